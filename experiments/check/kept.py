@@ -67,8 +67,8 @@ class KeptVerdict:
         except (OSError, msgspec.MsgspecError):
             return None
 
-    def keep(self, verdict: Verdict) -> None:
-        """Keeps a verdict for the next check; nothing is kept where that cannot be done or would not be safe."""
+    def keep(self, verdict: Verdict, most: int = MOST) -> None:
+        """Keeps a verdict for the next check, and the newest `most` in all; nothing where that would not be safe."""
         place = self._place()
         if place is None or _code() != self._code or any(_strangers()):
             return
@@ -78,7 +78,7 @@ class KeptVerdict:
             part = place.with_suffix(f".{os.getpid()}")
             part.write_bytes(_seal(content) + b"\n" + content)
             part.replace(place)
-            for old in sorted(place.parent.iterdir(), key=lambda each: each.stat().st_mtime_ns)[:-MOST]:
+            for old in sorted(place.parent.iterdir(), key=lambda each: each.stat().st_mtime_ns)[:-most]:
                 old.unlink()
 
     def _place(self) -> Path | None:

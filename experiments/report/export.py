@@ -77,7 +77,9 @@ UNITS: Final[dict[str, Any]] = {
 COLUMNS: Final = ("x", "y", "z", "yaw", "true_x", "true_y", "true_z", "goal_x", "goal_y", "goal_z", "error")
 
 
-def write_mat(traces: Mapping[str, Trace], metrics: Mapping[str, CaseMetrics], file: Path) -> None:
+def write_mat(
+    traces: Mapping[str, Trace], metrics: Mapping[str, CaseMetrics], file: Path, most_bytes: int = LARGEST
+) -> None:
     """Writes a struct for each case, named after it, into a file of MATLAB's version 5.
 
     Numbers are doubles, robots are counted from 1, what is unknown is NaN. What is in the structs: docs/matlab.md.
@@ -87,7 +89,7 @@ def write_mat(traces: Mapping[str, Trace], metrics: Mapping[str, CaseMetrics], f
     names = matlab_names(traces)
     cases = {names[case]: structure(trace, metrics[case]) for case, trace in traces.items()}
     for name, case in cases.items():
-        if (size := _bytes(case)) >= LARGEST:
+        if (size := _bytes(case)) >= most_bytes:
             raise ExplainedError(f"{file}: {name} has {size / 1e9:.1f} GB, MATLAB reads 2.1; export a table: --csv")
     try:
         with file.open("wb") as stream:

@@ -81,6 +81,7 @@ def sweep(
     out: str | Path | None = None,
     scheduler: str | None = None,
     processes: int | None = None,
+    most_seeds: int = MOST_SEEDS,
     progress: Progress = lambda _done, _of: None,
 ) -> SweepResult:
     """Runs a sweep, or what is missing of it; after Ctrl-C it gives what is done.
@@ -92,6 +93,7 @@ def sweep(
         out: Where runs are kept and looked for.
         scheduler: Address of a dask scheduler; None: on this machine.
         processes: On this machine; None: one for each core.
+        most_seeds: Of one cell side by side in a process.
         progress: Told of progress.
 
     Raises:
@@ -111,7 +113,7 @@ def sweep(
     with Store(folder) as store:
         notes = store.changed_since(origin(read, [cell.plan for cell in plan]))
         with workers(scheduler, processes) as crew:
-            runner = SweepRunner(store, crew)
+            runner = SweepRunner(store, crew, most_seeds)
             with suppress(KeyboardInterrupt):  # what is done is kept
                 runner.run_missing(plan, seeds, progress)
         rows = runner.rows(plan, seeds)
@@ -127,6 +129,7 @@ class SweepRunner:
 
     store: Store
     crew: Workers
+    most_seeds: int = MOST_SEEDS
 
     def run_missing(
         self, plan: Sequence[Cell], seeds: Sequence[int], progress: Progress = lambda _done, _of: None
@@ -145,7 +148,7 @@ class SweepRunner:
                 code_of(cell.plan),
             )
             for cell, missing in lacking
-            for size in [min(piece, side_by_side(cell.plan))]
+            for size in [min(piece, self.most_seeds, side_by_side(cell.plan))]
             for k in range(0, len(missing), size)
         ]
         done = 0

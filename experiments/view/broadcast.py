@@ -39,8 +39,11 @@ ENCODED: Final = (
 class Broadcast:
     """The messages of one recording, in order of time, on the network."""
 
-    def __init__(self, session: zenoh.Session, path: Path, realm: str | None = None) -> None:
-        """Reads the recording; its keys begin with `realm`, or with that of the run."""
+    def __init__(self, session: zenoh.Session, path: Path, realm: str | None = None, watch_s: float = SEEN_S) -> None:
+        """Reads the recording; its keys begin with `realm`, or with that of the run.
+
+        `watch_s` is how long it looks for others in the realm before it plays.
+        """
         records = Records(path)
         self._topics: dict[int, Topic | None] = {}  # by channel
         self._sent: list[tuple[int, int, bytes]] = []  # log time [ns], channel, data
@@ -54,6 +57,7 @@ class Broadcast:
         self.plan, self.case = about.plan, about.case
         if not self._sent:
             raise RecordingError(f"{path}: holds no message; there is nothing to replay")
+        self._watch_s = watch_s
         self._session, self.keys = session, Keys(realm or self.plan.experiment.network.realm)
         self.begin, self.end = self._sent[0][0] * 1e-9, self._sent[-1][0] * 1e-9  # [s, UTC]
         self._publishers: dict[str, Any] = {}
@@ -76,7 +80,7 @@ class Broadcast:
             if strangers := {token for token in found if token not in own and Keys.life_of(token) != mine}:
                 raise ExplainedError(_occupied(keys, strangers))
 
-        until = time.monotonic() + SEEN_S
+        until = time.monotonic() + self._watch_s
         while time.monotonic() < until and not ended.wait(STEP_S):
             refuse_strangers()
         count = at = 0

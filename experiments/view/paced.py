@@ -32,9 +32,9 @@ PAGE_S: Final = 30.0  # the first case waits so long for a page
 class PacedView:
     """The page of a run in virtual time; `watch` is called by the simulation, which waits in it."""
 
-    def __init__(self, server: viser.ViserServer, *, pace: float, dark: bool) -> None:
-        """`pace`: simulated seconds in one second, at first."""
-        self._server = server
+    def __init__(self, server: viser.ViserServer, *, pace: float, dark: bool, page_s: float = PAGE_S) -> None:
+        """`pace`: simulated seconds in one second, at first; `page_s`: limit of the wait for a page [s]."""
+        self._server, self._page_s = server, page_s
         self.clock = Clock(-inf, inf, -inf)
         self.clock.speed, self.clock.playing = pace, True
         with server.gui.add_folder("Virtual time", order=5.0):
@@ -59,7 +59,7 @@ class PacedView:
     def watch(self, instant: Instant) -> None:
         """Draws a moment of the simulation, and holds it until the clock of the page is there."""
         clock = self.clock
-        while not self._server.get_clients() and time.monotonic() - self._opened < PAGE_S:
+        while not self._server.get_clients() and time.monotonic() - self._opened < self._page_s:
             time.sleep(POLL_S)
         if clock.t == -inf:
             clock.t, self._waited = instant.now, time.monotonic()

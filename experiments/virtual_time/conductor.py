@@ -27,8 +27,8 @@ class VirtualConductor:
     start_at: float  # [s] common start; NaN before it is known
     over: bool  # all robots are done
 
-    def __init__(self, robots: Sequence[Robot]) -> None:
-        self._robots = robots
+    def __init__(self, robots: Sequence[Robot], patience_s: float = PATIENCE_S) -> None:
+        self._robots, self._patience_s = robots, patience_s
         self._stage = Phase.READY
         self._since = 0.0
         self.airborne_at = self.start_at = nan
@@ -39,7 +39,7 @@ class VirtualConductor:
         if self._stage >= Phase.RUNNING:
             return sys.maxsize
         if min([robot.lifecycle.phase for robot in self._robots]) < self._stage:
-            return round((self._since + PATIENCE_S) / dt)
+            return round((self._since + self._patience_s) / dt)
         every = max(1, round(ORDERS_S / dt))
         return -(-tick // every) * every
 
@@ -71,8 +71,8 @@ class VirtualConductor:
 
     def _await(self, t: float) -> None:
         """Raises Stuck if robots have not reached the stage for too long."""
-        if t - self._since > PATIENCE_S:
+        if t - self._since > self._patience_s:
             late = [robot for robot in self._robots if robot.lifecycle.phase < self._stage]
             names = ", ".join(sorted(robot.assignment.name for robot in late))
             reason = late[0].lifecycle.reason
-            raise Stuck(f"not {self._stage.word} after {PATIENCE_S:g} s: {names} ({reason})")
+            raise Stuck(f"not {self._stage.word} after {self._patience_s:g} s: {names} ({reason})")

@@ -23,7 +23,7 @@ from experiments.arrays import PoseTable
 from experiments.definition.bodies import body_request, shadow_periods, shared_world
 from experiments.definition.plan import Plan
 from experiments.virtual_time.company import AT_END, AT_HAZARDS, LEAN, PLACES, WIDTH, Ledger
-from experiments.virtual_time.conductor import VirtualConductor
+from experiments.virtual_time.conductor import PATIENCE_S, VirtualConductor
 from experiments.virtual_time.network import CentreLog, VirtualNetwork
 from experiments.virtual_time.stretch import Stretches, stretches_of
 from twins.arrays import Array, Index
@@ -96,6 +96,7 @@ def simulate(
     landing: bool = True,
     progress: Callable[[float], object] = lambda _: None,
     watch: Callable[[Instant], object] | None = None,
+    patience_s: float = PATIENCE_S,
 ) -> Log:
     """Flies one case, compiled.
 
@@ -107,12 +108,13 @@ def simulate(
         landing: Let the robots land; else the log ends with the run.
         progress: Called at state_hz with the time of the experiment [s]; NaN before its start is known.
         watch: Called at state_hz, and as slow as it likes.
+        patience_s: Limit for robots to become ready, airborne or done [s].
 
     Raises:
         Stuck: If robots do not become ready, airborne or done.
         PluginError: If a plug-in fails; the error names it.
     """
-    flight = Flight(plan, seed, quiet=quiet, lean=lean)
+    flight = Flight(plan, seed, quiet=quiet, lean=lean, patience_s=patience_s)
     try:
         flight.fly(landing=landing, progress=progress, watch=watch)
     except FAILURES as error:
@@ -124,7 +126,7 @@ def simulate(
 class Flight:
     """A run in virtual time."""
 
-    def __init__(self, plan: Plan, seed: int, *, quiet: bool, lean: bool) -> None:
+    def __init__(self, plan: Plan, seed: int, *, quiet: bool, lean: bool, patience_s: float = PATIENCE_S) -> None:
         self.plan, self._seed, self.lean = plan, seed, lean
         self.names = names = plan.names
         self.robots = [Robot(plan.assignment(name)) for name in names]
@@ -139,7 +141,7 @@ class Flight:
             self._laws = [
                 guide.computer.stepping if guide.guided else law for guide, law in zip(guides, self._laws, strict=True)
             ]
-        self._conductor = VirtualConductor(self.robots)
+        self._conductor = VirtualConductor(self.robots, patience_s)
         rates = plan.experiment.rates
         self.dt, self.log_every = 1.0 / rates.body_hz, round(rates.body_hz / rates.state_hz)
         self._duration = plan.experiment.duration_s - 0.5 * self.dt  # [s] robots that land later are not lost

@@ -19,7 +19,7 @@ from agents.network.endpoints import free_endpoints, from_here
 from agents.network.keys import Keys
 from agents.network.lab import LabError, lab_of, register, require, secured
 from agents.network.lab import options as lab_options
-from agents.network.zenoh_config import check_loopback
+from agents.network.zenoh_config import ASK_S, check_loopback
 from agents.plugins import registry as plugins
 from experiments.definition import access_rights, mesh
 from experiments.definition import endpoints as reach
@@ -30,7 +30,7 @@ from experiments.file.document import Document, chosen
 from experiments.file.problems import refusal
 from experiments.real_time.conductor.case_context import CaseContext
 from experiments.real_time.conductor.conductor import CaseResult, Conductor
-from experiments.real_time.conductor.emergency import Emergency
+from experiments.real_time.conductor.emergency import STARTING_S, Emergency
 from experiments.real_time.conductor.run_view import Shown
 from experiments.real_time.conductor.support import RouterEnded, make_routers, start_routers
 from experiments.real_time.hosts import run_registry
@@ -185,7 +185,7 @@ def _staged(
         stops = (
             nullcontext()
             if meshed
-            else user.emergency.throughout(endpoints, keys, staging.identity, starting=own_router)
+            else user.emergency.throughout(endpoints, keys, staging.identity, STARTING_S if own_router else ASK_S)
         )
 
         def context(name: str) -> CaseContext:

@@ -36,15 +36,11 @@ class Emergency:
         return pubsub.ImmediateSubscriber(session, keys.estop, self._receive_stop)
 
     @contextmanager
-    def throughout(
-        self, endpoints: Sequence[str], keys: Keys, identity: str, *, starting: bool = False
-    ) -> Iterator[None]:
+    def throughout(self, endpoints: Sequence[str], keys: Keys, identity: str, wait_s: float = ASK_S) -> Iterator[None]:
         """Receive stops by a session of its own: those of the cases are closed between them.
 
-        `identity` is the name in the certificate, in a lab; `starting`: the routers were just started. Raises
-        Unreachable if no router answers.
+        `identity` is the name in the certificate, in a lab. Raises Unreachable if no router answers in `wait_s`.
         """
-        wait_s = STARTING_S if starting else ASK_S
         opened = network.open_session(endpoints, name="emergency stops", identity=identity, wait_s=wait_s)
         with held(opened) as (session, declared):
             declared.append(self.listen(session, keys))

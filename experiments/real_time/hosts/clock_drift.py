@@ -28,9 +28,9 @@ def applied(now: HostClock, before: float) -> float:
 class Drift:
     """Measures and corrects the clocks of some hosts in a thread of its own, for an answer may take long."""
 
-    def __init__(self, hosts: Iterable[Station]) -> None:
+    def __init__(self, hosts: Iterable[Station], period_s: float = PERIOD_S) -> None:
         """`hosts` were measured once already."""
-        self._hosts = list(hosts)
+        self._hosts, self._period_s = list(hosts), period_s
         self._over = threading.Event()
         self._measured: list[HostClock] = []
         self._trouble: list[str] = []
@@ -61,7 +61,7 @@ class Drift:
         return found
 
     def _run(self) -> None:
-        while self._hosts and not self._over.wait(PERIOD_S):
+        while self._hosts and not self._over.wait(self._period_s):
             for host in list(self._hosts):
                 if self._over.is_set():  # the end does not wait for hosts, each of which may be silent
                     return

@@ -149,10 +149,9 @@ def test_what_is_no_file_has_no_verdict(park, name):
     assert KeptVerdict(name).read() is None
 
 
-def test_old_verdicts_go(park, monkeypatch):
-    monkeypatch.setattr(kept, "MOST", 10)
+def test_old_verdicts_go(park):
     for seed in range(13):
-        KeptVerdict(str(park), [f"seed={seed}"]).keep(SAID)
+        KeptVerdict(str(park), [f"seed={seed}"]).keep(SAID, most=10)
     assert len(list((park.parents[1] / "cache" / "check").iterdir())) == 10
     assert KeptVerdict(str(park), ["seed=8"]).read() == SAID
 

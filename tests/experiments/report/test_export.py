@@ -168,7 +168,7 @@ def test_names_that_are_valid_stay():
     ]  # fmt: skip
 
 
-def test_what_cannot_be_exported_is_explained(flown, tmp_path, monkeypatch):
+def test_what_cannot_be_exported_is_explained(flown, tmp_path):
     folder, run = flown
     with pytest.raises(ExplainedError, match=r"run\.txt: is no name"):
         commands.export(str(folder), str(tmp_path / "run.txt"), as_csv=False)
@@ -177,9 +177,8 @@ def test_what_cannot_be_exported_is_explained(flown, tmp_path, monkeypatch):
     for name in ("run.mat", "run.csv"):
         with pytest.raises(ExplainedError, match="cannot be written: No such file or directory"):
             commands.export(str(folder), str(tmp_path / "nowhere" / name), as_csv=False)
-    monkeypatch.setattr(export, "LARGEST", 1000)
     with pytest.raises(ExplainedError, match=r"periodic has 0\.0 GB"):
-        export.write_mat(run.traces, run.metrics, tmp_path / "run.mat")
+        export.write_mat(run.traces, run.metrics, tmp_path / "run.mat", most_bytes=1000)
 
 
 def test_without_scipy_it_says_what_to_install(flown, monkeypatch):

@@ -97,15 +97,13 @@ def test_nothing_is_run_twice(done):
     assert progress.ran == 3
 
 
-def test_batches_do_not_change_the_table(done, tmp_path, monkeypatch):
-    monkeypatch.setattr(sweeps, "MOST_SEEDS", 1)
-    assert tables(swept(tmp_path)) == tables(done)
+def test_batches_do_not_change_the_table(done, tmp_path):
+    assert tables(swept(tmp_path, most_seeds=1)) == tables(done)
 
 
-def test_a_sweep_that_was_interrupted_goes_on(done, tmp_path, monkeypatch):
-    monkeypatch.setattr(sweeps, "MOST_SEEDS", 2)
+def test_a_sweep_that_was_interrupted_goes_on(done, tmp_path):
     progress = Progress(end_after=3)
-    part = swept(tmp_path, progress=progress)
+    part = swept(tmp_path, progress=progress, most_seeds=2)
     assert (part.missing, [row.seeds for row in part.rows]) == (6, [3])
     with (tmp_path / "runs.jsonl").open("ab") as file:
         file.write(b'{"cell":"cut off in mid')

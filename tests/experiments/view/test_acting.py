@@ -38,15 +38,14 @@ def test_trigger_and_law_numbers_have_sliders():
 
 
 @pytest.mark.slow
-def test_watched_virtual_run_is_unchanged_bit_by_bit(monkeypatch):
+def test_watched_virtual_run_is_unchanged_bit_by_bit():
     pytest.importorskip("viser", reason="needs viser")
     from experiments.view import paced  # noqa: PLC0415
     from experiments.view.serving import served  # noqa: PLC0415
 
-    monkeypatch.setattr(paced, "PAGE_S", 0.0)
     read = load("robotic-park", "duration_s=1.0", "timeline=[]", "cases={}")
     with served(int(free_endpoint(preferred_port=0).rpartition(":")[2]), dark=True) as server:
-        page = paced.PacedView(server, pace=100.0, dark=True)
+        page = paced.PacedView(server, pace=100.0, dark=True, page_s=0.0)
         (watched,) = simulate_seeds(read, [1], watch=page.begin)
     alone = simulate(read, seed=1)
     for case, trace in alone.traces.items():

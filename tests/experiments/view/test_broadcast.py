@@ -11,7 +11,6 @@ from agents.network import pubsub
 from agents.network.keys import Keys
 from experiments.file.document import load
 from experiments.run import simulate
-from experiments.view import broadcast
 from experiments.view.broadcast import Broadcast
 from experiments.view.replay import Clock
 from tests.fuzz.loopnet import Mute, Net
@@ -44,10 +43,9 @@ def test_replay_ends_when_another_process_owns_a_name(token, shown, recording, m
             if len(sent) == 20:
                 net.deliver(f"{token}\0\0".encode())
 
-    monkeypatch.setattr(broadcast, "SEEN_S", 0.0)
     with Net().worn() as net:
         monkeypatch.setattr(pubsub, "publisher", lambda *_, **__: Counted())
-        played = Broadcast(net.session, recording)
+        played = Broadcast(net.session, recording, watch_s=0.0)
         clock = Clock(0.0, played.end - played.begin)
         clock.playing, clock.speed = True, 10.0
         if shown:

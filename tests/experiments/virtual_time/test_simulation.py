@@ -166,22 +166,20 @@ def test_the_reference_formation_is_acquired():
     assert sent[4:].mean() > sent[1:4].mean() > 3.0
 
 
-def test_who_hears_nobody_is_named(monkeypatch):
-    monkeypatch.setattr("experiments.virtual_time.conductor.PATIENCE_S", 5.0)
+def test_who_hears_nobody_is_named():
     with pytest.raises(Stuck, match=r"not ready after 5 s: A, B \(never received B\)"):
-        simulate(Plan(ground(channel=Channel(delay_s=100.0))), 1)
+        simulate(Plan(ground(channel=Channel(delay_s=100.0))), 1, patience_s=5.0)
 
 
 def test_who_cannot_get_up_is_named(monkeypatch):
     monkeypatch.setattr("agents.decision.lifecycle.AT_HEIGHT", -1.0)  # nobody is ever near enough to his height
-    monkeypatch.setattr("experiments.virtual_time.conductor.PATIENCE_S", 5.0)
     robots = {
         "A": Robot(kind="khepera4", start=[0.0, 0.0]),
         "F": Robot(kind="crazyflie", start=[0.5, 0.0], hover=0.5),
         "G": Robot(kind="crazyflie", start=[-0.5, 0.0], hover=0.5),
     }
     with pytest.raises(Stuck, match=r"not airborne after 5 s: F, G"):
-        simulate(Plan(Experiment(title="Stuck", duration_s=1.0, robots=robots)), 1)
+        simulate(Plan(Experiment(title="Stuck", duration_s=1.0, robots=robots)), 1, patience_s=5.0)
 
 
 def test_robot_goes_on_without_a_never_received_neighbour():

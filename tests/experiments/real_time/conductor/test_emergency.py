@@ -8,15 +8,13 @@ from agents.network.endpoints import free_endpoint
 from agents.network.keys import Keys
 from agents.network.session import Unreachable
 from agents.runtime.router import serve_router
-from experiments.real_time.conductor import emergency
-from experiments.real_time.conductor.emergency import Emergency
+from experiments.real_time.conductor.emergency import STARTING_S, Emergency
 
 KEYS = Keys("park")
 
 
 @pytest.fixture
-def endpoint(monkeypatch):
-    monkeypatch.setattr(emergency, "ASK_S", 0.2)
+def endpoint():
     return free_endpoint(preferred_port=0)
 
 
@@ -25,7 +23,7 @@ def test_router_that_just_started_is_waited_for(endpoint):
     late = threading.Timer(0.6, serve_router, ([endpoint], over))
     late.start()
     try:
-        with Emergency().throughout([endpoint], KEYS, "operator", starting=True):
+        with Emergency().throughout([endpoint], KEYS, "operator", STARTING_S):
             pass
     finally:
         over.set()
@@ -33,5 +31,5 @@ def test_router_that_just_started_is_waited_for(endpoint):
 
 
 def test_one_of_somebody_else_is_not(endpoint):
-    with pytest.raises(Unreachable), Emergency().throughout([endpoint], KEYS, "operator"):
+    with pytest.raises(Unreachable), Emergency().throughout([endpoint], KEYS, "operator", 0.2):
         pass

@@ -78,8 +78,7 @@ class Host:
         return self.clock
 
 
-def test_robots_are_told_drift_and_no_jump(monkeypatch):
-    monkeypatch.setattr(clock_drift, "PERIOD_S", 0.01)
+def test_robots_are_told_drift_and_no_jump():
     host = Host([0.21, 0.21 + 2 * STEP_S, 0.22])
     measured, trouble = [], []
 
@@ -88,7 +87,7 @@ def test_robots_are_told_drift_and_no_jump(monkeypatch):
             every.extend(more)
         return len(trouble) >= 2
 
-    with clock_drift.Drift([host]) as following:
+    with clock_drift.Drift([host], 0.01) as following:
         until(followed, "a jump and silence are noticed")
     assert host.told == pytest.approx([0.21 - UNCERTAINTY_S, 0.22 - UNCERTAINTY_S])
     assert [each.offset for each in measured] == pytest.approx([0.21, 0.21 + 2 * STEP_S, 0.22])
@@ -96,8 +95,7 @@ def test_robots_are_told_drift_and_no_jump(monkeypatch):
     assert "says nothing; its clock is not corrected any more" in trouble[1]
 
 
-def test_end_waits_only_for_the_host_being_asked(monkeypatch):
-    monkeypatch.setattr(clock_drift, "PERIOD_S", 0.01)
+def test_end_waits_only_for_the_host_being_asked():
     asked = []
 
     class Silent(Host):
@@ -106,7 +104,7 @@ def test_end_waits_only_for_the_host_being_asked(monkeypatch):
             following._over.set()
             return super().measure(samples)
 
-    with clock_drift.Drift([Silent([]), Silent([]), Silent([])]) as following:
+    with clock_drift.Drift([Silent([]), Silent([]), Silent([])], 0.01) as following:
         until(lambda: asked, "the first is asked")
     assert len(asked) == 1
 
