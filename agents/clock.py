@@ -1,12 +1,12 @@
 """Clock of an experiment in one process: the machine's clock plus its known correction.
 
-The wall clock is read once and continued with `uptime`, so that a step in mid-run (NTP, an operator) changes nothing,
-and a machine that was suspended is not behind the others afterwards. All processes of a run on the launcher's machine
-share one reading, however late they are started.
+The wall clock is read once and continued with `uptime`. A step in mid-run (NTP, an operator) changes nothing, and a
+machine that was suspended is not behind the others afterwards. All processes of a run on the launcher's machine share
+one reading, however late they are started.
 
 Clocks drift. The starter of a process on another machine measures the offset again during the run and writes it to the
-process's lifeline, `clock -0.200131`; the process follows by going a little faster or slower, never back: stamps decide
-which of two samples is the newer one.
+lifeline of the process, `clock -0.200131`. The clock of the process then runs a little faster or slower. It never goes
+back, because stamps decide which of two samples is newer.
 """
 
 from __future__ import annotations

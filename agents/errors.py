@@ -2,4 +2,4 @@
 
 
 class ExplainedError(Exception):
-    """An error whose text names the place and the remedy."""
+    """An error with a text that names the place and the remedy."""

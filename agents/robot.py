@@ -65,7 +65,7 @@ class Robot:
     sent_position: Vector  # what is transmitted, where `transmit` says so [m]
     sent_velocity: Vector  # [m/s]
     decisions: int  # since the common start
-    updates: int  # decisions at which the goal was computed anew; of a guided robot, received goals
+    updates: int  # decisions that recomputed the goal; of a guided robot, received goals
     interventions: int  # ticks on which safety changed the setpoint, from the common start on
     evasions: int  # ticks on which avoidance did, likewise
     causes: int  # of hazards on this tick, a bit for each
@@ -160,9 +160,9 @@ class Robot:
             self._begin_plan(origin, t - at)
 
     def start(self, at: float, t: float = -inf, origin: Pose | None = None) -> str:
-        """Order to begin at `at` [s], or to go on after a hold; returns as `hold`.
+        """Order to begin at `at` [s], or to continue after a hold; returns as `hold`.
 
-        `origin`: x, y, z [m] and yaw [rad] at which the plan of a restarted robot began; None: it begins anew.
+        `origin`: x, y, z [m] and yaw [rad] at which the plan of a restarted robot began; None: the plan restarts.
         """
         waits = self.lifecycle.phase == AIRBORNE
         refusal = self.lifecycle.start(at)
@@ -246,7 +246,7 @@ class Robot:
         self._filter.judge(now)
 
     def _doubt(self) -> None:
-        """Its external positions jumped, or deceive."""
+        """Note that the external positions jumped, or deceive."""
         now, external = self.now, self._external
         now.jump = external.jump if isnan(now.jump) else max(now.jump, external.jump)
         if external.deceived:
@@ -307,7 +307,7 @@ class Robot:
         """A law gives a velocity, here or at the central controller: the goal moves on with it on every tick."""
         follower, velocity, now, guidance = self._follower, stepping.velocity, self.now, self.guidance
         follows = self.goals.follows and self.decisions > 0
-        if guidance is not None:  # one whose goals do not come any more stands, long before it counts as unguided
+        if guidance is not None:  # a robot without new goals stands still, long before it counts as unguided
             velocity = guidance.velocity
             follows = isfinite(velocity[0]) and t - guidance.stamp <= OLD_VELOCITY * self._decide_every * self._dt
         moves = self.lifecycle.phase == RUNNING and not self.keeping.held and follows

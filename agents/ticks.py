@@ -27,7 +27,7 @@ class Ticks:
 
     def start(self) -> float:
         """Make the present time 0, at which the first tick is due; returns it on the clock [s]."""
-        self.zero = self._clock()  # to be moved by a loop whose time is slewed
+        self.zero = self._clock()  # moved by a loop with slewed time
         self.t = self.next = 0.0  # [s] times of the last tick and of the next one
         return self.zero
 

@@ -57,7 +57,7 @@ class Claims:
         while self._locks:
             path, lock = self._locks.popitem()
             with suppress(OSError):
-                path.unlink()  # while it is locked: whoever waits at this file finds that it is no longer there
+                path.unlink()  # while it is locked: a process that waits at this file finds that it is gone
             os.close(lock)
 
 

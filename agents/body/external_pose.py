@@ -73,7 +73,7 @@ class External:
         return True
 
     def estimate(self, t: float, state: BodyState) -> None:
-        """Estimate, at `t` [s], the velocity of a robot whose body measures none, from its positions."""
+        """Estimate, at `t` [s], the velocity of a robot from its positions, if its body measures none."""
         velocity = state.velocity
         if isnan(velocity[0]) or isnan(velocity[1]) or isnan(velocity[2]):
             self.update(state.time, state.position, state.yaw)

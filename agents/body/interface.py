@@ -161,9 +161,9 @@ class Body(ABC):
     """Base of all bodies: hardware or a twin of n robots.
 
     The `takes` of the kind of a row tells how its row of `command` is read.
-    Calls come from one thread, but for `land` and `stop`: these come from others too, more than once, and while another
-    call runs or hangs (`agents.runtime.watchdog`, emergency stops). They must neither block nor need the loop to go on.
-    A body of several rows commands all of them, even if one of them fails (`call_all`).
+    All calls come from one thread, except `land` and `stop`: other threads call these too, more than once, and while
+    another call runs or hangs (`agents.runtime.watchdog`, emergency stops). They must neither block nor need the loop
+    to go on. A body of several rows commands all of them, even if one of them fails (`call_all`).
     """
 
     @abstractmethod
@@ -194,8 +194,8 @@ class Body(ABC):
     def stop(self, rows: Sequence[int]) -> None:
         """Motors off, at once, wherever the rows are: the emergency stop.
 
-        The order is repeated until the device confirms that its motors are off, or counts as gone; until then `flying`
-        stays set for a flying row, and its note is `UNANSWERED`.
+        The order is repeated until the device confirms that its motors are off, or counts as gone. Until then `flying`
+        stays set for a flying row, with the note `UNANSWERED`.
         """
 
     @abstractmethod

@@ -12,7 +12,7 @@ from agents.vectors import NotNegative, Positive, Share, Vector
 
 
 class Safety(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
-    """Limits of setpoints, and of what may happen to a robot before it holds, lands or has its motors cut."""
+    """Limits of setpoints, and thresholds at which a robot holds, lands or has its motors cut."""
 
     speed: Annotated[Positive | None, Meta(description="[m/s], if lower than the kind's own")] = None
     max_goal_distance: Annotated[Positive, Meta(description="farthest goal from where the robot is [m]")] = 0.5
@@ -23,39 +23,42 @@ class Safety(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     ] = 0.3
     neighbour_timeout_s: Annotated[Positive, Meta(description="a neighbour gone for this long is left out [s]")] = 1.0
     lost_neighbour: Annotated[
-        Literal["drop", "hold", "land"], Meta(description="what a robot does then: go on without it, hold, or land")
+        Literal["drop", "hold", "land"],
+        Meta(description="reaction to a lost neighbour: continue without it, hold, or land"),
     ] = "drop"
     lost_conductor: Annotated[
-        Literal["finish", "land"], Meta(description="what robots do when the conductor is gone in mid-run")
+        Literal["finish", "land"],
+        Meta(description="reaction to a conductor that is gone in mid-run: finish the run, or land"),
     ] = "finish"
     offline_s: Annotated[
-        Positive, Meta(description="a robot without a router holds, and after this lands: no stop reaches it [s]")
+        Positive,
+        Meta(
+            description="time without a router after which a robot lands, as no stop reaches it; it holds at once [s]"
+        ),
     ] = 10.0
     separation: Annotated[
         Positive | None,
         Meta(
-            description="nearer than this to another robot that it hears, from middle to middle, a robot holds; nearer "
-            "than half of it, or touching, it lands [m]; left out: not watched"
+            description="distance of centres below which two robots that receive each other's poses hold [m]; below "
+            "half of it, or in contact, they land; left out: not watched"
         ),
     ] = None
     cut_beyond_m: Annotated[Positive, Meta(description="a drone this far outside the arena has its motors cut [m]")] = (
         0.75
     )
     overspeed: Annotated[
-        float, Meta(gt=1, description="a robot that moves faster than this times what its kind can holds, then lands")
+        float, Meta(gt=1, description="multiple of the top speed of its kind above which a robot holds, then lands")
     ] = 2.5
-    tilt: Annotated[
-        float, Meta(gt=0, lt=4, description="a drone that leans more than this has its motors cut [rad]")
-    ] = 1.2
-    battery_low: Annotated[Share, Meta(description="with less charge than this a robot lands; 0: never")] = 0.1
-    battery_min: Annotated[Share, Meta(description="with less charge than this it does not take off; 0: always")] = 0.2
+    tilt: Annotated[float, Meta(gt=0, lt=4, description="tilt above which the motors of a drone are cut [rad]")] = 1.2
+    battery_low: Annotated[Share, Meta(description="charge below which a robot lands; 0: never")] = 0.1
+    battery_min: Annotated[Share, Meta(description="charge below which it does not take off; 0: it always does")] = 0.2
     start_within: Annotated[
         NotNegative,
-        Meta(description="a robot that is farther from its `start` than this does not take off [m]; 0: anywhere"),
+        Meta(description="distance from its `start` beyond which a robot does not take off [m]; 0: anywhere"),
     ] = 0.3
     landing_s: Annotated[
         Positive,
-        Meta(description="a landing drone that neither descends nor hovers for this long has its motors cut [s]"),
+        Meta(description="time without descending or hovering after which the motors of a landing drone are cut [s]"),
     ] = 20.0
     loop_timeout_s: Annotated[
         Positive, Meta(description="a robot whose control loop hangs for this long is landed from outside of it [s]")

@@ -14,8 +14,8 @@ from agents.network import messages, pubsub, validation
 from agents.network.keys import Keys
 from agents.vectors import Vector
 
-REPEATED_S: Final = 0.3  # [s] without a new pose: the note says so
-SECOND_S: Final = 1.0  # [s] after its last sample a second source is not told of any more
+REPEATED_S: Final = 0.3  # time without a new pose that makes the note [s]
+SECOND_S: Final = 1.0  # time after the last sample of a second source for which the note stays [s]
 SECOND: Final = "a second source sends its position, and is refused"  # note of such a robot
 FROZEN: Final = "its measured position repeats itself to the last bit"  # note of such a robot
 
@@ -41,12 +41,12 @@ class MeasuredPositions:
         """Subscribe for `rows` of the robots `names`; positions beyond `reach` [m] are refused.
 
         Args:
-            exact: Rows whose positions a simulation knows without noise; theirs may repeat.
+            exact: Rows with noise-free positions from a simulation, which may repeat.
             silence_s: Time without a new position after which another source takes over [s].
         """
         self._names, self._reach = tuple(names), reach
         # stamp of the last position of each robot less the time of its arrival [s]: the clock of its source is ahead by
-        # at least so much, or, where negative, behind or late; NaN before the first
+        # at least this value, or, if it is negative, behind or late; NaN before the first
         self.ahead = [nan] * len(self._names)
         self.malformed = [0] * len(self._names)  # refused positions of each robot
         self.trouble = [""] * len(self._names)  # reason of the last refusal of each robot

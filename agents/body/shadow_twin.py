@@ -1,10 +1,10 @@
 """Shadow twin: a twin beside a robot that gets the same commands; its deviation measures the quality of the model.
 
-The twin is put onto the robot, with its measured pose and velocity, when the robot is first driven (a flying one: when
-it is in the air and gets its first setpoint), and again every `restart_s`. In between it runs by itself. Right after
-a restart the difference is nothing; what it grows to is the error of predicting the robot for as long. Over a whole
-run the difference is that prediction's, averaged over horizons from nothing to `restart_s`. A twin that is never
-restarted shows the error of simulating the whole run: the drift of speed and yaw adds up.
+The twin is reset to the measured pose and velocity of the robot at the robot's first setpoint (of a flying one: the
+first in the air), and then every `restart_s`. In between it runs by itself. Right after a reset the difference is zero;
+it grows to the error of predicting the robot for that time. Over a whole run the difference is that prediction's,
+averaged over horizons from nothing to `restart_s`. A twin that is never restarted shows the error of simulating the
+whole run: the drift of speed and yaw adds up.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ FRESH_S: Final = 0.25  # a pose older than this is not where the robot is
 
 
 class Placeable(Body):
-    """A body whose robots can be placed, such as a twin."""
+    """A body with robots that can be placed, such as a twin."""
 
     @abstractmethod
     def place(
@@ -135,7 +135,7 @@ class Shadowed(Body):
         return t - state.time <= FRESH_S and is_finite(state.position) and isfinite(state.yaw)
 
     def _twin_rows(self, rows: Sequence[int]) -> list[int]:
-        """The twin's robots of those `rows` of the body, whose motors come on or go off."""
+        """Robots of the twin for `rows` of the body, as their motors switch on or off."""
         mine = [self._rows.index(row) for row in rows if row in self._rows]
         for k in mine:
             self._driven[k], self._due[k] = False, -inf

@@ -54,7 +54,7 @@ class Followed:
     goal_yaw: float  # wanted there [rad], NaN for any
     pose_stamp: float  # of the pose on which it rests [s]
     sent_at: float  # [s]
-    updates: int  # decisions at which its goal was computed anew
+    updates: int  # decisions that recomputed its goal
 
     def __init__(self, assignment: Assignment) -> None:
         self.guided = self.needed = assignment.guided
@@ -80,7 +80,7 @@ class Centre:
 
     @property
     def needed(self) -> list[int]:
-        """Rows of robots whose poses are needed."""
+        """Rows of robots with needed poses."""
         return [row for row, robot in enumerate(self.robots) if robot.needed]
 
     def receive(

@@ -1,4 +1,4 @@
-"""Control updates: whether a robot computes its law anew; else it keeps its goal. Quiet."""
+"""Control updates: decision whether a robot recomputes its law; otherwise it keeps its goal. Quiet."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ class Input:
 
 
 class ControlUpdates:
-    """Choice whether the law is computed anew, and its inputs at the last computation.
+    """Choice whether the law is recomputed, and its inputs at the last computation.
 
-    ε of a control trigger is the change of the input of the law since its last computation. This input are the relative
-    positions p_i − p̂_j on the links, as the robot believes them, and p_i if it keeps a distance to a fixed object; ‖ε‖
-    is the largest change of one.
+    ε of a control trigger is the change of the input of the law since its last computation. These inputs are the
+    relative positions p_i − p̂_j on the links, as the robot estimates them, and p_i if it keeps a distance to a fixed
+    object. ‖ε‖ is their largest change.
     """
 
     __slots__ = ("_anchored", "_inputs", "asking")

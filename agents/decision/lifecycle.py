@@ -35,7 +35,7 @@ IDLE, READY, AIRBORNE, RUNNING, LANDING, DONE = (int(phase) for phase in Phase)
 AT_HEIGHT: Final = 0.05  # [m] below the hover height, and less: arrived,
 ABOVE_HEIGHT: Final = 0.1  # or above it: a Crazyflie overshoots, and takes 10 s to come back
 FINISHED: Final = "finished"  # reasons for a landing that is no fault; orders are others
-TOLD_TO_END: Final = "told to end"
+TOLD_TO_END: Final = "asked to end"
 SETTLED: Final = 0.1  # [m/s] slower: climbing or rolling has ended
 
 

@@ -1,4 +1,4 @@
-"""Perception: things near a robot, from its own range readings and from received poses. Quiet but for new readings."""
+"""Perception: things near a robot, from its own range readings and received poses. Quiet, except for new readings."""
 
 from __future__ import annotations
 

@@ -110,10 +110,10 @@ class TwoWheels(Steering, frozen=True):
     """Steering of a differential robot, which turns on the spot.
 
     It cannot move sideways (paper, eq. (1)): the pose error is turned into distance and bearing. The law is that of
-    Farias et al. for the Khepera IV, v = K d (π − |α|)/π and ω = K_α sin α; α is taken to the nearer end of the robot,
-    which drives backward as well as forward, because formation goals lie behind it as often as before it. Toward a goal
-    exactly abeam v is 0: wheels that accelerate drive before they turn, which would put the goal behind the end that
-    drives ahead: the robot would change ends at each tick and never leave.
+    Farias et al. for the Khepera IV, v = K d (π − |α|)/π and ω = K_α sin α. The bearing α refers to the nearer end of
+    the robot. It drives backward and forward, because formation goals lie behind it and in front of it equally often.
+    Toward a goal exactly abeam v is 0: wheels that accelerate drive before they turn. The goal would then lie behind
+    the end that drives ahead, so the robot would change ends at each tick and never leave.
     """
 
     def twist(self, x: float, y: float, yaw: float, goal_yaw: float, agility: Agility) -> tuple[float, float]:

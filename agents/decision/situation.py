@@ -43,7 +43,7 @@ class ProcessHealth:
 
     @property
     def loop_failing(self) -> bool:
-        """Whether the control loop misses so many ticks that it controls nothing."""
+        """Whether the control loop misses too many ticks to control the robot."""
         return self.missed_share > LATE_SHARE
 
     @property

@@ -19,7 +19,7 @@ from agents.vectors import Vector, is_finite
 
 Words = tuple[tuple[str, Values], ...]  # what a robot says beside its pose: variables by name
 
-MOST_STEPS: Final = 3.0  # a pause counts as so many periods at most: integrals would leap
+MOST_STEPS: Final = 3.0  # longest pause that counts, in periods: after a longer one integrals would leap
 DIGITS: Final = 7  # significant ones of what is said: units are unknown
 
 
@@ -106,7 +106,7 @@ class Stepping:
             if not (isinstance(said.metre, Real) and said.metre > 0.0):
                 raise PluginError(
                     f"SAYS of the law {type(law).__name__}: the metre of {name} is {said.metre!r}, not a positive "
-                    "number; infinity for a variable whose changes are no reason to transmit"
+                    "number; infinity: changes of this variable cause no transmission"
                 )
         try:
             begun = law.begin(self.facts)
@@ -199,7 +199,7 @@ class Stepping:
 
 
 def is_sound(control: Control) -> bool:
-    """Whether a velocity or goal is finite, but for a height that is left out."""
+    """Whether a velocity or goal is finite, apart from a height that is left out."""
     ways = (way for way in (control.velocity, control.goal) if way is not None)
     return all(isfinite(x) and isfinite(y) and abs(z) != inf for x, y, z in ways)
 

@@ -87,12 +87,12 @@ class LowPass:
     A bare low-pass of the position would lag by τ·v behind a robot that drives, 0.1 m at 0.15 m/s and 0.7 s. This one
     does not: ṗ_f = v + (p − p_f)/τ and v̇_f = (v − v_f)/τ, with p − p_f and v as they are at the end of a step.
 
-    v of a robot on wheels is its measured velocity. A flying robot's measured velocity contains the wobble, which would
-    enter the transmitted position. Its horizontal v therefore follows from its own setpoints: v̇ = (v_c − v)/T, with T
-    the lag of its kind, v_c the commanded velocity, or K (setpoint − p_f) within its speed if positions are commanded.
-    Such a model of a robot on both sides of a network is the idea of L. A. Montestruque and P. J. Antsaklis, "On the
-    model-based control of networked systems", Automatica 39(10), 2003. Where the robot deviates from its model by Δv,
-    p_f is off by τ·Δv.
+    v of a robot on wheels is its measured velocity. The measured velocity of a flying robot contains the wobble, which
+    would enter the transmitted position. Its horizontal v therefore follows from its own setpoints: v̇ = (v_c − v)/T. T
+    is the lag of its kind, v_c the commanded velocity; if positions are commanded, v_c is K (setpoint − p_f) within its
+    speed. Such a model of a robot on both sides of a network is the idea of L. A. Montestruque and P. J. Antsaklis, "On
+    the model-based control of networked systems", Automatica 39(10), 2003. Where the robot deviates from its model by
+    Δv, p_f is off by τ·Δv.
     """
 
     __slots__ = (
@@ -112,7 +112,7 @@ class LowPass:
     def smooth(self, t: float, position: Vector, velocity: Vector, constant_s: float, setpoint: Setpoint) -> None:
         """Smooth a measured `position` [m] and `velocity` [m/s] at `t` [s], with the last setpoint.
 
-        A robot begins at its measured pose, and begins anew after it was unknown.
+        Smoothing starts at the measured pose, and restarts there after the pose was unknown.
         """
         step = t - self._t if isfinite(self._t) else 0.0
         self._t = t

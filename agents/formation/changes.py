@@ -1,7 +1,7 @@
 """Formations that change: targets that move smoothly from one shape to another, and links that come and go.
 
-A robot subscribes to every possible neighbour; these functions decide which are neighbours now, from the robot's own
-clock and the poses that it received, so that all decisions stay its own.
+A robot subscribes to every possible neighbour. These functions decide which are neighbours now, from the clock of the
+robot and the poses that it received; all decisions stay local.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ def _turned(vector: Vector, angle: float) -> Vector:
 
 
 def _scaled(distance: float, grown: float, rise: float) -> float:
-    """Length of a link whose part in the plane is scaled and whose height difference is kept."""
+    """Length of a link with its part in the plane scaled and its height difference kept."""
     if grown == 1.0:
         return distance
     return sqrt(max(grown * grown * (distance * distance - rise * rise), 0.0) + rise * rise)

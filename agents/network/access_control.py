@@ -2,8 +2,8 @@
 
 Zenoh checks kinds of messages, on their way in and out of the router. A verb here stands for all messages that one end
 needs, the keys of advanced publishers included (`@adv`, which no wildcard of a rule matches by itself).
-Everything else is denied. There are no rules that deny: Zenoh asks whether the key of a rule *includes* that of the
-message, so that a put on `park/**` would slip through beside a rule that denies `park/*/order`.
+Everything else is denied. No rule denies: Zenoh compares whether the key of a rule *includes* that of the message. A
+put on `park/**` would pass in spite of a rule that denies `park/*/order`.
 """
 
 from __future__ import annotations

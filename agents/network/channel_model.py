@@ -29,7 +29,7 @@ _MIXERS: Final = (0xBF58476D1CE4E5B9, 0x94D049BB133111EB)
 
 
 def key(seed: int, *names: str) -> int:
-    """A key of 64 bits: another one for another seed, or other names, or the same ones in another order."""
+    """64-bit key of a seed and some names; their order matters."""
     text = "\0".join([str(seed), *names])
     return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "little")
 
@@ -43,7 +43,7 @@ def uniform(word: int, counter: int) -> float:
 
 
 ROUNDING_S: Final = 2e-6  # stamps on the wire are whole microseconds, and sums of binary fractions miss the ticks
-LOSS, JITTER, USES = 0, 1, 2  # each sample has so many numbers of its own
+LOSS, JITTER, USES = 0, 1, 2  # random numbers of each sample: two, by their index
 
 
 class LinkEffects(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -117,9 +117,9 @@ class LinkChannel:
     def arrival(self, seq: int, stamp: float, since: float, size: int) -> float:
         """Time at which a sample that sets out at `stamp` [s] gets through; infinity if it is lost.
 
-        `since` [s] is that time after the common start; NaN or negative as long as that is not known or over: before
-        the common start nothing is lost and no link is too slow, since no run begins before all robots have received
-        their neighbours, and the real network repeats a first pose until it arrives. Nor is anything after the end.
+        `since` [s] is the time of `stamp` after the common start; NaN or negative before it is known or over. Before
+        the common start, and after the end, no sample is lost and no link is too slow. A run begins only when all
+        robots have received their neighbours, and the real network repeats a first pose until it arrives.
         """
         conditions = self._conditions
         if self.plain:
@@ -152,9 +152,10 @@ class LinkChannel:
         """Whether the link loses a sample, by its number alone.
 
         A link is good or bad, and loses a sample that finds it bad (Gilbert, Capacity of a burst-noise channel, Bell
-        System Technical Journal 39, 1960). One number u of each sample moves it: below the probability of becoming bad
-        it is bad then, above one less that of becoming good it is good, whatever it was; in between it stays as it was,
-        so that the last sample with another number decides. That one is looked for, and no state is kept.
+        System Technical Journal 39, 1960). One number u of each sample changes its state. With u below the probability
+        of becoming bad the link is bad, with u above one minus the probability of becoming good it is good. With u in
+        between it keeps its state, so the last sample with another u decides. The method looks for that sample and
+        keeps no state.
         """
         key, enter, leave = self._conditions.key, self._enter, self._leave
         while True:
@@ -224,7 +225,7 @@ class Channel:
         return arrived
 
     def forget(self, link: int) -> None:
-        """Samples under way on a link whose sender is gone never arrive: they would look like its return."""
+        """Drop the samples under way when the sender of a link is gone: they would look like its return."""
         self._flying = [each for each in self._flying if each[2] != link]
         heapify(self._flying)
 

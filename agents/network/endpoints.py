@@ -28,7 +28,7 @@ class EndpointError(ExplainedError, ValueError):
 
 
 def refusal(endpoint: str) -> str:
-    """Why the protocol of an endpoint is not supported, with the remedy; empty if it is."""
+    """Reason why the protocol of an endpoint is not supported, with the remedy; empty if it is."""
     protocol = endpoint.partition("/")[0]
     if protocol in PROTOCOLS:
         return ""
@@ -188,6 +188,6 @@ def near(endpoints: Sequence[str], senders: Mapping[str, set[str]], names: Seque
 
 
 def from_here(endpoint: str) -> str:
-    """Endpoint with which this machine connects to a listener of its own."""
+    """Endpoint with which this machine connects to its own listening socket."""
     parsed = Endpoint.parse(endpoint)
     return str(parsed.at("127.0.0.1")) if parsed.is_wildcard else endpoint

@@ -97,7 +97,7 @@ def files(folder: Path, name: str) -> Files:
         except OSError as error:
             raise LabError(f"{file}: cannot be read: {error.strerror}") from None
         if file == found.key and stat.S_IMODE(mode) & 0o077:
-            raise LabError(f"{file}: others can read this key: `chmod 600 {file}`, or revoke it if somebody has")
+            raise LabError(f"{file}: others can read this key: `chmod 600 {file}`, or revoke it if they have read it")
     return found
 
 
@@ -165,7 +165,8 @@ def lab_of(endpoints: Sequence[str]) -> Path | None:
 def session_id(name: str) -> str:
     """A Zenoh id, as text, for a session of an identity: random, and with the mark of its name at the end.
 
-    A router has one session of an id, whoever asks first: by the mark it knows an id that was taken from another.
+    A router accepts one session per id, the first; by the mark it recognises an id that was taken from another
+    identity.
     """
     first = secrets.choice("123456789abcdef")  # an id has no leading zero
     return first + secrets.token_hex(16)[: 31 - len(_mark(name))] + _mark(name)
@@ -176,7 +177,7 @@ def _mark(name: str) -> str:
 
 
 def robbed(known: Register, zid: str, common_name: str | None) -> str | None:
-    """The identity whose mark a session's id has, although its certificate is another one; None if all is well."""
+    """Identity of the mark in a session's id, if it differs from that of the certificate; else None."""
     for name, identity in known.identities.items():
         if zid.endswith(_mark(name)):
             return None if common_name == identity.common_name else name

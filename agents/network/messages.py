@@ -1,8 +1,8 @@
 """Messages on the network: their structs, their two encodings, and the decoding of payloads.
 
-JSON is the default (every Zenoh tool prints it), MessagePack a setting for thin links: a sample is MessagePack if its
-encoding says so, and JSON otherwise, since many tools set no encoding, or another one. `decode` raises `Malformed` for
-a payload that is not the struct, `agents.network.validation` for impossible values. Unknown numbers are left out of
+JSON is the default (every Zenoh tool prints it), MessagePack a setting for thin links. A sample without the encoding of
+MessagePack is read as JSON, since many tools set no encoding, or another one. `decode` raises `Malformed` for a payload
+that is not the struct, `agents.network.validation` for impossible values. Unknown numbers are left out of
 messages: JSON has no NaN.
 """
 
@@ -107,8 +107,8 @@ class GoalReceipt(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class State(Message, frozen=True, omit_defaults=True):
     """Telemetry of a body and its decision, for recorder and viewers; unknown numbers are left out.
 
-    Several states of one `seq` are one sample: `payloads` splits those whose `received` or `goal_receipts` is too long
-    for one payload.
+    Several states of one `seq` are one sample: `payloads` splits a state if its `received` or `goal_receipts` is too
+    long for one payload.
     """
 
     robot: str
@@ -210,7 +210,7 @@ class Goal(BareGoal, frozen=True, omit_defaults=True):
 class CentreState(Message, frozen=True):
     """Report of the central controller, at 1 Hz; counters since the start of its process.
 
-    Poses count that were measured in the run, by robot.
+    Pose counts cover poses measured during the run.
     """
 
     stamp: float  # [s] UTC

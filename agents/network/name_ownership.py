@@ -2,9 +2,9 @@
 
 Robots, the world and the central controller have names. A process claims a name with a token that carries the time of
 its start. Of several claims the earliest wins; a name that is owned already stays with its owner, whatever clocks say.
-Tokens end with their session, so a name is free again as soon as its owner is dead, or cut off, or stands still for
-longer than its lease. In the latter cases its tokens come back, maybe after another process has taken the name: a
-process that was cut off or stood still must ask (`OwnershipCheck`), and gives way to any other owner.
+Tokens end with their session, so a name is free again as soon as its owner is dead, cut off, or suspended for longer
+than its lease. In the last two cases its tokens come back, maybe after another process has taken the name. A process
+that was cut off or suspended must check this (`OwnershipCheck`), and gives way to any other owner.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ def claim(
 ) -> list[zenoh.LivelinessToken]:
     """Takes the ownership of names; returns the tokens that keep it, as long as they are referenced.
 
-    The decision has two rounds, before and after the token of the owner is declared. Of two processes, the one whose
-    token a router got later sees the other one's in its round, so that exactly one passes both.
+    The decision has two rounds, before and after the token of the owner is declared. Of two processes, the one with the
+    later token at the router sees the other token in its round. Exactly one process passes both rounds.
 
     Raises NameTaken if another process owns one of the names, or claimed it earlier; the tokens of a killed process are
     given `OWNER_VANISH_S` to vanish. Raises network.Unreachable without an answer in `ANSWER_S`, or when `stop` is set.
@@ -87,7 +87,7 @@ def _earlier_claims(
     while True:
         found = {key: network.tokens_present(session, Keys.lives(key)) for key in alive}
         if pause.is_set():
-            raise network.Unreachable("told to end before the name was taken")
+            raise network.Unreachable("asked to end before the name was taken")
         if None not in found.values() and network.connected(session):
             break
         if time.monotonic() > deadline:
@@ -111,7 +111,7 @@ def keep(session: zenoh.Session, alive: Sequence[str], pause: threading.Event) -
     One answer is not enough: a link that is lost ends its questions as an answer does, and a process that takes the
     name may be between its two rounds. No other owner must be seen for `SETTLE_S`. One that is seen may still give way
     to the claim of this process, for `OWNER_VANISH_S`. `pause` ends the wait when it is set. The tokens of the session
-    are declared, and Zenoh declares them anew when it was cut off.
+    are declared; Zenoh declares them again after it was cut off.
 
     Raises NameTaken if another process owns one of the names, and network.Unreachable if `pause` was set before that
     was known; without a router the wait has no limit.
@@ -137,14 +137,14 @@ def keep(session: zenoh.Session, alive: Sequence[str], pause: threading.Event) -
             if now - free > SETTLE_S:
                 return
         pause.wait(network.RETRY_S)
-    raise network.Unreachable("told to end before it was known whether the name has another owner")
+    raise network.Unreachable("asked to end before it was known whether the name has another owner")
 
 
 class OwnershipCheck:
     """Check whether a process still owns its names, in a thread of its own: a loop polls the result."""
 
     def __init__(self, alive: Sequence[str], lease_s: float = LEASE_S) -> None:
-        """Begin when the names are owned: liveliness keys `alive`, in a session whose lease is `lease_s` [s]."""
+        """Begin when the names are owned: liveliness keys `alive`, in a session with the lease `lease_s` [s]."""
         self._alive, self._stood_s = alive, 0.5 * lease_s
         self.awake_at = uptime()  # last run of the process [s]
         self._taken = ""
@@ -170,7 +170,7 @@ class OwnershipCheck:
         return self._asking is None
 
     def stood_still(self) -> bool:
-        """Standstill of the process since the last call, so long that its names may have another owner."""
+        """Whether the process stood still since the last call for longer than its names are safe."""
         last, self.awake_at = self.awake_at, uptime()
         return self.awake_at - last >= self._stood_s
 
@@ -226,11 +226,11 @@ class NameKeeper:
         except NameTaken as taken:
             raise NameTaken(
                 f"{self._owners_text(taken)}: a robot of this name is on the network already; end it first "
-                "(`./zenpark keys` shows who is there), or choose another router with --connect"
+                "(`./zenpark keys` lists its members), or choose another router with --connect"
             ) from None
 
     def stood_still(self) -> bool:
-        """Standstill of the process since the last call, so long that its names may have another owner."""
+        """Whether the process stood still since the last call for longer than its names are safe."""
         return self._check.stood_still()
 
     def begin_check(self, session: zenoh.Session) -> None:

@@ -42,10 +42,10 @@ T = TypeVar("T")
 
 
 def pose_publisher(session: zenoh.Session, key: str, mime: str, kept: int = 1) -> AdvancedPublisher:
-    """A publisher whose last `kept` values are never lost, however rarely it publishes.
+    """A publisher that never loses its last `kept` values, however rarely it publishes.
 
-    Late joiners ask for the last value (cache), subscribers that were cut off ask again when they see the publisher
-    reappear (detection), and a value lost before a silence is noticed by the heartbeat.
+    Late joiners request the last value (cache). Subscribers that were cut off request it again when the publisher
+    reappears (detection). The heartbeat reveals a value lost before a silence.
     """
     return declare_advanced_publisher(
         session,
@@ -180,12 +180,12 @@ class Inbox(Generic[M]):
         kind: type[M],
         *,
         keys: Keys | None = None,  # if given, a message must carry the name of the robot of its key
-        robots: Container[str] | None = None,  # messages of others are left out; None: of none
+        robots: Container[str] | None = None,  # robots with accepted messages; None: all
         on_refusal: Callable[[str, str], object] | None = None,  # called with key and reason of each refusal
     ) -> None:
         """Reads `kind` from the queue of a subscription."""
         self._subscription, self._kind, self._keys, self._on_refusal = subscription, kind, keys, on_refusal
-        self._next = subscription.handler.try_recv  # the handler is made anew by Zenoh whenever it is asked for
+        self._next = subscription.handler.try_recv  # Zenoh makes a new handler at each access
         self._robots = robots
         self._key, self._owner = "", None if keys is None else keys.whose("")  # of the last sample: mostly the next's
         self.malformed, self.trouble = 0, ""  # refused payloads, and the reason of the last refusal
@@ -325,8 +325,8 @@ class Orders(Generic[M]):
     def read(self) -> Iterator[tuple[zenoh.Query, M]]:
         """Queued orders with their queries. Reply inside `with query:` and on the key, or the client waits.
 
-        A malformed order gets an error for a reply. A query without payload is no order: tools that read all keys
-        (`get park/**`) send such and get no reply; one on the key itself gets the form of an order.
+        A malformed order gets an error as its reply. A query without payload is no order: tools that read all keys
+        (`get park/**`) send one and get no reply. Such a query on the key itself gets the form of an order.
         """
         for query in received(self._queries):
             payload = query.payload.to_bytes() if query.payload is not None else b""
@@ -358,8 +358,10 @@ def _ends_flight(query: zenoh.Query) -> bool:
 
 
 class LastValue:
-    """Answers a plain `get` (z_get, REST) on a key with its last value, which the cache of an advanced publisher does
-    not; polled by `answer` from the control loop, so it costs no thread."""
+    """Reply to a plain `get` (z_get, REST) on a key: the last value, which the cache of the publisher does not give.
+
+    Polled by `answer` from the control loop, so it costs no thread.
+    """
 
     def __init__(self, session: zenoh.Session, key: str, mime: str) -> None:
         self.key = key

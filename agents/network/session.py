@@ -1,9 +1,9 @@
 """Sessions on the Zenoh network: opening, connection state, and detection of a silent router.
 
-Everything that is received waits to be polled from the control loop: frequent samples in a ring channel, which keeps
-the newest ones and never blocks; rare ones in a queue (`agents.network.pubsub`). A callback of the usual kind would
-cost a thread each, a slow one stops all reception of its session, and one that is left open keeps the interpreter from
-exiting. The emergency stop alone cannot wait for the next tick (`pubsub.ImmediateSubscriber`).
+The control loop polls all received samples. Frequent samples wait in a ring channel, which keeps the newest ones and
+never blocks; rare ones wait in a queue (`agents.network.pubsub`). A callback of the usual kind would cost a thread
+each, a slow one stops all reception of its session, and one that is left open keeps the interpreter from exiting. The
+emergency stop alone cannot wait for the next tick (`pubsub.ImmediateSubscriber`).
 """
 
 from __future__ import annotations
@@ -149,7 +149,7 @@ LINK_S: Final = 0.01
 ENDPOINT_FREE_S: Final = 3.0  # limit for the endpoint of a robot of a mesh that is restarted to become free
 ROBOT_LEASE_S: Final = 1.2  # of robots: the neighbours of a robot that hangs must detect it within 1.5 s
 ASK_EVERY_S: Final = 0.4  # between two queries to the router
-ANSWER_S: Final = 0.3  # without a reply for so long the router is silent
+ANSWER_S: Final = 0.3  # time without a reply after which the router counts as silent
 ASKED: Final = 8  # pending queries
 LOOK_S: Final = 0.1  # most time between two polls that counts as silence of the router
 
@@ -178,8 +178,9 @@ def open_session(
     """A session on the network of some endpoints; use it in a `with`.
 
     It is a client of the first router that answers. In a mesh (`agents.network.endpoints`) it is linked with all
-    members, also with later ones. Raises EndpointError if an endpoint is malformed, or it cannot listen there, LabError
-    if its lab has no such identity, and Unreachable without an answer in time, or when `stop` is set before.
+    members, also with later ones. Raises EndpointError if an endpoint is malformed, or cannot be listened on, and
+    LabError if its lab has no such identity. Raises Unreachable without an answer in time, or when `stop` is set
+    before.
     """
     ends = topology.ends(endpoints, name)
     chosen = config(

@@ -53,8 +53,9 @@ def settings(
     """Settings of every session: no multicast, no gossip, no shared memory, listening on loopback only.
 
     With a lab (`agents.network.lab`) both ends show certificates, and listening beyond loopback is allowed. Raises
-    EndpointError if an endpoint is malformed, or one to listen on can be reached from outside this machine although
-    there is no lab, or the lab's router has no rights to enforce, and LabError if the lab has no such identity.
+    EndpointError if an endpoint is malformed, and LabError if the lab has no such identity. An endpoint to listen on
+    that can be reached from outside this machine is an EndpointError without a lab, or if the lab's router has no
+    rights to enforce.
     """
     for endpoint in (*connect, *listen):
         protocol, slash, address = endpoint.partition("/")
@@ -82,7 +83,7 @@ def settings(
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "transport/link/tx/lease": round(lease_s * 1000),
-        # A client that has lost its router tries them in the order of the list: a frozen one delays it so long.
+        # A client without its router tries them in the order of the list; a frozen one delays it by this time.
         "transport/unicast/open_timeout": round((NEXT_S if mode == "client" and len(connect) > 1 else OPEN_S) * 1000),
         "transport/unicast/accept_timeout": round(OPEN_S * 1000),
         "transport/shared_memory/enabled": False,

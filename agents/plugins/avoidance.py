@@ -1,4 +1,4 @@
-"""Avoidance: keeping clear of obstacles seen by range sensors and of robots whose poses are received.
+"""Avoidance: keeping clear of obstacles seen by range sensors and of robots with received poses.
 
 An avoidance is a frozen struct of its parameters, found by the entry-point group `zenpark.avoidances`. It may act at
 two levels: `deviate` shifts a goal (individual level; the potential of the paper), `restrain` limits the setpoint
@@ -24,7 +24,7 @@ HURRY: Final = 2.0  # times its limit of speed: no robot is faster, not along th
 
 
 class Thing:
-    """Thing near a robot: an upright cylinder, a robot whose pose was received or the end of a range reading.
+    """Thing near a robot: an upright cylinder, a robot with a received pose or the end of a range reading.
 
     What follows `lag` is set by `measure`.
     """
@@ -84,7 +84,7 @@ class Nearby:
         self.reserve(1)  # a compiler wants to see what is in a list
 
     def reserve(self, count: int) -> None:
-        """Make room for so many things; rare."""
+        """Make room for `count` things; rare."""
         while len(self.things) < count:
             self.things.append(Thing())
             self.planes.append(Plane())
@@ -151,7 +151,7 @@ class Avoidance(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
 
     hears: Annotated[
         Literal["neighbours", "all"],
-        Meta(description="robots whose poses are received for it: neighbours of the formation, or all"),
+        Meta(description="robots with poses received for it: neighbours of the formation, or all"),
     ] = "neighbours"
     clearance: Annotated[
         NotNegative,
@@ -185,15 +185,15 @@ class Potential(Avoidance, frozen=True):
     """The repulsive potential of the paper, eqs. (2) to (4): a shift of the goal away from near things.
 
     Each thing k within d0 pushes with F_k = η (1/d_k − 1/d0) / d_k² along the horizontal unit vector from it to the
-    robot, and the goal is shifted by u = h v F/‖F‖, F = Σ F_k; d is between surfaces once both stopped. In a layer of
+    robot. The goal is shifted by u = h v F/‖F‖, F = Σ F_k; d is between surfaces once both stopped. In a layer of
     `LAYER` below d0 the shift grows in proportion to ‖F‖ (Slotine and Sastry, "Tracking control of non-linear systems
     using sliding surfaces", Int. J. Control 38(2), 1983), and the part of the pull against F also pulls aside, by
     `ASIDE` (a vortex field: De Luca and Oriolo, "Local incremental planning for nonholonomic mobile robots", ICRA
-    1994). docs/plugins.md says why, and how what the paper leaves open is read.
+    1994). docs/plugins.md gives the reasons, and the choices where the paper leaves something open.
     """
 
     reach: Annotated[Positive, Meta(description="d0, from surface to surface [m]")] = 0.30
-    strength: Annotated[Positive, Meta(description="η [N m³], of all forces alike")] = 1.5e-4
+    strength: Annotated[Positive, Meta(description="η [N m³], equal for all forces")] = 1.5e-4
     velocity: Annotated[Positive, Meta(description="v [m/s]; left out: the robot's limit of speed")] = inf
     period_s: Annotated[NotNegative, Meta(description="h [s]; 0: 1/response of the robot's kind")] = 0.0
 

@@ -20,25 +20,24 @@ SKEW: Final = 0.2  # a robot on wheels hardly flees along a heading this far (it
 LEAST: Final = 1e-100  # to divide by: beyond any speed, and still a number
 
 Planar = tuple[float, float]  # x, y
-Solution = tuple[float, float, float]  # x, y, and by how much bounds clash, or -1: not at all [m/s]
+Solution = tuple[float, float, float]  # x, y, and the excess of clashing bounds, or -1: none clash [m/s]
 
 
 class Barrier(Avoidance, frozen=True):
     """A control barrier function, kept by a quadratic program in closed form.
 
-    For each thing near a robot let n be the horizontal unit vector from it to the robot, h the gap between their
-    surfaces less `margin`, and s = h − τ_i [−n·v_i]₊ − τ_j [n·v_j]₊ the part of h that would remain if both stopped
-    now: a body whose velocity follows its commands with time constant τ goes on for τ v. The commanded velocity u must
-    obey
+    For each thing near a robot let n be the horizontal unit vector from it to the robot and h the gap between their
+    surfaces less `margin`. If both stopped now, s = h − τ_i [−n·v_i]₊ − τ_j [n·v_j]₊ of it would remain: a body that
+    follows its commands with time constant τ moves on by τ v. The commanded velocity u must obey
 
         −n·u ≤ α s / 2                  its half; the other robot keeps the other half
         −n·u ≤ α s − [n·v_j]₊           for the received velocity of the other robot
         −n·u ≤ α s                      in place of the first, where s < 0: back off
 
-    and is the one nearest to the wanted velocity w (‖u − w‖² least, a quadratic program in two variables). At the last,
-    the speed of robots on wheels along their heading is limited by the same inequalities, of which none forbids turning
-    on the spot; before that their goal is shifted to where u points, so that they drive around things rather than stop,
-    and by a smaller α (`steering`), so that they have turned in time.
+    and is the one nearest to the wanted velocity w (‖u − w‖² least, a quadratic program in two variables). In the end,
+    the same inequalities limit the speed of robots on wheels along their heading; none forbids turning on the spot.
+    Before that their goal is shifted in the direction of u, so that they drive around things rather than stop. A
+    smaller α (`steering`) applies there, so that they have turned in time.
 
     All inequalities are kept wherever some velocity within the limit of speed does so. Those that standing still obeys
     are always kept. Where only a velocity beyond the limit would obey the others (something comes faster than the
@@ -55,12 +54,10 @@ class Barrier(Avoidance, frozen=True):
     """
 
     margin: Annotated[NotNegative, Meta(description="gap between surfaces that is kept [m]")] = 0.05
-    alpha: Annotated[Positive, Meta(description="α: how fast a gap may be used up, per metre of it [1/s]")] = 3.0
+    alpha: Annotated[Positive, Meta(description="α: speed at which a gap may shrink, per metre of it [1/s]")] = 3.0
     steering: Annotated[
         Positive,
-        Meta(
-            description="robots on wheels are steered by this share of α around robots whose poses they receive", le=1
-        ),
+        Meta(description="share of α with which robots on wheels steer around robots with received poses", le=1),
     ] = 0.2
     right: Annotated[
         NotNegative, Meta(description="share of the barred velocity that is driven to the right instead")
@@ -186,11 +183,10 @@ def along_heading(v: float, own: OwnState, near: Nearby) -> float:
 
 
 def closest(x: float, y: float, speed: float, near: Nearby) -> Planar:
-    """The velocity nearest to x, y [m/s] among those within `speed` that obey all half-planes.
+    """Velocity nearest to x, y [m/s] among those within `speed` that obey all half-planes.
 
-    If none obeys them, the one nearest among all velocities that do is made so much smaller that it keeps to `speed`.
-    If there is none at all, bounds below 0 are raised together by as little as makes one obey; the other half-planes
-    have standing still in common.
+    If none obeys them, the nearest of all velocities that do is scaled down to `speed`. If there is none at all, bounds
+    below 0 are raised together by as little as makes one obey; the other half-planes have standing still in common.
     """
     found_x, found_y, clash = solution(x, y, speed, near, 0.0)
     if clash < 0.0:
@@ -211,7 +207,7 @@ def closest(x: float, y: float, speed: float, near: Nearby) -> Planar:
 
 
 def solution(x: float, y: float, speed: float, near: Nearby, raised: float) -> Solution:
-    """As `closest`, with bounds below 0 `raised` [m/s], or how much farther those that clash must be raised.
+    """As `closest`, with bounds below 0 `raised` [m/s], or the further rise that clashing bounds need.
 
     One half-plane after the other is added. If the nearest point so far does not obey it, then the new one lies on its
     border, in the interval that those before it leave there (Seidel, Discrete & Computational Geometry 6, 1991).
@@ -251,7 +247,7 @@ def solution(x: float, y: float, speed: float, near: Nearby, raised: float) -> S
 
 
 def clash_of(first: Plane, second: Plane, third: Plane, raised: float, slack: float) -> float:
-    """How much farther the bounds below 0 must be raised so that three half-planes have a common point [m/s].
+    """Further rise of the bounds below 0 until three half-planes have a common point [m/s].
 
     They have none if −Σ λ b > 0, where λ ≥ 0 are the weights with which their normals cancel out. Two that face each
     other come as three, of which two are one.

@@ -25,8 +25,8 @@ LONGEST: Final = 60  # characters of a result that is shown
 def explain(error: Exception, plugins: Iterable[tuple[str, object]]) -> Exception:
     """Error that names the one of `plugins` that is to blame for an exception of a tick; else the exception itself.
 
-    A plug-in, which comes with what it is, a law for example, is to blame if its method was at work, or if the line
-    that called it could not use its result.
+    Each plug-in comes with its sort, a law for example. A plug-in is to blame if its method was running, or if the
+    calling line could not use its result.
     """
     if isinstance(error, PluginError):
         return error
@@ -56,7 +56,7 @@ def failure(what: str, plugin: object, error: Exception) -> PluginError:
 
 
 def wrong(what: str, plugin: object, method: str, result: object, wanted: str) -> PluginError:
-    """Error that names a plug-in whose `method` gave a `result` other than what is `wanted`, in words."""
+    """Error that names a plug-in with a `method` that gave a `result` other than the `wanted` one, in words."""
     got = "nothing: is a `return` missing?" if result is None else repr(result)[:LONGEST]
     name, file = type(plugin).__name__, _file(plugin)
     return PluginError(f"`{method}` of the {what} {name} must give {wanted}, not {got} ({plain(file)})")

@@ -1,8 +1,8 @@
 """Plug-ins in a Python file beside an experiment: `"pursuit.py:Pursuit"` instead of a name, without an installation.
 
-Whoever reads the experiment file adopts the Python file: a copy goes into the user's cache under its digest, and the
-choice becomes `pursuit.py:Pursuit@DIGEST`. Every process of that user on this machine loads that copy and no other.
-A choice of another machine or of a recording is thus loaded only if its user has read such a file here.
+The reader of the experiment file adopts the Python file: a copy goes into the user's cache under its digest, and the
+choice becomes `pursuit.py:Pursuit@DIGEST`. Every process of that user on this machine loads that copy and no other. A
+choice of another machine or of a recording is thus loaded only if its user has read such a file here.
 """
 
 from __future__ import annotations

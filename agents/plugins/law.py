@@ -27,7 +27,7 @@ T = TypeVar("T")
 
 
 class Said(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How neighbours get a variable of the memory."""
+    """Transmission of a variable of the memory to neighbours."""
 
     unit: str = "1"
     metre: float = 1.0  # change of it that counts, for every trigger, as one metre of deviation of the pose

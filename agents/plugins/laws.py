@@ -35,9 +35,9 @@ class Gradient(Law, frozen=True):
 class Distance(Gradient, frozen=True):
     """Formation by distances: the negative gradient of Σ μ/8 (d² − ‖p_i − p_j‖²)² (paper, eq. (6)).
 
-    With a `dead_zone` b a link with error s pulls as if its error were s less b, and not at all below. Two robots that
-    disagree about the length of their link by less than 2b, because of different distances or outdated positions of
-    each other, then both find a length at which they rest. Without it they push and pull for ever, which turns the
+    With a `dead_zone` b a link with error s pulls as if its error were s less b, and not at all below. Two robots may
+    disagree about the length of their link, because of different distances or outdated positions of each other. Below
+    2b of disagreement both find a length at which they rest. Without it they push and pull for ever, which turns the
     whole formation (Mou, Belabbas, Morse, Sun, Anderson, IEEE TAC 2016).
     """
 
@@ -75,8 +75,8 @@ class Bearing(Gradient, frozen=True):
     """Formation by directions: the negative gradient of Σ k/2 (distance of p_i − p_j from the ray along g_ij)².
 
     On the side that g_ij points to, this is −k P_g (p_i − p_j) with the projector P_g = I − g gᵀ of Zhao and Zelazo
-    (IEEE Transactions on Control of Network Systems 4(3), 2017); on the other side, where that law is content with the
-    opposite direction, the robots first close up. The size of the formation is left to two leaders, or to heights.
+    (IEEE Transactions on Control of Network Systems 4(3), 2017). On the other side that law accepts the opposite
+    direction; here the robots first close up. The size of the formation is left to two leaders, or to heights.
     """
 
     NEEDS: ClassVar[Need] = "bearing"

@@ -29,7 +29,7 @@ class Predictor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     """Extrapolation between two messages; a subclass that defines nothing holds the last pose."""
 
     def position(self, pose: Sent, age: float) -> Vector:
-        """Believed position [m] of the robot whose `pose` is of this `age` [s].
+        """Estimated position [m] of the robot with a `pose` of this `age` [s].
 
         Negative ages, which clocks of two machines can make, count as zero.
         """
@@ -52,12 +52,12 @@ class ConstantVelocity(Predictor, frozen=True):
     """p̂ = p_k + v_k · min(t − t_k, horizon): the last transmitted motion, which stops after the horizon.
 
     The linear predictor of Y. S. Suh, "Send-On-Delta Sensor Data Transmission With A Linear Predictor", with the
-    velocity taken from the message instead of from the samples before. Without a horizon the belief about a robot whose
-    last message was lost runs away until its next message.
+    velocity taken from the message instead of from the samples before. Without a horizon the estimate runs away after a
+    lost message, until the next one arrives.
     """
 
     horizon_s: Annotated[
-        Positive, Meta(description="the last velocity is used for this long [s]; left out: for ever")
+        Positive, Meta(description="time for which the last velocity is used [s]; left out: for ever")
     ] = inf
 
     def position(self, pose: Sent, age: float) -> Vector:

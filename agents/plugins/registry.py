@@ -50,7 +50,7 @@ BASES: Final = {
 
 
 class _Groups(Protocol):
-    """Result of `entry_points()`, whose type Python 3.12 changed."""
+    """Result of `entry_points()`; Python 3.12 changed its type."""
 
     def select(self, *, group: str) -> EntryPoints: ...
 
@@ -81,8 +81,9 @@ def names(group: str) -> list[str]:
 def load(group: str, name: str) -> Any:  # noqa: ANN401 - what it is depends on the group
     """The object registered under a name.
 
-    Raises UnknownPlugin with the nearest name, or all of them; and PluginError, with the distributions, if two register
-    different ones under this name, if the module fails to import, or if it is no class as the base of the group asks.
+    Raises UnknownPlugin with the nearest name, or all of them. Raises PluginError, with the distributions, if two
+    register different objects under this name, or if the module fails to import. Raises it, too, for an object that is
+    no class derived from the base of the group.
     """
     if files.is_choice(name):
         return _fitting(group, name, _in_file(name))
@@ -139,7 +140,7 @@ def module(group: str, name: str) -> str:
 
 
 def unusable(use: Callable[[str, str], object]) -> list[str]:
-    """Why what a file may name cannot be used: a line for each plug-in that `use(group, name)` refuses."""
+    """Reasons why plug-ins that a file may name cannot be used: a line for each one that `use(group, name)` refuses."""
     lines = []
     for group in CHOSEN:
         for name in names(group):
@@ -213,7 +214,7 @@ def body_name(address: str) -> str:
 
 
 def distributions(text: str | None = None) -> dict[str, str]:
-    """Installed distributions with plug-ins, and their versions, but for our own; with metrics, or named, if `text`."""
+    """Installed distributions with plug-ins, and their versions, except our own; with metrics, or named, if `text`."""
     words = None if text is None else {*re.findall(r"[\w.-]+", text)}
     used = [
         (entry, dist) for entry, dist in _foreign() if entry.group == METRICS or words is None or entry.name in words
@@ -261,7 +262,7 @@ def _registered(group: str) -> dict[str, list[EntryPoint]]:
 
 
 def _reason(error: BaseException) -> str:
-    """Why a module fails to import, with the nearest name where it asks `zenpark` for another."""
+    """Reason why a module fails to import, with the nearest name of `zenpark` for an unknown one."""
     asked = re.search(r"import name '(\w+)'", str(error))
     if asked and isinstance(error, ImportError) and error.name == FACE:
         return f"{FACE} has no {asked[1]!r}; {did_you_mean(asked[1], dir(sys.modules[FACE]))}"

@@ -1,8 +1,7 @@
 """Families of triggers from the literature on event-based sampling and control, by their inequalities.
 
 ε is the held value less the true one, e the errors of a robot's links, y = Σ|e| and V = Σ ½e² as the robot itself knows
-them, t_k its last event. Each publication is about a state, an input and a plant of its own; here ε and y take their
-place.
+them, t_k its last event. Each publication has its own state, input and plant; here ε and y replace them.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Triggers: decide when a robot transmits (communication) or computes its law anew (control).
+"""Triggers: decide when a robot transmits (communication) or recomputes its law (control).
 
 A trigger is a frozen struct of its parameters, found by the entry-point group `zenpark.triggers`. What it remembers
 stands outside of it, by name, so that one serves all robots. It judges a held value: for communication the position
@@ -75,7 +75,7 @@ class Trigger(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     PLACES: ClassVar[tuple[Place, ...]] = ("communication", "control")  # where it makes sense
     PREDICTION: ClassVar[str] = "hold"  # default of an experiment that names none
     JUDGES_ERRORS: ClassVar[bool] = False  # uses errors of the formation, which are 0 for robots that a centre guides
-    JUDGES_DRIFT: ClassVar[bool] = False  # waits by how the pose drifts, and asks of nothing else meanwhile
+    JUDGES_DRIFT: ClassVar[bool] = False  # waits by the drift of the pose, and uses no other input meanwhile
     TIMED: ClassVar[bool] = False  # fires by time alone, whatever is measured
     MEMORY: ClassVar[Mapping[str, float]] = {}  # what it remembers from question to question, with its first values
 

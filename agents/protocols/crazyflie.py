@@ -50,7 +50,7 @@ class Loco(Part, frozen=True, tag_field="system", tag="loco"):
     """Loco deck and anchors."""
 
     mode: Literal["auto", "twr", "tdoa2", "tdoa3"] = "auto"  # how ranges are measured
-    # positions [m] of anchors 0, 1, ...; empty: what they were told before
+    # positions [m] of anchors 0, 1, ...; empty: keep the last ones
     anchors: list[tuple[float, float, float]] = []
 
 

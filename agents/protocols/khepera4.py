@@ -41,7 +41,7 @@ Server = Literal["2023-01-07", "2023-01-15", "2023-04-10", "2025-05", "fork", "k
 class ParkServer:
     """Behaviour of one published server of Robotic Park (`server.c`, `prog-template.c` of its ROS package).
 
-    All read one command per `read()`, without a time limit for the last one: none stops a robot whose link is gone.
+    All read one command per `read()`, without a time limit for the last one: none stops a robot without a link.
     """
 
     answer: Literal["increments", "heading", "pose"]  # of `p`: d,dθ or d,θ or x,y,θ
@@ -93,7 +93,7 @@ class Khepera4Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
 
 
 def fitting(answer: str) -> list[str]:
-    """The park servers whose `p` may be answered like that."""
+    """Park servers that may give such an answer to `p`."""
     words = answer.split(",")
     if not all(re.fullmatch(r"[-+]?\d+\.\d+", word) for word in words):
         return []
@@ -119,8 +119,9 @@ def park_goal_2023_04(v: float, turn: float) -> tuple[float, float]:
     """Goal (x, y) [m] at which the controller of 2023-04-10 drives `v` [m/s] and `turn` [rad/s] from (0, 0, π/2).
 
     Its law, from the bearing error e of the goal: ω = 1.5 sin e, and v = (|Δx| + 100 Δy²) (3.14 − ⌊|e|⌋)/3.14 in cm/s,
-    10 at most and never negative; it stands when |Δx| + 100 Δy² is at most 0.01. Along y such a goal is near: 10 cm/s
-    need 0.32 m, so a robot that is told nothing more stops there. The least goal that turns on the spot lies 1 cm away.
+    10 at most and never negative; the robot stands still when |Δx| + 100 Δy² is at most 0.01. Along y such a goal is
+    near: 10 cm/s need 0.32 m, so a robot without further commands stops there. The least goal that turns on the spot
+    lies 1 cm away.
     """
     if not v and not turn:
         return 0.0, 0.0
@@ -145,7 +146,7 @@ def park_goal_2023_01(v: float, turn: float, theta: float) -> tuple[float, float
 
 
 def units(v: float, turn: float) -> tuple[int, int]:
-    """Speed units of the left and right wheel; both slowed alike where one would be too fast."""
+    """Speed units of the left and right wheel; both slowed by the same factor if one would be too fast."""
     half = 0.5 * BASE * turn
     left, right = (v - half) / UNIT, (v + half) / UNIT
     share = max(1.0, abs(left) / FASTEST, abs(right) / FASTEST)

@@ -1,8 +1,8 @@
 """ROS 2 on Zenoh as bytes: message types and CDR, key expressions, attachments and liveliness tokens.
 
-Two middlewares put ROS 2 on Zenoh. zenoh-bridge-ros2dds ("ros2dds") passes the CDR of DDS topics on under plain keys;
-rmw_zenoh ("rmw") is ROS 2 itself on Zenoh: its keys name type and type hash, every sample carries an attachment, and
-liveliness tokens are the graph that `ros2 topic list` shows. Sources: rmw_zenoh, docs/design.md, and the tokens and
+Two middlewares put ROS 2 on Zenoh. zenoh-bridge-ros2dds ("ros2dds") passes the CDR of DDS topics on under plain keys.
+rmw_zenoh ("rmw") is ROS 2 itself on Zenoh: its keys name type and type hash, and every sample carries an attachment.
+Its liveliness tokens are the graph that `ros2 topic list` shows. Sources: rmw_zenoh, docs/design.md, and the tokens and
 attachments that its `liveliness_utils` and `attachment_helpers` write; zenoh-plugin-ros2dds, `liveliness_mgt`.
 
 `rosbags` and `xxhash` are the extra `ros`; they are imported when the first `Types` is made.

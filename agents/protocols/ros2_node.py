@@ -81,7 +81,7 @@ class Publisher:
 
     def __init__(self, node: Node, kind: str, key: str, token: str) -> None:
         participant = node.participant
-        self._node = node  # a token that nobody holds is taken back: the node lives as long as what it has
+        self._node = node  # a token without a reference is taken back: the node lives as long as what it has
         self.kind: Final = kind
         self.key: Final = key
         self._types = participant.types

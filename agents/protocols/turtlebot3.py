@@ -37,7 +37,10 @@ _NAMESPACE: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)
 
 
 class TurtleBot3Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The `device` table of a TurtleBot3. Robot and twin read the same one, so that a switch changes nothing else."""
+    """The `device` table of a TurtleBot3.
+
+    Robot and twin read the same table, so that a switch between them changes no other setting.
+    """
 
     distro: Distro = "jazzy"  # ROS 2 distribution of the robot; what its address says counts more
     domain: Annotated[int, Meta(ge=0, le=ros2.MAX_DOMAIN)] = 0  # ROS_DOMAIN_ID, for style "rmw"; likewise
@@ -118,7 +121,7 @@ def whole(speed: float, limit: float) -> float:
 def charge(voltage: float, percentage: float) -> float:
     """Charge from 0 to 1 of a BatteryState.
 
-    ROS asks for a percentage from 0 to 1, the robot sends 0 to 100 and stops updating it when nearly empty: where the
+    ROS specifies a percentage from 0 to 1; the robot sends 0 to 100, and stops updating it when nearly empty. If the
     voltage is known the lower of the two counts.
     """
     full = percentage / 100.0 if percentage > 1.0 else percentage

@@ -1,9 +1,9 @@
 """Wire format of the Vicon DataStream: TCP, little endian, unpadded, millimetres and rotation matrices.
 
 A packet is the magic number, a length, and blocks; a block is its kind, a length, and a payload. Text is its length and
-bytes, a list its count and items. The server speaks first and offers the kinds of block that it has; the client answers
-with those that it wants and asks for one frame, or for all as they come. What does not change from frame to frame
-(names, axes) may be sent once and is then valid until it is sent again.
+bytes, a list its count and items. The server begins and offers its kinds of block. The client answers with those that
+it wants, and requests one frame, or all as they come. What does not change from frame to frame (names, axes) may be
+sent once and is then valid until it is sent again.
 """
 
 from __future__ import annotations
@@ -191,7 +191,7 @@ def unpack_frame_number(payload: bytes) -> int:
 
 
 def unpack_latency(payload: bytes) -> float:
-    """How old a frame is [s], all stages together."""
+    """Age of a frame [s], all stages together."""
     (count,) = _unpack(_WORD, payload, 0)
     at, total = 4, 0.0
     for _ in range(count):

@@ -41,7 +41,7 @@ class NetworkLaunch(msgspec.Struct, frozen=True, kw_only=True, rename="kebab"):
 
     connect: Annotated[list[str], Meta(title="ENDPOINT", description=f"default: {DEFAULT_ENDPOINT}")] = []
     lab: Annotated[str | None, Meta(title="FOLDER", description="certificates of a lab (`./zenpark cert init`)")] = None
-    identity: Annotated[str, Meta(title="NAME", description="whose certificate, in a lab")] = msgspec.field(
+    identity: Annotated[str, Meta(title="NAME", description="name of the certificate, in a lab")] = msgspec.field(
         default="", name="as"
     )
     realm: Annotated[str, Meta(description="first chunk of the robots' keys")] = Keys().realm

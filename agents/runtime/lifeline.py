@@ -1,7 +1,7 @@
 """Parent-death detection: the launcher writes a heartbeat to the standard input of a process.
 
-End of file means that the launcher is gone, silence that it hangs or that the network to it is cut. This works for a
-local process and through ssh alike, on every operating system.
+End of file means that the launcher is gone, silence that it hangs or that the network to it is cut. This works equally
+for a local process and through ssh, on every operating system.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ FAR_SILENCE_S: Final = 4.5
 LONGEST: Final = 4096  # of a line [bytes]
 
 
-GONE: Final = "the starter is gone"  # or has come to its end
+GONE: Final = "the starter is gone"  # or has ended
 
 
 class Lifeline:

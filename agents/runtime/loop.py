@@ -68,7 +68,7 @@ class Setup:
     # source of the range readings of each row: its body; the world, by the key `ranges` of the row ("world"); or that
     # key, received by the body itself ("far"). Left out: the bodies.
     ranging: Sequence[Ranging] = ()
-    # located rows whose positions a simulation knows without noise: they may repeat. Left out: none
+    # located rows with noise-free positions from a simulation, which may repeat. Left out: none
     exact: Sequence[bool] = ()
     # effects of the modelled channel on received poses, for each robot by link; empty: none
     conditions: Sequence[Sequence[Conditions]] = ()
@@ -119,8 +119,8 @@ class Runtime:
     def run(self) -> int:
         """Opens the body, joins the network, drives until all is done; returns the exit code of the process.
 
-        Raises BodyError if the body cannot be opened, network.Unreachable if no router answers, and NameTaken if
-        another process owns the name of a robot, or took it while this one stood still or was cut off: then the body
+        Raises BodyError if the body cannot be opened, and network.Unreachable if no router answers. Raises NameTaken if
+        another process owns the name of a robot, or took it while this one was suspended or cut off. The body then
         belongs to that process and is left as it is.
         """
         lost = threading.Event()

@@ -84,7 +84,7 @@ def _start(robot: Robot, order: Order, t: float, utc: float) -> str:
 
 
 def _misdated(robot: Robot, at: float, origin: Setpoint | None, t: float, utc: float) -> str:
-    """Why a common start `at` [s, UTC], or the origin of a plan, cannot be; empty: it can."""
+    """Reason why a common start `at` [s, UTC], or the origin of a plan, is impossible; empty if it is possible."""
     if not isfinite(at):
         return NEEDS_AT
     if not t - robot.assignment.duration < at - utc < t + SOON_S:

@@ -60,8 +60,8 @@ class NeighbourSubscription:
     ) -> None:
         """Subscribes to the robot `name`, the sender on `links`.
 
-        `reach` has the largest |x|, |y|, |z| of a valid pose [m], `rate` is the largest rate of its poses [1/s],
-        `depth` of them may wait, and each rings the `bell`, if there is one.
+        `reach` has the largest |x|, |y|, |z| of a valid pose [m], `rate` is the largest rate of its poses [1/s]. At
+        most `depth` of them may wait; each rings the `bell`, if there is one.
         """
         self.name, self.links, self._reach, self._rate = name, links, reach, rate
         key = keys.pose(name)

@@ -42,7 +42,7 @@ class RangeInbox:
 
     @property
     def trouble(self) -> str:
-        """Why the last payload of a robot was refused."""
+        """Reason why the last payload of a robot was refused."""
         return next((inbox.trouble for inbox in self._inboxes.values() if inbox.trouble), "")
 
     def read(self, utc: float, now: float) -> dict[int, RangeScan | None]:

@@ -243,8 +243,8 @@ class RouterLaunch(msgspec.Struct, frozen=True, kw_only=True):
     listen: Annotated[list[str], Meta(title="ENDPOINT", description=f"default: {DEFAULT_ENDPOINT}")] = []
     connect: Annotated[list[str], Meta(title="ENDPOINT", description="another router")] = []
     lifeline: Annotated[bool, Meta(description="end when standard input ends or is silent")] = False
-    linger: Annotated[float, Meta(title="SECONDS", description="and then stay for so long")] = 0.0
-    rights: Annotated[str | None, Meta(title="FILE", description="who may do what, in a lab")] = None
+    linger: Annotated[float, Meta(title="SECONDS", description="time to stay afterwards")] = 0.0
+    rights: Annotated[str | None, Meta(title="FILE", description="rights of identities, in a lab")] = None
 
 
 def _launched(launch: RouterLaunch) -> int:

@@ -58,7 +58,7 @@ class Telemetry:
         neighbours: PoseInbox,  # poses received since the last state are sent with it, and removed
         counts: Counts,  # kept by the runtime
         malformed: Callable[[], int],  # number of refused payloads, other than poses
-        ranged: Sequence[bool],  # (n) robots whose bodies measure ranges: those of the others come from the network
+        ranged: Sequence[bool],  # (n) robots with bodies that measure ranges: those of the others come from the network
         # goals received by each robot since the last state, removed here; None: no robot is guided
         receipts: Sequence[deque[messages.GoalReceipt]] | None = None,
     ) -> None:
@@ -89,7 +89,7 @@ class Telemetry:
         self._numbers = [0] * len(names)
 
     def send_states(self, t: float) -> None:
-        """Sends the state of every robot, also of one whose position is unknown."""
+        """Sends the state of every robot, also of one without a known position."""
         self._seq += 1
         for row, robot in enumerate(self._robots):
             now, state, setpoint = robot.now, robot.now.state, robot.setpoint

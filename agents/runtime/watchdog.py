@@ -1,7 +1,7 @@
 """Watchdog of the control loop: another thread of the process lands the robots when the loop hangs.
 
 It depends on the interpreter: in a frozen process, or while native code keeps the interpreter's lock, no thread runs,
-and the far end must act (docs/safety.md tells which, for each body).
+and the far end must act (docs/safety.md lists the reaction of each body).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ DOWN_S: Final = 10.0  # least limit for the robots of a loop that hangs to land,
 CUT_S: Final = 0.5  # and for the body to cut the motors; then the process ends
 AGAIN_S: Final = 0.5  # between two orders to land: the first may be lost
 LOOKS: Final = 5  # checks in each silence
-HUNG: Final = 70  # exit code of a process whose loop hung for good
+HUNG: Final = 70  # exit code of a process with a loop that hung for good
 
 
 class Watchdog:

@@ -27,12 +27,12 @@ SUNK: Final = 0.15  # [m] below its goal
 SLOWEST: Final = 0.2  # [m/s] no device lands more slowly,
 CREEPS: Final = 0.025  # [m/s] or more slowly than this for
 STEP: Final = 0.05  # [m]
-STALLS_S: Final = 4.0  # a climb without that much more height for this long does not follow; one of
-STALLS_VELOCITY_S: Final = 10.0  # a device that is told velocities, and may need a second order to take off
+STALLS_S: Final = 4.0  # time after which a climb without `STEP` of gained height counts as stalled; of
+STALLS_VELOCITY_S: Final = 10.0  # a device that takes velocities, which may need a second order to take off
 SINKS: Final = 0.15  # [m/s] and downward: the robot does not fly to its goal
 AHEAD_S: Final = 0.1  # no network here is later than this: stamps further ahead come from a clock that is ahead
 FOREIGN_S: Final = 0.5  # a gap in the poses from another source does not end their hazard before
-NOT_UNIT: Final = 0.1  # quaternions whose squared norm is further than this from 1 are no attitude
+NOT_UNIT: Final = 0.1  # largest deviation of the squared norm of a quaternion from 1
 BEHIND: Final = 0.5  # share of the age at which a position is invalid: stamps this far behind give a warning
 
 
@@ -66,7 +66,8 @@ class Status:
 class Ascent:
     """Progress of a climb: straight up, as bodies do by themselves.
 
-    A robot whose measured height does not follow flies by a wrong one, higher and higher: its markers lie on the floor.
+    If the measured height does not follow, it is a wrong one, and the robot flies higher and higher: its markers lie on
+    the floor.
     """
 
     __slots__ = (
@@ -416,7 +417,7 @@ class Detector:
             Cause.FOREIGN: foreign,
             Cause.REFUSED: lambda: ", ".join(f"{each.name}: {each.doubt}" for each in neighbours.all if each.doubt),
             Cause.STANDSTILL: lambda: f"for {health.suspended_s:.1f} s; it waits for its neighbours",
-            Cause.STILL: lambda: "it does not rise" if ascent.stalled else f"told {obedience.told:.2f} m in vain",
+            Cause.STILL: lambda: "it does not rise" if ascent.stalled else f"{obedience.told:.2f} m commanded in vain",
             Cause.STRAYING: lambda: (
                 f"{ascent.aside:.2f} m aside while it climbs" if ascent.carried else f"{obedience.strayed:.2f} m lately"
             ),

@@ -78,7 +78,7 @@ class Cause(IntEnum):
     TILT = Rule("it has tipped over", Outcome.CUT, after_s=0.1, landing=True)
     NEIGHBOUR = Rule("a neighbour is lost", Outcome.WARN)
     ALONE = Rule("all its neighbours are lost", Outcome.HOLD)
-    CENTRE = Rule("nobody guides it", Outcome.HOLD)
+    CENTRE = Rule("it gets no goals", Outcome.HOLD)
     BATTERY = Rule("its battery is low", Outcome.LAND, after_s=1.0)  # its voltage sags under a short load
     ROUTER = Rule("no connection to a router", Outcome.HOLD, then=Outcome.LAND)
     CONDUCTOR = Rule("the conductor is gone", Outcome.WARN, after_s=2.0)  # offline robots see it first again
@@ -97,12 +97,12 @@ class Cause(IntEnum):
     REFUSED = Rule("all poses of a neighbour are refused", Outcome.WARN)  # it counts as lost, too
     STANDSTILL = Rule("its process stood still", Outcome.HOLD)
     # a position that does not follow is a wrong one, by which the robot would go away; on wheels it may only be stuck
-    STILL = Rule("it is told to move and does not", Outcome.WARN, then=Outcome.LAND, then_s=0.0, grounded_s=2.0)
-    STRAYING = Rule("it moves and is not told to", Outcome.LAND)
+    STILL = Rule("it does not obey commands to move", Outcome.WARN, then=Outcome.LAND, then_s=0.0, grounded_s=2.0)
+    STRAYING = Rule("it moves without a command", Outcome.LAND)
     UNREACHABLE = Rule("its device does not answer", Outcome.WARN, after_s=0.5, landing=True)
-    HOVERING = Rule("it is told to land and hovers", Outcome.WARN, after_s=2.0, landing=True)
+    HOVERING = Rule("it hovers although commanded to land", Outcome.WARN, after_s=2.0, landing=True)
     UNSEEING = Rule("its range sensors are silent", Outcome.HOLD)  # avoidance would drive it against what it saw
-    UNSTARTED = Rule("nobody will start it", Outcome.LAND)  # it would hover until its battery is empty
+    UNSTARTED = Rule("no start will come", Outcome.LAND)  # it would hover until its battery is empty
 
 
 _LOST: Final[Mapping[str, Outcome]] = {
@@ -131,10 +131,10 @@ def rules(limits: Limits) -> list[Rule]:
 
 
 def failed(text: str) -> bool:
-    """Whether an incident's text tells that a robot does not do its part of an experiment any more.
+    """Whether an incident's text means that a robot no longer does its part of an experiment.
 
-    It has landed, was cut, does not move although it is told to, its device does not answer, or it has no position at
-    the end.
+    Such a robot has landed, was cut, does not obey commands to move, its device does not answer, or it has no position
+    at the end.
     """
     outcome, _, words = text.partition(": ")
     severe = tuple(cause.rule.words for cause in (Cause.STILL, Cause.UNREACHABLE, Cause.HOVERING))
@@ -215,7 +215,7 @@ class Hazards:
         return self._record(t, changed, words) if changed else []
 
     def advance(self, t: float, causes: int, active: bool, landing: bool) -> int:
-        """Advance to `t` [s], as `update`; returns the causes whose outcome changed, as a set."""
+        """Advance to `t` [s], as `update`; returns the set of causes with a changed outcome."""
         watched = 0
         if active:
             watched = ALL

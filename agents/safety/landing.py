@@ -17,7 +17,7 @@ from agents.vectors import UNKNOWN, Vector, clamp, is_finite, norm, planar
 NEAR: Final = 0.05  # [m] between surfaces, seen from above: with less a robot does not land in place
 ROOM: Final = 0.12  # [m] the same at the place aside
 LOW: Final = 0.2  # [m] above the floor: from lower it lands in place
-BESIDE: Final = 0.1  # [m] robots whose heights differ by less are in each other's way
+BESIDE: Final = 0.1  # [m] smallest difference of heights at which robots are not in each other's way
 SLOW: Final = 0.15  # [m/s] a robot that moved aside lands when slower
 PATIENCE_S: Final = 3.0  # [s] longest time to move aside
 ROUNDING: Final = 1e-9

@@ -1,9 +1,9 @@
-"""Obedience of a body: a robot that is told to move and does not, or that moves and is not told to.
+"""Obedience of a body: detection of robots that do not obey commands to move, or move without a command.
 
-The told motion is that of the setpoint: the speed at which a body closes a position error, a velocity, or a twist along
-the nose, added up on every tick, as one that follows slow decisions is large after each and small before the next. Told
-and measured motion are compared over pieces of half a second, so that neither the rate of the measured positions nor
-their resolution matters.
+The commanded motion is that of the setpoint: the speed at which a body closes a position error, a velocity, or a twist
+along the nose. It is added up on every tick, because a setpoint of slow decisions is large after each and small before
+the next. Commanded and measured motion are compared over pieces of half a second, so that neither the rate of the
+measured positions nor their resolution matters.
 
 Quiet: all of it.
 """
@@ -16,23 +16,23 @@ from typing import Final
 from agents.body.kinds import Kind
 from agents.vectors import UNKNOWN, ZERO, Setpoint, Vector, clamp, difference, distance, dot, is_finite, norm, wrap
 
-SAMPLE_S: Final = 0.1  # in which the setpoints of all ticks are added up
-MISSED_S: Final = 2.0 * SAMPLE_S  # without a tick: what was told meanwhile is not known
-PIECE: Final = 5  # samples of which told and measured motion are compared
+SAMPLE_S: Final = 0.1  # period in which the setpoints of all ticks are added up
+MISSED_S: Final = 2.0 * SAMPLE_S  # time without a tick after which the commanded motion is unknown
+PIECE: Final = 5  # samples of a comparison of commanded and measured motion
 PIECE_S: Final = PIECE * SAMPLE_S
-SLOW_FLIES, SLOW_WHEELS = 0.25, 0.1  # shares of a kind's speed: slower setpoints are not told to move
-MOVES: Final = 0.2  # share of the told way that a robot moves at least
-WITHOUT_S: Final = 1.5  # at a kind's top speed: so much way told and not moved is disobedience,
-LEAST_WITHOUT_S: Final = 2.0  # and at least so long
-FORGET_S: Final = 5.0  # after which motion that was not told is forgotten
-KEPT: Final = 1.0 - PIECE_S / FORGET_S  # share of it that a piece keeps of those before
-RUSH_S: Final = 0.5  # at a kind's top speed, and its size, is what it may move without being told
+SLOW_FLIES, SLOW_WHEELS = 0.25, 0.1  # shares of a kind's speed: slower setpoints are no command to move
+MOVES: Final = 0.2  # least share of the commanded travel that a robot moves
+WITHOUT_S: Final = 1.5  # commanded travel without motion, in seconds at top speed, that counts as unresponsive,
+LEAST_WITHOUT_S: Final = 2.0  # if it lasted at least this long
+FORGET_S: Final = 5.0  # time after which uncommanded motion is forgotten
+KEPT: Final = 1.0 - PIECE_S / FORGET_S  # share of earlier uncommanded motion that a piece keeps
+RUSH_S: Final = 0.5  # tolerated uncommanded travel, in seconds at top speed, besides the size of the robot
 ROUNDING_S: Final = 1e-6
-TURN: Final = 1.5  # [rad] what it may turn without being told, on wheels
+TURN: Final = 1.5  # tolerated uncommanded rotation of a wheeled robot [rad]
 
 
 class Obedience:
-    """Told and measured motion of one robot."""
+    """Commanded and measured motion of one robot."""
 
     __slots__ = (
         "anchor", "anchor_yaw", "begin", "begin_yaw", "by_position", "by_twist", "drift", "due", "flies", "free",
@@ -40,10 +40,10 @@ class Obedience:
         "turn", "turn_before", "turned", "vain", "vain_turn", "way", "way_before", "without", "x", "y", "z",
     )  # fmt: skip
 
-    still: bool  # it is told to move and does not
-    strays: bool  # it moves and is not told to
-    told: float  # way that it was told and has not moved [m]
-    strayed: float  # way that it moved and was not told [m]
+    still: bool  # it does not obey commands to move
+    strays: bool  # it moves without a command
+    told: float  # commanded travel that it has not moved [m]
+    strayed: float  # uncommanded travel [m]
     # of its kind
     flies: bool
     by_position: bool  # takes positions as setpoints
@@ -51,17 +51,17 @@ class Obedience:
     speed: float  # [m/s]
     response: float  # [1/s]
     rim: float  # [m] turning moves wheels by it
-    slow: float  # slower setpoints are not told to move [m/s]
-    without: float  # least way of disobedience [m]
-    free: float  # what it may move without being told [m]
-    # told in this sample
+    slow: float  # slower setpoints are no command to move [m/s]
+    without: float  # least commanded travel without motion that counts [m]
+    free: float  # tolerated uncommanded travel [m]
+    # commanded in this sample
     last: float  # time of the last tick [s]
     due: float  # end of the sample [s]
     x: float  # [m]
     y: float
     z: float
     turned: float  # [rad]
-    # told in this piece and in the one before, for a body is late: it moves when it is told no more
+    # commanded in this piece and in the one before: a body is late and moves after its command has ended
     samples: int  # of this piece
     way: Vector  # [m]
     way_before: Vector
@@ -69,9 +69,9 @@ class Obedience:
     turn_before: float
     begin: Vector  # position at the begin of the piece [m]; NaN: there is none
     begin_yaw: float  # [rad]
-    drift: Vector  # moved and not told, of late [m]
-    spin: float  # turned and not told, of late [rad]
-    # told since it moved last
+    drift: Vector  # recent uncommanded travel [m]
+    spin: float  # recent uncommanded rotation [rad]
+    # commanded since its last motion
     anchor: Vector  # position then [m]
     anchor_yaw: float  # [rad]
     told_s: float  # [s], less the pauses
@@ -91,7 +91,7 @@ class Obedience:
         self.forget(UNKNOWN, nan)
 
     def update(self, t: float, setpoint: Setpoint, position: Vector, yaw: float, watched: bool) -> None:
-        """Add up what was told, and compare at the end of each sample; call it on every tick, at `t` [s].
+        """Add up the commanded motion, and compare at the end of each sample; call it on every tick, at `t` [s].
 
         `setpoint` is that of the tick before, NaN without one; `position` [m] and `yaw` [rad] are measured; a `watched`
         robot follows its setpoints and has a valid pose.
@@ -122,7 +122,7 @@ class Obedience:
             self.compare(t, setpoint, position, yaw, watched)
 
     def add(self, since: float, setpoint: Setpoint, yaw: float) -> None:
-        """Add the motion that a velocity or a twist tells in `since` [s]; none without a setpoint or a pose."""
+        """Add the motion that a velocity or a twist commands in `since` [s]; none without a setpoint or a pose."""
         if self.by_twist:
             v, turn = setpoint[0], setpoint[1]
             if v != 0.0 and isfinite(v) and isfinite(yaw):
@@ -140,7 +140,7 @@ class Obedience:
             self.turned += turn * since
 
     def compare(self, t: float, setpoint: Setpoint, position: Vector, yaw: float, watched: bool) -> None:
-        """Compare told and measured motion at the end of a sample; a robot without one of them begins anew."""
+        """Compare commanded and measured motion at the end of a sample; without one of them the count restarts."""
         way, turn = (self.x, self.y, self.z), self.turned
         self.end_sample(t)
         told = isfinite(setpoint[0]) and isfinite(setpoint[1]) and isfinite(setpoint[2]) and isfinite(setpoint[3])
@@ -162,7 +162,7 @@ class Obedience:
         self.x = self.y = self.z = self.turned = 0.0
 
     def count_still(self, position: Vector, yaw: float, way: Vector, turn: float) -> None:
-        """Add a `way` [m] and a `turn` [rad] that are told to move; a robot that moved counts anew."""
+        """Add a commanded `way` [m] and `turn` [rad]; the count restarts after a motion."""
         rim = self.rim
         if norm(way) + rim * abs(turn) >= self.slow * SAMPLE_S:
             vain = self.vain
@@ -181,7 +181,7 @@ class Obedience:
         self.still = told >= self.without and self.told_s >= LEAST_WITHOUT_S
 
     def count_strays(self, position: Vector, yaw: float) -> None:
-        """Add what it moved beyond the told way, against it, or aside of it, in the piece that ends."""
+        """Add the motion beyond, against or aside of the commanded travel, in the piece that ends."""
         moved = difference(position, self.begin)
         x, y, z = self.way[0] + self.way_before[0], self.way[1] + self.way_before[1], self.way[2] + self.way_before[2]
         length = sqrt(x * x + y * y + z * z)
@@ -208,7 +208,7 @@ class Obedience:
         self.begin, self.begin_yaw = position, yaw
 
     def forget(self, position: Vector, yaw: float) -> None:
-        """Begin anew at a `position` [m] and `yaw` [rad]."""
+        """Restart at a `position` [m] and `yaw` [rad]."""
         self.still = self.strays = False
         self.told = self.told_s = self.strayed = self.vain_turn = self.spin = self.turn = self.turn_before = 0.0
         self.vain = self.drift = self.way = self.way_before = ZERO

@@ -51,8 +51,8 @@ class Continuity:
     def jump(self, time: float, position: Vector, yaw: float, watched: bool) -> float:
         """Length [m] of the jump of the robot, or NaN.
 
-        The `position` [m] and `yaw` [rad] were measured at `time` [s]. A robot whose yaw jumped has jumped, too. One
-        that is not `watched`, not in motion, may be carried, and begins anew unless it has jumped.
+        The `position` [m] and `yaw` [rad] were measured at `time` [s]. A jump of the yaw counts as well. A robot that
+        is not `watched`, not in motion, may be carried; it restarts unless it has jumped.
         """
         (x, y, z), (last_x, last_y, last_z) = position, self._place
         x, y, z = x - last_x, y - last_y, z - last_z
@@ -91,10 +91,10 @@ class Continuity:
 
 
 class ExternalPositions:
-    """Belief in the positions of a robot that are measured from outside, sample by sample.
+    """Plausibility of externally measured positions of a robot, sample by sample.
 
-    In motion it has jumped if it moved by more than its own size beyond what it can: two robots that are mistaken for
-    each other are at least that far apart. Smaller errors show as disobedience.
+    A moving robot has jumped if it moved by more than its own size beyond its possible travel. Two robots that are
+    mistaken for each other are at least that distance apart. Smaller errors show as disobedience.
     """
 
     __slots__ = (

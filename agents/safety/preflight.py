@@ -24,7 +24,7 @@ from agents.plugins.triggers import LastEvent, Trigger, View
 from agents.safety.detection import clock_off, clock_text, nearest_robot, tilt_angle, tilted
 from agents.vectors import NO_SETPOINT, ZERO, Vector, is_finite, norm, planar
 
-LOST_S: Final = 0.5  # a ready robot whose check failed for this long is not ready any more
+LOST_S: Final = 0.5  # time of a failing check after which a ready robot is not ready any more
 FLOOR_M: Final = 0.5  # largest height of a standing drone: positioning systems differ about the floor
 REST_M_S: Final = 0.3  # and largest speed
 LEVEL: Final = 0.35  # [rad] and largest tilt
@@ -51,7 +51,7 @@ class Preflight:
     def check(self, now: Situation, missing: Sequence[str], neighbours: Neighbours, health: ProcessHealth) -> str:
         """First reason why the robot must not take off, empty if there is none.
 
-        `missing`: neighbours without whose pose it must not.
+        `missing`: neighbours with a required pose that is not there.
         """
         above = self._robot_above(now, neighbours)
         self._covered = above is not None
@@ -62,7 +62,7 @@ class Preflight:
         return next(reasons, "")
 
     def lost(self, t: float, failing: str) -> bool:
-        """Whether a check, which gave the reason `failing`, has failed for so long that it is not ready any more."""
+        """Whether a check with the reason `failing` has failed for too long for the robot to stay ready."""
         if not failing:
             self._since = inf
             return False

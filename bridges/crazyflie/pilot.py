@@ -202,7 +202,7 @@ class CrazyfliePilot:
         self._connection_note = self._connection_note or "waits for the other drones of its radio to connect"
         while not self._turn.acquire(timeout=RETRY_S):
             if self._ending.is_set():
-                raise LinkError("told to end")
+                raise LinkError("asked to end")
         try:
             return self._connect()
         finally:

@@ -112,7 +112,7 @@ def wait_for_type(rclpy: Any, topic: str) -> str:
 
 
 def main(words: "list[str]") -> int:
-    """Run the node until it is told to end."""
+    """Run the node until it is asked to end."""
     parser = argparse.ArgumentParser(description="Stops a TurtleBot3 that gets no commands.")
     parser.add_argument("--silence", type=float, default=0.5, help="[s] without a command after which it is stopped")
     parser.add_argument("--topic", default="cmd_vel")

@@ -49,7 +49,7 @@ def test_it_runs_and_reports_without_links(file, tmp_path, capsys):
     ) == 1  # fmt: skip
     printed = capsys.readouterr()
     said = printed.out
-    assert "TB01 at 7.5 s: it is told to move and does not" in printed.err + said  # they push each other
+    assert "TB01 at 7.5 s: it does not obey commands to move" in printed.err + said  # they push each other
     assert "no link was measured" in said
     assert "One collision in default: TB01–TB02" in said
     page = re.sub(r"<[^>]+>", " ", (tmp_path / "run" / "report.html").read_text("utf-8"))

@@ -97,7 +97,7 @@ def test_who_joined_lands_when_the_conductor_is_dead(router: RouterProcess, tmp_
         flight.finish()
         assert joined.wait(PATIENCE_S) == 0
         watcher.look()
-        assert (watcher.phase("KH02"), watcher.status["KH02"].reason) == ("done", "told to end")
+        assert (watcher.phase("KH02"), watcher.status["KH02"].reason) == ("done", "asked to end")
         watcher.until(lambda: not watcher.alive, "so do the others")
     finally:
         watcher.close()

@@ -116,6 +116,6 @@ trigger = {{ kind = "periodic", period_s = 0.05 }}
         code, out = flight.finish(60.0)
         assert abs(twin.truth()[0][0, 0]) < 0.001
     assert code == 1, out + flight.said()
-    assert "hazard KH01: warn: it is told to move and does not: told 0." in flight.said()
+    assert "hazard KH01: warn: it does not obey commands to move: 0." in flight.said()
     assert "zenpark: Failed in default: KH01 at " in flight.said()
     assert "error [m] KH01 0." in flight.said()

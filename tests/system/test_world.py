@@ -313,7 +313,7 @@ def test_world_ordered_to_end_waits_for_robots(world: WorldProcess, router: Rout
         watcher.until(lambda: watcher.phase("CF01") == "airborne", "it is up")
         world.process.terminate()
         assert robot.end() == 0
-        watcher.until(lambda: watcher.phase("CF01") == "done", "it landed in the world that was told to end")
+        watcher.until(lambda: watcher.phase("CF01") == "done", "it landed in the world that was asked to end")
         assert world.wait(30) == 0
     finally:
         watcher.close()

@@ -1,4 +1,4 @@
-"""Laws whose libraries are extras of zenpark, imported at first use.
+"""Laws with libraries that are extras of zenpark, imported at first use.
 
 May import: agents.plugins, agents.vectors.
 """

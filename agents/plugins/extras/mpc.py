@@ -29,13 +29,14 @@ Planar = tuple[float, float]  # x, y
 
 
 class Mpc(Law, frozen=True):
-    """Goals reached by plans over a horizon, which robots tell each other and keep apart, seen from above.
+    """Goals reached by plans over a horizon, which robots exchange and keep apart, seen from above.
 
-    Each minimises Σ_k ‖p_k − g‖² + r Σ_k ‖a_k‖² + w Σ_j (ε_j + ε_j²) over accelerations a_k and ε_j ≥ 0, with p'' = a,
-    limits of speed and acceleration per axis, and n_j·(p_κ − p̂_jκ) ≥ d − ε_j at the first step κ at which its last plan
-    comes nearer than d to what another has said (C. E. Luis, M. Vukosavljevic, A. P. Schoellig, "Online trajectory
-    generation with distributed model predictive control for multi-robot motion planning", IEEE Robotics and Automation
-    Letters 5(2), 2020). A plan goes on from the one before, unless the robot has strayed from it. Neither distance nor
+    Each minimises Σ_k ‖p_k − g‖² + r Σ_k ‖a_k‖² + w Σ_j (ε_j + ε_j²) over accelerations a_k and ε_j ≥ 0, with p'' = a
+    and limits of speed and acceleration per axis. The constraint n_j·(p_κ − p̂_jκ) ≥ d − ε_j holds at the first step κ
+    at which its last plan comes nearer than d to another received plan (C. E. Luis, M. Vukosavljevic, A. P. Schoellig,
+    "Online trajectory generation with distributed model predictive control for multi-robot motion planning", IEEE
+    Robotics and Automation Letters 5(2), 2020). A plan continues the one before, unless the robot has left that one.
+    Neither distance nor
     arrival is guaranteed: constraints are soft, and robots that block each other stay.
     """
 
@@ -62,7 +63,7 @@ class Mpc(Law, frozen=True):
         return {"path": (nan,) * (2 * self.steps + 2), "state": (nan,) * 6}
 
     def step(self, view: View, memory: Memory) -> Control:
-        """Plan anew from the state of the last plan, and move along."""
+        """Plan again from the state of the last plan, and move along."""
         ahead, speed = horizon(self.steps, self.period, self.effort), min(self.speed, view.robot.speed)
         p, v = advance(memory["state"], view, speed)
         conflicts, slack, a = [], 0.0, ahead.rest
@@ -104,7 +105,7 @@ def advance(state: tuple[float, ...], view: View, speed: float) -> tuple[Planar,
 
 
 class Horizon:
-    """Plans of so many steps: accelerations in rows of x and y, places after each of the steps likewise."""
+    """Plans of a number of steps: accelerations in rows of x and y, places after each of the steps likewise."""
 
     def __init__(self, steps: int, period: float, effort: float) -> None:
         """Raises PluginError without the solver."""
@@ -132,7 +133,7 @@ class Horizon:
         return found
 
     def later(self, path: tuple[float, ...], seconds: float) -> Array:
-        """Places of a path that was said so long ago [s], which stays at its end."""
+        """Places of a path `seconds` [s] after its transmission; it stays at its end."""
         np = self._np
         points, when = np.array(path).reshape(-1, 2), (self._times + seconds) / self._period
         before = np.minimum(when.astype(int), len(points) - 2)

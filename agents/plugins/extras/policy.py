@@ -57,7 +57,7 @@ class Policy(Law, frozen=True):
 
 
 def observe(view: View, places: int) -> list[float]:
-    """Observation of the first so many neighbours: 4 + 4 n numbers."""
+    """Observation of the first n neighbours: 4 + 4 n numbers."""
     (x, y, _), found = view.position, [*view.position[:2], *view.velocity[:2]]
     for each in view.neighbours[:places]:
         wanted_x, wanted_y, _ = each.link.relative

@@ -48,7 +48,7 @@ class Aggregative(Averaging, frozen=True):
     integral: Annotated[Positive, Meta(description="k_I [1/s]")] = 3.0
 
     def begin(self, robot: RobotFacts) -> Memory:
-        """Estimates s of the centre [m] and y of its gradient [m], with their integrals; neighbours that were heard."""
+        """Estimates s of the centre [m] and y of its gradient [m], with their integrals; received neighbours only."""
         return {**dict.fromkeys(("s", "s_q", "y", "y_q"), (0.0, 0.0)), "n": (0.0,)}
 
     def step(self, view: View, memory: Memory) -> Control:

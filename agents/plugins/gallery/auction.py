@@ -20,14 +20,14 @@ MOST_TASKS: Final = 31  # of 64 numbers, two for each task
 class Auction(Law, frozen=True):
     """Each robot wins one task and goes there: the sum of ways is within n ε of the least, with n robots.
 
-    A robot that holds no task bids for the one with the largest profit, way saved less price, and raises its price so
-    that the next best is as good, and by ε. Neighbours tell each other the highest bids; of equal ones that of the
-    higher number holds (M. M. Zavlanos, L. Spesivtsev, G. J. Pappas, "A distributed auction algorithm for the
-    assignment problem", IEEE Conference on Decision and Control, 2008; on consensus of bids H.-L. Choi, L. Brunet,
-    J. P. How, "Consensus-based decentralized auctions for robust task allocation", IEEE Transactions on Robotics
-    25(4), 2009). Bids are states, which a lost message only delays. Prices count in ε: levels are said exactly. Robots
-    without a task stay. When a task appears all bid anew, from the places where they are then. A robot that is lost
-    keeps what it won.
+    A robot without a task bids for the task with the largest profit, way saved less price. It raises the price until
+    the next best task is as good, and by ε. Neighbours exchange the highest bids; of equal ones that of the higher
+    number holds (M. M. Zavlanos, L. Spesivtsev, G. J. Pappas, "A distributed auction algorithm for the assignment
+    problem", IEEE Conference on Decision and Control, 2008; on consensus of bids H.-L. Choi, L. Brunet, J. P. How,
+    "Consensus-based decentralized auctions for robust task allocation", IEEE Transactions on Robotics 25(4), 2009).
+    Bids are states, which a lost message only delays. Prices count in ε: levels are transmitted exactly. Robots without
+    a task stay. When a task appears all bid again, from their places at that time. A robot that is lost keeps what it
+    won.
     """
 
     ALONE: ClassVar[bool] = True
@@ -61,7 +61,7 @@ class Auction(Law, frozen=True):
         return {"level": zero, "bidder": none, "called": (-1.0,), "way": zero, "calm": (0.0,)}
 
     def step(self, view: View, memory: Memory) -> Control:
-        """Hear bids, bid, and move on when bids are calm."""
+        """Receive bids, bid, and move on when bids are calm."""
         here, robot, me = view.position[:2], view.robot, float(view.robot.number)
         places = self.called(view.time)
         called, size = (

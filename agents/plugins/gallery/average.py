@@ -20,16 +20,17 @@ STANDING: Final = 1e-9  # eigenvalues below are 0: of what the robots have in co
 class Averaging(Law, frozen=True):
     """A law that estimates averages in proportional-integral form.
 
-    A link weighs 1/max(n_i, n_j), with n the numbers of neighbours that were heard, which all say: alike for both ends,
-    as the theorem asks, and small enough for the steps of most graphs. Both ends compare what was said.
+    A link weighs 1/max(n_i, n_j), with n the numbers of received neighbours, which all robots transmit. The weight is
+    equal at both ends, as the theorem requires, and small enough for the steps of most graphs. Both ends compare
+    transmitted values.
     """
 
-    rate: Annotated[Positive, Meta(description="γ: of forgetting how the estimate began [1/s]")] = 1.0
+    rate: Annotated[Positive, Meta(description="γ: rate at which the initial estimate is forgotten [1/s]")] = 1.0
     gain: Annotated[Positive, Meta(description="k_P [1/s]")] = 2.0
     integral: Annotated[Positive, Meta(description="k_I [1/s]")] = 1.5
 
     def heard(self, view: View) -> list[tuple[float, NeighbourView]]:
-        """Neighbours that have spoken, with the weights of their links."""
+        """Neighbours with received variables, and the weights of their links."""
         (n,) = view.said["n"]
         return [(1.0 / max(n, each.said["n"][0], 1.0), each) for each in view.known(*self.SAYS)]
 
@@ -55,7 +56,7 @@ class Averaging(Law, frozen=True):
         pairs = set(zip(plan.links.receiver.tolist(), plan.links.sender.tolist(), strict=True))
         for receiver, sender in sorted((i, j) for i, j in pairs if (j, i) not in pairs)[:1]:
             there, here = plan.names[sender], plan.names[receiver]
-            message = f"{here} hears {there}, but not the other way: what all agree on is not the average"
+            message = f"{here} receives {there}, but not the other way: the robots do not agree on the average"
             yield "error", message, f'link both ways, as "{there} - {here}"'
             return
         step = 1.0 / plan.experiment.rates.coordination_hz

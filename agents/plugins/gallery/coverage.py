@@ -20,8 +20,8 @@ class Coverage(Law, frozen=True):
 
     H = Σ_i ∫_{V_i} ‖q − p_i‖² φ(q) dq never rises, and the robots end at a centroidal Voronoi partition (J. Cortés,
     S. Martínez, T. Karatas, F. Bullo, "Coverage control for mobile sensing networks", IEEE Transactions on Robotics
-    and Automation 20(2), 2004). A link to every robot whose cell may touch the own one is needed. A neighbour that is
-    lost leaves its cell to the others; a robot without a cell, outside the area, stays.
+    and Automation 20(2), 2004). A robot needs a link to every robot with a cell that may touch its own. A neighbour
+    that is lost leaves its cell to the others; a robot without a cell, outside the area, stays.
     """
 
     ALONE: ClassVar[bool] = True

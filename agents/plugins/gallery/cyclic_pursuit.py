@@ -15,12 +15,12 @@ from agents.vectors import Positive
 class CyclicPursuit(Law, frozen=True):
     """v_i = k R(−α) (p̂_j − p_i), seen from above: each robot pursues the next one, j, by an angle α to its right.
 
-    Among n robots the slowest motion grows at the rate 2 k sin(π/n) sin(α − π/n): they meet in their mean below
-    α = π/n, circle it to the left at 2 k sin(π/n) [rad/s] at that angle, and leave it in spirals above, up to 2 π/n
-    (M. Pavone, E. Frazzoli, "Decentralized policies for geometric pattern formation and path coverage", ASME Journal
-    of Dynamic Systems, Measurement, and Control 129(5), 2007; with the heading of wheels: J. A. Marshall,
-    M. E. Broucke, B. A. Francis, "Formations of vehicles in cyclic pursuit", IEEE Transactions on Automatic Control
-    49(11), 2004). The mean stays. Lag of bodies and messages adds its own angle: they circle at a little less than π/n.
+    Among n robots the slowest motion grows at the rate 2 k sin(π/n) sin(α − π/n). Below α = π/n they meet in their
+    mean; at that angle they circle it to the left at 2 k sin(π/n) [rad/s]; above, up to 2 π/n, they leave it in spirals
+    (M. Pavone, E. Frazzoli, "Decentralized policies for geometric pattern formation and path coverage", ASME Journal of
+    Dynamic Systems, Measurement, and Control 129(5), 2007; with the heading of wheels: J. A. Marshall, M. E. Broucke,
+    B. A. Francis, "Formations of vehicles in cyclic pursuit", IEEE Transactions on Automatic Control 49(11), 2004). The
+    mean stays. Lag of bodies and messages adds its own angle: they circle at a little less than π/n.
     """
 
     PREDICTION: ClassVar[str] = "constant-velocity"

@@ -72,7 +72,7 @@ class Enclosing(Law, frozen=True):
             (j_x, j_y), (v_x, v_y) = each.said["target"], each.said["speed"]
             mean_x, mean_y = mean_x + share * v_x, mean_y + share * v_y
             place_x, place_y = place_x + share * (j_x + each.age * v_x), place_y + share * (j_y + each.age * v_y)
-        if links > 1.0 and is_known((a, b)):  # it does not see the target, and does not hear of it for the first time
+        if links > 1.0 and is_known((a, b)):  # it does not see the target, and this is not the first received estimate
             rate = min(self.observer * view.step_s, 1.0)
             a, b = a + view.step_s * speed_x, b + view.step_s * speed_y
             place_x, place_y = a + rate * (place_x - a), b + rate * (place_y - b)

@@ -40,7 +40,7 @@ class Flocking(Law, frozen=True):
         return {"v": (0.0, 0.0)}
 
     def step(self, view: View, memory: Memory) -> Control:
-        """Step of Euler's method; a robot that is held, or led by its plan, begins anew at rest."""
+        """Step of Euler's method; a robot that is held, or led by its plan, starts again from rest."""
         if view.leads or not view.moves:
             return Control(memory={"v": (0.0, 0.0)}, velocity=(0.0, 0.0, nan))
         (vx, vy), (x, y, _), t = memory["v"], view.position, view.time

@@ -15,14 +15,14 @@ from agents.vectors import Positive
 class LeaderObserver(Law, frozen=True):
     """v_i = v̂_i − k/n Σ_j (p_i − p̂_j − d_ij), v̂̇_i = −γ/n Σ_j (v̂_i − v̂_j), seen from above, with n neighbours j.
 
-    The leader, which has no links of its own, says the velocity of its plan; all others estimate it from what they
-    hear. Where every robot hears the leader, directly or through others, the lag behind one of constant speed goes to
-    zero, where the law without v̂ lags in proportion to the speed (Y. Hong, J. Hu, L. Gao, "Tracking control for
-    multi-agent consensus with an active leader and variable topology", Automatica 42(7), 2006; Y. Hong, G. Chen,
-    L. Bushnell, "Distributed observers design for leader-following control of multi-agent networks", Automatica 44(3),
+    The leader, which has no links of its own, transmits the velocity of its plan; all others estimate it from received
+    values. If every robot receives the leader, directly or through others, the lag behind a leader of constant speed
+    goes to zero. Without v̂ the lag is proportional to the speed (Y. Hong, J. Hu, L. Gao, "Tracking control for
+    multi-agent consensus with an active leader and variable topology", Automatica 42(7), 2006; Y. Hong, G. Chen, L.
+    Bushnell, "Distributed observers design for leader-following control of multi-agent networks", Automatica 44(3),
     2008; Y. Cao, W. Ren, "Distributed coordinated tracking with reduced interaction via a variable structure approach",
     IEEE Transactions on Automatic Control 57(1), 2012). No integral of an error: a robot that is held winds nothing up.
-    All say how many links they are from a leader: where none is left the count grows to that of robots, and v̂ is 0.
+    All transmit their number of links from a leader: without a leader it grows to the number of robots, and v̂ is 0.
     """
 
     NEEDS: ClassVar[Need] = "relative"
@@ -40,7 +40,7 @@ class LeaderObserver(Law, frozen=True):
         return {"v": (0.0, 0.0), "links": (float(robot.count),)}
 
     def step(self, view: View, memory: Memory) -> Control:
-        """Step of Euler's method, on the shares of what is heard."""
+        """Step of Euler's method, on the shares of received values."""
         v_x, v_y = memory["v"]
         if view.leads:
             return Control(memory={"v": view.target_velocity[:2], "links": (0.0,)})

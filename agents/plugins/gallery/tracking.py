@@ -25,15 +25,15 @@ class Tracking(Law, frozen=True):
     """x̂_i = (Σ_j Y_j)⁻¹ Σ_j y_j, with Y ← W F⁻ᵀ Y F⁻¹ + g gᵀ and y ← W F⁻ᵀ y + g (z − h(x̂) + gᵀ x̂); robots stand.
 
     Kalman filter of a target of nearly constant velocity, in information form, in units of one reading, 1/σ². Each
-    robot says the information of its own readings z, and adds what its neighbours said, brought up to date. All is
-    discounted by the filter gain of the sum, W = (I + F⁻ᵀ ΣY F⁻¹ Q)⁻¹: where all robots hear each other, the sums are
-    those of the central filter, but for the delay of messages. A message holds all information of its sender, so losses
-    delay and never bias (R. Olfati-Saber, "Kalman-consensus filter: optimality, stability, and performance", CDC 2009;
-    F. Govaers, "Distributed Kalman filter", in *Kalman Filters: Theory for Advanced Applications*, 2018).
+    robot transmits the information of its own readings z, and adds that of its neighbours, brought up to date. All is
+    discounted by the filter gain of the sum, W = (I + F⁻ᵀ ΣY F⁻¹ Q)⁻¹. If all robots receive each other, the sums are
+    those of the central filter, apart from the delay of messages. A message holds all information of its sender, so
+    losses delay and never bias (R. Olfati-Saber, "Kalman-consensus filter: optimality, stability, and performance", CDC
+    2009; F. Govaers, "Distributed Kalman filter", in *Kalman Filters: Theory for Advanced Applications*, 2018).
 
     Readings are emulated: the distance or direction, seen from above, of the place that the target sends, with a normal
     error. A hash of robot, time and that place draws it: another in each run, as motion capture never gives a place
-    twice, and the same in a repetition. The filter gets nothing else of the target.
+    twice, and the same in a repetition. The filter gets no other data of the target.
     """
 
     PREDICTION: ClassVar[str] = "constant-velocity"
@@ -43,7 +43,9 @@ class Tracking(Law, frozen=True):
         "x": Said(unit="m", metre=100.0, place=0),  # for views
     }
 
-    target: Annotated[str, Meta(description="robot that is tracked; those that hear it see it")] = ""
+    target: Annotated[
+        str, Meta(description="robot that is tracked; robots that receive its poses get readings of it")
+    ] = ""
     sees: Annotated[Literal["distance", "direction"], Meta(description="quantity of a reading")] = "distance"
     sigma: Annotated[Positive, Meta(description="σ, standard deviation of a reading [m] or [rad]")] = 0.1
     agility: Annotated[Positive, Meta(description="density of the target's white acceleration [m²/s³]")] = 1e-4
@@ -75,7 +77,7 @@ class Tracking(Law, frozen=True):
             for each in view.known("y", "Y")
         ]
         y, known = total([own, *others])
-        if not all(row[k] > 0.0 for k, row in enumerate(inverse(known))):  # what was heard is no information
+        if not all(row[k] > 0.0 for k, row in enumerate(inverse(known))):  # received values are no information
             others, (y, known) = [], own
         reading = self.measure(view)
         own = total([own, told_by(reading, self.sees, view.position, times(inverse(known), y))])
@@ -129,7 +131,7 @@ def predicted(y: Values, matrix: Values, seconds: float, density: float, every: 
     return times(onward, y), product(product(onward, rows(matrix)), back)
 
 
-@lru_cache(maxsize=8)  # most ages are alike
+@lru_cache(maxsize=8)  # most ages are equal
 def transition(t: float, density: float, every: Values) -> tuple[Matrix, Matrix]:
     """W F⁻ᵀ and F⁻¹ for `t` [s], where `every` is the sum of information."""
     a, b, c = density * t**3 / 3.0, density * t * t / 2.0, density * t

@@ -363,7 +363,7 @@ def hop_of(robot: Robot) -> Literal["hop", "drive"]:
 def _drive_remedy(way: float) -> str:
     """Remedy for a drive of `way` [m]; nothing if that is right."""
     if way < DRIVE_OFF_M:
-        return "told to drive and does not: motors on, wheels free, server and message type right?"
+        return "does not drive although commanded to: motors on, wheels free, server and message type right?"
     wrong = abs(way - DRIVE_M) > DRIVE_OFF_M
     return "its speed is not what it is told: units and wheel sizes of its server, slipping wheels" if wrong else ""
 

@@ -66,7 +66,7 @@ def _wrong(folder: Path, name: str) -> str:
         if not file.is_file():
             return f"{file.name} is missing"
     if stat.S_IMODE(key.stat().st_mode) & 0o077:
-        return f"others can read {key.name}; revoke it if somebody has"
+        return f"others can read {key.name}; revoke it if they have read it"
     try:
         ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT).load_cert_chain(certificate, key, lambda: b"")
     except OSError:  # of which ssl.SSLError is one

@@ -148,7 +148,7 @@ def _read(file: Path) -> Run | None:
 
 
 def _answers(endpoint: str) -> bool:
-    """Whether something takes connections there; nobody knows of QUIC before it is spoken."""
+    """Whether the endpoint takes connections; of QUIC this is unknown before the first packet."""
     where = Endpoint.parse(endpoint)
     with suppress(OSError):
         if where.protocol == UNIX:

@@ -196,7 +196,7 @@ def _check_status(status: messages.Status) -> None:
 
 
 def serve(launch: Launch) -> int:
-    """Runs the centre of an experiment until it is told to end; returns the exit code."""
+    """Runs the centre of an experiment until it is asked to end; returns the exit code."""
     plan, endpoints = launch.read()
     experiment, guided = plan.experiment, plan.guided
     if not guided:

@@ -170,7 +170,7 @@ class WorldLaunch(Launch, frozen=True, kw_only=True, rename="kebab"):
 
 
 def serve(launch: WorldLaunch) -> int:
-    """Runs the world of an experiment until it is told to end and its robots are down; returns the exit code."""
+    """Runs the world of an experiment until it is asked to end and its robots are down; returns the exit code."""
     plan, endpoints = launch.read()
     robots = plan.experiment.robots.values()
     if not any(WORLD in (robot.body, robot.ranges) for robot in robots):

@@ -75,7 +75,7 @@ def test_a_link_of_one_way_is_no_average():
     plan = document.loads(text).cases()["periodic"]
     ((severity, message, remedy),) = plan.law.analyse(plan)
     assert severity == "error"
-    assert "KH01 hears KH06" in message
+    assert "KH01 receives KH06" in message
     assert '"KH06 - KH01"' in remedy
 
 

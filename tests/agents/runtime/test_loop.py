@@ -144,7 +144,7 @@ def test_standstill_without_router_halts_then_lands(kind, after_s, monkeypatch):
     stage.runtime._keeper.end()
     landed = [at - woke[0] for at, order in stage.orders if order == "land"]
     assert landed[: len(after_s)] == pytest.approx(after_s, abs=0.05)
-    assert "no router tells who owns its name" in stage.runtime.robots[0].lifecycle.reason
+    assert "no router answers about the owner of its name" in stage.runtime.robots[0].lifecycle.reason
 
 
 @pytest.mark.parametrize("phase", [Phase.READY, Phase.AIRBORNE])

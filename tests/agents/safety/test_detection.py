@@ -242,7 +242,7 @@ def test_unstarted_drone_lands():
     robot.step(2.9)
     assert robot.acts == []
     robot.step(0.2)
-    assert [each.text for each in robot.acts] == ["land: nobody will start it: the conductor is gone for 3.0 s"]
+    assert [each.text for each in robot.acts] == ["land: no start will come: the conductor is gone for 3.0 s"]
 
 
 def test_failing_control_loop():
@@ -291,7 +291,7 @@ def test_climb_that_is_carried_aside():
 
     assert robot.step(0.55, carry).texts == []
     robot.step(0.05, carry)
-    assert robot.texts == ["land: it moves and is not told to: 0.57 m aside while it climbs"]
+    assert robot.texts == ["land: it moves without a command: 0.57 m aside while it climbs"]
     robot.status.climbing = False
     assert robot.step().found == set()
 
@@ -302,7 +302,7 @@ def test_climb_without_measured_height(kind, patience_s):
     robot.status.cruising, robot.status.climbing = False, True
     robot.position = (0.0, 0.0, 0.02)
     assert robot.step(patience_s).texts == []
-    assert robot.step(0.03).texts == ["land: it is told to move and does not: it does not rise"]
+    assert robot.step(0.03).texts == ["land: it does not obey commands to move: it does not rise"]
 
 
 def lands(*, height=0.5, velocity=(0.0, 0.0, 0.0), **safety):
@@ -331,7 +331,7 @@ def test_landing_that_does_no_good_is_cut(height, velocity, seconds):
 
 def test_hovering_drone_is_never_cut():
     robot = lands().step(30.0)
-    assert robot.texts == ["warn: it is told to land and hovers: at 0.50 m"]
+    assert robot.texts == ["warn: it hovers although commanded to land: at 0.50 m"]
     robot.values["flying"] = False
     assert robot.step().found == set()
 
@@ -365,7 +365,7 @@ def test_disobedient_wheels():
     robot = Watched(KHEPERA4, hover=0.0)
     robot.status.setpoint = (0.2, 0.0, 0.0, 0.0)
     robot.step(5.0)
-    assert robot.texts[0].startswith("warn: it is told to move and does not: told 0.")
+    assert robot.texts[0].startswith("warn: it does not obey commands to move: 0.")
     robot = Watched(KHEPERA4, hover=0.0)
     robot.status.setpoint = (0.0, 0.0, 0.0, 0.0)
 

@@ -226,7 +226,7 @@ def test_outcomes_only_become_harder(story, lost, kind):
     ("text", "fails", "blind"),
     [
         ("land: it left the arena: 0.30 m outside", True, False),
-        ("warn: it is told to move and does not: told 1 m in vain", True, False),
+        ("warn: it does not obey commands to move: 1 m commanded in vain", True, False),
         ("warn: a neighbour is lost: B", False, False),
         ("hold: its own position is lost: none", False, True),
         ("unresolved at the end: its own position is lost, for 2.00 s", True, True),

@@ -434,10 +434,13 @@ def test_who_does_not_come_back_has_died(gone: list[int]):
             [("hazard", "hold: its own position is lost: none"), ("hazard", "over: its own position is lost, after")],
             (),
         ),
-        ([("hazard", "over: it is told to move and does not, after 2.00 s")], ()),
+        ([("hazard", "over: it does not obey commands to move, after 2.00 s")], ()),
         (
-            [("hazard", "warn: it is told to move and does not: told 0.21 m in vain"), ("lost", "its process ended")],
-            ("F at 3.0 s: it is told to move and does not: told 0.21 m in vain",),
+            [
+                ("hazard", "warn: it does not obey commands to move: 0.21 m commanded in vain"),
+                ("lost", "its process ended"),
+            ],
+            ("F at 3.0 s: it does not obey commands to move: 0.21 m commanded in vain",),
         ),
         ([("hazard", "warn: its device does not answer: for 1.0 s")],
          ("F at 3.0 s: its device does not answer: for 1.0 s",)),

@@ -122,7 +122,7 @@ def test_robots_beginning_is_its_first_status_within_experiment() -> None:
         ("finished", (), False),
         ("ordered to land", (), False),
         ("ordered to leave", (), False),
-        ("told to end", (), False),
+        ("asked to end", (), False),
         ("emergency stop by a test", (), False),
     ],
 )

@@ -55,7 +55,7 @@ def test_each_fault_has_its_remedy(lab, there, tmp_path):
     assert said(tmp_path / "nowhere", lab)[0].startswith("has no certificates of KH01, CF01; `./zenpark hosts install")
     (there / "KH01.key").chmod(0o644)
     assert said(there, lab)[0].startswith(
-        "others can read KH01.key; revoke it if somebody has; `./zenpark hosts install"
+        "others can read KH01.key; revoke it if they have read it; `./zenpark hosts install"
     )
     (there / "KH01.key").unlink()
     assert said(there, lab)[0].startswith("KH01.key is missing; `./zenpark hosts install")

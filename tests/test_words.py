@@ -1,0 +1,75 @@
+"""Texts are plain technical English: no phrase that hides its subject, a noun first, short sentences."""
+
+from __future__ import annotations
+
+import ast
+import io
+import re
+import tokenize
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+LONGEST = 30  # words of a sentence
+PLACES = ("agents", "face")
+# clauses in the place of a noun or of a number, and words that few readers know
+PHRASES = re.compile(
+    r"\b(so (long|much|many|often)|(that|how) much|but for|as often as|com(e|es|ing) to|came to|whose|who(m|so)?ever|"
+    r"(some|no)body|told|anew|alike|lest|heed\w*|hear[sd]?|hearing|speaks?|spoken|nothing else|those who)\b",
+    re.IGNORECASE,
+)
+FIRST = re.compile(r"(It|Its|They|Their|Who|What|Which|Whose|This|That|These|Those|He|She|We|You|There|How|Why)\b")
+FENCE = re.compile(r"^ *(```|~~~).*?^ *\1|^(?: {4,}[^\n]*\n)+", re.MULTILINE | re.DOTALL)
+ITEM = re.compile(r"\n\s*\n|\n(?=\s*(?:[-*|>#]|\d+\.|`?\w[\w., ]*`?:) )")
+ASIDE = re.compile(r" ?\([^()]*\)|(?<=\])\([^()]*\)")
+WORD = re.compile(r"\b(?:[^\W\d_]{2,}|a)\b")
+
+
+def texts(file: Path) -> Iterator[tuple[int, str, bool]]:
+    """Line, text, and whether it is a docstring or a page; else a comment or a message."""
+    source = file.read_text("utf-8")
+    if file.suffix == ".md":
+        yield 1, FENCE.sub("", source), True
+        return
+    docs = set()
+    for node in ast.walk(ast.parse(source)):
+        documented = isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
+        if documented and (doc := ast.get_docstring(node)):
+            docs.add(id(node.body[0].value))
+            yield getattr(node, "lineno", 1), doc, True
+        elif (
+            isinstance(node, ast.Constant)
+            and isinstance(node.value, str)
+            and id(node) not in docs
+            and " " in node.value
+        ):
+            yield node.lineno, node.value, False
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.COMMENT:
+            yield token.start[0], token.string, False
+
+
+def sentences(text: str) -> Iterator[str]:
+    """Sentences, without what stands in parentheses, quotes or code."""
+    for item in ITEM.split(text):
+        plain = re.sub(r'"[^"]*"|`[^`]*`', "it", re.sub(r"\s+", " ", item))
+        yield from re.split(r"(?<=[.!?])[*_”]*\s+", ASIDE.sub("", ASIDE.sub("", plain)))
+
+
+def files(place: str) -> list[Path]:
+    return [file for end in ("py", "md") for file in sorted((ROOT / place).rglob(f"*.{end}"))] or [ROOT / place]
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_texts_are_plain(place):
+    found = []
+    for file in files(place):
+        for line, text, long in texts(file):
+            said = [match[0] for match in PHRASES.finditer(re.sub(r"\s+", " ", text))]
+            if long:
+                said += [match[0] for match in [FIRST.match(text)] if match]
+                said += [each for each in sentences(text) if len(WORD.findall(each)) > LONGEST]
+            found += [f"{file.relative_to(ROOT)}:{line}: {each}" for each in said]
+    assert not found, "\n".join(found)
