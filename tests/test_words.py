@@ -20,7 +20,7 @@ PHRASES = re.compile(
     r"(some|no)body|told|anew|alike|lest|heed\w*|hear[sd]?|hearing|speaks?|spoken|nothing else|those who)\b",
     re.IGNORECASE,
 )
-FIRST = re.compile(r"(It|Its|They|Their|Who|What|Which|Whose|This|That|These|Those|He|She|We|You|There|How|Why)\b")
+FIRST = re.compile(r"\A(?:It|Its|They|Their|Who|What|Which|Whose|This|That|These|Those|He|She|We|You|There|How|Why)\b")
 FENCE = re.compile(r"^ *(```|~~~).*?^ *\1|^(?: {4,}[^\n]*\n)+", re.MULTILINE | re.DOTALL)
 ITEM = re.compile(r"\n\s*\n|\n(?=\s*(?:[-*|>#]|\d+\.|`?\w[\w., ]*`?:) )")
 ASIDE = re.compile(r" ?\([^()]*\)|(?<=\])\([^()]*\)")
@@ -69,7 +69,7 @@ def test_texts_are_plain(place):
         for line, text, long in texts(file):
             said = [match[0] for match in PHRASES.finditer(re.sub(r"\s+", " ", text))]
             if long:
-                said += [match[0] for match in [FIRST.match(text)] if match]
+                said += FIRST.findall(text)
                 said += [each for each in sentences(text) if len(WORD.findall(each)) > LONGEST]
             found += [f"{file.relative_to(ROOT)}:{line}: {each}" for each in said]
     assert not found, "\n".join(found)

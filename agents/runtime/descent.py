@@ -55,7 +55,7 @@ class Descent:
         self.watchdog = Watchdog(body, self._everyone, alarm=alarm, silence_s=silence_s, down_s=down_s)
 
     def await_ownership(self) -> bool:
-        """Whether the process stood still since the last call; then it has waited until the ownership was certain.
+        """Whether the process was suspended since the last call; if so, it has waited until the ownership was certain.
 
         Until then it must not command its bodies, since another process may drive them. Without an answer those on
         wheels halt after `neighbour_timeout_s`, and after `offline_s`, or `ANSWER_S` if it is told to end, all land:
@@ -69,7 +69,7 @@ class Descent:
         while not self._keeper.is_owner():
             waited = self._ticks.elapsed() - woke
             if waited > limits.offline_s or (waited > ANSWER_S and self.reason_to_end() is not None):
-                self._recover(f"it stood still, and for {waited:.0f} s no router tells who owns its name")
+                self._recover(f"it stood still, and for {waited:.0f} s no router answers about the owner of its name")
                 break
             if drives and waited > limits.neighbour_timeout_s:
                 self._body.land(drives)
