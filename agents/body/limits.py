@@ -14,14 +14,18 @@ from agents.vectors import NotNegative, Positive, Share, Vector
 class Safety(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
     """Limits of setpoints, and thresholds at which a robot holds, lands or has its motors cut."""
 
-    speed: Annotated[Positive | None, Meta(description="[m/s], if lower than the kind's own")] = None
-    max_goal_distance: Annotated[Positive, Meta(description="farthest goal from where the robot is [m]")] = 0.5
-    margin: Annotated[NotNegative, Meta(description="how far inside the walls goals stay [m]")] = 0.05
-    position_timeout_s: Annotated[Positive, Meta(description="own position older than this is none: hold [s]")] = 0.5
+    speed: Annotated[Positive | None, Meta(description="speed limit [m/s], if lower than that of the kind")] = None
+    max_goal_distance: Annotated[Positive, Meta(description="largest distance of a goal from the robot [m]")] = 0.5
+    margin: Annotated[NotNegative, Meta(description="distance of goals from the walls of the arena [m]")] = 0.05
+    position_timeout_s: Annotated[
+        Positive, Meta(description="a position older than this counts as unknown; the robot holds [s]")
+    ] = 0.5
     land_without_position_s: Annotated[
-        NotNegative, Meta(description="a flying robot that has no position of its own for this long lands [s]")
+        NotNegative, Meta(description="time without a known position after which a flying robot lands [s]")
     ] = 0.3
-    neighbour_timeout_s: Annotated[Positive, Meta(description="a neighbour gone for this long is left out [s]")] = 1.0
+    neighbour_timeout_s: Annotated[
+        Positive, Meta(description="time without a pose after which a neighbour counts as lost [s]")
+    ] = 1.0
     lost_neighbour: Annotated[
         Literal["drop", "hold", "land"],
         Meta(description="reaction to a lost neighbour: continue without it, hold, or land"),
@@ -43,9 +47,9 @@ class Safety(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             "half of it, or in contact, they land; left out: not watched"
         ),
     ] = None
-    cut_beyond_m: Annotated[Positive, Meta(description="a drone this far outside the arena has its motors cut [m]")] = (
-        0.75
-    )
+    cut_beyond_m: Annotated[
+        Positive, Meta(description="distance outside the arena at which the motors of a drone are cut [m]")
+    ] = 0.75
     overspeed: Annotated[
         float, Meta(gt=1, description="multiple of the top speed of its kind above which a robot holds, then lands")
     ] = 2.5
@@ -61,7 +65,7 @@ class Safety(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         Meta(description="time without descending or hovering after which the motors of a landing drone are cut [s]"),
     ] = 20.0
     loop_timeout_s: Annotated[
-        Positive, Meta(description="a robot whose control loop hangs for this long is landed from outside of it [s]")
+        Positive, Meta(description="time without a tick of the control loop after which the watchdog lands a robot [s]")
     ] = 0.5
 
 
