@@ -57,9 +57,9 @@ class Descent:
     def await_ownership(self) -> bool:
         """Whether the process was suspended since the last call; if so, it has waited until the ownership was certain.
 
-        Until then it must not command its bodies, since another process may drive them. Without an answer those on
-        wheels halt after `neighbour_timeout_s`, and after `offline_s`, or `ANSWER_S` if it is told to end, all land:
-        the process drives its bodies again then, until it learns that they belong to another one.
+        While it waits it must not command its bodies, since another process may drive them. Without an answer those on
+        wheels halt after `neighbour_timeout_s`. After `offline_s`, or `ANSWER_S` if the process is asked to end, all
+        land. The process then drives its bodies again, until it learns that they belong to another one.
         """
         if not self._keeper.stood_still() or self.watchdog.tripped:  # the watchdog handles a loop that hangs
             return False
