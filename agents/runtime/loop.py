@@ -16,7 +16,6 @@ from functools import partial
 from math import ceil, inf, isfinite, isnan
 from typing import Final, Literal
 
-import msgspec
 import zenoh
 
 from agents.body.external_pose import External
@@ -33,7 +32,6 @@ from agents.network.channel_model import Conditions
 from agents.network.keys import Keys
 from agents.network.name_ownership import NameKeeper
 from agents.network.shutdown import leave
-from agents.network.zenoh_config import ASK_S
 from agents.plugins.calls import explain
 from agents.plugins.registry import FAILURES
 from agents.robot import Robot
@@ -42,7 +40,7 @@ from agents.runtime.descent import Descent
 from agents.runtime.goal_inbox import GoalInbox
 from agents.runtime.lifeline import SILENCE_S as LIFELINE_S
 from agents.runtime.lifeline import Lifeline
-from agents.runtime.orders import LAND, STOP, carry_out
+from agents.runtime.orders import LAND, STOP, OrderDesk
 from agents.runtime.pose_inbox import PoseInbox
 from agents.runtime.range_inbox import RangeInbox
 from agents.runtime.telemetry import Counts, Telemetry
@@ -98,7 +96,6 @@ class Runtime:
         self._counts = Counts(len(self._names))
         self._state_slot = 0
         self._stopping: str | None = None
-        self._leaving: set[int] = set()  # rows that were ordered to leave the run
         self._retired: set[int] = set()  # rows that land, or have landed, while the run goes on
         self._cut_off = False  # motors were cut by a stop that the loop has not polled yet
         self._estimators = [External() for _ in self._names]
@@ -152,9 +149,7 @@ class Runtime:
     def _reason(self, asked: bool) -> str | None:
         if asked:
             return TOLD_TO_END
-        return "ordered to leave" if len(self._leaving) == len(self._names) else None
-
-    # ------------------------------------------------------------------ the network
+        return "ordered to leave" if len(self._orders.leaving) == len(self._names) else None
 
     def _subscribe_to_stops(self, session: zenoh.Session) -> None:
         """Subscribes to emergency stops before the body is opened, which may take a minute."""
@@ -168,7 +163,10 @@ class Runtime:
         self._router = network.RouterWatch(session, keys.alive(names[0]), self._setup.endpoints)
         self._poses = [pubsub.pose_publisher(session, keys.pose(name), self._mime) for name in names]
         self._last = [pubsub.LastValue(session, keys.pose(name), self._mime) for name in names]
-        self._orders = [pubsub.Orders(session, keys.order(name), messages.Order) for name in names]
+        self._orders = OrderDesk(
+            session, keys, self._setup.encoding, robots=self.robots, body=self._body, counts=self._counts,
+            on_start=self._align,
+        )  # fmt: skip
         self._conductor = pubsub.AliveWatch(session, keys.conductor)
         located = [row for row, there in enumerate(self._setup.located) if there]
         exact = [row for row, there in enumerate(self._setup.exact) if there]
@@ -200,123 +198,6 @@ class Runtime:
             receipts=None if self._goals is None else self._goals.news,
         )
         self._declare_tokens()
-
-    def _declare_tokens(self) -> None:
-        self._keeper.declare(self._session, (row for row in self._everyone if row not in self._retired))
-
-    def _call_for_help(self, why: str) -> None:
-        """Removes the robots from the formation while their loop hangs, or is over; called by the watchdog's thread."""
-        print(f"{', '.join(self._names)}: {why}; landing it", flush=True)
-        if self._joined:
-            self._telemetry.repeat_statuses(why, self._setup.clock.utc())
-            # a loop that has recovered meanwhile keeps its tokens
-            self._keeper.withdraw(self._everyone, lambda: self._descent.begun or bool(self._watchdog.tripped))
-
-    def _recover(self, why: str) -> None:
-        """Lands the robots after the watchdog ordered it, although the loop runs again."""
-        for robot in self.robots:
-            if robot.lifecycle.active:
-                robot.lifecycle.land(why)
-            robot.landing.land_in_place()  # the body lands by other means
-        self._declare_tokens()
-
-    def _hold_after_suspend(self, slept: float) -> None:
-        """Holds position until neighbour poses are fresh again, after the loop was suspended for `slept` [s]."""
-        self.health.mark_resumed(self._ticks.t, slept)
-        print(f"{', '.join(self._names)}: stood still for {slept:.1f} s; holding", flush=True)
-
-    def _receive(self, t: float) -> None:
-        health = self.health
-        health.offline_since = self._cut_off_since(t)
-        for _, there in self._conductor.changes() if self._conductor.waiting else ():
-            health.conductor_lost_since = inf if there else min(health.conductor_lost_since, t)
-        self._neighbours.deliver(t, self._utc)
-        if self._goals is not None:
-            self._goals.receive(t, self._utc)
-        if self._estop.waiting:
-            self._apply_stops()
-        if (located := self._located) is not None:
-            for row, taken, position, yaw in located.receive(self._utc, t):
-                robot = self.robots[row]
-                if robot.believes(taken, position):
-                    self._body.locate(row, taken, position, robot.believed_yaw(taken, yaw))
-        for row, orders in enumerate(self._orders):
-            for query, order in orders.read() if orders.waiting else ():
-                self._obey(row, query, order, t)
-        for last in self._last:
-            if last.waiting:
-                last.answer()
-
-    def _cut_off_since(self, t: float) -> float:
-        """Time [s] since which no router answers; infinity while one does."""
-        if t >= self._router_due:  # a check of the router costs as much as a law
-            self._router_due = t + ROUTER_S
-            before, self._silent_since = self._silent_since, self._router.silent_since(t, self._neighbours.arrived)
-            if before < inf and self._silent_since == inf:
-                self._keeper.begin_check(self._session)  # it was cut off
-            self._keeper.is_owner()
-        return self._silent_since
-
-    def _cut(self, _stop: messages.Stop) -> None:
-        """Cuts the motors on reception of an emergency stop, in the receiving thread; the loop does the rest.
-
-        A body that is still being opened is stopped on the first tick.
-        """
-        self._cut_off = True
-        if self._opened:
-            self._body.stop(self._everyone)
-
-    def _apply_stops(self) -> None:
-        """Ends the lifecycle of all rows after an emergency stop, see `_cut`."""
-        for stop in network.received(self._estop):
-            self._cut_off = False  # the phases hold it from now on
-            for robot in self.robots:
-                robot.lifecycle.stop(stop.words)
-
-    def _malformed(self) -> int:
-        """Payloads that were refused, of all kinds but poses."""
-        return (
-            sum(orders.malformed for orders in self._orders)
-            + (self._goals.malformed if self._goals is not None else 0)
-            + (sum(self._located.malformed) if self._located is not None else 0)
-            + (self._ranges.malformed if self._ranges is not None else 0)
-        )
-
-    def _obey(self, row: int, query: zenoh.Query, order: messages.Order, t: float) -> None:
-        key = self._setup.keys.order(self._names[row])
-        with query:
-            robot = self.robots[row]
-            waits = robot.lifecycle.phase == Phase.AIRBORNE
-            slept = self.health.suspended_s
-            # the conductor has given up waiting
-            if order.order == "takeoff" and slept > ASK_S and self.health.just_resumed(t):
-                refusal, value = f"the process stood still for {slept:.1f} s; ask again", None
-            else:
-                refusal, value = carry_out(robot, order, t, self._utc)
-            self._counts.refused += bool(refusal)
-            if order.order == "leave":
-                self._leaving.add(row)
-            if (
-                order.order == "start" and order.at is not None and not refusal and waits
-            ):  # a running robot keeps its ticks
-                self._ticks.align(order.at - self._utc)  # robots that start together decide together
-                self._telemetry.due = t  # the central controller must know the start in time
-            phase = Phase(robot.lifecycle.phase).word
-            found = self._inspect(row, t) if order.order == "inspect" else None
-            reply = messages.Reply(self._names[row], not refusal, phase, refusal, value, found)
-            query.reply(key, messages.encode(reply, self._setup.encoding), encoding=self._mime)
-
-    def _inspect(self, row: int, t: float) -> messages.Inspection:
-        known = self._body.inspect(row)
-        if not self._states:
-            return known
-        state = self._states[row]
-        return msgspec.structs.replace(
-            known,
-            flying=state.flying,
-            age_s=messages.number(t - state.time),
-            ahead_s=None if isnan(state.ahead) else messages.number(state.ahead),
-        )
 
     # ------------------------------------------------------------------ the loop
 
@@ -378,21 +259,6 @@ class Runtime:
             # not by `until_next`: a wait that lasts too long delays its tick and skips none
             ahead = ticks.next - ticks.elapsed()
 
-    def _yield_after_stop(self) -> None:
-        """Sleeps, so that other processes get the CPU to stop their motors."""
-        ticks = ceil(STOP_YIELD_S / self._dt)
-        self._ticks.next += ticks * self._dt
-        for robot in self.robots:
-            robot.tick += ticks
-        time.sleep(STOP_YIELD_S)
-
-    def _skip_ticks(self, ticks: int) -> None:
-        """Count a tick after `ticks` that are too late, mostly 0."""
-        self.health.count_tick(ticks, self._dt)
-        if ticks:
-            for robot in self.robots:
-                robot.skip_ticks(ticks)
-
     def _tick(self, t: float) -> None:
         self._receive(t)
         states = self._states = self._read(t)
@@ -412,6 +278,26 @@ class Runtime:
             telemetry.send_ranges(states)
         telemetry.send_statuses(t, everything=t >= telemetry.due, states=states, changed=self._neighbours.changed)
         self._neighbours.changed = False
+
+    def _receive(self, t: float) -> None:
+        health = self.health
+        health.offline_since = self._cut_off_since(t)
+        for _, there in self._conductor.changes() if self._conductor.waiting else ():
+            health.conductor_lost_since = inf if there else min(health.conductor_lost_since, t)
+        self._neighbours.deliver(t, self._utc)
+        if self._goals is not None:
+            self._goals.receive(t, self._utc)
+        if self._estop.waiting:
+            self._apply_stops()
+        if (located := self._located) is not None:
+            for row, taken, position, yaw in located.receive(self._utc, t):
+                robot = self.robots[row]
+                if robot.believes(taken, position):
+                    self._body.locate(row, taken, position, robot.believed_yaw(taken, yaw))
+        self._orders.answer(t, self._utc, self._states)
+        for last in self._last:
+            if last.waiting:
+                last.answer()
 
     def _read(self, t: float) -> Sequence[BodyState]:
         """States of the bodies, completed by what others measure."""
@@ -439,25 +325,6 @@ class Runtime:
         if not begun and self.robots[0].decisions:
             counts.begin()
         return running
-
-    def _retire(self, t: float) -> None:
-        """Undeclares the tokens of rows that leave, or land unasked, and silences them: no neighbour must follow them.
-
-        The latter declare theirs again after the experiment; rows that were ordered to land keep theirs.
-        """
-        during = []
-        for row, robot in enumerate(self.robots):
-            life = robot.lifecycle
-            during.append(isfinite(life.start_at) and t < life.start_at + self._duration)
-            # support processes without a launcher end with the last token (`agents.network.shutdown`)
-            down = robot.descending if self._stopping is None else life.phase == Phase.DONE
-            unasked = during[row] and not life.reason.startswith((messages.EMERGENCY, LAND, STOP))
-            if down and (unasked or row in self._leaving) and row not in self._retired:
-                self._retired.add(row)
-                self._keeper.withdraw((row,))  # nothing, if the watchdog has done it
-        if back := [row for row in self._retired if not (during[row] or row in self._leaving)]:
-            self._retired.difference_update(back)
-            self._declare_tokens()
 
     def _act(self) -> None:
         """Commands the body, motors-off first."""
@@ -489,3 +356,103 @@ class Runtime:
         payload = messages.encode(pose, self._setup.encoding)
         self._last[row].hold(payload)
         self._poses[row].put(payload)
+
+    # ------------------------------------------------------------------ what is rare
+
+    def _align(self, at: float, t: float) -> None:
+        """Aligns the ticks with a common start at `at` [s]: robots that start together decide together."""
+        self._ticks.align(at)
+        self._telemetry.due = t  # the central controller must know the start in time
+
+    def _declare_tokens(self) -> None:
+        self._keeper.declare(self._session, (row for row in self._everyone if row not in self._retired))
+
+    def _retire(self, t: float) -> None:
+        """Undeclares the tokens of rows that leave, or land unasked, and silences them: no neighbour must follow them.
+
+        The latter declare theirs again after the experiment; rows that were ordered to land keep theirs.
+        """
+        during = []
+        for row, robot in enumerate(self.robots):
+            life = robot.lifecycle
+            during.append(isfinite(life.start_at) and t < life.start_at + self._duration)
+            # support processes without a launcher end with the last token (`agents.network.shutdown`)
+            down = robot.descending if self._stopping is None else life.phase == Phase.DONE
+            unasked = during[row] and not life.reason.startswith((messages.EMERGENCY, LAND, STOP))
+            if down and (unasked or row in self._orders.leaving) and row not in self._retired:
+                self._retired.add(row)
+                self._keeper.withdraw((row,))  # nothing, if the watchdog has done it
+        if back := [row for row in self._retired if not (during[row] or row in self._orders.leaving)]:
+            self._retired.difference_update(back)
+            self._declare_tokens()
+
+    def _cut(self, _stop: messages.Stop) -> None:
+        """Cuts the motors on reception of an emergency stop, in the receiving thread; the loop does the rest.
+
+        A body that is still being opened is stopped on the first tick.
+        """
+        self._cut_off = True
+        if self._opened:
+            self._body.stop(self._everyone)
+
+    def _apply_stops(self) -> None:
+        """Ends the lifecycle of all rows after an emergency stop, see `_cut`."""
+        for stop in network.received(self._estop):
+            self._cut_off = False  # the phases hold it from now on
+            for robot in self.robots:
+                robot.lifecycle.stop(stop.words)
+
+    def _yield_after_stop(self) -> None:
+        """Sleeps, so that other processes get the CPU to stop their motors."""
+        ticks = ceil(STOP_YIELD_S / self._dt)
+        self._ticks.next += ticks * self._dt
+        for robot in self.robots:
+            robot.tick += ticks
+        time.sleep(STOP_YIELD_S)
+
+    def _skip_ticks(self, ticks: int) -> None:
+        """Count a tick after `ticks` that are too late, mostly 0."""
+        self.health.count_tick(ticks, self._dt)
+        if ticks:
+            for robot in self.robots:
+                robot.skip_ticks(ticks)
+
+    def _hold_after_suspend(self, slept: float) -> None:
+        """Holds position until neighbour poses are fresh again, after the loop was suspended for `slept` [s]."""
+        self.health.mark_resumed(self._ticks.t, slept)
+        print(f"{', '.join(self._names)}: stood still for {slept:.1f} s; holding", flush=True)
+
+    def _cut_off_since(self, t: float) -> float:
+        """Time [s] since which no router answers; infinity while one does."""
+        if t >= self._router_due:  # a check of the router costs as much as a law
+            self._router_due = t + ROUTER_S
+            before, self._silent_since = self._silent_since, self._router.silent_since(t, self._neighbours.arrived)
+            if before < inf and self._silent_since == inf:
+                self._keeper.begin_check(self._session)  # it was cut off
+            self._keeper.is_owner()
+        return self._silent_since
+
+    def _call_for_help(self, why: str) -> None:
+        """Removes the robots from the formation while their loop hangs, or is over; called by the watchdog's thread."""
+        print(f"{', '.join(self._names)}: {why}; landing it", flush=True)
+        if self._joined:
+            self._telemetry.repeat_statuses(why, self._setup.clock.utc())
+            # a loop that has recovered meanwhile keeps its tokens
+            self._keeper.withdraw(self._everyone, lambda: self._descent.begun or bool(self._watchdog.tripped))
+
+    def _recover(self, why: str) -> None:
+        """Lands the robots after the watchdog ordered it, although the loop runs again."""
+        for robot in self.robots:
+            if robot.lifecycle.active:
+                robot.lifecycle.land(why)
+            robot.landing.land_in_place()  # the body lands by other means
+        self._declare_tokens()
+
+    def _malformed(self) -> int:
+        """Payloads that were refused, of all kinds but poses."""
+        return (
+            self._orders.malformed
+            + (self._goals.malformed if self._goals is not None else 0)
+            + (sum(self._located.malformed) if self._located is not None else 0)
+            + (self._ranges.malformed if self._ranges is not None else 0)
+        )

@@ -1,14 +1,22 @@
-"""Execution of orders to a robot, or the reason of a refusal. Pure; the loop receives and replies."""
+"""Orders to the robots of a process: reception, execution or the reason of a refusal, reply."""
 
 from __future__ import annotations
 
-from math import isfinite
+from collections.abc import Callable, Sequence
+from math import isfinite, isnan
 from typing import Final
 
 import msgspec
+import zenoh
 
+from agents.body.interface import Body, BodyState
+from agents.decision.lifecycle import Phase
+from agents.network import messages, pubsub
+from agents.network.keys import Keys
 from agents.network.messages import Order
+from agents.network.zenoh_config import ASK_S
 from agents.robot import Robot
+from agents.runtime.telemetry import Counts
 from agents.vectors import Setpoint
 
 SOON_S: Final = 3600.0  # a common start further ahead results from a wrong clock
@@ -21,9 +29,77 @@ PAUSED: Final = "ordered to hold"
 Answer = tuple[str, float | None]  # reason of a refusal (empty: none), and the value of a parameter
 
 
+class OrderDesk:
+    """Answers the orders to the robots of a process, between two ticks of their loop.
+
+    Declare it before their liveliness tokens: a client that sees a token may then give orders.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        keys: Keys,
+        encoding: messages.Encoding,
+        *,
+        robots: Sequence[Robot],
+        body: Body,  # inspected on request
+        counts: Counts,  # refused orders are counted there
+        on_start: Callable[[float, float], object],  # time of a common start of a waiting robot, present time [s]
+    ) -> None:
+        self.leaving: set[int] = set()  # rows that were ordered to leave the run
+        self._encoding, self._robots, self._body = encoding, robots, body
+        self._counts, self._on_start = counts, on_start
+        self._keys = [keys.order(robot.assignment.name) for robot in robots]
+        self._inboxes = [pubsub.Orders(session, key, Order) for key in self._keys]
+
+    @property
+    def malformed(self) -> int:
+        """Refused payloads."""
+        return sum(inbox.malformed for inbox in self._inboxes)
+
+    def answer(self, t: float, utc: float, states: Sequence[BodyState]) -> None:
+        """Answers all until `t` [s] of a clock that was 0 at `utc` [s]; `states`: last reading of the body, if any."""
+        for row, inbox in enumerate(self._inboxes):
+            for query, order in inbox.read() if inbox.waiting else ():
+                with query:
+                    reply = self._obey(row, order, t, utc, states)
+                    payload = messages.encode(reply, self._encoding)
+                    query.reply(self._keys[row], payload, encoding=messages.MIME[self._encoding])
+
+    def _obey(self, row: int, order: Order, t: float, utc: float, states: Sequence[BodyState]) -> messages.Reply:
+        robot = self._robots[row]
+        waits = robot.lifecycle.phase == Phase.AIRBORNE
+        slept = robot.health.suspended_s
+        # the conductor has given up waiting
+        if order.order == "takeoff" and slept > ASK_S and robot.health.just_resumed(t):
+            refusal, value = f"the process stood still for {slept:.1f} s; ask again", None
+        else:
+            refusal, value = carry_out(robot, order, t, utc)
+        self._counts.refused += bool(refusal)
+        if order.order == "leave":
+            self.leaving.add(row)
+        if order.order == "start" and order.at is not None and not refusal and waits:  # a running robot keeps its ticks
+            self._on_start(order.at - utc, t)
+        phase = Phase(robot.lifecycle.phase).word
+        found = self._inspect(row, t, states) if order.order == "inspect" else None
+        return messages.Reply(robot.assignment.name, not refusal, phase, refusal, value, found)
+
+    def _inspect(self, row: int, t: float, states: Sequence[BodyState]) -> messages.Inspection:
+        known = self._body.inspect(row)
+        if not states:
+            return known
+        state = states[row]
+        return msgspec.structs.replace(
+            known,
+            flying=state.flying,
+            age_s=messages.number(t - state.time),
+            ahead_s=None if isnan(state.ahead) else messages.number(state.ahead),
+        )
+
+
 def carry_out(robot: Robot, order: Order, t: float, utc: float) -> Answer:
     """Carries out an order to one robot at `t` [s] of a clock that was 0 at `utc` [s]."""
-    refusal = ""  # also of "inspect": the loop adds the inspection to the reply, it has the body
+    refusal = ""  # also of "inspect": the desk adds the inspection to the reply
     match order.order:
         case "takeoff":
             refusal = _take_off(robot, order, t, utc)

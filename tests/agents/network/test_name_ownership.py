@@ -320,7 +320,7 @@ def test_late_alarm_leaves_the_tokens(monkeypatch):
         assert CountedToken.live == shown
         robot._recover("it hung")
         assert CountedToken.live == shown
-        robot._leaving.add(0)
+        robot._orders.leaving.add(0)
         robot.robots[0].lifecycle.land("ordered to leave")
         robot._watchdog.tripped = "it hangs"
         robot._call_for_help("it hangs")

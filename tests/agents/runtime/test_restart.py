@@ -154,8 +154,7 @@ def test_repeated_start_keeps_the_ticks():
 
         def start(at: float) -> None:
             net.deliver(sent("park/A/order", messages.Order("start", at=UTC + at))[0])
-            for query, order in robot._orders[0].read():
-                robot._obey(0, query, order, robot._ticks.t)
+            robot._orders.answer(robot._ticks.t, UTC, ())
 
         robot.robots[0].lifecycle.phase = AIRBORNE
         start(7.504)
