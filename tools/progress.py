@@ -14,8 +14,6 @@ from tools.terminal import printable, say
 if TYPE_CHECKING:
     from rich.console import Console, Group
 
-    from experiments.report.page import Finding
-
 REFRESH_S: Final = 0.25
 LINE_S: Final = 5.0
 QUIET: Final = ("robot",)  # kinds of events that the table shows better
@@ -171,10 +169,3 @@ def columns(rows: Sequence[Sequence[str]]) -> list[str]:
     """Lines of a table, its columns as wide as they must be."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
-
-
-def finding_lines(findings: Sequence[Finding]) -> list[str]:
-    """The verdict of a page, a line for each finding."""
-    from experiments.report.page import MARKS
-
-    return [f"{MARKS[finding.mark]} {finding.text}" for finding in findings]

@@ -17,8 +17,8 @@ from experiments.real_time.conductor.run_view import RunFailed
 from experiments.recording.run_folder import new_folder
 from tests.reliability.soak_sampler import Sampler
 from tests.reliability.soak_verdict import judge, passed, table
+from tests.reliability.terminal import report_lines
 from tools.options import AsJson, Bodies, Case, Out, Settings, print_result
-from tools.progress import columns, finding_lines
 
 
 def soak(
@@ -48,7 +48,7 @@ def soak(
     findings = judge(soaked)
     well = passed(findings)
     shown = {"run": folder, "passed": well, "findings": findings}
-    print_result(shown, *columns(table(soaked)), *finding_lines(findings), f"results: {folder}", as_json=as_json)
+    print_result(shown, *report_lines(table(soaked), findings), f"results: {folder}", as_json=as_json)
     if soaked.interrupted:
         return 130
     return 0 if well else 1

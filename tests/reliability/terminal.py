@@ -1,0 +1,13 @@
+"""A table and a verdict as lines of the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from experiments.report.page import MARKS, Finding
+from tools.progress import columns
+
+
+def report_lines(rows: Sequence[Sequence[str]], verdict: Sequence[Finding]) -> list[str]:
+    """Lines of a table, its head first, and one for each finding."""
+    return [*columns(rows), *(f"{MARKS[finding.mark]} {finding.text}" for finding in verdict)]
