@@ -535,7 +535,7 @@ def _losses(found: Sequence[PastRun]) -> list[str]:
     if not count:
         return []
     rate = f"{lost} poses lost, {lost / flown_h:.3g} per hour"
-    return [f"real time: {flown_h:.2f} h in {count} runs; {rate}; the last {quiet_h:.2f} h without loss"]
+    return [f"real time: {flown_h:.3g} h in {count} runs; {rate}; the last {quiet_h:.3g} h without loss"]
 
 
 def _minute(at: float) -> str:

@@ -162,7 +162,7 @@ def test_past_runs_tell_losses_per_hour(tmp_path: Path) -> None:
         kept(tmp_path / str(k), begun=1e9 + k, lost=lost)
     kept(tmp_path / "virtual", begun=2e9, lost=5, virtual=True)
     *_, line, _ = zenpark("runs", "--past", "--in", str(tmp_path)).stdout.splitlines()
-    assert line == "real time: 4.00 h in 4 runs; 9 poses lost, 2.25 per hour; the last 2.00 h without loss"
+    assert line == "real time: 4 h in 4 runs; 9 poses lost, 2.25 per hour; the last 2 h without loss"
     assert "real time" not in zenpark("runs", "virtual", "--in", str(tmp_path)).stdout
 
 
