@@ -33,10 +33,10 @@ OPEN_S: Final = 5.0  # deadline of the router's answer and of the first position
 POLL_S: Final = 0.02  # between looks for them
 WORLD: Final = "world"  # the address of robots in the shared world process
 REPEAT_S: Final = 0.1  # period of repeated orders: the publisher drops samples when its queue is full
-HALT_S: Final = 3.0  # how long `land` is repeated to a robot on wheels
-ANSWER_S: Final = 2.5  # the note reports a robot that is not measured to stand so long after a stop
+HALT_S: Final = 3.0  # time for which `land` is repeated to a robot on wheels
+ANSWER_S: Final = 2.5  # time after a stop at which the note reports a robot that is not measured to stand still
 SUPERSEDED_S: Final = 1.0  # a shorter standstill costs no process its name
-STANDSTILL_S: Final = 1.0  # how long `close` waits until stopped robots are measured to stand
+STANDSTILL_S: Final = 1.0  # longest wait of `close` until stopped robots are measured to stand still
 REACH: Final = (1e3, 1e3, 1e3)  # [m] bounds of valid positions: any room
 
 

@@ -9,8 +9,8 @@ from agents.safety.detection import SLOWEST
 from agents.vectors import ZERO, Vector, norm
 
 FRESH_S: Final = 0.5  # older positions are lost; robots tolerate as much
-LANDING_S: Final = 10.0  # a robot without positions counts as landed so long after `land`, and after a slow descent
-GROUNDED_S: Final = 1.0  # a robot in flight that is measured on the ground for so long has landed by itself
+LANDING_S: Final = 10.0  # from `land`, and a slow descent, until a robot without positions counts as landed
+GROUNDED_S: Final = 1.0  # time measured on the ground after which a robot in flight has landed by itself
 AWAY_M: Final = 0.05  # [m] above the ground: higher is in the air, lower is down
 FLOOR_M: Final = 0.2  # [m] a take-off from higher up is one from a table: the floor is at 0
 TABLE_M: Final = 0.3  # [m] horizontally from there it ends

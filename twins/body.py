@@ -53,7 +53,7 @@ class Twin:
     _delays: bool
     _drives: bool  # uses its battery all the time; what flies, with its motors on
     _endurance: float  # of a full battery [s],
-    _used: float  # and how much of it is used [s]
+    _used: float  # and the used part of it [s]
     _command: Setpoint  # given since the last step; NaN: none
     _before: Vector  # true position before the step [m]
     _t: float  # time of the last step [s]
@@ -157,7 +157,7 @@ class Twin:
         self._velocity = velocity
 
     def reserve(self, steps: int) -> None:
-        """Draw noise for so many steps and measurements ahead."""
+        """Draw noise for `steps` steps and measurements ahead."""
         for each in (self._jitter.noise, self._measurement.noise, self._drift.noise):
             each.reserve(steps + 1)
 

@@ -18,7 +18,7 @@ from bridges.crazyflie.positioning import Convergence, configure
 from bridges.crazyflie.telemetry import Telemetry
 from bridges.crazyflie.trajectory import Target
 
-NO_ANSWER_S: Final = 2.4  # without any answer for so long, no Crazyflie is there
+NO_ANSWER_S: Final = 2.4  # time without any answer after which no Crazyflie is there
 RADIO_LOST_S: Final = 3.0  # without an answered poll the link is lost, and a new one is opened
 LOST_S: Final = 1.0  # likewise without a packet over UDP or USB
 LOGS_S: Final = 1.0  # after a longer gap the firmware has removed its log blocks
@@ -32,14 +32,14 @@ LEAST_SHARE: Final = 0.1
 SLOWING_S: Final = 2.0  # more before that is done again: a queue drains meanwhile
 LOOP_HZ: Final = 20.0  # at least, for gaps and phases, however few setpoints are streamed
 EXTERNAL_AGE_S: Final = 0.5  # older external poses are not passed on
-LANDING_S: Final = 12.0  # `close` waits for a landing for at least so long
+LANDING_S: Final = 12.0  # least time that `close` waits for a landing
 JOIN_S: Final = 5.0
 
 IN_THE_AIR: Final = "connected again, in the air"
 # on the floor without radio, motors with the least thrust of the firmware (20,000 of 65,535) carry half of the weight
 SAFE_PARAMETERS: Final = {"posCtlPid.thrustMin": 5000.0}
 
-TAKEOFF_EXPIRY_S: Final = 2.0  # a take-off that could not begin for so long is dropped
+TAKEOFF_EXPIRY_S: Final = 2.0  # time after which a take-off that could not begin is dropped
 
 Order = tuple[str, float, float]  # "takeoff", "land" or "stop"; height of a take-off [m]; time of the order [s]
 
@@ -129,7 +129,7 @@ class CrazyfliePilot:
 
     @property
     def refusal(self) -> str:
-        """Why the drone on the ground would refuse to take off; empty if it would not."""
+        """Reason why the drone on the ground would refuse to take off; empty if it would not."""
         return "" if self._flight.airborne else self._flight.takeoff_refusal()
 
     @property

@@ -1,7 +1,7 @@
 """Telemetry of Crazyflies, newest values only: written by cflib's threads, read by the robot's loop.
 
-A pose is as old as the drone's own time stamp says, not as its arrival: queues on board, in the radio and in this
-computer hold packets back for seconds without losing one.
+The age of a pose follows from the drone's own time stamp, not from its arrival. Queues on board, in the radio and in
+this computer hold packets back for seconds without losing one.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ RANGES: Final = {f"range.{side}": "uint16_t" for side in ("front", "back", "left
 BEARING: Final = tuple(map(radians, (0.0, 180.0, 90.0, -90.0, 0.0)))
 ELEVATION: Final = tuple(map(radians, (0.0, 0.0, 0.0, 0.0, 90.0)))
 OUT_OF_REACH_MM: Final = 8000.0
-# voltages of a full and an empty cell at rest, and how much less they are in the air [V]
+# voltages of a full and an empty cell at rest, and their sag in the air [V]
 FULL_V, EMPTY_V, SAG_V = 4.2, 3.5, 0.3
 SMOOTHING_S: Final = 2.0  # time constant of the voltage: a short load is no empty battery
 WRAP_MS: Final = 1 << 24  # stamps of log packets have 24 bits
 BACK_MS: Final = 1000  # a stamp that is further back comes from a drone that was switched off and on
-AHEAD_S: Final = 10.0  # so does one that is further ahead: longer than a full queue, whose packets were late before
+AHEAD_S: Final = 10.0  # likewise one that is further ahead: longer than a full queue with late packets
 LATE_S: Final = 2.0  # and the first over a new connection that is older: no queue outlives one
 DRIFT: Final = 1e-4  # [s/s] largest difference between the clocks of a drone and of this computer
 INFO_TEXT: Final = {
@@ -57,7 +57,7 @@ class StampAge:
     """Age of packets of one drone: arrival less its stamp, less the smallest such difference so far."""
 
     def __init__(self) -> None:
-        self.restarted = False  # the clock of the drone began anew
+        self.restarted = False  # the clock of the drone restarted
         self.connected_anew = False  # the next packet is the first over a new connection
         self._last: int | None = None  # stamp without its overflows [ms]
         self._arrived = -inf

@@ -202,15 +202,15 @@ class Park:
 class GoalPark(Park):
     """A server of Robotic Park that obeys only goals: its own controller is led by a goal just ahead of the robot.
 
-    The server is told that the robot stands at the origin, and the goal is laid where the law of the server gives the
-    wanted speeds (`protocol.park_goal_2023_04`, `protocol.park_goal_2023_01`). `stop` does not help: the next turn of
-    its loop drives again.
+    The driver sets the server's position to the origin, and lays the goal where the law of the server gives the wanted
+    speeds (`protocol.park_goal_2023_04`, `protocol.park_goal_2023_01`). `stop` does not help: the next turn of its loop
+    drives again.
     """
 
     def __init__(self, wire: Wire, chosen: protocol.Khepera4Settings, server: protocol.ParkServer) -> None:
         super().__init__(wire, chosen, server)
         self._theta = 0.0  # [rad] heading by the server's count
-        self._placed = -math.inf  # [s] when the server was told its position
+        self._placed = -math.inf  # [s] time at which the server's position was set
         self._way = 0.0, 0.0  # [m] since then, in its frame
         self._about = 0.0  # [rad/s] of a turn toward a goal behind
         self._goal = (0.0, 0.0)  # [m] the last one, of a server that counts poses
@@ -289,7 +289,7 @@ def identify(wire: Wire, chosen: protocol.Khepera4Settings, server: str | None) 
         answer = wire.receive(uptime() + max(FIRST_ANSWER_S, chosen.silence_s))
     except TimeoutError as error:
         raise TimeoutError(
-            "no answer to p; a server of 2023 serves one client in its life: start it anew on the robot, for each case"
+            "no answer to p; a server of 2023 serves one client in its life: restart it on the robot, for each case"
         ) from error
     time.sleep(protocol.GAP_S)
     fitting = protocol.fitting(answer.decode("ascii", "replace").strip("\0\r\n "))
@@ -302,8 +302,8 @@ def identify(wire: Wire, chosen: protocol.Khepera4Settings, server: str | None) 
         )
     if server is None and len(fitting) > 1:
         raise WrongServer(
-            f"answers p with {_shown(answer)}, as the servers {', '.join(fitting)} do: write which of them runs there, "
-            f'such as device = {{ server = "{fitting[0]}" }}, and start it anew, for it may serve one client only'
+            f"answers p with {_shown(answer)}, as the servers {', '.join(fitting)} do: write the one that runs there, "
+            f'such as device = {{ server = "{fitting[0]}" }}, and restart it, for it may serve one client only'
         )
     kind = protocol.PARK[server or fitting[0]]
     return (Park if kind.drives else GoalPark)(wire, chosen, kind)

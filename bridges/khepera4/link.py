@@ -28,13 +28,13 @@ RETRY_S: Final = 0.5  # between the end of a connection and the next attempt
 STOPS: Final = 3  # stop commands at the end of the link
 RANGES_S: Final = 0.2
 BATTERY_S: Final = 5.0
-STOP_TRIES_S: Final = 3.0  # time for attempts to stop a robot whose connection broke while it moved
+STOP_TRIES_S: Final = 3.0  # time for attempts to stop a robot after its connection broke in motion
 STOP_RETRY_S: Final = 0.1  # between two such attempts
 STANDING: Final = 0.02  # [m/s] slower robots stand
-AGAIN_S: Final = 0.2  # a silent robot is told to stop so often, so that it stops as soon as it hears again
-KEEP_S: Final = 20.0  # a silent robot is stopped over the same connection for so long: most servers accept no other
+AGAIN_S: Final = 0.2  # period of stops to a silent robot, which obeys as soon as it receives again
+KEEP_S: Final = 20.0  # time of stops to a silent robot over the same connection: most servers accept no other
 TCP_THIN_LINEAR_TIMEOUTS: Final = 16  # of Linux: the first repetitions of lost bytes do not wait longer and longer
-ANSWER_S: Final = 2.5  # the note reports a robot that is not known to stand so long after a halt
+ANSWER_S: Final = 2.5  # time after a halt at which the note reports a robot that is not known to stand still
 
 
 @dataclass(frozen=True)
@@ -233,7 +233,7 @@ class Khepera4Link:
     def _run_connection(self, driver: Driver) -> None:
         """Loop of one connection, until it breaks or the link ends."""
         driver.begin()
-        driver.move(self._odometer)  # before any motion: counters at zero show that the robot was switched on anew
+        driver.move(self._odometer)  # before any motion: counters at zero show that the robot was switched off and on
         self._stands = True
         ticks = Ticks(self._settings.poll_hz, clock=uptime)
         ranges_due = battery_due = answered = ticks.zero
@@ -247,8 +247,8 @@ class Khepera4Link:
                 driver.drive(v, turn, until)
                 driver.move(self._odometer)
             except TimeoutError as error:
-                # stops wait in the connection until the robot hears again; the next exchange after that stops it
-                self.trouble = f"{self._address}: {error}; it is told to stop until it answers"
+                # stops wait in the connection until the robot receives again; the next exchange after that stops it
+                self.trouble = f"{self._address}: {error}; it gets stops until it answers"
                 silent, driver.patience_s = True, AGAIN_S
                 if uptime() - answered > KEEP_S:
                     raise

@@ -83,7 +83,7 @@ class TelloBody(Body):
             return [self._state(row, pilot, t, now) for row, pilot in enumerate(self._pilots)]
 
     def _state(self, row: int, pilot: TelloPilot, t: float, now: float) -> BodyState:
-        """State of a drone, whose pilot gets its external pose."""
+        """State of a drone; its pilot gets the external pose."""
         received = pilot.state_received - now + t
         state = BodyState(
             t,

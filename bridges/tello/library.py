@@ -1,7 +1,7 @@
 """djitellopy without its threads: its parser and its sends, over sockets that are read here.
 
-The library's own threads end for the life of the process at the first datagram that is not ASCII, and with them the
-telemetry of all Tellos; its `send_rc_control` sends nothing after the wall clock was set back.
+The library's own threads end for good at the first datagram that is not ASCII, and with them the telemetry of all
+Tellos. Its `send_rc_control` sends nothing after the wall clock was set back.
 """
 
 from __future__ import annotations

@@ -23,9 +23,9 @@ LAND_RETRY_S: Final = 1.0  # between two `land` without an answer
 TAKEOFF_RETRY_S: Final = 6.0  # likewise of `takeoff`, which a drone answers when it is up
 SHORTEST_TAKEOFF_S: Final = 1.0  # no drone is up earlier
 TAKEOFF_S: Final = 20.0  # after this time the take-off has failed
-LAST_REPEATS: Final = 5  # the last command of a process is sent so many times: a datagram may be lost
-MOTORS_STOPPED_S: Final = 1.5  # the motors stand once the drone's counter of motor seconds is constant for so long,
-CUT_S: Final = 2.5  # which is known so long after an emergency stop that was received
+LAST_REPEATS: Final = 5  # transmissions of the last command of a process: a datagram may be lost
+MOTORS_STOPPED_S: Final = 1.5  # time of a constant counter of motor seconds after which the motors stand still,
+CUT_S: Final = 2.5  # and time after a received emergency stop at which this is known
 UNREAD_S: Final = 2.0  # drones land when their process has not read the state for longer
 ON_GROUND_S: Final = 3.0  # low for this long, motors not running: on the ground
 LANDED_ALONE_S: Final = 20.0  # silent for this long: landed by itself
@@ -33,7 +33,7 @@ LOW: Final = 30  # [cm] the reported height is rounded and drifts
 TOO_HIGH_M: Final = 1.0  # [m] above the end of its climb, by its own height: its positions are those of something else
 UNORDERED: Final = 3  # seconds on the motors' clock of a high drone that rests: it flies without an order
 REFUSALS: Final = 3  # answers in a row that refuse the sticks: the note says so
-REFUSED_S: Final = 1.0  # for so long after the last of them
+REFUSED_S: Final = 1.0  # time after the last of them for which it does
 
 ZERO_STICKS: Final = (0, 0, 0, 0)
 
@@ -319,7 +319,7 @@ class TelloPilot:
         self._send_and_await(command, now)
 
     def _send_and_await(self, command: str, now: float) -> None:
-        """Send a command whose answer is used; discard earlier answers."""
+        """Send a command with an answer that is used; discard earlier answers."""
         self._sent_at = now
         if command == "takeoff":
             self._ordered_up_at = now

@@ -197,7 +197,7 @@ class TurtleBot3(Body):
             self._close()
 
     def _stop_stale(self) -> None:
-        """Send zeros to robots whose last command is stale, as `command` does while the loop runs."""
+        """Send zeros to robots with a stale last command, as `command` does while the loop runs."""
         while not self._ending.wait(REPEAT_S):
             now = self._clock()
             for robot in self._robots:

@@ -23,8 +23,8 @@ SILENCE_S: Final = 0.5  # with older odometry the robot is out of reach and gets
 REPEAT_S: Final = 0.05  # longest time between commands while the robot shall move,
 BETWEEN_S: Final = 0.02  # shortest time between commands that change
 ZEROS: Final = 20  # number of zeros after a stop; more while odometry reports motion
-ANSWER_S: Final = 2.5  # the note reports a robot that is not known to stand so long after a halt
-BLOCKED_S: Final = 1.5  # the note reports a robot that does not move for so long despite commands
+ANSWER_S: Final = 2.5  # time after a halt at which the note reports a robot that is not known to stand still
+BLOCKED_S: Final = 1.5  # time at which the note reports a robot that does not move despite commands
 STANDING: Final = (0.005, 0.02)  # [m/s, rad/s] slower robots stand
 FASTEST: Final = 0.5  # [m/s] odometry that jumps faster was restarted
 RESETS: Final = (3, 5.0)  # as many within as many seconds are no restarts: two robots send odometry, or it is broken
@@ -37,7 +37,8 @@ Planar = tuple[float, float, float]  # x, y [m], yaw [rad]
 class StampAge:
     """Age of messages: arrival less stamp, less the smallest such difference so far, for the clocks are not the same.
 
-    A stamp that does not grow comes from a clock that was set back, or from a sender without stamps: all begins anew.
+    A stamp that does not grow comes from a clock that was set back, or from a sender without stamps: the record
+    restarts.
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""Watchdog of a TurtleBot3: a ROS 2 node that stops the robot when nobody commands it; it runs on the robot.
+"""Watchdog of a TurtleBot3: a ROS 2 node on the robot that stops it when no commands come.
 
 turtlebot3_node drives on with the last cmd_vel for ever. This file is copied to the robot as it is (`./zenpark hosts
 watchdog`), and needs Python 3.10 and the rclpy of ROS 2 Humble or later there, nothing of zenpark.
@@ -18,7 +18,7 @@ from typing import Any
 
 CHECK_S = 0.02  # between two looks at the clock
 ZERO_S = 0.05  # between two zeros
-ZEROS_S = 1.0  # zeros are repeated for so long: one may be lost
+ZEROS_S = 1.0  # time for which zeros are repeated: one may be lost
 GRAPH_S = 1.0  # between two looks for the type that the robot takes
 TYPES = {"twist": "geometry_msgs/msg/Twist", "stamped": "geometry_msgs/msg/TwistStamped"}
 
@@ -33,7 +33,7 @@ class Watchdog:
         self.stops = 0  # times that the robot was stopped
 
     def hear(self, t: float, *, moves: bool) -> None:
-        """A command was received at `t`; our own zeros are heard as well, and mean nothing new."""
+        """Note a command received at `t`; our own zeros arrive as well, and change nothing."""
         self._heard, self._moves = t, moves
 
     def zero_due(self, t: float) -> bool:
@@ -56,7 +56,7 @@ def moving(twist: Any) -> bool:
 
 
 def type_of_robot(node: Any, topic: str) -> str:
-    """Type of the topic by those who receive it on the robot, "" if nobody does, without this node itself."""
+    """Type of the topic at its subscribers on the robot, other than this node; "" if there are none."""
     for each in node.get_subscriptions_info_by_topic(topic):
         if each.node_name != node.get_name() and each.topic_type in TYPES.values():
             return str(each.topic_type)

@@ -32,10 +32,10 @@ from bridges.vicon.client import Frame, Reader
 FIRST_S: Final = 5.0  # deadline of the first answer of the server
 ATTEMPT_S: Final = 2.0  # deadline of each attempt to connect
 PAUSE_S: Final = 0.5  # between attempts
-SILENCE_S: Final = 2.0  # without a frame for so long, reconnect
-LOST_S: Final = 0.5  # occlusions of so long are reported; robots hold on for half a second as well
-REPEATED_S: Final = 0.3  # a pose that is the same to the last bit for so long is not measured any more
-POLL_S: Final = 0.2  # how soon the end of the process is noticed
+SILENCE_S: Final = 2.0  # time without a frame before the next connection
+LOST_S: Final = 0.5  # time of an occlusion before it is reported; robots tolerate half a second as well
+REPEATED_S: Final = 0.3  # time of a pose that is the same to the last bit after which it counts as not measured
+POLL_S: Final = 0.2  # latency of noticing the end of the process
 SKEW: Final = 1e-3  # tolerance of a rotation's orthonormality
 
 

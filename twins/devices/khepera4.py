@@ -23,7 +23,7 @@ from twins.models.differential import Differential
 from twins.models.disturbance import Drift, Latency
 from twins.models.noise import refill
 
-GARBAGE: Final = (3.0, -2.0)  # [m] goal of servers whose goal was never set; theirs is what the memory holds
+GARBAGE: Final = (3.0, -2.0)  # [m] goal of servers without a goal from a client: the content of the memory
 RECEIVE_S: Final = 0.05  # [s] after which the fork's loop turns without a command,
 SELECT_S: Final = 1.0  # [s] that of 2023-04-10, and
 MAIN_S: Final = 0.02  # [s] that of 2025-05, whether or not there are commands
@@ -104,7 +104,7 @@ class ParkProgram:
             self.robot.halt()
 
     def advance(self, t: float, *, connected: bool, left: bool) -> None:
-        """Let the loop turn until `t` [s] without a command; one whose client has `left` no longer waits for any."""
+        """Let the loop turn until `t` [s] without a command; after its client has `left` it no longer waits for any."""
         period = {"2023-04-10": SELECT_S, "fork": RECEIVE_S, "2025-05": MAIN_S}.get(self.name, math.inf)
         if left and self.kind.clients is not None:
             self._turn()

@@ -33,7 +33,7 @@ from twins.devices.device import CaptureFault, Faults, FaultyLink, serve_until_n
 
 BACKLOG: Final = 1 << 18  # [bytes] largest queue of a client; a slower client misses frames
 REACH: Final = (1e3, 1e3, 1e3)  # [m] bounds of valid positions: any room
-FRESH_S: Final = 0.5  # a robot whose true pose is older is not visible
+FRESH_S: Final = 0.5  # a robot with an older true pose is not visible
 
 
 def upright(yaw: float) -> Array:
@@ -54,7 +54,7 @@ class _Client:
 
 
 class ViconTwin:
-    """DataStream server for subjects whose poses are set by `place`.
+    """DataStream server for subjects with poses set by `place`.
 
     Attributes:
         link: Its faults, and what waits to be sent.

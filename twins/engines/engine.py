@@ -195,7 +195,7 @@ class World:
 
 
 def require_carried(engine: EngineFactory, kinds: Iterable[Kind]) -> None:
-    """Raises BodyError for kinds whose motion an engine does not carry."""
+    """Raises BodyError for kinds with a motion that an engine does not carry."""
     if refused := sorted({kind.name for kind in kinds if not isinstance(kind.motion, engine.CARRIES)}):
         known = ", ".join(motion.__name__ for motion in engine.CARRIES)
         which = ", ".join(map(repr, refused))

@@ -1,7 +1,7 @@
 """MuJoCo engine: drones are rigid bodies on four motors, controlled by the firmware's cascade; attitude is simulated.
 
-Every row is a simulation of its own small model, and one call advances all: rows are independent to the last bit, and
-the cost of a row does not grow with their number, as in one model of all. Drones touch the floor, the walls and the
+Every row is a simulation of its own small model, and one call advances all. Rows are independent to the last bit, and
+the cost of a row does not grow with their number, unlike in one model of all. Drones touch the floor, the walls and the
 obstacles without a plan. They fly through each other and through ground robots: contacts among robots are simulated by
 the engine `pymunk`.
 """
@@ -29,7 +29,7 @@ from twins.models.quadrotor import GRAVITY
 from twins.scene import Scene
 
 SUBSTEPS: Final = 2  # of MuJoCo in a step of the firmware
-QUIET_S: Final = 0.1  # a drone at rest for so long with its motors off is no longer simulated
+QUIET_S: Final = 0.1  # time at rest with its motors off after which a drone is no longer simulated
 AT_REST: Final = 0.005  # [m/s], and ten times that in rad/s
 TIPPED: Final = 0.5  # cosine of the largest tilt for a take-off, as in the firmware's supervisor
 # the loop follows a random error of the estimate in part: with this share at a correlation time of 0.5 s

@@ -30,8 +30,8 @@ class Contacts:
     """Contact handling of one space.
 
     Pymunk detects a contact only when bodies overlap already: at 0.5 m/s and steps of 5 ms that is 2.5 mm too late. Its
-    shapes therefore have a skin, in which a contact is detected without force: bodies that would overlap at the end of
-    a step bounce in the skin, and bodies that keep pushing approach until they just touch.
+    shapes therefore have a skin, in which a contact is detected without force. Bodies that would overlap at the end of
+    a step bounce in the skin; bodies that keep pushing approach until they just touch.
     """
 
     numbers: dict[pymunk.Shape, int]  # row of each shape, or negative number of an obstacle

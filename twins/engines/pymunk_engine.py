@@ -63,10 +63,10 @@ class Planar(EngineFactory, frozen=True):
 class PlanarEngine(Orders[Moving]):
     """Implements `twins.engines.engine.Engine`.
 
-    The motion models compute the velocity of each robot after this tick; forces within the grip of the wheels, or the
-    thrust of a tilted quadrotor, change the velocity to that, and pymunk's solver adds the contacts. Without contact a
+    The motion models compute the velocity of each robot after this tick. Forces within the grip of the wheels, or the
+    thrust of a tilted quadrotor, bring the body to that velocity; pymunk's solver adds the contacts. Without contact a
     tick equals that of the point-mass engine. Pymunk moves bodies at the beginning of a step and computes velocities at
-    its end; positions here are therefore one step ahead of pymunk's: those at the beginning of the next step.
+    its end. Positions here are therefore one step ahead of pymunk's: those at the beginning of the next step.
     """
 
     def __init__(self, stage: Stage, choice: Planar) -> None:
@@ -227,7 +227,7 @@ class _Robot:
             d_x = d_y = 0.0
         drift_x, drift_y = (wobble[0] - self._wobble[0]) / dt, (wobble[1] - self._wobble[1]) / dt
         target_x, target_y = before_x + d_x, before_y + d_y
-        # all in the first step of the tick: then the tick equals one of the point-mass engine, whose steps are ticks
+        # all in the first step of the tick: then the tick equals one of the point-mass engine, where a step is a tick
         cells, at = self._cells, self._at
         cells[at + PUSH_X] = (target_x + drift_x - cells[at + V_X]) * self._force
         cells[at + PUSH_Y] = (target_y + drift_y - cells[at + V_Y]) * self._force

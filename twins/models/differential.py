@@ -1,7 +1,7 @@
 """Differential drive: unicycle on two wheels with limits of speed and acceleration; all of it is quiet.
 
-A command holds until the next one, as on the robots themselves: what stops wheels that are told nothing more is their
-bridge, a watchdog on the robot, or nothing (docs/hanging.md).
+A command holds until the next one, as on the robots themselves: wheels without new commands are stopped by their
+bridge, by a watchdog on the robot, or by nothing (docs/hanging.md).
 """
 
 from __future__ import annotations

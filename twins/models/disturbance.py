@@ -74,7 +74,7 @@ class Measurement:
 
 
 class Drift:
-    """Error of odometry: a random walk of the measured position whose variance grows with the distance driven."""
+    """Error of odometry: a random walk of the measured position; its variance grows with the distance driven."""
 
     __slots__ = ("_rate", "noise", "present", "x", "y")
 

@@ -25,7 +25,7 @@ from twins.models.noise import stream
 from twins.sensing.ray_casting import Beams, Caster, Fan
 
 DRAWN_AHEAD: Final = 512  # numbers per robot and sensor
-ON_TIME: Final = 1e-6  # [s] ticks are multiples of a period, but for rounding
+ON_TIME: Final = 1e-6  # [s] ticks are multiples of a period, up to rounding
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -261,7 +261,7 @@ def test_link_gap_stops_robot_and_keeps_the_connection(served):
             return bool(drive.state.note[0])
 
         drive.until(forward)
-        assert "no answer to p; it is told to stop until it answers" in drive.state.note[0]
+        assert "no answer to p; it gets stops until it answers" in drive.state.note[0]
         drive.until(lambda: not drive.state.note[0])  # nothing is commanded meanwhile
         stood = twins.truth()[0][0, 0]
         drive.goal = [(stood + 0.3, 0.0, 0.0)]
@@ -384,9 +384,7 @@ def test_the_wrong_protocol_is_named(served, impatient):
     older = served(request("khepera4", ["-"], device=ONCE))
     with pytest.raises(BodyError, match=r"answers p with .* write which of them runs there, such as device = { server"):
         KheperaBody(request("khepera4", older.addresses)).open()
-    with pytest.raises(
-        BodyError, match=r"no answer to p; a server of 2023 serves one client in its life: start it anew"
-    ):
+    with pytest.raises(BodyError, match=r"no answer to p; a server of 2023 serves one client in its life: restart it"):
         KheperaBody(request("khepera4", older.addresses, device=ONCE)).open()
 
 

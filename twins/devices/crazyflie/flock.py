@@ -357,8 +357,8 @@ class Flock:
     def _touch_floor(self, before: Array, place: Array, setpoint: Array) -> None:
         """Stop rows at the floor; those that hit it hard, with `before` (N, 3) [m/s], end on their sides.
 
-        A row whose motors still carry much of its weight slides from its `place` (N, 3) [m] to where its estimate
-        leads, `setpoint` (N, 4).
+        If the motors of a row still carry much of its weight, it slides from its `place` (N, 3) [m] toward `setpoint`
+        (N, 4), as its estimate leads.
         """
         quadrotor = self.quadrotor
         floor = quadrotor.position[:, 2] <= 0.0
@@ -383,5 +383,5 @@ class Flock:
         self.attitude += -np.expm1(-self.dt / LEANING_S) * (wanted - self.attitude)
 
     def _motors_on(self) -> Mask:
-        """Rows (N,) whose motors turn."""
+        """Rows (N,) with turning motors."""
         return np.asarray(self.commander.on & self.supervisor.may_fly & (self.charge > 0.0))

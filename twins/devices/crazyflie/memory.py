@@ -50,7 +50,7 @@ class Memories:
         settings = b"0xBC" + struct.pack("<BBBffBI", 1, 80, 2, 0.0, 0.0, 0xE7, 0xE7E7E7E7)  # radio, trim, address
         self._bytes[Memory.EEPROM][: len(settings) + 1] = settings + bytes((sum(settings) % 0x100,))
         self.write_errors = 0  # of the tester: bytes that are not their address
-        self.stored = (0, 0)  # masks of the stations whose geometry and calibration would survive a restart
+        self.stored = (0, 0)  # masks of the stations with a geometry, and a calibration, that survives a restart
 
     def restart(self) -> None:
         """Forget what does not survive switching off and on: the trajectories."""
@@ -112,12 +112,12 @@ class Memories:
 
     @property
     def geometries(self) -> int:
-        """Mask of the base stations whose geometry is valid."""
+        """Mask of the base stations with valid geometry."""
         return self._valid(0, GEOMETRY_BYTES)
 
     @property
     def calibrations(self) -> int:
-        """Mask of the base stations whose calibration is valid."""
+        """Mask of the base stations with valid calibration."""
         return self._valid(CALIBRATION, CALIBRATION_BYTES)
 
     def _valid(self, begin: int, size: int) -> int:

@@ -133,7 +133,7 @@ class Planner:
         """Plan an arc from `pose` around a centre beside it, or ahead of (clockwise) or behind it if `sideways`.
 
         As in the firmware the arc is one polynomial with the position, velocity and acceleration of the spiral at its
-        ends, so it is a spiral for angles up to 90° only.
+        ends. It is therefore a spiral for angles up to 90° only.
 
         Args:
             pose: Start (4,).

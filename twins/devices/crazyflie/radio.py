@@ -95,7 +95,7 @@ class Air:
     """Socket on which software dongles exchange packets with the drones of one device."""
 
     def __init__(self, links: Sequence[RadioLink], hz: float) -> None:
-        """Links of the drones, whose `address` is set; `hz`: exchanges per second of a dongle."""
+        """Links of the drones, each with its `address`; `hz`: exchanges per second of a dongle."""
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.bind((HOST, 0))
         self.socket.setblocking(False)

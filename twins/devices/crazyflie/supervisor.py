@@ -16,8 +16,8 @@ from agents.protocols.crtp import Info
 from twins.arrays import Array, Mask
 
 LEVEL_S: Final = 0.5  # an older low-level setpoint is ignored: the drone levels out
-LOCK_S: Final = 2.0  # without setpoints for so long, the drone locks
-FLYING_S: Final = 2.0  # a drone counts as flying for so long after its motors turned
+LOCK_S: Final = 2.0  # time without setpoints after which the drone locks
+FLYING_S: Final = 2.0  # time after the last turn of its motors for which a drone counts as flying
 LANDED_S: Final = 3.0  # from landing to disarming
 PREFLIGHT_S: Final = 30.0  # from arming to disarming, if it does not take off
 SPIN_UP_S: Final = 0.5  # from the arming of brushless motors to their readiness
@@ -52,7 +52,7 @@ class Supervisor:
 
     @property
     def may_fly(self) -> Mask:
-        """Rows (N,) whose motors may turn."""
+        """Rows (N,) with motors that may turn."""
         state = self.state
         return np.asarray(
             (state == State.READY) | (state == State.FLYING) | (state == State.LEVEL) | (state == State.LANDED)

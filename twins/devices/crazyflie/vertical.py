@@ -1,6 +1,6 @@
 """Vertical motion: the firmware's loops of height and climb rate, and motors that carry a weight.
 
-These loops make a take-off overshoot: the integral of the height is charged while the drone lags behind its plan, on
+These loops make a take-off overshoot. The integral of the height is charged while the drone lags behind its plan, on
 the floor at first, and must be discharged above the height.
 """
 
