@@ -94,13 +94,16 @@ class ExternalBody(Body):
     Its own clock is `uptime` and starts at creation; `read` measures the offset of the caller's clock.
     """
 
-    def __init__(self, request: BodyRequest) -> None:
-        """Create the body, still closed; raises BodyError if a row has settings: there are none."""
+    def __init__(self, request: BodyRequest, open_timeout: float = OPEN_S) -> None:
+        """Create the body, still closed; raises BodyError if a row has settings: there are none.
+
+        `open_timeout` is the limit for the router and for the first position of every row [s].
+        """
         for name, device in zip(request.names, request.device, strict=True):
             if device:
                 raise BodyError(f"{name}: device: `{next(iter(device))}` is unknown; an external body has no settings")
         self._names, self._keys, self._endpoints = request.names, request.keys, request.endpoints
-        self._zero = uptime()
+        self._zero, self._open_timeout = uptime(), open_timeout
         self._clock, self._corrected = request.clock, request.clock.correction_s
         self._utc = request.clock.utc()  # one reading, as in the runtime: a step of the wall clock has no effect
         self._clock_offset = inf  # from the caller's clock to this one [s]
@@ -118,10 +121,12 @@ class ExternalBody(Body):
     # ------------------------------------------------------------------ Body
 
     def open(self) -> None:
-        deadline = time.monotonic() + OPEN_S
+        deadline = time.monotonic() + self._open_timeout
         try:
             name = f"body of {'+'.join(self._names)}"
-            self._session = network.open_session(self._endpoints, name=name, wait_s=OPEN_S, identity=self._names[0])
+            self._session = network.open_session(
+                self._endpoints, name=name, wait_s=self._open_timeout, identity=self._names[0]
+            )
         except ExplainedError as error:
             raise BodyError(f"{', '.join(self._names)}: {error}") from None
         session, keys, mime = self._session, self._keys, messages.MIME["json"]

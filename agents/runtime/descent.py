@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from math import inf
 
 import zenoh
@@ -18,6 +19,16 @@ from agents.robot import Robot
 from agents.runtime.watchdog import AGAIN_S, DOWN_S, Watchdog
 from agents.safety.detection import SLOWEST
 from agents.ticks import Ticks
+
+
+@dataclass(frozen=True)
+class DescentTiming:
+    """Limits of a descent."""
+
+    landing_s: float = FAREWELL_S  # [s] least limit for a landing
+    stop_s: float = STOPPED_S  # [s] limit for a body to confirm that its motors are off
+    again_s: float = AGAIN_S  # [s] between two orders
+    slowest: float = SLOWEST  # [m/s] lowest speed of a descent
 
 
 class Descent:
@@ -38,19 +49,20 @@ class Descent:
         silence_s: float,  # [s] without a tick after which the watchdog lands the robots
         alarm: Callable[[str], object],  # tells the other processes why they land, in another thread
         recover: Callable[[str], object],  # lands the robots by their decisions, for a reason
+        timing: DescentTiming,
     ) -> None:
         self.begun = False  # the loop is over
         self.airborne = False  # a row flew at the last reading of its body, or took off since
         self.reason_to_end: Callable[[], str | None] = lambda: None
         kinds = [robot.assignment.kind for robot in robots]
         self._robots, self._body, self._keeper, self._ticks = robots, body, keeper, ticks
-        self._recover = recover
+        self._recover, self._timing = recover, timing
         self._limits = robots[0].assignment.limits  # those of the experiment
         self._everyone = tuple(range(len(robots)))
         self._on_wheels = tuple(row for row, kind in enumerate(kinds) if not kind.flies)
         ceiling = self._limits.high[2] if any(kind.flies for kind in kinds) else 0.0
-        longest_s = ceiling / SLOWEST  # [s] landing: what still descends after a limit would fall
-        self.limit_s = max(FAREWELL_S, longest_s)  # [s] for a landing
+        longest_s = ceiling / timing.slowest  # [s] landing: what still descends after a limit would fall
+        self.limit_s = max(timing.landing_s, longest_s)  # [s] for a landing
         down_s = max(DOWN_S, longest_s)
         self.watchdog = Watchdog(body, self._everyone, alarm=alarm, silence_s=silence_s, down_s=down_s)
 
@@ -84,7 +96,7 @@ class Descent:
         """Register the steps of the end: land what still flies, stop it, end the watchdog, close the body."""
         steps.callback(self._close_body)
         steps.callback(self.watchdog.end)
-        steps.callback(self._order_down, self._body.stop, STOPPED_S)
+        steps.callback(self._order_down, self._body.stop, self._timing.stop_s)
         steps.callback(self._land)
 
     def _close_body(self) -> None:
@@ -125,7 +137,7 @@ class Descent:
             self.watchdog.beat()
             self.await_ownership()
             if (now := self._ticks.elapsed()) >= again:
-                again = now + AGAIN_S
+                again = now + self._timing.again_s
                 obeyed = False
                 with _noted(failures):
                     order(self._everyone)

@@ -36,7 +36,7 @@ from agents.plugins.calls import explain
 from agents.plugins.registry import FAILURES
 from agents.robot import Robot
 from agents.runtime.command_line import on_termination
-from agents.runtime.descent import Descent
+from agents.runtime.descent import Descent, DescentTiming
 from agents.runtime.goal_inbox import GoalInbox
 from agents.runtime.lifeline import SILENCE_S as LIFELINE_S
 from agents.runtime.lifeline import Lifeline
@@ -78,6 +78,7 @@ class Setup:
     loop_timeout_s: float = SILENCE_S
     wake: bool = False  # a pose of a neighbour wakes the loop
     lifeline_s: float = LIFELINE_S  # silence of the lifeline that counts as its loss [s]
+    descent: DescentTiming = field(default_factory=DescentTiming)
 
 
 class Runtime:
@@ -110,6 +111,7 @@ class Runtime:
         self._descent = Descent(
             self.robots, body, self._keeper, self._ticks,
             silence_s=setup.loop_timeout_s, alarm=self._call_for_help, recover=self._recover,
+            timing=setup.descent,
         )  # fmt: skip
         self._watchdog = self._descent.watchdog
 

@@ -42,7 +42,7 @@ class Watchdog:
     ) -> None:
         self.tripped = ""  # why the robots were ordered to land; empty before, and after `forgive`
         self._body, self._rows, self._alarm, self._end = body, rows, alarm, end
-        self._silence_s, self._down_s = silence_s, down_s
+        self.down_s, self._silence_s = down_s, silence_s
         self._beats = 0
         self._over = threading.Event()
         self._thread: threading.Thread | None = None
@@ -95,7 +95,7 @@ class Watchdog:
             if looked >= again:
                 again = looked + AGAIN_S
                 self._call_in_thread("land", lambda: self._body.land(self._rows))
-            if looked - hung > self._down_s:
+            if looked - hung > self.down_s:
                 self._abort()
                 return
 

@@ -21,7 +21,7 @@ from agents.network.endpoints import free_endpoint
 from agents.network.keys import Keys
 from agents.safety.detection import SLOWEST
 from agents.vectors import NO_SETPOINT, ZERO, Setpoint, Vector
-from bridges import external, measured_flight
+from bridges import measured_flight
 from bridges.external import ExternalBody
 from tests.conftest import RouterProcess
 from tests.waiting import until
@@ -153,13 +153,9 @@ class Drive:
 
 
 @pytest.mark.system
-def test_missing_positions_are_named_with_reasons(
-    router: RouterProcess, far: FarEnd, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(external, "OPEN_S", 0.5)
-
+def test_missing_positions_are_named_with_reasons(router: RouterProcess, far: FarEnd) -> None:
     def refusal(rows: dict[str, str]) -> str:
-        body = ExternalBody(request(router.endpoint, rows))
+        body = ExternalBody(request(router.endpoint, rows), 0.5)
         with pytest.raises(BodyError) as caught:
             body.open()
         return str(caught.value)
@@ -192,11 +188,8 @@ def test_missing_positions_are_named_with_reasons(
 
 
 @pytest.mark.system
-def test_bad_positions_settings_and_routers_are_named(
-    router: RouterProcess, far: FarEnd, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(external, "OPEN_S", 0.5)
-    body = ExternalBody(request(router.endpoint, {"CF01": "crazyflie"}))
+def test_bad_positions_settings_and_routers_are_named(router: RouterProcess, far: FarEnd) -> None:
+    body = ExternalBody(request(router.endpoint, {"CF01": "crazyflie"}), 0.5)
     stop = threading.Event()
 
     def run() -> None:
@@ -214,7 +207,7 @@ def test_bad_positions_settings_and_routers_are_named(
     with pytest.raises(BodyError, match=r"CF01: device: .*`rate`.*has no settings"):
         ExternalBody(request(router.endpoint, {"CF01": "crazyflie"}, rate=5))
     with pytest.raises(BodyError, match="CF01: no router answers at"):
-        ExternalBody(request(free_endpoint(preferred_port=0), {"CF01": "crazyflie"})).open()
+        ExternalBody(request(free_endpoint(preferred_port=0), {"CF01": "crazyflie"}), 0.5).open()
 
 
 # ---------------------------------------------------------------------- what it believes
@@ -310,11 +303,10 @@ def test_restarted_simulator_hears_orders_under_way(body: ExternalBody, far: Far
 
 
 @pytest.mark.system
-def test_without_a_world_it_says_what_to_start(router: RouterProcess, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(external, "OPEN_S", 0.3)
+def test_without_a_world_it_says_what_to_start(router: RouterProcess) -> None:
     asked = replace(request(router.endpoint, {"CF01": "crazyflie"}), addresses=("world",))
     with pytest.raises(BodyError) as caught:
-        ExternalBody(asked).open()
+        ExternalBody(asked, 0.3).open()
     assert str(caught.value) == (
         "CF01: nothing is published on park/CF01/position: is `./zenpark world serve` with this experiment running and "
         f"connected to {router.endpoint}?"

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
+from dataclasses import replace
 from math import inf
 
 import pytest
 
+import agents.robot
 from agents.body.interface import BodyState, call_all
 from agents.network import messages
 from agents.network.keys import Keys
-from agents.runtime import descent, loop
+from agents.network.name_ownership import NameKeeper
+from agents.runtime import loop
+from agents.runtime.descent import Descent, DescentTiming
 from agents.runtime.loop import Runtime, Setup
+from agents.ticks import Ticks
 from experiments.definition.experiment import Arena, Formation, Robot
 from experiments.definition.plan import Plan
 from tests.agents.few import pair
@@ -20,6 +25,7 @@ from tests.fuzz.loopnet import Net
 from tests.fuzz.messages import sent
 
 TICKS = 5  # that the loop makes before something breaks
+QUICK = DescentTiming(landing_s=0.3, stop_s=0.1, slowest=inf)
 
 
 class Airborne:
@@ -76,21 +82,16 @@ class Airborne:
         return list(dict.fromkeys(self.calls))
 
 
-def run(body: Airborne, silence_s: float = 5.0) -> Net:
+def run(body: Airborne, silence_s: float = 5.0, timing: DescentTiming = QUICK) -> Net:
     """Runs a robot with that body to its end, on a network of its own."""
     experiment = pair(robots={"F": Robot(kind="crazyflie", start=[0.1, 0.2], hover=0.5)}, formation=Formation())
     with Net().worn() as net:
         body.net = net
-        setup = Setup(Keys("park"), [], "json", 50.0, lifeline=False, located=[False], loop_timeout_s=silence_s)
+        setup = Setup(
+            Keys("park"), [], "json", 50.0, lifeline=False, located=[False], loop_timeout_s=silence_s, descent=timing
+        )
         Runtime([Plan(experiment).assignment("F")], body, setup).run()
     return net
-
-
-@pytest.fixture(autouse=True)
-def short_waits(monkeypatch):
-    monkeypatch.setattr(descent, "FAREWELL_S", 0.3)
-    monkeypatch.setattr(descent, "STOPPED_S", 0.1)
-    monkeypatch.setattr(descent, "SLOWEST", inf)
 
 
 @pytest.mark.parametrize("broken", [(), ("read",), ("land",), ("stop",), ("close",), ("read", "land", "stop", "close")])
@@ -105,55 +106,54 @@ def test_shutdown_tries_everything_and_raises(broken):
     assert "the loop breaks" in chain
 
 
-def test_robot_is_stopped_once_it_is_down(monkeypatch):
-    monkeypatch.setattr(descent, "FAREWELL_S", 30.0)
+def test_robot_is_stopped_once_it_is_down():
     body = Airborne(steps=10)
     with pytest.raises(OSError, match="the loop breaks"):
-        run(body)
+        run(body, timing=replace(QUICK, landing_s=30.0))
     assert body.steps <= 0
     assert body.calls == ["open", "land", "stop", "close"]
 
 
-def test_slow_descent_is_not_stopped_in_flight(monkeypatch):
-    monkeypatch.setattr(descent, "FAREWELL_S", 0.05)
-    monkeypatch.setattr(descent, "SLOWEST", 2.5 / 20.0)  # from the ceiling of 2.5 m it takes 20 s
+def test_slow_descent_is_not_stopped_in_flight():
     body = Airborne(steps=100)  # a second
-    with pytest.raises(OSError, match="the loop breaks"):
-        run(body)
+    with pytest.raises(OSError, match="the loop breaks"):  # from the ceiling of 2.5 m it takes 20 s
+        run(body, timing=replace(QUICK, landing_s=0.05, slowest=2.5 / 20.0))
     assert body.steps <= 0
 
 
 @pytest.mark.parametrize(("height", "down_s"), [(1.0, 10.0), (6.0, 30.0)])
-def test_watchdog_waits_for_a_whole_descent(monkeypatch, height, down_s):
-    monkeypatch.undo()
+def test_watchdog_waits_for_a_whole_descent(height, down_s):
     robots = {"F": Robot(kind="crazyflie", start=[0.1, 0.2], hover=0.5), "B": Robot(kind="khepera4", start=[0.5, 0.2])}
     plan = Plan(pair(robots=robots, formation=Formation(), arena=Arena(size=(4.0, 4.0, height))))
-    setup = Setup(Keys("park"), [], "json", 50.0, lifeline=False, located=[False])
-    flying, driving = (Runtime([plan.assignment(name)], Airborne(), setup)._watchdog for name in "FB")
-    assert flying._down_s == pytest.approx(down_s)
-    assert driving._down_s == 10.0
+    keeper, silent = NameKeeper(Keys("park"), "FB", 0.0), lambda _reason: None
+    flying, driving = (
+        Descent(
+            [agents.robot.Robot(plan.assignment(name))], Airborne(), keeper, Ticks(50.0),
+            silence_s=0.5, alarm=silent, recover=silent, timing=DescentTiming(),
+        )
+        for name in "FB"
+    )  # fmt: skip
+    assert flying.watchdog.down_s == pytest.approx(down_s)
+    assert driving.watchdog.down_s == 10.0
 
 
-def test_unreadable_body_gets_time_to_land(monkeypatch):
-    monkeypatch.setattr(descent, "AGAIN_S", 0.02)
+def test_unreadable_body_gets_time_to_land():
     body = Airborne("read")
     with pytest.raises(OSError, match="read fails"):
-        run(body)
+        run(body, timing=replace(QUICK, again_s=0.02))
     assert body.calls.count("land") > 3  # again and again: the first may have got lost
     assert body.calls.count("stop") > 1
 
 
-def test_failed_stop_is_repeated(monkeypatch):
-    monkeypatch.setattr(descent, "AGAIN_S", 0.02)
+def test_failed_stop_is_repeated():
     body = Airborne("stop", steps=0)
     with pytest.raises(OSError, match="stop fails"):
-        run(body)
+        run(body, timing=replace(QUICK, again_s=0.02))
     assert "land" not in body.calls
     assert body.calls.count("stop") > 1
 
 
-def test_emergency_stop_during_a_descent(monkeypatch):
-    monkeypatch.setattr(descent, "FAREWELL_S", 30.0)
+def test_emergency_stop_during_a_descent():
     body = Airborne(steps=10**9)
 
     def stop() -> None:
@@ -162,7 +162,7 @@ def test_emergency_stop_during_a_descent(monkeypatch):
 
     body.looks = stop
     with pytest.raises(OSError, match="the loop breaks"):
-        run(body)
+        run(body, timing=replace(QUICK, landing_s=30.0))
     assert body.order == ["open", "land", "stop", "close"]
 
 
