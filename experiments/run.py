@@ -300,6 +300,17 @@ def reopen_seeds(folder: str | Path) -> list[Run]:
     return [recorded, *(run for seed, run in runs.items() if seed != recorded.seed)]
 
 
+def read_metrics(folder: str | Path) -> list[CaseMetrics]:
+    """Metrics of all cases and seeds of a run, as its folder keeps them; of another version, from its recordings.
+
+    Raises RecordingError as `reopen_seeds`.
+    """
+    try:
+        return metrics_files.read_json(Path(folder) / METRICS)
+    except (OSError, ValueError):
+        return [case for run in reopen_seeds(folder) for case in run.metrics.values()]
+
+
 def read_back(folder: Path, recordings: Mapping[str, Path], notes: Sequence[str], failures: Sequence[str] = ()) -> Run:
     """A run from its recordings, by case; those of killed recorders too, as far as they go.
 

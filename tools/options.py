@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 WIDEST: Final = 110  # columns of print
 CONNECT: Final = "ZENPARK_CONNECT"  # environment: default of --connect, endpoints with spaces between them
 PANELS: Final = {
-    "Experiments": "new check explain run sweep report compare export list schema import recover clean",
+    "Experiments": "new check explain run sweep report export list schema import recover clean",
     "Watch": "view replay top runs keys echo hz",
     "Act": "robot world estop",
     "By hand": "router agent centre twin bridge",

@@ -220,13 +220,8 @@ def compare(
         ("Runs", ", ".join(names)),
         ("Reference", cases[0].case),
     ]
-    how = [
-        Row((name, folder, "; ".join(found) or ("the same file, seeds and versions" if k else "the reference")))
-        for k, (name, folder, found) in enumerate(differences)
-    ]
-    differ = Table(("Run", "Folder", "Differs from the first in"), tuple(how), words=True)
     sections = [
-        *_tables("Differences", DIFFERENCES, [differ], folded=False),
+        *_tables("Differences", DIFFERENCES, [differences_table(differences)], folded=False),
         *_results(cases),
         Section("Figures", pictures=numbered(zip(drawn, captions, strict=True))),
         *_details(cases),
@@ -241,6 +236,15 @@ def compare(
         verdict=[*_noted(differences), *findings(cases)],
         sections=sections,
     )
+
+
+def differences_table(differences: Sequence[tuple[str, str, Sequence[str]]]) -> Table:
+    """Name and folder of each run, and how it differs from the first one."""
+    how = [
+        Row((name, folder, "; ".join(found) or ("the same file, seeds and versions" if k else "the reference")))
+        for k, (name, folder, found) in enumerate(differences)
+    ]
+    return Table(("Run", "Folder", "Differs from the first in"), tuple(how), words=True)
 
 
 def _noted(differences: Sequence[tuple[str, str, Sequence[str]]]) -> list[Finding]:

@@ -1,4 +1,4 @@
-"""Tables of a report as LaTeX (booktabs) and as Markdown, for papers and notes."""
+"""Tables of a report as LaTeX (booktabs), as Markdown and as plain texts."""
 
 from __future__ import annotations
 
@@ -90,6 +90,11 @@ def _letter(letter: str) -> str:
 def markdown(tables: Sequence[Table]) -> str:
     """Pipe tables, one for each table with rows; titles bold above, notes below."""
     return "\n\n".join(_pipes(table) for table in tables if table.rows)
+
+
+def plain(table: Table) -> list[tuple[str, ...]]:
+    """Cells of a table as texts, its head first, for a terminal."""
+    return [table.head, *(tuple(map(_text, row.cells)) for row in table.rows)]
 
 
 def _pipes(table: Table) -> str:

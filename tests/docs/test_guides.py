@@ -24,7 +24,7 @@ STEP = re.compile(
     r"^```(?P<language>toml|python)\n(?P<block>(?s:.*?))^```|^ {4,}\./zenpark (?P<command>[^#\n]*)(?P<said>.*)",
     re.MULTILINE,
 )
-COMPUTING = {"cert", "check", "clean", "compare", "explain", "export", "import", "new", "report", "sweep"}
+COMPUTING = {"cert", "check", "clean", "explain", "export", "import", "new", "report", "sweep"}
 REAL = (
     "run way.toml",
     "run shadow.toml --out runs/shadow --open",

@@ -40,7 +40,6 @@ def test_commands():
                 "router",
                 "check",
                 "clean",
-                "compare",
                 "preflight",
                 "report",
                 "export",

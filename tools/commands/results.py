@@ -1,9 +1,10 @@
-"""Commands that read results (report, compare, export, recover) and find or remove their folders (runs, clean)."""
+"""Commands that read results (report, export, recover) and find or remove their folders (runs, clean)."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
@@ -16,13 +17,12 @@ from tools.options import AsJson, example, known_words, print_json, print_result
 from tools.terminal import say
 
 if TYPE_CHECKING:
+    from experiments.metrics.results import CaseMetrics
     from experiments.recording.run_folder import PastRun
     from experiments.report.page import Table
     from experiments.run import Run
 
 app: Final = typer.Typer()
-
-SAME: Final = "the same file, seeds, code and versions"
 
 
 @app.command(epilog=example("report runs/first", "report runs/first runs/second --out comparison.html"))
@@ -30,7 +30,9 @@ def report(
     runs: Annotated[
         list[str],
         typer.Argument(
-            metavar="RUN...", help="Folders of runs, or that of a sweep.", autocompletion=completion.folders
+            metavar="RUN...",
+            help="Folders of runs, or full of runs, or of a sweep.",
+            autocompletion=completion.folders,
         ),
     ],
     out: Annotated[
@@ -56,74 +58,117 @@ def report(
     ] = None,
     as_json: AsJson = False,
 ) -> int:
-    """Write the report of one run, or compare several; of a sweep, its figures or its table."""
+    """Write the report of one run, or compare several with the first; of a sweep, its figures or its table."""
     from experiments.file.problems import refusal
     from experiments.metrics.metric import short_name
     from experiments.recording.reader import RecordingError
     from experiments.report import report as pages  # matplotlib takes 0.6 s
     from experiments.report import typeset
     from experiments.report.tables import summary_metrics
-    from experiments.run import reopen_seeds
+    from experiments.run import read_metrics, reopen_seeds
 
-    if metrics and not (as_latex or as_markdown):
+    form = partial(typeset.latex, width=width) if as_latex else typeset.markdown if as_markdown else None
+    if metrics and form is None:
         raise refusal("--metrics", "chooses numbers of a printed table", "add --latex or --markdown")
-    if pdf and (as_latex or as_markdown):
+    if pdf and form is not None:
         raise refusal("--pdf", "writes figures", "leave out --latex or --markdown")
     if len(runs) == 1 and (Path(runs[0]) / SWEEP).is_file():
-        form = partial(typeset.latex, width=width) if as_latex else typeset.markdown if as_markdown else None
         return _report_sweep(Path(runs[0]), out, width, metrics, form, pdf=pdf, as_json=as_json)
-    labels = label or [chr(ord("A") + k) if k < 26 else f"{k + 1}" for k in range(len(runs))]
-    if len(labels) != len(runs):
-        message = f"{len(labels)} labels for {len(runs)} runs"
+    folders = _folders_of_runs(runs)
+    labels = label or [chr(ord("A") + k) if k < 26 else f"{k + 1}" for k in range(len(folders))]
+    if len(labels) != len(folders):
+        message = f"{len(labels)} labels for {len(folders)} runs"
         raise refusal("--label", message, "give one for each run, in their order")
-    read = [reopen_seeds(folder) for folder in runs]
-    for folder, seeds in zip(runs, read, strict=True):
-        if not seeds[0].traces:
-            raise RecordingError(f"{folder}: no case had begun; there is nothing to report")
-    own = runs[0]
-    if pool and len(runs) > 1:
-        read, labels, own = [_pooled(runs, read)], labels[:1], f"{Path(own)}-pooled"
-    if pdf and len(read) > 1:
+    several = len(folders) > 1 and not pool
+    if pdf and several:
         raise refusal("--pdf", "writes the figures of one run", "report each run by itself, or pool them (--pool)")
-    named = [
-        (name, [case for each in seeds for case in each.metrics.values()])
-        for name, seeds in zip(labels, read, strict=True)
-    ]
-    if as_latex or as_markdown:
-        cases = pages.labelled(named) if len(read) > 1 else named[0][1]
+    read = [] if several else [reopen_seeds(folder) for folder in folders]
+    named = [(name, read_metrics(folder)) for name, folder in zip(labels, folders, strict=True)] if several else []
+    begun = [bool(cases) for _, cases in named] or [bool(seeds[0].traces) for seeds in read]
+    for folder, known in zip(folders, begun, strict=True):
+        if not known:
+            raise RecordingError(f"{folder}: no case had begun; there is nothing to report")
+    pooled = len(read) > 1
+    seeds = _pooled(folders, read) if pooled else [run for found in read for run in found]
+    cases = pages.labelled(named) if several else [case for run in seeds for case in run.metrics.values()]
+    if form is not None:
         names = {short_name(name): name for name in summary_metrics()}
         tables = pages.result_tables(cases, [names[name] for name in known_words("--metrics", [metrics or ""], names)])
-        _put(typeset.latex(tables, width) if as_latex else typeset.markdown(tables), out)
+        _put(form(tables), out)
         return 0
-    target = Path(out or "comparison.html") if len(read) > 1 else Path(out or own)
-    try:
-        if len(read) == 1:
-            write_figures_of_merit(read[0], target)
-            page = write_report(read[0], target, width, pdf=pdf)
-        else:
-            titles = "; ".join(dict.fromkeys(seeds[0].title for seeds in read))
-            page = pages.compare(target, named, source=titles, differences=_differences(labels, runs))
-    except OSError as error:
-        raise RecordingError(
-            f"{target}: cannot be written: {error.strerror}; choose another place with --out"
-        ) from None
-    found = [{"folder": seeds[0].folder, **summary(seeds)} for seeds in read] if as_json else []
+    if several:
+        return _compare(folders, named, Path(out or "comparison.html"), as_json=as_json)
+    target = Path(out or (f"{Path(folders[0])}-pooled" if pooled else folders[0]))
+    with _writing(target):
+        write_figures_of_merit(seeds, target)
+        page = write_report(seeds, target, width, pdf=pdf)
+    found = [{"folder": seeds[0].folder, **summary(seeds)}] if as_json else []
     print_result({"report": page, "runs": found}, str(page), as_json=as_json)
     return 0
 
 
-def _put(text: str, out: str | None) -> None:
-    """Print a text, or write it into a file and print where that is."""
+def _folders_of_runs(folders: Sequence[str]) -> list[str]:
+    """Folders of runs in the given order; one that is full of them stands for those in it, the oldest first."""
+    from experiments.recording.run_folder import past_runs
+
+    found = list[str]()
+    for folder in folders:
+        inside = [run.folder for run in past_runs([Path(folder)])]
+        found += [folder] if str(Path(folder)) in inside or not inside else inside
+    return found
+
+
+def _compare(
+    folders: Sequence[str], named: Sequence[tuple[str, Sequence[CaseMetrics]]], target: Path, *, as_json: bool
+) -> int:
+    """Print how runs differ and their key figures against the first, and write the page of their comparison."""
+    from experiments.metrics.metric import console_metrics
+    from experiments.recording.run_folder import past_runs
+    from experiments.report import report as pages
+    from experiments.report.page import MARKS
+    from experiments.report.tables import summary_table
+    from experiments.report.typeset import plain
+    from experiments.report.verdict import interruptions, spoiled
+    from tools.progress import columns
+
+    known = {run.folder: run for run in past_runs([Path(folder) for folder in folders])}
+    past = [known[place] for folder in folders if (place := str(Path(folder))) in known]
+    differ = _differences([name for name, _ in named], folders)
+    with _writing(target):
+        titles = "; ".join(dict.fromkeys(run.origin.title for run in past))
+        page = pages.compare(target, named, source=titles, differences=differ)
+    if as_json:
+        shown = {"report": page, "reference": folders[0], "runs": [_as_json(run) for run in past]}
+        print_json(shown | {"differences": {folder: found for _, folder, found in differ[1:]}})
+        return 0
+    cases = pages.labelled(named)
+    table = summary_table(cases, [*console_metrics()])
+    say(*columns(plain(pages.differences_table(differ))), "")
+    say(*columns([*zip(*plain(table), strict=True)]), table.note)
+    say(*(f"{MARKS[each.mark]} {each.text}" for each in (*spoiled(cases), *interruptions(cases))), str(page))
+    return 0
+
+
+@contextmanager
+def _writing(target: str | Path) -> Iterator[None]:
+    """Raises RecordingError if `target` cannot be written inside."""
     from experiments.recording.reader import RecordingError
 
+    try:
+        yield
+    except OSError as error:
+        why = f"{target}: cannot be written: {error.strerror}; choose another place with --out"
+        raise RecordingError(why) from None
+
+
+def _put(text: str, out: str | None) -> None:
+    """Print a text, or write it into a file and print where that is."""
     if out is None:
         print(text)
         return
-    try:
+    with _writing(out):
         Path(out).parent.mkdir(parents=True, exist_ok=True)
         Path(out).write_text(f"{text}\n", encoding="utf-8")
-    except OSError as error:
-        raise RecordingError(f"{out}: cannot be written: {error.strerror}; choose another file with --out") from None
     print(out)
 
 
@@ -191,7 +236,7 @@ def _pooled(folders: Sequence[str], read: Sequence[Sequence[Run]]) -> list[Run]:
         for case, trace in first.items():
             mine = run.traces[case]
             if mine.plan.changed(seed=0) != trace.plan.changed(seed=0):
-                hint = f"compare them without --pool: `./zenpark compare {folders[0]} {folder}`"
+                hint = f"compare them without --pool: `./zenpark report {folders[0]} {folder}`"
                 raise refusal(folder, f"differs from {folders[0]} in more than its seed", hint)
             if mine.clock != trace.clock:
                 raise refusal(folder, f"is of {mine.clock} time, {folders[0]} of {trace.clock} time", "pool them apart")
@@ -222,86 +267,6 @@ def _differences(labels: Sequence[str], folders: Sequence[str]) -> list[tuple[st
     known = [(name, past[str(Path(folder))]) for name, folder in zip(labels, folders, strict=True)
              if str(Path(folder)) in past]  # fmt: skip
     return [(name, run.folder, differences(known[0][1], run)) for name, run in known]
-
-
-@app.command(epilog=example("compare runs/first runs/second --json"))
-def compare(
-    folders: Annotated[
-        list[str],
-        typer.Argument(
-            metavar="RUN...", help="Folders of runs, or folders full of them.", autocompletion=completion.folders
-        ),
-    ],
-    out: Annotated[str | None, typer.Option(metavar="FILE", help="Write a page with figures as well.")] = None,
-    as_json: AsJson = False,
-) -> int:
-    """Compare many runs: how their files, seeds and versions differ, then their key figures against the first."""
-    from experiments.metrics.metric import console_metrics
-    from experiments.recording.reader import RecordingError
-    from experiments.recording.run_folder import differences, past_runs
-    from experiments.report.tables import over_seeds
-    from tools.progress import columns
-
-    # in the given order: the first one is the reference
-    if gone := [folder for folder in folders if not Path(folder).is_dir()]:
-        raise RecordingError(f"{', '.join(gone)}: no such folder; name those of runs (`./zenpark runs --past`)")
-    found = [run for folder in folders for run in past_runs([Path(folder)])]
-    found = list({run.folder: run for run in found}.values())
-    if len(found) < 2:
-        raise RecordingError(
-            f"{', '.join(folders)}: {len(found)} runs there; name two or more (`./zenpark runs --past`)"
-        )
-    first = found[0]
-    differ = {run.folder: differences(first, run) for run in found[1:]}
-    if as_json:
-        print_json({"reference": first.folder, "runs": [_as_json(run) for run in found], "differences": differ})
-    else:
-        say(f"reference: {first.folder}")
-        for folder, each in differ.items():
-            say(f"{folder}: {'; '.join(each) or SAME}")
-        reference = next(iter(first.cases.values()), {})
-        rows, remarks, shown = [], list[str](), console_metrics()
-        for run in found:
-            for case, figures in run.cases.items():
-                fair = _comparable(run, case, first)
-                cells = [_against(figures.get(name, {}), reference.get(name, {}), fair) for name in shown]
-                rows.append([run.folder, case, f"{len(run.seeds)}", *cells])
-                remarks += [f"  {run.folder}, {case}, seed {k}: {why}" for k, why in run.remarks.get(case, {}).items()]
-        head = ("run", "case", "seeds", *(m.head + " (– never)" * (m.mean == "all") for m in shown.values()))
-        say("", *columns([head, *rows]))
-        if remarks:
-            say("Not compared, because spoiled or of another length:", *remarks)
-        if seeds := max((len(run.seeds) for run in found if len(run.seeds) > 1), default=0):
-            print(over_seeds(seeds))
-    return report([run.folder for run in found], out) if out is not None else 0
-
-
-def _comparable(run: PastRun, case: str, first: PastRun) -> Container[int]:
-    """Seeds of a case that can be compared with those of the first case of the first run."""
-    from experiments.metrics.comparable import equally_long
-
-    if not first.cases:
-        return ()
-    reference = next(iter(first.cases))
-    spoiled, lengths = first.remarks.get(reference, {}), [*first.lengths.get(reference, {}).values()]
-    if len(spoiled) == len(lengths):
-        return ()
-    mine = run.lengths.get(case, {})
-    fair = [seed for seed, length in mine.items() if equally_long([length, *lengths])]
-    return [seed for seed in fair if seed not in run.remarks.get(case, {})]
-
-
-def _against(values: Mapping[int, float | None], reference: Mapping[int, float | None], fair: Container[int]) -> str:
-    """A figure over seeds, and behind it as a multiple of the reference's, of the seeds that may be compared."""
-    from experiments.metrics.statistics import ratios_by_seed, spread
-    from experiments.report.page import interval
-    from experiments.report.tables import ratio_words
-
-    compared = {seed: value if seed in fair else None for seed, value in values.items()}
-    share = spread(ratios_by_seed(compared, reference))
-    behind = "" if share.mean is None or values is reference else f" (× {ratio_words(share)})"
-    known = spread([*values.values()])
-    return interval(known) + (f" ({known.n} of {len(values)})" if 0 < known.n < len(values) else "") + behind
 
 
 def _as_json(run: PastRun) -> dict[str, Any]:

@@ -76,7 +76,7 @@ def test_installed_metric_is_everywhere(installed):
     page = (installed / "run" / "report.html").read_text("utf-8")
     assert all(text in page for text in ("Way [m]", "Length of the path", "Gap [m] of the case", "broken failed"))
 
-    shown = zenpark(installed, "compare", "run").stdout + zenpark(installed, "report", "run", "--markdown").stdout
+    shown = zenpark(installed, "report", "run", "--markdown").stdout
     assert "Way [m]" in shown
     made = json.loads((installed / "run" / "run.json").read_text())["made_by"]
     assert made["plugins"] == {"my-metrics": "0.1"}

@@ -180,7 +180,7 @@ def test_control_sequences_of_a_bundle_stay_out(flown: Path, tmp_path: Path) -> 
     (folder / "run.json").write_text(json.dumps(origin))
     assert zenpark("export", str(folder), "--bundle").exit_code == 0
     again = zenpark("run", str(tmp_path / "run.zip"), "--no-report", "--out", str(tmp_path / "again"))
-    compared = zenpark("compare", str(folder), str(tmp_path / "again"))
+    compared = zenpark("report", str(folder), str(tmp_path / "again"), "--out", str(tmp_path / "page.html"))
     past = zenpark("runs", "--past", "--in", str(tmp_path))
     for said in (again, compared, past):
         assert said.exit_code == 0, said.output

@@ -150,11 +150,6 @@ def test_past_runs_on_the_command_line(tmp_path: Path) -> None:
     assert [line.split()[2] for line in lines[1:3]] == [str(a), str(b)]
     assert lines[1].endswith("paper")
     assert len(msgspec.json.decode(zenpark("runs", "paper", "--in", str(tmp_path), "--json").stdout)["runs"]) == 1
-    said = zenpark("compare", str(tmp_path)).stdout
-    assert f"{b}: seeds: 1, 2 → 3, 4" in said
-    assert "30.0 (× 3.000)" in said
-    alone = zenpark("compare", str(a))
-    assert "name two or more" in str(alone.exception)
 
 
 def test_past_runs_tell_losses_per_hour(tmp_path: Path) -> None:

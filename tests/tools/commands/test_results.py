@@ -164,15 +164,22 @@ def test_runs_of_several_seeds_are_pooled_to_one(three: tuple[Path, str], tmp_pa
 def test_a_comparison_has_the_intervals_of_the_report(three: tuple[Path, str], tmp_path: Path) -> None:
     again = tmp_path / "again"
     shutil.copytree(three[0], again)
-    lines = zenpark("compare", str(three[0]), str(again)).splitlines()
-    event = next(line for line in lines if re.match(rf"{re.escape(str(again))} +event", line))
+    (again / "event.mcap").unlink()  # `clean --recordings` leaves the metrics
+    page = tmp_path / "comparison.html"
+    lines = zenpark("report", str(three[0]), str(tmp_path), "--out", str(page)).splitlines()
+    assert re.fullmatch(rf"B +{re.escape(str(again))} +the same file, seeds and versions", lines[2])
+    event = next(line for line in lines if line.startswith("B · event "))
     (reported,) = [line for line in three[1].splitlines() if line.startswith("       event: ")]
     rate, error = re.findall(r"(\d[\d.]* ± [\d.]+)", reported)[:2]
     assert rate in event
     assert error in event
-    assert re.search(r"\(× 0\.\d+ ± 0\.\d+\)", event)
-    assert "Means over 3 seeds ± half-width" in lines[-1]
-    figures = json.loads(zenpark("compare", str(three[0]), str(again), "--json"))["runs"][0]["cases"]["event"]["iae"]
+    assert re.search(r" × 0\.\d+ ± 0\.\d+", event)
+    assert "Means over 3 seeds ± half-width" in lines[-2]
+    assert lines[-1] == str(page)
+    assert "Comparison of runs" in page.read_text()
+    found = json.loads(zenpark("report", str(three[0]), str(again), "--out", str(page), "--json"))
+    assert found["differences"] == {str(again): []}
+    figures = found["runs"][0]["cases"]["event"]["iae"]
     assert figures["n"] == 3
     assert figures["ci95"] > 0.0
 
@@ -231,9 +238,9 @@ def test_a_spoiled_run_is_not_compared(three: tuple[Path, str], tmp_path: Path) 
     assert done.exit_code == 1
     assert "✗ Spoiled, and compared with nothing: event: robots failed." in done.stdout
     assert "ratios" not in done.stdout
-    compared = zenpark("compare", str(three[0]), out)
-    assert "×" not in next(line for line in compared.splitlines() if re.match(rf"{re.escape(out)} +event", line))
-    assert f"{out}, event, seed 1: " in compared
+    compared = zenpark("report", str(three[0]), out, "--out", str(tmp_path / "comparison.html"))
+    assert "×" not in next(line for line in compared.splitlines() if line.startswith("B · event "))
+    assert "Spoiled, and compared with nothing: B · event: " in compared
     assert "robots failed" in zenpark("runs", "--past", "--in", out)
     pooled = CliRunner().invoke(app, ["report", out, str(three[0]), "--pool"])
     assert "is no whole run that nothing spoiled" in str(pooled.exception)
