@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import io
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
@@ -33,30 +32,6 @@ HEADING: Final = ("host", "reachable", "zenpark", "Python", "clock", "devices", 
 SECURED: Final = (*HEADING[:-1], "certificates", HEADING[-1])  # in a lab
 VAGUE_S: Final = 0.02  # a clock with a larger uncertainty lets robots start apart
 REACH_S: Final = 15.0
-INSTALL_S: Final = 900.0
-FILES: Final = ("zenpark", "face", "pyproject.toml", "README.md", "LICENSE")
-
-# $0 is the folder, the rest is what to put there; a checkout or a folder of something else is not ours to change
-PUT_ZENPARK: Final = """set -eu
-folder=$0
-if [ -e "$folder/.git" ]; then
-    echo "$folder is a git checkout: bring it up to date with git, there" >&2; exit 3
-fi
-ours() { grep -q '^name = "zenpark"' "$folder/pyproject.toml" 2>/dev/null; }
-if [ -d "$folder" ] && [ -n "$(ls -A "$folder")" ] && ! ours; then
-    echo "$folder holds something else: say in the file where zenpark may go, such as \\"zenpark/zenpark\\"" >&2; exit 3
-fi
-mkdir -p "$folder"
-rm -rf "$folder/.incoming"
-mkdir "$folder/.incoming"
-tar -xzf - -C "$folder/.incoming"
-for each in "$@"; do
-    rm -rf "$folder/$each"
-    mv "$folder/.incoming/$each" "$folder/$each"
-done
-rmdir "$folder/.incoming"
-exec "$folder/zenpark" --version
-"""
 
 
 @dataclass
@@ -87,16 +62,16 @@ def watchdog(
 ) -> None:
     """Install a watchdog on a TurtleBot3, which stops it when no command arrives."""
     from agents.protocols import turtlebot3
-    from experiments.real_time.hosts import robot_watchdog
+    from experiments.real_time.hosts import installation
 
     if robot is None:
-        sys.stdout.write(robot_watchdog.FILE.read_text("utf-8"))
+        sys.stdout.write(installation.WATCHDOG.read_text("utf-8"))
         return
     at = turtlebot3.address(robot, f"ros2dds://{namespace}", turtlebot3.TurtleBot3Settings())
     said = (
-        robot_watchdog.remove(robot)
+        installation.remove_watchdog(robot)
         if remove
-        else robot_watchdog.install(robot, namespace=at.namespace, domain=domain, silence_s=silence)
+        else installation.put_watchdog(robot, namespace=at.namespace, domain=domain, silence_s=silence)
     )
     for line in said:
         print(f"{robot}: {line}")
@@ -133,6 +108,7 @@ def install(file: File, settings: Settings = None, on: On = None, lab: Lab = Non
     from experiments.file import document
     from experiments.real_time.hosts import certificates
     from experiments.real_time.hosts.hosts import HostError
+    from experiments.real_time.hosts.installation import put, send
     from experiments.recording import version
 
     read = document.read(file, settings or [])
@@ -328,123 +304,3 @@ def _recognised(row: Row, there: Station, folder: Path, robots: Sequence[str]) -
         remedy = f"`./zenpark cert renew {folder} {' '.join(there.host.robots)}`, then `./zenpark hosts install FILE`"
         row.trouble.append(f"{there.name}: its certificates end in {left:.0f} days; {remedy}")
     return not wrong
-
-
-def put(name: str, host: Host) -> str:
-    """Put this zenpark on a host, and make it ready; return what it then says of itself.
-
-    Raises HostError if there is no place for it, or it cannot be made ready there.
-    """
-    from experiments.real_time.hosts.hosts import HostError, run_script
-    from experiments.recording import version
-
-    place = PurePosixPath(host.zenpark.removeprefix("~/"))
-    if place.name != "zenpark" or place.parent in (PurePosixPath(), PurePosixPath("/")):
-        raise HostError(f"{name}: '{host.zenpark}' names no folder of its own; write zenpark = \"zenpark/zenpark\"")
-    if not (version.ROOT / "zenpark").is_file():
-        raise HostError(f"{name}: this zenpark is no checkout, which is what can be copied; start ./zenpark of one")
-    wanted = [*version.PACKAGES, *FILES, *sorted(path.name for path in version.ROOT.glob("requirements*.lock"))]
-    names = [each for each in wanted if (version.ROOT / each).exists()]
-    output = run_script(
-        name,
-        host,
-        (PUT_ZENPARK, place.parent, *names),
-        packed(version.ROOT, names),
-        limit_s=INSTALL_S,
-        late=f"not ready after {INSTALL_S / 60:g} minutes; start {place} there by hand",
-        failed="not installed: ",
-    )
-    return f"{output.strip()} ({version.digest()[: version.SHOWN]}) installed"
-
-
-def packed(root: Path, names: Sequence[str], mode: int | None = None) -> bytes:
-    """Files of a folder as a compressed tar without user names and without files made by running it.
-
-    Args:
-        mode: Of all files; None: as they have it.
-    """
-    import tarfile
-
-    sink = io.BytesIO()
-
-    def kept(member: tarfile.TarInfo) -> tarfile.TarInfo | None:
-        member.uid = member.gid = 0
-        member.uname = member.gname = ""
-        member.mode = member.mode if mode is None else mode
-        return None if "__pycache__" in PurePosixPath(member.name).parts else member
-
-    with tarfile.open(fileobj=sink, mode="w:gz", compresslevel=6) as tar:
-        for name in names:
-            tar.add(root / name, name, filter=kept)
-    return sink.getvalue()
-
-
-SEND_S: Final = 60.0
-
-# $0 is the folder, the rest is what it is to hold; a lab's own folder or one of something else is not ours to change
-PUT_CERTIFICATES: Final = """set -eu
-umask 077
-folder=$0
-if [ -e "$folder" ]; then
-    for each in $(ls -A "$folder"); do
-        case $each in
-            ca.key) echo "$folder is the lab's own folder: say in the file where certificates may go, such as \\
-lab = \\"zenpark-lab\\"" >&2; exit 3;;
-            *.pem|*.key|.incoming) ;;
-            *) echo "$folder holds something else ($each): say in the file where certificates may go, such as \\
-lab = \\"zenpark-lab\\"" >&2; exit 3;;
-        esac
-    done
-fi
-mkdir -p "$folder"
-chmod 700 "$folder"
-rm -rf "$folder/.incoming"
-mkdir "$folder/.incoming"
-tar -xzf - -C "$folder/.incoming"
-cd "$folder"
-for each in *.pem *.key; do
-    if [ -e "$each" ] && [ ! -e ".incoming/$each" ]; then
-        rm -f "$each"
-        echo "$each"
-    fi
-done
-for each in "$@"; do
-    mv ".incoming/$each" "$each"
-done
-rmdir .incoming
-"""
-
-
-def send(name: str, host: Host, folder: Path, robots: Sequence[str]) -> str:
-    """Put the certificates of some robots on a host, in place of what its folder held; return what was done.
-
-    Args:
-        robots: Their names; no other certificates stay there.
-
-    Raises:
-        HostError: If some cannot be sent, or there is no place for them.
-        LabError: If the register of the lab cannot be read.
-    """
-    from agents.network.lab import AUTHORITY
-    from experiments.real_time.hosts import certificates
-    from experiments.real_time.hosts.hosts import HostError, run_script
-
-    if trouble := list(certificates.ended(folder, robots)):
-        raise HostError("\n".join(f"{name}: {each}" for each in trouble))
-    place = PurePosixPath(host.lab.removeprefix("~/"))
-    if place in (PurePosixPath(), PurePosixPath("/")) or ".." in place.parts:
-        raise HostError(f"{name}: '{host.lab}' names no folder of its own; write lab = \"zenpark-lab\"")
-    # the key before its certificate: a process that reads them in between finds that they do not fit, and tries again
-    files = [f"{AUTHORITY}.pem", *(f"{robot}.{end}" for robot in robots for end in ("key", "pem"))]
-    output = run_script(
-        name,
-        host,
-        (PUT_CERTIFICATES, place, *files),
-        packed(folder, files, mode=0o600),
-        limit_s=SEND_S,
-        late=f"has not taken its certificates in {SEND_S:g} s; is it overloaded?",
-        failed="certificates not put there: ",
-    )
-    removed = output.split()
-    more = f"; removed {', '.join(removed)}" if removed else ""
-    return f"certificates of {', '.join(robots)} put into {place}{more}"

@@ -18,7 +18,7 @@ import pytest
 
 from bridges.turtlebot3 import watchdog
 from bridges.turtlebot3.watchdog import TYPES, Node, Watchdog, moving, type_of_robot
-from experiments.real_time.hosts import robot_watchdog
+from experiments.real_time.hosts import installation
 from experiments.real_time.hosts.hosts import HostError
 from tests.waiting import until
 
@@ -217,26 +217,28 @@ def robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 @pytest.mark.system
 def test_watchdog_is_installed_kept_and_removed_over_ssh(robot: Path) -> None:
     for attempt in range(2):  # a second time replaces the first
-        said = robot_watchdog.install("robot", namespace="tb3_0", domain=30, silence_s=0.5)
+        said = installation.put_watchdog("robot", namespace="tb3_0", domain=30, silence_s=0.5)
         assert "it is started at each boot (crontab -l)" in said
         assert "watches cmd_vel (geometry_msgs/msg/TwistStamped): stops the robot after 0.5 s" in said[-1], attempt
         assert "__ns:=/tb3_0" in said[-1]
     folder = robot / "zenpark-watchdog"
     assert (robot / "crontab").read_text() == f"@reboot {folder}/run\n"
-    assert (folder / "watchdog.py").read_bytes() == robot_watchdog.FILE.read_bytes()
+    assert (folder / "watchdog.py").read_bytes() == installation.WATCHDOG.read_bytes()
     first = int((folder / "pid").read_text())
     os.kill(first, signal.SIGKILL)
     until(lambda: int((folder / "pid").read_text() or first) != first, "it is started anew")
-    assert robot_watchdog.remove("robot") == ["removed"]
+    assert installation.remove_watchdog("robot") == ["removed"]
     assert not folder.exists()
     assert (robot / "crontab").read_text() == ""
-    assert robot_watchdog.remove("robot") == ["there is none"]
+    assert installation.remove_watchdog("robot") == ["there is none"]
 
 
 @pytest.mark.system
 def test_a_robot_without_ros_is_named(robot: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(robot_watchdog, "PUT", robot_watchdog.PUT.replace("${ROS_SETUP:-$setup}", "$setup"))
+    monkeypatch.setattr(
+        installation, "PUT_WATCHDOG", installation.PUT_WATCHDOG.replace("${ROS_SETUP:-$setup}", "$setup")
+    )
     with pytest.raises(HostError, match=r"(?s)^robot: .*there is no ROS 2 under /opt/ros$"):
-        robot_watchdog.install("robot", namespace="", domain=30, silence_s=0.5)
+        installation.put_watchdog("robot", namespace="", domain=30, silence_s=0.5)
     with pytest.raises(HostError, match=r"^nowhere: .*no machine of that name"):
-        robot_watchdog.install("nowhere", namespace="", domain=30, silence_s=0.5)
+        installation.put_watchdog("nowhere", namespace="", domain=30, silence_s=0.5)

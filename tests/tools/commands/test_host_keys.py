@@ -9,8 +9,8 @@ import pytest
 from experiments.definition.experiment import Host
 from experiments.real_time.hosts import authority
 from experiments.real_time.hosts.hosts import HostError
+from experiments.real_time.hosts.installation import send
 from tests.tools.commands.test_hosts import FAKE
-from tools.commands.hosts import send
 
 
 @pytest.fixture

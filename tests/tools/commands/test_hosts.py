@@ -11,11 +11,12 @@ import pytest
 
 from experiments.file import catalogue
 from experiments.file.problems import DocumentError
-from experiments.real_time.hosts import hosts
+from experiments.real_time.hosts import hosts, installation
+from experiments.real_time.hosts.installation import packed
 from experiments.recording import playback, version
 from tests.system.lab import ROOT, Flight
 from tools.commands import hosts as tool
-from tools.commands.hosts import HEADING, choose, packed
+from tools.commands.hosts import HEADING, choose
 from tools.progress import columns
 
 FAKE = """\
@@ -207,4 +208,4 @@ def test_install_leaves_alone_what_is_not_its_own(home, tmp_path, capsys, there,
 @pytest.mark.parametrize("place", ["zenpark", "~/zenpark", "/zenpark", "bin/zp"])
 def test_host_command_needs_a_folder_of_its_own(place):
     with pytest.raises(hosts.HostError, match="names no folder of its own"):
-        tool.put("lab1", hosts.Host(address="a", zenpark=place))
+        installation.put("lab1", hosts.Host(address="a", zenpark=place))
