@@ -83,7 +83,7 @@ class _Robot:
         if self.scan is not None:
             self.scan.close()
         self.goal.close()
-        self.goal_publisher.undeclare()  # type: ignore[no-untyped-call]
+        self.goal_publisher.undeclare()
 
 
 class Graph:

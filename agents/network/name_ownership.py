@@ -65,7 +65,7 @@ def claim(
             raise NameTaken(", ".join(others))
     except BaseException:
         for token in tokens:
-            token.undeclare()  # type: ignore[no-untyped-call]
+            token.undeclare()
         raise
     return tokens
 
@@ -263,7 +263,7 @@ class NameKeeper:
         with self._lock:
             tokens = [self._tokens.pop(row) for row in rows if row in self._tokens] if only_if() else []
         for token in tokens:
-            token.undeclare()  # type: ignore[no-untyped-call]
+            token.undeclare()
 
     def end(self) -> None:
         """Ends a running check."""

@@ -122,7 +122,7 @@ class RingingSubscriber:
         return self._waiting.popleft() if self._waiting else None
 
     def undeclare(self) -> None:
-        self._subscriber.undeclare()  # type: ignore[no-untyped-call]
+        self._subscriber.undeclare()
 
     def _append(self, sample: zenoh.Sample) -> None:
         self._waiting.append(sample)
@@ -295,7 +295,7 @@ class ImmediateSubscriber:
         return self.waiting.popleft() if self.waiting else None
 
     def close(self) -> None:
-        self._subscriber.undeclare()  # type: ignore[no-untyped-call]
+        self._subscriber.undeclare()
 
     def _receive(self, sample: zenoh.Sample) -> None:
         if sample.kind == zenoh.SampleKind.DELETE:
@@ -345,7 +345,7 @@ class Orders(Generic[M]):
                     query.reply_err(reason.encode(), encoding="text/plain")
 
     def close(self) -> None:
-        self._queryable.undeclare()  # type: ignore[no-untyped-call]
+        self._queryable.undeclare()
 
 
 def _ends_flight(query: zenoh.Query) -> bool:

@@ -211,7 +211,7 @@ def open_session(
         else:
             if not ends.visits or _gathered(session, len(ends.connect), gather_s, ended, deadline):
                 return session
-            session.close()  # type: ignore[no-untyped-call]
+            session.close()
         raise Unreachable(_silence(endpoints, identity or name)) from None
 
 

@@ -35,7 +35,7 @@ def leave(session: zenoh.Session, *declared: object, limit_s: float = LEAVE_S) -
 
 
 def _close(session: zenoh.Session, _declared: tuple[object, ...]) -> None:
-    session.close()  # type: ignore[no-untyped-call]
+    session.close()
 
 
 @contextmanager

@@ -73,7 +73,7 @@ class Node:
 
     def close(self) -> None:
         if self._token is not None:
-            self._token.undeclare()  # type: ignore[no-untyped-call]
+            self._token.undeclare()
 
 
 class Publisher:
@@ -106,8 +106,8 @@ class Publisher:
 
     def close(self) -> None:
         if self._token is not None:
-            self._token.undeclare()  # type: ignore[no-untyped-call]
-        self._publisher.undeclare()  # type: ignore[no-untyped-call]
+            self._token.undeclare()
+        self._publisher.undeclare()
 
 
 class Subscriber:
@@ -139,8 +139,8 @@ class Subscriber:
 
     def close(self) -> None:
         if self._token is not None:
-            self._token.undeclare()  # type: ignore[no-untyped-call]
-        self._subscriber.undeclare()  # type: ignore[no-untyped-call]
+            self._token.undeclare()
+        self._subscriber.undeclare()
 
 
 def _announce(participant: Participant, token: str) -> zenoh.LivelinessToken | None:

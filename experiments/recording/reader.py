@@ -234,7 +234,7 @@ def _copy(parts: Sequence[Records], writer: Writer) -> None:
         )
     for metadata in first.metadata:
         writer.add_metadata(metadata.name, metadata.metadata)
-    writer.finish()  # type: ignore[no-untyped-call]
+    writer.finish()
 
 
 class _Repeats:

@@ -47,7 +47,7 @@ class ChunkIndices:
         self.end = max(self.end, index.message_end_time)
         record = RecordBuilder()
         index.write(record)
-        self._kept.write(record.end())  # type: ignore[no-untyped-call]
+        self._kept.write(record.end())
 
     def __iter__(self) -> Iterator[ChunkIndices]:
         yield self  # all at once, see `write`

@@ -174,7 +174,7 @@ class Observer:
         if wanted and self._ranges is None:
             self._ranges = pubsub.subscriber(self._session, self._keys.ranges("*"), DEPTH)
         elif not wanted and self._ranges is not None:
-            self._ranges.undeclare()  # type: ignore[no-untyped-call]
+            self._ranges.undeclare()
             self._ranges = None
             self.scans.clear()
 

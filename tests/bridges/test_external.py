@@ -98,7 +98,7 @@ class FarEnd:
 
     def close(self) -> None:
         self.hush()
-        self.session.close()  # type: ignore[no-untyped-call]
+        self.session.close()
 
 
 @pytest.fixture

@@ -120,7 +120,7 @@ class Watcher(Looking):
         return orders.send_order(self.session, self.keys, [robot], order, PATIENCE_S)[robot]
 
     def close(self) -> None:
-        self.session.close()  # type: ignore[no-untyped-call]
+        self.session.close()
 
 
 class Started:

@@ -93,7 +93,7 @@ def test_robots_without_conductor_end_if_file_says_so(router: RouterProcess, tmp
         for name in "AB":
             assert watcher.order(name, messages.Order("takeoff")).ok
         watcher.until(lambda: [watcher.phase(name) for name in "AB"] == ["airborne"] * 2, "waiting for the start")
-        token.undeclare()  # type: ignore[no-untyped-call]
+        token.undeclare()
         watcher.until(lambda: [watcher.phase(name) for name in "AB"] == ["done"] * 2, "down")
         status = watcher.status["A"]
         assert status.reason == "the conductor is gone"

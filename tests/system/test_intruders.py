@@ -170,7 +170,7 @@ def test_nobody_speaks_for_a_robot_or_stops_everybody(laboratory: Laboratory, wh
             session.delete(key)
         settled(laboratory)
     keys = {str(sample.key_expr) for sample in network.received(heard.handler) if "mallory" in str(sample.payload)}
-    heard.undeclare()  # type: ignore[no-untyped-call]
+    heard.undeclare()
     assert not keys
 
 
@@ -263,11 +263,11 @@ def test_no_one_takes_anothers_place(laboratory: Laboratory) -> None:
         ]
         assert poses
         assert all(pose.seq < 10**8 for pose in poses)
-        late.undeclare()  # type: ignore[no-untyped-call]
+        late.undeclare()
         assert "KH09" not in laboratory.watcher.alive
         assert not list(order.read())
         assert not last.answer()
-        token.undeclare()  # type: ignore[no-untyped-call]
+        token.undeclare()
 
 
 # ---------------------------------------------------------------------- who has stolen a key of somebody who may

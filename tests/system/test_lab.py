@@ -138,7 +138,7 @@ def test_a_new_authority_refuses_every_earlier_file(laboratory: Laboratory, tmp_
 
         def lets_in() -> bool:
             try:
-                laboratory.session("operator").close()  # type: ignore[no-untyped-call]
+                laboratory.session("operator").close()
             except zenoh.ZError:
                 return False
             return True

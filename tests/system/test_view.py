@@ -72,7 +72,7 @@ def announced(watcher: Watcher, park: Experiment, case: str) -> Iterator[None]:
     told = pubsub.pose_publisher(watcher.session, watcher.keys.experiment, messages.JSON)
     told.put(document.case_document(Plan(park), case))
     yield
-    told.undeclare()  # type: ignore[no-untyped-call]
+    told.undeclare()
 
 
 @pytest.mark.mechanism("view")

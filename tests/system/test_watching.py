@@ -90,8 +90,8 @@ def test_recording_plays_with_keys_and_payloads_as_flown(
     refused = zenpark("replay", tmp_path, "--connect", router.endpoint)
     assert (refused.returncode, seen) == (2, {})
     assert "a run is up (park/run/conductor)" in refused.stderr
-    token.undeclare()  # type: ignore[no-untyped-call]
-    listening.undeclare()  # type: ignore[no-untyped-call]
+    token.undeclare()
+    listening.undeclare()
 
 
 def test_replay_owns_robot_names_and_ends_when_replaced(

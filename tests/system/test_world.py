@@ -116,7 +116,7 @@ class Desk(Looking):
         self.until(seen, what)
 
     def close(self) -> None:
-        self.session.close()  # type: ignore[no-untyped-call]
+        self.session.close()
 
 
 @pytest.fixture

@@ -173,7 +173,7 @@ class TurtleBot3Twin:
     def close(self) -> None:
         """Leaves the network."""
         for session in self._sessions.values():
-            session.close()  # type: ignore[no-untyped-call]
+            session.close()
         self._sessions.clear()
 
     # ------------------------------------------------------------------ commands

@@ -165,7 +165,7 @@ class NetworkView:
 
     def refuse_joining(self) -> None:
         """Robots that join from now on wait for the next run."""
-        self._experiment.undeclare()  # type: ignore[no-untyped-call]
+        self._experiment.undeclare()
 
     def update(self) -> list[str]:
         """Receive all since the last update; return the robots whose token has vanished for good.

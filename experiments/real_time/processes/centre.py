@@ -109,7 +109,7 @@ class CentreProcess:
             if t - self._reported >= REPORT_S - 1e-6:
                 self._report(t)
         self._report(ticks.next)
-        token.undeclare()  # type: ignore[no-untyped-call]
+        token.undeclare()
 
     def _receive(self, t: float) -> None:
         """Receives all since the last decision."""

@@ -117,7 +117,7 @@ def wait_for_experiment(session: zenoh.Session, keys: Keys, names: Sequence[str]
                 print(f"not joined: {error}", flush=True)
                 continue
             if set(names) <= set(read.experiment.robots):
-                subscriber.undeclare()  # type: ignore[no-untyped-call]
+                subscriber.undeclare()
                 return read
             print(f"not joined: {read.experiment.title} has no {', '.join(names)}", flush=True)
         pause.wait(LOOK_S)

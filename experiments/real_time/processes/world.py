@@ -95,7 +95,7 @@ class WorldProcess:
                 self._report(ticks.next)
             if self._ended():
                 break
-        token.undeclare()  # type: ignore[no-untyped-call]
+        token.undeclare()
 
     def _ended(self) -> bool:
         return self._over.is_set() or (self._lost.is_set() and self._farewell.over())

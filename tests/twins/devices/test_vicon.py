@@ -352,7 +352,7 @@ def test_process_ends_with_its_starter_after_the_robots(process: subprocess.Pope
         for _ in range(40):
             assert reader.newest(1.0) is not None
         assert process.poll() is None
-        token.undeclare()  # type: ignore[no-untyped-call]
+        token.undeclare()
         assert process.wait(30) == 0
     reader.close()
 
