@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import inf
 
 from agents.body.kinds import Kind
 from agents.body.limits import Limits
@@ -33,6 +34,7 @@ class Assignment:
     pose_every: int  # ticks from one question to the trigger to the next
     decide_every: int  # ticks from one goal to the next
     duration: float  # of the experiment [s]
+    lands_at: float = inf  # in it, if not at its end [s]
     number: int = 0  # among all robots of the experiment
     count: int = 1  # of these
     legs: tuple[Leg, ...] = ()  # its plan

@@ -35,6 +35,7 @@ IDLE, READY, AIRBORNE, RUNNING, LANDING, DONE = (int(phase) for phase in Phase)
 AT_HEIGHT: Final = 0.05  # [m] below the hover height, and less: arrived,
 ABOVE_HEIGHT: Final = 0.1  # or above it: a Crazyflie overshoots, and takes 10 s to come back
 FINISHED: Final = "finished"  # reasons for a landing that is no fault; orders are others
+SCRIPTED: Final = "lands as its file says"
 TOLD_TO_END: Final = "asked to end"
 SETTLED: Final = 0.1  # [m/s] slower: climbing or rolling has ended
 
@@ -43,7 +44,7 @@ class Lifecycle:
     """Phases of one robot."""
 
     __slots__ = (
-        "_before", "_duration", "_flies", "_hover", "_waits", "climbing", "failing", "land_due",
+        "_before", "_ends_after", "_flies", "_hover", "_scripted", "_waits", "climbing", "failing", "land_due",
         "moved", "phase", "reason", "settled_until", "start_at", "stop_due", "takeoff_due",
     )  # fmt: skip
 
@@ -58,9 +59,10 @@ class Lifecycle:
     reason: str  # why it is not ready, or has landed
     failing: str  # check that fails on this tick, though the robot may be ready; empty: none
 
-    def __init__(self, kind: Kind, hover: float, duration: float) -> None:
-        """Of a robot that hovers at `hover` [m], in an experiment of `duration` [s]."""
-        self._flies, self._hover, self._duration = kind.flies, hover, duration
+    def __init__(self, kind: Kind, hover: float, duration: float, lands_at: float = inf) -> None:
+        """Of a robot that hovers at `hover` [m], in an experiment of `duration`, and lands at `lands_at` [s] in it."""
+        self._flies, self._hover = kind.flies, hover
+        self._ends_after, self._scripted = min(duration, lands_at), lands_at < duration
         self.phase = self._before = IDLE
         self.start_at, self.settled_until = inf, -inf
         self.climbing = self.moved = self.takeoff_due = self.land_due = self.stop_due = False
@@ -148,7 +150,7 @@ class Lifecycle:
         self.moved = self.phase != self._before  # orders between ticks count as well
         self._before = self.phase
         if self.phase == RUNNING:
-            self.settled_until = self.start_at + self._duration - 1e-6
+            self.settled_until = self.start_at + self._ends_after - 1e-6
 
     def _advance(self, t: float, position: Vector, velocity: Vector, flying: bool, ready: bool) -> None:
         if self.phase == IDLE and ready:
@@ -159,7 +161,7 @@ class Lifecycle:
             self.phase, self.climbing = AIRBORNE, False
         if self.phase == AIRBORNE and t >= self.start_at - 1e-6:
             self.phase = RUNNING
-        if self.phase == RUNNING and t - self.start_at >= self._duration - 1e-6:
-            self.land(FINISHED)
+        if self.phase == RUNNING and t - self.start_at >= self._ends_after - 1e-6:
+            self.land(SCRIPTED if self._scripted else FINISHED)
         if self.phase == LANDING and not self.land_due and self._is_down(velocity, flying):
             self.phase = DONE  # but not before the body has received the command

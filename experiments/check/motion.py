@@ -20,10 +20,13 @@ from experiments.check.ideal_run import approaches
 from experiments.check.realisation import OFF, mirrored_robots
 from experiments.check.theory import FAR_OFF, GAIN, strength
 from experiments.definition.links import gain_key
+from experiments.file.problems import Path
 from twins.arrays import Array, Mask, norm
 
 CLEARANCE: Final = 0.1  # [m] between one robot's top and another's bottom
 NEARLY: Final = 0.9  # of its speed: the rest is needed to catch up
+LATE: Final = 0.25  # share of a run, at its end, in which a formation is to have come to rest
+SWINGS: Final = 6.0  # ways of an error there, as multiples of its range, that make it an oscillation
 SETTLED: Final = 1e-3  # [m] slower than this per decision, robots have come to rest
 
 
@@ -93,6 +96,9 @@ def _formation(analysis: Analysis) -> Iterator[Finding]:
         or (_cut(analysis) and last.max() > experiment.tolerance)
     ):
         return
+    if (finding := _oscillation(analysis)) is not None:
+        yield finding
+        return
     end, worst = float(prediction.time[-1]), int(last.argmax())
     left = f"{analysis.link(worst)} is {1e3 * last[worst]:.0f} mm off after {end:g} s"
     allowed = f"(tolerance {1e3 * experiment.tolerance:g} mm)"
@@ -145,6 +151,29 @@ def _formation(analysis: Analysis) -> Iterator[Finding]:
         other = "start nearer to the shape" if formed is None else "change or lead more slowly"
         remedy = f"give a longer duration_s, {other}, or raise {strength(analysis)}"
         yield Finding("warning", "not-acquired", message, remedy, ("duration_s",))
+
+
+def _oscillation(analysis: Analysis) -> Finding | None:
+    """Finding that a link is longer and shorter in turn to the end, by more than the tolerance; leaders stand then."""
+    time, tolerance = analysis.prediction.time, analysis.plan.experiment.tolerance
+    begin = int(np.argmax(time >= (1.0 - LATE) * time[-1]))
+    late, led = analysis.error[begin:], analysis.prediction.position[begin:, analysis.without_neighbours]
+    if np.ptp(led, axis=0).max(initial=0.0) > SETTLED:
+        return None
+    ways, ranges = np.abs(np.diff(late, axis=0)).sum(axis=0), np.ptp(late, axis=0)
+    swinging = (ways > SWINGS * ranges) & (ranges > tolerance / 2) & (late.max(axis=0) > tolerance)
+    if not swinging.any():
+        return None
+    link = int(np.where(swinging, ranges, 0.0).argmax())
+    message = (
+        f"the formation oscillates to the end: from {time[begin]:.0f} to {time[-1]:.0f} s the error of "
+        f"{analysis.link(link)} swings between {1e3 * late[:, link].min():.0f} and {1e3 * late[:, link].max():.0f} mm "
+        f"(tolerance {1e3 * tolerance:g} mm)"
+    )
+    remedy = f"the loop, not the starts, is at fault: lower {strength(analysis)}, or let bodies and messages lag less"
+    name = gain_key(analysis.law, BY_DISTANCE if analysis.asked.wants is None else BY_RELATIVE)
+    path: Path = ("formation", name) if strength(analysis) in GAIN.values() else ("formation", "law")
+    return Finding("warning", "keeps-oscillating", message, remedy, path)
 
 
 def anchors(analysis: Analysis) -> Iterator[Finding]:

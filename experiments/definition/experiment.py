@@ -101,6 +101,12 @@ class Robot(Part, frozen=True):
     avoids: Annotated[
         bool, Meta(description="whether it keeps clear of others where the experiment has an avoidance")
     ] = True
+    lands_at_s: Annotated[
+        Positive | None,
+        Meta(
+            description="when it lands in mid-run, silent and lost to the others, as after a fault [s]; left out: never"
+        ),
+    ] = None
     standby: Annotated[
         bool, Meta(description="not started and not waited for until `./zenpark robot add` lets it join the run")
     ] = False

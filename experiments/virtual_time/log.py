@@ -14,7 +14,7 @@ from typing import Any, Final, TypeVar
 import numpy as np
 from msgspec.structs import replace
 
-from agents.decision.lifecycle import FINISHED, Phase
+from agents.decision.lifecycle import FINISHED, SCRIPTED, Phase
 from agents.decision.stepping import Words
 from agents.network import messages
 from agents.safety.hazards import Outcome
@@ -279,7 +279,9 @@ class Logbook:
         log = self._log
         sent = self._counts(self._log.sent.link, self._log.sent.stamp)
         received = self._counts(self._links.receiver[self._log.received.link], self._log.received.arrival)
-        unsafe = {row: each.text for row, each in log.incidents if each.outcome >= Outcome.LAND}
+        early = [each.lands_at_s or math.inf for each in self._experiment.robots.values()]
+        ends = {row: SCRIPTED for row, at in enumerate(early) if at < self._experiment.duration_s}
+        ends |= {row: each.text for row, each in log.incidents if each.outcome >= Outcome.LAND}
         for end, phase, done in ((self._experiment.duration_s, "landing", 0), (log.ended, "done", 1)):
             for row, name in enumerate(log.names):
                 mine = self._links.receiver == row
@@ -288,7 +290,7 @@ class Logbook:
                     robot=name,
                     stamp=EPOCH + end,
                     phase=phase,
-                    reason=unsafe.get(row, FINISHED),
+                    reason=ends.get(row, FINISHED),
                     body="",
                     battery=None,
                     sent=int(sent[done][row]),

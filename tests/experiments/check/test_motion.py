@@ -222,6 +222,13 @@ def test_variants_that_do_not_work_in_flight(name, change, expected, message, re
     assert_found(name, change, expected, message, remedy)
 
 
+def test_late_oscillation_blames_loop_not_starts():
+    found = bad(TRIANGLE, "formation.gain=10", "channel.delay_s=0.6")
+    assert "swings between" in found["keeps-oscillating"][1]
+    assert "lower the gain" in found["keeps-oscillating"][2]
+    assert not {"local-minimum", "not-acquired"} & found.keys()
+
+
 def test_paths_that_cross():
     ways = {"A": [0.6, 0.6], "B": [-0.6, 0.6]}  # from (0, 0) and (1, 0): they meet in the middle
     legs = [

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from agents.body.limits import Safety
-from agents.decision.lifecycle import DONE
+from agents.decision.lifecycle import DONE, LANDING, RUNNING
 from experiments.check.check import check
 from experiments.definition.experiment import Formation, Robot
 from experiments.definition.plan import Plan
 from experiments.file import document
+from experiments.metrics.measure import measure
 from experiments.recording import playback
 from experiments.virtual_time.log import Logbook
 from experiments.virtual_time.simulation import simulate
@@ -78,6 +79,28 @@ def test_drone_that_lands_is_lost_to_the_formation(architecture):
     lengths = {low: np.linalg.norm(end[1] - end[[0, 2]], axis=1) for low, end in ends.items()}
     for low, planar in ((0.1, np.sqrt(0.8**2 - 0.3**2)), (0.99, 0.89)):  # G stops on its way to a drone that is gone
         assert lengths[low] == pytest.approx([planar, 0.9], abs=0.02)
+
+
+@pytest.mark.parametrize("architecture", ["distributed", "centralised"])
+def test_scripted_landing_silences_and_loses_a_robot(architecture):
+    robots = {
+        "F": Robot(kind="crazyflie", start=[0.0, 0.0], hover=0.3, lands_at_s=4.0),
+        "G": Robot(kind="khepera4", start=[1.3, 0.1]),
+        "H": Robot(kind="khepera4", start=[0.0, 0.9]),
+    }
+    experiment = pair(
+        robots=robots, formation=Formation(links={"F > G": 0.8, "G - H": 0.9}), duration_s=12.0,
+        architecture=architecture,
+    )  # fmt: skip
+    log = simulate(Plan(experiment), 1)
+    assert log.time[np.argmax(log.phase[:, 0] == LANDING)] == pytest.approx(4.0, abs=0.03)
+    assert log.phase[np.searchsorted(log.time, 9.0)].tolist() == [DONE, RUNNING, RUNNING]
+    assert log.sent.stamp[log.sent.link == 0].max() < 4.03
+    if architecture == "distributed":
+        assert ("G", "warn: a neighbour is lost: F") in events(log, experiment)
+    reasons = [status.reason for status in Logbook(log, Plan(experiment), "case")._statuses()]
+    assert reasons[:3] == ["lands as its file says", "finished", "finished"]
+    assert not measure(Logbook(log, Plan(experiment), "case").trace()).failures
 
 
 FINDINGS = {
