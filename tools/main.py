@@ -37,8 +37,9 @@ app: Final = typer.Typer(
 for _module in (run, results, view, sweep, check, explain, author, processes, network, orders):
     app.add_typer(_module.app)
 app.add_typer(hosts.app, name="hosts")
-app.add_typer(lab.app, name="cert")
+app.add_typer(lab.app, name="lab")
 app.add_typer(orders.robot_app, name="robot")
+app.add_typer(hosts.turtlebot_app, name="turtlebot")
 app.add_typer(orders.world_app, name="world")
 
 # what `./zenpark` itself does, before Python's packages are there

@@ -26,7 +26,7 @@ PANELS: Final = {
     "Watch": "view replay top runs keys echo hz",
     "Act": "robot world estop",
     "By hand": "router agent centre twin bridge",
-    "Lab": "preflight hosts cert",
+    "Lab": "preflight hosts lab turtlebot",
     "Set-up": "install hardware docs test",
 }
 
@@ -116,7 +116,7 @@ Connect = Annotated[
         help="A router; may be repeated. @FILE: those of a running run. [tcp/127.0.0.1:7447]",
     ),
 ]
-Lab = Annotated[str | None, typer.Option(metavar="FOLDER", help="Certificates of a lab (`./zenpark cert init`).")]
+Lab = Annotated[str | None, typer.Option(metavar="FOLDER", help="Certificates of a lab (`./zenpark lab init`).")]
 As = Annotated[str, typer.Option("--as", metavar="NAME", help="Whose certificate, in a lab.")]
 Settings = Annotated[
     list[str] | None,

@@ -72,12 +72,12 @@ def register(folder: Path) -> Register:
         return msgspec.json.decode(file.read_bytes(), type=Register)
     except FileNotFoundError:
         raise LabError(
-            f"{folder} is no lab, {REGISTER} is missing: `./zenpark cert init {folder} FILE` makes one"
+            f"{folder} is no lab, {REGISTER} is missing: `./zenpark lab init {folder} FILE` makes one"
         ) from None
     except OSError as error:
         raise LabError(f"{file}: cannot be read: {error.strerror}") from None
     except msgspec.MsgspecError as error:
-        raise LabError(f"{file}: {error}; put it back as `./zenpark cert` wrote it") from None
+        raise LabError(f"{file}: {error}; put it back as `./zenpark lab` wrote it") from None
 
 
 def files(folder: Path, name: str) -> Files:
@@ -91,8 +91,8 @@ def files(folder: Path, name: str) -> Files:
         except FileNotFoundError:
             raise LabError(
                 f"{file} is missing: copy it from the lab's own folder, or make it there with "
-                f"`./zenpark cert issue {folder} {name}`, if it had one before with "
-                f"`./zenpark cert renew {folder} {name}`"
+                f"`./zenpark lab issue {folder} {name}`, if it had one before with "
+                f"`./zenpark lab renew {folder} {name}`"
             ) from None
         except OSError as error:
             raise LabError(f"{file}: cannot be read: {error.strerror}") from None
@@ -105,7 +105,7 @@ def require(folder: Path, names: Sequence[str]) -> None:
     """Checks identities before anything is started; raises LabError for the first wrong one, or all missing ones."""
     missing = [name for name in names if not (folder / f"{name}.pem").exists()]
     if len(missing) > 1:
-        remedy = f"`./zenpark cert issue {folder} {' '.join(missing)}`"
+        remedy = f"`./zenpark lab issue {folder} {' '.join(missing)}`"
         raise LabError(f"{folder} has no certificates of {', '.join(missing)}: {remedy}")
     for name in names:
         files(folder, name)

@@ -232,7 +232,7 @@ def _silence(endpoints: Sequence[str], identity: str) -> str:
     refused = (
         ""
         if folder is None
-        else f", or it refuses the certificate of {identity} (`./zenpark cert show {folder}` says how long it is valid)"
+        else f", or it refuses the certificate of {identity} (`./zenpark lab show {folder}` says how long it is valid)"
     )
     remedy = "`./zenpark router` starts one, --connect names another"
     if topology.is_mesh(endpoints):

@@ -107,8 +107,8 @@ def _of_lab(
         known = lab.register(folder)
         if identity in known.identities and not known.identities[identity].hosts:
             raise lab.LabError(
-                f"{identity} has a certificate for clients only, but in a mesh all listen: `./zenpark cert init` "
-                f"with the file of the mesh makes such, or `./zenpark cert issue {folder} NAME --host ADDRESS`"
+                f"{identity} has a certificate for clients only, but in a mesh all listen: `./zenpark lab init` "
+                f"with the file of the mesh makes such, or `./zenpark lab issue {folder} NAME --host ADDRESS`"
             )
         settings["access_control"] = access_control.rules(rights, known)
         settings["low_pass_filter"] = access_control.sizes(rights)
@@ -129,7 +129,7 @@ def check_loopback(endpoint: str) -> None:
     if not loopback:
         raise EndpointError(
             f"will not listen on {endpoint}: any program there could command the robots. Make certificates with "
-            "`./zenpark cert init LAB FILE`, then listen on tls/... with --lab LAB; or listen on "
+            "`./zenpark lab init LAB FILE`, then listen on tls/... with --lab LAB; or listen on "
             f"{DEFAULT_ENDPOINT} and let other machines in through an SSH tunnel (ssh -R 7447:127.0.0.1:7447 HOST)"
         )
 

@@ -40,7 +40,7 @@ class NetworkLaunch(msgspec.Struct, frozen=True, kw_only=True, rename="kebab"):
     """Options of a process that joins a network without an experiment."""
 
     connect: Annotated[list[str], Meta(title="ENDPOINT", description=f"default: {DEFAULT_ENDPOINT}")] = []
-    lab: Annotated[str | None, Meta(title="FOLDER", description="certificates of a lab (`./zenpark cert init`)")] = None
+    lab: Annotated[str | None, Meta(title="FOLDER", description="certificates of a lab (`./zenpark lab init`)")] = None
     identity: Annotated[str, Meta(title="NAME", description="name of the certificate, in a lab")] = msgspec.field(
         default="", name="as"
     )

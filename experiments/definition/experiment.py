@@ -336,7 +336,7 @@ class Network(Part, frozen=True):
     encoding: Annotated[Literal["json", "msgpack"], Meta(description="of the payloads")] = "json"
     lab: Annotated[
         str | None,
-        Meta(description="folder of certificates (`./zenpark cert init`), beside this file; left out: loopback only"),
+        Meta(description="folder of certificates (`./zenpark lab init`), beside this file; left out: loopback only"),
     ] = None
 
 

@@ -114,11 +114,11 @@ def wish_of(text: str) -> Wish:
 
     Raises DocumentError if it cannot be understood.
     """
-    place = f'--optimize "{text}"'
+    place = f'--optimise "{text}"'
     first, *rest = (part.strip() for part in text.split(","))
     if not first or _LIMIT.fullmatch(first):
         raise refusal(
-            place, "it does not say what is to be least", 'write, for example, --optimize "messages, iae<=1.01"'
+            place, "it does not say what is to be least", 'write, for example, --optimise "messages, iae<=1.01"'
         )
     limits = []
     for part in rest:
@@ -183,7 +183,7 @@ def tune(
             raise refusal(axis.argument, "the search needs a range", f"write {axis.path}=LOW:HIGH:log (or lin)")
     spans = [axis for axis in axes if axis.span is not None]
     if not spans:
-        raise refusal("--optimize", "there is nothing to change", "add a range: trigger.threshold=0.002:0.05:log")
+        raise refusal("--optimise", "there is nothing to change", "add a range: trigger.threshold=0.002:0.05:log")
     fixed = [f"{axis.path}={axis.values[0]}" for axis in axes if axis.span is None]
     read = load(file, *settings, *fixed)
     reference = compared(read)
@@ -195,7 +195,7 @@ def tune(
         hint = "choose a case that has it"
         raise refusal(spans[0].argument, f"no case that is looked at has it; the reference '{reference}' is not", hint)
     cma = _library()
-    folder = Path(out) if out is not None else folder_of(read, spans, "optimize")
+    folder = Path(out) if out is not None else folder_of(read, spans, "optimise")
     tried: list[CellRow] = []
     selected: list[CellRow] = []
     plan: dict[tuple[str, str], Cell] = {}
@@ -281,7 +281,7 @@ def _library() -> Any:  # noqa: ANN401 - it has no types
         return import_module("cma")
     except ImportError:
         raise ExplainedError(
-            "--optimize needs a library that is an extra: ./zenpark install cma, or pip install -e '.[optimize]'"
+            "--optimise needs a library that is an extra: ./zenpark install cma, or pip install -e '.[optimize]'"
         ) from None
 
 

@@ -103,10 +103,10 @@ def sweep(
     read = load(file, *settings)
     axes, words = arguments(given)
     if "tuning" in words:
-        raise refusal(words["tuning"], "there is nothing to tune", 'add --optimize "messages, iae<=1.01"')
+        raise refusal(words["tuning"], "there is nothing to tune", 'add --optimise "messages, iae<=1.01"')
     for axis in axes:
         if not axis.values:
-            raise refusal(axis.argument, "how many values?", f"write {axis.argument}12; --optimize needs no number")
+            raise refusal(axis.argument, "how many values?", f"write {axis.argument}12; --optimise needs no number")
     seeds = seeds_of(words.get("seeds"), read.experiment.seed)
     plan = cells(read, str(file), settings, axes, cases)
     folder = Path(out) if out is not None else folder_of(read, axes, "sweep")

@@ -24,7 +24,7 @@ STEP = re.compile(
     r"^```(?P<language>toml|python)\n(?P<block>(?s:.*?))^```|^ {4,}\./zenpark (?P<command>[^#\n]*)(?P<said>.*)",
     re.MULTILINE,
 )
-COMPUTING = {"cert", "check", "clean", "explain", "export", "import", "new", "report", "sweep"}
+COMPUTING = {"lab", "check", "clean", "explain", "export", "import", "new", "report", "sweep"}
 REAL = (
     "run way.toml",
     "run shadow.toml --out runs/shadow --open",
@@ -119,7 +119,7 @@ def test_a_guide_flies_in_real_time(command: str, tmp_path: Path, monkeypatch: p
 @pytest.mark.timeout(150)
 def test_the_lab_of_the_guide_flies(tmp_path: Path) -> None:
     lab = tmp_path / "lab"
-    assert zenpark("cert", "init", lab, "triangle").returncode == 0
+    assert zenpark("lab", "init", lab, "triangle").returncode == 0
     short = ("--set", "duration_s=2", "--no-report", "--out", tmp_path / "run")
     ended = zenpark("run", "triangle", "--lab", lab, *short, timeout_s=120.0)
     assert ended.returncode == 0, (ended.stdout, ended.stderr)

@@ -27,7 +27,7 @@ def test_one_command_runs_while_others_watch_and_stop(tmp_path: Path) -> None:
     file = tmp_path / "triangle.toml"
     text = (ROOT / "experiments" / "catalogue" / "triangle.toml").read_text("utf-8")
     file.write_text(text + '\n[network]\nlab = "lab"\n', "utf-8")
-    assert zenpark("cert", "init", tmp_path / "lab", file).returncode == 0
+    assert zenpark("lab", "init", tmp_path / "lab", file).returncode == 0
     flight = Flight(tmp_path / "run", str(file), "--case", "event", "--no-report", "--set", "duration_s=90")
     flight.until_said("phase conductor: formation")
     endpoint, _, lab = flight.endpoint().partition("#lab=")
@@ -56,15 +56,15 @@ def test_what_is_missing_is_said_before_anything_starts(tmp_path: Path) -> None:
     lab = tmp_path / "lab"
     authority.create(lab, {"router": "router", "operator": "operator", "recorder": "recorder", "KH01": "robot"})
     for arguments, said in (
-        (("run", "triangle", "--lab", lab, "--out", tmp_path / "a"), f"`./zenpark cert issue {lab} KH02 CF01`"),
-        (("run", "triangle", "--lab", tmp_path / "no", "--out", tmp_path / "b"), "zenpark cert init"),
-        (("router", "--listen", "tls/0.0.0.0:0"), "zenpark cert init LAB FILE"),
-        (("router", "--listen", "tcp/0.0.0.0:0"), "zenpark cert init LAB FILE"),
+        (("run", "triangle", "--lab", lab, "--out", tmp_path / "a"), f"`./zenpark lab issue {lab} KH02 CF01`"),
+        (("run", "triangle", "--lab", tmp_path / "no", "--out", tmp_path / "b"), "zenpark lab init"),
+        (("router", "--listen", "tls/0.0.0.0:0"), "zenpark lab init LAB FILE"),
+        (("router", "--listen", "tcp/0.0.0.0:0"), "zenpark lab init LAB FILE"),
         (("router", "--lab", lab), "name the experiment too"),
         (("router", "triangle", "--lab", lab, "--listen", "tcp/127.0.0.1:0"), "write tls/127.0.0.1:0"),
         (("agent", "triangle", "CF01", "--lab", lab), "CF01.pem is missing"),
         (("echo", "park/**", "--lab", lab), "observer.pem is missing"),
-        (("cert", "init", lab, "triangle"), "is a lab already"),
+        (("lab", "init", lab, "triangle"), "is a lab already"),
     ):
         done = zenpark(*arguments)
         assert done.returncode == 2, (arguments, done.stderr)

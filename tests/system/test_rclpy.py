@@ -80,7 +80,7 @@ def test_types_and_cdr_are_those_of_rclpy(tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", [ros2.TWIST, ros2.TWIST_STAMPED])
 def test_watchdog_stops_robot_of_killed_commander(tmp_path: Path, kind: str) -> None:
     printed = subprocess.run(
-        [sys.executable, "-m", "tools.guard", "hosts", "watchdog"], capture_output=True, check=True
+        [sys.executable, "-m", "tools.guard", "turtlebot", "watchdog"], capture_output=True, check=True
     )
     watchdog = tmp_path / "watchdog.py"
     watchdog.write_bytes(printed.stdout)

@@ -187,7 +187,7 @@ def test_lab_observer_watches_and_shift_s_stops_run(tmp_path: Path) -> None:
     file = tmp_path / "triangle.toml"
     text = (ROOT / "experiments" / "catalogue" / "triangle.toml").read_text("utf-8")
     file.write_text(text + '\n[network]\nlab = "lab"\n', "utf-8")
-    assert zenpark("cert", "init", tmp_path / "lab", file).returncode == 0
+    assert zenpark("lab", "init", tmp_path / "lab", file).returncode == 0
     flight = Flight(tmp_path / "run", str(file), "--case", "event", "--no-report", "--set", "duration_s=90")
     flight.until_said("phase conductor: formation")
     endpoint, _, lab = flight.endpoint().partition("#lab=")

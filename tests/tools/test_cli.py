@@ -65,7 +65,8 @@ def test_commands():
                 "explain",
                 "hosts",
                 "station",
-                "cert",
+                "lab",
+                "turtlebot",
                 "install",
                 "hardware",
                 "docs",
@@ -155,7 +156,7 @@ def with_parameters(built, above=()):
 
 def test_call_builds_only_its_own_commands_parameters():
     whole = typer.main.get_command(app)
-    assert {"run", "robot stop", "cert init"} < set(with_parameters(whole))
+    assert {"run", "robot stop", "lab init"} < set(with_parameters(whole))
     for words in (*([name] for name in COMMANDS), ["robot", "stop", "KH01"], [], ["--help"], ["rnu"], ["robot", "run"]):
         built = typer.main.get_command(part_for(words))
         assert set(with_parameters(built)) == {" ".join(words[:2]), *words[:1]} & set(with_parameters(whole))
@@ -218,9 +219,9 @@ def test_results_of_actions_are_json_on_request(tmp_path, monkeypatch):
     invoke = CliRunner().invoke
     said = json.loads(invoke(app, ["clean", "--older", "0", "--recordings", "--json"]).stdout)
     assert said == [{"folder": "runs/past", "parts": ["runs/past/default.mcap"], "removed": False}]
-    made = json.loads(invoke(app, ["cert", "init", "lab", "KH01", "--json"]).stdout)
+    made = json.loads(invoke(app, ["lab", "init", "lab", "KH01", "--json"]).stdout)
     assert made["identities"]["KH01"]["role"] == "robot"
-    assert list(json.loads(invoke(app, ["cert", "issue", "lab", "ana", "--json"]).stdout)["identities"]) == ["ana"]
+    assert list(json.loads(invoke(app, ["lab", "issue", "lab", "ana", "--json"]).stdout)["identities"]) == ["ana"]
 
 
 def test_routers_come_from_the_environment(monkeypatch):

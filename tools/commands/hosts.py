@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from experiments.real_time.hosts.station import Found
 
 app: Final = group("Check the other machines of an experiment, and put zenpark there.")
+turtlebot_app: Final = group("Prepare a TurtleBot3 for experiments.")
 On = Annotated[
     list[str] | None, typer.Option(metavar="HOST|TAG", help="Only this host, or those with this tag; may be repeated.")
 ]
@@ -47,7 +48,7 @@ class Row:
         return not any(cell.startswith(NO) for cell in self.cells)
 
 
-@app.command(epilog=example("hosts watchdog ubuntu@192.168.0.31 --namespace tb3_0"))
+@turtlebot_app.command(epilog=example("turtlebot watchdog ubuntu@192.168.0.31 --namespace tb3_0"))
 def watchdog(
     robot: Annotated[
         str | None, typer.Argument(metavar="[USER@ROBOT]", help="TurtleBot3 that ssh reaches; none: print the file.")
@@ -280,7 +281,7 @@ def _router_remedy(there: Station, router: Found, plan: Plan) -> str:
     from agents.network.endpoints import Endpoint
 
     if "refuses the certificate" in router.text and Endpoint.parse(router.what).is_loopback:
-        return f"ssh carries it, so look at the certificates: `./zenpark cert show {there.lab}`"
+        return f"ssh carries it, so look at the certificates: `./zenpark lab show {there.lab}`"
     if plan.experiment.network.connect is not None:
         return "is it on (`./zenpark router` starts one)? Else mend connect in [network]"
     if plan.experiment.network.listen is not None:
@@ -301,6 +302,6 @@ def _recognised(row: Row, there: Station, folder: Path, robots: Sequence[str]) -
     row.cells.append(f"{mark} {len(holds.held)}, {left:.0f} days left" if not wrong else mark)
     row.trouble += [*wrong, *strays]
     if soon:
-        remedy = f"`./zenpark cert renew {folder} {' '.join(there.host.robots)}`, then `./zenpark hosts install FILE`"
+        remedy = f"`./zenpark lab renew {folder} {' '.join(there.host.robots)}`, then `./zenpark hosts install FILE`"
         row.trouble.append(f"{there.name}: its certificates end in {left:.0f} days; {remedy}")
     return not wrong

@@ -1,4 +1,4 @@
-"""`./zenpark cert`: the certificates of a lab."""
+"""`./zenpark lab`: the certificates of a lab."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Hosts = Annotated[
 SOON_DAYS: Final = 14.0
 
 
-@app.command(epilog=example("cert init lab robotic-park --host 192.168.0.10"))
+@app.command(epilog=example("lab init lab robotic-park --host 192.168.0.10"))
 def init(
     folder: Folder,
     given: Annotated[
@@ -55,7 +55,7 @@ def init(
     )
 
 
-@app.command(epilog=example("cert issue lab ana --role operator"))
+@app.command(epilog=example("lab issue lab ana --role operator"))
 def issue(
     folder: Folder,
     names: Names,
@@ -77,7 +77,7 @@ def issue(
     _print(Path(folder), made(Path(folder), identities, hosts=host or [], days=days), names, as_json=as_json)
 
 
-@app.command(epilog=example("cert renew lab", "cert renew lab router --host 192.168.0.10"))
+@app.command(epilog=example("lab renew lab", "lab renew lab router --host 192.168.0.10"))
 def renew(
     folder: Folder,
     names: Annotated[list[str] | None, typer.Argument(metavar="[NAME...]", help="All, if none is named.")] = None,
@@ -96,7 +96,7 @@ def renew(
     _print(Path(folder), known, names or list(known.identities), as_json=as_json)
 
 
-@app.command(epilog=example("cert revoke lab KH01"))
+@app.command(epilog=example("lab revoke lab KH01"))
 def revoke(folder: Folder, names: Names, days: Days = 90.0, as_json: AsJson = False) -> None:
     """Take all rights from certificates that are lost or stolen, and make new ones."""
     from experiments.real_time.hosts.authority import revoke as made
@@ -111,7 +111,7 @@ def revoke(folder: Folder, names: Names, days: Days = 90.0, as_json: AsJson = Fa
     )
 
 
-@app.command(epilog=example("cert show lab"))
+@app.command(epilog=example("lab show lab"))
 def show(folder: Folder, as_json: AsJson = False) -> int:
     """Show the members of a lab and the ends of their certificates; exit code 1 if a certificate has ended."""
     from agents.network.lab import register

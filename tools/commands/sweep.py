@@ -37,7 +37,7 @@ INTERRUPTED: Final = 130  # exit code
 @app.command(
     epilog=example(
         "sweep robotic-park trigger.threshold=0.002:0.05:log12 seeds=50",
-        "sweep triangle trigger.threshold=0.002:0.05 --optimize 'messages, iae<=1.01'",
+        "sweep triangle trigger.threshold=0.002:0.05 --optimise 'messages, iae<=1.01'",
     )
 )
 def sweep(
@@ -47,15 +47,17 @@ def sweep(
         typer.Argument(
             metavar="[PATH=VALUES...]",
             help="Axes: trigger.threshold=0.002:0.05:log12, or lin12, or a list 1,2,3; several make a grid. "
-            "seeds=50 or seeds=101:150 [20 from the file's on]; tuning=1001:1060 for --optimize.",
+            "seeds=50 or seeds=101:150 [20 from the file's on]; tuning=1001:1060 for --optimise.",
         ),
     ] = None,
     *,
     case: Cases = None,
     settings: Settings = None,
-    optimize: Annotated[
+    optimise: Annotated[
         str | None,
         typer.Option(
+            "--optimise",
+            "--optimise",
             metavar="WISH",
             help="Seek values in the ranges instead: 'messages, iae<=1.01' (relative to the first case).",
         ),
@@ -81,11 +83,11 @@ def sweep(
     if not sound(load(file, *changes), kept, seeds=2, as_json=as_json, anyway=anyway):
         return 2
     options = {"settings": changes, "cases": case or [], "out": out, "scheduler": scheduler, "processes": processes}
-    if optimize is None:
+    if optimise is None:
         found, more, lines, code = _sweep(file, given or [], options)
     else:
         try:
-            found, more, lines, code = _optimise(file, given or [], optimize, options)
+            found, more, lines, code = _optimise(file, given or [], optimise, options)
         except KeyboardInterrupt:
             print("interrupted: all that was tried is kept; the same command goes on from there", file=sys.stderr)
             return 130
@@ -101,7 +103,7 @@ def sweep(
         words = ["./zenpark", "sweep", file, *(given or [])]
         words += [part for name in case or [] for part in ("--case", name)]
         words += [part for setting in changes for part in ("--set", setting)]
-        page = pages.write(found, shlex.join([*words, *(["--optimize", optimize] if optimize else [])]))
+        page = pages.write(found, shlex.join([*words, *(["--optimise", optimise] if optimise else [])]))
         lines += [f"figures: {found.folder / 'figures'}", f"page: {page}"]
     print_result(table, *lines, as_json=as_json)
     if open_report and page is not None and code != INTERRUPTED:

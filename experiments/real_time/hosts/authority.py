@@ -65,7 +65,7 @@ def create(
     check_path(folder)
     if (folder / REGISTER).exists() or (folder / f"{AUTHORITY}.key").exists():
         raise LabError(
-            f"{folder} is a lab already: `./zenpark cert issue {folder} NAME...` adds identities, "
+            f"{folder} is a lab already: `./zenpark lab issue {folder} NAME...` adds identities, "
             "renew and revoke change them"
         )
     try:
@@ -91,7 +91,7 @@ def issue(folder: Path, identities: Mapping[str, Role], *, hosts: Sequence[str] 
     """
     known = register(folder)
     if there := [name for name in identities if name in known.identities]:
-        raise LabError(f"{', '.join(there)}: in the lab already; `./zenpark cert renew` or `revoke` makes new files")
+        raise LabError(f"{', '.join(there)}: in the lab already; `./zenpark lab renew` or `revoke` makes new files")
     return _issued(_opened(folder), known, {name: Identity(role, name, "", "") for name, role in identities.items()},
                    hosts=hosts, days=days)  # fmt: skip
 
@@ -118,7 +118,7 @@ def renew(
     if authority and names:
         raise LabError("a new authority signs all certificates anew: give no name with --authority")
     if hosts and not names:
-        raise LabError("only routers need --host: name them, as in `./zenpark cert renew LAB router --host ADDRESS`")
+        raise LabError("only routers need --host: name them, as in `./zenpark lab renew LAB router --host ADDRESS`")
     signing = _found(folder) if authority else _opened(folder)
     return _issued(signing, known, _named(known, names or list(known.identities)), hosts=hosts, days=days)
 

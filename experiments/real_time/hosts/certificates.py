@@ -93,9 +93,9 @@ def ended(folder: Path, names: Sequence[str]) -> Iterator[str]:
     known = register(folder).identities
     for name in names:
         if name not in known:
-            yield f"{name} is not in the lab {folder}; `./zenpark cert issue {folder} {name}` adds it"
+            yield f"{name} is not in the lab {folder}; `./zenpark lab issue {folder} {name}` adds it"
         elif (until := datetime.fromisoformat(known[name].until)) < datetime.now(UTC):
-            yield f"the certificate of {name} ended at {until:%Y-%m-%d %H:%M}; `./zenpark cert renew {folder} {name}`"
+            yield f"the certificate of {name} ended at {until:%Y-%m-%d %H:%M}; `./zenpark lab renew {folder} {name}`"
         else:
             try:
                 files(folder, name)
@@ -133,7 +133,7 @@ def faults(found: Holding, folder: Path, there: float) -> Iterator[str]:
     known = register(folder).identities
     for each in found.held:
         if each.name not in known:
-            yield f"{each.name} is not in the lab {folder}; `./zenpark cert issue {folder} {each.name}`, then {INSTALL}"
+            yield f"{each.name} is not in the lab {folder}; `./zenpark lab issue {folder} {each.name}`, then {INSTALL}"
             continue
         if each.wrong:
             yield f"{each.wrong}; {INSTALL}"
@@ -150,7 +150,7 @@ def faults(found: Holding, folder: Path, there: float) -> Iterator[str]:
         elif certificate.not_valid_after_utc < datetime.now(UTC):
             yield (
                 f"the certificate of {each.name} ended at {certificate.not_valid_after_utc:%Y-%m-%d %H:%M}; "
-                f"`./zenpark cert renew {folder} {each.name}`, then {INSTALL}"
+                f"`./zenpark lab renew {folder} {each.name}`, then {INSTALL}"
             )
         elif not certificate.not_valid_before_utc.timestamp() < there < certificate.not_valid_after_utc.timestamp():
             now = datetime.fromtimestamp(there, UTC)
@@ -165,7 +165,7 @@ def unnamed(endpoints: Sequence[str], folder: Path) -> Iterator[str]:
         if reached not in named:
             yield (
                 f"reaches the router at {reached}, which stands in no router's certificate; "
-                f"`./zenpark cert renew {folder} router --host {reached}` adds it"
+                f"`./zenpark lab renew {folder} router --host {reached}` adds it"
             )
 
 

@@ -87,7 +87,7 @@ def test_router_listens_anywhere_only_with_a_lab(folder, endpoint):
     made = config(settings("router", listen=[f"{endpoint}#lab={folder}"], name="router", rights=RIGHTS))
     assert made.get_json("listen/endpoints") == f'["{endpoint}"]'
     assert '"default_permission":"deny"' in made.get_json("access_control")
-    with pytest.raises(EndpointError, match=r"zenpark cert init LAB FILE.*--lab LAB"):
+    with pytest.raises(EndpointError, match=r"zenpark lab init LAB FILE.*--lab LAB"):
         config(settings("router", listen=[endpoint], name="router"))
 
 
@@ -97,13 +97,13 @@ def test_lab_router_must_know_the_rights(folder):
 
 
 def test_what_is_missing_is_named_with_its_remedy(folder, tmp_path):
-    with pytest.raises(LabError, match=r"CF09\.pem is missing: .*`./zenpark cert issue .* CF09`"):
+    with pytest.raises(LabError, match=r"CF09\.pem is missing: .*`./zenpark lab issue .* CF09`"):
         files(folder, "CF09")
-    with pytest.raises(LabError, match=r"no certificates of CF08, CF09: `./zenpark cert issue .* CF08 CF09`"):
+    with pytest.raises(LabError, match=r"no certificates of CF08, CF09: `./zenpark lab issue .* CF08 CF09`"):
         require(folder, ["CF01", "CF08", "CF09"])
     with pytest.raises(LabError, match=r"CF09\.pem is missing"):
         config(settings("client", connect=[f"tls/127.0.0.1:7447#lab={folder}"], name="CF09"))
-    with pytest.raises(LabError, match=r"is no lab, lab\.json is missing: `./zenpark cert init"):
+    with pytest.raises(LabError, match=r"is no lab, lab\.json is missing: `./zenpark lab init"):
         register(tmp_path)
     (tmp_path / lab.REGISTER).write_text("{")
     with pytest.raises(LabError, match="put it back"):

@@ -41,7 +41,7 @@ def test_what_is_wrong_with_a_wish(text, message, hint):
     with pytest.raises(DocumentError) as caught:
         wish_of(text)
     (problem,) = caught.value.problems
-    assert problem.file == f'--optimize "{text}"'
+    assert problem.file == f'--optimise "{text}"'
     assert message in problem.message
     assert hint in problem.hint
 
@@ -88,7 +88,7 @@ def test_search_finds_fewest_messages_within_the_limit(tuned):
 def test_the_command_tells_on_which_seeds(tuned, capsys):
     found, given, options = tuned
     wish, folder = "messages, iae<=1.02", str(options["out"])
-    assert commands.sweep("triangle", given, settings=SHORT, out=folder, processes=1, optimize=wish) == 0
+    assert commands.sweep("triangle", given, settings=SHORT, out=folder, processes=1, optimise=wish) == 0
     said = capsys.readouterr().out
     assert said.startswith("tuned on seeds 101 to 118, reported on seeds 1 to 6\n")
     assert f"{found.rows[1].label}: keeps IAE ratio <= 1.02" in said

@@ -150,25 +150,25 @@ def said(*arguments):
 @pytest.mark.slow
 def test_the_commands(tmp_path):
     folder = tmp_path / "lab"
-    first = said("cert", "init", folder, "robotic-park", "KH09", "--host", "192.0.2.7", "--days", "10")
+    first = said("lab", "init", folder, "robotic-park", "KH09", "--host", "192.0.2.7", "--days", "10")
     assert first.exit_code == 0
     assert {"TB01", "KH03", "CF02", "KH09", "observer", "operator"} < register(folder).identities.keys()
     assert "10 days left  renew it  listens at localhost, 127.0.0.1, ::1, 192.0.2.7" in first.stdout
     assert "zenpark run FILE --lab" in first.stdout
-    assert said("cert", "issue", folder, "ana", "--role", "operator").exit_code == 0
+    assert said("lab", "issue", folder, "ana", "--role", "operator").exit_code == 0
     assert register(folder).identities["ana"].role == "operator"
-    revoked = said("cert", "revoke", folder, "ana").stdout
+    revoked = said("lab", "revoke", folder, "ana").stdout
     assert revoked.count("as ana.2") == 1
     assert "A zenohd notices nothing" in revoked
-    assert said("cert", "renew", folder, "--authority").exit_code == 0
-    assert said("cert", "show", folder).exit_code == 0
-    assert '"ana.2"' in said("cert", "show", folder, "--json").stdout
-    assert isinstance(said("cert", "init", tmp_path / "b", "router").exception, LabError)
-    assert isinstance(said("cert", "issue", folder, "bob", "--role", "operater").exception, LabError)
+    assert said("lab", "renew", folder, "--authority").exit_code == 0
+    assert said("lab", "show", folder).exit_code == 0
+    assert '"ana.2"' in said("lab", "show", folder, "--json").stdout
+    assert isinstance(said("lab", "init", tmp_path / "b", "router").exception, LabError)
+    assert isinstance(said("lab", "issue", folder, "bob", "--role", "operater").exception, LabError)
 
 
 def test_an_ended_certificate_is_shown(tmp_path):
     authority.create(tmp_path / "lab", {"CF01": "robot"}, days=-0.01)
-    shown = said("cert", "show", tmp_path / "lab")
+    shown = said("lab", "show", tmp_path / "lab")
     assert shown.exit_code == 1
     assert "ENDED" in shown.stdout

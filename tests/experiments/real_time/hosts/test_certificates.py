@@ -92,8 +92,8 @@ def test_expired_certificates_and_clocks_outside_validity_are_reported(lab, ther
         shutil.copy(lab / f"KH01.{end}", there)
     (only,) = said(there, lab)
     assert only.startswith("the certificate of KH01 ended at ")
-    assert f"`./zenpark cert renew {lab} KH01`, then `./zenpark hosts install FILE`" in only
-    assert f"`./zenpark cert renew {lab} KH01`" in next(ended(lab, ROBOTS))
+    assert f"`./zenpark lab renew {lab} KH01`, then `./zenpark hosts install FILE`" in only
+    assert f"`./zenpark lab renew {lab} KH01`" in next(ended(lab, ROBOTS))
     authority.renew(lab, ["KH01"])
     for end in ("pem", "key"):
         shutil.copy(lab / f"KH01.{end}", there)
@@ -104,7 +104,7 @@ def test_expired_certificates_and_clocks_outside_validity_are_reported(lab, ther
 
 def test_robot_outside_the_lab_cannot_be_sent(lab, there):
     found = Holding(held(there, ROBOTS).authority, held(there, ["TB01"]).held)
-    assert next(faults(found, lab, time.time())).startswith(f"TB01 is not in the lab {lab}; `./zenpark cert issue")
+    assert next(faults(found, lab, time.time())).startswith(f"TB01 is not in the lab {lab}; `./zenpark lab issue")
     assert next(ended(lab, ["TB01"])).startswith("TB01 is not in the lab")
     (lab / "CF01.key").unlink()
     assert "CF01.key is missing" in next(ended(lab, ["CF01"]))
@@ -123,7 +123,7 @@ def test_keys_of_others_do_not_belong_there(lab, there):
 def test_router_is_trusted_under_its_certificates_names(lab):
     assert list(unnamed(["tls/127.0.0.1:7447", "quic/localhost:1"], lab)) == []
     (only,) = unnamed(["tls/192.0.2.7:7447", "quic/192.0.2.7:7448"], lab)
-    assert f"`./zenpark cert renew {lab} router --host 192.0.2.7`" in only
+    assert f"`./zenpark lab renew {lab} router --host 192.0.2.7`" in only
     authority.renew(lab, ["router"], hosts=["192.0.2.7"])
     assert list(unnamed(["tls/192.0.2.7:7447"], lab)) == []
 
