@@ -63,7 +63,7 @@ class CrazyflieBody(Body):
         self._telemetry = [Telemetry(lighthouse=isinstance(each.positioning, Lighthouse)) for each in settings]
         in_turn = max((len(on_it) for on_it in self._radios.values()), default=1)
         self._open_timeout = max(each.connect_s + each.converge_s for each in settings) + 5.0 * in_turn
-        self._pilots = [
+        self.pilots = [
             CrazyfliePilot(
                 name,
                 where,
@@ -86,16 +86,16 @@ class CrazyflieBody(Body):
         """
         prepare(self._addresses)
         self._claims.take()
-        for pilot in self._pilots:
+        for pilot in self.pilots:
             pilot.start()
         deadline = time.monotonic() + self._open_timeout
-        waiting = list(self._pilots)
+        waiting = list(self.pilots)
         while waiting and time.monotonic() < deadline:
             time.sleep(POLL_S)
             waiting = [pilot for pilot in waiting if not pilot.opened.is_set() and pilot.failure is None]
-        if not any(pilot.opened.is_set() for pilot in self._pilots):
+        if not any(pilot.opened.is_set() for pilot in self.pilots):
             self.close()
-            failures = [pilot.failure for pilot in self._pilots if pilot.failure is not None]
+            failures = [pilot.failure for pilot in self.pilots if pilot.failure is not None]
             raise failures[0] if failures else BodyError(f"{', '.join(self._names)}: not ready in time")
         refusals = [self._measure_radio(radio, rows) for radio, rows in self._radios.items()]
         if any(refusals):
@@ -108,26 +108,26 @@ class CrazyflieBody(Body):
         refusal, best = "", 0.0
         end = time.monotonic() + MEASURING_S
         while time.monotonic() < end:
-            before, begin = self._exchanges(rows), time.monotonic()
+            before, begin = self.exchanges(rows), time.monotonic()
             time.sleep(WINDOW_S)
-            best = max(best, (self._exchanges(rows) - before) / (time.monotonic() - begin))
+            best = max(best, (self.exchanges(rows) - before) / (time.monotonic() - begin))
             self._capacity[radio] = capacity(settings, best)
             refusal = overload(radio, settings, best)
             if not refusal:
                 break
         return refusal
 
-    def _exchanges(self, rows: list[int]) -> int:
-        return sum(self._pilots[row].exchanges for row in rows)
+    def exchanges(self, rows: list[int]) -> int:
+        return sum(self.pilots[row].exchanges for row in rows)
 
     def read(self, t: float) -> Sequence[BodyState]:
         """See `Body.read`."""
         now = time.monotonic()
         self._zero = now - t
-        return [self._state(row, now) for row in range(len(self._pilots))]
+        return [self._state(row, now) for row in range(len(self.pilots))]
 
     def _state(self, row: int, now: float) -> BodyState:
-        telemetry, pilot = self._telemetry[row], self._pilots[row]
+        telemetry, pilot = self._telemetry[row], self.pilots[row]
         settled, received = telemetry.settled, telemetry.pose_time - self._zero
         x, y, z, vx, vy, vz, yaw = telemetry.pose
         state = BodyState(
@@ -152,35 +152,35 @@ class CrazyflieBody(Body):
     def command(self, setpoints: Sequence[Setpoint]) -> None:
         """See `Body.command`."""
         now = time.monotonic()
-        for pilot, setpoint in zip(self._pilots, setpoints, strict=True):
+        for pilot, setpoint in zip(self.pilots, setpoints, strict=True):
             pilot.set_target(now, setpoint if isfinite(sum(setpoint)) else None)
 
     def takeoff(self, rows: Sequence[int], heights: Sequence[float]) -> None:
         """See `Body.takeoff`."""
         for row, up in zip(rows, heights, strict=True):
             self._telemetry[row].airborne = True  # at once: callers wait for a landing as long as this is set
-            self._pilots[row].give_order("takeoff", up)
+            self.pilots[row].give_order("takeoff", up)
 
     def land(self, rows: Sequence[int]) -> None:
         """See `Body.land`."""
         for row in rows:
-            self._pilots[row].give_order("land")
+            self.pilots[row].give_order("land")
 
     def stop(self, rows: Sequence[int]) -> None:
         """See `Body.stop`. Drones on the ground get no command: an emergency stop locks them until a restart."""
         for row in rows:
-            self._pilots[row].give_order("stop")
+            self.pilots[row].give_order("stop")
 
     def locate(self, row: int, t: float, position: Vector, yaw: float) -> None:
         """See `Body.locate`."""
         if self._external[row].update(t, position, yaw):
-            self._pilots[row].locate(self._zero + t, position, yaw)
+            self.pilots[row].locate(self._zero + t, position, yaw)
 
     def inspect(self, row: int) -> Inspection:
         """See `Body.inspect`."""
         load = self._loads[row]
         return Inspection(
-            firmware=self._pilots[row].firmware,
+            firmware=self.pilots[row].firmware,
             volts=number(self._telemetry[row].volts),
             packets_hz=load,
             capacity_hz=self._capacity.get(self._dongles[row]),
@@ -188,16 +188,16 @@ class CrazyflieBody(Body):
 
     def close(self) -> None:
         """See `Body.close`. Drones in the air are landed first."""
-        for pilot in self._pilots:
+        for pilot in self.pilots:
             pilot.close()
-        for pilot in self._pilots:
+        for pilot in self.pilots:
             pilot.join()
         self._claims.release()
 
     def _note(self, row: int, now: float) -> str:
         age = now - self._telemetry[row].pose_time
         stale = f"no pose for {age:.1f} s" if STALE_S < age < inf else ""
-        return "; ".join(part for part in (self._pilots[row].note, stale) if part)
+        return "; ".join(part for part in (self.pilots[row].note, stale) if part)
 
     def _scan(self, telemetry: Telemetry) -> RangeScan | None:
         if not isfinite(telemetry.ranges_time):

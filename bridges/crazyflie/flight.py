@@ -85,7 +85,7 @@ class Flight:
         self._settings, self._telemetry, self._pause = settings, telemetry, pause
         self._target: Target | None = None
         self._commanded_at = math.inf
-        self._since = -math.inf
+        self.phase_since = -math.inf
         self._due = -math.inf  # next setpoint [s]
         self._begun = math.inf  # begin of the setpoint that is being sent [s]
         self._sent: Target | None = None  # last setpoint,
@@ -103,7 +103,7 @@ class Flight:
         self._on_board: deque[float] = deque(maxlen=STARTS)
         self._start_replies = 0  # of the planner to starts
         self._stream_hz = settings.stream_hz
-        self._span = 0.0  # duration of the take-off or landing [s]
+        self.span_s = 0.0  # duration of the take-off or landing [s]
 
     @property
     def airborne(self) -> bool:
@@ -137,14 +137,14 @@ class Flight:
     @property
     def landing_s(self) -> float:
         """Duration of a landing from here, with one that is ordered again [s]."""
-        return max(self._span, self._highest / DESCENT) + AGAIN_S + SHORTEST_S
+        return max(self.span_s, self._highest / DESCENT) + AGAIN_S + SHORTEST_S
 
     def publish_airborne(self) -> None:
         """Write `airborne` to the telemetry."""
         self._telemetry.airborne = self.airborne
 
     @property
-    def _hold(self) -> float:
+    def hold_s(self) -> float:
         """Time for which a setpoint is held before the descent [s]."""
         return max(HOLD_S, PERIODS / self._stream_hz)
 
@@ -174,7 +174,7 @@ class Flight:
             self._release()
             self._pause(POLL_S)
         self._disarm_at = math.inf
-        self._target, self._top, self._sent, self._span = None, (x, y, height, place[3]), None, span
+        self._target, self._top, self._sent, self.span_s = None, (x, y, height, place[3]), None, span
         self._on_board.clear()
         self._on_board.append(height)
         self._enter(Phase.CLIMBING)  # from here on a stop cuts the motors
@@ -184,7 +184,7 @@ class Flight:
         )
         replies, _ = self.link.planner_reply(trajectories.start_command)
         self._start_replies = replies + (answer is None)  # an answer that is not here yet may come
-        self._plan_end(time.monotonic() + self._span, height)
+        self._plan_end(time.monotonic() + self.span_s, height)
         if answer is None or answer == Status.OK:
             return  # a lost answer is no refusal: `update_phase` sees whether it flies
         self._enter(Phase.GROUND)
@@ -216,21 +216,21 @@ class Flight:
 
     def _begin_landing(self) -> None:
         self._enter(Phase.LANDING)
-        self._span = self._ordered_span
-        self._down_at = self._since + self._span + MARGIN_S
+        self.span_s = self._ordered_span
+        self._down_at = self.phase_since + self.span_s + MARGIN_S
         self._land_replies, _ = self.link.planner_reply(HighLevel.LAND)
 
     def _repeat_landing(self, now: float) -> None:
         """Order a landing again that a gap or another client has ended; a planner that lands refuses the order."""
         telemetry = self._telemetry
-        near = now - self._since > self._span - NEAR_S
+        near = now - self.phase_since > self.span_s - NEAR_S
         replies, answer = self.link.planner_reply(HighLevel.LAND)
         if replies > self._land_replies and answer == Status.OK:
             self._late_landings += near
             self._begin_landing()
-        ended = telemetry.pose_time - self._since > self._span  # what waits in queues tells of before
+        ended = telemetry.pose_time - self.phase_since > self.span_s  # what waits in queues tells of before
         high = ended and telemetry.pose[2] > LOW and self._late_landings < LATE_LANDINGS
-        if telemetry.status_time - self._since > self._span + AGAIN_S:
+        if telemetry.status_time - self.phase_since > self.span_s + AGAIN_S:
             self._land()
         elif (high or not near) and not self.link.busy and now - self._released_at > LAND_S:
             self._order_landing()
@@ -269,7 +269,7 @@ class Flight:
     def send_due(self, now: float) -> None:
         """Send the packets that are due at `now` on the monotonic clock [s]."""
         if self.phase is Phase.STOPPING:
-            if now - self._since > ANSWER_S:
+            if now - self.phase_since > ANSWER_S:
                 self.trouble = UNANSWERED
             self.link.cf.supervisor.send_emergency_stop()
         if now > self._disarm_at:
@@ -279,12 +279,12 @@ class Flight:
         if self.phase not in (Phase.CLIMBING, Phase.FLYING):
             return
         self._confirm_starts()
-        begun = self._since + (self._span if self.phase is Phase.CLIMBING else 0.0)
-        if now - max(self._sent_at, begun) > self._hold + UNSTARTED_S and not self.link.busy:
+        begun = self.phase_since + (self.span_s if self.phase is Phase.CLIMBING else 0.0)
+        if now - max(self._sent_at, begun) > self.hold_s + UNSTARTED_S and not self.link.busy:
             self.trouble = "landed: its setpoints are not confirmed"
             self.land()
             return
-        if now - max(self._commanded_at, self._since) > LOOP_SILENCE_S:
+        if now - max(self._commanded_at, self.phase_since) > LOOP_SILENCE_S:
             self.trouble = "landed: no commands from the robot's loop"
             self.land()
             return
@@ -293,7 +293,7 @@ class Flight:
     def _stream(self, now: float) -> None:
         """Send the setpoint, if due; while the drone has none, the end of its climb."""
         target = self._target
-        if target is None and now - self._since > self._span:
+        if target is None and now - self.phase_since > self.span_s:
             target = self._top
         if target is None or now < self._due or self.link.busy:
             return
@@ -304,7 +304,7 @@ class Flight:
         if _same(target, self._sent) and now - self._sent_at < REFRESH_S:
             return
         self._begun = min(self._begun, now)
-        packets = self.link.trajectories.hold(target, self._hold, self._release_others)
+        packets = self.link.trajectories.hold(target, self.hold_s, self._release_others)
         if packets == 0:
             return
         self._sent, self._sent_at = target, now
@@ -315,7 +315,7 @@ class Flight:
 
     def _plan_end(self, since: float, height: float) -> None:
         """Note when a trajectory that holds a height [m] since a time [s] has reached the floor."""
-        self._down_at = since + self._hold + max(height, 0.0) / SINK + MARGIN_S
+        self._down_at = since + self.hold_s + max(height, 0.0) / SINK + MARGIN_S
 
     def _release(self) -> None:
         """End the setpoints of other clients, which mute the planner: 2 s after the last one the drone would lock."""
@@ -341,7 +341,7 @@ class Flight:
         if now - telemetry.arrival > FRESH_S:
             return
         info, flying = telemetry.info, self._flying
-        since = telemetry.status_time - self._since  # a status that waited behind others tells of an earlier phase
+        since = telemetry.status_time - self.phase_since  # a status that waited behind others tells of an earlier phase
         if self.phase is Phase.GROUND and flying and since > STOPPING_S:
             self.trouble = "landed: it flew without an order"
             self.land()
@@ -397,7 +397,7 @@ class Flight:
         return Info.FLYING in self._telemetry.info
 
     def _enter(self, phase: Phase) -> None:
-        self.phase, self._since = phase, time.monotonic()
+        self.phase, self.phase_since = phase, time.monotonic()
         self.publish_airborne()
 
     def takeoff_refusal(self) -> str:
@@ -419,7 +419,7 @@ class Flight:
     def _write_climb(self, place: Target, climb: tuple[float, float]) -> int | None:
         """Write the climb; returns its number, or None, with `trouble`."""
         begin = time.monotonic()
-        while (number := self.link.trajectories.write_climb(place, climb, self._hold)) is None:
+        while (number := self.link.trajectories.write_climb(place, climb, self.hold_s)) is None:
             if time.monotonic() > begin + UPLOAD_S:
                 self.trouble = "no take-off: its trajectory is not confirmed; is its radio too full, or gone?"
                 break

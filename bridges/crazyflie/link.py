@@ -137,7 +137,7 @@ class CrazyflieLink:
         self._connected = threading.Event()
         self.error: str | None = None  # reason of the loss; None while connected
         self.answered = self._unsafe = False  # any packet was received; safelink is missing
-        self._blocks: dict[str, Any] = {}
+        self.blocks: dict[str, Any] = {}
         self._periods: dict[str, int] = {}  # that were asked for, in units of 10 ms
         self._parameters: dict[int, tuple[str, str]] = {}  # asked for, by number: name, format
         self._values: dict[str, float] = {}  # answers about parameters
@@ -222,23 +222,23 @@ class CrazyflieLink:
             block.start()
         except AttributeError as error:  # block too large, too many blocks, or link lost meanwhile
             raise LinkError(f"log block {name}: {error}") from error
-        self._blocks[name], self._periods[name] = block, block.period
+        self.blocks[name], self._periods[name] = block, block.period
 
     def stop_log(self, name: str) -> None:
         """End a log block."""
-        block = self._blocks.pop(name, None)
+        block = self.blocks.pop(name, None)
         if block is not None:
             block.delete()
 
     def restart_logs(self) -> None:
         """Create all log blocks again: the firmware removes them after a second without packets."""
-        for block in list(self._blocks.values()):
+        for block in list(self.blocks.values()):
             block.added = False
             block.start()
 
     def scale_logs(self, share: float) -> None:
         """Set the rates of all log blocks to a share of those asked for; not below 5 Hz."""
-        for name, block in list(self._blocks.items()):
+        for name, block in list(self.blocks.items()):
             period = self._periods[name]
             block.period = min(round(period / share), max(SLOWEST, period))
             block.start()

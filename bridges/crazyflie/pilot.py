@@ -67,7 +67,7 @@ class CrazyfliePilot:
         self._name, self._address, self._settings, self._telemetry = name, address, settings, telemetry
         self._start_pose, self._turn = place, turn
         self._flight = Flight(settings, telemetry, self._pause)
-        self._link: CrazyflieLink | None = None
+        self.link: CrazyflieLink | None = None
         self._connection_note = "connecting"
         self._order: Order | None = None
         self._executing = ""  # order
@@ -135,12 +135,12 @@ class CrazyfliePilot:
     @property
     def exchanges(self) -> int:
         """Packets received over the current link."""
-        return 0 if self._link is None else self._link.exchanges
+        return 0 if self.link is None else self.link.exchanges
 
     @property
     def firmware(self) -> str | None:
         """Version of the firmware; None before the drone has said it."""
-        return None if self._link is None else self._link.firmware
+        return None if self.link is None else self.link.firmware
 
     def close(self) -> None:
         """Land the drone if it flies, then end the thread."""
@@ -167,7 +167,7 @@ class CrazyfliePilot:
                 self._ending.wait(RETRY_S)
                 continue
             try:
-                self._link = self._flight.link = link
+                self.link = self._flight.link = link
                 link.confirmed = self._wake.set
                 self._prepare(link)
                 self._serve(link)

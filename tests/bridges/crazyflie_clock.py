@@ -92,7 +92,7 @@ class Drone:
         self.thread = Thread(fleet.now + fleet.random.random() / LOOP_HZ, self._control)
 
     def start_log(self, _name, rate_hz, variables, logged):
-        table, number = self._fleet.twin.drones[self.row]._log_table, len(self._blocks)
+        table, number = self._fleet.twin.drones[self.row].log_table, len(self._blocks)
         kinds = [CODES[kind] for kind in variables.values()]
         codes = [LOG_CODES[kind] for kind in kinds]
         items = [crtp.ITEM.pack(code, table.number[name]) for code, name in zip(codes, variables, strict=True)]
@@ -131,7 +131,7 @@ class Drone:
             self.thread.due = self._fleet.now
 
     def _send_at_once(self, port, channel, data):
-        self._fleet.twin._deliver(self.row, bytes((crtp.header(port, channel),)) + data)
+        self._fleet.twin.deliver(self.row, bytes((crtp.header(port, channel),)) + data)
 
     def _send(self, port, channel, data):
         while self.out:
@@ -255,7 +255,7 @@ class Fleet:
         if drone.out:
             drone.out.popleft()
         if packet is not None:
-            self.twin._deliver(row, packet)
+            self.twin.deliver(row, packet)
         drone.receive(answer)
 
 

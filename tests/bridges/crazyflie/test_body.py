@@ -272,7 +272,7 @@ def test_another_session_finds_it_in_the_air():
         process.takeoff(0.4)
         process.setpoint = [(0.0, 0.0, 0.4, 0.0)]
         process.run(0.2)
-        pilot = process.body._pilots[0]
+        pilot = process.body.pilots[0]
         pilot._end_by = 0.0  # it ends without a landing
         pilot._ending.set()
         pilot._thread.join()

@@ -73,7 +73,7 @@ def test_short_gaps_are_flown_through():
     with flown(device=RADIO) as (twin, process):
         process.takeoff(HEIGHT)
         descent = Descent(twin, process)
-        link = process.body._pilots[0]._link
+        link = process.body.pilots[0].link
         for x, gap in enumerate((0.15, 0.3, 0.45, 0.7)):
             hovering(process, x=0.1 * x).run(0.2)
             twin.device.lines[0].silence(gap)
@@ -81,7 +81,7 @@ def test_short_gaps_are_flown_through():
             process.until(lambda: abs(truth(twin)[0] - 0.1 * x) < 0.03 and process.state.flying[0], "goal")  # noqa: B023
             assert abs(truth(twin)[2] - HEIGHT) < 0.1
         assert descent.fastest.max() < SINKS
-        assert process.body._pilots[0]._link is link
+        assert process.body.pilots[0].link is link
         assert supervised(twin) == State.FLYING
         process.cut()
 
@@ -294,7 +294,7 @@ def test_a_radio_that_becomes_slow_gets_fewer_logs(monkeypatch):
         process.land()
         assert supervised(twin) != State.LOCKED
         process.until(lambda: "fewer logs" not in process.state.note[0], "the rates that were chosen")
-        blocks = process.body._pilots[0]._link._blocks
+        blocks = process.body.pilots[0].link.blocks
         assert blocks["state"].period == 5
 
 
@@ -321,7 +321,7 @@ def test_a_fleet_on_one_radio(monkeypatch, tmp_path):
     monkeypatch.setattr(link, "_KNOWN_TABLES", {})
     rows = 8
     with flown(rows=rows, device=RADIO | {"stream_hz": 5.0}) as (twin, process):
-        assert process.body._exchanges(list(range(rows))) < 60 * 250, "a minute of a slow radio"
+        assert process.body.exchanges(list(range(rows))) < 60 * 250, "a minute of a slow radio"
         descent, notes = Descent(twin, process), set()
         tick = process.tick
 

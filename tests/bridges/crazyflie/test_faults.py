@@ -131,7 +131,7 @@ def test_reset_in_the_air():
         process.run(0.3)
         flock, drone = twin.device.flock, twin.device.drones[0]
         flock.restart(0)
-        drone._start()
+        drone.start()
         process.until(lambda: not process.state.flying[0], "seen")
         process.setpoint = None
         process.until(lambda: drone.value("posCtlPid.thrustMin") == 5000 and not process.state.note[0], "set up again")
@@ -149,13 +149,13 @@ def test_new_link_does_not_move_a_flow_deck():
         process.setpoint = [(0.4, 0.0, 0.3, 0.0)]
         process.until(lambda: abs(truth(twin)[0] - 0.4) < 0.02, "goal")
         process.land()
-        link_before, pilot = process.body._pilots[0]._link, process.body._pilots[0]
+        link_before, pilot = process.body.pilots[0].link, process.body.pilots[0]
         twin.device.lines[0].silence(1.5)
-        process.until(lambda: pilot._link is not link_before and not process.state.note[0], "a new link")
+        process.until(lambda: pilot.link is not link_before and not process.state.note[0], "a new link")
         assert process.state.position[0, 0] == pytest.approx(truth(twin)[0], abs=0.02)
         assert truth(twin)[0] > 0.3
         twin.device.flock.restart(0)
-        twin.device.drones[0]._start()
+        twin.device.drones[0].start()
         process.until(lambda: abs(process.state.position[0, 0]) < 0.02 and not process.state.note[0], "at its start")
 
 

@@ -90,7 +90,7 @@ def test_unanswered_landing_is_ordered_again(air):
     assert not air.times("setpoint"), "a start would make the planner forget the landing"
     assert len(air.times("land")) == module.TRIES
     air.telemetry.pose = [0.0] * 7
-    air.pass_(air.flight._span)
+    air.pass_(air.flight.span_s)
     assert 2 < len(air.times("land")[module.TRIES :]) < 5
     air.sent.clear()
     air.pass_(module.AGAIN_S)
@@ -126,7 +126,7 @@ def test_slow_radio_gets_rarer_setpoints_held_longer(air):
     air.pass_(4.0)
     sent = [at for at in air.times("setpoint") if at > begin]
     assert np.diff(sent).min() > 0.9 / module.SLOWEST_HZ
-    assert np.diff(sent).max() < 0.5 * air.flight._hold
+    assert np.diff(sent).max() < 0.5 * air.flight.hold_s
 
 
 def test_end_of_climb_is_held_until_first_setpoint(monkeypatch):
@@ -251,7 +251,7 @@ def test_landing_lasts_from_the_highest_place(monkeypatch, pose, set_point):
         air.flight._stream(air.now + 1.0)
     air.telemetry.pose = (0.0, 0.0, pose, *(0.0,) * 4)
     air.flight.land_after_gap(0.9)
-    assert air.flight._span == pytest.approx(2.1 / module.DESCENT)
+    assert air.flight.span_s == pytest.approx(2.1 / module.DESCENT)
 
 
 @pytest.mark.parametrize("height", [0.2, 0.8, 8.0])
@@ -259,14 +259,14 @@ def test_landing_never_exceeds_half_a_metre_per_second(air, height):
     """At the fastest a rest-to-rest polynomial is 35/16 of its mean speed."""
     air.telemetry.pose = [0.0, 0.0, height, *[0.0] * 4]
     air.flight.land()
-    assert 35.0 / 16.0 * (height - module.FLOOR) / air.flight._span < 0.5
-    assert height == 0.2 or air.flight._span < height / SLOWEST + 1.0
+    assert 35.0 / 16.0 * (height - module.FLOOR) / air.flight.span_s < 0.5
+    assert height == 0.2 or air.flight.span_s < height / SLOWEST + 1.0
 
 
 def test_the_height_seen_from_outside_counts(air):
     air.flight.note_external(1.5, math.nan)
     air.flight.land()
-    assert air.flight._span == pytest.approx(1.6 / module.DESCENT)
+    assert air.flight.span_s == pytest.approx(1.6 / module.DESCENT)
 
 
 def test_setpoints_of_others_end_at_each_landing(air):
@@ -274,14 +274,14 @@ def test_setpoints_of_others_end_at_each_landing(air):
     air.sent.clear()
     air.flight.land()
     air.telemetry.pose = [0.0] * 7
-    air.pass_(air.flight._span)
+    air.pass_(air.flight.span_s)
     assert [what for _, what in air.sent] == ["send_notify_setpoint_stop", "land"] * (len(air.sent) // 2)
     repeated = air.times("land")[module.TRIES :]
     assert np.diff(repeated).max() < 0.6, "the drone locks 2 s after the last setpoint of the other"
-    assert repeated[-1] < air.flight._since + air.flight._span - module.NEAR_S
+    assert repeated[-1] < air.flight.phase_since + air.flight.span_s - module.NEAR_S
     air.replies[HighLevel.LAND] = 1, 0
     air.pass_(0.1)
-    assert air.now - air.flight._since < 0.2, "it was not landing any more"
+    assert air.now - air.flight.phase_since < 0.2, "it was not landing any more"
 
 
 def test_nothing_is_ordered_into_a_silent_radio(air):
@@ -302,7 +302,7 @@ def test_nothing_is_ordered_into_a_silent_radio(air):
 def test_landing_on_a_table_ends(air):
     """Where it stands is as high as it would fly if another client had ended the landing: a few more attempts."""
     air.flight.land()
-    orders, begun, end = len(air.times("land")), 1, air.now + air.flight._span
+    orders, begun, end = len(air.times("land")), 1, air.now + air.flight.span_s
     for _ in range(1500):
         air.flying = air.now < end + 2.0
         air.pass_(0.02)
@@ -310,7 +310,7 @@ def test_landing_on_a_table_ends(air):
         if answered > orders:
             accepted = air.now > end
             orders, air.replies[HighLevel.LAND] = answered, (answered, Status.OK if accepted else Status.REFUSED)
-            begun, end = begun + accepted, air.now + air.flight._span if accepted else end
+            begun, end = begun + accepted, air.now + air.flight.span_s if accepted else end
     assert begun == 1 + module.LATE_LANDINGS
     assert air.flight.phase is Phase.GROUND
 

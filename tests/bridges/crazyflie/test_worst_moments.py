@@ -37,7 +37,7 @@ class Client:
     def __call__(self):
         if self.height is not None:
             setpoint = struct.pack("<4f", 0.0, 0.0, self.height, 0.0)
-            self._fleet.twin._deliver(0, bytes((Port.SETPOINT << 4, Setpoint.POSITION)) + setpoint)
+            self._fleet.twin.deliver(0, bytes((Port.SETPOINT << 4, Setpoint.POSITION)) + setpoint)
 
     def leave(self):
         self.height = None
@@ -97,7 +97,7 @@ def test_another_client_cuts_the_motors(fleet):
     fleet.run(3.0, speed=0.3)
     zero = bytes((Port.COMMANDER << 4,)) + struct.pack("<fffH", 0.0, 0.0, 0.0, 0)
     for packet in (zero, bytes((Port.HIGH_LEVEL << 4, HighLevel.STOP, 0))):
-        fleet.twin._deliver(0, packet)
+        fleet.twin.deliver(0, packet)
         lowest = min(fleet.run(0.05, speed=0.3).heights[0] for _ in range(60))
         assert lowest > HEIGHT - 0.2
         assert fleet.heights[0] == pytest.approx(HEIGHT, abs=0.03)
@@ -115,8 +115,8 @@ def test_memory_that_takes_no_setpoint(fleet, how):
     if how == "refused":
         drone.memories.write = lambda *_: False
     drone.send = lambda port, *rest: None if port == Port.MEMORY and how == "unanswered" else send(port, *rest)
-    deliver = fleet.twin._deliver
-    fleet.twin._deliver = lambda row, packet: (written.append(packet[0] >> 4 == Port.MEMORY), deliver(row, packet))
+    deliver = fleet.twin.deliver
+    fleet.twin.deliver = lambda row, packet: (written.append(packet[0] >> 4 == Port.MEMORY), deliver(row, packet))
     fleet.run(1.0, speed=0.3)
     assert sum(written) < 10
     assert landed(fleet) < 0.02

@@ -124,7 +124,7 @@ class CrazyflieTwin:
 
     def serve(self, ready: socket.socket, t: float) -> None:
         if self._air is not None:
-            self._air.serve(t, self._deliver)
+            self._air.serve(t, self.deliver)
             return
         row = self._row[ready]
         line = self.lines[row]
@@ -134,9 +134,9 @@ class CrazyflieTwin:
             packet = line.receive()
             if packet is None:
                 return
-            self._deliver(row, packet)
+            self.deliver(row, packet)
 
-    def _deliver(self, row: int, packet: bytes) -> None:
+    def deliver(self, row: int, packet: bytes) -> None:
         try:
             self.drones[row].receive(packet[0] >> 4, packet[0] & 3, packet[1:])
         except (struct.error, IndexError, ValueError, UnicodeDecodeError):

@@ -70,10 +70,10 @@ class Drone:
 
     def __post_init__(self) -> None:
         tables = inventory(self.flock.tables[self.row])
-        self.parameters, self._log_table = tables.parameters, tables.logs
+        self.parameters, self.log_table = tables.parameters, tables.logs
         self.memories = self.flock.memories[self.row]
         self.logs = LogBlocks(self.flock, self.row, self.value, tables.logs)
-        self._start()
+        self.start()
         # answer to a packet on the same port and channel, or None
         self._answer: dict[Port, Callable[[int, bytes], bytes | None]] = {
             Port.LINK: self._link,
@@ -88,7 +88,7 @@ class Drone:
             Port.LOCATION: self._location,
         }
 
-    def _start(self) -> None:
+    def start(self) -> None:
         """State after switching on."""
         flock, row = self.flock, self.row
         self.thrust_locked = True
@@ -138,7 +138,7 @@ class Drone:
                 return data[:2] + crtp.ADDRESS
             self.on = data[1] in (PowerSwitch.ON, PowerSwitch.RESET)
             self.flock.restart(self.row)
-            self._start()
+            self.start()
             return data[:2]
         answers = {0: data, 1: crtp.GREETING, 3: None if data else b""}  # 0: echo
         return answers.get(channel)
@@ -261,7 +261,7 @@ class Drone:
 
     def _log(self, channel: int, data: bytes) -> bytes | None:
         if channel == 0:
-            return self._table(self._log_table, data, bytes((crtp.LOG_BLOCKS, crtp.LOG_VARIABLES)))
+            return self._table(self.log_table, data, bytes((crtp.LOG_BLOCKS, crtp.LOG_VARIABLES)))
         if channel != 1:
             return None
         block = data[1] if len(data) > 1 else 0

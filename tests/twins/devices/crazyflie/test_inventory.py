@@ -15,7 +15,7 @@ from twins.devices.crazyflie.tables import EXTENDED, PACKINGS, READ_ONLY, invent
 
 def logged(wire, *names):
     """Values of log variables, in the type that they have on board."""
-    table, values = wire.drone._log_table, []
+    table, values = wire.drone.log_table, []
     for name in names:
         number = table.number[name]
         kind = table.variables[number].type
