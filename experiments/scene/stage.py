@@ -93,19 +93,27 @@ RINGED: Final = (Condition.LANDING, Condition.HELD, Condition.SILENT, Condition.
 PALED: Final = (Condition.SILENT, Condition.STOPPED, Condition.DEAD)
 
 
-def condition(status: Status | None, *, alive: bool, age_s: float) -> Condition:
-    """Condition of a robot by its last status, if any, which is `age_s` [s] old; `alive`: its token stands."""
-    if status is None:
-        return Condition.WAITING if alive else Condition.DEAD
-    phase = status.phase
+def condition(
+    status: Status | None, phase: str | None = None, *, alive: bool = True, silent: bool = False, held: bool = False
+) -> Condition:
+    """Condition of a robot.
+
+    Args:
+        status: Last received, if any.
+        phase: Word of its phase; None: that of the status.
+        alive: Its liveliness token stands.
+        silent: Its last message is old.
+        held: A hazard holds it, also without a status.
+    """
+    phase = status.phase if phase is None and status is not None else phase
     for case, applies in (
-        (Condition.STOPPED, status.reason.startswith(EMERGENCY)),
+        (Condition.STOPPED, status is not None and status.reason.startswith(EMERGENCY)),
         (Condition.DONE, phase == Phase.DONE.word),
         (Condition.DEAD, not alive),
-        (Condition.SILENT, age_s > SILENT_S),
+        (Condition.SILENT, silent),
         (Condition.LANDING, phase == Phase.LANDING.word),
-        (Condition.WAITING, phase in (Phase.IDLE.word, Phase.READY.word)),
-        (Condition.HELD, status.hazard.startswith("hold")),
+        (Condition.WAITING, phase in (None, Phase.IDLE.word, Phase.READY.word)),
+        (Condition.HELD, held or (status is not None and status.hazard.startswith("hold"))),
     ):
         if applies:
             return case

@@ -20,7 +20,7 @@ from agents.network.session import received
 from experiments.arrays import known_rows
 from experiments.file import document
 from experiments.file.problems import DocumentError
-from experiments.scene.stage import Condition, LinkTracker, Moment, Stage, Trail, condition
+from experiments.scene.stage import SILENT_S, Condition, LinkTracker, Moment, Stage, Trail, condition
 from experiments.view.heartbeat import DataAge
 
 UNKNOWN_S: Final = 2.0  # without an experiment for so long, robots are drawn of which only the names are known
@@ -210,7 +210,7 @@ class Observer:
         elapsed = self.elapsed
         error = self._tracker.errors(elapsed, position)
         self._trail.add(now, position)
-        conditions = [condition(r.status, alive=r.alive, age_s=now - r.heard_at) for r in reports]
+        conditions = [condition(r.status, alive=r.alive, silent=now - r.heard_at > SILENT_S) for r in reports]
         under_way = [None if s is None or c in (Condition.WAITING, Condition.DONE) else s.goal
                      for s, c in zip(states, conditions, strict=True)]  # fmt: skip
         return Moment(

@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from agents.body.interface import BodyState
-from agents.decision.lifecycle import RUNNING
+from agents.decision.lifecycle import RUNNING, Phase
 from agents.network.messages import Event
 from experiments.definition.plan import Plan
-from experiments.scene.stage import Condition, LinkTracker, Moment, Stage, Trail
+from experiments.scene.stage import Condition, LinkTracker, Moment, Stage, Trail, condition
 from experiments.view.live import FRAME_S, Page
 from experiments.view.panel import PLOT_S, Row, known
-from experiments.view.replay import CONDITION_OF, Clock, add_transport
+from experiments.view.replay import Clock, add_transport
 from experiments.virtual_time.simulation import Instant
 from twins.arrays import Array
 
@@ -99,10 +99,7 @@ class PacedView:
         attitude, shadow = _column(states, "attitude"), _column(states, "shadow_position")
         running = np.array([robot.lifecycle.phase == RUNNING for robot in robots])
         elapsed = None if isnan(instant.time) else instant.time
-        conditions = [
-            CONDITION_OF.get(robot.lifecycle.phase, Condition.HELD if robot.hazards.held else Condition.ACTIVE)
-            for robot in robots
-        ]
+        conditions = [condition(None, Phase(robot.lifecycle.phase).word, held=robot.hazards.held) for robot in robots]
         self._trail.add(instant.now, position)
         laws = [robot.stepping for robot in robots]  # of guided robots nothing is known here
         return Moment(

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import numpy as np
 
-from agents.decision.lifecycle import DONE, IDLE, LANDING, READY
-from agents.network.messages import EMERGENCY, Memory, Status, WorldState
+from agents.decision.lifecycle import Phase
+from agents.network.messages import Memory, Status, WorldState
 from experiments.definition.formation import errors_over_time
 from experiments.recording.trace import ROUNDING_S
 from experiments.scene.drawing import SceneDrawing
-from experiments.scene.stage import TRAIL, TRAIL_S, Condition, LinkTracker, Moment, Stage
+from experiments.scene.stage import TRAIL, TRAIL_S, Condition, LinkTracker, Moment, Stage, condition
 from experiments.scene.tracks import LOST_S, Track, Tracks
 from experiments.view.live import FRAME_S, IDLE_S, TABLE_S, Page
 from experiments.view.panel import HISTORY_S, PLOT_S, History, Row, known, robot_row
@@ -31,9 +31,6 @@ SPEEDS: Final = ("0.1", "0.25", "0.5", "1", "2", "5", "10", "20")
 STEP_S: Final = 0.02  # of a single step: a sample at 50 Hz
 APART: Final = 0.15  # between words on the slider, in its lengths
 GAP: Final = 1.15  # from arena to arena, in its lengths
-CONDITION_OF: Final = {  # by phase; in the others a robot is active, or held
-    IDLE: Condition.WAITING, READY: Condition.WAITING, LANDING: Condition.LANDING, DONE: Condition.DONE,
-}  # fmt: skip
 
 
 class Film:
@@ -105,13 +102,9 @@ def _condition(track: Track, sample: int, t: float) -> Condition:
     """Condition of a robot by its sample and its last status."""
     if sample < 0:
         return Condition.WAITING
-    phase, status = int(track.phase[sample]), _last_status(track.statuses, t)
-    if status is not None and status.reason.startswith(EMERGENCY):
-        return Condition.STOPPED
-    if t - track.time[sample] > LOST_S and phase != DONE:
-        return Condition.DEAD if sample == len(track.time) - 1 else Condition.SILENT
-    held = status is not None and status.hazard.startswith("hold")
-    return CONDITION_OF.get(phase, Condition.HELD if held else Condition.ACTIVE)
+    silent, last = t - track.time[sample] > LOST_S, sample == len(track.time) - 1
+    phase, status = Phase(int(track.phase[sample])).word, _last_status(track.statuses, t)
+    return condition(status, phase, alive=not (silent and last), silent=silent)
 
 
 def _last_status(messages: Sequence[M], t: float) -> M | None:

@@ -147,8 +147,7 @@ class _Top:
         )
 
     def _rows(self) -> list[Row]:
-        from agents.decision.lifecycle import Phase
-        from agents.network.messages import EMERGENCY
+        from experiments.scene.stage import Condition, condition
 
         observer, now, rows = self._observer, self._observer.now(), []
         stage = observer.stage
@@ -156,14 +155,13 @@ class _Top:
         for name in [*stage.names, *sorted(observer.robots.keys() - {*stage.names})]:
             report = observer.robots[name]
             status = report.status
-            ended = status is not None and status.phase == Phase.DONE.word
-            stopped = status is not None and status.reason.startswith(EMERGENCY)
-            lost = stopped or (report.known and not report.alive and not ended)
+            known = condition(status, alive=report.alive or not report.known)
+            gone = {Condition.STOPPED: "stopped", Condition.DEAD: "lost"}.get(known, "")
             rows.append(
                 self._trends.row(
                     name, status, now=now,
                     error=report.state.error if report.state is not None and (name in linked or not linked) else None,
-                    gone="stopped" if stopped else "lost" if lost else "", lost=lost,
+                    gone=gone, lost=bool(gone),
                 )
             )  # fmt: skip
         return rows

@@ -17,8 +17,6 @@ from experiments.scene.stage import BAD, FAIR, GOOD, UNKNOWN, Condition, LinkTra
 from tests.experiments import moments
 from twins.scene import Obstacle
 
-ALIVE = {"alive": True, "age_s": 0.1}
-
 
 def status(phase: str = "running", **fields: object) -> messages.Status:
     zero = dict.fromkeys(
@@ -47,16 +45,16 @@ def at_start(park: Stage) -> Moment:
 @pytest.mark.parametrize(
     ("said", "seen", "is_"),
     [
-        (status(), ALIVE, Condition.ACTIVE),
-        (status(), {"alive": False, "age_s": 0.1}, Condition.DEAD),
-        (status(), {"alive": True, "age_s": 4.0}, Condition.SILENT),
-        (status("landing"), ALIVE, Condition.LANDING),
-        (status("done"), {"alive": False, "age_s": 9.0}, Condition.DONE),
-        (status("done", reason="emergency stop by operator"), ALIVE, Condition.STOPPED),
-        (status(hazard="hold: minimum separation: 0.18 m from CF03"), ALIVE, Condition.HELD),
-        (status("ready"), ALIVE, Condition.WAITING),
-        (None, ALIVE, Condition.WAITING),
-        (None, {"alive": False, "age_s": 9.0}, Condition.DEAD),
+        (status(), {}, Condition.ACTIVE),
+        (status(), {"alive": False}, Condition.DEAD),
+        (status(), {"silent": True}, Condition.SILENT),
+        (status("landing"), {}, Condition.LANDING),
+        (status("done"), {"alive": False, "silent": True}, Condition.DONE),
+        (status("done", reason="emergency stop by operator"), {}, Condition.STOPPED),
+        (status(hazard="hold: minimum separation: 0.18 m from CF03"), {}, Condition.HELD),
+        (status("ready"), {}, Condition.WAITING),
+        (None, {}, Condition.WAITING),
+        (None, {"alive": False, "silent": True}, Condition.DEAD),
     ],
 )
 def test_condition_of_a_robot(said, seen, is_):
