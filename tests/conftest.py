@@ -159,6 +159,12 @@ def eventually() -> Callable[[Callable[[], object]], None]:
     return until
 
 
+@pytest.fixture
+def unflown(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`check` flies one second only: enough for findings that take no flight."""
+    monkeypatch.setattr("experiments.check.ideal_run.WORK", 0.0)
+
+
 @pytest.fixture(autouse=True)
 def no_orphans(request: pytest.FixtureRequest) -> Iterator[None]:
     """After a system test no process and no thread that it started is left."""

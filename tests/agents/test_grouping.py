@@ -49,10 +49,13 @@ WAYS = {
     "self-triggered ahead": ("self-triggered", {"kind": "constant-velocity", "horizon_s": 0.3}, "lyapunov"),
     "lyapunov": ({"kind": "lyapunov", "maximum_silence_s": 0.7}, "constant-velocity", None),
 }
+BY_DAY = ("mixed", "dynamic", "predictive", "self-triggered ahead")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize(
+    "way", [way if way in BY_DAY else pytest.param(way, marks=pytest.mark.nightly) for way in WAYS]
+)
 def test_every_trigger_predictor_and_smoothing(park, way):
     trigger, prediction, update = WAYS[way]
     formation = msgspec.structs.replace(park.formation, update=update)

@@ -86,7 +86,10 @@ def test_help_of_commands_ends_with_valid_examples(path, command):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("flown", [False, pytest.param(True, marks=pytest.mark.nightly)])
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_experiments_of_a_page_are_sound(page):
+def test_experiments_of_a_page_are_sound(page, flown, request):
+    if not flown:
+        request.getfixturevalue("unflown")
     for text in BLOCK.findall(page.read_text("utf-8")):
         assert [str(found) for found in check(document.loads(text)) if found.severity == "error"] == []

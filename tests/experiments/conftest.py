@@ -2,7 +2,6 @@
 
 import pytest
 
-from experiments.check import ideal_run
 from tests.experiments.recordings import whole_run, write
 
 
@@ -17,9 +16,3 @@ def recorded(tmp_path_factory):
     target = tmp_path_factory.mktemp("recorded") / "run.mcap"
     write(target, *whole_run())
     return target.read_bytes()
-
-
-@pytest.fixture
-def unflown(monkeypatch):
-    """`check` flies one second only: enough for findings that take no flight."""
-    monkeypatch.setattr(ideal_run, "WORK", 0.0)

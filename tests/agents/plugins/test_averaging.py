@@ -56,6 +56,7 @@ def findings(name, *changes):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("unflown")
 @pytest.mark.parametrize("name", ["average", "aggregative"])
 def test_gains_beyond_the_bound_are_found_with_remedy(name):
     assert [severity for severity, *_ in findings(name)] == ["note"]

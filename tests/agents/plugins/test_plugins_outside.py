@@ -20,6 +20,7 @@ from agents.body.interface import BodyError
 from agents.formation.link import Link
 from agents.plugins.avoidance import Nearby, OwnState
 from tests.agents.signals import Play, standing
+from tests.shell import shell
 from tests.system import lab
 from tests.waiting import until
 
@@ -64,12 +65,10 @@ def install(folder, name, version, groups):
     (written / "entry_points.txt").write_text("\n".join(lines))
 
 
-def zenpark(folder, *arguments):
-    path = os.pathsep.join([str(folder), str(ROOT)])
-    return subprocess.run(
-        [sys.executable, "-m", "tools.guard", *arguments],
-        cwd=folder, env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True, timeout=60, check=False,
-    )  # fmt: skip
+@pytest.fixture(scope="module")
+def zenpark(installed):
+    with shell(installed) as command:
+        yield command
 
 
 def test_every_group_has_an_example():
@@ -80,27 +79,27 @@ def test_every_group_has_an_example():
 
 
 @pytest.mark.slow
-def test_trigger_of_the_docs_runs_from_outside(installed):
+def test_trigger_of_the_docs_runs_from_outside(zenpark):
     assert len(source_of("SendEvery").splitlines()) <= 20
-    listed = zenpark(installed, "list").stdout
+    listed = zenpark("list").stdout
     assert re.search(r"Triggers: .*\bsend-every\b", listed)
     assert re.search(r"Laws: .*\bspring\b", listed)
     assert not [name for name, _, _, group in REGISTERED if group != "zenpark.bodies" and name not in listed]
     choice = 'cases.event.trigger={ kind = "send-every", metres = 0.02, maximum_silence_s = 5.0 }'
-    run = zenpark(installed, "run", "triangle", "--virtual", "--json", "--set", "duration_s=5", "--set", choice)
+    run = zenpark("run", "triangle", "--virtual", "--json", "--no-report", "--set", "duration_s=5", "--set", choice)
     assert run.returncode == 0, run.stderr
     cases = json.loads(run.stdout)["cases"]
     assert 0.0 < cases["event"]["mean"]["f_hz"] < 0.1 * cases["periodic"]["mean"]["f_hz"]
-    wrong = zenpark(installed, "run", "triangle", "--virtual", "--set", choice.replace("metres", "meters"))
+    wrong = zenpark("run", "triangle", "--virtual", "--set", choice.replace("metres", "meters"))
     assert wrong.returncode != 0
     assert "did you mean 'metres'?" in wrong.stderr
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("line", re.findall(r"^    \./zenpark (run triangle --virtual .*)$", GUIDE, re.MULTILINE))
-def test_every_run_of_the_guide_ends_well(installed, line, tmp_path):
+def test_every_run_of_the_guide_ends_well(zenpark, line, tmp_path):
     words = shlex.split(line)
-    done = zenpark(installed, *words, "--set", "duration_s=8", "--no-report", "--out", str(tmp_path / "run"))
+    done = zenpark(*words, "--set", "duration_s=6", "--no-report", "--out", str(tmp_path / "run"))
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "run" / "metrics.csv").exists()
 
@@ -178,22 +177,22 @@ def rovers(*addresses):
 
 
 @pytest.mark.slow
-def test_kind_of_the_docs_is_known_everywhere(installed, tmp_path):
-    assert re.search(r"Kinds of robots: .*\bhovercraft\b", zenpark(installed, "list").stdout)
-    assert "0.8 kg" in zenpark(installed, "explain", "hovercraft").stdout
-    assert '"hovercraft"' in zenpark(installed, "schema").stdout
-    words = ["triangle", "--set", "robots.KH01.kind=hovercraft", "--set", "duration_s=8"]
-    assert zenpark(installed, "check", *words).returncode == 0
-    refused = zenpark(installed, "check", *words, "--set", "world.engine=pymunk")
+def test_kind_of_the_docs_is_known_everywhere(zenpark, tmp_path):
+    assert re.search(r"Kinds of robots: .*\bhovercraft\b", zenpark("list").stdout)
+    assert "0.8 kg" in zenpark("explain", "hovercraft").stdout
+    assert '"hovercraft"' in zenpark("schema").stdout
+    words = ["triangle", "--set", "robots.KH01.kind=hovercraft", "--set", "duration_s=4"]
+    assert zenpark("check", *words).returncode == 0
+    refused = zenpark("check", *words, "--set", "world.engine=pymunk")
     assert "'hovercraft' does not move in this engine" in refused.stderr + refused.stdout
-    run = zenpark(installed, "run", *words, "--virtual", "--no-report", "--out", str(tmp_path / "run"))
+    run = zenpark("run", *words, "--virtual", "--no-report", "--out", str(tmp_path / "run"))
     assert run.returncode == 0, run.stderr
-    uninstalled = installed.parent / "none"
-    uninstalled.mkdir()
-    assert "hovercraft" not in zenpark(uninstalled, "list").stdout
-    report = zenpark(uninstalled, "report", str(tmp_path / "run"))
-    assert report.returncode == 0, report.stderr
-    unknown = zenpark(uninstalled, "check", *words)
+    (tmp_path / "none").mkdir()
+    with shell(tmp_path / "none") as uninstalled:
+        assert "hovercraft" not in uninstalled("list").stdout
+        unknown = uninstalled("check", *words)
+        report = uninstalled("report", str(tmp_path / "run"))
+        assert report.returncode == 0, report.stderr
     assert "no 'hovercraft' among the kinds of robots" in unknown.stderr + unknown.stdout
 
 
@@ -205,12 +204,13 @@ def test_broken_kind_is_left_out(tmp_path):
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1\n")
     (about / "entry_points.txt").write_text("[zenpark.kinds]\nwreck = wrecks:WRECK\n")
     (tmp_path / "wrecks.py").write_text("raise LookupError('on purpose')\n")
-    assert zenpark(tmp_path, "--help").returncode == 0
-    listed = zenpark(tmp_path, "list")
-    assert listed.returncode == 0
-    assert re.search(r"left out: .*wreck.*on purpose", listed.stderr)
-    assert zenpark(tmp_path, "check", "triangle").returncode == 0
-    refused = zenpark(tmp_path, "check", "triangle", "--set", "robots.KH01.kind=wreck")
+    with shell(tmp_path) as zenpark:
+        assert zenpark("--help").returncode == 0
+        listed = zenpark("list")
+        assert listed.returncode == 0
+        assert re.search(r"left out: .*wreck.*on purpose", listed.stderr)
+        assert zenpark("check", "triangle").returncode == 0
+        refused = zenpark("check", "triangle", "--set", "robots.KH01.kind=wreck")
     assert "the kind 'wreck' cannot be used" in refused.stderr + refused.stdout
 
 

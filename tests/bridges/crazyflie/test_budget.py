@@ -14,10 +14,10 @@ SINKS = 0.5  # [m/s] a landing is slower
 @pytest.mark.parametrize(
     ("rows", "exchanges", "rates"),
     [
-        (1, 400.0, {}),
+        pytest.param(1, 400.0, {}, marks=pytest.mark.nightly),
         (4, 400.0, {}),
         pytest.param(8, 400.0, {"stream_hz": 7.0}, marks=pytest.mark.nightly),
-        (15, 664.0, {"stream_hz": 5.0}),
+        pytest.param(15, 664.0, {"stream_hz": 5.0}, marks=pytest.mark.nightly),
         pytest.param(5, 250.0, {"stream_hz": 7.0}, marks=pytest.mark.nightly),
     ],
 )

@@ -10,9 +10,15 @@ from agents.safety.setpoint_filter import OUTSIDE_M
 from experiments.real_time.conductor.hot_changes import CLIMB_S
 from tests.bridges.crazyflie_clock import TICK, Fleet
 
+HEIGHTS = [
+    (0.5, 3.0),
+    (2.0, 9.0),
+    *(pytest.param(*each, marks=pytest.mark.nightly) for each in ((0.8, 3.5), (1.0, 4.5), (4.0, CLIMB_S - 1.0))),
+]
+
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("height", "soon"), [(0.5, 3.0), (0.8, 3.5), (1.0, 4.5), (2.0, 9.0), (4.0, CLIMB_S - 1.0)])
+@pytest.mark.parametrize(("height", "soon"), HEIGHTS)
 def test_ready_at_height_in_spite_of_the_overshoot(monkeypatch, height, soon):
     """Followed by lifecycle and detectors as in a robot's process, for 12 s at its height."""
     lifecycle, setpoint = Lifecycle(CRAZYFLIE, height, 100.0), (0.0, 0.0, height, 0.0)

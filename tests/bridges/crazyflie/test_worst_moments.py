@@ -10,6 +10,7 @@ from tests.bridges.crazyflie_clock import HEIGHT, Fleet
 from twins.devices.crazyflie.supervisor import State
 
 HZ = 500.0  # [1/s] exchanges of the radio
+NIGHTLY = pytest.mark.nightly
 SINKS, TOUCHES = 0.55, 0.4  # [m/s] a landing is slower, in the air and at the floor
 
 
@@ -45,9 +46,18 @@ class Client:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("hover", "gap", "begin"), [(2.0, 2.0, 0.43), (2.0, 2.5, 1.0), (1.2, 2.5, 0.3), (0.8, 1.0, 0.03)]
+    ("hover", "gap", "begin", "speed"),
+    [
+        (2.0, 2.0, 0.43, 0.3),
+        pytest.param(2.0, 2.0, 0.43, 0.0, marks=NIGHTLY),
+        pytest.param(2.0, 2.5, 1.0, 0.0, marks=NIGHTLY),
+        pytest.param(2.0, 2.5, 1.0, 0.3, marks=NIGHTLY),
+        (1.2, 2.5, 0.3, 0.0),
+        pytest.param(1.2, 2.5, 0.3, 0.3, marks=NIGHTLY),
+        (0.8, 1.0, 0.03, 0.3),
+        pytest.param(0.8, 1.0, 0.03, 0.0, marks=NIGHTLY),
+    ],
 )
-@pytest.mark.parametrize("speed", [0.0, 0.3])
 def test_gap_in_the_climb(fleet, hover, gap, begin, speed):
     """The climb goes on, and the landing begins at its end; also when setpoints have begun, and were not received."""
     fleet.climb(hover, begin)
@@ -60,7 +70,7 @@ def test_gap_in_the_climb(fleet, hover, gap, begin, speed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stays_s", [0.0, 2.0, 5.0])
+@pytest.mark.parametrize("stays_s", [0.0, pytest.param(2.0, marks=NIGHTLY), 5.0])
 def test_flight_by_another_client_is_landed(fleet, stays_s):
     """It leaves at once, or when it has ended the landing again and again."""
     client = Client(fleet, 0.8)
@@ -105,7 +115,7 @@ def test_another_client_cuts_the_motors(fleet):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("how", ["refused", "unanswered"])
+@pytest.mark.parametrize("how", [pytest.param("refused", marks=NIGHTLY), "unanswered"])
 def test_memory_that_takes_no_setpoint(fleet, how):
     """The drone descends by itself, and would stand with its motors on: it is landed. The radio is not flooded."""
     fleet.climb(0.5, 0.45)
@@ -140,7 +150,7 @@ def test_short_gaps_one_after_the_other(fleet):
     assert fleet.phases == {Phase.FLYING}
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_landing_from_eight_metres(fleet):
     fleet.climb(8.0, 7.5)
     fleet.run(3.0)

@@ -99,7 +99,7 @@ def test_more_is_flown_where_it_is_compiled(monkeypatch, compiled, flown_s):
     assert isolated(Plan(many).changed(duration_s=30.0)).experiment.duration_s == 11.0  # to compile takes longer
 
 
-def flat_strip(gain: float, jitter: float = 0.01) -> Experiment:
+def flat_strip(gain: float, jitter: float = 0.01, duration_s: float = 30.0) -> Experiment:
     """Two flat triangles of drones that start in their shape, shaken by hover jitter."""
     places = {f"CF{k}": (0.6 * k - 0.9, 0.2 * (k % 2)) for k in range(4)}
     pairs = [("CF0", "CF1"), ("CF0", "CF2"), ("CF1", "CF2"), ("CF1", "CF3"), ("CF2", "CF3")]
@@ -110,7 +110,7 @@ def flat_strip(gain: float, jitter: float = 0.01) -> Experiment:
         arena=Arena(size=(8.0, 8.0, 2.0)),
         formation=Formation(links=links, gain=gain),
         disturbance={"all": Disturbance(hover_jitter=Jitter(jitter))},
-        duration_s=60.0,
+        duration_s=duration_s,
     )
 
 
@@ -122,7 +122,7 @@ def late(experiment: Experiment, seeds: list[int]) -> int:
 
 
 def test_soft_formation_is_found_under_hover_jitter():
-    soft = flat_strip(0.3)
+    soft = flat_strip(0.3, duration_s=60.0)
     claims = {each.code: each for each in check(of(soft))}
     assert "after 0.0 s" in claims["acquired"].message  # without noise
     found = claims["soft"]

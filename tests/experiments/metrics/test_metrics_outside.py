@@ -27,7 +27,8 @@ from experiments.sweep.pareto import front
 from experiments.sweep.table import CellRow
 from experiments.virtual_time.log import Logbook
 from experiments.virtual_time.simulation import simulate
-from tests.agents.plugins.test_plugins_outside import ROOT, install, zenpark
+from tests.agents.plugins.test_plugins_outside import ROOT, install
+from tests.shell import shell
 
 GUIDE = (ROOT / "docs" / "metrics.md").read_text(encoding="utf-8")
 WAY, GAP = re.findall(r"```python\n(.*?)```", GUIDE, re.DOTALL)
@@ -52,19 +53,25 @@ def installed(tmp_path_factory):
     return folder
 
 
+@pytest.fixture(scope="module")
+def zenpark(installed):
+    with shell(installed) as command:
+        yield command
+
+
 def test_guide_metric_is_short():
     assert len(WAY.strip().splitlines()) <= 22
 
 
 @pytest.mark.slow
-def test_installed_metric_is_everywhere(installed):
-    listed = zenpark(installed, "list")
+def test_installed_metric_is_everywhere(installed, zenpark):
+    listed = zenpark("list")
     assert re.search(r"^Added metrics: broken, gap_m, gone, way_m$", listed.stdout, re.MULTILINE)
     assert "metric gone is left out: plug-in 'gone' (no_such_module:Way) of my-metrics fails to import" in listed.stderr
-    assert "Length of the path of a robot" in zenpark(installed, "explain", "way_m").stdout
+    assert "Length of the path of a robot" in zenpark("explain", "way_m").stdout
 
     short = ["--set", "duration_s=5"]
-    run = zenpark(installed, "run", "triangle", "--virtual", "--seeds", "2", *short, "--out", "run")
+    run = zenpark("run", "triangle", "--virtual", "--seeds", "2", *short, "--out", "run")
     assert run.returncode == 0, run.stderr
     assert re.search(r"event: f .*, Way \d.* m, .*\(ratios: f .*, Way \d", run.stdout)
     assert "metric broken failed: ZeroDivisionError: division by zero (my_metrics.py:" in run.stdout
@@ -76,16 +83,16 @@ def test_installed_metric_is_everywhere(installed):
     page = (installed / "run" / "report.html").read_text("utf-8")
     assert all(text in page for text in ("Way [m]", "Length of the path", "Gap [m] of the case", "broken failed"))
 
-    shown = zenpark(installed, "report", "run", "--markdown").stdout
+    shown = zenpark("report", "run", "--markdown").stdout
     assert "Way [m]" in shown
     made = json.loads((installed / "run" / "run.json").read_text())["made_by"]
     assert made["plugins"] == {"my-metrics": "0.1"}
 
 
 @pytest.mark.slow
-def test_installed_metric_is_swept(installed):
+def test_installed_metric_is_swept(installed, zenpark):
     arguments = ["trigger.threshold=0.01,0.03", "seeds=3", "--set", "duration_s=5", "--out", "swept"]
-    done = zenpark(installed, "sweep", "triangle", *arguments)
+    done = zenpark("sweep", "triangle", *arguments)
     assert done.returncode == 0, done.stderr
     assert re.search(r"^note: metric broken failed: ZeroDivisionError", done.stdout, re.MULTILINE)
     assert "Way ratio" in done.stdout
@@ -94,16 +101,16 @@ def test_installed_metric_is_swept(installed):
     assert 0.0 < cell["ratio"]["way_m"]["ci95"] < 0.2
     assert cell["mean"]["broken"]["n"] == 0
     assert (installed / "swept" / "figures" / "pareto_way_m.svg").is_file()
-    table = zenpark(installed, "report", "swept", "--markdown", "--metrics", "messages,way_m").stdout
+    table = zenpark("report", "swept", "--markdown", "--metrics", "messages,way_m").stdout
     assert "| Messages ratio | Way ratio |" in table
 
 
 @pytest.mark.slow
-def test_installed_metric_is_a_limit_of_a_search(installed):
-    (line,) = re.findall(r"^    \./zenpark (sweep .*--optimise.*)$", GUIDE, re.MULTILINE)
+def test_installed_metric_is_a_limit_of_a_search(zenpark):
+    (line,) = re.findall(r"^    \./zenpark (sweep .*--optimize.*)$", GUIDE, re.MULTILINE)
     words = [word for word in shlex.split(line) if not word.startswith(("seeds=", "tuning="))]
     short = ["seeds=1:2", "tuning=1001:1006", "--set", "duration_s=1", "--anyway", "--no-report", "--out", "tuned"]
-    done = zenpark(installed, *words, *short)
+    done = zenpark(*words, *short)
     assert done.returncode == 0, done.stderr
     assert re.search(r"^event threshold=.*: keeps Way ratio <= 1.02$", done.stdout, re.MULTILINE)
 

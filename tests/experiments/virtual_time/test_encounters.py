@@ -24,15 +24,15 @@ def met(kinds, avoidance, each, **settings):
 
 
 def test_without_avoidance_robots_collide():
-    outcome = met(("turtlebot3", "turtlebot3"), None, 6, duration_s=12.0)
-    assert outcome.collided.sum() >= 6
+    outcome = met(("turtlebot3", "turtlebot3"), None, 3, duration_s=12.0)
+    assert outcome.collided.sum() >= 3
     assert outcome.gap.min() < -0.1
     assert outcome.arrived.all()
     assert not outcome.avoided.any()
 
 
 def test_barrier_keeps_robots_apart_until_arrival():
-    outcome = met(("khepera4", "tello"), BARRIER, 5, duration_s=20.0)
+    outcome = met(("khepera4", "tello"), BARRIER, 3, duration_s=20.0)
     assert outcome.gap.min() > 0.01
     assert outcome.arrived.all()
     assert (outcome.avoided > 0.0).any()
@@ -91,7 +91,7 @@ def test_robot_without_avoidance_is_avoided():
     assert whole.arrived.all()
 
 
-@pytest.mark.parametrize("seeds", [6, pytest.param(20, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("seeds", [3, pytest.param(20, marks=pytest.mark.nightly)])
 def test_four_kinds_change_sides(seeds):
     outcome = meet(encounter(FOUR, BARRIER), range(1, 1 + seeds))
     assert outcome.collided.sum() == 0
@@ -106,7 +106,7 @@ def test_four_kinds_change_sides(seeds):
     ],
 )
 def test_robots_with_sensors_alone_keep_clear(kind, sensors):
-    outcome = met((kind, kind), {"kind": "barrier"}, 4, sensors=sensors)
+    outcome = met((kind, kind), {"kind": "barrier"}, 2, sensors=sensors)
     assert outcome.collided.sum() == 0
     assert outcome.arrived.all()
 

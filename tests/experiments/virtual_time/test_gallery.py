@@ -25,6 +25,8 @@ from experiments.virtual_time.log import Logbook
 from experiments.virtual_time.simulation import simulate
 
 CASES = ("periodic", "event", "event-loss")
+NIGHTLY = pytest.mark.nightly
+EVERY_CASE = ["periodic", pytest.param("event", marks=NIGHTLY), "event-loss"]
 
 
 @cache
@@ -63,7 +65,9 @@ def test_events_save_messages():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("case", "most"), [("periodic", 1e-3), ("event", 3e-3), ("event-loss", 0.01)])
+@pytest.mark.parametrize(
+    ("case", "most"), [("periodic", 1e-3), pytest.param("event", 3e-3, marks=NIGHTLY), ("event-loss", 0.01)]
+)
 def test_aggregative_team_descends_linearly_to_its_optimum(case, most):
     """Both ends of a link compare what was said: by events the averages keep no error but the threshold's ripple.
 
@@ -88,7 +92,7 @@ def test_aggregative_team_descends_linearly_to_its_optimum(case, most):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", EVERY_CASE)
 def test_robots_fly_to_the_tasks_that_they_won(case):
     known = trace("auction", case)
     law, place = known.plan.experiment.formation.law, known.true_position[..., :2]
@@ -109,7 +113,7 @@ def test_robots_fly_to_the_tasks_that_they_won(case):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", EVERY_CASE)
 def test_consensus_meets_mean_at_the_graphs_rate(case):
     known = trace("consensus", case)
     offset = np.array([*known.plan.experiment.formation.law["offset"].values()])
@@ -203,7 +207,7 @@ def test_followers_go_into_the_hull_of_their_leaders():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", EVERY_CASE)
 @pytest.mark.parametrize("share", [0.6, 1.0, 1.2])
 def test_pursuit_meets_circles_or_leaves_by_its_angle(case, share):
     angle, gain, half = share * np.pi / 6.0, 0.3, np.pi / 6.0
@@ -229,7 +233,9 @@ def lag(known):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("case", "most"), [("periodic", 0.001), ("event", 0.005), ("event-loss", 0.008)])
+@pytest.mark.parametrize(
+    ("case", "most"), [("periodic", 0.001), pytest.param("event", 0.005, marks=NIGHTLY), ("event-loss", 0.008)]
+)
 def test_followers_of_a_constant_leader_do_not_lag(case, most):
     known = trace("leader-observer", case)
     window = (known.time > 20.0) & (known.time < 38.0)
@@ -268,7 +274,7 @@ def off_centroid(places):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", EVERY_CASE)
 def test_coverage_lowers_its_cost_and_ends_at_centroids(case):
     known = trace("coverage", case)
     ways = known.true_position[::25, :, :2]
@@ -287,7 +293,7 @@ def five_alone():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", EVERY_CASE)
 def test_coverage_makes_up_for_a_robot_landing_midflight(case):
     """The battery of CF06, a Crazyflie among Tellos, is low first."""
     others = tuple(f'robots.CF0{number}.kind="tello"' for number in range(1, 6))
@@ -339,7 +345,9 @@ def test_followers_without_any_leader_stop():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("case", "most"), [("periodic", 0.04), ("event", 0.05), ("event-loss", 0.08)])
+@pytest.mark.parametrize(
+    ("case", "most"), [("periodic", 0.04), pytest.param("event", 0.05, marks=NIGHTLY), ("event-loss", 0.08)]
+)
 def test_flock_keeps_spacing_velocity_and_rendezvous_of_mean(case, most):
     known = trace("flocking", case)
     place = known.true_position[..., :2]
@@ -392,7 +400,9 @@ def out_of_place(known):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("case", "most"), [("periodic", 0.002), ("event", 0.005), ("event-loss", 0.008)])
+@pytest.mark.parametrize(
+    ("case", "most"), [("periodic", 0.002), pytest.param("event", 0.005, marks=NIGHTLY), ("event-loss", 0.008)]
+)
 def test_integral_action_leaves_no_error_in_a_wind(case, most):
     known = trace("integral", case)
     late = known.time > 37.0
@@ -403,7 +413,7 @@ def test_integral_action_leaves_no_error_in_a_wind(case, most):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", EVERY_CASE)
 def test_integral_action_needs_no_leader_for_the_shape(case):
     text = index.find_file("integral").read_text()
     text = (
@@ -420,7 +430,7 @@ def test_integral_action_needs_no_leader_for_the_shape(case):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", EVERY_CASE)
 def test_displacement_keeps_an_error_in_a_wind(case):
     known = trace("integral", case, 'formation.law={ kind = "displacement" }')
     links = np.array([[2, 0, -1, 0], [0, 2, 0, -1], [-1, 0, 3, -1], [0, -1, -1, 2]])
@@ -445,7 +455,7 @@ def test_integral_stops_at_limit_and_for_held_robots():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", EVERY_CASE)
 def test_robots_enclose_a_target_that_two_see(case):
     known = trace("enclosing", case)
     place = known.true_position[..., :2]

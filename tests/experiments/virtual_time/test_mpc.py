@@ -2,6 +2,7 @@
 
 import sys
 from dataclasses import replace
+from functools import cache
 from math import cos, dist, nan, pi, sin
 from random import Random
 
@@ -64,6 +65,13 @@ def flown(starts, goals, *changes, case="periodic"):
     return Logbook(simulate(plan, plan.experiment.seed), plan, case).trace()
 
 
+@cache
+def swapped(swap, number, case="periodic"):
+    """Trace of robots that change places, and their goals [m]."""
+    starts, goals = swap(number)
+    return flown(starts, goals, case=case), goals
+
+
 def nearest(trace):
     """Least distance between any two robots [m]."""
     place = trace.true_position[..., :2]
@@ -77,12 +85,10 @@ def farthest(trace, goals):
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 @pytest.mark.parametrize("number", CASES)
 @pytest.mark.parametrize("swap", [opposite, random])
 def test_eight_robots_swap_places_without_contact(swap, number):
-    starts, goals = swap(number)
-    trace = flown(starts, goals)
+    trace, goals = swapped(swap, number)
     assert nearest(trace) > CONTACT
     assert farthest(trace, goals) < 0.05
 
@@ -108,14 +114,12 @@ def test_contacts_and_deadlocks_are_those_of_the_page(swap, changes, touching, w
 
 
 @pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.parametrize("case", ["event", "event-loss"])
+@pytest.mark.parametrize("case", [pytest.param("event", marks=pytest.mark.nightly), "event-loss"])
 def test_swap_by_events_and_with_losses(case):
-    starts, goals = opposite(0)
-    trace = flown(starts, goals, case=case)
+    trace, goals = swapped(opposite, 0, case)
     assert nearest(trace) > CONTACT
     assert trace.true_position[-1, :, :2] == pytest.approx(np.array(goals), abs=0.05)
-    assert len(trace.sent) < 0.7 * len(flown(starts, goals).sent)
+    assert len(trace.sent) < 0.7 * len(swapped(opposite, 0)[0].sent)
 
 
 ALONE = """

@@ -54,9 +54,11 @@ def track(case, seed, *changes):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("case", "most"), [("periodic", 1.1), ("event", 1.15), ("event-loss", 1.15)])
+@pytest.mark.parametrize(
+    ("case", "most"), [("periodic", 1.1), pytest.param("event", 1.15, marks=pytest.mark.nightly), ("event-loss", 1.15)]
+)
 def test_tracking_is_consistent_and_as_accurate_as_central(case, most):
-    runs = [track(case, seed) for seed in (1, 2, 3)]
+    runs = [track(case, seed) for seed in (1, 2)]
     own, central = (sum(run[k] for run in runs) / len(runs) for k in (0, 1))
     assert central < own < most**2 * central
     assert own < 0.05**2

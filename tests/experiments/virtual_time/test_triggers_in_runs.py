@@ -159,7 +159,7 @@ def test_updates_are_counted_for_each_robot(park):
 
 # ---------------------------------------------------------------- what it is good for
 
-SEEDS = range(1, 5)  # parameters were chosen on 1001 to 1010
+SEEDS = (1, 2)  # parameters were chosen on 1001 to 1010
 
 
 @pytest.fixture(scope="module")

@@ -212,7 +212,8 @@ def test_sensor_not_due_keeps_its_readings():
 )
 @pytest.mark.parametrize("scale", [1.0, 0.5])
 def test_noise_has_sigma_of_the_maker(kind, sensor, gap, sigma, scale):
-    readings = facing(kind, sensor, gap, scale, np.arange(100) * 0.25, robots=30)
+    robots = 4 if sensor == "lds01" else 30  # each with 360 beams
+    readings = facing(kind, sensor, gap, scale, np.arange(100) * 0.25, robots=robots)
     seen = readings[np.isfinite(readings)] - SENSORS[sensor].mount
     step = SENSORS[sensor].resolution
     expected = np.array([NormalDist(gap, sigma * scale).inv_cdf((k + 0.5) / 4000) for k in range(4000)])

@@ -1,22 +1,17 @@
 """Heights of the Crazyflie twin: figures of the maker's firmware, compiled and run on a rigid body."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from agents.protocols.crtp import Status
 from tests.twins.crazyflie_wire import DT, Wire
+from tests.twins.loopback import request
+from twins.devices.crazyflie.flock import Flock
+from twins.devices.device import Faults
 
 SHARE = 0.01  # of a height: settled
-
-
-def climb(height, span, platform="crazyflie", seconds=20.0):
-    """Heights of a take-off on every tick [m]."""
-    wire = Wire({"platform": platform})
-    if platform == "brushless":
-        wire.arm()
-        wire.wait(0.6)
-    assert wire.takeoff(height, span) == Status.OK
-    return heights(wire, seconds)
 
 
 def heights(wire, seconds, each=None):
@@ -28,14 +23,28 @@ def heights(wire, seconds, each=None):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("platform", ["crazyflie", "brushless"])
-@pytest.mark.parametrize(("height", "span"), [(0.5, 1.5), (0.8, 2.0), (1.0, 2.5), (1.0, 2.0), (2.0, 5.0)])
-def test_take_off_overshoots_and_returns(height, span, platform):
+def test_take_off_overshoots_and_returns():
     """By 7 to 11 %, for 10 to 15 s: the integral of the height was charged on the floor and on the way."""
-    reached = climb(height, span, platform)
-    assert 0.07 < reached.max() / height - 1.0 < 0.11
-    away = DT * np.flatnonzero(np.abs(reached / height - 1.0) > SHARE)[-1]
-    assert 10.0 < away < 15.0
+    climbs = [(0.5, 1.5), (0.8, 2.0), (1.0, 2.5), (1.0, 2.0), (2.0, 5.0)]
+    asked = request("crazyflie", ["x"] * 2 * len(climbs))
+    platforms = ({"platform": platform} for platform in ("crazyflie", "brushless") for _ in climbs)
+    flock = Flock(replace(asked, device=tuple(platforms)), Faults())
+    for row in range(5, 10):
+        assert flock.arm(row, on=True)
+    begin, at = 0.6, np.zeros(4)  # the motors of those that are armed spin up
+    for t in np.arange(DT, begin + DT / 2, DT):
+        flock.advance(t)
+    for row, (height, span) in enumerate(climbs * 2):
+        flock.planner.climb(row, flock.t, at, height=height, yaw=0.0, span=span, landing=False)
+    reached = []
+    for t in begin + np.arange(DT, 20.0, DT):
+        flock.advance(t)
+        reached.append(flock.quadrotor.position[:, 2].copy())
+    share = np.array(reached) / [height for height, _ in climbs * 2] - 1.0
+    assert (share.max(axis=0) > 0.07).all()
+    assert (share.max(axis=0) < 0.11).all()
+    for row in share.T:
+        assert 10.0 < DT * np.flatnonzero(np.abs(row) > SHARE)[-1] < 15.0
 
 
 @pytest.mark.slow
@@ -83,4 +92,6 @@ def test_second_flight_overshoots_as_the_first():
     wire.wait(9.0)
     assert not wire.motors
     assert wire.takeoff(0.8, 2.0) == Status.OK
-    np.testing.assert_allclose(heights(wire, 10.0), climb(0.8, 2.0, seconds=10.0), atol=1e-9)
+    first = Wire()
+    assert first.takeoff(0.8, 2.0) == Status.OK
+    np.testing.assert_allclose(heights(wire, 10.0), heights(first, 10.0), atol=1e-9)
