@@ -107,7 +107,7 @@ def test_installed_metric_is_swept(installed, zenpark):
 
 @pytest.mark.slow
 def test_installed_metric_is_a_limit_of_a_search(zenpark):
-    (line,) = re.findall(r"^    \./zenpark (sweep .*--optimize.*)$", GUIDE, re.MULTILINE)
+    (line,) = re.findall(r"^    \./zenpark (sweep .*--optimise.*)$", GUIDE, re.MULTILINE)
     words = [word for word in shlex.split(line) if not word.startswith(("seeds=", "tuning="))]
     short = ["seeds=1:2", "tuning=1001:1006", "--set", "duration_s=1", "--anyway", "--no-report", "--out", "tuned"]
     done = zenpark(*words, *short)
