@@ -147,25 +147,25 @@ class Status(Message, frozen=True):
     stamp: float  # [s] UTC
     phase: str  # of the lifecycle
     reason: str  # for the phase
-    body: str  # report of the body
-    battery: float | None  # charge, 0 to 1
-    sent: int  # poses
-    received: int  # poses of neighbours
-    lost: dict[str, int]  # by neighbour: samples that never arrived, by their sequence numbers
-    dropped: dict[str, int]  # by neighbour, if any: samples that the modelled channel dropped
-    malformed: int  # refused payloads
-    refused: int  # orders
-    ticks: int  # since the common start
-    missed: int  # ticks that were skipped
-    decisions: int  # ticks with a goal that was computed or received
-    interventions: int  # ticks on which safety changed the decision
-    avoided: int  # ticks on which avoidance changed goal or setpoint
-    late_s: float  # [s] largest lateness of a tick since the last status
-    started: float  # [s] UTC of the start of the experiment; 0 before
-    missing: list[str]  # neighbours that were never received, or are gone
-    pid: int
-    cpu_s: float
-    rss_mb: float
+    body: str = ""  # report of the body
+    battery: float | None = None  # charge, 0 to 1
+    sent: int = 0  # poses
+    received: int = 0  # poses of neighbours
+    lost: dict[str, int] = {}  # by neighbour: samples that never arrived, by their sequence numbers
+    dropped: dict[str, int] = {}  # by neighbour, if any: samples that the modelled channel dropped
+    malformed: int = 0  # refused payloads
+    refused: int = 0  # orders
+    ticks: int = 0  # since the common start
+    missed: int = 0  # ticks that were skipped
+    decisions: int = 0  # ticks with a goal that was computed or received
+    interventions: int = 0  # ticks on which safety changed the decision
+    avoided: int = 0  # ticks on which avoidance changed goal or setpoint
+    late_s: float = 0.0  # [s] largest lateness of a tick since the last status
+    started: float = 0.0  # [s] UTC of the start of the experiment; 0 before
+    missing: list[str] = []  # neighbours that were never received, or are gone
+    pid: int = 0
+    cpu_s: float = 0.0
+    rss_mb: float = 0.0
     origin: Setpoint | None = None  # start of the robot, or of its plan: x, y, z [m], yaw [rad]
     # worst present hazard and its outcome: "hold: minimum separation: 0.18 m from CF03 (limit 0.25 m)"
     hazard: str = ""
@@ -215,19 +215,19 @@ class CentreState(Message, frozen=True):
 
     stamp: float  # [s] UTC
     robots: list[str]  # guided
-    missing: list[str]  # needed, but never received, or gone
-    load: float  # share of a core in the last second
-    late_s: float  # [s] largest lateness of a decision in the last second
-    decisions: int
-    missed: int  # decisions that were skipped because they were late
-    goals: int  # sent
-    received: dict[str, int]  # poses
-    lost: dict[str, int]  # by their sequence numbers
-    dropped: dict[str, int]  # by the modelled channel
-    malformed: int
-    pid: int
-    cpu_s: float
-    rss_mb: float
+    missing: list[str] = []  # needed, but never received, or gone
+    load: float = 0.0  # share of a core in the last second
+    late_s: float = 0.0  # [s] largest lateness of a decision in the last second
+    decisions: int = 0
+    missed: int = 0  # decisions that were skipped because they were late
+    goals: int = 0  # sent
+    received: dict[str, int] = {}  # poses
+    lost: dict[str, int] = {}  # by their sequence numbers
+    dropped: dict[str, int] = {}  # by the modelled channel
+    malformed: int = 0
+    pid: int = 0
+    cpu_s: float = 0.0
+    rss_mb: float = 0.0
 
 
 class Command(Message, frozen=True):
@@ -278,11 +278,11 @@ class WorldState(Message, frozen=True):
     load: float  # share of the last second that was worked
     paused: bool
     robots: list[str]  # simulated here
-    mirrored: list[str]  # robots of other processes that are seen here
-    obstacles: list[ObstaclePose]
-    contacts: int
-    refused: int
-    malformed: int
+    mirrored: list[str] = []  # robots of other processes that are seen here
+    obstacles: list[ObstaclePose] = []
+    contacts: int = 0
+    refused: int = 0
+    malformed: int = 0
     trouble: str = ""
 
 

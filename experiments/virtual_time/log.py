@@ -193,19 +193,11 @@ class Logbook:
         return messages.CentreState(
             stamp=EPOCH + self._experiment.duration_s,
             robots=[name for name, reached in zip(names, goals.reached, strict=True) if reached],
-            missing=[],
-            load=0.0,
-            late_s=0.0,
             decisions=len(np.unique(goals.sent.stamp)),
-            missed=0,
             goals=len(goals.sent),
             received=dict(zip(names, goals.received.tolist(), strict=True)),
             lost=dict.fromkeys(names, 0),
             dropped=dict(zip(names, goals.dropped.tolist(), strict=True)),
-            malformed=0,
-            pid=0,
-            cpu_s=0.0,
-            rss_mb=0.0,
         )
 
     def _states(self) -> Iterator[tuple[float, list[messages.State]]]:
@@ -291,25 +283,15 @@ class Logbook:
                     stamp=EPOCH + end,
                     phase=phase,
                     reason=ends.get(row, FINISHED),
-                    body="",
-                    battery=None,
                     sent=int(sent[done][row]),
                     received=int(received[done][row]),
                     lost={log.names[s]: 0 for s in self._links.sender[mine].tolist()},
                     dropped={log.names[s]: n for s, n in each if n},
-                    malformed=0,
-                    refused=0,
                     ticks=log.ticks,
-                    missed=0,
                     decisions=int(log.updates[row]),
                     interventions=int(log.interventions[row]),
                     avoided=int(log.avoided[row]),
-                    late_s=0.0,
                     started=EPOCH,
-                    missing=[],
-                    pid=0,
-                    cpu_s=0.0,
-                    rss_mb=0.0,
                 )
 
     def _contacts(self) -> Iterator[messages.Contact]:
@@ -338,14 +320,11 @@ class Logbook:
                 load=0.0,
                 paused=False,
                 robots=list(log.names),
-                mirrored=[],
                 obstacles=[
                     messages.ObstaclePose(*each)
                     for each in zip(scene.names, map(tuple, log.obstacles[k].tolist()), strict=True)
                 ],
                 contacts=int(np.searchsorted(touched, t, side="right")),
-                refused=0,
-                malformed=0,
             )
 
     def _counts(self, row: Index, time: Array) -> tuple[Index, Index]:

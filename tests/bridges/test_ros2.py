@@ -302,30 +302,9 @@ class Realm:
 
     def status(self, name, body=""):
         status = messages.Status(
-            name,
-            time.time(),
-            "running",
-            "",
-            body,
-            0.75,
-            10,
-            20,
-            {"CF02": 1},
-            {},
-            0,
-            0,
-            100,
-            2,
-            50,
-            3,
-            0,
-            0.01,
-            0.0,
-            [],
-            1,
-            0.5,
-            30,
-        )
+            name, time.time(), "running", "", body, battery=0.75, sent=10, received=20, lost={"CF02": 1}, ticks=100,
+            missed=2, decisions=50, interventions=3, late_s=0.01, pid=1, cpu_s=0.5, rss_mb=30.0,
+        )  # fmt: skip
         self.out[name][1].put(messages.encode(status))
 
 

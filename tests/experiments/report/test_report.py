@@ -396,8 +396,7 @@ def test_verdict_names_collisions():
 def test_verdict_on_a_world_that_fell_behind():
     def paced(*factors, clock="real"):
         world = tuple(
-            WorldState(float(k), "pymunk", 0.0, factor, 0.1, factor == 0.0, [], [], [], 0, 0, 0)
-            for k, factor in enumerate(factors)
+            WorldState(float(k), "pymunk", 0.0, factor, 0.1, factor == 0.0, []) for k, factor in enumerate(factors)
         )
         return dataclasses.replace(side_by_side(), world=world, clock=clock)
 

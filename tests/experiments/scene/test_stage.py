@@ -19,14 +19,7 @@ from twins.scene import Obstacle
 
 
 def status(phase: str = "running", **fields: object) -> messages.Status:
-    zero = dict.fromkeys(
-        ("sent", "received", "malformed", "refused", "ticks", "missed", "decisions", "interventions", "avoided", "pid"),
-        0,
-    )
-    return messages.Status(
-        **{"robot": "CF01", "stamp": 0.0, "phase": phase, "reason": "", "body": "", "battery": None, "lost": {},
-           "dropped": {}, "late_s": 0.0, "started": 0.0, "missing": [], "cpu_s": 0.0, "rss_mb": 0.0, **zero, **fields}
-    )  # fmt: skip
+    return messages.Status(**{"robot": "CF01", "stamp": 0.0, "phase": phase, "reason": "", **fields})
 
 
 @pytest.fixture(scope="module")

@@ -168,10 +168,8 @@ class Stage:
     def phase(self, name: str, phase: str) -> None:
         assert phase in [each.word for each in Phase]
         self.robots[name].status = messages.Status(
-            robot=name, stamp=self.clock.utc(), phase=phase, reason="", body="", battery=None, sent=0, received=0,
-            lost={}, dropped={}, malformed=0, refused=0, ticks=0, missed=0, decisions=0, interventions=0, avoided=0,
-            late_s=0.0, started=0.0, missing=[], pid=self._pid, cpu_s=0.0, rss_mb=0.0,
-        )  # fmt: skip
+            robot=name, stamp=self.clock.utc(), phase=phase, reason="", pid=self._pid
+        )
 
     def told(self, name: str, order: str) -> None:
         if order == "leave":

@@ -27,9 +27,8 @@ WHEELS = Robot(kind="khepera4", start=[1.0, 0.0], body="khepera4://192.0.2.1")
 
 
 def status(**values) -> Status:
-    nothing = {str: "", int: 0, float: 0.0, dict[str, int]: {}, list[str]: []}
-    empty = {each.name: nothing.get(each.type) for each in msgspec.structs.fields(Status) if each.required}
-    return Status(**{**empty, "robot": "CF01", "phase": "ready", "battery": 0.9, **values})
+    known = {"robot": "CF01", "stamp": 0.0, "phase": "ready", "reason": "", "battery": 0.9}
+    return Status(**{**known, **values})
 
 
 def states(*places, yaw: float | None = 0.0) -> list[State]:
