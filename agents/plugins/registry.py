@@ -75,7 +75,7 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
 
 def names(group: str) -> list[str]:
     """Names registered in an entry-point group, sorted."""
-    return sorted(_registered(group))
+    return sorted(registered(group))
 
 
 def load(group: str, name: str) -> Any:  # noqa: ANN401 - what it is depends on the group
@@ -87,7 +87,7 @@ def load(group: str, name: str) -> Any:  # noqa: ANN401 - what it is depends on 
     """
     if files.is_choice(name):
         return _fitting(group, name, _in_file(name))
-    known = _registered(group)
+    known = registered(group)
     what = group.rpartition(".")[2]
     if name not in known:
         raise UnknownPlugin(f"no {name!r} among the {what}; {did_you_mean(name, sorted(known)) or 'none is installed'}")
@@ -136,7 +136,7 @@ def _in_file(name: str) -> Any:  # noqa: ANN401 - likewise
 
 def module(group: str, name: str) -> str:
     """Name of the module in which a plug-in that was loaded stands; raises KeyError for one that is not registered."""
-    return _registered(group)[name][0].module
+    return registered(group)[name][0].module
 
 
 def unusable(use: Callable[[str, str], object]) -> list[str]:
@@ -226,7 +226,7 @@ def distributions(text: str | None = None) -> dict[str, str]:
 def _foreign() -> list[tuple[EntryPoint, Distribution]]:
     """Entry points of other distributions than ours."""
     groups = (BODIES, DEVICES, METRICS, *CHOSEN)
-    entries = (entry for group in groups for entry in _installed().select(group=group))
+    entries = (entry for group in groups for entry in installed().select(group=group))
     return [(entry, entry.dist) for entry in entries if entry.dist is not None and _name(entry.dist) != "zenpark"]
 
 
@@ -245,16 +245,16 @@ def _name(distribution: Distribution) -> str:
 
 
 @cache
-def _installed() -> _Groups:
+def installed() -> _Groups:
     """Cached, and all groups at once: reading the metadata of all installed distributions takes milliseconds."""
     return entry_points()
 
 
 @cache
-def _registered(group: str) -> dict[str, list[EntryPoint]]:
+def registered(group: str) -> dict[str, list[EntryPoint]]:
     """Entry points of a group by name: one each, unless distributions register different objects under one name."""
     found: dict[str, list[EntryPoint]] = {}
-    for entry in _installed().select(group=group):
+    for entry in installed().select(group=group):
         same = found.setdefault(entry.name, [])
         if entry.value not in {each.value for each in same}:  # a distribution may be found twice, by two paths
             same.append(entry)
@@ -270,7 +270,7 @@ def _reason(error: BaseException) -> str:
 
 
 def _origin_of(group: str, name: str) -> str:
-    return f"plug-in {files.plain(name)!r}" if files.is_choice(name) else _origin(_registered(group)[name][0])
+    return f"plug-in {files.plain(name)!r}" if files.is_choice(name) else _origin(registered(group)[name][0])
 
 
 def _origin(entry: EntryPoint) -> str:

@@ -94,26 +94,26 @@ class Runtime:
         self._mime = messages.MIME[setup.encoding]
         self._dt = 1.0 / common.body_hz
         self._state_every = round(common.body_hz / setup.state_hz)
-        self._counts = Counts(len(self._names))
+        self.counts = Counts(len(self._names))
         self._state_slot = 0
         self._stopping: str | None = None
         self._retired: set[int] = set()  # rows that land, or have landed, while the run goes on
         self._cut_off = False  # motors were cut by a stop that the loop has not polled yet
         self._estimators = [External() for _ in self._names]
-        self._states: Sequence[BodyState] = ()  # last reading of the body
+        self.states: Sequence[BodyState] = ()  # last reading of the body
         self._opened = self._joined = False
-        self._ticks = Ticks(common.body_hz, clock=uptime)
+        self.ticks = Ticks(common.body_hz, clock=uptime)
         self._bell = pubsub.Bell() if setup.wake else None
         self._utc = 0.0
         self._keeper = NameKeeper(setup.keys, self._names, setup.clock.utc())
         self._reach = validation.reach_of(common.limits.low, common.limits.high)
         self._everyone = tuple(range(len(self._names)))
         self._descent = Descent(
-            self.robots, body, self._keeper, self._ticks,
+            self.robots, body, self._keeper, self.ticks,
             silence_s=setup.loop_timeout_s, alarm=self._call_for_help, recover=self._recover,
             timing=setup.descent,
         )  # fmt: skip
-        self._watchdog = self._descent.watchdog
+        self.watchdog = self._descent.watchdog
 
     def run(self) -> int:
         """Opens the body, joins the network, drives until all is done; returns the exit code of the process.
@@ -139,12 +139,12 @@ class Runtime:
                 rights=self._setup.rights,
             )
             out.callback(leave, session, self)
-            self._subscribe_to_stops(session)
+            self.subscribe_to_stops(session)
             self._keeper.claim(session, self._setup.endpoints, asked)
             out.callback(self._keeper.end)
             self._body.open()
             self._descent.register(out)
-            self._join(session)
+            self.join(session)
             self._loop(lambda: lifeline.reason if lost.is_set() else self._reason(asked.is_set()))
         return 0
 
@@ -153,11 +153,11 @@ class Runtime:
             return TOLD_TO_END
         return "ordered to leave" if len(self._orders.leaving) == len(self._names) else None
 
-    def _subscribe_to_stops(self, session: zenoh.Session) -> None:
+    def subscribe_to_stops(self, session: zenoh.Session) -> None:
         """Subscribes to emergency stops before the body is opened, which may take a minute."""
         self._estop = pubsub.ImmediateSubscriber(session, self._setup.keys.estop, self._cut)
 
-    def _join(self, session: zenoh.Session) -> None:
+    def join(self, session: zenoh.Session) -> None:
         self._opened = True
         keys, names = self._setup.keys, self._names
         self._session = self._descent.session = session
@@ -166,7 +166,7 @@ class Runtime:
         self._poses = [pubsub.pose_publisher(session, keys.pose(name), self._mime) for name in names]
         self._last = [pubsub.LastValue(session, keys.pose(name), self._mime) for name in names]
         self._orders = OrderDesk(
-            session, keys, self._setup.encoding, robots=self.robots, body=self._body, counts=self._counts,
+            session, keys, self._setup.encoding, robots=self.robots, body=self._body, counts=self.counts,
             on_start=self._align,
         )  # fmt: skip
         self._conductor = pubsub.AliveWatch(session, keys.conductor)
@@ -194,7 +194,7 @@ class Runtime:
             self._setup.encoding,
             robots=self.robots,
             neighbours=neighbours,
-            counts=self._counts,
+            counts=self.counts,
             malformed=self._malformed,
             ranged=[source == "body" for source in ranging],
             receipts=None if self._goals is None else self._goals.news,
@@ -209,17 +209,17 @@ class Runtime:
         self._descent.reason_to_end = stopping
         self._descent.await_ownership()  # opening the body may have taken long
         # one reading: a step of the wall clock in mid-run does not move the experiment
-        self._utc = self._telemetry.utc = self._setup.clock.at(self._ticks.start())
+        self._utc = self._telemetry.utc = self._setup.clock.at(self.ticks.start())
         self._joined = True
-        self._watchdog.start()
-        self._run_ticks(stopping)
+        self.watchdog.start()
+        self.run_ticks(stopping)
 
-    def _run_ticks(self, stopping: Callable[[], str | None]) -> None:
-        ticks, counts, farewell = self._ticks, self._counts, inf
+    def run_ticks(self, stopping: Callable[[], str | None]) -> None:
+        ticks, counts, farewell = self.ticks, self.counts, inf
         while True:
-            self._watchdog.beat()
-            if self._watchdog.tripped:
-                self._recover(self._watchdog.forgive())
+            self.watchdog.beat()
+            if self.watchdog.tripped:
+                self._recover(self.watchdog.forgive())
             self._wait(ticks.until_next())
             if self._cut_off:  # most stops come during that sleep
                 self._yield_after_stop()
@@ -233,7 +233,7 @@ class Runtime:
                 self._hold_after_suspend(missed * self._dt)
             t = ticks.t
             ticks.zero -= self._setup.clock.slew(self._dt)
-            self._tick(t)
+            self.tick(t)
             if farewell == inf and (reason := stopping()) is not None:
                 farewell = t + self._descent.limit_s
                 self._stopping = reason
@@ -250,7 +250,7 @@ class Runtime:
 
         A robot only knows more by that: it decides, sends and moves on its ticks.
         """
-        ticks, bell = self._ticks, self._bell
+        ticks, bell = self.ticks, self._bell
         if bell is None or ahead <= 0.0:
             time.sleep(ahead)
             return
@@ -261,9 +261,9 @@ class Runtime:
             # not by `until_next`: a wait that lasts too long delays its tick and skips none
             ahead = ticks.next - ticks.elapsed()
 
-    def _tick(self, t: float) -> None:
+    def tick(self, t: float) -> None:
         self._receive(t)
-        states = self._states = self._read(t)
+        states = self.states = self._read(t)
         try:
             running = self._decide(t, states)
         except FAILURES as error:
@@ -271,7 +271,7 @@ class Runtime:
             raise explain(error, plugins) from error
         if self._retired or not running:
             self._retire(t)
-        self._counts.ticks += 1
+        self.counts.ticks += 1
         slot = (self.robots[0].tick - 1) // self._state_every
         telemetry = self._telemetry
         if slot != self._state_slot:
@@ -296,7 +296,7 @@ class Runtime:
                 robot = self.robots[row]
                 if robot.believes(taken, position):
                     self._body.locate(row, taken, position, robot.believed_yaw(taken, yaw))
-        self._orders.answer(t, self._utc, self._states)
+        self._orders.answer(t, self._utc, self.states)
         for last in self._last:
             if last.waiting:
                 last.answer()
@@ -316,7 +316,7 @@ class Runtime:
 
     def _decide(self, t: float, states: Sequence[BodyState]) -> bool:
         """Let all robots decide, transmit and act; returns whether all are running, as before."""
-        counts, running, begun = self._counts, True, self.robots[0].decisions > 0
+        counts, running, begun = self.counts, True, self.robots[0].decisions > 0
         for row, robot in enumerate(self.robots):
             if robot.transmit(t, states[row]) and row not in self._retired:
                 self._send_pose(row, robot, states[row].yaw, t)
@@ -332,7 +332,7 @@ class Runtime:
         """Commands the body, motors-off first."""
         robots, body = self.robots, self._body
         stale = self._descent.await_ownership()
-        overruled = self._cut_off or self._watchdog.tripped  # another thread has ordered the body to stop or to land
+        overruled = self._cut_off or self.watchdog.tripped  # another thread has ordered the body to stop or to land
         stops = [row for row, robot in enumerate(robots) if robot.stops]
         lands = [row for row, robot in enumerate(robots) if robot.lands]
         if stops or lands:
@@ -350,9 +350,9 @@ class Runtime:
             body.stop(self._everyone)
 
     def _send_pose(self, row: int, robot: Robot, yaw: float, t: float) -> None:
-        self._counts.sent[row] += 1
+        self.counts.sent[row] += 1
         pose = messages.pose(
-            self._names[row], self._counts.sent[row], self._utc + t, robot.sent_position, robot.sent_velocity,
+            self._names[row], self.counts.sent[row], self._utc + t, robot.sent_position, robot.sent_velocity,
             yaw=yaw, words=robot.words,
         )  # fmt: skip
         payload = messages.encode(pose, self._setup.encoding)
@@ -363,7 +363,7 @@ class Runtime:
 
     def _align(self, at: float, t: float) -> None:
         """Aligns the ticks with a common start at `at` [s]: robots that start together decide together."""
-        self._ticks.align(at)
+        self.ticks.align(at)
         self._telemetry.due = t  # the central controller must know the start in time
 
     def _declare_tokens(self) -> None:
@@ -407,7 +407,7 @@ class Runtime:
     def _yield_after_stop(self) -> None:
         """Sleeps, so that other processes get the CPU to stop their motors."""
         ticks = ceil(STOP_YIELD_S / self._dt)
-        self._ticks.next += ticks * self._dt
+        self.ticks.next += ticks * self._dt
         for robot in self.robots:
             robot.tick += ticks
         time.sleep(STOP_YIELD_S)
@@ -421,7 +421,7 @@ class Runtime:
 
     def _hold_after_suspend(self, slept: float) -> None:
         """Holds position until neighbour poses are fresh again, after the loop was suspended for `slept` [s]."""
-        self.health.mark_resumed(self._ticks.t, slept)
+        self.health.mark_resumed(self.ticks.t, slept)
         print(f"{', '.join(self._names)}: stood still for {slept:.1f} s; holding", flush=True)
 
     def _cut_off_since(self, t: float) -> float:
@@ -440,7 +440,7 @@ class Runtime:
         if self._joined:
             self._telemetry.repeat_statuses(why, self._setup.clock.utc())
             # a loop that has recovered meanwhile keeps its tokens
-            self._keeper.withdraw(self._everyone, lambda: self._descent.begun or bool(self._watchdog.tripped))
+            self._keeper.withdraw(self._everyone, lambda: self._descent.begun or bool(self.watchdog.tripped))
 
     def _recover(self, why: str) -> None:
         """Lands the robots after the watchdog ordered it, although the loop runs again."""

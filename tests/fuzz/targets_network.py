@@ -66,8 +66,8 @@ def robot() -> Iterator[Target]:
         setup = Setup(KEYS, [], "json", 50.0, lifeline=False, located=[True], ranging=["world"])
         runtime = Runtime([Plan(experiment).assignment("KH01")], body, setup)
         body.open()
-        runtime._subscribe_to_stops(net.session)
-        runtime._join(net.session)
+        runtime.subscribe_to_stops(net.session)
+        runtime.join(net.session)
         runtime._utc = runtime._telemetry.utc = time.time()
         command = body.command
 
@@ -82,7 +82,7 @@ def robot() -> Iterator[Target]:
         def tick() -> None:
             nonlocal t
             t += 0.01
-            runtime._tick(t)
+            runtime.tick(t)
 
         began = runtime._utc
         for k in range(1, 6):

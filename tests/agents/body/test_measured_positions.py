@@ -72,18 +72,18 @@ def flown(
         setup = Setup(KEYS, [], "json", 50.0, lifeline=False, located=[True])
         runtime = Runtime([Plan(few).assignment("T")], body, setup)
         body.open()
-        runtime._subscribe_to_stops(net.session)  # type: ignore[arg-type]
-        runtime._join(net.session)  # type: ignore[arg-type]
+        runtime.subscribe_to_stops(net.session)  # type: ignore[arg-type]
+        runtime.join(net.session)  # type: ignore[arg-type]
         runtime._utc = runtime._telemetry.utc = UTC
         (robot,) = runtime.robots
         for tick in range(1, round(seconds / DT)):
             t = tick * DT
             if (off := ahead(t)) is not None:
-                seen = runtime._states[0].true_position if runtime._states else PLACE
+                seen = runtime.states[0].true_position if runtime.states else PLACE
                 measured = tuple(value + noise.gauss(0.0, 1e-4) for value in seen) if t < frozen_s else measured
                 place = messages.Position("T", UTC + t + off, measured, 0.0)
                 net.deliver(sent(KEYS.position("T"), place)[0])
-            runtime._tick(t)
+            runtime.tick(t)
             if robot.lifecycle.phase == Phase.READY:
                 robot.lifecycle.takeoff()
             worst = robot.hazards.worst()
@@ -134,7 +134,7 @@ def test_a_pose_that_repeats_itself_is_none(exact: list[int], expected: list[flo
 def test_frozen_motion_capture_lands_what_flies(frozen_s: float, phase: str) -> None:
     runtime, said = flown(lambda _: 0.0, frozen_s + 7.0, frozen_s)
     assert Phase(runtime.robots[0].lifecycle.phase).word == phase
-    assert runtime._states[0].note == FROZEN
+    assert runtime.states[0].note == FROZEN
     if frozen_s:
         (held, text), (landed, _), *_ = [each for each in said if "its own position is lost" in each[1]]
         assert text.startswith("hold: its own position is lost: the last is 0.5")

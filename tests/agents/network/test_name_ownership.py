@@ -305,16 +305,16 @@ def test_late_alarm_leaves_the_tokens(monkeypatch):
     with Net().worn() as net, monkeypatch.context() as patched:
         patched.setattr(pubsub, "alive_token", CountedToken)
         robot = Runtime([Plan(pair()).assignment(name) for name in "AB"], Airborne(), setup)
-        robot._subscribe_to_stops(net.session)
-        robot._join(net.session)
+        robot.subscribe_to_stops(net.session)
+        robot.join(net.session)
         robot._joined = True
         shown = [Keys().alive("A"), Keys().alive("B")]
         assert CountedToken.live == shown
-        robot._watchdog.tripped = "it hangs"
+        robot.watchdog.tripped = "it hangs"
         robot._call_for_help("it hangs")
         robot._call_for_help("it hangs")
         assert CountedToken.live == []
-        robot._recover(robot._watchdog.forgive())
+        robot._recover(robot.watchdog.forgive())
         assert CountedToken.live == shown
         robot._call_for_help("it hung")  # by a thread that was held up until the loop had recovered
         assert CountedToken.live == shown
@@ -322,10 +322,10 @@ def test_late_alarm_leaves_the_tokens(monkeypatch):
         assert CountedToken.live == shown
         robot._orders.leaving.add(0)
         robot.robots[0].lifecycle.land("ordered to leave")
-        robot._watchdog.tripped = "it hangs"
+        robot.watchdog.tripped = "it hangs"
         robot._call_for_help("it hangs")
         robot._retire(0.0)  # of a row whose token the alarm has taken back
-        robot._recover(robot._watchdog.forgive())
+        robot._recover(robot.watchdog.forgive())
         assert CountedToken.live == shown[1:]
 
 

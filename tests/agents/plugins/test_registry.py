@@ -60,8 +60,8 @@ def foreign(monkeypatch):
         EntryPoint("twice", "one:A", "test"),
         EntryPoint("twice", "two:B", "test"),
     ]
-    monkeypatch.setattr(registry, "_installed", lambda: SimpleNamespace(select=lambda group: listed))
-    monkeypatch.setattr(registry, "_registered", registry._registered.__wrapped__)
+    monkeypatch.setattr(registry, "installed", lambda: SimpleNamespace(select=lambda group: listed))
+    monkeypatch.setattr(registry, "registered", registry.registered.__wrapped__)
     return "test"
 
 
@@ -136,7 +136,7 @@ def test_name_that_zenpark_has_not_gets_the_nearest(monkeypatch, tmp_path):
     (tmp_path / "misled.py").write_text("from zenpark import law\n", "utf-8")
     monkeypatch.syspath_prepend(str(tmp_path))
     entry = EntryPoint("misled", "misled:Law", LAWS)
-    monkeypatch.setattr(registry, "_registered", lambda _: {"misled": [entry]})
+    monkeypatch.setattr(registry, "registered", lambda _: {"misled": [entry]})
     with pytest.raises(registry.PluginError, match="fails to import: zenpark has no 'law'; did you mean 'Law'"):
         registry.load(LAWS, "misled")
 
@@ -230,7 +230,7 @@ def failing():
 
 def test_foreign_culprit_is_named_with_its_line(monkeypatch):
     entry = SimpleNamespace(module=__name__, dist=Named("theirs"))
-    monkeypatch.setattr(registry, "_installed", lambda: SimpleNamespace(select=lambda group: [entry]))
+    monkeypatch.setattr(registry, "installed", lambda: SimpleNamespace(select=lambda group: [entry]))
     with pytest.raises(LookupError) as caught:
         failing()
     place = registry.culprit(caught.value)

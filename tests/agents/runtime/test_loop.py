@@ -45,16 +45,16 @@ def test_standstill_skips_ticks_and_holds(stands_s, missed, holds, monkeypatch, 
             Setup(Keys("park"), [], "json", 50.0, lifeline=False, located=[False]),
         )
         body.open()
-        runtime._subscribe_to_stops(net.session)
-        runtime._join(net.session)
-        tick = runtime._tick
+        runtime.subscribe_to_stops(net.session)
+        runtime.join(net.session)
+        tick = runtime.tick
 
         def worked(t):
             times.append(t)
             tick(t)
             now[0] += stands_s if len(times) == 5 else 0.001
 
-        monkeypatch.setattr(runtime, "_tick", worked)
+        monkeypatch.setattr(runtime, "tick", worked)
 
         def stopping():
             if len(times) < 12:
@@ -62,9 +62,9 @@ def test_standstill_skips_ticks_and_holds(stands_s, missed, holds, monkeypatch, 
             runtime.robots[0].lifecycle.phase = loop.Phase.DONE
             return "enough"
 
-        runtime._run_ticks(stopping)
+        runtime.run_ticks(stopping)
     assert times == pytest.approx([(k if k < 5 else k + missed) / HZ for k in range(12)])
-    assert runtime._counts.missed == missed
+    assert runtime.counts.missed == missed
     assert runtime.robots[0].tick == 12 + missed
     assert (f"stood still for {stands_s:.1f} s; holding" in capsys.readouterr().out) == holds
     assert (runtime.health.resumed_at == pytest.approx((5 + missed) / HZ)) == holds
@@ -102,9 +102,9 @@ class Stage:
         call(*args)
 
     def begin(self, net):
-        self.runtime._subscribe_to_stops(net.session)
+        self.runtime.subscribe_to_stops(net.session)
         self.body.open()
-        self.runtime._join(net.session)
+        self.runtime.join(net.session)
 
     def run(self, visit):
         """Ticks until `visit`, which is called before each with the phase, is true."""
@@ -116,7 +116,7 @@ class Stage:
             life.phase = int(Phase.DONE) if over[-1] else life.phase
             return "enough" if over[-1] else None
 
-        self.runtime._run_ticks(stopping)
+        self.runtime.run_ticks(stopping)
 
 
 @pytest.mark.parametrize(("kind", "after_s"), [("khepera4", [1.0, 10.0]), ("crazyflie", [10.0])])
@@ -167,7 +167,7 @@ def test_stop_during_command_has_last_word(phase, monkeypatch):
         stage.run(visit)
     assert len(stops) == 1
     assert [order for at, order in stage.orders if at >= stops[0]][-2:] == ["stop", "stop"]
-    assert not stage.body.read(stage.runtime._ticks.t + 0.01)[0].flying
+    assert not stage.body.read(stage.runtime.ticks.t + 0.01)[0].flying
 
 
 def test_stop_while_body_opens_keeps_it_down(monkeypatch):
@@ -178,11 +178,11 @@ def test_stop_while_body_opens_keeps_it_down(monkeypatch):
         return phase == Phase.DONE
 
     with Net().worn() as net:
-        stage.runtime._subscribe_to_stops(net.session)
+        stage.runtime.subscribe_to_stops(net.session)
         stage.runtime._estop._receive(Sample("park/estop", messages.JSON, b"{}"))
         assert stage.orders == [], "a closed body is left alone"
         stage.body.open()
-        stage.runtime._join(net.session)
+        stage.runtime.join(net.session)
         stage.run(visit)
     assert [order for _, order in stage.orders] == ["stop"]
     assert stage.runtime.robots[0].lifecycle.reason.startswith(messages.EMERGENCY)
@@ -221,7 +221,7 @@ def test_plugins_of_all_robots_are_named():
     setup = Setup(Keys("park"), [], "json", 50.0, lifeline=False, located=[False, False])
     with Net().worn() as net:
         runtime = Runtime(assignments, assemble(bodies.body_request(plan, ("A", "B"), 1)), setup)
-        runtime._subscribe_to_stops(net.session)
-        runtime._join(net.session)
+        runtime.subscribe_to_stops(net.session)
+        runtime.join(net.session)
         with pytest.raises(PluginError, match="the trigger Faulty failed: AttributeError"):
-            runtime._tick(0.01)
+            runtime.tick(0.01)

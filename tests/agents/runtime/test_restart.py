@@ -148,17 +148,17 @@ def test_repeated_start_keeps_the_ticks():
     setup = Setup(Keys("park"), [], "json", 50.0, lifeline=False, located=[False])
     with Net().worn() as net:
         robot = Runtime([Plan(pair()).assignment("A")], Airborne(), setup)
-        robot._subscribe_to_stops(net.session)
-        robot._join(net.session)
-        robot._utc, robot._ticks.t, robot._ticks.next = UTC, 7.0, 7.01
+        robot.subscribe_to_stops(net.session)
+        robot.join(net.session)
+        robot._utc, robot.ticks.t, robot.ticks.next = UTC, 7.0, 7.01
 
         def start(at: float) -> None:
             net.deliver(sent("park/A/order", messages.Order("start", at=UTC + at))[0])
-            robot._orders.answer(robot._ticks.t, UTC, ())
+            robot._orders.answer(robot.ticks.t, UTC, ())
 
         robot.robots[0].lifecycle.phase = AIRBORNE
         start(7.504)
-        assert robot._ticks.next == pytest.approx(7.004)
+        assert robot.ticks.next == pytest.approx(7.004)
         robot.robots[0].lifecycle.phase = RUNNING
         start(7.508)
-        assert robot._ticks.next == pytest.approx(7.004)
+        assert robot.ticks.next == pytest.approx(7.004)

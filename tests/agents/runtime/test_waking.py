@@ -63,12 +63,12 @@ class Stage:
 
     def run(self, ticks):
         runtime = self.runtime
-        runtime._subscribe_to_stops(self.net.session)
+        runtime.subscribe_to_stops(self.net.session)
         self.body.open()
-        runtime._join(self.net.session)
+        runtime.join(self.net.session)
         runtime._utc = runtime._setup.clock.utc()
         (neighbour,) = runtime.robots[0].neighbours.all
-        deliver, tick = runtime._neighbours.deliver, runtime._tick
+        deliver, tick = runtime._neighbours.deliver, runtime.tick
 
         def delivered(t, utc):
             deliver(t, utc)
@@ -79,7 +79,7 @@ class Stage:
             tick(t)
             self.ticks.append(t)
 
-        runtime._neighbours.deliver, runtime._tick = delivered, ticked
+        runtime._neighbours.deliver, runtime.tick = delivered, ticked
 
         def stopping():
             if len(self.ticks) < ticks:
@@ -87,7 +87,7 @@ class Stage:
             runtime.robots[0].lifecycle.phase = int(Phase.DONE)
             return "enough"
 
-        runtime._run_ticks(stopping)
+        runtime.run_ticks(stopping)
 
 
 @pytest.mark.parametrize(("wake", "known"), [(True, [0.013, 0.016, 0.052]), (False, [0.02, 0.06])])
@@ -98,7 +98,7 @@ def test_pose_between_ticks_wakes_loop(wake, known, monkeypatch):
     assert stage.known == pytest.approx(known)
     assert stage.ticks == pytest.approx([k / HZ for k in range(10)])
     assert stage.runtime.robots[0].tick == 10
-    assert stage.runtime._counts.missed == 0
+    assert stage.runtime.counts.missed == 0
 
 
 def test_stopped_robot_is_not_woken(monkeypatch):

@@ -160,9 +160,9 @@ class Listing(Steep, frozen=True):
 
 
 def test_uncompiled_law_is_noted_once(monkeypatch):
-    installed = registry._registered
+    installed = registry.registered
     mine = {registry.LAWS: {"mine": [EntryPoint("mine", f"{__name__}:Listing", registry.LAWS)]}}
-    monkeypatch.setattr(registry, "_registered", lambda group: installed(group) | mine.get(group, {}))
+    monkeypatch.setattr(registry, "registered", lambda group: installed(group) | mine.get(group, {}))
     found = [each for each in check(document.read(TRIANGLE, ["formation.law=mine"])) if each.code == "uncompiled"]
     assert [each.severity for each in found] == ["note"]
     assert "Listing.error uses" in found[0].message
@@ -183,9 +183,9 @@ def test_uncompiled_law_is_noted_once(monkeypatch):
     ],
 )
 def test_remedy_for_a_users_law_names_the_law(monkeypatch, law, code, message, remedy):
-    installed = registry._registered
+    installed = registry.registered
     mine = {registry.LAWS: {"mine": [EntryPoint("mine", f"{__name__}:{law}", registry.LAWS)]}}
-    monkeypatch.setattr(registry, "_registered", lambda group: installed(group) | mine.get(group, {}))
+    monkeypatch.setattr(registry, "registered", lambda group: installed(group) | mine.get(group, {}))
     found = bad(TRIANGLE, "formation.law=mine", "duration_s=1")[code]
     assert message in found[1]
     assert remedy in found[2]

@@ -182,9 +182,9 @@ class Undescribed(msgspec.Struct, frozen=True):
 
 @pytest.mark.parametrize("foreign", [[], [metadata.EntryPoint("clamped", f"{__name__}:Undescribed", registry.LAWS)]])
 def test_schema_describes_every_field_of_zenpark(monkeypatch, foreign):
-    installed = registry._registered
+    installed = registry.registered
     more = {registry.LAWS: {entry.name: [entry] for entry in foreign}}
-    monkeypatch.setattr(registry, "_registered", lambda group: installed(group) | more.get(group, {}))
+    monkeypatch.setattr(registry, "registered", lambda group: installed(group) | more.get(group, {}))
     own = {entry.name for entry in metadata.distribution("zenpark").entry_points}
 
     def undescribed(node, path):

@@ -149,12 +149,12 @@ def test_word_that_is_no_key_finds_related_keys(word, key):
 @pytest.fixture
 def broken(monkeypatch):
     """A registered law without its module."""
-    entry, listed = EntryPoint("broken", "no_such_module_anywhere:Law", registry.LAWS), registry._registered
+    entry, listed = EntryPoint("broken", "no_such_module_anywhere:Law", registry.LAWS), registry.registered
 
     def with_it(group):
         return {**listed(group), "broken": [entry]} if group == registry.LAWS else listed(group)
 
-    monkeypatch.setattr(registry, "_registered", with_it)
+    monkeypatch.setattr(registry, "registered", with_it)
     reference.entries.cache_clear()
     yield
     reference.entries.cache_clear()
