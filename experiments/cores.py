@@ -22,7 +22,7 @@ def cores() -> int:
 
 @contextmanager
 def pool(count: int) -> Iterator[ProcessPoolExecutor]:
-    """So many processes, started as the work comes in; the end of the block ends them, and their work."""
+    """Pool of `count` processes, started as the work comes in; the end of the block ends them, and their work."""
     others = frozenset(multiprocessing.active_children())
     context = multiprocessing.get_context("spawn")  # a fork would take our threads' locks along
     before = {name: os.environ[name] for name in ONE_THREAD if name in os.environ}

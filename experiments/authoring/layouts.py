@@ -65,8 +65,9 @@ def grid(rows: int, columns: int, spacing: float) -> Layout:
 def hemisphere(count: int, spacing: float, apart: float) -> Layout:
     """`count` robots spread evenly over a hemisphere, linked by its Delaunay triangulation.
 
-    The links are those of the Delaunay triangulation on the sphere: points that are projected stereographically from
-    the opposite pole have the same one in the plane, because circles of the sphere become circles. Blunt triangles of
+    The links are those of the Delaunay triangulation on the sphere. Points that are projected stereographically from
+    the opposite pole have the same triangulation in the plane, because circles of the sphere become circles. Blunt
+    triangles of
     the rim are left out: their long sides would only make the formation slower.
 
     Args:

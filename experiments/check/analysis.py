@@ -86,7 +86,7 @@ class Analysis:
 
     @property
     def law(self) -> Gradient:
-        """The law, for those who know that it is a gradient."""
+        """The law, for callers that know it as a gradient."""
         return cast(Gradient, self.plan.law)
 
     @property
@@ -114,7 +114,7 @@ class Analysis:
 
     @property
     def limits(self) -> Limits:
-        """Limits of every robot, but for `hold_s`."""
+        """Limits of every robot, except `hold_s`."""
         return self.plan.limits(self.names[0])
 
     @property

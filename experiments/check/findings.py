@@ -76,7 +76,7 @@ class Figures(msgspec.Struct, frozen=True, kw_only=True):
     pose_bytes: int  # payload of one pose, its numbers at their longest
     words_bytes: int  # of these what the law says
     pose_kbit_s: float  # payload of one robot at the largest rate of its trigger [kbit/s]
-    predicted_s: float  # how much of the run was predicted
+    predicted_s: float  # share of the run that was predicted
 
 
 def join_names(words: Sequence[str], most: int = 4) -> str:

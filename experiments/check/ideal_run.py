@@ -28,7 +28,7 @@ from twins.arrays import Array, norm
 FAR: Final = 1e6  # [m] walls that no robot meets
 WORK: Final = 2.2e5  # robot ticks that are flown, of 10 to 20 µs each: 310 s of seven robots, 2 s of a thousand
 FLIGHTS: Final = 2  # of a check: without noise, and with it
-SPEED_UP: Final = 15.0  # so many times as much where compiled functions fly them: 33 s of a thousand
+SPEED_UP: Final = 15.0  # factor of the work that compiled functions fly: 33 s of a thousand
 STEPS_HZ: Final = 100.0  # steps of a drone's model between two decisions
 ROUNDED: Final = 1e-9  # of eigenvalues
 REPETITIONS: Final = 5  # flights with noise, each with another seed
@@ -45,7 +45,7 @@ class Prediction:
     messages_hz: float = (
         0.0  # transmissions of all robots with the noise of the experiment, which makes robots transmit
     )
-    velocities: tuple[bool, ...] = ()  # (N) robots whose law ordered a velocity at its last step; empty where stuck
+    velocities: tuple[bool, ...] = ()  # (N) robots with a velocity from the last step of their law; empty if stuck
     stuck: str = ""  # reason why the run does not begin; the robots stay at their starts then
     noisy: Prediction | None = None  # the flight beside it with the noise of the experiment and its seed, if there was
 
@@ -127,7 +127,7 @@ def isolated(plan: Plan) -> Plan:
 
 
 def _work(bare: Plan, ticks: float) -> float:
-    """Robot ticks that are flown of so many."""
+    """Robot ticks that are flown, of `ticks`."""
     most = SPEED_UP * WORK
     if FLIGHTS * stretch.TICK_S * min(ticks, most) < stretch.COMPILES_S:  # to compile would take longer
         return WORK

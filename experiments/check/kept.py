@@ -1,7 +1,7 @@
-"""Verdicts of earlier checks, kept in the user's cache folder: what has not changed need not be flown again.
+"""Verdicts of earlier checks, kept in the user's cache folder: an unchanged experiment need not be flown again.
 
-A verdict holds only while everything it rests on is the same to the letter: the experiment file and the TOML files
-beside it, the `--set` and the cases, the code of zenpark and of every plug-in, and what is installed.
+A verdict holds only while all its inputs are the same to the letter. These are the experiment file and the TOML files
+beside it, `--set` and the cases, the code of zenpark and of every plug-in, and the installed packages.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ class KeptVerdict:
                 old.unlink()
 
     def _place(self) -> Path | None:
-        """Its file; None where something cannot be read, or a text is no longer the same."""
+        """File of the verdict; None if an input cannot be read, or a text has changed."""
         if self._texts is None or self._code is None or self._read_texts() != self._texts:
             return None
         key = repr((self._asked, self._texts, self._code)).encode("utf-8", "backslashreplace")
@@ -131,7 +131,7 @@ def _plugins() -> Iterator[EntryPoint]:
 
 
 def _importable(path: str) -> Iterator[tuple[str, int]]:
-    """Names in a folder of modules; of distributions, whose name has their version, when they were installed [ns]."""
+    """Names in a folder of modules; of distributions, named with their version, also the time of installation [ns]."""
     with suppress(OSError), os.scandir(path or ".") as entries:
         for each in entries:
             if not each.name.startswith(".") and each.name not in UNCOUNTED:

@@ -55,7 +55,7 @@ def starts(analysis: Analysis) -> Iterator[Finding]:
 
 
 def flight(analysis: Analysis) -> Iterator[Finding]:
-    """Report what stopped or disturbed the ideal run, and how much of it was flown."""
+    """Report disturbances or the stop of the ideal run, and the share of it that was flown."""
     experiment, prediction = analysis.plan.experiment, analysis.prediction
     if prediction.stuck:
         message = f"the run does not begin, even undisturbed: {prediction.stuck}"
@@ -194,7 +194,7 @@ def anchors(analysis: Analysis) -> Iterator[Finding]:
 
 
 def _on_the_wrong_side(analysis: Analysis) -> tuple[str, str] | None:
-    """Robots whose end is the mirror image of their place in the shape, and what to do; None if that does not help."""
+    """Robots that end at the mirror image of their place in the shape, and the remedy; None if it does not help."""
     end, links = analysis.prediction.position[-1], analysis.asked.take(analysis.standing)
     moves = np.ones(len(end), dtype=bool)
     moves[analysis.without_neighbours] = False

@@ -14,8 +14,8 @@ from experiments.check.ideal_run import fly, has_noise, isolated, repetitions
 from experiments.check.theory import FAR_OFF, strength
 from experiments.metrics.measurement import WINDOW_S
 
-SOFT: Final = 3.0  # time constants of a mode, of whose error 5 % are left then, that are to fit into the run
-LATER: Final = 2.0  # times the time without noise, from which on a formation is acquired late
+SOFT: Final = 3.0  # time constants of a mode that must fit into the run: 5 % of its error are left then
+LATER: Final = 2.0  # multiple of the time without noise above which a formation is acquired late
 NARROW: Final = 0.6  # of the tolerance: noise may move a link that is farther off out of it
 WITHOUT: Final = {  # findings that noise may refute: what robots do without it
     "acquired-late": "are late",
@@ -48,7 +48,7 @@ class Flights:
         return [at for each in self.flown if (at := each.acquired_for_good) is not None]
 
     def enough(self, number: int) -> bool:
-        """Whether so many flights are more than chance.
+        """Whether `number` failed flights are more than chance.
 
         One of five may be: of such experiments one in four was lost with other seeds.
         """
@@ -62,9 +62,9 @@ def span_of(times: list[float]) -> str:
 
 
 def with_noise(analysis: Analysis, finding: Finding) -> Finding:
-    """A finding that the formation is not acquired, held against flights with noise; the good news if all acquire it.
+    """Finding of a formation that is not acquired, after flights with noise; the good news if all acquire it.
 
-    A trigger or the wheels leave robots alone whose errors are small. Noise moves them on.
+    A trigger or the wheels leave robots with small errors alone. Noise moves them on.
     """
     if finding.code not in WITHOUT or not has_noise(analysis.plan):
         return finding
@@ -94,7 +94,7 @@ def acquired_note(analysis: Analysis, formed: float, left: str) -> Finding:
 def softness(analysis: Analysis) -> Iterator[Finding]:
     """Check that a formation that is acquired without noise is also acquired, and in time, with that of its file.
 
-    Flown with more seeds are those whose flight with noise beside the ideal one is late, and those that are soft.
+    Experiments with a late flight with noise, and soft ones, are flown with more seeds.
     """
     experiment, loop, shape = analysis.plan.experiment, analysis.modes, analysis.shape
     formed = analysis.acquired_for_good

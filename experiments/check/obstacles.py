@@ -131,7 +131,7 @@ def reality(analysis: Analysis) -> Iterator[Finding]:
     for name, robot in robots.items():
         served, path = robot.ranges == "world", ("robots", name, "ranges")
         if served and robot.body == WORLD:
-            message = f'{name} lives in the world, whose range sensors are its own: ranges = "world" adds nothing'
+            message = f'{name} lives in the world and has its range sensors anyway: ranges = "world" adds nothing'
             yield Finding("warning", "ranges-twice", message, "leave ranges out", path)
         elif served and not _sensors(robot):
             message = f"{name} has no range sensors that the world could serve"
@@ -154,7 +154,7 @@ def _sensors(robot: Robot) -> tuple[str, ...]:
 
 
 def _heights(analysis: Analysis, z: Array) -> tuple[Array, Array]:
-    """Lower and upper end (..., N) of robots whose position is at `z` (..., N) [m]."""
+    """Lower and upper end (..., N) of robots at positions `z` (..., N) [m]."""
     kinds = analysis.kinds
     height = np.array([kind.height for kind in kinds])
     low = np.where([kind.flies for kind in kinds], z - 0.5 * height, 0.0)

@@ -196,14 +196,14 @@ def find_shapes(
     *,
     solids: Solids | None = None,
 ) -> list[Shape]:
-    """Places where links and anchors have what they ask for, one for each guess, until one is good.
+    """Shapes that meet the targets of links and anchors, one for each guess, until one is good.
 
     Args:
-        links: With what they ask for, see `targets_of_law`.
+        links: With their targets, see `targets_of_law`.
         guesses: (N, 3) each [m].
         moves: (N,) rows that may be placed elsewhere in the plane.
-        climbs: (N,) rows whose heights are free as well; the others are held where they are.
-        solids: Robots of which none may stand in another.
+        climbs: (N,) rows with free heights as well; the others keep theirs.
+        solids: Robots that must not overlap.
 
     Returns:
         The shapes that were found, in the order of the guesses; only the last one may be good.
@@ -211,7 +211,7 @@ def find_shapes(
     found, free = list[Shape](), np.column_stack([moves, moves, np.zeros_like(moves) if climbs is None else climbs])
     for guess in guesses:
         shape = fitted_shape(links, anchors, guess, free)
-        if solids is not None and shape.worst <= OFF:  # of another shape nobody asks
+        if solids is not None and shape.worst <= OFF:  # for other shapes it does not matter
             shape = replace(shape, overlaps=solids.overlaps(shape.position))
         found.append(shape)
         if shape.good:
@@ -249,7 +249,7 @@ def unfold_distances(links: Links, height: Array) -> Array:
 
 @np.errstate(
     over="ignore", invalid="ignore"
-)  # too far a step, or too high a height, is no better, whatever it comes to
+)  # too far a step, or too high a height, is no better, in spite of its result
 def fitted_shape(links: Links, anchors: Anchored, guess: Array, free: Mask) -> Shape:
     """Least squares of the residuals from a guess (N, 3) [m], by Levenberg's and Marquardt's method.
 
@@ -338,7 +338,7 @@ def _mirror(point: Array, left: Array, right: Array) -> Array:
 class Conflict(NamedTuple):
     """Distances that contradict one another whatever the rest of the formation does."""
 
-    # two robots whose heights alone are farther apart than they should be, or the three of a triangle
+    # two robots with a difference of heights beyond their distance, or the three of a triangle
     rows: tuple[int, ...]
     ceiling: float  # height of the higher ones at which they would just be met [m]; NaN where no height would do
     high: tuple[int, ...]  # the rows of the higher ones
@@ -391,7 +391,7 @@ class Contradiction(NamedTuple):
 
 
 def contradictions(links: Links) -> list[Contradiction]:
-    """Rings of links by relative position whose vectors do not add up to zero, the shortest rings first."""
+    """Rings of links by relative position with vectors that do not add up to zero, the shortest rings first."""
     if links.wants is None or links.relative is None:
         return []
     here = [
@@ -428,8 +428,8 @@ def formation_rigidity(
     """Infinitesimal rigidity when heights are held, and in full space if all links ask for distances.
 
     Leaders (rows `led`) keep their places among themselves by their plans, so a bar stands between any two of them.
-    Where links ask for more than distances, or robots are anchored, the formation is rigid if nothing moves it but
-    translations, a rotation and a growth: as many of those as they leave free.
+    If links have targets other than distances, or robots are anchored, some translations, a rotation and a growth may
+    be left free. The formation is rigid if no other motion leaves the links satisfied.
     """
     pairs = np.array([(i, j) for i in led for j in led if i < j], dtype=np.intp).reshape(-1, 2)
     if links.wants is not None or anchors:

@@ -33,7 +33,7 @@ def safety(analysis: Analysis) -> Iterator[Finding]:
 
 
 def batteries(analysis: Analysis) -> Iterator[Finding]:
-    """Report all robots whose battery ends before the run, by their kinds."""
+    """Report all robots with a battery that ends before the run, by their kinds."""
     experiment, low = analysis.plan.experiment, analysis.plan.experiment.safety.battery_low
     if low <= 0.0:
         return
@@ -87,7 +87,7 @@ def _separation(analysis: Analysis, limit: float) -> Iterator[Finding]:
 
 
 def libraries(analysis: Analysis) -> Iterator[Finding]:
-    """Report bodies of robots of this machine whose library is missing."""
+    """Report bodies of robots of this machine with a missing library."""
     experiment = analysis.plan.experiment
     elsewhere = {name for host in experiment.hosts.values() for name in host.robots}
     for name, robot in experiment.robots.items():

@@ -19,8 +19,8 @@ from twins.arrays import Array, Index, norm
 
 STEP: Final = 1e-4  # [m] of the differences that stand for the law's derivative
 STANDING: Final = 1e-6  # modes slower than the fastest by this factor do not move at all
-UNMOVED: Final = 1e-6  # of the fastest: a motion of the whole that the law answers by less is none of its business
-EVEN: Final = 1e-9  # of the fastest: a loop that is symmetric but for this has real modes, which are quicker to find
+UNMOVED: Final = 1e-6  # of the fastest: the law ignores a motion of the whole with a smaller answer
+EVEN: Final = 1e-9  # of the fastest: a loop that is symmetric up to this has real modes, which are quicker to find
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Modes:
     # largest real part of the eigenvalues of H M, what a decision takes from a mode, with the h of robots that bear as
     # much as those of `bearable`: the loop is unstable from 2
     gain: float
-    radius: float  # largest |1 − λ| of modes whose sign stays: above 1 something grows
+    radius: float  # largest |1 − λ| of modes that keep their sign: above 1 one of them grows
     slowest_s: float  # time constant of the slowest mode that moves [s]; infinity where none does
     # modes that decay more slowly than was asked for, or not at all: in that time nothing brings them back
     free: int = 0
@@ -47,11 +47,11 @@ def modes(
     anchors: Anchored = (),
     within_s: float = math.inf,
 ) -> Modes:
-    """Eigenvalues of p⁺ = p + H u(p) at `position`, over x and y of the robots that listen.
+    """Eigenvalues of p⁺ = p + H u(p) at `position`, over x and y of the robots with incoming links.
 
-    Translations and rotations of which the law knows nothing are taken out before: left in, their rounded zeros would
-    pass for modes of hours. A law that knows no heading turns its answer with the whole, u(R p) = R u(p); where
-    distances were rounded, u is not 0 at the best shape, and a rotation is not left alone but answered by just that.
+    Translations and rotations that the law ignores are taken out before: left in, their rounded zeros would pass for
+    modes of hours. A law without a heading turns its answer with the formation, u(R p) = R u(p). With rounded distances
+    u is not 0 at the best shape, and a rotation gets exactly that answer.
 
     Args:
         law: Its pull is differentiated numerically.
@@ -88,7 +88,7 @@ def modes(
 
 
 def _eigenvalues(matrix: Array) -> NDArray[np.complex128]:
-    """Eigenvalues; real ones of a matrix that is symmetric but for `EVEN`."""
+    """Eigenvalues; real ones of a matrix that is symmetric up to `EVEN`."""
     scale = float(np.abs(matrix).max(initial=0.0))
     if np.abs(matrix - matrix.T).max(initial=0.0) <= EVEN * scale:
         return np.linalg.eigvalsh(0.5 * (matrix + matrix.T)).astype(complex)

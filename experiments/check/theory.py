@@ -159,7 +159,7 @@ def offsets(analysis: Analysis) -> Iterator[Finding]:
 
 
 def _contradictions(analysis: Analysis, severity: Severity, more: str = "") -> Iterator[Finding]:
-    """Finding on the shortest ring of links whose offsets do not add up."""
+    """Finding on the shortest ring of links with offsets that do not add up."""
     for ring in contradictions(analysis.asked.take(analysis.standing))[:1]:
         names = [analysis.names[row] for row in ring.rows]
         way = f"around {join_names([*names, names[0]], 8)}" if len(names) > 2 else f"between {names[0]} and {names[1]}"

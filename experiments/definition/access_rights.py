@@ -18,7 +18,7 @@ from agents.protocols import turtlebot3
 from experiments.definition.experiment import VICON_TWIN, WORLD, Robot
 from experiments.definition.plan import Plan
 
-FAR: Final = ("external", WORLD)  # bodies whose poses come from the process that carries them
+FAR: Final = ("external", WORLD)  # bodies with poses from the process that carries them
 MANY: Final = 16  # senders from which on the right is "*", if they are all robots: a router reads N² keys for minutes
 ROS: Final = ("ros2dds", "rmw")
 ROS_TWIN: Final = "turtlebot3-twin"
@@ -33,7 +33,7 @@ def rights(cases: Iterable[Plan]) -> Rights:
 
 
 def needed_identities(plan: Plan, operator: str = "operator") -> list[str]:
-    """Identities whose certificates a run needs on the machine that starts it."""
+    """Identities with certificates that a run needs on the machine that starts it."""
     experiment = plan.experiment
     robots = experiment.robots.values()
     abroad = {robot for host in experiment.hosts.values() for robot in host.robots}

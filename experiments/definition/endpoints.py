@@ -1,4 +1,4 @@
-"""Endpoints of the routers of an experiment, and the lab whose certificates they ask for."""
+"""Endpoints of the routers of an experiment, and the lab of the certificates that they demand."""
 
 from __future__ import annotations
 

@@ -34,8 +34,8 @@ class Part(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 class StartBox(Part, frozen=True):
     """Part of the floor where robots may start."""
 
-    at: Annotated[Planar, Meta(description="its middle, x, y [m]")]
-    size: Annotated[tuple[Positive, Positive], Meta(description="x, y [m]")]
+    at: Annotated[Planar, Meta(description="centre x, y [m]")]
+    size: Annotated[tuple[Positive, Positive], Meta(description="width along x and y [m]")]
 
 
 class Shadow(Part, frozen=True):
@@ -43,21 +43,23 @@ class Shadow(Part, frozen=True):
 
     restart_s: Annotated[
         Positive | None,
-        Meta(description="the twin is put onto the robot this often [s]; left out: once, at the common start"),
+        Meta(description="period at which the twin is reset to the robot [s]; left out: once, at the common start"),
     ] = 5.0
 
 
 class Arena(Part, frozen=True):
     """Box that the robots must not leave: centred on the origin, floor at z = 0."""
 
-    size: Annotated[Spatial, Meta(description="x, y, z [m]")] = (4.0, 4.0, 2.5)
+    size: Annotated[Spatial, Meta(description="size along x, y, z [m]")] = (4.0, 4.0, 2.5)
     file: Annotated[
-        str | None, Meta(description="an arena file whose [arena] this one begins with; beside the experiment file")
+        str | None, Meta(description="arena file, beside the experiment file; its [arena] is the base of this one")
     ] = None
-    walls: Annotated[bool, Meta(description="its border is a wall: robots touch it, range sensors see it")] = True
-    obstacles: Annotated[dict[Name, Obstacle], Meta(description="what stands in it")] = {}
+    walls: Annotated[bool, Meta(description="whether its border is a wall that robots touch and range sensors see")] = (
+        True
+    )
+    obstacles: Annotated[dict[Name, Obstacle], Meta(description="obstacles by name")] = {}
     starts: Annotated[
-        dict[Name, StartBox], Meta(description="where robots may be put before a run; none given: anywhere")
+        dict[Name, StartBox], Meta(description="areas where robots may be put before a run; none given: anywhere")
     ] = {}
 
 
@@ -65,14 +67,14 @@ class Rates(Part, frozen=True):
     """Rates [Hz]; pose_hz, coordination_hz and state_hz divide body_hz."""
 
     body_hz: Annotated[Rate, Meta(description="position control and body [1/s]")] = 100.0
-    pose_hz: Annotated[Rate, Meta(description="how often the trigger is asked [1/s]")] = 50.0
-    coordination_hz: Annotated[Rate, Meta(description="how often a new goal is decided [1/s]")] = 10.0
+    pose_hz: Annotated[Rate, Meta(description="rate of questions to the trigger [1/s]")] = 50.0
+    coordination_hz: Annotated[Rate, Meta(description="rate of decisions on a new goal [1/s]")] = 10.0
     state_hz: Annotated[Rate, Meta(description="telemetry for recorder and viewers [1/s]")] = 50.0
     wake: Annotated[
         bool | None,
         Meta(
-            description="in real time, receive poses on arrival, not on the next tick of body_hz; left out: unless the "
-            "trigger is timed"
+            description="whether poses in real time are received on arrival, not on the next tick of body_hz; left "
+            "out: yes, unless the trigger is timed"
         ),
     ] = None
 
@@ -80,22 +82,31 @@ class Rates(Part, frozen=True):
 class Robot(Part, frozen=True):
     """Robot: kind, start, body and settings."""
 
-    kind: Annotated[str, Meta(description="its size, speed and setpoint: `./zenpark explain crazyflie`")]
-    start: Annotated[list[float], Meta(min_length=2, max_length=3, description="x, y [m] and, if wanted, yaw [rad]")]
+    kind: Annotated[
+        str, Meta(description="kind of robot, which sets size, speed and setpoint: `./zenpark explain crazyflie`")
+    ]
+    start: Annotated[
+        list[float], Meta(min_length=2, max_length=3, description="start x, y [m] and, if wanted, yaw [rad]")
+    ]
     body: Annotated[
         str, Meta(description="twin (in its own process), world (in the twin service), or the address of the real one")
     ] = "twin"
     hover: Annotated[Positive | None, Meta(description="height that a flying robot holds [m]")] = None
     position: Annotated[
-        Literal["body", "external"], Meta(description="its own estimate, or what is published on its key `position`")
+        Literal["body", "external"],
+        Meta(description="source of its position: its own estimate, or messages on its key `position`"),
     ] = "body"
-    device: Annotated[dict[str, Any], Meta(description="settings of its hardware; the body knows them")] = {}
-    process: Annotated[Name | None, Meta(description="robots of one name share one process")] = None
+    device: Annotated[dict[str, Any], Meta(description="settings of its hardware, defined by the body")] = {}
+    process: Annotated[Name | None, Meta(description="name of its process; robots with the same name share one")] = None
     sensors: Annotated[
         list[str] | None, Meta(description="range sensors of its twin; left out: those that its kind has")
     ] = None
-    ranges: Annotated[Literal["body", "world"], Meta(description="its own range sensors, or those of the world")] = (
-        "body"
+    ranges: Annotated[
+        Literal["body", "world"], Meta(description="source of its ranges: its own sensors, or those of the world")
+    ] = "body"
+    shadow: Annotated[Shadow | None, Meta(description="shadow twin beside the robot")] = None
+    avoids: Annotated[bool, Meta(description="whether it keeps clear of others if the experiment has an avoidance")] = (
+        True
     )
     shadow: Annotated[Shadow | None, Meta(description="a twin beside it")] = None
     avoids: Annotated[
@@ -108,17 +119,19 @@ class Robot(Part, frozen=True):
         ),
     ] = None
     standby: Annotated[
-        bool, Meta(description="not started and not waited for until `./zenpark robot add` lets it join the run")
+        bool, Meta(description="whether it stays out of the run until `./zenpark robot add` lets it join")
     ] = False
 
 
 class Target(Part, frozen=True):
     """Target of a link, one of three: distance, offset or bearing."""
 
-    distance: Annotated[Positive | None, Meta(description="[m]")] = None
+    distance: Annotated[Positive | None, Meta(description="distance to keep [m]")] = None
     offset: Annotated[
         Vector | None,
-        Meta(description="x, y (, z) of the second robot from the first [m]; z left out: as they hold their heights"),
+        Meta(
+            description="place x, y (, z) of the second robot relative to the first [m]; z left out: by their heights"
+        ),
     ] = None
     bearing: Annotated[
         Vector | None,
@@ -139,10 +152,10 @@ class Link(Target, frozen=True):
 
     gain: Annotated[
         Positive | None,
-        Meta(description="[1/(m²·decision)] of a distance, else [1/decision]; left out: that of the formation"),
+        Meta(description="gain [1/(m²·decision)] of a distance, else [1/decision]; left out: that of the formation"),
     ] = None
-    from_s: Annotated[NotNegative, Meta(description="the link is there from then on [s]")] = 0.0
-    until_s: Annotated[Positive | None, Meta(description="and until then [s]; left out: to the end")] = None
+    from_s: Annotated[NotNegative, Meta(description="start of the link [s]")] = 0.0
+    until_s: Annotated[Positive | None, Meta(description="end of the link [s]; left out: end of the run")] = None
 
     def __post_init__(self) -> None:
         if not self.alone:
@@ -159,8 +172,8 @@ class Link(Target, frozen=True):
 class Anchor(Part, frozen=True):
     """Distance of a robot to a point, to a line through it, or to a plane through it."""
 
-    distance: Annotated[NotNegative, Meta(description="[m]; 0: on it")] = 0.0
-    to: Annotated[Vector | None, Meta(description="the point, x, y (, z) [m]; left out: the origin")] = None
+    distance: Annotated[NotNegative, Meta(description="distance to keep [m]; 0: on it")] = 0.0
+    to: Annotated[Vector | None, Meta(description="point x, y (, z) [m]; left out: the origin")] = None
     along: Annotated[
         Vector | None, Meta(description="direction x, y (, z) of a line through that point, of any length")
     ] = None
@@ -170,7 +183,8 @@ class Anchor(Part, frozen=True):
     gain: Annotated[
         Positive | None,
         Meta(
-            description="[1/(m²·decision)]; left out: twice that of the formation, or its stiffness where distance is 0"
+            description="gain [1/(m²·decision)]; left out: twice that of the formation, or its stiffness if distance "
+            "is 0"
         ),
     ] = None
 
@@ -186,30 +200,37 @@ class Anchor(Part, frozen=True):
 class Change(Part, frozen=True):
     """Smooth transition of the formation to another shape, from `at_s` on."""
 
-    at_s: Annotated[NotNegative, Meta(description="[s] after the common start")]
-    over_s: Annotated[NotNegative, Meta(description="how long it takes [s]; 0: at once")] = 5.0
+    at_s: Annotated[NotNegative, Meta(description="start of the transition, after the common start [s]")]
+    over_s: Annotated[NotNegative, Meta(description="duration [s]; 0: at once")] = 5.0
     links: Annotated[
         dict[str, Positive | Target],
-        Meta(description="links that ask for something else then"),
+        Meta(description="links that get another target"),
     ] = {}
     shape: Annotated[
         dict[Name, Vector],
         Meta(description="places of robots, x, y (, z) [m]: new targets of the links that have theirs from a shape"),
     ] = {}
     scale: Annotated[
-        Positive, Meta(description="of the shape seen from above, as a multiple of the shape before; heights stay")
+        Positive, Meta(description="size of the shape seen from above, as a multiple of the shape before; heights stay")
     ] = 1.0
-    rotate: Annotated[float, Meta(description="to the left [rad]; not for distances, which know no direction")] = 0.0
+    rotate: Annotated[
+        float, Meta(description="rotation to the left [rad]; not for distances, which have no direction")
+    ] = 0.0
 
 
 class Proximity(Part, frozen=True):
     """Links that exist while two robots are near each other."""
 
-    range: Annotated[Positive, Meta(description="nearer than this they become neighbours [m]")]
-    release: Annotated[Positive | None, Meta(description="farther than this no more [m]; left out: 1.1 range")] = None
+    range: Annotated[Positive, Meta(description="distance below which robots become neighbours [m]")]
+    release: Annotated[
+        Positive | None, Meta(description="distance above which they stop being neighbours [m]; left out: 1.1 range")
+    ] = None
     distance: Annotated[
         Positive | None,
-        Meta(description="what any two robots without a link keep then [m]; left out: only the links of the file"),
+        Meta(
+            description="distance to keep by neighbours without a link in the file [m]; left out: only links of the "
+            "file act"
+        ),
     ] = None
 
     def __post_init__(self) -> None:
@@ -222,18 +243,25 @@ class Formation(Part, frozen=True):
 
     law: Annotated[Choice, Meta(description="a registered law")] = "distance"
     update: Annotated[
-        Choice | None, Meta(description="a trigger: when a robot computes the law anew; left out: at every decision")
+        Choice | None,
+        Meta(description="trigger that decides when a robot recomputes the law; left out: at every decision"),
     ] = None
     gain: Annotated[
-        Positive, Meta(description="μ of links that ask for a distance [1/(m²·decision)] (paper, eq. (6))")
+        Positive, Meta(description="μ of links with a distance as their target [1/(m²·decision)] (paper, eq. (6))")
     ] = 3.0
     stiffness: Annotated[
         Positive,
-        Meta(description="k of links that ask for an offset or a bearing, or of all if the law says so [1/decision]"),
+        Meta(
+            description="k of links with an offset or a bearing as their target, or of all for some laws [1/decision]"
+        ),
     ] = 0.5
     clamp: Annotated[Positive, Meta(description="largest step of the goal per axis and decision [m]")] = 0.1
-    tracking_gain: Annotated[NotNegative, Meta(description="k [1/(m²·decision)] (paper, eq. (7))")] = 3.0
-    leader: Annotated[Name | None, Meta(description="left out: every robot without neighbours")] = None
+    tracking_gain: Annotated[
+        NotNegative, Meta(description="k of followers of a leader [1/(m²·decision)] (paper, eq. (7))")
+    ] = 3.0
+    leader: Annotated[Name | None, Meta(description="robot that leads; left out: every robot without neighbours")] = (
+        None
+    )
     links: Annotated[
         dict[str, Positive | Link],
         Meta(
@@ -248,18 +276,18 @@ class Formation(Part, frozen=True):
     shape: Annotated[
         dict[Name, Vector],
         Meta(
-            description='places of robots, x, y (, z) [m], wherever the shape is drawn: a link `"A > B" = "shape"`'
-            " has its distance, offset or bearing from there, as the law needs; z left out: as they hold their heights"
+            description='places of robots, x, y (, z) [m], about any origin: a link `"A > B" = "shape"`'
+            " gets its distance, offset or bearing from there, as the law needs; z left out: by their heights"
         ),
     ] = {}
     changes: Annotated[list[Change], Meta(description="other shapes, in order of time")] = []
-    proximity: Annotated[Proximity | None, Meta(description="links by range; left out: they are always there")] = None
+    proximity: Annotated[Proximity | None, Meta(description="links by range; left out: links are permanent")] = None
 
 
 class Leg(Part, frozen=True):
     """Plan that a robot follows from `at_s` on."""
 
-    at_s: Annotated[NotNegative, Meta(description="[s] after the common start")]
+    at_s: Annotated[NotNegative, Meta(description="start of the plan, after the common start [s]")]
     robot: Annotated[Name, Meta(description="name of the robot")]
     plan: Annotated[Choice, Meta(description="a registered planner")]
 
@@ -278,12 +306,13 @@ class LinkChannel(Part, frozen=True):
 class Outage(Part, frozen=True):
     """Time in which nothing passes on some links."""
 
-    from_s: Annotated[NotNegative, Meta(description="[s] after the common start")]
-    until_s: Annotated[Positive | None, Meta(description="[s] after it; left out: to the end")] = None
+    from_s: Annotated[NotNegative, Meta(description="start of the outage, after the common start [s]")]
+    until_s: Annotated[Positive | None, Meta(description="end of the outage [s]; left out: end of the run")] = None
     links: Annotated[
-        list[str], Meta(description='"A > B": poses from A to B; "A - B": both ways; left out, and robots too: all')
+        list[str],
+        Meta(description='links; "A > B": poses from A to B; "A - B": both ways; left out, with robots too: all'),
     ] = []
-    robots: Annotated[list[Name], Meta(description="all links to and from these")] = []
+    robots: Annotated[list[Name], Meta(description="robots with all their links")] = []
 
     def __post_init__(self) -> None:
         if self.until_s is not None and self.until_s <= self.from_s:
@@ -295,7 +324,7 @@ class Channel(LinkEffects, Part, frozen=True):
 
     outages: Annotated[list[Outage], Meta(description="times in which nothing passes")] = []
     links: Annotated[
-        dict[str, LinkChannel], Meta(description='"A > B": poses from A to B; "A - B": both ways; the effects there')
+        dict[str, LinkChannel], Meta(description='effects by link; "A > B": poses from A to B; "A - B": both ways')
     ] = {}
 
 
@@ -315,11 +344,11 @@ class Network(Part, frozen=True):
     ] = None
     topology: Annotated[
         Literal["routers", "mesh"],
-        Meta(description="all meet at routers; or without any, each robot is linked with exactly its neighbours"),
+        Meta(description="connections: all at routers; or, without routers, each robot with exactly its neighbours"),
     ] = "routers"
     addresses: Annotated[
         dict[Name, str],
-        Meta(description="where robots listen in a mesh; left out: at free ports on loopback"),
+        Meta(description="endpoints of robots in a mesh; left out: free ports on loopback"),
     ] = {}
     routers: Annotated[
         int,
@@ -346,18 +375,18 @@ class Host(Part, frozen=True):
     address: Annotated[
         str | None,
         Meta(
-            description="what ssh takes: a name of its configuration, user@machine, ssh://user@machine:port; left out: "
-            "its robots are started there by hand or at boot, and join"
+            description="address for ssh: a name of its configuration, user@machine, ssh://user@machine:port; left "
+            "out: its robots are started there by hand or at boot, and join"
         ),
     ] = None
-    zenpark: Annotated[str, Meta(description="the command there; a path counts from the home folder")] = (
+    zenpark: Annotated[str, Meta(description="command of zenpark there; a path counts from the home folder")] = (
         "zenpark/zenpark"
     )
     lab: Annotated[
         str, Meta(description="folder there for the certificates of its robots, in a lab; counts from the home folder")
     ] = "zenpark-lab"
     robots: Annotated[list[Name], Meta(description="robots there; those that no host names run here")] = []
-    tags: Annotated[list[Name], Meta(description="by which `./zenpark hosts` chooses among hosts")] = []
+    tags: Annotated[list[Name], Meta(description="labels by which `./zenpark hosts` chooses among hosts")] = []
 
 
 class World(Part, frozen=True):
@@ -365,36 +394,40 @@ class World(Part, frozen=True):
 
     engine: Annotated[Choice, Meta(description="a registered engine")] = "point-mass"
     sensor_noise: Annotated[
-        NotNegative, Meta(description="of range sensors, as a multiple of the noise of real ones")
+        NotNegative, Meta(description="noise of range sensors, as a multiple of that of real ones")
     ] = 1.0
     wheel_watchdog_s: Annotated[
         Positive | None,
         Meta(
-            description="robots on wheels stop after so long without a command, as if each had a watchdog [s]; left "
-            "out: they drive on, as Khepera IV and TurtleBot3 do, unless `watchdog_s` is in their `device` table"
+            description="time without a command after which robots on wheels stop, like by a watchdog [s]; left out: "
+            "they drive on, as Khepera IV and TurtleBot3 do, unless `watchdog_s` is in their `device` table"
         ),
     ] = None
     patience_s: Annotated[
-        Positive, Meta(description="a robot whose world is gone holds for this long, then lands [s]")
+        Positive, Meta(description="time for which a robot without its world holds before it lands [s]")
     ] = 30.0
 
 
 class Start(Part, frozen=True):
     """Beginning of a run."""
 
-    deadline_s: Annotated[Positive, Meta(description="how long to wait for all robots to be ready [s]")] = 20.0
-    missing: Annotated[Literal["abort", "go-on"], Meta(description="when one is not ready by then")] = "abort"
+    deadline_s: Annotated[Positive, Meta(description="time limit for all robots to be ready [s]")] = 20.0
+    missing: Annotated[Literal["abort", "go-on"], Meta(description="reaction to a robot that is not ready by then")] = (
+        "abort"
+    )
     scatter: Annotated[
-        NotNegative, Meta(description="twins start up to this far from `start`, on each axis, by the seed [m]")
+        NotNegative, Meta(description="largest random offset of a twin from `start`, on each axis, by the seed [m]")
     ] = 0.0
-    scatter_yaw: Annotated[NotNegative, Meta(description="and turned by up to this, by the seed [rad]")] = 0.0
+    scatter_yaw: Annotated[
+        NotNegative, Meta(description="largest random yaw offset of each start, by the seed [rad]")
+    ] = 0.0
 
 
 class Hybrid(Part, frozen=True):
     """Hybrid architecture: some robots are guided by the central controller, the others decide for themselves."""
 
     kind: Annotated[Literal["hybrid"], Meta(description='"hybrid"')]
-    robots: Annotated[list[Name], Meta(min_length=1, description="those that the centre guides")]
+    robots: Annotated[list[Name], Meta(min_length=1, description="robots that the centre guides")]
 
 
 # metrics of zenpark that a criterion can name; those of other distributions come beside them
@@ -410,7 +443,7 @@ class Criterion(Part, frozen=True):
     """Limit that a run must keep to pass: of a metric, or of a measure of the law."""
 
     metric: Annotated[
-        str | None, Meta(description='a metric, one in a file beside this one too ("way.py:Way"); or give `measure`')
+        str | None, Meta(description='metric, also one in a file beside this one ("way.py:Way"); or give `measure`')
     ] = None
     measure: Annotated[
         str | None, Meta(description="a number that the law measures, averaged over the last second of the run")
@@ -419,13 +452,13 @@ class Criterion(Part, frozen=True):
         str,
         Meta(description="mean over robots, worst (largest for `at_most`, smallest for `at_least`), or a robot's name"),
     ] = MEAN
-    case: Annotated[str | None, Meta(description="of which case; left out: of each")] = None
+    case: Annotated[str | None, Meta(description="judged case; left out: each case")] = None
     at_most: Annotated[float | None, Meta(description="upper limit, in the unit of the metric")] = None
     at_least: Annotated[float | None, Meta(description="lower limit, in the unit of the metric")] = None
     relative_to: Annotated[
         str | None, Meta(description="a case: limits are multiples of the value there, seed by seed")
     ] = None
-    why: Annotated[str, Meta(description="printed where it is not met")] = ""
+    why: Annotated[str, Meta(description="reason, printed if it is not met")] = ""
 
     def __post_init__(self) -> None:
         if (self.metric is None) == (self.measure is None):
@@ -438,7 +471,7 @@ class Criterion(Part, frozen=True):
             raise ValueError("`relative_to` names the case that is judged; name another one")
 
     def excess(self, value: float) -> float:
-        """By how much a value is beyond the limits; 0 or less where it keeps them."""
+        """Excess of a value over the limits; 0 or less if it keeps them."""
         above = -math.inf if self.at_most is None else value - self.at_most
         return max(above, -math.inf if self.at_least is None else self.at_least - value)
 
@@ -446,19 +479,23 @@ class Criterion(Part, frozen=True):
 class Experiment(Part, frozen=True):
     """Experiment, or a case of it after `document.cases`."""
 
-    title: Annotated[str, Meta(description="what the experiment shows, for people")]
+    title: Annotated[str, Meta(description="subject of the experiment, for people")]
     robots: Annotated[dict[Name, Robot], Meta(description="robots by name", min_length=1)]
-    duration_s: Annotated[Positive, Meta(description="from the common start [s]", le=86400)]
+    duration_s: Annotated[Positive, Meta(description="duration from the common start [s]", le=86400)]
     spares: Annotated[
         dict[Name, Robot], Meta(description="robots that wait to take over the name of another one of their kind")
     ] = {}
     on_loss: Annotated[
         Literal["none", "restart", "replace"],
-        Meta(description="when a robot is lost in mid-run: go on without it, start it again, or let a spare take over"),
+        Meta(
+            description="reaction to a robot lost in mid-run: continue without it, restart it, or let a spare take over"
+        ),
     ] = "none"
-    source: Annotated[str, Meta(description="where it was published")] = ""
-    seed: Annotated[int, Meta(description="of all random numbers: noise, starts, network", ge=0, le=2**32 - 1)] = 1
-    tolerance: Annotated[Positive, Meta(description="a link is acquired when its error stays below [m]")] = 0.05
+    source: Annotated[str, Meta(description="publication that it reproduces")] = ""
+    seed: Annotated[int, Meta(description="seed of all random numbers: noise, starts, network", ge=0, le=2**32 - 1)] = 1
+    tolerance: Annotated[Positive, Meta(description="error below which a link must stay to count as acquired [m]")] = (
+        0.05
+    )
     arena: Annotated[Arena, Meta(description="size, obstacles and start boxes")] = Arena()
     rates: Annotated[Rates, Meta(description="rates of body, poses, decisions and telemetry [Hz]")] = Rates()
     formation: Annotated[Formation, Meta(description="links with their targets, anchors, and the law")] = Formation()
@@ -469,10 +506,10 @@ class Experiment(Part, frozen=True):
             description="distributed: each robot decides for itself; centralised: one process for all; hybrid: for some"
         ),
     ] = "distributed"
-    trigger: Annotated[Choice, Meta(description="a registered trigger: when a robot transmits")] = "periodic"
+    trigger: Annotated[Choice, Meta(description="registered trigger that decides when a robot transmits")] = "periodic"
     prediction: Annotated[
         Choice | None,
-        Meta(description="where a robot is believed to be between two messages; left out: as the trigger needs it"),
+        Meta(description="estimate of a robot's place between two messages; left out: as the trigger needs it"),
     ] = None
     positioning: Annotated[
         str | None, Meta(description='source of `position = "external"`: vicon://HOST[:PORT], or vicon-twin')

@@ -205,7 +205,7 @@ class Plan:
 
     @cached_property
     def avoidance_senders(self) -> dict[str, tuple[str, ...]]:
-        """Robots whose poses a robot receives for its avoidance alone, by receiver.
+        """Senders of poses that a robot receives for its avoidance alone, by receiver.
 
         These are all robots that no law links, if it needs all; else neighbours of robots that the centre guides, which
         have no law of their own.
@@ -309,10 +309,10 @@ class Plan:
 
     @property
     def externally_measured(self) -> tuple[str, ...]:
-        """Robots whose positions motion capture publishes.
+        """Robots with positions published by motion capture.
 
-        Where robots of the world are, the world itself publishes them, as two sources would contradict each other; but
-        a simulated motion capture sees them, and then the world leaves it to that.
+        The world itself publishes positions of its robots, as two sources would contradict each other. With a simulated
+        motion capture, which sees these robots as well, the world does not publish them.
         """
         simulated = self.experiment.positioning == VICON_TWIN
         robots = self.experiment.robots.items()

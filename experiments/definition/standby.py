@@ -67,6 +67,6 @@ def _links_between(links: Mapping[str, T], robots: Collection[str]) -> dict[str,
 
 
 def robots_without_address(plan: Plan) -> dict[str, str]:
-    """Robots whose host has no address, so that they are not started from here; robot to host."""
+    """Robots on hosts without an address, so that they are not started from here; robot to host."""
     hosts = plan.experiment.hosts.items()
     return {robot: name for name, host in hosts if host.address is None for robot in host.robots}

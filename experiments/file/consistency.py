@@ -130,7 +130,7 @@ def criteria_faults(plan: Plan, cases: Iterable[str]) -> Iterator[Fault]:
 
 
 def _case_names(names: Iterable[str]) -> Iterator[Fault]:
-    """Faults of cases whose files are one on systems whose file names do not tell capitals apart."""
+    """Faults of cases with the same file name on systems that ignore capitals."""
     former: dict[str, str] = {}
     for name in names:
         other = former.setdefault(name.lower(), name)
@@ -312,7 +312,7 @@ def _triggers(plan: Plan) -> Iterator[Fault]:
     """Triggers in the wrong place, or without the prediction that they need."""
     kind, prediction, update = plan.trigger_name, plan.experiment.prediction, plan.update
     if "communication" not in plan.trigger.PLACES:
-        message = f"'{kind}' decides when the law is computed anew, not when a robot transmits"
+        message = f"'{kind}' decides when the law is recomputed, not when a robot transmits"
         yield Fault(("trigger",), message, f"put it into [formation] as update = '{kind}', and another trigger here")
     if prediction is not None and plan.needs_prediction and plan.predictor is HOLD:
         message = f"'{kind}' counts on neighbours that extrapolate, but prediction = 'hold' says that they do not"
@@ -321,7 +321,7 @@ def _triggers(plan: Plan) -> Iterator[Fault]:
     if update is None:
         return
     if "control" not in update.PLACES:
-        message = f"'{plan.update_name}' decides when a robot transmits, not when the law is computed anew"
+        message = f"'{plan.update_name}' decides when a robot transmits, not when the law is recomputed"
         yield Fault(("formation", "update"), message, "take another one, such as send-on-delta or relative-control")
     if update.smoothing_s:
         message = "smoothing_s is for transmissions, and there are none where the law is computed"
@@ -337,7 +337,9 @@ def _remembering(plan: Plan) -> Iterator[Fault]:
         message = f"the law '{name}' is no function of its input alone: a step that is left out would be lost"
         yield Fault(("formation", "update"), message, "leave update out", on_key=True)
     if isinstance(experiment.architecture, Hybrid) and plan.law.SAYS:
-        message = f"guided robots do not speak, and '{name}' says something: their free neighbours would hear nothing"
+        message = (
+            f"guided robots transmit no variables, and '{name}' needs them: their free neighbours would receive nothing"
+        )
         hint = 'write architecture = "centralised" or "distributed", or take another law'
         yield Fault(("architecture",), message, hint, on_key=True)
     if experiment.formation.anchors:

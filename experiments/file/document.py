@@ -90,11 +90,11 @@ def read(path: str | Path, overrides: Sequence[str] = ()) -> Document:
 
     Args:
         path: A .toml file, a .json file as `write_json` makes it, or a name of the catalogue.
-        overrides: `path=value` each, as behind `--set`; a later one wins, and all win over the cases, but for those
-            that address one (`cases.event.trigger.threshold=0.02`).
+        overrides: `path=value` each, as behind `--set`; a later one wins, and all win over the cases, except those of
+            one case (`cases.event.trigger.threshold=0.02`).
 
     Raises:
-        DocumentError: With everything that is wrong and where, whatever is in the file.
+        DocumentError: With all problems and their places, for any content of the file.
     """
     file = index.find_file(path)
     label = str(path) if file == Path(path) else str(file)

@@ -118,9 +118,8 @@ def assign(document: dict[str, Any], override: Override, *, part: bool = False) 
 def merged(document: Mapping[str, Any], changes: Mapping[str, Any], path: Path = ()) -> dict[str, Any]:
     """A document with the changes of a case: tables merge, everything else replaces.
 
-    A trigger, law or plan of another kind replaces the whole table, because the parameters of the old kind mean
-    nothing to the new one; an obstacle has one shape, and a new one replaces it. A link is the same link however it is
-    written.
+    A trigger, law or plan of another kind replaces the whole table, because the parameters of the old kind mean nothing
+    to the new one. An obstacle has one shape, and a new one replaces it. A link is the same link however it is written.
     """
     result = dict(document)
     for name, value in changes.items():

@@ -20,7 +20,7 @@ from experiments.catalogue.index import FOLDER
 from experiments.file.json_schema import described
 
 NONE: Final[Mapping[str, object]] = {}
-_NAMES: Final = {  # tables whose keys are names, with the example of such a name
+_NAMES: Final = {  # tables with names as keys, and an example of such a name
     "robots": ("ROBOT", "CF01"),
     "disturbance": ("KIND", "crazyflie"),
     "hosts": ("HOST", "lab1"),
@@ -74,11 +74,11 @@ def entries() -> tuple[Entry, ...]:
 
 
 def matching(asked: str) -> list[Entry]:
-    """Entries of a key as a user writes it: names may be real ones, in capitals, or left out; a plug-in in the place
-    of its kind (`trigger.send-on-delta.threshold`) or left out; the end of a key is enough if no key is meant in full,
-    such as `plan.circle`, `circle`, and so is a kind of robot.
+    """Entries of a key as a user writes it, or of a kind of robot.
 
-    A key of a table is followed by the keys of that table.
+    Names may be real ones, in capitals, or left out; a plug-in stands in the place of its kind (`trigger.send-on-
+    delta.threshold`) or is left out. The end of a key is enough if no key is meant in full, such as `plan.circle`,
+    `circle`. A key of a table is followed by the keys of that table.
     """
     if asked in KINDS:
         return [_kind(KINDS[asked])]

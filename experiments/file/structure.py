@@ -248,7 +248,7 @@ def _kinds_with(group: str, keys: Sequence[str]) -> list[str]:
 
 
 def _own_checks(value: Mapping[str, Any], struct: type[msgspec.Struct], path: Path) -> list[Fault]:
-    """Faults of a table whose values are right one by one; the struct's own check can name a field in words alone."""
+    """Faults of a table with values that are right one by one; the struct's own check names fields in words alone."""
     try:
         msgspec.convert(value, struct)
     except msgspec.ValidationError as error:

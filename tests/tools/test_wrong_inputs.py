@@ -44,7 +44,7 @@ FILES = (
     ('"KH02 - CF01"', '"CF01 > KH02" = 0.8\n"KH02 - CF01"', "the link from CF01 to KH02 stands again", "r"),
     ("hover = 0.6", "hover = 60", ":23:9: 'CF01' cannot hover at 60 m", "use a hover of at most 1.95"),
     (START, "start = [-6.6, -0.5]", ":14:10: 'KH01' starts outside of the arena", "x lies between -1 and 1"),
-    ('"send-on-delta", threshold', '"relative-control", floor', "decides when the law is computed anew", "[formation]"),
+    ('"send-on-delta", threshold', '"relative-control", floor', "decides when the law is recomputed", "[formation]"),
     ("[arena]", LEG, "this leg begins at 90 s, when the run of 15 s is over", "begin earlier"),
     ("[robots.KH01]", "[robots.Rób₁]", ":12:10: ", "names are letters, digits and _"),
     ("[robots.KH01]", '[robots."Röb1"]', ":12:9: 'Röb1' cannot be a name", "use letters, digits and _"),

@@ -112,7 +112,7 @@ def _plain(text: str) -> str:
 
 
 def _arena(found: Heights) -> list[float]:
-    """Their park, or as much as starts and shape need, to the next half metre [m]."""
+    """Size of the authors' park, or of the space that starts and shape need, to the next half metre [m]."""
     places = np.concatenate([found.start, found.shape])
     reach = 2.0 * (np.abs(places[:, :2]).max(axis=0) + ROOM)
     needed = [*reach, found.hover.max(initial=0.0) + ROOM]
@@ -259,7 +259,7 @@ def _gain(park: Park, robot: Robot, task: Task, distance: float, weight: float =
 
 
 def _links(park: Park, found: Heights, own: dict[str, float], notes: list[str]) -> dict[str, Any]:
-    """The links: one that both ends ask for alike, else one for each end."""
+    """The links: one if both ends have the same target, else one for each end."""
     hover = dict(zip((robot.name for robot in park.robots), found.hover.tolist(), strict=True))
     asked: dict[tuple[str, str], tuple[str, tuple[float, ...]]] = {}
     for robot, task in park.tasks:

@@ -1,9 +1,9 @@
 """Experiment files of Robotic Park's authors (organisation Robotic-Park-Lab), as typed records.
 
 Three formats. *Sections* (since December 2023): Operation, Architecture and Robots; periods named T are milliseconds,
-the others seconds. Two of 2023: *flat*, whose keys are robots, each with its communication and task; and an *index*,
-whose keys are robots with a start and the flat file (`config_path`) of that one robot. In those of 2023 gain and limit
-of the law stand in the programs of that time: 0.25 and 0.08 m (0.32 m, divided by 4) per decision.
+the others seconds. Two of 2023: *flat*, with robots as keys, each with its communication and task; and an *index*, with
+robots as keys, each with a start and its own flat file (`config_path`). In those of 2023 the programs of that time
+define gain and limit of the law: 0.25 and 0.08 m (0.32 m, divided by 4) per decision.
 """
 
 from __future__ import annotations
@@ -159,7 +159,7 @@ class Robot(Struct, frozen=True):
     local_pose: _Timed = _Timed()
     controller: Trigger = Trigger()  # of the position
     controller_type: str = ""
-    init_theta: Number = 0.0  # [rad] of Kheperas of 2023, whose pose has no third number
+    init_theta: Number = 0.0  # [rad] of Kheperas of 2023, with a pose of two numbers
     task: Task = Task(enable=False)
     config_path: str = ""  # in an index
 

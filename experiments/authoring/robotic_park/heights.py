@@ -23,10 +23,10 @@ ATTEMPTS: Final = 40  # random beginnings
 SPREAD: Final = (0.05, 0.1, 0.3, 0.6)  # [m] standard deviations of theirs
 SHAPE_MET: Final = 0.01  # [m] a larger error is another shape
 LOWEST: Final = 0.3  # [m] of a drone
-ALOFT: Final = 0.7  # [m] where drones hover whose pose has no height, as in the authors' files
+ALOFT: Final = 0.7  # [m] height of drones with a pose without height, as in the authors' files
 REAL_ORIGIN: Final = (0.0, 0.0, 0.8)  # [m] of the origin in the driver of real Crazyflies
 MOVED: Final = 0.02  # [m] a height that is another than at the start
-SPACING: Final = 0.6  # [m] between robots whose start is made up
+SPACING: Final = 0.6  # [m] between robots with an invented start
 
 
 @dataclass(frozen=True)
@@ -46,15 +46,15 @@ class Room:
 def find_shape(wanted: Links, anchors: Anchored, start: Array, climbs: Mask, room: Room | None = None) -> Shape:
     """Best places for what links and anchors ask for, with robots apart from one another and drones in the air.
 
-    A formation that can be met at the heights of the starts stays there. Else heights are free, and least squares
-    begin at the starts, at a dome above them and at starts that are moved at random (always the same ones): a single
+    A formation that can be met at the heights of the starts stays there. Otherwise heights are free. Least squares then
+    begin at the starts, at a dome above them and at starts that are moved at random (always the same ones). A single
     beginning ends in a local minimum for about two of three of the shapes in space that the authors fly. A shape that
     hangs below the floor is mirrored.
 
     Args:
         start: (N, 3) [m].
-        climbs: (N,) robots whose height may be another; the others keep theirs.
-        room: What a shape has to keep to; None: nothing.
+        climbs: (N,) robots that may change their height; the others keep theirs.
+        room: Limits of a shape; None: none.
     """
     moves = np.ones_like(climbs)
     solids = None if room is None else room.solids
@@ -100,11 +100,11 @@ class Heights:
 
 
 def find_heights(park: Park, notes: list[str]) -> Heights:
-    """The heights, from the shape in space if links tell one.
+    """The heights, from the shape in space if links define one.
 
-    The origin of their files is a point about which drones spread while they climb: where the shape is not flat, no
-    robot stands on the floor and the origin has no place of its own, the whole is lifted so that the lowest drone keeps
-    the height at which it starts.
+    The origin of their files is a point about which drones spread while they climb. If the shape is not flat, no robot
+    stands on the floor and the origin has no place of its own, the whole is lifted: the lowest drone keeps the height
+    of its start.
     """
     flies = np.array([KINDS[robot.kind].flies for robot in park.robots])
     start = _starts(park, notes)

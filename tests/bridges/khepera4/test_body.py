@@ -382,7 +382,7 @@ def test_the_wrong_protocol_is_named(served, impatient):
         KheperaBody(request("khepera4", crossed)).open()
     assert str(caught.value).count("the robot uses the other protocol") == 2
     older = served(request("khepera4", ["-"], device=ONCE))
-    with pytest.raises(BodyError, match=r"answers p with .* write which of them runs there, such as device = { server"):
+    with pytest.raises(BodyError, match=r"answers p with .* write the one that runs there, such as device = { server"):
         KheperaBody(request("khepera4", older.addresses)).open()
     with pytest.raises(BodyError, match=r"no answer to p; a server of 2023 serves one client in its life: restart it"):
         KheperaBody(request("khepera4", older.addresses, device=ONCE)).open()

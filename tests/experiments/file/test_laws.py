@@ -15,7 +15,7 @@ AVERAGE = index.find_file("average")
     ("change", "said"),
     [
         ("formation.update=send-on-delta", "no function of its input alone"),
-        ('architecture={ kind = "hybrid", robots = ["KH01"] }', "guided robots do not speak"),
+        ('architecture={ kind = "hybrid", robots = ["KH01"] }', "guided robots transmit no variables"),
         ("formation.anchors={ KH01 = 0.5 }", "'average' does not know them"),
         ("cases.event.trigger=relative", "'relative' judges errors of links"),
         ("cases.event.trigger=self-triggered", "does not see the variables"),

@@ -55,7 +55,7 @@ def updating(park, update):
 @pytest.mark.parametrize(
     ("change", "path", "message", "hint"),
     [
-        ({"trigger": "relative-control"}, ("trigger",), "when the law is computed anew", "update = 'relative-control'"),
+        ({"trigger": "relative-control"}, ("trigger",), "when the law is recomputed", "update = 'relative-control'"),
         ({"trigger": CHOSEN, "prediction": "hold"}, ("prediction",), "neighbours that extrapolate", "leave prediction"),
         ({"update": "predictive"}, ("formation", "update"), "when a robot transmits", "relative-control"),
         (
