@@ -25,9 +25,9 @@ from twins.arrays import Array, Mask, norm
 
 CLEARANCE: Final = 0.1  # [m] between one robot's top and another's bottom
 NEARLY: Final = 0.9  # of its speed: the rest is needed to catch up
-LATE: Final = 0.25  # share of a run, at its end, in which a formation is to have come to rest
+LATE: Final = 0.25  # share of a run, at its end, in which a formation must be at rest
 SWINGS: Final = 6.0  # ways of an error there, as multiples of its range, that make it an oscillation
-SETTLED: Final = 1e-3  # [m] slower than this per decision, robots have come to rest
+SETTLED: Final = 1e-3  # [m] travel per decision below which robots are at rest
 
 
 def starts(analysis: Analysis) -> Iterator[Finding]:
