@@ -84,7 +84,7 @@ class Acting:
         self._targets: dict[str, Any] = {}  # by leader
         self._held_until = -inf  # [s, monotonic] targets stay where they were dragged
         self._dragged = False
-        self._due: dict[str, tuple[float, Callable[[], object]]] = {}  # orders that wait until a control is at rest
+        self.due: dict[str, tuple[float, Callable[[], object]]] = {}  # orders that wait until a control is at rest
         self._lock = threading.Lock()
         self._number = 0  # of the present stage
 
@@ -108,7 +108,7 @@ class Acting:
                 ("Resume all", "resume", viser.Icon.PLAYER_PLAY, "green"),
             ):  # fmt: skip
                 button = gui.add_button(text, icon=icon, color=colour)  # type: ignore[arg-type]
-                button.on_click(partial(self._press, messages.Order(what), what))  # type: ignore[arg-type]
+                button.on_click(partial(self.press, messages.Order(what), what))  # type: ignore[arg-type]
             drag = gui.add_checkbox("Drag targets", initial_value=False, hint="Of the leaders.")
             drag.on_update(lambda event: self._show_targets(shown=bool(event.target.value)))
 
@@ -127,7 +127,7 @@ class Acting:
                 slider = self._server.gui.add_slider(
                     parameter.label, step, REACH * parameter.value, step, parameter.value
                 )
-                slider.on_update(partial(self._slide, parameter))
+                slider.on_update(partial(self.slide, parameter))
                 self._parts.append(slider)
 
     def follow(self, moment: Moment, alive: Sequence[str]) -> None:
@@ -140,8 +140,8 @@ class Acting:
                 if np.isfinite(goal).all() and np.abs(target.position - goal).max() > 1e-3:
                     target.position = goal
         with self._lock:
-            due = [name for name, (at, _) in self._due.items() if now >= at]
-            ready = [self._due.pop(name)[1] for name in due]
+            due = [name for name, (at, _) in self.due.items() if now >= at]
+            ready = [self.due.pop(name)[1] for name in due]
         for order in ready:
             threading.Thread(target=order, daemon=True).start()
 
@@ -196,7 +196,7 @@ class Acting:
         order = messages.Order("go", goal=(x, y))
         self._order_in_thread(name, lambda: self._order_all(order, what, [name]))
 
-    def _slide(self, parameter: Parameter, event: viser.GuiEvent[Any]) -> None:
+    def slide(self, parameter: Parameter, event: viser.GuiEvent[Any]) -> None:
         if event.client is None:  # moved by this program, not by a hand
             return
         value, what = parameter.limited(float(event.target.value)), parameter.name
@@ -207,7 +207,7 @@ class Acting:
         order = messages.Order("set", name=parameter.name, value=value)
         self._order_in_thread(what, lambda: self._order_all(order, f"{what} = {value:g}"))
 
-    def _press(self, order: messages.Order, what: str, event: viser.GuiEvent[Any]) -> None:
+    def press(self, order: messages.Order, what: str, event: viser.GuiEvent[Any]) -> None:
         if order.order in CALMING or not self._refuse(event.client_id, what):
             self._order_all(order, what)
 
@@ -227,7 +227,7 @@ class Acting:
 
     def _order_in_thread(self, name: str, order: Callable[[], object]) -> None:
         with self._lock:
-            self._due[name] = (time.monotonic() + SETTLED_S, order)
+            self.due[name] = (time.monotonic() + SETTLED_S, order)
 
     def _order_all(self, order: messages.Order, what: str, robots: Sequence[str] | None = None) -> None:
         """Gives an order to robots, to all that are there if none is named, and says what they answered."""

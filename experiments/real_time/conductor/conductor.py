@@ -102,7 +102,7 @@ class Conductor(CaseRun):
         self._progress.phase = "connecting the hosts" if self._experiment.hosts else "starting"
         clocks = self._context.hosts.join(self._plan)
         start = ready = None
-        self._failures: list[str] = []
+        self.failures: list[str] = []
         self._landed: set[str] = set()  # robots whose early landing was seen
         try:
             self._processes.prepare()
@@ -110,7 +110,7 @@ class Conductor(CaseRun):
                 self._join(stack)
                 self._adopt()
                 self._processes.start()
-                if self._await_phase("ready", self._patience(), recorder=True):
+                if self.await_phase("ready", self._patience(), recorder=True):
                     ready = time.monotonic() - began
                     self._view.report_clocks(clocks)
                     self._drift = stack.enter_context(Drift(self._context.hosts.in_use()))
@@ -118,7 +118,7 @@ class Conductor(CaseRun):
                     self._view.report("ready", "conductor", f"{count} robots after {ready:.2f} s")
                     if self._take_off():
                         start = self._start()
-                        self._walk(start)
+                        self.walk(start)
                 self._land()
                 if start is not None:
                     self._drift.close()
@@ -133,7 +133,7 @@ class Conductor(CaseRun):
             self._processes.end()
             parted = self._processes.join_parts()
         lost = tuple(name for name, view in self._robots.items() if view.left_because == "lost")
-        failures = [*([f"lost {', '.join(lost)}"] if lost else []), *self._failures, *([parted] if parted else [])]
+        failures = [*([f"lost {', '.join(lost)}"] if lost else []), *self.failures, *([parted] if parted else [])]
         return CaseResult(self._context.recording, start, ready, lost, tuple(failures))
 
     def _join(self, stack: ExitStack) -> None:
@@ -165,7 +165,7 @@ class Conductor(CaseRun):
 
     # ------------------------------------------------------------------ phases
 
-    def _await_phase(
+    def await_phase(
         self, phase: str, limit_s: float, *, recorder: bool = False, meanwhile: Callable[[], None] = lambda: None
     ) -> bool:
         """Wait until every robot that is left has reached a phase; False if the user interrupted."""
@@ -179,14 +179,14 @@ class Conductor(CaseRun):
             late = [name for name, view in self._robots.items() if not (view.reached(phase) or view.gone)]
             lost = [name for name, view in self._robots.items() if view.left_because == "lost"]
             if lost and self._experiment.start.missing == "abort":
-                raise RunFailed(self._start_failure(lost, "could not start"))
+                raise RunFailed(self.start_failure(lost, "could not start"))
             if recorder and not self._processes.recording:
                 raise RunFailed("nothing would be recorded: the recorder ended each time; its log says why")
             if not late and (not recorder or self._view.recording_begun):
                 return True
             if time.monotonic() > deadline:
                 if late and self._experiment.start.missing == "abort":
-                    raise RunFailed(self._start_failure(late, f"not {phase} after {limit_s:g} s"))
+                    raise RunFailed(self.start_failure(late, f"not {phase} after {limit_s:g} s"))
                 for name in late:
                     self._view.report("late", name, f"not {phase} after {limit_s:g} s: {self._reason(name)}")
                 return True
@@ -201,7 +201,7 @@ class Conductor(CaseRun):
                 refused.remove(name)
                 refused.extend(self._order(messages.Order("takeoff"), [name]))
 
-        return self._await_phase("airborne", CLIMB_S, meanwhile=again)
+        return self.await_phase("airborne", CLIMB_S, meanwhile=again)
 
     def _patience(self) -> float:
         """Limit for all robots to be ready [s]: robots that go on without a neighbour report it after the deadline."""
@@ -223,7 +223,7 @@ class Conductor(CaseRun):
         self._starting = {*there}
         return at
 
-    def _walk(self, start: float) -> None:
+    def walk(self, start: float) -> None:
         """Follow the run to its end."""
         coming = deque(self._experiment.phases)
         end = start + self._experiment.duration_s
@@ -247,7 +247,7 @@ class Conductor(CaseRun):
             if ended:
                 if now < end - EARLY_S:
                     what = "all robots had landed" if left else "no robot was left"
-                    self._failures.append(f"{what} after {now - start:.1f} of {self._experiment.duration_s:g} s")
+                    self.failures.append(f"{what} after {now - start:.1f} of {self._experiment.duration_s:g} s")
                 return
             time.sleep(POLL_S)
 
@@ -259,7 +259,7 @@ class Conductor(CaseRun):
             self._landed.add(name)
             if (reason := self._reason(name)).startswith((LAND, STOP)):
                 text = f"{name} landed after {elapsed:.1f} of {self._experiment.duration_s:g} s: {reason}"
-                self._failures.append(text)
+                self.failures.append(text)
 
     def _start_late(self, start: float) -> None:
         """Repeat the start to robots that still wait: a busy machine may have lost the order, or its answer."""
@@ -333,7 +333,7 @@ class Conductor(CaseRun):
             if death.kind == "recorder":
                 self._view.await_recorder()
                 if self._progress.elapsed is not None:
-                    self._failures.append(death.text)
+                    self.failures.append(death.text)
             elif death.kind == "lost":
                 self._robots[death.source].alive = False
                 self._changes.mark_lost(death.source)
@@ -380,7 +380,7 @@ class Conductor(CaseRun):
             return "no status of its process yet"
         return status.reason or f"it is {status.phase}"
 
-    def _start_failure(self, names: Sequence[str], what: str) -> str:
+    def start_failure(self, names: Sequence[str], what: str) -> str:
         lines = [f"{', '.join(names)}: {what}; nothing has moved or all have landed"]
         for name in names:
             gone = self._robots[name].gone  # then the event of its end has told the last line of its output

@@ -182,7 +182,7 @@ class NetworkView:
             self.recording_begun |= there
             self._recorder_vanished = inf if there else time.monotonic()
         for status in self._statuses.read():
-            self._receive_status(status)
+            self.receive_status(status)
         self._progress.states = list(self._states.read())
         for state in self._progress.states:
             view = self.robots[state.robot]
@@ -240,7 +240,7 @@ class NetworkView:
             away_s, progress.silent_since = now - progress.silent_since, inf
             self.report("router", "conductor", f"a router answers again, after {away_s:.1f} s")
 
-    def _receive_status(self, status: messages.Status) -> None:
+    def receive_status(self, status: messages.Status) -> None:
         view = self.robots[status.robot]
         if status.phase not in ORDER or status.pid == view.former:
             return

@@ -12,7 +12,7 @@ import gc
 import os
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import inf, isfinite, nan
 from typing import Final
 
@@ -42,7 +42,7 @@ PHASES: Final = {phase.word: int(phase) for phase in Phase}
 class CentreProcess:
     """Clock and network of a central controller."""
 
-    def __init__(self, plan: Plan, joint: Network) -> None:
+    def __init__(self, plan: Plan, joint: Network, clock: Callable[[], float] = uptime) -> None:
         """Declares all but the token, which tells that orders are received."""
         session, keys = joint.session, joint.keys
         experiment, names = plan.experiment, plan.names
@@ -54,9 +54,9 @@ class CentreProcess:
         self._router = network.RouterWatch(session, keys.centre_alive, joint.endpoints)
         self._cut_off = False
         self._encoding: messages.Encoding = experiment.network.encoding
-        self._ticks = Ticks(common.body_hz / common.decide_every, clock=uptime)
+        self.ticks = Ticks(common.body_hz / common.decide_every, clock=clock)
         # poses that are sent on the tick of a decision arrive within half a tick, and still count
-        self._patience = 0.5 / common.body_hz
+        self.patience_s = 0.5 / common.body_hz
         rows, ends = centre.needed, [(name, name) for name in names]
         self._poses = ModelledInbox(
             session, keys, {names[row]: [row] for row in rows},
@@ -65,16 +65,16 @@ class CentreProcess:
             counted=self._within_run,
         )  # fmt: skip
         self._received = [0] * len(names)
-        self._guided = [row for row in rows if centre.robots[row].guided]
+        self.guided = [row for row in rows if centre.robots[row].guided]
         self._statuses = {
             row: pubsub.Inbox(pubsub.pose_subscriber(session, keys.status(names[row])), messages.Status, keys=keys)
-            for row in self._guided
+            for row in self.guided
         }
         mime = messages.MIME[self._encoding]
-        self._goals = {row: pubsub.publisher(session, keys.goal(names[row]), mime) for row in self._guided}
+        self._goals = {row: pubsub.publisher(session, keys.goal(names[row]), mime) for row in self.guided}
         self._memories = {
             row: pubsub.publisher(session, keys.memory(names[row]), mime)
-            for row in self._guided
+            for row in self.guided
             if centre.robots[row].computer.stepping is not None
         }
         self._reports = pubsub.pose_publisher(session, keys.centre, messages.JSON)
@@ -82,24 +82,24 @@ class CentreProcess:
         self._begun = inf
         self._clock = Clock()
         self._seq = round(self._clock.utc() * 1e3)  # beyond any number of a former central controller
-        self._sent = self._missed = 0
-        self._late_s, self._reported, self._cpu_s = 0.0, 0.0, time.process_time()
+        self._sent = self.missed = 0
+        self.late_s, self._reported, self._cpu_s = 0.0, 0.0, time.process_time()
 
     def run(self, over: threading.Event) -> None:
         """Decides until `over` is set."""
         gc.collect()
         gc.freeze()  # imported objects live as long as the process: a collection need not visit them
-        ticks = self._ticks
+        ticks = self.ticks
         self._utc = self._clock.at(ticks.start())
-        ticks.zero += self._patience
+        ticks.zero += self.patience_s
         token = pubsub.alive_token(self._session, self._keys.centre_alive)
         while not over.wait(ticks.until_next()):
             if self._ownership.settle(self._session, over.is_set):
                 continue
             ticks.until_next()  # a wait that lasted too long skips as well: goals for a past instant help nobody
             missed = ticks.begin()
-            self._missed += missed
-            self._late_s = max(self._late_s, missed * ticks.period + ticks.late_s)
+            self.missed += missed
+            self.late_s = max(self.late_s, missed * ticks.period + ticks.late_s)
             t = ticks.t
             self._receive(t)
             goals = self.centre.decide(t, self._phase, self._start)
@@ -119,11 +119,11 @@ class CentreProcess:
         for row, inbox in self._statuses.items():
             for status in inbox.read(_check_status):
                 self._update_status(row, status)
-        begun = min(self._start[row] for row in self._guided)
+        begun = min(self._start[row] for row in self.guided)
         if begun != self._begun:
             self._begun = begun
             if isfinite(begun):  # decisions fall on the same instants as those of the robots
-                self._ticks.align(begun)
+                self.ticks.align(begun)
         for row, arrival, received in self._poses.receive(t, self._utc, lambda _: begun):
             pose = received.pose
             yaw = nan if pose.yaw is None else pose.yaw
@@ -171,12 +171,12 @@ class CentreProcess:
         senders = {sender.links[0]: sender for sender in self._poses.senders}  # by row
         report = messages.CentreState(
             stamp=self._utc + t,
-            robots=[self._names[row] for row in self._guided],
+            robots=[self._names[row] for row in self.guided],
             missing=[self._names[row] for row in self.centre.missing_robots()],
-            load=round((cpu_s - self._cpu_s) / max(t - self._reported, self._ticks.period), 4),
-            late_s=round(self._late_s, 6),
+            load=round((cpu_s - self._cpu_s) / max(t - self._reported, self.ticks.period), 4),
+            late_s=round(self.late_s, 6),
             decisions=self.centre.decisions,
-            missed=self._missed,
+            missed=self.missed,
             goals=self._sent,
             received={sender.name: self._received[row] for row, sender in senders.items()},
             lost={sender.name: sender.lost for sender in senders.values()},
@@ -186,7 +186,7 @@ class CentreProcess:
             cpu_s=cpu_s,
             rss_mb=resident_mb(),
         )
-        self._cpu_s, self._reported, self._late_s = cpu_s, t, 0.0
+        self._cpu_s, self._reported, self.late_s = cpu_s, t, 0.0
         self._reports.put(messages.encode(report))
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import gc
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Final
 
@@ -56,13 +56,20 @@ class Pace:
 class WorldProcess:
     """Runs a population in real time, and obeys orders."""
 
-    def __init__(self, plan: Plan, population: Population, joint: Network, lost: threading.Event) -> None:
+    def __init__(
+        self,
+        plan: Plan,
+        population: Population,
+        joint: Network,
+        lost: threading.Event,
+        clock: Callable[[], float] = uptime,
+    ) -> None:
         """`lost` is set to end as soon as the robots have landed."""
         session, self._keys = joint.session, joint.keys
         self._ownership, self._over = joint.ownership, threading.Event()
         self._population, self._session, self._lost = population, session, lost
         self._engine, hz = plan.engine_name, plan.experiment.rates.body_hz
-        self._ticks = Ticks(hz, catch_up=round(SLIP_S * hz), clock=uptime)
+        self._ticks = Ticks(hz, catch_up=round(SLIP_S * hz), clock=clock)
         self.exchange = Exchange(plan, population, joint)
         self._reports = pubsub.pose_publisher(session, self._keys.world, messages.JSON)
         self._orders = pubsub.Orders(session, self._keys.world_order, messages.WorldOrder)

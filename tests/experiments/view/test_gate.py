@@ -138,7 +138,7 @@ def test_old_pictures_order_no_motion(seen, ordered, operator, monkeypatch):
     if seen is not None:
         acting._server.gate.seen[7] = seen
     for what in ("hold", "land", "resume"):
-        acting._press(messages.Order(what), what, SimpleNamespace(client_id=7))
+        acting.press(messages.Order(what), what, SimpleNamespace(client_id=7))
     assert [order.order for order in given] == ordered
 
 
@@ -153,7 +153,7 @@ def test_slider_orders_what_is_limited(operator):
     acting, given = operator
     acting._server.gate.seen[7] = Seen(time.time(), 2)
     parameter = orders.Parameter("clamp", 0.1, "m")
-    acting._slide(parameter, SimpleNamespace(client=object(), client_id=7, target=SimpleNamespace(value=1e6)))
-    _, order = acting._due["clamp"]
+    acting.slide(parameter, SimpleNamespace(client=object(), client_id=7, target=SimpleNamespace(value=1e6)))
+    _, order = acting.due["clamp"]
     order()
     assert [(each.name, each.value) for each in given] == [("clamp", 0.4)]

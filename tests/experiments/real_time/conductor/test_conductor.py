@@ -34,10 +34,10 @@ class Course(Conductor):
     def __init__(self, phases: dict[float, str], deaths: dict[float, Death] | None = None) -> None:
         self._clock: Any = Clock()
         self._experiment = EXPERIMENT
-        self._robots = {name: RobotView() for name in EXPERIMENT.robots}
+        self.robots = self._robots = {name: RobotView() for name in EXPERIMENT.robots}
         self._progress = Progress("only", "", None, 10.0, self._robots)
         self._phases, self._deaths = phases, deaths or {}
-        self._failures: list[str] = []
+        self.failures: list[str] = []
         self._starting: set[str] = set()
         self._landed: set[str] = set()
         self.reasons: dict[str, str] = {}  # of robots that have landed at 3 s, before all others
@@ -82,8 +82,8 @@ def _without_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
 )
 def test_a_run_that_ended_early_has_failed(landing: float, failures: list[str]) -> None:
     course = Course({0.0: "running", landing: "landing"})
-    course._walk(START)
-    assert [text.replace("3.5", "3.0") for text in course._failures] == failures
+    course.walk(START)
+    assert [text.replace("3.5", "3.0") for text in course.failures] == failures
 
 
 @pytest.mark.parametrize(
@@ -92,37 +92,37 @@ def test_a_run_that_ended_early_has_failed(landing: float, failures: list[str]) 
 def test_robot_that_was_ordered_down_spoils_the_run(reason: str, spoilt: bool) -> None:
     """What lands a robot else is a hazard of the recording."""
     course = Course({0.0: "running", 10.0: "landing"})
-    name = next(iter(course._robots))
+    name = next(iter(course.robots))
     course.reasons = {name: reason}
-    course._walk(START)
-    assert [text.split(" of ")[0].rpartition(" ")[0] for text in course._failures] == [f"{name} landed after"] * spoilt
+    course.walk(START)
+    assert [text.split(" of ")[0].rpartition(" ")[0] for text in course.failures] == [f"{name} landed after"] * spoilt
 
 
 def test_a_run_without_any_robot_left_has_failed() -> None:
     course = Course({0.0: "running"})
-    for view in course._robots.values():
+    for view in course.robots.values():
         view.left_because = "lost"
-    course._walk(START)
-    assert [text.partition(" after")[0] for text in course._failures] == ["no robot was left"]
+    course.walk(START)
+    assert [text.partition(" after")[0] for text in course.failures] == ["no robot was left"]
 
 
 def test_a_recorder_that_dies_spoils_the_run() -> None:
     course = Course({0.0: "running", 10.0: "landing"}, {4.0: DEAD})
-    course._walk(START)
-    assert course._failures == [DEAD.text]
+    course.walk(START)
+    assert course.failures == [DEAD.text]
 
 
 def test_a_recorder_is_awaited_again_before_the_start() -> None:
     course = Course({0.0: "ready"}, {0.0: DEAD})
-    assert course._await_phase("ready", 10.0, recorder=True)
-    assert course._failures == []
+    assert course.await_phase("ready", 10.0, recorder=True)
+    assert course.failures == []
 
 
 def test_nothing_flies_without_a_recorder() -> None:
     course = Course({0.0: "ready"})
     course._processes.recording = False
     with pytest.raises(RunFailed, match="nothing would be recorded"):
-        course._await_phase("ready", 10.0, recorder=True)
+        course.await_phase("ready", 10.0, recorder=True)
 
 
 def test_a_recorder_that_stands_still_is_killed() -> None:
@@ -134,10 +134,10 @@ def test_a_recorder_that_stands_still_is_killed() -> None:
 
 def test_output_of_a_lost_robot_is_told_once():
     course = Course({})
-    lost, late = list(course._robots)[:2]
+    lost, late = list(course.robots)[:2]
     course._processes.last_line = lambda name: f"last words of {name}"
-    course._robots[lost].left_because = "lost"
-    told = course._start_failure([lost, late], "could not start")
+    course.robots[lost].left_because = "lost"
+    told = course.start_failure([lost, late], "could not start")
     assert told.count("could not start") == 1
     assert f"last words of {late}" in told
     assert f"last words of {lost}" not in told  # the event of its end has them

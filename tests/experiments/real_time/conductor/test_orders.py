@@ -102,7 +102,7 @@ def test_robots_beginning_is_its_first_status_within_experiment() -> None:
     view.report = lambda *_, **__: None  # type: ignore[method-assign]
     for phase, at in (("airborne", -0.1), ("running", 0.28), ("running", 1.28), ("landing", 2.0)):
         said = status(at=at)
-        view._receive_status(
+        view.receive_status(
             messages.decode(
                 messages.encode(said).replace(b'"run"', f'"{phase}"'.encode()), messages.JSON, messages.Status
             )
@@ -139,7 +139,7 @@ def test_unasked_landing_is_a_hazard_with_reason_once(reason: str, incidents: tu
         made = msgspec.structs.replace(
             status(at=float(at)), phase=phase, reason=reason if down else "", incidents=told if down else []
         )
-        view._receive_status(made)
+        view.receive_status(made)
     found = [text for kind, source, text in said if (kind, source) == ("hazard", "TB01")]
     assert found == [*incidents, *([f"land: {reason}"] if fault else [])]
     assert any(failed(text) for text in found) == (fault or reason == "its battery is low")

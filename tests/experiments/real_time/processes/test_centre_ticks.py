@@ -4,7 +4,6 @@ import pytest
 
 from agents.network.keys import Keys
 from agents.network.name_ownership import OwnershipCheck
-from agents.ticks import Ticks
 from experiments.definition.plan import Plan
 from experiments.real_time.processes.centre import CentreProcess
 from experiments.real_time.processes.joining import Network
@@ -34,16 +33,14 @@ def test_decisions_follow_start_and_skip_standstill(monkeypatch):
     over, decided = Over(12), []
     with Net().worn() as net:
         experiment = pair(architecture="centralised")
-        process = CentreProcess(
-            Plan(experiment), Network(net.session, KEYS, [], [], OwnershipCheck([KEYS.centre_alive]))
-        )
+        joint = Network(net.session, KEYS, [], [], OwnershipCheck([KEYS.centre_alive]))
+        process = CentreProcess(Plan(experiment), joint, clock=lambda: over.now)
         hz = experiment.rates.coordination_hz
-        process._ticks = ticks = Ticks(hz, clock=lambda: over.now)
 
         def decide(t, _phase, start):
             decided.append((round(t * hz, 6), round((over.now - BEGIN) * hz, 6)))
             if len(decided) == 3:
-                for row in process._guided:
+                for row in process.guided:
                     start[row] = 4.25 / hz  # robots began there
             over.now += (3.9 if len(decided) == 8 else 0.1) / hz
             return []
@@ -55,28 +52,26 @@ def test_decisions_follow_start_and_skip_standstill(monkeypatch):
     assert [t for t, _ in decided] == pytest.approx(times)
     delays = [at - t for t, at in decided]
     assert delays == pytest.approx([late if t != 9.25 else 6.25 + late + 3.9 - 9.25 for t in times])
-    assert process._missed == 2
-    assert ticks.next == pytest.approx(13.25 / hz)
+    assert process.missed == 2
+    assert process.ticks.next == pytest.approx(13.25 / hz)
 
 
 def test_long_wait_decides_for_no_past_instant(monkeypatch):
     over, decided, late = Over(12, more=0.73), [], []
     with Net().worn() as net:
         experiment = pair(architecture="centralised")
-        process = CentreProcess(
-            Plan(experiment), Network(net.session, KEYS, [], [], OwnershipCheck([KEYS.centre_alive]))
-        )
+        joint = Network(net.session, KEYS, [], [], OwnershipCheck([KEYS.centre_alive]))
+        process = CentreProcess(Plan(experiment), joint, clock=lambda: over.now)
         hz = experiment.rates.coordination_hz
-        process._ticks = Ticks(hz, clock=lambda: over.now)
 
         def decide(t, *_):
             decided.append(over.now - BEGIN - t)
-            late.append(process._late_s)
+            late.append(process.late_s)
             return []
 
         monkeypatch.setattr(process.centre, "decide", decide)
         process.run(over)
     assert len(decided) == 12
-    assert max(decided) < 1.0 / hz + process._patience
-    assert process._missed == int(0.73 * hz)
+    assert max(decided) < 1.0 / hz + process.patience_s
+    assert process.missed == int(0.73 * hz)
     assert max(late) == pytest.approx(0.73, abs=1e-9)

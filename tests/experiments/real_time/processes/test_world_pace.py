@@ -7,12 +7,11 @@ import pytest
 
 from agents.network.keys import Keys
 from agents.network.name_ownership import OwnershipCheck
-from agents.ticks import Ticks
 from experiments.definition.experiment import Formation, Robot
 from experiments.definition.plan import Plan
 from experiments.real_time.processes import world, world_network
 from experiments.real_time.processes.joining import Network
-from experiments.real_time.processes.world import SLIP_S, WorldProcess
+from experiments.real_time.processes.world import WorldProcess
 from experiments.real_time.processes.world_population import Population
 from tests.agents.few import pair
 from tests.fuzz.loopnet import Net
@@ -36,8 +35,7 @@ def test_lateness_is_caught_up_and_standstill_lost(stands_s, lost, forgiven, asl
     with Net().worn() as net:
         population = Population(Plan(experiment))
         joint = Network(net.session, KEYS, [], [], OwnershipCheck([KEYS.world_alive]))
-        process = WorldProcess(Plan(experiment), population, joint, threading.Event())
-        process._ticks = Ticks(HZ, catch_up=round(SLIP_S * HZ), clock=lambda: now[0])
+        process = WorldProcess(Plan(experiment), population, joint, threading.Event(), lambda: now[0])
         monkeypatch.setattr(process.exchange, "slept", lambda seconds, t: slept.append((seconds, t)))
         advance = population.advance
 
