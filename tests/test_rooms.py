@@ -22,8 +22,9 @@ agents.clock agents.ticks agents.user_folder
 agents.formation agents.network
 agents.plugins
 agents.body
+agents.protocols
 agents.kinds
-agents.decision agents.protocols
+agents.decision
 agents.safety
 agents.robot
 agents.runtime
@@ -243,3 +244,36 @@ def test_test_names_are_short_and_unique():
     assert not long, f"at most {MOST_WORDS} words: the subject first, then what happens"
     twice = [file for file, names in names_of_tests().items() if len(set(names)) < len(names)]
     assert not twice
+
+
+# what names a kind outside of its own files, and why; all others ask its `Kind`
+NAMES_KINDS = {
+    "experiments.authoring.generate": "kind of a new formation, if none is asked for",
+    "experiments.authoring.robotic_park.file": "drivers of another project, by their robots",
+    "experiments.definition.experiment": "example in a text",
+    "experiments.file.reference": "example in a text",
+    "experiments.file.structure": "example in a text",
+    "experiments.file.text": "example in a text",
+    "experiments.real_time.hosts.installation": "watchdog, a program for one robot",
+    "experiments.real_time.hosts.station": "page on radios",
+    "experiments.scene.models": "pictures, by their kinds",
+    "tools.commands.author": "kind of a new formation, if none is asked for",
+    "tools.commands.hosts": "watchdog, a program for one robot",
+    "tools.commands.processes": "example in a text",
+}
+OWN_OF_KINDS = ("agents.kinds.", "agents.protocols.", "bridges.", "twins.devices.")
+
+
+def test_kinds_stand_in_their_own_files():
+    word = re.compile(r"\b(?:crazyflie|khepera4|tello|turtlebot3)\b", re.IGNORECASE)
+    naming = {
+        name
+        for name, file in modules().items()
+        if not name.startswith(OWN_OF_KINDS)
+        for node in tree(name)
+        if (isinstance(node, ast.Name | ast.alias) and word.search(ast.unparse(node)))
+        or (isinstance(node, ast.ImportFrom) and word.search(node.module or ""))
+        or (isinstance(node, ast.FunctionDef) and word.search(node.name))
+        or (isinstance(node, ast.Constant) and isinstance(node.value, str) and re.search(word.pattern, node.value))
+    }
+    assert naming == NAMES_KINDS.keys()

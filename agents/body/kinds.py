@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from math import inf, isfinite
+from math import inf, isfinite, nan
 from typing import Final, Literal
 
 import msgspec
@@ -87,6 +87,37 @@ class ProtocolTwin:
     device: Mapping[str, object] = field(default_factory=dict, hash=False)  # settings on top of those of the file
 
 
+@dataclass(frozen=True)
+class Trial:
+    """Trial of a kind in `./zenpark preflight`, before its other flights."""
+
+    name: str  # of the check, and of the option that asks for it
+    device: Mapping[str, object] = field(hash=False)  # settings on top of those of the file
+    hold_s: float  # for which it takes after the take-off [s]
+    # a `module:function` of the recorded states, the failure in words and the device settings; it gives what was found
+    # and the remedy, empty if all is well
+    judge: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sensor:
+    """Range sensor; ranges are measured from the sensor itself."""
+
+    name: str
+    bearing: tuple[float, ...]  # (m) of the rays from the robot's nose, to the left [rad]
+    elevation: tuple[float, ...] = ()  # (m) 0 or ±π/2 [rad]; empty: all 0
+    mount: float = 0.0  # from the robot's centre to the sensor, along each ray [m]
+    height: float  # above the robot's position, which is the lowest point of its body [m]
+    nearest: float = 0.0  # closer objects are not reported [m]; with 0, an object that touches the sensor is at 0
+    farthest: float  # farther objects are not reported [m]
+    rate_hz: float
+    sigma: float  # standard deviation of a reading [m]
+    relative: float = 0.0  # standard deviation as a share of the range, from `relative_from` on
+    relative_from: float = inf  # [m]
+    dropout: float = 0.0  # probability that a ray reports nothing
+    resolution: float = 0.0  # step of the readings [m]; 0: none
+
+
 class Agility(msgspec.Struct, frozen=True):
     """Rates and limits of a kind, as `Kind` has them."""
 
@@ -129,7 +160,8 @@ class Kind:
     steering: Steering | None = None  # of one that takes twists; None: as two wheels turn
     # of its twin, or a `module:class`, see `twins.models.ground.Ground`; None: it has no twin
     motion: Motion | str | None = None
-    sensors: tuple[str, ...] = ()  # range sensors that each has, see `twins.sensing.range_sensors.SENSORS`
+    sensors: tuple[Sensor, ...] = ()  # range sensors that each has
+    decks: tuple[Sensor, ...] = ()  # those that a robot has if the file says so
     airframe: Airframe | None = None  # for the engine mujoco; None: that engine refuses it
     # how it is known
     aliases: tuple[str, ...] = ()  # parts of names by which importers know it
@@ -142,6 +174,10 @@ class Kind:
     bodies: tuple[str, ...] = ()  # of the group `zenpark.bodies` that drive this kind only
     library: str = ""  # that those need
     twin: ProtocolTwin | None = None
+    # `module:function` of name, body and device settings: a robot's address in ROS 2 on routers of the experiment
+    ros_address: str = ""
+    takeoff_height: float = nan  # to which it climbs by itself [m]; NaN: to any
+    trial: Trial | None = None
     connect: str = ""  # remedy for a robot that does not answer
     charge: str = "charge it"  # remedy for an empty battery
     locks: bool = False  # an emergency stop locks it until it is switched off and on

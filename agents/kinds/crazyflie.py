@@ -2,11 +2,23 @@
 
 from __future__ import annotations
 
-from math import inf
+from math import inf, radians
 from typing import Final
 
-from agents.body.kinds import Airframe, Flight, Kind, ProtocolTwin
+from agents.body.kinds import Airframe, Flight, Kind, ProtocolTwin, Sensor
 
+# in the order of its bridge: front, back, left, right, up. Rate, sigma and height (half that of the robot) are choices;
+# its beams are lines here, and cones in reality
+MULTIRANGER: Final = Sensor(
+    name="multiranger",
+    bearing=(0.0, radians(180.0), radians(90.0), radians(-90.0), 0.0),
+    elevation=(0.0, 0.0, 0.0, 0.0, radians(90.0)),
+    height=0.0145,
+    farthest=4.0,
+    rate_hz=20.0,
+    sigma=0.010,
+    resolution=0.001,
+)
 CRAZYFLIE: Final = Kind(
     "crazyflie",
     "position",
@@ -31,6 +43,7 @@ CRAZYFLIE: Final = Kind(
         torque=0.00596,  # Förster, "System Identification of the Crazyflie 2.0 Nano Quadrocopter", 2015
         size=(0.092, 0.092, 0.029),
     ),
+    decks=(MULTIRANGER,),
     aliases=("dron", "crazyflie"),
     prefix="CF",
     colour="#AA4499",

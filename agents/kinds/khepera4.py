@@ -4,8 +4,26 @@ from __future__ import annotations
 
 from typing import Final
 
-from agents.body.kinds import Kind, ProtocolTwin, Wheels
+from agents.body.kinds import Kind, ProtocolTwin, Sensor, Wheels
+from agents.protocols.khepera4 import LIGHT_BEARING, RIM, SOUND_BEARING
 
+# the maker gives no accuracy, and rates depend on the program on the robot: 10 Hz, sigmas, heights (lower than a landed
+# Crazyflie is high) and dropouts are choices
+INFRARED: Final = Sensor(
+    name="infrared", bearing=LIGHT_BEARING, mount=RIM, height=0.025, farthest=0.25, rate_hz=10.0, sigma=0.005
+)
+ULTRASONIC: Final = Sensor(
+    name="ultrasonic",
+    bearing=SOUND_BEARING,
+    mount=RIM,
+    height=0.025,
+    nearest=0.25,
+    farthest=2.0,
+    rate_hz=10.0,
+    sigma=0.005,
+    dropout=0.01,  # lost echoes
+    resolution=0.01,  # its protocols use centimetres
+)
 KHEPERA4: Final = Kind(
     "khepera4",
     "twist",
@@ -19,7 +37,7 @@ KHEPERA4: Final = Kind(
     response=1.0,
     turn_response=1.5,
     motion=Wheels(base=0.1054, speed=0.8137, acceleration=130.0 * 0.021),  # 130 rad/s² on a wheel of 42 mm
-    sensors=("infrared", "ultrasonic"),
+    sensors=(INFRARED, ULTRASONIC),
     aliases=("khepera",),
     prefix="KH",
     colour="#44AA99",

@@ -5,8 +5,9 @@ from __future__ import annotations
 from math import inf, radians
 from typing import Final
 
-from agents.body.kinds import Flight, Kind, ProtocolTwin
+from agents.body.kinds import Flight, Kind, ProtocolTwin, Trial
 from agents.kinds.crazyflie import CRAZYFLIE
+from agents.protocols.tello import TAKEOFF_HEIGHT, TEST_ENDS_S
 
 assert CRAZYFLIE.airframe is not None
 TELLO: Final = Kind(
@@ -32,6 +33,8 @@ TELLO: Final = Kind(
     bodies=("tello",),
     library="djitellopy",
     twin=ProtocolTwin("tello-twin", "tellos"),  # all of a computer are on one port
+    takeoff_height=TAKEOFF_HEIGHT,
+    trial=Trial("sticks", {"stick_test": True}, TEST_ENDS_S[-1], "agents.protocols.tello:judge_stick_test"),
     connect="switch it on; this computer in its Wi-Fi; UDP 8889 and 8890 through the firewall (docs/tello.md)",
     charge="charge it, or put a full one in",
 )

@@ -6,12 +6,15 @@ The drone's own units are centimetres and degrees, its yaw grows clockwise, and 
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
+from collections.abc import Mapping, Sequence
 from typing import Final
 from urllib.parse import urlsplit
 
 import msgspec
 
-from agents.body.interface import BodyError
+from agents.body.interface import BodyError, settings
+from agents.network.messages import State
 
 HOST: Final = "192.168.10.1"  # of a Tello that is its own access point
 CONTROL_PORT: Final = 8889  # at the drone for commands; djitellopy binds the same number here for the answers
@@ -23,6 +26,10 @@ STICK: Final = 100  # full deflection
 STICK_SPEED: Final = 1.0  # [m/s] at full deflection, unless measured: a guess, the maker gives no figure
 TEST_SPEED: Final = 0.2  # [m/s] of the stick test, as far as known: 2 s forward, at rest 1 s before and after, 2 s back
 TEST_ENDS_S: Final = (1.0, 3.0, 4.0, 6.0, 7.0)  # [s] ends of its parts, from the end of the take-off
+TEST_WINDOW_S: Final = 1.0  # the speed of sticks is that over this time, when it has settled
+SLOWEST_STICK: Final = 0.1  # [m/s] at full deflection; less is none
+STICK_UNEVEN: Final = 0.3  # largest difference of forward and back, as a share of their mean
+STICK_OFF: Final = 0.1  # largest error of the setting `stick_speed`, as a share of it
 STICK_TURN: Final = math.radians(100.0)  # [rad/s] at full deflection, likewise
 
 
@@ -91,6 +98,37 @@ def stick_test(elapsed: float, stick_speed: float) -> tuple[int, int, int, int] 
     deflection = test_deflection(stick_speed)
     forward = (0, deflection, 0, -deflection, 0)
     return next(((0, stick, 0, 0) for stick, end in zip(forward, TEST_ENDS_S, strict=True) if elapsed < end), None)
+
+
+def judge_stick_test(states: Sequence[State], failure: str, device: Mapping[str, object]) -> tuple[str, str]:
+    """Result of a stick test and remedy: speed at full deflection [m/s], from that over a second forward and back."""
+    speeds = _test_speeds([state for state in states if state.position is not None and state.yaw is not None])
+    if failure:
+        fast = speeds is not None and max(speeds) > 2.0 * TEST_SPEED
+        remedy = "it is fast: double stick_speed in its table, then again" if fast else "look at its log"
+        return failure, f"{remedy}; do not fly it before the cause is clear"
+    if speeds is None:
+        return "its position was not known long enough", "see the line on its position"
+    believed = settings(TelloSettings, "", device).stick_speed
+    forward, back = (speed * STICK / test_deflection(believed) for speed in speeds)
+    measured = 0.5 * (forward + back)
+    found = (
+        f"{measured:.2f} m/s at full deflection ({forward:.2f} forward, {back:.2f} back), `stick_speed` is {believed:g}"
+    )
+    if min(forward, back) < SLOWEST_STICK or abs(forward - back) > STICK_UNEVEN * measured:
+        return found, "uneven: no draught, the floor well lit and patterned, propellers, then again"
+    off = abs(measured - believed) > STICK_OFF * believed
+    return found, f"write device = {{ stick_speed = {measured:.2f} }} in its table, then again" if off else ""
+
+
+def _test_speeds(known: Sequence[State]) -> tuple[float, float] | None:
+    """Largest mean speeds [m/s] over `TEST_WINDOW_S` along the nose, forward and back; None for shorter times."""
+    times = [state.stamp for state in known]
+    yaw = (known[0].yaw or 0.0) if known else 0.0
+    along = [state.position[0] * math.cos(yaw) + state.position[1] * math.sin(yaw) for state in known if state.position]
+    ends = ((begin, bisect_left(times, time + TEST_WINDOW_S)) for begin, time in enumerate(times))
+    speeds = [(along[end] - along[k]) / (times[end] - times[k]) for k, end in ends if end < len(times)]
+    return (max(speeds), -min(speeds)) if speeds else None
 
 
 def motion(

@@ -7,6 +7,7 @@ Shared by the bridge that drives one and the protocol twin that plays one. Sourc
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from math import copysign
 from typing import Annotated, Final, Literal, get_args
@@ -15,7 +16,7 @@ from urllib.parse import parse_qsl
 import msgspec
 from msgspec import Meta
 
-from agents.body.interface import BodyError
+from agents.body.interface import BodyError, settings
 from agents.protocols import ros2
 from agents.protocols.ros2 import Distro, Style
 
@@ -95,6 +96,17 @@ def address(name: str, text: str, chosen: TurtleBot3Settings) -> Address:
 def twin(name: str, chosen: TurtleBot3Settings) -> Address:
     """The address of a robot's protocol twin: its own name is the namespace."""
     return Address(chosen.style, re.sub(r"\W|^(?=\d)", "_", name, flags=re.ASCII), chosen.distro, chosen.domain)
+
+
+def address_on_routers(name: str, text: str, device: Mapping[str, object], *, of_twin: bool) -> Address | None:
+    """Address of a robot, or of its protocol twin, on routers of the experiment; None if it has an endpoint of its own.
+
+    Raises as `address`.
+    """
+    chosen = settings(TurtleBot3Settings, name, device)
+    if chosen.endpoint is not None:
+        return None
+    return twin(name, chosen) if of_twin else address(name, text, chosen)
 
 
 def command_type(distro: Distro, stamped: bool | None) -> str:

@@ -63,7 +63,8 @@ def layout(what: str, size: str, wanted: LayoutOptions) -> Layout:
     if what == "polygon":
         return layouts.polygon(count, wanted.spacing)
     if not kind.flies:
-        raise LayoutError(f"a hemisphere needs robots that fly, not a {kind.name}: choose --kind crazyflie")
+        flying = " or ".join(each.name for each in KINDS.usable() if each.flies)
+        raise LayoutError(f"a hemisphere needs robots that fly, not a {kind.name}: choose --kind {flying}")
     return layouts.hemisphere(count, wanted.spacing, 2.0 * kind.radius + PASSING)
 
 

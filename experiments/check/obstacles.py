@@ -7,10 +7,10 @@ from typing import Final
 
 import numpy as np
 
-from agents.body.kinds import KINDS
 from experiments.check.analysis import Analysis
 from experiments.check.findings import FORGIVEN, Finding, join_names
-from experiments.definition.experiment import WORLD, Robot
+from experiments.definition.bodies import sensors_of
+from experiments.definition.experiment import WORLD
 from twins import scene as outlines
 from twins.arrays import Array, Index, Mask
 from twins.scene import Obstacle
@@ -108,7 +108,7 @@ def perception(analysis: Analysis) -> Iterator[Finding]:
     height = analysis.height
     low, high = _heights(analysis, height)
     for row, name in enumerate(analysis.names):
-        if _sensors(experiment.robots[name]) or not experiment.robots[name].avoids:
+        if sensors_of(experiment.robots[name]) or not experiment.robots[name].avoids:
             continue
         in_height = [k for k in range(len(scene.names)) if outlines.at_height(scene, k, low[row], high[row])]
         there = [f"'{scene.names[k]}'" for k in in_height]
@@ -133,7 +133,7 @@ def reality(analysis: Analysis) -> Iterator[Finding]:
         if served and robot.body == WORLD:
             message = f'{name} lives in the world and has its range sensors anyway: ranges = "world" adds nothing'
             yield Finding("warning", "ranges-twice", message, "leave ranges out", path)
-        elif served and not _sensors(robot):
+        elif served and not sensors_of(robot):
             message = f"{name} has no range sensors that the world could serve"
             yield Finding("warning", "ranges-of-nothing", message, 'say which: sensors = ["multiranger"]', path)
         elif served and bare:
@@ -147,10 +147,6 @@ def reality(analysis: Analysis) -> Iterator[Finding]:
         subject = f"{join_names(alone)} {'is' if len(alone) == 1 else 'are'}"
         message = f'in real time {subject} in no common place and without range sensors, unless body = "world"'
         yield Finding("note", "alone", message, "", ("robots", alone[0]))
-
-
-def _sensors(robot: Robot) -> tuple[str, ...]:
-    return KINDS[robot.kind].sensors if robot.sensors is None else tuple(robot.sensors)
 
 
 def _heights(analysis: Analysis, z: Array) -> tuple[Array, Array]:

@@ -8,20 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from functools import reduce
-from typing import Final
+from typing import Any, Final
 
-from agents.body.interface import settings
+from agents.body.kinds import KINDS
 from agents.network.access_control import ADMIN, Grant, Rights
 from agents.network.keys import Keys
 from agents.plugins import registry
-from agents.protocols import turtlebot3
 from experiments.definition.experiment import VICON_TWIN, WORLD, Robot
 from experiments.definition.plan import Plan
 
 FAR: Final = ("external", WORLD)  # bodies with poses from the process that carries them
 MANY: Final = 16  # senders from which on the right is "*", if they are all robots: a router reads N² keys for minutes
-ROS: Final = ("ros2dds", "rmw")
-ROS_TWIN: Final = "turtlebot3-twin"
 
 
 def rights(cases: Iterable[Plan]) -> Rights:
@@ -154,15 +151,14 @@ def senders_by_receiver(plan: Plan) -> dict[str, set[str]]:
     return found
 
 
-def _ros(name: str, robot: Robot) -> turtlebot3.Address | None:
+def _ros(name: str, robot: Robot) -> Any:  # noqa: ANN401 - of the protocol of its kind
     """Address of a robot in ROS 2 on the experiment's own routers; None if it is not there."""
-    body = registry.body_name(robot.body)
-    if body not in (*ROS, ROS_TWIN):
+    kind, body = KINDS[robot.kind], registry.body_name(robot.body)
+    twin = "" if kind.twin is None else kind.twin.body
+    if not kind.ros_address or body not in (*kind.bodies, twin):
         return None
-    chosen = settings(turtlebot3.TurtleBot3Settings, name, robot.device)
-    if chosen.endpoint is not None:
-        return None
-    return turtlebot3.twin(name, chosen) if body == ROS_TWIN else turtlebot3.address(name, robot.body, chosen)
+    address = registry.find(kind.ros_address, f"ROS 2 of the kind {kind.name}")
+    return address(name, robot.body, robot.device, of_twin=body == twin)
 
 
 def _ros_keys(names: Iterable[str], plan: Plan) -> tuple[list[str], list[str]]:

@@ -14,7 +14,7 @@ from agents.body.interface import BodyError, BodyRequest
 from agents.body.kinds import KINDS, Kind
 from agents.network.keys import Keys
 from agents.vectors import Vector, clamp
-from experiments.definition.experiment import VICON_TWIN, WORLD
+from experiments.definition.experiment import VICON_TWIN, WORLD, Robot
 from experiments.definition.plan import Plan
 from twins import scene as outlines
 from twins.engines.engine import World
@@ -81,6 +81,12 @@ def _is_clear(stands: Scene, place: tuple[float, float], kind: Kind) -> bool:
     )
 
 
+def sensors_of(robot: Robot) -> tuple[str, ...]:
+    """Names of the range sensors of a robot."""
+    own = tuple(each.name for each in KINDS[robot.kind].sensors)
+    return own if robot.sensors is None else tuple(robot.sensors)
+
+
 def shared_world(plan: Plan, names: Sequence[str], *, sensing: bool | None = None) -> World:
     """World that `names` share; with range sensors where avoidance uses them, or as `sensing` says."""
     experiment = plan.experiment
@@ -88,8 +94,7 @@ def shared_world(plan: Plan, names: Sequence[str], *, sensing: bool | None = Non
     carried = []
     for name in names:
         robot = experiment.robots[name]
-        own = KINDS[robot.kind].sensors if robot.sensors is None else tuple(robot.sensors)
-        carried.append(own if used or robot.sensors else ())
+        carried.append(sensors_of(robot) if used or robot.sensors else ())
     return World(
         scene=plan.scene,
         engine=plan.engine,

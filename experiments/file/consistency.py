@@ -38,7 +38,7 @@ from twins import scene as outlines
 from twins.engines.engine import require_carried
 from twins.engines.point_mass import TWINLESS, has_model
 from twins.scene import Scene
-from twins.sensing.range_sensors import SENSORS
+from twins.sensing.range_sensors import sensors
 
 
 def standby_faults(experiment: Experiment) -> Iterator[Fault]:
@@ -242,9 +242,9 @@ def _robot(plan: Plan, path: tuple[str, str], robot: Robot) -> Iterator[Fault]:
             yield from _engine(plan, path, kind)
         yield from _hover(experiment, path, robot, kind)
     for number, sensor in enumerate(robot.sensors or []):
-        if sensor not in SENSORS:
+        if sensor not in sensors():
             message = f"no {sensor!r} among the range sensors"
-            yield Fault((*path, "sensors", number), message, did_you_mean(sensor, SENSORS))
+            yield Fault((*path, "sensors", number), message, did_you_mean(sensor, sensors()))
     for axis, size in enumerate(experiment.arena.size[:2]):
         if abs(robot.start[axis]) > size / 2:
             hint = f"{'xy'[axis]} lies between {-size / 2:g} and {size / 2:g}; or enlarge size in [arena]"

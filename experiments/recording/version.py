@@ -18,16 +18,17 @@ from typing import Final
 
 import msgspec
 
+from agents.body.kinds import KINDS
 from agents.plugins import registry
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 PACKAGES: Final = ("agents", "bridges", "twins", "experiments", "tools")
 SHOWN: Final = 8  # characters of a digest that people compare
-# of these the version may change what a run comes to, or what is said on a wire; those not installed are left out
+# of these, and of those of kinds, the version may change what a run comes to, or what is said on a wire; those not
+# installed are left out
 LIBRARIES: Final = (
-    *("numpy", "eclipse-zenoh", "msgspec", "mcap", "pymunk", "mujoco", "mujoco-core", "daqp", "onnxruntime"),
-    *("cflib", "djitellopy", "rosbags"),
-)
+    "numpy", "eclipse-zenoh", "msgspec", "mcap", "pymunk", "mujoco", "mujoco-core", "daqp", "onnxruntime",
+)  # fmt: skip
 GIT_S: Final = 5.0
 UNSYNCHRONISED: Final = 5  # what adjtimex returns for a clock that nothing keeps right (TIME_ERROR)
 TIMEX_BYTES: Final = 256  # more than struct timex has
@@ -39,7 +40,7 @@ class Provenance(msgspec.Struct, frozen=True, omit_defaults=True):
     zenpark: str  # version
     code: str  # digest of all modules, see `digest`
     python: str
-    packages: dict[str, str]  # versions of `LIBRARIES`
+    packages: dict[str, str]  # versions of `LIBRARIES` and of those of kinds
     commit: str = ""  # of a checkout; "+changes" behind it if files differ from it
     plugins: dict[str, str] = {}  # distributions that have plug-ins, but for our own, and their versions
     host: str = ""
@@ -91,7 +92,8 @@ def digest(root: Path = ROOT, packages: Sequence[str] = PACKAGES) -> str:
 
 def provenance(text: str | None = None) -> Provenance:
     """Code, versions and machine of this process, now; of plug-ins only those that the text of an experiment names."""
-    packages = {name: found for name in LIBRARIES if (found := installed(name)) is not None}
+    libraries = dict.fromkeys([*LIBRARIES, *(kind.library for kind in KINDS.usable() if kind.library)])
+    packages = {name: found for name in libraries if (found := installed(name)) is not None}
     with suppress(OSError, ValueError):
         memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
     return Provenance(

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from agents.body.kinds import Kind
 from agents.decision.lifecycle import Phase
-from agents.kinds.khepera4 import KHEPERA4
+from agents.kinds.theory import POINT
 from agents.network.messages import EMERGENCY, Ranges, Status, WorldState
 from agents.plugins import registry
 from agents.plugins.laws import Gradient
@@ -177,7 +177,7 @@ class Stage:
         """Robots of which nothing but their names is known."""
         everywhere = Scene.furnished((4.0, 4.0, 2.5), {}, {}, walled=False)
         return cls(
-            "", names, (KHEPERA4,) * len(names), (Place.TWIN,) * len(names), np.zeros(len(names), dtype=bool),
+            "", names, (POINT,) * len(names), (Place.TWIN,) * len(names), np.zeros(len(names), dtype=bool),
             everywhere, links([]), (), 0.0,
         )  # fmt: skip
 

@@ -26,7 +26,7 @@ from agents.network.pubsub import alive_token, pose_publisher, publisher
 from agents.network.session import open_session, received
 from agents.protocols import ros2
 from bridges.ros2 import GoalHeight, main, ros_name, scan, transform
-from twins.sensing.range_sensors import SENSORS
+from twins.sensing.range_sensors import fan, sensors
 
 ROOT = Path(__file__).resolve().parents[2]
 JSON = "application/json"
@@ -127,9 +127,9 @@ def test_range_readings_are_a_scan_of_equal_steps(bearing, up, distance, grid, p
     np.testing.assert_array_equal(back.ranges, np.array(places, np.float32))
 
 
-@pytest.mark.parametrize("name", SENSORS)
+@pytest.mark.parametrize("name", sensors())
 def test_each_sensor_becomes_a_scan_that_loses_nothing(name):
-    sensor = SENSORS[name]
+    sensor = fan(sensors()[name])
     flat = np.abs(sensor.elevation) < 0.01
     distance = (0.5 + 0.01 * np.arange(len(flat))).tolist()
     ranges = messages.Ranges("R", 12.5, sensor.bearing.round(6).tolist(), sensor.elevation.round(6).tolist(), distance)

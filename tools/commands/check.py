@@ -166,7 +166,7 @@ def preflight(
                 read,
                 folder,
                 options,
-                Trials(hop=hop, stop=stop, sticks=sticks),
+                Trials(hop=hop, stop=stop, own=sticks),
                 Supervision(shown(quiet=as_json), interrupted, emergency, tell=warn),
             )
             ended = interrupted()

@@ -189,7 +189,7 @@ class World:
 
     scene: Scene
     engine: EngineFactory
-    sensors: Sequence[tuple[str, ...]]  # range sensors, by name (`twins.sensing.range_sensors.SENSORS`)
+    sensors: Sequence[tuple[str, ...]]  # range sensors, by name (`twins.sensing.range_sensors.sensors`)
     sensor_noise: float  # of the range sensors, as a multiple of the real noise
     mirrored: Sequence[bool]  # robots that really are elsewhere, shown here at their received poses
 

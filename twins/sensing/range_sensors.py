@@ -1,8 +1,7 @@
 """Range sensors of twins: direction, range, rate and noise of each.
 
-A new sensor is a new entry of `SENSORS`: a `Sensor` with its rays and parameters. A robot has a sensor when its
-`sensors` in the experiment file names it, or, for all robots of a kind, when its kind does. No other module knows
-sensor names.
+A sensor is a `agents.body.kinds.Sensor` of a kind. A robot has it when its `sensors` in the experiment file names it,
+or, for all robots of a kind, when its kind does.
 
 Accuracies that makers give as limits (±) are read as two standard deviations of white noise: 95 % within them.
 """
@@ -10,7 +9,7 @@ Accuracies that makers give as limits (±) are read as two standard deviations o
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from functools import cache
 from math import inf, nan
 from statistics import NormalDist
 from typing import Final
@@ -18,7 +17,7 @@ from typing import Final
 import numpy as np
 
 from agents.body.interface import BodyError, BodyRequest, RangeScan
-from agents.protocols.khepera4 import LIGHT_BEARING, RIM, SOUND_BEARING
+from agents.body.kinds import KINDS, Sensor
 from twins.arrays import Array, Index
 from twins.engines.engine import Engine, World
 from twins.models.noise import stream
@@ -28,79 +27,16 @@ DRAWN_AHEAD: Final = 512  # numbers per robot and sensor
 ON_TIME: Final = 1e-6  # [s] ticks are multiples of a period, up to rounding
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Sensor:
-    """One kind of range sensor; ranges are measured from the sensor itself."""
-
-    bearing: Array  # (m,) of the rays from the robot's nose, to the left [rad]
-    elevation: Array  # (m,) 0 or ±π/2 [rad]
-    mount: float = 0.0  # from the robot's centre to the sensor, along each ray [m]
-    height: float  # above the robot's position, which is the lowest point of its body [m]
-    nearest: float = 0.0  # closer objects are not reported [m]; with 0, an object that touches the sensor is at 0
-    farthest: float  # farther objects are not reported [m]
-    rate_hz: float
-    sigma: float  # standard deviation of a reading [m]
-    relative: float = 0.0  # standard deviation as a share of the range, from `relative_from` on
-    relative_from: float = inf  # [m]
-    dropout: float = 0.0  # probability that a ray reports nothing
-    resolution: float = 0.0  # step of the readings [m]; 0: none
-
-    @property
-    def fan(self) -> Fan:
-        """The sensor's rays, from the robot's centre."""
-        return Fan(self.bearing, self.elevation, self.height, self.mount + self.farthest)
+@cache
+def sensors() -> dict[str, Sensor]:
+    """Range sensors of all kinds by name."""
+    return {each.name: each for kind in KINDS.usable() for each in (*kind.sensors, *kind.decks)}
 
 
-SENSORS: Final[dict[str, Sensor]] = {
-    # Khepera IV; the maker gives no accuracy, and rates depend on the program on the robot: 10 Hz, sigmas, heights
-    # (lower than a landed Crazyflie is high) and dropouts are choices
-    "infrared": Sensor(
-        bearing=np.array(LIGHT_BEARING),
-        elevation=np.zeros(len(LIGHT_BEARING)),
-        mount=RIM,
-        height=0.025,
-        farthest=0.25,
-        rate_hz=10.0,
-        sigma=0.005,
-    ),
-    "ultrasonic": Sensor(
-        bearing=np.array(SOUND_BEARING),
-        elevation=np.zeros(len(SOUND_BEARING)),
-        mount=RIM,
-        height=0.025,
-        nearest=0.25,
-        farthest=2.0,
-        rate_hz=10.0,
-        sigma=0.005,
-        dropout=0.01,  # lost echoes
-        resolution=0.01,  # its protocols use centimetres
-    ),
-    # TurtleBot3: ±15 mm below 0.5 m, ±5 % beyond; the dropout is a choice
-    "lds01": Sensor(
-        bearing=np.radians(np.arange(360.0)),
-        elevation=np.zeros(360),
-        height=0.182,  # mounted on top: lower robots are below its plane
-        nearest=0.12,
-        farthest=3.5,
-        rate_hz=5.0,
-        sigma=0.0075,
-        relative=0.025,
-        relative_from=0.5,
-        dropout=0.005,
-        resolution=0.001,
-    ),
-    # Crazyflie's Multi-ranger, in the order of its bridge: front, back, left, right, up. Rate, sigma and height (half
-    # that of the robot) are choices; its beams are lines here, and cones in reality
-    "multiranger": Sensor(
-        bearing=np.radians([0.0, 180.0, 90.0, -90.0, 0.0]),
-        elevation=np.radians([0.0, 0.0, 0.0, 0.0, 90.0]),
-        height=0.0145,
-        farthest=4.0,
-        rate_hz=20.0,
-        sigma=0.010,
-        resolution=0.001,
-    ),
-}
+def fan(sensor: Sensor) -> Fan:
+    """The rays of a sensor, from the robot's centre."""
+    elevation = np.array(sensor.elevation or (0.0,) * len(sensor.bearing))
+    return Fan(np.array(sensor.bearing), elevation, sensor.height, sensor.mount + sensor.farthest)
 
 
 class RangeSensors:
@@ -113,8 +49,8 @@ class RangeSensors:
         carried = [tuple(dict.fromkeys(own)) for own in world.sensors]
         for robot, own in zip(request.names, carried, strict=True):
             for name in own:
-                if name not in SENSORS:
-                    raise BodyError(f"{robot}: there is no sensor {name}; there are {', '.join(SENSORS)}")
+                if name not in sensors():
+                    raise BodyError(f"{robot}: there is no sensor {name}; there are {', '.join(sensors())}")
         self._caster = Caster(world.scene, request.kinds)
         fans = [(row, name) for row, own in enumerate(carried) for name in own]
         self._mounted = []
@@ -125,7 +61,7 @@ class RangeSensors:
         self._rays = [_directions(own) for own in carried]
         # distance to what each sensor of a robot has seen last
         self._seen: list[dict[str, list[float]]] = [
-            {name: [nan] * len(SENSORS[name].bearing) for name in own} for own in carried
+            {name: [nan] * len(sensors()[name].bearing) for name in own} for own in carried
         ]
         self.scans = [None] * len(carried)
         self._due = [-inf] * len(self._mounted)
@@ -168,24 +104,25 @@ class RangeSensors:
         return True
 
 
-def _directions(sensors: Sequence[str]) -> tuple[list[float], list[float]]:
+def _directions(names: Sequence[str]) -> tuple[list[float], list[float]]:
     """Bearings and elevations of the rays of some sensors [rad]."""
-    bearing = [each for name in sensors for each in SENSORS[name].bearing.tolist()]
-    return bearing, [each for name in sensors for each in SENSORS[name].elevation.tolist()]
+    fans = [fan(sensors()[name]) for name in names]
+    bearing = [ray for each in fans for ray in each.bearing.tolist()]
+    return bearing, [ray for each in fans for ray in each.elevation.tolist()]
 
 
 def _arrange_beams(mounted: Sequence[_Mounted]) -> Beams:
     """Arrange the rays of these sensors, sensor after sensor."""
     rows = [one.rows for one in mounted]
     which = np.repeat(np.arange(len(mounted)), [len(each) for each in rows])
-    return Beams([one.sensor.fan for one in mounted], np.concatenate(rows), which)
+    return Beams([fan(one.sensor) for one in mounted], np.concatenate(rows), which)
 
 
 class _Mounted:
     """One kind of sensor on the robots that have it."""
 
     def __init__(self, name: str, rows: Index, request: BodyRequest, scale: float) -> None:
-        sensor = self.sensor = SENSORS[name]
+        sensor = self.sensor = sensors()[name]
         self.name = name
         self.rows = rows  # (k,)
         self._scale = scale

@@ -136,9 +136,10 @@ def _robot(robot: Robot, found: Heights, row: int) -> dict[str, Any]:
 def _body(robot: Robot) -> dict[str, str]:
     """Address of a real robot and its process; nothing for twins, and where there is no address."""
     radio = RADIO.fullmatch(robot.uri)
-    if robot.type != "virtual" and robot.kind == "crazyflie" and radio:
+    bodies = KINDS[robot.kind].bodies if robot.type != "virtual" else ()
+    if "radio" in bodies and radio:
         return {"body": robot.uri, "process": f"radio{radio[1]}"}
-    if robot.type != "virtual" and robot.kind in ("khepera4", "tello") and re.fullmatch(r"[\w.-]+(:\d+)?", robot.host):
+    if robot.kind in bodies and re.fullmatch(r"[\w.-]+(:\d+)?", robot.host):
         return {"body": f"{robot.kind}://{robot.host}"}
     return {}
 
@@ -242,11 +243,8 @@ def _formation(park: Park, found: Heights, notes: list[str]) -> tuple[dict[str, 
 
 
 def _divides(park: Park, robot: Robot) -> bool:
-    """Whether the driver of a robot divides the pull of a neighbour by its distance.
-
-    That of real Kheperas does; those in Webots, of real Crazyflies and the central controller do not.
-    """
-    return not park.central and robot.type != "virtual" and robot.kind == "khepera4"
+    """Whether the driver of a robot divides the pull of a neighbour by its distance."""
+    return robot.driver.divides and not park.central
 
 
 def _gain(park: Park, robot: Robot, task: Task, distance: float, weight: float = 1.0) -> float:

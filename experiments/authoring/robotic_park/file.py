@@ -144,6 +144,16 @@ class _Timed(Struct, frozen=True):
     T: Positive = 20.0  # [ms]
 
 
+class Driver(NamedTuple):
+    """What the authors' driver of a kind does, which those in Webots and the central controller do not."""
+
+    plans_alone: bool = False  # with the period of the task, and an origin of its own
+    divides: bool = False  # the pull of a neighbour by its distance
+
+
+DRIVERS: Final = {"crazyflie": Driver(plans_alone=True), "khepera4": Driver(divides=True)}
+
+
 class Robot(Struct, frozen=True):
     """Robot of theirs."""
 
@@ -174,6 +184,11 @@ class Robot(Struct, frozen=True):
     @property
     def kind(self) -> str:
         return kind_of(self.name)
+
+    @property
+    def driver(self) -> Driver:
+        """Of a real robot; in Webots drivers have nothing of their own."""
+        return Driver() if self.type == "virtual" else DRIVERS.get(self.kind, Driver())
 
     @property
     def start(self) -> Pose | None:
@@ -223,8 +238,8 @@ class Park:
     )
 
     def period(self, robot: Robot) -> float:
-        """Time between decisions of a robot [s]: the driver of real Crazyflies takes the period of the task."""
-        own = robot.kind == "crazyflie" and robot.type != "virtual" and not self.central
+        """Time between decisions of a robot [s]."""
+        own = robot.driver.plans_alone and not self.central
         return 1e-3 * robot.task.period_ms if own else robot.task.period
 
     @property

@@ -158,12 +158,11 @@ def find_heights(park: Park, notes: list[str]) -> Heights:
 def origin_of(park: Park, robot: Robot, relation: Relation) -> tuple[float, ...] | None:
     """Place [m] of the origin that a robot keeps a distance to; None where it is that of the arena.
 
-    The file may give one. If not, the driver of real Crazyflies has one of its own (`REAL_ORIGIN`); those of Kheperas
-    and in Webots, and the central controller, take that of the arena.
+    The file may give one. If not, some drivers have one of their own (`REAL_ORIGIN`).
     """
     if len(relation.values) == 4:
         return relation.values[1:]
-    own = robot.kind == "crazyflie" and robot.type != "virtual" and not park.central
+    own = robot.driver.plans_alone and not park.central
     return REAL_ORIGIN if own and relation.name == "origin" and len(relation.values) == 1 else None
 
 

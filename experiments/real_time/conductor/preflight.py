@@ -12,15 +12,15 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Final
 
 import msgspec
 
 from agents.body.interface import UNANSWERED
-from agents.kinds.tello import TELLO
+from agents.body.kinds import KINDS, Trial
 from agents.network import messages
-from agents.protocols import tello
 from experiments.definition.experiment import Channel, Formation, Leg, Robot
 from experiments.definition.plan import Plan
 from experiments.file.document import Document
@@ -55,7 +55,7 @@ class Trials:
 
     hop: bool = False  # drones hop to `HOP_M` (see `alone`), robots on wheels drive `DRIVE_M`
     stop: bool = False  # emergency stop of a drone that begins to climb, of a robot on wheels that drives
-    sticks: bool = False  # Tellos fly the stick test, in which no loop is closed
+    own: bool = False  # kinds that have a `Trial` of their own make it
 
 
 def check_robots(
@@ -78,12 +78,13 @@ def check_robots(
 def alone(plan: Plan) -> Plan:
     """The robots of a case without formation and plans: drones hop to `HOP_M`, robots on wheels drive `DRIVE_M`.
 
-    A Tello climbs to a height of its own before it obeys, and is not sent down to `HOP_M` from there.
+    A drone that climbs to a height of its own before it obeys is not sent down to `HOP_M` from there.
     """
+    fixed = [name for name, kind in zip(plan.names, plan.kinds, strict=True) if math.isfinite(kind.takeoff_height)]
     robots = {
         name: msgspec.structs.replace(
             robot,
-            hover=robot.hover if robot.hover is None or robot.kind == TELLO.name else min(HOP_M, robot.hover),
+            hover=robot.hover if robot.hover is None or name in fixed else min(HOP_M, robot.hover),
             shadow=None,
             standby=False,
         )
@@ -204,8 +205,10 @@ class Inspector(CaseRun):
             ("stop, motors on", "--stop", asked.stop,
              lambda: checks.stop_in_motion(each, self._move(name, robot, stop=True))),
         ]  # fmt: skip
-        if robot.kind == TELLO.name:  # first: the other flights are steered by what it measures
-            trials.insert(0, ("sticks", "--sticks", asked.sticks, lambda: checks.sticks(each, self._test_sticks(name))))
+        own = KINDS[robot.kind].trial
+        if own is not None:  # first: the other flights are steered by what it measures
+            tries = partial(checks.trial, own, each)
+            trials.insert(0, (own.name, f"--{own.name}", asked.own, lambda: tries(self._own_trial(name, own))))
         for check, option, wanted, judge in trials:
             if not wanted:
                 yield checks.not_tried(check, f"{option} tries it")
@@ -221,12 +224,14 @@ class Inspector(CaseRun):
                 red = made.verdict == "bad"
                 yield made
 
-    def _test_sticks(self, name: str) -> Tried:
-        """Stick test of a Tello, flown at the height of its take-off."""
+    def _own_trial(self, name: str, own: Trial) -> Tried:
+        """Trial of a kind, flown at the height of its take-off."""
         robot = self._processes.robot(name)
-        device = robot.device | {"stick_test": True}
-        robot = msgspec.structs.replace(robot, hover=tello.TAKEOFF_HEIGHT, device=device)
-        return self._move(name, robot, changed={name: robot}, hold_s=tello.TEST_ENDS_S[-1])
+        height = KINDS[robot.kind].takeoff_height
+        robot = msgspec.structs.replace(
+            robot, hover=height if math.isfinite(height) else robot.hover, device={**robot.device, **own.device}
+        )
+        return self._move(name, robot, changed={name: robot}, hold_s=own.hold_s)
 
     def _move(
         self,

@@ -12,13 +12,11 @@ from typing import Final, Literal
 import msgspec
 import numpy as np
 
-from agents.body.interface import settings
-from agents.body.kinds import KINDS
+from agents.body.kinds import KINDS, Trial
 from agents.body.limits import Safety
 from agents.body.measured_positions import FROZEN
 from agents.network import messages
 from agents.plugins import registry
-from agents.protocols import tello
 from agents.safety.detection import clock_off, clock_text
 from experiments.definition.bodies import driven_kind
 from experiments.definition.experiment import WORLD, Robot
@@ -33,10 +31,6 @@ HELD: Final = 25  # last states of a hop, by which its height is measured
 HOP_DRIFT_M: Final = 0.2  # a hop that ends farther to the side is bad
 DRIVE_M: Final = 0.1  # way of the drive of a robot on wheels
 DRIVE_OFF_M: Final = 0.03  # farther from this way: bad
-STICK_WINDOW_S: Final = 1.0  # the speed of sticks is that over this time, when it has settled
-SLOWEST_STICK: Final = 0.1  # [m/s] at full deflection; less is none
-STICK_UNEVEN: Final = 0.3  # largest difference of forward and back, as a share of their mean
-STICK_OFF: Final = 0.1  # largest error of the setting `stick_speed`, as a share of it
 STEADY_M: Final = 0.02  # largest spread of the position of a robot at rest without a warning,
 UNSTEADY_M: Final = 0.05  # and with which it must not fly
 TURNED: Final = math.radians(20.0)  # yaw farther than this from that of `start`: bad
@@ -316,43 +310,11 @@ def hop(observed: Observed, tried: Tried, safety: Safety) -> Check:
     return Check(check=what, verdict="bad" if remedy else "ok", found=said, remedy=remedy)
 
 
-def sticks(observed: Observed, tried: Tried) -> Check:
-    """Stick test of a Tello: speed at full deflection [m/s], from the largest speed over a second forward and back."""
-    known = [state for state in tried.states if state.position is not None and state.yaw is not None]
-    speeds = _speeds(known)
-    if tried.failure:
-        fast = speeds is not None and max(speeds) > 2.0 * tello.TEST_SPEED
-        remedy = "it is fast: double stick_speed in its table, then again" if fast else "look at its log"
-        return _bad("sticks", tried.failure, f"{remedy}; do not fly it before the cause is clear")
-    if speeds is None:
-        return _bad("sticks", "its position was not known long enough", "see the line on its position")
-    believed = settings(tello.TelloSettings, "", observed.robot.device).stick_speed
-    forward, back = (speed * tello.STICK / tello.test_deflection(believed) for speed in speeds)
-    measured = 0.5 * (forward + back)
-    said = (
-        f"{measured:.2f} m/s at full deflection ({forward:.2f} forward, {back:.2f} back), `stick_speed` is {believed:g}"
-    )
-    if min(forward, back) < SLOWEST_STICK or abs(forward - back) > STICK_UNEVEN * measured:
-        return _bad("sticks", said, "uneven: no draught, the floor well lit and patterned, propellers, then again")
-    if abs(measured - believed) > STICK_OFF * believed:
-        return _bad("sticks", said, f"write device = {{ stick_speed = {measured:.2f} }} in its table, then again")
-    return Check(check="sticks", verdict="ok", found=said)
-
-
-def _speeds(known: Sequence[messages.State]) -> tuple[float, float] | None:
-    """Largest mean speeds [m/s] over `STICK_WINDOW_S` along the nose, forward and back; None for shorter times."""
-    if not known:
-        return None
-    time_s = np.array([state.stamp for state in known])
-    positions = np.array([state.position for state in known])[:, :2]
-    yaw = known[0].yaw or 0.0
-    along = positions @ [math.cos(yaw), math.sin(yaw)]
-    end = np.searchsorted(time_s, time_s + STICK_WINDOW_S)
-    begin = np.flatnonzero(end < len(known))
-    if not len(begin):
-        return None
-    speed = (along[end[begin]] - along[begin]) / (time_s[end[begin]] - time_s[begin])
-    return float(speed.max()), float(-speed.min())
+def trial(asked: Trial, observed: Observed, tried: Tried) -> Check:
+    """Trial of a kind."""
+    judge = registry.find(asked.judge, f"trial {asked.name}")
+    found, remedy = judge(tried.states, tried.failure, observed.robot.device)
+    return Check(check=asked.name, verdict="bad" if remedy else "ok", found=found, remedy=remedy)
 
 
 def hop_of(robot: Robot) -> Literal["hop", "drive"]:

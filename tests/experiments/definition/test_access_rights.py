@@ -34,7 +34,7 @@ def control(experiment):
 
 
 def experiment(links, processes=(), architecture="distributed", **more):
-    robots = {f"R{k}": Robot(kind="khepera4", start=[0.1 * k, 0.0], **more) for k in range(4)}
+    robots = {f"R{k}": Robot(**{"kind": "khepera4", "start": [0.1 * k, 0.0], **more}) for k in range(4)}
     for group, names in enumerate(processes):
         for name in names:
             robots[name] = msgspec.structs.replace(robots[name], process=f"shared{group}")
@@ -262,7 +262,7 @@ def test_ros_2_is_reached_on_its_own_keys():
 
 
 def test_a_rmw_robot_has_its_domain():
-    one = experiment(set(), body="rmw://tb3_0?domain=7")
+    one = experiment(set(), kind="turtlebot3", body="rmw://tb3_0?domain=7")
     made = control(one)
     assert may(made, "R0", "put", "7/tb3_0/cmd_vel/geometry_msgs::msg::dds_::Twist_/RIHS01_0")
     assert may(made, "R0", "watch", "@ros2_lv/7/**")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from agents.body.interface import BodyError
-from agents.body.kinds import KINDS
+from agents.body.kinds import KINDS, Sensor
 from agents.kinds.crazyflie import CRAZYFLIE
 from agents.kinds.khepera4 import KHEPERA4
 from agents.kinds.turtlebot3 import TURTLEBOT3
@@ -18,8 +18,9 @@ from twins.body import TwinBody
 from twins.engines.engine import Stage, World
 from twins.engines.point_mass import PointMass
 from twins.scene import Obstacle, Scene
-from twins.sensing import range_sensors
-from twins.sensing.range_sensors import SENSORS, RangeSensors
+from twins.sensing.range_sensors import RangeSensors, fan, sensors
+
+SENSORS = sensors()
 
 
 def placed(kinds, carried, *, obstacles=None, size=(6.0, 6.0, 2.5), noise=0.0, mirrored=None):
@@ -50,7 +51,8 @@ def swept(asked, world, times=(0.0,)):
 
 def facing(kind, sensor, gap, noise=0.0, times=(0.0,), *, robots=1):
     """Readings (len(times) * robots,) of the ray ahead of robots, each alone, whose sensor is `gap` from a wall."""
-    ahead = (SENSORS[sensor].bearing == 0.0) & (SENSORS[sensor].elevation == 0.0)
+    rays = fan(SENSORS[sensor])
+    ahead = (rays.bearing == 0.0) & (rays.elevation == 0.0)
     place, world = (3.0 - SENSORS[sensor].mount - gap, 0.0), placed([kind], [(sensor,)], noise=noise)
     seen = [swept(request([kind], [place], seeds=(seed,)), world, times)[0] for seed in range(robots)]
     return np.concatenate(seen)[:, ahead].ravel()
@@ -58,11 +60,12 @@ def facing(kind, sensor, gap, noise=0.0, times=(0.0,), *, robots=1):
 
 def test_sensors_make_sense():
     for name, sensor in SENSORS.items():
-        assert sensor.bearing.shape == sensor.elevation.shape, name
+        assert len(sensor.elevation) in {0, len(sensor.bearing)}, name
         assert 0.0 <= sensor.nearest < sensor.farthest, name
-        assert sensor.fan.reach == sensor.mount + sensor.farthest, name
+        assert fan(sensor).reach == sensor.mount + sensor.farthest, name
         assert sensor.rate_hz > 0.0, name
-    assert {name for kind in KINDS.values() for name in kind.sensors} <= SENSORS.keys()
+    carried = [each for kind in KINDS.values() for each in {*kind.sensors, *kind.decks}]
+    assert len(carried) == len(SENSORS)  # each of its own name
 
 
 def test_figures_of_the_makers():
@@ -132,7 +135,7 @@ def test_rays_are_in_the_order_of_sensors():
     ahead = [distance for distance, bearing in zip(first.distance, first.bearing, strict=True) if bearing == 0.0]
     # the landed Crazyflie is too near for sound, and hides what is behind it; all TurtleBots' rays pass over both
     np.testing.assert_allclose(ahead, [np.nan, 0.135], atol=1e-12)
-    assert last.distance[light.tolist().index(np.pi)] == pytest.approx(0.1, abs=1e-12)
+    assert last.distance[light.index(np.pi)] == pytest.approx(0.1, abs=1e-12)
     assert np.isnan(lidar.distance[180])
 
 
@@ -145,7 +148,7 @@ def test_multiranger_looks_ahead_and_up():
 
 def test_unknown_sensor_is_refused():
     asked = request([KHEPERA4] * 2, names=("KH01", "KH02"))
-    with pytest.raises(BodyError, match=r"KH02: there is no sensor radar; there are infrared, ultrasonic, lds01"):
+    with pytest.raises(BodyError, match=r"KH02: there is no sensor radar; there are multiranger, infrared, ultrasonic, lds01"):
         RangeSensors(asked, placed([KHEPERA4] * 2, [("infrared",), ("infrared", "radar")]))
 
 
@@ -270,7 +273,7 @@ def test_mirrored_robots_are_seen_and_see():
     engine.mirror([1], [(0.3, 0.0, 0.0)], [math.pi], [ZERO])
     engine.advance(0.01, [(0.0, 0.0)] * 3)
     ranges.sweep(0.1, engine)
-    ahead = SENSORS["infrared"].bearing.tolist().index(0.0)
+    ahead = SENSORS["infrared"].bearing.index(0.0)
     for row in (0, 1):
         seen = distances(ranges, row)
         assert seen[ahead] == pytest.approx(0.23, abs=1e-12)
@@ -288,9 +291,9 @@ def test_state_of_a_twin_has_its_scan():
 
 
 def test_added_sensor_measures(monkeypatch):
-    """As a user adds one: an entry of the table, here a height sensor that looks down."""
-    floor = range_sensors.Sensor(
-        bearing=np.zeros(1), elevation=np.array([-0.5 * np.pi]), height=0.0, farthest=2.0, rate_hz=25.0, sigma=0.0
+    """As a kind adds one, here a height sensor that looks down."""
+    floor = Sensor(
+        name="floor", bearing=(0.0,), elevation=(-0.5 * np.pi,), height=0.0, farthest=2.0, rate_hz=25.0, sigma=0.0
     )
     monkeypatch.setitem(SENSORS, "floor", floor)
     asked = request([CRAZYFLIE] * 2, [(0.0, 0.0, 0.8), (1.0, 0.0, 0.8)])

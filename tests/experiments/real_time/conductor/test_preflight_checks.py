@@ -10,6 +10,7 @@ import pytest
 
 from agents.body.limits import Safety
 from agents.body.measured_positions import FROZEN
+from agents.kinds.tello import TELLO
 from agents.network.messages import Inspection, State, Status
 from experiments.definition.experiment import Experiment, Robot
 from experiments.definition.plan import Plan
@@ -275,7 +276,7 @@ def pushed(forward: float, back: float, *, yaw: float = 0.5) -> list[State]:
 )
 def test_the_speed_of_sticks(forward, back, believed, verdict, text):
     each = Observed(Robot(kind="tello", start=[0.0, 0.0], hover=0.8, device={"stick_speed": believed}))
-    made = checks.sticks(each, Tried(states=pushed(forward, back)))
+    made = checks.trial(TELLO.trial, each, Tried(states=pushed(forward, back)))
     assert made.verdict == verdict, made
     assert text in made.found
     if forward == back == 0.3:
@@ -284,10 +285,12 @@ def test_the_speed_of_sticks(forward, back, believed, verdict, text):
 
 def test_sticks_that_could_not_be_measured():
     each = Observed(Robot(kind="tello", start=[0.0, 0.0], hover=0.8))
-    assert checks.sticks(each, Tried(failure="not ready: no position")).verdict == "bad"
-    fast = checks.sticks(each, Tried(failure="came down by itself: it moves", states=pushed(0.5, 0.0)[:200]))
+    assert checks.trial(TELLO.trial, each, Tried(failure="not ready: no position")).verdict == "bad"
+    fast = checks.trial(
+        TELLO.trial, each, Tried(failure="came down by itself: it moves", states=pushed(0.5, 0.0)[:200])
+    )
     assert "double stick_speed" in fast.remedy
-    assert checks.sticks(each, Tried(states=pushed(0.2, 0.2)[:20])).verdict == "bad"
+    assert checks.trial(TELLO.trial, each, Tried(states=pushed(0.2, 0.2)[:20])).verdict == "bad"
 
 
 def test_users_body_gets_no_remedy_of_another_device():
