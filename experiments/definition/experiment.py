@@ -108,10 +108,6 @@ class Robot(Part, frozen=True):
     avoids: Annotated[bool, Meta(description="whether it keeps clear of others if the experiment has an avoidance")] = (
         True
     )
-    shadow: Annotated[Shadow | None, Meta(description="shadow twin beside the robot")] = None
-    avoids: Annotated[bool, Meta(description="whether it keeps clear of others if the experiment has an avoidance")] = (
-        True
-    )
     lands_at_s: Annotated[
         Positive | None,
         Meta(
