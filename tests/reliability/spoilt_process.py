@@ -130,20 +130,20 @@ def _spoil_capture(number: Switch, subject: Switch) -> None:
 
 def _refuse_landings(folder: Path) -> None:
     from agents.network.messages import Command  # not in every process
-    from experiments.real_time.processes.world_network import Exchange
+    from experiments.real_time.processes.world_network import Commands
 
-    obey, switches = Exchange._obey, dict[str, Switch]()
+    obey, switches = Commands._obey, dict[str, Switch]()
 
-    def refusing(exchange: Exchange, row: int, command: Command, t: float) -> None:
+    def refusing(commands: Commands, row: int, command: Command, t: float) -> None:
         name = command.robot
         if name not in switches:
             switches[name] = Switch(folder / f"refuse-{name}")
         if command.action == "land" and switches[name].read():
-            exchange._done[name], exchange._quiet[row] = command.seq - 1, t  # it is repeated, and the robot hovers
+            commands._done[name], commands._quiet[row] = command.seq - 1, t  # it is repeated, and the robot hovers
         else:
-            obey(exchange, row, command, t)
+            obey(commands, row, command, t)
 
-    Exchange._obey = refusing  # type: ignore[method-assign, assignment]
+    Commands._obey = refusing  # type: ignore[method-assign, assignment]
 
 
 def _stamp_stops(stamp: Switch) -> None:

@@ -94,7 +94,7 @@ class WorldProcess:
                 continue
             ticks.until_next()  # a sleep that lasted too long is lost time as well
             if missed := ticks.begin():
-                exchange.slept(missed * ticks.period, ticks.t)
+                exchange.commands.forgive(missed * ticks.period, ticks.t)
             began = ticks.elapsed()
             self._tick(ticks.t)
             pace.worked += ticks.elapsed() - began
@@ -115,7 +115,7 @@ class WorldProcess:
             self.paused, changed = False, True  # robots that must land cannot wait
         self.exchange.receive(t)
         if not self.paused:
-            self.exchange.apply_commands(t)
+            self.exchange.commands.apply(t)
             self._population.advance()
             self._pace.ticks += 1
         if self._ownership.settle(self._session, self._ended):
@@ -134,7 +134,7 @@ class WorldProcess:
                 self._carry_out(order)
             except Refused as refusal:
                 reason = str(refusal)
-                self.exchange.refuse("world", f"{order.order}: {reason}")
+                self.exchange.events.refuse("world", f"{order.order}: {reason}")
             reply = messages.WorldReply(not reason, self.paused, round(self._population.time, 6), reason)
             query.reply(self._keys.world_order, messages.encode(reply), encoding=messages.JSON)
             return not reason
@@ -151,7 +151,7 @@ class WorldProcess:
             self.exchange.restart()
 
     def _report(self, t: float) -> None:
-        population, exchange = self._population, self.exchange
+        population, exchange, events = self._population, self.exchange, self.exchange.events
         state = messages.WorldState(
             stamp=exchange.utc + t,
             engine=self._engine,
@@ -160,12 +160,12 @@ class WorldProcess:
             load=round(self._pace.load, 4),
             paused=self.paused,
             robots=self.carried,
-            mirrored=exchange.mirrored(),
+            mirrored=exchange.states.mirrored(),
             obstacles=[messages.ObstaclePose(name, pose) for name, pose in population.obstacles().items()],
-            contacts=exchange.contacts,
-            refused=exchange.refused,
-            malformed=exchange.malformed + self._orders.malformed,
-            trouble=exchange.trouble,
+            contacts=exchange.publications.contacts,
+            refused=events.refused,
+            malformed=events.malformed + self._orders.malformed,
+            trouble=events.trouble,
         )
         self._reports.put(messages.encode(state))
 

@@ -25,7 +25,7 @@ from agents.vectors import NO_SETPOINT, UNKNOWN, ZERO, Vector
 from experiments.definition.experiment import WORLD
 from experiments.definition.plan import Plan
 from experiments.real_time.processes.joining import Network
-from experiments.real_time.processes.world_population import HOLD_S, Population
+from experiments.real_time.processes.world_population import HOLD_S, Meeting, Population
 
 DEPTH: Final = 16_384  # queued commands: those of two hundred robots in 0.8 s
 TRUTH_HZ: Final = 50.0
@@ -44,63 +44,14 @@ class Exchange:
     """The network of a world. Times `t` are on the clock of the world [s]."""
 
     utc: float  # [s] UTC at which the clock of the world was 0
-    contacts: int  # that have begun
-    refused: int  # commands to unknown robots, and orders that could not be carried out
-    malformed: int  # refused payloads
-    trouble: str  # last refusal; empty if there was none
 
     def __init__(self, plan: Plan, population: Population, joint: Network) -> None:
-        session, keys, experiment = joint.session, joint.keys, plan.experiment
-        self._population, self._session, self._keys = population, session, keys
-        self._encoding = experiment.network.encoding
-        self._mime = messages.MIME[self._encoding]
-        x, y, z = experiment.arena.size
-        self._reach = validation.reach_of((-0.5 * x, -0.5 * y, 0.0), (0.5 * x, 0.5 * y, z))
-        self._truth_every = max(1, round(experiment.rates.body_hz / TRUTH_HZ))
-        # commands to robots with another body are for another simulator
-        self._elsewhere = {keys.setpoint(name) for name, robot in experiment.robots.items() if robot.body != WORLD}
         self._clock = Clock()
         self.utc = self._clock.utc()
-        self.contacts = self.refused = self.malformed = 0
-        self.trouble = ""
-        self._ownership = joint.ownership
-        self._router = network.RouterWatch(session, keys.world_alive, joint.endpoints)
-        self._cut_off = False
-        self._setpoints = pubsub.Inbox(
-            pubsub.subscriber(session, keys.setpoint("*"), DEPTH),
-            messages.Command,
-            keys=keys,
-            on_refusal=self._count_malformed,
-        )
-        self._statuses = pubsub.Inbox(
-            pubsub.pose_subscriber(session, keys.status("*"), 1024), messages.Status, on_refusal=self._count_malformed
-        )
-        self._contacts = pubsub.publisher(session, keys.contact, messages.JSON)
-        self._events = pubsub.publisher(session, keys.event, messages.JSON)
-        self._done: dict[str, int] = {}  # number of the last executed command
-        # session that owns the name of a robot: a new one numbers its commands from anew
-        self._lives: dict[str, str] = {}
-        self._owners = pubsub.AliveWatch(session, Keys.life(keys.alive("*"), "*"))
-        self._strangers: set[str] = set()
-        self._met: set[frozenset[str]] = set()
-        self._started: dict[str, float] = {}
-        self._begun = inf
-        self._ticks = 0
-        names = self._names = population.names
-        self._quiet = [inf] * len(names)  # begin of the silence of each robot; infinity: it needs no command
-        self._carried = carried = [row for row, here in enumerate(population.carried) if here]
-        self._row = {keys.setpoint(names[row]): row for row in carried}
-        measured = frozenset(plan.externally_measured)
-
-        def publishers(key: Callable[[str], str], rows: Iterable[int]) -> dict[int, zenoh.Publisher]:
-            return {row: pubsub.publisher(session, key(names[row]), self._mime) for row in rows}
-
-        self._positions = publishers(keys.position, (row for row in carried if names[row] not in measured))
-        self._truths = publishers(keys.truth, carried)
-        self._ranges = publishers(keys.ranges, (row for row, seen in enumerate(population.seen) if seen))
-        mirrored = [row for row, here in enumerate(population.carried) if not here]
-        self._mirrors = [_Mirror(row, self._states_of(names[row])) for row in mirrored]
-        self.restart()
+        self.events = Events(joint, self._clock)
+        self.commands = Commands(plan, population, joint, self.events)
+        self.states = States(plan, population, joint, self.events, self._clock)
+        self.publications = Publications(plan, population, joint, self.events)
 
     def begin(self, up: float) -> None:
         """Sets the clock of the world to 0 at a time `up` of the clock `uptime` [s]."""
@@ -108,37 +59,90 @@ class Exchange:
 
     def restart(self) -> None:
         """Follows a body that is made anew: it has no commands, and does not know the mirrored robots."""
-        self._held = [False] * len(self._names)
-        self._given = [NO_SETPOINT] * len(self._names)  # setpoints since the last step
-        self._scanned = dict.fromkeys(self._ranges, -inf)  # time of the last published sweep [s]
-        self._update_mirrors()
+        self.commands.restart()
+        self.states.update_body()
+        self.publications.restart()
 
     def restore_positions(self, there: Set[str]) -> list[str]:
         """Places simulated robots that are on the network at the poses of their states; returns their names."""
-        waiting = {name: self._states_of(name) for name in (self._names[row] for row in self._carried) if name in there}
-        found: list[str] = []
-        deadline, pause = time.monotonic() + ANSWER_S, threading.Event()
-        while waiting and time.monotonic() < deadline:
-            pause.wait(0.01)
-            for name, inbox in list(waiting.items()):
-                state = self._newest(inbox)
-                if state is None or state.position is None:
-                    continue
-                flying = state.position[2] > IN_AIR_M and state.phase in UP
-                self._population.put(name, state.position, state.yaw or 0.0, flying=flying)
-                row = self._names.index(name)
-                self._quiet[row] = CLIMB_S if flying and self._population.flies[row] else inf
-                found.append(name)
-                waiting.pop(name).close()
-        for inbox in waiting.values():
-            inbox.close()
-        return found
+        found = self.states.restore(there)
+        for name, flying in found.items():
+            self.commands.expect(name, flying=flying)
+        return list(found)
 
-    def mirrored(self) -> list[str]:
-        """Names of the mirrored robots with a known pose."""
-        return [self._names[mirror.row] for mirror in self._mirrors if isfinite(mirror.place[0])]
+    def receive(self, t: float) -> None:
+        """Receives all until `t`."""
+        self.commands.receive(t)
+        self.states.receive(t, self.utc)
 
-    # ------------------------------------------------------------------ receive
+    def publish(self, t: float) -> None:
+        """Publishes positions, true poses, range readings and contacts."""
+        self.publications.publish(round(self.utc + t, 6))
+
+
+class Events:
+    """Events of a world, for recorder and viewers; what it has refused."""
+
+    def __init__(self, joint: Network, clock: Clock) -> None:
+        self.refused = 0  # commands to unknown robots, and orders that could not be carried out
+        self.malformed = 0  # refused payloads
+        self.trouble = ""  # last refusal; empty if there was none
+        self._clock = clock
+        self._publisher = pubsub.publisher(joint.session, joint.keys.event, messages.JSON)
+
+    def publish(self, kind: str, source: str, text: str) -> None:
+        """Publishes an event."""
+        print(f"{kind} {source}: {text}", flush=True)
+        self._publisher.put(messages.encode(messages.Event(self._clock.utc(), kind, source, text)))
+
+    def refuse(self, source: str, reason: str) -> None:
+        """Counts and publishes a refusal."""
+        self.refused += 1
+        self.trouble = reason
+        self.publish("refused", source, reason)
+
+    def count_malformed(self, _key: str, reason: str) -> None:
+        self.malformed += 1
+        self.trouble = reason
+
+
+class Commands:
+    """Commands to the simulated robots: received, checked, applied; robots without commands hold, then land."""
+
+    def __init__(self, plan: Plan, population: Population, joint: Network, events: Events) -> None:
+        session, keys, names = joint.session, joint.keys, population.names
+        self._population, self._session, self._keys, self._events = population, session, keys, events
+        # commands to robots with another body are for another simulator
+        robots = plan.experiment.robots.items()
+        self._elsewhere = {keys.setpoint(name) for name, robot in robots if robot.body != WORLD}
+        self._row = {keys.setpoint(names[row]): row for row, here in enumerate(population.carried) if here}
+        self._ownership = joint.ownership
+        self._router = network.RouterWatch(session, keys.world_alive, joint.endpoints)
+        self._cut_off = False
+        self._inbox = pubsub.Inbox(
+            pubsub.subscriber(session, keys.setpoint("*"), DEPTH),
+            messages.Command,
+            keys=keys,
+            on_refusal=events.count_malformed,
+        )
+        self._done: dict[str, int] = {}  # number of the last executed command
+        # session that owns the name of a robot: a new one numbers its commands from anew
+        self._lives: dict[str, str] = {}
+        self._owners = pubsub.AliveWatch(session, Keys.life(keys.alive("*"), "*"))
+        self._strangers: set[str] = set()
+        self._quiet = [inf] * len(names)  # begin of the silence of each robot; infinity: it needs no command
+        self.restart()
+
+    def restart(self) -> None:
+        """Forgets what was commanded."""
+        rows = len(self._population.names)
+        self._held = [False] * rows
+        self._given = [NO_SETPOINT] * rows  # setpoints since the last step
+
+    def expect(self, name: str, *, flying: bool) -> None:
+        """Expects commands to a robot that was placed: `CLIMB_S` passes before one that flies lands without any."""
+        row = self._population.names.index(name)
+        self._quiet[row] = CLIMB_S if flying and self._population.flies[row] else inf
 
     def receive(self, t: float) -> None:
         """Receives all until `t`."""
@@ -148,21 +152,18 @@ class Exchange:
         for token, there in self._owners.changes():
             if there:
                 self._note_owner(token)
-        for command, sample in self._setpoints.read_samples(validation.check_command, self._known):
+        for command, sample in self._inbox.read_samples(validation.check_command, self._known):
             row = self._row[str(sample.key_expr)]
             if command.seq > self._done.get(command.robot, 0):
                 self._done[command.robot] = command.seq
                 self._obey(row, command, t)
-        self._update_poses(t)
-        for status in self._statuses.read():
-            self._update_start(status, t)
 
-    def slept(self, seconds: float, t: float) -> None:
-        """Forgives silence after the world stood still for so long, until `t`."""
+    def forgive(self, seconds: float, t: float) -> None:
+        """Forgives silence after the world stood still for `seconds`, until `t`."""
         if seconds > HANG_S:
             self._quiet = [max(since, t) for since in self._quiet]
 
-    def apply_commands(self, t: float) -> None:
+    def apply(self, t: float) -> None:
         """Applies the commands; robots without commands hold, drive on, or land after `LAND_S`."""
         population, body = self._population, self._population.body
         holding, tired = set[int](), list[int]()
@@ -183,10 +184,10 @@ class Exchange:
         if tired:
             body.land(tired)
             for row in tired:
-                self.publish_event("silent", self._names[row], f"lands: no command for {LAND_S:g} s")
+                self._events.publish("silent", population.names[row], f"lands: no command for {LAND_S:g} s")
         if any(isfinite(setpoint[0]) for setpoint in self._given):
             body.command(self._given)
-            self._given = [NO_SETPOINT] * len(self._names)
+            self._given = [NO_SETPOINT] * len(population.names)
 
     def _obey(self, row: int, command: messages.Command, t: float) -> None:
         population, action = self._population, command.action
@@ -221,16 +222,75 @@ class Exchange:
     def _reject_unknown(self, key: str) -> None:
         name = self._keys.whose(key)
         if name is None:
-            self.malformed += 1
+            self._events.malformed += 1
             return
-        self.refused += 1
+        self._events.refused += 1
         if name not in self._strangers and len(self._strangers) < STRANGERS:
             self._strangers.add(name)
-            self.publish_event(
+            self._events.publish(
                 "refused",
                 "world",
                 f"{name} gets commands, but is not in this world: start the world with the experiment that has it",
             )
+
+
+class States:
+    """States and statuses of the robots: poses of mirrored ones, former poses of simulated ones, start of the run."""
+
+    def __init__(self, plan: Plan, population: Population, joint: Network, events: Events, clock: Clock) -> None:
+        self._population, self._session, self._keys, self._events = population, joint.session, joint.keys, events
+        self._clock, self._names = clock, population.names
+        x, y, z = plan.experiment.arena.size
+        self._reach = validation.reach_of((-0.5 * x, -0.5 * y, 0.0), (0.5 * x, 0.5 * y, z))
+        self._statuses = pubsub.Inbox(
+            pubsub.pose_subscriber(joint.session, joint.keys.status("*"), 1024),
+            messages.Status,
+            on_refusal=events.count_malformed,
+        )
+        self._started: dict[str, float] = {}
+        self._begun = inf
+        mirrored = [row for row, here in enumerate(population.carried) if not here]
+        self._mirrors = [_Mirror(row, self._states_of(self._names[row])) for row in mirrored]
+        self.update_body()
+
+    def mirrored(self) -> list[str]:
+        """Names of the mirrored robots with a known pose."""
+        return [self._names[mirror.row] for mirror in self._mirrors if isfinite(mirror.place[0])]
+
+    def update_body(self) -> None:
+        """Tells the body of the mirrored robots."""
+        mirrors = self._mirrors
+        self._population.body.mirror(
+            [mirror.row for mirror in mirrors],
+            [mirror.place for mirror in mirrors],
+            [mirror.yaw for mirror in mirrors],
+            [mirror.velocity for mirror in mirrors],
+        )
+
+    def restore(self, there: Set[str]) -> dict[str, bool]:
+        """Places simulated robots that are `there` at the poses of their states: their names, and whether they fly."""
+        carried = zip(self._names, self._population.carried, strict=True)
+        waiting = {name: self._states_of(name) for name, here in carried if here and name in there}
+        found: dict[str, bool] = {}
+        deadline, pause = time.monotonic() + ANSWER_S, threading.Event()
+        while waiting and time.monotonic() < deadline:
+            pause.wait(0.01)
+            for name, inbox in list(waiting.items()):
+                state = self._newest(inbox)
+                if state is None or state.position is None:
+                    continue
+                found[name] = state.position[2] > IN_AIR_M and state.phase in UP
+                self._population.put(name, state.position, state.yaw or 0.0, flying=found[name])
+                waiting.pop(name).close()
+        for inbox in waiting.values():
+            inbox.close()
+        return found
+
+    def receive(self, t: float, utc: float) -> None:
+        """Receives all until `t` [s] of a clock that was 0 at `utc` [s]."""
+        self._update_poses(t)
+        for status in self._statuses.read():
+            self._update_start(status, utc + t)
 
     def _update_poses(self, t: float) -> None:
         """Updates the poses of mirrored robots."""
@@ -245,20 +305,11 @@ class Exchange:
                 mirror.place = UNKNOWN
                 changed = True
         if changed:
-            self._update_mirrors()
-
-    def _update_mirrors(self) -> None:
-        mirrors = self._mirrors
-        self._population.body.mirror(
-            [mirror.row for mirror in mirrors],
-            [mirror.place for mirror in mirrors],
-            [mirror.yaw for mirror in mirrors],
-            [mirror.velocity for mirror in mirrors],
-        )
+            self.update_body()
 
     def _states_of(self, name: str) -> pubsub.Inbox[messages.State]:
         subscriber = pubsub.subscriber(self._session, self._keys.state(name), 4)
-        return pubsub.Inbox(subscriber, messages.State, keys=self._keys, on_refusal=self._count_malformed)
+        return pubsub.Inbox(subscriber, messages.State, keys=self._keys, on_refusal=self._events.count_malformed)
 
     def _newest(self, inbox: pubsub.Inbox[messages.State]) -> messages.State | None:
         """The newest valid state that has a position."""
@@ -269,7 +320,7 @@ class Exchange:
                 found = state
         return found
 
-    def _update_start(self, status: messages.Status, t: float) -> None:
+    def _update_start(self, status: messages.Status, now: float) -> None:
         """Derives the start of the run from the robots' statuses, for obstacles that move by a plan."""
         if status.phase in UNDER_WAY and 0.0 < status.started < inf and status.robot in self._names:
             self._started[status.robot] = status.started
@@ -278,18 +329,40 @@ class Exchange:
         begun = min(self._started.values(), default=self._begun)
         if begun != self._begun:
             self._begun = begun
-            self._population.begin(self._population.time + begun - (self.utc + t))
+            self._population.begin(self._population.time + begun - now)
 
-    def _count_malformed(self, _key: str, reason: str) -> None:
-        self.malformed += 1
-        self.trouble = reason
 
-    # ------------------------------------------------------------------ publish
+class Publications:
+    """Positions, true poses, range readings and contacts, published after each step."""
 
-    def publish(self, t: float) -> None:
-        """Publishes positions, true poses, range readings and contacts."""
+    contacts = 0  # that have begun
+
+    def __init__(self, plan: Plan, population: Population, joint: Network, events: Events) -> None:
+        session, keys, experiment = joint.session, joint.keys, plan.experiment
+        names = self._names = population.names
+        self._population, self._events = population, events
+        self._encoding = experiment.network.encoding
+        self._truth_every = max(1, round(experiment.rates.body_hz / TRUTH_HZ))
+        self._contacts = pubsub.publisher(session, keys.contact, messages.JSON)
+        self._met: set[frozenset[str]] = set()
+        self._ticks = 0
+        mime, measured = messages.MIME[self._encoding], frozenset(plan.externally_measured)
+        carried = [row for row, here in enumerate(population.carried) if here]
+
+        def publishers(key: Callable[[str], str], rows: Iterable[int]) -> dict[int, zenoh.Publisher]:
+            return {row: pubsub.publisher(session, key(names[row]), mime) for row in rows}
+
+        self._positions = publishers(keys.position, (row for row in carried if names[row] not in measured))
+        self._truths = publishers(keys.truth, carried)
+        self._ranges = publishers(keys.ranges, (row for row, seen in enumerate(population.seen) if seen))
+        self.restart()
+
+    def restart(self) -> None:
+        self._scanned = dict.fromkeys(self._ranges, -inf)  # time of the last published sweep [s]
+
+    def publish(self, stamp: float) -> None:
+        """Publishes all that is new at `stamp` [s] UTC."""
         states, names, encoding = self._population.states, self._names, self._encoding
-        stamp = round(self.utc + t, 6)
         for row, publisher in self._positions.items():
             state = states[row]
             _publish(publisher, messages.position(names[row], stamp, *_rounded(state.position, state.yaw)), encoding)
@@ -300,24 +373,16 @@ class Exchange:
         self._ticks += 1
         self._publish_sweeps(states, stamp)
         for meeting in self._population.meetings():
-            self.contacts += 1
-            contact = messages.Contact(stamp, meeting.first, meeting.second, meeting.impulse, meeting.overlap)
-            self._contacts.put(messages.encode(contact))
-            pair = frozenset((meeting.first, meeting.second))
-            if pair not in self._met:
-                self._met.add(pair)
-                self.publish_event("contact", meeting.first, f"touches {meeting.second} ({meeting.impulse:.3g} N s)")
+            self._publish_contact(meeting, stamp)
 
-    def publish_event(self, kind: str, source: str, text: str) -> None:
-        """Publishes an event, for recorder and viewers."""
-        print(f"{kind} {source}: {text}", flush=True)
-        self._events.put(messages.encode(messages.Event(self._clock.utc(), kind, source, text)))
-
-    def refuse(self, source: str, reason: str) -> None:
-        """Counts and publishes a refusal."""
-        self.refused += 1
-        self.trouble = reason
-        self.publish_event("refused", source, reason)
+    def _publish_contact(self, meeting: Meeting, stamp: float) -> None:
+        self.contacts += 1
+        contact = messages.Contact(stamp, meeting.first, meeting.second, meeting.impulse, meeting.overlap)
+        self._contacts.put(messages.encode(contact))
+        pair = frozenset((meeting.first, meeting.second))
+        if pair not in self._met:
+            self._met.add(pair)
+            self._events.publish("contact", meeting.first, f"touches {meeting.second} ({meeting.impulse:.3g} N s)")
 
     def _publish_sweeps(self, states: Sequence[BodyState], stamp: float) -> None:
         """Publishes new range readings."""

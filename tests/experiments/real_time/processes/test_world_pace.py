@@ -36,7 +36,7 @@ def test_lateness_is_caught_up_and_standstill_lost(stands_s, lost, forgiven, asl
         population = Population(Plan(experiment))
         joint = Network(net.session, KEYS, [], [], OwnershipCheck([KEYS.world_alive]))
         process = WorldProcess(Plan(experiment), population, joint, threading.Event(), lambda: now[0])
-        monkeypatch.setattr(process.exchange, "slept", lambda seconds, t: slept.append((seconds, t)))
+        monkeypatch.setattr(process.exchange.commands, "forgive", lambda seconds, t: slept.append((seconds, t)))
         advance = population.advance
 
         def stand():
