@@ -50,6 +50,7 @@ def test_a_blank_does_not_pass(exercise):
     assert missed(exercise)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("exercise", EXERCISES, ids=lambda file: file.stem)
 def test_a_solution_passes(exercise):
     assert missed(exercise, *solutions()[exercise.name]) == []

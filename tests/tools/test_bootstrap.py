@@ -269,16 +269,24 @@ def started(bootstrap, monkeypatch):
     return modules
 
 
-def test_tests_run_in_two_parts_without_retries(bootstrap, started, capsys):
+def test_tests_run_in_three_parts_without_retries(bootstrap, started, monkeypatch, capsys):
+    monkeypatch.setattr(bootstrap, "ROOT", ROOT)
     assert bootstrap.test([]) == 1
-    assert [module[0] for module in started] == ["ruff", "ruff", "mypy", "pytest", "pytest"]
-    computing, processes = started[3:]
+    assert [module[0] for module in started] == ["ruff", "ruff", "mypy", "pytest", "pytest", "pytest"]
+    computing, devices, runs = started[3:]
     assert computing[2] == "not system and not nightly"
-    assert processes[2:5] == ["mechanism", "-n", "1"]
+    assert [part[2:5] for part in (devices, runs)] == [["mechanism", "-n", "2"], ["mechanism", "-n", "1"]]
+    files = [{part for part in parts if part.startswith("tests/")} for parts in (devices, runs)]
+    assert all(files)
+    assert all(file.startswith("tests/system/") == where for where in (False, True) for file in files[where])
     said = capsys.readouterr().err
-    titles = ["part 1 of 2, computing, on all cores", "part 2 of 2, real processes, one at a time"]
+    titles = [
+        "part 1 of 3, computing, on all cores",
+        "part 2 of 3, devices and network, two at a time",
+        "part 3 of 3, whole runs, one at a time",
+    ]
     assert [line for line in said.splitlines() if line.endswith(tuple(titles))] == [f"zenpark: {t}" for t in titles]
-    assert re.search(rf"{titles[1]}: failed in \d+ s\n$", said)
+    assert re.search(rf"{titles[2]}: failed in \d+ s\n$", said)
 
 
 def test_all_prepares_what_the_tests_of_processes_need(bootstrap, started):

@@ -21,6 +21,7 @@ from experiments.definition.experiment import Formation, Robot
 from experiments.definition.plan import Plan
 from tests.agents.few import pair
 from tests.agents.runtime.test_shutdown import Airborne
+from tests.cases import for_each
 from tests.conftest import RouterProcess
 from tests.fuzz.loopnet import Net, Reply, Sample
 
@@ -122,7 +123,7 @@ def faked(monkeypatch):
     return fake
 
 
-@pytest.mark.parametrize("seed", range(120))
+@for_each("seed", range(120))
 def test_exactly_one_of_several_claims_succeeds(seed, faked):
     starts = {"a": 1.0, "b": 2.0, "c": 2.0}
     results = faked(Table(seed)).run({who: starts[who] for who in ("a", "b", "c")[: 2 + seed % 2]})
@@ -171,7 +172,7 @@ def woken(table: Table, who: str, tokens: list[str]) -> Callable[[], object]:
     return work
 
 
-@pytest.mark.parametrize("seed", range(120))
+@for_each("seed", range(120))
 def test_at_most_one_owner_drives_the_body(seed, faked):
     table = faked(Table(seed))
     table.run({"old": 1.0})

@@ -17,6 +17,7 @@ from agents.kinds.turtlebot3 import TURTLEBOT3
 from agents.plugins.avoidance import Nearby, Plane, measure_gap
 from agents.plugins.barrier import Barrier, closest
 from tests.agents.things import NOTHING, near, own
+from tests.cases import for_each
 
 FEW, MANY = settings(max_examples=50), settings(max_examples=400, deadline=None)
 ROUNDING = 1e-7  # [m/s]
@@ -201,7 +202,7 @@ def test_bound_is_half_the_gap_or_less():
     assert (comes.things[0].away_x, comes.things[0].away_y) == (-1.0, 0.0)
 
 
-@pytest.mark.parametrize("gap", [-0.04 + 0.016 * k for k in range(40)])
+@for_each("gap", [-0.04 + 0.016 * k for k in range(40)])
 def test_both_halves_use_no_more_than_the_gap(gap):
     far, robot = 0.25 + gap, {"radius": TELLO.radius, "is_robot": True}
     barrier = Barrier(right=0.0)
@@ -222,7 +223,7 @@ def test_velocities_and_positions_are_restrained_alike(kind):
     assert tuple(rest) == setpoint[2:]
 
 
-@pytest.mark.parametrize("yaw", [-3.1 + 0.31 * k for k in range(21)])
+@for_each("yaw", [-3.1 + 0.31 * k for k in range(21)])
 def test_wheels_are_slowed_along_their_heading(yaw):
     reach, here = KHEPERA4.radius + 0.05, own(KHEPERA4, (0.0, 0.0), yaw=yaw)
     v, *rest = BARRIER.restrain((0.25, 3.0, 0.0, 0.0), here, near((reach + 0.06, 0.0)))
@@ -239,7 +240,7 @@ def test_wheels_back_off_and_stand_where_torn():
     assert BARRIER.restrain(STILL, here, fast)[0] == -KHEPERA4.speed
 
 
-@pytest.mark.parametrize("seed", range(20))
+@for_each("seed", range(20))
 def test_things_in_all_directions_are_obeyed(seed):
     rng, reach, here = np.random.default_rng(seed), TELLO.radius + 0.05, own(TELLO, (3.0, -2.0))
     for _ in range(10):
@@ -295,7 +296,7 @@ def test_far_things_change_nothing(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS.values(), ids=lambda kind: kind.name)
-@pytest.mark.parametrize("exponent", range(2, 39))
+@for_each("exponent", range(2, 39))
 def test_absurd_velocities_are_answered_within_limits(kind, exponent):
     """Beyond 1e8 m/s no half-plane is met exactly, and one alone has no pair that it could give way to."""
     here = own(kind, (0.0, 0.0), velocity=(-(10.0**exponent), 0.0, 0.0))

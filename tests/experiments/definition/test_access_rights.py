@@ -18,6 +18,7 @@ from experiments.definition.experiment import Experiment, Formation, Hybrid, Net
 from experiments.definition.plan import Plan
 from experiments.file.document import load
 from tests.agents.acl import ACTIONS, held, may, permitted
+from tests.cases import for_each
 
 KEYS = Keys()
 OUTSIDER = "mallory"
@@ -164,8 +165,8 @@ NO_OPERATORS = ("R0", "R1", *(role for role in ROLES[1:] if role != "operator"),
 BROAD = (KEYS.estop, "park/**", "park/*/pose", "park/*", "**", "*/*/*", "park/R3/pos$*", KEYS.experiment)
 
 
-@pytest.mark.parametrize(
-    ("who", "action", "key"),
+@for_each(
+    "who, action, key",
     [
         *((who, action, key) for who in NO_OPERATORS for action in ("put", "delete") for key in BROAD),
         *((who, "ask", "park/*/order") for who in ("R0", "observer", "recorder", "world", "ros2", OUTSIDER)),

@@ -11,10 +11,11 @@ from agents.plugins import registry
 from experiments.file import reference
 from experiments.file.document import loads
 from experiments.file.problems import DocumentError
+from tests.cases import for_each
 from tools.main import app
 
 
-@pytest.mark.parametrize("entry", reference.entries(), ids=lambda entry: entry.key)
+@for_each("entry", reference.entries())
 def test_an_example_is_a_part_of_a_file(entry):
     value = tomllib.loads(entry.example)
     for part in entry.words:
@@ -62,7 +63,7 @@ GROUPS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("entry", [each for each in reference.entries() if "(" in each.key], ids=lambda each: each.key)
+@for_each("entry", [each for each in reference.entries() if "(" in each.key])
 def test_plugin_example_has_all_that_it_needs(entry):
     *tables, choice = entry.example.split("\n")
     ((owner, parameters),) = tomllib.loads(choice).items()

@@ -41,7 +41,10 @@ def trace(name, case, *changes):
     return flown(name, case, *changes)[1].trace()
 
 
-@pytest.mark.parametrize(("case", "most"), [("periodic", 1e-4), ("event", 0.015), ("event-loss", 0.02)])
+@pytest.mark.parametrize(
+    ("case", "most"),
+    [("periodic", 1e-4), pytest.param("event", 0.015, marks=pytest.mark.slow), ("event-loss", 0.02)],
+)
 def test_average_of_constant_signals_has_no_error(case, most):
     known = trace("average", case)
     assert np.abs(known.memory["x"][-1] - 3.0).max() < most
