@@ -48,7 +48,7 @@ def test_compiled_flights_are_longer():
     assert peers.duration_s(peers.COMPILED_WHEELS, 1000) == 10.0
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_failed_install_names_the_first_error(monkeypatch):
     monkeypatch.setenv("PIP_NO_INDEX", "1")
     monkeypatch.delenv("PIP_FIND_LINKS", raising=False)
@@ -70,7 +70,7 @@ def test_table_gives_ratios_to_zenpark():
     assert lines[3] == "| 7 | irsim 2.12.0 | 20 | 8,100 | 0.41 × khepera4 point-mass plain |"
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_growth_has_a_line_for_each_number(monkeypatch):
     monkeypatch.setitem(growth.DURATIONS, 7, 20.0)
     lines = growth.report(sizes=(3, 5), rounds=1, settings=[peers.WHEELS]).splitlines()

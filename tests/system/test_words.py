@@ -12,7 +12,7 @@ from tests.system.lab import Flight, Watcher, typed
 
 pytestmark = pytest.mark.system
 
-RUN_S = 24.0
+RUN_S = 20.0
 
 
 @pytest.mark.mechanism("words")
@@ -23,7 +23,7 @@ def test_robots_agree_on_an_average_in_real_time(tmp_path: Path) -> None:
         for number in range(1, 7)
         for part in ("--set", f"robots.KH0{number}.process={'even' if number % 2 == 0 else 'odd'}")
     ]
-    flight = Flight(tmp_path / "run", "average", "--case", "event-loss", *groups, "--set", "duration_s=12")
+    flight = Flight(tmp_path / "run", "average", "--case", "event-loss", *groups, "--set", "duration_s=9")
     code, _ = flight.finish(120.0)
     assert code == 0, flight.said()
     file = tmp_path / "run" / "event-loss.mcap"
