@@ -18,7 +18,7 @@ def for_each(names: str, cases: Iterable[object]) -> Callable[[Callable[..., Non
                 values = case if len(keys) > 1 else (case,)
                 try:
                     test(**dict(zip(keys, values, strict=True)), **fixtures)  # type: ignore[arg-type]
-                except Exception as error:
+                except Exception as error:  # noqa: BLE001 (whatever a test raises)
                     error.add_note(f"case {case!r}")
                     failures.append(error)
             if failures:
