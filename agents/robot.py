@@ -15,7 +15,7 @@ from typing import ClassVar, Final
 
 from agents.body.interface import BodyState
 from agents.decision.assignment import Assignment
-from agents.decision.centralised import Guidance
+from agents.decision.centralised import ReceivedGoals
 from agents.decision.goals import GoalComputer, StationKeeping
 from agents.decision.lifecycle import AIRBORNE, IDLE, LANDING, READY, RUNNING, Lifecycle, Phase
 from agents.decision.neighbours import Neighbours
@@ -79,9 +79,9 @@ class Robot:
         self.assignment, self.health = assignment, health or ProcessHealth()
         self.goals = GoalComputer(assignment, passive=assignment.guided)
         self.neighbours: Neighbours = self.goals.neighbours
-        self.guidance: Guidance | None = None
+        self.guidance: ReceivedGoals | None = None
         if assignment.guided:
-            self.guidance = Guidance(flies=kind.flies, silence_s=limits.neighbour_timeout_s)
+            self.guidance = ReceivedGoals(flies=kind.flies, silence_s=limits.neighbour_timeout_s)
         self.keeping = StationKeeping(assignment.ground)
         self.lifecycle = Lifecycle(kind, assignment.hover, assignment.duration, assignment.lands_at)
         stepping = self._stepping = self.goals.stepping
@@ -472,7 +472,7 @@ class Robot:
         """Whether a running robot must stay: for its safety, or because no link of the law is active."""
         return self.hazards.held or self.goals.without_neighbours()
 
-    def _follow(self, guidance: Guidance) -> None:
+    def _follow(self, guidance: ReceivedGoals) -> None:
         """A guided robot takes its received goal, on the tick of reception."""
         running = self.lifecycle.phase == RUNNING
         held = (running and self._holds()) or self.lifecycle.phase == AIRBORNE

@@ -24,7 +24,7 @@ from agents.decision.lifecycle import Phase
 from agents.network import messages, pubsub, validation
 from agents.network import session as network
 from agents.network.keys import Keys
-from agents.network.shutdown import end, held
+from agents.network.shutdown import closing_cleanly, end
 from agents.protocols import ros2
 from agents.protocols.ros2 import Distro, Message, Types
 from agents.protocols.ros2_node import Participant, Publisher, Subscriber
@@ -332,11 +332,11 @@ def serve(launch: Ros2Launch) -> int:
     types = ros2.types(launch.distro)
     with on_termination(stop.set), ExitStack() as stack:
         identity = launch.identity or "ros2"
-        opened = held(network.open_session(launch.endpoints(), name="ros2", stop=stop, identity=identity))
+        opened = closing_cleanly(network.open_session(launch.endpoints(), name="ros2", stop=stop, identity=identity))
         session, declared = stack.enter_context(opened)
         outside = session
         if launch.ros:
-            outside, _ = stack.enter_context(held(network.open_session(launch.ros, name="ros2", stop=stop)))
+            outside, _ = stack.enter_context(closing_cleanly(network.open_session(launch.ros, name="ros2", stop=stop)))
         graph = Graph(session, Participant(outside, types, style="rmw", domain=launch.domain), Keys(launch.realm))
         declared.append(graph)
         print(f"ros2 ready: node /{NODE}, domain {launch.domain}, {launch.distro}", flush=True)

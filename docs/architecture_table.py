@@ -18,7 +18,7 @@ from experiments.definition.plan import Plan
 from experiments.file.document import load
 from experiments.sweep.runs import RunMetrics, run_metrics
 from experiments.virtual_time import simulation
-from experiments.virtual_time.log import Logbook
+from experiments.virtual_time.log import RunRecorder
 
 SEEDS: Final = 20
 DELAYS_S: Final = (0.0, 0.02, 0.05, 0.1)
@@ -35,7 +35,7 @@ def flown(plan: Plan, seeds: Sequence[int]) -> tuple[list[RunMetrics], float, fl
     messages, deliveries, delay = [], [], []
     for seed in seeds:
         log = simulation.simulate(plan, seed, lean=True)
-        book, time = Logbook(log, plan, ""), log.sent.stamp
+        book, time = RunRecorder(log, plan, ""), log.sent.stamp
         found.append(run_metrics(book.trace()))
         within = (time >= -1e-9) & (time < plan.experiment.duration_s - 1e-9)
         sent = np.bincount(log.sent.link[within], minlength=len(log.names))

@@ -14,7 +14,7 @@ from agents.kinds.crazyflie import CRAZYFLIE
 from twins.arrays import Array
 from twins.devices.crazyflie.flock import LOST, Estimator
 from twins.devices.crazyflie.planner import ORDER, Planner, evaluate, polynomial
-from twins.engines.engine import Engine, Stage
+from twins.engines.engine import Engine, EngineInput
 from twins.engines.mujoco_engine import RigidBody
 from twins.engines.point_mass import PointMass
 from twins.scene import Scene
@@ -103,7 +103,7 @@ def settling(variance: Callable[[], float]) -> tuple[float, float]:
 
 def law_difference(setpoints: Array) -> tuple[float, float]:
     """Root mean square and largest distance [m] of the twin's law to the cascade on a rigid body; setpoints (T, 4)."""
-    one = Stage((CRAZYFLIE,), [(0.0, 0.0, 0.0)], [0.0], DT, [False], Scene.empty())
+    one = EngineInput((CRAZYFLIE,), [(0.0, 0.0, 0.0)], [0.0], DT, [False], Scene.empty())
     engines: tuple[Engine, ...] = PointMass().build(one), RigidBody().build(one)
     paths = []
     for engine in engines:

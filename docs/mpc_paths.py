@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from experiments.catalogue import index
 from experiments.file import document
 from experiments.report.style import STYLE
-from experiments.virtual_time.log import Logbook
+from experiments.virtual_time.log import RunRecorder
 from experiments.virtual_time.simulation import simulate
 
 SECONDS = (0.0, 2.0, 3.5, 8.0)  # of the panels
@@ -20,7 +20,7 @@ SECONDS = (0.0, 2.0, 3.5, 8.0)  # of the panels
 def main() -> None:
     """Ways so far, and what the robots say of the next 3 s."""
     plan = document.read(index.find_file("mpc"), []).cases()["periodic"]
-    trace = Logbook(simulate(plan, plan.experiment.seed), plan, "periodic").trace()
+    trace = RunRecorder(simulate(plan, plan.experiment.seed), plan, "periodic").trace()
     plans = trace.memory["path"].reshape(len(trace.time), len(plan.names), -1, 2)
     colours = mpl.colormaps["turbo"](np.linspace(0.05, 0.95, len(plan.names)))
     with mpl.rc_context(STYLE):

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from agents.kinds.crazyflie import CRAZYFLIE
 from experiments.report.style import CASES, STYLE
 from twins.arrays import Array
-from twins.engines.engine import Engine, Stage
+from twins.engines.engine import Engine, EngineInput
 from twins.engines.mujoco_engine import RigidBody
 from twins.engines.point_mass import PointMass
 from twins.scene import Scene
@@ -45,7 +45,7 @@ def figures(path: Array, step: float) -> tuple[float, float]:
 
 def main() -> None:
     """Both."""
-    one = Stage((CRAZYFLIE,), [(0.0, 0.0, 0.0)], [0.0], DT, [False], Scene.empty())
+    one = EngineInput((CRAZYFLIE,), [(0.0, 0.0, 0.0)], [0.0], DT, [False], Scene.empty())
     print(f"law: {CRAZYFLIE.motion}")
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(7.0, 1.9), layout="constrained")

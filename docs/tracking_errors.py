@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from experiments.catalogue import index
 from experiments.file import document
 from experiments.report.style import STYLE
-from experiments.virtual_time.log import Logbook
+from experiments.virtual_time.log import RunRecorder
 from experiments.virtual_time.simulation import simulate
 
 
@@ -22,7 +22,7 @@ def main() -> None:
         figure = Figure(figsize=(7.0, 2.0), layout="constrained")
         where, *errors = figure.subplots(1, 1 + len(given.cases()), width_ratios=[1.0, 1.2, 1.2, 1.2])
         for axes, (case, plan) in zip(errors, given.cases().items(), strict=True):
-            trace = Logbook(simulate(plan, plan.experiment.seed), plan, case).trace()
+            trace = RunRecorder(simulate(plan, plan.experiment.seed), plan, case).trace()
             target = trace.true_position[:, :1, :2]
             if axes is errors[0]:
                 where.plot(*trace.memory["x"][::5, 1, :2].T, ".", markersize=2)

@@ -20,7 +20,7 @@ from experiments.file.document import load
 from experiments.metrics import measure
 from experiments.metrics.results import CaseMetrics
 from experiments.virtual_time import simulation
-from experiments.virtual_time.log import Logbook
+from experiments.virtual_time.log import RunRecorder
 
 TUNING: Final = tuple(range(1001, 1011))
 REPORTED: Final = tuple(range(1, 51))
@@ -56,7 +56,7 @@ UPDATES: Final[dict[str, dict[str, Any] | None]] = {
 def measured(plan: Plan, seeds: Sequence[int]) -> list[CaseMetrics]:
     """The metrics of each seed."""
     logs = (simulation.simulate(plan, seed) for seed in seeds)
-    return [measure.measure(Logbook(log, plan, "").trace()) for log in logs]
+    return [measure.measure(RunRecorder(log, plan, "").trace()) for log in logs]
 
 
 def mean(cases: Sequence[CaseMetrics], index: str) -> float:

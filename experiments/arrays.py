@@ -23,7 +23,7 @@ def known_rows(values: Iterable[Sequence[float] | float | None], width: int = 1)
     return np.array([blank if each is None else each for each in values], dtype=float).reshape(-1, width)
 
 
-class Columns(msgspec.Struct, frozen=True):
+class ArrayTable(msgspec.Struct, frozen=True):
     """Base of tables: arrays with a first axis of the same length; a column may be None."""
 
     @classmethod
@@ -41,7 +41,7 @@ class Columns(msgspec.Struct, frozen=True):
         return type(self)(*kept)
 
 
-class PoseTable(Columns, frozen=True):
+class PoseTable(ArrayTable, frozen=True):
     """Poses (M) of many robots: as they were sent, on their way, or as they were received.
 
     In memory alone an array may have no columns, (M, 0), where its values are not kept.

@@ -34,7 +34,7 @@ from experiments.recording.run_folder import METRICS, SOURCE, case_figures, read
 from experiments.recording.trace import Trace
 from experiments.report import metrics_files
 from experiments.virtual_time import simulation
-from experiments.virtual_time.log import Logbook
+from experiments.virtual_time.log import RunRecorder
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -64,7 +64,7 @@ SHARED: Final = 1e6  # robot ticks that are shared between processes, which take
 MOST_SAMPLES: Final = 2e7  # states of one robot; each takes about 300 bytes
 
 
-class Figures(dict[str, "Figure"]):
+class FigureSet(dict[str, "Figure"]):
     """Figures by name, which a notebook shows one below the other."""
 
     def _repr_html_(self) -> str:
@@ -86,11 +86,11 @@ class Run:
     notes: tuple[str, ...] = ()  # robots lost, a damaged recording, a case that never began
     made: float = field(default_factory=time.time)  # [s] UTC
 
-    def figures(self, width: float = 3.5) -> Figures:
+    def figures(self, width: float = 3.5) -> FigureSet:
         """The figures of the report by name, `width` [in] wide: 3.5 for one column, 7.16 for a whole page."""
         from experiments.report import figures  # noqa: PLC0415 - matplotlib takes 0.6 s
 
-        return Figures(figures.every(list(self.metrics.values()), list(self.traces.values()), width))
+        return FigureSet(figures.all_figures(list(self.metrics.values()), list(self.traces.values()), width))
 
     def __repr__(self) -> str:
         where = f" in {self.folder}" if self.folder else ""
@@ -132,7 +132,7 @@ def _column(values: Sequence[Any]) -> list[Any]:
 
 
 Progress = Callable[[str, int, int], None]  # case, simulated seconds, seconds in all
-Watch = Callable[[str, Plan], Callable[[simulation.Instant], object] | None]  # of a case
+Watch = Callable[[str, Plan], Callable[[simulation.Snapshot], object] | None]  # of a case
 
 
 def simulate(
@@ -186,7 +186,7 @@ def simulate_seeds(
             duration_s = plan.experiment.duration_s
             passing = partial(_pass_progress, progress, name, duration_s)
             log = simulation.simulate(plan, first, progress=passing, watch=watch(name, plan))
-            logbook = Logbook(log, plan, name)
+            logbook = RunRecorder(log, plan, name)
             traces[0][name] = logbook.trace()
             metrics[0][name] = measure.measure(traces[0][name])
             if folder is not None:
@@ -209,7 +209,7 @@ Flown = tuple[Trace, CaseMetrics]
 
 def _flown(name: str, plan: Plan, seed: int, progress: Callable[[float], object] = lambda _: None) -> Flown:
     """Trace and metrics of a run of a case."""
-    trace = Logbook(simulation.simulate(plan, seed, progress=progress), plan, name).trace()
+    trace = RunRecorder(simulation.simulate(plan, seed, progress=progress), plan, name).trace()
     return trace, measure.measure(trace)
 
 

@@ -14,7 +14,7 @@ from experiments.real_time.conductor.conduct import hardware
 from tools.terminal import say
 
 
-def stranger(file: Path) -> bool:
+def belongs_to_another(file: Path) -> bool:
     """Whether a file is of another user than the one who asks, the system's, and the owner of this zenpark."""
     own = {os.geteuid(), 0, Path(__file__).stat().st_uid}
     if os.environ.get("SUDO_UID", "").isdecimal():

@@ -48,7 +48,7 @@ COLOURS: Final = {Rank.GONE: "bold red", Rank.SILENT: "magenta", Rank.HELD: "yel
 
 
 @dataclass(frozen=True)
-class Row:
+class LiveRow:
     """One robot; None where nothing is known."""
 
     name: str
@@ -110,7 +110,7 @@ class Trends:
         error: float | None,
         gone: str = "",
         lost: bool = False,
-    ) -> Row:
+    ) -> LiveRow:
         """The row of a robot.
 
         Args:
@@ -120,7 +120,7 @@ class Trends:
             lost: It should take part: process or token have vanished.
         """
         if status is None:
-            return Row(name, gone or "starting", Rank.GONE if lost else Rank.FINE)
+            return LiveRow(name, gone or "starting", Rank.GONE if lost else Rank.FINE)
         trend = self.add(status)
         growing = frozenset(word for word, when in trend.grew.items() if now - when < RECENT_S)
         phase, rank = gone or status.phase, Rank.FINE
@@ -136,7 +136,7 @@ class Trends:
             note += f" {status.malformed} malformed"
         if foreign := sum(status.foreign.values()):
             note += f" {foreign} foreign"
-        return Row(
+        return LiveRow(
             name, phase, rank, error, trend.rate, status.missed, sum(status.lost.values()), trend.cpu, status.battery,
             status.sent, note.strip(), growing, status.pid,
         )  # fmt: skip
@@ -154,16 +154,16 @@ def _rank(status: Status, growing: frozenset[str]) -> Rank:
     return Rank.FINE
 
 
-def worst_first(rows: Sequence[Row], *, fit: bool) -> list[Row]:
+def worst_first(rows: Sequence[LiveRow], *, fit: bool) -> list[LiveRow]:
     """Rows by urgency; rows of one urgency by error where not all fit, else as they came: a table that stays still."""
     return sorted(rows, key=lambda row: (row.rank, 0.0 if fit else -(row.error if row.error is not None else -inf)))
 
 
-def totals(rows: Sequence[Row], shown: int) -> Row:
+def totals(rows: Sequence[LiveRow], shown: int) -> LiveRow:
     """One row for all: the largest error, the lowest battery, sums of the rest, each process counted once."""
     cpu = {row.pid or row.name: row.cpu for row in rows if row.cpu is not None}
     notable = sum(row.rank < Rank.FINE for row in rows)
-    return Row(
+    return LiveRow(
         f"all {len(rows)}",
         f"+{len(rows) - shown} more",
         error=max((row.error for row in rows if row.error is not None), default=None),
@@ -187,7 +187,7 @@ def metres(error: float | None) -> str:
     return "–" if error is None else f"{error:.3f}"
 
 
-def _cells(row: Row) -> list[Text]:
+def _cells(row: LiveRow) -> list[Text]:
     """Texts of a row, by column."""
     from rich.text import Text
 
@@ -211,7 +211,7 @@ def _cells(row: Row) -> list[Text]:
     return [Text(text, style) for text, style in cells]
 
 
-def drawn(title: str, rows: Sequence[Row], events: Sequence[Event], width: int, height: int) -> Group:
+def drawn(title: str, rows: Sequence[LiveRow], events: Sequence[Event], width: int, height: int) -> Group:
     """The table with its title and events, no wider than `width`, no more than `height` lines.
 
     Args:

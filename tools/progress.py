@@ -7,8 +7,8 @@ import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final, Self
 
-from experiments.real_time.conductor.run_view import OUTPUT, News, Progress, RobotView, Shown
-from tools.live_table import Row, Trends, drawn, heading, metres
+from experiments.real_time.conductor.run_view import OUTPUT, News, Progress, ProgressDisplay, RobotView
+from tools.live_table import LiveRow, Trends, drawn, heading, metres
 from tools.terminal import printable, say
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ class Table:
             self._live.update(_table(progress, self._trends, self._live.console), refresh=True)
 
 
-def shown(*, quiet: bool) -> Shown:
+def shown(*, quiet: bool) -> ProgressDisplay:
     """A table in a terminal, lines elsewhere, and only lines when asked to be quiet."""
     return Table() if sys.stderr.isatty() and not quiet else Lines()
 
@@ -93,7 +93,7 @@ def _table(progress: Progress, trends: Trends, console: Console) -> Group:
     return drawn(title, rows, news, console.width, console.height - 1)
 
 
-def _row(trends: Trends, name: str, view: RobotView, now: float) -> Row:
+def _row(trends: Trends, name: str, view: RobotView, now: float) -> LiveRow:
     because = view.left_because
     return trends.row(name, view.status, now=now, error=view.error, gone=because, lost=because == "lost")
 

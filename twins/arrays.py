@@ -22,6 +22,6 @@ def norm(vectors: Array) -> Array:
     return length
 
 
-def some(mask: Mask) -> bool:
+def any_true(mask: Mask) -> bool:
     """True if any entry of `mask` is true. A tenth of the cost of `mask.any()` on a few rows."""
     return 1 in mask.tobytes()

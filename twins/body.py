@@ -14,7 +14,7 @@ from agents.body.interface import BodyRequest, BodyState, Disturbance
 from agents.body.kinds import Kind
 from agents.body.shadow_twin import Placeable
 from agents.vectors import NO_SETPOINT, ZERO, Setpoint, Vector
-from twins.engines.engine import Engine, Motion, Stage, Touch, World
+from twins.engines.engine import Engine, EngineInput, Motion, Touch, World
 from twins.engines.point_mass import PointMassEngine, model, require_models
 from twins.models import noise
 from twins.models.disturbance import Drift, HoverJitter, Latency, Measurement
@@ -190,7 +190,7 @@ class TwinBody(Placeable):
             self.engine = self._alone = PointMassEngine(list(models), dt)
         else:
             mirrored = world.mirrored
-            stage = Stage(request.kinds, request.start, request.yaw, dt, mirrored, world.scene)
+            stage = EngineInput(request.kinds, request.start, request.yaw, dt, mirrored, world.scene)
             self.engine = world.engine.build(stage)
             if type(self.engine) is PointMassEngine:
                 self._alone = self.engine

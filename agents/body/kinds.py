@@ -197,7 +197,7 @@ class Kind:
             raise ValueError(f"the kind {self.name!r} drives: let it take velocities or twists")
 
 
-class Figures(msgspec.Struct, frozen=True):
+class RecordedKind(msgspec.Struct, frozen=True):
     """Figures of a kind, with which a recording is shown and measured where the kind is not installed."""
 
     name: str
@@ -216,7 +216,7 @@ class Figures(msgspec.Struct, frozen=True):
     colour: str
 
     @classmethod
-    def of(cls, kind: Kind) -> Figures:
+    def of(cls, kind: Kind) -> RecordedKind:
         return cls(**{name: getattr(kind, name) for name in cls.__struct_fields__})
 
 
@@ -252,7 +252,7 @@ class Kinds(Mapping[str, Kind]):
     def __len__(self) -> int:
         return len(list(iter(self)))
 
-    def remember(self, figures: Figures) -> None:
+    def remember(self, figures: RecordedKind) -> None:
         """Know a kind that is not installed by its figures, without a twin; raises ValueError for absurd ones."""
         if figures.name not in {kind.name for kind in self.usable()}:
             self.loaded[figures.name] = Kind(**msgspec.structs.asdict(figures))

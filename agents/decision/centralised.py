@@ -207,7 +207,7 @@ class Centre:
         return (patience is not None and t > patience) or not self.robots[row].computer.neighbours.unreceived()
 
 
-class Guidance:
+class ReceivedGoals:
     """Goal received from the central controller, its age, and liveliness of the controller."""
 
     __slots__ = ("_flies", "_silence_s", "fresh", "goal", "goal_yaw", "lost_since", "stamp", "velocity")

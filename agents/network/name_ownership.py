@@ -105,7 +105,7 @@ def _is_rival(alive: str, token: str, mine: str, rank: str, owners: bool) -> boo
     return owners and token != Keys.life(alive, mine)
 
 
-def keep(session: zenoh.Session, alive: Sequence[str], pause: threading.Event) -> None:
+def confirm_ownership(session: zenoh.Session, alive: Sequence[str], pause: threading.Event) -> None:
     """Returns when it is certain that no other process has taken the names since they were owned.
 
     One answer is not enough: a link that is lost ends its questions as an answer does, and a process that takes the
@@ -159,7 +159,7 @@ class OwnershipCheck:
             self._asking = threading.Thread(target=self._ask, name="owner of the name", daemon=True)
             self._asking.start()
 
-    def over(self) -> bool:
+    def finished(self) -> bool:
         """Whether no check runs (0.1 µs then); raises NameTaken, each time, if another process owns a name."""
         if self._asking is not None and not self._asking.is_alive():
             self._asking = None
@@ -169,21 +169,21 @@ class OwnershipCheck:
             raise NameTaken(self._taken)
         return self._asking is None
 
-    def stood_still(self) -> bool:
+    def check_standstill(self) -> bool:
         """Whether the process stood still since the last call for longer than its names are safe."""
         last, self.awake_at = self.awake_at, uptime()
         return self.awake_at - last >= self._stood_s
 
-    def settle(self, session: zenoh.Session, ended: Callable[[], bool]) -> bool:
+    def wait_while_checking(self, session: zenoh.Session, ended: Callable[[], bool]) -> bool:
         """Wait while a check runs, or for one if the process stood still since the last call; returns whether it did.
 
         For processes without a body, before they send anything: another process may send the same meanwhile. Raises
-        NameTaken as `over`.
+        NameTaken as `finished`.
         """
-        if self.stood_still():
+        if self.check_standstill():
             self.begin(session)
         waited = False
-        while not self.over() and not ended():
+        while not self.finished() and not ended():
             waited = True
             time.sleep(TURN_S)
             self.awake_at = uptime()
@@ -194,7 +194,7 @@ class OwnershipCheck:
 
     def _ask(self) -> None:
         try:
-            keep(self._session, self._alive, self._over)
+            confirm_ownership(self._session, self._alive, self._over)
         except NameTaken as taken:
             self._taken = str(taken)
         except network.Unreachable:
@@ -222,16 +222,16 @@ class NameKeeper:
         alive = [self._keys.alive(name) for name in self._names]
         try:
             self._owned = claim(session, alive, began=self._began, endpoints=endpoints, stop=stop)
-            self._check.stood_still()
+            self._check.check_standstill()
         except NameTaken as taken:
             raise NameTaken(
                 f"{self._owners_text(taken)}: a robot of this name is on the network already; end it first "
                 "(`./zenpark keys` lists its members), or choose another router with --connect"
             ) from None
 
-    def stood_still(self) -> bool:
+    def check_standstill(self) -> bool:
         """Whether the process stood still since the last call for longer than its names are safe."""
-        return self._check.stood_still()
+        return self._check.check_standstill()
 
     def begin_check(self, session: zenoh.Session) -> None:
         """Starts a check of the ownership."""
@@ -243,7 +243,7 @@ class NameKeeper:
         Raises NameTaken if they belong to another one; the bodies are that one's then.
         """
         try:
-            return self._check.over()
+            return self._check.finished()
         except NameTaken as taken:
             self.hands_off = True
             raise NameTaken(

@@ -34,11 +34,11 @@ ADDRESSES: Final = (
 )
 
 
-class Part(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
+class DeviceTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
     """A table of the settings."""
 
 
-class Lighthouse(Part, frozen=True, tag_field="system", tag="lighthouse"):
+class Lighthouse(DeviceTable, frozen=True, tag_field="system", tag="lighthouse"):
     """Lighthouse deck and base stations."""
 
     # geometry and calibration as the Crazyflie client saves them; None: what is stored on board
@@ -46,7 +46,7 @@ class Lighthouse(Part, frozen=True, tag_field="system", tag="lighthouse"):
     base_stations: Annotated[int, Meta(ge=1, le=16)] = 4  # that the firmware knows
 
 
-class Loco(Part, frozen=True, tag_field="system", tag="loco"):
+class Loco(DeviceTable, frozen=True, tag_field="system", tag="loco"):
     """Loco deck and anchors."""
 
     mode: Literal["auto", "twr", "tdoa2", "tdoa3"] = "auto"  # how ranges are measured
@@ -54,7 +54,7 @@ class Loco(Part, frozen=True, tag_field="system", tag="loco"):
     anchors: list[tuple[float, float, float]] = []
 
 
-class Outside(Part, frozen=True, tag_field="system", tag="external"):
+class Outside(DeviceTable, frozen=True, tag_field="system", tag="external"):
     """Positions from outside (motion capture), passed on to the Crazyflie's own estimator."""
 
     rate_hz: Rate = 20.0  # largest rate at which they are forwarded
@@ -63,7 +63,7 @@ class Outside(Part, frozen=True, tag_field="system", tag="external"):
     attitude_sigma: Positive = 0.05  # standard deviation of the attitude [rad]
 
 
-class CrazyflieSettings(Part, frozen=True):
+class CrazyflieSettings(DeviceTable, frozen=True):
     """CrazyflieSettings of one Crazyflie."""
 
     stream_hz: Rate = 10.0  # largest rate of setpoints

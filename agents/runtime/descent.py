@@ -73,7 +73,7 @@ class Descent:
         wheels halt after `neighbour_timeout_s`. After `offline_s`, or `ANSWER_S` if the process is asked to end, all
         land. The process then drives its bodies again, until it learns that they belong to another one.
         """
-        if not self._keeper.stood_still() or self.watchdog.tripped:  # the watchdog handles a loop that hangs
+        if not self._keeper.check_standstill() or self.watchdog.tripped:  # the watchdog handles a loop that hangs
             return False
         limits, drives = self._limits, self._on_wheels
         woke, self._keeper.hands_off = self._ticks.elapsed(), True
@@ -88,7 +88,7 @@ class Descent:
                 drives = ()
             self.watchdog.beat()
             time.sleep(self._ticks.period)
-        self._keeper.stood_still()
+        self._keeper.check_standstill()
         self._keeper.hands_off = False
         return True
 

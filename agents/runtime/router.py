@@ -25,7 +25,7 @@ from agents.network.access_control import Rights
 from agents.network.endpoints import DEFAULT_ENDPOINT, EndpointError
 from agents.network.keys import Keys
 from agents.network.session import deserted, forbid_lingering, hang_up_on, prompt_threads
-from agents.network.shutdown import end, held
+from agents.network.shutdown import closing_cleanly, end
 from agents.network.zenoh_config import config, reason, settings
 from agents.runtime import command_line
 from agents.runtime.command_line import on_termination
@@ -107,7 +107,7 @@ def serve_router(
     read = _stamp(register)  # before reading: a change in between is detected
     chosen = config(settings("router", listen=endpoints, connect=link, name="router", rights=rights))
     while True:
-        with held(_routing(chosen, endpoints, patience_s, stop)) as (session, declared):
+        with closing_cleanly(_routing(chosen, endpoints, patience_s, stop)) as (session, declared):
             guard = None
             if register is not None and rights is not None:
                 guard = Guard(session, lab.register(register.parent), rights.realm)
@@ -154,14 +154,14 @@ class Guard:
         """Compare the tokens in the tables of the router with the sessions that declared them; poll it."""
         # another router declares the tokens of its own clients, which it compares itself
         links = {str(link.zid): link for link in self._session.info.links() if not self._is_router(link)}
-        held = Counter[str]()
+        connections = Counter[str]()
         for key, declarers in declared_tokens(self._session):
             named = Keys.session_of(key)
             for zid in declarers & links.keys():
-                held[zid] += 1
+                connections[zid] += 1
                 if named not in (None, zid):
                     self._ban(links[zid], f"holds a token of {self._keys.whose(key)} in the name of another session")
-        for zid, count in held.items():
+        for zid, count in connections.items():
             if count > MOST_TOKENS:
                 self._ban(links[zid], f"holds more than {MOST_TOKENS} liveliness tokens")
         while self._hazards:

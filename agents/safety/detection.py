@@ -19,7 +19,7 @@ from agents.decision.situation import LATE_SHARE, SILENT_S, ProcessHealth, Situa
 from agents.plugins.predictors import Predictor
 from agents.safety.hazards import Cause
 from agents.safety.landing import LOW, SLOW
-from agents.safety.obedience import RUSH_S, Obedience
+from agents.safety.motion_check import RUSH_S, MotionCheck
 from agents.safety.setpoint_filter import OUTSIDE_M
 from agents.vectors import NO_SETPOINT, UNKNOWN, Setpoint, Vector, is_finite, norm, planar
 
@@ -145,7 +145,7 @@ class Detector:
     FIXED: ClassVar = ("flies", "sees")
     __slots__ = (
         "ascent", "avoids", "battery_low", "behind_s", "descent", "fastest", "fastest_squared", "flies", "lean",
-        "leaned", "leans_since", "limits", "name", "obedience", "predictor", "radius", "scan", "scanned", "sees",
+        "leaned", "leans_since", "limits", "motion_check", "name", "predictor", "radius", "scan", "scanned", "sees",
         "separation", "silence_s", "slow_squared",
     )  # fmt: skip
 
@@ -163,7 +163,7 @@ class Detector:
     behind_s: float  # stamps that are older have a wrong clock [s]
     separation: float  # least distance of robots [m]; 0: any
     avoids: bool  # needs range readings, once there were some
-    obedience: Obedience
+    motion_check: MotionCheck
     ascent: Ascent
     descent: Descent
     leaned: bool  # on the tick before
@@ -186,7 +186,7 @@ class Detector:
         self.behind_s = BEHIND * limits.position_timeout_s
         self.separation = 0.0 if limits.separation is None else limits.separation
         self.avoids = assignment.avoidance is not None and assignment.avoids
-        self.obedience, self.ascent = Obedience(kind), Ascent(kind, assignment.hover)
+        self.motion_check, self.ascent = MotionCheck(kind), Ascent(kind, assignment.hover)
         self.descent = Descent(limits.high[2])
         self.leaned, self.leans_since, self.sees = False, 0.0, False
         self.scan, self.scanned = None, inf
@@ -227,11 +227,11 @@ class Detector:
             found |= self.of_orders(now, status)
         if self.sees and self.sees_nothing(t, state) and status.cruising:
             found |= 1 << Cause.UNSEEING
-        obedience, ascent = self.obedience, self.ascent
-        obedience.update(t, status.setpoint, now.position, now.yaw, status.cruising and not now.invalid)
-        if obedience.still or ascent.stalled:
+        motion_check, ascent = self.motion_check, self.ascent
+        motion_check.update(t, status.setpoint, now.position, now.yaw, status.cruising and not now.invalid)
+        if motion_check.unresponsive or ascent.stalled:
             found |= 1 << Cause.STILL
-        if obedience.strays or ascent.carried:
+        if motion_check.uncommanded or ascent.carried:
             found |= 1 << Cause.STRAYING
         return found if now.sound else found | self.of_place(now)
 
@@ -361,7 +361,7 @@ class Detector:
     def words(self, cause: Cause, now: Situation, status: Status, neighbours: Neighbours, health: ProcessHealth) -> str:
         """Extent of a cause that the last call of `causes` found; of `BELOW` by `Landing.robot_below`."""
         t, state, limits = now.t, now.state, self.limits
-        obedience, ascent = self.obedience, self.ascent
+        motion_check, ascent = self.motion_check, self.ascent
 
         def nearest() -> str:
             apart, other = nearest_robot(now.position, neighbours, self.predictor, t)
@@ -417,9 +417,13 @@ class Detector:
             Cause.FOREIGN: foreign,
             Cause.REFUSED: lambda: ", ".join(f"{each.name}: {each.doubt}" for each in neighbours.all if each.doubt),
             Cause.STANDSTILL: lambda: f"for {health.suspended_s:.1f} s; it waits for its neighbours",
-            Cause.STILL: lambda: "it does not rise" if ascent.stalled else f"{obedience.told:.2f} m commanded in vain",
+            Cause.STILL: lambda: (
+                "it does not rise" if ascent.stalled else f"{motion_check.commanded:.2f} m commanded in vain"
+            ),
             Cause.STRAYING: lambda: (
-                f"{ascent.aside:.2f} m aside while it climbs" if ascent.carried else f"{obedience.strayed:.2f} m lately"
+                f"{ascent.aside:.2f} m aside while it climbs"
+                if ascent.carried
+                else f"{motion_check.drifted:.2f} m lately"
             ),
             Cause.UNREACHABLE: lambda: f"for {t - state.received:.1f} s",
             Cause.HOVERING: lambda: f"at {now.position[2]:.2f} m",

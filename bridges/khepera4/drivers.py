@@ -99,7 +99,7 @@ class Driver(Protocol):
         ...
 
 
-class Park:
+class RoboticParkServer:
     """A server of Robotic Park that obeys `d`; what else it does is in `protocol.PARK`."""
 
     def __init__(self, wire: Wire, chosen: protocol.Khepera4Settings, server: protocol.ParkServer) -> None:
@@ -199,7 +199,7 @@ class Park:
         return way
 
 
-class GoalPark(Park):
+class GoalPark(RoboticParkServer):
     """A server of Robotic Park that obeys only goals: its own controller is led by a goal just ahead of the robot.
 
     The driver sets the server's position to the origin, and lays the goal where the law of the server gives the wanted
@@ -274,7 +274,7 @@ class GoalPark(Park):
         self._ahead = math.hypot(*self._goal)
 
 
-def identify(wire: Wire, chosen: protocol.Khepera4Settings, server: str | None) -> Park:
+def identify(wire: Wire, chosen: protocol.Khepera4Settings, server: str | None) -> RoboticParkServer:
     """Stop a park robot, and find out or make sure by the answer to `p` which `server` runs on it.
 
     Raises:
@@ -306,7 +306,7 @@ def identify(wire: Wire, chosen: protocol.Khepera4Settings, server: str | None) 
             f'such as device = {{ server = "{fitting[0]}" }}, and restart it, for it may serve one client only'
         )
     kind = protocol.PARK[server or fitting[0]]
-    return (Park if kind.drives else GoalPark)(wire, chosen, kind)
+    return (RoboticParkServer if kind.drives else GoalPark)(wire, chosen, kind)
 
 
 def _shown(answer: bytes) -> str:

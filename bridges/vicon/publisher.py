@@ -21,7 +21,7 @@ from agents.clock import Clock, uptime
 from agents.network import messages, pubsub
 from agents.network import session as network
 from agents.network.keys import Keys
-from agents.network.shutdown import Farewell, end, held
+from agents.network.shutdown import Farewell, closing_cleanly, end
 from agents.protocols import vicon_datastream
 from agents.protocols.vicon_datastream import Malformed, Segment
 from agents.runtime import command_line
@@ -217,7 +217,7 @@ def serve(launch: ViconLaunch) -> int:
     identity = launch.identity or "positioning"
     with (
         on_termination(stop.set),
-        held(network.open_session(launch.endpoints(), name="vicon", stop=stop, identity=identity)) as (
+        closing_cleanly(network.open_session(launch.endpoints(), name="vicon", stop=stop, identity=identity)) as (
             session,
             declared,
         ),

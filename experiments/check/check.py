@@ -16,14 +16,14 @@ from agents.plugins.files import plain
 from experiments.check import motion, noise, safety, theory
 from experiments.check import obstacles as surroundings
 from experiments.check.analysis import Analysis, analyse
-from experiments.check.findings import FORGIVEN, MARK, NOT_RANDOM, Figures, Finding, first_of_each_code
+from experiments.check.findings import FORGIVEN, MARK, NOT_RANDOM, CheckNumbers, Finding, first_of_each_code
 from experiments.check.ideal_run import predict, ticking_plugins
 from experiments.check.realisation import algebraic_connectivity
 from experiments.definition import standby
 from experiments.definition.graph import edges
 from experiments.definition.plan import Plan
 from experiments.file.document import Document, Source, chosen
-from experiments.file.problems import Fault, Path, Place, Problem, nearest
+from experiments.file.problems import Fault, Path, Problem, TextPosition, nearest
 from experiments.virtual_time.source import is_foreign, outside
 
 QUIET: Final = np.errstate(all="ignore")  # absurd numbers overflow on their way to a finding that says so
@@ -97,7 +97,7 @@ def analyses(given: Document) -> dict[str, Analysis]:
 
 def examine(
     given: Document, analyses: Mapping[str, Analysis] | None = None
-) -> tuple[list[Finding], dict[str, Figures]]:
+) -> tuple[list[Finding], dict[str, CheckNumbers]]:
     """Findings of all cases, as `check`, and the figures of each case by its name."""
     analyses = _analyses(given.cases()) if analyses is None else analyses
     figures_of = {name: _figures(analysis) for name, analysis in analyses.items()}
@@ -108,7 +108,7 @@ def unreadable(problem: Problem) -> Finding:
     return Finding("error", "document", problem.message, problem.hint, problem.place)
 
 
-def figures(plan: Plan) -> Figures:
+def figures(plan: Plan) -> CheckNumbers:
     return _figures(_analyses({"": plan})[""])
 
 
@@ -142,7 +142,7 @@ def _findings(given: Document, analyses: Mapping[str, Analysis]) -> list[Finding
 
 def _place(source: Source, path: Path, cases: Sequence[str]) -> str:
     """The place of `path` in the file or in a `--set`; in the first of `cases` that changes it, if any."""
-    keys = source.places | {override.whole: Place(0, 0) for override in source.overrides}
+    keys = source.places | {override.whole: TextPosition(0, 0) for override in source.overrides}
     own = next((p for name in cases if len(nearest(keys, p := ("cases", name, *path))[0]) > 2), path)
     return source.located(Fault(own, "")).place
 
@@ -153,7 +153,7 @@ def _finite(value: float) -> float | None:
 
 
 @QUIET
-def _figures(analysis: Analysis) -> Figures:
+def _figures(analysis: Analysis) -> CheckNumbers:
     experiment = analysis.plan.experiment
     shape, planar, spatial, loop = analysis.shape, analysis.planar, analysis.spatial, analysis.modes
     spare = analysis.spare
@@ -161,7 +161,7 @@ def _figures(analysis: Analysis) -> Figures:
     end, fastest, follower = prediction.position[-1], analysis.fastest, analysis.follower
     last = float(prediction.time[-1])
     payload, words, load = theory.load(analysis)
-    return Figures(
+    return CheckNumbers(
         robots=len(analysis.names),
         arena=experiment.arena.size,
         obstacles={

@@ -40,7 +40,7 @@ class Finding:
         return f"{MARK[self.severity]} {self.message}" + (f"; {self.remedy}" if self.remedy else "")
 
 
-class Figures(msgspec.Struct, frozen=True, kw_only=True):
+class CheckNumbers(msgspec.Struct, frozen=True, kw_only=True):
     """Figures of one case; None where one has no meaning, as without links."""
 
     robots: int  # how many

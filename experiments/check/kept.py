@@ -23,7 +23,7 @@ import msgspec
 
 from agents.user_folder import cache_folder
 from experiments.catalogue import index
-from experiments.check.findings import Figures, Finding
+from experiments.check.findings import CheckNumbers, Finding
 from experiments.recording import version
 
 MOST: Final = 200  # verdicts that are kept
@@ -39,7 +39,7 @@ class Verdict(msgspec.Struct, frozen=True):
     path: str  # of its file
     title: str
     findings: list[Finding]
-    figures: dict[str, Figures] | None  # by case; None where they were not asked for
+    figures: dict[str, CheckNumbers] | None  # by case; None where they were not asked for
 
 
 class KeptVerdict:

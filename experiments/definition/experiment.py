@@ -27,18 +27,18 @@ Spatial = tuple[Positive, Positive, Positive]
 Choice = str | dict[str, Any]  # a plug-in by name, or a table with its `kind` and its parameters
 
 
-class Part(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
+class FileTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
     """A table of the experiment file."""
 
 
-class StartBox(Part, frozen=True):
+class StartBox(FileTable, frozen=True):
     """Part of the floor where robots may start."""
 
     at: Annotated[Planar, Meta(description="centre x, y [m]")]
     size: Annotated[tuple[Positive, Positive], Meta(description="width along x and y [m]")]
 
 
-class Shadow(Part, frozen=True):
+class Shadow(FileTable, frozen=True):
     """Shadow twin: runs beside a robot with the same setpoints, to measure how far they agree."""
 
     restart_s: Annotated[
@@ -47,7 +47,7 @@ class Shadow(Part, frozen=True):
     ] = 5.0
 
 
-class Arena(Part, frozen=True):
+class Arena(FileTable, frozen=True):
     """Box that the robots must not leave: centred on the origin, floor at z = 0."""
 
     size: Annotated[Spatial, Meta(description="size along x, y, z [m]")] = (4.0, 4.0, 2.5)
@@ -63,7 +63,7 @@ class Arena(Part, frozen=True):
     ] = {}
 
 
-class Rates(Part, frozen=True):
+class Rates(FileTable, frozen=True):
     """Rates [Hz]; pose_hz, coordination_hz and state_hz divide body_hz."""
 
     body_hz: Annotated[Rate, Meta(description="position control and body [1/s]")] = 100.0
@@ -79,7 +79,7 @@ class Rates(Part, frozen=True):
     ] = None
 
 
-class Robot(Part, frozen=True):
+class Robot(FileTable, frozen=True):
     """Robot: kind, start, body and settings."""
 
     kind: Annotated[
@@ -119,7 +119,7 @@ class Robot(Part, frozen=True):
     ] = False
 
 
-class Target(Part, frozen=True):
+class Target(FileTable, frozen=True):
     """Target of a link, one of three: distance, offset or bearing."""
 
     distance: Annotated[Positive | None, Meta(description="distance to keep [m]")] = None
@@ -165,7 +165,7 @@ class Link(Target, frozen=True):
         return self.distance is None and self.offset is None and self.bearing is None
 
 
-class Anchor(Part, frozen=True):
+class Anchor(FileTable, frozen=True):
     """Distance of a robot to a point, to a line through it, or to a plane through it."""
 
     distance: Annotated[NotNegative, Meta(description="distance to keep [m]; 0: on it")] = 0.0
@@ -193,7 +193,7 @@ class Anchor(Part, frozen=True):
                 raise ValueError(f"`{name}` has no direction; give x, y, such as [1.0, 0.0]")
 
 
-class Change(Part, frozen=True):
+class Change(FileTable, frozen=True):
     """Smooth transition of the formation to another shape, from `at_s` on."""
 
     at_s: Annotated[NotNegative, Meta(description="start of the transition, after the common start [s]")]
@@ -214,7 +214,7 @@ class Change(Part, frozen=True):
     ] = 0.0
 
 
-class Proximity(Part, frozen=True):
+class Proximity(FileTable, frozen=True):
     """Links that exist while two robots are near each other."""
 
     range: Annotated[Positive, Meta(description="distance below which robots become neighbours [m]")]
@@ -234,7 +234,7 @@ class Proximity(Part, frozen=True):
             raise ValueError("`release` must not be nearer than `range`; or leave it out")
 
 
-class Formation(Part, frozen=True):
+class Formation(FileTable, frozen=True):
     """Formation: links with their targets, anchors, and the law."""
 
     law: Annotated[Choice, Meta(description="a registered law")] = "distance"
@@ -280,7 +280,7 @@ class Formation(Part, frozen=True):
     proximity: Annotated[Proximity | None, Meta(description="links by range; left out: links are permanent")] = None
 
 
-class Leg(Part, frozen=True):
+class Leg(FileTable, frozen=True):
     """Plan that a robot follows from `at_s` on."""
 
     at_s: Annotated[NotNegative, Meta(description="start of the plan, after the common start [s]")]
@@ -288,7 +288,7 @@ class Leg(Part, frozen=True):
     plan: Annotated[Choice, Meta(description="a registered planner")]
 
 
-class LinkChannel(Part, frozen=True):
+class LinkChannel(FileTable, frozen=True):
     """Effects on one link; a field left out is that of the channel."""
 
     delay_s: Delay | None = None
@@ -299,7 +299,7 @@ class LinkChannel(Part, frozen=True):
     queue_s: Delay | None = None
 
 
-class Outage(Part, frozen=True):
+class Outage(FileTable, frozen=True):
     """Time in which nothing passes on some links."""
 
     from_s: Annotated[NotNegative, Meta(description="start of the outage, after the common start [s]")]
@@ -315,7 +315,7 @@ class Outage(Part, frozen=True):
             raise ValueError("`until_s` must be later than `from_s`; or leave it out")
 
 
-class Channel(LinkEffects, Part, frozen=True):
+class Channel(LinkEffects, FileTable, frozen=True):
     """Effects of the network on poses between robots: modelled in virtual time, added at the receiver in real time."""
 
     outages: Annotated[list[Outage], Meta(description="times in which nothing passes")] = []
@@ -324,7 +324,7 @@ class Channel(LinkEffects, Part, frozen=True):
     ] = {}
 
 
-class Network(Part, frozen=True):
+class Network(FileTable, frozen=True):
     """Network of a run in real time."""
 
     realm: Annotated[Name, Meta(description="first chunk of every key")] = "park"
@@ -365,7 +365,7 @@ class Network(Part, frozen=True):
     ] = None
 
 
-class Host(Part, frozen=True):
+class Host(FileTable, frozen=True):
     """Other machine, which runs some of the robots."""
 
     address: Annotated[
@@ -385,7 +385,7 @@ class Host(Part, frozen=True):
     tags: Annotated[list[Name], Meta(description="labels by which `./zenpark hosts` chooses among hosts")] = []
 
 
-class World(Part, frozen=True):
+class World(FileTable, frozen=True):
     """World that all twins share in virtual time, and those with `body = "world"` in real time."""
 
     engine: Annotated[Choice, Meta(description="a registered engine")] = "point-mass"
@@ -404,7 +404,7 @@ class World(Part, frozen=True):
     ] = 30.0
 
 
-class Start(Part, frozen=True):
+class Start(FileTable, frozen=True):
     """Beginning of a run."""
 
     deadline_s: Annotated[Positive, Meta(description="time limit for all robots to be ready [s]")] = 20.0
@@ -419,7 +419,7 @@ class Start(Part, frozen=True):
     ] = 0.0
 
 
-class Hybrid(Part, frozen=True):
+class Hybrid(FileTable, frozen=True):
     """Hybrid architecture: some robots are guided by the central controller, the others decide for themselves."""
 
     kind: Annotated[Literal["hybrid"], Meta(description='"hybrid"')]
@@ -435,7 +435,7 @@ MEAN: Final = "mean"  # over robots
 WORST: Final = "worst"  # of them
 
 
-class Criterion(Part, frozen=True):
+class Criterion(FileTable, frozen=True):
     """Limit that a run must keep to pass: of a metric, or of a measure of the law."""
 
     metric: Annotated[
@@ -472,7 +472,7 @@ class Criterion(Part, frozen=True):
         return max(above, -math.inf if self.at_least is None else self.at_least - value)
 
 
-class Experiment(Part, frozen=True):
+class Experiment(FileTable, frozen=True):
     """Experiment, or a case of it after `document.cases`."""
 
     title: Annotated[str, Meta(description="subject of the experiment, for people")]

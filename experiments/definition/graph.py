@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from experiments.arrays import Columns
+from experiments.arrays import ArrayTable
 from twins.arrays import Array, Index, Mask
 
 
-class Links(Columns, frozen=True):
+class Links(ArrayTable, frozen=True):
     """Directed links (E), sorted by receiver; rows are the robots of the experiment.
 
     Columns of `agents.formation.link.Link`, where a link is described.

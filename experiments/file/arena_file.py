@@ -15,7 +15,7 @@ import msgspec
 
 from agents.plugins.registry import did_you_mean
 from experiments.catalogue import index
-from experiments.definition.experiment import Arena, Part
+from experiments.definition.experiment import Arena, FileTable
 from experiments.file import structure
 from experiments.file import text as syntax
 from experiments.file.consistency import arena_faults
@@ -28,7 +28,7 @@ _HERE: Final = ("arena", "file")
 _BELONGS: Final = "belongs in the experiment file: an arena file holds nothing but [arena]"
 
 
-class _Whole(Part, frozen=True):
+class _Whole(FileTable, frozen=True):
     """Content of an arena file."""
 
     arena: Arena

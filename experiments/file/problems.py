@@ -31,14 +31,14 @@ _BARE_VALUE: Final = re.compile(r"[^,\]}#\n]*")
 
 
 @dataclass(frozen=True)
-class Place:
+class TextPosition:
     """Begin of a key and of its value, as offsets into the text."""
 
     key: int
     value: int
 
 
-def places(text: str, *, json: bool = False) -> dict[Path, Place]:
+def places(text: str, *, json: bool = False) -> dict[Path, TextPosition]:
     """Place of every path of a valid document, tables and list items included."""
     scan = _Scan(text, json)
     if json:
@@ -48,12 +48,12 @@ def places(text: str, *, json: bool = False) -> dict[Path, Place]:
     return scan.found
 
 
-def nearest(found: Mapping[Path, Place], path: Path) -> tuple[Path, Place]:
+def nearest(found: Mapping[Path, TextPosition], path: Path) -> tuple[Path, TextPosition]:
     """The longest beginning of `path` that stands in the text."""
     for length in range(len(path), 0, -1):
         if path[:length] in found:
             return path[:length], found[path[:length]]
-    return (), Place(0, 0)
+    return (), TextPosition(0, 0)
 
 
 def line_column(text: str, offset: int) -> tuple[int, int]:
@@ -65,7 +65,7 @@ def line_column(text: str, offset: int) -> tuple[int, int]:
 class _Scan:
     text: str
     json: bool
-    found: dict[Path, Place] = field(default_factory=dict)
+    found: dict[Path, TextPosition] = field(default_factory=dict)
     items: dict[Path, int] = field(default_factory=dict)  # how many [[headers]] each list of tables has so far
 
     def document(self) -> None:
@@ -86,12 +86,12 @@ class _Scan:
         table: Path = ()
         for number, (name, offset) in enumerate(parts):
             table = (*table, name)
-            self.found.setdefault(table, Place(offset, start))
+            self.found.setdefault(table, TextPosition(offset, start))
             if opening == 2 and number == len(parts) - 1:
                 self.items[table] = self.items.get(table, 0) + 1
             if table in self.items:
                 table = (*table, self.items[table] - 1)
-                self.found.setdefault(table, Place(start, start))
+                self.found.setdefault(table, TextPosition(start, start))
         return table, at + opening
 
     def pair(self, table: Path, start: int) -> int:
@@ -101,7 +101,7 @@ class _Scan:
         path = table
         for name, offset in parts:
             path = (*path, name)
-            self.found.setdefault(path, Place(offset, at))
+            self.found.setdefault(path, TextPosition(offset, at))
         return self.value(path, at)
 
     def key(self, at: int) -> tuple[list[tuple[str, int]], int]:
@@ -139,7 +139,7 @@ class _Scan:
         while at < len(self.text) and self.text[at] != closing:
             if closing == "]":
                 item = (*path, number)
-                self.found.setdefault(item, Place(at, at))
+                self.found.setdefault(item, TextPosition(at, at))
                 at, number = self.value(item, at), number + 1
             else:
                 at = self.pair(path, at)
@@ -238,7 +238,7 @@ class Text:
     is_json: bool
 
     @cached_property
-    def places(self) -> dict[Path, Place]:
+    def places(self) -> dict[Path, TextPosition]:
         return places(self.text, json=self.is_json)
 
     def refuse(self, faults: Iterable[Fault]) -> None:

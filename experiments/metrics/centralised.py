@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from experiments.metrics.results import Guidance
+from experiments.metrics.results import CentralisedMetrics
 from experiments.recording.trace import Trace
 from twins.arrays import Array, Index, Mask
 
@@ -57,7 +57,7 @@ def deliveries(trace: Trace) -> int:
     return len(trace.received) + (0 if goals is None else int(goals.received.sum() + goals.reached.sum()))
 
 
-def guidance(trace: Trace) -> Guidance | None:
+def guidance(trace: Trace) -> CentralisedMetrics | None:
     """Metrics of the centralised architecture; None if each robot decides for itself."""
     goals = trace.goals
     if goals is None:
@@ -65,7 +65,7 @@ def guidance(trace: Trace) -> Guidance | None:
     duration = float(trace.time[-1] - trace.time[0])
     load = [report.load for report in goals.reports] if trace.clock == "real" else []
     missed = [report.missed for report in goals.reports]
-    return Guidance(
+    return CentralisedMetrics(
         guided=trace.plan.guided,
         goals=len(goals.sent),
         goals_hz=len(goals.sent) / duration,

@@ -51,7 +51,7 @@ class ShadowMetrics(msgspec.Struct, frozen=True):
     known: float  # share of the run in which both are known
 
 
-class Guidance(msgspec.Struct, frozen=True):
+class CentralisedMetrics(msgspec.Struct, frozen=True):
     """The centralised architecture of one case: goals, delays and load of the central controller."""
 
     guided: tuple[str, ...]  # robots whose goals it computes
@@ -123,7 +123,7 @@ class RobotMetrics(msgspec.Struct, frozen=True):
     shadow: ShadowMetrics | None  # None without a shadow twin
     goals: int = 0  # sent to it by the central controller
     goal_bytes: int = 0  # payload of these goals
-    delay_mean_s: float | None = None  # [s] see `Guidance`; None for robots that decide for themselves
+    delay_mean_s: float | None = None  # [s] see `CentralisedMetrics`; None for robots that decide for themselves
     delay_p95_s: float | None = None  # [s]
     delay_max_s: float | None = None  # [s]
     foreign: int = 0  # poses in its name that did not come from its process, and were refused
@@ -150,7 +150,7 @@ class Belief(msgspec.Struct, frozen=True):
     max: float | None  # [m]
 
 
-class Passage(msgspec.Struct, frozen=True):
+class LinkDelivery(msgspec.Struct, frozen=True):
     """Delivery statistics of one link."""
 
     receiver: str
@@ -201,7 +201,7 @@ class CaseMetrics(msgspec.Struct, frozen=True):
     excursion_robot: str  # empty if none was outside
     lost: int  # sum over the robots
     dropped: int  # by the modelled network, sum over the robots
-    passages: tuple[Passage, ...]  # per link
+    link_deliveries: tuple[LinkDelivery, ...]  # per link
     modelled: bool  # the file asks for network effects
     missed_deadlines: int  # sum over the robots
     missed_share: float | None  # missed deadlines over the ticks that were due, of all robots
@@ -226,7 +226,7 @@ class CaseMetrics(msgspec.Struct, frozen=True):
     network_messages: int = 0  # poses of all robots, leaders too, and goals of the central controller
     network_bytes: int = 0  # payload of these messages
     deliveries: int = 0  # of the same messages those that arrived, counted once for each receiver
-    guidance: Guidance | None = None  # None if each robot decides for itself
+    guidance: CentralisedMetrics | None = None  # None if each robot decides for itself
     # why the figures are compared with none of another case, one clause each, see `metrics.comparable`
     spoiled: tuple[str, ...] = ()
     measures: dict[str, LawMeasure] = {}  # of the law by name, means over the robots in the means

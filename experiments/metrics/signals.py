@@ -18,7 +18,7 @@ from agents.safety.hazards import OVER, QUIET_S, UNRESOLVED, is_blind
 from agents.vectors import Vector
 from experiments.definition.formation import errors_over_time
 from experiments.definition.graph import Links
-from experiments.metrics.results import Passage
+from experiments.metrics.results import LinkDelivery
 from experiments.recording.losses import count_unrecorded
 from experiments.recording.trace import Trace
 from twins.arrays import Array, Index, Mask, norm
@@ -312,7 +312,7 @@ def transmissions(trace: Trace) -> tuple[Index, Index]:
     return recorded + np.array(missing, dtype=np.intp), recorded
 
 
-def link_passages(trace: Trace) -> tuple[Passage, ...]:
+def link_deliveries(trace: Trace) -> tuple[LinkDelivery, ...]:
     """Delivery statistics of every link, those that only avoidance needs included."""
     links, received = trace.plan.pose_links, trace.received
     count, link, took = len(links), received.link, received.arrival - received.stamp
@@ -323,7 +323,7 @@ def link_passages(trace: Trace) -> tuple[Passage, ...]:
     np.maximum.at(longest, link, took)
     columns = zip(links.receiver.tolist(), links.sender.tolist(), counts.tolist(), dropped.tolist(), strict=True)
     return tuple(
-        Passage(
+        LinkDelivery(
             receiver=trace.robots[i],
             sender=trace.robots[j],
             received=number,

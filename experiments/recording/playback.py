@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
-from agents.body.kinds import KINDS, Figures
+from agents.body.kinds import KINDS, RecordedKind
 from agents.decision.lifecycle import Phase
 from agents.network.messages import CentreState, Contact, Event, HostClock, Memory, State, Status, Variable, WorldState
 from agents.network.validation import ABSURD, FUTURE_S, is_count
@@ -100,7 +100,7 @@ class AboutRun:
         kinds = next((record.data for record in records.attachments if record.name == KINDS_JSON), b"[]")
         try:
             announced = float(about["started"]) if "started" in about else None
-            for each in msgspec.json.decode(kinds, type=list[Figures]):
+            for each in msgspec.json.decode(kinds, type=list[RecordedKind]):
                 KINDS.remember(each)
             plan = Plan.decoded(attached)
             _ = plan.one_way_links  # names of robots are not in the types

@@ -17,7 +17,7 @@ from mcap.opcode import Opcode
 from mcap.records import ChunkIndex, MessageIndex, Statistics
 from mcap.writer import CompressionType, Writer
 
-from agents.body.kinds import KINDS, Figures
+from agents.body.kinds import KINDS, RecordedKind
 from agents.network.messages import BareGoal, BarePose, Event, Goal, Pose, State, Vector
 from experiments.definition.plan import Plan
 from experiments.recording import version
@@ -275,7 +275,7 @@ class Recording:
         self._writer.add_attachment(0, 0, TOML, "application/toml", document.encode())
         self._writer.add_attachment(0, 0, JSON, "application/json", msgspec.json.encode(experiment))
         names = sorted({robot.kind for robot in (*experiment.robots.values(), *experiment.spares.values())})
-        figures = [Figures.of(KINDS[name]) for name in names if name in KINDS]
+        figures = [RecordedKind.of(KINDS[name]) for name in names if name in KINDS]
         self._writer.add_attachment(0, 0, KINDS_JSON, "application/json", msgspec.json.encode(figures))
         self._writer.add_metadata(METADATA, about)
 

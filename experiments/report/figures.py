@@ -67,7 +67,7 @@ SOLID: Final = 0.95  # share of the time that marks cover where there is nothing
 __all__ = ["formation", "plan_view", "svg"]  # besides those of this module
 
 
-def every(
+def all_figures(
     cases: Sequence[CaseMetrics],
     traces: Sequence[Trace],
     width: float = WIDTH,
@@ -469,7 +469,7 @@ def _steps(waits: Array) -> tuple[Array, Array]:
 
 Style = Literal["-", "--", ":"]
 
-MOST: Final = 8  # robots whose twins are drawn: a page holds no more
+MOST_SHADOWS: Final = 8  # robots whose twins are drawn: a page holds no more
 PARTS: Final[tuple[tuple[str, str, Style], ...]] = (
     ("along", CASES[0], "-"),
     ("to the left", CASES[1], "--"),
@@ -480,7 +480,7 @@ PARTS: Final[tuple[tuple[str, str, Style], ...]] = (
 @styled
 def shadows(traces: Sequence[Trace], width: float = WIDTH) -> Figure:
     """Each robot with its twin: the paths from above, and the difference over time, of the first few."""
-    shown = [(trace, row) for trace in traces for row in _rows(trace)][:MOST]
+    shown = [(trace, row) for trace in traces for row in _rows(trace)][:MOST_SHADOWS]
     height = panel_height(len(shown), 1.15)
     figure = Drawing(figsize=(width, height * len(shown) + 0.8), layout="constrained")
     panels = figure.subplots(len(shown), 2, squeeze=False, width_ratios=(1.0, 1.7))

@@ -24,7 +24,7 @@ Cell = str | tuple[str, str]  # a text, or a text and a smaller one behind it
 
 
 @dataclass(frozen=True)
-class Row:
+class TableRow:
     """Cells of a row; `sum` rows are set apart."""
 
     cells: tuple[Cell, ...]
@@ -36,7 +36,7 @@ class Table:
     """A table."""
 
     head: tuple[str, ...]
-    rows: tuple[Row, ...]
+    rows: tuple[TableRow, ...]
     title: str = ""
     note: str = ""
     words: bool = False  # aligns to the left

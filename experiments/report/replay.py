@@ -15,7 +15,7 @@ from experiments.report import trajectories
 from experiments.report.page import inline, template
 from experiments.report.style import svg
 from experiments.scene.models import ROUND, circle
-from experiments.scene.stage import FAIR_M, GOOD_M, Stage
+from experiments.scene.stage import FAIR_M, GOOD_M, SceneModel
 from twins.arrays import Array
 
 CASES: Final = 2  # side by side
@@ -56,7 +56,7 @@ def _still_picture(traces: Sequence[Trace], at: float, label: str) -> str:
 
 
 def _replay_data(traces: Sequence[Trace]) -> dict[str, Any]:
-    stage = Stage.of_plan(traces[0].plan)
+    stage = SceneModel.of_plan(traces[0].plan)
     scene, end = stage.scene, max(float(trace.time[-1]) for trace in traces)
     width = 4 * len(stage.names) + len(stage.links) + 3 * len(scene.names)
     step = max(STEP_S, end * width * len(traces) / NUMBERS)
@@ -88,7 +88,7 @@ def _replay_data(traces: Sequence[Trace]) -> dict[str, Any]:
 
 def _case(trace: Trace, step: float) -> dict[str, Any]:
     """Samples of one case: x, y, z and yaw of each robot [mm, mrad], the level of each link's error, the obstacles."""
-    stage = Stage.of_plan(trace.plan)
+    stage = SceneModel.of_plan(trace.plan)
     grid = np.arange(0.0, float(trace.time[-1]) + 1e-9, step)
     at = np.clip(np.searchsorted(trace.time, grid - 1e-9), 0, len(trace.time) - 1)
     place = trace.true_position[at]

@@ -19,7 +19,17 @@ from experiments.recording.trace import Trace
 from experiments.recording.version import provenance
 from experiments.report import figures, replay
 from experiments.report.metrics_files import Band
-from experiments.report.page import Finding, PageFigure, Row, Section, Table, date_of, numbered, render, seeds_in_words
+from experiments.report.page import (
+    Finding,
+    PageFigure,
+    Section,
+    Table,
+    TableRow,
+    date_of,
+    numbered,
+    render,
+    seeds_in_words,
+)
 from experiments.report.tables import (
     architecture_table,
     clearance_tables,
@@ -129,7 +139,7 @@ def write(
     ]
     bands = bands or figures.error_bands(traces)
     if drawings is None:
-        drawn = figures.every(cases, traces, bands=bands)
+        drawn = figures.all_figures(cases, traces, bands=bands)
         drawings = {name: figures.svg(figure) for name, figure in drawn.items()}
     pictures = _pictures(cases, traces, bands, drawings)
     short, every_event = events_tables(first)
@@ -241,7 +251,7 @@ def compare(
 def differences_table(differences: Sequence[tuple[str, str, Sequence[str]]]) -> Table:
     """Name and folder of each run, and how it differs from the first one."""
     how = [
-        Row((name, folder, "; ".join(found) or ("the same file, seeds and versions" if k else "the reference")))
+        TableRow((name, folder, "; ".join(found) or ("the same file, seeds and versions" if k else "the reference")))
         for k, (name, folder, found) in enumerate(differences)
     ]
     return Table(("Run", "Folder", "Differs from the first in"), tuple(how), words=True)

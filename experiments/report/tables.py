@@ -17,10 +17,10 @@ from typing import Any, Final
 from agents.network.messages import Event
 from experiments.metrics.criteria import judge
 from experiments.metrics.metric import ERRORS, OURS, Metric, known_metrics
-from experiments.metrics.results import Approach, CaseMetrics, Passage, RobotMetrics
+from experiments.metrics.results import Approach, CaseMetrics, LinkDelivery, RobotMetrics
 from experiments.metrics.statistics import Spread, by_case, ratios, spread
 from experiments.recording.trace import Trace
-from experiments.report.page import NONE, Cell, Row, Table, interval, number
+from experiments.report.page import NONE, Cell, Table, TableRow, interval, number
 
 Line = tuple[str, Callable[[CaseMetrics], float | None], float]  # label, value of a run, scale
 Column = tuple[str, Callable[[Sequence[Any]], Cell]]  # head, cell of the same robot or link in all seeds
@@ -80,7 +80,7 @@ def _table_by_case(head: str, cases: Sequence[CaseMetrics], lines: Iterable[Line
     """A row for each number of a case, a column for each case."""
     grouped = by_case(cases)
     rows = [
-        Row((label, *(_over_seeds([value(run) for run in runs], scale) for runs in grouped.values())))
+        TableRow((label, *(_over_seeds([value(run) for run in runs], scale) for runs in grouped.values())))
         for label, value, scale in lines
     ]
     return Table((head, *grouped), tuple(rows))
@@ -111,7 +111,9 @@ def summary_table(cases: Sequence[CaseMetrics], chosen: Sequence[str] = ()) -> T
 
     shown = {name: metric for name, metric in summary_metrics(cases).items() if not chosen or name in chosen}
     rows = [
-        Row((metric.head + " of the case" * (metric.per == "case"), *(cell(runs, name) for runs in grouped.values())))
+        TableRow(
+            (metric.head + " of the case" * (metric.per == "case"), *(cell(runs, name) for runs in grouped.values()))
+        )
         for name, metric in shown.items()
     ]
     seeds = max(len(runs) for runs in grouped.values())
@@ -181,7 +183,7 @@ def whole_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
         for unit, lines in units.items()
     ]
     sums = [
-        Row((metric.head, *(number(_total(runs, name)) for runs in by_case(cases).values())))
+        TableRow((metric.head, *(number(_total(runs, name)) for runs in by_case(cases).values())))
         for name, metric in known_metrics(cases).items()
         if metric.mean == "sum" and metric.per == "robot"
     ]
@@ -208,9 +210,9 @@ def _occurred(table: Table) -> Table:
     return replace(table, rows=tuple(rows))
 
 
-def _delay(case: CaseMetrics, what: Callable[[Sequence[Passage]], float | None]) -> float | None:
+def _delay(case: CaseMetrics, what: Callable[[Sequence[LinkDelivery]], float | None]) -> float | None:
     """A statistic of the delays of a case; None in virtual time without a modelled network, where they are given."""
-    return what(case.passages) if case.clock == "real" or case.modelled else None
+    return what(case.link_deliveries) if case.clock == "real" or case.modelled else None
 
 
 def architecture_table(cases: Sequence[CaseMetrics]) -> Table | None:
@@ -240,11 +242,11 @@ def architecture_table(cases: Sequence[CaseMetrics]) -> Table | None:
             ("Decisions that came too late", _value("guidance.missed"), 1.0),
         ],
     )
-    rows = [Row(("Decides", *(architecture_of(runs[0]) for runs in grouped.values()))), *table.rows]
+    rows = [TableRow(("Decides", *(architecture_of(runs[0]) for runs in grouped.values()))), *table.rows]
     if len(grouped) > 1:
         for name in ERRORS:
             relative = (interval(spread(ratios(runs, first, name))) for runs in grouped.values())
-            rows.append(Row((f"{OURS[name].label} relative to {reference}", *relative)))
+            rows.append(TableRow((f"{OURS[name].label} relative to {reference}", *relative)))
     return Table(table.head, tuple(row for row in rows if any(cell != NONE for cell in row.cells[1:])))
 
 
@@ -276,7 +278,7 @@ def _table_by_row(
     for item in every:
         found.setdefault(name(item), []).append(item)
     rows = [
-        Row((what, *(cell(mine) for _, cell in columns)), sum=group is sums)
+        TableRow((what, *(cell(mine) for _, cell in columns)), sum=group is sums)
         for group in (found, sums or {})
         for what, mine in group.items()
     ]
@@ -366,19 +368,23 @@ def network_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
         ("Longest [ms]", _cell(max, "delay_max", 1e3)),
     ]
     link = partial(
-        _table_by_row, head="Link", items=attrgetter("passages"), name="{0.sender} > {0.receiver}".format, totals=True
+        _table_by_row,
+        head="Link",
+        items=attrgetter("link_deliveries"),
+        name="{0.sender} > {0.receiver}".format,
+        totals=True,
     )
     return tuple(link(name, runs, columns) for name, runs in by_case(cases).items() if runs[0].modelled)
 
 
-def dropped_share(links: Sequence[Passage]) -> float | None:
+def dropped_share(links: Sequence[LinkDelivery]) -> float | None:
     """Share of the poses on some links that the modelled network dropped [%]; None without poses."""
     dropped = sum(link.dropped for link in links)
     every = dropped + sum(link.received for link in links)
     return 100.0 * dropped / every if every else None
 
 
-def mean_delay(links: Sequence[Passage]) -> float | None:
+def mean_delay(links: Sequence[LinkDelivery]) -> float | None:
     """Mean delay over all poses received on some links [s]; None without poses."""
     received = sum(link.received for link in links)
     total = sum(link.received * link.delay_mean for link in links if link.delay_mean is not None)
@@ -461,7 +467,7 @@ def collision_table(cases: Sequence[CaseMetrics]) -> Table:
     for case, each in found[:MOST_COLLISIONS]:
         where = (case.case, f"seed {case.seed}") if several else case.case
         depth, impulse = number(each.overlap, 100.0), number(each.impulse, 1000.0)
-        rows.append(Row((where, f"{each.time_s:.2f}", each.first, each.second, impulse, depth)))
+        rows.append(TableRow((where, f"{each.time_s:.2f}", each.first, each.second, impulse, depth)))
     head = ("Case", "t [s]", "First", "Second", "Impulse [mN s]", "Overlap [cm]")
     return Table(head, tuple(rows), note=_hidden_rows_note(len(found) - MOST_COLLISIONS, "metrics.json"), words=True)
 
@@ -472,7 +478,9 @@ def criteria_table(cases: Sequence[CaseMetrics]) -> Table:
     for each in judge(cases):
         kept = len(each.values) - len(each.failed)
         answer = "not judged" if each.passed is None else f"{kept} of {len(each.values)}"
-        rows.append(Row((each.what, each.limit, interval(spread([*each.values.values()])), answer, each.criterion.why)))
+        rows.append(
+            TableRow((each.what, each.limit, interval(spread([*each.values.values()])), answer, each.criterion.why))
+        )
     return Table(("Criterion", "Limit", "Reached", "Seeds", "Why"), tuple(rows), words=True)
 
 
@@ -485,7 +493,7 @@ def clocks_table(traces: Sequence[Trace]) -> Table:
             drift = f"{1e6 * offset.drift:+.1f} ± {2e6 * offset.uncertainty / offset.over:.1f}"
         before = (f"{1e3 * offset.first:+.3f}", f"{1e3 * offset.last:+.3f}", f"{1e3 * offset.uncertainty:.3f}")
         left = (f"{1e3 * (offset.last - offset.first):+.3f}", f"{1e3 * offset.worst:.3f}")
-        rows.append(Row((case, offset.host, ", ".join(offset.robots), *before, drift, *left)))
+        rows.append(TableRow((case, offset.host, ", ".join(offset.robots), *before, drift, *left)))
     head = ("Case", "Host", "Robots", "Offset before [ms]", "after [ms]", "± [ms]", "Drift [ppm]")
     return Table((*head, "Added [ms]", "Left [ms]"), tuple(rows), words=True)
 
@@ -496,7 +504,7 @@ def events_tables(traces: Sequence[Trace]) -> tuple[Table, tuple[str, Table] | N
     head = ("Case", "t [s]", "Event", "Source", "")
 
     def table(chosen: Sequence[tuple[str, Event]]) -> Table:
-        rows = [Row((case, f"{e.stamp:.2f}", e.kind, e.source, e.text)) for case, e in chosen[:MOST_EVENTS]]
+        rows = [TableRow((case, f"{e.stamp:.2f}", e.kind, e.source, e.text)) for case, e in chosen[:MOST_EVENTS]]
         return Table(head, tuple(rows), note=_hidden_rows_note(len(chosen) - MOST_EVENTS, "the recording"), words=True)
 
     telling = [(case, event) for case, event in events if event.kind not in ROUTINE]

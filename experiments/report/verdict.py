@@ -200,7 +200,7 @@ def _modelled(name: str, runs: Sequence[CaseMetrics]) -> Finding | None:
     """Loss and delay of a modelled network."""
     if not runs[0].modelled:
         return None
-    links = [link for run in runs for link in run.passages]
+    links = [link for run in runs for link in run.link_deliveries]
     dropped = sum(link.dropped for link in links)
     every = dropped + sum(link.received for link in links)
     text = f"The modelled network dropped {number(dropped)} of {number(every)} samples in {name}"

@@ -14,7 +14,7 @@ import numpy as np
 from agents.network.messages import Ranges
 from experiments.scene import models
 from experiments.scene import stage as appearance
-from experiments.scene.stage import NOWHERE, Colour, Colours, Moment, Stage, chassis
+from experiments.scene.stage import NOWHERE, Colour, Colours, Moment, SceneModel, chassis
 from twins.arrays import Array, Index, Mask
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ DARK: Final = Look((20, 20, 20), (52, 54, 60), (95, 100, 110), (150, 155, 165), 
 
 
 @dataclass
-class Shown:
+class VisibleParts:
     """Parts that are drawn on demand."""
 
     names: bool = True
@@ -79,10 +79,10 @@ def light(server: viser.ViserServer) -> None:
 class SceneDrawing:
     """One case in a scene."""
 
-    def __init__(self, server: viser.ViserServer, stage: Stage, look: Look, root: str = "/case") -> None:
+    def __init__(self, server: viser.ViserServer, stage: SceneModel, look: Look, root: str = "/case") -> None:
         """Draws what does not move; `root` is the name of the node that carries everything, which `offset` moves."""
         self._scene, self.stage, self._look, self._root = server.scene, stage, look, root
-        self.shown = Shown()
+        self.shown = VisibleParts()
         self._round = 0
         self._offset = (0.0, 0.0, 0.0)
         self._frame = self._scene.add_frame(root, show_axes=False)

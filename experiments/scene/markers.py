@@ -10,7 +10,7 @@ import numpy as np
 from agents.network.messages import Vector
 from experiments.definition.plan import Plan
 from experiments.recording.ros2.viewers import CYLINDER, LINE_LIST, LINE_STRIP, TEXT, Draw, Marker
-from experiments.scene.stage import NOWHERE, UNKNOWN, LinkTracker, Stage, link_colours, segments
+from experiments.scene.stage import NOWHERE, UNKNOWN, LinkTracker, SceneModel, link_colours, segments
 from twins.scene import corners
 
 EDGE: Final = (90, 94, 102)
@@ -20,7 +20,7 @@ LINE_M: Final = 0.01
 
 def drawing(plan: Plan) -> Draw:
     """The function that draws a case: of a time [s, UTC] and the places [m] of the robots known then."""
-    stage = Stage.of_plan(plan)
+    stage = SceneModel.of_plan(plan)
     tracker, begun = LinkTracker(stage), [float("nan")]
     still = [*_arena(stage), *_robots(stage)]
 
@@ -34,7 +34,7 @@ def drawing(plan: Plan) -> Draw:
     return draw
 
 
-def _arena(stage: Stage) -> list[Marker]:
+def _arena(stage: SceneModel) -> list[Marker]:
     (x0, y0, _), (x1, y1, z1) = stage.scene.low.tolist(), stage.scene.high.tolist()
     ring = [(x0, y0, 0.0), (x1, y0, 0.0), (x1, y1, 0.0), (x0, y1, 0.0), (x0, y0, 0.0)]
     made = [Marker("arena", LINE_STRIP, (2.0 * LINE_M, 0.0, 0.0), EDGE, points=ring)]
@@ -44,7 +44,7 @@ def _arena(stage: Stage) -> list[Marker]:
     return made
 
 
-def _robots(stage: Stage) -> list[Marker]:
+def _robots(stage: SceneModel) -> list[Marker]:
     """Bodies and names, in the frames of the robots: the transforms move them."""
     made = []
     for name, kind, colour in zip(stage.names, stage.kinds, stage.colours.tolist(), strict=True):
@@ -55,7 +55,7 @@ def _robots(stage: Stage) -> list[Marker]:
     return made
 
 
-def _obstacles(stage: Stage, since: float) -> list[Marker]:
+def _obstacles(stage: SceneModel, since: float) -> list[Marker]:
     scene, made = stage.scene, []
     for number, pose in enumerate(scene.at(since)):
         low, high = float(scene.bottom[number]), float(stage.tops[number])
@@ -74,7 +74,7 @@ def _obstacles(stage: Stage, since: float) -> list[Marker]:
     return made
 
 
-def _links(stage: Stage, tracker: LinkTracker, since: float, position: np.ndarray) -> list[Marker]:
+def _links(stage: SceneModel, tracker: LinkTracker, since: float, position: np.ndarray) -> list[Marker]:
     """Marker of a list of lines; those whose ends are not known lie out of sight, so that none of before stays."""
     net = stage.links
     if not len(net):

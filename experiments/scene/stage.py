@@ -1,6 +1,6 @@
 """Scene model: what a case looks like at one moment, from poses, statuses, links and obstacles. Pure; needs no browser.
 
-`Stage` is what stays for a whole case, `Moment` what changes; functions turn both into positions and colours.
+`SceneModel` is what stays for a whole case, `Moment` what changes; functions turn both into positions and colours.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ ROBOTS: Final[tuple[Colour, ...]] = (
 GOOD, FAIR, BAD, UNKNOWN = (0, 158, 115), (230, 159, 0), (213, 50, 30), (140, 140, 140)
 
 
-class Place(IntEnum):
+class BodyLocation(IntEnum):
     """Where the body of a robot is."""
 
     TWIN = 0  # simulated in the robot's own process
@@ -60,9 +60,9 @@ class Place(IntEnum):
     REAL = 2  # hardware, or a simulator of another program
 
 
-PLACES: Final = {Place.TWIN: "own twin", Place.WORLD: "in the world", Place.REAL: "real"}
-CHASSIS: Final[dict[Place, Colour]] = {
-    Place.TWIN: (236, 236, 232), Place.WORLD: (128, 132, 140), Place.REAL: (38, 40, 44),
+PLACES: Final = {BodyLocation.TWIN: "own twin", BodyLocation.WORLD: "in the world", BodyLocation.REAL: "real"}
+CHASSIS: Final[dict[BodyLocation, Colour]] = {
+    BodyLocation.TWIN: (236, 236, 232), BodyLocation.WORLD: (128, 132, 140), BodyLocation.REAL: (38, 40, 44),
 }  # fmt: skip
 
 
@@ -120,12 +120,12 @@ def condition(
     return Condition.ACTIVE
 
 
-def place_of(body: str) -> Place:
+def place_of(body: str) -> BodyLocation:
     """Where the body with this address is."""
     if body == WORLD:
-        return Place.WORLD
+        return BodyLocation.WORLD
     name = registry.body_name(body)
-    return Place.TWIN if name == "twin" or name in registry.names(registry.DEVICES) else Place.REAL
+    return BodyLocation.TWIN if name == "twin" or name in registry.names(registry.DEVICES) else BodyLocation.REAL
 
 
 T = TypeVar("T")
@@ -140,13 +140,13 @@ def _if_installed(plug_in: Callable[[], T]) -> T | None:
 
 
 @dataclass(frozen=True)
-class Stage:
+class SceneModel:
     """Parts of a scene that stay for a whole case: N robots, E links, M obstacles."""
 
     title: str
     names: tuple[str, ...]
     kinds: tuple[Kind, ...]
-    places: tuple[Place, ...]
+    places: tuple[BodyLocation, ...]
     shadowed: Mask  # (N,) with a twin beside the robot
     scene: Scene
     links: Links
@@ -155,7 +155,7 @@ class Stage:
     plan: Plan | None = field(default=None, repr=False)  # None: only the robots are known
 
     @classmethod
-    def of_plan(cls, plan: Plan) -> Stage:
+    def of_plan(cls, plan: Plan) -> SceneModel:
         experiment = plan.experiment
         avoidance = _if_installed(lambda: plan.avoidance)
         formation = _if_installed(lambda: plan.formation)
@@ -173,11 +173,11 @@ class Stage:
         )
 
     @classmethod
-    def of_robots(cls, names: tuple[str, ...]) -> Stage:
+    def of_robots(cls, names: tuple[str, ...]) -> SceneModel:
         """Robots of which nothing but their names is known."""
         everywhere = Scene.furnished((4.0, 4.0, 2.5), {}, {}, walled=False)
         return cls(
-            "", names, (POINT,) * len(names), (Place.TWIN,) * len(names), np.zeros(len(names), dtype=bool),
+            "", names, (POINT,) * len(names), (BodyLocation.TWIN,) * len(names), np.zeros(len(names), dtype=bool),
             everywhere, links([]), (), 0.0,
         )  # fmt: skip
 
@@ -263,14 +263,14 @@ class Moment:
     shadow: Array | None = None  # (N, 3) [m] of the twins beside the robots
     shadow_yaw: Array | None = None  # (N,) [rad]
     time: float | None = None  # [s] since the common start; None before it
-    places: Array | None = None  # (N, P, 3) [m] that the robots say, see `Stage.said_places`
+    places: Array | None = None  # (N, P, 3) [m] that the robots say, see `SceneModel.said_places`
     measures: Sequence[Mapping[str, float]] = ()  # of the law, by robot; none known if empty
 
 
 class LinkTracker:
     """Errors of the links as the law measures them, along a motion."""
 
-    def __init__(self, stage: Stage) -> None:
+    def __init__(self, stage: SceneModel) -> None:
         self._stage = stage
         plan = stage.plan
         self._law = None if plan is None else _if_installed(lambda: plan.law)
@@ -350,7 +350,7 @@ def link_colours(error: Array) -> Colours:
     return np.array([GOOD, FAIR, BAD, UNKNOWN], dtype=np.uint8)[level]
 
 
-def segments(stage: Stage, position: Array) -> Array:
+def segments(stage: SceneModel, position: Array) -> Array:
     """Both ends (E, 2, 3) of each link, NaN where one is unknown [m]: middles of bodies at `position` (N, 3) [m]."""
     middle = position + 0.5 * np.array([[0.0, 0.0, kind.height] for kind in stage.kinds]).reshape(-1, 3)
     return np.stack([middle[stage.links.sender], middle[stage.links.receiver]], axis=1)
@@ -375,18 +375,18 @@ def dashes(ends: Array) -> Array:
     return np.concatenate(made) if made else np.zeros((0, 2, 3))
 
 
-def lit(stage: Stage, moment: Moment) -> Mask:
+def lit(stage: SceneModel, moment: Moment) -> Mask:
     """Links (E,) whose sender has just transmitted."""
     return np.asarray(moment.silent_for[stage.links.sender] <= FLASH_S)
 
 
-def accents(stage: Stage, moment: Moment) -> Colours:
+def accents(stage: SceneModel, moment: Moment) -> Colours:
     """Colours (N, 3) of the coloured parts of the robots: grey for those that are silent, stopped or dead."""
     pale = np.isin(moment.condition, PALED)
     return np.where(pale[:, None], np.array([105, 105, 105], dtype=np.uint8), stage.colours)
 
 
-def chassis(stage: Stage) -> Colours:
+def chassis(stage: SceneModel) -> Colours:
     """Colours (N, 3) of the other parts, by the place of the body."""
     return np.array([CHASSIS[place] for place in stage.places], dtype=np.uint8).reshape(-1, 3)
 
@@ -398,17 +398,17 @@ def rings(moment: Moment) -> tuple[Array, Colours]:
     return shown(np.where(wanted, moment.position, np.nan)), colours.reshape(-1, 3)
 
 
-def label(stage: Stage, row: int, condition: int) -> str:
+def label(stage: SceneModel, row: int, condition: int) -> str:
     """Text beside a robot: its name, the place of its body unless it is an own twin, and its condition."""
     words = [stage.names[row]]
-    if stage.places[row] != Place.TWIN:
+    if stage.places[row] != BodyLocation.TWIN:
         words.append(PLACES[stage.places[row]])
     if condition in RINGED:
         words.append(CONDITIONS[Condition(condition)][0].upper())
     return " · ".join(words)
 
 
-def rays(stage: Stage, moment: Moment, scans: Mapping[str, Ranges]) -> Array:
+def rays(stage: SceneModel, moment: Moment, scans: Mapping[str, Ranges]) -> Array:
     """Range readings (K, 2, 3) [m] as lines from the robots to what they see; one hidden line if there are none."""
     made = []
     for row, name in enumerate(stage.names):
@@ -431,7 +431,7 @@ def trail_segments(trail: Array) -> Array:
     return visible(pairs, np.ones(len(pairs), dtype=bool))
 
 
-def trail_colours(stage: Stage, points: int, background: Colour) -> Colours:
+def trail_colours(stage: SceneModel, points: int, background: Colour) -> Colours:
     """Colours (N·(K−1), 2, 3) of such segments: from the robot's colour towards the background."""
     share = np.linspace(0.15, 0.8, points)[None, :, None]
     faded = (1.0 - share) * stage.colours[:, None, :] + share * np.array(background)

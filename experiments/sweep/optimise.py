@@ -63,7 +63,7 @@ class Limit:
 
 
 @dataclass(frozen=True)
-class Wish:
+class Objective:
     """A metric to be minimised, or maximised where more is better, within limits of others."""
 
     index: str
@@ -93,7 +93,7 @@ class TuningResult:
     """Result of a search."""
 
     read: Document
-    wish: Wish
+    objective: Objective
     tuning: tuple[int, ...]  # seeds of the search
     seeds: tuple[int, ...]  # seeds of the report
     rows: tuple[CellRow, ...]  # the reference, and the best of each case, on `seeds`
@@ -109,7 +109,7 @@ class TuningResult:
         return searched(self.tuning)
 
 
-def wish_of(text: str) -> Wish:
+def parse_objective(text: str) -> Objective:
     """`messages, iae<=1.01, itae<=1.05`: first what is to be least, then limits.
 
     Raises DocumentError if it cannot be understood.
@@ -131,7 +131,7 @@ def wish_of(text: str) -> Wish:
         raise refusal(place, f"neither less nor more of '{first}' is better", "name another metric, such as messages")
     if not limits:
         raise refusal(place, "without a limit the best is to say nothing", "add one, such as iae<=1.01")
-    return Wish(least, tuple(limits))
+    return Objective(least, tuple(limits))
 
 
 def _aim(index: str, value: float) -> float:
@@ -147,7 +147,7 @@ def searched(tuning: Sequence[int]) -> tuple[int, ...]:
 def tune(
     file: str | Path,
     given: Sequence[str],
-    wished: str,
+    wanted: str,
     *,
     settings: Sequence[str] = (),
     cases: Sequence[str] = (),
@@ -160,7 +160,7 @@ def tune(
 
     Args (others as of `sweep`):
         given: Ranges, `seeds=` to report on and `tuning=` to seek on, as on the command line.
-        wished: As `wish_of` takes it.
+        wanted: As `parse_objective` takes it.
         progress: Told of the case, of evaluations done, and of how many there are at most.
 
     Raises:
@@ -168,7 +168,7 @@ def tune(
         ExplainedError: If the library is not installed, or the workers are lost.
         KeyboardInterrupt: After Ctrl-C; the same call goes on from there.
     """
-    wish = wish_of(wished)
+    objective = parse_objective(wanted)
     read = load(file, *settings)
     axes, words = arguments(given)
     seeds = seeds_of(words.get("seeds"), read.experiment.seed)
@@ -187,7 +187,7 @@ def tune(
     fixed = [f"{axis.path}={axis.values[0]}" for axis in axes if axis.span is None]
     read = load(file, *settings, *fixed)
     reference = compared(read)
-    search = _Search(read, str(file), (*settings, *fixed), wish, tuning)
+    search = _Search(read, str(file), (*settings, *fixed), objective, tuning)
     ranges = {
         name: found for name in chosen(read, cases) if name != reference and (found := search.ranges(name, spans))
     }
@@ -201,8 +201,8 @@ def tune(
     plan: dict[tuple[str, str], Cell] = {}
     with Store(folder) as store:
         notes = store.changed_since(origin(read, [read.cases()[name] for name in (reference, *ranges)]))
-        with workers(scheduler, processes) as crew:
-            runner = SweepRunner(store, crew)
+        with workers(scheduler, processes) as working:
+            runner = SweepRunner(store, working)
             for name, mine in ranges.items():
                 rows = search.run(cma, runner, name, mine, progress)
                 tried += rows
@@ -214,7 +214,9 @@ def tune(
             runner.run_missing(final, seeds)
             reported = runner.rows(final, seeds)
             notes += runner.metric_faults(final, seeds)
-    return TuningResult(read, wish, tuning, seeds, tuple(reported), tuple(tried), tuple(selected), folder, tuple(notes))
+    return TuningResult(
+        read, objective, tuning, seeds, tuple(reported), tuple(tried), tuple(selected), folder, tuple(notes)
+    )
 
 
 @dataclass(frozen=True)
@@ -224,7 +226,7 @@ class _Search:
     read: Document
     file: str
     settings: tuple[str, ...]
-    wish: Wish
+    objective: Objective
     tuning: tuple[int, ...]
 
     def ranges(self, case: str, axes: Sequence[Axis]) -> list[Axis]:
@@ -241,15 +243,15 @@ class _Search:
     def choose(self, runner: SweepRunner, rows: Sequence[CellRow], axes: Sequence[Axis]) -> CellRow:
         """The best point of the search, on seeds that took no part in it."""
         fresh = self.tuning[len(searched(self.tuning)) :]
-        ranked = sorted(rows, key=self.wish.rank)
+        ranked = sorted(rows, key=self.objective.rank)
         looked_at: list[CellRow] = []
         for begin in range(0, min(ROUNDS * ROUND, len(ranked)), ROUND):
             pairs = [self.again(row, axes) for row in ranked[begin : begin + ROUND]]
             runner.run_missing([cell for pair in pairs for cell in pair], fresh)
             looked_at += [runner.rows(pair, fresh)[-1] for pair in pairs]
-            if any(self.wish.rank(row) < BROKEN for row in looked_at):
+            if any(self.objective.rank(row) < BROKEN for row in looked_at):
                 break
-        return min(looked_at, key=self.wish.rank)
+        return min(looked_at, key=self.objective.rank)
 
     def run(self, cma: Any, runner: SweepRunner, case: str, axes: Sequence[Axis], progress: Progress) -> list[CellRow]:  # noqa: ANN401
         """The cells tried for a case, each once."""
@@ -270,7 +272,7 @@ class _Search:
             runner.run_missing(plan, searched(self.tuning))
             for values, pair in cells.items():
                 known[values] = runner.rows(pair, searched(self.tuning))[-1]
-            strategy.tell(points, [self.wish.rank(known[values]) for values in wanted])
+            strategy.tell(points, [self.objective.rank(known[values]) for values in wanted])
             asked += len(points)
             progress(case, min(asked, most), most)
         return list(known.values())

@@ -9,8 +9,17 @@ from typing import Final
 
 from experiments.metrics.metric import foreign_metrics
 from experiments.report import style
-from experiments.report.page import Finding, PageFigure, Section, Table, date_of, numbered, render, seeds_in_words
-from experiments.report.page import Row as Line
+from experiments.report.page import (
+    Finding,
+    PageFigure,
+    Section,
+    Table,
+    TableRow,
+    date_of,
+    numbered,
+    render,
+    seeds_in_words,
+)
 from experiments.report.tables import over_seeds, ratio_words
 from experiments.sweep.optimise import TuningResult
 from experiments.sweep.pareto import by_environment, front, pareto
@@ -98,11 +107,11 @@ def _searched(tuned: TuningResult) -> list[Section]:
 
 def verdict(tuned: TuningResult) -> list[Finding]:
     """For each case whether the limits were kept on the reporting seeds, and at how many messages."""
-    limits = " and ".join(map(str, tuned.wish.limits))
+    limits = " and ".join(map(str, tuned.objective.limits))
     found = []
     for row in (row for row in tuned.rows if not row.reference):
         what = f"{row.label}: {_saved(row)}"
-        if tuned.wish.kept(row):
+        if tuned.objective.kept(row):
             found.append(Finding("good", f"{what}, keeps {limits}"))
         else:
             found.append(Finding("bad", f"{what}, does not keep {limits}"))
@@ -119,7 +128,9 @@ def table(rows: Sequence[CellRow], title: str = "", chosen: Sequence[str] = ()) 
     columns = {shown[name][0]: [shown[name][1](row) for row in rows] for name in chosen or shown}
     alike = {head: cells[0] for head, cells in columns.items() if title and not chosen and len({*cells}) == 1}
     columns = parameters | {head: cells for head, cells in columns.items() if head not in alike}
-    lines = [Line((row.case, *(cells[k] for cells in columns.values())), row.reference) for k, row in enumerate(rows)]
+    lines = [
+        TableRow((row.case, *(cells[k] for cells in columns.values())), row.reference) for k, row in enumerate(rows)
+    ]
     reference = next((row.case for row in rows if row.reference), "the reference")
     note = [f"Ratios are relative to {reference} with the same seed."]
     note += [f"In all cells: {', '.join(f'{head} {cell}' for head, cell in alike.items())}."] if alike else []

@@ -24,7 +24,7 @@ from experiments.recording.trace import Trace
 from experiments.recording.version import ROOT, engine_versions
 from experiments.recording.version import digest as digest_of_code
 from experiments.virtual_time.conductor import Stuck
-from experiments.virtual_time.log import Logbook
+from experiments.virtual_time.log import RunRecorder
 from experiments.virtual_time.simulation import simulate
 
 PACKAGES: Final = ("agents", "twins", "experiments")  # whose code decides what a run comes to
@@ -122,7 +122,7 @@ def _flown(plan: Plan, seeds: tuple[int, ...]) -> tuple[list[RunMetrics], dict[i
         except FAILED as error:
             failed[seed] = str(error)
         else:
-            runs.append(run_metrics(Logbook(log, plan, "").trace()))
+            runs.append(run_metrics(RunRecorder(log, plan, "").trace()))
     return runs, failed
 
 

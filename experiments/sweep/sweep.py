@@ -112,8 +112,8 @@ def sweep(
     folder = Path(out) if out is not None else folder_of(read, axes, "sweep")
     with Store(folder) as store:
         notes = store.changed_since(origin(read, [cell.plan for cell in plan]))
-        with workers(scheduler, processes) as crew:
-            runner = SweepRunner(store, crew, most_seeds)
+        with workers(scheduler, processes) as working:
+            runner = SweepRunner(store, working, most_seeds)
             with suppress(KeyboardInterrupt):  # what is done is kept
                 runner.run_missing(plan, seeds, progress)
         rows = runner.rows(plan, seeds)
@@ -128,7 +128,7 @@ class SweepRunner:
     """Runs that are done, and the workers for the missing ones."""
 
     store: Store
-    crew: Workers
+    workers: Workers
     most_seeds: int = MOST_SEEDS
 
     def run_missing(
@@ -139,7 +139,7 @@ class SweepRunner:
         total = sum(len(cell_seeds) for _, cell_seeds in lacking)
         if not total:
             return
-        piece = max(1, math.ceil(total / (SHARE * self.crew.count())))
+        piece = max(1, math.ceil(total / (SHARE * self.workers.count())))
         works = [
             Work(
                 cell.digest,
@@ -153,7 +153,7 @@ class SweepRunner:
         ]
         done = 0
         progress(0, total)
-        for work, outcome in self.crew.done(works):
+        for work, outcome in self.workers.done(works):
             self.store.add(work.cell, work.code, outcome)
             done += len(work.seeds)
             progress(done, total)

@@ -20,7 +20,7 @@ from agents.network import endpoints as topology
 from agents.network import lab, messages, pubsub
 from agents.network.keys import Keys
 from experiments.real_time.conductor import orders
-from experiments.scene.stage import Moment, Stage
+from experiments.scene.stage import Moment, SceneModel
 from experiments.view.heartbeat import STALE_S
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ class Acting:
         self._events = pubsub.pose_publisher(session, keys.event, messages.JSON, pubsub.EVENTS)
         self._urgent = orders.stop_publisher(session, keys)
         self._alive: Sequence[str] = ()
-        self._stage = Stage.of_robots(())
+        self._stage = SceneModel.of_robots(())
         self._parts: list[Any] = []  # of the present stage
         self._targets: dict[str, Any] = {}  # by leader
         self._held_until = -inf  # [s, monotonic] targets stay where they were dragged
@@ -112,7 +112,7 @@ class Acting:
             drag = gui.add_checkbox("Drag targets", initial_value=False, hint="Of the leaders.")
             drag.on_update(lambda event: self._show_targets(shown=bool(event.target.value)))
 
-    def set_stage(self, stage: Stage, number: int) -> None:
+    def set_stage(self, stage: SceneModel, number: int) -> None:
         """Another case: its parameters, and the number by which pages report that they show it."""
         self._stage, self._number = stage, number
         for part in (*self._parts, *self._targets.values()):
@@ -270,7 +270,7 @@ class Parameter:
         return min(max(value, self.value / STEPS), REACH * self.value)
 
 
-def parameters(stage: Stage) -> list[Parameter]:
+def parameters(stage: SceneModel) -> list[Parameter]:
     """Parameters that robots change in flight: the numbers of the trigger, and two of the formation."""
     assert stage.plan is not None
     assert stage.plan is not None

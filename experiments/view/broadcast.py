@@ -94,7 +94,7 @@ class Broadcast:
             self._declared += [announced, *(pubsub.alive_token(self._session, token) for token in names)]
             last, now = clock.t, time.monotonic()
             while not ended.wait(STEP_S):
-                ownership.settle(self._session, ended.is_set)
+                ownership.wait_while_checking(self._session, ended.is_set)
                 refuse_strangers(names)
                 now, before = time.monotonic(), now
                 clock.advance(now - before)

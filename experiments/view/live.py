@@ -17,8 +17,8 @@ import zenoh
 
 from agents.network.keys import Keys
 from agents.network.session import connected
-from experiments.scene.drawing import DARK, LIGHT, SceneDrawing, Shown
-from experiments.scene.stage import MANY, Condition, LinkTracker, Moment, Stage
+from experiments.scene.drawing import DARK, LIGHT, SceneDrawing, VisibleParts
+from experiments.scene.stage import MANY, Condition, LinkTracker, Moment, SceneModel
 from experiments.view import heartbeat
 from experiments.view.acting import Acting, Watched
 from experiments.view.observer import Observer
@@ -105,7 +105,7 @@ class Page:
 
     def __init__(self, server: viser.ViserServer, *, dark: bool) -> None:
         self._server, self.look = server, DARK if dark else LIGHT
-        self.panel, self.shown, self.camera = Panel(server), Shown(), Camera(server)
+        self.panel, self.shown, self.camera = Panel(server), VisibleParts(), Camera(server)
         self._plotted = self._tabled = -inf
         self._boxes: dict[str, Any] = {}
         with server.gui.add_folder("Show", order=50.0, expand_by_default=False):
@@ -117,12 +117,12 @@ class Page:
                 box.on_update(partial(self._set, name))
                 self._boxes[name] = box
 
-    def fit(self, stage: Stage) -> None:
+    def fit(self, stage: SceneModel) -> None:
         """Goals of many robots are not drawn until they are asked for."""
         if len(stage.names) > MANY:
             self._boxes["goals"].value = self.shown.goals = False
 
-    def begin(self, stage: Stage) -> None:
+    def begin(self, stage: SceneModel) -> None:
         """Another case: its drawing in place of the one before, its panel, and the camera on its arena."""
         with self._server.atomic():
             if hasattr(self, "drawing"):

@@ -20,7 +20,7 @@ from agents.network.session import received
 from experiments.arrays import known_rows
 from experiments.file import document
 from experiments.file.problems import DocumentError
-from experiments.scene.stage import SILENT_S, Condition, LinkTracker, Moment, Stage, Trail, condition
+from experiments.scene.stage import SILENT_S, Condition, LinkTracker, Moment, SceneModel, Trail, condition
 from experiments.view.heartbeat import DataAge
 
 UNKNOWN_S: Final = 2.0  # without an experiment for so long, robots are drawn of which only the names are known
@@ -50,7 +50,7 @@ class RobotReport:
 class Observer:
     """A realm as it is seen from outside; polled. Needs no experiment file."""
 
-    stage: Stage
+    stage: SceneModel
     case: str
     robots: dict[str, RobotReport]  # by name, in the order of the stage
     events: deque[messages.Event]  # of the run, incidents of robots included, oldest first
@@ -76,7 +76,7 @@ class Observer:
         self.robots, self.scans = {}, {}
         self.events = deque(maxlen=EVENTS)
         self.world, self.conducted = None, False
-        self._begin(Stage.of_robots(()))
+        self._begin(SceneModel.of_robots(()))
 
     # ------------------------------------------------------------------ reception
 
@@ -111,7 +111,7 @@ class Observer:
         if not changed and self.stage.plan is None and now - self._opened > UNKNOWN_S:
             names = tuple(sorted(name for name, report in self.robots.items() if report.known))
             if names != self.stage.names:
-                self._begin(Stage.of_robots(names))
+                self._begin(SceneModel.of_robots(names))
                 changed = True
         return changed
 
@@ -124,12 +124,12 @@ class Observer:
                 continue  # of another version: robots are drawn without it
             case, plan = next(iter(read.cases().items()))
             if (case, plan) != (self.case, self.stage.plan):
-                self._begin(Stage.of_plan(plan), case)
+                self._begin(SceneModel.of_plan(plan), case)
                 self.events.clear()
                 changed = True
         return changed
 
-    def _begin(self, stage: Stage, case: str = "") -> None:
+    def _begin(self, stage: SceneModel, case: str = "") -> None:
         self.stage, self.case = stage, case
         before, self.robots = self.robots, {}
         for name in stage.names:

@@ -15,11 +15,11 @@ from agents.body.interface import BodyState
 from agents.decision.lifecycle import RUNNING, Phase
 from agents.network.messages import Event
 from experiments.definition.plan import Plan
-from experiments.scene.stage import Condition, LinkTracker, Moment, Stage, Trail, condition
+from experiments.scene.stage import Condition, LinkTracker, Moment, SceneModel, Trail, condition
 from experiments.view.live import FRAME_S, Page
-from experiments.view.panel import PLOT_S, Row, known
+from experiments.view.panel import PLOT_S, RobotRow, known
 from experiments.view.replay import Clock, add_transport
-from experiments.virtual_time.simulation import Instant
+from experiments.virtual_time.simulation import Snapshot
 from twins.arrays import Array
 
 if TYPE_CHECKING:
@@ -42,9 +42,9 @@ class PacedView:
         self._page = Page(server, dark=dark)
         self._opened = time.monotonic()
 
-    def begin(self, case: str, plan: Plan) -> Callable[[Instant], object]:
+    def begin(self, case: str, plan: Plan) -> Callable[[Snapshot], object]:
         """Another case begins; returns what its simulation calls."""
-        stage = self._stage = Stage.of_plan(plan)
+        stage = self._stage = SceneModel.of_plan(plan)
         self._case, self._plan = case, plan
         rows = len(stage.names)
         self._tracker, self._trail = LinkTracker(stage), Trail(rows)
@@ -56,7 +56,7 @@ class PacedView:
         self.clock.t = -inf
         return self.watch
 
-    def watch(self, instant: Instant) -> None:
+    def watch(self, instant: Snapshot) -> None:
         """Draws a moment of the simulation, and holds it until the clock of the page is there."""
         clock = self.clock
         while not self._server.get_clients() and time.monotonic() - self._opened < self._page_s:
@@ -75,7 +75,7 @@ class PacedView:
                 return
             time.sleep(POLL_S)
 
-    def _count(self, instant: Instant) -> None:
+    def _count(self, instant: Snapshot) -> None:
         """Transmissions and incidents since the last call."""
         for row, robot in enumerate(instant.robots):
             at = robot.transmitter.asking.last.time
@@ -91,7 +91,7 @@ class PacedView:
                 self._incidents[row] += 1
                 self._events.append(Event(each.time - begin, "hazard", self._stage.names[row], each.text))
 
-    def _moment(self, instant: Instant) -> Moment:
+    def _moment(self, instant: Snapshot) -> Moment:
         robots, states = instant.robots, instant.states
         truth, measured = _column(states, "true_position"), _column(states, "position")
         position = np.where(np.isfinite(truth).all(axis=1, keepdims=True), truth, measured)
@@ -120,7 +120,7 @@ class PacedView:
             measures=[{} if law is None else law.measures for law in laws],
         )
 
-    def _draw(self, instant: Instant, now: float) -> None:
+    def _draw(self, instant: Snapshot, now: float) -> None:
         moment = self._moment(instant)
         with self._server.atomic():
             self._page.drawing.draw(moment, still=not self.clock.playing)
@@ -131,11 +131,11 @@ class PacedView:
             history.add(instant.now, errors, np.array([float(len(each)) for each in self._sent]))
         self._page.refresh(now, panel.show_plots, partial(self._tabulate, instant, moment))
 
-    def _tabulate(self, instant: Instant, moment: Moment) -> None:
+    def _tabulate(self, instant: Snapshot, moment: Moment) -> None:
         errors = self._tracker.of_robots(moment.error)
         panel = self._page.panel
         rows = [
-            Row(
+            RobotRow(
                 name, Condition(int(moment.condition[k])), known(errors[k]), float(len(self._sent[k])),
                 known(instant.states[k].battery), note=instant.robots[k].hazards.worst(),
             ).measured(moment.measures, k)

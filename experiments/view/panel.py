@@ -23,7 +23,7 @@ from experiments.scene.stage import (
     UNKNOWN,
     Colour,
     Condition,
-    Stage,
+    SceneModel,
 )
 from twins.arrays import Array
 
@@ -45,7 +45,7 @@ WHOLE_WIDTH: Final = "<style>@media(max-width:36em){[style*='width: 20em']{width
 
 
 @dataclass(frozen=True)
-class Row:
+class RobotRow:
     """One robot in the table; None where nothing is known."""
 
     name: str
@@ -59,7 +59,7 @@ class Row:
     note: str = ""
     measures: Mapping[str, float] = field(default_factory=dict)  # of its law
 
-    def measured(self, measures: Sequence[Mapping[str, float]], row: int) -> Row:
+    def measured(self, measures: Sequence[Mapping[str, float]], row: int) -> RobotRow:
         """The same with the measures of its law, of those of all robots."""
         return replace(self, measures=measures[row]) if measures else self
 
@@ -73,15 +73,15 @@ def robot_row(
     *,
     delay: float | None = None,
     ticks: bool = True,  # whether they can be missed
-) -> Row:
+) -> RobotRow:
     """The row of a robot by its last status."""
     if status is None:
-        return Row(name, condition, error, rate, delay=delay)
+        return RobotRow(name, condition, error, rate, delay=delay)
     note = status.hazard or (status.reason if condition > Condition.DONE else "")
     if not note and status.missing:
         note = "misses " + ", ".join(status.missing)
     missed, share = status.missed if ticks else None, status.missed / max(1, status.ticks + status.missed)
-    return Row(name, condition, error, rate, status.battery, missed, share, delay, note)
+    return RobotRow(name, condition, error, rate, status.battery, missed, share, delay, note)
 
 
 def known(value: float) -> float | None:
@@ -139,10 +139,10 @@ class Panel:
             self._list = self._gui.add_html("")
         with self._gui.add_folder("Legend", order=60.0, expand_by_default=False):
             self._gui.add_html(legend())
-        self.stage = Stage.of_robots(())
+        self.stage = SceneModel.of_robots(())
         self.history = History(0)
 
-    def set_stage(self, stage: Stage) -> None:
+    def set_stage(self, stage: SceneModel) -> None:
         """Another case: its robots, and empty plots."""
         self.stage, self.history = stage, History(len(stage.names))
         for plot in (self._error, self._rate):
@@ -184,7 +184,7 @@ class Panel:
         if abs(self._bar.value - share) >= 0.5:
             self._bar.value = share
 
-    def show_robots(self, rows: Sequence[Row]) -> None:
+    def show_robots(self, rows: Sequence[RobotRow]) -> None:
         _set(self._table, table(rows, self.stage))
 
     def show_links(self, error: Array, delay: Sequence[float | None]) -> None:
@@ -215,7 +215,7 @@ def css(colour: Sequence[int]) -> str:
 HEADS: Final = ("error", "f [Hz]", "battery", "missed", "delay")
 
 
-def _cells(row: Row) -> tuple[str, ...]:
+def _cells(row: RobotRow) -> tuple[str, ...]:
     """Row of a robot in the table, below `HEADS`."""
     error = row.error
     return (
@@ -227,7 +227,7 @@ def _cells(row: Row) -> tuple[str, ...]:
     )
 
 
-def _measures(row: Row, names: Sequence[str]) -> tuple[str, ...]:
+def _measures(row: RobotRow, names: Sequence[str]) -> tuple[str, ...]:
     return tuple(f"{row.measures[name]:.3g}" if name in row.measures else "" for name in names)
 
 
@@ -244,7 +244,7 @@ def _milliseconds(seconds: float) -> str:
     return f"{round(1e3 * seconds, 1) + 0.0:.1f} ms"  # a sum, for it has no negative zero
 
 
-def table(rows: Sequence[Row], stage: Stage) -> str:
+def table(rows: Sequence[RobotRow], stage: SceneModel) -> str:
     """Table of robots as HTML: of many, those that need attention first, then by error; without empty columns."""
     colours: Mapping[str, Sequence[int]] = dict(zip(stage.names, stage.colours.tolist(), strict=True))
     shown = list(rows)
@@ -285,7 +285,7 @@ def table(rows: Sequence[Row], stage: Stage) -> str:
     )
 
 
-def link_table(stage: Stage, error: Array, delay: Sequence[float | None]) -> str:
+def link_table(stage: SceneModel, error: Array, delay: Sequence[float | None]) -> str:
     """Table of links as HTML; links that are not there, or not known, are left out."""
     order = [k for k in np.argsort(-np.nan_to_num(error)).tolist() if np.isfinite(error[k])][:LINKS]
     lines = []

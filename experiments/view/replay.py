@@ -16,10 +16,10 @@ from agents.network.messages import Memory, Status, WorldState
 from experiments.definition.formation import errors_over_time
 from experiments.recording.trace import ROUNDING_S
 from experiments.scene.drawing import SceneDrawing
-from experiments.scene.stage import TRAIL, TRAIL_S, Condition, LinkTracker, Moment, Stage, condition
+from experiments.scene.stage import TRAIL, TRAIL_S, Condition, LinkTracker, Moment, SceneModel, condition
 from experiments.scene.tracks import LOST_S, Track, Tracks
 from experiments.view.live import FRAME_S, IDLE_S, TABLE_S, Page
-from experiments.view.panel import HISTORY_S, PLOT_S, History, Row, known, robot_row
+from experiments.view.panel import HISTORY_S, PLOT_S, History, RobotRow, known, robot_row
 from twins.arrays import Array
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ class Film:
     """A recorded case as moments."""
 
     def __init__(self, tracks: Tracks) -> None:
-        self.tracks, self.stage = tracks, Stage.of_plan(tracks.plan)
+        self.tracks, self.stage = tracks, SceneModel.of_plan(tracks.plan)
         self._links = LinkTracker(self.stage)
         self._ages: Array = TRAIL_S * np.arange(TRAIL, dtype=np.float64)
 
@@ -69,7 +69,7 @@ class Film:
             measures=[each.numbers for each in memories],
         )
 
-    def rows(self, t: float) -> list[Row]:
+    def rows(self, t: float) -> list[RobotRow]:
         """The table at `t` [s]."""
         moment = self.moment(t)
         errors = self._links.of_robots(moment.error)

@@ -37,7 +37,7 @@ from experiments.recording.trace import (
 from experiments.recording.writer import Recording
 from experiments.scene import markers
 from experiments.virtual_time.network import CentreLog
-from experiments.virtual_time.simulation import OPTIONAL, Log
+from experiments.virtual_time.simulation import OPTIONAL, VirtualRunLog
 from twins.arrays import Array, Index
 
 SAMPLED: Final = ("position", "yaw", "true_position", "goal", "setpoint")  # columns of a log that a trace has as well
@@ -48,10 +48,10 @@ LARGE_CHUNK_BYTES: Final = 512 * 1024  # of a run that is over: there is nothing
 T = TypeVar("T")
 
 
-class Logbook:
+class RunRecorder:
     """Virtual run as a trace or a recording."""
 
-    def __init__(self, log: Log, plan: Plan, case: str) -> None:
+    def __init__(self, log: VirtualRunLog, plan: Plan, case: str) -> None:
         self._log, self._plan, self._case = log, plan, case
         self._experiment, self._scene = plan.experiment, plan.scene
         self._links: Links = plan.pose_links

@@ -35,7 +35,7 @@ OPTIONAL: Final = ("attitude", "shadow_position", "shadow_yaw")  # columns that 
 
 
 @dataclass(frozen=True)
-class Log:
+class VirtualRunLog:
     """Everything recorded of a virtual run; times since the common start [s], arrays over samples (K), robots (N)."""
 
     names: tuple[str, ...]  # (N)
@@ -77,7 +77,7 @@ class Log:
 
 
 @dataclass(frozen=True)
-class Instant:
+class Snapshot:
     """Present state of a run in virtual time, for those who watch it; nothing in it may be changed."""
 
     time: float  # [s] since the common start; NaN before it is known
@@ -95,9 +95,9 @@ def simulate(
     lean: bool = False,
     landing: bool = True,
     progress: Callable[[float], object] = lambda _: None,
-    watch: Callable[[Instant], object] | None = None,
+    watch: Callable[[Snapshot], object] | None = None,
     patience_s: float = PATIENCE_S,
-) -> Log:
+) -> VirtualRunLog:
     """Flies one case, compiled.
 
     Args:
@@ -163,7 +163,7 @@ class Flight:
         *,
         landing: bool,
         progress: Callable[[float], object],
-        watch: Callable[[Instant], object] | None,
+        watch: Callable[[Snapshot], object] | None,
     ) -> None:
         """Flies until all robots are done, or to the end of the run without `landing`."""
         conductor, dt, first = self._conductor, self.dt, self.robots[0]
@@ -177,7 +177,7 @@ class Flight:
             if (first.tick - 1) % self.log_every == 0:  # the robots' count begins anew at the common start
                 progress(t - conductor.start_at)
                 if watch is not None:
-                    watch(Instant(t - conductor.start_at, t, self.robots, self._states, self.twin.engine))
+                    watch(Snapshot(t - conductor.start_at, t, self.robots, self._states, self.twin.engine))
                 self._sample(t)
             if not landing and t - conductor.start_at >= self.plan.experiment.duration_s - 0.5 * dt:
                 return
@@ -269,7 +269,7 @@ class Flight:
                 self._columns.setdefault(what, []).append(np.array([sample[what] for sample in self._samples]))
             self._samples = []
 
-    def log(self) -> Log:
+    def log(self) -> VirtualRunLog:
         """Everything recorded so far."""
         self._settle()
         conductor, names = self._conductor, self.names
@@ -284,7 +284,7 @@ class Flight:
             if what in OPTIONAL and np.isnan(columns[what]).all():
                 columns[what] = None
         incidents = [(row, each) for row, robot in enumerate(self.robots) for each in robot.hazards.incidents]
-        return Log(
+        return VirtualRunLog(
             names=names,
             seed=self._seed,
             lean=self.lean,

@@ -24,7 +24,7 @@ RARE = {
     "agents/plugins/predictors.py": set(),
     "agents/plugins/trigger_families.py": set(),
     "agents/plugins/triggers.py": set(),
-    "agents/safety/obedience.py": set(),
+    "agents/safety/motion_check.py": set(),
     "agents/safety/positions.py": set(),
     "agents/safety/setpoint_filter.py": set(),
     "agents/vectors.py": set(),

@@ -19,7 +19,7 @@ from agents.body.kinds import KINDS
 from agents.decision.lifecycle import RUNNING
 from experiments.definition.experiment import Arena, Experiment, Leg, Rates, Robot, Start
 from experiments.definition.plan import Plan
-from experiments.virtual_time.simulation import Log, simulate
+from experiments.virtual_time.simulation import VirtualRunLog, simulate
 from twins.arrays import Array, Mask, norm
 
 CIRCLE: Final = 0.8  # [m] robots begin about here and want to go to the other side
@@ -140,7 +140,7 @@ def random_pairs(avoidance: str | dict[str, Any] | None, each: int, **settings: 
     return outcomes
 
 
-def _outcome(experiment: Experiment, log: Log) -> Outcome:
+def _outcome(experiment: Experiment, log: VirtualRunLog) -> Outcome:
     kinds = [KINDS[robot.kind] for robot in experiment.robots.values()]
     place = log.true_position[(log.phase == RUNNING).all(axis=1)]
     gap = np.inf

@@ -6,10 +6,10 @@ from math import inf
 
 import numpy as np
 
-from experiments.scene.stage import Condition, Moment, Stage
+from experiments.scene.stage import Condition, Moment, SceneModel
 
 
-def unknown(stage: Stage) -> Moment:
+def unknown(stage: SceneModel) -> Moment:
     """Nothing is known yet."""
     rows, net = len(stage.names), len(stage.links)
     blank = np.full((rows, 3), np.nan)

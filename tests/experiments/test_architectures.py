@@ -15,7 +15,7 @@ from experiments.report import metrics_files, report
 from experiments.report.tables import architecture_table
 from experiments.report.verdict import findings
 from experiments.virtual_time import simulation
-from experiments.virtual_time.log import Logbook
+from experiments.virtual_time.log import RunRecorder
 from twins.arrays import norm
 
 pytestmark = pytest.mark.slow  # runs and reports, whole
@@ -51,7 +51,7 @@ def fly(experiment, seed=1):
 
 
 def traced(experiment, case=""):
-    return Logbook(fly(experiment), Plan(experiment), case or str(experiment.architecture)[:11]).trace()
+    return RunRecorder(fly(experiment), Plan(experiment), case or str(experiment.architecture)[:11]).trace()
 
 
 def measured(experiment):
@@ -166,7 +166,7 @@ def test_links_of_avoidance_stay_with_the_robots(cases):
 def test_a_recording_tells_the_same(tmp_path, cases):
     park = with_delay(short(cases["event"], duration_s=4.0, timeline=[]), 0.03, HYBRID, loss=0.05)
     log = fly(park, 3)
-    book = Logbook(log, Plan(park), "hybrid")
+    book = RunRecorder(log, Plan(park), "hybrid")
     book.record(tmp_path / "hybrid.mcap", "")
     first, second = book.trace().goals, playback.read(tmp_path / "hybrid.mcap").trace.goals
     np.testing.assert_allclose(second.sent.stamp, first.sent.stamp, rtol=0.0, atol=3e-6)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from agents.decision.centralised import Guidance
+from agents.decision.centralised import ReceivedGoals
 from agents.network import messages, validation
 from agents.network.messages import Malformed
 from experiments.file.document import load
@@ -68,7 +68,7 @@ def test_velocity_of_a_goal_is_checked_and_kept():
             validation.check_goal(goal, now=2.0, reach=(1.0, 1.0, 1.0), oldest_s=1.0)
     assert messages.wanted((0.1, 0.2, float("nan"))) == [0.1, 0.2]
     assert messages.wanted((float("nan"),) * 3) is None
-    guidance = Guidance(flies=True, silence_s=1.0)
+    guidance = ReceivedGoals(flies=True, silence_s=1.0)
     assert guidance.receive((0.0, 0.0, 1.0), 0.0, 1.0, (0.1, 0.0, 0.0))
     assert guidance.receive((0.0, 0.0, 1.0), 0.0, 2.0)
     assert np.isnan(guidance.velocity).all()

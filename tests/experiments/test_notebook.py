@@ -10,7 +10,7 @@ import pytest
 
 from experiments.metrics.measure import measure
 from experiments.recording.reader import RecordingError
-from experiments.run import CHECKOUT, Figures, Run, reopen, show
+from experiments.run import CHECKOUT, FigureSet, Run, reopen, show
 from tests.experiments.traces import crowd
 
 
@@ -38,7 +38,7 @@ def test_a_figure_is_shown_and_kept(run, tmp_path):
 @pytest.mark.slow
 def test_figures_show_themselves(run):
     figures = run.figures(width=7.16)
-    assert isinstance(figures, Figures)
+    assert isinstance(figures, FigureSet)
     assert figures._repr_html_().count("<svg") == len(figures)
     assert figures["errors"].get_figwidth() == 7.16
 

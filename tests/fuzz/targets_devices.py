@@ -64,7 +64,7 @@ def khepera_twin() -> Iterator[Target]:
 def khepera_bridge() -> Iterator[Target]:
     """Answers of all servers to everything that the link asks, apart by zero bytes."""
     from agents.protocols import khepera4  # noqa: PLC0415
-    from bridges.khepera4.drivers import KTeam, Park, identify  # noqa: PLC0415
+    from bridges.khepera4.drivers import KTeam, RoboticParkServer, identify  # noqa: PLC0415
     from bridges.khepera4.odometry import Odometer  # noqa: PLC0415
 
     class Line:
@@ -95,7 +95,7 @@ def khepera_bridge() -> Iterator[Target]:
         which, *parts = data.split(b"\0")
         line: Any = Line(parts)
         odometer = Odometer(0.0, 0.0, 0.0)
-        driver: Park | KTeam
+        driver: RoboticParkServer | KTeam
         if which[:1] == b"k":
             driver = KTeam(line, khepera4.Khepera4Settings())
         else:

@@ -51,7 +51,7 @@ def usage_of(pid: int) -> Usage | None:
     return Usage(round(int(fields[21]) * PAGE / 1e6, 3), int(fields[17]), files, cpu_s)
 
 
-class Row(msgspec.Struct, frozen=True):
+class SoakSample(msgspec.Struct, frozen=True):
     """A process at one time; fields of robots are None for others."""
 
     time_s: float  # from the common start [s]
@@ -71,7 +71,7 @@ class Row(msgspec.Struct, frozen=True):
     longest_s: float | None = None  # the largest delay [s]
 
 
-COLUMNS: Final = tuple(each.name for each in msgspec.structs.fields(Row))
+COLUMNS: Final = tuple(each.name for each in msgspec.structs.fields(SoakSample))
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class Soaked:
     title: str  # of the experiment
     robots: tuple[str, ...]  # by process
     duration_s: float  # planned, from the common start [s]
-    rows: Sequence[Row]  # in order of time
+    rows: Sequence[SoakSample]  # in order of time
     failed: Mapping[str, str] = field(default_factory=dict)  # what processes and robots failed in, and when
     interrupted: bool = False  # by the user
 
@@ -139,18 +139,18 @@ class Sampler(ExitStack):
             self._experiment.title,
             tuple(map("+".join, self._experiment.processes.values())),
             self._experiment.duration_s,
-            msgspec.convert(known, list[Row], strict=False),
+            msgspec.convert(known, list[SoakSample], strict=False),
             self._failed,
             interrupted,
         )
 
-    def _rows(self, t: float, robots: Mapping[str, RobotView]) -> Iterator[Row]:
+    def _rows(self, t: float, robots: Mapping[str, RobotView]) -> Iterator[SoakSample]:
         """A row for each process of the run."""
         roles = {pid: role_of(words) for pid, words in tagged(f"{RUN}={self._tag}")}
         for pid, process in {**roles, os.getpid(): CONDUCTOR}.items():
             if process == OTHER or (usage := usage_of(pid)) is None:
                 continue
-            row = Row(t, process, *usage)
+            row = SoakSample(t, process, *usage)
             if process == "recorder" and self._recording.exists():
                 row = msgspec.structs.replace(row, recording_mb=round(self._recording.stat().st_size / 1e6, 3))
             names = [name for name in process.split("+") if name in robots]

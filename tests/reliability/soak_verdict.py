@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Final, NamedTuple
 
 from experiments.report.page import NONE, Finding
-from tests.reliability.soak_sampler import Row, Soaked
+from tests.reliability.soak_sampler import Soaked, SoakSample
 
 WARM_SHARE: Final = 0.5  # of the run that does not count (a recorder fills its pools for 150 s), but not more than
 WARM_S: Final = 300.0
@@ -22,8 +22,8 @@ MISSED: Final = 0.01  # share of the ticks
 class Ends(NamedTuple):
     """Rows of a process after the warm-up: first and last window."""
 
-    first: Sequence[Row]
-    last: Sequence[Row]
+    first: Sequence[SoakSample]
+    last: Sequence[SoakSample]
 
     def over(self, what: Callable[[Iterable[float]], float], field: str) -> tuple[float, float]:
         """A statistic of a field in both windows."""

@@ -10,7 +10,7 @@ from agents.network import messages
 from experiments.file.document import load
 from experiments.real_time.conductor.run_view import Progress, RobotView, RunFailed
 from tests.__main__ import command
-from tests.reliability.soak_sampler import Row, Sampler, Soaked
+from tests.reliability.soak_sampler import Sampler, Soaked, SoakSample
 from tests.reliability.soak_verdict import judge, passed, table
 
 ROBOTS = ("TB01", "CF02")
@@ -28,7 +28,7 @@ def soaked(change=None, *, until=SPAN, **more):
                 fields |= {"received": 5, "delay_s": 0.002, "longest_s": 0.01}
             if change is not None:
                 fields |= change(name, t)
-            rows.append(Row(t, name, **fields))
+            rows.append(SoakSample(t, name, **fields))
     return Soaked("test", ROBOTS, SPAN, rows, **more)
 
 

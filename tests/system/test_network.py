@@ -12,7 +12,7 @@ from experiments.file.document import load
 from experiments.recording import playback
 from experiments.recording.trace import Trace
 from experiments.run import reopen
-from experiments.virtual_time.log import Logbook
+from experiments.virtual_time.log import RunRecorder
 from experiments.virtual_time.simulation import simulate
 from tests.system.lab import Flight, transmits_at_50_hz
 from twins.arrays import Index
@@ -34,7 +34,7 @@ def sent_and_heard(trace: Trace, listener: int, speaker: int, end: float) -> tup
 def virtual(duration_s: float) -> Trace:
     """The same in virtual time, longer: robots start sooner there, and their numbers must overlap."""
     plan = load("triangle", *BAD, "formation.gain=1.4", f"duration_s={duration_s}").cases()["periodic"]
-    return Logbook(simulate(plan, plan.experiment.seed), plan, "periodic").trace()
+    return RunRecorder(simulate(plan, plan.experiment.seed), plan, "periodic").trace()
 
 
 @pytest.mark.mechanism("modelled channel in real time")

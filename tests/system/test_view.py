@@ -20,7 +20,7 @@ from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.run import simulate
-from experiments.scene.stage import Condition, Stage
+from experiments.scene.stage import Condition, SceneModel
 from experiments.view import acting
 from tests.conftest import RouterProcess
 from tests.experiments import moments
@@ -259,7 +259,7 @@ def test_hundred_robots_are_drawn_at_twenty_frames() -> None:
         + "[formation.links]\n"
         + "".join(f'"R{k} > R{k + 1}" = 1.0\n' for k in range(99))
     ).cases()["default"]
-    crowd_stage = Stage.of_plan(crowd)
+    crowd_stage = SceneModel.of_plan(crowd)
     serving = ExitStack()
     server = serving.enter_context(served(int(free_endpoint(preferred_port=0).rpartition(":")[2]), dark=False))
     shown = Page(server, dark=False)

@@ -64,12 +64,12 @@ def test_others_files_run_when_agreed(answer, runs, monkeypatch: pytest.MonkeyPa
 def test_own_files_are_no_strangers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = tmp_path / "own.toml"
     file.touch()
-    assert not consent.stranger(file)
-    assert not consent.stranger(tmp_path / "missing.toml")
+    assert not consent.belongs_to_another(file)
+    assert not consent.belongs_to_another(tmp_path / "missing.toml")
     owner = SimpleNamespace(st_uid=os.geteuid() + 4321)
     monkeypatch.setattr(Path, "stat", lambda self, **_: owner if self == file else SimpleNamespace(st_uid=0))
     monkeypatch.setattr(Path, "exists", lambda *_: True)
     monkeypatch.delenv("SUDO_UID", raising=False)
-    assert consent.stranger(file)
+    assert consent.belongs_to_another(file)
     monkeypatch.setenv("SUDO_UID", str(owner.st_uid))
-    assert not consent.stranger(file)
+    assert not consent.belongs_to_another(file)

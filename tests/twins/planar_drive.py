@@ -3,7 +3,7 @@
 import numpy as np
 
 from agents.vectors import ZERO
-from twins.engines.engine import Stage
+from twins.engines.engine import EngineInput
 from twins.engines.pymunk_engine import Planar
 from twins.scene import Obstacle, Scene
 
@@ -13,7 +13,7 @@ DT = 0.01
 def stage(kinds, start, yaw=None, *, mirrored=None, scene=None, dt=DT):
     """Robots at x, y (and z), in endless room unless a scene is given."""
     n = len(kinds)
-    return Stage(
+    return EngineInput(
         tuple(kinds),
         [(float(x), float(y), *(z or (0.0,))) for x, y, *z in start],
         [0.0] * n if yaw is None else [float(each) for each in yaw],

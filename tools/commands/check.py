@@ -29,7 +29,7 @@ from tools.options import (
 
 if TYPE_CHECKING:
     from experiments.check.analysis import Analysis
-    from experiments.check.findings import Figures, Finding
+    from experiments.check.findings import CheckNumbers, Finding
     from experiments.check.kept import KeptVerdict, Verdict
     from experiments.real_time.conductor.preflight_checks import RobotChecks
 
@@ -214,7 +214,7 @@ def _print_text(text: str) -> None:
     print(text.encode(encoding, "replace").decode(encoding))
 
 
-def _print_json(file: str, found: Sequence[Finding], numbers: Mapping[str, Figures]) -> None:
+def _print_json(file: str, found: Sequence[Finding], numbers: Mapping[str, CheckNumbers]) -> None:
     ok = all(each.severity != "error" for each in found)
     print_json({"file": file, "ok": ok, "findings": found, "figures": numbers})
 
@@ -241,7 +241,7 @@ def _counted(count: int, what: str) -> str:
     return f"{count or 'no'} {what}{'s' * (count != 1)}"
 
 
-def _rows(numbers: Mapping[str, Figures]) -> list[str]:
+def _rows(numbers: Mapping[str, CheckNumbers]) -> list[str]:
     """A line for each figure; where the cases differ, each with its name."""
     worded = {name: _formatted(each) for name, each in numbers.items()}
     lines = []
@@ -253,7 +253,7 @@ def _rows(numbers: Mapping[str, Figures]) -> list[str]:
     return lines
 
 
-def _formatted(of: Figures) -> dict[str, str]:
+def _formatted(of: CheckNumbers) -> dict[str, str]:
     from experiments.check.findings import join_names
 
     def number(value: float | None, form: str, unit: str = "") -> str:

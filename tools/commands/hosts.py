@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from experiments.definition.plan import Plan
     from experiments.file.document import Document
     from experiments.real_time.hosts.hosts import HostError, Station
-    from experiments.real_time.hosts.station import Found
+    from experiments.real_time.hosts.station import HostCheck
 
 app: Final = group("Check the other machines of an experiment, and put zenpark there.")
 turtlebot_app: Final = group("Prepare a TurtleBot3 for experiments.")
@@ -36,7 +36,7 @@ REACH_S: Final = 15.0
 
 
 @dataclass
-class Row:
+class HostRow:
     """Result of one host: a cell of each column, and the remedies."""
 
     cells: list[str]
@@ -156,8 +156,10 @@ def _has_certificates(there: Station, folder: Path, robots: Sequence[str]) -> bo
     """Whether a host holds the certificates of its robots, and no others."""
     from experiments.real_time.hosts import certificates
 
-    holds = there.holds(robots)
-    return not (holds.others or [*certificates.faults(holds, folder, time.time()), *certificates.ended(folder, robots)])
+    content = there.folder_content(robots)
+    return not (
+        content.others or [*certificates.faults(content, folder, time.time()), *certificates.ended(folder, robots)]
+    )
 
 
 @contextmanager
@@ -206,20 +208,20 @@ def stations(
         yield found
 
 
-def _without_address(name: str, plan: Plan, heading: Sequence[str] = HEADING) -> Row:
+def _without_address(name: str, plan: Plan, heading: Sequence[str] = HEADING) -> HostRow:
     """A host without an address: its robots join by themselves."""
     robots = ", ".join(plan.experiment.hosts[name].robots) or "no robots"
-    return Row([name, f"{NOTHING} no address: {robots} started there", *[NOTHING] * (len(heading) - 2)])
+    return HostRow([name, f"{NOTHING} no address: {robots} started there", *[NOTHING] * (len(heading) - 2)])
 
 
-def _row(there: Station | HostError, plan: Plan, heading: Sequence[str]) -> Row:
+def _row(there: Station | HostError, plan: Plan, heading: Sequence[str]) -> HostRow:
     """Everything about one host."""
     from experiments.real_time.hosts.hosts import HostError
 
     if isinstance(there, HostError):
         name = str(there).partition(":")[0]
-        return Row([name, NO, *[NOTHING] * (len(heading) - 2)], [str(there)])
-    row = Row([there.name])
+        return HostRow([name, NO, *[NOTHING] * (len(heading) - 2)], [str(there)])
+    row = HostRow([there.name])
     try:
         _fill(row, there, plan)
     except HostError as error:
@@ -228,7 +230,7 @@ def _row(there: Station | HostError, plan: Plan, heading: Sequence[str]) -> Row:
     return row
 
 
-def _fill(row: Row, there: Station, plan: Plan) -> None:
+def _fill(row: HostRow, there: Station, plan: Plan) -> None:
     from msgspec.structs import replace
 
     from experiments.real_time.hosts import certificates
@@ -276,7 +278,7 @@ def _fill(row: Row, there: Station, plan: Plan) -> None:
     ]
 
 
-def _router_remedy(there: Station, router: Found, plan: Plan) -> str:
+def _router_remedy(there: Station, router: HostCheck, plan: Plan) -> str:
     """Remedy for a router that a host does not reach."""
     from agents.network.endpoints import Endpoint
 
@@ -289,18 +291,18 @@ def _router_remedy(there: Station, router: Found, plan: Plan) -> str:
     return "ssh carries it: does sshd there allow that (AllowTcpForwarding yes)? Else add listen to [network]"
 
 
-def _recognised(row: Row, there: Station, folder: Path, robots: Sequence[str]) -> bool:
+def _recognised(row: HostRow, there: Station, folder: Path, robots: Sequence[str]) -> bool:
     """Add what a host holds of the lab's certificates to its row; whether its robots would be let in."""
     from experiments.real_time.hosts import certificates
 
     wrong = there.distrusted(there.host.robots)
-    holds = there.holds(robots)
-    strays = [f"{there.name}: {each}" for each in certificates.strays(holds, there.name)]
+    content = there.folder_content(robots)
+    misplaced_keys = [f"{there.name}: {each}" for each in certificates.misplaced_keys(content, there.name)]
     left = certificates.days_left(folder, there.host.robots)
     soon = not wrong and left < SOON_DAYS
-    mark = NO if wrong or strays else DOUBTFUL if soon else YES
-    row.cells.append(f"{mark} {len(holds.held)}, {left:.0f} days left" if not wrong else mark)
-    row.trouble += [*wrong, *strays]
+    mark = NO if wrong or misplaced_keys else DOUBTFUL if soon else YES
+    row.cells.append(f"{mark} {len(content.identities)}, {left:.0f} days left" if not wrong else mark)
+    row.trouble += [*wrong, *misplaced_keys]
     if soon:
         remedy = f"`./zenpark lab renew {folder} {' '.join(there.host.robots)}`, then `./zenpark hosts install FILE`"
         row.trouble.append(f"{there.name}: its certificates end in {left:.0f} days; {remedy}")

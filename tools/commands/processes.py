@@ -144,13 +144,13 @@ def of_zenohd(endpoints: Sequence[str], link: Sequence[str] = (), rights: Rights
 
 def _rights(file: str, lab: str | None, bodies: str | None) -> tuple[Rights, Path | None]:
     from experiments.definition import access_rights
-    from experiments.definition import endpoints as reach
+    from experiments.definition import endpoints as endpoint_choice
     from experiments.definition.bodies import choose_bodies
     from experiments.file import document
 
     read = document.read(file)
     cases = [choose_bodies(case, bodies) for case in read.cases().values()]
-    return access_rights.rights(cases), reach.lab_folder(read.plan, read.path, lab)
+    return access_rights.rights(cases), endpoint_choice.lab_folder(read.plan, read.path, lab)
 
 
 @app.command(epilog=example("centre architectures --case centralised"))

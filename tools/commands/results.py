@@ -100,7 +100,7 @@ def report(
         return _compare(folders, named, Path(out or "comparison.html"), as_json=as_json)
     target = Path(out or (f"{Path(folders[0])}-pooled" if pooled else folders[0]))
     with _writing(target):
-        write_figures_of_merit(seeds, target)
+        write_metrics(seeds, target)
         page = write_report(seeds, target, width, pdf=pdf)
     found = [{"folder": seeds[0].folder, **summary(seeds)}] if as_json else []
     print_result({"report": page, "runs": found}, str(page), as_json=as_json)
@@ -351,7 +351,7 @@ def recover(
     )
 
 
-def write_figures_of_merit(runs: Sequence[Run], folder: Path) -> None:
+def write_metrics(runs: Sequence[Run], folder: Path) -> None:
     """Write `metrics.csv` and `metrics.json` of a run into its folder."""
     from experiments.report import metrics_files
 
@@ -389,7 +389,7 @@ def write_report(runs: Sequence[Run], folder: Path, width: float = 3.5, *, pdf: 
     kept = {} if recorded else metrics_files.read_bands(place)
     bands = kept or figures.error_bands(traces)
     of_all = recorded or bool(kept)  # seeds
-    drawn = figures.every(every, traces, width, bands)
+    drawn = figures.all_figures(every, traces, width, bands)
     stays = [] if of_all else ["errors"]  # the one that is there is of all seeds
     drawings = {
         name: style.svg(figure) if name in stays else style.save(figure, folder / "figures", name, pdf=pdf)

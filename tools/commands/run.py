@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import typer
 
 from tools.commands import view as viewing
-from tools.commands.results import summary, write_figures_of_merit, write_report
+from tools.commands.results import summary, write_metrics, write_report
 from tools.options import (
     Anyway,
     As,
@@ -105,7 +105,7 @@ def run(
         anyway=anyway,
         tags=tag or [],
     )
-    show = _Shown(out, as_json, report, open_report, view, pace, yes)
+    show = _OutputOptions(out, as_json, report, open_report, view, pace, yes)
     if not bundle.is_bundle(file):
         return _run(origin, options, show)
     if origin != RunOrigin(file=file, virtual=virtual, tags=origin.tags):
@@ -115,7 +115,7 @@ def run(
 
 
 @dataclass(frozen=True)
-class _Shown:
+class _OutputOptions:
     """Where the results of a run go, and how they are shown."""
 
     out: str | None
@@ -127,7 +127,9 @@ class _Shown:
     agreed: bool  # to what an experiment of others touches
 
 
-def _run(origin: RunOrigin, options: RunOptions, show: _Shown, *, former: Path | None = None, bundle: str = "") -> int:
+def _run(
+    origin: RunOrigin, options: RunOptions, show: _OutputOptions, *, former: Path | None = None, bundle: str = ""
+) -> int:
     """Run an experiment.
 
     Args:
@@ -148,11 +150,11 @@ def _run(origin: RunOrigin, options: RunOptions, show: _Shown, *, former: Path |
     if not sound(read, kept, options.cases, seeds=origin.seeds, as_json=show.as_json, anyway=origin.anyway):
         return 2
     if not origin.virtual:
-        from experiments.real_time.conductor.conduct import embody
+        from experiments.real_time.conductor.conduct import with_bodies
         from tools import consent
 
-        if bundle or consent.stranger(read.path):
-            consent.require(bundle or str(read.path), embody(read, options), given=show.agreed)
+        if bundle or consent.belongs_to_another(read.path):
+            consent.require(bundle or str(read.path), with_bodies(read, options), given=show.agreed)
     folder = new_folder(read, show.out)
     try:
         read.keep(folder / SOURCE)
@@ -214,7 +216,7 @@ def _kept_origin(folder: Path, origin: RunOrigin, read: Document, options: RunOp
         keep_origin(folder, msgspec.structs.replace(read_origin(folder) or made, ended=time.time(), load_after=load()))
 
 
-def _repeat(asked: RunOrigin, show: _Shown, lab: str | None, identity: str) -> int:
+def _repeat(asked: RunOrigin, show: _OutputOptions, lab: str | None, identity: str) -> int:
     """Repeat the run of a bundle; in virtual time the results are compared to the last bit."""
     from tempfile import TemporaryDirectory
 
@@ -318,9 +320,9 @@ def _conduct(read: Document, folder: Path, options: RunOptions, *, quiet: bool) 
     return runs, emergency.words or failed, STOPPED if emergency else 130 if interrupted() else 0
 
 
-def _write(runs: Sequence[Run], folder: Path, show: _Shown) -> None:
+def _write(runs: Sequence[Run], folder: Path, show: _OutputOptions) -> None:
     """Write and print the results."""
-    write_figures_of_merit(runs, folder)
+    write_metrics(runs, folder)
     page = write_report(runs, folder) if show.report else None
     found = summary(runs)
     print_result(found, *_lines(runs, found, page), as_json=show.as_json)
@@ -328,7 +330,7 @@ def _write(runs: Sequence[Run], folder: Path, show: _Shown) -> None:
         open_in_browser(page.resolve().as_uri())
 
 
-def _refuse(options: RunOptions, show: _Shown, *, virtual: bool, seeds: int) -> None:
+def _refuse(options: RunOptions, show: _OutputOptions, *, virtual: bool, seeds: int) -> None:
     """Raise DocumentError for options that do not go together, before anything is started."""
     from experiments.file.problems import refusal
 

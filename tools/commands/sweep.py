@@ -125,7 +125,7 @@ def _sweep(file: str, given: Sequence[str], options: dict[str, Any]) -> Outcome:
     return found, {}, [str(found)], INTERRUPTED if found.missing else 1 if found.failures else 0
 
 
-def _optimise(file: str, given: Sequence[str], wish: str, options: dict[str, Any]) -> Outcome:
+def _optimise(file: str, given: Sequence[str], objective: str, options: dict[str, Any]) -> Outcome:
     """Search; return as `_sweep`; raises KeyboardInterrupt on Ctrl-C."""
     import msgspec
 
@@ -135,12 +135,18 @@ def _optimise(file: str, given: Sequence[str], wish: str, options: dict[str, Any
     from tools.progress import Bar
 
     with Bar() as bar:
-        found = tune(file, given, wish, **options, progress=lambda case, done, of: bar.show(f"{case}: tried", done, of))
+        found = tune(
+            file, given, objective, **options, progress=lambda case, done, of: bar.show(f"{case}: tried", done, of)
+        )
     tables.write_csv(found.folder / "tried.csv", found.tried)
     tuning, seeds = seeds_in_words(found.tuning), seeds_in_words(found.seeds)
     lines = [f"tuned on seeds {tuning}, reported on seeds {seeds}", *tables.text(found.rows)]
-    kept = {row.label: found.wish.kept(row) for row in found.rows if not row.reference}
-    limits = ", ".join(map(str, found.wish.limits))
+    kept = {row.label: found.objective.kept(row) for row in found.rows if not row.reference}
+    limits = ", ".join(map(str, found.objective.limits))
     lines += [f"{label}: {'keeps' if well else 'DOES NOT KEEP'} {limits}" for label, well in kept.items()]
-    more = {"tuning": list(found.tuning), "wish": wish, "tried": [msgspec.to_builtins(row) for row in found.tried]}
+    more = {
+        "tuning": list(found.tuning),
+        "objective": objective,
+        "tried": [msgspec.to_builtins(row) for row in found.tried],
+    }
     return found, more, lines, 0 if all(kept.values()) else 1

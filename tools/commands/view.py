@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from experiments.view.acting import Watched
     from experiments.view.replay import Clock
     from experiments.view.serving import Server
-    from tools.live_table import Row
+    from tools.live_table import LiveRow
 
 app: Final = typer.Typer()
 
@@ -87,14 +87,14 @@ def top(
 ) -> int:
     """Show the live table of a run, from any shell; in a pipe and as JSON, the table once."""
     from agents.network.session import open_session
-    from agents.network.shutdown import held
+    from agents.network.shutdown import closing_cleanly
     from agents.runtime.command_line import on_termination
 
     ended = threading.Event()
     with on_termination(ended.set):
         watched = _watched(connect, realm, lab, identity)
         opened = open_session(watched.endpoints, name="top", wait_s=5.0, identity=watched.identity)
-        with held(opened) as (session, declared):
+        with closing_cleanly(opened) as (session, declared):
             table = _Top(session, watched)
             declared.append(table)
             return table.run(ended, as_json=as_json)
@@ -146,7 +146,7 @@ class _Top:
             row.cpu is not None or row.rank == 0 or not reports[row.name].known for row in self._rows()
         )
 
-    def _rows(self) -> list[Row]:
+    def _rows(self) -> list[LiveRow]:
         from experiments.scene.stage import Condition, condition
 
         observer, now, rows = self._observer, self._observer.now(), []
@@ -194,7 +194,7 @@ def replay(
     """Play a recording onto the network, for view, top, echo and other tools; in a terminal Enter pauses it."""
     from agents.network.endpoints import DEFAULT_ENDPOINT
     from agents.network.session import open_session
-    from agents.network.shutdown import held
+    from agents.network.shutdown import closing_cleanly
     from agents.runtime.command_line import on_termination
     from experiments.view.broadcast import Broadcast
     from experiments.view.replay import Clock
@@ -204,7 +204,7 @@ def replay(
     with on_termination(ended.set):
         endpoints = routers(connect, lab) or [DEFAULT_ENDPOINT]
         opened = open_session(endpoints, name="replay", wait_s=5.0, identity=identity)
-        with held(opened) as (session, declared):
+        with closing_cleanly(opened) as (session, declared):
             played = Broadcast(session, file, realm)
             declared.append(played)
             clock = Clock(0.0, played.end - played.begin)
@@ -332,13 +332,13 @@ def _default_identity(endpoints: Sequence[str]) -> str:
 
 def _live(watched: Watched, ended: threading.Event, *, port: int, dark: bool, open_page: bool, with_run: bool) -> None:
     from agents.network.session import open_session
-    from agents.network.shutdown import held
+    from agents.network.shutdown import closing_cleanly
     from experiments.view import live
     from experiments.view.acting import Acting, may_act
     from experiments.view.serving import served
 
     opened = open_session(watched.endpoints, name="view", wait_s=5.0, identity=watched.identity)
-    with held(opened) as (session, declared), served(port, dark=dark) as server:
+    with closing_cleanly(opened) as (session, declared), served(port, dark=dark) as server:
         acting = Acting(session, watched) if may_act(watched) else None
         page = live.LiveView(server, session, watched, dark=dark, acting=acting)
         declared.append(page)

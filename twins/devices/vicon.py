@@ -21,7 +21,7 @@ from agents.clock import Clock, uptime
 from agents.network import messages, pubsub, validation
 from agents.network import session as network
 from agents.network.keys import Keys
-from agents.network.shutdown import Farewell, end, held
+from agents.network.shutdown import Farewell, closing_cleanly, end
 from agents.protocols import vicon_datastream
 from agents.protocols.vicon_datastream import Framer, Kind, Malformed, Segment
 from agents.runtime import command_line
@@ -277,7 +277,9 @@ def run(launch: TwinLaunch) -> int:
     identity = launch.identity or "twin"
     with (
         on_termination(stop.set),
-        held(network.open_session(launch.endpoints(), name="vicon-twin", stop=stop, identity=identity)) as opened,
+        closing_cleanly(
+            network.open_session(launch.endpoints(), name="vicon-twin", stop=stop, identity=identity)
+        ) as opened,
     ):
         session, declared = opened
         rng = np.random.default_rng(launch.seed)

@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from twins.arrays import Array, Index, Mask, clamp, some
+from twins.arrays import Array, Index, Mask, any_true, clamp
 
 RATE_HZ: Final = 500.0  # of the attitude and rate loops
 OUTER: Final = 5  # divisor of the rate for the position and velocity loops: 100 Hz
@@ -114,7 +114,7 @@ class Firmware:
             return
         cos, sin = np.cos(yaw), np.sin(yaw)
         reference = clamp(self._position.advance(_to_level_frame(offset, cos, sin), offset), -SPEED, SPEED)
-        if some(by_velocity):
+        if any_true(by_velocity):
             reference = np.where(by_velocity[:, None], _to_level_frame(wanted, cos, sin), reference)
         moving = _to_level_frame(velocity, cos, sin)
         output = self._velocity.advance(reference - moving, moving)

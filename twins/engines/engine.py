@@ -23,7 +23,7 @@ Pose = tuple[float, float, float]  # x, y [m], yaw [rad]
 
 
 @dataclass(frozen=True)
-class Stage:
+class EngineInput:
     """Input of an engine: n robots and the scene."""
 
     kinds: tuple[Kind, ...]  # of the robots
@@ -178,7 +178,7 @@ class EngineFactory(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     CONTACTS: ClassVar[bool] = False  # detects contacts; else they are computed from the recorded positions
     CARRIES: ClassVar[tuple[type, ...]] = (object,)  # motions of `agents.body.kinds` that it moves
 
-    def build(self, stage: Stage) -> Engine:
+    def build(self, stage: EngineInput) -> Engine:
         """Build an engine; raises BodyError with the remedy if a kind has no twin, or a library is missing."""
         raise TypeError(f"{type(self).__name__} must define `build`")
 

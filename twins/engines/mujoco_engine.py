@@ -19,9 +19,9 @@ from msgspec import Meta
 from agents.body.interface import Attitude, BodyError
 from agents.body.kinds import Kind
 from agents.vectors import ZERO, Vector
-from twins.arrays import Array, Index, Mask, clamp, norm, some
+from twins.arrays import Array, Index, Mask, any_true, clamp, norm
 from twins.engines.crazyflie_cascade import RATE_HZ, Firmware
-from twins.engines.engine import EngineFactory, Mirrored, Planar, Pose, Stage, Touch
+from twins.engines.engine import EngineFactory, EngineInput, Mirrored, Planar, Pose, Touch
 from twins.engines.mujoco_model import mjcf
 from twins.engines.point_mass import Moving, Orders, model, require_models
 from twins.models.onboard_flight import OnboardFlight
@@ -43,14 +43,14 @@ class RigidBody(EngineFactory, frozen=True):
 
     motor_lag_s: Annotated[float, Meta(ge=0.01, le=0.1, description="time constant of a motor's thrust [s]")] = 0.03
 
-    def build(self, stage: Stage) -> RigidBodyEngine:
+    def build(self, stage: EngineInput) -> RigidBodyEngine:
         return RigidBodyEngine(stage, self.motor_lag_s)
 
 
 class RigidBodyEngine(Orders["Drone | Moving"]):
     """Implements `twins.engines.engine.Engine`; ground robots are those of the point-mass engine."""
 
-    def __init__(self, stage: Stage, motor_lag: float) -> None:
+    def __init__(self, stage: EngineInput, motor_lag: float) -> None:
         """`motor_lag`: of a thrust [s]; raises BodyError for a kind without a twin, or without MuJoCo."""
         require_models(stage.kinds)
         self._dt, self._scene = stage.dt, stage.scene
@@ -234,7 +234,7 @@ class Drones:
             return
         alone = len(awake) < len(state)
         models = [self._models[row] for row in awake] if alone else self._models
-        any_flies = some(flying)
+        any_flies = any_true(flying)
         target[:, :2] += wobble / TRACKED_SHARE
         wanted = clamp(velocity, -self._speed, self._speed)
         wanted[:, :2] += np.where(by_velocity[:, None], drift, 0.0)
@@ -283,7 +283,7 @@ class Drones:
         moving = flying | (norm(state[:, SPEED]) > AT_REST) | (norm(state[:, SPIN]) > 10.0 * AT_REST)
         self._quiet = np.where(moving, 0.0, self._quiet + self._period * self._ticks)
         rests = self._quiet >= QUIET_S
-        if some(rests):
+        if any_true(rests):
             state[rests, SPEED] = state[rests, SPIN] = 0.0
             for row in np.flatnonzero(rests).tolist():
                 drones[row].velocity = ZERO

@@ -9,7 +9,7 @@ from agents.body.interface import BodyError
 from agents.body.kinds import Flight, Holonomic, Kind, Steered, Wheels
 from agents.plugins import registry
 from agents.vectors import Setpoint, Vector
-from twins.engines.engine import EngineFactory, Mirrored, Motion, Planar, Pose, Stage, Touch
+from twins.engines.engine import EngineFactory, EngineInput, Mirrored, Motion, Planar, Pose, Touch
 from twins.models.differential import Differential
 from twins.models.ground import Bicycle, Ground, Omni
 from twins.models.quadrotor import Quadrotor
@@ -23,7 +23,7 @@ Moving = Quadrotor | Differential | Ground | Mirrored
 class PointMass(EngineFactory, frozen=True):
     """The point-mass engine has no parameters."""
 
-    def build(self, stage: Stage) -> PointMassEngine:
+    def build(self, stage: EngineInput) -> PointMassEngine:
         return PointMassEngine(moving_models(stage), stage.dt, stage.scene)
 
 
@@ -63,7 +63,7 @@ def model(kind: Kind, start: Vector, yaw: float) -> Quadrotor | Differential | G
     return MODELS[type(motion)](kind, start, yaw)
 
 
-def moving_models(stage: Stage) -> list[Moving]:
+def moving_models(stage: EngineInput) -> list[Moving]:
     """Motion models of all robots; raises BodyError for a kind without one."""
     require_models(stage.kinds)
     return [

@@ -13,11 +13,11 @@ from msgspec import Meta
 
 from agents.body.kinds import Flight, Kind, Wheels
 from agents.vectors import Share, Vector, clamp, is_finite
-from twins.engines.engine import EngineFactory, Mirrored, Pose, Stage, Touch, require_carried
+from twins.engines.engine import EngineFactory, EngineInput, Mirrored, Pose, Touch, require_carried
 from twins.engines.engine import Planar as Displacement
 from twins.engines.point_mass import Moving, Orders, moving_models, require_models
 from twins.engines.pymunk_contacts import Contacts, Layers
-from twins.engines.pymunk_space import Place, Surfaces
+from twins.engines.pymunk_space import ArenaSpace, Surfaces
 from twins.models.differential import Differential
 from twins.models.onboard_flight import TOUCHDOWN
 from twins.models.quadrotor import GRAVITY, Quadrotor
@@ -56,7 +56,7 @@ class Planar(EngineFactory, frozen=True):
     CONTACTS: ClassVar[bool] = True
     CARRIES: ClassVar[tuple[type, ...]] = (Wheels, Flight)
 
-    def build(self, stage: Stage) -> PlanarEngine:
+    def build(self, stage: EngineInput) -> PlanarEngine:
         return PlanarEngine(stage, self)
 
 
@@ -69,7 +69,7 @@ class PlanarEngine(Orders[Moving]):
     its end. Positions here are therefore one step ahead of pymunk's: those at the beginning of the next step.
     """
 
-    def __init__(self, stage: Stage, choice: Planar) -> None:
+    def __init__(self, stage: EngineInput, choice: Planar) -> None:
         """Raises BodyError for a kind without a twin, or with a motion that is not carried."""
         require_models(stage.kinds)
         require_carried(choice, itertools.compress(stage.kinds, (not each for each in stage.mirrored)))
@@ -88,11 +88,11 @@ class PlanarEngine(Orders[Moving]):
         for robot, motion in zip(self._robots, self.motions, strict=True):
             robot.put(motion.position, motion.yaw)
 
-    def _build_space(self, stage: Stage, choice: Planar) -> tuple[_Space, list[_Robot]]:
+    def _build_space(self, stage: EngineInput, choice: Planar) -> tuple[_Space, list[_Robot]]:
         """Build the scene with its robots, and find the numbers of each body in it."""
         skin = 0.5 * choice.approach * self._step
         surfaces = Surfaces(choice.friction, choice.wall_friction, choice.traction, skin)
-        place = Place(surfaces, -1 - len(stage.scene.names))
+        place = ArenaSpace(surfaces, -1 - len(stage.scene.names))
         for row, kind in enumerate(stage.kinds):
             place.add_robot(row, kind, mirrored=stage.mirrored[row])
         place.furnish(stage.scene)
@@ -277,7 +277,7 @@ class _Space:
     cells: memoryview[float]  # of all bodies, WIDTH each; pymunk's own memory
     obstacles: dict[int, int]  # index of the first number of each obstacle with a plan or a mass
 
-    def __init__(self, place: Place, contacts: Contacts, iterations: int) -> None:
+    def __init__(self, place: ArenaSpace, contacts: Contacts, iterations: int) -> None:
         self._space, self.contacts = place.space, contacts
         self._space.iterations = iterations
         contacts.attach(self._space)
@@ -315,7 +315,7 @@ class _Space:
             )
 
 
-def _build_layers(stage: Stage) -> Layers:
+def _build_layers(stage: EngineInput) -> Layers:
     scene, rows = stage.scene, len(stage.kinds)
     # negative numbers count from the end: obstacle 0 is last, and the arena's walls come before all obstacles
     bottom = [*(0.0,) * rows, -math.inf, *scene.bottom[::-1].tolist()]

@@ -42,7 +42,7 @@ class Surfaces:
 
 
 @dataclass
-class Place:
+class ArenaSpace:
     """A scene with its robots."""
 
     surfaces: Surfaces

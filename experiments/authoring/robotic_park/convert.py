@@ -16,7 +16,16 @@ from typing import Any, Final, TypeVar
 import numpy as np
 
 from agents.body.kinds import KINDS
-from experiments.authoring.robotic_park.file import PLACES, SURFACES, Park, Robot, Task, read, starts_from, text_of
+from experiments.authoring.robotic_park.file import (
+    PLACES,
+    SURFACES,
+    ParkExperiment,
+    Robot,
+    Task,
+    read,
+    starts_from,
+    text_of,
+)
 from experiments.authoring.robotic_park.heights import Heights, find_heights, origin_of
 from experiments.catalogue import index
 from experiments.check.findings import join_names
@@ -144,7 +153,7 @@ def _body(robot: Robot) -> dict[str, str]:
     return {}
 
 
-def _notes_on_robots(park: Park) -> Iterator[str]:
+def _notes_on_robots(park: ParkExperiment) -> Iterator[str]:
     """Notes on settings of the authors' robots that zenpark does not have."""
     robots = park.robots
     idle = [robot for robot in robots if robot.task.written and not robot.task.enable]
@@ -196,7 +205,9 @@ def _words(value: object) -> str:
     return "no threshold" if value is None else f"{value:g}"
 
 
-def _formation(park: Park, found: Heights, notes: list[str]) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
+def _formation(
+    park: ParkExperiment, found: Heights, notes: list[str]
+) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
     """Law and gains, links and anchors: the tables `[formation]`, `[formation.links]` and `[formation.anchors]`.
 
     The gradient law of their drivers is u = k (d² − ‖x‖²) x for each neighbour with x = p_i − p_j, which is zenpark's
@@ -247,7 +258,7 @@ def _divides(park: Park, robot: Robot) -> bool:
     return robot.driver.divides and not park.central
 
 
-def _gain(park: Park, robot: Robot, task: Task, distance: float, weight: float = 1.0) -> float:
+def _gain(park: ParkExperiment, robot: Robot, task: Task, distance: float, weight: float = 1.0) -> float:
     """The gain of zenpark's law at a distance [m]: μ [1/m²] for distances, the stiffness for poses."""
     divisor_of_law = 1.0
     if task.kind == "distance":
@@ -287,7 +298,7 @@ def _links(park: Park, found: Heights, own: dict[str, float], notes: list[str]) 
     return lines
 
 
-def _anchors(park: Park, found: Heights, gains: dict[str, float], notes: list[str]) -> dict[str, Any]:
+def _anchors(park: ParkExperiment, found: Heights, gains: dict[str, float], notes: list[str]) -> dict[str, Any]:
     """The anchor of each robot that keeps to a place; that of a distance only if the shape has them."""
     anchors: dict[str, Any] = {}
     for row, (robot, task) in ((park.robots.index(each[0]), each) for each in park.tasks):

@@ -129,7 +129,7 @@ class Task(Struct, frozen=True, rename={"period_ms": "T"}):
 
     @property
     def period(self) -> float:
-        """Time between decisions [s], of all drivers but one: see `Park.period`."""
+        """Time between decisions [s], of all drivers but one: see `ParkExperiment.period`."""
         return self.controller.period or 1e-3 * self.period_ms
 
     @property
@@ -227,7 +227,7 @@ class _Sections(Struct, frozen=True, rename="pascal"):
 
 
 @dataclass(frozen=True)
-class Park:
+class ParkExperiment:
     """Experiment of theirs."""
 
     mode: str  # physical, virtual, hybrid
@@ -337,7 +337,7 @@ def load(file: str, text: str) -> Entry:
     return Entry(file, "", value)
 
 
-def read(file: str, text: str, poses: Mapping[str, Pose], notes: list[str]) -> Park:
+def read(file: str, text: str, poses: Mapping[str, Pose], notes: list[str]) -> ParkExperiment:
     """An experiment, in whichever of the formats; `notes` gets what is not carried over.
 
     Args:
@@ -382,7 +382,7 @@ def read(file: str, text: str, poses: Mapping[str, Pose], notes: list[str]) -> P
         msgspec.structs.replace(robot, pose=list(poses[robot.name]), init_theta=0.0) if robot.name in poses else robot
         for robot in robots.values()
     ]
-    return Park(mode, placed, central, any("mars_data" in entry.value for entry in entries))
+    return ParkExperiment(mode, placed, central, any("mars_data" in entry.value for entry in entries))
 
 
 def _counted(file: str, problems: list[Problem]) -> list[Problem]:

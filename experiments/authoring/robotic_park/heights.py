@@ -11,7 +11,7 @@ import numpy as np
 from agents.body.kinds import KINDS
 from agents.formation.anchors import Anchor
 from agents.formation.link import BY_DISTANCE, BY_RELATIVE
-from experiments.authoring.robotic_park.file import Park, Relation, Robot
+from experiments.authoring.robotic_park.file import ParkExperiment, Relation, Robot
 from experiments.check.motion import CLEARANCE
 from experiments.check.realisation import Shape, Solids, find_shapes
 from experiments.definition.formation import Anchored
@@ -155,7 +155,7 @@ def find_heights(park: Park, notes: list[str]) -> Heights:
     return Heights(start, shape, hover, anchored, (0.0, 0.0, round(lift, 3)))
 
 
-def origin_of(park: Park, robot: Robot, relation: Relation) -> tuple[float, ...] | None:
+def origin_of(park: ParkExperiment, robot: Robot, relation: Relation) -> tuple[float, ...] | None:
     """Place [m] of the origin that a robot keeps a distance to; None where it is that of the arena.
 
     The file may give one. If not, some drivers have one of their own (`REAL_ORIGIN`).
@@ -166,7 +166,7 @@ def origin_of(park: Park, robot: Robot, relation: Relation) -> tuple[float, ...]
     return REAL_ORIGIN if own and relation.name == "origin" and len(relation.values) == 1 else None
 
 
-def _starts(park: Park, notes: list[str]) -> Array:
+def _starts(park: ParkExperiment, notes: list[str]) -> Array:
     """Starts (N, 3) [m]; robots without a start stand on a ring, in the order of the file."""
     count = len(park.robots)
     angle = 2.0 * np.pi * np.arange(count) / max(count, 1)
@@ -181,7 +181,7 @@ def _starts(park: Park, notes: list[str]) -> Array:
     return np.array([ring[row] if robot.start is None else robot.start for row, robot in enumerate(park.robots)])
 
 
-def _wanted_distances(park: Park, start: Array, flies: Mask) -> tuple[Links, Anchored]:
+def _wanted_distances(park: ParkExperiment, start: Array, flies: Mask) -> tuple[Links, Anchored]:
     """Links, and distances to points, as the tasks have them."""
     row = {robot.name: number for number, robot in enumerate(park.robots)}
     every = [(robot, task.kind, relation) for robot, task in park.tasks for relation in task.relations]
@@ -200,6 +200,6 @@ def _wanted_distances(park: Park, start: Array, flies: Mask) -> tuple[Links, Anc
     ]
 
 
-def _point(park: Park, robot: Robot, relation: Relation) -> tuple[float, float, float]:
+def _point(park: ParkExperiment, robot: Robot, relation: Relation) -> tuple[float, float, float]:
     x, y, z = origin_of(park, robot, relation) or (0.0, 0.0, 0.0)
     return x, y, z

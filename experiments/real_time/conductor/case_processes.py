@@ -19,7 +19,7 @@ from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.file.document import write_json
 from experiments.real_time.conductor.case_context import CaseContext
-from experiments.real_time.conductor.support import Servants
+from experiments.real_time.conductor.support import SupportProcesses
 from experiments.real_time.hosts.hosts import STATION
 from experiments.real_time.hosts.launcher import LAND_S, ZYGOTE, Process
 from experiments.recording.reader import RecordingError, recover
@@ -46,7 +46,7 @@ class CaseProcesses:
         self._context = context
         self._launcher = context.launcher
         self._groups = context.plan.experiment.processes  # by process, without the case
-        self._servants = Servants(context)
+        self._support = SupportProcesses(context)
         self.adopted: set[str] = set()  # robots that others have started, or will
         # hosts without address, by the robots that are started there
         self.away = standby.robots_without_address(context.plan)
@@ -60,9 +60,9 @@ class CaseProcesses:
         context = self._context
         if recorder:
             missing = ": messages from between are missing in the recording"
-            self._servants.supervise(self._record, missing, ": the recording stops here")
-        self._reached = self._servants.start()
-        if self._servants.standins:
+            self._support.supervise(self._record, missing, ": the recording stops here")
+        self._reached = self._support.start()
+        if self._support.standins:
             self._addressed = context.variant("addressed")
             self._addressed.write_bytes(write_json(self._reached))
 
@@ -183,7 +183,7 @@ class CaseProcesses:
         self.end_robots()
         self._launcher.end([self._context.process("centre")], grace_s=2.0)  # its last report is recorded
         self._launcher.end([self._context.process("recorder")], grace_s=5.0)
-        self._launcher.end(self._servants.standins, grace_s=2.0)
+        self._launcher.end(self._support.standins, grace_s=2.0)
 
     def end_robots(self) -> list[str]:
         """End the processes of all robots, which land first; return the robots whose process had to be killed."""
@@ -194,10 +194,10 @@ class CaseProcesses:
         """Processes that ended since the last call; recorder, router, world, centre and positioning restart,
         a few times."""
         for process in self._launcher.died():
-            again = self._servants.again(process)
+            again = self._support.again(process)
             if again is not None:
                 yield Death(again[0], "conductor", again[1])
-            elif process.name in self._servants.standins:
+            elif process.name in self._support.standins:
                 what = process.name.removeprefix(self._context.process(""))
                 text = f"the {what} ended ({process.exit}); robots that need it hold, or land{process.because}"
                 yield Death("device", "conductor", text)

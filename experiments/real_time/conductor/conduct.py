@@ -22,7 +22,7 @@ from agents.network.lab import options as lab_options
 from agents.network.zenoh_config import ASK_S, check_loopback
 from agents.plugins import registry as plugins
 from experiments.definition import access_rights, mesh
-from experiments.definition import endpoints as reach
+from experiments.definition import endpoints as endpoint_choice
 from experiments.definition.bodies import choose_bodies
 from experiments.definition.experiment import WORLD
 from experiments.definition.plan import Plan
@@ -31,7 +31,7 @@ from experiments.file.problems import refusal
 from experiments.real_time.conductor.case_context import CaseContext
 from experiments.real_time.conductor.conductor import CaseResult, Conductor
 from experiments.real_time.conductor.emergency import STARTING_S, Emergency
-from experiments.real_time.conductor.run_view import Shown
+from experiments.real_time.conductor.run_view import ProgressDisplay
 from experiments.real_time.conductor.support import RouterEnded, make_routers, start_routers
 from experiments.real_time.hosts import run_registry
 from experiments.real_time.hosts.hosts import Hosts
@@ -57,7 +57,7 @@ class RunOptions:
 class Supervision:
     """How a user follows and ends a run."""
 
-    show: Shown  # shows the progress
+    show: ProgressDisplay  # shows the progress
     interrupted: Callable[[], bool]  # whether the user wants to end: all robots land, and what was recorded is kept
     emergency: Emergency = field(default_factory=Emergency)  # receives emergency stops, which end the run as well
     tell: Callable[[Sequence[str]], None] = lambda _: None  # receives notes for the user before the start
@@ -73,7 +73,7 @@ class Conducted:
     failures: list[str]  # that the recordings may not tell: the run is spoilt
 
 
-def conduct(read: Document, folder: Path, staging: RunOptions, user: Supervision) -> Conducted:
+def conduct(read: Document, folder: Path, options: RunOptions, user: Supervision) -> Conducted:
     """Run an experiment in real time: a router, a process per robot, a recorder.
 
     Args:
@@ -89,33 +89,33 @@ def conduct(read: Document, folder: Path, staging: RunOptions, user: Supervision
             run of this machine has.
     """
     results: dict[str, CaseResult] = {}
-    embodied = embody(read, staging)
+    embodied = with_bodies(read, options)
     emergency = user.emergency
-    with staged(read, embodied, folder, staging, user) as stage, user.show as show:
+    with run_setup(read, embodied, folder, options, user) as setup, user.show as show:
         for name in embodied:
             if user.interrupted() or emergency:
                 break
-            results[name] = Conductor(stage.context(name), show).run()
+            results[name] = Conductor(setup.context(name), show).run()
     unflown = ", ".join(name for name in embodied if name not in results)
     stopped = [emergency.words + (f"; not run: {unflown}" if unflown else "")] if emergency else []
     failures = [f"{case}: {why}" for case, result in results.items() for why in result.failures]
     begun = {case: result.recording for case, result in results.items() if result.start is not None}
-    return Conducted(begun, [*stopped, *failures, *stage.left], failures)
+    return Conducted(begun, [*stopped, *failures, *setup.left], failures)
 
 
-def embody(read: Document, staging: RunOptions) -> dict[str, Plan]:
+def with_bodies(read: Document, options: RunOptions) -> dict[str, Plan]:
     """The chosen cases of an experiment, with the bodies and on the machines that are asked for."""
-    if staging.bodies == "protocol" and read.experiment.hosts and not staging.here:
+    if options.bodies == "protocol" and read.experiment.hosts and not options.here:
         hint = "add --here, which lets all robots run on this machine"
         raise refusal("--bodies protocol", "protocol twins cannot be seen from hosts", hint)
-    embodied = {name: choose_bodies(case, staging.bodies) for name, case in chosen(read, staging.cases).items()}
-    if staging.here:
+    embodied = {name: choose_bodies(case, options.bodies) for name, case in chosen(read, options.cases).items()}
+    if options.here:
         embodied = {name: case.changed(hosts={}) for name, case in embodied.items()}
     return embodied
 
 
 @dataclass
-class Stage:
+class RunSetup:
     """Routers and hosts of a run, while it is up."""
 
     context: Callable[[str], CaseContext]  # of a case, by its name
@@ -123,56 +123,56 @@ class Stage:
 
 
 @contextmanager
-def staged(
+def run_setup(
     read: Document,
     embodied: Mapping[str, Plan],
     folder: Path,
-    staging: RunOptions,
+    options: RunOptions,
     user: Supervision,
-) -> Iterator[Stage]:
+) -> Iterator[RunSetup]:
     """Put routers and hosts up for some cases, list the run on this machine, and listen for emergency stops.
 
-    Args, Raises: As `conduct`; `embodied` are the cases, see `embody`.
+    Args, Raises: As `conduct`; `embodied` are the cases, see `with_bodies`.
     """
     read.keep(folder / SOURCE)
     with ExitStack() as up:
         for left in reversed(range(1 if read.experiment.network.listen else PORT_CHOICES)):
             try:
-                stage = up.enter_context(_staged(read, embodied, folder, staging, user))
+                setup = up.enter_context(_run_setup(read, embodied, folder, options, user))
                 break
             except RouterEnded:
                 if not left:
                     raise
-        yield stage
+        yield setup
 
 
 @contextmanager
-def _staged(
+def _run_setup(
     read: Document,
     embodied: Mapping[str, Plan],
     folder: Path,
-    staging: RunOptions,
+    options: RunOptions,
     user: Supervision,
-) -> Iterator[Stage]:
-    """`staged`, at ports that are free now."""
+) -> Iterator[RunSetup]:
+    """`run_setup`, at ports that are free now."""
     network = read.experiment.network
     meshed = network.topology == "mesh"
     own_router = network.connect is None and not meshed
-    of_lab = reach.lab_folder(read.plan, read.path, staging.lab)
+    of_lab = endpoint_choice.lab_folder(read.plan, read.path, options.lab)
     secure = of_lab is not None
     own = network.listen or free_endpoints(network.routers, protocol="tls" if secure else "tcp")
-    listening = reach.router_endpoints(read.plan, read.path, own if own_router else [], staging.lab)
+    listening = endpoint_choice.router_endpoints(read.plan, read.path, own if own_router else [], options.lab)
     if own_router and not secure:
         for endpoint in listening:
             check_loopback(endpoint)
     endpoints = list(map(from_here, listening)) if own_router else listening
     if meshed:
         endpoints = secured(mesh.member_endpoints(embodied.values(), secure=secure), of_lab)
-    rights = write_rights(embodied.values(), endpoints, folder, staging.identity)
+    rights = write_rights(embodied.values(), endpoints, folder, options.identity)
     (folder / mesh.ENDPOINTS).write_text("".join(f"{endpoint}\n" for endpoint in endpoints), "utf-8")
     me = run_registry.own_entry(
         "run", read.experiment.title or read.path.stem, endpoints,
-        folder=folder, realm=network.realm, identity=staging.identity, robots=hardware(embodied.values()),
+        folder=folder, realm=network.realm, identity=options.identity, robots=hardware(embodied.values()),
     )  # fmt: skip
     with run_registry.registered(me) as unlisted, user.launching(folder / "logs") as launcher:
         user.tell([*([unlisted] if unlisted else []), *check_other_runs(me, run_registry.runs(), str(read.path))])
@@ -185,7 +185,7 @@ def _staged(
         stops = (
             nullcontext()
             if meshed
-            else user.emergency.throughout(endpoints, keys, staging.identity, STARTING_S if own_router else ASK_S)
+            else user.emergency.throughout(endpoints, keys, options.identity, STARTING_S if own_router else ASK_S)
         )
 
         def context(name: str) -> CaseContext:
@@ -199,14 +199,14 @@ def _staged(
                 hosts=hosts,
                 interrupted=user.interrupted,
                 rights=rights,
-                identity=staging.identity,
+                identity=options.identity,
                 emergency=user.emergency,
             )
 
-        stage = Stage(context)
+        setup = RunSetup(context)
         with stops:
-            yield stage
-        stage.left += hosts.sweep()
+            yield setup
+        setup.left += hosts.sweep()
 
 
 def hardware(cases: Iterable[Plan]) -> dict[str, str]:

@@ -30,7 +30,7 @@ from experiments.real_time.conductor.run_view import (
     Progress,
     RobotView,
     RunFailed,
-    Show,
+    ShowProgress,
 )
 from experiments.real_time.hosts.clock_drift import Drift
 from experiments.real_time.hosts.launcher import LAND_S
@@ -61,7 +61,7 @@ class CaseRun:
 
     _view: NetworkView
 
-    def __init__(self, context: CaseContext, show: Show) -> None:
+    def __init__(self, context: CaseContext, show: ShowProgress) -> None:
         """Write the case as a file for its processes; nothing is started yet."""
         self._context, self._show = context, show
         self._plan = plan = context.plan

@@ -11,7 +11,7 @@ import zenoh
 from agents.network import messages, pubsub
 from agents.network import session as network
 from agents.network.keys import Keys
-from agents.network.shutdown import held
+from agents.network.shutdown import closing_cleanly
 from agents.network.zenoh_config import ASK_S
 
 STARTING_S: Final = 10.0  # limit for routers that were just started: on a busy machine that takes seconds
@@ -42,7 +42,7 @@ class Emergency:
         `identity` is the name in the certificate, in a lab. Raises Unreachable if no router answers in `wait_s`.
         """
         opened = network.open_session(endpoints, name="emergency stops", identity=identity, wait_s=wait_s)
-        with held(opened) as (session, declared):
+        with closing_cleanly(opened) as (session, declared):
             declared.append(self.listen(session, keys))
             yield
 

@@ -14,7 +14,7 @@ from agents.network import endpoints as topology
 from agents.network import messages, pubsub
 from agents.network import session as network
 from agents.network.keys import Keys
-from agents.network.shutdown import held
+from agents.network.shutdown import closing_cleanly
 
 if TYPE_CHECKING:
     from experiments.real_time.hosts.run_registry import Run
@@ -162,7 +162,7 @@ class EmergencyStop:
         """Find the robots that the stop would reach; nothing is sent to them."""
         try:
             opened = network.open_session(self.endpoints, name="estop", wait_s=2.0, identity=self.identity)
-            with held(opened) as (session, _):
+            with closing_cleanly(opened) as (session, _):
                 self.seen = alive(session, Keys(self.realm))
         except Exception as error:  # noqa: BLE001 - as for the stop itself
             self.failure = error
@@ -171,7 +171,7 @@ class EmergencyStop:
         keys = Keys(self.realm)
         # a robot that does not answer must not delay the others' stop
         opened = network.open_session(self.endpoints, name="estop", wait_s=2.0, identity=self.identity, gather_s=0.0)
-        with held(opened) as (session, declared):
+        with closing_cleanly(opened) as (session, declared):
             stop = messages.encode(messages.Stop(self.identity, reason))
             urgent = stop_publisher(session, keys)
             urgent.put(stop)

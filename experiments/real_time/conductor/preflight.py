@@ -26,12 +26,12 @@ from experiments.definition.plan import Plan
 from experiments.file.document import Document
 from experiments.real_time.conductor import preflight_checks as checks
 from experiments.real_time.conductor.case_context import CaseContext
-from experiments.real_time.conductor.conduct import RunOptions, Supervision, embody, staged
+from experiments.real_time.conductor.conduct import RunOptions, Supervision, run_setup, with_bodies
 from experiments.real_time.conductor.conductor import CaseRun
 from experiments.real_time.conductor.hot_changes import CLIMB_S
 from experiments.real_time.conductor.orders import start_lead_s
 from experiments.real_time.conductor.preflight_checks import DRIVE_M, HOP_M, Check, Observed, RobotChecks, Tried
-from experiments.real_time.conductor.run_view import Show
+from experiments.real_time.conductor.run_view import ShowProgress
 from experiments.real_time.hosts.launcher import LAND_S
 
 PREFLIGHT: Final = "preflight"  # name of the case, in files and on the console
@@ -70,9 +70,9 @@ def check_robots(
     Returns:
         The checks of each robot; none if the user ended them before they began.
     """
-    plan = alone(next(iter(embody(read, options).values())))
-    with staged(read, {PREFLIGHT: plan}, folder, options, user) as stage, user.show as show:
-        return Inspector(stage.context(PREFLIGHT), show, trials).run()
+    plan = alone(next(iter(with_bodies(read, options).values())))
+    with run_setup(read, {PREFLIGHT: plan}, folder, options, user) as setup, user.show as show:
+        return Inspector(setup.context(PREFLIGHT), show, trials).run()
 
 
 def alone(plan: Plan) -> Plan:
@@ -112,7 +112,7 @@ def alone(plan: Plan) -> Plan:
 class Inspector(CaseRun):
     """Checks the robots of one case, see `check_robots`."""
 
-    def __init__(self, context: CaseContext, show: Show, trials: Trials) -> None:
+    def __init__(self, context: CaseContext, show: ShowProgress, trials: Trials) -> None:
         """Write the case as a file for its processes; nothing is started yet."""
         super().__init__(context, show)
         self._trials = trials

@@ -18,7 +18,7 @@ from agents.network import lab, messages, pubsub
 from agents.network import session as network
 from agents.network.endpoints import DEFAULT_ENDPOINT
 from agents.network.keys import Keys
-from agents.network.shutdown import held
+from agents.network.shutdown import closing_cleanly
 from agents.runtime.lifeline import SILENCE_S
 from experiments.definition import mesh
 from experiments.file import document
@@ -104,8 +104,8 @@ class News:
         return events
 
 
-Show = Callable[[Progress], None]
-Shown = AbstractContextManager[Show]  # a live table takes the terminal over
+ShowProgress = Callable[[Progress], None]
+ProgressDisplay = AbstractContextManager[ShowProgress]  # a live table takes the terminal over
 
 
 class RunFailed(ExplainedError):
@@ -128,7 +128,7 @@ class NetworkView:
             identity=context.identity,
             rights=mesh.member_rights(context.plan, endpoints),
         )
-        self.session, declared = stack.enter_context(held(opened))
+        self.session, declared = stack.enter_context(closing_cleanly(opened))
         declared.append(self)
         session = self.session
         self._events = pubsub.pose_publisher(session, keys.event, messages.JSON, pubsub.EVENTS)

@@ -76,7 +76,7 @@ STARTS: Final = 4  # a process that dies more often is not helped by another sta
 
 
 @dataclass
-class _Servant:
+class _Supervised:
     """Supervised process; texts for the robots' state meanwhile, and when it is given up."""
 
     start: Callable[[], object]
@@ -85,7 +85,7 @@ class _Servant:
     starts: int = 1
 
 
-class Servants:
+class SupportProcesses:
     """Supervised processes of one case: routers, world, central controller, motion capture; and protocol twins."""
 
     standins: list[str]  # processes of protocol twins, world and motion capture
@@ -96,17 +96,17 @@ class Servants:
         self.standins = []
         count = context.plan.experiment.network.routers
         self._known = {
-            each.name: _Servant(
+            each.name: _Supervised(
                 partial(each.start, context.launcher, context.rights),
                 ": all go on at another meanwhile" if count > 1 else "",
                 ": no other takes its place" if count > 1 else ": the robots hold, and land at the end",
             )
             for each in make_routers(context.hosts.routers, count)
-        } | {context.process("world"): _Servant(partial(start_world, context))}
+        } | {context.process("world"): _Supervised(partial(start_world, context))}
 
     def supervise(self, start: Callable[[], Process], meanwhile: str, given_up: str) -> None:
         """Start a process of the case, and again when it dies."""
-        self._known[start().name] = _Servant(start, meanwhile, given_up)
+        self._known[start().name] = _Supervised(start, meanwhile, given_up)
 
     def start(self) -> Plan:
         """Start what the robots of the case need; return the case with the addresses of its robots.
@@ -138,7 +138,7 @@ class Servants:
         if context.plan.guided:
             centre = partial(context.start, "centre", "experiments.real_time.processes.centre", str(context.file))
             given_up = ": the robots that it guides hold, and land at the end"
-            self._known[centre().name] = _Servant(centre, given_up=given_up)
+            self._known[centre().name] = _Supervised(centre, given_up=given_up)
         return addressed
 
     def _start_positioning(self, plan: Plan) -> None:
@@ -160,7 +160,7 @@ class Servants:
         bridge = partial(context.start, "vicon", "bridges.vicon.publisher", host, *maps, *realm)
         self.standins.append(bridge().name)
         hold = ": robots without a position hold, drones land"
-        self._known[self.standins[-1]] = _Servant(bridge, hold, hold)
+        self._known[self.standins[-1]] = _Supervised(bridge, hold, hold)
 
     def again(self, process: Process) -> tuple[str, str] | None:
         """Restart a process that has died; its role and the text of the event. None if it is not supervised."""

@@ -28,7 +28,7 @@ INSTALL: Final = "`./zenpark hosts install FILE` puts the right ones there"
 SHOWN: Final = 12  # digits of a fingerprint, for people
 
 
-class Held(msgspec.Struct, frozen=True, omit_defaults=True):
+class IdentityFiles(msgspec.Struct, frozen=True, omit_defaults=True):
     """An identity on a machine: its certificate (PEM, "" if there is none), and what is wrong with its files."""
 
     name: str
@@ -36,19 +36,19 @@ class Held(msgspec.Struct, frozen=True, omit_defaults=True):
     wrong: str = ""
 
 
-class Holding(msgspec.Struct, frozen=True, omit_defaults=True):
+class FolderContent(msgspec.Struct, frozen=True, omit_defaults=True):
     """Content of a folder: its authority (PEM), the requested identities, and keys of others."""
 
     authority: str = ""
-    held: list[Held] = []
+    identities: list[IdentityFiles] = []
     others: list[str] = []
 
 
-def held(folder: Path, names: Sequence[str]) -> Holding:
+def read_folder(folder: Path, names: Sequence[str]) -> FolderContent:
     """Content of a folder on this machine, of the identities `names`."""
-    return Holding(
+    return FolderContent(
         _text(folder / f"{AUTHORITY}.pem"),
-        [Held(name, _text(folder / f"{name}.pem"), _wrong(folder, name)) for name in names],
+        [IdentityFiles(name, _text(folder / f"{name}.pem"), _wrong(folder, name)) for name in names],
         sorted(file.stem for file in folder.glob("*.key") if file.stem not in names),
     )
 
@@ -110,7 +110,7 @@ def days_left(folder: Path, names: Sequence[str]) -> float:
     return (min(ends) - datetime.now(UTC)).total_seconds() / 86400.0 if ends else 0.0
 
 
-def faults(found: Holding, folder: Path, there: float) -> Iterator[str]:
+def faults(found: FolderContent, folder: Path, there: float) -> Iterator[str]:
     """Faults of the certificates of a machine, each with its remedy.
 
     Args:
@@ -119,7 +119,7 @@ def faults(found: Holding, folder: Path, there: float) -> Iterator[str]:
     """
     from cryptography import x509  # noqa: PLC0415 - 4.5 MB that runs without a lab do without
 
-    names = ", ".join(each.name for each in found.held)
+    names = ", ".join(each.name for each in found.identities)
     if not found.authority:
         yield f"has no certificates of {names}; {INSTALL}"
         return
@@ -131,7 +131,7 @@ def faults(found: Holding, folder: Path, there: float) -> Iterator[str]:
         )
         return
     known = register(folder).identities
-    for each in found.held:
+    for each in found.identities:
         if each.name not in known:
             yield f"{each.name} is not in the lab {folder}; `./zenpark lab issue {folder} {each.name}`, then {INSTALL}"
             continue
@@ -169,7 +169,7 @@ def unnamed(endpoints: Sequence[str], folder: Path) -> Iterator[str]:
             )
 
 
-def strays(found: Holding, host: str) -> Iterator[str]:
+def misplaced_keys(found: FolderContent, host: str) -> Iterator[str]:
     """Keys that do not belong to a machine, with the remedy."""
     if found.others:
         keys = ", ".join(f"{name}.key" for name in found.others)

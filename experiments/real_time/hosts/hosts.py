@@ -188,9 +188,9 @@ class Station:
         self.clock = msgspec.structs.replace(self.clock, applied=applied)
         return self.clock
 
-    def holds(self, names: Sequence[str]) -> certificates.Holding:
+    def folder_content(self, names: Sequence[str]) -> certificates.FolderContent:
         """Certificates of some robots in its folder."""
-        return self.ask(Question("certificates", lab=self.folder, names=list(names)))[0].holds
+        return self.ask(Question("certificates", lab=self.folder, names=list(names)))[0].content
 
     def distrusted(self, names: Sequence[str]) -> list[str]:
         """Reasons why its robots and a router would refuse each other, in a lab, each with its remedy."""
@@ -198,7 +198,7 @@ class Station:
             return []
         answer = self.ask(Question("certificates", lab=self.folder, names=list(names)))[0]
         found = [
-            *certificates.faults(answer.holds, self.lab, answer.clock),
+            *certificates.faults(answer.content, self.lab, answer.clock),
             *certificates.unnamed(self.endpoints, self.lab),
         ]
         return [f"{self.name}: {fault}" for fault in found]

@@ -54,7 +54,7 @@ class Question(msgspec.Struct, frozen=True, omit_defaults=True):
     names: list[str] = []  # certificates that are asked for, or shown to routers
 
 
-class Found(msgspec.Struct, frozen=True):
+class HostCheck(msgspec.Struct, frozen=True):
     """A thing that was looked for."""
 
     what: str
@@ -71,8 +71,8 @@ class Answer(msgspec.Struct, frozen=True, omit_defaults=True):
     python: str = ""
     machine: str = ""
     seen_from: str = ""
-    found: list[Found] = []
-    holds: certificates.Holding = certificates.Holding()
+    found: list[HostCheck] = []
+    content: certificates.FolderContent = certificates.FolderContent()
 
 
 def answer(question: Question, clock: float) -> Answer:
@@ -83,11 +83,13 @@ def answer(question: Question, clock: float) -> Answer:
         case "reach":
             return Answer(code, clock, found=[_reach(endpoint, question) for endpoint in question.endpoints])
         case "certificates":
-            return Answer(code, clock, holds=certificates.held(Path(question.lab or "."), question.names))
+            return Answer(code, clock, content=certificates.read_folder(Path(question.lab or "."), question.names))
         case "devices":
             return Answer(code, clock, found=list(devices(question.bodies)))
         case "sweep":
-            return Answer(code, clock, found=[Found(str(pid), False, "was killed") for pid in kill(_other_processes())])
+            return Answer(
+                code, clock, found=[HostCheck(str(pid), False, "was killed") for pid in kill(_other_processes())]
+            )
         case _:
             return Answer(
                 code,
@@ -99,37 +101,39 @@ def answer(question: Question, clock: float) -> Answer:
             )
 
 
-def _reach(endpoint: str, question: Question) -> Found:
+def _reach(endpoint: str, question: Question) -> HostCheck:
     began = time.monotonic()
     identity = question.names[0] if question.names else None
     try:
         routers = lab.secured([endpoint], question.lab)
         with network.open_session(routers, name="zenpark hosts", wait_s=REACH_S, identity=identity):
-            return Found(endpoint, True, f"{(time.monotonic() - began) * 1e3:.0f} ms")
+            return HostCheck(endpoint, True, f"{(time.monotonic() - began) * 1e3:.0f} ms")
     except ExplainedError as error:
-        return Found(endpoint, False, str(error))
+        return HostCheck(endpoint, False, str(error))
 
 
-def devices(bodies: Sequence[str]) -> Iterator[Found]:
+def devices(bodies: Sequence[str]) -> Iterator[HostCheck]:
     """Needs of the bodies of a host's robots: libraries, radios, serial ports, and the right to use them."""
     words = {registry.body_name(body) for body in bodies}
     for library in sorted(filter(None, {missing_library(word) for word in words})):
-        yield Found(library, False, "is missing: `./zenpark hardware` there adds it")
+        yield HostCheck(library, False, "is missing: `./zenpark hardware` there adds it")
     if words & {"radio", "usb"}:
         radios = list(_radios())
         yield from radios or [
-            Found("Crazyradio", False, "none is plugged in: plug one in there, or let its robots run on another host")
+            HostCheck(
+                "Crazyradio", False, "none is plugged in: plug one in there, or let its robots run on another host"
+            )
         ]
     for port in sorted({match[0] for body in bodies if (match := re.search(r"/dev/[\w./-]+", body))}):
         if not Path(port).exists():
-            yield Found(port, False, "is not there: is it plugged in?")
+            yield HostCheck(port, False, "is not there: is it plugged in?")
         elif not os.access(port, os.R_OK | os.W_OK):
-            yield Found(port, False, "may not be used: sudo usermod -aG dialout $USER, then log in again")
+            yield HostCheck(port, False, "may not be used: sudo usermod -aG dialout $USER, then log in again")
         else:
-            yield Found(port, True, "may be used")
+            yield HostCheck(port, True, "may be used")
 
 
-def _radios() -> Iterator[Found]:
+def _radios() -> Iterator[HostCheck]:
     for device in sorted(USB.glob("*")):
         try:
             vendor, product = ((device / name).read_text().strip() for name in ("idVendor", "idProduct"))
@@ -140,7 +144,7 @@ def _radios() -> Iterator[Found]:
         if name is not None:
             node = f"/dev/bus/usb/{bus:03}/{number:03}"
             well = os.access(node, os.W_OK)
-            yield Found(name, well, "may be used" if well else f"{node} may not be written: {UDEV}")
+            yield HostCheck(name, well, "may be used" if well else f"{node} may not be written: {UDEV}")
 
 
 def _other_processes() -> list[int]:

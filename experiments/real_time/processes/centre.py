@@ -94,7 +94,7 @@ class CentreProcess:
         ticks.zero += self.patience_s
         token = pubsub.alive_token(self._session, self._keys.centre_alive)
         while not over.wait(ticks.until_next()):
-            if self._ownership.settle(self._session, over.is_set):
+            if self._ownership.wait_while_checking(self._session, over.is_set):
                 continue
             ticks.until_next()  # a wait that lasted too long skips as well: goals for a past instant help nobody
             missed = ticks.begin()
@@ -103,7 +103,7 @@ class CentreProcess:
             t = ticks.t
             self._receive(t)
             goals = self.centre.decide(t, self._phase, self._start)
-            if not self._ownership.settle(self._session, over.is_set):
+            if not self._ownership.wait_while_checking(self._session, over.is_set):
                 self._send(goals, t)
                 self._send_memories(t)
             if t - self._reported >= REPORT_S - 1e-6:

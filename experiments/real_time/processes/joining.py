@@ -22,7 +22,7 @@ from agents.network import session as network
 from agents.network.endpoints import DEFAULT_ENDPOINT
 from agents.network.keys import Keys
 from agents.network.name_ownership import NameTaken, OwnershipCheck, claim
-from agents.network.shutdown import held
+from agents.network.shutdown import closing_cleanly
 from agents.runtime.command_line import on_termination
 from agents.runtime.lifeline import SILENCE_S, Lifeline
 from experiments.definition import mesh
@@ -84,7 +84,7 @@ def joined(
         Lifeline(lost).start()
     with on_termination(on_signal):
         session = network.open_session(endpoints, name=name, stop=stop, rights=mesh.member_rights(plan, endpoints))
-        with held(session) as (session, declared):
+        with closing_cleanly(session) as (session, declared):
             if token:
                 try:
                     declared.append(claim(session, [token], began=began, endpoints=endpoints, stop=stop))

@@ -20,7 +20,7 @@ from agents.network import messages, pubsub
 from agents.network import session as network
 from agents.network.endpoints import DEFAULT_ENDPOINT
 from agents.network.keys import Keys
-from agents.network.shutdown import Farewell, end, held
+from agents.network.shutdown import Farewell, closing_cleanly, end
 from agents.plugins import registry
 from agents.runtime import command_line
 from agents.runtime.command_line import on_termination
@@ -108,7 +108,7 @@ def _serve(
         truths, ended = list[zenoh.Publisher](), lost.is_set
         if connect:
             opened = network.open_session(connect, name=word, stop=over, identity=identity)
-            session, declared = stack.enter_context(held(opened))
+            session, declared = stack.enter_context(closing_cleanly(opened))
             truths = [pubsub.publisher(session, keys.truth(name), messages.JSON) for name in names]
             farewell = Farewell(session, keys, names, lost)
             declared += [truths, farewell]

@@ -90,7 +90,7 @@ class WorldProcess:
         self._over = over
         while not over.is_set():
             time.sleep(ticks.until_next())
-            if self._ownership.settle(self._session, self._ended):
+            if self._ownership.wait_while_checking(self._session, self._ended):
                 continue
             ticks.until_next()  # a sleep that lasted too long is lost time as well
             if missed := ticks.begin():
@@ -118,7 +118,7 @@ class WorldProcess:
             self.exchange.commands.apply(t)
             self._population.advance()
             self._pace.ticks += 1
-        if self._ownership.settle(self._session, self._ended):
+        if self._ownership.wait_while_checking(self._session, self._ended):
             return
         self.exchange.publish(t)
         if changed:

@@ -4,7 +4,7 @@ from math import inf, isnan, nan
 
 import pytest
 
-from agents.decision.centralised import Guidance
+from agents.decision.centralised import ReceivedGoals
 from agents.decision.lifecycle import AIRBORNE, IDLE, LANDING, READY, RUNNING
 from agents.robot import Robot
 from experiments.definition.experiment import Experiment, Formation, Hybrid, Start
@@ -178,7 +178,7 @@ def test_hybrid_leaves_the_law_to_others():
 
 
 def test_age_of_guidance():
-    guidance = Guidance(flies=True, silence_s=1.0)
+    guidance = ReceivedGoals(flies=True, silence_s=1.0)
     assert guidance.missing
     assert guidance.unguided(0.0)
     guidance.receive((0.0, 0.0, 1.0), nan, 4.0)

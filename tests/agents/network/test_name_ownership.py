@@ -15,7 +15,7 @@ import pytest
 from agents.network import name_ownership, pubsub
 from agents.network import session as network
 from agents.network.keys import Keys
-from agents.network.name_ownership import NameTaken, claim, keep
+from agents.network.name_ownership import NameTaken, claim, confirm_ownership
 from agents.runtime.loop import Runtime, Setup
 from experiments.definition.experiment import Formation, Robot
 from experiments.definition.plan import Plan
@@ -167,7 +167,7 @@ def woken(table: Table, who: str, tokens: list[str]) -> Callable[[], object]:
         for token in tokens:
             table.step(who)
             table.tokens.append(token)
-        return keep(Session(table, who), [KEY], threading.Event())
+        return confirm_ownership(Session(table, who), [KEY], threading.Event())
 
     return work
 

@@ -11,7 +11,7 @@ import time
 from experiments.file import document
 from experiments.metrics import measure as metrics
 from experiments.virtual_time import stretch
-from experiments.virtual_time.log import Logbook
+from experiments.virtual_time.log import RunRecorder
 from experiments.virtual_time.simulation import Flight
 from tests.bench.drivers import ring
 
@@ -84,7 +84,7 @@ def measure(robots, kind, engine, evaluator, duration_s, *, complete=False):
     if evaluator == "compiled" and (flight.stretches is None or flight.stretches.flown < 0.9 * ticks):
         raise SystemExit(f"not compiled: {stretch.REFUSED}")
     if complete:
-        measured = metrics.measure(Logbook(flight.log(), flown, case).trace())
+        measured = metrics.measure(RunRecorder(flight.log(), flown, case).trace())
         found["metrics_s"] = time.process_time() - end
         if duration_s >= FORMED_S and any(robot.acquired_s is None for robot in measured.robots):
             raise SystemExit("the ring does not form")

@@ -5,7 +5,7 @@ import pytest
 from agents.decision.lifecycle import Lifecycle, Phase
 from agents.kinds.crazyflie import CRAZYFLIE
 from agents.safety.detection import Ascent
-from agents.safety.obedience import Obedience
+from agents.safety.motion_check import MotionCheck
 from agents.safety.setpoint_filter import OUTSIDE_M
 from experiments.real_time.conductor.hot_changes import CLIMB_S
 from tests.bridges.crazyflie_clock import TICK, Fleet
@@ -22,7 +22,7 @@ HEIGHTS = [
 def test_ready_at_height_in_spite_of_the_overshoot(monkeypatch, height, soon):
     """Followed by lifecycle and detectors as in a robot's process, for 12 s at its height."""
     lifecycle, setpoint = Lifecycle(CRAZYFLIE, height, 100.0), (0.0, 0.0, height, 0.0)
-    ascent, obedience = Ascent(CRAZYFLIE, height), Obedience(CRAZYFLIE)
+    ascent, motion_check = Ascent(CRAZYFLIE, height), MotionCheck(CRAZYFLIE)
     with Fleet(monkeypatch, 1, 500.0) as fleet:
         flock = fleet.twin.flock
 
@@ -31,7 +31,7 @@ def test_ready_at_height_in_spite_of_the_overshoot(monkeypatch, height, soon):
             flying, yaw = bool(flock.quadrotor.flying[0]), float(flock.quadrotor.yaw[0])
             lifecycle.advance(t, position, velocity, flying=flying, ready=ready)
             ascent.update(t, lifecycle.climbing, flying, position)
-            obedience.update(t, setpoint, position, yaw, not lifecycle.climbing)
+            motion_check.update(t, setpoint, position, yaw, not lifecycle.climbing)
 
         advance(0.0, ready=True)
         assert lifecycle.takeoff() == ""
@@ -47,8 +47,8 @@ def test_ready_at_height_in_spite_of_the_overshoot(monkeypatch, height, soon):
                 since = fleet.now
             assert not ascent.carried
             assert not ascent.stalled
-            assert not obedience.still
-            assert not obedience.strays
+            assert not motion_check.unresponsive
+            assert not motion_check.uncommanded
             assert t < soon or since is not None
             highest = max(highest, float(fleet.heights[0]))
         assert lifecycle.phase == Phase.RUNNING

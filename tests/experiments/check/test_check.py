@@ -20,7 +20,7 @@ from agents.plugins.laws import Gradient
 from agents.vectors import UNKNOWN, ZERO, norm
 from experiments.check.analysis import analyse
 from experiments.check.check import check, examine, figures
-from experiments.check.findings import Figures
+from experiments.check.findings import CheckNumbers
 from experiments.check.ideal_run import Prediction
 from experiments.check.safety import batteries
 from experiments.definition.experiment import Experiment, Formation, Leg, Robot
@@ -304,7 +304,7 @@ def test_json(capsys):
     assert said["ok"] is False
     assert said["findings"][0]["code"] == "too-high"
     assert said["figures"].keys() == {"periodic", "event"}
-    assert said["figures"]["event"].keys() == set(Figures.__struct_fields__)
+    assert said["figures"]["event"].keys() == set(CheckNumbers.__struct_fields__)
     assert commands.check("triangle", settings=[], as_json=True) == 0
     assert json.loads(capsys.readouterr().out)["ok"] is True
 

@@ -17,7 +17,7 @@ from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.sweep.runs import run_metrics
 from experiments.virtual_time import conductor, simulation, stretch
-from experiments.virtual_time.log import Logbook
+from experiments.virtual_time.log import RunRecorder
 from tests.experiments.checked import GROUND, assert_found, bad, ground, of
 from twins.models.quadrotor import Quadrotor
 
@@ -49,7 +49,7 @@ def test_wheels_stop_before_weak_formation_is_acquired():
     numbers = figures(Plan(weak))
     assert numbers.acquired_s is None
     log = simulation.simulate(Plan(msgspec.structs.replace(weak, seed=7)), 7, lean=True)
-    run = run_metrics(Logbook(log, Plan(weak), "").trace())
+    run = run_metrics(RunRecorder(log, Plan(weak), "").trace())
     assert run.values["acquired_s"] is None
     last = log.true_position[log.time <= weak.duration_s][-1]
     off = max(abs(float(np.hypot(*(last[i] - last[j])[:2])) - 1.0) for i, j in ((0, 1), (1, 2), (0, 2)))
@@ -117,7 +117,7 @@ def flat_strip(gain: float, jitter: float = 0.01, duration_s: float = 30.0) -> E
 def late(experiment: Experiment, seeds: list[int]) -> int:
     """Number of runs with these seeds that acquire after 15 s, in the mean of the robots, or not at all."""
     logs = (simulation.simulate(Plan(experiment), seed, lean=True) for seed in seeds)
-    runs = [run_metrics(Logbook(log, Plan(experiment), "").trace()) for log in logs]
+    runs = [run_metrics(RunRecorder(log, Plan(experiment), "").trace()) for log in logs]
     return sum(run.values["acquired_s"] is None or run.values["acquired_s"] > 15.0 for run in runs)
 
 

@@ -22,10 +22,10 @@ from experiments.metrics.metric import Metric
 from experiments.metrics.statistics import Spread, ratios
 from experiments.report import figures, metrics_files, tables
 from experiments.sweep import runs
-from experiments.sweep.optimise import Limit, Wish, wish_of
+from experiments.sweep.optimise import Limit, Objective, parse_objective
 from experiments.sweep.pareto import front
 from experiments.sweep.table import CellRow
-from experiments.virtual_time.log import Logbook
+from experiments.virtual_time.log import RunRecorder
 from experiments.virtual_time.simulation import simulate
 from tests.agents.plugins.test_plugins_outside import ROOT, install
 from tests.shell import shell
@@ -180,7 +180,7 @@ def triangle():
 
 @pytest.fixture(scope="module")
 def trace(triangle):
-    return Logbook(simulate(Plan(triangle), 1), Plan(triangle), "event").trace()
+    return RunRecorder(simulate(Plan(triangle), 1), Plan(triangle), "event").trace()
 
 
 @pytest.fixture(scope="module")
@@ -237,11 +237,11 @@ def test_store_of_a_sweep_knows_the_metrics(known, triangle, monkeypatch):
 
 def test_search_for_more_of_a_metric(known):
     known(way_m=Way(), height=Height())
-    assert wish_of("height, way_m<=1.02, height>=0.5") == Wish(
+    assert parse_objective("height, way_m<=1.02, height>=0.5") == Objective(
         "height", (Limit("way_m", 1.02), Limit("height", 0.5, least=True))
     )
     with pytest.raises(DocumentError, match="'way_m>=1' is no limit"):
-        wish_of("height, way_m>=1")
+        parse_objective("height, way_m>=1")
 
 
 def swept(messages, height):
@@ -257,10 +257,10 @@ def test_metric_to_maximise_leads_front_and_search(known):
     known(height=Height())
     low, high = swept(0.5, 0.9), swept(0.5, 1.2)
     assert front([low, high], "height") == [high]
-    wish = wish_of("height, messages<=0.6")
-    assert wish.rank(high) < wish.rank(low)
-    assert wish_of("messages, height>=1.0").kept(high)
-    assert not wish_of("messages, height>=1.0").kept(low)
+    objective = parse_objective("height, messages<=0.6")
+    assert objective.rank(high) < objective.rank(low)
+    assert parse_objective("messages, height>=1.0").kept(high)
+    assert not parse_objective("messages, height>=1.0").kept(low)
 
 
 @pytest.mark.parametrize(

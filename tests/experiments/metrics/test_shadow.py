@@ -106,12 +106,12 @@ def test_without_a_shadow_there_is_none():
     plain = trace(experiment({"A": "crazyflie"}, {}), winding(T)[:, None])
     assert agreement(plain) == [None]
     assert measure.measure(plain).robots[0].shadow is None
-    assert "shadows" not in figures.every([], [plain])
+    assert "shadows" not in figures.all_figures([], [plain])
 
 
 def test_figure_has_a_row_for_each_shadowed_robot():
     known = shadowed(winding(T), winding(T) + np.array([0.02, 0.0, 0.0]))
-    figure = figures.every([], [known, dataclasses.replace(known, case="other")])["shadows"]
+    figure = figures.all_figures([], [known, dataclasses.replace(known, case="other")])["shadows"]
     assert len(figure.axes) == 4
     above, beside = figure.axes[:2]
     np.testing.assert_allclose(above.lines[1].get_xdata() - above.lines[0].get_xdata(), 0.02)

@@ -191,13 +191,13 @@ def test_intervals_reach_one_at_the_longest():
 
 def test_every_figure_and_motions_of_the_first_seed():
     traces = [park("a", seed=seed, duration=22.0) for seed in (2, 1)]
-    drawn = figures.every([measure(each) for each in traces], traces)
+    drawn = figures.all_figures([measure(each) for each in traces], traces)
     assert list(drawn) == ["plan_view", "formation", "errors", "robot_bars", "events", "intervals"]
     line = drawn["plan_view"].axes[0].lines[-2].get_xdata()
     assert line[0] == traces[0].true_position[-1, -1, 0]
     small = crowd(3, duration=1.0)
     flat = dataclasses.replace(small, true_position=small.true_position * [1.0, 1.0, 0.0])
-    assert "formation" not in figures.every([], [flat])
+    assert "formation" not in figures.all_figures([], [flat])
 
 
 def test_cases_are_overlaid_in_space_with_final_links():
@@ -223,7 +223,7 @@ def test_dead_or_silent_robot_can_be_drawn(draw):
 def drawn(traces):
     """All figures, rendered."""
     measured = [measure(each) for each in traces if len(each.time) > 1]
-    made = figures.every(measured, traces)
+    made = figures.all_figures(measured, traces)
     for figure in made.values():
         assert "<svg" in figures.svg(figure)
     return list(made)
@@ -239,7 +239,7 @@ WITHOUT_SPACE = ["errors", "robot_bars", "events", "intervals"]
 
 
 def test_no_trace_gives_no_figure():
-    assert figures.every([], []) == {}
+    assert figures.all_figures([], []) == {}
 
 
 def test_a_trace_that_ends_before_the_first_leg():
@@ -261,7 +261,7 @@ def test_nothing_known_and_hardly_any_time(samples):
 
 def test_no_sample_gives_no_picture():
     known = cut(park(), -1.0)
-    assert figures.every([], [known]) == {}
+    assert figures.all_figures([], [known]) == {}
 
 
 @pytest.mark.parametrize("draw", OF_TRACES, ids=lambda draw: draw.__name__)

@@ -45,7 +45,7 @@ def test_measures_are_means_over_run_and_end(traces, measured):
 
 
 def test_figures_show_measures_and_no_errors(traces, measured):
-    drawn = figures.every(measured, list(traces.values()))
+    drawn = figures.all_figures(measured, list(traces.values()))
     assert {"measures", "robot_bars", "global_bars"} < {*drawn}
     assert "errors" not in drawn
     (axes,) = drawn["measures"].axes

@@ -16,7 +16,7 @@ from experiments.metrics.statistics import spread
 from experiments.recording.run_folder import RunOrigin
 from experiments.report import report
 from experiments.report.metrics_files import write_csv
-from experiments.report.page import Row, Section, Table, date_of, inline, interval, number
+from experiments.report.page import Section, Table, TableRow, date_of, inline, interval, number
 from experiments.report.tables import events_tables, proof_tables, robot_tables, summary_table, whole_tables
 from experiments.report.verdict import findings, left_out
 from tests.experiments.traces import crowd, cut, experiment, park, trace
@@ -160,7 +160,10 @@ def test_an_event_of_all_cases_is_one_row():
 
 
 def test_tables_wider_than_half_a_page_stand_alone():
-    narrow, wide = Table(("Mean", "a"), (Row(("IAE", "1.0")),)), Table(("Mean", "a"), (Row(("IAE", "1.0 ± " * 20)),))
+    narrow, wide = (
+        Table(("Mean", "a"), (TableRow(("IAE", "1.0")),)),
+        Table(("Mean", "a"), (TableRow(("IAE", "1.0 ± " * 20)),)),
+    )
     assert Section("Results", tables=(narrow,) * 3).packed
     assert not Section("Results", tables=(narrow, narrow, wide)).packed
     assert not Section("Results", tables=(narrow,) * 2).packed

@@ -13,7 +13,7 @@ from experiments.report import report
 from experiments.report.page import number
 from experiments.report.tables import network_tables, proof_tables, whole_tables
 from experiments.report.verdict import findings
-from experiments.virtual_time.log import Logbook
+from experiments.virtual_time.log import RunRecorder
 from experiments.virtual_time.simulation import simulate
 from tests.experiments.traces import pair
 
@@ -26,14 +26,14 @@ BAD = Channel(delay_s=0.05, loss=0.2, links={"TB01 > KH01": LinkChannel(loss=0.0
 def run():
     park = load("robotic-park").cases()["periodic"].experiment
     park = msgspec.structs.replace(park, duration_s=4.0, timeline=[], channel=BAD)
-    return Logbook(simulate(Plan(park), 1), Plan(park), "bad")
+    return RunRecorder(simulate(Plan(park), 1), Plan(park), "bad")
 
 
 def test_dropped_differs_from_lost(run):
     measured = measure(run.trace())
     assert measured.modelled
     assert measured.lost == 0
-    links = {(each.sender, each.receiver): each for each in measured.passages}
+    links = {(each.sender, each.receiver): each for each in measured.link_deliveries}
     assert len(links) == 21
     spared = links["TB01", "KH01"]
     assert (spared.dropped, spared.received) == (0, 200)  # that of the end is under way; one from before the start came
@@ -43,7 +43,7 @@ def test_dropped_differs_from_lost(run):
             assert each.dropped == pytest.approx(40, abs=24)
             assert each.received + each.dropped == pytest.approx(200, abs=4)
             assert each.delay_mean == pytest.approx(0.05)
-    assert measured.dropped == sum(each.dropped for each in measured.passages)
+    assert measured.dropped == sum(each.dropped for each in measured.link_deliveries)
     of = {robot.robot: robot.dropped for robot in measured.robots}
     assert of["TB01"] == sum(each.dropped for ends, each in links.items() if ends[0] == "TB01")
     assert sum(of.values()) == measured.dropped
@@ -86,7 +86,7 @@ def test_recording_keeps_dropped_poses(tmp_path, run):
     assert trace.dropped.sum() > 500
     np.testing.assert_array_equal(read.dropped, trace.dropped)
     np.testing.assert_array_equal(read.lost, 0)
-    one, other = measure(read).passages, measure(trace).passages
+    one, other = measure(read).link_deliveries, measure(trace).link_deliveries
     for a, b in zip(one, other, strict=True):
         assert (a.received, a.dropped) == (b.received, b.dropped)
         assert a.delay_mean == pytest.approx(b.delay_mean, abs=1e-5)

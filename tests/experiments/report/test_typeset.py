@@ -1,10 +1,10 @@
 from __future__ import annotations
 
-from experiments.report.page import Row, Table
+from experiments.report.page import Table, TableRow
 from experiments.report.typeset import latex, markdown
 
 TABLE = Table(
-    ("Robot", "IAE [m s]"), (Row((("KH_1", "khepera4"), "1 ± 2")), Row(("mean", "−3"), sum=True)), title="a|b"
+    ("Robot", "IAE [m s]"), (TableRow((("KH_1", "khepera4"), "1 ± 2")), TableRow(("mean", "−3"), sum=True)), title="a|b"
 )
 
 
@@ -35,7 +35,7 @@ def test_a_wide_float_spans_both_columns():
 
 def test_signs_of_users_are_safe_in_latex():
     table = Table(
-        ("[m] a_b", "minimum_interval_s"), (Row(("50 % & #1_~^\\", "0.1")),), title="{σ} $λ → x", note="α ± β"
+        ("[m] a_b", "minimum_interval_s"), (TableRow(("50 % & #1_~^\\", "0.1")),), title="{σ} $λ → x", note="α ± β"
     )
     text = latex([table])
     assert r"{}[m] a\_b & minimum\_interval\_s \\" in text.splitlines()

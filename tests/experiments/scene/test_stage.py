@@ -13,7 +13,18 @@ from agents.network import messages
 from experiments.definition.plan import Plan
 from experiments.file.document import load, loads
 from experiments.scene import markers, models, stage
-from experiments.scene.stage import BAD, FAIR, GOOD, UNKNOWN, Condition, LinkTracker, Moment, Place, Stage, Trail
+from experiments.scene.stage import (
+    BAD,
+    FAIR,
+    GOOD,
+    UNKNOWN,
+    BodyLocation,
+    Condition,
+    LinkTracker,
+    Moment,
+    SceneModel,
+    Trail,
+)
 from tests.experiments import moments
 from twins.scene import Obstacle
 
@@ -23,11 +34,11 @@ def status(phase: str = "running", **fields: object) -> messages.Status:
 
 
 @pytest.fixture(scope="module")
-def park() -> Stage:
-    return Stage.of_plan(load("robotic-park").cases()["event"])
+def park() -> SceneModel:
+    return SceneModel.of_plan(load("robotic-park").cases()["event"])
 
 
-def at_start(park: Stage) -> Moment:
+def at_start(park: SceneModel) -> Moment:
     moment = moments.unknown(park)
     assert park.plan is not None
     for row, robot in enumerate(park.plan.experiment.robots.values()):
@@ -56,9 +67,9 @@ def test_condition_of_a_robot(said, seen, is_):
 
 def test_bodies_are_told_apart():
     assert [stage.place_of(body) for body in ("twin", "crazyflie-twin", "world", "radio://0/80/2M/E7E7E7E701")] == [
-        Place.TWIN, Place.TWIN, Place.WORLD, Place.REAL,
+        BodyLocation.TWIN, BodyLocation.TWIN, BodyLocation.WORLD, BodyLocation.REAL,
     ]  # fmt: skip
-    assert len({tuple(colour) for colour in stage.CHASSIS.values()}) == len(Place)
+    assert len({tuple(colour) for colour in stage.CHASSIS.values()}) == len(BodyLocation)
 
 
 def test_links_change_colour_with_their_error():
@@ -85,7 +96,7 @@ def test_links_that_are_not_there_have_no_error():
         robots.B = { kind = "khepera4", start = [0.5, 0.0] }
         formation.links."A > B" = { distance = 0.5, from_s = 3.0 }
     """
-    pair = Stage.of_plan(loads(text).cases()["default"])
+    pair = SceneModel.of_plan(loads(text).cases()["default"])
     tracker, place = LinkTracker(pair), np.array([[0.0, 0.0, 0.0], [0.6, 0.0, 0.0]])
     assert np.isnan(tracker.errors(1.0, place)).all()
     assert tracker.errors(4.0, place) == pytest.approx([0.1])
@@ -166,7 +177,7 @@ def test_faces_look_outward(mesh):
 
 
 def test_obstacles_stand_where_the_file_says():
-    course = Stage.of_plan(next(iter(load("obstacle-course").cases().values())))
+    course = SceneModel.of_plan(next(iter(load("obstacle-course").cases().values())))
     scene = course.scene
     for k in range(len(scene.names)):
         mesh = models.obstacle(scene, k)
@@ -188,11 +199,11 @@ def test_hanging_obstacle_has_a_height_in_recordings():
 def test_case_with_absent_plugin_is_drawn_without_errors(park):
     assert park.plan is not None
     formation = msgspec.structs.replace(park.plan.experiment.formation, law="not-here")
-    other = Stage.of_plan(park.plan.changed(formation=formation, avoidance="not-here"))
+    other = SceneModel.of_plan(park.plan.changed(formation=formation, avoidance="not-here"))
     assert np.isnan(LinkTracker(other).errors(0.0, at_start(park).position)).all()
 
 
 def test_robots_without_an_experiment_are_drawn_too():
-    found = Stage.of_robots(("A", "B"))
+    found = SceneModel.of_robots(("A", "B"))
     assert LinkTracker(found).errors(None, np.zeros((2, 3))).shape == (0,)
     assert replace(moments.unknown(found)).position.shape == (2, 3)

@@ -11,7 +11,7 @@ from experiments.metrics.metric import swept_metrics
 from experiments.metrics.statistics import Spread
 from experiments.recording import version
 from experiments.sweep import table
-from experiments.sweep.optimise import wish_of
+from experiments.sweep.optimise import parse_objective
 from experiments.sweep.page import _fewest
 from experiments.sweep.pareto import by_environment, front
 from experiments.sweep.plan import arguments, cells
@@ -53,7 +53,7 @@ def test_runs_of_other_length_have_no_ratio():
 def test_cell_with_failed_runs_is_on_no_front():
     landed, whole = _row(0.2, 0.5, failed=1), _row(0.4, 1.0)
     assert front([landed, whole]) == [whole]
-    assert wish_of("messages, iae<=1.01").rank(landed) > wish_of("messages, iae<=1.01").rank(whole)
+    assert parse_objective("messages, iae<=1.01").rank(landed) > parse_objective("messages, iae<=1.01").rank(whole)
     (finding,) = _fewest([landed, whole])
     assert "60.0 %" in finding.text
 

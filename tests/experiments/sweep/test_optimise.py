@@ -5,7 +5,7 @@ import pytest
 from experiments.file.problems import DocumentError
 from experiments.metrics.metric import swept_metrics
 from experiments.metrics.statistics import Spread
-from experiments.sweep.optimise import BROKEN, Limit, Wish, searched, tune, wish_of
+from experiments.sweep.optimise import BROKEN, Limit, Objective, parse_objective, searched, tune
 from experiments.sweep.table import CellRow, relative_metrics
 from tools.commands import sweep as commands
 
@@ -19,9 +19,9 @@ def row(**ratios):
 
 
 def test_a_wish():
-    wish = wish_of("messages, iae<=1.01 ,ITAE < 1.05, acquired<=12")
-    assert wish == Wish("messages", (Limit("iae", 1.01), Limit("itae", 1.05), Limit("acquired_s", 12.0)))
-    assert [str(limit) for limit in wish.limits] == ["IAE ratio <= 1.01", "ITAE ratio <= 1.05", "acquired_s <= 12"]
+    objective = parse_objective("messages, iae<=1.01 ,ITAE < 1.05, acquired<=12")
+    assert objective == Objective("messages", (Limit("iae", 1.01), Limit("itae", 1.05), Limit("acquired_s", 12.0)))
+    assert [str(limit) for limit in objective.limits] == ["IAE ratio <= 1.01", "ITAE ratio <= 1.05", "acquired_s <= 12"]
 
 
 @pytest.mark.parametrize(
@@ -39,7 +39,7 @@ def test_a_wish():
 )
 def test_what_is_wrong_with_a_wish(text, message, hint):
     with pytest.raises(DocumentError) as caught:
-        wish_of(text)
+        parse_objective(text)
     (problem,) = caught.value.problems
     assert problem.file == f'--optimise "{text}"'
     assert message in problem.message
@@ -47,12 +47,12 @@ def test_what_is_wrong_with_a_wish(text, message, hint):
 
 
 def test_limits_precede_messages_and_count_with_their_interval():
-    wish = wish_of("messages, iae<=1.05")
-    assert wish.rank(row(messages=0.2, iae=1.03)) == 0.2
-    assert wish.rank(row(messages=0.1, iae=1.045)) > BROKEN  # 1.045 ± 0.01
-    assert wish.rank(row(iae=1.2)) > wish.rank(row(iae=1.1)) > BROKEN
-    assert wish.kept(row(iae=1.045))
-    assert not wish.kept(row(iae=1.06))
+    objective = parse_objective("messages, iae<=1.05")
+    assert objective.rank(row(messages=0.2, iae=1.03)) == 0.2
+    assert objective.rank(row(messages=0.1, iae=1.045)) > BROKEN  # 1.045 ± 0.01
+    assert objective.rank(row(iae=1.2)) > objective.rank(row(iae=1.1)) > BROKEN
+    assert objective.kept(row(iae=1.045))
+    assert not objective.kept(row(iae=1.06))
 
 
 def test_third_of_the_tuning_seeds_serves_the_search():
@@ -72,13 +72,13 @@ def test_search_finds_fewest_messages_within_the_limit(tuned):
     found, given, options = tuned
     reference, best = found.rows
     assert (reference.case, reference.reference, best.case, best.seeds) == ("periodic", True, "event", 6)
-    assert found.wish.kept(best)
+    assert found.objective.kept(best)
     assert best.ratio["messages"].mean < 0.3
     assert best.parameters == found.chosen[0].parameters
     assert found.chosen[0].seeds == 12
     assert {each.seeds for each in found.tried} == {6}
     assert not set(found.tuning) & set(found.seeds)
-    within = [each for each in found.tried if found.wish.rank(each) < BROKEN]
+    within = [each for each in found.tried if found.objective.rank(each) < BROKEN]
     assert len(within) >= 3
     again = tune("triangle", given, "messages, iae<=1.02", **options)
     assert (again.rows, again.tried) == (found.rows, found.tried)
@@ -87,8 +87,8 @@ def test_search_finds_fewest_messages_within_the_limit(tuned):
 @pytest.mark.nightly
 def test_the_command_tells_on_which_seeds(tuned, capsys):
     found, given, options = tuned
-    wish, folder = "messages, iae<=1.02", str(options["out"])
-    assert commands.sweep("triangle", given, settings=SHORT, out=folder, processes=1, optimise=wish) == 0
+    objective, folder = "messages, iae<=1.02", str(options["out"])
+    assert commands.sweep("triangle", given, settings=SHORT, out=folder, processes=1, optimise=objective) == 0
     said = capsys.readouterr().out
     assert said.startswith("tuned on seeds 101 to 118, reported on seeds 1 to 6\n")
     assert f"{found.rows[1].label}: keeps IAE ratio <= 1.02" in said

@@ -11,7 +11,7 @@ from experiments.file.document import load
 from experiments.metrics import measure
 from experiments.sweep import runs
 from experiments.sweep.runs import WorkResult, code_of, digest, fly, run_metrics
-from experiments.virtual_time.log import Logbook
+from experiments.virtual_time.log import RunRecorder
 from experiments.virtual_time.simulation import simulate
 
 
@@ -24,7 +24,7 @@ def park():
 @pytest.mark.parametrize("seed", [3, 8])
 def test_lean_figures_are_those_of_the_report(park, seed):
     lean, whole = (
-        Logbook(simulate(Plan(park), seed, lean=lean), Plan(park), "event").trace() for lean in (True, False)
+        RunRecorder(simulate(Plan(park), seed, lean=lean), Plan(park), "event").trace() for lean in (True, False)
     )
     figures, measured = run_metrics(lean), measure.measure(whole)
     assert figures == run_metrics(whole)

@@ -174,8 +174,8 @@ def test_number_of_parallel_flights_depends_on_robots():
 
 
 def test_workers_with_other_code_are_refused():
-    with workers(None, 1) as crew, pytest.raises(ExplainedError, match="another version of zenpark"):
-        list(crew.done([Work("x", b'{"title":"","robots":{},"duration_s":1}', (1,), "other")]))
+    with workers(None, 1) as working, pytest.raises(ExplainedError, match="another version of zenpark"):
+        list(working.done([Work("x", b'{"title":"","robots":{},"duration_s":1}', (1,), "other")]))
 
 
 def test_a_scheduler_that_is_none():

@@ -10,7 +10,7 @@ from agents.network import lab
 from agents.network.endpoints import free_endpoint
 from experiments.file.document import load
 from experiments.run import simulate, simulate_seeds
-from experiments.scene.stage import Stage
+from experiments.scene.stage import SceneModel
 from experiments.view.acting import Watched, may_act, parameters
 
 
@@ -31,7 +31,7 @@ def test_only_an_operator_of_a_lab_gives_orders(tmp_path):
 
 
 def test_trigger_and_law_numbers_have_sliders():
-    park = Stage.of_plan(load("robotic-park").cases()["event"])
+    park = SceneModel.of_plan(load("robotic-park").cases()["event"])
     assert [(each.label, each.value) for each in parameters(park)] == [
         ("trigger.threshold [m]", 0.01), ("clamp [m]", 0.1), ("tracking_gain [1/(m²·decision)]", 3.0),
     ]  # fmt: skip

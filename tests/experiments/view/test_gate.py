@@ -15,7 +15,7 @@ from websockets.http11 import Request, Response
 
 from agents.network import messages
 from experiments.file.document import load
-from experiments.scene.stage import Stage
+from experiments.scene.stage import SceneModel
 from experiments.view import acting as orders
 from experiments.view import heartbeat
 from experiments.view.gate import Gate, Seen
@@ -144,7 +144,7 @@ def test_old_pictures_order_no_motion(seen, ordered, operator, monkeypatch):
 
 @pytest.mark.parametrize("sent", [-1.0, 0.0, 1e9, inf, float("nan")])
 def test_slider_values_are_limited_here(sent):
-    threshold = orders.parameters(Stage.of_plan(load("robotic-park").cases()["event"]))[0]
+    threshold = orders.parameters(SceneModel.of_plan(load("robotic-park").cases()["event"]))[0]
     assert threshold.label == "trigger.threshold [m]"
     assert 0.0 < threshold.limited(sent) <= 0.04
 

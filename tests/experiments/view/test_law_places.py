@@ -10,8 +10,8 @@ import pytest
 from experiments.file.document import load
 from experiments.run import simulate
 from experiments.scene import models, tracks
-from experiments.scene.stage import Condition, Stage
-from experiments.view.panel import Row, table
+from experiments.scene.stage import Condition, SceneModel
+from experiments.view.panel import RobotRow, table
 from experiments.view.replay import Film
 
 SHORT = ("duration_s=3.0",)
@@ -36,14 +36,14 @@ def test_said_places_are_those_of_the_memory(flown):
 
 
 def test_places_with_z_and_unknown_ones():
-    stage = Stage.of_plan(load("aggregative", *SHORT).cases()["event"])
+    stage = SceneModel.of_plan(load("aggregative", *SHORT).cases()["event"])
     position = np.full((len(stage.names), 3), 0.7)
     memories = [{"s": (1.0, 2.0, 3.0)}, {"s": (1.0, 2.0)}, {"s": (1.0, 2.0, 3.0, 4.0)}, {"s": (1.0,)}, {}]
     places = stage.said_places(memories, position)[:, 0]
     assert places[:3].tolist() == [[1.0, 2.0, 3.0], [1.0, 2.0, 0.7], [1.0, 2.0, 0.7]]
     assert np.isnan(places[3:]).all()
-    assert not Stage.of_robots(("A",)).place_variables
-    planned = Stage.of_plan(load("mpc", *SHORT).cases()["event"])
+    assert not SceneModel.of_robots(("A",)).place_variables
+    planned = SceneModel.of_plan(load("mpc", *SHORT).cases()["event"])
     path = tuple(float(number) for number in range(32))
     assert planned.said_places([{"path": path}], position)[0].tolist() == [[30.0, 31.0, 0.7]]
 
@@ -56,7 +56,10 @@ def test_measures_stand_in_the_table(flown):
     text = table(rows, film.stage)
     assert all(name in text for name in list(trace.measures)[:3])
     assert (
-        table([Row("A", Condition.ACTIVE, measures={"<b>": 0.12345})], Stage.of_robots(("A",))).count("&lt;b&gt;") == 1
+        table([RobotRow("A", Condition.ACTIVE, measures={"<b>": 0.12345})], SceneModel.of_robots(("A",))).count(
+            "&lt;b&gt;"
+        )
+        == 1
     )
 
 

@@ -14,7 +14,7 @@ from experiments.recording.reader import RecordingError
 from experiments.run import simulate
 from experiments.scene import tracks
 from experiments.scene.stage import BAD, FAIR, Condition
-from experiments.view.panel import History, Row, css, event_list, link_table, table
+from experiments.view.panel import History, RobotRow, css, event_list, link_table, table
 from experiments.view.replay import Clock, Film, marks
 
 GUIDED = ("architecture=centralised",)
@@ -142,8 +142,8 @@ def test_curves_of_many_robots_are_three():
 
 def test_table_shows_the_worst_first_and_escapes_names(flown):
     stage = Film(tracks.read(flown[1])).stage
-    rows = [Row(f"R{k}", Condition.ACTIVE, error=0.001 * k) for k in range(30)]
-    rows[3] = Row("<b>", Condition.DEAD, note="<script>")
+    rows = [RobotRow(f"R{k}", Condition.ACTIVE, error=0.001 * k) for k in range(30)]
+    rows[3] = RobotRow("<b>", Condition.DEAD, note="<script>")
     text = table(rows, stage)
     assert text.index("&lt;b&gt;") < text.index("R29") < text.index("R28")
     assert "<script>" not in text
@@ -161,8 +161,8 @@ def test_warnings_misses_and_leaders_look_so(flown):
     leader = next(name for row, name in enumerate(stage.names) if row not in stage.links.receiver)
     follower = next(name for name in stage.names if name != leader)
     rows = [
-        Row(leader, Condition.ACTIVE, missed=0, delay=-1e-6),
-        Row(follower, Condition.ACTIVE, error=0.01, missed=7, missed_share=0.5, note="warn: a neighbour is lost"),
+        RobotRow(leader, Condition.ACTIVE, missed=0, delay=-1e-6),
+        RobotRow(follower, Condition.ACTIVE, error=0.01, missed=7, missed_share=0.5, note="warn: a neighbour is lost"),
     ]
     text = table(rows, stage)
     assert ">–<" in text

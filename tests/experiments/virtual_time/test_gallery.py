@@ -21,7 +21,7 @@ from experiments.catalogue import index
 from experiments.definition.standby import without_standby
 from experiments.file import document
 from experiments.recording import playback
-from experiments.virtual_time.log import Logbook
+from experiments.virtual_time.log import RunRecorder
 from experiments.virtual_time.simulation import simulate
 
 CASES = ("periodic", "event", "event-loss")
@@ -34,7 +34,7 @@ def flown(name, case, *changes):
     """Log and logbook of a catalogue entry."""
     plan = document.read(index.find_file(name), changes).cases()[case]
     log = simulate(plan, plan.experiment.seed)
-    return log, Logbook(log, plan, case)
+    return log, RunRecorder(log, plan, case)
 
 
 def trace(name, case, *changes):
@@ -184,7 +184,7 @@ def test_relative_event_consensus_keeps_rate_without_floor(loss, silence):
     trigger = f'cases.event.trigger={{ kind = "relative", share = {share}{silence} }}'
     given = document.loads(text, NOISELESS, f"channel.loss={loss}", 'formation.law="displacement"', trigger)
     plan = given.cases()["event"]
-    known = Logbook(simulate(plan, 1), plan, "event").trace()
+    known = RunRecorder(simulate(plan, 1), plan, "event").trace()
     apart, spectrum, gain = apart_from_mean(known), np.linalg.eigvalsh(RING), 2.0 * 0.15  # of a Crazyflie [1/s]
     most = np.sqrt(spectrum[1]) / (2.0 * np.sqrt(2.0 * 2.0))  # share with which ‖A‖ ‖ε‖ outweighs the consensus
     window = (known.time > 2.0) & (known.time < 15.0)
@@ -203,7 +203,7 @@ def test_followers_go_into_the_hull_of_their_leaders():
     bare = "\n".join(line for line in index.find_file("consensus").read_text().splitlines() if " - CF0" not in line)
     given = document.loads(bare, f"formation.links={{ {words} }}", 'formation.law={ kind = "consensus" }')
     plan = given.cases()["periodic"]
-    end = Logbook(simulate(plan, 1), plan, "periodic").trace().true_position[-1, :, :2]
+    end = RunRecorder(simulate(plan, 1), plan, "periodic").trace().true_position[-1, :, :2]
     first, second = end[:2]
     for share, place in zip((0.25, 0.5, 0.75), end[2:], strict=True):
         assert place == pytest.approx((1.0 - share) * first + share * second, abs=0.02)
@@ -425,7 +425,7 @@ def test_integral_action_needs_no_leader_for_the_shape(case):
         .replace("[5.0, 4.0, 2.5]", "[20.0, 20.0, 2.5]")
     )
     plan = document.loads(text).cases()[case]
-    known = Logbook(simulate(plan, 1), plan, case).trace()
+    known = RunRecorder(simulate(plan, 1), plan, case).trace()
     late = known.time > 37.0
     assert np.linalg.norm(out_of_place(known)[late], axis=2).max() < 0.012
     drift = known.true_position[-1, 0, :2] - known.true_position[known.time > 10.0][0, 0, :2]

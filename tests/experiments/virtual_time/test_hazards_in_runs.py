@@ -11,14 +11,14 @@ from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.metrics.measure import measure
 from experiments.recording import playback
-from experiments.virtual_time.log import Logbook
+from experiments.virtual_time.log import RunRecorder
 from experiments.virtual_time.simulation import simulate
 from tests.agents.few import pair
 from tests.agents.swarm import changed
 
 
 def events(log, experiment):
-    trace = Logbook(log, Plan(experiment), "case").trace()
+    trace = RunRecorder(log, Plan(experiment), "case").trace()
     return [(event.source, event.text) for event in trace.events if event.kind == "hazard"]
 
 
@@ -35,7 +35,7 @@ def test_robots_that_come_too_near_hold(tmp_path):
     found = events(log, experiment)
     assert {source for source, _ in found} == {"A", "B"}
     assert ("A", "hold: minimum separation: 0.60 m from B (limit 0.6 m)") in found
-    book = Logbook(log, Plan(experiment), "case")
+    book = RunRecorder(log, Plan(experiment), "case")
     book.record(tmp_path / "case.mcap", 'title = "A pair"')
     read = [event for event in playback.read(tmp_path / "case.mcap").trace.events if event.kind == "hazard"]
     assert {(event.source, event.text) for event in read} == set(found)
@@ -57,7 +57,7 @@ def test_drone_with_low_battery_lands_and_reports_it():
     found = events(log, experiment)
     assert found[0] == ("F", "land: its battery is low: 98% (limit 98%)")
     assert found[1:3] == [("G", "warn: a neighbour is lost: F"), ("G", "hold: all its neighbours are lost: F")]
-    reasons = [status.reason for status in Logbook(log, Plan(experiment), "case")._statuses()]
+    reasons = [status.reason for status in RunRecorder(log, Plan(experiment), "case")._statuses()]
     assert reasons[:2] == ["land: its battery is low: 98% (limit 98%)", "finished"]
 
 
@@ -98,9 +98,9 @@ def test_scripted_landing_silences_and_loses_a_robot(architecture):
     assert log.sent.stamp[log.sent.link == 0].max() < 4.03
     if architecture == "distributed":
         assert ("G", "warn: a neighbour is lost: F") in events(log, experiment)
-    reasons = [status.reason for status in Logbook(log, Plan(experiment), "case")._statuses()]
+    reasons = [status.reason for status in RunRecorder(log, Plan(experiment), "case")._statuses()]
     assert reasons[:3] == ["lands as its file says", "finished", "finished"]
-    assert not measure(Logbook(log, Plan(experiment), "case").trace()).failures
+    assert not measure(RunRecorder(log, Plan(experiment), "case").trace()).failures
 
 
 FINDINGS = {

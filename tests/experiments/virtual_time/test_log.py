@@ -10,7 +10,7 @@ from agents.body.interface import Disturbance
 from experiments.definition.experiment import Arena, Experiment, Formation, Leg, Rates, Robot, Shadow, World
 from experiments.definition.plan import Plan
 from experiments.recording import playback
-from experiments.virtual_time.log import Logbook
+from experiments.virtual_time.log import RunRecorder
 from experiments.virtual_time.simulation import simulate
 from twins.engines.engine import Touch
 from twins.scene import Obstacle
@@ -74,7 +74,7 @@ def equal(one, other, name):
 
 
 def test_logged_and_played_back_runs_are_the_same(log, tmp_path):
-    book = Logbook(log, Plan(experiment()), "only")
+    book = RunRecorder(log, Plan(experiment()), "only")
     book.record(tmp_path / "run.mcap", "")
     played = playback.read(tmp_path / "run.mcap")
     assert played.complete
@@ -87,7 +87,7 @@ def test_logged_and_played_back_runs_are_the_same(log, tmp_path):
 
 
 def test_a_trace_has_the_contacts_of_the_run(log):
-    trace = Logbook(log, Plan(experiment()), "only").trace()
+    trace = RunRecorder(log, Plan(experiment()), "only").trace()
     assert [(c.stamp, c.first, c.second, c.impulse, c.overlap) for c in trace.contacts] == [
         (pytest.approx(0.503), "KH", "CF", 0.2, 0.002),
         (pytest.approx(1.25), "KH", "cart", 0.3, 0.003),
@@ -97,7 +97,7 @@ def test_a_trace_has_the_contacts_of_the_run(log):
 
 
 def test_world_is_logged_each_second_with_moving_things(log):
-    world = Logbook(log, Plan(experiment()), "only").trace().world
+    world = RunRecorder(log, Plan(experiment()), "only").trace().world
     assert [round(said.stamp, 6) for said in world] == [0.0, 1.0, 2.0, 3.0]
     assert [[standing.name for standing in said.obstacles] for said in world] == [["post", "cart"]] * 4
     assert [said.obstacles[1].pose[0] for said in world] == pytest.approx([-0.8, -0.7, -0.6, -0.5])
@@ -109,10 +109,10 @@ def test_world_is_logged_each_second_with_moving_things(log):
 @pytest.mark.parametrize(("engine", "contacts"), [("point-mass", None), ("pymunk", ())])
 def test_engine_without_contacts_found_reports_none(log, engine, contacts):
     quiet = replace(log, touches=())
-    assert Logbook(quiet, Plan(experiment(engine)), "only").trace().contacts == contacts
+    assert RunRecorder(quiet, Plan(experiment(engine)), "only").trace().contacts == contacts
 
 
 def test_nothing_is_said_of_an_empty_place(log):
     quiet = replace(log, touches=(), obstacles=log.obstacles[:, :, :0])
-    trace = Logbook(quiet, Plan(experiment(arena=Arena())), "only").trace()
+    trace = RunRecorder(quiet, Plan(experiment(arena=Arena())), "only").trace()
     assert (trace.world, trace.contacts) == ((), None)

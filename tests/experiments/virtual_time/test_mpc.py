@@ -18,7 +18,7 @@ from agents.vectors import ZERO
 from experiments.catalogue import index
 from experiments.definition.plan import Plan
 from experiments.file import document
-from experiments.virtual_time.log import Logbook
+from experiments.virtual_time.log import RunRecorder
 from experiments.virtual_time.simulation import simulate
 from tests.agents.bench import Bench
 from tests.agents.few import triangle
@@ -62,7 +62,7 @@ def flown(starts, goals, *changes, case="periodic"):
     table = ", ".join(f"{name} = [{x:.4f}, {y:.4f}]" for name, (x, y) in zip(NAMES, goals, strict=True))
     given = document.read(index.find_file("mpc"), [*words, f"formation.law.goal={{ {table} }}", *changes])
     plan = given.cases()[case]
-    return Logbook(simulate(plan, plan.experiment.seed), plan, case).trace()
+    return RunRecorder(simulate(plan, plan.experiment.seed), plan, case).trace()
 
 
 @cache
@@ -140,7 +140,7 @@ law = { kind = "mpc", goal = { KH01 = [1.0, 0.6] } }
 def test_one_robot_reaches_its_goal_within_its_limits(kind):
     text = ALONE.replace("KIND", kind).replace("HOVER", "hover = 0.8" if kind == "crazyflie" else "")
     plan = document.loads(text).cases()["periodic"]
-    trace = Logbook(simulate(plan, 1), plan, "periodic").trace()
+    trace = RunRecorder(simulate(plan, 1), plan, "periodic").trace()
     assert trace.true_position[-1, 0, :2] == pytest.approx([1.0, 0.6], abs=0.02)
     state = trace.memory["state"][:, 0]
     known = state[np.isfinite(state).all(axis=1)]

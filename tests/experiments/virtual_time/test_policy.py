@@ -18,7 +18,7 @@ from agents.vectors import UNKNOWN, ZERO
 from experiments.catalogue import index
 from experiments.file import document
 from experiments.file.document import DocumentError
-from experiments.virtual_time.log import Logbook
+from experiments.virtual_time.log import RunRecorder
 from experiments.virtual_time.simulation import simulate
 
 pytest.importorskip("onnxruntime", reason="the law policy is the extra [policy]: ./zenpark install onnxruntime")
@@ -47,7 +47,7 @@ def test_a_policy_acts_in_flight_as_offline(case, most, monkeypatch):
 
     monkeypatch.setattr(Policy, "step", watched)
     plan = document.read(index.find_file("policy"), []).cases()[case]
-    known = Logbook(simulate(plan, plan.experiment.seed), plan, case).trace()
+    known = RunRecorder(simulate(plan, plan.experiment.seed), plan, case).trace()
     assert len(acted) > 4 * 190
     assert np.array(acted) == pytest.approx(offline(np.array(seen)), abs=1e-6)
     place = known.true_position[..., :2] - SHAPE

@@ -13,7 +13,7 @@ from experiments.definition.experiment import Channel, Experiment, Formation, Le
 from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.virtual_time.conductor import LEAD_S, Stuck
-from experiments.virtual_time.simulation import Log, simulate
+from experiments.virtual_time.simulation import VirtualRunLog, simulate
 
 
 def changed(experiment, **parts):
@@ -42,9 +42,9 @@ def ground(**parts):
     return Experiment(**{**given, **parts})
 
 
-def same(a: Log, b: Log):
+def same(a: VirtualRunLog, b: VirtualRunLog):
     """To the last bit, NaN included."""
-    for field in fields(Log):
+    for field in fields(VirtualRunLog):
         one, other = getattr(a, field.name), getattr(b, field.name)
         if isinstance(one, PoseTable):
             one, other = msgspec.structs.astuple(one)[:6], msgspec.structs.astuple(other)[:6]

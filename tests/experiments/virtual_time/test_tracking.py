@@ -6,7 +6,7 @@ from scipy.special import gammaincinv
 
 from experiments.catalogue import index
 from experiments.file import document
-from experiments.virtual_time.log import Logbook
+from experiments.virtual_time.log import RunRecorder
 from experiments.virtual_time.simulation import simulate
 
 
@@ -40,7 +40,7 @@ def track_centrally(known, steps, seeing):
 def track(case, seed, *changes):
     """Mean squared errors of a place [m²], of the robots and of a central filter, and normalised ones of the robots."""
     plan = document.read(index.find_file("tracking"), changes).cases()[case]
-    known = Logbook(simulate(plan, seed), plan, case).trace()
+    known = RunRecorder(simulate(plan, seed), plan, case).trace()
     seeing, steps = slice(1, None), np.arange(5, len(known.time), 5)
     place = known.true_position[:, 0, :2]
     truth = np.hstack([place, np.gradient(place, known.time, axis=0)])[steps]
@@ -79,7 +79,7 @@ def test_robots_without_sight_know_target_from_others():
     text = index.find_file("tracking").read_text("utf-8")
     bare = "\n".join(line for line in text.splitlines() if not line.startswith(('"TB01 > KH01"', '"TB01 > KH04"')))
     plan = document.loads(bare).cases()["event"]
-    known = Logbook(simulate(plan, 1), plan, "event").trace()
+    known = RunRecorder(simulate(plan, 1), plan, "event").trace()
     late = known.time > 5.0
     assert np.isnan(known.measures["reading"][late][:, [1, 4]]).all()
     apart = known.memory["x"][late][:, 1:, :2] - known.true_position[late, :1, :2]

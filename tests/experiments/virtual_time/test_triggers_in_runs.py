@@ -13,7 +13,7 @@ from experiments.definition.plan import Plan
 from experiments.file import consistency, document
 from experiments.metrics import measure, signals
 from experiments.virtual_time import simulation
-from experiments.virtual_time.log import Logbook
+from experiments.virtual_time.log import RunRecorder
 from tests.agents.swarm import changed
 
 pytestmark = pytest.mark.slow  # runs and reports, whole
@@ -28,7 +28,7 @@ def park():
 
 def measured(experiment, seeds):
     logs = (simulation.simulate(Plan(experiment), seed) for seed in seeds)
-    return [measure.measure(Logbook(log, Plan(experiment), "").trace()) for log in logs]
+    return [measure.measure(RunRecorder(log, Plan(experiment), "").trace()) for log in logs]
 
 
 def mean(cases, index):
@@ -98,7 +98,7 @@ def flown(park):
     """A short run with the chosen trigger on a network with a delay, as a log and as a trace."""
     experiment = changed(park, trigger=CHOSEN, duration_s=8.0, timeline=[], channel=Channel(delay_s=0.05))
     log = simulation.simulate(Plan(experiment), 4)
-    return log, Logbook(log, Plan(experiment), "predictive").trace()
+    return log, RunRecorder(log, Plan(experiment), "predictive").trace()
 
 
 def test_received_poses_equal_sent_ones_with_velocity(flown):
@@ -150,7 +150,7 @@ def test_updates_are_counted_for_each_robot(park):
     experiment = changed(updating(park, {"kind": "send-on-delta", "threshold": 0.02}), duration_s=12.0, timeline=[])
     log = simulation.simulate(Plan(experiment), 1)
     assert log.updates[0] == log.decisions == 120
-    trace = Logbook(log, Plan(experiment), "").trace()
+    trace = RunRecorder(log, Plan(experiment), "").trace()
     np.testing.assert_array_equal(trace.decisions, log.updates)
     assert (trace.decisions[1:] < 120).all()
     assert (trace.decisions[1:] > 10).all()

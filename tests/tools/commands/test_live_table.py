@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.segment import Segment
 
 from agents.network.messages import Event, Status
-from tools.live_table import HEADS, Rank, Row, Trends, drawn, heading, worst_first
+from tools.live_table import HEADS, LiveRow, Rank, Trends, drawn, heading, worst_first
 
 STATUS = Status(
     "robot-01", 10.0, "running", "", "", 0.9, 100, 300, {"robot-02": 0}, {}, 0, 0, 500, 0, 500, 0, 0, 0.0, 1.0, [],
@@ -17,24 +17,24 @@ STATUS = Status(
 EVENTS = [Event(float(k), "hazard", "robot-01", f"number {k} " + "far " * 40) for k in range(9)]
 
 
-def rows(count: int) -> list[Row]:
+def rows(count: int) -> list[LiveRow]:
     return [
-        Row(f"robot-{k:02}", "running", error=0.001 * k, rate=12.5, late=0, lost=3, cpu=0.04, battery=0.8, sent=900,
+        LiveRow(f"robot-{k:02}", "running", error=0.001 * k, rate=12.5, late=0, lost=3, cpu=0.04, battery=0.8, sent=900,
             note="", pid=k + 1)
         for k in range(count)
     ]  # fmt: skip
 
 
-def segments(title: str, rows: list[Row], events: list[Event], width: int, height: int) -> list[list[Segment]]:
+def segments(title: str, rows: list[LiveRow], events: list[Event], width: int, height: int) -> list[list[Segment]]:
     """The table, line by line."""
     return Console(width=width, height=height).render_lines(drawn(title, rows, events, width, height), pad=False)
 
 
-def lines(title: str, rows: list[Row], events: list[Event], width: int, height: int) -> list[str]:
+def lines(title: str, rows: list[LiveRow], events: list[Event], width: int, height: int) -> list[str]:
     return ["".join(part.text for part in line).rstrip() for line in segments(title, rows, events, width, height)]
 
 
-def styles(*rows: Row) -> dict[str, str]:
+def styles(*rows: LiveRow) -> dict[str, str]:
     return {part.text.strip(): str(part.style) for line in segments("t", [*rows], [], 140, 10) for part in line}
 
 
@@ -73,7 +73,7 @@ def test_a_wide_table_has_all_columns_and_totals():
 def test_rows_that_fit_stay_in_their_order():
     few = rows(5)
     assert worst_first(few, fit=True) == few
-    few[3] = Row("robot-03", "lost", Rank.GONE)
+    few[3] = LiveRow("robot-03", "lost", Rank.GONE)
     assert [row.name for row in worst_first(few, fit=True)][:2] == ["robot-03", "robot-00"]
 
 
@@ -118,5 +118,5 @@ def test_what_a_robot_needs(changed, now, gone, rank, phase):
 
 
 def test_text_of_others_cannot_steer_the_terminal():
-    text = lines("t", [Row("a\x1b[2J", "x\ny", note="\x1b]0;z\x07")], [Event(0.0, "k", "s", "\x1b[31m")], 100, 20)
+    text = lines("t", [LiveRow("a\x1b[2J", "x\ny", note="\x1b]0;z\x07")], [Event(0.0, "k", "s", "\x1b[31m")], 100, 20)
     assert all(line.isprintable() for line in text)

@@ -15,7 +15,7 @@ from agents.kinds.turtlebot3 import TURTLEBOT3
 from agents.vectors import ZERO
 from tests.twins.requests import request
 from twins.body import TwinBody
-from twins.engines.engine import Stage, World
+from twins.engines.engine import EngineInput, World
 from twins.engines.point_mass import PointMass
 from twins.scene import Obstacle, Scene
 from twins.sensing.range_sensors import RangeSensors, fan, sensors
@@ -30,7 +30,7 @@ def placed(kinds, carried, *, obstacles=None, size=(6.0, 6.0, 2.5), noise=0.0, m
 
 
 def engine_of(asked, world):
-    return PointMass().build(Stage(asked.kinds, asked.start, asked.yaw, 0.01, world.mirrored, world.scene))
+    return PointMass().build(EngineInput(asked.kinds, asked.start, asked.yaw, 0.01, world.mirrored, world.scene))
 
 
 def distances(ranges, row=None):

@@ -39,7 +39,7 @@ from twins.devices.crazyflie.tables import (
 )
 from twins.devices.crazyflie.trajectories import Trajectories
 
-TOLD: Final = {  # parameters that make a Crazyflie write to its console
+CONSOLE_TEXTS: Final = {  # parameters that make a Crazyflie write to its console
     "system.assertInfo": "SYS: No assert information found\n",
     "system.storageStats": "STORAGE: Used storage: 1 %\n",
     "system.taskDump": "SYSLOAD: Task dump\n",
@@ -47,7 +47,7 @@ TOLD: Final = {  # parameters that make a Crazyflie write to its console
 }
 Send = Callable[[Port, int, bytes], None]
 LEAST: Final = "posCtlPid.thrustMin"
-LARGEST: Final = 2.0**32  # upper bound of whole parameters, far above any length, angle or speed
+MAX_WHOLE_PARAMETER: Final = 2.0**32  # upper bound of whole parameters, far above any length, angle or speed
 LEAST_THRUST, MOST_THRUST = 1000, 60000
 DEFAULT_SPEED: Final = 0.5  # [m/s] mean speed of take-offs and landings with velocity that name none
 CLIMB_THRUST: Final = 24000.0  # additional thrust for a climb of about 1 m/s
@@ -256,8 +256,8 @@ class Drone:
             flock.supervisor.stop(self.row)
         elif name == "memTst.resetW" and value:
             self.memories.write_errors = 0
-        elif name in TOLD and value:
-            self.console(TOLD[name])
+        elif name in CONSOLE_TEXTS and value:
+            self.console(CONSOLE_TEXTS[name])
 
     def _log(self, channel: int, data: bytes) -> bytes | None:
         if channel == 0:
@@ -443,6 +443,6 @@ class Drone:
 def _numbers(packing: struct.Struct, data: bytes) -> tuple[Any, ...]:
     """Numbers packed at the beginning of `data`."""
     values = packing.unpack_from(data)
-    if not all(abs(value) <= LARGEST for value in values):  # NaN fails too
+    if not all(abs(value) <= MAX_WHOLE_PARAMETER for value in values):  # NaN fails too
         raise ValueError(f"{values} are not valid numbers for a robot")
     return values

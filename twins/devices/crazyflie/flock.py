@@ -12,7 +12,7 @@ from agents.body.kinds import Flight
 from agents.kinds.crazyflie import CRAZYFLIE
 from agents.protocols.crazyflie import Lighthouse, Loco, Outside, chosen
 from agents.protocols.crtp import Info, Power
-from twins.arrays import Array, Index, Mask, some
+from twins.arrays import Array, Index, Mask, any_true
 from twins.body import instants
 from twins.devices.crazyflie.commander import Commander
 from twins.devices.crazyflie.memory import Memories
@@ -313,7 +313,7 @@ class Flock:
         before, place = quadrotor.velocity, quadrotor.position.copy()
         quadrotor.advance()
         self._climb(before, place, np.nan_to_num(delayed[:, 2] - place[:, 2]))
-        if some(quadrotor.flying):
+        if any_true(quadrotor.flying):
             # the controller takes what the estimate does not see of the velocity for none
             quadrotor.velocity[:, :2] -= np.where(
                 quadrotor.flying[:, None], self.dt * self._speed_gain[:2] * self.estimator.rate[:, :2], 0.0
@@ -347,7 +347,7 @@ class Flock:
         estimator = self.estimator
         setpoint[:, :3] -= estimator.error
         setpoint[:, 3] -= estimator.turn
-        if some(estimator.turn != 0.0):  # it turns its accelerations by a wrong yaw
+        if any_true(estimator.turn != 0.0):  # it turns its accelerations by a wrong yaw
             place = self.quadrotor.position[:, :2]
             ahead, cos, sin = setpoint[:, :2] - place, np.cos(estimator.turn), np.sin(estimator.turn)
             turned = np.stack([cos * ahead[:, 0] + sin * ahead[:, 1], cos * ahead[:, 1] - sin * ahead[:, 0]], axis=1)

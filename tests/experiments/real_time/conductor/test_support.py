@@ -13,8 +13,8 @@ from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.real_time.conductor import conduct
 from experiments.real_time.conductor.case_context import CaseContext
-from experiments.real_time.conductor.conduct import PORT_CHOICES, RunOptions, Supervision, embody, staged
-from experiments.real_time.conductor.support import STARTS, RouterEnded, Servants
+from experiments.real_time.conductor.conduct import PORT_CHOICES, RunOptions, Supervision, run_setup, with_bodies
+from experiments.real_time.conductor.support import STARTS, RouterEnded, SupportProcesses
 from experiments.real_time.hosts import run_registry
 from experiments.real_time.hosts.hosts import Hosts
 from experiments.real_time.hosts.launcher import ROUTER, Launcher
@@ -35,7 +35,7 @@ def test_dead_router_listens_again_where_machines_expect_it(tmp_path):
     here, everywhere = "tcp/127.0.0.1:7447", "tcp/0.0.0.0:7447"
     experiment = document.read("triangle").experiment
     hosts = Hosts(launcher, [everywhere])
-    servants = Servants(
+    servants = SupportProcesses(
         CaseContext(Plan(experiment), "only", tmp_path, tmp_path / "case.toml", [here], launcher, hosts)
     )
     dead = SimpleNamespace(name=ROUTER, exit="killed by SIGKILL")
@@ -58,13 +58,13 @@ def test_router_with_port_taken_meanwhile_listens_elsewhere(tmp_path, monkeypatc
         chosen = iter(free)
         monkeypatch.setattr(conduct, "free_endpoints", lambda *_, **__: next(chosen))
         read, user = document.read("triangle"), Supervision(nullcontext(), lambda: False)
-        with staged(read, embody(read, RunOptions()), tmp_path, RunOptions(), user) as stage:
+        with run_setup(read, with_bodies(read, RunOptions()), tmp_path, RunOptions(), user) as stage:
             assert stage.context("event").endpoints == free[-1]
             (run,) = [run for run in run_registry.runs() if run.folder == str(tmp_path)]
             assert run.endpoints == free[-1]
         chosen = iter([[taken]] * PORT_CHOICES)
         with pytest.raises(RouterEnded, match="already in use"), ExitStack() as up:
-            up.enter_context(staged(read, embody(read, RunOptions()), tmp_path, RunOptions(), user))
+            up.enter_context(run_setup(read, with_bodies(read, RunOptions()), tmp_path, RunOptions(), user))
 
 
 def test_suspended_launcher_knows_when_its_robots_have_landed(tmp_path, monkeypatch):

@@ -9,14 +9,14 @@ from agents.network.lab import register
 from experiments.definition.experiment import Host
 from experiments.real_time.hosts import authority
 from experiments.real_time.hosts.certificates import (
-    Holding,
+    FolderContent,
     days_left,
     ended,
     faults,
     fingerprint,
-    held,
+    misplaced_keys,
     of_host,
-    strays,
+    read_folder,
     unnamed,
 )
 
@@ -41,14 +41,14 @@ def there(lab, tmp_path):
 
 
 def said(there, lab, clock=None):
-    return list(faults(held(there, ROBOTS), lab, time.time() if clock is None else clock))
+    return list(faults(read_folder(there, ROBOTS), lab, time.time() if clock is None else clock))
 
 
 def test_nothing_is_said_of_what_counts(lab, there):
-    found = held(there, ROBOTS)
-    assert said(there, lab) == list(strays(found, "lab1")) == list(ended(lab, ROBOTS)) == []
+    found = read_folder(there, ROBOTS)
+    assert said(there, lab) == list(misplaced_keys(found, "lab1")) == list(ended(lab, ROBOTS)) == []
     assert days_left(lab, ROBOTS) == pytest.approx(90.0, abs=0.1)
-    assert not any("PRIVATE" in text for text in (found.authority, *(each.certificate for each in found.held)))
+    assert not any("PRIVATE" in text for text in (found.authority, *(each.certificate for each in found.identities)))
 
 
 def test_each_fault_has_its_remedy(lab, there, tmp_path):
@@ -103,7 +103,7 @@ def test_expired_certificates_and_clocks_outside_validity_are_reported(lab, ther
 
 
 def test_robot_outside_the_lab_cannot_be_sent(lab, there):
-    found = Holding(held(there, ROBOTS).authority, held(there, ["TB01"]).held)
+    found = FolderContent(read_folder(there, ROBOTS).authority, read_folder(there, ["TB01"]).identities)
     assert next(faults(found, lab, time.time())).startswith(f"TB01 is not in the lab {lab}; `./zenpark lab issue")
     assert next(ended(lab, ["TB01"])).startswith("TB01 is not in the lab")
     (lab / "CF01.key").unlink()
@@ -114,7 +114,7 @@ def test_robot_outside_the_lab_cannot_be_sent(lab, there):
 def test_keys_of_others_do_not_belong_there(lab, there):
     for name in ("KH02.key", "ca.key"):
         shutil.copy(lab / name, there)
-    (only,) = strays(held(there, ROBOTS), "lab1")
+    (only,) = misplaced_keys(read_folder(there, ROBOTS), "lab1")
     assert only.startswith(
         "holds KH02.key, ca.key, which do not belong on lab1; `./zenpark hosts install FILE` removes"
     )

@@ -1,4 +1,4 @@
-"""Obedience: robots of every kind that are told to move and do not, and robots that move and are not told to."""
+"""Robots of every kind that are commanded to move and do not, and robots that move without a command."""
 
 import math
 
@@ -9,7 +9,7 @@ from agents.kinds.crazyflie import CRAZYFLIE
 from agents.kinds.khepera4 import KHEPERA4
 from agents.kinds.tello import TELLO
 from agents.kinds.turtlebot3 import TURTLEBOT3
-from agents.safety.obedience import Obedience
+from agents.safety.motion_check import MotionCheck
 
 DT = 0.01
 WHEELS = [KHEPERA4, TURTLEBOT3]
@@ -21,7 +21,7 @@ class Told:
     """A robot: its setpoints, and where it is measured."""
 
     def __init__(self, kind):
-        self.kind, self.obedience = kind, Obedience(kind)
+        self.kind, self.motion_check = kind, MotionCheck(kind)
         self.position, self.yaw, self.tick = (0.0, 0.0, 0.0), 0.0, 0
 
     def go(self, seconds, *, told=0.0, told_turn=0.0, speed=0.0, turn=0.0, every=1, step=None):
@@ -37,9 +37,9 @@ class Told:
             if self.kind.takes == "position":
                 here = self.position
                 setpoint = (here[0] + told / self.kind.response, here[1], here[2], 0.0)
-            self.obedience.update(self.tick * DT, setpoint, self.position, self.yaw, True)
+            self.motion_check.update(self.tick * DT, setpoint, self.position, self.yaw, True)
             self.tick += 1
-        return self.obedience.still, self.obedience.strays
+        return self.motion_check.unresponsive, self.motion_check.uncommanded
 
 
 @every_kind
@@ -58,7 +58,7 @@ def test_robot_that_does_not_move(kind):
     robot = Told(kind)
     assert robot.go(1.5, told=kind.speed) == (False, False)
     assert robot.go(2.0, told=kind.speed) == (True, False)
-    assert robot.obedience.told == pytest.approx(3.4 * kind.speed, rel=0.05)
+    assert robot.motion_check.commanded == pytest.approx(3.4 * kind.speed, rel=0.05)
     assert robot.go(1.5, told=kind.speed, speed=0.9 * kind.speed) == (False, False)  # it has begun
 
 
@@ -83,7 +83,7 @@ def test_robot_that_moves_without_being_told(kind):
     robot = Told(kind)
     assert robot.go(2.0) == (False, False)
     assert robot.go(4.0, speed=0.4 * kind.speed) == (False, True)
-    assert robot.obedience.strayed > 0.5 * kind.speed
+    assert robot.motion_check.drifted > 0.5 * kind.speed
     assert robot.go(15.0) == (False, False)
     opposite = Told(kind)
     assert opposite.go(3.0, told=0.5 * kind.speed, speed=-0.5 * kind.speed) == (False, True)
@@ -112,10 +112,10 @@ def test_carried_robot_does_not_stray():
 
 @pytest.mark.parametrize("kind", [TELLO, KHEPERA4], ids=lambda kind: kind.name)
 def test_unwatched_robot_is_obedient(kind):
-    obedience = Obedience(kind)
+    motion_check = MotionCheck(kind)
     for tick in range(1000):
-        obedience.update(tick * DT, (0.0, 0.0, 0.0, 0.0), (0.003 * tick, 0.0, 0.0), 0.0, False)
-        assert (obedience.still, obedience.strays) == (False, False)
+        motion_check.update(tick * DT, (0.0, 0.0, 0.0, 0.0), (0.003 * tick, 0.0, 0.0), 0.0, False)
+        assert (motion_check.unresponsive, motion_check.uncommanded) == (False, False)
 
 
 def test_missed_ticks_begin_anew():
@@ -123,16 +123,16 @@ def test_missed_ticks_begin_anew():
     assert robot.go(3.4, told=KHEPERA4.speed) == (True, False)
     robot.tick += 20
     assert robot.go(DT, told=KHEPERA4.speed) == (False, False)
-    assert robot.obedience.told == 0.0
+    assert robot.motion_check.commanded == 0.0
 
 
 @pytest.mark.parametrize("setpoint", [(math.nan,) * 4, (math.inf, 0.0, 0.0, 0.0)], ids=["none", "infinite"])
 @every_kind
 def test_setpoints_without_numbers_tell_nothing(kind, setpoint):
-    obedience = Obedience(kind)
+    motion_check = MotionCheck(kind)
     for tick in range(500):
-        obedience.update(tick * DT, setpoint, (0.0, 0.0, 0.0), math.inf if tick % 2 else 0.0, True)
-    assert (obedience.told, obedience.strayed, obedience.still) == (0.0, 0.0, False)
+        motion_check.update(tick * DT, setpoint, (0.0, 0.0, 0.0), math.inf if tick % 2 else 0.0, True)
+    assert (motion_check.commanded, motion_check.drifted, motion_check.unresponsive) == (0.0, 0.0, False)
 
 
 @pytest.mark.parametrize(("position", "yaw"), [((1.0, 0.0, 0.5), math.nan), ((1.0, math.nan, 0.5), 0.0)])
@@ -141,8 +141,8 @@ def test_partly_known_pose_is_no_begin(position, yaw):
     robot.position = (1.0, 0.0, 0.5)
     robot.go(1.0, told=0.5, speed=0.5)
     for _ in range(100):
-        robot.obedience.update(robot.tick * DT, (2.0, 0.0, 0.5, 0.0), position, yaw, False)
+        robot.motion_check.update(robot.tick * DT, (2.0, 0.0, 0.5, 0.0), position, yaw, False)
         robot.tick += 1
     assert robot.go(10.0, told=0.5, speed=0.5) == (False, False)
-    assert robot.obedience.strayed < 0.1
+    assert robot.motion_check.drifted < 0.1
     assert robot.go(4.0, speed=0.5) == (False, True)

@@ -1,4 +1,4 @@
-"""Obedience of a body: detection of robots that do not obey commands to move, or move without a command.
+"""Check of a robot's motion: it must move when commanded, and only then.
 
 The commanded motion is that of the setpoint: the speed at which a body closes a position error, a velocity, or a twist
 along the nose. It is added up on every tick, because a setpoint of slow decisions is large after each and small before
@@ -31,19 +31,20 @@ ROUNDING_S: Final = 1e-6
 TURN: Final = 1.5  # tolerated uncommanded rotation of a wheeled robot [rad]
 
 
-class Obedience:
+class MotionCheck:
     """Commanded and measured motion of one robot."""
 
     __slots__ = (
-        "anchor", "anchor_yaw", "begin", "begin_yaw", "by_position", "by_twist", "drift", "due", "flies", "free",
-        "last", "response", "rim", "samples", "slow", "speed", "spin", "still", "strayed", "strays", "told", "told_s",
-        "turn", "turn_before", "turned", "vain", "vain_turn", "way", "way_before", "without", "x", "y", "z",
+        "anchor", "anchor_yaw", "begin", "begin_yaw", "by_position", "by_twist", "commanded", "commanded_s", "drift",
+        "drifted", "due", "flies", "free", "last", "response", "rim", "samples", "slow", "speed", "spin", "turn",
+        "turn_before", "turned", "unanswered", "unanswered_turn", "uncommanded", "unresponsive", "way", "way_before",
+        "without", "x", "y", "z",
     )  # fmt: skip
 
-    still: bool  # it does not obey commands to move
-    strays: bool  # it moves without a command
-    told: float  # commanded travel that it has not moved [m]
-    strayed: float  # uncommanded travel [m]
+    unresponsive: bool  # it does not obey commands to move
+    uncommanded: bool  # it moves without a command
+    commanded: float  # commanded travel that it has not moved [m]
+    drifted: float  # uncommanded travel [m]
     # of its kind
     flies: bool
     by_position: bool  # takes positions as setpoints
@@ -74,9 +75,9 @@ class Obedience:
     # commanded since its last motion
     anchor: Vector  # position then [m]
     anchor_yaw: float  # [rad]
-    told_s: float  # [s], less the pauses
-    vain: Vector  # way [m]
-    vain_turn: float  # [rad]
+    commanded_s: float  # [s], less the pauses
+    unanswered: Vector  # way [m]
+    unanswered_turn: float  # [rad]
 
     def __init__(self, kind: Kind) -> None:
         self.flies, self.speed, self.response = kind.flies, kind.speed, kind.response
@@ -143,44 +144,44 @@ class Obedience:
         """Compare commanded and measured motion at the end of a sample; without one of them the count restarts."""
         way, turn = (self.x, self.y, self.z), self.turned
         self.end_sample(t)
-        told = isfinite(setpoint[0]) and isfinite(setpoint[1]) and isfinite(setpoint[2]) and isfinite(setpoint[3])
+        commanded = isfinite(setpoint[0]) and isfinite(setpoint[1]) and isfinite(setpoint[2]) and isfinite(setpoint[3])
         known = is_finite(position) and isfinite(yaw)
-        if not (watched and told and known) or self.begin[0] != self.begin[0]:
+        if not (watched and commanded and known) or self.begin[0] != self.begin[0]:
             self.forget(position, yaw)
             return
         before = self.way
         self.way = before[0] + way[0], before[1] + way[1], before[2] + way[2]
         self.turn += turn
-        self.count_still(position, yaw, way, turn)
+        self.count_unresponsive(position, yaw, way, turn)
         self.samples += 1
         if self.samples >= PIECE:
             self.samples = 0
-            self.count_strays(position, yaw)
+            self.count_uncommanded(position, yaw)
 
     def end_sample(self, t: float) -> None:
         self.due = t + SAMPLE_S - ROUNDING_S
         self.x = self.y = self.z = self.turned = 0.0
 
-    def count_still(self, position: Vector, yaw: float, way: Vector, turn: float) -> None:
+    def count_unresponsive(self, position: Vector, yaw: float, way: Vector, turn: float) -> None:
         """Add a commanded `way` [m] and `turn` [rad]; the count restarts after a motion."""
         rim = self.rim
         if norm(way) + rim * abs(turn) >= self.slow * SAMPLE_S:
-            vain = self.vain
-            self.vain = vain[0] + way[0], vain[1] + way[1], vain[2] + way[2]
-            self.vain_turn += turn
-            self.told_s += SAMPLE_S
+            unanswered = self.unanswered
+            self.unanswered = unanswered[0] + way[0], unanswered[1] + way[1], unanswered[2] + way[2]
+            self.unanswered_turn += turn
+            self.commanded_s += SAMPLE_S
         else:
-            self.told_s -= SAMPLE_S  # a pause that was as long lets it be forgotten
-        told = norm(self.vain) + rim * abs(self.vain_turn)  # to and fro is no way
+            self.commanded_s -= SAMPLE_S  # a pause that was as long lets it be forgotten
+        commanded = norm(self.unanswered) + rim * abs(self.unanswered_turn)  # to and fro is no way
         moved = distance(position, self.anchor) + rim * abs(wrap(yaw - self.anchor_yaw))
-        if moved > MOVES * max(told, self.without) or self.told_s < 0.0:
-            told = self.told_s = self.vain_turn = 0.0
-            self.vain = ZERO
+        if moved > MOVES * max(commanded, self.without) or self.commanded_s < 0.0:
+            commanded = self.commanded_s = self.unanswered_turn = 0.0
+            self.unanswered = ZERO
             self.anchor, self.anchor_yaw = position, yaw
-        self.told = told
-        self.still = told >= self.without and self.told_s >= LEAST_WITHOUT_S
+        self.commanded = commanded
+        self.unresponsive = commanded >= self.without and self.commanded_s >= LEAST_WITHOUT_S
 
-    def count_strays(self, position: Vector, yaw: float) -> None:
+    def count_uncommanded(self, position: Vector, yaw: float) -> None:
         """Add the motion beyond, against or aside of the commanded travel, in the piece that ends."""
         moved = difference(position, self.begin)
         x, y, z = self.way[0] + self.way_before[0], self.way[1] + self.way_before[1], self.way[2] + self.way_before[2]
@@ -199,19 +200,20 @@ class Obedience:
                 KEPT * drift[2] + moved[2] - obeyed * toward[2],
             )
             if self.by_twist:
-                turned, told = wrap(yaw - self.begin_yaw), self.turn + self.turn_before
-                self.spin = KEPT * self.spin + (turned - clamp(turned, min(told, 0.0), max(told, 0.0)))
-        self.strayed = norm(self.drift)
-        self.strays = self.strayed > self.free or abs(self.spin) > TURN
+                turned, commanded = wrap(yaw - self.begin_yaw), self.turn + self.turn_before
+                self.spin = KEPT * self.spin + (turned - clamp(turned, min(commanded, 0.0), max(commanded, 0.0)))
+        self.drifted = norm(self.drift)
+        self.uncommanded = self.drifted > self.free or abs(self.spin) > TURN
         self.way_before, self.turn_before = self.way, self.turn
         self.way, self.turn = ZERO, 0.0
         self.begin, self.begin_yaw = position, yaw
 
     def forget(self, position: Vector, yaw: float) -> None:
         """Restart at a `position` [m] and `yaw` [rad]."""
-        self.still = self.strays = False
-        self.told = self.told_s = self.strayed = self.vain_turn = self.spin = self.turn = self.turn_before = 0.0
-        self.vain = self.drift = self.way = self.way_before = ZERO
+        self.unresponsive = self.uncommanded = False
+        self.commanded = self.commanded_s = self.drifted = self.unanswered_turn = self.spin = 0.0
+        self.turn = self.turn_before = 0.0
+        self.unanswered = self.drift = self.way = self.way_before = ZERO
         # a place of which a part is unknown is no begin: nothing would ever be nearer to it
         known = is_finite(position) and isfinite(yaw)
         self.begin = self.anchor = position if known else UNKNOWN
