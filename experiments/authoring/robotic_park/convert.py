@@ -253,7 +253,7 @@ def _formation(
     return table, _links(park, found, own, notes), _anchors(park, found, gains, notes)
 
 
-def _divides(park: Park, robot: Robot) -> bool:
+def _divides(park: ParkExperiment, robot: Robot) -> bool:
     """Whether the driver of a robot divides the pull of a neighbour by its distance."""
     return robot.driver.divides and not park.central
 
@@ -267,7 +267,7 @@ def _gain(park: ParkExperiment, robot: Robot, task: Task, distance: float, weigh
     return float(f"{gain:.4g}")
 
 
-def _links(park: Park, found: Heights, own: dict[str, float], notes: list[str]) -> dict[str, Any]:
+def _links(park: ParkExperiment, found: Heights, own: dict[str, float], notes: list[str]) -> dict[str, Any]:
     """The links: one if both ends have the same target, else one for each end."""
     hover = dict(zip((robot.name for robot in park.robots), found.hover.tolist(), strict=True))
     asked: dict[tuple[str, str], tuple[str, tuple[float, ...]]] = {}

@@ -99,7 +99,7 @@ class Heights:
     centre: tuple[float, float, float]  # place of the origin [m]
 
 
-def find_heights(park: Park, notes: list[str]) -> Heights:
+def find_heights(park: ParkExperiment, notes: list[str]) -> Heights:
     """The heights, from the shape in space if links define one.
 
     The origin of their files is a point about which drones spread while they climb. If the shape is not flat, no robot
