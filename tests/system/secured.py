@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import msgspec
+import pytest
 import zenoh
 
 from agents.network import lab, messages
@@ -24,6 +25,11 @@ from tests.system.lab import ENVIRONMENT, ROOT, RobotProcess, Watcher, until
 
 FILE = ROOT / "tests" / "system" / "secured.toml"
 FLOWN = ("KH01", "KH02", "CF01")
+
+
+def refused() -> contextlib.AbstractContextManager[object]:
+    """What a router does with a session that it does not let in."""
+    return pytest.raises(zenoh.ZError, match="Unable to connect")
 
 
 class Laboratory:

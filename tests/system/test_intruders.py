@@ -21,7 +21,7 @@ from agents.network.keys import Keys
 from agents.network.zenoh_config import config, settings
 from experiments.real_time.conductor import orders
 from experiments.real_time.hosts import authority
-from tests.system.secured import FLOWN, Laboratory, copy, elsewhere, flying, steady
+from tests.system.secured import FLOWN, Laboratory, copy, elsewhere, flying, refused, steady
 
 pytestmark = pytest.mark.system
 
@@ -89,7 +89,7 @@ def test_without_a_certificate_nobody_gets_in(laboratory: Laboratory, protocol: 
         chosen.insert_json5(
             "transport/link/tls", json.dumps({"root_ca_certificate": str(laboratory.folder / "ca.pem")})
         )
-    with pytest.raises(zenoh.ZError, match="Unable to connect"):
+    with refused():
         zenoh.open(chosen)
 
 
@@ -97,7 +97,7 @@ def test_a_certificate_of_another_authority_is_refused(laboratory: Laboratory, t
     rogue = elsewhere(tmp_path / "rogue")
     (rogue / "ca.pem").write_bytes((laboratory.folder / "ca.pem").read_bytes())  # it does trust the router
     for identity in ("operator", "KH01", "router"):
-        with pytest.raises(zenoh.ZError, match="Unable to connect"):
+        with refused():
             laboratory.session(identity, rogue)
 
 
@@ -105,7 +105,7 @@ def test_an_ended_certificate_is_refused(laboratory: Laboratory, tmp_path: Path)
     old = copy(laboratory.folder, tmp_path / "old")
     authority.renew(old, ["operator", "KH01"], days=-0.01)
     for identity in ("operator", "KH01"):
-        with pytest.raises(zenoh.ZError, match="Unable to connect"):
+        with refused():
             laboratory.session(identity, old)
 
 
@@ -113,7 +113,7 @@ def test_self_made_authority_of_same_name_is_refused(laboratory: Laboratory, tmp
     forger = copy(laboratory.folder, tmp_path / "forger")
     authority.renew(forger, authority=True)
     (forger / "ca.pem").write_bytes((laboratory.folder / "ca.pem").read_bytes())
-    with pytest.raises(zenoh.ZError, match="Unable to connect"):
+    with refused():
         laboratory.session("operator", forger)
 
 
@@ -132,14 +132,14 @@ def test_a_robots_certificate_does_not_make_a_router(laboratory: Laboratory, tmp
     }.items():
         chosen.insert_json5(key, json.dumps(value))
     (honest,) = lab.secured([plain], laboratory.folder)
-    with zenoh.open(chosen), pytest.raises(zenoh.ZError, match="Unable to connect"):
+    with zenoh.open(chosen), refused():
         zenoh.open(config(settings("client", connect=[honest], name="KH01")))
 
 
 def test_router_outside_its_certificates_addresses_is_refused(laboratory: Laboratory) -> None:
     address = laboratory.plain.rpartition(":")[2]
     (endpoint,) = lab.secured([f"tls/127.0.0.2:{address}"], laboratory.folder)
-    with pytest.raises(zenoh.ZError, match="Unable to connect"):
+    with refused():
         zenoh.open(config(settings("client", connect=[endpoint], name="KH01")))
 
 

@@ -77,13 +77,6 @@ def test_commands():
     )
 
 
-@pytest.mark.parametrize("what", ["vicon", "ros2"])
-def test_every_bridge_has_help(what, capsys):
-    with pytest.raises(SystemExit):
-        app(["bridge", what, "--help"])
-    assert capsys.readouterr().out.startswith(f"usage: zenpark bridge {what} ")
-
-
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_has_help(command):
     said = CliRunner().invoke(app, [command, "--help"])

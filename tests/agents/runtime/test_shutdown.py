@@ -6,6 +6,7 @@ import threading
 from collections.abc import Sequence
 from dataclasses import replace
 from math import inf
+from typing import Any
 
 import pytest
 
@@ -94,6 +95,12 @@ def run(body: Airborne, silence_s: float = 5.0, timing: DescentTiming = QUICK) -
     return net
 
 
+def run_and_break(body: Airborne, **given: Any) -> None:
+    """Run a robot to the error of its loop."""
+    with pytest.raises(OSError, match="the loop breaks"):
+        run(body, **given)
+
+
 @pytest.mark.parametrize("broken", [(), ("read",), ("land",), ("stop",), ("close",), ("read", "land", "stop", "close")])
 def test_shutdown_tries_everything_and_raises(broken):
     body = Airborne(*broken)
@@ -108,16 +115,15 @@ def test_shutdown_tries_everything_and_raises(broken):
 
 def test_robot_is_stopped_once_it_is_down():
     body = Airborne(steps=10)
-    with pytest.raises(OSError, match="the loop breaks"):
-        run(body, timing=replace(QUICK, landing_s=30.0))
+    run_and_break(body, timing=replace(QUICK, landing_s=30.0))
     assert body.steps <= 0
     assert body.calls == ["open", "land", "stop", "close"]
 
 
 def test_slow_descent_is_not_stopped_in_flight():
     body = Airborne(steps=100)  # a second
-    with pytest.raises(OSError, match="the loop breaks"):  # from the ceiling of 2.5 m it takes 20 s
-        run(body, timing=replace(QUICK, landing_s=0.05, slowest=2.5 / 20.0))
+    slow = replace(QUICK, landing_s=0.05, slowest=2.5 / 20.0)  # from the ceiling of 2.5 m it takes 20 s
+    run_and_break(body, timing=slow)
     assert body.steps <= 0
 
 
@@ -161,8 +167,7 @@ def test_emergency_stop_during_a_descent():
             body.net.deliver(sent("park/estop", messages.Stop("a test", "to see"))[0])
 
     body.looks = stop
-    with pytest.raises(OSError, match="the loop breaks"):
-        run(body, timing=replace(QUICK, landing_s=30.0))
+    run_and_break(body, timing=replace(QUICK, landing_s=30.0))
     assert body.order == ["open", "land", "stop", "close"]
 
 
@@ -175,8 +180,7 @@ def test_hanging_read_is_landed_by_the_watchdog():
         landed.set()
 
     body.land, body.looks = told, lambda: landed.wait(10.0)
-    with pytest.raises(OSError, match="the loop breaks"):
-        run(body, silence_s=0.1)
+    run_and_break(body, silence_s=0.1)
     assert landed.is_set()
     assert body.order == ["open", "land", "stop", "close"]
 
@@ -216,6 +220,5 @@ def test_stop_between_ticks_yields_the_processor(monkeypatch):
 
     monkeypatch.setattr(loop.time, "sleep", asleep)
     body.command = command
-    with pytest.raises(OSError, match="the loop breaks"):
-        run(body)
+    run_and_break(body)
     assert done == [done[0], loop.STOP_YIELD_S, done[0]]
