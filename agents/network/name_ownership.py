@@ -12,6 +12,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from math import inf
 from typing import Final
 
@@ -24,10 +25,21 @@ from agents.network import session as network
 from agents.network.keys import Keys
 from agents.network.zenoh_config import LEASE_S
 
-OWNER_VANISH_S: Final = 2.5  # limit for the tokens of a killed owner to vanish
 ANSWER_S: Final = 10.0  # limit for the routers to answer
 TURN_S: Final = 0.01  # between two polls of a check
 SETTLE_S: Final = 0.2  # limit for a token to travel from one router to the next, and for a lost link to be noticed
+
+
+@dataclass(frozen=True)
+class OwnershipTiming:
+    """Limits of the questions who owns a name [s]."""
+
+    vanish_s: float = 2.5  # for the tokens of a killed owner to vanish
+    answer_s: float = ANSWER_S  # for the routers to answer
+    retry_s: float = network.RETRY_S  # between two questions
+
+
+USUAL: Final = OwnershipTiming()
 
 
 class NameTaken(ExplainedError):
@@ -41,6 +53,7 @@ def claim(
     began: float,  # start of the process, UTC [s]
     endpoints: Sequence[str] = (),  # routers; if there are several, tokens get `SETTLE_S` to travel between them
     stop: threading.Event | None = None,  # ends the wait when it is set
+    timing: OwnershipTiming = USUAL,
 ) -> list[zenoh.LivelinessToken]:
     """Takes the ownership of names; returns the tokens that keep it, as long as they are referenced.
 
@@ -48,20 +61,19 @@ def claim(
     later token at the router sees the other token in its round. Exactly one process passes both rounds.
 
     Raises NameTaken if another process owns one of the names, or claimed it earlier; the tokens of a killed process are
-    given `OWNER_VANISH_S` to vanish. Raises network.Unreachable without an answer in `ANSWER_S`, or when `stop` is set.
+    given `vanish_s` to vanish. Raises network.Unreachable without an answer in `answer_s`, or when `stop` is set.
     """
     pause = stop or threading.Event()
     mine = str(session.zid())
-    rank = Keys.rank(began, mine)
+    asked = _Claim(session, alive, mine, Keys.rank(began, mine), pause, timing)
     settle_s = SETTLE_S if len(endpoints) > 1 else 0.0
-    tokens = [pubsub.alive_token(session, Keys.claim(key, rank)) for key in alive]
+    tokens = [pubsub.alive_token(session, Keys.claim(key, asked.rank)) for key in alive]
     try:
         pause.wait(settle_s)
-        _first_round(session, alive, mine, rank, pause)
+        asked.await_free_names()
         tokens += [pubsub.alive_token(session, Keys.life(key, mine)) for key in alive]
         pause.wait(settle_s)
-        others = _earlier_claims(session, alive, mine, rank, pause, owners=False)
-        if others:
+        if others := asked.rivals(owners=False):
             raise NameTaken(", ".join(others))
     except BaseException:
         for token in tokens:
@@ -70,47 +82,55 @@ def claim(
     return tokens
 
 
-def _first_round(session: zenoh.Session, alive: Sequence[str], mine: str, rank: str, pause: threading.Event) -> None:
-    """Waits until no other process owns a name or has an earlier claim."""
-    deadline = time.monotonic() + OWNER_VANISH_S
-    while others := _earlier_claims(session, alive, mine, rank, pause, owners=True):
-        if time.monotonic() > deadline:
-            raise NameTaken(", ".join(others))
-        pause.wait(network.RETRY_S)
+@dataclass(frozen=True)
+class _Claim:
+    """The claim `rank` of the session `mine` on names (their liveliness keys)."""
+
+    session: zenoh.Session
+    alive: Sequence[str]
+    mine: str
+    rank: str
+    pause: threading.Event
+    timing: OwnershipTiming
+
+    def await_free_names(self) -> None:
+        """Waits until no other process owns a name or has an earlier claim."""
+        deadline = time.monotonic() + self.timing.vanish_s
+        while others := self.rivals(owners=True):
+            if time.monotonic() > deadline:
+                raise NameTaken(", ".join(others))
+            self.pause.wait(self.timing.retry_s)
+
+    def rivals(self, *, owners: bool) -> list[str]:
+        """Names with an earlier claim, or with another owner if `owners` count."""
+        answer_s = self.timing.answer_s
+        deadline = time.monotonic() + answer_s
+        while True:
+            found = {key: network.tokens_present(self.session, Keys.lives(key)) for key in self.alive}
+            if self.pause.is_set():
+                raise network.Unreachable("asked to end before the name was taken")
+            if None not in found.values() and network.connected(self.session):
+                break
+            if time.monotonic() > deadline:
+                raise network.Unreachable(f"no router answers who owns the name, for {answer_s:g} s: is it overloaded?")
+            self.pause.wait(self.timing.retry_s)
+        return [key for key, tokens in found.items() if any(self._is_rival(key, each, owners) for each in tokens or ())]
+
+    def _is_rival(self, alive: str, token: str, owners: bool) -> bool:
+        """Whether a token stands in the way."""
+        if (other := Keys.rank_of(alive, token)) is not None:
+            return other < self.rank
+        return owners and token != Keys.life(alive, self.mine)
 
 
-def _earlier_claims(
-    session: zenoh.Session, alive: Sequence[str], mine: str, rank: str, pause: threading.Event, *, owners: bool
-) -> list[str]:
-    """Names (their liveliness keys) with an earlier claim than `rank`, or with another owner if `owners` count."""
-    deadline = time.monotonic() + ANSWER_S
-    while True:
-        found = {key: network.tokens_present(session, Keys.lives(key)) for key in alive}
-        if pause.is_set():
-            raise network.Unreachable("asked to end before the name was taken")
-        if None not in found.values() and network.connected(session):
-            break
-        if time.monotonic() > deadline:
-            raise network.Unreachable(f"no router answers who owns the name, for {ANSWER_S:g} s: is it overloaded?")
-        pause.wait(network.RETRY_S)
-    return [
-        key for key, tokens in found.items() if any(_is_rival(key, token, mine, rank, owners) for token in tokens or ())
-    ]
-
-
-def _is_rival(alive: str, token: str, mine: str, rank: str, owners: bool) -> bool:
-    """Whether a token stands in the way of the claim `rank` of the session `mine`."""
-    if (other := Keys.rank_of(alive, token)) is not None:
-        return other < rank
-    return owners and token != Keys.life(alive, mine)
-
-
-def confirm_ownership(session: zenoh.Session, alive: Sequence[str], pause: threading.Event) -> None:
+def confirm_ownership(
+    session: zenoh.Session, alive: Sequence[str], pause: threading.Event, timing: OwnershipTiming = USUAL
+) -> None:
     """Returns when it is certain that no other process has taken the names since they were owned.
 
     One answer is not enough: a link that is lost ends its questions as an answer does, and a process that takes the
     name may be between its two rounds. No other owner must be seen for `SETTLE_S`. One that is seen may still give way
-    to the claim of this process, for `OWNER_VANISH_S`. `pause` ends the wait when it is set. The tokens of the session
+    to the claim of this process, for `vanish_s`. `pause` ends the wait when it is set. The tokens of the session
     are declared; Zenoh declares them again after it was cut off.
 
     Raises NameTaken if another process owns one of the names, and network.Unreachable if `pause` was set before that
@@ -130,22 +150,22 @@ def confirm_ownership(session: zenoh.Session, alive: Sequence[str], pause: threa
             if any(Keys.life_of(token) not in (None, mine) for token in tokens or ())
         ]:
             free, taken = inf, min(taken, now)
-            if now - taken > OWNER_VANISH_S:
+            if now - taken > timing.vanish_s:
                 raise NameTaken(", ".join(others))
         else:
             free, taken = min(free, now), inf
             if now - free > SETTLE_S:
                 return
-        pause.wait(network.RETRY_S)
+        pause.wait(timing.retry_s)
     raise network.Unreachable("asked to end before it was known whether the name has another owner")
 
 
 class OwnershipCheck:
     """Check whether a process still owns its names, in a thread of its own: a loop polls the result."""
 
-    def __init__(self, alive: Sequence[str], lease_s: float = LEASE_S) -> None:
+    def __init__(self, alive: Sequence[str], lease_s: float = LEASE_S, timing: OwnershipTiming = USUAL) -> None:
         """Begin when the names are owned: liveliness keys `alive`, in a session with the lease `lease_s` [s]."""
-        self._alive, self._stood_s = alive, 0.5 * lease_s
+        self._alive, self._stood_s, self._timing = alive, 0.5 * lease_s, timing
         self.awake_at = uptime()  # last run of the process [s]
         self._taken = ""
         self._asking: threading.Thread | None = None
@@ -194,7 +214,7 @@ class OwnershipCheck:
 
     def _ask(self) -> None:
         try:
-            confirm_ownership(self._session, self._alive, self._over)
+            confirm_ownership(self._session, self._alive, self._over, self._timing)
         except NameTaken as taken:
             self._taken = str(taken)
         except network.Unreachable:
@@ -208,11 +228,11 @@ class NameKeeper:
     thread of its own.
     """
 
-    def __init__(self, keys: Keys, names: Sequence[str], began: float) -> None:
+    def __init__(self, keys: Keys, names: Sequence[str], began: float, timing: OwnershipTiming = USUAL) -> None:
         """Names of a process that began at `began`, UTC [s]."""
         self.hands_off = False  # another process drives the bodies, or may do so
-        self._keys, self._names, self._began = keys, names, began
-        self._check = OwnershipCheck([keys.alive(name) for name in names], network.ROBOT_LEASE_S)
+        self._keys, self._names, self._began, self._timing = keys, names, began, timing
+        self._check = OwnershipCheck([keys.alive(name) for name in names], network.ROBOT_LEASE_S, timing)
         self._owned: list[zenoh.LivelinessToken] = []
         self._tokens: dict[int, zenoh.LivelinessToken] = {}  # by row
         self._lock = threading.Lock()
@@ -221,7 +241,7 @@ class NameKeeper:
         """Claims the names, before any body is touched; raises NameTaken and network.Unreachable as `claim`."""
         alive = [self._keys.alive(name) for name in self._names]
         try:
-            self._owned = claim(session, alive, began=self._began, endpoints=endpoints, stop=stop)
+            self._owned = claim(session, alive, began=self._began, endpoints=endpoints, stop=stop, timing=self._timing)
             self._check.check_standstill()
         except NameTaken as taken:
             raise NameTaken(

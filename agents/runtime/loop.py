@@ -30,7 +30,7 @@ from agents.network import session as network
 from agents.network.access_control import Rights
 from agents.network.channel_model import Conditions
 from agents.network.keys import Keys
-from agents.network.name_ownership import NameKeeper
+from agents.network.name_ownership import NameKeeper, OwnershipTiming
 from agents.network.shutdown import leave
 from agents.plugins.calls import explain
 from agents.plugins.registry import FAILURES
@@ -79,6 +79,7 @@ class Setup:
     wake: bool = False  # a pose of a neighbour wakes the loop
     lifeline_s: float = LIFELINE_S  # silence of the lifeline that counts as its loss [s]
     descent: DescentTiming = field(default_factory=DescentTiming)
+    ownership: OwnershipTiming = field(default_factory=OwnershipTiming)
 
 
 class Runtime:
@@ -105,7 +106,7 @@ class Runtime:
         self.ticks = Ticks(common.body_hz, clock=uptime)
         self._bell = pubsub.Bell() if setup.wake else None
         self._utc = 0.0
-        self._keeper = NameKeeper(setup.keys, self._names, setup.clock.utc())
+        self._keeper = NameKeeper(setup.keys, self._names, setup.clock.utc(), setup.ownership)
         self._reach = validation.reach_of(common.limits.low, common.limits.high)
         self._everyone = tuple(range(len(self._names)))
         self._descent = Descent(

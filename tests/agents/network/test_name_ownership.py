@@ -15,7 +15,7 @@ import pytest
 from agents.network import name_ownership, pubsub
 from agents.network import session as network
 from agents.network.keys import Keys
-from agents.network.name_ownership import NameTaken, claim, confirm_ownership
+from agents.network.name_ownership import NameTaken, OwnershipTiming, claim, confirm_ownership
 from agents.runtime.loop import Runtime, Setup
 from experiments.definition.experiment import Formation, Robot
 from experiments.definition.plan import Plan
@@ -26,6 +26,8 @@ from tests.conftest import RouterProcess
 from tests.fuzz.loopnet import Net, Reply, Sample
 
 KEY = Keys().alive("CF01")
+ATONCE = OwnershipTiming(retry_s=0.0)
+HASTY = OwnershipTiming(vanish_s=0.0)
 
 
 class Table:
@@ -58,7 +60,7 @@ class Table:
 
     def run(self, starts: dict[str, float]) -> dict[str, object]:
         """The outcome of the claims of some sessions, by their starts."""
-        return self.together({who: partial(claim, Session(self, who), [KEY], began=at) for who, at in starts.items()})
+        return self.together({who: claiming(self, who, at) for who, at in starts.items()})
 
     def together(self, works: dict[str, Callable[[], object]]) -> dict[str, object]:
         """The outcome of what some sessions do."""
@@ -80,6 +82,10 @@ class Table:
         for thread in threads:
             thread.join()
         return results
+
+
+def claiming(table: Table, who: str, began: float) -> Callable[[], object]:
+    return partial(claim, Session(table, who), [KEY], began=began, timing=ATONCE)  # type: ignore[arg-type]
 
 
 class Token:
@@ -117,7 +123,6 @@ def faked(monkeypatch):
         monkeypatch.setattr(network, "tokens_present", here)
         monkeypatch.setattr(network, "connected", lambda _session: True)
         monkeypatch.setattr(name_ownership.time, "monotonic", lambda: table.now)
-        monkeypatch.setattr(network, "RETRY_S", 0.0)
         return table
 
     return fake
@@ -167,7 +172,7 @@ def woken(table: Table, who: str, tokens: list[str]) -> Callable[[], object]:
         for token in tokens:
             table.step(who)
             table.tokens.append(token)
-        return confirm_ownership(Session(table, who), [KEY], threading.Event())
+        return confirm_ownership(Session(table, who), [KEY], threading.Event(), ATONCE)
 
     return work
 
@@ -176,8 +181,7 @@ def woken(table: Table, who: str, tokens: list[str]) -> Callable[[], object]:
 def test_at_most_one_owner_drives_the_body(seed, faked):
     table = faked(Table(seed))
     table.run({"old": 1.0})
-    new = partial(claim, Session(table, "new"), [KEY], began=2.0)
-    results = table.together({"new": new, "old": woken(table, "old", asleep(table, "old"))})
+    results = table.together({"new": claiming(table, "new", 2.0), "old": woken(table, "old", asleep(table, "old"))})
     # which one depends on the moment; in the worst case each gives way to the other
     assert sum(not isinstance(result, NameTaken) for result in results.values()) <= 1
 
@@ -221,7 +225,7 @@ def test_silent_router_frees_no_name(faked):
     table.answers = False
     table._running = {"a"}
     with pytest.raises(network.Unreachable, match="no router answers who owns the name"):
-        claim(Session(table, "a"), [KEY], began=1.0)
+        claiming(table, "a", 1.0)()
 
 
 @pytest.mark.parametrize(
@@ -231,11 +235,10 @@ def test_silent_router_frees_no_name(faked):
         (Reply(Sample("", "", b"Timeout"), good=False), network.Unreachable),
     ],
 )
-def test_a_process_without_its_name_touches_no_body(reply, error, monkeypatch):
-    monkeypatch.setattr(name_ownership, "OWNER_VANISH_S", 0.0)
-    monkeypatch.setattr(name_ownership, "ANSWER_S", 0.0)
+def test_a_process_without_its_name_touches_no_body(reply, error):
     experiment = pair(robots={"F": Robot(kind="crazyflie", start=[0.1, 0.2], hover=0.5)}, formation=Formation())
-    setup = Setup(Keys("park"), [], "json", 50.0, lifeline=False, located=[False])
+    timing = OwnershipTiming(vanish_s=0.0, answer_s=0.0)
+    setup = Setup(Keys("park"), [], "json", 50.0, lifeline=False, located=[False], ownership=timing)
     body = Airborne()
     with Net().worn() as net:
         net.replies = [reply]
@@ -258,9 +261,8 @@ class Woken(Airborne):
 
 @pytest.mark.parametrize("way", ["still", "opening", "cut off"])
 def test_displaced_owner_leaves_the_body_alone(way, monkeypatch):
-    monkeypatch.setattr(name_ownership, "OWNER_VANISH_S", 0.0)
     experiment = pair(robots={"F": Robot(kind="crazyflie", start=[0.1, 0.2], hover=0.5)}, formation=Formation())
-    setup = Setup(Keys("park"), [], "json", 50.0, lifeline=False, located=[False])
+    setup = Setup(Keys("park"), [], "json", 50.0, lifeline=False, located=[False], ownership=HASTY)
     body = Woken()
     told: list[int] = []
     now = [0.0]
@@ -332,22 +334,21 @@ def test_late_alarm_leaves_the_tokens(monkeypatch):
 
 @pytest.mark.mechanism("name ownership")
 @pytest.mark.system
-def test_real_router_knows_owners_of_names(router: RouterProcess, monkeypatch):
-    monkeypatch.setattr(name_ownership, "ANSWER_S", 0.5)
+def test_real_router_knows_owners_of_names(router: RouterProcess):
+    timing = OwnershipTiming(vanish_s=0.0, answer_s=0.5)
     with (
         network.open_session([router.endpoint], name="one") as one,
         network.open_session([router.endpoint], name="two") as two,
     ):
-        owned = claim(one, [KEY], began=2.0)
-        monkeypatch.setattr(name_ownership, "OWNER_VANISH_S", 0.0)
+        owned = claim(one, [KEY], began=2.0, timing=timing)
         with pytest.raises(NameTaken):
-            claim(two, [KEY], began=1.0)
+            claim(two, [KEY], began=1.0, timing=timing)
         for token in owned:
             token.undeclare()
         router.process.send_signal(signal.SIGSTOP)
         os.waitpid(router.process.pid, os.WUNTRACED)  # until it has stopped: else it may still answer
         try:
             with pytest.raises(network.Unreachable):
-                claim(two, [KEY], began=1.0)
+                claim(two, [KEY], began=1.0, timing=timing)
         finally:
             router.process.send_signal(signal.SIGCONT)

@@ -13,7 +13,7 @@ from agents.decision.centralised import CentreGoal
 from agents.network import name_ownership, pubsub
 from agents.network import session as network
 from agents.network.keys import Keys
-from agents.network.name_ownership import NameTaken, OwnershipCheck
+from agents.network.name_ownership import NameTaken, OwnershipCheck, OwnershipTiming
 from experiments.definition.experiment import Formation, Robot
 from experiments.definition.plan import Plan
 from experiments.real_time.processes.centre import CentreProcess
@@ -50,9 +50,8 @@ def test_replaced_process_sends_nothing(what, way, monkeypatch):
                 over.set()
 
     monkeypatch.setattr(name_ownership, "uptime", lambda: now[0])
-    monkeypatch.setattr(name_ownership, "OWNER_VANISH_S", 0.0)
     monkeypatch.setattr(Attentive, "silent_since", lambda *_: silent[0])
-    ownership = OwnershipCheck([token])
+    ownership = OwnershipCheck([token], timing=OwnershipTiming(vanish_s=0.0))
     with Net().worn() as net:
         joint = Network(net.session, KEYS, [], [], ownership)
         monkeypatch.setattr(pubsub, "publisher", lambda *_, **__: Counted())
