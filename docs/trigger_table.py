@@ -89,7 +89,7 @@ def communication(base: Plan, seeds: Sequence[int]) -> None:
     for name, trigger in MATCHED.items():
         good = measured(case := base.changed(trigger=trigger), seeds)
         bad = measured(case.changed(channel=BAD), seeds)
-        belief = 1e3 * fmean(each.belief_rms or 0.0 for each in good)
+        belief = 1e3 * fmean(each.mean["belief_rms"] or 0.0 for each in good)
         print(
             f"| {name} | {written(trigger)} | {mean(good, 'f_hz'):.2f} | {100 * (1 - mean(good, 'f_hz') / f):.1f} % "
             f"| {mean(good, 'iae') / iae:.3f} | {mean(good, 'itae') / itae:.3f} | {belief:.1f} mm "
@@ -104,7 +104,7 @@ def control(base: Plan, seeds: Sequence[int]) -> None:
     print("|---|---|---|---|---|---|---|---|")
     base = base.changed(trigger=CHOSEN)
     reference = measured(base, seeds)
-    iae, itae, j2 = mean(reference, "iae"), mean(reference, "itae"), fmean(case.j2 for case in reference)
+    iae, itae, j2 = mean(reference, "iae"), mean(reference, "itae"), fmean(case.mean["j2"] or 0.0 for case in reference)
     for name, update in UPDATES.items():
         formation = msgspec.structs.replace(base.experiment.formation, update=update)
         cases = measured(base.changed(formation=formation), seeds)
@@ -112,7 +112,7 @@ def control(base: Plan, seeds: Sequence[int]) -> None:
         print(
             f"| {name} | {written(update)} | {fmean(robot.updates for robot in followers):.0f} "
             f"| {mean(cases, 'f_hz'):.2f} | {mean(cases, 'iae') / iae:.3f} | {mean(cases, 'itae') / itae:.3f} "
-            f"| {fmean(case.j2 for case in cases) / j2:.3f} | {formed(cases)} |",
+            f"| {fmean(case.mean['j2'] or 0.0 for case in cases) / j2:.3f} | {formed(cases)} |",
             flush=True,
         )
 

@@ -430,6 +430,7 @@ class Hybrid(FileTable, frozen=True):
 JUDGED: Final = (
     *("f_hz", "messages", "bytes", "iae", "itae", "rmse", "acquired_s", "updates", "lost", "dropped"),
     *("missed_deadlines", "residual", "settle_s", "collisions", "receivers"),
+    *("j2", "belief_rms", "belief_max", "closest"),  # of the case
 )
 MEAN: Final = "mean"  # over robots
 WORST: Final = "worst"  # of them

@@ -15,14 +15,13 @@ import msgspec
 import numpy as np
 
 from agents.network.messages import Event
-from agents.plugins.laws import Distance
 from agents.safety.hazards import UNRESOLVED, failed, is_blind
 from experiments.definition import link_conditions
 from experiments.definition.graph import Links
 from experiments.metrics import centralised
 from experiments.metrics.clearance import collisions
 from experiments.metrics.comparable import reasons
-from experiments.metrics.measurement import BAND, Measurement
+from experiments.metrics.measurement import Measurement
 from experiments.metrics.metric import (
     OURS,
     Metric,
@@ -37,17 +36,13 @@ from experiments.metrics.metric import (
 from experiments.metrics.results import Approach, Belief, CaseMetrics, Collision, LawMeasure, RobotMetrics
 from experiments.metrics.shadow import agreement
 from experiments.metrics.signals import (
-    LinkErrors,
-    belief_errors,
-    closest_distance,
-    integral,
     link_deliveries,
     mean_known,
     net_rotation,
     network_away,
     outside_arena,
 )
-from experiments.recording.trace import ROUNDING_S, Trace
+from experiments.recording.trace import Trace
 from twins.arrays import Array, norm
 
 TROUBLES: Final = ("late", "unread")  # kinds of events of the run itself, not of a robot
@@ -108,7 +103,7 @@ def measure(trace: Trace) -> CaseMetrics:
         formed = k > 0 or together[k] is not None  # before, there is no shape that one could turn
         rotation.append(net_rotation(trace.true_position[after:end, kept], trace.time[after:end]) if formed else None)
 
-    held = belief_errors(trace, errors.net)
+    held = shared.belief
     rms = np.sqrt(mean_known(held**2))
     largest = np.where(np.isfinite(held), held, -np.inf).max(axis=0, initial=-np.inf)
     beyond = outside_arena(trace)
@@ -129,14 +124,10 @@ def measure(trace: Trace) -> CaseMetrics:
         mean=case_values(metrics, values, kept),
         acquired_s=tuple(together),
         rotation_rad_s=tuple(rotation),
-        j2=_benchmark_cost(trace, errors) if shared.has_errors else None,
         belief=tuple(
             Belief(names[i], names[j], _number(rms[k]), _number(largest[k]))
             for k, (i, j) in enumerate(zip(errors.net.receiver, errors.net.sender, strict=True))
         ),
-        belief_rms=_number(math.sqrt(mean_known(held.reshape(-1) ** 2))),
-        belief_max=_number(largest.max(initial=-np.inf)),
-        closest=_number(closest_distance(trace.true_position)),
         excursion=max(0.0, float(beyond[farthest])),
         excursion_robot=names[farthest] if beyond[farthest] > 0.0 else "",
         lost=int(trace.lost.sum()),
@@ -211,7 +202,7 @@ def _robots(
     def plain(i: int) -> dict[str, Any]:
         waits = shared.waits[i]
         return {
-            **{name: values[name][i] for name in OURS},
+            **{name: values[name][i] for name, metric in OURS.items() if metric.per == "robot"},
             **{what: int(each[i]) for what, each in numbers.items()},
             "gap_min_s": float(waits.min()) if len(waits) else None,
             "gap_median_s": float(np.median(waits)) if len(waits) else None,
@@ -279,47 +270,6 @@ def _slowest(trace: Trace) -> float | None:
     if trace.clock == "virtual":
         return None
     return min((report.factor for report in trace.world if not report.paused), default=None)
-
-
-def _benchmark_cost(trace: Trace, errors: LinkErrors) -> float:
-    """J2 of the authors' benchmark (`benchmark_evaluation.m` of 2024), summed over the robots that receive poses.
-
-    Of each robot, with r the distances to its neighbours and anchors and d the wanted ones: 0.02 n_m + 0.1 n_u +
-    0.3 t_s + 0.1 IAE + 0.01 ITAE, all until the settling time t_s, the last time at which g = Σ(r² − d²) is farther
-    from its end than 2 % of |g(0) − g(end)|. n_m are transmissions, n_u computed goals; IAE and ITAE are those of
-    Σ|r − d|, halved because a link has two ends (their script takes the ITAE of the last neighbour only, which is taken
-    for a slip). For laws without distances, and where wanted distances change, g is their error. Goals are counted by
-    their changes in the samples, in proportion to all that were computed.
-    """
-    plan, time, place = trace.plan, trace.time, trace.true_position
-    links, anchors = errors.net, plan.anchors_by_row
-    plain = isinstance(plan.law, Distance) and not plan.formation.changes
-    new = (np.diff(trace.goal, axis=0) != 0.0).any(axis=2) & np.isfinite(trace.goal[1:]).all(axis=2)
-    cost = 0.0
-    for i in sorted({*links.receiver.tolist()}):
-        own = np.flatnonzero(links.receiver == i)
-        error, gap = errors.error[:, own], errors.error[:, own]
-        if plain:
-            gap = norm(place[:, i, None] - place[:, links.sender[own]]) ** 2 - links.distance[own] ** 2
-        for anchor in (each for row, each in anchors if row == i):
-            away = norm(np.array([anchor.displacement(tuple(each)) for each in place[:, i].tolist()]))[:, None]
-            error = np.hstack([error, np.abs(away - anchor.distance)])
-            gap = np.hstack([gap, away**2 - anchor.distance**2])
-        signal = np.where(np.isfinite(gap), gap, 0.0).sum(axis=1)
-        known = np.flatnonzero(np.isfinite(gap).any(axis=1))
-        if not len(known):
-            continue
-        first, end = signal[known[[0, -1]]]
-        outside = known[np.abs(signal[known] - end) > BAND * abs(first - end)]
-        last = int(outside[-1]) if len(outside) else 0
-        settled = slice(0, last + 1)
-        e, t = np.where(np.isfinite(error[settled]), error[settled], 0.0).sum(axis=1)[:, None], time[settled]
-        sent = int((trace.sent_by(i).stamp < time[last] - ROUNDING_S).sum())
-        before, all_new = int(new[:last, i].sum()), int(new[:, i].sum())
-        share = before / all_new if all_new else last / (len(time) - 1)
-        effort = 0.02 * sent + 0.1 * share * int(trace.decisions[i]) + 0.3 * float(time[last] - time[0])
-        cost += effort + 0.05 * float(integral(e, t)[0]) + 0.005 * float(integral(t[:, None] * e, t)[0])
-    return cost
 
 
 def _all(times: Sequence[float | None]) -> float | None:

@@ -3,24 +3,27 @@
 from __future__ import annotations
 
 from functools import cached_property
+from math import nan
 from typing import Final
 
 import numpy as np
 
-from agents.plugins.laws import Gradient
+from agents.plugins.laws import Distance, Gradient
 from experiments.metrics.clearance import Clearance
 from experiments.metrics.results import Phase
 from experiments.metrics.signals import (
     LinkErrors,
     after_last,
+    belief_errors,
+    integral,
     integrals,
     leaders,
     phase_starts,
     transmission_gaps,
     transmissions,
 )
-from experiments.recording.trace import Trace
-from twins.arrays import Array, Index
+from experiments.recording.trace import ROUNDING_S, Trace
+from twins.arrays import Array, Index, norm
 
 WINDOW_S: Final = 1.0  # [s] of the moving mean that decides on acquisition, and of the residual
 BAND: Final = 0.02  # of the largest error: the 2 % band of the settling time
@@ -61,6 +64,16 @@ class Measurement:
     def clearance(self) -> Clearance:
         """Distances between surfaces."""
         return Clearance.of_trace(self.trace)
+
+    @cached_property
+    def belief(self) -> Array:
+        """Errors of the believed positions (T, E) [m], see `signals.belief_errors`."""
+        return belief_errors(self.trace, self.errors.net)
+
+    @cached_property
+    def cost(self) -> float:
+        """J2, see `benchmark_cost`; NaN for laws without errors."""
+        return benchmark_cost(self.trace, self.errors) if self.has_errors else nan
 
     @cached_property
     def known(self) -> Array:
@@ -154,6 +167,47 @@ class Measurement:
         if dropped is None:
             return np.zeros(rows, dtype=np.intp)
         return np.bincount(self.trace.plan.pose_links.sender, weights=dropped, minlength=rows).astype(np.intp)
+
+
+def benchmark_cost(trace: Trace, errors: LinkErrors) -> float:
+    """J2 of the authors' benchmark (`benchmark_evaluation.m` of 2024), summed over the robots that receive poses.
+
+    Of each robot, with r the distances to its neighbours and anchors and d the wanted ones: 0.02 n_m + 0.1 n_u +
+    0.3 t_s + 0.1 IAE + 0.01 ITAE, all until the settling time t_s, the last time at which g = Σ(r² − d²) is farther
+    from its end than 2 % of |g(0) − g(end)|. n_m are transmissions, n_u computed goals; IAE and ITAE are those of
+    Σ|r − d|, halved because a link has two ends (their script takes the ITAE of the last neighbour only, which is taken
+    for a slip). For laws without distances, and where wanted distances change, g is their error. Goals are counted by
+    their changes in the samples, in proportion to all that were computed.
+    """
+    plan, time, place = trace.plan, trace.time, trace.true_position
+    links, anchors = errors.net, plan.anchors_by_row
+    plain = isinstance(plan.law, Distance) and not plan.formation.changes
+    new = (np.diff(trace.goal, axis=0) != 0.0).any(axis=2) & np.isfinite(trace.goal[1:]).all(axis=2)
+    cost = 0.0
+    for i in sorted({*links.receiver.tolist()}):
+        own = np.flatnonzero(links.receiver == i)
+        error, gap = errors.error[:, own], errors.error[:, own]
+        if plain:
+            gap = norm(place[:, i, None] - place[:, links.sender[own]]) ** 2 - links.distance[own] ** 2
+        for anchor in (each for row, each in anchors if row == i):
+            away = norm(np.array([anchor.displacement(tuple(each)) for each in place[:, i].tolist()]))[:, None]
+            error = np.hstack([error, np.abs(away - anchor.distance)])
+            gap = np.hstack([gap, away**2 - anchor.distance**2])
+        signal = np.where(np.isfinite(gap), gap, 0.0).sum(axis=1)
+        known = np.flatnonzero(np.isfinite(gap).any(axis=1))
+        if not len(known):
+            continue
+        first, end = signal[known[[0, -1]]]
+        outside = known[np.abs(signal[known] - end) > BAND * abs(first - end)]
+        last = int(outside[-1]) if len(outside) else 0
+        settled = slice(0, last + 1)
+        e, t = np.where(np.isfinite(error[settled]), error[settled], 0.0).sum(axis=1)[:, None], time[settled]
+        sent = int((trace.sent_by(i).stamp < time[last] - ROUNDING_S).sum())
+        before, all_new = int(new[:last, i].sum()), int(new[:, i].sum())
+        share = before / all_new if all_new else last / (len(time) - 1)
+        effort = 0.02 * sent + 0.1 * share * int(trace.decisions[i]) + 0.3 * float(time[last] - time[0])
+        cost += effort + 0.05 * float(integral(e, t)[0]) + 0.005 * float(integral(t[:, None] * e, t)[0])
+    return cost
 
 
 def bounds_of(trace: Trace) -> list[tuple[float, int, int]]:

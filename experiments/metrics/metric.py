@@ -23,6 +23,7 @@ from agents.plugins import files, registry
 from experiments.definition.experiment import Criterion
 from experiments.metrics.measurement import Measurement
 from experiments.metrics.results import CaseMetrics, RobotMetrics
+from experiments.metrics.signals import closest_distance, mean_known
 from experiments.recording.trace import Trace
 from twins.arrays import Array, Index
 
@@ -74,7 +75,7 @@ class Metric(msgspec.Struct, frozen=True):
         return statistics.fmean(known)
 
 
-def _ours(of: Callable[[Measurement], Array | Index], label: str, meaning: str, **facts: object) -> Metric:
+def _ours(of: Callable[[Measurement], Array | Index | float], label: str, meaning: str, **facts: object) -> Metric:
     """A metric of zenpark as an object of a class of its own, with the attributes `facts`."""
     body = {"of": lambda _self, _trace, shared: of(shared), "label": label, "__doc__": meaning, **facts}
     made = msgspec.defstruct(label, [], bases=(Metric,), namespace=body, module=__name__, frozen=True)
@@ -82,7 +83,8 @@ def _ours(of: Callable[[Measurement], Array | Index], label: str, meaning: str, 
 
 
 UNSEEN: Final = {"mean": "sum", "swept": False, "shown": False}  # they do not occur in virtual time
-OURS: Final[Mapping[str, Metric]] = {  # by the names of the fields of `RobotMetrics`
+OF_CASE: Final = {"per": "case", "swept": False, "shown": False}
+OURS: Final[Mapping[str, Metric]] = {  # by the names of the fields of `RobotMetrics`, and then those of the case
     "f_hz": _ours(
         attrgetter("rate"), "f",
         "Transmissions over duration. Counted by running numbers, so that what a recorder lost counts too.",
@@ -123,6 +125,27 @@ OURS: Final[Mapping[str, Metric]] = {  # by the names of the fields of `RobotMet
     "missed_deadlines": _ours(
         attrgetter("trace.missed_deadlines"), "Missed deadlines",
         "Ticks that were skipped because their time had passed; shares are of the ticks that were due.", **UNSEEN,
+    ),
+    "j2": _ours(
+        attrgetter("cost"), "J2",
+        "Cost of the authors' benchmark: 0.02 · transmissions + 0.1 · decisions + 0.3 · settling time + 0.1 · IAE +"
+        " 0.01 · ITAE, summed over the robots that receive poses, all until the settling time: the last time at which"
+        " Σ(r² − d²) is farther from its end than 2 % of its way. IAE and ITAE are halved: a link has two ends.",
+        **OF_CASE,
+    ),
+    "belief_rms": _ours(
+        lambda m: np.sqrt(mean_known(m.belief.reshape(-1) ** 2)), "Belief error, RMS",
+        "Error of a receiver's estimate of a neighbour, over all links: the newest pose received, carried on by the"
+        " prediction until the next.",
+        unit="m", **OF_CASE,
+    ),
+    "belief_max": _ours(
+        lambda m: m.belief.max(initial=-np.inf, where=np.isfinite(m.belief)), "Belief error, largest",
+        "The largest of these errors.", unit="m", **OF_CASE,
+    ),
+    "closest": _ours(
+        lambda m: closest_distance(m.trace.true_position), "Closest robots", "Smallest distance between two centres.",
+        unit="m", better="more", **OF_CASE,
     ),
 }  # fmt: skip
 CONSOLE: Final = ("f_hz", "iae", "rmse", "acquired_s")  # of ours, in a line of the terminal

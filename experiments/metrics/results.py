@@ -190,13 +190,7 @@ class CaseMetrics(msgspec.Struct, frozen=True):
     acquired_s: tuple[float | None, ...]
     # [rad/s] net rotation rate of the formation per phase, from acquisition on
     rotation_rad_s: tuple[float | None, ...]
-    # cost of the authors' benchmark: Σ(0.02 n_m + 0.1 n_u + 0.3 t_s + 0.1 IAE + 0.01 ITAE) over the robots that receive
-    # poses, each until its settling time t_s, see `measure`; None for laws without errors
-    j2: float | None
     belief: tuple[Belief, ...]  # per link
-    belief_rms: float | None  # [m] over all links
-    belief_max: float | None  # [m] over all links
-    closest: float | None  # [m] smallest distance between two robots' centres
     excursion: float  # [m] farthest outside the arena
     excursion_robot: str  # empty if none was outside
     lost: int  # sum over the robots
@@ -233,3 +227,8 @@ class CaseMetrics(msgspec.Struct, frozen=True):
     metric_faults: tuple[str, ...] = ()  # metrics of other distributions that failed or cannot be used, a sentence each
     criteria: tuple[Criterion, ...] = ()  # of the experiment
     judged: tuple[Judged, ...] = ()  # those that are for this case, as written with all cases of the run
+
+    @property
+    def has_errors(self) -> bool:
+        """Whether links have errors: only gradient laws measure them."""
+        return self.mean.get("j2") is not None

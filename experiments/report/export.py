@@ -70,8 +70,6 @@ UNITS: Final[dict[str, Any]] = {
         "short": "m",
         "formation_acquired_s": "s, for each phase",
         "rotation_rad_s": "rad/s, for each phase",
-        "belief_rms": "m",
-        "belief_max": "m",
     },
 }
 COLUMNS: Final = ("x", "y", "z", "yaw", "true_x", "true_y", "true_z", "goal_x", "goal_y", "goal_z", "error")
@@ -194,7 +192,7 @@ def structure(trace: Trace, metrics: CaseMetrics) -> dict[str, Any]:
         "metrics": {
             "robot": [robot.robot for robot in metrics.robots],
             **{name: [robot.value(name) for robot in metrics.robots] for name in columns},
-            **{name: getattr(metrics, name) for name in ("leaders", "mean", "j2", "belief_rms", "belief_max")},
+            **{name: getattr(metrics, name) for name in ("leaders", "mean")},
             "formation_acquired_s": metrics.acquired_s,
             "rotation_rad_s": metrics.rotation_rad_s,
         },

@@ -153,7 +153,7 @@ def global_bars(cases: Sequence[CaseMetrics], width: float = WIDTH) -> Figure:
 
 def _bar_metrics(cases: Sequence[CaseMetrics]) -> list[tuple[str, str, str]]:
     """Metrics that are drawn as bars: name, label and unit as matplotlib writes them; no errors of laws without any."""
-    judged = any(case.j2 is not None for case in cases)
+    judged = any(case.has_errors for case in cases)
     return [
         (name, f"${metric.label}$" if len(metric.label) == 1 else plain(metric.label), metric.unit.translate(FORMULA))
         for name, metric in known_metrics(cases).items()

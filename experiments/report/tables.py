@@ -39,11 +39,6 @@ RUN: Final = (
     ("Worst link", "Of each robot the link with the largest error, averaged over the last second of a phase."),
     ("Net rotation", "How fast the formation turns about its centroid, seen from above, after it was acquired: the"
      " slope of the angle that fits the followers' positions best to those at acquisition."),
-    ("Belief", "A receiver's estimate of a neighbour: the newest pose received, carried on by the prediction until the"
-     " next."),
-    ("J2", "Cost of the authors' benchmark: 0.02 · transmissions + 0.1 · decisions + 0.3 · settling time + 0.1 · IAE +"
-     " 0.01 · ITAE, summed over the robots that receive poses, all until the settling time: the last time at which"
-     " Σ(r² − d²) is farther from its end than 2 % of its way. IAE and ITAE are halved, because a link has two ends."),
     ("Collision", "Robots are upright cylinders of their kind's radius and height. A collision is a contact that the"
      " world's engine saw begin, with its impulse; of robots that no such engine carries it is a maximal time in which"
      " true cylinders overlap each other, an obstacle or the arena's walls."),
@@ -150,9 +145,6 @@ def whole_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
         "Acquired by all followers [s]": phased("acquired_s", 1.0),
         "Distances [cm]": [
             *((f"Worst link{_phase_end(cases, k, len(phases))}", partial(_worst, k=k), 100.0) for k in phases),
-            ("Belief error, RMS", _value("belief_rms"), 100.0),
-            ("Belief error, largest", _value("belief_max"), 100.0),
-            ("Closest robots, between centres", _value("closest"), 100.0),
             ("Closest robots, between surfaces", _value("near.gap"), 100.0),
             ("Closest to the arena", _value("near_arena.gap"), 100.0),
             ("Farthest outside the arena", _value("excursion"), 100.0),
@@ -171,7 +163,6 @@ def whole_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
         "Hardest impulse [mN s]": [
             ("of a collision", lambda case: _known(max, (each.impulse for each in case.collisions)), 1000.0)
         ],
-        "Cost (a number without unit)": [("J2", _value("j2"), 1.0)],
         "Measures of the law": [
             (f"{name}, {words}", partial(_of_law, name=name, what=what), 1.0)
             for name in dict.fromkeys(name for case in cases for name in case.measures)
@@ -189,7 +180,7 @@ def whole_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
     ]
     tables.append(Table((f"Sum over all robots{' and seeds' if several else ''}", *by_case(cases)), tuple(sums)))
     # a formation that was never acquired is a result; without errors of links there is none
-    formed = any(case.belief and case.j2 is not None for case in cases)
+    formed = any(case.belief and case.has_errors for case in cases)
     shown = [table if formed and table is tables[0] else _occurred(table) for table in tables]
     return tuple(table for table in shown if table.rows)
 

@@ -23,7 +23,7 @@ NAMED = 3  # so many collisions, or twins, are named; the tables have them all
 def findings(cases: Sequence[CaseMetrics]) -> list[Finding]:
     """The verdict over all cases, the first one being the reference; nothing is praised if one of them was spoiled."""
     formation = any(case.belief for case in cases)
-    judged = [case for case in cases if case.belief and case.j2 is not None]  # others have laws without errors
+    judged = [case for case in cases if case.belief and case.has_errors]  # others have laws without errors
     found = [
         *failures(cases),
         *spoiled(cases),
@@ -336,7 +336,7 @@ def _against_the_first(cases: Sequence[CaseMetrics]) -> list[Finding]:
             text = f"Its errors relative to {reference}: {_list(parts)}{some}."
             mark: Mark = "good" if worse <= 1.0 and not some else "plain" if worse < 1.25 else "fair"
             found.append(Finding(mark, text))
-        judged = all(run.j2 is not None for run in (*runs, *first))
+        judged = all(run.has_errors for run in (*runs, *first))
         if judged and "IAE" not in dict(known) and rate.mean is not None:
             text = f"Less is known of one of {name} and {reference}: integrals of errors are not compared."
             found.append(Finding("fair", text))

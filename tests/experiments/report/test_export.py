@@ -94,7 +94,7 @@ def test_metrics_are_those_of_the_report(flown, mat):
     assert read["iae"] == pytest.approx([robot.iae for robot in measured.robots], rel=1e-6)
     assert read["messages"].tolist() == [robot.messages for robot in measured.robots]
     assert read["mean"]["itae"] == pytest.approx(measured.mean["itae"], rel=1e-6)
-    assert read["j2"] == pytest.approx(measured.j2, rel=1e-6)
+    assert read["mean"]["j2"] == pytest.approx(measured.mean["j2"], rel=1e-6)
     assert np.isnan(read["impulse"]).all()  # nothing touched: unknown
     by_hand = np.bincount(mat["event"]["sent"]["robot"].astype(int))[1:] / 4.0
     assert read["f_hz"] == pytest.approx(by_hand)

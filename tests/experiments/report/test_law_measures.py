@@ -26,7 +26,7 @@ def measured(traces):
 def test_indices_of_links_are_unknown_without_errors(measured):
     case = measured[0]
     robot = case.robots[0]
-    assert (case.j2, case.mean["iae"], case.acquired_s) == (None, None, (None,))
+    assert (case.mean["j2"], case.mean["iae"], case.acquired_s) == (None, None, (None,))
     assert (robot.settle_s, robot.coverage, robot.residual, robot.iae) == (None, None, None, None)
     assert robot.known == 1.0
     texts = " ".join(each.text for each in verdict.findings(measured))
