@@ -3,19 +3,36 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator
+import zlib
+from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from math import inf
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import IO, Any, Final, Literal, Self, cast
+from typing import Any, Final, Literal, Self, cast
 
 import msgspec
-from mcap._chunk_builder import ChunkBuilder
+import zstandard
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
-from mcap.records import ChunkIndex, MessageIndex, Statistics
-from mcap.writer import CompressionType, Writer
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    Chunk,
+    ChunkIndex,
+    DataEnd,
+    Header,
+    McapRecord,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+    SummaryOffset,
+)
+from mcap.writer import MCAP0_MAGIC
 
 from agents.body.kinds import KINDS, RecordedKind
 from agents.network.messages import BareGoal, BarePose, Event, Goal, Pose, State, Vector
@@ -28,89 +45,128 @@ from experiments.recording.ros2.viewers import Draw
 from experiments.recording.topics import CHUNK_BYTES, JSON, KINDS_JSON, METADATA, SPOKEN, TOML, TOPICS, Message
 
 BLOCK_BYTES: Final = 1024 * 1024
-INDICES: Final = "_Writer__chunk_indices"  # as of mcap 1.6; the library has no public place for it
-CHUNK, STATISTICS = "_Writer__chunk_builder", "_Writer__statistics"  # nor for these
+HEAD: Final = struct.Struct("<BQHIQQ")  # a message's record up to its data
+# records that the summary repeats, in groups of this order
+GROUPS: Final = (
+    Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS, Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX,
+    Opcode.METADATA_INDEX,
+)  # fmt: skip
 
 
-class ChunkIndices:
-    """Chunk indices in an unnamed file, in place of the writer's list, which grows in memory with the recording."""
+class McapFile:
+    """An MCAP file in chunks of messages with their schemas and channels; attachments and metadata lie before them.
 
-    def __init__(self, folder: Path, writer: Writer) -> None:
-        """Takes the place of a new writer's list; the file without a name is in `folder`, and gone with the process."""
-        self._kept = TemporaryFile(dir=folder)  # noqa: SIM115 - closed by `close`
-        self.end = 0  # [ns] latest log time in the chunks so far
-        assert getattr(writer, INDICES) == [], "another version of mcap"
-        setattr(writer, INDICES, self)
+    The library's own writer takes five times as long for a message, and its memory grows with the recording.
+    """
 
-    def append(self, index: ChunkIndex) -> None:
-        """Keeps the index of a chunk."""
-        self.end = max(self.end, index.message_end_time)
-        record = RecordBuilder()
-        index.write(record)
-        self._kept.write(record.end())
+    def __init__(self, file: _Unbuffered, folder: Path, chunk_bytes: int) -> None:
+        """Keep indices of chunks in a file without a name in `folder`, gone with the process."""
+        self.full = False  # the chunk in progress has its size
+        self.end = 0  # [ns] latest log time in the finished chunks
+        self._file, self._size = file, chunk_bytes
+        self._chunk, self._index = RecordBuilder(), dict[int, list[int]]()  # log times [ns] and offsets, by channel
+        self._first = self._last = 0  # [ns] log times in the chunk
+        self._summary = {group: RecordBuilder() for group in GROUPS}
+        self._indices = TemporaryFile(dir=folder)  # noqa: SIM115 - closed by `close`
+        self._counted = Statistics(0, 0, Counter(), 0, 0, 0, 0, 0, 0)
 
-    def __iter__(self) -> Iterator[ChunkIndices]:
-        yield self  # all at once, see `write`
+    def start(self) -> None:
+        """Write the head."""
+        self._file.write(MCAP0_MAGIC)
+        self._put(Header(profile="ros2", library="zenpark"))
 
-    def write(self, stream: RecordBuilder) -> None:
-        """Adds all indices to the summary."""
-        self._kept.seek(0)
-        while block := self._kept.read(BLOCK_BYTES):
-            stream.write(block)
+    def attach(self, name: str, kind: str, data: bytes) -> None:
+        """Write an attachment."""
+        offset, length = self._put(Attachment(0, 0, name, kind, data))
+        AttachmentIndex(offset, length, 0, 0, len(data), name, kind).write(self._summary[Opcode.ATTACHMENT_INDEX])
+        self._counted.attachment_count += 1
 
-    def close(self) -> None:
-        """Close the file, which is then deleted."""
-        self._kept.close()
+    def describe(self, name: str, about: dict[str, str]) -> None:
+        """Write metadata."""
+        offset, length = self._put(Metadata(name, about))
+        MetadataIndex(offset, length, name).write(self._summary[Opcode.METADATA_INDEX])
+        self._counted.metadata_count += 1
 
+    def register_schema(self, name: str, schema: str) -> int:
+        """Number of a new schema, in ROS 2's language."""
+        self._counted.schema_count += 1
+        made = Schema(data=schema.encode(), encoding="ros2msg", id=self._counted.schema_count, name=name)
+        for place in (self._chunk, self._summary[Opcode.SCHEMA]):
+            made.write(place)
+        return made.id
 
-class Chunk(ChunkBuilder):
-    """Chunk in progress, in place of the writer's own: adds a message in a fifth of the library's time."""
-
-    HEAD: Final = struct.Struct("<BQHIQQ")  # a message's record up to its data
-
-    def __init__(self, writer: Writer, size: int = CHUNK_BYTES) -> None:
-        """Takes the place of a new writer's chunk; it is full at this size [bytes]."""
-        super().__init__()
-        self.full = False
-        self._size = size
-        self._statistics: Statistics = getattr(writer, STATISTICS)
-        setattr(writer, CHUNK, self)
+    def register_channel(self, topic: str, schema: int) -> int:
+        """Number of a new channel of messages in CDR."""
+        self._counted.channel_count += 1
+        made = Channel(self._counted.channel_count, topic, "cdr", {}, schema)
+        for place in (self._chunk, self._summary[Opcode.CHANNEL]):
+            made.write(place)
+        return made.id
 
     def add(self, channel: int, logged: int, data: bytes, stamp: int, number: int) -> None:
-        """Adds a message with its log time and stamp [ns], and its entry in the index."""
-        if not self.num_messages or logged < self.message_start_time:
-            self.message_start_time = logged
-        self.message_end_time = max(self.message_end_time, logged)
-        index = self.message_indices.get(channel)
-        if index is None:
-            index = self.message_indices[channel] = _MessageIndex(channel, [])
-        offset, length = self.count, len(data) + self.HEAD.size
-        index.records.append((logged, offset))
-        self.num_messages += 1
+        """Add a message with its log time and stamp [ns] to the chunk in progress."""
+        self._first = min(self._first, logged) if self._index else logged
+        self._last = max(self._last, logged)
+        offset, length = self._chunk.count, len(data) + HEAD.size
+        self._index.setdefault(channel, []).extend((logged, offset))
         # its opcode and the length itself, 9 bytes, are not in the length
-        self.record_writer.write(self.HEAD.pack(Opcode.MESSAGE, length - 9, channel, number, logged, stamp) + data)
+        self._chunk.write(HEAD.pack(Opcode.MESSAGE, length - 9, channel, number, logged, stamp) + data)
         self.full = offset + length > self._size
 
-    def reset(self) -> None:
-        """Counts the messages of a chunk that was taken by `end` and written, and begins the next."""
-        counted = self._statistics
-        first = min(counted.message_start_time, self.message_start_time)
-        counted.message_start_time = first if counted.message_count else self.message_start_time
-        counted.message_end_time = max(counted.message_end_time, self.message_end_time)
-        counted.message_count += self.num_messages
-        for channel, index in self.message_indices.items():
-            counted.channel_message_counts[channel] += len(index.records)
-        self.message_start_time = self.message_end_time = self.num_messages = 0
-        self.message_indices.clear()
-        self.full = False
+    def flush(self) -> None:
+        """Write the chunk in progress, unless it is without messages."""
+        if not self._index:
+            return
+        data = self._chunk.end()
+        packed, size = zstandard.compress(data), len(data)
+        offset, length = self._put(Chunk("zstd", packed, self._last, self._first, zlib.crc32(data), size))
+        begin, indices, offsets = self._file.tell(), RecordBuilder(), dict[int, int]()
+        for channel, numbers in self._index.items():
+            offsets[channel] = begin + indices.count
+            head = (Opcode.MESSAGE_INDEX, 6 + 8 * len(numbers), channel, 8 * len(numbers))
+            indices.write(struct.pack(f"<BQHI{len(numbers)}Q", *head, *numbers))
+            self._counted.channel_message_counts[channel] += len(numbers) // 2
+            self._counted.message_count += len(numbers) // 2
+        written, record = indices.end(), RecordBuilder()
+        self._file.write(written)
+        ChunkIndex(length, offset, "zstd", len(packed), self._last, len(written), offsets, self._first, size).write(
+            record
+        )
+        self._indices.write(record.end())
+        counted = self._counted
+        first = min(counted.message_start_time, self._first) if counted.chunk_count else self._first
+        counted.message_start_time, counted.message_end_time = first, max(counted.message_end_time, self._last)
+        counted.chunk_count += 1
+        self.end, self._last, self.full = max(self.end, self._last), 0, False
+        self._index.clear()
 
+    def finish(self) -> None:
+        """Write the last chunk and the summary."""
+        self.flush()
+        self._put(DataEnd(0))
+        self._counted.write(self._summary[Opcode.STATISTICS])
+        begin, sum_, offsets = self._file.tell(), 0, RecordBuilder()
+        self._indices.seek(0)
+        for group in GROUPS:
+            start, kept = self._file.tell(), self._summary[group].end()
+            for block in iter(partial(self._indices.read, BLOCK_BYTES), b"") if group == Opcode.CHUNK_INDEX else [kept]:
+                self._file.write(block)
+                sum_ = zlib.crc32(block, sum_)
+            SummaryOffset(group, start, self._file.tell() - start).write(offsets)
+        # the footer's sum of the summary covers its own fields before that sum
+        end = offsets.end() + struct.pack("<BQQQ", Opcode.FOOTER, 20, begin, self._file.tell())
+        self._file.write(end + struct.pack("<I", zlib.crc32(end, sum_)) + MCAP0_MAGIC)
 
-class _MessageIndex(MessageIndex):
-    def write(self, stream: RecordBuilder) -> None:
-        """Write all entries at once."""
-        numbers = [number for entry in self.records for number in entry]
-        head = (Opcode.MESSAGE_INDEX, 6 + 8 * len(numbers), self.channel_id, 8 * len(numbers))
-        stream.write(struct.pack(f"<BQHI{len(numbers)}Q", *head, *numbers))
+    def close(self) -> None:
+        """Close the file of the indices, which is then deleted, and the file itself."""
+        self._indices.close()
+        self._file.close()
+
+    def _put(self, record: McapRecord) -> tuple[int, int]:
+        """Write a record; return where it begins, and its length."""
+        built, offset = RecordBuilder(), self._file.tell()
+        record.write(built)
+        return offset, self._file.write(built.end())
 
 
 DRAWN: Final = "/{robot}/true_pose"
@@ -179,14 +235,12 @@ class Recording:
         )
         self._over = ""  # why nothing more can be written
         try:
-            self._file = _Unbuffered(path)
+            file = _Unbuffered(path)
         except FileExistsError:
             raise RecordingError(f"{path}: exists already; move it away or record under another name") from None
         except OSError as error:
             raise RecordingError(f"{path}: cannot be created: {error.strerror}; record somewhere else") from error
-        self._writer = Writer(cast(IO[bytes], self._file), chunk_size=chunk_bytes, compression=CompressionType.ZSTD)
-        self._chunk = Chunk(self._writer, chunk_bytes)
-        self._index = ChunkIndices(path.parent, self._writer)
+        self._file = McapFile(file, path.parent, chunk_bytes)
         made = version.provenance()
         about = {"case": case, "seed": str(seed), "clock": clock, "version": made.zenpark}
         about |= {"code": made.code, "commit": made.commit, "python": made.python, "host": made.host, "cpu": made.cpu}
@@ -196,7 +250,7 @@ class Recording:
         try:
             self._write_or_fail(self._begin, plan, document, about)
         except RecordingError:
-            self._close_file()
+            self._file.close()
             raise
 
     def write(self, message: Message, received: float | None = None, size: int = 0) -> None:
@@ -248,20 +302,16 @@ class Recording:
 
     def flush(self) -> None:
         """Brings everything so far to the disk."""
-        self._write_or_fail(self._writer.flush)
+        self._write_or_fail(self._file.flush)
 
     def close(self) -> None:
         """Finishes the file; a second call does nothing. After a write error it stays unfinished, and recoverable."""
         try:
             if not self._over:
-                self._write_or_fail(self._writer.finish)
+                self._write_or_fail(self._file.finish)
                 self._over = f"{self.path}: the recording is closed"
         finally:
-            self._close_file()
-
-    def _close_file(self) -> None:
-        self._file.close()
-        self._index.close()
+            self._file.close()
 
     def __enter__(self) -> Self:
         return self
@@ -271,13 +321,13 @@ class Recording:
 
     def _begin(self, plan: Plan, document: str, about: dict[str, str]) -> None:
         experiment = plan.experiment
-        self._writer.start(profile="ros2", library="zenpark")
-        self._writer.add_attachment(0, 0, TOML, "application/toml", document.encode())
-        self._writer.add_attachment(0, 0, JSON, "application/json", msgspec.json.encode(experiment))
+        self._file.start()
+        self._file.attach(TOML, "application/toml", document.encode())
+        self._file.attach(JSON, "application/json", msgspec.json.encode(experiment))
         names = sorted({robot.kind for robot in (*experiment.robots.values(), *experiment.spares.values())})
         figures = [RecordedKind.of(KINDS[name]) for name in names if name in KINDS]
-        self._writer.add_attachment(0, 0, KINDS_JSON, "application/json", msgspec.json.encode(figures))
-        self._writer.add_metadata(METADATA, about)
+        self._file.attach(KINDS_JSON, "application/json", msgspec.json.encode(figures))
+        self._file.describe(METADATA, about)
 
     def _record(self, topic: _Written, message: Message, entry: object, logged: float) -> bool:
         """Write a message; False if it could not be encoded."""
@@ -295,18 +345,18 @@ class Recording:
             raise RecordingError(self._over)
         try:
             # chunks in order of time, as viewers want them: what was late by a moment joins the present chunk
-            self._chunk.add(channel, max(self._index.end, begun), data, stamp, number)
+            self._file.add(channel, max(self._file.end, begun), data, stamp, number)
         except BaseException:
             self._over = self._interrupted
             raise
-        if self._chunk.full:
+        if self._file.full:
             self.flush()
         return True
 
     def _register(self, topic: _Written, robot: str) -> int:
         if topic.kind not in self._schemas:
-            self._schemas[topic.kind] = self._writer.register_schema(topic.kind, "ros2msg", topic.schema.encode())
-        channel = self._writer.register_channel(topic.name.format(robot=robot), "cdr", self._schemas[topic.kind])
+            self._schemas[topic.kind] = self._file.register_schema(topic.kind, topic.schema)
+        channel = self._file.register_channel(topic.name.format(robot=robot), self._schemas[topic.kind])
         self._channels[topic.name, robot] = channel
         return channel
 
@@ -347,10 +397,7 @@ class _Written:
 
 
 class _Unbuffered:
-    """An unbuffered file: a write is the kernel's when it returns, so that a kill loses none of it.
-
-    Not a `RawIOBase`: around one of those, `mcap` puts a buffer.
-    """
+    """An unbuffered file: a write is the kernel's when it returns, so that a kill loses none of it."""
 
     def __init__(self, path: Path) -> None:
         self._raw = path.open("xb", buffering=0)
@@ -363,9 +410,6 @@ class _Unbuffered:
 
     def tell(self) -> int:
         return self._raw.tell()
-
-    def flush(self) -> None:
-        pass
 
     def close(self) -> None:
         self._raw.close()

@@ -148,7 +148,7 @@ def test_interrupt_inside_a_write_ends_all_writing(path, monkeypatch):
         raise KeyboardInterrupt
 
     recording = Recording(path, Plan(PAIR), case="only", seed=4, clock="real")
-    monkeypatch.setattr(recording._writer, "flush", interrupted)
+    monkeypatch.setattr(recording._file, "flush", interrupted)
     with pytest.raises(KeyboardInterrupt):
         recording.flush()
     with pytest.raises(RecordingError, match=r"interrupted while it wrote; run `\./zenpark recover`"):
@@ -156,27 +156,30 @@ def test_interrupt_inside_a_write_ends_all_writing(path, monkeypatch):
     recording.close()
 
 
-def test_file_equals_the_librarys_own():
-    files = []
-    for chunk_of in (writer.Chunk, lambda _: None):
-        file = io.BytesIO()
-        library = Writer(file, chunk_size=CHUNK_BYTES)
-        chunk = chunk_of(library)
-        library.start("ros2", "zenpark")
-        schema = library.register_schema("a", "ros2msg", b"int32 a")
-        channels = [library.register_channel(name, "cdr", schema) for name in "ab"]
-        for number in range(3000):
-            message = (channels[number % 7 > 2], 1000 + (number ^ 5), bytes(number % 50), 900 + number, number)
-            if chunk is None:
-                library.add_message(*message)
-            else:
-                chunk.add(*message)
-                if chunk.full:
-                    library.flush()
-        library.finish()
-        files.append(file.getvalue())
-    assert len(files[0]) > 3 * 2000
-    assert files[0] == files[1]
+def test_file_equals_the_librarys_own(tmp_path):
+    plain, swift = io.BytesIO(), io.BytesIO()
+    library, own = Writer(plain, chunk_size=CHUNK_BYTES), writer.McapFile(swift, tmp_path, CHUNK_BYTES)
+    library.start("ros2", "zenpark")
+    own.start()
+    library.add_attachment(0, 0, "file", "text/plain", b"data")
+    own.attach("file", "text/plain", b"data")
+    library.add_metadata("about", {"case": "a"})
+    own.describe("about", {"case": "a"})
+    schema = library.register_schema("a", "ros2msg", b"int32 a")
+    assert own.register_schema("a", "int32 a") == schema
+    channels = [library.register_channel(name, "cdr", schema) for name in "ab"]
+    assert [own.register_channel(name, schema) for name in "ab"] == channels
+    for number in range(3000):
+        message = (channels[number % 7 > 2], 1000 + (number ^ 5), bytes(number % 50), 900 + number, number)
+        library.add_message(*message)
+        own.add(*message)
+        if own.full:
+            own.flush()
+    library.finish()
+    own.finish()
+    assert len(plain.getvalue()) > 3 * 2000
+    assert swift.getvalue() == plain.getvalue()
+    own.close()
 
 
 @pytest.mark.usefixtures("small_disk")
