@@ -25,7 +25,8 @@ from agents.network.shutdown import leave
 from agents.protocols import ros2, turtlebot3
 from agents.protocols.ros2_node import Participant
 from agents.vectors import UNKNOWN, Setpoint, Vector
-from bridges.turtlebot3.robot import REPEAT_S, SILENCE_S, Robot
+from bridges.turtlebot3.odometry import SILENCE_S
+from bridges.turtlebot3.robot import REPEAT_S, Robot
 
 OPEN_S: Final = 4.5  # from the first attempt to reach the router to odometry of every robot
 DIAGNOSIS_S: Final = 0.3  # how long a failing `open` looks for other robots, to name them in the error
@@ -71,7 +72,7 @@ class TurtleBot3(Body):
                         session, ros2.types(where.distro), style=where.style, domain=where.domain
                     )
                 robot.join(participants[which])
-            while missing := [robot for robot in self._robots if robot.odometry_received == -inf]:
+            while missing := [robot for robot in self._robots if robot.odometry.received == -inf]:
                 if self._clock() > deadline:
                     raise BodyError("; ".join(self._missing_odometry(robot) for robot in missing))
                 time.sleep(POLL_S)
@@ -127,8 +128,8 @@ class TurtleBot3(Body):
         now = self._read_at = self._clock()
         for robot in self._robots:
             robot.receive_messages(t, now)
-            if robot.time == -inf and robot.odometry_received > -inf:
-                robot.time = t - (now - robot.odometry_received)  # received during `open`
+            if robot.time == -inf and robot.odometry.received > -inf:
+                robot.time = t - (now - robot.odometry.received)  # received during `open`
             robot.send_command(self._clock())
         linked = {endpoints: network.connected(session) for endpoints, session in self._sessions.items()}
         return [
@@ -136,13 +137,13 @@ class TurtleBot3(Body):
         ]
 
     def _state(self, row: int, robot: Robot, t: float, now: float, *, linked: bool) -> BodyState:
-        (x, y, yaw), odometry = robot.pose, robot.time
+        (x, y, yaw), odometry = robot.odometry.pose, robot.time
         state = BodyState(
             odometry,
             (x, y, 0.0) if isfinite(x) else UNKNOWN,
             yaw=yaw,
             battery=robot.battery,
-            received=t - now + robot.odometry_received,
+            received=t - now + robot.odometry.received,
             note=robot.note(now, linked),
             scan=robot.scan,
         )
@@ -151,7 +152,7 @@ class TurtleBot3(Body):
             # a robot with external positions but without odometry is still out of reach
             if t - odometry > SILENCE_S:
                 state.time = min(state.time, odometry)
-        speed = robot.speed[0]
+        speed = robot.odometry.speed[0]
         state.velocity = speed * cos(state.yaw), speed * sin(state.yaw), 0.0
         return state
 
@@ -202,7 +203,7 @@ class TurtleBot3(Body):
             now = self._clock()
             for robot in self._robots:
                 try:
-                    if robot.stale(now):
+                    if robot.commanded.stale(now):
                         robot.send_command(now)
                 except Exception:  # noqa: BLE001 - of any kind: the others are stopped; the loop meets it as well
                     continue

@@ -19,7 +19,8 @@ from agents.kinds.khepera4 import KHEPERA4
 from agents.network.session import open_session
 from agents.protocols import ros2, turtlebot3
 from bridges.turtlebot3.body import TurtleBot3
-from bridges.turtlebot3.robot import StampAge, ranges
+from bridges.turtlebot3.odometry import StampAge
+from bridges.turtlebot3.robot import ranges
 from tests.bridges.turtlebots import STYLES, FastClock, Stage, request
 from tests.waiting import until
 from twins.devices.device import Faults

@@ -220,7 +220,7 @@ def test_two_robots_of_one_namespace_have_no_position() -> None:
     robot._types, robot._command_type = ros2.types("humble"), ros2.TWIST
     waiting: list[SimpleNamespace] = []
     nothing = SimpleNamespace(newest=lambda: None)
-    robot._odometry = SimpleNamespace(received=lambda: [waiting.pop()])  # type: ignore[assignment]
+    robot._odometry_inbox = SimpleNamespace(received=lambda: [waiting.pop()])  # type: ignore[assignment]
     robot._scan = robot._battery = nothing  # type: ignore[assignment]
     robot._watch = SimpleNamespace(handler=SimpleNamespace(try_recv=lambda: None))  # type: ignore[assignment]
 
@@ -257,8 +257,8 @@ def test_stale_commands_are_followed_by_zeros() -> None:
     for robot, put in zip(body._robots, (fails, lambda message: sent.append(message.linear.x)), strict=True):
         robot._types, robot._command_type = types, ros2.TWIST
         robot._command = SimpleNamespace(put=put)  # type: ignore[assignment]
-        robot.odometry_received = 1e9
-        robot._sent_at = 100.0
+        robot.odometry.received = 1e9
+        robot.commanded._sent_at = 100.0
         robot.drive(0.1, 0.0, 100.0)
 
     class Rounds:
@@ -277,7 +277,7 @@ def test_command_from_before_suspension_becomes_zeros() -> None:
     sent = []
     robot._types, robot._command_type = ros2.types("humble"), ros2.TWIST
     robot._command = SimpleNamespace(put=lambda message: sent.append(message.linear.x))  # type: ignore[assignment]
-    robot.odometry_received = 103.0
+    robot.odometry.received = 103.0
     robot.drive(0.1, 0.0, 100.0)  # decided on what was read then, commanded after the suspension
     robot.send_command(103.0)
     assert sent == [0.0]

@@ -1,0 +1,127 @@
+"""Odometry of a TurtleBot3: a pose in the arena from counts that begin anywhere, and may restart."""
+
+from __future__ import annotations
+
+from collections import deque
+from math import cos, hypot, inf, isfinite, nan, pi, sin
+from typing import Final
+
+from agents.protocols import ros2
+from agents.protocols.ros2 import Message
+
+SILENCE_S: Final = 0.5  # with older odometry the robot is out of reach and gets zeros
+STANDING: Final = (0.005, 0.02)  # [m/s, rad/s] slower robots stand
+FASTEST: Final = 0.5  # [m/s] odometry that jumps faster was restarted
+RESETS: Final = (3, 5.0)  # as many within as many seconds are no restarts: two robots send odometry, or it is broken
+DRIFT: Final = 1e-3  # [s/s] largest difference between the robot's clock, which may be slewed, and ours
+ORIGIN: Final = (0.01, 0.02)  # [m, rad] odometry closer to zero is at its origin
+
+Planar = tuple[float, float, float]  # x, y [m], yaw [rad]
+
+
+class StampAge:
+    """Age of messages: arrival less stamp, less the smallest such difference so far, for the clocks are not the same.
+
+    A stamp that does not grow comes from a clock that was set back, or from a sender without stamps: the record
+    restarts.
+    """
+
+    def __init__(self) -> None:
+        self._stamp = self._arrival = -inf
+        self._least = inf
+
+    def age(self, arrival: float, stamp: float) -> float:
+        """Age [s] of a message with this stamp [s] that arrived at `arrival` [s, monotonic]."""
+        if stamp <= self._stamp:
+            self._least = inf
+        crept = DRIFT * max(arrival - self._arrival, 0.0) if isfinite(self._arrival) else 0.0
+        delay = arrival - stamp
+        self._least = min(self._least + crept, delay)
+        self._stamp, self._arrival = stamp, arrival
+        return delay - self._least
+
+
+class Odometry:
+    """Pose and speed of a robot in the arena, by its odometry. Times `now` are monotonic [s]."""
+
+    def __init__(self, start: Planar, *, boot: bool) -> None:
+        """Of a robot at `start`; `boot`: it stood there when it was switched on, not when it is first received."""
+        self.pose: Planar = (nan, nan, nan)  # in the arena; NaN before the first odometry
+        self.speed = (0.0, 0.0)  # v [m/s] and ω [rad/s]
+        self.received = -inf  # time of the last odometry
+        self.age = 0.0  # of the last odometry when it arrived, by its stamp [s]
+        self.restarted = False
+        self._start, self._stamps = start, StampAge()
+        self._raw_pose: Planar = (nan, nan, nan)  # in odometry's own frame
+        self._frame: Planar | None = start if boot else None  # origin of odometry in the arena
+        self._resets: deque[float] = deque(maxlen=RESETS[0])  # times of the last
+
+    def update(self, message: Message, now: float) -> bool:
+        """Take a message; False if a number in it is not finite."""
+        place, q = message.pose.pose.position, message.pose.pose.orientation
+        twist = message.twist.twist
+        x, y, v, w = place.x, place.y, twist.linear.x, twist.angular.z
+        yaw = ros2.yaw_of(q)
+        if not all(map(isfinite, (x, y, yaw, v, w))):
+            return False
+        if self._frame is None:
+            self._frame = _frame(self._start, (x, y, yaw))
+        pose = _to_arena(self._frame, (x, y, yaw))
+        if self.received > -inf and self._was_reset((x, y, yaw), pose, now):
+            # odometry counts from zero again: assume that the robot stands at its last known pose
+            self._frame, self.restarted = _frame(self.pose, (x, y, yaw)), True
+            self._resets.append(now)
+            pose = self.pose
+        self._raw_pose = (x, y, yaw)
+        self.pose, self.speed = pose, (v, w)
+        self.age = self._stamps.age(now, ros2.stamp_of(message.header))
+        self.received = now
+        return True
+
+    def _was_reset(self, counted: Planar, pose: Planar, now: float) -> bool:
+        """Whether odometry was reset: a jump faster than any robot, or back at the origin after a silence."""
+        silence = now - self.received
+        jump = hypot(pose[0] - self.pose[0], pose[1] - self.pose[1])
+        back = silence > SILENCE_S and _at_origin(counted) and not _at_origin(self._raw_pose)
+        return back or jump > FASTEST * silence + 0.1
+
+    def silent(self, now: float) -> bool:
+        return now - self.received > SILENCE_S
+
+    def unsteady(self, now: float) -> bool:
+        """Whether odometry was reset too often to tell a position."""
+        count, span = RESETS
+        return len(self._resets) == count and now - self._resets[0] < span
+
+    @property
+    def standing(self) -> bool:
+        return abs(self.speed[0]) < STANDING[0] and abs(self.speed[1]) < STANDING[1]
+
+    def fault(self, now: float) -> str:
+        """Fault for users; empty if none."""
+        if self.silent(now):
+            return f"odometry silent for {now - self.received:.0f} s" if self.received > -inf else "no odometry"
+        if self.unsteady(now):
+            return "odometry jumps again and again: do two robots have this namespace?"
+        if self.age > SILENCE_S:
+            return f"odometry is {self.age:.1f} s old by its stamps: its link holds it back, or its clock was set"
+        return ""
+
+
+def _at_origin(pose: Planar) -> bool:
+    return hypot(pose[0], pose[1]) < ORIGIN[0] and abs(pose[2]) < ORIGIN[1]
+
+
+def _to_arena(frame: Planar, pose: Planar) -> Planar:
+    """Transform a pose from `frame` to the arena."""
+    x, y, yaw = frame
+    c, s = cos(yaw), sin(yaw)
+    heading = pi - (pi - yaw - pose[2]) % (2.0 * pi)
+    return x + c * pose[0] - s * pose[1], y + s * pose[0] + c * pose[1], heading
+
+
+def _frame(arena: Planar, pose: Planar) -> Planar:
+    """Frame in which `pose` equals the pose `arena` of the arena."""
+    yaw = arena[2] - pose[2]
+    c, s = cos(yaw), sin(yaw)
+    return arena[0] - c * pose[0] + s * pose[1], arena[1] - s * pose[0] - c * pose[1], yaw
