@@ -30,7 +30,7 @@ from experiments.metrics import comparable, measure
 from experiments.metrics.results import CaseMetrics
 from experiments.recording import playback
 from experiments.recording.reader import RecordingError
-from experiments.recording.run_folder import METRICS, SOURCE, case_figures, read_origin
+from experiments.recording.run_folder import METRICS, SOURCE, case_figures, differences_from_first, read_origin
 from experiments.recording.trace import Trace
 from experiments.report import metrics_files
 from experiments.virtual_time import simulation
@@ -309,6 +309,47 @@ def read_metrics(folder: str | Path) -> list[CaseMetrics]:
         return metrics_files.read_json(Path(folder) / METRICS)
     except (OSError, ValueError):
         return [case for run in reopen_seeds(folder) for case in run.metrics.values()]
+
+
+def pool_seeds(folders: Sequence[str], read: Sequence[Sequence[Run]]) -> list[Run]:
+    """Seeds of several runs, by folder, as those of one, with the cases that all of them have.
+
+    Raises DocumentError if experiments, clocks or bodies differ, or a seed is there twice.
+    """
+    every = [run for seeds in read for run in seeds]
+    for folder, runs_of_one in zip(folders, read, strict=True):
+        for each in (case for run in runs_of_one for case in run.metrics.values()):
+            if each.interrupted or each.spoiled:
+                early = [f"{each.duration_s:.1f} s of {each.planned_s:g} s"] if each.interrupted else []
+                why = f"{each.case}, seed {each.seed}: {'; '.join([*early, *each.spoiled])}"
+                raise refusal(folder, f"is no whole run that nothing spoiled ({why})", "repeat it, or leave it out")
+    cases = [case for case in every[0].metrics if all(case in run.metrics for run in every)]
+    first = {case: read[0][0].traces[case] for case in cases}
+    for folder, (run, *_) in zip(folders, read, strict=True):
+        for case, trace in first.items():
+            mine = run.traces[case]
+            if mine.plan.changed(seed=0) != trace.plan.changed(seed=0):
+                hint = f"compare them without --pool: `./zenpark report {folders[0]} {folder}`"
+                raise refusal(folder, f"differs from {folders[0]} in more than its seed", hint)
+            if mine.clock != trace.clock:
+                raise refusal(folder, f"is of {mine.clock} time, {folders[0]} of {trace.clock} time", "pool them apart")
+    seeds = [run.seed for run in every]
+    if twice := sorted({seed for seed in seeds if seeds.count(seed) > 1}):
+        raise refusal("--pool", f"seed {twice[0]} is there twice", "give each run a --seed of its own")
+    if not cases:
+        raise refusal("--pool", "no case is in all of these runs", "run the same cases")
+    left = dict.fromkeys(case for run in every for case in run.metrics if case not in cases)
+    notes = [f"Of {len(folders)} runs together: {', '.join(folders)}."]
+    notes += [f"Left out, because it is not in all of them: {', '.join(left)}."] if left else []
+    for _, folder, found in differences_from_first(folders, folders):
+        notes += [f"{folder}: {each}" for each in found if each.startswith("made with")]
+
+    def alone(run: Run) -> Run:
+        kept = {case: run.traces[case] for case in cases if case in run.traces}
+        return replace(run, traces=kept, metrics={case: run.metrics[case] for case in cases}, folder=None)
+
+    runs = [alone(run) for run in every]
+    return [replace(runs[0], notes=(*notes, *runs[0].notes)), *runs[1:]]
 
 
 def read_back(folder: Path, recordings: Mapping[str, Path], notes: Sequence[str], failures: Sequence[str] = ()) -> Run:

@@ -255,3 +255,11 @@ def _formatted(value: object) -> str:
     if value in (None, [], {}):
         return "-"
     return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+
+
+def differences_from_first(labels: Sequence[str], folders: Sequence[str]) -> list[tuple[str, str, list[str]]]:
+    """Label and folder of each run, and how it differs from the first one; of those that keep their file."""
+    past = {run.folder: run for run in past_runs([Path(folder) for folder in folders])}
+    known = [(name, past[str(Path(folder))]) for name, folder in zip(labels, folders, strict=True)
+             if str(Path(folder)) in past]  # fmt: skip
+    return [(name, run.folder, differences(known[0][1], run)) for name, run in known]

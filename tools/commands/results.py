@@ -65,7 +65,7 @@ def report(
     from experiments.report import report as pages  # matplotlib takes 0.6 s
     from experiments.report import typeset
     from experiments.report.tables import summary_metrics
-    from experiments.run import read_metrics, reopen_seeds
+    from experiments.run import pool_seeds, read_metrics, reopen_seeds
 
     form = partial(typeset.latex, width=width) if as_latex else typeset.markdown if as_markdown else None
     if metrics and form is None:
@@ -89,7 +89,7 @@ def report(
         if not known:
             raise RecordingError(f"{folder}: no case had begun; there is nothing to report")
     pooled = len(read) > 1
-    seeds = _pooled(folders, read) if pooled else [run for found in read for run in found]
+    seeds = pool_seeds(folders, read) if pooled else [run for found in read for run in found]
     cases = pages.labelled(named) if several else [case for run in seeds for case in run.metrics.values()]
     if form is not None:
         names = {short_name(name): name for name in summary_metrics()}
@@ -123,7 +123,7 @@ def _compare(
 ) -> int:
     """Print how runs differ and their key figures against the first, and write the page of their comparison."""
     from experiments.metrics.metric import console_metrics
-    from experiments.recording.run_folder import past_runs
+    from experiments.recording.run_folder import differences_from_first, past_runs
     from experiments.report import report as pages
     from experiments.report.page import MARKS
     from experiments.report.tables import summary_table
@@ -133,7 +133,7 @@ def _compare(
 
     known = {run.folder: run for run in past_runs([Path(folder) for folder in folders])}
     past = [known[place] for folder in folders if (place := str(Path(folder))) in known]
-    differ = _differences([name for name, _ in named], folders)
+    differ = differences_from_first([name for name, _ in named], folders)
     with _writing(target):
         titles = "; ".join(dict.fromkeys(run.origin.title for run in past))
         page = pages.compare(target, named, source=titles, differences=differ)
@@ -212,61 +212,6 @@ def _report_sweep(
     figures = target / "figures"
     print_result({"figures": figures, "cells": len(rows)}, str(figures), as_json=as_json)
     return 0
-
-
-def _pooled(folders: Sequence[str], read: Sequence[Sequence[Run]]) -> list[Run]:
-    """Seeds of several runs as those of one, with the cases that all of them have.
-
-    Raises DocumentError if experiments, clocks or bodies differ, or a seed is there twice.
-    """
-    from dataclasses import replace
-
-    from experiments.file.problems import refusal
-
-    every = [run for seeds in read for run in seeds]
-    for folder, runs_of_one in zip(folders, read, strict=True):
-        for each in (case for run in runs_of_one for case in run.metrics.values()):
-            if each.interrupted or each.spoiled:
-                early = [f"{each.duration_s:.1f} s of {each.planned_s:g} s"] if each.interrupted else []
-                why = f"{each.case}, seed {each.seed}: {'; '.join([*early, *each.spoiled])}"
-                raise refusal(folder, f"is no whole run that nothing spoiled ({why})", "repeat it, or leave it out")
-    cases = [case for case in every[0].metrics if all(case in run.metrics for run in every)]
-    first = {case: read[0][0].traces[case] for case in cases}
-    for folder, (run, *_) in zip(folders, read, strict=True):
-        for case, trace in first.items():
-            mine = run.traces[case]
-            if mine.plan.changed(seed=0) != trace.plan.changed(seed=0):
-                hint = f"compare them without --pool: `./zenpark report {folders[0]} {folder}`"
-                raise refusal(folder, f"differs from {folders[0]} in more than its seed", hint)
-            if mine.clock != trace.clock:
-                raise refusal(folder, f"is of {mine.clock} time, {folders[0]} of {trace.clock} time", "pool them apart")
-    seeds = [run.seed for run in every]
-    if twice := sorted({seed for seed in seeds if seeds.count(seed) > 1}):
-        raise refusal("--pool", f"seed {twice[0]} is there twice", "give each run a --seed of its own")
-    if not cases:
-        raise refusal("--pool", "no case is in all of these runs", "run the same cases")
-    left = dict.fromkeys(case for run in every for case in run.metrics if case not in cases)
-    notes = [f"Of {len(folders)} runs together: {', '.join(folders)}."]
-    notes += [f"Left out, because it is not in all of them: {', '.join(left)}."] if left else []
-    for _, folder, found in _differences(folders, folders):
-        notes += [f"{folder}: {each}" for each in found if each.startswith("made with")]
-
-    def alone(run: Run) -> Run:
-        kept = {case: run.traces[case] for case in cases if case in run.traces}
-        return replace(run, traces=kept, metrics={case: run.metrics[case] for case in cases}, folder=None)
-
-    runs = [alone(run) for run in every]
-    return [replace(runs[0], notes=(*notes, *runs[0].notes)), *runs[1:]]
-
-
-def _differences(labels: Sequence[str], folders: Sequence[str]) -> list[tuple[str, str, list[str]]]:
-    """Label and folder of each run, and how it differs from the first one; of those that keep their file."""
-    from experiments.recording.run_folder import differences, past_runs
-
-    past = {run.folder: run for run in past_runs([Path(folder) for folder in folders])}
-    known = [(name, past[str(Path(folder))]) for name, folder in zip(labels, folders, strict=True)
-             if str(Path(folder)) in past]  # fmt: skip
-    return [(name, run.folder, differences(known[0][1], run)) for name, run in known]
 
 
 def _as_json(run: PastRun) -> dict[str, Any]:
