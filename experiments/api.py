@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from agents.plugins.predictors import Predictor
     from agents.plugins.registry import PluginError
     from agents.plugins.triggers import Trigger
-    from agents.vectors import Vector, clamp, difference, distance, dot, norm, planar, wrap
+    from agents.vectors import Vector, clamp, distance, norm, wrap
     from experiments.check import ideal_run
     from experiments.check.check import check, figures
     from experiments.definition import graph, rigidity
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from experiments.real_time.conductor.orders import send_run_order
     from experiments.recording.trace import Trace
     from experiments.report import style
-    from experiments.run import Run, folder, reopen, reopen_seeds, show, simulate
+    from experiments.run import folder, reopen, reopen_seeds, show, simulate
     from experiments.sweep import pareto
     from experiments.sweep.sweep import sweep
     from twins.arrays import Array
@@ -42,19 +42,19 @@ if TYPE_CHECKING:
     from twins.models.ground import Ground
 
 __all__ = [  # noqa: RUF022 - by subject, as in docs/python.md
-    # experiments
-    "load", "loads", "check", "simulate", "sweep", "reopen", "reopen_seeds", "show", "folder", "figures",
-    "Document", "Run", "Trace",
-    # laws
-    "Law", "Gradient", "Control", "Memory", "Said", "View", "RobotFacts", "Link", "PluginError",
-    # other plug-ins of the file
-    "Trigger", "Predictor", "Planner", "Avoidance", "measure_gap", "EngineFactory", "PointMassEngine", "moving_models",
-    # metrics
-    "Metric", "Measurement", "Array",
+    # what most notebooks and plug-ins need
+    "load", "loads", "check", "simulate", "sweep", "reopen", "show",
+    "Law", "Gradient", "Control", "Said", "Trigger", "Planner", "Metric", "Trace",
+    # more of experiments
+    "Document", "figures", "reopen_seeds", "folder",
+    # what laws and metrics get and raise
+    "View", "Memory", "RobotFacts", "Link", "PluginError", "Measurement", "Array",
+    # other bases of plug-ins
+    "Predictor", "Avoidance", "measure_gap", "EngineFactory", "PointMassEngine", "moving_models",
     # kinds and bodies
     "Kind", "KINDS", "Ground", "Body", "BodyRequest", "BodyState", "BodyError", "call_all",
     # vectors
-    "Vector", "norm", "distance", "difference", "dot", "planar", "clamp", "wrap",
+    "Vector", "norm", "distance", "clamp", "wrap",
     # orders to a run in real time
     "RunOrder", "Keys", "send_run_order",
     # modules of theory and of figures
@@ -74,7 +74,7 @@ HOMES: Final = {  # modules, and what of them is named above
     "agents.plugins.predictors": "Predictor",
     "agents.plugins.registry": "PluginError",
     "agents.plugins.triggers": "Trigger",
-    "agents.vectors": "Vector clamp difference distance dot norm planar wrap",
+    "agents.vectors": "Vector clamp distance norm wrap",
     "experiments.check": "ideal_run",
     "experiments.check.check": "check figures",
     "experiments.definition": "graph rigidity",
@@ -85,7 +85,7 @@ HOMES: Final = {  # modules, and what of them is named above
     "experiments.real_time.conductor.orders": "send_run_order",
     "experiments.recording.trace": "Trace",
     "experiments.report": "style",
-    "experiments.run": "Run folder reopen reopen_seeds show simulate",
+    "experiments.run": "folder reopen reopen_seeds show simulate",
     "experiments.sweep": "pareto",
     "experiments.sweep.sweep": "sweep",
     "twins.arrays": "Array",

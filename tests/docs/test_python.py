@@ -42,7 +42,7 @@ FLYING = (
         "Planner",
     ),
     *("Avoidance", "measure_gap", "Kind", "KINDS", "Ground", "Body", "BodyRequest", "BodyState", "BodyError"),
-    *("call_all", "Vector", "norm", "distance", "difference", "dot", "planar", "clamp", "wrap"),
+    *("call_all", "Vector", "norm", "distance", "clamp", "wrap"),
 )
 
 
@@ -64,6 +64,11 @@ def test_every_name_has_a_type_and_a_home():
     assert sorted(zenpark.__all__) == sorted(api.HOME) == dir(zenpark)
     for name in zenpark.__all__:
         assert getattr(zenpark, name) is not None
+
+
+def test_fifteen_names_come_first_and_on_the_page():
+    rows = re.search(r"^Fifteen names.*\n\n((?:\|.*\n)+)", PAGE, re.MULTILINE)[1]
+    assert re.findall(r"`(\w+)`", rows) == zenpark.__all__[:15]
 
 
 def test_unknown_names_are_refused_with_the_nearest():
