@@ -289,7 +289,7 @@ class ImmediateSubscriber:
         """Subscribes: each stop is given to `obey`; the newest `depth` wait to be polled from then on."""
         self._obey = obey
         self.waiting: deque[messages.Stop] = deque(maxlen=depth)  # to be polled
-        self._subscriber = session.declare_subscriber(key, Callback(self._receive, indirect=False))
+        self._subscriber = session.declare_subscriber(key, Callback(self.receive, indirect=False))
 
     def try_recv(self) -> messages.Stop | None:
         return self.waiting.popleft() if self.waiting else None
@@ -297,7 +297,7 @@ class ImmediateSubscriber:
     def close(self) -> None:
         self._subscriber.undeclare()
 
-    def _receive(self, sample: zenoh.Sample) -> None:
+    def receive(self, sample: zenoh.Sample) -> None:
         if sample.kind == zenoh.SampleKind.DELETE:
             return
         stop = messages.read_stop(sample.payload.to_bytes(), str(sample.encoding))

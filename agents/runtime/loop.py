@@ -156,7 +156,7 @@ class Runtime:
 
     def subscribe_to_stops(self, session: zenoh.Session) -> None:
         """Subscribes to emergency stops before the body is opened, which may take a minute."""
-        self._estop = pubsub.ImmediateSubscriber(session, self._setup.keys.estop, self._cut)
+        self.estop = pubsub.ImmediateSubscriber(session, self._setup.keys.estop, self._cut)
 
     def join(self, session: zenoh.Session) -> None:
         self._opened = True
@@ -290,7 +290,7 @@ class Runtime:
         self._neighbours.deliver(t, self._utc)
         if self._goals is not None:
             self._goals.receive(t, self._utc)
-        if self._estop.waiting:
+        if self.estop.waiting:
             self._apply_stops()
         if (located := self._located) is not None:
             for row, taken, position, yaw in located.receive(self._utc, t):
@@ -400,7 +400,7 @@ class Runtime:
 
     def _apply_stops(self) -> None:
         """Ends the lifecycle of all rows after an emergency stop, see `_cut`."""
-        for stop in network.received(self._estop):
+        for stop in network.received(self.estop):
             self._cut_off = False  # the phases hold it from now on
             for robot in self.robots:
                 robot.lifecycle.stop(stop.words)

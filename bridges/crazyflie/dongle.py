@@ -30,7 +30,7 @@ class Dongle:
     serial_number: Final = "SOFTWARE"
 
     def __init__(self, air: Simulated) -> None:
-        self._air = air
+        self.air = air
         self._ctx = self  # pyusb's resources of a device
         self._socket: socket.socket | None = None
         self._channel, self._rate, self._retries, self._address = 2, 2, 3, bytes((0xE7,) * 5)
@@ -41,7 +41,7 @@ class Dongle:
     def set_configuration(self, _number: int) -> None:
         """See pyusb: opens the device."""
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.connect((self._air.host, self._air.port))
+        self._socket.connect((self.air.host, self.air.port))
         self._socket.settimeout(ANSWER_S)
 
     def reset(self) -> None:
@@ -76,7 +76,7 @@ class Dongle:
         self._status = self._exchange(request + packet)
         status = self._status[0]
         repeated = status >> 4 if status & ACK else self._retries
-        self._ends = begin + 1.0 / self._air.hz + self._extra + repeated * RETRY_S
+        self._ends = begin + 1.0 / self.air.hz + self._extra + repeated * RETRY_S
         self._extra = 0.0
         return len(packet)
 

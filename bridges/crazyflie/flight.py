@@ -177,7 +177,7 @@ class Flight:
         self._target, self._top, self._sent, self.span_s = None, (x, y, height, place[3]), None, span
         self._on_board.clear()
         self._on_board.append(height)
-        self._enter(Phase.CLIMBING)  # from here on a stop cuts the motors
+        self.enter(Phase.CLIMBING)  # from here on a stop cuts the motors
         trajectories = self.link.trajectories
         answer = self._command_planner(
             trajectories.start_command, lambda: trajectories.start(trajectory), Info.PLANNER_ACTIVE
@@ -187,14 +187,14 @@ class Flight:
         self._plan_end(time.monotonic() + self.span_s, height)
         if answer is None or answer == Status.OK:
             return  # a lost answer is no refusal: `update_phase` sees whether it flies
-        self._enter(Phase.GROUND)
+        self.enter(Phase.GROUND)
         self._disarm_at = -math.inf
         self.trouble = f"take-off refused: {ANSWERS.get(answer, f'error {answer}')}"
 
     def land(self) -> None:
         """Descend at the current place, then switch the motors off; disarm on the ground."""
         if self.phase is Phase.GROUND and self._flying:
-            self._enter(Phase.FLYING)
+            self.enter(Phase.FLYING)
         if self.phase in (Phase.CLIMBING, Phase.FLYING):
             self._land()
         elif self.phase is Phase.GROUND:
@@ -215,7 +215,7 @@ class Flight:
         self.link.cf.high_level_commander.land(FLOOR, self._ordered_span, yaw=None)
 
     def _begin_landing(self) -> None:
-        self._enter(Phase.LANDING)
+        self.enter(Phase.LANDING)
         self.span_s = self._ordered_span
         self._down_at = self.phase_since + self.span_s + MARGIN_S
         self._land_replies, _ = self.link.planner_reply(HighLevel.LAND)
@@ -261,7 +261,7 @@ class Flight:
             self._disarm_at = -math.inf
             return
         if self.phase is not Phase.STOPPING:
-            self._enter(Phase.STOPPING)
+            self.enter(Phase.STOPPING)
         self.link.cf.supervisor.send_emergency_stop()
 
     # ------------------------------------------------------------------ in the air
@@ -288,9 +288,9 @@ class Flight:
             self.trouble = "landed: no commands from the robot's loop"
             self.land()
             return
-        self._stream(now)
+        self.stream(now)
 
-    def _stream(self, now: float) -> None:
+    def stream(self, now: float) -> None:
         """Send the setpoint, if due; while the drone has none, the end of its climb."""
         target = self._target
         if target is None and now - self.phase_since > self.span_s:
@@ -300,7 +300,7 @@ class Flight:
         if time.monotonic() - self._commanded_at > LOOP_SILENCE_S:  # the process stood still until a moment ago
             return
         if self._target is not None and self.phase is Phase.CLIMBING:
-            self._enter(Phase.FLYING)
+            self.enter(Phase.FLYING)
         if _same(target, self._sent) and now - self._sent_at < REFRESH_S:
             return
         self._begun = min(self._begun, now)
@@ -348,18 +348,18 @@ class Flight:
             return
         if self.airborne and Info.LOCKED in info:
             self.trouble = "" if self.phase is Phase.STOPPING else "the drone cut its motors"
-            self._enter(Phase.STOPPED)
+            self.enter(Phase.STOPPED)
         elif self.phase is Phase.STOPPING:
             if not flying and since > STOPPING_S:
                 self.trouble = ""
-                self._enter(Phase.STOPPED)
+                self.enter(Phase.STOPPED)
         elif self.phase is Phase.STOPPED and not flying and Info.LOCKED not in info and since > STOPPING_S:
-            self._enter(Phase.GROUND)  # switched off and on
+            self.enter(Phase.GROUND)  # switched off and on
             self.trouble = ""
         elif self.phase is Phase.LANDING and not flying and since > SHORTEST_S:
-            self._enter(Phase.GROUND)
+            self.enter(Phase.GROUND)
         elif self.airborne and not flying and since > FLYING_FLAG_S:
-            self._enter(Phase.GROUND)
+            self.enter(Phase.GROUND)
             self._disarm_at = -math.inf
             self.trouble = self.trouble or "its motors do not turn"
         elif telemetry.battery_low and self.phase in (Phase.CLIMBING, Phase.FLYING):
@@ -382,11 +382,11 @@ class Flight:
             return True
         if self._flying and self.phase is not Phase.STOPPED:
             if not self.airborne:
-                self._enter(Phase.FLYING)
+                self.enter(Phase.FLYING)
             self._start_replies = 0
             return True
         if self.airborne:
-            self._enter(Phase.GROUND)
+            self.enter(Phase.GROUND)
         return False
 
     # ------------------------------------------------------------------ parts of the above
@@ -396,7 +396,7 @@ class Flight:
         """Whether the supervisor reports that the motors turned within the last two seconds."""
         return Info.FLYING in self._telemetry.info
 
-    def _enter(self, phase: Phase) -> None:
+    def enter(self, phase: Phase) -> None:
         self.phase, self.phase_since = phase, time.monotonic()
         self.publish_airborne()
 

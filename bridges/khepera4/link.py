@@ -240,7 +240,7 @@ class Khepera4Link:
         silent = False
         while not self._ending.wait(ticks.until_next()):
             ticks.begin()
-            v, turn, until = (0.0, 0.0, math.inf) if silent else self._current_twist()
+            v, turn, until = (0.0, 0.0, math.inf) if silent else self.current_twist()
             moves = v != 0.0 or turn != 0.0
             self._stands = self._stands and not moves
             try:
@@ -285,7 +285,7 @@ class Khepera4Link:
             self._stands = True
             return
 
-    def _current_twist(self) -> tuple[float, float, float]:
+    def current_twist(self) -> tuple[float, float, float]:
         """v [m/s], ω [rad/s], and until when they may be sent [s, `uptime`]."""
         v, turn, decided = self.setpoint
         if self.battery_empty or uptime() > decided + FRESH_S:

@@ -43,7 +43,7 @@ class TelloBody(Body):
         self._start_yaw = request.yaw
         self._external = [External() for _ in self._names]
         self._library: TelloLibrary | None = None
-        self._pilots: list[TelloPilot] = []
+        self.pilots: list[TelloPilot] = []
         self._lock = threading.Lock()
         self._ending = threading.Event()
         self._last_read = -math.inf
@@ -57,7 +57,7 @@ class TelloBody(Body):
         except BodyError:
             self._claims.release()
             raise
-        self._pilots = [
+        self.pilots = [
             TelloPilot(library.drone(*place), kind, chosen)
             for place, kind, chosen in zip(self._endpoints, self._kinds, self._settings, strict=True)
         ]
@@ -65,13 +65,13 @@ class TelloBody(Body):
         self._thread = threading.Thread(target=self._run, args=(library,), name="tello pilots", daemon=True)
         self._thread.start()
         deadline = uptime() + OPEN_S
-        while uptime() < deadline and any(pilot.state_received == -math.inf for pilot in self._pilots):
+        while uptime() < deadline and any(pilot.state_received == -math.inf for pilot in self.pilots):
             self._ending.wait(0.02)
-        if all(pilot.state_received == -math.inf for pilot in self._pilots):
+        if all(pilot.state_received == -math.inf for pilot in self.pilots):
             now = uptime()
             reasons = [
                 f"{name} at {host}:{port}: {pilot.note(now)}"
-                for name, (host, port), pilot in zip(self._names, self._endpoints, self._pilots, strict=True)
+                for name, (host, port), pilot in zip(self._names, self._endpoints, self.pilots, strict=True)
             ]
             self.close()
             remedy = f"switch it on, join its Wi-Fi, let UDP {protocol.STATE_PORT} through the firewall"
@@ -80,7 +80,7 @@ class TelloBody(Body):
     def read(self, t: float) -> Sequence[BodyState]:
         with self._lock:
             now = self._last_read = uptime()
-            return [self._state(row, pilot, t, now) for row, pilot in enumerate(self._pilots)]
+            return [self._state(row, pilot, t, now) for row, pilot in enumerate(self.pilots)]
 
     def _state(self, row: int, pilot: TelloPilot, t: float, now: float) -> BodyState:
         """State of a drone; its pilot gets the external pose."""
@@ -104,24 +104,24 @@ class TelloBody(Body):
     def command(self, setpoints: Sequence[Setpoint]) -> None:
         with self._lock:
             now = uptime()
-            for pilot, setpoint in zip(self._pilots, setpoints, strict=True):
+            for pilot, setpoint in zip(self.pilots, setpoints, strict=True):
                 if math.isfinite(sum(setpoint)) and pilot.duty in (Duty.HOLD, Duty.FLY):
                     pilot.duty, pilot.setpoint, pilot.setpoint_time = Duty.FLY, setpoint, now
 
     def takeoff(self, rows: Sequence[int], heights: Sequence[float]) -> None:
         with self._lock:
             for row, height in zip(rows, heights, strict=True):
-                self._pilots[row].take_off(height, uptime())
+                self.pilots[row].take_off(height, uptime())
 
     def land(self, rows: Sequence[int]) -> None:
         with self._lock:
             now = uptime()
-            call_all(partial(self._pilots[row].land, now) for row in rows if self._pilots)
+            call_all(partial(self.pilots[row].land, now) for row in rows if self.pilots)
 
     def stop(self, rows: Sequence[int]) -> None:
         with self._lock:
             now = uptime()
-            call_all(partial(self._pilots[row].cut, now) for row in rows if self._pilots)
+            call_all(partial(self.pilots[row].cut, now) for row in rows if self.pilots)
 
     def locate(self, row: int, t: float, position: Vector, yaw: float) -> None:
         self._external[row].update(t, position, yaw)
@@ -132,9 +132,9 @@ class TelloBody(Body):
             self._thread.join()
             self._thread = None
         try:
-            call_all(pilot.leave for pilot in self._pilots)  # which can still be stopped
+            call_all(pilot.leave for pilot in self.pilots)  # which can still be stopped
         finally:
-            self._pilots = []
+            self.pilots = []
             if self._library is not None:
                 self._library.close()
                 self._library = None
@@ -147,7 +147,7 @@ class TelloBody(Body):
                 with contextlib.suppress(Exception):  # no datagram may end the thread
                     library.receive()
                 now = uptime()
-                for pilot in self._pilots:
+                for pilot in self.pilots:
                     try:
                         pilot.step(now, self._last_read)
                     except Exception as error:  # noqa: BLE001 - of any kind: the others fly on

@@ -78,7 +78,7 @@ class TelloPilot:
         self._state: Mapping[str, Any] = {}
         self._zero_yaw: int | None = None
         self._height, self._motors = 0, -1
-        self._running = self._aloft = -math.inf  # when the motors' clock last moved, when it was last not low
+        self._running = self.aloft = -math.inf  # when the motors' clock last moved, when it was last not low
         self._began_at = self._sent_at = self._cut_at = self._up_at = self._ordered_up_at = -math.inf
         self._rested = 0  # seconds on the motors' clock since the drone rests
         self._refusals, self._refused_at, self._refusal = 0, -math.inf, ""  # of the sticks: number, last time, answer
@@ -205,12 +205,12 @@ class TelloPilot:
 
         For a firmware without that counter: whether the drone has been low for as long.
         """
-        ran = self._running if self._motors >= 0 else self._aloft
+        ran = self._running if self._motors >= 0 else self.aloft
         return self.state_received - max(ran, self._cut_at) > MOTORS_STOPPED_S
 
     def _on_ground(self, now: float) -> bool:
         """Whether the drone's state proves that it is on the ground, and has not begun a take-off."""
-        return not self.silent(now) and now - max(self._aloft, self._running, self._ordered_up_at) > ON_GROUND_S
+        return not self.silent(now) and now - max(self.aloft, self._running, self._ordered_up_at) > ON_GROUND_S
 
     def _rest(self, trouble: str) -> None:
         self.duty, self.trouble, self._rested = Duty.REST, trouble, 0
@@ -241,14 +241,14 @@ class TelloPilot:
             self._land_unattended(now)
         elif now - self._began_at > TAKEOFF_S:
             self.land(now, f"did not take off in {TAKEOFF_S:.0f} s")
-        elif self._aloft > self._began_at and now - self._sent_at > TAKEOFF_RETRY_S:
+        elif self.aloft > self._began_at and now - self._sent_at > TAKEOFF_RETRY_S:
             self._airborne(now)  # the answer was lost
         elif now - self._sent_at > TAKEOFF_RETRY_S:
             self._send_and_await("takeoff", now)
 
     def _airborne(self, now: float) -> None:
         self.duty, self._up_at = Duty.HOLD, now
-        self._running = self._aloft = now
+        self._running = self.aloft = now
 
     def _sticks(self, now: float, last_read: float) -> tuple[int, int, int, int]:
         """Stick values for the setpoint or toward the position to hold; zeros if neither is fresh."""
@@ -275,7 +275,7 @@ class TelloPilot:
             self._state, self.state_received, self._send_error = state, now, ""
             self._store_state(state, now)
         if self.position[2] - self._floor > 0.01 * LOW:  # whatever the drone measures
-            self._aloft = now
+            self.aloft = now
         answers: list[bytes] = self._drone.get_own_udp_object()["responses"]
         while answers:
             self._process_answer(answers.pop(0).decode("ascii", "replace").strip(), now)
@@ -290,7 +290,7 @@ class TelloPilot:
         if isinstance(height, int):
             self._height = height
             if height >= LOW:
-                self._aloft = now
+                self.aloft = now
         if isinstance(motors, int) and motors != self._motors:
             self._rested += self._motors >= 0
             self._motors, self._running = motors, now
@@ -300,13 +300,13 @@ class TelloPilot:
         refused = answer.startswith(("error", "out of range", "unknown"))
         if self.duty is Duty.RISE:
             if (answer == "ok" and now - self._began_at > SHORTEST_TAKEOFF_S) or (
-                refused and self._aloft > self._began_at
+                refused and self.aloft > self._began_at
             ):
                 self._airborne(now)  # a drone in the air refuses the second of two commands
             elif refused:
                 self._rest(f"refuses to take off: {answer!r}, battery at {self.battery:.0%}")
         elif self.duty is Duty.LAND:
-            low = self._height < LOW and self._aloft < now
+            low = self._height < LOW and self.aloft < now
             if answer == "ok" and low and now - self._ordered_up_at > ON_GROUND_S:
                 self._rest(self.trouble)
             elif refused:

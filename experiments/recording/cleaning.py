@@ -22,12 +22,12 @@ class InUse(OSError):
 @contextmanager
 def using(folder: Path) -> Iterator[None]:
     """Inside, a folder is in use by this process, as every `clean` on this machine sees."""
-    with _locked(folder, fcntl.LOCK_SH | fcntl.LOCK_NB):
+    with locked(folder, fcntl.LOCK_SH | fcntl.LOCK_NB):
         yield
 
 
 @contextmanager
-def _locked(folder: Path, how: int) -> Iterator[bool]:
+def locked(folder: Path, how: int) -> Iterator[bool]:
     """Inside, a folder is locked if its file system has locks, which it yields; the system frees it with the process.
 
     Raises InUse if it is locked otherwise.
@@ -59,13 +59,13 @@ def remove(folder: Path, parts: Sequence[Path] | None = None, *, really: bool = 
         InUse: If a run is at work in it or below it, or may be, where locks are unknown.
         OSError: If something of it cannot be removed; what is left is still known as a run.
     """
-    with _locked(folder, fcntl.LOCK_EX | fcntl.LOCK_NB) as certain:
+    with locked(folder, fcntl.LOCK_EX | fcntl.LOCK_NB) as certain:
         origin = read_origin(folder)
         if not certain and origin is not None and origin.ended is None:
             raise InUse(f"{folder} may be in use: it has no end, and its file system has no locks")
         if parts is None:
             for below in _runs_below(folder):
-                with _locked(below, fcntl.LOCK_EX | fcntl.LOCK_NB):
+                with locked(below, fcntl.LOCK_EX | fcntl.LOCK_NB):
                     pass
         if not really:
             return

@@ -200,14 +200,14 @@ def structure(trace: Trace, metrics: CaseMetrics) -> dict[str, Any]:
     }
     if trace.memory or trace.measures:  # of a law that remembers
         case |= {what: dict(getattr(trace, what)) for what in ("memory", "measures")}
-    return {name: _converted(value) for name, value in case.items()}
+    return {name: converted(value) for name, value in case.items()}
 
 
-def _converted(value: Any) -> Any:  # noqa: ANN401 - any field of a struct
+def converted(value: Any) -> Any:  # noqa: ANN401 - any field of a struct
     """A value as `savemat` takes it: a number as double, unknown as NaN, an array of texts for a cell array."""
     match value:
         case dict():
-            return {name: _converted(each) for name, each in value.items()}
+            return {name: converted(each) for name, each in value.items()}
         case str():
             return value
         case list() | tuple() if all(isinstance(each, str) for each in value):

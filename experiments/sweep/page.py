@@ -70,7 +70,7 @@ def write(found: SweepResult | TuningResult, command: str) -> Path:
         if found.failures:
             text = f"{len(found.failures)} runs failed, and count in no figure; the first: {found.failures[0]}"
             notes.append(Finding("bad", text))
-        notes += _fewest(found.rows)
+        notes += fewest(found.rows)
     return render(
         found.folder / PAGE,
         title=f"{title}: {found.read.experiment.title}",
@@ -152,7 +152,7 @@ def pictures(
     return numbered(zip(saved, [CAPTION, *others], strict=True))
 
 
-def _fewest(rows: Sequence[CellRow]) -> list[Finding]:
+def fewest(rows: Sequence[CellRow]) -> list[Finding]:
     """Per environment the cell with the fewest messages within each level of error; the nearest one if none is."""
     others = [row for row in rows if not row.reference and not row.failed and row.ratio["iae"].mean is not None]
     parts = by_environment(others)
@@ -164,7 +164,7 @@ def _fewest(rows: Sequence[CellRow]) -> list[Finding]:
 
 
 def _fewest_within(rows: Sequence[CellRow], levels: Sequence[float], where: str) -> list[Finding]:
-    """As `_fewest`, of one environment, with words about that in front."""
+    """As `fewest`, of one environment, with words about that in front."""
     found: dict[str, Finding] = {}
     for level in levels:
         within = [row for row in front(rows) if (row.ratio["iae"].mean or 0.0) <= level]

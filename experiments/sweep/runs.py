@@ -77,7 +77,7 @@ def fly(case: bytes, seeds: Sequence[int], code: str) -> bytes:
         return msgspec.json.encode(WorkResult([], stranger=str(error)))
     if mine != code:
         return msgspec.json.encode(WorkResult([], stranger=f"{mine}, not {code}"))
-    runs, failed = _flown(without_standby(plan), tuple(seeds))
+    runs, failed = fly_seeds(without_standby(plan), tuple(seeds))
     failed |= {run.seed: run.failure for run in runs if run.failure}
     whole = sorted((run for run in runs if not run.failure), key=lambda run: seeds.index(run.seed))
     return msgspec.json.encode(WorkResult(whole, failed))
@@ -101,8 +101,8 @@ def code_of(plan: Plan) -> str:
     files, library = plugin_files(plan), plan.law.LIBRARY
     engine = plan.engine_name
     libraries = [engine, *engine_versions(engine), *(engine_versions(library) if library else [])]
-    others = sorted(_file_digest(file) for file in files if file.parent.parent != ROOT)
-    others += [f"{name} {_file_digest(Path(getfile(type(each))))}" for name, each in foreign_metrics().items()]
+    others = sorted(file_digest(file) for file in files if file.parent.parent != ROOT)
+    others += [f"{name} {file_digest(Path(getfile(type(each))))}" for name, each in foreign_metrics().items()]
     return hashlib.sha256(
         ":".join((digest_of_code(packages=PACKAGES), np.__version__, *libraries, *others)).encode()
     ).hexdigest()[:20]
@@ -113,7 +113,7 @@ def lean_enough() -> bool:
     return all(LEAN.issuperset(metric.needs) for metric in swept_metrics().values())
 
 
-def _flown(plan: Plan, seeds: tuple[int, ...]) -> tuple[list[RunMetrics], dict[int, str]]:
+def fly_seeds(plan: Plan, seeds: tuple[int, ...]) -> tuple[list[RunMetrics], dict[int, str]]:
     """Metrics of the runs of these seeds, and why others failed."""
     runs, failed = [], {}
     for seed in seeds:
@@ -146,5 +146,5 @@ def _early_end(trace: Trace) -> str:
 
 
 @cache
-def _file_digest(file: Path) -> str:
+def file_digest(file: Path) -> str:
     return hashlib.sha256(file.read_bytes()).hexdigest()

@@ -38,7 +38,7 @@ class Film:
 
     def __init__(self, tracks: Tracks) -> None:
         self.tracks, self.stage = tracks, SceneModel.of_plan(tracks.plan)
-        self._links = LinkTracker(self.stage)
+        self.links = LinkTracker(self.stage)
         self._ages: Array = TRAIL_S * np.arange(TRAIL, dtype=np.float64)
 
     def moment(self, t: float) -> Moment:
@@ -57,7 +57,7 @@ class Film:
             goal=goal,
             condition=conditions,
             silent_for=np.array([_time_since(track.sent, t) for track in tracks]),
-            error=self._links.errors(t, position),
+            error=self.links.errors(t, position),
             broken=self.stage.broken_links(conditions, [_last_status(track.statuses, t) for track in tracks]),
             obstacles=self.stage.obstacles_at(t, _last_status(self.tracks.world, t)),
             trail=trail,
@@ -72,7 +72,7 @@ class Film:
     def rows(self, t: float) -> list[RobotRow]:
         """The table at `t` [s]."""
         moment = self.moment(t)
-        errors = self._links.of_robots(moment.error)
+        errors = self.links.of_robots(moment.error)
         ticks = self.tracks.clock == "real"  # virtual time misses none
         rows = []
         for k, (name, track) in enumerate(zip(self.tracks.robots, self.tracks.tracks, strict=True)):
@@ -93,7 +93,7 @@ class Film:
             error = np.nan_to_num(errors_over_time(stage.plan.law, stage.plan.formation, grid, position))
         sent = [np.searchsorted(each.sent, grid) - np.searchsorted(each.sent, grid - 1.0) for each in tracks.tracks]
         history.time = grid.tolist()
-        history.error = [self._links.of_robots(each) for each in error]
+        history.error = [self.links.of_robots(each) for each in error]
         history.rate = list(np.stack(sent, axis=1).astype(float))
         return history
 

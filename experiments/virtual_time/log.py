@@ -143,7 +143,7 @@ class RunRecorder:
             goals = self._goal_messages(self._log.centre)
             yield ((EPOCH + t, goal, len(messages.encode(goal, self._encoding))) for t, goal in goals)
             yield [(EPOCH + self._experiment.duration_s, self._centre_report(self.goals), None)]
-        for rare in (self._statuses(), self._world(), self._contacts()):
+        for rare in (self.statuses(), self._world(), self._contacts()):
             yield sorted(((each.stamp, each, None) for each in rare), key=itemgetter(0))
 
     @property
@@ -266,7 +266,7 @@ class RunRecorder:
             found.setdefault((k, robot), []).append(each)
         return found
 
-    def _statuses(self) -> Iterator[messages.Status]:
+    def statuses(self) -> Iterator[messages.Status]:
         """The counters at the end of the run and at the end of everything."""
         log = self._log
         sent = self._counts(self._log.sent.link, self._log.sent.stamp)

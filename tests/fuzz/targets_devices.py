@@ -43,8 +43,8 @@ def khepera_twin() -> Iterator[Target]:
             nonlocal t
             device: Any = devices.get(data[:1].decode("ascii", "replace"), devices["p"])
             wire = Wire()
-            server = device._servers[0]
-            server._client, server._left = wire, False
+            server = device.servers[0]
+            server.client, server._left = wire, False
             wire.waiting += [data[1:256], data[256:512]] if len(data) > 256 else [data[1:]]
             while wire.waiting:
                 device.serve(wire, t)
@@ -184,9 +184,9 @@ def vicon_twin() -> Iterator[Target]:
         nonlocal t
         t += 0.01
         wire: Any = Wire()
-        vicon._clients = {wire: _Client()}
+        vicon.clients = {wire: _Client()}
         wire.waiting += [data[:3000], data[3000:]] if len(data) > 3000 else [data]
-        while wire.waiting and wire in vicon._clients:
+        while wire.waiting and wire in vicon.clients:
             vicon.serve(wire, t)
         vicon.advance(t)
 
@@ -194,7 +194,7 @@ def vicon_twin() -> Iterator[Target]:
         [vicon_datastream.pack_kinds(vicon_datastream.POSES) + ask, ask, one, vicon_datastream.packet() + one + one],
         take,
     )
-    vicon._clients.clear()
+    vicon.clients.clear()
     vicon.close()
 
 

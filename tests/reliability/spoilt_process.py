@@ -139,7 +139,7 @@ def _refuse_landings(folder: Path) -> None:
         if name not in switches:
             switches[name] = Switch(folder / f"refuse-{name}")
         if command.action == "land" and switches[name].read():
-            commands._done[name], commands._quiet[row] = command.seq - 1, t  # it is repeated, and the robot hovers
+            commands.done[name], commands.quiet[row] = command.seq - 1, t  # it is repeated, and the robot hovers
         else:
             obey(commands, row, command, t)
 

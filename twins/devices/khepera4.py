@@ -248,28 +248,28 @@ class _Server:
 
     def __init__(self, robot: _Robot, name: str, faults: Faults, listener: socket.socket) -> None:
         self.robot, self.listener = robot, listener
-        self._program = ParkProgram(robot, name) if name in protocol.PARK else None
+        self.program = ParkProgram(robot, name) if name in protocol.PARK else None
         self._answers = FaultyLink[bytes](faults)
-        self._client: socket.socket | None = None
+        self.client: socket.socket | None = None
         self._left = False  # whether a client has left
         self._partial = b""
 
     def sockets(self, *, silent: bool) -> list[socket.socket]:
         """Sockets to wait on; what is sent to a silent robot waits in its connection, as in a gap of the radio."""
-        if silent or (self._left and self._program is not None and self._program.kind.clients == 1):
+        if silent or (self._left and self.program is not None and self.program.kind.clients == 1):
             return []
-        return [self.listener if self._client is None else self._client]
+        return [self.listener if self.client is None else self.client]
 
     def serve(self, ready: socket.socket, t: float) -> None:
         """Accept a client, answer a command, or close the connection."""
         self._answers.t = t
         try:
             if ready is self.listener:
-                self._client, _ = self.listener.accept()
-                self._client.setblocking(False)
-                self._client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                if self._program is not None:
-                    self._program.begin_session()
+                self.client, _ = self.listener.accept()
+                self.client.setblocking(False)
+                self.client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                if self.program is not None:
+                    self.program.begin_session()
                 return
             received = ready.recv(255)
         except BlockingIOError:
@@ -285,31 +285,31 @@ class _Server:
     def advance(self, t: float) -> None:
         """Let the program on the robot go on until `t` [s]."""
         self._answers.t = t
-        if self._program is not None:
-            self._program.advance(t, connected=self._client is not None, left=self._left)
+        if self.program is not None:
+            self.program.advance(t, connected=self.client is not None, left=self._left)
 
     def flush(self) -> None:
         """Send due answers."""
         for answer in self._answers.due():
-            if self._client is not None and answer:
+            if self.client is not None and answer:
                 try:
-                    self._client.send(answer)
+                    self.client.send(answer)
                 except OSError:
                     self.hang_up()
 
     def hang_up(self) -> None:
         """Close the client's connection: the robot stops if its server does that, else it drives on."""
-        if self._client is not None:
-            self._client.close()
+        if self.client is not None:
+            self.client.close()
             self._left = True
-            if self._program is not None:
-                self._program.end_session()
-        self._client, self._partial = None, b""
+            if self.program is not None:
+                self.program.end_session()
+        self.client, self._partial = None, b""
         self._answers = FaultyLink(self._answers.faults)
 
     def _answer(self, received: bytes, t: float) -> bytes:
-        if self._program is not None:
-            return self._program.answer(received, t)
+        if self.program is not None:
+            return self.program.answer(received, t)
         *lines, self._partial = (self._partial + received).replace(b"\n", b"\r").split(b"\r")
         answers = [answer_kteam(self.robot, line.decode("ascii", "replace")) for line in lines if line]
         return "".join(f"{answer}\r\n" for answer in answers).encode()
@@ -323,14 +323,14 @@ class KheperaDevice:
         chosen = [settings(protocol.Khepera4Settings, *row) for row in zip(body.names, body.device, strict=True)]
         self._dt = 1.0 / body.rate_hz
         self._t = 0.0
-        self._servers: list[_Server] = []
+        self.servers: list[_Server] = []
         addresses = []
         try:
             for row, choice in enumerate(chosen):
                 listener = _listen(body.names[row], body.addresses[row])
                 server = choice.server or protocol.NEWEST
                 robot = _Robot(body, row, request.faults)
-                self._servers.append(_Server(robot, server, request.faults, listener))
+                self.servers.append(_Server(robot, server, request.faults, listener))
                 host, port = listener.getsockname()
                 addresses.append(f"{'kteam' if server == 'kteam' else 'khepera4'}://{host}:{port}")
         except BodyError:
@@ -339,29 +339,29 @@ class KheperaDevice:
         self.addresses = tuple(addresses)
 
     def sockets(self) -> Sequence[socket.socket]:
-        return [wire for server in self._servers for wire in server.sockets(silent=self._silent(server, self._t))]
+        return [wire for server in self.servers for wire in server.sockets(silent=self._silent(server, self._t))]
 
     def serve(self, ready: socket.socket, t: float) -> None:
-        for server in self._servers:
+        for server in self.servers:
             if ready in server.sockets(silent=False):
                 server.serve(ready, t)
 
     def advance(self, t: float) -> None:
         for now in instants(self._t, t, self._dt):
-            for server in self._servers:
+            for server in self.servers:
                 server.robot.move()
                 server.advance(now)
         self._t = t
-        for server in self._servers:
+        for server in self.servers:
             if not self._faults.silent(t):
                 server.flush()
 
     def truth(self) -> tuple[Array, Array]:
-        models = [server.robot.model for server in self._servers]
+        models = [server.robot.model for server in self.servers]
         return np.array([model.position for model in models]), np.array([model.yaw for model in models])
 
     def close(self) -> None:
-        for server in self._servers:
+        for server in self.servers:
             server.hang_up()
             server.listener.close()
 

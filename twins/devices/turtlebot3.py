@@ -98,9 +98,9 @@ class TurtleBot3Twin:
         self._ticks = 0
         self._used = 0.0
         random = np.random.default_rng([body.seeds[0], 0x7B3])
-        self._link = FaultyLink[tuple[Publisher, bytes]](request.faults, random)
+        self.link = FaultyLink[tuple[Publisher, bytes]](request.faults, random)
         self._sessions: dict[tuple[str, ...], zenoh.Session] = {}
-        self._robots: list[_Robot] = []
+        self.robots: list[_Robot] = []
         addresses = []
         self._clock = body.clock
         participants: dict[tuple[object, ...], Participant] = {}
@@ -114,7 +114,7 @@ class TurtleBot3Twin:
                 which = (endpoints, where.style, where.distro, where.domain)
                 if which not in participants:
                     participants[which] = self._participant(endpoints, where)
-                self._robots.append(_Robot(_node(participants[which], where, chosen), body, row))
+                self.robots.append(_Robot(_node(participants[which], where, chosen), body, row))
                 addresses.append(str(where))
         except BaseException:
             self.close()
@@ -142,11 +142,11 @@ class TurtleBot3Twin:
 
     def advance(self, t: float) -> None:
         steps = instants(self._t, t, self._dt)
-        self._t = self._link.t = t
-        silent = self._link.faults.silent(t)
+        self._t = self.link.t = t
+        silent = self.link.faults.silent(t)
         self._receive_commands(t)
         for _ in steps:
-            for robot in self._robots:
+            for robot in self.robots:
                 robot.move()
             self._used += self._dt
             self._ticks += 1
@@ -157,18 +157,18 @@ class TurtleBot3Twin:
             ):
                 if self._ticks % max(1, round(1.0 / (rate * self._dt))) == 0 and not silent:
                     publish()
-        for publisher, payload in self._link.due():
+        for publisher, payload in self.link.due():
             if not silent:
                 publisher.send(payload)
 
     def truth(self) -> tuple[Array, Array]:
-        models = [robot.model for robot in self._robots]
+        models = [robot.model for robot in self.robots]
         return np.array([model.position for model in models]), np.array([model.yaw for model in models])
 
     @property
     def commands_received(self) -> list[int]:
         """Executed commands of each robot."""
-        return [robot.executed for robot in self._robots]
+        return [robot.executed for robot in self.robots]
 
     def close(self) -> None:
         """Leaves the network."""
@@ -179,10 +179,10 @@ class TurtleBot3Twin:
     # ------------------------------------------------------------------ commands
 
     def _receive_commands(self, t: float) -> None:
-        for robot in self._robots:
+        for robot in self.robots:
             node = robot.node
             for message in node.command.received():
-                if self._link.lost():
+                if self.link.lost():
                     continue
                 said = message.twist if node.stamped else message
                 v, w = said.linear.x, said.angular.z
@@ -198,12 +198,12 @@ class TurtleBot3Twin:
     # ------------------------------------------------------------------ published topics
 
     def _publish(self, publisher: Publisher, types: ros2.Types, message: Message) -> None:
-        if not self._link.lost():
-            self._link.put((publisher, types.encode(message, publisher.kind)))
+        if not self.link.lost():
+            self.link.put((publisher, types.encode(message, publisher.kind)))
 
     def _odometry(self) -> None:
         now = self._clock.utc()
-        for robot in self._robots:
+        for robot in self.robots:
             node = robot.node
             make = node.types.make
             ahead, left, turned, speed, rate = robot.odometry()
@@ -220,7 +220,7 @@ class TurtleBot3Twin:
 
     def _scan(self) -> None:
         now, step = self._clock.utc(), 2.0 * pi / turtlebot3.RAYS
-        for node in (robot.node for robot in self._robots):
+        for node in (robot.node for robot in self.robots):
             message = node.types.make(
                 ros2.LASER_SCAN,
                 header=node.types.header(now, "base_scan"),
@@ -237,11 +237,11 @@ class TurtleBot3Twin:
             self._publish(node.scan, node.types, message)
 
     def _battery(self) -> None:
-        spent = self._used * self._link.faults.drain / TURTLEBOT3.endurance_s
-        charge = max(0.0, self._link.faults.battery - spent)
+        spent = self._used * self.link.faults.drain / TURTLEBOT3.endurance_s
+        charge = max(0.0, self.link.faults.battery - spent)
         voltage = turtlebot3.EMPTY_V + charge * (turtlebot3.FULL_V - turtlebot3.EMPTY_V)
         now = self._clock.utc()
-        for node in (robot.node for robot in self._robots):
+        for node in (robot.node for robot in self.robots):
             message = node.types.make(
                 ros2.BATTERY_STATE,
                 header=node.types.header(now, ""),

@@ -88,10 +88,10 @@ class ViconTwin:
         self.latency_s = 0.0
         self._told: tuple[CaptureFault, int] = "", 0  # fault of the last frame, and its subject
         self._last = b"", b""  # the last frame without a fault: its number, its poses
-        self._frames = 0
+        self.frames_sent = 0
         self._listener = socket.create_server((host, port))
         self._listener.setblocking(False)
-        self._clients: dict[socket.socket, _Client] = {}
+        self.clients: dict[socket.socket, _Client] = {}
         self.address = f"{host}:{self._listener.getsockname()[1]}"
 
     def place(self, row: int, position: Array, rotation: Array) -> None:
@@ -103,31 +103,31 @@ class ViconTwin:
         self._visible[row] = False
 
     def sockets(self) -> Sequence[socket.socket]:
-        return [self._listener, *self._clients]
+        return [self._listener, *self.clients]
 
     def serve(self, ready: socket.socket, t: float) -> None:
         if ready is self._listener:
             self._accept()
-        elif ready in self._clients:
+        elif ready in self.clients:
             self._receive(ready, t)
 
     def advance(self, t: float) -> None:
         """Send the frame that is due at `t` [s], if any."""
         self.link.t = t
         due = int(t * self._rate + 1e-6)
-        if due > self._frames:
-            self._frames = due  # missed frames are not repeated
+        if due > self.frames_sent:
+            self.frames_sent = due  # missed frames are not repeated
             if not self.link.silent(t):
                 self.link.put(self._frame(t))
         for frame in self.link.due():
             self._send(frame)
-        for connection, client in list(self._clients.items()):
+        for connection, client in list(self.clients.items()):
             self._flush(connection, client)
 
     def close(self) -> None:
-        for connection in (self._listener, *self._clients):
+        for connection in (self._listener, *self.clients):
             connection.close()
-        self._clients.clear()
+        self.clients.clear()
 
     def _accept(self) -> None:
         try:
@@ -136,11 +136,11 @@ class ViconTwin:
             return
         connection.setblocking(False)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._clients[connection] = _Client(unsent=bytearray(vicon_datastream.pack_kinds(vicon_datastream.POSES)))
-        self._flush(connection, self._clients[connection])
+        self.clients[connection] = _Client(unsent=bytearray(vicon_datastream.pack_kinds(vicon_datastream.POSES)))
+        self._flush(connection, self.clients[connection])
 
     def _receive(self, connection: socket.socket, t: float) -> None:
-        client = self._clients[connection]
+        client = self.clients[connection]
         try:
             received = connection.recv(65536)
             if not received:
@@ -160,7 +160,7 @@ class ViconTwin:
             self._drop(connection)
 
     def _drop(self, connection: socket.socket) -> None:
-        del self._clients[connection]
+        del self.clients[connection]
         connection.close()
 
     def _names(self) -> bytes:
@@ -179,9 +179,9 @@ class ViconTwin:
         before, self._told = self._told, self.link.faults.captured(t)
         fault, subject = self._told
         if before != self._told and "renamed" in (before[0], fault):
-            for client in self._clients.values():
+            for client in self.clients.values():
                 client.named = False
-        head = vicon_datastream.pack_frame_number(self._frames) + vicon_datastream.pack_latency(
+        head = vicon_datastream.pack_frame_number(self.frames_sent) + vicon_datastream.pack_latency(
             [("Data Collected", self.latency_s)]
         )
         if fault not in ("frozen", "repeated"):
@@ -205,7 +205,7 @@ class ViconTwin:
         return frame
 
     def _send(self, frame: bytes) -> None:
-        for client in self._clients.values():
+        for client in self.clients.values():
             if not (client.streams or client.asked) or len(client.unsent) > BACKLOG:
                 continue
             client.unsent += vicon_datastream.packet(frame if client.named else self._names() + frame)

@@ -125,12 +125,12 @@ class Commands:
             keys=keys,
             on_refusal=events.count_malformed,
         )
-        self._done: dict[str, int] = {}  # number of the last executed command
+        self.done: dict[str, int] = {}  # number of the last executed command
         # session that owns the name of a robot: a new one numbers its commands from anew
-        self._lives: dict[str, str] = {}
+        self.lives: dict[str, str] = {}
         self._owners = pubsub.AliveWatch(session, Keys.life(keys.alive("*"), "*"))
         self._strangers: set[str] = set()
-        self._quiet = [inf] * len(names)  # begin of the silence of each robot; infinity: it needs no command
+        self.quiet = [inf] * len(names)  # begin of the silence of each robot; infinity: it needs no command
         self.restart()
 
     def restart(self) -> None:
@@ -142,7 +142,7 @@ class Commands:
     def expect(self, name: str, *, flying: bool) -> None:
         """Expects commands to a robot that was placed: `CLIMB_S` passes before one that flies lands without any."""
         row = self._population.names.index(name)
-        self._quiet[row] = CLIMB_S if flying and self._population.flies[row] else inf
+        self.quiet[row] = CLIMB_S if flying and self._population.flies[row] else inf
 
     def receive(self, t: float) -> None:
         """Receives all until `t`."""
@@ -154,14 +154,14 @@ class Commands:
                 self._note_owner(token)
         for command, sample in self._inbox.read_samples(validation.check_command, self._known):
             row = self._row[str(sample.key_expr)]
-            if command.seq > self._done.get(command.robot, 0):
-                self._done[command.robot] = command.seq
+            if command.seq > self.done.get(command.robot, 0):
+                self.done[command.robot] = command.seq
                 self._obey(row, command, t)
 
     def forgive(self, seconds: float, t: float) -> None:
         """Forgives silence after the world stood still for `seconds`, until `t`."""
         if seconds > HANG_S:
-            self._quiet = [max(since, t) for since in self._quiet]
+            self.quiet = [max(since, t) for since in self.quiet]
 
     def apply(self, t: float) -> None:
         """Applies the commands; robots without commands hold, drive on, or land after `LAND_S`."""
@@ -170,14 +170,14 @@ class Commands:
         for row, motion in enumerate(body.engine.motions):
             hold_s = population.hold_s[row]
             if self._cut_off:  # without a router no command arrives: robots hold, but need not land
-                self._quiet[row] = max(self._quiet[row], t - HOLD_S - 1e-3)
+                self.quiet[row] = max(self.quiet[row], t - HOLD_S - 1e-3)
                 hold_s = HOLD_S
-            silence = t - self._quiet[row]
+            silence = t - self.quiet[row]
             if silence > hold_s and not self._held[row]:
                 self._held[row] = True
                 holding.add(row)
             if silence > max(hold_s, LAND_S) and motion.flying:
-                self._quiet[row] = inf
+                self.quiet[row] = inf
                 tired.append(row)
         if holding:
             body.command(population.holding(holding))
@@ -193,24 +193,24 @@ class Commands:
         population, action = self._population, command.action
         if action == "drive":
             self._given[row] = command.setpoint or NO_SETPOINT
-            self._quiet[row], self._held[row] = t, False
+            self.quiet[row], self._held[row] = t, False
             return
         self._given[row], self._held[row] = NO_SETPOINT, False
         if action == "takeoff" and command.height is not None:
             population.takeoff(row, command.height)
-            self._quiet[row] = t + CLIMB_S
+            self.quiet[row] = t + CLIMB_S
         else:
             (population.body.land if action == "land" else population.body.stop)([row])
-            self._quiet[row] = inf
+            self.quiet[row] = inf
 
     def _note_owner(self, token: str) -> None:
         """A new process owns the name of a robot: it numbers commands by its own clock, which may be behind."""
         name, life = self._keys.whose(token), Keys.life_of(token)
         if name is None or life is None:
             return
-        if self._lives.get(name, life) != life:
-            self._done.pop(name, None)
-        self._lives[name] = life
+        if self.lives.get(name, life) != life:
+            self.done.pop(name, None)
+        self.lives[name] = life
 
     def _known(self, key: str) -> bool:
         """Whether a command is for a robot of this world; one that is for no robot of this system is refused."""

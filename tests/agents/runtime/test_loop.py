@@ -154,7 +154,7 @@ def test_stop_during_command_has_last_word(phase, monkeypatch):
     def stop():
         if not stops and stage.runtime.robots[0].lifecycle.phase == phase:
             stops.append(stage.now)
-            stage.runtime._estop._receive(Sample("park/estop", messages.JSON, b"{}"))
+            stage.runtime.estop.receive(Sample("park/estop", messages.JSON, b"{}"))
 
     def visit(now):
         if now == Phase.READY:
@@ -179,7 +179,7 @@ def test_stop_while_body_opens_keeps_it_down(monkeypatch):
 
     with Net().worn() as net:
         stage.runtime.subscribe_to_stops(net.session)
-        stage.runtime._estop._receive(Sample("park/estop", messages.JSON, b"{}"))
+        stage.runtime.estop.receive(Sample("park/estop", messages.JSON, b"{}"))
         assert stage.orders == [], "a closed body is left alone"
         stage.body.open()
         stage.runtime.join(net.session)

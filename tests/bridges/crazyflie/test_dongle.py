@@ -286,10 +286,10 @@ def test_a_radio_that_becomes_slow_gets_fewer_logs(monkeypatch):
         process.takeoff(HEIGHT)
         hovering(process).run(0.2)
         (dongle,) = crazyradio._find_devices()
-        dongle._air = dongle._air._replace(hz=22.0)
+        dongle.air = dongle.air._replace(hz=22.0)
         process.until(lambda: "fewer logs" in process.state.note[0], "note")
         process.until(lambda: process.t - process.state.time[0] < 0.3, "young poses")
-        dongle._air = dongle._air._replace(hz=500.0)
+        dongle.air = dongle.air._replace(hz=500.0)
         assert "fewer logs" in process.state.note[0]
         process.land()
         assert supervised(twin) != State.LOCKED

@@ -59,7 +59,7 @@ class Air:
 
     def fly(self):
         self.telemetry.settled, self.telemetry.pose = True, [0.1, 0.2, 0.5, 0.0, 0.0, 0.0, 0.0]
-        self.flight._enter(Phase.CLIMBING)
+        self.flight.enter(Phase.CLIMBING)
         return self.pass_(0.1)
 
     def pass_(self, seconds):
@@ -248,7 +248,7 @@ def test_landing_lasts_from_the_highest_place(monkeypatch, pose, set_point):
     air.flying = True
     if set_point:
         air.flight.set_target(air.now, (0.0, 0.0, 2.0, 0.0))
-        air.flight._stream(air.now + 1.0)
+        air.flight.stream(air.now + 1.0)
     air.telemetry.pose = (0.0, 0.0, pose, *(0.0,) * 4)
     air.flight.land_after_gap(0.9)
     assert air.flight.span_s == pytest.approx(2.1 / module.DESCENT)
@@ -370,7 +370,7 @@ def test_stalled_process_sends_no_stale_setpoint(air):
     air.sent.clear()
     chosen = air.now
     air.now += 3.0
-    air.flight._stream(chosen + 0.2)
+    air.flight.stream(chosen + 0.2)
     assert air.sent == []
     air.flight.send_due(air.now)
     assert {what for _, what in air.sent} == {"land", "send_notify_setpoint_stop"}
@@ -390,7 +390,7 @@ def test_an_old_status_tells_of_an_earlier_phase(air):
 def test_setpoints_of_old_poses_are_ignored(air):
     air.telemetry.pose_time = air.now - 0.4
     air.flight.set_target(air.now, (1.0, 0.2, 0.5, 0.0))
-    air.flight._stream(air.now + 1.0)
+    air.flight.stream(air.now + 1.0)
     assert air.flight._target == PLACE
 
 

@@ -167,7 +167,7 @@ def test_setpoint_lost_at_the_begin_of_a_gap(fleet):
     drone = fleet.drones[0]
     fleet.twin.lines[0].silence(2.0)
     drone.flight.set_target(fleet.now, (0.0, 0.0, 0.5, 0.0))
-    drone.flight._stream(fleet.now)
+    drone.flight.stream(fleet.now)
     fleet.run(2.0)
     assert landed(fleet) < 0.02
     assert fleet.fastest < SINKS

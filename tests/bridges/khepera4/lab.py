@@ -21,13 +21,13 @@ class Lab:
         self.device = KheperaDevice(
             DeviceRequest(request("khepera4", ["khepera4-twin"], device={"server": server}), Faults())
         )
-        self.program = self.device._servers[0]._program
+        self.program = self.device.servers[0].program
         self.now, self.due, self.gap_until = 0.0, DT, -math.inf
         self.queue, self.answers, self.heard = b"", b"", []
         monkeypatch.setattr(drivers, "time", self)
         monkeypatch.setattr(drivers, "uptime", self.monotonic)
         self.program.begin_session()
-        self.device._servers[0]._client = self  # a client is there
+        self.device.servers[0].client = self  # a client is there
         chosen = protocol.Khepera4Settings(server=server if named else None, **settings)
         self.odometer = Odometer(0.0, 0.0, 0.0)
         try:
@@ -98,5 +98,5 @@ class Lab:
             self.exchange(v, turn)
 
     def close(self):
-        self.device._servers[0]._client = None
+        self.device.servers[0].client = None
         self.device.close()

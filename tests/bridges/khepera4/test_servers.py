@@ -106,10 +106,10 @@ def test_command_is_as_old_as_its_state(monkeypatch):
         "KH01", Address.parse("KH01", "khepera4://127.0.0.1"), protocol.Khepera4Settings(), (0.0, 0.0, 0.0)
     )
     link.drive(0.1, 0.2, uptime())
-    assert link._current_twist()[:2] == (0.1, 0.2)
-    assert link._current_twist()[2] == pytest.approx(uptime() + FRESH_S, abs=0.4)
+    assert link.current_twist()[:2] == (0.1, 0.2)
+    assert link.current_twist()[2] == pytest.approx(uptime() + FRESH_S, abs=0.4)
     link.drive(0.1, 0.2, uptime() - FRESH_S - 3.0)  # read before a suspension, commanded after it
-    assert link._current_twist()[:2] == (0.0, 0.0)
+    assert link.current_twist()[:2] == (0.0, 0.0)
 
 
 @pytest.mark.parametrize("server", SERVERS)

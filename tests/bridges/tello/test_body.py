@@ -276,7 +276,7 @@ def test_stopped_take_off_counts_as_flying_until_standing():
 def test_undrivable_drone_keeps_no_other_from_stopping():
     body = TelloBody(request("tello", ["tello://10.0.0.2", "tello://10.0.0.3"], external=True))
     lost, good = Cockpit().fly(), Cockpit().fly()
-    body._pilots = [lost.pilot, good.pilot]
+    body.pilots = [lost.pilot, good.pilot]
     lost.drone.get_own_udp_object = lambda: {}
     for what in (body.land, body.stop):
         with pytest.raises(KeyError, match="responses"):

@@ -122,7 +122,7 @@ def test_height_of_motion_capture_counts_in_the_air():
 
 def test_stop_counts_while_the_body_closes(monkeypatch):
     body, cockpit = TelloBody(request("tello", ["tello://10.0.0.2"], external=True)), Cockpit().fly()
-    body._pilots = [cockpit.pilot]
+    body.pilots = [cockpit.pilot]
     cockpit.drone.said.clear()
     monkeypatch.setattr(pilot.time, "sleep", lambda _: body.stop([0]))
     body.close()
@@ -177,10 +177,10 @@ def test_failing_pilot_lands_and_others_fly(kind):
 
     broken.drone.get_own_udp_object = fail
     for cockpit in (broken, good):
-        cockpit.pilot.state_received = cockpit.pilot._aloft = np.inf  # on whatever clock
+        cockpit.pilot.state_received = cockpit.pilot.aloft = np.inf  # on whatever clock
         cockpit.drone.said.clear()
         cockpit.drone.sticks.clear()
-    body._pilots, body._ending, body._last_read = [broken.pilot, good.pilot], Rounds(3), np.inf
+    body.pilots, body._ending, body._last_read = [broken.pilot, good.pilot], Rounds(3), np.inf
     body._run(Post())
     assert len(good.drone.sticks) == 3
     assert set(broken.drone.said) == {"land"}
@@ -191,8 +191,8 @@ def test_sleep_of_the_machine_ends_its_flight(monkeypatch):
     """The machine's monotonic clock stands still meanwhile; its uptime goes on."""
     body, cockpit = TelloBody(request("tello", ["tello://10.0.0.2"], external=True)), Cockpit().fly()
     pilot = cockpit.pilot
-    pilot.state_received = pilot._aloft = np.inf
-    body._pilots, body._ending = [pilot], Rounds(1)
+    pilot.state_received = pilot.aloft = np.inf
+    body.pilots, body._ending = [pilot], Rounds(1)
     body.read(0.0)
     body.command([(0.5, 0.0, 0.0, 0.0)])
     cockpit.drone.sticks.clear()

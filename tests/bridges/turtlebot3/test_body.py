@@ -278,7 +278,7 @@ def test_loop_that_hangs_leaves_it_standing(hub):
         stage.body.open()
         stage.run(1.0, stage.constant(0.2))
         before = stage.place
-        until(lambda: stage.twin._robots[0].twist == (0.0, 0.0), "it stands")
+        until(lambda: stage.twin.robots[0].twist == (0.0, 0.0), "it stands")
         assert np.linalg.norm(stage.place - before) < 0.5
         until(lambda: stage.moved(0.5, stage.constant(0.2))[0] > 0.05, "and drives on when it is told to")
 
@@ -288,7 +288,7 @@ def test_odometry_held_back_is_old(hub):
     with Stage(request(hub.endpoint)) as stage:
         stage.body.open()
         stage.run(1.0, stage.constant(0.2))
-        stage.twin._link.faults = Faults(delay_s=2.0)
+        stage.twin.link.faults = Faults(delay_s=2.0)
         until(lambda: "old by its stamps" in stage.run(0.1, stage.constant(0.2)).note[0], "it is noticed")
         assert stage.t - stage.state.time[0] == pytest.approx(2.0, abs=0.5)
 

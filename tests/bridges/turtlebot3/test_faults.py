@@ -43,7 +43,7 @@ def test_wrong_command_type_moves_nothing_and_is_reported(hub, style):
 def test_robot_that_does_not_move_is_reported(hub):
     with Stage(request(hub.endpoint)) as stage:
         stage.body.open()
-        stage.twin._robots[0].model._acceleration = 0.0  # as with its motors off
+        stage.twin.robots[0].model._acceleration = 0.0  # as with its motors off
         stage.run(1.0, stage.constant(0.2))
         assert stage.state.note == ("",)
         stage.run(1.0, stage.constant(0.2))

@@ -217,10 +217,10 @@ def test_sweep_keeps_what_metrics_need(known, triangle):
     seeds = (1,)
     known(way_m=Way())
     assert runs.lean_enough()
-    ((lean,), _) = runs._flown(Plan(triangle), seeds)
+    ((lean,), _) = runs.fly_seeds(Plan(triangle), seeds)
     known(way_m=Way(), height=Height())
     assert not runs.lean_enough()
-    ((whole,), _) = runs._flown(Plan(triangle), seeds)
+    ((whole,), _) = runs.fly_seeds(Plan(triangle), seeds)
     assert whole.values.items() > lean.values.items()
     assert whole.values["height"] is not None
     assert whole.metric_faults == ()
@@ -231,7 +231,7 @@ def test_store_of_a_sweep_knows_the_metrics(known, triangle, monkeypatch):
     before = runs.code_of(Plan(triangle))
     known(way_m=Way())
     with_way = runs.code_of(Plan(triangle))
-    monkeypatch.setattr(runs, "_file_digest", lambda _file: "changed")
+    monkeypatch.setattr(runs, "file_digest", lambda _file: "changed")
     assert len({before, with_way, runs.code_of(Plan(triangle))}) == 3
 
 

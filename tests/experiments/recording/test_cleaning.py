@@ -50,7 +50,7 @@ def test_runs_inside_runs_protect_them(tmp_path: Path) -> None:
 
 def test_two_removals_do_not_meet(tmp_path: Path) -> None:
     folder = past(tmp_path / "run")
-    with cleaning._locked(folder, cleaning.fcntl.LOCK_EX), pytest.raises(cleaning.InUse):
+    with cleaning.locked(folder, cleaning.fcntl.LOCK_EX), pytest.raises(cleaning.InUse):
         cleaning.remove(folder)
 
 

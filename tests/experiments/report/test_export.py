@@ -198,5 +198,5 @@ def test_a_run_without_a_case_has_nothing(monkeypatch, tmp_path):
 
 
 def test_unknown_numbers_become_nan():
-    assert math.isnan(export._converted(None))
-    assert export._converted([1, None, 2.5])[[0, 2]].tolist() == [1.0, 2.5]
+    assert math.isnan(export.converted(None))
+    assert export.converted([1, None, 2.5])[[0, 2]].tolist() == [1.0, 2.5]

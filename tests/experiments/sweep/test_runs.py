@@ -99,10 +99,10 @@ def test_a_plug_in_that_changes_changes_the_code(park, tmp_path, monkeypatch):
     real = structure.getfile
     monkeypatch.setattr(structure, "getfile", lambda of: str(file) if of.__name__ == "SendOnDelta" else real(of))
     foreign = code_of(Plan(park))
-    runs._file_digest.cache_clear()
+    runs.file_digest.cache_clear()
     file.write_text("two")
     assert len({before, foreign, code_of(Plan(park))}) == 3
-    runs._file_digest.cache_clear()
+    runs.file_digest.cache_clear()
 
 
 def test_the_version_of_the_engines_library_counts(park, monkeypatch):

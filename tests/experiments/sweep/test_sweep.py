@@ -266,11 +266,11 @@ def test_the_command_writes_table_figures_and_page(done, capsys):
 def test_nearest_cell_is_named_without_any_within_levels(done):
     far = [msgspec.structs.replace(row, ratio={**row.ratio, "iae": spread([1.2 + k])}) if not row.reference else row
            for k, row in enumerate(done.rows)]  # fmt: skip
-    (finding,) = sweep_page._fewest(far)
+    (finding,) = sweep_page.fewest(far)
     nearest = next(row for row in far if not row.reference)
     assert finding.text.startswith(f"No cell has an IAE ratio of at most 1.05; the nearest: {nearest.label}: ")
 
 
 def test_the_page_says_who_needs_fewest_messages(done):
-    found = [finding.text for finding in sweep_page._fewest(done.rows)]
+    found = [finding.text for finding in sweep_page.fewest(done.rows)]
     assert all(text.startswith("Fewest messages with an IAE ratio of at most ") for text in found)

@@ -78,7 +78,7 @@ def test_history_has_errors_and_rates_of_whole_case(flown):
     history = film.history()
     k = int(np.searchsorted(history.time, 2.0))
     moment = film.moment(history.time[k])
-    assert history.error[k] == pytest.approx(film._links.of_robots(moment.error), abs=1e-6, nan_ok=True)
+    assert history.error[k] == pytest.approx(film.links.of_robots(moment.error), abs=1e-6, nan_ok=True)
     assert sum(rate.sum() for rate in history.rate) > 0
 
 

@@ -57,7 +57,7 @@ def test_drone_with_low_battery_lands_and_reports_it():
     found = events(log, experiment)
     assert found[0] == ("F", "land: its battery is low: 98% (limit 98%)")
     assert found[1:3] == [("G", "warn: a neighbour is lost: F"), ("G", "hold: all its neighbours are lost: F")]
-    reasons = [status.reason for status in RunRecorder(log, Plan(experiment), "case")._statuses()]
+    reasons = [status.reason for status in RunRecorder(log, Plan(experiment), "case").statuses()]
     assert reasons[:2] == ["land: its battery is low: 98% (limit 98%)", "finished"]
 
 
@@ -98,7 +98,7 @@ def test_scripted_landing_silences_and_loses_a_robot(architecture):
     assert log.sent.stamp[log.sent.link == 0].max() < 4.03
     if architecture == "distributed":
         assert ("G", "warn: a neighbour is lost: F") in events(log, experiment)
-    reasons = [status.reason for status in RunRecorder(log, Plan(experiment), "case")._statuses()]
+    reasons = [status.reason for status in RunRecorder(log, Plan(experiment), "case").statuses()]
     assert reasons[:3] == ["lands as its file says", "finished", "finished"]
     assert not measure(RunRecorder(log, Plan(experiment), "case").trace()).failures
 

@@ -284,7 +284,7 @@ def test_delay_is_of_what_it_says(listen):
 @pytest.mark.system
 def test_silence_is_of_both_directions_and_ends(listen):
     listener = listen(ready=True)
-    listener.twin._link.faults = Faults(silent_from_s=listener.t + 1.0, silent_for_s=2.0)
+    listener.twin.link.faults = Faults(silent_from_s=listener.t + 1.0, silent_for_s=2.0)
     listener.tell(0.1, 0.0)
     listener.obeyed(1)
     assert listener.count(1.0) <= 20

@@ -384,7 +384,7 @@ def told(fault: CaptureFault) -> tuple[list[Frame], list[Frame]]:
             twin.link.faults = Faults(capture=fault if k > 3 else "")
             for row in range(2):
                 twin.place(row, np.array([0.1 * k, float(row), 0.5]), upright(0.0))
-            twin._frames = k
+            twin.frames_sent = k
             blocks = twin._frame(0.01 * k)
             frames.append(decoder.frame(twin._names() + blocks))
     finally:

@@ -35,10 +35,10 @@ def test_world_obeys_sender_with_clock_behind():
 
         def order(seq: int, action: str, **more: object) -> bool:
             """Whether it is carried out."""
-            before = world.commands._done.get("F", 0)
+            before = world.commands.done.get("F", 0)
             net.deliver(sent(KEYS.setpoint("F"), messages.Command("F", seq, UTC, action, **more))[0])
             world.receive(0.0)
-            return world.commands._done.get("F", 0) != before
+            return world.commands.done.get("F", 0) != before
 
         own(net, KEYS.alive("F"), "one")
         assert order(NOW, "takeoff", height=0.5)
@@ -63,7 +63,7 @@ def test_world_of_many_robots_knows_name_owners():
             for token in (alive, Keys.life(alive, "one"), Keys.claim(alive, Keys.rank(1.0, "one"))):
                 net.deliver(f"{token}\0\0".encode())
         world.receive(0.0)
-    assert world.commands._lives == dict.fromkeys(names, "one")
+    assert world.commands.lives == dict.fromkeys(names, "one")
 
 
 def test_centre_with_clock_behind_is_followed():
