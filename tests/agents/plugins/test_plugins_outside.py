@@ -99,7 +99,7 @@ def test_trigger_of_the_docs_runs_from_outside(zenpark):
 @pytest.mark.parametrize("line", re.findall(r"^    \./zenpark (run triangle --virtual .*)$", GUIDE, re.MULTILINE))
 def test_every_run_of_the_guide_ends_well(zenpark, line, tmp_path):
     words = shlex.split(line)
-    done = zenpark(*words, "--set", "duration_s=6", "--no-report", "--out", str(tmp_path / "run"))
+    done = zenpark(*words, "--case", "event", "--set", "duration_s=6", "--no-report", "--out", str(tmp_path / "run"))
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "run" / "metrics.csv").exists()
 

@@ -91,7 +91,16 @@ def test_installed_metric_is_everywhere(installed, zenpark):
 
 @pytest.mark.slow
 def test_installed_metric_is_swept(installed, zenpark):
-    arguments = ["trigger.threshold=0.01,0.03", "seeds=3", "--set", "duration_s=5", "--out", "swept"]
+    arguments = [
+        "trigger.threshold=0.01,0.03",
+        "seeds=3",
+        "--set",
+        "duration_s=5",
+        "--processes",
+        "1",
+        "--out",
+        "swept",
+    ]
     done = zenpark("sweep", "triangle", *arguments)
     assert done.returncode == 0, done.stderr
     assert re.search(r"^note: metric broken failed: ZeroDivisionError", done.stdout, re.MULTILINE)
@@ -109,7 +118,18 @@ def test_installed_metric_is_swept(installed, zenpark):
 def test_installed_metric_is_a_limit_of_a_search(zenpark):
     (line,) = re.findall(r"^    \./zenpark (sweep .*--optimise.*)$", GUIDE, re.MULTILINE)
     words = [word for word in shlex.split(line) if not word.startswith(("seeds=", "tuning="))]
-    short = ["seeds=1:2", "tuning=1001:1006", "--set", "duration_s=1", "--anyway", "--no-report", "--out", "tuned"]
+    short = [
+        "seeds=1:2",
+        "tuning=1001:1006",
+        "--set",
+        "duration_s=1",
+        "--processes",
+        "1",
+        "--anyway",
+        "--no-report",
+        "--out",
+        "tuned",
+    ]
     done = zenpark(*words, *short)
     assert done.returncode == 0, done.stderr
     assert re.search(r"^event threshold=.*: keeps Way ratio <= 1.02$", done.stdout, re.MULTILINE)
