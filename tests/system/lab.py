@@ -175,6 +175,17 @@ class WorldProcess(Started):
         self.ready = self.process.stdout.readline().strip()
 
 
+ROLES = {
+    "experiments.real_time.processes.zygote": "zygote",
+    "agents.runtime.router": "router",
+    "experiments.real_time.processes.recorder": "recorder",
+    "bridges.vicon.publisher": "vicon",
+    "twins.devices.vicon": "vicon-twin",
+    "experiments.real_time.processes.world": "world",
+    "experiments.real_time.processes.centre": "centre",
+}  # of processes, by their modules
+
+
 class Flight:
     """`./zenpark run` in a process of its own."""
 
@@ -203,20 +214,8 @@ class Flight:
             if "experiments.real_time.processes.robot" in line:
                 for name in line[line.index("experiments.real_time.processes.robot") + 2 : line.index("--connect")]:
                     found[name] = child
-            elif "experiments.real_time.processes.zygote" in line:
-                found["zygote"] = child
-            elif "agents.runtime.router" in line:
-                found["router"] = child
-            elif "experiments.real_time.processes.recorder" in line:
-                found["recorder"] = child
-            elif "bridges.vicon.publisher" in line:
-                found["vicon"] = child
-            elif "twins.devices.vicon" in line:
-                found["vicon-twin"] = child
-            elif "experiments.real_time.processes.world" in line:
-                found["world"] = child
-            elif "experiments.real_time.processes.centre" in line:
-                found["centre"] = child
+            else:
+                found |= {role: child for module, role in ROLES.items() if module in line}
         return found
 
     def endpoint(self) -> str:

@@ -28,6 +28,12 @@ def lab(monkeypatch):
         each.close()
 
 
+@pytest.fixture(params=SERVERS)
+def robot(lab, request):
+    """A robot with each of the servers."""
+    return lab(request.param)
+
+
 def stands(robot):
     before = robot.truth()
     for _ in range(25):
@@ -36,9 +42,7 @@ def stands(robot):
 
 
 @pytest.mark.parametrize(("goal", "seconds"), [((0.6, 0.0), 15.0), ((0.3, 0.3), 12.0)])
-@pytest.mark.parametrize("server", SERVERS)
-def test_motion_within_5_percent_of_what_was_asked(lab, server, goal, seconds):
-    robot = lab(server)
+def test_motion_within_5_percent_of_what_was_asked(robot, goal, seconds):
     robot.go_to(goal, seconds)
     x, y, _ = robot.truth()
     assert math.hypot(x - goal[0], y - goal[1]) < 0.05 * math.hypot(*goal)
@@ -46,16 +50,12 @@ def test_motion_within_5_percent_of_what_was_asked(lab, server, goal, seconds):
     assert stands(robot)
 
 
-@pytest.mark.parametrize("server", SERVERS)
-def test_a_goal_behind_is_reached(lab, server):
-    robot = lab(server)
+def test_a_goal_behind_is_reached(robot):
     robot.go_to((-0.3, 0.05), 18.0)
     assert robot.truth()[:2] == pytest.approx((-0.3, 0.05), abs=0.015)
 
 
-@pytest.mark.parametrize("server", SERVERS)
-def test_speeds_are_those_that_were_asked_for(lab, server):
-    robot = lab(server)
+def test_speeds_are_those_that_were_asked_for(robot):
     for _ in range(10):
         robot.exchange(0.08, 0.3)
     x, y, yaw = robot.truth()
@@ -68,9 +68,7 @@ def test_speeds_are_those_that_were_asked_for(lab, server):
     assert robot.odometer.yaw == pytest.approx(now[2], abs=0.02)
 
 
-@pytest.mark.parametrize("server", SERVERS)
-def test_link_gap_ends_in_stop_over_same_connection(lab, server):
-    robot = lab(server)
+def test_link_gap_ends_in_stop_over_same_connection(robot):
     for _ in range(25):
         robot.exchange(0.1, 0.0)
     begin, x = robot.now, robot.truth()[0]
@@ -90,9 +88,7 @@ def test_link_gap_ends_in_stop_over_same_connection(lab, server):
     assert robot.odometer.x == pytest.approx(robot.truth()[0], abs=0.02)  # what it drove unheard is estimated
 
 
-@pytest.mark.parametrize("server", SERVERS)
-def test_command_that_waited_too_long_becomes_a_stop(lab, server):
-    robot = lab(server)
+def test_command_that_waited_too_long_becomes_a_stop(robot):
     for _ in range(25):
         robot.exchange(0.1, 0.0)
     robot.driver.drive(0.1, 0.0, robot.now - 0.1)  # the process was suspended between decision and sending
@@ -112,14 +108,12 @@ def test_command_is_as_old_as_its_state(monkeypatch):
     assert link.current_twist()[:2] == (0.0, 0.0)
 
 
-@pytest.mark.parametrize("server", SERVERS)
-def test_nothing_sent_looks_like_a_goal_to_servers(lab, server):
-    robot = lab(server)
+def test_nothing_sent_looks_like_a_goal_to_servers(robot):
     for _ in range(5):
         robot.exchange(0.1, 0.0)
     goals = [read for read in robot.heard if read[:1] == b"g"]
     assert not robot.driver.ranged
-    assert bool(goals) == (not protocol.PARK[server].drives)
+    assert bool(goals) == (not robot.driver.server.drives)
     assert b"get_data" not in goals
 
 
@@ -144,10 +138,8 @@ def test_server_other_than_the_named_is_refused(lab, monkeypatch):
     assert set(robot.heard) == {b"stop", b"p"}
 
 
-@pytest.mark.parametrize("server", SERVERS)
-def test_way_during_machine_sleep_is_counted(lab, server):
+def test_way_during_machine_sleep_is_counted(robot):
     """The robot drives on; the machine's monotonic clock leaves the sleep out, its uptime does not."""
-    robot = lab(server)
     for _ in range(25):
         robot.exchange(0.1, 0.0)
     x, counted = robot.truth()[0], robot.odometer.x

@@ -54,6 +54,10 @@ class Cockpit:
         self.pilot.position = at
         self.pilot.take_off(height, self.now)
 
+    def aim(self, setpoint):
+        """Give the pilot in flight a setpoint."""
+        self.pilot.duty, self.pilot.setpoint, self.pilot.setpoint_time = Duty.FLY, setpoint, self.now
+
     def fly(self):
         """In the air, at its place, its motors' clock running."""
         self.take_off(0.6, at=(1.0, 2.0, 0.0))

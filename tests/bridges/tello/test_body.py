@@ -65,11 +65,7 @@ def test_tello_climbs_and_holds_until_setpoints_come():
     cockpit.pilot.position = (np.nan,) * 3
     cockpit.pass_(0.05)
     assert cockpit.drone.sticks[-1] == (0, 0, 0, 0)
-    cockpit.pilot.duty, cockpit.pilot.setpoint, cockpit.pilot.setpoint_time = (
-        Duty.FLY,
-        (0.0, 0.3, 0.0, 0.0),
-        cockpit.now,
-    )
+    cockpit.aim((0.0, 0.3, 0.0, 0.0))
     cockpit.pass_(0.5)
     assert cockpit.drone.sticks[-1] == (-30, 0, 0, 0)
     cockpit.pass_(0.1)
@@ -91,7 +87,7 @@ def test_process_woken_from_suspension_sends_nothing_stale():
     """Suspended in the middle of a step, which is a stick of before; then it lands, as it does in a take-off."""
     cockpit = Cockpit().fly()
     pilot, drone = cockpit.pilot, cockpit.drone
-    pilot.duty, pilot.setpoint, pilot.setpoint_time = Duty.FLY, (0.0, 0.3, 0.0, 0.0), cockpit.now
+    cockpit.aim((0.0, 0.3, 0.0, 0.0))
     sticks, read = pilot._sticks, cockpit.now
 
     def suspended(now, last_read):
@@ -119,11 +115,7 @@ def test_sticks_of_another_scale():
     cockpit.pilot.position, cockpit.pilot.yaw = (0.9, 2.0, 0.6), 0.0
     cockpit.pass_(0.05)
     assert cockpit.drone.sticks[-1] == (0, 20, 0, 0)
-    cockpit.pilot.duty, cockpit.pilot.setpoint, cockpit.pilot.setpoint_time = (
-        Duty.FLY,
-        (0.0, 0.2, 0.0, 0.0),
-        cockpit.now,
-    )
+    cockpit.aim((0.0, 0.2, 0.0, 0.0))
     cockpit.pass_(0.05)
     assert cockpit.drone.sticks[-1] == (-40, 0, 0, 0)
 
@@ -134,11 +126,7 @@ def test_the_stick_test_closes_no_loop():
     cockpit.drone.sticks.clear()
     flown = []
     for _ in range(70):
-        cockpit.pilot.duty, cockpit.pilot.setpoint, cockpit.pilot.setpoint_time = (
-            Duty.FLY,
-            (0.5, 0.5, 0.5, 0.5),
-            cockpit.now,
-        )
+        cockpit.aim((0.5, 0.5, 0.5, 0.5))
         cockpit.pass_(0.1)
         flown.append(cockpit.drone.sticks[-1])
     forward = [sticks[1] for sticks in flown]

@@ -84,11 +84,7 @@ def test_drone_that_flies_unordered_is_landed():
 def test_drone_that_does_not_land_rests_its_sticks():
     """It keeps the last sticks that it was told."""
     cockpit = Cockpit().fly()
-    cockpit.pilot.duty, cockpit.pilot.setpoint, cockpit.pilot.setpoint_time = (
-        Duty.FLY,
-        (0.5, 0.0, 0.0, 0.0),
-        cockpit.now,
-    )
+    cockpit.aim((0.5, 0.0, 0.0, 0.0))
     cockpit.pass_(0.1)
     assert cockpit.drone.sticks[-1] == (0, 50, 0, 0)
     cockpit.pilot.land(cockpit.now)

@@ -20,6 +20,7 @@ from experiments.file import document
 from experiments.real_time.conductor import hot_changes
 from experiments.real_time.conductor.hot_changes import HotChanges
 from experiments.real_time.conductor.run_view import RobotView
+from tests.fuzz import loopnet
 
 KEYS = Keys()
 START = 1000.0
@@ -37,35 +38,22 @@ class Clock:
         return START + self.now
 
 
-class Payload:
-    def __init__(self, data: bytes) -> None:
-        self._data = data
-
-    def to_bytes(self) -> bytes:
-        return self._data
-
-
-class Query:
+class Query(loopnet.Query):
     """An order to the conductor, and its answer."""
 
-    encoding = messages.JSON
     reply_sent: messages.RunReply | None = None
     error = b""
 
     def __init__(self, payload: bytes) -> None:
-        self.payload = Payload(payload)
+        super().__init__(KEYS.run_order, messages.JSON, payload)
 
-    def __enter__(self) -> Query:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        assert self.reply_sent is not None or self.error, "a query without an answer"
-
-    def reply(self, key: str, payload: bytes, encoding: str) -> None:
-        assert (key, self.reply_sent) == (KEYS.run_order, None)
+    def reply(self, key: str, payload: bytes, encoding: str = "") -> None:
+        super().reply(key, payload, encoding)
+        assert key == self.key_expr
         self.reply_sent = messages.decode(payload, encoding, messages.RunReply)
 
-    def reply_err(self, payload: bytes, encoding: str) -> None:
+    def reply_err(self, payload: bytes, encoding: str = "") -> None:
+        super().reply("", payload, encoding)
         self.error = payload
 
 
