@@ -1,8 +1,11 @@
-"""The parts of the benchmarks that are no timings: the law, the dialogue with a simulator, the tables."""
+"""The parts of the benchmarks that are no timings: the law, the dialogue with a simulator, the tables, processes."""
 
 from __future__ import annotations
 
+import os
 import subprocess
+import sys
+import time
 from contextlib import closing
 
 import numpy as np
@@ -11,6 +14,8 @@ import pytest
 from tests.bench import __main__ as renewal
 from tests.bench import growth, peers
 from tests.bench.drivers import ring
+from tests.bench.process import Meter
+from tests.reliability.soak_sampler import usage_of
 
 
 @pytest.fixture(autouse=True)
@@ -91,3 +96,24 @@ def test_simulators_are_run_by_drivers_of_their_own():
     drivers = {file.stem.removeprefix("peer_") for file in folder.glob("peer_*.py")}
     assert drivers == {*peers.OTHERS, "zenpark"} - {"gym-pybullet-drones"}
     assert subprocess.run(["grep", "-rlE", r"^\s*(from|import) vmas", folder], check=False).returncode == 1
+
+
+def test_what_another_process_spends_is_read_exactly() -> None:
+    before = usage_of(os.getpid())
+    begun = time.process_time()
+    while time.process_time() < begun + 0.05:
+        pass
+    after = usage_of(os.getpid())
+    assert before is not None
+    assert after is not None
+    assert 0.05 <= after.cpu_s - before.cpu_s <= time.process_time() - begun + 0.01
+    assert after.rss_mb > 1.0
+
+
+def test_a_process_that_has_ended_is_left_out() -> None:
+    over = subprocess.Popen([sys.executable, "-c", "pass"])
+    over.wait()
+    meter = Meter()
+    for _ in range(2):
+        meter.measure({"CF01": os.getpid(), "CF02": over.pid})
+    assert set(meter.shares()) == {"CF01"}

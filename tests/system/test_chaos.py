@@ -1,7 +1,8 @@
-"""The fault laboratory on a small experiment, with real processes."""
+"""Faults and long runs in real processes."""
 
 from __future__ import annotations
 
+import csv
 import json
 import subprocess
 from pathlib import Path
@@ -45,3 +46,17 @@ def test_a_fault_that_nobody_knows_is_refused(tmp_path: Path) -> None:
     assert done.returncode == 2
     assert "--kinds kil: is not known" in done.stderr
     assert done.stderr.count("\n") <= 2
+
+
+def test_three_robots_for_a_few_seconds(tmp_path: Path) -> None:
+    asked = ("triangle", "--minutes", "0.1", "--json", "--out", str(tmp_path / "soak"))
+    done = zenpark("--soak", *asked, timeout_s=120.0, module="tests")
+    assert done.stdout, done.stderr
+    said = json.loads(done.stdout)
+    texts = [finding["text"] for finding in said["findings"]]
+    assert texts[0].startswith("all 3 robots lived"), texts
+    assert any(text.startswith("0 of ") and text.endswith("poses were lost") for text in texts), texts
+    with (tmp_path / "soak" / "soak.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert {row["process"] for row in rows} == {"KH01", "KH02", "CF01", "router", "recorder", "conductor"}
+    assert all(float(row["rss_mb"]) > 5.0 and int(row["threads"]) > 0 for row in rows)

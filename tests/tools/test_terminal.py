@@ -1,12 +1,13 @@
-"""Text of others in the terminal."""
+"""What the command line knows of its terminal and its options."""
 
 from __future__ import annotations
 
 import sys
+import webbrowser
 
 import pytest
 
-from tools.options import print_result, warn
+from tools.options import open_in_browser, print_result, warn
 from tools.terminal import printable, say
 
 ESCAPES = "\x1b]0;owned\x07\x1b[2J\r\x9b2J\u202e"
@@ -31,3 +32,12 @@ def test_no_escape_reaches_the_terminal(tell, capsys) -> None:
     printed = "".join(capsys.readouterr())
     assert not {"\x1b", "\x07", "\x9b", "\r", "\u202e"} & set(printed)
     assert printed.count("\n") == 2
+
+
+@pytest.mark.parametrize("opened", [True, False])
+def test_page_is_named_where_no_browser_opens_it(opened, monkeypatch, capsys):
+    asked = []
+    monkeypatch.setattr(webbrowser, "open", lambda address: asked.append(address) or opened)
+    open_in_browser("file:///report.html")
+    assert asked == ["file:///report.html"]
+    assert ("open file:///report.html by hand" in capsys.readouterr().err) is not opened

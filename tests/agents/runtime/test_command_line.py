@@ -1,4 +1,4 @@
-"""Signals are heeded inside and only there; the arguments of the network are the same for every process."""
+"""What a process does with its words, its output and its interruption."""
 
 import os
 import signal
@@ -7,7 +7,7 @@ import pytest
 
 from agents.network.endpoints import DEFAULT_ENDPOINT
 from agents.network.lab import LabError
-from agents.runtime.command_line import NetworkLaunch, on_termination, parse
+from agents.runtime.command_line import NetworkLaunch, Output, interrupts, on_termination, parse
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -42,3 +42,49 @@ def test_a_lab_wants_endpoints_that_ask_for_certificates(tmp_path):
     assert given.identity == "CF01"
     with pytest.raises(LabError, match="asks for no certificate"):
         given.endpoints()
+
+
+def test_it_prints(pipe):
+    print("über", 1, file=Output(pipe[1]), flush=True)
+    assert os.read(pipe[0], 100).decode() == "über 1\n"
+
+
+def test_nobody_reads(pipe):
+    os.close(pipe.pop(0))
+    print("x", file=Output(pipe[0]), flush=True)
+
+
+def test_slow_reader_costs_no_time(pipe):
+    out = Output(pipe[1])
+    for _ in range(100):
+        print("x" * 4000, file=out)  # a pipe holds 64 kB: a print that waited would wait for ever
+    assert len(os.read(pipe[0], 1 << 20)) >= 4096
+
+
+@pytest.fixture
+def hang_up():
+    """Sets what becomes of SIGHUP."""
+    before = signal.getsignal(signal.SIGHUP)
+    yield lambda handler: signal.signal(signal.SIGHUP, handler)
+    signal.signal(signal.SIGHUP, before)
+
+
+def test_the_first_asks_and_the_second_insists(hang_up):
+    hang_up(signal.SIG_DFL)
+    with interrupts() as interrupted:
+        assert not interrupted()
+        signal.raise_signal(signal.SIGHUP)
+        assert interrupted()
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGTERM)
+    assert signal.getsignal(signal.SIGHUP) == signal.SIG_DFL
+
+
+def test_who_was_started_by_nohup_outlives_its_terminal(hang_up):
+    hang_up(signal.SIG_IGN)
+    with interrupts() as interrupted:
+        signal.raise_signal(signal.SIGHUP)
+        assert not interrupted()
+        signal.raise_signal(signal.SIGINT)
+        assert interrupted()
+    assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN

@@ -1,4 +1,4 @@
-"""What stands in an arena is drawn where it stands, in every picture of the arena."""
+"""Obstacles and expected motions in figures."""
 
 from __future__ import annotations
 
@@ -10,8 +10,11 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon, Rectangle
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
+from experiments.check.check import analyses
 from experiments.definition.experiment import Arena, StartBox
+from experiments.file import document
 from experiments.report import figures, scenery, trajectories
+from experiments.report.trajectories import expected_motion
 from tests.experiments.traces import crowd, park
 from twins.scene import Obstacle
 
@@ -130,3 +133,16 @@ def test_robots_on_the_floor_stand_on_it(short):
     for arena, top in ((EMPTY, 0.216), (FULL, 0.15 * 1.08 * 3.0)):
         low, high = trajectories.formation([within(flat, arena)]).axes[0].get_zlim()
         assert (low, high) == pytest.approx((0.0, top))
+
+
+@pytest.mark.slow
+def test_target_shape_is_laid_on_the_leader():
+    given = document.read("robotic-park", ["timeline=[]", "duration_s=15"])
+    known = analyses(given)["event"]
+    axes = expected_motion({"event": known}).axes[0]
+    target = [line.get_xydata()[0] for line in axes.lines if line.get_marker() == "D"]
+    leader = known.names.index("TB01")
+    assert target[leader] == pytest.approx(known.start[leader, :2], abs=1e-9)
+    ends = [line.get_xydata()[0] for line in axes.lines if line.get_marker() == "o" and line.get_markersize() == 3.5]
+    assert np.array(ends) == pytest.approx(known.prediction.position[-1, :, :2])
+    assert np.linalg.norm(np.array(target) - ends, axis=1).max() < 0.2

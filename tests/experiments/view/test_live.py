@@ -1,13 +1,21 @@
-"""Camera of the live view: what a page of any shape has in sight."""
+"""A view of a run that goes on: what it shows, what it may do, and its sign of life."""
 
 from __future__ import annotations
 
 from itertools import product
 
+import msgspec
 import numpy as np
 import pytest
 
+from agents.network import lab
+from agents.network.endpoints import free_endpoint
+from experiments.file.document import load
+from experiments.run import simulate, simulate_seeds
+from experiments.scene.stage import SceneModel
 from experiments.view import live
+from experiments.view.acting import Watched, may_act, parameters
+from experiments.view.heartbeat import RECORDED_S, SLOWEST_S, DataAge, frame_s, mark
 
 
 @pytest.mark.parametrize("size", [(2.0, 2.0, 0.95), (12.0, 12.0, 1.1), (4.3, 2.0, 0.95), (0.5, 6.0, 2.0)])
@@ -26,3 +34,85 @@ def test_whole_arena_is_in_sight_and_fills_page(size, aspect):
     assert low - 1e-4 <= up.min() <= up.max() <= high + 1e-4
     fills = np.ptp(over) / np.ptp(live.FREE), np.ptp(up) / (high - low)
     assert max(fills) == pytest.approx(1.0)
+
+
+def test_age_is_unknown_before_the_first_pose():
+    assert DataAge().seconds(1000.0, 0.0) is None
+
+
+def test_poses_that_came_late_are_old():
+    age = DataAge()
+    age.add(1000.0, utc=1000.1, now=10.0)
+    assert age.seconds(1000.1, 10.0) == pytest.approx(0.1)
+    age.add(1001.0, utc=1046.0, now=56.0)  # 45 s in a queue
+    assert age.seconds(1046.0, 56.0) == pytest.approx(45.0)
+    assert not age.recorded
+
+
+def test_silence_makes_poses_old():
+    age = DataAge()
+    age.add(1000.5, utc=1000.0, now=10.0)  # a clock ahead by half a second
+    assert age.seconds(1133.0, 143.0) == pytest.approx(133.0)
+
+
+def test_recordings_are_as_old_as_their_delay_grew():
+    age = DataAge()
+    age.add(1000.0, utc=1000.0 + 86400.0, now=10.0)
+    assert age.recorded
+    assert age.seconds(1000.0 + 86400.0, 10.0) == 0.0
+    assert age.seconds(1000.0 + 86403.0, 13.0) == pytest.approx(3.0)
+    assert RECORDED_S < 86400.0
+
+
+def test_mark_escapes_and_states_the_time():
+    text = mark(3, 1000.0, 0.25, "<b>'", over=True)
+    assert "data-stage='3'" in text
+    assert "data-picture='999.750'" in text
+    assert "<b>" not in text
+    assert "data-picture=''" in mark(3, 1000.0, None)
+
+
+def test_slow_pages_get_fewer_pictures():
+    periods = [frame_s(lag, 0.04) for lag in (0.0, 1.0, 2.0, 3.0, 100.0)]
+    assert periods[:2] == [0.04, 0.04]
+    assert periods == sorted(periods)
+    assert periods[-1] == SLOWEST_S
+
+
+def test_only_an_operator_of_a_lab_gives_orders(tmp_path):
+    known = {
+        name: lab.Identity(role=role, common_name=name, serial="1", until="2027-01-01T00:00:00")
+        for name, role in (("operator", "operator"), ("observer", "observer"), ("ana", "operator"))
+    }
+    (tmp_path / lab.REGISTER).write_bytes(msgspec.json.encode(lab.Register(known)))
+    endpoints = lab.secured(["tls/127.0.0.1:7447"], tmp_path)
+    found = {name: may_act(Watched(endpoints, "park", name)) for name in (*known, "stranger")}
+    assert found == {"operator": True, "observer": False, "ana": True, "stranger": False}
+    assert [may_act(Watched(["tcp/127.0.0.1:7447"], "park", name)) for name in ("operator", "observer")] == [
+        True,
+        False,
+    ]
+    assert not may_act(Watched(lab.secured(["tls/127.0.0.1:7447"], tmp_path / "no"), "park", "operator"))
+
+
+def test_trigger_and_law_numbers_have_sliders():
+    park = SceneModel.of_plan(load("robotic-park").cases()["event"])
+    assert [(each.label, each.value) for each in parameters(park)] == [
+        ("trigger.threshold [m]", 0.01), ("clamp [m]", 0.1), ("tracking_gain [1/(m²·decision)]", 3.0),
+    ]  # fmt: skip
+
+
+@pytest.mark.slow
+def test_watched_virtual_run_is_unchanged_bit_by_bit():
+    pytest.importorskip("viser", reason="needs viser")
+    from experiments.view import paced  # noqa: PLC0415
+    from experiments.view.serving import served  # noqa: PLC0415
+
+    read = load("robotic-park", "duration_s=1.0", "timeline=[]", "cases={}")
+    with served(int(free_endpoint(preferred_port=0).rpartition(":")[2]), dark=True) as server:
+        page = paced.PacedView(server, pace=100.0, dark=True, page_s=0.0)
+        (watched,) = simulate_seeds(read, [1], watch=page.begin)
+    alone = simulate(read, seed=1)
+    for case, trace in alone.traces.items():
+        np.testing.assert_array_equal(watched.traces[case].true_position, trace.true_position)
+    assert page.clock.t > 0.0

@@ -1,14 +1,20 @@
-"""Two runs on one machine: hardware belongs to one of them, twins of the same names fly beside each other."""
+"""Runs that are conducted, and their emergency stop."""
 
+import threading
 from pathlib import Path
 
 import msgspec
 import pytest
 
+from agents.network.endpoints import free_endpoint
+from agents.network.keys import Keys
+from agents.network.session import Unreachable
+from agents.runtime.router import serve_router
 from experiments.definition.experiment import Formation, Host, Robot
 from experiments.definition.plan import Plan
 from experiments.file.problems import DocumentError
 from experiments.real_time.conductor.conduct import check_other_runs, hardware
+from experiments.real_time.conductor.emergency import STARTING_S, Emergency
 from experiments.real_time.hosts import run_registry
 from tests.agents.few import pair
 
@@ -74,3 +80,28 @@ def test_hardware_that_another_run_has_is_refused(
 
 def test_a_run_that_has_died_has_nothing() -> None:
     assert check_other_runs(run({"CF01": RADIO}), [run({"CF01": RADIO}, born="long ago")], "x.toml") == []
+
+
+KEYS = Keys("park")
+
+
+@pytest.fixture
+def endpoint():
+    return free_endpoint(preferred_port=0)
+
+
+def test_router_that_just_started_is_waited_for(endpoint):
+    over = threading.Event()
+    late = threading.Timer(0.6, serve_router, ([endpoint], over))
+    late.start()
+    try:
+        with Emergency().throughout([endpoint], KEYS, "operator", STARTING_S):
+            pass
+    finally:
+        over.set()
+        late.join()
+
+
+def test_one_of_somebody_else_is_not(endpoint):
+    with pytest.raises(Unreachable), Emergency().throughout([endpoint], KEYS, "operator", 0.2):
+        pass
