@@ -223,7 +223,7 @@ def _result(future: Future[Flown]) -> Flown:
 
 @contextmanager
 def _processes(works: Mapping[str, Plan], seeds: int) -> Iterator[ProcessPoolExecutor | None]:
-    """Processes for so many more seeds of these cases, None where to begin them would take longer."""
+    """Processes for `seeds` more seeds of these cases; None if starting them would take longer."""
     ticks = sum(plan.experiment.duration_s * plan.experiment.rates.body_hz * len(plan.names) for plan in works.values())
     count = min(cores(), len(works) * seeds)
     if count < 2 or seeds * ticks < SHARED:

@@ -27,7 +27,7 @@ def guided_rows(trace: Trace) -> Mask:
 
 
 def received_by_centre(trace: Trace) -> Mask:
-    """Robots (N,) whose poses the central controller receives: those that it guides, and their neighbours."""
+    """Senders (N,) of poses to the central controller: the robots that it guides, and their neighbours."""
     rows = guided_rows(trace)
     net = trace.plan.links
     hears = rows.copy()

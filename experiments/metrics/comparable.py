@@ -1,4 +1,4 @@
-"""Which runs can be compared: those that nothing spoiled, of equal length, of which as much is known."""
+"""Comparable runs: undisturbed ones of equal length, with equally complete data."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SAME_COVERAGE: Final = 0.01  # by which known shares of errors may differ where 
 
 
 def reasons(case: CaseMetrics) -> tuple[str, ...]:
-    """Why the figures of a run are compared with none of another, one clause each; empty if nothing spoiled it."""
+    """Reasons why the figures of a run are not compared with those of another one, one clause each."""
     lost, missed, factor = lost_share(case), case.missed_share or 0.0, case.world_factor
     found = []
     if case.failures:
@@ -38,9 +38,9 @@ def reasons(case: CaseMetrics) -> tuple[str, ...]:
 
 
 def with_failures(case: CaseMetrics, told: Iterable[str]) -> CaseMetrics:
-    """A case with failures that its recording does not tell: its conductor saw them, and its recorder had ended.
+    """A case with failures that its recording misses: its conductor saw them after the end of its recorder.
 
-    Those whose robots have failed by the recording already are left out.
+    Failures of robots that have failed by the recording already are left out.
     """
     failed = {text.split(" ")[0].rstrip(":") for text in case.failures}
     names = {robot.robot for robot in case.robots}

@@ -24,7 +24,7 @@ class Judgement(msgspec.Struct, frozen=True):
 
     @property
     def failed(self) -> list[int]:
-        """Seeds that do not keep the limit, or whose value is unknown."""
+        """Seeds that do not keep the limit, or have no known value."""
         return [seed for seed in self.values if not self.keeps(seed)]
 
     def keeps(self, seed: int) -> bool | None:

@@ -1,7 +1,7 @@
 """Metrics of a run: the indices of the paper (section IV-B), and the numbers that show whether to trust them.
 
 All errors are taken on true positions. A robot that died has NaN positions from then on: its links are left out from
-that moment, integrals cover what is known (`coverage` says how much), and the means leave that robot out. The figures
+that moment, integrals cover the known part (`coverage` is its share), and the means leave that robot out. The figures
 of a run that was interrupted cover the time until then.
 """
 
@@ -46,7 +46,7 @@ from experiments.recording.trace import Trace
 from twins.arrays import Array, norm
 
 TROUBLES: Final = ("late", "unread")  # kinds of events of the run itself, not of a robot
-PRESENT: Final = 0.8  # a robot whose position is known for less of the run was out of reach
+PRESENT: Final = 0.8  # least share of known positions of a robot: below it the robot was out of reach
 GAP_S: Final = 0.5  # [s] shorter times without a position are not named
 
 

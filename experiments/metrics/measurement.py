@@ -27,7 +27,7 @@ from twins.arrays import Array, Index, norm
 
 WINDOW_S: Final = 1.0  # [s] of the moving mean that decides on acquisition, and of the residual
 BAND: Final = 0.02  # of the largest error: the 2 % band of the settling time
-KNOWN: Final = 0.95  # a robot whose position is known for less of the run counts as died
+KNOWN: Final = 0.95  # least share of known positions of a robot: below it the robot counts as died
 
 
 class Measurement:
@@ -87,7 +87,7 @@ class Measurement:
 
     @cached_property
     def died(self) -> tuple[str, ...]:
-        """Followers whose position is unknown for too long: means leave them out."""
+        """Followers without a known position for too long: means leave them out."""
         names = zip(self.trace.robots, self.known, strict=True)
         return tuple(name for name, share in names if share < KNOWN and name not in self.leaders)
 

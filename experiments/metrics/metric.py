@@ -112,7 +112,7 @@ OURS: Final[Mapping[str, Metric]] = {  # by the names of the fields of `RobotMet
         unit="s", mean="all", relative=False,
     ),
     "updates": _ours(
-        attrgetter("trace.decisions"), "Updates", "Goals that a robot computed anew.", relative=False, shown=False
+        attrgetter("trace.decisions"), "Updates", "Goals that a robot recomputed.", relative=False, shown=False
     ),
     "lost": _ours(
         attrgetter("trace.lost"), "Lost samples",
@@ -190,7 +190,7 @@ def metrics_of_criteria(criteria: Iterable[Criterion]) -> tuple[dict[str, Metric
 
 
 def unusable_metrics() -> tuple[str, ...]:
-    """Why registered metrics are left out, a sentence each."""
+    """Reasons why registered metrics are left out, a sentence each."""
     return _installed()[1]
 
 

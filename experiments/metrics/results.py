@@ -54,7 +54,7 @@ class ShadowMetrics(msgspec.Struct, frozen=True):
 class CentralisedMetrics(msgspec.Struct, frozen=True):
     """The centralised architecture of one case: goals, delays and load of the central controller."""
 
-    guided: tuple[str, ...]  # robots whose goals it computes
+    guided: tuple[str, ...]  # robots with goals that it computes
     goals: int  # sent
     goals_hz: float  # [Hz]
     goal_bytes: int  # payload
@@ -101,7 +101,7 @@ class RobotMetrics(msgspec.Struct, frozen=True):
     # [s] when e enters the 2 % band of its largest value for good; the duration if never, None for laws without errors
     settle_s: float | None
     missed_share: float | None  # missed deadlines over the ticks that were due, made or missed
-    updates: int  # goals computed anew
+    updates: int  # recomputed goals
     gap_min_s: float | None  # [s] shortest time between two transmissions
     gap_median_s: float | None  # [s] median
     gap_max_s: float | None  # [s] longest

@@ -68,7 +68,7 @@ def agreement(trace: Trace) -> list[ShadowMetrics | None]:
 
 
 def _of_speeds(time: Array, robot: Array, twin: Array, known: Mask) -> float | None:
-    """Correlation of the speeds of two paths (T, 3), but for where the twin was put elsewhere."""
+    """Correlation of the speeds of two paths (T, 3), without the resets of the twin."""
     width = max(1, round(SPEED_S / float(time[1] - time[0])))
     if len(time) <= width:
         return None

@@ -20,10 +20,10 @@ def ratio(value: float | None, reference: float | None) -> float | None:
 
 
 def ratios(runs: Sequence[CaseMetrics], reference: Sequence[CaseMetrics], index: str) -> list[float | None]:
-    """A metric of each run over the reference: of the same seed if all seeds are the same, else over its mean.
+    """Ratio of a metric of each run to the reference: to the same seed if all seeds are the same, else to its mean.
 
-    None for runs that were spoiled, for those that are shorter than others, and of metrics that add up for those of
-    which less is known than of others; such a run of the reference is left out.
+    None for disturbed runs, and for runs that are shorter than others. None as well for sums of a run with fewer known
+    data than others. Such a run of the reference is left out.
     """
     every = [*runs, *reference]
     metric = known_metrics(every[:1]).get(index)

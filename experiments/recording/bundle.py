@@ -57,7 +57,7 @@ def write(folder: Path, target: Path, plans: list[Plan]) -> Path:
     """Write the bundle of a run.
 
     Args:
-        plans: Its cases, whose plug-ins are added.
+        plans: Its cases, with plug-ins that are added.
 
     Raises:
         RecordingError: If the folder has no `run.json`, or the archive cannot be written.
@@ -189,6 +189,6 @@ def _files(folder: Path, target: Path) -> Iterator[tuple[str, Path]]:
 
 
 def _plugins(plans: list[Plan]) -> set[Path]:
-    """Modules of the plug-ins that the cases choose, but for our own."""
+    """Modules of the plug-ins that the cases choose, except our own."""
     files = {file for plan in plans for file in plugin_files(plan)}
     return {file for file in files if not any(file.is_relative_to(ROOT / package) for package in PACKAGES)}

@@ -112,8 +112,8 @@ R = TypeVar("R", bound=Report)
 def lives(reports: Iterable[R], made: Callable[[R], int]) -> list[list[R]]:
     """Reports in order of time, by the process that made them, in the order of the first of each.
 
-    Two processes of one robot may report in turn. A number that a later process was given again (in containers all have
-    the same) is told from the former one by counters that fell.
+    Two processes of one robot may report in turn. If a later process has the same number (in containers all have the
+    same), falling counters distinguish it from the former one.
 
     Args:
         reports: In order of time.

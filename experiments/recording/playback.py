@@ -48,8 +48,8 @@ from experiments.recording.trace import (
 )
 from twins.arrays import Array, Index
 
-HOLD_PERIODS: Final = 2.0  # a sample is valid for so many state periods
-EARLY_S: Final = 0.5  # robots that land by their own clocks at the end of the whole run are not that much early
+HOLD_PERIODS: Final = 2.0  # state periods for which a sample is valid
+EARLY_S: Final = 0.5  # a landing at most this much before the planned end is a regular one [s]
 LANDED: Final = (Phase.LANDING.word, Phase.DONE.word)
 NOWHERE: Final = (math.nan, math.nan, math.nan)
 OPTIONAL: Final = ("attitude", "shadow_position", "shadow_yaw")  # columns that a trace may lack
@@ -94,7 +94,7 @@ class AboutRun:
 
     @classmethod
     def of(cls, records: Records) -> AboutRun:
-        """Content of `records`, whose messages were read."""
+        """Content of `records`, after their messages were read."""
         about = next((record.metadata for record in records.metadata if record.name == METADATA), {})
         attached = next((record.data for record in records.attachments if record.name == JSON), b"")
         kinds = next((record.data for record in records.attachments if record.name == KINDS_JSON), b"[]")
@@ -142,15 +142,16 @@ def read(path: Path) -> Playback:
     Counters of a robot are sums over all its processes. What robots refuse (running numbers that are not possible,
     stamps ahead of the time) is left out.
 
-    `lost` of a robot is the sum of: (1) gaps in the sequence numbers of its poses recorded in the run, where a number
-    that goes back is a publisher that began anew at 1; (2) poses beyond the last recorded one that its last status of
-    the run counts as sent; (3) poses that the last status of each receiver counts as lost from it, less the count of
-    the same process before the common start. A pose that two receivers and the recorder missed counts three times, for
-    each was to get it. Poses that the modelled network dropped are not lost; the receivers count them in `dropped`.
+    `lost` of a robot is a sum of three parts. (1) Gaps in the sequence numbers of its poses recorded in the run; a
+    number that goes back is a publisher that restarted at 1. (2) Poses beyond the last recorded one that its last
+    status of the run counts as sent. (3) Poses that the last status of each receiver counts as lost from it, less the
+    count of the same process before the common start. A pose that two receivers and the recorder missed counts three
+    times, since each should have received it. Poses that the modelled network dropped are not lost; the receivers count
+    them in `dropped`.
 
-    The trace of a shorter run than its experiment ends where the conductor began to land all robots (interrupted by
-    the user, or all had come down before); after a kill of recorder or conductor, with the last known samples of
-    running robots. It holds nothing of a landing.
+    The trace of a run that is shorter than its experiment ends when the conductor began to land all robots (interrupted
+    by the user, or all had come down before). After a kill of recorder or conductor it ends with the last known samples
+    of running robots. It contains no landing.
 
     Stamps of robots on other machines are corrected by the drift of their clocks in the run; their offset at its
     beginning was subtracted where they were made.
@@ -302,7 +303,7 @@ def _by_robot(messages: Iterable[M], robots: Sequence[str]) -> list[list[M]]:
 
 
 def _joined(states: list[list[State]], plan: Plan, start: float) -> Array | None:
-    """When each robot took part at first (N,) [s]: 0, but of those on standby; None without such robots."""
+    """Time at which each robot joined (N,) [s]: 0, except for those on standby; None without such robots."""
     robots = plan.experiment.robots.values()
     if not any(robot.standby for robot in robots):
         return None

@@ -1,7 +1,7 @@
 """Reads and recovers MCAP files, finished or not: what a killed recorder or a full disk left behind counts.
 
 Readers that seek need the summary that only a finished file has. This one goes through the file from its beginning, and
-checks each record before it is believed, so that damage costs the records it hit and those that depend on them.
+checks each record before using it. Damage costs only the records it hit and those that depend on them.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class Records:
     complete: bool = False  # the file was finished by its recorder and nothing in it is damaged; known at the end
 
     def messages(self) -> Iterator[Message]:
-        """All messages whose channel is known, in the order they were written; raises as `pieces` does."""
+        """All messages with a known channel, in the order of writing; raises as `pieces` does."""
         for data, places in self.pieces():
             for at in places:
                 _, length, channel, sequence, logged, published = _MESSAGE.unpack_from(data, at)
@@ -159,7 +159,7 @@ class Recovered:
 
 
 def later_parts(recording: Path) -> list[Path]:
-    """Parts of a recording by recorders that took over in its run, and that nobody has joined to it."""
+    """Parts of a recording by recorders that took over in its run, not yet joined to it."""
     folder = recording.parent / PARTS / recording.stem
     return sorted(folder.glob("part*.mcap"), key=lambda file: (len(file.name), file.name))
 

@@ -35,7 +35,7 @@ class RunOrigin(msgspec.Struct, frozen=True, omit_defaults=True):
     virtual: bool = False  # in virtual time
     cases: list[str] = []  # that were chosen; empty: all
     changes: list[str] = []  # behind `--set` and `--seed`
-    seeds: Annotated[int, msgspec.Meta(ge=1, le=100_000)] = 1  # so many, from that of the file on
+    seeds: Annotated[int, msgspec.Meta(ge=1, le=100_000)] = 1  # number of seeds, from that of the file on
     bodies: str | None = None  # behind `--bodies`
     here: bool = False  # all robots on this machine
     anyway: bool = False  # although the check found errors
@@ -118,7 +118,7 @@ class PastRun(msgspec.Struct, frozen=True):
     recorded: bool  # whether it has a recording
     seeds: list[int]
     cases: dict[str, dict[str, dict[int, float | None]]]  # metrics of each case, by seed; None: not known
-    # of each case and seed what a reader of its figures must know: how much of its time it took, what spoiled it
+    # of each case and seed notes for a reader of its figures: share of its time, disturbances
     remarks: dict[str, dict[int, str]] = {}
     lengths: dict[str, dict[int, float]] = {}  # of each case by seed [s]; those of another version are not known
     lost: int = 0  # poses that were sent and never received, of all cases
@@ -212,7 +212,7 @@ def case_figures(file: Path) -> list[CaseFigures]:
 
 
 def differences(first: PastRun, other: PastRun) -> list[str]:
-    """How the file, the options, the seeds, the code and the versions of a run differ from those of another one."""
+    """Differences of a run from another one in file, options, seeds, code and versions."""
     before, after = (dict(flattened(_document(Path(run.folder)))) for run in (first, other))
     found = [
         f"{key} {_formatted(before.get(key))} → {_formatted(after.get(key))}"

@@ -1,13 +1,13 @@
 """Topics of a recording: each kind of message with its key on the network, its topic and its type in the file.
 
-The recorder subscribes by this table, the writer and the playback look topics up in it. Beside them stand topics in
-types that every viewer draws: `/<robot>/true_pose` (geometry_msgs/PoseStamped), `/tf` (tf2_msgs/TFMessage, from the
-frame `map` to a frame of each robot's name) and `/scene` (visualization_msgs/MarkerArray: arena, obstacles, robots,
-links in the colours of their errors).
+The recorder subscribes by this table, the writer and the playback look topics up in it. Further topics have types that
+every viewer draws: `/<robot>/true_pose` (geometry_msgs/PoseStamped), `/tf` (tf2_msgs/TFMessage, from the frame `map` to
+a frame of each robot's name) and `/scene` (visualization_msgs/MarkerArray: arena, obstacles, robots, links in the
+colours of their errors).
 
 Attached are the experiment as it was written (`experiment.toml`), this case with its overrides (`experiment.json`), and
-the figures of its kinds of robots (`kinds.json`), for readers without them;
-the metadata record `zenpark` has case, seed, clock, and the code, versions and machine that made it.
+the figures of its kinds of robots (`kinds.json`), for readers without them. The metadata record `zenpark` has case,
+seed and clock, and the code, versions and machine that made it.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ Message = Pose | Memory | State | Status | Event | Contact | WorldState | Goal |
 
 
 class SentPose(BarePose, frozen=True, kw_only=True):
-    """A pose as it was sent to the neighbours, by a robot whose law says nothing."""
+    """A pose as it was sent to the neighbours, by a robot with a law without variables to transmit."""
 
     received: float  # [s] UTC, by the recorder
     size: int  # [bytes] of the payload on the network

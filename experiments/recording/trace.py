@@ -42,9 +42,9 @@ def contacts_watched(contacts: Sequence[Contact], world: Iterable[WorldState]) -
 class Goals:
     """Goals of one case, from the common start on.
 
-    A robot's delay is from the measurement of its pose to the moment at which it acts on the first goal that rests on
-    that pose: both ways through the network, and the wait for the next decision. Goals that rest on a pose that was
-    answered before (a robot that has nothing new to say) have none.
+    The delay of a robot begins with the measurement of its pose. It ends when the robot acts on the first goal computed
+    from that pose: both ways through the network, and the wait for the next decision. Goals from a pose that was
+    answered before (a robot with nothing new to transmit) have none.
     """
 
     sent: PoseTable  # goals in the place of positions; `link` is the row of the robot
@@ -138,10 +138,10 @@ class Trace:
     setpoint: Array  # (T, N, 4) as sent to the body, see `agents.network.messages.State`
     sent: PoseTable  # by the robots, in order of time; `link` is the row of the sender
     received: PoseTable  # in order of arrival; `link` is one of `plan.pose_links`
-    lost: Index  # (N,) poses of each robot that by their numbers were sent and never came to a receiver or the recorder
+    lost: Index  # (N,) poses of each robot that by their numbers were sent but not received, or not recorded
     missed_deadlines: Index  # (N,) ticks that began more than one period late
     ticks: Index  # (N,)
-    decisions: Index  # (N,) goals computed anew
+    decisions: Index  # (N,) recomputed goals
     events: tuple[Event, ...]
     interventions: Index  # (N,) ticks on which safety changed the decision
     avoided: Index  # (N,) ticks on which avoidance changed the decision

@@ -1,4 +1,4 @@
-"""Which zenpark this is, and where it runs: two machines have the same one if its code is the same to the letter."""
+"""Provenance of results: digest of the code, versions, machine."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ LIBRARIES: Final = (
     "numpy", "eclipse-zenoh", "msgspec", "mcap", "pymunk", "mujoco", "mujoco-core", "daqp", "onnxruntime",
 )  # fmt: skip
 GIT_S: Final = 5.0
-UNSYNCHRONISED: Final = 5  # what adjtimex returns for a clock that nothing keeps right (TIME_ERROR)
+UNSYNCHRONISED: Final = 5  # return value of adjtimex for a clock that is not synchronised (TIME_ERROR)
 TIMEX_BYTES: Final = 256  # more than struct timex has
 
 
@@ -42,7 +42,7 @@ class Provenance(msgspec.Struct, frozen=True, omit_defaults=True):
     python: str
     packages: dict[str, str]  # versions of `LIBRARIES` and of those of kinds
     commit: str = ""  # of a checkout; "+changes" behind it if files differ from it
-    plugins: dict[str, str] = {}  # distributions that have plug-ins, but for our own, and their versions
+    plugins: dict[str, str] = {}  # distributions with plug-ins, except our own, and their versions
     host: str = ""
     system: str = ""
     cpu: str = ""

@@ -174,7 +174,7 @@ FRAMES: Final = "/tf"
 SCENE: Final = "/scene"
 FRAMES_S: Final = 0.04  # between two transforms of a robot [s]
 SCENE_S: Final = 0.2  # between two drawings of the scene [s]
-LATE_S: Final = 2.0  # a message that came later than so long after its stamp has a clock that is wrong [s]
+LATE_S: Final = 2.0  # age of a message on arrival above which its clock is wrong [s]
 ROUNDING_S: Final = 1e-6
 LATEST_S: Final = 2.0**32  # a stamp beyond (the year 2106) is a broken clock; nanoseconds of it may not fit the file
 

@@ -78,7 +78,7 @@ class Member:
 
 
 class Planned:
-    """Itinerary whose targets are known beforehand, one for each decision."""
+    """Itinerary with targets that are known beforehand, one for each decision."""
 
     __slots__ = ("decide_hz", "first", "targets")
 

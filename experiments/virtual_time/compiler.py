@@ -297,7 +297,7 @@ def _len(context: Any, builder: Any, sig: Any, args: Any) -> Any:
 
 
 def opened(kind: Any) -> Any:
-    """Compiled function that gives the object, or the list of so many values, at an address."""
+    """Compiled function that gives the object, or the list of `count` values, at an address."""
     of = type_of(kind)
 
     @intrinsic  # type: ignore[untyped-decorator]

@@ -13,7 +13,7 @@ from agents.robot import Robot
 
 LEAD_S: Final = 0.5  # from the order to the common start
 ORDERS_S: Final = 0.5  # orders before the start fall on multiples of this, as those of a conductor do
-PATIENCE_S: Final = 60.0  # an experiment whose robots are not ready, up or down after this long never will be
+PATIENCE_S: Final = 60.0  # limit for robots to be ready, up or down: after it they never will be
 
 
 class Stuck(ExplainedError):

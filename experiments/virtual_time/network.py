@@ -58,9 +58,9 @@ class CentreLog:
 
 
 class VirtualCentre:
-    """The central controller. Its poses and goals take as long and are lost as often as poses between robots.
+    """The central controller. Its poses and goals have the delays and losses of poses between robots.
 
-    Phases and the common start are the conductor's, and known at once, as they are to the robots.
+    Phases and the common start are the conductor's; the centre and the robots know them at once.
     """
 
     def __init__(self, plan: Plan, robots: Sequence[Robot], seed: int) -> None:

@@ -35,7 +35,7 @@ class Items(NamedTuple):
 
 
 class Layout:
-    """Attributes of objects of one class whose values are of the same kinds."""
+    """Attributes of objects of one class with values of the same kinds."""
 
     def __init__(self, owner: type, fields: dict[str, Any], fixed: dict[str, Any], name: str) -> None:
         """`fixed`: attributes that are constants, with their values; `name` tells layouts apart in any process."""
@@ -74,7 +74,7 @@ def is_frozen(owner: type) -> bool:
     return (struct is not None and struct.frozen) or (data is not None and data.frozen)
 
 
-LAYOUTS: Final[dict[tuple[Any, ...], Layout]] = {}  # a class that was defined anew is another one
+LAYOUTS: Final[dict[tuple[Any, ...], Layout]] = {}  # a class that was defined again is another one
 
 
 class Layouts:
@@ -86,7 +86,7 @@ class Layouts:
         self.guessed = False  # whether a list was empty of which no other one was filled
 
     def forget(self) -> None:
-        """Look at all objects anew."""
+        """Forget all objects, to look at them again."""
         self._of.clear()
         self.guessed = False
 
@@ -205,7 +205,7 @@ class Image:
         return True
 
     def take(self, thing: Any, words: int) -> int:
-        """Room for an object of so many words: its place in the memory [bytes]."""
+        """Room for an object of `words` words: its place in the memory [bytes]."""
         at, self.used = WORD * self.used, self.used + words
         if self.used > self._size:
             raise _FullError
@@ -254,11 +254,11 @@ def _count(thing: Any, kind: Any) -> int:
 
 
 class _FullError(Exception):
-    """There is no room for an object."""
+    """Lack of room for an object."""
 
 
 def _format(kind: Any, count: int = 1) -> str:
-    """Format of `struct` of so many values of a kind."""
+    """Format of `struct` of `count` values of a kind."""
     code = "d" if kind == FLOAT or isinstance(kind, Floats) else "q"
     return f"{count * width(kind)}{code}"
 

@@ -55,7 +55,7 @@ class VirtualRunLog:
     received: PoseTable  # poses on all links
     lost: Index  # (E,) samples lost on each link, from the common start to the landing
     decisions: int  # coordination decisions of each robot
-    updates: Index  # (N,) goals computed anew
+    updates: Index  # (N,) recomputed goals
     interventions: Index  # (N,) ticks on which safety changed the decision, from the common start on
     avoided: Index  # (N,) ticks on which avoidance changed the decision, from the common start on
     touches: tuple[Touch, ...]  # contacts, by their beginning
@@ -71,7 +71,7 @@ class VirtualRunLog:
     # of laws that remember, by name: variables (K, N, k), and measures (K, N), NaN where unknown; empty if lean
     memory: Mapping[str, Array] = field(default_factory=dict)
     measures: Mapping[str, Array] = field(default_factory=dict)
-    velocities: tuple[bool, ...] = ()  # (N) robots whose law ordered a velocity at its last step
+    velocities: tuple[bool, ...] = ()  # (N) robots with a velocity from the last step of their law
     centre: CentreLog | None = None  # None if each robot decides for itself
     incidents: tuple[tuple[int, Incident], ...] = ()  # hazards, each with the row of its robot, in order of time
 
@@ -174,7 +174,7 @@ class Flight:
                 self._tick, reason = stretches.fly(self._tick, conductor.next_order(self._tick, dt))
             t = self._tick * dt
             self.step(t, reason)
-            if (first.tick - 1) % self.log_every == 0:  # the robots' count begins anew at the common start
+            if (first.tick - 1) % self.log_every == 0:  # the robots' count restarts at the common start
                 progress(t - conductor.start_at)
                 if watch is not None:
                     watch(Snapshot(t - conductor.start_at, t, self.robots, self._states, self.twin.engine))

@@ -17,7 +17,9 @@ from functools import cache
 from types import CodeType
 from typing import Any, Final
 
-OURS: Final = frozenset({"agents", "twins", "experiments"})  # packages whose quiet functions tests hold to the subset
+OURS: Final = frozenset(
+    {"agents", "twins", "experiments"}
+)  # packages with quiet functions that tests hold to the subset
 BANNED: Final[dict[type, str]] = {
     ast.JoinedStr: "an f-string", ast.Dict: "a dictionary", ast.Set: "a set", ast.ListComp: "a comprehension",
     ast.SetComp: "a comprehension", ast.DictComp: "a comprehension", ast.GeneratorExp: "a generator",
@@ -121,7 +123,7 @@ def specialised(function: Callable[..., Any], fixed: Mapping[str, Any]) -> tuple
 
 
 def place(function: Callable[..., Any], line: int = 1) -> str:
-    """File and line of a function, whose source has so many."""
+    """File and line of a function, at line `line` of its source."""
     code = inspect.unwrap(function).__code__
     return f"{code.co_filename}:{code.co_firstlineno + line - 1}"
 
@@ -199,7 +201,7 @@ def _round(x: float) -> int:
 
 
 def _whole(x: float) -> float:
-    """A number whose whole part has a place in a word."""
+    """A number with a whole part that fits into a word."""
     if not abs(x) < LARGEST_WHOLE:
         raise ValueError("it has no whole part")
     return x

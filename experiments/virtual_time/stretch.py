@@ -43,7 +43,7 @@ COMPILES_S: Final = 20.0  # or to compile (15 to 20 s), which is kept
 LONGEST: Final = 10_000  # ticks of a stretch,
 ROBOT_TICKS: Final = 1_000_000  # and of all robots in it: noise is drawn, and room kept, for all of them beforehand
 LEAST: Final = 20  # after a stretch of fewer ticks
-PAUSE: Final = 10  # so many are flown in plain Python, twice as many after the next one,
+PAUSE: Final = 10  # ticks that are flown in plain Python, twice as many after the next one,
 LONGEST_PAUSE: Final = 160  # at most
 ROOM: Final = 2  # more samples on a link than its delay asks for
 STEPS: Final = ("advance", "deliver", "observe", "transmit", "detect", "pursue", "note")
@@ -129,7 +129,7 @@ def possible(flight: Flown) -> bool:
 
 @dataclass
 class Prepared:
-    """How the robots of a case are stored, and their compiled loop."""
+    """Stored layout of the robots of a case, and their compiled loop."""
 
     rows: list[list[int]]  # of robots of the same layout
     kinds: tuple[Items, ...]  # of each of those

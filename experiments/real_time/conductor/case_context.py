@@ -26,7 +26,7 @@ class CaseContext:
     hosts: Hosts  # other machines, on which robots may be started; it has the endpoints at which our routers listen
     interrupted: Callable[[], bool] = lambda: False  # whether the user wants to end the run
     rights: Path | None = None  # access rights for a router that is started again, in a lab
-    identity: str = "operator"  # whose certificate the conductor shows, in a lab
+    identity: str = "operator"  # identity of the conductor, in a lab
     emergency: Emergency = field(default_factory=Emergency)  # emergency stops, which end the run as well
 
     @property

@@ -1,7 +1,7 @@
 """Processes of one case: recorder, stand-ins for hardware, robots, routers.
 
-Robots are started on the machines that the file names, or by others; all else runs on the launcher's, whose clock is
-that of the experiment.
+Robots are started on the machines that the file names, or by others. All other processes run on the launcher's machine,
+and its clock is that of the experiment.
 """
 
 from __future__ import annotations
@@ -186,7 +186,7 @@ class CaseProcesses:
         self._launcher.end(self._support.standins, grace_s=2.0)
 
     def end_robots(self) -> list[str]:
-        """End the processes of all robots, which land first; return the robots whose process had to be killed."""
+        """End the processes of all robots, which land first; return the robots with a process that had to be killed."""
         groups = {self._context.process(group): members for group, members in self._groups.items()}
         return [name for process in self._launcher.end(groups, grace_s=LAND_S) for name in groups[process.name]]
 

@@ -50,12 +50,12 @@ class RunOptions:
     bodies: str | None = None
     here: bool = False  # whether all robots run on this machine, whatever hosts the file has
     lab: str | None = None  # folder of certificates, instead of the file's
-    identity: str = "operator"  # whose certificate the conductor shows, in a lab: an operator's
+    identity: str = "operator"  # identity of the conductor, in a lab: an operator
 
 
 @dataclass(frozen=True)
 class Supervision:
-    """How a user follows and ends a run."""
+    """Means of a user to follow and end a run."""
 
     show: ProgressDisplay  # shows the progress
     interrupted: Callable[[], bool]  # whether the user wants to end: all robots land, and what was recorded is kept

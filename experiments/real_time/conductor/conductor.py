@@ -41,8 +41,8 @@ TARDY_S: Final = 0.05  # robots that begin later than this after the common star
 GO_ON_S: Final = 5.0  # robots start later than the conductor, and count the deadline from then
 
 ADOPT_S: Final = 0.5
-LATE_S: Final = 1.0  # who says that it waits so long after the common start has not heard of it
-LEAVE_S: Final = 8.0  # so long may robots of the case before take to end
+LATE_S: Final = 1.0  # a robot that still waits this long after the common start has missed the order [s]
+LEAVE_S: Final = 8.0  # limit for robots of the previous case to end [s]
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ class Conductor(CaseRun):
         clocks = self._context.hosts.join(self._plan)
         start = ready = None
         self.failures: list[str] = []
-        self._landed: set[str] = set()  # robots whose early landing was seen
+        self._landed: set[str] = set()  # robots that were seen to land early
         try:
             self._processes.prepare()
             with ExitStack() as stack:
@@ -346,7 +346,7 @@ class Conductor(CaseRun):
         self._show_progress()
 
     def _miss(self, name: str) -> None:
-        """Report an adopted robot whose token has vanished for good."""
+        """Report an adopted robot with a token that has vanished for good."""
         if name not in self._processes.adopted or self._changes.expects(name, "it is gone"):
             return
         if not self._robots[name].reached("landing"):  # a robot that is down before the others undeclares its token
@@ -383,7 +383,7 @@ class Conductor(CaseRun):
     def start_failure(self, names: Sequence[str], what: str) -> str:
         lines = [f"{', '.join(names)}: {what}; nothing has moved or all have landed"]
         for name in names:
-            gone = self._robots[name].gone  # then the event of its end has told the last line of its output
+            gone = self._robots[name].gone  # then the event of its end has shown the last line of its output
             if not gone or self._robots[name].status is not None:
                 last = "" if gone else self._processes.last_line(name)
                 lines.append(f"  {name}: {self._reason(name)}" + (f"\n    {last}" if last else ""))

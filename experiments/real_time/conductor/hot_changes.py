@@ -64,7 +64,7 @@ class HotChanges:
         self._changes: list[_Change] = []
         self._pending: list[_Asked] = []
         self._leaving: set[str] = set()
-        self._ended: dict[str, str] = {}  # robots whose process has ended while they join, and how
+        self._ended: dict[str, str] = {}  # robots with a process that ended while they joined, and its end
         self._losses: dict[str, int] = {}
         self._spares = replacement.Spares(plan)
 
@@ -250,7 +250,7 @@ class HotChanges:
         asked = time.monotonic()
         by_hand = all(robots[name].alive and not processes.runs(name) for name in names)
         if order.order == "add" and any(robots[name].reached("airborne") and not robots[name].gone for name in names):
-            raise Refused("takes part already; `./zenpark robot restart` starts it anew")
+            raise Refused("takes part already; `./zenpark robot restart` restarts it")
         if by_hand and not any(robots[name].reached("airborne") for name in names):
             processes.adopted |= {*names}
             yield from self._join(names)
@@ -288,7 +288,7 @@ class HotChanges:
         return f"{spare or next_one.body} has its name and takes part after {time.monotonic() - asked:.1f} s"
 
     def _join(self, names: Sequence[str]) -> Generator[None]:
-        """Robots whose process has just begun join the run: ready, airborne, running."""
+        """Let robots with a new process join the run: ready, airborne, running."""
         robots = self._robots
         for name in names:
             robots[name].left_because = ""
@@ -334,7 +334,7 @@ class HotChanges:
             yield
 
     def _require_whole(self, names: Sequence[str]) -> None:
-        """A process that others need cannot be started anew for some of its robots."""
+        """Refuse to restart a process for only some of its robots."""
         together = self._processes.companions(names[0])
         if others := [name for name in together if name not in names]:
             raise Refused(

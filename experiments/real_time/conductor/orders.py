@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 REPLY_S: Final = 1.0
 LEAD_S: Final = 0.5  # from the order to the common start: every robot has it by then,
-LEAD_EACH_S: Final = 0.01  # with so much more for each robot
+LEAD_EACH_S: Final = 0.01  # and the additional time for each robot
 STOP_ANSWER_S: Final = 2.0
 STOP_AGAIN_S: Final = 0.05
 STOPPED: Final = "done"
@@ -136,7 +136,7 @@ class EmergencyStop:
 
     endpoints: Sequence[str]
     realm: str
-    identity: str  # whose certificate is shown, in a lab
+    identity: str  # identity to show, in a lab
     run: Run | None = None  # None: only the routers are known
     seen: set[str] = field(default_factory=set)  # robots that were alive
     moving: set[str] = field(default_factory=set)  # those of them without a report of their stop

@@ -1,7 +1,7 @@
 """Checks of the robots of an experiment before the first flight: each alone, by the processes that a run starts.
 
-All stand at first, at the same time, so that radios and networks carry what they carry in a run. Motors are touched in
-the trials only, one robot after the other, under the safety of the robot's own process; an interrupt lands it.
+All robots are observed at rest together, under the network load of a run. Motors are touched in the trials only, one
+robot after the other, under the safety of the robot's own process; an interrupt lands it.
 """
 
 from __future__ import annotations
@@ -36,16 +36,16 @@ from experiments.real_time.hosts.launcher import LAND_S
 
 PREFLIGHT: Final = "preflight"  # name of the case, in files and on the console
 POLL_S: Final = 0.02
-SAMPLE_S: Final = 2.0  # how long robots are observed at rest
+SAMPLE_S: Final = 2.0  # time for which robots are observed at rest
 INSPECT_S: Final = 0.2  # from one inspection to the next
-HOLD_S: Final = 2.0  # how long a hopping drone stays at its height
+HOLD_S: Final = 2.0  # time for which a hopping drone stays at its height
 DRIVE_M_S: Final = 0.05  # speed of the drive
-DRIVE_S: Final = 4.0  # its duration: the way, and time to come to rest
+DRIVE_S: Final = 4.0  # its duration: the way, and time to stop
 RADIUS_M: Final = 1.0  # of its arc, which begins along the robot's nose
 RISEN_M: Final = 0.03  # a climbing drone is stopped when it is this high,
 MOVED_M: Final = 0.02  # and a robot on wheels when it has moved so far
-TRY_S: Final = 4.0  # what does not move for so long is stopped nevertheless
-STOP_LIMIT_S: Final = 3.0  # how long a stop is waited for
+TRY_S: Final = 4.0  # time without motion after which a robot is stopped nevertheless
+STOP_LIMIT_S: Final = 3.0  # time limit for a stop
 STANDS_M_S: Final = 0.02  # slower: a robot on wheels stands
 
 

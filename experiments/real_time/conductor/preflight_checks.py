@@ -327,7 +327,7 @@ def _drive_remedy(way: float) -> str:
     if way < DRIVE_OFF_M:
         return "does not drive although commanded to: motors on, wheels free, server and message type right?"
     wrong = abs(way - DRIVE_M) > DRIVE_OFF_M
-    return "its speed is not what it is told: units and wheel sizes of its server, slipping wheels" if wrong else ""
+    return "its speed is not the commanded one: units and wheel sizes of its server, slipping wheels" if wrong else ""
 
 
 def _hop_remedy(above: float, side: float) -> str:

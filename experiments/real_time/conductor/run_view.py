@@ -28,7 +28,7 @@ from experiments.real_time.conductor.case_context import CaseContext
 ORDER: Final = tuple(phase.word for phase in Phase)
 AHEAD_S: Final = -0.02  # what comes before it was said is from a clock that is ahead [s],
 BEHIND_S: Final = 0.5  # and what always takes this long, from one that is behind
-FROZEN_S: Final = 3.0  # a robot whose status is older than this is shown as silent
+FROZEN_S: Final = 3.0  # age of a status from which on a robot is shown as silent
 ROUTER_S: Final = 10.0  # limit for a router that was just started to answer
 MISSED_S: Final = 1.0  # a robot that changes from one router to another is back sooner
 STILL_S: Final = 3.0  # a recorder without a token for longer than this is killed, and started again
@@ -52,7 +52,7 @@ class RobotView:
     note: str = ""  # last reported note of its body, without numbers
     place: messages.Vector | None = None  # [m] last known
     origin: messages.Setpoint | None = None  # start of the robot, or of its plan: x, y, z [m], yaw [rad]
-    former: int | None = None  # process whose statuses are outdated: the robot has a new one, or will have
+    former: int | None = None  # process with outdated statuses: the robot has a new one, or will have
     began: float | None = None  # [s, UTC] stamp of its first tick in the experiment
 
     @property
@@ -68,7 +68,7 @@ class RobotView:
         return self.status is not None and ORDER.index(self.status.phase) >= ORDER.index(phase)
 
     def forget_process(self) -> None:
-        """Forget the process that has ended, but for its last place and its origin."""
+        """Forget the process that has ended, except its last place and its origin."""
         self.former = self.status.pid if self.status is not None else self.former
         self.status, self.alive, self.vanished = None, False, inf
         self.behind, self.began = inf, None
@@ -168,10 +168,10 @@ class NetworkView:
         self._experiment.undeclare()
 
     def update(self) -> list[str]:
-        """Receive all since the last update; return the robots whose token has vanished for good.
+        """Receive all since the last update; return the robots with a token that has vanished for good.
 
-        Raises RunFailed if this process stood still for so long that its robots have landed; other ones may have their
-        names now.
+        Raises RunFailed if this process was suspended until its robots have landed; other ones may have their names
+        now.
         """
         if self._launcher.last_silence > self._begun:
             raise RunFailed(
@@ -218,7 +218,7 @@ class NetworkView:
             self.report("clock", "conductor", text)
 
     def _missing_tokens(self) -> list[str]:
-        """Robots whose token has been missing for long: where there is another router, it comes back at once."""
+        """Robots with a token that has been missing for long: with another router, it comes back at once."""
         now = time.monotonic()
         self._watch_router(now)
         missed = [name for name, view in self.robots.items() if now - max(view.vanished, self._cut_off) > MISSED_S]
@@ -250,7 +250,7 @@ class NetworkView:
             self.report("hazard", status.robot, incident.text)
         if _fell_out(view.status, status):
             self.report("hazard", status.robot, f"land: {status.reason}")
-        note = re.sub(r"[\d.]+", "", status.body)  # of a silence whose seconds count up, one is reported
+        note = re.sub(r"[\d.]+", "", status.body)  # a silence with its counted seconds is reported once
         if note != view.note:
             view.note = note
             self.report("body", status.robot, status.body or "no trouble any more")

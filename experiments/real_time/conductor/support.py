@@ -142,7 +142,7 @@ class SupportProcesses:
         return addressed
 
     def _start_positioning(self, plan: Plan) -> None:
-        """Start the motion capture of the case, whose robots have addresses."""
+        """Start the motion capture of the case; its robots have addresses."""
         context, experiment, measured = self._context, plan.experiment, plan.externally_measured
         if experiment.positioning is None or not measured:
             return

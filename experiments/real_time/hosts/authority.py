@@ -1,10 +1,10 @@
 """A lab's certificate authority: makes, renews and revokes the certificates of robots and people.
 
-Keys are of the curve P-256, certificates carry a name as their common name, by which a router knows whose rights hold.
-Only listening members get a certificate that is valid for a router; a robot's is for connecting.
-Zenoh reads no revocation lists. What counts here is the register: a router gives rights to the common name that stands
-in it, and `revoke` moves that on, from `CF01` to `CF01.2`. The old key still opens a connection, in which nothing is
-allowed. A new authority (`renew --authority`) ends that as well, at the price of new files for all members.
+Keys are of the curve P-256. Certificates carry a name as their common name, by which a router finds the rights. Only
+listening members get a certificate that is valid for a router; a robot's is for connecting. Zenoh reads no revocation
+lists. What counts here is the register: a router gives rights to the common name that stands in it, and `revoke` moves
+that on, from `CF01` to `CF01.2`. The old key still opens a connection, in which nothing is allowed. A new authority
+(`renew --authority`) ends that as well, at the price of new files for all members.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ SERVICES: Final[tuple[Role, ...]] = tuple(role for role in ROLES if role != "rob
 HERE: Final = ("localhost", "127.0.0.1", "::1")
 DAYS: Final = 90.0  # of a certificate
 AUTHORITY_DAYS: Final = 1826.0  # five years
-MOST_OF_NAME: Final = 24  # characters of a lab's name in its certificate, whose common name holds 64
+MOST_OF_NAME: Final = 24  # characters of a lab's name in its certificate; a common name holds 64
 CLOCKS: Final = timedelta(hours=1)  # how far a robot's clock may be behind
 
 
@@ -109,14 +109,14 @@ def renew(
     Args:
         names: Of identities; all if none is named.
         hosts: Names and addresses at which those named may listen from now on, beside those from before.
-        authority: Whether the authority is a new one, whose certificates alone count from now on: all of them.
+        authority: Whether to make a new authority; from then on only its certificates count, so all are renewed.
 
     Raises:
         LabError: If there is no such identity, or the authority's key is not on this machine.
     """
     known = register(folder)
     if authority and names:
-        raise LabError("a new authority signs all certificates anew: give no name with --authority")
+        raise LabError("a new authority signs all certificates again: give no name with --authority")
     if hosts and not names:
         raise LabError("only routers need --host: name them, as in `./zenpark lab renew LAB router --host ADDRESS`")
     signing = _found(folder) if authority else _opened(folder)

@@ -1,7 +1,7 @@
-"""A lab's certificates on other machines: what one holds, what is the matter with it, and what is to be done.
+"""A lab's certificates on other machines: their content, problems and remedies.
 
-A station says what its folder holds; only certificates leave it, which are public. Whoever starts the run compares
-them with the register of the lab. Private keys go one way, over ssh, with `./zenpark hosts install`.
+A station reports the content of its folder; only certificates leave it, which are public. The machine that starts the
+run compares them with the register of the lab. Private keys go one way, over ssh, with `./zenpark hosts install`.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def fingerprint(certificate: str) -> str:
 
 
 def of_host(name: str, hosts: Mapping[str, Host]) -> list[str]:
-    """Robots whose certificates a host's folder holds, including those of hosts that share the folder."""
+    """Robots with certificates in a host's folder, including those of hosts that share the folder."""
     place = hosts[name].address, hosts[name].lab
     return [robot for host in hosts.values() if (host.address, host.lab) == place for robot in host.robots]
 
@@ -126,7 +126,7 @@ def faults(found: FolderContent, folder: Path, there: float) -> Iterator[str]:
     theirs, ours = fingerprint(found.authority), fingerprint(_text(folder / f"{AUTHORITY}.pem"))
     if theirs != ours:
         yield (
-            f"its certificates are of another lab, or of one whose authority has been renewed since (ca.pem "
+            f"its certificates are of another lab, or of an authority that has been renewed since (ca.pem "
             f"{theirs[:SHOWN]}, here {ours[:SHOWN]}); {INSTALL}"
         )
         return

@@ -1,8 +1,8 @@
 """Clocks of other machines during a run: measured every second, and corrected in the robots that run there.
 
-A host that drifts by 50 ppm is 0.18 s off after an hour. Each station is asked as before the run, and the robots'
-processes get their new correction on their lifelines (`agents.clock`): only the launcher holds these, and no network of
-the experiment is needed. A correction moves only as far as a measurement proves that it is off.
+A host that drifts by 50 ppm is 0.18 s off after an hour. Each station is asked as before the run. The robots' processes
+get their new correction on their lifelines (`agents.clock`), which only the launcher holds; no network of the
+experiment is needed. A correction moves only as far as a measurement proves that it is off.
 """
 
 from __future__ import annotations

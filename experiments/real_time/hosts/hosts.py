@@ -221,7 +221,7 @@ class Station:
         return process
 
     def _under_way(self) -> list[Process]:
-        """Processes whose ssh is not through yet: the other end prints a line at once."""
+        """Processes with an ssh that has not connected yet: the other end prints a line at once."""
         self._starting = [each for each in self._starting if each.alive and not each.output]
         return self._starting
 

@@ -109,7 +109,7 @@ def put_watchdog(robot: str, *, namespace: str, domain: int, silence_s: float) -
         robot: Address as ssh takes it.
         namespace: Of the robot's ROS nodes, without slashes around it; may be empty.
         domain: ROS_DOMAIN_ID.
-        silence_s: Without a command for so long the robot is stopped [s].
+        silence_s: Time without a command after which the robot is stopped [s].
 
     Raises:
         HostError: If the robot cannot be reached, has no ROS 2, or the watchdog does not come up.

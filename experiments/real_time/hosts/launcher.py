@@ -55,7 +55,7 @@ class Process:
 
     @property
     def exit(self) -> str:
-        """Its end, in words."""
+        """End of the process, in words."""
         code = self.handle.poll()
         if code is None:
             return "still running"
@@ -65,7 +65,7 @@ class Process:
 
     @property
     def output(self) -> str:
-        """Its output until now."""
+        """Output of the process until now."""
         return self.log.read_bytes()[self.begins :].decode(errors="replace")
 
     def news(self) -> list[str]:
@@ -89,7 +89,7 @@ class Process:
 
     @property
     def because(self) -> str:
-        """The last line of its output behind a colon, for a message; empty if there is none."""
+        """Last output line with a leading colon, for messages; may be empty."""
         return "".join(f": {line}" for line in self.tail().strip().splitlines()[-1:])
 
 
@@ -103,7 +103,7 @@ class Launcher:
     def __init__(self, logs: Path) -> None:
         """Output of each process goes to a file in the folder `logs`."""
         self._logs = logs
-        # the clock of modules that are started here; None: each reads the wall clock anew
+        # the clock of modules that are started here; None: each reads the wall clock itself
         self.clock: Clock | None = None
         self._processes: dict[str, Process] = {}
         self._zygote: Path | None = None  # its socket; None if there is none, or none any more

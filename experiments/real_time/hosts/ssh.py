@@ -30,7 +30,7 @@ _TROUBLE: Final = (
     (r"host key is known|host key verification failed", "its host key is not known here",
      "log in once by hand (ssh {address}) and compare the fingerprint that it shows"),
     (r"permission denied \(", "none of our keys lets us in",
-     "ssh-copy-id {address}, or load the key into the agent (ssh-add); nobody can type a password here"),
+     "ssh-copy-id {address}, or load the key into the agent (ssh-add); no password can be typed here"),
     (r"could not resolve hostname", "no machine of that name is known",
      "mend its address, or give it a HostName in ~/.ssh/config"),
     (r"connection refused|timed out|no route to host|network is unreachable|host is down", "it cannot be reached",

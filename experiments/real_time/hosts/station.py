@@ -2,7 +2,7 @@
 
 `./zenpark station`: questions come in on standard input, a line of JSON each, answers go out on standard output.
 Standard input is the lifeline as well. When it is lost, the station waits until the robots of its run are down and
-gone, and kills those that are late: a frozen process obeys nothing else.
+gone, and kills those that are late: a frozen process obeys no other order.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Question(msgspec.Struct, frozen=True, omit_defaults=True):
 
     ask: Literal["hello", "clock", "reach", "devices", "certificates", "sweep", "preload"]
     endpoints: list[str] = []  # routers to reach
-    bodies: list[str] = []  # whose devices are asked for
+    bodies: list[str] = []  # robots with devices in question
     lab: str | None = None  # folder of certificates
     names: list[str] = []  # certificates that are asked for, or shown to routers
 
@@ -148,8 +148,11 @@ def _radios() -> Iterator[HostCheck]:
 
 
 def _other_processes() -> list[int]:
-    """Processes of the same run on this machine, but for this one, its parent, the zygote and those that stand for
-    robots: these end with the robots, or with this one."""
+    """Other processes of the same run on this machine.
+
+    This process, its parent, the zygote and those that stand for robots are left out: these end with the robots, or
+    with this one.
+    """
     run, mine = os.environ.get(RUN), (os.getpid(), os.getppid())
     found = tagged(f"{RUN}={run}") if run else []
     return [pid for pid, words in found if pid not in mine and zygote.MODULE not in words]

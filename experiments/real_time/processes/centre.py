@@ -2,8 +2,8 @@
 
 It receives the poses of the guided robots and of their neighbours, as any neighbour would, and sends each robot its
 goal. `agents.decision.centralised` decides; here are the clock and the network. After a restart it receives the last
-poses, and by the robots' statuses when and where each began; laws that remember begin anew. It runs on the machine of
-the conductor, whose clock is that of the experiment.
+poses, and from the robots' statuses the time and place of each start; laws with a memory restart. It runs on the
+machine of the conductor, with the clock of the experiment.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ class CentreProcess:
         while not over.wait(ticks.until_next()):
             if self._ownership.wait_while_checking(self._session, over.is_set):
                 continue
-            ticks.until_next()  # a wait that lasted too long skips as well: goals for a past instant help nobody
+            ticks.until_next()  # a wait that lasted too long skips as well: goals for a past instant are useless
             missed = ticks.begin()
             self.missed += missed
             self.late_s = max(self.late_s, missed * ticks.period + ticks.late_s)

@@ -42,7 +42,7 @@ class TwinLaunch(Launch, frozen=True, kw_only=True):
 
 
 def stand_in(launch: TwinLaunch) -> int:
-    """Runs the protocol twins of robots whose `body` asks for the same one; returns the exit code."""
+    """Runs the protocol twins of robots with the same `body`; returns the exit code."""
     plan, endpoints = launch.read()
     experiment, names = plan.experiment, launch.names
     words = {experiment.robots[name].body if name in experiment.robots else "" for name in names}

@@ -201,7 +201,7 @@ def serve(launch: WorldLaunch) -> int:
         token=Keys(plan.experiment.network.realm).world_alive,
         taken="a world runs",
     ) as joint:
-        # before anything watches those tokens: a session that has begun to watch answers from what it has heard
+        # before a watch of those tokens begins: a session that watches answers from what it has received
         there = _alive(joint.session, joint.keys)
         world = WorldProcess(plan, population, joint, lost)
         joint.declared.append(world)

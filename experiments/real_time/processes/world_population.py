@@ -42,7 +42,7 @@ class Population:
     names: tuple[str, ...]  # of the n rows: the robots of the experiment
     carried: tuple[bool, ...]  # rows that are simulated here; the others are mirrors
     seen: tuple[bool, ...]  # rows with simulated range sensors: carried ones, and those that ask for them
-    hold_s: tuple[float, ...]  # [s] a row is held after so long without a command; infinity: it drives on
+    hold_s: tuple[float, ...]  # [s] time without a command after which a row is held; infinity: it drives on
     body: TwinBody  # of these rows
     time: float  # [s] simulated since the start
     states: Sequence[BodyState]  # last reading of the body

@@ -1,12 +1,12 @@
 """The zygote of a machine imports once what the processes of robots need, and forks one for each request.
 
 `python -m experiments.real_time.processes.zygote SOCKET PADDING`; SOCKET is the number of a listening socket that it
-inherits, standard input the lifeline. A request is a packet with what to run and three file descriptors, which become
-standard input, output and error of the new process; the answer is its id with a pidfd, then, in another packet, its
-exit code. A process that has been forked is held by its own lifeline and not by the zygote, whose end it survives.
+inherits, standard input the lifeline. A request is a packet with the program and three file descriptors, which become
+standard input, output and error of the new process. The answer is its id with a pidfd, then, in another packet, its
+exit code. A forked process is held by its own lifeline; it survives the end of the zygote.
 
-A fork copies only the thread that asks for it: the zygote has one, or refuses, and whoever has no zygote, or one that
-refuses, spawns. Linux only. This module is light to import: on other machines the ssh of each robot runs a process that
+A fork copies only the thread that asks for it: the zygote has one, or refuses. Without a zygote, or if it refuses, the
+launcher spawns. Linux only. This module is light to import: on other machines the ssh of each robot runs a process that
 does no more than `stand_for` the robot's.
 """
 
@@ -41,7 +41,7 @@ NAME: Final = 15  # of a process, as `ps` and `top` show it [bytes]
 PACKET: Final = 65536  # [bytes]
 REPLY_S: Final = 10.0  # for an answer; before the first one the zygote imports
 CODE_S: Final = 2.0  # for the exit code of a process that has ended
-UNKNOWN: Final = 256  # exit code of a process whose zygote ended before it
+UNKNOWN: Final = 256  # exit code of a process after the end of its zygote
 
 
 class NoZygote(Exception):
@@ -99,7 +99,7 @@ class Forked:
         self._lock = threading.Lock()
 
     def poll(self) -> int | None:
-        """Its exit code, minus the number of the signal that killed it, `UNKNOWN`, or None while it runs."""
+        """Exit code, minus the number of the signal that killed it, `UNKNOWN`, or None while it runs."""
         return self._ended(0.0)
 
     def wait(self, timeout: float | None = None) -> int:
@@ -193,14 +193,16 @@ class Zygote:
     def __init__(self, listener: socket.socket, lifeline: int = 0) -> None:
         self._listener, self._lifeline = listener, lifeline
         self._path = Path(listener.getsockname())
-        self._children: dict[int, tuple[int, socket.socket]] = {}  # by pidfd: id, and who is told of the end
+        self._children: dict[
+            int, tuple[int, socket.socket]
+        ] = {}  # by pidfd: id, and the socket that gets the exit code
         self._waiting = select.poll()
 
     def serve(self) -> Request | None:
-        """Fork on request until the lifeline is lost; whoever starts the zygote has its processes end before that.
+        """Fork on request until the lifeline is lost; the starter of the zygote ends its processes before that.
 
         Returns:
-            None in the zygote, at its end; in each process that was forked, what that is to run.
+            None in the zygote, at its end; in each forked process, the request that it must run.
         """
         for fd in (self._listener.fileno(), self._lifeline):
             self._waiting.register(fd, select.POLLIN)
@@ -238,7 +240,7 @@ class Zygote:
         pidfd = os.pidfd_open(pid)
         self._children[pidfd] = pid, asker
         self._waiting.register(pidfd, select.POLLIN)
-        with contextlib.suppress(OSError):  # whoever asked has gone
+        with contextlib.suppress(OSError):  # the asker has gone
             socket.send_fds(asker, [str(pid).encode()], [pidfd])
         return None
 

@@ -1,8 +1,9 @@
 """Structs as ROS 2 messages: the schema text that tools read, and fast functions to and from CDR.
 
-A recording whose messages describe themselves opens in rerun, Foxglove, rosbags and mcap-ros2 without a ROS
-installation. CDR aligns every number to its size, so a message is a chain of runs whose layout is fixed, with texts and
-sequences of any length between them. `codec` finds the runs once and writes two straight-line functions from them.
+A recording with messages that describe themselves opens in rerun, Foxglove, rosbags and mcap-ros2 without a ROS
+installation. CDR aligns every number to its size. A message is therefore a chain of runs with a fixed layout, with
+texts and sequences of any length between them. `codec` finds the runs once and writes two straight-line functions from
+them.
 """
 
 from __future__ import annotations

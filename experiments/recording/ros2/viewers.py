@@ -192,5 +192,5 @@ def pose(state: State) -> bytes:
 
 
 def transform(state: State) -> bytes:
-    """The `TFMessage` of a robot, from the arena to its body, whose frame has its name; raises `Unencodable`."""
+    """The `TFMessage` of a robot, from the arena to its body, in a frame with its name; raises `Unencodable`."""
     return _stamped(TF, state, (1,), FRAME, state.robot)

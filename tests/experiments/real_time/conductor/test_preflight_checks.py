@@ -210,7 +210,7 @@ def test_wheeled_robot_that_rolls_on_after_the_stop():
         (DRONE, (0.3, 0.5, 0.2), "bad", "drifts"),
         (WHEELS, (0.1, 0.5, 0.0), "ok", ""),
         (WHEELS, (0.0, 0.5, 0.0), "bad", "does not drive although commanded to"),
-        (WHEELS, (0.2, 0.5, 0.0), "bad", "its speed is not what it is told"),
+        (WHEELS, (0.2, 0.5, 0.0), "bad", "its speed is not the commanded one"),
     ],
 )
 def test_hops_and_drives(robot, end, verdict, remedy):
