@@ -24,8 +24,8 @@ from agents.plugins import registry
 ROOT: Final = Path(__file__).resolve().parents[2]
 PACKAGES: Final = ("agents", "bridges", "twins", "experiments", "tools")
 SHOWN: Final = 8  # characters of a digest that people compare
-# of these, and of those of kinds, the version may change what a run comes to, or what is said on a wire; those not
-# installed are left out
+# libraries, besides those of kinds, with versions that may change results, or bytes on a wire; those not installed are
+# left out
 LIBRARIES: Final = (
     "numpy", "eclipse-zenoh", "msgspec", "mcap", "pymunk", "mujoco", "mujoco-core", "daqp", "onnxruntime",
 )  # fmt: skip

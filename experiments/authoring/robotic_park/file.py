@@ -145,7 +145,7 @@ class _Timed(Struct, frozen=True):
 
 
 class Driver(NamedTuple):
-    """What the authors' driver of a kind does, which those in Webots and the central controller do not."""
+    """Behaviour of the authors' driver of a kind that those in Webots and the central controller lack."""
 
     plans_alone: bool = False  # with the period of the task, and an origin of its own
     divides: bool = False  # the pull of a neighbour by its distance

@@ -80,7 +80,7 @@ class _Supervised:
     """Supervised process; texts for the robots' state meanwhile, and when it is given up."""
 
     start: Callable[[], object]
-    meanwhile: str = ": robots hold until then"
+    meanwhile: str = ": robots hold meanwhile"
     given_up: str = ""
     starts: int = 1
 

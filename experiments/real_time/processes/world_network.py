@@ -58,7 +58,7 @@ class Exchange:
         self.utc = self._clock.at(up)
 
     def restart(self) -> None:
-        """Follows a body that is made anew: it has no commands, and does not know the mirrored robots."""
+        """Follows a new body: it has no commands, and does not know the mirrored robots."""
         self.commands.restart()
         self.states.update_body()
         self.publications.restart()
