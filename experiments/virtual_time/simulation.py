@@ -78,7 +78,7 @@ class VirtualRunLog:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """Present state of a run in virtual time, for those who watch it; nothing in it may be changed."""
+    """Present state of a run in virtual time, for observers; read only."""
 
     time: float  # [s] since the common start; NaN before it is known
     now: float  # [s] of the clock of the decision
