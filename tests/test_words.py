@@ -13,11 +13,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 LONGEST = 30  # words of a sentence
-PLACES = [
-    f"experiments/{name}"
-    for name in ("authoring", "check", "definition", "file", "metrics", "real_time", "recording", "virtual_time")
-]
-PLACES += ["agents", "bridges", "face", "twins"]
+PLACES = ("agents", "bridges", "experiments", "face", "twins")
 # clauses in the place of a noun or of a number, and words that few readers know
 PHRASES = re.compile(
     r"\b(so (long|much|many|often)|(that|how) much|but for|as often as|com(e|es|ing) to|came to|whose|who(m|so)?ever|"

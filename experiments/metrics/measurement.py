@@ -172,12 +172,12 @@ class Measurement:
 def benchmark_cost(trace: Trace, errors: LinkErrors) -> float:
     """J2 of the authors' benchmark (`benchmark_evaluation.m` of 2024), summed over the robots that receive poses.
 
-    Of each robot, with r the distances to its neighbours and anchors and d the wanted ones: 0.02 n_m + 0.1 n_u +
-    0.3 t_s + 0.1 IAE + 0.01 ITAE, all until the settling time t_s, the last time at which g = Σ(r² − d²) is farther
-    from its end than 2 % of |g(0) − g(end)|. n_m are transmissions, n_u computed goals; IAE and ITAE are those of
-    Σ|r − d|, halved because a link has two ends (their script takes the ITAE of the last neighbour only, which is taken
-    for a slip). For laws without distances, and where wanted distances change, g is their error. Goals are counted by
-    their changes in the samples, in proportion to all that were computed.
+    The cost of a robot is 0.02 n_m + 0.1 n_u + 0.3 t_s + 0.1 IAE + 0.01 ITAE, all until the settling time t_s. With r
+    the distances to its neighbours and anchors and d the wanted ones, t_s is the last time at which g = Σ(r² − d²)
+    differs from its end by more than 2 % of |g(0) − g(end)|. n_m are transmissions, n_u computed goals; IAE and ITAE
+    are those of Σ|r − d|, halved because a link has two ends (their script takes the ITAE of the last neighbour only,
+    which is taken for a slip). For laws without distances, and where wanted distances change, g is their error. Goals
+    are counted by their changes in the samples, in proportion to all that were computed.
     """
     plan, time, place = trace.plan, trace.time, trace.true_position
     links, anchors = errors.net, plan.anchors_by_row

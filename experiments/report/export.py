@@ -42,7 +42,7 @@ UNITS: Final[dict[str, Any]] = {
     "error": "m, sum over the links of the robot; time x robot",
     "tolerance": "m",
     "phase_start": "s",
-    "adjacency": "1 where the robot of the row hears that of the column",
+    "adjacency": "1 if the robot of the row receives poses of that of the column",
     "sent": {
         "time": "s",
         "robot": "row in robots",

@@ -75,8 +75,8 @@ def all_figures(
 ) -> dict[str, Figure]:
     """All figures of a run by name; motions of the first seed, `errors` of all seeds.
 
-    Figures without content are left out: all without a trace; ratios of a single case; pictures of space where no
-    position is known, or in perspective where all robots stay on the floor; errors of laws that measure none.
+    Figures without content are left out: all without a trace; ratios of a single case; errors of laws that measure
+    none. Pictures of space need known positions, and in perspective robots above the floor.
 
     Args:
         cases, traces: The run; several seeds of a case have one name.
@@ -321,7 +321,7 @@ def _largest(values: Array) -> Array:
 
 
 def _acquisitions(runs: Sequence[CaseMetrics]) -> list[float]:
-    """When all followers had acquired in each phase [s] since the common start, mean over the seeds that did."""
+    """Times of acquisition by all followers in each phase, mean over seeds that acquired [s since the common start]."""
     found = []
     longest = sorted((run.starts_s for run in runs), key=len)[-1:]
     for k, start in enumerate(longest[0] if longest else ()):
@@ -370,14 +370,14 @@ def events(traces: Sequence[Trace], width: float = WIDTH) -> Figure:
 
 
 def _marks(trace: Trace, columns: int) -> list[tuple[Array, Array]]:
-    """Beginnings and ends [s] of the marks of each robot, where a picture shows so many columns."""
+    """Beginnings and ends [s] of the marks of each robot, in a picture of `columns` columns."""
     pixel = max(float(trace.time[-1] - trace.time[0]), SHORTEST_S) / columns
     pairs = [merged(np.sort(trace.sent_by(i).stamp), pixel) for i in range(len(trace.robots))]
     return [(begin, end + pixel) for begin, end in pairs]
 
 
 def _solid(trace: Trace, marks: Sequence[tuple[Array, Array]]) -> str:
-    """Caption of a case whose marks all touch; empty if there is anything to see."""
+    """Caption of a case if all its marks touch; otherwise empty."""
     span = max(float(trace.time[-1] - trace.time[0]), SHORTEST_S)
     if not marks or any((end - begin).sum() < SOLID * span for begin, end in marks):
         return ""
@@ -469,7 +469,7 @@ def _steps(waits: Array) -> tuple[Array, Array]:
 
 Style = Literal["-", "--", ":"]
 
-MOST_SHADOWS: Final = 8  # robots whose twins are drawn: a page holds no more
+MOST_SHADOWS: Final = 8  # robots with drawn twins: a page holds no more
 PARTS: Final[tuple[tuple[str, str, Style], ...]] = (
     ("along", CASES[0], "-"),
     ("to the left", CASES[1], "--"),

@@ -1,4 +1,4 @@
-"""A page: findings, tables and pictures in one HTML file that needs nothing else, now or in ten years."""
+"""A page: findings, tables and pictures in one self-contained HTML file, readable in ten years."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ class Section:
 
     @property
     def anchor(self) -> str:
-        """Its id in the page, for links."""
+        """Id in the page, for links."""
         return re.sub(r"[^a-z0-9]+", "-", self.title.lower()).strip("-")
 
 
@@ -142,7 +142,7 @@ def render(
     foot: Sequence[str] | None = None,
     replay: str = "",
 ) -> Path:
-    """Writes a page that needs nothing else: findings, facts, sections with their contents, a `foot` of small lines.
+    """Writes a self-contained page: findings, facts, sections with their contents, a `foot` of small lines.
 
     Args:
         foot: Code and versions of this process if left out.

@@ -108,7 +108,7 @@ def write(
             and the figures of motions show the first seed.
         text: The experiment file; the experiment of the first trace as JSON if left out.
         date: When a run without `run.json` was, see `date_of`; now if left out.
-        measured: `measure` of each trace, if that was done already; and of seeds whose traces are not known.
+        measured: `measure` of each trace, if already done; and of seeds without known traces.
         notes: What the reader should know besides: a damaged recording, robots that were lost. That runs were
             interrupted is seen from the traces.
         run: Folder of the run; the same as `folder` if left out.
@@ -249,7 +249,7 @@ def compare(
 
 
 def differences_table(differences: Sequence[tuple[str, str, Sequence[str]]]) -> Table:
-    """Name and folder of each run, and how it differs from the first one."""
+    """Name and folder of each run, and its differences from the first one."""
     how = [
         TableRow((name, folder, "; ".join(found) or ("the same file, seeds and versions" if k else "the reference")))
         for k, (name, folder, found) in enumerate(differences)
@@ -258,7 +258,7 @@ def differences_table(differences: Sequence[tuple[str, str, Sequence[str]]]) -> 
 
 
 def _noted(differences: Sequence[tuple[str, str, Sequence[str]]]) -> list[Finding]:
-    """Which runs differ from the first one, and in how much."""
+    """Differences of the runs from the first one."""
     found = []
     for name, _, how in differences[1:]:
         more = f" and {len(how) - 2} more" if len(how) > 2 else ""

@@ -1,7 +1,7 @@
-"""Draws what stands in an arena, from above and in space: border, obstacles, start boxes. All pictures use it.
+"""Drawing of an arena, from above and in space: border, obstacles, start boxes. All pictures use it.
 
-Greys only, so that colours are left for robots, distinguished by outline and hatch: grey is an obstacle at rest,
-hatched one that can be pushed (where they stood at the start), dashed is where a moving one ends, with its path dotted.
+Only greys are used, since colours are for robots. A grey obstacle is at rest, a hatched one can be pushed (both at
+their places at the start). A dashed outline is the end of a moving one, with its path dotted.
 """
 
 from __future__ import annotations

@@ -179,7 +179,7 @@ def case_line(k: int) -> Line:
 def robot_legend(
     figure: Figure, traces: Sequence[Trace], more: tuple[Sequence[Artist], Sequence[str]] = ((), ())
 ) -> None:
-    """Which robot, or which kind of robots, has which line; and what `more` there is, handles and labels."""
+    """Legend of the lines of robots, or of kinds of robots, and of `more`, handles and labels."""
     trace = max(traces, key=lambda each: len(each.robots))
     label = trace.robots
     if len(label) > MANY:

@@ -45,16 +45,16 @@ RUN: Final = (
     ("Closest approach", "Between surfaces, negative where they overlap; that of two robots is between their centres."),
     ("Changed by safety", "Ticks on which what had been decided was changed before it went to the body; by avoidance:"
      " those of them, and of changed goals, that kept clear of something."),
-    ("Twin beside a robot", "It gets the same commands, and is put onto the robot, as measured, when that is first"
-     " driven and again as often as \"ahead\" says. Differences are twin less robot: errors of predicting the robot up"
-     " to so far ahead. Along and across are in the robot's heading, to the left positive."),
+    ("Twin beside a robot", "A twin that gets the robot's commands and is reset to its measured pose every \"ahead\""
+     " seconds. Differences are twin less robot: errors of predicting the robot up to that time ahead. Along and "
+     "across are in the robot's heading, to the left positive."),
     ("Correlation", "Pearson's, between robot and twin, of positions and of speeds over 0.2 s; a dash where one of them"
      " hardly moved."),
     ("Spoiled", "A run in which a robot failed or began late, 1 % of the deadlines or of the poses were missed or lost,"
      " messages could not be read, or the world was slow. Its figures are compared with none."),
     ("×", "Over the reference with the same seed, of runs of equal length that nothing spoiled."),
-    ("Known", "Share of a robot's link errors that is known. Robots whose position is known for less than 95 % of the"
-     " run are left out of the means; their neighbours' errors leave out the links to them."),
+    ("Known", "Known share of a robot's link errors. Robots with a position known for less than 95 % of the run"
+     " are left out of the means; their neighbours' errors leave out the links to them."),
     ("±", "Half-width of the 95 % confidence interval of the mean over seeds (Student's t)."),
 )  # fmt: skip
 
@@ -82,7 +82,7 @@ def _table_by_case(head: str, cases: Sequence[CaseMetrics], lines: Iterable[Line
 
 
 def _over_seeds(values: Sequence[float | None], scale: float = 1.0) -> str:
-    """Mean and interval over the seeds, and the number of seeds whose value is known."""
+    """Mean and interval over the seeds, and the number of seeds with a known value."""
     found = spread(values)
     return interval(found, scale) + (f" ({found.n} of {len(values)})" if 0 < found.n < len(values) else "")
 
@@ -551,7 +551,7 @@ def _worst(case: CaseMetrics, k: int) -> float | None:
 
 
 def _phase(cases: Sequence[CaseMetrics], k: int) -> str:
-    """Which phase: nothing for the first."""
+    """Suffix naming a later phase; empty for the first."""
     start = next((case.starts_s[k] for case in cases if k < len(case.starts_s)), 0.0)
     return f" after {start:g} s" if k else ""
 

@@ -52,7 +52,7 @@ from experiments.scene.stage import link_colours
 from twins.arrays import Array
 
 LOW: Final = 0.2  # [m] robots below that are as well seen from above
-OVERLAID: Final = 3  # so many cases are told apart upon each other, from above
+OVERLAID: Final = 3  # cases that can be distinguished upon each other, from above
 FLAT: Final = 0.15  # of its width is how high a picture of robots on the floor is, where tall things stand there
 
 

@@ -17,7 +17,7 @@ from experiments.report.tables import dropped_share, mean_delay, ratio_words
 
 KEPT_UP = 0.99  # a world that is slower than this share of real time falls behind
 UNFINISHED_M = 0.3  # a robot that is nearer to where its plan wants it merely lags
-NAMED = 3  # so many collisions, or twins, are named; the tables have them all
+NAMED = 3  # collisions, or twins, that are named; the tables have them all
 
 
 def findings(cases: Sequence[CaseMetrics]) -> list[Finding]:
@@ -100,12 +100,12 @@ def _of_each_case(
 
 
 def failures(cases: Sequence[CaseMetrics]) -> list[Finding]:
-    """Robots that did not do their part; nothing else in a report means much before that is known."""
+    """Robots that did not do their part: the first thing that a reader must know."""
     return [Finding("bad", f"Failed in {case.case}: {_first_few(case.failures)}.") for case in cases if case.failures]
 
 
 def spoiled(cases: Sequence[CaseMetrics]) -> list[Finding]:
-    """Which cases are compared with none, and why."""
+    """Cases that are not compared with others, and the reasons."""
     found = []
     for name, runs in by_case(cases).items():
         bad = [run for run in runs if run.spoiled]
@@ -131,7 +131,7 @@ def metric_faults(cases: Sequence[CaseMetrics]) -> list[Finding]:
 
 
 def interruptions(cases: Sequence[CaseMetrics]) -> list[Finding]:
-    """Which runs ended before their time, or were without a network; the first thing that a reader must know."""
+    """Runs that ended early, or were without a network."""
     found, several = [], len(by_case(cases)) > 1
     for run in cases:
         if run.interrupted:

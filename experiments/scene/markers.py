@@ -75,7 +75,7 @@ def _obstacles(stage: SceneModel, since: float) -> list[Marker]:
 
 
 def _links(stage: SceneModel, tracker: LinkTracker, since: float, position: np.ndarray) -> list[Marker]:
-    """Marker of a list of lines; those whose ends are not known lie out of sight, so that none of before stays."""
+    """Marker of a list of lines; those without known ends lie out of sight, so that no earlier one stays."""
     net = stage.links
     if not len(net):
         return []

@@ -34,8 +34,8 @@ Colour = tuple[int, int, int]
 
 GOOD_M: Final = 0.025  # error of a link that counts as kept
 FAIR_M: Final = 0.05
-SILENT_S: Final = 3.0  # without a status for so long a robot counts as silent
-FLASH_S: Final = 0.12  # a link is lit for so long after its sender transmits
+SILENT_S: Final = 3.0  # time without a status after which a robot counts as silent
+FLASH_S: Final = 0.12  # time for which a link is lit after its sender transmits
 TRAIL: Final = 60  # points of a trail
 TRAIL_S: Final = 0.2  # between two of them
 DASH_M: Final = 0.04
@@ -53,7 +53,7 @@ GOOD, FAIR, BAD, UNKNOWN = (0, 158, 115), (230, 159, 0), (213, 50, 30), (140, 14
 
 
 class BodyLocation(IntEnum):
-    """Where the body of a robot is."""
+    """Location of the body of a robot."""
 
     TWIN = 0  # simulated in the robot's own process
     WORLD = 1  # simulated in a world
@@ -121,7 +121,7 @@ def condition(
 
 
 def place_of(body: str) -> BodyLocation:
-    """Where the body with this address is."""
+    """Kind of location of a body, by its address."""
     if body == WORLD:
         return BodyLocation.WORLD
     name = registry.body_name(body)
@@ -225,7 +225,7 @@ class SceneModel:
         return np.array([*(self.scene.high - self.scene.low)[:2], high])
 
     def broken_links(self, conditions: Index, statuses: Sequence[Status | None]) -> Mask:
-        """Links (E,) with an end that is gone, or whose receiver misses the sender in its last status."""
+        """Links (E,) with an end that is gone, or a receiver that misses the sender in its last status."""
         net = self.links
         missing = {(row, name) for row, last in enumerate(statuses) if last is not None for name in last.missing}
         gone = np.isin(conditions, PALED)
@@ -256,7 +256,7 @@ class Moment:
     condition: Index  # (N,) of `Condition`
     silent_for: Array  # (N,) [s] since the last transmission of each robot
     error: Array  # (E,) [m] of each link; NaN: unknown, or the link is not there
-    broken: Mask  # (E,) links whose receiver does not get poses of its sender
+    broken: Mask  # (E,) links with a receiver that does not get poses of its sender
     obstacles: Array  # (M, 3) x, y [m], yaw [rad]
     trail: Array  # (N, K, 3) [m] former positions, the newest first
     attitude: Array | None = None  # (N, 4) quaternions w, x, y, z; NaN: only yaw is known
@@ -376,7 +376,7 @@ def dashes(ends: Array) -> Array:
 
 
 def lit(stage: SceneModel, moment: Moment) -> Mask:
-    """Links (E,) whose sender has just transmitted."""
+    """Links (E,) with a sender that has just transmitted."""
     return np.asarray(moment.silent_for[stage.links.sender] <= FLASH_S)
 
 

@@ -1,4 +1,4 @@
-"""Tracks of the robots of a recording, for replay: what is drawn, and nothing else."""
+"""Tracks of the robots of a recording, for replay: only the drawn fields."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from experiments.recording.trace import ROUNDING_S
 from twins.arrays import Array, Index
 
 M = TypeVar("M", Status, Memory)
-LOST_S: Final = 1.0  # without a sample for so long a robot is silent
+LOST_S: Final = 1.0  # time without a sample after which a robot is silent
 WORDS: Final = {phase.word: int(phase) for phase in Phase}
 NOWHERE: Final = (nan, nan, nan)
 COLUMNS: Final = np.cumsum([1, 1, 3, 1, 3, 4, 3, 1])  # ends of the columns of `_sample`
@@ -178,8 +178,8 @@ def _gathered(data: bytes, places: Index, kind: str | np.dtype[Any], width: int 
 def _samples(data: bytes, begins: Index, ends: Index, robot: str) -> Array:
     """Rows as of `_sample` (K, 17) of the states of a robot that lie between places in bytes (K,).
 
-    A state costs a tenth of its decoding: drawn fields are taken out of all states of one phase at once, by their
-    places behind the beginning, or before the end when they follow a list. Only states of other layouts are decoded.
+    A state costs a tenth of its decoding. The drawn fields are taken out of all states of one phase at once, by their
+    places after the beginning, or before the end if they follow a list. Only states of other layouts are decoded.
     """
     table = np.full((len(begins), COLUMNS[-1]), nan)
     left = np.arange(len(begins))

@@ -1,10 +1,10 @@
 """Finds the parameters of a trigger that keep the errors within limits with the fewest messages.
 
 The search is CMA-ES (Hansen, "The CMA evolution strategy: a tutorial", arXiv:1604.00772, 2016) by its author's library
-`cma`: it needs no slopes, only compares, so that noise and limits do it no harm; it asks for a generation at a time,
-which all cores or a cluster run side by side; and it depends on numpy alone. A point that breaks a limit is worse than
-any that does not, and the more so the farther. A limit counts as kept when the upper end of the 95 % confidence
-interval over the seeds keeps it.
+`cma`. It needs no slopes, only comparisons, so noise and limits do it no harm. It asks for a generation at a time,
+which all cores or a cluster run side by side, and depends on numpy alone. A point that breaks a limit is worse than any
+that does not, and worse the farther it is. A limit counts as kept when the upper end of the 95 % confidence interval
+over the seeds keeps it.
 
 The best of many was also the luckiest on its seeds. So a third of the tuning seeds serves the search, and the choice
 among the best is made on the others. The chosen one is run on seeds that took part in no choice, and only these are
@@ -31,15 +31,15 @@ from experiments.sweep.sweep import SweepRunner, folder_of, origin
 from experiments.sweep.table import CellRow, relative_metrics, words_of
 from experiments.sweep.workers import workers
 
-Progress = Callable[[str, int, int], None]  # case, evaluations done, of at most so many
+Progress = Callable[[str, int, int], None]  # case, evaluations done, largest number of them
 
-FINE: Final = 0.01  # of a range: closer than this the search does not look
-SIGMA: Final = 0.3  # of a range: how far it looks at first
-EVALUATIONS: Final = (20, 20)  # at most so many, and so many more for each parameter
+FINE: Final = 0.01  # of a range: resolution of the search
+SIGMA: Final = 0.3  # of a range: first width of the search
+EVALUATIONS: Final = (20, 20)  # largest number, and the increase for each parameter
 SEARCH: Final = 1 / 3  # share of the tuning seeds that serves the search
 TUNING: Final = 60  # seeds, if no number is given
 FEWEST: Final = 6
-ROUND: Final = 6  # so many of the best are looked at again at a time, until one keeps the limits
+ROUND: Final = 6  # number of the best that are looked at again at a time, until one keeps the limits
 ROUNDS: Final = 4
 BROKEN: Final = 1e6  # added to what breaks a limit
 
@@ -156,12 +156,12 @@ def tune(
     processes: int | None = None,
     progress: Progress = lambda _case, _done, _of: None,
 ) -> TuningResult:
-    """Seeks the parameters of each case that has any of the axes; what was tried before is not run again.
+    """Seeks the parameters of each case that has any of the axes; finished runs are not repeated.
 
     Args (others as of `sweep`):
         given: Ranges, `seeds=` to report on and `tuning=` to seek on, as on the command line.
         wanted: As `parse_objective` takes it.
-        progress: Told of the case, of evaluations done, and of how many there are at most.
+        progress: Called with the case, the evaluations done, and their largest number.
 
     Raises:
         DocumentError: If the file or an argument is wrong.

@@ -30,7 +30,7 @@ from experiments.report.style import (
 from experiments.sweep.table import UNKNOWN, CellRow, short, words_of
 from twins.arrays import Array
 
-MOST_CURVES: Final = 7  # colours of cases, and markers; more could not be told apart, and are drawn as clouds
+MOST_CURVES: Final = 7  # colours of cases, and markers; more could not be distinguished, and are drawn as clouds
 LEGEND_LINE: Final = 0.14  # [in]
 GREY: Final = "#7a7a7a"
 THIN: Final[dict[str, Any]] = {"linewidth": 0.8, "markersize": 3.6, "markeredgewidth": 0.8, "zorder": 3}
@@ -42,13 +42,13 @@ SPAN: Final = 8.0  # a wider range of messages is drawn on a logarithmic axis
 def pareto(rows: Sequence[CellRow], index: str = "iae", *, joined: bool = True, width: float = WIDTH) -> Figure:
     """Messages against an error, both over the reference with the same seeds; one curve for each trigger.
 
-    Of several parameters the first runs along the curves, markers tell the others. Full markers: no other cell of the
+    Of several parameters the first runs along the curves, markers show the others. Full markers: no other cell of the
     same environment has fewer messages and no more error; these are joined by a grey line for each environment.
     Hollow: another one is better, or runs failed. Whiskers are 95 % confidence intervals. The reference is the cross
     at (1, 1).
 
     Args:
-        rows: The cells; those whose ratios are unknown are left out.
+        rows: The cells; those without known ratios are left out.
         index: Of the error: `iae`, or another metric that has a ratio.
         joined: Whether cells of a case are joined along a parameter, if these curves are few; else they are a cloud.
     """

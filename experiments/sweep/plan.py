@@ -5,8 +5,7 @@
 A cell is one case with one value of each parameter that the case has. A case without a parameter (a periodic trigger
 has no threshold) is one cell, however many values the others run through.
 
-What the ratios are taken over is the first case of the file: with the same gain, arena and network as what is compared
-with it, but with the trigger that the file gives it, because it is triggers that are compared.
+Ratios are relative to the first case with the same gain, arena and network, but with its own trigger.
 """
 
 from __future__ import annotations
@@ -85,7 +84,7 @@ class Cell:
     case: str  # name of the case
     parameters: Mapping[str, Any]  # values of the axes, by path
     plan: Plan  # what is run
-    # digest of what the ratios are taken over: the first case of the file with the same values, but for those of its
+    # digest of the reference of the ratios: the first case of the file with the same values, except those of its
     # trigger
     reference: str
     digest: str  # of what is run

@@ -27,7 +27,7 @@ from experiments.virtual_time.conductor import Stuck
 from experiments.virtual_time.log import RunRecorder
 from experiments.virtual_time.simulation import simulate
 
-PACKAGES: Final = ("agents", "twins", "experiments")  # whose code decides what a run comes to
+PACKAGES: Final = ("agents", "twins", "experiments")  # packages with code that determines results
 # fields of a trace that a lean log of `experiments.virtual_time.simulation.simulate` keeps
 LEAN: Final = frozenset(
     {
@@ -84,19 +84,19 @@ def fly(case: bytes, seeds: Sequence[int], code: str) -> bytes:
 
 
 def digest(plan: Plan) -> str:
-    """The same for experiments that run in the same way: title, source, cases, criteria and the seed are left out.
+    """Digest of an experiment without title, source, cases, criteria and seed.
 
-    Robots and links count in the order of the file, by which starts are drawn and sums are formed.
+    Robots and links keep the order of the file, which decides random starts and sums.
     """
     bare = plan.changed(title="", source="", cases={}, criteria=[], seed=0)
     return hashlib.sha256(msgspec.json.encode(bare.experiment)).hexdigest()[:20]
 
 
 def code_of(plan: Plan) -> str:
-    """Digest of all that decides on results: our code, that of its plug-ins and of metrics, and the versions of numpy
-    and of the libraries of the engine, which has its name, and of the law.
+    """Digest of everything that determines the result: our code, modules of plug-ins and metrics, library versions.
 
-    Of a plug-in the module counts in which it stands; another module that it imports does not.
+    The libraries are numpy, that of the engine, which has its name, and that of the law. Of a plug-in only its own
+    module counts, not other modules that it imports.
     """
     files, library = plugin_files(plan), plan.law.LIBRARY
     engine = plan.engine_name
@@ -141,7 +141,7 @@ def run_metrics(trace: Trace) -> RunMetrics:
 
 
 def _early_end(trace: Trace) -> str:
-    """How much of its time a run took, if it ended early."""
+    """Text on the end of a run that ended early; else empty."""
     return f"ended at {trace.time[-1]:.1f} s of {trace.plan.experiment.duration_s:g} s" if ended_early(trace) else ""
 
 

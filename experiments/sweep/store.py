@@ -1,8 +1,8 @@
-"""The runs of a sweep that are done, on disk, so that none is ever repeated.
+"""Finished runs of a sweep, on disk, so that none is ever repeated.
 
-A line of `runs.jsonl` holds some runs of one cell under the digest of what was run and of the code that ran it: a file
-that was changed, or another zenpark, leads to other digests, and what they no longer fit is left alone. A line that was
-cut off while it was written is as good as none.
+A line of `runs.jsonl` holds some runs of one cell under the digest of the cell and of the code. A changed file, or
+another zenpark, leads to other digests; lines with former digests are ignored. A line that was cut off while it was
+written is ignored as well.
 """
 
 from __future__ import annotations
@@ -83,11 +83,11 @@ class Store:
         path.write_bytes(msgspec.json.format(msgspec.json.encode(now), indent=2) + b"\n")
         found = []
         if before.version != now.version:
-            found.append(f"this is zenpark {now.version}, not {before.version}: all runs are made anew")
+            found.append(f"this is zenpark {now.version}, not {before.version}: all runs are repeated")
         elif before.code != now.code:
-            found.append("the code of zenpark or of a plug-in has changed: what it runs is run anew")
+            found.append("the code of zenpark or of a plug-in has changed: its runs are repeated")
         if before.file != now.file:
-            found.append("the experiment file has changed: what it changes is run anew")
+            found.append("the experiment file has changed: affected runs are repeated")
         return found
 
     def runs(self, cell: str, code: str) -> dict[int, RunMetrics]:

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MOST_SEEDS: Final = 100  # of one cell side by side: more are hardly faster, and progress would come in larger steps
-SHARE: Final = 3  # each worker gets its part in at least so many pieces, so that all end at about the same time
+SHARE: Final = 3  # least number of pieces of a worker's part, so that all end at about the same time
 MOST_BYTES: Final = 2e8  # of samples that one process logs
 LEAN_BYTES, WHOLE_BYTES = 48.0, 340.0  # of a sample of a robot
 LONGEST: Final = 60  # letters of a folder's name that is made up here
@@ -84,7 +84,7 @@ def sweep(
     most_seeds: int = MOST_SEEDS,
     progress: Progress = lambda _done, _of: None,
 ) -> SweepResult:
-    """Runs a sweep, or what is missing of it; after Ctrl-C it gives what is done.
+    """Runs a sweep, or its missing runs; after Ctrl-C it returns the finished ones.
 
     Args:
         given: Axes and seeds, as on the command line.
@@ -94,7 +94,7 @@ def sweep(
         scheduler: Address of a dask scheduler; None: on this machine.
         processes: On this machine; None: one for each core.
         most_seeds: Of one cell side by side in a process.
-        progress: Told of progress.
+        progress: Called with the runs done, and their number.
 
     Raises:
         DocumentError: If the file or an argument is wrong.

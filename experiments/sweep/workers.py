@@ -18,7 +18,7 @@ from experiments.cores import KILLED, cores, pool
 from experiments.sweep.runs import WorkResult, fly
 
 ADDRESS: Final = re.compile(r"(tcp|tls)://[^\s/]+:[0-9]{1,5}")
-ANSWER_S: Final = 10.0  # a scheduler that does not answer for so long is not there
+ANSWER_S: Final = 10.0  # time without an answer after which a scheduler counts as absent
 
 
 @dataclass(frozen=True)

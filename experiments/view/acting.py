@@ -49,7 +49,7 @@ class Watched:
 
     endpoints: Sequence[str]
     realm: str
-    identity: str  # whose certificate is shown, in a lab
+    identity: str  # identity to show, in a lab
     run: Run | None = None  # of this machine, if it is registered
 
     @property

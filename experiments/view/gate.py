@@ -107,7 +107,7 @@ class Gate:
 
 
 def own(headers: Headers) -> bool:
-    """Whether a request comes to a name of this machine, and not from a page of another origin."""
+    """Whether a request names this machine, and is not from a page of another origin."""
     hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
     if len(hosts) != 1 or OWN_HOST.fullmatch(hosts[0]) is None:
         return False

@@ -62,7 +62,7 @@ def mark(stage: int, drawn: float, age: float | None, words: str = "", *, over: 
 
 
 def page_mark(page: int) -> str:
-    """Mark of a page, as HTML, by which its reports are told apart."""
+    """Mark of a page, as HTML, which identifies its reports."""
     return f"<i data-page='{page}' hidden></i>"
 
 

@@ -38,7 +38,7 @@ FOV: Final = 0.8  # [rad] upright
 ASPECT: Final = 1.2  # width over height of a page that is not known yet
 FROM: Final = np.array([-0.40, -0.77, 0.50])  # direction of the camera, as seen from the arena
 FREE: Final = np.array([-0.92, 0.92])  # of a page from its middle to its edges, where the arena is shown
-PHONE: Final = 0.7  # width over height of a page whose panel is below, not beside
+PHONE: Final = 0.7  # width over height of a page with its panel below, not beside
 ABOVE: Final = np.array([0.24, 0.96])  # as `FREE`, upwards, of such a page
 
 

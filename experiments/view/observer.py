@@ -23,7 +23,7 @@ from experiments.file.problems import DocumentError
 from experiments.scene.stage import SILENT_S, Condition, LinkTracker, Moment, SceneModel, Trail, condition
 from experiments.view.heartbeat import DataAge
 
-UNKNOWN_S: Final = 2.0  # without an experiment for so long, robots are drawn of which only the names are known
+UNKNOWN_S: Final = 2.0  # time without an experiment after which robots are drawn that are known by name only
 RATE_S: Final = 1.0
 Handler = zenoh.handlers.Handler[zenoh.Sample]
 R = TypeVar("R", messages.State, messages.Memory, messages.Ranges)

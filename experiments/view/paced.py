@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     import viser
 
 POLL_S: Final = 0.005
-PAGE_S: Final = 30.0  # the first case waits so long for a page
+PAGE_S: Final = 30.0  # time for which the first case waits for a page
 
 
 class PacedView:

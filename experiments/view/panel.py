@@ -132,7 +132,7 @@ class Panel:
         self._plot_folder = self._gui.add_folder("Last 30 s", order=20.0)
         self._error: Any = None
         self._rate: Any = None
-        self._followers: Sequence[int] = ()  # rows of the robots that receive on a link, whose errors are plotted
+        self._followers: Sequence[int] = ()  # rows of the robots that receive on a link, with plotted errors
         with self._gui.add_folder("Links", order=25.0, expand_by_default=False):
             self._links = self._gui.add_html("")
         with self._gui.add_folder("Events", order=30.0):

@@ -153,7 +153,7 @@ class Clock:
 
 
 def add_transport(server: viser.ViserServer, clock: Clock, steps: tuple[str, ...]) -> None:
-    """Adds play and pause, also by the space bar, steps of a sample or so many seconds, and the speed."""
+    """Adds play and pause, also by the space bar, steps of a sample or some seconds, and the speed."""
     import viser  # noqa: PLC0415 - an extra
 
     def step(event: viser.GuiEvent[Any]) -> None:

@@ -73,9 +73,9 @@ def served(port: int, *, dark: bool) -> Iterator[Server]:
 
 @contextmanager
 def _gated(gate: Gate) -> Iterator[None]:
-    """Inside, a server of the library `websockets` asks the gate first; raises ExplainedError if none was started.
+    """Block in which a server of the library `websockets` asks the gate; raises ExplainedError if none was started.
 
-    viser has no parameter for it: it calls `websockets.asyncio.server.serve`, whose `process_request` is public.
+    viser has no parameter for it: it calls `websockets.asyncio.server.serve`, which has a public `process_request`.
     """
     serve, gated = websockets.serve, list[str]()
 

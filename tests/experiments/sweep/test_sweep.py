@@ -123,7 +123,7 @@ def test_changed_file_is_noticed_and_reruns_affected_runs(tmp_path):
     sweep(file, [AXIS, "seeds=2"], out=folder, processes=1)
     file.write_text(text.replace("threshold = 0.01", "threshold = 0.01, minimum_interval_s = 0.1"))
     found = sweep(file, [AXIS, "seeds=2"], out=folder, processes=1, progress=(progress := Progress()))
-    assert found.notes == ("the experiment file has changed: what it changes is run anew",)
+    assert found.notes == ("the experiment file has changed: affected runs are repeated",)
     assert progress.ran == 4  # the two cells of `event`; `periodic` is as it was
     assert min(row.gap_min_s for row in found.rows if row.case == "event") == pytest.approx(0.1)
 
@@ -131,7 +131,7 @@ def test_changed_file_is_noticed_and_reruns_affected_runs(tmp_path):
 def test_another_version_is_noticed(tmp_path, monkeypatch):
     swept(tmp_path, "seeds=1")
     monkeypatch.setattr(sweeps, "version", lambda _name: "99.0")
-    assert swept(tmp_path, "seeds=1").notes == ("this is zenpark 99.0, not 0.1.0: all runs are made anew",)
+    assert swept(tmp_path, "seeds=1").notes == ("this is zenpark 99.0, not 0.1.0: all runs are repeated",)
 
 
 def test_runs_that_fail_are_counted_and_named(tmp_path, monkeypatch):
