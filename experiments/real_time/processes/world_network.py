@@ -126,7 +126,7 @@ class Commands:
             on_refusal=events.count_malformed,
         )
         self.done: dict[str, int] = {}  # number of the last executed command
-        # session that owns the name of a robot: a new one numbers its commands from anew
+        # session that owns the name of a robot: a new one restarts the numbers of its commands
         self.lives: dict[str, str] = {}
         self._owners = pubsub.AliveWatch(session, Keys.life(keys.alive("*"), "*"))
         self._strangers: set[str] = set()
