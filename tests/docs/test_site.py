@@ -41,6 +41,13 @@ def text(page: Path) -> str:
     return unescape(re.sub(r"<[^>]+>", "", page.read_text("utf-8")))
 
 
+def test_reference_is_printed_as_text():
+    command = [sys.executable, ROOT / "docs" / "site.py", "experiment-file"]
+    printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert printed.startswith("# The experiment file")
+    assert "lands_at_s" in printed
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_the_site_has_every_page_and_fetches_nothing(site):

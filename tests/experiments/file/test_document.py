@@ -110,7 +110,7 @@ EXPECTED = [
     ("unknown-key", 15, 1, "unknown key 'clmap' in 'formation'", "did you mean 'clamp'?"),
     ("unknown-kind", 5, 8, "no 'kephera4' among the kinds of robots", "did you mean 'khepera4'?"),
     ("unknown-leader", 14, 10, "no robot is called 'kh01'", "did you mean 'KH01'?"),
-    ("unknown-sensor", 7, 24, "no 'lidar' among the range sensors", "known: infrared, ultrasonic, lds01"),
+    ("unknown-sensor", 7, 24, "no 'lidar' among the range sensors", "known: multiranger, infrared, ultrasonic, lds01"),
     ("unknown-trigger", 3, 20, "no 'periodc' among the triggers", "did you mean 'periodic'?"),
     ("wrong-word", 9, 11, "'missing' cannot be 'goon'", "did you mean 'go-on'?"),
     ("yaw-in-degrees", 6, 21, "the yaw is in radians", "90 degrees are 1.5708"),
