@@ -3,3 +3,7 @@
 
 class ExplainedError(Exception):
     """An error with a text that names the place and the remedy."""
+
+
+class Refusal(Exception):
+    """An order that is not carried out, with reason and remedy."""

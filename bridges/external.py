@@ -37,7 +37,7 @@ HALT_S: Final = 3.0  # time for which `land` is repeated to a robot on wheels
 ANSWER_S: Final = 2.5  # time after a stop at which the note reports a robot that is not measured to stand still
 SUPERSEDED_S: Final = 1.0  # a shorter standstill costs no process its name
 STANDSTILL_S: Final = 1.0  # longest wait of `close` until stopped robots are measured to stand still
-REACH: Final = (1e3, 1e3, 1e3)  # [m] bounds of valid positions: any room
+VALID_BOX: Final = (1e3, 1e3, 1e3)  # [m] bounds of valid positions: any room
 
 
 class _RepeatedOrder(msgspec.Struct):
@@ -131,7 +131,7 @@ class ExternalBody(Body):
             raise BodyError(f"{', '.join(self._names)}: {error}") from None
         session, keys, mime = self._session, self._keys, messages.MIME["json"]
         rows = range(len(self._names))
-        self._positions = MeasuredPositions(session, keys, self._names, rows, REACH, exact=rows, silence_s=FRESH_S)
+        self._positions = MeasuredPositions(session, keys, self._names, rows, VALID_BOX, exact=rows, silence_s=FRESH_S)
         self._ranges = RangeInbox(session, keys, self._names, rows)
         self._setpoints = [pubsub.publisher(session, keys.setpoint(name), mime) for name in self._names]
         self._orders = [

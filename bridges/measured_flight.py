@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import hypot, inf, isfinite, isnan
 from typing import Final
 
-from agents.safety.detection import SLOWEST
+from agents.safety.detection import LOWEST_DESCENT_M_S
 from agents.vectors import ZERO, Vector, norm
 
 FRESH_S: Final = 0.5  # older positions are lost; robots tolerate as much
@@ -68,7 +68,7 @@ class MeasuredFlight:
         if not landing:
             down = now - self._grounded_since > GROUNDED_S
         elif aged:
-            descent = LANDING_S if isnan(z) else max(LANDING_S, z / SLOWEST)
+            descent = LANDING_S if isnan(z) else max(LANDING_S, z / LOWEST_DESCENT_M_S)
             down = now - self.landing_since > descent
         else:  # else it has come lower and stands: on a table
             down = grounded or (self._highest - z > AWAY_M and now - self._still_since > LANDING_S)

@@ -35,7 +35,7 @@ from agents.runtime.lifeline import Lifeline
 NODE: Final = "zenpark"
 FRAME: Final = "map"  # the arena, as rviz and nav2 name the fixed frame; goals must be in it
 POLL_S: Final = 0.01
-REACH: Final = (1e3, 1e3, 1e3)  # [m] bounds of valid positions: any room
+VALID_BOX: Final = (1e3, 1e3, 1e3)  # [m] bounds of valid positions: any room
 DEGREE: Final = radians(1.0)
 SAME: Final = 1e-3  # [rad] bearings that differ less are one
 OK, WARN, ERROR = 0, 1, 2  # levels of a DiagnosticStatus
@@ -160,7 +160,7 @@ class Graph:
     def _publish_states(self) -> None:
         """Publish received states as pose, transform and velocity."""
         now, transforms = self._clock.utc(), []
-        for state in self._states.read(lambda state: validation.check_state(state, now=now, reach=REACH)):
+        for state in self._states.read(lambda state: validation.check_state(state, now=now, valid_box=VALID_BOX)):
             if (robot := self._robots.get(state.robot)) is None:
                 continue
             robot.stamp = state.stamp

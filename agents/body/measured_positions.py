@@ -33,18 +33,18 @@ class MeasuredPositions:
         keys: Keys,
         names: Sequence[str],
         rows: Sequence[int],
-        reach: Vector,
+        valid_box: Vector,
         *,
         exact: Sequence[int] = (),
         silence_s: float,
     ) -> None:
-        """Subscribe for `rows` of the robots `names`; positions beyond `reach` [m] are refused.
+        """Subscribe for `rows` of the robots `names`; positions beyond `valid_box` [m] are refused.
 
         Args:
             exact: Rows with noise-free positions from a simulation, which may repeat.
             silence_s: Time without a new position after which another source takes over [s].
         """
-        self._names, self._reach = tuple(names), reach
+        self._names, self._valid_box = tuple(names), valid_box
         # stamp of the last position of each robot less the time of its arrival [s]: the clock of its source is ahead by
         # at least this value, or, if it is negative, behind or late; NaN before the first
         self.ahead = [nan] * len(self._names)
@@ -133,7 +133,7 @@ class MeasuredPositions:
 
     def _check(self, row: int, utc: float, now: float, measured: messages.Position) -> None:
         self.ahead[row] = measured.stamp - utc - now  # also of a stamp that is refused
-        validation.check_position(measured, now=utc + now, reach=self._reach)
+        validation.check_position(measured, now=utc + now, valid_box=self._valid_box)
 
     def _note_refusal(self, row: int, _key: str, reason: str) -> None:
         self.malformed[row] += 1

@@ -15,7 +15,7 @@ from agents.plugins.calls import failure, wrong
 from agents.plugins.registry import FAILURES
 from agents.vectors import Vector, clamp, is_finite
 
-REACH: Final = 3.0  # [m] between axes; farther things are ignored
+SIGHT_M: Final = 3.0  # [m] between axes; farther things are ignored
 AHEAD_S: Final = 0.1  # received positions are extrapolated for this long: a silent robot may have stopped
 BELIEVED_S: Final = 0.5  # and received velocities are used for this long
 SCAN_S: Final = 1.0  # readings older than this are dropped
@@ -123,11 +123,11 @@ class Perception:
         (x, y, z), (vx, vy, vz) = sender.position, sender.velocity
         x = x + vx * ahead
         off_x = here[0] - x
-        if not abs(off_x) <= REACH:  # most of a large company
+        if not abs(off_x) <= SIGHT_M:  # most of a large company
             return
         y, z = y + vy * ahead, z + vz * ahead
         off_y, up = here[1] - y, here[2] - z
-        if not off_x * off_x + off_y * off_y <= REACH * REACH:
+        if not off_x * off_x + off_y * off_y <= SIGHT_M * SIGHT_M:
             return
         # a lost drone still hovers, has landed, or falls: it is in the way from the floor up
         lost = t - sender.lost_since > self._neighbour_timeout_s or sender.stamp == -inf
@@ -152,11 +152,11 @@ class Perception:
         vx, vy, vz = (each if isfinite(each) else 0.0 for each in now.velocity)
         x, y, z = now.position[0] - vx * then, now.position[1] - vy * then, now.position[2] - vz * then
         # those of which a point can be; never received: NaN
-        close = [each for each in neighbours.all if _apart(each, now.position) <= REACH + 1.0]
-        farthest = min(REACH, self._in_time)
+        close = [each for each in neighbours.all if _apart(each, now.position) <= SIGHT_M + 1.0]
+        farthest = min(SIGHT_M, self._in_time)
         for bearing, elevation, far in zip(scan.bearing, scan.elevation, scan.distance, strict=True):
             # NaN: nothing was hit; nothing is inside the robot either
-            if not (INSIDE * self._radius < far <= REACH and isfinite(bearing) and isfinite(elevation)):
+            if not (INSIDE * self._radius < far <= SIGHT_M and isfinite(bearing) and isfinite(elevation)):
                 continue
             flat = cos(elevation)
             if flat > STEEP and far * flat <= farthest:

@@ -27,7 +27,7 @@ class EndpointError(ExplainedError, ValueError):
     """An endpoint that cannot or must not be used, with the remedy."""
 
 
-def refusal(endpoint: str) -> str:
+def protocol_refusal(endpoint: str) -> str:
     """Reason why the protocol of an endpoint is not supported, with the remedy; empty if it is."""
     protocol = endpoint.partition("/")[0]
     if protocol in PROTOCOLS:
@@ -49,7 +49,7 @@ class Endpoint:
     def parse(cls, text: str) -> Self:
         """Parses an endpoint; raises ValueError, which says how one is written, if it is none."""
         protocol, _, whole = text.partition("/")
-        if protocol and whole and (why := refusal(text)):
+        if protocol and whole and (why := protocol_refusal(text)):
             raise ValueError(why)
         end = min((at for mark in "?#" if (at := whole.find(mark)) >= 0), default=len(whole))
         address, rest = whole[:end], whole[end:]

@@ -22,7 +22,7 @@ REACH_M: Final = 1.0  # a position farther outside the arena is refused
 MAX_YAW: Final = 1e3  # [rad]; ours is within ±π, other programs may count on over full turns
 
 
-def reach_of(low: Vector, high: Vector) -> Vector:
+def valid_box_of(low: Vector, high: Vector) -> Vector:
     """Largest |x|, |y|, |z| [m] of a valid position or goal in the arena from `low` to `high`, x, y, z [m]."""
     x, y, z = (max(abs(least), abs(most)) + REACH_M for least, most in zip(low, high, strict=True))
     return x, y, z
@@ -36,38 +36,38 @@ def taken(stamp: float, now: float) -> float:
     return min(stamp, now)
 
 
-def check_pose(pose: Pose, *, now: float, reach: Vector) -> None:
-    """Refuses an impossible pose: stamp in the future, position beyond `reach` (`reach_of`), no robot's velocity."""
+def check_pose(pose: Pose, *, now: float, valid_box: Vector) -> None:
+    """Refuses an impossible pose: stamp in the future, position outside `valid_box`, no robot's velocity."""
     if not (is_count(pose.seq) and _possible(pose.stamp, now)):
         raise Malformed(f"sequence number {pose.seq} or stamp {pose.stamp} is impossible")
-    _refuse_place(pose.position, reach)
+    _refuse_place(pose.position, valid_box)
     _refuse_motion(pose.velocity, pose.yaw)
     if pose.shared:
         _refuse_words(pose.shared)
 
 
-def check_state(state: State, *, now: float, reach: Vector) -> None:
+def check_state(state: State, *, now: float, valid_box: Vector) -> None:
     """Refuses telemetry with an impossible pose; a pose may be missing."""
     _refuse_stamp(state.stamp, now)
     if state.position is not None:
-        _refuse_place(state.position, reach)
+        _refuse_place(state.position, valid_box)
     _refuse_motion(state.velocity, state.yaw)
 
 
-def check_position(measured: Position, *, now: float, reach: Vector) -> None:
+def check_position(measured: Position, *, now: float, valid_box: Vector) -> None:
     _refuse_stamp(measured.stamp, now)
-    _refuse_place(measured.position, reach)
+    _refuse_place(measured.position, valid_box)
     if measured.yaw is not None and not abs(measured.yaw) <= MAX_YAW:
         raise Malformed(f"yaw {measured.yaw} is impossible")
 
 
-def check_goal(goal: Goal, *, now: float, reach: Vector, oldest_s: float) -> None:
+def check_goal(goal: Goal, *, now: float, valid_box: Vector, oldest_s: float) -> None:
     """Refuses a goal that is impossible or too old, or younger than the pose on which it rests."""
     if not (is_count(goal.seq) and now - oldest_s <= goal.stamp and _possible(goal.stamp, now)):
         raise Malformed(f"sequence number {goal.seq} or stamp {goal.stamp} is impossible, or the goal is old")
     if not 0.0 < goal.pose <= goal.stamp + FUTURE_S:  # the robot's clock may be ahead
         raise Malformed(f"a goal of {goal.stamp} cannot rest on a pose of {goal.pose}")
-    _refuse_place(goal.position, reach)
+    _refuse_place(goal.position, valid_box)
     if goal.velocity is not None and not (
         2 <= len(goal.velocity) <= 3 and all(abs(each) <= MAX_SPEED for each in goal.velocity)
     ):
@@ -129,8 +129,8 @@ def _refuse_stamp(stamp: float, now: float) -> None:
         raise Malformed(f"stamp {stamp} is impossible")
 
 
-def _refuse_place(position: Vector, reach: Vector) -> None:
-    (x, y, z), (far_x, far_y, far_z) = position, reach
+def _refuse_place(position: Vector, valid_box: Vector) -> None:
+    (x, y, z), (far_x, far_y, far_z) = position, valid_box
     if not (abs(x) <= far_x and abs(y) <= far_y and abs(z) <= far_z):
         raise Malformed(f"position {position} is outside the arena")
 

@@ -13,7 +13,7 @@ import zenoh
 
 from agents.network import access_control, lab
 from agents.network import endpoints as topology
-from agents.network.endpoints import DEFAULT_ENDPOINT, UNIX, EndpointError, Mode, refusal
+from agents.network.endpoints import DEFAULT_ENDPOINT, UNIX, EndpointError, Mode, protocol_refusal
 
 LEASE_S: Final = 2.0  # a peer silent for this long is considered dead
 ASK_S: Final = 2.0  # limit for a reply to a query
@@ -61,7 +61,7 @@ def settings(
         protocol, slash, address = endpoint.partition("/")
         if not (protocol and slash and address and endpoint.isprintable()):
             raise EndpointError(f"'{endpoint}' is not an endpoint: write it like {DEFAULT_ENDPOINT}")
-        if why := refusal(lab.bare([endpoint])[0]):
+        if why := protocol_refusal(lab.bare([endpoint])[0]):
             raise EndpointError(why)
     of_lab, folder = _of_lab([*connect, *listen], identity or name or "", bool(listen), rights)
     connect, listen = topology.bare(connect), topology.bare(listen)

@@ -15,7 +15,7 @@ from msgspec import Meta
 
 from agents.vectors import ZERO, NotNegative, Positive, Setpoint, Vector
 
-FAR: Final = 1e6  # [m] from 0 on both axes: what is not there
+ABSENT_M: Final = 1e6  # [m] from 0 on both axes: what is not there
 COINCIDENT: Final = 1e-6  # [m] axes nearer than this have no direction
 TOUCHING: Final = 1e-3  # [m] smallest gap in a force: forces stay finite
 LAYER: Final = 0.05  # [m] depth within d0 in which the push of a thing grows to its full size
@@ -52,7 +52,7 @@ class Thing:
 
     def vanish(self) -> None:
         """Be a point at rest, out of reach of everything."""
-        self.x = self.y = FAR
+        self.x = self.y = ABSENT_M
         self.velocity_x = self.velocity_y = self.radius = self.low = self.high = self.lag = 0.0
         self.is_robot = False
 
@@ -71,7 +71,7 @@ class Plane:
 
 
 class Nearby:
-    """Things near a robot: the first `count` of `things`. The list has room for more, which stand `FAR` away."""
+    """Things near a robot: the first `count` of `things`. The list has room for more, which stand `ABSENT_M` away."""
 
     __slots__ = ("count", "planes", "things")
 

@@ -22,7 +22,7 @@ from agents.user_folder import OWN, cache_folder
 CHOICE: Final = r"[^@:\\/][^@:\\]*\.py:[A-Za-z_][A-Za-z0-9_]*"  # as a user writes it
 PREFIX: Final = "zenpark_file_"  # of the names of their modules
 KEPT: Final = "plugins"  # folder of the copies, in the cache
-LARGEST: Final = 1_000_000  # [bytes] of such a file
+MAX_FILE_BYTES: Final = 1_000_000  # [bytes] of such a file
 _CHOICE: Final = re.compile(rf"({CHOICE})(?:@([0-9a-f]{{32}}))?")
 _OTHERS: Final = 0o022  # mode of what others may write
 
@@ -58,14 +58,14 @@ def adopt(name: str, folder: Path) -> tuple[str, Path]:
         raise ValueError(f"{path} is no file; put the Python file beside the experiment file")
     try:
         with file.open("rb") as opened:
-            about, text = os.fstat(opened.fileno()), opened.read(LARGEST + 1)
+            about, text = os.fstat(opened.fileno()), opened.read(MAX_FILE_BYTES + 1)
     except OSError as error:
         known = ", ".join(sorted(each.name for each in folder.glob("*.py"))[:10]) or "none is there"
         raise ValueError(
             f"the file {file} cannot be read ({error.strerror}); files beside the experiment: {known}"
         ) from None
-    if len(text) > LARGEST:
-        raise ValueError(f"{path} has more than {LARGEST // 1000} kB; take a file with one plug-in")
+    if len(text) > MAX_FILE_BYTES:
+        raise ValueError(f"{path} has more than {MAX_FILE_BYTES // 1000} kB; take a file with one plug-in")
     owners = {os.geteuid(), 0, Path(__file__).stat().st_uid}
     if about.st_uid not in owners or (about.st_mode & stat.S_IWOTH):
         raise ValueError(f"{path} is of another user, or others may write to it; copy it, and look at what it does")

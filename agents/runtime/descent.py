@@ -17,7 +17,7 @@ from agents.network.name_ownership import ANSWER_S, NameKeeper
 from agents.network.shutdown import FAREWELL_S, STOPPED_S
 from agents.robot import Robot
 from agents.runtime.watchdog import AGAIN_S, DOWN_S, Watchdog
-from agents.safety.detection import SLOWEST
+from agents.safety.detection import LOWEST_DESCENT_M_S
 from agents.ticks import Ticks
 
 
@@ -28,7 +28,7 @@ class DescentTiming:
     landing_s: float = FAREWELL_S  # [s] least limit for a landing
     stop_s: float = STOPPED_S  # [s] limit for a body to confirm that its motors are off
     again_s: float = AGAIN_S  # [s] between two orders
-    slowest: float = SLOWEST  # [m/s] lowest speed of a descent
+    slowest: float = LOWEST_DESCENT_M_S  # [m/s] lowest speed of a descent
 
 
 class Descent:

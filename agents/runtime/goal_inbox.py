@@ -14,7 +14,7 @@ from agents.network import session as network
 from agents.network.channel_model import Channel, Conditions
 from agents.network.keys import Keys
 from agents.robot import Robot
-from agents.runtime.pose_inbox import NEWS
+from agents.runtime.pose_inbox import MAX_UNREPORTED
 
 
 class GoalInbox:
@@ -26,14 +26,14 @@ class GoalInbox:
         keys: Keys,
         robots: Sequence[Robot],
         *,
-        reach: messages.Vector,
+        valid_box: messages.Vector,
         conditions: Sequence[Conditions] = (),
     ) -> None:
-        """Subscribes for the guided ones of `robots`; goals beyond `reach` [m] are refused.
+        """Subscribes for the guided ones of `robots`; goals beyond `valid_box` [m] are refused.
 
         `conditions` are the effects of the modelled channel on the goals of each robot; empty: none.
         """
-        self._session, self._robots, self._reach = session, robots, reach
+        self._session, self._robots, self._valid_box = session, robots, valid_box
         guided = [row for row, robot in enumerate(robots) if robot.guidance is not None]
         self._inboxes = {
             row: pubsub.Inbox(
@@ -46,7 +46,7 @@ class GoalInbox:
         self._seq = dict.fromkeys(guided, 0)
         self._channel = Channel(conditions or [Conditions()] * len(robots))
         # by row, for telemetry, which empties them
-        self.news = [deque[messages.GoalReceipt](maxlen=NEWS) for _ in robots]
+        self.unreported = [deque[messages.GoalReceipt](maxlen=MAX_UNREPORTED) for _ in robots]
 
     @property
     def malformed(self) -> int:
@@ -70,7 +70,7 @@ class GoalInbox:
             yaw = nan if goal.yaw is None else goal.yaw
             x, y, z = (*(goal.velocity or (nan, nan)), nan)[:3]
             if guidance is not None and guidance.receive(goal.position, yaw, stamp, (x, y, z)):
-                self.news[row].append(messages.GoalReceipt(goal.seq, goal.stamp, goal.pose, utc + t))
+                self.unreported[row].append(messages.GoalReceipt(goal.seq, goal.stamp, goal.pose, utc + t))
 
     def _mark(self, t: float, *, there: bool) -> None:
         for row in self._inboxes:
@@ -94,6 +94,6 @@ class GoalInbox:
 
     def _check(self, row: int, now: float, goal: messages.Goal) -> None:
         oldest_s = self._robots[row].assignment.limits.neighbour_timeout_s
-        validation.check_goal(goal, now=now, reach=self._reach, oldest_s=oldest_s)
+        validation.check_goal(goal, now=now, valid_box=self._valid_box, oldest_s=oldest_s)
         if goal.seq <= self._seq[row]:
             raise messages.Malformed(f"goal {goal.seq} after {self._seq[row]}")

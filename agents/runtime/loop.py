@@ -50,7 +50,7 @@ from agents.ticks import Ticks
 STOP_YIELD_S: Final = 0.05  # sleep after an emergency stop, so that other processes get the CPU to stop their motors
 ROUTER_S: Final = 0.045  # between two checks of the router
 
-Ranging = Literal["body", "world", "far"]
+Ranging = Literal["body", "world", "remote"]
 
 
 @dataclass(frozen=True)
@@ -62,11 +62,11 @@ class Setup:
     encoding: messages.Encoding  # of sent payloads
     state_hz: float  # [1/s] rate of telemetry
     lifeline: bool  # whether standard input is a lifeline
-    located: Sequence[bool]  # robots with a position measured from outside
+    externally_measured: Sequence[bool]  # robots with a position measured from outside
     # source of the range readings of each row: its body; the world, by the key `ranges` of the row ("world"); or that
-    # key, received by the body itself ("far"). Left out: the bodies.
+    # key, received by the body itself ("remote"). Left out: the bodies.
     ranging: Sequence[Ranging] = ()
-    # located rows with noise-free positions from a simulation, which may repeat. Left out: none
+    # externally measured rows with noise-free positions from a simulation, which may repeat. Left out: none
     exact: Sequence[bool] = ()
     # effects of the modelled channel on received poses, for each robot by link; empty: none
     conditions: Sequence[Sequence[Conditions]] = ()
@@ -107,7 +107,7 @@ class Runtime:
         self._bell = pubsub.Bell() if setup.wake else None
         self._utc = 0.0
         self._keeper = NameKeeper(setup.keys, self._names, setup.clock.utc(), setup.ownership)
-        self._reach = validation.reach_of(common.limits.low, common.limits.high)
+        self._valid_box = validation.valid_box_of(common.limits.low, common.limits.high)
         self._everyone = tuple(range(len(self._names)))
         self._descent = Descent(
             self.robots, body, self._keeper, self.ticks,
@@ -171,11 +171,11 @@ class Runtime:
             on_start=self._align,
         )  # fmt: skip
         self._conductor = pubsub.AliveWatch(session, keys.conductor)
-        located = [row for row, there in enumerate(self._setup.located) if there]
+        located = [row for row, there in enumerate(self._setup.externally_measured) if there]
         exact = [row for row, there in enumerate(self._setup.exact) if there]
         silence_s = self._limits.position_timeout_s
         self._located = (
-            MeasuredPositions(session, keys, names, located, self._reach, exact=exact, silence_s=silence_s)
+            MeasuredPositions(session, keys, names, located, self._valid_box, exact=exact, silence_s=silence_s)
             if located
             else None
         )
@@ -183,12 +183,12 @@ class Runtime:
         seen_by_world = [row for row, source in enumerate(ranging) if source == "world"]
         self._ranges = RangeInbox(session, keys, names, seen_by_world) if seen_by_world else None
         self._neighbours = neighbours = PoseInbox(
-            session, keys, self.robots, reach=self._reach, conditions=self._setup.conditions, bell=self._bell
+            session, keys, self.robots, valid_box=self._valid_box, conditions=self._setup.conditions, bell=self._bell
         )
         self._goals = None
         if any(robot.guidance is not None for robot in self.robots):
             of_goals = self._setup.goal_conditions
-            self._goals = GoalInbox(session, keys, self.robots, reach=self._reach, conditions=of_goals)
+            self._goals = GoalInbox(session, keys, self.robots, valid_box=self._valid_box, conditions=of_goals)
         self._telemetry = Telemetry(
             session,
             keys,
@@ -198,7 +198,7 @@ class Runtime:
             counts=self.counts,
             malformed=self._malformed,
             ranged=[source == "body" for source in ranging],
-            receipts=None if self._goals is None else self._goals.news,
+            receipts=None if self._goals is None else self._goals.unreported,
         )
         self._declare_tokens()
 

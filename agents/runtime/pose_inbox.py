@@ -53,17 +53,17 @@ class NeighbourSubscription:
         name: str,
         links: Sequence[int],
         *,
-        reach: messages.Vector,
+        valid_box: messages.Vector,
         rate: float,
         depth: int = pubsub.POSES,
         bell: pubsub.Bell | None = None,
     ) -> None:
         """Subscribes to the robot `name`, the sender on `links`.
 
-        `reach` has the largest |x|, |y|, |z| of a valid pose [m], `rate` is the largest rate of its poses [1/s]. At
+        `valid_box` has the largest |x|, |y|, |z| of a valid pose [m], `rate` is the largest rate of its poses [1/s]. At
         most `depth` of them may wait; each rings the `bell`, if there is one.
         """
-        self.name, self.links, self._reach, self._rate = name, links, reach, rate
+        self.name, self.links, self._valid_box, self._rate = name, links, valid_box, rate
         key = keys.pose(name)
         subscription: pubsub.Subscription = (
             pubsub.pose_subscriber(session, key, depth)
@@ -110,7 +110,7 @@ class NeighbourSubscription:
                 self.foreign += 1
                 continue
             try:
-                validation.check_pose(pose, now=now, reach=self._reach)
+                validation.check_pose(pose, now=now, valid_box=self._valid_box)
             except messages.Malformed as error:
                 self._note_refusal(now, str(error))
                 continue
@@ -160,7 +160,7 @@ class NeighbourSubscription:
             self.behind = age if self._old >= PROOFS else 0.0
 
 
-NEWS: Final = 20_000  # poses that wait for telemetry, which empties them several times a second: 10 MB
+MAX_UNREPORTED: Final = 20_000  # poses that wait for telemetry, which empties them several times a second: 10 MB
 
 
 class Knowledge(Protocol):
@@ -187,7 +187,7 @@ class ModelledInbox:
         conditions: Sequence[Conditions],  # effects of the modelled channel on each link
         knowledge: Knowledge,
         *,
-        reach: messages.Vector,
+        valid_box: messages.Vector,
         rate: float,
         depth: int = pubsub.POSES,
         bell: pubsub.Bell | None = None,
@@ -199,7 +199,7 @@ class ModelledInbox:
         """
         self._knowledge, self._channel, self._counted = knowledge, Channel(conditions), counted
         self.senders = [
-            NeighbourSubscription(session, keys, name, mine, reach=reach, rate=rate, depth=depth, bell=bell)
+            NeighbourSubscription(session, keys, name, mine, valid_box=valid_box, rate=rate, depth=depth, bell=bell)
             for name, mine in links.items()
         ]
         self.arrived = 0  # poses before the modelled channel, without those of robots of this process
@@ -285,13 +285,13 @@ class PoseInbox(ModelledInbox):
         keys: Keys,
         robots: Sequence[Robot],
         *,
-        reach: messages.Vector,
+        valid_box: messages.Vector,
         conditions: Sequence[Sequence[Conditions]] = (),
         bell: pubsub.Bell | None = None,
     ) -> None:
         """Subscribes to the neighbours of `robots`, which get poses and losses.
 
-        `reach` and `bell` as of `NeighbourSubscription`; `conditions` of each link of each robot, empty: an ideal
+        `valid_box` and `bell` as of `NeighbourSubscription`; `conditions` of each link of each robot, empty: an ideal
         network.
         """
         self._robots = robots
@@ -305,10 +305,10 @@ class PoseInbox(ModelledInbox):
         first = robots[0].assignment
         super().__init__(
             session, keys, links, [each for own in conditions for each in own] or ideal, self,
-            reach=reach, rate=first.body_hz / first.pose_every, bell=bell,
+            valid_box=valid_box, rate=first.body_hz / first.pose_every, bell=bell,
         )  # fmt: skip
         # (n) newest received poses of each robot, for telemetry, which empties them
-        self.news = [deque[messages.PoseReceipt](maxlen=NEWS) for _ in robots]
+        self.unreported = [deque[messages.PoseReceipt](maxlen=MAX_UNREPORTED) for _ in robots]
         self.received = [0] * len(robots)  # (n) received poses of each robot
         self._marks = [(0.0, "", 0)] * len(self.senders)
 
@@ -349,7 +349,7 @@ class PoseInbox(ModelledInbox):
             self._robots[row].neighbours.receive(
                 k, pose.position, velocity, received.measured - utc, arrival, yaw=yaw, said=said
             )
-            self.news[row].append(
+            self.unreported[row].append(
                 messages.PoseReceipt(pose.robot, pose.seq, pose.stamp, utc + arrival, pose.position, velocity)
             )
             self.received[row] += 1

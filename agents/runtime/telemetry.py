@@ -107,7 +107,7 @@ class Telemetry:
                 messages.number(robot.error),
                 messages.vector(state.true_position),
                 messages.heading(state.true_yaw),
-                list(self._neighbours.news[row]),
+                list(self._neighbours.unreported[row]),
                 attitude if all(map(isfinite, attitude)) else None,
                 messages.vector(shadow),
                 messages.number(state.shadow_yaw),
@@ -117,7 +117,7 @@ class Telemetry:
                 self._states[row].put(payload)
             if robot.stepping is not None:
                 self._send_memory(row, robot.stepping, t)
-            self._neighbours.news[row].clear()
+            self._neighbours.unreported[row].clear()
             self._receipts[row].clear()
 
     def _send_memory(self, row: int, stepping: Stepping, t: float) -> None:

@@ -24,7 +24,7 @@ from agents.safety.setpoint_filter import OUTSIDE_M
 from agents.vectors import NO_SETPOINT, UNKNOWN, Setpoint, Vector, is_finite, norm, planar
 
 SUNK: Final = 0.15  # [m] below its goal
-SLOWEST: Final = 0.2  # [m/s] no device lands more slowly,
+LOWEST_DESCENT_M_S: Final = 0.2  # [m/s] no device lands more slowly,
 CREEPS: Final = 0.025  # [m/s] or more slowly than this for
 STEP: Final = 0.05  # [m]
 STALLS_S: Final = 4.0  # time after which a climb without `STEP` of gained height counts as stalled; of
@@ -130,7 +130,7 @@ class Descent:
         """
         begins, self.landing = landing and not self.landing, landing
         if begins:
-            self.due = t + (height if valid else self.room) / SLOWEST
+            self.due = t + (height if valid else self.room) / LOWEST_DESCENT_M_S
         if begins or (valid and height < self.lowest - STEP):
             self.lowest, self.lowered_at = height, t
         still = landing and t - self.lowered_at > STEP / CREEPS

@@ -15,7 +15,7 @@ from agents.vectors import UNKNOWN, Vector, clamp
 
 JUMP_M: Final = 0.5  # [m] beyond what a robot can move between two measurements: it is not where its position says
 GAP_S: Final = 0.5  # longest time that counts between them; after a longer one it stood, or was landed
-REACH: Final = 1.5  # share of a kind's speed: what it can move
+PLAUSIBLE_SPEED: Final = 1.5  # share of a kind's speed: what it can move
 FLIP: Final = 0.5  # [rad] beyond what a robot can turn between two measurements: its markers are mistaken
 ABSURD: Final = 1e6  # [rad] no yaw
 MOST_TURNED: Final = 1.2  # [rad] between two measurements, however long the time between them
@@ -44,8 +44,8 @@ class Continuity:
 
     def __init__(self, kind: Kind, jump_m: float = JUMP_M) -> None:
         """A jump is longer than `jump_m` [m]."""
-        self._jump_m, self._squared, self._fastest = jump_m, jump_m * jump_m, REACH * kind.speed
-        self._wheels, self._turn_rate = kind.takes == "twist", REACH * kind.turn_rate
+        self._jump_m, self._squared, self._fastest = jump_m, jump_m * jump_m, PLAUSIBLE_SPEED * kind.speed
+        self._wheels, self._turn_rate = kind.takes == "twist", PLAUSIBLE_SPEED * kind.turn_rate
         self._place, self._time, self._yaw, self.jumped, self.turned = UNKNOWN, 0.0, nan, False, nan
 
     def jump(self, time: float, position: Vector, yaw: float, watched: bool) -> float:
@@ -112,7 +112,7 @@ class ExternalPositions:
     _flipped: float  # sum of the jumps of the yaw [rad]
 
     def __init__(self, kind: Kind) -> None:
-        self._continuity, self._turn_rate = Continuity(kind, 2.0 * kind.radius), REACH * kind.turn_rate
+        self._continuity, self._turn_rate = Continuity(kind, 2.0 * kind.radius), PLAUSIBLE_SPEED * kind.turn_rate
         self._time, self._yaw, self._yaw_time, self._flipped = -inf, nan, nan, 0.0
         self.jump, self.deceived, self.doubted = nan, False, False
 

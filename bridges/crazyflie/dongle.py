@@ -16,7 +16,7 @@ from typing import Any, Final
 from agents.protocols.crazyradio import ACK, ANSWER, EXCHANGE, RETRY_S, SWITCH_S, Simulated
 
 ANSWER_S: Final = 0.1  # longest wait for the simulated air
-LARGEST: Final = 64  # [bytes] of an answer
+MAX_ANSWER_BYTES: Final = 64  # [bytes] of an answer
 REFUSED_S: Final = 0.01  # exchange with an air that is gone
 
 # requests of the dongle's configuration
@@ -90,7 +90,7 @@ class Dongle:
         try:
             self._socket.send(request)
             while True:
-                answer = self._socket.recv(LARGEST)
+                answer = self._socket.recv(MAX_ANSWER_BYTES)
                 number, status = ANSWER.unpack_from(answer)
                 if number == self._number:  # else the late answer of an earlier exchange
                     return bytes((status,)) + answer[ANSWER.size :]

@@ -36,7 +36,7 @@ JOIN_S: Final = 1.5  # cflib's threads check for their end once per second
 OLDEST: Final = (0, 1, 32)  # version of cflib that has all that is called: the emergency stop, for one
 PERIODS_MS: Final = 10.0  # log periods are multiples of this
 
-SLOWEST: Final = 20  # longest period of a log block, in units of 10 ms
+LONGEST_PERIOD: Final = 20  # longest period of a log block, in units of 10 ms
 
 LogCallback = Callable[[float, int, Mapping[str, float]], None]
 
@@ -240,7 +240,7 @@ class CrazyflieLink:
         """Set the rates of all log blocks to a share of those asked for; not below 5 Hz."""
         for name, block in list(self.blocks.items()):
             period = self._periods[name]
-            block.period = min(round(period / share), max(SLOWEST, period))
+            block.period = min(round(period / share), max(LONGEST_PERIOD, period))
             block.start()
 
     def send_parameter(self, parameter: str, value: float | None) -> None:

@@ -19,7 +19,7 @@ from agents.body.interface import BodyError
 from agents.protocols import tello as protocol
 from bridges.tello.pilot import Vendor
 
-MOST: Final = 100  # datagrams read at a time from a socket: a flood must not keep the pilots from their drones
+MAX_DATAGRAMS: Final = 100  # datagrams read at a time from a socket: a flood must not keep the pilots from their drones
 DATAGRAM_BYTES: Final = 1024
 
 
@@ -78,7 +78,7 @@ def _djitellopy() -> Any:  # noqa: ANN401 - the library has no types
 
 def _received(wire: socket.socket) -> Iterator[tuple[bytes, str]]:
     """Datagrams that have come so far, with the hosts of their senders."""
-    for _ in range(MOST):
+    for _ in range(MAX_DATAGRAMS):
         try:
             data, (host, _) = wire.recvfrom(DATAGRAM_BYTES)
         except OSError:  # nothing left, or an error of the network: both may end

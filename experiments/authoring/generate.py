@@ -27,7 +27,7 @@ POWER: Final = 200  # rounds of the power method: λ to a few percent
 HIGHEST: Final = 3.0  # gain of the reference experiment
 FREE: Final = 0.3  # share of the spacing that starts may be scattered by, on each axis
 PASSING: Final = 0.1  # [m] between robots on their way
-MOST: Final = 5000  # robots: five times as many as anything here was tried with
+MAX_ROBOTS: Final = 5000  # robots: five times as many as anything here was tried with
 TELEMETRY: Final = 5000.0  # samples in a second, of all robots
 WOBBLE: Final = "# hover_jitter = { sigma = 0.01, correlation_s = 0.5 }   # m, s: real drones wobble"
 
@@ -69,8 +69,8 @@ def layout(what: str, size: str, wanted: LayoutOptions) -> Layout:
 
 
 def _allow(count: int) -> None:
-    if count > MOST:
-        raise LayoutError(f"{count} robots are more than {MOST}: give fewer")
+    if count > MAX_ROBOTS:
+        raise LayoutError(f"{count} robots are more than {MAX_ROBOTS}: give fewer")
 
 
 def experiment_file(made: Layout, wanted: LayoutOptions) -> str:

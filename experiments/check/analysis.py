@@ -49,7 +49,9 @@ from experiments.metrics.signals import after_last, moving_mean
 from twins.arrays import Array, Index, Mask, norm
 from twins.scene import Scene
 
-MANY: Final = 500  # robots of which it is not asked any more what can be lost: the time grows with their third power
+MANY_ROBOTS: Final = (
+    500  # robots of which it is not asked any more what can be lost: the time grows with their third power
+)
 FITTING: Final = 1e-4  # [m] between a target and that of the best shape
 STANDS: Final = 0.001  # [m] moved by less in `WINDOW_S`
 GUESSES: Final = 400  # random places of robots from which a shape is sought: each costs time with their number
@@ -282,7 +284,7 @@ def analyse(plan: Plan, prediction: Prediction) -> Analysis:
         shape = best_shape(stages[0])
         here = asked.take(standing)
         planar, spatial = formation_rigidity(shape.position, here, silent, anchors)
-        if planar.rigid and spatial is not None and rows <= MANY:
+        if planar.rigid and spatial is not None and rows <= MANY_ROBOTS:
             spare = formation_redundancy(shape.position, here, silent)
         share = closed_shares(kinds, hz)
         within = experiment.duration_s

@@ -12,7 +12,7 @@ from experiments.file.problems import Path
 
 Severity = Literal["error", "warning", "note"]
 
-SHOWN: Final = 5  # findings of one sort; the others are counted
+SHOWN_FINDINGS: Final = 5  # findings of one sort; the others are counted
 NOT_RANDOM: Final = "not-random"  # code of the warning that no seed changes anything
 FORGIVEN: Final = 1e-6  # of rounding
 DELAYED: Final = 1.2  # times the acquisition without noise, from which on the one with noise is given as well
@@ -92,7 +92,7 @@ def first_of_each_code(findings: Iterable[Finding]) -> list[Finding]:
         by_code.setdefault(each.code, []).append(each)
     kept = []
     for same in by_code.values():
-        kept += same[:SHOWN]
-        if len(same) > SHOWN:
-            kept[-1] = replace(kept[-1], message=f"{kept[-1].message}; and {len(same) - SHOWN} more like this")
+        kept += same[:SHOWN_FINDINGS]
+        if len(same) > SHOWN_FINDINGS:
+            kept[-1] = replace(kept[-1], message=f"{kept[-1].message}; and {len(same) - SHOWN_FINDINGS} more like this")
     return kept

@@ -25,7 +25,7 @@ from experiments.virtual_time import conductor, simulation, stretch
 from experiments.virtual_time.source import outside
 from twins.arrays import Array, norm
 
-FAR: Final = 1e6  # [m] walls that no robot meets
+ENDLESS_M: Final = 1e6  # [m] walls that no robot meets
 WORK: Final = 2.2e5  # robot ticks that are flown, of 10 to 20 µs each: 310 s of seven robots, 2 s of a thousand
 FLIGHTS: Final = 2  # of a check: without noise, and with it
 SPEED_UP: Final = 15.0  # factor of the work that compiled functions fly: 33 s of a thousand
@@ -114,7 +114,9 @@ def isolated(plan: Plan) -> Plan:
         source="",
         cases={},
         robots=robots,
-        arena=msgspec.structs.replace(experiment.arena, size=(FAR, FAR, FAR), walls=False, obstacles={}, starts={}),
+        arena=msgspec.structs.replace(
+            experiment.arena, size=(ENDLESS_M, ENDLESS_M, ENDLESS_M), walls=False, obstacles={}, starts={}
+        ),
         world=World(),
         avoidance=None,
         start=msgspec.structs.replace(experiment.start, scatter=0.0, scatter_yaw=0.0),

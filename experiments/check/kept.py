@@ -26,9 +26,9 @@ from experiments.catalogue import index
 from experiments.check.findings import CheckNumbers, Finding
 from experiments.recording import version
 
-MOST: Final = 200  # verdicts that are kept
+MAX_VERDICTS: Final = 200  # verdicts that are kept
 MOST_FILES: Final = 200  # beside an experiment, and in the catalogue, that are read
-LARGEST: Final = 4_000_000  # [bytes] of such a file
+MAX_VERDICT_BYTES: Final = 4_000_000  # [bytes] of such a file
 UNCOUNTED: Final = ("__pycache__", "runs")  # in a folder of modules: what Python, or a run, makes there
 OTHERS: Final = 0o022  # mode of a folder in which others may write
 
@@ -67,7 +67,7 @@ class KeptVerdict:
         except (OSError, msgspec.MsgspecError):
             return None
 
-    def keep(self, verdict: Verdict, most: int = MOST) -> None:
+    def keep(self, verdict: Verdict, most: int = MAX_VERDICTS) -> None:
         """Keeps a verdict for the next check, and the newest `most` in all; nothing where that would not be safe."""
         place = self._place()
         if place is None or _code() != self._code or any(_strangers()):
@@ -102,7 +102,7 @@ class KeptVerdict:
             for folder in (self._file.parent, index.FOLDER):
                 inside = sorted(folder.iterdir())
                 files += [each for each in inside if each.suffix.lower() == ".toml" or each.name.encode() in named]
-            if len(files) > MOST_FILES or any(each.stat().st_size > LARGEST for each in files):
+            if len(files) > MOST_FILES or any(each.stat().st_size > MAX_VERDICT_BYTES for each in files):
                 return None
             return [(str(each), _digest(each)) for each in files if each == self._file or each.is_file()]
         except (OSError, ValueError):

@@ -17,8 +17,10 @@ from agents.plugins import registry
 from experiments.definition.experiment import VICON_TWIN, WORLD, Robot
 from experiments.definition.plan import Plan
 
-FAR: Final = ("external", WORLD)  # bodies with poses from the process that carries them
-MANY: Final = 16  # senders from which on the right is "*", if they are all robots: a router reads N² keys for minutes
+REMOTE_BODIES: Final = ("external", WORLD)  # bodies with poses from the process that carries them
+MANY_SENDERS: Final = (
+    16  # senders from which on the right is "*", if they are all robots: a router reads N² keys for minutes
+)
 
 
 def rights(cases: Iterable[Plan]) -> Rights:
@@ -56,7 +58,7 @@ def _rights(plan: Plan) -> Rights:
     robots: dict[str, Grant] = {}
     for group in experiment.processes.values():
         others = sorted({sender for name in group for sender in senders[name]})
-        if len(others) >= MANY and {*others, *group} == set(experiment.robots):
+        if len(others) >= MANY_SENDERS and {*others, *group} == set(experiment.robots):
             others = ["*"]
         led = [name for name in group if name in guided]
         inputs = [*_key_per_name(group, keys.position, keys.ranges), *map(keys.goal, led)]
@@ -84,8 +86,8 @@ def _rights(plan: Plan) -> Rights:
 
 def _roles(plan: Plan, keys: Keys) -> dict[str, Grant]:
     names = plan.experiment.robots
-    far = [name for name, robot in names.items() if robot.body in FAR]
-    ranged = [name for name, robot in names.items() if robot.body in FAR or robot.ranges == WORLD]
+    far = [name for name, robot in names.items() if robot.body in REMOTE_BODIES]
+    ranged = [name for name, robot in names.items() if robot.body in REMOTE_BODIES or robot.ranges == WORLD]
     located = plan.externally_measured
     twins = [name for name, robot in names.items() if robot.body in registry.names(registry.DEVICES)]
     measured = sorted({*located, *twins})

@@ -20,7 +20,7 @@ from experiments.definition.experiment import Experiment
 from experiments.file.consistency import judged_metrics
 from experiments.file.overrides import ALONE, SHAPE
 from experiments.file.problems import Path
-from experiments.file.structure import LARGEST, group_of, struct_of
+from experiments.file.structure import MAX_NUMBER, group_of, struct_of
 
 _OWNERS: Final[dict[str, Path]] = {  # structs with a choice of a plug-in, and where each stands in a file
     "Experiment": (),
@@ -100,7 +100,7 @@ def _bounded(node: Mapping[str, Any]) -> dict[str, Any]:
     result = _map_children(node, _bounded)
     if result.get("default") == math.inf:
         del result["default"]
-    largest = {"number": LARGEST, "integer": WORD - 1}.get(str(node.get("type")))
+    largest = {"number": MAX_NUMBER, "integer": WORD - 1}.get(str(node.get("type")))
     if largest is not None:
         if not {"minimum", "exclusiveMinimum"} & node.keys():
             result["minimum"] = -largest

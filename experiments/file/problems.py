@@ -159,8 +159,8 @@ def _blank(text: str, at: int) -> int:
     return _end(_BLANK, text, at)
 
 
-SHOWN = 100  # characters of a source line; longer ones are cut around the place
-MOST = 20  # problems in one message
+SHOWN_CHARACTERS = 100  # characters of a source line; longer ones are cut around the place
+MAX_PROBLEMS = 20  # problems in one message
 
 
 @dataclass(frozen=True)
@@ -214,8 +214,8 @@ class DocumentError(ExplainedError, ValueError):
     """Experiment that cannot be read, with all of its problems."""
 
     def __init__(self, problems: Sequence[Problem]) -> None:
-        more = [f"and {len(problems) - MOST} more"] if len(problems) > MOST else []
-        super().__init__("\n".join([*map(str, problems[:MOST]), *more]))
+        more = [f"and {len(problems) - MAX_PROBLEMS} more"] if len(problems) > MAX_PROBLEMS else []
+        super().__init__("\n".join([*map(str, problems[:MAX_PROBLEMS]), *more]))
         self.problems = list(problems)
 
 
@@ -263,8 +263,8 @@ def shown(value: object) -> str:
 
 def _window(source: str, column: int) -> tuple[str, str]:
     """The part of a line around a column, and the blanks that lead to that column (tabs stay, so that they line up)."""
-    first = max(0, column - SHOWN // 2) if len(source) > SHOWN else 0
-    part = source[first : first + SHOWN]
+    first = max(0, column - SHOWN_CHARACTERS // 2) if len(source) > SHOWN_CHARACTERS else 0
+    part = source[first : first + SHOWN_CHARACTERS]
     blanks = "".join("\t" if letter == "\t" else " " for letter in part[: column - first])
     cut = "..." if first else ""
     return cut + _printable(part), " " * len(cut) + blanks

@@ -25,7 +25,7 @@ from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
 from experiments.file.problems import DocumentError, Fault, Path, Problem, refusal, shown
 
-LARGEST: Final = 1e12  # in any unit; squares and products of larger numbers are not finite for long
+MAX_NUMBER: Final = 1e12  # in any unit; squares and products of larger numbers are not finite for long
 _REMEDY: Final = {  # of a missing key
     "title": 'add title = "what this experiment shows"',
     "duration_s": "add duration_s = 30.0",
@@ -64,7 +64,7 @@ def number_faults(value: object, path: Path = ()) -> Iterator[Fault]:
             yield from number_faults(each, (*path, number))
     elif isinstance(value, float) and not math.isfinite(value):
         yield Fault(path, f"'{_name(path)}' is {value}, which is no quantity", "give a finite number")
-    elif isinstance(value, float) and abs(value) > LARGEST:
+    elif isinstance(value, float) and abs(value) > MAX_NUMBER:
         yield Fault(path, f"'{_name(path)}' is {value:g}, larger than anything here can be", "give a smaller number")
     elif isinstance(value, int) and not -(2**63) <= value < 2**63:
         yield Fault(path, f"'{_name(path)}' has more digits than a 64-bit integer holds", "give a smaller number")

@@ -11,7 +11,7 @@ import msgspec
 
 from experiments.file.problems import DocumentError, Problem, at_offset, refusal
 
-LARGEST: Final = 4_000_000  # bytes; a hundred robots take ten thousand
+MAX_TEXT_BYTES: Final = 4_000_000  # bytes; a hundred robots take ten thousand
 BEGIN: Final = "./zenpark new copies an experiment to begin with"
 _AT: Final = re.compile(r" \(at (?:line (\d+), column (\d+)|end of document)\)$")
 _REMEDIES: Final = (
@@ -37,7 +37,7 @@ def content(file: Path, label: str) -> str:
     """
     try:
         with file.open("rb") as stream:
-            found = stream.read(LARGEST + 1)
+            found = stream.read(MAX_TEXT_BYTES + 1)
     except FileNotFoundError:
         raise
     except IsADirectoryError:
@@ -46,8 +46,10 @@ def content(file: Path, label: str) -> str:
         raise refusal(label, "is a folder", hint) from None
     except (OSError, ValueError) as error:
         raise refusal(label, f"cannot be read: {reason(error)}", "check the name and the permissions") from error
-    if len(found) > LARGEST:
-        raise refusal(label, f"is longer than {LARGEST // 1_000_000} MB", "name the experiment file, not a recording")
+    if len(found) > MAX_TEXT_BYTES:
+        raise refusal(
+            label, f"is longer than {MAX_TEXT_BYTES // 1_000_000} MB", "name the experiment file, not a recording"
+        )
     return decoded(found, label)
 
 

@@ -27,7 +27,7 @@ LEFT_OUT: Final = ("logs", f"{ORIGIN}.new")  # of the run's folder
 DATE: Final = (2000, 1, 1, 0, 0, 0)  # of every member: the same run makes the same archive
 SUMS: Final = "SHA256SUMS"
 PIECE: Final = 1 << 20  # [bytes] in memory at once
-LARGEST: Final = 1 << 34  # [bytes] of all members together
+MAX_BUNDLE_BYTES: Final = 1 << 34  # [bytes] of all members together
 # what the library raises of archives that are damaged, ciphered or of another method
 DAMAGED: Final = (
     OSError, zipfile.BadZipFile, zlib.error, struct.error, EOFError, ValueError, LookupError, RuntimeError
@@ -118,8 +118,8 @@ def unpack(bundle: Path, into: Path) -> RunOrigin:
     """
     try:
         with zipfile.ZipFile(bundle) as archive:
-            if sum(member.file_size for member in archive.infolist()) > LARGEST:
-                raise RecordingError(f"{bundle}: more than {LARGEST >> 30} GB unpacked")
+            if sum(member.file_size for member in archive.infolist()) > MAX_BUNDLE_BYTES:
+                raise RecordingError(f"{bundle}: more than {MAX_BUNDLE_BYTES >> 30} GB unpacked")
             archive.extractall(into)  # names with .. or / at the front are made harmless by the library
         sums = (into / SUMS).read_text("utf-8")
     except DAMAGED as error:

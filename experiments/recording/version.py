@@ -23,7 +23,7 @@ from agents.plugins import registry
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 PACKAGES: Final = ("agents", "bridges", "twins", "experiments", "tools")
-SHOWN: Final = 8  # characters of a digest that people compare
+DIGEST_CHARACTERS: Final = 8  # characters of a digest that people compare
 # libraries, besides those of kinds, with versions that may change results, or bytes on a wire; those not installed are
 # left out
 LIBRARIES: Final = (
@@ -54,9 +54,10 @@ class Provenance(msgspec.Struct, frozen=True, omit_defaults=True):
     @property
     def words(self) -> tuple[str, ...]:
         """Code, versions and machine in a sentence each, for people."""
-        code = f"zenpark {self.zenpark}, code {self.code[:SHOWN]}"
+        code = f"zenpark {self.zenpark}, code {self.code[:DIGEST_CHARACTERS]}"
         if self.commit:
-            code += f", commit {self.commit[:SHOWN]}{' with changes' if self.commit.endswith('+changes') else ''}"
+            changed = " with changes" if self.commit.endswith("+changes") else ""
+            code += f", commit {self.commit[:DIGEST_CHARACTERS]}{changed}"
         used = [f"Python {self.python}", *(f"{name} {number}" for name, number in self.packages.items())]
         added = [f"plug-ins of {name} {number}" for name, number in self.plugins.items()]
         machine = [self.system, self.cpu, f"{self.cores} cores", f"{self.memory_gb:.0f} GB"]
@@ -71,7 +72,7 @@ class Provenance(msgspec.Struct, frozen=True, omit_defaults=True):
         """
         found = []
         if self.code != other.code:
-            found.append(f"code {self.code[:SHOWN]}, not {other.code[:SHOWN]}")
+            found.append(f"code {self.code[:DIGEST_CHARACTERS]}, not {other.code[:DIGEST_CHARACTERS]}")
         mine, theirs = ({"Python": each.python, **each.packages, **each.plugins} for each in (self, other))
         shared = sorted(mine.keys() & theirs.keys())
         found += [f"{name} {mine[name]}, not {theirs[name]}" for name in shared if mine[name] != theirs[name]]

@@ -25,7 +25,7 @@ from experiments.recording.trace import Trace
 from twins.arrays import Array
 
 LONGEST: Final = 63  # letters of a name in MATLAB
-LARGEST: Final = 2**31  # bytes of a variable that MATLAB reads from a file of this version
+MAX_VARIABLE_BYTES: Final = 2**31  # bytes of a variable that MATLAB reads from a file of this version
 KEYWORDS: Final = frozenset(
     {
         *("break", "case", "catch", "classdef", "continue", "else", "elseif", "end", "for", "function", "global", "if"),
@@ -76,7 +76,7 @@ COLUMNS: Final = ("x", "y", "z", "yaw", "true_x", "true_y", "true_z", "goal_x", 
 
 
 def write_mat(
-    traces: Mapping[str, Trace], metrics: Mapping[str, CaseMetrics], file: Path, most_bytes: int = LARGEST
+    traces: Mapping[str, Trace], metrics: Mapping[str, CaseMetrics], file: Path, most_bytes: int = MAX_VARIABLE_BYTES
 ) -> None:
     """Writes a struct for each case, named after it, into a file of MATLAB's version 5.
 

@@ -34,8 +34,8 @@ from experiments.report.style import (
     HATCHES,
     INK,
     MAGENTA,
-    MANY,
     MARKERS,
+    MAX_COLOURED_ROBOTS,
     PAPER,
     SHORTEST_S,
     TALLEST,
@@ -194,7 +194,7 @@ def robot_bars(cases: Sequence[CaseMetrics], width: float = WIDTH) -> Figure:
             axes.yaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
         axes.grid(axis="y")
     words = [f"({name})" if name in out else name for name in names]
-    upright, size = 90 if len(names) > MANY else 0, 6.5 if len(names) <= 2 * MANY else 5.0
+    upright, size = 90 if len(names) > MAX_COLOURED_ROBOTS else 0, 6.5 if len(names) <= 2 * MAX_COLOURED_ROBOTS else 5.0
     panels[-1].set_xticks(range(len(names)), words, rotation=upright, fontsize=size)
     panels[-1].set_xlim(-0.6, len(names) - 0.4)
     figure.align_ylabels(list(panels))

@@ -46,8 +46,8 @@ HATCHES: Final = ("", "////", "....", "xxxx", "\\\\\\\\", "----", "++++")
 # robots: Tol's muted colours, so that none of them is taken for a case
 ROBOTS: Final = ("#000000", "#CC6677", "#44AA99", "#999933", "#6FB7DC", "#AA4499", "#C9A227")
 CORNERS: Final = ((3.0, 3.0), (-3.0, 3.0), (3.0, -3.0), (-3.0, -3.0))  # [pt] of a text from its point
-MANY: Final = 8  # robots that have a colour each; more are coloured by kind
-MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X", "*")  # of cases, parameters, or `MANY` robots
+MAX_COLOURED_ROBOTS: Final = 8  # robots that have a colour each; more are coloured by kind
+MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X", "*")  # of cases, parameters, or `MAX_COLOURED_ROBOTS` robots
 
 STYLE: Final[Mapping[Any, Any]] = {
     "font.family": "serif",
@@ -158,7 +158,7 @@ def thinned(trace: Trace, panels: int) -> slice:
 
 def robot_lines(trace: Trace) -> list[Line]:
     """Style of each robot's curve: a colour of its own if there are few robots, else the colour of its kind."""
-    if len(trace.robots) <= MANY:
+    if len(trace.robots) <= MAX_COLOURED_ROBOTS:
         styles = ["-"] * len(ROBOTS) + ["--"] * len(ROBOTS)
         return [{"color": ROBOTS[i % len(ROBOTS)], "linestyle": styles[i]} for i in range(len(trace.robots))]
     kinds = [trace.plan.experiment.robots[name].kind for name in trace.robots]
@@ -182,7 +182,7 @@ def robot_legend(
     """Legend of the lines of robots, or of kinds of robots, and of `more`, handles and labels."""
     trace = max(traces, key=lambda each: len(each.robots))
     label = trace.robots
-    if len(label) > MANY:
+    if len(label) > MAX_COLOURED_ROBOTS:
         label = tuple(trace.plan.experiment.robots[name].kind for name in trace.robots)
     shown = {name: Line2D([], [], **line) for name, line in zip(label, robot_lines(trace), strict=True)}
     entries = [*shown.values(), *more[0]], [*shown, *more[1]]

@@ -30,8 +30,8 @@ from experiments.report import scenery
 from experiments.report.style import (
     INK,
     MAGENTA,
-    MANY,
     MARKERS,
+    MAX_COLOURED_ROBOTS,
     PAPER,
     ROBOTS,
     STYLE,
@@ -124,15 +124,20 @@ def _draw_from_above(axes: Axes, trace: Trace, few: slice, style: Line | None) -
     ink = "#8a8a8a" if style is None else style["color"]
     for pair in edges(trace.plan.links):
         axes.plot(*last[pair, :2].T, color=ink, linewidth=0.5, alpha=1.0 if style is None else 0.6, zorder=1)
-    small = 3.0 if len(trace.robots) <= MANY else 2.0
+    small = 3.0 if len(trace.robots) <= MAX_COLOURED_ROBOTS else 2.0
     for i, line in enumerate(robot_lines(trace)):
         colour = line["color"] if style is None else ink
-        marker = MARKERS[i] if style is not None and len(trace.robots) <= MANY else "o"
+        marker = MARKERS[i] if style is not None and len(trace.robots) <= MAX_COLOURED_ROBOTS else "o"
         path = {**line, "linewidth": 0.8} if style is None else style
         axes.plot(place[few, i, 0], place[few, i, 1], **path)
         axes.plot(*last[i, :2], marker, ms=small + 0.5, mec="none", color=colour)
         axes.plot(*first[i, :2], marker, ms=small, mec=colour, mfc="none", mew=0.7)
-        if style is not None and "alpha" in style and len(trace.robots) <= MANY and np.isfinite(last[i, :2]).all():
+        if (
+            style is not None
+            and "alpha" in style
+            and len(trace.robots) <= MAX_COLOURED_ROBOTS
+            and np.isfinite(last[i, :2]).all()
+        ):
             halo = [withStroke(linewidth=1.5, foreground=PAPER)]
             axes.annotate(
                 trace.robots[i],
@@ -174,7 +179,7 @@ def expected_motion(analyses: Mapping[str, Analysis]) -> Figure:
             axes.plot(*target[[i, j], :2].T, color=MAGENTA, linewidth=0.8, linestyle=style, zorder=1)
         for row, robot in enumerate(known.names):
             colour = ROBOTS[row % len(ROBOTS)]
-            if len(known.names) > MANY:
+            if len(known.names) > MAX_COLOURED_ROBOTS:
                 colour = KINDS[experiment.robots[robot].kind].colour
             axes.plot(motion[:, row, 0], motion[:, row, 1], color=colour, linewidth=0.6)
             axes.plot(*known.start[row, :2], "o", ms=3.0, mec=colour, mfc="none", mew=0.7)
@@ -292,13 +297,13 @@ def film(traces: Sequence[Trace]) -> tuple[Figure, Callable[[float], None]]:
             styles = robot_lines(trace)
             trails = [axes.plot([], [], [], **{**style, "linewidth": 0.8, "zorder": 3})[0] for style in styles]
             dots = [axes.plot([], [], [], "o", ms=5, mec="none", color=style["color"])[0] for style in styles]
-            few = len(trace.robots) <= MANY
+            few = len(trace.robots) <= MAX_COLOURED_ROBOTS
             halo = {"path_effects": [withStroke(linewidth=1.5, foreground=PAPER)], "zorder": 7}
             names = [axes.text(0, 0, 0, name, fontsize=6, ha="center", **halo) for name in trace.robots if few]
             plan = trace.plan
             error = errors_over_time(plan.law, plan.formation, trace.time, trace.true_position)
             parts.append((trace, links, trails, dots, names, error))
-        if any(len(trace.robots) > MANY for trace in shown):
+        if any(len(trace.robots) > MAX_COLOURED_ROBOTS for trace in shown):
             robot_legend(figure, shown)
 
     def show(t: float) -> None:
@@ -324,7 +329,7 @@ def _draw_in_space(axes: Axes3D, trace: Trace, case: Line | None) -> None:
     place = trace.true_position
     known = np.asarray(np.isfinite(place).all(axis=2))
     starts, ends = place[known.argmax(axis=0), np.arange(place.shape[1])], last_known(trace)
-    few_robots = len(trace.robots) <= MANY
+    few_robots = len(trace.robots) <= MAX_COLOURED_ROBOTS
     if len(pairs := edges(trace.plan.links)):
         lines = Line3DCollection(ends[pairs], colors=colour or "#8a8a8a", linewidths=0.5, alpha=0.7, zorder=1)
         axes.add_collection3d(lines)

@@ -44,7 +44,7 @@ NAME_M: Final = 0.25  # above the highest robot
 NOWHERE: Final = (0.0, 0.0, -1000.0)  # where hidden parts are put: far below the floor
 
 # Okabe and Ito's colours, which the colour-blind tell apart, and two more
-MANY: Final = 24  # goals of more robots are drawn on demand
+MANY_GOALS: Final = 24  # goals of more robots are drawn on demand
 ROBOTS: Final[tuple[Colour, ...]] = (
     (0, 114, 178), (230, 159, 0), (0, 158, 115), (204, 121, 167), (86, 180, 233), (213, 94, 0), (120, 94, 240),
     (153, 153, 51),

@@ -33,7 +33,7 @@ REASON: Final = "button of zenpark view"
 SETTLED_S: Final = 0.4  # after the last move of a slider, or the end of a drag, its value is sent
 SLIDERS: Final = 6
 STEPS: Final = 50  # of a slider up to the value of the file, and
-REACH: Final = 4.0  # times that value at its end
+RANGE: Final = 4.0  # times that value at its end
 CALMING: Final = ("hold", "land")  # orders that count whatever the page shows
 OBSERVER: Final = "observer"
 NOTE_S: Final = 8.0
@@ -125,7 +125,7 @@ class Acting:
             for parameter in parameters(stage)[:SLIDERS]:
                 step = parameter.value / STEPS
                 slider = self._server.gui.add_slider(
-                    parameter.label, step, REACH * parameter.value, step, parameter.value
+                    parameter.label, step, RANGE * parameter.value, step, parameter.value
                 )
                 slider.on_update(partial(self.slide, parameter))
                 self._parts.append(slider)
@@ -267,7 +267,7 @@ class Parameter:
         """A value within the reach of the slider, whatever the page sent; NaN becomes the value of the file."""
         if isnan(value):
             return self.value
-        return min(max(value, self.value / STEPS), REACH * self.value)
+        return min(max(value, self.value / STEPS), RANGE * self.value)
 
 
 def parameters(stage: SceneModel) -> list[Parameter]:

@@ -18,7 +18,7 @@ import zenoh
 from agents.network.keys import Keys
 from agents.network.session import connected
 from experiments.scene.drawing import DARK, LIGHT, SceneDrawing, VisibleParts
-from experiments.scene.stage import MANY, Condition, LinkTracker, Moment, SceneModel
+from experiments.scene.stage import MANY_GOALS, Condition, LinkTracker, Moment, SceneModel
 from experiments.view import heartbeat
 from experiments.view.acting import Acting, Watched
 from experiments.view.observer import Observer
@@ -119,7 +119,7 @@ class Page:
 
     def fit(self, stage: SceneModel) -> None:
         """Goals of many robots are not drawn until they are asked for."""
-        if len(stage.names) > MANY:
+        if len(stage.names) > MANY_GOALS:
             self._boxes["goals"].value = self.shown.goals = False
 
     def begin(self, stage: SceneModel) -> None:

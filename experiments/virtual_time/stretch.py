@@ -81,7 +81,7 @@ COLOUR: Final = re.compile(r"\x1b\[[0-9;]*m")  # of a compiler's messages
 REFUSED: Final[dict[str, str]] = {}  # by driver, why it cannot be compiled
 DRIVERS: Final[dict[tuple[Any, ...], Any]] = {}  # compiled loops of this process; None: it cannot be compiled
 RECENT: Final[dict[bytes, Prepared]] = {}  # of cases that this process has flown; a few
-MOST: Final = 8  # of those
+MAX_RECENT: Final = 8  # of those
 STEADY: Final = frozenset({"numpy", "msgspec"})  # of others, but no plug-ins
 
 
@@ -244,7 +244,7 @@ class Stretches:
         run = driver(kinds, of_ledger)
         if run is None:
             return None
-        while len(RECENT) >= MOST:
+        while len(RECENT) >= MAX_RECENT:
             del RECENT[next(iter(RECENT))]
         RECENT[self._case] = made = Prepared([*groups.values()], kinds, of_ledger, run)
         return made

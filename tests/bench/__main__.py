@@ -9,7 +9,7 @@ import re
 import time
 from pathlib import Path
 
-from experiments.recording.version import SHOWN, provenance
+from experiments.recording.version import DIGEST_CHARACTERS, provenance
 from tests.bench import growth, peers
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "results" / "peers.md"
@@ -33,7 +33,7 @@ def circumstances() -> str:
     here = provenance()
     memory = f"{here.cores} cores, {here.memory_gb:.0f} GB, other work on them: load {here.load}"
     day = time.strftime("%Y-%m-%d")
-    return f"Commit {here.commit[:SHOWN]}, {day}; {here.cpu}, {memory}; Python {here.python}."
+    return f"Commit {here.commit[:DIGEST_CHARACTERS]}, {day}; {here.cpu}, {memory}; Python {here.python}."
 
 
 def main() -> None:

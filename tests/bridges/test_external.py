@@ -19,7 +19,7 @@ from agents.network import messages, pubsub
 from agents.network import session as network
 from agents.network.endpoints import free_endpoint
 from agents.network.keys import Keys
-from agents.safety.detection import SLOWEST
+from agents.safety.detection import LOWEST_DESCENT_M_S
 from agents.vectors import NO_SETPOINT, ZERO, Setpoint, Vector
 from bridges import measured_flight
 from bridges.external import ExternalBody
@@ -421,7 +421,7 @@ def test_unseen_landing_ends_at_last(body: ExternalBody, far: FarEnd, monkeypatc
     body.land([0, 1])
     told = time.monotonic()
     drive.until(lambda: not drive.flying[0], "nobody has seen it for long")
-    assert time.monotonic() - told > 0.5 / SLOWEST, "from 0.5 m it may take so long"
+    assert time.monotonic() - told > 0.5 / LOWEST_DESCENT_M_S, "from 0.5 m it may take so long"
     assert drive.flying[1]  # this one is seen, and does not come down
     assert drive.notes[0].startswith("no position for")
 

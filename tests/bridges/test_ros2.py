@@ -477,7 +477,7 @@ def test_goals_come_in(router, bridge, eventually):
         eventually(lambda: samples.extend(received(goals)) or len(samples) >= 2)
         first, second = (messages.decode(s.payload.to_bytes(), str(s.encoding), messages.Goal) for s in samples)
         for goal in (first, second):
-            validation.check_goal(goal, now=time.time(), reach=(3.0, 3.0, 3.0), oldest_s=1.0)
+            validation.check_goal(goal, now=time.time(), valid_box=(3.0, 3.0, 3.0), oldest_s=1.0)
         assert (second.seq - first.seq, first.pose) == (1, 1700000000.5)
         assert (first.robot, first.position) == ("CF01", (1.5, 0.25, 0.5))
         assert first.yaw == pytest.approx(0.5)

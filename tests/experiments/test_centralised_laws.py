@@ -65,7 +65,7 @@ def test_velocity_of_a_goal_is_checked_and_kept():
     for velocity in ([0.1], [0.1, 99.0], [float("nan"), 0.0], [0.0] * 4):
         goal = messages.Goal("A", 1, 2.0, (0.0, 0.0, 0.0), None, 2.0, velocity)
         with pytest.raises(Malformed, match="velocity"):
-            validation.check_goal(goal, now=2.0, reach=(1.0, 1.0, 1.0), oldest_s=1.0)
+            validation.check_goal(goal, now=2.0, valid_box=(1.0, 1.0, 1.0), oldest_s=1.0)
     assert messages.wanted((0.1, 0.2, float("nan"))) == [0.1, 0.2]
     assert messages.wanted((float("nan"),) * 3) is None
     guidance = ReceivedGoals(flies=True, silence_s=1.0)

@@ -63,7 +63,7 @@ def robot() -> Iterator[Target]:
     def make():
         net.forget()
         body = assemble(bodies.body_request(Plan(experiment), ["KH01"], 1, ["tcp/127.0.0.1:1"]))
-        setup = Setup(KEYS, [], "json", 50.0, lifeline=False, located=[True], ranging=["world"])
+        setup = Setup(KEYS, [], "json", 50.0, lifeline=False, externally_measured=[True], ranging=["world"])
         runtime = Runtime([Plan(experiment).assignment("KH01")], body, setup)
         body.open()
         runtime.subscribe_to_stops(net.session)
@@ -112,7 +112,7 @@ def world() -> Iterator[Target]:
     """The twin service: commands, states of those elsewhere, statuses, and orders to put things in and out."""
     from experiments.real_time.processes.joining import Network  # noqa: PLC0415
     from experiments.real_time.processes.world import WorldProcess  # noqa: PLC0415
-    from experiments.real_time.processes.world_population import Population  # noqa: PLC0415
+    from experiments.real_time.processes.world_population import WorldBodies  # noqa: PLC0415
 
     changes = ["robots.KH01.body=world", "robots.KH02.body=world", "world.engine=pymunk"]
     experiment = document.read("triangle", changes).experiment
@@ -120,7 +120,7 @@ def world() -> Iterator[Target]:
     def make():
         net.forget()
         joint = Network(net.session, KEYS, [], [], OwnershipCheck([]))  # type: ignore[arg-type]
-        process = WorldProcess(Plan(experiment), Population(Plan(experiment)), joint, Event())
+        process = WorldProcess(Plan(experiment), WorldBodies(Plan(experiment)), joint, Event())
         process.exchange.utc = time.time()
         t = 0.0
 

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from agents.network.endpoints import EndpointError, free_endpoint
 from agents.plugins import registry
-from experiments.recording.version import SHOWN, digest, provenance
+from experiments.recording.version import DIGEST_CHARACTERS, digest, provenance
 from tools.main import app, main, part_for
 from tools.options import PANELS
 
@@ -209,7 +209,7 @@ def test_an_emergency_stop_waits_for_no_numpy():
 def test_version():
     done = zenpark("--version")
     assert (done.returncode, done.stdout, done.stderr) == (0, f"{provenance().words[0]}\n", "")
-    assert done.stdout.startswith(f"zenpark 0.1.0, code {digest()[:SHOWN]}")
+    assert done.stdout.startswith(f"zenpark 0.1.0, code {digest()[:DIGEST_CHARACTERS]}")
 
 
 @pytest.mark.parametrize(

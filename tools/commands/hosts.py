@@ -123,7 +123,9 @@ def install(file: File, settings: Settings = None, on: On = None, lab: Lab = Non
             shown.append(row)
             same = not isinstance(there, HostError) and there.same_version
             try:
-                row["zenpark"] = f"has it already ({version.digest()[: version.SHOWN]})" if same else put(name, host)
+                row["zenpark"] = (
+                    f"has it already ({version.digest()[: version.DIGEST_CHARACTERS]})" if same else put(name, host)
+                )
                 if not as_json:
                     print(f"{name}: {row['zenpark']}", flush=True)
                 if folder is not None and host.robots:
@@ -237,12 +239,12 @@ def _fill(row: HostRow, there: Station, plan: Plan) -> None:
     from experiments.real_time.hosts.station import Question
     from experiments.recording import version
 
-    here = version.digest()[: version.SHOWN]
+    here = version.digest()[: version.DIGEST_CHARACTERS]
     row.cells.append(f"{YES} {there.hello.machine}")
     if there.same_version:
         row.cells.append(f"{YES} {here}")
     else:
-        row.cells.append(f"{NO} {there.hello.zenpark[: version.SHOWN]}, here {here}")
+        row.cells.append(f"{NO} {there.hello.zenpark[: version.DIGEST_CHARACTERS]}, here {here}")
         row.trouble.append(
             f"{there.name}: another zenpark is there; `./zenpark hosts install FILE` puts this one there"
         )

@@ -32,7 +32,7 @@ from twins.arrays import Array
 from twins.devices.device import CaptureFault, Faults, FaultyLink, serve_until_next
 
 BACKLOG: Final = 1 << 18  # [bytes] largest queue of a client; a slower client misses frames
-REACH: Final = (1e3, 1e3, 1e3)  # [m] bounds of valid positions: any room
+VALID_BOX: Final = (1e3, 1e3, 1e3)  # [m] bounds of valid positions: any room
 FRESH_S: Final = 0.5  # a robot with an older true pose is not visible
 
 
@@ -236,7 +236,7 @@ class TruthSubscription:
 
     def update(self, vicon: ViconTwin, now: float) -> None:
         """Place every robot with a fresh pose at UTC time `now` [s], and hide the others."""
-        check = partial(validation.check_position, now=now, reach=REACH)
+        check = partial(validation.check_position, now=now, valid_box=VALID_BOX)
         for row, inbox in enumerate(self._inboxes):
             for truth in inbox.read(check):
                 self._stamp[row] = truth.stamp

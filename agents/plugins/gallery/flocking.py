@@ -11,7 +11,7 @@ from agents.plugins.law import Control, Law, Memory, RobotFacts, View
 from agents.vectors import NotNegative, Positive
 
 EPSILON = 5.0  # of the σ-norm, where lengths are in spacings
-REACH = 1.2  # spacings at which robots act on each other
+INTERACTION_RANGE = 1.2  # spacings at which robots act on each other
 FLAT = 0.2  # share of the reach below which they do so in full
 
 
@@ -48,7 +48,7 @@ class Flocking(Law, frozen=True):
         uy = -self.pull * (y - self.place[1] - t * self.velocity[1]) - self.damping * (vy - self.velocity[1])
         for each in view.neighbours:
             dx, dy = (each.position[0] - x) / self.spacing, (each.position[1] - y) / self.spacing
-            near = bump(sigma(hypot(dx, dy)) / sigma(REACH))
+            near = bump(sigma(hypot(dx, dy)) / sigma(INTERACTION_RANGE))
             apart = sigma(hypot(dx, dy)) - sigma(1.0)
             action = self.spacing * self.stiffness * near * apart / sqrt(1.0 + apart * apart)
             action /= sqrt(1.0 + EPSILON * (dx * dx + dy * dy))

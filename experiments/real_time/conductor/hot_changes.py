@@ -13,13 +13,14 @@ from typing import Final
 
 import zenoh
 
+from agents.errors import Refusal
 from agents.network import messages
 from agents.network.keys import Keys
 from agents.plugins.registry import did_you_mean
 from experiments.definition.plan import Plan
 from experiments.real_time.conductor import replacement
 from experiments.real_time.conductor.case_processes import CaseProcesses
-from experiments.real_time.conductor.replacement import Refused, in_the_way
+from experiments.real_time.conductor.replacement import in_the_way
 from experiments.real_time.conductor.run_view import FROZEN_S, NetworkView
 from experiments.real_time.hosts.launcher import LAND_S
 
@@ -27,7 +28,7 @@ CLIMB_S: Final = 15.0  # limit for a robot to climb
 READY_S: Final = 5.0  # a robot starts later, and counts the deadline of the file from then
 ROOM_S: Final = 20.0  # limit for the place of a robot to become free, where no operator waits for an answer
 RESTARTS: Final = 3  # a robot that is lost more often is not helped by a restart
-MOST: Final = 100  # orders at once
+MAX_ORDERS: Final = 100  # orders at once
 INSIST_S: Final = 5.0  # an order that a robot refuses is repeated for this long,
 AGAIN_S: Final = 0.5  # with this period
 
@@ -118,7 +119,7 @@ class HotChanges:
                 next(change.steps)
             except StopIteration as end:
                 self._answer(change, done=str(end.value))
-            except Refused as refusal:
+            except Refusal as refusal:
                 self._answer(change, refused=str(refusal))
             else:
                 continue
@@ -147,8 +148,8 @@ class HotChanges:
                 "robots can be changed between the common start and the landing, and this run is not there: "
                 "ask again after it has begun"
             )
-        if len(self._pending) >= MOST:
-            yield f"{MOST} orders are under way; wait for them"
+        if len(self._pending) >= MAX_ORDERS:
+            yield f"{MAX_ORDERS} orders are under way; wait for them"
         others = (order.spare, order.body, order.at)
         if order.order != "replace" and any(other is not None for other in others):
             yield f"`with`, `body` and `at` belong to replace, not to {order.order}"
@@ -213,7 +214,7 @@ class HotChanges:
         self._leaving |= {*there}
         for name, reply in self._view.order(there, messages.Order("leave")).items():
             if not reply.ok and name in self._processes.adopted:
-                raise Refused(f"{name} does not answer, and was not started from here: end its process where it runs")
+                raise Refusal(f"{name} does not answer, and was not started from here: end its process where it runs")
             if not reply.ok:
                 self._view.report("silent", name, f"does not answer ({reply.reason}): its lifeline is cut")
                 self._processes.release(name)
@@ -221,14 +222,14 @@ class HotChanges:
         while still := [name for name in there if self._robots[name].alive or self._process_must_end(name, names)]:
             past = time.monotonic() - began
             if past > LAND_S and any(name in self._processes.adopted for name in still):
-                raise Refused(f"{', '.join(still)}: ordered to land, but still there after {LAND_S:g} s")
+                raise Refusal(f"{', '.join(still)}: ordered to land, but still there after {LAND_S:g} s")
             if not killed and (past > LAND_S or (past > FROZEN_S and all(map(self._frozen, still)))):
                 killed = True
                 for name in still:
                     self._view.report("killed", name, f"still there after {past:.0f} s")
                     self._processes.kill(name)
             if past > LAND_S + FROZEN_S:
-                raise Refused(f"{', '.join(still)}: cannot be ended")
+                raise Refusal(f"{', '.join(still)}: cannot be ended")
             yield
         for name in names:
             self._robots[name].left_because = "removed"
@@ -250,13 +251,13 @@ class HotChanges:
         asked = time.monotonic()
         by_hand = all(robots[name].alive and not processes.runs(name) for name in names)
         if order.order == "add" and any(robots[name].reached("airborne") and not robots[name].gone for name in names):
-            raise Refused("takes part already; `./zenpark robot restart` restarts it")
+            raise Refusal("takes part already; `./zenpark robot restart` restarts it")
         if by_hand and not any(robots[name].reached("airborne") for name in names):
             processes.adopted |= {*names}
             yield from self._join(names)
             return f"takes part after {time.monotonic() - asked:.1f} s"
         if foreign := [name for name in names if name in processes.adopted or name in processes.away]:
-            raise Refused(
+            raise Refusal(
                 f"{', '.join(foreign)} was not started from here: end its process and start it again where it runs, "
                 f"then `./zenpark robot add {' '.join(foreign)}`"
             )
@@ -275,7 +276,7 @@ class HotChanges:
         asked = time.monotonic()
         name = names[0]
         if len(self._processes.companions(name)) > 1:
-            raise Refused(f"{name} shares its process with others: restart them together instead")
+            raise Refusal(f"{name} shares its process with others: restart them together instead")
         next_one, spare = self._spares.successor(name, self._processes.robot(name), order)
         if next_one.body == replacement.TWIN:
             places = {name: tuple(self._processes.place(name, next_one))}
@@ -303,7 +304,7 @@ class HotChanges:
                 start = messages.Order("start", at=self._start, origin=robots[name].origin)
                 yield from self._repeat_order([name], start)
             yield from self._reach(names, "running", FROZEN_S)
-        except Refused:
+        except Refusal:
             self._leaving |= {*names}
             self._view.order(names, messages.Order("leave"))
             for name in names:
@@ -317,7 +318,7 @@ class HotChanges:
         while refused := {name: reply for name, reply in self._view.order(left, order).items() if not reply.ok}:
             asked = time.monotonic()
             if asked - began > INSIST_S:
-                raise Refused("; ".join(f"{name}, {order.order}: {reply.reason}" for name, reply in refused.items()))
+                raise Refusal("; ".join(f"{name}, {order.order}: {reply.reason}" for name, reply in refused.items()))
             left = list(refused)
             while time.monotonic() - asked < AGAIN_S:
                 yield
@@ -326,18 +327,18 @@ class HotChanges:
         began = time.monotonic()
         while late := [name for name in names if not self._robots[name].reached(phase)]:
             if ended := next((name for name in names if name in self._ended), None):
-                raise Refused(f"{ended}: {self._ended[ended]}")
+                raise Refusal(f"{ended}: {self._ended[ended]}")
             if time.monotonic() - began > limit_s:
                 status = self._robots[late[0]].status
                 why = "no status of its process" if status is None else status.reason or f"it is {status.phase}"
-                raise Refused(f"{', '.join(late)}: not {phase} after {limit_s:g} s: {why}")
+                raise Refusal(f"{', '.join(late)}: not {phase} after {limit_s:g} s: {why}")
             yield
 
     def _require_whole(self, names: Sequence[str]) -> None:
         """Refuse to restart a process for only some of its robots."""
         together = self._processes.companions(names[0])
         if others := [name for name in together if name not in names]:
-            raise Refused(
+            raise Refusal(
                 f"{', '.join(names)} shares a process with {', '.join(others)}: name them all, "
                 f"`./zenpark robot restart {' '.join(together)}`"
             )
@@ -362,5 +363,5 @@ class HotChanges:
             if not any(found):
                 return
             if time.monotonic() - began >= patience_s:
-                raise Refused(next(filter(None, found)))
+                raise Refusal(next(filter(None, found)))
             yield

@@ -9,6 +9,7 @@ from typing import Final
 import msgspec
 
 from agents.body.kinds import KINDS
+from agents.errors import Refusal
 from agents.network import messages
 from agents.plugins import registry
 from agents.plugins.registry import did_you_mean
@@ -18,10 +19,6 @@ from experiments.real_time.conductor.run_view import RobotView
 
 TWIN: Final = "twin"  # a body that is there as long as its process
 OF_BODY: Final = ("body", "start", "hover", "position", "device", "sensors", "ranges")  # fields of a spare
-
-
-class Refused(RuntimeError):
-    """A change that is not made, with reason and remedy."""
 
 
 class Spares:
@@ -39,10 +36,10 @@ class Spares:
         if spare is None and order.body is None:
             spare = self._first_spare(name, robot.kind)
         if spare is not None and order.body is not None:
-            raise Refused("a spare has a body of its own: leave --body or --with out")
+            raise Refusal("a spare has a body of its own: leave --body or --with out")
         made = self._of_spare(spare, name, robot) if spare is not None else self._of_body(order.body or "", robot)
         if WORLD in (robot.body, made.body) and robot.body != made.body:
-            raise Refused("a robot cannot go into the world, or out of it, in mid-run")
+            raise Refusal("a robot cannot go into the world, or out of it, in mid-run")
         if order.at is not None:
             made = self._put(made, order.at, order.yaw)
         return made, spare
@@ -51,7 +48,7 @@ class Spares:
         for spare, robot in self._spares.items():
             if robot.kind == kind and spare not in self.used:
                 return spare
-        raise Refused(
+        raise Refusal(
             f"the file has no spare {kind} left for {name}: say which body takes over, --body URI, or add [spares.NAME]"
         )
 
@@ -59,11 +56,11 @@ class Spares:
         spares = self._spares
         if spare not in spares:
             there = did_you_mean(spare[:50], spares) if spares else "the file has none"
-            raise Refused(f"no spare '{spare[:50]}'; {there}")
+            raise Refusal(f"no spare '{spare[:50]}'; {there}")
         if spare in self.used:
-            raise Refused(f"{spare} has taken over {self.used[spare]} already")
+            raise Refusal(f"{spare} has taken over {self.used[spare]} already")
         if spares[spare].kind != robot.kind:
-            raise Refused(f"{spare} is a {spares[spare].kind} and cannot be {name}, a {robot.kind}")
+            raise Refusal(f"{spare} is a {spares[spare].kind} and cannot be {name}, a {robot.kind}")
         brought = {field: getattr(spares[spare], field) for field in OF_BODY}
         return msgspec.structs.replace(robot, **brought, process=None, shadow=None)
 
@@ -71,18 +68,18 @@ class Spares:
     def _of_body(body: str, robot: Robot) -> Robot:
         word, known = registry.body_name(body), registry.names(registry.BODIES)
         if word in registry.names(registry.DEVICES):
-            raise Refused(f"{word} needs a simulated device, which is started before the run only")
+            raise Refusal(f"{word} needs a simulated device, which is started before the run only")
         if word not in known:
-            raise Refused(f"no {word[:50]!r} among the bodies; {did_you_mean(word[:50], known)}")
+            raise Refusal(f"no {word[:50]!r} among the bodies; {did_you_mean(word[:50], known)}")
         device = robot.device if word == registry.body_name(robot.body) else {}
         return msgspec.structs.replace(robot, body=body, device=device, process=None, shadow=None)
 
     def _put(self, robot: Robot, at: tuple[float, float], yaw: float) -> Robot:
         if robot.body != TWIN:
-            raise Refused("only a twin can be put somewhere: put the robot there yourself, and leave --at out")
+            raise Refusal("only a twin can be put somewhere: put the robot there yourself, and leave --at out")
         half = [size / 2 for size in self._arena.size[:2]]
         if not math.isfinite(yaw) or not all(abs(x) <= limit for x, limit in zip(at, half, strict=True)):
-            raise Refused(f"--at lies outside of the arena, ±{half[0]:g} by ±{half[1]:g} m")
+            raise Refusal(f"--at lies outside of the arena, ±{half[0]:g} by ±{half[1]:g} m")
         return msgspec.structs.replace(robot, start=[*at, yaw])
 
 

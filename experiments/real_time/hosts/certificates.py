@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from experiments.definition.experiment import Host
 
 INSTALL: Final = "`./zenpark hosts install FILE` puts the right ones there"
-SHOWN: Final = 12  # digits of a fingerprint, for people
+FINGERPRINT_DIGITS: Final = 12  # digits of a fingerprint, for people
 
 
 class IdentityFiles(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -127,7 +127,7 @@ def faults(found: FolderContent, folder: Path, there: float) -> Iterator[str]:
     if theirs != ours:
         yield (
             f"its certificates are of another lab, or of an authority that has been renewed since (ca.pem "
-            f"{theirs[:SHOWN]}, here {ours[:SHOWN]}); {INSTALL}"
+            f"{theirs[:FINGERPRINT_DIGITS]}, here {ours[:FINGERPRINT_DIGITS]}); {INSTALL}"
         )
         return
     known = register(folder).identities

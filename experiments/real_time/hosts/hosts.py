@@ -287,6 +287,6 @@ class Hosts:
 
 
 def _other_version(station: Station) -> str:
-    there, here = station.hello.zenpark[: version.SHOWN], version.digest()[: version.SHOWN]
+    there, here = station.hello.zenpark[: version.DIGEST_CHARACTERS], version.digest()[: version.DIGEST_CHARACTERS]
     remedy = "`./zenpark hosts install FILE` puts this one there"
     return f"{station.name}: another zenpark is there ({there}, here {here}); {remedy}"

@@ -48,7 +48,7 @@ def put(name: str, host: Host) -> str:
         late=f"not ready after {INSTALL_S / 60:g} minutes; start {place} there by hand",
         failed="not installed: ",
     )
-    return f"{output.strip()} ({version.digest()[: version.SHOWN]}) installed"
+    return f"{output.strip()} ({version.digest()[: version.DIGEST_CHARACTERS]}) installed"
 
 
 def packed(root: Path, names: Sequence[str], mode: int | None = None) -> bytes:

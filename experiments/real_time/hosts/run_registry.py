@@ -23,7 +23,7 @@ from agents.network import lab
 from agents.network.endpoints import UNIX, Endpoint
 from agents.user_folder import runtime_folder
 
-LARGEST: Final = 1 << 20  # [bytes] of a file
+MAX_ENTRY_BYTES: Final = 1 << 20  # [bytes] of a file
 KNOCK_S: Final = 0.3  # longest time of a local router to accept a connection
 
 
@@ -136,7 +136,7 @@ def _read(file: Path) -> Run | None:
     """A run's file, if it is one of this user's."""
     try:
         about = file.lstat()
-        if not stat.S_ISREG(about.st_mode) or about.st_uid != os.getuid() or about.st_size > LARGEST:
+        if not stat.S_ISREG(about.st_mode) or about.st_uid != os.getuid() or about.st_size > MAX_ENTRY_BYTES:
             return None
         run = msgspec.json.decode(file.read_bytes(), type=Run)
         for endpoint in topology.bare(run.endpoints):

@@ -23,7 +23,7 @@ from agents.network import messages, pubsub
 from agents.network import session as network
 from agents.network.keys import Keys
 from agents.network.shutdown import end
-from agents.network.validation import reach_of
+from agents.network.validation import valid_box_of
 from agents.runtime import command_line
 from agents.runtime.pose_inbox import ModelledInbox
 from agents.runtime.telemetry import resident_mb
@@ -61,7 +61,7 @@ class CentreProcess:
         self._poses = ModelledInbox(
             session, keys, {names[row]: [row] for row in rows},
             conditions_of(plan, ends, experiment.seed, stream=TO_CENTRE, real=True), centre,
-            reach=reach_of(common.limits.low, common.limits.high), rate=experiment.rates.pose_hz, depth=DEPTH,
+            valid_box=valid_box_of(common.limits.low, common.limits.high), rate=experiment.rates.pose_hz, depth=DEPTH,
             counted=self._within_run,
         )  # fmt: skip
         self._received = [0] * len(names)

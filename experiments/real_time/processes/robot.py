@@ -48,7 +48,7 @@ from experiments.real_time.processes.joining import Launch
 
 STDIN: Final = "-"
 JOIN: Final = "join"
-FAR: Final = ("external", "world")  # bodies in another process, with their range sensors
+REMOTE_BODIES: Final = ("external", "world")  # bodies in another process, with their range sensors
 EXPERIMENT_S: Final = 15.0  # how long an experiment may take to arrive on standard input
 
 
@@ -105,7 +105,7 @@ def _run(plan: Plan, launch: RobotLaunch, endpoints: Sequence[str]) -> int:
         state_hz=experiment.rates.state_hz,
         lifeline=launch.lifeline,
         lifeline_s=FAR_SILENCE_S if launch.file == STDIN else SILENCE_S,
-        located=[experiment.robots[name].position == "external" for name in names],
+        externally_measured=[experiment.robots[name].position == "external" for name in names],
         exact=[name not in plan.externally_measured for name in names],
         ranging=[_ranging(experiment.robots[name]) for name in names],
         conditions=[
@@ -147,8 +147,8 @@ def read_experiment() -> str:
 
 def _ranging(robot: Robot) -> Ranging:
     """Source of the range readings of a robot: bodies in other processes receive them by themselves."""
-    if registry.body_name(robot.body) in FAR:
-        return "far"
+    if registry.body_name(robot.body) in REMOTE_BODIES:
+        return "remote"
     return robot.ranges
 
 

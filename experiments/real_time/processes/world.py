@@ -17,6 +17,7 @@ import msgspec
 import zenoh
 
 from agents.clock import uptime
+from agents.errors import Refusal
 from agents.network import messages, pubsub
 from agents.network.keys import Keys
 from agents.network.shutdown import Farewell, end
@@ -26,8 +27,8 @@ from experiments.definition.experiment import WORLD
 from experiments.definition.plan import Plan
 from experiments.file.problems import refusal
 from experiments.real_time.processes.joining import Launch, Network, joined
-from experiments.real_time.processes.world_network import Exchange
-from experiments.real_time.processes.world_population import Population, Refused
+from experiments.real_time.processes.world_network import WorldNetwork
+from experiments.real_time.processes.world_population import WorldBodies
 
 REPORT_S: Final = 1.0
 SLIP_S: Final = 0.05  # lateness that is caught up; the rest of the time is lost, which shows in the factor
@@ -59,7 +60,7 @@ class WorldProcess:
     def __init__(
         self,
         plan: Plan,
-        population: Population,
+        population: WorldBodies,
         joint: Network,
         lost: threading.Event,
         clock: Callable[[], float] = uptime,
@@ -70,7 +71,7 @@ class WorldProcess:
         self._population, self._session, self._lost = population, session, lost
         self._engine, hz = plan.engine_name, plan.experiment.rates.body_hz
         self._ticks = Ticks(hz, catch_up=round(SLIP_S * hz), clock=clock)
-        self.exchange = Exchange(plan, population, joint)
+        self.exchange = WorldNetwork(plan, population, joint)
         self._reports = pubsub.pose_publisher(session, self._keys.world, messages.JSON)
         self._orders = pubsub.Orders(session, self._keys.world_order, messages.WorldOrder)
         self._pace = Pace()
@@ -132,7 +133,7 @@ class WorldProcess:
             reason = ""
             try:
                 self._carry_out(order)
-            except Refused as refusal:
+            except Refusal as refusal:
                 reason = str(refusal)
                 self.exchange.events.refuse("world", f"{order.order}: {reason}")
             reply = messages.WorldReply(not reason, self.paused, round(self._population.time, 6), reason)
@@ -190,7 +191,7 @@ def serve(launch: WorldLaunch) -> int:
     def leave() -> None:
         (over if lost.is_set() else lost).set()  # a second signal does not wait for robots to land
 
-    population = Population(plan)
+    population = WorldBodies(plan)
     with joined(
         plan,
         endpoints,

@@ -25,7 +25,7 @@ from agents.vectors import NO_SETPOINT, UNKNOWN, ZERO, Vector
 from experiments.definition.experiment import WORLD
 from experiments.definition.plan import Plan
 from experiments.real_time.processes.joining import Network
-from experiments.real_time.processes.world_population import HOLD_S, Meeting, Population
+from experiments.real_time.processes.world_population import HOLD_S, ContactBegin, WorldBodies
 
 DEPTH: Final = 16_384  # queued commands: those of two hundred robots in 0.8 s
 TRUTH_HZ: Final = 50.0
@@ -40,12 +40,12 @@ UP: Final = ("ready", "airborne", "running", "landing")  # phases in which a rob
 UNDER_WAY: Final = ("airborne", "running")
 
 
-class Exchange:
+class WorldNetwork:
     """The network of a world. Times `t` are on the clock of the world [s]."""
 
     utc: float  # [s] UTC at which the clock of the world was 0
 
-    def __init__(self, plan: Plan, population: Population, joint: Network) -> None:
+    def __init__(self, plan: Plan, population: WorldBodies, joint: Network) -> None:
         self._clock = Clock()
         self.utc = self._clock.utc()
         self.events = Events(joint, self._clock)
@@ -109,7 +109,7 @@ class Events:
 class Commands:
     """Commands to the simulated robots: received, checked, applied; robots without commands hold, then land."""
 
-    def __init__(self, plan: Plan, population: Population, joint: Network, events: Events) -> None:
+    def __init__(self, plan: Plan, population: WorldBodies, joint: Network, events: Events) -> None:
         session, keys, names = joint.session, joint.keys, population.names
         self._population, self._session, self._keys, self._events = population, session, keys, events
         # commands to robots with another body are for another simulator
@@ -237,11 +237,11 @@ class Commands:
 class States:
     """States and statuses of the robots: poses of mirrored ones, former poses of simulated ones, start of the run."""
 
-    def __init__(self, plan: Plan, population: Population, joint: Network, events: Events, clock: Clock) -> None:
+    def __init__(self, plan: Plan, population: WorldBodies, joint: Network, events: Events, clock: Clock) -> None:
         self._population, self._session, self._keys, self._events = population, joint.session, joint.keys, events
         self._clock, self._names = clock, population.names
         x, y, z = plan.experiment.arena.size
-        self._reach = validation.reach_of((-0.5 * x, -0.5 * y, 0.0), (0.5 * x, 0.5 * y, z))
+        self._valid_box = validation.valid_box_of((-0.5 * x, -0.5 * y, 0.0), (0.5 * x, 0.5 * y, z))
         self._statuses = pubsub.Inbox(
             pubsub.pose_subscriber(joint.session, joint.keys.status("*"), 1024),
             messages.Status,
@@ -314,7 +314,7 @@ class States:
     def _newest(self, inbox: pubsub.Inbox[messages.State]) -> messages.State | None:
         """The newest valid state that has a position."""
         found = None
-        check = partial(validation.check_state, now=self._clock.utc(), reach=self._reach)
+        check = partial(validation.check_state, now=self._clock.utc(), valid_box=self._valid_box)
         for state in inbox.read(check):
             if state.position is not None:
                 found = state
@@ -337,7 +337,7 @@ class Publications:
 
     contacts = 0  # that have begun
 
-    def __init__(self, plan: Plan, population: Population, joint: Network, events: Events) -> None:
+    def __init__(self, plan: Plan, population: WorldBodies, joint: Network, events: Events) -> None:
         session, keys, experiment = joint.session, joint.keys, plan.experiment
         names = self._names = population.names
         self._population, self._events = population, events
@@ -375,7 +375,7 @@ class Publications:
         for meeting in self._population.meetings():
             self._publish_contact(meeting, stamp)
 
-    def _publish_contact(self, meeting: Meeting, stamp: float) -> None:
+    def _publish_contact(self, meeting: ContactBegin, stamp: float) -> None:
         self.contacts += 1
         contact = messages.Contact(stamp, meeting.first, meeting.second, meeting.impulse, meeting.overlap)
         self._contacts.put(messages.encode(contact))

@@ -10,6 +10,7 @@ from typing import Final
 import numpy as np
 
 from agents.body.interface import BodyState
+from agents.errors import Refusal
 from agents.plugins import registry
 from agents.vectors import NO_SETPOINT, Setpoint
 from experiments.definition import bodies
@@ -22,12 +23,8 @@ WALL: Final = "wall"  # name of the walls of the arena in contacts
 HOLD_S: Final = 0.5  # without a command for this long a flying robot holds its position
 
 
-class Refused(ValueError):
-    """An order that a world cannot carry out, with reason and remedy."""
-
-
 @dataclass(frozen=True)
-class Meeting:
+class ContactBegin:
     """Begin of a contact, by names."""
 
     first: str
@@ -36,7 +33,7 @@ class Meeting:
     overlap: float  # [m]
 
 
-class Population:
+class WorldBodies:
     """The robots of a world by their rows, and all that may happen to them."""
 
     names: tuple[str, ...]  # of the n rows: the robots of the experiment
@@ -98,13 +95,13 @@ class Population:
         self.body.place([row], [(x, y, z if flies else 0.0)], [yaw], [flying and flies])
         self.states = self.body.read(self._ticks * self._dt)
 
-    def meetings(self) -> list[Meeting]:
+    def meetings(self) -> list[ContactBegin]:
         """Contacts that have begun since the last call."""
         obstacles = (*self._scene.names, WALL)
         found = []
         for touch in self.body.touches():
             second = self.names[touch.second] if touch.second >= 0 else obstacles[-1 - touch.second]
-            found.append(Meeting(self.names[touch.first], second, touch.impulse, touch.overlap))
+            found.append(ContactBegin(self.names[touch.first], second, touch.impulse, touch.overlap))
         return found
 
     def obstacles(self) -> dict[str, tuple[float, float, float]]:
@@ -123,7 +120,7 @@ class Population:
         else:
             rows = [self._row(name)]
             if not self.carried[rows[0]]:
-                raise Refused(f"{name} is only mirrored here: it is where its own process says")
+                raise Refusal(f"{name} is only mirrored here: it is where its own process says")
             self._require_room(rows[0])
         for row in rows:
             flying, (x, y, _), yaw = before[row].flying, *self._home[row]
@@ -146,7 +143,7 @@ class Population:
 
     def _row(self, name: str) -> int:
         if name not in self.names:
-            raise Refused(f"there is no '{name}' in this world; {registry.did_you_mean(name, self.names)}")
+            raise Refusal(f"there is no '{name}' in this world; {registry.did_you_mean(name, self.names)}")
         return self.names.index(name)
 
     def _require_room(self, row: int) -> None:
@@ -157,9 +154,9 @@ class Population:
                 apart = math.hypot(motion.position[0] - x, motion.position[1] - y)
                 gap = apart - own.radius - kind.radius
                 if gap < 0.0:
-                    raise Refused(f"{name} would overlap {self.names[other]} by {-1e3 * gap:.0f} mm: move that first")
+                    raise Refusal(f"{name} would overlap {self.names[other]} by {-1e3 * gap:.0f} mm: move that first")
         poses = np.array(self.body.engine.obstacles).reshape(-1, 3)
         for k, obstacle in enumerate(self._scene.names):
             gap = float(scene.distance(self._scene, k, poses[k], np.array([x, y]))) - own.radius
             if self._scene.bottom[k] < own.height and gap < 0.0:
-                raise Refused(f"{name} would overlap {obstacle} by {-1e3 * gap:.0f} mm: reset all")
+                raise Refusal(f"{name} would overlap {obstacle} by {-1e3 * gap:.0f} mm: reset all")

@@ -69,7 +69,7 @@ def flown(
     net = Net()
     with net.worn():
         body = assemble(bodies.body_request(Plan(few), ("T",), 1))
-        setup = Setup(KEYS, [], "json", 50.0, lifeline=False, located=[True])
+        setup = Setup(KEYS, [], "json", 50.0, lifeline=False, externally_measured=[True])
         runtime = Runtime([Plan(few).assignment("T")], body, setup)
         body.open()
         runtime.subscribe_to_stops(net.session)  # type: ignore[arg-type]

@@ -8,7 +8,7 @@ import pytest
 from agents.body.interface import BodyState, RangeScan
 from agents.body.limits import Limits
 from agents.decision.neighbours import Incoming, Neighbours
-from agents.decision.perception import AHEAD_S, DESCENT_S, REACH, SCAN_S, Perception
+from agents.decision.perception import AHEAD_S, DESCENT_S, SCAN_S, SIGHT_M, Perception
 from agents.decision.situation import Situation
 from agents.kinds.crazyflie import CRAZYFLIE
 from agents.kinds.khepera4 import KHEPERA4
@@ -109,8 +109,8 @@ def test_things_above_and_below_are_ignored(height, there):
 
 
 def test_far_or_never_received_robots_are_ignored():
-    assert len(Sight().hear((REACH - 0.01, 0.0, 0.0), stamp=9.0).sense(9.0)) == 1
-    assert Sight().hear((REACH + 0.01, 0.0, 0.0), stamp=9.0).sense(9.0) == []
+    assert len(Sight().hear((SIGHT_M - 0.01, 0.0, 0.0), stamp=9.0).sense(9.0)) == 1
+    assert Sight().hear((SIGHT_M + 0.01, 0.0, 0.0), stamp=9.0).sense(9.0) == []
     assert Sight().sense(9.0) == []
 
 
@@ -162,7 +162,7 @@ def test_ray_ends_where_it_points():
     things, c, s = Sight().sense(0.0, (1.0, 2.0, 0.0), yaw=0.5, scan=scan), cos(0.5), sin(0.5)
     assert places(things) == [(1 + 0.4 * c, 2 + 0.4 * s), (1 - 0.9 * s, 2 + 0.9 * c)]
     assert not any(thing.radius or thing.is_robot or thing.velocity_x for thing in things)
-    assert Sight().sense(0.0, scan=rays([0.0], [REACH + 0.1])) == []
+    assert Sight().sense(0.0, scan=rays([0.0], [SIGHT_M + 0.1])) == []
 
 
 @pytest.mark.parametrize(

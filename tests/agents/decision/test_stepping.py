@@ -214,7 +214,7 @@ def test_poses_without_words_are_as_they_were():
 def test_impossible_words_are_refused(shared):
     pose = messages.Pose("A", 1, 2.0, (0.0, 0.0, 0.0), shared=shared)
     with pytest.raises(Malformed):
-        validation.check_pose(pose, now=2.0, reach=(1.0, 1.0, 1.0))
+        validation.check_pose(pose, now=2.0, valid_box=(1.0, 1.0, 1.0))
 
 
 def test_reference_moves_with_the_velocity_and_stays_near():

@@ -53,7 +53,7 @@ messages = st.one_of(
     st.builds(Event, number, word, word, word),
 )  # fmt: skip
 POSE = Pose("KH01", 3, 1000.0, (0.1, -0.2, 0.0), (0.01, 0.0, 0.0), 1.5)
-REACH = (2.0, 2.0, 3.5)
+VALID_BOX = (2.0, 2.0, 3.5)
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
@@ -147,7 +147,7 @@ def test_fields_of_other_types_are_malformed(value, field):
         return
     assert isinstance(value, int | float | str | list) or (value is None and field in {"velocity", "yaw"})
     try:
-        validation.check_pose(pose, now=1000.0, reach=REACH)
+        validation.check_pose(pose, now=1000.0, valid_box=VALID_BOX)
     except Malformed:
         return
     assert all(
@@ -228,8 +228,8 @@ def test_yaw_stays_within_half_a_turn():
         for said in poses:
             assert abs(said.yaw) <= math.pi
             assert math.cos(said.yaw - yaw) == pytest.approx(1.0, abs=1e-9)
-        validation.check_pose(poses[0], now=1000.0, reach=REACH)
-        validation.check_position(poses[1], now=1000.0, reach=REACH)
+        validation.check_pose(poses[0], now=1000.0, valid_box=VALID_BOX)
+        validation.check_position(poses[1], now=1000.0, valid_box=VALID_BOX)
     assert wire.heading(1.234567890123) == 1.234567890123
 
 

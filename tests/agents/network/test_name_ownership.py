@@ -238,7 +238,7 @@ def test_silent_router_frees_no_name(faked):
 def test_a_process_without_its_name_touches_no_body(reply, error):
     experiment = pair(robots={"F": Robot(kind="crazyflie", start=[0.1, 0.2], hover=0.5)}, formation=Formation())
     timing = OwnershipTiming(vanish_s=0.0, answer_s=0.0)
-    setup = Setup(Keys("park"), [], "json", 50.0, lifeline=False, located=[False], ownership=timing)
+    setup = Setup(Keys("park"), [], "json", 50.0, lifeline=False, externally_measured=[False], ownership=timing)
     body = Airborne()
     with Net().worn() as net:
         net.replies = [reply]
@@ -262,7 +262,7 @@ class Woken(Airborne):
 @pytest.mark.parametrize("way", ["still", "opening", "cut off"])
 def test_displaced_owner_leaves_the_body_alone(way, monkeypatch):
     experiment = pair(robots={"F": Robot(kind="crazyflie", start=[0.1, 0.2], hover=0.5)}, formation=Formation())
-    setup = Setup(Keys("park"), [], "json", 50.0, lifeline=False, located=[False], ownership=HASTY)
+    setup = Setup(Keys("park"), [], "json", 50.0, lifeline=False, externally_measured=[False], ownership=HASTY)
     body = Woken()
     told: list[int] = []
     now = [0.0]
@@ -304,7 +304,7 @@ class CountedToken:
 
 
 def test_late_alarm_leaves_the_tokens(monkeypatch):
-    setup = Setup(Keys("park"), [], "json", 50.0, lifeline=False, located=[False, False])
+    setup = Setup(Keys("park"), [], "json", 50.0, lifeline=False, externally_measured=[False, False])
     with Net().worn() as net, monkeypatch.context() as patched:
         patched.setattr(pubsub, "alive_token", CountedToken)
         robot = Runtime([Plan(pair()).assignment(name) for name in "AB"], Airborne(), setup)

@@ -9,12 +9,12 @@ from agents.network import validation
 from agents.network.messages import Command, Goal, Malformed, Pose, State
 
 POSE = Pose("KH01", 3, 1000.0, (0.1, -0.2, 0.0), (0.01, 0.0, 0.0), 1.5)
-REACH = (2.0, 2.0, 3.5)
+VALID_BOX = (2.0, 2.0, 3.5)
 
 
 def test_an_honest_pose_passes():
-    validation.check_pose(POSE, now=1000.0, reach=REACH)
-    validation.check_pose(POSE, now=1e9, reach=REACH)  # late joiners get old ones
+    validation.check_pose(POSE, now=1000.0, valid_box=VALID_BOX)
+    validation.check_pose(POSE, now=1e9, valid_box=VALID_BOX)  # late joiners get old ones
 
 
 @pytest.mark.parametrize(
@@ -41,7 +41,7 @@ def test_an_honest_pose_passes():
 def test_a_pose_that_no_robot_can_have(change, says):
     pose = msgspec.structs.replace(POSE, **change)
     with pytest.raises(Malformed, match=says):
-        validation.check_pose(pose, now=1000.0, reach=REACH)
+        validation.check_pose(pose, now=1000.0, valid_box=VALID_BOX)
 
 
 @pytest.mark.parametrize(
@@ -74,16 +74,16 @@ def test_commands_that_no_body_can_carry_out(command: Command, why: str) -> None
 )
 def test_states_of_mirrored_robots_that_cannot_be(changes: dict[str, object]) -> None:
     state = State("KH01", 1, 1000.0, "running", (1.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.5, None, None, 0.0)
-    validation.check_state(state, now=1000.0, reach=(2.0, 2.0, 2.0))
+    validation.check_state(state, now=1000.0, valid_box=(2.0, 2.0, 2.0))
     with pytest.raises(Malformed):
-        validation.check_state(msgspec.structs.replace(state, **changes), now=1000.0, reach=(2.0, 2.0, 2.0))
+        validation.check_state(msgspec.structs.replace(state, **changes), now=1000.0, valid_box=(2.0, 2.0, 2.0))
 
 
 GOAL = Goal("KH01", 7, 999.9, (0.5, -0.5, 0.0), 0.25, 999.85)
 
 
 def check_goal(**changes):
-    validation.check_goal(msgspec.structs.replace(GOAL, **changes), now=1000.0, reach=REACH, oldest_s=1.0)
+    validation.check_goal(msgspec.structs.replace(GOAL, **changes), now=1000.0, valid_box=VALID_BOX, oldest_s=1.0)
 
 
 def test_an_honest_goal_passes():

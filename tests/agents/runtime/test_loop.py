@@ -42,7 +42,7 @@ def test_standstill_skips_ticks_and_holds(stands_s, missed, holds, monkeypatch, 
         runtime = Runtime(
             [Plan(experiment).assignment("A")],
             body,
-            Setup(Keys("park"), [], "json", 50.0, lifeline=False, located=[False]),
+            Setup(Keys("park"), [], "json", 50.0, lifeline=False, externally_measured=[False]),
         )
         body.open()
         runtime.subscribe_to_stops(net.session)
@@ -85,7 +85,7 @@ class Stage:
         self.runtime = Runtime(
             [Plan(experiment).assignment("F")],
             self.body,
-            Setup(Keys("park"), [], "json", 50.0, lifeline=False, located=[False]),
+            Setup(Keys("park"), [], "json", 50.0, lifeline=False, externally_measured=[False]),
         )
         for order in ("takeoff", "land", "stop", "command"):
             monkeypatch.setattr(self.body, order, partial(self.note, order, getattr(self.body, order)))
@@ -218,7 +218,7 @@ class Faulty(Trigger, frozen=True):
 def test_plugins_of_all_robots_are_named():
     plan = Plan(pair())
     assignments = [plan.assignment("A"), replace(plan.assignment("B"), trigger=Faulty())]
-    setup = Setup(Keys("park"), [], "json", 50.0, lifeline=False, located=[False, False])
+    setup = Setup(Keys("park"), [], "json", 50.0, lifeline=False, externally_measured=[False, False])
     with Net().worn() as net:
         runtime = Runtime(assignments, assemble(bodies.body_request(plan, ("A", "B"), 1)), setup)
         runtime.subscribe_to_stops(net.session)

@@ -44,7 +44,11 @@ class Robot:
     def __init__(self, net: Net, conditions: Conditions | None = None) -> None:
         self.net, self.decision = net, Decision(Plan(pair()).assignment("A"))
         self.inbox = PoseInbox(
-            net.session, KEYS, [self.decision], reach=(5.0, 5.0, 5.0), conditions=[[conditions]] if conditions else ()
+            net.session,
+            KEYS,
+            [self.decision],
+            valid_box=(5.0, 5.0, 5.0),
+            conditions=[[conditions]] if conditions else (),
         )
         (self.neighbour,) = self.decision.neighbours.all
         (self.sender,) = self.inbox.senders
@@ -432,7 +436,7 @@ def test_pose_stamped_ahead_counts_from_arrival(robot, ahead):
     assert (robot.neighbour.stamp, robot.neighbour.arrival) == pytest.approx((7.0, 7.0), abs=1e-5)
     robot.t += 2.0
     assert believed(robot) == pytest.approx(0.6, abs=1e-5), "two seconds old, not younger"
-    (news,) = robot.inbox.news[0]
+    (news,) = robot.inbox.unreported[0]
     assert news.stamp == pytest.approx(UTC + 7.0 + ahead), "recorded as it was stamped"
 
 

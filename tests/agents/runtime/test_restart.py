@@ -145,7 +145,7 @@ def test_start_with_unknown_origin_is_refused():
 
 
 def test_repeated_start_keeps_the_ticks():
-    setup = Setup(Keys("park"), [], "json", 50.0, lifeline=False, located=[False])
+    setup = Setup(Keys("park"), [], "json", 50.0, lifeline=False, externally_measured=[False])
     with Net().worn() as net:
         robot = Runtime([Plan(pair()).assignment("A")], Airborne(), setup)
         robot.subscribe_to_stops(net.session)

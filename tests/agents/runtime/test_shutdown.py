@@ -89,7 +89,14 @@ def run(body: Airborne, silence_s: float = 5.0, timing: DescentTiming = QUICK) -
     with Net().worn() as net:
         body.net = net
         setup = Setup(
-            Keys("park"), [], "json", 50.0, lifeline=False, located=[False], loop_timeout_s=silence_s, descent=timing
+            Keys("park"),
+            [],
+            "json",
+            50.0,
+            lifeline=False,
+            externally_measured=[False],
+            loop_timeout_s=silence_s,
+            descent=timing,
         )
         Runtime([Plan(experiment).assignment("F")], body, setup).run()
     return net

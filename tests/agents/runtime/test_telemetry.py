@@ -10,7 +10,7 @@ import pytest
 from agents.network import messages, pubsub
 from agents.network.keys import Keys
 from agents.robot import Robot as Decision
-from agents.runtime.pose_inbox import NEWS, PoseInbox
+from agents.runtime.pose_inbox import MAX_UNREPORTED, PoseInbox
 from agents.runtime.telemetry import Counts, Telemetry
 from agents.vectors import UNKNOWN
 from experiments.definition import bodies
@@ -50,7 +50,7 @@ class Robot:
         self.body = TwinBody(bodies.body_request(Plan(experiment), ("A",), 1))
         self.body.open()
         nowhere = None
-        self.neighbours = PoseInbox(nowhere, Keys(), [self.decision], reach=(2.0, 2.0, 2.0))  # type: ignore[arg-type]
+        self.neighbours = PoseInbox(nowhere, Keys(), [self.decision], valid_box=(2.0, 2.0, 2.0))  # type: ignore[arg-type]
         self.telemetry = Telemetry(
             nowhere, Keys(), "json",  # type: ignore[arg-type]
             robots=[self.decision], neighbours=self.neighbours, counts=Counts(1), malformed=lambda: 0, ranged=[True],
@@ -59,7 +59,7 @@ class Robot:
 
     def hear(self, count: int, first: int = 1) -> None:
         for seq in range(first, first + count):
-            self.neighbours.news[0].append(
+            self.neighbours.unreported[0].append(
                 messages.PoseReceipt(
                     "B", seq, UTC + 0.02 * seq, UTC + 0.02 * seq, (0.4, 0.1, 0.0), (0.123456, 0.0, 0.0)
                 )
@@ -87,18 +87,18 @@ def test_blind_robot_reports_received_poses(robot: Robot) -> None:
     robot.hear(100)
     (said,) = robot.tell(0.02, position=UNKNOWN)
     assert (said.position, len(said.received)) == (None, 100)
-    assert not robot.neighbours.news[0]
+    assert not robot.neighbours.unreported[0]
     (said,) = robot.tell(0.04)
     assert said.position is not None
     assert said.received == []
 
 
 def test_waiting_receipts_are_bounded(robot: Robot) -> None:
-    robot.hear(NEWS + 500)
-    assert len(robot.neighbours.news[0]) == NEWS
+    robot.hear(MAX_UNREPORTED + 500)
+    assert len(robot.neighbours.unreported[0]) == MAX_UNREPORTED
     states = robot.tell(0.02)
     assert len(states) > 1
-    assert [each.seq for state in states for each in state.received] == list(range(501, NEWS + 501))
+    assert [each.seq for state in states for each in state.received] == list(range(501, MAX_UNREPORTED + 501))
     assert {state.seq for state in states} == {1}
 
 

@@ -34,7 +34,7 @@ class Stage:
             monkeypatch.setattr(module, "uptime", lambda: self.now)
         experiment = pair()
         body = assemble(bodies.body_request(Plan(experiment), ("A",), 1))
-        setup = Setup(KEYS, [], "json", 50.0, lifeline=False, located=[False], wake=wake)
+        setup = Setup(KEYS, [], "json", 50.0, lifeline=False, externally_measured=[False], wake=wake)
         self.runtime = Runtime([Plan(experiment).assignment("A")], body, setup)
         self.body = body
         self.seq = 0

@@ -16,7 +16,7 @@ from agents.kinds.turtlebot3 import TURTLEBOT3
 from agents.plugins.predictors import HOLD
 from agents.safety.detection import (
     FOREIGN_S,
-    SLOWEST,
+    LOWEST_DESCENT_M_S,
     Descent,
     clock_off,
     clock_text,
@@ -316,7 +316,7 @@ def lands(*, height=0.5, velocity=(0.0, 0.0, 0.0), **safety):
 
 @pytest.mark.parametrize(
     ("height", "velocity", "seconds"),
-    [(0.02, (0.0, 0.0, 0.0), 2.0), (0.5, (0.0, 0.0, 0.5), 2.5), (NAN, (0.0, 0.0, 0.0), 2.5 / SLOWEST)],
+    [(0.02, (0.0, 0.0, 0.0), 2.0), (0.5, (0.0, 0.0, 0.5), 2.5), (NAN, (0.0, 0.0, 0.0), 2.5 / LOWEST_DESCENT_M_S)],
     ids=["on the floor", "climbs", "blind"],
 )
 def test_landing_that_does_no_good_is_cut(height, velocity, seconds):

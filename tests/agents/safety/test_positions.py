@@ -7,7 +7,7 @@ import pytest
 
 from agents.kinds.crazyflie import CRAZYFLIE
 from agents.kinds.khepera4 import KHEPERA4
-from agents.safety.positions import FLIP, JUMP_M, REACH, Continuity, ExternalPositions
+from agents.safety.positions import FLIP, JUMP_M, PLAUSIBLE_SPEED, Continuity, ExternalPositions
 
 
 def jump(*samples, kind=CRAZYFLIE):
@@ -22,7 +22,7 @@ def test_jump_is_farther_than_a_robot_can_move():
     assert jump((0.0, 0.0), (0.01, 1.0), (9.0, 1.0)) == 1.0  # time does not heal it
     assert math.isnan(jump((0.0, 0.0), (0.01, 1.0), (0.02, 0.0)))
     assert jump((0.0, 0.0), (0.01, 1.0), (0.02, nan), (0.03, 1.0)) == 1.0
-    far = JUMP_M + REACH * CRAZYFLIE.speed * 0.3  # a gap in the measurements
+    far = JUMP_M + PLAUSIBLE_SPEED * CRAZYFLIE.speed * 0.3  # a gap in the measurements
     assert math.isnan(jump((0.0, 0.0), (0.3, far - 0.01)))
     assert jump((0.0, 0.0), (0.3, far - 0.01), kind=KHEPERA4) == pytest.approx(far - 0.01)
     assert jump((0.0, 0.0), (9.0, 5.0)) == 5.0
@@ -59,7 +59,7 @@ def turned(*yaws, kind=KHEPERA4, watched=True):
 
 
 def test_wheels_whose_yaw_jumps_have_jumped():
-    most = FLIP + REACH * KHEPERA4.turn_rate * 0.02
+    most = FLIP + PLAUSIBLE_SPEED * KHEPERA4.turn_rate * 0.02
     assert math.isnan(turned((0.0, 0.0), (0.02, most - 0.001)))
     assert turned((0.0, 0.0), (0.02, most + 0.001)) == pytest.approx(most + 0.001)
     assert math.isnan(turned((0.0, 3.1), (0.02, -3.1)))

@@ -10,7 +10,7 @@ from agents.body.interface import UNANSWERED
 from agents.protocols import crtp
 from agents.protocols.crazyflie import CrazyflieSettings
 from agents.protocols.crtp import HighLevel, Info, Port, Status
-from agents.safety.detection import SLOWEST
+from agents.safety.detection import LOWEST_DESCENT_M_S
 from bridges.crazyflie import flight as module
 from bridges.crazyflie import telemetry as telemetry_module
 from bridges.crazyflie import trajectory as trajectory_module
@@ -260,7 +260,7 @@ def test_landing_never_exceeds_half_a_metre_per_second(air, height):
     air.telemetry.pose = [0.0, 0.0, height, *[0.0] * 4]
     air.flight.land()
     assert 35.0 / 16.0 * (height - module.FLOOR) / air.flight.span_s < 0.5
-    assert height == 0.2 or air.flight.span_s < height / SLOWEST + 1.0
+    assert height == 0.2 or air.flight.span_s < height / LOWEST_DESCENT_M_S + 1.0
 
 
 def test_the_height_seen_from_outside_counts(air):

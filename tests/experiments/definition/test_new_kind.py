@@ -18,9 +18,11 @@ from experiments.report import style, trajectories
 KIND = "alphabot"
 ROVERS = (
     'title = "Rovers"\nduration_s = 2.0\n[arena]\nsize = [12.0, 4.0, 2.0]\n'
-    + "".join(f'[robots.R{k}]\nkind = "{KIND}"\nstart = [{k - 5}.0, 0.0]\n' for k in range(style.MANY + 1))
+    + "".join(
+        f'[robots.R{k}]\nkind = "{KIND}"\nstart = [{k - 5}.0, 0.0]\n' for k in range(style.MAX_COLOURED_ROBOTS + 1)
+    )
     + "[formation.links]\n"
-    + "".join(f'"R{k} > R{k + 1}" = 1.0\n' for k in range(style.MANY))
+    + "".join(f'"R{k} > R{k + 1}" = 1.0\n' for k in range(style.MAX_COLOURED_ROBOTS))
 )
 
 

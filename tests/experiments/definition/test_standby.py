@@ -9,6 +9,7 @@ import msgspec
 import pytest
 
 from agents.body.interface import BodyState
+from agents.errors import Refusal
 from agents.network import messages
 from agents.robot import Robot as Decision
 from experiments import run
@@ -26,7 +27,7 @@ from experiments.definition.experiment import (
 )
 from experiments.definition.plan import Plan
 from experiments.file import consistency, document
-from experiments.real_time.conductor.replacement import Refused, Spares
+from experiments.real_time.conductor.replacement import Spares
 
 BOT = Robot(kind="khepera4", start=[0.0, 0.0])
 FLY = Robot(kind="crazyflie", start=[0.5, 0.5], hover=0.5)
@@ -124,7 +125,7 @@ def test_spare_brings_its_body_and_keeps_the_rest() -> None:
     assert whose == "S", "the first of its kind"
     assert (robot.body, robot.start, robot.avoids, robot.ranges) == (spare.body, spare.start, True, "body")
     spares.used["S"] = "A"
-    with pytest.raises(Refused, match="no spare khepera4 left"):
+    with pytest.raises(Refusal, match="no spare khepera4 left"):
         spares.successor("A", old, order())
     robot, whose = spares.successor("A", old, order(body="twin", at=(0.5, 0.25), yaw=1.0))
     assert (robot.body, robot.start, whose) == ("twin", [0.5, 0.25, 1.0], None)
@@ -146,5 +147,5 @@ def test_spare_brings_its_body_and_keeps_the_rest() -> None:
     ],
 )
 def test_what_cannot_take_over_a_name(asked: messages.RunOrder, said: str) -> None:
-    with pytest.raises(Refused, match=said):
+    with pytest.raises(Refusal, match=said):
         Spares(Plan(experiment(spares={"F": FLY, "S": BOT}))).successor("A", BOT, asked)

@@ -9,7 +9,7 @@ from experiments.catalogue import index
 from experiments.file import catalogue as entries
 from experiments.file import document
 from experiments.file.document import DocumentError, read
-from experiments.file.text import LARGEST
+from experiments.file.text import MAX_TEXT_BYTES
 from tests.experiments.traces import parse_links
 
 MALFORMED = Path(__file__).parent / "malformed"
@@ -246,7 +246,7 @@ def test_a_folder_names_the_experiments_in_it(write):
         (b"\xef\xbb\xbf", (0, 0), "is empty", "zenpark new"),
         (b"a = " + b"1" * 5000, (0, 0), "is no TOML", "smaller number"),
         (b"a = " + b"[" * 5000 + b"]" * 5000, (0, 0), "nested too deeply", "flatten"),
-        (b"#" * (LARGEST + 1), (0, 0), "is longer than 4 MB", "not a recording"),
+        (b"#" * (MAX_TEXT_BYTES + 1), (0, 0), "is longer than 4 MB", "not a recording"),
     ],
 )
 def test_a_file_that_is_no_experiment(write, content, place, message, hint):

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from experiments.catalogue import index
 from experiments.file.document import DocumentError, read, write_json
-from experiments.file.problems import MOST
+from experiments.file.problems import MAX_PROBLEMS
 
 PARK = (index.FOLDER / "robotic-park.toml").read_text("utf-8")
 LINES = PARK.split("\n")
@@ -39,7 +39,7 @@ def reads_or_refuses(content, suffix=".toml", overrides=()):
     else:
         assert refusal.problems
         assert all(problem.message for problem in refusal.problems)
-        assert all(str(problem) in str(refusal) for problem in refusal.problems[:MOST])
+        assert all(str(problem) in str(refusal) for problem in refusal.problems[:MAX_PROBLEMS])
         assert str(refusal).encode("utf-8")
 
 

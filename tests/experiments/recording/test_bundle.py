@@ -67,7 +67,7 @@ def test_run_records_how_where_and_with_what(flown: Path) -> None:
     about = records.metadata[0].metadata
     assert (about["code"], about["numpy"], about["host"]) == (made.code, made.packages["numpy"], made.host)
     foot = (flown / "run" / "report.html").read_text("utf-8").partition("<footer>")[2]
-    assert f"code {made.code[: version.SHOWN]}" in foot
+    assert f"code {made.code[: version.DIGEST_CHARACTERS]}" in foot
     assert f"Python {made.python}, numpy {made.packages['numpy']}" in foot
 
 

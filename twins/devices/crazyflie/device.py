@@ -21,7 +21,7 @@ from twins.devices.crazyflie.radio import HOST, Air, RadioLink
 from twins.devices.device import DeviceRequest, FaultyLink
 
 SCANNED_PORTS: Final = range(19850, 19860)  # at which cflib looks for simulations
-LARGEST: Final = 64  # [bytes]
+MAX_PACKET_BYTES: Final = 64  # [bytes]
 AT_ONCE: Final = 64  # packets read from one socket before the others are served
 RECEIVE_BYTES: Final = 1 << 20
 
@@ -67,7 +67,7 @@ class UdpLink(FaultyLink[bytes]):
         """Next packet, or None. The newest sender becomes the client, as in Bitcraze's own simulation."""
         while True:
             try:
-                packet, sender = self.socket.recvfrom(LARGEST)
+                packet, sender = self.socket.recvfrom(MAX_PACKET_BYTES)
             except BlockingIOError:
                 return None
             except ConnectionError:  # an earlier packet was rejected

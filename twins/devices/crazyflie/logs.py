@@ -18,7 +18,7 @@ from twins.devices.crazyflie.tables import LOG_TYPES, PACKINGS, Table, pack
 from twins.models.quadrotor import GRAVITY
 
 ROOM: Final = (2.0, 2.0, 2.5)  # [m] from the origin to the walls, and height: measured by the Multi-ranger
-REACH: Final = 4.0  # [m] of its sensors
+SENSOR_RANGE_M: Final = 4.0  # [m] of its sensors
 NOTHING_MM: Final = 32766  # reading when nothing is in reach
 SENSORS: Final = {"front": 0.0, "left": 0.5 * math.pi, "back": math.pi, "right": 1.5 * math.pi}
 MILLISECONDS: Final = 0xFFFFFF
@@ -230,4 +230,4 @@ def _distance(flock: Flock, row: int, bearing: float) -> float:
 
 
 def _in_reach(distance: float) -> float:
-    return distance / crtp.MM if 0.0 <= distance <= REACH else NOTHING_MM
+    return distance / crtp.MM if 0.0 <= distance <= SENSOR_RANGE_M else NOTHING_MM

@@ -20,7 +20,7 @@ from twins.devices.device import Faults, FaultyLink
 HOST: Final = "127.0.0.1"
 CHANNEL: Final = 80
 RATE: Final = "2M"
-LARGEST: Final = 64  # [bytes] of a datagram
+MAX_DATAGRAM_BYTES: Final = 64  # [bytes] of a datagram
 AT_ONCE: Final = 64  # exchanges before the models advance
 NOTHING: Final = bytes((NULL, 0x01, 0x00))  # acknowledgement of a drone with nothing to send
 LOG_DATA: Final = header(Port.LOG, 2)
@@ -110,7 +110,7 @@ class Air:
         """Answer the exchanges that wait at time `t` [s]; `deliver` gets the row and packet of each that arrived."""
         for _ in range(AT_ONCE):
             try:
-                datagram, client = self.socket.recvfrom(LARGEST)
+                datagram, client = self.socket.recvfrom(MAX_DATAGRAM_BYTES)
             except BlockingIOError:
                 return
             except ConnectionError:  # an earlier answer was rejected

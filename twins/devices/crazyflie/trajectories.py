@@ -19,7 +19,7 @@ from twins.devices.crazyflie.planner import ORDER, Piece, evaluate, wrap
 
 POINTS: Final = (0, 1, 3, 7)  # control points of a compressed element beside the one that the last piece ends with
 SCALES: Final = (crtp.MM, crtp.MM, crtp.MM, radians(0.1))  # units of compressed x, y, z [m], yaw [rad]
-LARGEST: Final = 2.0**32  # upper bound of coefficients and times
+MAX_COEFFICIENT: Final = 2.0**32  # upper bound of coefficients and times
 FASTEST: Final = 0.01  # smallest time scale
 
 
@@ -78,7 +78,7 @@ class Trajectories:
 
 def _uncompressed(memory: bytes, number: int, scale: float) -> Piece:
     *values, span = crtp.PIECE.unpack_from(memory, crtp.PIECE.size * number)
-    if not np.abs(values).max() <= LARGEST or not 0.0 < span <= LARGEST:  # NaN fails too
+    if not np.abs(values).max() <= MAX_COEFFICIENT or not 0.0 < span <= MAX_COEFFICIENT:  # NaN fails too
         raise ValueError("no numbers of a trajectory")
     return span * scale, np.array(values).reshape(4, ORDER + 1) / scale ** np.arange(ORDER + 1)
 

@@ -77,7 +77,7 @@ def test_other_process_of_its_number_is_no_run() -> None:
         b'{"what":"run","pid":-1,"born":"","since":0,"title":"","folder":"","endpoints":["tcp/127.0.0.1:1"]}',
         b'{"what":"run","pid":1,"born":"","since":0,"title":"","folder":"","endpoints":["nonsense"]}',
         b'{"what":"run","pid":1,"born":"","since":0,"title":"","folder":"","endpoints":[]}',
-        b" " * (run_registry.LARGEST + 1),
+        b" " * (run_registry.MAX_ENTRY_BYTES + 1),
     ],
     ids=range(8),
 )

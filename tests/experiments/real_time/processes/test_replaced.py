@@ -19,7 +19,7 @@ from experiments.definition.plan import Plan
 from experiments.real_time.processes.centre import CentreProcess
 from experiments.real_time.processes.joining import Network
 from experiments.real_time.processes.world import WorldProcess
-from experiments.real_time.processes.world_population import Population
+from experiments.real_time.processes.world_population import WorldBodies
 from tests.agents.few import pair
 from tests.conftest import RouterProcess
 from tests.fuzz.loopnet import Attentive, Mute, Net, Reply, Sample
@@ -59,7 +59,7 @@ def test_replaced_process_sends_nothing(what, way, monkeypatch):
             drone = Robot(kind="crazyflie", start=[0.1, 0.2], hover=0.5, body="world")
             experiment = pair(robots={"F": drone}, formation=Formation())
             lost = threading.Event()
-            process = WorldProcess(Plan(experiment), Population(Plan(experiment)), joint, lost)
+            process = WorldProcess(Plan(experiment), WorldBodies(Plan(experiment)), joint, lost)
         else:
             process = CentreProcess(Plan(pair(architecture="centralised")), joint)
             goals = [CentreGoal(0, (0.0, 0.0, 0.0), 0.0, 0.0)]

@@ -11,8 +11,8 @@ from experiments.definition import experiment as definition
 from experiments.definition.experiment import Formation
 from experiments.definition.plan import Plan
 from experiments.real_time.processes.joining import Network
-from experiments.real_time.processes.world_network import Exchange
-from experiments.real_time.processes.world_population import Population
+from experiments.real_time.processes.world_network import WorldNetwork
+from experiments.real_time.processes.world_population import WorldBodies
 from tests.agents.few import pair
 from tests.fuzz.loopnet import Net
 from tests.fuzz.messages import sent
@@ -29,8 +29,8 @@ def test_world_obeys_sender_with_clock_behind():
     drone = definition.Robot(kind="crazyflie", start=[0.1, 0.2], hover=0.5, body="world")
     experiment = pair(robots={"F": drone}, formation=Formation())
     with Net().worn() as net:
-        world = Exchange(
-            Plan(experiment), Population(Plan(experiment)), Network(net.session, KEYS, [], [], OwnershipCheck([]))
+        world = WorldNetwork(
+            Plan(experiment), WorldBodies(Plan(experiment)), Network(net.session, KEYS, [], [], OwnershipCheck([]))
         )
 
         def order(seq: int, action: str, **more: object) -> bool:
@@ -55,8 +55,8 @@ def test_world_of_many_robots_knows_name_owners():
     drone = definition.Robot(kind="crazyflie", start=[0.1, 0.2], hover=0.5, body="world")
     experiment = pair(robots={"F000": drone}, formation=Formation())
     with Net().worn() as net:
-        world = Exchange(
-            Plan(experiment), Population(Plan(experiment)), Network(net.session, KEYS, [], [], OwnershipCheck([]))
+        world = WorldNetwork(
+            Plan(experiment), WorldBodies(Plan(experiment)), Network(net.session, KEYS, [], [], OwnershipCheck([]))
         )
         for name in names:
             alive = KEYS.alive(name)
@@ -70,7 +70,7 @@ def test_centre_with_clock_behind_is_followed():
     experiment = pair(architecture="centralised")
     robot = Robot(Plan(experiment).assignment("A"))
     with Net().worn() as net:
-        goals = GoalInbox(net.session, KEYS, [robot], reach=(5.0, 5.0, 5.0))
+        goals = GoalInbox(net.session, KEYS, [robot], valid_box=(5.0, 5.0, 5.0))
 
         def tell(seq: int, t: float, x: float) -> float:
             """The goal that is pursued."""

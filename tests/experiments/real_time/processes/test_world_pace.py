@@ -12,7 +12,7 @@ from experiments.definition.plan import Plan
 from experiments.real_time.processes import world, world_network
 from experiments.real_time.processes.joining import Network
 from experiments.real_time.processes.world import WorldProcess
-from experiments.real_time.processes.world_population import Population
+from experiments.real_time.processes.world_population import WorldBodies
 from tests.agents.few import pair
 from tests.fuzz.loopnet import Net
 
@@ -33,7 +33,7 @@ def test_lateness_is_caught_up_and_standstill_lost(stands_s, lost, forgiven, asl
     drone = Robot(kind="crazyflie", start=[0.1, 0.2], hover=0.5, body="world")
     experiment = pair(robots={"F": drone}, formation=Formation())
     with Net().worn() as net:
-        population = Population(Plan(experiment))
+        population = WorldBodies(Plan(experiment))
         joint = Network(net.session, KEYS, [], [], OwnershipCheck([KEYS.world_alive]))
         process = WorldProcess(Plan(experiment), population, joint, threading.Event(), lambda: now[0])
         monkeypatch.setattr(process.exchange.commands, "forgive", lambda seconds, t: slept.append((seconds, t)))

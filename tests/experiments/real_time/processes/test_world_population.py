@@ -8,10 +8,11 @@ import msgspec
 import numpy as np
 import pytest
 
+from agents.errors import Refusal
 from agents.vectors import NO_SETPOINT
 from experiments.definition.experiment import Arena, Experiment, Robot, World
 from experiments.definition.plan import Plan
-from experiments.real_time.processes.world_population import Population, Refused
+from experiments.real_time.processes.world_population import WorldBodies
 from twins.scene import Obstacle
 
 POST = Obstacle(radius=0.1, at=(1.5, 1.5))
@@ -35,25 +36,25 @@ def experiment(**robots: Robot) -> Experiment:
 
 
 @pytest.fixture
-def world() -> Population:
-    return Population(Plan(experiment()))
+def world() -> WorldBodies:
+    return WorldBodies(Plan(experiment()))
 
 
-def row(world: Population, name: str) -> int:
+def row(world: WorldBodies, name: str) -> int:
     return world.names.index(name)
 
 
-def at(world: Population, name: str) -> list[float]:
+def at(world: WorldBodies, name: str) -> list[float]:
     return [round(value, 6) for value in world.states[row(world, name)].true_position]
 
 
-def go(world: Population, ticks: int, **setpoints: tuple[float, float, float, float]) -> None:
+def go(world: WorldBodies, ticks: int, **setpoints: tuple[float, float, float, float]) -> None:
     for _ in range(ticks):
         world.body.command([setpoints.get(name, NO_SETPOINT) for name in world.names])
         world.advance()
 
 
-def test_world_carries_its_robots_and_mirrors_others(world: Population) -> None:
+def test_world_carries_its_robots_and_mirrors_others(world: WorldBodies) -> None:
     assert world.names == ("KH01", "CF01", "TB01")
     assert world.carried == (True, True, False)
     assert world.seen == (True, True, False)
@@ -65,7 +66,7 @@ def test_world_carries_its_robots_and_mirrors_others(world: Population) -> None:
 
 
 def test_mirrored_robot_may_ask_for_ranges() -> None:
-    world = Population(
+    world = WorldBodies(
         Plan(
             experiment(
                 TB01=Robot(kind="turtlebot3", start=[1.0, 0.0], ranges="world"),
@@ -77,7 +78,7 @@ def test_mirrored_robot_may_ask_for_ranges() -> None:
     assert world.seen == (True, False)
 
 
-def test_reset_puts_back_and_leaves_in_the_air(world: Population) -> None:
+def test_reset_puts_back_and_leaves_in_the_air(world: WorldBodies) -> None:
     world.takeoff(row(world, "CF01"), 0.6)
     go(world, 250)
     go(world, 100, CF01=(0.4, 1.2, 0.6, 0.0), KH01=(0.2, 0.0, 0.0, 0.0))
@@ -91,20 +92,20 @@ def test_reset_puts_back_and_leaves_in_the_air(world: Population) -> None:
     assert [state.flying for state in world.states[:2]] == [False, True]
     go(world, 50)
     assert at(world, "CF01") == [0.0, 1.0, pytest.approx(0.6, abs=0.01)], "it holds there"
-    with pytest.raises(Refused, match="TB01 is only mirrored here"):
+    with pytest.raises(Refusal, match="TB01 is only mirrored here"):
         world.reset("TB01")
     go(world, 200, KH01=(0.2, 0.0, 0.0, 0.0))
     world.put("CF01", (0.0, 0.0, 0.0), 0.0, flying=False)
-    with pytest.raises(Refused, match=r"KH01 would overlap CF01 by \d+ mm: move that first"):
+    with pytest.raises(Refusal, match=r"KH01 would overlap CF01 by \d+ mm: move that first"):
         world.reset("KH01")
-    with pytest.raises(Refused, match=r"there is no 'KH02' in this world; did you mean 'KH01'\?"):
+    with pytest.raises(Refusal, match=r"there is no 'KH02' in this world; did you mean 'KH01'\?"):
         world.reset("KH02")
 
 
 def test_reset_puts_back_pushed_obstacles() -> None:
     given = experiment(KH01=Robot(kind="khepera4", start=[-1.0, -1.0, math.pi], body="world"))
     arena = msgspec.structs.replace(given.arena, obstacles={"crate": msgspec.structs.replace(CRATE, mass=0.2)})
-    world = Population(Plan(msgspec.structs.replace(given, arena=arena, world=World(engine="pymunk"))))
+    world = WorldBodies(Plan(msgspec.structs.replace(given, arena=arena, world=World(engine="pymunk"))))
     go(world, 400, KH01=(0.2, 0.0, 0.0, 0.0))
     assert world.obstacles()["crate"][0] < -1.55
     world.reset(None)
@@ -116,12 +117,12 @@ def test_reset_puts_back_pushed_obstacles() -> None:
 def test_nothing_is_put_back_into_an_obstacle() -> None:
     cart = Obstacle(box=(0.2, 0.2), at=(0.0, -1.0), plan={"kind": "line", "move_by": [0.0, 1.0], "speed": 0.5})
     given = experiment()
-    world = Population(
+    world = WorldBodies(
         Plan(msgspec.structs.replace(given, arena=msgspec.structs.replace(given.arena, obstacles={"cart": cart})))
     )
     world.begin(0.0)
     go(world, 300)
-    with pytest.raises(Refused, match="KH01 would overlap cart by 170 mm: reset all"):
+    with pytest.raises(Refusal, match="KH01 would overlap cart by 170 mm: reset all"):
         world.reset("KH01")
 
 
@@ -129,7 +130,7 @@ def test_planned_obstacles_move_from_the_start() -> None:
     belt = Obstacle(box=(0.2, 0.2), at=(0.0, -1.0), plan={"kind": "line", "move_by": [1.0, 0.0], "speed": 0.5})
     given = experiment()
     arena = msgspec.structs.replace(given.arena, obstacles={"belt": belt})
-    world = Population(Plan(msgspec.structs.replace(given, arena=arena)))
+    world = WorldBodies(Plan(msgspec.structs.replace(given, arena=arena)))
     go(world, 100)
     assert world.obstacles()["belt"] == (0.0, -1.0, 0.0)
     world.begin(world.time + 0.5)
@@ -148,7 +149,7 @@ def test_contacts_have_names() -> None:
         KH03=Robot(kind="khepera4", start=[1.8, 0.0], body="world"),
         KH04=Robot(kind="khepera4", start=[1.5, 1.2, math.pi / 2], body="world"),
     )
-    world = Population(Plan(msgspec.structs.replace(given, world=World(engine="pymunk"))))
+    world = WorldBodies(Plan(msgspec.structs.replace(given, world=World(engine="pymunk"))))
     found = []
     for _ in range(200):
         go(world, 1, **dict.fromkeys(world.names, (0.2, 0.0, 0.0, 0.0)))
@@ -158,13 +159,13 @@ def test_contacts_have_names() -> None:
     assert all(meeting.impulse > 0.0 and meeting.overlap < 1e-3 for meeting in found)
 
 
-def test_wheels_stop_with_a_watchdog_alone(world: Population) -> None:
+def test_wheels_stop_with_a_watchdog_alone(world: WorldBodies) -> None:
     flying = row(world, "CF01")
     assert world.hold_s[flying] == 0.5
     assert world.hold_s[row(world, "KH01")] == np.inf
     watched = experiment()
     watched = msgspec.structs.replace(watched, world=msgspec.structs.replace(watched.world, wheel_watchdog_s=0.7))
-    assert Population(Plan(watched)).hold_s[row(world, "KH01")] == 0.7
+    assert WorldBodies(Plan(watched)).hold_s[row(world, "KH01")] == 0.7
     go(world, 10, KH01=(0.2, 0.0, 0.0, 0.0))
     go(world, 300)
     assert at(world, "KH01")[0] > 0.5, "it drives on, as the real one"
