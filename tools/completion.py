@@ -122,7 +122,7 @@ def _document(context: typer.Context) -> dict[str, Any]:
     """The experiment that is named before on the command line; empty if it cannot be read."""
     import tomllib  # noqa: PLC0415 - help is quicker without
 
-    # behind an option that has no value yet, arguments are not told apart
+    # behind an option without a value, arguments are not distinguished
     file = str(context.params.get("file") or next(iter(context.args), ""))
     place = index.FOLDER / f"{file}.toml" if file in index.names() else Path(file)
     try:

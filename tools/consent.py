@@ -63,7 +63,9 @@ def require(file: str, cases: Mapping[str, Plan], *, given: bool) -> None:
     if given:
         return
     if not (sys.stdin.isatty() and sys.stderr.isatty()):
-        raise refusal(file, "it touches machines or devices, and nobody can be asked here", "agree to that with --yes")
+        raise refusal(
+            file, "it touches machines or devices, and there is no terminal for a question", "agree to that with --yes"
+        )
     print("Run it? [y/N] ", end="", file=sys.stderr, flush=True)
     if sys.stdin.readline().strip().lower() not in ("y", "yes"):
         raise refusal(file, "not run", "--here keeps robots on this machine, --bodies twin off their devices")

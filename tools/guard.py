@@ -16,7 +16,7 @@ PACKAGES: Final = ("agents", "bridges", "twins", "experiments", "tools")
 
 
 def intruders(root: Path) -> dict[str, Path | None]:
-    """Which of our packages would be imported from elsewhere than `root`, and from where (None: from nowhere)."""
+    """Our packages that would be imported from outside `root`, and the place (None: they are not found)."""
     found: dict[str, Path | None] = {}
     for name in PACKAGES:
         spec = importlib.util.find_spec(name)

@@ -117,13 +117,13 @@ Connect = Annotated[
     ),
 ]
 Lab = Annotated[str | None, typer.Option(metavar="FOLDER", help="Certificates of a lab (`./zenpark lab init`).")]
-As = Annotated[str, typer.Option("--as", metavar="NAME", help="Whose certificate, in a lab.")]
+As = Annotated[str, typer.Option("--as", metavar="NAME", help="Name of the certificate, in a lab.")]
 Settings = Annotated[
     list[str] | None,
     typer.Option(
         "--set",
         metavar="PATH=VALUE",
-        help="Changes a value of the file; may be repeated.",
+        help="Change a value of the file; may be repeated.",
         autocompletion=completion.paths,
     ),
 ]
@@ -140,20 +140,20 @@ Cases = Annotated[
     typer.Option("--case", metavar="NAME", help="Only this case; may be repeated.", autocompletion=completion.cases),
 ]
 Lifeline = Annotated[bool, typer.Option("--lifeline", help="End when standard input ends or falls silent.")]
-Out = Annotated[str | None, typer.Option(metavar="FOLDER", help="Where the results go. [runs/...]")]
+Out = Annotated[str | None, typer.Option(metavar="FOLDER", help="Folder for the results. [runs/...]")]
 Bodies = Annotated[
     str | None,
     typer.Option(
         metavar="twin|world|protocol",
-        help="Every robot in a twin of its own, in one world, or behind a protocol twin (real time).",
+        help="Bodies: a twin per robot, one world, or protocol twins (real time).",
     ),
 ]
-Here = Annotated[bool, typer.Option("--here", help="All robots on this machine, whatever [hosts] says.")]
+Here = Annotated[bool, typer.Option("--here", help="Run all robots on this machine, ignoring [hosts].")]
 Report = Annotated[
-    bool, typer.Option(help="Writes the report; `./zenpark report FOLDER --pdf` adds its figures as PDF.")
+    bool, typer.Option(help="Write the report; `./zenpark report FOLDER --pdf` adds its figures as PDF.")
 ]
-Anyway = Annotated[bool, typer.Option("--anyway", help="Runs it although the check finds errors.")]
-OpenReport = Annotated[bool, typer.Option("--open", help="Opens it in the browser.")]
+Anyway = Annotated[bool, typer.Option("--anyway", help="Run it in spite of errors of the check.")]
+OpenReport = Annotated[bool, typer.Option("--open", help="Open it in the browser.")]
 
 
 def with_options(command: Callable[..., int]) -> Callable[..., int]:

@@ -69,7 +69,7 @@ class Table:
         self._live.__exit__(None, None, None)
 
     def __call__(self, progress: Progress) -> None:
-        """Draw the table anew, four times a second at most."""
+        """Redraw the table, four times a second at most."""
         for event in self._news.new_events(progress):
             if event.kind == OUTPUT:
                 self._live.console.print(printable(f"{event.source}| {event.text}"), markup=False, highlight=False)

@@ -26,16 +26,18 @@ def new(
     ] = None,
     target: Annotated[str | None, typer.Argument(metavar="TARGET", help="The file to write. [NAME.toml]")] = None,
     *,
-    polygon: Annotated[int | None, typer.Option(metavar="N", help="Robots on a regular polygon.")] = None,
-    grid: Annotated[str | None, typer.Option(metavar="RxC", help="Robots on a grid, such as 5x8.")] = None,
-    hemisphere: Annotated[int | None, typer.Option(metavar="N", help="On a hemisphere, with Delaunay links.")] = None,
-    kind: Annotated[str, typer.Option(metavar="KIND", help="Of the robots of a formation.")] = "crazyflie",
-    spacing: Annotated[float, typer.Option(min=0.01, max=1000.0, help="Between neighbours [m].")] = 0.6,
+    polygon: Annotated[int | None, typer.Option(metavar="N", help="Place robots on a regular polygon.")] = None,
+    grid: Annotated[str | None, typer.Option(metavar="RxC", help="Place robots on a grid, such as 5x8.")] = None,
+    hemisphere: Annotated[
+        int | None, typer.Option(metavar="N", help="Place robots on a hemisphere, with Delaunay links.")
+    ] = None,
+    kind: Annotated[str, typer.Option(metavar="KIND", help="Kind of the robots of a formation.")] = "crazyflie",
+    spacing: Annotated[float, typer.Option(min=0.01, max=1000.0, help="Distance between neighbours [m].")] = 0.6,
     scatter: Annotated[
         float | None,
-        typer.Option(min=0.0, max=1000.0, help="Starts are drawn this far around, by seed [m]. [0.3 spacing]"),
+        typer.Option(min=0.0, max=1000.0, help="Largest random offset of starts, by seed [m]. [0.3 spacing]"),
     ] = None,
-    law: Annotated[str, typer.Option(metavar="distance|displacement", help="Of a formation.")] = "distance",
+    law: Annotated[str, typer.Option(metavar="distance|displacement", help="Law of a formation.")] = "distance",
     seed: Annotated[int, typer.Option(min=0, help="Of the file.")] = 1,
     duration: Annotated[float, typer.Option(min=1.0, max=86400.0, help="[s]")] = 60.0,
 ) -> None:
@@ -64,7 +66,9 @@ def new(
 def import_(
     file: Annotated[str, typer.Argument(metavar="FILE.yaml", help="An experiment of Robotic Park's authors.")],
     target: Annotated[str | None, typer.Argument(metavar="TARGET", help="The file to write. [FILE.toml]")] = None,
-    duration: Annotated[float, typer.Option(min=1.0, max=86400.0, help="Their files do not say how long [s].")] = 60.0,
+    duration: Annotated[
+        float, typer.Option(min=1.0, max=86400.0, help="Duration, which their files do not give [s].")
+    ] = 60.0,
     poses: Annotated[
         str | None,
         typer.Option(metavar="FILE", help="Starts: an index of robots (.yaml), or a Webots world (.wbt)."),

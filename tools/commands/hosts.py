@@ -57,7 +57,7 @@ def watchdog(
     namespace: Annotated[str, typer.Option(help="Namespace of the robot's nodes, such as tb3_0.")] = "",
     domain: Annotated[int, typer.Option(min=0, max=232, help="ROS_DOMAIN_ID of the robot.")] = 30,
     silence: Annotated[
-        float, typer.Option(min=0.1, max=5.0, help="Stop it after so long without a command [s].")
+        float, typer.Option(min=0.1, max=5.0, help="Time without a command after which it stops [s].")
     ] = 0.5,
     remove: Annotated[bool, typer.Option("--remove", help="Remove it.")] = False,
 ) -> None:

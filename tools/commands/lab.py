@@ -17,10 +17,10 @@ app: Final = group("Make, renew and revoke the certificates of a lab: robots, pe
 
 Folder = Annotated[str, typer.Argument(metavar="LAB", help="Folder of the lab.")]
 Names = Annotated[list[str], typer.Argument(metavar="NAME...", help="Identities.")]
-Days = Annotated[float, typer.Option(min=0.01, help="For which a certificate is valid.")]
+Days = Annotated[float, typer.Option(min=0.01, help="Validity of a certificate [days].")]
 Hosts = Annotated[
     list[str] | None,
-    typer.Option("--host", metavar="HOST", help="Name or address at which it listens; may be repeated."),
+    typer.Option("--host", metavar="HOST", help="Name or address of its endpoint; may be repeated."),
 ]
 SOON_DAYS: Final = 14.0
 
@@ -29,7 +29,8 @@ SOON_DAYS: Final = 14.0
 def init(
     folder: Folder,
     given: Annotated[
-        list[str] | None, typer.Argument(metavar="[FILE|ROBOT...]", help="Experiments, whose robots; or their names.")
+        list[str] | None,
+        typer.Argument(metavar="[FILE|ROBOT...]", help="Experiments, for all their robots; or names of robots."),
     ] = None,
     *,
     host: Hosts = None,
@@ -60,7 +61,7 @@ def issue(
     folder: Folder,
     names: Names,
     *,
-    role: Annotated[str, typer.Option(help="robot, operator, observer, router, ...; or by the name itself.")] = "",
+    role: Annotated[str, typer.Option(help="Role: robot, operator, observer, router, ... [by the name]")] = "",
     host: Hosts = None,
     days: Days = 90.0,
     as_json: AsJson = False,
@@ -80,12 +81,12 @@ def issue(
 @app.command(epilog=example("lab renew lab", "lab renew lab router --host 192.168.0.10"))
 def renew(
     folder: Folder,
-    names: Annotated[list[str] | None, typer.Argument(metavar="[NAME...]", help="All, if none is named.")] = None,
+    names: Annotated[list[str] | None, typer.Argument(metavar="[NAME...]", help="Names; all if none is given.")] = None,
     *,
     host: Hosts = None,
     days: Days = 90.0,
     authority: Annotated[
-        bool, typer.Option("--authority", help="A new authority too: every file from before is refused.")
+        bool, typer.Option("--authority", help="Make a new authority too; every earlier file is then refused.")
     ] = False,
     as_json: AsJson = False,
 ) -> None:

@@ -155,7 +155,9 @@ def echo(
     key: KeyExpression,
     *,
     connect: Connect = None,
-    count: Annotated[int | None, typer.Option("--count", "-n", min=1, help="End after so many samples.")] = None,
+    count: Annotated[
+        int | None, typer.Option("--count", "-n", min=1, help="Number of samples after which to end.")
+    ] = None,
     seconds: Seconds = None,
     lab: Lab = None,
     identity: As = "observer",

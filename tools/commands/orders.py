@@ -54,7 +54,7 @@ ORDERS: Final[Mapping[messages.OrderKind, str]] = {
     "takeoff": "Let robots take off that were started by hand.",
     "start": "Begin the experiment of robots that were started by hand, at one common time.",
     "hold": "Let robots hold where they are; the others go on.",
-    "resume": "Let robots go on that were told to hold.",
+    "resume": "Let robots continue after a hold.",
     "land": "Land robots where they are.",
 }
 DONE: Final[Mapping[str, str]] = {
@@ -186,10 +186,8 @@ def replace(
     *,
     spare: Annotated[str | None, typer.Option("--with", metavar="SPARE", help="A spare of the file.")] = None,
     body: Annotated[str | None, typer.Option(metavar="URI", help="Address of another body.")] = None,
-    at: Annotated[
-        Place | None, typer.Option(metavar="X Y", help="Where a twin starts [m]; else as the file says.")
-    ] = None,
-    yaw: Annotated[float, typer.Option(help="Of a twin that is put somewhere [rad].")] = 0.0,
+    at: Annotated[Place | None, typer.Option(metavar="X Y", help="Start of a twin [m]. [the file's]")] = None,
+    yaw: Annotated[float, typer.Option(help="Yaw of a twin that is moved [rad].")] = 0.0,
     by: Operator,
 ) -> int:
     """Let another body take over a robot's name, links and plan; by default a spare of its kind."""
@@ -252,7 +250,7 @@ def estop(
         list[str] | None,
         typer.Option(
             metavar="ENDPOINT",
-            help="Only at this router, or at those of one run (@RUN/network.txt); may be repeated. "
+            help="Only this router, or those of one run (@RUN/network.txt); may be repeated. "
             f"[all runs of this machine, the routers of ${CONNECT}, and tcp/127.0.0.1:7447]",
         ),
     ] = None,
@@ -262,7 +260,7 @@ def estop(
     realm: Annotated[str | None, typer.Option(metavar="NAME", help="First chunk of the keys. [the run's]")] = None,
     lab: Lab = None,
     identity: Annotated[
-        str | None, typer.Option("--as", metavar="NAME", help="Whose certificate, in a lab. [the run's operator]")
+        str | None, typer.Option("--as", metavar="NAME", help="Name of the certificate, in a lab. [the run's operator]")
     ] = None,
     as_json: AsJson = False,
 ) -> int:

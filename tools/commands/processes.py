@@ -36,7 +36,7 @@ def agent(
         bool, typer.Option("--lifeline", help="Land and end when standard input ends or falls silent.")
     ] = False,
     clock_correction: Annotated[
-        float, typer.Option(metavar="SECONDS", help="Added to this machine's clock to get the conductor's.")
+        float, typer.Option(metavar="SECONDS", help="Offset from this machine's clock to the conductor's.")
     ] = 0.0,
     once: Annotated[bool, typer.Option("--once", help="End when down after the experiment.")] = False,
     realm: Realm = "park",
@@ -76,7 +76,7 @@ def station() -> int:
 @app.command(epilog=example("router", "router lab.toml --lab lab --listen tls/192.168.0.10:7447"))
 def router(
     file: Annotated[
-        str | None, typer.Argument(metavar="[FILE]", help="The experiment whose rights it enforces, in a lab.")
+        str | None, typer.Argument(metavar="[FILE]", help="Experiment with the rights to enforce, in a lab.")
     ] = None,
     *,
     listen: Annotated[
@@ -84,13 +84,13 @@ def router(
         typer.Option(metavar="ENDPOINT", help="Without a lab on loopback; may be repeated. [tcp/127.0.0.1:7447]"),
     ] = None,
     connect: Annotated[
-        list[str] | None, typer.Option(metavar="ENDPOINT", help="Another router to be linked with; may be repeated.")
+        list[str] | None, typer.Option(metavar="ENDPOINT", help="Another router to connect to; may be repeated.")
     ] = None,
     lifeline: Lifeline = False,
     lab: Lab = None,
     bodies: Bodies = None,
     print_config: Annotated[
-        bool, typer.Option("--print-config", help="Print the configuration for a zenohd that is to do the same.")
+        bool, typer.Option("--print-config", help="Print the configuration for a zenohd with the same role.")
     ] = False,
 ) -> int:
     """Run the Zenoh router that the robots meet at."""
@@ -175,7 +175,7 @@ def world(
     *,
     case: Case = None,
     connect: Connect = None,
-    engine: Annotated[str | None, typer.Option(metavar="NAME", help="What moves the twins. [the file's]")] = None,
+    engine: Annotated[str | None, typer.Option(metavar="NAME", help="Engine of the twins. [the file's]")] = None,
     lifeline: Annotated[
         bool, typer.Option("--lifeline", help="End, after its robots, when standard input ends or falls silent.")
     ] = False,
@@ -190,11 +190,11 @@ def world(
 
 @app.command(epilog=example("twin crazyflie --count 2", "twin tello --faults '{\"loss\": 0.05}'"))
 def twin(
-    kind: Annotated[str, typer.Argument(metavar="KIND", help="Such as crazyflie; one that has a protocol twin.")],
+    kind: Annotated[str, typer.Argument(metavar="KIND", help="Kind with a protocol twin, such as crazyflie.")],
     *,
-    count: Annotated[int, typer.Option(min=1, max=99, help="How many.")] = 1,
+    count: Annotated[int, typer.Option(min=1, max=99, help="Number of robots.")] = 1,
     connect: Connect = None,
-    faults: Annotated[str, typer.Option(metavar="JSON", help="What goes wrong, such as '{\"loss\": 0.05}'.")] = "{}",
+    faults: Annotated[str, typer.Option(metavar="JSON", help="Faults, such as '{\"loss\": 0.05}'.")] = "{}",
     device: Annotated[str, typer.Option(metavar="JSON", help="Settings of the device.")] = "{}",
     table: Annotated[
         list[str] | None,

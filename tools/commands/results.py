@@ -36,17 +36,17 @@ def report(
         ),
     ],
     out: Annotated[
-        str | None, typer.Option(metavar="FILE", help="Where the report, or the tables, go. [the run's folder]")
+        str | None, typer.Option(metavar="FILE", help="Folder for the report, or the tables. [the run's folder]")
     ] = None,
     *,
     label: Annotated[
-        list[str] | None, typer.Option(metavar="NAME", help="Of each run of a comparison, in order. [A, B, ...]")
+        list[str] | None, typer.Option(metavar="NAME", help="Name of each run of a comparison, in order. [A, B, ...]")
     ] = None,
     pool: Annotated[
-        bool, typer.Option("--pool", help="Runs that differ in their seed alone as one: means and intervals.")
+        bool, typer.Option("--pool", help="Pool runs that differ in their seed only: means and intervals.")
     ] = False,
     width: Annotated[
-        float, typer.Option(min=2.0, max=12.0, metavar="INCHES", help="Of figures and LaTeX tables: 3.5 or 7.16.")
+        float, typer.Option(min=2.0, max=12.0, metavar="INCHES", help="Width of figures and LaTeX tables: 3.5 or 7.16.")
     ] = 3.5,
     pdf: Annotated[bool, typer.Option("--pdf", help="Write the figures as PDF as well, into figures/.")] = False,
     as_latex: Annotated[
@@ -54,7 +54,7 @@ def report(
     ] = False,
     as_markdown: Annotated[bool, typer.Option("--markdown", help="Print the tables as Markdown instead.")] = False,
     metrics: Annotated[
-        str | None, typer.Option(metavar="NAMES", help="With --latex or --markdown: these alone, as f,iae,itae.")
+        str | None, typer.Option(metavar="NAMES", help="Metrics for --latex or --markdown, as f,iae,itae.")
     ] = None,
     as_json: AsJson = False,
 ) -> int:
@@ -185,7 +185,7 @@ def _report_sweep(
     pdf: bool,
     as_json: bool,
 ) -> int:
-    """The table of a sweep for a paper in some form, or its figures anew, so wide [in]."""
+    """Write the table of a sweep for a paper, or its figures in a width [in]."""
     import msgspec
 
     from experiments.recording.reader import RecordingError
@@ -235,12 +235,14 @@ def export(  # noqa: PLR0917 - a command line
     ] = None,
     as_csv: Annotated[bool, typer.Option("--csv", help="A table of trajectories: case, time, robot, x, ...")] = False,
     as_bundle: Annotated[
-        bool, typer.Option("--bundle", help="All that is needed to repeat it: an archive for a paper's supplement.")
+        bool, typer.Option("--bundle", help="Archive to repeat the run, for a paper's supplement.")
     ] = False,
     video: Annotated[
         Path | None, typer.Option("--video", metavar="FILE", help="A film of all cases: FILE.mp4 (by ffmpeg) or .gif.")
     ] = None,
-    speed: Annotated[float, typer.Option(min=0.1, max=100.0, help="Of a film: how much faster than the run.")] = 4.0,
+    speed: Annotated[
+        float, typer.Option(min=0.1, max=100.0, help="Speed of a film, as a multiple of real time.")
+    ] = 4.0,
     as_json: AsJson = False,
 ) -> None:
     """Write a run for MATLAB, as one table, as a film, or as a bundle that `./zenpark run` repeats."""
@@ -277,10 +279,10 @@ def export(  # noqa: PLR0917 - a command line
 @app.command(epilog=example("recover runs/first/event.mcap"))
 def recover(
     file: Annotated[str, typer.Argument(metavar="FILE", help="A recording that was cut off.")],
-    target: Annotated[str | None, typer.Argument(metavar="TARGET", help="Where the whole one goes.")] = None,
+    target: Annotated[str | None, typer.Argument(metavar="TARGET", help="Path of the repaired recording.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Repair a recording whose writer was killed."""
+    """Repair a recording after its writer was killed."""
     from experiments.recording.reader import later_parts
     from experiments.recording.reader import recover as repair
 
@@ -358,14 +360,14 @@ def write_report(runs: Sequence[Run], folder: Path, width: float = 3.5, *, pdf: 
 Words = Annotated[
     list[str] | None, typer.Argument(metavar="[WORD...]", help="Runs with all of these as tag, or in name and title.")
 ]
-Below = Annotated[list[str] | None, typer.Option("--in", metavar="FOLDER", help="Where to look for runs. [runs]")]
+Below = Annotated[list[str] | None, typer.Option("--in", metavar="FOLDER", help="Folder of runs. [runs]")]
 
 
 @app.command(epilog=example("runs", "runs --past paper --json"))
 def runs(
     words: Words = None,
     *,
-    past: Annotated[bool, typer.Option("--past", help="Those that are over.")] = False,
+    past: Annotated[bool, typer.Option("--past", help="List runs that have ended.")] = False,
     below: Below = None,
     as_json: AsJson = False,
 ) -> None:
@@ -469,12 +471,12 @@ def _sweep_as_json(folder: Path) -> dict[str, Any]:
 def clean(
     words: Words = None,
     *,
-    older: Annotated[float | None, typer.Option(min=0.0, metavar="DAYS", help="Older than this.")] = None,
+    older: Annotated[float | None, typer.Option(min=0.0, metavar="DAYS", help="Least age of the runs [days].")] = None,
     recordings: Annotated[
         bool, typer.Option("--recordings", help="Only recordings and logs; figures, report and file stay.")
     ] = False,
-    tagged: Annotated[bool, typer.Option("--tagged", help="Also runs that have a tag.")] = False,
-    yes: Annotated[bool, typer.Option("--yes", help="Does it; else it is only shown.")] = False,
+    tagged: Annotated[bool, typer.Option("--tagged", help="Include runs with a tag.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Remove; without it, only list.")] = False,
     below: Below = None,
     as_json: AsJson = False,
 ) -> int:

@@ -47,7 +47,7 @@ app: Final = typer.Typer()
 
 STOPPED: Final = 1  # exit code of a run that an emergency stop has ended,
 FAILED: Final = 1  # and of one in which a robot did not do its part, or that does not keep a criterion
-SPOILED: Final = 3  # of a run whose figures cannot be compared
+SPOILED: Final = 3  # of a run with figures that cannot be compared
 FEW: Final = 6  # hazards of runs in virtual time that are printed
 
 
@@ -56,7 +56,7 @@ def run(
     file: File,
     *,
     virtual: Annotated[
-        bool, typer.Option("--virtual", help="In virtual time, in this process, as fast as it goes.")
+        bool, typer.Option("--virtual", help="Run in virtual time, in this process, as fast as possible.")
     ] = False,
     case: Cases = None,
     out: Out = None,
@@ -64,7 +64,7 @@ def run(
     settings: Settings = None,
     as_json: AsJson = False,
     seeds: Annotated[
-        int, typer.Option(min=1, max=100_000, help="Runs so many seeds: mean and 95 % interval (virtual only).")
+        int, typer.Option(min=1, max=100_000, help="Number of seeds: mean and 95 % interval (virtual only).")
     ] = 1,
     bodies: Bodies = None,
     here: Here = False,
@@ -72,17 +72,18 @@ def run(
     report: Report = True,
     open_report: OpenReport = False,
     tag: Annotated[
-        list[str] | None, typer.Option("--tag", metavar="WORD", help="By which `./zenpark runs --past` finds it again.")
+        list[str] | None, typer.Option("--tag", metavar="WORD", help="Label by which `./zenpark runs --past` finds it.")
     ] = None,
     lab: Lab = None,
     identity: As = "operator",
     yes: Annotated[
         bool,
-        typer.Option("--yes", help="Agrees to machines, devices and code that a bundle or another's file names."),
+        typer.Option("--yes", help="Agree to machines, devices and code that a bundle or another person's file names."),
     ] = False,
-    view: Annotated[bool, typer.Option("--view", help="Shows it in the browser, in three dimensions.")] = False,
+    view: Annotated[bool, typer.Option("--view", help="Show it in the browser, in three dimensions.")] = False,
     pace: Annotated[
-        float | None, typer.Option(min=0.01, max=100.0, help="Of --virtual --view: so many times as fast. [1]")
+        float | None,
+        typer.Option(min=0.01, max=100.0, help="Speed of --virtual --view, as a multiple of real time. [1]"),
     ] = None,
 ) -> int:
     """Run an experiment: one process per robot, or in virtual time; a bundle repeats its run."""
@@ -116,7 +117,7 @@ def run(
 
 @dataclass(frozen=True)
 class _OutputOptions:
-    """Where the results of a run go, and how they are shown."""
+    """Destination of the results of a run, and their display."""
 
     out: str | None
     as_json: bool
@@ -254,7 +255,7 @@ def _repeat(asked: RunOrigin, show: _OutputOptions, lab: str | None, identity: s
 
 
 def _print_differences(folder: Path, former: Path, *, quiet: bool) -> int:
-    """Print whether a repeated run came to the same to the last bit, if not `quiet`, or not; the exit code."""
+    """Print whether a repeated run gave the same results to the last bit; returns the exit code."""
     from experiments.recording import bundle
 
     found = bundle.differences(folder, former)
@@ -352,14 +353,14 @@ def _refuse(options: RunOptions, show: _OutputOptions, *, virtual: bool, seeds: 
 def sound(
     read: Document, kept: KeptVerdict, cases: Sequence[str] = (), *, seeds: int, as_json: bool, anyway: bool
 ) -> bool:
-    """Print the warnings and errors of the check of a run of so many seeds; False if errors keep it from being run.
+    """Print the warnings and errors of the check of a run; False if errors prevent the run.
 
     Args:
         read: The experiment.
-        kept: What an earlier check said of it.
+        kept: Verdict of an earlier check.
         cases: Names of the cases to be run; all if none is named.
-        seeds: How many are run.
-        as_json: Whether errors that keep it from being run are on standard output as JSON too.
+        seeds: Number of seeds to run.
+        as_json: Whether errors that prevent the run are on standard output as JSON too.
         anyway: Whether it is run in spite of errors.
 
     Raises:

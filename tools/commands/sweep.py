@@ -59,13 +59,13 @@ def sweep(
             "--optimise",
             "--optimise",
             metavar="WISH",
-            help="Seek values in the ranges instead: 'messages, iae<=1.01' (relative to the first case).",
+            help="Optimise values in the ranges instead: 'messages, iae<=1.01' (relative to the first case).",
         ),
     ] = None,
     out: Out = None,
-    processes: Annotated[int | None, typer.Option(min=1, help="How many at once. [one per core]")] = None,
+    processes: Annotated[int | None, typer.Option(min=1, help="Number at once. [one per core]")] = None,
     scheduler: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="On the workers of this dask scheduler, tcp://HOST:PORT.")
+        str | None, typer.Option(metavar="ADDRESS", help="Dask scheduler with the workers to use, tcp://HOST:PORT.")
     ] = None,
     as_json: AsJson = False,
     anyway: Anyway = False,

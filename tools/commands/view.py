@@ -52,14 +52,16 @@ def view(
     identity: Annotated[
         str | None,
         typer.Option(
-            "--as", metavar="NAME", help="Whose certificate, in a lab; only an operator gives orders. [observer]"
+            "--as", metavar="NAME", help="Name of the certificate, in a lab; only an operator gives orders. [observer]"
         ),
     ] = None,
-    port: Annotated[int, typer.Option(min=1, max=65535, help="Of the page; the next free one if it is taken.")] = PORT,
-    dark: Annotated[bool, typer.Option("--dark", help="Dark colours.")] = False,
-    open_page: Annotated[bool, typer.Option("--open", help="Opens it in the browser.")] = False,
+    port: Annotated[
+        int, typer.Option(min=1, max=65535, help="Port of the page; the next free one if it is taken.")
+    ] = PORT,
+    dark: Annotated[bool, typer.Option("--dark", help="Use dark colours.")] = False,
+    open_page: Annotated[bool, typer.Option("--open", help="Open it in the browser.")] = False,
     with_run: Annotated[
-        bool, typer.Option("--with-run", hidden=True, help="Waits for the run, and ends with it.")
+        bool, typer.Option("--with-run", hidden=True, help="Wait for the run, and end with it.")
     ] = False,
 ) -> int:
     """Show a run in the browser, in three dimensions: a live one, or a recording."""
@@ -184,8 +186,8 @@ def replay(
     run: Annotated[str, typer.Argument(metavar="RUN", help="Folder of a run, or a recording (.mcap).")],
     *,
     case: Case = None,
-    rate: Annotated[float, typer.Option(min=0.01, max=100.0, help="Times as fast as flown.")] = 1.0,
-    loop: Annotated[bool, typer.Option("--loop", help="Begins again at the end.")] = False,
+    rate: Annotated[float, typer.Option(min=0.01, max=100.0, help="Speed, as a multiple of real time.")] = 1.0,
+    loop: Annotated[bool, typer.Option("--loop", help="Restart at the end.")] = False,
     connect: Connect = None,
     realm: Annotated[str | None, typer.Option(metavar="NAME", help="First chunk of the keys. [the run's]")] = None,
     lab: Lab = None,
