@@ -163,7 +163,7 @@ def test_lighthouse(tmp_path):
     """Geometry and calibration arrive, are stored, and only then does the estimate settle."""
     device = {"positioning": {"system": "lighthouse", "file": lighthouse_file(tmp_path, 0, 1)}}
     with flown(device=device) as (twin, process):
-        memories = twin.device.flock.memories[0]
+        memories = twin.device.flock.decks.memories[0]
         assert (memories.geometries, memories.calibrations) == (0b11, 0b11)
         assert memories.stored == (0b1111, 0b1111)
         assert struct.unpack("<fff", memories.read(Memory.LIGHTHOUSE, 0x100, 12)) == pytest.approx((1.25, 0.5, 2.0))
@@ -194,7 +194,7 @@ def test_loco():
     anchors = [[-2.0, -2.0, 0.0], [2.0, -2.0, 2.5], [2.0, 2.0, 0.0], [-2.0, 2.0, 2.5]]
     device = {"positioning": {"system": "loco", "mode": "tdoa3", "anchors": anchors}}
     with flown(device=device) as (twin, _):
-        known = twin.device.flock.memories[0].anchors()
+        known = twin.device.flock.decks.memories[0].anchors()
         assert {number: list(place) for number, place in known.items()} == dict(enumerate(anchors))
         assert twin.device.drones[0].value("loco.mode") == 3
         assert twin.device.drones[0].value("stabilizer.estimator") == 2

@@ -51,7 +51,7 @@ def test_faulty_drones_fail_differently_while_others_fly_on():
         process.run(0.3)
         lines[mute].faults = Faults(silent_from_s=0.0)
         lines[blinking].faults = Faults(silent_from_s=lines[blinking].t, silent_for_s=1.2)
-        twin.device.flock.charge[empty] = 0.05
+        twin.device.flock.batteries.charge[empty] = 0.05
         other.kill()
         process.setpoint[well] = (0.3, float(well), 0.3, 0.0)
         process.setpoint[lossy] = (0.3, float(lossy), 0.3, 0.0)
@@ -81,7 +81,7 @@ def test_faulty_drones_fail_differently_while_others_fly_on():
             lambda: abs(truth(twin, well)[0] - 0.3) < 0.03 and abs(truth(twin, lossy)[0] - 0.3) < 0.03, "goals"
         )
         assert process.t - process.state.time[well] < 0.5
-        twin.device.flock.charge[empty] = 0.02  # without load its voltage has recovered
+        twin.device.flock.batteries.charge[empty] = 0.02  # without load its voltage has recovered
         process.until(lambda: process.state.note[empty].endswith("; battery low"), "empty battery")
         process.body.takeoff([empty], [0.5])
         process.until(lambda: "no take-off: battery low" in process.state.note[empty], "refusal")

@@ -71,7 +71,7 @@ class Drone:
     def __post_init__(self) -> None:
         tables = inventory(self.flock.tables[self.row])
         self.parameters, self.log_table = tables.parameters, tables.logs
-        self.memories = self.flock.memories[self.row]
+        self.memories = self.flock.decks.memories[self.row]
         self.logs = LogBlocks(self.flock, self.row, self.value, tables.logs)
         self.start()
         # answer to a packet on the same port and channel, or None
@@ -97,12 +97,12 @@ class Drone:
         self.logs.began = flock.t
         self.values = [variable.value for variable in self.parameters.variables]
         present = {
-            "deck.bcLighthouse4": flock.lighthouse[row],
-            "deck.bcLoco": flock.loco[row],
-            "deck.bcDWM1000": flock.loco[row],
-            "deck.bcMultiranger": flock.multiranger[row],
-            "deck.bcFlow2": flock.flow[row],
-            "deck.bcZRanger2": flock.flow[row],
+            "deck.bcLighthouse4": flock.decks.lighthouse[row],
+            "deck.bcLoco": flock.decks.loco[row],
+            "deck.bcDWM1000": flock.decks.loco[row],
+            "deck.bcMultiranger": flock.decks.multiranger[row],
+            "deck.bcFlow2": bool(flock.decks.flow[row]),
+            "deck.bcZRanger2": bool(flock.decks.flow[row]),
         }
         for name, deck in present.items():
             if name in self.parameters.number:
@@ -427,11 +427,11 @@ class Drone:
             flock.estimator.add_external(row, flock.t, (x, y, z), flock.place[row])
             yaw = math.atan2(2.0 * (qw * qz + qx * qy), 1.0 - 2.0 * (qy * qy + qz * qz))
             flock.estimator.turn[row] = math.remainder(yaw - flock.quadrotor.yaw[row], math.tau)
-        elif kind == Location.LPP and flock.loco[row]:
+        elif kind == Location.LPP and flock.decks.loco[row]:
             if rest[1] == crtp.ANCHOR_POSITION and rest[0] < ANCHORS:
-                flock.memories[row].set_anchor(rest[0], *_numbers(crtp.VECTOR, rest[2:]))
+                flock.decks.memories[row].set_anchor(rest[0], *_numbers(crtp.VECTOR, rest[2:]))
         elif kind == Location.STORE_LIGHTHOUSE:
-            flock.memories[row].stored = struct.unpack_from("<HH", rest)
+            flock.decks.memories[row].stored = struct.unpack_from("<HH", rest)
             return bytes((Location.STORE_LIGHTHOUSE, 1))
         elif kind == Location.STOP:
             flock.supervisor.stop(row)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import compress
 from typing import Final
 
 import numpy as np
@@ -10,7 +12,7 @@ from agents.body.external_pose import velocity_after
 from agents.body.interface import BodyRequest
 from agents.body.kinds import Flight
 from agents.kinds.crazyflie import CRAZYFLIE
-from agents.protocols.crazyflie import Lighthouse, Loco, Outside, chosen
+from agents.protocols.crazyflie import CrazyflieSettings, Lighthouse, Loco, Outside, chosen
 from agents.protocols.crtp import Info, Power
 from twins.arrays import Array, Index, Mask, any_true
 from twins.body import instants
@@ -162,6 +164,69 @@ class Disturbances:
         return drawn
 
 
+class Batteries:
+    """Batteries of N rows."""
+
+    def __init__(self, quadrotor: Quadrotors, faults: Faults, dt: float) -> None:
+        rows = len(quadrotor.flying)
+        self.charge = np.full(rows, faults.battery)  # 0 to 1
+        self._quadrotor, self._t = quadrotor, 0.0
+        self._low_since = np.full(rows, np.inf)  # [s]
+        self._drain = dt * faults.drain / CRAZYFLIE.endurance_s
+
+    def advance(self, t: float) -> None:
+        """Drain by one step until `t` [s]."""
+        self._t = t
+        np.maximum(self.charge - self._drain * self._quadrotor.flying, 0.0, out=self.charge)
+        self._low_since = np.where(self.volts < LOW_V, np.minimum(self._low_since, t), np.inf)
+
+    @property
+    def volts(self) -> Array:
+        """(N,) voltages [V]; under load they sag."""
+        return np.asarray(np.interp(self.charge, CHARGES, VOLTS) - SAG_V * self._quadrotor.flying)
+
+    def level(self, row: int) -> int:
+        """Log variable pm.batteryLevel [%], in steps of 10."""
+        return 10 * int(np.searchsorted(VOLTS[:-2], self.volts[row]))
+
+    def power(self, row: int) -> Power:
+        """State of a row's power management."""
+        if self.charge[row] <= 0.0:
+            return Power.SHUTDOWN
+        return Power.LOW if self._t - self._low_since[row] > LOW_S else Power.BATTERY
+
+
+class Decks:
+    """Decks of N rows, with the memories that they bring; positioning on board needs their contents."""
+
+    def __init__(self, settings: Sequence[CrazyflieSettings]) -> None:
+        self.lighthouse = [isinstance(each.positioning, Lighthouse) for each in settings]
+        self.loco = [isinstance(each.positioning, Loco) for each in settings]
+        self.multiranger = [each.multiranger for each in settings]
+        outside = np.array([isinstance(each.positioning, Outside) for each in settings])
+        self.flow = ~(outside | np.array(self.lighthouse) | np.array(self.loco))  # (N,)
+        present = zip(self.lighthouse, self.loco, self.multiranger, self.flow.tolist(), strict=True)
+        boards = "bcLighthouse4", "bcDWM1000", "bcMultiranger", "bcFlow2"
+        self.memories = [Memories(list(compress(boards, each))) for each in present]
+
+    def station_status(self, row: int) -> int:
+        """Log variable lighthouse.status: 0 nothing received, 1 geometry or calibration missing, 2 measuring."""
+        if not self.lighthouse[row]:
+            return 0
+        memories = self.memories[row]
+        return 2 if memories.geometries & memories.calibrations else 1
+
+    def ready(self) -> Mask:
+        """Rows (N,) with a working positioning system on board."""
+        working = np.zeros(len(self.memories), dtype=bool)
+        for row, memories in enumerate(self.memories):
+            if self.lighthouse[row]:
+                working[row] = self.station_status(row) == 2
+            elif self.loco[row]:
+                working[row] = len(memories.anchors()) >= ENOUGH_ANCHORS
+        return np.asarray(working)
+
+
 class Flock:
     """N Crazyflies; the protocol of each is a `twins.devices.crazyflie.drone.Drone`."""
 
@@ -173,12 +238,7 @@ class Flock:
             chosen(name, device, external=external)
             for name, device, external in zip(request.names, request.device, request.external, strict=True)
         ]
-        self.lighthouse = [isinstance(each.positioning, Lighthouse) for each in settings]
-        self.loco = [isinstance(each.positioning, Loco) for each in settings]
-        self.multiranger = [each.multiranger for each in settings]
-        outside = np.array([isinstance(each.positioning, Outside) for each in settings])
-        self._flow = ~(outside | np.array(self.lighthouse) | np.array(self.loco))
-        self.flow = self._flow.tolist()
+        self.decks = Decks(settings)
         self.tables = [tuple(each.tables) for each in settings]
         self.gaps = [each.gaps for each in settings]
         self._faults, self._fault_tumbled = faults, False
@@ -189,14 +249,7 @@ class Flock:
         self.supervisor = Supervisor(~np.array(by_hand))
         self.estimator = Estimator(rows)
         self.quadrotor = Quadrotors(request, self.dt)
-        decks = zip(self.lighthouse, self.loco, self.multiranger, self.flow, strict=True)
-        boards = "bcLighthouse4", "bcDWM1000", "bcMultiranger", "bcFlow2"
-        self.memories = [
-            Memories([name for name, present in zip(boards, each, strict=True) if present]) for each in decks
-        ]
-        self.charge = np.full(rows, faults.battery)  # 0 to 1
-        self._low_since = np.full(rows, np.inf)  # [s]
-        self._drain = self.dt * faults.drain / CRAZYFLIE.endurance_s
+        self.batteries = Batteries(self.quadrotor, faults, self.dt)
         self._disturbances = Disturbances(request, self.dt)
         flight = CRAZYFLIE.motion
         assert isinstance(flight, Flight)
@@ -220,21 +273,6 @@ class Flock:
         """Estimated yaw of a row [rad]."""
         return float(self.quadrotor.yaw[row] + self.estimator.turn[row])
 
-    @property
-    def volts(self) -> Array:
-        """(N,) voltages of the batteries [V]; under load they sag."""
-        return np.asarray(np.interp(self.charge, CHARGES, VOLTS) - SAG_V * self.quadrotor.flying)
-
-    def battery_level(self, row: int) -> int:
-        """Log variable pm.batteryLevel [%], in steps of 10."""
-        return 10 * int(np.searchsorted(VOLTS[:-2], self.volts[row]))
-
-    def power(self, row: int) -> Power:
-        """State of a row's power management."""
-        if self.charge[row] <= 0.0:
-            return Power.SHUTDOWN
-        return Power.LOW if self.t - self._low_since[row] > LOW_S else Power.BATTERY
-
     def info(self, row: int) -> Info:
         """Flags of a row's supervisor and planner."""
         info = self.supervisor.info(row)
@@ -243,23 +281,6 @@ class Flock:
         if self.planner.finished(self.t)[row]:
             info |= Info.PLANNER_FINISHED
         return info
-
-    def station_status(self, row: int) -> int:
-        """Log variable lighthouse.status: 0 nothing received, 1 geometry or calibration missing, 2 measuring."""
-        if not self.lighthouse[row]:
-            return 0
-        memories = self.memories[row]
-        return 2 if memories.geometries & memories.calibrations else 1
-
-    def ready(self) -> Mask:
-        """Rows (N,) with a working positioning system on board."""
-        working = np.zeros(len(self.flow), dtype=bool)
-        for row, memories in enumerate(self.memories):
-            if self.lighthouse[row]:
-                working[row] = self.station_status(row) == 2
-            elif self.loco[row]:
-                working[row] = len(memories.anchors()) >= ENOUGH_ANCHORS
-        return np.asarray(working)
 
     def arm(self, row: int, *, on: bool) -> bool:
         """Arm or disarm a row; False if refused."""
@@ -281,7 +302,7 @@ class Flock:
 
     def advance(self, t: float) -> Mask:
         """Advance to time `t` [s] by steps of dt; returns the rows (N,) locked or crashed on the way."""
-        locked = np.zeros(len(self.charge), dtype=bool)
+        locked = np.zeros(len(self.place), dtype=bool)
         for now in instants(self.t, t, self.dt) or [t]:
             locked |= self._step(now)
         return locked
@@ -322,9 +343,8 @@ class Flock:
         self._update_attitude(before)
         self.place = quadrotor.position.copy()
         self.place[:, :2] += self._disturbances.jitter(quadrotor.position[:, 2])
-        np.maximum(self.charge - self._drain * quadrotor.flying, 0.0, out=self.charge)
-        self._low_since = np.where(self.volts < LOW_V, np.minimum(self._low_since, t), np.inf)
-        self.estimator.advance(t, self.dt, self.ready(), self._flow, flying=quadrotor.flying)
+        self.batteries.advance(t)
+        self.estimator.advance(t, self.dt, self.decks.ready(), self.decks.flow, flying=quadrotor.flying)
         measured = self.place + self._disturbances.noise()
         self.estimate = measured + self.estimator.error
         moved = zip(self.velocity.tolist(), (measured - self._last_measured).tolist(), strict=True)
@@ -384,4 +404,4 @@ class Flock:
 
     def _motors_on(self) -> Mask:
         """Rows (N,) with turning motors."""
-        return np.asarray(self.commander.on & self.supervisor.may_fly & (self.charge > 0.0))
+        return np.asarray(self.commander.on & self.supervisor.may_fly & (self.batteries.charge > 0.0))

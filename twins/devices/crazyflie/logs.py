@@ -188,27 +188,27 @@ def _motion(flock: Flock, row: int) -> dict[str, Read]:
 
 def _system(flock: Flock, row: int, parameter: Callable[[str], float]) -> dict[str, Read]:
     """Decks, battery, supervisor."""
-    memories, read = flock.memories[row], dict[str, Read]()
-    for sensor, bearing in SENSORS.items() if flock.multiranger[row] else ():
+    memories, read = flock.decks.memories[row], dict[str, Read]()
+    for sensor, bearing in SENSORS.items() if flock.decks.multiranger[row] else ():
         read[f"range.{sensor}"] = lambda bearing=bearing: _distance(flock, row, bearing)  # type: ignore[misc]
-    if flock.multiranger[row]:
+    if flock.decks.multiranger[row]:
         read["range.up"] = lambda: _in_reach(ROOM[2] - flock.place[row, 2])
-    if flock.flow[row]:
+    if flock.decks.flow[row]:
         read["range.zrange"] = lambda: _in_reach(flock.place[row, 2])
-    if flock.loco[row]:
+    if flock.decks.loco[row]:
         read["loco.spiWr"] = read["loco.spiRe"] = lambda: 500.0  # [1/s] accesses of the deck's driver
     read |= {
-        "pm.vbat": lambda: float(flock.volts[row]),
-        "pm.vbatMV": lambda: crtp.SECONDS_MS * float(flock.volts[row]),
-        "pm.batteryLevel": lambda: flock.battery_level(row),
-        "pm.state": lambda: flock.power(row),
+        "pm.vbat": lambda: float(flock.batteries.volts[row]),
+        "pm.vbatMV": lambda: crtp.SECONDS_MS * float(flock.batteries.volts[row]),
+        "pm.batteryLevel": lambda: flock.batteries.level(row),
+        "pm.state": lambda: flock.batteries.power(row),
         "supervisor.info": lambda: flock.info(row),
         "sys.canfly": lambda: bool(flock.info(row) & Info.CAN_FLY),
         "sys.isFlying": lambda: bool(flock.info(row) & Info.FLYING),
         "sys.isTumbled": lambda: bool(flock.info(row) & Info.TUMBLED),
         "memTst.errCntW": lambda: memories.write_errors,
-        "lighthouse.status": lambda: flock.station_status(row),
-        "lighthouse.bsReceive": lambda: memories.geometries if flock.lighthouse[row] else 0,
+        "lighthouse.status": lambda: flock.decks.station_status(row),
+        "lighthouse.bsReceive": lambda: memories.geometries if flock.decks.lighthouse[row] else 0,
         "lighthouse.bsActive": lambda: memories.geometries & memories.calibrations,
         "lighthouse.bsGeoVal": lambda: memories.geometries,
         "lighthouse.bsCalVal": lambda: memories.calibrations,

@@ -323,13 +323,13 @@ def test_battery():
     """It empties in flight only, as fast as told; empty, the motors stop."""
     wire = Wire(battery=0.5, drain=10.0)
     wire.wait(5.0)
-    assert wire.flock.charge[0] == 0.5
+    assert wire.flock.batteries.charge[0] == 0.5
     wire.takeoff(1.0, 2.0)
     wire.wait(4.0)
-    used = 0.5 - wire.flock.charge[0]
+    used = 0.5 - wire.flock.batteries.charge[0]
     assert used == pytest.approx(4.0 * 10.0 / 420.0, rel=0.01)
     wire.wait(0.4 * 42.0 + 1.0)
-    assert wire.flock.charge[0] == 0.0
+    assert wire.flock.batteries.charge[0] == 0.0
     assert wire.position[2] == 0.0
 
 
@@ -338,23 +338,23 @@ def test_battery_level_is_that_of_the_firmware():
     flock = Wire().flock
     levels = {1.0: 90, 0.95: 90, 0.85: 90, 0.55: 60, 0.15: 20, 0.09: 10, 0.01: 10, 0.0: 0}
     for charge, level in levels.items():
-        flock.charge[0] = charge
-        assert flock.battery_level(0) == level
-    flock.charge[0] = 0.6
-    assert flock.volts[0] == pytest.approx(3.96)
+        flock.batteries.charge[0] = charge
+        assert flock.batteries.level(0) == level
+    flock.batteries.charge[0] = 0.6
+    assert flock.batteries.volts[0] == pytest.approx(3.96)
     flock.quadrotor.flying[0] = True
-    assert flock.volts[0] == pytest.approx(3.66)
-    assert flock.battery_level(0) == 10
+    assert flock.batteries.volts[0] == pytest.approx(3.66)
+    assert flock.batteries.level(0) == 10
 
 
 def test_an_empty_battery_is_reported_after_five_seconds():
     wire = Wire(battery=0.05)
     wire.takeoff(0.5, 2.0)
     wire.wait(4.0)
-    assert wire.flock.volts[0] < 3.2
-    assert wire.flock.power(0) == Power.BATTERY
+    assert wire.flock.batteries.volts[0] < 3.2
+    assert wire.flock.batteries.power(0) == Power.BATTERY
     wire.wait(1.5)
-    assert wire.flock.power(0) == Power.LOW
+    assert wire.flock.batteries.power(0) == Power.LOW
 
 
 # ---------------------------------------------------------------------- the floor, and crashes

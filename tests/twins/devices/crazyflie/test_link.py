@@ -214,9 +214,9 @@ def test_other_memories():
     assert read(Memory.DECKS, 24) == b"\3" + bytes(23)
     tester = Memories.kinds.index(Memory.TESTER)
     wire.put(Port.MEMORY, 2, struct.pack("<BI", tester, 5), bytes((5, 6, 7, 99)))
-    assert wire.flock.memories[0].write_errors == 1
+    assert wire.flock.decks.memories[0].write_errors == 1
     wire.put(Port.PARAM, 2, number("memTst.resetW"), 1)
-    assert wire.flock.memories[0].write_errors == 0
+    assert wire.flock.decks.memories[0].write_errors == 0
 
 
 @pytest.mark.slow
@@ -263,21 +263,21 @@ def test_lighthouse_memory():
     """Four base stations; a change of the version erases them."""
     wire = Wire(device={"positioning": {"system": "lighthouse"}})
     memory = Memories.kinds.index(Memory.LIGHTHOUSE)
-    assert wire.flock.station_status(0) == 1
+    assert wire.flock.decks.station_status(0) == 1
     for begin, size in ((0, 49), (CALIBRATION, 61)):
         page = bytes(range(size - 1)) + b"\1"
         for at in range(0, size, 24):
             where = struct.pack("<BI", memory, begin + 0x100 + at)
             assert wire.put(Port.MEMORY, 2, where, page[at : at + 24])[0][2] == where + b"\0"
-    assert wire.flock.memories[0].geometries == wire.flock.memories[0].calibrations == 0b10
-    assert wire.flock.station_status(0) == 2
+    assert wire.flock.decks.memories[0].geometries == wire.flock.decks.memories[0].calibrations == 0b10
+    assert wire.flock.decks.station_status(0) == 2
     beyond = struct.pack("<BI", memory, 0x400)
     assert wire.put(Port.MEMORY, 2, beyond, b"\1")[0][2][-1] == Status.IO
     assert wire.put(Port.MEMORY, 1, beyond, 4)[0][2] == beyond + bytes((Status.IO,))
     assert wire.put(Port.LOCATION, 1, 11, struct.pack("<HH", 2, 2)) == [(Port.LOCATION, 1, b"\x0b\1")]
-    assert wire.flock.memories[0].stored == (2, 2)
+    assert wire.flock.decks.memories[0].stored == (2, 2)
     wire.put(Port.PARAM, 2, number("lighthouse.systemType"), 1)
-    assert wire.flock.memories[0].geometries == 0
+    assert wire.flock.decks.memories[0].geometries == 0
 
 
 def test_loco_anchors():
@@ -285,9 +285,9 @@ def test_loco_anchors():
     wire = Wire(device={"positioning": {"system": "loco"}})
     memory = Memories.kinds.index(Memory.LOCO)
     for anchor in range(4):
-        assert not wire.flock.ready()[0]
+        assert not wire.flock.decks.ready()[0]
         assert wire.put(Port.LOCATION, 1, 2, anchor, 1, struct.pack("<fff", anchor, 1.0, 2.0)) == []
-    assert wire.flock.ready()[0]
+    assert wire.flock.decks.ready()[0]
     where = struct.pack("<BI", memory, ANCHOR_PAGES + 0x300)
     ((_, _, answer),) = wire.put(Port.MEMORY, 1, where, 13)
     assert struct.unpack("<fff?", answer[6:]) == (3.0, 1.0, 2.0, True)
