@@ -145,6 +145,14 @@ def router() -> Iterator[RouterProcess]:
     assert not psutil.pid_exists(made.process.pid)
 
 
+@pytest.fixture(scope="module")
+def hub() -> Iterator[RouterProcess]:
+    """One router for all tests of a module that leave it alone."""
+    made = RouterProcess()
+    yield made
+    made.stop()
+
+
 @pytest.fixture
 def patient_router() -> Iterator[RouterProcess]:
     """A router whose clients wait 60 s for a sign of life, as those of rmw_zenohd do."""

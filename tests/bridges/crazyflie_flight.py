@@ -23,6 +23,7 @@ class Process:
         self.body = body
         self.state = None
         self.setpoint = None
+        self.located_as = None  # the twin whose place is measured from outside
         body.open()
         self._zero = time.monotonic()
         self._pause = threading.Event()
@@ -32,6 +33,8 @@ class Process:
         return time.monotonic() - self._zero
 
     def tick(self):
+        if self.located_as is not None:
+            self.body.locate(0, self.t, tuple(truth(self.located_as).tolist()), 0.0)
         self._pause.wait(0.01)
         self.state = Columns(self.body.read(self.t))
         rows = len(self.state.time)

@@ -24,12 +24,6 @@ STATION = """
 SWEEP = "{phase: 0.1, tilt: 0.02, curve: 0.0, gibmag: 0.0, gibphase: 1.0, ogeemag: 0.0, ogeephase: 1.5}"
 
 
-@pytest.fixture(autouse=True)
-def toc_cache(monkeypatch, tmp_path_factory):
-    """cflib's cache, kept from one test to the next and away from the user's."""
-    monkeypatch.setenv("ZENPARK_CACHE_DIR", str(tmp_path_factory.getbasetemp() / "cache"))
-
-
 def lighthouse_file(folder: Path, *numbers: int) -> str:
     lines = ["type: lighthouse_system_configuration", "version: '1'", "systemType: 2", "geos:"]
     lines += [f"  {number}:" + STATION.format(x=number + 0.25) for number in numbers]
@@ -211,14 +205,7 @@ def test_external_position():
         process.body.takeoff([0], [0.5])
         process.until(lambda: "position estimate has not settled" in process.state.note[0], "refusal")
         assert not process.state.flying[0]
-
-        tick = process.tick
-
-        def located():
-            process.body.locate(0, process.t, tuple(truth(twin).tolist()), 0.0)
-            return tick()
-
-        process.tick = located
+        process.located_as = twin
         process.until(lambda: np.isfinite(process.state.position[0]).all(), "settled")
         assert twin.device.drones[0].value("locSrv.extPosStdDev") == pytest.approx(0.02)
         assert twin.device.flock.estimator.received[0] > 10

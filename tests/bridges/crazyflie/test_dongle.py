@@ -23,9 +23,7 @@ SINKS = 0.5  # [m/s] a landing is slower, a fall from this height six times as f
 
 
 @pytest.fixture(autouse=True)
-def toc_cache(monkeypatch, tmp_path_factory):
-    """cflib's cache, kept from one test to the next and away from the user's."""
-    monkeypatch.setenv("ZENPARK_CACHE_DIR", str(tmp_path_factory.getbasetemp() / "cache"))
+def known_tables(toc_cache):
     if link._KNOWN_TABLES:
         return
     with Served(CrazyflieTwin, request("crazyflie", ["x"])) as twin:  # over UDP a thousand entries are read in no time
@@ -150,13 +148,7 @@ def test_nothing_is_received_any_more(begins):
 def test_radio_gap_with_motion_capture_ends_in_landing():
     """The estimator is blind, and drifts: it is down before it is far away, and stays there with its motors on."""
     with flown(device=RADIO, external=True) as (twin, process):
-        tick = process.tick
-
-        def located():
-            process.body.locate(0, process.t, tuple(truth(twin).tolist()), 0.0)
-            return tick()
-
-        process.tick = located
+        process.located_as = twin
         process.until(lambda: np.isfinite(process.state.position).all(), "settled")
         process.takeoff(0.6)
         process.setpoint = [(0.0, 0.0, 0.6, 0.0)]

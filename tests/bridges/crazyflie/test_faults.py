@@ -26,12 +26,6 @@ from twins.devices.device import Faults
 RADIO = "radio://0/80/2M/E7E7E7E70{}"
 
 
-@pytest.fixture(autouse=True)
-def toc_cache(monkeypatch, tmp_path_factory):
-    """cflib's cache, kept from one test to the next and away from the user's."""
-    monkeypatch.setenv("ZENPARK_CACHE_DIR", str(tmp_path_factory.getbasetemp() / "cache"))
-
-
 @pytest.mark.system
 def test_faulty_drones_fail_differently_while_others_fly_on():
     """In one process: one is well, one loses 5 % of all packets; one falls silent for good, one for a moment, one's

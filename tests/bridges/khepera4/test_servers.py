@@ -97,7 +97,7 @@ def test_command_that_waited_too_long_becomes_a_stop(robot):
     assert stands(robot)
 
 
-def test_command_is_as_old_as_its_state(monkeypatch):
+def test_command_is_as_old_as_its_state():
     link = Khepera4Link(
         "KH01", Address.parse("KH01", "khepera4://127.0.0.1"), protocol.Khepera4Settings(), (0.0, 0.0, 0.0)
     )
@@ -128,7 +128,7 @@ def test_ambiguous_server_is_asked_for_and_not_driven(lab, server):
         lab(server, named=False)
 
 
-def test_server_other_than_the_named_is_refused(lab, monkeypatch):
+def test_server_other_than_the_named_is_refused(lab):
     robot = lab("2025-05")
     with pytest.raises(WrongServer, match="as the server of 2025-05 does, not that of 2023-01-07"):
         drivers.identify(robot, protocol.Khepera4Settings(server="2023-01-07"), "2023-01-07")

@@ -118,7 +118,7 @@ def test_recovery_overwrites_nothing(path, tmp_path):
     assert not read(path).complete
 
 
-def test_a_recorder_that_took_over_completes_the_recording(path, tmp_path, capsys):
+def test_a_recorder_that_took_over_completes_the_recording(path, tmp_path):
     """Its first messages are the last values and the events that publishers repeat."""
     run = sorted(whole_run(), key=lambda message: message.stamp)
     first, rest = run[:50], run[50:]

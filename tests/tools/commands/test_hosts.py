@@ -108,7 +108,7 @@ def test_hosts_can_be_left_out(home, tmp_path):
 
 
 @pytest.mark.system
-def test_another_zenpark_is_refused_before_anything_moves(home, tmp_path, monkeypatch):
+def test_another_zenpark_is_refused_before_anything_moves(home, tmp_path):
     command = home / "zenpark" / "zenpark"
     serve = "from experiments.real_time.hosts.station import serve; serve()"
     old = f"import experiments.recording.version as v; v.digest = lambda: 'f' * 64; {serve}"

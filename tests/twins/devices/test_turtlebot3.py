@@ -13,7 +13,6 @@ from zenoh.handlers import RingChannel
 from agents.body.interface import BodyError, Disturbance
 from agents.network.session import open_session
 from tests.bridges.turtlebots import request
-from tests.conftest import RouterProcess
 from twins.devices.device import DeviceRequest, Faults
 from twins.devices.turtlebot3 import TurtleBot3Twin
 
@@ -30,13 +29,6 @@ HASHES = {
     "sensor_msgs/msg/BatteryState": "RIHS01_4bee5dfce981c98faa6828b868307a0a73f992ed0789f374ee96c8f840e69741",
     "geometry_msgs/msg/TwistStamped": "RIHS01_5f0fcd4f81d5d06ad9b4c4c63e3ea51b82d6ae4d0558f1d475229b1121db6f64",
 }
-
-
-@pytest.fixture(scope="module")
-def hub():
-    made = RouterProcess()
-    yield made
-    made.stop()
 
 
 def key_of(style, distro, topic, kind):

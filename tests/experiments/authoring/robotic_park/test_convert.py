@@ -502,7 +502,7 @@ def test_faults_of_an_index_name_their_file(tmp_path, broken, said, where):
     assert raised.value.problems[0].file.endswith(where)
 
 
-def test_one_robot_names_what_to_import(tmp_path):
+def test_one_robot_names_what_to_import():
     with pytest.raises(DocumentError, match="import the file that lists all robots"):
         convert_text(flat("dron01"), "AC_dron01.yaml", 20.0)
 
