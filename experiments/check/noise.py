@@ -37,8 +37,9 @@ class Flights:
     @classmethod
     def of(cls, analysis: Analysis) -> Flights:
         bare = isolated(analysis.plan)
-        count, first = repetitions(bare), bare.experiment.seed
-        flown = [fly(bare, seed) for seed in range(first, first + count)]
+        count, first, beside = repetitions(bare), bare.experiment.seed, analysis.prediction.noisy
+        flown = [] if beside is None else [beside]
+        flown += [fly(bare, seed) for seed in range(first + len(flown), first + count)]
         seeds = f"seed {first}" if count == 1 else f"seeds {first} to {first + count - 1}"
         return cls(tuple(analysis.flown(each) for each in flown if not each.stuck), seeds, count)
 

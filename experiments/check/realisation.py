@@ -30,6 +30,7 @@ ROUNDED: Final = 1e-3  # [m] distances written with three decimals contradict on
 MIRRORS: Final = 3  # robots on the wrong side that are sought
 MOST_MIRRORED: Final = 40  # robots of a formation in which they are sought: the time grows with the third power
 MOST_SIDES: Final = 4  # neighbours of a robot through which the lines are sought
+STILL: Final = 1e-12  # squares of singular values below this, of the largest or of 1 m², are arithmetic
 POINT: Final = 1e-6  # [m] robots that are nearer than this to each other stand in one point, which nothing turns
 
 
@@ -41,17 +42,6 @@ class Residuals:
     tail: Index  # (M,) row i
     head: Index  # (M,) row j, −1 for anchors
     slope: Array  # (M, 3) derivative of the value by the place of row i; that by row j is its negative
-
-    def jacobian(self, rows: Index, count: int) -> Array:
-        """Derivatives (M, 2 R) of all values by x and y of `rows` (R,), of `count` robots."""
-        column = np.full(count + 1, -1)  # the last stands for anchors
-        column[rows] = np.arange(len(rows))
-        number, slopes = np.arange(len(self.value)), np.zeros((len(self.value), len(rows), 2))
-        for end, sign in ((self.tail, 1.0), (self.head, -1.0)):
-            at = column[end]
-            moves = at >= 0
-            slopes[number[moves], at[moves]] = sign * self.slope[moves, :2]
-        return slopes.reshape(len(self.value), -1)
 
     def normal(self, rows: Index, count: int, axes: int) -> tuple[Array, Array]:
         """JᵀJ (axes·R, axes·R) and Jᵀ value (axes·R,) of the Jacobian J, which need not be made: it is nearly empty."""
@@ -433,7 +423,7 @@ def formation_rigidity(
     """
     pairs = np.array([(i, j) for i in led for j in led if i < j], dtype=np.intp).reshape(-1, 2)
     if links.wants is not None or anchors:
-        return _told_more(position, links, pairs, anchors), None
+        return _similar_rigidity(position, links, pairs, anchors), None
     pairs = np.unique(np.concatenate([edges(links), pairs]), axis=0).astype(np.intp)
     moves = np.ones_like(position, dtype=bool)
     moves[:, 2] = False
@@ -454,23 +444,23 @@ def formation_redundancy(position: Array, links: Links, led: Index) -> Redundanc
     return Redundancy(found.pairs[: len(own)], found.robots)
 
 
-def _told_more(position: Array, links: Links, bars: Index, anchors: Anchored) -> Rigidity:
+def _similar_rigidity(position: Array, links: Links, bars: Index, anchors: Anchored) -> Rigidity:
+    """Rigidity but for translations, a rotation and a growth, from JᵀJ, whose eigenvalues are squares."""
     rows = len(position)
-    matrix = residuals(links, anchors, position).jacobian(np.arange(rows), rows)
-    stiff = np.zeros((len(bars), 2, rows, 2))
-    number = np.arange(len(bars))
-    for axis in (0, 1):
-        stiff[number, axis, bars[:, 0], axis], stiff[number, axis, bars[:, 1], axis] = 1.0, -1.0
-    matrix = np.concatenate([matrix, stiff.reshape(-1, 2 * rows)])
+    asked = residuals(links, anchors, position)
+    square = asked.normal(np.arange(rows), rows, 2)[0]
+    i, j = np.repeat(bars, 2, axis=0).T  # leaders keep their places along both axes
+    stiff = Residuals(np.zeros(len(i)), i, j, np.tile(np.eye(3)[:2], (len(bars), 1)))
+    square += stiff.normal(np.arange(rows), rows, 2)[0]
     x, y = (position - position.mean(axis=0))[:, :2].T
     zero, one = np.zeros(rows), np.ones(rows)
     alike = np.stack([np.stack(each, axis=1).ravel() for each in ((one, zero), (zero, one), (-y, x), (x, y))])
     alike = alike[norm(alike) > POINT]
-    kept = len(alike) - np.linalg.matrix_rank(matrix @ alike.T, tol=1e-6)
-    singular = np.linalg.svd(matrix, compute_uv=False)
-    rank = int((singular > 1e-9 * max(1.0, float(singular.max(initial=0.0)))).sum())
-    needed = 2 * rows - int(kept)
-    return Rigidity(rank, needed, float(singular[needed - 1]) if 0 < needed <= len(singular) else 0.0)
+    answered = int((np.linalg.eigvalsh(alike @ square @ alike.T) > STILL).sum())
+    squares = np.linalg.eigvalsh(square)[::-1]
+    rank = int((squares > STILL * max(1.0, float(squares.max(initial=0.0)))).sum())
+    needed = 2 * rows - len(alike) + answered
+    return Rigidity(rank, needed, math.sqrt(squares[needed - 1]) if 0 < needed <= rank else 0.0)
 
 
 def algebraic_connectivity(links: Links, rows: int) -> float:

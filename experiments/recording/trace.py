@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Final, TypeVar
 
 import msgspec
@@ -160,4 +161,10 @@ class Trace:
     joined: Array | None = None  # (N,) [s] since when each robot takes part; None: all from the start
 
     def sent_by(self, row: int) -> PoseTable:
-        return self.sent.take(self.sent.link == row)
+        return self.sent.take(self._sent_by_row[row])
+
+    @cached_property
+    def _sent_by_row(self) -> list[Index]:
+        """Indices of the poses of each robot, in their order."""
+        order = np.argsort(self.sent.link, kind="stable")
+        return np.split(order, np.searchsorted(self.sent.link[order], np.arange(1, len(self.robots))))

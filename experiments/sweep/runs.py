@@ -23,6 +23,7 @@ from experiments.metrics.metric import case_values, foreign_metrics, swept_metri
 from experiments.recording.trace import Trace
 from experiments.recording.version import ROOT, engine_versions
 from experiments.recording.version import digest as digest_of_code
+from experiments.virtual_time import stretch
 from experiments.virtual_time.conductor import Stuck
 from experiments.virtual_time.log import RunRecorder
 from experiments.virtual_time.simulation import simulate
@@ -59,13 +60,14 @@ class WorkResult(msgspec.Struct, frozen=True):
     stranger: str = ""  # other digest of the code, or a missing plug-in: nothing was run
 
 
-def fly(case: bytes, seeds: Sequence[int], code: str) -> bytes:
+def fly(case: bytes, seeds: Sequence[int], code: str, plain_s: float = 0.0) -> bytes:
     """Simulates a case once for each seed.
 
     Args:
         case: An experiment as JSON.
         seeds: Of the runs.
         code: `code_of` the experiment in the process that distributes the work; nothing is run with other code.
+        plain_s: Seconds that all runs of the sweep that are like these would take in plain Python, about.
 
     Returns:
         A `WorkResult` as JSON, runs in the order of the seeds.
@@ -77,6 +79,7 @@ def fly(case: bytes, seeds: Sequence[int], code: str) -> bytes:
         return msgspec.json.encode(WorkResult([], stranger=str(error)))
     if mine != code:
         return msgspec.json.encode(WorkResult([], stranger=f"{mine}, not {code}"))
+    stretch.expect(plain_s)
     runs, failed = fly_seeds(without_standby(plan), tuple(seeds))
     failed |= {run.seed: run.failure for run in runs if run.failure}
     whole = sorted((run for run in runs if not run.failure), key=lambda run: seeds.index(run.seed))

@@ -15,10 +15,12 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import version
+from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -34,6 +36,7 @@ from experiments.sweep.runs import RunMetrics, code_of, lean_enough
 from experiments.sweep.store import Store, StoreOrigin
 from experiments.sweep.table import CellRow
 from experiments.sweep.workers import Work, Workers, workers
+from experiments.virtual_time import stretch
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -140,17 +143,18 @@ class SweepRunner:
         if not total:
             return
         piece = max(1, math.ceil(total / (SHARE * self.workers.count())))
-        works = [
-            Work(
-                cell.digest,
-                document.write_json(cell.plan),
-                tuple(missing[k : k + size]),
-                code_of(cell.plan),
+        plain_s, by_case = defaultdict[str, float](float), dict[str, list[Work]]()
+        for cell, missing in lacking:
+            plain_s[cell.case] += len(missing) * stretch.plain_s(cell.plan)
+        for cell, missing in lacking:
+            size = min(piece, self.most_seeds, side_by_side(cell.plan))
+            code, case = code_of(cell.plan), document.write_json(cell.plan)
+            by_case.setdefault(cell.case, []).extend(
+                Work(cell.digest, case, tuple(missing[k : k + size]), code, plain_s[cell.case])
+                for k in range(0, len(missing), size)
             )
-            for cell, missing in lacking
-            for size in [min(piece, self.most_seeds, side_by_side(cell.plan))]
-            for k in range(0, len(missing), size)
-        ]
+        # cases in turn, so that each process compiles another one
+        works = [work for turn in zip_longest(*by_case.values()) for work in turn if work is not None]
         done = 0
         progress(0, total)
         for work, outcome in self.workers.done(works):

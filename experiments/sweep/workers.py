@@ -29,6 +29,7 @@ class Work:
     case: bytes
     seeds: tuple[int, ...]
     code: str
+    plain_s: float  # that all runs of this case in the sweep would take in plain Python, about
 
 
 @dataclass(frozen=True)
@@ -48,10 +49,10 @@ class Workers:
         """
         if self.executor is None:
             for work in works:
-                yield work, self._checked(fly(work.case, work.seeds, work.code))
+                yield work, self._checked(fly(work.case, work.seeds, work.code, work.plain_s))
             return
         # processes of a pool are started as the work comes in
-        waiting = {self.executor.submit(fly, work.case, work.seeds, work.code): work for work in works}
+        waiting = {self.executor.submit(fly, work.case, work.seeds, work.code, work.plain_s): work for work in works}
         try:
             for future in as_completed(waiting):
                 yield waiting[future], self._checked(future.result())

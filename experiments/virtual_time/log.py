@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import heapq
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cached_property
-from itertools import accumulate, pairwise
+from itertools import accumulate, pairwise, repeat
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, Final, TypeVar
@@ -43,6 +43,7 @@ from twins.arrays import Array, Index
 SAMPLED: Final = ("position", "yaw", "true_position", "goal", "setpoint")  # columns of a log that a trace has as well
 
 
+MANY_ROWS: Final = 10_000
 LARGE_CHUNK_BYTES: Final = 512 * 1024  # of a run that is over: there is nothing to be lost by a kill
 
 T = TypeVar("T")
@@ -155,7 +156,7 @@ class RunRecorder:
         assert sent.yaw is not None
         columns = (sent.stamp, sent.link, sent.seq, sent.position, sent.velocity, sent.yaw)
         words = self._words(sent)
-        for t, row, seq, position, velocity, yaw in zip(*(column.tolist() for column in columns), strict=True):
+        for t, row, seq, position, velocity, yaw in _rows(columns):
             yield messages.pose(names[row], seq, EPOCH + t, position, velocity, yaw=yaw, words=next(words))
 
     def _words(self, sent: PoseTable) -> Iterator[Words]:
@@ -207,8 +208,8 @@ class RunRecorder:
         columns = [log.phase, log.position, log.velocity, log.yaw, log.goal, log.setpoint, log.error]
         known = {what: column for what in OPTIONAL if (column := getattr(log, what)) is not None}
         columns += [log.true_position, log.true_yaw, *known.values()]
-        received, receipts = self._received_by_sample(), self._goals_by_sample()
-        for k, t in enumerate(log.time.tolist()):
+        arrived = zip(self._received_by_sample(), self._goals_by_sample(), strict=True)
+        for (k, t), (received, receipts) in zip(enumerate(log.time.tolist()), arrived, strict=True):
             sample = [
                 column[k].tolist() for column in columns
             ]  # one by one: all of them would take eight times as much
@@ -229,42 +230,49 @@ class RunRecorder:
                         error[row],
                         messages.vector(truth[row]),
                         messages.heading(true_yaw[row]),
-                        received.get((k, row), []),
+                        received.get(row, []),
                         **_known(known, [each[row] for each in more]),
-                        goal_receipts=receipts.get((k, row), []),
+                        goal_receipts=receipts.get(row, []),
                     )
                     for row, name in enumerate(log.names)
                 ],
             )
 
-    def _received_by_sample(self) -> dict[tuple[int, int], list[messages.PoseReceipt]]:
+    def _received_by_sample(self) -> Iterator[dict[int, list[messages.PoseReceipt]]]:
         names, got = self._log.names, self._log.received
         columns = (self._links.sender[got.link], got.seq, got.stamp, got.arrival, got.position, got.velocity)
-        news = (
-            messages.PoseReceipt(names[whose], number, EPOCH + taken, EPOCH + arrived, tuple(where), tuple(moves))
-            for whose, number, taken, arrived, where, moves in zip(*(c.tolist() for c in columns), strict=True)
-        )
-        return self._by_sample(got.arrival, self._links.receiver[got.link], news)
 
-    def _goals_by_sample(self) -> dict[tuple[int, int], list[messages.GoalReceipt]]:
+        def receipt(values: list[Any]) -> messages.PoseReceipt:
+            sender, seq, taken, arrived, position, velocity = values
+            stamps = EPOCH + taken, EPOCH + arrived
+            return messages.PoseReceipt(names[sender], seq, *stamps, tuple(position), tuple(velocity))
+
+        return self._by_sample(got.arrival, self._links.receiver[got.link], columns, receipt)
+
+    def _goals_by_sample(self) -> Iterator[dict[int, list[messages.GoalReceipt]]]:
         if self._log.centre is None:
-            return {}
+            return repeat({}, len(self._log.time))
         got = self._log.centre.followed
         assert got.extra is not None
-        columns = (got.seq, got.stamp, got.extra[:, 0], got.arrival)
-        news = (
-            messages.GoalReceipt(number, EPOCH + sent, EPOCH + taken, EPOCH + acted)
-            for number, sent, taken, acted in zip(*(c.tolist() for c in columns), strict=True)
-        )
-        return self._by_sample(got.arrival, got.link, news)
 
-    def _by_sample(self, arrival: Array, row: Index, news: Iterable[T]) -> dict[tuple[int, int], list[T]]:
-        """Arrivals by the number of the next sample and the row."""
+        def receipt(values: list[Any]) -> messages.GoalReceipt:
+            seq, *times = values
+            return messages.GoalReceipt(seq, *(EPOCH + t for t in times))
+
+        return self._by_sample(got.arrival, got.link, (got.seq, got.stamp, got.extra[:, 0], got.arrival), receipt)
+
+    def _by_sample(
+        self, arrival: Array, row: Index, columns: Sequence[np.ndarray], receipt: Callable[[list[Any]], T]
+    ) -> Iterator[dict[int, list[T]]]:
+        """Arrivals before each sample by row, made sample by sample: a large run has millions."""
         sample = np.searchsorted(self._log.time, arrival - ROUNDING_S)
-        found: dict[tuple[int, int], list[T]] = {}
-        for k, robot, each in zip(sample.tolist(), row.tolist(), news, strict=True):
-            found.setdefault((k, robot), []).append(each)
-        return found
+        order = np.argsort(sample, kind="stable")
+        bounds = np.searchsorted(sample[order], np.arange(len(self._log.time) + 1))
+        for begin, end in pairwise(bounds.tolist()):
+            at, found = order[begin:end], dict[int, list[T]]()
+            for robot, *values in zip(*(column[at].tolist() for column in (row, *columns)), strict=True):
+                found.setdefault(robot, []).append(receipt(values))
+            yield found
 
     def statuses(self) -> Iterator[messages.Status]:
         """The counters at the end of the run and at the end of everything."""
@@ -344,6 +352,12 @@ class RunRecorder:
         yield 0.0, "start", "conductor", "common start"
         yield from ((at, "phase", "conductor", name) for at, name in self._experiment.phases)
         yield self._experiment.duration_s, "phase", "conductor", "landing"
+
+
+def _rows(columns: Sequence[np.ndarray]) -> Iterator[tuple[Any, ...]]:
+    """Rows of columns, some at a time as Python values: all of them would take eight times as much memory."""
+    for begin in range(0, len(columns[0]), MANY_ROWS):
+        yield from zip(*(column[begin : begin + MANY_ROWS].tolist() for column in columns), strict=True)
 
 
 def _known(names: Iterable[str], values: Iterable[float | list[float]]) -> dict[str, Any]:

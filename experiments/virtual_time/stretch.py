@@ -1,12 +1,13 @@
 """Stretches of a run in which nothing happens to a robot, flown by compiled functions.
 
-What is compiled is kept in the user's cache folder: the first time takes a quarter of a minute, later ones a fraction
-of a second. It is used where it pays.
+What is compiled is kept in the user's cache folder: the first time takes 5 to 15 s, later ones a fraction of a second.
+It is used where it pays.
 """
 
 from __future__ import annotations
 
 import fcntl
+import gc
 import hashlib
 import os
 import re
@@ -39,7 +40,7 @@ from twins.body import TwinBody
 
 TICK_S: Final = 15e-6  # of CPU for a tick of a robot in plain Python: 10 to 20 µs
 PAYS_S: Final = 1.0  # for less work in a process plain Python is quicker than to load numba and a loop (0.6 s),
-COMPILES_S: Final = 20.0  # or to compile (15 to 20 s), which is kept
+COMPILES_S: Final = 10.0  # or to compile, which is kept
 LONGEST: Final = 10_000  # ticks of a stretch,
 ROBOT_TICKS: Final = 1_000_000  # and of all robots in it: noise is drawn, and room kept, for all of them beforehand
 LEAST: Final = 20  # after a stretch of fewer ticks
@@ -76,7 +77,7 @@ def {name}({parameters}, at, rows, k, end, dt, log_every, instant):
         k += 1
     return k
 """
-WORK: Final = [0.0]  # seconds of plain Python that the flights of this process take, about
+WORK: Final = [0.0]  # seconds of plain Python that the flights of this process take, about, and those that will follow
 COLOUR: Final = re.compile(r"\x1b\[[0-9;]*m")  # of a compiler's messages
 REFUSED: Final[dict[str, str]] = {}  # by driver, why it cannot be compiled
 DRIVERS: Final[dict[tuple[Any, ...], Any]] = {}  # compiled loops of this process; None: it cannot be compiled
@@ -108,10 +109,19 @@ class Flown(Protocol):
 
 def stretches_of(flight: Flown) -> Stretches | None:
     """Compiled stretches of a flight, where they are possible and pay; else None: then it is flown as it is."""
-    experiment = flight.plan.experiment
-    ticks = experiment.duration_s * experiment.rates.body_hz
-    WORK[0] += TICK_S * ticks * len(flight.robots)
+    WORK[0] += plain_s(flight.plan)
     return None if WORK[0] < PAYS_S or not possible(flight) else Stretches(flight)
+
+
+def plain_s(plan: Plan) -> float:
+    """About the seconds that a flight takes in plain Python."""
+    experiment = plan.experiment
+    return TICK_S * experiment.duration_s * experiment.rates.body_hz * len(experiment.robots)
+
+
+def expect(seconds: float) -> None:
+    """Count on flights that take so many seconds in plain Python, here or in processes that use what is compiled."""
+    WORK[0] = max(WORK[0], seconds)
 
 
 def possible(flight: Flown) -> bool:
@@ -325,11 +335,14 @@ def code_of(owners: Iterable[type]) -> str:
 
 def _compiled(name: str, kinds: Sequence[Items], of_ledger: Layout, folder: Path) -> Any:
     """Loop of that name, from the cache folder or new; None if it cannot be had, and then `REFUSED` says why."""
+    gc.disable()  # a compiler leaves much behind at once, and hardly any circles: a fifteenth of its time
     try:
         return _loop(name, kinds, of_ledger, folder)
     except Exception as error:  # noqa: BLE001 - of a compiler, its cache and plug-ins: the run is flown without them
         REFUSED[name] = COLOUR.sub("", f"{type(error).__name__}: {error}")
         return None
+    finally:
+        gc.enable()
 
 
 def _loop(name: str, kinds: Sequence[Items], of_ledger: Layout, folder: Path) -> Any:

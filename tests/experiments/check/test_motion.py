@@ -96,7 +96,7 @@ def test_more_is_flown_where_it_is_compiled(monkeypatch, compiled, flown_s):
     robots = {f"R{k}": park.robots["KH01"] for k in range(200)}
     many = msgspec.structs.replace(park, robots=robots, formation=formation, timeline=[], duration_s=600.0)
     assert isolated(Plan(many)).experiment.duration_s == flown_s
-    assert isolated(Plan(many).changed(duration_s=30.0)).experiment.duration_s == 11.0  # to compile takes longer
+    assert isolated(Plan(many).changed(duration_s=15.0)).experiment.duration_s == 11.0  # to compile takes longer
 
 
 def flat_strip(gain: float, jitter: float = 0.01, duration_s: float = 30.0) -> Experiment:

@@ -104,12 +104,12 @@ def test_batches_do_not_change_the_table(done, tmp_path):
 def test_a_sweep_that_was_interrupted_goes_on(done, tmp_path):
     progress = Progress(end_after=3)
     part = swept(tmp_path, progress=progress, most_seeds=2)
-    assert (part.missing, [row.seeds for row in part.rows]) == (6, [3])
+    assert (part.missing, [row.seeds for row in part.rows]) == (5, [2, 2])  # cases take turns
     with (tmp_path / "runs.jsonl").open("ab") as file:
         file.write(b'{"cell":"cut off in mid')
     progress = Progress()
     whole = swept(tmp_path, progress=progress)
-    assert (progress.ran, whole.missing) == (6, 0)
+    assert (progress.ran, whole.missing) == (5, 0)
     assert tables(whole) == tables(done)
     assert swept(tmp_path, progress=(quiet := Progress())).rows == done.rows
     assert quiet.ran == 0
@@ -175,7 +175,7 @@ def test_number_of_parallel_flights_depends_on_robots():
 
 def test_workers_with_other_code_are_refused():
     with workers(None, 1) as working, pytest.raises(ExplainedError, match="another version of zenpark"):
-        list(working.done([Work("x", b'{"title":"","robots":{},"duration_s":1}', (1,), "other")]))
+        list(working.done([Work("x", b'{"title":"","robots":{},"duration_s":1}', (1,), "other", 0.0)]))
 
 
 def test_a_scheduler_that_is_none():
