@@ -445,7 +445,7 @@ def formation_redundancy(position: Array, links: Links, led: Index) -> Redundanc
 
 
 def _similar_rigidity(position: Array, links: Links, bars: Index, anchors: Anchored) -> Rigidity:
-    """Rigidity but for translations, a rotation and a growth, from JᵀJ, whose eigenvalues are squares."""
+    """Rigidity up to translations, a rotation and a growth, from the squared singular values: eigenvalues of JᵀJ."""
     rows = len(position)
     asked = residuals(links, anchors, position)
     square = asked.normal(np.arange(rows), rows, 2)[0]
