@@ -12,7 +12,7 @@ from experiments.metrics.statistics import Spread
 from experiments.recording import version
 from experiments.sweep import table
 from experiments.sweep.optimise import parse_objective
-from experiments.sweep.page import _fewest
+from experiments.sweep.page import fewest
 from experiments.sweep.pareto import by_environment, front
 from experiments.sweep.plan import arguments, cells
 from experiments.sweep.runs import RunMetrics, WorkResult, code_of, digest, fly
@@ -54,7 +54,7 @@ def test_cell_with_failed_runs_is_on_no_front():
     landed, whole = _row(0.2, 0.5, failed=1), _row(0.4, 1.0)
     assert front([landed, whole]) == [whole]
     assert parse_objective("messages, iae<=1.01").rank(landed) > parse_objective("messages, iae<=1.01").rank(whole)
-    (finding,) = _fewest([landed, whole])
+    (finding,) = fewest([landed, whole])
     assert "60.0 %" in finding.text
 
 
@@ -62,7 +62,7 @@ def test_fronts_are_per_environment():
     rows = [_row(0.2, 1.0, loss=0.0), _row(0.3, 1.1, loss=0.0), _row(0.25, 1.04, loss=0.1)]
     parts = by_environment(rows)
     assert [front(part) for part in parts.values()] == [rows[:1], rows[2:]]
-    assert [finding.text.split(":")[0] for finding in _fewest(rows)] == ["With loss=0", "With loss=0.1"]
+    assert [finding.text.split(":")[0] for finding in fewest(rows)] == ["With loss=0", "With loss=0.1"]
 
 
 def test_loss_is_environment_and_threshold_is_chosen():
