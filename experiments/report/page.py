@@ -77,6 +77,10 @@ class Finding:
     mark: Mark
     text: str
 
+    def __str__(self) -> str:
+        """Line for a terminal."""
+        return f"{MARKS[self.mark]} {self.text}"
+
 
 @dataclass(frozen=True)
 class PageFigure:

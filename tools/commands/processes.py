@@ -7,22 +7,41 @@ import re
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final, TypeVar
 
 import typer
 
 from tools import completion
 from tools.commands.orders import world_app
-from tools.options import CONNECT, As, Bodies, Case, Connect, File, Lab, Lifeline, Realm, example, routers
+from tools.options import CONNECT, As, Bodies, Case, Connect, File, Lab, Lifeline, Realm, example, routers, with_options
 
 if TYPE_CHECKING:
     from agents.network.access_control import Rights
+    from experiments.real_time.processes.joining import Launch
 
+L = TypeVar("L", bound="Launch")
 app: Final = typer.Typer()
 
 
+@dataclass(frozen=True)
+class Started:
+    """Options of the processes of an experiment."""
+
+    case: Case = None
+    connect: Connect = None
+    lifeline: Lifeline = False
+    lab: Lab = None
+
+    def launch(self, kind: type[L], file: str, **more: Any) -> L:  # noqa: ANN401 - fields of the struct
+        """The command line of a process as its library takes it."""
+        common: dict[str, Any] = {**vars(self), "connect": self.connect or []}
+        return kind(file=file, **common, **more)
+
+
 @app.command(epilog=example("agent triangle KH01"))
+@with_options
 def agent(
     file: File,
     names: Annotated[
@@ -30,39 +49,24 @@ def agent(
         typer.Argument(metavar="NAME...", help="The robots of this process.", autocompletion=completion.members),
     ],
     *,
-    case: Case = None,
-    connect: Connect = None,
-    lifeline: Annotated[
-        bool, typer.Option("--lifeline", help="Land and end when standard input ends or falls silent.")
-    ] = False,
     clock_correction: Annotated[
         float, typer.Option(metavar="SECONDS", help="Offset from this machine's clock to the conductor's.")
     ] = 0.0,
     once: Annotated[bool, typer.Option("--once", help="End when down after the experiment.")] = False,
     realm: Realm = "park",
-    lab: Lab = None,
+    started: Started,
 ) -> int:
     """Be one robot of an experiment, or several that share a device.
 
-    FILE "join" waits for whatever is run next; "-" is a line of JSON on standard input.
+    FILE "join" waits for whatever is run next; "-" is a line of JSON on standard input. At the end of its lifeline it
+    lands first.
     """
     from experiments.real_time.processes.robot import RobotLaunch, fly
 
     if file == "join" and (wrong := [name for name in names if not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII)]):
         raise typer.BadParameter(f"'{wrong[0]}' cannot be a name; use letters, digits and _", param_hint="NAME")
-    return fly(
-        RobotLaunch(
-            file=file,
-            names=names,
-            case=case,
-            connect=connect or [],
-            lifeline=lifeline,
-            clock_correction=clock_correction,
-            once=once,
-            realm=realm,
-            lab=lab,
-        )
-    )
+    given = {"names": names, "clock_correction": clock_correction, "once": once, "realm": realm}
+    return fly(started.launch(RobotLaunch, file, **given))
 
 
 @app.command(hidden=True)
@@ -154,38 +158,27 @@ def _rights(file: str, lab: str | None, bodies: str | None) -> tuple[Rights, Pat
 
 
 @app.command(epilog=example("centre architectures --case centralised"))
-def centre(
-    file: File,
-    *,
-    case: Case = None,
-    connect: Connect = None,
-    lifeline: Lifeline = False,
-    lab: Lab = None,
-) -> int:
+@with_options
+def centre(file: File, *, started: Started) -> int:
     """Be the centre of an experiment: decide for the robots that it guides."""
     from experiments.real_time.processes.centre import serve
     from experiments.real_time.processes.joining import Launch
 
-    return serve(Launch(file=file, case=case, connect=connect or [], lifeline=lifeline, lab=lab))
+    return serve(started.launch(Launch, file))
 
 
 @world_app.command(name="serve", epilog=example("world serve obstacle-course"))
+@with_options
 def world(
     file: File,
     *,
-    case: Case = None,
-    connect: Connect = None,
     engine: Annotated[str | None, typer.Option(metavar="NAME", help="Engine of the twins. [the file's]")] = None,
-    lifeline: Annotated[
-        bool, typer.Option("--lifeline", help="End, after its robots, when standard input ends or falls silent.")
-    ] = False,
-    lab: Lab = None,
+    started: Started,
 ) -> int:
     """Run the world of an experiment: its twins, with obstacles, contacts and range sensors."""
     from experiments.real_time.processes.world import WorldLaunch, serve
 
-    launch = WorldLaunch(file=file, case=case, connect=connect or [], lifeline=lifeline, engine=engine, lab=lab)
-    return serve(launch)
+    return serve(started.launch(WorldLaunch, file, engine=engine))
 
 
 @app.command(epilog=example("twin crazyflie --count 2", "twin tello --faults '{\"loss\": 0.05}'"))

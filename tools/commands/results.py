@@ -125,7 +125,6 @@ def _compare(
     from experiments.metrics.metric import console_metrics
     from experiments.recording.run_folder import differences_from_first, past_runs
     from experiments.report import report as pages
-    from experiments.report.page import MARKS
     from experiments.report.tables import summary_table
     from experiments.report.typeset import plain
     from experiments.report.verdict import interruptions, spoiled
@@ -145,7 +144,7 @@ def _compare(
     table = summary_table(cases, [*console_metrics()])
     say(*columns(plain(pages.differences_table(differ))), "")
     say(*columns([*zip(*plain(table), strict=True)]), table.note)
-    say(*(f"{MARKS[each.mark]} {each.text}" for each in (*spoiled(cases), *interruptions(cases))), str(page))
+    say(*map(str, (*spoiled(cases), *interruptions(cases))), str(page))
     return 0
 
 

@@ -401,11 +401,10 @@ def _command(origin: RunOrigin, options: RunOptions) -> str:
 
 def _lines(runs: Sequence[Run], found: dict[str, Any], page: Path | None) -> Iterator[str]:
     """The results in a few lines."""
-    from experiments.report import page as page_of
     from experiments.report import verdict
 
     cases = [case for each in runs for case in each.metrics.values()]
-    yield from (f"{page_of.MARKS[each.mark]} {each.text}" for each in verdict.spoiled(cases))
+    yield from map(str, verdict.spoiled(cases))
     yield from (finding.text for finding in verdict.interruptions(cases))
     yield from _hazards(runs)
     yield from (_case_line(name, runs, found) for name in found["cases"])
@@ -413,7 +412,7 @@ def _lines(runs: Sequence[Run], found: dict[str, Any], page: Path | None) -> Ite
         yield verdict.left_out(cases)
     yield from (finding.text for finding in verdict.contacts(cases) if finding.mark == "bad")
     yield from (finding.text for finding in verdict.metric_faults(cases))
-    yield from (f"{page_of.MARKS[each.mark]} {each.text}" for each in verdict.criteria_met(cases))
+    yield from map(str, verdict.criteria_met(cases))
     if len(runs) > 1:
         yield f"± is the half-width of the 95 % confidence interval of the mean over {len(runs)} seeds (Student's t)"
     yield from (f"note: {note}" for note in runs[0].notes)
