@@ -3,6 +3,9 @@
 import subprocess
 import sys
 
+import pytest
+
+from tests.cases import for_each
 from tests.conftest import ROOT
 
 CHILD = """
@@ -17,3 +20,17 @@ def test_ctrl_c_reaches_children_of_background_tests():
     in_background = ["sh", "-c", "trap '' INT; exec \"$@\"", "sh", sys.executable, "-c", CHILD]
     done = subprocess.run(in_background, cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout == "True\n"
+
+
+@for_each("number, wanted", [(2, 4), (3, 8), (4, 16), (0, 1)])
+def squares(number, wanted, asked):
+    asked.append(number)
+    assert number**2 == wanted
+
+
+def test_every_case_is_tried_and_every_failure_told():
+    asked = []
+    with pytest.raises(ExceptionGroup, match="2 of 4 cases fail") as caught:
+        squares(asked=asked)
+    assert asked == [2, 3, 4, 0]
+    assert [error.__notes__ for error in caught.value.exceptions] == [["case (3, 8)"], ["case (0, 1)"]]
