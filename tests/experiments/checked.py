@@ -37,9 +37,9 @@ def bad(name: str, *changes: str) -> dict[str, tuple[str, str, str, str]]:
 
 
 def assert_found(name: str, change: str, expected: tuple[str, str], message: str, remedy: str) -> None:
-    """A change of an experiment is found, with its place, and words of its message and of its remedy."""
+    """A change of an experiment, or several, is found, with its place, and words of its message and of its remedy."""
     severity, code = expected
-    found = bad(name, change)
+    found = bad(name, *change.split("; "))
     assert code in found
     assert found[code][0] == severity
     assert message in found[code][1]

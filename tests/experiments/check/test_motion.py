@@ -208,12 +208,18 @@ def test_a_trigger_that_never_fires_is_named():
     [
         (
             PARK,
-            "timeline.0.plan.move_by=[2.0, 0.0]",
+            "timeline.0.plan.move_by=[2.0, 0.0]; duration_s=33",
             ("error", "leaves-arena"),
             "TB01 would leave the arena at 3",
             "shorten",
         ),
-        (PARK, "timeline.0.at_s=5", ("warning", "acquired-late"), "when the plans begin at 5 s", "begin later"),
+        (
+            PARK,
+            "timeline.0.at_s=5; duration_s=18",
+            ("warning", "acquired-late"),
+            "when the plans begin at 5 s",
+            "begin later",
+        ),
         (PARK, "duration_s=24", ("warning", "lags"), "lags behind its leader", "slowly"),
         (TRIANGLE, "duration_s=2", ("warning", "not-acquired"), "mm off after 2 s", "duration_s"),
     ],
