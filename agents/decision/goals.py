@@ -214,10 +214,12 @@ class GoalComputer:
         return is_sound(self.stepping.rehearse(self._view(t, position, ZERO, 0.0, t)))
 
     def unknown_reads(self, t: float, position: Vector) -> str:
-        """Words on what the law reads although it is unknown, asked as in `is_sound`; empty without."""
+        """Words on what the law reads although it is unknown; empty without. In flight, too: it changes nothing."""
         stepping, law = self.stepping, self.law
         if stepping is not None:
-            view = self._view(t, position, ZERO, 0.0, t)
+            view = self._sight(t, position, ZERO, 0.0)
+            if self.itinerary is not None:
+                view.target = position
             return unknown_reads(law, lambda watched: stepping.rehearse(watched(view)))
         senders = [each for each in self.neighbours.all if each.active]
         return unknown_reads(
@@ -228,12 +230,17 @@ class GoalComputer:
         )
 
     def _view(self, t: float, position: Vector, velocity: Vector, yaw: float, start: float) -> View:
+        view = self._sight(t, position, velocity, yaw)
+        if self.itinerary is not None:
+            x, y, z, _ = self.itinerary.target(t - start, (position[0], position[1], self.ground), yaw)
+            cast(Stepping, self.stepping).aim(view, (x, y, z))
+        return view
+
+    def _sight(self, t: float, position: Vector, velocity: Vector, yaw: float) -> View:
+        """View without the target of the plan."""
         stepping, predictor = cast(Stepping, self.stepping), self._predictor
         view = stepping.view()
         view.position, view.velocity, view.yaw, view.leads = position, velocity, yaw, not self.follows
-        if self.itinerary is not None:
-            x, y, z, _ = self.itinerary.target(t - start, (position[0], position[1], self.ground), yaw)
-            stepping.aim(view, (x, y, z))
         view.neighbours = [
             NeighbourView(
                 sender.sender, sender.name, sender.place(predictor, t), sender.velocity, sender.yaw, t - sender.stamp,

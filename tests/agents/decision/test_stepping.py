@@ -19,6 +19,7 @@ from agents.kinds.khepera4 import KHEPERA4
 from agents.network import messages, validation
 from agents.network.messages import Malformed, Variable
 from agents.plugins.law import Control, Law, Said
+from agents.plugins.planners import Leg, Line
 from agents.plugins.registry import PluginError
 from agents.vectors import UNKNOWN
 from experiments.definition.plan import Plan
@@ -170,6 +171,25 @@ def test_velocity_that_is_not_finite_holds_and_lands():
     assert any("the law Lost decides what is not finite" in each.text for each in bench.robot.hazards.incidents)
     bench.step(30.0, hear)
     assert bench.life.phase >= LANDING
+
+
+def test_words_on_unknown_reads_change_nothing():
+    class Aiming(Counting, frozen=True):
+        def step(self, view, memory):
+            return Control(memory=memory, velocity=(*view.target_velocity[:2], view.neighbours[0].link.bearing[0]))
+
+    line = Leg(0.0, Line(move_by=[1.0, 0.0], speed_=0.1))
+    speeds = []
+    for asks in (False, True):
+        bench = Bench(replace(given(Aiming()), legs=(line,)), (0.0, 0.0, 0.0))
+        bench.running(hear).step(0.9, hear)
+        goals = bench.robot.goals
+        words = goals.unknown_reads(99.0, (5.0, 5.0, 0.0)) if asks else ""
+        assert words.startswith(": Aiming reads link.bearing") == asks
+        assert "view.target" not in words
+        bench.step(0.2, hear)
+        speeds.append(goals.stepping.control.velocity[:2])
+    assert speeds[0] == speeds[1] == pytest.approx((0.1, 0.0), abs=1e-6)
 
 
 def test_deviation_counts_in_metres():
