@@ -41,13 +41,14 @@ class TurtleBot3(Body):
 
     Args:
         clock: Monotonic [s]; commands from before a suspension of the machine are old by it.
+        open_timeout: Limit for the router and the odometry of every robot [s].
 
     Raises:
         BodyError: If an address or a setting is wrong.
     """
 
-    def __init__(self, request: BodyRequest, clock: Clock = uptime) -> None:
-        self._clock = clock
+    def __init__(self, request: BodyRequest, clock: Clock = uptime, open_timeout: float = OPEN_S) -> None:
+        self._clock, self._open_timeout = clock, open_timeout
         self._robots = [Robot(request, row) for row in range(len(request.names))]
         self._claims = Claims([robot.name for robot in self._robots], [robot.device for robot in self._robots])
         self._sessions: dict[tuple[str, ...], zenoh.Session] = {}
@@ -60,7 +61,7 @@ class TurtleBot3(Body):
     def open(self) -> None:
         """See `Body.open`: returns after the first odometry of every robot."""
         self._claims.take()
-        deadline = self._clock() + OPEN_S
+        deadline = self._clock() + self._open_timeout
         try:
             participants: dict[tuple[object, ...], Participant] = {}
             for robot in self._robots:

@@ -13,7 +13,6 @@ import pytest
 
 from agents.body.interface import UNANSWERED, BodyError
 from agents.protocols import ros2
-from bridges.turtlebot3 import body as bridge
 from bridges.turtlebot3.body import DIAGNOSIS_S, OPEN_S, TurtleBot3
 from bridges.turtlebot3.robot import Robot
 from tests.bridges.turtlebots import STYLES, Stage, clock, request
@@ -194,11 +193,10 @@ def test_robot_of_other_domain_or_distribution_is_recognised(hub):
 
 
 @pytest.mark.system
-def test_no_router_is_named_in_time(monkeypatch):
-    monkeypatch.setattr(bridge, "OPEN_S", 0.5)
+def test_no_router_is_named_in_time():
     begin = time.monotonic()
     with pytest.raises(BodyError, match=r"TB0: no router answers at tcp/127\.0\.0\.1:9"):
-        TurtleBot3(request(NOWHERE, addresses=("ros2dds://tb3_0",))).open()
+        TurtleBot3(request(NOWHERE, addresses=("ros2dds://tb3_0",)), open_timeout=0.5).open()
     assert 0.5 < time.monotonic() - begin < 2.0
     assert OPEN_S < 5.0
     with pytest.raises(BodyError, match="TB0: 'nonsense' is not an endpoint"):
