@@ -1,4 +1,4 @@
-"""The process around the decision: deadline loop, inboxes, telemetry, orders, lifeline, watchdog.
+"""The process around the decision: deadline loop, descent, inboxes, telemetry, orders, lifeline, watchdog.
 
 May import: agents.
 """
