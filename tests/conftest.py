@@ -103,11 +103,7 @@ class RouterProcess:
 
     def start(self) -> None:
         self.process = subprocess.Popen(
-            [sys.executable, *self._command],
-            cwd=ROOT,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            text=True,
+            [sys.executable, *self._command], cwd=ROOT, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True
         )
         assert self.process.stdout is not None
         assert self.process.stdout.readline() == f"router ready on {self.endpoint}\n"

@@ -74,8 +74,7 @@ def call(words: list[str], monkeypatch: pytest.MonkeyPatch) -> object:
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize(
-    "guide",
-    [pytest.param(guide, marks=pytest.mark.nightly) if guide in LONG else guide for guide in GUIDES],
+    "guide", [pytest.param(guide, marks=pytest.mark.nightly) if guide in LONG else guide for guide in GUIDES]
 )
 def test_a_guide_can_be_followed(
     guide: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

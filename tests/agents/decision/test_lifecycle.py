@@ -73,11 +73,7 @@ class Life:
 
 @pytest.mark.slow
 @settings(max_examples=100)
-@given(
-    st.booleans(),
-    st.lists(st.tuples(st.sampled_from(ORDERS), st.integers(0, 12)), max_size=25),
-    st.booleans(),
-)
+@given(st.booleans(), st.lists(st.tuples(st.sampled_from(ORDERS), st.integers(0, 12)), max_size=25), st.booleans())
 def test_any_orders_in_any_order(flies, orders, ready):
     robot = Life(flies)
     robot.ready, life = ready, robot.life

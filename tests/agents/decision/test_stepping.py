@@ -228,8 +228,7 @@ def test_poses_without_words_are_as_they_were():
 
 
 @pytest.mark.parametrize(
-    "shared",
-    [[Variable("x", [0.0] * 65)], [Variable("x", [nan])], [Variable("x", [inf])], [Variable("x", [1.0])] * 2],
+    "shared", [[Variable("x", [0.0] * 65)], [Variable("x", [nan])], [Variable("x", [inf])], [Variable("x", [1.0])] * 2]
 )
 def test_impossible_words_are_refused(shared):
     pose = messages.Pose("A", 1, 2.0, (0.0, 0.0, 0.0), shared=shared)

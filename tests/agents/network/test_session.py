@@ -55,14 +55,7 @@ def payloads(handler):
 
 
 @pytest.mark.parametrize(
-    "endpoint",
-    [
-        "tcp/0.0.0.0:7447",
-        "tcp/[::]:7447",
-        "tcp/192.168.1.2:7447",
-        "tcp/host.example:7447",
-        "tcp/:1",
-    ],
+    "endpoint", ["tcp/0.0.0.0:7447", "tcp/[::]:7447", "tcp/192.168.1.2:7447", "tcp/host.example:7447", "tcp/:1"]
 )
 def test_refuses_to_listen_beyond_loopback(endpoint):
     with pytest.raises(EndpointError, match="SSH tunnel"):

@@ -201,9 +201,7 @@ def test_call_all_raises_the_last_error():
             raise OSError(what)
 
     with pytest.raises(OSError, match="three") as error:
-        call_all(
-            [lambda: call("one", fails=True), lambda: call("two"), lambda: call("three", fails=True)],
-        )
+        call_all([lambda: call("one", fails=True), lambda: call("two"), lambda: call("three", fails=True)])
     assert made == ["one", "two", "three"]
     assert str(error.value.__context__) == "one"
 

@@ -41,10 +41,7 @@ def test_run_ends_beside_a_robot_below():
 
 @pytest.mark.parametrize("trigger", ["send-on-delta", "predictive"])
 def test_drone_lands_beside_robot_that_died_moving(trigger):
-    robots = {
-        "F": Robot(kind="crazyflie", start=[0.0, 0.0], hover=1.0),
-        "K": Robot(kind="khepera4", start=[-0.4, 0.0]),
-    }
+    robots = {"F": Robot(kind="crazyflie", start=[0.0, 0.0], hover=1.0), "K": Robot(kind="khepera4", start=[-0.4, 0.0])}
     leg = Leg(at_s=0.0, robot="K", plan={"kind": "line", "move_by": [1.0, 0.0], "speed": 0.2})
     swarm = Swarm(
         pair(

@@ -75,12 +75,7 @@ def measure(robots, kind, engine, evaluator, duration_s, *, complete=False):
     flight.fly(landing=False, progress=progress, watch=None)
     end = time.process_time()
     ticks = round((duration_s - start_s) * HZ)
-    found = {
-        "cpu_s": end - start,
-        "agent_steps": ticks * robots,
-        "read_s": loaded - begun,
-        "start_s": start - loaded,
-    }
+    found = {"cpu_s": end - start, "agent_steps": ticks * robots, "read_s": loaded - begun, "start_s": start - loaded}
     if evaluator == "compiled" and (flight.stretches is None or flight.stretches.flown < 0.9 * ticks):
         raise SystemExit(f"not compiled: {stretch.REFUSED}")
     if complete:

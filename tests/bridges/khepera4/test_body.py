@@ -220,8 +220,7 @@ def test_link_outlives_failures_of_any_kind(failure):
 
 @pytest.mark.system
 @pytest.mark.parametrize(
-    ("speaks", "bearings"),
-    [((PARK, PARK), 0), ((KTEAM, KTEAM), 13), ((ONCE | {"ranges": True}, PARK), 5)],
+    ("speaks", "bearings"), [((PARK, PARK), 0), ((KTEAM, KTEAM), 13), ((ONCE | {"ranges": True}, PARK), 5)]
 )
 def test_robots_drive_to_their_goals(served, speaks, bearings):
     rows = replace(request("khepera4", ["khepera4-twin"] * 2, yaw=0.5), device=speaks)

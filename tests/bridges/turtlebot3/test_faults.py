@@ -117,11 +117,7 @@ while not select.select([sys.stdin], [], [], 0.01)[0]:  # whoever started it is 
 class TwinProcess:
     def __init__(self, endpoint):
         self.process = subprocess.Popen(
-            [sys.executable, "-c", TWIN, endpoint],
-            cwd=ROOT,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
+            [sys.executable, "-c", TWIN, endpoint], cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
         )
         self.address = self.process.stdout.readline().strip()
 

@@ -109,10 +109,7 @@ def test_what_was_not_seen_is_not_said() -> None:
     for pose in (nan, flat, None):
         assert pose_filter.filter_poses(frame(cf_1=pose, kh_1=pose), 1.1) == []
     assert pose_filter.refused == 4
-    assert said == [
-        "CF01 is seen as 'cf_1'",
-        "KH01 is not seen: markers hidden, or subject 'kh_1' is switched off",
-    ]
+    assert said == ["CF01 is seen as 'cf_1'", "KH01 is not seen: markers hidden, or subject 'kh_1' is switched off"]
     pose_filter.filter_poses(frame(other=(0.0, 0.0, 0.0)), 1.6)
     assert said[2:] == [
         "CF01: no subject 'cf_1' (there are: other); name another with --map CF01=SUBJECT",

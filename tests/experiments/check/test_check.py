@@ -172,12 +172,7 @@ def test_uncompiled_law_is_noted_once(monkeypatch):
 @pytest.mark.parametrize(
     ("law", "code", "message", "remedy"),
     [
-        (
-            "Steep",
-            "unstable",
-            ", limit 2",
-            "does not use `links.gain`: let it ask for less by the law's own",
-        ),
+        ("Steep", "unstable", ", limit 2", "does not use `links.gain`: let it ask for less by the law's own"),
         ("Undefined", "not-finite", "the law 'mine' gives for", "a length of 0"),
         ("Weak", "not-acquired", "not acquired in time", "raise the law's own parameters (largest)"),
     ],

@@ -24,14 +24,7 @@ PLACES = np.array(
     ]
 )
 # paper, eq. (11): who listens to whom
-HEARS = {
-    1: (0, 2, 3, 4),
-    2: (1, 3, 5),
-    3: (0, 1, 2, 5),
-    4: (0, 1, 5, 6),
-    5: (2, 3, 4, 6),
-    6: (4, 5),
-}
+HEARS = {1: (0, 2, 3, 4), 2: (1, 3, 5), 3: (0, 1, 2, 5), 4: (0, 1, 5, 6), 5: (2, 3, 4, 6), 6: (4, 5)}
 FEW = settings(max_examples=40)
 REFERENCE = [(listener, speaker) for listener, heard in HEARS.items() for speaker in heard]
 

@@ -14,12 +14,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from agents.network.messages import Event, Pose, PoseReceipt, State, Status
 from experiments.recording.ros2 import viewers
-from experiments.recording.ros2.cdr import (
-    Codec,
-    Undecodable,
-    Unencodable,
-    codec,
-)
+from experiments.recording.ros2.cdr import Codec, Undecodable, Unencodable, codec
 from experiments.recording.topics import SentPose
 
 

@@ -24,17 +24,7 @@ from experiments.recording.ros2 import viewers
 from experiments.recording.topics import CHUNK_BYTES
 from experiments.recording.writer import Recording
 from experiments.scene import markers
-from tests.experiments.recordings import (
-    DOCUMENT,
-    PAIR,
-    START,
-    begun,
-    put,
-    scattered,
-    state,
-    whole_run,
-    write,
-)
+from tests.experiments.recordings import DOCUMENT, PAIR, START, begun, put, scattered, state, whole_run, write
 
 
 def test_what_is_attached(path):

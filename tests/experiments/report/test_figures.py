@@ -19,13 +19,7 @@ from tests.experiments.traces import crowd, cut, experiment, pair, park, trace
 
 pytestmark = pytest.mark.slow  # runs and reports, whole
 
-OF_TRACES = (
-    figures.formation,
-    figures.errors,
-    figures.events,
-    figures.intervals,
-    figures.plan_view,
-)
+OF_TRACES = (figures.formation, figures.errors, figures.events, figures.intervals, figures.plan_view)
 OF_CASES = (figures.global_bars, figures.robot_bars)
 RUNS = {
     "7 robots, 2 cases, a leg": lambda: [park(duration=23.0), park("event", 0.01, duration=23.0)],

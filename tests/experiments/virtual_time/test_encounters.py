@@ -100,10 +100,7 @@ def test_four_kinds_change_sides(seeds):
 
 @pytest.mark.parametrize(
     ("kind", "sensors"),
-    [
-        pytest.param("turtlebot3", ["lds01"], marks=pytest.mark.nightly),
-        ("khepera4", ["infrared", "ultrasonic"]),
-    ],
+    [pytest.param("turtlebot3", ["lds01"], marks=pytest.mark.nightly), ("khepera4", ["infrared", "ultrasonic"])],
 )
 def test_robots_with_sensors_alone_keep_clear(kind, sensors):
     outcome = met((kind, kind), {"kind": "barrier"}, 2, sensors=sensors)

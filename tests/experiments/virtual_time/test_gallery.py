@@ -42,8 +42,7 @@ def trace(name, case, *changes):
 
 
 @pytest.mark.parametrize(
-    ("case", "most"),
-    [("periodic", 1e-4), pytest.param("event", 0.015, marks=pytest.mark.slow), ("event-loss", 0.02)],
+    ("case", "most"), [("periodic", 1e-4), pytest.param("event", 0.015, marks=pytest.mark.slow), ("event-loss", 0.02)]
 )
 def test_average_of_constant_signals_has_no_error(case, most):
     known = trace("average", case)

@@ -128,10 +128,7 @@ def test_a_table_has_straight_columns():
 
 
 def test_hosts_are_chosen_by_name_or_tag():
-    lab = {
-        "lab1": hosts.Host(address="a", tags=["radio"]),
-        "lab2": hosts.Host(address="b"),
-    }
+    lab = {"lab1": hosts.Host(address="a", tags=["radio"]), "lab2": hosts.Host(address="b")}
     assert list(choose(lab, [])) == ["lab1", "lab2"]
     assert list(choose(lab, ["radio"])) == ["lab1"]
     assert list(choose(lab, ["lab2", "radio"])) == ["lab1", "lab2"]

@@ -77,8 +77,7 @@ def _without_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(
-    ("landing", "failures"),
-    [(3.0, ["all robots had landed after 3.0 of 10 s"]), (9.6, []), (10.2, [])],
+    ("landing", "failures"), [(3.0, ["all robots had landed after 3.0 of 10 s"]), (9.6, []), (10.2, [])]
 )
 def test_a_run_that_ended_early_has_failed(landing: float, failures: list[str]) -> None:
     course = Course({0.0: "running", landing: "landing"})

@@ -43,10 +43,7 @@ def test_dead_router_listens_again_where_machines_expect_it(tmp_path):
     assert [words[:2] for words in launcher.told] == [(ROUTER, "agents.runtime.router")] * (STARTS - 1)
     assert all(words[2:4] == ("--listen", everywhere) for words in launcher.told)
     assert said[0] == (ROUTER, "the router ended (killed by SIGKILL); started again")
-    assert said[-1] == (
-        ROUTER,
-        "the router ended (killed by SIGKILL); given up: the robots hold, and land at the end",
-    )
+    assert said[-1] == (ROUTER, "the router ended (killed by SIGKILL); given up: the robots hold, and land at the end")
     assert servants.again(SimpleNamespace(name="only-KH01", exit="exit code 2")) is None
 
 

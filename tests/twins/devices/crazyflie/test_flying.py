@@ -263,13 +263,7 @@ def test_closing_a_link_just_after_landing_locks():
 # ---------------------------------------------------------------------- the supervisor
 
 
-@pytest.mark.parametrize(
-    "how",
-    [
-        (Port.SUPERVISOR, 1, int(Safety.STOP)),
-        (Port.LOCATION, 1, int(Location.STOP)),
-    ],
-)
+@pytest.mark.parametrize("how", [(Port.SUPERVISOR, 1, int(Safety.STOP)), (Port.LOCATION, 1, int(Location.STOP))])
 def test_emergency_stop(how):
     wire = Wire().hovering()
     wire.put(*how)
