@@ -120,7 +120,7 @@ def plain_s(plan: Plan) -> float:
 
 
 def expect(seconds: float) -> None:
-    """Count on flights that take so many seconds in plain Python, here or in processes that use what is compiled."""
+    """Announce flights: seconds of plain Python in this process and in those that share its compiled loops."""
     WORK[0] = max(WORK[0], seconds)
 
 
