@@ -1,21 +1,27 @@
-"""A view of a run that goes on: what it shows, what it may do, and its sign of life."""
+"""A view of a run that goes on: what it shows, what it may do, and its sign of life; a replay gives way to robots."""
 
 from __future__ import annotations
 
+import threading
 from itertools import product
 
 import msgspec
 import numpy as np
 import pytest
 
-from agents.network import lab
+from agents.errors import ExplainedError
+from agents.network import lab, pubsub
 from agents.network.endpoints import free_endpoint
+from agents.network.keys import Keys
 from experiments.file.document import load
 from experiments.run import simulate, simulate_seeds
 from experiments.scene.stage import SceneModel
 from experiments.view import live
 from experiments.view.acting import Watched, may_act, parameters
+from experiments.view.broadcast import Broadcast
 from experiments.view.heartbeat import RECORDED_S, SLOWEST_S, DataAge, frame_s, mark
+from experiments.view.replay import Clock
+from tests.fuzz.loopnet import Mute, Net
 
 
 @pytest.mark.parametrize("size", [(2.0, 2.0, 0.95), (12.0, 12.0, 1.1), (4.3, 2.0, 0.95), (0.5, 6.0, 2.0)])
@@ -116,3 +122,44 @@ def test_watched_virtual_run_is_unchanged_bit_by_bit():
     for case, trace in alone.traces.items():
         np.testing.assert_array_equal(watched.traces[case].true_position, trace.true_position)
     assert page.clock.t > 0.0
+
+
+KEYS = Keys()
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    simulate(load("triangle", "duration_s=2.0", "timeline=[]"), cases=["event"], folder=folder)
+    return folder / "event.mcap"
+
+
+@pytest.mark.parametrize(
+    ("token", "shown"),
+    [
+        (KEYS.life(KEYS.alive("KH01"), "beef"), "park/KH01/alive"),  # of a recorded name
+        (KEYS.alive("other"), "park/other/alive"),
+        (KEYS.claim(KEYS.alive("KH01"), KEYS.rank(1.0, "beef")), ""),  # of a robot that is refused
+        (KEYS.life(KEYS.alive("KH01"), "f00d"), ""),  # its own
+    ],
+)
+def test_replay_ends_when_another_process_owns_a_name(token, shown, recording, monkeypatch):
+    sent: list[bytes] = []
+
+    class Counted(Mute):
+        def put(self, payload, **_):
+            sent.append(payload)
+            if len(sent) == 20:
+                net.deliver(f"{token}\0\0".encode())
+
+    with Net().worn() as net:
+        monkeypatch.setattr(pubsub, "publisher", lambda *_, **__: Counted())
+        played = Broadcast(net.session, recording, watch_s=0.0)
+        clock = Clock(0.0, played.end - played.begin)
+        clock.playing, clock.speed = True, 10.0
+        if shown:
+            with pytest.raises(ExplainedError, match=shown):
+                played.run(threading.Event(), clock)
+            assert clock.t < clock.end
+        else:
+            assert played.run(threading.Event(), clock) > len(sent) > 20
