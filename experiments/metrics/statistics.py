@@ -34,14 +34,9 @@ def ratios(runs: Sequence[CaseMetrics], reference: Sequence[CaseMetrics], index:
         less = sums and most - coverage(run) > SAME_COVERAGE
         return None if run.spoiled or less or not equally_long((run.duration_s, longest)) else run.mean.get(index)
 
-    return ratios_by_seed(*({run.seed: value(run) for run in each} for each in (runs, reference)))
-
-
-def ratios_by_seed(values: Mapping[int, float | None], reference: Mapping[int, float | None]) -> list[float | None]:
-    """Values over those of the same seed if all seeds are the same, else over their mean."""
-    mean = spread([*reference.values()]).mean
-    paired = values.keys() == reference.keys()
-    return [ratio(value, reference[seed] if paired else mean) for seed, value in values.items()]
+    values, others = ({run.seed: value(run) for run in each} for each in (runs, reference))
+    mean, paired = spread([*others.values()]).mean, values.keys() == others.keys()
+    return [ratio(known, others[seed] if paired else mean) for seed, known in values.items()]
 
 
 def same_length(runs: Sequence[CaseMetrics]) -> bool:
