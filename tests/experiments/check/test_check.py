@@ -395,6 +395,7 @@ def test_batteries_ending_before_the_run_are_all_named():
     assert not said(12000.0, battery_low=0.0)
 
 
+@pytest.mark.usefixtures("unflown")
 def test_payload_of_what_a_law_says():
     bare, said = (figures(document.read(name).cases()["event"]) for name in ("triangle", "average"))
     assert bare.words_bytes == 0
