@@ -9,10 +9,12 @@ from typing import Final
 import msgspec
 import numpy as np
 
+from agents.decision.goals import GoalComputer
 from agents.decision.stepping import Stepping
 from agents.formation.link import BY_BEARING, BY_DISTANCE, BY_RELATIVE
 from agents.network import messages
 from agents.plugins.calls import unknown_reads
+from agents.vectors import ZERO
 from experiments.check.analysis import Analysis
 from experiments.check.findings import FORGIVEN, Finding, Severity, join_names
 from experiments.check.realisation import OFF, Conflict, Shape, conflicts, contradictions
@@ -314,8 +316,25 @@ def law(analysis: Analysis) -> Iterator[Finding]:
         message = "messages are lost, and the trigger may stay silent for ever: what was said last is not repeated"
         remedy = "give the trigger maximum_silence_s, such as 1.0"
         yield Finding("warning", "lost-words", message, remedy, ("trigger",))
+    if reads := "" if analysis.is_gradient or analysis.prediction.stuck else _unknown_reads(analysis):
+        message = f"the law '{plan.law_name}' comes to a number in spite of an unknown one{reads}"
+        yield Finding("warning", "reads-unknown", message, "a comparison with an unknown number is false", path)
     for severity, message, remedy in plan.law.analyse(plan):
         yield Finding(severity, "law", message, remedy, path)
+
+
+def _unknown_reads(analysis: Analysis) -> str:
+    """Words on what the law of the first robot with neighbours reads at the start although it is unknown."""
+    plan, starts = analysis.plan, analysis.start.tolist()
+    if not len(analysis.links):
+        return ""
+    row = int(analysis.links.receiver[0])
+    goals = GoalComputer(plan.assignment(plan.names[row], centrally=plan.names[row] in plan.guided))
+    for number, sender in enumerate(goals.neighbours.all):
+        goals.neighbours.mark_alive(number)
+        goals.neighbours.receive(number, tuple(starts[sender.sender]), ZERO, 0.0, 0.0)
+    goals.update_links(0.0)
+    return goals.unknown_reads(0.0, tuple(starts[row]))
 
 
 def load(analysis: Analysis) -> tuple[int, int, float]:

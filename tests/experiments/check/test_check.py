@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from agents.decision.position_control import REACHED
 from agents.network import messages
 from agents.plugins import registry
+from agents.plugins.law import Control, Law
 from agents.plugins.laws import Gradient
 from agents.vectors import UNKNOWN, ZERO, norm
 from experiments.check.analysis import analyse
@@ -152,6 +153,13 @@ class Undefined(Steep, frozen=True):
         return ZERO if self.error(apart, link) > 1e-3 else UNKNOWN
 
 
+class Comparing(Law, frozen=True):
+    """A law that compares what it did not ask for."""
+
+    def step(self, view, memory):
+        return Control(velocity=(0.1 * sum(each.link.relative[0] > 0.0 for each in view.neighbours), 0.0, 0.0))
+
+
 class Listing(Steep, frozen=True):
     """A law that is not compiled."""
 
@@ -174,6 +182,7 @@ def test_uncompiled_law_is_noted_once(monkeypatch):
     [
         ("Steep", "unstable", ", limit 2", "does not use `links.gain`: let it ask for less by the law's own"),
         ("Undefined", "not-finite", "the law 'mine' gives for", "a length of 0"),
+        ("Comparing", "reads-unknown", 'give the law NEEDS = "relative"', "a comparison with an unknown number"),
         ("Weak", "not-acquired", "not acquired in time", "raise the law's own parameters (largest)"),
     ],
 )
