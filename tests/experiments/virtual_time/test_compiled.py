@@ -11,10 +11,12 @@ from pathlib import Path
 from typing import ClassVar
 
 import msgspec
+import numpy as np
 import pytest
 
 from agents.body.interface import Disturbance, Jitter
 from agents.body.limits import Safety
+from agents.decision.lifecycle import Phase
 from agents.formation.link import BY_BEARING, BY_DISTANCE, BY_RELATIVE
 from agents.plugins import registry
 from agents.plugins.laws import Gradient
@@ -155,6 +157,9 @@ def test_legs_hazard_and_several_stretches():
         robots=robots, formation=Formation(links={"A > B": 0.8}), duration_s=25.0, timeline=legs,
         safety=Safety(battery_low=0.96), avoidance={"kind": "potential"},
     )  # fmt: skip
+    lands = robots | {"A": msgspec.structs.replace(robots["A"], lands_at_s=8.0)}
+    log, _ = same(msgspec.structs.replace(made, robots=lands, safety=Safety()))
+    assert log.phase[np.argmax(log.time > 14.0)].tolist() == [Phase.DONE, Phase.RUNNING]
     for seed, lean in ((1, False), (2, False), (3, True)):
         log, ticks = same(made, seed=seed, lean=lean)
         assert ticks > 1500
