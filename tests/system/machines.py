@@ -116,8 +116,9 @@ class Machine:
                 textwrap.dedent(
                     f"""\
                     import time
-                    since, monotonic, utc = time.monotonic(), time.monotonic, time.time
+                    monotonic, reading, utc = time.monotonic, time.clock_gettime, time.time
                     time.monotonic = lambda: monotonic() * {1.0 + drift!r}
+                    time.clock_gettime = lambda clock: reading(clock) * {1.0 + drift!r}
                     time.time = lambda: utc() + {offset_s!r} + {drift!r} * (utc() - {time.time()!r})
                     """
                 )
