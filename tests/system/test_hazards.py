@@ -69,6 +69,20 @@ def test_drone_with_low_battery_lands_and_others_continue(tmp_path: Path) -> Non
     assert ends["KH01"] == "done: finished"
 
 
+def test_scripted_landing_fails_no_run(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    asked = ("--set", "robots.CF01.lands_at_s=3", "--set", "duration_s=6")
+    flight = Flight(folder, "triangle", "--case", "event", "--no-report", *asked)
+    flight.until_said(r"hazard KH01: warn: a neighbour is lost: CF01")
+    assert flight.finish()[0] == 0
+    played = playback.read(folder / "event.mcap")
+    sent = [pose.stamp - played.started for pose in typed(folder / "event.mcap", "/CF01/pose")]
+    assert max(sent) < 3.1
+    ends = {event.source: event.text for event in played.trace.events if event.kind == "robot"}
+    assert ends["CF01"] == "done: lands as its file says"
+    assert ends["KH01"] == "done: finished"
+
+
 def test_uncharged_robot_does_not_take_off_with_reason(router: RouterProcess, tmp_path: Path) -> None:
     watcher = Watcher(router.endpoint)
     robots = RobotProcess(router.endpoint, written(tmp_path, "battery_min = 1.0"), "A", "B")

@@ -123,6 +123,7 @@ def test_robots_beginning_is_its_first_status_within_experiment() -> None:
         ("ordered to land", (), False),
         ("ordered to leave", (), False),
         ("asked to end", (), False),
+        ("lands as its file says", (), False),
         ("emergency stop by a test", (), False),
     ],
 )
