@@ -349,7 +349,7 @@ def test_wheels_stop_without_setpoints_and_at_closing(served, speaks):
         assert 0.09 < went < 0.5  # half a second, the time to be heard, the time to stop
         body.command([(nan, 0.0, 0.0, 0.0)])
         body.command([(0.2, 0.0, 0.0, 0.0)])
-        drive.until(lambda: drive.state.velocity[0, 0] > 0.05)
+        drive.until(lambda: twins.truth()[0][0, 0] > went + 0.02)
 
     def stands():
         before = twins.truth()[0][0, 0]
