@@ -317,7 +317,7 @@ def law(analysis: Analysis) -> Iterator[Finding]:
         remedy = "give the trigger maximum_silence_s, such as 1.0"
         yield Finding("warning", "lost-words", message, remedy, ("trigger",))
     if reads := "" if analysis.is_gradient or analysis.prediction.stuck else _unknown_reads(analysis):
-        message = f"the law '{plan.law_name}' comes to a number in spite of an unknown one{reads}"
+        message = f"the law '{plan.law_name}' gives a number in spite of an unknown one{reads}"
         yield Finding("warning", "reads-unknown", message, "a comparison with an unknown number is false", path)
     for severity, message, remedy in plan.law.analyse(plan):
         yield Finding(severity, "law", message, remedy, path)
