@@ -52,8 +52,10 @@ def texts(file: Path) -> Iterator[tuple[int, str, bool]]:
 
 
 def sentences(text: str) -> Iterator[str]:
-    """Sentences, without what stands in parentheses, quotes or code."""
+    """Sentences outside of tables, without parentheses, quotes and code."""
     for item in ITEM.split(text):
+        if item.lstrip().startswith("|"):
+            continue
         plain = re.sub(r'"[^"]*"|`[^`]*`', "it", re.sub(r"\s+", " ", item))
         yield from re.split(r"(?<=[.!?])[*_”]*\s+", ASIDE.sub("", ASIDE.sub("", plain)))
 
