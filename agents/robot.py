@@ -238,7 +238,7 @@ class Robot:
         state = now.state
         moves = life.climbing or AIRBORNE <= life.phase <= LANDING
         now.jump = self._continuity.jump(state.time, state.position, state.yaw, moves)
-        now.turned = self._continuity.turned
+        now.yaw_jump = self._continuity.yaw_jump
         if self._external.doubted:
             self._doubt()
         if now.jump == now.jump:
@@ -444,7 +444,7 @@ class Robot:
         for incident in serious:
             end = life.stop if incident.outcome == Outcome.CUT else life.land
             end(incident.cause.rule.words)
-            misled = isfinite(now.jump) or incident.cause in (Cause.STILL, Cause.STRAYING)
+            misled = isfinite(now.jump) or incident.cause in (Cause.UNRESPONSIVE, Cause.STRAYING)
             if self.assignment.kind.flies and misled:
                 self._external.disbelieve()  # it lands by what it knows itself
 

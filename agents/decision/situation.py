@@ -64,8 +64,8 @@ class Situation:
     """One robot on a tick; overwritten on each."""
 
     __slots__ = (
-        "excess", "flyaway", "invalid", "jump", "outside", "outside_wall", "position", "sound",
-        "state", "t", "turned", "velocity", "yaw",
+        "excess", "flyaway", "invalid", "jump", "outside", "outside_wall", "position", "sound", "state", "t",
+        "velocity", "yaw", "yaw_jump",
     )  # fmt: skip
 
     t: float  # now [s]
@@ -74,7 +74,7 @@ class Situation:
     velocity: Vector  # measured or estimated [m/s]
     yaw: float  # measured [rad]
     jump: float  # length of the jump of its position [m]; NaN: it did not jump
-    turned: float  # of its yaw [rad]; NaN: it did not
+    yaw_jump: float  # size of the jump of its yaw [rad]; NaN: it did not jump
     sound: bool  # pose known, fresh and inside the arena: the five below are False and 0
     invalid: bool  # own pose missing, stale or not finite: no closed loop is possible
     outside_wall: bool  # outside a wall, or above the ceiling
@@ -83,7 +83,7 @@ class Situation:
     excess: float  # distance from the arena along the worst axis [m]; 0 inside
 
     def __init__(self) -> None:
-        self.t, self.state, self.jump, self.turned = 0.0, BodyState(), nan, nan
+        self.t, self.state, self.jump, self.yaw_jump = 0.0, BodyState(), nan, nan
         self.begin(0.0)
         self.sound = True
         self.invalid = self.outside_wall = self.outside = self.flyaway = False

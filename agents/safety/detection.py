@@ -230,7 +230,7 @@ class Detector:
         motion_check, ascent = self.motion_check, self.ascent
         motion_check.update(t, status.setpoint, now.position, now.yaw, status.cruising and not now.invalid)
         if motion_check.unresponsive or ascent.stalled:
-            found |= 1 << Cause.STILL
+            found |= 1 << Cause.UNRESPONSIVE
         if motion_check.uncommanded or ascent.carried:
             found |= 1 << Cause.STRAYING
         return found if now.sound else found | self.of_place(now)
@@ -275,7 +275,7 @@ class Detector:
             for sender in neighbours.all:
                 waits = waits or (-inf < sender.stamp < health.resumed_at and not isfinite(sender.lost_since))
             if waits:
-                found |= 1 << Cause.STANDSTILL
+                found |= 1 << Cause.SUSPENDED
         if health.offline_since < inf:
             found |= 1 << Cause.ROUTER
         elif health.conductor_lost_since < inf:
@@ -416,8 +416,8 @@ class Detector:
             Cause.BEHIND: late,
             Cause.FOREIGN: foreign,
             Cause.REFUSED: lambda: ", ".join(f"{each.name}: {each.doubt}" for each in neighbours.all if each.doubt),
-            Cause.STANDSTILL: lambda: f"for {health.suspended_s:.1f} s; it waits for its neighbours",
-            Cause.STILL: lambda: (
+            Cause.SUSPENDED: lambda: f"for {health.suspended_s:.1f} s; it waits for its neighbours",
+            Cause.UNRESPONSIVE: lambda: (
                 "it does not rise" if ascent.stalled else f"{motion_check.commanded:.2f} m commanded in vain"
             ),
             Cause.STRAYING: lambda: (
@@ -469,8 +469,8 @@ def lags(sender: Neighbour) -> bool:
 
 def lost_position(now: Situation) -> str:
     """Reason why the own pose is invalid."""
-    if isfinite(now.turned):
-        return f"its yaw jumped by {now.turned:.2f} rad"
+    if isfinite(now.yaw_jump):
+        return f"its yaw jumped by {now.yaw_jump:.2f} rad"
     if isfinite(now.jump):
         return f"it jumped by {now.jump:.2f} m"
     if not is_finite(now.position):

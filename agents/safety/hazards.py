@@ -95,9 +95,11 @@ class Cause(IntEnum):
     BEHIND = Rule("a neighbour's clock is behind", Outcome.WARN)
     FOREIGN = Rule("a tool sends poses of a neighbour", Outcome.WARN, after_s=1.0)  # not late ones of a former process
     REFUSED = Rule("all poses of a neighbour are refused", Outcome.WARN)  # it counts as lost, too
-    STANDSTILL = Rule("its process stood still", Outcome.HOLD)
+    SUSPENDED = Rule("its process stood still", Outcome.HOLD)
     # a position that does not follow is a wrong one, by which the robot would go away; on wheels it may only be stuck
-    STILL = Rule("it does not obey commands to move", Outcome.WARN, then=Outcome.LAND, then_s=0.0, grounded_s=2.0)
+    UNRESPONSIVE = Rule(
+        "it does not obey commands to move", Outcome.WARN, then=Outcome.LAND, then_s=0.0, grounded_s=2.0
+    )
     STRAYING = Rule("it moves without a command", Outcome.LAND)
     UNREACHABLE = Rule("its device does not answer", Outcome.WARN, after_s=0.5, landing=True)
     HOVERING = Rule("it hovers although commanded to land", Outcome.WARN, after_s=2.0, landing=True)
@@ -118,7 +120,7 @@ def rules(limits: Limits) -> list[Rule]:
     chosen = {
         Cause.POSITION: {"then_s": limits.land_without_position_s if limits.hold_s is None else limits.hold_s},
         # robots of a world, which wait longer without a position, do not move while it is paused
-        Cause.STILL: {
+        Cause.UNRESPONSIVE: {
             "then_s": 0.0 if limits.hold_s is None or limits.hold_s == limits.land_without_position_s else NEVER
         },
         Cause.NEIGHBOUR: {"first": _LOST[limits.lost_neighbour]},
@@ -137,7 +139,7 @@ def failed(text: str) -> bool:
     at the end.
     """
     outcome, _, words = text.partition(": ")
-    severe = tuple(cause.rule.words for cause in (Cause.STILL, Cause.UNREACHABLE, Cause.HOVERING))
+    severe = tuple(cause.rule.words for cause in (Cause.UNRESPONSIVE, Cause.UNREACHABLE, Cause.HOVERING))
     blind = outcome == UNRESOLVED and is_blind(text)
     return outcome in {"land", "cut"} or (outcome == "warn" and words.startswith(severe)) or blind
 

@@ -35,10 +35,10 @@ class MotionCheck:
     """Commanded and measured motion of one robot."""
 
     __slots__ = (
-        "anchor", "anchor_yaw", "begin", "begin_yaw", "by_position", "by_twist", "commanded", "commanded_s", "drift",
-        "drifted", "due", "flies", "free", "last", "response", "rim", "samples", "slow", "speed", "spin", "turn",
-        "turn_before", "turned", "unanswered", "unanswered_turn", "uncommanded", "unresponsive", "way", "way_before",
-        "without", "x", "y", "z",
+        "anchor", "anchor_yaw", "begin", "begin_yaw", "by_position", "by_twist", "commanded", "commanded_s",
+        "commanded_turn", "drift", "drifted", "due", "flies", "free", "last", "response", "rim", "samples",
+        "slow", "speed", "turn", "turn_before", "unanswered", "unanswered_turn", "uncommanded",
+        "uncommanded_turn", "unresponsive", "way", "way_before", "without", "x", "y", "z",
     )  # fmt: skip
 
     unresponsive: bool  # it does not obey commands to move
@@ -61,7 +61,7 @@ class MotionCheck:
     x: float  # [m]
     y: float
     z: float
-    turned: float  # [rad]
+    commanded_turn: float  # [rad]
     # commanded in this piece and in the one before: a body is late and moves after its command has ended
     samples: int  # of this piece
     way: Vector  # [m]
@@ -71,7 +71,7 @@ class MotionCheck:
     begin: Vector  # position at the begin of the piece [m]; NaN: there is none
     begin_yaw: float  # [rad]
     drift: Vector  # recent uncommanded travel [m]
-    spin: float  # recent uncommanded rotation [rad]
+    uncommanded_turn: float  # recent uncommanded rotation [rad]
     # commanded since its last motion
     anchor: Vector  # position then [m]
     anchor_yaw: float  # [rad]
@@ -87,7 +87,7 @@ class MotionCheck:
         self.without = WITHOUT_S * kind.speed * (1.0 if kind.flies else 0.5)
         self.free = RUSH_S * kind.speed + kind.radius
         self.last = self.due = -inf
-        self.x = self.y = self.z = self.turned = 0.0
+        self.x = self.y = self.z = self.commanded_turn = 0.0
         self.samples = 0
         self.forget(UNKNOWN, nan)
 
@@ -138,11 +138,11 @@ class MotionCheck:
             if isfinite(setpoint[2]):
                 self.z += setpoint[2] * since
         if isfinite(turn):
-            self.turned += turn * since
+            self.commanded_turn += turn * since
 
     def compare(self, t: float, setpoint: Setpoint, position: Vector, yaw: float, watched: bool) -> None:
         """Compare commanded and measured motion at the end of a sample; without one of them the count restarts."""
-        way, turn = (self.x, self.y, self.z), self.turned
+        way, turn = (self.x, self.y, self.z), self.commanded_turn
         self.end_sample(t)
         commanded = isfinite(setpoint[0]) and isfinite(setpoint[1]) and isfinite(setpoint[2]) and isfinite(setpoint[3])
         known = is_finite(position) and isfinite(yaw)
@@ -160,7 +160,7 @@ class MotionCheck:
 
     def end_sample(self, t: float) -> None:
         self.due = t + SAMPLE_S - ROUNDING_S
-        self.x = self.y = self.z = self.turned = 0.0
+        self.x = self.y = self.z = self.commanded_turn = 0.0
 
     def count_unresponsive(self, position: Vector, yaw: float, way: Vector, turn: float) -> None:
         """Add a commanded `way` [m] and `turn` [rad]; the count restarts after a motion."""
@@ -191,7 +191,7 @@ class MotionCheck:
         obeyed = clamp(dot(moved, toward), 0.0, length)
         if norm(moved) > 4.0 * self.speed * PIECE_S:
             # no robot is so fast: it was moved in the world, or its position comes from something else now
-            self.drift, self.spin = ZERO, 0.0
+            self.drift, self.uncommanded_turn = ZERO, 0.0
         else:
             drift = self.drift
             self.drift = (
@@ -201,9 +201,10 @@ class MotionCheck:
             )
             if self.by_twist:
                 turned, commanded = wrap(yaw - self.begin_yaw), self.turn + self.turn_before
-                self.spin = KEPT * self.spin + (turned - clamp(turned, min(commanded, 0.0), max(commanded, 0.0)))
+                stray = turned - clamp(turned, min(commanded, 0.0), max(commanded, 0.0))
+                self.uncommanded_turn = KEPT * self.uncommanded_turn + stray
         self.drifted = norm(self.drift)
-        self.uncommanded = self.drifted > self.free or abs(self.spin) > TURN
+        self.uncommanded = self.drifted > self.free or abs(self.uncommanded_turn) > TURN
         self.way_before, self.turn_before = self.way, self.turn
         self.way, self.turn = ZERO, 0.0
         self.begin, self.begin_yaw = position, yaw
@@ -211,7 +212,7 @@ class MotionCheck:
     def forget(self, position: Vector, yaw: float) -> None:
         """Restart at a `position` [m] and `yaw` [rad]."""
         self.unresponsive = self.uncommanded = False
-        self.commanded = self.commanded_s = self.drifted = self.unanswered_turn = self.spin = 0.0
+        self.commanded = self.commanded_s = self.drifted = self.unanswered_turn = self.uncommanded_turn = 0.0
         self.turn = self.turn_before = 0.0
         self.unanswered = self.drift = self.way = self.way_before = ZERO
         # a place of which a part is unknown is no begin: nothing would ever be nearer to it

@@ -28,11 +28,11 @@ class Continuity:
     """
 
     __slots__ = (
-        "_fastest", "_jump_m", "_place", "_squared", "_time", "_turn_rate", "_wheels", "_yaw", "jumped", "turned",
+        "_fastest", "_jump_m", "_place", "_squared", "_time", "_turn_rate", "_wheels", "_yaw", "jumped", "yaw_jump",
     )  # fmt: skip
 
     jumped: bool  # it has jumped
-    turned: float  # by what its yaw jumped [rad]; NaN: it did not
+    yaw_jump: float  # size of the jump of its yaw [rad]; NaN: it did not jump
     _jump_m: float  # a jump is longer [m]
     _squared: float  # and that squared [m²]
     _fastest: float  # speed that it can have [m/s]
@@ -46,7 +46,7 @@ class Continuity:
         """A jump is longer than `jump_m` [m]."""
         self._jump_m, self._squared, self._fastest = jump_m, jump_m * jump_m, PLAUSIBLE_SPEED * kind.speed
         self._wheels, self._turn_rate = kind.takes == "twist", PLAUSIBLE_SPEED * kind.turn_rate
-        self._place, self._time, self._yaw, self.jumped, self.turned = UNKNOWN, 0.0, nan, False, nan
+        self._place, self._time, self._yaw, self.jumped, self.yaw_jump = UNKNOWN, 0.0, nan, False, nan
 
     def jump(self, time: float, position: Vector, yaw: float, watched: bool) -> float:
         """Length [m] of the jump of the robot, or NaN.
@@ -62,7 +62,7 @@ class Continuity:
             if self._wheels:
                 self._yaw = yaw
             if self.jumped:
-                self.jumped, self.turned = False, nan
+                self.jumped, self.yaw_jump = False, nan
             return nan
         return self._weigh(time, position, yaw, watched or self.jumped, sqrt(squared))
 
@@ -77,7 +77,7 @@ class Continuity:
         turn = abs((yaw - self._yaw + pi) % tau - pi) if self._wheels and isfinite(yaw) else nan  # NaN: none before
         turned = watched and turn > plausible_turn
         unknown = watched and (isnan(position[0]) or isnan(position[1]) or isnan(position[2]))
-        self.turned = turn if turned else nan
+        self.yaw_jump = turn if turned else nan
         self.jumped = turned or (watched and (gap > plausible or (unknown and self.jumped)))
         if self._wheels and not self.jumped and (isfinite(yaw) or not watched):
             self._yaw = yaw

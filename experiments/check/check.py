@@ -65,7 +65,7 @@ SUBJECTS: Final = (
     ),
     *(surroundings.contacts, surroundings.obstacles, surroundings.perception, surroundings.reality),
     *(motion.flight, motion.starts, motion.formation, motion.anchors, noise.softness, motion.walls, motion.ceiling),
-    *(motion.encounters, motion.speeds, motion.turning, motion.rates, motion.ends),
+    *(motion.encounters, motion.speeds, motion.turning_circle, motion.rates, motion.ends),
     safety.architecture,
     safety.safety,
     safety.batteries,

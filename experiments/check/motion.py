@@ -354,7 +354,7 @@ def speeds(analysis: Analysis) -> Iterator[Finding]:
         yield Finding("note", "speeds", f"no plan asks for more than the robots have ({asked:.2g} m/s at most)")
 
 
-def turning(analysis: Analysis) -> Iterator[Finding]:
+def turning_circle(analysis: Analysis) -> Iterator[Finding]:
     """Report robots that cannot turn on the spot and follow goals that a gradient law moves a little at a time."""
     if not isinstance(analysis.law, Gradient):
         return

@@ -238,7 +238,7 @@ def test_dead_wheels_are_found():
 
     swarm.spoil("A", dead)
     swarm.run(10.0)
-    assert Cause.STILL in cause(swarm, "A")
+    assert Cause.UNRESPONSIVE in cause(swarm, "A")
     assert group.robots[row].lifecycle.phase in (RUNNING, LANDING, DONE)
     assert swarm.last("A", "setpoint") == (0.0, 0.0, 0.0, 0.0) or swarm.phase("A") == RUNNING
 

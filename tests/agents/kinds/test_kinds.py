@@ -19,7 +19,7 @@ from agents.plugins.registry import PluginError
 from agents.safety.setpoint_filter import SetpointFilter
 from experiments.check.analysis import analyse
 from experiments.check.ideal_run import predict
-from experiments.check.motion import turning
+from experiments.check.motion import turning_circle
 from experiments.file.document import loads
 from experiments.file.problems import DocumentError
 from experiments.run import simulate
@@ -89,7 +89,7 @@ def test_a_formation_follows_without_hazards(kind):
 def test_check_says_what_cannot_turn_on_the_spot():
     for kind, count in (("ackermann", 1), ("omni", 0)):
         (case,) = loads(FOLLOW.replace("KIND", kind)).cases().values()
-        found = list(turning(analyse(case, predict(case))))
+        found = list(turning_circle(analyse(case, predict(case))))
         assert [each.code for each in found] == ["turning-circle"] * count
 
 

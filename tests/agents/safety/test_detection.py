@@ -85,7 +85,7 @@ PLACE = {
         "0.30 m outside (limit 0.25 m)",
     ),
     "flown": ({"outside": True, "flyaway": True, "excess": 0.8}, {Cause.OUTSIDE, Cause.FAR_OUTSIDE}, ""),
-    "flipped": ({"invalid": True, "jump": 0.7, "turned": 1.2}, {Cause.POSITION}, "its yaw jumped by 1.20 rad"),
+    "flipped": ({"invalid": True, "jump": 0.7, "yaw_jump": 1.2}, {Cause.POSITION}, "its yaw jumped by 1.20 rad"),
     "jumped": ({"invalid": True, "jump": 0.7}, {Cause.POSITION}, "it jumped by 0.70 m"),
     "stale": ({"invalid": True}, {Cause.POSITION}, "the last is 0.00 s old"),
 }

@@ -69,8 +69,8 @@ EXPECTED = {  # of a drone: outcomes, and the ticks at which they begin while th
     Cause.BEHIND: [(0, "WARN")],
     Cause.FOREIGN: [(100, "WARN")],
     Cause.REFUSED: [(0, "WARN")],
-    Cause.STANDSTILL: [(0, "HOLD")],
-    Cause.STILL: [(0, "LAND")],
+    Cause.SUSPENDED: [(0, "HOLD")],
+    Cause.UNRESPONSIVE: [(0, "LAND")],
     Cause.STRAYING: [(0, "LAND")],
     Cause.UNREACHABLE: [(50, "WARN")],
     Cause.HOVERING: [(200, "WARN")],
@@ -96,13 +96,13 @@ def test_wheels_without_a_position_stand_for_ever():
 
 
 def test_robot_that_does_not_move_lands():
-    assert Bench(CRAZYFLIE).see(20.0, Cause.STILL).changes == [(0, "LAND")]
-    assert Bench(KHEPERA4).see(20.0, Cause.STILL).changes == [(0, "WARN"), (200, "LAND")]
+    assert Bench(CRAZYFLIE).see(20.0, Cause.UNRESPONSIVE).changes == [(0, "LAND")]
+    assert Bench(KHEPERA4).see(20.0, Cause.UNRESPONSIVE).changes == [(0, "WARN"), (200, "LAND")]
 
 
 @pytest.mark.parametrize("kind", [CRAZYFLIE, KHEPERA4], ids=lambda kind: kind.name)
 def test_robot_of_a_paused_world_is_not_landed(kind):
-    assert Bench(kind, hold_s=10.0).see(20.0, Cause.STILL).changes == [(0, "WARN")]
+    assert Bench(kind, hold_s=10.0).see(20.0, Cause.UNRESPONSIVE).changes == [(0, "WARN")]
 
 
 def test_choices_of_an_experiment():

@@ -54,8 +54,8 @@ def turned(*yaws, kind=KHEPERA4, watched=True):
     continuity = Continuity(kind)
     for t, yaw in yaws:
         found = continuity.jump(t, (0.0, 0.0, 0.0), yaw, watched)
-    assert math.isnan(found) == math.isnan(continuity.turned)
-    return continuity.turned
+    assert math.isnan(found) == math.isnan(continuity.yaw_jump)
+    return continuity.yaw_jump
 
 
 def test_wheels_whose_yaw_jumps_have_jumped():
