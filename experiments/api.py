@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
     from agents.body.interface import Body, BodyError, BodyRequest, BodyState, call_all
-    from agents.body.kinds import KINDS, Kind
+    from agents.body.kinds import KINDS, Flight, Holonomic, Kind, Steered, Wheels
     from agents.formation.link import Link
     from agents.network.keys import Keys
     from agents.network.messages import RunOrder
@@ -52,7 +52,8 @@ __all__ = [  # noqa: RUF022 - by subject, as in docs/python.md
     # other bases of plug-ins
     "Predictor", "Avoidance", "measure_gap", "EngineFactory", "PointMassEngine", "moving_models",
     # kinds and bodies
-    "Kind", "KINDS", "Ground", "Body", "BodyRequest", "BodyState", "BodyError", "call_all",
+    "Kind", "KINDS", "Wheels", "Steered", "Holonomic", "Flight", "Ground",
+    "Body", "BodyRequest", "BodyState", "BodyError", "call_all",
     # vectors
     "Vector", "norm", "distance", "clamp", "wrap",
     # orders to a run in real time
@@ -63,7 +64,7 @@ __all__ = [  # noqa: RUF022 - by subject, as in docs/python.md
 
 HOMES: Final = {  # modules, and what of them is named above
     "agents.body.interface": "Body BodyError BodyRequest BodyState call_all",
-    "agents.body.kinds": "KINDS Kind",
+    "agents.body.kinds": "KINDS Flight Holonomic Kind Steered Wheels",
     "agents.formation.link": "Link",
     "agents.network.keys": "Keys",
     "agents.network.messages": "RunOrder",

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from math import inf, isfinite, nan
-from typing import Final, Literal
+from typing import Final, Literal, get_args
 
 import msgspec
 
@@ -183,7 +183,9 @@ class Kind:
     locks: bool = False  # an emergency stop locks it until it is switched off and on
 
     def __post_init__(self) -> None:
-        """Raises ValueError for a number that no robot has."""
+        """Raises ValueError for a number that no robot has, or an unknown setpoint."""
+        if self.takes not in (known := get_args(Takes)):
+            raise ValueError(f"takes of the kind {self.name!r} is {self.takes!r}: it must be one of {', '.join(known)}")
         positive = ("radius", "height", "mass", "endurance_s", "speed", "turn_rate", "response", "turn_response")
         for name in positive:
             if not (isfinite(value := getattr(self, name)) and value > 0.0):

@@ -35,6 +35,7 @@ STRUCTS: Final = (TRIGGERS, PREDICTORS, LAWS, PLANNERS, AVOIDANCES, ENGINES)  # 
 CHOSEN: Final = (ROBOTS, *STRUCTS)  # of which a file names some
 METRICS: Final = "zenpark.metrics"  # measured quantities, without parameters
 FACE: Final = "zenpark"  # module of the names that plug-ins import
+NAMED_BY_FILE: Final = (*STRUCTS, METRICS)  # of which a class may stand in a file beside the experiment
 DEVICES: Final = "zenpark.devices"  # protocol twins: simulated far ends of the protocols of bodies
 # Base of the classes of each group, as `module:class`: what zenpark asks of a plug-in stands there, with its default.
 BASES: Final = {
@@ -85,7 +86,7 @@ def load(group: str, name: str) -> Any:  # noqa: ANN401 - what it is depends on 
     register different objects under this name, or if the module fails to import. Raises it, too, for an object that is
     no class derived from the base of the group.
     """
-    if files.is_choice(name):
+    if files.is_choice(name) and group in NAMED_BY_FILE:
         return _fitting(group, name, _in_file(name))
     known = registered(group)
     what = group.rpartition(".")[2]

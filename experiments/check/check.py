@@ -160,6 +160,7 @@ def _figures(analysis: Analysis) -> CheckNumbers:
     links, prediction, limits = analysis.links, analysis.prediction, analysis.limits
     end, fastest, follower = prediction.position[-1], analysis.fastest, analysis.follower
     last = float(prediction.time[-1])
+    flown = not prediction.stuck  # else the robots stand at their starts, which says nothing of a run
     payload, words, load = theory.load(analysis)
     return CheckNumbers(
         robots=len(analysis.names),
@@ -188,9 +189,9 @@ def _figures(analysis: Analysis) -> CheckNumbers:
         free_modes=loop.free if loop else 0,
         speed_needed=_finite(fastest[2].speed()) if fastest else None,
         speed_available=None if follower is None else float(analysis.pull[follower]),
-        acquired_s=analysis.acquired(min(analysis.departure, last)) if shape else None,
+        acquired_s=analysis.acquired(min(analysis.departure, last)) if shape and flown else None,
         acquired_noisy_s=analysis.noisy.acquired(min(analysis.departure, last)) if shape and analysis.noisy else None,
-        end_error_mm=_finite(1e3 * float(analysis.error[-1].max())) if shape and len(links) else None,
+        end_error_mm=_finite(1e3 * float(analysis.error[-1].max())) if shape and len(links) and flown else None,
         end={name: (float(x), float(y), float(z)) for name, (x, y, z) in zip(analysis.names, end, strict=True)},
         end_inside=bool(((end >= np.array(limits.low) - FORGIVEN) & (end <= np.array(limits.high) + FORGIVEN)).all()),
         messages_hz=prediction.messages_hz,

@@ -276,6 +276,9 @@ def _unknown(path: tuple[str, str], name: str) -> Fault:
     except registry.PluginError as error:
         return Fault((*path, "kind"), f"the kind '{name}' cannot be used: {error}", "mend or uninstall it")
     except KeyError:
+        if files.is_choice(name):
+            hint = "a kind cannot be named by its file: install it, and name it (docs/plugins.md#a-kind-of-robot)"
+            return Fault((*path, "kind"), f"{name!r} is a file", hint)
         hint = f"{did_you_mean(name, KINDS)}; one of your own is a plug-in to install (docs/plugins.md)"
     return Fault((*path, "kind"), f"no {name!r} among the kinds of robots", hint)
 

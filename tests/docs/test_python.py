@@ -42,6 +42,7 @@ FLYING = (
         "Planner",
     ),
     *("Avoidance", "measure_gap", "Kind", "KINDS", "Ground", "Body", "BodyRequest", "BodyState", "BodyError"),
+    *("Wheels", "Steered", "Holonomic", "Flight"),
     *("call_all", "Vector", "norm", "distance", "clamp", "wrap"),
 )
 

@@ -17,12 +17,14 @@ from types import SimpleNamespace
 import pytest
 
 from agents.body.interface import BodyError
+from agents.body.kinds import Kind
 from agents.formation.link import Link
 from agents.plugins.avoidance import Nearby, OwnState
 from tests.agents.signals import Play, standing
 from tests.shell import shell
 from tests.system import lab
 from tests.waiting import until
+from twins.engines.point_mass import model
 
 ROOT = Path(__file__).parents[3]
 
@@ -194,6 +196,16 @@ def test_kind_of_the_docs_is_known_everywhere(zenpark, tmp_path):
         report = uninstalled("report", str(tmp_path / "run"))
         assert report.returncode == 0, report.stderr
     assert "no 'hovercraft' among the kinds of robots" in unknown.stderr + unknown.stdout
+
+
+def test_kind_of_the_docs_without_a_class_moves():
+    names: dict[str, Kind] = {}
+    exec(source_of("BARROW"), names)
+    robot = model(names["BARROW"], (0.0, 0.0, 0.0), 0.0)
+    robot.command((0.3, 0.0, 0.0, 0.0))
+    for _ in range(50):
+        robot.move(0.02)
+    assert 0.1 < robot.position[0] <= 0.3
 
 
 @pytest.mark.slow

@@ -194,6 +194,9 @@ def test_robots_that_never_begin_are_reported_with_reason(monkeypatch):
     assert found["not-begun"].severity == "error"
     assert "not ready after 60 s: KH01" in found["not-begun"].message
     assert not {"acquired", "not-acquired", "wheels-stop"} & found.keys()
+    numbers = figures(of(robots_on_wheels(1.0)).plan)
+    assert numbers.acquired_s is None
+    assert numbers.end_error_mm is None
 
 
 def test_a_trigger_that_never_fires_is_named():

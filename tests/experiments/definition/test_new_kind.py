@@ -56,6 +56,11 @@ def test_kind_without_motion_model_is_refused_too(monkeypatch):
     assert caught.value.problems[0].line == 6
 
 
+def test_unknown_setpoint_is_refused_with_the_known_ones():
+    with pytest.raises(ValueError, match="it must be one of position, velocity, twist"):
+        replace(MOVING, takes="wheels")
+
+
 def test_kind_without_protocol_twin_is_refused_by_name(monkeypatch):
     monkeypatch.setitem(KINDS.loaded, KIND, MOVING)
     with pytest.raises(BodyError, match=f"--bodies protocol: no protocol twin of '{KIND}', only of crazyflie"):

@@ -116,6 +116,15 @@ def test_a_wrong_choice_names_place_and_remedy(task, law, message, hint):
     assert "@" not in text
 
 
+@pytest.mark.parametrize("kind", ["meet.py:Meet", "none.py:BARROW"])
+def test_kind_in_a_file_is_refused(task, kind):
+    task.write_text(TASK.replace('kind = "khepera4"', f'kind = "{kind}"', 1), "utf-8")
+    text = refused(task)
+    assert f"{task}:5:8: " in text
+    assert "a kind cannot be named by its file" in text
+    assert "docs/plugins.md#a-kind-of-robot" in text
+
+
 def test_a_pipe_is_not_waited_for(task):
     os.mkfifo(task.parent / "pipe.py")
     task.write_text(TASK.replace('law = "meet.py:Meet"', 'law = "pipe.py:Meet"'), "utf-8")

@@ -63,6 +63,22 @@ def test_guide_metric_is_short():
     assert len(WAY.strip().splitlines()) <= 22
 
 
+def test_fields_of_the_page_have_their_shapes():
+    trace = RunRecorder(simulate(load("triangle", "duration_s=1.0").cases()["event"], 1), load("triangle").plan, "")
+    trace = trace.trace()
+    sizes = {"T": len(trace.time), "N": len(trace.robots), "E": len(trace.plan.pose_links)}
+    rows = re.findall(r"^\| (`.*`) \| (\([TNE].*\)) \|", GUIDE, re.MULTILINE)
+    shapes = {}
+    for names, given in rows:
+        found = re.findall(r"\(([^)]+)\)", given)
+        fields = re.findall(r"`(\w+)`", names)
+        shapes |= dict(zip(fields, found * (len(fields) if len(found) == 1 else 1), strict=True))
+    assert {"time", "true_position", "goal", "dropped"} < shapes.keys()
+    for name, shape in shapes.items():
+        words = [each for each in shape.replace(" ", "").split(",") if each]
+        assert np.shape(getattr(trace, name)) == tuple(sizes.get(each) or int(each) for each in words), name
+
+
 @pytest.mark.slow
 def test_installed_metric_is_everywhere(installed, zenpark):
     listed = zenpark("list")
