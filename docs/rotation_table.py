@@ -1,4 +1,4 @@
-"""The table of docs/formations.md: how fast formations turn whose robots disagree, with and without a remedy.
+"""The table of docs/formations.md: rate of turning of formations with disagreeing robots, with and without a remedy.
 
 python docs/rotation_table.py       # some minutes; needs nothing but zenpark
 """
@@ -60,7 +60,7 @@ def measured(name: str, experiment: Experiment) -> Row:
 
 
 def disagreeing(experiment: Experiment, by: float) -> Experiment:
-    """Every link that both hear: the first robot wants it shorter, the second longer, by `by` [m]."""
+    """Links in both directions: the first robot wants each shorter, the second longer, by `by` [m]."""
     links: dict[str, float | Link] = {}
     for text, distance in experiment.formation.links.items():
         first, sign, second = text.split()

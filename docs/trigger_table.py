@@ -1,8 +1,8 @@
 """The tables of triggers.md: every trigger on the reference experiment, in virtual time.
 
-python docs/trigger_table.py                 seeds 1 to 50, on which nothing was chosen
-python docs/trigger_table.py --tuning        seeds 1001 to 1010, on which the parameters were chosen
-python docs/trigger_table.py --seeds 5       fewer, for a quick look
+python docs/trigger_table.py                 seeds 1 to 50, on which nothing was chosen.
+python docs/trigger_table.py --tuning        seeds 1001 to 1010, on which the parameters were chosen.
+python docs/trigger_table.py --seeds 5       fewer, for a quick look.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def mean(cases: Sequence[CaseMetrics], index: str) -> float:
 
 
 def formed(cases: Sequence[CaseMetrics]) -> str:
-    """In how many runs every follower came to its place and stayed, before the leader left and after."""
+    """Number of runs in which every follower reached its place and stayed, before the leader left and after."""
     return f"{sum(None not in case.acquired_s for case in cases)}/{len(cases)}"
 
 

@@ -237,7 +237,7 @@ assert np.all(np.abs(off) < 0.125)
 # A prediction by hand, over a range of rates of more than 20, and no mode is off by more than an eighth. But the
 # errors are no accident: slow modes are slower than predicted, and fast ones faster. Both have a reason.
 #
-# *Sampling.* The goal is decided anew ten times in a second, and stands in between. Of a distance to its goal a
+# *Sampling.* The goal is decided again ten times in a second, and stands in between. Of a distance to its goal a
 # robot then closes h = 1 − exp(−c/10), and a decision leaves 1 − h k λ of a mode. That is what `check` computes;
 # its `slowest_mode_s` is the time constant of λ₂.
 #

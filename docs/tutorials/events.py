@@ -101,7 +101,7 @@ assert abs(np.median(first) - np.ceil(DELTA / 0.15 / ASKED_S) * ASKED_S) < 1e-9
 # %% [markdown]
 # Could a robot transmit infinitely often in a finite time? In continuous time that is what must be
 # excluded for every trigger (*Zeno* behaviour). Here it cannot happen: a trigger is asked 50 times a second, and
-# that is the highest rate. Moreover, a robot that drives with v at most transmits no sooner than after δ/v, but for
+# that is the highest rate. Moreover, a robot that drives with v at most transmits no sooner than after δ/v, except for
 # noise.
 
 # %%

@@ -43,7 +43,7 @@ def rank(position: Array, pairs: Pairs, free: Mask | None = None) -> tuple[int, 
 
 
 def in_the_plane(position: Array) -> Mask:
-    """Which coordinates (N, 3) may change if heights are held: x and y."""
+    """Mask of the coordinates (N, 3) that may change if heights are held: x and y."""
     free = np.ones_like(position, dtype=bool)
     free[:, 2] = False
     return free
@@ -187,7 +187,7 @@ assert "in space 5 of 6, not needed while heights are held" in said["rigid"]
 # %%
 @style.styled
 def squares() -> Figure:
-    """How the four runs end, seen from above."""
+    """Ends of the four runs, seen from above."""
     figure = style.Drawing(figsize=(2.0 * style.WIDTH, 1.9), layout="constrained")
     for axes, (what, name) in zip(figure.subplots(1, 4), ends, strict=True):
         place = ends[what, name] - ends[what, name].mean(axis=0)
