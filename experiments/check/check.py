@@ -128,6 +128,8 @@ def _findings(given: Document, analyses: Mapping[str, Analysis]) -> list[Finding
                 continue
             for finding in first_of_each_code(subject(analysis)):
                 holders.setdefault(finding, []).append(name)
+    for finding in theory.unused_gains([*given.cases().values()]):
+        holders[finding] = [*analyses]
     source = given.source
     found = []
     for finding, names in holders.items():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Final
 
 import msgspec
@@ -14,13 +14,16 @@ from agents.decision.stepping import Stepping
 from agents.formation.link import BY_BEARING, BY_DISTANCE, BY_RELATIVE
 from agents.network import messages
 from agents.plugins.calls import unknown_reads
+from agents.plugins.laws import Gradient
 from agents.vectors import ZERO
 from experiments.check.analysis import Analysis
 from experiments.check.findings import FORGIVEN, Finding, Severity, join_names
 from experiments.check.realisation import OFF, Conflict, Shape, conflicts, contradictions
+from experiments.definition.experiment import Formation
 from experiments.definition.formation import law_offsets, unlinked
 from experiments.definition.graph import components, reachable
 from experiments.definition.links import gain_key
+from experiments.definition.plan import Plan
 from experiments.file.problems import Path
 from twins.arrays import Index, Mask, norm
 
@@ -321,6 +324,19 @@ def law(analysis: Analysis) -> Iterator[Finding]:
         yield Finding("warning", "reads-unknown", message, "a comparison with an unknown number is false", path)
     for severity, message, remedy in plan.law.analyse(plan):
         yield Finding(severity, "law", message, remedy, path)
+
+
+def unused_gains(plans: Sequence[Plan]) -> Iterator[Finding]:
+    """Warn of a gain of [formation] that is set, while the laws of all cases pull by the other one."""
+    for key, other in (("gain", "stiffness"), ("stiffness", "gain")):
+        default = getattr(Formation(), key)
+        given = [plan.experiment.formation for plan in plans]
+        if any(each.anchors for each in given) or not any(getattr(each, key) != default for each in given):
+            continue
+        if all(isinstance(plan.law, Gradient) and other == plan.law.PULLS_BY for plan in plans):
+            laws = join_names(sorted({f"'{plan.law_name}'" for plan in plans}))
+            message = f"{key} is not used by the law {laws}, which pulls by {other}"
+            yield Finding("warning", "unused-gain", message, f"write {other} instead", ("formation", key))
 
 
 def _unknown_reads(analysis: Analysis) -> str:

@@ -7,6 +7,7 @@ Console, files, reports, sweeps and searches draw from `known_metrics`. A distri
 from __future__ import annotations
 
 import statistics
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields
 from functools import cache
@@ -14,7 +15,7 @@ from math import isfinite
 from operator import attrgetter
 from pathlib import Path
 from traceback import extract_tb
-from typing import ClassVar, Final, Literal, cast
+from typing import Any, ClassVar, Final, Literal, cast
 
 import msgspec
 import numpy as np
@@ -154,6 +155,14 @@ TAKEN: Final = {  # columns of tables
     *RobotMetrics.__struct_fields__, *CaseMetrics.__struct_fields__,
     *("in_mean", "gap", "reference", "seeds", "acquired_share"),
 }  # fmt: skip
+# fields of a trace that a lean log of `experiments.virtual_time.simulation.simulate` keeps
+LEAN: Final = frozenset(
+    {
+        *("case", "plan", "seed", "robots", "clock", "time", "true_position", "events", "dropped"),
+        *("ticks", "decisions", "interventions", "avoided", "lost", "missed_deadlines"),
+    }
+)
+_COLUMNS: Final = frozenset(each.name for each in fields(Trace))
 
 
 def known_metrics(cases: Iterable[CaseMetrics] = ()) -> dict[str, Metric]:
@@ -175,6 +184,17 @@ def console_metrics() -> dict[str, Metric]:
     """Metrics in a line of the terminal."""
     added = {name: metric for name, metric in foreign_metrics().items() if metric.shown}
     return {name: OURS[name] for name in CONSOLE} | added
+
+
+def terminal_labels(metrics: Mapping[str, Metric]) -> dict[str, str]:
+    """Label of each metric; one of a file that has the label of another has its file behind it."""
+    labels = Counter(metric.label for metric in metrics.values())
+    return {
+        name: f"{metric.label} ({name.partition(':')[0]})"
+        if labels[metric.label] > 1 and files.is_choice(name)
+        else metric.label
+        for name, metric in metrics.items()
+    }
 
 
 def metrics_of_criteria(criteria: Iterable[Criterion]) -> tuple[dict[str, Metric], tuple[str, ...]]:
@@ -213,7 +233,6 @@ def _installed() -> tuple[dict[str, Metric], tuple[str, ...]]:
 def _made(name: str) -> Metric:
     """The metric registered under a name; raises PluginError if it cannot be used."""
     plugin = cast(type[Metric], registry.struct(registry.METRICS, name))
-    columns = {field.name for field in fields(Trace)}
     wrong = ""
     if not files.is_choice(name) and (not name.isidentifier() or name != name.lower()):
         wrong = "its name must be of small letters, digits and _"
@@ -223,30 +242,48 @@ def _made(name: str) -> Metric:
         wrong = f"it has parameters ({', '.join(plugin.__struct_fields__)}), and no file gives them"
     elif not isinstance(plugin.label, str) or not plugin.label or not isinstance(plugin.unit, str):
         wrong = "label and unit must be texts, and the label not empty"
-    elif bad := [each for each in plugin.needs if each not in columns]:
-        wrong = f"needs names {bad[0]!r}, and a trace has no such field: {registry.did_you_mean(bad[0], columns)}"
+    elif bad := [each for each in plugin.needs if each not in _COLUMNS]:
+        wrong = (
+            f"needs names {bad[0]!r}, and a trace has no such field: {registry.did_you_mean(bad[0], sorted(_COLUMNS))}"
+        )
     if wrong:
         raise registry.PluginError(wrong)
     return plugin()
 
 
-def values_of(metrics: Mapping[str, Metric], shared: Measurement) -> tuple[dict[str, list[Number]], tuple[str, ...]]:
+class _LeanTrace(Trace):
+    """Trace of a sweep; a field that no metric needs is not kept, and reading it raises PluginError."""
+
+    def __getattribute__(self, name: str) -> Any:  # noqa: ANN401 - as the fields are
+        if name in _COLUMNS - LEAN - {"sent"}:  # of `sent` numbers and times are kept
+            raise registry.PluginError(f"it reads {name!r}, which its `needs` does not name: a sweep keeps no more")
+        return super().__getattribute__(name)
+
+
+def values_of(
+    metrics: Mapping[str, Metric], shared: Measurement, *, lean: bool = False
+) -> tuple[dict[str, list[Number]], tuple[str, ...]]:
     """Values of metrics by robot, or the single one of a case; and which metrics failed, a sentence each.
 
-    A metric of another distribution that fails has unknown values. Integers stay integers.
+    A metric of another distribution that fails has unknown values. Integers stay integers. A `lean` trace has the
+    fields `LEAN` alone.
     """
+    trace = shared.trace
+    shown = _LeanTrace(**{name: getattr(trace, name) for name in _COLUMNS}) if lean else trace
     found: dict[str, list[Number]] = {}
     failed = []
     for name, metric in metrics.items():
         count = len(shared.trace.robots) if metric.per == "robot" else 1
         try:
             with np.errstate(all="ignore"):
-                found[name] = _numbers(metric, np.asarray(metric.of(shared.trace, shared)), count)
+                values = metric.of(trace if name in OURS else shown, shared)
+                found[name] = _numbers(metric, np.asarray(values), count)
         except registry.FAILURES as error:
             if name in OURS:
                 raise
             found[name] = [None] * count
-            at = extract_tb(error.__traceback__)[-1]
+            frames = extract_tb(error.__traceback__)
+            at = next((each for each in reversed(frames) if each.filename != __file__), frames[-1])
             where = f"{Path(at.filename).name}:{at.lineno}"
             failed.append(f"metric {name} failed: {type(error).__name__}: {error} ({where})")
     return found, tuple(failed)

@@ -19,7 +19,7 @@ from experiments.definition.standby import without_standby
 from experiments.file.structure import plugin_files
 from experiments.metrics.measure import ended_early, failures
 from experiments.metrics.measurement import Measurement
-from experiments.metrics.metric import case_values, foreign_metrics, swept_metrics, values_of
+from experiments.metrics.metric import LEAN, case_values, foreign_metrics, swept_metrics, values_of
 from experiments.recording.trace import Trace
 from experiments.recording.version import ROOT, engine_versions
 from experiments.recording.version import digest as digest_of_code
@@ -29,13 +29,6 @@ from experiments.virtual_time.log import RunRecorder
 from experiments.virtual_time.simulation import simulate
 
 PACKAGES: Final = ("agents", "twins", "experiments")  # packages with code that determines results
-# fields of a trace that a lean log of `experiments.virtual_time.simulation.simulate` keeps
-LEAN: Final = frozenset(
-    {
-        *("case", "plan", "seed", "robots", "clock", "time", "true_position", "events", "dropped"),
-        *("ticks", "decisions", "interventions", "avoided", "lost", "missed_deadlines"),
-    }
-)
 FAILED: Final = (Stuck, BodyError, registry.PluginError)  # what a run may end with that other runs do not
 
 
@@ -132,7 +125,7 @@ def fly_seeds(plan: Plan, seeds: tuple[int, ...]) -> tuple[list[RunMetrics], dic
 def run_metrics(trace: Trace) -> RunMetrics:
     """Metrics of one run, from a trace that may be lean."""
     shared, metrics = Measurement(trace), swept_metrics()
-    values, faults = values_of(metrics, shared)
+    values, faults = values_of(metrics, shared, lean=trace.position.shape[2] == 0)
     return RunMetrics(
         seed=trace.seed,
         values=case_values(metrics, values, shared.kept, sums=True),

@@ -29,6 +29,7 @@ def explain(
     as_json: AsJson = False,
 ) -> int:
     """Explain a key of the experiment file, a plug-in, a kind of robot or a metric: text, unit, limits, an example."""
+    from agents.plugins import files
     from experiments.file import json_schema, reference
     from experiments.metrics.metric import known_metrics, short_name
     from experiments.metrics.results import RobotMetrics
@@ -56,6 +57,8 @@ def explain(
             field for metric in RobotMetrics.__struct_fields__ for field in (metric, metric.split("_")[0])
         }:
             hint, listed = "a metric of a run: `./zenpark docs`, page 'Metrics and CSV columns'", []
+        if files.is_choice(key):
+            hint, listed = "classes in files are not explained: their parameters stand in the file", []
         warn([f"nothing in the experiment file is named {key!r}; {'keys about it:' if listed else hint}"])
         for entry in listed:
             print(textwrap.shorten(f"  {entry.key}  {entry.text}", WIDEST, placeholder=" ..."), file=sys.stderr)

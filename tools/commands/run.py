@@ -438,7 +438,7 @@ def _hazards(runs: Sequence[Run]) -> Iterator[str]:
 
 def _case_line(name: str, runs: Sequence[Run], found: dict[str, Any]) -> str:
     """The key figures of a case, over all seeds: means of a robot; losses are sums over all robots."""
-    from experiments.metrics.metric import foreign_metrics
+    from experiments.metrics.metric import foreign_metrics, terminal_labels
     from experiments.metrics.statistics import Spread, spread
     from experiments.report.page import interval
     from experiments.report.tables import ratio_words
@@ -457,7 +457,8 @@ def _case_line(name: str, runs: Sequence[Run], found: dict[str, Any]) -> str:
         line += f", IAE {mean['iae']} m s, RMSE {mean['rmse']} m, {_acquired(mean['acquired_s'], measured)}"
     foreign = foreign_metrics(measured).items()
     added = {name: metric for name, metric in foreign if metric.shown and name in mean}
-    line += "".join(f", {metric.label} {mean[name]} {metric.unit}".rstrip() for name, metric in added.items())
+    labels = terminal_labels(added)
+    line += "".join(f", {labels[name]} {mean[name]} {metric.unit}".rstrip() for name, metric in added.items())
     line += f", lost {sum(each.lost for each in measured)}"
     if missed := sum(each.missed_deadlines for each in measured):
         share = spread([each.missed_share for each in measured]).mean or 0.0
@@ -465,7 +466,7 @@ def _case_line(name: str, runs: Sequence[Run], found: dict[str, Any]) -> str:
     if dropped := sum(each.dropped for each in measured):
         line += f", {dropped} dropped by the modelled network"
     if name != next(iter(found["cases"])) and shares["f_hz"].mean is not None:
-        more = [f", {metric.label} {ratio[name]}" for name, metric in added.items() if metric.relative]
+        more = [f", {labels[name]} {ratio[name]}" for name, metric in added.items() if metric.relative]
         line += f"   (ratios: f {ratio['f_hz']}, IAE {ratio['iae']}{''.join(more)})"
     return line
 

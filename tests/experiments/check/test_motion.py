@@ -9,9 +9,11 @@ import pytest
 from agents.body.interface import Disturbance, Jitter
 from agents.kinds.crazyflie import CRAZYFLIE
 from agents.plugins.laws import Distance
+from experiments.catalogue import index
 from experiments.check import ideal_run
 from experiments.check.check import check, figures
 from experiments.check.ideal_run import REPETITIONS, fly, isolated, linear_step, predict, repetitions
+from experiments.check.theory import unused_gains
 from experiments.definition.experiment import Arena, Experiment, Formation, Leg, Robot
 from experiments.definition.plan import Plan
 from experiments.file import document
@@ -197,6 +199,27 @@ def test_robots_that_never_begin_are_reported_with_reason(monkeypatch):
     numbers = figures(of(robots_on_wheels(1.0)).plan)
     assert numbers.acquired_s is None
     assert numbers.end_error_mm is None
+
+
+@pytest.mark.parametrize(
+    ("law", "changes", "message"),
+    [
+        ("displacement", {"gain": 0.4}, "gain is not used by the law 'displacement', which pulls by stiffness"),
+        ("distance", {"stiffness": 0.4}, "stiffness is not used by the law 'distance', which pulls by gain"),
+        ("mixed", {"stiffness": 0.4, "gain": 1.0}, ""),
+        ("distance", {"gain": 0.4}, ""),
+    ],
+)
+def test_gain_of_another_law_is_named(law, changes, message):
+    plan = robots_on_wheels(1.0)
+    made = msgspec.structs.replace(plan, formation=msgspec.structs.replace(plan.formation, law=law, **changes))
+    found = [(each.message, each.where) for each in unused_gains([Plan(made)])]
+    assert found == ([(message, ("formation", next(iter(changes))))] if message else [])
+
+
+@pytest.mark.parametrize("name", index.titles())
+def test_catalogue_sets_no_unused_gain(name):
+    assert not [*unused_gains([*document.read(name).cases().values()])]
 
 
 def test_a_trigger_that_never_fires_is_named():

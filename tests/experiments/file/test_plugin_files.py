@@ -362,3 +362,9 @@ def test_all_other_choices_may_be_files(task):
     (leading,) = [robot for robot in run.metrics["fast"].robots if robot.robot == "L"]
     assert run.traces["fast"].true_position[-1, 2, 1] > 0.02
     assert 0 < leading.messages < 10
+
+
+def test_explain_says_that_files_are_not_explained(task, monkeypatch, capsys):
+    monkeypatch.chdir(task.parent)
+    assert call(monkeypatch, "explain", "meet.py:Meet") == 2
+    assert "their parameters stand in the file" in capsys.readouterr().err

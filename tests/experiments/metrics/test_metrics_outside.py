@@ -190,6 +190,12 @@ class Height(Metric, frozen=True):
         return np.nanmax(trace.goal[..., 2])
 
 
+class Careless(Height, frozen=True):
+    """Does not say what it reads."""
+
+    needs = ("true_position",)
+
+
 class Wrong(Metric, frozen=True):
     """Gives three numbers whatever there is."""
 
@@ -262,6 +268,16 @@ def test_sweep_keeps_what_metrics_need(known, triangle):
     assert whole.metric_faults == ()
 
 
+def test_sweep_names_a_field_missing_in_needs(known, triangle, trace):
+    known(goal=Careless())
+    assert measure(trace).metric_faults == ()
+    ((run,), _) = runs.fly_seeds(Plan(triangle), (1,))
+    assert run.values["goal"] is None
+    (fault,) = run.metric_faults
+    assert "it reads 'goal', which its `needs` does not name" in fault
+    assert "(test_metrics_outside.py:" in fault
+
+
 def test_store_of_a_sweep_knows_the_metrics(known, triangle, monkeypatch):
     known()
     before = runs.code_of(Plan(triangle))
@@ -269,6 +285,11 @@ def test_store_of_a_sweep_knows_the_metrics(known, triangle, monkeypatch):
     with_way = runs.code_of(Plan(triangle))
     monkeypatch.setattr(runs, "file_digest", lambda _file: "changed")
     assert len({before, with_way, runs.code_of(Plan(triangle))}) == 3
+
+
+def test_metrics_of_one_label_are_told_apart():
+    labels = metric.terminal_labels({"way_m": Way(), "my_metrics.py:Way": Way(), "my_metrics.py:Height": Height()})
+    assert [*labels.values()] == ["Way", "Way (my_metrics.py)", "Height"]
 
 
 def test_search_for_more_of_a_metric(known):
