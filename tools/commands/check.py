@@ -279,8 +279,8 @@ def _formatted(of: CheckNumbers) -> dict[str, str]:
         "formation acquired after": number(of.acquired_s, ".1f", " s")
         + (f", with noise {of.acquired_noisy_s:.1f} s" if _differs(of.acquired_s, of.acquired_noisy_s) else ""),
         "worst link at the end": number(of.end_error_mm, ".1f", " mm"),
-        "all end inside the arena": "yes" if of.end_inside else "no",
-        "poses sent by all, estimated": number(of.messages_hz, ".1f", " per second"),
+        "all end inside the arena": ("yes" if of.end_inside else "no") if of.predicted_s else "-",
+        "poses sent by all, estimated": number(of.messages_hz if of.predicted_s else None, ".1f", " per second"),
         "payload of one pose, at most": f"{of.pose_bytes} bytes"
         + (f", {of.words_bytes} of them said by the law" if of.words_bytes else ""),
         "payload of one robot, at most": number(of.pose_kbit_s, ".0f", " kbit/s"),

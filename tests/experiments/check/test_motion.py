@@ -21,6 +21,7 @@ from experiments.sweep.runs import run_metrics
 from experiments.virtual_time import conductor, simulation, stretch
 from experiments.virtual_time.log import RunRecorder
 from tests.experiments.checked import GROUND, assert_found, bad, ground, of
+from tools.commands import check as commands
 from twins.models.quadrotor import Quadrotor
 
 pytestmark = pytest.mark.slow  # each check flies the experiment on the virtual clock
@@ -199,6 +200,9 @@ def test_robots_that_never_begin_are_reported_with_reason(monkeypatch):
     numbers = figures(of(robots_on_wheels(1.0)).plan)
     assert numbers.acquired_s is None
     assert numbers.end_error_mm is None
+    shown = commands._formatted(numbers)
+    labels = ("formation acquired after", "worst link at the end", "all end inside the arena")
+    assert {shown[label] for label in (*labels, "poses sent by all, estimated")} == {"-"}
 
 
 @pytest.mark.parametrize(
