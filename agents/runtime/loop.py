@@ -111,7 +111,7 @@ class Runtime:
         self._everyone = tuple(range(len(self._names)))
         self._descent = Descent(
             self.robots, body, self._keeper, self.ticks,
-            silence_s=setup.loop_timeout_s, alarm=self._call_for_help, recover=self._recover,
+            silence_s=setup.loop_timeout_s, alarm=self._leave_formation, recover=self._land_after_hang,
             timing=setup.descent,
         )  # fmt: skip
         self.watchdog = self._descent.watchdog
@@ -220,7 +220,7 @@ class Runtime:
         while True:
             self.watchdog.beat()
             if self.watchdog.tripped:
-                self._recover(self.watchdog.forgive())
+                self._land_after_hang(self.watchdog.forgive())
             self._wait(ticks.until_next())
             if self._cut_off:  # most stops come during that sleep
                 self._yield_after_stop()
@@ -435,7 +435,7 @@ class Runtime:
             self._keeper.is_owner()
         return self._silent_since
 
-    def _call_for_help(self, why: str) -> None:
+    def _leave_formation(self, why: str) -> None:
         """Removes the robots from the formation while their loop hangs, or is over; called by the watchdog's thread."""
         print(f"{', '.join(self._names)}: {why}; landing it", flush=True)
         if self._joined:
@@ -443,7 +443,7 @@ class Runtime:
             # a loop that has recovered meanwhile keeps its tokens
             self._keeper.withdraw(self._everyone, lambda: self._descent.begun or bool(self.watchdog.tripped))
 
-    def _recover(self, why: str) -> None:
+    def _land_after_hang(self, why: str) -> None:
         """Lands the robots after the watchdog ordered it, although the loop runs again."""
         for robot in self.robots:
             if robot.lifecycle.active:

@@ -182,183 +182,183 @@ class ActiveFault:
 # ---------------------------------------------------------------------- the faults
 
 
-def _kill(it: ActiveFault) -> Check:
+def _kill(active: ActiveFault) -> Check:
     """SIGKILL to a robot's process; its body stays in the room and must come down."""
-    it.run.send(it.victim, SIGKILL)
-    it.run.dead[it.victim] = it.begun
-    return it.loss_noticed
+    active.run.send(active.victim, SIGKILL)
+    active.run.dead[active.victim] = active.begun
+    return active.loss_noticed
 
 
-def _freeze(it: ActiveFault) -> Check:
+def _freeze(active: ActiveFault) -> Check:
     """SIGSTOP for 5 s, then SIGCONT."""
-    it.run.send(it.victim, SIGSTOP)
-    return it.back
+    active.run.send(active.victim, SIGSTOP)
+    return active.back
 
 
-def _partition(it: ActiveFault) -> Check:
+def _partition(active: ActiveFault) -> Check:
     """Nothing passes between a robot and the router for 3 s; messages of that time arrive afterwards."""
-    it.run.cut(it.victim)
-    return it.back
+    active.run.cut(active.victim)
+    return active.back
 
 
-def _router(it: ActiveFault) -> Check:
+def _router(active: ActiveFault) -> Check:
     """SIGKILL to the only router; the conductor starts it again."""
-    it.run.send("router", SIGKILL)
-    return it.reported("router")
+    active.run.send("router", SIGKILL)
+    return active.reported("router")
 
 
-def _failover(it: ActiveFault) -> Check:
+def _failover(active: ActiveFault) -> Check:
     """SIGKILL to the first of two routers."""
-    return _router(it)
+    return _router(active)
 
 
-def _frozen_router(it: ActiveFault) -> Check:
+def _frozen_router(active: ActiveFault) -> Check:
     """SIGSTOP for 5 s to a router whose lease is 60 s: robots must notice by themselves, and hold."""
-    it.run.send("router", SIGSTOP)
-    return it.all_held
+    active.run.send("router", SIGSTOP)
+    return active.all_held
 
 
-def _conductor(it: ActiveFault) -> Check:
+def _conductor(active: ActiveFault) -> Check:
     """SIGKILL to the launcher: robots land by themselves, and everything ends."""
-    it.run.send("conductor", SIGKILL)
-    return it.all_landed
+    active.run.send("conductor", SIGKILL)
+    return active.all_landed
 
 
-def _clock(it: ActiveFault) -> Check:
+def _clock(active: ActiveFault) -> Check:
     """The wall clock of all processes steps by 0.5 to 5 s, forward or back."""
-    it.shift_clock("clock", it.fault.size, it.run.switch("clock").read())
-    return it.positions_kept
+    active.shift_clock("clock", active.fault.size, active.run.switch("clock").read())
+    return active.positions_kept
 
 
-def _clock_behind(it: ActiveFault) -> Check:
+def _clock_behind(active: ActiveFault) -> Check:
     """SIGKILL to a robot's process; it is started again with a clock 3 to 4.5 s behind, and must be received."""
-    run, observer, victim = it.run, it.observer, it.victim
+    run, observer, victim = active.run, active.observer, active.victim
     run.send(victim, SIGKILL)
-    it.shift_clock(f"clock-{run.process_of(victim)}", -it.fault.size)
+    active.shift_clock(f"clock-{run.process_of(victim)}", -active.fault.size)
     restarted = back = None
 
     def check() -> str:
         nonlocal restarted, back
         if restarted is None:
-            if victim in observer.alive or not it.lost():
+            if victim in observer.alive or not active.lost():
                 return f"the loss of {victim} is not reported"
             run.shifted.add(victim)
             restarted = time.monotonic()
             run.restart(victim, observer.session)
         if (why := run.answer.reason or run.answer.refused.get(victim)) and not run.over:
-            it.add_violation(f"{victim} is not let in again: {why}")
+            active.add_violation(f"{victim} is not let in again: {why}")
             return ""
         if victim not in observer.alive:
             return f"{victim} is not back"
         back = back or time.monotonic()
-        deaf = [name for name in it.receivers() if observer.received_at.get((name, victim), 0.0) < restarted]
+        deaf = [name for name in active.receivers() if observer.received_at.get((name, victim), 0.0) < restarted]
         names = ", ".join(deaf)
         if deaf and time.monotonic() - back > DEAF_S:
-            it.add_violation(f"{names}: no pose of {victim} received in the first {DEAF_S:g} s after its restart")
-        if deaf or victim not in it.live:
+            active.add_violation(f"{names}: no pose of {victim} received in the first {DEAF_S:g} s after its restart")
+        if deaf or victim not in active.live:
             return f"{victim} does not take part yet, or its poses do not reach {names or 'any robot'}"
         return ""
 
     return check
 
 
-def _mocap_clock(it: ActiveFault) -> Check:
+def _mocap_clock(active: ActiveFault) -> Check:
     """The wall clock of motion capture steps by 0.5 to 4.5 s, and back after 3 s: no robot may lose its position."""
-    it.shift_clock(MOCAP_CLOCK, it.fault.size)
-    return it.positions_kept
+    active.shift_clock(MOCAP_CLOCK, active.fault.size)
+    return active.positions_kept
 
 
-def _mocap_frozen(it: ActiveFault) -> Check:
+def _mocap_frozen(active: ActiveFault) -> Check:
     """Motion capture tells the same poses in new frames for 5 s: no robot may move by them."""
-    it.run.spoil_capture("frozen")
-    return it.all_unaware("position")
+    active.run.spoil_capture("frozen")
+    return active.all_unaware("position")
 
 
-def _mocap_repeated(it: ActiveFault) -> Check:
+def _mocap_repeated(active: ActiveFault) -> Check:
     """Motion capture sends its last frame again and again for 5 s: no robot may move by it."""
-    it.run.spoil_capture("repeated")
-    return it.all_unaware("position")
+    active.run.spoil_capture("repeated")
+    return active.all_unaware("position")
 
 
-def _mocap_swapped(it: ActiveFault) -> Check:
+def _mocap_swapped(active: ActiveFault) -> Check:
     """Motion capture takes two subjects for each other for 5 s: both must hold or land."""
-    names = it.run.measured
-    it.run.spoil_capture("swapped", it.victim)
-    pair = it.victim, names[(names.index(it.victim) + 1) % len(names)]
-    it.note = f"and {pair[1]}"
-    return lambda: it.unaware(pair, "")
+    names = active.run.measured
+    active.run.spoil_capture("swapped", active.victim)
+    pair = active.victim, names[(names.index(active.victim) + 1) % len(names)]
+    active.note = f"and {pair[1]}"
+    return lambda: active.unaware(pair, "")
 
 
-def _mocap_renamed(it: ActiveFault) -> Check:
+def _mocap_renamed(active: ActiveFault) -> Check:
     """A subject of motion capture has another name for 5 s: its robot must hold or land."""
-    it.run.spoil_capture("renamed", it.victim)
-    return lambda: it.unaware([it.victim], "position")
+    active.run.spoil_capture("renamed", active.victim)
+    return lambda: active.unaware([active.victim], "position")
 
 
-def _refused_landing(it: ActiveFault) -> Check:
+def _refused_landing(active: ActiveFault) -> Check:
     """A robot is ordered to land, and its body refuses for 12 s: it must be told again until it is down."""
-    it.run.refuse_landing(it.victim, it.observer.session)
-    return it.landed
+    active.run.refuse_landing(active.victim, active.observer.session)
+    return active.landed
 
 
-def _sleep(it: ActiveFault) -> Check:
+def _sleep(active: ActiveFault) -> Check:
     """The computer of a robot sleeps for 8 s: on waking it must be heard, hear the others, or be down."""
-    it.run.sleep(it.victim)
+    active.run.sleep(active.victim)
 
     def check() -> str:
-        if (why := it.back()) or it.observer.is_down(it.victim):
+        if (why := active.back()) or active.observer.is_down(active.victim):
             return why
-        deaf = it.deaf_to()
-        return f"{it.victim} receives no pose of {', '.join(deaf)}" if deaf else ""
+        deaf = active.deaf_to()
+        return f"{active.victim} receives no pose of {', '.join(deaf)}" if deaf else ""
 
     return check
 
 
-def _double(it: ActiveFault) -> Check:
+def _double(active: ActiveFault) -> Check:
     """A second process of a robot's name is started: it must be refused, and touch nothing."""
-    victim, second = it.victim, it.run.start_duplicate(it.victim)
+    victim, second = active.victim, active.run.start_duplicate(active.victim)
 
     def check() -> str:
-        for order in it.observer.orders:
-            if order.robot == victim and not it.run.over:
-                it.add_violation(f"the body of {victim} was ordered to {order.action}")
+        for order in active.observer.orders:
+            if order.robot == victim and not active.run.over:
+                active.add_violation(f"the body of {victim} was ordered to {order.action}")
         if second.alive:
             return f"the second process of {victim} is not refused yet"
         if second.handle.returncode != REFUSED:
-            it.add_violation(f"the second process of {victim}: {second.exit}, {second.tail()[-200:]}")
-        return "" if victim in it.live else f"{victim} is not running any more"
+            active.add_violation(f"the second process of {victim}: {second.exit}, {second.tail()[-200:]}")
+        return "" if victim in active.live else f"{victim} is not running any more"
 
     return check
 
 
-def _read_error(it: ActiveFault) -> Check:
+def _read_error(active: ActiveFault) -> Check:
     """Reading a robot's body raises: it must be ordered to land or to stop all the same."""
-    observer, victim = it.observer, it.victim
-    it.run.switch(f"read-{victim}").write(1.0)
+    observer, victim = active.observer, active.victim
+    active.run.switch(f"read-{victim}").write(1.0)
 
     def check() -> str:
         if not any(order.robot == victim and order.action in ("land", "stop") for order in observer.orders):
             return f"the body of {victim} was ordered neither to land nor to stop"
         if observer.invariants.in_the_air(victim):
             return f"{victim} has not come down yet"
-        if not it.lost():  # it lands for as long as a landing may take, for it sees nothing of it
+        if not active.lost():  # it lands for as long as a landing may take, for it sees nothing of it
             return f"the process of {victim} has not ended yet"
-        it.run.dead.setdefault(victim, time.monotonic())
-        return it.loss_noticed()
+        active.run.dead.setdefault(victim, time.monotonic())
+        return active.loss_noticed()
 
     return check
 
 
-def _disk(it: ActiveFault) -> Check:
+def _disk(active: ActiveFault) -> Check:
     """The recording can grow no more."""
-    it.note = it.run.fill_disk()
-    return it.reported("recorder")
+    active.note = active.run.fill_disk()
+    return active.reported("recorder")
 
 
-def _corrupt(it: ActiveFault) -> Check:
+def _corrupt(active: ActiveFault) -> Check:
     """Payloads of nonsense on every key that a robot believes."""
-    it.note = f"{it.run.spoil(it.victim, it.observer.session)} payloads of nonsense"
-    return it.back
+    active.note = f"{active.run.spoil(active.victim, active.observer.session)} payloads of nonsense"
+    return active.back
 
 
 @dataclass(frozen=True)

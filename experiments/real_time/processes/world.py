@@ -141,7 +141,7 @@ class WorldProcess:
             return not reason
 
     def _carry_out(self, order: messages.WorldOrder) -> None:
-        """Raises Refused."""
+        """Raises Refusal."""
         population, what = self._population, order.order
         if what == "pause":
             self.paused = True

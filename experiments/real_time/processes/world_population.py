@@ -147,7 +147,7 @@ class WorldBodies:
         return self.names.index(name)
 
     def _require_room(self, row: int) -> None:
-        """Raises Refused if a robot on the floor would overlap something at its start."""
+        """Raises Refusal if a robot on the floor would overlap something at its start."""
         name, own, (x, y, _) = self.names[row], self._kinds[row], self._home[row][0]
         for other, (kind, motion) in enumerate(zip(self._kinds, self.body.engine.motions, strict=True)):
             if other != row and motion.position[2] < own.height:

@@ -314,21 +314,21 @@ def test_late_alarm_leaves_the_tokens(monkeypatch):
         shown = [Keys().alive("A"), Keys().alive("B")]
         assert CountedToken.live == shown
         robot.watchdog.tripped = "it hangs"
-        robot._call_for_help("it hangs")
-        robot._call_for_help("it hangs")
+        robot._leave_formation("it hangs")
+        robot._leave_formation("it hangs")
         assert CountedToken.live == []
-        robot._recover(robot.watchdog.forgive())
+        robot._land_after_hang(robot.watchdog.forgive())
         assert CountedToken.live == shown
-        robot._call_for_help("it hung")  # by a thread that was held up until the loop had recovered
+        robot._leave_formation("it hung")  # by a thread that was held up until the loop had recovered
         assert CountedToken.live == shown
-        robot._recover("it hung")
+        robot._land_after_hang("it hung")
         assert CountedToken.live == shown
         robot._orders.leaving.add(0)
         robot.robots[0].lifecycle.land("ordered to leave")
         robot.watchdog.tripped = "it hangs"
-        robot._call_for_help("it hangs")
+        robot._leave_formation("it hangs")
         robot._retire(0.0)  # of a row whose token the alarm has taken back
-        robot._recover(robot.watchdog.forgive())
+        robot._land_after_hang(robot.watchdog.forgive())
         assert CountedToken.live == shown[1:]
 
 
