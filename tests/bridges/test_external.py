@@ -316,6 +316,7 @@ def test_without_a_world_it_says_what_to_start(router: RouterProcess) -> None:
 def test_numbers_after_standstill_exceed_those_of_successor(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [1000.0]
     monkeypatch.setattr(time, "clock_gettime", lambda _clock: now[0])
+    monkeypatch.setattr(time, "time", lambda: 1.7e9 + now[0])
 
     def process() -> ExternalBody:
         made = ExternalBody(request("tcp/127.0.0.1:1", {"CF01": "crazyflie"}))

@@ -308,6 +308,7 @@ def test_broken_robots_of_the_guide_fail_the_run(installed, four_rovers, tmp_pat
     assert max(hypot(*velocity[:2]) for velocity in drove if velocity) > 0.02  # the body measures none
 
 
+@pytest.mark.slow
 def test_body_of_the_docs_refuses_wrong_addresses():
     with pytest.raises(BodyError, match="no address"):
         rovers("rover://nowhere")

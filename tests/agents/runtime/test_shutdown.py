@@ -127,6 +127,7 @@ def test_robot_is_stopped_once_it_is_down():
     assert body.calls == ["open", "land", "stop", "close"]
 
 
+@pytest.mark.slow
 def test_slow_descent_is_not_stopped_in_flight():
     body = Airborne(steps=100)  # a second
     slow = replace(QUICK, landing_s=0.05, slowest=2.5 / 20.0)  # from the ceiling of 2.5 m it takes 20 s

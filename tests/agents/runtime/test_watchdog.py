@@ -73,6 +73,7 @@ class Kennel:
             pause.wait(0.01)
 
 
+@pytest.mark.slow
 def test_a_loop_that_goes_round_is_left_alone():
     kennel = Kennel(silence_s=1.0)  # a busy machine may hold up a loop for some tenths
     with kennel.watched():
@@ -82,6 +83,7 @@ def test_a_loop_that_goes_round_is_left_alone():
     assert not kennel.dog.tripped
 
 
+@pytest.mark.slow
 def test_hanging_loop_is_landed_and_may_recover(eventually: Callable[[Callable[[], object]], None]):
     kennel = Kennel(silence_s=0.5)
     with kennel.watched():
@@ -98,6 +100,7 @@ def test_hanging_loop_is_landed_and_may_recover(eventually: Callable[[Callable[[
     assert not kennel.ends
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stuck", ["", "land", "stop"])
 def test_endless_hang_is_cut_and_ended(stuck: str, eventually):
     kennel = Kennel(down_s=0.8)

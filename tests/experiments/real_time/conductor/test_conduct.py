@@ -90,6 +90,7 @@ def endpoint():
     return free_endpoint(preferred_port=0)
 
 
+@pytest.mark.slow
 def test_router_that_just_started_is_waited_for(endpoint):
     over = threading.Event()
     late = threading.Timer(0.6, serve_router, ([endpoint], over))

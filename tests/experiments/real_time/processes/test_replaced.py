@@ -29,6 +29,7 @@ from tests.waiting import until
 KEYS = Keys()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", ["still", "cut off"])
 @pytest.mark.parametrize("what", ["world", "centre"])
 def test_replaced_process_sends_nothing(what, way, monkeypatch):

@@ -105,6 +105,7 @@ def test_thrust_needs_a_zero_first():
     assert wire.position[2] > 0.1
 
 
+@pytest.mark.slow
 def test_drone_disarmed_aloft_falls_and_is_ready():
     wire = Wire().hovering(0.5)
     wire.put(Port.SUPERVISOR, 1, int(Safety.ARM), 0)
@@ -124,6 +125,7 @@ def test_a_plan_that_is_no_number_locks():
     assert wire.state == State.LOCKED
 
 
+@pytest.mark.slow
 def test_a_flat_fall_is_a_landing():
     wire = Wire().hovering(0.8)
     wire.plan(HighLevel.STOP)
