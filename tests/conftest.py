@@ -143,7 +143,7 @@ def router() -> Iterator[RouterProcess]:
 
 @pytest.fixture(scope="module")
 def hub() -> Iterator[RouterProcess]:
-    """One router for all tests of a module that leave it alone."""
+    """Router for all tests of a module that leave it alone."""
     made = RouterProcess()
     yield made
     made.stop()

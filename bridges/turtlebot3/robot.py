@@ -1,4 +1,4 @@
-"""One TurtleBot3: its topics, and velocity commands that are repeated.
+"""TurtleBot3: its topics, and velocity commands that are repeated.
 
 The robot has no watchdog for this connection: the OpenCR board stops the wheels when the ROS node on the robot is
 silent, not when we are. So every end sends zeros on cmd_vel, and every command is repeated until it is stale.
@@ -93,7 +93,7 @@ class RepeatedVelocity:
 
 
 class Robot:
-    """One TurtleBot3: topics, state and current command."""
+    """TurtleBot3 with its topics, state and current command."""
 
     def __init__(self, request: BodyRequest, row: int) -> None:
         name, kind = request.names[row], request.kinds[row]

@@ -43,7 +43,7 @@ FLOWN = {}
 
 
 def fly(experiment, seed=1):
-    """What a run records; the same one is flown once."""
+    """Recording of a run; each is flown once."""
     key = msgspec.json.encode(experiment), seed
     if key not in FLOWN:
         FLOWN[key] = simulation.simulate(Plan(experiment), seed)

@@ -28,7 +28,7 @@ FLOWN = ("KH01", "KH02", "CF01")
 
 
 def refused() -> contextlib.AbstractContextManager[object]:
-    """What a router does with a session that it does not let in."""
+    """Reaction of a router to a session that it does not let in."""
     return pytest.raises(zenoh.ZError, match="Unable to connect")
 
 

@@ -1,4 +1,4 @@
-"""What the command line knows of its terminal and its options."""
+"""Terminal and options of the command line."""
 
 from __future__ import annotations
 

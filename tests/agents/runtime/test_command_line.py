@@ -1,4 +1,4 @@
-"""What a process does with its words, its output and its interruption."""
+"""Words, output and interruption of a process."""
 
 import os
 import signal

@@ -143,7 +143,7 @@ def test_every_motion_on_the_floor():
 
 
 def test_legs_hazard_and_several_stretches():
-    """One loop, with a registered avoidance, flies other seeds too, and samples of positions alone."""
+    """A compiled loop with a registered avoidance flies other seeds too, and samples of positions alone."""
     line = {"kind": "line", "move_by": [0.2, 0.1], "speed": 0.1}
     legs = [
         Leg(at_s=2.0, robot="A", plan=line),
