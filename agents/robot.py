@@ -25,7 +25,7 @@ from agents.decision.situation import ProcessHealth, Situation
 from agents.decision.stepping import Stepping, Words
 from agents.decision.transmission import Transmitter
 from agents.plugins.predictors import HOLD
-from agents.safety.detection import Detector, Status
+from agents.safety.detection import Detector, RobotStatus
 from agents.safety.hazards import Cause, Hazards, Outcome
 from agents.safety.landing import Landing
 from agents.safety.positions import Continuity, ExternalPositions
@@ -89,7 +89,7 @@ class Robot:
         speech = None if stepping is None or assignment.guided else stepping.speech
         self.transmitter = Transmitter(assignment.trigger, assignment.predictor, kind, speech)
         self.hazards, self.landing = Hazards(kind, limits), Landing(assignment)
-        self._detector, self._preflight, self._status = Detector(assignment), Preflight(assignment), Status()
+        self._detector, self._preflight, self._status = Detector(assignment), Preflight(assignment), RobotStatus()
         self._controller, self._filter = PositionController(kind), SetpointFilter(kind, limits)
         self._continuity, self._external = Continuity(kind), ExternalPositions(kind)
         self._flies, self._predicts = kind.flies, assignment.predictor is not HOLD

@@ -52,7 +52,7 @@ class _RepeatedOrder(msgspec.Struct):
 
 
 @dataclass(slots=True)
-class _Robot:
+class _ExternalRobot:
     """Last state of a robot, and its orders."""
 
     name: str
@@ -108,7 +108,7 @@ class ExternalBody(Body):
         self._utc = request.clock.utc()  # one reading, as in the runtime: a step of the wall clock has no effect
         self._clock_offset = inf  # from the caller's clock to this one [s]
         self._robots = [
-            _Robot(name, address, kind.flies, kind.takes == "twist", round(1e3 * self._utc), yaw)
+            _ExternalRobot(name, address, kind.flies, kind.takes == "twist", round(1e3 * self._utc), yaw)
             for name, address, kind, yaw in zip(
                 request.names, request.addresses, request.kinds, request.yaw, strict=True
             )
@@ -312,7 +312,7 @@ class ExternalBody(Body):
                     robot.seq = max(robot.seq, least)
 
     def _next_command(
-        self, robot: _Robot, action: Action, setpoint: Setpoint | None = None, height: float | None = None
+        self, robot: _ExternalRobot, action: Action, setpoint: Setpoint | None = None, height: float | None = None
     ) -> messages.Command:
         robot.seq += 1
         return messages.Command(robot.name, robot.seq, self._stamp(), action, setpoint, height)
@@ -327,5 +327,5 @@ class ExternalBody(Body):
             self._positions.trouble[row] = f"commands cannot be sent: {error}"
 
 
-def _source_name(robot: _Robot) -> str:
+def _source_name(robot: _ExternalRobot) -> str:
     return "`./zenpark world serve` with this experiment" if robot.address == WORLD else "the simulator"

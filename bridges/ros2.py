@@ -65,7 +65,7 @@ class GoalHeight:
 
 
 @dataclass
-class _Robot:
+class _RobotTopics:
     """Topics of one robot, and its goal's publisher in the realm."""
 
     pose: Publisher
@@ -98,7 +98,7 @@ class Graph:
         self._node = participant.node(NODE)
         self._diagnostics = self._node.publisher("/diagnostics", ros2.DIAGNOSTIC_ARRAY)
         self._transforms = self._node.publisher("/tf", ros2.TF_MESSAGE, ros2.TRANSFORMS)
-        self._robots: dict[str, _Robot] = {}
+        self._robots: dict[str, _RobotTopics] = {}
         self._states = pubsub.Inbox(pubsub.subscriber(session, keys.state("*"), 1024), messages.State, keys=keys)
         self._ranges = pubsub.Inbox(pubsub.subscriber(session, keys.ranges("*"), 256), messages.Ranges, keys=keys)
         self._statuses = pubsub.Inbox(pubsub.pose_subscriber(session, keys.status("*"), 256), messages.Status)
@@ -147,9 +147,9 @@ class Graph:
                 self._robots[name] = self._declare_topics(name)
         return gone
 
-    def _declare_topics(self, name: str) -> _Robot:
+    def _declare_topics(self, name: str) -> _RobotTopics:
         chunk = ros_name(name)
-        return _Robot(
+        return _RobotTopics(
             self._node.publisher(f"/{chunk}/pose", ros2.POSE_STAMPED),
             self._node.publisher(f"/{chunk}/velocity", ros2.TWIST_STAMPED),
             self._node.subscriber(f"/{chunk}/goal", ros2.POSE_STAMPED, depth=8),
@@ -188,7 +188,7 @@ class Graph:
     def _diagnostics_of_statuses(self) -> list[Message]:
         return [diagnosis(self._types, status) for status in self._statuses.read() if status.robot in self._robots]
 
-    def _forward_goal(self, name: str, robot: _Robot, message: Message) -> None:
+    def _forward_goal(self, name: str, robot: _RobotTopics, message: Message) -> None:
         """Forward a goal from ROS into the realm, unless a central controller sends goals."""
         place, q = message.pose.position, message.pose.orientation
         numbers = (place.x, place.y, place.z, q.x, q.y, q.z, q.w)

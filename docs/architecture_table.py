@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from experiments.definition.experiment import Channel
+from experiments.definition.experiment import ChannelTable
 from experiments.definition.plan import Plan
 from experiments.file.document import load
 from experiments.sweep.runs import RunMetrics, run_metrics
@@ -67,7 +67,7 @@ def main() -> None:
         first: list[RunMetrics] | None = None
         for delay_s in DELAYS_S:
             for who, case in cases.items():
-                plan = case.changed(trigger=trigger, channel=Channel(delay_s=delay_s))
+                plan = case.changed(trigger=trigger, channel=ChannelTable(delay_s=delay_s))
                 runs, messages, deliveries, late = flown(plan, seeds)
                 first = first or runs
                 ratio = {what: mean(runs, what) / mean(first, what) for what in ("iae", "itae")}

@@ -13,7 +13,7 @@ import numpy as np
 from agents.kinds.crazyflie import CRAZYFLIE
 from twins.arrays import Array
 from twins.devices.crazyflie.flock import LOST, Estimator
-from twins.devices.crazyflie.planner import ORDER, Planner, evaluate, polynomial
+from twins.devices.crazyflie.planner import ORDER, OnboardPlanners, evaluate, polynomial
 from twins.engines.engine import Engine, EngineInput
 from twins.engines.mujoco_engine import RigidBody
 from twins.engines.point_mass import PointMass
@@ -51,7 +51,7 @@ def minimum_snap_difference(rng: np.random.Generator) -> float:
 
 def spiral_difference(angle: float, last: float) -> float:
     """Largest distance [m] from an arc of `angle` [rad] from a radius of 1 m to `last` [m] to the spiral itself."""
-    planner, span = Planner(1), 5.0
+    planner, span = OnboardPlanners(1), 5.0
     planner.spiral(
         0, 0.0, np.zeros(4), angle=angle, radii=(1.0, last), climb=0.0, span=span, sideways=False, clockwise=False
     )
@@ -127,7 +127,7 @@ def step(axis: int, size: float) -> Array:
 
 def planned(span: float) -> Array:
     """Setpoints (T, 4) of a plan of 2 m along x in `span` [s]."""
-    planner = Planner(1)
+    planner = OnboardPlanners(1)
     start = np.array([0.0, 0.0, 1.0, 0.0])
     goal = start + np.array([2.0, 0.0, 0.0, 0.0])
     planner.go_to(0, 0.0, start, np.zeros(3), goal=goal, span=span, relative=False, linear=False)

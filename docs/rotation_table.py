@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
-from experiments.definition.experiment import Experiment, Formation, Link, Robot, Start
+from experiments.definition.experiment import Experiment, Formation, LinkTable, RobotTable, Start
 from experiments.definition.formation import errors_over_time
 from experiments.definition.plan import Plan
 from experiments.file import document
@@ -61,10 +61,10 @@ def measured(name: str, experiment: Experiment) -> Row:
 
 def disagreeing(experiment: Experiment, by: float) -> Experiment:
     """Links in both directions: the first robot wants each shorter, the second longer, by `by` [m]."""
-    links: dict[str, float | Link] = {}
+    links: dict[str, float | LinkTable] = {}
     for text, distance in experiment.formation.links.items():
         first, sign, second = text.split()
-        if sign == ">" or isinstance(distance, Link):
+        if sign == ">" or isinstance(distance, LinkTable):
             links[text] = distance
         else:
             links[f"{first} > {second}"], links[f"{second} > {first}"] = distance + by, distance - by
@@ -79,7 +79,7 @@ def by_law(experiment: Experiment, law: str | dict[str, object]) -> Experiment:
 def facing(experiment: Experiment) -> Experiment:
     """The reference with offsets instead of distances on two links from its leader; the heading is that of seed 200."""
     beside = {"TB01 > KH01": [-0.139, -0.584], "TB01 > KH03": [0.584, -0.139]}
-    links = {**experiment.formation.links, **{text: Link(offset=at, gain=1.0) for text, at in beside.items()}}
+    links = {**experiment.formation.links, **{text: LinkTable(offset=at, gain=1.0) for text, at in beside.items()}}
     return by_law(changed(experiment, formation=changed(experiment.formation, links=links)), "mixed")
 
 
@@ -88,7 +88,7 @@ def ring(count: int, kind: str, trigger: dict[str, object]) -> Experiment:
     angle = 2.0 * math.pi * np.arange(count) / count
     place = 0.3 / math.sin(math.pi / count) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     hover = 0.8 if kind == "crazyflie" else None
-    robots = {f"R{i}": Robot(kind=kind, start=(1.15 * place[i]).tolist(), hover=hover) for i in range(count)}
+    robots = {f"R{i}": RobotTable(kind=kind, start=(1.15 * place[i]).tolist(), hover=hover) for i in range(count)}
     links = {
         f"R{i} - R{(i + step) % count}": float(math.dist(place[i], place[(i + step) % count]))
         for step in range(1, (count + 1) // 2)

@@ -14,7 +14,7 @@ from typing import Any, Final
 
 import msgspec
 
-from experiments.definition.experiment import Channel
+from experiments.definition.experiment import ChannelTable
 from experiments.definition.plan import Plan
 from experiments.file.document import load
 from experiments.metrics import measure
@@ -24,7 +24,7 @@ from experiments.virtual_time.log import RunRecorder
 
 TUNING: Final = tuple(range(1001, 1011))
 REPORTED: Final = tuple(range(1, 51))
-BAD: Final = Channel(delay_s=0.05, loss=0.1)
+BAD: Final = ChannelTable(delay_s=0.05, loss=0.1)
 CHOSEN: Final = {"kind": "predictive", "threshold": 0.011, "smoothing_s": 0.4}
 
 # One scale of each was chosen on the tuning seeds so that its belief error is that of send-on-delta at 1 cm.

@@ -102,7 +102,7 @@ class Run:
         from experiments.report import page, tables, verdict  # noqa: PLC0415 - for people alone
 
         cases = list(self.metrics.values())
-        found = [*verdict.findings(cases), *(page.Finding("fair", note) for note in self.notes)] if cases else []
+        found = [*verdict.findings(cases), *(page.VerdictLine("fair", note) for note in self.notes)] if cases else []
         return page.fragment(self.title, found, [tables.summary_table(cases)] if cases else [])
 
     def to_frame(self) -> Any:  # noqa: ANN401 - of pandas or of polars

@@ -102,6 +102,15 @@ def floor_of(entry: str) -> int:
     return next(number for number, floor in enumerate(FLOORS) if entry in floor)
 
 
+def test_names_of_classes_stand_once():
+    places: dict[str, list[str]] = {}
+    for module, file in modules().items():
+        for node in ast.walk(ast.parse(file.read_text("utf-8"))):
+            if isinstance(node, ast.ClassDef):
+                places.setdefault(node.name, []).append(module)
+    assert {name: where for name, where in places.items() if len(where) > 1} == {}
+
+
 def test_imports_go_one_way():
     against = [
         f"{name} imports {other}"

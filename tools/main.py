@@ -17,7 +17,7 @@ from typer.models import CommandInfo
 
 from agents.errors import ExplainedError
 from tools.commands import author, check, explain, hosts, lab, network, orders, processes, results, run, sweep, view
-from tools.options import Command, Group, example, print_json, warn
+from tools.options import Group, ZenparkCommand, example, print_json, warn
 
 
 def _exit(code: object, **_: object) -> None:
@@ -118,7 +118,7 @@ def part_for(words: Sequence[str], whole: typer.Typer = app) -> typer.Typer:
         name = command.name or getattr(command.callback, "__name__", "")
         shown = copy(command)
         if name in words[:1]:
-            shown.cls = Command
+            shown.cls = ZenparkCommand
         else:
             shown.name, shown.help = name, command.help or inspect.getdoc(command.callback)
             shown.callback = lambda: None

@@ -61,7 +61,7 @@ def _quick(parameters: list[Any]) -> list[Any]:
     return parameters
 
 
-class Command(TyperCommand):
+class ZenparkCommand(TyperCommand):
     """A command that imports pydantic for the numbers and paths that are given alone."""
 
     def get_params(self, ctx: Any) -> list[Any]:  # noqa: ANN401 - of typer's private click

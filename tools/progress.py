@@ -7,7 +7,7 @@ import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final, Self
 
-from experiments.real_time.conductor.run_view import OUTPUT, News, Progress, ProgressDisplay, RobotView
+from experiments.real_time.conductor.run_view import OUTPUT, EventFeed, Progress, ProgressDisplay, RobotView
 from tools.live_table import LiveRow, Trends, drawn, heading, metres
 from tools.terminal import printable, say
 
@@ -23,7 +23,7 @@ class Lines:
     """A line for each event and every few seconds, on standard error."""
 
     def __init__(self) -> None:
-        self._news, self._next = News(), 0.0
+        self._news, self._next = EventFeed(), 0.0
 
     def __enter__(self) -> Self:
         return self
@@ -51,7 +51,7 @@ class Lines:
             print(f"{progress.case}: {progress.elapsed:5.1f} s, {progress.phase}; {what}", file=sys.stderr)
 
 
-class Table:
+class ProgressTable:
     """A live table of the robots, on standard error."""
 
     def __init__(self) -> None:
@@ -59,7 +59,7 @@ class Table:
         from rich.live import Live
 
         self._live = Live(console=Console(stderr=True), refresh_per_second=4, auto_refresh=False)
-        self._news, self._next, self._trends = News(), 0.0, Trends()
+        self._news, self._next, self._trends = EventFeed(), 0.0, Trends()
 
     def __enter__(self) -> Self:
         self._live.__enter__()
@@ -81,7 +81,7 @@ class Table:
 
 def shown(*, quiet: bool) -> ProgressDisplay:
     """A table in a terminal, lines elsewhere, and only lines when asked to be quiet."""
-    return Table() if sys.stderr.isatty() and not quiet else Lines()
+    return ProgressTable() if sys.stderr.isatty() and not quiet else Lines()
 
 
 def _table(progress: Progress, trends: Trends, console: Console) -> Group:

@@ -17,7 +17,7 @@ from agents.vectors import NO_SETPOINT, ZERO, Setpoint, Vector
 from twins.engines.engine import Engine, EngineInput, Motion, Touch, World
 from twins.engines.point_mass import PointMassEngine, model, require_models
 from twins.models import noise
-from twins.models.disturbance import Drift, HoverJitter, Latency, Measurement
+from twins.models.disturbance import HoverJitter, Latency, MeasurementNoise, OdometryDrift
 from twins.models.onboard_flight import OnboardFlight
 
 if TYPE_CHECKING:  # a process of one robot needs no scene, which needs numpy
@@ -44,8 +44,8 @@ class Twin:
 
     motion: Motion  # of an engine
     _jitter: HoverJitter
-    _measurement: Measurement
-    _drift: Drift
+    _measurement: MeasurementNoise
+    _drift: OdometryDrift
     _latency: Latency
     _jitters: bool  # whether these four are present
     _measures: bool
@@ -67,8 +67,8 @@ class Twin:
         """`dt`: step of `advance` [s]."""
         self.motion = motion
         self._jitter = HoverJitter(disturbance if kind.flies else Disturbance(), name, seed, dt)
-        self._measurement = Measurement(disturbance, name, seed, spatial=kind.flies)
-        self._drift, self._latency = Drift(disturbance, name, seed), Latency(disturbance, dt)
+        self._measurement = MeasurementNoise(disturbance, name, seed, spatial=kind.flies)
+        self._drift, self._latency = OdometryDrift(disturbance, name, seed), Latency(disturbance, dt)
         self._jitters, self._measures = self._jitter.present, self._measurement.present
         self._drifts, self._delays = self._drift.present, self._latency.present
         self._drives, self._endurance = not kind.flies, kind.endurance_s

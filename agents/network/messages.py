@@ -64,7 +64,7 @@ class Pose(BarePose, frozen=True, omit_defaults=True):
     shared: list[Variable] = []  # left out while the law says nothing
 
 
-class Memory(Message, frozen=True, omit_defaults=True):
+class LawMemory(Message, frozen=True, omit_defaults=True):
     """Memory and measures of a robot's law, for recorder and viewers; unknown variables are left out."""
 
     robot: str
@@ -445,10 +445,10 @@ def variables(values: Iterable[tuple[str, Sequence[float]]]) -> list[Variable]:
 
 def memory(
     robot: str, seq: int, stamp: float, variables_: Mapping[str, Sequence[float]], measures: Mapping[str, float]
-) -> Memory:
+) -> LawMemory:
     """Message with the memory and the measures of a law."""
     numbers = ((name, (value,)) for name, value in measures.items())
-    return Memory(robot, seq, stamp, variables(variables_.items()), variables(numbers))
+    return LawMemory(robot, seq, stamp, variables(variables_.items()), variables(numbers))
 
 
 def wanted(velocity: Sequence[float]) -> list[float] | None:

@@ -44,7 +44,7 @@ class Predictor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
         return inf
 
 
-class Hold(Predictor, frozen=True):
+class HoldPrediction(Predictor, frozen=True):
     """p̂ = p_k: the last transmitted position."""
 
 
@@ -72,4 +72,4 @@ class ConstantVelocity(Predictor, frozen=True):
         return self.horizon_s
 
 
-HOLD = Hold()
+HOLD = HoldPrediction()

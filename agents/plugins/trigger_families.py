@@ -12,7 +12,7 @@ from typing import Annotated, ClassVar
 
 from msgspec import Meta
 
-from agents.plugins.triggers import ROUNDING_S, Place, SendOnDelta, Trigger, View
+from agents.plugins.triggers import ROUNDING_S, Place, SendOnDelta, Trigger, TriggerView
 from agents.vectors import NotNegative, Positive, distance, norm
 
 
@@ -29,11 +29,11 @@ class Relative(Trigger, frozen=True):
 
     share: Annotated[Positive, Meta(description="σ: share of the error, as a deviation, that is allowed [1]")] = 0.03
 
-    def fires(self, view: View) -> bool:
+    def fires(self, view: TriggerView) -> bool:
         return view.deviation > self.share * view.error
 
 
-class Mixed(Trigger, frozen=True):
+class MixedTrigger(Trigger, frozen=True):
     """‖ε‖² > σ·y² + c²: a share of the error, and a floor for small errors.
 
     M. C. F. Donkers and W. P. M. H. Heemels, "Output-based event-triggered control with guaranteed L∞-gain and improved
@@ -48,7 +48,7 @@ class Mixed(Trigger, frozen=True):
     )
     floor: Annotated[Positive, Meta(description="c: deviation that is allowed without errors [m]")] = 0.007
 
-    def fires(self, view: View) -> bool:
+    def fires(self, view: TriggerView) -> bool:
         return view.deviation * view.deviation > self.share * view.error * view.error + self.floor * self.floor
 
 
@@ -64,7 +64,7 @@ class Decaying(Trigger, frozen=True):
     extra: Annotated[NotNegative, Meta(description="c1: deviation that is allowed beside it at the start [m]")] = 0.02
     rate: Annotated[Positive, Meta(description="α: rate at which that addition fades [1/s]")] = 0.3
 
-    def fires(self, view: View) -> bool:
+    def fires(self, view: TriggerView) -> bool:
         return view.deviation > self.floor + self.extra * exp(-self.rate * view.since_start)
 
 
@@ -88,7 +88,7 @@ class Dynamic(Trigger, frozen=True):
     # η [m² s], and time of its last computation [s]
     MEMORY: ClassVar[Mapping[str, float]] = {"eta": 0.0, "computed_at": nan}
 
-    def fires(self, view: View) -> bool:
+    def fires(self, view: TriggerView) -> bool:
         memory, gap = view.memory, view.deviation
         known = isfinite(gap)
         w = self.share * view.error * view.error + self.floor * self.floor
@@ -105,7 +105,7 @@ class Dynamic(Trigger, frozen=True):
         return eta + self.weight * w <= 0.0
 
 
-class Integral(Trigger, frozen=True):
+class IntegralTrigger(Trigger, frozen=True):
     """∫‖ε‖ dt > A since t_k: a large deviation for a short time, or a small one for long.
 
     M. Miskowicz, "Asymptotic Effectiveness of the Event-Based Sampling According to the Integral Criterion", Sensors
@@ -118,7 +118,7 @@ class Integral(Trigger, frozen=True):
     # integral [m s], its end [s], and the time of the event since which it runs [s]
     MEMORY: ClassVar[Mapping[str, float]] = {"area": 0.0, "until": 0.0, "event": nan}
 
-    def fires(self, view: View) -> bool:
+    def fires(self, view: TriggerView) -> bool:
         memory, event = view.memory, view.last.time
         if memory.event != event:
             memory.area, memory.until, memory.event = 0.0, event, event
@@ -153,7 +153,7 @@ class SelfTriggered(Trigger, frozen=True):
     acceleration: Annotated[Positive, Meta(description="a: bound on the acceleration of the deviation [m/s²]")] = 0.25
     longest_s: Annotated[Positive, Meta(description="longest planned interval [s]")] = 2.0
 
-    def fires(self, view: View) -> bool:
+    def fires(self, view: TriggerView) -> bool:
         drift, bound = view.drift, self.acceleration
         wait = 2.0 * self.threshold / (drift + sqrt(drift * drift + 2.0 * bound * self.threshold))
         return view.since_event >= min(wait, self.longest_s, view.reach_s) - ROUNDING_S
@@ -176,7 +176,7 @@ class Lyapunov(Trigger, frozen=True):
     floor: Annotated[NotNegative, Meta(description="c: deviation that is allowed without errors [m]")] = 0.006
     largest: Annotated[Positive, Meta(description="δ: deviation that is allowed at any level [m]")] = 0.012
 
-    def fires(self, view: View) -> bool:
+    def fires(self, view: TriggerView) -> bool:
         now, then, slack = view.energy, view.last.energy, 0.5 * self.floor * self.floor
         left = now < self.level * then - slack or now > then / self.level + slack
         return left or view.deviation > self.largest
@@ -196,6 +196,6 @@ class RelativeControl(Trigger, frozen=True):
         NotNegative, Meta(description="a: share of the output that is allowed beside it [1], and its largest value [m]")
     ] = 0.1
 
-    def fires(self, view: View) -> bool:
+    def fires(self, view: TriggerView) -> bool:
         change = distance(view.offset, view.last.offset)
         return change >= self.floor + min(self.share * norm(view.offset), self.share)

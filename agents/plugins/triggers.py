@@ -40,7 +40,7 @@ class LastEvent:
         self.time, self.energy = -inf, 0.0
 
 
-class View:
+class TriggerView:
     """Quantities that a trigger may use; overwritten at each question."""
 
     __slots__ = (
@@ -90,7 +90,7 @@ class Trigger(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         NotNegative, Meta(description="time constant of the low-pass on transmitted and judged poses [s]; 0: none")
     ] = 0.0
 
-    def fires(self, view: View) -> bool:
+    def fires(self, view: TriggerView) -> bool:
         """Whether the condition holds."""
         raise TypeError(f"{type(self).__name__} must define `fires`")
 
@@ -101,12 +101,12 @@ class TriggerState:
     __slots__ = ("evaluated_at", "last", "trigger", "view")
 
     trigger: Trigger  # may be replaced by one of the same kind
-    view: View  # for the next question
+    view: TriggerView  # for the next question
     last: LastEvent
     evaluated_at: float  # [s]
 
     def __init__(self, trigger: Trigger) -> None:
-        self.trigger, self.view, self.evaluated_at = trigger, View(trigger.MEMORY), -inf
+        self.trigger, self.view, self.evaluated_at = trigger, TriggerView(trigger.MEMORY), -inf
         self.last = self.view.last
 
     def due(self) -> bool:
@@ -142,7 +142,7 @@ class Periodic(Trigger, frozen=True):
 
     period_s: Annotated[Positive, Meta(description="T: time between two transmissions [s]")] = 0.02
 
-    def fires(self, view: View) -> bool:
+    def fires(self, view: TriggerView) -> bool:
         return view.since_event >= self.period_s - ROUNDING_S
 
 
@@ -155,5 +155,5 @@ class SendOnDelta(Trigger, frozen=True):
 
     threshold: Annotated[Positive, Meta(description="δ: deviation of the held position that is allowed [m]")] = 0.01
 
-    def fires(self, view: View) -> bool:
+    def fires(self, view: TriggerView) -> bool:
         return view.deviation > self.threshold

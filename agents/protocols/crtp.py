@@ -45,7 +45,7 @@ class Port(IntEnum):
     LINK = 15
 
 
-class Status(IntEnum):
+class LogStatus(IntEnum):
     """The last byte of an answer; cflib falls over log errors that are not among these."""
 
     OK = 0
@@ -149,7 +149,7 @@ class HighLevel(IntEnum):
     START_2 = 13
 
 
-class Safety(IntEnum):
+class SupervisorCommand(IntEnum):
     """Commands to the supervisor, channel 1, and its question, channel 0."""
 
     ARM = 1
@@ -187,7 +187,7 @@ class Location(IntEnum):
     STORE_LIGHTHOUSE = 11
 
 
-class Memory(IntEnum):
+class MemoryKind(IntEnum):
     """Kinds of memories."""
 
     EEPROM = 0x00

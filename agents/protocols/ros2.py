@@ -207,7 +207,7 @@ def endpoints(style: Style, role: Role, topic: str, *, domain: int | None = None
     return f"@ros2_lv/{'*' if domain is None else domain}/*/*/*/{role}/*/*/*/{mangle(topic)}/**"
 
 
-class Endpoint(NamedTuple):
+class TopicEndpoint(NamedTuple):
     """Publisher or subscriber by its token; ros2dds knows neither type hashes nor domains."""
 
     topic: str  # full name, "/tb3_0/odom"
@@ -216,14 +216,14 @@ class Endpoint(NamedTuple):
     domain: int = 0
 
 
-def announced(style: Style, token: str) -> Endpoint:
+def announced(style: Style, token: str) -> TopicEndpoint:
     """The endpoint that a token announces; raises ValueError if it announces none."""
     chunks = token.split("/")
     if style == "ros2dds" and len(chunks) >= 6:
-        return Endpoint("/" + chunks[4].replace("§", "/"), chunks[5].replace("§", "/"))
+        return TopicEndpoint("/" + chunks[4].replace("§", "/"), chunks[5].replace("§", "/"))
     if style == "rmw" and len(chunks) >= 13:  # rmw_zenoh 0.10.5 adds one for topics with a uint8[]
         kind = chunks[10].replace("::dds_::", "/").replace("::", "/").removesuffix("_")
-        return Endpoint(chunks[9].replace("%", "/"), kind, chunks[11], int(chunks[1]))
+        return TopicEndpoint(chunks[9].replace("%", "/"), kind, chunks[11], int(chunks[1]))
     raise ValueError(f"'{token}' announces no publisher or subscriber")
 
 

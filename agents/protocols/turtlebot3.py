@@ -59,7 +59,7 @@ class TurtleBot3Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unkno
 
 
 @dataclass(frozen=True)
-class Address:
+class TurtleBotAddress:
     """Address of a robot: `ros2dds://tb3_0?distro=humble`, `rmw://tb3_0?domain=0&distro=jazzy`."""
 
     style: Style
@@ -72,7 +72,7 @@ class Address:
         return f"{self.style}://{self.namespace}?{domain}distro={self.distro}"
 
 
-def address(name: str, text: str, chosen: TurtleBot3Settings) -> Address:
+def address(name: str, text: str, chosen: TurtleBot3Settings) -> TurtleBotAddress:
     """The address of a robot; raises BodyError if it is wrong, with robot and part."""
     style, _, rest = text.partition("://")
     path, _, query = rest.partition("?")
@@ -90,15 +90,17 @@ def address(name: str, text: str, chosen: TurtleBot3Settings) -> Address:
         raise BodyError(f"{name}: distro '{distro}' is not known; one of {', '.join(get_args(Distro))}")
     if not (domain.isascii() and domain.isdigit() and int(domain) <= ros2.MAX_DOMAIN):
         raise BodyError(f"{name}: domain '{domain}' is no number from 0 to {ros2.MAX_DOMAIN}")
-    return Address(style, namespace, distro, int(domain))  # type: ignore[arg-type]
+    return TurtleBotAddress(style, namespace, distro, int(domain))  # type: ignore[arg-type]
 
 
-def twin(name: str, chosen: TurtleBot3Settings) -> Address:
+def twin(name: str, chosen: TurtleBot3Settings) -> TurtleBotAddress:
     """The address of a robot's protocol twin: its own name is the namespace."""
-    return Address(chosen.style, re.sub(r"\W|^(?=\d)", "_", name, flags=re.ASCII), chosen.distro, chosen.domain)
+    return TurtleBotAddress(
+        chosen.style, re.sub(r"\W|^(?=\d)", "_", name, flags=re.ASCII), chosen.distro, chosen.domain
+    )
 
 
-def address_on_routers(name: str, text: str, device: Mapping[str, object], *, of_twin: bool) -> Address | None:
+def address_on_routers(name: str, text: str, device: Mapping[str, object], *, of_twin: bool) -> TurtleBotAddress | None:
     """Address of a robot, or of its protocol twin, on routers of the experiment; None if it has an endpoint of its own.
 
     Raises as `address`.

@@ -22,7 +22,7 @@ MM: Final = 1000.0  # millimetres in a metre
 Z_UP: Final = 0
 
 
-class Kind(IntEnum):
+class BlockKind(IntEnum):
     """Kinds of block, as numbered on the wire."""
 
     STREAM_INFO = 1
@@ -37,12 +37,12 @@ class Kind(IntEnum):
 
 
 POSES: Final = (
-    Kind.STREAM_INFO,
-    Kind.SUBJECT_INFO,
-    Kind.FRAME_INFO,
-    Kind.GLOBAL_SEGMENTS,
-    Kind.LATENCY_INFO,
-    Kind.APPLICATION_INFO,
+    BlockKind.STREAM_INFO,
+    BlockKind.SUBJECT_INFO,
+    BlockKind.FRAME_INFO,
+    BlockKind.GLOBAL_SEGMENTS,
+    BlockKind.LATENCY_INFO,
+    BlockKind.APPLICATION_INFO,
 )  # what there is to know of rigid bodies
 
 _WORD = struct.Struct("<I")
@@ -50,7 +50,7 @@ _HEAD = struct.Struct("<II")
 _SEGMENT = struct.Struct("<I3d9d")
 
 
-class Malformed(ValueError):
+class MalformedBlock(ValueError):
     """Bytes that are not in the DataStream format."""
 
 
@@ -84,17 +84,17 @@ def packet(*blocks: bytes) -> bytes:
 def pack_kinds(kinds: Iterable[int]) -> bytes:
     """The packet with which a server offers kinds of block, and a client wants some of them."""
     chosen = sorted(kinds)
-    return packet(block(Kind.OBJECT_ENUMS, struct.pack(f"<I{len(chosen)}I", len(chosen), *chosen)))
+    return packet(block(BlockKind.OBJECT_ENUMS, struct.pack(f"<I{len(chosen)}I", len(chosen), *chosen)))
 
 
 def pack_stream_info(rate_hz: float) -> bytes:
     """The block with the frame rate."""
-    return block(Kind.STREAM_INFO, struct.pack("<q", round(CLOCK_HZ / rate_hz)))
+    return block(BlockKind.STREAM_INFO, struct.pack("<q", round(CLOCK_HZ / rate_hz)))
 
 
 def pack_axes(up: int = Z_UP) -> bytes:
     """The block with the upward axis."""
-    return block(Kind.APPLICATION_INFO, bytes([up]))
+    return block(BlockKind.APPLICATION_INFO, bytes([up]))
 
 
 def pack_subject(number: int, name: str) -> bytes:
@@ -102,23 +102,23 @@ def pack_subject(number: int, name: str) -> bytes:
     root = _HEAD.pack(NO_PARENT, 0) + struct.pack("<6f", *[0.0] * 6) + _text(name)
     neither_markers_nor_attachments = _HEAD.pack(0, 0)
     payload = _WORD.pack(number) + _text(name) + _WORD.pack(1) + root + neither_markers_nor_attachments
-    return block(Kind.SUBJECT_INFO, payload)
+    return block(BlockKind.SUBJECT_INFO, payload)
 
 
 def pack_frame_number(number: int) -> bytes:
-    return block(Kind.FRAME_INFO, _WORD.pack(number & 0xFFFFFFFF))
+    return block(BlockKind.FRAME_INFO, _WORD.pack(number & 0xFFFFFFFF))
 
 
 def pack_latency(parts: Iterable[tuple[str, float]]) -> bytes:
     """The block with the latency of a frame: stages and their durations [s]."""
     stages = [_text(name) + struct.pack("<d", seconds) for name, seconds in parts]
-    return block(Kind.LATENCY_INFO, _WORD.pack(len(stages)) + b"".join(stages))
+    return block(BlockKind.LATENCY_INFO, _WORD.pack(len(stages)) + b"".join(stages))
 
 
 def pack_segments(subject: int, segments: Iterable[Segment]) -> bytes:
     """The block with the poses of the segments of a subject; without any it is occluded."""
     packed = [_SEGMENT.pack(s.number, *(MM * x for x in s.position), *s.rotation) for s in segments]
-    return block(Kind.GLOBAL_SEGMENTS, _HEAD.pack(subject, len(packed)) + b"".join(packed))
+    return block(BlockKind.GLOBAL_SEGMENTS, _HEAD.pack(subject, len(packed)) + b"".join(packed))
 
 
 # ---------------------------------------------------------------------- unpacking
@@ -138,9 +138,9 @@ class Framer:
         while len(waiting) - at >= _HEAD.size:
             magic, length = _HEAD.unpack_from(waiting, at)
             if magic != MAGIC:
-                raise Malformed(f"a packet begins with {magic:#010x}, not with {MAGIC:#010x}")
+                raise MalformedBlock(f"a packet begins with {magic:#010x}, not with {MAGIC:#010x}")
             if length > MAX_PACKET:
-                raise Malformed(f"a packet of {length} bytes is longer than any frame")
+                raise MalformedBlock(f"a packet of {length} bytes is longer than any frame")
             end = at + _HEAD.size + length
             if end > len(waiting):
                 break
@@ -157,7 +157,7 @@ def blocks(body: bytes) -> Iterator[tuple[int, bytes]]:
         kind, length = _unpack(_HEAD, body, at)
         at += _HEAD.size
         if length > len(body) - at:
-            raise Malformed(f"a block of {length} bytes in a packet that ends after {len(body) - at}")
+            raise MalformedBlock(f"a block of {length} bytes in a packet that ends after {len(body) - at}")
         yield kind, body[at : at + length]
         at += length
 
@@ -166,7 +166,7 @@ def unpack_kinds(payload: bytes) -> set[int]:
     """Kinds that `pack_kinds` packed; raises Malformed, as the functions below, if the block is cut off."""
     (count,) = _unpack(_WORD, payload, 0)
     if 4 * count > len(payload) - 4:
-        raise Malformed(f"a list of {count} kinds in {len(payload)} bytes")
+        raise MalformedBlock(f"a list of {count} kinds in {len(payload)} bytes")
     return set(struct.unpack_from(f"<{count}I", payload, 4))
 
 
@@ -206,7 +206,7 @@ def unpack_segments(payload: bytes) -> tuple[int, list[Segment]]:
     """The number of a subject and where its segments are; no segments: it is occluded."""
     subject, count = _unpack(_HEAD, payload, 0)
     if count * _SEGMENT.size > len(payload) - _HEAD.size:
-        raise Malformed(f"{count} segments in {len(payload)} bytes")
+        raise MalformedBlock(f"{count} segments in {len(payload)} bytes")
     found = []
     for number, x, y, z, *rotation in _SEGMENT.iter_unpack(payload[8 : 8 + count * _SEGMENT.size]):
         found.append(Segment(number, (x / MM, y / MM, z / MM), tuple(rotation)))
@@ -226,7 +226,7 @@ def _read_text(payload: bytes, at: int) -> tuple[str, int]:
     (length,) = _unpack(_WORD, payload, at)
     end = at + 4 + length
     if end > len(payload):
-        raise Malformed(f"a text of {length} bytes where {len(payload) - at - 4} are left")
+        raise MalformedBlock(f"a text of {length} bytes where {len(payload) - at - 4} are left")
     return payload[at + 4 : end].decode(errors="replace"), end
 
 
@@ -234,4 +234,4 @@ def _unpack(layout: struct.Struct, payload: bytes, at: int) -> tuple[int, ...]:
     try:
         return layout.unpack_from(payload, at)
     except struct.error:
-        raise Malformed(f"a block is cut off after {len(payload)} bytes") from None
+        raise MalformedBlock(f"a block is cut off after {len(payload)} bytes") from None

@@ -43,7 +43,7 @@ from agents.runtime.lifeline import Lifeline
 from agents.runtime.orders import LAND, STOP, OrderDesk
 from agents.runtime.pose_inbox import PoseInbox
 from agents.runtime.range_inbox import RangeInbox
-from agents.runtime.telemetry import Counts, Telemetry
+from agents.runtime.telemetry import Counts, TelemetryPublisher
 from agents.runtime.watchdog import SILENCE_S
 from agents.ticks import Ticks
 
@@ -189,7 +189,7 @@ class Runtime:
         if any(robot.guidance is not None for robot in self.robots):
             of_goals = self._setup.goal_conditions
             self._goals = GoalInbox(session, keys, self.robots, valid_box=self._valid_box, conditions=of_goals)
-        self._telemetry = Telemetry(
+        self._telemetry = TelemetryPublisher(
             session,
             keys,
             self._setup.encoding,

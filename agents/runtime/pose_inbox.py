@@ -16,7 +16,7 @@ from agents.network import messages, pubsub, validation
 from agents.network.channel_model import Channel, Conditions
 from agents.network.keys import Keys
 from agents.robot import Robot
-from agents.runtime.pose_order import News, PoseOrder
+from agents.runtime.pose_order import Freshness, PoseOrder
 
 LATE_S: Final = 3.0  # longest delay of a pose in a network: Zenoh holds one back for 2 s behind a missing one
 PROOFS: Final = 3  # late poses in succession that prove a slow clock: one may be the last value of a silent robot
@@ -116,20 +116,20 @@ class NeighbourSubscription:
                 continue
             seq, stamp = order.seq, order.stamp
             news = order.compare(session, pose.seq, pose.stamp)
-            if news in (News.OLD, News.REPEATED):
-                self.stale += news is News.OLD
+            if news in (Freshness.OLD, Freshness.REPEATED):
+                self.stale += news is Freshness.OLD
                 continue
             age, missed = now - pose.stamp, 0
             if age > LATE_S or self._old:
                 self._detect_lag(now, age)
-            if news is News.NEXT and seq and pose.seq != seq + 1:
+            if news is Freshness.NEXT and seq and pose.seq != seq + 1:
                 missed = validation.missed(seq, pose.seq, pose.stamp - stamp, self._rate)
             # A clock that is behind: a predictor must not extrapolate over that time. A pose from before the last
             # reception, too late for a network, proves it at once; the first pose ever may be that of a silent robot.
             slow = self.behind or (pose.stamp < before and age > LATE_S)
             measured = now - LATE_S if slow else validation.taken(pose.stamp, now)
             self._received_at, self._refusals, self.doubt = now, 0, ""
-            yield ReceivedPose(pose, len(sample.payload), missed, measured, news is News.ANEW)
+            yield ReceivedPose(pose, len(sample.payload), missed, measured, news is Freshness.ANEW)
 
     def _note_refusal(self, now: float, reason: str) -> None:
         """Counts a refused pose of the robot; after several in succession, for long, the robot is in doubt."""

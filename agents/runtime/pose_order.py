@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import Enum
 
 
-class News(Enum):
+class Freshness(Enum):
     """Result of the comparison of a pose with the last one."""
 
     NEXT = 1
@@ -55,13 +55,13 @@ class PoseOrder:
         """Whether a pose from `session`, None if it names none, comes from another source than the robot."""
         return session != self._session and bool(self._lives or (self._named and session is None))
 
-    def compare(self, session: str | None, seq: int, stamp: float) -> News:
+    def compare(self, session: str | None, seq: int, stamp: float) -> Freshness:
         """Compare a pose from a source that is not foreign, and store it if it is newer."""
         other = session is not None and session != self._session
         if stamp <= self.stamp and (other or seq <= self.seq or (session is None and self._session is not None)):
-            return News.REPEATED if stamp == self.stamp else News.OLD
+            return Freshness.REPEATED if stamp == self.stamp else Freshness.OLD
         anew = stamp <= self.stamp or (other and self._session is not None)
         if other:
             self._session = session
         self.seq, self.stamp = seq, stamp
-        return News.ANEW if anew else News.NEXT
+        return Freshness.ANEW if anew else Freshness.NEXT

@@ -45,7 +45,7 @@ class Counts:
         self.ticks = self.missed = 0
 
 
-class Telemetry:
+class TelemetryPublisher:
     """States, statuses and range readings of the robots of a process."""
 
     def __init__(

@@ -36,7 +36,7 @@ NOT_UNIT: Final = 0.1  # largest deviation of the squared norm of a quaternion f
 BEHIND: Final = 0.5  # share of the age at which a position is invalid: stamps this far behind give a warning
 
 
-class Status:
+class RobotStatus:
     """Status of a robot in its experiment, for `Detector`; the robot overwrites it on each tick."""
 
     __slots__ = (
@@ -105,7 +105,7 @@ class Ascent:
         self.stalled = climbing and self.hover - height > SUNK and t - self.risen_at > self.patience_s
 
 
-class Descent:
+class LandingProgress:
     """Progress of a landing."""
 
     __slots__ = ("due", "hovers", "landing", "late", "lowered_at", "lowest", "room")
@@ -165,7 +165,7 @@ class Detector:
     avoids: bool  # needs range readings, once there were some
     motion_check: MotionCheck
     ascent: Ascent
-    descent: Descent
+    descent: LandingProgress
     leaned: bool  # on the tick before
     leans_since: float  # time of the first sample of that [s]
     sees: bool  # it avoids, and has range readings
@@ -187,11 +187,11 @@ class Detector:
         self.separation = 0.0 if limits.separation is None else limits.separation
         self.avoids = assignment.avoidance is not None and assignment.avoids
         self.motion_check, self.ascent = MotionCheck(kind), Ascent(kind, assignment.hover)
-        self.descent = Descent(limits.high[2])
+        self.descent = LandingProgress(limits.high[2])
         self.leaned, self.leans_since, self.sees = False, 0.0, False
         self.scan, self.scanned = None, inf
 
-    def causes(self, now: Situation, status: Status, neighbours: Neighbours, health: ProcessHealth) -> int:
+    def causes(self, now: Situation, status: RobotStatus, neighbours: Neighbours, health: ProcessHealth) -> int:
         """Causes that are present, as a set of bits `1 << cause`; call it once on every tick."""
         t, state, found = now.t, now.state, 0
         if self.separation > 0.0:
@@ -250,7 +250,7 @@ class Detector:
                 return 1 << Cause.SEPARATION | 1 << Cause.TOUCHING
         return 1 << Cause.SEPARATION
 
-    def of_neighbours(self, t: float, status: Status, neighbours: Neighbours) -> int:
+    def of_neighbours(self, t: float, status: RobotStatus, neighbours: Neighbours) -> int:
         """Neighbours, and their poses."""
         found = 0
         for sender in neighbours.all:
@@ -266,7 +266,7 @@ class Detector:
             found |= 1 << Cause.FOREIGN
         return found
 
-    def of_process(self, t: float, status: Status, neighbours: Neighbours, health: ProcessHealth) -> int:
+    def of_process(self, t: float, status: RobotStatus, neighbours: Neighbours, health: ProcessHealth) -> int:
         """Router, conductor, control loop and suspensions."""
         found = 0
         if health.just_resumed(t):
@@ -286,7 +286,7 @@ class Detector:
             found |= 1 << Cause.LATE
         return found
 
-    def of_motion(self, now: Situation, status: Status, squared: float) -> int:
+    def of_motion(self, now: Situation, status: RobotStatus, squared: float) -> int:
         """Speed, of which the square is known [m²/s²], and sinking."""
         found = 0
         if squared > self.fastest_squared:
@@ -295,7 +295,7 @@ class Detector:
             found |= 1 << Cause.SINKING
         return found
 
-    def of_device(self, t: float, state: BodyState, status: Status) -> int:
+    def of_device(self, t: float, state: BodyState, status: RobotStatus) -> int:
         """Battery, motors, link and clock."""
         found = 0
         if state.battery < self.battery_low:
@@ -308,7 +308,7 @@ class Detector:
             found |= 1 << Cause.CLOCK
         return found
 
-    def of_orders(self, now: Situation, status: Status) -> int:
+    def of_orders(self, now: Situation, status: RobotStatus) -> int:
         """Operator, decision, central controller and landing."""
         found = 0
         if status.ordered:
@@ -358,7 +358,9 @@ class Detector:
                 self.scanned = scan.time
         return t - self.scanned > SCAN_S
 
-    def words(self, cause: Cause, now: Situation, status: Status, neighbours: Neighbours, health: ProcessHealth) -> str:
+    def words(
+        self, cause: Cause, now: Situation, status: RobotStatus, neighbours: Neighbours, health: ProcessHealth
+    ) -> str:
         """Extent of a cause that the last call of `causes` found; of `BELOW` by `Landing.robot_below`."""
         t, state, limits = now.t, now.state, self.limits
         motion_check, ascent = self.motion_check, self.ascent

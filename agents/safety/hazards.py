@@ -149,7 +149,7 @@ def is_blind(text: str) -> bool:
     return text.partition(": ")[2].startswith(Cause.POSITION.rule.words)
 
 
-class Incident(NamedTuple):
+class HazardChange(NamedTuple):
     """Begin, change or end of a hazard: time [s], cause, outcome, and text."""
 
     time: float
@@ -168,7 +168,7 @@ class Hazards:
 
     held: bool  # the robot must keep its place
     under_way: bool  # a hazard exists, or its begin or end is pending: `update` must be called
-    incidents: list[Incident]  # since the reader emptied the list
+    incidents: list[HazardChange]  # since the reader emptied the list
     # as in `Rule`, by the number of the cause, or as a set
     first: list[int]
     after_s: list[float]
@@ -207,7 +207,7 @@ class Hazards:
 
     def update(
         self, t: float, causes: int, words: Callable[[Cause], str], *, active: bool, landing: bool
-    ) -> list[Incident]:
+    ) -> list[HazardChange]:
         """Update at `t` [s] with the `causes` of this tick; returns landings and cuts that begin now, the hardest last.
 
         Hazards are for a robot that is `active`: it climbs, waits aloft or runs; those with `Rule.landing` for one that
@@ -274,7 +274,7 @@ class Hazards:
             self.lasted_s[number] = self.last[number] - self.begun[number]
             self.begun[number], self.level[number] = NEVER, 0
 
-    def _record(self, t: float, changed: int, words: Callable[[Cause], str]) -> list[Incident]:
+    def _record(self, t: float, changed: int, words: Callable[[Cause], str]) -> list[HazardChange]:
         """Record changes in words; returns landings and cuts, the hardest last."""
         news = []
         for cause in Cause:
@@ -288,7 +288,7 @@ class Hazards:
             else:
                 text = f"{outcome.name.lower()}: {rule}: {words(cause)}"
                 self.texts[cause] = text
-            news.append(Incident(t, cause, outcome, text))
+            news.append(HazardChange(t, cause, outcome, text))
         news.sort(key=lambda incident: incident.outcome)
         self.incidents += news
         return [incident for incident in news if incident.outcome >= Outcome.LAND]

@@ -20,7 +20,7 @@ from agents.decision.perception import Perception
 from agents.decision.situation import ProcessHealth, Situation
 from agents.decision.transmission import Transmitter
 from agents.plugins.calls import wrong
-from agents.plugins.triggers import LastEvent, Trigger, View
+from agents.plugins.triggers import LastEvent, Trigger, TriggerView
 from agents.safety.detection import clock_off, clock_text, nearest_robot, tilt_angle, tilted
 from agents.vectors import NO_SETPOINT, ZERO, Vector, is_finite, norm, planar
 
@@ -159,7 +159,7 @@ def rehearse(
     trigger, update = transmitter.asking.trigger, assignment.update
     _expect_bool(trigger, trigger.fires(deepcopy(transmitter.asking.view)))
     if update is not None:
-        _expect_bool(update, update.fires(View(update.MEMORY)))
+        _expect_bool(update, update.fires(TriggerView(update.MEMORY)))
     for leg in assignment.legs:
         _expect("planner", leg.planner, "target", leg.planner.target(0.0, position, 0.0), 4)
     if perception is not None:

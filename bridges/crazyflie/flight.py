@@ -17,7 +17,7 @@ from typing import Final
 
 from agents.body.interface import UNANSWERED
 from agents.protocols.crazyflie import SETPOINT_PACKETS, CrazyflieSettings
-from agents.protocols.crtp import HighLevel, Info, Status
+from agents.protocols.crtp import HighLevel, Info, LogStatus
 from bridges.crazyflie.link import CrazyflieLink
 from bridges.crazyflie.telemetry import Telemetry
 from bridges.crazyflie.trajectory import HOLD_S, SINK, Target
@@ -55,12 +55,12 @@ UNSTARTED_S: Final = 1.0  # a drone that has descended by itself for longer, bec
 STARTS: Final = 8  # trajectories that may be on board
 TURNED: Final = 0.35  # [rad] largest difference of the yaw on board from that of the external positions
 
-ANSWERS: Final[dict[int, str]] = {Status.BUSY: "not armed, or locked", Status.REFUSED: "its planner is busy"}
+ANSWERS: Final[dict[int, str]] = {LogStatus.BUSY: "not armed, or locked", LogStatus.REFUSED: "its planner is busy"}
 
 Pause = Callable[[float], None]
 
 
-class Phase(Enum):
+class FlightPhase(Enum):
     """Flight phase of a Crazyflie; the value is its text for users."""
 
     GROUND = "on the ground"
@@ -71,16 +71,16 @@ class Phase(Enum):
     STOPPED = "stopped"
 
 
-AIRBORNE: Final = (Phase.CLIMBING, Phase.FLYING, Phase.LANDING, Phase.STOPPING)
+AIRBORNE: Final = (FlightPhase.CLIMBING, FlightPhase.FLYING, FlightPhase.LANDING, FlightPhase.STOPPING)
 
 
-class Flight:
+class FlightControl:
     """Flight control of one Crazyflie over its current link; called by its pilot's thread only, except `set_target`."""
 
     def __init__(self, settings: CrazyflieSettings, telemetry: Telemetry, pause: Pause) -> None:
         """`pause` waits for some seconds; it raises when the link is lost or a stop is ordered."""
         self.link: CrazyflieLink  # current connection; a new one after a loss
-        self.phase = Phase.GROUND
+        self.phase = FlightPhase.GROUND
         self.trouble = ""  # last fault, for users; empty if none
         self._settings, self._telemetry, self._pause = settings, telemetry, pause
         self._target: Target | None = None
@@ -177,7 +177,7 @@ class Flight:
         self._target, self._top, self._sent, self.span_s = None, (x, y, height, place[3]), None, span
         self._on_board.clear()
         self._on_board.append(height)
-        self.enter(Phase.CLIMBING)  # from here on a stop cuts the motors
+        self.enter(FlightPhase.CLIMBING)  # from here on a stop cuts the motors
         trajectories = self.link.trajectories
         answer = self._command_planner(
             trajectories.start_command, lambda: trajectories.start(trajectory), Info.PLANNER_ACTIVE
@@ -185,19 +185,19 @@ class Flight:
         replies, _ = self.link.planner_reply(trajectories.start_command)
         self._start_replies = replies + (answer is None)  # an answer that is not here yet may come
         self._plan_end(time.monotonic() + self.span_s, height)
-        if answer is None or answer == Status.OK:
+        if answer is None or answer == LogStatus.OK:
             return  # a lost answer is no refusal: `update_phase` sees whether it flies
-        self.enter(Phase.GROUND)
+        self.enter(FlightPhase.GROUND)
         self._disarm_at = -math.inf
         self.trouble = f"take-off refused: {ANSWERS.get(answer, f'error {answer}')}"
 
     def land(self) -> None:
         """Descend at the current place, then switch the motors off; disarm on the ground."""
-        if self.phase is Phase.GROUND and self._flying:
-            self.enter(Phase.FLYING)
-        if self.phase in (Phase.CLIMBING, Phase.FLYING):
+        if self.phase is FlightPhase.GROUND and self._flying:
+            self.enter(FlightPhase.FLYING)
+        if self.phase in (FlightPhase.CLIMBING, FlightPhase.FLYING):
             self._land()
-        elif self.phase is Phase.GROUND:
+        elif self.phase is FlightPhase.GROUND:
             self._disarm_at = -math.inf
 
     def _land(self) -> None:
@@ -215,7 +215,7 @@ class Flight:
         self.link.cf.high_level_commander.land(FLOOR, self._ordered_span, yaw=None)
 
     def _begin_landing(self) -> None:
-        self.enter(Phase.LANDING)
+        self.enter(FlightPhase.LANDING)
         self.span_s = self._ordered_span
         self._down_at = self.phase_since + self.span_s + MARGIN_S
         self._land_replies, _ = self.link.planner_reply(HighLevel.LAND)
@@ -225,7 +225,7 @@ class Flight:
         telemetry = self._telemetry
         near = now - self.phase_since > self.span_s - NEAR_S
         replies, answer = self.link.planner_reply(HighLevel.LAND)
-        if replies > self._land_replies and answer == Status.OK:
+        if replies > self._land_replies and answer == LogStatus.OK:
             self._late_landings += near
             self._begin_landing()
         ended = telemetry.pose_time - self.phase_since > self.span_s  # what waits in queues tells of before
@@ -260,26 +260,26 @@ class Flight:
         if not self.airborne and fresh and not self._flying:
             self._disarm_at = -math.inf
             return
-        if self.phase is not Phase.STOPPING:
-            self.enter(Phase.STOPPING)
+        if self.phase is not FlightPhase.STOPPING:
+            self.enter(FlightPhase.STOPPING)
         self.link.cf.supervisor.send_emergency_stop()
 
     # ------------------------------------------------------------------ in the air
 
     def send_due(self, now: float) -> None:
         """Send the packets that are due at `now` on the monotonic clock [s]."""
-        if self.phase is Phase.STOPPING:
+        if self.phase is FlightPhase.STOPPING:
             if now - self.phase_since > ANSWER_S:
                 self.trouble = UNANSWERED
             self.link.cf.supervisor.send_emergency_stop()
         if now > self._disarm_at:
             self._disarm()
-        if self.phase is Phase.LANDING and self._flying:
+        if self.phase is FlightPhase.LANDING and self._flying:
             self._repeat_landing(now)
-        if self.phase not in (Phase.CLIMBING, Phase.FLYING):
+        if self.phase not in (FlightPhase.CLIMBING, FlightPhase.FLYING):
             return
         self._confirm_starts()
-        begun = self.phase_since + (self.span_s if self.phase is Phase.CLIMBING else 0.0)
+        begun = self.phase_since + (self.span_s if self.phase is FlightPhase.CLIMBING else 0.0)
         if now - max(self._sent_at, begun) > self.hold_s + UNSTARTED_S and not self.link.busy:
             self.trouble = "landed: its setpoints are not confirmed"
             self.land()
@@ -299,8 +299,8 @@ class Flight:
             return
         if time.monotonic() - self._commanded_at > LOOP_SILENCE_S:  # the process stood still until a moment ago
             return
-        if self._target is not None and self.phase is Phase.CLIMBING:
-            self.enter(Phase.FLYING)
+        if self._target is not None and self.phase is FlightPhase.CLIMBING:
+            self.enter(FlightPhase.FLYING)
         if _same(target, self._sent) and now - self._sent_at < REFRESH_S:
             return
         self._begun = min(self._begun, now)
@@ -331,7 +331,7 @@ class Flight:
 
     def land_after_gap(self, gap: float) -> None:
         """Land after `gap` [s] in which nothing was received, or the process stood still, if it was long."""
-        if gap > LANDING_GAP_S and self.phase in (Phase.CLIMBING, Phase.FLYING):
+        if gap > LANDING_GAP_S and self.phase in (FlightPhase.CLIMBING, FlightPhase.FLYING):
             self.trouble = f"landed: nothing received for {gap:.1f} s"
             self.land()
 
@@ -342,27 +342,27 @@ class Flight:
             return
         info, flying = telemetry.info, self._flying
         since = telemetry.status_time - self.phase_since  # a status that waited behind others tells of an earlier phase
-        if self.phase is Phase.GROUND and flying and since > STOPPING_S:
+        if self.phase is FlightPhase.GROUND and flying and since > STOPPING_S:
             self.trouble = "landed: it flew without an order"
             self.land()
             return
         if self.airborne and Info.LOCKED in info:
-            self.trouble = "" if self.phase is Phase.STOPPING else "the drone cut its motors"
-            self.enter(Phase.STOPPED)
-        elif self.phase is Phase.STOPPING:
+            self.trouble = "" if self.phase is FlightPhase.STOPPING else "the drone cut its motors"
+            self.enter(FlightPhase.STOPPED)
+        elif self.phase is FlightPhase.STOPPING:
             if not flying and since > STOPPING_S:
                 self.trouble = ""
-                self.enter(Phase.STOPPED)
-        elif self.phase is Phase.STOPPED and not flying and Info.LOCKED not in info and since > STOPPING_S:
-            self.enter(Phase.GROUND)  # switched off and on
+                self.enter(FlightPhase.STOPPED)
+        elif self.phase is FlightPhase.STOPPED and not flying and Info.LOCKED not in info and since > STOPPING_S:
+            self.enter(FlightPhase.GROUND)  # switched off and on
             self.trouble = ""
-        elif self.phase is Phase.LANDING and not flying and since > SHORTEST_S:
-            self.enter(Phase.GROUND)
+        elif self.phase is FlightPhase.LANDING and not flying and since > SHORTEST_S:
+            self.enter(FlightPhase.GROUND)
         elif self.airborne and not flying and since > FLYING_FLAG_S:
-            self.enter(Phase.GROUND)
+            self.enter(FlightPhase.GROUND)
             self._disarm_at = -math.inf
             self.trouble = self.trouble or "its motors do not turn"
-        elif telemetry.battery_low and self.phase in (Phase.CLIMBING, Phase.FLYING):
+        elif telemetry.battery_low and self.phase in (FlightPhase.CLIMBING, FlightPhase.FLYING):
             self.trouble = "landed: battery low"
             self.land()
 
@@ -372,21 +372,21 @@ class Flight:
         The drone counts as flying until it is seen: its motors may be on.
         """
         down = time.monotonic() > self._down_at
-        if self.airborne and self.phase is not Phase.STOPPING:  # a stop is sent when the drone is in reach again
+        if self.airborne and self.phase is not FlightPhase.STOPPING:  # a stop is sent when the drone is in reach again
             self.trouble = "out of reach: " + ("motors may be on: switch it off" if down else "it lands by itself")
         return down
 
     def resume(self) -> bool:
         """Continue on a new link after a loss; True if the drone is in the air."""
-        if self.phase is Phase.STOPPING:
+        if self.phase is FlightPhase.STOPPING:
             return True
-        if self._flying and self.phase is not Phase.STOPPED:
+        if self._flying and self.phase is not FlightPhase.STOPPED:
             if not self.airborne:
-                self.enter(Phase.FLYING)
+                self.enter(FlightPhase.FLYING)
             self._start_replies = 0
             return True
         if self.airborne:
-            self.enter(Phase.GROUND)
+            self.enter(FlightPhase.GROUND)
         return False
 
     # ------------------------------------------------------------------ parts of the above
@@ -396,7 +396,7 @@ class Flight:
         """Whether the supervisor reports that the motors turned within the last two seconds."""
         return Info.FLYING in self._telemetry.info
 
-    def enter(self, phase: Phase) -> None:
+    def enter(self, phase: FlightPhase) -> None:
         self.phase, self.phase_since = phase, time.monotonic()
         self.publish_airborne()
 

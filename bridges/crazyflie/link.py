@@ -21,10 +21,10 @@ from agents.body.interface import BodyError
 from agents.protocols import crtp
 from agents.protocols.crazyflie import dongle_of
 from agents.protocols.crazyradio import software
-from agents.protocols.crtp import HighLevel, Memory, Port
+from agents.protocols.crtp import HighLevel, MemoryKind, Port
 from agents.user_folder import cache_folder
 from bridges.crazyflie.dongle import plug_in
-from bridges.crazyflie.trajectory import PLACES, PromptRadio, Trajectories
+from bridges.crazyflie.trajectory import PLACES, PromptRadio, TrajectoryMemory
 
 FIRST_S: Final = 0.6  # to the first packet; cflib never repeats its first two requests
 SILENCE_S: Final = 1.0  # between two answers while the connection is set up
@@ -141,7 +141,7 @@ class CrazyflieLink:
         self._periods: dict[str, int] = {}  # that were asked for, in units of 10 ms
         self._parameters: dict[int, tuple[str, str]] = {}  # asked for, by number: name, format
         self._values: dict[str, float] = {}  # answers about parameters
-        self.trajectories = Trajectories(self._send)
+        self.trajectories = TrajectoryMemory(self._send)
         self.confirmed: Callable[[], None] = lambda: None  # called when the drone has confirmed a part of them
         cf = self.cf = Crazyflie()
         cf._toc_cache = _tables()
@@ -314,7 +314,7 @@ class CrazyflieLink:
 
     def define_trajectories(self) -> None:
         """Tell the drone where its trajectories will be; raises BodyError if it refuses, LinkError if silent."""
-        memories = [memory.id for memory in self.cf.mem.mems if memory.type == Memory.TRAJECTORY]
+        memories = [memory.id for memory in self.cf.mem.mems if memory.type == MemoryKind.TRAJECTORY]
         if not memories:
             raise BodyError("the firmware has no memory for trajectories: update it")
         self.trajectories.memory = memories[0]

@@ -12,7 +12,7 @@ from agents.protocols.crazyflie import CrazyflieSettings, Outside
 from agents.protocols.crtp import Info
 from agents.ticks import Ticks
 from agents.vectors import Vector
-from bridges.crazyflie.flight import LANDING_GAP_S, Flight, Phase
+from bridges.crazyflie.flight import LANDING_GAP_S, FlightControl, FlightPhase
 from bridges.crazyflie.link import CrazyflieLink, LinkError, SilentError
 from bridges.crazyflie.positioning import Convergence, configure
 from bridges.crazyflie.telemetry import Telemetry
@@ -66,7 +66,7 @@ class CrazyfliePilot:
         self.failure: BodyError | None = None  # reason why the first connection failed
         self._name, self._address, self._settings, self._telemetry = name, address, settings, telemetry
         self._start_pose, self._turn = place, turn
-        self._flight = Flight(settings, telemetry, self._pause)
+        self._flight = FlightControl(settings, telemetry, self._pause)
         self.link: CrazyflieLink | None = None
         self._connection_note = "connecting"
         self._order: Order | None = None
@@ -104,7 +104,7 @@ class CrazyfliePilot:
         self._wake.set()
 
     def set_target(self, now: float, target: Target | None) -> None:
-        """See `Flight.set_target`."""
+        """See `FlightControl.set_target`."""
         self._flight.set_target(now, target)
 
     def locate(self, now: float, position: Vector, yaw: float) -> None:
@@ -405,7 +405,7 @@ class CrazyfliePilot:
         if now - self._late_since > LATE_S:
             self._late_since = now + SLOWING_S
             self._scale_rates(link, max(0.5 * self._share, LEAST_SHARE))
-        elif self._share < 1.0 and self._flight.phase is Phase.GROUND and now - self._late_until > CALM_S:
+        elif self._share < 1.0 and self._flight.phase is FlightPhase.GROUND and now - self._late_until > CALM_S:
             self._scale_rates(link, 1.0)  # it was this computer that was busy; in the air nothing is tried
         self._flight.land_after_gap(gap)
 
@@ -460,7 +460,7 @@ class CrazyfliePilot:
                 link.cf.extpos.send_extpose(x, y, z, 0.0, 0.0, sin(0.5 * yaw), cos(0.5 * yaw))
             else:
                 link.cf.extpos.send_extpos(x, y, z)
-            if self._convergence is None and self._flight.phase is Phase.GROUND:
+            if self._convergence is None and self._flight.phase is FlightPhase.GROUND:
                 self._connection_note = "position estimate is settling"
                 start_yaw = yaw if isfinite(yaw) else self._start_pose[1]
                 self._convergence = Convergence(link, position, start_yaw, absolute=True)

@@ -53,7 +53,7 @@ INFO_TEXT: Final = {
 STATION_TEXT: Final = ("receives no base station", "misses geometry or calibration of its base stations", "")
 
 
-class StampAge:
+class PacketAge:
     """Age of packets of one drone: arrival less its stamp, less the smallest such difference so far."""
 
     def __init__(self) -> None:
@@ -87,7 +87,7 @@ class Telemetry:
 
     def __init__(self, *, lighthouse: bool) -> None:
         """`lighthouse`: report the state of the base stations."""
-        self.stamps = StampAge()
+        self.stamps = PacketAge()
         self.arrival = -inf  # of the last packet of a log
         self.status_time = -inf  # of the last status over this connection
         self.pose_time = self.ranges_time = -inf

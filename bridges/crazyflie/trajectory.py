@@ -81,7 +81,7 @@ def _fits(target: Target) -> bool:
     return target[3] == 0.0 and max(map(abs, target[:3])) < FARTHEST
 
 
-class Trajectories:
+class TrajectoryMemory:
     """Trajectory memory of one Crazyflie, over one link.
 
     Only what differs is written, one part at a time: a burst of parts would be answered by a burst, behind which poses

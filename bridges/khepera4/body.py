@@ -14,7 +14,7 @@ from agents.clock import uptime
 from agents.network.messages import Inspection
 from agents.protocols import khepera4 as protocol
 from agents.vectors import Setpoint, Vector
-from bridges.khepera4.link import Address, Khepera4Link
+from bridges.khepera4.link import Khepera4Link, KheperaAddress
 
 OPEN_S: Final = 4.5  # deadline of the first odometry: that of a connection and of the first answer
 
@@ -24,7 +24,7 @@ class KheperaBody(Body):
 
     def __init__(self, request: BodyRequest) -> None:
         self._names = request.names
-        self._addresses = [Address.parse(*row) for row in zip(request.names, request.addresses, strict=True)]
+        self._addresses = [KheperaAddress.parse(*row) for row in zip(request.names, request.addresses, strict=True)]
         self._settings = [
             settings(protocol.Khepera4Settings, *row) for row in zip(request.names, request.device, strict=True)
         ]

@@ -38,7 +38,7 @@ ANSWER_S: Final = 2.5  # time after a halt at which the note reports a robot tha
 
 
 @dataclass(frozen=True)
-class Address:
+class KheperaAddress:
     """Address and protocol of a robot: `khepera4://HOST[:PORT][?server=2023-01-07]`, `kteam://HOST:PORT` or
     `kteam:///dev/ttyS0`.
     """
@@ -50,7 +50,7 @@ class Address:
     server: str | None  # of Robotic Park's; None: not named
 
     @classmethod
-    def parse(cls, robot: str, address: str) -> Address:
+    def parse(cls, robot: str, address: str) -> KheperaAddress:
         """Parse an address; raises BodyError if it has none of the three forms."""
         try:
             parts = urlsplit(address)
@@ -117,7 +117,7 @@ class Address:
 
 
 @dataclass(frozen=True)
-class Odometry:
+class KheperaOdometry:
     """Newest odometry of a robot, in the experiment's frame."""
 
     stamp: float = -math.inf  # time of reception [s, `uptime`]
@@ -131,9 +131,9 @@ class Khepera4Link:
     """Thread of one robot. Odometry and setpoint are exchanged as whole objects, so neither side waits."""
 
     def __init__(
-        self, name: str, address: Address, chosen: protocol.Khepera4Settings, start: tuple[float, float, float]
+        self, name: str, address: KheperaAddress, chosen: protocol.Khepera4Settings, start: tuple[float, float, float]
     ) -> None:
-        self.odometry = Odometry()
+        self.odometry = KheperaOdometry()
         self.scan: tuple[float, Sequence[float], Sequence[float]] | None = (
             None  # time [s, `uptime`], bearings [rad], distances [m]
         )
@@ -257,7 +257,7 @@ class Khepera4Link:
             self._stands = not moves
             now, at = uptime(), self._odometer
             answered = now
-            self.odometry = Odometry(now, at.x, at.y, at.yaw, at.velocity)
+            self.odometry = KheperaOdometry(now, at.x, at.y, at.yaw, at.velocity)
             self.trouble = ""
             try:
                 if driver.ranged and now >= ranges_due:

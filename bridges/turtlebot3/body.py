@@ -26,7 +26,7 @@ from agents.protocols import ros2, turtlebot3
 from agents.protocols.ros2_node import Participant
 from agents.vectors import UNKNOWN, Setpoint, Vector
 from bridges.turtlebot3.odometry import SILENCE_S
-from bridges.turtlebot3.robot import REPEAT_S, Robot
+from bridges.turtlebot3.robot import REPEAT_S, TurtleBotConnection
 
 OPEN_S: Final = 4.5  # from the first attempt to reach the router to odometry of every robot
 DIAGNOSIS_S: Final = 0.3  # how long a failing `open` looks for other robots, to name them in the error
@@ -49,7 +49,7 @@ class TurtleBot3(Body):
 
     def __init__(self, request: BodyRequest, clock: Clock = uptime, open_timeout: float = OPEN_S) -> None:
         self._clock, self._open_timeout = clock, open_timeout
-        self._robots = [Robot(request, row) for row in range(len(request.names))]
+        self._robots = [TurtleBotConnection(request, row) for row in range(len(request.names))]
         self._claims = Claims([robot.name for robot in self._robots], [robot.device for robot in self._robots])
         self._sessions: dict[tuple[str, ...], zenoh.Session] = {}
         self._outside = request.external
@@ -86,7 +86,7 @@ class TurtleBot3(Body):
         self._thread = threading.Thread(target=self._stop_stale, name="turtlebot3 zeros", daemon=True)
         self._thread.start()
 
-    def _session(self, robot: Robot, deadline: float) -> zenoh.Session:
+    def _session(self, robot: TurtleBotConnection, deadline: float) -> zenoh.Session:
         if robot.endpoints not in self._sessions:
             wait = max(0.0, deadline - self._clock())
             try:
@@ -98,7 +98,7 @@ class TurtleBot3(Body):
             self._sessions[robot.endpoints] = session
         return self._sessions[robot.endpoints]
 
-    def _missing_odometry(self, robot: Robot) -> str:
+    def _missing_odometry(self, robot: TurtleBotConnection) -> str:
         """Diagnosis and remedy for a robot without odometry."""
         where = robot.address
         session = self._sessions[robot.endpoints]
@@ -137,7 +137,7 @@ class TurtleBot3(Body):
             self._state(row, robot, t, now, linked=linked[robot.endpoints]) for row, robot in enumerate(self._robots)
         ]
 
-    def _state(self, row: int, robot: Robot, t: float, now: float, *, linked: bool) -> BodyState:
+    def _state(self, row: int, robot: TurtleBotConnection, t: float, now: float, *, linked: bool) -> BodyState:
         (x, y, yaw), odometry = robot.odometry.pose, robot.time
         state = BodyState(
             odometry,

@@ -92,7 +92,7 @@ class RepeatedVelocity:
         return now - self._still_since > BLOCKED_S
 
 
-class Robot:
+class TurtleBotConnection:
     """TurtleBot3 with its topics, state and current command."""
 
     def __init__(self, request: BodyRequest, row: int) -> None:

@@ -23,7 +23,7 @@ GRAPH_S = 1.0  # between two looks for the type that the robot takes
 TYPES = {"twist": "geometry_msgs/msg/Twist", "stamped": "geometry_msgs/msg/TwistStamped"}
 
 
-class Watchdog:
+class StopTimer:
     """Decision when zeros are due. Times in seconds on any one clock that never steps."""
 
     def __init__(self, silence_s: float) -> None:
@@ -63,13 +63,13 @@ def type_of_robot(node: Any, topic: str) -> str:
     return ""
 
 
-class Node:
+class WatchdogNode:
     """The node: commands in, zeros out."""
 
     def __init__(self, rclpy: Any, topic: str, kind: str, silence_s: float) -> None:
         messages = importlib.import_module("geometry_msgs.msg")
         self.node = rclpy.create_node("cmd_vel_watchdog")
-        self.watchdog = Watchdog(silence_s)
+        self.watchdog = StopTimer(silence_s)
         self._make = messages.TwistStamped if kind == TYPES["stamped"] else messages.Twist
         self._stamped = kind == TYPES["stamped"]
         self._publisher = self.node.create_publisher(self._make, topic, 10)
@@ -129,7 +129,7 @@ def main(words: "list[str]") -> int:
     node = None
     try:
         kind = wait_for_type(rclpy, asked.topic) if asked.type == "auto" else TYPES[asked.type]
-        node = Node(rclpy, asked.topic, kind, asked.silence)
+        node = WatchdogNode(rclpy, asked.topic, kind, asked.silence)
         rclpy.spin(node.node)
     except KeyboardInterrupt:
         return 0

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from agents.protocols import vicon_datastream
-from agents.protocols.vicon_datastream import Framer, Kind, Malformed, Segment, Subject
+from agents.protocols.vicon_datastream import BlockKind, Framer, MalformedBlock, Segment, Subject
 
 CHUNK: Final = 1 << 18  # [bytes] read at once: about ten frames of twenty bodies
 OLDEST_S: Final = 1.0  # a larger latency in a frame is invalid
@@ -42,17 +42,17 @@ class Decoder:
         named: dict[int, Subject] = {}
         seen: dict[int, list[Segment]] = {}
         for kind, payload in vicon_datastream.blocks(body):
-            if kind == Kind.GLOBAL_SEGMENTS:
+            if kind == BlockKind.GLOBAL_SEGMENTS:
                 subject, segments = vicon_datastream.unpack_segments(payload)
                 seen[subject] = segments
-            elif kind == Kind.FRAME_INFO:
+            elif kind == BlockKind.FRAME_INFO:
                 number = vicon_datastream.unpack_frame_number(payload)
-            elif kind == Kind.LATENCY_INFO:
+            elif kind == BlockKind.LATENCY_INFO:
                 latency = vicon_datastream.unpack_latency(payload)
-            elif kind == Kind.SUBJECT_INFO:
+            elif kind == BlockKind.SUBJECT_INFO:
                 known = vicon_datastream.unpack_subject(payload)
                 named[known.number] = known
-            elif kind == Kind.APPLICATION_INFO:
+            elif kind == BlockKind.APPLICATION_INFO:
                 self._z_up = payload[:1] == bytes([vicon_datastream.Z_UP])
         if named:
             self._subjects = named  # the server resends all when one changes
@@ -78,12 +78,12 @@ class Reader:
         try:
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             offered = self._offered_streams(deadline)
-            if Kind.GLOBAL_SEGMENTS not in offered:
-                raise Malformed("the server has no segments to offer")
+            if BlockKind.GLOBAL_SEGMENTS not in offered:
+                raise MalformedBlock("the server has no segments to offer")
             wanted = offered.intersection(vicon_datastream.POSES)
-            stream = vicon_datastream.packet(vicon_datastream.block(Kind.REQUEST_FRAME, b"\x01"))
+            stream = vicon_datastream.packet(vicon_datastream.block(BlockKind.REQUEST_FRAME, b"\x01"))
             self._socket.sendall(vicon_datastream.pack_kinds(wanted) + stream)
-        except (OSError, Malformed):
+        except (OSError, MalformedBlock):
             self._socket.close()
             raise
 
@@ -116,7 +116,7 @@ class Reader:
             self._drain()
             while self._waiting:
                 for kind, payload in vicon_datastream.blocks(self._waiting.popleft()):
-                    if kind == Kind.OBJECT_ENUMS:
+                    if kind == BlockKind.OBJECT_ENUMS:
                         return vicon_datastream.unpack_kinds(payload)
 
     def _readable(self, deadline: float) -> bool:

@@ -23,7 +23,7 @@ from agents.network import session as network
 from agents.network.keys import Keys
 from agents.network.shutdown import Farewell, closing_cleanly, end
 from agents.protocols import vicon_datastream
-from agents.protocols.vicon_datastream import Malformed, Segment
+from agents.protocols.vicon_datastream import MalformedBlock, Segment
 from agents.runtime import command_line
 from agents.runtime.command_line import NetworkLaunch, on_termination
 from agents.runtime.lifeline import Lifeline
@@ -153,7 +153,7 @@ class Bridge:
                 return False
             try:
                 reader = Reader(self._host, self._port, ATTEMPT_S if ever else min(ATTEMPT_S, max(0.1, left)))
-            except (OSError, Malformed) as error:
+            except (OSError, MalformedBlock) as error:
                 self._report_once(f"no connection to {self._host}:{self._port}: {describe_error(error)}; trying again")
                 pause.wait(PAUSE_S)
                 continue
@@ -161,7 +161,7 @@ class Bridge:
             self._report_once(f"connected to {self._host}:{self._port}")
             try:
                 self._pump(reader, over)
-            except (OSError, Malformed) as error:
+            except (OSError, MalformedBlock) as error:
                 self._report_once(f"lost {self._host}:{self._port}: {describe_error(error)}; trying again")
             finally:
                 reader.close()
@@ -187,7 +187,7 @@ class Bridge:
             self._print_line(state)
 
 
-def describe_error(error: OSError | Malformed) -> str:
+def describe_error(error: OSError | MalformedBlock) -> str:
     """Text of an error, without the operating system's numbers."""
     return error.strerror if isinstance(error, OSError) and error.strerror else str(error)
 

@@ -30,7 +30,7 @@ from experiments.check.realisation import (
     unfold_distances,
 )
 from experiments.check.stability import Modes, modes
-from experiments.definition.experiment import Link
+from experiments.definition.experiment import LinkTable
 from experiments.definition.formation import (
     Anchored,
     Pattern,
@@ -232,7 +232,7 @@ class Analysis:
             ("formation", "links"),
         )
 
-    def fitting_links(self) -> dict[str, Link]:
+    def fitting_links(self) -> dict[str, LinkTable]:
         """The links of the file with the nearest targets that fit together: those of the best shape, rounded to 0.1 mm.
 
         Empty where the shape has no links.
@@ -241,12 +241,14 @@ class Analysis:
             return {}
         place = dict(zip(self.names, np.round(self.shape.position, 5), strict=True))
         return {
-            text: _fitting(given if isinstance(given, Link) else Link(distance=given), *link_pairs(text)[0], place)
+            text: _fitting(
+                given if isinstance(given, LinkTable) else LinkTable(distance=given), *link_pairs(text)[0], place
+            )
             for text, given in self.plan.experiment.formation.links.items()
         }
 
 
-def _fitting(given: Link, second: str, first: str, place: Mapping[str, Array]) -> Link:
+def _fitting(given: LinkTable, second: str, first: str, place: Mapping[str, Array]) -> LinkTable:
     """A link with the target that two places have; as it is if they fit it already."""
     offset = place[second] - place[first]
     if given.distance is not None:

@@ -17,8 +17,8 @@ import msgspec
 import numpy as np
 
 from agents.body.kinds import Flight, Kind
-from agents.safety.hazards import Incident, Outcome
-from experiments.definition.experiment import World
+from agents.safety.hazards import HazardChange, Outcome
+from experiments.definition.experiment import WorldTable
 from experiments.definition.plan import Plan
 from experiments.recording.trace import ROUNDING_S, sent_in_run
 from experiments.virtual_time import conductor, simulation, stretch
@@ -40,7 +40,7 @@ class Prediction:
 
     time: Array  # (T,) [s] after the common start
     position: Array  # (T, N, 3) [m]
-    incidents: tuple[tuple[int, Incident], ...] = ()  # hazards on the way, each with the row of its robot
+    incidents: tuple[tuple[int, HazardChange], ...] = ()  # hazards on the way, each with the row of its robot
     transmissions: int = 1  # of all robots in the run
     messages_hz: float = (
         0.0  # transmissions of all robots with the noise of the experiment, which makes robots transmit
@@ -117,7 +117,7 @@ def isolated(plan: Plan) -> Plan:
         arena=msgspec.structs.replace(
             experiment.arena, size=(ENDLESS_M, ENDLESS_M, ENDLESS_M), walls=False, obstacles={}, starts={}
         ),
-        world=World(),
+        world=WorldTable(),
         avoidance=None,
         start=msgspec.structs.replace(experiment.start, scatter=0.0, scatter_yaw=0.0),
         safety=msgspec.structs.replace(experiment.safety, separation=None),
@@ -133,7 +133,7 @@ def _work(bare: Plan, ticks: float) -> float:
     most = SPEED_UP * WORK
     if FLIGHTS * stretch.TICK_S * min(ticks, most) < stretch.COMPILES_S:  # to compile would take longer
         return WORK
-    flight = simulation.Flight(bare, bare.experiment.seed, quiet=True, lean=True)
+    flight = simulation.VirtualRun(bare, bare.experiment.seed, quiet=True, lean=True)
     if not stretch.possible(flight) or any(map(outside, ticking_plugins(bare))):
         return WORK
     stretch.WORK[0] += stretch.COMPILES_S  # the first flight is compiled as well
@@ -187,7 +187,7 @@ def fly(bare: Plan, seed: int, *, quiet: bool = False) -> Prediction:
 PASSES_ABOVE: Final = 1e3  # [m] more than the sum of two radii
 
 
-class Approach(NamedTuple):
+class PairApproach(NamedTuple):
     """Closest approach of two robots."""
 
     first: int
@@ -197,7 +197,7 @@ class Approach(NamedTuple):
     time: float  # [s]
 
 
-def approaches(prediction: Prediction, kinds: Sequence[Kind], clearance: float) -> list[Approach]:
+def approaches(prediction: Prediction, kinds: Sequence[Kind], clearance: float) -> list[PairApproach]:
     """Pairs that come nearer than the sum of their radii while neither is above the other by the clearance.
 
     Args:
@@ -205,7 +205,7 @@ def approaches(prediction: Prediction, kinds: Sequence[Kind], clearance: float) 
     """
     radius, height = np.array([kind.radius for kind in kinds]), np.array([kind.height for kind in kinds])
     low, high = prediction.position[..., :2].min(axis=0), prediction.position[..., :2].max(axis=0)
-    found: list[Approach] = []
+    found: list[PairApproach] = []
     for i in range(len(kinds) - 1):
         # the areas in which they move: of many robots most never come near each other
         apart = np.maximum(low[i] - high[i + 1 :], low[i + 1 :] - high[i]).max(axis=1)
@@ -221,5 +221,5 @@ def approaches(prediction: Prediction, kinds: Sequence[Kind], clearance: float) 
         for k in np.flatnonzero(np.isfinite(rank.min(axis=0))):
             when = at[k]
             there = float(far[when, k]), float(between[when, k]), float(prediction.time[when])
-            found.append(Approach(i, int(j[k]), *there))
+            found.append(PairApproach(i, int(j[k]), *there))
     return found

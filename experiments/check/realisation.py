@@ -270,7 +270,7 @@ def fitted_shape(links: Links, anchors: Anchored, guess: Array, free: Mask) -> S
     return Shape(position, error, anchor_errors(anchors, position[None])[0])
 
 
-class Mirrored(NamedTuple):
+class MirrorImage(NamedTuple):
     """Robot on the wrong side of the line through two of its neighbours."""
 
     row: int
@@ -278,7 +278,7 @@ class Mirrored(NamedTuple):
     place: Array  # (3,) on the right side [m]
 
 
-def mirrored_robots(links: Links, end: Array, moves: Mask, anchors: Anchored = ()) -> list[Mirrored]:
+def mirrored_robots(links: Links, end: Array, moves: Mask, anchors: Anchored = ()) -> list[MirrorImage]:
     """Robots that have to change sides, at most `MIRRORS`, for the formation to get from `end` (N, 3) to its shape.
 
     One after the other that one is mirrored that leads to the shape, or nearest to it, with the least motion of all.
@@ -294,7 +294,7 @@ def mirrored_robots(links: Links, end: Array, moves: Mask, anchors: Anchored = (
         for row in np.flatnonzero(moves).tolist()
         for left, right in combinations(neighbours[row][:MOST_SIDES].tolist(), 2)
     ]
-    place, found = end, list[Mirrored]()
+    place, found = end, list[MirrorImage]()
     best = fitted_shape(links, anchors, place, free)
     for _ in range(MIRRORS):
         tried = []
@@ -312,7 +312,7 @@ def mirrored_robots(links: Links, end: Array, moves: Mask, anchors: Anchored = (
         if shape.worst >= best.worst:
             return []
         best, place = shape, shape.position
-        found.append(Mirrored(row, ends, shape.position[row]))
+        found.append(MirrorImage(row, ends, shape.position[row]))
         if best.worst <= OFF:
             return found
     return []

@@ -14,7 +14,7 @@ from agents.body.kinds import KINDS
 from agents.network.access_control import ADMIN, Grant, Rights
 from agents.network.keys import Keys
 from agents.plugins import registry
-from experiments.definition.experiment import VICON_TWIN, WORLD, Robot
+from experiments.definition.experiment import VICON_TWIN, WORLD, RobotTable
 from experiments.definition.plan import Plan
 
 REMOTE_BODIES: Final = ("external", WORLD)  # bodies with poses from the process that carries them
@@ -153,7 +153,7 @@ def senders_by_receiver(plan: Plan) -> dict[str, set[str]]:
     return found
 
 
-def _ros(name: str, robot: Robot) -> Any:  # noqa: ANN401 - of the protocol of its kind
+def _ros(name: str, robot: RobotTable) -> Any:  # noqa: ANN401 - of the protocol of its kind
     """Address of a robot in ROS 2 on the experiment's own routers; None if it is not there."""
     kind, body = KINDS[robot.kind], registry.body_name(robot.body)
     twin = "" if kind.twin is None else kind.twin.body

@@ -14,7 +14,7 @@ from agents.body.interface import BodyError, BodyRequest
 from agents.body.kinds import KINDS, Kind
 from agents.network.keys import Keys
 from agents.vectors import Vector, clamp
-from experiments.definition.experiment import VICON_TWIN, WORLD, Robot
+from experiments.definition.experiment import VICON_TWIN, WORLD, RobotTable
 from experiments.definition.plan import Plan
 from twins import scene as outlines
 from twins.engines.engine import World
@@ -81,7 +81,7 @@ def _is_clear(stands: Scene, place: tuple[float, float], kind: Kind) -> bool:
     )
 
 
-def sensors_of(robot: Robot) -> tuple[str, ...]:
+def sensors_of(robot: RobotTable) -> tuple[str, ...]:
     """Names of the range sensors of a robot."""
     own = tuple(each.name for each in KINDS[robot.kind].sensors)
     return own if robot.sensors is None else tuple(robot.sensors)

@@ -79,7 +79,7 @@ class Rates(FileTable, frozen=True):
     ] = None
 
 
-class Robot(FileTable, frozen=True):
+class RobotTable(FileTable, frozen=True):
     """Robot: kind, start, body and settings."""
 
     kind: Annotated[
@@ -119,7 +119,7 @@ class Robot(FileTable, frozen=True):
     ] = False
 
 
-class Target(FileTable, frozen=True):
+class TargetTable(FileTable, frozen=True):
     """Target of a link, one of three: distance, offset or bearing."""
 
     distance: Annotated[Positive | None, Meta(description="distance to keep [m]")] = None
@@ -143,7 +143,7 @@ class Target(FileTable, frozen=True):
             raise ValueError("a bearing of zeros has no direction; give x, y, such as [1.0, 0.0]")
 
 
-class Link(Target, frozen=True):
+class LinkTable(TargetTable, frozen=True):
     """Link with a target other than a distance or without one, a gain of its own, or a limited time."""
 
     gain: Annotated[
@@ -155,7 +155,7 @@ class Link(Target, frozen=True):
 
     def __post_init__(self) -> None:
         if not self.alone:
-            Target.__post_init__(self)
+            TargetTable.__post_init__(self)
         if self.until_s is not None and self.until_s <= self.from_s:
             raise ValueError("`until_s` must be later than `from_s`; or leave it out")
 
@@ -165,7 +165,7 @@ class Link(Target, frozen=True):
         return self.distance is None and self.offset is None and self.bearing is None
 
 
-class Anchor(FileTable, frozen=True):
+class AnchorTable(FileTable, frozen=True):
     """Distance of a robot to a point, to a line through it, or to a plane through it."""
 
     distance: Annotated[NotNegative, Meta(description="distance to keep [m]; 0: on it")] = 0.0
@@ -193,13 +193,13 @@ class Anchor(FileTable, frozen=True):
                 raise ValueError(f"`{name}` has no direction; give x, y, such as [1.0, 0.0]")
 
 
-class Change(FileTable, frozen=True):
+class ChangeTable(FileTable, frozen=True):
     """Smooth transition of the formation to another shape, from `at_s` on."""
 
     at_s: Annotated[NotNegative, Meta(description="start of the transition, after the common start [s]")]
     over_s: Annotated[NotNegative, Meta(description="duration [s]; 0: at once")] = 5.0
     links: Annotated[
-        dict[str, Positive | Target],
+        dict[str, Positive | TargetTable],
         Meta(description="links that get another target"),
     ] = {}
     shape: Annotated[
@@ -259,14 +259,14 @@ class Formation(FileTable, frozen=True):
         None
     )
     links: Annotated[
-        dict[str, Positive | Link],
+        dict[str, Positive | LinkTable],
         Meta(
             description='"A > B": B receives from A; "A - B": both receive; distance [m], a table with another target,'
             ' "shape": as in [formation.shape], or "link": none, for laws that need no target'
         ),
     ] = {}
     anchors: Annotated[
-        dict[Name, Positive | Anchor],
+        dict[Name, Positive | AnchorTable],
         Meta(description="by robot: distance to the origin [m], or to another place"),
     ] = {}
     shape: Annotated[
@@ -276,11 +276,11 @@ class Formation(FileTable, frozen=True):
             " gets its distance, offset or bearing from there, as the law needs; z left out: by their heights"
         ),
     ] = {}
-    changes: Annotated[list[Change], Meta(description="other shapes, in order of time")] = []
+    changes: Annotated[list[ChangeTable], Meta(description="other shapes, in order of time")] = []
     proximity: Annotated[Proximity | None, Meta(description="links by range; left out: links are permanent")] = None
 
 
-class Leg(FileTable, frozen=True):
+class LegTable(FileTable, frozen=True):
     """Plan that a robot follows from `at_s` on."""
 
     at_s: Annotated[NotNegative, Meta(description="start of the plan, after the common start [s]")]
@@ -288,7 +288,7 @@ class Leg(FileTable, frozen=True):
     plan: Annotated[Choice, Meta(description="a registered planner")]
 
 
-class LinkChannel(FileTable, frozen=True):
+class LinkChannelTable(FileTable, frozen=True):
     """Effects on one link; a field left out is that of the channel."""
 
     delay_s: Delay | None = None
@@ -315,16 +315,16 @@ class Outage(FileTable, frozen=True):
             raise ValueError("`until_s` must be later than `from_s`; or leave it out")
 
 
-class Channel(LinkEffects, FileTable, frozen=True):
+class ChannelTable(LinkEffects, FileTable, frozen=True):
     """Effects of the network on poses between robots: modelled in virtual time, added at the receiver in real time."""
 
     outages: Annotated[list[Outage], Meta(description="times in which nothing passes")] = []
     links: Annotated[
-        dict[str, LinkChannel], Meta(description='effects by link; "A > B": poses from A to B; "A - B": both ways')
+        dict[str, LinkChannelTable], Meta(description='effects by link; "A > B": poses from A to B; "A - B": both ways')
     ] = {}
 
 
-class Network(FileTable, frozen=True):
+class NetworkTable(FileTable, frozen=True):
     """Network of a run in real time."""
 
     realm: Annotated[Name, Meta(description="first chunk of every key")] = "park"
@@ -385,7 +385,7 @@ class Host(FileTable, frozen=True):
     tags: Annotated[list[Name], Meta(description="labels by which `./zenpark hosts` chooses among hosts")] = []
 
 
-class World(FileTable, frozen=True):
+class WorldTable(FileTable, frozen=True):
     """World that all twins share in virtual time, and those with `body = "world"` in real time."""
 
     engine: Annotated[Choice, Meta(description="a registered engine")] = "point-mass"
@@ -477,10 +477,10 @@ class Experiment(FileTable, frozen=True):
     """Experiment, or a case of it after `document.cases`."""
 
     title: Annotated[str, Meta(description="subject of the experiment, for people")]
-    robots: Annotated[dict[Name, Robot], Meta(description="robots by name", min_length=1)]
+    robots: Annotated[dict[Name, RobotTable], Meta(description="robots by name", min_length=1)]
     duration_s: Annotated[Positive, Meta(description="duration from the common start [s]", le=86400)]
     spares: Annotated[
-        dict[Name, Robot], Meta(description="robots that wait to take over the name of another one of their kind")
+        dict[Name, RobotTable], Meta(description="robots that wait to take over the name of another one of their kind")
     ] = {}
     on_loss: Annotated[
         Literal["none", "restart", "replace"],
@@ -496,7 +496,7 @@ class Experiment(FileTable, frozen=True):
     arena: Annotated[Arena, Meta(description="size, obstacles and start boxes")] = Arena()
     rates: Annotated[Rates, Meta(description="rates of body, poses, decisions and telemetry [Hz]")] = Rates()
     formation: Annotated[Formation, Meta(description="links with their targets, anchors, and the law")] = Formation()
-    timeline: Annotated[list[Leg], Meta(description="plans of robots, for each robot in order of time")] = []
+    timeline: Annotated[list[LegTable], Meta(description="plans of robots, for each robot in order of time")] = []
     architecture: Annotated[
         Literal["distributed", "centralised"] | Hybrid,
         Meta(
@@ -517,9 +517,11 @@ class Experiment(FileTable, frozen=True):
     avoidance: Annotated[
         Choice | None, Meta(description="how robots avoid obstacles and each other; left out: they do not")
     ] = None
-    world: Annotated[World, Meta(description="simulated world of the twins")] = World()
-    channel: Annotated[Channel, Meta(description="modelled delays and losses of poses")] = Channel()
-    network: Annotated[Network, Meta(description="routers and certificates of a run in real time")] = Network()
+    world: Annotated[WorldTable, Meta(description="simulated world of the twins")] = WorldTable()
+    channel: Annotated[ChannelTable, Meta(description="modelled delays and losses of poses")] = ChannelTable()
+    network: Annotated[NetworkTable, Meta(description="routers and certificates of a run in real time")] = (
+        NetworkTable()
+    )
     hosts: Annotated[dict[Name, Host], Meta(description="other machines, and which robots run there")] = {}
     safety: Annotated[Safety, Meta(description="limits at which robots hold, land or stop")] = Safety()
     start: Annotated[Start, Meta(description="start of a run: its deadline and the scatter of the robots")] = Start()

@@ -16,8 +16,7 @@ from agents.formation.changes import Change, Target, change_target, exists, plan
 from agents.formation.link import BY_DISTANCE, Link
 from agents.plugins.law import Law
 from agents.plugins.laws import Distance, Gradient
-from experiments.definition.experiment import Anchor, Experiment
-from experiments.definition.experiment import Change as Described
+from experiments.definition.experiment import AnchorTable, ChangeTable, Experiment
 from experiments.definition.graph import Links
 from experiments.definition.links import OneWay, held_height, link_pairs, link_target
 from twins.arrays import Array, Mask, norm
@@ -195,7 +194,7 @@ def compile_anchors(experiment: Experiment) -> dict[str, tuple[anchors.Anchor, .
     to_origin = 2.0 * formation.gain  # twice that of a link: as the authors' controllers pull to the origin
     found: dict[str, tuple[anchors.Anchor, ...]] = {}
     for name, given in formation.anchors.items():
-        each = given if isinstance(given, Anchor) else Anchor(distance=given)
+        each = given if isinstance(given, AnchorTable) else AnchorTable(distance=given)
         gain = each.gain or (to_origin if each.distance > 0.0 else formation.stiffness)
         found[name] = (anchors.Anchor(
             point=_spatial(each.to),
@@ -213,7 +212,7 @@ def _link(one_way: OneWay) -> Link:
     return Link(wanted.distance, one_way.gain, wanted.relative, wanted.bearing, wanted.wants)
 
 
-def _targets(experiment: Experiment, described: Described, one_way: Sequence[OneWay]) -> list[Target]:
+def _targets(experiment: Experiment, described: ChangeTable, one_way: Sequence[OneWay]) -> list[Target]:
     """Target of each link after a change."""
     new = {
         pair: link_target(experiment, text, given, pair[0])

@@ -10,11 +10,13 @@ from msgspec.structs import replace
 
 from agents.network import channel_model
 from agents.network.channel_model import Conditions, LinkEffects
-from experiments.definition.experiment import Channel, LinkChannel
+from experiments.definition.experiment import ChannelTable, LinkChannelTable
 from experiments.definition.links import link_pairs
 from experiments.definition.plan import Plan
 
-OWN_S: Final = Channel().delay_s  # any real network takes as long: to wait for it would cost a tick in ten milliseconds
+OWN_S: Final = (
+    ChannelTable().delay_s
+)  # any real network takes as long: to wait for it would cost a tick in ten milliseconds
 TO_CENTRE, FROM_CENTRE = "to centre", "from centre"  # streams
 
 Ends = Sequence[tuple[str, str]]  # sender and receiver of each link, by name
@@ -22,10 +24,10 @@ Ends = Sequence[tuple[str, str]]  # sender and receiver of each link, by name
 
 def models_network(plan: Plan) -> bool:
     """Whether the file asks for any network effect."""
-    return plan.experiment.channel != Channel()
+    return plan.experiment.channel != ChannelTable()
 
 
-def link_effects(channel: Channel, own: LinkChannel | None = None) -> LinkEffects:
+def link_effects(channel: ChannelTable, own: LinkChannelTable | None = None) -> LinkEffects:
     """Effects on a link: its `own` settings, and the channel's where it has none."""
     effects = {name: getattr(channel, name) for name in LinkEffects.__struct_fields__}
     if own is not None:
@@ -54,7 +56,7 @@ def conditions_of(plan: Plan, ends: Ends, seed: int, *, stream: str = "", real: 
     return found
 
 
-def _outages(channel: Channel, sender: str, receiver: str) -> list[tuple[float, float]]:
+def _outages(channel: ChannelTable, sender: str, receiver: str) -> list[tuple[float, float]]:
     """Begin and end of the outages of a link [s]."""
     found = []
     for outage in channel.outages:

@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 
 from agents.formation.link import BY_BEARING, BY_DISTANCE, BY_NOTHING, BY_RELATIVE
 from agents.plugins.law import Law, Need
-from experiments.definition.experiment import Experiment, Link, Target
+from experiments.definition.experiment import Experiment, LinkTable, TargetTable
 
 _LINK: Final = re.compile(r"\s*(\w+)\s*([>-])\s*(\w+)\s*", re.ASCII)
 _ALMOST: Final = re.compile(r"\s*(\w+)\s*([^\w\s]+)\s*(\w+)\s*", re.ASCII)
@@ -21,7 +21,7 @@ RELEASE: Final = 1.1  # of the range: what separates coming from going, so that 
 class TargetKind(NamedTuple):
     """Kind of target that a law takes of a link."""
 
-    fields: tuple[str, ...]  # of `Target` that give it; the first is the one that a drawn shape gives
+    fields: tuple[str, ...]  # of `TargetTable` that give it; the first is the one that a drawn shape gives
     words: str
     example: str  # as the file writes it
     wants: int | None  # how the law takes every link, see `agents.formation.link`; None: by its own target
@@ -92,7 +92,7 @@ def one_way_links(experiment: Experiment, law: Law) -> list[OneWay]:
     reach, release = (math.inf, math.inf) if near is None else (near.range, near.release or RELEASE * near.range)
     found = []
     for text, link in formation.links.items():
-        given = link if isinstance(link, Link) else Link(distance=link)
+        given = link if isinstance(link, LinkTable) else LinkTable(distance=link)
         for receiver, sender in link_pairs(text):
             wanted = link_target(experiment, text, given, receiver)
             gain = _gain(experiment, law, wanted.wants) if given.gain is None else given.gain
@@ -112,10 +112,10 @@ def one_way_links(experiment: Experiment, law: Law) -> list[OneWay]:
     return sorted(found, key=lambda link: (row[link.receiver], row[link.sender]))
 
 
-def link_target(experiment: Experiment, text: str, given: Target | float, receiver: str) -> LinkTarget:
+def link_target(experiment: Experiment, text: str, given: TargetTable | float, receiver: str) -> LinkTarget:
     """Target of a link for one of its ends, as distance, offset and bearing."""
-    given = given if isinstance(given, Target) else Target(distance=given)
-    if isinstance(given, Link) and given.alone:
+    given = given if isinstance(given, TargetTable) else TargetTable(distance=given)
+    if isinstance(given, LinkTable) and given.alone:
         return LinkTarget(BY_NOTHING, math.nan)
     if given.distance is not None:
         return LinkTarget(BY_DISTANCE, given.distance)

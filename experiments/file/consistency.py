@@ -22,12 +22,12 @@ from experiments.definition.experiment import (
     WORLD,
     WORST,
     Arena,
-    Change,
+    ChangeTable,
     Experiment,
     Hybrid,
-    Link,
-    Robot,
-    Target,
+    LinkTable,
+    RobotTable,
+    TargetTable,
 )
 from experiments.definition.links import FORM, NO_TARGET, held_height, link_pairs
 from experiments.definition.plan import Plan
@@ -217,7 +217,7 @@ def divisor(body: float, wanted: float) -> float:
     return min(exact, key=lambda rate: abs(rate - wanted), default=body)
 
 
-def _robot(plan: Plan, path: tuple[str, str], robot: Robot) -> Iterator[Fault]:
+def _robot(plan: Plan, path: tuple[str, str], robot: RobotTable) -> Iterator[Fault]:
     experiment, name = plan.experiment, path[1]
     yield from _names(experiment, path, robot)
     body = registry.body_name(robot.body)
@@ -283,7 +283,7 @@ def _unknown(path: tuple[str, str], name: str) -> Fault:
     return Fault((*path, "kind"), f"no {name!r} among the kinds of robots", hint)
 
 
-def _names(experiment: Experiment, path: tuple[str, str], robot: Robot) -> Iterator[Fault]:
+def _names(experiment: Experiment, path: tuple[str, str], robot: RobotTable) -> Iterator[Fault]:
     """Faults of the name of a robot, and of that of its process."""
     name = path[1]
     if name in _RESERVED or name in KINDS:
@@ -296,7 +296,7 @@ def _names(experiment: Experiment, path: tuple[str, str], robot: Robot) -> Itera
         yield Fault((*path, "process"), message, "rename the process, and name it at each robot that shares it")
 
 
-def _hover(experiment: Experiment, path: tuple[str, str], robot: Robot, kind: Kind) -> Iterator[Fault]:
+def _hover(experiment: Experiment, path: tuple[str, str], robot: RobotTable, kind: Kind) -> Iterator[Fault]:
     name, top, margin = path[1], experiment.arena.size[2], experiment.safety.margin
     if not kind.flies:
         if robot.hover is not None:
@@ -396,7 +396,7 @@ def _formation(plan: Plan) -> Iterator[Fault]:
     for text, link in experiment.formation.links.items():
         path = ("formation", "links", text)
         yield from _asked(plan, text, link, path)
-        if isinstance(link, Link):
+        if isinstance(link, LinkTable):
             yield from after_the_end((*path, "from_s"), "link", link.from_s, experiment.duration_s)
     for number, change in enumerate(experiment.formation.changes):
         yield from _change(plan, number, change)
@@ -435,14 +435,14 @@ def _links(experiment: Experiment) -> Iterator[Fault]:
         given.update(dict.fromkeys(both, text))
 
 
-def _kind_of(given: Target | float) -> str:
+def _kind_of(given: TargetTable | float) -> str:
     """Name of the target of a link."""
-    if not isinstance(given, Target):
+    if not isinstance(given, TargetTable):
         return "distance"
     return next((name for name in ("distance", "offset", "bearing") if getattr(given, name) is not None), NO_TARGET)
 
 
-def _asked(plan: Plan, text: str, given: Target | float, path: Path) -> Iterator[Fault]:
+def _asked(plan: Plan, text: str, given: TargetTable | float, path: Path) -> Iterator[Fault]:
     """Targets that the law does not take, or that robots with held heights cannot meet."""
     experiment, name, needs, kind = plan.experiment, plan.law_name, plan.target_kind, _kind_of(given)
     if kind not in needs.fields and kind == NO_TARGET:
@@ -456,7 +456,7 @@ def _asked(plan: Plan, text: str, given: Target | float, path: Path) -> Iterator
         )
         yield Fault(path, message, f'{hint}, or take law = "mixed", which goes by each link')
         return
-    if not isinstance(given, Target):
+    if not isinstance(given, TargetTable):
         return
     second, first = link_pairs(text)[0]
     rise = held_height(experiment, second) - held_height(experiment, first)
@@ -472,7 +472,7 @@ def _asked(plan: Plan, text: str, given: Target | float, path: Path) -> Iterator
         yield Fault((*path, "bearing", 2), message, "leave the third number out: a direction seen from above")
 
 
-def _change(plan: Plan, number: int, change: Change) -> Iterator[Fault]:
+def _change(plan: Plan, number: int, change: ChangeTable) -> Iterator[Fault]:
     experiment, path = plan.experiment, ("formation", "changes", number)
     yield from after_the_end((*path, "at_s"), "change", change.at_s, experiment.duration_s)
     before = {pair: given for text, given in experiment.formation.links.items() for pair in link_pairs(text)}
@@ -499,6 +499,11 @@ def _change(plan: Plan, number: int, change: Change) -> Iterator[Fault]:
         yield Fault((*path, "rotate"), message, "give links an offset or a bearing, and law a law that goes by them")
     if change.scale != 1.0:
         for text, given in experiment.formation.links.items():
-            if isinstance(given, Target) and given.bearing is not None and len(given.bearing) == 3 and given.bearing[2]:
+            if (
+                isinstance(given, TargetTable)
+                and given.bearing is not None
+                and len(given.bearing) == 3
+                and given.bearing[2]
+            ):
                 message = f"the slope of {text!r} changes when the formation grows and heights are held"
                 yield Fault((*path, "scale"), message, "give that bearing as seen from above, without the third number")

@@ -9,7 +9,7 @@ from typing import Final
 from agents.network.channel_model import LinkEffects
 from agents.network.endpoints import Endpoint
 from agents.plugins import files, registry
-from experiments.definition.experiment import Experiment, LinkChannel
+from experiments.definition.experiment import Experiment, LinkChannelTable
 from experiments.definition.link_conditions import link_effects
 from experiments.definition.links import pairs_or_none
 from experiments.definition.plan import Plan
@@ -187,7 +187,7 @@ def _pose_pairs(plan: Plan) -> set[tuple[str, str]] | None:
     return {(names[i], names[j]) for i, j in zip(links.receiver.tolist(), links.sender.tolist(), strict=True)}
 
 
-def _bursts(held: LinkEffects, path: Path, own: LinkEffects | LinkChannel) -> Iterator[Fault]:
+def _bursts(held: LinkEffects, path: Path, own: LinkEffects | LinkChannelTable) -> Iterator[Fault]:
     """Faults of burst losses: `held` are the effects on a link, `own` those at this place of the file."""
     loss, burst = held.loss, held.burst
     if burst is None or (own.loss is None and own.burst is None):

@@ -25,9 +25,9 @@ from experiments.file.structure import MAX_NUMBER, group_of, struct_of
 _OWNERS: Final[dict[str, Path]] = {  # structs with a choice of a plug-in, and where each stands in a file
     "Experiment": (),
     "Formation": ("formation",),
-    "Leg": ("timeline", 0),
+    "LegTable": ("timeline", 0),
     "Obstacle": ("arena", "obstacles", "any"),
-    "World": ("world",),
+    "WorldTable": ("world",),
 }
 _CASE: Final = "InCase"
 TARGETS: Final = ("distance", "offset", "bearing")  # of a link, of which one is given
@@ -56,10 +56,10 @@ def described() -> dict[str, Any]:
             if (group := group_of((*path, name))) is not None:
                 kept = {key: field[key] for key in ("description", "default") if key in field}
                 fields[name] = {**kept, **_choice(group, definitions)}
-    for name, field in definitions["LinkChannel"]["properties"].items():  # as at the channel
-        field["description"] = definitions["Channel"]["properties"][name]["description"]
+    for name, field in definitions["LinkChannelTable"]["properties"].items():  # as at the channel
+        field["description"] = definitions["ChannelTable"]["properties"][name]["description"]
     definitions["Formation"]["properties"]["links"]["additionalProperties"]["anyOf"].append({"enum": [SHAPE, ALONE]})
-    definitions["Robot"]["properties"]["kind"]["enum"] = [kind.name for kind in KINDS.usable()]
+    definitions["RobotTable"]["properties"]["kind"]["enum"] = [kind.name for kind in KINDS.usable()]
     judged = definitions["Criterion"]["properties"]["metric"]
     judged["anyOf"] = [{"enum": judged_metrics()}, {"type": "string", "pattern": f"^{files.CHOICE}$"}]
     partial = {name + _CASE: _partial(each) for name, each in definitions.items()}
@@ -77,12 +77,12 @@ def described() -> dict[str, Any]:
 
 def _exclude(definitions: dict[str, Any]) -> None:
     """Adds the choices between fields of which one is given: in a case none may be, the file has it."""
-    for name, fields in (("Target", TARGETS), ("Link", TARGETS), ("Obstacle", SHAPES)):
+    for name, fields in (("TargetTable", TARGETS), ("LinkTable", TARGETS), ("Obstacle", SHAPES)):
         several = [{"required": list(pair)} for pair in combinations(fields, 2)]
         for each in (name, name + _CASE):
             definitions[each]["not"] = {"anyOf": several}
     for owner, key, elsewhere, fields in (
-        ("Formation", "links", "shape", TARGETS), ("Change", "links", "shape", TARGETS),
+        ("Formation", "links", "shape", TARGETS), ("ChangeTable", "links", "shape", TARGETS),
         ("Arena", "obstacles", "file", SHAPES),
     ):  # fmt: skip
         one = {"anyOf": [{"not": {"type": "object"}}, *({"required": [field]} for field in fields)]}

@@ -10,7 +10,7 @@ import numpy as np
 
 from agents.plugins.laws import Distance, Gradient
 from experiments.metrics.clearance import Clearance
-from experiments.metrics.results import Phase
+from experiments.metrics.results import PhaseMetrics
 from experiments.metrics.signals import (
     LinkErrors,
     after_last,
@@ -113,13 +113,13 @@ class Measurement:
         return self._acquired(0)
 
     @cached_property
-    def phases(self) -> list[list[Phase]]:
+    def phases(self) -> list[list[PhaseMetrics]]:
         """Per phase and robot: time of acquisition and residual error."""
         found = []
         for k, (start, begin, end) in enumerate(self.bounds):
             acquired = self._acquired(k) if k else self.acquired
             worst = self.errors.part(max(begin, end - self.window), end).worst(self.trace.robots)
-            found.append([Phase(start, when, *left) for when, left in zip(acquired, worst, strict=True)])
+            found.append([PhaseMetrics(start, when, *left) for when, left in zip(acquired, worst, strict=True)])
         return found
 
     def _acquired(self, phase: int) -> list[float | None]:

@@ -7,7 +7,7 @@ import msgspec
 from experiments.definition.experiment import Criterion
 
 
-class Phase(msgspec.Struct, frozen=True):
+class PhaseMetrics(msgspec.Struct, frozen=True):
     """Robot in a later phase: from a leg of the timeline to the next, or to the end."""
 
     start_s: float  # [s] since the common start
@@ -97,7 +97,7 @@ class RobotMetrics(msgspec.Struct, frozen=True):
     missed_deadlines: int  # ticks that were skipped: their time had passed
     residual: float | None  # [m] worst link, |error| averaged over the last second of the first phase
     worst: str  # robot at the other end of that link
-    phases: tuple[Phase, ...]  # each later phase
+    phases: tuple[PhaseMetrics, ...]  # each later phase
     # [s] when e enters the 2 % band of its largest value for good; the duration if never, None for laws without errors
     settle_s: float | None
     missed_share: float | None  # missed deadlines over the ticks that were due, made or missed

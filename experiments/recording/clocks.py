@@ -19,7 +19,7 @@ from twins.arrays import Array
 
 
 @dataclass(frozen=True)
-class Sample:
+class ClockSample:
     """Question to a host, and the answer."""
 
     left: float  # [s] our clock, when the question left
@@ -27,7 +27,7 @@ class Sample:
     back: float  # [s] our clock, when the answer came back
 
 
-def host_offset(samples: Sequence[Sample]) -> tuple[float, float]:
+def host_offset(samples: Sequence[ClockSample]) -> tuple[float, float]:
     """The host's clock less ours [s], and how far off that can be [s], by the sample of the shortest round trip."""
     best = min(samples, key=lambda sample: sample.back - sample.left)
     return best.there - (best.left + best.back) / 2, (best.back - best.left) / 2

@@ -17,7 +17,17 @@ from msgspec.structs import replace
 
 from agents.body.kinds import KINDS, RecordedKind
 from agents.decision.lifecycle import Phase
-from agents.network.messages import CentreState, Contact, Event, HostClock, Memory, State, Status, Variable, WorldState
+from agents.network.messages import (
+    CentreState,
+    Contact,
+    Event,
+    HostClock,
+    LawMemory,
+    State,
+    Status,
+    Variable,
+    WorldState,
+)
 from agents.network.validation import ABSURD, FUTURE_S, is_count
 from agents.plugins.registry import PluginError
 from experiments.arrays import PoseTable, known_rows
@@ -55,7 +65,7 @@ NOWHERE: Final = (math.nan, math.nan, math.nan)
 OPTIONAL: Final = ("attitude", "shadow_position", "shadow_yaw")  # columns that a trace may lack
 
 S = TypeVar("S", bound=msgspec.Struct)
-M = TypeVar("M", State, SentPose, Status, Memory)
+M = TypeVar("M", State, SentPose, Status, LawMemory)
 
 
 class NotStarted(RecordingError):
@@ -204,7 +214,7 @@ class _Content:
             right = Correction(self[HostClock])
             self[State][:] = [right.state(state) for state in self[State]]
             self[SentPose][:] = [replace(pose, stamp=right(pose.robot, pose.stamp)) for pose in self[SentPose]]
-            self[Memory][:] = [replace(each, stamp=right(each.robot, each.stamp)) for each in self[Memory]]
+            self[LawMemory][:] = [replace(each, stamp=right(each.robot, each.stamp)) for each in self[LawMemory]]
             self[Status][:] = [right.status(status) for status in self[Status]]
             self[SentGoal][:] = [replace(goal, pose=right(goal.robot, goal.pose)) for goal in self[SentGoal]]
         return count
@@ -259,7 +269,7 @@ def _trace(content: _Content, about: AboutRun, run: tuple[float, float]) -> Trac
     known = {what: each for what, each in columns.items() if what not in OPTIONAL or np.isfinite(each).any()}
     contacts = messages_in_run(content[Contact], start, duration)
     world = messages_in_run(content[WorldState], start, duration)
-    told, stepping = _by_robot(content[Memory], robots), HOLD_PERIODS / min(rate, experiment.rates.coordination_hz)
+    told, stepping = _by_robot(content[LawMemory], robots), HOLD_PERIODS / min(rate, experiment.rates.coordination_hz)
     goals = _goals(content, states, robots, start, duration) if plan.guided else None
     return Trace(
         case=about.case,
@@ -314,7 +324,7 @@ def _joined(states: list[list[State]], plan: Plan, start: float) -> Array | None
     return np.maximum(first, 0.0)
 
 
-def _possible(message: State | SentPose | Status | Memory) -> bool:
+def _possible(message: State | SentPose | Status | LawMemory) -> bool:
     """Whether robots would take the numbers of a message: metrics refuse what robots refuse."""
     match message:
         case SentPose():
@@ -351,7 +361,7 @@ def _sampled(states: list[State], start: float, time: Array, hold: float) -> dic
 
 
 def _memories(
-    told: list[list[Memory]], start: float, time: Array, hold: float, what: Literal["memory", "measures"]
+    told: list[list[LawMemory]], start: float, time: Array, hold: float, what: Literal["memory", "measures"]
 ) -> dict[str, Array]:
     """Variables of all robots on the grid `time` (T,), by name: (T, N, k); NaN where one is unknown."""
     sizes: dict[str, int] = {}

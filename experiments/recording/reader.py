@@ -40,7 +40,7 @@ class RecordingError(ExplainedError):
     """A recording that cannot be written, read or recovered, with its path and the remedy."""
 
 
-class Message(NamedTuple):
+class RecordedMessage(NamedTuple):
     """A message as it lies in the file; times in nanoseconds."""
 
     channel: int
@@ -62,13 +62,13 @@ class Records:
     metadata: list[Metadata] = field(default_factory=list)  # in the order of the file
     complete: bool = False  # the file was finished by its recorder and nothing in it is damaged; known at the end
 
-    def messages(self) -> Iterator[Message]:
+    def messages(self) -> Iterator[RecordedMessage]:
         """All messages with a known channel, in the order of writing; raises as `pieces` does."""
         for data, places in self.pieces():
             for at in places:
                 _, length, channel, sequence, logged, published = _MESSAGE.unpack_from(data, at)
                 if channel in self.channels:
-                    yield Message(
+                    yield RecordedMessage(
                         channel, sequence, logged, published, data[at + _MESSAGE.size : at + _RECORD.size + length]
                     )
 
@@ -245,12 +245,12 @@ class _Repeats:
         self._latest: dict[int, int] = {}  # [ns] stamp of all other messages, by channel
         self._unordered: set[int] = set()
 
-    def has(self, channel: int, message: Message) -> bool:
+    def has(self, channel: int, message: RecordedMessage) -> bool:
         if channel in self._unordered:
             return (message.published, message.data) in self._events
         return message.published <= self._latest.get(channel, -1)
 
-    def keep(self, channel: int, message: Message, topic: str) -> None:
+    def keep(self, channel: int, message: RecordedMessage, topic: str) -> None:
         if topic == EVENTS:
             self._unordered.add(channel)
             self._events.add((message.published, message.data))

@@ -27,7 +27,7 @@ from agents.network.messages import (
     Event,
     Goal,
     HostClock,
-    Memory,
+    LawMemory,
     Pose,
     State,
     Status,
@@ -43,7 +43,7 @@ CHUNK_BYTES: Final = 32 * 1024  # lost at most by a kill: a third of a second of
 DEPTH: Final = 20_000  # samples that may wait while the disk does
 RARE: Final = 1_000  # of those at 1 Hz or rarer: a ring takes its memory as it first goes round
 
-Message = Pose | Memory | State | Status | Event | Contact | WorldState | Goal | CentreState | HostClock
+Message = Pose | LawMemory | State | Status | Event | Contact | WorldState | Goal | CentreState | HostClock
 
 
 class SentPose(BarePose, frozen=True, kw_only=True):
@@ -85,7 +85,7 @@ TOPICS: Final = (
     Topic(State, State, "/{robot}/state", lambda keys: keys.state("*"), DEPTH),  # with the poses received since
     Topic(Pose, SentPose, "/{robot}/pose", lambda keys: keys.pose("*"), DEPTH, repeated=True),
     SPOKEN,
-    Topic(Memory, Memory, "/{robot}/memory", lambda keys: keys.memory("*"), DEPTH),
+    Topic(LawMemory, LawMemory, "/{robot}/memory", lambda keys: keys.memory("*"), DEPTH),
     Topic(Status, Status, "/{robot}/status", lambda keys: keys.status("*"), repeated=True),
     Topic(Event, Event, "/events", lambda keys: keys.event, repeated=True),
     Topic(Contact, Contact, "/world/contact", lambda keys: keys.contact, finite=True),

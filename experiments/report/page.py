@@ -71,7 +71,7 @@ Mark = Literal["good", "fair", "bad", "plain"]
 
 
 @dataclass(frozen=True)
-class Finding:
+class VerdictLine:
     """A sentence of the verdict and its mark."""
 
     mark: Mark
@@ -140,7 +140,7 @@ def render(
     title: str,
     source: str,
     facts: Sequence[tuple[str, str]],
-    verdict: Sequence[Finding],
+    verdict: Sequence[VerdictLine],
     sections: Sequence[Section],
     command: str = "",
     foot: Sequence[str] | None = None,
@@ -170,7 +170,7 @@ def render(
 MARKS: Final[dict[Mark, str]] = {"good": "✓", "fair": "!", "bad": "✗", "plain": "·"}
 
 
-def fragment(title: str, verdict: Sequence[Finding], tables: Sequence[Table]) -> str:
+def fragment(title: str, verdict: Sequence[VerdictLine], tables: Sequence[Table]) -> str:
     """Verdict and tables as HTML without a page around it, for the end of a notebook's cell."""
     return template("fragment.html.jinja").render(title=title, findings=verdict, tables=tables, marks=MARKS)
 

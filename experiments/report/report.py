@@ -20,11 +20,11 @@ from experiments.recording.version import provenance
 from experiments.report import figures, replay
 from experiments.report.metrics_files import Band
 from experiments.report.page import (
-    Finding,
     PageFigure,
     Section,
     Table,
     TableRow,
+    VerdictLine,
     date_of,
     numbered,
     render,
@@ -157,14 +157,14 @@ def write(
     ]
     first_of_all, verdict = [*failures(cases), *spoiled(cases), *interruptions(cases)], findings(cases)
     if len(seeds) > 1 and not (experiment.start.scatter or experiment.start.scatter_yaw):
-        verdict.append(Finding("plain", SAME_STARTS))
+        verdict.append(VerdictLine("plain", SAME_STARTS))
     return render(
         folder / "report.html",
         title=experiment.title,
         source=experiment.source,
         facts=facts,
         command=made.command,
-        verdict=[*first_of_all, *(Finding("fair", note) for note in notes), *verdict[len(first_of_all) :]],
+        verdict=[*first_of_all, *(VerdictLine("fair", note) for note in notes), *verdict[len(first_of_all) :]],
         sections=sections,
         foot=() if made.made_by is None else made.made_by.words,  # of an old run it is not known
         replay=replay.embedded(traces),
@@ -257,14 +257,14 @@ def differences_table(differences: Sequence[tuple[str, str, Sequence[str]]]) -> 
     return Table(("Run", "Folder", "Differs from the first in"), tuple(how), words=True)
 
 
-def _noted(differences: Sequence[tuple[str, str, Sequence[str]]]) -> list[Finding]:
+def _noted(differences: Sequence[tuple[str, str, Sequence[str]]]) -> list[VerdictLine]:
     """Differences of the runs from the first one."""
     found = []
     for name, _, how in differences[1:]:
         more = f" and {len(how) - 2} more" if len(how) > 2 else ""
         same = "has the same file, seeds and versions as the reference"
         text = f"{name} differs in {'; '.join(how[:2])}{more}." if how else f"{name} {same}."
-        found.append(Finding("fair" if how else "plain", text))
+        found.append(VerdictLine("fair" if how else "plain", text))
     return found
 
 

@@ -12,7 +12,7 @@ from experiments.metrics.comparable import LOST, MISSED, SLOW, lost_share, spoil
 from experiments.metrics.metric import ERRORS, OURS
 from experiments.metrics.results import CaseMetrics, Collision
 from experiments.metrics.statistics import by_case, ratios, same_length, spread
-from experiments.report.page import Finding, Mark, interval, number
+from experiments.report.page import Mark, VerdictLine, interval, number
 from experiments.report.tables import dropped_share, mean_delay, ratio_words
 
 KEPT_UP = 0.99  # a world that is slower than this share of real time falls behind
@@ -20,7 +20,7 @@ UNFINISHED_M = 0.3  # a robot that is nearer to where its plan wants it merely l
 NAMED = 3  # collisions, or twins, that are named; the tables have them all
 
 
-def findings(cases: Sequence[CaseMetrics]) -> list[Finding]:
+def findings(cases: Sequence[CaseMetrics]) -> list[VerdictLine]:
     """The verdict over all cases, the first one being the reference; nothing is praised if one of them was spoiled."""
     formation = any(case.belief for case in cases)
     judged = [case for case in cases if case.belief and case.has_errors]  # others have laws without errors
@@ -48,11 +48,11 @@ def findings(cases: Sequence[CaseMetrics]) -> list[Finding]:
         *_shadows(cases),
     ]
     if any(case.spoiled or case.failures for case in cases):
-        return [Finding("plain", each.text) if each.mark == "good" else each for each in found]
+        return [VerdictLine("plain", each.text) if each.mark == "good" else each for each in found]
     return found
 
 
-def criteria_met(cases: Sequence[CaseMetrics]) -> list[Finding]:
+def criteria_met(cases: Sequence[CaseMetrics]) -> list[VerdictLine]:
     """Whether the runs pass the criteria of their experiment, and why not; empty without criteria."""
     found = criteria.judge(cases)
     if not found:
@@ -64,10 +64,10 @@ def criteria_met(cases: Sequence[CaseMetrics]) -> list[Finding]:
     words = "Not passed" if bad else "Not judged as a whole" if unknown else "Passed"
     mark: Mark = "bad" if bad else "fair" if unknown else "good"
     return [
-        Finding(mark, f"{words}: {count}."),
-        *(Finding("bad", _missed(each)) for each in bad),
-        *(Finding("plain", _met(each)) for each in found if each.passed),
-        *(Finding("fair", f"Not judged: {each.what} ({each.limit}), since that was not run.") for each in unknown),
+        VerdictLine(mark, f"{words}: {count}."),
+        *(VerdictLine("bad", _missed(each)) for each in bad),
+        *(VerdictLine("plain", _met(each)) for each in found if each.passed),
+        *(VerdictLine("fair", f"Not judged: {each.what} ({each.limit}), since that was not run.") for each in unknown),
     ]
 
 
@@ -93,18 +93,20 @@ def _missed(judgement: criteria.Judgement) -> str:
 
 
 def _of_each_case(
-    cases: Sequence[CaseMetrics], find: Callable[[str, Sequence[CaseMetrics]], Finding | None]
-) -> list[Finding]:
+    cases: Sequence[CaseMetrics], find: Callable[[str, Sequence[CaseMetrics]], VerdictLine | None]
+) -> list[VerdictLine]:
     """Findings about each case, from its name and its runs of all seeds."""
     return [found for name, runs in by_case(cases).items() if (found := find(name, runs)) is not None]
 
 
-def failures(cases: Sequence[CaseMetrics]) -> list[Finding]:
+def failures(cases: Sequence[CaseMetrics]) -> list[VerdictLine]:
     """Robots that did not do their part: the first thing that a reader must know."""
-    return [Finding("bad", f"Failed in {case.case}: {_first_few(case.failures)}.") for case in cases if case.failures]
+    return [
+        VerdictLine("bad", f"Failed in {case.case}: {_first_few(case.failures)}.") for case in cases if case.failures
+    ]
 
 
-def spoiled(cases: Sequence[CaseMetrics]) -> list[Finding]:
+def spoiled(cases: Sequence[CaseMetrics]) -> list[VerdictLine]:
     """Cases that are not compared with others, and the reasons."""
     found = []
     for name, runs in by_case(cases).items():
@@ -112,25 +114,29 @@ def spoiled(cases: Sequence[CaseMetrics]) -> list[Finding]:
         if bad:
             which = name if len(runs) == 1 else f"{name} ({len(bad)} of {len(runs)} seeds)"
             why = "; ".join(dict.fromkeys(reason for run in bad for reason in run.spoiled))
-            found.append(Finding("bad", f"Spoiled, and compared with nothing: {which}: {why}."))
+            found.append(VerdictLine("bad", f"Spoiled, and compared with nothing: {which}: {why}."))
     return found
 
 
-def _troubles(cases: Sequence[CaseMetrics]) -> list[Finding]:
+def _troubles(cases: Sequence[CaseMetrics]) -> list[VerdictLine]:
     """Findings of conductor and recorder."""
     return [
-        Finding("bad" if any(map(spoils, case.troubles)) else "fair", f"In {case.case}: {_first_few(case.troubles)}.")
+        VerdictLine(
+            "bad" if any(map(spoils, case.troubles)) else "fair", f"In {case.case}: {_first_few(case.troubles)}."
+        )
         for case in cases
         if case.troubles
     ]
 
 
-def metric_faults(cases: Sequence[CaseMetrics]) -> list[Finding]:
+def metric_faults(cases: Sequence[CaseMetrics]) -> list[VerdictLine]:
     """Metrics of other distributions that failed, once each."""
-    return [Finding("fair", f"{text}.") for text in dict.fromkeys(text for run in cases for text in run.metric_faults)]
+    return [
+        VerdictLine("fair", f"{text}.") for text in dict.fromkeys(text for run in cases for text in run.metric_faults)
+    ]
 
 
-def interruptions(cases: Sequence[CaseMetrics]) -> list[Finding]:
+def interruptions(cases: Sequence[CaseMetrics]) -> list[VerdictLine]:
     """Runs that ended early, or were without a network."""
     found, several = [], len(by_case(cases)) > 1
     for run in cases:
@@ -139,11 +145,11 @@ def interruptions(cases: Sequence[CaseMetrics]) -> list[Finding]:
             text = (
                 f"{where} after {run.duration_s:.1f} s of {run.planned_s:g} s: all {'its ' if several else ''}figures"
             )
-            found.append(Finding("fair", f"{text} are up to there."))
+            found.append(VerdictLine("fair", f"{text} are up to there."))
         if run.away_s:
             where = f"In {run.case} the" if several else "The"
             text = f"{where} network was away for {run.away_s:.1f} s: errors are over the rest of the time."
-            found.append(Finding("fair", text))
+            found.append(VerdictLine("fair", text))
     return found
 
 
@@ -160,19 +166,19 @@ def left_out(cases: Sequence[CaseMetrics]) -> str:
     return " ".join(words) or "The means are over all robots."
 
 
-def _lost_poses(cases: Sequence[CaseMetrics]) -> list[Finding]:
+def _lost_poses(cases: Sequence[CaseMetrics]) -> list[VerdictLine]:
     sent = sum(robot.messages for case in cases for robot in case.robots)
     lost = {name: sum(run.lost for run in runs) for name, runs in by_case(cases).items()}
     if any(lost.values()):
         where = _list([f"{number(count)} in {name}" for name, count in lost.items() if count])
         mark: Mark = "bad" if max(map(lost_share, cases)) >= LOST else "fair"
-        return [Finding(mark, f"Samples were lost: {where}, of {number(sent)} poses sent in all.")]
+        return [VerdictLine(mark, f"Samples were lost: {where}, of {number(sent)} poses sent in all.")]
     if not sent:
-        return [Finding("plain", "No pose was sent: whether any would have been lost is unknown.")]
+        return [VerdictLine("plain", "No pose was sent: whether any would have been lost is unknown.")]
     if silent := _without_status(cases):
         text = f"No pose is known to be lost of {number(sent)} sent; what {_list(silent)} received is unknown."
-        return [Finding("plain", text)]
-    return [Finding("good", f"No pose was lost: {number(sent)} were sent, and no running number is missing.")]
+        return [VerdictLine("plain", text)]
+    return [VerdictLine("good", f"No pose was lost: {number(sent)} were sent, and no running number is missing.")]
 
 
 def _without_status(cases: Sequence[CaseMetrics]) -> list[str]:
@@ -181,7 +187,7 @@ def _without_status(cases: Sequence[CaseMetrics]) -> list[str]:
     return list(dict.fromkeys(robot.robot for robot in real if robot.missed_share is None))
 
 
-def _foreign(name: str, runs: Sequence[CaseMetrics]) -> Finding | None:
+def _foreign(name: str, runs: Sequence[CaseMetrics]) -> VerdictLine | None:
     """Poses that robots refused since another session sent them."""
     counts = Counter[str]()
     for run in runs:
@@ -189,14 +195,14 @@ def _foreign(name: str, runs: Sequence[CaseMetrics]) -> Finding | None:
     if not counts:
         return None
     robots = _list([f"{number(count)} of {robot}" for robot, count in counts.items()])
-    return Finding(
+    return VerdictLine(
         "bad",
         f"Poses from other sessions than the robots' own were refused in {name}: {robots}. Look for a second process "
         "of that name; in a lab, revoke the certificate.",
     )
 
 
-def _modelled(name: str, runs: Sequence[CaseMetrics]) -> Finding | None:
+def _modelled(name: str, runs: Sequence[CaseMetrics]) -> VerdictLine | None:
     """Loss and delay of a modelled network."""
     if not runs[0].modelled:
         return None
@@ -209,29 +215,31 @@ def _modelled(name: str, runs: Sequence[CaseMetrics]) -> Finding | None:
     if mean is not None:
         longest = max(link.delay_max for link in links if link.delay_max is not None)
         text += f"; those received took {number(mean, 1e3)} ms, at most {number(longest, 1e3)} ms"
-    return Finding("plain", f"{text}.")
+    return VerdictLine("plain", f"{text}.")
 
 
-def _deadlines(cases: Sequence[CaseMetrics]) -> list[Finding]:
+def _deadlines(cases: Sequence[CaseMetrics]) -> list[VerdictLine]:
     if all(case.clock == "virtual" for case in cases):
         return []
     if not any(case.missed_deadlines for case in cases):
         if silent := _without_status(cases):
-            return [Finding("plain", f"Whether {_list(silent)} missed deadlines is unknown: no status was recorded.")]
-        return [Finding("good", "No deadline was missed.")]
+            return [
+                VerdictLine("plain", f"Whether {_list(silent)} missed deadlines is unknown: no status was recorded.")
+            ]
+        return [VerdictLine("good", "No deadline was missed.")]
     words = []
     for name, runs in by_case(cases).items():
         if missed := sum(run.missed_deadlines for run in runs):
             share = spread([run.missed_share for run in runs]).mean or 0.0
             words.append(f"{number(missed)} in {name} ({100.0 * share:.2g} %)")
     worst = max(case.missed_share or 0.0 for case in cases)
-    return [Finding("fair" if worst < MISSED else "bad", f"Deadlines were missed: {_list(words)}.")]
+    return [VerdictLine("fair" if worst < MISSED else "bad", f"Deadlines were missed: {_list(words)}.")]
 
 
-def _gaps(cases: Sequence[CaseMetrics]) -> list[Finding]:
+def _gaps(cases: Sequence[CaseMetrics]) -> list[VerdictLine]:
     """Times without the position of a robot that came back."""
     return [
-        Finding(
+        VerdictLine(
             "fair", f"Position unknown in {case.case}: {_first_few(case.gaps)}; neither in nor out of the tolerance."
         )
         for case in cases
@@ -239,14 +247,14 @@ def _gaps(cases: Sequence[CaseMetrics]) -> list[Finding]:
     ]
 
 
-def _died(name: str, runs: Sequence[CaseMetrics]) -> Finding | None:
+def _died(name: str, runs: Sequence[CaseMetrics]) -> VerdictLine | None:
     died = list(dict.fromkeys(robot for run in runs for robot in run.died))
     if not died:
         return None
-    return Finding("bad", f"In {name}, {_list(died)} dropped out; the means leave {_verb(died, 'it', 'them')} out.")
+    return VerdictLine("bad", f"In {name}, {_list(died)} dropped out; the means leave {_verb(died, 'it', 'them')} out.")
 
 
-def _guided(name: str, runs: Sequence[CaseMetrics]) -> Finding | None:
+def _guided(name: str, runs: Sequence[CaseMetrics]) -> VerdictLine | None:
     """Cost of the central controller."""
     centres = [run.guidance for run in runs if run.guidance is not None]
     if not centres:
@@ -259,10 +267,10 @@ def _guided(name: str, runs: Sequence[CaseMetrics]) -> Finding | None:
         text += f", acted on {interval(delay, 1000.0)} ms after the pose on which they rest"
     if busy.mean is not None:
         text += f"; its process took {interval(busy, 100.0)} % of a core"
-    return Finding("plain", f"{text}.")
+    return VerdictLine("plain", f"{text}.")
 
 
-def _acquired(cases: Sequence[CaseMetrics]) -> list[Finding]:
+def _acquired(cases: Sequence[CaseMetrics]) -> list[VerdictLine]:
     found = []
     tolerance = f"{100.0 * cases[0].tolerance:g} cm"
     longest = max(cases, key=lambda case: len(case.starts_s))
@@ -281,16 +289,16 @@ def _acquired(cases: Sequence[CaseMetrics]) -> list[Finding]:
         formation = "The formation" if k == 0 else f"After the leg at {start:g} s it"
         if reached:
             text = f"{formation} was acquired by all {'again' if k else f'to {tolerance}'} after {_list(reached)}."
-            found.append(Finding("fair" if missing else "good", text))
+            found.append(VerdictLine("fair" if missing else "good", text))
         if missing:
-            found.append(Finding("bad", f"{formation} never stayed within {tolerance} in {_list(missing)}."))
+            found.append(VerdictLine("bad", f"{formation} never stayed within {tolerance} in {_list(missing)}."))
         if cut:
             text = f"{formation} was not within {tolerance} when {_list(cut)} {_verb(cut, 'was', 'were')} interrupted."
-            found.append(Finding("plain", text))
+            found.append(VerdictLine("plain", text))
     return found
 
 
-def _worst_link(cases: Sequence[CaseMetrics]) -> Finding:
+def _worst_link(cases: Sequence[CaseMetrics]) -> VerdictLine:
     words, largest = [], 0.0
     for name, runs in by_case(cases).items():
         left = [(*robot.by_the_end, robot.robot) for run in runs for robot in run.robots]
@@ -301,15 +309,15 @@ def _worst_link(cases: Sequence[CaseMetrics]) -> Finding:
         largest = max(largest, error)
         words.append(f"{number(error, 100.0)} cm ({robot}–{other}, {name})")
     if not words:
-        return Finding("plain", "No link could be measured at the end.")
+        return VerdictLine("plain", "No link could be measured at the end.")
     mark: Mark = "good" if largest <= cases[0].tolerance else "bad"
     if mark == "bad" and any(case.interrupted for case in cases):
         mark = "plain"  # it may have been on its way
     of = " of all seeds" if len(cases) > len(by_case(cases)) else ""
-    return Finding(mark, f"By the end the worst link{of} was off by {_list(words)}.")
+    return VerdictLine(mark, f"By the end the worst link{of} was off by {_list(words)}.")
 
 
-def _against_the_first(cases: Sequence[CaseMetrics]) -> list[Finding]:
+def _against_the_first(cases: Sequence[CaseMetrics]) -> list[VerdictLine]:
     grouped = by_case(cases)
     (reference, first), *others = grouped.items()
     found = []
@@ -324,22 +332,22 @@ def _against_the_first(cases: Sequence[CaseMetrics]) -> list[Finding]:
             means = [interval(spread([run.mean["f_hz"] for run in group])) for group in (runs, first)]
             text = f"{name} needs {how}: f {means[0]} rather than {means[1]} Hz"
             text += f"{_with_leaders(runs, first)}{some}."
-            found.append(Finding("good" if fewer > 0.0 and float(share) and not some else "plain", text))
+            found.append(VerdictLine("good" if fewer > 0.0 and float(share) and not some else "plain", text))
         errors = [(OURS[name].label, spread(ratios(runs, first, name))) for name in ERRORS]
         known = [(label, each) for label, each in errors if each.mean is not None]
         if not same_length([*runs, *first]):
             text = f"Runs of different length of {name} and {reference} are not compared."
-            found.append(Finding("fair", text))
+            found.append(VerdictLine("fair", text))
         if known:
             parts = [f"{label} {ratio_words(each)}" for label, each in known]
             worse = max(each.mean for _, each in known if each.mean is not None)
             text = f"Its errors relative to {reference}: {_list(parts)}{some}."
             mark: Mark = "good" if worse <= 1.0 and not some else "plain" if worse < 1.25 else "fair"
-            found.append(Finding(mark, text))
+            found.append(VerdictLine(mark, text))
         judged = all(run.has_errors for run in (*runs, *first))
         if judged and "IAE" not in dict(known) and rate.mean is not None:
             text = f"Less is known of one of {name} and {reference}: integrals of errors are not compared."
-            found.append(Finding("fair", text))
+            found.append(VerdictLine("fair", text))
     return found
 
 
@@ -354,7 +362,7 @@ def _with_leaders(runs: Sequence[CaseMetrics], first: Sequence[CaseMetrics]) -> 
     return f"; leaders included, {how}"
 
 
-def contacts(cases: Sequence[CaseMetrics]) -> list[Finding]:
+def contacts(cases: Sequence[CaseMetrics]) -> list[VerdictLine]:
     """Contacts; without any, the closest approach."""
     found = []
     for name, runs in by_case(cases).items():
@@ -365,7 +373,7 @@ def contacts(cases: Sequence[CaseMetrics]) -> list[Finding]:
         shown += [f"{len(touched) - NAMED} more"] if len(touched) > NAMED else []
         which = f"{sum(1 for run in runs if run.collisions)} of {len(runs)} seeds of {name}"
         count = "One collision" if len(touched) == 1 else f"{len(touched)} collisions"
-        found.append(Finding("bad", f"{count} in {name if len(runs) == 1 else which}: {_list(shown)}."))
+        found.append(VerdictLine("bad", f"{count} in {name if len(runs) == 1 else which}: {_list(shown)}."))
     near = [(case.near, case.case) for case in cases if case.near is not None]
     arena = [(case.near_arena, case.case) for case in cases if case.near_arena is not None]
     if found or not (near or arena):
@@ -380,8 +388,8 @@ def contacts(cases: Sequence[CaseMetrics]) -> list[Finding]:
     unseen = list(dict.fromkeys(robot.robot for case in cases for robot in case.robots if robot.known < 1.0))
     if unseen and not all(case.watched for case in cases):
         text = f"No contact is known; the closest approach was {_list(gaps)}. Of {_list(unseen)} not all is known."
-        return [Finding("plain", text)]
-    return [Finding("good", f"No robot touched another or the arena; the closest approach was {_list(gaps)}.")]
+        return [VerdictLine("plain", text)]
+    return [VerdictLine("good", f"No robot touched another or the arena; the closest approach was {_list(gaps)}.")]
 
 
 def _collision(each: Collision) -> str:
@@ -390,26 +398,26 @@ def _collision(each: Collision) -> str:
     return f"{each.first}–{each.second} at {each.time_s:.2f} s" + (f" ({', '.join(parts)})" if parts else "")
 
 
-def _avoided(cases: Sequence[CaseMetrics]) -> list[Finding]:
+def _avoided(cases: Sequence[CaseMetrics]) -> list[VerdictLine]:
     found = []
     for case in cases:
         if case.avoided_share:
             most = max(case.robots, key=lambda robot: robot.avoided)
             text = f"Avoidance was at work on {number(case.avoided_share, 100.0)} % of all ticks in {case.case}"
-            found.append(Finding("plain", f"{text}, most on those of {most.robot} ({number(most.avoided)})."))
+            found.append(VerdictLine("plain", f"{text}, most on those of {most.robot} ({number(most.avoided)})."))
     return found[:NAMED]
 
 
-def _pace(cases: Sequence[CaseMetrics]) -> list[Finding]:
+def _pace(cases: Sequence[CaseMetrics]) -> list[VerdictLine]:
     factors = [(case.world_factor, case.case) for case in cases if case.world_factor is not None]
     factor, case = min(factors, default=(1.0, ""))
     if factor >= KEPT_UP:
         return []
     text = f"The world fell behind: at its slowest it ran at {factor:.2f} of real time, in {case}."
-    return [Finding("fair" if factor >= SLOW else "bad", text)]
+    return [VerdictLine("fair" if factor >= SLOW else "bad", text)]
 
 
-def _shadows(cases: Sequence[CaseMetrics]) -> list[Finding]:
+def _shadows(cases: Sequence[CaseMetrics]) -> list[VerdictLine]:
     found = [(case, robot, robot.shadow) for case in cases for robot in case.robots if robot.shadow is not None]
     found.sort(key=lambda each: -each[2].rmse)
     if not found:
@@ -419,24 +427,24 @@ def _shadows(cases: Sequence[CaseMetrics]) -> list[Finding]:
         ahead = "over the whole run" if shadow.horizon_s is None else f"up to {shadow.horizon_s:g} s ahead"
         shown.append(f"{robot.robot} to {number(shadow.rmse, 100.0)} cm RMSE {ahead} ({case.case})")
     rest = "; the others more closely" if len(found) > NAMED else ""
-    return [Finding("plain", f"Twins beside robots foresaw {_list(shown)}{rest}.")]
+    return [VerdictLine("plain", f"Twins beside robots foresaw {_list(shown)}{rest}.")]
 
 
-def _unfinished(cases: Sequence[CaseMetrics]) -> list[Finding]:
+def _unfinished(cases: Sequence[CaseMetrics]) -> list[VerdictLine]:
     """Robots that did not get where their plan wanted them."""
     found = []
     for case in cases:
         short = [each for each in case.robots if each.short is not None and each.short > UNFINISHED_M]
         if short:
             names = _list([f"{each.robot} by {number(each.short, 100.0)} cm" for each in short])
-            found.append(Finding("bad", f"Not where the plan wanted them at the end of {case.case}: {names}."))
+            found.append(VerdictLine("bad", f"Not where the plan wanted them at the end of {case.case}: {names}."))
     return found
 
 
-def _room(cases: Sequence[CaseMetrics]) -> list[Finding]:
+def _room(cases: Sequence[CaseMetrics]) -> list[VerdictLine]:
     far = max(cases, key=lambda case: case.excursion)
     text = f"{far.excursion_robot} was {number(far.excursion, 100.0)} cm outside the arena in {far.case}."
-    return [Finding("fair" if far.excursion < 0.02 else "bad", text)] if far.excursion > 0.0 else []
+    return [VerdictLine("fair" if far.excursion < 0.02 else "bad", text)] if far.excursion > 0.0 else []
 
 
 def _first_few(texts: Sequence[str]) -> str:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.decision.lifecycle import Phase
-from agents.network.messages import Event, HostClock, Memory, State, Status, WorldState
+from agents.network.messages import Event, HostClock, LawMemory, State, Status, WorldState
 from experiments.definition.plan import Plan
 from experiments.recording.clocks import Correction
 from experiments.recording.playback import AboutRun, topic_of
@@ -26,7 +26,7 @@ from experiments.recording.topics import SentPose
 from experiments.recording.trace import ROUNDING_S
 from twins.arrays import Array, Index
 
-M = TypeVar("M", Status, Memory)
+M = TypeVar("M", Status, LawMemory)
 LOST_S: Final = 1.0  # time without a sample after which a robot is silent
 WORDS: Final = {phase.word: int(phase) for phase in Phase}
 NOWHERE: Final = (nan, nan, nan)
@@ -53,7 +53,7 @@ class Track:
     shadow_yaw: Array  # (K,) [rad]
     sent: Array  # (P,) [s] of each pose to the neighbours
     statuses: tuple[Status, ...]  # stamps since the common start
-    memories: tuple[Memory, ...] = ()  # of a law that remembers, likewise
+    memories: tuple[LawMemory, ...] = ()  # of a law that remembers, likewise
 
     def at(self, t: float) -> int:
         """Number of the last sample at or before `t` [s]; −1 before the first."""
@@ -98,7 +98,7 @@ def read(path: Path) -> Tracks:
     records = Records(path)
     samples: dict[str, list[Array]] = {}
     sent: dict[str, list[Array]] = {}
-    rare: dict[type, list[Any]] = {kind: [] for kind in (Event, Status, WorldState, HostClock, Memory)}
+    rare: dict[type, list[Any]] = {kind: [] for kind in (Event, Status, WorldState, HostClock, LawMemory)}
     for data, starts in _batches(records):
         heads = _gathered(data, starts, HEAD)[:, 0]
         for channel in np.unique(heads["channel"]).tolist():
@@ -143,7 +143,7 @@ def read(path: Path) -> Tracks:
             time[order], phase[:, 0].astype(np.intp), position, yaw[:, 0], goal, attitude, shadow, shadow_yaw[:, 0],
             sent=poses[np.isfinite(poses)],
             statuses=told(name, statuses),
-            memories=told(name, rare[Memory]),
+            memories=told(name, rare[LawMemory]),
         )  # fmt: skip
 
     tracks = tuple(map(track, robots))

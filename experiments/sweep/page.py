@@ -10,11 +10,11 @@ from typing import Final
 from experiments.metrics.metric import foreign_metrics
 from experiments.report import style
 from experiments.report.page import (
-    Finding,
     PageFigure,
     Section,
     Table,
     TableRow,
+    VerdictLine,
     date_of,
     numbered,
     render,
@@ -58,7 +58,7 @@ def write(found: SweepResult | TuningResult, command: str) -> Path:
         ("Robots", str(len(found.read.experiment.robots))),
         ("Cells", str(len(found.tried if isinstance(found, TuningResult) else found.rows))),
     ]
-    notes = [Finding("fair", note) for note in found.notes]
+    notes = [VerdictLine("fair", note) for note in found.notes]
     if isinstance(found, TuningResult):
         title, sections = "Tuned", _searched(found)
         facts.append(("Tuning seeds", seeds_in_words(found.tuning)))
@@ -66,10 +66,10 @@ def write(found: SweepResult | TuningResult, command: str) -> Path:
     else:
         title, sections = "Sweep", _swept(found)
         if found.missing:
-            notes.append(Finding("bad", f"interrupted: {found.missing} runs are missing; the same command goes on"))
+            notes.append(VerdictLine("bad", f"interrupted: {found.missing} runs are missing; the same command goes on"))
         if found.failures:
             text = f"{len(found.failures)} runs failed, and count in no figure; the first: {found.failures[0]}"
-            notes.append(Finding("bad", text))
+            notes.append(VerdictLine("bad", text))
         notes += fewest(found.rows)
     return render(
         found.folder / PAGE,
@@ -105,16 +105,16 @@ def _searched(tuned: TuningResult) -> list[Section]:
     ]
 
 
-def verdict(tuned: TuningResult) -> list[Finding]:
+def verdict(tuned: TuningResult) -> list[VerdictLine]:
     """For each case whether the limits were kept on the reporting seeds, and at how many messages."""
     limits = " and ".join(map(str, tuned.objective.limits))
     found = []
     for row in (row for row in tuned.rows if not row.reference):
         what = f"{row.label}: {_saved(row)}"
         if tuned.objective.kept(row):
-            found.append(Finding("good", f"{what}, keeps {limits}"))
+            found.append(VerdictLine("good", f"{what}, keeps {limits}"))
         else:
-            found.append(Finding("bad", f"{what}, does not keep {limits}"))
+            found.append(VerdictLine("bad", f"{what}, does not keep {limits}"))
     return found
 
 
@@ -152,31 +152,31 @@ def pictures(
     return numbered(zip(saved, [CAPTION, *others], strict=True))
 
 
-def fewest(rows: Sequence[CellRow]) -> list[Finding]:
+def fewest(rows: Sequence[CellRow]) -> list[VerdictLine]:
     """Per environment the cell with the fewest messages within each level of error; the nearest one if none is."""
     others = [row for row in rows if not row.reference and not row.failed and row.ratio["iae"].mean is not None]
     parts = by_environment(others)
-    found: list[Finding] = []
+    found: list[VerdictLine] = []
     for where, part in parts.items():
         levels = LEVELS if len(parts) == 1 else LEVELS[-1:]
         found += _fewest_within(part, levels, f"With {where}: " if len(parts) > 1 else "")
     return found
 
 
-def _fewest_within(rows: Sequence[CellRow], levels: Sequence[float], where: str) -> list[Finding]:
+def _fewest_within(rows: Sequence[CellRow], levels: Sequence[float], where: str) -> list[VerdictLine]:
     """As `fewest`, of one environment, with words about that in front."""
-    found: dict[str, Finding] = {}
+    found: dict[str, VerdictLine] = {}
     for level in levels:
         within = [row for row in front(rows) if (row.ratio["iae"].mean or 0.0) <= level]
         if within:
             what = f"{where}fewest messages with an IAE ratio of at most {level:g}"
             text = f"{what[0].upper()}{what[1:]}: {within[0].label}: {_saved(within[0])}"
-            found.setdefault(within[0].label, Finding("good" if within[0].acquired == 1.0 else "fair", text))
+            found.setdefault(within[0].label, VerdictLine("good" if within[0].acquired == 1.0 else "fair", text))
     if not found:
         nearest = min(rows, key=lambda row: row.ratio["iae"].mean or 0.0)
         what = f"{where}no cell has an IAE ratio of at most {LEVELS[-1]:g}; the nearest"
         text = f"{what[0].upper()}{what[1:]}: {nearest.label}: {_saved(nearest)}"
-        return [Finding("fair", text)]
+        return [VerdictLine("fair", text)]
     return list(found.values())
 
 

@@ -26,8 +26,8 @@ from experiments.view.heartbeat import STALE_S
 if TYPE_CHECKING:
     import viser
 
-    from experiments.real_time.hosts.run_registry import Run
-    from experiments.view.serving import Server
+    from experiments.real_time.hosts.run_registry import RegisteredRun
+    from experiments.view.serving import PageServer
 
 REASON: Final = "button of zenpark view"
 SETTLED_S: Final = 0.4  # after the last move of a slider, or the end of a drag, its value is sent
@@ -44,13 +44,13 @@ LAST: Final = "Repeat it with `./zenpark estop`, or cut the power."
 
 
 @dataclass(frozen=True)
-class Watched:
+class WatchedRun:
     """The run that is watched."""
 
     endpoints: Sequence[str]
     realm: str
     identity: str  # identity to show, in a lab
-    run: Run | None = None  # of this machine, if it is registered
+    run: RegisteredRun | None = None  # of this machine, if it is registered
 
     @property
     def words(self) -> str:
@@ -58,7 +58,7 @@ class Watched:
         return f"at {', '.join(topology.bare(self.endpoints))}" if self.run is None else self.run.words
 
 
-def may_act(watched: Watched) -> bool:
+def may_act(watched: WatchedRun) -> bool:
     """Whether the page may give orders: with an operator's certificate in a lab, elsewhere unless as an observer."""
     folder = lab.lab_of(watched.endpoints)
     if folder is None:
@@ -73,7 +73,7 @@ def may_act(watched: Watched) -> bool:
 class Acting:
     """Buttons of an operator's page, and the orders that they give."""
 
-    def __init__(self, session: zenoh.Session, watched: Watched) -> None:
+    def __init__(self, session: zenoh.Session, watched: WatchedRun) -> None:
         self._session, self._watched, self._clock = session, watched, Clock()
         self._keys = keys = Keys(watched.realm)
         self._events = pubsub.pose_publisher(session, keys.event, messages.JSON, pubsub.EVENTS)
@@ -88,7 +88,7 @@ class Acting:
         self._lock = threading.Lock()
         self._number = 0  # of the present stage
 
-    def build(self, server: Server) -> None:
+    def build(self, server: PageServer) -> None:
         """Adds the buttons."""
         import viser  # noqa: PLC0415 - an extra
 

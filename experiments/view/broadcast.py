@@ -14,7 +14,7 @@ from typing import Any, Final
 
 import zenoh
 
-from agents.clock import Clock as Utc
+from agents.clock import Clock
 from agents.errors import ExplainedError
 from agents.network import messages, pubsub
 from agents.network.keys import Keys
@@ -24,7 +24,7 @@ from experiments.recording.playback import AboutRun, topic_of
 from experiments.recording.reader import RecordingError, Records
 from experiments.recording.ros2.cdr import Undecodable, codec
 from experiments.recording.topics import Topic
-from experiments.view.replay import Clock
+from experiments.view.replay import ReplayClock
 
 STEP_S: Final = 0.01
 SEEN_S: Final = 1.0  # until the tokens of a run that is up have come
@@ -63,13 +63,13 @@ class Broadcast:
         self._publishers: dict[str, Any] = {}
         self._declared: list[object] = []
 
-    def run(self, ended: threading.Event, clock: Clock, endpoints: Sequence[str] = ()) -> int:
+    def run(self, ended: threading.Event, clock: ReplayClock, endpoints: Sequence[str] = ()) -> int:
         """Plays until `ended`, by a clock from 0 to the recording's length [s]; returns the number of messages sent.
 
         Raises ExplainedError if a run or a robot is up in the realm, before or while it plays.
         """
         keys, names = self.keys, [self.keys.alive(name) for name in self.plan.names]
-        began, mine = Utc().utc(), str(self._session.zid())
+        began, mine = Clock().utc(), str(self._session.zid())
         owners = Keys.life(keys.alive("*"), "*")
         watched = (keys.conductor, keys.alive("*"), owners, keys.world_alive)
         watches = [pubsub.AliveWatch(self._session, key) for key in watched]

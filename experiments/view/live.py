@@ -20,7 +20,7 @@ from agents.network.session import connected
 from experiments.scene.drawing import DARK, LIGHT, SceneDrawing, VisibleParts
 from experiments.scene.stage import MANY_GOALS, Condition, LinkTracker, Moment, SceneModel
 from experiments.view import heartbeat
-from experiments.view.acting import Acting, Watched
+from experiments.view.acting import Acting, WatchedRun
 from experiments.view.observer import Observer
 from experiments.view.panel import PLOT_S, Panel, known, robot_row
 from twins.arrays import Array, norm
@@ -28,7 +28,7 @@ from twins.arrays import Array, norm
 if TYPE_CHECKING:
     import viser
 
-    from experiments.view.serving import Server
+    from experiments.view.serving import PageServer
 
 FRAME_S: Final = 1.0 / 25.0
 FAREWELL_S: Final = 0.5  # until the last words have reached the pages
@@ -151,7 +151,7 @@ class LiveView:
     """The page of one realm."""
 
     def __init__(
-        self, server: Server, session: zenoh.Session, watched: Watched, *, dark: bool, acting: Acting | None
+        self, server: PageServer, session: zenoh.Session, watched: WatchedRun, *, dark: bool, acting: Acting | None
     ) -> None:
         """Draws an empty page; without `acting` that of an observer, which sees no buttons."""
         self._server, self._session, self._watched, self._acting = server, session, watched, acting

@@ -26,7 +26,7 @@ from experiments.view.heartbeat import DataAge
 UNKNOWN_S: Final = 2.0  # time without an experiment after which robots are drawn that are known by name only
 RATE_S: Final = 1.0
 Handler = zenoh.handlers.Handler[zenoh.Sample]
-R = TypeVar("R", messages.State, messages.Memory, messages.Ranges)
+R = TypeVar("R", messages.State, messages.LawMemory, messages.Ranges)
 DEPTH: Final = 8192  # samples between two rounds
 EVENTS: Final = 200  # kept
 
@@ -37,7 +37,7 @@ class RobotReport:
 
     state: messages.State | None = None
     status: messages.Status | None = None
-    memory: messages.Memory = field(default_factory=lambda: messages.Memory("", 0, 0.0))
+    memory: messages.LawMemory = field(default_factory=lambda: messages.LawMemory("", 0, 0.0))
     heard_at: float = -inf  # [s, monotonic] arrival of that status
     alive: bool = False
     known: bool = False  # it was alive, or reported, at some time
@@ -153,7 +153,7 @@ class Observer:
         states = list(self._newest(self._states, messages.State))
         if states:
             self.age.add(max(state.stamp for state in states), self._clock.utc(), time.monotonic())
-        for memory in self._newest(self._memories, messages.Memory):
+        for memory in self._newest(self._memories, messages.LawMemory):
             self._report(memory.robot).memory = memory
         for state in states:
             report = self._report(state.robot)

@@ -18,7 +18,7 @@ from experiments.definition.plan import Plan
 from experiments.scene.stage import Condition, LinkTracker, Moment, SceneModel, Trail, condition
 from experiments.view.live import FRAME_S, Page
 from experiments.view.panel import PLOT_S, RobotRow, known
-from experiments.view.replay import Clock, add_transport
+from experiments.view.replay import ReplayClock, add_transport
 from experiments.virtual_time.simulation import Snapshot
 from twins.arrays import Array
 
@@ -35,7 +35,7 @@ class PacedView:
     def __init__(self, server: viser.ViserServer, *, pace: float, dark: bool, page_s: float = PAGE_S) -> None:
         """`pace`: simulated seconds in one second, at first; `page_s`: limit of the wait for a page [s]."""
         self._server, self._page_s = server, page_s
-        self.clock = Clock(-inf, inf, -inf)
+        self.clock = ReplayClock(-inf, inf, -inf)
         self.clock.speed, self.clock.playing = pace, True
         with server.gui.add_folder("Virtual time", order=5.0):
             add_transport(server, self.clock, ("+1", "+1 s"))

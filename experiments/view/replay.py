@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 import numpy as np
 
 from agents.decision.lifecycle import Phase
-from agents.network.messages import Memory, Status, WorldState
+from agents.network.messages import LawMemory, Status, WorldState
 from experiments.definition.formation import errors_over_time
 from experiments.recording.trace import ROUNDING_S
 from experiments.scene.drawing import SceneDrawing
@@ -25,8 +25,8 @@ from twins.arrays import Array
 if TYPE_CHECKING:
     import viser
 
-M = TypeVar("M", Status, WorldState, Memory)
-NOTHING: Final = Memory("", 0, 0.0)
+M = TypeVar("M", Status, WorldState, LawMemory)
+NOTHING: Final = LawMemory("", 0, 0.0)
 SPEEDS: Final = ("0.1", "0.25", "0.5", "1", "2", "5", "10", "20")
 STEP_S: Final = 0.02  # of a single step: a sample at 50 Hz
 APART: Final = 0.15  # between words on the slider, in its lengths
@@ -126,7 +126,7 @@ def _taken(tracks: Sequence[Track], at: Sequence[int], name: str, width: int) ->
     return np.array(rows, dtype=float).reshape(-1, width)
 
 
-class Clock:
+class ReplayClock:
     """Time of a replay or a paced run: plays, pauses, goes by steps, at any speed."""
 
     def __init__(self, begin: float, end: float, t: float = 0.0) -> None:
@@ -152,7 +152,7 @@ class Clock:
         self.t = min(max(t, self.begin), self.end)
 
 
-def add_transport(server: viser.ViserServer, clock: Clock, steps: tuple[str, ...]) -> None:
+def add_transport(server: viser.ViserServer, clock: ReplayClock, steps: tuple[str, ...]) -> None:
     """Adds play and pause, also by the space bar, steps of a sample or some seconds, and the speed."""
     import viser  # noqa: PLC0415 - an extra
 
@@ -177,7 +177,7 @@ class ReplayView:
     def __init__(self, server: viser.ViserServer, films: Sequence[Film], where: str, *, dark: bool) -> None:
         """Draws all cases beside one another; `where` says which run it is."""
         self._server, self._films, self._where = server, list(films), where
-        self.clock = Clock(min(film.tracks.begin for film in films), max(film.tracks.end for film in films))
+        self.clock = ReplayClock(min(film.tracks.begin for film in films), max(film.tracks.end for film in films))
         self._drawn: object = None
         self._tabled = -inf
         self._build_controls()

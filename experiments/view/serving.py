@@ -22,7 +22,7 @@ LOOPBACK: Final = "127.0.0.1"
 _PATCHING: Final = threading.Lock()
 
 
-class Server(viser.ViserServer):
+class PageServer(viser.ViserServer):
     """Server of a page that only its address opens."""
 
     def __init__(self, port: int) -> None:
@@ -52,9 +52,9 @@ class Server(viser.ViserServer):
 
 
 @contextmanager
-def served(port: int, *, dark: bool) -> Iterator[Server]:
+def served(port: int, *, dark: bool) -> Iterator[PageServer]:
     """Serve a page to this machine alone, at `port` or the next free one."""
-    server = Server(port)
+    server = PageServer(port)
     server.gui.configure_theme(
         dark_mode=dark,
         show_logo=False,

@@ -1,6 +1,6 @@
 """Compilation of quiet functions over records; the only module that knows numba.
 
-`Thing` is what numba sees of an object: an address, and the layout of the record that stands there.
+`LayoutType` is what numba sees of an object: an address, and the layout of the record that stands there.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from numba.core.imputils import lower_builtin, lower_getattr_generic, lower_seta
 from numba.core.typing.templates import AbstractTemplate, AttributeTemplate, infer_getattr, infer_global, signature
 from numba.extending import intrinsic, register_model
 
-from experiments.virtual_time.records import BOOL, FLOAT, INT, WORD, Floats, Items, Layout, width
+from experiments.virtual_time.records import BOOL, FLOAT, INT, WORD, Floats, Items, RecordLayout, width
 from experiments.virtual_time.source import BUILTINS, POWER, PREFIX, SAFE, STRICT, is_foreign, place, specialised
 
 config.LOOP_VECTORIZE = 0  # a tenth of the time of compilation, and of no use here
@@ -37,10 +37,10 @@ SIMPLE = {FLOAT: types.float64, INT: types.int64, BOOL: types.boolean}
 CONSTANTS = {float: types.float64, int: types.int64, bool: types.boolean}  # of a class
 
 
-class Thing(types.Type):  # type: ignore[misc]
+class LayoutType(types.Type):  # type: ignore[misc]
     """Object of a layout."""
 
-    def __init__(self, layout: Layout) -> None:
+    def __init__(self, layout: RecordLayout) -> None:
         self.layout = layout
         super().__init__(name=f"{layout.name}.{id(layout)}")  # layouts are kept for ever
 
@@ -60,10 +60,10 @@ def type_of(kind: Any) -> Any:
         return types.UniTuple(types.float64, kind.size)
     if isinstance(kind, Items):
         return Several(kind.item)
-    return Thing(kind) if isinstance(kind, Layout) else SIMPLE[kind]
+    return LayoutType(kind) if isinstance(kind, RecordLayout) else SIMPLE[kind]
 
 
-@register_model(Thing)
+@register_model(LayoutType)
 class _ThingModel(models.PrimitiveModel):  # type: ignore[misc]
     def __init__(self, manager: Any, kind: Any) -> None:
         super().__init__(manager, kind, NUMBER)
@@ -111,14 +111,14 @@ def _store(builder: Any, kind: Any, address: Any, word: int, value: Any) -> None
 
 
 @cache
-def method(layout: Layout, name: str) -> Any:
+def method(layout: RecordLayout, name: str) -> Any:
     """Compiled method of objects of a layout; None if there is none."""
     found = getattr(layout.owner, name, None)
     return compiled(found, layout) if inspect.isfunction(found) else None
 
 
 @cache
-def compiled(function: Callable[..., Any], layout: Layout | None = None) -> Any:
+def compiled(function: Callable[..., Any], layout: RecordLayout | None = None) -> Any:
     """Function, compiled; a method for objects of a layout. Raises SyntaxError outside of the subset."""
     code, names = specialised(function, {} if layout is None else layout.fixed)
     space: dict[str, Any] = {"__name__": function.__module__}
@@ -200,7 +200,7 @@ def _power(x: float, y: float) -> float:
 
 @infer_getattr
 class _Attributes(AttributeTemplate):  # type: ignore[misc]
-    key = Thing
+    key = LayoutType
 
     def generic_resolve(self, thing: Any, name: str) -> Any:
         layout, name = thing.layout, name.removeprefix(PREFIX)
@@ -212,7 +212,7 @@ class _Attributes(AttributeTemplate):  # type: ignore[misc]
         of_method = types.Dispatcher(found)
 
         class Method(AbstractTemplate):  # type: ignore[misc]
-            key = (Thing, name)
+            key = (LayoutType, name)
 
             def generic(self, args: Any, kws: Any) -> Any:
                 return of_method.get_call_type(self.context, (thing, *args), kws).as_method()
@@ -222,14 +222,14 @@ class _Attributes(AttributeTemplate):  # type: ignore[misc]
 
 @cache
 def _lower_method(name: str) -> None:
-    @lower_builtin((Thing, name), Thing, types.VarArg(types.Any))  # type: ignore[untyped-decorator]
+    @lower_builtin((LayoutType, name), LayoutType, types.VarArg(types.Any))  # type: ignore[untyped-decorator]
     def call(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         function = context.get_function(types.Dispatcher(method(sig.args[0].layout, name)), sig)
         context.add_linking_libs(getattr(function, "libs", ()))
         return function(builder, args)
 
 
-@lower_getattr_generic(Thing)  # type: ignore[untyped-decorator]
+@lower_getattr_generic(LayoutType)  # type: ignore[untyped-decorator]
 def _get(context: Any, builder: Any, kind: Any, value: Any, name: str) -> Any:
     layout, name = kind.layout, name.removeprefix(PREFIX)
     if name not in layout.fields:
@@ -238,7 +238,7 @@ def _get(context: Any, builder: Any, kind: Any, value: Any, name: str) -> Any:
     return _load(context, builder, layout.fields[name], value, layout.offset[name])
 
 
-@lower_setattr_generic(Thing)  # type: ignore[untyped-decorator]
+@lower_setattr_generic(LayoutType)  # type: ignore[untyped-decorator]
 def _set(context: Any, builder: Any, sig: Any, args: Any, name: str) -> None:
     layout, name = sig.args[0].layout, name.removeprefix(PREFIX)
     kind = layout.fields[name]
@@ -303,7 +303,7 @@ def opened(kind: Any) -> Any:
     @intrinsic  # type: ignore[untyped-decorator]
     def found(typing_context: Any, address: Any, count: Any) -> Any:
         def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-            return args[0] if isinstance(of, Thing) else _several(context, builder, of, *args)
+            return args[0] if isinstance(of, LayoutType) else _several(context, builder, of, *args)
 
         return of(types.int64, types.int64), code
 

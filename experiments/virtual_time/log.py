@@ -168,7 +168,7 @@ class RunRecorder:
         while True:
             yield ()
 
-    def _memories(self) -> Iterator[messages.Memory]:
+    def _memories(self) -> Iterator[messages.LawMemory]:
         """Memory and measures of the laws at each sample."""
         log = self._log
         for k, t in enumerate(log.time.tolist() if log.memory or log.measures else ()):

@@ -34,7 +34,7 @@ class Items(NamedTuple):
     item: Any
 
 
-class Layout:
+class RecordLayout:
     """Attributes of objects of one class with values of the same kinds."""
 
     def __init__(self, owner: type, fields: dict[str, Any], fixed: dict[str, Any], name: str) -> None:
@@ -74,7 +74,7 @@ def is_frozen(owner: type) -> bool:
     return (struct is not None and struct.frozen) or (data is not None and data.frozen)
 
 
-LAYOUTS: Final[dict[tuple[Any, ...], Layout]] = {}  # a class that was defined again is another one
+LAYOUTS: Final[dict[tuple[Any, ...], RecordLayout]] = {}  # a class that was defined again is another one
 
 
 class Layouts:
@@ -82,7 +82,9 @@ class Layouts:
 
     def __init__(self) -> None:
         self._filled: dict[tuple[type, str], Items] = {}
-        self._of: dict[int, tuple[Any, Layout | None]] = {}  # by identity; the object is kept, or another would take it
+        self._of: dict[
+            int, tuple[Any, RecordLayout | None]
+        ] = {}  # by identity; the object is kept, or another would take it
         self.guessed = False  # whether a list was empty of which no other one was filled
 
     def forget(self) -> None:
@@ -125,7 +127,7 @@ class Layouts:
             self._filled[where] = items
         return items
 
-    def of(self, thing: Any) -> Layout | None:
+    def of(self, thing: Any) -> RecordLayout | None:
         """Layout of an object; None within a circle of objects, of which one is left out."""
         known = self._of.get(id(thing))
         if known is not None:
@@ -152,7 +154,7 @@ class Layouts:
         if layout is None:
             text = f"{owner.__module__}.{owner.__qualname__} {fields} {fixed}"
             name = f"{owner.__name__}-{hashlib.sha256(text.encode()).hexdigest()[:20]}"
-            layout = LAYOUTS[key] = Layout(owner, fields, fixed, name)
+            layout = LAYOUTS[key] = RecordLayout(owner, fields, fixed, name)
         self._of[id(thing)] = (thing, layout)
         return layout
 
@@ -194,7 +196,7 @@ class Image:
         self.words = np.zeros(self._size, dtype=np.int64)
         self.memory, self._base = self.words.data.cast("B"), self.words.ctypes.data
         self._known: dict[int, int] = {}  # address by identity
-        self._things: list[tuple[Any, Layout, int]] = []
+        self._things: list[tuple[Any, RecordLayout, int]] = []
         self._lists: list[tuple[list[Any], Any, int]] = []
         self.used = 0
         try:
@@ -212,7 +214,7 @@ class Image:
         self._known[id(thing)] = self._base + at
         return at
 
-    def put(self, thing: Any, layout: Layout) -> int:
+    def put(self, thing: Any, layout: RecordLayout) -> int:
         """Store an object, and what it leads to, unless it is there already; returns its address."""
         found = self._known.get(id(thing))
         if found is not None:
@@ -236,7 +238,7 @@ class Image:
             at = self.take(items, count * width(item))
             found = self._base + at
             values: Iterable[Any] = items
-            if isinstance(item, Layout):
+            if isinstance(item, RecordLayout):
                 values = [self.put(each, item) for each in items]
             elif isinstance(item, Items):
                 values = chain.from_iterable([self.put_items(each, item) for each in items])
@@ -271,12 +273,12 @@ def _items(memory: memoryview, at: int, count: int, kind: Any) -> list[Any]:
     return [value != 0 for value in values] if kind == BOOL else list(values)
 
 
-def _storing(layout: Layout) -> Callable[[Image, Any, int], None]:
+def _storing(layout: RecordLayout) -> Callable[[Image, Any, int], None]:
     """Function that writes an object at a place of an image; raises TypeError for one of another layout."""
     values, conditions, space = [], ["type(thing) is owner"], {"owner": layout.owner}
     for name, kind in layout.fields.items():
         space[f"kind_{name}"] = kind
-        if isinstance(kind, Layout):
+        if isinstance(kind, RecordLayout):
             values.append(f"image.put(thing.{name}, kind_{name})")
         elif isinstance(kind, Items):
             values.append(f"*image.put_items(thing.{name}, kind_{name})")
@@ -295,11 +297,11 @@ def store(image, thing, at):
     return cast("Callable[[Image, Any, int], None]", _made(source, "store", pack=pack, **space))
 
 
-def _loading(layout: Layout) -> Callable[[Any, memoryview, int], None]:
+def _loading(layout: RecordLayout) -> Callable[[Any, memoryview, int], None]:
     """Function that reads the numbers of an object back from a place in the memory of an image."""
     targets, statements, formats = list[str](), list[str](), list[str]()
     for name, kind in layout.fields.items():
-        if isinstance(kind, Layout | Items):
+        if isinstance(kind, RecordLayout | Items):
             formats.append(f"{WORD * width(kind)}x")
             continue
         formats.append(_format(kind))

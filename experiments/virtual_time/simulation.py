@@ -18,7 +18,7 @@ from agents.plugins.calls import explain
 from agents.plugins.law import Memory
 from agents.plugins.registry import FAILURES
 from agents.robot import Robot
-from agents.safety.hazards import Incident
+from agents.safety.hazards import HazardChange
 from experiments.arrays import PoseTable
 from experiments.definition.bodies import body_request, shadow_periods, shared_world
 from experiments.definition.plan import Plan
@@ -73,7 +73,7 @@ class VirtualRunLog:
     measures: Mapping[str, Array] = field(default_factory=dict)
     velocities: tuple[bool, ...] = ()  # (N) robots with a velocity from the last step of their law
     centre: CentreLog | None = None  # None if each robot decides for itself
-    incidents: tuple[tuple[int, Incident], ...] = ()  # hazards, each with the row of its robot, in order of time
+    incidents: tuple[tuple[int, HazardChange], ...] = ()  # hazards, each with the row of its robot, in order of time
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ def simulate(
         Stuck: If robots do not become ready, airborne or done.
         PluginError: If a plug-in fails; the error names it.
     """
-    flight = Flight(plan, seed, quiet=quiet, lean=lean, patience_s=patience_s)
+    flight = VirtualRun(plan, seed, quiet=quiet, lean=lean, patience_s=patience_s)
     try:
         flight.fly(landing=landing, progress=progress, watch=watch)
     except FAILURES as error:
@@ -123,7 +123,7 @@ def simulate(
     return flight.log()
 
 
-class Flight:
+class VirtualRun:
     """A run in virtual time."""
 
     def __init__(self, plan: Plan, seed: int, *, quiet: bool, lean: bool, patience_s: float = PATIENCE_S) -> None:

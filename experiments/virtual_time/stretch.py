@@ -34,7 +34,7 @@ from experiments.recording.version import digest
 from experiments.virtual_time import company
 from experiments.virtual_time.company import AT_END, Ledger, Member, Planned, Way
 from experiments.virtual_time.network import VirtualNetwork
-from experiments.virtual_time.records import BOOL, FLOAT, INT, Image, Items, Layout, Layouts
+from experiments.virtual_time.records import BOOL, FLOAT, INT, Image, Items, Layouts, RecordLayout
 from experiments.virtual_time.source import OURS
 from twins.body import TwinBody
 
@@ -143,7 +143,7 @@ class Prepared:
 
     rows: list[list[int]]  # of robots of the same layout
     kinds: tuple[Items, ...]  # of each of those
-    of_ledger: Layout
+    of_ledger: RecordLayout
     run: Any
     words: int = 1 << 12  # that all objects take
 
@@ -293,7 +293,7 @@ class Stretches:
                 flight.robots[row].goals.itinerary = itinerary
 
 
-def driver(kinds: tuple[Items, ...], of_ledger: Layout) -> Any:
+def driver(kinds: tuple[Items, ...], of_ledger: RecordLayout) -> Any:
     """Compiled loop over ticks for groups of robots of these kinds; None without one, and as long as it does not pay.
 
     Raises LookupError if there will be none.
@@ -333,7 +333,7 @@ def code_of(owners: Iterable[type]) -> str:
     return " ".join(sorted(total))
 
 
-def _compiled(name: str, kinds: Sequence[Items], of_ledger: Layout, folder: Path) -> Any:
+def _compiled(name: str, kinds: Sequence[Items], of_ledger: RecordLayout, folder: Path) -> Any:
     """Loop of that name, from the cache folder or new; None if it cannot be had, and then `REFUSED` says why."""
     gc.disable()  # a compiler leaves much behind at once, and hardly any circles: a fifteenth of its time
     try:
@@ -345,7 +345,7 @@ def _compiled(name: str, kinds: Sequence[Items], of_ledger: Layout, folder: Path
         gc.enable()
 
 
-def _loop(name: str, kinds: Sequence[Items], of_ledger: Layout, folder: Path) -> Any:
+def _loop(name: str, kinds: Sequence[Items], of_ledger: RecordLayout, folder: Path) -> Any:
     if not (folder.is_dir() and os.access(folder, os.W_OK)):
         raise OSError(f"nothing can be kept in {folder}")
     from experiments.virtual_time.compiler import compiled, kept, opened  # noqa: PLC0415 - half a second, and a level
@@ -375,12 +375,12 @@ def _loop(name: str, kinds: Sequence[Items], of_ledger: Layout, folder: Path) ->
     return kept(space[name], (*(INT,) * (2 * len(kinds) + 4), FLOAT, INT, BOOL), folder)
 
 
-def _layouts(kinds: Sequence[Any]) -> Iterator[Layout]:
+def _layouts(kinds: Sequence[Any]) -> Iterator[RecordLayout]:
     """All layouts that these kinds lead to."""
     for kind in kinds:
         if isinstance(kind, Items):
             yield from _layouts([kind.item])
-        elif isinstance(kind, Layout):
+        elif isinstance(kind, RecordLayout):
             yield kind
             yield from _layouts(list(kind.fields.values()))
 

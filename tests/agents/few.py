@@ -1,7 +1,7 @@
 """Experiments of one, two and three robots."""
 
 from agents.body.interface import Disturbance, Jitter
-from experiments.definition.experiment import Formation, Robot
+from experiments.definition.experiment import Formation, RobotTable
 from experiments.file import document
 from tests.agents.swarm import Swarm
 
@@ -19,7 +19,10 @@ def pair(**parts):
     given = {
         "title": "A pair",
         "duration_s": 60.0,
-        "robots": {"A": Robot(kind="khepera4", start=[-0.4, 0.0]), "B": Robot(kind="khepera4", start=[0.4, 0.1])},
+        "robots": {
+            "A": RobotTable(kind="khepera4", start=[-0.4, 0.0]),
+            "B": RobotTable(kind="khepera4", start=[0.4, 0.1]),
+        },
         "formation": Formation(links={"A - B": 0.5}),
         "trigger": PERIODIC,
         **parts,
@@ -30,7 +33,7 @@ def pair(**parts):
 def triangle(**parts):
     """Three ground robots; C receives nobody and stands."""
     robots = {
-        name: Robot(kind="khepera4", start=start)
+        name: RobotTable(kind="khepera4", start=start)
         for name, start in {"A": [-0.4, 0.0], "B": [0.4, 0.1], "C": [0.0, -0.5]}.items()
     }
     links = {"A - B": 0.5, "C > A": 0.5, "C > B": 0.5}
@@ -39,5 +42,5 @@ def triangle(**parts):
 
 def drone(**parts):
     """One Crazyflie that stands in the air."""
-    robots = {"F": Robot(kind="crazyflie", start=[0.1, 0.2], hover=0.5)}
+    robots = {"F": RobotTable(kind="crazyflie", start=[0.1, 0.2], hover=0.5)}
     return Swarm(pair(robots=robots, formation=Formation(), **parts))

@@ -4,7 +4,7 @@ import msgspec
 import pytest
 
 from agents.decision.lifecycle import DONE
-from experiments.definition.experiment import Leg
+from experiments.definition.experiment import LegTable
 from experiments.file import document
 from tests.agents.few import NOISY
 from tests.agents.swarm import LOGGED, Swarm, changed
@@ -72,7 +72,9 @@ def test_every_trigger_predictor_and_smoothing(park, way):
 def assert_the_same(park, *grouped, least=300):
     """However they are grouped; gives the run of all in one process."""
     line = {"kind": "line", "move_by": [0.3, 0.1], "speed": 0.15}
-    experiment = changed(park, duration_s=5.0, timeline=[Leg(at_s=2.0, robot="TB01", plan=line)], disturbance=NOISY)
+    experiment = changed(
+        park, duration_s=5.0, timeline=[LegTable(at_s=2.0, robot="TB01", plan=line)], disturbance=NOISY
+    )
     together = eventful(experiment, [tuple(experiment.robots)])
     for groups in grouped:
         apart = eventful(experiment, groups)

@@ -7,7 +7,7 @@ import pytest
 from agents.decision.lifecycle import AIRBORNE, IDLE, READY, RUNNING
 from agents.network.messages import Order
 from agents.runtime.orders import carry_out
-from experiments.definition.experiment import Formation, Leg, Robot, Start
+from experiments.definition.experiment import Formation, LegTable, RobotTable, Start
 from experiments.definition.plan import Plan
 from tests.agents.bench import Bench
 from tests.agents.few import pair, triangle
@@ -148,7 +148,7 @@ def test_robot_without_router_holds_and_goes_on():
 def test_swapped_robots_are_refused():
     """Each stands where the other one begins: neither takes off, and each names the mistake."""
     places = {"A": (0.15, 0.0, 0.0), "B": (-0.1, 0.0, 0.0)}
-    robots = {"A": Robot(kind="khepera4", start=[-0.1, 0.0]), "B": Robot(kind="khepera4", start=[0.15, 0.0])}
+    robots = {"A": RobotTable(kind="khepera4", start=[-0.1, 0.0]), "B": RobotTable(kind="khepera4", start=[0.15, 0.0])}
     swarm = Swarm(pair(robots=robots))
     for name, place in places.items():
         swarm.spoil(name, lambda state, place=place: setattr(state, "position", place))
@@ -179,7 +179,7 @@ def test_hold_and_start_again():
 
 
 def test_leader_goes_where_it_is_sent():
-    robots = {"L": Robot(kind="khepera4", start=[0.0, 0.0]), "F": Robot(kind="khepera4", start=[-0.5, 0.0])}
+    robots = {"L": RobotTable(kind="khepera4", start=[0.0, 0.0]), "F": RobotTable(kind="khepera4", start=[-0.5, 0.0])}
     swarm = Swarm(pair(robots=robots, formation=Formation(links={"L > F": 0.5})))
     leader, order = swarm.robot("L"), Order("go", goal=(0.2, 0.1))
     assert "cannot go anywhere while idle" in carry_out(leader, order, 0.0, 0.0)[0]
@@ -231,9 +231,12 @@ def test_steps_of_goals_are_clamped():
 @pytest.mark.parametrize("kind", ["khepera4", "crazyflie", "tello"])
 def test_leader_follows_its_plan(kind):
     hover = None if kind == "khepera4" else 0.6
-    robots = {"L": Robot(kind=kind, start=[0.0, 0.0], hover=hover), "F": Robot(kind="khepera4", start=[-0.5, 0.0])}
+    robots = {
+        "L": RobotTable(kind=kind, start=[0.0, 0.0], hover=hover),
+        "F": RobotTable(kind="khepera4", start=[-0.5, 0.0]),
+    }
     plan = {"kind": "line", "move_by": [0.3, 0.0], "speed": 0.1}
-    legs = [Leg(at_s=1.0, robot="L", plan=plan)]
+    legs = [LegTable(at_s=1.0, robot="L", plan=plan)]
     swarm = Swarm(pair(robots=robots, formation=Formation(links={"L > F": 0.8}), timeline=legs)).running()
     begin = swarm.last("L", "goal")
     assert begin == pytest.approx((0.0, 0.0, hover or 0.0), abs=1e-9)
@@ -245,9 +248,9 @@ def test_leader_follows_its_plan(kind):
 
 @pytest.mark.slow
 def test_follower_with_a_plan_is_pulled_by_both():
-    robots = {"L": Robot(kind="khepera4", start=[0.0, 0.0]), "F": Robot(kind="khepera4", start=[-0.5, 0.0])}
+    robots = {"L": RobotTable(kind="khepera4", start=[0.0, 0.0]), "F": RobotTable(kind="khepera4", start=[-0.5, 0.0])}
     formation = Formation(links={"L > F": 0.5}, tracking_gain=3.0)
-    legs = [Leg(at_s=0.0, robot="F", plan={"kind": "hold", "at": [0.0, 0.5]})]
+    legs = [LegTable(at_s=0.0, robot="F", plan={"kind": "hold", "at": [0.0, 0.5]})]
     place = Swarm(pair(robots=robots, formation=formation, timeline=legs)).running().run(40.0).last("F", "truth")
     assert dist(place, (0.0, 0.5, 0.0)) < 0.2  # the pull ends with the third power of what is left
     assert dist(place, (0.0, 0.0, 0.0)) == pytest.approx(0.5, abs=0.02)
@@ -260,8 +263,8 @@ def test_robot_without_links_and_plan_stays():
 
 def test_late_robot_joins_its_plan():
     plan = {"kind": "line", "move_by": [0.3, 0.0], "speed": 0.1}
-    robots = {"L": Robot(kind="khepera4", start=[0.0, 0.0])}
-    swarm = Swarm(pair(robots=robots, formation=Formation(), timeline=[Leg(at_s=1.0, robot="L", plan=plan)]))
+    robots = {"L": RobotTable(kind="khepera4", start=[0.0, 0.0])}
+    swarm = Swarm(pair(robots=robots, formation=Formation(), timeline=[LegTable(at_s=1.0, robot="L", plan=plan)]))
     swarm.run(0.05)
     robot = swarm.robot("L")
     robot.lifecycle.takeoff()

@@ -9,7 +9,7 @@ from agents.decision.lifecycle import AIRBORNE, DONE, IDLE, LANDING, READY, RUNN
 from agents.plugins.laws import Distance
 from agents.safety.hazards import Cause
 from agents.vectors import NO_SETPOINT, UNKNOWN
-from experiments.definition.experiment import Experiment, Formation, Robot
+from experiments.definition.experiment import Experiment, Formation, RobotTable
 from experiments.definition.plan import Plan
 from tests.agents.few import drone, pair
 from tests.agents.swarm import Swarm, changed
@@ -101,7 +101,7 @@ def test_wheels_with_an_old_position_know_no_error():
 
 
 def test_followers_of_blind_wheels_stop():
-    robots = {"A": Robot(kind="khepera4", start=[-1.5, 0.0]), "B": Robot(kind="khepera4", start=[-1.0, 0.0])}
+    robots = {"A": RobotTable(kind="khepera4", start=[-1.5, 0.0]), "B": RobotTable(kind="khepera4", start=[-1.0, 0.0])}
     shape = Formation(links={"B > A": 0.5})
     swarm = Swarm(pair(robots=robots, formation=shape, prediction={"kind": "constant-velocity"})).running()
     assert swarm.robot("B").go((1.5, 0.0), swarm.t) == ""
@@ -281,7 +281,7 @@ def test_law_that_wants_nonsense_is_stopped(kind, monkeypatch):
     monkeypatch.setattr(Plan, "law", Mad())
     hover = None if kind == "khepera4" else 0.6
     starts = {"A": [-0.4, 0.0], "B": [0.4, 0.0]}
-    robots = {name: Robot(kind=kind, start=start, hover=hover) for name, start in starts.items()}
+    robots = {name: RobotTable(kind=kind, start=start, hover=hover) for name, start in starts.items()}
     swarm = Swarm(pair(robots=robots)).running()
     swarm.run(12.0)
     for name in "AB":
@@ -291,7 +291,7 @@ def test_law_that_wants_nonsense_is_stopped(kind, monkeypatch):
 
 
 def test_nonsense_is_known_before_take_off(monkeypatch):
-    robots = {"A": Robot(kind="khepera4", start=[-0.3, 0.0]), "B": Robot(kind="khepera4", start=[0.3, 0.0])}
+    robots = {"A": RobotTable(kind="khepera4", start=[-0.3, 0.0]), "B": RobotTable(kind="khepera4", start=[0.3, 0.0])}
     monkeypatch.setattr(Plan, "law", Mad())
     swarm = Swarm(pair(robots=robots))
     swarm.run(0.2)
@@ -378,9 +378,9 @@ def trouble(rng, swarm, name):
 def test_whatever_happens_no_robot_comes_up_again(seed):
     rng = random.Random(seed)
     robots = {
-        "F": Robot(kind="crazyflie", start=[0.0, 0.0], hover=0.6),
-        "T": Robot(kind="tello", start=[0.6, 0.0], hover=0.8),
-        "K": Robot(kind="khepera4", start=[0.0, 0.7]),
+        "F": RobotTable(kind="crazyflie", start=[0.0, 0.0], hover=0.6),
+        "T": RobotTable(kind="tello", start=[0.6, 0.0], hover=0.8),
+        "K": RobotTable(kind="khepera4", start=[0.0, 0.7]),
     }
     links = {"F - T": 0.7, "K - F": 0.8, "K - T": 0.9}
     experiment = Experiment(title="x", duration_s=60.0, robots=robots, formation=Formation(links=links))

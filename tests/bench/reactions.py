@@ -31,7 +31,7 @@ from agents.network import messages, pubsub
 from agents.network import session as network
 from agents.network.endpoints import free_endpoint
 from agents.network.keys import Keys
-from experiments.definition.experiment import Arena, Formation, Rates, Robot
+from experiments.definition.experiment import Arena, Formation, Rates, RobotTable
 from experiments.definition.plan import Plan
 from experiments.file.document import write_json
 from experiments.real_time.conductor import orders
@@ -111,7 +111,7 @@ def ring(count: int, body: str) -> Plan:
     return Plan.made(
         title="a ring",
         robots={
-            name: Robot(kind="khepera4", start=[radius * cos(turn), radius * sin(turn)], body=body, sensors=[])
+            name: RobotTable(kind="khepera4", start=[radius * cos(turn), radius * sin(turn)], body=body, sensors=[])
             for name, turn in zip(names, turns, strict=True)
         },
         duration_s=600.0,

@@ -17,7 +17,7 @@ from agents.protocols.crazyflie import chosen
 from agents.protocols.crtp import HighLevel, Log, Port
 from agents.ticks import Ticks
 from bridges.crazyflie import flight, telemetry, trajectory
-from bridges.crazyflie.flight import Flight, Phase
+from bridges.crazyflie.flight import FlightControl, FlightPhase
 from bridges.crazyflie.link import BUSY_S
 from bridges.crazyflie.pilot import LOGS_S, LOOP_HZ
 from bridges.crazyflie.telemetry import Telemetry
@@ -79,9 +79,11 @@ class Drone:
         self.out, self.order, self._blocks, self._replies = deque(), None, {}, {}
         self.telemetry = Telemetry(lighthouse=False)
         self.telemetry.settled = True
-        self.flight = Flight(fleet.settings, self.telemetry, lambda seconds: self.thread.pause(fleet.now + seconds))
-        self.trajectories = trajectory.Trajectories(self._send_at_once)
-        self.trajectories.memory = fleet.twin.drones[row].memories.kinds.index(crtp.Memory.TRAJECTORY)
+        self.flight = FlightControl(
+            fleet.settings, self.telemetry, lambda seconds: self.thread.pause(fleet.now + seconds)
+        )
+        self.trajectories = trajectory.TrajectoryMemory(self._send_at_once)
+        self.trajectories.memory = fleet.twin.drones[row].memories.kinds.index(crtp.MemoryKind.TRAJECTORY)
         self.trajectories.define()
         self.telemetry.start_logging(self, log_hz=fleet.settings.log_hz, ranges_hz=None)
         fleet.twin.lines[row].queue.clear()  # answers
@@ -209,7 +211,7 @@ class Fleet:
         return self
 
     def order(self, what):
-        """Give an order, a function of a `Flight`, to all."""
+        """Give an order, a function of a `FlightControl`, to all."""
         for drone in self.drones:
             drone.order = what
 
@@ -265,11 +267,11 @@ def flight_of(fleet):
     fleet.ages.clear()
     fleet.order(lambda flight: flight.takeoff(HEIGHT))
     fleet.run(3.0)
-    assert fleet.phases == {Phase.CLIMBING}, fleet.troubles
+    assert fleet.phases == {FlightPhase.CLIMBING}, fleet.troubles
     fleet.run(4.0, speed=0.3)
-    assert fleet.phases == {Phase.FLYING}, fleet.troubles
-    fleet.order(Flight.land)
+    assert fleet.phases == {FlightPhase.FLYING}, fleet.troubles
+    fleet.order(FlightControl.land)
     fleet.run(6.0)
-    assert fleet.phases == {Phase.GROUND}
+    assert fleet.phases == {FlightPhase.GROUND}
     assert not fleet.troubles
     return np.array(fleet.ages)

@@ -11,7 +11,7 @@ from bridges.crazyflie.body import CrazyflieBody
 from tests.bridges.columns import Columns
 from tests.twins.loopback import Served, request
 from twins.devices.crazyflie.device import CrazyflieTwin
-from twins.devices.crazyflie.supervisor import State
+from twins.devices.crazyflie.supervisor import SupervisorState
 
 PATIENCE_S = 30.0
 
@@ -97,4 +97,4 @@ def truth(twin, row=0):
 
 def supervised(twin, row=0):
     """What its supervisor is at."""
-    return State(twin.device.flock.supervisor.state[row])
+    return SupervisorState(twin.device.flock.supervisor.state[row])

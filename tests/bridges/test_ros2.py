@@ -201,7 +201,7 @@ def test_tokens_are_those_of_rmw_zenoh():
         f"@ros2_lv/2/{zid}/0/10/MP/%/%/talker/%chatter/std_msgs::msg::dds_::String_/"
         f"RIHS01_{HASHES['std_msgs/msg/String']}/::,7:,:,:,,"
     )
-    assert ros2.announced("rmw", token) == ros2.Endpoint(
+    assert ros2.announced("rmw", token) == ros2.TopicEndpoint(
         "/chatter", "std_msgs/msg/String", f"RIHS01_{HASHES['std_msgs/msg/String']}", 2
     )
     assert ros2.announced("rmw", f"{token}/cpu%pub") == ros2.announced("rmw", token), "one more since 0.10.5"
@@ -210,7 +210,7 @@ def test_tokens_are_those_of_rmw_zenoh():
     assert not zenoh.KeyExpr(ros2.endpoints("rmw", "MS", "/chatter", domain=2)).intersects(zenoh.KeyExpr(token))
     dds = ros2.dds_token("1f", "MS", "/tb3_0/cmd_vel", ros2.TWIST)
     assert dds.startswith("@/1f/@ros2_lv/MS/tb3_0§cmd_vel/geometry_msgs§msg§Twist/")
-    assert ros2.announced("ros2dds", dds) == ros2.Endpoint("/tb3_0/cmd_vel", ros2.TWIST)
+    assert ros2.announced("ros2dds", dds) == ros2.TopicEndpoint("/tb3_0/cmd_vel", ros2.TWIST)
     assert zenoh.KeyExpr(ros2.endpoints("ros2dds", "MS", "/tb3_0/cmd_vel")).includes(zenoh.KeyExpr(dds))
 
 

@@ -10,7 +10,7 @@ from agents.body.interface import BodyError
 from agents.protocols.crazyflie import device_of
 from bridges.crazyflie.body import CrazyflieBody
 from bridges.khepera4.body import KheperaBody
-from bridges.khepera4.link import Address
+from bridges.khepera4.link import KheperaAddress
 from bridges.tello.body import TelloBody
 from bridges.turtlebot3.body import TurtleBot3
 from tests.bridges import turtlebots
@@ -28,7 +28,7 @@ def crazyflie(port):
 
 
 def khepera(port):
-    address = Address.parse("R0", f"kteam://localhost:{port}")
+    address = KheperaAddress.parse("R0", f"kteam://localhost:{port}")
     return KheperaBody(request("khepera4", [f"khepera4://127.0.0.1:{port}"])), address.device
 
 

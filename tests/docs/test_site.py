@@ -11,7 +11,7 @@ import pytest
 
 from agents.body.interface import BodyRequest, BodyState
 from agents.formation.link import Link
-from agents.plugins.triggers import View
+from agents.plugins.triggers import TriggerView
 from experiments.file import reference
 from experiments.metrics.results import RobotMetrics
 from experiments.recording.topics import TOPICS
@@ -103,5 +103,5 @@ def test_reference_has_every_key_command_topic_and_column(site):
     assert not [name for name, words in pages.items() if "&lt;" in words or "None \\|" in words or "\\| None" in words]
     assert "park/CF01/pose" in text(site / "reference" / "network.html")
     api = text(site / "reference" / "api.html")
-    fields = {name for made in (BodyRequest, BodyState, Link, View) for name in made.__annotations__}
+    fields = {name for made in (BodyRequest, BodyState, Link, TriggerView) for name in made.__annotations__}
     assert not {"simulate", *fields} - set(api.split())

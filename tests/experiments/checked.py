@@ -9,7 +9,7 @@ import msgspec
 
 from agents.body.interface import Disturbance
 from experiments.check.check import check
-from experiments.definition.experiment import Arena, Experiment, Formation, Robot
+from experiments.definition.experiment import Arena, Experiment, Formation, RobotTable
 from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.file.document import Document
@@ -48,7 +48,8 @@ def assert_found(name: str, change: str, expected: tuple[str, str], message: str
 
 
 GROUND = {
-    name: Robot(kind="khepera4", start=[x, y]) for name, x, y in [("A", 0, 0), ("B", 1, 0), ("C", 0, 1), ("D", 1, 1)]
+    name: RobotTable(kind="khepera4", start=[x, y])
+    for name, x, y in [("A", 0, 0), ("B", 1, 0), ("C", 0, 1), ("D", 1, 1)]
 }
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from agents.body.interface import Disturbance, Jitter
 from agents.body.kinds import KINDS
 from agents.decision.lifecycle import RUNNING
-from experiments.definition.experiment import Arena, Experiment, Leg, Rates, Robot, Start
+from experiments.definition.experiment import Arena, Experiment, LegTable, Rates, RobotTable, Start
 from experiments.definition.plan import Plan
 from experiments.virtual_time.simulation import VirtualRunLog, simulate
 from twins.arrays import Array, Mask, norm
@@ -92,7 +92,7 @@ def encounter(
         angle = number * (between if len(kinds) == 2 else 2.0 * math.pi / len(kinds))
         x, y = CIRCLE * math.cos(angle), CIRCLE * math.sin(angle)
         name = f"R{number}"
-        robots[name] = Robot(
+        robots[name] = RobotTable(
             kind=kind,
             start=[x, y, angle + math.pi],
             hover=height if KINDS[kind].flies else None,
@@ -100,7 +100,7 @@ def encounter(
             avoids=number < len(kinds) - stubborn,
         )
         plan = {"kind": "waypoints", "points": [[-x, -y]], "speed": speeds[number]}
-        timeline.append(Leg(at_s=0.0, robot=name, plan=plan))
+        timeline.append(LegTable(at_s=0.0, robot=name, plan=plan))
     wobble = Disturbance(hover_jitter=Jitter(0.01))
     return Experiment(
         title="Robots that change sides",

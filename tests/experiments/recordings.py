@@ -3,7 +3,7 @@
 import numpy as np
 
 from agents.network.messages import Contact, Event, ObstaclePose, Pose, PoseReceipt, State, Status, WorldState
-from experiments.definition.experiment import Experiment, Formation, Rates, Robot
+from experiments.definition.experiment import Experiment, Formation, Rates, RobotTable
 from experiments.definition.plan import Plan
 from experiments.recording.writer import Recording
 
@@ -15,7 +15,7 @@ DOCUMENT = 'title = "pair"  # as it was written\n'
 
 PAIR = Experiment(
     title="pair",
-    robots={"TB01": Robot("turtlebot3", [0.0, 0.0]), "CF01": Robot("crazyflie", [1.0, 0.0], hover=0.8)},
+    robots={"TB01": RobotTable("turtlebot3", [0.0, 0.0]), "CF01": RobotTable("crazyflie", [1.0, 0.0], hover=0.8)},
     duration_s=1.0,
     formation=Formation(links={"TB01 - CF01": 1.0}),
     rates=Rates(state_hz=10.0),

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from experiments.check import check
-from experiments.definition.experiment import Channel, Experiment, Formation, Hybrid, Leg, Robot
+from experiments.definition.experiment import ChannelTable, Experiment, Formation, Hybrid, LegTable, RobotTable
 from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.file.problems import DocumentError
@@ -31,12 +31,12 @@ def cases():
 
 def short(experiment, **parts):
     """Five seconds of it, with a leader that drives."""
-    given = {"duration_s": 5.0, "timeline": [Leg(at_s=3.0, robot="TB01", plan=LINE)], **parts}
+    given = {"duration_s": 5.0, "timeline": [LegTable(at_s=3.0, robot="TB01", plan=LINE)], **parts}
     return msgspec.structs.replace(experiment, **given)
 
 
 def with_delay(experiment, delay_s, architecture="distributed", **more):
-    return msgspec.structs.replace(experiment, channel=Channel(delay_s=delay_s, **more), architecture=architecture)
+    return msgspec.structs.replace(experiment, channel=ChannelTable(delay_s=delay_s, **more), architecture=architecture)
 
 
 FLOWN = {}
@@ -81,7 +81,7 @@ def test_architectures_without_delay_move_the_same(cases, architecture, whole):
 @pytest.mark.parametrize(("update", "seed"), [(None, 1), ("relative-control", 2)])
 def test_motion_is_alike_when_updates_have_events(cases, update, seed):
     formation = msgspec.structs.replace(cases["periodic"].formation, update=update)
-    park = short(cases["periodic"], duration_s=4.0, timeline=[Leg(at_s=2.0, robot="TB01", plan=LINE)],
+    park = short(cases["periodic"], duration_s=4.0, timeline=[LegTable(at_s=2.0, robot="TB01", plan=LINE)],
                  formation=formation)  # fmt: skip
     first = fly(with_delay(park, 0.0), seed)
     for architecture in ("centralised", HYBRID):
@@ -294,8 +294,8 @@ def test_who_is_guided(cases):
 
 
 def test_robots_without_a_formation_are_guided_too():
-    robots = {"A": Robot(kind="khepera4", start=[0.0, 0.0])}
-    plan = Leg(at_s=0.0, robot="A", plan={"kind": "waypoints", "points": [[0.3, 0.0]], "speed": 0.1})
+    robots = {"A": RobotTable(kind="khepera4", start=[0.0, 0.0])}
+    plan = LegTable(at_s=0.0, robot="A", plan={"kind": "waypoints", "points": [[0.3, 0.0]], "speed": 0.1})
     one = Experiment(title="one", duration_s=5.0, robots=robots, timeline=[plan], formation=Formation())
     first, second = (fly(with_delay(one, 0.0, a)) for a in ("distributed", "centralised"))
     assert_same_motion(first, second)

@@ -11,7 +11,7 @@ import numpy as np
 from agents.network.messages import Event
 from agents.plugins.laws import Distance
 from experiments.arrays import PoseTable
-from experiments.definition.experiment import Arena, Experiment, Formation, Leg, Robot
+from experiments.definition.experiment import Arena, Experiment, Formation, LegTable, RobotTable
 from experiments.definition.formation import law_offsets
 from experiments.definition.graph import links
 from experiments.definition.plan import Plan
@@ -35,11 +35,11 @@ def experiment(
     return Experiment(
         title=str(rest.pop("title", "A test")),
         source="Nobody, Nowhere 2020",
-        robots={name: Robot(kind=kind, start=[0.0, 0.0]) for name, kind in robots.items()},
+        robots={name: RobotTable(kind=kind, start=[0.0, 0.0]) for name, kind in robots.items()},
         duration_s=45.0,
         arena=rest.pop("arena", Arena(size=(4.0, 4.0, 2.5))),
         formation=Formation(links=dict(formation), leader=leader),
-        timeline=[Leg(at_s=at, robot=next(iter(robots)), plan="hold") for at in legs],
+        timeline=[LegTable(at_s=at, robot=next(iter(robots)), plan="hold") for at in legs],
     )
 
 

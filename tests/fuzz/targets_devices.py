@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from agents.protocols import vicon_datastream
-from agents.protocols.vicon_datastream import Kind, Segment
+from agents.protocols.vicon_datastream import BlockKind, Segment
 from tests.fuzz.sockets import Wire
 from tests.fuzz.target import Place, Renewed, Target
 from tests.twins.loopback import request as twin_request
@@ -159,7 +159,7 @@ def vicon_bridge() -> Iterator[Target]:
             for begin in range(0, len(data), 4000):
                 for body in framer.feed(data[begin : begin + 4000]):
                     for kind, payload in vicon_datastream.blocks(body):
-                        if kind == Kind.OBJECT_ENUMS:
+                        if kind == BlockKind.OBJECT_ENUMS:
                             vicon_datastream.unpack_kinds(payload)
                     frame = decoder.frame(body)
                     if frame is not None:
@@ -168,15 +168,15 @@ def vicon_bridge() -> Iterator[Target]:
 
         return take
 
-    yield Target(_vicon_stream(), Renewed(make, 300), (vicon_datastream.Malformed,))
+    yield Target(_vicon_stream(), Renewed(make, 300), (vicon_datastream.MalformedBlock,))
 
 
 def vicon_twin() -> Iterator[Target]:
     """What a client sends to the server."""
     from twins.devices.vicon import ViconTwin, _Client  # noqa: PLC0415
 
-    ask = vicon_datastream.packet(vicon_datastream.block(Kind.REQUEST_FRAME, b"\1"))
-    one = vicon_datastream.packet(vicon_datastream.block(Kind.REQUEST_NEXT_FRAME))
+    ask = vicon_datastream.packet(vicon_datastream.block(BlockKind.REQUEST_FRAME, b"\1"))
+    one = vicon_datastream.packet(vicon_datastream.block(BlockKind.REQUEST_NEXT_FRAME))
     vicon = ViconTwin(["cf1", "kh1"])
     t = 0.0
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from agents.protocols import crtp
-from agents.protocols.crtp import HighLevel, Log, Misc, Port, Safety, Setpoint
+from agents.protocols.crtp import HighLevel, Log, Misc, Port, Setpoint, SupervisorCommand
 from tests.fuzz.sockets import Wire
 from tests.fuzz.target import Place, Renewed, Target
 from tests.twins.loopback import request as twin_request
@@ -31,7 +31,7 @@ def crazyflie_twin() -> Iterator[Target]:
     climb = crtp.CLIMB.pack(0.5, 0.0, True, 1.0)
     pose = crtp.POSE.pack(0.1, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0)
     full = crtp.FULL_STATE.pack(100, 200, 300, 0, 0, 0, 0, 0, 0, 0xC0000000, 0, 0, 0)
-    arm = packet(Port.SUPERVISOR, 1, bytes((Safety.ARM, 1)))
+    arm = packet(Port.SUPERVISOR, 1, bytes((SupervisorCommand.ARM, 1)))
     up = arm + packet(Port.HIGH_LEVEL, 0, bytes((HighLevel.TAKEOFF, 0)) + climb)
     examples = [
         packet(Port.LINK, 1, b"hello"), b"\1\xff", packet(Port.PLATFORM, 1, b"\0"), packet(Port.LINK, 0, b"echo"),
@@ -66,7 +66,8 @@ def crazyflie_twin() -> Iterator[Target]:
         packet(Port.LOCATION, 1, b"\2\1\1" + crtp.VECTOR.pack(0.1, 0.2, 0.3)), packet(Port.LOCATION, 1,
         b"\x0b\3\0\3\0"),
         packet(Port.LOCATION, 1, b"\3"), packet(Port.LOCATION, 1, b"\4"),
-        *(packet(Port.SUPERVISOR, 1, bytes((kind, 1))) for kind in Safety), packet(Port.SUPERVISOR, 0, b"\x0c"),
+        *(packet(Port.SUPERVISOR, 1, bytes((kind, 1))) for kind in SupervisorCommand),
+        packet(Port.SUPERVISOR, 0, b"\x0c"),
     ]  # fmt: skip
 
     def make():

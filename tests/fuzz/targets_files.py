@@ -402,7 +402,7 @@ def words() -> Iterator[Target]:
     from agents.network import zenoh_config as sessions  # noqa: PLC0415
     from agents.protocols import crazyflie, khepera4, tello, turtlebot3  # noqa: PLC0415
     from bridges.crazyflie.positioning import stations  # noqa: PLC0415
-    from bridges.khepera4.link import Address  # noqa: PLC0415
+    from bridges.khepera4.link import KheperaAddress  # noqa: PLC0415
     from bridges.vicon.publisher import parse_server  # noqa: PLC0415
     from experiments.definition.links import link_pairs  # noqa: PLC0415
     from tools.commands.network import key_expression  # noqa: PLC0415
@@ -425,7 +425,7 @@ def words() -> Iterator[Target]:
         read: dict[str, Callable[[str], object]] = {
             "endpoint": lambda text: sessions.config(sessions.settings("client", connect=[text], listen=[text])),
             "crazyflie": lambda text: crazyflie.address("R1", text),
-            "khepera": lambda text: Address.parse("R1", text),
+            "khepera": lambda text: KheperaAddress.parse("R1", text),
             "tello": lambda text: tello.endpoint("R1", text),
             "turtlebot": lambda text: turtlebot3.address("R1", text, turtlebot3.TurtleBot3Settings()),
             "vicon": parse_server,

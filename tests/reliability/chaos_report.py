@@ -14,7 +14,7 @@ from agents.errors import ExplainedError
 from experiments.metrics.measure import measure
 from experiments.recording import playback
 from experiments.recording.reader import recover
-from experiments.report.page import NONE, Finding
+from experiments.report.page import NONE, VerdictLine
 from tests.reliability.faults import FAULTS, Fault
 
 
@@ -102,20 +102,20 @@ def table(result: ChaosResult) -> list[tuple[str, ...]]:
     return rows
 
 
-def findings(result: ChaosResult) -> list[Finding]:
+def findings(result: ChaosResult) -> list[VerdictLine]:
     """The verdict; bad findings are violations, or faults that could not be done."""
     done, wanted, rounds = len(result.outcomes), len(result.script), result.rounds
     nearest = min((each.nearest_m for each in rounds), default=math.inf)
     late = max((each.gone_s for each in rounds), default=0.0)
     found = [
-        Finding("good" if done == wanted else "bad", f"{done} of {wanted} faults in {len(rounds)} rounds"),
-        Finding("plain", f"robots came as near as {nearest:.3f} m to each other, surface to surface"),
-        Finding("plain", f"after the end of a round all of its processes were gone within {late:.1f} s"),
+        VerdictLine("good" if done == wanted else "bad", f"{done} of {wanted} faults in {len(rounds)} rounds"),
+        VerdictLine("plain", f"robots came as near as {nearest:.3f} m to each other, surface to surface"),
+        VerdictLine("plain", f"after the end of a round all of its processes were gone within {late:.1f} s"),
     ]
     for each in rounds:
         if each.missed > BUSY:
             text = f"the machine was too busy, {100 * each.missed:.0f} % of ticks were missed"
-            found.append(Finding("fair", f"round {each.round}: {text}"))
+            found.append(VerdictLine("fair", f"round {each.round}: {text}"))
     wrong = [line(each) for each in result.outcomes if each.violations]
     wrong += [f"round {each.round}: {text}" for each in rounds for text in each.violations]
-    return found + ([Finding("bad", text) for text in wrong] or [Finding("good", "0 violations")])
+    return found + ([VerdictLine("bad", text) for text in wrong] or [VerdictLine("good", "0 violations")])

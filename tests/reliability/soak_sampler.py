@@ -18,7 +18,7 @@ import msgspec
 
 from agents.safety.hazards import failed
 from experiments.definition.plan import Plan
-from experiments.real_time.conductor.run_view import News, Progress, RobotView
+from experiments.real_time.conductor.run_view import EventFeed, Progress, RobotView
 from experiments.real_time.hosts.launcher import RUN, tagged
 from tests.reliability.spoilt_process import CONDUCTOR, OTHER, role_of
 
@@ -95,7 +95,7 @@ class Sampler(ExitStack):
         self._recording, self._table = folder / f"{case}.mcap", folder / TABLE
         self._delays: dict[str, list[float]] = {name: [] for name in experiment.robots}  # since the last sample [s]
         self._failed: dict[str, str] = {}
-        self._news = News()
+        self._news = EventFeed()
         self._every = min(SAMPLE_S, experiment.duration_s / SAMPLES)
         self._due, self._print_due = self._every, PRINT_S
         os.environ[RUN] = self._tag = secrets.token_hex(8)  # processes of the run inherit it

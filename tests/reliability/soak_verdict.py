@@ -6,7 +6,7 @@ import statistics
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Final, NamedTuple
 
-from experiments.report.page import NONE, Finding
+from experiments.report.page import NONE, VerdictLine
 from tests.reliability.soak_sampler import Soaked, SoakSample
 
 WARM_SHARE: Final = 0.5  # of the run that does not count (a recorder fills its pools for 150 s), but not more than
@@ -53,13 +53,13 @@ def ends(soaked: Soaked) -> dict[str, Ends]:
     return found
 
 
-def judge(soaked: Soaked) -> list[Finding]:
+def judge(soaked: Soaked) -> list[VerdictLine]:
     """The verdict; bad findings fail it."""
     both, last = ends(soaked), {row.process: row for row in soaked.rows}
     found = [*_alive(soaked), _memory(soaked, both)]
 
     def add(wrong: str, right: str) -> None:
-        found.append(Finding("bad", wrong) if wrong else Finding("good", right))
+        found.append(VerdictLine("bad", wrong) if wrong else VerdictLine("good", right))
 
     def total(field: str) -> int:
         return sum(getattr(row, field) or 0 for row in last.values())
@@ -73,7 +73,7 @@ def judge(soaked: Soaked) -> list[Finding]:
     untested = "" if received else "no pose was received: nothing was tested"
     add(f"lost poses: {lost}" if lost else untested, f"0 of {received} poses were lost")
     if malformed := total("malformed"):
-        found.append(Finding("bad", f"{malformed} payloads were refused as malformed"))
+        found.append(VerdictLine("bad", f"{malformed} payloads were refused as malformed"))
     windows = [
         [row.delay_s for each in both.values() for row in each[end] if row.delay_s is not None] for end in (0, 1)
     ]
@@ -82,41 +82,41 @@ def judge(soaked: Soaked) -> list[Finding]:
         longest = max(row.longest_s or 0.0 for row in soaked.rows)
         text = f"{1e3 * before:.2f} ms at first, {1e3 * after:.2f} ms at last, {1e3 * longest:.0f} ms at most"
         slow = after > max(SLOWER * before, DELAY_S)
-        found.append(Finding("bad" if slow else "good", f"delay of poses: {text}"))
+        found.append(VerdictLine("bad" if slow else "good", f"delay of poses: {text}"))
     if ticks := total("ticks"):
         share = total("missed") / ticks
         text = f"{total('missed')} of {ticks} ticks were missed ({100.0 * share:.3f} %)"
-        found.append(Finding("good" if share < MISSED else "fair", text))
+        found.append(VerdictLine("good" if share < MISSED else "fair", text))
     return found
 
 
-def passed(findings: Sequence[Finding]) -> bool:
+def passed(findings: Sequence[VerdictLine]) -> bool:
     """Whether nothing is bad."""
     return all(finding.mark != "bad" for finding in findings)
 
 
-def _alive(soaked: Soaked) -> list[Finding]:
+def _alive(soaked: Soaked) -> list[VerdictLine]:
     lasted, sampled = max((row.time_s for row in soaked.rows), default=0.0), {row.process for row in soaked.rows}
     bad = [f"{name} {what}" for name, what in soaked.failed.items()]
     bad += [f"{name} never had a process" for name in soaked.robots if name not in sampled | soaked.failed.keys()]
     if soaked.interrupted:
         bad.append(f"it was interrupted after {lasted:.0f} s of {soaked.duration_s:g} s")
     good = f"all {len(soaked.robots)} robots lived through {lasted / 60.0:.1f} minutes"
-    return [Finding("bad", text) for text in bad] or [Finding("good", good)]
+    return [VerdictLine("bad", text) for text in bad] or [VerdictLine("good", good)]
 
 
-def _memory(soaked: Soaked, both: Mapping[str, Ends]) -> Finding:
+def _memory(soaked: Soaked, both: Mapping[str, Ends]) -> VerdictLine:
     if not both:
-        return Finding("bad", "too few samples to compare beginning and end: let it run longer")
+        return VerdictLine("bad", "too few samples to compare beginning and end: let it run longer")
     grown = {process: each.growth for process, each in both.items()}
     most = max(grown, key=lambda process: grown[process])
     text = f"memory: largest growth after {warm_s(soaked):.0f} s is {100 * grown[most]:+.2f} % ({most})"
     if soaked.duration_s < JUDGED_S:
-        return Finding("plain", f"{text}; not judged below {JUDGED_S / 60:.0f} minutes")
+        return VerdictLine("plain", f"{text}; not judged below {JUDGED_S / 60:.0f} minutes")
     beyond = ", ".join(f"{process} {100 * growth:+.2f} %" for process, growth in grown.items() if growth > GROWTH)
     if beyond:
-        return Finding("bad", f"memory grows beyond {100 * GROWTH:g} %: {beyond}")
-    return Finding("good", f"{text}, within {100 * GROWTH:g} %")
+        return VerdictLine("bad", f"memory grows beyond {100 * GROWTH:g} %: {beyond}")
+    return VerdictLine("good", f"{text}, within {100 * GROWTH:g} %")
 
 
 def table(soaked: Soaked) -> list[tuple[str, ...]]:

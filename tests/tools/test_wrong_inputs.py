@@ -11,7 +11,7 @@ import msgspec
 import pytest
 
 from experiments.check.safety import devices, libraries
-from experiments.definition.experiment import Robot
+from experiments.definition.experiment import RobotTable
 from experiments.definition.plan import Plan
 from experiments.file.document import loads
 from tools.main import main
@@ -181,7 +181,9 @@ def test_a_missing_library_is_a_finding(monkeypatch: pytest.MonkeyPatch) -> None
 
 @pytest.mark.parametrize(("second", "same"), [("ROVER://192.0.2.7:5005/", True), ("rover://192.0.2.7:5006", False)])
 def test_two_robots_with_one_devices_address_are_found(second: str, same: bool) -> None:
-    robots = {name: Robot(kind="khepera4", start=[0.0, 0.0], body="world") for name in ("RV01", "RV02", "RV03", "RV04")}
+    robots = {
+        name: RobotTable(kind="khepera4", start=[0.0, 0.0], body="world") for name in ("RV01", "RV02", "RV03", "RV04")
+    }
     for name, body in (("RV01", "rover://192.0.2.7:5005"), ("RV03", second)):
         robots[name] = msgspec.structs.replace(robots[name], body=body)
 

@@ -5,11 +5,11 @@ import struct
 
 import numpy as np
 
-from agents.protocols.crtp import HighLevel, Port, Safety, Setpoint
+from agents.protocols.crtp import HighLevel, Port, Setpoint, SupervisorCommand
 from tests.twins.loopback import request
 from twins.devices.crazyflie.drone import Drone
 from twins.devices.crazyflie.flock import Flock
-from twins.devices.crazyflie.supervisor import State
+from twins.devices.crazyflie.supervisor import SupervisorState
 from twins.devices.device import Faults
 
 DT = 0.01
@@ -41,7 +41,7 @@ class Wire:
 
     @property
     def state(self):
-        return State(self.flock.supervisor.state[0])
+        return SupervisorState(self.flock.supervisor.state[0])
 
     @property
     def motors(self):
@@ -95,7 +95,7 @@ class Wire:
         self.put(Port.SETPOINT, 1, 0, struct.pack("<I", 0))
 
     def arm(self, on=True):
-        ((_, _, answer),) = self.put(Port.SUPERVISOR, 1, int(Safety.ARM), int(on))
+        ((_, _, answer),) = self.put(Port.SUPERVISOR, 1, int(SupervisorCommand.ARM), int(on))
         return answer
 
     def hovering(self, height=1.0):

@@ -26,7 +26,7 @@ DEPTH: Final = 8192  # samples between two polls
 
 
 @dataclass
-class Member:
+class NetworkMember:
     """A session on the network: its name, its Zenoh id, and the keys that it holds."""
 
     name: str
@@ -51,7 +51,7 @@ def key_expression(text: str) -> str:
         raise ExplainedError(f"'{text}' is not a key expression: {why}. Write it like park/*/pose") from None
 
 
-def members(session: zenoh.Session, timeout_s: float = 2.0) -> list[Member]:
+def members(session: zenoh.Session, timeout_s: float = 2.0) -> list[NetworkMember]:
     """Members of the network, by name, from the admin space of routers and members of a mesh, without `session` itself.
 
     A frozen process is still listed, for its router knows it; only its name is then unknown.
@@ -74,7 +74,9 @@ def members(session: zenoh.Session, timeout_s: float = 2.0) -> list[Member]:
     mine = str(session.zid())
     everyone = (held.keys() | names.keys()) - {mine}
     found = [
-        Member(names.get(owner) or "?", owner, **{kind: sorted(keys) for kind, keys in held.get(owner, {}).items()})
+        NetworkMember(
+            names.get(owner) or "?", owner, **{kind: sorted(keys) for kind, keys in held.get(owner, {}).items()}
+        )
         for owner in everyone
     ]
     return sorted(found, key=lambda member: (member.name, member.id))

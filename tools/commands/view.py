@@ -19,11 +19,11 @@ if TYPE_CHECKING:
     import zenoh
     from rich.console import Group
 
-    from experiments.real_time.hosts.run_registry import Run
+    from experiments.real_time.hosts.run_registry import RegisteredRun
     from experiments.run import Watch
-    from experiments.view.acting import Watched
-    from experiments.view.replay import Clock
-    from experiments.view.serving import Server
+    from experiments.view.acting import WatchedRun
+    from experiments.view.replay import ReplayClock
+    from experiments.view.serving import PageServer
     from tools.live_table import LiveRow
 
 app: Final = typer.Typer()
@@ -105,7 +105,7 @@ def top(
 class _Top:
     """The table of a run that is seen from outside."""
 
-    def __init__(self, session: zenoh.Session, watched: Watched) -> None:
+    def __init__(self, session: zenoh.Session, watched: WatchedRun) -> None:
         from agents.network.keys import Keys
         from experiments.view.observer import Observer
         from tools.live_table import Trends
@@ -199,7 +199,7 @@ def replay(
     from agents.network.shutdown import closing_cleanly
     from agents.runtime.command_line import on_termination
     from experiments.view.broadcast import Broadcast
-    from experiments.view.replay import Clock
+    from experiments.view.replay import ReplayClock
 
     file = _recordings(Path(run), case)[0]
     ended = threading.Event()
@@ -209,7 +209,7 @@ def replay(
         with closing_cleanly(opened) as (session, declared):
             played = Broadcast(session, file, realm)
             declared.append(played)
-            clock = Clock(0.0, played.end - played.begin)
+            clock = ReplayClock(0.0, played.end - played.begin)
             clock.playing, clock.speed, clock.loop = True, rate, loop
             if sys.stdin.isatty():
                 threading.Thread(target=_pause_on_enter, args=(clock,), daemon=True).start()
@@ -217,7 +217,7 @@ def replay(
             print(f"messages sent: {played.run(ended, clock, endpoints)}")
 
 
-def _pause_on_enter(clock: Clock) -> None:
+def _pause_on_enter(clock: ReplayClock) -> None:
     for _ in sys.stdin:
         clock.playing = not clock.playing
         print("plays" if clock.playing else f"paused at {clock.t:.1f} s", flush=True)
@@ -274,7 +274,7 @@ def paced(pace: float) -> Iterator[Watch]:
         yield PacedView(server, pace=pace, dark=False).begin
 
 
-def _running_run(folder: Path, *, wait_s: float, ended: threading.Event) -> Run | None:
+def _running_run(folder: Path, *, wait_s: float, ended: threading.Event) -> RegisteredRun | None:
     """The run of a folder, if it is up, or is within `wait_s` [s]."""
     import time
 
@@ -287,10 +287,10 @@ def _running_run(folder: Path, *, wait_s: float, ended: threading.Event) -> Run 
             return found
 
 
-def _of_run(run: Run, identity: str | None) -> Watched:
-    from experiments.view.acting import Watched
+def _of_run(run: RegisteredRun, identity: str | None) -> WatchedRun:
+    from experiments.view.acting import WatchedRun
 
-    return Watched(run.endpoints, run.realm, identity or _default_identity(run.endpoints), run)
+    return WatchedRun(run.endpoints, run.realm, identity or _default_identity(run.endpoints), run)
 
 
 def _replay(folder: Path, ended: threading.Event, *, port: int, dark: bool, open_page: bool) -> int:
@@ -307,13 +307,13 @@ def _replay(folder: Path, ended: threading.Event, *, port: int, dark: bool, open
     return 0
 
 
-def _watched(connect: list[str] | None, realm: str, lab: str | None, identity: str | None) -> Watched:
+def _watched(connect: list[str] | None, realm: str, lab: str | None, identity: str | None) -> WatchedRun:
     """The run on the command line, else the newest one of this machine."""
     from experiments.real_time.hosts import run_registry
-    from experiments.view.acting import Watched
+    from experiments.view.acting import WatchedRun
 
     if given := routers(connect, lab):
-        return Watched(given, realm, identity or _default_identity(given))
+        return WatchedRun(given, realm, identity or _default_identity(given))
     up = [run for run in run_registry.runs() if run.what == "run" and run.alive]
     if not up:
         raise ExplainedError(
@@ -332,7 +332,9 @@ def _default_identity(endpoints: Sequence[str]) -> str:
     return "operator" if lab_of(endpoints) is None else "observer"
 
 
-def _live(watched: Watched, ended: threading.Event, *, port: int, dark: bool, open_page: bool, with_run: bool) -> None:
+def _live(
+    watched: WatchedRun, ended: threading.Event, *, port: int, dark: bool, open_page: bool, with_run: bool
+) -> None:
     from agents.network.session import open_session
     from agents.network.shutdown import closing_cleanly
     from experiments.view import live
@@ -352,7 +354,7 @@ def _live(watched: Watched, ended: threading.Event, *, port: int, dark: bool, op
         page.close(f"the view has ended{f' with the run: ./zenpark view {folder} plays it' if folder else ''}")
 
 
-def _tell(server: Server, what: str, *, open_page: bool, to: TextIO | None = None) -> None:
+def _tell(server: PageServer, what: str, *, open_page: bool, to: TextIO | None = None) -> None:
     print(f"{server.address}  {what}", flush=True, file=to)
     if open_page:
         open_in_browser(server.address_for_once(), server.address)

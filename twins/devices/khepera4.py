@@ -20,7 +20,7 @@ from twins.arrays import Array
 from twins.body import instants
 from twins.devices.device import DeviceRequest, Faults, FaultyLink
 from twins.models.differential import Differential
-from twins.models.disturbance import Drift, Latency
+from twins.models.disturbance import Latency, OdometryDrift
 from twins.models.noise import refill
 
 GARBAGE: Final = (3.0, -2.0)  # [m] goal of servers without a goal from a client: the content of the memory
@@ -29,14 +29,14 @@ SELECT_S: Final = 1.0  # [s] that of 2023-04-10, and
 MAIN_S: Final = 0.02  # [s] that of 2025-05, whether or not there are commands
 
 
-class _Robot:
+class _WheeledRobot:
     """A robot below its server: wheels, encoders and battery."""
 
     def __init__(self, body: BodyRequest, row: int, faults: Faults) -> None:
         self._dt, self._faults = 1.0 / body.rate_hz, faults
         self.model = Differential(body.kinds[row], body.start[row], body.yaw[row])
         disturbance, name, seed = body.disturbance[row], body.names[row], body.seeds[row]
-        self._latency, self._drift = Latency(disturbance, self._dt), Drift(disturbance, name, seed)
+        self._latency, self._drift = Latency(disturbance, self._dt), OdometryDrift(disturbance, name, seed)
         self.charge = faults.battery
         self.pulses = (0.0, 0.0)  # of the left and the right encoder, since power-on
         self.speed = (0.0, 0.0)  # units
@@ -84,7 +84,7 @@ class ParkProgram:
     The loop reads the encoders, lets the controller drive if a goal was set, and waits for one command.
     """
 
-    def __init__(self, robot: _Robot, name: str) -> None:
+    def __init__(self, robot: _WheeledRobot, name: str) -> None:
         self.robot, self.name, self.kind = robot, name, protocol.PARK[name]
         self._last = robot.pulses
         self._place = [0.0, 0.0]  # [m]
@@ -201,7 +201,7 @@ class ParkProgram:
         self.robot.drive(int((v - half) / unit), int((v + half) / unit))
 
 
-def answer_kteam(robot: _Robot, line: str) -> str:
+def answer_kteam(robot: _WheeledRobot, line: str) -> str:
     """Answer of K-Team's `kh4server` to a line; `$` for an unknown command."""
     letter = line[:1]
     try:
@@ -246,7 +246,7 @@ def answer_kteam(robot: _Robot, line: str) -> str:
 class _Server:
     """Port of one robot: serves one client; others wait until that client has left, or for ever."""
 
-    def __init__(self, robot: _Robot, name: str, faults: Faults, listener: socket.socket) -> None:
+    def __init__(self, robot: _WheeledRobot, name: str, faults: Faults, listener: socket.socket) -> None:
         self.robot, self.listener = robot, listener
         self.program = ParkProgram(robot, name) if name in protocol.PARK else None
         self._answers = FaultyLink[bytes](faults)
@@ -329,7 +329,7 @@ class KheperaDevice:
             for row, choice in enumerate(chosen):
                 listener = _listen(body.names[row], body.addresses[row])
                 server = choice.server or protocol.NEWEST
-                robot = _Robot(body, row, request.faults)
+                robot = _WheeledRobot(body, row, request.faults)
                 self.servers.append(_Server(robot, server, request.faults, listener))
                 host, port = listener.getsockname()
                 addresses.append(f"{'kteam' if server == 'kteam' else 'khepera4'}://{host}:{port}")

@@ -22,13 +22,13 @@ from agents.network import session as network
 from agents.protocols import ros2, turtlebot3
 from agents.protocols.ros2 import Message
 from agents.protocols.ros2_node import Participant, Publisher, Subscriber
-from agents.protocols.turtlebot3 import Address, TurtleBot3Settings
+from agents.protocols.turtlebot3 import TurtleBot3Settings, TurtleBotAddress
 from agents.vectors import clamp
 from twins.arrays import Array
 from twins.body import instants
 from twins.devices.device import DeviceRequest, FaultyLink
 from twins.models.differential import Differential
-from twins.models.disturbance import Drift, Measurement
+from twins.models.disturbance import MeasurementNoise, OdometryDrift
 from twins.models.noise import refill
 
 JOIN_S: Final = 5.0  # deadline of the router's answer
@@ -47,7 +47,7 @@ class _Node:
     watchdog: float
 
 
-class _Robot:
+class _TurtleBot:
     """Wheels, odometry and node of one robot."""
 
     def __init__(self, node: _Node, body: BodyRequest, row: int) -> None:
@@ -55,8 +55,8 @@ class _Robot:
         self.model = Differential(body.kinds[row], body.start[row], body.yaw[row])
         self.start = (*body.start[row][:2], body.yaw[row])
         disturbance, name, seed = body.disturbance[row], body.names[row], body.seeds[row]
-        self._measurement = Measurement(disturbance, name, seed, spatial=False)
-        self._drift = Drift(disturbance, name, seed)
+        self._measurement = MeasurementNoise(disturbance, name, seed, spatial=False)
+        self._drift = OdometryDrift(disturbance, name, seed)
         self.twist = (0.0, 0.0)  # v [m/s], ω [rad/s]
         self.commanded = -inf  # time of the last command [s]
         self.executed = 0  # commands
@@ -100,7 +100,7 @@ class TurtleBot3Twin:
         random = np.random.default_rng([body.seeds[0], 0x7B3])
         self.link = FaultyLink[tuple[Publisher, bytes]](request.faults, random)
         self._sessions: dict[tuple[str, ...], zenoh.Session] = {}
-        self.robots: list[_Robot] = []
+        self.robots: list[_TurtleBot] = []
         addresses = []
         self._clock = body.clock
         participants: dict[tuple[object, ...], Participant] = {}
@@ -114,14 +114,14 @@ class TurtleBot3Twin:
                 which = (endpoints, where.style, where.distro, where.domain)
                 if which not in participants:
                     participants[which] = self._participant(endpoints, where)
-                self.robots.append(_Robot(_node(participants[which], where, chosen), body, row))
+                self.robots.append(_TurtleBot(_node(participants[which], where, chosen), body, row))
                 addresses.append(str(where))
         except BaseException:
             self.close()
             raise
         self.addresses = tuple(addresses)
 
-    def _participant(self, endpoints: tuple[str, ...], where: Address) -> Participant:
+    def _participant(self, endpoints: tuple[str, ...], where: TurtleBotAddress) -> Participant:
         if endpoints not in self._sessions:
             session = network.open_session(endpoints, name="turtlebot3-twin", wait_s=JOIN_S, identity="twin")
             self._sessions[endpoints] = session
@@ -264,7 +264,7 @@ class TurtleBot3Twin:
             self._publish(node.battery, node.types, message)
 
 
-def _node(participant: Participant, where: Address, chosen: TurtleBot3Settings) -> _Node:
+def _node(participant: Participant, where: TurtleBotAddress, chosen: TurtleBot3Settings) -> _Node:
     """The node of one robot."""
     kind = turtlebot3.command_type(where.distro, chosen.stamped)
     node = participant.node("turtlebot3_node", where.namespace)

@@ -23,7 +23,7 @@ from agents.network import session as network
 from agents.network.keys import Keys
 from agents.network.shutdown import Farewell, closing_cleanly, end
 from agents.protocols import vicon_datastream
-from agents.protocols.vicon_datastream import Framer, Kind, Malformed, Segment
+from agents.protocols.vicon_datastream import BlockKind, Framer, MalformedBlock, Segment
 from agents.runtime import command_line
 from agents.runtime.command_line import NetworkLaunch, on_termination
 from agents.runtime.lifeline import Lifeline
@@ -149,14 +149,14 @@ class ViconTwin:
                 return
             for body in client.framer.feed(received):
                 for kind, payload in vicon_datastream.blocks(body):
-                    if kind == Kind.REQUEST_FRAME:
+                    if kind == BlockKind.REQUEST_FRAME:
                         client.streams = payload[:1] == b"\x01"
                         client.asked += not client.streams
-                    elif kind == Kind.REQUEST_NEXT_FRAME:
+                    elif kind == BlockKind.REQUEST_NEXT_FRAME:
                         client.asked += 1
         except BlockingIOError:
             return
-        except (OSError, Malformed):
+        except (OSError, MalformedBlock):
             self._drop(connection)
 
     def _drop(self, connection: socket.socket) -> None:
@@ -248,7 +248,7 @@ class TruthSubscription:
         vicon.latency_s = max(0.0, float(age[fresh].mean())) if fresh.any() else 0.0
 
 
-class TwinLaunch(NetworkLaunch, frozen=True, kw_only=True, rename="kebab"):
+class ViconTwinLaunch(NetworkLaunch, frozen=True, kw_only=True, rename="kebab"):
     """A simulated Vicon that sees simulated robots."""
 
     robots: Annotated[list[str], Meta(title="ROBOT", description="their names are the subjects'")]
@@ -267,7 +267,7 @@ def parse_address(text: str) -> tuple[str, int]:
     return host, int(port)
 
 
-def run(launch: TwinLaunch) -> int:
+def run(launch: ViconTwinLaunch) -> int:
     """Run the twin until a signal, or until its lifeline is lost and the robots are gone; returns the exit code."""
     host, port = parse_address(launch.listen)
     faults = msgspec.json.decode(launch.faults, type=Faults)
@@ -313,7 +313,7 @@ def run(launch: TwinLaunch) -> int:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line of the process."""
-    return command_line.run("vicon twin", TwinLaunch, run, arguments, (ValueError, RecursionError))
+    return command_line.run("vicon twin", ViconTwinLaunch, run, arguments, (ValueError, RecursionError))
 
 
 if __name__ == "__main__":

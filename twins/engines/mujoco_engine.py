@@ -23,7 +23,7 @@ from twins.arrays import Array, Index, Mask, any_true, clamp, norm
 from twins.engines.crazyflie_cascade import RATE_HZ, Firmware
 from twins.engines.engine import EngineFactory, EngineInput, Mirrored, Planar, Pose, Touch
 from twins.engines.mujoco_model import mjcf
-from twins.engines.point_mass import Moving, Orders, model, require_models
+from twins.engines.point_mass import MotionOrders, Moving, model, require_models
 from twins.models.onboard_flight import OnboardFlight
 from twins.models.quadrotor import GRAVITY
 from twins.scene import Scene
@@ -47,7 +47,7 @@ class RigidBody(EngineFactory, frozen=True):
         return RigidBodyEngine(stage, self.motor_lag_s)
 
 
-class RigidBodyEngine(Orders["Drone | Moving"]):
+class RigidBodyEngine(MotionOrders["MujocoDrone | Moving"]):
     """Implements `twins.engines.engine.Engine`; ground robots are those of the point-mass engine."""
 
     def __init__(self, stage: EngineInput, motor_lag: float) -> None:
@@ -56,7 +56,7 @@ class RigidBodyEngine(Orders["Drone | Moving"]):
         self._dt, self._scene = stage.dt, stage.scene
         self._air = [row for row, kind in enumerate(stage.kinds) if kind.flies and not stage.mirrored[row]]
         self.drones = Drones([stage.kinds[row] for row in self._air], stage.dt, scene=stage.scene, motor_lag=motor_lag)
-        self.motions: list[Drone | Moving] = []
+        self.motions: list[MujocoDrone | Moving] = []
         for row, kind in enumerate(stage.kinds):
             start, yaw = stage.start[row], stage.yaw[row]
             if stage.mirrored[row]:
@@ -92,11 +92,11 @@ class RigidBodyEngine(Orders["Drone | Moving"]):
     def _update_attitudes(self) -> None:
         """Update the attitude of what stays upright."""
         for motion in self.motions:
-            if not isinstance(motion, Drone):
+            if not isinstance(motion, MujocoDrone):
                 motion.attitude = _upright_quaternion(motion.yaw)
 
 
-class Drone(OnboardFlight):
+class MujocoDrone(OnboardFlight):
     """Setpoints and state of one of the drones that `Drones` moves.
 
     Heights are those of the centre of mass relative to standing on the floor [m]; yaw has no jumps.
@@ -176,21 +176,21 @@ class Drones:
         self._wobble = np.zeros((rows, 2))
         self._angles = np.zeros((rows, 3))
         self._yaw, self._heading = np.zeros(rows), np.zeros(rows)  # yaw, and its setpoint [rad]
-        self._drones: list[Drone] = []
+        self._drones: list[MujocoDrone] = []
 
-    def add(self, kind: Kind, start: Vector, yaw: float) -> Drone:
+    def add(self, kind: Kind, start: Vector, yaw: float) -> MujocoDrone:
         """The next drone, at rest at `start` [m], `yaw` [rad]."""
-        drone = Drone(self, len(self._drones), kind, start, yaw)
+        drone = MujocoDrone(self, len(self._drones), kind, start, yaw)
         self._drones.append(drone)
         return drone
 
-    def blow(self, drone: Drone) -> None:
+    def blow(self, drone: MujocoDrone) -> None:
         """Push a drone by its wind, as a slant of gravity in a model of its own."""
         model = copy.copy(self._models[drone.row])
         model.opt.gravity[:2] = drone.wind
         self._models[drone.row] = model
 
-    def start_motors(self, drone: Drone) -> bool:
+    def start_motors(self, drone: MujocoDrone) -> bool:
         """Prepare a take-off; returns whether the drone stands upright."""
         row = drone.row
         if not self._tilt_cosine(slice(row, row + 1))[0] > TIPPED:
@@ -202,7 +202,7 @@ class Drones:
         self._quiet[row] = 0.0
         return True
 
-    def place(self, drone: Drone) -> None:
+    def place(self, drone: MujocoDrone) -> None:
         """Set the state of a drone to its position and yaw, at rest."""
         row = drone.row
         rows = np.array([row])

@@ -75,7 +75,7 @@ def moving_models(stage: EngineInput) -> list[Moving]:
 MotionT = TypeVar("MotionT", bound=Motion)
 
 
-class Orders(Generic[MotionT]):
+class MotionOrders(Generic[MotionT]):
     """Orders to robots by their rows."""
 
     motions: list[MotionT]
@@ -111,7 +111,7 @@ class Orders(Generic[MotionT]):
                 motion.show(position, yaw, velocity)
 
 
-class PointMassEngine(Orders[Moving]):
+class PointMassEngine(MotionOrders[Moving]):
     """Implements `twins.engines.engine.Engine`. Its robots may as well be moved one by one, see `twins.body.Twin`."""
 
     def __init__(self, motions: list[Moving], dt: float, scene: Scene | None = None) -> None:

@@ -15,7 +15,7 @@ from agents.body.kinds import Flight, Kind, Wheels
 from agents.vectors import Share, Vector, clamp, is_finite
 from twins.engines.engine import EngineFactory, EngineInput, Mirrored, Pose, Touch, require_carried
 from twins.engines.engine import Planar as Displacement
-from twins.engines.point_mass import Moving, Orders, moving_models, require_models
+from twins.engines.point_mass import MotionOrders, Moving, moving_models, require_models
 from twins.engines.pymunk_contacts import Contacts, Layers
 from twins.engines.pymunk_space import ArenaSpace, Surfaces
 from twins.models.differential import Differential
@@ -60,7 +60,7 @@ class Planar(EngineFactory, frozen=True):
         return PlanarEngine(stage, self)
 
 
-class PlanarEngine(Orders[Moving]):
+class PlanarEngine(MotionOrders[Moving]):
     """Implements `twins.engines.engine.Engine`.
 
     The motion models compute the velocity of each robot after this tick. Forces within the grip of the wheels, or the
@@ -88,7 +88,7 @@ class PlanarEngine(Orders[Moving]):
         for robot, motion in zip(self._robots, self.motions, strict=True):
             robot.put(motion.position, motion.yaw)
 
-    def _build_space(self, stage: EngineInput, choice: Planar) -> tuple[_Space, list[_Robot]]:
+    def _build_space(self, stage: EngineInput, choice: Planar) -> tuple[_Space, list[_RobotBody]]:
         """Build the scene with its robots, and find the numbers of each body in it."""
         skin = 0.5 * choice.approach * self._step
         surfaces = Surfaces(choice.friction, choice.wall_friction, choice.traction, skin)
@@ -99,11 +99,11 @@ class PlanarEngine(Orders[Moving]):
         contacts = Contacts(
             place.numbers, self._layers, self._step, skin, choice.restitution, choice.slide, self._found
         )
-        space, robots = _Space(place, contacts, choice.iterations), list[_Robot]()
+        space, robots = _Space(place, contacts, choice.iterations), list[_RobotBody]()
         for row, kind in enumerate(stage.kinds):
             body = place.rows[row]
             wheels = place.wheels.get(row, body)
-            robots.append(_Robot(space.cells, space.begin(body), space.begin(wheels), kind, self._step))
+            robots.append(_RobotBody(space.cells, space.begin(body), space.begin(wheels), kind, self._step))
             if row in place.feet:
                 robots[row].foot, robots[row].grip = place.feet[row]
         return space, robots
@@ -141,12 +141,12 @@ class PlanarEngine(Orders[Moving]):
         self._found.clear()
         return found
 
-    def _push_flying(self, row: int, robot: _Robot, flight: Quadrotor, wobble: Displacement) -> None:
+    def _push_flying(self, row: int, robot: _RobotBody, flight: Quadrotor, wobble: Displacement) -> None:
         """Apply the force that a flying robot's model asks for."""
         height = robot.fly(flight, wobble, self._dt, self._fastest)
         self._layers.bottom[row], self._layers.top[row] = height, height + robot.tall
 
-    def _show_mirrored(self, row: int, robot: _Robot, motion: Mirrored) -> None:
+    def _show_mirrored(self, row: int, robot: _RobotBody, motion: Mirrored) -> None:
         """Set a mirrored robot to its received pose; the solver sees its motion from there."""
         motion.move(self._dt)
         robot.show(motion, self._step)
@@ -170,7 +170,7 @@ class PlanarEngine(Orders[Moving]):
         self._planned_poses = poses
 
 
-class _Robot:
+class _RobotBody:
     """A robot's body, and its wheels, in the numbers of a space."""
 
     __slots__ = (

@@ -51,7 +51,7 @@ class HoverJitter:
         return share * x, share * y
 
 
-class Measurement:
+class MeasurementNoise:
     """White noise on the measured position and yaw."""
 
     __slots__ = ("noise", "present")
@@ -73,7 +73,7 @@ class Measurement:
         return ahead[k], ahead[k + 1], ahead[k + 2], ahead[k + 3]
 
 
-class Drift:
+class OdometryDrift:
     """Error of odometry: a random walk of the measured position; its variance grows with the distance driven."""
 
     __slots__ = ("_rate", "noise", "present", "x", "y")

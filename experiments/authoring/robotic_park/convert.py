@@ -20,7 +20,7 @@ from experiments.authoring.robotic_park.file import (
     PLACES,
     SURFACES,
     ParkExperiment,
-    Robot,
+    ParkRobot,
     Task,
     read,
     starts_from,
@@ -128,7 +128,7 @@ def _arena(found: Heights) -> list[float]:
     return [max(size, float(np.ceil(2.0 * need) / 2.0)) for size, need in zip(PARK, needed, strict=True)]
 
 
-def _robot(robot: Robot, found: Heights, row: int) -> dict[str, Any]:
+def _robot(robot: ParkRobot, found: Heights, row: int) -> dict[str, Any]:
     start, flies = found.start[row, :2].tolist(), KINDS[robot.kind].flies
     if not flies and robot.start is not None and robot.start[2]:
         start.append(robot.start[2])
@@ -142,7 +142,7 @@ def _robot(robot: Robot, found: Heights, row: int) -> dict[str, Any]:
     }
 
 
-def _body(robot: Robot) -> dict[str, str]:
+def _body(robot: ParkRobot) -> dict[str, str]:
     """Address of a real robot and its process; nothing for twins, and where there is no address."""
     radio = RADIO.fullmatch(robot.uri)
     bodies = KINDS[robot.kind].bodies if robot.type != "virtual" else ()
@@ -253,12 +253,12 @@ def _formation(
     return table, _links(park, found, own, notes), _anchors(park, found, gains, notes)
 
 
-def _divides(park: ParkExperiment, robot: Robot) -> bool:
+def _divides(park: ParkExperiment, robot: ParkRobot) -> bool:
     """Whether the driver of a robot divides the pull of a neighbour by its distance."""
     return robot.driver.divides and not park.central
 
 
-def _gain(park: ParkExperiment, robot: Robot, task: Task, distance: float, weight: float = 1.0) -> float:
+def _gain(park: ParkExperiment, robot: ParkRobot, task: Task, distance: float, weight: float = 1.0) -> float:
     """The gain of zenpark's law at a distance [m]: μ [1/m²] for distances, the stiffness for poses."""
     divisor_of_law = 1.0
     if task.kind == "distance":

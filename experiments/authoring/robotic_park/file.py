@@ -59,7 +59,7 @@ class _Threshold(Struct, frozen=True):
     ai: Number | Literal["None", "none", "Null", "null"] = 0.0
 
 
-class Trigger(Struct, frozen=True):
+class ParkTrigger(Struct, frozen=True):
     """Time at which something is done: always, or on events."""
 
     protocol: When = "Continuous"
@@ -77,11 +77,11 @@ class Trigger(Struct, frozen=True):
         return constant, 0.0 if isinstance(self.threshold.ai, str) else self.threshold.ai
 
 
-class _Communication(Trigger, frozen=True):
+class _Communication(ParkTrigger, frozen=True):
     protocol: When = msgspec.field(default="Continuous", name="type")
 
 
-class _Law(Trigger, frozen=True, rename="camel"):
+class _Law(ParkTrigger, frozen=True, rename="camel"):
     type: str = "gradient"
     period: Positive | None = None  # [s]
     gain: Positive = 0.1
@@ -144,17 +144,17 @@ class _Timed(Struct, frozen=True):
     T: Positive = 20.0  # [ms]
 
 
-class Driver(NamedTuple):
+class DriverBehaviour(NamedTuple):
     """Behaviour of the authors' driver of a kind that those in Webots and the central controller lack."""
 
     plans_alone: bool = False  # with the period of the task, and an origin of its own
     divides: bool = False  # the pull of a neighbour by its distance
 
 
-DRIVERS: Final = {"crazyflie": Driver(plans_alone=True), "khepera4": Driver(divides=True)}
+DRIVERS: Final = {"crazyflie": DriverBehaviour(plans_alone=True), "khepera4": DriverBehaviour(divides=True)}
 
 
-class Robot(Struct, frozen=True):
+class ParkRobot(Struct, frozen=True):
     """Robot of theirs."""
 
     name: str
@@ -167,7 +167,7 @@ class Robot(Struct, frozen=True):
     positioning: Literal["Intern", "Extern", "MoCap"] = "Intern"
     communication: _Communication = _Communication()
     local_pose: _Timed = _Timed()
-    controller: Trigger = Trigger()  # of the position
+    controller: ParkTrigger = ParkTrigger()  # of the position
     controller_type: str = ""
     init_theta: Number = 0.0  # [rad] of Kheperas of 2023, with a pose of two numbers
     task: Task = Task(enable=False)
@@ -186,9 +186,9 @@ class Robot(Struct, frozen=True):
         return kind_of(self.name)
 
     @property
-    def driver(self) -> Driver:
+    def driver(self) -> DriverBehaviour:
         """Of a real robot; in Webots drivers have nothing of their own."""
-        return Driver() if self.type == "virtual" else DRIVERS.get(self.kind, Driver())
+        return DriverBehaviour() if self.type == "virtual" else DRIVERS.get(self.kind, DriverBehaviour())
 
     @property
     def start(self) -> Pose | None:
@@ -231,23 +231,23 @@ class ParkExperiment:
     """Experiment of theirs."""
 
     mode: str  # physical, virtual, hybrid
-    robots: list[Robot]
+    robots: list[ParkRobot]
     central: bool  # decided by a central controller
     recent: (
         bool  # for drivers of 2024, which read `mars_data`; the first of them have the law of before, later ones not
     )
 
-    def period(self, robot: Robot) -> float:
+    def period(self, robot: ParkRobot) -> float:
         """Time between decisions of a robot [s]."""
         own = robot.driver.plans_alone and not self.central
         return 1e-3 * robot.task.period_ms if own else robot.task.period
 
     @property
-    def tasks(self) -> list[tuple[Robot, Task]]:
+    def tasks(self) -> list[tuple[ParkRobot, Task]]:
         return [(robot, robot.task) for robot in self.robots if robot.task.enable]
 
 
-class Entry(NamedTuple):
+class YamlValue(NamedTuple):
     """Value of a YAML file, with the file and the path of its key."""
 
     file: str
@@ -272,11 +272,11 @@ class Entry(NamedTuple):
             message, _, hint = words.partition(": ")
             raise refusal(self.file, f"{key or 'the file'}: {message}", hint) from None
 
-    def tables(self) -> list[Entry]:
+    def tables(self) -> list[YamlValue]:
         """The tables in it."""
         path = f"{self.key}." if self.key else ""
         found = self.value.items()
-        return [Entry(self.file, path + key, value) for key, value in found if isinstance(value, dict)]
+        return [YamlValue(self.file, path + key, value) for key, value in found if isinstance(value, dict)]
 
 
 class _Loader(yaml.SafeLoader):  # type: ignore[misc] # PyYAML has no types
@@ -314,7 +314,7 @@ def text_of(file: str, hint: str) -> str:
         raise refusal(file, MISSING, hint) from None
 
 
-def load(file: str, text: str) -> Entry:
+def load(file: str, text: str) -> YamlValue:
     """The table that a YAML file holds; nothing in it is ever executed.
 
     Raises:
@@ -334,7 +334,7 @@ def load(file: str, text: str) -> Entry:
     if not isinstance(value, dict):
         hint = "an experiment of Robotic Park has sections such as Operation and Robots"
         raise refusal(file, "is no table of sections", hint)
-    return Entry(file, "", value)
+    return YamlValue(file, "", value)
 
 
 def read(file: str, text: str, poses: Mapping[str, Pose], notes: list[str]) -> ParkExperiment:
@@ -357,11 +357,11 @@ def read(file: str, text: str, poses: Mapping[str, Pose], notes: list[str]) -> P
         for task in [each for entry in entries for each in entry.tables() if each.key.endswith(".task")]:
             related = Task(enable=False, relationship=str(task.value.get("relationship", ""))).written
             task.value["enable"] = bool(related) or task.value.get("enable", True)
-    robots, problems = dict[str, Robot](), list[Problem]()
+    robots, problems = dict[str, ParkRobot](), list[Problem]()
     for entry in entries:
         _strip_idle_task(entry)
         try:
-            robots[entry.key] = (entry if given.robots else _settings(entry)).typed(Robot)
+            robots[entry.key] = (entry if given.robots else _settings(entry)).typed(ParkRobot)
             task = entry.value.get("task", {}) if given.robots else {}
             if task and robots[entry.key].task.enable and not {"type", "relationship"} <= task.keys():
                 hint = "write distance or pose, and name_d, name_x_y_z or none"
@@ -396,17 +396,17 @@ def _counted(file: str, problems: list[Problem]) -> list[Problem]:
     return [*(each for each in problems if each not in missing), Problem(file, 0, 0, message, missing[0].hint)]
 
 
-def _strip_idle_task(entry: Entry) -> None:
+def _strip_idle_task(entry: YamlValue) -> None:
     """Leave of a task that is switched off what is counted: other values in it may be anything."""
     task = entry.value.get("task")
     if isinstance(task, dict) and str(task.get("enable", True)).lower() == "false":
         entry.value["task"] = {key: task[key] for key in ("enable", "relationship") if key in task}
 
 
-def _entries(root: Entry) -> list[Entry]:
+def _entries(root: YamlValue) -> list[YamlValue]:
     """The robots of a file; those of 2023 get what they need not say."""
     if "Robots" in root.value:
-        return Entry(root.file, "Robots", root.typed(_Sections).robots).tables()
+        return YamlValue(root.file, "Robots", root.typed(_Sections).robots).tables()
     return [
         each._replace(value={"name": each.value.get("id", each.key), "type": "virtual", "pose": None} | each.value)
         for each in root.tables()
@@ -414,11 +414,11 @@ def _entries(root: Entry) -> list[Entry]:
     ]
 
 
-def _settings(listed: Entry) -> Entry:
+def _settings(listed: YamlValue) -> YamlValue:
     """A robot of 2023 as in sections, with what the file holds that an index names for it."""
     own = listed
     if "config_path" in listed.value:
-        file = str(Path(listed.file).parent / listed.typed(Robot).config_path)
+        file = str(Path(listed.file).parent / listed.typed(ParkRobot).config_path)
         tables = load(file, text_of(file, "put the files of the robots beside the index")).tables()
         if not tables:
             raise refusal(file, "has no robot", f"write its settings under '{listed.key}:'")
@@ -431,7 +431,7 @@ def _settings(listed: Entry) -> Entry:
     return own._replace(value=table)
 
 
-def _notes_on_sections(root: Entry, given: _Sections) -> Iterator[str]:
+def _notes_on_sections(root: YamlValue, given: _Sections) -> Iterator[str]:
     operation, mode = given.operation, given.architecture.mode
     if operation.tool and operation.mode != "physical":
         tool = f"{operation.tool} {operation.world}".strip()
@@ -442,7 +442,7 @@ def _notes_on_sections(root: Entry, given: _Sections) -> Iterator[str]:
         yield f"Architecture: {mode}; taken as {CENTRAL}, though their launcher starts a centre for that spelling alone"
     elif mode not in (CENTRAL, "distributed"):
         yield f"Architecture: {mode}; every robot decides for itself here"
-    tools = [each for each in root.tables() if each.key in TOOLS] + Entry(root.file, "Other", given.other).tables()
+    tools = [each for each in root.tables() if each.key in TOOLS] + YamlValue(root.file, "Other", given.other).tables()
     on = [each.key for each in tools if each.typed(_Section).enable]
     if "Other.Reconfiguration" in on:
         yield "Other.Reconfiguration: the first shape is imported; the others can stand in [[formation.changes]]"
@@ -450,7 +450,7 @@ def _notes_on_sections(root: Entry, given: _Sections) -> Iterator[str]:
         yield f"{', '.join(others)}: zenpark records, watches and reports by itself"
 
 
-def _notes_on_older(entries: list[Entry], robots: Mapping[str, Robot], marks: set[str]) -> Iterator[str]:
+def _notes_on_older(entries: list[YamlValue], robots: Mapping[str, ParkRobot], marks: set[str]) -> Iterator[str]:
     yield "law: gain and limit are not in files of 2023; 0.25 and 0.08 m per decision, as in the programs of that time"
     if marks:
         yield f"{', '.join(sorted(marks))}: the marker of a robot that stands in the file already"
@@ -459,7 +459,7 @@ def _notes_on_older(entries: list[Entry], robots: Mapping[str, Robot], marks: se
         yield f"the file does not say which robots are real: all are twins here; addresses in it: {addresses}"
 
 
-def _check_names(file: str, robots: Mapping[str, Robot]) -> None:
+def _check_names(file: str, robots: Mapping[str, ParkRobot]) -> None:
     """Refuse two robots of one name, and relations to no robot."""
     names = [robot.name for robot in robots.values()]
     for key, robot in robots.items():
@@ -518,7 +518,7 @@ def starts_from(file: str) -> dict[str, Pose]:
             for entry in _entries(load(file, text))
             if {"name", "pose"} <= entry.value.keys() and kind_of(str(entry.value["name"]))
         ]
-        found = {robot.name: robot.start for entry in placed if (robot := entry.typed(Robot)).start}
+        found = {robot.name: robot.start for entry in placed if (robot := entry.typed(ParkRobot)).start}
     if not found:
         raise refusal(file, "tells the start of no robot", hint)
     return found
@@ -537,8 +537,8 @@ def _world(file: str, text: str) -> Iterator[tuple[str, Pose]]:
             node = []
             name = "".join(behind.get("name", behind.get("DEF", []))[:1]).strip('"')
             if kind_of(name):
-                place = Entry(file, f"{name}.translation", behind.get("translation", [0.0, 0.0, 0.0])[:3])
-                turn = Entry(file, f"{name}.rotation", behind.get("rotation", [0.0, 0.0, 1.0, 0.0]))
+                place = YamlValue(file, f"{name}.translation", behind.get("translation", [0.0, 0.0, 0.0])[:3])
+                turn = YamlValue(file, f"{name}.rotation", behind.get("rotation", [0.0, 0.0, 1.0, 0.0]))
                 x, y, z = place.typed(tuple[Number, Number, Number])
                 _, _, axis, angle = turn.typed(tuple[Number, Number, Number, Number])
                 yaw = math.copysign(1.0, axis) * angle if abs(axis) > 1.0 - 1e-3 else 0.0

@@ -11,7 +11,7 @@ import numpy as np
 from agents.body.kinds import KINDS
 from agents.formation.anchors import Anchor
 from agents.formation.link import BY_DISTANCE, BY_RELATIVE
-from experiments.authoring.robotic_park.file import ParkExperiment, Relation, Robot
+from experiments.authoring.robotic_park.file import ParkExperiment, ParkRobot, Relation
 from experiments.check.motion import CLEARANCE
 from experiments.check.realisation import Shape, Solids, find_shapes
 from experiments.definition.formation import Anchored
@@ -155,7 +155,7 @@ def find_heights(park: ParkExperiment, notes: list[str]) -> Heights:
     return Heights(start, shape, hover, anchored, (0.0, 0.0, round(lift, 3)))
 
 
-def origin_of(park: ParkExperiment, robot: Robot, relation: Relation) -> tuple[float, ...] | None:
+def origin_of(park: ParkExperiment, robot: ParkRobot, relation: Relation) -> tuple[float, ...] | None:
     """Place [m] of the origin that a robot keeps a distance to; None where it is that of the arena.
 
     The file may give one. If not, some drivers have one of their own (`REAL_ORIGIN`).
@@ -200,6 +200,6 @@ def _wanted_distances(park: ParkExperiment, start: Array, flies: Mask) -> tuple[
     ]
 
 
-def _point(park: ParkExperiment, robot: Robot, relation: Relation) -> tuple[float, float, float]:
+def _point(park: ParkExperiment, robot: ParkRobot, relation: Relation) -> tuple[float, float, float]:
     x, y, z = origin_of(park, robot, relation) or (0.0, 0.0, 0.0)
     return x, y, z

@@ -14,7 +14,7 @@ from typing import Final
 import msgspec
 
 from experiments.definition import bodies, standby
-from experiments.definition.experiment import Robot
+from experiments.definition.experiment import RobotTable
 from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.file.document import write_json
@@ -104,7 +104,7 @@ class CaseProcesses:
         self.adopted = {*there, *self.away}
         return sorted(self.adopted)
 
-    def start(self, only: Collection[str] | None = None, changed: Mapping[str, Robot] | None = None) -> None:
+    def start(self, only: Collection[str] | None = None, changed: Mapping[str, RobotTable] | None = None) -> None:
         """Start all robots that are neither adopted nor on standby, or `only` some of them, on their machines.
 
         `changed` are robots with other settings, this time only.
@@ -119,7 +119,7 @@ class CaseProcesses:
             if missing := [name for name in wanted if not (name in self.adopted or robots[name].standby)]:
                 self._start(missing, file, plan)
 
-    def start_again(self, names: Sequence[str], bodies: Mapping[str, Robot] | None = None) -> None:
+    def start_again(self, names: Sequence[str], bodies: Mapping[str, RobotTable] | None = None) -> None:
         """Start the process of the robots `names` while the run is under way.
 
         They are ready without silent neighbours, which may be out of the run as well. `bodies` are other robots, which
@@ -150,11 +150,11 @@ class CaseProcesses:
         else:
             self._context.start(group, "experiments.real_time.processes.robot", str(file), *names)
 
-    def robot(self, name: str) -> Robot:
+    def robot(self, name: str) -> RobotTable:
         """The robot of a name now: it may be another one, at an address that the file does not know."""
         return self._reached.experiment.robots[name]
 
-    def place(self, name: str, robot: Robot | None = None) -> tuple[float, float]:
+    def place(self, name: str, robot: RobotTable | None = None) -> tuple[float, float]:
         """Start of a robot: x, y [m], or of `robot` under its name."""
         reached = self._reached
         if robot is not None:

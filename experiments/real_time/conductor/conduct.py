@@ -224,7 +224,9 @@ def hardware(cases: Iterable[Plan]) -> dict[str, str]:
     return found
 
 
-def check_other_runs(me: run_registry.Run, others: Iterable[run_registry.Run], file: str) -> list[str]:
+def check_other_runs(
+    me: run_registry.RegisteredRun, others: Iterable[run_registry.RegisteredRun], file: str
+) -> list[str]:
     """Notes on other runs that are up and have robots of the same names.
 
     Raises DocumentError if a robot of the run is hardware that another one has.
@@ -245,7 +247,7 @@ def check_other_runs(me: run_registry.Run, others: Iterable[run_registry.Run], f
     return notes
 
 
-def _drives_same_device(other: run_registry.Run, name: str, body: str) -> bool:
+def _drives_same_device(other: run_registry.RegisteredRun, name: str, body: str) -> bool:
     """Whether another run drives the same device: an address that names none belongs to the robot of that name."""
     if plugins.body_name(body) == body:
         return other.robots.get(name) == body

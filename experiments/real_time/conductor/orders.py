@@ -17,7 +17,7 @@ from agents.network.keys import Keys
 from agents.network.shutdown import closing_cleanly
 
 if TYPE_CHECKING:
-    from experiments.real_time.hosts.run_registry import Run
+    from experiments.real_time.hosts.run_registry import RegisteredRun
 
 REPLY_S: Final = 1.0
 LEAD_S: Final = 0.5  # from the order to the common start: every robot has it by then,
@@ -137,7 +137,7 @@ class EmergencyStop:
     endpoints: Sequence[str]
     realm: str
     identity: str  # identity to show, in a lab
-    run: Run | None = None  # None: only the routers are known
+    run: RegisteredRun | None = None  # None: only the routers are known
     seen: set[str] = field(default_factory=set)  # robots that were alive
     moving: set[str] = field(default_factory=set)  # those of them without a report of their stop
     failure: Exception | None = None  # why the routers cannot be reached

@@ -21,7 +21,7 @@ import msgspec
 from agents.body.interface import UNANSWERED
 from agents.body.kinds import KINDS, Trial
 from agents.network import messages
-from experiments.definition.experiment import Channel, Formation, Leg, Robot
+from experiments.definition.experiment import ChannelTable, Formation, LegTable, RobotTable
 from experiments.definition.plan import Plan
 from experiments.file.document import Document
 from experiments.real_time.conductor import preflight_checks as checks
@@ -100,10 +100,10 @@ def alone(plan: Plan) -> Plan:
         robots=robots,
         duration_s=DRIVE_S,
         formation=Formation(),
-        timeline=[Leg(at_s=0.0, robot=name, plan=arc) for name, robot in robots.items() if robot.hover is None],
+        timeline=[LegTable(at_s=0.0, robot=name, plan=arc) for name, robot in robots.items() if robot.hover is None],
         architecture="distributed",
         avoidance=None,
-        channel=Channel(),
+        channel=ChannelTable(),
         on_loss="none",
         cases={},
     )
@@ -236,10 +236,10 @@ class Inspector(CaseRun):
     def _move(
         self,
         name: str,
-        robot: Robot,
+        robot: RobotTable,
         *,
         stop: bool = False,
-        changed: Mapping[str, Robot] | None = None,
+        changed: Mapping[str, RobotTable] | None = None,
         hold_s: float = HOLD_S,
     ) -> Tried:
         """Trial of a robot in a process of its own: it hops or drives, and lands or is stopped."""
@@ -263,7 +263,7 @@ class Inspector(CaseRun):
             self._processes.end_robots()  # lands it, whatever has happened
         return tried
 
-    def _order_motion(self, name: str, robot: Robot) -> str:
+    def _order_motion(self, name: str, robot: RobotTable) -> str:
         """Order a robot to move; the reason of a refusal."""
         reply = self._order(name, messages.Order("takeoff"))
         if reply.ok and robot.hover is None:
@@ -271,7 +271,7 @@ class Inspector(CaseRun):
             reply = self._order(name, messages.Order("start", at=self._clock.utc() + start_lead_s(1)))
         return "" if reply.ok else f"refused: {reply.reason}"
 
-    def _fly(self, name: str, robot: Robot, tried: Tried, hold_s: float) -> None:
+    def _fly(self, name: str, robot: RobotTable, tried: Tried, hold_s: float) -> None:
         """Follow a hop or a drive to its end; a drone lands after `hold_s` [s] at its height."""
         seen = self._robots[name]
         measured = -math.inf
@@ -362,7 +362,7 @@ class Inspector(CaseRun):
         return status.hazard or status.reason or f"it is {status.phase}" + (f"; {status.body}" if status.body else "")
 
 
-def _moved(states: Sequence[messages.State], robot: Robot) -> bool:
+def _moved(states: Sequence[messages.State], robot: RobotTable) -> bool:
     """Whether a robot has begun to climb or to drive."""
     known = [state.position for state in states if state.position is not None]
     if len(known) < 2:

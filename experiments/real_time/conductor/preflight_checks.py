@@ -19,7 +19,7 @@ from agents.network import messages
 from agents.plugins import registry
 from agents.safety.detection import clock_off, clock_text
 from experiments.definition.bodies import driven_kind
-from experiments.definition.experiment import WORLD, Robot
+from experiments.definition.experiment import WORLD, RobotTable
 from experiments.real_time.conductor.run_view import AHEAD_S, BEHIND_S
 from twins.arrays import Array
 
@@ -67,7 +67,7 @@ class RobotChecks(msgspec.Struct, frozen=True):
 class Observed:
     """Reports of a robot about itself while it stood."""
 
-    robot: Robot
+    robot: RobotTable
     status: messages.Status | None = None  # the last one
     ended: str = ""  # last words of its process, if that has ended
     states: list[messages.State] = field(default_factory=list)
@@ -216,14 +216,14 @@ def _start(name: str, observed: Mapping[str, Observed], safety: Safety) -> Check
     return Check(check="start pose", verdict="ok", found=said)
 
 
-def _counts_from_start(robot: Robot) -> bool:
+def _counts_from_start(robot: RobotTable) -> bool:
     """Whether a real robot, or its protocol twin, measures its way only: it is at its `start` wherever it stands."""
     if robot.position == "external" or driven_kind(registry.body_name(robot.body)) is None:
         return False
     return robot.hover is None or not robot.device.get("positioning")
 
 
-def _distance(here: Array, robot: Robot) -> float:
+def _distance(here: Array, robot: RobotTable) -> float:
     return math.dist(here.tolist(), robot.start[:2])
 
 
@@ -267,7 +267,7 @@ def stop_in_motion(observed: Observed, tried: Tried) -> Check:
     return check
 
 
-def stop_at_rest(robot: Robot, tried: Tried) -> Check:
+def stop_at_rest(robot: RobotTable, tried: Tried) -> Check:
     """Emergency stop of a robot that stands."""
     check = stop("stop, motors off", tried)
     kind = driven_kind(registry.body_name(robot.body))
@@ -317,7 +317,7 @@ def trial(asked: Trial, observed: Observed, tried: Tried) -> Check:
     return Check(check=asked.name, verdict="bad" if remedy else "ok", found=found, remedy=remedy)
 
 
-def hop_of(robot: Robot) -> Literal["hop", "drive"]:
+def hop_of(robot: RobotTable) -> Literal["hop", "drive"]:
     """Counterpart of a drone's hop for this robot."""
     return "drive" if robot.hover is None else "hop"
 

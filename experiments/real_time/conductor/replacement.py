@@ -13,7 +13,7 @@ from agents.errors import Refusal
 from agents.network import messages
 from agents.plugins import registry
 from agents.plugins.registry import did_you_mean
-from experiments.definition.experiment import WORLD, Robot
+from experiments.definition.experiment import WORLD, RobotTable
 from experiments.definition.plan import Plan
 from experiments.real_time.conductor.run_view import RobotView
 
@@ -30,7 +30,7 @@ class Spares:
         self._spares, self._arena = plan.experiment.spares, plan.experiment.arena
         self.used = {}
 
-    def successor(self, name: str, robot: Robot, order: messages.RunOrder) -> tuple[Robot, str | None]:
+    def successor(self, name: str, robot: RobotTable, order: messages.RunOrder) -> tuple[RobotTable, str | None]:
         """The robot with the name `name` from now on, and the name of the spare, if it is one."""
         spare = order.spare
         if spare is None and order.body is None:
@@ -52,7 +52,7 @@ class Spares:
             f"the file has no spare {kind} left for {name}: say which body takes over, --body URI, or add [spares.NAME]"
         )
 
-    def _of_spare(self, spare: str, name: str, robot: Robot) -> Robot:
+    def _of_spare(self, spare: str, name: str, robot: RobotTable) -> RobotTable:
         spares = self._spares
         if spare not in spares:
             there = did_you_mean(spare[:50], spares) if spares else "the file has none"
@@ -65,7 +65,7 @@ class Spares:
         return msgspec.structs.replace(robot, **brought, process=None, shadow=None)
 
     @staticmethod
-    def _of_body(body: str, robot: Robot) -> Robot:
+    def _of_body(body: str, robot: RobotTable) -> RobotTable:
         word, known = registry.body_name(body), registry.names(registry.BODIES)
         if word in registry.names(registry.DEVICES):
             raise Refusal(f"{word} needs a simulated device, which is started before the run only")
@@ -74,7 +74,7 @@ class Spares:
         device = robot.device if word == registry.body_name(robot.body) else {}
         return msgspec.structs.replace(robot, body=body, device=device, process=None, shadow=None)
 
-    def _put(self, robot: Robot, at: tuple[float, float], yaw: float) -> Robot:
+    def _put(self, robot: RobotTable, at: tuple[float, float], yaw: float) -> RobotTable:
         if robot.body != TWIN:
             raise Refusal("only a twin can be put somewhere: put the robot there yourself, and leave --at out")
         half = [size / 2 for size in self._arena.size[:2]]
@@ -87,7 +87,12 @@ MARGIN_M: Final = 0.1  # free space around a robot that begins to move
 
 
 def in_the_way(
-    name: str, place: Sequence[float], robots: Mapping[str, Robot], views: Mapping[str, RobotView], *, body_stays: bool
+    name: str,
+    place: Sequence[float],
+    robots: Mapping[str, RobotTable],
+    views: Mapping[str, RobotView],
+    *,
+    body_stays: bool,
 ) -> str:
     """Refusal of `place`, x, y [m], for the robot `name` to begin there, whatever its height; empty if it is free.
 

@@ -89,7 +89,7 @@ class Progress:
     clock: Clock = field(default_factory=Clock)
 
 
-class News:
+class EventFeed:
     """Each event of a run once, whatever its case."""
 
     def __init__(self) -> None:

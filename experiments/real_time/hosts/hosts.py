@@ -174,7 +174,7 @@ class Station:
         trips = []
         for _ in range(samples):
             answer, left, back = self.ask(Question("clock"))
-            trips.append(clocks.Sample(left, answer.clock, back))
+            trips.append(clocks.ClockSample(left, answer.clock, back))
         offset, uncertainty = clocks.host_offset(trips)
         self.clock = HostClock(self.name, trips[-1].back, offset, uncertainty, self.host.robots, self.applied)
         return self.clock

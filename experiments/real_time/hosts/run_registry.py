@@ -27,7 +27,7 @@ MAX_ENTRY_BYTES: Final = 1 << 20  # [bytes] of a file
 KNOCK_S: Final = 0.3  # longest time of a local router to accept a connection
 
 
-class Run(msgspec.Struct, frozen=True):
+class RegisteredRun(msgspec.Struct, frozen=True):
     """A run, or a router that was started by hand."""
 
     what: Literal["run", "router"]
@@ -83,16 +83,16 @@ def own_entry(
     realm: str = "park",
     identity: str = "operator",
     robots: dict[str, str] | None = None,
-) -> Run:
+) -> RegisteredRun:
     pid = os.getpid()
     place = "" if folder is None else str(folder.absolute())
-    return Run(
+    return RegisteredRun(
         what, pid, born(pid) or "", Clock().utc(), title, place, list(endpoints), realm, identity, robots or {}
     )  # fmt: skip
 
 
 @contextmanager
-def registered(run: Run) -> Iterator[str]:
+def registered(run: RegisteredRun) -> Iterator[str]:
     """Inside, a run is registered; yields the reason if that failed, else an empty text."""
     file, why = None, ""
     try:
@@ -110,12 +110,12 @@ def registered(run: Run) -> Iterator[str]:
                 file.unlink()
 
 
-def runs() -> list[Run]:
+def runs() -> list[RegisteredRun]:
     """All runs that are up, oldest first; and those that died while a router of theirs, or their robots, may be up.
 
     Files of runs that are gone are removed; what is none of ours, or cannot be read, is left alone.
     """
-    found: list[Run] = []
+    found: list[RegisteredRun] = []
     try:
         files = sorted(runtime_folder().glob("*.json"))
     except OSError:
@@ -132,13 +132,13 @@ def runs() -> list[Run]:
     return sorted(found, key=lambda run: run.since)
 
 
-def _read(file: Path) -> Run | None:
+def _read(file: Path) -> RegisteredRun | None:
     """A run's file, if it is one of this user's."""
     try:
         about = file.lstat()
         if not stat.S_ISREG(about.st_mode) or about.st_uid != os.getuid() or about.st_size > MAX_ENTRY_BYTES:
             return None
-        run = msgspec.json.decode(file.read_bytes(), type=Run)
+        run = msgspec.json.decode(file.read_bytes(), type=RegisteredRun)
         for endpoint in topology.bare(run.endpoints):
             Endpoint.parse(endpoint)
         lab.lab_of(run.endpoints)

@@ -27,7 +27,7 @@ from agents.runtime.command_line import on_termination
 from agents.runtime.lifeline import Lifeline
 from agents.ticks import Ticks
 from experiments.definition import bodies
-from experiments.definition.experiment import Robot
+from experiments.definition.experiment import RobotTable
 from experiments.definition.plan import Plan
 from experiments.file import structure
 from experiments.file.problems import refusal
@@ -79,7 +79,9 @@ def by_hand(
         raise refusal(f"zenpark twin {kind}", "there is no such protocol twin", hint)
     hover = 0.8 if KINDS[kind].flies else None
     robots = {
-        f"{kind[:2].upper()}{k + 1:02}": Robot(kind=kind, start=[0.5 * k, 0.0], body=word, hover=hover, device=settings)
+        f"{kind[:2].upper()}{k + 1:02}": RobotTable(
+            kind=kind, start=[0.5 * k, 0.0], body=word, hover=hover, device=settings
+        )
         for k in range(count)
     }
     plan = Plan.made(title=word, robots=robots, duration_s=1.0)

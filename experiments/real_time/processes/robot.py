@@ -37,7 +37,7 @@ from agents.runtime.lifeline import FAR_SILENCE_S, SILENCE_S
 from agents.runtime.loop import Ranging, Runtime, Setup
 from experiments.definition import bodies, mesh
 from experiments.definition.endpoints import router_endpoints
-from experiments.definition.experiment import Robot
+from experiments.definition.experiment import RobotTable
 from experiments.definition.link_conditions import FROM_CENTRE, Ends, conditions_of
 from experiments.definition.plan import Plan
 from experiments.file import document
@@ -145,7 +145,7 @@ def read_experiment() -> str:
     raise refusal("standard input", f"no experiment came within {EXPERIMENT_S:g} s", hint)
 
 
-def _ranging(robot: Robot) -> Ranging:
+def _ranging(robot: RobotTable) -> Ranging:
     """Source of the range readings of a robot: bodies in other processes receive them by themselves."""
     if registry.body_name(robot.body) in REMOTE_BODIES:
         return "remote"

@@ -10,7 +10,7 @@ from agents.body.interface import Body, BodyError, BodyState
 from agents.network.messages import Inspection
 from agents.plugins import registry
 from experiments.definition import bodies
-from experiments.definition.experiment import Experiment, Robot
+from experiments.definition.experiment import Experiment, RobotTable
 from experiments.definition.plan import Plan
 from twins.body import TwinBody
 
@@ -107,7 +107,7 @@ def test_failing_body_keeps_no_other_from_orders(what):
 
 def request(*addresses):
     robots = {
-        f"R{k}": Robot(kind="crazyflie" if k == 1 else "khepera4", start=[0.5 * k, 0.0], body=address, hover=0.5)
+        f"R{k}": RobotTable(kind="crazyflie" if k == 1 else "khepera4", start=[0.5 * k, 0.0], body=address, hover=0.5)
         for k, address in enumerate(addresses)
     }
     return bodies.body_request(Plan(Experiment(title="Bodies", robots=robots, duration_s=1.0)), tuple(robots), 7)

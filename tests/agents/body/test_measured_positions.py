@@ -15,7 +15,7 @@ from agents.network.keys import Keys
 from agents.runtime.loop import Runtime, Setup
 from agents.safety.detection import clock_text
 from experiments.definition import bodies
-from experiments.definition.experiment import Formation, Robot
+from experiments.definition.experiment import Formation, RobotTable
 from experiments.definition.plan import Plan
 from tests.agents.few import pair
 from tests.agents.runtime.test_pose_inbox import Sample
@@ -62,7 +62,7 @@ def flown(
     the same; what was said, when.
     """
     few = pair(
-        robots={"T": Robot(kind="tello", start=[0.1, 0.2], hover=0.5, position="external")}, formation=Formation()
+        robots={"T": RobotTable(kind="tello", start=[0.1, 0.2], hover=0.5, position="external")}, formation=Formation()
     )
     said: list[tuple[float, str]] = []
     measured, noise = (0.0, 0.0, 0.0), Random(1)

@@ -9,7 +9,7 @@ from agents.decision.neighbours import Incoming, Neighbours
 from agents.kinds.khepera4 import KHEPERA4
 from agents.plugins.predictors import HOLD, ConstantVelocity
 from agents.plugins.triggers import SendOnDelta
-from experiments.definition.experiment import Formation, Leg
+from experiments.definition.experiment import Formation, LegTable
 from tests.agents.few import triangle
 from tests.agents.swarm import Swarm, changed
 
@@ -72,7 +72,7 @@ def test_lost_neighbour_makes_it_compute():
 
 
 def test_follower_with_a_plan_always_computes():
-    leg = Leg(at_s=0.0, robot="A", plan={"kind": "hold", "at": [0.0, 0.2]})
+    leg = LegTable(at_s=0.0, robot="A", plan={"kind": "hold", "at": [0.0, 0.2]})
     swarm = updating({"kind": "periodic", "period_s": 30.0}, timeline=[leg]).running().run(1.95)
     assert updates(swarm) == {"A": 20, "B": 1, "C": 20}
 

@@ -7,8 +7,7 @@ import pytest
 from agents.decision.centralised import ReceivedGoals
 from agents.decision.lifecycle import AIRBORNE, IDLE, LANDING, READY, RUNNING
 from agents.robot import Robot
-from experiments.definition.experiment import Experiment, Formation, Hybrid, Start
-from experiments.definition.experiment import Robot as Member
+from experiments.definition.experiment import Experiment, Formation, Hybrid, RobotTable, Start
 from experiments.definition.plan import Plan
 from tests.agents.bench import Bench
 
@@ -18,8 +17,8 @@ PLACES = {"A": (-0.4, 0.0, 0.0), "B": (0.4, 0.1, 0.8)}
 def pair(**parts):
     """A Khepera and a Crazyflie that receive each other, guided by a central controller; `parts` changes that."""
     robots = {
-        "A": Member(kind="khepera4", start=[-0.4, 0.0]),
-        "B": Member(kind="crazyflie", start=[0.4, 0.1], hover=0.8),
+        "A": RobotTable(kind="khepera4", start=[-0.4, 0.0]),
+        "B": RobotTable(kind="crazyflie", start=[0.4, 0.1], hover=0.8),
     }
     given = {
         "title": "A pair", "duration_s": 60.0, "robots": robots, "formation": Formation(links={"A - B": 0.9}),

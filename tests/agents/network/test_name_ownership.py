@@ -17,7 +17,7 @@ from agents.network import session as network
 from agents.network.keys import Keys
 from agents.network.name_ownership import NameTaken, OwnershipTiming, claim, confirm_ownership
 from agents.runtime.loop import Runtime, Setup
-from experiments.definition.experiment import Formation, Robot
+from experiments.definition.experiment import Formation, RobotTable
 from experiments.definition.plan import Plan
 from tests.agents.few import pair
 from tests.agents.runtime.test_shutdown import Airborne
@@ -236,7 +236,7 @@ def test_silent_router_frees_no_name(faked):
     ],
 )
 def test_a_process_without_its_name_touches_no_body(reply, error):
-    experiment = pair(robots={"F": Robot(kind="crazyflie", start=[0.1, 0.2], hover=0.5)}, formation=Formation())
+    experiment = pair(robots={"F": RobotTable(kind="crazyflie", start=[0.1, 0.2], hover=0.5)}, formation=Formation())
     timing = OwnershipTiming(vanish_s=0.0, answer_s=0.0)
     setup = Setup(Keys("park"), [], "json", 50.0, lifeline=False, externally_measured=[False], ownership=timing)
     body = Airborne()
@@ -261,7 +261,7 @@ class Woken(Airborne):
 
 @pytest.mark.parametrize("way", ["still", "opening", "cut off"])
 def test_displaced_owner_leaves_the_body_alone(way, monkeypatch):
-    experiment = pair(robots={"F": Robot(kind="crazyflie", start=[0.1, 0.2], hover=0.5)}, formation=Formation())
+    experiment = pair(robots={"F": RobotTable(kind="crazyflie", start=[0.1, 0.2], hover=0.5)}, formation=Formation())
     setup = Setup(Keys("park"), [], "json", 50.0, lifeline=False, externally_measured=[False], ownership=HASTY)
     body = Woken()
     told: list[int] = []

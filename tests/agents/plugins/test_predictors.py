@@ -5,13 +5,13 @@ import pytest
 from agents.decision.neighbours import Incoming, Neighbours
 from agents.kinds.khepera4 import KHEPERA4
 from agents.plugins import registry
-from agents.plugins.predictors import HOLD, ConstantVelocity, Hold
+from agents.plugins.predictors import HOLD, ConstantVelocity, HoldPrediction
 from agents.plugins.triggers import LastEvent
 
 
 def test_both_are_registered():
     assert {"hold", "constant-velocity"} <= set(registry.names(registry.PREDICTORS))
-    assert registry.build(registry.PREDICTORS, "hold") == HOLD == Hold()
+    assert registry.build(registry.PREDICTORS, "hold") == HOLD == HoldPrediction()
 
 
 @pytest.mark.parametrize(("age", "seconds"), [(-0.5, 0.0), (0.0, 0.0), (1.0, 1.0), (2.0, 2.0), (9.0, 2.0)])

@@ -13,15 +13,15 @@ from agents.plugins.predictors import HOLD, ConstantVelocity
 from agents.plugins.trigger_families import (
     Decaying,
     Dynamic,
-    Integral,
+    IntegralTrigger,
     Lyapunov,
-    Mixed,
+    MixedTrigger,
     Predictive,
     Relative,
     RelativeControl,
     SelfTriggered,
 )
-from agents.plugins.triggers import LastEvent, Periodic, SendOnDelta, View
+from agents.plugins.triggers import LastEvent, Periodic, SendOnDelta, TriggerView
 from tests.agents import signals
 from tests.agents.signals import DT, Play, standing, wander
 
@@ -82,7 +82,7 @@ def test_relative(seed, share):
 @SOME
 @given(SEEDS, SHARE, LENGTH)
 def test_mixed(seed, share, floor):
-    check(Mixed(share=share, floor=floor), seed, lambda q: q.gap**2 - share * q.now.error**2 - floor**2)
+    check(MixedTrigger(share=share, floor=floor), seed, lambda q: q.gap**2 - share * q.now.error**2 - floor**2)
 
 
 @SOME
@@ -123,7 +123,7 @@ def test_integral(seed, area):
         so_far = q.gap * DT if q.t - q.t_k < 1.5 * DT else so_far + q.gap * DT
         return so_far - area
 
-    check(Integral(area=area), seed, margin)
+    check(IntegralTrigger(area=area), seed, margin)
 
 
 @pytest.mark.parametrize("predictor", [HOLD, ConstantVelocity(), ConstantVelocity(horizon_s=0.1)])
@@ -163,7 +163,7 @@ def test_self_triggered_bounds_bounded_accelerations(seed, bound):
 
 def test_self_triggered_knows_its_next_event():
     """It uses neither position nor errors between two events."""
-    trigger, view = SelfTriggered(), View({})
+    trigger, view = SelfTriggered(), TriggerView({})
     view.drift, fired = 0.05, []
     for name in ("position", "velocity", "error", "energy", "offset", "deviation"):
         delattr(view, name)

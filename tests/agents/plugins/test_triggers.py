@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agents.plugins import registry
-from agents.plugins.triggers import Periodic, SendOnDelta, Trigger, TriggerState, View
+from agents.plugins.triggers import Periodic, SendOnDelta, Trigger, TriggerState, TriggerView
 from tests.agents.signals import DT, Play, standing, wander
 
 NAMES = registry.names(registry.TRIGGERS)
@@ -129,8 +129,8 @@ def test_periodic_counts_stay_exact(period, hz, begin_s, length_s, expected):
 
 def test_trigger_must_define_fires():
     with pytest.raises(TypeError, match="Trigger must define `fires`"):
-        Trigger().fires(View({}))
-    assert View({}).deviation == View({}).since_event == inf
+        Trigger().fires(TriggerView({}))
+    assert TriggerView({}).deviation == TriggerView({}).since_event == inf
 
 
 def test_docs_table_has_families_and_defaults():

@@ -16,7 +16,7 @@ from agents.plugins.triggers import Trigger
 from agents.runtime import descent, loop
 from agents.runtime.loop import Runtime, Setup
 from experiments.definition import bodies
-from experiments.definition.experiment import Formation, Robot
+from experiments.definition.experiment import Formation, RobotTable
 from experiments.definition.plan import Plan
 from tests.agents.few import pair
 from tests.fuzz.loopnet import Net, Sample
@@ -75,7 +75,7 @@ class Stage:
 
     def __init__(self, monkeypatch, kind: str) -> None:
         hover = {"hover": 0.5} if kind == "crazyflie" else {}
-        experiment = pair(robots={"F": Robot(kind=kind, start=[0.1, 0.2], **hover)}, formation=Formation())
+        experiment = pair(robots={"F": RobotTable(kind=kind, start=[0.1, 0.2], **hover)}, formation=Formation())
         self.now, self.orders, self.commands = 1000.0, [], 0
         for module in (loop, descent):
             monkeypatch.setattr(module, "time", types.SimpleNamespace(sleep=self.sleep))

@@ -16,7 +16,7 @@ from agents.network.keys import Keys
 from agents.plugins.law import Control, Law, Said
 from agents.runtime.loop import Runtime, Setup
 from agents.runtime.orders import carry_out
-from experiments.definition.experiment import Formation, Leg, Robot
+from experiments.definition.experiment import Formation, LegTable, RobotTable
 from experiments.definition.plan import Plan
 from tests.agents.bench import Bench
 from tests.agents.few import pair
@@ -31,9 +31,12 @@ START, WAY, BEGINS_S, SPEED = (-0.6, 0.1), 0.75, 5.0, 0.15
 def leader(*, listens: bool = False):
     """A, which drives `WAY` along x from `BEGINS_S` on."""
     return pair(
-        robots={"A": Robot(kind="turtlebot3", start=list(START)), "B": Robot(kind="khepera4", start=[0.6, 0.6])},
+        robots={
+            "A": RobotTable(kind="turtlebot3", start=list(START)),
+            "B": RobotTable(kind="khepera4", start=[0.6, 0.6]),
+        },
         formation=Formation(links={"B > A": 0.5} if listens else {"A > B": 0.5}),
-        timeline=[Leg(robot="A", at_s=BEGINS_S, plan={"kind": "line", "move_by": [WAY, 0.0], "speed": SPEED})],
+        timeline=[LegTable(robot="A", at_s=BEGINS_S, plan={"kind": "line", "move_by": [WAY, 0.0], "speed": SPEED})],
         safety=Safety(start_within=0.0),  # as processes get it that are started in mid-run
     )
 

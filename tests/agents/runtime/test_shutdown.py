@@ -19,7 +19,7 @@ from agents.runtime import loop
 from agents.runtime.descent import Descent, DescentTiming
 from agents.runtime.loop import Runtime, Setup
 from agents.ticks import Ticks
-from experiments.definition.experiment import Arena, Formation, Robot
+from experiments.definition.experiment import Arena, Formation, RobotTable
 from experiments.definition.plan import Plan
 from tests.agents.few import pair
 from tests.fuzz.loopnet import Net
@@ -85,7 +85,7 @@ class Airborne:
 
 def run(body: Airborne, silence_s: float = 5.0, timing: DescentTiming = QUICK) -> Net:
     """Runs a robot with that body to its end, on a network of its own."""
-    experiment = pair(robots={"F": Robot(kind="crazyflie", start=[0.1, 0.2], hover=0.5)}, formation=Formation())
+    experiment = pair(robots={"F": RobotTable(kind="crazyflie", start=[0.1, 0.2], hover=0.5)}, formation=Formation())
     with Net().worn() as net:
         body.net = net
         setup = Setup(
@@ -137,7 +137,10 @@ def test_slow_descent_is_not_stopped_in_flight():
 
 @pytest.mark.parametrize(("height", "down_s"), [(1.0, 10.0), (6.0, 30.0)])
 def test_watchdog_waits_for_a_whole_descent(height, down_s):
-    robots = {"F": Robot(kind="crazyflie", start=[0.1, 0.2], hover=0.5), "B": Robot(kind="khepera4", start=[0.5, 0.2])}
+    robots = {
+        "F": RobotTable(kind="crazyflie", start=[0.1, 0.2], hover=0.5),
+        "B": RobotTable(kind="khepera4", start=[0.5, 0.2]),
+    }
     plan = Plan(pair(robots=robots, formation=Formation(), arena=Arena(size=(4.0, 4.0, height))))
     keeper, silent = NameKeeper(Keys("park"), "FB", 0.0), lambda _reason: None
     flying, driving = (

@@ -11,7 +11,7 @@ from agents.network import messages, pubsub
 from agents.network.keys import Keys
 from agents.robot import Robot as Decision
 from agents.runtime.pose_inbox import MAX_UNREPORTED, PoseInbox
-from agents.runtime.telemetry import Counts, Telemetry
+from agents.runtime.telemetry import Counts, TelemetryPublisher
 from agents.vectors import UNKNOWN
 from experiments.definition import bodies
 from experiments.definition.plan import Plan
@@ -51,7 +51,7 @@ class Robot:
         self.body.open()
         nowhere = None
         self.neighbours = PoseInbox(nowhere, Keys(), [self.decision], valid_box=(2.0, 2.0, 2.0))  # type: ignore[arg-type]
-        self.telemetry = Telemetry(
+        self.telemetry = TelemetryPublisher(
             nowhere, Keys(), "json",  # type: ignore[arg-type]
             robots=[self.decision], neighbours=self.neighbours, counts=Counts(1), malformed=lambda: 0, ranged=[True],
         )  # fmt: skip

@@ -17,7 +17,7 @@ from agents.plugins.predictors import HOLD
 from agents.safety.detection import (
     FOREIGN_S,
     LOWEST_DESCENT_M_S,
-    Descent,
+    LandingProgress,
     clock_off,
     clock_text,
     nearest_robot,
@@ -346,7 +346,7 @@ def test_slow_landing_is_given_its_time():
 
 
 def test_blind_drone_gets_the_time_of_its_room():
-    descent, cut = Descent(6.0), []
+    descent, cut = LandingProgress(6.0), []
     for tick in range(400):
         descent.update(0.1 * tick, True, False, NAN, UNKNOWN)
         cut += [tick] if descent.late else []

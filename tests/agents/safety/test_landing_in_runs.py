@@ -11,7 +11,7 @@ from agents.kinds.crazyflie import CRAZYFLIE
 from agents.kinds.khepera4 import KHEPERA4
 from agents.safety.hazards import Cause
 from agents.safety.landing import NEAR
-from experiments.definition.experiment import Experiment, Formation, Leg, Robot
+from experiments.definition.experiment import Experiment, Formation, LegTable, RobotTable
 from tests.agents.few import pair
 from tests.agents.swarm import Swarm
 
@@ -19,9 +19,9 @@ from tests.agents.swarm import Swarm
 def test_run_ends_beside_a_robot_below():
     """The links put the drone over the robot on wheels; the process and the event are the real ones."""
     robots = {
-        "G": Robot(kind="khepera4", start=[0.0, 0.0]),
-        "F": Robot(kind="crazyflie", start=[0.3, 0.0], hover=0.8),
-        "H": Robot(kind="crazyflie", start=[-0.4, 0.0], hover=0.8),
+        "G": RobotTable(kind="khepera4", start=[0.0, 0.0]),
+        "F": RobotTable(kind="crazyflie", start=[0.3, 0.0], hover=0.8),
+        "H": RobotTable(kind="crazyflie", start=[-0.4, 0.0], hover=0.8),
     }
     links = {"G > F": 0.8, "H > F": 0.4}
     swarm = Swarm(Experiment(title="over", duration_s=3.0, robots=robots, formation=Formation(links=links)))
@@ -43,8 +43,11 @@ def test_run_ends_beside_a_robot_below():
 
 @pytest.mark.parametrize("trigger", ["send-on-delta", "predictive"])
 def test_drone_lands_beside_robot_that_died_moving(trigger):
-    robots = {"F": Robot(kind="crazyflie", start=[0.0, 0.0], hover=1.0), "K": Robot(kind="khepera4", start=[-0.4, 0.0])}
-    leg = Leg(at_s=0.0, robot="K", plan={"kind": "line", "move_by": [1.0, 0.0], "speed": 0.2})
+    robots = {
+        "F": RobotTable(kind="crazyflie", start=[0.0, 0.0], hover=1.0),
+        "K": RobotTable(kind="khepera4", start=[-0.4, 0.0]),
+    }
+    leg = LegTable(at_s=0.0, robot="K", plan={"kind": "line", "move_by": [1.0, 0.0], "speed": 0.2})
     swarm = Swarm(
         pair(
             robots=robots,
@@ -77,7 +80,7 @@ def farthest(kind: str, axis: int, side: float, latency_s: float = 0.0) -> float
     start = [0.1, 0.1]
     if axis < 2:
         start[axis] = side
-    member = Robot(kind=kind, start=start, **({"hover": HOVER} if KINDS[kind].flies else {}))
+    member = RobotTable(kind=kind, start=start, **({"hover": HOVER} if KINDS[kind].flies else {}))
     disturbed = {"all": Disturbance(latency_s=latency_s)} if latency_s else {}
     swarm = Swarm(
         pair(

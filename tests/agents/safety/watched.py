@@ -9,7 +9,7 @@ from agents.decision.neighbours import Incoming, Neighbours
 from agents.decision.situation import ProcessHealth, Situation
 from agents.kinds.crazyflie import CRAZYFLIE
 from agents.plugins.predictors import HOLD
-from agents.safety.detection import Detector, Status
+from agents.safety.detection import Detector, RobotStatus
 from agents.safety.hazards import Cause, Hazards
 
 DT = 0.01
@@ -28,7 +28,7 @@ class Watched:
         self.avoids = avoids
         self.detector, self.hazards = Detector(assignment), Hazards(kind, limits)
         self.neighbours, self.health = Neighbours(incoming, limits.neighbour_timeout_s), ProcessHealth()
-        self.now, self.status = Situation(), Status()
+        self.now, self.status = Situation(), RobotStatus()
         self.status.cruising, self.status.goal_height = True, hover
         self.position, self.velocity, self.yaw = (0.0, 0.0, hover), (0.0, 0.0, 0.0), 0.0
         self.values = {"battery": 0.8, "flying": kind.flies}

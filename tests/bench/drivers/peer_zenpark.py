@@ -12,7 +12,7 @@ from experiments.file import document
 from experiments.metrics import measure as metrics
 from experiments.virtual_time import stretch
 from experiments.virtual_time.log import RunRecorder
-from experiments.virtual_time.simulation import Flight
+from experiments.virtual_time.simulation import VirtualRun
 from tests.bench.drivers import ring
 
 HZ = round(1.0 / ring.STEP_S)
@@ -71,7 +71,7 @@ def measure(robots, kind, engine, evaluator, duration_s, *, complete=False):
     read = document.loads(experiment(robots, kind, engine, duration_s))
     loaded = time.process_time()
     ((case, flown),) = read.cases().items()
-    flight = Flight(flown, seed=1, quiet=True, lean=False)
+    flight = VirtualRun(flown, seed=1, quiet=True, lean=False)
     flight.fly(landing=False, progress=progress, watch=None)
     end = time.process_time()
     ticks = round((duration_s - start_s) * HZ)

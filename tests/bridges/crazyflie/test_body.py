@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from agents.body.interface import BodyError
-from agents.protocols.crtp import Memory
+from agents.protocols.crtp import MemoryKind
 from bridges.crazyflie.body import CrazyflieBody
 from tests.bridges.crazyflie_flight import Process, flown, supervised, truth
 from tests.twins.loopback import request
-from twins.devices.crazyflie.supervisor import State
+from twins.devices.crazyflie.supervisor import SupervisorState
 
 pytestmark = pytest.mark.system
 
@@ -51,13 +51,13 @@ def test_flight_and_next_session():
         assert process.state.position[0] == pytest.approx(truth(twin), abs=0.05)
         assert process.state.yaw[0] == pytest.approx(0.5, abs=0.06)
         assert process.t - process.state.time[0] < 0.5
-        assert supervised(twin) == State.FLYING
+        assert supervised(twin) == SupervisorState.FLYING
         process.land()
         assert truth(twin)[2] == 0.0
         assert not twin.device.flock.quadrotor.flying[0]
         process.body.stop([0])
         process.close()
-        assert supervised(twin) != State.LOCKED  # an emergency stop of one that stands would lock it
+        assert supervised(twin) != SupervisorState.LOCKED  # an emergency stop of one that stands would lock it
         again = Process(CrazyflieBody(request("crazyflie", twin.addresses)))
         try:
             again.takeoff()
@@ -65,7 +65,7 @@ def test_flight_and_next_session():
         finally:
             again.close()  # in the air: it lands first
         assert truth(twin)[2] == 0.0
-        assert supervised(twin) != State.LOCKED
+        assert supervised(twin) != SupervisorState.LOCKED
 
 
 def test_a_goal_with_a_yaw():
@@ -85,7 +85,7 @@ def test_emergency_stop():
     with flown() as (twin, process):
         process.takeoff()
         process.body.stop([0])
-        process.until(lambda: supervised(twin) == State.LOCKED, "locked")
+        process.until(lambda: supervised(twin) == SupervisorState.LOCKED, "locked")
         process.until(lambda: truth(twin)[2] == 0.0, "down")
         process.until(lambda: not process.state.flying[0] and "locked" in process.state.note[0], "said so")
         process.until(lambda: process.state.refusal == ("locked: switch it off and on",), "refuses to take off")
@@ -160,7 +160,7 @@ def test_lighthouse(tmp_path):
         memories = twin.device.flock.decks.memories[0]
         assert (memories.geometries, memories.calibrations) == (0b11, 0b11)
         assert memories.stored == (0b1111, 0b1111)
-        assert struct.unpack("<fff", memories.read(Memory.LIGHTHOUSE, 0x100, 12)) == pytest.approx((1.25, 0.5, 2.0))
+        assert struct.unpack("<fff", memories.read(MemoryKind.LIGHTHOUSE, 0x100, 12)) == pytest.approx((1.25, 0.5, 2.0))
         assert twin.device.drones[0].value("stabilizer.estimator") == 2
         assert twin.device.flock.estimator.variance[0] < 1e-2
         process.until(lambda: process.state.note[0] == "", "nothing to say")
@@ -218,9 +218,9 @@ def test_external_position():
 def test_arming():
     """A platform that must be armed is."""
     with flown(device={"platform": "brushless"}) as (twin, process):
-        assert supervised(twin) == State.DISARMED
+        assert supervised(twin) == SupervisorState.DISARMED
         process.takeoff(0.2)
-        assert supervised(twin) == State.FLYING
+        assert supervised(twin) == SupervisorState.FLYING
         process.cut()
 
 
@@ -229,9 +229,9 @@ def test_end_during_arming():
     with flown(device={"platform": "brushless"}) as (twin, process):
         process.tick()
         process.body.takeoff([0], [0.5])
-        process.until(lambda: supervised(twin) == State.ARMING, "arming")
+        process.until(lambda: supervised(twin) == SupervisorState.ARMING, "arming")
         process.close()
-        assert supervised(twin) == State.DISARMED
+        assert supervised(twin) == SupervisorState.DISARMED
         assert truth(twin)[2] == 0.0
 
 
@@ -242,12 +242,12 @@ def test_order_during_arming(order, after_s):
         row = [0]
         process.tick()
         process.body.takeoff(row, [0.5])
-        process.until(lambda: supervised(twin) == State.ARMING, "arming")
+        process.until(lambda: supervised(twin) == SupervisorState.ARMING, "arming")
         process.run(after_s)
         getattr(process.body, order)(row)
-        process.until(lambda: supervised(twin) == State.DISARMED, "disarmed")
+        process.until(lambda: supervised(twin) == SupervisorState.DISARMED, "disarmed")
         process.run(1.0)
-        assert supervised(twin) == State.DISARMED
+        assert supervised(twin) == SupervisorState.DISARMED
         assert truth(twin)[2] == 0.0
         process.takeoff(0.2)
         process.cut()
@@ -269,7 +269,7 @@ def test_another_session_finds_it_in_the_air():
             assert again.tick().note == ("",)
             assert not again.state.flying[0]
             assert truth(twin)[2] == 0.0
-            assert supervised(twin) != State.LOCKED
+            assert supervised(twin) != SupervisorState.LOCKED
             assert twin.device.drones[0].value("posCtlPid.thrustMin") == 5000
         finally:
             again.close()

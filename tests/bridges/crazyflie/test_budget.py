@@ -9,7 +9,7 @@ from agents.protocols.crazyflie import YOUNG_S, CrazyflieSettings, oldest_pose, 
 from agents.safety.detection import Ascent
 from agents.safety.motion_check import MotionCheck
 from agents.safety.setpoint_filter import OUTSIDE_M
-from bridges.crazyflie.flight import Phase
+from bridges.crazyflie.flight import FlightPhase
 from experiments.real_time.conductor.hot_changes import CLIMB_S
 from tests.bridges.crazyflie_clock import HEIGHT, TICK, Fleet, flight_of
 
@@ -57,7 +57,7 @@ def test_full_queue_ages_poses_and_prevents_take_off(monkeypatch):
         fleet.run(0.5)
         (trouble,) = fleet.troubles
         assert "s old; is its radio too full" in trouble
-        assert fleet.phases == {Phase.GROUND}
+        assert fleet.phases == {FlightPhase.GROUND}
         assert line.dropped == 0
         assert not fleet.twin.flock.quadrotor.flying.any()
 

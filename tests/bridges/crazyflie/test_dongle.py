@@ -13,7 +13,7 @@ from bridges.crazyflie.body import CrazyflieBody
 from tests.bridges.crazyflie_flight import Process, flown, supervised, truth
 from tests.twins.loopback import Served, request
 from twins.devices.crazyflie.device import CrazyflieTwin
-from twins.devices.crazyflie.supervisor import State
+from twins.devices.crazyflie.supervisor import SupervisorState
 
 pytestmark = pytest.mark.system
 
@@ -63,7 +63,7 @@ def test_flight_over_the_radio():
         assert np.abs(process.state.position - twin.truth()[0]).max() < 0.05
         process.land()
         assert descent.fastest.max() < SINKS
-        assert supervised(twin) != State.LOCKED
+        assert supervised(twin) != SupervisorState.LOCKED
 
 
 def test_short_gaps_are_flown_through():
@@ -80,7 +80,7 @@ def test_short_gaps_are_flown_through():
             assert abs(truth(twin)[2] - HEIGHT) < 0.1
         assert descent.fastest.max() < SINKS
         assert process.body.pilots[0].link is link
-        assert supervised(twin) == State.FLYING
+        assert supervised(twin) == SupervisorState.FLYING
         process.cut()
 
 
@@ -95,7 +95,7 @@ def test_a_long_gap_ends_in_a_landing():
         process.until(lambda: not process.state.flying[0], "landed")
         assert truth(twin)[2] == pytest.approx(0.0, abs=0.02)
         assert descent.fastest.max() < SINKS
-        assert supervised(twin) != State.LOCKED
+        assert supervised(twin) != SupervisorState.LOCKED
         process.until(
             lambda: process.t - process.state.time[0] < 0.3, "logs again: the firmware has removed its blocks"
         )
@@ -136,7 +136,7 @@ def test_nothing_is_received_any_more(begins):
             landed = t[np.flatnonzero(z[row] == 0.0)[0]]
             assert z[row][t > landed].max() < 1e-3, "lifted again"
         assert descent.fastest.max() < SINKS
-        assert not any(supervised(twin, row) == State.LOCKED for row in range(3))
+        assert not any(supervised(twin, row) == SupervisorState.LOCKED for row in range(3))
         assert not twin.device.flock.quadrotor.flying[:2].any()
         assert process.state.flying[2], "nothing is seen of its motors"
         twin.device.lines[2].silence(0.0)
@@ -185,7 +185,7 @@ def test_random_losses(loss):
         process.until(lambda: abs(truth(twin)[0] - 0.2) < 0.03, "goal")
         process.land()
         assert descent.fastest.max() < SINKS
-        assert supervised(twin) != State.LOCKED
+        assert supervised(twin) != SupervisorState.LOCKED
         assert not any(word in process.state.note[0] for word in ("refused", "link lost", "landed"))
 
 
@@ -233,7 +233,7 @@ def test_a_lost_answer_is_no_refusal():
         assert process.state.flying[0]
         process.land()
         assert descent.fastest.max() < SINKS
-        assert supervised(twin) != State.LOCKED
+        assert supervised(twin) != SupervisorState.LOCKED
 
 
 def test_a_session_that_begins_while_safelink_is_on():
@@ -264,7 +264,7 @@ def test_queue_filling_in_the_air_ends_in_landing():
         process.until(lambda: process.t - process.state.time[0] > 0.5, "old poses")
         assert process.state.flying[0]
         process.land()  # as the robot's loop does then
-        process.until(lambda: supervised(twin) in {State.LANDED, State.READY}, "landed")
+        process.until(lambda: supervised(twin) in {SupervisorState.LANDED, SupervisorState.READY}, "landed")
         assert descent.fastest.max() < SINKS
 
 
@@ -284,7 +284,7 @@ def test_a_radio_that_becomes_slow_gets_fewer_logs(monkeypatch):
         dongle.air = dongle.air._replace(hz=500.0)
         assert "fewer logs" in process.state.note[0]
         process.land()
-        assert supervised(twin) != State.LOCKED
+        assert supervised(twin) != SupervisorState.LOCKED
         process.until(lambda: "fewer logs" not in process.state.note[0], "the rates that were chosen")
         blocks = process.body.pilots[0].link.blocks
         assert blocks["state"].period == 5
@@ -292,11 +292,11 @@ def test_a_radio_that_becomes_slow_gets_fewer_logs(monkeypatch):
 
 def test_recovery_from_a_crash_is_asked_for():
     with flown(device=RADIO) as (twin, process):
-        twin.device.flock.supervisor.state[0] = State.CRASHED
+        twin.device.flock.supervisor.state[0] = SupervisorState.CRASHED
         process.until(lambda: "crashed: put it upright" in process.state.note[0], "note")
         process.body.takeoff([0], [HEIGHT])
         process.until(lambda: "no take-off: crashed" in process.state.note[0] and not process.state.flying[0], "no")
-        assert supervised(twin) == State.CRASHED
+        assert supervised(twin) == SupervisorState.CRASHED
         process.close()
         again = Process(CrazyflieBody(request("crazyflie", twin.addresses, device={"recover": True})))
         try:

@@ -20,7 +20,7 @@ from tests.bridges.crazyflie_flight import Process, flown, supervised, truth
 from tests.twins.loopback import Served, request
 from tests.waiting import until
 from twins.devices.crazyflie.device import CrazyflieTwin
-from twins.devices.crazyflie.supervisor import State
+from twins.devices.crazyflie.supervisor import SupervisorState
 from twins.devices.device import Faults
 
 RADIO = "radio://0/80/2M/E7E7E7E70{}"
@@ -58,7 +58,7 @@ def test_faulty_drones_fail_differently_while_others_fly_on():
             return unseen and not process.state.flying[[blinking, empty]].any()
 
         process.until(settled, "those that fail are down")
-        assert not any(supervised(twin, row) == State.LOCKED for row in range(5))
+        assert not any(supervised(twin, row) == SupervisorState.LOCKED for row in range(5))
         assert not twin.device.flock.quadrotor.flying[blinking:].any()
         assert process.state.flying[[mute, killed]].all()
         assert truth(twin, mute)[2] == truth(twin, blinking)[2] == truth(twin, empty)[2] == 0.0
@@ -96,7 +96,7 @@ def test_loop_that_stops_commanding():
         process.setpoint = [(0.0, 0.0, 0.3, 0.0)]
         process.run(0.2)
         until(lambda: truth(twin)[2] == 0.0, "it was landed")
-        assert supervised(twin) != State.LOCKED
+        assert supervised(twin) != SupervisorState.LOCKED
         assert "no commands from" in process.tick().note[0]
         process.cut()
 
@@ -164,7 +164,7 @@ def test_process_woken_from_suspension_lifts_no_drone(link):
             until(lambda: abs(truth(twin)[0] - 0.3) < 0.05, "it follows setpoints")
             os.kill(child.pid, signal.SIGSTOP)
             until(lambda: truth(twin)[2] == 0.0, "its drone has come down")
-            assert supervised(twin) == State.FLYING
+            assert supervised(twin) == SupervisorState.FLYING
             os.kill(child.pid, signal.SIGCONT)
             heights = []
 
@@ -174,7 +174,7 @@ def test_process_woken_from_suspension_lifts_no_drone(link):
 
             until(stands, "its motors are stopped")
             assert max(heights) == 0.0
-            assert supervised(twin) != State.LOCKED
+            assert supervised(twin) != SupervisorState.LOCKED
         finally:
             child.kill()
             child.wait()

@@ -9,14 +9,14 @@ import pytest
 from agents.body.interface import UNANSWERED
 from agents.protocols import crtp
 from agents.protocols.crazyflie import CrazyflieSettings
-from agents.protocols.crtp import HighLevel, Info, Port, Status
+from agents.protocols.crtp import HighLevel, Info, LogStatus, Port
 from agents.safety.detection import LOWEST_DESCENT_M_S
 from bridges.crazyflie import flight as module
 from bridges.crazyflie import telemetry as telemetry_module
 from bridges.crazyflie import trajectory as trajectory_module
-from bridges.crazyflie.flight import Flight, Phase
+from bridges.crazyflie.flight import FlightControl, FlightPhase
 from bridges.crazyflie.telemetry import Telemetry
-from bridges.crazyflie.trajectory import HOLD_S, SINK, TAKEOFFS, Trajectories
+from bridges.crazyflie.trajectory import HOLD_S, SINK, TAKEOFFS, TrajectoryMemory
 
 PLACE = (0.1, 0.2, 0.5, 0.0)
 
@@ -29,13 +29,13 @@ class Air:
         for each in (module, telemetry_module, trajectory_module):
             monkeypatch.setattr(each, "time", types.SimpleNamespace(monotonic=lambda: self.now))
         self.telemetry = Telemetry(lighthouse=False)
-        self.flight = Flight(CrazyflieSettings(**chosen), self.telemetry, self.pause)
+        self.flight = FlightControl(CrazyflieSettings(**chosen), self.telemetry, self.pause)
         self.flight.link = types.SimpleNamespace(
             cf=self,
             error=None,
             busy=False,
             planner_reply=lambda command: self.replies.get(command, (0, 0)),
-            trajectories=Trajectories(self.wire),
+            trajectories=TrajectoryMemory(self.wire),
         )
         self.replies = {}
         self.supervisor = self.commander = self.high_level_commander = self
@@ -59,7 +59,7 @@ class Air:
 
     def fly(self):
         self.telemetry.settled, self.telemetry.pose = True, [0.1, 0.2, 0.5, 0.0, 0.0, 0.0, 0.0]
-        self.flight.enter(Phase.CLIMBING)
+        self.flight.enter(FlightPhase.CLIMBING)
         return self.pass_(0.1)
 
     def pass_(self, seconds):
@@ -86,7 +86,7 @@ def air(monkeypatch):
 def test_unanswered_landing_is_ordered_again(air):
     air.sent.clear()
     air.flight.land()
-    assert air.flight.phase is Phase.LANDING
+    assert air.flight.phase is FlightPhase.LANDING
     assert not air.times("setpoint"), "a start would make the planner forget the landing"
     assert len(air.times("land")) == module.TRIES
     air.telemetry.pose = [0.0] * 7
@@ -139,13 +139,13 @@ def test_end_of_climb_is_held_until_first_setpoint(monkeypatch):
     air.flying, setpoint = True, air.flight.set_target
     air.flight.set_target = lambda now, _: setpoint(now, None)
     air.pass_(6.0)
-    assert air.flight.phase is Phase.CLIMBING
+    assert air.flight.phase is FlightPhase.CLIMBING
     held = air.times("setpoint")
     assert held[0] - air.times("climb")[-1] < 1.5 + HOLD_S
     assert np.diff(held).max() < 0.5 * HOLD_S
     air.flight.set_target = lambda _now, _: None
     air.pass_(2.0)
-    assert air.flight.phase is Phase.LANDING
+    assert air.flight.phase is FlightPhase.LANDING
 
 
 def test_emergency_stop_is_repeated_until_answered(air):
@@ -158,7 +158,7 @@ def test_emergency_stop_is_repeated_until_answered(air):
     assert air.flight.trouble == UNANSWERED
     air.info |= Info.LOCKED
     air.pass_(0.04)
-    assert air.flight.phase is Phase.STOPPED
+    assert air.flight.phase is FlightPhase.STOPPED
     assert not air.flight.airborne
     assert air.flight.trouble == ""
     air.sent.clear()
@@ -170,7 +170,7 @@ def test_firmware_without_lock_flag_stops_once_not_flying(air):
     air.flight.stop()
     air.flying = False
     air.pass_(2.2)
-    assert air.flight.phase is Phase.STOPPED
+    assert air.flight.phase is FlightPhase.STOPPED
 
 
 def test_a_stop_outlives_the_link(monkeypatch):
@@ -197,7 +197,7 @@ def test_drone_flying_unasked_is_landed_and_not_cut(monkeypatch):
     air = Air(monkeypatch)
     air.telemetry.pose = [0.1, 0.2, 0.8, 0.0, 0.0, 0.0, 0.0]
     air.pass_(0.1)
-    assert air.flight.phase is Phase.LANDING
+    assert air.flight.phase is FlightPhase.LANDING
     assert air.flight.airborne
     assert air.times("land")
     assert not air.times("send_emergency_stop")
@@ -208,15 +208,17 @@ def test_a_take_off_without_an_answer_goes_on(monkeypatch):
     air.telemetry.settled, air.flying, air.telemetry.pose = True, False, (0.0,) * 7
     air.pass_(0.1)
     air.flight.takeoff(0.5)
-    assert air.flight.phase is Phase.CLIMBING
+    assert air.flight.phase is FlightPhase.CLIMBING
     air.pass_(1.0)
     assert air.flight.trouble == ""
     air.pass_(3.0)  # its motors never turn
-    assert air.flight.phase is Phase.GROUND
+    assert air.flight.phase is FlightPhase.GROUND
     assert air.flight.trouble == "its motors do not turn"
 
 
-@pytest.mark.parametrize(("gap", "phase"), [(0.3, Phase.FLYING), (0.7, Phase.FLYING), (0.9, Phase.LANDING)])
+@pytest.mark.parametrize(
+    ("gap", "phase"), [(0.3, FlightPhase.FLYING), (0.7, FlightPhase.FLYING), (0.9, FlightPhase.LANDING)]
+)
 def test_after_a_gap(air, gap, phase):
     air.flight.land_after_gap(gap)
     assert air.flight.phase is phase
@@ -234,7 +236,7 @@ def test_a_drone_out_of_reach_counts_as_flying(air):
     assert "motors may be on" in air.flight.trouble
     air.telemetry.info = air.info
     assert not air.flight.resume()
-    assert air.flight.phase is Phase.GROUND
+    assert air.flight.phase is FlightPhase.GROUND
 
 
 @pytest.mark.parametrize("pose", [0.3, math.nan])
@@ -309,10 +311,10 @@ def test_landing_on_a_table_ends(air):
         answered = len(air.times("land"))
         if answered > orders:
             accepted = air.now > end
-            orders, air.replies[HighLevel.LAND] = answered, (answered, Status.OK if accepted else Status.REFUSED)
+            orders, air.replies[HighLevel.LAND] = answered, (answered, LogStatus.OK if accepted else LogStatus.REFUSED)
             begun, end = begun + accepted, air.now + air.flight.span_s if accepted else end
     assert begun == 1 + module.LATE_LANDINGS
-    assert air.flight.phase is Phase.GROUND
+    assert air.flight.phase is FlightPhase.GROUND
 
 
 def test_setpoints_of_others_end_in_flight(air):
@@ -384,7 +386,7 @@ def test_an_old_status_tells_of_an_earlier_phase(air):
         air.telemetry.arrival, air.telemetry.status_time = air.now, 100.0
         air.flight.set_target(air.now, PLACE)
         air.flight.update_phase(air.now)
-    assert air.flight.phase is Phase.FLYING
+    assert air.flight.phase is FlightPhase.FLYING
 
 
 def test_setpoints_of_old_poses_are_ignored(air):
@@ -400,7 +402,7 @@ def test_crashed_drone_is_not_recovered_by_take_off(monkeypatch, info):
     air.telemetry.settled, air.flying, air.info = True, False, Info.ARMED | info
     air.pass_(0.1)
     air.flight.takeoff(0.5)
-    assert air.flight.phase is Phase.GROUND
+    assert air.flight.phase is FlightPhase.GROUND
     assert "no take-off" in air.flight.trouble
     assert air.sent == []
 
@@ -419,6 +421,6 @@ def test_armed_is_not_yet_able_to_fly(monkeypatch):
 
     air.flight._pause = spun_up
     air.flight.takeoff(0.5)
-    assert air.flight.phase is Phase.CLIMBING
+    assert air.flight.phase is FlightPhase.CLIMBING
     assert min(air.times("climb")) > 101.5
     assert air.times("send_arming_request") == []

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from agents.protocols.crtp import Info
-from bridges.crazyflie.telemetry import StampAge, Telemetry
+from bridges.crazyflie.telemetry import PacketAge, Telemetry
 
 
 def ages(packets):
     """Ages of packets, each given as stamp [ms] and arrival [s]."""
-    stamps = StampAge()
+    stamps = PacketAge()
     return [stamps.age(arrival, stamp) for stamp, arrival in packets]
 
 
@@ -37,7 +37,7 @@ def test_clocks_drift():
 
 
 def test_a_drone_that_was_switched_off_and_on():
-    stamps = StampAge()
+    stamps = PacketAge()
     stamps.age(50.0, 100_000)
     assert not stamps.restarted
     assert stamps.age(52.0, 500) == 0.0
@@ -46,7 +46,7 @@ def test_a_drone_that_was_switched_off_and_on():
 
 def test_restart_half_an_overflow_later():
     """On a charger for hours: the stamp of the new start is ahead of the old one, counted around."""
-    stamps = StampAge()
+    stamps = PacketAge()
     stamps.age(50.0, 10_000_000)
     assert stamps.age(53.0, 2_000) == 0.0
     assert stamps.restarted
@@ -55,7 +55,7 @@ def test_restart_half_an_overflow_later():
 @pytest.mark.parametrize(("stamp", "restarted"), [(15_000, False), (14_000, False), (8_000, True)])
 def test_restart_found_with_a_larger_stamp(stamp, restarted):
     """Switched off and on soon after its first start: ten seconds later its clock has advanced by three."""
-    stamps = StampAge()
+    stamps = PacketAge()
     stamps.age(50.0, 5_000)
     stamps.connected_anew = True
     stamps.age(60.0, stamp)

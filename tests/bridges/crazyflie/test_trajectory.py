@@ -8,11 +8,11 @@ import pytest
 
 from agents.protocols import crtp
 from agents.protocols.crazyradio import COUNTERS, NULL
-from agents.protocols.crtp import HighLevel, Memory, Port
+from agents.protocols.crtp import HighLevel, MemoryKind, Port
 from bridges.crazyflie import trajectory as module
 from bridges.crazyflie.trajectory import COMPRESSED, HOLD_S, POLYNOMIALS, REPEAT_S, SINK, START_EXPIRY_S, TAKEOFFS
 from twins.devices.crazyflie.memory import Memories
-from twins.devices.crazyflie.planner import Planner, evaluate, polynomial
+from twins.devices.crazyflie.planner import OnboardPlanners, evaluate, polynomial
 from twins.devices.crazyflie.trajectories import Trajectories
 
 DT = 0.01
@@ -23,12 +23,12 @@ class Board:
     """Memory, planner and answers of a Crazyflie; `lost`: so many answers about the memory do not come."""
 
     def __init__(self, monkeypatch):
-        self.memories, self.planner, self.lost = Memories(), Planner(1), 0
+        self.memories, self.planner, self.lost = Memories(), OnboardPlanners(1), 0
         self.now = 100.0
         monkeypatch.setattr(module, "time", types.SimpleNamespace(monotonic=lambda: self.now))
         self.trajectories = Trajectories(self.memories)
         self.sent, self.started = [], []
-        self.client = module.Trajectories(self.receive)
+        self.client = module.TrajectoryMemory(self.receive)
         self.client.define()
         self.sent.clear()
 
@@ -36,7 +36,7 @@ class Board:
         self.sent.append(data)
         if port == Port.MEMORY:
             _, address = crtp.MEMORY.unpack_from(data)
-            assert self.memories.write(Memory.TRAJECTORY, address, data[crtp.MEMORY.size :])
+            assert self.memories.write(MemoryKind.TRAJECTORY, address, data[crtp.MEMORY.size :])
             self.lost -= 1
             if self.lost < 0:
                 self.client.note_answer(address, 0)

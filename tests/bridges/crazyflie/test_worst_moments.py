@@ -5,9 +5,9 @@ import struct
 import pytest
 
 from agents.protocols.crtp import HighLevel, Port, Setpoint
-from bridges.crazyflie.flight import DESCENT, Flight, Phase
+from bridges.crazyflie.flight import DESCENT, FlightControl, FlightPhase
 from tests.bridges.crazyflie_clock import HEIGHT, Fleet
-from twins.devices.crazyflie.supervisor import State
+from twins.devices.crazyflie.supervisor import SupervisorState
 
 HZ = 500.0  # [1/s] exchanges of the radio
 NIGHTLY = pytest.mark.nightly
@@ -66,7 +66,7 @@ def test_gap_in_the_climb(fleet, hover, gap, begin, speed):
     assert landed(fleet) < 0.02
     assert fleet.fastest < SINKS
     assert fleet.touch < TOUCHES
-    assert fleet.twin.flock.supervisor.state[0] != State.CRASHED
+    assert fleet.twin.flock.supervisor.state[0] != SupervisorState.CRASHED
 
 
 @pytest.mark.slow
@@ -74,16 +74,16 @@ def test_gap_in_the_climb(fleet, hover, gap, begin, speed):
 def test_flight_by_another_client_is_landed(fleet, stays_s):
     """It leaves at once, or when it has ended the landing again and again."""
     client = Client(fleet, 0.8)
-    while fleet.phases != {Phase.LANDING}:
+    while fleet.phases != {FlightPhase.LANDING}:
         fleet.run(0.02)
     fleet.run(stays_s)
     client.leave()
     fleet.run(0.8 / DESCENT + 5.0)
-    assert fleet.phases == {Phase.GROUND}
+    assert fleet.phases == {FlightPhase.GROUND}
     assert fleet.fastest < SINKS
     assert fleet.touch < TOUCHES
     assert fleet.troubles == {"landed: it flew without an order"}
-    assert fleet.twin.flock.supervisor.state[0] != State.LOCKED
+    assert fleet.twin.flock.supervisor.state[0] != SupervisorState.LOCKED
 
 
 @pytest.mark.slow
@@ -95,8 +95,8 @@ def test_another_client_in_flight_is_ended(fleet):
     fleet.run(0.02, speed=0.3)
     client.leave()
     fleet.run(4.0, speed=0.3)
-    assert fleet.phases == {Phase.FLYING}
-    assert fleet.twin.flock.supervisor.state[0] == State.FLYING
+    assert fleet.phases == {FlightPhase.FLYING}
+    assert fleet.twin.flock.supervisor.state[0] == SupervisorState.FLYING
     assert fleet.heights[0] > 0.3
 
 
@@ -111,7 +111,7 @@ def test_another_client_cuts_the_motors(fleet):
         lowest = min(fleet.run(0.05, speed=0.3).heights[0] for _ in range(60))
         assert lowest > HEIGHT - 0.2
         assert fleet.heights[0] == pytest.approx(HEIGHT, abs=0.03)
-    assert fleet.twin.flock.supervisor.state[0] == State.FLYING
+    assert fleet.twin.flock.supervisor.state[0] == SupervisorState.FLYING
 
 
 @pytest.mark.slow
@@ -134,7 +134,7 @@ def test_memory_that_takes_no_setpoint(fleet, how):
     assert fleet.fastest < SINKS
     assert fleet.touch < TOUCHES
     fleet.run(4.0)
-    assert fleet.phases == {Phase.GROUND}
+    assert fleet.phases == {FlightPhase.GROUND}
     drone.memories.write = write
 
 
@@ -147,14 +147,14 @@ def test_short_gaps_one_after_the_other(fleet):
         for _ in range(5):
             fleet.twin.lines[0].silence(gap)
             assert fleet.run(gap + between, speed=0.3).heights[0] > HEIGHT - 0.1
-    assert fleet.phases == {Phase.FLYING}
+    assert fleet.phases == {FlightPhase.FLYING}
 
 
 @pytest.mark.nightly
 def test_landing_from_eight_metres(fleet):
     fleet.climb(8.0, 7.5)
     fleet.run(3.0)
-    fleet.order(Flight.land)
+    fleet.order(FlightControl.land)
     assert landed(fleet) < 0.02
     assert fleet.fastest < SINKS
     assert fleet.touch < TOUCHES

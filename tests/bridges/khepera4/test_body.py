@@ -27,7 +27,7 @@ from agents.protocols import khepera4 as protocol
 from bridges.khepera4 import body as khepera4
 from bridges.khepera4 import drivers
 from bridges.khepera4.body import OPEN_S, KheperaBody
-from bridges.khepera4.link import Address, Khepera4Link, Odometry
+from bridges.khepera4.link import Khepera4Link, KheperaAddress, KheperaOdometry
 from bridges.khepera4.odometry import Odometer
 from tests.bridges.columns import Columns
 from tests.twins.loopback import Served, reached, request
@@ -152,15 +152,15 @@ def test_velocity_follows_with_a_tenth_of_a_second():
 @pytest.mark.parametrize(
     ("address", "expected"),
     [
-        ("khepera4://192.168.0.21", Address(False, "192.168.0.21", 50000, "", None)),
-        ("khepera4://kh1.lab:1234", Address(False, "kh1.lab", 1234, "", None)),
-        ("kteam://10.0.0.3:2000", Address(True, "10.0.0.3", 2000, "", None)),
-        ("kteam:///dev/ttyS0", Address(True, "", 0, "/dev/ttyS0", None)),
-        ("khepera4://kh1?server=2023-01-07", Address(False, "kh1", 50000, "", "2023-01-07")),
+        ("khepera4://192.168.0.21", KheperaAddress(False, "192.168.0.21", 50000, "", None)),
+        ("khepera4://kh1.lab:1234", KheperaAddress(False, "kh1.lab", 1234, "", None)),
+        ("kteam://10.0.0.3:2000", KheperaAddress(True, "10.0.0.3", 2000, "", None)),
+        ("kteam:///dev/ttyS0", KheperaAddress(True, "", 0, "/dev/ttyS0", None)),
+        ("khepera4://kh1?server=2023-01-07", KheperaAddress(False, "kh1", 50000, "", "2023-01-07")),
     ],
 )
 def test_addresses(address, expected):
-    assert Address.parse("K", address) == expected
+    assert KheperaAddress.parse("K", address) == expected
 
 
 @pytest.mark.parametrize(
@@ -200,7 +200,9 @@ def test_nobody_there_is_said_with_the_remedy(impatient):
 
 @pytest.mark.parametrize("failure", [AssertionError, MemoryError, UnicodeError, StopIteration])
 def test_link_outlives_failures_of_any_kind(failure):
-    link = Khepera4Link("K", Address.parse("K", "khepera4://127.0.0.1"), protocol.Khepera4Settings(), (0.0, 0.0, 0.0))
+    link = Khepera4Link(
+        "K", KheperaAddress.parse("K", "khepera4://127.0.0.1"), protocol.Khepera4Settings(), (0.0, 0.0, 0.0)
+    )
     tried = []
 
     def connect():
@@ -451,25 +453,25 @@ def test_wheels_with_link_broken_at_end_are_stopped():
 
 def test_a_stop_that_is_not_answered_is_said():
     link = Khepera4Link(
-        "KH01", Address.parse("KH01", "khepera4://127.0.0.1"), protocol.Khepera4Settings(), (0.0, 0.0, 0.0)
+        "KH01", KheperaAddress.parse("KH01", "khepera4://127.0.0.1"), protocol.Khepera4Settings(), (0.0, 0.0, 0.0)
     )
     link.drive(0.2, 0.0, 0.0)
-    link.odometry = Odometry(100.0, 0.0, 0.0, 0.0, (0.2, 0.0))
+    link.odometry = KheperaOdometry(100.0, 0.0, 0.0, 0.0, (0.2, 0.0))
     link.halt(100.0)
     link.halt(101.0)  # again, by the watchdog
     assert not link.unanswered(102.0)
     assert link.unanswered(103.0)
-    link.odometry = Odometry(103.0, 0.0, 0.0, 0.0, (0.0, 0.0))
+    link.odometry = KheperaOdometry(103.0, 0.0, 0.0, 0.0, (0.0, 0.0))
     assert not link.unanswered(103.0)
     link.drive(0.2, 0.0, 0.0)
-    link.odometry = Odometry(110.0, 0.0, 0.0, 0.0, (0.2, 0.0))
+    link.odometry = KheperaOdometry(110.0, 0.0, 0.0, 0.0, (0.2, 0.0))
     assert not link.unanswered(110.0)
 
 
 @pytest.mark.system
 def test_serial_line_in_use_is_left_alone():
     ours, theirs = os.openpty()
-    address = Address.parse("KH01", f"kteam://{os.ttyname(theirs)}")
+    address = KheperaAddress.parse("KH01", f"kteam://{os.ttyname(theirs)}")
     first = address.connect()
     link = Khepera4Link("KH02", address, protocol.Khepera4Settings(), (0.0, 0.0, 0.0))
     link.start()
@@ -488,7 +490,7 @@ def test_kteam_over_a_serial_line():
     """A pseudo terminal with the twin's side of the protocol at its other end."""
     ours, theirs = os.openpty()
     tty.setraw(theirs)
-    robot = twin._Robot(request("khepera4", ["-"]), 0, Faults())
+    robot = twin._WheeledRobot(request("khepera4", ["-"]), 0, Faults())
     ending = threading.Event()
     heard = []
 

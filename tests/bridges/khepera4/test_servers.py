@@ -9,7 +9,7 @@ from agents.clock import uptime
 from agents.protocols import khepera4 as protocol
 from bridges.khepera4 import drivers
 from bridges.khepera4.drivers import WrongServer
-from bridges.khepera4.link import Address, Khepera4Link
+from bridges.khepera4.link import Khepera4Link, KheperaAddress
 from tests.bridges.khepera4.lab import Lab
 
 SERVERS = list(protocol.PARK)
@@ -99,7 +99,7 @@ def test_command_that_waited_too_long_becomes_a_stop(robot):
 
 def test_command_is_as_old_as_its_state():
     link = Khepera4Link(
-        "KH01", Address.parse("KH01", "khepera4://127.0.0.1"), protocol.Khepera4Settings(), (0.0, 0.0, 0.0)
+        "KH01", KheperaAddress.parse("KH01", "khepera4://127.0.0.1"), protocol.Khepera4Settings(), (0.0, 0.0, 0.0)
     )
     link.drive(0.1, 0.2, uptime())
     assert link.current_twist()[:2] == (0.1, 0.2)
@@ -190,7 +190,7 @@ def test_way_that_is_reported_late_is_counted_once(lab):
     ],
 )
 def test_server_is_named_in_address_or_table(address, device, server):
-    assert Address.parse("R0", address).server_of("R0", protocol.Khepera4Settings(**device)) == server
+    assert KheperaAddress.parse("R0", address).server_of("R0", protocol.Khepera4Settings(**device)) == server
 
 
 @pytest.mark.parametrize(
@@ -200,4 +200,4 @@ def test_server_is_named_in_address_or_table(address, device, server):
 )  # fmt: skip
 def test_address_and_table_must_not_contradict_one_another(address, device):
     with pytest.raises(BodyError, match=r"R0: h:.*: device\.server is "):
-        Address.parse("R0", address).server_of("R0", protocol.Khepera4Settings(**device))
+        KheperaAddress.parse("R0", address).server_of("R0", protocol.Khepera4Settings(**device))

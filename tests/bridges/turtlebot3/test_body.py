@@ -86,7 +86,7 @@ def test_drives_turtlebots_only():
 
 def test_addresses():
     where = turtlebot3.address("TB0", "rmw://fleet/tb3_0?distro=humble", turtlebot3.TurtleBot3Settings(domain=30))
-    assert where == turtlebot3.Address("rmw", "fleet/tb3_0", "humble", 30)
+    assert where == turtlebot3.TurtleBotAddress("rmw", "fleet/tb3_0", "humble", 30)
     assert str(where) == "rmw://fleet/tb3_0?domain=30&distro=humble"
     assert turtlebot3.address("TB0", "ros2dds://", turtlebot3.TurtleBot3Settings()).namespace == ""
     assert turtlebot3.command_type("humble", None) == ros2.TWIST

@@ -14,7 +14,7 @@ import pytest
 from agents.body.interface import UNANSWERED, BodyError
 from agents.protocols import ros2
 from bridges.turtlebot3.body import DIAGNOSIS_S, OPEN_S, TurtleBot3
-from bridges.turtlebot3.robot import Robot
+from bridges.turtlebot3.robot import TurtleBotConnection
 from tests.bridges.turtlebots import STYLES, Stage, clock, request
 from tests.waiting import until
 from twins.devices.device import Faults
@@ -210,7 +210,7 @@ def odometry(x: float, stamp: float) -> SimpleNamespace:
 
 
 def test_two_robots_of_one_namespace_have_no_position() -> None:
-    robot = Robot(request("tcp/127.0.0.1:1", addresses=("ros2dds://tb3_0",)), 0)
+    robot = TurtleBotConnection(request("tcp/127.0.0.1:1", addresses=("ros2dds://tb3_0",)), 0)
     robot._types, robot._command_type = ros2.types("humble"), ros2.TWIST
     waiting: list[SimpleNamespace] = []
     nothing = SimpleNamespace(newest=lambda: None)
@@ -267,7 +267,7 @@ def test_stale_commands_are_followed_by_zeros() -> None:
 
 
 def test_command_from_before_suspension_becomes_zeros() -> None:
-    robot = Robot(request("tcp/127.0.0.1:1", addresses=("ros2dds://tb3_0",)), 0)
+    robot = TurtleBotConnection(request("tcp/127.0.0.1:1", addresses=("ros2dds://tb3_0",)), 0)
     sent = []
     robot._types, robot._command_type = ros2.types("humble"), ros2.TWIST
     robot._command = SimpleNamespace(put=lambda message: sent.append(message.linear.x))  # type: ignore[assignment]

@@ -17,7 +17,7 @@ from types import SimpleNamespace as Thing
 import pytest
 
 from bridges.turtlebot3 import watchdog
-from bridges.turtlebot3.watchdog import TYPES, Node, Watchdog, moving, type_of_robot
+from bridges.turtlebot3.watchdog import TYPES, StopTimer, WatchdogNode, moving, type_of_robot
 from experiments.real_time.hosts import installation
 from experiments.real_time.hosts.hosts import HostError
 from tests.waiting import until
@@ -31,14 +31,14 @@ def twist(v: float = 0.0, w: float = 0.0) -> Thing:
     return Thing(linear=vector(v), angular=Thing(x=0.0, y=0.0, z=w))
 
 
-def zeros(dog: Watchdog, begin: float, end: float) -> list[float]:
+def zeros(dog: StopTimer, begin: float, end: float) -> list[float]:
     """Times of the zeros that are sent from `begin` to `end` [s]."""
     ticks = [begin + 0.02 * k for k in range(round((end - begin) / 0.02))]
     return [t for t in ticks if dog.zero_due(t)]
 
 
 def test_moving_robot_stops_after_half_a_second_silence() -> None:
-    dog = Watchdog(0.5)
+    dog = StopTimer(0.5)
     dog.hear(10.0, moves=True)
     sent = zeros(dog, 10.0, 14.0)
     assert sent[0] == pytest.approx(10.52)
@@ -48,7 +48,7 @@ def test_moving_robot_stops_after_half_a_second_silence() -> None:
 
 
 def test_commanded_or_standing_robot_is_left_alone() -> None:
-    dog = Watchdog(0.5)
+    dog = StopTimer(0.5)
     assert zeros(dog, 0.0, 5.0) == []  # nobody has ever moved it
     for k in range(50):
         dog.hear(5.0 + 0.4 * k, moves=True)
@@ -58,7 +58,7 @@ def test_commanded_or_standing_robot_is_left_alone() -> None:
 
 
 def test_its_own_zeros_are_heard_and_end_nothing() -> None:
-    dog = Watchdog(0.5)
+    dog = StopTimer(0.5)
     dog.hear(0.0, moves=True)
     first = zeros(dog, 0.0, 0.6)
     dog.hear(0.6, moves=False)
@@ -120,7 +120,7 @@ def test_node_sends_zeros_of_the_robots_type(monkeypatch: pytest.MonkeyPatch, ki
     monkeypatch.setitem(sys.modules, "geometry_msgs.msg", messages)
     ros, clock = FakeRos(), [100.0]
     monkeypatch.setattr(watchdog.time, "monotonic", lambda: clock[0])
-    Node(ros, "cmd_vel", TYPES[kind], 0.5)
+    WatchdogNode(ros, "cmd_vel", TYPES[kind], 0.5)
     ros.hear(twist(0.1) if kind == "twist" else Thing(twist=twist(0.1)))
     for _ in range(50):
         clock[0] += 0.02

@@ -24,7 +24,7 @@ from experiments.check.check import check, examine, figures
 from experiments.check.findings import CheckNumbers
 from experiments.check.ideal_run import Prediction
 from experiments.check.safety import batteries
-from experiments.definition.experiment import Experiment, Formation, Leg, Robot
+from experiments.definition.experiment import Experiment, Formation, LegTable, RobotTable
 from experiments.definition.plan import Plan
 from experiments.file import catalogue, document
 from experiments.file.problems import DocumentError
@@ -363,14 +363,14 @@ def experiments(draw: st.DrawFn) -> Experiment:
         flies = draw(st.booleans())
         kind = draw(st.sampled_from(["crazyflie", "tello"] if flies else ["khepera4", "turtlebot3"]))
         hover = draw(st.floats(0.2, 2.0)) if flies else None
-        robots[f"R{number}"] = Robot(kind=kind, start=[draw(place), draw(place)], hover=hover)
+        robots[f"R{number}"] = RobotTable(kind=kind, start=[draw(place), draw(place)], hover=hover)
     pairs = [(i, j) for i in range(count) for j in range(i)]
     chosen = draw(st.lists(st.sampled_from(pairs), unique=True)) if pairs else []
     links = {f"R{i} {draw(st.sampled_from('>-'))} R{j}": draw(st.floats(0.05, 3.0)) for i, j in chosen}
     leader = draw(st.sampled_from([None, *robots]))
     move = [draw(place), draw(place)]
     plan = {"kind": "line", "move_by": move, "speed": draw(st.floats(0.01, 1.0))}
-    legs = [Leg(at_s=draw(st.floats(0.0, 4.0)), robot=draw(st.sampled_from(list(robots))), plan=plan)]
+    legs = [LegTable(at_s=draw(st.floats(0.0, 4.0)), robot=draw(st.sampled_from(list(robots))), plan=plan)]
     formation = Formation(links=links, leader=leader, gain=draw(st.floats(0.1, 30.0)))
     return Experiment(
         title="made", robots=robots, duration_s=draw(st.floats(5.0, 10.0)), formation=formation, timeline=legs

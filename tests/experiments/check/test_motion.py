@@ -14,7 +14,7 @@ from experiments.check import ideal_run
 from experiments.check.check import check, figures
 from experiments.check.ideal_run import REPETITIONS, fly, isolated, linear_step, predict, repetitions
 from experiments.check.theory import unused_gains
-from experiments.definition.experiment import Arena, Experiment, Formation, Leg, Robot
+from experiments.definition.experiment import Arena, Experiment, Formation, LegTable, RobotTable
 from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.sweep.runs import run_metrics
@@ -34,7 +34,7 @@ def robots_on_wheels(gain: float) -> Experiment:
     places = {"KH01": [0.0, 0.0], "KH02": [1.2, 0.0], "KH03": [0.6, 1.04]}
     return Experiment(
         title="Three",
-        robots={name: Robot(kind="khepera4", start=start) for name, start in places.items()},
+        robots={name: RobotTable(kind="khepera4", start=start) for name, start in places.items()},
         arena=Arena(size=(6.0, 6.0, 2.0)),
         formation=Formation(links={"KH01 - KH02": 1.0, "KH02 - KH03": 1.0, "KH01 - KH03": 1.0}, gain=gain, clamp=0.1),
         duration_s=120.0,
@@ -109,7 +109,7 @@ def flat_strip(gain: float, jitter: float = 0.01, duration_s: float = 30.0) -> E
     links = {f"{i} - {j}": float(np.hypot(*np.subtract(places[i], places[j]))) for i, j in pairs}
     return Experiment(
         title="Strip",
-        robots={name: Robot(kind="crazyflie", start=list(place), hover=0.6) for name, place in places.items()},
+        robots={name: RobotTable(kind="crazyflie", start=list(place), hover=0.6) for name, place in places.items()},
         arena=Arena(size=(8.0, 8.0, 2.0)),
         formation=Formation(links=links, gain=gain),
         disturbance={"all": Disturbance(hover_jitter=Jitter(jitter))},
@@ -268,13 +268,17 @@ def test_late_oscillation_blames_loop_not_starts():
 def test_paths_that_cross():
     ways = {"A": [0.6, 0.6], "B": [-0.6, 0.6]}  # from (0, 0) and (1, 0): they meet in the middle
     legs = [
-        Leg(at_s=1.0, robot=name, plan={"kind": "line", "move_by": way, "speed": 0.1}) for name, way in ways.items()
+        LegTable(at_s=1.0, robot=name, plan={"kind": "line", "move_by": way, "speed": 0.1})
+        for name, way in ways.items()
     ]
     assert ground({}, timeline=legs)["too-close"].startswith("A and B come within")
 
 
 def test_landing_beside_a_robot_that_is_heard():
-    robots = {"G": Robot(kind="khepera4", start=[0.0, 0.0]), "F": Robot(kind="crazyflie", start=[0.5, 0.0], hover=0.8)}
+    robots = {
+        "G": RobotTable(kind="khepera4", start=[0.0, 0.0]),
+        "F": RobotTable(kind="crazyflie", start=[0.5, 0.0], hover=0.8),
+    }
     formation = Formation(links={"G > F": 0.801})
     made = Experiment(title="made", robots=robots, duration_s=30.0, tolerance=0.1, formation=formation)
     found = {each.code: each for each in check(of(made))}
@@ -285,9 +289,9 @@ def test_landing_beside_a_robot_that_is_heard():
 
 def test_landing_on_a_robot():
     robots = {
-        "G": Robot(kind="khepera4", start=[0.0, 0.01]),
-        "H": Robot(kind="khepera4", start=[0.5, 0.5]),
-        "F": Robot(kind="crazyflie", start=[0.0, 0.0], hover=0.8),
+        "G": RobotTable(kind="khepera4", start=[0.0, 0.01]),
+        "H": RobotTable(kind="khepera4", start=[0.5, 0.5]),
+        "F": RobotTable(kind="crazyflie", start=[0.0, 0.0], hover=0.8),
     }
     found = ground({"G - H": 0.7}, robots=robots, duration_s=30.0)
     assert found["lands-on"] == "F ends above G, from which it receives no poses, and would land on it"
@@ -295,7 +299,7 @@ def test_landing_on_a_robot():
 
 def test_a_robot_at_the_wall_is_held_back():
     plan = {"kind": "line", "move_by": [-2.97, 0.0], "speed": 0.1}
-    found = ground({}, timeline=[Leg(at_s=1.0, robot="A", plan=plan)])
+    found = ground({}, timeline=[LegTable(at_s=1.0, robot="A", plan=plan)])
     assert found["near-wall"].startswith("A comes within the margin of 0.05 m of a wall at 32.")
 
 
@@ -304,7 +308,7 @@ def test_overshoot_above_the_arena(hover, top, warned):
     """A Crazyflie overshoots its take-off by up to 11 %."""
     made = Experiment(
         title="Low",
-        robots={"F": Robot(kind="crazyflie", start=[0.0, 0.0], hover=hover)},
+        robots={"F": RobotTable(kind="crazyflie", start=[0.0, 0.0], hover=hover)},
         arena=Arena(size=(4.0, 4.0, top)),
         duration_s=5.0,
     )
@@ -318,7 +322,7 @@ def test_overshoot_above_the_arena(hover, top, warned):
 
 def test_a_plan_for_ever_is_not_cut_off():
     plan = {"kind": "circle", "radius": 0.5, "period_s": 40.0}
-    assert ground({}, timeline=[Leg(at_s=1.0, robot="D", plan=plan)]) == {}
+    assert ground({}, timeline=[LegTable(at_s=1.0, robot="D", plan=plan)]) == {}
 
 
 @pytest.mark.nightly
@@ -345,7 +349,7 @@ def test_formation_lost_again_counts_acquired_and_names_stiffness(tmp_path):
 def anchored(**changed) -> Experiment:
     made = Experiment(
         title="One robot, one anchor",
-        robots={"CF01": Robot(kind="crazyflie", start=[0.0, 0.3], hover=0.7)},
+        robots={"CF01": RobotTable(kind="crazyflie", start=[0.0, 0.3], hover=0.7)},
         formation=Formation(anchors={"CF01": 1.0}),
         duration_s=20.0,
     )
@@ -381,10 +385,10 @@ def test_what_noise_does_not_free_is_told():
 def test_drones_above_one_another_do_not_touch():
     def crossing(height: float) -> dict[str, str]:
         robots = {
-            "CF01": Robot(kind="crazyflie", start=[-1.0, 0.0], hover=0.5),
-            "TL01": Robot(kind="tello", start=[0.0, 0.0], hover=height),
+            "CF01": RobotTable(kind="crazyflie", start=[-1.0, 0.0], hover=0.5),
+            "TL01": RobotTable(kind="tello", start=[0.0, 0.0], hover=height),
         }
-        way = [Leg(at_s=1.0, robot="CF01", plan={"kind": "line", "move_by": [2.0, 0.0], "speed": 0.3})]
+        way = [LegTable(at_s=1.0, robot="CF01", plan={"kind": "line", "move_by": [2.0, 0.0], "speed": 0.3})]
         made = Experiment(title="Crossing", robots=robots, timeline=way, duration_s=15.0)
         return {each.code: each.message for each in check(of(made))}
 

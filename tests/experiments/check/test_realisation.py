@@ -23,7 +23,7 @@ from experiments.check.realisation import (
     mirrored_robots,
     unfold_distances,
 )
-from experiments.definition.experiment import Experiment, Formation, Robot
+from experiments.definition.experiment import Experiment, Formation, RobotTable
 from experiments.definition.graph import Links, links
 from experiments.file import document
 from tests.experiments.checked import of
@@ -146,7 +146,7 @@ def test_robots_in_one_another_are_found():
 
 def test_shape_in_one_place_is_an_error():
     """A square of four links and a diagonal of nothing: two corners are to be in one place."""
-    robots = {f"K{k}": Robot(kind="khepera4", start=[0.5 * k, 0.1 * k]) for k in range(4)}
+    robots = {f"K{k}": RobotTable(kind="khepera4", start=[0.5 * k, 0.1 * k]) for k in range(4)}
     sides = {"K0 - K1": 1.0, "K1 - K2": 1.0, "K2 - K3": 1.0, "K0 - K3": 1.0, "K0 - K2": 0.01}
     made = Experiment(title="Folded", robots=robots, formation=Formation(links=sides, gain=1.0), duration_s=5.0)
     found = {each.code: each for each in check(of(made))}

@@ -14,7 +14,7 @@ from agents.network.keys import Keys
 from agents.network.lab import ROLES, Identity, LabError, Register
 from experiments.definition import access_rights
 from experiments.definition.bodies import choose_bodies
-from experiments.definition.experiment import Experiment, Formation, Hybrid, Network, Robot
+from experiments.definition.experiment import Experiment, Formation, Hybrid, NetworkTable, RobotTable
 from experiments.definition.plan import Plan
 from experiments.file.document import load
 from tests.agents.acl import ACTIONS, held, may, permitted
@@ -35,7 +35,7 @@ def control(experiment):
 
 
 def experiment(links, processes=(), architecture="distributed", **more):
-    robots = {f"R{k}": Robot(**{"kind": "khepera4", "start": [0.1 * k, 0.0], **more}) for k in range(4)}
+    robots = {f"R{k}": RobotTable(**{"kind": "khepera4", "start": [0.1 * k, 0.0], **more}) for k in range(4)}
     for group, names in enumerate(processes):
         for name in names:
             robots[name] = msgspec.structs.replace(robots[name], process=f"shared{group}")
@@ -206,7 +206,7 @@ def test_queryable_wildcard_reaches_every_robot(who, part):
 
 def test_linked_routers_pass_on_what_either_admits():
     alone = experiment({(1, 0)})
-    for network in (Network(routers=2), Network(connect=["tls/a:7447", "tls/b:7447"])):
+    for network in (NetworkTable(routers=2), NetworkTable(connect=["tls/a:7447", "tls/b:7447"])):
         linked = control(msgspec.structs.replace(alone, network=network))
         for key, action in product(("park/R0/pose", KEYS.estop, KEYS.event, "park/R1/order"), ACTIONS):
             assert may(linked, "router", action, key) == (action != "delete"), (key, action)
@@ -277,7 +277,7 @@ def test_cases_that_share_a_router_share_their_rights():
     assert may(made, "R1", "hear", "park/R0/pose")
     assert may(made, "R1", "hear", "park/R2/pose")
     assert not may(made, "R1", "hear", "park/R3/pose")
-    elsewhere = msgspec.structs.replace(one, network=Network(realm="yard"))
+    elsewhere = msgspec.structs.replace(one, network=NetworkTable(realm="yard"))
     with pytest.raises(LabError, match=r"realms park and yard share no router"):
         access_rights.rights([Plan(one), Plan(elsewhere)])
 

@@ -15,7 +15,7 @@ from agents.plugins.laws import Distance
 from agents.plugins.planners import Line
 from agents.plugins.triggers import Periodic, SendOnDelta
 from experiments.definition import bodies
-from experiments.definition.experiment import Arena, Experiment, Formation, Link, Rates, Robot, Start
+from experiments.definition.experiment import Arena, Experiment, Formation, LinkTable, Rates, RobotTable, Start
 from experiments.definition.plan import Plan
 from experiments.file import document
 from twins.scene import Obstacle
@@ -91,9 +91,9 @@ def test_bodies_of_other_seeds_are_alike(park):
 
 def experiment(**parts):
     robots = {
-        "A": Robot(kind="khepera4", start=[0.5, -0.5, 1.5]),
-        "B": Robot(kind="crazyflie", start=[0.0, 0.25], hover=0.7),
-        "C": Robot(kind="turtlebot3", start=[-0.5, 0.0]),
+        "A": RobotTable(kind="khepera4", start=[0.5, -0.5, 1.5]),
+        "B": RobotTable(kind="crazyflie", start=[0.0, 0.25], hover=0.7),
+        "C": RobotTable(kind="turtlebot3", start=[-0.5, 0.0]),
     }
     return Experiment(**{"title": "Three", "robots": robots, "duration_s": 5.0, **parts})
 
@@ -114,7 +114,7 @@ def test_limits_are_arena_and_safety_of_the_file():
 
 
 def test_links_may_have_gains_of_their_own():
-    given = {"A > B": Link(distance=0.5, gain=7.0), "B - C": 0.6, "C > A": Link(distance=1.0)}
+    given = {"A > B": LinkTable(distance=0.5, gain=7.0), "B - C": 0.6, "C > A": LinkTable(distance=1.0)}
     net = Plan(experiment(formation=Formation(gain=2.0, links=given))).links
     table = zip(*(column.tolist() for column in (net.receiver, net.sender, net.distance, net.gain)), strict=True)
     assert list(table) == [(0, 2, 1.0, 2.0), (1, 0, 0.5, 7.0), (1, 2, 0.6, 2.0), (2, 1, 0.6, 2.0)]
@@ -157,7 +157,7 @@ def test_rates_patience_and_triggers():
 
 
 def test_robots_are_not_scattered_into_obstacles():
-    robots = {name: Robot(kind="khepera4", start=[-0.5, y]) for name, y in (("A", -0.5), ("B", 0.5))}
+    robots = {name: RobotTable(kind="khepera4", start=[-0.5, y]) for name, y in (("A", -0.5), ("B", 0.5))}
     post = Obstacle(radius=0.3, at=(0.0, 0.0))
     given = Experiment(
         title="t", duration_s=1.0, robots=robots, arena=Arena(obstacles={"post": post}), start=Start(scatter=0.6)

@@ -5,7 +5,7 @@ import pytest
 
 from agents.network import channel_model
 from experiments.definition import link_conditions
-from experiments.definition.experiment import Channel, Experiment, Formation, LinkChannel, Outage, Robot
+from experiments.definition.experiment import ChannelTable, Experiment, Formation, LinkChannelTable, Outage, RobotTable
 from experiments.definition.plan import Plan
 from experiments.file import consistency
 
@@ -17,9 +17,9 @@ def experiment(channel=None, **parts):
     given = {
         "title": "Three",
         "duration_s": 10.0,
-        "robots": {name: Robot(kind="khepera4", start=[0.5 * k, 0.0]) for k, name in enumerate(NAMES)},
+        "robots": {name: RobotTable(kind="khepera4", start=[0.5 * k, 0.0]) for k, name in enumerate(NAMES)},
         "formation": Formation(links={"A - B": 0.5, "A > C": 0.5, "B > C": 0.5}),
-        "channel": channel or Channel(),
+        "channel": channel or ChannelTable(),
     }
     return Experiment(**{**given, **parts})
 
@@ -32,16 +32,16 @@ def conditions(channel, seed=1, **how):
 
 
 def test_default_delay_is_a_millisecond_or_nothing_really():
-    assert [link.delay for link in conditions(Channel())] == [0.001] * 4
-    assert [link.delay for link in conditions(Channel(), real=True)] == [0.0] * 4
-    assert [link.delay for link in conditions(Channel(delay_s=0.02), real=True)] == [0.02] * 4
+    assert [link.delay for link in conditions(ChannelTable())] == [0.001] * 4
+    assert [link.delay for link in conditions(ChannelTable(), real=True)] == [0.0] * 4
+    assert [link.delay for link in conditions(ChannelTable(delay_s=0.02), real=True)] == [0.02] * 4
     assert not link_conditions.models_network(Plan(experiment()))
-    assert link_conditions.models_network(Plan(experiment(Channel(loss=0.1))))
+    assert link_conditions.models_network(Plan(experiment(ChannelTable(loss=0.1))))
 
 
 def test_links_have_their_own():
-    own = {"A > C": LinkChannel(loss=0.3, burst=4.0), "A - B": LinkChannel(delay_s=0.1, bandwidth=1e4)}
-    made = conditions(Channel(loss=0.1, jitter_s=0.01, queue_s=0.2, links=own))
+    own = {"A > C": LinkChannelTable(loss=0.3, burst=4.0), "A - B": LinkChannelTable(delay_s=0.1, bandwidth=1e4)}
+    made = conditions(ChannelTable(loss=0.1, jitter_s=0.01, queue_s=0.2, links=own))
     assert [link.loss for link in made] == [0.1, 0.1, 0.3, 0.1]
     np.testing.assert_array_equal([link.burst for link in made], [np.nan, np.nan, 4.0, np.nan])
     assert [link.delay for link in made] == [0.1, 0.1, 0.001, 0.001]
@@ -56,7 +56,7 @@ def test_outages_of_links_of_robots_and_of_all():
         Outage(from_s=4.0, until_s=5.0, robots=["B"]),
     ]
     every, some, of_robot = (1.0, 2.0), (3.0, np.inf), (4.0, 5.0)
-    assert [[*link.outages] for link in conditions(Channel(outages=outages))] == [
+    assert [[*link.outages] for link in conditions(ChannelTable(outages=outages))] == [
         [every, of_robot],
         [every, some, of_robot],
         [every],
@@ -65,7 +65,7 @@ def test_outages_of_links_of_robots_and_of_all():
 
 
 def test_keys_come_from_the_seed_and_the_names():
-    made = conditions(Channel(loss=0.2, links={"A > C": LinkChannel(loss=0.5)}), seed=7)
+    made = conditions(ChannelTable(loss=0.2, links={"A > C": LinkChannelTable(loss=0.5)}), seed=7)
     assert [link.key for link in made] == [channel_model.key(7, *names) for names in ENDS]
 
 
@@ -78,32 +78,52 @@ def wrong(channel, **parts):
 @pytest.mark.parametrize(
     ("channel", "path", "message", "hint"),
     [
-        (Channel(links={"A > D": LinkChannel()}), "channel.links.A > D", "no robot is called 'D'", "known: A, B, C"),
         (
-            Channel(links={"A < B": LinkChannel()}),
+            ChannelTable(links={"A > D": LinkChannelTable()}),
+            "channel.links.A > D",
+            "no robot is called 'D'",
+            "known: A, B, C",
+        ),
+        (
+            ChannelTable(links={"A < B": LinkChannelTable()}),
             "channel.links.A < B",
             "'A < B' is no link",
             '"A > B" are poses from A',
         ),
-        (Channel(links={"C > A": LinkChannel()}), "channel.links.C > A", "there is no link C > A", "add the link"),
         (
-            Channel(links={"A > B": LinkChannel(), "A - B": LinkChannel()}),
+            ChannelTable(links={"C > A": LinkChannelTable()}),
+            "channel.links.C > A",
+            "there is no link C > A",
+            "add the link",
+        ),
+        (
+            ChannelTable(links={"A > B": LinkChannelTable(), "A - B": LinkChannelTable()}),
             "channel.links.A - B",
             "the link A > B has its settings by 'A > B' already",
             "keep one",
         ),
-        (Channel(burst=3.0), "channel.burst", "nothing is lost here", "give a loss too"),
-        (Channel(loss=0.5, burst=1.5), "channel.burst", "2 are lost in a row on average, not 1.5", "at least 2"),
+        (ChannelTable(burst=3.0), "channel.burst", "nothing is lost here", "give a loss too"),
+        (ChannelTable(loss=0.5, burst=1.5), "channel.burst", "2 are lost in a row on average, not 1.5", "at least 2"),
         (
-            Channel(loss=0.1, burst=2.0, links={"A > B": LinkChannel(loss=0.8)}),
+            ChannelTable(loss=0.1, burst=2.0, links={"A > B": LinkChannelTable(loss=0.8)}),
             "channel.links.A > B.loss",
             "5 are lost in a row on average, not 2",
             "at least 5",
         ),
-        (Channel(outages=[Outage(from_s=10.0)]), "channel.outages.0.from_s", "begins at 10 s", "a longer duration_s"),
-        (Channel(outages=[Outage(from_s=1.0, robots=["D"])]), "channel.outages.0.robots.0", "'D'", "known: A, B, C"),
         (
-            Channel(outages=[Outage(from_s=1.0, links=["C > B"])]),
+            ChannelTable(outages=[Outage(from_s=10.0)]),
+            "channel.outages.0.from_s",
+            "begins at 10 s",
+            "a longer duration_s",
+        ),
+        (
+            ChannelTable(outages=[Outage(from_s=1.0, robots=["D"])]),
+            "channel.outages.0.robots.0",
+            "'D'",
+            "known: A, B, C",
+        ),
+        (
+            ChannelTable(outages=[Outage(from_s=1.0, links=["C > B"])]),
             "channel.outages.0.links.0",
             "no link C > B",
             "leave it out",
@@ -118,9 +138,9 @@ def test_what_contradicts_is_named_with_its_remedy(channel, path, message, hint)
 
 
 def test_what_is_fine_is_fine():
-    good = Channel(loss=0.5, burst=2.0, links={"A > B": LinkChannel(loss=0.1)}, outages=[Outage(from_s=0.0)])
+    good = ChannelTable(loss=0.5, burst=2.0, links={"A > B": LinkChannelTable(loss=0.1)}, outages=[Outage(from_s=0.0)])
     assert wrong(good) == []
-    assert wrong(Channel(loss=1.0, burst=3.0)) == []
+    assert wrong(ChannelTable(loss=1.0, burst=3.0)) == []
 
 
 def test_an_outage_must_end_after_it_began():
@@ -129,7 +149,7 @@ def test_an_outage_must_end_after_it_began():
 
 
 def test_links_that_only_avoidance_hears_are_links():
-    channel = Channel(links={"C > A": LinkChannel(loss=0.5)})
+    channel = ChannelTable(links={"C > A": LinkChannelTable(loss=0.5)})
     everybody = {"kind": "potential", "hears": "all"}
     assert wrong(channel, avoidance=everybody) == []
     chosen = experiment(channel, avoidance=everybody)

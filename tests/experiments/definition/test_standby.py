@@ -11,26 +11,25 @@ import pytest
 from agents.body.interface import BodyState
 from agents.errors import Refusal
 from agents.network import messages
-from agents.robot import Robot as Decision
+from agents.robot import Robot
 from experiments import run
 from experiments.definition import standby as reserves
 from experiments.definition.experiment import (
-    Channel,
+    ChannelTable,
     Experiment,
     Formation,
     Hybrid,
-    Leg,
-    Link,
-    LinkChannel,
+    LegTable,
+    LinkChannelTable,
     Outage,
-    Robot,
+    RobotTable,
 )
 from experiments.definition.plan import Plan
 from experiments.file import consistency, document
 from experiments.real_time.conductor.replacement import Spares
 
-BOT = Robot(kind="khepera4", start=[0.0, 0.0])
-FLY = Robot(kind="crazyflie", start=[0.5, 0.5], hover=0.5)
+BOT = RobotTable(kind="khepera4", start=[0.0, 0.0])
+FLY = RobotTable(kind="crazyflie", start=[0.5, 0.5], hover=0.5)
 
 
 def experiment(**more: Any) -> Experiment:
@@ -69,10 +68,10 @@ def test_what_is_right_is_not_complained_of() -> None:
 
 def test_without_those_on_standby_nothing_names_them() -> None:
     whole = experiment(
-        timeline=[Leg(at_s=1.0, robot="C", plan="hold")],
+        timeline=[LegTable(at_s=1.0, robot="C", plan="hold")],
         architecture=Hybrid("hybrid", ["A", "C"]),
-        channel=Channel(
-            links={"A > C": LinkChannel(loss=0.5), "A > B": LinkChannel(loss=0.1)},
+        channel=ChannelTable(
+            links={"A > C": LinkChannelTable(loss=0.5), "A > B": LinkChannelTable(loss=0.1)},
             outages=[Outage(from_s=1.0, links=["A - C"]), Outage(from_s=2.0, robots=["B", "C"]), Outage(from_s=3.0)],
         ),
     )
@@ -100,7 +99,7 @@ def test_nobody_waits_for_a_robot_on_standby(standby: bool) -> None:
     case = experiment()
     robots = {**case.robots, "C": msgspec.structs.replace(FLY, standby=standby)}
     told = Plan(msgspec.structs.replace(case, robots=robots)).assignment("A")
-    robot = Decision(told)
+    robot = Robot(told)
     assert robot.missing_neighbours() == ["B", "C"]
     place = next(place for place, link in enumerate(told.neighbours) if link.name == "B")
     robot.neighbours.mark_alive(place)

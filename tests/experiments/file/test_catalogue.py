@@ -110,9 +110,9 @@ def test_schema_is_draft_7_and_knows_the_plugins():
     assert {"periodic", "send-on-delta"} <= set(by_name["enum"])
     kinds = {table["properties"]["kind"]["const"]: table for table in tables}
     assert kinds["send-on-delta"]["properties"]["threshold"]["exclusiveMinimum"] == 0
-    plans = schema["definitions"]["Leg"]["properties"]["plan"]["anyOf"]
+    plans = schema["definitions"]["LegTable"]["properties"]["plan"]["anyOf"]
     assert "line" not in plans[0]["enum"]  # it cannot do without its parameters
-    assert schema["definitions"]["Robot"]["properties"]["kind"]["enum"] == list(KINDS)
+    assert schema["definitions"]["RobotTable"]["properties"]["kind"]["enum"] == list(KINDS)
     case = schema["properties"]["cases"]["additionalProperties"]["$ref"].rpartition("/")[2]
     assert "required" not in schema["definitions"][case]
     assert "cases" not in schema["definitions"][case]["properties"]

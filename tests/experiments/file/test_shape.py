@@ -5,7 +5,7 @@ import math
 import pytest
 
 from agents.plugins import registry
-from experiments.definition.experiment import Link
+from experiments.definition.experiment import LinkTable
 from experiments.file import document
 from experiments.file.document import DocumentError
 
@@ -39,8 +39,8 @@ def links(text, *changes, case="default"):
 
 def test_lengths_hold_between_places_at_robots_heights():
     found = links(FILE)
-    assert found["TB01 > KH01"] == Link(distance=pytest.approx(0.5))
-    assert found["KH01 - CF01"] == Link(distance=pytest.approx(math.hypot(0.3, 0.4, 0.6)), gain=2.0)
+    assert found["TB01 > KH01"] == LinkTable(distance=pytest.approx(0.5))
+    assert found["KH01 - CF01"] == LinkTable(distance=pytest.approx(math.hypot(0.3, 0.4, 0.6)), gain=2.0)
     assert found["TB01 > CF01"] == 0.7
 
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agents.network.messages import Event
-from experiments.definition.experiment import Anchor
+from experiments.definition.experiment import AnchorTable
 from experiments.metrics import measure, statistics
 from experiments.metrics.metric import OURS
 from experiments.metrics.results import CaseMetrics, RobotMetrics
@@ -207,7 +207,7 @@ def test_settling_time_is_two_percent_of_largest_error():
 def test_benchmark_cost_by_hand(anchored: bool):
     known = pair(1.0 + np.exp(-T), sent={"F": [0.0, 1.0, 2.0, 10.0], "L": [0.5]})
     if anchored:  # at the place of the leader: the same once more
-        formation = msgspec.structs.replace(known.plan.experiment.formation, anchors={"F": Anchor(distance=1.0)})
+        formation = msgspec.structs.replace(known.plan.experiment.formation, anchors={"F": AnchorTable(distance=1.0)})
         known = dataclasses.replace(known, plan=known.plan.changed(formation=formation))
     # r² − 1 = x² + 2x with x = e⁻ᵗ, from 3 to 0: 2 % of it at x = √1.06 − 1, 3.5212 s; the last sample before
     settled = 3.52

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from agents.network.messages import GoalReceipt, HostClock, State
-from experiments.recording.clocks import Correction, Sample, host_offset
+from experiments.recording.clocks import ClockSample, Correction, host_offset
 
 SMALL = st.floats(0.0, 0.5)
 
@@ -14,7 +14,8 @@ SMALL = st.floats(0.0, 0.5)
 @given(st.floats(-10.0, 10.0), st.lists(st.tuples(SMALL, SMALL), min_size=1, max_size=20))
 def test_offset_is_within_uncertainty_despite_unequal_ways(true, ways):
     samples = [
-        Sample(100.0 + k, 100.0 + k + there + true, 100.0 + k + there + back) for k, (there, back) in enumerate(ways)
+        ClockSample(100.0 + k, 100.0 + k + there + true, 100.0 + k + there + back)
+        for k, (there, back) in enumerate(ways)
     ]
     found, uncertainty = host_offset(samples)
     assert abs(found - true) <= uncertainty + 1e-9
@@ -22,7 +23,7 @@ def test_offset_is_within_uncertainty_despite_unequal_ways(true, ways):
 
 
 def test_the_shortest_way_tells_most():
-    slow, quick = Sample(0.0, 0.2, 1.0), Sample(2.0, 2.2005, 2.001)
+    slow, quick = ClockSample(0.0, 0.2, 1.0), ClockSample(2.0, 2.2005, 2.001)
     assert host_offset([slow, quick, slow]) == (pytest.approx(0.2), pytest.approx(0.0005))
 
 

@@ -10,7 +10,7 @@ from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
 
 from agents.network.messages import Event, HostClock, PoseReceipt
-from experiments.definition.experiment import Formation, Rates, Robot
+from experiments.definition.experiment import Formation, Rates, RobotTable
 from experiments.recording.playback import NotStarted, read
 from experiments.recording.reader import RecordingError, recover
 from experiments.scene import tracks
@@ -244,7 +244,7 @@ def test_what_the_modelled_network_dropped_is_no_loss(path):
 
 
 def test_foreign_poses_count_once_for_all_receivers(path):
-    robots = {name: Robot("tello", [float(k), 0.0]) for k, name in enumerate("ABC")}
+    robots = {name: RobotTable("tello", [float(k), 0.0]) for k, name in enumerate("ABC")}
     said = [
         status(name, at=at, foreign={"A": count} if count else {})
         for name, counts in (("B", (2, 5, 9)), ("C", (0, 1, 3)))

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from agents.body.interface import Disturbance, Jitter
 from experiments import run
-from experiments.definition.experiment import Channel, LinkChannel, Start
+from experiments.definition.experiment import ChannelTable, LinkChannelTable, Start
 from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.file.problems import DocumentError
@@ -72,8 +72,8 @@ def test_whether_seeds_change_anything() -> None:
         {"disturbance": {"A": Disturbance(hover_jitter=Jitter(0.01))}},
         {"disturbance": {"khepera4": Disturbance(odometry_drift=0.001)}},
         {"start": Start(scatter=0.1)},
-        {"channel": Channel(loss=0.1)},
-        {"channel": Channel(links={"A > B": LinkChannel(jitter_s=0.1)})},
+        {"channel": ChannelTable(loss=0.1)},
+        {"channel": ChannelTable(links={"A > B": LinkChannelTable(jitter_s=0.1)})},
     ]
     assert not Plan(bare).uses_chance
     assert not Plan(msgspec.structs.replace(bare, disturbance={"all": Disturbance(latency_s=0.1)})).uses_chance

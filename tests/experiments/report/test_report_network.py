@@ -4,7 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from experiments.definition.experiment import Channel, LinkChannel
+from experiments.definition.experiment import ChannelTable, LinkChannelTable
 from experiments.definition.plan import Plan
 from experiments.file.document import load
 from experiments.metrics.measure import measure
@@ -19,7 +19,7 @@ from tests.experiments.traces import pair
 
 pytestmark = pytest.mark.slow  # runs and reports, whole
 
-BAD = Channel(delay_s=0.05, loss=0.2, links={"TB01 > KH01": LinkChannel(loss=0.0, delay_s=0.03)})
+BAD = ChannelTable(delay_s=0.05, loss=0.2, links={"TB01 > KH01": LinkChannelTable(loss=0.0, delay_s=0.03)})
 
 
 @pytest.fixture(scope="module")

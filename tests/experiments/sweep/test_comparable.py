@@ -3,7 +3,7 @@
 import msgspec
 import pytest
 
-from experiments.definition.experiment import World
+from experiments.definition.experiment import WorldTable
 from experiments.definition.plan import Plan
 from experiments.file import reference
 from experiments.file.document import load
@@ -79,7 +79,7 @@ def test_digest_knows_the_order_of_robots():
 
 
 def test_code_knows_the_engines_library(monkeypatch):
-    case = msgspec.structs.replace(load("triangle").cases()["periodic"].experiment, world=World(engine="mujoco"))
+    case = msgspec.structs.replace(load("triangle").cases()["periodic"].experiment, world=WorldTable(engine="mujoco"))
     found = set()
     for number in ("4.0", "4.1"):
         monkeypatch.setattr(version, "installed", lambda name, number=number: number if name == "mujoco-core" else None)

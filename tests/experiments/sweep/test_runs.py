@@ -4,7 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from experiments.definition.experiment import Channel, Start, World
+from experiments.definition.experiment import ChannelTable, Start, WorldTable
 from experiments.definition.plan import Plan
 from experiments.file import structure
 from experiments.file.document import load
@@ -54,7 +54,7 @@ def flown(experiment, seeds):
 @pytest.mark.slow
 def test_run_depends_on_its_seed_alone(park):
     lossy = msgspec.structs.replace(
-        park, duration_s=2.0, channel=Channel(delay_s=0.05, jitter_s=0.4, loss=0.2), start=Start(scatter=0.05)
+        park, duration_s=2.0, channel=ChannelTable(delay_s=0.05, jitter_s=0.4, loss=0.2), start=Start(scatter=0.05)
     )
     seeds = list(range(1, 5))
     together = flown(lossy, seeds)
@@ -108,7 +108,7 @@ def test_a_plug_in_that_changes_changes_the_code(park, tmp_path, monkeypatch):
 def test_the_version_of_the_engines_library_counts(park, monkeypatch):
     """Runs of another pymunk or mujoco are other runs; of one that is not used they are the same."""
     real = runs.engine_versions
-    pymunk = msgspec.structs.replace(park, world=World(engine="pymunk"))
+    pymunk = msgspec.structs.replace(park, world=WorldTable(engine="pymunk"))
     before = code_of(Plan(park)), code_of(Plan(pymunk))
     monkeypatch.setattr(runs, "engine_versions", lambda name: ["0.0"] if name == "pymunk" else real(name))
     assert code_of(Plan(park)) == before[0]

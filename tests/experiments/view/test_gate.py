@@ -116,7 +116,7 @@ def operator(monkeypatch):
     monkeypatch.setattr(orders.orders, "stop_publisher", lambda *_: None)
     given = []
     monkeypatch.setattr(orders.orders, "send_order", lambda _s, _k, _r, order: given.append(order) or {})
-    made = orders.Acting(None, orders.Watched(["tcp/127.0.0.1:7447"], "park", "operator"))
+    made = orders.Acting(None, orders.WatchedRun(["tcp/127.0.0.1:7447"], "park", "operator"))
     made._server = SimpleNamespace(gate=Gate(), get_clients=dict)
     made._number = 2
     return made, given

@@ -17,10 +17,10 @@ from experiments.file.document import load
 from experiments.run import simulate, simulate_seeds
 from experiments.scene.stage import SceneModel
 from experiments.view import live
-from experiments.view.acting import Watched, may_act, parameters
+from experiments.view.acting import WatchedRun, may_act, parameters
 from experiments.view.broadcast import Broadcast
 from experiments.view.heartbeat import RECORDED_S, SLOWEST_S, DataAge, frame_s, mark
-from experiments.view.replay import Clock
+from experiments.view.replay import ReplayClock
 from tests.fuzz.loopnet import Mute, Net
 
 
@@ -92,13 +92,13 @@ def test_only_an_operator_of_a_lab_gives_orders(tmp_path):
     }
     (tmp_path / lab.REGISTER).write_bytes(msgspec.json.encode(lab.Register(known)))
     endpoints = lab.secured(["tls/127.0.0.1:7447"], tmp_path)
-    found = {name: may_act(Watched(endpoints, "park", name)) for name in (*known, "stranger")}
+    found = {name: may_act(WatchedRun(endpoints, "park", name)) for name in (*known, "stranger")}
     assert found == {"operator": True, "observer": False, "ana": True, "stranger": False}
-    assert [may_act(Watched(["tcp/127.0.0.1:7447"], "park", name)) for name in ("operator", "observer")] == [
+    assert [may_act(WatchedRun(["tcp/127.0.0.1:7447"], "park", name)) for name in ("operator", "observer")] == [
         True,
         False,
     ]
-    assert not may_act(Watched(lab.secured(["tls/127.0.0.1:7447"], tmp_path / "no"), "park", "operator"))
+    assert not may_act(WatchedRun(lab.secured(["tls/127.0.0.1:7447"], tmp_path / "no"), "park", "operator"))
 
 
 def test_trigger_and_law_numbers_have_sliders():
@@ -155,7 +155,7 @@ def test_replay_ends_when_another_process_owns_a_name(token, shown, recording, m
     with Net().worn() as net:
         monkeypatch.setattr(pubsub, "publisher", lambda *_, **__: Counted())
         played = Broadcast(net.session, recording, watch_s=0.0)
-        clock = Clock(0.0, played.end - played.begin)
+        clock = ReplayClock(0.0, played.end - played.begin)
         clock.playing, clock.speed = True, 10.0
         if shown:
             with pytest.raises(ExplainedError, match=shown):

@@ -15,7 +15,7 @@ from experiments.run import simulate
 from experiments.scene import tracks
 from experiments.scene.stage import BAD, FAIR, Condition
 from experiments.view.panel import History, RobotRow, css, event_list, link_table, table
-from experiments.view.replay import Clock, Film, marks
+from experiments.view.replay import Film, ReplayClock, marks
 
 GUIDED = ("architecture=centralised",)
 
@@ -83,7 +83,7 @@ def test_history_has_errors_and_rates_of_whole_case(flown):
 
 
 def test_the_clock_plays_pauses_and_ends():
-    clock = Clock(-2.0, 10.0)
+    clock = ReplayClock(-2.0, 10.0)
     clock.advance(1.0)
     assert clock.t == 0.0
     clock.toggle()

@@ -8,14 +8,14 @@ import numpy as np
 
 from experiments.definition.plan import Plan
 from experiments.virtual_time import stretch
-from experiments.virtual_time.simulation import Flight
+from experiments.virtual_time.simulation import VirtualRun
 
 
 def flown(experiment, *, compiled, seed=1, lean=False):
     """Log of a run, and the ticks of it that were compiled."""
     stretch.WORK[0] = 1e6 if compiled else -1e6  # compilation pays, or nothing does
     try:
-        flight = Flight(Plan(experiment), seed, quiet=False, lean=lean)
+        flight = VirtualRun(Plan(experiment), seed, quiet=False, lean=lean)
         flight.fly(landing=True, progress=lambda _: None, watch=None)
     finally:
         stretch.WORK[0] = 0.0

@@ -23,7 +23,7 @@ from agents.plugins.laws import Gradient
 from agents.plugins.registry import AVOIDANCES, LAWS, PREDICTORS, TRIGGERS, PluginError
 from agents.plugins.triggers import Trigger
 from agents.vectors import UNKNOWN
-from experiments.definition.experiment import Channel, Experiment, Formation, Leg, Robot, World
+from experiments.definition.experiment import ChannelTable, Experiment, Formation, LegTable, RobotTable, WorldTable
 from experiments.definition.plan import Plan
 from experiments.virtual_time import stretch
 from tests.agents.plugins.test_every_plugin import made
@@ -64,7 +64,10 @@ def pair(**parts):
     given = {
         "title": "A pair",
         "duration_s": 4.0,
-        "robots": {"A": Robot(kind="khepera4", start=[-0.4, 0.0]), "B": Robot(kind="khepera4", start=[0.4, 0.1])},
+        "robots": {
+            "A": RobotTable(kind="khepera4", start=[-0.4, 0.0]),
+            "B": RobotTable(kind="khepera4", start=[0.4, 0.1]),
+        },
         "formation": Formation(links={"A > B": 0.5}),
         "disturbance": {"all": Disturbance(position_sigma=0.0005)},
         **parts,
@@ -115,7 +118,7 @@ def test_every_plugin_and_model(assigned):
         )  # fmt: skip
 
     robots = {
-        f"R{k}": Robot(
+        f"R{k}": RobotTable(
             kind=KINDS[k % 4],
             sensors=[],
             hover=0.5 if k % 2 == 0 else None,
@@ -126,7 +129,7 @@ def test_every_plugin_and_model(assigned):
     links = {f"R{k} - R{(k + 1) % count}": 0.6 for k in range(count)}
     experiment = pair(
         robots=robots, formation=Formation(links=links), disturbance=NATURE, duration_s=5.0,
-        avoidance={"kind": "potential"}, channel=Channel(delay_s=0.03),
+        avoidance={"kind": "potential"}, channel=ChannelTable(delay_s=0.03),
     )  # fmt: skip
     assigned(change)
     _, ticks = same(experiment)
@@ -136,7 +139,7 @@ def test_every_plugin_and_model(assigned):
 @pytest.mark.nightly
 def test_every_motion_on_the_floor():
     kinds = ("omni", "ackermann", "double-integrator")
-    robots = {f"R{k}": Robot(kind=kind, start=[0.9 * k - 0.9, 0.3 * k]) for k, kind in enumerate(kinds)}
+    robots = {f"R{k}": RobotTable(kind=kind, start=[0.9 * k - 0.9, 0.3 * k]) for k, kind in enumerate(kinds)}
     formation = Formation(law="distance", links={"R0 - R1": 0.7, "R1 - R2": 0.7, "R2 - R0": 0.7})
     _, ticks = same(pair(robots=robots, formation=formation))
     assert ticks > 300
@@ -146,12 +149,12 @@ def test_legs_hazard_and_several_stretches():
     """A compiled loop with a registered avoidance flies other seeds too, and samples of positions alone."""
     line = {"kind": "line", "move_by": [0.2, 0.1], "speed": 0.1}
     legs = [
-        Leg(at_s=2.0, robot="A", plan=line),
-        Leg(at_s=11.3, robot="A", plan={"kind": "circle", "radius": 0.3, "period_s": 9.0}),
+        LegTable(at_s=2.0, robot="A", plan=line),
+        LegTable(at_s=11.3, robot="A", plan={"kind": "circle", "radius": 0.3, "period_s": 9.0}),
     ]
     robots = {
-        "A": Robot(kind="crazyflie", hover=0.5, start=[-0.4, 0.0]),
-        "B": Robot(kind="crazyflie", hover=0.5, start=[0.4, 0.1]),
+        "A": RobotTable(kind="crazyflie", hover=0.5, start=[-0.4, 0.0]),
+        "B": RobotTable(kind="crazyflie", hover=0.5, start=[0.4, 0.1]),
     }
     made = pair(
         robots=robots, formation=Formation(links={"A > B": 0.8}), duration_s=25.0, timeline=legs,
@@ -253,7 +256,7 @@ def test_laws_and_trigger_of_a_user(assigned, tmp_path, monkeypatch):
     homes, names = spring(tmp_path, 0, HOMES), spring(tmp_path, 1, "from zenpark import Gradient, clamp, norm\n")
     starts = {"A": [0.0, 0.0], "B": [0.4, 0.1], "C": [-0.4, 0.1], "D": [0.0, 0.3], "E": [0.0, -0.45]}
     ring = pair(
-        robots={name: Robot(kind="khepera4", start=start) for name, start in starts.items()},
+        robots={name: RobotTable(kind="khepera4", start=start) for name, start in starts.items()},
         formation=Formation(links={f"A > {name}": 0.5 for name in "BCDE"}),
     )
 
@@ -305,7 +308,7 @@ def test_law_outside_of_the_subset_is_flown_plain(assigned, law, fault):
     stretch.REFUSED.clear()
 
 
-@pytest.mark.parametrize("parts", [{"channel": Channel(loss=0.1)}, {"world": World(engine="pymunk")}])
+@pytest.mark.parametrize("parts", [{"channel": ChannelTable(loss=0.1)}, {"world": WorldTable(engine="pymunk")}])
 def test_what_is_not_compiled(parts):
     _, ticks = same(pair(duration_s=1.0, **parts))
     assert ticks == 0

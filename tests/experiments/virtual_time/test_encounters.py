@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from agents.decision.lifecycle import RUNNING
-from experiments.definition.experiment import Channel, Start
+from experiments.definition.experiment import ChannelTable, Start
 from experiments.definition.plan import Plan
 from experiments.virtual_time.simulation import simulate
 from tests.experiments.encounters import ANGLES, Outcome, encounter, meet, random_pairs
@@ -110,7 +110,7 @@ def test_robots_with_sensors_alone_keep_clear(kind, sensors):
 
 @pytest.mark.nightly
 def test_bad_network_causes_no_collision():
-    bad = Channel(delay_s=0.02, jitter_s=0.02, loss=0.2)
+    bad = ChannelTable(delay_s=0.02, jitter_s=0.02, loss=0.2)
     for kinds in (("tello", "tello"), ("crazyflie", "turtlebot3")):
         outcome = meet(msgspec.structs.replace(encounter(kinds, BARRIER), channel=bad), range(1, 21))
         assert outcome.collided.sum() == 0

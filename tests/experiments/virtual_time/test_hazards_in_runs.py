@@ -6,7 +6,7 @@ import pytest
 from agents.body.limits import Safety
 from agents.decision.lifecycle import DONE, LANDING, RUNNING
 from experiments.check.check import check
-from experiments.definition.experiment import Formation, Robot
+from experiments.definition.experiment import Formation, RobotTable
 from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.metrics.measure import measure
@@ -45,8 +45,9 @@ def test_robots_that_come_too_near_hold(tmp_path):
 @pytest.mark.slow
 def test_drone_with_low_battery_lands_and_reports_it():
     robots = {
-        "F": Robot(kind="crazyflie", start=[0.0, 0.0], hover=0.5), "G": Robot(kind="khepera4", start=[0.9, 0.1])
-    }  # fmt: skip
+        "F": RobotTable(kind="crazyflie", start=[0.0, 0.0], hover=0.5),
+        "G": RobotTable(kind="khepera4", start=[0.9, 0.1]),
+    }
     experiment = pair(
         robots=robots, formation=Formation(links={"F > G": 0.8}), safety=Safety(battery_low=0.985), duration_s=12.0
     )
@@ -64,9 +65,9 @@ def test_drone_with_low_battery_lands_and_reports_it():
 @pytest.mark.parametrize("architecture", ["distributed", "centralised"])
 def test_drone_that_lands_is_lost_to_the_formation(architecture):
     robots = {
-        "F": Robot(kind="crazyflie", start=[0.0, 0.0], hover=0.3),
-        "G": Robot(kind="khepera4", start=[1.3, 0.1]),
-        "H": Robot(kind="khepera4", start=[0.0, 0.9]),
+        "F": RobotTable(kind="crazyflie", start=[0.0, 0.0], hover=0.3),
+        "G": RobotTable(kind="khepera4", start=[1.3, 0.1]),
+        "H": RobotTable(kind="khepera4", start=[0.0, 0.9]),
     }
     formation, ends = Formation(links={"F > G": 0.8, "G - H": 0.9}), {}
     for low in (0.1, 0.99):
@@ -84,9 +85,9 @@ def test_drone_that_lands_is_lost_to_the_formation(architecture):
 @pytest.mark.parametrize("architecture", ["distributed", "centralised"])
 def test_scripted_landing_silences_and_loses_a_robot(architecture):
     robots = {
-        "F": Robot(kind="crazyflie", start=[0.0, 0.0], hover=0.3, lands_at_s=4.0),
-        "G": Robot(kind="khepera4", start=[1.3, 0.1]),
-        "H": Robot(kind="khepera4", start=[0.0, 0.9]),
+        "F": RobotTable(kind="crazyflie", start=[0.0, 0.0], hover=0.3, lands_at_s=4.0),
+        "G": RobotTable(kind="khepera4", start=[1.3, 0.1]),
+        "H": RobotTable(kind="khepera4", start=[0.0, 0.9]),
     }
     experiment = pair(
         robots=robots, formation=Formation(links={"F > G": 0.8, "G - H": 0.9}), duration_s=12.0,

@@ -7,7 +7,16 @@ import numpy as np
 import pytest
 
 from agents.body.interface import Disturbance
-from experiments.definition.experiment import Arena, Experiment, Formation, Leg, Rates, Robot, Shadow, World
+from experiments.definition.experiment import (
+    Arena,
+    Experiment,
+    Formation,
+    LegTable,
+    Rates,
+    RobotTable,
+    Shadow,
+    WorldTable,
+)
 from experiments.definition.plan import Plan
 from experiments.recording import playback
 from experiments.virtual_time.log import RunRecorder
@@ -21,8 +30,8 @@ NATURE = Disturbance(position_sigma=0.001, yaw_sigma=0.002)
 
 def experiment(engine="point-mass", **parts):
     robots = {
-        "KH": Robot(kind="khepera4", start=[-0.4, 0.0], shadow=Shadow(restart_s=1.0)),
-        "CF": Robot(kind="crazyflie", start=[0.4, 0.1], hover=0.5),
+        "KH": RobotTable(kind="khepera4", start=[-0.4, 0.0], shadow=Shadow(restart_s=1.0)),
+        "CF": RobotTable(kind="crazyflie", start=[0.4, 0.1], hover=0.5),
     }
     given = {
         "title": "Logged",
@@ -32,8 +41,8 @@ def experiment(engine="point-mass", **parts):
         "formation": Formation(links={"KH - CF": 0.7}),
         "disturbance": {"all": NATURE},
         "rates": Rates(state_hz=50.0),
-        "timeline": [Leg(at_s=1.0, robot="CF", plan={"kind": "line", "move_by": [0.2, 0.0], "speed": 0.2})],
-        "world": World(engine=engine),
+        "timeline": [LegTable(at_s=1.0, robot="CF", plan={"kind": "line", "move_by": [0.2, 0.0], "speed": 0.2})],
+        "world": WorldTable(engine=engine),
     }
     return Experiment(**given | parts)
 

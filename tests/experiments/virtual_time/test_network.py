@@ -10,7 +10,7 @@ import pytest
 from agents.network import messages
 from agents.robot import Robot
 from experiments.definition import experiment as definition
-from experiments.definition.experiment import Channel, Formation, LinkChannel, Network, Outage
+from experiments.definition.experiment import ChannelTable, Formation, LinkChannelTable, NetworkTable, Outage
 from experiments.definition.plan import Plan
 from experiments.recording.trace import EPOCH
 from experiments.virtual_time.network import VirtualNetwork
@@ -25,7 +25,7 @@ A_TO_B, B_TO_A, A_TO_C, B_TO_C = 1, 0, 2, 3
 class Talk:
     """Robots that transmit their number and the time, tick by tick."""
 
-    channel: Channel
+    channel: ChannelTable
     links: dict[str, float] = field(default_factory=lambda: dict(LINKS))
     seed: int = 1
     start: float = 0.0
@@ -33,7 +33,7 @@ class Talk:
     tick: int = 0
 
     def __post_init__(self):
-        robots = {name: definition.Robot(kind="khepera4", start=[k, 0.0]) for k, name in enumerate("ABC")}
+        robots = {name: definition.RobotTable(kind="khepera4", start=[k, 0.0]) for k, name in enumerate("ABC")}
         experiment = pair(
             duration_s=1e4, robots=robots, formation=Formation(links=self.links), channel=self.channel, **self.more
         )
@@ -63,7 +63,7 @@ class Talk:
 
 
 def test_each_receiver_gets_what_is_sent():
-    talk = Talk(Channel(delay_s=0.001)).run(1, [0, 2]).run(1)
+    talk = Talk(ChannelTable(delay_s=0.001)).run(1, [0, 2]).run(1)
     got = talk.received
     assert sorted(got.link.tolist()) == [A_TO_B, A_TO_C]
     np.testing.assert_array_equal(got.position, [[0, 0, 1], [0, 0, 1]])
@@ -74,14 +74,14 @@ def test_each_receiver_gets_what_is_sent():
 
 
 def test_no_links_no_samples():
-    talk = Talk(Channel(loss=0.5, jitter_s=0.1), links={}).run(10, [0])
+    talk = Talk(ChannelTable(loss=0.5, jitter_s=0.1), links={}).run(10, [0])
     assert len(talk.received.link) == 0
     assert talk.lost == []
 
 
 @pytest.mark.parametrize(("delay", "ticks"), [(0.0, 1), (0.001, 1), (0.01, 1), (0.02, 2), (0.07, 7), (0.071, 8)])
 def test_delay_is_a_number_of_ticks(delay, ticks):
-    talk, newest = Talk(Channel(delay_s=delay)), []
+    talk, newest = Talk(ChannelTable(delay_s=delay)), []
     for _ in range(100):
         talk.run(1, [0])
         newest.append(talk.robots[1].neighbours.all[0].stamp)
@@ -89,39 +89,41 @@ def test_delay_is_a_number_of_ticks(delay, ticks):
 
 
 def test_order_of_arrival_is_logged():
-    got = Talk(Channel(jitter_s=0.05)).run(200, [0, 1]).received
+    got = Talk(ChannelTable(jitter_s=0.05)).run(200, [0, 1]).received
     assert (np.diff(got.arrival) >= 0.0).all()
     assert (np.diff(got.seq[got.link == A_TO_B]) < 0).any()  # some overtook others
 
 
 @pytest.mark.parametrize(("loss", "lost"), [(0.0, [0, 0, 0, 0]), (1.0, [50, 50, 50, 50])])
 def test_everything_or_nothing_is_lost(loss, lost):
-    talk = Talk(Channel(loss=loss)).run(50, [0, 1, 2]).run(1)
+    talk = Talk(ChannelTable(loss=loss)).run(50, [0, 1, 2]).run(1)
     assert talk.lost == lost
     assert len(talk.received.link) == 200 - sum(lost)
 
 
 def test_seed_decides_which_samples_are_lost():
-    first, again, other = (Talk(Channel(loss=0.5), seed=seed).run(100, [0, 1]).run(1).received for seed in (1, 1, 2))
+    first, again, other = (
+        Talk(ChannelTable(loss=0.5), seed=seed).run(100, [0, 1]).run(1).received for seed in (1, 1, 2)
+    )
     assert first.seq.tolist() == again.seq.tolist() != other.seq.tolist()
 
 
 def test_nothing_is_lost_before_the_start():
-    channel = Channel(loss=1.0, bandwidth=800.0, outages=[Outage(from_s=0.0)])
+    channel = ChannelTable(loss=1.0, bandwidth=800.0, outages=[Outage(from_s=0.0)])
     talk = Talk(channel, start=0.5).run(60, [0])
     got = talk.received
     np.testing.assert_allclose(got.arrival - got.stamp, 0.001)
     assert got.stamp.max() == pytest.approx(0.49)
     assert talk.lost == [0, 10, 10, 0]
-    unknown = Talk(Channel(loss=1.0), start=inf).run(60, [0])
+    unknown = Talk(ChannelTable(loss=1.0), start=inf).run(60, [0])
     assert len(unknown.received.link) == 2 * 59
 
 
 @pytest.mark.parametrize("encoding", ["json", "msgpack"])
 def test_samples_have_their_size_on_the_wire(encoding):
     bandwidth = 10_000.0
-    channel = Channel(delay_s=0.0, bandwidth=bandwidth)
-    got = Talk(channel, more={"network": Network(encoding=encoding)}).run(1, [0, 1]).run(40).received
+    channel = ChannelTable(delay_s=0.0, bandwidth=bandwidth)
+    got = Talk(channel, more={"network": NetworkTable(encoding=encoding)}).run(1, [0, 1]).run(40).received
     for link, row in ((A_TO_B, 0), (A_TO_C, 0), (B_TO_A, 1), (B_TO_C, 1)):
         pose = messages.pose("AB"[row], 1, EPOCH, [float(row), 0.0, 1.0], [-float(row), -0.0, -1.0], yaw=0.0)
         size = len(messages.encode(pose, encoding))
@@ -130,8 +132,8 @@ def test_samples_have_their_size_on_the_wire(encoding):
 
 
 def test_links_differ_by_name():
-    own = {"A > C": LinkChannel(delay_s=0.05), "A - B": LinkChannel(loss=1.0)}
-    talk = Talk(Channel(delay_s=0.01, links=own)).run(20, [0, 1]).run(10)
+    own = {"A > C": LinkChannelTable(delay_s=0.05), "A - B": LinkChannelTable(loss=1.0)}
+    talk = Talk(ChannelTable(delay_s=0.01, links=own)).run(20, [0, 1]).run(10)
     got = talk.received
     delay = got.arrival - got.stamp
     assert {*got.link.tolist()} == {A_TO_C, B_TO_C}
@@ -141,7 +143,7 @@ def test_links_differ_by_name():
 
 
 def test_default_channel():
-    assert msgspec.structs.asdict(Channel()) == {
+    assert msgspec.structs.asdict(ChannelTable()) == {
         "delay_s": 0.001, "jitter_s": 0.0, "loss": 0.0, "burst": None, "bandwidth": None, "queue_s": 0.5,
         "outages": [], "links": {},
     }  # fmt: skip
@@ -150,11 +152,11 @@ def test_default_channel():
 @pytest.mark.parametrize(
     ("channel", "instant"),
     [
-        (Channel(), False),
-        (Channel(delay_s=0.0), True),
-        (Channel(delay_s=0.0, loss=0.5), True),
-        (Channel(delay_s=0.0, jitter_s=0.1), False),
-        (Channel(delay_s=0.0, bandwidth=1e6), False),
+        (ChannelTable(), False),
+        (ChannelTable(delay_s=0.0), True),
+        (ChannelTable(delay_s=0.0, loss=0.5), True),
+        (ChannelTable(delay_s=0.0, jitter_s=0.1), False),
+        (ChannelTable(delay_s=0.0, bandwidth=1e6), False),
     ],
 )
 def test_instant_network(channel, instant):
@@ -162,7 +164,7 @@ def test_instant_network(channel, instant):
 
 
 def test_poses_to_the_centre_are_lost_alike():
-    talk = Talk(Channel(loss=0.5), more={"architecture": "centralised"}).run(400, [0, 1, 2]).run(1)
+    talk = Talk(ChannelTable(loss=0.5), more={"architecture": "centralised"}).run(400, [0, 1, 2]).run(1)
     centre = talk.network.logged(0.0)["centre"]
     assert len(centre.received.link) + centre.lost_poses.sum() == 3 * 400
     assert centre.lost_poses / 400 == pytest.approx(0.5, abs=0.1)

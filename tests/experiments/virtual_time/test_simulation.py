@@ -9,7 +9,7 @@ import pytest
 from agents.body.interface import Disturbance
 from agents.decision.lifecycle import AIRBORNE, DONE, IDLE, LANDING, READY, RUNNING
 from experiments.arrays import PoseTable
-from experiments.definition.experiment import Channel, Experiment, Formation, Leg, Robot, Start
+from experiments.definition.experiment import ChannelTable, Experiment, Formation, LegTable, RobotTable, Start
 from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.virtual_time.conductor import LEAD_S, Stuck
@@ -29,15 +29,15 @@ def park():
         "KH02": Disturbance(odometry_drift=0.002, latency_s=0.02),
         "CF02": Disturbance(latency_s=0.03),
     }
-    leg = Leg(at_s=2.0, robot="TB01", plan={"kind": "line", "move_by": [0.2, 0.0], "speed": 0.2})
+    leg = LegTable(at_s=2.0, robot="TB01", plan={"kind": "line", "move_by": [0.2, 0.0], "speed": 0.2})
     trigger = {"kind": "send-on-delta", "threshold": 0.01, "maximum_silence_s": 0.2}
-    channel = Channel(delay_s=0.004, jitter_s=0.01, loss=0.2)
+    channel = ChannelTable(delay_s=0.004, jitter_s=0.01, loss=0.2)
     return changed(experiment, duration_s=4.0, disturbance=nature, timeline=[leg], trigger=trigger, channel=channel)
 
 
 def ground(**parts):
     """Two ground robots that listen to each other."""
-    robots = {"A": Robot(kind="khepera4", start=[-0.4, 0.0]), "B": Robot(kind="khepera4", start=[0.4, 0.1])}
+    robots = {"A": RobotTable(kind="khepera4", start=[-0.4, 0.0]), "B": RobotTable(kind="khepera4", start=[0.4, 0.1])}
     given = {"title": "A pair", "duration_s": 2.0, "robots": robots, "formation": Formation(links={"A - B": 0.5})}
     return Experiment(**{**given, **parts})
 
@@ -105,7 +105,7 @@ def test_periodic_poses_are_all_sent_and_all_heard():
 
 
 def test_losses_are_counted_from_start_to_landing():
-    experiment = ground(channel=Channel(loss=0.25), duration_s=10.0)
+    experiment = ground(channel=ChannelTable(loss=0.25), duration_s=10.0)
     log = simulate(Plan(experiment), 1)
     time, row = log.sent.stamp, log.sent.link
     run = (time >= -1e-9) & (time < 10.0 - 1e-9)
@@ -118,9 +118,9 @@ def test_losses_are_counted_from_start_to_landing():
 
 
 def test_one_robot_alone():
-    robots = {"F": Robot(kind="crazyflie", start=[0.2, -0.1], hover=0.6)}
+    robots = {"F": RobotTable(kind="crazyflie", start=[0.2, -0.1], hover=0.6)}
     plan = {"kind": "circle", "radius": 0.2, "period_s": 8.0}
-    leg = Leg(at_s=0.0, robot="F", plan=plan)
+    leg = LegTable(at_s=0.0, robot="F", plan=plan)
     log = simulate(Plan(Experiment(title="Alone", duration_s=8.0, robots=robots, timeline=[leg])), 1)
     run = (log.time >= 0.0) & (log.time <= 8.0)
     path = log.true_position[run, 0]
@@ -136,9 +136,9 @@ def test_one_robot_alone():
 @pytest.mark.slow
 def test_three_robots_find_their_triangle():
     robots = {
-        "A": Robot(kind="khepera4", start=[-0.6, -0.5]),
-        "B": Robot(kind="khepera4", start=[0.6, -0.5]),
-        "F": Robot(kind="crazyflie", start=[0.1, 0.6], hover=0.6),
+        "A": RobotTable(kind="khepera4", start=[-0.6, -0.5]),
+        "B": RobotTable(kind="khepera4", start=[0.6, -0.5]),
+        "F": RobotTable(kind="crazyflie", start=[0.1, 0.6], hover=0.6),
     }
     links = {"A - B": 0.6, "A - F": 0.8, "B - F": 0.8}
     nature = {"all": Disturbance(position_sigma=0.0003)}
@@ -168,22 +168,22 @@ def test_the_reference_formation_is_acquired():
 
 def test_who_hears_nobody_is_named():
     with pytest.raises(Stuck, match=r"not ready after 5 s: A, B \(never received B\)"):
-        simulate(Plan(ground(channel=Channel(delay_s=100.0))), 1, patience_s=5.0)
+        simulate(Plan(ground(channel=ChannelTable(delay_s=100.0))), 1, patience_s=5.0)
 
 
 def test_who_cannot_get_up_is_named(monkeypatch):
     monkeypatch.setattr("agents.decision.lifecycle.AT_HEIGHT", -1.0)  # nobody is ever near enough to his height
     robots = {
-        "A": Robot(kind="khepera4", start=[0.0, 0.0]),
-        "F": Robot(kind="crazyflie", start=[0.5, 0.0], hover=0.5),
-        "G": Robot(kind="crazyflie", start=[-0.5, 0.0], hover=0.5),
+        "A": RobotTable(kind="khepera4", start=[0.0, 0.0]),
+        "F": RobotTable(kind="crazyflie", start=[0.5, 0.0], hover=0.5),
+        "G": RobotTable(kind="crazyflie", start=[-0.5, 0.0], hover=0.5),
     }
     with pytest.raises(Stuck, match=r"not airborne after 5 s: F, G"):
         simulate(Plan(Experiment(title="Stuck", duration_s=1.0, robots=robots)), 1, patience_s=5.0)
 
 
 def test_robot_goes_on_without_a_never_received_neighbour():
-    log = simulate(Plan(ground(channel=Channel(delay_s=100.0), start=Start(deadline_s=1.0, missing="go-on"))), 1)
+    log = simulate(Plan(ground(channel=ChannelTable(delay_s=100.0), start=Start(deadline_s=1.0, missing="go-on"))), 1)
     run = (log.time >= 0.0) & (log.time <= 2.0)
     np.testing.assert_allclose(log.true_position[run], np.tile(log.true_position[0], (run.sum(), 1, 1)), atol=1e-9)
     assert not log.error.any()
@@ -191,7 +191,7 @@ def test_robot_goes_on_without_a_never_received_neighbour():
 
 
 def test_all_is_lost_inside_run_and_nothing_outside():
-    log = simulate(Plan(ground(channel=Channel(loss=1.0))), 1)
+    log = simulate(Plan(ground(channel=ChannelTable(loss=1.0))), 1)
     stamp = log.received.stamp
     assert not ((stamp > -1e-9) & (stamp < 2.0 - 1e-9)).any()
     assert stamp.max() >= 2.0 - 1e-9

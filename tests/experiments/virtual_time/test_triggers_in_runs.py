@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from agents.plugins.predictors import HOLD, ConstantVelocity
-from experiments.definition.experiment import Channel, Formation
+from experiments.definition.experiment import ChannelTable, Formation
 from experiments.definition.plan import Plan
 from experiments.file import consistency, document
 from experiments.metrics import measure, signals
@@ -96,7 +96,7 @@ def test_triggers_where_they_make_sense_are_not(park, change):
 @pytest.fixture(scope="module")
 def flown(park):
     """A short run with the chosen trigger on a network with a delay, as a log and as a trace."""
-    experiment = changed(park, trigger=CHOSEN, duration_s=8.0, timeline=[], channel=Channel(delay_s=0.05))
+    experiment = changed(park, trigger=CHOSEN, duration_s=8.0, timeline=[], channel=ChannelTable(delay_s=0.05))
     log = simulation.simulate(Plan(experiment), 4)
     return log, RunRecorder(log, Plan(experiment), "predictive").trace()
 
@@ -179,7 +179,7 @@ def test_smoothed_prediction_saves_97_percent_and_costs_little(park, whole):
 
 @pytest.mark.slow
 def test_maximum_silence_stops_runaway_prediction_on_bad_network(park, whole):
-    bad = changed(park, trigger={**CHOSEN, "maximum_silence_s": 2.0}, channel=Channel(delay_s=0.05, loss=0.1))
+    bad = changed(park, trigger={**CHOSEN, "maximum_silence_s": 2.0}, channel=ChannelTable(delay_s=0.05, loss=0.1))
     cases = measured(bad, SEEDS)
     assert all(None not in case.acquired_s for case in cases)
     assert mean(cases, "iae") < 1.03 * mean(whole, "iae")

@@ -10,7 +10,7 @@ import pytest
 from agents.network import messages
 from experiments.real_time.conductor.run_view import Progress, RobotView
 from tools import progress as module
-from tools.progress import Bar, Lines, Table
+from tools.progress import Bar, Lines, ProgressTable
 
 
 class Terminal(io.StringIO):
@@ -93,14 +93,14 @@ def test_a_passing_bar_is_not_for_files(capsys, clock):
     assert capsys.readouterr().err == ""
 
 
-@pytest.mark.parametrize("kind", [Lines, Table])
+@pytest.mark.parametrize("kind", [Lines, ProgressTable])
 def test_errors_from_before_routers_silence_are_no_news(
-    kind: type[Lines | Table], capsys: pytest.CaptureFixture[str]
+    kind: type[Lines | ProgressTable], capsys: pytest.CaptureFixture[str]
 ) -> None:
     progress = Progress("event", "formation", 4.0, 15.0, {"KH01": RobotView(error=0.123)})
     with kind() as show:
         show(progress)
-    assert "0.123" in capsys.readouterr().err or kind is Table
+    assert "0.123" in capsys.readouterr().err or kind is ProgressTable
     progress.silent_since = time.monotonic() - 2.0
     with kind() as show:
         show(progress)

@@ -22,7 +22,7 @@ from agents.network import session as network
 from agents.network.endpoints import free_endpoint
 from agents.network.keys import Keys
 from agents.protocols import vicon_datastream
-from agents.protocols.vicon_datastream import Framer, Kind, Malformed, Segment
+from agents.protocols.vicon_datastream import BlockKind, Framer, MalformedBlock, Segment
 from bridges.vicon.client import Decoder, Frame, Reader
 from tests.conftest import ROOT, RouterProcess
 from tests.twins.camera import Camera
@@ -121,7 +121,7 @@ def test_damage_is_malformed_and_nothing_else(noise: bytes, at: int, value: int)
                 decoder.frame(body)
                 for _, payload in vicon_datastream.blocks(body):
                     vicon_datastream.unpack_kinds(payload)
-        except Malformed:
+        except MalformedBlock:
             pass  # anything else would fail the test
 
 
@@ -135,7 +135,7 @@ def test_root_segment_is_subject_pose_and_names_update() -> None:
             for parent, segment in segments
         ]
         payload = number.to_bytes(4, "little") + text(name) + len(parts).to_bytes(4, "little") + b"".join(parts)
-        return vicon_datastream.block(Kind.SUBJECT_INFO, payload + bytes(8))
+        return vicon_datastream.block(BlockKind.SUBJECT_INFO, payload + bytes(8))
 
     near, far = Segment(7, (1.0, 0.0, 0.0), (0.0,) * 9), Segment(3, (2.0, 0.0, 0.0), (0.0,) * 9)
     moved = vicon_datastream.pack_frame_number(5) + vicon_datastream.pack_segments(1, [near, far])
@@ -188,7 +188,7 @@ def test_clients_come_and_go_without_blocking_each_other() -> None:
     with Camera(["CF01"], rate_hz=250.0) as camera:
         camera.place("CF01", [0.1, 0.2, 0.3], 0.5)
         slow = socket.create_connection(("127.0.0.1", camera.port))
-        slow.sendall(vicon_datastream.packet(vicon_datastream.block(Kind.REQUEST_FRAME, b"\x01")))
+        slow.sendall(vicon_datastream.packet(vicon_datastream.block(BlockKind.REQUEST_FRAME, b"\x01")))
         rude = socket.create_connection(("127.0.0.1", camera.port))
         rude.sendall(b"GET / HTTP/1.1\r\n\r\n")
         for _ in range(3):
@@ -209,7 +209,7 @@ def test_a_client_may_ask_for_single_frames() -> None:
     with Camera(["CF01"]) as camera, socket.create_connection(("127.0.0.1", camera.port), 2.0) as client:
         camera.place("CF01", [1.0, 2.0, 3.0])
         framer, decoder, frames = Framer(), Decoder(), []
-        ask = vicon_datastream.packet(vicon_datastream.block(Kind.REQUEST_NEXT_FRAME))
+        ask = vicon_datastream.packet(vicon_datastream.block(BlockKind.REQUEST_NEXT_FRAME))
         for wanted in (1, 2):
             client.sendall(ask)
             while len(frames) < wanted:
@@ -228,7 +228,7 @@ def test_delayed_frame_comes_late_but_unchanged() -> None:
         listener = twin.sockets()[0]
         select.select([listener], [], [], 2.0)
         twin.serve(listener, 0.0)
-        client.sendall(vicon_datastream.packet(vicon_datastream.block(Kind.REQUEST_FRAME, b"\x01")))
+        client.sendall(vicon_datastream.packet(vicon_datastream.block(BlockKind.REQUEST_FRAME, b"\x01")))
         select.select(twin.sockets(), [], [], 2.0)
         twin.serve(twin.sockets()[1], 0.0)
         offer = vicon_datastream.pack_kinds(vicon_datastream.POSES)

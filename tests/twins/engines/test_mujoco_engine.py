@@ -372,8 +372,7 @@ def test_missing_library_is_named(monkeypatch):
 @pytest.mark.slow
 @pytest.mark.nightly
 def test_drones_hunt_with_the_gain_of_wheels():
-    from experiments.definition.experiment import Link  # noqa: PLC0415
-    from experiments.definition.experiment import World as WorldTable  # noqa: PLC0415
+    from experiments.definition.experiment import LinkTable, WorldTable  # noqa: PLC0415
     from experiments.definition.plan import Plan  # noqa: PLC0415
     from experiments.file import document  # noqa: PLC0415
     from experiments.virtual_time.simulation import simulate  # noqa: PLC0415
@@ -383,7 +382,7 @@ def test_drones_hunt_with_the_gain_of_wheels():
     error = {}
     for gain in (1.0, 3.0):
         formed = {
-            pair: msgspec.structs.replace(link, gain=gain) if isinstance(link, Link) else link
+            pair: msgspec.structs.replace(link, gain=gain) if isinstance(link, LinkTable) else link
             for pair, link in park.formation.links.items()
         }
         formation = msgspec.structs.replace(park.formation, links=formed)

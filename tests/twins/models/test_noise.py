@@ -10,7 +10,7 @@ import pytest
 
 from agents.body.interface import Disturbance, Jitter
 from agents.vectors import NO_SETPOINT
-from twins.models.disturbance import Drift, HoverJitter, Latency, Measurement
+from twins.models.disturbance import HoverJitter, Latency, MeasurementNoise, OdometryDrift
 from twins.models.noise import BLOCK, Noise, refill
 
 
@@ -79,8 +79,8 @@ def test_hover_jitter_grows_with_height():
 
 def test_no_disturbance_needs_no_noise():
     none = Disturbance()
-    jitter, drift = HoverJitter(none, "A", 1, 0.01), Drift(none, "A", 1)
-    measurement = Measurement(none, "A", 1, spatial=True)
+    jitter, drift = HoverJitter(none, "A", 1, 0.01), OdometryDrift(none, "A", 1)
+    measurement = MeasurementNoise(none, "A", 1, spatial=True)
     assert not Latency(none, 0.01).present
     for disturbed in (jitter, drift, measurement):
         assert not disturbed.present
@@ -97,7 +97,7 @@ def test_no_disturbance_needs_no_noise():
     ],
 )
 def test_measurement_noise_has_sigma_on_measured_axes(disturbance, spatial, sigma):
-    measurement, drawn = Measurement(disturbance, "A", 1, spatial=spatial), []
+    measurement, drawn = MeasurementNoise(disturbance, "A", 1, spatial=spatial), []
     for _ in range(5000):
         drawn.append(measurement.draw())
         refill(measurement.noise)
@@ -107,7 +107,7 @@ def test_measurement_noise_has_sigma_on_measured_axes(disturbance, spatial, sigm
 def test_variance_of_odometry_grows_with_way():
     rate, errors = 0.02, {100: [], 400: []}
     for seed in range(300):
-        drift = Drift(Disturbance(odometry_drift=rate), "A", seed)
+        drift = OdometryDrift(Disturbance(odometry_drift=rate), "A", seed)
         for tick in range(1, 401):
             drift.advance(0.006, 0.008)  # a centimetre
             refill(drift.noise)

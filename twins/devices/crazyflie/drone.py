@@ -14,26 +14,26 @@ from agents.protocols import crtp
 from agents.protocols.crtp import (
     HighLevel,
     Location,
+    LogStatus,
     Misc,
     Platform,
     Port,
     PowerSwitch,
-    Safety,
     Setpoint,
-    Status,
+    SupervisorCommand,
     Toc,
 )
 from twins.arrays import Array
 from twins.devices.crazyflie.flock import Flock
 from twins.devices.crazyflie.logs import LogBlocks
 from twins.devices.crazyflie.memory import ANCHORS
-from twins.devices.crazyflie.planner import Plan
+from twins.devices.crazyflie.planner import PlannerState
 from twins.devices.crazyflie.tables import (
     EXTENDED,
     PACKINGS,
     PARAMETER_CODES,
     READ_ONLY,
-    Table,
+    VariableTable,
     inventory,
     pack,
 )
@@ -163,23 +163,23 @@ class Drone:
         return bytes((done, done))
 
     def _supervisor(self, channel: int, data: bytes) -> bytes | None:
-        command, answer = (channel, data[0]), bytes((data[0] | Safety.ANSWER,))
-        if command == (0, Safety.ASK):
+        command, answer = (channel, data[0]), bytes((data[0] | SupervisorCommand.ANSWER,))
+        if command == (0, SupervisorCommand.ASK):
             return answer + struct.pack("<H", self.flock.info(self.row))
-        if command == (1, Safety.ARM):
+        if command == (1, SupervisorCommand.ARM):
             return answer + self._arm(on=bool(data[1]))
-        if command == (1, Safety.RECOVER):
+        if command == (1, SupervisorCommand.RECOVER):
             return answer + self._recover()
-        if command == (1, Safety.STOP):
+        if command == (1, SupervisorCommand.STOP):
             self.flock.supervisor.stop(self.row)
-        elif command == (1, Safety.WATCHDOG):
+        elif command == (1, SupervisorCommand.WATCHDOG):
             self.flock.supervisor.reset_watchdog(self.row, self.flock.t)
         return None
 
     # ------------------------------------------------------------------ parameters, logs, memories
 
     @staticmethod
-    def _table(table: Table, data: bytes, limits: bytes = b"") -> bytes | None:
+    def _table(table: VariableTable, data: bytes, limits: bytes = b"") -> bytes | None:
         if data[0] == Toc.INFO:
             return crtp.TOC_INFO.pack(Toc.INFO, len(table.items), table.crc) + limits
         if data[0] == Toc.ITEM:
@@ -195,7 +195,7 @@ class Drone:
             return self._set_by_name(data) if data[0] == Misc.SET_BY_NAME else self._param_misc(data)
         (number,) = crtp.IDENT.unpack_from(data)
         if number >= len(table.variables):
-            return data[:2] + bytes((Status.UNKNOWN,))
+            return data[:2] + bytes((LogStatus.UNKNOWN,))
         variable = table.variables[number]
         if channel == crtp.PARAM_READ:
             return data[:2] + b"\0" + pack(variable.type, self.values[number])
@@ -208,11 +208,11 @@ class Drone:
     def _set_by_name(self, data: bytes) -> bytes:
         group, name, rest = data[1:].split(b"\0", 2)
         number = self.parameters.number.get(f"{group.decode()}.{name.decode()}")
-        status = Status.UNKNOWN
+        status = LogStatus.UNKNOWN
         if number is not None:
             kind = self.parameters.variables[number].type
             if PARAMETER_CODES[kind] == rest[0]:
-                status = Status.OK
+                status = LogStatus.OK
                 self._set(number, _numbers(PACKINGS[kind], rest[1:])[0])
         return data[: len(group) + len(name) + 3] + bytes((status,))
 
@@ -221,7 +221,7 @@ class Drone:
         command, number = crtp.ITEM.unpack_from(data)
         known = data[: crtp.ITEM.size]
         if number >= len(variables):
-            return known + bytes((Status.UNKNOWN,))
+            return known + bytes((LogStatus.UNKNOWN,))
         variable = variables[number]
         extended = bytes((1 if variable.flags & EXTENDED else 0,))
         default = pack(variable.type, variable.value)
@@ -281,7 +281,7 @@ class Drone:
             read = memories.read_number(number, address, rest[0])
         elif number >= len(memories.kinds) or not memories.write(memories.kinds[number], address, rest):
             read = None
-        return head + (bytes((Status.IO,)) if read is None else bytes((Status.OK,)) + read)
+        return head + (bytes((LogStatus.IO,)) if read is None else bytes((LogStatus.OK,)) + read)
 
     # ------------------------------------------------------------------ motion
 
@@ -328,19 +328,19 @@ class Drone:
     def _high_level(self, _channel: int, data: bytes) -> bytes:
         return data[:3].ljust(3, b"\0") + bytes((self._plan(data[0], data[1], data[2:]),))
 
-    def _plan(self, command: int, group: int, data: bytes) -> Status:
+    def _plan(self, command: int, group: int, data: bytes) -> LogStatus:
         flock, row, planner = self.flock, self.row, self.flock.planner
         if command == HighLevel.DEFINE:  # for all groups: the number of the trajectory is in the place of the mask
             return self.trajectories.define(group, *crtp.DEFINE.unpack_from(data))
         if command == HighLevel.GROUP:
             if (number := self.parameters.number.get("hlCommander.groupmask")) is not None:
                 self.values[number] = group
-            return Status.OK
+            return LogStatus.OK
         if group and not group & int(self.value("hlCommander.groupmask")):
-            return Status.OK
+            return LogStatus.OK
         if command == HighLevel.STOP:
             planner.stop(row)
-            return Status.OK
+            return LogStatus.OK
         begin = {
             HighLevel.TAKEOFF: self._climb,
             HighLevel.LAND: self._climb,
@@ -355,13 +355,13 @@ class Drone:
             HighLevel.START_2: self._follow,
         }.get(command)  # type: ignore[call-overload]
         if begin is None or not flock.supervisor.may_fly[row]:
-            return Status.NO_COMMAND if begin is None else Status.BUSY
+            return LogStatus.NO_COMMAND if begin is None else LogStatus.BUSY
         # the firmware plans from its last setpoint while a plan runs, else from its estimate
-        pose = flock.pose(row) if planner.plan[row] == Plan.IDLE else planner.state(row, flock.t)[0]
-        status: Status = begin(command, pose, data)
+        pose = flock.pose(row) if planner.plan[row] == PlannerState.IDLE else planner.state(row, flock.t)[0]
+        status: LogStatus = begin(command, pose, data)
         return status
 
-    def _climb(self, command: int, pose: Array, data: bytes) -> Status:
+    def _climb(self, command: int, pose: Array, data: bytes) -> LogStatus:
         landing = command in (HighLevel.LAND, HighLevel.OLD_LAND, HighLevel.LAND_VELOCITY)
         if command in (HighLevel.OLD_TAKEOFF, HighLevel.OLD_LAND):
             (height, span), yaw, keep = _numbers(crtp.OLD_CLIMB, data), 0.0, False
@@ -376,12 +376,12 @@ class Drone:
             self.row, self.flock.t, pose, height=height, yaw=yaw, span=span, landing=landing
         )
 
-    def _go_to(self, command: int, pose: Array, data: bytes) -> Status:
+    def _go_to(self, command: int, pose: Array, data: bytes) -> LogStatus:
         old = command == HighLevel.OLD_GO_TO
         packing = crtp.OLD_GO_TO if old else crtp.GO_TO
         if any(map(math.isnan, packing.unpack_from(data))) and self.flock.quadrotor.flying[self.row]:
             self.flock.supervisor.stop(self.row)  # no plan has such values: motors off, and locked
-            return Status.OK
+            return LogStatus.OK
         relative, *straight, x, y, z, yaw, span = _numbers(packing, data)
         linear = any(straight)
         goal, velocity = np.array([x, y, z, yaw]), self.flock.quadrotor.velocity[self.row]
@@ -389,7 +389,7 @@ class Drone:
             self.row, self.flock.t, pose, velocity, goal=goal, span=span, relative=relative, linear=linear
         )
 
-    def _spiral(self, _: int, pose: Array, data: bytes) -> Status:
+    def _spiral(self, _: int, pose: Array, data: bytes) -> LogStatus:
         sideways, clockwise, angle, first, last, climb, span = _numbers(crtp.SPIRAL, data)
         return self.flock.planner.spiral(
             self.row,
@@ -403,7 +403,7 @@ class Drone:
             clockwise=clockwise,
         )
 
-    def _follow(self, command: int, pose: Array, data: bytes) -> Status:
+    def _follow(self, command: int, pose: Array, data: bytes) -> LogStatus:
         if command == HighLevel.START:
             (relative, reverse, number, scale), turned = _numbers(crtp.START, data), False
         else:

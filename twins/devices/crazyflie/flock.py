@@ -18,11 +18,11 @@ from twins.arrays import Array, Index, Mask, any_true
 from twins.body import instants
 from twins.devices.crazyflie.commander import Commander
 from twins.devices.crazyflie.memory import Memories
-from twins.devices.crazyflie.planner import Plan, Planner
+from twins.devices.crazyflie.planner import OnboardPlanners, PlannerState
 from twins.devices.crazyflie.supervisor import Supervisor
 from twins.devices.crazyflie.vertical import VerticalLoops
 from twins.devices.device import Faults
-from twins.models.disturbance import HoverJitter, Latency, Measurement
+from twins.models.disturbance import HoverJitter, Latency, MeasurementNoise
 from twins.models.noise import refill
 from twins.models.quadrotor import GRAVITY, Quadrotor
 
@@ -137,7 +137,7 @@ class Disturbances:
     def __init__(self, request: BodyRequest, dt: float) -> None:
         robots = list(zip(request.disturbance, request.names, request.seeds, strict=True))
         self._jitters = [HoverJitter(*robot, dt) for robot in robots]
-        self._measurements = [Measurement(*robot, spatial=True) for robot in robots]
+        self._measurements = [MeasurementNoise(*robot, spatial=True) for robot in robots]
         self._latencies = [Latency(disturbance, dt) for disturbance in request.disturbance]
 
     def delay(self, setpoint: Array) -> Array:
@@ -244,7 +244,7 @@ class Flock:
         self._faults, self._fault_tumbled = faults, False
         by_hand = [faults.refuse_arming or each.platform == "brushless" for each in settings]
         self.refuse_arming = faults.refuse_arming
-        self.planner = Planner(rows)
+        self.planner = OnboardPlanners(rows)
         self.commander = Commander(rows)
         self.supervisor = Supervisor(~np.array(by_hand))
         self.estimator = Estimator(rows)
@@ -276,7 +276,7 @@ class Flock:
     def info(self, row: int) -> Info:
         """Flags of a row's supervisor and planner."""
         info = self.supervisor.info(row)
-        if self.planner.plan[row] != Plan.IDLE:
+        if self.planner.plan[row] != PlannerState.IDLE:
             info |= Info.PLANNER_ACTIVE
         if self.planner.finished(self.t)[row]:
             info |= Info.PLANNER_FINISHED

@@ -11,10 +11,10 @@ from typing import Final
 import numpy as np
 
 from agents.protocols import crtp
-from agents.protocols.crtp import Info, Log, Status
+from agents.protocols.crtp import Info, Log, LogStatus
 from twins.arrays import Array
 from twins.devices.crazyflie.flock import Flock
-from twins.devices.crazyflie.tables import LOG_TYPES, PACKINGS, Table, pack
+from twins.devices.crazyflie.tables import LOG_TYPES, PACKINGS, VariableTable, pack
 from twins.models.quadrotor import GRAVITY
 
 ROOM: Final = (2.0, 2.0, 2.5)  # [m] from the origin to the walls, and height: measured by the Multi-ranger
@@ -44,7 +44,7 @@ class Block:
 class LogBlocks:
     """The log blocks of one Crazyflie."""
 
-    def __init__(self, flock: Flock, row: int, parameter: Callable[[str], float], table: Table) -> None:
+    def __init__(self, flock: Flock, row: int, parameter: Callable[[str], float], table: VariableTable) -> None:
         self.began = 0.0  # time at which the drone was switched on [s]
         self._blocks: dict[int, Block] = {}
         known = _motion(flock, row) | _system(flock, row, parameter)  # the others are constants of the table
@@ -55,16 +55,16 @@ class LogBlocks:
     def reset(self) -> None:
         self._blocks.clear()
 
-    def execute(self, command: int, number: int, rest: bytes, t: float) -> Status:
+    def execute(self, command: int, number: int, rest: bytes, t: float) -> LogStatus:
         """Execute a command for block `number` at time `t` [s]."""
         block = self._blocks.get(number)
         if command == Log.RESET:
             self.reset()
-            return Status.OK
+            return LogStatus.OK
         if command == Log.CREATE:
             return self._create(number, rest)
         if block is None:
-            return Status.UNKNOWN
+            return LogStatus.UNKNOWN
         if command == Log.APPEND:
             return self._append(block, rest)
         if command == Log.START:
@@ -74,7 +74,7 @@ class LogBlocks:
             block.period = 0.0
         elif command == Log.DELETE:
             del self._blocks[number]
-        return Status.OK if command in (Log.START, Log.STOP, Log.DELETE) else Status.NO_COMMAND
+        return LogStatus.OK if command in (Log.START, Log.STOP, Log.DELETE) else LogStatus.NO_COMMAND
 
     def due(self, t: float) -> Iterator[bytes]:
         """Packets that are due at `t` [s]."""
@@ -88,26 +88,26 @@ class LogBlocks:
             values = b"".join(pack(kind, read()) for read, kind in block.variables)
             yield bytes((number,)) + stamp + values
 
-    def _create(self, number: int, items: bytes) -> Status:
+    def _create(self, number: int, items: bytes) -> LogStatus:
         if number in self._blocks:
-            return Status.EXISTS
+            return LogStatus.EXISTS
         if len(self._blocks) == crtp.LOG_BLOCKS:
-            return Status.NO_ROOM
+            return LogStatus.NO_ROOM
         self._blocks[number] = Block()
         return self._append(self._blocks[number], items)
 
-    def _append(self, block: Block, items: bytes) -> Status:
+    def _append(self, block: Block, items: bytes) -> LogStatus:
         for begin in range(0, len(items) - 2, 3):
             code, number = crtp.ITEM.unpack_from(items, begin)
             kind = LOG_TYPES.get(code & 0x0F)
             if number >= len(self._read) or kind is None:
-                return Status.UNKNOWN
+                return LogStatus.UNKNOWN
             if block.size + PACKINGS[kind].size > crtp.LOG_PAYLOAD:
-                return Status.TOO_LARGE
+                return LogStatus.TOO_LARGE
             if sum(len(other.variables) for other in self._blocks.values()) == crtp.LOG_VARIABLES:
-                return Status.NO_ROOM
+                return LogStatus.NO_ROOM
             block.variables.append((self._read[number], kind))
-        return Status.OK
+        return LogStatus.OK
 
 
 def _motion(flock: Flock, row: int) -> dict[str, Read]:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Final
 from zlib import crc32
 
-from agents.protocols.crtp import ANCHOR, Memory
+from agents.protocols.crtp import ANCHOR, MemoryKind
 
 STATIONS: Final = 4  # the firmware's default
 ANCHORS: Final = 8
@@ -23,14 +23,14 @@ BOARDS: Final = {"bcDWM1000": 0x06, "bcMultiranger": 0x0C, "bcFlow2": 0x0F, "bcL
 DECK_VERSION: Final = 3  # of the list of deck memories, which is empty otherwise
 
 SIZES: Final = {
-    Memory.EEPROM: 0x20,
-    Memory.LED_RING: 24,
-    Memory.LED_TIMING: 0x400,
-    Memory.DECKS: 0x2000,
-    Memory.TRAJECTORY: 4096,
-    Memory.LOCO: ANCHOR_PAGES + PAGE * 0x100,
-    Memory.LIGHTHOUSE: 2 * CALIBRATION,
-    Memory.TESTER: 0x1000,
+    MemoryKind.EEPROM: 0x20,
+    MemoryKind.LED_RING: 24,
+    MemoryKind.LED_TIMING: 0x400,
+    MemoryKind.DECKS: 0x2000,
+    MemoryKind.TRAJECTORY: 4096,
+    MemoryKind.LOCO: ANCHOR_PAGES + PAGE * 0x100,
+    MemoryKind.LIGHTHOUSE: 2 * CALIBRATION,
+    MemoryKind.TESTER: 0x1000,
 }
 
 
@@ -43,23 +43,23 @@ class Memories:
         """`decks`: names of `BOARDS`."""
         self.decks = [_board(name, BOARDS[name]) for name in decks]
         self._bytes = {kind: bytearray(size) for kind, size in SIZES.items()}
-        loco = self._bytes[Memory.LOCO]
+        loco = self._bytes[MemoryKind.LOCO]
         for where in (0, ACTIVE):  # all anchors are active, without positions
             loco[where : where + 1 + ANCHORS] = bytes((ANCHORS, *range(ANCHORS)))
-        self._bytes[Memory.DECKS][0] = DECK_VERSION
+        self._bytes[MemoryKind.DECKS][0] = DECK_VERSION
         settings = b"0xBC" + struct.pack("<BBBffBI", 1, 80, 2, 0.0, 0.0, 0xE7, 0xE7E7E7E7)  # radio, trim, address
-        self._bytes[Memory.EEPROM][: len(settings) + 1] = settings + bytes((sum(settings) % 0x100,))
+        self._bytes[MemoryKind.EEPROM][: len(settings) + 1] = settings + bytes((sum(settings) % 0x100,))
         self.write_errors = 0  # of the tester: bytes that are not their address
         self.stored = (0, 0)  # masks of the stations with a geometry, and a calibration, that survives a restart
 
     def restart(self) -> None:
         """Forget what does not survive switching off and on: the trajectories."""
-        self._bytes[Memory.TRAJECTORY] = bytearray(SIZES[Memory.TRAJECTORY])
+        self._bytes[MemoryKind.TRAJECTORY] = bytearray(SIZES[MemoryKind.TRAJECTORY])
 
     @property
     def listed(self) -> list[tuple[int, int]]:
         """Kind and size [bytes] of each memory."""
-        return [*SIZES.items(), *[(Memory.DECK, ONE_WIRE_BYTES)] * len(self.decks)]
+        return [*SIZES.items(), *[(MemoryKind.DECK, ONE_WIRE_BYTES)] * len(self.decks)]
 
     def read_number(self, number: int, address: int, count: int) -> bytes | None:
         """Read by the number of a memory, see `read`."""
@@ -70,24 +70,24 @@ class Memories:
         return self.decks[number - len(self.kinds)][address : address + count]
 
     @staticmethod
-    def size(kind: Memory) -> int:
+    def size(kind: MemoryKind) -> int:
         """Size of a memory [bytes]."""
         return SIZES[kind]
 
-    def read(self, kind: Memory, address: int, count: int) -> bytes | None:
+    def read(self, kind: MemoryKind, address: int, count: int) -> bytes | None:
         """Read `count` bytes from `address` on; None at an invalid address."""
-        if kind == Memory.TESTER:
+        if kind == MemoryKind.TESTER:
             return bytes((address + k) & 0xFF for k in range(count))
         data = self._bytes[kind]
         if address + count > len(data) or not self._exists(kind, address):
             return None
         return bytes(data[address : address + count])
 
-    def write(self, kind: Memory, address: int, data: bytes) -> bool:
+    def write(self, kind: MemoryKind, address: int, data: bytes) -> bool:
         """Write `data` to `address`; False at an invalid address."""
-        if kind == Memory.LOCO or address + len(data) > SIZES[kind] or not self._exists(kind, address):
+        if kind == MemoryKind.LOCO or address + len(data) > SIZES[kind] or not self._exists(kind, address):
             return False
-        if kind == Memory.TESTER:
+        if kind == MemoryKind.TESTER:
             self.write_errors += sum(value != (address + k) & 0xFF for k, value in enumerate(data))
         self._bytes[kind][address : address + len(data)] = data
         return True
@@ -95,11 +95,11 @@ class Memories:
     def set_anchor(self, anchor: int, x: float, y: float, z: float) -> None:
         """Store the position of an anchor [m]."""
         where = ANCHOR_PAGES + PAGE * anchor
-        self._bytes[Memory.LOCO][where : where + ANCHOR.size] = ANCHOR.pack(x, y, z, True)
+        self._bytes[MemoryKind.LOCO][where : where + ANCHOR.size] = ANCHOR.pack(x, y, z, True)
 
     def anchors(self) -> dict[int, tuple[float, float, float]]:
         """Positions [m] of the anchors that have one."""
-        loco, known = self._bytes[Memory.LOCO], {}
+        loco, known = self._bytes[MemoryKind.LOCO], {}
         for anchor in range(ANCHORS):
             x, y, z, valid = ANCHOR.unpack_from(loco, ANCHOR_PAGES + PAGE * anchor)
             if valid:
@@ -108,7 +108,7 @@ class Memories:
 
     def clear_stations(self) -> None:
         """Erase geometries and calibrations, as a change of the Lighthouse version does."""
-        self._bytes[Memory.LIGHTHOUSE] = bytearray(SIZES[Memory.LIGHTHOUSE])
+        self._bytes[MemoryKind.LIGHTHOUSE] = bytearray(SIZES[MemoryKind.LIGHTHOUSE])
 
     @property
     def geometries(self) -> int:
@@ -121,13 +121,13 @@ class Memories:
         return self._valid(CALIBRATION, CALIBRATION_BYTES)
 
     def _valid(self, begin: int, size: int) -> int:
-        data = self._bytes[Memory.LIGHTHOUSE]
+        data = self._bytes[MemoryKind.LIGHTHOUSE]
         return sum((data[begin + PAGE * i + size - 1] != 0) << i for i in range(STATIONS))
 
     @staticmethod
-    def _exists(kind: Memory, address: int) -> bool:
+    def _exists(kind: MemoryKind, address: int) -> bool:
         """Whether an address is valid: pages of base stations beyond the firmware's number are not."""
-        return kind != Memory.LIGHTHOUSE or address % CALIBRATION < STATIONS * PAGE
+        return kind != MemoryKind.LIGHTHOUSE or address % CALIBRATION < STATIONS * PAGE
 
 
 def _board(name: str, product: int) -> bytes:

@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.protocols.crtp import Status
+from agents.protocols.crtp import LogStatus
 from twins.arrays import Array, Mask
 
 SHORTEST: Final = 0.01  # [s]
@@ -23,7 +23,7 @@ ORDER: Final = 7  # of the polynomials
 Piece = tuple[float, Array]  # duration [s], coefficients (4, ORDER + 1) of x, y, z, yaw, constant first
 
 
-class Plan(IntEnum):
+class PlannerState(IntEnum):
     """State of a planner."""
 
     IDLE = 0
@@ -62,11 +62,11 @@ def evaluate(coefficients: Array, t: Array) -> tuple[Array, Array, Array]:
     return value, first, 2.0 * half
 
 
-class Planner:
+class OnboardPlanners:
     """Planners of N rows; a pose is (4,): x, y, z [m], yaw [rad]."""
 
     def __init__(self, rows: int) -> None:
-        self.plan: NDArray[np.int8] = np.zeros(rows, dtype=np.int8)  # (N,) `Plan` of each row
+        self.plan: NDArray[np.int8] = np.zeros(rows, dtype=np.int8)  # (N,) `PlannerState` of each row
         self._begin = np.zeros(rows)
         self._span = np.ones(rows)
         self._coefficients = np.zeros((rows, 4, ORDER + 1))
@@ -74,19 +74,19 @@ class Planner:
 
     def climb(
         self, row: int, t: float, pose: Array, *, height: float, yaw: float, span: float, landing: bool
-    ) -> Status:
+    ) -> LogStatus:
         """Plan a vertical motion to `height` [m]: a landing with motors off at its end, or a take-off.
 
         A take-off is refused unless idle, a landing while landing.
         """
-        possible = self.plan[row] != Plan.LANDING if landing else self.plan[row] == Plan.IDLE
+        possible = self.plan[row] != PlannerState.LANDING if landing else self.plan[row] == PlannerState.IDLE
         if not possible:
-            return Status.REFUSED
+            return LogStatus.REFUSED
         span, zero = max(span, SHORTEST), np.zeros(4)
         goal = self._shorter_turn(pose, np.array([pose[0], pose[1], height, yaw]))
         self._start(row, t, [(span, polynomial(span, (pose, zero, zero), (goal, zero, zero)))])
-        self.plan[row] = Plan.LANDING if landing else Plan.FLYING
-        return Status.OK
+        self.plan[row] = PlannerState.LANDING if landing else PlannerState.FLYING
+        return LogStatus.OK
 
     def go_to(
         self,
@@ -99,12 +99,12 @@ class Planner:
         span: float,
         relative: bool,
         linear: bool,
-    ) -> Status:
+    ) -> LogStatus:
         """Plan a motion to the pose `goal`, from the current trajectory or else from `pose` and `velocity` (3,)."""
         span = max(span, SHORTEST)
         zero = np.zeros(4)
         speed, acceleration = np.append(velocity, 0.0), zero
-        if self.plan[row] != Plan.IDLE:
+        if self.plan[row] != PlannerState.IDLE:
             pose, speed, acceleration = self.state(row, t)
         if relative:
             goal = pose + goal
@@ -115,7 +115,7 @@ class Planner:
         else:
             ends = (pose, speed, acceleration), (goal, zero, zero)
         self.follow(row, t, [(span, polynomial(span, *ends))])
-        return Status.OK
+        return LogStatus.OK
 
     def spiral(
         self,
@@ -129,7 +129,7 @@ class Planner:
         span: float,
         sideways: bool,
         clockwise: bool,
-    ) -> Status:
+    ) -> LogStatus:
         """Plan an arc from `pose` around a centre beside it, or ahead of (clockwise) or behind it if `sideways`.
 
         As in the firmware the arc is one polynomial with the position, velocity and acceleration of the spiral at its
@@ -166,31 +166,31 @@ class Planner:
         (begin, v, a), (end, w, b) = ends
         goal = pose + (end - begin) + [0.0, 0.0, climb, 0.0]
         self.follow(row, t, [(span, polynomial(span, (pose, v, a), (goal, w, b)))])
-        return Status.OK
+        return LogStatus.OK
 
     def follow(self, row: int, t: float, pieces: Sequence[Piece]) -> None:
         """Follow pieces one after the other, then hold the last pose."""
         self._start(row, t, pieces)
-        self.plan[row] = Plan.FLYING
+        self.plan[row] = PlannerState.FLYING
 
     def stop(self, row: int) -> None:
         """Drop the plan of a row."""
-        self.plan[row] = Plan.IDLE
+        self.plan[row] = PlannerState.IDLE
 
     def finished(self, t: float) -> Mask:
         """Rows (N,) at the end of their plan, or without one."""
         last = np.array([not rest for rest in self._rest])
-        return np.asarray((self.plan == Plan.IDLE) | (last & (t - self._begin >= self._span)))
+        return np.asarray((self.plan == PlannerState.IDLE) | (last & (t - self._begin >= self._span)))
 
     def goal(self, t: float) -> Array:
         """Current planned poses (N, 4), NaN for idle rows; a row that has landed becomes idle."""
         for row, rest in enumerate(self._rest):
             if rest:
                 self._advance(row, t)
-        self.plan[(self.plan == Plan.LANDING) & (t - self._begin >= self._span)] = Plan.IDLE
+        self.plan[(self.plan == PlannerState.LANDING) & (t - self._begin >= self._span)] = PlannerState.IDLE
         elapsed = np.clip(t - self._begin, 0.0, self._span)
         pose, _, _ = evaluate(self._coefficients, elapsed[:, None])
-        return np.asarray(np.where((self.plan == Plan.IDLE)[:, None], np.nan, pose))
+        return np.asarray(np.where((self.plan == PlannerState.IDLE)[:, None], np.nan, pose))
 
     def state(self, row: int, t: float) -> tuple[Array, Array, Array]:
         """Pose, speed and acceleration (4,) on the plan of a row; at rest after the end of the plan."""

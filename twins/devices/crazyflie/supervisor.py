@@ -24,7 +24,7 @@ SPIN_UP_S: Final = 0.5  # from the arming of brushless motors to their readiness
 WATCHDOG_S: Final = 1.0  # longest time between two packets of the emergency watchdog
 
 
-class State(IntEnum):
+class SupervisorState(IntEnum):
     """State of a supervisor."""
 
     DISARMED = 0
@@ -43,7 +43,9 @@ class Supervisor:
     def __init__(self, auto_arm: Mask) -> None:
         rows = len(auto_arm)
         self._auto = auto_arm
-        self.state: NDArray[np.int8] = np.where(auto_arm, State.READY, State.DISARMED).astype(np.int8)
+        self.state: NDArray[np.int8] = np.where(auto_arm, SupervisorState.READY, SupervisorState.DISARMED).astype(
+            np.int8
+        )
         self.tumbled: NDArray[np.bool_] = np.zeros(rows, dtype=bool)  # upside down, or on their side
         self._since = np.zeros(rows)  # time of arming or landing [s]
         self._motors_ran = np.full(rows, -np.inf)
@@ -55,37 +57,40 @@ class Supervisor:
         """Rows (N,) with motors that may turn."""
         state = self.state
         return np.asarray(
-            (state == State.READY) | (state == State.FLYING) | (state == State.LEVEL) | (state == State.LANDED)
+            (state == SupervisorState.READY)
+            | (state == SupervisorState.FLYING)
+            | (state == SupervisorState.LEVEL)
+            | (state == SupervisorState.LANDED)
         )
 
     @property
     def level(self) -> Mask:
         """Rows (N,) that ignore horizontal setpoints."""
-        return np.asarray(self.state == State.LEVEL)
+        return np.asarray(self.state == SupervisorState.LEVEL)
 
     def restart(self, row: int) -> None:
         """State after switching off and on."""
-        self.state[row] = State.READY if self._auto[row] else State.DISARMED
+        self.state[row] = SupervisorState.READY if self._auto[row] else SupervisorState.DISARMED
         self._motors_ran[row], self._watchdog[row], self._stop[row] = -np.inf, np.inf, False
 
     def arm(self, row: int, t: float, *, on: bool) -> bool:
         """Arm or disarm a row; False if not possible in its state."""
-        if on and self.state[row] == State.DISARMED and not self.tumbled[row]:
-            self.state[row], self._since[row] = State.ARMING, t
-        elif not on and self.state[row] in (State.FLYING, State.LEVEL) and not self._auto[row]:
+        if on and self.state[row] == SupervisorState.DISARMED and not self.tumbled[row]:
+            self.state[row], self._since[row] = SupervisorState.ARMING, t
+        elif not on and self.state[row] in (SupervisorState.FLYING, SupervisorState.LEVEL) and not self._auto[row]:
             self._stop[row] = True  # disarmed in the air, it locks
-        elif not on and self.state[row] not in (State.LOCKED, State.CRASHED):
-            self.state[row] = State.DISARMED
+        elif not on and self.state[row] not in (SupervisorState.LOCKED, SupervisorState.CRASHED):
+            self.state[row] = SupervisorState.DISARMED
         return bool(self.armed(row) == on)
 
     def recover(self, row: int) -> bool:
         """Recover a row from a crash, once it stands upright; whether it is in order."""
-        if self.state[row] == State.CRASHED and not self.tumbled[row]:
-            self.state[row] = State.DISARMED
-        return bool(self.state[row] != State.CRASHED)
+        if self.state[row] == SupervisorState.CRASHED and not self.tumbled[row]:
+            self.state[row] = SupervisorState.DISARMED
+        return bool(self.state[row] != SupervisorState.CRASHED)
 
     def armed(self, row: int) -> bool:
-        return bool(self.may_fly[row] or self.state[row] == State.ARMING)
+        return bool(self.may_fly[row] or self.state[row] == SupervisorState.ARMING)
 
     def stop(self, row: int) -> None:
         """Request an emergency stop of a row."""
@@ -105,32 +110,35 @@ class Supervisor:
         """
         self._motors_ran[spinning] = t
         flying, state = t - self._motors_ran < FLYING_S, self.state
-        airborne = (state == State.FLYING) | (state == State.LEVEL)
-        lock = (state != State.LOCKED) & (
+        airborne = (state == SupervisorState.FLYING) | (state == SupervisorState.LEVEL)
+        lock = (state != SupervisorState.LOCKED) & (
             self._stop
             | (t - self._watchdog > WATCHDOG_S)
             | (airborne & (age > LOCK_S))
-            | ((state == State.LEVEL) & self.tumbled)
+            | ((state == SupervisorState.LEVEL) & self.tumbled)
         )
-        crash = (state == State.FLYING) & self.tumbled & ~lock
+        crash = (state == SupervisorState.FLYING) & self.tumbled & ~lock
         settled = t - self._since
         rules = (
-            (lock, State.LOCKED),
-            (crash, State.CRASHED),
-            (self.tumbled & ((state == State.READY) | (state == State.ARMING)), State.DISARMED),
-            ((state == State.DISARMED) & self._auto & ~self.tumbled, State.READY),
-            ((state == State.ARMING) & (settled >= SPIN_UP_S), State.READY),
-            ((state == State.FLYING) & (age > LEVEL_S), State.LEVEL),
-            ((state == State.LEVEL) & (age <= LEVEL_S), State.FLYING),
-            ((state == State.FLYING) & ~flying, State.LANDED),
-            (((state == State.READY) | (state == State.LANDED)) & flying, State.FLYING),
-            ((state == State.READY) & ~self._auto & (settled > PREFLIGHT_S), State.DISARMED),
-            ((state == State.LANDED) & (settled > LANDED_S), State.DISARMED),
+            (lock, SupervisorState.LOCKED),
+            (crash, SupervisorState.CRASHED),
+            (
+                self.tumbled & ((state == SupervisorState.READY) | (state == SupervisorState.ARMING)),
+                SupervisorState.DISARMED,
+            ),
+            ((state == SupervisorState.DISARMED) & self._auto & ~self.tumbled, SupervisorState.READY),
+            ((state == SupervisorState.ARMING) & (settled >= SPIN_UP_S), SupervisorState.READY),
+            ((state == SupervisorState.FLYING) & (age > LEVEL_S), SupervisorState.LEVEL),
+            ((state == SupervisorState.LEVEL) & (age <= LEVEL_S), SupervisorState.FLYING),
+            ((state == SupervisorState.FLYING) & ~flying, SupervisorState.LANDED),
+            (((state == SupervisorState.READY) | (state == SupervisorState.LANDED)) & flying, SupervisorState.FLYING),
+            ((state == SupervisorState.READY) & ~self._auto & (settled > PREFLIGHT_S), SupervisorState.DISARMED),
+            ((state == SupervisorState.LANDED) & (settled > LANDED_S), SupervisorState.DISARMED),
         )
         after = state.copy()
         for rule, to in reversed(rules):  # the first that applies counts; np.select takes five times as long
             after[rule] = to
-        self._since[((after == State.LANDED) | (after == State.READY)) & (state != after)] = t
+        self._since[((after == SupervisorState.LANDED) | (after == SupervisorState.READY)) & (state != after)] = t
         self.state = after
         return np.asarray(lock | crash)
 
@@ -138,13 +146,13 @@ class Supervisor:
         """Flags of a row, without those of the planner."""
         state, tumbled = self.state[row], self.tumbled[row]
         flags = {
-            Info.CAN_BE_ARMED: state == State.DISARMED and not tumbled,
+            Info.CAN_BE_ARMED: state == SupervisorState.DISARMED and not tumbled,
             Info.ARMED: self.armed(row),
             Info.CAN_FLY: self.may_fly[row],
             Info.AUTO_ARM: self._auto[row],
-            Info.FLYING: state in (State.FLYING, State.LEVEL),
+            Info.FLYING: state in (SupervisorState.FLYING, SupervisorState.LEVEL),
             Info.TUMBLED: tumbled,
-            Info.LOCKED: state == State.LOCKED,
-            Info.CRASHED: state == State.CRASHED,
+            Info.LOCKED: state == SupervisorState.LOCKED,
+            Info.CRASHED: state == SupervisorState.CRASHED,
         }
         return Info(sum(flag for flag, holds in flags.items() if holds))

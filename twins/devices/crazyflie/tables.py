@@ -44,7 +44,7 @@ RANGE: Final = re.compile(r"(\w*?)(\d+)-(\d+)")  # several names with a number e
 
 
 @dataclass(frozen=True)
-class Variable:
+class DeviceVariable:
     """One parameter or log variable: type on board, value at the start, access."""
 
     name: str
@@ -66,10 +66,10 @@ def pack(kind: str, value: float) -> bytes:
     return packing.pack(whole - (1 << bits) if kind[0] == "i" and whole >> (bits - 1) else whole)
 
 
-class Table:
+class VariableTable:
     """Variables in the order of their numbers."""
 
-    def __init__(self, variables: Sequence[Variable], codes: Mapping[str, int]) -> None:
+    def __init__(self, variables: Sequence[DeviceVariable], codes: Mapping[str, int]) -> None:
         """`codes`: codes of the types on the wire; they are part of the checksum, because cflib keeps all tables in one
         cache by checksum."""
         self.variables = tuple(variables)
@@ -86,8 +86,8 @@ class Table:
 class Inventory:
     """Both tables of a Crazyflie."""
 
-    parameters: Table
-    logs: Table
+    parameters: VariableTable
+    logs: VariableTable
 
 
 class LogTocElement(msgspec.Struct, tag_field="__class__", tag="LogTocElement"):
@@ -116,7 +116,7 @@ def inventory(files: tuple[str, ...] = ()) -> Inventory:
     Raises BodyError if a file is no table of cflib's cache, or two are of the same kind.
     """
     sections = list(_sections(BUILT_IN.read_text("ascii")))
-    read: dict[type, list[Variable]] = {}
+    read: dict[type, list[DeviceVariable]] = {}
     for file in files:
         kind, variables = _cached(file)
         if kind in read:
@@ -124,12 +124,12 @@ def inventory(files: tuple[str, ...] = ()) -> Inventory:
         known = {variable.name: variable.value for variable in sections[0 if kind is ParamTocElement else 1]}
         read[kind] = [replace(variable, value=known.get(variable.name, 0.0)) for variable in variables]
     return Inventory(
-        Table(read.get(ParamTocElement, sections[0]), PARAMETER_CODES),
-        Table(read.get(LogTocElement, sections[1]), LOG_CODES),
+        VariableTable(read.get(ParamTocElement, sections[0]), PARAMETER_CODES),
+        VariableTable(read.get(LogTocElement, sections[1]), LOG_CODES),
     )
 
 
-def _sections(text: str) -> Iterator[list[Variable]]:
+def _sections(text: str) -> Iterator[list[DeviceVariable]]:
     for section in re.split(r"^\[\w+\]$", text, flags=re.MULTILINE)[1:]:
         variables = []
         for line in filter(None, section.splitlines()):
@@ -143,7 +143,7 @@ def _sections(text: str) -> Iterator[list[Variable]]:
                     stem, first, last = several.groups()
                     every = [f"{stem}{number}" for number in range(int(first), int(last) + 1)]
                 variables += [
-                    Variable(f"{group}.{each}", kind.rstrip("!*"), float(value or 0.0), flags) for each in every
+                    DeviceVariable(f"{group}.{each}", kind.rstrip("!*"), float(value or 0.0), flags) for each in every
                 ]
         yield variables
 
@@ -152,7 +152,7 @@ def _flags(element: LogTocElement) -> int:
     return (READ_ONLY if element.access else 0) | (EXTENDED if element.extended else 0)
 
 
-def _cached(file: str) -> tuple[type, list[Variable]]:
+def _cached(file: str) -> tuple[type, list[DeviceVariable]]:
     """Kind and variables of a table in cflib's cache."""
     try:
         groups = msgspec.json.decode(Path(file).read_bytes(), type=Cached)
@@ -160,7 +160,7 @@ def _cached(file: str) -> tuple[type, list[Variable]]:
         (kind,) = {type(element) for element in elements}
         codes = PARAMETER_CODES if kind is ParamTocElement else LOG_CODES
         variables = [
-            Variable(
+            DeviceVariable(
                 f"{element.group}.{element.name}",
                 element.ctype.removesuffix("_t").replace("uint", "u").replace("int", "i"),
                 flags=_flags(element) if kind is ParamTocElement else 0,

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from agents.protocols import crtp
-from agents.protocols.crtp import COMPRESSED, IN_MEMORY, Memory, Status
+from agents.protocols.crtp import COMPRESSED, IN_MEMORY, LogStatus, MemoryKind
 from twins.arrays import Array
 from twins.devices.crazyflie.memory import Memories
 from twins.devices.crazyflie.planner import ORDER, Piece, evaluate, wrap
@@ -30,16 +30,16 @@ class Trajectories:
         self._memories = memories
         self._defined: dict[int, tuple[int, int, int, int]] = {}  # location, kind, address, number of pieces
 
-    def define(self, number: int, location: int, kind: int, address: int, count: int) -> Status:
+    def define(self, number: int, location: int, kind: int, address: int, count: int) -> LogStatus:
         """Define a trajectory that starts at `address` of the memory."""
         if number >= crtp.TRAJECTORIES:
-            return Status.NO_COMMAND
+            return LogStatus.NO_COMMAND
         self._defined[number] = location, kind, address, count
-        return Status.OK
+        return LogStatus.OK
 
     def pieces(
         self, number: int, start: Array | None, *, turned: bool, reverse: bool, scale: float
-    ) -> tuple[Status, list[Piece]]:
+    ) -> tuple[LogStatus, list[Piece]]:
         """Pieces of a trajectory; none if it is not defined, which the firmware answers with OK as well.
 
         Args:
@@ -50,13 +50,13 @@ class Trajectories:
         """
         location, kind, address, count = self._defined.get(number, (0, 0, 0, 0))
         memory = self._memories.read(
-            Memory.TRAJECTORY, address, max(0, self._memories.size(Memory.TRAJECTORY) - address)
+            MemoryKind.TRAJECTORY, address, max(0, self._memories.size(MemoryKind.TRAJECTORY) - address)
         )
         if location != IN_MEMORY or memory is None:
-            return Status.OK, []
+            return LogStatus.OK, []
         if kind == COMPRESSED:
             if scale != 1.0 or reverse:
-                return Status.NO_COMMAND, []
+                return LogStatus.NO_COMMAND, []
             pieces = _compressed(memory)
         else:
             pieces = [_uncompressed(memory, k, max(scale, FASTEST)) for k in range(count)]
@@ -73,7 +73,7 @@ class Trajectories:
             pieces = [(span, rotation @ coefficients) for span, coefficients in pieces]
             for _, coefficients in pieces:
                 coefficients[:, 0] += shift
-        return Status.OK, pieces
+        return LogStatus.OK, pieces
 
 
 def _uncompressed(memory: bytes, number: int, scale: float) -> Piece:

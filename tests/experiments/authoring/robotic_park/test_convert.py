@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from experiments.authoring.robotic_park.convert import convert, convert_text
-from experiments.authoring.robotic_park.file import Trigger, _Threshold, starts_from
+from experiments.authoring.robotic_park.file import ParkTrigger, _Threshold, starts_from
 from experiments.check.check import check, examine, figures
 from experiments.definition.formation import law_errors
 from experiments.definition.plan import Plan
@@ -568,11 +568,11 @@ def test_errors_of_a_key_have_a_remedy():
 
 
 def test_zero_threshold_is_refused_and_co_precedes_threshold():
-    assert Trigger("EventBased", _Threshold(co=0.02, threshold=0.5)).event == (0.02, 0.0)
-    assert Trigger("EventBased", _Threshold(threshold=0.5)).event == (0.5, 0.0)
-    assert Trigger("EventBased").event == (0.01, 0.0)
+    assert ParkTrigger("EventBased", _Threshold(co=0.02, threshold=0.5)).event == (0.02, 0.0)
+    assert ParkTrigger("EventBased", _Threshold(threshold=0.5)).event == (0.5, 0.0)
+    assert ParkTrigger("EventBased").event == (0.01, 0.0)
     with pytest.raises(ValueError, match="crossed always"):
-        _ = Trigger("EventBased", _Threshold(threshold=0)).event
+        _ = ParkTrigger("EventBased", _Threshold(threshold=0)).event
 
 
 def test_disabled_task_may_hold_anything(tmp_path):

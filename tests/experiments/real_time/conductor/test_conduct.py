@@ -10,7 +10,7 @@ from agents.network.endpoints import free_endpoint
 from agents.network.keys import Keys
 from agents.network.session import Unreachable
 from agents.runtime.router import serve_router
-from experiments.definition.experiment import Formation, Host, Robot
+from experiments.definition.experiment import Formation, Host, RobotTable
 from experiments.definition.plan import Plan
 from experiments.file.problems import DocumentError
 from experiments.real_time.conductor.conduct import check_other_runs, hardware
@@ -21,17 +21,17 @@ from tests.agents.few import pair
 RADIO = "radio://0/80/2M/E7E7E7E701"
 REAL = pair(
     robots={
-        "CF01": Robot(kind="crazyflie", start=[0.0, 0.0], hover=0.5, body=RADIO),
-        "TE01": Robot(kind="tello", start=[0.5, 0.0], hover=0.5, body="tello"),
-        "KH01": Robot(kind="khepera4", start=[-0.5, 0.0], body="khepera4://10.0.0.7", device={"port": 344}),
-        "KH02": Robot(kind="khepera4", start=[-0.5, 0.5]),
-        "KH03": Robot(kind="khepera4", start=[-0.5, 0.9], body="khepera4-twin"),
+        "CF01": RobotTable(kind="crazyflie", start=[0.0, 0.0], hover=0.5, body=RADIO),
+        "TE01": RobotTable(kind="tello", start=[0.5, 0.0], hover=0.5, body="tello"),
+        "KH01": RobotTable(kind="khepera4", start=[-0.5, 0.0], body="khepera4://10.0.0.7", device={"port": 344}),
+        "KH02": RobotTable(kind="khepera4", start=[-0.5, 0.5]),
+        "KH03": RobotTable(kind="khepera4", start=[-0.5, 0.9], body="khepera4-twin"),
     },
     formation=Formation(),
 )
 
 
-def run(robots: dict[str, str], title: str = "here", born: str | None = None) -> run_registry.Run:
+def run(robots: dict[str, str], title: str = "here", born: str | None = None) -> run_registry.RegisteredRun:
     made = run_registry.own_entry("run", title, ["tcp/127.0.0.1:7448"], folder=Path("/runs/other"), robots=robots)
     return made if born is None else msgspec.structs.replace(made, born=born)
 

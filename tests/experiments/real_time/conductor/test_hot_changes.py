@@ -14,7 +14,7 @@ import zenoh
 from agents.decision.lifecycle import Phase
 from agents.network import messages, pubsub
 from agents.network.keys import Keys
-from experiments.definition.experiment import Experiment, Robot
+from experiments.definition.experiment import Experiment, RobotTable
 from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.real_time.conductor import hot_changes
@@ -107,10 +107,10 @@ class Crew:
     def runs(self, name: str) -> bool:
         return name in self.running
 
-    def robot(self, name: str) -> Robot:
+    def robot(self, name: str) -> RobotTable:
         return self.bodies[name]
 
-    def place(self, name: str, robot: Robot | None = None) -> Any:
+    def place(self, name: str, robot: RobotTable | None = None) -> Any:
         return np.array((robot or self.bodies[name]).start[:2])
 
     def release(self, name: str) -> None:
@@ -120,7 +120,7 @@ class Crew:
         self.did.append(("kill", name))
         self._stage.end(name)
 
-    def start_again(self, names: tuple[str, ...], bodies: dict[str, Robot] | None = None) -> None:
+    def start_again(self, names: tuple[str, ...], bodies: dict[str, RobotTable] | None = None) -> None:
         self.did.append(("start", *names))
         self.bodies |= bodies or {}
         for name in names:
@@ -134,7 +134,7 @@ class Stage:
     def __init__(self, monkeypatch: pytest.MonkeyPatch, **more: Any) -> None:
         self.clock = Clock()
         monkeypatch.setattr(hot_changes, "time", self.clock)
-        spare = Robot(kind="crazyflie", start=[0.8, 0.8], hover=0.5)
+        spare = RobotTable(kind="crazyflie", start=[0.8, 0.8], hover=0.5)
         experiment = msgspec.structs.replace(document.read("triangle").experiment, spares={"S1": spare}, **more)
         self.experiment: Experiment = experiment
         self.robots = {name: RobotView(place=(*robot.start[:2], 0.0)) for name, robot in experiment.robots.items()}  # type: ignore[arg-type]
@@ -303,7 +303,7 @@ def test_lost_orders_are_repeated_within_limited_time(stage: Stage) -> None:
     query = stage.ask("restart", "KH01")
     start = stage.crew.start_again
 
-    def hanging(names: tuple[str, ...], bodies: dict[str, Robot] | None = None) -> None:
+    def hanging(names: tuple[str, ...], bodies: dict[str, RobotTable] | None = None) -> None:
         start(names, bodies)
         stage.hung.add("KH01")
 

@@ -12,7 +12,7 @@ from agents.body.limits import Safety
 from agents.body.measured_positions import FROZEN
 from agents.kinds.tello import TELLO
 from agents.network.messages import Inspection, State, Status
-from experiments.definition.experiment import Experiment, Robot
+from experiments.definition.experiment import Experiment, RobotTable
 from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.real_time.conductor import preflight_checks as checks
@@ -22,9 +22,9 @@ from experiments.real_time.conductor.preflight_checks import Observed, Tried
 TODAY = date(2026, 3, 1)
 RADIO = "radio://0/80/2M/E7E7E7E70"
 LIGHTHOUSE = {"positioning": {"system": "lighthouse"}}
-DRONE = Robot(kind="crazyflie", start=[0.0, 0.5, 0.0], hover=0.2, body=f"{RADIO}1", device=LIGHTHOUSE)
-OTHER = Robot(kind="crazyflie", start=[0.0, -0.5, 0.0], hover=0.8, body=f"{RADIO}2", device=LIGHTHOUSE)
-WHEELS = Robot(kind="khepera4", start=[1.0, 0.0], body="khepera4://192.0.2.1")
+DRONE = RobotTable(kind="crazyflie", start=[0.0, 0.5, 0.0], hover=0.2, body=f"{RADIO}1", device=LIGHTHOUSE)
+OTHER = RobotTable(kind="crazyflie", start=[0.0, -0.5, 0.0], hover=0.8, body=f"{RADIO}2", device=LIGHTHOUSE)
+WHEELS = RobotTable(kind="khepera4", start=[1.0, 0.0], body="khepera4://192.0.2.1")
 
 
 def status(**values) -> Status:
@@ -236,7 +236,7 @@ def test_robots_are_checked_without_formation_and_low():
 
 
 def test_a_tello_takes_off_to_its_own_height():
-    robots = {"T1": Robot(kind="tello", start=[0.0, 0.0], hover=0.8), "CF01": OTHER}
+    robots = {"T1": RobotTable(kind="tello", start=[0.0, 0.0], hover=0.8), "CF01": OTHER}
     case = alone(Plan(Experiment(title="", duration_s=1.0, robots=robots)))
     assert {name: robot.hover for name, robot in case.experiment.robots.items()} == {"T1": 0.8, "CF01": checks.HOP_M}
 
@@ -275,7 +275,7 @@ def pushed(forward: float, back: float, *, yaw: float = 0.5) -> list[State]:
     ],
 )
 def test_the_speed_of_sticks(forward, back, believed, verdict, text):
-    each = Observed(Robot(kind="tello", start=[0.0, 0.0], hover=0.8, device={"stick_speed": believed}))
+    each = Observed(RobotTable(kind="tello", start=[0.0, 0.0], hover=0.8, device={"stick_speed": believed}))
     made = checks.trial(TELLO.trial, each, Tried(states=pushed(forward, back)))
     assert made.verdict == verdict, made
     assert text in made.found
@@ -284,7 +284,7 @@ def test_the_speed_of_sticks(forward, back, believed, verdict, text):
 
 
 def test_sticks_that_could_not_be_measured():
-    each = Observed(Robot(kind="tello", start=[0.0, 0.0], hover=0.8))
+    each = Observed(RobotTable(kind="tello", start=[0.0, 0.0], hover=0.8))
     assert checks.trial(TELLO.trial, each, Tried(failure="not ready: no position")).verdict == "bad"
     fast = checks.trial(
         TELLO.trial, each, Tried(failure="came down by itself: it moves", states=pushed(0.5, 0.0)[:200])

@@ -11,7 +11,7 @@ import pytest
 
 from agents.network.endpoints import free_endpoint
 from experiments.real_time.hosts import run_registry
-from experiments.real_time.hosts.run_registry import Run, born, own_entry, registered, runs
+from experiments.real_time.hosts.run_registry import RegisteredRun, born, own_entry, registered, runs
 
 
 @pytest.fixture(autouse=True)
@@ -25,7 +25,7 @@ def nowhere() -> list[str]:
     return [free_endpoint(preferred_port=0)]
 
 
-def dead() -> Run:
+def dead() -> RegisteredRun:
     """A run whose process has ended."""
     process = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
     started = born(process.pid)

@@ -14,7 +14,7 @@ from agents.network import name_ownership, pubsub
 from agents.network import session as network
 from agents.network.keys import Keys
 from agents.network.name_ownership import NameTaken, OwnershipCheck, OwnershipTiming
-from experiments.definition.experiment import Formation, Robot
+from experiments.definition.experiment import Formation, RobotTable
 from experiments.definition.plan import Plan
 from experiments.real_time.processes.centre import CentreProcess
 from experiments.real_time.processes.joining import Network
@@ -57,7 +57,7 @@ def test_replaced_process_sends_nothing(what, way, monkeypatch):
         joint = Network(net.session, KEYS, [], [], ownership)
         monkeypatch.setattr(pubsub, "publisher", lambda *_, **__: Counted())
         if what == "world":
-            drone = Robot(kind="crazyflie", start=[0.1, 0.2], hover=0.5, body="world")
+            drone = RobotTable(kind="crazyflie", start=[0.1, 0.2], hover=0.5, body="world")
             experiment = pair(robots={"F": drone}, formation=Formation())
             lost = threading.Event()
             process = WorldProcess(Plan(experiment), WorldBodies(Plan(experiment)), joint, lost)

@@ -26,7 +26,7 @@ def own(net: Net, alive: str, session: str, *, gone: bool = False) -> None:
 
 
 def test_world_obeys_sender_with_clock_behind():
-    drone = definition.Robot(kind="crazyflie", start=[0.1, 0.2], hover=0.5, body="world")
+    drone = definition.RobotTable(kind="crazyflie", start=[0.1, 0.2], hover=0.5, body="world")
     experiment = pair(robots={"F": drone}, formation=Formation())
     with Net().worn() as net:
         world = WorldNetwork(
@@ -52,7 +52,7 @@ def test_world_obeys_sender_with_clock_behind():
 
 def test_world_of_many_robots_knows_name_owners():
     names = [f"F{row:03}" for row in range(120)]  # each with a token, a claim and the token of an owner
-    drone = definition.Robot(kind="crazyflie", start=[0.1, 0.2], hover=0.5, body="world")
+    drone = definition.RobotTable(kind="crazyflie", start=[0.1, 0.2], hover=0.5, body="world")
     experiment = pair(robots={"F000": drone}, formation=Formation())
     with Net().worn() as net:
         world = WorldNetwork(

@@ -7,7 +7,7 @@ import pytest
 
 from agents.network.keys import Keys
 from agents.network.name_ownership import OwnershipCheck
-from experiments.definition.experiment import Formation, Robot
+from experiments.definition.experiment import Formation, RobotTable
 from experiments.definition.plan import Plan
 from experiments.real_time.processes import world, world_network
 from experiments.real_time.processes.joining import Network
@@ -30,7 +30,7 @@ def test_lateness_is_caught_up_and_standstill_lost(stands_s, lost, forgiven, asl
         now[0] += seconds + (stands_s if asleep and len(simulated) == 20 else 0.0)
 
     monkeypatch.setattr(world, "time", types.SimpleNamespace(sleep=sleep))
-    drone = Robot(kind="crazyflie", start=[0.1, 0.2], hover=0.5, body="world")
+    drone = RobotTable(kind="crazyflie", start=[0.1, 0.2], hover=0.5, body="world")
     experiment = pair(robots={"F": drone}, formation=Formation())
     with Net().worn() as net:
         population = WorldBodies(Plan(experiment))

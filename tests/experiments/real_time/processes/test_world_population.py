@@ -10,7 +10,7 @@ import pytest
 
 from agents.errors import Refusal
 from agents.vectors import NO_SETPOINT
-from experiments.definition.experiment import Arena, Experiment, Robot, World
+from experiments.definition.experiment import Arena, Experiment, RobotTable, WorldTable
 from experiments.definition.plan import Plan
 from experiments.real_time.processes.world_population import WorldBodies
 from twins.scene import Obstacle
@@ -21,16 +21,16 @@ FENCE = Obstacle(wall=[(-0.5, 0.0), (0.5, 0.0)], at=(0.0, -1.5))
 SHELF = Obstacle(box=(0.5, 0.5), at=(1.5, -1.5), bottom=0.5)
 
 
-def experiment(**robots: Robot) -> Experiment:
+def experiment(**robots: RobotTable) -> Experiment:
     return Experiment(
         title="a world",
         duration_s=10.0,
         arena=Arena(obstacles={"post": POST, "crate": CRATE, "fence": FENCE, "shelf": SHELF}),
         robots=robots
         or {
-            "KH01": Robot(kind="khepera4", start=[0.0, 0.0], body="world"),
-            "CF01": Robot(kind="crazyflie", start=[0.0, 1.0, 0.5], body="world", hover=0.6),
-            "TB01": Robot(kind="turtlebot3", start=[1.0, 0.0]),
+            "KH01": RobotTable(kind="khepera4", start=[0.0, 0.0], body="world"),
+            "CF01": RobotTable(kind="crazyflie", start=[0.0, 1.0, 0.5], body="world", hover=0.6),
+            "TB01": RobotTable(kind="turtlebot3", start=[1.0, 0.0]),
         },
     )
 
@@ -69,8 +69,8 @@ def test_mirrored_robot_may_ask_for_ranges() -> None:
     world = WorldBodies(
         Plan(
             experiment(
-                TB01=Robot(kind="turtlebot3", start=[1.0, 0.0], ranges="world"),
-                KH01=Robot(kind="khepera4", start=[0.0, 0.0]),
+                TB01=RobotTable(kind="turtlebot3", start=[1.0, 0.0], ranges="world"),
+                KH01=RobotTable(kind="khepera4", start=[0.0, 0.0]),
             )
         )
     )
@@ -103,9 +103,9 @@ def test_reset_puts_back_and_leaves_in_the_air(world: WorldBodies) -> None:
 
 
 def test_reset_puts_back_pushed_obstacles() -> None:
-    given = experiment(KH01=Robot(kind="khepera4", start=[-1.0, -1.0, math.pi], body="world"))
+    given = experiment(KH01=RobotTable(kind="khepera4", start=[-1.0, -1.0, math.pi], body="world"))
     arena = msgspec.structs.replace(given.arena, obstacles={"crate": msgspec.structs.replace(CRATE, mass=0.2)})
-    world = WorldBodies(Plan(msgspec.structs.replace(given, arena=arena, world=World(engine="pymunk"))))
+    world = WorldBodies(Plan(msgspec.structs.replace(given, arena=arena, world=WorldTable(engine="pymunk"))))
     go(world, 400, KH01=(0.2, 0.0, 0.0, 0.0))
     assert world.obstacles()["crate"][0] < -1.55
     world.reset(None)
@@ -144,12 +144,12 @@ def test_planned_obstacles_move_from_the_start() -> None:
 
 def test_contacts_have_names() -> None:
     given = experiment(
-        KH01=Robot(kind="khepera4", start=[0.0, 0.0], body="world"),
-        KH02=Robot(kind="khepera4", start=[0.3, 0.0, math.pi], body="world"),
-        KH03=Robot(kind="khepera4", start=[1.8, 0.0], body="world"),
-        KH04=Robot(kind="khepera4", start=[1.5, 1.2, math.pi / 2], body="world"),
+        KH01=RobotTable(kind="khepera4", start=[0.0, 0.0], body="world"),
+        KH02=RobotTable(kind="khepera4", start=[0.3, 0.0, math.pi], body="world"),
+        KH03=RobotTable(kind="khepera4", start=[1.8, 0.0], body="world"),
+        KH04=RobotTable(kind="khepera4", start=[1.5, 1.2, math.pi / 2], body="world"),
     )
-    world = WorldBodies(Plan(msgspec.structs.replace(given, world=World(engine="pymunk"))))
+    world = WorldBodies(Plan(msgspec.structs.replace(given, world=WorldTable(engine="pymunk"))))
     found = []
     for _ in range(200):
         go(world, 1, **dict.fromkeys(world.names, (0.2, 0.0, 0.0, 0.0)))

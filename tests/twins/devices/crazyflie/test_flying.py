@@ -9,10 +9,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.polynomial import Polynomial
 
-from agents.protocols.crtp import HighLevel, Info, Location, Platform, Port, Power, Safety, Setpoint, Status, yaw_of
+from agents.protocols.crtp import (
+    HighLevel,
+    Info,
+    Location,
+    LogStatus,
+    Platform,
+    Port,
+    Power,
+    Setpoint,
+    SupervisorCommand,
+    yaw_of,
+)
 from tests.twins.crazyflie_wire import Wire
-from twins.devices.crazyflie.planner import Planner, evaluate, polynomial
-from twins.devices.crazyflie.supervisor import State
+from twins.devices.crazyflie.planner import OnboardPlanners, evaluate, polynomial
+from twins.devices.crazyflie.supervisor import SupervisorState
 
 pytestmark = pytest.mark.slow  # seconds of firmware, in steps of milliseconds
 
@@ -41,7 +52,7 @@ def test_polynomial_meets_both_ends(begin, end, span):
 
 def test_chained_plans_are_smooth():
     """A new goal in the middle of a plan: position and velocity do not jump."""
-    planner = Planner(1)
+    planner = OnboardPlanners(1)
     planner.climb(0, 0.0, np.zeros(4), height=1.0, yaw=0.0, span=2.0, landing=False)
     for t, goal in ((1.0, [1.0, 0.5, 1.2, 1.0]), (1.7, [-0.5, 0.2, 0.8, -2.9]), (2.1, [0.0, 0.0, 1.0, 2.9])):
         before = [planner.goal(t - h)[0] for h in (2e-4, 1e-4)]
@@ -56,7 +67,7 @@ def test_chained_plans_are_smooth():
 
 
 def test_relative_and_linear_plans():
-    planner = Planner(2)
+    planner = OnboardPlanners(2)
     for row in range(2):
         planner.climb(row, 0.0, np.zeros(4), height=1.0, yaw=0.0, span=1.0, landing=False)
     goal, at = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(4)
@@ -72,23 +83,23 @@ def test_relative_and_linear_plans():
 def test_takeoff_go_to_land():
     """A whole flight by the planner; every command is answered, and what cannot be is refused."""
     wire = Wire()
-    assert wire.takeoff(1.0, 2.0) == Status.OK
-    assert wire.takeoff(1.0, 2.0) == Status.REFUSED
+    assert wire.takeoff(1.0, 2.0) == LogStatus.OK
+    assert wire.takeoff(1.0, 2.0) == LogStatus.REFUSED
     wire.wait(4.0)
     assert wire.position == pytest.approx([0.0, 0.0, 1.07], abs=0.01)  # it overshoots
-    assert wire.go_to(1.0, 0.5, 1.2, 1.0, 2.0) == Status.OK
+    assert wire.go_to(1.0, 0.5, 1.2, 1.0, 2.0) == LogStatus.OK
     wire.wait(15.0)
     assert wire.position == pytest.approx([1.0, 0.5, 1.2], abs=0.01)
     assert wire.flock.quadrotor.yaw[0] == pytest.approx(1.0, abs=0.01)
-    assert wire.land(2.0) == Status.OK
-    assert wire.land(2.0) == Status.REFUSED
+    assert wire.land(2.0) == LogStatus.OK
+    assert wire.land(2.0) == LogStatus.REFUSED
     wire.wait(3.0)
     assert wire.position == pytest.approx([1.0, 0.5, 0.0], abs=0.01)
     assert not wire.motors
     assert Info.FLYING in wire.flock.info(0)  # for two seconds after its motors turned
     wire.wait(1.5)
     assert Info.FLYING not in wire.flock.info(0)
-    assert wire.plan(77) == Status.NO_COMMAND
+    assert wire.plan(77) == LogStatus.NO_COMMAND
 
 
 def test_it_lags_behind_the_planner():
@@ -107,11 +118,11 @@ def test_it_lags_behind_the_planner():
 def test_groups():
     """A command to a group that it is not in is answered, and not obeyed."""
     wire = Wire()
-    assert wire.plan(HighLevel.TAKEOFF, struct.pack("<ff?f", 1.0, 0.0, True, 1.0), group=2) == Status.OK
+    assert wire.plan(HighLevel.TAKEOFF, struct.pack("<ff?f", 1.0, 0.0, True, 1.0), group=2) == LogStatus.OK
     wire.wait(2.0)
     assert wire.position[2] == 0.0
     wire.put(Port.HIGH_LEVEL, 0, int(HighLevel.GROUP), 2)
-    assert wire.plan(HighLevel.TAKEOFF, struct.pack("<ff?f", 1.0, 0.0, True, 1.0), group=2) == Status.OK
+    assert wire.plan(HighLevel.TAKEOFF, struct.pack("<ff?f", 1.0, 0.0, True, 1.0), group=2) == LogStatus.OK
     wire.wait(2.0)
     assert wire.position[2] > 0.8
 
@@ -193,27 +204,27 @@ def test_silence_levels_out_and_then_locks():
     wire = Wire().streaming()
     wire.wait(1.0, lambda: wire.goal(5.0, 0.0, 1.0))
     wire.wait(0.49)
-    assert wire.state == State.FLYING
+    assert wire.state == SupervisorState.FLYING
     wire.wait(0.04)
-    assert wire.state == State.LEVEL
+    assert wire.state == SupervisorState.LEVEL
     drift = wire.flock.quadrotor.velocity[0, 0]
     wire.wait(1.4)
     assert wire.flock.quadrotor.velocity[0, 0] == pytest.approx(drift, abs=0.01)
     assert wire.position[2] == pytest.approx(1.0, abs=0.01)
     assert wire.motors
     wire.wait(0.1)
-    assert wire.state == State.LOCKED
+    assert wire.state == SupervisorState.LOCKED
     wire.wait(1.0)
     assert wire.position[2] == 0.0
-    assert wire.takeoff(1.0, 2.0) == Status.BUSY
+    assert wire.takeoff(1.0, 2.0) == LogStatus.BUSY
 
 
 def test_a_setpoint_in_time_is_followed_again():
     wire = Wire().streaming()
     wire.wait(1.5)
-    assert wire.state == State.LEVEL
+    assert wire.state == SupervisorState.LEVEL
     wire.wait(3.0, lambda: wire.goal(0.0, 0.0, 1.2))
-    assert wire.state == State.FLYING
+    assert wire.state == SupervisorState.FLYING
     assert wire.position[2] == pytest.approx(1.2, abs=0.015)  # a step in height takes 10 s to settle
 
 
@@ -225,7 +236,7 @@ def test_the_order_of_command_and_release_matters():
     assert not wire.motors
     assert wire.position[2] < 0.95
     wire = Wire().streaming()
-    assert wire.go_to(0.0, 0.0, 1.0, 0.0, 1.0) == Status.OK
+    assert wire.go_to(0.0, 0.0, 1.0, 0.0, 1.0) == LogStatus.OK
     wire.release()
     wire.wait(2.0)
     assert wire.motors
@@ -236,7 +247,7 @@ def test_after_a_setpoint_the_planner_is_not_heard():
     """As after cflib has closed a link on the ground: take-off is answered, and nothing happens, until the release."""
     wire = Wire()
     wire.zero()
-    assert wire.takeoff(0.5, 1.0) == Status.OK
+    assert wire.takeoff(0.5, 1.0) == LogStatus.OK
     wire.wait(2.0)
     assert wire.position[2] == 0.0
     wire.release()
@@ -251,24 +262,26 @@ def test_closing_a_link_just_after_landing_locks():
     wire.wait(1.6)
     wire.zero()
     wire.wait(2.5)
-    assert wire.state == State.LOCKED
+    assert wire.state == SupervisorState.LOCKED
     wire = Wire().hovering(0.5)
     wire.land(1.0)
     wire.wait(5.5)
     wire.zero()
     wire.wait(4.0)
-    assert wire.state == State.READY
+    assert wire.state == SupervisorState.READY
 
 
 # ---------------------------------------------------------------------- the supervisor
 
 
-@pytest.mark.parametrize("how", [(Port.SUPERVISOR, 1, int(Safety.STOP)), (Port.LOCATION, 1, int(Location.STOP))])
+@pytest.mark.parametrize(
+    "how", [(Port.SUPERVISOR, 1, int(SupervisorCommand.STOP)), (Port.LOCATION, 1, int(Location.STOP))]
+)
 def test_emergency_stop(how):
     wire = Wire().hovering()
     wire.put(*how)
     wire.wait(0.01)
-    assert wire.state == State.LOCKED
+    assert wire.state == SupervisorState.LOCKED
     assert not wire.motors
     wire.wait(1.0)
     assert wire.position[2] == 0.0
@@ -277,21 +290,21 @@ def test_emergency_stop(how):
 def test_emergency_watchdog():
     wire = Wire().hovering()
     for _ in range(5):
-        wire.put(Port.SUPERVISOR, 1, int(Safety.WATCHDOG))
+        wire.put(Port.SUPERVISOR, 1, int(SupervisorCommand.WATCHDOG))
         wire.wait(0.9)
-    assert wire.state == State.FLYING
+    assert wire.state == SupervisorState.FLYING
     wire.wait(0.2)
-    assert wire.state == State.LOCKED
+    assert wire.state == SupervisorState.LOCKED
 
 
 def test_arming():
     """One that must be armed: not before, and not for longer than it says."""
     wire = Wire(device={"platform": "brushless"})
-    assert wire.takeoff(0.5, 1.0) == Status.BUSY
+    assert wire.takeoff(0.5, 1.0) == LogStatus.BUSY
     assert wire.arm() == bytes((0x81, 1, 1))
     assert Info.ARMED in wire.flock.info(0)
     assert Info.CAN_FLY not in wire.flock.info(0)  # its motors spin up
-    assert wire.takeoff(0.5, 1.0) == Status.BUSY
+    assert wire.takeoff(0.5, 1.0) == LogStatus.BUSY
     wire.wait(0.6)
     assert Info.CAN_FLY in wire.flock.info(0)
     wire.wait(30.1)
@@ -310,7 +323,7 @@ def test_arming():
 def test_refused_arming():
     wire = Wire(refuse_arming=True)
     assert wire.arm() == bytes((0x81, 0, 0))
-    assert wire.takeoff(0.5, 1.0) == Status.BUSY
+    assert wire.takeoff(0.5, 1.0) == LogStatus.BUSY
 
 
 def test_battery():
@@ -369,26 +382,26 @@ def test_a_fall_ends_upside_down():
     wire.plan(HighLevel.STOP)
     wire.wait(1.0)
     assert wire.position[2] == 0.0
-    assert wire.state == State.CRASHED
+    assert wire.state == SupervisorState.CRASHED
     assert Info.CRASHED | Info.TUMBLED in wire.flock.info(0)
-    assert wire.put(Port.SUPERVISOR, 1, int(Safety.RECOVER)) == [(Port.SUPERVISOR, 1, b"\x82\0\0")]
-    assert wire.takeoff(0.5, 1.0) == Status.BUSY
+    assert wire.put(Port.SUPERVISOR, 1, int(SupervisorCommand.RECOVER)) == [(Port.SUPERVISOR, 1, b"\x82\0\0")]
+    assert wire.takeoff(0.5, 1.0) == LogStatus.BUSY
     wire.flock.supervisor.tumbled[0] = False
-    assert wire.takeoff(0.5, 1.0) == Status.BUSY
+    assert wire.takeoff(0.5, 1.0) == LogStatus.BUSY
     assert wire.put(Port.PLATFORM, 0, int(Platform.RECOVER)) == [(Port.PLATFORM, 0, b"\2\1\1")]  # before version 12
     wire.wait(0.1)
-    assert wire.hovering(0.5).state == State.FLYING
+    assert wire.hovering(0.5).state == SupervisorState.FLYING
 
 
 def test_a_collision():
     """It lies on its side from a time on: its motors stop, it falls; upright again it can be recovered."""
     wire = Wire(tumbled_from_s=19.0, tumbled_for_s=3.0).hovering()
     wire.wait(1.5)
-    assert wire.state == State.CRASHED
+    assert wire.state == SupervisorState.CRASHED
     wire.wait(3.0)
     assert Info.TUMBLED not in wire.flock.info(0)
-    assert wire.state == State.CRASHED
-    assert wire.put(Port.SUPERVISOR, 1, int(Safety.RECOVER)) == [(Port.SUPERVISOR, 1, b"\x82\1\1")]
+    assert wire.state == SupervisorState.CRASHED
+    assert wire.put(Port.SUPERVISOR, 1, int(SupervisorCommand.RECOVER)) == [(Port.SUPERVISOR, 1, b"\x82\1\1")]
 
 
 def test_disarmed_in_the_air_it_locks():
@@ -398,7 +411,7 @@ def test_disarmed_in_the_air_it_locks():
     wire.hovering(0.5)
     wire.arm(on=False)
     wire.wait(0.1)
-    assert wire.state == State.LOCKED
+    assert wire.state == SupervisorState.LOCKED
 
 
 # ---------------------------------------------------------------------- where it believes to be
@@ -432,7 +445,7 @@ def test_position_from_outside():
     wire.wait(3.0, locate)
     assert wire.flock.estimate[0] == pytest.approx([0.6, 0.2, 0.0], abs=1e-3)
     assert wire.flock.estimator.variance[0] < 1e-4
-    assert wire.takeoff(0.5, 1.0) == Status.OK
+    assert wire.takeoff(0.5, 1.0) == LogStatus.OK
     wire.wait(2.0, locate)
     wire.go_to(0.0, 0.0, 0.5, 0.0, 2.0)
     wire.wait(12.0, locate)

@@ -11,7 +11,18 @@ from hypothesis import strategies as st
 
 from agents.body.interface import BodyError, Disturbance, Jitter
 from agents.protocols import crtp
-from agents.protocols.crtp import NRF, Log, Memory, Misc, Port, PowerSwitch, Safety, Status, Toc, header
+from agents.protocols.crtp import (
+    NRF,
+    Log,
+    LogStatus,
+    MemoryKind,
+    Misc,
+    Port,
+    PowerSwitch,
+    SupervisorCommand,
+    Toc,
+    header,
+)
 from tests.twins.crazyflie_wire import Wire
 from tests.twins.loopback import request
 from twins.body import TwinBody
@@ -40,9 +51,9 @@ def test_greeting_and_version():
     assert wire.put(Port.LINK, 1, 0) == [(Port.LINK, 1, b"Bitcraze Crazyflie".ljust(30, b"\0"))]
     assert wire.put(Port.PLATFORM, 1, 0) == [(Port.PLATFORM, 1, b"\0" + struct.pack("<I", 12))]
     assert wire.put(Port.LINK, 0, b"anything") == [(Port.LINK, 0, b"anything")]
-    ((_, _, answer),) = wire.put(Port.SUPERVISOR, 0, int(Safety.ASK))
+    ((_, _, answer),) = wire.put(Port.SUPERVISOR, 0, int(SupervisorCommand.ASK))
     assert answer[0] == 0x8C
-    assert wire.put(Port.SUPERVISOR, 1, int(Safety.RECOVER)) == [(Port.SUPERVISOR, 1, b"\x82\1\1")]
+    assert wire.put(Port.SUPERVISOR, 1, int(SupervisorCommand.RECOVER)) == [(Port.SUPERVISOR, 1, b"\x82\1\1")]
 
 
 @pytest.mark.parametrize(("port", "table"), [(Port.PARAM, PARAMETER_TABLE), (Port.LOG, LOG_TABLE)])
@@ -96,7 +107,7 @@ def test_parameters():
     assert wire.put(Port.PARAM, 2, key, struct.pack("<f", 0.5)) == [(Port.PARAM, 2, key + struct.pack("<f", 0.5))]
     assert wire.drone.value("kalman.initialX") == 0.5
     assert wire.put(Port.PARAM, 1, key)[0][2][3:] == struct.pack("<f", 0.5)
-    assert wire.put(Port.PARAM, 1, b"\xff\xff") == [(Port.PARAM, 1, b"\xff\xff" + bytes((Status.UNKNOWN,)))]
+    assert wire.put(Port.PARAM, 1, b"\xff\xff") == [(Port.PARAM, 1, b"\xff\xff" + bytes((LogStatus.UNKNOWN,)))]
 
 
 def test_constants_are_not_answered():
@@ -132,7 +143,7 @@ def test_parameter_by_name():
     name = b"stabilizer\0controller\0"
     assert wire.put(Port.PARAM, 3, 0, name, 0x08, 2) == [(Port.PARAM, 3, b"\0" + name + b"\0")]
     assert wire.drone.value("stabilizer.controller") == 2
-    assert wire.put(Port.PARAM, 3, 0, b"no\0such\0", 0x08, 2)[0][2][-1] == Status.UNKNOWN
+    assert wire.put(Port.PARAM, 3, 0, b"no\0such\0", 0x08, 2)[0][2][-1] == LogStatus.UNKNOWN
 
 
 def test_every_parameter_packs():
@@ -166,24 +177,24 @@ def test_log_block():
     wire.put(Port.LOG, 1, int(Log.STOP), 3)
     assert wire.wait(0.1) == []
     assert wire.put(Port.LOG, 1, int(Log.DELETE), 3)[0][2][2] == 0
-    assert wire.put(Port.LOG, 1, int(Log.START), 3, 2)[0][2][2] == Status.UNKNOWN
+    assert wire.put(Port.LOG, 1, int(Log.START), 3, 2)[0][2][2] == LogStatus.UNKNOWN
 
 
 def test_log_limits():
     """26 bytes, 16 blocks, 128 variables; only errors that cflib knows."""
     wire = Wire()
     wide, narrow = variable(0x77, "stateEstimate.x"), variable(0x11, "pm.batteryLevel")
-    assert wire.put(Port.LOG, 1, int(Log.CREATE), 0, wide * 6)[0][2][2] == Status.OK
-    assert wire.put(Port.LOG, 1, int(Log.APPEND), 0, wide)[0][2][2] == Status.TOO_LARGE
-    assert wire.put(Port.LOG, 1, int(Log.APPEND), 0, narrow * 2)[0][2][2] == Status.OK
-    assert wire.put(Port.LOG, 1, int(Log.CREATE), 0, wide)[0][2][2] == Status.EXISTS
-    assert wire.put(Port.LOG, 1, int(Log.CREATE), 1, b"\x11\xff\xff")[0][2][2] == Status.UNKNOWN
+    assert wire.put(Port.LOG, 1, int(Log.CREATE), 0, wide * 6)[0][2][2] == LogStatus.OK
+    assert wire.put(Port.LOG, 1, int(Log.APPEND), 0, wide)[0][2][2] == LogStatus.TOO_LARGE
+    assert wire.put(Port.LOG, 1, int(Log.APPEND), 0, narrow * 2)[0][2][2] == LogStatus.OK
+    assert wire.put(Port.LOG, 1, int(Log.CREATE), 0, wide)[0][2][2] == LogStatus.EXISTS
+    assert wire.put(Port.LOG, 1, int(Log.CREATE), 1, b"\x11\xff\xff")[0][2][2] == LogStatus.UNKNOWN
     wire.put(Port.LOG, 1, int(Log.RESET))
     for block in range(16):
-        assert wire.put(Port.LOG, 1, int(Log.CREATE), block, narrow * 8)[0][2][2] == Status.OK
-    assert wire.put(Port.LOG, 1, int(Log.APPEND), 0, narrow)[0][2][2] == Status.NO_ROOM
-    assert wire.put(Port.LOG, 1, int(Log.CREATE), 16, narrow)[0][2][2] == Status.NO_ROOM
-    assert wire.put(Port.LOG, 1, 99, 0)[0][2][2] == Status.NO_COMMAND
+        assert wire.put(Port.LOG, 1, int(Log.CREATE), block, narrow * 8)[0][2][2] == LogStatus.OK
+    assert wire.put(Port.LOG, 1, int(Log.APPEND), 0, narrow)[0][2][2] == LogStatus.NO_ROOM
+    assert wire.put(Port.LOG, 1, int(Log.CREATE), 16, narrow)[0][2][2] == LogStatus.NO_ROOM
+    assert wire.put(Port.LOG, 1, 99, 0)[0][2][2] == LogStatus.NO_COMMAND
     assert wire.put(Port.LOG, 1, int(Log.RESET))[0][2] == bytes((Log.RESET, 0, 0))  # three bytes, or cflib stumbles
 
 
@@ -198,7 +209,7 @@ def test_silence_deletes_log_blocks():
             client.heard()
             client.device.advance(t)
             assert bool(client.heard()) == logged
-        assert client.device.drones[0].logs.execute(Log.START, 0, b"\1", 2.6) == Status.UNKNOWN
+        assert client.device.drones[0].logs.execute(Log.START, 0, b"\1", 2.6) == LogStatus.UNKNOWN
 
 
 def test_other_memories():
@@ -208,11 +219,11 @@ def test_other_memories():
     def read(kind, count):
         return wire.put(Port.MEMORY, 1, struct.pack("<BI", Memories.kinds.index(kind), 0), count)[0][2][6:]
 
-    eeprom = read(Memory.EEPROM, 21)
+    eeprom = read(MemoryKind.EEPROM, 21)
     assert eeprom[:7] == b"0xBC\1P\2"
     assert sum(eeprom[:20]) % 256 == eeprom[20]
-    assert read(Memory.DECKS, 24) == b"\3" + bytes(23)
-    tester = Memories.kinds.index(Memory.TESTER)
+    assert read(MemoryKind.DECKS, 24) == b"\3" + bytes(23)
+    tester = Memories.kinds.index(MemoryKind.TESTER)
     wire.put(Port.MEMORY, 2, struct.pack("<BI", tester, 5), bytes((5, 6, 7, 99)))
     assert wire.flock.decks.memories[0].write_errors == 1
     wire.put(Port.PARAM, 2, number("memTst.resetW"), 1)
@@ -253,7 +264,7 @@ def test_every_variable_packs():
 def test_memories_are_listed():
     wire = Wire()
     assert wire.put(Port.MEMORY, 0, 1)[0][2] == bytes((1, len(Memories.kinds) + 1))  # and the one of its Flow deck
-    assert wire.put(Port.MEMORY, 0, 2, len(Memories.kinds))[0][2][2] == Memory.DECK
+    assert wire.put(Port.MEMORY, 0, 2, len(Memories.kinds))[0][2][2] == MemoryKind.DECK
     assert wire.put(Port.MEMORY, 0, 2, len(Memories.kinds) + 1) == []
     kinds = [wire.put(Port.MEMORY, 0, 2, i)[0][2][2] for i in range(len(Memories.kinds))]
     assert kinds == list(Memories.kinds)
@@ -262,7 +273,7 @@ def test_memories_are_listed():
 def test_lighthouse_memory():
     """Four base stations; a change of the version erases them."""
     wire = Wire(device={"positioning": {"system": "lighthouse"}})
-    memory = Memories.kinds.index(Memory.LIGHTHOUSE)
+    memory = Memories.kinds.index(MemoryKind.LIGHTHOUSE)
     assert wire.flock.decks.station_status(0) == 1
     for begin, size in ((0, 49), (CALIBRATION, 61)):
         page = bytes(range(size - 1)) + b"\1"
@@ -272,8 +283,8 @@ def test_lighthouse_memory():
     assert wire.flock.decks.memories[0].geometries == wire.flock.decks.memories[0].calibrations == 0b10
     assert wire.flock.decks.station_status(0) == 2
     beyond = struct.pack("<BI", memory, 0x400)
-    assert wire.put(Port.MEMORY, 2, beyond, b"\1")[0][2][-1] == Status.IO
-    assert wire.put(Port.MEMORY, 1, beyond, 4)[0][2] == beyond + bytes((Status.IO,))
+    assert wire.put(Port.MEMORY, 2, beyond, b"\1")[0][2][-1] == LogStatus.IO
+    assert wire.put(Port.MEMORY, 1, beyond, 4)[0][2] == beyond + bytes((LogStatus.IO,))
     assert wire.put(Port.LOCATION, 1, 11, struct.pack("<HH", 2, 2)) == [(Port.LOCATION, 1, b"\x0b\1")]
     assert wire.flock.decks.memories[0].stored == (2, 2)
     wire.put(Port.PARAM, 2, number("lighthouse.systemType"), 1)
@@ -283,7 +294,7 @@ def test_lighthouse_memory():
 def test_loco_anchors():
     """They say where they are once they have been told; four are enough for an estimate."""
     wire = Wire(device={"positioning": {"system": "loco"}})
-    memory = Memories.kinds.index(Memory.LOCO)
+    memory = Memories.kinds.index(MemoryKind.LOCO)
     for anchor in range(4):
         assert not wire.flock.decks.ready()[0]
         assert wire.put(Port.LOCATION, 1, 2, anchor, 1, struct.pack("<fff", anchor, 1.0, 2.0)) == []
@@ -291,7 +302,7 @@ def test_loco_anchors():
     where = struct.pack("<BI", memory, ANCHOR_PAGES + 0x300)
     ((_, _, answer),) = wire.put(Port.MEMORY, 1, where, 13)
     assert struct.unpack("<fff?", answer[6:]) == (3.0, 1.0, 2.0, True)
-    assert wire.put(Port.MEMORY, 2, where, b"\0")[0][2][-1] == Status.IO  # written by radio only
+    assert wire.put(Port.MEMORY, 2, where, b"\0")[0][2][-1] == LogStatus.IO  # written by radio only
 
 
 # ---------------------------------------------------------------------- the link

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from numpy.polynomial import Polynomial
 
-from agents.protocols.crtp import COMPRESSED, IN_MEMORY, UNCOMPRESSED, HighLevel, Memory, Port, Status
+from agents.protocols.crtp import COMPRESSED, IN_MEMORY, UNCOMPRESSED, HighLevel, LogStatus, MemoryKind, Port
 from tests.twins.crazyflie_wire import Wire
 from twins.devices.crazyflie.memory import Memories
-from twins.devices.crazyflie.planner import Planner, evaluate
+from twins.devices.crazyflie.planner import OnboardPlanners, evaluate
 from twins.devices.crazyflie.trajectories import Trajectories
 
 RISE = [0.0, 0.0, 0.0, 0.0, 35.0, -84.0, 70.0, -20.0]  # from 0 to 1 in 1 s, at rest at both ends
@@ -23,9 +23,9 @@ def piece(span, x=(), y=(), z=(), yaw=()):
 def uploaded(data, kind=UNCOMPRESSED, count=0):
     """Trajectory 3 of a memory that holds `data` at address 132."""
     memories = Memories()
-    assert memories.write(Memory.TRAJECTORY, 132, data)
+    assert memories.write(MemoryKind.TRAJECTORY, 132, data)
     trajectories = Trajectories(memories)
-    assert trajectories.define(3, IN_MEMORY, kind, 132, count) == Status.OK
+    assert trajectories.define(3, IN_MEMORY, kind, 132, count) == LogStatus.OK
     return trajectories
 
 
@@ -41,7 +41,7 @@ def pose(pieces, t):
 def flown(trajectories, start=None, **options):
     options = {"turned": False, "reverse": False, "scale": 1.0} | options
     status, pieces = trajectories.pieces(3, start, **options)
-    assert status == Status.OK
+    assert status == LogStatus.OK
     return pieces
 
 
@@ -92,12 +92,12 @@ def test_compressed_pieces():
             wanted = [1e-3 * bezier([500, *high], s), 0.3, 1.2, 0.5 * math.pi * (1.0 - s)]
             assert pose(pieces, 1.5 + s) == pytest.approx(wanted)
     other = uploaded(start + first + b"\0\0\0", COMPRESSED)
-    assert other.pieces(3, None, turned=False, reverse=True, scale=1.0) == (Status.NO_COMMAND, [])
+    assert other.pieces(3, None, turned=False, reverse=True, scale=1.0) == (LogStatus.NO_COMMAND, [])
 
 
 def test_what_is_not_there(corner):
-    assert corner.pieces(4, None, turned=False, reverse=False, scale=1.0) == (Status.OK, [])  # as the firmware
-    assert corner.define(10, IN_MEMORY, UNCOMPRESSED, 0, 1) == Status.NO_COMMAND
+    assert corner.pieces(4, None, turned=False, reverse=False, scale=1.0) == (LogStatus.OK, [])  # as the firmware
+    assert corner.define(10, IN_MEMORY, UNCOMPRESSED, 0, 1) == LogStatus.NO_COMMAND
     with pytest.raises(ValueError, match="no numbers"):
         uploaded(piece(1.0, [1e30]), count=1).pieces(3, None, turned=False, reverse=False, scale=1.0)
     with pytest.raises(ValueError, match="no numbers"):
@@ -110,21 +110,21 @@ def test_what_is_not_there(corner):
 def test_a_trajectory_is_flown():
     """Uploaded, defined and started by packets; afterwards it hovers at the end, and lands there."""
     wire = Wire().hovering()
-    memory = Memories.kinds.index(Memory.TRAJECTORY)
+    memory = Memories.kinds.index(MemoryKind.TRAJECTORY)
     data = piece(2.0, [c / 2.0**k for k, c in enumerate(RISE)], [], [1.0])
     for at in range(0, len(data), 24):
         where = struct.pack("<BI", memory, at)
         assert wire.put(Port.MEMORY, 2, where, data[at : at + 24])[0][2] == where + b"\0"
     ((_, _, answer),) = wire.put(Port.HIGH_LEVEL, 0, int(HighLevel.DEFINE), 1, struct.pack("<BBIB", 1, 0, 0, 1))
-    assert answer[3] == Status.OK
-    assert wire.plan(HighLevel.START_2, struct.pack("<???Bf", False, False, False, 1, 1.0)) == Status.OK
+    assert answer[3] == LogStatus.OK
+    assert wire.plan(HighLevel.START_2, struct.pack("<???Bf", False, False, False, 1, 1.0)) == LogStatus.OK
     wire.wait(1.0)
     assert wire.flock.planner.goal(wire.t)[0, 0] == pytest.approx(0.5)
     assert not wire.flock.planner.finished(wire.t)[0]
     wire.wait(4.0)
     assert wire.position == pytest.approx([1.0, 0.0, 1.0], abs=0.01)
     assert wire.flock.planner.finished(wire.t)[0]
-    assert wire.plan(HighLevel.START, struct.pack("<??Bf", True, True, 1, 1.0)) == Status.OK  # back, protocol 9
+    assert wire.plan(HighLevel.START, struct.pack("<??Bf", True, True, 1, 1.0)) == LogStatus.OK  # back, protocol 9
     wire.wait(5.0)
     assert wire.position == pytest.approx([0.0, 0.0, 1.0], abs=0.01)
 
@@ -136,7 +136,7 @@ def test_a_trajectory_is_flown():
 @pytest.mark.parametrize("sideways", [False, True])
 def test_a_spiral_goes_round_its_centre(clockwise, sideways):
     """A quarter of a circle that widens and climbs: distance to its centre, speed, and where the nose points."""
-    planner, yaw, angle, span = Planner(1), 0.3, 0.5 * math.pi, 4.0
+    planner, yaw, angle, span = OnboardPlanners(1), 0.3, 0.5 * math.pi, 4.0
     start = np.array([0.2, -0.1, 1.0, yaw])
     planner.spiral(
         0, 0.0, start, angle=angle, radii=(0.5, 0.7), climb=0.4, span=span, sideways=sideways, clockwise=clockwise
@@ -160,7 +160,7 @@ def test_a_spiral_goes_round_its_centre(clockwise, sideways):
 @pytest.mark.slow
 def test_a_spiral_is_flown():
     wire = Wire().hovering()
-    assert wire.plan(HighLevel.SPIRAL, struct.pack("<??fffff", 0, 0, math.pi / 2, 0.5, 0.5, 0.2, 3.0)) == Status.OK
+    assert wire.plan(HighLevel.SPIRAL, struct.pack("<??fffff", 0, 0, math.pi / 2, 0.5, 0.5, 0.2, 3.0)) == LogStatus.OK
     wire.wait(6.0)
     assert wire.position == pytest.approx([0.5, 0.5, 1.2], abs=0.02)
     assert wire.flock.quadrotor.yaw[0] == pytest.approx(math.pi / 2, abs=0.02)

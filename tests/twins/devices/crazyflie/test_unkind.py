@@ -6,9 +6,9 @@ import struct
 import numpy as np
 import pytest
 
-from agents.protocols.crtp import HighLevel, Location, Port, Safety, Setpoint, Status
+from agents.protocols.crtp import HighLevel, Location, LogStatus, Port, Setpoint, SupervisorCommand
 from tests.twins.crazyflie_wire import Wire
-from twins.devices.crazyflie.supervisor import State
+from twins.devices.crazyflie.supervisor import SupervisorState
 
 LEAST = "posCtlPid.thrustMin"
 
@@ -41,13 +41,13 @@ def set_parameter(wire, name, packing, value):
 )
 def test_older_commands_are_flown(takeoff, land):
     wire = Wire()
-    assert wire.plan(takeoff[0], struct.pack(takeoff[1], *takeoff[2])) == Status.OK
+    assert wire.plan(takeoff[0], struct.pack(takeoff[1], *takeoff[2])) == LogStatus.OK
     wire.wait(3.5)
     assert wire.position == pytest.approx([0.0, 0.0, 0.5375], abs=0.01)  # it overshoots
-    assert wire.plan(HighLevel.OLD_GO_TO, struct.pack("<?fffff", False, 0.3, -0.2, 0.6, 0.0, 2.0)) == Status.OK
+    assert wire.plan(HighLevel.OLD_GO_TO, struct.pack("<?fffff", False, 0.3, -0.2, 0.6, 0.0, 2.0)) == LogStatus.OK
     wire.wait(12.0)
     assert wire.position == pytest.approx([0.3, -0.2, 0.6], abs=0.01)
-    assert wire.plan(land[0], struct.pack(land[1], *land[2])) == Status.OK
+    assert wire.plan(land[0], struct.pack(land[1], *land[2])) == LogStatus.OK
     wire.wait(4.0)
     assert not wire.motors
     assert wire.position[2] == 0.0
@@ -108,13 +108,13 @@ def test_thrust_needs_a_zero_first():
 @pytest.mark.slow
 def test_drone_disarmed_aloft_falls_and_is_ready():
     wire = Wire().hovering(0.5)
-    wire.put(Port.SUPERVISOR, 1, int(Safety.ARM), 0)
+    wire.put(Port.SUPERVISOR, 1, int(SupervisorCommand.ARM), 0)
     wire.wait(0.1)
     assert not wire.motors
     wire.wait(6.0)
     assert wire.position[2] == 0.0
-    assert wire.state == State.READY
-    assert wire.takeoff(0.5, 1.0) == Status.OK
+    assert wire.state == SupervisorState.READY
+    assert wire.takeoff(0.5, 1.0) == LogStatus.OK
 
 
 def test_a_plan_that_is_no_number_locks():
@@ -122,7 +122,7 @@ def test_a_plan_that_is_no_number_locks():
     wire.go_to(math.nan, 0.0, 0.5, 0.0, 1.0)
     wire.wait(0.1)
     assert not wire.motors
-    assert wire.state == State.LOCKED
+    assert wire.state == SupervisorState.LOCKED
 
 
 @pytest.mark.slow
@@ -131,8 +131,8 @@ def test_a_flat_fall_is_a_landing():
     wire.plan(HighLevel.STOP)
     wire.wait(5.0)
     assert wire.position[2] == 0.0
-    assert wire.state in {State.LANDED, State.READY}
-    assert wire.takeoff(0.5, 1.0) == Status.OK
+    assert wire.state in {SupervisorState.LANDED, SupervisorState.READY}
+    assert wire.takeoff(0.5, 1.0) == LogStatus.OK
 
 
 # ---------------------------------------------------------------------- the floor, motors on
@@ -145,7 +145,7 @@ def left_alone(wire, seconds):
         wire.put(Port.LOCATION, 0, struct.pack("<fff", *wire.position))
 
     wire.wait(1.0, located)
-    assert wire.takeoff(0.5, 1.5) == Status.OK
+    assert wire.takeoff(0.5, 1.5) == LogStatus.OK
     wire.wait(2.0, located)
     wire.go_to(0.0, 0.0, -1.0, 0.0, 4.0)
     wire.wait(4.0)
@@ -185,7 +185,7 @@ def test_frozen_positions_shoot_it_up():
         wire.put(Port.LOCATION, 0, struct.pack("<fff", 0.0, 0.0, 0.0))
 
     wire.wait(1.0, located)
-    assert wire.takeoff(0.2, 1.5) == Status.OK
+    assert wire.takeoff(0.2, 1.5) == LogStatus.OK
     wire.wait(1.5, located)
     assert wire.flock.estimate[0, 2] < 0.1
     assert wire.flock.quadrotor.velocity[0, 2] > 0.4

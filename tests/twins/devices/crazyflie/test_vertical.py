@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from agents.protocols.crtp import Status
+from agents.protocols.crtp import LogStatus
 from tests.twins.crazyflie_wire import DT, Wire
 from tests.twins.loopback import request
 from twins.devices.crazyflie.flock import Flock
@@ -91,7 +91,7 @@ def test_second_flight_overshoots_as_the_first():
     wire.land(4.0)
     wire.wait(9.0)
     assert not wire.motors
-    assert wire.takeoff(0.8, 2.0) == Status.OK
+    assert wire.takeoff(0.8, 2.0) == LogStatus.OK
     first = Wire()
-    assert first.takeoff(0.8, 2.0) == Status.OK
+    assert first.takeoff(0.8, 2.0) == LogStatus.OK
     np.testing.assert_allclose(heights(wire, 10.0), heights(first, 10.0), atol=1e-9)
