@@ -38,7 +38,7 @@ def experiment(**more: Any) -> Experiment:
         "B": msgspec.structs.replace(BOT, start=[0.5, 0.0]),
         "C": msgspec.structs.replace(FLY, standby=True),
     }
-    links: dict[str, float | Link] = {"A - B": 0.5, "A - C": 0.7, "C > B": 0.7}
+    links: dict[str, float | LinkTable] = {"A - B": 0.5, "A - C": 0.7, "C > B": 0.7}
     made = Experiment(title="x", robots=robots, duration_s=5.0, formation=Formation(links=links))
     return msgspec.structs.replace(made, **more)
 
