@@ -21,6 +21,7 @@ from experiments.definition.experiment import (
     Hybrid,
     LegTable,
     LinkChannelTable,
+    LinkTable,
     Outage,
     RobotTable,
 )
