@@ -7,8 +7,6 @@ from copy import copy
 from math import inf, isfinite
 from typing import Any
 
-import msgspec
-
 from agents.body.interface import BodyState
 from agents.decision.lifecycle import AIRBORNE, READY, RUNNING
 from agents.decision.situation import ProcessHealth
@@ -17,6 +15,7 @@ from agents.vectors import ZERO, Vector
 from experiments.definition import bodies
 from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
+from tests.small import changed  # noqa: F401
 from twins.body import TwinBody
 
 LEAD_S = 0.5
@@ -182,8 +181,3 @@ class Swarm:
     def running(self) -> Swarm:
         """Until the experiment begins."""
         return self.until(RUNNING)
-
-
-def changed(experiment: Experiment, **parts: object) -> Experiment:
-    """The experiment with other parts."""
-    return msgspec.structs.replace(experiment, **parts)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 import os
 import re
-import subprocess
 import sys
 from pathlib import Path
 
@@ -13,7 +12,8 @@ import pytest
 
 import zenpark
 from experiments import api
-from tests.docs.test_references import PAGES, ROOT
+from tests.commands import ROOT, environment, python
+from tests.docs.test_references import PAGES
 
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 PAGE = (ROOT / "docs" / "python.md").read_text("utf-8")
@@ -115,9 +115,7 @@ def test_type_checkers_know_the_names(tmp_path):
     """In a folder of the user's own, by what is installed."""
     laws = [block for block in BLOCK.findall(PAGE) if "Clock(Law" in block or "Rope(Gradient" in block]
     (tmp_path / "laws.py").write_text("\n".join([*laws, "from zenpark import nonsense", "wrong: int = norm(robot)"]))
-    done = subprocess.run(
-        [sys.executable, "-m", "mypy", "--strict", "laws.py"], cwd=tmp_path, capture_output=True, text=True, check=False
-    )
+    done = python("-m", "mypy", "--strict", "laws.py", cwd=tmp_path, env=None, code=None)
     found = re.findall(r"\[([a-z-]+)\]$", done.stdout, re.MULTILINE)
     assert found == ["attr-defined", "assignment", "arg-type"], done.stdout
 
@@ -125,14 +123,7 @@ def test_type_checkers_know_the_names(tmp_path):
 def loaded(program: str) -> set[str]:
     """Modules that a process has that runs a program in a folder of its own."""
     path = os.pathsep.join([str(ROOT), str(ROOT / "face")])
-    done = subprocess.run(
-        [sys.executable, "-c", f"{program}\nimport sys\nprint(*sys.modules)"],
-        env={**os.environ, "PYTHONPATH": path},
-        cwd="/",
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    done = python("-c", f"{program}\nimport sys\nprint(*sys.modules)", cwd="/", env=environment(PYTHONPATH=path))
     return set(done.stdout.split())
 
 

@@ -5,11 +5,11 @@ import shlex
 import shutil
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.commands import ROOT, zenpark
+
 UNIT = re.search(r"```ini\n(\[Unit\].*?)```", (ROOT / "docs" / "hosts.md").read_text("utf-8"), re.DOTALL)
 
 
@@ -37,9 +37,6 @@ def test_its_command_is_understood(tmp_path):
     words = shlex.split(line.replace("%i", "CF01"))
     assert words[:3] == ["agent", "join", "CF01"]
     words[words.index("--lab") + 1] = str(tmp_path)  # where there is no certificate
-    done = subprocess.run(
-        [sys.executable, "-m", "tools.guard", *words], cwd=ROOT, capture_output=True, text=True, check=False, timeout=60
-    )
-    assert done.returncode == 2, done.stderr
+    done = zenpark(*words, code=2)
     assert "is missing" in done.stderr
     assert "Traceback" not in done.stderr

@@ -89,7 +89,7 @@ def of_all() -> dict[str, list[object]]:
 
 
 def sent(key: str, message: object) -> list[bytes]:
-    """A message as `loopnet.Net.deliver` takes it, in both encodings."""
+    """A message as `network.Net.deliver` takes it, in both encodings."""
     return [
         b"\0".join([key.encode(), messages.MIME[encoding].encode(), messages.encode(message, encoding)])  # type: ignore[arg-type]
         for encoding in ("json", "msgpack")

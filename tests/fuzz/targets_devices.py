@@ -12,7 +12,7 @@ from agents.protocols import vicon_datastream
 from agents.protocols.vicon_datastream import BlockKind, Segment
 from tests.fuzz.sockets import Wire
 from tests.fuzz.target import Place, Renewed, Target
-from tests.twins.loopback import request as twin_request
+from tests.requests import request
 from twins.devices.device import Device, DeviceRequest, Faults
 
 # ---------------------------------------------------------------------- the Khepera IV
@@ -35,7 +35,7 @@ def khepera_twin() -> Iterator[Target]:
             device.close()
         devices = {}
         for letter, server in letters.items():
-            made = twin_request("khepera4", ["khepera4-twin"], device={"server": server})
+            made = request("khepera4", ["khepera4-twin"], device={"server": server})
             devices[letter] = khepera4.KheperaDevice(DeviceRequest(made, Faults()))
         t = 0.0
 

@@ -15,7 +15,7 @@ from agents.protocols import crtp
 from agents.protocols.crtp import HighLevel, Log, Misc, Port, Setpoint, SupervisorCommand
 from tests.fuzz.sockets import Wire
 from tests.fuzz.target import Place, Renewed, Target
-from tests.twins.loopback import request as twin_request
+from tests.requests import request
 from twins.devices.device import DeviceRequest, Faults
 
 # ---------------------------------------------------------------------- the Crazyflie
@@ -74,7 +74,7 @@ def crazyflie_twin() -> Iterator[Target]:
         nonlocal device
         if device is not None:
             device.close()
-        device = CrazyflieTwin(DeviceRequest(twin_request("crazyflie", ["crazyflie-twin"]), Faults()))
+        device = CrazyflieTwin(DeviceRequest(request("crazyflie", ["crazyflie-twin"]), Faults()))
         line, wire = device.lines[0], Wire()
         own = line.socket
         line.socket.close()
@@ -121,7 +121,7 @@ def tello_twin() -> Iterator[Target]:
         nonlocal device
         if device is not None:
             device.close()
-        device = TelloDevice(DeviceRequest(twin_request("tello", ["tello-twin"]), Faults()))
+        device = TelloDevice(DeviceRequest(request("tello", ["tello-twin"]), Faults()))
         wire = Wire()
         device._drones[0].wire.close()
         device._drones[0].wire = wire

@@ -14,8 +14,6 @@ from threading import Event
 import msgspec
 import numpy as np
 
-from agents.body.interface import BodyRequest, Disturbance
-from agents.body.kinds import KINDS
 from agents.network import messages as wire
 from agents.network.name_ownership import OwnershipCheck
 from agents.runtime.loop import Runtime, Setup
@@ -24,9 +22,10 @@ from experiments.definition import bodies
 from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.real_time.conductor import orders
-from tests.fuzz.loopnet import Net, Reply, Sample
 from tests.fuzz.messages import KEYS, everything, good, of_all, sent
 from tests.fuzz.target import Place, Renewed, Target
+from tests.network import Net, Reply, Sample
+from tests.requests import request
 
 RUBBISH = io.StringIO()  # where processes say what they would say on a terminal
 
@@ -212,16 +211,6 @@ def conductor() -> Iterator[Target]:
         yield Target(everything("KH01", "KH02", "CF01"), Renewed(make, 500))
 
 
-def request(kind: str, address: str, count: int = 1) -> BodyRequest:
-    """Robots of one kind."""
-    return BodyRequest(
-        names=tuple(f"KH{row + 1:02}" for row in range(count)), kinds=(KINDS[kind],) * count,
-        addresses=(address,) * count, start=((0.0, 0.0, 0.0),) * count, yaw=(0.0,) * count, rate_hz=100.0,
-        seeds=(1,) * count, disturbance=(Disturbance(),) * count, external=(False,) * count, device=({},) * count,
-        endpoints=("tcp/127.0.0.1:1",), keys=KEYS,
-    )  # fmt: skip
-
-
 def external_body() -> Iterator[Target]:
     """A body elsewhere says where it is and what it sees."""
     from bridges.external import ExternalBody  # noqa: PLC0415
@@ -232,7 +221,9 @@ def external_body() -> Iterator[Target]:
             key = KEYS.position(name)
             place = wire.Position(name, time.time(), (0.0, 0.0, 0.0), 0.1)
             net.first[key] = Sample(key, wire.JSON, wire.encode(place))
-        body = ExternalBody(request("khepera4", "external", 2))
+        body = ExternalBody(
+            request("khepera4", ["external"] * 2, names=["KH01", "KH02"], endpoints=["tcp/127.0.0.1:1"])
+        )
         body.open()
         t = 0.0
 

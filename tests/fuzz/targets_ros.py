@@ -9,9 +9,9 @@ import numpy as np
 from agents.network.keys import Keys
 from agents.protocols import ros2
 from agents.vectors import is_finite
-from tests.fuzz.loopnet import Net, Sample
 from tests.fuzz.target import Place, Renewed, Target
-from tests.fuzz.targets_network import request
+from tests.network import Net, Sample
+from tests.requests import request
 from twins.devices.device import DeviceRequest, Faults
 
 # ---------------------------------------------------------------------- ROS 2

@@ -5,30 +5,8 @@ import threading
 import time
 from dataclasses import replace
 
-from agents.body.interface import BodyRequest, Disturbance
-from agents.body.kinds import KINDS
-from agents.network.keys import Keys
+from tests.requests import request  # noqa: F401
 from twins.devices.device import DeviceRequest, Faults
-
-
-def request(kind, addresses, *, external=False, device=None, start=None, yaw=0.0, disturbance=None):
-    """What a body or a device of these robots is opened with; they stand 1 m apart on the y axis."""
-    rows = len(addresses)
-    places = [(0.0, float(row), 0.0) for row in range(rows)] if start is None else start
-    return BodyRequest(
-        names=tuple(f"R{row}" for row in range(rows)),
-        kinds=(KINDS[kind],) * rows,
-        addresses=tuple(addresses),
-        start=tuple((float(x), float(y), float(z)) for x, y, z in places),
-        yaw=(yaw,) * rows,
-        rate_hz=100.0,
-        seeds=tuple(range(1, rows + 1)),
-        disturbance=(disturbance or Disturbance(),) * rows,
-        external=(external,) * rows,
-        device=(device or {},) * rows,
-        endpoints=(),
-        keys=Keys("park"),
-    )
 
 
 class Served:

@@ -1,0 +1,258 @@
+"""A Zenoh network without Zenoh: what `agents.network.session` hands out, fed by hand, so that no time is lost on a
+wire.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import lru_cache
+from typing import Any
+from unittest import mock
+
+import zenoh
+from zenoh.handlers import Callback
+
+from agents.network import messages, pubsub
+
+Orders = pubsub.Orders  # the real one: `Net.worn` replaces it
+
+
+class Payload:
+    def __init__(self, data: bytes) -> None:
+        self._data = data
+
+    def to_bytes(self) -> bytes:
+        return self._data
+
+    def __len__(self) -> int:
+        return len(self._data)
+
+
+class Sample:
+    timestamp = attachment = source_info = None
+
+    def __init__(self, key: str, mime: str, data: bytes, *, gone: bool = False) -> None:
+        self.key_expr, self.encoding, self.payload = key, mime, Payload(data)
+        self.kind = zenoh.SampleKind.DELETE if gone else zenoh.SampleKind.PUT
+
+
+class Query(Sample):
+    """A question; every one must be answered, but for those of tools that read all keys: they hold no order."""
+
+    answers = 0
+    answer: tuple[str, bytes, str] | None = None  # key, payload and encoding of a reply
+    error: bytes | None = None  # payload of a refusal
+
+    def __enter__(self) -> Query:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        reads_all = "*" in self.key_expr and not len(self.payload)
+        assert self.answers == (0 if reads_all else 1), "a query without an answer"
+
+    def reply(self, key: str, payload: bytes, encoding: str = "") -> None:
+        self._count(payload, encoding)
+        self.answer = (key, payload, encoding)
+
+    def reply_err(self, payload: bytes, encoding: str = "") -> None:
+        self._count(payload, encoding)
+        self.error = payload
+
+    def _count(self, payload: bytes, encoding: str) -> None:
+        assert isinstance(payload, bytes)
+        assert encoding
+        self.answers += 1
+
+
+class Reply:
+    def __init__(self, sample: Sample, *, good: bool) -> None:
+        self.ok, self.err = (sample, None) if good else (None, sample)
+
+
+class Channel:
+    """The end of a key that listens."""
+
+    def __init__(self, key: str, *, asked: bool = False, depth: int = 64) -> None:
+        self.key, self.asked, self.expression = key, asked, zenoh.KeyExpr(key)
+        self.waiting: deque[Sample] = deque(maxlen=depth)
+        self.handler = self
+        self.obey: Callable[[Sample], object] = lambda _sample: None
+
+    def try_recv(self) -> Sample | None:
+        return self.waiting.popleft() if self.waiting else None
+
+    def add(self, sample: Sample) -> None:
+        self.waiting.append(sample)
+        self.obey(sample)
+
+    def undeclare(self) -> None:
+        self.waiting.clear()
+
+    close = undeclare
+
+
+def typed_orders(channel: Channel, kind: type[messages.Message]) -> pubsub.Orders[Any]:
+    """Orders of a kind that wait in a channel."""
+    orders = Orders.__new__(Orders)
+    orders._kind, orders._queries, orders.waiting, orders.malformed = kind, channel, channel.waiting, 0  # type: ignore[assignment]
+    orders.close = channel.close  # type: ignore[method-assign]
+    return orders
+
+
+class Mute:
+    """The end of a key that speaks, a token, a last value: nobody listens."""
+
+    waiting = ()
+
+    def put(self, payload: bytes, **_: object) -> None:
+        assert isinstance(payload, bytes)
+
+    hold = put
+
+    def answer(self) -> int:
+        return 0
+
+    def undeclare(self) -> None:
+        pass
+
+    def __enter__(self) -> Mute:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+
+class Attentive:
+    """A router that always answers."""
+
+    def __init__(self, *_: object) -> None: ...
+
+    @staticmethod
+    def silent_since(_t: float, _arrived: int = 0) -> float:
+        return math.inf
+
+
+class Session:
+    """What is used of a session itself."""
+
+    def __init__(self, net: Net) -> None:
+        self._net = net
+
+    def __enter__(self) -> Session:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def zid(self) -> str:
+        return "f00d"
+
+    def close(self) -> None:
+        pass
+
+    def liveliness(self) -> Session:
+        return self
+
+    def declare_subscriber(self, key: str, handler: object = None, **_: object) -> Channel:
+        made = self._net.listen(key)
+        if isinstance(handler, Callback):
+            made.obey = handler
+        return made
+
+    def get(self, *_: object, **__: object) -> list[Reply]:
+        return list(self._net.replies)
+
+    def declare_publisher(self, *_: object, **__: object) -> Mute:
+        return Mute()
+
+
+@lru_cache(4096)
+def expression(key: str) -> zenoh.KeyExpr | None:
+    """A key expression, if it is one: no other arrives."""
+    try:
+        return zenoh.KeyExpr(key)
+    except zenoh.ZError:
+        return None
+
+
+class Net:
+    """Every channel that was declared.
+
+    Attributes:
+        first: What waits for whoever subscribes, by key.
+        replies: What every question is answered with.
+    """
+
+    def __init__(self) -> None:
+        self.channels: list[Channel] = []
+        self.first: dict[str, Sample] = {}
+        self.replies: list[Reply] = []
+        self.session = Session(self)
+
+    def forget(self) -> None:
+        """Everybody has left."""
+        self.channels.clear()
+
+    def listen(self, key: str, *, asked: bool = False) -> Channel:
+        made = Channel(key, asked=asked)
+        self.channels.append(made)
+        if key in self.first:
+            made.add(self.first[key])
+        return made
+
+    def deliver(self, data: bytes, *, gone: bool = False) -> None:
+        """Key, MIME type and payload, with zero bytes between them; a key that is none becomes somebody's."""
+        key_bytes, _, rest = data.partition(b"\0")
+        mime, _, payload = rest.partition(b"\0")
+        key = key_bytes.decode("utf-8", "replace")
+        there = expression(key)
+        if there is None:
+            if not self.channels:
+                return
+            key = self.channels[len(data) % len(self.channels)].key.replace("**", "x/y").replace("*", "KH01")
+            there = zenoh.KeyExpr(key)
+        kind = mime.decode("utf-8", "replace")
+        for channel in self.channels:
+            if channel.expression.intersects(there):
+                make: Callable[..., Sample] = Query if channel.asked else Sample
+                channel.add(make(key, kind, payload, gone=gone))
+
+    @contextmanager
+    def worn(self) -> Iterator[Net]:
+        """`agents.network.session` is this network."""
+
+        def heard(_session: object, key: str, *_: object, **__: object) -> Channel:
+            return self.listen(key)
+
+        def ringing(_session: object, key: str, bell: pubsub.Bell, *_: object, **__: object) -> Channel:
+            made = self.listen(key)
+            made.obey = lambda _sample: bell.ring()
+            return made
+
+        def mute(*_: object, **__: object) -> Mute:
+            return Mute()
+
+        declared: dict[str, Any] = {
+            "pose_subscriber": heard,
+            "RingingSubscriber": ringing,
+            "subscriber": heard,
+            "Orders": lambda _session, key, kind: typed_orders(self.listen(key, asked=True), kind),
+            "pose_publisher": mute,
+            "publisher": mute,
+            "source_of": lambda _publisher: None,
+            "LastValue": mute,
+            "alive_token": mute,
+        }
+        opened: dict[str, Any] = {
+            "connected": lambda _session: True,
+            "RouterWatch": Attentive,
+            "open_session": lambda *_, **__: self.session,
+        }
+        with (
+            mock.patch.multiple("agents.network.pubsub", **declared),
+            mock.patch.multiple("agents.network.session", **opened),
+        ):
+            yield self
