@@ -9,11 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.system import rclpy_wheels, zenohd
-
 ROOT = Path(__file__).resolve().parents[2]
-
-
 LEVELS = {
     "core": "requirements.lock",
     "view": "requirements-view.lock",
@@ -29,23 +25,28 @@ def locked(name):
     return dict(re.findall(r"^([a-z0-9.-]+)==(\S+)", (ROOT / name).read_text(), re.MULTILINE))
 
 
-def test_locks_name_no_address():
-    for name in LOCKS:
-        assert not re.search(r"https?:|--index|--extra-index|--find-links", (ROOT / name).read_text())
-
-
-def test_every_locked_package_has_hashes():
-    for name in LOCKS:
-        text = re.sub(r"\\\n", "", (ROOT / name).read_text())
-        assert all("--hash=sha256:" in line for line in text.splitlines() if not line.startswith("#"))
+@pytest.mark.parametrize("name", LOCKS)
+def test_locks_have_hashes_and_no_address(name):
+    text = (ROOT / name).read_text()
+    assert not re.search(r"https?:|--index|--extra-index|--find-links", text)
+    lines = re.sub(r"\\\n", "", text).splitlines()
+    assert all("--hash=sha256:" in line for line in lines if not line.startswith("#"))
 
 
 def test_locks_hold_every_requirement():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
-    core, dev = locked("requirements.lock"), locked("requirements-dev.lock")
-    wanted = {re.match(r"[a-z0-9-]+", line)[0] for line in project["project"]["dependencies"]}
-    assert wanted <= core.keys()
-    assert {re.match(r"[a-z0-9-]+", line)[0] for line in project["dependency-groups"]["dev"]} <= dev.keys()
+    for lock, lines in (
+        ("requirements.lock", project["project"]["dependencies"]),
+        ("requirements-dev.lock", project["dependency-groups"]["dev"]),
+    ):
+        assert {re.match(r"[a-z0-9-]+", line)[0] for line in lines} <= locked(lock).keys()
+
+
+def test_each_lock_has_all_of_the_one_before(bootstrap):
+    assert {level: path.name for level, path in bootstrap.LOCKS.items()} == LEVELS
+    for less, more in (*pairwise(LOCKS[:-1]), ("requirements-fast.lock", "requirements-dev.lock")):
+        assert locked(less).items() < locked(more).items()
+    assert [name for name in LOCKS if "numba" in locked(name)] == list(LOCKS[2:])
 
 
 @pytest.mark.slow
@@ -61,29 +62,25 @@ def test_a_wheel_has_the_names_for_plugins(tmp_path):
     assert {"experiments/api.py", "agents/py.typed", "twins/py.typed", "experiments/py.typed"} <= {*inside}
 
 
-def test_each_lock_has_all_of_the_one_before(bootstrap):
-    assert {level: path.name for level, path in bootstrap.LOCKS.items()} == LEVELS
-    for less, more in pairwise(LOCKS[:-1]):
-        assert locked(less).items() < locked(more).items()
-    assert locked("requirements-fast.lock").items() < locked("requirements-dev.lock").items()
-
-
-def test_numba_is_locked_above_view_only():
-    assert [name for name in LOCKS if "numba" in locked(name)] == list(LOCKS[2:])
+def stamp(bootstrap, level):
+    """What an installation of a level leaves."""
+    bootstrap.STAMP.write_text(f"{bootstrap.fingerprint()} {level}\n")
 
 
 @pytest.fixture
-def installed(bootstrap, monkeypatch):
+def replaced(bootstrap, monkeypatch):
+    """Processes that the script becomes, as their arguments and environments, instead of becoming them."""
+    processes = []
+    monkeypatch.setattr(bootstrap.os, "execve", lambda _, *process: processes.append(process))
+    monkeypatch.setattr(bootstrap.signal, "pthread_sigmask", lambda *_: None)
+    return processes
+
+
+@pytest.fixture
+def installed(bootstrap, replaced, monkeypatch):
     """Levels that were installed, in order; `fast` comes without numba."""
     levels = []
-
-    def install(level):
-        levels.append(level)
-        bootstrap.STAMP.write_text(f"{bootstrap.fingerprint()} {level}\n")
-
-    monkeypatch.setattr(bootstrap, "install", install)
-    monkeypatch.setattr(bootstrap.os, "execve", lambda *_: None)
-    monkeypatch.setattr(bootstrap.signal, "pthread_sigmask", lambda *_: None)
+    monkeypatch.setattr(bootstrap, "install", lambda level: levels.append(level) or stamp(bootstrap, level))
     return levels
 
 
@@ -128,7 +125,7 @@ def commands(bootstrap, monkeypatch):
         kept.append((command, environment))
         raise bootstrap.Trouble("offline")
 
-    bootstrap.STAMP.write_text(f"{bootstrap.fingerprint()} core\n")
+    stamp(bootstrap, "core")
     monkeypatch.setattr(bootstrap, "call", call)
     monkeypatch.setattr(bootstrap, "works", lambda python: True)
     monkeypatch.setattr(bootstrap, "get_uv", lambda base: "uv")
@@ -136,12 +133,9 @@ def commands(bootstrap, monkeypatch):
     return kept
 
 
-def test_offline_a_sweep_goes_on_with_the_core(bootstrap, commands, monkeypatch, capsys):
-    started = []
-    monkeypatch.setattr(bootstrap.os, "execve", lambda path, command, environment: started.append(command[2:]))
-    monkeypatch.setattr(bootstrap.signal, "pthread_sigmask", lambda *_: None)
+def test_offline_a_sweep_goes_on_with_the_core(bootstrap, commands, replaced, capsys):
     bootstrap.main(SWEEP)
-    assert started == [SWEEP]
+    assert [command[2:] for command, _ in replaced] == [SWEEP]
     assert bootstrap.ready("core")
     assert [environment["UV_HTTP_RETRIES"] for _, environment in commands] == ["0"]
     assert capsys.readouterr().err.splitlines()[-1].startswith("zenpark: no numba (offline")
@@ -162,26 +156,20 @@ def test_higher_level_only_adds_packages(bootstrap, commands, monkeypatch):
 
 
 def test_ready_only_for_what_was_installed(bootstrap):
-    assert not bootstrap.ready("core")
-    bootstrap.STAMP.write_text(f"{bootstrap.fingerprint()} core\n")
-    assert bootstrap.ready("core")
-    assert not bootstrap.ready("dev")
-    bootstrap.STAMP.write_text(f"{bootstrap.fingerprint()} dev\n")
-    assert bootstrap.ready("core")
-    assert bootstrap.ready("dev")
+    for installed, ready in ((None, []), ("core", ["core"]), ("dev", ["core", "dev"])):
+        if installed is not None:
+            stamp(bootstrap, installed)
+        assert [level for level in ("core", "dev") if bootstrap.ready(level)] == ready
+    for text in ("", "core", "a b c", "0000 core"):
+        bootstrap.STAMP.write_text(text)
+        assert not bootstrap.ready("core")
 
 
 @pytest.mark.parametrize("changed", ["pyproject.toml", *LOCKS])
 def test_a_changed_file_makes_it_stale(bootstrap, changed):
-    bootstrap.STAMP.write_text(f"{bootstrap.fingerprint()} dev\n")
+    stamp(bootstrap, "dev")
     with (bootstrap.ROOT / changed).open("a") as file:
         file.write("\n")
-    assert not bootstrap.ready("core")
-
-
-@pytest.mark.parametrize("stamp", ["", "core", "a b c", "0000 core"])
-def test_a_broken_stamp_makes_it_stale(bootstrap, stamp):
-    bootstrap.STAMP.write_text(stamp)
     assert not bootstrap.ready("core")
 
 
@@ -247,15 +235,11 @@ def test_help_installs_nothing(bootstrap, monkeypatch, capsys, command, option):
 
 
 @pytest.mark.parametrize("words", [("--chaos", "triangle", "-h"), ("--soak",), ("--bench", "start")])
-def test_measurements_run_in_the_folder_of_the_user(bootstrap, monkeypatch, words):
-    made = []
+def test_measurements_run_in_the_folder_of_the_user(bootstrap, replaced, monkeypatch, words):
     monkeypatch.setattr(bootstrap, "prepare", lambda level: None)
-    monkeypatch.setattr(
-        bootstrap.os, "execve", lambda python, command, environment: made.append((command, environment))
-    )
     monkeypatch.setattr(bootstrap, "test", lambda arguments: 0)
     bootstrap.main(["test", *words])
-    ((command, environment),) = made
+    ((command, environment),) = replaced
     assert command[1:] == ["-m", "tests", *words]
     assert environment["PYTHONSAFEPATH"] == "1"
 
@@ -276,17 +260,16 @@ def test_tests_run_in_three_parts_without_retries(bootstrap, started, monkeypatc
     computing, devices, runs = started[3:]
     assert computing[2] == "not system and not nightly"
     assert [part[2:5] for part in (devices, runs)] == [["mechanism", "-n", "2"], ["mechanism", "-n", "1"]]
-    files = [{part for part in parts if part.startswith("tests/")} for parts in (devices, runs)]
-    assert all(files)
-    assert all(file.startswith("tests/system/") == where for where in (False, True) for file in files[where])
+    for whole_runs, part in enumerate((devices, runs)):
+        places = {file.startswith("tests/system/") for file in part if file.startswith("tests/")}
+        assert places == {bool(whole_runs)}
     said = capsys.readouterr().err
-    titles = [
+    assert re.findall(r"part \d of 3, [^:\n]*$", said, re.MULTILINE) == [
         "part 1 of 3, computing, on all cores",
         "part 2 of 3, devices and network, two at a time",
         "part 3 of 3, whole runs, one at a time",
     ]
-    assert [line for line in said.splitlines() if line.endswith(tuple(titles))] == [f"zenpark: {t}" for t in titles]
-    assert re.search(rf"{titles[2]}: failed in \d+ s\n$", said)
+    assert re.search(r"part 3 of 3, whole runs, one at a time: failed in \d+ s\n$", said)
 
 
 def test_all_prepares_what_the_tests_of_processes_need(bootstrap, started):
@@ -299,33 +282,3 @@ def test_all_prepares_what_the_tests_of_processes_need(bootstrap, started):
 def test_arguments_replace_the_parts_for_pytest(bootstrap, started):
     bootstrap.test(["--quick", "tests/agents", "-x"])
     assert started[3:] == [["pytest", "-m", bootstrap.QUICK, "tests/agents", "-x"]]
-
-
-def test_why_there_is_no_rclpy_is_said(monkeypatch, tmp_path):
-    monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.setattr(rclpy_wheels, "CACHE", tmp_path)
-    monkeypatch.setattr(rclpy_wheels, "REASON", tmp_path / "reason.txt")
-    assert "`./zenpark test --all` installs one" in rclpy_wheels.missing()
-    for said, why in (
-        ("no index", f"no rclpy in {tmp_path}: no index"),
-        ("", "no unshare, to keep ROS off the network"),
-    ):
-        monkeypatch.setattr(rclpy_wheels, "_install", lambda said=said: said)
-        assert rclpy_wheels.install() == rclpy_wheels.missing() == why
-
-
-def test_skipped_tests_say_why_zenohd_is_absent(monkeypatch, tmp_path):
-    monkeypatch.setenv("PATH", str(tmp_path))
-    for name in ("CACHE", "BUILT", "REASON"):
-        monkeypatch.setattr(zenohd, name, tmp_path / name)
-    for asked in (zenohd.folder, lambda: zenohd.build(1)):
-        with pytest.raises(zenohd.NotBuilt, match="no cargo to build one"):
-            asked()
-    cargo = tmp_path / "cargo"
-    cargo.write_text("#!/bin/sh\necho error: no crates.io >&2; exit 101\n")
-    cargo.chmod(0o755)
-    with pytest.raises(zenohd.NotBuilt, match=r"`\./zenpark test --all` builds one"):
-        zenohd.folder()
-    for asked in (lambda: zenohd.build(1), zenohd.folder):
-        with pytest.raises(zenohd.NotBuilt, match=r"cargo metadata failed: error: no crates\.io"):
-            asked()

@@ -1,7 +1,5 @@
 """Consent before an experiment of others touches machines and devices."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 from types import SimpleNamespace
@@ -31,26 +29,26 @@ robots = ["B"]
 """
 
 
-def asking(monkeypatch: pytest.MonkeyPatch, answer: str | None) -> None:
+def asking(monkeypatch, answer):
     """A terminal in which the user answers; None: no terminal."""
     stdin = SimpleNamespace(isatty=lambda: answer is not None, readline=lambda: f"{answer}\n")
     monkeypatch.setattr(consent.sys, "stdin", stdin)
     monkeypatch.setattr(consent.sys.stderr, "isatty", lambda: True, raising=False)
 
 
-def test_devices_and_machines_are_named() -> None:
+def test_devices_and_machines_are_named():
     device, machine = consent.touched(loads(REACHING).cases().values())
     assert "A: radio://0/80/2M/E7E7E7E701" in device
     assert "ssh pi@192.0.2.7" in machine
 
 
-def test_simulated_runs_ask_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_simulated_runs_ask_nothing(monkeypatch):
     asking(monkeypatch, None)
     consent.require("a.zip", load("robotic-park").cases(), given=False)
 
 
 @pytest.mark.parametrize(("answer", "runs"), [("y", True), ("YES", True), ("n", False), ("", False), (None, False)])
-def test_others_files_run_when_agreed(answer, runs, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_others_files_run_when_agreed(answer, runs, monkeypatch):
     asking(monkeypatch, answer)
     cases = loads(REACHING).cases()
     consent.require("a.zip", cases, given=True)
@@ -61,7 +59,7 @@ def test_others_files_run_when_agreed(answer, runs, monkeypatch: pytest.MonkeyPa
             consent.require("a.zip", cases, given=False)
 
 
-def test_own_files_are_no_strangers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_own_files_are_no_strangers(tmp_path, monkeypatch):
     file = tmp_path / "own.toml"
     file.touch()
     assert not consent.belongs_to_another(file)

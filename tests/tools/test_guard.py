@@ -11,23 +11,19 @@ from tools.guard import PACKAGES, intruders
 ROOT = Path(__file__).resolve().parents[2]
 
 
+def python(*words, cwd=ROOT, path=(), **options):
+    """A process of Python, ended; with these first on its import path."""
+    path = {"PYTHONPATH": os.pathsep.join(map(str, path))} if path else {}
+    command, environment = [sys.executable, *words], os.environ | path
+    return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, check=False, **options)
+
+
 def start(folder, *path):
-    """The command line, started in a folder and with these first on the import path."""
-    return subprocess.run(
-        [sys.executable, "-c", "from tools.guard import main; main()", "--version"],
-        cwd=folder,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(map(str, path))},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    return python("-c", "from tools.guard import main; main()", "--version", cwd=folder, path=path)
 
 
-def test_this_checkout_is_whole():
+def test_everything_that_is_elsewhere_is_an_intruder(tmp_path):
     assert intruders(ROOT) == {}
-
-
-def test_elsewhere_everything_is_an_intruder(tmp_path):
     assert intruders(tmp_path) == {name: ROOT / name for name in PACKAGES}
 
 
@@ -42,9 +38,8 @@ def test_ctrl_c_while_python_starts_prints_no_traceback():
         signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
         os.kill(os.getpid(), signal.SIGINT)
 
-    command = [sys.executable, "-m", "tools.guard", "--version"]
-    done = subprocess.run(command, cwd=ROOT, preexec_fn=interrupted, capture_output=True, check=False)
-    assert (done.returncode, done.stdout, done.stderr) == (130, b"", b"")
+    done = python("-m", "tools.guard", "--version", preexec_fn=interrupted)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
 
 
 def test_ctrl_c_while_script_imports_prints_no_traceback():
@@ -56,8 +51,8 @@ def test_ctrl_c_while_script_imports_prints_no_traceback():
         "sys.meta_path.insert(0, Interrupted)\n"
         "runpy.run_path('zenpark', run_name='__main__')"
     )
-    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, check=False)
-    assert (done.returncode, done.stderr) == (130, b"")
+    done = python("-c", program)
+    assert (done.returncode, done.stderr) == (130, "")
 
 
 @pytest.mark.slow
@@ -65,9 +60,8 @@ def test_guard_names_obstructing_package_and_remedy(tmp_path):
     for name in ("agents", "twins"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "__init__.py").write_text("raise RuntimeError('must not be imported')")
-    elsewhere = tmp_path / "elsewhere"
-    elsewhere.mkdir()
-    done = start(elsewhere, tmp_path, ROOT)
+    (tmp_path / "elsewhere").mkdir()
+    done = start(tmp_path / "elsewhere", tmp_path, ROOT)
     assert (done.returncode, done.stdout) == (2, "")
     first, agents, twins, remedy = done.stderr.splitlines()
     assert first == "zenpark: another package is in the way of ours"
@@ -77,14 +71,8 @@ def test_guard_names_obstructing_package_and_remedy(tmp_path):
 
 
 def test_imports_nothing_of_ours_and_nothing_heavy():
-    done = subprocess.run(
-        [sys.executable, "-c", "import sys, tools.guard; print(*sys.modules)"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    loaded = set(done.stdout.split())
+    loaded = set(python("-c", "import sys, tools.guard; print(*sys.modules)").stdout.split())
+    assert "tools.guard" in loaded
     assert not loaded & {"agents", "bridges", "twins", "experiments", "tools.main", "typer", "numpy", "zenoh"}
 
 
@@ -93,14 +81,7 @@ def test_imports_nothing_of_ours_and_nothing_heavy():
     ("words", "code"), [(["station"], 0), (["agent", "-", "KH01", "--clock-correction=-0.5", "--lifeline"], 2)]
 )
 def test_run_needs_no_typer_on_its_hosts(words, code):
-    done = subprocess.run(
-        [sys.executable, "-X", "importtime", "-m", "tools.guard", *words],
-        cwd=ROOT,
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = python("-X", "importtime", "-m", "tools.guard", *words, stdin=subprocess.DEVNULL)
     assert done.returncode == code, done.stderr[-500:]
     loaded = {line.rpartition("|")[2].strip() for line in done.stderr.splitlines()}
     assert "experiments.real_time.hosts.station" in loaded or "experiments.real_time.processes.robot" in loaded
@@ -114,5 +95,4 @@ def test_a_robot_loads_no_openssl():
         "atexit.register(lambda: print('openssl:', sys.modules['_hashlib'], 'hashlib' in sys.modules));"
         "runpy.run_module('experiments.real_time.processes.robot', run_name='__main__', alter_sys=True)"
     )
-    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert done.stdout.endswith("openssl: None True\n")
+    assert python("-c", program).stdout.endswith("openssl: None True\n")

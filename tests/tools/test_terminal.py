@@ -1,19 +1,23 @@
-"""Terminal and options of the command line."""
+"""What a terminal shows: text that cannot steer it; progress as a bar, and as lines elsewhere."""
 
-from __future__ import annotations
-
+import io
 import sys
+import time
 import webbrowser
+from types import SimpleNamespace
 
 import pytest
 
+from agents.network import messages
+from experiments.real_time.conductor.run_view import Progress, RobotView
 from tools.options import open_in_browser, print_result, warn
+from tools.progress import Bar, Lines, ProgressTable
 from tools.terminal import printable, say
 
 ESCAPES = "\x1b]0;owned\x07\x1b[2J\r\x9b2J\u202e"
 
 
-def test_printable_escapes_what_steers_the_terminal() -> None:
+def test_printable_escapes_what_steers_the_terminal():
     assert printable(ESCAPES).isprintable()
     assert printable("Böhm 1 234 → δ [m²]\u202f–") == "Böhm 1 234 → δ [m²]\u202f–"
 
@@ -27,7 +31,7 @@ def test_printable_escapes_what_steers_the_terminal() -> None:
         lambda: print_result({}, f"a{ESCAPES}\nb", as_json=False),
     ],
 )
-def test_no_escape_reaches_the_terminal(tell, capsys) -> None:
+def test_no_escape_reaches_the_terminal(tell, capsys):
     tell()
     printed = "".join(capsys.readouterr())
     assert not {"\x1b", "\x07", "\x9b", "\r", "\u202e"} & set(printed)
@@ -41,3 +45,101 @@ def test_page_is_named_where_no_browser_opens_it(opened, monkeypatch, capsys):
     open_in_browser("file:///report.html")
     assert asked == ["file:///report.html"]
     assert ("open file:///report.html by hand" in capsys.readouterr().err) is not opened
+
+
+# progress
+
+
+class Terminal(io.StringIO):
+    """A standard error that a person looks at."""
+
+    def isatty(self):
+        return True
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """Stands in for the module `time`: `now` [s]."""
+    made = SimpleNamespace(now=100.0, monotonic=lambda: made.now)
+    monkeypatch.setattr("tools.progress.time", made)
+    return made
+
+
+@pytest.fixture
+def terminal(monkeypatch):
+    """Makes one; called by the test, because pytest puts its own in place before that."""
+
+    def make():
+        made = Terminal()
+        monkeypatch.setattr("sys.stderr", made)
+        monkeypatch.setenv("TERM", "xterm")
+        monkeypatch.setenv("COLUMNS", "100")
+        return made
+
+    return make
+
+
+def test_lines_without_a_terminal(capsys, clock):
+    with Bar(passing=True) as bar:
+        bar.show("event", 0, 60)
+        clock.now += 30.0
+        bar.show("event", 60, 60)
+    with Bar() as bar:
+        bar.show("runs", 0, 4)
+        clock.now += 4.9
+        bar.show("runs", 1, 4)
+        clock.now += 0.2
+        bar.show("runs", 2, 4)
+        bar.show("runs", 4, 4)
+    assert capsys.readouterr().err == "runs 0 of 4\nruns 2 of 4\nruns 4 of 4\n"
+
+
+def test_a_bar_in_a_terminal(terminal, clock):
+    screen = terminal()
+    with Bar() as bar:
+        bar.show("runs", 0, 4)
+        clock.now += 3.0
+        bar.show("runs", 4, 4)
+    assert "runs" in screen.getvalue()
+    assert "4/4" in screen.getvalue()
+
+
+def test_passing_bar_appears_late_and_counts_from_beginning(terminal, clock):
+    screen = terminal()
+    with Bar(passing=True) as bar:
+        bar.show("event", 0, 60)
+        clock.now += 1.9
+        bar.show("event", 20, 60)
+        assert screen.getvalue() == ""
+        clock.now += 1.1
+        bar.show("event", 40, 60)
+    assert "40/60" in screen.getvalue()
+    assert "0:00:03" in screen.getvalue()
+
+
+@pytest.mark.parametrize("kind", [Lines, ProgressTable])
+def test_errors_from_before_routers_silence_are_no_news(kind, capsys):
+    progress = Progress("event", "formation", 4.0, 15.0, {"KH01": RobotView(error=0.123)})
+    with kind() as show:
+        show(progress)
+    assert "0.123" in capsys.readouterr().err or kind is ProgressTable
+    progress.silent_since = time.monotonic() - 2.0
+    with kind() as show:
+        show(progress)
+    said = capsys.readouterr().err
+    assert "no router answers for 2.0 s" in said
+    assert "error [m]" not in said
+
+
+def test_hazard_is_printed_with_its_beginning(capsys):
+    progress = Progress("event", "formation", 9.0, 15.0, {})
+    stamp = progress.clock.utc()
+    progress.events += [
+        messages.Event(stamp - 0.5, "hazard", "Q1", "hold: its own position is lost"),
+        messages.Event(stamp, "phase", "conductor", "formation"),
+    ]
+    with Lines() as show:
+        show(progress)
+    hazard, phase, *_ = capsys.readouterr().err.splitlines()
+    assert hazard == "event: hazard Q1: hold: its own position is lost (at 8.5 s)"
+    assert phase == "event: phase conductor: formation"

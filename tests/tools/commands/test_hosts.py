@@ -1,24 +1,28 @@
-"""Hosts by way of an `ssh` that runs everything on this machine: check, install, and a whole run."""
+"""Hosts by way of an `ssh` that runs everything on this machine: check, install, certificates, and a whole run."""
 
 import io
 import json
 import os
+import shutil
+import stat
 import sys
 import tarfile
-from pathlib import Path
 
 import pytest
 
+from experiments.definition.experiment import Host
 from experiments.file import catalogue
 from experiments.file.problems import DocumentError
-from experiments.real_time.hosts import hosts, installation
-from experiments.real_time.hosts.installation import packed
+from experiments.real_time.hosts import authority
+from experiments.real_time.hosts.hosts import HostError
+from experiments.real_time.hosts.installation import packed, put, send
 from experiments.recording import playback, version
 from tests.system.lab import ROOT, Flight
 from tools.commands import hosts as tool
 from tools.commands.hosts import HEADING, choose
 from tools.progress import columns
 
+SHORT = ("--case", "event", "--set", "duration_s=2", "--no-report")
 FAKE = """\
 #!{python}
 import os, sys
@@ -38,18 +42,18 @@ os.execv("/bin/sh", ["sh", "-c", command])
 """
 
 
+def program(place, text):
+    place.parent.mkdir(parents=True, exist_ok=True)
+    place.write_text(text)
+    place.chmod(0o755)
+
+
 @pytest.fixture
 def home(tmp_path, monkeypatch):
     """The home folder of the one host that there is, which has this zenpark."""
     folder = tmp_path / "home"
-    (folder / "zenpark").mkdir(parents=True)
-    command = folder / "zenpark" / "zenpark"
-    command.write_text(f'#!/bin/sh\nPYTHONPATH={ROOT} exec {sys.executable} -m tools.guard "$@"\n')
-    command.chmod(0o755)
-    (tmp_path / "bin").mkdir()
-    fake = tmp_path / "bin" / "ssh"
-    fake.write_text(FAKE.format(python=sys.executable, home=str(folder)))
-    fake.chmod(0o755)
+    program(folder / "zenpark" / "zenpark", f'#!/bin/sh\nPYTHONPATH={ROOT} exec {sys.executable} -m tools.guard "$@"\n')
+    program(tmp_path / "bin" / "ssh", FAKE.format(python=sys.executable, home=str(folder)))
     monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}:{os.environ['PATH']}")
     return folder
 
@@ -87,23 +91,17 @@ def test_check_makes_a_row_of_each(home, tmp_path, capsys):
 @pytest.mark.system
 def test_a_run_here_and_there(home, tmp_path):
     file = experiment(tmp_path, lab1={"address": "lab1", "robots": ["CF01", "KH01"]})
-    short = ("--case", "event", "--set", "duration_s=2", "--no-report")
-    flight = Flight(tmp_path / "run", file, *short)
-    code, _ = flight.finish(60.0)
-    assert code == 0
+    assert Flight(tmp_path / "run", file, *SHORT).finish(60.0)[0] == 0
     trace = playback.read(tmp_path / "run" / "event.mcap").trace
     assert [lie.host for lie in trace.clocks] == ["lab1"]
     assert not trace.lost.any()
-    log = (tmp_path / "run" / "logs" / "event-CF01.log").read_text()
-    assert "CF01: done (finished)" in log
+    assert "CF01: done (finished)" in (tmp_path / "run" / "logs" / "event-CF01.log").read_text()
 
 
 @pytest.mark.system
 def test_hosts_can_be_left_out(home, tmp_path):
     file = experiment(tmp_path, lab1={"address": "nobody", "robots": ["CF01", "KH01"]})
-    short = ("--case", "event", "--set", "duration_s=2", "--no-report")
-    flight = Flight(tmp_path / "here", file, *short, "--here")
-    assert flight.finish(60.0)[0] == 0
+    assert Flight(tmp_path / "here", file, *SHORT, "--here").finish(60.0)[0] == 0
     assert playback.read(tmp_path / "here" / "event.mcap").trace.clocks == ()
 
 
@@ -128,7 +126,7 @@ def test_a_table_has_straight_columns():
 
 
 def test_hosts_are_chosen_by_name_or_tag():
-    lab = {"lab1": hosts.Host(address="a", tags=["radio"]), "lab2": hosts.Host(address="b")}
+    lab = {"lab1": Host(address="a", tags=["radio"]), "lab2": Host(address="b")}
     assert list(choose(lab, [])) == ["lab1", "lab2"]
     assert list(choose(lab, ["radio"])) == ["lab1"]
     assert list(choose(lab, ["lab2", "radio"])) == ["lab1", "lab2"]
@@ -149,16 +147,9 @@ def test_package_holds_code_and_nothing_that_running_left():
 def prepared(home, bootstrap):
     """A .venv for a zenpark that is put there, so that nothing needs to be brought from elsewhere."""
     folder = home / "zenpark"
-    (folder / ".venv" / "bin").mkdir(parents=True)
-    python = folder / ".venv" / "bin" / "python"
-    python.write_text(f'#!/bin/sh\nexec {sys.executable} "$@"\n')
-    python.chmod(0o755)
-    entry = folder / ".venv" / "bin" / "zenpark"
-    entry.write_text("import sys\nfrom tools.guard import main\nmain()\n")
-    for name in ("ROOT", "LOCKS"):
-        value = getattr(bootstrap, name)
-        new = folder if name == "ROOT" else {level: folder / path.name for level, path in value.items()}
-        setattr(bootstrap, name, new)
+    program(folder / ".venv" / "bin" / "python", f'#!/bin/sh\nexec {sys.executable} "$@"\n')
+    (folder / ".venv" / "bin" / "zenpark").write_text("import sys\nfrom tools.guard import main\nmain()\n")
+    bootstrap.ROOT, bootstrap.LOCKS = folder, {level: folder / path.name for level, path in bootstrap.LOCKS.items()}
     for path in (ROOT / "pyproject.toml", *ROOT.glob("requirements*.lock")):
         (folder / path.name).write_bytes(path.read_bytes())
     (folder / ".venv" / "zenpark.stamp").write_text(f"{bootstrap.fingerprint()} core\n")
@@ -192,17 +183,67 @@ def test_install_puts_this_one_there_once(home, tmp_path, capsys, bootstrap):
 def test_install_leaves_alone_what_is_not_its_own(home, tmp_path, capsys, there, message):
     if there is not None:
         (home / "zenpark" / "zenpark").write_text("#!/bin/sh\nexit 9\n")
-        place = home / "zenpark" / there
-        place.parent.mkdir(exist_ok=True)
-        place.touch()
+        program(home / "zenpark" / there, "")
     address = "lab1" if there is not None else "nobody"
-    file = experiment(tmp_path, lab1={"address": address, "robots": ["CF01"]})
-    assert tool.install(file) == 1
+    assert tool.install(experiment(tmp_path, lab1={"address": address, "robots": ["CF01"]})) == 1
     assert message in capsys.readouterr().err
-    assert Path(home / "zenpark" / "zenpark").read_text().startswith("#!/bin/sh")
+    assert (home / "zenpark" / "zenpark").read_text().startswith("#!/bin/sh")
 
 
 @pytest.mark.parametrize("place", ["zenpark", "~/zenpark", "/zenpark", "bin/zp"])
 def test_host_command_needs_a_folder_of_its_own(place):
-    with pytest.raises(hosts.HostError, match="names no folder of its own"):
-        installation.put("lab1", hosts.Host(address="a", zenpark=place))
+    with pytest.raises(HostError, match="names no folder of its own"):
+        put("lab1", Host(address="a", zenpark=place))
+
+
+# certificates
+
+
+@pytest.fixture
+def lab(tmp_path):
+    folder = tmp_path / "lab"
+    authority.create(folder, {"router": "router", "KH01": "robot", "CF01": "robot"})
+    return folder
+
+
+def test_folder_holds_only_what_it_was_sent(home, lab):
+    host, there = Host(address="lab1", lab="~/keys of mine"), home / "keys of mine"
+    assert send("lab1", host, lab, ["KH01", "CF01"]) == "certificates of KH01, CF01 put into keys of mine"
+    before = (there / "KH01.key").read_bytes()
+    authority.renew(lab, ["KH01"])
+    assert send("lab1", host, lab, ["KH01"]).endswith("; removed CF01.pem, CF01.key")
+    assert {file.name for file in there.iterdir()} == {"KH01.key", "KH01.pem", "ca.pem"}
+    assert before != (there / "KH01.key").read_bytes() == (lab / "KH01.key").read_bytes()
+    assert stat.S_IMODE(there.stat().st_mode) == 0o700
+    assert {stat.S_IMODE(file.stat().st_mode) for file in there.iterdir()} == {0o600}
+
+
+def test_what_is_not_its_own_is_left_alone(home, lab):
+    there = home / "zenpark-lab"
+    for strange, said in (("ca.key", "is the lab's own folder"), ("thesis.tex", "holds something else (thesis.tex)")):
+        there.mkdir()
+        (there / strange).touch()
+        (there / "CF01.key").touch()
+        with pytest.raises(HostError, match="certificates not put there") as caught:
+            send("lab1", Host(address="lab1"), lab, ["KH01"])
+        assert said in str(caught.value)
+        assert 'lab = "zenpark-lab"' in str(caught.value)
+        assert {file.name for file in there.iterdir()} == {strange, "CF01.key"}
+        shutil.rmtree(there)
+
+
+@pytest.mark.parametrize("place", ["", "~/", "/", ".", "../keys"])
+def test_keys_need_a_folder_of_their_own(lab, place):
+    with pytest.raises(HostError, match="names no folder of its own"):
+        send("lab1", Host(address="lab1", lab=place), lab, ["KH01"])
+
+
+def test_what_cannot_be_sent_is_said_before(home, lab):
+    authority.renew(lab, ["CF01"], days=-0.01)
+    with pytest.raises(HostError) as caught:
+        send("lab1", Host(address="lab1"), lab, ["KH01", "CF01", "TB01"])
+    assert "lab1: the certificate of CF01 ended at" in str(caught.value)
+    assert "lab1: TB01 is not in the lab" in str(caught.value)
+    assert not (home / "zenpark-lab").exists()
+    with pytest.raises(HostError, match="lab1: it cannot be reached"):
+        send("lab1", Host(address="nobody"), lab, ["KH01"])

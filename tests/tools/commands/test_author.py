@@ -1,0 +1,109 @@
+"""Commands of an author, as they are typed: `new` with a formation, `import`, and `check`."""
+
+import re
+import tomllib
+
+import pytest
+from typer.testing import CliRunner
+
+from experiments.file import document
+from tests.experiments.robotic_park_files import dome
+from tools.main import app
+
+
+@pytest.fixture
+def typed(tmp_path, monkeypatch):
+    """Result of a command in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    return lambda *words: CliRunner().invoke(app, [*words])
+
+
+@pytest.mark.parametrize(
+    ("words", "file", "robots"),
+    [
+        ("--hemisphere 40", "hemisphere-40.toml", 40),
+        ("--polygon 5 --kind khepera4 mine.toml", "mine.toml", 5),
+        ("--grid 2x3 --spacing 0.8", "grid-2x3.toml", 6),
+        ("--polygon 9 --scatter 0 --duration 12", "polygon-9.toml", 9),
+        ("triangle", "triangle.toml", 3),
+    ],
+)
+def test_formations(typed, words, file, robots):
+    result = typed("new", *words.split())
+    assert result.exit_code == 0, result.output
+    assert f"zenpark check {file}" in result.output
+    experiment = document.read(file).experiment
+    assert len(experiment.robots) == robots
+    if "--duration" in words:
+        assert (experiment.duration_s, experiment.start.scatter) == (12.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("", "--hemisphere 40"),
+        ("--polygon 5 --grid 2x2", "--grid is too much"),
+        ("--polygon 5 a.toml b.toml", "'b.toml' is too much"),
+    ],
+)
+def test_one_formation_at_a_time(typed, tmp_path, words, said):
+    result = typed("new", *words.split())
+    assert result.exit_code == 2
+    assert said in result.output
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_import(typed, tmp_path):
+    (tmp_path / "five.yaml").write_text(dome(5))
+    result = typed("import", "five.yaml", "--duration", "30")
+    assert result.exit_code == 0, result.output
+    assert "Not carried over" in result.output
+    assert document.read("five.toml").experiment.duration_s == 30.0
+
+
+CONTRADICTION = """
+title = "Contradiction"
+duration_s = 5.0
+[robots]
+A = { kind = "khepera4", start = [0.0, 0.0] }
+B = { kind = "khepera4", start = [0.8, 0.0] }
+C = { kind = "khepera4", start = [0.8, 0.8] }
+D = { kind = "khepera4", start = [0.0, 0.8] }
+[formation.links]
+"A - B" = 0.8
+"B - C" = 0.8
+"C - D" = 0.8
+"A - D" = { distance = 0.8, gain = 2.0 }
+"A - C" = 1.2
+"B - D" = 1.2
+"""
+
+
+@pytest.fixture
+def square(typed, tmp_path):
+    """A file whose links contradict each other; `check`, in its folder."""
+    (tmp_path / "square.toml").write_text(CONTRADICTION)
+    return lambda *words: typed("check", *words)
+
+
+@pytest.mark.slow
+def test_experiment_error_exits_1_and_malformed_file_2(square, tmp_path):
+    (tmp_path / "wrong.toml").write_text("title = ")
+    assert square("square.toml").exit_code == 1
+    assert square("wrong.toml", "--json").exit_code == 2
+    assert square("triangle", "--set", "duration_s=3", "--plot", "a.svg").exit_code == 0
+    assert (tmp_path / "a.svg").read_text().count("<path") > 20
+
+
+@pytest.mark.slow
+def test_fix_prints_links_that_fit_together(square, tmp_path):
+    said = square("square.toml", "--fix").stdout
+    links = said[said.index("[formation.links]") :]
+    fixed = tomllib.loads(links)["formation"]["links"]
+    assert set(fixed) == {"A - B", "B - C", "C - D", "A - D", "A - C", "B - D"}
+    assert fixed["A - D"]["gain"] == 2.0
+    assert fixed["A - C"] == pytest.approx(2**0.5 * fixed["A - B"], abs=2e-3)
+    (tmp_path / "fixed.toml").write_text(CONTRADICTION[: CONTRADICTION.index("[formation.links]")] + links)
+    again = square("fixed.toml")
+    assert again.exit_code == 0
+    assert float(re.search(r"distances met to +([0-9.]+) mm", again.stdout)[1]) < 0.2
