@@ -39,7 +39,7 @@ PLUGINS: Final = (
     "agents.body.kinds",
     "agents.body.interface",
     "experiments.metrics.metric",
-    "experiments.metrics.measurement",
+    "experiments.metrics.signals",
     "twins.engines.engine",
 )
 

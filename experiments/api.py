@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from experiments.definition import graph, rigidity
     from experiments.file.document import Document, load, loads
     from experiments.metrics import signals
-    from experiments.metrics.measurement import Measurement
     from experiments.metrics.metric import Metric
+    from experiments.metrics.signals import Measurement
     from experiments.real_time.conductor.orders import send_run_order
     from experiments.recording.trace import Trace
     from experiments.report import style
@@ -81,7 +81,7 @@ HOMES: Final = {  # modules, and what of them is named above
     "experiments.definition": "graph rigidity",
     "experiments.file.document": "Document load loads",
     "experiments.metrics": "signals",
-    "experiments.metrics.measurement": "Measurement",
+    "experiments.metrics.signals": "Measurement",
     "experiments.metrics.metric": "Metric",
     "experiments.real_time.conductor.orders": "send_run_order",
     "experiments.recording.trace": "Trace",

@@ -44,8 +44,7 @@ from experiments.definition.links import held_height, link_pairs
 from experiments.definition.plan import Plan
 from experiments.definition.rigidity import Redundancy, Rigidity
 from experiments.file.problems import Path
-from experiments.metrics.measurement import WINDOW_S
-from experiments.metrics.signals import after_last, moving_mean
+from experiments.metrics.signals import WINDOW_S, after_last, moving_mean
 from twins.arrays import Array, Index, Mask, norm
 from twins.scene import Scene
 

@@ -12,7 +12,7 @@ from experiments.check.analysis import Analysis
 from experiments.check.findings import DELAYED, FORGIVEN, Finding
 from experiments.check.ideal_run import fly, has_noise, isolated, repetitions
 from experiments.check.theory import FAR_OFF, strength
-from experiments.metrics.measurement import WINDOW_S
+from experiments.metrics.signals import WINDOW_S
 
 SOFT: Final = 3.0  # time constants of a mode that must fit into the run: 5 % of its error are left then
 LATER: Final = 2.0  # multiple of the time without noise above which a formation is acquired late

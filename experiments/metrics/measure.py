@@ -21,7 +21,6 @@ from experiments.definition.graph import Links
 from experiments.metrics import centralised
 from experiments.metrics.clearance import collisions
 from experiments.metrics.comparable import reasons
-from experiments.metrics.measurement import Measurement
 from experiments.metrics.metric import (
     OURS,
     Metric,
@@ -36,6 +35,7 @@ from experiments.metrics.metric import (
 from experiments.metrics.results import Approach, Belief, CaseMetrics, Collision, LawMeasure, RobotMetrics
 from experiments.metrics.shadow import agreement
 from experiments.metrics.signals import (
+    Measurement,
     link_deliveries,
     mean_known,
     net_rotation,

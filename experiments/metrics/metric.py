@@ -22,9 +22,8 @@ import numpy as np
 
 from agents.plugins import files, registry
 from experiments.definition.experiment import Criterion
-from experiments.metrics.measurement import Measurement
 from experiments.metrics.results import CaseMetrics, RobotMetrics
-from experiments.metrics.signals import closest_distance, mean_known
+from experiments.metrics.signals import Measurement, closest_distance, mean_known
 from experiments.recording.trace import Trace
 from twins.arrays import Array, Index
 

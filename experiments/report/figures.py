@@ -21,11 +21,10 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 from numpy.typing import NDArray
 
 from agents.plugins.laws import Gradient
-from experiments.metrics.measurement import WINDOW_S, bounds_of
 from experiments.metrics.metric import ERRORS, FORMULA, known_metrics
 from experiments.metrics.results import CaseMetrics
 from experiments.metrics.shadow import differences, in_heading
-from experiments.metrics.signals import LinkErrors, leaders, moving_mean, transmission_gaps
+from experiments.metrics.signals import WINDOW_S, LinkErrors, bounds_of, leaders, moving_mean, transmission_gaps
 from experiments.metrics.statistics import Spread, by_case, ratios, spread
 from experiments.recording.trace import Trace
 from experiments.report.metrics_files import Band

@@ -18,8 +18,8 @@ from experiments.definition.plan import Plan
 from experiments.definition.standby import without_standby
 from experiments.file.structure import plugin_files
 from experiments.metrics.measure import ended_early, failures
-from experiments.metrics.measurement import Measurement
 from experiments.metrics.metric import LEAN, case_values, foreign_metrics, swept_metrics, values_of
+from experiments.metrics.signals import Measurement
 from experiments.recording.trace import Trace
 from experiments.recording.version import ROOT, engine_versions
 from experiments.recording.version import digest as digest_of_code
