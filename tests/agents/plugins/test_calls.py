@@ -1,63 +1,62 @@
-"""Errors of a tick name the plug-in to blame."""
+"""Errors of a tick name the plug-in to blame; one that gives something else than it must is refused before take-off."""
 
-from math import nan
+import re
+from dataclasses import replace
+from math import inf, nan
 from pathlib import Path
 from typing import ClassVar
 
-import msgspec
+import numpy as np
 import pytest
 
+from agents.decision.lifecycle import READY
 from agents.formation.link import BY_NOTHING, Link
+from agents.plugins.avoidance import Avoidance
 from agents.plugins.calls import explain, failure, unknown_reads, wrong
 from agents.plugins.law import Control, Law, NeighbourView, RobotFacts, Said, View
-from agents.plugins.registry import PluginError
+from agents.plugins.laws import Distance
+from agents.plugins.planners import Leg, Planner
+from agents.plugins.predictors import Predictor
+from agents.plugins.registry import FAILURES, PluginError
+from agents.plugins.triggers import Trigger
 from agents.vectors import ZERO
-
-
-class Spring(msgspec.Struct, frozen=True):
-    """A law that goes wrong in a way."""
-
-    way: str = ""
-
-    def pull(self, apart, link):
-        if self.way == "fails":
-            return self.divide(apart)
-        return None if self.way == "nothing" else (1.0, 2.0)
-
-    def divide(self, apart):
-        return half(apart) / 0.0
-
-
-class Push(msgspec.Struct, frozen=True):
-    """An avoidance that does nothing wrong."""
-
-    def restrain(self, setpoint, own, near):
-        return setpoint
+from experiments.definition.plan import Plan
+from tests.agents.bench import Bench
+from tests.agents.few import pair
 
 
 def half(number):
     return 0.5 * number
 
 
+class Spring(Distance, frozen=True):
+    """A law that goes wrong in a way."""
+
+    way: str = ""
+
+    def pull(self, apart, link):
+        return half(apart) / 0.0 if self.way == "fails" else None
+
+
+FAILS, NOTHING, SHORT = Spring(way="fails"), Spring(way="nothing"), Spring(way="short")
+
+
 def explained(call):
-    """Text of the error of a tick, and its kind."""
+    """The error that a tick ends with."""
     try:
         call()
-    except (ArithmeticError, TypeError, LookupError, PluginError) as error:
-        return explain(error, [("avoidance", PUSH), ("law", LAW["fails"]), ("law", LAW["nothing"])])
+    except FAILURES as error:
+        return explain(error, [("avoidance", Avoidance()), ("law", FAILS), ("law", NOTHING)])
     raise AssertionError
 
 
-PUSH, LAW = Push(), {way: Spring(way) for way in ("fails", "nothing", "short")}
-
-
-def tick(law):
+def unpack(law):
     x, y, z = law.pull(1.0, None)
     return x, y, z
 
 
 def test_failure_names_plug_in_and_line():
-    error = explained(lambda: tick(LAW["fails"]))
+    error = explained(lambda: unpack(FAILS))
     lines = Path(__file__).read_text("utf-8").splitlines()
     line = 1 + next(k for k, text in enumerate(lines) if "return half(apart)" in text)
     assert isinstance(error, PluginError)
@@ -65,7 +64,7 @@ def test_failure_names_plug_in_and_line():
 
 
 def test_result_of_no_use_names_the_method():
-    error = explained(lambda: tick(LAW["nothing"]))
+    error = explained(lambda: unpack(NOTHING))
     assert isinstance(error, PluginError)
     assert "`pull` of the law Spring gives what cannot be used" in str(error)
     assert "is a `return` missing?" in str(error)
@@ -74,7 +73,7 @@ def test_result_of_no_use_names_the_method():
 def test_other_errors_stay_what_they_are():
     assert isinstance(explained(lambda: half("x")), TypeError)
     assert isinstance(explained(lambda: {}["x"]), KeyError)
-    told = failure("law", LAW["fails"], ValueError("no"))
+    told = failure("law", FAILS, ValueError("no"))
 
     def again():
         raise told
@@ -84,7 +83,7 @@ def test_other_errors_stay_what_they_are():
 
 @pytest.mark.parametrize(("result", "text"), [(None, "nothing: is a `return` missing?"), ((1.0, 2.0), "(1.0, 2.0)")])
 def test_wrong_result_is_shown(result, text):
-    error = wrong("law", LAW["short"], "pull", result, "three numbers")
+    error = wrong("law", SHORT, "pull", result, "three numbers")
     assert str(error) == f"`pull` of the law Spring must give three numbers, not {text} ({__file__})"
 
 
@@ -123,3 +122,137 @@ def test_unknown_reads_name_field_and_remedy(reads, words):
     )  # fmt: skip
     law = Reader(reads)
     assert unknown_reads(law, lambda watched: law.step(watched(view), {})) == (words and f": Reader reads {words}")
+
+
+# ---------------------------------------------------------------- before take-off
+
+
+class Answer(Trigger, frozen=True):
+    answer: object = None
+
+    def fires(self, view):
+        return self.answer
+
+
+class Pull(Distance, frozen=True):
+    answer: object = None
+
+    def pull(self, apart, link):
+        return self.answer
+
+
+class Silent(Distance, frozen=True):
+    answer: object = None
+
+    def error(self, apart, link):
+        return self.answer
+
+
+class Way(Planner, frozen=True):
+    answer: object = None
+
+    def target(self, elapsed, anchor, heading):
+        return self.answer
+
+
+class Guess(Predictor, frozen=True):
+    answer: object = None
+
+    def position(self, pose, age):
+        return self.answer
+
+
+class Broken(Avoidance, frozen=True):
+    """An avoidance with a method that gives an answer, or raises it."""
+
+    method: str
+    answer: object = None
+
+    def give(self, method, else_):
+        if isinstance(self.answer, Exception) and method == self.method:
+            raise self.answer
+        return self.answer if method == self.method else else_
+
+    def horizon(self, own):
+        return self.give("horizon", inf)
+
+    def deviate(self, goal, own, near, period):
+        return self.give("deviate", goal)
+
+    def restrain(self, setpoint, own, near):
+        return self.give("restrain", setpoint)
+
+
+def idle(**parts):
+    """A robot that has not taken off, beside one that it receives."""
+    bench = Bench(replace(Plan(pair()).assignment("A"), **parts), (-0.4, 0.0, 0.0))
+    bench.hear(0, (0.4, 0.1, 0.0))
+    return bench
+
+
+@pytest.mark.parametrize("place", ["trigger", "update"])
+@pytest.mark.parametrize(("answer", "told"), [(None, "nothing: is a `return` missing"), (1.0, "1.0"), ("yes", "'yes'")])
+def test_trigger_must_give_a_bool(place, answer, told):
+    bench = idle(**{place: Answer(answer=answer)})
+    with pytest.raises(PluginError, match=rf"`fires` of the trigger Answer must give True or False, not {told}"):
+        bench.step()
+    assert bench.life.takeoff()
+
+
+@pytest.mark.parametrize("answer", [True, False, np.True_])
+def test_bools_of_numpy_are_bools(answer):
+    assert idle(trigger=Answer(answer=answer)).step().life.phase == READY
+
+
+@pytest.mark.parametrize("answer", [None, (1.0, 2.0), "abc", ("a", "b", "c")])
+@pytest.mark.parametrize(
+    ("part", "plugin", "wanted"),
+    [
+        ("law", Pull, "`pull` of the law Pull must give three numbers"),
+        ("law", Silent, "`error` of the law Silent must give a number"),
+        ("predictor", Guess, "`position` of the predictor Guess must give three numbers"),
+        ("legs", Way, "`target` of the planner Way must give four numbers"),
+    ],
+)
+def test_results_must_be_numbers(part, plugin, wanted, answer):
+    made = plugin(answer=answer)
+    bench = idle(**{part: (Leg(30.0, made),) if part == "legs" else made})
+    with pytest.raises(PluginError, match=wanted):
+        bench.step()
+
+
+@pytest.mark.parametrize(
+    ("method", "answer", "says"),
+    [
+        ("deviate", KeyError("goal"), r"the avoidance Broken failed: KeyError: 'goal' \(.*test_calls\.py:\d+\)$"),
+        ("deviate", AssertionError(), "the avoidance Broken failed: AssertionError"),
+        ("deviate", (0.0,), r"`deviate` of the avoidance Broken must give three numbers, not \(0.0,\)"),
+        ("restrain", TypeError(), r"the avoidance Broken failed: TypeError.* \(.*test_calls\.py:\d+\)$"),
+        ("restrain", None, r"`restrain` of the avoidance Broken must give four numbers, not nothing: is a `return` "),
+        ("restrain", ("here",) * 4, "`restrain` of the avoidance Broken must give four numbers"),
+        ("restrain", (0.0, 0.0), "`restrain` of the avoidance Broken"),
+        ("horizon", KeyError("own"), r"the avoidance Broken failed: KeyError: 'own' \(.*test_calls\.py:\d+\)$"),
+        ("horizon", nan, "`horizon` of the avoidance Broken must give a distance of 0 m or more, not nan"),
+        ("horizon", None, "`horizon` of the avoidance Broken must give a distance"),
+    ],
+)
+def test_mistake_in_an_avoidance_is_named(method, answer, says):
+    avoidance = Broken(method=method, answer=answer)
+    with pytest.raises(FAILURES) as caught:
+        idle(avoidance=avoidance).running(lambda bench: bench.hear(0, (0.4, 0.1, 0.0)))
+    told = explain(caught.value, [("avoidance", avoidance)])
+    assert isinstance(told, PluginError)
+    assert re.search(says, str(told))
+
+
+class Counting(Trigger, frozen=True):
+    MEMORY: ClassVar = {"asked": 0}
+
+    def fires(self, view):
+        view.memory.asked += 1
+        return False
+
+
+def test_rehearsal_leaves_no_trace():
+    bench = idle(trigger=Counting()).step()
+    assert bench.robot.transmitter.asking.view.memory.asked == 1

@@ -1,6 +1,7 @@
 """Every registered plug-in, a user's too: a robot decides the same alone and in company, and bears losses."""
 
 from dataclasses import replace
+from functools import partial
 from math import cos, isfinite, nan, pi, sin
 from random import Random
 
@@ -26,13 +27,7 @@ from tests.agents.things import near, own
 GROUPS = (LAWS, TRIGGERS, PREDICTORS, PLANNERS, AVOIDANCES)
 EVERY = [(group, name) for group in GROUPS for name in registry.names(group)]
 PLACES = {"A": (-0.4, 0.0, 0.0), "B": (0.4, 0.1, 0.0), "C": (0.0, -0.5, 0.0)}
-WANTS = {
-    "distance": BY_DISTANCE,
-    "any": BY_DISTANCE,
-    "relative": BY_RELATIVE,
-    "bearing": BY_BEARING,
-    "nothing": BY_NOTHING,
-}
+WANTS = {"distance": BY_DISTANCE, "any": BY_DISTANCE, "relative": BY_RELATIVE, "bearing": BY_BEARING}
 SAMPLES = {float: 0.3, int: 1, bool: False, str: "a", list: [[0.3, 0.2], [-0.2, 0.4]]}
 
 
@@ -59,18 +54,17 @@ def made(group, name):
 def assignment(group, name):
     """A of three ground robots with this plug-in at work."""
     plan = Plan(triangle(avoidance={"kind": "potential", "hears": "all"}, prediction="constant-velocity"))
-    given, plugin = plan.assignment("A"), made(group, name)
+    given, plugin = replace(plan.assignment("A"), start=None, starts=()), made(group, name)
     if group == LAWS:
-        wants = WANTS[plugin.NEEDS]
+        wants = WANTS.get(plugin.NEEDS, BY_NOTHING)
         links = tuple(
             msgspec.structs.replace(link, relative=(0.3, 0.2, 0.0), bearing=(0.6, 0.8, nan), wants=wants)
             for link in given.neighbours
         )
         return replace(given, law=plugin, neighbours=links)
     if group == TRIGGERS:
-        places = plugin.PLACES
-        given = replace(given, trigger=plugin) if "communication" in places else given
-        return replace(given, update=plugin) if "control" in places else given
+        given = replace(given, trigger=plugin) if "communication" in plugin.PLACES else given
+        return replace(given, update=plugin) if "control" in plugin.PLACES else given
     if group == PLANNERS:
         return replace(given, legs=(Leg(0.5, plugin),))
     return replace(given, **{"predictor" if group == PREDICTORS else "avoidance": plugin})
@@ -101,23 +95,23 @@ def tick(bench):
     drive(bench)
 
 
-def recorded(bench, trace):
-    tick(bench)
-    trace.append(repr((bench.robot.goal, bench.robot.setpoint, bench.robot.error, bench.said[-1:])))
-
-
 def lives(given, company):
     """Traces of a robot over 3 s, while `company` robots of the same plug-ins are asked in between."""
     first, trace = Bench(given, PLACES["A"]), []
     others = [Bench(given, (0.1 * k, -0.1 * k, 0.0)) for k in range(company)]
-    first.step(0.05, lambda bench: recorded(bench, trace))
+
+    def recorded(bench):
+        tick(bench)
+        trace.append(repr((bench.robot.goal, bench.robot.setpoint, bench.robot.error, bench.said[-1:])))
+
+    first.step(0.05, recorded)
     for other in others:
         other.life.phase, other.life.start_at = RUNNING, 0.0
     assert first.life.takeoff() == "", first.life.reason
-    first.step(0.02, lambda bench: recorded(bench, trace))
+    first.step(0.02, recorded)
     assert first.robot.start(first.t) == ""
     for _ in range(300):
-        first.step(0.01, lambda bench: recorded(bench, trace))
+        first.step(0.01, recorded)
         for other in others:
             other.step(0.01, tick)
     assert first.life.phase == RUNNING, first.life.reason
@@ -126,14 +120,13 @@ def lives(given, company):
 
 @pytest.mark.parametrize(("group", "name"), EVERY)
 def test_same_alone_and_in_company(group, name):
-    given = replace(assignment(group, name), start=None, starts=())
+    given = assignment(group, name)
     assert lives(given, 0) == lives(given, 3)
 
 
 @pytest.mark.parametrize(("group", "name"), EVERY)
 def test_losses_restarts_and_unknown_positions(group, name):
-    bench = Bench(replace(assignment(group, name), start=None, starts=()), PLACES["A"])
-    setpoints = []
+    bench, setpoints = Bench(assignment(group, name), PLACES["A"]), []
 
     def watched(bench):
         tick(bench)
@@ -145,8 +138,7 @@ def test_losses_restarts_and_unknown_positions(group, name):
     bench.neighbours.mark_alive(0)
     bench.step(0.3, watched)
     bench.neighbours.discard_pose(1)  # a new process, without a pose at first
-    bench.step(0.3, drive)
-    bench.step(0.3, watched)
+    bench.step(0.3, drive).step(0.3, watched)
     place = bench.position
     for unknown in (UNKNOWN, (nan, 0.0, 0.0)):
         bench.position = unknown
@@ -154,8 +146,7 @@ def test_losses_restarts_and_unknown_positions(group, name):
         assert bench.robot.setpoint == (0.0, 0.0, 0.0, 0.0)
         bench.position = place
         bench.step(0.2, watched)
-    for velocity in (UNKNOWN, (1e9, -1e9, 0.0)):
-        bench.velocity = velocity
+    for bench.velocity in (UNKNOWN, (1e9, -1e9, 0.0)):
         bench.step(0.2, watched)
     bench.velocity, bench.yaw = (0.0, 0.0, 0.0), nan
     bench.step(0.2, watched)
@@ -188,7 +179,7 @@ def known(memory):
 @pytest.mark.parametrize("name", REMEMBERING)
 def test_laws_that_remember_keep_what_they_know(name):
     """Whatever is lost: what was known stays known, and setpoints stay finite."""
-    bench = Bench(replace(assignment(LAWS, name), start=None, starts=()), PLACES["A"])
+    bench = Bench(assignment(LAWS, name), PLACES["A"])
     bench.running(talk).step(0.5, talk)
     stepping = bench.robot.stepping
     at_first = known(stepping.memory)
@@ -224,8 +215,8 @@ def test_laws_that_remember_keep_what_they_know(name):
 def test_remembering_laws_ignore_the_order_of_arrival(name):
     ends = []
     for order in (1, -1):
-        bench = Bench(replace(assignment(LAWS, name), start=None, starts=()), PLACES["A"])
-        bench.running(lambda bench, order=order: talk(bench, order)).step(2.0, lambda b, order=order: talk(b, order))
+        bench, said = Bench(assignment(LAWS, name), PLACES["A"]), partial(talk, order=order)
+        bench.running(said).step(2.0, said)
         ends.append(repr((bench.robot.stepping.memory, bench.robot.stepping.measures, bench.robot.setpoint)))
     assert ends[0] == ends[1]
 
@@ -233,8 +224,7 @@ def test_remembering_laws_ignore_the_order_of_arrival(name):
 @pytest.mark.parametrize("name", REMEMBERING)
 def test_remembering_laws_bear_a_period_three_times_longer(name):
     given = assignment(LAWS, name)
-    given = replace(given, decide_every=3 * given.decide_every, start=None, starts=())
-    bench = Bench(given, PLACES["A"])
+    bench = Bench(replace(given, decide_every=3 * given.decide_every), PLACES["A"])
     bench.running(talk).step(10.0, talk)
     stepping = bench.robot.stepping
     assert all(abs(number) < 1e6 for values in stepping.memory.values() for number in values if isfinite(number))
@@ -242,30 +232,28 @@ def test_remembering_laws_bear_a_period_three_times_longer(name):
     assert bench.life.phase == RUNNING, bench.life.reason
 
 
-def turned(random, distance):
-    """A place at a distance from 0 [m]."""
-    angle = random.uniform(-pi, pi)
-    return distance * cos(angle), distance * sin(angle)
-
-
 @pytest.mark.parametrize("kind", KINDS.values(), ids=lambda kind: kind.name)
 @pytest.mark.parametrize("name", registry.names(AVOIDANCES))
-def test_readings_beyond_the_horizon_change_nothing(name, kind):
-    """Range readings there are left out."""
+def test_range_readings_beyond_the_horizon_change_nothing(name, kind):
     avoidance, random, acted = made(AVOIDANCES, name), Random(7), 0
+
+    def any_of(most):
+        return random.uniform(-most, most), random.uniform(-most, most)
+
+    def at(distance):
+        angle = random.uniform(-pi, pi)
+        return distance * cos(angle), distance * sin(angle)
+
     for _ in range(300):
-        speed = kind.speed
-        velocity = (random.uniform(-speed, speed), random.uniform(-speed, speed), 0.0)
-        here = own(kind, (0.0, 0.0), yaw=random.uniform(-pi, pi), velocity=velocity)
+        here = own(kind, (0.0, 0.0), yaw=random.uniform(-pi, pi), velocity=(*any_of(kind.speed), 0.0))
         horizon = min(kind.radius + avoidance.horizon(here), 1e3)
-        close = [turned(random, random.uniform(kind.radius, horizon)) for _ in range(3)]
-        far = [turned(random, horizon * random.uniform(1.0 + 1e-9, 1.2)) for _ in range(30)]
-        goal = (random.uniform(-1.0, 1.0), random.uniform(-1.0, 1.0), 0.5)
-        reach = 1.0 / kind.response if kind.takes == "position" else 1.0
-        setpoint = (random.uniform(-speed, speed) * reach, random.uniform(-speed, speed) * reach, 0.0, 0.0)
+        close = [at(random.uniform(kind.radius, horizon)) for _ in range(3)]
+        far = [at(horizon * random.uniform(1.0 + 1e-9, 1.2)) for _ in range(30)]
+        goal = (*any_of(1.0), 0.5)
+        setpoint = (*any_of(kind.speed / kind.response if kind.takes == "position" else kind.speed), 0.0, 0.0)
         alone, together = near(*close), near(*close, *far)
-        assert avoidance.deviate(goal, here, together, 0.01) == avoidance.deviate(goal, here, alone, 0.01)
-        restrained = avoidance.restrain(setpoint, here, alone)
+        deviated, restrained = avoidance.deviate(goal, here, alone, 0.01), avoidance.restrain(setpoint, here, alone)
+        assert avoidance.deviate(goal, here, together, 0.01) == deviated
         assert avoidance.restrain(setpoint, here, together) == restrained
-        acted += restrained != setpoint or avoidance.deviate(goal, here, alone, 0.01) != goal
+        acted += restrained != setpoint or deviated != goal
     assert acted > 10

@@ -8,19 +8,18 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 import tomllib
-from math import cos, hypot, isnan, sin
+from math import hypot, isnan
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
 from agents.body.interface import BodyError
-from agents.body.kinds import Kind
 from agents.formation.link import Link
-from agents.plugins.avoidance import Nearby, OwnState
+from agents.kinds.khepera4 import KHEPERA4
 from tests.agents.signals import Play, standing
+from tests.agents.things import near, own
 from tests.shell import shell
 from tests.system import lab
 from tests.waiting import until
@@ -40,6 +39,13 @@ REGISTERED = re.findall(
 def source_of(name):
     (source,) = [block for block in BLOCKS if f"class {name}" in block or f"\n{name} = " in block]
     return source
+
+
+def made_in_guide(name):
+    """What the guide defines by this name."""
+    names = {"__name__": "guide"}
+    exec(source_of(name), names)
+    return names[name]
 
 
 @pytest.fixture(scope="module")
@@ -127,57 +133,6 @@ assert {{each for each in sys.modules if each.startswith("experiments")}} == {{"
     assert done.returncode == 0, done.stderr
 
 
-class Rover(threading.Thread):
-    """Robot of the guide: turns and drives by the twists that it gets over UDP, and answers with its pose."""
-
-    def __init__(self):
-        super().__init__(daemon=True)
-        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self.socket.bind(("127.0.0.1", 0))
-        self.pose, self.twists = [0.0, 0.0, 0.0], []
-
-    @property
-    def address(self):
-        return "rover://{}:{}".format(*self.socket.getsockname())
-
-    def run(self):
-        while True:
-            payload, sender = self.socket.recvfrom(1500)
-            if payload == b"end":
-                return
-            twist = json.loads(payload)
-            self.twists.append((twist["v"], twist["w"]))
-            self.pose[2] += 0.02 * twist["w"]
-            self.pose[0] += 0.02 * twist["v"] * cos(self.pose[2])
-            self.pose[1] += 0.02 * twist["v"] * sin(self.pose[2])
-            self.socket.sendto(b"not a pose", sender)
-            self.socket.sendto(json.dumps(dict(zip(("x", "y", "yaw"), self.pose, strict=True))).encode(), sender)
-
-
-@pytest.fixture
-def rover():
-    robot = Rover()
-    robot.start()
-    yield robot
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as end:
-        end.sendto(b"end", robot.socket.getsockname())
-    robot.join(5.0)
-    robot.socket.close()
-
-
-def rovers(*addresses):
-    names: dict[str, type] = {"__name__": "my_body"}
-    exec(source_of("Rovers"), names)
-    count = len(addresses)
-    request = SimpleNamespace(
-        names=tuple(f"R{k}" for k in range(count)),
-        addresses=addresses,
-        start=((0.0, 0.0, 0.0),) * count,
-        yaw=(0.0,) * count,
-    )
-    return names["Rovers"](request)
-
-
 @pytest.mark.slow
 def test_kind_of_the_docs_is_known_everywhere(zenpark, tmp_path):
     assert re.search(r"Kinds of robots: .*\bhovercraft\b", zenpark("list").stdout)
@@ -199,9 +154,7 @@ def test_kind_of_the_docs_is_known_everywhere(zenpark, tmp_path):
 
 
 def test_kind_of_the_docs_without_a_class_moves():
-    names: dict[str, Kind] = {}
-    exec(source_of("BARROW"), names)
-    robot = model(names["BARROW"], (0.0, 0.0, 0.0), 0.0)
+    robot = model(made_in_guide("BARROW"), (0.0, 0.0, 0.0), 0.0)
     robot.command((0.3, 0.0, 0.0, 0.0))
     for _ in range(50):
         robot.move(0.02)
@@ -211,10 +164,7 @@ def test_kind_of_the_docs_without_a_class_moves():
 @pytest.mark.slow
 def test_broken_kind_is_left_out(tmp_path):
     """A broken plug-in spoils neither the help nor experiments without it."""
-    about = tmp_path / "broken-1.dist-info"
-    about.mkdir()
-    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1\n")
-    (about / "entry_points.txt").write_text("[zenpark.kinds]\nwreck = wrecks:WRECK\n")
+    install(tmp_path, "broken", "1", {"zenpark.kinds": {"wreck": "wrecks:WRECK"}})
     (tmp_path / "wrecks.py").write_text("raise LookupError('on purpose')\n")
     with shell(tmp_path) as zenpark:
         assert zenpark("--help").returncode == 0
@@ -224,23 +174,6 @@ def test_broken_kind_is_left_out(tmp_path):
         assert zenpark("check", "triangle").returncode == 0
         refused = zenpark("check", "triangle", "--set", "robots.KH01.kind=wreck")
     assert "the kind 'wreck' cannot be used" in refused.stderr + refused.stdout
-
-
-def test_body_of_the_docs_drives_over_udp(rover):
-    body = rovers(rover.address)
-    body.open()
-    for _ in range(3):
-        body.command([(0.5, 0.0, 0.0, 0.0)])
-    until(lambda: body.read(7.0)[0].position[0] > 0.0299)
-    (state,) = body.read(7.0)
-    assert state.position == pytest.approx((0.03, 0.0, 0.0))
-    assert state.time == 7.0
-    body.stop([0])
-    body.command([(0.5, 0.0, 0.0, 0.0)])
-    state.velocity = (0.0, 0.0, 0.0)  # as the loop does
-    assert all(map(isnan, body.read(7.1)[0].velocity))
-    until(lambda: len(rover.twists) >= 5 and rover.twists[-2:] == [(0.0, 0.0)] * 2)
-    body.close()
 
 
 ROVER = """
@@ -254,8 +187,10 @@ print(link.getsockname()[1], flush=True)
 while True:
     payload, sender = link.recvfrom(1500)
     twist = json.loads(payload)
+    print(twist["v"], twist["w"], file=sys.stderr, flush=True)
     yaw += 0.02 * twist["w"]
     x, y = x + 0.02 * twist["v"] * math.cos(yaw), y + 0.02 * twist["v"] * math.sin(yaw)
+    link.sendto(b"not a pose", sender)
     link.sendto(json.dumps({"x": math.nan if broken else x, "y": y, "yaw": yaw}).encode(), sender)
 """
 STARTS = {"RV01": (0.0, 0.0), "RV02": (0.6, 0.0), "RV03": (0.0, 0.6), "RV04": (0.6, 0.6)}
@@ -263,25 +198,53 @@ FAULTS = {"RV01": signal.SIGKILL, "RV02": signal.SIGSTOP, "RV03": signal.SIGUSR1
 
 
 @pytest.fixture
-def four_rovers():
-    """Robots of the guide as processes, by name."""
-    made = {
-        name: subprocess.Popen([sys.executable, "-c", ROVER, *map(str, start)], stdout=subprocess.PIPE, text=True)
-        for name, start in STARTS.items()
+def four_rovers(tmp_path):
+    """Robots of the guide as processes, and their addresses, by name; each writes its twists into a file."""
+    processes = {}
+    for name, start in STARTS.items():
+        with (tmp_path / name).open("w") as twists:
+            command = [sys.executable, "-c", ROVER, *map(str, start)]
+            processes[name] = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=twists, text=True)
+    yield {
+        name: (process, f"rover://127.0.0.1:{int(process.stdout.readline())}") for name, process in processes.items()
     }
-    yield made
-    for process in made.values():
+    for process in processes.values():
         process.kill()
         process.communicate()
+
+
+def rovers(*addresses):
+    count = len(addresses)
+    names = tuple(f"R{k}" for k in range(count))
+    request = SimpleNamespace(names=names, addresses=addresses, start=((0.0, 0.0, 0.0),) * count, yaw=(0.0,) * count)
+    return made_in_guide("Rovers")(request)
+
+
+def test_body_of_the_docs_drives_over_udp(four_rovers, tmp_path):
+    _, address = four_rovers["RV01"]
+    body = rovers(address)
+    body.open()
+    for _ in range(3):
+        body.command([(0.5, 0.0, 0.0, 0.0)])
+    until(lambda: body.read(7.0)[0].position[0] > 0.0299)
+    (state,) = body.read(7.0)
+    assert state.position == pytest.approx((0.03, 0.0, 0.0))
+    assert state.time == 7.0
+    body.stop([0])
+    body.command([(0.5, 0.0, 0.0, 0.0)])
+    state.velocity = (0.0, 0.0, 0.0)  # as the loop does
+    assert all(map(isnan, body.read(7.1)[0].velocity))
+    driven = ["0.5 0.0"] * 3 + ["0.0 0.0"] * 2
+    until(lambda: (tmp_path / "RV01").read_text().splitlines()[-5:] == driven)
+    body.close()
 
 
 @pytest.mark.system
 def test_broken_robots_of_the_guide_fail_the_run(installed, four_rovers, tmp_path, monkeypatch):
     monkeypatch.setitem(lab.ENVIRONMENT, "PYTHONPATH", os.pathsep.join([str(installed), str(ROOT)]))
     robots = "".join(
-        f'[robots.{name}]\nkind = "khepera4"\nstart = {list(STARTS[name])}\n'
-        f'body = "rover://127.0.0.1:{int(process.stdout.readline())}"\n'
-        for name, process in four_rovers.items()
+        f'[robots.{name}]\nkind = "khepera4"\nstart = {list(STARTS[name])}\nbody = "{address}"\n'
+        for name, (_, address) in four_rovers.items()
     )
     file = tmp_path / "rovers.toml"
     file.write_text(
@@ -291,7 +254,7 @@ def test_broken_robots_of_the_guide_fail_the_run(installed, four_rovers, tmp_pat
     flight = lab.Flight(tmp_path / "run", str(file))
     flight.until_said("event start|start conductor: common start")
     for name, fault in FAULTS.items():
-        four_rovers[name].send_signal(fault)
+        four_rovers[name][0].send_signal(fault)
     code, _ = flight.finish()
     assert code == 1
     said = flight.said()
@@ -319,23 +282,14 @@ def test_body_of_the_docs_refuses_wrong_addresses():
 
 
 def test_law_of_the_docs_pulls_to_its_distance():
-    names: dict[str, type] = {"__name__": "my_laws"}
-    exec(source_of("Spring"), names)
-    law, link = names["Spring"](constant=0.3), Link(0.5)
+    law, link = made_in_guide("Spring")(constant=0.3), Link(0.5)
     assert law.pull((1.0, 0.0, 0.0), link) == pytest.approx((-0.15, 0.0, 0.0))
     assert law.error((1.0, 0.0, 0.0), link) == pytest.approx(0.5)
     assert law.pull((0.0, 0.0, 0.0), link) == (0.0, 0.0, 0.0)
 
 
-def made(name, **parameters):
-    """A plug-in of the guide."""
-    names: dict[str, type] = {"__name__": "guide"}
-    exec(source_of(name), names)
-    return names[name](**parameters)
-
-
 def test_fading_of_the_docs_spends_what_it_saved():
-    trigger = made("Fading", threshold=0.0, floor=0.01, forget=0.1)
+    trigger = made_in_guide("Fading")(threshold=0.0, floor=0.01, forget=0.1)
     saved = Play(trigger, standing(100) + standing(1, (0.015, 0.0, 0.0)))
     assert not saved.fired[-1]
     assert Play(trigger, standing(1) + standing(1, (0.015, 0.0, 0.0))).fired[-1]
@@ -343,19 +297,14 @@ def test_fading_of_the_docs_spends_what_it_saved():
 
 def test_predictor_and_planner_of_the_docs():
     sent = SimpleNamespace(position=(1.0, 2.0, 0.0), velocity=(0.2, 0.0, 0.0))
-    assert made("Cautious", share=0.5).position(sent, 2.0) == pytest.approx((1.2, 2.0, 0.0))
-    assert made("Cautious").velocity(sent, 9.0) == pytest.approx((0.1, 0.0, 0.0))
-    shuttle = made("Shuttle", length=0.4, period_s=4.0)
+    assert made_in_guide("Cautious")(share=0.5).position(sent, 2.0) == pytest.approx((1.2, 2.0, 0.0))
+    assert made_in_guide("Cautious")().velocity(sent, 9.0) == pytest.approx((0.1, 0.0, 0.0))
+    shuttle = made_in_guide("Shuttle")(length=0.4, period_s=4.0)
     assert shuttle.target(3.0, (1.0, 0.0, 0.0), 0.0)[:3] == pytest.approx((1.3, 0.0, 0.0))
     assert shuttle.target(5.0, (1.0, 0.0, 0.0), 0.0)[:3] == pytest.approx((1.3, 0.0, 0.0))
 
 
 def test_avoidance_of_the_docs_stops_short():
-    own, near, avoidance = OwnState(), Nearby(), made("StopShort", gap=0.2)
-    near.reserve(1)
-    thing = near.add()
-    thing.x, thing.y = 0.15, 0.0
-    assert avoidance.deviate((1.0, 0.0, 0.5), own, near, 0.1) == (0.0, 0.0, 0.5)
-    near.count = 0
-    near.clear_rest(1)
-    assert avoidance.deviate((1.0, 0.0, 0.5), own, near, 0.1) == (1.0, 0.0, 0.5)
+    avoidance, goal, here = made_in_guide("StopShort")(), (0.5, 0.5, 0.5), own(KHEPERA4, (0.0, 0.0))
+    assert avoidance.deviate(goal, here, near((KHEPERA4.radius + 0.19, 0.0)), 0.01) == (0.0, 0.0, 0.5)
+    assert avoidance.deviate(goal, here, near((KHEPERA4.radius + 0.21, 0.0)), 0.01) == goal
