@@ -225,51 +225,7 @@ def test_a_calm_event_triggered_ring_does_not_turn():
     assert sent[0] < sent[1] / 5
 
 
-# ---------------------------------------------------------------- what is refused
-
-REFUSED = {
-    "no three": ('"A - B" = { distance = 0.5, offset = [0.5, 0.0] }', "one of the three"),
-    "none": ('"A - B" = { gain = 1.0 }', "give a distance or an offset"),
-    "no direction": ('"A - B" = { bearing = [0.0, 0.0] }', "no direction"),
-    "ends first": ('"A - B" = { distance = 0.5, from_s = 3.0, until_s = 2.0 }', "must be later than `from_s`"),
-    "after the end": ('"A - B" = { distance = 0.5, from_s = 99.0 }', "when the run of 40 s is over"),
-    "bearing for distances": ('"A - B" = { bearing = [1.0, 0.0] }', "needs a distance or an offset"),
-    "height": ('"A - C" = { offset = [0.5, 0.0, 0.2] }', "'C' is held 0.6 m above 'A', not 0.2 m"),
-    "nobody anchored": ('"A - B" = 0.5\n[formation.anchors]\nE = 1.0', "no robot is called 'E'"),
-    "line and plane": (
-        '"A - B" = 0.5\n[formation.anchors]\nA = { along = [1, 0], across = [1, 0] }', "give one of them"
-    ),
-    "no link to change": (
-        '"A - B" = 0.5\n[[formation.changes]]\nat_s = 1.0\nlinks = { "A - C" = 0.5 }', "none of the formation's links"
-    ),
-    "another sort": (
-        '"A - B" = 0.5\n[[formation.changes]]\nat_s = 1.0\nlinks = { "A - B" = { offset = [0.5, 0.0] } }',
-        "there is no way between them",
-    ),
-    "late change": ('"A - B" = 0.5\n[[formation.changes]]\nat_s = 50.0\nscale = 2.0', "when the run of 40 s is over"),
-    "turned distances": (
-        '"A - B" = 0.5\n[[formation.changes]]\nat_s = 1.0\nrotate = 2.0', "nothing here knows a direction"
-    ),
-    "near and far": ('"A - B" = 0.5\n[formation.proximity]\nrange = 1.0\nrelease = 0.9', "must not be nearer"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", REFUSED)
-def test_nonsense_is_refused_where_it_stands(written, name):
-    text, said = REFUSED[name]
-    with pytest.raises(document.DocumentError) as refused:
-        written(f"[formation.links]\n{text}\n")
-    (problem,) = refused.value.problems
-    assert said in f"{problem.message}; {problem.hint}"
-    assert problem.line > len(ROBOTS.splitlines())
-    assert problem.hint
-
-
-def test_a_law_that_needs_offsets_says_so(written):
-    with pytest.raises(document.DocumentError, match="needs an offset of every link"):
-        written('[formation]\nlaw = "displacement"\n[formation.links]\n"A - B" = 0.5\n')
-    with pytest.raises(document.DocumentError, match="there are no links"):
-        written("[formation.proximity]\nrange = 1.0\n")
+# ---------------------------------------------------------------- what `check` says
 
 
 @pytest.mark.usefixtures("unflown")

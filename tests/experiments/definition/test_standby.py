@@ -44,25 +44,6 @@ def experiment(**more: Any) -> Experiment:
     return msgspec.structs.replace(made, **more)
 
 
-@pytest.mark.parametrize(
-    ("change", "path", "said"),
-    [
-        ({"robots": {"A": msgspec.structs.replace(BOT, standby=True, process="p")}}, ("robots", "A", "process"), "own"),
-        ({"robots": {"A": msgspec.structs.replace(BOT, standby=True)}}, ("robots", "A", "standby"), "all robots"),
-        ({"spares": {"A": BOT}}, ("spares", "A"), "name of a robot already"),
-        ({"spares": {"S": msgspec.structs.replace(FLY, kind="tello")}}, ("spares", "S", "kind"), "no robot is a tello"),
-        ({"spares": {"S": msgspec.structs.replace(FLY, hover=None)}}, ("spares", "S"), "height to hold"),
-        ({"spares": {"S": msgspec.structs.replace(BOT, process="p")}}, ("spares", "S", "process"), "of its own"),
-        ({"spares": {"S": msgspec.structs.replace(BOT, body="khepera4-twin")}}, ("spares", "S", "body"), "before the"),
-        ({"spares": {"S": msgspec.structs.replace(BOT, body="nothing")}}, ("spares", "S", "body"), "no 'nothing'"),
-        ({"on_loss": "replace"}, ("on_loss",), "there is no spare"),
-    ],
-)  # fmt: skip
-def test_reserves_that_nobody_could_call_upon(change: dict[str, object], path: tuple[str, ...], said: str) -> None:
-    found = [(fault.path, f"{fault.message}; {fault.hint}") for fault in consistency.faults(Plan(experiment(**change)))]
-    assert any(where == path and said in what for where, what in found), found
-
-
 def test_what_is_right_is_not_complained_of() -> None:
     assert not list(consistency.faults(Plan(experiment(spares={"S": FLY, "T": BOT}, on_loss="replace"))))
 

@@ -1,9 +1,14 @@
+"""Places of values in TOML and JSON, and faults of JSON behind flags."""
+
 import tomllib
 
 import pytest
 
 from experiments.catalogue import index
-from experiments.file.problems import line_column, nearest, places
+from experiments.file.problems import DocumentError, line_column, nearest, places
+from experiments.file.structure import OBJECT, parse_object
+from twins.devices.device import Faults
+from twins.scene import Obstacle
 
 FORMS = '''\
 # every form that TOML has
@@ -68,7 +73,7 @@ def test_places(path, key, value):
     assert line_column(FORMS, place.value) == value
 
 
-def test_json():
+def test_json_places():
     text = '{\n "a\\u00e9": {"b/": [1, {"c": null}]},\n "d": "x, {}"\n}'
     found = places(text, json=True)
     assert line_column(text, found["aé", "b/", 1, "c"].key) == (2, 25)
@@ -80,3 +85,38 @@ def test_absent_path_has_the_nearest_place():
     found = places(FORMS)
     assert nearest(found, ("l", 1, "sub", "missing"))[0] == ("l", 1, "sub")
     assert nearest(found, ("missing", "a")) == ((), nearest(found, ())[1])
+
+
+@pytest.mark.parametrize(
+    ("text", "struct", "value"),
+    [('{"rc_hz": 20.0}', None, {"rc_hz": 20.0}), ('{"loss": 0.05}', Faults, {"loss": 0.05}), ("{}", Faults, {})],
+)
+def test_json_behind_a_flag_is_read(text, struct, value):
+    assert parse_object("--faults", text, struct) == value
+
+
+@pytest.mark.parametrize(
+    ("text", "message", "hint"),
+    [
+        ("[1]", "is no JSON object", OBJECT),
+        ("", "is not JSON: Input data was truncated", OBJECT),
+        ('{"radius": }', "is not JSON: invalid character (byte 11)", OBJECT),
+        ("[" * 6000, "is not JSON: maximum recursion depth exceeded while deserializing an object", OBJECT),
+        ('{"radius": -1}', "'radius' must be a number > 0, not -1", "of a cylinder [m]"),
+    ],
+)
+def test_wrong_json_behind_a_flag_has_a_remedy(text, message, hint):
+    with pytest.raises(DocumentError) as refused:
+        parse_object("--obstacle", text, Obstacle)
+    (problem,) = refused.value.problems
+    assert (problem.message, problem.hint) == (message, hint)
+    assert problem.file.startswith("--obstacle ")
+
+
+def test_all_faults_behind_a_flag_are_told():
+    with pytest.raises(DocumentError) as refused:
+        parse_object("--faults", '{"los": 1, "battery": "full"}', Faults)
+    assert [problem.message for problem in refused.value.problems] == [
+        "unknown key 'los'",
+        "'battery' must be a number, not 'full'",
+    ]
