@@ -1,7 +1,6 @@
 """[channel] of a file: what it means for each link, by name; and everything that can be wrong with it."""
 
 import numpy as np
-import pytest
 
 from agents.network import channel_model
 from experiments.definition import link_conditions
