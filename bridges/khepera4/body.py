@@ -14,6 +14,7 @@ from agents.clock import uptime
 from agents.network.messages import Inspection
 from agents.protocols import khepera4 as protocol
 from agents.vectors import Setpoint, Vector
+from bridges.khepera4.drivers import FIRST_ANSWER_S
 from bridges.khepera4.link import Khepera4Link, KheperaAddress
 
 OPEN_S: Final = 4.5  # deadline of the first odometry: that of a connection and of the first answer
@@ -22,7 +23,9 @@ OPEN_S: Final = 4.5  # deadline of the first odometry: that of a connection and 
 class KheperaBody(Body):
     """Khepera IV robots."""
 
-    def __init__(self, request: BodyRequest) -> None:
+    def __init__(self, request: BodyRequest, open_s: float = OPEN_S, first_answer_s: float = FIRST_ANSWER_S) -> None:
+        """Deadlines [s] of the first odometry, and of a server's first answer."""
+        self._open_s, self._first_answer_s = open_s, first_answer_s
         self._names = request.names
         self._addresses = [KheperaAddress.parse(*row) for row in zip(request.names, request.addresses, strict=True)]
         self._settings = [
@@ -39,9 +42,9 @@ class KheperaBody(Body):
         """See `Body.open`. Robots without answer are retried while the others drive."""
         self._claims.take()
         for place in zip(self._names, self._addresses, self._settings, self._start, strict=True):
-            self._links.append(Khepera4Link(*place))
+            self._links.append(Khepera4Link(*place, self._first_answer_s))
             self._links[-1].start()
-        deadline, pause = uptime() + OPEN_S, threading.Event()
+        deadline, pause = uptime() + self._open_s, threading.Event()
         while uptime() < deadline and any(
             link.odometry.stamp == -math.inf and not link.refused for link in self._links
         ):

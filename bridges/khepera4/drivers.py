@@ -274,7 +274,9 @@ class GoalPark(RoboticParkServer):
         self._ahead = math.hypot(*self._goal)
 
 
-def identify(wire: Wire, chosen: protocol.Khepera4Settings, server: str | None) -> RoboticParkServer:
+def identify(
+    wire: Wire, chosen: protocol.Khepera4Settings, server: str | None, first_answer_s: float = FIRST_ANSWER_S
+) -> RoboticParkServer:
     """Stop a park robot, and find out or make sure by the answer to `p` which `server` runs on it.
 
     Raises:
@@ -286,7 +288,7 @@ def identify(wire: Wire, chosen: protocol.Khepera4Settings, server: str | None) 
     time.sleep(protocol.GAP_S)
     wire.send(b"p")
     try:
-        answer = wire.receive(uptime() + max(FIRST_ANSWER_S, chosen.silence_s))
+        answer = wire.receive(uptime() + max(first_answer_s, chosen.silence_s))
     except TimeoutError as error:
         raise TimeoutError(
             "no answer to p; a server of 2023 serves one client in its life: restart it on the robot, for each case"

@@ -20,7 +20,7 @@ from agents.body.interface import FRESH_S, BodyError
 from agents.clock import uptime
 from agents.protocols import khepera4 as protocol
 from agents.ticks import Ticks
-from bridges.khepera4.drivers import Driver, KTeam, Wire, WrongServer, identify
+from bridges.khepera4.drivers import FIRST_ANSWER_S, Driver, KTeam, Wire, WrongServer, identify
 from bridges.khepera4.odometry import Odometer
 
 CONNECT_S: Final = 1.5
@@ -131,7 +131,12 @@ class Khepera4Link:
     """Thread of one robot. Odometry and setpoint are exchanged as whole objects, so neither side waits."""
 
     def __init__(
-        self, name: str, address: KheperaAddress, chosen: protocol.Khepera4Settings, start: tuple[float, float, float]
+        self,
+        name: str,
+        address: KheperaAddress,
+        chosen: protocol.Khepera4Settings,
+        start: tuple[float, float, float],
+        first_answer_s: float = FIRST_ANSWER_S,
     ) -> None:
         self.odometry = KheperaOdometry()
         self.scan: tuple[float, Sequence[float], Sequence[float]] | None = (
@@ -144,7 +149,7 @@ class Khepera4Link:
         self.server = ""  # that runs on the robot, by its answers; empty while not known
         self.trouble = f"{address}: not connected yet"  # for users; empty while connected
         self._address, self._settings, self._server = address, chosen, address.server_of(name, chosen)
-        self._odometer = Odometer(*start)
+        self._odometer, self._first_answer_s = Odometer(*start), first_answer_s
         self._stands = True  # by the last command that was answered
         self._stop_deadline = math.inf
         self._ending = threading.Event()
@@ -198,7 +203,7 @@ class Khepera4Link:
                         self.server = "kteam"
                         self._run_connection(KTeam(wire, self._settings))
                     else:
-                        park = identify(wire, self._settings, self._server)
+                        park = identify(wire, self._settings, self._server, self._first_answer_s)
                         self.server = next(name for name, kind in protocol.PARK.items() if kind is park.server)
                         self._run_connection(park)
                 except Exception as error:  # noqa: BLE001 - of any kind: the wheels must stop

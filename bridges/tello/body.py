@@ -28,7 +28,9 @@ OPEN_S: Final = 3.0  # deadline of a drone's first state line
 class TelloBody(Body):
     """Tellos. One process flies all Tellos of a computer."""
 
-    def __init__(self, request: BodyRequest) -> None:
+    def __init__(self, request: BodyRequest, open_s: float = OPEN_S) -> None:
+        """`open_s`: deadline of the first state line [s]."""
+        self._open_s = open_s
         self._names, self._kinds = request.names, request.kinds
         self._endpoints = [protocol.endpoint(*row) for row in zip(request.names, request.addresses, strict=True)]
         self._settings = [
@@ -64,7 +66,7 @@ class TelloBody(Body):
         self._ending.clear()
         self._thread = threading.Thread(target=self._run, args=(library,), name="tello pilots", daemon=True)
         self._thread.start()
-        deadline = uptime() + OPEN_S
+        deadline = uptime() + self._open_s
         while uptime() < deadline and any(pilot.state_received == -math.inf for pilot in self.pilots):
             self._ending.wait(0.02)
         if all(pilot.state_received == -math.inf for pilot in self.pilots):
@@ -143,12 +145,16 @@ class TelloBody(Body):
     def _run(self, library: TelloLibrary) -> None:
         period = 1.0 / max(chosen.rc_hz for chosen in self._settings)
         while not self._ending.wait(period):  # not by `Ticks`: a stop needs the lock, and gets it in this pause
-            with self._lock:
-                with contextlib.suppress(Exception):  # no datagram may end the thread
-                    library.receive()
-                now = uptime()
-                for pilot in self.pilots:
-                    try:
-                        pilot.step(now, self._last_read)
-                    except Exception as error:  # noqa: BLE001 - of any kind: the others fly on
-                        pilot.fail(error)
+            self.step(library)
+
+    def step(self, library: TelloLibrary) -> None:
+        """One round of the thread: receive datagrams, and let each pilot act."""
+        with self._lock:
+            with contextlib.suppress(Exception):  # no datagram may end the thread
+                library.receive()
+            now = uptime()
+            for pilot in self.pilots:
+                try:
+                    pilot.step(now, self._last_read)
+                except Exception as error:  # noqa: BLE001 - of any kind: the others fly on
+                    pilot.fail(error)

@@ -15,12 +15,11 @@ DT = 0.01
 
 
 class Lab:
-    """One robot, its twin, and the wire between the driver and it; also the clock of the driver."""
+    """One robot, its twin, the wire between the driver and it, and the clock of the driver."""
 
     def __init__(self, server, monkeypatch, *, named=True, **settings):
-        self.device = KheperaDevice(
-            DeviceRequest(request("khepera4", ["khepera4-twin"], device={"server": server}), Faults())
-        )
+        asked = request("khepera4", ["khepera4-twin"], device={"server": server})
+        self.device = KheperaDevice(DeviceRequest(asked, Faults()))
         self.program = self.device.servers[0].program
         self.now, self.due, self.gap_until = 0.0, DT, -math.inf
         self.queue, self.answers, self.heard = b"", b"", []
@@ -78,24 +77,29 @@ class Lab:
 
     # what drives
 
+    @property
     def truth(self):
         position, yaw = self.device.truth()
         return *position[0, :2].tolist(), float(yaw[0])
 
-    def exchange(self, v, turn, period=0.04):
-        """One period of the link."""
-        due = self.now + period
-        self.driver.drive(v, turn)
-        self.driver.move(self.odometer)
-        self.sleep(max(0.0, due - self.now))
+    def exchange(self, v, turn=0.0, periods=1):
+        """Periods of the link, of 40 ms each."""
+        for _ in range(periods):
+            due = self.now + 0.04
+            self.driver.drive(v, turn)
+            self.driver.move(self.odometer)
+            self.sleep(max(0.0, due - self.now))
 
     def go_to(self, goal, seconds):
-        law = PositionController(KHEPERA4)
-        until = self.now + seconds
+        law, until, at = PositionController(KHEPERA4), self.now + seconds, self.odometer
         while self.now < until:
-            at = self.odometer
             v, turn, _, _ = law.setpoint((*goal, 0.0), math.nan, (at.x, at.y, 0.0), at.yaw)
             self.exchange(v, turn)
+
+    def stands(self):
+        before = self.truth
+        self.exchange(0.0, periods=25)
+        return self.truth == before
 
     def close(self):
         self.device.servers[0].client = None

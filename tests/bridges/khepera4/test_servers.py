@@ -4,15 +4,10 @@ import math
 
 import pytest
 
-from agents.body.interface import FRESH_S, BodyError
-from agents.clock import uptime
 from agents.protocols import khepera4 as protocol
 from bridges.khepera4 import drivers
 from bridges.khepera4.drivers import WrongServer
-from bridges.khepera4.link import Khepera4Link, KheperaAddress
 from tests.bridges.khepera4.lab import Lab
-
-SERVERS = list(protocol.PARK)
 
 
 @pytest.fixture
@@ -28,40 +23,31 @@ def lab(monkeypatch):
         each.close()
 
 
-@pytest.fixture(params=SERVERS)
+@pytest.fixture(params=protocol.PARK)
 def robot(lab, request):
     """A robot with each of the servers."""
     return lab(request.param)
 
 
-def stands(robot):
-    before = robot.truth()
-    for _ in range(25):
-        robot.exchange(0.0, 0.0)
-    return robot.truth() == before
-
-
 @pytest.mark.parametrize(("goal", "seconds"), [((0.6, 0.0), 15.0), ((0.3, 0.3), 12.0)])
 def test_motion_within_5_percent_of_what_was_asked(robot, goal, seconds):
     robot.go_to(goal, seconds)
-    x, y, _ = robot.truth()
+    x, y, _ = robot.truth
     assert math.hypot(x - goal[0], y - goal[1]) < 0.05 * math.hypot(*goal)
     assert (robot.odometer.x, robot.odometer.y) == pytest.approx((x, y), abs=0.006)
-    assert stands(robot)
+    assert robot.stands()
 
 
 def test_a_goal_behind_is_reached(robot):
     robot.go_to((-0.3, 0.05), 18.0)
-    assert robot.truth()[:2] == pytest.approx((-0.3, 0.05), abs=0.015)
+    assert robot.truth[:2] == pytest.approx((-0.3, 0.05), abs=0.015)
 
 
 def test_speeds_are_those_that_were_asked_for(robot):
-    for _ in range(10):
-        robot.exchange(0.08, 0.3)
-    x, y, yaw = robot.truth()
-    for _ in range(50):
-        robot.exchange(0.08, 0.3)
-    now = robot.truth()
+    robot.exchange(0.08, 0.3, periods=10)
+    x, y, yaw = robot.truth
+    robot.exchange(0.08, 0.3, periods=50)
+    now = robot.truth
     assert now[2] - yaw == pytest.approx(0.6, rel=0.05)
     chord = 0.08 / 0.3 * 2.0 * math.sin(0.3)
     assert math.hypot(now[0] - x, now[1] - y) == pytest.approx(chord, rel=0.05)
@@ -69,52 +55,61 @@ def test_speeds_are_those_that_were_asked_for(robot):
 
 
 def test_link_gap_ends_in_stop_over_same_connection(robot):
-    for _ in range(25):
-        robot.exchange(0.1, 0.0)
-    begin, x = robot.now, robot.truth()[0]
+    robot.exchange(0.1, periods=25)
+    begin, x = robot.now, robot.truth[0]
     robot.gap_until = begin + 0.7
     with pytest.raises(TimeoutError):
-        robot.exchange(0.1, 0.0)
+        robot.exchange(0.1)
     robot.driver.patience_s = 0.2  # as `Khepera4Link` does
     while True:
         try:
-            robot.exchange(0.0, 0.0)
+            robot.exchange(0.0)
             break
         except TimeoutError:
             assert robot.now < begin + 1.5
     robot.sleep(0.1)
-    assert stands(robot)
-    assert robot.truth()[0] - x < 0.1  # all that it drove since the gap began
-    assert robot.odometer.x == pytest.approx(robot.truth()[0], abs=0.02)  # what it drove unheard is estimated
+    assert robot.stands()
+    assert robot.truth[0] - x < 0.1  # all that it drove since the gap began
+    assert robot.odometer.x == pytest.approx(robot.truth[0], abs=0.02)  # what it drove unheard is estimated
 
 
 def test_command_that_waited_too_long_becomes_a_stop(robot):
-    for _ in range(25):
-        robot.exchange(0.1, 0.0)
+    robot.exchange(0.1, periods=25)
     robot.driver.drive(0.1, 0.0, robot.now - 0.1)  # the process was suspended between decision and sending
     robot.driver.move(robot.odometer)
     robot.sleep(0.2)
-    assert stands(robot)
-
-
-def test_command_is_as_old_as_its_state():
-    link = Khepera4Link(
-        "KH01", KheperaAddress.parse("KH01", "khepera4://127.0.0.1"), protocol.Khepera4Settings(), (0.0, 0.0, 0.0)
-    )
-    link.drive(0.1, 0.2, uptime())
-    assert link.current_twist()[:2] == (0.1, 0.2)
-    assert link.current_twist()[2] == pytest.approx(uptime() + FRESH_S, abs=0.4)
-    link.drive(0.1, 0.2, uptime() - FRESH_S - 3.0)  # read before a suspension, commanded after it
-    assert link.current_twist()[:2] == (0.0, 0.0)
+    assert robot.stands()
 
 
 def test_nothing_sent_looks_like_a_goal_to_servers(robot):
-    for _ in range(5):
-        robot.exchange(0.1, 0.0)
+    robot.exchange(0.1, periods=5)
     goals = [read for read in robot.heard if read[:1] == b"g"]
     assert not robot.driver.ranged
     assert bool(goals) == (not robot.driver.server.drives)
     assert b"get_data" not in goals
+
+
+def test_way_during_machine_sleep_is_counted(robot):
+    """The robot drives on; the machine's monotonic clock leaves the sleep out, its uptime does not."""
+    robot.exchange(0.1, periods=25)
+    x, counted = robot.truth[0], robot.odometer.x
+    robot.sleep(10.0)
+    robot.monotonic = lambda: robot.now - 10.0
+    robot.exchange(0.0, periods=25)
+    assert robot.odometer.x - counted == pytest.approx(robot.truth[0] - x, abs=0.1)
+
+
+def test_way_that_is_reported_late_is_counted_once(lab):
+    robot = lab("2023-01-07")
+    robot.driver.patience_s = 0.2
+    robot.exchange(0.2)
+    robot.gap_until = robot.now + 0.5
+    for _ in range(2):
+        with pytest.raises(TimeoutError):
+            robot.exchange(0.0)
+    robot.sleep(0.3)
+    robot.exchange(0.0, periods=20)
+    assert robot.odometer.x == pytest.approx(robot.truth[0], abs=0.001)
 
 
 @pytest.mark.parametrize("server", ["2023-04-10", "2025-05"])
@@ -138,18 +133,6 @@ def test_server_other_than_the_named_is_refused(lab):
     assert set(robot.heard) == {b"stop", b"p"}
 
 
-def test_way_during_machine_sleep_is_counted(robot):
-    """The robot drives on; the machine's monotonic clock leaves the sleep out, its uptime does not."""
-    for _ in range(25):
-        robot.exchange(0.1, 0.0)
-    x, counted = robot.truth()[0], robot.odometer.x
-    robot.sleep(10.0)
-    robot.monotonic = lambda: robot.now - 10.0
-    for _ in range(25):
-        robot.exchange(0.0, 0.0)
-    assert robot.odometer.x - counted == pytest.approx(robot.truth()[0] - x, abs=0.1)
-
-
 def test_first_answer_may_take_seconds(lab):
     """A server of 2023 has one client in its life: one that does not wait for its answer is lost."""
     robot = lab("2025-05")
@@ -163,41 +146,3 @@ def test_first_answer_may_take_seconds(lab):
 
     robot.receive = late
     assert drivers.identify(robot, protocol.Khepera4Settings(), None).server == protocol.PARK["2025-05"]
-
-
-def test_way_that_is_reported_late_is_counted_once(lab):
-    robot = lab("2023-01-07")
-    robot.driver.patience_s = 0.2
-    robot.exchange(0.2, 0.0)
-    robot.gap_until = robot.now + 0.5
-    for _ in range(2):
-        with pytest.raises(TimeoutError):
-            robot.exchange(0.0, 0.0)
-    robot.sleep(0.3)
-    for _ in range(20):
-        robot.exchange(0.0, 0.0)
-    assert robot.odometer.x == pytest.approx(robot.truth()[0], abs=0.001)
-
-
-@pytest.mark.parametrize(
-    ("address", "device", "server"),
-    [
-        ("khepera4://h", {}, None),
-        ("khepera4://h?server=fork", {}, "fork"),
-        ("khepera4://h", {"server": "2023-01-07"}, "2023-01-07"),
-        ("khepera4://h?server=fork", {"server": "fork"}, "fork"),
-        ("kteam://h:1", {"server": "kteam"}, "kteam"),
-    ],
-)
-def test_server_is_named_in_address_or_table(address, device, server):
-    assert KheperaAddress.parse("R0", address).server_of("R0", protocol.Khepera4Settings(**device)) == server
-
-
-@pytest.mark.parametrize(
-    ("address", "device"),
-    [("khepera4://h?server=fork", {"server": "2025-05"}), ("kteam://h:1", {"server": "fork"}),
-     ("khepera4://h", {"server": "kteam"})],
-)  # fmt: skip
-def test_address_and_table_must_not_contradict_one_another(address, device):
-    with pytest.raises(BodyError, match=r"R0: h:.*: device\.server is "):
-        KheperaAddress.parse("R0", address).server_of("R0", protocol.Khepera4Settings(**device))

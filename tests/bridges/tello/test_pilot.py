@@ -1,0 +1,331 @@
+"""The pilot of a Tello against a drone made of lists and a clock made of numbers."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from agents.body.interface import UNANSWERED
+from agents.protocols import tello as protocol
+from bridges.tello.pilot import Duty
+from tests.bridges.tello.cockpit import Cockpit
+
+SPEED = st.floats(-1.0, 1.0)
+
+
+@pytest.fixture
+def standing():
+    return Cockpit()
+
+
+@pytest.fixture
+def flown():
+    return Cockpit().fly()
+
+
+@given(SPEED, SPEED, SPEED, st.floats(-1.7, 1.7), st.floats(-10.0, 10.0))
+def test_sticks_say_the_velocity_in_the_world(x, y, z, turn, yaw):
+    rc = protocol.sticks((x, y, z), turn, yaw)
+    assert all(isinstance(stick, int) and abs(stick) <= 100 for stick in rc)
+    if abs(np.cos(yaw) * x + np.sin(yaw) * y) <= 1.0 and abs(np.cos(yaw) * y - np.sin(yaw) * x) <= 1.0:
+        assert protocol.motion(rc, yaw) == pytest.approx((x, y, z, turn), abs=0.01)
+
+
+def test_sticks_by_hand():
+    assert protocol.sticks((0.5, 0.0, 0.0), 0.0, 0.0) == (0, 50, 0, 0)
+    assert protocol.sticks((0.0, 0.5, 0.2), np.radians(30.0), 0.0) == (-50, 0, 20, -30)
+    assert protocol.sticks((0.0, 0.5, 0.0), 0.0, np.pi / 2) == (0, 50, 0, 0)
+    assert protocol.sticks((9.0, 0.0, -9.0), 9.0, 0.0) == (0, 100, -100, -100)
+
+
+# ---------------------------------------------------------------------- take-off
+
+
+def test_take_off_is_sent_once_and_answered_aloft(standing):
+    standing.pass_(0.2).responses.append(b"ok")  # of something that was said before
+    standing.take_off(0.6, rested_s=0.0).pass_(0.5)
+    assert (standing.flying, standing.duty) == (True, Duty.RISE)
+    standing.answer(b"ok").pass_(2.9)  # too early: no drone is up by then
+    assert standing.duty is Duty.RISE
+    standing.answer(b"ok\r\n")
+    assert standing.duty is Duty.HOLD
+    assert standing.said == ["takeoff"]
+
+
+@pytest.mark.parametrize("answer", [b"error", b"out of range", b"unknown command: takeoff"])
+def test_a_drone_that_refuses_says_so(standing, answer):
+    standing.take_off(0.6).answer(answer)
+    assert standing.duty is Duty.REST
+    assert "refuses to take off" in standing.note
+
+
+def test_refused_second_take_off_means_it_flies(standing):
+    standing.take_off(0.6).pass_(2.0, h=80).answer(b"error")
+    assert standing.duty is Duty.HOLD
+
+
+def test_lost_answers_and_lost_commands(standing):
+    standing.take_off(0.6).pass_(6.5)  # nothing happens: the command was lost
+    assert standing.said == ["takeoff", "takeoff"]
+    standing.pass_(6.5, h=80, time=6)  # it is up: the answer was lost
+    assert standing.duty is Duty.HOLD
+    standing.land()
+    standing.pass_(2.2)
+    assert standing.said[2:] == ["land", "land", "land"]
+    standing.pass_(3.3, h=10)  # it is down, its motors' clock stands
+    assert (standing.duty, standing.flying) == (Duty.REST, False)
+
+
+def test_a_drone_that_never_gets_up_is_landed(standing):
+    standing.take_off(0.6).pass_(20.2)
+    assert standing.said[-1] == "land"
+    standing.pass_(1.2)  # it may have obeyed the last of the orders to take off, 3 s ago
+    assert not standing.flying
+    assert "did not take off in 20 s" in standing.note
+
+
+# ---------------------------------------------------------------------- flight
+
+
+def test_tello_climbs_and_holds_until_setpoints_come(flown):
+    flown.pilot.position, flown.pilot.yaw = (0.9, 2.0, 0.8), 0.0
+    assert flown.pass_(0.05).sticks[-1] == (0, 10, -20, 0)
+    flown.pilot.position = (np.nan,) * 3
+    assert flown.pass_(0.05).sticks[-1] == (0, 0, 0, 0)
+    flown.aim(0.0, 0.3, 0.0, 0.0)
+    assert flown.pass_(0.5).sticks[-1] == (-30, 0, 0, 0)
+    assert flown.pass_(0.1).sticks[-1] == (0, 0, 0, 0), "a setpoint of half a second ago is none"
+    assert len(flown.forget().pass_(10.0).sticks) == 200, "the sticks keep it alive"
+
+
+def test_sticks_of_another_scale():
+    """A drone that flies 0.5 m/s at full deflection gets twice the sticks of one that flies 1 m/s."""
+    cockpit = Cockpit(stick_speed=0.5).fly()
+    cockpit.pilot.position, cockpit.pilot.yaw = (0.9, 2.0, 0.6), 0.0
+    assert cockpit.pass_(0.05).sticks[-1] == (0, 20, 0, 0)
+    cockpit.aim(0.0, 0.2, 0.0, 0.0)
+    assert cockpit.pass_(0.05).sticks[-1] == (-40, 0, 0, 0)
+
+
+def test_the_stick_test_closes_no_loop():
+    """Forward for 2 s, back for 2 s, whatever setpoints say; with the position lost the sticks rest."""
+    cockpit, given = Cockpit(stick_test=True).fly(), []
+    for _ in range(70):
+        cockpit.aim(0.5, 0.5, 0.5, 0.5)
+        given.append(cockpit.pass_(0.1).sticks[-1])
+    forward = [sticks[1] for sticks in given]
+    assert {sticks[:1] + sticks[2:] for sticks in given[:68]} == {(0, 0, 0)}
+    assert (forward.count(20), forward.count(-20)) == (20, 20)
+    assert forward.index(20) == pytest.approx(9, abs=1)
+    assert given[-1] == (-50, 50, 50, -29)  # it is over
+    lost = Cockpit(stick_test=True).fly()
+    lost.pilot.position = (np.nan,) * 3
+    assert lost.pass_(2.0).sticks[-1] == (0, 0, 0, 0)
+
+
+def test_a_climb_with_markers_on_the_floor_ends(flown):
+    flown.pilot.position = (1.0, 2.0, 0.02)
+    assert flown.pass_(1.0, h=150, time=5).duty is Duty.HOLD
+    assert flown.pass_(0.2, h=170).duty is Duty.LAND
+    assert flown.said[-1] == "land"
+    assert flown.pilot.trouble == "landing: it is 1.7 m high, and its positions do not rise with it"
+
+
+def test_process_woken_from_suspension_sends_nothing_stale(flown):
+    """Suspended in the middle of a step, which is a stick of before; then it lands, as it does in a take-off."""
+    flown.aim(0.0, 0.3, 0.0, 0.0)
+    read, flown.stall_s = flown.now, 3.0
+    flown.pilot.step(flown.now, read)
+    assert flown.sticks == []
+    flown.now, flown.stall_s = flown.now + 3.0, 0.0
+    flown.pilot.step(flown.now, read)
+    assert (flown.duty, flown.sticks, flown.said) == (Duty.LAND, [(0, 0, 0, 0)], ["land"])
+    rising = Cockpit().take_off(0.6).forget()
+    rising.pilot.step(rising.now + 8.0, rising.now)
+    assert rising.said == ["land"]
+
+
+def test_a_process_that_does_nothing_loses_its_drone(flown):
+    flown.attended = False
+    assert flown.pass_(0.1).duty is Duty.LAND
+    assert "its process did nothing for 2 s" in flown.note
+
+
+def test_a_low_battery_brings_it_down():
+    cockpit = Cockpit(low_battery=0.2).fly().pass_(0.2, bat=19)
+    assert (cockpit.duty, cockpit.pilot.battery) == (Duty.LAND, 0.19)
+    assert cockpit.note == "landing: battery at 19%"
+
+
+def test_a_drone_that_landed_by_itself_is_seen(flown):
+    assert not flown.pass_(3.5, h=0).flying
+    assert flown.note == "landed by itself, battery at 80%"
+
+
+def test_drone_that_flies_unordered_is_landed(standing):
+    standing.pass_(5.0).pass_(5.0, h=120)
+    assert not standing.flying, "carried: its motors stand"
+    standing.report["h"] = 0
+    for second in range(1, 4):
+        standing.pass_(1.0, time=second)
+    assert (standing.duty, standing.flying) == (Duty.REST, False)  # low: carried, or on the floor
+    standing.pass_(0.1, h=80)
+    assert (standing.said[-1], standing.flying) == ("land", True)
+    assert standing.note == "landing: it flew without an order"
+
+
+def test_refused_sticks_are_counted(flown):
+    assert flown.answer(b"error", b"error Not joystick").note == ""
+    assert flown.answer(b"error Not joystick").note == "refuses the sticks, 3 times: 'error Not joystick'"
+    assert flown.pass_(1.1).note == ""
+
+
+def test_a_network_that_is_down_is_named(flown):
+    flown.broken = True
+    flown.pass_(0.05)
+    flown.land()
+    flown.cut()
+    assert "cannot send: Network is unreachable" in flown.note
+    flown.broken = False
+    assert flown.pass_(0.2).note == ""
+
+
+def test_yaw_counts_from_where_it_was_opened(standing):
+    assert standing.pass_(0.2).pilot.turned == 0.0
+    assert standing.pass_(0.2, yaw=-70).pilot.turned == pytest.approx(np.pi / 2), "clockwise is positive to the drone"
+    standing.pass_(0.2, yaw="garbled", bat=None, h="", time=1.5)
+    assert standing.pilot.turned == pytest.approx(np.pi / 2)
+    assert standing.pilot.battery == 0.8
+
+
+# ---------------------------------------------------------------------- landing
+
+
+def test_landing_ends_when_answered_and_low(flown):
+    flown.land()
+    assert flown.answer(b"ok").duty is Duty.LAND  # of the sticks: some firmware answers them
+    assert flown.pass_(0.5, h=0).answer(b"ok").duty is Duty.REST
+
+
+class Climber(Cockpit):
+    """Rises to 0.8 m in 4 s and answers `land` with "error" meanwhile; then obeys."""
+
+    up_at = landed_at = np.inf
+
+    def send_command_without_return(self, command):
+        super().send_command_without_return(command)
+        if command == "takeoff":
+            self.up_at = min(self.up_at, self.now)
+        elif command == "land" and self.now - self.up_at < 4.0:
+            self.responses.append(b"error")
+        elif command == "land":
+            self.landed_at = min(self.landed_at, self.now)
+
+    def fly_on(self, seconds):
+        for _ in range(round(seconds / 0.05)):
+            aloft = self.up_at < self.now < self.landed_at
+            risen = max(0.0, min(80.0, 30.0 * (self.now - self.up_at - 1.0))) if aloft else 0.0
+            ran = max(0.0, min(self.now, self.landed_at) - self.up_at)
+            self.pass_(0.05, h=10 * int(risen / 10.0), time=int(ran))
+
+
+def test_refused_landing_is_repeated_until_down():
+    climber = Climber().take_off(0.8, rested_s=5.0)
+    climber.fly_on(0.7)
+    climber.land()
+    climber.fly_on(0.3)
+    assert (climber.duty, climber.report["h"]) == (Duty.LAND, 0)
+    climber.fly_on(4.0)
+    assert climber.said.count("land") == 5
+    assert climber.landed_at < climber.now
+    climber.fly_on(4.0)
+    assert not climber.flying
+
+
+def test_landing_before_the_motors_start_is_repeated(standing):
+    """A drone that rested for long and has just been told to take off is not on the ground for that."""
+    standing.take_off(0.8, rested_s=10.0).pass_(0.1)
+    standing.land()
+    standing.answer(b"ok").pass_(1.0)  # of anything but a landing: no drone is down again so soon
+    assert standing.duty is Duty.LAND
+    assert standing.said[-2:] == ["land", "land"]
+
+
+def test_drone_that_does_not_land_rests_its_sticks(flown):
+    """It keeps the last sticks that it was told."""
+    flown.aim(0.5, 0.0, 0.0, 0.0)
+    assert flown.pass_(0.1).sticks[-1] == (0, 50, 0, 0)
+    flown.forget().land()
+    assert flown.pass_(1.0).sticks == [(0, 0, 0, 0)], "a landing that is obeyed is left alone"
+    assert flown.answer(b"error").sticks == [(0, 0, 0, 0)] * 2
+
+
+def test_height_of_motion_capture_counts_in_the_air(standing):
+    """A drone without a counter of motor seconds whose own height stays at zero."""
+    del standing.report["time"]
+    standing.take_off(1.0, at=(0.0, 0.0, 0.05)).pass_(3.0)
+    standing.responses.append(b"ok")
+    standing.pilot.position = (0.0, 0.0, 1.0)
+    assert standing.pass_(5.0).duty is Duty.HOLD
+    standing.land()
+    assert standing.answer(b"ok").duty is Duty.LAND
+    standing.pilot.position = (0.0, 0.0, 0.05)
+    assert standing.pass_(3.2).duty is Duty.REST
+
+
+def test_silent_drone_is_landed_until_surely_down(flown):
+    flown.speaks = False
+    flown.pass_(1.2)
+    assert flown.pilot.silent(flown.now)
+    assert flown.note.startswith("silent for 1 s")
+    flown.land()
+    assert flown.forget().pass_(5.05).said == ["land"] * 5
+    assert flown.flying
+    assert not flown.pass_(15.0).flying
+    assert "landed by itself" in flown.note
+    assert flown.forget().pass_(1.0).said == ["command"] * 2  # once on again, it must be put into SDK mode
+    flown.speaks = True
+    assert not flown.pass_(0.2).pilot.silent(flown.now)
+
+
+def test_drone_left_aloft_lands_when_process_ends(flown):
+    flown.pilot.leave()
+    assert flown.said == ["land"] * 5 + ["(end)"]
+
+
+# ---------------------------------------------------------------------- emergency stop
+
+
+def test_emergency_stop_is_repeated_until_motors_stand(flown):
+    flown.cut()
+    assert flown.said == ["emergency"]
+    flown.cut()  # the loop's own stop, after that of the thread that receives
+    for second in range(4, 9):  # all are lost: the clock of its motors runs on
+        assert flown.pass_(1.0, time=second).said == ["emergency"] * (2 + 20 * (second - 3))
+        assert flown.flying
+        assert (UNANSWERED in flown.note) == (second > 5)
+    assert flown.pass_(0.4, h=0).flying  # one is heard
+    assert flown.pass_(0.3).duty is Duty.REST
+    assert flown.note == ""
+    assert flown.forget().pass_(1.0).said == []
+
+
+def test_silent_drone_is_stopped_until_surely_landed(flown):
+    flown.speaks = False
+    flown.cut()
+    assert flown.forget().pass_(19.0).said == ["emergency"] * 380
+    assert UNANSWERED in flown.note
+    assert flown.pass_(1.2).duty is Duty.REST
+    assert "landed by itself" in flown.note
+
+
+def test_standing_drone_answers_a_stop_at_once(standing):
+    standing.pass_(2.0).cut()
+    assert standing.said[-1] == "emergency"
+    assert not standing.pass_(0.05).flying
+
+
+def test_stopped_take_off_counts_as_flying_until_standing(standing):
+    standing.take_off(0.6, rested_s=5.0).pass_(0.1).cut()  # its motors' clock has not moved yet
+    assert standing.pass_(1.4).flying
+    assert not standing.pass_(0.5).flying
