@@ -21,7 +21,7 @@ from bridges.crazyflie.flight import FlightControl, FlightPhase
 from bridges.crazyflie.link import BUSY_S
 from bridges.crazyflie.pilot import LOGS_S, LOOP_HZ
 from bridges.crazyflie.telemetry import Telemetry
-from tests.twins.loopback import request
+from tests.requests import request
 from twins.devices.crazyflie.device import CrazyflieTwin
 from twins.devices.crazyflie.tables import LOG_CODES, PACKINGS
 from twins.devices.device import DeviceRequest, Faults

@@ -9,7 +9,8 @@ import numpy as np
 from agents.vectors import NO_SETPOINT
 from bridges.crazyflie.body import CrazyflieBody
 from tests.bridges.columns import Columns
-from tests.twins.loopback import Served, request
+from tests.requests import request
+from tests.twins.loopback import Served
 from twins.devices.crazyflie.device import CrazyflieTwin
 from twins.devices.crazyflie.supervisor import SupervisorState
 

@@ -14,7 +14,7 @@ from bridges.khepera4.link import KheperaAddress
 from bridges.tello.body import TelloBody
 from bridges.turtlebot3.body import TurtleBot3
 from tests.bridges import turtlebots
-from tests.twins.loopback import request
+from tests.requests import request
 
 
 @pytest.fixture(autouse=True)

@@ -12,7 +12,7 @@ from agents.body.interface import BodyError
 from agents.protocols.crtp import MemoryKind
 from bridges.crazyflie.body import CrazyflieBody
 from tests.bridges.crazyflie_flight import Process, flown, supervised, truth
-from tests.twins.loopback import request
+from tests.requests import request
 from twins.devices.crazyflie.supervisor import SupervisorState
 
 pytestmark = pytest.mark.system

@@ -11,7 +11,8 @@ from agents.protocols.crtp import Port
 from bridges.crazyflie import body, link, pilot
 from bridges.crazyflie.body import CrazyflieBody
 from tests.bridges.crazyflie_flight import Process, flown, supervised, truth
-from tests.twins.loopback import Served, request
+from tests.requests import request
+from tests.twins.loopback import Served
 from twins.devices.crazyflie.device import CrazyflieTwin
 from twins.devices.crazyflie.supervisor import SupervisorState
 

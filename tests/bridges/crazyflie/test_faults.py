@@ -17,7 +17,8 @@ from bridges.crazyflie import link
 from bridges.crazyflie.body import CrazyflieBody
 from bridges.crazyflie.telemetry import Telemetry
 from tests.bridges.crazyflie_flight import Process, flown, supervised, truth
-from tests.twins.loopback import Served, request
+from tests.requests import request
+from tests.twins.loopback import Served
 from tests.waiting import until
 from twins.devices.crazyflie.device import CrazyflieTwin
 from twins.devices.crazyflie.supervisor import SupervisorState

@@ -7,7 +7,7 @@ from agents.kinds.khepera4 import KHEPERA4
 from agents.protocols import khepera4 as protocol
 from bridges.khepera4 import drivers
 from bridges.khepera4.odometry import Odometer
-from tests.twins.loopback import request
+from tests.requests import request
 from twins.devices.device import DeviceRequest, Faults
 from twins.devices.khepera4 import KheperaDevice
 

@@ -26,7 +26,8 @@ from bridges.khepera4.body import OPEN_S, KheperaBody
 from bridges.khepera4.link import Khepera4Link, KheperaAddress, KheperaOdometry
 from bridges.khepera4.odometry import Odometer
 from tests.bridges.driver import Driver, constant, toward
-from tests.twins.loopback import Served, reached, request
+from tests.requests import request
+from tests.twins.loopback import Served, reached
 from tests.waiting import until
 from twins.devices.device import DeviceRequest, Faults
 from twins.devices.khepera4 import KheperaDevice, answer_kteam
@@ -407,10 +408,12 @@ def recording(*, lives=1, hangs_up=lambda _reads: False):
 
 @pytest.mark.system
 def test_park_never_gets_two_commands_at_once():
-    with recording() as (place, clients):
-        with opened(request("khepera4", [place], device={"ranges": True}), (1.0, 0.0)) as driver:
-            driver.until(lambda: len(clients[0]) > 60)
-            scan = driver.state.scan[0]
+    with (
+        recording() as (place, clients),
+        opened(request("khepera4", [place], device={"ranges": True}), (1.0, 0.0)) as driver,
+    ):
+        driver.until(lambda: len(clients[0]) > 60)
+        scan = driver.state.scan[0]
     reads = [text for text, _ in clients[0]]
     assert {text.split()[0] for text in reads} == {"d", "p", "get_data", "stop"}
     assert all(len(text.split()) == 3 for text in reads if text[0] == "d")
@@ -428,9 +431,11 @@ def test_wheels_with_link_broken_at_end_are_stopped():
         texts = [text for text, _ in clients[-1]]
         return len(clients) == 1 and any(text[0] == "d" for text in texts) and texts[-1] == "stop"
 
-    with recording(lives=2, hangs_up=hangs_up) as (place, clients):
-        with opened(request("khepera4", [place]), (1.0, 0.0)) as driver:
-            driver.until(lambda: any(text[0] == "d" for text, _ in clients[0]))
+    with (
+        recording(lives=2, hangs_up=hangs_up) as (place, clients),
+        opened(request("khepera4", [place]), (1.0, 0.0)) as driver,
+    ):
+        driver.until(lambda: any(text[0] == "d" for text, _ in clients[0]))
     assert len(clients) == 2
     assert [text for text, _ in clients[1]][-2:] == ["stop", "p"]
 

@@ -17,7 +17,8 @@ from agents.body.interface import BodyError
 from agents.kinds.tello import TELLO
 from bridges.tello.body import TelloBody
 from tests.bridges.driver import Driver, toward
-from tests.twins.loopback import Served, reached, request
+from tests.requests import request
+from tests.twins.loopback import Served, reached
 from twins.devices.tello import TelloDevice
 
 ONE = request("tello", ["tello-twin"], external=True)

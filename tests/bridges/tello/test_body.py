@@ -22,7 +22,7 @@ from bridges.tello.library import TelloLibrary
 from bridges.tello.pilot import Duty
 from tests.bridges.tello.cockpit import Cockpit
 from tests.conftest import ROOT
-from tests.twins.loopback import request
+from tests.requests import request
 
 NOTHING_COMES = SimpleNamespace(receive=lambda: None)
 
