@@ -1,5 +1,9 @@
 """Messages of a run of two robots, and recordings made of them."""
 
+import resource
+from contextlib import contextmanager
+
+import msgspec
 import numpy as np
 
 from agents.network.messages import Contact, Event, ObstaclePose, Pose, PoseReceipt, State, Status, WorldState
@@ -8,11 +12,7 @@ from experiments.definition.plan import Plan
 from experiments.recording.writer import Recording
 
 START = 1_760_000_000.0
-
-
 DOCUMENT = 'title = "pair"  # as it was written\n'
-
-
 PAIR = Experiment(
     title="pair",
     robots={"TB01": RobotTable("turtlebot3", [0.0, 0.0]), "CF01": RobotTable("crazyflie", [1.0, 0.0], hover=0.8)},
@@ -24,54 +24,18 @@ PAIR = Experiment(
 
 def state(robot="TB01", seq=1, at=0.0, x=0.0, **more):
     known = {
-        "robot": robot,
-        "seq": seq,
-        "stamp": START + at,
-        "phase": "run",
-        "position": (x, 0.0, 0.0),
-        "velocity": (0.1, 0.2, 0.3),
-        "yaw": 0.0,
-        "goal": (x + 1.0, 2.0, 3.0),
-        "setpoint": (x, 0.0, 0.5, 0.25),
-        "error": 0.05,
-    }
-    return State(**known | more)
+        "phase": "run", "position": (x, 0.0, 0.0), "velocity": (0.1, 0.2, 0.3), "yaw": 0.0,
+        "goal": (x + 1.0, 2.0, 3.0), "setpoint": (x, 0.0, 0.5, 0.25), "error": 0.05,
+    }  # fmt: skip
+    return State(robot, seq, START + at, **known | more)
 
 
 def pose(robot="TB01", seq=1, at=0.0, x=0.0):
     return Pose(robot, seq, START + at, (x, 0.5, 0.0), (0.1, 0.2, 0.3), 0.4)
 
 
-def status(
-    robot="TB01",
-    at=1.0,
-    *,
-    sent=0,
-    lost=None,
-    dropped=None,
-    foreign=None,
-    started=START,
-    pid=7,
-    ticks=0,
-    missed=0,
-    decisions=0,
-):
-    return Status(
-        robot=robot,
-        stamp=START + at,
-        phase="run",
-        reason="",
-        sent=sent,
-        lost=lost or {},
-        foreign=foreign or {},
-        dropped=dropped or {},
-        ticks=ticks,
-        missed=missed,
-        decisions=decisions,
-        started=started,
-        pid=pid,
-        rss_mb=1.0,
-    )
+def status(robot="TB01", at=1.0, **more):
+    return Status(robot, START + at, "run", "", **{"started": START, "pid": 7, "rss_mb": 1.0} | more)
 
 
 def begun(at=0.0):
@@ -83,43 +47,30 @@ def landed(at=1.0, text="landing"):
 
 
 def write(path, *messages, experiment=PAIR, **more):
-    """Records messages as they come; a pose is received 2 ms after its stamp, with 150 bytes."""
-    with Recording(
-        path, Plan(experiment), DOCUMENT, **{"case": "only", "seed": 4, "clock": "real"} | more
-    ) as recording:
-        put(recording, messages)
-        return recording
+    """Record messages as they come; a pose is received 2 ms after its stamp, with 150 bytes."""
+    with recording(path, experiment, **more) as made:
+        put(made, messages)
+        return made
+
+
+def recording(path, experiment=PAIR, document=DOCUMENT, **more):
+    return Recording(path, Plan(experiment), document, **{"case": "only", "seed": 4, "clock": "real"} | more)
 
 
 def put(recording, messages):
     for message in messages:
-        if isinstance(message, Pose):
-            recording.write(message, message.stamp + 0.002, 150)
-        else:
-            recording.write(message)
+        recording.write(message, *((message.stamp + 0.002, 150) if isinstance(message, Pose) else ()))
 
 
 def touched(at, first="TB01", second="CF01"):
     return Contact(START + at, first, second, 0.25, 0.001)
 
 
-def world(at, engine="pymunk", **more):
-    known = {
-        "stamp": START + at,
-        "engine": engine,
-        "time": at + 3.0,
-        "factor": 0.98,
-        "load": 0.4,
-        "paused": False,
-        "robots": ["TB01"],
-        "mirrored": ["CF01"],
-        "obstacles": [ObstaclePose("box", (1.0, 0.5 * at, 0.1)), ObstaclePose("post", (0.0, 0.0, 0.0))],
-        "contacts": 2,
-        "refused": 0,
-        "malformed": 1,
-        "trouble": "none",
-    }
-    return WorldState(**known | more)
+def world(at, engine="pymunk"):
+    obstacles = [ObstaclePose("box", (1.0, 0.5 * at, 0.1)), ObstaclePose("post", (0.0, 0.0, 0.0))]
+    return WorldState(
+        START + at, engine, at + 3.0, 0.98, 0.4, False, ["TB01"], ["CF01"], obstacles, 2, 0, 1, "none"
+    )  # fmt: skip
 
 
 def whole_run():
@@ -127,11 +78,10 @@ def whole_run():
     messages = [begun(), status("TB01", at=0.0), status("CF01", at=0.0)]
     for k in range(11):
         at = k / 10
-        pose_heard = ((at - 0.05, 0.0, 0.0), (1.0, 0.0, 0.0))
-        heard = [PoseReceipt("TB01", k, START + at - 0.05, START + at - 0.04, *pose_heard)] if k else []
+        receipt = PoseReceipt("TB01", k, START + at - 0.05, START + at - 0.04, (at - 0.05, 0.0, 0.0), (1.0, 0.0, 0.0))
         messages += [
             state("TB01", k + 1, at, at, true_position=(at, 0.0, 0.01), true_yaw=0.1),
-            state("CF01", k + 1, at, -at, received=heard),
+            state("CF01", k + 1, at, -at, received=[receipt] if k else []),
             pose("TB01", k + 1, at, at),
         ]
     return [
@@ -150,3 +100,26 @@ def scattered(count):
     """States that do not compress."""
     x = np.random.default_rng(1).normal(size=(count, 3)).tolist()
     return [state(seq=k + 1, at=k / count, position=tuple(p), goal=tuple(p)) for k, p in enumerate(x)]
+
+
+def broken(path, *messages):
+    """Recording without its last byte: its recorder was killed."""
+    write(path, *(messages or whole_run()))
+    path.write_bytes(path.read_bytes()[:-1])
+    return path
+
+
+def changed(**parts):
+    """The pair of this module with other parts."""
+    return msgspec.structs.replace(PAIR, **parts)
+
+
+@contextmanager
+def small_disk(size=40_000):
+    """Files of this process may not grow beyond a size [bytes]."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)

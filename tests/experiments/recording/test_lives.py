@@ -1,53 +1,58 @@
-"""Counters over all processes of a robot, numbers that no robot would take, robots on standby."""
+"""Messages that no recording should change by: lives of processes, forged numbers, standby, repetitions, odd places."""
 
-import msgspec
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
-from agents.network.messages import PoseReceipt
+from agents.network.messages import Pose, PoseReceipt, State
+from experiments.definition.experiment import Formation
 from experiments.metrics.measure import measure
-from experiments.recording.losses import count_in_run, lives
+from experiments.recording.losses import count_in_run
 from experiments.recording.playback import read
-from tests.experiments.recordings import PAIR, START, begun, landed, pose, seconds, state, status, whole_run, write
+from experiments.run import reopen
+from tests.experiments.recordings import (
+    PAIR,
+    START,
+    begun,
+    changed,
+    landed,
+    pose,
+    seconds,
+    state,
+    status,
+    whole_run,
+    write,
+)  # fmt: skip
 
 
-def _life(pid, counts):
+def life(pid, *counts):
     """Statuses of a process: at each time [s] ticks, and a tenth of that in decisions."""
     return [status(at=at, pid=pid, ticks=ticks, decisions=ticks // 10) for at, ticks in counts]
 
 
-def _ticks(statuses, end=20.0):
-    ordered = sorted(statuses, key=lambda each: each.stamp)
-    return count_in_run(ordered, "ticks", START, START + end)
+EVERY_SECOND = [(float(k), 100 * k) for k in range(1, 21)]
+BETWEEN = [(k + 0.5, 10 * k) for k in range(1, 20)]
 
 
-def test_counters_of_all_lives_are_added():
-    first, second = _life(7, [(1.0, 100), (9.0, 900)]), _life(8, [(12.0, 50), (20.0, 850)])
-    assert _ticks([*first, *second]) == 900 + 850
-
-
-def test_counters_end_with_the_run():
-    assert _ticks(_life(7, [(19.5, 1950), (20.5, 2050)])) == 2000
-    assert _ticks(_life(7, [(19.5, 1950)])) == 1950
-    assert (
-        _ticks(_life(7, [(-0.5, 4000), (0.5, 50), (20.5, 2050)])) == 2000
-    )  # ticks before the start are no ticks of it
-
-
-def test_two_processes_of_one_robot_report_in_turn():
-    turns = [*_life(7, [(k, 100 * k) for k in range(1, 21)]), *_life(8, [(k + 0.5, 10 * k) for k in range(1, 20)])]
-    assert _ticks(turns) == 2000 + 190
-
-
-def test_a_process_number_is_given_again():
-    again = [*_life(1, [(1.0, 100), (9.0, 900)]), *_life(1, [(12.0, 50), (20.0, 850)])]
-    assert [len(life) for life in lives(again, lambda each: each.decisions)] == [2, 2]
-    assert _ticks(again) == 900 + 850
-
-
-def test_a_clock_set_back_is_no_restart():
-    mixed = _life(7, [(8.0, 800), (9.0, 900), (8.5, 1000), (9.5, 1100), (20.0, 2150)])
-    assert _ticks(mixed) == 2150
+@pytest.mark.parametrize(
+    ("said", "ticks"),
+    [
+        ([*life(7, (1.0, 100), (9.0, 900)), *life(8, (12.0, 50), (20.0, 850))], 900 + 850),
+        ([*life(1, (1.0, 100), (9.0, 900)), *life(1, (12.0, 50), (20.0, 850))], 900 + 850),
+        (life(7, (19.5, 1950), (20.5, 2050)), 2000),
+        (life(7, (19.5, 1950)), 1950),
+        (life(7, (-0.5, 4000), (0.5, 50), (20.5, 2050)), 2000),
+        ([*life(7, *EVERY_SECOND), *life(8, *BETWEEN)], 2000 + 190),
+        (life(7, (8.0, 800), (9.0, 900), (8.5, 1000), (9.5, 1100), (20.0, 2150)), 2150),
+    ],
+    ids=[
+        "another process", "process number given again", "beyond the end", "until shortly before the end",
+        "before the start", "two processes in turn", "clock set back",
+    ],
+)  # fmt: skip
+def test_counters_of_all_lives_in_the_run(said, ticks):
+    ordered = sorted(said, key=lambda each: each.stamp)
+    assert count_in_run(ordered, "ticks", START, START + 20.0) == ticks
 
 
 @pytest.mark.parametrize("seq", [2**63 - 1, 2**53, 0, -5])
@@ -69,17 +74,15 @@ def test_forged_counters_count_nowhere(path):
 
 
 def test_share_of_missed_deadlines_stays_below_one(path):
-    late = [msgspec.structs.replace(each, missed=300) for each in _life(7, [(1.0, 100)])]
-    write(path, *whole_run()[:-2], *late)
+    write(path, *whole_run()[:-2], status(ticks=100, missed=300))
     assert measure(read(path).trace).robots[0].missed_share == pytest.approx(0.75)
 
 
-RESERVE = msgspec.structs.replace(
-    PAIR, duration_s=4.0, robots=PAIR.robots | {"KH01": msgspec.structs.replace(PAIR.robots["TB01"], standby=True)}
-)
-LINKED = msgspec.structs.replace(
-    RESERVE, formation=msgspec.structs.replace(PAIR.formation, links={"TB01 - CF01": 1.0, "TB01 - KH01": 1.0})
-)
+STANDBY = {"KH01": replace(PAIR.robots["TB01"], standby=True)}
+LINKED = changed(
+    duration_s=4.0, robots=PAIR.robots | STANDBY,
+    formation=Formation(links={"TB01 - CF01": 1.0, "TB01 - KH01": 1.0}),
+)  # fmt: skip
 
 
 def test_reserve_that_never_came_is_left_out(path):
@@ -100,3 +103,64 @@ def test_reserve_is_judged_since_it_came(path):
     assert (added.known, added.coverage, measured.died, measured.failures) == (1.0, 1.0, (), ())
     assert added.f_hz == pytest.approx(25 / 2.5)
     assert measured.robots[0].coverage == 1.0
+
+
+def figures(path, *messages):
+    write(path, *messages)
+    case = measure(read(path).trace)
+    of_robots = [(robot.iae, robot.messages, robot.received, robot.known) for robot in case.robots]
+    return of_robots, case.deliveries, case.lost
+
+
+@pytest.fixture
+def whole(tmp_path):
+    return figures(tmp_path / "whole.mcap", *whole_run())
+
+
+def is_state(message):
+    return isinstance(message, State)
+
+
+RUN = whole_run()
+DOUBLED = {
+    "all twice": [each for each in RUN for _ in range(2)],
+    "receipts thrice": [replace(each, received=each.received * 3) if is_state(each) else each for each in RUN],
+    "robots of no experiment": [*RUN, *[replace(each, robot="XX99") for each in RUN if isinstance(each, State | Pose)]],
+    "second start": [*RUN, begun(0.5)],
+}
+
+
+@pytest.mark.parametrize("messages", DOUBLED.values(), ids=DOUBLED)
+def test_repeated_and_foreign_messages_change_no_figure(path, whole, messages):
+    assert figures(path, *messages) == whole
+
+
+@pytest.mark.parametrize("place", [(1e300, 0.0, 0.0), (float("nan"),) * 3, (float("inf"), 0.0, 0.0)])
+def test_impossible_places_are_unknown(path, whole, place):
+    known = [each for each in RUN if is_state(each) and each.robot == "TB01" and abs(each.stamp - START - 0.5) < 0.01]
+    odd = {id(each): replace(each, position=place, true_position=place) for each in known}
+    found = figures(path, *[odd.get(id(each), each) for each in RUN])
+    assert len(odd) == 1
+    assert found[0][0][0] == pytest.approx(whole[0][0][0])  # a hole of less than a second is drawn over
+    assert found[1:] == whole[1:]
+
+
+def test_recording_that_broke_off_late_is_interrupted(path):
+    write(path, begun(), *seconds(7))  # 0.4 s before its end, without a word of a landing
+    broken = measure(read(path).trace)
+    assert broken.interrupted
+    assert broken.duration_s == pytest.approx(0.6, abs=0.11)  # within a sample
+
+
+def test_robots_that_landed_by_themselves_are_whole(path):
+    write(path, begun(), *seconds(7), state("TB01", 9, 1.5, phase="landing"))
+    assert not measure(read(path).trace).interrupted
+
+
+def test_two_recordings_of_one_case_are_told(tmp_path):
+    for name in ("only", "only-recovered"):
+        write(tmp_path / f"{name}.mcap", *whole_run())
+    write(tmp_path / "other.mcap", begun(), *seconds(11), landed(), case="other", seed=9)
+    notes = " ".join(reopen(tmp_path).notes)
+    assert "only: several recordings are of this case; shown is only-recovered.mcap" in notes
+    assert "different seeds: only 4, other 9" in notes

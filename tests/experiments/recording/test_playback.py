@@ -18,6 +18,8 @@ from tests.experiments.recordings import (
     PAIR,
     START,
     begun,
+    broken,
+    changed,
     landed,
     pose,
     seconds,
@@ -27,54 +29,47 @@ from tests.experiments.recordings import (
     whole_run,
     world,
     write,
-)
+)  # fmt: skip
 
 
 def test_a_run_is_read_back(path):
     write(path, *whole_run())
     playback = read(path)
     trace = playback.trace
-    assert playback.complete
-    assert playback.messages == 1 + 4 + 22 * 3 + 11
+    assert (playback.complete, playback.messages, playback.started) == (True, 1 + 4 + 22 * 3 + 11, START)
     assert (trace.case, trace.seed, trace.clock, trace.robots) == ("only", 4, "real", ("TB01", "CF01"))
     assert trace.plan.experiment == PAIR
-    np.testing.assert_allclose(trace.time, np.arange(11) / 10, rtol=0, atol=1e-12)
+    assert (trace.contacts, trace.world) == (None, ())
+    assert (trace.attitude, trace.shadow_position, trace.shadow_yaw) == (None, None, None)
     along = np.arange(11) / 10
-    np.testing.assert_allclose(trace.position[:, 0, 0], along, atol=1e-6)
-    np.testing.assert_allclose(trace.position[:, 1, 0], -along, atol=1e-6)
+    np.testing.assert_allclose(trace.time, along, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(trace.position[..., 0], np.column_stack([along, -along]), atol=1e-6)
     np.testing.assert_allclose(trace.true_position[:, 0, 2], 0.01)
     np.testing.assert_allclose(trace.true_position[:, 1], trace.position[:, 1])
-    assert (trace.contacts, trace.world, trace.attitude, trace.shadow_position, trace.shadow_yaw) == (
-        None, (), None, None, None
-    )  # fmt: skip
     np.testing.assert_allclose(trace.goal[:, 0], np.column_stack([along + 1, along * 0 + 2, along * 0 + 3]))
-    np.testing.assert_allclose(
-        trace.setpoint[:, 1], np.column_stack([-along, along * 0, along * 0 + 0.5, along * 0 + 0.25])
-    )
-    before_the_end = along[:-1]
-    np.testing.assert_allclose(trace.sent.stamp, before_the_end, atol=1e-6)
-    assert trace.sent.seq.tolist() == list(range(1, 11))
-    assert trace.sent.bytes.tolist() == [150] * 10
-    np.testing.assert_allclose(trace.sent.position[:, :2], np.column_stack([before_the_end, before_the_end * 0 + 0.5]))
-    np.testing.assert_allclose(trace.sent.velocity, np.tile([0.1, 0.2, 0.3], (10, 1)))
-    np.testing.assert_allclose(trace.sent.yaw, 0.4)
-    np.testing.assert_allclose(trace.received.arrival, along[1:] - 0.04, atol=1e-6)
-    np.testing.assert_allclose(trace.received.stamp, along[1:] - 0.05, atol=1e-6)
-    net = trace.plan.pose_links
-    assert {(net.receiver[link], net.sender[link]) for link in trace.received.link} == {(1, 0)}
-    assert trace.received.seq.tolist() == list(range(1, 11))
-    np.testing.assert_allclose(trace.received.position[:, 0], along[1:] - 0.05)
-    np.testing.assert_array_equal(trace.received.velocity, np.tile([1.0, 0.0, 0.0], (10, 1)))
-    assert trace.lost.tolist() == [1, 0]
-    assert trace.ticks.tolist() == [100, 99]
-    assert trace.missed_deadlines.tolist() == [3, 0]
-    assert trace.decisions.tolist() == [10, 9]
+    rest = np.tile([0.0, 0.5, 0.25], (11, 1))
+    np.testing.assert_allclose(trace.setpoint[:, 1], np.column_stack([-along, rest]))
+    sent, before_the_end = trace.sent, along[:-1]
+    np.testing.assert_allclose(sent.stamp, before_the_end, atol=1e-6)
+    np.testing.assert_allclose(sent.position[:, :2], np.column_stack([before_the_end, before_the_end * 0 + 0.5]))
+    np.testing.assert_allclose(sent.velocity, np.tile([0.1, 0.2, 0.3], (10, 1)))
+    np.testing.assert_allclose(sent.yaw, 0.4)
+    assert sent.bytes.tolist() == [150] * 10
+    received, net = trace.received, trace.plan.pose_links
+    np.testing.assert_allclose(received.arrival, along[1:] - 0.04, atol=1e-6)
+    np.testing.assert_allclose(received.stamp, along[1:] - 0.05, atol=1e-6)
+    np.testing.assert_allclose(received.position[:, 0], along[1:] - 0.05)
+    np.testing.assert_array_equal(received.velocity, np.tile([1.0, 0.0, 0.0], (10, 1)))
+    assert {(net.receiver[link], net.sender[link]) for link in received.link} == {(1, 0)}
+    assert sent.seq.tolist() == received.seq.tolist() == list(range(1, 11))
+    assert (trace.lost.tolist(), trace.ticks.tolist()) == ([1, 0], [100, 99])
+    assert (trace.missed_deadlines.tolist(), trace.decisions.tolist()) == ([3, 0], [10, 9])
     assert trace.events == (Event(0.0, "start", "conductor", "go"),)
 
 
 def test_what_the_world_said_is_read_back(path):
-    said = [world(-0.5), world(0.5), world(1.5), touched(0.7), touched(-0.1), touched(0.2, second="wall"), touched(1.2)]
-    write(path, *whole_run(), *said)
+    touches = [touched(0.7), touched(-0.1), touched(0.2, second="wall"), touched(1.2)]
+    broken(path, *whole_run(), world(-0.5), world(0.5), world(1.5), *touches)
     trace = read(path).trace
     assert [(each.first, each.second, round(each.stamp, 6)) for each in trace.contacts] == [
         ("TB01", "wall", 0.2),
@@ -83,7 +78,6 @@ def test_what_the_world_said_is_read_back(path):
     assert (trace.contacts[0].impulse, trace.contacts[0].overlap) == (0.25, 0.001)
     assert [msgspec.structs.replace(each, stamp=START + 0.5) for each in trace.world] == [world(0.5)]
     assert trace.world[0].stamp == pytest.approx(0.5)
-    path.write_bytes(path.read_bytes()[:-1])
     target = path.with_name("whole.mcap")
     assert recover(path, target).robots == ("TB01", "CF01")
     assert read(target).trace.contacts == trace.contacts
@@ -104,34 +98,26 @@ def test_no_contacts_differ_from_no_contact_detection(path, said, contacts):
 
 
 def test_avoidance_interventions_are_counted_until_the_end(path):
-    counted = [
-        msgspec.structs.replace(status(at=at), interventions=5 * k, avoided=2 * k)
-        for k, at in enumerate((-0.5, 0.5, 1.5, 2.5))
-    ]
-    write(path, *whole_run()[:-2], *counted)
+    said = [status(at=k - 0.5, interventions=5 * k, avoided=2 * k) for k in range(4)]
+    write(path, *whole_run()[:-2], *said)
     trace = read(path).trace
     assert (trace.interventions.tolist(), trace.avoided.tolist()) == ([8, 0], [3, 0])
 
 
 def test_attitude_interpolates_the_short_way_on_recorded_side(path):
-    angle = [0.2 * k for k in range(12)]
-    sign = [-1.0 if k in {3, 4, 5} else 1.0 for k in range(12)]
-    turned = [
-        state(at=k / 10 - 0.05, attitude=(s * math.cos(0.5 * a), 0.0, s * math.sin(0.5 * a), 0.0))
-        for k, (a, s) in enumerate(zip(angle, sign, strict=True))
-    ]
-    write(path, begun(), *turned)
-    trace = read(path).trace
-    wanted = np.array([[math.cos(0.1 * (k + 0.5)), 0.0, math.sin(0.1 * (k + 0.5)), 0.0] for k in range(11)])
-    np.testing.assert_allclose(trace.attitude[:, 0], wanted * np.array(sign)[:11, None], atol=1e-6)
+    half, sign = 0.1 * np.arange(12), np.array([-1.0 if k in {3, 4, 5} else 1.0 for k in range(12)])
+    turned = (sign * [np.cos(half), 0.0 * half, np.sin(half), 0.0 * half]).T
+    write(path, begun(), *[state(at=k / 10 - 0.05, attitude=tuple(q)) for k, q in enumerate(turned.tolist())])
+    trace, half = read(path).trace, half[:11] + 0.05
+    wanted = (sign[:11] * [np.cos(half), 0.0 * half, np.sin(half), 0.0 * half]).T
+    np.testing.assert_allclose(trace.attitude[:, 0], wanted, atol=1e-6)
     assert np.isnan(trace.attitude[:, 1]).all()
 
 
 def test_where_the_twin_beside_a_robot_was(path):
-    beside = [
-        state(at=k / 10, x=k / 10, shadow_position=(k / 10, 0.1, 0.0), shadow_yaw=3.0 + k / 10) for k in range(11)
-    ]
-    write(path, begun(), *beside, *[state("CF01", at=k / 10) for k in range(11)])
+    along = [k / 10 for k in range(11)]
+    beside = [state(at=at, x=at, shadow_position=(at, 0.1, 0.0), shadow_yaw=3.0 + at) for at in along]
+    write(path, begun(), *beside, *[state("CF01", at=at) for at in along])
     trace = read(path).trace
     np.testing.assert_allclose(trace.shadow_position[:, 0] - trace.position[:, 0], np.tile([0.0, 0.1, 0.0], (11, 1)))
     np.testing.assert_allclose(trace.shadow_yaw[:, 0], 3.0 + np.arange(11) / 10, atol=1e-6)
@@ -140,11 +126,8 @@ def test_where_the_twin_beside_a_robot_was(path):
 
 
 def test_samples_between_the_grid_are_interpolated(path):
-    write(
-        path,
-        begun(),
-        *[state(at=k / 10 + 0.05, x=k / 10 + 0.05, yaw=math.remainder(k, math.tau)) for k in range(-1, 11)],
-    )
+    between = [(k / 10 + 0.05, math.remainder(k, math.tau)) for k in range(-1, 11)]
+    write(path, begun(), *[state(at=at, x=at, yaw=yaw) for at, yaw in between])
     trace = read(path).trace
     np.testing.assert_allclose(trace.position[:, 0, 0], np.arange(11) / 10, atol=1e-6)
     np.testing.assert_allclose(trace.goal[:, 0, 0], np.arange(11) / 10 + 0.95, atol=1e-6)  # the last one before
@@ -152,17 +135,15 @@ def test_samples_between_the_grid_are_interpolated(path):
     np.testing.assert_allclose(turned, [math.remainder(k - 0.5, math.tau) for k in range(11)], atol=1e-4)
 
 
-def test_yaw_keeps_the_branch_it_was_recorded_on(path):
-    yaw = [math.remainder(0.9 * k, math.tau) for k in range(11)]
+BRANCHES = [math.remainder(0.9 * k, math.tau) for k in range(11)]
+
+
+@pytest.mark.parametrize("yaw", [BRANCHES, [None] * 5 + [0.3] * 6], ids=["jumps", "unknown at first"])
+def test_yaw_keeps_the_branch_it_was_recorded_on(path, yaw):
     write(path, begun(), *[state(at=k / 10, yaw=value) for k, value in enumerate(yaw)])
-    np.testing.assert_allclose(read(path).trace.yaw[:, 0], yaw, atol=1e-5)
-
-
-def test_a_yaw_that_is_not_known_at_first(path):
-    write(path, begun(), *[state(at=k / 10, yaw=None if k < 5 else 0.3) for k in range(11)])
-    yaw = read(path).trace.yaw[:, 0]
-    assert np.isnan(yaw[:3]).all()
-    np.testing.assert_allclose(yaw[5:], 0.3, atol=1e-6)
+    found, known = read(path).trace.yaw[:, 0], yaw.count(None)
+    np.testing.assert_allclose(found[known:], yaw[known:], atol=1e-5)
+    assert np.isnan(found[: max(known - 2, 0)]).all()
 
 
 def test_silence_is_nan_and_never_extrapolated(path):
@@ -177,54 +158,54 @@ def test_silence_is_nan_and_never_extrapolated(path):
 
 def test_a_long_hole_is_not_interpolated_over(path):
     times = [0.0, 0.1, 0.6, 0.7, 2.0, 2.1]
-    long = msgspec.structs.replace(PAIR, duration_s=2.0)
-    write(path, begun(), *[state(at=at, x=at) for at in times], experiment=long)
+    write(path, begun(), *[state(at=at, x=at) for at in times], experiment=changed(duration_s=2.0))
     x = read(path).trace.position[:, 0, 0]
     np.testing.assert_allclose(x[:8], np.arange(8) / 10, atol=1e-6)
     assert np.flatnonzero(np.isnan(x)).tolist() == list(range(10, 18))
 
 
 def test_numbers_that_nobody_knows(path):
-    lost = [
-        state(at=k / 10, x=math.nan if k == 5 else k / 10, goal=None, setpoint=None, yaw=math.nan) for k in range(11)
-    ]
-    write(path, begun(), *lost)
+    places, unknown = [math.nan if k == 5 else k / 10 for k in range(11)], {"goal": None, "setpoint": None}
+    write(path, begun(), *[state(at=k / 10, x=x, yaw=math.nan, **unknown) for k, x in enumerate(places)])
     trace = read(path).trace
     np.testing.assert_allclose(trace.position[:, 0, 0], np.arange(11) / 10, atol=1e-6)
     for array in (trace.goal, trace.setpoint, trace.yaw):
         assert np.isnan(array).all()
 
 
+def poses(*numbered):
+    """Poses of TB01, by number and time [s]."""
+    return [pose(seq=seq, at=at) for seq, at in numbered]
+
+
+def lost_of(*counted, **more):
+    """Statuses of CF01 with what it lost of TB01, by time [s] and number."""
+    return [status("CF01", at=at, lost={"TB01": lost}, **more) for at, lost in counted]
+
+
 @pytest.mark.parametrize(
     ("messages", "lost"),
     [
-        ([pose(seq=k, at=k / 10) for k in (1, 2, 5, 6)], 2),  # a gap of two
-        ([pose(seq=s, at=a) for s, a in ((8, 0.1), (9, 0.2), (1, 0.3), (2, 0.4))], 0),  # began anew
-        ([pose(seq=s, at=a) for s, a in ((8, 0.1), (9, 0.2), (3, 0.3), (4, 0.4))], 2),  # anew, the first two lost
+        (poses((1, 0.1), (2, 0.2), (5, 0.5), (6, 0.6)), 2),  # a gap of two
+        (poses((8, 0.1), (9, 0.2), (1, 0.3), (2, 0.4)), 0),  # began anew
+        (poses((8, 0.1), (9, 0.2), (3, 0.3), (4, 0.4)), 2),  # anew, the first two lost
         # a forged number: no more than 50 poses a second can have been said
-        ([pose(seq=s, at=a) for s, a in ((8, 0.1), (99_999_999, 0.12), (9, 0.14), (10, 0.16))], 2),
-        ([pose(seq=8, at=0.1), status(at=0.9, sent=99_999_999)], 40),
-        (
-            [pose(seq=4, at=0.1), pose(seq=4, at=0.1), pose(seq=5, at=0.2)],
-            0,
-        ),  # the same twice: said again to a late one
-        ([pose(seq=1, at=-2.0), pose(seq=9, at=0.1), pose(seq=10, at=0.2)], 0),  # a gap that began before the run
-        ([pose(seq=5, at=0.9), status(sent=8)], 3),  # the last three never came
-        ([pose(seq=5, at=0.9), pose(seq=6, at=1.2), status(sent=5)], 0),
-        ([pose(seq=9, at=0.5), status(sent=2, pid=8)], 0),  # a younger process counts from zero
+        (poses((8, 0.1), (99_999_999, 0.12), (9, 0.14), (10, 0.16)), 2),
+        ([*poses((8, 0.1)), status(at=0.9, sent=99_999_999)], 40),
+        (poses((4, 0.1), (4, 0.1), (5, 0.2)), 0),  # the same twice: said again to a late one
+        (poses((1, -2.0), (9, 0.1), (10, 0.2)), 0),  # a gap that began before the run
+        ([*poses((5, 0.9)), status(sent=8)], 3),  # the last three never came
+        ([*poses((5, 0.9), (6, 1.2)), status(sent=5)], 0),
+        ([*poses((9, 0.5)), status(sent=2, pid=8)], 0),  # a younger process counts from zero
         ([status(at=-0.5, sent=4), status(sent=6)], 2),  # none of them recorded
-        ([pose(seq=3, at=-0.2), status(at=-1.0, sent=2), status(sent=4)], 1),
-        ([status("CF01", at=-0.5, lost={"TB01": 4}), status("CF01", lost={"TB01": 6})], 2),  # less what was before
-        ([status("CF01", at=a, lost={"TB01": n}) for a, n in ((0.2, 1), (0.6, 1), (1.0, 3))], 3),  # counters go up
+        ([*poses((3, -0.2)), status(at=-1.0, sent=2), status(sent=4)], 1),
+        (lost_of((-0.5, 4), (1.0, 6)), 2),  # less what was before
+        (lost_of((0.2, 1), (0.6, 1), (1.0, 3)), 3),  # counters go up
         (
-            [
-                status("CF01", at=-0.5, lost={"TB01": 4}),
-                status("CF01", at=0.2, lost={"TB01": 5}),
-                status("CF01", at=0.9, lost={"TB01": 2}, pid=8),
-            ],
-            3,  # one before its listener began anew, two after
-        ),
-        ([status("CF01", at=30.0, lost={"TB01": 4})], 0),  # long after the run
+            [*lost_of((-0.5, 4), (0.2, 5)), *lost_of((0.9, 2), pid=8)],
+            3,
+        ),  # one before its listener began anew, two after
+        (lost_of((30.0, 4)), 0),  # long after the run
     ],
 )
 def test_lost(path, messages, lost):
@@ -233,10 +214,8 @@ def test_lost(path, messages, lost):
 
 
 def test_what_the_modelled_network_dropped_is_no_loss(path):
-    said = [
-        status("CF01", at=at, dropped=dropped) for at, dropped in ((-0.5, {}), (0.4, {"TB01": 3}), (1.0, {"TB01": 7}))
-    ]
-    linked = msgspec.structs.replace(PAIR, formation=Formation(links={"TB01 - CF01": 0.5}))
+    said = [status("CF01", at=at, dropped={"TB01": count}) for at, count in ((-0.5, 0), (0.4, 3), (1.0, 7))]
+    linked = changed(formation=Formation(links={"TB01 - CF01": 0.5}))
     write(path, begun(), state(), *said, landed(), experiment=linked)
     trace = read(path).trace
     assert trace.dropped.tolist() == [0, 7]  # TB01 listens to CF01; CF01 to TB01
@@ -245,12 +224,9 @@ def test_what_the_modelled_network_dropped_is_no_loss(path):
 
 def test_foreign_poses_count_once_for_all_receivers(path):
     robots = {name: RobotTable("tello", [float(k), 0.0]) for k, name in enumerate("ABC")}
-    said = [
-        status(name, at=at, foreign={"A": count} if count else {})
-        for name, counts in (("B", (2, 5, 9)), ("C", (0, 1, 3)))
-        for at, count in zip((-0.5, 0.4, 1.0), counts, strict=True)
-    ]
-    three = msgspec.structs.replace(PAIR, robots=robots, formation=Formation(links={"A > B": 0.5, "A > C": 0.5}))
+    counts = (("B", -0.5, 2), ("C", -0.5, 0), ("B", 0.4, 5), ("C", 0.4, 1), ("B", 1.0, 9), ("C", 1.0, 3))
+    said = [status(name, at=at, foreign={"A": count}) for name, at, count in counts]
+    three = changed(robots=robots, formation=Formation(links={"A > B": 0.5, "A > C": 0.5}))
     write(path, begun(), *(state(name) for name in robots), *said, landed(), experiment=three)
     assert read(path).trace.foreign.tolist() == [7, 0, 0]
 
@@ -264,18 +240,15 @@ def test_only_poses_of_the_run_are_sent(path):
 
 def test_what_a_drifting_clock_stamped_is_set_right(path):
     """50 ppm over an hour are 0.18 s: what CF01 says at 3600 s it stamps 0.18 s later."""
-    long = msgspec.structs.replace(PAIR, duration_s=3600.0, rates=Rates(state_hz=1.0))
-    clocks = [HostClock("lab2", START, 0.2, 1e-4, ["CF01"]), HostClock("lab2", START + 3600.0, 0.38, 1e-4, ["CF01"])]
+    clocks = [HostClock("lab2", START + at, lie, 1e-4, ["CF01"]) for at, lie in ((0.0, 0.2), (3600.0, 0.38))]
     heard = [PoseReceipt("CF01", 9, START + 1800.09, START + 1800.01, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))]
     messages = [begun(), *clocks]
     for k in range(0, 3601, 10):
         messages += [state("TB01", k + 1, k, 0.001 * k), state("CF01", k + 1, k * (1 + 50e-6), 0.001 * k)]
     messages += [state("TB01", 9000, 3600.5, 3.6, received=heard), pose("CF01", 1, 1800.09), landed(3600.0)]
-    write(path, *messages, experiment=long)
+    write(path, *messages, experiment=changed(duration_s=3600.0, rates=Rates(state_hz=1.0)))
     trace = read(path).trace
-    asked = [600, 1800, 3600]
-    np.testing.assert_allclose(trace.position[asked, 1, 0], [0.6, 1.8, 3.6], atol=1e-6)
-    np.testing.assert_allclose(trace.position[asked, 0, 0], trace.position[asked, 1, 0], atol=1e-6)
+    np.testing.assert_allclose(trace.position[[600, 1800, 3600], :, 0], [[x, x] for x in (0.6, 1.8, 3.6)], atol=1e-6)
     assert trace.sent.stamp[0] == pytest.approx(1800.0, abs=1e-4)
     assert trace.received.stamp[0] == pytest.approx(1800.0, abs=1e-4), "on the speaker's clock"
     assert trace.received.arrival[0] == pytest.approx(1800.01, abs=1e-4), "on the listener's"
@@ -305,39 +278,27 @@ def test_trace_of_an_interrupted_run_ends_there(path):
     assert trace.events[-1].stamp == pytest.approx(0.75)
 
 
-def test_run_stopped_by_user_after_end_is_whole(path):
-    write(path, begun(), *seconds(11), landed(1.3, "landing (interrupted)"))
-    assert read(path).trace.time[-1] == 1.0
+def follow(begin, end, phase="running"):
+    """States of TB01 alone."""
+    return [state("TB01", k, k / 10, phase=phase) for k in range(begin, end)]
 
 
-def test_run_in_which_all_landed_ends_there(path):
-    long = msgspec.structs.replace(PAIR, duration_s=5.0)
-    write(path, begun(), *seconds(31), landed(3.0), experiment=long)
-    assert read(path).trace.time[-1] == 3.0
-
-
-def test_robots_land_slightly_early_by_their_own_clocks(path):
-    write(path, begun(), *seconds(11), landed(0.98))
-    assert read(path).trace.time[-1] == 1.0
-
-
-def test_run_without_conductor_events_ends_with_the_robots(path):
-    long = msgspec.structs.replace(PAIR, duration_s=20.0)
-    down = [state("TB01", k, k / 10, phase="landing") for k in range(41, 60)]
-    more = [state("TB01", k, k / 10, phase="running") for k in range(31, 36)]
-    write(path, begun(), *seconds(31), *more, *down, experiment=long)
+@pytest.mark.parametrize(
+    ("duration_s", "messages", "end", "silent"),
+    [
+        (1.0, [*seconds(11), landed(1.3, "landing (interrupted)")], 1.0, False),
+        (1.0, [*seconds(11), landed(0.98)], 1.0, False),
+        (5.0, [*seconds(31), landed(3.0)], 3.0, False),
+        (20.0, [*seconds(31), *follow(31, 36), *follow(41, 60, "landing")], 3.0, False),
+        (20.0, [*seconds(31), *follow(31, 100)], 9.9, True),
+    ],
+    ids=["stopped after the end", "landed slightly early", "all landed", "no conductor", "one long silent"],
+)
+def test_end_of_a_run(path, duration_s, messages, end, silent):
+    write(path, begun(), *messages, experiment=changed(duration_s=duration_s))
     trace = read(path).trace
-    assert trace.time[-1] == pytest.approx(3.0)
-    assert np.isfinite(trace.position).all()
-
-
-def test_robot_silent_long_before_does_not_end_run(path):
-    long = msgspec.structs.replace(PAIR, duration_s=20.0)
-    more = [state("TB01", k, k / 10, phase="running") for k in range(31, 100)]
-    write(path, begun(), *seconds(31), *more, experiment=long)
-    trace = read(path).trace
-    assert trace.time[-1] == pytest.approx(9.9)
-    assert np.isnan(trace.position[-1, 1]).all()
+    assert trace.time[-1] == pytest.approx(end)
+    assert np.isfinite(trace.position[-1]).all(axis=1).tolist() == [True, not silent]
 
 
 @pytest.mark.parametrize("end", [-0.5, 0.0, 0.05])
@@ -345,11 +306,6 @@ def test_a_run_interrupted_before_its_start(path, end):
     write(path, state(), begun(), landed(end, "landing (interrupted)"))
     with pytest.raises(NotStarted, match="ended before the common start"):
         read(path)
-
-
-def test_when_the_run_began(path):
-    write(path, *whole_run())
-    assert read(path).started == START
 
 
 def test_a_run_that_never_started(path):
@@ -384,7 +340,7 @@ def test_broken_clock_does_not_stretch_the_timeline(path, stamp):
 
 
 def foreign(path, *channels, metadata=None, attachment=None):
-    """A file of another program, with one message on each channel (topic, schema name, schema text, data)."""
+    """Write a file of another program, with one message on each channel (topic, schema name, schema text, data)."""
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start()

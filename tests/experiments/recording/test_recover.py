@@ -1,6 +1,5 @@
 """A recording is read also when its recorder was killed or the file is damaged, and can be made whole."""
 
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -15,74 +14,62 @@ from rosbags.highlevel import AnyReader
 from agents.network.messages import Event, Pose
 from experiments.recording.playback import read
 from experiments.recording.reader import RecordingError, Recovered, recover
-from tests.experiments.recordings import DOCUMENT, begun, scattered, whole_run, write
+from tests.experiments.recordings import DOCUMENT, begun, broken, scattered, whole_run, write
 from tools.commands import results as commands
 
 KILLED = """
+import itertools
 from pathlib import Path
-from experiments.definition.plan import Plan
-from experiments.recording.writer import Recording
 from tests.experiments.recordings import *
-recording = Recording(Path({path!r}), Plan(PAIR), DOCUMENT, case="only", seed=4, clock="real")
-put(recording, whole_run())
-recording.flush()
+made = recording(Path({path!r}))
+put(made, whole_run())
+made.flush()
 print("flushed", flush=True)
-k = 0
-while True:
-    k += 1
-    recording.write(state("CF01", 100 + k, 5.0 + k / 1000, k * 0.37))
+for k in itertools.count(1):
+    made.write(state("CF01", 100 + k, 5.0 + k / 1000, k * 0.37))
 """
 
 
 @pytest.mark.mechanism("recovery of an unfinished recording")
 @pytest.mark.system
 def test_a_killed_recorder_leaves_a_recording(path, tmp_path, recorded):
-    code = KILLED.format(path=str(path))
     root = Path(__file__).parents[3]
-    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, cwd=root) as process:
-        assert process.stdout is not None
+    command = [sys.executable, "-c", KILLED.format(path=str(path))]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=root) as process:
         assert process.stdout.readline() == "flushed\n"
-        process.send_signal(signal.SIGKILL)
-    assert process.returncode == -signal.SIGKILL
-    before = path.read_bytes()
-    playback = read(path)
+        process.kill()
+    before, playback = path.read_bytes(), read(path)
     assert not playback.complete
     assert playback.messages >= 60
-
-    target = tmp_path / "whole.mcap"
+    target, whole = tmp_path / "whole.mcap", tmp_path / "finished.mcap"
     assert recover(path, target) == Recovered(playback.messages, ("TB01", "CF01"), complete=False)
     assert path.read_bytes() == before
     again = read(target)
-    assert again.complete
-    assert again.messages == playback.messages
-    whole = tmp_path / "finished.mcap"
+    assert (again.complete, again.messages) == (True, playback.messages)
     whole.write_bytes(recorded)
-    wanted = read(whole).trace
     for trace in (playback.trace, again.trace):
-        np.testing.assert_array_equal(trace.position[:, 0], wanted.position[:, 0])
-        np.testing.assert_array_equal(trace.sent.stamp, wanted.sent.stamp)
-        assert trace.lost.tolist() == wanted.lost.tolist()
+        assert_same(trace, read(whole).trace, robots=1)
+
+
+def assert_same(trace, wanted, robots=None):
+    np.testing.assert_array_equal(trace.position[:, :robots], wanted.position[:, :robots])
+    np.testing.assert_array_equal(trace.sent.stamp, wanted.sent.stamp)
+    assert trace.lost.tolist() == wanted.lost.tolist()
 
 
 def test_recovery_keeps_everything(path, tmp_path):
-    write(path, *whole_run())
-    path.write_bytes(path.read_bytes()[:-1])
     target = tmp_path / "whole.mcap"
-    assert recover(path, target) == Recovered(82, ("TB01", "CF01"), complete=False)
+    assert recover(broken(path), target) == Recovered(82, ("TB01", "CF01"), complete=False)
     with target.open("rb") as file:
         reader = make_reader(file, validate_crcs=True)
         assert (reader.get_header().profile, reader.get_header().library) == ("ros2", "zenpark")
         assert {one.name: one.data for one in reader.iter_attachments()}["experiment.toml"].decode() == DOCUMENT
         assert [one.metadata["case"] for one in reader.iter_metadata()] == ["only"]
         summary = reader.get_summary()
-        assert {channel.topic for channel in summary.channels.values()} == {
-            "/events",
-            *(f"/{robot}/{what}" for robot in ("TB01", "CF01") for what in ("state", "true_pose", "status")),
-            "/tf",
-            "/TB01/pose",
-        }
-        assert {schema.encoding for schema in summary.schemas.values()} == {"ros2msg"}
-        assert summary.statistics.message_count == 82
+    of_robots = {f"/{robot}/{what}" for robot in ("TB01", "CF01") for what in ("state", "true_pose", "status")}
+    assert {channel.topic for channel in summary.channels.values()} == {"/events", "/tf", "/TB01/pose", *of_robots}
+    assert {schema.encoding for schema in summary.schemas.values()} == {"ros2msg"}
+    assert summary.statistics.message_count == 82
     with AnyReader([target]) as reader:
         assert len(list(reader.messages())) == 82
 
@@ -97,23 +84,18 @@ def test_a_whole_file_needs_no_recovery(path, tmp_path, capsys):
 
 
 def test_the_command_writes_beside_the_source(path, capsys):
-    write(path, *whole_run())
-    path.write_bytes(path.read_bytes()[:-1])
-    commands.recover(str(path), None)
+    commands.recover(str(broken(path)), None)
     target = path.with_name("run-recovered.mcap")
     assert capsys.readouterr().out == f"{target}: 82 messages of TB01, CF01\n"
     assert read(target).complete
 
 
 def test_recovery_overwrites_nothing(path, tmp_path):
-    write(path, *whole_run())
-    path.write_bytes(path.read_bytes()[:-1])
     target = tmp_path / "precious"
     target.write_text("mine")
-    with pytest.raises(RecordingError, match="precious: exists already"):
-        recover(path, target)
-    with pytest.raises(RecordingError, match="exists already"):
-        recover(path, path)
+    for into in (target, broken(path)):
+        with pytest.raises(RecordingError, match=f"{into.name}: exists already"):
+            recover(path, into)
     assert target.read_text() == "mine"
     assert not read(path).complete
 
@@ -122,25 +104,19 @@ def test_a_recorder_that_took_over_completes_the_recording(path, tmp_path):
     """Its first messages are the last values and the events that publishers repeat."""
     run = sorted(whole_run(), key=lambda message: message.stamp)
     first, rest = run[:50], run[50:]
-    repeated = [each for each in first if isinstance(each, Event)] + [
-        next(each for each in reversed(first) if isinstance(each, Pose))
-    ]
-    write(path, *first)
-    path.write_bytes(path.read_bytes()[:-1])
+    events, poses = ([each for each in first if isinstance(each, kind)] for kind in (Event, Pose))
+    assert events
+    broken(path, *first)
     later = path.parent / "cases" / path.stem / "part2.mcap"
     later.parent.mkdir(parents=True)
-    write(later, *repeated, *rest)
+    write(later, *events, poses[-1], *rest)
     (later.parent / "part3.mcap").touch()  # killed before its first record
-    assert repeated
     commands.recover(str(path), None)
-    whole = tmp_path / "whole.mcap"
-    write(whole, *run)
+    write(whole := tmp_path / "whole.mcap", *run)
     made, wanted = (read(file) for file in (path.with_name("run-recovered.mcap"), whole))
     assert made.complete
     assert made.messages == wanted.messages
-    np.testing.assert_array_equal(made.trace.position, wanted.trace.position)
-    np.testing.assert_array_equal(made.trace.sent.stamp, wanted.trace.sent.stamp)
-    assert made.trace.lost.tolist() == wanted.trace.lost.tolist()
+    assert_same(made.trace, wanted.trace)
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@
 import io
 import itertools
 import math
-import resource
 
 import msgspec
 import numpy as np
@@ -22,9 +21,22 @@ from experiments.recording.playback import read
 from experiments.recording.reader import RecordingError, recover
 from experiments.recording.ros2 import viewers
 from experiments.recording.topics import CHUNK_BYTES
-from experiments.recording.writer import Recording
 from experiments.scene import markers
-from tests.experiments.recordings import DOCUMENT, PAIR, START, begun, put, scattered, state, whole_run, write
+from tests.experiments.recordings import (
+    DOCUMENT,
+    PAIR,
+    START,
+    begun,
+    broken,
+    put,
+    recording,
+    scattered,
+    small_disk,
+    state,
+    whole_run,
+    write,
+)
+from tests.waiting import ManualClock
 
 
 def test_what_is_attached(path):
@@ -38,6 +50,12 @@ def test_what_is_attached(path):
     assert msgspec.json.decode(attached["experiment.json"], type=Experiment) == PAIR
     assert (about["case"], about["seed"], about["clock"], about["started"]) == ("only", "4", "real", repr(START))
     assert about["version"]
+
+
+def decoded(path, topics=None):
+    """Messages of a recording, as another library reads them."""
+    with path.open("rb") as file:
+        return list(make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages(topics))
 
 
 def test_others_read_it(path):
@@ -55,8 +73,7 @@ def test_others_read_it(path):
     measured = [message for topic, _, message in seen if topic == "/CF01/true_pose"]
     assert measured[3].pose.position.x == -0.3
 
-    with path.open("rb") as file:
-        found = list(make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages())
+    found = decoded(path)
     assert len(found) == len(seen)
     sent = [one for one in found if one.channel.topic == "/TB01/pose"]
     assert [one.decoded_message.seq for one in sent] == list(range(1, 12))
@@ -75,24 +92,21 @@ def test_a_recording_is_never_overwritten(path):
     with pytest.raises(RecordingError, match=r"run\.mcap: exists already; move it away"):
         write(path)
     assert path.read_text() == "precious"
-
-
-def test_a_folder_that_is_not_there(tmp_path):
     with pytest.raises(RecordingError, match="cannot be created: No such file"):
-        write(tmp_path / "none" / "run.mcap")
+        write(path.parent / "none" / "run.mcap")
 
 
 def test_closed_twice_and_used_after(path):
-    recording = write(path, begun())
-    recording.close()
+    made = write(path, begun())
+    made.close()
     with pytest.raises(RecordingError, match="closed"):
-        recording.write(state())
+        made.write(state())
 
 
 def test_callers_error_leaves_a_finished_file(path):
     def fails():
-        with Recording(path, Plan(PAIR), case="only", seed=4, clock="real") as recording:
-            put(recording, whole_run())
+        with recording(path) as made:
+            put(made, whole_run())
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -100,20 +114,15 @@ def test_callers_error_leaves_a_finished_file(path):
     assert read(path).complete
 
 
-@pytest.fixture
-def small_disk():
-    """Files of this process may not grow beyond 40 kB."""
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (40_000, limits[1]))
-    yield
-    resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-
-
-@pytest.mark.usefixtures("small_disk")
 def test_a_full_disk_keeps_what_was_written(path):
     messages = scattered(2000)
-    with pytest.raises(RecordingError, match=r"run\.mcap: cannot be written: .*zenpark recover"):
-        write(path, begun(), *messages)
+    made = recording(path)
+    with small_disk():
+        with pytest.raises(RecordingError, match=r"run\.mcap: cannot be written: .*zenpark recover"):
+            put(made, [begun(), *messages])
+        with pytest.raises(RecordingError, match="make room"):
+            made.write(messages[0])
+        made.close()
     assert path.stat().st_size == 40_000
     playback = read(path)
     assert not playback.complete
@@ -121,29 +130,27 @@ def test_a_full_disk_keeps_what_was_written(path):
     np.testing.assert_allclose(playback.trace.position[0, 0], messages[0].position, atol=1e-3)
 
 
-@pytest.mark.usefixtures("small_disk")
-def test_after_a_write_error_nothing_more_is_written(path):
-    recording = Recording(path, Plan(PAIR), case="only", seed=4, clock="real")
-    messages = scattered(2000)
-    with pytest.raises(RecordingError):
-        put(recording, messages)
-    with pytest.raises(RecordingError, match="make room"):
-        recording.write(messages[0])
-    recording.close()
-    assert path.stat().st_size == 40_000
+def test_disk_too_full_for_record_or_recovery(path, tmp_path):
+    big = broken(tmp_path / "big.mcap", begun(), *scattered(2000))
+    with small_disk():
+        with pytest.raises(RecordingError, match=r"run\.mcap: cannot be written"):
+            recover(big, path)
+        assert not path.exists()
+        with pytest.raises(RecordingError, match="cannot be written"):
+            recording(path, document="#" * 50_000)
 
 
 def test_interrupt_inside_a_write_ends_all_writing(path, monkeypatch):
-    def interrupted():
+    def interrupted(_):
         raise KeyboardInterrupt
 
-    recording = Recording(path, Plan(PAIR), case="only", seed=4, clock="real")
-    monkeypatch.setattr(recording._file, "flush", interrupted)
+    made = recording(path)
+    monkeypatch.setattr(writer.McapFile, "flush", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        recording.flush()
+        made.flush()
     with pytest.raises(RecordingError, match=r"interrupted while it wrote; run `\./zenpark recover`"):
-        recording.write(begun())
-    recording.close()
+        made.write(begun())
+    made.close()
 
 
 def test_file_equals_the_librarys_own(tmp_path):
@@ -172,38 +179,17 @@ def test_file_equals_the_librarys_own(tmp_path):
     own.close()
 
 
-@pytest.mark.usefixtures("small_disk")
-def test_a_disk_too_full_for_the_first_record(path):
-    with pytest.raises(RecordingError, match="cannot be written"):
-        Recording(path, Plan(PAIR), "#" * 50_000, case="only", seed=4, clock="real")
-
-
-@pytest.mark.usefixtures("small_disk")
-def test_a_disk_too_full_to_recover_onto(path, tmp_path):
-    big = tmp_path / "big.mcap"
-    resource.setrlimit(resource.RLIMIT_FSIZE, (resource.getrlimit(resource.RLIMIT_FSIZE)[1],) * 2)
-    write(big, begun(), *scattered(2000))
-    big.write_bytes(big.read_bytes()[:-20])
-    resource.setrlimit(resource.RLIMIT_FSIZE, (40_000, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
-    with pytest.raises(RecordingError, match=r"run\.mcap: cannot be written"):
-        recover(big, path)
-    assert not path.exists()
-
-
 def drawn_scene(path):
-    """The pair's recording with a scene, states out of order by 0.15 s, and an event from the future."""
-    clock = [START]
-    recording = Recording(
-        path, Plan(PAIR), case="only", seed=4, clock="real", draw=markers.drawing(Plan(PAIR)), utc=lambda: clock[0]
-    )
-    with recording:
-        recording.write(Event(START + 5.0, "start", "conductor", "common start"))
+    """Write the pair's recording with a scene, states out of order by 0.15 s, and an event from the future."""
+    clock = ManualClock(START)
+    with recording(path, draw=markers.drawing(Plan(PAIR)), utc=clock.utc) as made:
+        made.write(Event(START + 5.0, "start", "conductor", "common start"))
         for k in range(300):
-            clock[0] = START + 0.05 * k + 0.2
+            clock.now = START + 0.05 * k + 0.2
             for robot, late in (("TB01", 0.0), ("CF01", 0.15)):
-                recording.write(state(robot, seq=k + 1, at=0.05 * k + 0.2 - late, x=0.01 * k))
+                made.write(state(robot, seq=k + 1, at=0.05 * k + 0.2 - late, x=0.01 * k))
             if k % 20 == 7:
-                recording.write(Event(clock[0] - 0.5, "robot", "CF01", "said late"))
+                made.write(Event(clock.now - 0.5, "robot", "CF01", "said late"))
 
 
 def test_viewers_find_frames_and_scene_in_standard_types(path):
@@ -226,8 +212,7 @@ def test_viewers_find_frames_and_scene_in_standard_types(path):
     assert (links.type, links.header.frame_id, len(links.colors)) == (5, "map", len(links.points))
     assert links.points[0].x == pytest.approx(2.99, abs=0.05)
 
-    with path.open("rb") as file:
-        found = list(make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages(["/tf", "/scene"]))
+    found = decoded(path, ["/tf", "/scene"])
     assert len(found) == len(frames) + len(scenes)
     assert [len(one.decoded_message.markers) for one in found if one.channel.topic == "/scene"] == [
         len(each) for each in scenes
@@ -238,9 +223,8 @@ def test_size_of_chunks_changes_no_message(tmp_path):
     kept = []
     for size in (1_000, CHUNK_BYTES, 1_000_000):
         file = tmp_path / f"{size}.mcap"
-        with Recording(file, Plan(PAIR), case="only", seed=4, clock="real", chunk_bytes=size) as recording:
-            for k in range(200):
-                recording.write(state("CF01", k, START + 0.02 * k))
+        with recording(file, chunk_bytes=size) as made:
+            put(made, [state("CF01", k, START + 0.02 * k) for k in range(200)])
         with file.open("rb") as stream:
             reader = make_reader(stream, validate_crcs=True)
             found = [(channel.topic, message) for _, channel, message in reader.iter_messages()]
