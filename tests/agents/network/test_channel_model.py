@@ -32,12 +32,19 @@ def channel(**values):
     return Channel([conditions(**values)])
 
 
-def say(made, link, seq, stamp, *, start=0.0, size=100, now=-inf):
-    made.send(link, (seq, stamp), seq, stamp, start=start, size=size, now=now)
+def send(made, stamps, *, links=(0,), start=0.0, size=100, nows=()):
+    """Send samples 1, 2, … at `stamps` [s] on each of the links; `nows` [s] are their receptions."""
+    for k, stamp in enumerate(stamps):
+        for link in links:
+            made.send(link, (k + 1, stamp), k + 1, stamp, start=start, size=size, now=nows[k] if nows else -inf)
 
 
-def heard(made, t=inf):
+def received(made, t=inf):
     return [Got(link, arrival, *sample) for link, arrival, sample in made.due(t)]
+
+
+def arrivals(made, t=inf):
+    return [got.arrival for got in received(made, t)]
 
 
 def lost(link=0, count=MANY, **values):
@@ -48,6 +55,33 @@ def lost(link=0, count=MANY, **values):
 def bursts(gone):
     """Lengths of the runs of lost samples."""
     return np.array([len(list(run)) for bad, run in groupby(gone.tolist()) if bad])
+
+
+# ---------------------------------------------------------------------- random numbers
+
+
+def test_first_numbers_of_splitmix64():
+    """SplitMix64 with seed 0 begins with these words (as in the tests of its other implementations)."""
+    words = [0xE220A8397B1DCDAF, 0x6E789E6AA1B965F4, 0x06C45D188009454F]
+    assert [uniform(0, counter) for counter in (1, 2, 3)] == [(word >> 11) / 2**53 for word in words]
+
+
+def test_keys_differ_by_seed_names_and_order():
+    """Whoever changes a key loses other samples than runs did before."""
+    made = [key(1, "A", "B"), key(2, "A", "B"), key(1, "B", "A"), key(1, "AB"), key(1, "A", "B", ""), key(11, "B")]
+    assert made[0] == 0x2E2988F8CB8FE3C8
+    assert len(set(made)) == len(made)
+    assert all(0 <= each < 2**64 for each in made)
+
+
+@pytest.mark.parametrize("stride", [1, 2, 64, 2**20])
+def test_numbers_are_uniform(stride):
+    """χ² over a thousand bins: the mean is 999, four standard deviations are 179."""
+    count, word = 100_000, key(1, "A")
+    u = np.array([uniform(word, counter * stride) for counter in range(count)])
+    bins = np.bincount((1000 * u).astype(int), minlength=1000)
+    assert abs(((bins - count / 1000) ** 2 / (count / 1000)).sum() - 999.0) < 179.0
+    assert abs(np.corrcoef(u[:-1], u[1:])[0, 1]) < 4.5 / sqrt(count)
 
 
 # ---------------------------------------------------------------------- losses
@@ -102,55 +136,45 @@ def test_bursts_are_a_chain_without_memory(seed, loss, more):
 def test_fate_depends_on_no_other_sample(seed, order, burst):
     values = {"seed": seed, "loss": 0.3, "burst": burst, "jitter": 0.01}
     together, alone = Channel([conditions(link, **values) for link in range(3)]), channel(**values)
-    for seq in range(1, 61):
-        for link in range(3):
-            say(together, link, seq, 0.1 * seq)
+    send(together, [0.1 * seq for seq in range(1, 61)], links=range(3))
     for seq in order:
-        say(alone, 0, seq, 0.1 * seq)
-    got = [each for each in heard(together) if each.link == 0]
-    assert sorted(got) == sorted(other := heard(alone))
+        alone.send(0, (seq, 0.1 * seq), seq, 0.1 * seq, start=0.0, size=100)
+    got = [each for each in received(together) if each.link == 0]
+    assert sorted(got) == sorted(other := received(alone))
     assert together.dropped[0] == alone.dropped[0] == 60 - len(other)
 
 
-def test_repetitions_lose_others():
-    first, second = (lost(seed=seed, loss=0.3) for seed in (1, 2))
-    assert (first & second).mean() == pytest.approx(0.09, abs=0.01)
+@pytest.mark.parametrize("other", [{"seed": 2}, {"link": 1}], ids=str)
+def test_repetitions_and_links_lose_others(other):
+    assert (lost(loss=0.3) & lost(loss=0.3, **other)).mean() == pytest.approx(0.09, abs=0.01)
 
 
 # ---------------------------------------------------------------------- delay and jitter
 
 
-def test_delay_and_jitter():
-    made = channel(delay=0.02, jitter=0.03)
-    for seq in range(1, 5001):
-        say(made, 0, seq, 1.0 * seq)
-    extra = np.array([got.arrival - got.stamp - 0.02 for got in heard(made)])
+@pytest.mark.parametrize("loss", [0.0, 0.5])
+def test_delay_and_jitter(loss):
+    made = channel(delay=0.02, jitter=0.03, loss=loss)
+    send(made, range(1, 5001))
+    extra = np.array([got.arrival - got.stamp - 0.02 for got in received(made)])
     assert extra.min() >= -1e-9
     assert extra.mean() == pytest.approx(0.03, rel=0.06)
     assert np.quantile(extra, 0.5) == pytest.approx(0.03 * log(2.0), rel=0.06)
-    assert made.dropped == [0]
-
-
-def test_jitter_is_independent_of_loss():
-    made = channel(jitter=0.03, loss=0.5)
-    for seq in range(1, 4001):
-        say(made, 0, seq, 1.0 * seq)
-    assert np.mean([got.arrival - got.stamp for got in heard(made)]) == pytest.approx(0.03, rel=0.1)
+    assert made.dropped == [5000 - len(extra)]
+    assert (made.dropped[0] > 0) == (loss > 0.0)
 
 
 def test_time_of_the_real_network_counts():
     made = channel(delay=0.05)
-    for seq, (stamp, now) in enumerate([(1.0, 1.0), (1.1, 1.13), (1.2, 1.25), (1.3, 1.42)], start=1):
-        say(made, 0, seq, stamp, now=now)
-    assert [got.arrival for got in heard(made)] == pytest.approx([1.05, 1.15, 1.25, 1.42])
+    send(made, [1.0, 1.1, 1.2, 1.3], nows=[1.0, 1.13, 1.25, 1.42])
+    assert arrivals(made) == pytest.approx([1.05, 1.15, 1.25, 1.42])
 
 
 def test_ideal_network_adds_nothing():
     made = Channel([Conditions(), Conditions()])
     assert made.ideal
-    for link in (0, 1):
-        say(made, link, 1, 0.97, now=1.0)
-    assert [got.arrival for got in heard(made, 1.0)] == [1.0, 1.0]
+    send(made, [0.97], links=(0, 1), nows=[1.0])
+    assert arrivals(made, 1.0) == [1.0, 1.0]
     assert made.due(2.0) == []
     for value in ({"delay": 0.01}, {"jitter": 0.01}, {"loss": 0.1}, {"bandwidth": 1e4}, {"outages": ((0.0, 1.0),)}):
         assert not channel(**value).ideal
@@ -158,18 +182,16 @@ def test_ideal_network_adds_nothing():
 
 def test_samples_wait_for_their_time():
     made = channel(delay=0.05)
-    say(made, 0, 1, 0.0)
-    say(made, 0, 2, 0.02)
-    assert [[got.seq for got in heard(made, t)] for t in (0.04, 0.05, 0.06, 0.08)] == [[], [1], [], [2]]
+    send(made, [0.0, 0.02])
+    assert [[got.seq for got in received(made, t)] for t in (0.04, 0.05, 0.06, 0.08)] == [[], [1], [], [2]]
 
 
 def test_forgotten_samples_never_arrive():
     made = Channel([conditions(link, delay=0.05) for link in range(3)])
-    for link in range(3):
-        say(made, link, 1, 0.0)
+    send(made, [0.0], links=range(3))
     made.forget(0)
     made.forget(2)
-    assert [got.link for got in heard(made)] == [1]
+    assert [got.link for got in received(made)] == [1]
     made.forget(1)
     assert made.due(1.0) == []
 
@@ -177,18 +199,19 @@ def test_forgotten_samples_never_arrive():
 # ---------------------------------------------------------------------- bandwidth
 
 
-def test_narrow_link_takes_its_time():
+@pytest.mark.parametrize(
+    ("size", "expected"), [(100, [0.105, 0.205, 0.305, 0.605]), (50, [0.055, 0.105, 0.155, 0.555])], ids=str
+)
+def test_narrow_link_takes_its_time(size, expected):
     made = channel(delay=0.005, bandwidth=8000.0, queue=10.0)  # 100 bytes take 0.1 s
-    for seq, stamp in enumerate([0.0, 0.02, 0.04, 0.5], start=1):
-        say(made, 0, seq, stamp, size=100 if seq < 4 else 50)
-    assert [got.arrival for got in heard(made)] == pytest.approx([0.105, 0.205, 0.305, 0.555], abs=1e-12)
+    send(made, [0.0, 0.02, 0.04, 0.5], size=size)
+    assert arrivals(made) == pytest.approx(expected, abs=1e-12)
 
 
 def test_full_queue_drops():
     made = channel(bandwidth=8000.0, queue=0.15)
-    for seq in range(1, 101):  # transmitted every 20 ms, sent every 100 ms
-        say(made, 0, seq, 0.02 * (seq - 1))
-    got = heard(made)
+    send(made, [0.02 * k for k in range(100)])  # transmitted every 20 ms, sent every 100 ms
+    got = received(made)
     assert max(each.arrival - 0.1 - each.stamp for each in got) <= 0.15 + 2e-6
     assert np.diff([each.arrival for each in got]) == pytest.approx(0.1, abs=1e-12)  # always busy
     assert [each.seq for each in got] == [1, 2, *range(4, 100, 5)]  # from the second on, those that wait for 0.14 s
@@ -197,32 +220,27 @@ def test_full_queue_drops():
 
 def test_without_a_queue_busy_links_drop():
     made = channel(bandwidth=8000.0, queue=0.0)
-    for seq in range(1, 11):
-        say(made, 0, seq, 0.05 * (seq - 1))
-    assert [got.seq for got in heard(made)] == [1, 3, 5, 7, 9]
+    send(made, [0.05 * k for k in range(10)])
+    assert [got.seq for got in received(made)] == [1, 3, 5, 7, 9]
 
 
 def test_lost_samples_have_been_sent():
     free, lossy = (channel(bandwidth=8000.0, queue=inf, loss=loss) for loss in (0.0, 0.5))
-    for seq in range(1, 51):
-        for made in (free, lossy):
-            say(made, 0, seq, 0.02 * seq)
-    whole = {got.seq: got.arrival for got in heard(free)}
-    part = heard(lossy)
+    for made in (free, lossy):
+        send(made, [0.02 * k for k in range(50)])
+    whole = {got.seq: got.arrival for got in received(free)}
+    part = received(lossy)
     assert 10 < len(part) < 40
     assert all(got.arrival == whole[got.seq] for got in part)
 
 
 def test_every_link_has_its_queue():
     made = Channel([conditions(0, bandwidth=8000.0, queue=10.0), conditions(1, queue=10.0)])
-    for seq in range(1, 6):
-        for link in (0, 1):
-            say(made, link, seq, 0.0)
+    send(made, [0.0] * 5, links=(0, 1))
     by_link = defaultdict(list)
-    for got in heard(made):
+    for got in received(made):
         by_link[got.link].append(got.arrival)
-    assert by_link[0] == pytest.approx([0.1, 0.2, 0.3, 0.4, 0.5])
-    assert by_link[1] == [0.0] * 5
+    assert by_link == {0: pytest.approx([0.1, 0.2, 0.3, 0.4, 0.5]), 1: [0.0] * 5}
     assert made.limited
 
 
@@ -231,35 +249,29 @@ def test_every_link_has_its_queue():
 
 def test_nothing_passes_in_an_outage():
     made = Channel([conditions(0, delay=0.05, outages=((1.0, 2.0),)), conditions(1, delay=0.05)])
-    for k in range(300):
-        for link in (0, 1):
-            say(made, link, k + 1, 10.0 + 0.01 * k, start=10.0)
-    stamps = [round(got.stamp - 10.0, 6) for got in heard(made) if got.link == 0]
+    send(made, [10.0 + 0.01 * k for k in range(300)], links=(0, 1), start=10.0)
+    stamps = [round(got.stamp - 10.0, 6) for got in received(made) if got.link == 0]
     assert not any(0.945 < stamp < 1.995 for stamp in stamps)  # what would arrive in it is lost too
     assert {0.94, 2.0} <= set(stamps)
     assert made.dropped == [105, 0]
 
 
-def test_outage_to_the_end():
-    made = channel(outages=((0.5, inf),))
-    for k in range(100):
-        say(made, 0, k + 1, 0.01 * k)
-    assert [got.seq for got in heard(made)] == list(range(1, 51))
-
-
 @pytest.mark.parametrize("start", [inf, nan, 2.0])
 def test_before_the_start_nothing_is_lost(start):
     made = channel(loss=1.0, delay=0.05, bandwidth=8.0, queue=0.0, outages=((0.0, inf),))
-    for k in range(100):
-        say(made, 0, k + 1, 0.01 * k, start=start)
-    assert [got.arrival for got in heard(made)] == pytest.approx([0.01 * k + 0.05 for k in range(100)])
+    send(made, [0.01 * k for k in range(100)], start=start)
+    assert arrivals(made) == pytest.approx([0.01 * k + 0.05 for k in range(100)])
 
 
-def test_after_the_end_nothing_is_lost():
-    made = channel(loss=1.0, duration=0.5)
-    for k in range(100):
-        say(made, 0, k + 1, 0.01 * k)
-    assert [got.seq for got in heard(made)] == list(range(51, 101))
+@pytest.mark.parametrize(
+    ("values", "passes"),
+    [({"outages": ((0.5, inf),)}, range(1, 51)), ({"loss": 1.0, "duration": 0.5}, range(51, 101))],
+    ids=["outage to the end", "after the end nothing is lost"],
+)
+def test_end_of_run_and_outage(values, passes):
+    made = channel(**values)
+    send(made, [0.01 * k for k in range(100)])
+    assert [got.seq for got in received(made)] == list(passes)
     assert made.dropped == [50]
 
 
@@ -273,13 +285,11 @@ def test_real_receiver_loses_what_virtual_does(seed, took):
     """The same sequence at both: as transmitted, and as it comes in over a real network."""
     values = {"delay": 0.05, "jitter": 0.02, "loss": 0.3, "burst": 3.0, "bandwidth": 40_000.0, "queue": 0.01}
     virtual, real = channel(seed=seed, **values), channel(seed=seed, **values)
-    latest = 0.0
-    for k in range(100):
-        stamp = 0.02 * k
-        say(virtual, 0, k + 1, stamp)
-        latest = max(latest, stamp + took[k])  # a publisher's samples come in order
-        say(real, 0, k + 1, stamp, now=latest)
-    one, other = ({got.seq: got.arrival for got in heard(made)} for made in (virtual, real))
+    stamps = [0.02 * k for k in range(100)]
+    send(virtual, stamps)
+    # a publisher's samples come in order
+    send(real, stamps, nows=np.maximum.accumulate(np.add(stamps, took)).tolist())
+    one, other = ({got.seq: got.arrival for got in received(made)} for made in (virtual, real))
     assert one.keys() == other.keys()
     assert all(other[seq] >= one[seq] for seq in one)
     assert virtual.dropped == real.dropped

@@ -33,7 +33,6 @@ from agents.network.session import (
     ANSWER_S,
     ASK_EVERY_S,
     RouterWatch,
-    Unreachable,
     connected,
     count_links,
     forbid_lingering,
@@ -52,67 +51,6 @@ POSE = "park/CF01/pose"
 
 def payloads(handler):
     return [sample.payload.to_bytes() for sample in received(handler)]
-
-
-@pytest.mark.parametrize(
-    "endpoint", ["tcp/0.0.0.0:7447", "tcp/[::]:7447", "tcp/192.168.1.2:7447", "tcp/host.example:7447", "tcp/:1"]
-)
-def test_refuses_to_listen_beyond_loopback(endpoint):
-    with pytest.raises(EndpointError, match="SSH tunnel"):
-        config(settings("router", listen=[endpoint]))
-
-
-@pytest.mark.parametrize("endpoint", ["127.0.0.1:7447", "tcp/", "/127.0.0.1:7447", ""])
-def test_refuses_what_is_no_endpoint(endpoint):
-    with pytest.raises(EndpointError, match=r"write it like tcp/127\.0\.0\.1:7447"):
-        config(settings("client", connect=[endpoint]))
-
-
-@pytest.mark.parametrize(
-    ("endpoint", "why"),
-    [("udp/127.0.0.1:1", "lost messages"), ("ws/127.0.0.1:1", "certificates"), ("serial//dev/ttyUSB0", "no network"),
-     ("http/127.0.0.1:1", "no such protocol")],
-)  # fmt: skip
-def test_transports_that_are_not_used_are_refused(endpoint, why):
-    for ends in ({"listen": [endpoint]}, {"connect": [endpoint]}):
-        with pytest.raises(EndpointError, match=rf"{why}.*; write it like tcp/127.* unixsock-stream/PATH"):
-            config(settings("router", **ends))
-
-
-@pytest.mark.parametrize("endpoint", ["t#tcp/localhost:1", "tcp/127.0.0.1:7447\n", "tcp?/x/y"])
-def test_endpoints_unknown_to_zenoh_are_refused_by_name(endpoint):
-    with pytest.raises(EndpointError, match=r"write .*tcp/127\.0\.0\.1:7447"):
-        config(settings("client", connect=[endpoint]))
-
-
-@pytest.mark.parametrize("endpoint", ["tcp/127.0.0.1:0", "tcp/127.3.2.1:7447", "tcp/[::1]:7447", "tcp/localhost:7447"])
-def test_listens_on_loopback(endpoint):
-    made = config(settings("router", listen=[endpoint], name="router", lease_s=1.5))
-    assert made.get_json("listen/endpoints") == f'["{endpoint}"]'
-    assert made.get_json("scouting/multicast/enabled") == "false"
-    assert made.get_json("scouting/gossip/enabled") == "false"
-    assert made.get_json("transport/shared_memory/enabled") == "false"
-    assert made.get_json("transport/link/tx/lease") == "1500"
-
-
-def test_free_endpoint_avoids_a_taken_port():
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
-        assert free_endpoint(port) != f"tcp/127.0.0.1:{port}"
-    assert free_endpoint(port) == f"tcp/127.0.0.1:{port}"
-
-
-def test_unreachable_names_endpoints_and_remedy():
-    endpoint = free_endpoint(preferred_port=0)
-    with pytest.raises(Unreachable, match=rf"{endpoint}.*`./zenpark router`"):
-        open_session([endpoint], name="test", wait_s=0.0)
-
-
-def test_stop_ends_the_wait_for_a_router():
-    stop = threading.Event()
-    stop.set()
-    with pytest.raises(Unreachable):
-        open_session([free_endpoint(preferred_port=0)], name="test", wait_s=1e6, stop=stop)
 
 
 @pytest.mark.system
