@@ -17,19 +17,8 @@ from experiments.metrics.statistics import by_case
 from experiments.recording.run_folder import RunOrigin, read_origin
 from experiments.recording.trace import Trace
 from experiments.recording.version import provenance
-from experiments.report import figures, replay
+from experiments.report import figures, page, replay
 from experiments.report.metrics_files import Band
-from experiments.report.page import (
-    PageFigure,
-    Section,
-    Table,
-    TableRow,
-    VerdictLine,
-    date_of,
-    numbered,
-    render,
-    seeds_in_words,
-)
 from experiments.report.tables import (
     architecture_table,
     clearance_tables,
@@ -128,11 +117,11 @@ def write(
     folder.mkdir(parents=True, exist_ok=True)
     made = read_origin(folder if run is None else run)
     if made is None or not made.date:  # another file of that name has no date
-        made = RunOrigin(date=date or date_of(time.time()), made_by=provenance())
+        made = RunOrigin(date=date or page.date_of(time.time()), made_by=provenance())
     facts = [
         ("Date", made.date),
         ("Clock", _joined(trace.clock for trace in traces)),
-        ("Seed" if len(seeds) == 1 else "Seeds", seeds_in_words(seeds)),
+        ("Seed" if len(seeds) == 1 else "Seeds", page.seeds_in_words(seeds)),
         ("Duration", _joined(_length(case) for case in cases)),
         ("Robots", str(len(traces[0].robots))),
         ("Cases", ", ".join(by_case(cases))),
@@ -147,24 +136,24 @@ def write(
     sections = [
         *_tables("Criteria", CRITERIA, [criteria_table(cases)], folded=False),
         *_results(cases),
-        Section("Figures", (FOR_A_PAPER,), pictures=pictures),
-        Section("Events", tables=(short,), more=every_event),
+        page.Section("Figures", (FOR_A_PAPER,), pictures=pictures),
+        page.Section("Events", tables=(short,), more=every_event),
         *_details(cases),
         *_of_worlds(cases, drawings, len(pictures)),
         *_tables("Clocks of other machines", CLOCKS, [clocks_table(first)]),
-        Section("Experiment file", listing=listing, folded=f"{len(listing.splitlines())} lines"),
+        page.Section("Experiment file", listing=listing, folded=f"{len(listing.splitlines())} lines"),
         _defined(cases),
     ]
     first_of_all, verdict = [*failures(cases), *spoiled(cases), *interruptions(cases)], findings(cases)
     if len(seeds) > 1 and not (experiment.start.scatter or experiment.start.scatter_yaw):
-        verdict.append(VerdictLine("plain", SAME_STARTS))
-    return render(
+        verdict.append(page.VerdictLine("plain", SAME_STARTS))
+    return page.render(
         folder / "report.html",
         title=experiment.title,
         source=experiment.source,
         facts=facts,
         command=made.command,
-        verdict=[*first_of_all, *(VerdictLine("fair", note) for note in notes), *verdict[len(first_of_all) :]],
+        verdict=[*first_of_all, *(page.VerdictLine("fair", note) for note in notes), *verdict[len(first_of_all) :]],
         sections=sections,
         foot=() if made.made_by is None else made.made_by.words,  # of an old run it is not known
         replay=replay.embedded(traces),
@@ -180,7 +169,7 @@ def labelled(runs: Sequence[tuple[str, Sequence[CaseMetrics]]]) -> list[CaseMetr
     ]
 
 
-def result_tables(cases: Sequence[CaseMetrics], chosen: Sequence[str] = ()) -> list[Table]:
+def result_tables(cases: Sequence[CaseMetrics], chosen: Sequence[str] = ()) -> list[page.Table]:
     """The tables of the section "Results", and those of each robot, each with the number of seeds; some indices alone.
 
     Args:
@@ -226,19 +215,19 @@ def compare(
     drawn = [figures.global_bars(cases), figures.robot_bars(cases)]
     captions = (_global_caption(cases), _robot_caption(cases))
     facts = [
-        ("Date", date_of(time.time())),
+        ("Date", page.date_of(time.time())),
         ("Runs", ", ".join(names)),
         ("Reference", cases[0].case),
     ]
     sections = [
         *_tables("Differences", DIFFERENCES, [differences_table(differences)], folded=False),
         *_results(cases),
-        Section("Figures", pictures=numbered(zip(drawn, captions, strict=True))),
+        page.Section("Figures", pictures=page.numbered(zip(drawn, captions, strict=True))),
         *_details(cases),
         _defined(cases),
     ]
     target.parent.mkdir(parents=True, exist_ok=True)
-    return render(
+    return page.render(
         target,
         title="Comparison of runs",
         source=source,
@@ -248,56 +237,58 @@ def compare(
     )
 
 
-def differences_table(differences: Sequence[tuple[str, str, Sequence[str]]]) -> Table:
+def differences_table(differences: Sequence[tuple[str, str, Sequence[str]]]) -> page.Table:
     """Name and folder of each run, and its differences from the first one."""
     how = [
-        TableRow((name, folder, "; ".join(found) or ("the same file, seeds and versions" if k else "the reference")))
+        page.TableRow(
+            (name, folder, "; ".join(found) or ("the same file, seeds and versions" if k else "the reference"))
+        )
         for k, (name, folder, found) in enumerate(differences)
     ]
-    return Table(("Run", "Folder", "Differs from the first in"), tuple(how), words=True)
+    return page.Table(("Run", "Folder", "Differs from the first in"), tuple(how), words=True)
 
 
-def _noted(differences: Sequence[tuple[str, str, Sequence[str]]]) -> list[VerdictLine]:
+def _noted(differences: Sequence[tuple[str, str, Sequence[str]]]) -> list[page.VerdictLine]:
     """Differences of the runs from the first one."""
     found = []
     for name, _, how in differences[1:]:
         more = f" and {len(how) - 2} more" if len(how) > 2 else ""
         same = "has the same file, seeds and versions as the reference"
         text = f"{name} differs in {'; '.join(how[:2])}{more}." if how else f"{name} {same}."
-        found.append(VerdictLine("fair" if how else "plain", text))
+        found.append(page.VerdictLine("fair" if how else "plain", text))
     return found
 
 
-def _tables(title: str, prose: str, tables: Iterable[Table | None], *, folded: bool = True) -> list[Section]:
+def _tables(title: str, prose: str, tables: Iterable[page.Table | None], *, folded: bool = True) -> list[page.Section]:
     """A section of tables with rows; none without any."""
     shown = tuple(table for table in tables if table is not None and table.rows)
     rows = f"{sum(len(table.rows) for table in shown)} rows"
-    return [Section(title, (prose,), shown, folded=rows if folded else "")] if shown else []
+    return [page.Section(title, (prose,), shown, folded=rows if folded else "")] if shown else []
 
 
-def _defined(cases: Sequence[CaseMetrics]) -> Section:
+def _defined(cases: Sequence[CaseMetrics]) -> page.Section:
     terms = definitions(cases)
-    return Section("Definitions", terms=terms, folded=f"{len(terms)} terms")
+    return page.Section("Definitions", terms=terms, folded=f"{len(terms)} terms")
 
 
-def _results(cases: Sequence[CaseMetrics]) -> list[Section]:
+def _results(cases: Sequence[CaseMetrics]) -> list[page.Section]:
     return [
-        Section("Results", (left_out(cases),), (summary_table(cases), *whole_tables(cases))),
+        page.Section("Results", (left_out(cases),), (summary_table(cases), *whole_tables(cases))),
         *_tables("Architecture", ARCHITECTURE, [architecture_table(cases)], folded=False),
     ]
 
 
-def _details(cases: Sequence[CaseMetrics]) -> list[Section]:
+def _details(cases: Sequence[CaseMetrics]) -> list[page.Section]:
     return [
-        Section("Each robot", tables=robot_tables(cases), folded="metrics of every robot"),
-        Section("Data integrity", (PROOF,), proof_tables(cases), folded="poses sent, recorded, received, lost"),
+        page.Section("Each robot", tables=robot_tables(cases), folded="metrics of every robot"),
+        page.Section("Data integrity", (PROOF,), proof_tables(cases), folded="poses sent, recorded, received, lost"),
         *_tables("Network model", NETWORK, network_tables(cases)),
     ]
 
 
 def _pictures(
     cases: Sequence[CaseMetrics], traces: Sequence[Trace], bands: Mapping[str, Band], drawings: Mapping[str, str]
-) -> tuple[PageFigure, ...]:
+) -> tuple[page.PageFigure, ...]:
     legs = "; legs of the timeline dashed" if any(len(case.starts_s) > 1 for case in cases) else ""
     seeds = len({case.seed for case in cases})
     seed = f" Seed {traces[0].seed}." if seeds > 1 else ""
@@ -317,10 +308,10 @@ def _pictures(
         "intervals": f"Share of the times between transmissions up to a length; single robots thin.{seed}",
         "plan_view": f"From above: start hollow, end full, with its links.{standing}{seed}",
     }
-    return numbered((svg, captions[name]) for name, svg in drawings.items() if name in captions)
+    return page.numbered((svg, captions[name]) for name, svg in drawings.items() if name in captions)
 
 
-def _of_worlds(cases: Sequence[CaseMetrics], drawings: Mapping[str, str], figures_before: int) -> list[Section]:
+def _of_worlds(cases: Sequence[CaseMetrics], drawings: Mapping[str, str], figures_before: int) -> list[page.Section]:
     """Contacts, close approaches and shadow twins, where there are any."""
     sections = []
     if any(case.near or case.near_arena or case.collisions for case in cases):
@@ -329,14 +320,16 @@ def _of_worlds(cases: Sequence[CaseMetrics], drawings: Mapping[str, str], figure
         contacts = f"{count} collisions" if count else "closest approaches"
         source = FROM_WORLD if all(case.watched for case in cases) else FROM_POSITIONS
         sections.append(
-            Section("Contacts and clearances", (source,), (*touched, *clearance_tables(cases)), folded=contacts)
+            page.Section("Contacts and clearances", (source,), (*touched, *clearance_tables(cases)), folded=contacts)
         )
     if tables := shadow_tables(cases):
         seed = f" Seed {cases[0].seed}." if len({case.seed for case in cases}) > 1 else ""
         drawn = ((svg, f"{SHADOWS}{seed}") for name, svg in drawings.items() if name == "shadows")
-        pictures = numbered(drawn, figures_before + 1)
+        pictures = page.numbered(drawn, figures_before + 1)
         sections.append(
-            Section("Twins beside robots", tables=tables, pictures=pictures, folded="shadow twins against their robots")
+            page.Section(
+                "Twins beside robots", tables=tables, pictures=pictures, folded="shadow twins against their robots"
+            )
         )
     return sections
 

@@ -8,18 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from experiments.metrics.metric import foreign_metrics
-from experiments.report import style
-from experiments.report.page import (
-    PageFigure,
-    Section,
-    Table,
-    TableRow,
-    VerdictLine,
-    date_of,
-    numbered,
-    render,
-    seeds_in_words,
-)
+from experiments.report import page, style
 from experiments.report.tables import over_seeds, ratio_words
 from experiments.sweep.optimise import TuningResult
 from experiments.sweep.pareto import by_environment, front, pareto
@@ -51,27 +40,29 @@ CAPTION: Final = (
 def write(found: SweepResult | TuningResult, command: str) -> Path:
     """Writes `sweep.html` and the figure into the folder of a sweep or of a search."""
     facts = [
-        ("Date", date_of(time.time())),
+        ("Date", page.date_of(time.time())),
         ("Clock", "virtual"),
-        ("Seeds", seeds_in_words(found.seeds)),
+        ("Seeds", page.seeds_in_words(found.seeds)),
         ("Duration", f"{found.read.experiment.duration_s:g} s"),
         ("Robots", str(len(found.read.experiment.robots))),
         ("Cells", str(len(found.tried if isinstance(found, TuningResult) else found.rows))),
     ]
-    notes = [VerdictLine("fair", note) for note in found.notes]
+    notes = [page.VerdictLine("fair", note) for note in found.notes]
     if isinstance(found, TuningResult):
         title, sections = "Tuned", _searched(found)
-        facts.append(("Tuning seeds", seeds_in_words(found.tuning)))
+        facts.append(("Tuning seeds", page.seeds_in_words(found.tuning)))
         notes += verdict(found)
     else:
         title, sections = "Sweep", _swept(found)
         if found.missing:
-            notes.append(VerdictLine("bad", f"interrupted: {found.missing} runs are missing; the same command goes on"))
+            notes.append(
+                page.VerdictLine("bad", f"interrupted: {found.missing} runs are missing; the same command goes on")
+            )
         if found.failures:
             text = f"{len(found.failures)} runs failed, and count in no figure; the first: {found.failures[0]}"
-            notes.append(VerdictLine("bad", text))
+            notes.append(page.VerdictLine("bad", text))
         notes += fewest(found.rows)
-    return render(
+    return page.render(
         found.folder / PAGE,
         title=f"{title}: {found.read.experiment.title}",
         source=found.read.experiment.source,
@@ -80,45 +71,45 @@ def write(found: SweepResult | TuningResult, command: str) -> Path:
         verdict=notes,
         sections=[
             *sections,
-            Section("The experiment", listing=found.read.listing, folded="Show the file"),
-            Section("Definitions", terms=(*TERMS, *((m.label, m.meaning) for m in foreign_metrics().values()))),
+            page.Section("The experiment", listing=found.read.listing, folded="Show the file"),
+            page.Section("Definitions", terms=(*TERMS, *((m.label, m.meaning) for m in foreign_metrics().values()))),
         ],
     )
 
 
-def _swept(found: SweepResult) -> list[Section]:
+def _swept(found: SweepResult) -> list[page.Section]:
     folded = "Show the table" if len(found.rows) > MOST_LINES else ""
     return [
-        Section("Messages against error", pictures=pictures(found.folder, found.rows, joined=True)),
-        Section("All cells", tables=(table(found.rows),), folded=folded),
+        page.Section("Messages against error", pictures=pictures(found.folder, found.rows, joined=True)),
+        page.Section("All cells", tables=(table(found.rows),), folded=folded),
     ]
 
 
-def _searched(tuned: TuningResult) -> list[Section]:
+def _searched(tuned: TuningResult) -> list[page.Section]:
     reference = [row for row in tuned.rows if row.reference]
-    seeds, searched = seeds_in_words(tuned.seeds), seeds_in_words(tuned.searched)
+    seeds, searched = page.seeds_in_words(tuned.seeds), page.seeds_in_words(tuned.searched)
     drawn = pictures(tuned.folder, [*reference, *tuned.tried], joined=False)
     return [
-        Section("Result", (f"On seeds {seeds}, which no choice has seen.",), (table(tuned.rows),)),
-        Section("All points of the search", (f"On seeds {searched}.",), pictures=drawn),
-        Section("Table of the search", tables=(table(tuned.tried),), folded="Show the table"),
+        page.Section("Result", (f"On seeds {seeds}, which no choice has seen.",), (table(tuned.rows),)),
+        page.Section("All points of the search", (f"On seeds {searched}.",), pictures=drawn),
+        page.Section("Table of the search", tables=(table(tuned.tried),), folded="Show the table"),
     ]
 
 
-def verdict(tuned: TuningResult) -> list[VerdictLine]:
+def verdict(tuned: TuningResult) -> list[page.VerdictLine]:
     """For each case whether the limits were kept on the reporting seeds, and at how many messages."""
     limits = " and ".join(map(str, tuned.objective.limits))
     found = []
     for row in (row for row in tuned.rows if not row.reference):
         what = f"{row.label}: {_saved(row)}"
         if tuned.objective.kept(row):
-            found.append(VerdictLine("good", f"{what}, keeps {limits}"))
+            found.append(page.VerdictLine("good", f"{what}, keeps {limits}"))
         else:
-            found.append(VerdictLine("bad", f"{what}, does not keep {limits}"))
+            found.append(page.VerdictLine("bad", f"{what}, does not keep {limits}"))
     return found
 
 
-def table(rows: Sequence[CellRow], title: str = "", chosen: Sequence[str] = ()) -> Table:
+def table(rows: Sequence[CellRow], title: str = "", chosen: Sequence[str] = ()) -> page.Table:
     """A row for each cell: case, parameters, numbers; some of them (keys of `numbers`), if `chosen`.
 
     With a `title`, for a paper: a number that is the same in all cells stands in the note, with the number of seeds.
@@ -129,18 +120,19 @@ def table(rows: Sequence[CellRow], title: str = "", chosen: Sequence[str] = ()) 
     alike = {head: cells[0] for head, cells in columns.items() if title and not chosen and len({*cells}) == 1}
     columns = parameters | {head: cells for head, cells in columns.items() if head not in alike}
     lines = [
-        TableRow((row.case, *(cells[k] for cells in columns.values())), row.reference) for k, row in enumerate(rows)
+        page.TableRow((row.case, *(cells[k] for cells in columns.values())), row.reference)
+        for k, row in enumerate(rows)
     ]
     reference = next((row.case for row in rows if row.reference), "the reference")
     note = [f"Ratios are relative to {reference} with the same seed."]
     note += [f"In all cells: {', '.join(f'{head} {cell}' for head, cell in alike.items())}."] if alike else []
     note += [over_seeds(max((row.seeds for row in rows), default=0))] if title else []
-    return Table(("Case", *columns), tuple(lines), title=title, note=" ".join(note))
+    return page.Table(("Case", *columns), tuple(lines), title=title, note=" ".join(note))
 
 
 def pictures(
     folder: Path, rows: Sequence[CellRow], *, joined: bool = True, width: float = style.WIDTH, pdf: bool = False
-) -> tuple[PageFigure, ...]:
+) -> tuple[page.PageFigure, ...]:
     """Messages against IAE, ITAE and other metrics with a figure, so wide [in]; also as files, see `style.save`."""
     against = {name: metric for name, metric in relative_metrics().items() if metric.figure and metric.shown}
     drawn = {name: pareto(rows, name, joined=joined, width=width) for name in against}
@@ -149,34 +141,34 @@ def pictures(
         f"Messages against {metric.label}, likewise{'; more is better' * (metric.better == 'more')}."
         for metric in [*against.values()][1:]
     ]
-    return numbered(zip(saved, [CAPTION, *others], strict=True))
+    return page.numbered(zip(saved, [CAPTION, *others], strict=True))
 
 
-def fewest(rows: Sequence[CellRow]) -> list[VerdictLine]:
+def fewest(rows: Sequence[CellRow]) -> list[page.VerdictLine]:
     """Per environment the cell with the fewest messages within each level of error; the nearest one if none is."""
     others = [row for row in rows if not row.reference and not row.failed and row.ratio["iae"].mean is not None]
     parts = by_environment(others)
-    found: list[VerdictLine] = []
+    found: list[page.VerdictLine] = []
     for where, part in parts.items():
         levels = LEVELS if len(parts) == 1 else LEVELS[-1:]
         found += _fewest_within(part, levels, f"With {where}: " if len(parts) > 1 else "")
     return found
 
 
-def _fewest_within(rows: Sequence[CellRow], levels: Sequence[float], where: str) -> list[VerdictLine]:
+def _fewest_within(rows: Sequence[CellRow], levels: Sequence[float], where: str) -> list[page.VerdictLine]:
     """As `fewest`, of one environment, with words about that in front."""
-    found: dict[str, VerdictLine] = {}
+    found: dict[str, page.VerdictLine] = {}
     for level in levels:
         within = [row for row in front(rows) if (row.ratio["iae"].mean or 0.0) <= level]
         if within:
             what = f"{where}fewest messages with an IAE ratio of at most {level:g}"
             text = f"{what[0].upper()}{what[1:]}: {within[0].label}: {_saved(within[0])}"
-            found.setdefault(within[0].label, VerdictLine("good" if within[0].acquired == 1.0 else "fair", text))
+            found.setdefault(within[0].label, page.VerdictLine("good" if within[0].acquired == 1.0 else "fair", text))
     if not found:
         nearest = min(rows, key=lambda row: row.ratio["iae"].mean or 0.0)
         what = f"{where}no cell has an IAE ratio of at most {LEVELS[-1]:g}; the nearest"
         text = f"{what[0].upper()}{what[1:]}: {nearest.label}: {_saved(nearest)}"
-        return [VerdictLine("fair", text)]
+        return [page.VerdictLine("fair", text)]
     return list(found.values())
 
 
