@@ -140,7 +140,7 @@ def _document(file: Path, label: str, text: str, flags: Sequence[str], *, is_jso
             if key in table
         ]
         shapes = {
-            name: [*fill_from_shape(each), *fill_from_files(each, file.parent), *structure.faults(each)]
+            name: [*fill_from_files(each, file.parent), *fill_from_shape(each), *structure.faults(each)]
             for name, each in documents.items()
         }
         source.refuse([*nested, *_each_once(shapes, tables)])
