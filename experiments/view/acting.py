@@ -273,7 +273,6 @@ class Parameter:
 def parameters(stage: SceneModel) -> list[Parameter]:
     """Parameters that robots change in flight: the numbers of the trigger, and two of the formation."""
     assert stage.plan is not None
-    assert stage.plan is not None
     trigger: Any = stage.plan.trigger
     formation = stage.plan.experiment.formation
     found = [Parameter(f"trigger.{name}", value, _unit(trigger, name))
