@@ -3,7 +3,6 @@
 import os
 import re
 import shutil
-import sys
 
 import msgspec
 import pytest
@@ -18,7 +17,7 @@ from experiments.recording.reader import RecordingError
 from experiments.report.tables import summary_table
 from experiments.run import reopen, simulate
 from experiments.sweep import runs
-from tools.main import main
+from tests.commands import invoke
 
 TASK = """
 title = "Two robots meet"
@@ -73,29 +72,25 @@ def refused(file, *changes):
     return str(caught.value)
 
 
-def call(monkeypatch, *words):
-    monkeypatch.setattr(sys, "argv", ["zenpark", *map(str, words)])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    return ended.value.code
+def changed(task, old, new):
+    """The experiment with another text, refused."""
+    task.write_text(TASK.replace(old, new, 1), "utf-8")
+    return refused(task)
 
 
-def test_a_law_beside_the_experiment_moves_robots(task):
+def test_law_beside_the_experiment_moves_robots(task):
     read = load(task)
     laws = {name: plan.law for name, plan in read.cases().items()}
     assert {name: law.gain for name, law in laws.items()} == {"slow": 0.1, "fast": 0.2}
     assert type(laws["slow"]) is type(laws["fast"])
     assert load(task, "formation.law.gain=0.3").experiment.formation.law["gain"] == 0.3
-    iae = {name: case.mean["iae"] for name, case in simulate(read).metrics.items()}
-    assert 0.0 < iae["fast"] < iae["slow"]
+    metrics = simulate(read).metrics
+    assert 0.0 < metrics["fast"].mean["iae"] < metrics["slow"].mean["iae"]
     assert not [each for each in check(read) if each.severity == "error"]
-
-
-def test_a_file_may_lie_in_a_folder_below(task):
     (task.parent / "solutions").mkdir()
     shutil.copy(task.parent / "meet.py", task.parent / "solutions")
-    changed = load(task, "formation.law=solutions/meet.py:Meet")
-    assert simulate(changed, cases=["slow"]).metrics == simulate(load(task), cases=["slow"]).metrics
+    below = load(task, "formation.law=solutions/meet.py:Meet")
+    assert simulate(below, cases=["slow"]).metrics["slow"] == metrics["slow"]
 
 
 @pytest.mark.parametrize(
@@ -107,9 +102,8 @@ def test_a_file_may_lie_in_a_folder_below(task):
         ("/etc/meet.py:Meet", "no '/etc/meet.py:Meet' among the laws", ""),
     ],
 )
-def test_a_wrong_choice_names_place_and_remedy(task, law, message, hint):
-    task.write_text(TASK.replace('law = "meet.py:Meet"', f'law = "{law}"'), "utf-8")
-    text = refused(task)
+def test_wrong_choice_names_place_and_remedy(task, law, message, hint):
+    text = changed(task, 'law = "meet.py:Meet"', f'law = "{law}"')
     assert f"{task}:11:7: " in text
     assert message in text
     assert hint in text
@@ -118,17 +112,15 @@ def test_a_wrong_choice_names_place_and_remedy(task, law, message, hint):
 
 @pytest.mark.parametrize("kind", ["meet.py:Meet", "none.py:BARROW"])
 def test_kind_in_a_file_is_refused(task, kind):
-    task.write_text(TASK.replace('kind = "khepera4"', f'kind = "{kind}"', 1), "utf-8")
-    text = refused(task)
+    text = changed(task, 'kind = "khepera4"', f'kind = "{kind}"')
     assert f"{task}:5:8: " in text
     assert "a kind cannot be named by its file" in text
     assert "docs/plugins.md#a-kind-of-robot" in text
 
 
-def test_a_pipe_is_not_waited_for(task):
+def test_pipe_is_not_waited_for(task):
     os.mkfifo(task.parent / "pipe.py")
-    task.write_text(TASK.replace('law = "meet.py:Meet"', 'law = "pipe.py:Meet"'), "utf-8")
-    assert "pipe.py is no file" in refused(task)
+    assert "pipe.py is no file" in changed(task, 'law = "meet.py:Meet"', 'law = "pipe.py:Meet"')
 
 
 @pytest.mark.parametrize(
@@ -139,22 +131,21 @@ def test_a_pipe_is_not_waited_for(task):
         ("Meet(Gradient, frozen=True)", "Meet", "inherits from zenpark.Law"),
     ],
 )
-def test_a_broken_file_is_named_with_its_line(task, old, new, message):
+def test_broken_file_is_named_with_its_line(task, old, new, message):
     (task.parent / "meet.py").write_text(MEET.replace(old, new), "utf-8")
     assert message in refused(task)
 
 
 def test_unknown_parameters_are_found(task):
-    task.write_text(TASK.replace("gain = 0.2", "gian = 0.2"), "utf-8")
-    assert "unknown parameter 'gian' of 'meet.py:Meet'" in refused(task)
+    assert "unknown parameter 'gian' of 'meet.py:Meet'" in changed(task, "gain = 0.2", "gian = 0.2")
 
 
-def test_what_others_may_write_is_not_loaded(task):
+def test_file_that_others_may_write_is_not_loaded(task):
     (task.parent / "meet.py").chmod(0o666)
     assert "others may write to it" in refused(task)
 
 
-def test_a_changed_file_is_another_plug_in(task):
+def test_changed_file_is_another_plug_in(task):
     before = load(task)
     (task.parent / "meet.py").write_text(MEET.replace("0.1", "0.4"), "utf-8")
     after = load(task)
@@ -170,10 +161,8 @@ def test_every_process_loads_it_by_its_digest(task):
     written.write_bytes(write_json(case))
     again = load(written).plan
     assert again == case
-    assert (
-        next(iter(received(case_document(case).decode(), "a pipe").cases().values())).experiment.formation
-        == case.experiment.formation
-    )
+    (there,) = received(case_document(case).decode(), "a pipe").cases().values()
+    assert there.experiment.formation == case.experiment.formation
     assert {file.name for file in plugin_files(again)} >= {"meet.py"}
     result = msgspec.json.decode(runs.fly(write_json(case), [1], runs.code_of(case)), type=runs.WorkResult)
     assert [run.seed for run in result.runs] == [1]
@@ -182,7 +171,7 @@ def test_every_process_loads_it_by_its_digest(task):
 @pytest.mark.slow
 def test_another_machine_loads_nothing(task, tmp_path, monkeypatch):
     out = tmp_path / "run"
-    assert call(monkeypatch, "run", task, "--virtual", "--no-report", "--out", out) == 0
+    invoke("run", task, "--virtual", "--no-report", "--out", out)
     assert (out / "meet.py").read_text("utf-8") == MEET
     case = load(task).cases()["fast"]
     monkeypatch.setenv("ZENPARK_CACHE_DIR", str(tmp_path / "elsewhere"))
@@ -192,11 +181,11 @@ def test_another_machine_loads_nothing(task, tmp_path, monkeypatch):
         received(case_document(case).decode(), "the network")
     with pytest.raises(RecordingError, match=r"meet\.py.*zenpark check"):
         reopen(out)
-    assert call(monkeypatch, "check", out / "experiment.toml") == 0
+    invoke("check", out / "experiment.toml")
     assert set(reopen(out).metrics) == {"slow", "fast"}
 
 
-def test_a_copy_that_was_changed_is_not_loaded(task):
+def test_copy_that_was_changed_is_not_loaded(task):
     choice, copy = files.adopt("meet.py:Meet", task.parent)
     copy.write_text(MEET + "\n", "utf-8")
     with pytest.raises(registry.PluginError, match="has not read it"):
@@ -204,25 +193,25 @@ def test_a_copy_that_was_changed_is_not_loaded(task):
 
 
 def test_hosts_do_not_load_it(task):
-    task.write_text(TASK + '[hosts.lab1]\naddress = "lab1"\nrobots = ["A"]\n', "utf-8")
-    assert "is a file of this machine" in refused(task)
+    hosts = '[hosts.lab1]\naddress = "lab1"\nrobots = ["A"]\n'
+    assert "is a file of this machine" in changed(task, "[cases.slow]\n", f"{hosts}[cases.slow]\n")
 
 
 @pytest.mark.slow
-def test_a_bundle_runs_code_by_agreement_alone(task, tmp_path, monkeypatch, capsys):
+def test_bundle_runs_code_by_agreement_alone(task, tmp_path, monkeypatch):
     out, archive = tmp_path / "run", tmp_path / "run.zip"
-    assert call(monkeypatch, "run", task, "--virtual", "--no-report", "--out", out) == 0
+    invoke("run", task, "--virtual", "--no-report", "--out", out)
     bundle.write(out, archive, [*load(task).cases().values()])
     monkeypatch.chdir(tmp_path)
-    assert call(monkeypatch, "run", archive, "--no-report") == 2
-    assert "meet.py" in capsys.readouterr().err
-    assert call(monkeypatch, "run", archive, "--no-report", "--yes") == 0
+    refusal = invoke("run", archive, "--no-report", code=1).exception
+    assert isinstance(refusal, DocumentError)
+    assert "meet.py" in str(refusal)
+    invoke("run", archive, "--no-report", "--yes")
 
 
-def test_a_law_in_the_subset_is_compiled(task):
+def test_law_in_the_subset_is_compiled(task):
     pytest.importorskip("numba")
-    notes = [each for each in check(load(task), ["slow"]) if "compiled" in each.message]
-    assert notes == []
+    assert not [each for each in check(load(task), ["slow"]) if "compiled" in each.message]
 
 
 def test_text_in_no_file_looks_here(task, monkeypatch):
@@ -258,10 +247,14 @@ class Broken(Metric, frozen=True):
 """
 
 
-def judged(task, **criterion):
+def with_criterion(task, **criterion):
     lines = [f"{key} = {value!r}" for key, value in criterion.items()]
     task.write_text("\n".join([TASK, "[[criteria]]", *lines]), "utf-8")
-    return judge([*simulate(load(task), cases=["fast"]).metrics.values()])
+    return task
+
+
+def judged(task, **criterion):
+    return judge([*simulate(load(with_criterion(task, **criterion)), cases=["fast"]).metrics.values()])
 
 
 @pytest.fixture
@@ -278,31 +271,26 @@ def spread(task):
         ({"metric": "spread.py:Last", "of": "worst"}, 0.0, 0.5),
     ],
 )
-def test_a_criterion_names_a_metric_in_a_file(spread, criterion, low, high):
+def test_criterion_names_a_metric_in_a_file(spread, criterion, low, high):
     (only,) = judged(spread, **criterion, at_most=high)
     assert low < only.values[1] < high
     assert only.passed
     assert "@" not in only.what
 
 
-def test_an_unusable_metric_in_a_file_is_named(spread):
-    assert "it has no Spred, only" in refused_criterion(spread, "spread.py:Spred")
-    assert "cannot be read" in refused_criterion(spread, "sprad.py:Spread")
+def test_unusable_metric_in_a_file_is_named(spread):
+    for metric, message in (("spread.py:Spred", "it has no Spred, only"), ("sprad.py:Spread", "cannot be read")):
+        assert message in refused(with_criterion(spread, metric=metric, at_most=1.0))
     (only,) = judged(spread, metric="spread.py:Broken", at_most=1.0)
     assert only.passed is False
 
 
-def refused_criterion(task, metric):
-    task.write_text(f'{TASK}[[criteria]]\nmetric = "{metric}"\nat_most = 1.0\n', "utf-8")
-    return refused(task)
-
-
-def test_a_run_keeps_the_metrics_of_its_criteria(spread, tmp_path, monkeypatch, capsys):
-    spread.write_text(TASK + '[[criteria]]\nmetric = "spread.py:Spread"\nat_most = 1.0\n', "utf-8")
+def test_run_keeps_the_metrics_of_its_criteria(spread, tmp_path):
+    with_criterion(spread, metric="spread.py:Spread", at_most=1.0)
     out = tmp_path / "run"
     out.mkdir()  # an empty folder is taken
-    assert call(monkeypatch, "run", spread, "--virtual", "--no-report", "--out", out) == 0
-    (shown,) = re.findall(r"^ +fast: f .*, Spread (0\.\d+) m, .*$", capsys.readouterr().out, re.MULTILINE)
+    output = invoke("run", spread, "--virtual", "--no-report", "--out", out).stdout
+    (shown,) = re.findall(r"^ +fast: f .*, Spread (0\.\d+) m, .*$", output, re.MULTILINE)
     assert (out / "spread.py").is_file()
     assert "spread.py:Spread" in (out / "metrics.csv").read_text("utf-8").partition("\n")[0]
     for case in msgspec.json.decode((out / "metrics.json").read_bytes()):
@@ -364,7 +352,6 @@ def test_all_other_choices_may_be_files(task):
     assert 0 < leading.messages < 10
 
 
-def test_explain_says_that_files_are_not_explained(task, monkeypatch, capsys):
+def test_explain_says_that_files_are_not_explained(task, monkeypatch):
     monkeypatch.chdir(task.parent)
-    assert call(monkeypatch, "explain", "meet.py:Meet") == 2
-    assert "their parameters stand in the file" in capsys.readouterr().err
+    assert "their parameters stand in the file" in invoke("explain", "meet.py:Meet", code=2).stderr
