@@ -6,6 +6,7 @@ import dataclasses
 from pathlib import Path
 
 import msgspec
+import numpy as np
 
 from agents.body.interface import Disturbance
 from experiments.check.check import check
@@ -47,6 +48,13 @@ def assert_found(name: str, change: str, expected: tuple[str, str], message: str
     assert found[code][3]
 
 
+# where the reference formation may stand: TB01, KH01..03, CF01..03 (IEEE Access 2023, section IV)
+PUBLISHED = np.array(
+    [
+        (0, 0, 0), (0.6, 0, 0), (0.6, -0.6, 0), (0, -0.6, 0),
+        (0.3, 0.098, 0.8), (0.3, -0.502, 0.8), (-0.2196, -0.2021, 0.8),
+    ]
+)  # fmt: skip
 GROUND = {
     name: RobotTable(kind="khepera4", start=[x, y])
     for name, x, y in [("A", 0, 0), ("B", 1, 0), ("C", 0, 1), ("D", 1, 1)]

@@ -15,9 +15,9 @@ from agents.plugins.laws import Distance
 from agents.plugins.planners import Line
 from agents.plugins.triggers import Periodic, SendOnDelta
 from experiments.definition import bodies
-from experiments.definition.experiment import Arena, Experiment, Formation, LinkTable, Rates, RobotTable, Start
+from experiments.definition.experiment import Arena, Formation, LinkTable, Rates, RobotTable, Start
 from experiments.definition.plan import Plan
-from experiments.file import document
+from tests.small import reference, small
 from twins.scene import Obstacle
 
 NAMES = ("TB01", "KH01", "KH02", "KH03", "CF01", "CF02", "CF03")
@@ -25,11 +25,11 @@ NAMES = ("TB01", "KH01", "KH02", "KH03", "CF01", "CF02", "CF03")
 
 @pytest.fixture(scope="module")
 def park():
-    return document.read("robotic-park").cases()["periodic"].experiment
+    return Plan(reference("periodic"))
 
 
-def test_the_part_of_the_leader(park):
-    made = Plan(park).assignment("TB01")
+def test_part_of_the_leader(park):
+    made = park.assignment("TB01")
     assert (made.name, made.kind, made.neighbours, made.guided) == ("TB01", TURTLEBOT3, (), False)
     assert math.isnan(made.hover)
     assert made.law == Distance()
@@ -42,15 +42,15 @@ def test_the_part_of_the_leader(park):
 
 
 def test_kinds_and_heights_of_all(park):
-    parts = [Plan(park).assignment(name) for name in NAMES]
+    parts = [park.assignment(name) for name in NAMES]
     assert [part.kind for part in parts] == [TURTLEBOT3] + [KHEPERA4] * 3 + [CRAZYFLIE] * 3
     assert [part.ground for part in parts] == [0.0] * 4 + [0.8] * 3
     assert [bool(part.legs) for part in parts] == [True] + [False] * 6
 
 
-def test_the_links_of_the_paper(park):
+def test_links_of_the_paper(park):
     """Eq. (11) and figure 11: 12 edges, three of them from the leader only."""
-    net = Plan(park).links
+    net = park.links
     heard = {NAMES[i]: {NAMES[j] for j in net.sender[net.receiver == i]} for i in range(7)}
     assert heard == {
         "TB01": set(),
@@ -70,16 +70,16 @@ def test_the_links_of_the_paper(park):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_robot_knows_its_own_links(park, name):
-    made, whole = Plan(park).assignment(name), Plan(park).links
-    row = NAMES.index(name)
+def test_robot_knows_its_own_links(park, name):
+    whole, row = park.links, NAMES.index(name)
     wanted = zip(whole.receiver.tolist(), whole.sender.tolist(), whole.distance.tolist(), strict=True)
-    assert [(link.sender, link.distance) for link in made.neighbours] == [(j, d) for i, j, d in wanted if i == row]
-    assert all(link.name == NAMES[link.sender] and link.in_law for link in made.neighbours)
+    made = park.assignment(name).neighbours
+    assert [(link.sender, link.distance) for link in made] == [(j, d) for i, j, d in wanted if i == row]
+    assert all(link.name == NAMES[link.sender] and link.in_law for link in made)
 
 
 def test_bodies_of_other_seeds_are_alike(park):
-    made, other = bodies.body_request(Plan(park), NAMES, 5), bodies.body_request(Plan(park), NAMES, 6)
+    made, other = bodies.body_request(park, NAMES, 5), bodies.body_request(park, NAMES, 6)
     assert made.names == NAMES
     assert (made.seeds, other.seeds) == ((5,) * 7, (6,) * 7)
     assert made.addresses == ("twin",) * 7
@@ -89,33 +89,33 @@ def test_bodies_of_other_seeds_are_alike(park):
     assert made.disturbance == other.disturbance
 
 
-def experiment(**parts):
+def three(**parts):
     robots = {
         "A": RobotTable(kind="khepera4", start=[0.5, -0.5, 1.5]),
         "B": RobotTable(kind="crazyflie", start=[0.0, 0.25], hover=0.7),
         "C": RobotTable(kind="turtlebot3", start=[-0.5, 0.0]),
     }
-    return Experiment(**{"title": "Three", "robots": robots, "duration_s": 5.0, **parts})
+    return Plan(small(robots, **parts))
 
 
 def test_starts_are_on_the_floor_with_a_yaw():
-    positions, yaws = Plan(experiment()).start_poses()
+    positions, yaws = three().start_poses()
     assert positions == [(0.5, -0.5, 0.0), (0.0, 0.25, 0.0), (-0.5, 0.0, 0.0)]
     assert yaws == [1.5, 0.0, 0.0]
 
 
 def test_limits_are_arena_and_safety_of_the_file():
-    given = experiment(arena=Arena(size=(2.0, 3.0, 4.0)), safety=Safety(speed=0.3, max_goal_distance=0.2, margin=0.1))
-    made = Plan(given).limits("A")
+    safety = Safety(speed=0.3, max_goal_distance=0.2, margin=0.1)
+    made = three(arena=Arena(size=(2.0, 3.0, 4.0)), safety=safety).limits("A")
     assert (made.low, made.high) == ((-1.0, -1.5, 0.0), (1.0, 1.5, 4.0))
     assert (made.speed, made.max_goal_distance, made.margin) == (0.3, 0.2, 0.1)
     assert (made.position_timeout_s, made.neighbour_timeout_s) == (0.5, 1.0)
-    assert Plan(experiment()).limits("A").top_speed == np.inf
+    assert three().limits("A").top_speed == np.inf
 
 
 def test_links_may_have_gains_of_their_own():
     given = {"A > B": LinkTable(distance=0.5, gain=7.0), "B - C": 0.6, "C > A": LinkTable(distance=1.0)}
-    net = Plan(experiment(formation=Formation(gain=2.0, links=given))).links
+    net = three(formation=Formation(gain=2.0, links=given)).links
     table = zip(*(column.tolist() for column in (net.receiver, net.sender, net.distance, net.gain)), strict=True)
     assert list(table) == [(0, 2, 1.0, 2.0), (1, 0, 0.5, 7.0), (1, 2, 0.6, 2.0), (2, 1, 0.6, 2.0)]
 
@@ -131,7 +131,7 @@ def test_links_may_have_gains_of_their_own():
     ],
 )
 def test_who_leads(formation, leaders):
-    assert list(Plan(experiment(formation=formation)).leaders) == leaders
+    assert list(three(formation=formation).leaders) == leaders
 
 
 def test_disturbances_merge_field_by_field_the_narrower_wins():
@@ -140,29 +140,27 @@ def test_disturbances_merge_field_by_field_the_narrower_wins():
         "crazyflie": Disturbance(hover_jitter=Jitter(0.01), latency_s=0.2),
         "B": Disturbance(position_sigma=0.0),
     }
-    made = Plan(experiment(disturbance=given))
+    made = three(disturbance=given)
     assert made.disturbance("A") == given["all"]
     assert made.disturbance("B") == Disturbance(Jitter(0.01), 0.0, 0.01, 0.2)
-    assert Plan(experiment()).disturbance("A") == Disturbance()
+    assert three().disturbance("A") == Disturbance()
 
 
 def test_rates_patience_and_triggers():
     rates = Rates(body_hz=200.0, pose_hz=40.0, coordination_hz=20.0)
     trigger = {"kind": "send-on-delta", "threshold": 0.02, "maximum_silence_s": 1.0}
-    made = Plan(experiment(rates=rates, start=Start(deadline_s=7.0, missing="go-on"), trigger=trigger)).assignment("A")
+    made = three(rates=rates, start=Start(deadline_s=7.0, missing="go-on"), trigger=trigger).assignment("A")
     assert (made.body_hz, made.pose_every, made.decide_every, made.patience_s) == (200.0, 5, 10, 7.0)
     assert made.trigger == SendOnDelta(threshold=0.02, maximum_silence_s=1.0)
     with pytest.raises(msgspec.ValidationError, match="threshold"):
-        Plan(experiment(trigger={**trigger, "threshold": -1.0})).assignment("A")
+        three(trigger={**trigger, "threshold": -1.0}).assignment("A")
 
 
 def test_robots_are_not_scattered_into_obstacles():
     robots = {name: RobotTable(kind="khepera4", start=[-0.5, y]) for name, y in (("A", -0.5), ("B", 0.5))}
-    post = Obstacle(radius=0.3, at=(0.0, 0.0))
-    given = Experiment(
-        title="t", duration_s=1.0, robots=robots, arena=Arena(obstacles={"post": post}), start=Start(scatter=0.6)
-    )
-    place = np.array([bodies.scattered_poses(Plan(given), ("A", "B"), seed)[0] for seed in range(100)])
+    arena = Arena(obstacles={"post": Obstacle(radius=0.3, at=(0.0, 0.0))})
+    plan = Plan(small(robots, arena=arena, start=Start(scatter=0.6)))
+    place = np.array([bodies.scattered_poses(plan, ("A", "B"), seed)[0] for seed in range(100)])
     gap = np.hypot(place[..., 0], place[..., 1]) - 0.3 - 0.07
     assert gap.min() > bodies.CLEAR
     assert gap.min() < 0.1  # it is near enough to be in the way

@@ -1,36 +1,28 @@
 """Formations of every sort from their file to where robots end, and what `check` refuses."""
 
-import msgspec
 import numpy as np
 import pytest
 
 from experiments.check import check
 from experiments.check.realisation import contradictions
+from experiments.definition.experiment import Formation, RobotTable, Start
 from experiments.definition.formation import compile_anchors, errors_over_time
 from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.metrics.signals import net_rotation
-from experiments.virtual_time import simulation
+from tests.runs import fly
+from tests.small import small
 
 pytestmark = pytest.mark.slow  # runs and reports, whole
 
 ROBOTS = """title = "Four"
 duration_s = {duration}
 arena = {{ size = [4.0, 4.0, 2.5] }}
-[robots.A]
-kind = "khepera4"
-start = [-0.6, -0.5]
-[robots.B]
-kind = "khepera4"
-start = [0.6, -0.5]
-[robots.C]
-kind = "crazyflie"
-start = [0.5, 0.6]
-hover = 0.6
-[robots.D]
-kind = "crazyflie"
-start = [-0.5, 0.9]
-hover = 0.6
+[robots]
+A = {{ kind = "khepera4", start = [-0.6, -0.5] }}
+B = {{ kind = "khepera4", start = [0.6, -0.5] }}
+C = {{ kind = "crazyflie", start = [0.5, 0.6], hover = 0.6 }}
+D = {{ kind = "crazyflie", start = [-0.5, 0.9], hover = 0.6 }}
 """
 SQUARE = """
 [formation]
@@ -67,24 +59,19 @@ leader = "A"
 """
 
 
-@pytest.fixture
-def written(tmp_path):
-    """Reads an experiment of four robots with this formation."""
-
-    def read(text, duration=40.0):
-        file = tmp_path / "formation.toml"
-        file.write_text(ROBOTS.format(duration=duration) + text)
-        return document.read(file)
-
-    return read
+PARTED = '[formation.links]\n"A - B" = 0.5\n"C - D" = 0.5\n"B - C" = { distance = 0.8, from_s = 8.0, until_s = 20.0 }\n'
 
 
-def flown(experiment):
+def written(text, duration=40.0):
+    """Four robots with this formation."""
+    return document.loads(ROBOTS.format(duration=duration) + text)
+
+
+def flown(plan):
     """The true positions (T, N, 3) from the common start on, their times, and the links' errors (T, E)."""
-    log = simulation.simulate(Plan(experiment), 1)
-    running = (log.time >= 0.0) & (log.time < experiment.duration_s)
+    log = fly(plan.experiment).log
+    running = (log.time >= 0.0) & (log.time < plan.experiment.duration_s)
     time, position = log.time[running], log.true_position[running]
-    plan = Plan(experiment)
     return time, position, errors_over_time(plan.law, plan.formation, time, position)
 
 
@@ -95,39 +82,39 @@ def codes(given):
 # ---------------------------------------------------------------- from the file
 
 
-def test_both_ends_of_a_link_want_the_same(written):
-    experiment = written(SQUARE).experiment
-    asked = {(link.receiver, link.sender): link.wanted for link in Plan(experiment).one_way_links}
+def test_both_ends_of_a_link_want_the_same():
+    links = written(SQUARE).plan.one_way_links
+    asked = {(link.receiver, link.sender): link.wanted for link in links}
     assert asked["B", "A"].relative == (0.6, 0.0, 0.0)  # B stands 0.6 m along x from A
     assert asked["A", "B"].relative == (-0.6, -0.0, -0.0)
     assert asked["C", "B"].relative == (0.0, 0.6, 0.6)  # the heights that they hold
     assert asked["B", "C"].distance == pytest.approx(np.hypot(0.6, 0.6))
-    assert {link.gain for link in Plan(experiment).one_way_links} == {0.5}  # the stiffness, not the gain of distances
+    assert {link.gain for link in links} == {0.5}  # the stiffness, not the gain of distances
 
 
-def test_each_link_has_the_gain_of_its_target(written):
-    links = Plan(written(MIXED).experiment).one_way_links
-    assert {(link.receiver, link.sender): link.gain for link in links} == {
-        ("B", "A"): 0.5, ("B", "C"): 3.0, ("C", "B"): 3.0, ("C", "A"): 3.0, ("C", "D"): 3.0, ("D", "C"): 3.0,
-        ("D", "A"): 0.5,
+def test_each_link_has_the_gain_of_its_target():
+    assert {f"{link.sender}{link.receiver}": link.gain for link in written(MIXED).plan.one_way_links} == {
+        "AB": 0.5, "CB": 3.0, "BC": 3.0, "AC": 3.0, "DC": 3.0, "CD": 3.0, "AD": 0.5
     }  # fmt: skip
 
 
 @pytest.mark.usefixtures("unflown")
-def test_a_law_of_distances_takes_offsets_for_distances(written):
+def test_law_of_distances_takes_offsets_for_distances():
     given = written(SQUARE.replace('"displacement"', '"distance"'))
-    links = given.plan.formation.links
-    assert links.distance[:2].tolist() == pytest.approx([0.6, np.hypot(0.6, 0.6)])
+    assert given.plan.formation.links.distance[:2].tolist() == pytest.approx([0.6, np.hypot(0.6, 0.6)])
     assert "realisable" in codes(given)
 
 
-def test_anchors_from_the_file(written):
-    anchors = compile_anchors(
-        written(
-            "[formation.anchors]\nA = 1.0\nB = { along = [0.0, 2.0], to = [0.5, 0.0] }\nC = { across = [0, 0, 1], "
-            'distance = 0.6 }\nD = { distance = 0.7, gain = 9.0 }\n[formation.links]\n"A - B" = 0.5'
-        ).experiment
-    )
+def test_anchors_from_the_file():
+    anchored = """[formation.anchors]
+A = 1.0
+B = { along = [0.0, 2.0], to = [0.5, 0.0] }
+C = { across = [0, 0, 1], distance = 0.6 }
+D = { distance = 0.7, gain = 9.0 }
+[formation.links]
+"A - B" = 0.5
+"""
+    anchors = compile_anchors(written(anchored).experiment)
     assert [anchor.gain for (anchor,) in anchors.values()] == [6.0, 0.5, 6.0, 9.0]
     place = np.array([[1.0, 0.0, 0.0], [0.5, 7.0, 0.0], [3.0, 4.0, 0.6], [0.0, 0.7, 0.0]])
     for (anchor,), at in zip(anchors.values(), place.tolist(), strict=True):
@@ -139,17 +126,17 @@ def test_anchors_from_the_file(written):
 
 @pytest.mark.usefixtures("unflown")  # it is flown beside the check
 @pytest.mark.parametrize(("text", "worst"), [(SQUARE, 0.015), (BEARINGS, 0.05), (MIXED, 0.06)], ids=["s", "b", "m"])
-def test_formations_come_together(written, text, worst):
+def test_formations_come_together(text, worst):
     given = written(text, 60.0)
     assert not [each for each in check.check(given) if each.severity == "error"]
-    _, _, error = flown(given.experiment)
+    _, _, error = flown(given.plan)
     assert error[0].max() > 0.3
     assert error[-50:].max() < worst
 
 
-def test_a_formation_that_turns_and_grows(written):
+def test_formation_that_turns_and_grows():
     given = written(SQUARE + "[[formation.changes]]\nat_s = 10.0\nrotate = 1.5708\nscale = 1.4\n", 30.0)
-    time, position, error = flown(given.experiment)
+    time, position, error = flown(given.plan)
     before, after = position[time < 10.0][-1], position[-1]
     assert error[time < 10.0][-1].max() < 0.02
     assert error[-1].max() < 0.02
@@ -158,19 +145,21 @@ def test_a_formation_that_turns_and_grows(written):
     assert after[2, 2] == pytest.approx(0.6, abs=0.03)
 
 
-def test_distances_that_change(written):
-    text = '[formation]\ngain = 1.2\n[formation.links]\n"A - B" = 0.5\n"B - C" = 0.8\n"C - A" = 0.8\n"D - C" = 0.5\n'
-    text += '"D - A" = 0.9\n'
-    text += '[[formation.changes]]\nat_s = 15.0\nover_s = 3.0\nlinks = { "B - A" = 0.8, "D - C" = 0.7 }\n'
+def test_distances_that_change():
+    text = """[formation]
+gain = 1.2
+links = { "A - B" = 0.5, "B - C" = 0.8, "C - A" = 0.8, "D - C" = 0.5, "D - A" = 0.9 }
+changes = [{ at_s = 15.0, over_s = 3.0, links = { "B - A" = 0.8, "D - C" = 0.7 } }]
+"""
     given = written(text)
-    _, position, error = flown(given.experiment)
+    _, position, error = flown(given.plan)
     assert error[-1].max() < 0.02
     assert np.linalg.norm(position[-1, 0] - position[-1, 1]) == pytest.approx(0.8, abs=0.02)
 
 
-def test_links_by_range_and_by_the_clock(written):
+def test_links_by_range_and_by_the_clock():
     text = "[formation]\ngain = 1.5\n[formation.proximity]\nrange = 1.1\ndistance = 0.75\n"
-    _, position, error = flown(written(text).experiment)
+    _, position, error = flown(written(text).plan)
     apart = np.linalg.norm(position[:, :, None] - position[:, None], axis=3)
     there = ~np.isnan(error)
     pairs = [(i, j) for i in range(4) for j in range(4) if i != j]
@@ -180,43 +169,54 @@ def test_links_by_range_and_by_the_clock(written):
     assert 0 < there[0].sum() < len(pairs)
     assert np.nanmax(error[-1]) < 0.05
 
-    text = (
-        '[formation.links]\n"A - B" = 0.5\n"C - D" = 0.5\n"B - C" = { distance = 0.8, from_s = 8.0, until_s = 20.0 }\n'
-    )
-    time, _, error = flown(written(text).experiment)
+    time, _, error = flown(written(PARTED).plan)
     there = ~np.isnan(error)
     assert (there.sum(axis=1) == np.where((time >= 8.0 - 1e-6) & (time < 20.0 - 1e-6), 6, 4)).all()
 
 
 @pytest.mark.usefixtures("unflown")  # it is flown beside the check
-def test_dominant_leader_that_receives_holds_its_plan(written):
+def test_dominant_leader_that_receives_holds_its_plan():
     """Dominance: the leader hears the others; heavier links from it draw them along (paper, section III)."""
-    text = '[formation]\ngain = 1.3\nleader = "A"\ntracking_gain = 24.0\n[formation.links]\n'
-    text += '"A > B" = { distance = 0.6, gain = 4.0 }\n'
-    text += '"B > A" = { distance = 0.6, gain = 0.4 }\n"A > C" = 0.9\n"B - C" = 0.9\n"C - D" = 0.5\n"B > D" = 0.9\n'
-    text += '[[timeline]]\nat_s = 0.0\nrobot = "A"\nplan = { kind = "hold", at = [-0.5, -0.5] }\n'
-    text += '[[timeline]]\nat_s = 15.0\nrobot = "A"\nplan = { kind = "line", move_by = [0.5, 0.3], speed = 0.05 }\n'
+    text = """[formation]
+gain = 1.3
+leader = "A"
+tracking_gain = 24.0
+[formation.links]
+"A > B" = { distance = 0.6, gain = 4.0 }
+"B > A" = { distance = 0.6, gain = 0.4 }
+"A > C" = 0.9
+"B - C" = 0.9
+"C - D" = 0.5
+"B > D" = 0.9
+[[timeline]]
+at_s = 0.0
+robot = "A"
+plan = { kind = "hold", at = [-0.5, -0.5] }
+[[timeline]]
+at_s = 15.0
+robot = "A"
+plan = { kind = "line", move_by = [0.5, 0.3], speed = 0.05 }
+"""
     given = written(text, 45.0)
     assert not [each for each in check.check(given) if each.severity == "error"]
-    _, position, error = flown(given.experiment)
+    _, position, error = flown(given.plan)
     np.testing.assert_allclose(position[-1, 0, :2], [0.0, -0.2], atol=0.08)
     assert error[-1].max() < 0.05
 
 
-def test_a_calm_event_triggered_ring_does_not_turn():
+def test_calm_event_triggered_ring_does_not_turn():
     """Five drones with half the gain that they bear, send-on-delta at 1 cm, nothing that disturbs them."""
     angle = 2 * np.pi * np.arange(5) / 5
     place = 0.5104 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    robots = {f"R{i}": {"kind": "crazyflie", "start": (1.2 * place[i]).tolist(), "hover": 0.8} for i in range(5)}
+    robots = {f"R{i}": RobotTable(kind="crazyflie", start=(1.2 * place[i]).tolist(), hover=0.8) for i in range(5)}
     links = {f"R{i} - R{j}": float(np.linalg.norm(place[i] - place[j])) for i in range(5) for j in range(i)}
-    given = {
-        "title": "ring", "duration_s": 60.0, "robots": robots, "formation": {"links": links},
-        "start": {"scatter": 0.1}, "trigger": {"kind": "send-on-delta", "threshold": 0.01},
-    }  # fmt: skip
     rates, sent = [], []
     for gain in (0.5, 3.0):
-        given["formation"]["gain"] = gain
-        logs = [simulation.simulate(Plan(msgspec.convert(given, document.Experiment)), seed) for seed in (200, 201)]
+        given = small(
+            robots, duration_s=60.0, formation=Formation(links=links, gain=gain), start=Start(scatter=0.1),
+            trigger={"kind": "send-on-delta", "threshold": 0.01},
+        )  # fmt: skip
+        logs = [fly(given, seed).log for seed in (200, 201)]
         late = (logs[0].time > 30.0) & (logs[0].time < 60.0)
         rates.append(max(abs(net_rotation(log.true_position[late], log.time[late])) for log in logs))
         sent.append(sum(len(log.sent) for log in logs))
@@ -229,10 +229,10 @@ def test_a_calm_event_triggered_ring_does_not_turn():
 
 
 @pytest.mark.usefixtures("unflown")
-def test_offsets_that_do_not_add_up(written):
+def test_offsets_that_do_not_add_up():
     given = written(SQUARE.replace("[0.0, -0.6]", "[0.0, -0.7]"))
     found = codes(given)["offsets-contradict"]
-    assert (found.severity, found.where.rsplit(":", 2)[1]) == ("error", "24")
+    assert (found.severity, found.where.rsplit(":", 2)[1]) == ("error", "15")
     assert "100.0 mm" in found.message
     (first, *_) = contradictions(given.plan.formation.links)
     assert sorted(first.rows) == [0, 1, 2, 3]
@@ -240,39 +240,47 @@ def test_offsets_that_do_not_add_up(written):
 
 
 @pytest.mark.usefixtures("unflown")
-def test_averaging_offsets_that_do_not_add_up(written):
+def test_averaging_offsets_that_do_not_add_up():
     square = SQUARE.replace("displacement", "leader-observer")
     assert "offsets-contradict" not in codes(written(square))
     found = codes(written(square.replace("[0.0, -0.6]", "[0.0, -0.7]")))["offsets-contradict"]
     assert found.severity == "warning"
 
 
+LOOSE = BEARINGS.replace('"D - B" = { bearing = [1.0, -1.0] }\n', "").replace("B = 0.9", "A = 0.8")
+APART = SQUARE.replace('"B - C" = { offset = [0.0, 0.6] }\n', "").replace('"D - A" = { offset = [0.0, -0.6] }\n', "")
+CHANGING = """[formation]
+anchors = { D = 0.9 }
+links = { "A - B" = 0.5, "B - C" = 0.8, "C - A" = 0.8 }
+changes = [{ at_s = 10.0, links = { "A - B" = 1.5 } }]
+"""
+
+
 @pytest.mark.usefixtures("unflown")
-def test_what_check_says_of_formations(written):
-    assert codes(written(SQUARE))["rigid"].message == (
-        "the formation is rigid, rank 6 of 6 in the motions that the robots have"
-    )
-    loose = codes(written(BEARINGS.replace('"D - B" = { bearing = [1.0, -1.0] }\n', "").replace("B = 0.9", "A = 0.8")))
-    assert "not-rigid" in loose
-    apart = SQUARE.replace('"B - C" = { offset = [0.0, 0.6] }\n', "").replace(
-        '"D - A" = { offset = [0.0, -0.6] }\n', ""
-    )
-    assert codes(written(apart))["parts"].severity == "error"
-    low = SQUARE + "[formation.anchors]\nC = 0.3\n"
-    assert codes(written(low))["anchor-not-realisable"].severity == "error"
-    odd = '[formation.links]\n"A - B" = 0.5\n"B - C" = 0.8\n"C - A" = 0.8\n[[formation.changes]]\nat_s = 10.0\n'
-    odd += 'links = { "A - B" = 1.5 }\n'
-    found = codes(written(odd + "[formation.anchors]\nD = 0.9\n"))
-    assert found["change-not-realisable"].severity == "error"
+@pytest.mark.parametrize(
+    ("text", "code", "severity", "message"),
+    [
+        (SQUARE, "rigid", "note", "rank 6 of 6 in the motions that the robots have"),
+        (LOOSE, "not-rigid", "warning", ""),
+        (APART, "parts", "error", ""),
+        (SQUARE + "[formation.anchors]\nC = 0.3\n", "anchor-not-realisable", "error", ""),
+        (CHANGING, "change-not-realisable", "error", ""),
+    ],
+)
+def test_check_judges_formations(text, code, severity, message):
+    found = codes(written(text))[code]
+    assert found.severity == severity
+    assert message in found.message
+
+
+@pytest.mark.usefixtures("unflown")
+def test_unstable_law_of_offsets_names_its_stiffness():
     stiff = SQUARE.replace('"displacement"', '"displacement"\nstiffness = 9.0')
     assert "stiffness" in codes(written(stiff))["unstable"].remedy
 
 
-def test_links_that_leave_robots_alone(written):
-    text = (
-        '[formation.links]\n"A - B" = 0.5\n"C - D" = 0.5\n"B - C" = { distance = 0.8, from_s = 8.0, until_s = 20.0 }\n'
-    )
-    found = codes(written(text, 21.0))["comes-apart"]
+def test_links_that_leave_robots_alone():
+    found = codes(written(PARTED, 21.0))["comes-apart"]
     assert "falls into 2 parts from 0.0 s to 8.0 s" in found.message
     always = SQUARE + "[formation.proximity]\nrange = 3.0\n"
     assert codes(written(always, 10.0))["whole"].severity == "note"

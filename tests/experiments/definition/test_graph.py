@@ -1,4 +1,4 @@
-"""Graphs and frameworks against networkx, against sums done by hand, and against what is known of rigid frameworks."""
+"""Graphs against networkx; rigidity against known frameworks, and redundancy against leaving each link out."""
 
 from itertools import combinations
 
@@ -8,30 +8,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from experiments.definition.graph import Links, adjacency, components, degree, edges, laplacian, links, reachable
-from experiments.definition.rigidity import rigidity, rigidity_matrix
+from experiments.definition.graph import adjacency, components, degree, edges, laplacian, links, reachable
+from experiments.definition.rigidity import redundancy, rigidity, rigidity_matrix
+from tests.experiments.checked import PUBLISHED
 
-NAMES = ("TB01", "KH01", "KH02", "KH03", "CF01", "CF02", "CF03")
-PLACES = np.array(
-    [
-        [0, 0, 0],
-        [0.6, 0, 0],
-        [0.6, -0.6, 0],
-        [0, -0.6, 0],
-        [0.3, 0.098, 0.8],
-        [0.3, -0.502, 0.8],
-        [-0.2196, -0.2021, 0.8],
-    ]
-)
-# paper, eq. (11): who listens to whom
+# paper, eq. (11): rows from which each robot receives
 HEARS = {1: (0, 2, 3, 4), 2: (1, 3, 5), 3: (0, 1, 2, 5), 4: (0, 1, 5, 6), 5: (2, 3, 4, 6), 6: (4, 5)}
-FEW = settings(max_examples=40)
-REFERENCE = [(listener, speaker) for listener, heard in HEARS.items() for speaker in heard]
-
-
-def network(pairs):
-    """Links with a distance and a gain that tell them apart."""
-    return links(pairs, [1.0 + 0.1 * k for k in range(len(pairs))], [2.0 + 0.01 * k for k in range(len(pairs))])
+REFERENCE = links([(listener, speaker) for listener, heard in HEARS.items() for speaker in heard])
 
 
 @st.composite
@@ -44,52 +27,44 @@ def digraphs(draw, most=9):
 
 def as_networkx(rows, pairs):
     """An arrow from listener to speaker, as in the adjacency matrix."""
-    graph = nx.DiGraph()
+    graph = nx.DiGraph(pairs)
     graph.add_nodes_from(range(rows))
-    graph.add_edges_from(pairs)
     return graph
 
 
-@FEW
-@given(digraphs())
-def test_matrices_are_those_of_networkx(made):
+@settings(max_examples=40)
+@given(digraphs(), st.data())
+def test_graph_is_that_of_networkx(made, data):
     rows, pairs = made
-    net, graph = network(pairs), as_networkx(rows, pairs)
+    net, graph = links(pairs), as_networkx(rows, pairs)
     a = nx.to_numpy_array(graph, nodelist=range(rows))
     np.testing.assert_array_equal(adjacency(net, rows), a)
-    np.testing.assert_array_equal(np.diag(degree(net, rows)), [graph.out_degree(i) for i in range(rows)])
+    np.testing.assert_array_equal(np.diag(degree(net, rows)), a.sum(axis=1))
     np.testing.assert_array_equal(laplacian(net, rows), np.diag(a.sum(axis=1)) - a)
-    assert not laplacian(net, rows).sum(axis=1).any()
-
-
-@FEW
-@given(digraphs(), st.data())
-def test_reached_and_components_are_those_of_networkx(made, data):
-    rows, pairs = made
-    net, graph = network(pairs), as_networkx(rows, pairs)
+    assert components(net, rows) == nx.number_weakly_connected_components(graph)
+    assert {tuple(edge) for edge in edges(net).tolist()} == {tuple(sorted(pair)) for pair in pairs}
     sources = data.draw(st.lists(st.integers(0, rows - 1), unique=True, max_size=3))
     told = set(sources).union(*(nx.ancestors(graph, source) for source in sources))  # arrows point at the speaker
     found = reachable(net, rows, np.array(sources, dtype=np.intp))
     assert set(np.flatnonzero(found).tolist()) == told
-    assert components(net, rows) == nx.number_weakly_connected_components(graph)
-    undirected = {tuple(sorted(pair)) for pair in pairs}
-    assert {tuple(edge) for edge in edges(net).tolist()} == undirected
 
 
-def test_no_links_at_all():
-    net = links([], [], [])
-    assert len(net) == 0
-    assert len(edges(net)) == 0
-    assert components(net, 4) == 4
+def test_reference_network():
+    assert (len(REFERENCE), len(edges(REFERENCE))) == (21, 12)
+    assert components(REFERENCE, 7) == 1
+    np.testing.assert_array_equal(np.diag(degree(REFERENCE, 7)), [0, 4, 3, 4, 4, 4, 2])
+    assert reachable(REFERENCE, 7, np.array([0])).all()
+    assert np.flatnonzero(~reachable(REFERENCE, 7, np.array([6]))).tolist() == [0]
 
 
-def test_the_reference_network():
-    net = network(REFERENCE)
-    assert len(edges(net)) == 12
-    assert components(net, 7) == 1
-    np.testing.assert_array_equal(np.diag(degree(net, 7)), [0, 4, 3, 4, 4, 4, 2])
-    assert reachable(net, 7, np.array([0])).all()
-    assert np.flatnonzero(~reachable(net, 7, np.array([6]))).tolist() == [0]
+def test_links_take_pairs_with_or_without_targets():
+    path = links([(1, 0), (0, 1), (2, 1), (1, 2)])
+    assert laplacian(path, 3).tolist() == [[1, -1, 0], [-1, 2, -1], [0, -1, 1]]
+    assert np.isnan(path.distance).all()
+    assert links([(1, 0), (2, 0)], 0.6, 3.0).distance.tolist() == [0.6, 0.6]
+    assert links([(1, 0), (2, 0)], 0.6, [3.0, 4.0]).gain.tolist() == [3.0, 4.0]
+    nothing = links([], [], [])
+    assert (len(nothing), len(edges(nothing)), components(nothing, 4)) == (0, 0, 4)
 
 
 # ---------------------------------------------------------------- rigidity
@@ -102,26 +77,24 @@ def held_heights(rows):
 
 
 def test_reference_formation_is_rigid_only_with_heights_held():
-    pairs = edges(network(REFERENCE))
-    held, free = rigidity(PLACES, pairs, held_heights(7)), rigidity(PLACES, pairs)
+    pairs = edges(REFERENCE)
+    held, free = rigidity(PUBLISHED, pairs, held_heights(7)), rigidity(PUBLISHED, pairs)
     assert (held.rank, held.needed, held.rigid) == (2 * 7 - 3, 11, True)
-    assert (free.rank, free.needed, free.rigid) == (12, 15, False)
+    assert (free.rank, free.needed, free.rigid) == (12, 3 * 7 - 6, False)
     assert held.smallest > 0.1
     assert free.smallest == 0.0
 
 
 def test_rigidity_rows_are_half_gradients_of_squared_lengths():
-    pairs = edges(network(REFERENCE))
-    matrix = rigidity_matrix(PLACES, pairs)
-    motion = np.random.default_rng(3).normal(size=PLACES.shape)
+    pairs = edges(REFERENCE)
+    motion = np.random.default_rng(3).normal(size=PUBLISHED.shape)
 
-    def squared(position):
-        offset = position[pairs[:, 0]] - position[pairs[:, 1]]
-        return (offset**2).sum(axis=1)
+    def squared(step):
+        position = PUBLISHED + step * motion
+        return ((position[pairs[:, 0]] - position[pairs[:, 1]]) ** 2).sum(axis=1)
 
-    step = 1e-6
-    slope = (squared(PLACES + step * motion) - squared(PLACES - step * motion)) / (2 * step)
-    np.testing.assert_allclose(matrix @ motion.ravel(), 0.5 * slope, atol=1e-9)
+    slope = (squared(1e-6) - squared(-1e-6)) / 2e-6
+    np.testing.assert_allclose(rigidity_matrix(PUBLISHED, pairs) @ motion.ravel(), 0.5 * slope, atol=1e-9)
 
 
 def triangulation(rng, rows, dimension):
@@ -168,7 +141,7 @@ def rigid_motions(position, free):
 
 @settings(max_examples=40)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 7), st.booleans())
-def test_the_rank_needed_is_what_rigid_motions_leave(seed, rows, flat):
+def test_rank_needed_is_what_rigid_motions_leave(seed, rows, flat):
     rng = np.random.default_rng(seed)
     position = rng.uniform(-1, 1, (rows, 3))
     if flat:
@@ -197,13 +170,45 @@ def test_rigid_motions_that_held_coordinates_allow(position, free, motions):
     assert rigidity(position, np.array([[0, len(position) - 1]]), moves).needed == moves.sum() - motions
 
 
-def test_links_know_their_number():
-    assert len(Links(np.array([0, 0]), np.array([1, 2]), np.ones(2), np.ones(2))) == 2
+def one_by_one(position, pairs, free):
+    """Whether the rest is rigid without each link, and without each robot."""
+    without_link = [rigidity(position, np.delete(pairs, k, axis=0), free).rigid for k in range(len(pairs))]
+    without_robot = []
+    for row in range(len(position)):
+        keeps = np.arange(len(position)) != row
+        rest = pairs[(pairs != row).all(axis=1)]
+        without_robot.append(rigidity(position[keeps], rest - (rest > row), free[keeps]).rigid)
+    return without_link, without_robot
 
 
-def test_pairs_are_enough_for_the_matrices():
-    path = links([(1, 0), (0, 1), (2, 1), (1, 2)])
-    assert laplacian(path, 3).tolist() == [[1, -1, 0], [-1, 2, -1], [0, -1, 1]]
-    assert np.isnan(path.distance).all()
-    assert links([(1, 0), (2, 0)], 0.6, 3.0).distance.tolist() == [0.6, 0.6]
-    assert links([(1, 0), (2, 0)], 0.6, [3.0, 4.0]).gain.tolist() == [3.0, 4.0]
+@settings(max_examples=60)
+@given(st.integers(0, 2**32 - 1), st.integers(3, 9), st.sampled_from([0.5, 0.7, 0.9]), st.booleans())
+def test_redundancy_is_that_of_leaving_each_out(seed, rows, share, in_space):
+    rng = np.random.default_rng(seed)
+    position = rng.uniform(-1.0, 1.0, (rows, 3))
+    free = np.ones((rows, 3), dtype=bool) if in_space else held_heights(rows)
+    every = np.stack(np.triu_indices(rows, 1), axis=1)
+    pairs = every[rng.random(len(every)) < share].reshape(-1, 2)
+    found = redundancy(position, pairs, free)
+    if rigidity(position, pairs, free).rigid:
+        assert (found.pairs.tolist(), found.robots.tolist()) == one_by_one(position, pairs, free)
+    else:
+        assert not found.pairs.any()
+        assert not found.robots.any()
+
+
+@pytest.mark.parametrize(
+    ("rows", "linked", "links_spare", "robots_spare"),
+    [
+        (1, [], [], None),
+        (2, [(0, 1)], [False], None),
+        (3, [(0, 1), (0, 2), (1, 2)], [False] * 3, [True] * 3),  # two that are linked are rigid
+        (4, list(combinations(range(4), 2)), [True] * 6, [True] * 4),
+        (4, list(combinations(range(4), 2))[1:], [False] * 5, None),
+    ],
+)
+def test_redundancy_of_small_frameworks(rows, linked, links_spare, robots_spare):
+    position = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])[:rows]
+    found = redundancy(position, np.array(linked, dtype=np.intp).reshape(-1, 2), held_heights(rows))
+    assert found.pairs.tolist() == links_spare
+    assert robots_spare in (None, found.robots.tolist())

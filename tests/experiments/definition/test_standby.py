@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import pytest
 
 from agents.body.interface import BodyState
@@ -17,35 +16,24 @@ from experiments.definition import standby as reserves
 from experiments.definition.experiment import (
     ChannelTable,
     Experiment,
-    Formation,
     Hybrid,
     LegTable,
     LinkChannelTable,
-    LinkTable,
     Outage,
     RobotTable,
 )
 from experiments.definition.plan import Plan
 from experiments.file import consistency, document
 from experiments.real_time.conductor.replacement import Spares
+from tests.small import changed, small
 
 BOT = RobotTable(kind="khepera4", start=[0.0, 0.0])
 FLY = RobotTable(kind="crazyflie", start=[0.5, 0.5], hover=0.5)
 
 
-def experiment(**more: Any) -> Experiment:
-    robots = {
-        "A": BOT,
-        "B": msgspec.structs.replace(BOT, start=[0.5, 0.0]),
-        "C": msgspec.structs.replace(FLY, standby=True),
-    }
-    links: dict[str, float | LinkTable] = {"A - B": 0.5, "A - C": 0.7, "C > B": 0.7}
-    made = Experiment(title="x", robots=robots, duration_s=5.0, formation=Formation(links=links))
-    return msgspec.structs.replace(made, **more)
-
-
-def test_what_is_right_is_not_complained_of() -> None:
-    assert not list(consistency.faults(Plan(experiment(spares={"S": FLY, "T": BOT}, on_loss="replace"))))
+def experiment(**parts: Any) -> Experiment:
+    robots = {"A": BOT, "B": changed(BOT, start=[0.5, 0.0]), "C": changed(FLY, standby=True)}
+    return small(robots, {"A - B": 0.5, "A - C": 0.7, "C > B": 0.7}, duration_s=5.0, **parts)
 
 
 def test_without_those_on_standby_nothing_names_them() -> None:
@@ -66,21 +54,21 @@ def test_without_those_on_standby_nothing_names_them() -> None:
     assert [(outage.from_s, outage.robots) for outage in made.channel.outages] == [(2.0, ["B"]), (3.0, [])]
     assert made.architecture == Hybrid("hybrid", ["A"])
     assert not list(consistency.faults(plan))
+    assert not list(consistency.faults(Plan(experiment(spares={"S": FLY, "T": BOT}, on_loss="replace"))))
     assert reserves.without_standby(plan) is plan
 
 
 def test_virtual_time_flies_without_those_on_standby(tmp_path: Path) -> None:
     file = tmp_path / "x.json"
     file.write_bytes(document.write_json(Plan(experiment())))
-    trace = next(iter(run.simulate(document.read(file)).traces.values()))
+    (trace,) = run.simulate(document.read(file)).traces.values()
     assert trace.robots == ("A", "B")
 
 
 @pytest.mark.parametrize("standby", [True, False])
 def test_nobody_waits_for_a_robot_on_standby(standby: bool) -> None:
     case = experiment()
-    robots = {**case.robots, "C": msgspec.structs.replace(FLY, standby=standby)}
-    told = Plan(msgspec.structs.replace(case, robots=robots)).assignment("A")
+    told = Plan(changed(case, robots={**case.robots, "C": changed(FLY, standby=standby)})).assignment("A")
     robot = Robot(told)
     assert robot.missing_neighbours() == ["B", "C"]
     place = next(place for place, link in enumerate(told.neighbours) if link.name == "B")
@@ -99,9 +87,9 @@ def order(**more: object) -> messages.RunOrder:
 
 
 def test_spare_brings_its_body_and_keeps_the_rest() -> None:
-    spare = msgspec.structs.replace(BOT, start=[0.2, 0.3, 1.0], body="khepera4://192.0.2.1", avoids=False)
+    spare = changed(BOT, start=[0.2, 0.3, 1.0], body="khepera4://192.0.2.1", avoids=False)
     spares = Spares(Plan(experiment(spares={"F": FLY, "S": spare})))
-    old = msgspec.structs.replace(BOT, ranges="world")
+    old = changed(BOT, ranges="world")
     robot, whose = spares.successor("A", old, order())
     assert whose == "S", "the first of its kind"
     assert (robot.body, robot.start, robot.avoids, robot.ranges) == (spare.body, spare.start, True, "body")
