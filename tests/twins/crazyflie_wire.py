@@ -3,10 +3,8 @@
 import pickle
 import struct
 
-import numpy as np
-
 from agents.protocols.crtp import HighLevel, Port, Setpoint, SupervisorCommand
-from tests.twins.loopback import request
+from tests.requests import request
 from twins.devices.crazyflie.drone import Drone
 from twins.devices.crazyflie.flock import Flock
 from twins.devices.crazyflie.supervisor import SupervisorState
@@ -40,6 +38,28 @@ class Wire:
         return self.flock.quadrotor.position[0]
 
     @property
+    def velocity(self):
+        return self.flock.quadrotor.velocity[0]
+
+    @property
+    def yaw(self):
+        return self.flock.quadrotor.yaw[0]
+
+    @property
+    def estimate(self):
+        """Position as the drone believes it."""
+        return self.flock.estimate[0]
+
+    @property
+    def planned(self):
+        """Pose that the planner asks for now."""
+        return self.flock.planner.goal(self.t)[0]
+
+    @property
+    def info(self):
+        return self.flock.info(0)
+
+    @property
     def state(self):
         return SupervisorState(self.flock.supervisor.state[0])
 
@@ -52,6 +72,12 @@ class Wire:
         self.sent.clear()
         self.drone.receive(port, channel, b"".join(bytes((d,)) if isinstance(d, int) else d for d in data))
         return list(self.sent)
+
+    def ask(self, port, channel, *data):
+        """Sends a packet; returns what its one answer carries."""
+        ((answered, on, answer),) = self.put(port, channel, *data)
+        assert (answered, on) == (port, channel)
+        return answer
 
     def wait(self, seconds, each=None):
         """Lets time pass; `each` is done before every tick, and the log packets of the ticks are returned."""
@@ -67,36 +93,66 @@ class Wire:
             packets += self.sent
         return packets
 
-    def plan(self, command, payload=b"", group=0):
+    def after(self, seconds, each=None):
+        """The twin, that much later."""
+        self.wait(seconds, each)
+        return self
+
+    def key(self, name):
+        """A parameter, as packets name it."""
+        return struct.pack("<H", self.drone.parameters.number[name])
+
+    def set(self, name, packing, value):
+        return self.put(Port.PARAM, 2, self.key(name), struct.pack(f"<{packing}", value))
+
+    def log(self, command, *data):
+        """A command to the log blocks; returns the status."""
+        return self.ask(Port.LOG, 1, command, *data)[2]
+
+    def plan(self, command, packing="", *values, group=0):
         """A high-level command; returns the status."""
-        ((port, channel, answer),) = self.put(Port.HIGH_LEVEL, 0, int(command), group, payload)
-        assert (port, channel, answer[0], len(answer)) == (Port.HIGH_LEVEL, 0, command, 4)
+        answer = self.ask(Port.HIGH_LEVEL, 0, command, group, struct.pack(f"<{packing}", *values))
+        assert (answer[0], len(answer)) == (command, 4)
         return answer[3]
 
-    def takeoff(self, height, span):
-        return self.plan(HighLevel.TAKEOFF, struct.pack("<ff?f", height, 0.0, True, span))
+    def takeoff(self, height, span, group=0):
+        return self.plan(HighLevel.TAKEOFF, "ff?f", height, 0.0, True, span, group=group)
 
     def land(self, span):
-        return self.plan(HighLevel.LAND, struct.pack("<ff?f", 0.0, 0.0, True, span))
+        return self.plan(HighLevel.LAND, "ff?f", 0.0, 0.0, True, span)
 
-    def go_to(self, x, y, z, yaw, span, *, relative=False, linear=False):
-        return self.plan(HighLevel.GO_TO, struct.pack("<??fffff", relative, linear, x, y, z, yaw, span))
+    def go_to(self, x, y, z, yaw, span):
+        return self.plan(HighLevel.GO_TO, "??fffff", False, False, x, y, z, yaw, span)
+
+    def setpoint(self, kind, *values):
+        self.put(Port.SETPOINT, 0, kind, struct.pack("<4f", *values))
 
     def goal(self, x, y, z, yaw=0.0):
         """A streamed position, yaw in degrees."""
-        self.put(Port.SETPOINT, 0, int(Setpoint.POSITION), struct.pack("<ffff", x, y, z, yaw))
+        self.setpoint(Setpoint.POSITION, x, y, z, yaw)
+
+    def thrust(self, thrust):
+        self.put(Port.COMMANDER, 0, struct.pack("<fffH", 0.0, 0.0, 0.0, thrust))
 
     def zero(self):
         """What cflib sends when it closes a link."""
-        self.put(Port.COMMANDER, 0, struct.pack("<fffH", 0.0, 0.0, 0.0, 0))
+        self.thrust(0)
 
     def release(self):
         """The client says that it streams no more."""
         self.put(Port.SETPOINT, 1, 0, struct.pack("<I", 0))
 
     def arm(self, on=True):
-        ((_, _, answer),) = self.put(Port.SUPERVISOR, 1, int(SupervisorCommand.ARM), int(on))
-        return answer
+        return self.ask(Port.SUPERVISOR, 1, SupervisorCommand.ARM, int(on))
+
+    def armed(self):
+        """With motors that have spun up."""
+        self.arm()
+        return self.after(0.6)
+
+    def locate(self, position=None):
+        """A measured position, by default the true one."""
+        self.put(Port.LOCATION, 0, struct.pack("<fff", *(self.position if position is None else position)))
 
     def hovering(self, height=1.0):
         """In the air, at rest, held by the planner; what begins alike takes off once."""
@@ -114,6 +170,9 @@ class Wire:
 
     def streaming(self, height=1.0):
         """In the air, at rest, held by streamed positions."""
-        self.hovering(height)
-        self.wait(0.5, lambda: self.goal(*np.array([0.0, 0.0, height])))
-        return self
+        return self.hovering(height).after(0.5, lambda: self.goal(0.0, 0.0, height))
+
+
+def brushless(**parts):
+    """A twin that must be armed, and is."""
+    return Wire({"platform": "brushless"}, **parts).armed()

@@ -3,14 +3,40 @@
 import json
 import math
 import struct
+from pathlib import Path
 
 import pytest
 
 from agents.body.interface import BodyError
 from agents.protocols.crtp import Log, Port
 from tests.twins.crazyflie_wire import Wire
-from tests.twins.firmware_tables import FIRMWARE, cached
-from twins.devices.crazyflie.tables import EXTENDED, PACKINGS, READ_ONLY, inventory, pack
+from twins.devices.crazyflie.tables import EXTENDED, LOG_CODES, PACKINGS, READ_ONLY, inventory, pack
+
+# parameters and log variables of a real firmware, where this machine has them: names and types only
+PLACES = [folder / "shared" / "prototypes" / "crazyflie-toc.json" for folder in Path(__file__).parents[5:]]
+FIRMWARE = next(filter(Path.exists, PLACES), PLACES[0])
+CTYPES = {"u8": "uint8_t", "u16": "uint16_t", "u32": "uint32_t", "i8": "int8_t", "i16": "int16_t", "i32": "int32_t"}
+
+
+@pytest.fixture
+def files(tmp_path):
+    """Both tables of that firmware, as cflib writes them to its cache."""
+    if not FIRMWARE.exists():
+        pytest.skip(f"{FIRMWARE} with the firmware's tables is not there")
+    parameters, logs = json.loads(FIRMWARE.read_text())
+    tables = {
+        "ParamTocElement": {name: (kind, {"access": int(fixed), "extended": kept})
+                            for name, (kind, fixed, kept) in parameters.items()},
+        "LogTocElement": {name: (kind, {"access": 0}) for name, kind in logs.items()},
+    }  # fmt: skip
+    for element, entries in tables.items():
+        table = {}
+        for ident, (name, (kind, rest)) in enumerate(entries.items()):
+            group, own = name.split(".")
+            entry = {"__class__": element, "ident": ident, "group": group, "name": own, "pytype": ""}
+            table.setdefault(group, {})[own] = entry | {"ctype": CTYPES.get(kind, kind)} | rest
+        (tmp_path / f"{element}.json").write_text(json.dumps(table))
+    return [str(tmp_path / f"{element}.json") for element in tables]
 
 
 def logged(wire, *names):
@@ -19,9 +45,9 @@ def logged(wire, *names):
     for name in names:
         number = table.number[name]
         kind = table.variables[number].type
-        wire.put(Port.LOG, 1, int(Log.RESET))
-        wire.put(Port.LOG, 1, int(Log.CREATE), 0, struct.pack("<BH", {"float": 7, "u16": 2, "u8": 1}[kind], number))
-        wire.put(Port.LOG, 1, int(Log.START), 0, 1)
+        wire.put(Port.LOG, 1, Log.RESET)
+        wire.log(Log.CREATE, 0, struct.pack("<BH", LOG_CODES[kind], number))
+        wire.log(Log.START, 0, 1)
         values.append(PACKINGS[kind].unpack(wire.wait(0.01)[0][2][4:])[0])
     return values
 
@@ -49,9 +75,8 @@ def test_values_of_a_drone_that_stands():
     assert 0.1 < abs(roll) < 1.0
     assert 0.1 < abs(pitch) < 1.0
     assert yaw == 0.0
-    x, y, z, norm = logged(wire, "acc.x", "acc.y", "acc.z", "supervisor.accNorm")
-    assert (x, y, z) == (pytest.approx(0.0, abs=0.03), pytest.approx(0.0, abs=0.03), pytest.approx(1.0, abs=0.03))
-    assert norm == pytest.approx(1.0)
+    assert logged(wire, "acc.x", "acc.y", "acc.z") == pytest.approx([0.0, 0.0, 1.0], abs=0.03)
+    assert logged(wire, "supervisor.accNorm") == pytest.approx([1.0])
     assert logged(wire, "motor.m1", "range.front", "stabilizer.thrust") == [0, 0, 0.0]  # it has no Multi-ranger
     assert 0.0 < logged(wire, "gyro.xVariance")[0] < 0.1
 
@@ -60,9 +85,7 @@ def test_values_of_a_drone_that_flies():
     """Nose down to accelerate; the quaternion is that of the angles."""
     wire = Wire().streaming()
     wire.wait(0.1, lambda: wire.goal(1.0, 0.0, 1.0))
-    roll, pitch, qx, qy, qw = logged(
-        wire, "stateEstimate.roll", "stateEstimate.pitch", *(f"stateEstimate.q{axis}" for axis in "xyw")
-    )
+    roll, pitch, qx, qy, qw = logged(wire, *(f"stateEstimate.{name}" for name in ("roll", "pitch", "qx", "qy", "qw")))
     assert pitch < -5.0
     assert abs(roll) < 1.0
     assert qy > 0.04
@@ -71,15 +94,7 @@ def test_values_of_a_drone_that_flies():
     assert logged(wire, "motor.m1")[0] == pytest.approx(39300.0, rel=0.01)
 
 
-# ---------------------------------------------------------------------- a lab's own tables
-
-
-@pytest.fixture
-def files(tmp_path):
-    """Tables of a real firmware, as cflib keeps them in its cache."""
-    if not FIRMWARE.exists():
-        pytest.skip(f"{FIRMWARE} with the firmware's tables is not there")
-    return cached(tmp_path)
+# a lab's own tables
 
 
 @pytest.mark.slow
@@ -92,18 +107,21 @@ def test_tables_of_a_real_firmware(files):
     wire = Wire(device={"tables": files, "positioning": {"system": "loco"}})
     assert wire.drone.value("deck.bcLoco") == 1
     assert wire.drone.value("firmware.revision0") == 0.0  # this one has none
-    assert wire.hovering().flock.estimate[0, 2] == pytest.approx(1.0, abs=0.01)
+    assert wire.hovering().estimate[2] == pytest.approx(1.0, abs=0.01)
 
 
 def test_built_in_tables_agree_with_a_real_firmware(files):
     """Names and types; what is ours alone is known."""
     own, real = inventory(), inventory(tuple(files))
-    for ours, theirs in ((own.parameters, real.parameters), (own.logs, real.logs)):
-        known = {variable.name: (variable.type, variable.flags) for variable in theirs.variables}
-        mine = {variable.name: (variable.type, variable.flags) for variable in ours.variables}
+    for tables in ((own.parameters, real.parameters), (own.logs, real.logs)):
+        mine, known = ({each.name: (each.type, each.flags) for each in table.variables} for table in tables)
         shared = known.keys() & mine.keys()
         assert {name: mine[name] for name in shared} == {name: known[name] for name in shared}
         assert {name.split(".")[0] for name in mine.keys() - shared} <= {"spare", "firmware", "loco"}
+
+
+ENTRY = """{"pm": {"vbat": {"__class__": "LogTocElement", "ident": %d, "group": "pm", "name": "vbat",
+                        "ctype": "%s", "pytype": "<f", "access": 0}}}"""
 
 
 @pytest.mark.parametrize(
@@ -112,12 +130,10 @@ def test_built_in_tables_agree_with_a_real_firmware(files):
         ("", "no table of a Crazyflie"),
         ("[]", "no table of a Crazyflie"),
         ('{"pm": {"vbat": {"ident": 0}}}', "no table of a Crazyflie"),
-        (json.dumps({"pm": {"vbat": {"__class__": "LogTocElement", "ident": 3, "group": "pm", "name": "vbat",
-                                     "ctype": "float", "pytype": "<f", "access": 0}}}), "0, 1, 2"),
-        (json.dumps({"pm": {"vbat": {"__class__": "LogTocElement", "ident": 0, "group": "pm", "name": "vbat",
-                                     "ctype": "float128", "pytype": "<f", "access": 0}}}), "unknown type float128"),
+        (ENTRY % (3, "float"), "0, 1, 2"),
+        (ENTRY % (0, "float128"), "unknown type float128"),
     ],
-)  # fmt: skip
+)
 def test_other_files_are_refused(tmp_path, text, said):
     file = tmp_path / "table.json"
     file.write_text(text)

@@ -98,12 +98,9 @@ def test_compressed_pieces():
 def test_what_is_not_there(corner):
     assert corner.pieces(4, None, turned=False, reverse=False, scale=1.0) == (LogStatus.OK, [])  # as the firmware
     assert corner.define(10, IN_MEMORY, UNCOMPRESSED, 0, 1) == LogStatus.NO_COMMAND
-    with pytest.raises(ValueError, match="no numbers"):
-        uploaded(piece(1.0, [1e30]), count=1).pieces(3, None, turned=False, reverse=False, scale=1.0)
-    with pytest.raises(ValueError, match="no numbers"):
-        uploaded(piece(math.nan), count=1).pieces(3, None, turned=False, reverse=False, scale=1.0)
-    with pytest.raises(ValueError, match="no numbers"):
-        uploaded(b"", count=1).pieces(3, None, turned=False, reverse=False, scale=1.0)
+    for data in (piece(1.0, [1e30]), piece(math.nan), b""):
+        with pytest.raises(ValueError, match="no numbers"):
+            flown(uploaded(data, count=1))
 
 
 @pytest.mark.slow
@@ -114,22 +111,18 @@ def test_a_trajectory_is_flown():
     data = piece(2.0, [c / 2.0**k for k, c in enumerate(RISE)], [], [1.0])
     for at in range(0, len(data), 24):
         where = struct.pack("<BI", memory, at)
-        assert wire.put(Port.MEMORY, 2, where, data[at : at + 24])[0][2] == where + b"\0"
-    ((_, _, answer),) = wire.put(Port.HIGH_LEVEL, 0, int(HighLevel.DEFINE), 1, struct.pack("<BBIB", 1, 0, 0, 1))
-    assert answer[3] == LogStatus.OK
-    assert wire.plan(HighLevel.START_2, struct.pack("<???Bf", False, False, False, 1, 1.0)) == LogStatus.OK
-    wire.wait(1.0)
-    assert wire.flock.planner.goal(wire.t)[0, 0] == pytest.approx(0.5)
+        assert wire.ask(Port.MEMORY, 2, where, data[at : at + 24]) == where + b"\0"
+    assert wire.ask(Port.HIGH_LEVEL, 0, HighLevel.DEFINE, 1, struct.pack("<BBIB", 1, 0, 0, 1))[3] == LogStatus.OK
+    assert wire.plan(HighLevel.START_2, "???Bf", False, False, False, 1, 1.0) == LogStatus.OK
+    assert wire.after(1.0).planned[0] == pytest.approx(0.5)
     assert not wire.flock.planner.finished(wire.t)[0]
-    wire.wait(4.0)
-    assert wire.position == pytest.approx([1.0, 0.0, 1.0], abs=0.01)
+    assert wire.after(4.0).position == pytest.approx([1.0, 0.0, 1.0], abs=0.01)
     assert wire.flock.planner.finished(wire.t)[0]
-    assert wire.plan(HighLevel.START, struct.pack("<??Bf", True, True, 1, 1.0)) == LogStatus.OK  # back, protocol 9
-    wire.wait(5.0)
-    assert wire.position == pytest.approx([0.0, 0.0, 1.0], abs=0.01)
+    assert wire.plan(HighLevel.START, "??Bf", True, True, 1, 1.0) == LogStatus.OK  # back, protocol 9
+    assert wire.after(5.0).position == pytest.approx([0.0, 0.0, 1.0], abs=0.01)
 
 
-# ---------------------------------------------------------------------- spirals
+# spirals
 
 
 @pytest.mark.parametrize("clockwise", [False, True])
@@ -151,16 +144,13 @@ def test_a_spiral_goes_round_its_centre(clockwise, sideways):
         assert z == pytest.approx(1.0 + 0.4 * share, abs=1e-9)
         assert heading == pytest.approx(yaw + sense * angle * share, abs=1e-9)
     _, speed, _ = planner.state(0, 0.0)
-    along = (
-        (math.sin(to_centre), -math.cos(to_centre)) if not clockwise else (-math.sin(to_centre), math.cos(to_centre))
-    )
-    assert float(np.dot(speed[:2], along)) == pytest.approx(0.5 * angle / span)
+    along = sense * np.array([math.sin(to_centre), -math.cos(to_centre)])
+    assert along @ speed[:2] == pytest.approx(0.5 * angle / span)
 
 
 @pytest.mark.slow
 def test_a_spiral_is_flown():
     wire = Wire().hovering()
-    assert wire.plan(HighLevel.SPIRAL, struct.pack("<??fffff", 0, 0, math.pi / 2, 0.5, 0.5, 0.2, 3.0)) == LogStatus.OK
-    wire.wait(6.0)
-    assert wire.position == pytest.approx([0.5, 0.5, 1.2], abs=0.02)
-    assert wire.flock.quadrotor.yaw[0] == pytest.approx(math.pi / 2, abs=0.02)
+    assert wire.plan(HighLevel.SPIRAL, "??fffff", 0, 0, math.pi / 2, 0.5, 0.5, 0.2, 3.0) == LogStatus.OK
+    assert wire.after(6.0).position == pytest.approx([0.5, 0.5, 1.2], abs=0.02)
+    assert wire.yaw == pytest.approx(math.pi / 2, abs=0.02)

@@ -6,20 +6,14 @@ import numpy as np
 import pytest
 
 from agents.protocols.crtp import LogStatus
-from tests.twins.crazyflie_wire import DT, Wire
-from tests.twins.loopback import request
+from tests.requests import request
+from tests.twins.crazyflie_wire import DT, Wire, brushless
 from twins.devices.crazyflie.flock import Flock
 from twins.devices.device import Faults
 
-SHARE = 0.01  # of a height: settled
-
 
 def heights(wire, seconds, each=None):
-    reached = []
-    for _ in range(round(seconds / DT)):
-        wire.wait(DT, each)
-        reached.append(wire.position[2])
-    return np.array(reached)
+    return np.array([wire.after(DT, each).position[2] for _ in range(round(seconds / DT))])
 
 
 @pytest.mark.slow
@@ -41,10 +35,9 @@ def test_take_off_overshoots_and_returns():
         flock.advance(t)
         reached.append(flock.quadrotor.position[:, 2].copy())
     share = np.array(reached) / [height for height, _ in climbs * 2] - 1.0
-    assert (share.max(axis=0) > 0.07).all()
-    assert (share.max(axis=0) < 0.11).all()
     for row in share.T:
-        assert 10.0 < DT * np.flatnonzero(np.abs(row) > SHARE)[-1] < 15.0
+        assert 0.07 < row.max() < 0.11
+        assert 10.0 < DT * np.flatnonzero(np.abs(row) > 0.01)[-1] < 15.0  # until it settles
 
 
 @pytest.mark.slow
@@ -64,8 +57,7 @@ def test_landing_from_the_overshoot_ends_on_the_floor(wait):
     """Ordered as by the bridge; the motors stop on the floor, and it does not hit it."""
     wire = Wire()
     wire.takeoff(1.0, 2.5)
-    wire.wait(wait)
-    wire.land(1.1 / 0.22)
+    wire.after(wait).land(1.1 / 0.22)
     lowest = []
     while wire.motors:
         lowest.append(wire.position[2])
@@ -78,10 +70,7 @@ def test_landing_from_the_overshoot_ends_on_the_floor(wait):
 def test_thrust_in_hover_carries_the_weight():
     """29 g, and 39.3 g of a Brushless with guards, each with a deck, by the firmware's curves of thrust."""
     assert Wire().hovering().flock.vertical.thrust == pytest.approx([39300.0], rel=0.002)
-    brushless = Wire({"platform": "brushless"})
-    brushless.arm()
-    brushless.wait(0.6)
-    assert brushless.hovering().flock.vertical.thrust == pytest.approx([31750.0], rel=0.002)
+    assert brushless().hovering().flock.vertical.thrust == pytest.approx([31750.0], rel=0.002)
 
 
 @pytest.mark.slow
@@ -89,8 +78,7 @@ def test_second_flight_overshoots_as_the_first():
     """Motors off, the loops forget."""
     wire = Wire().hovering(0.8)
     wire.land(4.0)
-    wire.wait(9.0)
-    assert not wire.motors
+    assert not wire.after(9.0).motors
     assert wire.takeoff(0.8, 2.0) == LogStatus.OK
     first = Wire()
     assert first.takeoff(0.8, 2.0) == LogStatus.OK
