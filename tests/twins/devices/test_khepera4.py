@@ -1,7 +1,9 @@
 """The Khepera twin by its two protocols: a client of bare sockets, and the device's own time."""
 
+import math
 import select
 import socket
+from contextlib import ExitStack, closing
 
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ from hypothesis import strategies as st
 
 from agents.body.interface import BodyError, Disturbance
 from agents.protocols import khepera4 as protocol
-from tests.twins.loopback import request
+from tests.requests import request
 from twins.devices import khepera4
 from twins.devices.device import DeviceRequest, Faults
 
@@ -42,14 +44,12 @@ class Conversation:
 
     def serve(self):
         """Lets the device see what has come."""
-        ready = select.select(self.device.sockets(), [], [], 0.05)[0]
-        for wire in ready:
+        for wire in select.select(self.device.sockets(), [], [], 0.05)[0]:
             self.device.serve(wire, self.tick * DT)
-        return bool(ready)
 
     def say(self, data, client=None):
         (client or self.client).sendall(data)
-        return self.serve()
+        self.serve()
 
     def heard(self, client=None):
         client = client or self.client
@@ -59,67 +59,52 @@ class Conversation:
         self.say(data)
         return self.heard()
 
-    def wait(self, seconds):
+    def values(self, data=b"p"):
+        """Numbers of an answer."""
+        return [float(word) for word in self.ask(data).split(",") if not word.isalpha()]
+
+    def after(self, seconds):
+        """The robot, that much later."""
         for _ in range(round(seconds / DT)):
             self.tick += 1
             self.device.advance(self.tick * DT)
+        return self
 
+    @property
     def truth(self):
         position, yaw = self.device.truth()
-        return [*position[0, :2], yaw[0]]
+        return [*position[0, :2].tolist(), float(yaw[0])]
+
+    def speed(self):
+        """Speed over the floor [m/s], from now on."""
+        return math.dist(self.truth[:2], self.after(0.5).truth[:2]) / 0.5
 
 
 @pytest.fixture
 def talk():
-    made = []
-
-    def begin(server, **parts):
-        made.append(Conversation(server, **parts))
-        return made[-1]
-
-    yield begin
-    for each in made:
-        each.close()
-
-
-def values(answer):
-    return [float(word) for word in answer.split(",")]
-
-
-def speed(robot):
-    """Speed over the floor [m/s], from now on."""
-    before = robot.truth()
-    robot.wait(0.5)
-    after = robot.truth()
-    return np.hypot(after[0] - before[0], after[1] - before[1]) / 0.5
+    with ExitStack() as made:
+        yield lambda server, **parts: made.enter_context(closing(Conversation(server, **parts)))
 
 
 def test_server_of_2025_drives_and_reports_in_centimetres(talk):
     robot = talk("2025-05", start=[[0.5, -0.2, 0.0]], yaw=np.pi / 2)
     assert robot.ask(b"p") == "0.00,0.00,0.00"
     robot.say(b"d 10.0 0.0")
-    robot.wait(2.0)
-    assert robot.truth() == pytest.approx([0.5, 0.0, np.pi / 2], abs=0.004)
-    assert values(robot.ask(b"p")) == pytest.approx([0.2, 0.0, 0.0], abs=0.006)
+    assert robot.after(2.0).truth == pytest.approx([0.5, 0.0, np.pi / 2], abs=0.004)
+    assert robot.values() == pytest.approx([0.2, 0.0, 0.0], abs=0.006)
     robot.say(b"d 0.0 0.5")
-    robot.wait(1.0)
-    assert values(robot.ask(b"p"))[2] == pytest.approx(0.5, abs=0.04)  # wheels turn in whole units
+    assert robot.after(1.0).values()[2] == pytest.approx(0.5, abs=0.04)  # wheels turn in whole units
     robot.say(b"stop")
-    robot.wait(0.2)
-    assert speed(robot) == 0.0
+    assert robot.after(0.2).speed() == 0.0
     assert robot.ask(b"get_data") is None
-    assert speed(robot) == 0.0
+    assert robot.speed() == 0.0
 
 
-@pytest.mark.parametrize(
-    ("server", "moves"),
-    [("2023-01-07", True), ("2023-01-15", False), ("2023-04-10", False), ("2025-05", True), ("fork", True)],
-)
-def test_only_some_servers_obey_a_speed(talk, server, moves):
+@pytest.mark.parametrize("server", ["2023-01-07", "2023-01-15", "2023-04-10", "2025-05", "fork"])
+def test_only_some_servers_obey_a_speed(talk, server):
     robot = talk(server)
     robot.say(b"d 5 0")
-    robot.wait(0.5)
-    assert (speed(robot) > 0.04) == moves
+    assert (robot.after(0.5).speed() > 0.04) == (server not in {"2023-01-15", "2023-04-10"})
 
 
 @pytest.mark.parametrize(
@@ -127,20 +112,11 @@ def test_only_some_servers_obey_a_speed(talk, server, moves):
     [("2023-01-07", b"d 5 0"), ("2023-01-15", b"g 5 0"), ("2023-04-10", b"g 0 5"), ("2025-05", b"d 5 0"),
      ("fork", b"d 5 0"), ("kteam", b"D,74,74\r")],
 )  # fmt: skip
-def test_no_server_stops_by_watchdog_some_by_disconnection(talk, server, words):
+def test_no_watchdog_and_clients_that_leave(talk, server, words):
+    """Some stop when their client leaves; those of 2023 accept one client per life."""
     robot = talk(server)
     robot.say(words)
-    robot.wait(4.0)
-    assert speed(robot) > 0.03
-    robot.client.close()
-    robot.serve()
-    robot.wait(0.2)
-    assert (speed(robot) > 0.03) == (server not in {"2025-05", "fork"})
-
-
-@pytest.mark.parametrize("server", ["2023-01-07", "2023-01-15", "2023-04-10", "2025-05", "fork", "kteam"])
-def test_servers_of_2023_accept_one_client_per_life(talk, server):
-    robot = talk(server)
+    assert robot.after(4.0).speed() > 0.03
     question = b"R\r" if server == "kteam" else b"p"
     second = robot.connect()
     robot.say(question, second)
@@ -150,30 +126,26 @@ def test_servers_of_2023_accept_one_client_per_life(talk, server):
     for _ in range(3):  # the first goes, the second is let in, and heard
         robot.serve()
     assert (robot.heard(second) is None) == server.startswith("2023")
+    assert (robot.after(0.2).speed() > 0.03) == (server not in {"2025-05", "fork"})
+
+
+@pytest.mark.parametrize(
+    ("server", "drives", "answers"),
+    [("2023-01-07", False, True), ("2023-01-15", True, True), ("2023-04-10", True, False), ("2025-05", False, False),
+     ("fork", True, True)],
+)  # fmt: skip
+def test_range_poll_is_a_goal_to_later_servers(talk, server, drives, answers):
+    robot = talk(server)
+    assert (robot.ask(b"get_data") == "1000,1000,1000,1000,1000") == answers
+    assert (robot.after(1.5).speed() > 0.0) == drives
+    robot.say(b"stop")
+    assert (robot.after(2.0).speed() > 0.0) == drives  # the next turn of its loop drives again
 
 
 def test_park_loses_what_is_glued_to_a_command(talk):
     robot = talk("2023-01-07")
     robot.say(b"d 10.0 0.0stop")
-    robot.wait(1.0)
-    assert robot.truth()[0] > 0.08
-
-
-def test_range_poll_is_a_goal_to_later_servers(talk):
-    for server, drives, answers in (
-        ("2023-01-07", False, True),
-        ("2023-01-15", True, True),
-        ("2023-04-10", True, False),
-        ("2025-05", False, False),
-        ("fork", True, True),
-    ):
-        robot = talk(server)
-        assert (robot.ask(b"get_data") == "1000,1000,1000,1000,1000") == answers
-        robot.wait(1.5)
-        assert (speed(robot) > 0.0) == drives, server
-        robot.say(b"stop")
-        robot.wait(2.0)
-        assert (speed(robot) > 0.0) == drives, server  # the next turn of its loop drives again
+    assert robot.after(1.0).truth[0] > 0.08
 
 
 def test_goal_is_reached_by_2023_04_10_controller(talk):
@@ -184,20 +156,18 @@ def test_goal_is_reached_by_2023_04_10_controller(talk):
     robot.say(b"g 1.0 0.9")
     for _ in range(400):  # slower and slower: v falls with the square of Δy
         robot.ask(b"p")
-        robot.wait(0.05)
-    assert values(robot.ask(b"p"))[:2] == pytest.approx([1.0, 0.9], abs=0.06)
-    x, y, _ = robot.truth()  # its frame is turned by 1 rad against the world
-    cos, sin = np.cos(-1.0), np.sin(-1.0)
-    assert [x - 0.3, y] == pytest.approx([-sin * 0.4, cos * 0.4], abs=0.06)
+        robot.after(0.05)
+    assert robot.values()[:2] == pytest.approx([1.0, 0.9], abs=0.06)
+    # its frame is turned by 1 rad against the world
+    assert robot.truth[:2] == pytest.approx([0.3 + 0.4 * math.sin(1.0), 0.4 * math.cos(1.0)], abs=0.06)
 
 
 def test_increments_count_from_the_last_question(talk):
     robot = talk("2023-01-07")
     robot.say(b"d 5.0 0.1")
-    robot.wait(1.0)
+    robot.after(1.0)
     robot.ask(b"p")
-    robot.wait(1.0)
-    assert values(robot.ask(b"p")) == pytest.approx([0.05, 0.1], abs=0.006)
+    assert robot.after(1.0).values() == pytest.approx([0.05, 0.1], abs=0.006)
 
 
 @pytest.mark.parametrize("server", ["2023-01-15", "fork"])
@@ -210,44 +180,45 @@ def test_way_counts_from_the_last_command(talk, server):
     told = []
     for _ in range(25):
         robot.say(drive)
-        robot.wait(0.01)
-        told.append(values(robot.ask(b"p"))[0])
-        robot.wait(0.03)
+        robot.after(0.01)
+        told.append(robot.values()[0])
+        robot.after(0.03)
     assert told[5:] == pytest.approx([0.003] * 20, abs=0.0005)
-    assert robot.truth()[0] == pytest.approx(0.1, abs=0.01)
+    assert robot.truth[0] == pytest.approx(0.1, abs=0.01)
 
 
-@pytest.mark.parametrize("nonsense", [b"d", b"d fast", b"i", b"x", b"\xff\x00", b"d nan nan", b"d 1e999 0"])
-def test_park_ignores_what_it_does_not_understand(talk, nonsense):
-    robot = talk("2025-05")
-    assert robot.ask(nonsense) is None
-    assert robot.ask(b"p") == "0.00,0.00,0.00"
+@pytest.mark.parametrize(
+    ("server", "nonsense", "answer"),
+    [
+        *(("2025-05", words, None) for words in (b"d", b"d fast", b"i", b"x", b"\xff\x00", b"d nan nan", b"d 1e999 0")),
+        *(("kteam", words + b"\r", "$\r\n") for words in (b"Q", b"D,1", b"D,a,b", b"V,99", b"\xff", b"d,1,1")),
+    ],
+)
+def test_nonsense_is_ignored_or_answered_by_a_dollar(talk, server, nonsense, answer):
+    robot = talk(server)
+    assert robot.ask(nonsense) == answer
+    assert robot.after(0.5).speed() == 0.0
 
 
 def test_kteam_speaks_in_lines_units_and_pulses(talk):
     robot = talk("kteam")
     assert robot.ask(b"B\r\n") == "b,C,4\r\n"
     assert robot.ask(b"D,147,147\r") == "d\r\n"
-    robot.wait(2.0)
-    assert robot.ask(b"E\r") == "e,147,147\r\n"
-    assert robot.truth()[0] == pytest.approx(0.1994, abs=0.004)
-    left, right = values(robot.ask(b"R\r")[2:])
-    assert left == right == pytest.approx(robot.truth()[0] / 6.781e-6, abs=1.0)
+    assert robot.after(2.0).ask(b"E\r") == "e,147,147\r\n"
+    assert robot.truth[0] == pytest.approx(0.1994, abs=0.004)
+    left, right = robot.values(b"R\r")
+    assert left == right == pytest.approx(robot.truth[0] / 6.781e-6, abs=1.0)
     assert robot.ask(b"I\r") == "i\r\n"
     assert robot.ask(b"R\r") == "r,0,0\r\n"
     assert robot.ask(b"D,-50,50\r") == "d\r\n"
-    robot.wait(1.0)
-    assert robot.truth()[2] == pytest.approx(100 * 0.6781e-3 / 0.1054, abs=0.025)
+    assert robot.after(1.0).truth[2] == pytest.approx(100 * 0.6781e-3 / 0.1054, abs=0.025)
     assert robot.ask(b"G\r") == "g,1000,1000,1000,1000,1000\r\n"
     assert robot.ask(b"U,4\r") == "u\r\n"
     assert robot.ask(b"G\r") == "g,2000,2000,1000,2000,2000\r\n"
     assert robot.ask(b"N\r").count(",") == 12
     assert robot.ask(b"V,5\r") == "v,100\r\n"
-
-
-@pytest.mark.parametrize("line", [b"Q\r", b"D,1\r", b"D,a,b\r", b"V,99\r", b"\xff\r", b"d,1,1\r"])
-def test_kteam_answers_a_dollar_to_unknown_commands(talk, line):
-    assert talk("kteam").ask(line) == "$\r\n"
+    robot.ask(b"D,99999,99999\r")
+    assert robot.after(2.0).ask(b"E\r") == "e,1200,1200\r\n"
 
 
 def test_kteam_puts_lines_together_and_takes_them_apart(talk):
@@ -257,70 +228,54 @@ def test_kteam_puts_lines_together_and_takes_them_apart(talk):
     assert robot.ask(b"\r\nB\r") == "e,0,0\r\nb,C,4\r\n"
 
 
-def test_the_motors_have_a_limit(talk):
-    robot = talk("kteam")
-    robot.say(b"D,99999,99999\r")
-    robot.wait(2.0)
-    robot.ask(b"E\r")
-    assert robot.ask(b"E\r") == "e,1200,1200\r\n"
-
-
 def test_silence_and_delay(talk):
     robot = talk("2023-01-07", faults={"silent_from_s": 1.0, "silent_for_s": 1.0, "delay_s": 0.05})
     assert robot.ask(b"p") is None
-    robot.wait(0.05)
-    assert robot.heard() is not None
+    assert robot.after(0.05).heard() is not None
     robot.say(b"d 10 0")
-    robot.wait(1.0)
+    robot.after(1.0)
     robot.say(b"p")
     robot.say(b"stop")
-    robot.wait(0.5)
-    assert robot.heard() is None
-    assert robot.truth()[0] > 0.12  # it drives on, for it heard nothing
-    robot.wait(0.6)
+    assert robot.after(0.5).heard() is None
+    assert robot.truth[0] > 0.12  # it drives on, for it heard nothing
+    robot.after(0.6)
     robot.serve()  # both come at once, and it reads the first
-    robot.wait(0.06)
-    assert robot.heard() is not None
-    assert speed(robot) > 0.09
+    assert robot.after(0.06).heard() is not None
+    assert robot.speed() > 0.09
     robot.say(b"stop")
-    robot.wait(0.2)
-    assert speed(robot) == 0.0
+    assert robot.after(0.2).speed() == 0.0
 
 
 def test_a_battery_that_ends_stops_and_silences_it(talk):
     robot = talk("kteam", faults={"battery": 0.5, "drain": 1800.0})
     assert robot.ask(b"D,100,100\r") == "d\r\n"
-    robot.wait(4.0)
-    assert robot.ask(b"V,5\r") == "v,10\r\n"
-    robot.wait(2.0)
-    before = robot.truth()
-    robot.wait(1.0)
-    assert robot.truth() == before
+    assert robot.after(4.0).ask(b"V,5\r") == "v,10\r\n"
+    robot.after(2.0)
+    before = robot.truth
+    assert robot.after(1.0).truth == before
     assert robot.ask(b"V,5\r") is None
 
 
 def test_odometry_drifts_and_commands_lag_as_specified(talk):
     robot = talk("2025-05", disturbance=Disturbance(odometry_drift=0.02, latency_s=0.2))
     robot.say(b"d 20 0")
-    robot.wait(0.2)
-    assert robot.truth()[0] == 0.0
-    robot.wait(5.0)
-    error = np.array(values(robot.ask(b"p"))[:2]) - robot.truth()[:2]
+    assert robot.after(0.2).truth[0] == 0.0
+    robot.after(5.0)
+    error = np.array(robot.values()[:2]) - robot.truth[:2]
     assert 0.001 < np.abs(error).max() < 0.1  # 0.02 m per root metre along its nose, on one metre
 
 
 def test_addresses_that_cannot_be_had(talk):
     held = talk("2023-01-07").device.addresses[0].removeprefix("khepera4://")
-    for address, why in [
-        (f"khepera4-twin://{held}", "name another address"),
-        ("khepera4-twin://192.168.0.21", "loopback"),
-        ("khepera4-twin://127.0.0.1:99999", "name another address"),
-        ("khepera4-twin://127.0.0.1:port", "loopback"),
-    ]:
+    for address, device, why in (
+        (f"khepera4-twin://{held}", {}, "name another address"),
+        ("khepera4-twin://192.168.0.21", {}, "loopback"),
+        ("khepera4-twin://127.0.0.1:99999", {}, "name another address"),
+        ("khepera4-twin://127.0.0.1:port", {}, "loopback"),
+        ("khepera4-twin", {"server": "morse"}, r"R0: device: .*server"),
+    ):
         with pytest.raises(BodyError, match=why):
-            khepera4.KheperaDevice(DeviceRequest(request("khepera4", [address]), Faults()))
-    with pytest.raises(BodyError, match=r"R0: device: .*server"):
-        khepera4.KheperaDevice(DeviceRequest(request("khepera4", ["k"], device={"server": "morse"}), Faults()))
+            khepera4.KheperaDevice(DeviceRequest(request("khepera4", [address], device=device), Faults()))
 
 
 @given(st.floats(-0.27, 0.27), st.floats(-2.0, 2.0))

@@ -2,12 +2,13 @@
 
 import select
 import socket
+from contextlib import ExitStack, closing
 
 import numpy as np
 import pytest
 
 from agents.body.interface import BodyError, Disturbance, Jitter
-from tests.twins.loopback import request
+from tests.requests import request
 from twins.devices import tello
 from twins.devices.device import DeviceRequest, Faults
 
@@ -56,6 +57,15 @@ class Conversation:
                 answers.append((answer, self.tick * DT))
         return answers
 
+    def answers(self, seconds):
+        """The answers that come in the next seconds."""
+        return [answer for answer, _ in self.wait(seconds)]
+
+    def after(self, seconds):
+        """Where it is, that much later."""
+        self.wait(seconds)
+        return self.place()
+
     def state(self):
         """The newest state line, as a table, and how many came."""
         last, count = "", 0
@@ -74,15 +84,8 @@ class Conversation:
 
 @pytest.fixture
 def talk(monkeypatch):
-    made = []
-
-    def begin(**parts):
-        made.append(Conversation(monkeypatch, **parts))
-        return made[-1]
-
-    yield begin
-    for each in made:
-        each.close()
+    with ExitStack() as made:
+        yield lambda **parts: made.enter_context(closing(Conversation(monkeypatch, **parts)))
 
 
 def test_tello_is_silent_until_in_sdk_mode(talk):
@@ -101,8 +104,12 @@ def test_tello_is_silent_until_in_sdk_mode(talk):
 
 def test_take_off_and_landing_are_answered_when_over(talk):
     drone = talk()
-    [(answer, when)] = drone.up()
-    assert answer == "ok"
+    drone.ask("command")
+    drone.say("takeoff")
+    drone.wait(1.0)
+    assert drone.ask("land") == "error"
+    [(answer, when)] = drone.wait(7.0)
+    assert answer == "ok"  # of the take-off
     assert 2.0 < when < 6.0
     assert drone.place()[2] == pytest.approx(0.8, abs=0.01)
     drone.say("land")
@@ -114,16 +121,6 @@ def test_take_off_and_landing_are_answered_when_over(talk):
     assert drone.ask("land") == "error"
 
 
-def test_landing_is_refused_while_it_takes_off(talk):
-    drone = talk()
-    assert drone.ask("command") == "ok"
-    drone.say("takeoff")
-    drone.wait(1.0)
-    assert drone.ask("land") == "error"
-    assert [answer for answer, _ in drone.wait(7.0)] == ["ok"]  # of the take-off
-    assert drone.place()[2] == pytest.approx(0.8, abs=0.01)
-
-
 def test_landing_is_refused_for_some_time(talk):
     drone = talk(faults={"refuse_landing_s": 2.0})
     drone.up()
@@ -132,7 +129,7 @@ def test_landing_is_refused_for_some_time(talk):
     assert drone.ask("land") == "error"
     drone.wait(0.2)
     assert drone.ask("land") is None
-    assert [answer for answer, _ in drone.wait(8.0)] == ["ok"]
+    assert drone.answers(8.0) == ["ok"]
     assert drone.place()[2] == 0.0
 
 
@@ -141,10 +138,8 @@ def test_sticks_are_body_velocities_until_they_change(talk):
     drone.up()
     before = drone.place()
     assert drone.ask("rc 0 50 0 0") is None
-    drone.wait(4.0)
-    after = drone.place()
     # 0.5 m/s, reached with a time constant of 1/3 s: 4 s less that
-    assert after - before == pytest.approx([0.0, 0.5 * (4.0 - 1.0 / 3.0), 0.0], abs=0.02)
+    assert drone.after(4.0) - before == pytest.approx([0.0, 0.5 * (4.0 - 1.0 / 3.0), 0.0], abs=0.02)
     drone.say("rc 40 0 -10 0")
     drone.wait(2.0)
     drone.state()
@@ -163,14 +158,14 @@ def test_moves_end_where_they_should(talk):
     drone.up()
     begin = drone.place()
     drone.say("go 50 -40 30 100")
-    assert [answer for answer, _ in drone.wait(5.0)] == ["ok"]
+    assert drone.answers(5.0) == ["ok"]
     assert drone.place() - begin == pytest.approx([0.5, -0.4, 0.3], abs=0.035)
     drone.say("ccw 90")
-    assert [answer for answer, _ in drone.wait(3.0)] == ["ok"]
+    assert drone.answers(3.0) == ["ok"]
     assert drone.device.truth()[1][0] == pytest.approx(np.pi / 2, abs=0.02)
     begin = drone.place()
     drone.say("left 60")
-    assert [answer for answer, _ in drone.wait(5.0)] == ["ok"]
+    assert drone.answers(5.0) == ["ok"]
     assert drone.place() - begin == pytest.approx([-0.6, 0.0, 0.0], abs=0.04)
 
 
@@ -218,7 +213,7 @@ def test_a_curve_goes_through_its_points(talk):
     drone.say("curve 71 29 0 100 100 0 30")
     answers = []
     for _ in range(80):
-        answers += [answer for answer, _ in drone.wait(0.1)]
+        answers += drone.answers(0.1)
         assert np.linalg.norm((drone.place() - centre)[:2]) == pytest.approx(1.0, abs=0.05)
     assert answers == ["ok"]
     assert drone.place() - begin == pytest.approx([1.0, 1.0, 0.0], abs=0.05)
@@ -229,7 +224,7 @@ def test_a_flip_needs_half_a_battery(talk):
     for drone, answer in ((full, "ok"), (half, "error")):
         drone.up()
         drone.say("flip f")
-        assert [said for said, _ in drone.wait(3.0)] == [answer]
+        assert drone.answers(3.0) == [answer]
 
 
 def test_mission_pads_are_searched_for_when_switched_on(talk):
@@ -252,27 +247,23 @@ def test_wifi_gap_leaves_the_sticks_as_they_are(talk):
     before = drone.place()
     drone.device.silence(0, 1.0)
     drone.say("rc 0 0 0 0")
-    drone.wait(0.95)
+    assert drone.after(0.95)[0] - before[0] == pytest.approx(0.285, abs=0.02)
     assert drone.state()[1] == 0
-    assert drone.place()[0] - before[0] == pytest.approx(0.285, abs=0.02)
     drone.say("rc 0 0 0 0")
     drone.wait(0.1)
     drone.say("rc 0 0 0 0")
     drone.wait(1.0)
     assert drone.state()[1] > 0
     at = drone.place()
-    drone.wait(0.5)
-    assert drone.place() == pytest.approx(at, abs=0.01)
+    assert drone.after(0.5) == pytest.approx(at, abs=0.01)
 
 
 def test_sticks_of_another_scale(talk):
     drone = talk(device={"twin_stick_speed": 0.6})
     drone.up()
     drone.say("rc 0 50 0 0")
-    drone.wait(2.0)
-    before = drone.place()
-    drone.wait(1.0)
-    assert drone.place()[0] - before[0] == pytest.approx(0.3, abs=0.01)
+    before = drone.after(2.0)
+    assert drone.after(1.0)[0] - before[0] == pytest.approx(0.3, abs=0.01)
 
 
 def test_what_it_refuses_on_the_ground(talk):
@@ -287,20 +278,9 @@ def test_what_it_refuses_on_the_ground(talk):
 def test_tello_lands_after_fifteen_seconds_without_a_command(talk):
     drone = talk()
     drone.up()
-    drone.wait(6.9)
-    assert drone.place()[2] == pytest.approx(0.8, abs=0.01)  # 14.9 s after the last command
-    drone.wait(0.4)
-    assert drone.place()[2] < 0.8
-    drone.wait(6.0)
-    assert drone.place()[2] == 0.0
-
-
-def test_the_emergency_stop_lets_it_fall(talk):
-    drone = talk()
-    drone.up()
-    assert drone.ask("emergency") == "ok"
-    drone.wait(0.5)
-    assert drone.place()[2] == 0.0
+    assert drone.after(6.9)[2] == pytest.approx(0.8, abs=0.01)  # 14.9 s after the last command
+    assert drone.after(0.4)[2] < 0.8
+    assert drone.after(6.0)[2] == 0.0
 
 
 def test_a_battery_that_ends_brings_it_down(talk):
@@ -309,8 +289,7 @@ def test_a_battery_that_ends_brings_it_down(talk):
     assert weak.ask("takeoff") == "error"
     drained = talk(faults={"battery": 0.12, "drain": 10.0})
     drained.up()
-    drained.wait(6.0)
-    assert drained.place()[2] == 0.0
+    assert drained.after(6.0)[2] == 0.0
     assert 0 <= int(drained.ask("battery?")) < 5
     assert drained.ask("takeoff") == "error"
 
@@ -336,11 +315,7 @@ def test_silence_loss_and_delay(talk):
 def test_disturbance_shows_in_the_truth(talk):
     drone = talk(disturbance=Disturbance(hover_jitter=Jitter(0.02), latency_s=0.1))
     drone.up()
-    places = []
-    for _ in range(300):
-        drone.wait(DT)
-        places.append(drone.place())
-    assert 0.002 < np.std(places, axis=0)[0] < 0.06
+    assert 0.002 < np.std([drone.after(DT)[0] for _ in range(300)]) < 0.06
 
 
 def test_drones_have_addresses_of_their_own(talk):
@@ -352,17 +327,19 @@ def test_drones_have_addresses_of_their_own(talk):
     pair.wait(3.0)
     assert pair.place(0)[2] == 0.0
     assert pair.place(1)[2] > 0.5
+    assert pair.ask("emergency", row=1) == "ok"  # it falls
+    pair.wait(0.5)
+    assert pair.place(1)[2] == 0.0
 
 
 def test_addresses_that_cannot_be_had(talk):
     held = talk().device.addresses[0].removeprefix("tello://")
-    for address, why in [
-        (f"tello-twin://{held}", "in use"),
-        ("tello-twin://192.168.10.1", "loopback"),
-        ("tello-twin://kitchen", "IPv4"),
-        ("tello-twin://127.0.0.200:99999", "out of range"),
-    ]:
+    for address, device, why in (
+        (f"tello-twin://{held}", {}, "in use"),
+        ("tello-twin://192.168.10.1", {}, "loopback"),
+        ("tello-twin://kitchen", {}, "IPv4"),
+        ("tello-twin://127.0.0.200:99999", {}, "out of range"),
+        ("tello-twin", {"silence": 1}, r"R0: device: .*silence"),
+    ):
         with pytest.raises(BodyError, match=why):
-            tello.TelloDevice(DeviceRequest(request("tello", [address]), Faults()))
-    with pytest.raises(BodyError, match=r"R0: device: .*silence"):
-        tello.TelloDevice(DeviceRequest(request("tello", ["tello-twin"], device={"silence": 1}), Faults()))
+            tello.TelloDevice(DeviceRequest(request("tello", [address], device=device), Faults()))

@@ -1,15 +1,14 @@
 """The Vicon twin: what the vendor's own client and ours read from it, and what it does when things go wrong."""
 
-from __future__ import annotations
-
 import json
 import select
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from contextlib import closing, suppress
 from importlib.util import find_spec
 
 import numpy as np
@@ -23,11 +22,11 @@ from agents.network.endpoints import free_endpoint
 from agents.network.keys import Keys
 from agents.protocols import vicon_datastream
 from agents.protocols.vicon_datastream import BlockKind, Framer, MalformedBlock, Segment
-from bridges.vicon.client import Decoder, Frame, Reader
-from tests.conftest import ROOT, RouterProcess
+from bridges.vicon.client import Decoder, Reader
+from tests.commands import python, started
 from tests.twins.camera import Camera
 from tests.waiting import until
-from twins.devices.device import CaptureFault, Faults
+from twins.devices.device import Faults
 from twins.devices.vicon import ViconTwin, upright
 
 # the vendor's client, in a process of its own: it holds the interpreter, and never returns from a dead server
@@ -44,29 +43,21 @@ os._exit(0)
 """
 
 
-def rotation(w: float, x: float, y: float, z: float) -> np.ndarray:
-    """Rotation matrix of a quaternion."""
-    w, x, y, z = np.array([w, x, y, z]) / np.sqrt(w * w + x * x + y * y + z * z)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+def rotation(*quaternion):
+    """Rotation matrix (3, 3) of a quaternion w, x, y, z."""
+    w, *axis = np.array(quaternion) / np.linalg.norm(quaternion)
+    across = np.cross(np.eye(3), axis)
+    return np.eye(3) + 2.0 * w * across + 2.0 * across @ across
 
 
-def read(port: int, frames: int = 1) -> list[Frame]:
-    reader = Reader("127.0.0.1", port)
-    try:
+def read(port, frames=1):
+    with closing(Reader("127.0.0.1", port)) as reader:
         found = [reader.newest(2.0) for _ in range(frames)]
-    finally:
-        reader.close()
-    assert all(frame is not None for frame in found)
-    return [frame for frame in found if frame is not None]
+    assert None not in found
+    return found
 
 
-# ---------------------------------------------------------------------- the wire format
+# the wire format
 
 
 finite = st.floats(-50.0, 50.0)
@@ -74,9 +65,7 @@ bodies = st.lists(st.tuples(finite, finite, finite, st.lists(finite, min_size=9,
 
 
 @given(bodies, st.integers(0, 2**32 - 1), st.integers(1, 40))
-def test_packed_frames_are_unpacked_however_they_are_cut(
-    bodies: list[tuple[float, float, float, list[float]]], number: int, cut: int
-) -> None:
+def test_packed_frames_are_unpacked_however_they_are_cut(bodies, number, cut):
     sent = [Segment(0, (x, y, z), tuple(turn)) for x, y, z, turn in bodies]
     stream = vicon_datastream.packet(
         vicon_datastream.pack_axes(),
@@ -90,17 +79,15 @@ def test_packed_frames_are_unpacked_however_they_are_cut(
     assert len(packets) == 2
     for body in packets:
         frame = decoder.frame(body)
-        assert frame is not None
         assert (frame.number, frame.latency_s, frame.z_up) == (number, 0.375, True)
         assert list(frame.poses) == [f"körper {row}" for row in range(len(sent))]
         for seen, placed in zip(frame.poses.values(), sent, strict=True):
-            assert seen is not None
             assert seen.position == pytest.approx(placed.position, abs=1e-12)
             assert seen.rotation == placed.rotation
 
 
 @given(st.binary(max_size=200), st.integers(0, 400), st.integers(0, 255))
-def test_damage_is_malformed_and_nothing_else(noise: bytes, at: int, value: int) -> None:
+def test_damage_is_malformed_and_nothing_else(noise, at, value):
     honest = vicon_datastream.packet(
         vicon_datastream.pack_subject(0, "CF01"),
         vicon_datastream.pack_frame_number(1),
@@ -109,32 +96,20 @@ def test_damage_is_malformed_and_nothing_else(noise: bytes, at: int, value: int)
     )
     damaged = bytearray(honest)
     damaged[at % len(honest)] = value
-    for stream in (
-        noise,
-        bytes(damaged),
-        vicon_datastream.block(vicon_datastream.MAGIC, noise),
-        honest[: at % len(honest)],
-    ):
+    framed = vicon_datastream.block(vicon_datastream.MAGIC, noise)
+    for stream in (noise, bytes(damaged), framed, honest[: at % len(honest)]):
         decoder = Decoder()
-        try:
+        with suppress(MalformedBlock):  # anything else would fail the test
             for body in Framer().feed(stream):
                 decoder.frame(body)
                 for _, payload in vicon_datastream.blocks(body):
                     vicon_datastream.unpack_kinds(payload)
-        except MalformedBlock:
-            pass  # anything else would fail the test
 
 
-def test_root_segment_is_subject_pose_and_names_update() -> None:
-    def subject(number: int, name: str, segments: list[tuple[int, int]]) -> bytes:
-        def text(words: str) -> bytes:
-            return len(words).to_bytes(4, "little") + words.encode()
-
-        parts = [
-            parent.to_bytes(4, "little") + segment.to_bytes(4, "little") + bytes(24) + text("part")
-            for parent, segment in segments
-        ]
-        payload = number.to_bytes(4, "little") + text(name) + len(parts).to_bytes(4, "little") + b"".join(parts)
+def test_root_segment_is_subject_pose_and_names_update():
+    def subject(number, name, segments):
+        parts = [struct.pack("<II24xI4s", parent, segment, 4, b"part") for parent, segment in segments]
+        payload = struct.pack(f"<II{len(name)}sI", number, len(name), name.encode(), len(parts)) + b"".join(parts)
         return vicon_datastream.block(BlockKind.SUBJECT_INFO, payload + bytes(8))
 
     near, far = Segment(7, (1.0, 0.0, 0.0), (0.0,) * 9), Segment(3, (2.0, 0.0, 0.0), (0.0,) * 9)
@@ -142,20 +117,16 @@ def test_root_segment_is_subject_pose_and_names_update() -> None:
     decoder = Decoder()
     root = vicon_datastream.NO_PARENT
     assert decoder.frame(subject(1, "arm", [(root, 3), (3, 7)]) + subject(2, "leg", [(root, 0)])) is None
-    first = decoder.frame(moved)
-    assert first is not None
-    assert first.poses == {"arm": far, "leg": None}
-    again = decoder.frame(subject(1, "hand", [(7, 3), (root, 7)]) + moved)
-    assert again is not None
-    assert again.poses == {"hand": near}
+    assert decoder.frame(moved).poses == {"arm": far, "leg": None}
+    assert decoder.frame(subject(1, "hand", [(7, 3), (root, 7)]) + moved).poses == {"hand": near}
 
 
-# ---------------------------------------------------------------------- the twin
+# the twin
 
 
 @pytest.mark.system
 @pytest.mark.skipif(find_spec("motioncapture") is None, reason="needs motioncapture, the vendor's client in a wheel")
-def test_vendors_client_and_ours_read_same_poses() -> None:
+def test_vendors_client_and_ours_read_same_poses():
     placed = {
         "exact": ([1.25, -0.5, 0.75], [1.0, 0.0, 0.0, 0.0]),  # these have no error as single precision either
         "high": ([0.0, 2.0, 1.5], [0.5, 0.5, 0.5, 0.5]),
@@ -172,7 +143,6 @@ def test_vendors_client_and_ours_read_same_poses() -> None:
     assert theirs.keys() == frame.poses.keys() == placed.keys()
     for name, (position, quaternion) in placed.items():
         ours = frame.poses[name]
-        assert ours is not None
         assert ours.position == pytest.approx(position, abs=1e-12)
         np.testing.assert_allclose(np.array(ours.rotation).reshape(3, 3), rotation(*quaternion), atol=1e-12)
         # that wheel hands out single precision: to the last bit of it they are the same
@@ -184,7 +154,7 @@ def test_vendors_client_and_ours_read_same_poses() -> None:
 
 
 @pytest.mark.system
-def test_clients_come_and_go_without_blocking_each_other() -> None:
+def test_clients_come_and_go_without_blocking_each_other():
     with Camera(["CF01"], rate_hz=250.0) as camera:
         camera.place("CF01", [0.1, 0.2, 0.3], 0.5)
         slow = socket.create_connection(("127.0.0.1", camera.port))
@@ -205,7 +175,7 @@ def test_clients_come_and_go_without_blocking_each_other() -> None:
 
 
 @pytest.mark.system
-def test_a_client_may_ask_for_single_frames() -> None:
+def test_a_client_may_ask_for_single_frames():
     with Camera(["CF01"]) as camera, socket.create_connection(("127.0.0.1", camera.port), 2.0) as client:
         camera.place("CF01", [1.0, 2.0, 3.0])
         framer, decoder, frames = Framer(), Decoder(), []
@@ -222,7 +192,7 @@ def test_a_client_may_ask_for_single_frames() -> None:
 
 
 @pytest.mark.system
-def test_delayed_frame_comes_late_but_unchanged() -> None:
+def test_delayed_frame_comes_late_but_unchanged():
     twin = ViconTwin(["CF01"], faults=Faults(delay_s=0.05))
     with socket.create_connection(("127.0.0.1", int(twin.address.rpartition(":")[2])), 2.0) as client:
         listener = twin.sockets()[0]
@@ -231,8 +201,7 @@ def test_delayed_frame_comes_late_but_unchanged() -> None:
         client.sendall(vicon_datastream.packet(vicon_datastream.block(BlockKind.REQUEST_FRAME, b"\x01")))
         select.select(twin.sockets(), [], [], 2.0)
         twin.serve(twin.sockets()[1], 0.0)
-        offer = vicon_datastream.pack_kinds(vicon_datastream.POSES)
-        assert client.recv(65536) == offer
+        assert client.recv(65536) == vicon_datastream.pack_kinds(vicon_datastream.POSES)
         for t, height in ((0.01, 1.0), (0.02, 2.0), (0.055, 3.0)):
             twin.place(0, np.array([0.0, 0.0, height]), upright(0.0))
             twin.advance(t)
@@ -243,15 +212,13 @@ def test_delayed_frame_comes_late_but_unchanged() -> None:
         client.settimeout(2.0)
         (body,) = Framer().feed(client.recv(65536))
         frame = Decoder().frame(body)
-        assert frame is not None
         assert frame.number == 1
-        assert frame.poses["CF01"] is not None
         assert frame.poses["CF01"].position == (0.0, 0.0, 1.0)
     twin.close()
 
 
 @pytest.mark.system
-def test_occlusion_and_silence_come_when_they_should() -> None:
+def test_occlusion_and_silence_come_when_they_should():
     faults = {"occluded_from_s": 0.2, "occluded_for_s": 0.3}
     with Camera(["CF01"], faults=faults) as camera:
         camera.place("CF01", [0.0, 0.0, 1.0])
@@ -261,54 +228,35 @@ def test_occlusion_and_silence_come_when_they_should() -> None:
     assert min(hidden) == pytest.approx(20, abs=2)
     assert max(hidden) == pytest.approx(50, abs=2)
     assert len(hidden) == pytest.approx(30, abs=4)
-    with Camera(["CF01"], faults={"silent_from_s": 0.3}) as camera:
-        reader = Reader("127.0.0.1", camera.port)
-        last = None
+    with Camera(["CF01"], faults={"silent_from_s": 0.3}) as camera, closing(Reader("127.0.0.1", camera.port)) as reader:
         while (frame := reader.newest(0.3)) is not None:
-            last = frame
-        reader.close()
-    assert last is not None
-    assert last.number == pytest.approx(30, abs=2)
+            last = frame.number
+    assert last == pytest.approx(30, abs=2)
 
 
 @pytest.mark.system
-def test_noise_has_the_size_that_was_asked_for() -> None:
+def test_noise_has_the_size_that_was_asked_for():
     with Camera(["CF01"], rate_hz=1000.0, sigma=0.001, rng=np.random.default_rng(3)) as camera:
         camera.place("CF01", [0.3, -0.3, 1.0])
         frames = read(camera.port, 200)
-    seen = [segment.position for frame in frames if (segment := frame.poses["CF01"]) is not None]
-    error = np.array(seen) - [0.3, -0.3, 1.0]
+    error = np.array([frame.poses["CF01"].position for frame in frames]) - [0.3, -0.3, 1.0]
     assert error.std(axis=0) == pytest.approx([0.001] * 3, rel=0.25)
     assert np.abs(error.mean(axis=0)).max() < 4e-4
 
 
-# ---------------------------------------------------------------------- the process
+# the process
 
 
 @pytest.fixture
-def process(router: RouterProcess, request: pytest.FixtureRequest) -> Iterator[subprocess.Popen[str]]:
+def process(router, request):
     """Process of the twin; a parameter is a list of more options."""
-    command = [sys.executable, "-m", "twins.devices.vicon", "CF01", "KH01", "--connect", router.endpoint]
-    made = subprocess.Popen(
-        [*command, "--sigma", "0", "--rate", "200", *getattr(request, "param", [])],
-        cwd=ROOT,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    yield made
-    assert made.stdin is not None
-    assert made.stdout is not None
-    made.stdin.close()
-    made.stdout.close()
-    if made.poll() is None:
-        made.kill()
-    made.wait(30)
+    words = ["CF01", "KH01", "--connect", router.endpoint, "--sigma", "0", "--rate", "200"]
+    with started("-m", "twins.devices.vicon", *words, *getattr(request, "param", [])) as made:
+        yield made
 
 
 @pytest.mark.system
-def test_the_process_shows_the_truth_that_it_hears(process: subprocess.Popen[str], router: RouterProcess) -> None:
-    assert process.stdout is not None
+def test_the_process_shows_the_truth_that_it_hears(process, router):
     said = process.stdout.readline()
     assert said.startswith("vicon ready on 127.0.0.1:")
     keys = Keys()
@@ -317,22 +265,17 @@ def test_the_process_shows_the_truth_that_it_hears(process: subprocess.Popen[str
         reader = Reader("127.0.0.1", int(said.rpartition(":")[2]))
         deadline = time.monotonic() + 5.0
         seen = None
-        while seen is None and time.monotonic() < deadline:
+        while seen is None:
+            assert time.monotonic() < deadline
             truth.put(messages.encode(messages.Position("CF01", time.time() - 0.02, (0.4, -0.2, 0.9), 0.7)))
             session.put(keys.truth("KH01"), b"{}", encoding=messages.JSON)
             frame = reader.newest(1.0)
-            assert frame is not None
             assert frame.poses["KH01"] is None
             seen = frame.poses["CF01"]
-        assert seen is not None
         assert seen.position == pytest.approx((0.4, -0.2, 0.9), abs=1e-12)
         assert np.arctan2(seen.rotation[3], seen.rotation[0]) == pytest.approx(0.7, abs=1e-12)
         assert 0.02 <= frame.latency_s < 0.3
-        while seen is not None and time.monotonic() < deadline:  # silence is no place
-            frame = reader.newest(1.0)
-            assert frame is not None
-            seen = frame.poses["CF01"]
-        assert seen is None
+        until(lambda: reader.newest(1.0).poses["CF01"] is None, "silence is no place")
         reader.close()
     process.send_signal(signal.SIGTERM)
     assert process.wait(30) == 0
@@ -341,9 +284,7 @@ def test_the_process_shows_the_truth_that_it_hears(process: subprocess.Popen[str
 @pytest.mark.mechanism("lifeline: motion capture stays until the robots are down")
 @pytest.mark.parametrize("process", [["--lifeline"]], indirect=True)
 @pytest.mark.system
-def test_process_ends_with_its_starter_after_the_robots(process: subprocess.Popen[str], router: RouterProcess) -> None:
-    assert process.stdin is not None
-    assert process.stdout is not None
+def test_process_ends_with_its_starter_after_the_robots(process, router):
     said = process.stdout.readline()
     reader = Reader("127.0.0.1", int(said.rpartition(":")[2]))
     with network.open_session([router.endpoint], name="robot") as session:
@@ -358,28 +299,26 @@ def test_process_ends_with_its_starter_after_the_robots(process: subprocess.Pope
 
 
 @pytest.mark.system
-def test_user_errors_are_reported_without_a_traceback() -> None:
-    endpoint = free_endpoint(preferred_port=0)
-    for arguments, words in (
-        (["--listen", "801"], "is not HOST:PORT"),
-        (["--faults", '{"occluded": 1}'], "occluded"),
-        (["--rate", "0"], ">= 1"),
+def test_user_errors_are_reported_without_a_traceback():
+    command = ["-m", "twins.devices.vicon", "CF01", "--connect", free_endpoint(preferred_port=0)]
+    for option, value, words in (
+        ("--listen", "801", "is not HOST:PORT"),
+        ("--faults", '{"occluded": 1}', "occluded"),
+        ("--rate", "0", ">= 1"),
     ):
-        command = [sys.executable, "-m", "twins.devices.vicon", "CF01", "--connect", endpoint, *arguments]
-        ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=20, check=False)
-        assert ended.returncode == 2
+        ended = python(*command, option, value, code=2)
         assert words in ended.stderr
         assert "Traceback" not in ended.stderr
 
 
-# ---------------------------------------------------------------------- wrong frames
+# wrong frames
 
 
-def told(fault: CaptureFault) -> tuple[list[Frame], list[Frame]]:
+def told(fault):
     """Frames of two moving subjects, before and during a fault."""
     twin = ViconTwin(["CF01", "CF02"], sigma=0.001)
     decoder, frames = Decoder(), []
-    try:
+    with closing(twin):
         for k in range(1, 7):
             twin.link.faults = Faults(capture=fault if k > 3 else "")
             for row in range(2):
@@ -387,55 +326,40 @@ def told(fault: CaptureFault) -> tuple[list[Frame], list[Frame]]:
             twin.frames_sent = k
             blocks = twin._frame(0.01 * k)
             frames.append(decoder.frame(twin._names() + blocks))
-    finally:
-        twin.close()
-    assert all(frame is not None for frame in frames)
     return frames[:3], frames[3:]
 
 
-def x_of(frame: Frame, subject: str) -> float:
-    pose = frame.poses[subject]
-    assert pose is not None
-    return round(pose.position[0], 1)
-
-
-def test_frozen_capture_counts_its_frames() -> None:
+def test_frozen_capture_counts_its_frames_repeated_does_not():
     before, during = told("frozen")
     assert [frame.number for frame in during] == [4, 5, 6]
     assert all(frame.poses == before[-1].poses for frame in during)
-
-
-def test_repeated_capture_is_its_last_frame() -> None:
     before, during = told("repeated")
     assert during == [before[-1]] * 3
 
 
-def test_swapped_subjects_have_the_pose_of_the_other() -> None:
+def test_swapped_subjects_have_the_pose_of_the_other():
     before, during = told("swapped")
     for frames, expected in ((before, [0.0, 1.0]), (during, [1.0, 0.0])):
         for frame in frames:
             assert [frame.poses[name].position[1] for name in ("CF01", "CF02")] == pytest.approx(expected, abs=0.02)
-    assert [x_of(frame, "CF01") for frame in during] == [0.4, 0.5, 0.6]
+    assert [round(frame.poses["CF01"].position[0], 1) for frame in during] == [0.4, 0.5, 0.6]
 
 
-def test_renamed_subject_is_missing() -> None:
+def test_renamed_subject_is_missing():
     before, during = told("renamed")
     assert {tuple(frame.poses) for frame in before} == {("CF01", "CF02")}
     assert {tuple(frame.poses) for frame in during} == {("CF01-renamed", "CF02")}
 
 
-def test_faults_of_capture_have_their_time() -> None:
+def test_faults_of_capture_have_their_time():
     faults = Faults(capture="swapped", capture_from_s=2.0, capture_for_s=1.0)
     assert [faults.captured(t)[0] for t in (1.9, 2.0, 2.9, 3.0)] == ["", "swapped", "swapped", ""]
 
 
-def test_clients_get_the_names_when_one_changes() -> None:
+def test_clients_get_the_names_when_one_changes():
     with Camera(["CF01"], rate_hz=200.0) as camera:
         camera.place("CF01", [0.0, 0.0, 0.5])
-        reader = Reader("127.0.0.1", camera.port)
-        try:
+        with closing(Reader("127.0.0.1", camera.port)) as reader:
             for fault, name in (("", "CF01"), ("renamed", "CF01-renamed"), ("", "CF01")):
                 camera.twin.link.faults = Faults(capture=fault)
-                until(lambda name=name: (frame := reader.newest(2.0)) is not None and name in frame.poses, name)
-        finally:
-            reader.close()
+                until(lambda name=name: name in reader.newest(2.0).poses, name)
