@@ -27,65 +27,81 @@ OTHER = RobotTable(kind="crazyflie", start=[0.0, -0.5, 0.0], hover=0.8, body=f"{
 WHEELS = RobotTable(kind="khepera4", start=[1.0, 0.0], body="khepera4://192.0.2.1")
 
 
-def status(**values) -> Status:
-    known = {"robot": "CF01", "stamp": 0.0, "phase": "ready", "reason": "", "battery": 0.9}
-    return Status(**{**known, **values})
-
-
 def states(*places, yaw: float | None = 0.0) -> list[State]:
     return [State("CF01", k, 0.02 * k, "idle", place, yaw=yaw) for k, place in enumerate(places)]
 
 
-def standing(robot=DRONE, *, place=(0.0, 0.5, 0.0), yaw: float | None = 0.0, **inspected) -> Observed:
+def standing(
+    robot=DRONE, *, place=(0.0, 0.5, 0.0), noise=0.0, yaw: float | None = 0.0, said=None, **inspected
+) -> Observed:
+    """A robot at rest: what its process says, and what its device has told."""
+    x, y, z = place
     known = {"firmware": "2025.02", "volts": 4.1, "age_s": 0.02, **inspected}
-    return Observed(robot, status(), "", states(place, place, yaw=yaw), [Inspection(**known)], 0.001)
+    status = Status(**{"robot": "CF01", "stamp": 0.0, "phase": "ready", "reason": "", "battery": 0.9, **(said or {})})
+    seen = states((x - noise, y, z), (x + noise, y, z), yaw=yaw)
+    return Observed(robot, status, "", seen, [Inspection(**known)], 0.001)
+
+
+def checked(each: Observed, **others: Observed):
+    return checks.at_rest({"CF01": each, **others}, Safety(), TODAY)["CF01"]
 
 
 def found(each: Observed, check: str, **others: Observed):
-    made = checks.at_rest({"CF01": each, **others}, Safety(), TODAY)["CF01"]
-    return next(one for one in made if one.check == check)
+    return next(one for one in checked(each, **others) if one.check == check)
 
 
 def test_a_robot_that_is_in_order_is_green():
-    made = checks.at_rest({"CF01": standing(packets_hz=180.0, capacity_hz=250.0)}, Safety(), TODAY)["CF01"]
+    made = checked(standing(packets_hz=180.0, capacity_hz=250.0))
     assert {each.check: each.verdict for each in made} == dict.fromkeys(
         ["address", "firmware", "battery", "position", "start pose", "radio", "clock", "ready"], "ok"
     )
     assert not any(each.remedy for each in made)
 
 
+LEANS = "it is not level: it leans 40°"
+LOCKED = "locked: switch it off and on"
+
+
 @pytest.mark.parametrize(
-    ("inspected", "check", "verdict", "text"),
+    ("changed", "check", "verdict", "text"),
     [
         ({"firmware": "2023.11"}, "firmware", "warn", "2023.11, 28 months old"),
         ({"firmware": "twin"}, "firmware", "ok", "twin"),
         ({"firmware": None}, "firmware", "unknown", "not known by a crazyflie at radio://0/80/2M/E7E7E7E701"),
-        ({"age_s": 0.3}, "position", "bad", "at most 300 ms old"),
+        ({"age_s": 0.3}, "position", "bad", "spread 0.0 mm, at most 300 ms old"),
+        ({"noise": 0.001}, "position", "ok", "spread 1.0 mm, at most 20 ms old"),
+        ({"noise": 0.03}, "position", "warn", "spread 30.0 mm, at most 20 ms old"),
+        ({"noise": 0.2}, "position", "bad", "spread 200.0 mm, at most 20 ms old"),
         ({"packets_hz": 480.0, "capacity_hz": 250.0}, "radio", "bad", "480 of 250 packets/s"),
         ({}, "radio", "unknown", "no shared radio"),
         ({"ahead_s": 2.3}, "clock", "bad", "positions of CF01 are stamped 2.3 s ahead"),
-        ({"place": (0.5, 0.5, 0.0)}, "start pose", "bad", "0.50 m from `start`"),
+        ({"place": (0.5, 0.5, 0.0)}, "start pose", "bad", "0.50 m from `start`, turned by 0°"),
         ({"yaw": 1.0}, "start pose", "bad", "0.00 m from `start`, turned by 57°"),
         ({"yaw": None}, "start pose", "ok", "0.00 m from `start`"),
+        ({"said": {"battery": 0.1}}, "battery", "bad", "10%, 4.10 V, less than 20%"),
+        ({"said": {"phase": "idle", "reason": LEANS}}, "ready", "bad", LEANS),
+        ({"said": {"phase": "idle", "reason": LOCKED}}, "ready", "bad", LOCKED),
+        ({"said": {"body": "3 positions refused"}}, "address", "warn", "answers; 3 positions refused"),
     ],
 )
-def test_what_is_measured_at_rest(inspected, check, verdict, text):
-    made = found(standing(**inspected), check)
-    assert (made.verdict, bool(made.remedy)) == (verdict, verdict in ("warn", "bad"))
-    assert text in made.found
+def test_what_is_measured_at_rest(changed, check, verdict, text):
+    made = found(standing(**changed), check)
+    assert (made.verdict, bool(made.remedy), made.found) == (verdict, verdict in ("warn", "bad"), text)
 
 
-def test_swapped_robots_are_named():
-    here, there = standing(place=(0.0, -0.5, 0.0)), standing(OTHER, place=(0.0, 0.5, 0.0))
-    assert found(here, "start pose", CF02=there).remedy == (
+def test_clock_of_another_computer_is_compared():
+    each = standing()
+    each.behind_s = -1.5
+    assert found(each, "clock").found == "its computer's is +1.50 s off"
+
+
+@pytest.mark.parametrize(("other_y", "here_y", "there_y"), [(-0.5, -0.5, 0.5), (0.3, 0.38, 0.42)])
+def test_swapped_robots_are_named(other_y, here_y, there_y):
+    other = msgspec.structs.replace(OTHER, start=[0.0, other_y, 0.0])
+    there = standing(other, place=(0.0, there_y, 0.0))
+    assert found(standing(place=(0.0, here_y, 0.0)), "start pose", CF02=there).remedy == (
         "it stands where CF02 begins: addresses, markers or robots are swapped"
     )
-
-
-def test_swapped_robots_near_each_other_are_named():
-    near = msgspec.structs.replace(OTHER, start=[0.0, 0.3, 0.0])
-    here, there = standing(place=(0.0, 0.38, 0.0)), standing(near, place=(0.0, 0.42, 0.0))
-    assert found(here, "start pose", CF02=there).remedy.startswith("it stands where CF02 begins")
     assert found(standing(place=(0.0, 0.41, 0.0)), "start pose", CF02=there).verdict == "ok"
 
 
@@ -101,11 +117,9 @@ def test_swapped_robots_near_each_other_are_named():
     ],
 )
 def test_robots_that_count_from_start_are_unknown(robot, verdict):
-    each = standing(robot, place=(*robot.start[:2], 0.0))
-    each.states = states((*robot.start[:2], 0.0), (*robot.start[:2], 0.001))
-    assert found(each, "start pose").verdict == verdict
-    swapped = standing(robot, place=(5.0, 5.0, 0.0))
-    assert found(swapped, "start pose").verdict == "bad"
+    x, y = robot.start[:2]
+    assert found(standing(robot, place=(x, y, 0.0), noise=0.0005), "start pose").verdict == verdict
+    assert found(standing(robot, place=(5.0, 5.0, 0.0)), "start pose").verdict == "bad"
 
 
 @pytest.mark.parametrize(
@@ -113,10 +127,10 @@ def test_robots_that_count_from_start_are_unknown(robot, verdict):
     [(DRONE.body, "external", "bad"), ("world", "external", "ok"), (DRONE.body, "body", "ok")],
 )
 def test_captured_positions_that_never_change_are_red(body, position, verdict):
-    each = standing(msgspec.structs.replace(DRONE, body=body, position=position))
-    assert found(each, "position").verdict == verdict
+    robot = msgspec.structs.replace(DRONE, body=body, position=position)
+    assert found(standing(robot), "position").verdict == verdict
     if position == "external":
-        each.status = msgspec.structs.replace(each.status, body=f"{FROZEN}; connected")
+        each = standing(robot, said={"body": f"{FROZEN}; connected"})
         each.states = []
         assert (found(each, "position").verdict, found(each, "position").found) == ("bad", FROZEN)
 
@@ -134,51 +148,32 @@ def test_robots_of_a_kind_have_the_same_firmware():
     assert (made.verdict, made.remedy) == ("warn", "CF02 has 2025.09: flash the same to all of a kind")
 
 
-@pytest.mark.parametrize(("noise", "verdict"), [(0.001, "ok"), (0.03, "warn"), (0.2, "bad")])
-def test_a_position_that_moves_at_rest(noise, verdict):
-    each = standing()
-    each.states = states((-noise, 0.5, 0.0), (noise, 0.5, 0.0))
-    assert found(each, "position").verdict == verdict
+@pytest.mark.parametrize(
+    ("body", "remedy"),
+    [(DRONE.body, "switch it on"), ("quad://127.0.0.1:6001", "is it switched on, and its address right?")],
+)
+def test_unresponsive_robot_has_one_red_line(body, remedy):
+    (made,) = checked(Observed(msgspec.structs.replace(DRONE, body=body), ended="no answer"))
+    assert (made.check, made.verdict, made.found) == ("address", "bad", "no answer")
+    assert made.remedy.startswith(remedy)
+
+
+def test_one_drone_of_a_process_that_never_answered():
+    said = {
+        "battery": None,
+        "phase": "idle",
+        "reason": "no position of its own",
+        "body": "no answer at radio://0/80/...",
+    }
+    each = standing(said=said)
+    each.states, each.inspections = states(None), [Inspection()]
+    assert found(each, "address").verdict == found(each, "ready").verdict == "bad"
 
 
 def test_robot_without_position_is_not_placed_anywhere():
     each = standing()
     each.states = []
     assert [found(each, check).verdict for check in ("position", "start pose")] == ["bad", "unknown"]
-
-
-def test_unresponsive_robot_has_one_red_line_with_remedy():
-    silent = Observed(DRONE, ended="no answer at radio://0/80/2M/E7E7E7E701")
-    (made,) = checks.at_rest({"CF01": silent}, Safety(), TODAY)["CF01"]
-    assert (made.check, made.verdict, made.found) == ("address", "bad", silent.ended)
-    assert made.remedy.startswith("switch it on")
-
-
-def test_one_drone_of_a_process_that_never_answered():
-    said = status(battery=None, phase="idle", reason="no position of its own", body="no answer at radio://0/80/...")
-    each = Observed(DRONE, said, "", states(None), [Inspection()], 0.001)
-    assert found(each, "address").verdict == found(each, "ready").verdict == "bad"
-
-
-@pytest.mark.parametrize(
-    ("said", "check", "text"),
-    [
-        ({"battery": 0.1}, "battery", "10%, 4.10 V, less than 20%"),
-        ({"phase": "idle", "reason": "it is not level: it leans 40°"}, "ready", "it is not level: it leans 40°"),
-        ({"phase": "idle", "reason": "locked: switch it off and on"}, "ready", "locked: switch it off and on"),
-    ],
-)
-def test_what_its_own_process_says(said, check, text):
-    each = standing()
-    each.status = msgspec.structs.replace(each.status, **said)
-    made = found(each, check)
-    assert (made.verdict, made.found) == ("bad", text)
-
-
-def test_a_clock_that_is_off():
-    each = standing()
-    each.behind_s = -1.5
-    assert found(each, "clock").found == "its computer's is +1.50 s off"
 
 
 @pytest.mark.parametrize(
@@ -219,11 +214,7 @@ def test_hops_and_drives(robot, end, verdict, remedy):
     assert made.verdict == verdict
     assert made.remedy.startswith(remedy)
     assert made.found.endswith("; battery 60%, 3.70 V under load")
-
-
-def test_a_battery_that_sags_under_load():
-    tried = Tried(states=states((0.0, 0.5, 0.0), (0.0, 0.5, 0.2), (0.0, 0.5, 0.2)), charge=0.05)
-    assert checks.hop(standing(), tried, Safety()).verdict == "bad"
+    assert checks.hop(standing(robot), Tried(states=tried.states, charge=0.05), Safety()).verdict == "bad"
 
 
 def test_robots_are_checked_without_formation_and_low():
@@ -239,16 +230,6 @@ def test_a_tello_takes_off_to_its_own_height():
     robots = {"T1": RobotTable(kind="tello", start=[0.0, 0.0], hover=0.8), "CF01": OTHER}
     case = alone(Plan(Experiment(title="", duration_s=1.0, robots=robots)))
     assert {name: robot.hover for name, robot in case.experiment.robots.items()} == {"T1": 0.8, "CF01": checks.HOP_M}
-
-
-def test_bridge_note_on_an_answering_robot_is_warning():
-    each = standing()
-    each.status = status(body="3 positions refused")
-    made = found(each, "address")
-    assert (made.verdict, made.found) == ("warn", "answers; 3 positions refused")
-
-
-# ---------------------------------------------------------------------- sticks of a Tello
 
 
 def pushed(forward: float, back: float, *, yaw: float = 0.5) -> list[State]:
@@ -291,10 +272,3 @@ def test_sticks_that_could_not_be_measured():
     )
     assert "double stick_speed" in fast.remedy
     assert checks.trial(TELLO.trial, each, Tried(states=pushed(0.2, 0.2)[:20])).verdict == "bad"
-
-
-def test_users_body_gets_no_remedy_of_another_device():
-    own = msgspec.structs.replace(DRONE, body="quad://127.0.0.1:6001")
-    silent = Observed(own, ended="CF01: no pose within 3 s")
-    (made,) = checks.at_rest({"CF01": silent}, Safety(), TODAY)["CF01"]
-    assert (made.verdict, made.remedy) == ("bad", "is it switched on, and its address right?")

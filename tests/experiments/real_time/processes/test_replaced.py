@@ -14,19 +14,12 @@ from agents.network import name_ownership, pubsub
 from agents.network import session as network
 from agents.network.keys import Keys
 from agents.network.name_ownership import NameTaken, OwnershipCheck, OwnershipTiming
-from experiments.definition.experiment import Formation, RobotTable
-from experiments.definition.plan import Plan
-from experiments.real_time.processes.centre import CentreProcess
-from experiments.real_time.processes.joining import Network
-from experiments.real_time.processes.world import WorldProcess
-from experiments.real_time.processes.world_population import WorldBodies
-from tests.agents.few import pair
 from tests.conftest import RouterProcess
+from tests.experiments.real_time.processes import joined
+from tests.experiments.real_time.processes.joined import KEYS
 from tests.fuzz.loopnet import Attentive, Mute, Net, Reply, Sample
 from tests.system.lab import Started
 from tests.waiting import until
-
-KEYS = Keys()
 
 
 @pytest.mark.slow
@@ -54,18 +47,10 @@ def test_replaced_process_sends_nothing(what, way, monkeypatch):
     monkeypatch.setattr(Attentive, "silent_since", lambda *_: silent[0])
     ownership = OwnershipCheck([token], timing=OwnershipTiming(vanish_s=0.0))
     with Net().worn() as net:
-        joint = Network(net.session, KEYS, [], [], ownership)
         monkeypatch.setattr(pubsub, "publisher", lambda *_, **__: Counted())
-        if what == "world":
-            drone = RobotTable(kind="crazyflie", start=[0.1, 0.2], hover=0.5, body="world")
-            experiment = pair(robots={"F": drone}, formation=Formation())
-            lost = threading.Event()
-            process = WorldProcess(Plan(experiment), WorldBodies(Plan(experiment)), joint, lost)
-        else:
-            process = CentreProcess(Plan(pair(architecture="centralised")), joint)
-            goals = [CentreGoal(0, (0.0, 0.0, 0.0), 0.0, 0.0)]
-            monkeypatch.setattr(process.centre, "decide", lambda *_: goals)
-            process._goals[0] = Counted()
+        process = (joined.world if what == "world" else joined.centre)(net, ownership=ownership)
+        if what == "centre":
+            monkeypatch.setattr(process.centre, "decide", lambda *_: [CentreGoal(0, (0.0, 0.0, 0.0), 0.0, 0.0)])
         with pytest.raises(NameTaken):
             process.run(over)
     assert 20 <= len(sent) <= 21  # a tick of the world has up to two
@@ -75,14 +60,9 @@ TWO = """
 title = "two"
 duration_s = 60.0
 architecture = "centralised"
-[robots.KH01]
-kind = "khepera4"
-body = "world"
-start = [0.0, 0.0]
-[robots.KH02]
-kind = "khepera4"
-body = "world"
-start = [0.0, 0.5]
+[robots]
+KH01 = { kind = "khepera4", body = "world", start = [0.0, 0.0] }
+KH02 = { kind = "khepera4", body = "world", start = [0.0, 0.5] }
 """
 
 

@@ -4,20 +4,15 @@ from __future__ import annotations
 
 from agents.network import messages
 from agents.network.keys import Keys
-from agents.network.name_ownership import OwnershipCheck
 from agents.robot import Robot
 from agents.runtime.goal_inbox import GoalInbox
-from experiments.definition import experiment as definition
-from experiments.definition.experiment import Formation
 from experiments.definition.plan import Plan
-from experiments.real_time.processes.joining import Network
-from experiments.real_time.processes.world_network import WorldNetwork
-from experiments.real_time.processes.world_population import WorldBodies
 from tests.agents.few import pair
+from tests.experiments.real_time.processes.joined import KEYS, world_network
 from tests.fuzz.loopnet import Net
 from tests.fuzz.messages import sent
 
-KEYS, UTC = Keys(), 1.7e9
+UTC = 1.7e9
 NOW, BEHIND = 1_700_000_000_000, 1_600_000_000_000  # milliseconds, at which numbers begin
 
 
@@ -26,12 +21,8 @@ def own(net: Net, alive: str, session: str, *, gone: bool = False) -> None:
 
 
 def test_world_obeys_sender_with_clock_behind():
-    drone = definition.RobotTable(kind="crazyflie", start=[0.1, 0.2], hover=0.5, body="world")
-    experiment = pair(robots={"F": drone}, formation=Formation())
     with Net().worn() as net:
-        world = WorldNetwork(
-            Plan(experiment), WorldBodies(Plan(experiment)), Network(net.session, KEYS, [], [], OwnershipCheck([]))
-        )
+        world = world_network(net)
 
         def order(seq: int, action: str, **more: object) -> bool:
             """Whether it is carried out."""
@@ -52,14 +43,9 @@ def test_world_obeys_sender_with_clock_behind():
 
 def test_world_of_many_robots_knows_name_owners():
     names = [f"F{row:03}" for row in range(120)]  # each with a token, a claim and the token of an owner
-    drone = definition.RobotTable(kind="crazyflie", start=[0.1, 0.2], hover=0.5, body="world")
-    experiment = pair(robots={"F000": drone}, formation=Formation())
     with Net().worn() as net:
-        world = WorldNetwork(
-            Plan(experiment), WorldBodies(Plan(experiment)), Network(net.session, KEYS, [], [], OwnershipCheck([]))
-        )
-        for name in names:
-            alive = KEYS.alive(name)
+        world = world_network(net, "F000")
+        for alive in map(KEYS.alive, names):
             for token in (alive, Keys.life(alive, "one"), Keys.claim(alive, Keys.rank(1.0, "one"))):
                 net.deliver(f"{token}\0\0".encode())
         world.receive(0.0)
@@ -67,8 +53,7 @@ def test_world_of_many_robots_knows_name_owners():
 
 
 def test_centre_with_clock_behind_is_followed():
-    experiment = pair(architecture="centralised")
-    robot = Robot(Plan(experiment).assignment("A"))
+    robot = Robot(Plan(pair(architecture="centralised")).assignment("A"))
     with Net().worn() as net:
         goals = GoalInbox(net.session, KEYS, [robot], valid_box=(5.0, 5.0, 5.0))
 
