@@ -7,12 +7,9 @@ import mmap
 import resource
 import time
 import traceback
-import zlib
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
-
-import numpy as np
 
 from tests.fuzz.mutate import Mutator
 from tests.fuzz.target import Place, Target
@@ -26,51 +23,46 @@ class Tally:
     """What came of the inputs of a target.
 
     Attributes:
-        inputs: How many were tried.
-        refused: How many were refused as they should be.
-        escaped: Ways to fail, each with how often it was met.
-        kept: One input of each way to fail, and what it ended in.
-        slowest: The most CPU time that an input took [s], and its length.
+        inputs: Number of inputs tried.
+        refused: Number of inputs refused as they should be.
+        escaped: Number of times of each way to fail.
+        kept: First input of each way to fail, and what it ended in.
+        slowest: Largest CPU time of an input [s], and its length.
         taken: CPU time of all [s].
     """
 
     inputs: int = 0
     refused: int = 0
     escaped: Counter[str] = field(default_factory=Counter)
-    kept: list[tuple[bytes, str]] = field(default_factory=list)
+    kept: dict[str, tuple[bytes, str]] = field(default_factory=dict)
     slowest: tuple[float, int] = (0.0, 0)
     taken: float = 0.0
 
     def keep(self, way: str, data: bytes, text: str) -> None:
         """One more failure."""
         self.escaped[way] += 1
-        if self.escaped[way] <= 1:
-            self.kept.append((data, text))
+        self.kept.setdefault(way, (data, text))
+
+    def add(self, other: Tally) -> None:
+        """What came of further inputs."""
+        self.inputs, self.refused = self.inputs + other.inputs, self.refused + other.refused
+        self.escaped, self.kept = self.escaped + other.escaped, other.kept | self.kept
+        self.slowest, self.taken = max(self.slowest, other.slowest), self.taken + other.taken
 
 
-def generator(seed: int, name: str, block: int) -> np.random.Generator:
-    """What the inputs of a block of a target are drawn with: the same wherever and after whatever it runs."""
-    return np.random.default_rng([seed, zlib.crc32(name.encode()), block])
-
-
-def drive(
-    target: Target, inputs: int, rng: np.random.Generator, tally: Tally, *, slot: mmap.mmap | None = None, bombs: bool
-) -> None:
-    """Tries so many inputs.
+def drive(target: Target, inputs: int, seed: object, *, slot: mmap.mmap | None = None, bombs: bool = False) -> Tally:
+    """What comes of spoilt inputs.
 
     Args:
         target: To be driven.
-        inputs: How many.
-        rng: Draws them.
-        tally: What came of them is added there.
+        inputs: Number of inputs.
+        seed: Inputs are the same for the same seed.
         slot: Where each input is written before it is tried, for whoever looks after a crash.
         bombs: Whether time and memory count as well.
     """
-    mutator = Mutator(target.examples, rng)
-    cpu = time.process_time
+    mutator, tally = Mutator(target.examples, seed), Tally(inputs)
+    begun = last = time.process_time()
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    begun = cpu()
-    last = begun
     for _ in range(inputs):
         data = mutator.spoilt()
         if slot is not None:
@@ -82,18 +74,15 @@ def drive(
         except Exception as error:  # noqa: BLE001 - whatever escapes is what is looked for
             tally.keep(way_of(error), data, "".join(traceback.format_exception(error)))
         if bombs:
-            now = cpu()
-            if now - last > tally.slowest[0]:
-                tally.slowest = (now - last, len(data))
-                if now - last > SLOW_S:
-                    tally.keep("time", data, f"{now - last:.1f} s of CPU for {len(data)} bytes")
-            grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - memory
-            memory += max(0, grown)
+            taken, grown = time.process_time() - last, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - memory
+            tally.slowest, memory = max(tally.slowest, (taken, len(data))), memory + max(0, grown)
+            if taken > SLOW_S:
+                tally.keep("time", data, f"{taken:.1f} s of CPU for {len(data)} bytes")
             if grown > HUGE_KB:
                 tally.keep("memory", data, f"{grown // 1024} MB more for {len(data)} bytes")
-            last = cpu()
-    tally.inputs += inputs
-    tally.taken += cpu() - begun
+            last = time.process_time()
+    tally.taken = time.process_time() - begun
+    return tally
 
 
 def way_of(error: Exception) -> str:
@@ -104,9 +93,8 @@ def way_of(error: Exception) -> str:
     return f"{type(error).__name__} in {Path(inner[-1].filename).name}:{inner[-1].lineno}"
 
 
-def save(folder: Path, name: str, kept: tuple[bytes, str]) -> Path:
+def save(folder: Path, name: str, data: bytes, text: str) -> Path:
     """Keeps an input, and what it ended in beside it."""
-    data, text = kept
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / f"{name}--{hashlib.sha256(data + text.encode('utf-8', 'replace')[-200:]).hexdigest()[:12]}.bin"
     file.write_bytes(data)

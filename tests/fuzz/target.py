@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+
+Inputs = Generator[None, bytes, None]  # takes an input at each `yield`
 
 
 @dataclass(frozen=True)
@@ -42,18 +44,28 @@ class Place:
 
 
 class Renewed:
-    """Something with a memory, made anew after so many inputs: one that was told too much refuses all the rest."""
+    """Something with a memory, made anew after a number of inputs: one that was told too much refuses all the rest.
 
-    def __init__(self, make: Callable[[], Callable[[bytes], object]], every: int) -> None:
+    It is a generator that is sent an input at each `yield`; its end, by an error too, is its `finally`.
+    """
+
+    def __init__(self, make: Callable[[], Inputs], every: int) -> None:
         self._make, self._every, self._left = make, every, 0
-        self._take: Callable[[bytes], object] = lambda _: None
+        self._made: Inputs | None = None
 
-    def __call__(self, data: bytes) -> object:
+    def __call__(self, data: bytes) -> None:
         if not self._left:
-            self._take, self._left = self._make(), self._every
+            self.close()
+            self._made, self._left = self._make(), self._every
+            next(self._made)
+        assert self._made is not None
         self._left -= 1
         try:
-            return self._take(data)
+            self._made.send(data)
         except Exception:
-            self._left = 0  # it may be half-way through something
+            self._left = 0  # it has ended, half-way through something
             raise
+
+    def close(self) -> None:
+        if self._made is not None:
+            self._made.close()

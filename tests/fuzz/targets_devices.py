@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator
+from contextlib import ExitStack, closing
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -11,9 +13,9 @@ import numpy as np
 from agents.protocols import vicon_datastream
 from agents.protocols.vicon_datastream import BlockKind, Segment
 from tests.fuzz.sockets import Wire
-from tests.fuzz.target import Place, Renewed, Target
+from tests.fuzz.target import Inputs, Place, Renewed, Target
 from tests.requests import request
-from twins.devices.device import Device, DeviceRequest, Faults
+from twins.devices.device import DeviceRequest, Faults
 
 # ---------------------------------------------------------------------- the Khepera IV
 
@@ -29,36 +31,26 @@ def khepera_twin() -> Iterator[Target]:
     examples = [letter.encode() + word.encode() for word in park for letter in "pqrst"]
     examples += [b"k" + "\r".join([word, "R", ""]).encode() for word in kteam]
 
-    def make():
-        nonlocal devices
-        for device in devices.values():
-            device.close()
-        devices = {}
-        for letter, server in letters.items():
-            made = request("khepera4", ["khepera4-twin"], device={"server": server})
-            devices[letter] = khepera4.KheperaDevice(DeviceRequest(made, Faults()))
-        t = 0.0
+    def make() -> Inputs:
+        with ExitStack() as stack:
+            devices: dict[str, Any] = {}
+            for letter, server in letters.items():
+                made = DeviceRequest(request("khepera4", "khepera4-twin", device={"server": server}), Faults())
+                devices[letter] = stack.enter_context(closing(khepera4.KheperaDevice(made)))
+            for k in count():
+                data = yield
+                device = devices.get(data[:1].decode("ascii", "replace"), devices["p"])
+                wire, server = Wire(), device.servers[0]
+                server.client, server._left = wire, False
+                wire.waiting += [data[1:256], data[256:512]] if len(data) > 256 else [data[1:]]
+                while wire.waiting:
+                    device.serve(wire, 0.02 * k)
+                for t in (0.02 * k + 0.01, 0.02 * k + 0.02):
+                    device.advance(t)
+                assert np.isfinite(device.truth()[0]).all()
 
-        def take(data: bytes) -> None:
-            nonlocal t
-            device: Any = devices.get(data[:1].decode("ascii", "replace"), devices["p"])
-            wire = Wire()
-            server = device.servers[0]
-            server.client, server._left = wire, False
-            wire.waiting += [data[1:256], data[256:512]] if len(data) > 256 else [data[1:]]
-            while wire.waiting:
-                device.serve(wire, t)
-            for _ in range(2):
-                t += 0.01
-                device.advance(t)
-            assert np.isfinite(device.truth()[0]).all()
-
-        return take
-
-    devices: dict[str, Device] = {}
-    yield Target(examples, Renewed(make, 200))
-    for device in devices.values():
-        device.close()
+    with closing(Renewed(make, 200)) as take:
+        yield Target(examples, take)
 
 
 def khepera_bridge() -> Iterator[Target]:
@@ -149,12 +141,10 @@ def vicon_bridge() -> Iterator[Target]:
     from bridges.vicon.client import Decoder  # noqa: PLC0415
     from bridges.vicon.publisher import PoseFilter  # noqa: PLC0415
 
-    def make():
-        decoder, pose_filter, t = Decoder(), PoseFilter({"CF01": "cf1", "KH01": "kh1"}, lambda _: None), 0.0
-
-        def take(data: bytes) -> None:
-            nonlocal t
-            t += 0.01
+    def make() -> Inputs:
+        decoder, pose_filter = Decoder(), PoseFilter({"CF01": "cf1", "KH01": "kh1"}, lambda _: None)
+        for k in count(1):
+            data = yield
             framer = vicon_datastream.Framer()  # the connection is made anew after every error
             for begin in range(0, len(data), 4000):
                 for body in framer.feed(data[begin : begin + 4000]):
@@ -163,10 +153,8 @@ def vicon_bridge() -> Iterator[Target]:
                             vicon_datastream.unpack_kinds(payload)
                     frame = decoder.frame(body)
                     if frame is not None:
-                        for _, measured, segment, yaw in pose_filter.filter_poses(frame, t):
+                        for _, measured, segment, yaw in pose_filter.filter_poses(frame, 0.01 * k):
                             assert np.isfinite((measured, yaw, *segment.position)).all()
-
-        return take
 
     yield Target(_vicon_stream(), Renewed(make, 300), (vicon_datastream.MalformedBlock,))
 

@@ -7,6 +7,8 @@ import struct
 import sys
 import types
 from collections.abc import Iterator
+from contextlib import closing
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -14,7 +16,7 @@ import numpy as np
 from agents.protocols import crtp
 from agents.protocols.crtp import HighLevel, Log, Misc, Port, Setpoint, SupervisorCommand
 from tests.fuzz.sockets import Wire
-from tests.fuzz.target import Place, Renewed, Target
+from tests.fuzz.target import Inputs, Place, Renewed, Target
 from tests.requests import request
 from twins.devices.device import DeviceRequest, Faults
 
@@ -70,36 +72,26 @@ def crazyflie_twin() -> Iterator[Target]:
         packet(Port.SUPERVISOR, 0, b"\x0c"),
     ]  # fmt: skip
 
-    def make():
-        nonlocal device
-        if device is not None:
-            device.close()
-        device = CrazyflieTwin(DeviceRequest(request("crazyflie", ["crazyflie-twin"]), Faults()))
-        line, wire = device.lines[0], Wire()
-        own = line.socket
-        line.socket.close()
-        line.socket = wire  # type: ignore[assignment]
-        t = 0.0
+    def make() -> Inputs:
+        asked = DeviceRequest(request("crazyflie", "crazyflie-twin"), Faults())
+        with closing(CrazyflieTwin(asked)) as device:
+            line, wire = device.lines[0], Wire()
+            own = line.socket
+            line.socket.close()
+            line.socket = wire  # type: ignore[assignment]
+            for k in count():
+                data, at = (yield), 0
+                while at < len(data) and len(wire.waiting) < 40:
+                    wire.waiting.append(data[at + 1 : at + 1 + data[at]] or b"\0")
+                    at += 1 + data[at]
+                while wire.waiting:
+                    device.serve(own, 0.03 * k)
+                for step in (1, 2, 3):
+                    device.advance(0.03 * k + 0.01 * step)
+                assert np.isfinite(device.truth()[0]).all()
 
-        def take(data: bytes) -> None:
-            nonlocal t
-            at = 0
-            while at < len(data) and len(wire.waiting) < 40:
-                wire.waiting.append(data[at + 1 : at + 1 + data[at]] or b"\0")
-                at += 1 + data[at]
-            while wire.waiting:
-                device.serve(own, t)
-            for _ in range(3):
-                t += 0.01
-                device.advance(t)
-            position, _ = device.truth()
-            assert np.isfinite(position).all()
-
-        return take
-
-    device: Any = None
-    yield Target(examples, Renewed(make, 100))
-    device.close()
+    with closing(Renewed(make, 100)) as take:
+        yield Target(examples, take)
 
 
 # ---------------------------------------------------------------------- the Tello
@@ -117,31 +109,24 @@ def tello_twin() -> Iterator[Target]:
     ]  # fmt: skip
     examples = [b"command", *(f"command\0takeoff\0\0{word}".encode() for word in words)]
 
-    def make():
-        nonlocal device
-        if device is not None:
-            device.close()
-        device = TelloDevice(DeviceRequest(request("tello", ["tello-twin"]), Faults()))
-        wire = Wire()
-        device._drones[0].wire.close()
-        device._drones[0].wire = wire
-        t = 0.0
+    def make() -> Inputs:
+        with closing(TelloDevice(DeviceRequest(request("tello", "tello-twin"), Faults()))) as device:
+            wire: Any = Wire()
+            device._drones[0].wire.close()
+            device._drones[0].wire = wire
+            t = 0.0
+            while True:
+                data = yield
+                wire.waiting += data.split(b"\0")[:20]
+                while wire.waiting:
+                    device.serve(wire, t)
+                    for _ in range(2):
+                        t += 0.01
+                        device.advance(t)
+                assert np.isfinite(device.truth()[0]).all()
 
-        def take(data: bytes) -> None:
-            nonlocal t
-            wire.waiting += data.split(b"\0")[:20]
-            while wire.waiting:
-                device.serve(wire, t)
-                for _ in range(2):
-                    t += 0.01
-                    device.advance(t)
-            assert np.isfinite(device.truth()[0]).all()
-
-        return take
-
-    device: Any = None
-    yield Target(examples, Renewed(make, 100))
-    device.close()
+    with closing(Renewed(make, 100)) as take:
+        yield Target(examples, take)
 
 
 class Drone:
@@ -186,15 +171,12 @@ def tello_pilot() -> Iterator[Target]:
         for answer in (b"ok", b"error", b"out of range", b"unknown command: x", b"error Auto land")
     ]
 
-    def make():
+    def make() -> Inputs:
         drone = Drone()
         pilot = TelloPilot(drone, KINDS["tello"], TelloSettings())
         pilot.position = (0.0, 0.0, 0.5)
-        now = 100.0
-
-        def take(data: bytes) -> None:
-            nonlocal now
-            now += 0.05
+        for k in count(1):
+            data, now = (yield), 100.0 + 0.05 * k
             state, _, answer = data.partition(b"\0")
             try:
                 parsed = parse(state.decode("ascii"))
@@ -206,8 +188,6 @@ def tello_pilot() -> Iterator[Target]:
                 pilot.take_off(0.5, now)
             pilot.step(now, now)
             assert isinstance(pilot.note(now), str)
-
-        return take
 
     yield Target(examples, Renewed(make, 200))
 

@@ -6,7 +6,8 @@ import io
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, redirect_stdout, suppress
+from contextlib import ExitStack, closing, redirect_stdout, suppress
+from itertools import count
 from math import isnan
 from pathlib import Path
 from threading import Event
@@ -23,7 +24,7 @@ from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.real_time.conductor import orders
 from tests.fuzz.messages import KEYS, everything, good, of_all, sent
-from tests.fuzz.target import Place, Renewed, Target
+from tests.fuzz.target import Inputs, Place, Renewed, Target
 from tests.network import Net, Reply, Sample
 from tests.requests import request
 
@@ -59,7 +60,7 @@ def robot() -> Iterator[Target]:
 
     experiment = document.read("triangle", ["robots.KH01.position=external", "avoidance=barrier"]).experiment
 
-    def make():
+    def make() -> Inputs:
         net.forget()
         body = assemble(bodies.body_request(Plan(experiment), ["KH01"], 1, ["tcp/127.0.0.1:1"]))
         setup = Setup(KEYS, [], "json", 50.0, lifeline=False, externally_measured=[True], ranging=["world"])
@@ -76,13 +77,6 @@ def robot() -> Iterator[Target]:
             command(setpoints)
 
         body.command = told  # type: ignore[method-assign]
-        t = 0.0
-
-        def tick() -> None:
-            nonlocal t
-            t += 0.01
-            runtime.tick(t)
-
         began = runtime._utc
         for k in range(1, 6):
             for name in ("KH01", "KH02", "CF01"):
@@ -95,13 +89,11 @@ def robot() -> Iterator[Target]:
             if k > 2:
                 order = wire.Order("takeoff") if k == 3 else wire.Order("start", at=began + 0.01 * k)
                 net.deliver(sent("park/KH01/order", order)[0])
-            tick()
-
-        def take(data: bytes) -> None:
+            runtime.tick(0.01 * k)
+        for k in count(6):
+            data = yield
             net.deliver(data, gone=len(data) % 16 == 0)
-            tick()
-
-        return take
+            runtime.tick(0.01 * k)
 
     with Net().worn() as net, redirect_stdout(RUBBISH):
         yield Target(everything("KH01", "KH02", "CF01"), Renewed(make, 200))
@@ -116,25 +108,19 @@ def world() -> Iterator[Target]:
     changes = ["robots.KH01.body=world", "robots.KH02.body=world", "world.engine=pymunk"]
     experiment = document.read("triangle", changes).experiment
 
-    def make():
+    def make() -> Inputs:
         net.forget()
         joint = Network(net.session, KEYS, [], [], OwnershipCheck([]))  # type: ignore[arg-type]
         process = WorldProcess(Plan(experiment), WorldBodies(Plan(experiment)), joint, Event())
         process.exchange.utc = time.time()
-        t = 0.0
-
-        def take(data: bytes) -> None:
-            nonlocal t
-            t += 0.01
-            net.deliver(data)
-            process._tick(t)
-            if process._pace.update(t, 0.01):
-                process._report(t)
+        for k in count(1):
+            net.deliver((yield))
+            process._tick(0.01 * k)
+            if process._pace.update(0.01 * k, 0.01):
+                process._report(0.01 * k)
             population = process._population
             for carried, state in zip(population.carried, population.states, strict=True):
                 assert not carried or is_finite(state.position)
-
-        return take
 
     with Net().worn() as net, redirect_stdout(RUBBISH):
         yield Target(everything("KH01", "KH02", "CF01"), Renewed(make, 200))
@@ -147,27 +133,17 @@ def recorder() -> Iterator[Target]:
 
     experiment = document.read("triangle").experiment
 
-    def make():
-        nonlocal recording
+    def make() -> Inputs:
         net.forget()
-        if recording is not None:
-            recording.close()
-            recording.path.unlink()
         path = Path(folder) / f"{time.monotonic_ns()}.mcap"
-        recording = Recording(path, Plan(experiment), case="only", seed=1, clock="real")
-        made = Recorder(net.session, KEYS, recording)  # type: ignore[arg-type]
+        with Recording(path, Plan(experiment), case="only", seed=1, clock="real") as recording:
+            made = Recorder(net.session, KEYS, recording)  # type: ignore[arg-type]
+            while True:
+                net.deliver((yield))
+                made.receive()
 
-        def take(data: bytes) -> None:
-            net.deliver(data)
-            made.receive()
-
-        return take
-
-    recording: Recording | None = None
-    with tempfile.TemporaryDirectory() as folder, Net().worn() as net:
-        yield Target(everything("KH01", "KH02"), Renewed(make, 1000))
-        if recording is not None:
-            recording.close()
+    with tempfile.TemporaryDirectory() as folder, Net().worn() as net, closing(Renewed(make, 1000)) as take:
+        yield Target(everything("KH01", "KH02"), take)
 
 
 def conductor() -> Iterator[Target]:
@@ -187,11 +163,11 @@ def conductor() -> Iterator[Target]:
         def running(self, _name: str) -> bool:
             return False
 
-        def start(self, *_: str) -> None: ...
+        def start(self, *_: str, forked: bool = False) -> None: ...
 
         release = kill = start
 
-    def make():
+    def make() -> Inputs:
         net.forget()
         context = CaseContext(
             Plan(experiment), "only", Path(folder), source=Path(folder) / "only.json", endpoints=["tcp/127.0.0.1:1"],
@@ -200,12 +176,10 @@ def conductor() -> Iterator[Target]:
         made = Conductor(context, lambda _: None)
         made._join(ExitStack())
         made._changes.begin(time.time())
-
-        def take(data: bytes) -> None:
+        while True:
+            data = yield
             net.deliver(data, gone=len(data) % 16 == 0)
             made._update()
-
-        return take
 
     with tempfile.TemporaryDirectory() as folder, Net().worn() as net, redirect_stdout(RUBBISH):
         yield Target(everything("KH01", "KH02", "CF01"), Renewed(make, 500))
@@ -215,7 +189,7 @@ def external_body() -> Iterator[Target]:
     """A body elsewhere says where it is and what it sees."""
     from bridges.external import ExternalBody  # noqa: PLC0415
 
-    def make():
+    def make() -> Inputs:
         net.forget()
         for name in ("KH01", "KH02"):
             key = KEYS.position(name)
@@ -225,16 +199,10 @@ def external_body() -> Iterator[Target]:
             request("khepera4", ["external"] * 2, names=["KH01", "KH02"], endpoints=["tcp/127.0.0.1:1"])
         )
         body.open()
-        t = 0.0
-
-        def take(data: bytes) -> None:
-            nonlocal t
-            t += 0.01
-            net.deliver(data)
-            assert all(is_finite(state.position) for state in body.read(t))
+        for k in count(1):
+            net.deliver((yield))
+            assert all(is_finite(state.position) for state in body.read(0.01 * k))
             body.command([(0.0, 0.0, 0.0, 0.0)] * 2)
-
-        return take
 
     with Net().worn() as net:
         yield Target(everything("KH01", "KH02", only=("position", "ranges", "state")), Renewed(make, 200))
@@ -244,22 +212,17 @@ def vicon_truths() -> Iterator[Target]:
     """The simulated Vicon hears where twins are."""
     from twins.devices.vicon import TruthSubscription, ViconTwin  # noqa: PLC0415
 
-    with Net().worn() as net:
-        vicon = ViconTwin(["KH01", "KH02"])
-        truths = TruthSubscription(net.session, KEYS, ["KH01", "KH02"])  # type: ignore[arg-type]
-        t = 0.0
+    def make() -> Inputs:
+        net.forget()
+        with closing(ViconTwin(["KH01", "KH02"])) as vicon:
+            truths = TruthSubscription(net.session, KEYS, ["KH01", "KH02"])  # type: ignore[arg-type]
+            for k in count(1):
+                net.deliver((yield))
+                truths.update(vicon, time.time())
+                vicon.advance(0.01 * k)
 
-        def take(data: bytes) -> None:
-            nonlocal t
-            t += 0.01
-            net.deliver(data)
-            truths.update(vicon, time.time())
-            vicon.advance(t)
-
-        try:
-            yield Target(everything("KH01", "KH02", only=("truth",)), take)
-        finally:
-            vicon.close()
+    with Net().worn() as net, closing(Renewed(make, 10_000)) as take:
+        yield Target(everything("KH01", "KH02", only=("truth",)), take)
 
 
 def answers() -> Iterator[Target]:
@@ -281,8 +244,7 @@ def answers() -> Iterator[Target]:
         key, _, rest = data.partition(b"\0")
         mime, _, payload = rest.partition(b"\0")
         kind = mime.decode("utf-8", "replace")
-        made = [Sample(key.decode("utf-8", "replace"), kind, payload)]
-        net.replies = [Reply(sample, good=len(data) % 8 > 0) for sample in made]
+        net.replies = [Reply(Sample(key.decode("utf-8", "replace"), kind, payload), good=len(data) % 8 > 0)]
         assert isinstance(orders.send_order(net.session, KEYS, ["KH01"], wire.Order("hold"))["KH01"], wire.Reply)  # type: ignore[arg-type]
         assert isinstance(orders.send_world_order(net.session, KEYS, wire.WorldOrder("pause")), wire.WorldReply)  # type: ignore[arg-type]
         assert readable(payload, kind).isprintable()

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import closing
+from itertools import count
 
 import numpy as np
 
 from agents.network.keys import Keys
 from agents.protocols import ros2
 from agents.vectors import is_finite
-from tests.fuzz.target import Place, Renewed, Target
+from tests.fuzz.target import Inputs, Place, Renewed, Target
 from tests.network import Net, Sample
 from tests.requests import request
 from twins.devices.device import DeviceRequest, Faults
@@ -88,28 +90,23 @@ def turtlebot_bridge() -> Iterator[Target]:
     examples = [f"tb3_0/{topic}\0\0".encode() + good[kind] for topic, kind in topics.items()]
     examples += [ros2.dds_token("f00d", "MS", "/tb3_0/cmd_vel", ros2.TWIST_STAMPED).encode() + b"\0\0"]
 
-    bodies = [TurtleBot3(request("turtlebot3", "ros2dds://tb3_0"))]
-
-    def make():
-        bodies.pop()._claims.release()  # `close` would wait until the robot stands
+    def make() -> Inputs:
         net.forget()
         net.first["tb3_0/odom"] = Sample("tb3_0/odom", "", good[ros2.ODOMETRY])
-        bodies.append(body := TurtleBot3(request("turtlebot3", "ros2dds://tb3_0")))
-        body.open()
-        t = 0.0
+        body = TurtleBot3(request("turtlebot3", "ros2dds://tb3_0"))
+        try:
+            body.open()
+            for k in count(1):
+                data = yield
+                net.deliver(data, gone=len(data) % 16 == 0)
+                (state,) = body.read(0.01 * k)
+                assert is_finite(state.position)
+                body.command([(0.1, 0.2, 0.0, 0.0)])
+        finally:
+            body._claims.release()  # `close` would wait until the robot stands
 
-        def take(data: bytes) -> None:
-            nonlocal t
-            t += 0.01
-            net.deliver(data, gone=len(data) % 16 == 0)
-            (state,) = body.read(t)
-            assert is_finite(state.position)
-            body.command([(0.1, 0.2, 0.0, 0.0)])
-
-        return take
-
-    with Net().worn() as net:
-        yield Target(examples, Renewed(make, 200))
+    with Net().worn() as net, closing(Renewed(make, 200)) as take:
+        yield Target(examples, take)
 
 
 def turtlebot_twin() -> Iterator[Target]:
@@ -118,19 +115,13 @@ def turtlebot_twin() -> Iterator[Target]:
 
     good = ros_messages()
 
-    def make():
+    def make() -> Inputs:
         net.forget()
         device = TurtleBot3Twin(DeviceRequest(request("turtlebot3", "turtlebot3-twin"), Faults()))
-        t = 0.0
-
-        def take(data: bytes) -> None:
-            nonlocal t
-            t += 0.01
-            net.deliver(data)
-            device.advance(t)
+        for k in count(1):
+            net.deliver((yield))
+            device.advance(0.01 * k)
             assert np.isfinite(device.truth()[0]).all()
-
-        return take
 
     with Net().worn() as net:
         yield Target([b"KH01/cmd_vel\0\0" + good[ros2.TWIST_STAMPED]], Renewed(make, 300))
@@ -145,21 +136,19 @@ def ros_graph() -> Iterator[Target]:
     good = ros_messages()
     examples = everything("KH01", "KH02", only=("state", "ranges", "status"))
 
-    def make():
+    def make() -> Inputs:
         net.forget()
         participant = Participant(net.session, ros2.types("jazzy"), style="rmw")  # type: ignore[arg-type]
         graph = Graph(net.session, participant, Keys())  # type: ignore[arg-type]
         net.deliver(b"park/KH01/alive\0\0")
         graph.poll()
-
-        def take(data: bytes) -> None:
+        while True:
+            data = yield
             net.deliver(data, gone=len(data) % 16 == 0)
             graph.poll()
 
-        return take
-
     with Net().worn() as net:
-        make()
+        next(make())
         goals = [channel.key for channel in net.channels if "/goal" in channel.key]
         examples += [key.encode() + b"\0\0" + good[ros2.POSE_STAMPED] for key in goals]
         yield Target(examples, Renewed(make, 200))
