@@ -49,11 +49,11 @@ class TurtleBot3(Body):
 
     def __init__(self, request: BodyRequest, clock: Clock = uptime, open_timeout: float = OPEN_S) -> None:
         self._clock, self._open_timeout = clock, open_timeout
-        self._robots = [TurtleBotConnection(request, row) for row in range(len(request.names))]
-        self._claims = Claims([robot.name for robot in self._robots], [robot.device for robot in self._robots])
+        self.robots = [TurtleBotConnection(request, row) for row in range(len(request.names))]
+        self._claims = Claims([robot.name for robot in self.robots], [robot.device for robot in self.robots])
         self._sessions: dict[tuple[str, ...], zenoh.Session] = {}
         self._outside = request.external
-        self._external = [External() for _ in self._robots]
+        self._external = [External() for _ in self.robots]
         self._read_at = -inf  # [s] the state on which the next command is decided
         self._ending = threading.Event()
         self._thread: threading.Thread | None = None
@@ -64,7 +64,7 @@ class TurtleBot3(Body):
         deadline = self._clock() + self._open_timeout
         try:
             participants: dict[tuple[object, ...], Participant] = {}
-            for robot in self._robots:
+            for robot in self.robots:
                 where = robot.address
                 session = self._session(robot, deadline)
                 which = (robot.endpoints, where.style, where.distro, where.domain)
@@ -73,17 +73,17 @@ class TurtleBot3(Body):
                         session, ros2.types(where.distro), style=where.style, domain=where.domain
                     )
                 robot.join(participants[which])
-            while missing := [robot for robot in self._robots if robot.odometry.received == -inf]:
+            while missing := [robot for robot in self.robots if robot.odometry.received == -inf]:
                 if self._clock() > deadline:
                     raise BodyError("; ".join(self._missing_odometry(robot) for robot in missing))
                 time.sleep(POLL_S)
-                for robot in self._robots:
+                for robot in self.robots:
                     robot.receive_messages(-inf, self._clock())
         except BaseException:
             self._close()
             raise
         self._ending.clear()
-        self._thread = threading.Thread(target=self._stop_stale, name="turtlebot3 zeros", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="turtlebot3 zeros", daemon=True)
         self._thread.start()
 
     def _session(self, robot: TurtleBotConnection, deadline: float) -> zenoh.Session:
@@ -127,14 +127,14 @@ class TurtleBot3(Body):
 
     def read(self, t: float) -> Sequence[BodyState]:
         now = self._read_at = self._clock()
-        for robot in self._robots:
+        for robot in self.robots:
             robot.receive_messages(t, now)
             if robot.time == -inf and robot.odometry.received > -inf:
                 robot.time = t - (now - robot.odometry.received)  # received during `open`
             robot.send_command(self._clock())
         linked = {endpoints: network.connected(session) for endpoints, session in self._sessions.items()}
         return [
-            self._state(row, robot, t, now, linked=linked[robot.endpoints]) for row, robot in enumerate(self._robots)
+            self._state(row, robot, t, now, linked=linked[robot.endpoints]) for row, robot in enumerate(self.robots)
         ]
 
     def _state(self, row: int, robot: TurtleBotConnection, t: float, now: float, *, linked: bool) -> BodyState:
@@ -159,7 +159,7 @@ class TurtleBot3(Body):
 
     def command(self, setpoints: Sequence[Setpoint]) -> None:
         """See `Body.command`: v [m/s] and ω [rad/s]."""
-        for robot, (v, w, _, _) in zip(self._robots, setpoints, strict=True):
+        for robot, (v, w, _, _) in zip(self.robots, setpoints, strict=True):
             if isfinite(v) and isfinite(w):
                 robot.drive(v, w, self._read_at)
             robot.send_command(self._clock())
@@ -169,8 +169,7 @@ class TurtleBot3(Body):
 
     def land(self, rows: Sequence[int]) -> None:
         now = self._clock()
-        if self._sessions:
-            call_all(partial(self._robots[row].halt, now) for row in rows)
+        call_all(partial(self.robots[row].halt, now) for row in rows if self.robots[row].joined)
 
     def stop(self, rows: Sequence[int]) -> None:
         self.land(rows)
@@ -179,7 +178,7 @@ class TurtleBot3(Body):
         self._external[row].update(t, position, yaw)
 
     def inspect(self, row: int) -> Inspection:
-        return Inspection(volts=number(self._robots[row].volts))
+        return Inspection(volts=number(self.robots[row].volts))
 
     def close(self) -> None:
         """Stop all robots, wait until they stand (3 s at most), and leave the network."""
@@ -187,33 +186,38 @@ class TurtleBot3(Body):
             return
         until = self._clock() + STANDSTILL_S
         try:
-            self.stop(range(len(self._robots)))
+            self.stop(range(len(self.robots)))
             while (now := self._clock()) < until:
-                for robot in self._robots:
+                for robot in self.robots:
                     robot.receive_messages(robot.time, now)
-                call_all(partial(robot.send_command, now) for robot in self._robots)
-                if all(robot.settled for robot in self._robots):
+                call_all(partial(robot.send_command, now) for robot in self.robots)
+                if all(robot.settled for robot in self.robots):
                     break
                 time.sleep(POLL_S)
         finally:
             self._close()
 
-    def _stop_stale(self) -> None:
-        """Send zeros to robots with a stale last command, as `command` does while the loop runs."""
+    def _run(self) -> None:
         while not self._ending.wait(REPEAT_S):
-            now = self._clock()
-            for robot in self._robots:
-                try:
-                    if robot.commanded.stale(now):
-                        robot.send_command(now)
-                except Exception:  # noqa: BLE001 - of any kind: the others are stopped; the loop meets it as well
-                    continue
+            self.stop_stale()
+
+    def stop_stale(self) -> None:
+        """Send zeros to robots with a stale last command, as `command` does while the loop runs."""
+        now = self._clock()
+        for robot in self.robots:
+            try:
+                if robot.commanded.stale(now):
+                    robot.send_command(now)
+            except Exception:  # noqa: BLE001 - of any kind: the others are stopped; the loop meets it as well
+                continue
 
     def _close(self) -> None:
         self._ending.set()
         if self._thread is not None:
             self._thread.join()
             self._thread = None
+        for robot in self.robots:
+            robot.joined = False
         for session in self._sessions.values():
             leave(session, self)
         self._sessions.clear()

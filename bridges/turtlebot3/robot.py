@@ -109,6 +109,7 @@ class TurtleBotConnection:
         self.volts = nan  # of the battery [V]
         self.battery = nan  # charge, 0 to 1
         self.scan: RangeScan | None = None  # the newest
+        self.joined = False  # to its topics
         self.time = -inf  # time of measurement of the pose, on the clock of `Body.read` [s]
         self._clock = request.clock
         self._scan_age = StampAge()
@@ -127,6 +128,7 @@ class TurtleBotConnection:
         topic = ros2.absolute(where.namespace, self.settings.command_topic)
         watched = ros2.endpoints(where.style, "MS", topic, domain=where.domain)
         self._watch = pubsub.AliveWatch(participant.session, watched)
+        self.joined = True
 
     @property
     def device(self) -> str:

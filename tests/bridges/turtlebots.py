@@ -3,18 +3,16 @@
 import threading
 import time
 from dataclasses import replace
-from math import nan
+from unittest.mock import MagicMock
 
 import numpy as np
 
-from agents.body.interface import BodyRequest, Disturbance
 from agents.clock import Clock
-from agents.decision.position_control import PositionController
 from agents.kinds.turtlebot3 import TURTLEBOT3
-from agents.network.keys import Keys
-from agents.vectors import NO_SETPOINT
+from agents.protocols import ros2, turtlebot3
 from bridges.turtlebot3.body import TurtleBot3
-from tests.bridges.columns import Columns
+from tests import requests
+from tests.bridges.driver import Driver, toward
 from twins.devices.device import DeviceRequest, Faults
 from twins.devices.turtlebot3 import TurtleBot3Twin
 
@@ -22,6 +20,7 @@ STYLES = ["ros2dds", "rmw"]
 FAST = 4.0
 DT = 0.01
 BEGIN = time.monotonic()
+NOWHERE = "tcp/127.0.0.1:9"
 
 
 def clock():
@@ -35,53 +34,38 @@ class FastClock(Clock):
         return super().utc() + (FAST - 1.0) * (time.monotonic() - BEGIN)
 
 
-def request(endpoint, *, start=((0.0, 0.0),), yaw=None, device=None, external=False, addresses=None, disturbance=None):
+def request(endpoint, *addresses, start=((0.0, 0.0),), **more):
+    """Robots TB0, TB1, ... by a router."""
     rows = len(start)
-    return BodyRequest(
-        names=tuple(f"TB{row}" for row in range(rows)),
-        kinds=(TURTLEBOT3,) * rows,
-        addresses=addresses or ("turtlebot3-twin",) * rows,
-        start=tuple((float(x), float(y), 0.0) for x, y in start),
-        yaw=tuple(map(float, (0.0,) * rows if yaw is None else yaw)),
-        rate_hz=1.0 / DT,
-        seeds=(1,) * rows,
-        disturbance=(disturbance or Disturbance(),) * rows,
-        external=(external,) * rows,
-        device=(device or {},) * rows,
-        endpoints=(endpoint,),
-        keys=Keys("park"),
-        clock=FastClock(),
+    more = {"names": [f"TB{row}" for row in range(rows)], "seeds": [1] * rows, "clock": FastClock()} | more
+    return requests.request(
+        [TURTLEBOT3] * rows, addresses or "turtlebot3-twin", start=start, endpoints=(endpoint,), **more
     )
 
 
-class Stage:
+class Stage(Driver):
     """Twins that live on a thread, and what a robot process would do with their bridge."""
 
-    def __init__(self, twins_request, *, faults=None, body_request=None):
-        self.twin = TurtleBot3Twin(DeviceRequest(twins_request, faults or Faults()))
-        wanted = body_request or twins_request
-        self.body = TurtleBot3(replace(wanted, addresses=wanted.addresses if body_request else self.twin.addresses))
-        self.body._clock = clock
-        self.rows = len(twins_request.names)
+    def __init__(self, asked, device=None, **faults):
+        """`device` are the settings of the bridge, if others than those of the twins."""
+        self.twin = TurtleBot3Twin(DeviceRequest(asked, Faults(**faults)))
+        reached = replace(asked, addresses=self.twin.addresses)
+        if device is not None:
+            reached = replace(reached, device=(device,) * len(asked.names))
+        super().__init__(TurtleBot3(reached, clock), clock=clock, fast=FAST)
         self._end = threading.Event()
         self._thread = threading.Thread(target=self._live, name="turtlebot3-twin")
-        self.zero = clock()
-        self.t = 0.0
-        self.state = None
 
     def __enter__(self):
         self._thread.start()
+        self.body.open()
         return self
 
     def __exit__(self, *_):
         self.body.close()
-        self.kill()
-
-    def kill(self):
-        if not self._end.is_set():
-            self._end.set()
-            self._thread.join()
-            self.twin.close()
+        self._end.set()
+        self._thread.join()
+        self.twin.close()
 
     def _live(self):
         due = 0.0
@@ -89,39 +73,67 @@ class Stage:
             self.twin.advance(clock() - self.zero)
             due += DT
 
-    def run(self, seconds, decide=None):
-        """Reads and commands at 100 Hz of the fast clock for so long, or until `decide` returns True."""
-        end = self.t + seconds
-        pause = threading.Event()
-        while self.t < end:
-            pause.wait(max(0.0, (self.zero + self.t + DT - clock()) / FAST))
-            self.t = clock() - self.zero
-            self.state = Columns(self.body.read(self.t))
-            setpoints = [NO_SETPOINT] * self.rows
-            if decide is not None and (decided := decide(self.state)) is not None:
-                setpoints = [(v, w, 0.0, 0.0) for v, w in decided]
-            self.body.command(setpoints)
-        return self.state
+    def run(self, seconds, *setpoint, goals=None):
+        """Drive for some seconds: at v [m/s], ω [rad/s], toward goals, or not at all."""
+        self.decide = None
+        if goals is not None:
+            self.decide = toward(TURTLEBOT3, [(*goal, 0.0) for goal in goals])
+        elif setpoint:
+            v, w = (*setpoint, 0.0)[:2]
+            self.decide = lambda states: [(v, w, 0.0, 0.0)] * len(states)
+        return super().run(seconds)
 
-    def toward(self, goal):
-        """The position controller of the robot process."""
-        law = PositionController(TURTLEBOT3)
+    def note(self, seconds, *setpoint):
+        """What the first robot notes after some seconds."""
+        return self.run(seconds, *setpoint).note[0]
 
-        def decide(state):
-            for (x, y), position, yaw in zip(goal, state.position.tolist(), state.yaw.tolist(), strict=True):
-                yield law.setpoint((x, y, 0.0), nan, tuple(position), yaw)[:2]
-
-        return decide
-
-    def constant(self, v, w=0.0):
-        return lambda _: [(v, w)] * self.rows
+    def moved(self, seconds, *setpoint):
+        """How far the first robot really moves in so long [m]."""
+        before = self.place[0]
+        self.run(seconds, *setpoint)
+        return np.linalg.norm(self.place[0] - before)
 
     @property
     def place(self):
         return self.twin.truth()[0][:, :2].copy()
 
-    def moved(self, seconds, decide=None):
-        """How far the robots really move in so long [m]."""
-        before = self.place
-        self.run(seconds, decide)
-        return np.linalg.norm(self.place - before, axis=1)
+
+class FakeRos:
+    """Participant of a ROS that is not there: `odometry` waits to be received, `sent` are the speeds [m/s]."""
+
+    session = MagicMock()
+    types = ros2.types("humble")
+
+    def __init__(self, robot, error=None):
+        self.odometry, self.sent, self._error = [], [], error
+        robot.join(self)
+
+    def node(self, *_):
+        return self
+
+    def subscriber(self, topic, *_, **__):
+        waiting = self.odometry if topic == turtlebot3.ODOMETRY else []
+        return MagicMock(received=lambda: [waiting.pop() for _ in list(waiting)], newest=lambda: None)
+
+    def publisher(self, *_):
+        return self
+
+    def put(self, message):
+        if self._error is not None:
+            raise self._error
+        self.sent.append(message.linear.x)
+
+
+def odometry(types, x, y=0.0, stamp=1.0):
+    """Odometry of a robot that stands at a place [m]."""
+    zeros = np.zeros(36)
+    return types.make(
+        ros2.ODOMETRY,
+        header=types.header(stamp, ""),
+        child_frame_id="",
+        pose=types.make("geometry_msgs/msg/PoseWithCovariance", pose=types.pose(x, y, 0.0, 0.0), covariance=zeros),
+        twist=types.make("geometry_msgs/msg/TwistWithCovariance", twist=types.twist(ZERO, ZERO), covariance=zeros),
+    )
+
+
+ZERO = (0.0, 0.0, 0.0)

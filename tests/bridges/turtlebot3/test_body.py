@@ -21,12 +21,9 @@ from agents.protocols import ros2, turtlebot3
 from bridges.turtlebot3.body import TurtleBot3
 from bridges.turtlebot3.odometry import StampAge
 from bridges.turtlebot3.robot import ranges
-from tests.bridges.turtlebots import STYLES, FastClock, Stage, request
+from tests.bridges.turtlebots import NOWHERE, STYLES, FastClock, Stage, odometry, request
 from tests.waiting import until
 from twins.devices.device import Faults
-
-NOWHERE = "tcp/127.0.0.1:9"
-
 
 # ---------------------------------------------------------------------- without a network
 
@@ -40,9 +37,8 @@ def test_the_robot_does_what_the_bridge_meant(speed):
 
 def test_every_whole_speed_survives_the_truncation():
     for limit in (0.22, 2.84):
-        for steps in range(round(100 * limit) + 1):
-            for sign in (1.0, -1.0):
-                assert turtlebot3.cut(turtlebot3.whole(sign * steps / 100.0, limit)) == sign * steps / 100.0
+        for steps in range(-round(100 * limit), round(100 * limit) + 1):
+            assert turtlebot3.cut(turtlebot3.whole(steps / 100.0, limit)) == steps / 100.0
     assert turtlebot3.cut(0.29) == 0.28  # why a speed is not sent as it is
 
 
@@ -76,12 +72,12 @@ def test_charge(voltage, percentage, charge):
 )
 def test_wrong_addresses_and_settings_are_named(address, device, message):
     with pytest.raises(BodyError, match=message):
-        TurtleBot3(request(NOWHERE, addresses=(address,), device=device))
+        TurtleBot3(request(NOWHERE, address, device=device))
 
 
 def test_drives_turtlebots_only():
     with pytest.raises(BodyError, match="TB0 is a khepera4"):
-        TurtleBot3(replace(request(NOWHERE, addresses=("ros2dds://",)), kinds=(KHEPERA4,)))
+        TurtleBot3(replace(request(NOWHERE, "ros2dds://"), kinds=(KHEPERA4,)))
 
 
 def test_addresses():
@@ -94,40 +90,29 @@ def test_addresses():
     assert turtlebot3.command_type("jazzy", stamped=False) == ros2.TWIST
 
 
-def test_rays_that_saw_nothing_are_nan():
-    types = ros2.types("jazzy")
-    distance = np.array([1.0, np.inf, 0.0, 0.11, 3.5, 3.6, np.nan], np.float32)
-    scan = types.make(
-        ros2.LASER_SCAN,
-        header=types.header(1.0, "base_scan"),
-        angle_min=-0.5,
-        angle_max=0.1,
-        angle_increment=0.1,
-        time_increment=0.0,
-        scan_time=0.2,
-        range_min=0.12,
-        range_max=3.5,
-        ranges=distance,
-        intensities=distance,
-    )
-    found = ranges(scan, 7.0)
-    assert found.time == 7.0
-    np.testing.assert_allclose(found.bearing, np.linspace(-0.5, 0.1, 7), atol=1e-9)
-    np.testing.assert_allclose(found.distance, [1.0, np.nan, np.nan, np.nan, 3.5, np.nan, np.nan])
+NAN, INF = np.nan, np.inf
 
 
 @pytest.mark.parametrize(
-    ("first", "increment", "farthest", "seen"),
-    [(-0.5, 0.1, np.inf, 1.0), (-0.5, np.nan, 3.5, np.nan), (np.inf, 0.1, 3.5, np.nan), (-0.5, 0.1, np.nan, np.nan)],
+    ("first", "increment", "farthest", "distance", "seen"),
+    [
+        (-0.5, 0.1, 3.5, [1.0, INF, 0.0, 0.11, 3.5, 3.6, NAN], [1.0, NAN, NAN, NAN, 3.5, NAN, NAN]),
+        (-0.5, 0.1, INF, [0.0, 1.0, INF, -INF], [NAN, 1.0, NAN, NAN]),
+        (-0.5, NAN, 3.5, [0.0, 1.0, INF, -INF], [NAN] * 4),
+        (INF, 0.1, 3.5, [0.0, 1.0, INF, -INF], [NAN] * 4),
+        (-0.5, 0.1, NAN, [0.0, 1.0, INF, -INF], [NAN] * 4),
+    ],
 )
-def test_rays_are_finite_or_nothing(first, increment, farthest, seen):
+def test_rays_are_finite_or_nothing(first, increment, farthest, distance, seen):
     scan = SimpleNamespace(
-        angle_min=first, angle_increment=increment, range_min=0.0, range_max=farthest,
-        ranges=np.array([0.0, 1.0, np.inf, -np.inf], np.float32),
+        angle_min=first, angle_increment=increment, range_min=0.12, range_max=farthest,
+        ranges=np.array(distance, np.float32),
     )  # fmt: skip
     found = ranges(scan, 7.0)
+    assert found.time == 7.0
     assert np.isfinite(found.bearing).all()
-    np.testing.assert_array_equal(found.distance, [np.nan, seen, np.nan, np.nan])
+    assert first != -0.5 or increment != 0.1 or found.bearing == pytest.approx(-0.5 + 0.1 * np.arange(len(distance)))
+    np.testing.assert_array_equal(found.distance, seen)
 
 
 @pytest.mark.parametrize(
@@ -158,12 +143,11 @@ def test_drives_to_goals(hub, style, distro):
         assert stage.twin.addresses[0] == (
             f"ros2dds://TB0?distro={distro}" if style == "ros2dds" else f"rmw://TB0?domain=0&distro={distro}"
         )
-        stage.body.open()
         state = stage.run(0.1)
         np.testing.assert_allclose(state.position[:, :2], start, atol=1e-6)
         np.testing.assert_allclose(state.yaw, (1.0, -2.0), atol=1e-6)
         assert stage.twin.commands_received == [0, 0]  # rows of NaN are not sent
-        state = stage.run(9.0, stage.toward(goal))
+        state = stage.run(9.0, goals=goal.tolist())
         assert np.linalg.norm(stage.place - goal, axis=1).max() < 0.01
         assert np.linalg.norm(state.position[:, :2] - stage.place, axis=1).max() < 0.005
         assert (state.note, state.flying.any()) == (("", ""), False)
@@ -175,36 +159,20 @@ def test_drives_to_goals(hub, style, distro):
 
 
 @pytest.mark.system
-def test_an_empty_namespace_two_domains_and_another_router(hub):
-    asked = request(hub.endpoint, device={"style": "rmw", "domain": 30, "endpoint": hub.endpoint})
-    asked = replace(asked, endpoints=(NOWHERE,))
+def test_two_domains_and_another_router(hub):
+    asked = request(NOWHERE, device={"style": "rmw", "domain": 30, "endpoint": hub.endpoint})
     with Stage(asked) as stage:
         assert stage.twin.addresses == ("rmw://TB0?domain=30&distro=jazzy",)
-        stage.body.open()
-        assert stage.moved(2.0, stage.constant(0.2))[0] > 0.3
-    types = get_typestore(Stores.ROS2_HUMBLE)
+        assert stage.moved(2.0, 0.2) > 0.3
+
+
+@pytest.mark.system
+def test_an_empty_namespace(hub):
+    types = ros2.types("humble")
+    raw = types.encode(odometry(types, 4.0, 5.0), ros2.ODOMETRY)
     with open_session([hub.endpoint], name="robot") as session:
         out = session.declare_publisher("odom")
-        kinds = types.types
-        zero = kinds["geometry_msgs/msg/Vector3"](x=0.0, y=0.0, z=0.0)
-        message = kinds["nav_msgs/msg/Odometry"](
-            header=kinds["std_msgs/msg/Header"](
-                stamp=kinds["builtin_interfaces/msg/Time"](sec=1, nanosec=2), frame_id=""
-            ),
-            child_frame_id="",
-            pose=kinds["geometry_msgs/msg/PoseWithCovariance"](
-                pose=kinds["geometry_msgs/msg/Pose"](
-                    position=kinds["geometry_msgs/msg/Point"](x=4.0, y=5.0, z=0.0),
-                    orientation=kinds["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0),
-                ),
-                covariance=np.zeros(36),
-            ),
-            twist=kinds["geometry_msgs/msg/TwistWithCovariance"](
-                twist=kinds["geometry_msgs/msg/Twist"](linear=zero, angular=zero), covariance=np.zeros(36)
-            ),
-        )
-        raw = bytes(types.serialize_cdr(message, "nav_msgs/msg/Odometry"))
-        body = TurtleBot3(request(hub.endpoint, addresses=("ros2dds://",), device={"origin": "boot"}))
+        body = TurtleBot3(request(hub.endpoint, "ros2dds://", device={"origin": "boot"}))
         heard = session.declare_subscriber("cmd_vel", RingChannel(4))
         opening = threading.Thread(target=body.open)
         opening.start()
@@ -223,28 +191,25 @@ def test_an_empty_namespace_two_domains_and_another_router(hub):
 def test_what_it_sends_is_what_rmw_zenoh_sends(hub, eventually):
     asked = request(hub.endpoint, device={"style": "rmw"})
     code = "RIHS01_5f0fcd4f81d5d06ad9b4c4c63e3ea51b82d6ae4d0558f1d475229b1121db6f64"
-    with open_session([hub.endpoint], name="ros") as session, Stage(asked) as stage:
+    with open_session([hub.endpoint], name="ros") as session:
         tokens = session.liveliness().declare_subscriber("@ros2_lv/0/**", RingChannel(64), history=True)
         heard = session.declare_subscriber(
             f"0/TB0/cmd_vel/geometry_msgs::msg::dds_::TwistStamped_/{code}", RingChannel(64)
         )
-        stage.body.open()
-        stage.run(1.0, stage.constant(0.1, -0.5))
-        samples = []
-        eventually(lambda: (s := heard.try_recv()) is None or samples.append(s))
-        announced = []
-        eventually(lambda: (s := tokens.try_recv()) is None or announced.append(str(s.key_expr)))
+        with Stage(asked) as stage:
+            stage.run(1.0, 0.1, -0.5)
+            samples, announced = [], []
+            eventually(lambda: (s := heard.try_recv()) is None or samples.append(s))
+            eventually(lambda: (s := tokens.try_recv()) is None or announced.append(str(s.key_expr)))
         mine = [token for token in announced if "/MP/" in token and "/zenpark_TB0/%TB0%cmd_vel/" in token]
         assert len(mine) == 1
         gid = xxhash.xxh3_128_intdigest(mine[0].encode()).to_bytes(16, "little")
         attached = [struct.unpack("<qqB16s", sample.attachment.to_bytes()) for sample in samples]
         assert [sequence for sequence, *_ in attached] == list(range(1, len(samples) + 1))
         assert {(size, source) for _, _, size, source in attached} == {(16, gid)}
-        twist = get_typestore(Stores.ROS2_JAZZY).deserialize_cdr(
-            samples[0].payload.to_bytes(), "geometry_msgs/msg/TwistStamped"
-        )
-        assert int(twist.twist.linear.x * 100) == 10
-        assert int(twist.twist.angular.z * 100) == -50
+        raw, store = samples[0].payload.to_bytes(), get_typestore(Stores.ROS2_JAZZY)
+        twist = store.deserialize_cdr(raw, "geometry_msgs/msg/TwistStamped")
+        assert (int(twist.twist.linear.x * 100), int(twist.twist.angular.z * 100)) == (10, -50)
         assert abs(twist.header.stamp.sec - FastClock().utc()) < 10
         assert sum(token.endswith("/NN/%/%TB0/zenpark_TB0") for token in announced) == 1
         assert any("/MS/" in token and "%TB0%odom" in token for token in announced)
@@ -253,43 +218,32 @@ def test_what_it_sends_is_what_rmw_zenoh_sends(hub, eventually):
 @pytest.mark.system
 def test_speeds_are_limited_and_commands_repeated(hub):
     with Stage(request(hub.endpoint)) as stage:
-        stage.body.open()
-        stage.run(1.0, stage.constant(9.0))
-        v = stage.run(0.5, stage.constant(9.0)).velocity[0, 0]
-        assert v == pytest.approx(0.22, abs=1e-6)
+        assert stage.run(1.5, 9.0).velocity[0, 0] == pytest.approx(0.22, abs=1e-6)
         before = stage.twin.commands_received[0]
-        stage.run(2.0, stage.constant(9.0))
+        stage.run(2.0, 9.0)
         assert 20 <= stage.twin.commands_received[0] - before <= 60  # 20 Hz
 
 
 @pytest.mark.system
 def test_nobody_commands_and_it_stands(hub):
+    """Without setpoints, which the robot itself would not notice; and without a loop that reads and commands."""
     with Stage(request(hub.endpoint)) as stage:
-        stage.body.open()
-        assert stage.moved(1.0, stage.constant(0.2))[0] > 0.1
-        stage.run(1.0)  # rows of NaN: the robot itself would go on for ever
-        assert stage.moved(0.5)[0] == 0.0
-
-
-@pytest.mark.system
-def test_loop_that_hangs_leaves_it_standing(hub):
-    """Nothing is read nor commanded any more, while the robot's router answers all the time."""
-    with Stage(request(hub.endpoint)) as stage:
-        stage.body.open()
-        stage.run(1.0, stage.constant(0.2))
+        assert stage.moved(1.0, 0.2) > 0.1
+        stage.run(1.0)
+        assert stage.moved(0.5) == 0.0
+        stage.run(1.0, 0.2)
         before = stage.place
         until(lambda: stage.twin.robots[0].twist == (0.0, 0.0), "it stands")
         assert np.linalg.norm(stage.place - before) < 0.5
-        until(lambda: stage.moved(0.5, stage.constant(0.2))[0] > 0.05, "and drives on when it is told to")
+        until(lambda: stage.moved(0.5, 0.2) > 0.05, "and drives on when it is told to")
 
 
 @pytest.mark.system
 def test_odometry_held_back_is_old(hub):
     with Stage(request(hub.endpoint)) as stage:
-        stage.body.open()
-        stage.run(1.0, stage.constant(0.2))
+        stage.run(1.0, 0.2)
         stage.twin.link.faults = Faults(delay_s=2.0)
-        until(lambda: "old by its stamps" in stage.run(0.1, stage.constant(0.2)).note[0], "it is noticed")
+        until(lambda: "old by its stamps" in stage.note(0.1, 0.2), "it is noticed")
         assert stage.t - stage.state.time[0] == pytest.approx(2.0, abs=0.5)
 
 
@@ -299,42 +253,36 @@ def test_odometry_held_back_is_old(hub):
 )
 def test_ends_standing(hub, how):
     with Stage(request(hub.endpoint)) as stage:
-        stage.body.open()
-        stage.run(1.0, stage.constant(0.2, 1.0))
-        rows = [0]
+        stage.run(1.0, 0.2, 1.0)
         if how == "close":
             stage.body.close()
             threading.Event().wait(0.1)  # the twin lives on: it rolls out
             before = stage.place
-            stage.body.stop(rows)  # nothing left to stop, and nothing is raised
+            stage.body.stop([0])  # nothing left to stop, and nothing is raised
             threading.Event().wait(0.1)
             np.testing.assert_array_equal(stage.place, before)
             return
-        getattr(stage.body, how)(rows)
-        until(lambda: stage.moved(0.5)[0] == 0.0, "it stands")
-        stage.body.takeoff(rows, [0.5])
-        until(lambda: stage.moved(0.5, stage.constant(0.2))[0] > 0.05, "and drives on when it is told to")
+        getattr(stage.body, how)([0])
+        until(lambda: stage.moved(0.5) == 0.0, "it stands")
+        stage.body.takeoff([0], [0.5])
+        until(lambda: stage.moved(0.5, 0.2) > 0.05, "and drives on when it is told to")
 
 
 @pytest.mark.system
 def test_external_positions_with_the_speed_of_odometry(hub):
-    asked = request(hub.endpoint, start=((2.0, 2.0),), external=True)
-    with Stage(asked, faults=Faults(silent_from_s=4.0)) as stage:
-        stage.body.open()
+    with Stage(request(hub.endpoint, start=((2.0, 2.0),), external=True), silent_from_s=4.0) as stage:
+
+        def truth():
+            (x, y), yaw = stage.place[0], stage.twin.truth()[1][0]  # the arena is turned against the start
+            return [(-y, x, 0.1)], [yaw + pi / 2]
+
         assert np.isnan(stage.run(0.1).position[0, :2]).all()
-
-        def located(state):
-            (x, y), yaw = stage.place[0], stage.twin.truth()[1][0] + pi / 2  # the arena is turned against the start
-            stage.body.locate(0, stage.t, (-y, x, 0.1), yaw)
-            return stage.constant(0.2)(state)
-
-        state = stage.run(2.0, located)
-        x, y = stage.place[0]
-        np.testing.assert_allclose(state.position[0], [-y, x, 0.1], atol=0.01)
+        stage.truth = truth
+        state = stage.run(2.0, 0.2)
+        np.testing.assert_allclose(state.position[0], truth()[0][0], atol=0.01)
         np.testing.assert_allclose(state.velocity[0], [0.0, 0.2, 0.0], atol=1e-6)
         assert state.yaw[0] == pytest.approx(pi / 2)
-        # seen from outside, but it does not answer
-        until(lambda: "odometry silent" in stage.run(0.1, located).note[0], "its silence is noticed")
+        until(lambda: "odometry silent" in stage.note(0.1, 0.2), "seen from outside, but it does not answer")
         assert stage.t - stage.state.time[0] > 0.5
 
 
@@ -342,13 +290,12 @@ def test_external_positions_with_the_speed_of_odometry(hub):
 def test_robot_stands_on_start_pose_whatever_its_odometry(hub):
     asked = request(hub.endpoint, start=((1.0, 1.0),), yaw=(pi / 2,))
     with Stage(asked) as stage:
-        stage.body.open()
-        stage.run(2.5, stage.constant(0.2))
+        stage.run(2.5, 0.2)
         stage.run(1.0)
         stage.body.close()
         asked = replace(asked, addresses=stage.twin.addresses)
-        here, boot = (TurtleBot3(replace(asked, device=({"origin": origin},))) for origin in ("open", "boot"))
-        for body, place in ((here, (1.0, 1.0)), (boot, stage.place[0])):
+        for origin, place in (("open", (1.0, 1.0)), ("boot", stage.place[0])):
+            body = TurtleBot3(replace(asked, device=({"origin": origin},)))
             body.open()
             (state,) = body.read(0.0)
             body.close()

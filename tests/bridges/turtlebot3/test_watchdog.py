@@ -9,7 +9,6 @@ import signal
 import socket
 import subprocess
 import sys
-import types
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace as Thing
@@ -20,15 +19,11 @@ from bridges.turtlebot3 import watchdog
 from bridges.turtlebot3.watchdog import TYPES, StopTimer, WatchdogNode, moving, type_of_robot
 from experiments.real_time.hosts import installation
 from experiments.real_time.hosts.hosts import HostError
-from tests.waiting import until
-
-
-def vector(x: float = 0.0) -> Thing:
-    return Thing(x=x, y=0.0, z=0.0)
+from tests.waiting import ManualClock, until
 
 
 def twist(v: float = 0.0, w: float = 0.0) -> Thing:
-    return Thing(linear=vector(v), angular=Thing(x=0.0, y=0.0, z=w))
+    return Thing(linear=Thing(x=v, y=0.0, z=0.0), angular=Thing(x=0.0, y=0.0, z=w))
 
 
 def zeros(dog: StopTimer, begin: float, end: float) -> list[float]:
@@ -76,27 +71,18 @@ def test_zero_is_what_does_not_move(v: float, w: float, moves: bool) -> None:
     assert moving(twist(v, w)) == moves
 
 
-class FakeRos:
-    """As much of rclpy as the node uses."""
+class FakeNode:
+    """As much of rclpy and its nodes as the watchdog uses."""
 
     def __init__(self) -> None:
         self.sent: list[Thing] = []
-        self.hear: Callable[[Thing], None] = lambda _: None
-        self.check: Callable[[], None] = lambda: None
         self.receivers: list[Thing] = []
-
-    def create_node(self, name: str) -> FakeRos:
-        self.name = name
-        return self
-
-    def get_name(self) -> str:
-        return self.name
-
-    def get_subscriptions_info_by_topic(self, _topic: str) -> list[Thing]:
-        return self.receivers
-
-    def create_publisher(self, _kind: object, _topic: str, _depth: int) -> Thing:
-        return Thing(publish=self.sent.append)
+        self.create_node = lambda _name: self
+        self.get_name = lambda: "cmd_vel_watchdog"
+        self.get_subscriptions_info_by_topic = lambda _topic: self.receivers
+        self.create_publisher = lambda *_: Thing(publish=self.sent.append)
+        self.get_logger = lambda: Thing(info=lambda _: None, warning=lambda _: None)
+        self.get_clock = lambda: Thing(now=lambda: Thing(to_msg=lambda: "now"))
 
     def create_subscription(self, _kind: object, _topic: str, hear: Callable[[Thing], None], _depth: int) -> None:
         self.hear = hear
@@ -104,64 +90,68 @@ class FakeRos:
     def create_timer(self, _period: float, check: Callable[[], None]) -> None:
         self.check = check
 
-    def get_logger(self) -> Thing:
-        return Thing(info=lambda _: None, warning=lambda _: None)
-
-    def get_clock(self) -> Thing:
-        return Thing(now=lambda: Thing(to_msg=lambda: "now"))
-
 
 @pytest.mark.parametrize("kind", ["twist", "stamped"])
 def test_node_sends_zeros_of_the_robots_type(monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
-    messages = types.ModuleType("geometry_msgs.msg")
-    messages.Twist = twist  # type: ignore[attr-defined]
-    messages.TwistStamped = lambda: Thing(header=Thing(stamp=None), twist=twist())  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "geometry_msgs", types.ModuleType("geometry_msgs"))
+    stamped = lambda v=0.0: Thing(header=Thing(stamp=None), twist=twist(v))  # noqa: E731
+    messages = Thing(Twist=twist, TwistStamped=stamped)
+    monkeypatch.setitem(sys.modules, "geometry_msgs", messages)
     monkeypatch.setitem(sys.modules, "geometry_msgs.msg", messages)
-    ros, clock = FakeRos(), [100.0]
-    monkeypatch.setattr(watchdog.time, "monotonic", lambda: clock[0])
+    ros, clock = FakeNode(), ManualClock(100.0)
+    monkeypatch.setattr(watchdog, "time", clock)
     WatchdogNode(ros, "cmd_vel", TYPES[kind], 0.5)
-    ros.hear(twist(0.1) if kind == "twist" else Thing(twist=twist(0.1)))
+    ros.hear(twist(0.1) if kind == "twist" else stamped(0.1))
     for _ in range(50):
-        clock[0] += 0.02
+        clock.sleep(0.02)
         ros.check()
     assert 8 <= len(ros.sent) <= 11
     assert ros.sent[0] == (twist() if kind == "twist" else Thing(header=Thing(stamp="now"), twist=twist()))
 
 
 def test_type_is_the_robots_not_the_watchdogs() -> None:
-    ros = FakeRos().create_node("cmd_vel_watchdog")
+    ros = FakeNode()
     assert type_of_robot(ros, "cmd_vel") == ""
-    ros.receivers = [
-        Thing(node_name="cmd_vel_watchdog", topic_type=TYPES["twist"]),
-        Thing(node_name="turtlebot3_node", topic_type=TYPES["stamped"]),
-    ]
+    names = {"cmd_vel_watchdog": "twist", "turtlebot3_node": "stamped"}
+    ros.receivers = [Thing(node_name=name, topic_type=TYPES[kind]) for name, kind in names.items()]
     assert type_of_robot(ros, "cmd_vel") == TYPES["stamped"]
 
 
 # ---------------------------------------------------------------------- over ssh
 
 SSHD = shutil.which("sshd") or "/usr/sbin/sshd"
-ROS = '''
-"""A ROS that does nothing, for the watchdog on a robot that is not there."""
+ROS = {
+    "rclpy/__init__.py": '''"""A ROS that does nothing, for the watchdog on a robot that is not there."""
 import sys, time
 class _Node:
-    def __init__(self, name): self.name = name
-    def get_name(self): return self.name
+    def get_name(self): return "watchdog"
     def destroy_node(self): pass
     def get_subscriptions_info_by_topic(self, topic):
         return [type("Info", (), {"node_name": "turtlebot3_node", "topic_type": "geometry_msgs/msg/TwistStamped"})]
     def create_publisher(self, *a): return type("Publisher", (), {"publish": staticmethod(lambda m: None)})
     def create_subscription(self, *a): pass
-    def create_timer(self, *a): pass
+    create_timer = create_subscription
     def get_logger(self): return type("Log", (), {"info": staticmethod(lambda t: print(t, sys.argv, flush=True))})
 def init(args=None, signal_handler_options=None): pass
-def create_node(name): return _Node(name)
+def create_node(name): return _Node()
 def spin_once(node, timeout_sec=0): pass
 def spin(node): time.sleep(600)
 def ok(): return False
 def shutdown(): pass
-'''
+''',
+    "rclpy/utilities.py": "def remove_ros_args(args): return args[:args.index('--ros-args')]\n",
+    "rclpy/signals.py": "class SignalHandlerOptions: NO = None\n",
+    "geometry_msgs/__init__.py": "",
+    "geometry_msgs/msg.py": "class Twist: pass\nclass TwistStamped: pass\n",
+}
+
+
+def written(path: Path, text: str, *, runs: bool = False) -> Path:
+    """A file in a folder that may be new."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+    if runs:
+        path.chmod(0o755)
+    return path
 
 
 @pytest.fixture
@@ -170,39 +160,32 @@ def robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     if not Path(SSHD).exists() or shutil.which("ssh-keygen") is None:
         pytest.skip("needs openssh-server")
     home, site, bin_ = tmp_path / "home", tmp_path / "site", tmp_path / "bin"
-    for folder in (home, site / "rclpy", site / "geometry_msgs", bin_):
-        folder.mkdir(parents=True)
-    (site / "rclpy" / "__init__.py").write_text(ROS)
-    (site / "rclpy" / "utilities.py").write_text("def remove_ros_args(args): return args[:args.index('--ros-args')]\n")
-    (site / "rclpy" / "signals.py").write_text("class SignalHandlerOptions: NO = None\n")
-    (site / "geometry_msgs" / "__init__.py").touch()
-    (site / "geometry_msgs" / "msg.py").write_text("class Twist: pass\nclass TwistStamped: pass\n")
-    (site / "setup.sh").write_text(f"export PYTHONPATH={site}\n")
-    (bin_ / "crontab").write_text(f'#!/bin/sh\n[ "$1" = -l ] && exec cat {home}/crontab\nexec cat > {home}/crontab\n')
-    (bin_ / "crontab").chmod(0o755)
+    home.mkdir()
+    for name, text in ROS.items():
+        written(site / name, text)
+    written(site / "setup.sh", f"export PYTHONPATH={site}\n")
+    table = f'#!/bin/sh\n[ "$1" = -l ] && exec cat {home}/crontab\nexec cat > {home}/crontab\n'
+    written(bin_ / "crontab", table, runs=True)
     for name in ("host_key", "key"):
         subprocess.run(["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", str(tmp_path / name)], check=True)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    python = Path(sys.executable).parent
-    config = tmp_path / "sshd_config"
-    config.write_text(
+    config = written(
+        tmp_path / "sshd_config",
         f"Port {port}\nListenAddress 127.0.0.1\nHostKey {tmp_path}/host_key\nAuthorizedKeysFile {tmp_path}/key.pub\n"
         f"PidFile {tmp_path}/sshd.pid\nPasswordAuthentication no\nUsePAM no\nStrictModes no\n"
-        f"SetEnv HOME={home} PATH={bin_}:{python}:/usr/bin:/bin ROS_SETUP={site}/setup.sh\n"
+        f"SetEnv HOME={home} PATH={bin_}:{Path(sys.executable).parent}:/usr/bin:/bin ROS_SETUP={site}/setup.sh\n",
     )
     Path("/run/sshd").mkdir(exist_ok=True)
     with (tmp_path / "sshd.log").open("wb") as log:
         sshd = subprocess.Popen([SSHD, "-D", "-e", "-f", str(config)], stdin=subprocess.DEVNULL, stdout=log, stderr=log)
-    (tmp_path / "ssh_config").write_text(
+    ours = written(
+        tmp_path / "ssh_config",
         f"Host robot\n HostName 127.0.0.1\n Port {port}\n User {getpass.getuser()}\n IdentityFile {tmp_path}/key\n"
-        f" StrictHostKeyChecking no\n UserKnownHostsFile {tmp_path}/known\n"
+        f" StrictHostKeyChecking no\n UserKnownHostsFile {tmp_path}/known\n",
     )
-    ssh = tmp_path / "ours" / "ssh"
-    ssh.parent.mkdir()
-    ssh.write_text(f'#!/bin/sh\nexec {shutil.which("ssh")} -F {tmp_path}/ssh_config "$@"\n')
-    ssh.chmod(0o755)
+    ssh = written(tmp_path / "ours" / "ssh", f'#!/bin/sh\nexec {shutil.which("ssh")} -F {ours} "$@"\n', runs=True)
     monkeypatch.setenv("PATH", f"{ssh.parent}:{os.environ['PATH']}")
     until((tmp_path / "sshd.pid").exists, "its sshd runs")
     yield home
