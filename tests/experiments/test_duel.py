@@ -6,7 +6,7 @@ import pytest
 
 from experiments.check.check import check
 from experiments.file.document import load, read
-from experiments.report import page
+from experiments.report.page import number
 from experiments.run import simulate
 from tools.commands import run as commands
 
@@ -44,9 +44,7 @@ def file(tmp_path):
 
 
 def test_it_runs_and_reports_without_links(file, tmp_path, capsys):
-    assert commands.run(
-        str(file), virtual=True, out=str(tmp_path / "run")
-    ) == 1  # fmt: skip
+    assert commands.run(str(file), virtual=True, out=str(tmp_path / "run")) == 1
     printed = capsys.readouterr()
     said = printed.out
     assert "TB01 at 7.5 s: it does not obey commands to move" in printed.err + said  # they push each other
@@ -76,5 +74,4 @@ def test_unlinked_robot_goes_its_way_beside_a_formation(tmp_path):
 
 
 def test_rounding_is_no_result():
-    assert page.number(-2.8e-15) == "0"
-    assert page.number(2.0e-4) == "2.0e-04"
+    assert [number(value) for value in (-2.8e-15, 2.0e-4)] == ["0", "2.0e-04"]

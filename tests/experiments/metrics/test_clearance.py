@@ -50,24 +50,22 @@ def test_closest_approach_of_surfaces_has_time_and_names():
 
 def test_each_contact_is_one_collision_with_greatest_depth():
     found = Clearance.of_trace(pair(along_x(0.14 + 0.05 * np.cos(2.0 * np.pi * T))))
-    assert [each.time_s for each in found.overlaps] == [pytest.approx(at + 0.26) for at in range(4)]
-    for each in found.overlaps:
-        assert (each.first, each.second, each.impulse) == ("A", "B", None)
-        assert each.overlap == pytest.approx(0.05, abs=1e-5)
+    depth = pytest.approx(0.05, abs=1e-5)
+    assert found.overlaps == tuple(Collision(pytest.approx(k + 0.26), "A", "B", None, depth) for k in range(4))
     apart = Clearance.of_trace(pair(along_x(np.full_like(T, 2.0 * R))))
     assert apart.overlaps == ()  # they stand side by side
 
 
 def test_drone_over_ground_robot_is_its_height_away():
-    above = pair(along_x(np.full(50, 0.02), 0.5), ("turtlebot3", "crazyflie"))
-    gap = 0.5 - TURTLEBOT3.height
-    assert Clearance.of_trace(above).robots[0].gap == pytest.approx(gap)
-    assert Clearance.of_trace(above).overlaps == ()
-    beside = pair(along_x(np.full(50, 0.5), 0.5), ("turtlebot3", "crazyflie"))
+    kinds, gap = ("turtlebot3", "crazyflie"), 0.5 - TURTLEBOT3.height
     level = 0.5 - CRAZYFLIE.radius - TURTLEBOT3.radius
-    assert Clearance.of_trace(beside).robots[0].gap == pytest.approx(math.hypot(level, gap))
-    into = pair(along_x(np.full(50, 0.02), TURTLEBOT3.height - 0.5 * CRAZYFLIE.height), ("turtlebot3", "crazyflie"))
-    assert Clearance.of_trace(into).overlaps == (Collision(0.0, "A", "B", None, pytest.approx(0.5 * CRAZYFLIE.height)),)
+    above, beside, into = (
+        Clearance.of_trace(pair(along_x(np.full(50, x), z), kinds))
+        for x, z in ((0.02, 0.5), (0.5, 0.5), (0.02, TURTLEBOT3.height - 0.5 * CRAZYFLIE.height))
+    )
+    assert (above.robots[0].gap, above.overlaps) == (pytest.approx(gap), ())
+    assert beside.robots[0].gap == pytest.approx(math.hypot(level, gap))
+    assert into.overlaps == (Collision(0.0, "A", "B", None, pytest.approx(0.5 * CRAZYFLIE.height)),)
 
 
 def obstacles(**named):
@@ -129,11 +127,9 @@ def test_what_is_unknown_touches_nothing():
 
 
 def with_contacts(known, *contacts, clock="virtual", **bodies):
-    robots = {
-        name: msgspec.structs.replace(robot, body=bodies.get(name, "twin"))
-        for name, robot in known.plan.experiment.robots.items()
-    }
-    return dataclasses.replace(known, plan=known.plan.changed(robots=robots), contacts=contacts, clock=clock)
+    robots = known.plan.experiment.robots
+    made = {name: msgspec.structs.replace(robots[name], body=bodies.get(name, "twin")) for name in robots}
+    return dataclasses.replace(known, plan=known.plan.changed(robots=made), contacts=contacts, clock=clock)
 
 
 def test_what_an_engine_saw_stands_for_what_overlaps():

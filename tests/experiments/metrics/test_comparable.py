@@ -23,16 +23,16 @@ def trace():
     return dataclasses.replace(crowd(3, "periodic", duration=4.0), clock="real")
 
 
-def _with(trace, **columns):
+def changed(trace, **columns):
     arrays = {name: np.full(3, value) for name, value in columns.items()}
     return measure(dataclasses.replace(trace, **arrays))
 
 
-def _marks(*cases):
+def marks(*cases):
     return {each.mark for each in findings(cases)}
 
 
-def _texts(*cases):
+def texts(*cases):
     return " ".join(each.text for each in findings(cases))
 
 
@@ -47,7 +47,7 @@ def _texts(*cases):
     ],
 )
 def test_what_spoils_a_run(trace, columns, reason):
-    spoiled = _with(trace, **columns).spoiled
+    spoiled = changed(trace, **columns).spoiled
     assert reason in spoiled[0] if reason else not spoiled
 
 
@@ -80,13 +80,13 @@ def test_losses_that_no_recorder_saw_spoil(trace):
 
 
 def test_spoiled_runs_have_neither_ratio_nor_praise(trace, tmp_path):
-    good, bad = measure(trace), _with(trace, missed_deadlines=50)
+    good, bad = measure(trace), changed(trace, missed_deadlines=50)
     other = msgspec.structs.replace(bad, case="event")
-    assert "good" in _marks(good, msgspec.structs.replace(good, case="event"))
-    assert "good" not in _marks(good, other)
+    assert "good" in marks(good, msgspec.structs.replace(good, case="event"))
+    assert "good" not in marks(good, other)
     for pair in ((good, other), (other, good)):
         assert ratios([pair[1]], [pair[0]], "f_hz") == [None]
-        assert "Its errors relative" not in _texts(*pair)
+        assert "Its errors relative" not in texts(*pair)
     document = metrics_files.document("x", 1, [good, other])["cases"]["event"]
     assert document["spoiled"] == list(bad.spoiled)
     assert set(document["ratio"].values()) == {None}
@@ -103,7 +103,7 @@ def test_a_spoiled_seed_is_left_out_of_ratios(trace):
     others[1] = msgspec.structs.replace(others[1], spoiled=("robots failed",))
     assert ratios(others, first, "iae") == [1.0, None, 1.0]
     assert ratios(first, others, "iae") == [1.0, None, 1.0]
-    assert "seeds compared: 2 of 3" in _texts(*first, *others)
+    assert "seeds compared: 2 of 3" in texts(*first, *others)
 
 
 def test_integrals_over_holes_are_not_compared(trace):
@@ -120,10 +120,10 @@ def test_integrals_over_holes_are_not_compared(trace):
 
 def test_what_was_never_measured_is_unknown(trace):
     silent = measure(dataclasses.replace(trace, ticks=np.array([0, 100, 100])))
-    assert "Whether CF01 missed deadlines is unknown" in _texts(silent)
-    assert "what CF01 received is unknown" in _texts(silent)
+    assert "Whether CF01 missed deadlines is unknown" in texts(silent)
+    assert "what CF01 received is unknown" in texts(silent)
     mute = measure(dataclasses.replace(trace, sent=trace.sent.take(trace.sent.stamp < 0.0)))
-    assert "No pose was sent: whether any would have been lost is unknown." in _texts(mute)
+    assert "No pose was sent: whether any would have been lost is unknown." in texts(mute)
 
 
 def test_a_shorter_run_is_not_compared(trace):

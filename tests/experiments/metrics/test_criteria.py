@@ -1,10 +1,9 @@
 """Criteria of a file: what passes, what does not and why, over cases and seeds, in files and on the command line."""
 
 import json
-import sys
 
-import msgspec
 import pytest
+from msgspec.structs import replace
 
 from experiments.definition.experiment import JUDGED, Criterion
 from experiments.definition.plan import Plan
@@ -16,7 +15,7 @@ from experiments.report.page import number
 from experiments.report.tables import criteria_table
 from experiments.report.verdict import criteria_met
 from experiments.run import reopen, simulate, simulate_seeds
-from tools.main import main
+from tests.commands import invoke
 
 FILE = """
 title = "Two robots"
@@ -45,7 +44,7 @@ def cases():
 
 
 def with_criteria(cases, *criteria):
-    return [msgspec.structs.replace(case, criteria=criteria) for case in cases]
+    return [replace(case, criteria=criteria) for case in cases]
 
 
 def answer(cases, **criterion):
@@ -59,16 +58,16 @@ def test_names_that_are_judged_are_measured():
 
 
 def test_each_criterion_is_judged_in_its_cases(cases):
-    assert [(each.case, each.passed) for each in judge(cases)] == [
-        ("event", True),
-        ("periodic", False),
-        ("event", False),
-    ]
+    judged = [(each.case, each.passed) for each in judge(cases)]
+    assert judged == [("event", True), ("periodic", False), ("event", False)]
     first, *missed, met = criteria_met(cases)
     assert (first.mark, first.text) == ("bad", "Not passed: 1 of 3 criteria are met.")
     assert all("nobody is that good" in each.text for each in missed)
     assert "event" in met.text
     assert ", as asked: " in met.text
+    table = criteria_table(cases)
+    assert [row.cells[3] for row in table.rows] == ["1 of 1", "0 of 1", "0 of 1"]
+    assert criteria_table(with_criteria(cases)).rows == ()
 
 
 @pytest.mark.parametrize(
@@ -91,7 +90,7 @@ def test_numbers_that_can_be_judged(cases, criterion, passed):
 
 def test_the_value_farthest_out_of_range_is_named(cases):
     def texts(**limits):
-        found = [msgspec.structs.replace(case, seed=k, case="one") for k, case in enumerate(cases)]
+        found = [replace(case, seed=k, case="one") for k, case in enumerate(cases)]
         return criteria_met(with_criteria(found, Criterion(metric="f_hz", **limits)))[1].text
 
     event, periodic = sorted(case.mean["f_hz"] for case in cases)
@@ -101,34 +100,24 @@ def test_the_value_farthest_out_of_range_is_named(cases):
     assert f"is {number(periodic)} for 2 of 2 seeds" in far
 
 
-def test_a_report_lists_criteria_with_what_was_reached(cases):
-    table = criteria_table(cases)
-    assert [row.cells[3] for row in table.rows] == ["1 of 1", "0 of 1", "0 of 1"]
-    assert criteria_table(with_criteria(cases)).rows == ()
-
-
 def test_what_was_not_run_is_not_judged(cases):
     event = cases[1:]
     assert answer(event, metric="f_hz", case="periodic", at_most=1.0) == [None]
     assert answer(event, metric="f_hz", case="event", relative_to="periodic", at_most=1.0) == [None]
     assert has_passed(judge(event)) is False
     assert has_passed(judge(with_criteria(event, cases[0].criteria[0]))) is None
-
-
-def test_an_interrupted_run_passes_nothing(cases):
-    short = [msgspec.structs.replace(case, interrupted=True) for case in cases]
+    short = [replace(case, interrupted=True) for case in cases]
     assert answer(short, metric="f_hz", at_least=0.0) == [False, False]
 
 
 def test_every_seed_must_pass():
     runs = simulate_seeds(loads(FILE), [1, 2, 3], cases=["event"])
     found = [case for run in runs for case in run.metrics.values()]
-    values = sorted(case.mean["rmse"] for case in found)
-    (only,) = judge(with_criteria(found, Criterion(metric="rmse", at_most=values[1])))
-    assert len(only.values) == 3
-    assert len(only.failed) == 1
-    (_, why) = criteria_met(with_criteria(found, Criterion(metric="rmse", at_most=values[1])))
-    assert "for 1 of 3 seeds" in why.text
+    middle = sorted(case.mean["rmse"] for case in found)[1]
+    judged = with_criteria(found, Criterion(metric="rmse", at_most=middle))
+    (only,) = judge(judged)
+    assert (len(only.values), len(only.failed)) == (3, 1)
+    assert "for 1 of 3 seeds" in criteria_met(judged)[1].text
 
 
 def test_scripts_get_values_by_seed(cases):
@@ -147,17 +136,13 @@ def test_a_case_keeps_criteria_when_it_is_written():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("limits", "code"), [(HALF, 0), (HALF + TIGHT, 1)])
-def test_a_run_ends_by_its_criteria(limits, code, tmp_path, monkeypatch, capsys):
+def test_a_run_ends_by_its_criteria(limits, code, tmp_path):
     file, out = tmp_path / "task.toml", tmp_path / "run"
     file.write_text(FILE + limits, "utf-8")
-    monkeypatch.setattr(sys, "argv", ["zenpark", "run", str(file), "--virtual", "--json", "--out", str(out)])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert ended.value.code == code
+    done = invoke("run", file, "--virtual", "--json", "--out", out, code=code)
     passed = code == 0
-    assert json.loads(capsys.readouterr().out)["passed"] is passed
-    words = "Passed: 1 of 1 criteria are met." if passed else "nobody is that good"
+    assert json.loads(done.stdout)["passed"] is passed
     page = (out / "report.html").read_text("utf-8")
-    assert words in page
+    assert ("Passed: 1 of 1 criteria are met." if passed else "nobody is that good") in page
     assert "Every seed must keep each of them" in page
     assert reopen(out).summary()["passed"] is passed

@@ -5,8 +5,6 @@ import json
 import os
 import re
 import shlex
-import subprocess
-import sys
 
 import msgspec
 import numpy as np
@@ -19,16 +17,17 @@ from experiments.file.problems import DocumentError
 from experiments.metrics import metric
 from experiments.metrics.measure import measure
 from experiments.metrics.metric import Metric
-from experiments.metrics.statistics import Spread, ratios
+from experiments.metrics.results import CaseMetrics
+from experiments.metrics.statistics import ratios
 from experiments.report import figures, metrics_files, tables
 from experiments.sweep import runs
 from experiments.sweep.optimise import Limit, Objective, parse_objective
 from experiments.sweep.pareto import front
-from experiments.sweep.table import CellRow
-from experiments.virtual_time.log import RunRecorder
-from experiments.virtual_time.simulation import simulate
-from tests.agents.plugins.test_plugins_outside import ROOT, install
-from tests.shell import shell
+from tests.agents.plugins.test_plugins_outside import install
+from tests.commands import ROOT, environment, python, shell
+from tests.experiments.sweep.cells import cell
+from tests.runs import fly
+from tests.small import changed
 
 GUIDE = (ROOT / "docs" / "metrics.md").read_text(encoding="utf-8")
 WAY, GAP = re.findall(r"```python\n(.*?)```", GUIDE, re.DOTALL)
@@ -63,20 +62,24 @@ def test_guide_metric_is_short():
     assert len(WAY.strip().splitlines()) <= 22
 
 
-def test_fields_of_the_page_have_their_shapes():
-    trace = RunRecorder(simulate(load("triangle", "duration_s=1.0").cases()["event"], 1), load("triangle").plan, "")
-    trace = trace.trace()
+def test_fields_of_the_page_have_their_shapes(trace):
     sizes = {"T": len(trace.time), "N": len(trace.robots), "E": len(trace.plan.pose_links)}
-    rows = re.findall(r"^\| (`.*`) \| (\([TNE].*\)) \|", GUIDE, re.MULTILINE)
     shapes = {}
-    for names, given in rows:
-        found = re.findall(r"\(([^)]+)\)", given)
-        fields = re.findall(r"`(\w+)`", names)
-        shapes |= dict(zip(fields, found * (len(fields) if len(found) == 1 else 1), strict=True))
+    for names, given in re.findall(r"^\| (`.*`) \| (\([TNE].*\)) \|", GUIDE, re.MULTILINE):
+        fields, found = re.findall(r"`(\w+)`", names), re.findall(r"\(([^)]+)\)", given)
+        shapes |= dict(zip(fields, found * (len(fields) // len(found)), strict=True))
     assert {"time", "true_position", "goal", "dropped"} < shapes.keys()
     for name, shape in shapes.items():
         words = [each for each in shape.replace(" ", "").split(",") if each]
         assert np.shape(getattr(trace, name)) == tuple(sizes.get(each) or int(each) for each in words), name
+
+
+SHORT = ["--set", "duration_s=5"]
+
+
+def rows_of(file):
+    with file.open(newline="", encoding="utf-8") as opened:
+        return list(csv.DictReader(opened))
 
 
 @pytest.mark.slow
@@ -86,38 +89,27 @@ def test_installed_metric_is_everywhere(installed, zenpark):
     assert "metric gone is left out: plug-in 'gone' (no_such_module:Way) of my-metrics fails to import" in listed.stderr
     assert "Length of the path of a robot" in zenpark("explain", "way_m").stdout
 
-    short = ["--set", "duration_s=5"]
-    run = zenpark("run", "triangle", "--virtual", "--seeds", "2", *short, "--out", "run")
+    run = zenpark("run", "triangle", "--virtual", "--seeds", "2", *SHORT, "--out", "run")
     assert run.returncode == 0, run.stderr
     assert re.search(r"event: f .*, Way \d.* m, .*\(ratios: f .*, Way \d", run.stdout)
     assert "metric broken failed: ZeroDivisionError: division by zero (my_metrics.py:" in run.stdout
-    with (installed / "run" / "metrics.csv").open(newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(installed / "run" / "metrics.csv")
     assert all(float(row["way_m"]) > 0.1 for row in rows)
     assert {row["broken"] for row in rows} == {""}
     assert [bool(row["gap_m"]) for row in rows] == [row["robot"] == "mean" for row in rows]
     page = (installed / "run" / "report.html").read_text("utf-8")
     assert all(text in page for text in ("Way [m]", "Length of the path", "Gap [m] of the case", "broken failed"))
-
-    shown = zenpark("report", "run", "--markdown").stdout
-    assert "Way [m]" in shown
+    assert "Way [m]" in zenpark("report", "run", "--markdown").stdout
     made = json.loads((installed / "run" / "run.json").read_text())["made_by"]
     assert made["plugins"] == {"my-metrics": "0.1"}
 
 
+ALONE = ["--processes", "1"]
+
+
 @pytest.mark.slow
 def test_installed_metric_is_swept(installed, zenpark):
-    arguments = [
-        "trigger.threshold=0.01,0.03",
-        "seeds=3",
-        "--set",
-        "duration_s=5",
-        "--processes",
-        "1",
-        "--out",
-        "swept",
-    ]
-    done = zenpark("sweep", "triangle", *arguments)
+    done = zenpark("sweep", "triangle", "trigger.threshold=0.01,0.03", "seeds=3", *SHORT, *ALONE, "--out", "swept")
     assert done.returncode == 0, done.stderr
     assert re.search(r"^note: metric broken failed: ZeroDivisionError", done.stdout, re.MULTILINE)
     assert "Way ratio" in done.stdout
@@ -134,19 +126,8 @@ def test_installed_metric_is_swept(installed, zenpark):
 def test_installed_metric_is_a_limit_of_a_search(zenpark):
     (line,) = re.findall(r"^    \./zenpark (sweep .*--optimise.*)$", GUIDE, re.MULTILINE)
     words = [word for word in shlex.split(line) if not word.startswith(("seeds=", "tuning="))]
-    short = [
-        "seeds=1:2",
-        "tuning=1001:1006",
-        "--set",
-        "duration_s=1",
-        "--processes",
-        "1",
-        "--anyway",
-        "--no-report",
-        "--out",
-        "tuned",
-    ]
-    done = zenpark(*words, *short)
+    short = ["seeds=1:2", "tuning=1001:1006", "--set", "duration_s=1", *ALONE, "--anyway", "--no-report"]
+    done = zenpark(*words, *short, "--out", "tuned")
     assert done.returncode == 0, done.stderr
     assert re.search(r"^event threshold=.*: keeps Way ratio <= 1.02$", done.stdout, re.MULTILINE)
 
@@ -154,16 +135,13 @@ def test_installed_metric_is_a_limit_of_a_search(zenpark):
 @pytest.mark.slow
 def test_installed_metric_is_in_a_notebook(installed):
     code = (
-        "from experiments.file.document import load\n"
-        "from experiments.run import simulate\n"
+        "from zenpark import load, simulate\n"
         "run = simulate(load('triangle', 'duration_s=1.0'))\n"
         "found = run.metrics['event']\n"
         "print(found.mean['way_m'] > 0.0, found.robots[0].value('way_m') > 0.0, 'Way [m]' in run._repr_html_())"
     )
-    path = os.pathsep.join([str(installed), str(ROOT)])
-    words = [sys.executable, "-c", code]
-    done = subprocess.run(words, env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["True", "True", "True"]
+    path = os.pathsep.join(map(str, (installed, ROOT, ROOT / "face")))
+    assert python("-c", code, env=environment(PYTHONPATH=path)).stdout.split() == ["True", "True", "True"]
 
 
 class Way(Metric, frozen=True):
@@ -197,7 +175,7 @@ class Careless(Height, frozen=True):
 
 
 class Wrong(Metric, frozen=True):
-    """Gives three numbers whatever there is."""
+    """Gives thirty numbers whatever there is."""
 
     label = "Wrong"
 
@@ -217,18 +195,18 @@ def known(monkeypatch):
 
 @pytest.fixture(scope="module")
 def triangle():
-    return msgspec.structs.replace(load("triangle").cases()["event"].experiment, duration_s=2.0)
+    return changed(load("triangle").cases()["event"].experiment, duration_s=2.0)
 
 
 @pytest.fixture(scope="module")
 def trace(triangle):
-    return RunRecorder(simulate(Plan(triangle), 1), Plan(triangle), "event").trace()
+    return fly(triangle, case="event").trace
 
 
 @pytest.fixture(scope="module")
 def older(trace):
     """A case that was measured before a metric was installed."""
-    return msgspec.json.decode(msgspec.json.encode(measure(trace)), type=type(measure(trace)))
+    return msgspec.json.decode(msgspec.json.encode(measure(trace)), type=CaseMetrics)
 
 
 def test_metric_of_wrong_shape_is_unknown(known, trace):
@@ -250,19 +228,16 @@ def test_reports_of_older_runs_have_an_empty_column(known, trace, older, tmp_pat
     assert {row.cells[table.head.index("Way [m]")] for row in table.rows} == {tables.NONE}
     assert figures.robot_bars([older]).axes
     metrics_files.write_csv(tmp_path / "metrics.csv", [older, measure(trace)])
-    with (tmp_path / "metrics.csv").open(newline="", encoding="utf-8") as file:
-        way = [row["way_m"] for row in csv.DictReader(file)]
-    assert [bool(each) for each in way] == [False] * 4 + [True] * 4
+    assert [bool(row["way_m"]) for row in rows_of(tmp_path / "metrics.csv")] == [False] * 4 + [True] * 4
 
 
 def test_sweep_keeps_what_metrics_need(known, triangle):
-    seeds = (1,)
     known(way_m=Way())
     assert runs.lean_enough()
-    ((lean,), _) = runs.fly_seeds(Plan(triangle), seeds)
+    ((lean,), _) = runs.fly_seeds(Plan(triangle), (1,))
     known(way_m=Way(), height=Height())
     assert not runs.lean_enough()
-    ((whole,), _) = runs.fly_seeds(Plan(triangle), seeds)
+    ((whole,), _) = runs.fly_seeds(Plan(triangle), (1,))
     assert whole.values.items() > lean.values.items()
     assert whole.values["height"] is not None
     assert whole.metric_faults == ()
@@ -301,23 +276,13 @@ def test_search_for_more_of_a_metric(known):
         parse_objective("height, way_m>=1")
 
 
-def swept(messages, height):
-    one = {"messages": certain(messages), "height": certain(height)}
-    return CellRow("event", {}, {}, {}, False, 9, 0, {}, one, 1.0, 0.02)
-
-
-def certain(mean):
-    return Spread(mean, 0.0, 0.01, 9)
-
-
 def test_metric_to_maximise_leads_front_and_search(known):
     known(height=Height())
-    low, high = swept(0.5, 0.9), swept(0.5, 1.2)
+    low, high = cell(messages=0.5, height=0.9), cell(messages=0.5, height=1.2)
     assert front([low, high], "height") == [high]
     objective = parse_objective("height, messages<=0.6")
     assert objective.rank(high) < objective.rank(low)
-    assert parse_objective("messages, height>=1.0").kept(high)
-    assert not parse_objective("messages, height>=1.0").kept(low)
+    assert [parse_objective("messages, height>=1.0").kept(each) for each in (high, low)] == [True, False]
 
 
 @pytest.mark.parametrize(

@@ -86,27 +86,22 @@ def test_reset_twin_has_its_horizons_error_and_speed():
 
 
 def test_what_is_unknown_is_left_out():
-    twin = winding(T) + np.array([0.01, 0.0, 0.0])
-    twin[T < 5.0] = np.nan
-    way = winding(T)
-    way[T > 15.0] = np.nan
+    twin, way = winding(T) + np.array([0.01, 0.0, 0.0]), winding(T)
+    twin[T < 5.0], way[T > 15.0] = np.nan, np.nan
     (mine, _) = agreement(shadowed(way, twin))
     assert mine.bias == pytest.approx((0.01, 0.0, 0.0))
     assert mine.known == pytest.approx(0.5, abs=2e-3)
     assert mine.correlation_speed == pytest.approx(1.0)
     assert agreement(shadowed(way, np.full_like(way, np.nan))) == [None, None]
+    plain = trace(experiment({"A": "crazyflie"}, {}), winding(T)[:, None])
+    assert agreement(plain) == [None]
+    assert measure.measure(plain).robots[0].shadow is None
+    assert "shadows" not in figures.all_figures([], [plain])
 
 
 def test_yaw_differs_the_short_way_round():
     (mine, _) = agreement(shadowed(winding(T), winding(T), yaw=math.pi - 0.01, twin_yaw=-math.pi + 0.02))
     assert mine.bias_yaw == pytest.approx(0.03)
-
-
-def test_without_a_shadow_there_is_none():
-    plain = trace(experiment({"A": "crazyflie"}, {}), winding(T)[:, None])
-    assert agreement(plain) == [None]
-    assert measure.measure(plain).robots[0].shadow is None
-    assert "shadows" not in figures.all_figures([], [plain])
 
 
 def test_figure_has_a_row_for_each_shadowed_robot():

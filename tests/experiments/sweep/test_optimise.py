@@ -3,19 +3,13 @@
 import pytest
 
 from experiments.file.problems import DocumentError
-from experiments.metrics.metric import swept_metrics
-from experiments.metrics.statistics import Spread
 from experiments.sweep.optimise import BROKEN, Limit, Objective, parse_objective, searched, tune
-from experiments.sweep.table import CellRow, relative_metrics
+from experiments.sweep.page import fewest
+from experiments.sweep.pareto import by_environment, front
+from tests.experiments.sweep.cells import cell
 from tools.commands import sweep as commands
 
 SHORT = ["duration_s=4.0"]
-
-
-def row(**ratios):
-    found = {index: Spread(ratios.get(index, 1.0), 0.0, 0.01, 9) for index in relative_metrics()}
-    mean = {index: Spread(1.0, 0.0, 0.01, 9) for index in swept_metrics()}
-    return CellRow("event", {}, {}, {}, False, 9, 0, mean, found, 1.0, 0.02)
 
 
 def test_a_wish():
@@ -48,11 +42,26 @@ def test_what_is_wrong_with_a_wish(text, message, hint):
 
 def test_limits_precede_messages_and_count_with_their_interval():
     objective = parse_objective("messages, iae<=1.05")
-    assert objective.rank(row(messages=0.2, iae=1.03)) == 0.2
-    assert objective.rank(row(messages=0.1, iae=1.045)) > BROKEN  # 1.045 ± 0.01
-    assert objective.rank(row(iae=1.2)) > objective.rank(row(iae=1.1)) > BROKEN
-    assert objective.kept(row(iae=1.045))
-    assert not objective.kept(row(iae=1.06))
+    assert objective.rank(cell(messages=0.2, iae=1.03)) == 0.2
+    assert objective.rank(cell(messages=0.1, iae=1.045)) > BROKEN  # 1.045 ± 0.01
+    assert objective.rank(cell(iae=1.2)) > objective.rank(cell(iae=1.1)) > BROKEN
+    assert [objective.kept(cell(iae=iae)) for iae in (1.045, 1.06)] == [True, False]
+
+
+def test_cell_with_failed_runs_is_on_no_front():
+    landed, whole = cell(messages=0.2, iae=0.5, failed=1), cell(messages=0.4)
+    assert front([landed, whole]) == [whole]
+    assert parse_objective("messages, iae<=1.01").rank(landed) > parse_objective("messages, iae<=1.01").rank(whole)
+    (finding,) = fewest([landed, whole])
+    assert "60.0 %" in finding.text
+
+
+def test_fronts_are_per_environment():
+    given = [(0.2, 1.0, 0.0), (0.3, 1.1, 0.0), (0.25, 1.04, 0.1)]
+    rows = [cell(messages=messages, iae=iae, environment={"loss": loss}) for messages, iae, loss in given]
+    parts = by_environment(rows)
+    assert [front(part) for part in parts.values()] == [rows[:1], rows[2:]]
+    assert [finding.text.split(":")[0] for finding in fewest(rows)] == ["With loss=0", "With loss=0.1"]
 
 
 def test_third_of_the_tuning_seeds_serves_the_search():

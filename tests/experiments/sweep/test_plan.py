@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from experiments.file import reference
 from experiments.file.document import load
 from experiments.file.problems import DocumentError
 from experiments.sweep.plan import Span, arguments, cells, seeds_of
@@ -16,8 +17,8 @@ def triangle():
     return load("triangle")
 
 
-def planned(read, *given_axes, cases=(), settings=()):
-    return cells(read, str(read.path), settings, arguments(given_axes)[0], cases)
+def planned(read, *axes, cases=(), settings=()):
+    return cells(read, str(read.path), settings, arguments(axes)[0], cases)
 
 
 def test_logarithmic_range_has_equal_ratios_and_both_ends():
@@ -44,10 +45,12 @@ def test_a_value_of_a_range_lies_within_it(low, factor, share, scale):
     )
 
 
-def test_seeds():
-    assert seeds_of("seeds=3", 5) == (5, 6, 7)
-    assert seeds_of("seeds=101:103", 5) == (101, 102, 103)
-    assert len(seeds_of(None, 1)) == 20
+@pytest.mark.parametrize(
+    ("text", "seeds"),
+    [("seeds=3", (5, 6, 7)), ("seeds=101:103", (101, 102, 103)), (None, tuple(range(5, 25)))],
+)
+def test_seeds(text, seeds):
+    assert seeds_of(text, 5) == seeds
 
 
 def test_a_case_without_the_parameter_is_one_cell(triangle):
@@ -65,32 +68,38 @@ def test_a_case_without_the_parameter_is_one_cell(triangle):
 def test_reference_shares_values_with_what_it_is_compared(triangle):
     plan = planned(triangle, "formation.gain=2,3", "trigger.threshold=0.01,0.02")
     assert len(plan) == 2 + 4
-    reference = {cell.digest: cell.parameters["formation.gain"] for cell in plan if cell.case == "periodic"}
-    assert all(reference[cell.reference] == cell.parameters["formation.gain"] for cell in plan)
+    gain = {cell.digest: cell.parameters["formation.gain"] for cell in plan if cell.case == "periodic"}
+    assert all(gain[cell.reference] == cell.parameters["formation.gain"] for cell in plan)
 
 
 def test_value_of_one_case_and_a_chosen_case(triangle):
     plan = planned(triangle, "cases.event.trigger.threshold=0.01,0.02", cases=["event"])
     assert [cell.case for cell in plan] == ["periodic", "event", "event"]
     assert planned(triangle, "trigger.threshold=0.01,0.02", cases=["periodic"])[0].parameters == {}
+    plan = planned(triangle, "cases.periodic.trigger.period_s=0.02,0.1", cases=["event"])
+    assert [cell.parameters.get("cases.periodic.trigger.period_s") for cell in plan] == [0.02, 0.1, None]
+
+
+def test_loss_is_environment_and_threshold_is_chosen(triangle):
+    plan = planned(
+        triangle, "trigger.threshold=0.005,0.02", "channel.loss=0,0.1", "cases.event.channel.delay_s=0.01,0.02"
+    )
+    met = {frozenset(cell.environment) for cell in plan if cell.case == "event"}
+    assert met == {frozenset(("channel.loss", "cases.event.channel.delay_s"))}
+    assert {reference.unit(path) for path in ("trigger.threshold", "cases.event.trigger.threshold")} == {"m"}
 
 
 def test_trigger_of_the_reference_stays_as_written(triangle):
     """Also what the file leaves at its default is swept; the first case becomes one of those that are compared."""
     plan = planned(triangle, "trigger.minimum_interval_s=0.05,0.1", "formation.gain=2,3")
-    references = [cell for cell in plan if cell.digest == cell.reference]
-    assert [dict(cell.parameters) for cell in references] == [{"formation.gain": 2}, {"formation.gain": 3}]
-    assert all(cell.plan.experiment.trigger == triangle.cases()["periodic"].experiment.trigger for cell in references)
-    swept = [dict(cell.parameters) for cell in plan if cell.case == "periodic" and cell not in references]
+    first = [cell for cell in plan if cell.digest == cell.reference]
+    assert [dict(cell.parameters) for cell in first] == [{"formation.gain": 2}, {"formation.gain": 3}]
+    assert all(cell.plan.experiment.trigger == triangle.cases()["periodic"].experiment.trigger for cell in first)
+    swept = [dict(cell.parameters) for cell in plan if cell.case == "periodic" and cell not in first]
     assert swept == [
         {"trigger.minimum_interval_s": interval, "formation.gain": gain} for interval in (0.05, 0.1) for gain in (2, 3)
     ]
     assert len([cell for cell in plan if cell.case == "event"]) == 4
-
-
-def test_named_case_is_changed_even_as_the_reference(triangle):
-    plan = planned(triangle, "cases.periodic.trigger.period_s=0.02,0.1", cases=["event"])
-    assert [cell.parameters.get("cases.periodic.trigger.period_s") for cell in plan] == [0.02, 0.1, None]
 
 
 @pytest.mark.parametrize(

@@ -9,23 +9,27 @@ from experiments.definition.plan import Plan
 from experiments.file import structure
 from experiments.file.document import load
 from experiments.metrics import measure
-from experiments.sweep import runs
-from experiments.sweep.runs import WorkResult, code_of, digest, fly, run_metrics
+from experiments.metrics.metric import swept_metrics
+from experiments.metrics.statistics import Spread
+from experiments.recording import version
+from experiments.sweep import runs, table
+from experiments.sweep.plan import arguments, cells
+from experiments.sweep.runs import RunMetrics, WorkResult, code_of, digest, fly, run_metrics
 from experiments.virtual_time.log import RunRecorder
 from experiments.virtual_time.simulation import simulate
+from tests.small import changed, reference
 
 
 @pytest.fixture(scope="module")
 def park():
-    return msgspec.structs.replace(load("robotic-park").cases()["event"].experiment, duration_s=6.0, timeline=[])
+    return changed(reference(), duration_s=6.0, timeline=[])
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [3, 8])
 def test_lean_figures_are_those_of_the_report(park, seed):
-    lean, whole = (
-        RunRecorder(simulate(Plan(park), seed, lean=lean), Plan(park), "event").trace() for lean in (True, False)
-    )
+    logs = [simulate(Plan(park), seed, lean=lean) for lean in (True, False)]
+    lean, whole = (RunRecorder(log, Plan(park), "event").trace() for log in logs)
     figures, measured = run_metrics(lean), measure.measure(whole)
     assert figures == run_metrics(whole)
     assert figures.seed == seed
@@ -35,61 +39,78 @@ def test_lean_figures_are_those_of_the_report(park, seed):
     assert figures.values["dropped"] == measured.dropped
     followers = [robot.updates for robot in measured.robots if robot.robot not in measured.leaders]
     assert figures.values["updates"] == np.mean(followers) == measured.mean["updates"]
+    log = logs[0]
+    assert log.true_position.shape == (len(log.time), 7, 3)
+    assert [len(log.received), *(getattr(log, name).size for name in UNUSED)] == [0] * 7
+    assert len(log.sent) > 50
 
 
-@pytest.mark.slow
-def test_lean_log_is_small(park):
-    lean = simulate(Plan(park), 1, lean=True)
-    assert lean.true_position.shape == (len(lean.time), 7, 3)
-    for column in (lean.position, lean.velocity, lean.goal, lean.setpoint, lean.error, lean.phase):
-        assert column.size == 0
-    assert len(lean.received) == 0
-    assert len(lean.sent) > 50
+UNUSED = ("position", "velocity", "goal", "setpoint", "error", "phase")
 
 
-def flown(experiment, seeds):
+def result(experiment, seeds):
     return msgspec.json.decode(fly(msgspec.json.encode(experiment), seeds, code_of(Plan(experiment))), type=WorkResult)
 
 
 @pytest.mark.slow
 def test_run_depends_on_its_seed_alone(park):
-    lossy = msgspec.structs.replace(
-        park, duration_s=2.0, channel=ChannelTable(delay_s=0.05, jitter_s=0.4, loss=0.2), start=Start(scatter=0.05)
+    channel = ChannelTable(delay_s=0.05, jitter_s=0.4, loss=0.2)
+    lossy = changed(park, duration_s=2.0, channel=channel, start=Start(scatter=0.05))
+    together = result(lossy, [1, 2, 3, 4]).runs
+    assert [run.seed for run in together] == [1, 2, 3, 4]
+    assert result(lossy, [4, 2]).runs == [together[3], together[1]]
+    assert sum(run.values["dropped"] for run in together) > 0
+
+
+def test_run_in_which_robots_landed_has_failed():
+    case = load("triangle", "duration_s=2.0", "safety.battery_low=0.999").cases()["periodic"].experiment
+    found = result(case, [1, 2])
+    assert found.runs == []
+    assert all("battery" in found.failed[seed] for seed in (1, 2))
+
+
+def test_runs_of_other_length_have_no_ratio():
+    plan = cells(load("triangle"), "triangle", (), arguments(["cases.event.trigger.threshold=0.01"])[0], ())
+    first, other = plan
+    metrics = dict.fromkeys(swept_metrics(), 1.0)
+    whole, few, short = (
+        {1: RunMetrics(1, {**metrics, "messages": messages}, 0.02, duration_s)}
+        for messages, duration_s in ((100.0, 20.0), (20.0, 20.0), (20.0, 10.0))
     )
-    seeds = list(range(1, 5))
-    together = flown(lossy, seeds)
-    assert [run.seed for run in together.runs] == seeds
-    assert flown(lossy, [4, 2]).runs == [together.runs[3], together.runs[1]]
-    assert sum(run.values["dropped"] for run in together.runs) > 0
+    assert table.row(other, short, whole).ratio["messages"] == Spread(None, None, None, 0)
+    assert table.row(other, few, whole).ratio["messages"].mean == pytest.approx(0.2)
+    assert first.digest == first.reference
 
 
-@pytest.mark.slow
-def test_stuck_run_leaves_the_others(park, monkeypatch):
-    real = runs.simulate
-
-    def fails_with_2(plan, seed, *, lean):
-        if seed == 2:
-            raise runs.Stuck("not airborne after 60 s: CF01")
-        return real(plan, seed, lean=lean)
-
-    monkeypatch.setattr(runs, "simulate", fails_with_2)
-    short = msgspec.structs.replace(park, duration_s=1.0)
-    outcome = flown(short, [1, 2, 3])
-    assert [run.seed for run in outcome.runs] == [1, 3]
-    assert outcome.failed == {2: "not airborne after 60 s: CF01"}
+@pytest.mark.parametrize(
+    ("parts", "same"),
+    [
+        ({"title": "Another", "source": "", "seed": 99, "cases": {"a": {}}}, True),
+        ({"duration_s": 6.02}, False),
+        ({"robots": dict(reversed(reference().robots.items()))}, False),
+    ],
+    ids=["words and seed", "duration", "order of robots"],
+)
+def test_digest_knows_what_changes_a_run(park, parts, same):
+    assert (digest(Plan(changed(park, **parts))) == digest(Plan(park))) is same
 
 
-def test_work_for_other_code_is_refused(park):
-    answer = msgspec.json.decode(fly(msgspec.json.encode(park), [1], "of another version"), type=WorkResult)
-    assert answer.runs == []
-    assert answer.stranger.endswith("not of another version")
-
-
-def test_digest_ignores_what_does_not_change_a_run(park):
-    same = msgspec.structs.replace(park, title="Another", source="", seed=99, cases={"a": {}})
-    assert digest(Plan(same)) == digest(Plan(park))
-    other = msgspec.structs.replace(park, duration_s=6.02)
-    assert digest(Plan(other)) != digest(Plan(park))
+@pytest.mark.parametrize(
+    ("parts", "library"),
+    [
+        ({"world": WorldTable(engine="pymunk")}, "pymunk"),
+        ({"world": WorldTable(engine="mujoco")}, "mujoco-core"),
+        ({"formation": changed(reference().formation, law="mpc")}, "daqp"),
+    ],
+)
+def test_versions_of_used_libraries_count(park, monkeypatch, parts, library):
+    plain, using, found = Plan(park), Plan(changed(park, **parts)), []
+    for number in ("4.0", "4.1"):
+        monkeypatch.setattr(version, "installed", lambda name, number=number: number if name == library else None)
+        found.append((code_of(plain), code_of(using)))
+    assert found[0][0] == found[1][0]
+    assert found[0][1] != found[1][1]
+    assert library in version.LIBRARIES
 
 
 def test_a_plug_in_that_changes_changes_the_code(park, tmp_path, monkeypatch):
@@ -103,22 +124,3 @@ def test_a_plug_in_that_changes_changes_the_code(park, tmp_path, monkeypatch):
     file.write_text("two")
     assert len({before, foreign, code_of(Plan(park))}) == 3
     runs.file_digest.cache_clear()
-
-
-def test_the_version_of_the_engines_library_counts(park, monkeypatch):
-    """Runs of another pymunk or mujoco are other runs; of one that is not used they are the same."""
-    real = runs.engine_versions
-    pymunk = msgspec.structs.replace(park, world=WorldTable(engine="pymunk"))
-    before = code_of(Plan(park)), code_of(Plan(pymunk))
-    monkeypatch.setattr(runs, "engine_versions", lambda name: ["0.0"] if name == "pymunk" else real(name))
-    assert code_of(Plan(park)) == before[0]
-    assert code_of(Plan(pymunk)) != before[1]
-
-
-def test_the_version_of_the_laws_library_counts(park, monkeypatch):
-    formation = msgspec.structs.replace(park.formation, law="mpc")
-    planned = msgspec.structs.replace(park, formation=formation)
-    before = code_of(Plan(park)), code_of(Plan(planned))
-    monkeypatch.setattr(runs, "engine_versions", lambda name: ["0.0"] if name == "daqp" else [])
-    assert code_of(Plan(park)) == before[0]
-    assert code_of(Plan(planned)) != before[1]

@@ -5,6 +5,7 @@ import json
 import msgspec
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from agents.errors import ExplainedError
 from agents.plugins.triggers import SendOnDelta
@@ -17,6 +18,7 @@ from experiments.metrics.statistics import spread, student_95
 from experiments.recording.reader import RecordingError
 from experiments.run import simulate
 from experiments.sweep import page as sweep_page
+from experiments.sweep import runs
 from experiments.sweep import sweep as sweeps
 from experiments.sweep import table as sweep_table
 from experiments.sweep.pareto import curves, front, pareto
@@ -35,19 +37,15 @@ AXIS = "trigger.threshold=0.005,0.02"
 
 
 class Progress:
-    """What a sweep told."""
+    """What a sweep told: the number of runs so far."""
 
     def __init__(self, end_after=None):
-        self.told, self._end_after = [], end_after
+        self.ran, self._end_after = 0, end_after
 
     def __call__(self, done, of):
-        self.told.append((done, of))
+        self.ran = done
         if self._end_after is not None and done >= self._end_after:
             raise KeyboardInterrupt
-
-    @property
-    def ran(self):
-        return self.told[-1][0] if self.told else 0
 
 
 def swept(folder, *given, progress=None, **more):
@@ -97,10 +95,6 @@ def test_nothing_is_run_twice(done):
     assert progress.ran == 3
 
 
-def test_batches_do_not_change_the_table(done, tmp_path):
-    assert tables(swept(tmp_path, most_seeds=1)) == tables(done)
-
-
 def test_a_sweep_that_was_interrupted_goes_on(done, tmp_path):
     progress = Progress(end_after=3)
     part = swept(tmp_path, progress=progress, most_seeds=2)
@@ -135,8 +129,6 @@ def test_another_version_is_noticed(tmp_path, monkeypatch):
 
 
 def test_runs_that_fail_are_counted_and_named(tmp_path, monkeypatch):
-    from experiments.sweep import runs  # noqa: PLC0415
-
     real = runs.simulate
 
     def stuck(plan, seed, *, lean):
@@ -173,26 +165,21 @@ def test_number_of_parallel_flights_depends_on_robots():
     assert side_by_side(Plan(Experiment(title="t", robots=many, duration_s=45.0))) == 1
 
 
-def test_workers_with_other_code_are_refused():
+def test_workers_of_other_code_or_nowhere_are_refused():
     with workers(None, 1) as working, pytest.raises(ExplainedError, match="another version of zenpark"):
         list(working.done([Work("x", b'{"title":"","robots":{},"duration_s":1}', (1,), "other", 0.0)]))
-
-
-def test_a_scheduler_that_is_none():
     with pytest.raises(ExplainedError, match=r"--scheduler nonsense: this is no address; write one as tcp://"):
         workers("nonsense", None).__enter__()
 
 
 def test_the_front_has_what_no_other_beats(done):
     rows = [row for row in done.rows if not row.reference]
+    points = [(row.ratio["messages"].mean, row.ratio["iae"].mean) for row in rows]
     best = front(rows)
-    for row in rows:
-        beaten = any(
-            other.ratio["messages"].mean <= row.ratio["messages"].mean
-            and other.ratio["iae"].mean < row.ratio["iae"].mean
-            for other in rows
-        )
+    for row, (messages, iae) in zip(rows, points, strict=True):
+        beaten = any(fewer <= messages and less < iae for fewer, less in points)
         assert (row in best) != beaten
+    pareto(done.rows[:1]).canvas.draw()  # nothing but the reference
 
 
 def test_curves_go_along_the_first_parameter(tmp_path):
@@ -211,10 +198,10 @@ def test_curves_go_along_the_first_parameter(tmp_path):
 
 def test_tied_cells_share_front_and_parameter_columns(done):
     (row, *_) = [row for row in done.rows if not row.reference]
-    other = msgspec.structs.replace(row, case="other", parameters={"cases.other.trigger.threshold": 0.3}, units={})
+    other = replace(row, case="other", parameters={"cases.other.trigger.threshold": 0.3}, units={})
     assert front([row, other]) == [row, other]
     assert parameter_columns([row, other]) == {"threshold [m]": ["0.005", "0.3"]}
-    both = msgspec.structs.replace(row, parameters={**row.parameters, **other.parameters})
+    both = replace(row, parameters={**row.parameters, **other.parameters})
     assert list(parameter_columns([row, both])) == ["trigger.threshold [m]", "cases.other.trigger.threshold"]
 
 
@@ -239,10 +226,6 @@ def test_long_folder_name_is_cut_and_stays_unique():
     assert len({name[-8:] for name in names}) == 3
 
 
-def test_a_figure_of_nothing_but_the_reference(done):
-    pareto(done.rows[:1]).canvas.draw()
-
-
 def typed(folder, *given, **more):
     return commands.sweep("triangle", given, settings=SHORT, out=str(folder), processes=1, **more)
 
@@ -263,14 +246,11 @@ def test_the_command_writes_table_figures_and_page(done, capsys):
     assert json.loads(capsys.readouterr().out)["cells"] == table["cells"]
 
 
-def test_nearest_cell_is_named_without_any_within_levels(done):
-    far = [msgspec.structs.replace(row, ratio={**row.ratio, "iae": spread([1.2 + k])}) if not row.reference else row
+def test_the_page_says_who_needs_fewest_messages(done):
+    found = [finding.text for finding in sweep_page.fewest(done.rows)]
+    assert all(text.startswith("Fewest messages with an IAE ratio of at most ") for text in found)
+    far = [row if row.reference else replace(row, ratio={**row.ratio, "iae": spread([1.2 + k])})
            for k, row in enumerate(done.rows)]  # fmt: skip
     (finding,) = sweep_page.fewest(far)
     nearest = next(row for row in far if not row.reference)
     assert finding.text.startswith(f"No cell has an IAE ratio of at most 1.05; the nearest: {nearest.label}: ")
-
-
-def test_the_page_says_who_needs_fewest_messages(done):
-    found = [finding.text for finding in sweep_page.fewest(done.rows)]
-    assert all(text.startswith("Fewest messages with an IAE ratio of at most ") for text in found)
