@@ -238,7 +238,7 @@ def test_dead_robot_does_not_poison_the_others():
     assert msgspec.json.encode(after).find(b"NaN") == -1
 
 
-def test_robot_never_seen_or_without_links_has_no_errors():
+def test_unseen_and_unlinked_robots_have_no_errors():
     measured = measure(pair(np.full_like(T, np.nan)))
     robot = follower(measured)
     assert (robot.iae, robot.rmse, robot.coverage, robot.known) == (None, None, 0.0, 0.0)
