@@ -106,11 +106,11 @@ class Runtime:
         self.ticks = Ticks(common.body_hz, clock=uptime)
         self._bell = pubsub.Bell() if setup.wake else None
         self._utc = 0.0
-        self._keeper = NameKeeper(setup.keys, self._names, setup.clock.utc(), setup.ownership)
+        self.keeper = NameKeeper(setup.keys, self._names, setup.clock.utc(), setup.ownership)
         self._valid_box = validation.valid_box_of(common.limits.low, common.limits.high)
         self._everyone = tuple(range(len(self._names)))
         self._descent = Descent(
-            self.robots, body, self._keeper, self.ticks,
+            self.robots, body, self.keeper, self.ticks,
             silence_s=setup.loop_timeout_s, alarm=self._leave_formation, recover=self._land_after_hang,
             timing=setup.descent,
         )  # fmt: skip
@@ -141,8 +141,8 @@ class Runtime:
             )
             out.callback(leave, session, self)
             self.subscribe_to_stops(session)
-            self._keeper.claim(session, self._setup.endpoints, asked)
-            out.callback(self._keeper.end)
+            self.keeper.claim(session, self._setup.endpoints, asked)
+            out.callback(self.keeper.end)
             self._body.open()
             self._descent.register(out)
             self.join(session)
@@ -368,7 +368,7 @@ class Runtime:
         self._telemetry.due = t  # the central controller must know the start in time
 
     def _declare_tokens(self) -> None:
-        self._keeper.declare(self._session, (row for row in self._everyone if row not in self._retired))
+        self.keeper.declare(self._session, (row for row in self._everyone if row not in self._retired))
 
     def _retire(self, t: float) -> None:
         """Undeclares the tokens of rows that leave, or land unasked, and silences them: no neighbour must follow them.
@@ -384,7 +384,7 @@ class Runtime:
             unasked = during[row] and not life.reason.startswith((messages.EMERGENCY, LAND, STOP))
             if down and (unasked or row in self._orders.leaving) and row not in self._retired:
                 self._retired.add(row)
-                self._keeper.withdraw((row,))  # nothing, if the watchdog has done it
+                self.keeper.withdraw((row,))  # nothing, if the watchdog has done it
         if back := [row for row in self._retired if not (during[row] or row in self._orders.leaving)]:
             self._retired.difference_update(back)
             self._declare_tokens()
@@ -431,8 +431,8 @@ class Runtime:
             self._router_due = t + ROUTER_S
             before, self._silent_since = self._silent_since, self._router.silent_since(t, self._neighbours.arrived)
             if before < inf and self._silent_since == inf:
-                self._keeper.begin_check(self._session)  # it was cut off
-            self._keeper.is_owner()
+                self.keeper.begin_check(self._session)  # it was cut off
+            self.keeper.is_owner()
         return self._silent_since
 
     def _leave_formation(self, why: str) -> None:
@@ -441,7 +441,7 @@ class Runtime:
         if self._joined:
             self._telemetry.repeat_statuses(why, self._setup.clock.utc())
             # a loop that has recovered meanwhile keeps its tokens
-            self._keeper.withdraw(self._everyone, lambda: self._descent.begun or bool(self.watchdog.tripped))
+            self.keeper.withdraw(self._everyone, lambda: self._descent.begun or bool(self.watchdog.tripped))
 
     def _land_after_hang(self, why: str) -> None:
         """Lands the robots after the watchdog ordered it, although the loop runs again."""

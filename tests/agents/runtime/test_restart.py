@@ -12,17 +12,15 @@ import pytest
 from agents.body.limits import Safety
 from agents.decision.lifecycle import AIRBORNE, READY, RUNNING
 from agents.network import messages
-from agents.network.keys import Keys
 from agents.plugins.law import Control, Law, Said
-from agents.runtime.loop import Runtime, Setup
 from agents.runtime.orders import carry_out
 from experiments.definition.experiment import Formation, LegTable, RobotTable
 from experiments.definition.plan import Plan
 from tests.agents.bench import Bench
-from tests.agents.few import pair
-from tests.agents.runtime.test_shutdown import Airborne
-from tests.fuzz.loopnet import Net
+from tests.agents.runtime.process import Airborne, process
 from tests.fuzz.messages import sent
+from tests.network import Net
+from tests.small import pair
 
 UTC = 1.7e9
 START, WAY, BEGINS_S, SPEED = (-0.6, 0.1), 0.75, 5.0, 0.15
@@ -76,10 +74,6 @@ def test_restarted_leader_does_not_repeat_its_plan():
     assert Life(there, 30.0).robot.goal[0] == pytest.approx(there[0] + WAY)  # without the origin
     anew = Life(START, 30.0, origin)  # a twin of its own stands at its start again
     assert anew.robot.goal[:2] == pytest.approx(there)
-
-
-def test_leg_under_way_goes_on():
-    origin = (*START, 0.0, 0.0)
     half = Life((0.0, 0.0), BEGINS_S + 2.0, origin)
     gone = SPEED * (half.bench.t - half.start.at + UTC - BEGINS_S)
     assert half.robot.goal[0] == pytest.approx(START[0] + gone, abs=0.02)
@@ -148,20 +142,13 @@ def test_start_with_unknown_origin_is_refused():
 
 
 def test_repeated_start_keeps_the_ticks():
-    setup = Setup(Keys("park"), [], "json", 50.0, lifeline=False, externally_measured=[False])
     with Net().worn() as net:
-        robot = Runtime([Plan(pair()).assignment("A")], Airborne(), setup)
-        robot.subscribe_to_stops(net.session)
-        robot.join(net.session)
-        robot._utc, robot.ticks.t, robot.ticks.next = UTC, 7.0, 7.01
-
-        def start(at: float) -> None:
-            net.deliver(sent("park/A/order", messages.Order("start", at=UTC + at))[0])
-            robot._orders.answer(robot.ticks.t, UTC, ())
-
-        robot.robots[0].lifecycle.phase = AIRBORNE
-        start(7.504)
-        assert robot.ticks.next == pytest.approx(7.004)
-        robot.robots[0].lifecycle.phase = RUNNING
-        start(7.508)
-        assert robot.ticks.next == pytest.approx(7.004)
+        runtime = process(pair(), Airborne(), "A")
+        runtime.subscribe_to_stops(net.session)
+        runtime.join(net.session)
+        runtime.ticks.t, runtime.ticks.next = 7.0, 7.01
+        for phase, at in ((AIRBORNE, 7.504), (RUNNING, 7.508)):
+            runtime.robots[0].lifecycle.phase = phase
+            net.deliver(sent("park/A/order", messages.Order("start", at=at))[0])
+            runtime.tick(7.0)
+            assert runtime.ticks.next == pytest.approx(7.004)

@@ -10,96 +10,29 @@ from typing import Any
 
 import pytest
 
-import agents.robot
-from agents.body.interface import BodyState, call_all
+from agents.body.interface import call_all
 from agents.network import messages
 from agents.network.keys import Keys
 from agents.network.name_ownership import NameKeeper
+from agents.robot import Robot
 from agents.runtime import loop
 from agents.runtime.descent import Descent, DescentTiming
-from agents.runtime.loop import Runtime, Setup
 from agents.ticks import Ticks
-from experiments.definition.experiment import Arena, Formation, RobotTable
+from experiments.definition.experiment import Arena
 from experiments.definition.plan import Plan
-from tests.agents.few import pair
-from tests.fuzz.loopnet import Net
+from tests.agents.runtime.process import DRONE, Airborne, process
 from tests.fuzz.messages import sent
+from tests.network import Net
+from tests.small import small
 
-TICKS = 5  # that the loop makes before something breaks
+STOP = sent("park/estop", messages.Stop("a test", "to see"))[0]
 QUICK = DescentTiming(landing_s=0.3, stop_s=0.1, slowest=inf)
 
 
-class Airborne:
-    """A body that flies until `steps` reads after it was told to land, and fails in the calls `broken`."""
-
-    def __init__(self, *broken: str, steps: int = 3) -> None:
-        self.broken, self.steps = broken, steps
-        self.calls: list[str] = []
-        self.reads = 0
-        self.landing = self.stopped = False
-        self.looks = lambda: None
-
-    def open(self) -> None:
-        self.calls.append("open")
-
-    def read(self, t: float) -> list[BodyState]:
-        self.reads += 1
-        if self.reads > TICKS:
-            self.looks()
-            self.fail("read")
-        self.steps -= self.landing
-        return [BodyState(t, flying=self.steps > 0 and not self.stopped)]
-
-    def command(self, setpoints: Sequence[object]) -> None:
-        if self.reads == TICKS:
-            raise OSError("the loop breaks")
-
-    def takeoff(self, rows: Sequence[int], heights: Sequence[float]) -> None: ...
-
-    def locate(self, *_: object) -> None: ...
-
-    def land(self, rows: Sequence[int]) -> None:
-        self.landing = True
-        self.tell("land")
-
-    def stop(self, rows: Sequence[int]) -> None:
-        self.stopped = True
-        self.tell("stop")
-
-    def close(self) -> None:
-        self.tell("close")
-
-    def tell(self, what: str) -> None:
-        self.calls.append(what)
-        self.fail(what)
-
-    def fail(self, what: str) -> None:
-        if what in self.broken:
-            raise OSError(f"{what} fails")
-
-    @property
-    def order(self) -> list[str]:
-        """The calls, each once, in the order of the first."""
-        return list(dict.fromkeys(self.calls))
-
-
-def run(body: Airborne, silence_s: float = 5.0, timing: DescentTiming = QUICK) -> Net:
-    """Runs a robot with that body to its end, on a network of its own."""
-    experiment = pair(robots={"F": RobotTable(kind="crazyflie", start=[0.1, 0.2], hover=0.5)}, formation=Formation())
-    with Net().worn() as net:
-        body.net = net
-        setup = Setup(
-            Keys("park"),
-            [],
-            "json",
-            50.0,
-            lifeline=False,
-            externally_measured=[False],
-            loop_timeout_s=silence_s,
-            descent=timing,
-        )
-        Runtime([Plan(experiment).assignment("F")], body, setup).run()
-    return net
+def run(body: Airborne, silence_s: float = 5.0, timing: DescentTiming = QUICK) -> None:
+    """Run a robot with that body to its end, on a network of its own."""
+    with Net().worn() as body.net:
+        process(DRONE, body, loop_timeout_s=silence_s, descent=timing).run()
 
 
 def run_and_break(body: Airborne, **given: Any) -> None:
@@ -137,15 +70,11 @@ def test_slow_descent_is_not_stopped_in_flight():
 
 @pytest.mark.parametrize(("height", "down_s"), [(1.0, 10.0), (6.0, 30.0)])
 def test_watchdog_waits_for_a_whole_descent(height, down_s):
-    robots = {
-        "F": RobotTable(kind="crazyflie", start=[0.1, 0.2], hover=0.5),
-        "B": RobotTable(kind="khepera4", start=[0.5, 0.2]),
-    }
-    plan = Plan(pair(robots=robots, formation=Formation(), arena=Arena(size=(4.0, 4.0, height))))
+    plan = Plan(small({"F": "crazyflie", "B": "khepera4"}, arena=Arena(size=(4.0, 4.0, height))))
     keeper, silent = NameKeeper(Keys("park"), "FB", 0.0), lambda _reason: None
     flying, driving = (
         Descent(
-            [agents.robot.Robot(plan.assignment(name))], Airborne(), keeper, Ticks(50.0),
+            [Robot(plan.assignment(name))], Airborne(), keeper, Ticks(50.0),
             silence_s=0.5, alarm=silent, recover=silent, timing=DescentTiming(),
         )
         for name in "FB"
@@ -175,7 +104,7 @@ def test_emergency_stop_during_a_descent():
 
     def stop() -> None:
         if body.landing and not body.stopped:
-            body.net.deliver(sent("park/estop", messages.Stop("a test", "to see"))[0])
+            body.net.deliver(STOP)
 
     body.looks = stop
     run_and_break(body, timing=replace(QUICK, landing_s=30.0))
@@ -217,7 +146,7 @@ def test_stop_between_ticks_yields_the_processor(monkeypatch):
 
     def asleep(seconds: float) -> None:
         if body.reads and not body.stopped:
-            body.net.deliver(sent("park/estop", messages.Stop("a test", "to see"))[0])
+            body.net.deliver(STOP)
             done.append(body.reads)
         elif len(done) == 1:
             done.extend((seconds, body.reads))
