@@ -1,56 +1,53 @@
+"""Sessions on a real router; and what they do about one that is silent, alarms, and connections."""
+
 from __future__ import annotations
 
 import os
+import re
 import socket
 import struct
-import subprocess
-import sys
 import threading
 import time
-from collections.abc import Callable
 from math import inf
 from pathlib import Path
 
+import psutil
 import pytest
 import zenoh
 
+from agents.network import pubsub
 from agents.network.endpoints import EndpointError, free_endpoint
 from agents.network.messages import JSON, MSGPACK, Order, Stop
-from agents.network.pubsub import (
-    NO_ORDER,
-    AliveWatch,
-    CallbackQueue,
-    ImmediateSubscriber,
-    LastValue,
-    Orders,
-    alive_token,
-    pose_publisher,
-    pose_subscriber,
-    publisher,
-    subscriber,
-)
 from agents.network.session import (
     ANSWER_S,
     ASK_EVERY_S,
+    SLICE_NS,
     RouterWatch,
     connected,
     count_links,
     forbid_lingering,
     open_session,
+    prompt_threads,
     received,
 )
-from agents.network.session import _connections as connections
 from agents.network.zenoh_config import LEASE_S, config, settings
 from agents.runtime.router import serve_router
+from tests.commands import python, started
 from tests.conftest import RouterProcess
-from tests.fuzz.loopnet import Net
+from tests.network import Net
 
-ROOT = Path(__file__).resolve().parents[3]
-POSE = "park/CF01/pose"
+POSE, ORDER, ALIVE = "park/CF01/pose", "park/CF01/order", "park/CF01/alive"
 
 
 def payloads(handler):
     return [sample.payload.to_bytes() for sample in received(handler)]
+
+
+@pytest.fixture
+def two(router):
+    """Sessions of a robot and of another process."""
+    with open_session([router.endpoint], name="CF01") as robot, open_session([router.endpoint], name="ui") as other:
+        yield robot, other
 
 
 @pytest.mark.system
@@ -59,61 +56,275 @@ def test_router_says_when_its_port_is_taken(router):
         serve_router([router.endpoint], threading.Event())
 
 
+# ---------------------------------------------------------------- poses
+
+
 @pytest.mark.mechanism("last pose for a late joiner")
 @pytest.mark.system
-def test_late_joiner_hears_the_last_pose(router, eventually):
-    with (
-        open_session([router.endpoint], name="CF01") as sender,
-        open_session([router.endpoint], name="CF02") as early,
-        open_session([router.endpoint], name="CF03") as late,
-    ):
-        seen, poses = pose_subscriber(early, POSE), pose_publisher(sender, POSE, JSON)
-        received = []
-        for value in (b"1", b"2", b"3"):
-            poses.put(value)
-        eventually(lambda: received.extend(payloads(seen.handler)) or received[-1:] == [b"3"])  # none is on its way
-        joined, received = pose_subscriber(late, "park/*/pose"), []
-        eventually(lambda: received.extend(payloads(joined.handler)) or received)
+def test_late_joiner_hears_the_last_pose(two, router, eventually):
+    sender, early = two
+    seen, poses, got = pubsub.pose_subscriber(early, POSE), pubsub.pose_publisher(sender, POSE, JSON), []
+    for value in (b"1", b"2", b"3"):
+        poses.put(value)
+    eventually(lambda: got.extend(payloads(seen.handler)) or got[-1:] == [b"3"])  # none is on its way
+    with open_session([router.endpoint], name="late") as late:
+        joined, got = pubsub.pose_subscriber(late, "park/*/pose"), []
+        eventually(lambda: got.extend(payloads(joined.handler)) or got)
         poses.put(b"4")
-        eventually(lambda: received.extend(payloads(joined.handler)) or received[-1] == b"4")
-        assert received == [b"3", b"4"]
+        eventually(lambda: got.extend(payloads(joined.handler)) or got[-1] == b"4")
+        assert got == [b"3", b"4"]
 
 
 @pytest.mark.mechanism("transmission while the router is down")
 @pytest.mark.system
-def test_pose_said_while_the_router_was_down_arrives(router, eventually):
-    with (
-        open_session([router.endpoint], name="CF01") as speaker,
-        open_session([router.endpoint], name="CF02") as listener,
-    ):
-        pose, poses = pose_publisher(speaker, POSE, JSON), pose_subscriber(listener, POSE)
-        heard = []
-        pose.put(b"before")
-        eventually(lambda: heard.extend(payloads(poses.handler)) or heard == [b"before"])
-        router.kill()
-        eventually(lambda: not connected(speaker) and not connected(listener))
-        pose.put(b"while down")
-        router.start()
-        eventually(lambda: heard.extend(payloads(poses.handler)) or b"while down" in heard)
-        assert connected(speaker)
-        assert heard[-1] == b"while down"
+def test_pose_said_while_the_router_was_down_arrives(two, router, eventually):
+    sender, receiver = two
+    pose, poses, got = pubsub.pose_publisher(sender, POSE, JSON), pubsub.pose_subscriber(receiver, POSE), []
+    pose.put(b"before")
+    eventually(lambda: got.extend(payloads(poses.handler)) or got == [b"before"])
+    router.kill()
+    eventually(lambda: not connected(sender) and not connected(receiver))
+    pose.put(b"while down")
+    router.start()
+    eventually(lambda: got.extend(payloads(poses.handler)) or b"while down" in got)
+    assert connected(sender)
+    assert got[-1] == b"while down"
 
 
-@pytest.mark.mechanism("client at a second router")
 @pytest.mark.system
-def test_client_fails_over_to_the_second_router(router, eventually):
-    second = type(router)()
-    with open_session([router.endpoint, second.endpoint], name="CF01") as session:
-        first = session.info.routers_zid()
-        router.kill()
-        eventually(lambda: connected(session) and session.info.routers_zid() != first)
-    assert second.stop() == 0
+def test_queues_keep_the_newest(two, eventually):
+    robot, other = two
+    bell = pubsub.Bell()
+    wanted = pubsub.CallbackQueue[zenoh.Sample](2, lambda sample: sample.payload.to_bytes() != b"9")
+    assert list(received(wanted)) == []
+    other.declare_subscriber(POSE, wanted.callback)
+    ringing = pubsub.RingingSubscriber(other, POSE, bell, depth=2)
+    states, last = pubsub.subscriber(other, POSE, depth=3), pubsub.subscriber(other, "park/control")
+    poses = pubsub.publisher(robot, POSE, JSON)
+    eventually(lambda: poses.matching_status.matching)
+    for value in range(10):
+        poses.put(str(value))
+    pubsub.publisher(robot, "park/control", JSON).put(b"behind")
+    eventually(lambda: payloads(last.handler))
+    assert bell.wait(10.0)
+    assert payloads(states.handler) == [b"7", b"8", b"9"]
+    assert payloads(wanted) == [b"7", b"8"]
+    assert payloads(ringing) == [b"8", b"9"]
+    assert ringing.try_recv() is None
+    assert list(received(wanted)) == []
+
+
+def test_rings_before_a_wait_are_one():
+    bell = pubsub.Bell()
+    bell.ring()
+    bell.ring()
+    assert bell.wait(0.0)
+    assert not bell.wait(0.0)
+
+
+# ---------------------------------------------------------------- queries
+
+
+@pytest.mark.system
+def test_last_value_answers_a_plain_get(two, eventually):
+    robot, other = two
+    asker = other.declare_querier(POSE, timeout=5.0)  # a wildcard is never told that it matches
+    last = pubsub.LastValue(robot, POSE, JSON)
+    eventually(lambda: asker.matching_status.matching)
+    empty = other.get("park/*/pose", timeout=5.0)
+    eventually(last.answer)
+    assert list(empty) == []
+    last.hold(b"1")
+    last.hold(b"2")
+    asked = other.get("park/*/pose", timeout=5.0)
+    eventually(last.answer)
+    (reply,) = [reply.ok for reply in asked]
+    assert (str(reply.key_expr), reply.payload.to_bytes(), str(reply.encoding)) == (POSE, b"2", JSON)
+
+
+@pytest.mark.system
+def test_orders_wait_until_they_are_polled(two, eventually):
+    robot, other = two
+    orders = pubsub.Orders(robot, ORDER, Order)
+    asker = other.declare_querier(ORDER)
+    eventually(lambda: asker.matching_status.matching)
+    asked, waiting = other.get("park/*/order", payload=b'{"order": "land"}', timeout=5.0), []
+    eventually(lambda: waiting.extend(orders.read()) or waiting)
+    ((query, order),) = waiting
+    with query:
+        assert order == Order("land")
+        query.reply(ORDER, b"ok")
+    assert [reply.ok.payload.to_bytes() for reply in asked] == [b"ok"]
+    # a query without a payload is no order
+    for key, told in (("park/**", []), ("park/*/order", []), (ORDER, [pubsub.NO_ORDER])):
+        asked, waiting, replies = other.get(key, timeout=5.0), [], []
+        ended = threading.Thread(target=lambda asked=asked, replies=replies: replies.extend(asked))
+        ended.start()
+        eventually(lambda w=waiting, e=ended: w.extend(orders.read()) or not e.is_alive())
+        assert [reply.err.payload.to_string() for reply in replies] == told
+        assert not waiting
+
+
+# ---------------------------------------------------------------- ends of processes
+
+
+ROBOT = """
+import sys
+from agents.network.messages import Order
+from agents.network.pubsub import Orders, alive_token, pose_publisher, pose_subscriber
+from agents.network.session import open_session
+session = open_session([sys.argv[1]], name="CF01")
+held = [
+    alive_token(session, "park/CF01/alive"),
+    pose_publisher(session, "park/CF01/pose", "application/json"),
+    pose_subscriber(session, "park/CF02/pose"),
+    Orders(session, "park/CF01/order", Order),
+]
+print("ready", flush=True)
+sys.stdin.read()
+"""
+
+
+@pytest.mark.mechanism("exit with an open session")
+@pytest.mark.system
+def test_interpreter_exits_although_a_session_was_left_open(router):
+    done = python("-c", ROBOT, router.endpoint)
+    assert (done.stdout, done.stderr) == ("ready\n", "")
+
+
+@pytest.mark.mechanism("liveliness")
+@pytest.mark.system
+def test_a_killed_robot_is_noticed(router, eventually):
+    with started("-c", ROBOT, router.endpoint) as robot, open_session([router.endpoint], name="CF02") as session:
+        assert robot.stdout.readline() == "ready\n"
+        own = pubsub.alive_token(session, "park/CF02/alive")
+        watch, seen = pubsub.AliveWatch(session, "park/*/alive"), []
+        eventually(lambda: seen.extend(watch.changes()) or len(seen) == 2)
+        assert set(seen) == {(ALIVE, True), ("park/CF02/alive", True)}
+        for key in ("park/**", "park/*/alive"):  # on the keys of everybody: nobody's life, and nobody's death
+            pubsub.alive_token(session, key).undeclare()
+        robot.kill()
+        seen.clear()
+        eventually(lambda: seen.extend(watch.changes()) or seen)
+        assert seen == [(ALIVE, False)]
+        assert connected(session)
+        own.undeclare()
+
+
+# ---------------------------------------------------------------- silent routers
+
+
+class Question:
+    answered = False
+
+    def try_recv(self) -> None:
+        if self.answered:
+            raise zenoh.ZError("the answer is complete")
+
+
+class Asked:
+    """What `RouterWatch` needs of a session: who is linked, and questions that are answered by hand."""
+
+    def __init__(self) -> None:
+        self.info = self
+        self.routers, self.peers = ["router"], []
+        self.questions: list[Question] = []
+
+    def routers_zid(self) -> list[str]:
+        return self.routers
+
+    def peers_zid(self) -> list[str]:
+        return self.peers
+
+    def liveliness(self) -> Asked:
+        return self
+
+    def get(self, *_: object, **__: object) -> Question:
+        self.questions.append(Question())
+        return self.questions[-1]
+
+
+def looks(watch: RouterWatch, begin: float, end: float) -> float:
+    """What a watch says at last that is looked at 50 times a second."""
+    ticks = range(round(begin * 50), round(end * 50) + 1)
+    return [watch.silent_since(tick / 50) for tick in ticks][-1]
+
+
+@pytest.fixture
+def asked():
+    """A session, and the watch of its router."""
+    session = Asked()
+    return session, RouterWatch(session, ALIVE)
+
+
+def test_one_answer_after_silence_may_be_closing_link(asked):
+    session, watch = asked
+    assert looks(watch, 0.0, ANSWER_S) == inf
+    silent = pytest.approx(0.0)
+    assert looks(watch, 0.32, 0.46) == silent
+    assert len(session.questions) == 2
+    for question in session.questions:
+        question.answered = True
+    assert watch.silent_since(0.5) == silent
+    session.routers = []
+    assert watch.silent_since(0.52) == silent, "it goes on, and does not begin anew"
+    session.routers = ["another"]
+    for t in (0.54, 0.56):
+        assert watch.silent_since(t) == silent
+        session.questions[-1].answered = True
+    assert watch.silent_since(0.58) == inf
+
+
+def test_starved_process_does_not_blame_the_router(asked):
+    _, watch = asked
+    assert [watch.silent_since(t) for t in (0.0, 5.0, 5.5)] == [inf] * 3
+    assert looks(watch, 5.52, 5.56) == inf
+    assert looks(watch, 5.58, 5.7) == pytest.approx(5.3, abs=0.03)
+
+
+def test_router_that_delivers_samples_is_not_asked(asked):
+    session, watch = asked
+    ticks = [tick / 20 for tick in range(40)]
+    assert [watch.silent_since(t, arrived) for arrived, t in enumerate(ticks, 1)] == [inf] * len(ticks)
+    assert not session.questions
+    last = ticks[-1]
+    looked = [(t, watch.silent_since(t, len(ticks))) for t in (last + tick / 50 for tick in range(1, 40))]
+    begin = last + ASK_EVERY_S
+    assert next(t for t, since in looked if since < inf) == pytest.approx(begin + ANSWER_S, abs=0.05)
+    assert looked[-1][1] == pytest.approx(begin, abs=0.05)
+    assert watch.silent_since(looked[-1][0] + 0.02, len(ticks) + 1) < inf, "what was on its way is no answer"
+
+
+def test_members_of_a_mesh_are_not_asked(asked):
+    session, watch = asked
+    session.routers, session.peers = [], ["KH01"]
+    assert [watch.silent_since(t) for t in (0.0, 1.0, 2.0)] == [inf] * 3
+    session.peers = []
+    assert [watch.silent_since(t) for t in (3.0, 4.0)] == [3.0] * 2
+    assert not session.questions
+
+
+def test_silent_router_is_left_only_for_another(monkeypatch):
+    left = []
+    monkeypatch.setattr("agents.network.session.hang_up", left.append)
+    for endpoints, times in ((["one"], 0), (["one", "other"], 1)):
+        session = Asked()
+        watch = RouterWatch(session, ALIVE, endpoints)
+        looks(watch, 0.0, LEASE_S)
+        assert not left, "as long as one of ours would be waited for"
+        looks(watch, LEASE_S + 0.02, LEASE_S + 0.1)
+        assert len(left) == times
+    session.routers = []
+    looks(watch, LEASE_S + 0.12, 2.0 * LEASE_S + 0.5)
+    session.routers = ["other"]
+    looks(watch, 2.0 * LEASE_S + 0.52, 2.0 * LEASE_S + 0.54)
+    assert len(left) == 1, "the next one has as much time"
 
 
 @pytest.mark.system
 def test_a_frozen_router_is_silent_whatever_its_lease(patient_router, eventually):
     with open_session([patient_router.endpoint], name="CF01") as session:
-        watch, begun = RouterWatch(session, "park/CF01/alive"), time.monotonic()
+        watch, begun = RouterWatch(session, ALIVE), time.monotonic()
 
         def silent_since() -> float:
             return watch.silent_since(time.monotonic() - begun)
@@ -141,297 +352,79 @@ def test_router_that_waits_for_another_is_not_silent(patient_router):
         config(settings("router", listen=[near := free_endpoint(0)], connect=[patient_router.endpoint]))
     )
     with linked, open_session([near], name="CF01") as session, patient_router.frozen():
-        watch, begun = RouterWatch(session, "park/CF01/alive"), time.monotonic()
+        watch, begun = RouterWatch(session, ALIVE), time.monotonic()
         while (t := time.monotonic() - begun) < 4 * ASK_EVERY_S:
             assert watch.silent_since(t) == inf
 
 
-class Asked:
-    """What `RouterWatch` needs of a session: who is linked, and questions that are answered by hand."""
-
-    def __init__(self) -> None:
-        self.info = self
-        self.routers, self.peers = ["router"], []
-        self.questions: list[Question] = []
-
-    def routers_zid(self) -> list[str]:
-        return self.routers
-
-    def peers_zid(self) -> list[str]:
-        return self.peers
-
-    def liveliness(self) -> Asked:
-        return self
-
-    def get(self, *_: object, **__: object) -> Question:
-        self.questions.append(Question())
-        return self.questions[-1]
+@pytest.fixture
+def second():
+    """Another router, whose clients wait for 60 s."""
+    made = RouterProcess(lease_s=60.0)
+    yield made
+    assert made.stop() == 0
 
 
-class Question:
-    answered = False
-
-    def try_recv(self) -> None:
-        if self.answered:
-            raise zenoh.ZError("the answer is complete")
-
-
-def looks(watch: RouterWatch, begin: float, end: float) -> float:
-    """What a watch says at last that is looked at 50 times a second."""
-    ticks = range(round(begin * 50), round(end * 50) + 1)
-    return [watch.silent_since(tick / 50) for tick in ticks][-1]
-
-
-def test_one_answer_after_silence_may_be_closing_link():
-    session = Asked()
-    watch = RouterWatch(session, "park/CF01/alive")
-    assert looks(watch, 0.0, ANSWER_S) == inf
-    silent = pytest.approx(0.0)
-    assert looks(watch, 0.32, 0.46) == silent
-    assert len(session.questions) == 2
-    for question in session.questions:
-        question.answered = True
-    assert watch.silent_since(0.5) == silent
-    session.routers = []
-    assert watch.silent_since(0.52) == silent, "it goes on, and does not begin anew"
-    session.routers = ["another"]
-    for t in (0.54, 0.56):
-        assert watch.silent_since(t) == silent
-        session.questions[-1].answered = True
-    assert watch.silent_since(0.58) == inf
-
-
-def test_starved_process_does_not_blame_the_router():
-    session = Asked()
-    watch = RouterWatch(session, "park/CF01/alive")
-    stalls = [0.0, 5.0, 5.5]
-    assert [watch.silent_since(t) for t in stalls] == [inf] * len(stalls)
-    assert looks(watch, 5.52, 5.56) == inf
-    assert looks(watch, 5.58, 5.7) == pytest.approx(5.3, abs=0.03)
-
-
-def test_router_that_delivers_samples_is_not_asked():
-    session = Asked()
-    watch = RouterWatch(session, "park/CF01/alive")
-    ticks = [tick / 20 for tick in range(40)]
-    assert [watch.silent_since(t, arrived) for arrived, t in enumerate(ticks, 1)] == [inf] * len(ticks)
-    assert not session.questions
-    last = ticks[-1]
-    looked = [(t, watch.silent_since(t, len(ticks))) for t in (last + tick / 50 for tick in range(1, 40))]
-    asked = last + ASK_EVERY_S
-    assert next(t for t, since in looked if since < inf) == pytest.approx(asked + ANSWER_S, abs=0.05)
-    assert looked[-1][1] == pytest.approx(asked, abs=0.05)
-    assert watch.silent_since(looked[-1][0] + 0.02, len(ticks) + 1) < inf, "what was on its way is no answer"
-
-
-def test_silent_router_is_left_only_for_another(monkeypatch):
-    left = []
-    monkeypatch.setattr("agents.network.session.hang_up", left.append)
-    for endpoints, times in ((["one"], 0), (["one", "other"], 1)):
-        session = Asked()
-        watch = RouterWatch(session, "park/CF01/alive", endpoints)
-        looks(watch, 0.0, LEASE_S)
-        assert not left, "as long as one of ours would be waited for"
-        looks(watch, LEASE_S + 0.02, LEASE_S + 0.1)
-        assert len(left) == times
-    session.routers = []
-    looks(watch, LEASE_S + 0.12, 2.0 * LEASE_S + 0.5)
-    session.routers = ["other"]
-    looks(watch, 2.0 * LEASE_S + 0.52, 2.0 * LEASE_S + 0.54)
-    assert len(left) == 1, "the next one has as much time"
+@pytest.mark.mechanism("client at a second router")
+@pytest.mark.system
+def test_client_fails_over_to_the_second_router(router, second, eventually):
+    with open_session([router.endpoint, second.endpoint], name="CF01") as session:
+        first = session.info.routers_zid()
+        router.kill()
+        eventually(lambda: connected(session) and session.info.routers_zid() != first)
 
 
 @pytest.mark.system
-def test_second_router_takes_over_from_frozen_long_lease(patient_router, eventually):
-    second = RouterProcess(lease_s=60.0)
+def test_second_router_takes_over_from_frozen_long_lease(patient_router, second, eventually):
     ends = [patient_router.endpoint, second.endpoint]
     with open_session(ends, name="CF01") as robot, open_session(ends, name="CF02") as listener:
-        begun = time.monotonic()
-        watches = [RouterWatch(each, "park/CF01/alive", ends) for each in (robot, listener)]
-        token = alive_token(robot, "park/CF01/alive")
-        poses, heard = pose_publisher(robot, POSE, JSON), pose_subscriber(listener, POSE)
-        alive, here = AliveWatch(listener, "park/*/alive"), [zenoh.SampleKind.DELETE]
-        got: list[int] = []
-        said = 0
+        begun, sent, got, here = time.monotonic(), [0], [], [False]
+        watches = [RouterWatch(each, ALIVE, ends) for each in (robot, listener)]
+        token = pubsub.alive_token(robot, ALIVE)
+        poses, heard = pubsub.pose_publisher(robot, POSE, JSON), pubsub.pose_subscriber(listener, POSE)
+        alive = pubsub.AliveWatch(listener, "park/*/alive")
 
-        def goes_round() -> None:
-            nonlocal said
-            for watch in watches:
-                watch.silent_since(time.monotonic() - begun, len(got) if watch is watches[1] else 0)
-            said += 1
-            poses.put(str(said).encode())
-            got.extend(int(payload) for payload in payloads(heard.handler))
-            here[:] = [*here, *(sample.kind for sample in received(alive.handler))][-1:]
+        def until(true) -> None:
+            """Until something is true, let both processes watch their router, and poses be sent."""
 
-        def until(true: Callable[[], object]) -> None:
-            eventually(lambda: (goes_round(), true())[1])
+            def turn():
+                for watch in watches:
+                    watch.silent_since(time.monotonic() - begun, len(got) if watch is watches[1] else 0)
+                sent.append(sent[-1] + 1)
+                poses.put(str(sent[-1]).encode())
+                got.extend(int(payload) for payload in payloads(heard.handler))
+                here.extend(there for _, there in alive.changes())
+                return true()
 
-        def arrived() -> None:
-            mark = said
+            eventually(turn)
+
+        def arrive() -> None:
+            mark = sent[-1]
             until(lambda: got and got[-1] > mark)
             assert got == sorted(set(got)), "each once, in order"
-            until(lambda: here == [zenoh.SampleKind.PUT])
+            until(lambda: here[-1])
 
-        arrived()
-        old = {str(zid) for zid in robot.info.routers_zid()}
+        def routers() -> set[str]:
+            return {str(zid) for zid in robot.info.routers_zid()}
+
+        arrive()
+        old = routers()
         with patient_router.frozen():
             os.waitpid(patient_router.process.pid, os.WUNTRACED)
-            until(lambda: {str(zid) for zid in robot.info.routers_zid()} not in (old, set()))
-            arrived()
+            until(lambda: routers() not in (old, set()))
+            arrive()
             assert count_links(robot) == count_links(listener) == 1
-        arrived()
+        arrive()
         token.undeclare()
-        until(lambda: here == [zenoh.SampleKind.DELETE])
-    assert second.stop() == 0
+        until(lambda: not here[-1])
 
 
-def test_members_of_a_mesh_are_not_asked():
-    session = Asked()
-    session.routers, session.peers = [], ["KH01"]
-    watch = RouterWatch(session, "park/CF01/alive")
-    assert [watch.silent_since(t) for t in (0.0, 1.0, 2.0)] == [inf] * 3
-    session.peers = []
-    assert [watch.silent_since(t) for t in (3.0, 4.0)] == [3.0] * 2
-    assert not session.questions
-
-
-@pytest.mark.system
-def test_last_value_answers_a_plain_get(router, eventually):
-    with open_session([router.endpoint], name="CF01") as robot, open_session([router.endpoint], name="ui") as ui:
-        asker = ui.declare_querier(POSE, timeout=5.0)  # a wildcard is never told that it matches
-        last = LastValue(robot, POSE, JSON)
-        eventually(lambda: asker.matching_status.matching)
-        empty = ui.get("park/*/pose", timeout=5.0)
-        eventually(last.answer)
-        assert list(empty) == []
-        last.hold(b"1")
-        last.hold(b"2")
-        asked = ui.get("park/*/pose", timeout=5.0)
-        eventually(last.answer)
-        replies = [reply.ok for reply in asked]
-        assert [(str(reply.key_expr), reply.payload.to_bytes(), str(reply.encoding)) for reply in replies] == [
-            (POSE, b"2", JSON)
-        ]
-
-
-@pytest.mark.system
-def test_orders_wait_until_they_are_polled(router, eventually):
-    with open_session([router.endpoint], name="CF01") as robot, open_session([router.endpoint], name="ui") as ui:
-        taken = Orders(robot, "park/CF01/order", Order)
-        asker = ui.declare_querier("park/CF01/order")
-        eventually(lambda: asker.matching_status.matching)
-        asked = ui.get("park/*/order", payload=b'{"order": "land"}', timeout=5.0)
-        waiting = []
-        eventually(lambda: waiting.extend(taken.read()) or waiting)
-        ((query, order),) = waiting
-        with query:
-            assert order == Order("land")
-            query.reply("park/CF01/order", b"ok")
-        assert [reply.ok.payload.to_bytes() for reply in asked] == [b"ok"]
-
-
-@pytest.mark.system
-def test_a_query_without_payload_is_no_order(router, eventually):
-    with open_session([router.endpoint], name="CF01") as robot, open_session([router.endpoint], name="ui") as ui:
-        taken = Orders(robot, "park/CF01/order", Order)
-        asker = ui.declare_querier("park/CF01/order")
-        eventually(lambda: asker.matching_status.matching)
-        for key, told in (("park/**", []), ("park/*/order", []), ("park/CF01/order", [NO_ORDER])):
-            asked, waiting, replies = ui.get(key, timeout=5.0), [], []
-            ended = threading.Thread(target=lambda asked=asked, replies=replies: replies.extend(asked))
-            ended.start()
-            eventually(lambda w=waiting, e=ended: w.extend(taken.read()) or not e.is_alive())
-            assert [reply.err.payload.to_string() for reply in replies] == told
-            assert not waiting
-
-
-@pytest.mark.system
-def test_telemetry_keeps_the_newest(router, eventually):
-    with open_session([router.endpoint], name="CF01") as robot, open_session([router.endpoint], name="recorder") as ui:
-        states, control = subscriber(ui, "park/*/state", depth=3), subscriber(ui, "park/control")
-        state = publisher(robot, "park/CF01/state", JSON)
-        eventually(lambda: state.matching_status.matching)
-        for value in range(10):
-            state.put(str(value))
-        publisher(robot, "park/control", JSON).put(b"behind")
-        eventually(lambda: payloads(control.handler))
-        assert payloads(states.handler) == [b"7", b"8", b"9"]
-
-
-ROBOT = """
-import sys
-from agents.network.messages import Order
-from agents.network.pubsub import Orders, alive_token, pose_publisher, pose_subscriber
-from agents.network.session import open_session
-session = open_session([sys.argv[1]], name="CF01")
-held = [
-    alive_token(session, "park/CF01/alive"),
-    pose_publisher(session, "park/CF01/pose", "application/json"),
-    pose_subscriber(session, "park/CF02/pose"),
-    Orders(session, "park/CF01/order", Order),
-]
-print("ready", flush=True)
-sys.stdin.read()
-"""
-
-
-@pytest.mark.mechanism("exit with an open session")
-@pytest.mark.system
-def test_interpreter_exits_although_a_session_was_left_open(router):
-    done = subprocess.run(
-        [sys.executable, "-c", ROBOT, router.endpoint],
-        cwd=ROOT,
-        input="",
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
-    assert (done.returncode, done.stdout, done.stderr) == (0, "ready\n", "")
-
-
-@pytest.mark.system
-def test_an_inbox_keeps_the_newest_wanted_items(router, eventually):
-    inbox = CallbackQueue[zenoh.Sample](2, lambda sample: sample.payload.to_bytes() != b"1")
-    assert list(received(inbox)) == []
-    with open_session([router.endpoint], name="CF01") as session:
-        session.declare_subscriber(POSE, inbox.callback)
-        for number in (b"0", b"1", b"2", b"3"):
-            session.put(POSE, number)
-        got = []
-        eventually(lambda: got.extend(payloads(inbox)) or got)
-        assert got == [b"2", b"3"]
-        assert list(received(inbox)) == []
-
-
-@pytest.mark.mechanism("liveliness")
-@pytest.mark.system
-def test_a_killed_robot_is_noticed(router, eventually):
-    robot = subprocess.Popen(
-        [sys.executable, "-c", ROBOT, router.endpoint], cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE
-    )
-    with robot, open_session([router.endpoint], name="CF02") as session:
-        assert robot.stdout.readline() == b"ready\n"
-        own = alive_token(session, "park/CF02/alive")
-        watch = AliveWatch(session, "park/*/alive")
-        seen = []
-        eventually(lambda: seen.extend(received(watch.handler)) or len(seen) == 2)
-        assert {str(sample.key_expr) for sample in seen} == {"park/CF01/alive", "park/CF02/alive"}
-        assert all(sample.kind == zenoh.SampleKind.PUT for sample in seen)
-        for key in ("park/**", "park/*/alive"):  # on the keys of everybody: nobody's life, and nobody's death
-            alive_token(session, key).undeclare()
-        robot.kill()
-        seen.clear()
-        eventually(lambda: seen.extend(received(watch.handler)) or seen)
-        assert [str(sample.key_expr) for sample in seen] == ["park/CF01/alive"]
-        assert seen[0].kind == zenoh.SampleKind.DELETE
-        assert connected(session)
-        own.undeclare()
+# ---------------------------------------------------------------- alarms
 
 
 @pytest.mark.mechanism("emergency stop before everything else that came")
 @pytest.mark.system
-def test_alarm_is_obeyed_at_once_and_keeps_orders(router, eventually):
+def test_alarm_is_obeyed_at_once_and_keeps_orders(two, eventually):
     whole = b'{"operator": "ana", "reason": "fire"}'
     said = [  # by zenpark; by z_put and zenoh-cli; by `curl -X PUT -d`, with a header, with --json; by anything at all
         (whole, JSON, "by ana: fire"),
@@ -446,30 +439,30 @@ def test_alarm_is_obeyed_at_once_and_keeps_orders(router, eventually):
         (b"\x81\xa8operator\xa3ana", MSGPACK, "by ana"),
         (b"\xff\x00\x1b[2J", "image/png", "by an unknown sender: \N{REPLACEMENT CHARACTER}  [2J"),
     ]
-    with open_session([router.endpoint], name="CF01") as robot, open_session([router.endpoint], name="ui") as ui:
-        obeyed = []
-        alarm = ImmediateSubscriber(robot, "park/estop", obeyed.append, depth=2)
-        speaker = publisher(ui, "park/estop", JSON)
-        eventually(lambda: speaker.matching_status.matching)
-        ui.delete("park/estop")  # no stop
-        ui.delete("park/**")
-        for payload, encoding, _ in said:
-            ui.put("park/estop", payload, encoding=encoding)
-        ui.put("park/**", b"everybody", encoding="text/plain")
-        eventually(lambda: len(obeyed) > len(said))
-        words = [f"emergency stop {text}" for *_, text in said]
-        assert [stop.words for stop in obeyed] == [*words, "emergency stop by an unknown sender: everybody"]
-        kept = []
-        eventually(lambda: kept.extend(received(alarm)) or kept[-2:] == obeyed[-2:])
-        assert len(kept) <= 3  # the newest two, and one that came while they were polled
-        assert alarm.try_recv() is None
+    robot, other = two
+    obeyed = []
+    alarm = pubsub.ImmediateSubscriber(robot, "park/estop", obeyed.append, depth=2)
+    speaker = pubsub.publisher(other, "park/estop", JSON)
+    eventually(lambda: speaker.matching_status.matching)
+    other.delete("park/estop")  # no stop
+    other.delete("park/**")
+    for payload, encoding, _ in said:
+        other.put("park/estop", payload, encoding=encoding)
+    other.put("park/**", b"everybody", encoding="text/plain")
+    eventually(lambda: len(obeyed) > len(said))
+    words = [f"emergency stop {text}" for *_, text in said]
+    assert [stop.words for stop in obeyed] == [*words, "emergency stop by an unknown sender: everybody"]
+    kept = []
+    eventually(lambda: kept.extend(received(alarm)) or kept[-2:] == obeyed[-2:])
+    assert len(kept) <= 3  # the newest two, and one that came while they were polled
+    assert alarm.try_recv() is None
 
 
 def test_stop_waits_for_loop_after_being_obeyed():
     """A loop that polls in between would think that its motors are off, and then they are cut for ever."""
     seen = []
     net = Net()
-    alarm = ImmediateSubscriber(net.session, "park/estop", lambda _stop: seen.append(alarm.try_recv()))
+    alarm = pubsub.ImmediateSubscriber(net.session, "park/estop", lambda _stop: seen.append(alarm.try_recv()))
     net.deliver(b"park/estop\0text/plain\0stop")
     assert seen == [None]
     assert alarm.try_recv() == Stop("an unknown sender", "stop")
@@ -477,17 +470,22 @@ def test_stop_waits_for_loop_after_being_obeyed():
     def fails(_stop):
         raise OSError("a body that cannot be told")
 
-    alarm = ImmediateSubscriber(net.session, "park/estop", fails)
+    alarm = pubsub.ImmediateSubscriber(net.session, "park/estop", fails)
     with pytest.raises(OSError, match="cannot be told"):
         net.deliver(b"park/estop\0text/plain\0stop")
     assert alarm.try_recv() == Stop("an unknown sender", "stop")
 
 
-def lingers(connection: socket.socket) -> bool:
-    return bool(struct.unpack("ii", connection.getsockopt(socket.SOL_SOCKET, socket.SO_LINGER, 8))[0])
+# ---------------------------------------------------------------- connections and threads
 
 
-def test_a_connection_closes_without_lingering() -> None:
+def lingers(descriptor: int) -> bool:
+    """Whether a connection waits, when it is closed, for data that are on their way."""
+    with socket.socket(fileno=os.dup(descriptor)) as one:
+        return bool(struct.unpack("ii", one.getsockopt(socket.SOL_SOCKET, socket.SO_LINGER, 8))[0])
+
+
+def test_a_connection_closes_without_lingering():
     """A thread of Zenoh that closes the connection to a frozen process serves all others as well."""
     with socket.create_server(("127.0.0.1", 0)) as server, socket.create_connection(server.getsockname()) as near:
         far, _ = server.accept()
@@ -495,13 +493,13 @@ def test_a_connection_closes_without_lingering() -> None:
             for each in (near, far):
                 each.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 10))
             assert forbid_lingering() >= 2
-            assert not lingers(near)
-            assert not lingers(far)
+            assert not lingers(near.fileno())
+            assert not lingers(far.fileno())
 
 
 @pytest.mark.mechanism("router that closes without lingering")
 @pytest.mark.system
-def test_a_router_closes_no_connection_slowly(eventually) -> None:
+def test_a_router_closes_no_connection_slowly(eventually):
     """The router serves in this process, whose ends of the connections can be read."""
     endpoint, stop = free_endpoint(preferred_port=0), threading.Event()
     thread = threading.Thread(target=serve_router, args=([endpoint], stop))
@@ -511,10 +509,33 @@ def test_a_router_closes_no_connection_slowly(eventually) -> None:
             port = int(endpoint.rpartition(":")[2])
 
             def ends() -> list[bool]:
-                with connections() as found:
-                    return [lingers(each.socket) for each in found if each.near.endswith(f":{port}")]
+                found = psutil.Process().net_connections("tcp")
+                return [lingers(each.fd) for each in found if each.laddr.port == port and each.raddr]
 
             eventually(lambda: ends() == [False])
     finally:
         stop.set()
         thread.join()
+
+
+def granted() -> int:
+    """The slice of this thread [ns], as the kernel says it."""
+    try:
+        found = re.search(r"se\.slice\s*:\s*(\d+)", Path("/proc/thread-self/sched").read_text())
+    except OSError:
+        found = None
+    if found is None:
+        pytest.skip("this kernel does not say how long slices are")
+    return int(found[1])
+
+
+def test_threads_that_are_started_inside_have_short_slices():
+    before, inside = granted(), []
+    with prompt_threads():
+        if granted() != SLICE_NS:
+            pytest.skip("this kernel grants no slices")
+        thread = threading.Thread(target=lambda: inside.append(granted()))
+        thread.start()
+        thread.join()
+    assert inside == [SLICE_NS]
+    assert granted() == before > SLICE_NS
