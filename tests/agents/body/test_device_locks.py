@@ -1,15 +1,11 @@
 """One process for each device: the second is refused by name, and a lock ends with its process."""
 
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
 
 from agents.body.device_locks import Claims, numeric
 from agents.body.interface import BodyError
 from agents.protocols.crazyflie import device_of
+from tests.commands import started
 
 HOLDER = """
 from agents.body.device_locks import Claims
@@ -20,12 +16,12 @@ input()
 
 
 @pytest.fixture(autouse=True)
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(tmp_path, monkeypatch):
     monkeypatch.setenv("ZENPARK_RUNTIME_DIR", str(tmp_path / "runs"))
     return tmp_path / "runs"
 
 
-def test_device_has_one_holder_until_released(folder: Path) -> None:
+def test_device_has_one_holder_until_released(folder):
     first, second = Claims(["A", "B"], ["one", "two"]), Claims(["C", "D"], ["three", "two"])
     first.take()
     with pytest.raises(BodyError, match=r"^D: two is in use: this process drives it for B; end that first$"):
@@ -41,26 +37,19 @@ def test_device_has_one_holder_until_released(folder: Path) -> None:
     third.release()
 
 
-def test_holder_is_named_and_its_death_frees_device(folder: Path) -> None:
-    other = subprocess.Popen(
-        [sys.executable, "-c", HOLDER], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=dict(os.environ)
-    )
-    assert other.stdout is not None
-    try:
+def test_holder_is_named_and_its_death_frees_device(folder):
+    mine = Claims(["CF01"], ["radio 80"])
+    with started("-c", HOLDER) as other:
         assert other.stdout.readline() == "has it\n"
-        mine = Claims(["CF01"], ["radio 80"])
         with pytest.raises(BodyError, match=f"^CF01: radio 80 is in use: process {other.pid} drives it for CF07; end"):
             mine.take()
-    finally:
-        other.kill()
-        other.communicate()
     assert len(list(folder.iterdir())) == 1  # the file is left, the lock is not
     mine.take()
     mine.release()
     assert list(folder.iterdir()) == []
 
 
-def test_without_a_folder_nothing_is_driven(folder: Path) -> None:
+def test_without_a_folder_nothing_is_driven(folder):
     folder.mkdir(0o755)
     folder.chmod(0o777)
     with pytest.raises(
@@ -69,26 +58,21 @@ def test_without_a_folder_nothing_is_driven(folder: Path) -> None:
         Claims(["CF01"], ["radio 80"]).take()
 
 
-@pytest.mark.parametrize(
-    ("one", "other"),
-    [
+def test_spellings_of_one_crazyflie_are_one_device():
+    spellings = [
         ("radio://0/80/2M", "radio://1/80/2M/e7e7e7e7e7?rate_limit=100"),
         ("radio://0/80/2M/E7E7E7E701", "radio://0/80/2M/e7e7e7e701"),
         ("radio://0/80/2M/1", "radio://E7ABCD/80/2M/0000000001"),
         ("usb://0", "usb://00"),
         ("udp://localhost:19850", "udp://127.0.0.1:19850"),
-    ],
-)
-def test_two_spellings_of_one_crazyflie(one: str, other: str) -> None:
-    assert device_of(one) == device_of(other)
+        *(("radio://0/80/2M/E7E7E7E702",), ("radio://0/81/2M/E7E7E7E701",), ("radio://0/80/1M/E7E7E7E701",)),
+        *(("usb://1",), ("udp://127.0.0.1:1",), ("udp://127.0.0.1:2",)),
+    ]
+    devices = [{device_of(address) for address in addresses} for addresses in spellings]
+    assert [len(each) for each in devices] == [1] * len(spellings)
+    assert len(set.union(*devices)) == len(spellings)
 
 
-def test_different_crazyflies_are_different() -> None:
-    addresses = ["radio://0/80/2M/E7E7E7E701", "radio://0/80/2M/E7E7E7E702", "radio://0/81/2M/E7E7E7E701"]
-    addresses += ["radio://0/80/1M/E7E7E7E701", "usb://0", "usb://1", "udp://127.0.0.1:1", "udp://127.0.0.1:2"]
-    assert len({device_of(address) for address in addresses}) == len(addresses)
-
-
-def test_unresolvable_host_keeps_its_name() -> None:
+def test_unresolvable_host_keeps_its_name():
     assert numeric("No.Such.invalid") == "no.such.invalid"
     assert numeric("127.1") == "127.0.0.1"

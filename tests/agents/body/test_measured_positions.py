@@ -1,11 +1,12 @@
 """Positions by a clock that is off: what is stamped ahead hides no silence, and people are told how far it is off."""
 
-from collections.abc import Callable
-from math import inf, isnan
+from math import inf, isnan, nan
 from random import Random
+from types import SimpleNamespace
 
 import pytest
 
+from agents.body.external_pose import FASTEST, PATIENCE_S, External
 from agents.body.fleet import assemble
 from agents.body.interface import BodyState
 from agents.body.measured_positions import FROZEN, SECOND, MeasuredPositions
@@ -13,14 +14,13 @@ from agents.decision.lifecycle import Phase
 from agents.network import messages
 from agents.network.keys import Keys
 from agents.runtime.loop import Runtime, Setup
-from agents.safety.detection import clock_text
+from agents.vectors import UNKNOWN
 from experiments.definition import bodies
-from experiments.definition.experiment import Formation, RobotTable
+from experiments.definition.experiment import RobotTable
 from experiments.definition.plan import Plan
-from tests.agents.few import pair
-from tests.agents.runtime.test_pose_inbox import Sample
-from tests.fuzz.loopnet import Net
 from tests.fuzz.messages import sent
+from tests.network import Net, Sample
+from tests.small import small
 
 KEYS = Keys("park")
 UTC = 1.8e9
@@ -28,20 +28,24 @@ DT = 0.01
 PLACE = (0.1, 0.2, 0.0)
 
 
-def position(stamp: float, robot: str = "T") -> bytes:
-    return sent(KEYS.position("T"), messages.Position(robot, stamp, PLACE, 0.3))[0]
+def position(stamp, place=PLACE, robot="T"):
+    return sent(KEYS.position("T"), messages.Position(robot, stamp, place, 0.3))[0]
 
 
-def test_stamps_ahead_count_as_now_and_are_reported() -> None:
+def listening(net, names=("A", "T"), silence_s=0.5, **given):
+    """Positions of the last robot."""
+    rows = [len(names) - 1]
+    return MeasuredPositions(net.session, KEYS, names, rows, (9.0, 9.0, 9.0), silence_s=silence_s, **given)
+
+
+def test_stamps_ahead_count_as_now_and_are_reported():
     net = Net()
     with net.worn():
-        heard = MeasuredPositions(net.session, KEYS, ("A", "T"), [1], (9.0, 9.0, 9.0), exact=[1], silence_s=0.5)  # type: ignore[arg-type]
+        heard = listening(net, exact=[1])
         assert all(map(isnan, heard.ahead))
         for ahead, taken in ((-0.02, [7.98]), (2.3, [8.0]), (3600.0, []), (-7.0, [1.0])):
             net.deliver(position(UTC + 8.0 + ahead))
-            assert [(row, when) for row, when, *_ in heard.receive(UTC, 8.0)] == [
-                (1, pytest.approx(when, abs=1e-6)) for when in taken
-            ]
+            assert [when for _, when, *_ in heard.receive(UTC, 8.0)] == pytest.approx(taken, abs=1e-6)
             assert heard.ahead[1] == pytest.approx(ahead, abs=1e-6)
         net.deliver(position(UTC, robot="A"))
         assert not list(heard.receive(UTC, 8.0))
@@ -50,30 +54,22 @@ def test_stamps_ahead_count_as_now_and_are_reported() -> None:
         assert heard.trouble[1] == "position of 'A' on the key of 'T'"
 
 
-def test_the_text_names_robot_and_size() -> None:
-    assert clock_text("CF02", 2.3) == "positions of CF02 are stamped 2.3 s ahead"
-    assert clock_text("CF01", -0.4) == "positions of CF01 are stamped 0.4 s behind"
+def flown(ahead, seconds, frozen_s=inf):
+    """A Tello at 100 Hz whose positions are stamped `ahead(t)` of t [s] (None: there are none); what was said, when.
 
-
-def flown(
-    ahead: Callable[[float], float | None], seconds: float, frozen_s: float = inf
-) -> tuple[Runtime, list[tuple[float, str]]]:
-    """A Tello at 100 Hz whose positions are stamped so far ahead of `t` (None: there are none), and from `frozen_s` on
-    the same; what was said, when.
+    From `frozen_s` on they stay the same.
     """
-    few = pair(
-        robots={"T": RobotTable(kind="tello", start=[0.1, 0.2], hover=0.5, position="external")}, formation=Formation()
-    )
-    said: list[tuple[float, str]] = []
+    plan = Plan(small({"T": RobotTable(kind="tello", start=[0.1, 0.2], hover=0.5, position="external")}))
+    said = []
     measured, noise = (0.0, 0.0, 0.0), Random(1)
     net = Net()
     with net.worn():
-        body = assemble(bodies.body_request(Plan(few), ("T",), 1))
+        body = assemble(bodies.body_request(plan, ("T",), 1))
         setup = Setup(KEYS, [], "json", 50.0, lifeline=False, externally_measured=[True])
-        runtime = Runtime([Plan(few).assignment("T")], body, setup)
+        runtime = Runtime([plan.assignment("T")], body, setup)
         body.open()
-        runtime.subscribe_to_stops(net.session)  # type: ignore[arg-type]
-        runtime.join(net.session)  # type: ignore[arg-type]
+        runtime.subscribe_to_stops(net.session)
+        runtime.join(net.session)
         runtime._utc = runtime._telemetry.utc = UTC
         (robot,) = runtime.robots
         for tick in range(1, round(seconds / DT)):
@@ -81,8 +77,7 @@ def flown(
             if (off := ahead(t)) is not None:
                 seen = runtime.states[0].true_position if runtime.states else PLACE
                 measured = tuple(value + noise.gauss(0.0, 1e-4) for value in seen) if t < frozen_s else measured
-                place = messages.Position("T", UTC + t + off, measured, 0.0)
-                net.deliver(sent(KEYS.position("T"), place)[0])
+                net.deliver(position(UTC + t + off, measured))
             runtime.tick(t)
             if robot.lifecycle.phase == Phase.READY:
                 robot.lifecycle.takeoff()
@@ -93,7 +88,7 @@ def flown(
 
 
 @pytest.mark.parametrize("ahead", [0.0, 2.0, 4.5])
-def test_blindness_is_noticed_in_time_despite_stamps_ahead(ahead: float) -> None:
+def test_blindness_is_noticed_in_time_despite_stamps_ahead(ahead):
     silent = 3.0
     _, said = flown(lambda t: ahead if t < silent else None, 4.5)
     blind, text = next((t, text) for t, text in said if "its own position is lost" in text)
@@ -104,7 +99,7 @@ def test_blindness_is_noticed_in_time_despite_stamps_ahead(ahead: float) -> None
     assert warned == ([told] if ahead else [])
 
 
-def test_stamps_behind_are_reported_before_positions_expire() -> None:
+def test_stamps_behind_are_reported_before_positions_expire():
     _, said = flown(lambda t: 0.0 if t < 2.0 else -0.4, 4.0)
     (t, text), *_ = [each for each in said if "clock" in each[1]]
     assert t == pytest.approx(2.5, abs=0.03)
@@ -112,26 +107,25 @@ def test_stamps_behind_are_reported_before_positions_expire() -> None:
     assert not any("position is lost" in text for _, text in said)
 
 
-def test_waiting_robot_reports_positions_of_another_clock() -> None:
+def test_waiting_robot_reports_positions_of_another_clock():
     runtime, _ = flown(lambda _: -3600.0, 0.5)
     assert runtime.robots[0].lifecycle.reason == "no position of its own: positions of T are stamped 3.6e+03 s behind"
 
 
 @pytest.mark.parametrize(("exact", "expected"), [([], [8.3]), ([1], [8.0, 8.1, 8.2, 8.3, 8.4])])
-def test_a_pose_that_repeats_itself_is_none(exact: list[int], expected: list[float]) -> None:
+def test_a_pose_that_repeats_itself_is_none(exact, expected):
     net, taken = Net(), []
     with net.worn():
-        heard = MeasuredPositions(net.session, KEYS, ("A", "T"), [1], (9.0, 9.0, 9.0), exact=exact, silence_s=0.5)  # type: ignore[arg-type]
+        heard = listening(net, exact=exact)
         for tick in range(5):
             t = 8.0 + 0.1 * tick
-            place = messages.Position("T", UTC + t, (0.1, 0.2, 0.0 if tick < 3 else 0.001), 0.3)
-            net.deliver(sent(KEYS.position("T"), place)[0])
+            net.deliver(position(UTC + t, (0.1, 0.2, 0.0 if tick < 3 else 0.001)))
             taken += [when for _, when, *_ in heard.receive(UTC, t)]
     assert taken == pytest.approx(expected, abs=1e-6)
 
 
 @pytest.mark.parametrize(("frozen_s", "phase"), [(0.0, "idle"), (1.2, "done"), (4.0, "done")])
-def test_frozen_motion_capture_lands_what_flies(frozen_s: float, phase: str) -> None:
+def test_frozen_motion_capture_lands_what_flies(frozen_s, phase):
     runtime, said = flown(lambda _: 0.0, frozen_s + 7.0, frozen_s)
     assert Phase(runtime.robots[0].lifecycle.phase).word == phase
     assert runtime.states[0].note == FROZEN
@@ -141,19 +135,21 @@ def test_frozen_motion_capture_lands_what_flies(frozen_s: float, phase: str) -> 
         assert [held - frozen_s, landed - frozen_s] == pytest.approx([0.5, 0.8], abs=0.03)
 
 
-def test_the_first_of_two_sources_stays_until_silent() -> None:
-    net, taken = Net(), []
+def test_the_first_of_two_sources_stays_until_silent():
+    net = Net()
     with net.worn():
-        heard = MeasuredPositions(net.session, KEYS, ("T",), [0], (9.0, 9.0, 9.0), silence_s=0.45)  # type: ignore[arg-type]
+        heard = listening(net, ("T",), 0.45)
 
-        def tell(t: float, *places: tuple[str | None, float]) -> list[float]:
+        def tell(t, *places):
             for session, x in places:
-                payload = messages.encode(messages.Position("T", UTC + t, (x + 0.001 * t, 0.0, 0.0), 0.3))
+                place = messages.Position("T", UTC + t, (x + 0.001 * t, 0.0, 0.0), 0.3)
+                sample = Sample(KEYS.position("T"), messages.JSON, messages.encode(place, "json"))
+                sample.source_info = SimpleNamespace(source_id=SimpleNamespace(zid=session))
                 for channel in net.channels:
-                    channel.add(Sample(KEYS.position("T"), payload, session=session))
+                    channel.add(sample)
             return [round(float(position[0])) for _, _, position, _ in heard.receive(UTC, t)]
 
-        both: list[tuple[str | None, float]] = [("a", 1.0), ("b", 2.0)]
+        both = [("a", 1.0), ("b", 2.0)]
         taken = [tell(8.0 + 0.1 * tick, *both) for tick in range(4)]
         assert taken == [[], [1], [1], [1]]
         assert heard.malformed == [4]
@@ -168,3 +164,67 @@ def test_the_first_of_two_sources_stays_until_silent() -> None:
         state = BodyState()
         heard.annotate([state], 12.5)
         assert not state.note
+
+
+# ---------------------------------------------------------------- velocities, and poses that replace the own ones
+
+
+def state(t, position, velocity=UNKNOWN, yaw=0.0):
+    return BodyState(t, position, velocity, yaw)
+
+
+def test_velocity_follows_from_positions():
+    external = External()
+    for k in range(151):
+        t = 0.01 * k
+        moving = state(t, (0.2 * min(t, 1.0), 0.0, 0.0))
+        external.estimate(t, moving)
+        if k == 100:
+            assert moving.velocity == pytest.approx((0.2, 0.0, 0.0), abs=1e-3)
+    assert 0.0 <= moving.velocity[0] < 0.003  # it stands now
+
+
+def test_measured_velocity_is_kept():
+    measured = state(0.0, (0.0, 0.0, 0.0), (0.0, 0.7, 0.0))
+    External().estimate(0.0, measured)
+    assert measured.velocity == (0.0, 0.7, 0.0)
+
+
+def test_velocity_of_old_position_is_unknown():
+    external, first, old = External(), state(0.0, (0.0, 0.0, 0.0)), state(0.0, (0.0, 0.0, 0.0))
+    external.estimate(0.1, first)
+    assert first.velocity == (0.0, 0.0, 0.0)
+    external.estimate(PATIENCE_S, old)
+    assert all(map(isnan, old.velocity))
+    nowhere = state(0.0, (nan, 0.0, 0.0))
+    External().estimate(0.1, nowhere)
+    assert all(map(isnan, nowhere.velocity))
+
+
+def test_poses_that_are_old_or_jump_are_refused():
+    external = External()
+    assert external.update(1.0, (0.0, 0.0, 0.0), 0.0)
+    assert not external.update(1.0, (0.0, 0.0, 0.0), 0.0)
+    assert not external.update(1.1, (nan, 0.0, 0.0), 0.0)
+    assert not external.update(1.1, (FASTEST * 0.1 + 0.1, 0.0, 0.0), 0.0)
+    assert (external.refused, external.time) == (1, 1.0)
+    assert external.update(1.0 + PATIENCE_S, (9.0, 0.0, 0.0), 0.0)
+    assert external.velocity == (0.0, 0.0, 0.0)
+
+
+def test_own_yaw_continues_without_measured_yaw():
+    external = External()
+
+    def yaw(t, measured, own):
+        external.update(t, (0.1 * t, 0.0, 0.0), measured)
+        filled = state(t - 0.5, (7.0, 7.0, 7.0), yaw=own)
+        external.fill(filled)
+        assert (filled.time, filled.position, filled.velocity) == (t, external.position, external.velocity)
+        return filled.yaw
+
+    assert yaw(0.0, nan, 0.3) == 0.3  # none was measured yet
+    assert yaw(0.1, 1.0, 0.2) == 1.0
+    assert yaw(0.2, nan, 0.7) == pytest.approx(1.5)  # turned by 0.5 since
+    assert yaw(5.0, nan, -0.2) == pytest.approx(0.6)
+    assert yaw(5.1, 2.0, -0.2) == 2.0
+    assert isnan(yaw(5.2, nan, nan))

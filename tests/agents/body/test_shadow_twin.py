@@ -1,83 +1,21 @@
 """A twin beside a robot: it is told the same, put onto it when it should be, and never in its way."""
 
-from math import inf, isfinite, isnan, nan
+from math import inf, isnan, nan
 
 import pytest
 
-from agents.body.interface import BodyRequest, BodyState, Disturbance
-from agents.body.kinds import KINDS
+from agents.body.interface import BodyError, Disturbance
 from agents.body.shadow_twin import Shadowed, shadowed
-from agents.network.keys import Keys
 from agents.vectors import NO_SETPOINT, UNKNOWN, ZERO
+from tests.agents.body.recorded import Recorded
+from tests.requests import request
 
 DT = 0.1
 
 
-class Driven:
-    """Robots that move along x as told, at a share of the speed and off by a constant; keeps what it is told."""
-
-    def __init__(self, rows, *, share=1.0, off=0.0):
-        self.x, self.speed, self.yaw, self.flying = [0.0] * rows, [0.0] * rows, [0.0] * rows, [False] * rows
-        self.share, self.off = share, off
-        self.told, self.placed = [], []
-        self.t = self.stale = 0.0
-        self.note = ""
-        self.broken, self.failure = "", RuntimeError
-
-    def _may(self, what):
-        if self.broken == what:
-            raise self.failure("no engine")
-
-    def open(self):
-        self._may("open")
-        self.told.append("open")
-
-    def read(self, t):
-        self._may("read")
-        self.x = [x + (t - self.t) * self.share * speed for x, speed in zip(self.x, self.speed, strict=True)]
-        self.t = t
-        return [
-            BodyState(t - self.stale, (x + self.off, 0.0, 0.0), (speed, 0.0, 0.0), yaw, flying=flying, note=self.note)
-            for x, speed, yaw, flying in zip(self.x, self.speed, self.yaw, self.flying, strict=True)
-        ]
-
-    def command(self, setpoints):
-        self._may("command")
-        self.told.append(("command", [setpoint[0] for setpoint in setpoints]))
-        for row, (speed, *_) in enumerate(setpoints):
-            self.speed[row] = speed if isfinite(speed) else self.speed[row]
-
-    def takeoff(self, rows, heights):
-        self._may("takeoff")
-        self.told.append(("takeoff", rows, heights))
-        for row in rows:
-            self.flying[row] = True
-
-    def land(self, rows):
-        self._may("land")
-        self.told.append(("land", rows))
-
-    def stop(self, rows):
-        self._may("stop")
-        self.told.append(("stop", rows))
-
-    def locate(self, row, t, position, yaw):
-        self.told.append(("locate", row))
-
-    def close(self):
-        self._may("close")
-        self.told.append("close")
-
-    def place(self, rows, positions, yaws, flying, velocities=None):
-        self._may("place")
-        self.placed.append((round(self.t, 6), rows, [x for x, _, _ in positions], flying, velocities))
-        for row, (x, _, _), yaw in zip(rows, positions, yaws, strict=True):
-            self.x[row], self.yaw[row] = x, yaw
-
-
 def beside(rows=1, shadows=(0,), restart=inf, *, share=1.0, off=0.0):
     """A robot and its twin, which is faster by `share` and measured `off` [m]."""
-    robot, twin = Driven(rows, off=off), Driven(len(shadows), share=share)
+    robot, twin = Recorded(rows, off=off), Recorded(len(shadows), share=share)
     return Shadowed(robot, twin, shadows, [restart] * len(shadows)), robot, twin
 
 
@@ -138,7 +76,7 @@ def test_orders_reach_twins_by_their_own_rows():
     body.close()
     assert robot.told == [
         "open", ("takeoff", [1, 2], [0.5, 0.7]), ("command", [0.1, 0.2, 0.3]), ("land", [1]), ("land", [2, 0]),
-        ("stop", [0, 1, 2]), ("locate", 2), "close",
+        ("stop", [0, 1, 2]), ("locate", 2, 0.0, ZERO, 0.0), "close",
     ]  # fmt: skip
     assert twin.told == [
         "open", ("takeoff", [1], [0.7]), ("command", [0.1, 0.3]), ("land", []), ("land", [1, 0]), ("stop", [0, 1]),
@@ -190,7 +128,7 @@ def test_failing_twin_is_left_alone(what):
     body.close()
     assert robot.told == ["open", ("takeoff", [0], [1.0]), ("land", [0]), ("stop", [0]), ("command", [0.0]), "close"]
     if what != "close":
-        assert state.note == "its shadow failed: RuntimeError: no engine"
+        assert state.note == "its shadow failed: BodyError: no engine"
         assert state.shadow_position is UNKNOWN
 
 
@@ -208,48 +146,39 @@ def test_note_of_the_robot_is_kept():
     robot.note = "locked"
     assert [state.note for state in body.read(0.0)] == ["locked"] * 2
     twin.broken = "read"
-    assert [state.note for state in body.read(DT)] == ["locked", "locked; its shadow failed: RuntimeError: no engine"]
+    assert [state.note for state in body.read(DT)] == ["locked", "locked; its shadow failed: BodyError: no engine"]
 
 
 def test_a_failure_of_the_robot_is_not_hidden():
     body, robot, _ = beside()
     robot.broken = "read"
-    with pytest.raises(RuntimeError, match="no engine"):
+    with pytest.raises(BodyError, match="no engine"):
         body.read(0.0)
 
 
-def request(*kinds):
-    rows = len(kinds)
-    return BodyRequest(
-        names=tuple(f"R{k}" for k in range(rows)),
-        kinds=tuple(KINDS[kind] for kind in kinds),
-        addresses=("radio://0/80/2M/E7E7E7E701",) * rows,
-        start=(ZERO,) * rows,
-        yaw=(0.0,) * rows,
-        rate_hz=100.0,
-        seeds=(7,) * rows,
-        disturbance=(Disturbance(position_sigma=0.1, latency_s=0.1, odometry_drift=0.1),) * rows,
-        external=(True,) * rows,
-        device=({"tx_power": 3},) * rows,
-        endpoints=(),
-        keys=Keys(),
-    )
+DISTURBED = {
+    "disturbance": Disturbance(position_sigma=0.1, latency_s=0.1, odometry_drift=0.1),
+    "external": True,
+    "device": {"tx_power": 3},
+    "addresses": "radio://0/80/2M/E7E7E7E701",
+    "start": [(0.0, 0.0)] * 2,
+}
 
 
 def test_nobody_with_a_shadow_means_the_body_itself():
-    robot = Driven(2)
-    assert shadowed(robot, request("khepera4", "tello"), [nan, nan]) is robot
+    robot = Recorded(2)
+    assert shadowed(robot, request(["khepera4", "tello"], **DISTURBED), [nan, nan]) is robot
 
 
 @pytest.mark.parametrize("kind", ["khepera4", "tello"])
 def test_twin_is_undisturbed(kind):
-    robot = Driven(2)
+    robot = Recorded(2)
     robot.flying = [kind == "tello"] * 2
-    body = shadowed(robot, request("crazyflie", kind), [nan, 1.0])
+    body = shadowed(robot, request(["crazyflie", kind], **DISTURBED), [nan, 1.0])
     for k in range(101):
         first, second = body.read(k / 100)
         body.command([NO_SETPOINT, (0.2, 0.0, 0.0, 0.0)])
     assert first.shadow_position is UNKNOWN
-    assert second.position[0] == pytest.approx(0.2)
+    assert second.position[0] == pytest.approx(1.2)
     # it took over the robot's speed with its place
-    assert second.shadow_position == (pytest.approx(0.2), 0.0, 0.0)
+    assert second.shadow_position == (pytest.approx(1.2), 0.0, 0.0)

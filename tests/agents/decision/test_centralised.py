@@ -12,19 +12,13 @@ from agents.decision.lifecycle import AIRBORNE, DONE, IDLE, RUNNING
 from agents.robot import Robot
 from experiments.definition.experiment import Hybrid
 from experiments.definition.plan import Plan
-from experiments.file import document
+from tests.small import changed, reference
 
 STILL = (0.0, 0.0, 0.0)
 ALL = list(range(7))  # TB01, the leader, then KH01 to KH03 and CF01 to CF03
 
 
-@pytest.fixture(scope="module")
-def park():
-    return document.read("robotic-park").cases()["event"].experiment
-
-
-def replaced(experiment, **parts):
-    return msgspec.structs.replace(experiment, **parts)
+PARK = reference("event")
 
 
 class Desk:
@@ -47,20 +41,25 @@ class Desk:
             place = (self.places if places is None else places)[row]
             self.centre.receive(row, place, STILL, t if stamp is None else stamp, t, yaw=0.0)
 
+    def seen_as(self, row):
+        """A robot as each of its receivers knows it."""
+        known = (sender for robot in self.centre.robots for sender in robot.computer.neighbours.all)
+        return [sender for sender in known if sender.sender == row]
+
     def decide(self, t):
         """Goals by row."""
         return {goal.row: goal for goal in self.centre.decide(t, self.phase, self.start)}
 
 
-def central(park, **parts):
-    return Desk(replaced(park, architecture="centralised", **parts))
+def central(**parts):
+    return Desk(changed(PARK, architecture="centralised", **parts))
 
 
 @pytest.mark.parametrize("update", [None, {"kind": "send-on-delta", "threshold": 0.08}])
-def test_decides_what_robots_would(park, update):
-    formation = msgspec.structs.replace(park.formation, update=update)
-    park = replaced(park, formation=formation, duration_s=5.0, timeline=[])
-    desk, plan, rng = central(park), Plan(park), np.random.default_rng(1)
+def test_decides_what_robots_would(update):
+    formation = msgspec.structs.replace(PARK.formation, update=update)
+    parts = {"formation": formation, "duration_s": 5.0, "timeline": []}
+    desk, plan, rng = central(**parts), Plan(changed(PARK, **parts)), np.random.default_rng(1)
     robots = [Robot(plan.assignment(name)) for name in plan.names]
     places, sent = [(x, y, desk.ground(row)) for row, (x, y, _) in enumerate(desk.places)], 0
     for robot in robots:
@@ -88,9 +87,9 @@ def test_decides_what_robots_would(park, update):
     assert sent == 70 if update is None else 20 < sent < 55
 
 
-def test_goals_that_stay_are_repeated(park):
-    formation = msgspec.structs.replace(park.formation, update={"kind": "periodic", "period_s": 60.0})
-    desk = central(park, formation=formation)
+def test_goals_that_stay_are_repeated():
+    formation = msgspec.structs.replace(PARK.formation, update={"kind": "periodic", "period_s": 60.0})
+    desk = central(formation=formation)
     desk.hear(ALL, 0.0)
     goals = [desk.decide(0.1 * tick) for tick in range(13)]
     followers = [len(each.keys() - {0}) for each in goals]
@@ -98,22 +97,17 @@ def test_goals_that_stay_are_repeated(park):
     assert {goals[10][row].pose_stamp for row in ALL[1:]} == {0.0}  # they rest on what was known at the computation
 
 
-def test_late_older_poses_are_left_out(park):
-    desk = central(park)
+def test_late_older_poses_are_left_out():
+    desk = central()
     for x, stamp in ((0.3, 0.9), (0.1, 0.8), (0.7, 0.85)):
         desk.hear([1], 1.0, {1: (x, 0.0, 0.0)}, stamp)
     assert desk.centre.robots[1].position == (0.3, 0.0, 0.0)
-    found = {
-        (sender.position, sender.stamp)
-        for robot in desk.centre.robots
-        for sender in robot.computer.neighbours.all
-        if sender.sender == 1
-    }
+    found = {(sender.position, sender.stamp) for sender in desk.seen_as(1)}
     assert found == {((0.3, 0.0, 0.0), 0.9)}
 
 
-def test_waiting_robot_stays_once_neighbours_are_known(park):
-    desk = central(park)
+def test_waiting_robot_stays_once_neighbours_are_known():
+    desk = central()
     desk.phase, desk.start = [IDLE] * 7, [inf] * 7
     assert desk.decide(0.0) == {}
     assert desk.centre.missing_robots() == ALL
@@ -129,29 +123,23 @@ def test_waiting_robot_stays_once_neighbours_are_known(park):
     assert desk.centre.decisions == 1  # it begins with the robots, though none has said yet that it runs
 
 
-def test_lost_robot_gets_no_goals(park):
-    desk = central(park)
+def test_lost_robot_gets_no_goals():
+    desk = central()
     desk.hear(ALL, 0.0)
     assert list(desk.decide(0.0)) == ALL
     desk.centre.mark_lost(6, 0.1)
     assert list(desk.decide(0.1)) == ALL[:6]
 
-    def followed():
-        return any(
-            sender.active for robot in desk.centre.robots for sender in robot.computer.neighbours.all
-            if sender.sender == 6
-        )  # fmt: skip
-
-    assert followed()
+    assert any(sender.active for sender in desk.seen_as(6))
     desk.decide(1.2)
-    assert not followed()  # its neighbours go on without it
+    assert not any(sender.active for sender in desk.seen_as(6))  # its neighbours go on without it
     assert desk.centre.missing_robots() == [6]
     desk.centre.mark_alive(6)
     assert list(desk.decide(1.3)) == ALL
 
 
-def test_robot_without_neighbours_stays(park):
-    desk = central(park)
+def test_robot_without_neighbours_stays():
+    desk = central()
     desk.hear(ALL, 0.0)
     desk.decide(0.0)
     for row in (4, 5):  # CF03 receives nobody else
@@ -162,8 +150,8 @@ def test_robot_without_neighbours_stays(park):
     assert desk.decide(1.2)[6].goal == (x, y, 0.8)
 
 
-def test_hybrid_guides_its_robots_alone(park):
-    desk = Desk(replaced(park, architecture=Hybrid(kind="hybrid", robots=["CF03", "KH02"])))
+def test_hybrid_guides_its_robots_alone():
+    desk = Desk(changed(PARK, architecture=Hybrid(kind="hybrid", robots=["CF03", "KH02"])))
     needed = [desk.names[row] for row in desk.centre.needed]
     assert needed == ["KH01", "KH02", "KH03", "CF01", "CF02", "CF03"]  # not the leader
     desk.hear(desk.centre.needed, 0.0)
@@ -172,8 +160,8 @@ def test_hybrid_guides_its_robots_alone(park):
     assert [desk.names[row] for row in desk.decide(0.1)] == ["KH02"]
 
 
-def test_plans_begin_where_the_robots_did(park):
-    first, second = central(park), central(park)  # the leader drives 0.75 m from 21 s on, at 0.15 m/s
+def test_plans_begin_where_the_robots_did():
+    first, second = central(), central()  # the leader drives 0.75 m from 21 s on, at 0.15 m/s
     (x, y, z) = first.places[0]
     first.hear(ALL, 0.0)
     first.decide(0.0)
@@ -186,21 +174,15 @@ def test_plans_begin_where_the_robots_did(park):
         assert (goal[0] - x, goal[1] - y) == pytest.approx((0.3, 0.0), abs=1e-12)
 
 
-def test_late_robot_begins_its_plan_then(park):
-    desk = central(park)
+def test_late_robot_begins_its_plan_then():
+    desk = central()
     desk.hear(ALL[1:], 0.0)
     assert 0 not in desk.decide(0.0)
     desk.hear([0], 0.1)
     goal = desk.decide(0.1)[0]
     assert goal.goal[:2] == desk.places[0][:2]
     assert isnan(goal.yaw)
-
-
-def test_restarted_robot_waits_for_a_pose(park):
-    desk = central(park)
-    desk.hear(ALL, 0.0)
-    desk.decide(0.0)
-    desk.centre.discard_pose(1)
-    assert 1 not in desk.decide(0.1)
-    desk.hear([1], 0.2, stamp=-50.0)  # its clock may be behind that of its former process
-    assert 1 in desk.decide(0.2)
+    desk.centre.discard_pose(1)  # restarted: it waits for a pose
+    assert 1 not in desk.decide(0.2)
+    desk.hear([1], 0.3, stamp=-50.0)  # its clock may be behind that of its former process
+    assert 1 in desk.decide(0.3)

@@ -10,8 +10,8 @@ from agents.kinds.khepera4 import KHEPERA4
 from agents.plugins.predictors import HOLD, ConstantVelocity
 from agents.plugins.triggers import SendOnDelta
 from experiments.definition.experiment import Formation, LegTable
-from tests.agents.few import triangle
-from tests.agents.swarm import Swarm, changed
+from tests.agents.swarm import Swarm
+from tests.small import changed, triangle
 
 LINKS = {"A - B": 0.5, "C > A": 0.5, "C > B": 0.5}
 

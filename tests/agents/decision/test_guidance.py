@@ -7,28 +7,26 @@ import pytest
 from agents.decision.centralised import ReceivedGoals
 from agents.decision.lifecycle import AIRBORNE, IDLE, LANDING, READY, RUNNING
 from agents.robot import Robot
-from experiments.definition.experiment import Experiment, Formation, Hybrid, RobotTable, Start
+from agents.vectors import ZERO
+from experiments.definition.experiment import Formation, Hybrid, RobotTable, Start
 from experiments.definition.plan import Plan
 from tests.agents.bench import Bench
+from tests.small import small
 
 PLACES = {"A": (-0.4, 0.0, 0.0), "B": (0.4, 0.1, 0.8)}
 
 
-def pair(**parts):
+def led(**parts):
     """A Khepera and a Crazyflie that receive each other, guided by a central controller; `parts` changes that."""
     robots = {
         "A": RobotTable(kind="khepera4", start=[-0.4, 0.0]),
         "B": RobotTable(kind="crazyflie", start=[0.4, 0.1], hover=0.8),
     }
-    given = {
-        "title": "A pair", "duration_s": 60.0, "robots": robots, "formation": Formation(links={"A - B": 0.9}),
-        "architecture": "centralised", **parts,
-    }  # fmt: skip
-    return Experiment(**given)
+    return Plan(small(robots, {"A - B": 0.9}, **{"duration_s": 60.0, "architecture": "centralised", **parts}))
 
 
 def guided(name="A", **parts):
-    return Bench(Plan(pair(**parts)).assignment(name), PLACES[name])
+    return Bench(led(**parts).assignment(name), PLACES[name])
 
 
 def guide(bench, goal=None, yaw=nan, *, stamp=None):
@@ -37,10 +35,8 @@ def guide(bench, goal=None, yaw=nan, *, stamp=None):
     return bench.robot.guidance.receive(goal or bench.position, yaw, stamp)
 
 
-def running(name="A"):
-    bench = guided(name)
-    bench.running(guide)
-    return bench
+def running(name="A", **parts):
+    return guided(name, **parts).running(guide)
 
 
 def test_ready_once_the_centre_is_known():
@@ -50,12 +46,9 @@ def test_ready_once_the_centre_is_known():
     guide(bench)
     assert bench.step().life.phase == READY
     assert bench.robot.missing_neighbours() == []
-
-
-def test_patience_for_the_centre_ends():
-    bench = guided(start=Start(deadline_s=0.05, missing="go-on")).step(0.05)
-    assert bench.life.phase == IDLE
-    assert bench.step(0.02).life.phase == READY
+    patient = guided(start=Start(deadline_s=0.05, missing="go-on")).step(0.05)
+    assert patient.life.phase == IDLE
+    assert patient.step(0.02).life.phase == READY
 
 
 @pytest.mark.parametrize("name", PLACES)
@@ -153,48 +146,36 @@ def test_cut_off_from_the_network_it_holds():
     assert bench.step(0.02).robot.goal == bench.position
 
 
-def test_safety_limits_received_goals():
-    bench = running("B")
-    guide(bench, (3.0, 0.1, 0.8))
-    bench.step()
-    assert bench.robot.changed
-    assert bench.robot.setpoint[0] == pytest.approx(0.9, abs=1e-3)  # max_goal_distance from where it is
-
-
 def test_guided_robot_receives_for_avoidance_alone():
-    assert Plan(pair()).assignment("A").neighbours == ()
-    avoids = pair(avoidance={"kind": "barrier", "hears": "neighbours"})
-    assert [(each.name, each.in_law) for each in Plan(avoids).assignment("A").neighbours] == [("B", False)]
+    assert led().assignment("A").neighbours == ()
+    avoids = led(avoidance={"kind": "barrier", "hears": "neighbours"}).assignment("A")
+    assert [(each.name, each.in_law) for each in avoids.neighbours] == [("B", False)]
 
 
 def test_hybrid_leaves_the_law_to_others():
-    plan = Plan(pair(architecture=Hybrid(kind="hybrid", robots=["B"])))
-    alone, led = plan.assignment("A"), plan.assignment("B")
-    assert (alone.guided, led.guided) == (False, True)
+    plan = led(architecture=Hybrid(kind="hybrid", robots=["B"]))
+    alone, follower = plan.assignment("A"), plan.assignment("B")
+    assert (alone.guided, follower.guided) == (False, True)
     assert [each.name for each in alone.neighbours] == ["B"]
-    assert led.neighbours == ()
+    assert follower.neighbours == ()
     assert Robot(alone).guidance is None  # a robot that decides for itself takes no goals
 
 
-def test_age_of_guidance():
+def test_goals_of_another_controller_begin_anew():
     guidance = ReceivedGoals(flies=True, silence_s=1.0)
     assert guidance.missing
-    assert guidance.unguided(0.0)
-    guidance.receive((0.0, 0.0, 1.0), nan, 4.0)
-    assert [guidance.unguided(t) for t in (4.0, 5.0, 5.1)] == [False, False, True]
+    assert guidance.receive(ZERO, nan, 4.0)
     guidance.mark_lost(4.5)
     assert guidance.unguided(4.6)
-    assert guidance.receive((0.0, 0.0, 1.0), nan, 4.7)  # another controller
+    assert guidance.receive(ZERO, nan, 4.7)
     assert guidance.lost_since == inf
     guidance.begin_anew()
-    assert guidance.receive((0.0, 0.0, 1.0), nan, -3.0)  # whose clock is behind
+    assert guidance.receive(ZERO, nan, -3.0)  # its clock is behind
 
 
 @pytest.mark.parametrize("name", PLACES)
 def test_velocity_of_the_centre_ends_with_its_goals(name):
-    parts = {"formation": Formation(links={"A - B": 0.9}, law="consensus")}
-    bench = guided(name, **parts)
-    bench.running(guide)
+    bench = running(name, formation=Formation(links={"A - B": 0.9}, law="consensus"))
     robot, (x, y, z) = bench.robot, bench.position
 
     def move(bench):

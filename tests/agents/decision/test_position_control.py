@@ -64,15 +64,16 @@ def test_end_that_drives_ahead_is_chosen_once(kind, late):
             assert all(ends) or not any(ends)
 
 
-def test_wheels_drive_backward_to_what_lies_behind():
-    assert TwoWheels().twist(0.2, 0.0, 0.0, nan, UNIT) == pytest.approx((0.2, 0.0))
-    assert TwoWheels().twist(-0.2, 0.0, 0.0, nan, UNIT) == pytest.approx((-0.2, 0.0))
-
-
-def test_farias_law():
-    bearing, distance = 0.7, 0.3
-    twist = TwoWheels().twist(distance * cos(bearing), distance * sin(bearing), 0.0, nan, UNIT)
-    assert twist == pytest.approx((distance * (pi - bearing) / pi, 1.5 * sin(bearing)))
+@pytest.mark.parametrize(
+    ("x", "y", "twist"),
+    [
+        (0.2, 0.0, (0.2, 0.0)),
+        (-0.2, 0.0, (-0.2, 0.0)),  # backward to what lies behind
+        (0.3 * cos(0.7), 0.3 * sin(0.7), (0.3 * (pi - 0.7) / pi, 1.5 * sin(0.7))),  # the law of Farias
+    ],
+)
+def test_twists_toward_a_goal(x, y, twist):
+    assert TwoWheels().twist(x, y, 0.0, nan, UNIT) == pytest.approx(twist)
 
 
 def test_position_and_velocity_robots():

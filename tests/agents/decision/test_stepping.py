@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from math import dist, inf, isnan, nan
-from pathlib import Path
 from typing import ClassVar
 
+import msgspec
 import pytest
 
 from agents.decision.lifecycle import LANDING, RUNNING
@@ -18,13 +17,13 @@ from agents.kinds.crazyflie import CRAZYFLIE
 from agents.kinds.khepera4 import KHEPERA4
 from agents.network import messages, validation
 from agents.network.messages import Malformed, Variable
-from agents.plugins.law import Control, Law, Said
+from agents.plugins.law import Control, Law, RobotFacts, Said
 from agents.plugins.planners import Leg, Line
 from agents.plugins.registry import PluginError
-from agents.vectors import UNKNOWN
+from agents.vectors import UNKNOWN, ZERO
 from experiments.definition.plan import Plan
 from tests.agents.bench import Bench
-from tests.agents.few import triangle
+from tests.small import triangle
 
 DT = 0.02
 
@@ -54,41 +53,35 @@ class Odd(Counting, frozen=True):
         return self.decides
 
 
-class Failing(Counting, frozen=True):
+class Beginning(Counting, frozen=True):
+    """Begins with what it is given."""
+
+    count: Callable[[RobotFacts], object]
+
     def begin(self, robot):
-        return {"count": (1.0 / robot.number,)}
+        return {"count": self.count(robot)}
 
 
-class Wide(Counting, frozen=True):
-    def begin(self, robot):
-        return {"count": (0.0,) * 65}
-
-
-class Bare(Counting, frozen=True):
-    def begin(self, robot):
-        return {"count": 0.0}
-
-
-class Naming(Counting, frozen=True):
-    SAYS = ("count",)
-
-
-class Weightless(Counting, frozen=True):
-    SAYS: ClassVar[Mapping[str, Said]] = {"count": Said(metre=0.0)}
+def saying(says):
+    return msgspec.defstruct("Saying", [], bases=(Counting,), namespace={"SAYS": says}, frozen=True)()
 
 
 def given(law):
     return replace(Plan(triangle()).assignment("A"), law=law, start=None, starts=())
 
 
-def hear(bench):
-    for link in range(2):
-        bench.hear(link, (0.5, 0.5 * link, 0.0))
+def hear(bench, *words):
+    """Poses of both neighbours, with variables of the first one, and of the second."""
+    for link, said in enumerate(words or ({}, {})):
+        bench.neighbours.receive(link, (0.5, 0.5 * link, 0.0), ZERO, bench.t, bench.t, yaw=0.3, said=said)
+
+
+def running(law):
+    return Bench(given(law), ZERO).running(hear)
 
 
 def test_memory_is_kept_where_a_robot_was_due():
-    bench = Bench(given(Counting()), (0.0, 0.0, 0.0))
-    bench.step(0.2, hear)
+    bench = Bench(given(Counting()), ZERO).step(0.2, hear)
     stepping = bench.robot.stepping
     assert stepping.memory["count"] == (0.0,)  # the rehearsal is not kept
     bench.running(hear).step(0.99, hear)
@@ -99,24 +92,16 @@ def test_memory_is_kept_where_a_robot_was_due():
 
 
 def test_neighbours_are_heard_and_forgotten():
-    bench = Bench(given(Counting()), (0.0, 0.0, 0.0))
-    bench.running(hear)
-
-    def say(bench):
-        for link in range(2):
-            words = {"count": (3.0,)} if link else {"count": (3.0, 4.0), "other": (1.0,)}  # of another size
-            bench.neighbours.receive(link, (0.5, 0.5, 0.0), (0.0, 0.0, 0.0), bench.t, bench.t, yaw=0.3, said=words)
-
-    bench.step(0.3, say)
+    bench, odd = running(Counting()), {"count": (3.0, 4.0), "other": (1.0,)}  # of another size
+    bench.step(0.3, lambda bench: hear(bench, odd, {"count": (3.0,)}))
     assert bench.robot.stepping.measures == {"heard": 1.0}
     bench.neighbours.discard_pose(1)
-    bench.step(0.3, lambda bench: bench.hear(0, (0.5, 0.5, 0.0)))
+    bench.step(0.3, lambda bench: hear(bench, {}))
     assert bench.robot.stepping.measures == {"heard": 0.0}
 
 
 def test_a_robot_says_what_its_last_step_decided():
-    bench = Bench(given(Counting()), (0.0, 0.0, 0.0))
-    bench.running(hear)
+    bench = running(Counting())
     for _ in range(40):
         before = len(bench.said)
         bench.step(0.01, hear)
@@ -124,16 +109,19 @@ def test_a_robot_says_what_its_last_step_decided():
             assert bench.robot.words == (("count", bench.robot.stepping.memory["count"]),)
 
 
+REMEMBERED = {"count": (1.0,), "secret": (0.0, 0.0)}
+
+
 @pytest.mark.parametrize(
     "decides",
     [
         None,
         Control(),
-        Control(memory={"count": (1.0, 2.0), "secret": (0.0, 0.0)}),
-        Control(memory={"count": ("a",), "secret": (0.0, 0.0)}),
-        Control(memory={"count": (1.0,), "secret": (0.0, 0.0)}, velocity=(1.0, 2.0)),
-        Control(memory={"count": (1.0,), "secret": (0.0, 0.0)}, velocity=(0.0, 0.0, nan), goal=(0.0, 0.0, nan)),
-        Control(memory={"count": (1.0,), "secret": (0.0, 0.0)}, measures={"x": "much"}),
+        Control(memory={**REMEMBERED, "count": (1.0, 2.0)}),
+        Control(memory={**REMEMBERED, "count": ("a",)}),
+        Control(memory=REMEMBERED, velocity=(1.0, 2.0)),
+        Control(memory=REMEMBERED, velocity=(0.0, 0.0, nan), goal=(0.0, 0.0, nan)),
+        Control(memory=REMEMBERED, measures={"x": "much"}),
     ],
 )
 def test_what_cannot_be_used_names_the_law(decides):
@@ -142,19 +130,19 @@ def test_what_cannot_be_used_names_the_law(decides):
         stepping.step(stepping.view())
 
 
-def test_a_law_that_cannot_begin_is_named():
-    with pytest.raises(PluginError, match="the law Failing failed: ZeroDivisionError"):
-        Stepping(given(Failing()))
-    with pytest.raises(PluginError, match=r"`begin` of the law Bare must give a tuple of numbers for each variable"):
-        Stepping(given(Bare()))
-    with pytest.raises(PluginError, match="SAYS of the law Naming must name a Said for each variable"):
-        Stepping(given(Naming()))
-    with pytest.raises(
-        PluginError, match=r"SAYS of the law Weightless: the metre of count is 0\.0, not a positive number"
-    ):
-        Stepping(given(Weightless()))
-    with pytest.raises(PluginError, match="the law Wide says 65 numbers; a pose carries 64"):
-        Stepping(given(Wide()))
+@pytest.mark.parametrize(
+    ("law", "message"),
+    [
+        (Beginning(lambda robot: 1.0 / robot.number), "the law Beginning failed: ZeroDivisionError"),
+        (Beginning(lambda _: 0.0), "`begin` of the law Beginning must give a tuple of numbers for each variable"),
+        (Beginning(lambda _: (0.0,) * 65), "the law Beginning says 65 numbers; a pose carries 64"),
+        (saying(("count",)), "SAYS of the law Saying must name a Said for each variable"),
+        (saying({"count": Said(metre=0.0)}), r"the law Saying: the metre of count is 0\.0, not a positive number"),
+    ],
+)
+def test_a_law_that_cannot_begin_is_named(law, message):
+    with pytest.raises(PluginError, match=message):
+        Stepping(given(law))
 
 
 def test_velocity_that_is_not_finite_holds_and_lands():
@@ -163,8 +151,7 @@ def test_velocity_that_is_not_finite_holds_and_lands():
             way = (nan if view.time > 1.0 else 0.0, 0.0, nan)
             return Control(memory={"count": (0.0,), "secret": (nan, nan)}, velocity=way)
 
-    bench = Bench(given(Lost()), (0.0, 0.0, 0.0))
-    bench.running(hear).step(0.9, hear)
+    bench = running(Lost()).step(0.9, hear)
     assert bench.life.phase == RUNNING
     bench.step(0.5, hear)
     assert bench.robot.setpoint == (0.0, 0.0, 0.0, 0.0)
@@ -181,8 +168,7 @@ def test_words_on_unknown_reads_change_nothing():
     line = Leg(0.0, Line(move_by=[1.0, 0.0], speed_=0.1))
     speeds = []
     for asks in (False, True):
-        bench = Bench(replace(given(Aiming()), legs=(line,)), (0.0, 0.0, 0.0))
-        bench.running(hear).step(0.9, hear)
+        bench = Bench(replace(given(Aiming()), legs=(line,)), ZERO).running(hear).step(0.9, hear)
         goals = bench.robot.goals
         words = goals.unknown_reads(99.0, (5.0, 5.0, 0.0)) if asks else ""
         assert words.startswith(": Aiming reads link.bearing") == asks
@@ -197,27 +183,22 @@ def test_deviation_counts_in_metres():
     speech.record()
     assert speech.deviation(0.1) == 0.1  # before the first step there is nothing to say
     assert speech.words == ()
-    speech.update({"count": (0.0,)})
-    assert speech.deviation(0.1) == inf
-    speech.record()
-    assert speech.words == (("count", (0.0,)),)
-    speech.update({"count": (50.0,)})
-    assert speech.deviation(0.1) == 0.5
-    assert speech.deviation(0.7) == 0.7
-    speech.record()
-    assert speech.deviation(0.0) == 0.0
-    speech.update({"count": (nan,)})
-    assert speech.deviation(0.0) == 0.0
-    speech.record()
-    assert speech.words == ()
-    speech.update({"count": (1.0 / 3.0,)})
-    assert speech.deviation(0.0) == inf
-    speech.record()
-    assert speech.words == (("count", (0.3333333,)),)
+    for count, deviation, words in (
+        (0.0, inf, (("count", (0.0,)),)),
+        (50.0, 0.5, (("count", (50.0,)),)),
+        (nan, 0.0, ()),
+        (1.0 / 3.0, inf, (("count", (0.3333333,)),)),
+    ):
+        speech.update({"count": (count,)})
+        assert speech.deviation(0.0) == deviation
+        assert speech.deviation(0.7) == max(deviation, 0.7)
+        speech.record()
+        assert speech.words == words
+        assert speech.deviation(0.0) == 0.0
 
 
 def test_poses_without_words_are_as_they_were():
-    pose = messages.pose("A", 1, 2.0, (1.0, 2.0, 3.0), (0.0, 0.0, 0.0), yaw=0.5)
+    pose = messages.pose("A", 1, 2.0, (1.0, 2.0, 3.0), ZERO, yaw=0.5)
     text = b'{"robot":"A","seq":1,"stamp":2.0,"position":[1.0,2.0,3.0],"velocity":[0.0,0.0,0.0],"yaw":0.5}'
     assert messages.encode(pose, "json") == text
     spoken = messages.pose("A", 1, 2.0, (1.0, 2.0, 3.0), UNKNOWN, yaw=nan, words=(("x", (1.0, 2.0)), ("y", (nan,))))
@@ -231,7 +212,7 @@ def test_poses_without_words_are_as_they_were():
     "shared", [[Variable("x", [0.0] * 65)], [Variable("x", [nan])], [Variable("x", [inf])], [Variable("x", [1.0])] * 2]
 )
 def test_impossible_words_are_refused(shared):
-    pose = messages.Pose("A", 1, 2.0, (0.0, 0.0, 0.0), shared=shared)
+    pose = messages.Pose("A", 1, 2.0, ZERO, shared=shared)
     with pytest.raises(Malformed):
         validation.check_pose(pose, now=2.0, valid_box=(1.0, 1.0, 1.0))
 
@@ -250,22 +231,3 @@ def test_reference_moves_with_the_velocity_and_stays_near():
     places = [resting.goal((0.0, 0.0, nan), (0.01 * (k % 3 - 1), 0.0, 0.8), DT) for k in range(50)]
     assert dist(places[0], places[-1]) == 0.0
     assert VelocityFollower(KHEPERA4, 0.0).goal((0.0, 0.0, 0.3), (0.2, 0.1, 0.0), DT) == (0.2, 0.1, 0.0)
-
-
-def test_the_law_of_the_docs_steps():
-    text = (Path(__file__).parents[3] / "docs" / "plugins.md").read_text("utf-8")
-    (source,) = [block for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if "class Mean" in block]
-    space = {"__name__": __name__}
-    exec(source, space)
-    bench = Bench(given(space["Mean"]({"A": 3.0})), (0.0, 0.0, 0.0))
-
-    def say(bench):
-        for link in range(2):
-            words = {"x": (1.0,), "q": (0.0,)}
-            bench.neighbours.receive(
-                link, (0.5, 0.5 * link, 0.0), (0.0, 0.0, 0.0), bench.t, bench.t, yaw=nan, said=words
-            )
-
-    bench.running(say).step(3.0, say)
-    assert 1.0 < bench.robot.stepping.memory["x"][0] < 3.0
-    assert bench.robot.stepping.measures["disagreement"] > 0.0

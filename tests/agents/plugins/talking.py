@@ -9,6 +9,9 @@ from agents.decision.stepping import rounded
 from agents.formation.link import Link
 from agents.plugins.law import NeighbourView, RobotFacts, View
 from agents.vectors import ZERO
+from experiments.catalogue import index
+from experiments.check.check import check
+from experiments.file import document
 
 
 class Talking:
@@ -52,3 +55,18 @@ class Talking:
         view = View(self.facts[number], self.said[number], neighbours)
         view.position, view.time = self.places[number], self.rounds * self.step_s
         return self.law.step(view, self.memory[number])
+
+
+def law_findings(name, *changes):
+    """Severity, message and remedy of what a check finds about the law of an experiment of the catalogue."""
+    found = check(document.read(index.find_file(name), changes), ["periodic"])
+    return [(each.severity, each.message, each.remedy) for each in found if each.code == "law"]
+
+
+def one_way(name, link):
+    """What a law says of such an experiment if this link goes one way."""
+    text = index.find_file(name).read_text("utf-8").replace(link, link.replace(" - ", " > "))
+    plan = document.loads(text).cases()["periodic"]
+    ((severity, message, remedy),) = plan.law.analyse(plan)
+    assert severity == "error"
+    return message, remedy

@@ -6,12 +6,10 @@ from random import Random
 import numpy as np
 import pytest
 from scipy.optimize import linear_sum_assignment
+from scipy.sparse.csgraph import shortest_path
 
 from agents.plugins.gallery.auction import Auction
-from experiments.catalogue import index
-from experiments.check.check import check
-from experiments.file import document
-from tests.agents.plugins.talking import Talking
+from tests.agents.plugins.talking import Talking, law_findings, one_way
 
 EPSILON = 0.2
 
@@ -43,13 +41,10 @@ def settled(talking, most=6000):
 
 def hops(pairs, count):
     """Links between the two robots that are farthest apart."""
-    apart = np.full((count, count), np.inf)
-    np.fill_diagonal(apart, 0.0)
+    joined = np.zeros((count, count))
     for i, j in pairs:
-        apart[i, j] = apart[j, i] = 1.0
-    for k in range(count):
-        apart = np.minimum(apart, apart[:, [k]] + apart[[k]])
-    return apart.max()
+        joined[i, j] = 1.0
+    return shortest_path(joined, directed=False, unweighted=True).max()
 
 
 def least(places, tasks):
@@ -59,7 +54,18 @@ def least(places, tasks):
 
 
 def won(talking):
+    """Tasks by robot, -1: none."""
     return [int(each.measures["task"]) for each in talking.controls]
+
+
+def total(places, tasks, taken):
+    """Sum of ways [m]."""
+    return sum(dist(place, tasks[k]) for place, k in zip(places, taken, strict=True) if k >= 0)
+
+
+def no_task_twice(taken, tasks):
+    got = [each for each in taken if each >= 0]
+    return len(got) == len(set(got)) == min(len(taken), len(tasks))
 
 
 @pytest.mark.slow
@@ -74,10 +80,8 @@ def test_auction_total_is_within_bound_of_optimum(loss):
         if not loss:
             longest = max(dist(place, task) for place in places for task in tasks)
             assert took <= 2.0 * hops(pairs, len(places)) * ceil(longest / EPSILON)
-        got = [each for each in won(talking) if each >= 0]
-        assert len(got) == len(set(got)) == min(len(places), len(tasks))
-        ways = sum(dist(place, tasks[k]) for place, k in zip(places, won(talking), strict=True) if k >= 0)
-        gaps.append((ways - least(places, tasks)) / (EPSILON * len(places)))
+        assert no_task_twice(won(talking), tasks)
+        gaps.append((total(places, tasks, won(talking)) - least(places, tasks)) / (EPSILON * len(places)))
     assert min(gaps) > -1e-9
     assert 0.01 < max(gaps) <= 1.0  # some are not the least
 
@@ -91,8 +95,7 @@ def test_all_bid_anew_when_a_task_appears():
     begin = [place[:2] for place in talking.places]
     assert sorted(dist(place, tasks[k]) < 0.01 for place, k in zip(begin, won(talking), strict=True) if k >= 0)
     settled(talking)
-    ways = sum(dist(place, tasks[k]) for place, k in zip(begin, won(talking), strict=True) if k >= 0)
-    assert ways <= least(begin, tasks) + EPSILON * len(places)
+    assert total(begin, tasks, won(talking)) <= least(begin, tasks) + EPSILON * len(places)
 
 
 @pytest.mark.slow
@@ -107,34 +110,19 @@ def test_robots_that_begin_anew_take_no_task_twice():
             restarted = random.randrange(len(places))
             talking.memory[restarted] = talking.said[restarted] = law.begin(talking.facts[restarted])
         settled(talking)
-        got = [each for each in won(talking) if each >= 0]
-        assert len(got) == len(set(got)) == min(len(places), len(tasks))
-
-
-def findings(*changes):
-    found = check(document.read(index.find_file("auction"), changes), ["periodic"])
-    return [(each.severity, each.message, each.remedy) for each in found if each.code == "law"]
+        assert no_task_twice(won(talking), tasks)
 
 
 @pytest.mark.slow
-def test_rounds_are_foretold():
-    ((severity, message, _),) = findings()
-    rounds = 3 * ceil(dist((1.5, -1.5), (-1.6, 1.2)) / 0.15)
+def test_rounds_are_foretold_and_small_bids_found():
+    ((severity, message, _),) = law_findings("auction")
     assert severity == "note"
-    assert f"about {rounds} rounds" in message
-
-
-@pytest.mark.slow
-def test_bids_that_are_too_small_are_found():
-    ((severity, _, remedy),) = findings("formation.law.epsilon=0.01")
+    assert f"about {3 * ceil(dist((1.5, -1.5), (-1.6, 1.2)) / 0.15)} rounds" in message
+    ((severity, _, remedy),) = law_findings("auction", "formation.law.epsilon=0.01")
     assert severity == "warning"
-    enough = remedy.split()[3]
-    assert findings(f"formation.law.epsilon={enough}")[0][0] == "note"
+    assert law_findings("auction", f"formation.law.epsilon={remedy.split()[3]}")[0][0] == "note"
 
 
 def test_bids_that_do_not_come_back_are_found():
-    text = index.find_file("auction").read_text("utf-8").replace(" - CF", " > CF")
-    plan = document.loads(text).cases()["periodic"]
-    ((severity, message, _),) = plan.law.analyse(plan)
-    assert severity == "error"
+    message, _ = one_way("auction", " - CF")
     assert "do not reach" in message

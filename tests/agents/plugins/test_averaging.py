@@ -7,10 +7,7 @@ import pytest
 
 from agents.plugins.gallery.aggregative import Aggregative
 from agents.plugins.gallery.average import Average
-from experiments.catalogue import index
-from experiments.check.check import check
-from experiments.file import document
-from tests.agents.plugins.talking import Talking
+from tests.agents.plugins.talking import Talking, law_findings, one_way
 
 
 def modes(pairs, count):
@@ -50,32 +47,23 @@ def test_growth_is_that_of_the_estimator(every):
     assert lost > 3
 
 
-def findings(name, *changes):
-    found = check(document.read(index.find_file(name), changes), ["periodic"])
-    return [(each.severity, each.message, each.remedy) for each in found if each.code == "law"]
-
-
 @pytest.mark.slow
 @pytest.mark.usefixtures("unflown")
 @pytest.mark.parametrize("name", ["average", "aggregative"])
 def test_gains_beyond_the_bound_are_found_with_remedy(name):
-    assert [severity for severity, *_ in findings(name)] == ["note"]
-    ((severity, message, remedy),) = findings(name, "formation.law.integral=9", "formation.law.gain=4")
+    assert [severity for severity, *_ in law_findings(name)] == ["note"]
+    ((severity, message, remedy),) = law_findings(name, "formation.law.integral=9", "formation.law.gain=4")
     assert severity == "error"
     assert "diverges" in message
     words = remedy.split()
     gain, integral = words[words.index("gain") + 2], words[words.index("integral") + 2].strip(",")
     changes = (f"formation.law.gain={gain}", f"formation.law.integral={integral}")
-    assert findings(name, *changes)[0][0] in {"note", "warning"}
-    assert findings(name, "formation.law.rate=21")[0][0] == "error"
+    assert law_findings(name, *changes)[0][0] in {"note", "warning"}
+    assert law_findings(name, "formation.law.rate=21")[0][0] == "error"
 
 
-@pytest.mark.slow
 def test_a_link_of_one_way_is_no_average():
-    text = index.find_file("average").read_text("utf-8").replace("KH06 - KH01", "KH06 > KH01")
-    plan = document.loads(text).cases()["periodic"]
-    ((severity, message, remedy),) = plan.law.analyse(plan)
-    assert severity == "error"
+    message, remedy = one_way("average", "KH06 - KH01")
     assert "KH01 receives KH06" in message
     assert '"KH06 - KH01"' in remedy
 

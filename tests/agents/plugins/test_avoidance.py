@@ -15,8 +15,8 @@ from agents.plugins.registry import AVOIDANCES, build
 from agents.vectors import ZERO
 from experiments.definition.plan import Plan
 from tests.agents.bench import Bench
-from tests.agents.few import pair
 from tests.agents.things import NOTHING, near, own
+from tests.small import pair
 
 QUICK = Potential(velocity=0.2, period_s=0.1)  # h v = 0.02 m
 

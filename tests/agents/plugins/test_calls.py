@@ -22,7 +22,7 @@ from agents.plugins.triggers import Trigger
 from agents.vectors import ZERO
 from experiments.definition.plan import Plan
 from tests.agents.bench import Bench
-from tests.agents.few import pair
+from tests.small import pair
 
 
 def half(number):

@@ -21,8 +21,8 @@ from experiments.catalogue import index
 from experiments.definition.plan import Plan
 from experiments.file import document
 from tests.agents.bench import Bench
-from tests.agents.few import triangle
 from tests.agents.things import near, own
+from tests.small import triangle
 
 GROUPS = (LAWS, TRIGGERS, PREDICTORS, PLANNERS, AVOIDANCES)
 EVERY = [(group, name) for group in GROUPS for name in registry.names(group)]

@@ -9,8 +9,8 @@ import socket
 import subprocess
 import sys
 import tomllib
-from math import hypot, isnan
-from pathlib import Path
+from dataclasses import replace
+from math import hypot, isnan, nan
 from types import SimpleNamespace
 
 import pytest
@@ -18,15 +18,17 @@ import pytest
 from agents.body.interface import BodyError
 from agents.formation.link import Link
 from agents.kinds.khepera4 import KHEPERA4
+from agents.plugins import registry
+from agents.vectors import ZERO
+from experiments.definition.plan import Plan
+from tests.agents.bench import Bench
 from tests.agents.signals import Play, standing
 from tests.agents.things import near, own
-from tests.shell import shell
+from tests.commands import ROOT, environment, python, shell
+from tests.small import triangle
 from tests.system import lab
 from tests.waiting import until
 from twins.engines.point_mass import model
-
-ROOT = Path(__file__).parents[3]
-
 
 GUIDE = (ROOT / "docs" / "plugins.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"```python\n(.*?)```", GUIDE, re.DOTALL)
@@ -73,6 +75,10 @@ def install(folder, name, version, groups):
     (written / "entry_points.txt").write_text("\n".join(lines))
 
 
+def path_with(folder):
+    return os.pathsep.join([str(folder), str(ROOT)])
+
+
 @pytest.fixture(scope="module")
 def zenpark(installed):
     with shell(installed) as command:
@@ -80,10 +86,7 @@ def zenpark(installed):
 
 
 def test_every_group_has_an_example():
-    assert {group for _, _, _, group in REGISTERED} | {"zenpark.laws"} == {
-        *("zenpark.triggers", "zenpark.predictors", "zenpark.laws", "zenpark.planners"),
-        *("zenpark.avoidances", "zenpark.engines", "zenpark.bodies", "zenpark.kinds"),
-    }
+    assert {group for _, _, _, group in REGISTERED} | {registry.LAWS} == {registry.BODIES, *registry.CHOSEN}
 
 
 @pytest.mark.slow
@@ -125,12 +128,7 @@ assert registry.struct("zenpark.laws", "spring").__module__ == "my_laws"
 assert "numpy" not in sys.modules
 assert {{each for each in sys.modules if each.startswith("experiments")}} == {{"experiments", "experiments.api"}}
 """
-    path = os.pathsep.join([str(installed), str(ROOT)])
-    done = subprocess.run(
-        [sys.executable, "-c", program],
-        cwd=installed, env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True, timeout=60, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
+    python("-c", program, cwd=installed, env=environment(PYTHONPATH=path_with(installed)))
 
 
 @pytest.mark.slow
@@ -241,7 +239,7 @@ def test_body_of_the_docs_drives_over_udp(four_rovers, tmp_path):
 
 @pytest.mark.system
 def test_broken_robots_of_the_guide_fail_the_run(installed, four_rovers, tmp_path, monkeypatch):
-    monkeypatch.setitem(lab.ENVIRONMENT, "PYTHONPATH", os.pathsep.join([str(installed), str(ROOT)]))
+    monkeypatch.setitem(lab.ENVIRONMENT, "PYTHONPATH", path_with(installed))
     robots = "".join(
         f'[robots.{name}]\nkind = "khepera4"\nstart = {list(STARTS[name])}\nbody = "{address}"\n'
         for name, (_, address) in four_rovers.items()
@@ -286,6 +284,20 @@ def test_law_of_the_docs_pulls_to_its_distance():
     assert law.pull((1.0, 0.0, 0.0), link) == pytest.approx((-0.15, 0.0, 0.0))
     assert law.error((1.0, 0.0, 0.0), link) == pytest.approx(0.5)
     assert law.pull((0.0, 0.0, 0.0), link) == (0.0, 0.0, 0.0)
+
+
+def test_law_of_the_docs_with_memory_steps():
+    law = made_in_guide("Mean")({"A": 3.0})
+    bench = Bench(replace(Plan(triangle()).assignment("A"), law=law, start=None, starts=()), ZERO)
+
+    def hear(bench):
+        for link in range(2):
+            said = {"x": (1.0,), "q": (0.0,)}
+            bench.neighbours.receive(link, (0.5, 0.5 * link, 0.0), ZERO, bench.t, bench.t, yaw=nan, said=said)
+
+    bench.running(hear).step(3.0, hear)
+    assert 1.0 < bench.robot.stepping.memory["x"][0] < 3.0
+    assert bench.robot.stepping.measures["disagreement"] > 0.0
 
 
 def test_fading_of_the_docs_spends_what_it_saved():

@@ -1,8 +1,7 @@
 """Each family fires exactly when its inequality says, on random signals, by an account of its own."""
 
-import math
 from dataclasses import dataclass
-from math import dist, hypot
+from math import ceil, dist, exp, hypot, sqrt
 
 import numpy as np
 import pytest
@@ -60,36 +59,40 @@ def check(trigger, seed, margin, predictor=HOLD):
     assert decided > TICKS / 2
 
 
+FOLLOWING = st.builds(Predictive, threshold=LENGTH)
+CASES = {  # triggers without memory: when they must fire, and what is believed of the robot
+    "periodic": (st.builds(Periodic, period_s=st.integers(1, 20).map(lambda ticks: ticks * DT)),
+                 lambda q, own: q.t - q.t_k - own.period_s + 1e-6, HOLD),
+    "send-on-delta": (st.builds(SendOnDelta, threshold=LENGTH), lambda q, own: q.gap - own.threshold, HOLD),
+    "relative": (st.builds(Relative, share=SHARE), lambda q, own: q.gap - own.share * q.now.error, HOLD),
+    "mixed": (st.builds(MixedTrigger, share=SHARE, floor=LENGTH),
+              lambda q, own: q.gap**2 - own.share * q.now.error**2 - own.floor**2, HOLD),
+    "decaying": (st.builds(Decaying, floor=LENGTH, extra=LENGTH, rate=st.floats(0.1, 5.0)),
+                 lambda q, own: q.gap - own.floor - own.extra * exp(-own.rate * q.t), HOLD),
+    "predictive, hold": (FOLLOWING, lambda q, own: q.gap - own.threshold, HOLD),
+    "predictive": (FOLLOWING, lambda q, own: q.gap - own.threshold, ConstantVelocity()),
+    "predictive, horizon": (FOLLOWING, lambda q, own: q.gap - own.threshold, ConstantVelocity(horizon_s=0.1)),
+    "lyapunov": (
+        st.builds(Lyapunov, level=st.floats(0.2, 0.9), floor=st.floats(0.0, 0.2), largest=st.floats(0.05, 1.0)),
+        lambda q, own: max(own.level * q.then.energy - 0.5 * own.floor**2 - q.now.energy,
+                           q.now.energy - q.then.energy / own.level - 0.5 * own.floor**2, q.gap - own.largest),
+        HOLD,
+    ),
+    "relative-control": (
+        st.builds(RelativeControl, floor=st.floats(0.002, 0.05), share=SHARE),
+        lambda q, own: dist(q.now.offset, q.then.offset) - own.floor - min(own.share * hypot(*q.now.offset), own.share),
+        HOLD,
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CASES)
 @SOME
-@given(SEEDS, st.integers(1, 20))
-def test_periodic(seed, ticks):
-    period = ticks * DT
-    check(Periodic(period_s=period), seed, lambda q: q.t - q.t_k - period + 1e-6)
-
-
-@SOME
-@given(SEEDS, LENGTH)
-def test_send_on_delta(seed, threshold):
-    check(SendOnDelta(threshold=threshold), seed, lambda q: q.gap - threshold)
-
-
-@SOME
-@given(SEEDS, SHARE)
-def test_relative(seed, share):
-    check(Relative(share=share), seed, lambda q: q.gap - share * q.now.error)
-
-
-@SOME
-@given(SEEDS, SHARE, LENGTH)
-def test_mixed(seed, share, floor):
-    check(MixedTrigger(share=share, floor=floor), seed, lambda q: q.gap**2 - share * q.now.error**2 - floor**2)
-
-
-@SOME
-@given(SEEDS, LENGTH, LENGTH, st.floats(0.1, 5.0))
-def test_decaying(seed, floor, extra, rate):
-    trigger = Decaying(floor=floor, extra=extra, rate=rate)
-    check(trigger, seed, lambda q: q.gap - floor - extra * math.exp(-rate * q.t))
+@given(data=st.data(), seed=SEEDS)
+def test_fires_by_its_inequality(name, data, seed):
+    triggers, margin, predictor = CASES[name]
+    trigger = data.draw(triggers)
+    check(trigger, seed, lambda question: margin(question, trigger), predictor)
 
 
 @SOME
@@ -99,7 +102,7 @@ def test_dynamic(seed, share, floor, decay, weight):
 
     def margin(q):
         nonlocal eta, before
-        kept = math.exp(-decay * (q.t - before))
+        kept = exp(-decay * (q.t - before))
         w = share * q.now.error**2 + floor**2 - q.gap**2
         eta, before = max(kept * eta + (1.0 - kept) / decay * w, 0.0), q.t
         return -(eta + weight * w) + 1e-300
@@ -126,20 +129,13 @@ def test_integral(seed, area):
     check(IntegralTrigger(area=area), seed, margin)
 
 
-@pytest.mark.parametrize("predictor", [HOLD, ConstantVelocity(), ConstantVelocity(horizon_s=0.1)])
-@SOME
-@given(SEEDS, LENGTH)
-def test_predictive(predictor, seed, threshold):
-    check(Predictive(threshold=threshold), seed, lambda q: q.gap - threshold, predictor)
-
-
 @pytest.mark.parametrize(("predictor", "reach"), [(HOLD, 9.0), (ConstantVelocity(horizon_s=0.3), 0.3)])
 @SOME
 @given(SEEDS, LENGTH, st.floats(0.05, 5.0))
 def test_self_triggered(predictor, reach, seed, threshold, bound):
     def margin(q):
         drift = hypot(*q.then.velocity) if predictor is HOLD else 0.0
-        wait = min((math.sqrt(drift**2 + 2.0 * bound * threshold) - drift) / bound, 1.0, reach)
+        wait = min((sqrt(drift**2 + 2.0 * bound * threshold) - drift) / bound, 1.0, reach)
         return q.t - q.t_k - wait + 1e-6
 
     check(SelfTriggered(threshold=threshold, acceleration=bound, longest_s=1.0), seed, margin, predictor)
@@ -170,32 +166,5 @@ def test_self_triggered_knows_its_next_event():
     for k in range(60):
         view.since_event = k * DT
         fired.append(trigger.fires(view))
-    wait = 2 * 0.01 / (0.05 + math.sqrt(0.05**2 + 2 * 0.25 * 0.01))
-    assert fired.index(True) == math.ceil(wait / DT)
-
-
-@SOME
-@given(SEEDS, st.floats(0.2, 0.9), st.floats(0.0, 0.2), st.floats(0.05, 1.0))
-def test_lyapunov(seed, level, floor, largest):
-    def margin(q):
-        slack, now, then = 0.5 * floor**2, q.now.energy, q.then.energy
-        return max(level * then - slack - now, now - then / level - slack, q.gap - largest)
-
-    check(Lyapunov(level=level, floor=floor, largest=largest), seed, margin)
-
-
-@SOME
-@given(SEEDS, st.floats(0.002, 0.05), SHARE)
-def test_relative_control(seed, floor, share):
-    def margin(q):
-        return dist(q.now.offset, q.then.offset) - floor - min(share * hypot(*q.now.offset), share)
-
-    check(RelativeControl(floor=floor, share=share), seed, margin)
-
-
-def test_where_they_belong():
-    assert Predictive.PLACES == ("communication",)
-    assert Predictive.PREDICTION == "constant-velocity"
-    assert RelativeControl.PLACES == ("control",)
-    assert SendOnDelta.PLACES == ("communication", "control")
-    assert SendOnDelta.PREDICTION == "hold"
+    wait = 2 * 0.01 / (0.05 + sqrt(0.05**2 + 2 * 0.25 * 0.01))
+    assert fired.index(True) == ceil(wait / DT)

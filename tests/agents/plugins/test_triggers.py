@@ -1,4 +1,4 @@
-"""Every registered trigger: first questions are answered, intervals and silences are kept."""
+"""Every registered trigger: first questions are answered, intervals and silences are kept; what is believed then."""
 
 import re
 from math import dist, inf, nan
@@ -10,8 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from agents.decision.neighbours import Incoming, Neighbours
+from agents.kinds.khepera4 import KHEPERA4
 from agents.plugins import registry
-from agents.plugins.triggers import Periodic, SendOnDelta, Trigger, TriggerState, TriggerView
+from agents.plugins.predictors import HOLD, ConstantVelocity
+from agents.plugins.triggers import LastEvent, Periodic, SendOnDelta, Trigger, TriggerState, TriggerView
 from tests.agents.signals import DT, Play, standing, wander
 
 NAMES = registry.names(registry.TRIGGERS)
@@ -28,19 +31,6 @@ def made(name, **parameters):
     kind = registry.struct(registry.TRIGGERS, name)
     needed = {f.encode_name for f in msgspec.structs.fields(kind) if f.required}
     return registry.build(registry.TRIGGERS, {"kind": name, **dict.fromkeys(needed, 0.05), **parameters})
-
-
-def asked(trigger, deviation, t=9.0):
-    """Whether a trigger fires for a robot that had an event at 0 s."""
-    state = TriggerState(trigger)
-    state.view.t = state.view.since_event = t
-    state.view.deviation, state.last.time, state.view.last.time = deviation, 0.0, 0.0
-    return state.due()
-
-
-def test_all_families_are_registered():
-    assert set(NAMES) >= FAMILIES
-    assert all(isinstance(made(name), Trigger) for name in NAMES)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -105,7 +95,9 @@ def test_send_on_delta_bounds_the_deviation(seed, threshold):
 
 @pytest.mark.parametrize(("deviation", "fires"), [(0.25, False), (0.2500001, True), (0.3, True), (nan, False)])
 def test_send_on_delta_fires_beyond_its_threshold(deviation, fires):
-    assert asked(SendOnDelta(threshold=0.25), deviation) == fires
+    state = TriggerState(SendOnDelta(threshold=0.25))
+    state.view.t, state.view.since_event, state.view.deviation, state.last.time = 9.0, 9.0, deviation, 0.0
+    assert state.due() == fires
 
 
 @pytest.mark.parametrize(
@@ -144,3 +136,28 @@ def test_docs_table_has_families_and_defaults():
         own = set(kind.__struct_fields__) - set(Trigger.__struct_fields__)
         said = {field: float(value) for field, value in re.findall(r"`(\w+)`: \$[^$]+\$, ([0-9.]+)", parameters)}
         assert said == {field: defaults[field] for field in own}, name
+
+
+# ---------------------------------------------------------------- what is believed between two events
+
+
+@pytest.mark.parametrize(("age", "seconds"), [(-0.5, 0.0), (0.0, 0.0), (1.0, 1.0), (2.0, 2.0), (9.0, 2.0)])
+def test_constant_velocity_goes_on_until_its_horizon(age, seconds):
+    sent = LastEvent()
+    sent.position, sent.velocity = (1.0, 2.0, 3.0), (1.0, -2.0, 0.5)
+    predictor = ConstantVelocity(horizon_s=2.0)
+    assert predictor.position(sent, age) == pytest.approx((1.0 + seconds, 2.0 - 2.0 * seconds, 3.0 + 0.5 * seconds))
+    assert predictor.velocity(sent, age) == (sent.velocity if age < 2.0 else (0.0, 0.0, 0.0))
+    assert (predictor.reach(), ConstantVelocity().reach()) == (2.0, inf)
+    assert ConstantVelocity().position(sent, 9.0) == pytest.approx((10.0, -16.0, 7.5))
+
+
+def test_received_pose_counts_from_its_stamp():
+    neighbours = Neighbours([Incoming(0, "B", KHEPERA4, 1.0)], 1.0)
+    (sender,) = neighbours.all
+    neighbours.receive(0, (1.0, 0.0, 0.0), (0.1, 0.0, 0.0), 4.0, 4.4)  # the delay of the network is made up for
+    neighbours.mark_alive(0)
+    assert sender.place(ConstantVelocity(), 5.0) == pytest.approx((1.1, 0.0, 0.0))
+    assert sender.place(HOLD, 5.0) == (1.0, 0.0, 0.0)
+    neighbours.mark_lost(0, 4.5)
+    assert sender.place(ConstantVelocity(), 9.0) == pytest.approx((1.05, 0.0, 0.0))

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from agents.body.interface import RangeScan
 from agents.decision.neighbours import Incoming, Neighbours
-from agents.decision.situation import LATE_SHARE, ProcessHealth
+from agents.decision.situation import LATE_SHARE, SILENT_S, ProcessHealth
 from agents.kinds.crazyflie import CRAZYFLIE
 from agents.kinds.khepera4 import KHEPERA4
 from agents.kinds.tello import TELLO
@@ -17,25 +17,25 @@ from agents.plugins.predictors import HOLD
 from agents.safety.detection import (
     FOREIGN_S,
     LOWEST_DESCENT_M_S,
-    LandingProgress,
-    clock_off,
-    clock_text,
     nearest_robot,
     separation,
     tilt_angle,
     tilted,
 )
 from agents.safety.hazards import Cause, Outcome
+from agents.vectors import UNKNOWN, ZERO
 from tests.agents.safety.watched import DT, NAN, Watched
-
-UNKNOWN = (NAN, NAN, NAN)
 
 
 def leant(angle):
     return math.cos(angle / 2), math.sin(angle / 2), 0.0, 0.0
 
 
-BODY = {  # values of the body: causes of a drone that cruises at 0.5 m, and the extent of the first
+def mocap(seconds):
+    return f"positions of A are stamped {seconds}"
+
+
+CAUSES = {  # what is measured of a drone that cruises at 0.5 m: causes, and the extent of the first
     "tipped": ({"attitude": leant(1.3)}, {Cause.TILT}, "it leans 74° (limit 69°)"),
     "level enough": ({"attitude": leant(1.1)}, set(), ""),
     "empty": ({"battery": 0.09}, {Cause.BATTERY}, "9% (limit 10%)"),
@@ -43,79 +43,55 @@ BODY = {  # values of the body: causes of a drone that cruises at 0.5 m, and the
     "down": ({"flying": False}, {Cause.FALLEN}, "its motors are off"),
     "silent": ({"received": 0.4}, {Cause.UNREACHABLE}, "for 0.6 s"),
     "no device": ({"received": NAN}, set(), ""),
-    "ahead": ({"ahead": 0.11}, {Cause.CLOCK}, "positions of A are stamped 0.11 s ahead"),
-    "behind": ({"ahead": -0.3}, {Cause.CLOCK}, "positions of A are stamped 0.3 s behind"),
-    "late": ({"ahead": -0.2}, set(), ""),
-}
-
-
-@pytest.mark.parametrize("what", BODY)
-def test_causes_of_a_body(what):
-    values, causes, extent = BODY[what]
-    robot = Watched()
-    robot.values |= values
-    assert robot.step().found == causes
-    assert [robot.words(cause) for cause in causes] == [extent][: len(causes)]
-
-
-MOTION = {  # height and velocity
-    "too fast": (0.5, (0.0, 4.4, 0.0), {Cause.OVERSPEED}, "4.40 m/s (limit 4.33 m/s)"),
-    "fast": (0.5, (0.0, 4.3, 0.0), set(), ""),
-    "unknown": (0.5, UNKNOWN, set(), ""),
-    "sinks": (0.3, (0.0, 0.0, -0.2), {Cause.SINKING}, "0.20 m below its goal, and sinks at 0.20 m/s"),
-    "low": (0.3, (0.0, 0.0, -0.1), set(), ""),
-    "dips": (0.4, (0.0, 0.0, -0.2), set(), ""),
-}
-
-
-@pytest.mark.parametrize("what", MOTION)
-def test_causes_of_motion(what):
-    height, velocity, causes, extent = MOTION[what]
-    robot = Watched()
-    robot.position, robot.velocity = (0.0, 0.0, height), velocity
-    assert robot.step().found == causes
-    assert [robot.words(cause) for cause in causes] == [extent][: len(causes)]
-
-
-PLACE = {
-    "beyond": ({"outside_wall": True, "excess": 0.1}, {Cause.MARGIN}, "0.10 m outside (limit 0 m)"),
+    "clock ahead": ({"ahead": 0.11}, {Cause.CLOCK}, mocap("0.11 s ahead")),
+    "clock hardly ahead": ({"ahead": 0.1}, set(), ""),
+    "clock behind": ({"ahead": -0.26}, {Cause.CLOCK}, mocap("0.26 s behind")),
+    "clock hardly behind": ({"ahead": -0.25}, set(), ""),
+    "too fast": ({"velocity": (0.0, 4.4, 0.0)}, {Cause.OVERSPEED}, "4.40 m/s (limit 4.33 m/s)"),
+    "fast": ({"velocity": (0.0, 4.3, 0.0)}, set(), ""),
+    "speed unknown": ({"velocity": UNKNOWN}, set(), ""),
+    "sinks": (
+        {"position": (0.0, 0.0, 0.3), "velocity": (0.0, 0.0, -0.2)},
+        {Cause.SINKING},
+        "0.20 m below its goal, and sinks at 0.20 m/s",
+    ),
+    "low": ({"position": (0.0, 0.0, 0.3), "velocity": (0.0, 0.0, -0.1)}, set(), ""),
+    "dips": ({"position": (0.0, 0.0, 0.4), "velocity": (0.0, 0.0, -0.2)}, set(), ""),
+    "beyond": ({"flags": {"outside_wall": True, "excess": 0.1}}, {Cause.MARGIN}, "0.10 m outside (limit 0 m)"),
     "outside": (
-        {"outside_wall": True, "outside": True, "excess": 0.3},
+        {"flags": {"outside_wall": True, "outside": True, "excess": 0.3}},
         {Cause.OUTSIDE},
         "0.30 m outside (limit 0.25 m)",
     ),
-    "flown": ({"outside": True, "flyaway": True, "excess": 0.8}, {Cause.OUTSIDE, Cause.FAR_OUTSIDE}, ""),
-    "flipped": ({"invalid": True, "jump": 0.7, "yaw_jump": 1.2}, {Cause.POSITION}, "its yaw jumped by 1.20 rad"),
-    "jumped": ({"invalid": True, "jump": 0.7}, {Cause.POSITION}, "it jumped by 0.70 m"),
-    "stale": ({"invalid": True}, {Cause.POSITION}, "the last is 0.00 s old"),
+    "flown": (
+        {"flags": {"outside": True, "flyaway": True, "excess": 0.8}},
+        {Cause.OUTSIDE, Cause.FAR_OUTSIDE},
+        "0.80 m outside (limit 0.25 m)",
+    ),
+    "flipped": (
+        {"flags": {"invalid": True, "jump": 0.7, "yaw_jump": 1.2}},
+        {Cause.POSITION},
+        "its yaw jumped by 1.20 rad",
+    ),
+    "jumped": ({"flags": {"invalid": True, "jump": 0.7}}, {Cause.POSITION}, "it jumped by 0.70 m"),
+    "stale": ({"flags": {"invalid": True}}, {Cause.POSITION}, "the last is 0.00 s old"),
+    "early": ({"flags": {"invalid": True}, "time": 1.3}, {Cause.POSITION}, "it is stamped 0.3 s ahead"),
+    "lost": ({"flags": {"invalid": True}, "position": UNKNOWN}, {Cause.POSITION}, "none"),
 }
 
 
-@pytest.mark.parametrize("what", PLACE)
-def test_causes_of_a_place(what):
-    flags, causes, extent = PLACE[what]
-    robot = Watched()
-    robot.misplace(**flags)
+@pytest.mark.parametrize("what", CAUSES)
+def test_causes_of_one_tick(what):
+    measured, causes, extent = CAUSES[what]
+    robot = Watched().measure(**measured)
     assert robot.step().found == causes
-    assert not extent or robot.words(*causes) == extent
-
-
-def test_lost_positions_in_words():
-    robot = Watched()
-    robot.misplace(invalid=True)
-    robot.values["time"] = 1.3
-    robot.step()
-    assert robot.words(Cause.POSITION) == "it is stamped 0.3 s ahead"
-    robot.position = UNKNOWN
-    robot.step()
-    assert robot.words(Cause.POSITION) == "none"
+    assert [robot.words(cause) for cause in sorted(causes)][:1] == [extent][: len(causes)]
 
 
 def test_wheels_have_no_causes_of_flight():
-    robot = Watched(KHEPERA4, hover=NAN)
-    robot.position, robot.velocity = (0.0, 0.0, 0.0), (0.0, 0.0, -0.2)
-    robot.values |= {"attitude": leant(2.0), "flying": False}
-    robot.misplace(flyaway=True)
+    robot = Watched(KHEPERA4, hover=NAN).measure(
+        position=ZERO, velocity=(0.0, 0.0, -0.2), attitude=leant(2.0), flying=False, flags={"flyaway": True}
+    )
     assert robot.step().found == set()
 
 
@@ -140,38 +116,30 @@ def test_orders():
 # ---------------------------------------------------------------- neighbours
 
 
-def test_robots_too_near_hold_nearer_land():
-    robot = Watched(KHEPERA4, [("B", KHEPERA4), ("C", KHEPERA4)], hover=0.0, separation=0.3)
+@pytest.mark.parametrize(("kind", "touching"), [(KHEPERA4, 0.145), (TURTLEBOT3, 0.2)], ids=["small", "large"])
+def test_robots_too_near_hold_nearer_land(kind, touching):
+    robot = Watched(kind, [("B", kind), ("C", kind)], hover=0.0, separation=0.3)
     assert robot.step().found == set()
     robot.hear(1, (0.25, 0.0, 0.0))
     assert robot.step().found == {Cause.SEPARATION}
     assert robot.words(Cause.SEPARATION) == "0.25 m from C (limit 0.3 m)"
-    robot.hear(1, (0.145, 0.0, 0.0))
+    robot.hear(1, (touching, 0.0, 0.0))
     assert robot.step().found == {Cause.SEPARATION, Cause.TOUCHING}
     robot.position = UNKNOWN
     assert robot.step().found == set()
 
 
-def test_touching_robots_land_beyond_half_the_separation():
-    robot = Watched(TURTLEBOT3, [("B", TURTLEBOT3)], hover=0.0, separation=0.3).step()
-    robot.hear(0, (0.2, 0.0, 0.0))
-    assert robot.step().found == {Cause.SEPARATION, Cause.TOUCHING}
-
-
 def test_separation_from_senders():
     neighbours = Neighbours([Incoming(1, "B", KHEPERA4, 0.5), Incoming(2, "C", KHEPERA4, 0.5)], 1.0)
     sender, _ = neighbours.all
-    origin = (0.0, 0.0, 0.0)
-    assert nearest_robot(origin, neighbours, HOLD, 1.0) == (math.inf, "")
-    neighbours.receive(0, (0.3, 0.4, 0.0), origin, 1.0, 1.0)
-    assert separation(origin, sender, HOLD, 1.0, 1.0) == math.inf  # never alive
+    assert nearest_robot(ZERO, neighbours, HOLD, 1.0) == (math.inf, "")
+    neighbours.receive(0, (0.3, 0.4, 0.0), ZERO, 1.0, 1.0)
+    assert separation(ZERO, sender, HOLD, 1.0, 1.0) == math.inf  # never alive
     neighbours.mark_alive(0)
-    assert separation(origin, sender, HOLD, 1.0, 1.0) == 0.5
-    assert nearest_robot(origin, neighbours, HOLD, 1.0) == (0.5, "B")
+    assert nearest_robot(ZERO, neighbours, HOLD, 1.0) == (0.5, "B")
     assert separation(UNKNOWN, sender, HOLD, 1.0, 1.0) == math.inf
     neighbours.mark_lost(0, 2.0)
-    assert separation(origin, sender, HOLD, 3.0, 1.0) == 0.5
-    assert separation(origin, sender, HOLD, 3.1, 1.0) == math.inf
+    assert [separation(ZERO, sender, HOLD, t, 1.0) for t in (3.0, 3.1)] == [0.5, math.inf]
 
 
 def test_lost_neighbours():
@@ -247,17 +215,16 @@ def test_unstarted_drone_lands():
 
 def test_failing_control_loop():
     health = ProcessHealth()
-    for _ in range(500):
-        health.count_tick(4, DT)
-    assert health.missed_share == pytest.approx(0.8)  # 20 Hz is slow, not hopeless
-    health.count_tick(500, DT)  # 5 s of nothing
-    assert health.missed_share > LATE_SHARE
-    for _ in range(20):
-        health.count_tick(0, DT)
-    assert health.missed_share < LATE_SHARE
-    for _ in range(2000):
-        health.count_tick(0, DT)
-    assert health.missed_share == 0.0
+
+    def share(ticks, missed):
+        for _ in range(ticks):
+            health.count_tick(missed, DT)
+        return health.missed_share
+
+    assert share(500, missed=4) == pytest.approx(0.8)  # 20 Hz is slow, not hopeless
+    assert share(1, missed=500) > LATE_SHARE  # 5 s of nothing
+    assert share(20, missed=0) < LATE_SHARE
+    assert share(2000, missed=0) == 0.0
     robot = Watched()
     robot.health.missed_share = 0.95
     assert robot.step().found == {Cause.LATE}
@@ -278,16 +245,71 @@ def test_range_sensors_that_fall_silent(avoids):
     assert robot.texts == (["hold: its range sensors are silent: for 1.0 s"] if avoids else [])
 
 
+# ---------------------------------------------------------------- a process that was suspended
+
+
+def woken(slept=0.6, neighbours=(("B", KHEPERA4),)):
+    """A robot with one neighbour, the process of which has just resumed."""
+    robot = Watched(KHEPERA4, neighbours, hover=0.0).step(1.0)
+    robot.health.mark_resumed(robot.t, slept)
+    return robot
+
+
+def held(robot, seconds):
+    """Ticks on which a robot is held."""
+    return sum(robot.step().hazards.held for _ in range(round(seconds / DT)))
+
+
+def test_standstill_holds_until_neighbours_are_heard():
+    robot = woken()
+    assert held(robot, 0.03) == 3
+    robot.hear(0, (1.0, 0.0, 0.0))
+    assert held(robot, 3.0) == 0
+    begin, end = robot.texts
+    assert begin == "hold: its process stood still: for 0.6 s; it waits for its neighbours"
+    assert end.startswith("over: its process stood still, after ")
+    lost = woken()
+    lost.neighbours.mark_lost(0, lost.t)
+    assert held(lost, 0.5) == held(woken(neighbours=()), 0.5) == 0
+
+
+@pytest.mark.parametrize("slept", [0.6, 1.5, 2.2])
+def test_silent_neighbours_are_not_awaited_for_long(slept):
+    assert held(woken(slept), 3.0) == pytest.approx(SILENT_S / DT, abs=1)
+
+
+def test_waiting_begins_when_the_router_is_back():
+    robot = woken()
+    robot.health.offline_since = robot.t
+    assert held(robot, 3.0) == 300
+    robot.health.offline_since = math.inf
+    assert held(robot, 3.0) == pytest.approx(SILENT_S / DT, abs=1)
+    robot.health.offline_since = robot.t  # much later: that standstill is over
+    assert held(robot, 0.5) == 0
+
+
+def test_guided_robot_waits_for_a_new_goal():
+    robot = woken(neighbours=())
+    robot.status.goal_stamp = robot.t - 0.5
+    assert held(robot, 0.1) == 10
+    robot.status.goal_stamp = robot.t
+    assert held(robot, 0.1) == 0
+
+
 # ---------------------------------------------------------------- climbing, landing, obedience
 
 
-def test_climb_that_is_carried_aside():
-    robot = Watched()
+def climbs(kind=CRAZYFLIE):
+    robot = Watched(kind)
     robot.status.cruising, robot.status.climbing = False, True
-    begin = robot.t
+    return robot
+
+
+def test_climb_that_is_carried_aside():
+    robot = climbs()
 
     def carry(robot):
-        robot.position = (robot.t - begin, 0.0, 0.1 + robot.t - begin)
+        robot.position = (robot.t - 1.0, 0.0, 0.1 + robot.t - 1.0)
 
     assert robot.step(0.55, carry).texts == []
     robot.step(0.05, carry)
@@ -298,32 +320,30 @@ def test_climb_that_is_carried_aside():
 
 @pytest.mark.parametrize(("kind", "patience_s"), [(CRAZYFLIE, 4.0), (TELLO, 10.0)], ids=["crazyflie", "tello"])
 def test_climb_without_measured_height(kind, patience_s):
-    robot = Watched(kind)
-    robot.status.cruising, robot.status.climbing = False, True
-    robot.position = (0.0, 0.0, 0.02)
+    robot = climbs(kind).measure(position=(0.0, 0.0, 0.02))
     assert robot.step(patience_s).texts == []
     assert robot.step(0.03).texts == ["land: it does not obey commands to move: it does not rise"]
 
 
-def lands(*, height=0.5, velocity=(0.0, 0.0, 0.0), **safety):
+def lands(**measured):
     """A drone that begins to land."""
-    robot = Watched(landing_s=2.0, **safety)
-    robot.position, robot.velocity = (0.0, 0.0, height), velocity
+    robot = Watched(landing_s=2.0).measure(**measured)
     robot.status.cruising, robot.status.landing = False, True
     robot.active, robot.landing = False, True
     return robot
 
 
 @pytest.mark.parametrize(
-    ("height", "velocity", "seconds"),
-    [(0.02, (0.0, 0.0, 0.0), 2.0), (0.5, (0.0, 0.0, 0.5), 2.5), (NAN, (0.0, 0.0, 0.0), 2.5 / LOWEST_DESCENT_M_S)],
+    ("measured", "seconds"),
+    [
+        ({"position": (0.0, 0.0, 0.02)}, 2.0),
+        ({"velocity": (0.0, 0.0, 0.5)}, 2.5),
+        ({"position": (0.0, 0.0, NAN), "flags": {"invalid": True}}, 2.5 / LOWEST_DESCENT_M_S),  # of its room
+    ],
     ids=["on the floor", "climbs", "blind"],
 )
-def test_landing_that_does_no_good_is_cut(height, velocity, seconds):
-    robot = lands(height=height, velocity=velocity)
-    if math.isnan(height):
-        robot.misplace(invalid=True)
-    robot.step(seconds + 1.9)
+def test_landing_that_does_no_good_is_cut(measured, seconds):
+    robot = lands(**measured).step(seconds + 1.9)
     assert robot.acts == []
     robot.step(0.2)
     assert [each.text for each in robot.acts] == ["cut: its landing takes too long: more than 2 s without a descent"]
@@ -332,25 +352,14 @@ def test_landing_that_does_no_good_is_cut(height, velocity, seconds):
 def test_hovering_drone_is_never_cut():
     robot = lands().step(30.0)
     assert robot.texts == ["warn: it hovers although commanded to land: at 0.50 m"]
-    robot.values["flying"] = False
-    assert robot.step().found == set()
+    assert robot.measure(flying=False).step().found == set()
 
 
 def test_slow_landing_is_given_its_time():
-    robot = lands(velocity=(0.0, 0.0, -0.03))
-
     def sink(robot):
         robot.position = (0.0, 0.0, robot.position[2] - 0.03 * DT)
 
-    assert robot.step(15.0, sink).texts == []
-
-
-def test_blind_drone_gets_the_time_of_its_room():
-    descent, cut = LandingProgress(6.0), []
-    for tick in range(400):
-        descent.update(0.1 * tick, True, False, NAN, UNKNOWN)
-        cut += [tick] if descent.late else []
-    assert cut[0] == 301  # 6 m at 0.2 m/s
+    assert lands(velocity=(0.0, 0.0, -0.03)).step(15.0, sink).texts == []
 
 
 def test_robot_below_a_landing():
@@ -396,16 +405,6 @@ def test_tilt_is_an_angle_to_the_vertical(attitude, angle):
     assert tilted(attitude, 0.49) == (angle > 0.49)
 
 
-@pytest.mark.parametrize(("ahead", "off"), [(0.1, False), (0.2, True), (-0.25, False), (-0.26, True), (NAN, False)])
-def test_clocks_of_positions(ahead, off):
-    assert clock_off(ahead, 0.5) == off
-
-
-def test_clock_errors_in_words():
-    assert clock_text("A", 12.345) == "positions of A are stamped 12.3 s ahead"
-    assert clock_text("A", -0.3) == "positions of A are stamped 0.3 s behind"
-
-
 number = st.one_of(st.floats(-3.0, 3.0), st.floats())
 vector = st.tuples(number, number, number)
 
@@ -415,11 +414,11 @@ vector = st.tuples(number, number, number)
     st.sampled_from([CRAZYFLIE, TELLO, KHEPERA4]),
     st.lists(
         st.fixed_dictionaries(
-            {},
+            {"status": st.booleans(), "setpoint": st.tuples(*[number] * 4)},
             optional={
-                "position": vector, "velocity": vector, "yaw": number, "setpoint": st.tuples(*[number] * 4),
-                "attitude": st.tuples(*[number] * 4), "battery": number, "time": number, "ahead": number,
-                "received": number, "flying": st.booleans(), "flags": st.booleans(), "status": st.booleans(),
+                "position": vector, "velocity": vector, "yaw": number, "attitude": st.tuples(*[number] * 4),
+                "battery": number, "time": number, "ahead": number, "received": number, "flying": st.booleans(),
+                "flags": st.fixed_dictionaries({"invalid": st.booleans(), "outside": st.booleans()}),
             },
         ),
         max_size=6,
@@ -427,17 +426,10 @@ vector = st.tuples(number, number, number)
 )  # fmt: skip
 def test_any_numbers_are_judged_and_worded(kind, story):
     robot = Watched(kind, [("B", KHEPERA4)], separation=0.4)
-    for values in story:
-        robot.position = values.get("position", robot.position)
-        robot.velocity = values.get("velocity", robot.velocity)
-        robot.yaw = values.get("yaw", robot.yaw)
-        robot.status.setpoint = values.get("setpoint", robot.status.setpoint)
+    for measured in story:
+        status, robot.status.setpoint = measured.pop("status"), measured.pop("setpoint")
         for name in ("ordered", "climbing", "landing", "unguided", "not_finite", "alone"):
-            setattr(robot.status, name, values.get("status", False))
-        flags = {"invalid": values.get("flags", False), "outside": values.get("flags", False)}
-        robot.misplace(**flags)
-        names = ("attitude", "battery", "time", "ahead", "received", "flying")
-        robot.values |= {name: values[name] for name in names if name in values}
-        robot.step(0.35)
+            setattr(robot.status, name, status)
+        robot.measure(**measured).step(0.35)
         assert all(isinstance(robot.words(cause), str) for cause in robot.found)
         assert robot.hazards.under_way or not robot.hazards.worst()

@@ -91,28 +91,25 @@ def test_outcomes_of_a_lasting_cause(cause):
     assert [each.outcome.name for each in bench.acts] == [last][: last in ("LAND", "CUT")]
 
 
-def test_wheels_without_a_position_stand_for_ever():
-    assert Bench(KHEPERA4).see(20.0, Cause.POSITION).changes == [(0, "HOLD")]
-
-
-def test_robot_that_does_not_move_lands():
-    assert Bench(CRAZYFLIE).see(20.0, Cause.UNRESPONSIVE).changes == [(0, "LAND")]
-    assert Bench(KHEPERA4).see(20.0, Cause.UNRESPONSIVE).changes == [(0, "WARN"), (200, "LAND")]
-
-
-@pytest.mark.parametrize("kind", [CRAZYFLIE, KHEPERA4], ids=lambda kind: kind.name)
-def test_robot_of_a_paused_world_is_not_landed(kind):
-    assert Bench(kind, hold_s=10.0).see(20.0, Cause.UNRESPONSIVE).changes == [(0, "WARN")]
-
-
-def test_choices_of_an_experiment():
-    for lost, outcome in (("drop", "WARN"), ("hold", "HOLD"), ("land", "LAND")):
-        assert Bench(lost_neighbour=lost).see(0.1, Cause.NEIGHBOUR).changes == [(0, outcome)]
-    assert Bench(lost_conductor="land").see(3.0, Cause.CONDUCTOR).changes == [(200, "LAND")]
-    assert Bench(offline_s=3.0, neighbour_timeout_s=0.5).see(4.0, Cause.ROUTER).changes == [(50, "HOLD"), (300, "LAND")]
-    assert Bench(landing_s=5.0).see(6.0, Cause.LANDING).changes == [(500, "CUT")]
-    assert Bench(land_without_position_s=1.0).see(3.0, Cause.POSITION).changes == [(0, "HOLD"), (100, "LAND")]
-    assert Bench(hold_s=2.0).see(3.0, Cause.POSITION).changes == [(0, "HOLD"), (200, "LAND")]
+@pytest.mark.parametrize(
+    ("kind", "chosen", "cause", "changes"),
+    [
+        (KHEPERA4, {}, Cause.POSITION, [(0, "HOLD")]),
+        (KHEPERA4, {}, Cause.UNRESPONSIVE, [(0, "WARN"), (200, "LAND")]),
+        (KHEPERA4, {"hold_s": 10.0}, Cause.UNRESPONSIVE, [(0, "WARN")]),  # its world may pause
+        (CRAZYFLIE, {"hold_s": 10.0}, Cause.UNRESPONSIVE, [(0, "WARN")]),
+        (CRAZYFLIE, {"hold_s": 2.0}, Cause.POSITION, [(0, "HOLD"), (200, "LAND")]),
+        (CRAZYFLIE, {"land_without_position_s": 1.0}, Cause.POSITION, [(0, "HOLD"), (100, "LAND")]),
+        (CRAZYFLIE, {"lost_neighbour": "drop"}, Cause.NEIGHBOUR, [(0, "WARN")]),
+        (CRAZYFLIE, {"lost_neighbour": "hold"}, Cause.NEIGHBOUR, [(0, "HOLD")]),
+        (CRAZYFLIE, {"lost_neighbour": "land"}, Cause.NEIGHBOUR, [(0, "LAND")]),
+        (CRAZYFLIE, {"lost_conductor": "land"}, Cause.CONDUCTOR, [(200, "LAND")]),
+        (CRAZYFLIE, {"offline_s": 3.0, "neighbour_timeout_s": 0.5}, Cause.ROUTER, [(50, "HOLD"), (300, "LAND")]),
+        (CRAZYFLIE, {"landing_s": 5.0}, Cause.LANDING, [(500, "CUT")]),
+    ],
+)
+def test_choices_of_kind_and_experiment(kind, chosen, cause, changes):
+    assert Bench(kind, **chosen).see(12.0, cause).changes == changes
 
 
 @pytest.mark.parametrize("cause", [cause for cause in Cause if EXPECTED[cause][0][1] == "HOLD"])
@@ -137,52 +134,46 @@ def test_landing_never_ends():
     assert [each.cause for each in bench.acts] == [Cause.OUTSIDE]
 
 
-@pytest.mark.parametrize("absent_s", [0.0, 0.5])
-def test_hazard_of_a_robot_that_ends(absent_s):
+@pytest.mark.parametrize(
+    ("absent_s", "text"),
+    [
+        (0.0, "unresolved at the end: it is beyond a wall of the arena, for 9.99 s"),
+        (0.5, "over: it is beyond a wall of the arena, after 9.99 s"),
+    ],
+)
+def test_hazard_of_a_robot_that_ends(absent_s, text):
     bench = Bench().see(10.0, Cause.MARGIN).see(absent_s).see(5.0, Cause.MARGIN, active=False, landing=True)
     end = bench.hazards.incidents[-1]
-    assert end.outcome == Outcome.NONE
-    if absent_s:
-        assert end.text == "over: it is beyond a wall of the arena, after 9.99 s"
-    else:
-        assert end.text == "unresolved at the end: it is beyond a wall of the arena, for 9.99 s"
-        assert end.time == pytest.approx(10.0)
+    assert (end.outcome, end.text) == (Outcome.NONE, text)
+    assert absent_s or end.time == pytest.approx(10.0)
     assert bench.hazards.worst() == ""
 
 
-def test_flickering_cause_is_reported_once():
+@pytest.mark.parametrize(
+    ("cause", "present_s", "absent_s", "changes"),
+    [
+        (Cause.SEPARATION, 0.05, 0.3, [(0, "HOLD")]),  # reported once
+        (Cause.SETPOINT, 0.02, 0.08, [(0, "HOLD"), (50, "LAND")]),
+        (Cause.POSITION, 0.02, 0.08, [(0, "HOLD")]),
+        (Cause.TILT, 0.05, 0.02, []),
+    ],
+)
+def test_cause_that_comes_and_goes(cause, present_s, absent_s, changes):
     bench = Bench()
     for _ in range(20):
-        bench.see(0.05, Cause.SEPARATION).see(0.3)
-    assert bench.changes == [(0, "HOLD")]
-
-
-def test_repeated_wrong_setpoints_land_lost_positions_hold():
-    wild, blind = Bench(), Bench()
-    for _ in range(10):
-        wild.see(0.02, Cause.SETPOINT).see(0.08)
-        blind.see(0.02, Cause.POSITION).see(0.08)
-    assert wild.changes[-1] == (50, "LAND")
-    assert blind.changes == [(0, "HOLD")]
-
-
-def test_short_cause_is_forgotten():
-    bench = Bench()
-    for _ in range(20):
-        bench.see(0.05, Cause.TILT)
-        assert bench.hazards.under_way
-        bench.see(0.02)
-        assert not bench.hazards.under_way
-    assert bench.changes == []
+        assert bench.see(present_s, cause).hazards.under_way
+        assert bench.see(absent_s).hazards.under_way == bool(changes)
+    assert bench.changes == changes
 
 
 def test_worst_hazard_is_shown_and_acted_on():
-    bench = Bench().see(0.1, Cause.MARGIN)
-    assert bench.hazards.worst() == "warn: it is beyond a wall of the arena: number 2"
-    bench.see(0.1, Cause.SEPARATION, Cause.MARGIN)
-    assert bench.hazards.worst() == "hold: minimum separation: number 5"
-    bench.see(0.2, Cause.TILT, Cause.MARGIN)
-    assert bench.hazards.worst() == "cut: it has tipped over: number 8"
+    bench = Bench()
+    for causes, worst in (
+        ([Cause.MARGIN], "warn: it is beyond a wall of the arena: number 2"),
+        ([Cause.SEPARATION, Cause.MARGIN], "hold: minimum separation: number 5"),
+        ([Cause.TILT, Cause.MARGIN], "cut: it has tipped over: number 8"),
+    ):
+        assert bench.see(0.15, *causes).hazards.worst() == worst
     assert [each.outcome for each in bench.acts] == [Outcome.CUT]
 
 

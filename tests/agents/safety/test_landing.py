@@ -157,36 +157,28 @@ def test_drone_that_cannot_go_aside_lands_in_place(spoil):
     assert (drone.landing.aside, drone.sinks_at) == (False, 0.0)
 
 
+def landed_otherwise(bench, drone):
+    drone.landing.land_in_place()
+
+
+@pytest.mark.parametrize(("event", "sinks_at"), [(fallen, inf), (landed_otherwise, inf), (blind, DT)])
+def test_way_aside_ends(event, sinks_at):
+    """It sinks by itself if it only lost its pose; else something has told the body."""
+    bench, drone = above()
+    bench.step()
+    assert drone.landing.aside
+    event(bench, drone)
+    bench.step()
+    assert not drone.landing.aside
+    assert drone.sinks_at == pytest.approx(sinks_at)
+
+
 def test_robot_on_wheels_stops_at_once():
     bench, drone = above()
     ground = bench.robots[0]
     ground.ordered = True
     bench.step()
     assert (ground.sinks_at, drone.landing.aside) == (0.0, True)
-
-
-def test_way_aside_ends_when_the_landing_does():
-    bench, drone = above()
-    bench.step()
-    drone.lands = False
-    bench.step()
-    assert (drone.landing.aside, drone.sinks_at) == (False, inf)
-
-
-def test_drone_that_loses_its_pose_aside_lands():
-    bench, drone = above()
-    bench.step()
-    bench.lag = 1.0
-    bench.step()
-    assert drone.sinks_at == pytest.approx(DT)
-
-
-def test_drone_that_lands_by_other_means_stays_there():
-    bench, drone = above()
-    bench.step()
-    drone.landing.land_in_place()
-    bench.step()
-    assert (drone.landing.aside, drone.sinks_at) == (False, inf)  # something else has told the body
 
 
 def test_search_for_a_place_ends():

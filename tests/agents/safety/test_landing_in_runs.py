@@ -12,8 +12,8 @@ from agents.kinds.khepera4 import KHEPERA4
 from agents.safety.hazards import Cause
 from agents.safety.landing import NEAR
 from experiments.definition.experiment import Experiment, Formation, LegTable, RobotTable
-from tests.agents.few import pair
 from tests.agents.swarm import Swarm
+from tests.small import pair
 
 
 def test_run_ends_beside_a_robot_below():

@@ -63,14 +63,26 @@ def test_robot_that_does_not_move(kind):
 
 
 @wheels
-def test_wheels_that_crawl_or_turn_in_vain(kind):
-    assert Told(kind).go(8.0, told=0.2 * kind.speed) == (True, False)
-    assert Told(kind).go(4.0, told_turn=1.5) == (True, False)
-    assert Told(kind).go(4.0, told_turn=1.5, turn=1.5) == (False, False)
-    wobbling = Told(kind)  # to and fro is no way
-    for _ in range(40):
-        assert wobbling.go(0.1, told_turn=1.5) == (False, False)
-        assert wobbling.go(0.1, told_turn=-1.5) == (False, False)
+@pytest.mark.parametrize(
+    ("seconds", "given", "found"),
+    [
+        (8.0, {"told": 0.05}, (True, False)),  # it crawls
+        (4.0, {"told_turn": 1.5}, (True, False)),
+        (4.0, {"told_turn": 1.5, "turn": 1.5}, (False, False)),
+        (5.0, {"speed": 0.1}, (False, True)),  # as a Khepera that has lost its link
+        (4.0, {"turn": 1.0}, (False, True)),
+        (4.0, {"turn": 1.0, "told_turn": 1.0}, (False, False)),
+    ],
+)
+def test_wheels_that_ignore_or_need_no_commands(kind, seconds, given, found):
+    assert Told(kind).go(seconds, **given) == found
+
+
+@wheels
+def test_wheels_that_turn_to_and_fro_obey(kind):
+    robot = Told(kind)
+    for turn in (1.5, -1.5) * 40:
+        assert robot.go(0.1, told_turn=turn) == (False, False)
 
 
 @every_kind
@@ -87,13 +99,6 @@ def test_robot_that_moves_without_being_told(kind):
     assert robot.go(15.0) == (False, False)
     opposite = Told(kind)
     assert opposite.go(3.0, told=0.5 * kind.speed, speed=-0.5 * kind.speed) == (False, True)
-
-
-@wheels
-def test_wheels_that_run_away_or_spin(kind):
-    assert Told(kind).go(5.0, speed=0.1) == (False, True)  # as a Khepera that has lost its link
-    assert Told(kind).go(4.0, turn=1.0) == (False, True)
-    assert Told(kind).go(4.0, turn=1.0, told_turn=1.0) == (False, False)
 
 
 @wheels

@@ -1,7 +1,6 @@
 """Positions that are believed: a robot does not jump, and what its position jumped to is not passed on to it."""
 
-import math
-from math import inf, nan
+from math import inf, isfinite, isnan, nan, pi, remainder, sqrt, tau
 
 import pytest
 
@@ -9,23 +8,27 @@ from agents.kinds.crazyflie import CRAZYFLIE
 from agents.kinds.khepera4 import KHEPERA4
 from agents.safety.positions import FLIP, JUMP_M, PLAUSIBLE_SPEED, Continuity, ExternalPositions
 
+FAR = JUMP_M + PLAUSIBLE_SPEED * CRAZYFLIE.speed * 0.3  # [m] within a gap of 0.3 s in the measurements
 
-def jump(*samples, kind=CRAZYFLIE):
-    """Last jump of a robot in motion that was at x [m] at several times [s]."""
+
+@pytest.mark.parametrize(
+    ("kind", "samples", "jump"),
+    [
+        (CRAZYFLIE, [(0.0, 0.0), (0.01, 0.99 * JUMP_M)], nan),
+        (CRAZYFLIE, [(0.0, 0.0), (0.01, 1.0)], 1.0),
+        (CRAZYFLIE, [(0.0, 0.0), (0.01, 1.0), (9.0, 1.0)], 1.0),  # time does not heal it
+        (CRAZYFLIE, [(0.0, 0.0), (0.01, 1.0), (0.02, 0.0)], nan),
+        (CRAZYFLIE, [(0.0, 0.0), (0.01, 1.0), (0.02, nan), (0.03, 1.0)], 1.0),
+        (CRAZYFLIE, [(0.0, 0.0), (0.3, FAR - 0.01)], nan),
+        (KHEPERA4, [(0.0, 0.0), (0.3, FAR - 0.01)], FAR - 0.01),
+        (CRAZYFLIE, [(0.0, 0.0), (9.0, 5.0)], 5.0),
+    ],
+)
+def test_jump_is_farther_than_a_robot_can_move(kind, samples, jump):
+    """A robot in motion at x [m] at several times [s], and its last jump."""
     continuity = Continuity(kind)
-    return [continuity.jump(t, (x, 0.0, 0.0), 0.0, True) for t, x in samples][-1]
-
-
-def test_jump_is_farther_than_a_robot_can_move():
-    assert math.isnan(jump((0.0, 0.0), (0.01, 0.99 * JUMP_M)))
-    assert jump((0.0, 0.0), (0.01, 1.0)) == 1.0
-    assert jump((0.0, 0.0), (0.01, 1.0), (9.0, 1.0)) == 1.0  # time does not heal it
-    assert math.isnan(jump((0.0, 0.0), (0.01, 1.0), (0.02, 0.0)))
-    assert jump((0.0, 0.0), (0.01, 1.0), (0.02, nan), (0.03, 1.0)) == 1.0
-    far = JUMP_M + PLAUSIBLE_SPEED * CRAZYFLIE.speed * 0.3  # a gap in the measurements
-    assert math.isnan(jump((0.0, 0.0), (0.3, far - 0.01)))
-    assert jump((0.0, 0.0), (0.3, far - 0.01), kind=KHEPERA4) == pytest.approx(far - 0.01)
-    assert jump((0.0, 0.0), (9.0, 5.0)) == 5.0
+    jumps = [continuity.jump(t, (x, 0.0, 0.0), 0.0, True) for t, x in samples]
+    assert jumps[-1] == pytest.approx(jump, nan_ok=True)
 
 
 def test_unknown_position_does_not_end_a_jump():
@@ -40,51 +43,68 @@ def test_robot_at_rest_or_forgotten_may_be_carried():
     carried, moved = Continuity(KHEPERA4), Continuity(KHEPERA4)
     for continuity in (carried, moved):
         continuity.jump(0.0, here, 0.0, True)
-    assert math.isnan(carried.jump(0.01, there, 0.0, False))
-    assert moved.jump(0.01, there, 0.0, True) == pytest.approx(math.sqrt(3.0))
-    assert moved.jump(0.02, there, 0.0, False) == pytest.approx(math.sqrt(3.0))  # it has jumped, and stays so
+    assert isnan(carried.jump(0.01, there, 0.0, False))
+    assert moved.jump(0.01, there, 0.0, True) == pytest.approx(sqrt(3.0))
+    assert moved.jump(0.02, there, 0.0, False) == pytest.approx(sqrt(3.0))  # it has jumped, and stays so
     moved.forget()
     for continuity in (carried, moved):
-        assert math.isnan(continuity.jump(0.03, there, 0.0, True))
-        assert continuity.jump(0.04, here, 0.0, True) == pytest.approx(math.sqrt(3.0))
+        assert isnan(continuity.jump(0.03, there, 0.0, True))
+        assert continuity.jump(0.04, here, 0.0, True) == pytest.approx(sqrt(3.0))
 
 
-def turned(*yaws, kind=KHEPERA4, watched=True):
-    """Last jump of the yaw of a robot that had several yaws [rad] at times [s]."""
+FLIPPED = FLIP + PLAUSIBLE_SPEED * KHEPERA4.turn_rate * 0.02  # [rad] within 0.02 s
+
+
+@pytest.mark.parametrize(
+    ("kind", "watched", "samples", "jump"),
+    [
+        (KHEPERA4, True, [(0.0, 0.0), (0.02, FLIPPED - 0.001)], nan),
+        (KHEPERA4, True, [(0.0, 0.0), (0.02, FLIPPED + 0.001)], FLIPPED + 0.001),
+        (KHEPERA4, True, [(0.0, 3.1), (0.02, -3.1)], nan),
+        (KHEPERA4, True, [(0.0, 0.0), (0.02, 1.2), (9.0, 1.2)], 1.2),
+        (KHEPERA4, True, [(0.0, 0.0), (0.02, 1.2), (0.04, 0.1)], nan),
+        (KHEPERA4, True, [(0.0, 0.0), (0.02, nan), (0.04, 1.2)], 1.2),
+        (KHEPERA4, True, [(0.0, nan), (0.02, inf), (0.04, 1.2)], nan),
+        (CRAZYFLIE, True, [(0.0, 0.0), (0.02, 1.2)], nan),
+        (KHEPERA4, False, [(0.0, 0.0), (0.02, 1.2)], nan),
+    ],
+)
+def test_wheels_whose_yaw_jumps_have_jumped(kind, watched, samples, jump):
+    """Yaws [rad] at several times [s], and the last jump."""
     continuity = Continuity(kind)
-    for t, yaw in yaws:
+    for t, yaw in samples:
         found = continuity.jump(t, (0.0, 0.0, 0.0), yaw, watched)
-    assert math.isnan(found) == math.isnan(continuity.yaw_jump)
-    return continuity.yaw_jump
+    assert isnan(found) == isnan(continuity.yaw_jump)
+    assert continuity.yaw_jump == pytest.approx(jump, nan_ok=True)
 
 
-def test_wheels_whose_yaw_jumps_have_jumped():
-    most = FLIP + PLAUSIBLE_SPEED * KHEPERA4.turn_rate * 0.02
-    assert math.isnan(turned((0.0, 0.0), (0.02, most - 0.001)))
-    assert turned((0.0, 0.0), (0.02, most + 0.001)) == pytest.approx(most + 0.001)
-    assert math.isnan(turned((0.0, 3.1), (0.02, -3.1)))
-    assert turned((0.0, 0.0), (0.02, 1.2), (9.0, 1.2)) == pytest.approx(1.2)
-    assert math.isnan(turned((0.0, 0.0), (0.02, 1.2), (0.04, 0.1)))
-    assert turned((0.0, 0.0), (0.02, nan), (0.04, 1.2)) == pytest.approx(1.2)
-    assert math.isnan(turned((0.0, nan), (0.02, inf), (0.04, 1.2)))
-    assert math.isnan(turned((0.0, 0.0), (0.02, 1.2), kind=CRAZYFLIE))
-    assert math.isnan(turned((0.0, 0.0), (0.02, 1.2), watched=False))
-
-
-def believed(samples, dt=0.01):
-    """Which positions x [m] of a robot in motion are believed."""
+@pytest.mark.parametrize(
+    ("dt", "samples", "believed"),
+    [
+        (0.01, [0.0, 0.12, 0.0, 0.15, 0.0], [True, True, True, False, True]),
+        (0.01, [0.0, *[0.3] * 200, 0.12, 0.2], [True, *[False] * 200, True, True]),
+        (0.01, [0.0, 0.3, nan, 0.0], [True, False, False, True]),
+        (0.01, [0.015 * k for k in range(300)], [True] * 300),  # as fast as it can
+        (0.3, [0.0, 0.4], [True, True]),  # a gap in the measurements
+        (0.3, [0.0, 0.6], [True, False]),
+    ],
+    ids=["to and fro", "stays", "lost", "fast", "gap", "far"],
+)
+def test_external_position_jumps_by_more_than_a_robot(dt, samples, believed):
     external = ExternalPositions(CRAZYFLIE)
-    return [external.believes(dt * k, (x, 0.0, 1.0), watched=True) for k, x in enumerate(samples)], external
+    assert [external.believes(dt * k, (x, 0.0, 1.0), watched=True) for k, x in enumerate(samples)] == believed
 
 
-def test_external_position_jumps_by_more_than_a_robot():
-    assert believed([0.0, 0.12, 0.0, 0.15, 0.0])[0] == [True, True, True, False, True]
-    assert believed([0.0, *[0.3] * 200, 0.12, 0.2])[0] == [True, *[False] * 200, True, True]
-    assert believed([0.0, 0.3, nan, 0.0])[0] == [True, False, False, True]
-    assert all(believed([0.015 * k for k in range(300)])[0])  # as fast as it can
-    assert believed([0.0, 0.4], dt=0.3)[0] == [True, True]  # a gap in the measurements
-    assert believed([0.0, 0.6], dt=0.3)[0] == [True, False]
-    _, external = believed([0.0, 0.3])
+def jumped():
+    """Positions of a robot that have jumped by 0.3 m."""
+    external = ExternalPositions(CRAZYFLIE)
+    for t, x in ((0.0, 0.0), (0.01, 0.3)):
+        external.believes(t, (x, 0.0, 1.0), watched=True)
+    return external
+
+
+def test_doubted_position_may_be_forgotten():
+    external = jumped()
     assert external.doubted
     assert external.jump == pytest.approx(0.3)
     external.forget()
@@ -93,7 +113,7 @@ def test_external_position_jumps_by_more_than_a_robot():
 
 
 def test_positions_that_led_to_landing_stay_wrong():
-    _, external = believed([0.0, 0.3])
+    external = jumped()
     external.disbelieve()
     here = (0.0, 0.0, 1.0)
     assert not external.believes(0.5, here, watched=True)  # where it was before
@@ -119,14 +139,14 @@ def test_flipped_yaw_is_unknown_until_it_is_back():
     def known(since, until, off, *, watched=True):
         """Which yaws of a robot that turns at 1.5 rad/s, `off` [rad] from one tick to another, are believed."""
         times = [0.01 * tick for tick in range(since, until)]
-        yaws = [external.believed_yaw(t, math.remainder(1.5 * t + off, math.tau), watched=watched) for t in times]
-        return [math.isfinite(yaw) for yaw in yaws]
+        yaws = [external.believed_yaw(t, remainder(1.5 * t + off, tau), watched=watched) for t in times]
+        return [isfinite(yaw) for yaw in yaws]
 
     assert all(known(0, 300, 0.0))
-    assert not any(known(300, 1000, math.pi))  # it turns right round meanwhile
+    assert not any(known(300, 1000, pi))  # it turns right round meanwhile
     assert all(known(1000, 1100, 0.0))
-    assert not any(known(1100, 1200, -math.pi / 2))
-    assert all(known(1200, 1300, -math.pi / 2, watched=False))  # it stands: it may have been turned
-    assert math.isnan(external.believed_yaw(99.0, nan, watched=True))
-    assert math.isnan(external.believed_yaw(99.1, 1e308, watched=True))
-    assert math.isnan(external.believed_yaw(99.2, -1e308, watched=True))
+    assert not any(known(1100, 1200, -pi / 2))
+    assert all(known(1200, 1300, -pi / 2, watched=False))  # it stands: it may have been turned
+    assert isnan(external.believed_yaw(99.0, nan, watched=True))
+    assert isnan(external.believed_yaw(99.1, 1e308, watched=True))
+    assert isnan(external.believed_yaw(99.2, -1e308, watched=True))

@@ -36,6 +36,9 @@ class Swerve:
         return self.setpoint
 
 
+STOP, AHEAD, SLOW = (0.0, 0.0, 0.0, 0.0), (0.3, 0.0, 0.0, 0.0), (0.1, 0.0, 0.0, 0.0)
+
+
 def judged(kind, position, *, yaw=0.0, age=0.0, limits=LIMITS):
     """A filter, and a situation that it judged."""
     made, now = SetpointFilter(kind, limits), Situation()
@@ -118,64 +121,64 @@ def test_changed_says_whether_it_was_changed(kind, setpoint, position):
     assert made.not_finite == (not all(abs(each) < 1e6 for each in setpoint))
 
 
+SHORT = Limits(low=LIMITS.low, high=LIMITS.high, max_goal_distance=0.1)
+
+
 @pytest.mark.parametrize(
-    ("kind", "setpoint"),
-    [(CRAZYFLIE, (0.1, 0.2, 0.8, 0.3)), (TELLO, (0.2, 0.1, -0.1, 1.0)), (KHEPERA4, (0.2, 2.0, 0.0, 0.0))],
+    ("kind", "limits", "position", "setpoint", "safe"),
+    [
+        (CRAZYFLIE, ROOMY, (0.0, 0.0, 0.8), (0.1, 0.2, 0.8, 0.3), None),
+        (TELLO, ROOMY, (0.0, 0.0, 0.8), (0.2, 0.1, -0.1, 1.0), None),
+        (TELLO, ROOMY, (0.6, 0.6, 0.8), (0.2, 0.1, -0.1, 1.0), None),
+        (KHEPERA4, ROOMY, (0.0, 0.0, 0.0), (0.2, 2.0, 0.0, 0.0), None),
+        (KHEPERA4, ROOMY, (0.6, 0.6, 0.0), (0.2, 2.0, 0.0, 0.0), None),
+        (CRAZYFLIE, LIMITS, (0.0, 0.0, 2.3), (0.0, 0.0, 9.0, 0.5), (0.0, 0.0, 2.39, 0.5)),
+        # 0.5 m/s, closed at 2/s: a goal may be 0.25 m ahead
+        (CRAZYFLIE, LIMITS, (0.0, 0.0, 1.0), (0.9, 0.0, 1.0, 0.0), (0.25, 0.0, 1.0, 0.0)),
+        (CRAZYFLIE, SHORT, (0.0, 0.0, 1.0), (0.9, 0.0, 1.0, 0.0), (0.1, 0.0, 1.0, 0.0)),
+        (CRAZYFLIE, LIMITS, (0.3, 0.2, 0.8), (nan, 0.0, 0.0, 0.0), (0.3, 0.2, 0.8, 0.0)),  # it stays
+        (KHEPERA4, LIMITS, (0.0, 0.0, 0.0), (9.0, 0.0, 0.0, 0.0), (KHEPERA4.speed, 0.0, 0.0, 0.0)),
+        (TELLO, LIMITS, (0.0, 0.0, 1.0), (9.0, 0.0, 0.0, 0.0), (0.5, 0.0, 0.0, 0.0)),
+        (KHEPERA4, LIMITS, (0.97, 0.0, 0.0), (0.2, 1.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0)),
+        (KHEPERA4, LIMITS, (0.97, 0.0, 0.0), (-0.2, 1.0, 0.0, 0.0), None),  # back from beyond the margin
+    ],
 )
-def test_lawful_setpoints_pass_untouched(kind, setpoint):
-    for position in ((0.0, 0.0, 0.8), (0.6, 0.6, 0.8)):
-        safe, made = limited(kind, setpoint, position, limits=ROOMY)
-        if kind is not CRAZYFLIE or position[0] == 0.0:
-            assert safe == setpoint
-            assert not any((made.changed, made.not_finite, made.avoided))
+def test_setpoint_is_changed_where_it_must(kind, limits, position, setpoint, safe):
+    found, made = limited(kind, setpoint, position, limits=limits)
+    assert found == pytest.approx(safe) if safe else found == setpoint
+    assert (made.changed, made.not_finite, made.avoided) == (safe is not None, isnan(setpoint[0]), False)
 
 
-def test_goals_are_pulled_into_the_arena():
-    high, made = limited(CRAZYFLIE, (0.0, 0.0, 9.0, 0.5), (0.0, 0.0, 2.3))
-    assert high == pytest.approx((0.0, 0.0, 2.39, 0.5))
-    assert made.changed
-    # 0.5 m/s, closed at 2/s: a goal may be 0.25 m ahead
-    far, made = limited(CRAZYFLIE, (0.9, 0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-    assert far == pytest.approx((0.25, 0.0, 1.0, 0.0))
-    assert made.changed
-    short = Limits(low=LIMITS.low, high=LIMITS.high, max_goal_distance=0.1)
-    near, _ = limited(CRAZYFLIE, (0.9, 0.0, 1.0, 0.0), (0.0, 0.0, 1.0), limits=short)
-    assert near == pytest.approx((0.1, 0.0, 1.0, 0.0))
-
-
-def test_lower_of_two_speed_limits_counts():
-    assert limited(KHEPERA4, (9.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))[0] == (KHEPERA4.speed, 0.0, 0.0, 0.0)
-    assert limited(TELLO, (9.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0))[0] == (0.5, 0.0, 0.0, 0.0)
-
-
-def test_ground_robot_beyond_the_wall_may_return():
-    out, made = limited(KHEPERA4, (0.2, 1.0, 0.0, 0.0), (0.97, 0.0, 0.0))
-    assert (out, made.changed) == ((0.0, 1.0, 0.0, 0.0), True)
-    back, made = limited(KHEPERA4, (-0.2, 1.0, 0.0, 0.0), (0.97, 0.0, 0.0))
-    assert (back, made.changed) == ((-0.2, 1.0, 0.0, 0.0), False)
-
-
-def test_velocities_close_in_on_a_wall():
-    def out(x, age=0.0):
-        return limited(TELLO, (1.0, 0.5, 0.0, 0.0), (x, 0.0, 1.0), age=age, limits=ROOMY)[0][0]
-
-    assert out(-0.5) == 1.0
-    assert out(0.65) == pytest.approx(0.3 * TELLO.response)
-    assert out(0.95) == 0.0
-    assert out(1.0) == pytest.approx(-0.05 * TELLO.response)  # back
-    assert out(0.65, age=0.2) == pytest.approx(0.3 / (1.0 / TELLO.response + 0.2))  # it may have come nearer since
+@pytest.mark.parametrize(
+    ("x", "age", "speed"),
+    [
+        (-0.5, 0.0, 1.0),
+        (0.65, 0.0, 0.3 * TELLO.response),
+        (0.95, 0.0, 0.0),
+        (1.0, 0.0, -0.05 * TELLO.response),  # back
+        (0.65, 0.2, 0.3 / (1.0 / TELLO.response + 0.2)),  # it may have come nearer since
+    ],
+)
+def test_velocities_close_in_on_a_wall(x, age, speed):
+    (found, *_), _ = limited(TELLO, (1.0, 0.5, 0.0, 0.0), (x, 0.0, 1.0), age=age, limits=ROOMY)
+    assert found == pytest.approx(speed, abs=1e-12)
 
 
 @pytest.mark.parametrize("kind", [KHEPERA4, TURTLEBOT3], ids=lambda kind: kind.name)
-def test_wheels_slow_down_toward_a_wall(kind):
-    def driven(v, yaw, x=0.85):
-        return limited(kind, (v, 1.0, 0.0, 0.0), (x, 0.0, 0.0), yaw=yaw, limits=ROOMY)[0][0]
-
-    assert driven(0.2, 0.0) == pytest.approx(0.1 * kind.response)
-    assert driven(0.2, pi) == 0.2
-    assert driven(-0.2, pi) == pytest.approx(-0.1 * kind.response)
-    assert driven(0.2, 1.2) == 0.2  # along the wall
-    assert driven(0.2, 0.0, x=0.96) == 0.0
+@pytest.mark.parametrize(
+    ("x", "yaw", "v", "share"),  # of the response
+    [
+        (0.85, 0.0, 0.2, 0.1),
+        (0.85, pi, 0.2, None),
+        (0.85, pi, -0.2, -0.1),
+        (0.85, 1.2, 0.2, None),
+        (0.96, 0.0, 0.2, 0.0),
+    ],
+    ids=["ahead", "away", "backward", "along", "beyond"],
+)
+def test_wheels_slow_down_toward_a_wall(kind, x, yaw, v, share):
+    (found, *_), _ = limited(kind, (v, 1.0, 0.0, 0.0), (x, 0.0, 0.0), yaw=yaw, limits=ROOMY)
+    assert found == (v if share is None else pytest.approx(share * kind.response))
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
@@ -207,28 +210,19 @@ def test_an_old_position_is_none(age, old):
     assert made.limit((0.1, 0.0, 0.0, 0.0), now) == (0.0 if old else 0.1, 0.0, 0.0, 0.0)
 
 
-def test_goal_without_a_number_means_stay():
-    safe, made = limited(CRAZYFLIE, (nan, 0.0, 0.0, 0.0), (0.3, 0.2, 0.8))
-    assert safe == (0.3, 0.2, 0.8, 0.0)
-    assert made.changed
-    assert made.not_finite
-
-
-def test_avoidance_is_held_to_the_limits():
-    made, now = judged(TELLO, (0.0, 0.0, 1.0))
-    wanted = (0.3, 0.0, 0.0, 0.0)
-    assert made.check(wanted, now, Swerve(0.1, 0.0, 0.0, 0.0), None, None) == (0.1, 0.0, 0.0, 0.0)
-    assert (made.changed, made.avoided) == (True, True)
-    assert made.check(wanted, now, Swerve(0.0, 9.0, 0.0, 0.0), None, None) == (0.0, 0.5, 0.0, 0.0)
-    assert made.check(wanted, now, Swerve(*wanted), None, None) == wanted
-    assert (made.changed, made.avoided) == (False, False)
-    assert made.check(wanted, now, Swerve(nan, 0.0, 0.0, 0.0), None, None) == wanted
-    assert not made.avoided
-
-
-def test_avoidance_moves_no_robot_without_a_pose():
-    made, now = judged(TELLO, (0.0, 0.0, 1.0), age=1.0)
-    assert made.check((0.3, 0.0, 0.0, 0.0), now, Swerve(0.1, 0.0, 0.0, 0.0), None, None) == (0.0, 0.0, 0.0, 0.0)
-    made, now = judged(TELLO, (0.0, 0.0, 1.0))
-    assert made.check((nan, 0.0, 0.0, 0.0), now, Swerve(0.1, 0.0, 0.0, 0.0), None, None) == (0.0, 0.0, 0.0, 0.0)
-    assert made.not_finite
+@pytest.mark.parametrize(
+    ("age", "setpoint", "avoids", "safe", "avoided"),
+    [
+        (0.0, AHEAD, SLOW, SLOW, True),
+        (0.0, AHEAD, (0.0, 9.0, 0.0, 0.0), (0.0, 0.5, 0.0, 0.0), True),
+        (0.0, AHEAD, AHEAD, AHEAD, False),
+        (0.0, AHEAD, (nan, 0.0, 0.0, 0.0), AHEAD, False),
+        (1.0, AHEAD, SLOW, STOP, False),  # without a pose
+        (0.0, (nan, 0.0, 0.0, 0.0), SLOW, STOP, False),
+    ],
+)
+def test_avoidance_is_held_to_the_limits(age, setpoint, avoids, safe, avoided):
+    made, now = judged(TELLO, (0.0, 0.0, 1.0), age=age)
+    assert made.check(setpoint, now, Swerve(*avoids), None, None) == safe
+    assert (made.avoided, made.not_finite) == (avoided, isnan(setpoint[0]))
+    assert made.changed == (avoided or made.not_finite)

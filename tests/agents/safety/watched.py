@@ -67,19 +67,21 @@ class Watched:
             return "B; it goes aside first"
         return self.detector.words(cause, self.now, self.status, self.neighbours, self.health)
 
-    def misplace(self, **flags):
-        """Let the pose be invalid, or outside, as in `Situation`."""
-        self.now.sound = False
-        for name, value in flags.items():
-            setattr(self.now, name, value)
-
-    def has(self, cause):
-        return bool(self.causes >> cause & 1)
+    def measure(self, *, flags=None, **values):
+        """Let the body measure values from now on; `flags`: what is judged of its pose, as in `Situation`."""
+        for name in ("position", "velocity", "yaw"):
+            setattr(self, name, values.pop(name, getattr(self, name)))
+        self.values |= values
+        if flags is not None:
+            self.now.sound = False
+            for name, value in flags.items():
+                setattr(self.now, name, value)
+        return self
 
     @property
     def found(self):
         """Causes of the last tick."""
-        return {cause for cause in Cause if self.has(cause)}
+        return {cause for cause in Cause if self.causes >> cause & 1}
 
     @property
     def texts(self):
