@@ -131,7 +131,7 @@ def test_restarted_robot_is_where_it_was():
         (0.05, 0.0, 9.0, (0.05, 0.05 + CRAZYFLIE.height)),
     ],
 )
-def test_drone_is_in_the_way_where_it_is_and_sinks(height, speed, stamp, reach):
+def test_drone_is_in_the_way_below_too(height, speed, stamp, reach):
     things = Sight(TURTLEBOT3, CRAZYFLIE).hear((0.1, 0.0, height), (0.0, 0.0, speed), stamp).sense(9.0)
     assert [(thing.low, thing.high) for thing in things] == ([pytest.approx(reach)] if reach else [])
 
@@ -177,7 +177,7 @@ def test_ray_without_direction_or_length_is_ignored(wrong):
     assert places(Sight().sense(0.0, scan=scan)) == [(0.9, 0.0)]
 
 
-def test_seen_things_stay_until_new_readings_or_old_age():
+def test_seen_things_stay_until_replaced_or_old():
     sight, scan = Sight(), rays([0.0, 1.0], [0.5, 0.6], time=1.0)
     seen = [(0.5, 0.0), (0.6 * cos(1), 0.6 * sin(1))]
     assert places(sight.sense(1.0, scan=scan)) == seen

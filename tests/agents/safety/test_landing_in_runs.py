@@ -11,9 +11,9 @@ from agents.kinds.crazyflie import CRAZYFLIE
 from agents.kinds.khepera4 import KHEPERA4
 from agents.safety.hazards import Cause
 from agents.safety.landing import NEAR
-from experiments.definition.experiment import Experiment, Formation, LegTable, RobotTable
+from experiments.definition.experiment import LegTable, RobotTable
 from tests.agents.swarm import Swarm
-from tests.small import pair
+from tests.small import small
 
 
 def test_run_ends_beside_a_robot_below():
@@ -23,19 +23,14 @@ def test_run_ends_beside_a_robot_below():
         "F": RobotTable(kind="crazyflie", start=[0.3, 0.0], hover=0.8),
         "H": RobotTable(kind="crazyflie", start=[-0.4, 0.0], hover=0.8),
     }
-    links = {"G > F": 0.8, "H > F": 0.4}
-    swarm = Swarm(Experiment(title="over", duration_s=3.0, robots=robots, formation=Formation(links=links)))
-    swarm.running()
-    robot = swarm.robot("F")
-    swarm.until(LANDING)
-    waited = False
+    swarm = Swarm(small(robots, {"G > F": 0.8, "H > F": 0.4}, duration_s=3.0)).until(LANDING)
+    robot, waited = swarm.robot("F"), False
     while swarm.phase("F") != DONE:
         assert swarm.since < 15.0
         swarm.step()
         waited |= robot.landing.aside
-    gap = dist(swarm.last("F", "truth")[:2], swarm.last("G", "truth")[:2])
     assert waited
-    assert gap > 0.09
+    assert dist(swarm.last("F", "truth")[:2], swarm.last("G", "truth")[:2]) > 0.09
     told = [each.text for each in robot.hazards.incidents if each.cause == Cause.BELOW]
     assert told[0] == "warn: a robot is below it: G; it goes aside first"
     assert swarm.phase("G") == DONE
@@ -48,20 +43,12 @@ def test_drone_lands_beside_robot_that_died_moving(trigger):
         "K": RobotTable(kind="khepera4", start=[-0.4, 0.0]),
     }
     leg = LegTable(at_s=0.0, robot="K", plan={"kind": "line", "move_by": [1.0, 0.0], "speed": 0.2})
-    swarm = Swarm(
-        pair(
-            robots=robots,
-            formation=Formation(),
-            trigger={"kind": trigger, "threshold": 0.01},
-            avoidance={"kind": "barrier", "hears": "all"},
-            timeline=[leg],
-        )
-    ).running()
+    avoidance, sends = {"kind": "barrier", "hears": "all"}, {"kind": trigger, "threshold": 0.01}
+    swarm = Swarm(small(robots, duration_s=60.0, trigger=sends, avoidance=avoidance, timeline=[leg])).running()
     while swarm.last("K", "truth")[0] < -0.02:
         swarm.step()
-    dead, robot = swarm.where["K"][0], swarm.robot("F")
-    place = swarm.last("K", "truth")[:2]
-    swarm.groups.remove(dead)
+    place, robot = swarm.last("K", "truth")[:2], swarm.robot("F")
+    swarm.groups.remove(swarm.where["K"][0])
     swarm.names = ("F",)
     robot.neighbours.mark_lost(0, swarm.t)
     swarm.run(3.0)
@@ -75,19 +62,14 @@ WALLS = [(kind, axis, side) for kind in KINDS for axis, side in ((0, 1.0), (1, -
 WALLS += [(kind, 2, 1.0) for kind in KINDS if KINDS[kind].flies]
 
 
-def farthest(kind: str, axis: int, side: float, latency_s: float = 0.0) -> float:
+def farthest(kind, axis, side, latency_s):
     """How far beyond that wall [m] a guided robot gets, 1 m before it, whose goal is 0.9 m beyond it."""
     start = [0.1, 0.1]
     if axis < 2:
         start[axis] = side
     member = RobotTable(kind=kind, start=start, **({"hover": HOVER} if KINDS[kind].flies else {}))
-    disturbed = {"all": Disturbance(latency_s=latency_s)} if latency_s else {}
-    swarm = Swarm(
-        pair(
-            robots={"R": member}, formation=Formation(), architecture="centralised", disturbance=disturbed,
-            duration_s=30.0,
-        )
-    )  # fmt: skip
+    disturbance = {"all": Disturbance(latency_s=latency_s)}
+    swarm = Swarm(small({"R": member}, architecture="centralised", disturbance=disturbance, duration_s=30.0))
     robot = swarm.robot("R")
     limits = robot.assignment.limits
     wall = (limits.high if side > 0.0 else limits.low)[axis]
@@ -107,11 +89,9 @@ def farthest(kind: str, axis: int, side: float, latency_s: float = 0.0) -> float
     return reached
 
 
-@pytest.mark.parametrize(("kind", "axis", "side"), WALLS)
-def test_no_robot_gets_beyond_a_wall(kind, axis, side):
-    assert -0.1 < farthest(kind, axis, side) < 0.001
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_late_commands_keep_before_walls(kind):
-    assert -0.1 < farthest(kind, 0, 1.0, latency_s=0.15) < 0.001
+@pytest.mark.parametrize(
+    ("kind", "axis", "side", "latency_s"),
+    [*((*wall, 0.0) for wall in WALLS), *((kind, 0, 1.0, 0.15) for kind in KINDS)],
+)
+def test_no_robot_gets_beyond_a_wall(kind, axis, side, latency_s):
+    assert -0.1 < farthest(kind, axis, side, latency_s) < 0.001
