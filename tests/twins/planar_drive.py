@@ -11,11 +11,11 @@ DT = 0.01
 
 
 def stage(kinds, start, yaw=None, *, mirrored=None, scene=None, dt=DT):
-    """Robots at x, y (and z), in endless room unless a scene is given."""
+    """Robots on the floor at x, y, in endless room unless a scene is given."""
     n = len(kinds)
     return EngineInput(
         tuple(kinds),
-        [(float(x), float(y), *(z or (0.0,))) for x, y, *z in start],
+        [(float(x), float(y), 0.0) for x, y, *_ in start],
         [0.0] * n if yaw is None else [float(each) for each in yaw],
         dt,
         (False,) * n if mirrored is None else tuple(mirrored),
@@ -38,13 +38,16 @@ def columns(engine, name):
 
 
 class Drive:
-    """An engine, told the same setpoints for a while, and what was seen of it."""
+    """An engine, told the same setpoints for a while, and what was seen of it; who begins at a height, flies."""
 
-    def __init__(self, place, **choice):
-        self.engine = Planar(**choice).build(place)
-        self.kinds, self.rows = place.kinds, len(place.kinds)
+    def __init__(self, kinds, start, yaw=None, *, mirrored=None, scene=None, **choice):
+        self.engine = Planar(**choice).build(stage(kinds, start, yaw, mirrored=mirrored, scene=scene))
+        self.kinds, self.rows = kinds, len(kinds)
         self.t = 0.0
         self.path, self.touches = [], []
+        for row, place in enumerate(start):
+            if len(place) == 3:
+                self.put(row, place, flying=True)
 
     @property
     def position(self):
@@ -73,12 +76,10 @@ class Drive:
         self.engine.place([row], [tuple(map(float, position))], [yaw], [flying])
         return self
 
-    def aloft(self, position):
-        """Everything that flies is put into the air."""
-        flies = [row for row, kind in enumerate(self.kinds) if kind.flies]
-        for row, place in zip(flies, position, strict=True):
-            self.put(row, place, flying=True)
-        return self
+    @property
+    def pairs(self):
+        """Who touched whom, in order; -1: an obstacle, -2: a wall."""
+        return [(touch.first, touch.second) for touch in self.touches]
 
     def mirror(self, row, position, yaw=0.0, velocity=ZERO):
         self.engine.mirror([row], [tuple(position)], [yaw], [velocity])

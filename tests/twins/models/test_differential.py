@@ -50,7 +50,6 @@ def test_straight_on_and_on_the_spot():
     np.testing.assert_allclose(twin.position, way * np.array([0.5, math.sqrt(0.75), 0.0]), atol=1e-12)
     ramp = 0.2**2 / (2 * KHEPERA4.motion.acceleration)
     assert way == pytest.approx(0.2 - ramp, abs=0.002)
-    place = twin.position
     drive(twin, (0.0, 0.0), 0.2)
     place = twin.position
     drive(twin, (0.0, 1.0), 1.0)
@@ -60,6 +59,8 @@ def test_straight_on_and_on_the_spot():
 @pytest.mark.parametrize("kind", [KHEPERA4, TURTLEBOT3], ids=lambda kind: kind.name)
 def test_limit_of_wheels_keeps_the_curve(kind):
     limits, twin = kind.motion, robot(kind)
+    drive(twin, (kind.speed, 0.0), 1.0)
+    assert np.linalg.norm(twin.velocity) == pytest.approx(kind.speed)
     v, w = 3.0, 6.0
     drive(twin, (v, w), 2.0)
     speed = np.linalg.norm(twin.velocity)
@@ -68,13 +69,6 @@ def test_limit_of_wheels_keeps_the_curve(kind):
     rate = (twin.yaw - before) / DT
     assert speed / rate == pytest.approx(v / w, rel=1e-9)
     assert speed + 0.5 * limits.base * rate == pytest.approx(limits.speed)
-
-
-def test_speed_of_a_kind_can_be_driven():
-    for kind in (KHEPERA4, TURTLEBOT3):
-        twin = robot(kind)
-        drive(twin, (kind.speed, 0.0), 1.0)
-        assert np.linalg.norm(twin.velocity) == pytest.approx(kind.speed)
 
 
 def test_acceleration_of_wheels_is_limited():
@@ -86,28 +80,15 @@ def test_acceleration_of_wheels_is_limited():
     assert speed[-1] == pytest.approx(0.2)
 
 
-def test_command_holds_until_the_next():
+def test_command_holds_until_next_or_landing():
     twin = robot()
     drive(twin, (0.2, 0.0), 0.5)
     for _ in range(1000):
         twin.move(DT)
-    assert np.linalg.norm(twin.velocity) == pytest.approx(0.2)
-
-
-def test_nan_is_no_command():
-    twin = robot()
-    drive(twin, (0.2, 0.0), 0.5)
-    drive(twin, (np.nan, np.nan), 0.5)
-    assert np.linalg.norm(twin.velocity) == pytest.approx(0.2)
-    drive(twin, (np.nan, 0.0), 0.5)
-    drive(twin, (0.0, np.nan), 0.5)
-    assert np.linalg.norm(twin.velocity) == pytest.approx(0.2)
+    for no_command in ((np.nan, np.nan), (np.nan, 0.0), (0.0, np.nan)):
+        drive(twin, no_command, 0.5)
+        assert np.linalg.norm(twin.velocity) == pytest.approx(0.2)
     assert np.isfinite(twin.position).all()
-
-
-def test_land_halts_the_wheels():
-    twin = robot()
-    drive(twin, (0.2, 0.5), 0.5)
     twin.land()
     for _ in range(20):
         twin.move(DT)

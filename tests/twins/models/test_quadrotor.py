@@ -85,12 +85,9 @@ def test_yaw_turns_the_shorter_way():
     assert np.diff(yaw).min() >= 0.0
 
 
-def test_yaw_keeps_largest_rate():
+def test_yaw_follows_exponentially_up_to_its_rate():
     yaw = fly(flying(), (0.0, 0.0, 0.8, 3.0), 1.0)[:, 3]
     assert np.diff(yaw, prepend=0.0).max() / DT == pytest.approx(CRAZYFLIE.turn_rate)
-
-
-def test_yaw_follows_exponentially():
     yaw = fly(flying(), (0.0, 0.0, 0.8, 1.0), 0.5)[-1, 3]
     assert yaw == pytest.approx(1.0 - math.exp(-CRAZYFLIE.turn_response * 0.5), abs=0.01)
 
@@ -163,17 +160,12 @@ def test_setpoints_on_ground_have_no_effect(kind):
     assert path[-1] == pytest.approx([0.0, 0.0, 0.5, 0.0], abs=1e-3)  # nothing was kept for later
 
 
-def test_nan_keeps_last_setpoint():
-    quadrotor = flying()
-    quadrotor.command((0.5, 0.0, 0.8, 0.0))
-    assert fly(quadrotor, NO_SETPOINT, 8.0)[-1] == pytest.approx([0.5, 0.0, 0.8, 0.0], abs=1e-3)
-
-
-def test_setpoint_ends_a_climb():
+def test_setpoint_ends_a_climb_and_is_kept():
     quadrotor = Quadrotor(CRAZYFLIE, ZERO, 0.0)
     quadrotor.takeoff(2.0)
     fly(quadrotor, NO_SETPOINT, 2.0)
-    assert fly(quadrotor, (0.0, 0.0, 0.6, 0.0), 8.0)[-1, 2] == pytest.approx(0.6, abs=1e-3)
+    quadrotor.command((0.5, 0.0, 0.6, 0.0))
+    assert fly(quadrotor, NO_SETPOINT, 8.0)[-1] == pytest.approx([0.5, 0.0, 0.6, 0.0], abs=1e-3)
 
 
 def test_wobble_is_added_to_place_not_motion():

@@ -18,6 +18,7 @@ from twins.sensing import ray_casting
 from twins.sensing.ray_casting import Beams, Caster, Fan
 
 LOW = 0.01  # [m] everything that stands on the floor spans this height
+UP, DOWN = 0.5 * math.pi, -0.5 * math.pi
 
 
 def fan(bearing, reach=3.0, height=LOW, elevation=None):
@@ -115,18 +116,17 @@ def test_a_robot_and_a_wall_at_known_distances():
         scene=furnished(walled=True, size=(4.0, 5.0, 2.5)),
     )
     np.testing.assert_allclose(seen, [[0.93, 2.5, 2.0, 2.5], [0.93, 2.5, 1.0, 2.5]], atol=1e-12)
-
-
-def test_reach_counts_from_the_centre_to_the_surface():
-    other = KHEPERA4.radius + 2.0
+    other = KHEPERA4.radius + 2.0  # reach counts from the centre to the surface
     for beyond, expected in ((-1e-6, 2.0 - 1e-6), (1e-6, np.nan)):
         seen = look([[0.0, 0.0, 0.0], [other + beyond, 0.0, 0.0]], [fan([0.0], 2.0)])
         np.testing.assert_allclose(seen[0], [expected], atol=1e-12)
 
 
-def test_empty_room_and_lone_robot_show_nothing():
+def test_open_room_has_a_floor_and_nothing_else():
     assert np.isnan(look([[0.0, 0.0, 0.0]], [fan(np.arange(12.0))])).all()
     assert look(np.zeros((1, 3)), [fan([])]).shape == (1, 0)
+    seen = look([[0.0, 0.0, 1.0]], [fan([0.0, 0.0], elevation=[UP, DOWN])])
+    np.testing.assert_allclose(seen, [[np.nan, 1.01]], atol=1e-12)
 
 
 def test_absent_robot_neither_sees_nor_is_seen():
@@ -164,9 +164,6 @@ def test_a_flying_robot_looks_from_its_own_height():
         np.testing.assert_allclose(look([[0.0, 0.0, height]], [fan([0.0])], scene=scene), [[expected]], atol=1e-12)
 
 
-UP, DOWN = 0.5 * math.pi, -0.5 * math.pi
-
-
 def test_vertical_rays_see_nearest_things_above_and_below():
     scene = furnished(
         {
@@ -188,11 +185,6 @@ def test_vertical_rays_see_nearest_things_above_and_below():
         [0.99, 0.01],
     ]
     np.testing.assert_allclose(seen, expected, atol=1e-12)
-
-
-def test_room_without_walls_has_floor_but_no_ceiling():
-    seen = look([[0.0, 0.0, 1.0]], [fan([0.0, 0.0], elevation=[UP, DOWN])])
-    np.testing.assert_allclose(seen, [[np.nan, 1.01]], atol=1e-12)
 
 
 def test_ray_beginning_inside_a_thing_misses_it():
