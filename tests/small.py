@@ -47,10 +47,7 @@ def small(
     return Experiment(**{**fixed, **parts})  # type: ignore[arg-type]
 
 
-A_AND_B = {
-    "A": RobotTable(kind="khepera4", start=[-0.4, 0.0]),
-    "B": RobotTable(kind="khepera4", start=[0.4, 0.1]),
-}
+A_AND_B = {"A": RobotTable(kind="khepera4", start=[-0.4, 0.0]), "B": RobotTable(kind="khepera4", start=[0.4, 0.1])}
 
 
 def pair(**parts: object) -> Experiment:

@@ -12,7 +12,8 @@ from experiments.check.check import check
 from experiments.file import document
 from tests.__main__ import MEASUREMENTS
 from tests.__main__ import command as measurement
-from tests.docs.test_references import PAGES, ROOT, TOPS
+from tests.commands import ROOT
+from tests.docs.test_references import PAGES, TOPS
 from tools.main import app
 
 COMMAND = re.compile(r"^ {4,}\./zenpark (?P<words>[^#\n]*)", re.MULTILINE)
@@ -65,16 +66,10 @@ def _leaves(command, path=()):
             yield from _leaves(each, (*path, name))
 
 
-@pytest.mark.parametrize(
-    ("path", "command"),
-    [
-        pytest.param(path, command, id=" ".join(path))
-        for path, command in (
-            *_leaves(COMMAND_LINE),
-            *((("test", option), command) for option, command in MEASURING.items()),
-        )
-    ],
-)
+LEAVES = dict(_leaves(COMMAND_LINE)) | {("test", option): command for option, command in MEASURING.items()}
+
+
+@pytest.mark.parametrize(("path", "command"), LEAVES.items(), ids=map(" ".join, LEAVES))
 def test_help_of_commands_ends_with_valid_examples(path, command):
     lines = [line.strip() for line in (command.epilog or "").splitlines() if "./zenpark" in line]
     assert lines

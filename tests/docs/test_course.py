@@ -13,9 +13,10 @@ from experiments.check.check import check
 from experiments.file.document import load
 from experiments.metrics.criteria import has_passed, judge
 from experiments.run import simulate
+from tests.commands import ROOT
 from tests.docs.test_commands import commands
 
-COURSE = Path(__file__).resolve().parents[2] / "docs" / "course"
+COURSE = ROOT / "docs" / "course"
 EXERCISES = sorted(COURSE.glob("*.toml"))
 
 
@@ -43,22 +44,25 @@ def test_there_are_ten_exercises_with_solutions():
     assert not [file for file in COURSE.glob("solutions/*.py") if not (COURSE / file.name).is_file()]
 
 
+EVERY = pytest.mark.parametrize("exercise", EXERCISES, ids=lambda file: file.stem)
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("exercise", EXERCISES, ids=lambda file: file.stem)
+@EVERY
 def test_a_blank_does_not_pass(exercise):
     assert re.search(r"# fill in|\.\.\.  #", "".join(each.read_text("utf-8") for each in parts(exercise)))
     assert missed(exercise)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("exercise", EXERCISES, ids=lambda file: file.stem)
+@EVERY
 def test_a_solution_passes(exercise):
     assert missed(exercise, *solutions()[exercise.name]) == []
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("solved", [pytest.param(False, marks=pytest.mark.nightly), True])
-@pytest.mark.parametrize("exercise", EXERCISES, ids=lambda file: file.stem)
+@EVERY
 def test_exercises_are_sound(exercise, solved):
     changes = solutions()[exercise.name] if solved else []
     assert not [found for found in check(load(exercise, *changes)) if found.severity == "error"]
@@ -66,7 +70,7 @@ def test_exercises_are_sound(exercise, solved):
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("seed", [2, 3])
-@pytest.mark.parametrize("exercise", EXERCISES, ids=lambda file: file.stem)
+@EVERY
 def test_exercises_hold_for_other_seeds(exercise, seed):
     assert missed(exercise, seed=seed)
     assert missed(exercise, *solutions()[exercise.name], seed=seed) == []

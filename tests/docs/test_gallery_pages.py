@@ -3,7 +3,7 @@
 import runpy
 
 from experiments.catalogue import index
-from tests.docs.test_references import ROOT
+from tests.commands import ROOT
 from zenpark import load, simulate
 
 FOLDER = ROOT / "docs" / "gallery"

@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 import pytest
 
-from tests.system.lab import zenpark
+from tests.commands import ROOT, zenpark
 from tools.main import main
 
-DOCS = Path(__file__).resolve().parents[2] / "docs"
+DOCS = ROOT / "docs"
 GUIDES = (
     *("first-hour", "from-a-paper", "mixed-reality", "shadow-twin", "teaching"),
     *("two-crazyflies", "vicon", "three-machines", "lab-certificates", "course/solutions/README"),
@@ -106,8 +106,7 @@ def test_a_guide_flies_in_real_time(command: str, tmp_path: Path, monkeypatch: p
     (text,) = [step.text for step in found if (step.kind, step.file) == ("toml", name)]
     file, out = tmp_path / name, tmp_path / "runs" / Path(name).stem
     file.write_text(text, "utf-8")
-    ended = zenpark("run", file, *options, "--no-report", "--out", out, timeout_s=120.0)
-    assert ended.returncode == 0, (ended.stdout, ended.stderr)
+    zenpark("run", file, *options, "--no-report", "--out", out, timeout_s=120.0)
     monkeypatch.chdir(tmp_path)
     for step in found:
         if step.kind == "python" and f'reopen("runs/{out.name}")' in step.text:
@@ -118,7 +117,6 @@ def test_a_guide_flies_in_real_time(command: str, tmp_path: Path, monkeypatch: p
 @pytest.mark.timeout(150)
 def test_the_lab_of_the_guide_flies(tmp_path: Path) -> None:
     lab = tmp_path / "lab"
-    assert zenpark("lab", "init", lab, "triangle").returncode == 0
+    zenpark("lab", "init", lab, "triangle")
     short = ("--set", "duration_s=2", "--no-report", "--out", tmp_path / "run")
-    ended = zenpark("run", "triangle", "--lab", lab, *short, timeout_s=120.0)
-    assert ended.returncode == 0, (ended.stdout, ended.stderr)
+    zenpark("run", "triangle", "--lab", lab, *short, timeout_s=120.0)

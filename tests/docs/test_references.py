@@ -10,15 +10,14 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.commands import ROOT
+
 TOPS = ("agents", "bridges", "twins", "experiments", "tools")
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md"), *(ROOT / "bridges").rglob("*.md")])
 DOTTED = re.compile(rf"(?<![\w./-])(?:{'|'.join(TOPS)})(?:\.\w+)+")
 PATH = re.compile(rf"(?<![\w./-])(?:{'|'.join((*TOPS, 'docs', 'tests'))})/[\w./{{}},*-]*")
 MADE = {"docs/tutorials/out"}  # by the lessons
-SITE = {
-    f"reference/{name}.md" for name in runpy.run_path(str(ROOT / "docs" / "site.py"))["PAGES"]
-}  # made with the site
+SITE = {f"reference/{name}.md" for name in runpy.run_path(str(ROOT / "docs" / "site.py"))["PAGES"]}  # made with it
 LINK = re.compile(r"\]\(([^)#\s]+)(?:#[^)]*)?\)")
 
 

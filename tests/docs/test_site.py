@@ -1,9 +1,6 @@
 """The documentation site: builds without a warning, has every page, and its reference has every key."""
 
-import os
 import re
-import subprocess
-import sys
 from html import unescape
 from pathlib import Path
 
@@ -15,25 +12,16 @@ from agents.plugins.triggers import TriggerView
 from experiments.file import reference
 from experiments.metrics.results import RobotMetrics
 from experiments.recording.topics import TOPICS
+from tests.commands import ROOT, environment, python
 from tests.system.browser import CHROMIUM, needs_chromium
 from tools.main import app
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
     folder = tmp_path_factory.mktemp("site")
-    built = subprocess.run(
-        [sys.executable, "-m", "mkdocs", "build", "--site-dir", folder],
-        cwd=ROOT,
-        env={**os.environ, "PYTHONPATH": str(ROOT), "NO_MKDOCS_2_WARNING": "1"},
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=500,
-    )
-    assert built.returncode == 0, built.stderr
+    quiet = environment(NO_MKDOCS_2_WARNING="1")
+    python("-m", "mkdocs", "build", "--site-dir", folder, env=quiet, timeout_s=500.0)
     return folder
 
 
@@ -42,8 +30,7 @@ def text(page: Path) -> str:
 
 
 def test_reference_is_printed_as_text():
-    command = [sys.executable, ROOT / "docs" / "site.py", "experiment-file"]
-    printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    printed = python(ROOT / "docs" / "site.py", "experiment-file").stdout
     assert printed.startswith("# The experiment file")
     assert "lands_at_s" in printed
 

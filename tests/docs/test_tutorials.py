@@ -1,15 +1,12 @@
 """The lessons of docs/tutorials: what they claim is true, and they open as notebooks."""
 
 import ast
-import os
 import re
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.commands import ROOT, python
+
 FOLDER = ROOT / "docs" / "tutorials"
 FIGURES = {
     "consensus": ["consensus-motions", "consensus-rates", "consensus-spectra", "consensus-steps"],
@@ -59,17 +56,8 @@ def test_what_a_lesson_imports_is_there(lesson):
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("lesson", FIGURES)
 def test_what_a_lesson_claims_is_true(lesson, tmp_path):
-    done = subprocess.run(
-        [sys.executable, "-W", "error", FOLDER / f"{lesson}.py", tmp_path / "figures"],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=280,
-    )
-    assert (done.returncode, done.stderr) == (0, "")
+    done = python("-W", "error", FOLDER / f"{lesson}.py", tmp_path / "figures", cwd=tmp_path, timeout_s=280.0)
+    assert done.stderr == ""
     drawn = sorted(path.stem for path in (tmp_path / "figures").glob("*.svg"))
     assert drawn == FIGURES[lesson]
     for name in drawn:

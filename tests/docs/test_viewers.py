@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -12,9 +11,10 @@ from mcap.reader import make_reader
 
 from experiments.file.document import load
 from experiments.run import simulate
+from tests.commands import ROOT
 from tests.system.lab import typed
 
-LAYOUT = Path(__file__).parents[2] / "docs" / "viewers" / "foxglove.json"
+LAYOUT = ROOT / "docs" / "viewers" / "foxglove.json"
 
 
 def panels(part: Any) -> Iterator[str]:
@@ -33,8 +33,8 @@ def test_foxglove_layout_names_what_a_recording_has(tmp_path):
     with file.open("rb") as stream:
         summary = make_reader(stream).get_summary()
     recorded = {channel.topic: summary.schemas[channel.schema_id].name for channel in summary.channels.values()}
-    frames = {moved.header.frame_id for each in typed(file, "/tf") for moved in each.transforms}
-    frames |= {moved.child_frame_id for each in typed(file, "/tf") for moved in each.transforms}
+    moves = [moved for each in typed(file, "/tf") for moved in each.transforms]
+    frames = {name for moved in moves for name in (moved.header.frame_id, moved.child_frame_id)}
     layout = json.loads(LAYOUT.read_text("utf-8"))
     configured = layout["configById"]
     shown = list(panels(layout["layout"]))

@@ -43,11 +43,19 @@ def place_for(name: str) -> Iterator[Path]:
         yield Path(folder) / name
 
 
-def refused_well(error: DocumentError) -> None:
+def refusing_well(take: Callable[[bytes], None]) -> Callable[[bytes], None]:
     """What is refused is said, and can be printed."""
-    assert error.problems
-    assert all(problem.message for problem in error.problems)
-    str(error).encode("utf-8")
+
+    def checked(data: bytes) -> None:
+        try:
+            take(data)
+        except DocumentError as error:
+            if not (error.problems and all(problem.message for problem in error.problems)):
+                raise AssertionError("refused without a word") from error
+            str(error).encode("utf-8")
+            raise
+
+    return checked
 
 
 def experiment(suffix: str, examples: list[bytes]) -> Iterator[Target]:
@@ -56,14 +64,10 @@ def experiment(suffix: str, examples: list[bytes]) -> Iterator[Target]:
         for arena in index.FOLDER.glob("*.arena.toml"):
             (file.parent / arena.name).write_bytes(arena.read_bytes())
 
+        @refusing_well
         def take(data: bytes) -> None:
             file.write_bytes(data)
-            try:
-                cases = document.read(file).cases()
-            except DocumentError as error:
-                refused_well(error)
-                raise
-            assert all(write_json(case) for case in cases.values())
+            assert all(write_json(case) for case in document.read(file).cases().values())
 
         yield Target(examples, take, (DocumentError,))
 
@@ -90,13 +94,10 @@ def arena() -> Iterator[Target]:
     with place_for("some.toml") as file:
         file.write_text(f'title = "x"\nduration_s = 1.0\n{text}')
 
+        @refusing_well
         def take(data: bytes) -> None:
             (file.parent / "a.arena.toml").write_bytes(data)
-            try:
-                document.read(file)
-            except DocumentError as error:
-                refused_well(error)
-                raise
+            document.read(file)
 
         examples = [each.read_bytes() for each in sorted(index.FOLDER.glob("*.arena.toml"))]
         yield Target([*examples, b"[arena]\nsize = [4, 4, 2]\n"], take, (DocumentError,))
@@ -112,14 +113,10 @@ def overrides() -> Iterator[Target]:
     ]  # fmt: skip
     examples = [flag.encode() for flag in flags] + ["\n".join(flags[k : k + 3]).encode() for k in range(10)]
 
+    @refusing_well
     def take(data: bytes) -> None:
-        try:
-            name = "robotic-park" if len(data) % 4 == 0 else "triangle"
-            read = document.read(name, data.decode("utf-8", "surrogateescape").split("\n")[:8])
-        except DocumentError as error:
-            refused_well(error)
-            raise
-        assert read.cases()
+        name = "robotic-park" if len(data) % 4 == 0 else "triangle"
+        assert document.read(name, data.decode("utf-8", "surrogateescape").split("\n")[:8]).cases()
 
     yield Target(examples, take, (DocumentError,))
 
@@ -134,13 +131,10 @@ def park_yaml() -> Iterator[Target]:
     examples = [text.encode() for text in (*texts, "".join(map(theirs.flat, theirs.OTHERS)))]
     with place_for("some.toml") as file:
 
+        @refusing_well
         def take(data: bytes) -> None:
-            try:
-                text, _ = convert_text(decoded(data, "some.yaml"), "some.yaml", 20.0)
-                file.write_text(text, encoding="utf-8")
-            except DocumentError as error:
-                refused_well(error)
-                raise
+            text, _ = convert_text(decoded(data, "some.yaml"), "some.yaml", 20.0)
+            file.write_text(text, encoding="utf-8")
             with suppress(DocumentError):  # robots that stand in each other are for its user to see
                 document.read(file)
 
@@ -164,33 +158,17 @@ def recording_bytes(*, plain: bool) -> list[bytes]:
         began = time.time()
         with recording.Recording(path, Plan(what), "x", case="only", seed=1, clock="real", started=began) as writer:
             for k in range(12):
+                at = began + 0.1 * k
                 for name in ("KH01", "CF01"):
-                    said = good(name, k + 1)
-                    at = began + 0.1 * k
-                    writer.write(msgspec.structs.replace(said["state"][0], stamp=at))  # type: ignore[type-var]
-                    writer.write(msgspec.structs.replace(said["pose"][0], stamp=at), at, 150)  # type: ignore[type-var]
+                    said: Any = good(name, k + 1)
+                    writer.write(msgspec.structs.replace(said["state"][0], stamp=at))
+                    writer.write(msgspec.structs.replace(said["pose"][0], stamp=at), at, 150)
                     if k % 5 == 0:
-                        status = msgspec.structs.replace(said["status"][0], stamp=at, started=began)  # type: ignore[type-var]
-                        writer.write(status)
+                        writer.write(msgspec.structs.replace(said["status"][0], stamp=at, started=began))
             writer.write(wire.Event(began, "start", "conductor", "go"))
             writer.write(wire.Contact(began + 0.5, "KH01", "CF01", 0.1, 0.01))
-            writer.write(
-                wire.WorldState(
-                    began,
-                    "pymunk",
-                    0.0,
-                    1.0,
-                    0.1,
-                    False,
-                    ["KH01"],
-                    [],
-                    [wire.ObstaclePose("b", (0.0, 0.0, 0.0))],
-                    1,
-                    0,
-                    0,
-                    "",
-                )
-            )
+            world: Any = of_all()[KEYS.world][0]
+            writer.write(msgspec.structs.replace(world, stamp=began))
             for stamp, lies in ((began, 0.2), (began + 1.0, 0.21)):
                 writer.write(wire.HostClock("lab1", stamp, lies, 0.001, ["KH01"]))
             writer.write(wire.Event(began + 1.0, "phase", "conductor", "landing"))
@@ -378,17 +356,13 @@ def sweep_arguments() -> Iterator[Target]:
     ]  # fmt: skip
     examples = [line.encode() for line in lines] + [b"\n".join([lines[1].encode(), lines[3].encode()])]
 
+    @refusing_well
     def take(data: bytes) -> None:
-        given = data.decode("utf-8", "surrogateescape").split("\n")[:4]
-        try:
-            axes, words = arguments(given)
-            seeds_of(words.get("seeds"), 1)
-            seeds_of(words.get("tuning"), 1001)
-            few = [replace(axis, values=axis.values[:2]) for axis in axes[:2]]
-            cells(read, "triangle", [], few, [])
-        except DocumentError as error:
-            refused_well(error)
-            raise
+        axes, words = arguments(data.decode("utf-8", "surrogateescape").split("\n")[:4])
+        seeds_of(words.get("seeds"), 1)
+        seeds_of(words.get("tuning"), 1001)
+        few = [replace(axis, values=axis.values[:2]) for axis in axes[:2]]
+        cells(read, "triangle", [], few, [])
 
     yield Target(examples, take, (DocumentError,))
 

@@ -18,8 +18,8 @@ from tests.reliability.chaos_report import ChaosResult, FaultResult, RoundResult
 from tests.reliability.chaos_round import ChaosRound
 from tests.reliability.faults import FAULTS, script
 from tests.reliability.spoilt_run import Setting
-from tests.reliability.terminal import report_lines
 from tools.options import AsJson, File, Out, Settings, known_words, print_result
+from tools.progress import columns
 
 BARREN: Final = 3  # rounds without any fault, and it gives up
 
@@ -70,7 +70,7 @@ def chaos(
     result = ChaosResult(read.experiment.title, seed, planned, outcomes, ends)
     (folder / RESULT).write_bytes(msgspec.json.format(msgspec.json.encode(result), indent=1))
     verdict = findings(result)
-    print_result(result, *report_lines(table(result), verdict), f"results: {folder}", as_json=as_json)
+    print_result(result, *columns(table(result)), *map(str, verdict), f"results: {folder}", as_json=as_json)
     if interrupted():
         return 130
     return int(any(finding.mark == "bad" for finding in verdict))

@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from signal import SIGKILL, SIGSTOP
 from typing import Final, Literal
 
@@ -381,6 +382,8 @@ class FaultKind:
     recorded: Literal["", "lost", "router"] = ""  # kind of the event of which the recording must have one
 
 
+MOCAP: Final = "motion capture"
+_wrong_poses = partial(FaultKind, lasts_s=5.0, heals_s=8.0, most=1, disbands=True, stage=MOCAP, among="measured")
 FAULT_KINDS: Final = {
     "kill": FaultKind(_kill, most=2, recorded="lost"),
     "freeze": FaultKind(_freeze, 5.0, unsteered=True),
@@ -391,24 +394,12 @@ FAULT_KINDS: Final = {
     "conductor": FaultKind(_conductor, victim=False, most=1),
     "clock": FaultKind(_clock, victim=False, size=(0.5, 5.0), signed=True),
     "clock-behind": FaultKind(_clock_behind, heals_s=12.0, most=2, size=(3.0, 4.5), recorded="lost"),
-    "mocap-clock": FaultKind(
-        _mocap_clock, 3.0, victim=False, most=3, stage="motion capture", size=(0.5, 4.5), signed=True
-    ),
-    "mocap-frozen": FaultKind(
-        _mocap_frozen, 5.0, heals_s=8.0, victim=False, most=1, disbands=True, stage="motion capture", among="measured"
-    ),
-    "mocap-repeated": FaultKind(
-        _mocap_repeated, 5.0, heals_s=8.0, victim=False, most=1, disbands=True, stage="motion capture", among="measured"
-    ),
-    "mocap-swapped": FaultKind(
-        _mocap_swapped, 5.0, heals_s=8.0, most=1, disbands=True, stage="motion capture", among="measured"
-    ),
-    "mocap-renamed": FaultKind(
-        _mocap_renamed, 5.0, heals_s=8.0, most=1, disbands=True, stage="motion capture", among="measured"
-    ),
-    "refused-landing": FaultKind(
-        _refused_landing, 12.0, heals_s=8.0, most=1, disbands=True, among="flying", ordered=True
-    ),
+    "mocap-clock": FaultKind(_mocap_clock, 3.0, victim=False, most=3, stage=MOCAP, size=(0.5, 4.5), signed=True),
+    "mocap-frozen": _wrong_poses(_mocap_frozen, victim=False),
+    "mocap-repeated": _wrong_poses(_mocap_repeated, victim=False),
+    "mocap-swapped": _wrong_poses(_mocap_swapped),
+    "mocap-renamed": _wrong_poses(_mocap_renamed),
+    "refused-landing": FaultKind(_refused_landing, 12.0, 8.0, most=1, disbands=True, among="flying", ordered=True),
     "sleep": FaultKind(_sleep, 8.0, heals_s=6.0, most=2, unsteered=True),
     "double": FaultKind(_double, heals_s=6.0),
     "read-error": FaultKind(_read_error, heals_s=12.0, most=1, recorded="lost"),

@@ -5,7 +5,9 @@ Everything is written down as it comes: the processes that are measured keep no 
 
 from __future__ import annotations
 
-from typing import Annotated
+import statistics
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Annotated, Final, NamedTuple
 
 import typer
 
@@ -15,10 +17,19 @@ from experiments.file.document import chosen, load
 from experiments.real_time.conductor.conduct import RunOptions, Supervision, conduct
 from experiments.real_time.conductor.run_view import RunFailed
 from experiments.recording.run_folder import new_folder
-from tests.reliability.soak_sampler import Sampler
-from tests.reliability.soak_verdict import judge, passed, table
-from tests.reliability.terminal import report_lines
+from experiments.report.page import NONE, VerdictLine
+from tests.reliability.soak_sampler import Sampler, Soaked, SoakSample
 from tools.options import AsJson, Bodies, Case, Out, Settings, print_result
+from tools.progress import columns
+
+WARM_SHARE: Final = 0.5  # of the run that does not count (a recorder fills its pools for 150 s), but not more than
+WARM_S: Final = 300.0
+WINDOW: Final = 0.1  # share of what counts that is compared at both ends
+GROWTH: Final = 0.02  # of the memory
+JUDGED_S: Final = 300.0  # memory of a shorter run says nothing: allocators are still filling their pools
+SLOWER: Final = 2.0  # times the delay at the beginning
+DELAY_S: Final = 0.005  # delays below are the noise of the machine
+MISSED: Final = 0.01  # share of the ticks
 
 
 def soak(
@@ -48,7 +59,132 @@ def soak(
     findings = judge(soaked)
     well = passed(findings)
     shown = {"run": folder, "passed": well, "findings": findings}
-    print_result(shown, *report_lines(table(soaked), findings), f"results: {folder}", as_json=as_json)
+    print_result(shown, *columns(table(soaked)), *map(str, findings), f"results: {folder}", as_json=as_json)
     if soaked.interrupted:
         return 130
     return 0 if well else 1
+
+
+# ---------------------------------------------------------------------- the verdict
+
+
+class Ends(NamedTuple):
+    """Rows of a process after the warm-up: first and last window."""
+
+    first: Sequence[SoakSample]
+    last: Sequence[SoakSample]
+
+    def over(self, what: Callable[[Iterable[float]], float], field: str) -> tuple[float, float]:
+        """A statistic of a field in both windows."""
+        first, last = (what(getattr(row, field) for row in rows) for rows in self)
+        return first, last
+
+    @property
+    def growth(self) -> float:
+        """Growth of the memory, as a share of the first."""
+        first, last = self.over(statistics.median, "rss_mb")
+        return last / first - 1.0 if first else 0.0
+
+
+def warm_s(soaked: Soaked) -> float:
+    """From then on it counts [s]."""
+    return min(WARM_SHARE * soaked.duration_s, WARM_S)
+
+
+def ends(soaked: Soaked) -> dict[str, Ends]:
+    """Both ends of each process that has enough rows to have them, by name."""
+    found = {}
+    for process in sorted({row.process for row in soaked.rows}):
+        counted = [row for row in soaked.rows if row.process == process and row.time_s >= warm_s(soaked)]
+        size = max(2, round(WINDOW * len(counted)))
+        if len(counted) >= 2 * size:
+            found[process] = Ends(counted[:size], counted[-size:])
+    return found
+
+
+def judge(soaked: Soaked) -> list[VerdictLine]:
+    """The verdict; bad findings fail it."""
+    both, last = ends(soaked), {row.process: row for row in soaked.rows}
+    found = [*_alive(soaked), _memory(soaked, both)]
+
+    def add(wrong: str, right: str) -> None:
+        found.append(VerdictLine("bad", wrong) if wrong else VerdictLine("good", right))
+
+    def total(field: str) -> int:
+        return sum(getattr(row, field) or 0 for row in last.values())
+
+    for what, field in (("threads", "threads"), ("file descriptors", "files")):
+        counts = {process: each.over(max, field) for process, each in both.items()}
+        grown = ", ".join(f"{process} +{after - first}" for process, (first, after) in counts.items() if after > first)
+        add(grown and f"{what} grow: {grown}", f"{what} do not grow")
+    lost = ", ".join(f"{process} {row.lost}" for process, row in last.items() if row.lost)
+    received = sum(row.received or 0 for row in soaked.rows)
+    untested = "" if received else "no pose was received: nothing was tested"
+    add(f"lost poses: {lost}" if lost else untested, f"0 of {received} poses were lost")
+    if malformed := total("malformed"):
+        found.append(VerdictLine("bad", f"{malformed} payloads were refused as malformed"))
+    windows = [
+        [row.delay_s for each in both.values() for row in each[end] if row.delay_s is not None] for end in (0, 1)
+    ]
+    if all(windows):
+        before, after = map(statistics.median, windows)
+        longest = max(row.longest_s or 0.0 for row in soaked.rows)
+        text = f"{1e3 * before:.2f} ms at first, {1e3 * after:.2f} ms at last, {1e3 * longest:.0f} ms at most"
+        slow = after > max(SLOWER * before, DELAY_S)
+        found.append(VerdictLine("bad" if slow else "good", f"delay of poses: {text}"))
+    if ticks := total("ticks"):
+        share = total("missed") / ticks
+        text = f"{total('missed')} of {ticks} ticks were missed ({100.0 * share:.3f} %)"
+        found.append(VerdictLine("good" if share < MISSED else "fair", text))
+    return found
+
+
+def passed(findings: Sequence[VerdictLine]) -> bool:
+    """Whether nothing is bad."""
+    return all(finding.mark != "bad" for finding in findings)
+
+
+def _alive(soaked: Soaked) -> list[VerdictLine]:
+    lasted, sampled = max((row.time_s for row in soaked.rows), default=0.0), {row.process for row in soaked.rows}
+    bad = [f"{name} {what}" for name, what in soaked.failed.items()]
+    bad += [f"{name} never had a process" for name in soaked.robots if name not in sampled | soaked.failed.keys()]
+    if soaked.interrupted:
+        bad.append(f"it was interrupted after {lasted:.0f} s of {soaked.duration_s:g} s")
+    good = f"all {len(soaked.robots)} robots lived through {lasted / 60.0:.1f} minutes"
+    return [VerdictLine("bad", text) for text in bad] or [VerdictLine("good", good)]
+
+
+def _memory(soaked: Soaked, both: Mapping[str, Ends]) -> VerdictLine:
+    if not both:
+        return VerdictLine("bad", "too few samples to compare beginning and end: let it run longer")
+    grown = {process: each.growth for process, each in both.items()}
+    most = max(grown, key=lambda process: grown[process])
+    text = f"memory: largest growth after {warm_s(soaked):.0f} s is {100 * grown[most]:+.2f} % ({most})"
+    if soaked.duration_s < JUDGED_S:
+        return VerdictLine("plain", f"{text}; not judged below {JUDGED_S / 60:.0f} minutes")
+    beyond = ", ".join(f"{process} {100 * growth:+.2f} %" for process, growth in grown.items() if growth > GROWTH)
+    if beyond:
+        return VerdictLine("bad", f"memory grows beyond {100 * GROWTH:g} %: {beyond}")
+    return VerdictLine("good", f"{text}, within {100 * GROWTH:g} %")
+
+
+def table(soaked: Soaked) -> list[tuple[str, ...]]:
+    """A head and a row for each process: resident memory after the warm-up and at the end, CPU as share of a core."""
+    head = ("process", "MB first", "MB last", "growth", "threads", "files", "CPU", "lost", "missed", "delay [ms]")
+    rows: list[tuple[str, ...]] = [head]
+    for process, each in ends(soaked).items():
+        last, first = each.last[-1], each.first[0]
+        share = 100.0 * (last.cpu_s - first.cpu_s) / max(last.time_s - first.time_s, 1e-9)
+        delays = [row.delay_s for row in soaked.rows if row.process == process and row.delay_s is not None]
+        cells = (
+            process,
+            *(f"{memory:.1f}" for memory in each.over(statistics.median, "rss_mb")),
+            f"{100 * each.growth:+.2f} %",
+            str(last.threads),
+            str(last.files),
+            f"{share:.1f} %",
+            *(NONE if count is None else str(count) for count in (last.lost, last.missed)),
+            f"{1e3 * statistics.median(delays):.2f}" if delays else NONE,
+        )
+        rows.append(cells)
+    return rows

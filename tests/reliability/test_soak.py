@@ -10,8 +10,8 @@ from agents.network import messages
 from experiments.file.document import load
 from experiments.real_time.conductor.run_view import Progress, RobotView, RunFailed
 from tests.__main__ import command
+from tests.reliability.soak import judge, passed, table
 from tests.reliability.soak_sampler import Sampler, Soaked, SoakSample
-from tests.reliability.soak_verdict import judge, passed, table
 
 ROBOTS = ("TB01", "CF02")
 SPAN = 3600.0
