@@ -70,7 +70,7 @@ class KeptVerdict:
     def keep(self, verdict: Verdict, most: int = MAX_VERDICTS) -> None:
         """Keeps a verdict for the next check, and the newest `most` in all; nothing where that would not be safe."""
         place = self._place()
-        if place is None or _code() != self._code or any(_strangers()):
+        if place is None or _code() != self._code or any(uncovered_modules()):
             return
         with suppress(OSError, ValueError):
             content = msgspec.json.encode(verdict, enc_hook=_plain)
@@ -153,7 +153,7 @@ def _files(root: Path) -> list[Path]:
     return sorted(file for file in root.rglob("*") if file.is_file() and "__pycache__" not in file.parts)
 
 
-def _strangers() -> Iterator[Path]:
+def uncovered_modules() -> Iterator[Path]:
     """Modules of this process that nothing in `_code` stands for: what changes in them would go unseen."""
     paths = sysconfig.get_paths()
     known = [Path(paths[name]) for name in ("stdlib", "platstdlib", "purelib", "platlib")]

@@ -27,8 +27,9 @@ from experiments.check.safety import batteries
 from experiments.definition.experiment import Experiment, Formation, LegTable, RobotTable
 from experiments.definition.plan import Plan
 from experiments.file import catalogue, document
-from experiments.file.problems import DocumentError
-from tests.experiments.checked import GROUND, assert_found, bad, ground, of
+from tests.commands import invoke
+from tests.experiments.checked import GROUND, as_read, assert_found, bad, findings, ground
+from tests.small import changed, reference, small
 from tools.commands import check as commands
 
 pytestmark = pytest.mark.slow  # each check flies the experiment on the virtual clock
@@ -41,19 +42,13 @@ PARK, TRIANGLE = "robotic-park", "triangle"
 
 def test_laws_of_velocities_are_not_clamped():
     plan = document.read(TRIANGLE, ['formation.law="consensus"']).plan
-    found = figures(plan)
-    assert found.speed_available == min(kind.speed for kind in plan.kinds)
+    assert figures(plan).speed_available == min(kind.speed for kind in plan.kinds)
 
 
 @pytest.fixture(scope="module")
 def examined():
     """Findings on the reference experiment and figures of both cases."""
     return examine(document.read(PARK))
-
-
-@pytest.fixture
-def park(examined):
-    return examined[0]
 
 
 def test_numbers_of_the_reference(examined):
@@ -76,8 +71,8 @@ def test_numbers_of_the_reference(examined):
     assert examined[1]["periodic"].messages_hz == pytest.approx(350.0)
 
 
-def test_reference_is_feasible_with_a_quick_leader(park):
-    (found,) = [each for each in park if each.severity != "note"]
+def test_reference_is_feasible_with_a_quick_leader(examined):
+    (found,) = [each for each in examined[0] if each.severity != "note"]
     assert (found.code, found.severity) == ("followers-lag", "warning")
     assert "0.095 m/s" in found.message
     assert "0.15 m/s" in found.message
@@ -85,6 +80,10 @@ def test_reference_is_feasible_with_a_quick_leader(park):
     lines = catalogue.path(PARK).read_text("utf-8").splitlines()
     (line,) = (number for number, line in enumerate(lines, 1) if line.startswith("plan = "))
     assert found.where.endswith(f"robotic-park.toml:{line}:8")
+    notes = {each.code: each.message for each in examined[0] if each.severity == "note"}
+    assert {"connected", "realisable", "rigid", "stable", "starts", "acquired", "inside"} <= notes.keys()
+    assert "rank 11 of 11" in notes["rigid"]
+    assert "12 of 15, not needed" in notes["rigid"]
 
 
 @pytest.mark.parametrize("name", ["triangle", "convoy"])
@@ -92,38 +91,30 @@ def test_other_catalogue_experiments_have_no_findings(name):
     assert bad(name) == {}
 
 
-def test_notes_say_what_was_found(park):
-    notes = {each.code: each.message for each in park if each.severity == "note"}
-    assert {"connected", "realisable", "rigid", "stable", "starts", "acquired", "inside"} <= notes.keys()
-    assert "rank 11 of 11" in notes["rigid"]
-    assert "12 of 15, not needed" in notes["rigid"]
-
-
 # ------------------------------------------------------------------ experiments that do not
 
 
 @pytest.mark.usefixtures("unflown")
-def test_a_hover_above_the_limit_names_the_limit():
-    severity, message, remedy, where = bad(PARK, "robots.CF01.hover=0.81")["too-high"]
-    assert severity == "error"
-    assert message.startswith("CF01 is too high at 0.81 m for")
-    assert "TB01 - CF01 (0.86 m)" in message
-    assert "lower than 0.806 m" in remedy
-    assert where == "--set robots.CF01.hover=0.81"
+def test_hover_above_the_limit_names_the_limit():
+    found = bad(PARK, "robots.CF01.hover=0.81")["too-high"]
+    assert found.severity == "error"
+    assert found.message.startswith("CF01 is too high at 0.81 m for")
+    assert "TB01 - CF01 (0.86 m)" in found.message
+    assert "lower than 0.806 m" in found.remedy
+    assert found.where == "--set robots.CF01.hover=0.81"
     assert "too-high" not in bad(PARK, "robots.CF01.hover=0.805")
 
 
 @pytest.mark.usefixtures("unflown")
 @pytest.mark.parametrize(
-    ("gain", "code"),
-    [(5.0, None), (8.0, "oscillates"), (12.0, "unstable")],  # of links without drones
+    ("gain", "found"),
+    [(5.0, []), (8.0, [("oscillates", "warning")]), (12.0, [("unstable", "error")])],  # of links without drones
 )
-def test_gains(gain, code):
-    found = bad(PARK, f"formation.gain={gain}")
-    assert found.keys() & {"oscillates", "unstable"} == ({code} if code else set())
-    if code:
-        assert found[code][0] == ("error" if code == "unstable" else "warning")
-        assert "below 6.8" in found[code][2]
+def test_gains(gain, found):
+    claims = bad(PARK, f"formation.gain={gain}")
+    loop = [claims[code] for code in ("oscillates", "unstable") if code in claims]
+    assert [(each.code, each.severity) for each in loop] == found
+    assert all("below 6.8" in each.remedy for each in loop)
 
 
 class Steep(Gradient, frozen=True):
@@ -167,14 +158,24 @@ class Listing(Steep, frozen=True):
         return abs(link.distance - sum([each * each for each in apart]) ** 0.5)
 
 
-def test_uncompiled_law_is_noted_once(monkeypatch):
-    installed = registry.registered
-    mine = {registry.LAWS: {"mine": [EntryPoint("mine", f"{__name__}:Listing", registry.LAWS)]}}
-    monkeypatch.setattr(registry, "registered", lambda group: installed(group) | mine.get(group, {}))
-    found = [each for each in check(document.read(TRIANGLE, ["formation.law=mine"])) if each.code == "uncompiled"]
-    assert [each.severity for each in found] == ["note"]
-    assert "Listing.error uses" in found[0].message
-    assert "test_check.py:" in found[0].message
+@pytest.fixture
+def install(monkeypatch):
+    """Registers a law of this module as 'mine'."""
+
+    def installed(law):
+        before, entry = registry.registered, EntryPoint("mine", f"{__name__}:{law}", registry.LAWS)
+        mine = {registry.LAWS: {"mine": [entry]}}
+        monkeypatch.setattr(registry, "registered", lambda group: before(group) | mine.get(group, {}))
+
+    return installed
+
+
+def test_uncompiled_law_is_noted_once(install):
+    install("Listing")
+    (found,) = [each for each in check(document.read(TRIANGLE, ["formation.law=mine"])) if each.code == "uncompiled"]
+    assert found.severity == "note"
+    assert "Listing.error uses" in found.message
+    assert "test_check.py:" in found.message
 
 
 @pytest.mark.parametrize(
@@ -186,93 +187,74 @@ def test_uncompiled_law_is_noted_once(monkeypatch):
         ("Weak", "not-acquired", "not acquired in time", "raise the law's own parameters (largest)"),
     ],
 )
-def test_remedy_for_a_users_law_names_the_law(monkeypatch, law, code, message, remedy):
-    installed = registry.registered
-    mine = {registry.LAWS: {"mine": [EntryPoint("mine", f"{__name__}:{law}", registry.LAWS)]}}
-    monkeypatch.setattr(registry, "registered", lambda group: installed(group) | mine.get(group, {}))
+def test_remedy_for_a_users_law_names_the_law(install, law, code, message, remedy):
+    install(law)
     found = bad(TRIANGLE, "formation.law=mine", "duration_s=1")[code]
-    assert message in found[1]
-    assert remedy in found[2]
-    assert found[3] == ("--set duration_s=1" if code == "not-acquired" else "--set formation.law=mine")
+    assert message in found.message
+    assert remedy in found.remedy
+    assert found.where == ("--set duration_s=1" if code == "not-acquired" else "--set formation.law=mine")
 
 
 @pytest.mark.parametrize(
-    ("name", "change", "expected", "message", "remedy"),
+    ("change", "expected", "message", "remedy"),
     [
-        (PARK, 'formation.links."KH01 - KH03"=1.3', ("error", "no-triangle"), "KH01 - KH03 (1.3 m)", "shorten"),
-        (PARK, "robots.CF02.hover=0.9", ("error", "too-high"), "KH02 - CF02 (0.86 m)", "0.860 m"),
-        (PARK, "timeline.0.plan.speed=0.3", ("error", "leader-too-fast"), "0.3 m/s; it has 0.22", "0.2 m/s"),
-        (PARK, "safety.speed=0.1", ("error", "leader-too-fast"), "it has 0.1 m/s", "0.09 m/s"),
-        (PARK, "disturbance={}", ("warning", "not-random"), "runs of other seeds are the same", "position_sigma"),
-        (PARK, "timeline.0.plan.speed=0.21", ("warning", "leader-near-limit"), "of the 0.22 m/s", "0.2 m/s"),
-        (PARK, "timeline.0.plan.speed=0.02", ("warning", "leg-cut"), "lasts 37.5 s", "59"),
-        (PARK, "robots.KH01.start=[-0.98,-0.8]", ("warning", "start-margin"), "0.02 m from a wall", "margin"),
-        (PARK, "robots.CF01.start=[-0.6,0.75]", ("error", "start-overlap"), "TB01 and CF01 start 0.05 m", "floor"),
-        (
-            PARK,
-            "cases.periodic.trigger.period_s=0.005",
-            ("warning", "trigger-too-fast"),
-            "in case 'periodic'",
-            "to 200",
-        ),
-        (
-            PARK,
-            "cases.periodic.trigger.period_s=0.03",
-            ("warning", "trigger-uneven"),
-            "every 0.04 s",
-            "multiple of 0.02",
-        ),
-        (PARK, "rates.pose_hz=5", ("warning", "decides-unheard"), "at 5 Hz at most", "pose_hz"),
-        (PARK, "formation.leader=CF03", ("warning", "no-incoming-links"), "TB01 has no links", "> TB01"),
+        ('formation.links."KH01 - KH03"=1.3', ("error", "no-triangle"), "KH01 - KH03 (1.3 m)", "shorten"),
+        ("robots.CF02.hover=0.9", ("error", "too-high"), "KH02 - CF02 (0.86 m)", "0.860 m"),
+        ("timeline.0.plan.speed=0.3", ("error", "leader-too-fast"), "0.3 m/s; it has 0.22", "0.2 m/s"),
+        ("safety.speed=0.1", ("error", "leader-too-fast"), "it has 0.1 m/s", "0.09 m/s"),
+        ("disturbance={}", ("warning", "not-random"), "runs of other seeds are the same", "position_sigma"),
+        ("timeline.0.plan.speed=0.21", ("warning", "leader-near-limit"), "of the 0.22 m/s", "0.2 m/s"),
+        ("timeline.0.plan.speed=0.02", ("warning", "leg-cut"), "lasts 37.5 s", "59"),
+        ("robots.KH01.start=[-0.98,-0.8]", ("warning", "start-margin"), "0.02 m from a wall", "margin"),
+        ("robots.CF01.start=[-0.6,0.75]", ("error", "start-overlap"), "TB01 and CF01 start 0.05 m", "floor"),
+        ("cases.periodic.trigger.period_s=0.005", ("warning", "trigger-too-fast"), "in case 'periodic'", "to 200"),
+        ("cases.periodic.trigger.period_s=0.03", ("warning", "trigger-uneven"), "every 0.04 s", "multiple of 0.02"),
+        ("rates.pose_hz=5", ("warning", "decides-unheard"), "at 5 Hz at most", "pose_hz"),
+        ("formation.leader=CF03", ("warning", "no-incoming-links"), "TB01 has no links", "> TB01"),
     ],
 )
 @pytest.mark.usefixtures("unflown")
-def test_variants_that_do_not_work_in_theory(name, change, expected, message, remedy):
-    assert_found(name, change, expected, message, remedy)
+def test_variants_that_do_not_work_in_theory(change, expected, message, remedy):
+    assert_found(PARK, change, expected, message, remedy)
+
+
+SQUARE = {"A - B": 1.0, "B - D": 1.0, "D - C": 1.0, "A - C": 1.0, "A - D": 1.4, "B - C": 1.1}
 
 
 @pytest.mark.usefixtures("unflown")
-def test_followers_that_cannot_hear_of_the_leader():
-    found = ground({"A > B": 1.0, "C - D": 1.0}, leader="A")
-    assert found["leader-unknown"].startswith("C, D cannot be reached by the leader (A)")
-    assert "2 parts" in found["parts"]
-
-
-@pytest.mark.usefixtures("unflown")
-def test_a_leader_that_nobody_listens_to():
-    assert "leader-not-received" in ground({"B - C": 1.0, "C - D": 1.0, "B - D": 1.0}, leader="A")
-    assert "no-incoming-links" in ground({"A > B": 1.0, "A > C": 1.0, "B - C": 1.0}, leader="A")
-
-
-@pytest.mark.usefixtures("unflown")
-def test_a_chain_folds():
-    assert "rank 3 of 5" in ground({"A > B": 1.0, "B > C": 1.0, "C > D": 1.0})["not-rigid"]
+@pytest.mark.parametrize(
+    ("links", "leader", "code", "message"),
+    [
+        ({"A > B": 1.0, "C - D": 1.0}, "A", "leader-unknown", "C, D cannot be reached by the leader (A)"),
+        ({"A > B": 1.0, "C - D": 1.0}, "A", "parts", "2 parts"),
+        ({"B - C": 1.0, "C - D": 1.0, "B - D": 1.0}, "A", "leader-not-received", ""),
+        ({"A > B": 1.0, "A > C": 1.0, "B - C": 1.0}, "A", "no-incoming-links", ""),
+        ({"A > B": 1.0, "B > C": 1.0, "C > D": 1.0}, None, "not-rigid", "rank 3 of 5"),
+        (SQUARE, None, "not-realisable", "A - D"),
+    ],
+)
+def test_networks_that_make_no_formation(links, leader, code, message):
+    assert message in ground(links, leader)[code].message
 
 
 def test_no_links_are_no_formation():
     assert ground({}) == {}
-    made = Experiment(title="made", robots=GROUND, duration_s=5.0)
+    made = small(GROUND, duration_s=5.0)
     assert figures(Plan(made)).rank is None
-    assert "no-formation" in {each.code for each in check(of(made))}
-
-
-@pytest.mark.usefixtures("unflown")
-def test_distances_that_contradict_one_another_without_a_triangle():
-    square = {"A - B": 1.0, "B - D": 1.0, "D - C": 1.0, "A - C": 1.0, "A - D": 1.4, "B - C": 1.1}
-    assert "A - D" in ground(square)["not-realisable"]
+    assert "no-formation" in findings(made)
 
 
 @pytest.mark.usefixtures("unflown")
 def test_only_the_case_at_fault_is_named():
-    found = bad(PARK, "cases.event.formation.gain=12")
-    assert found["unstable"][1].startswith("in case 'event': the sampled loop is unstable")
-    assert found["unstable"][3] == "--set cases.event.formation.gain=12"
+    found = bad(PARK, "cases.event.formation.gain=12")["unstable"]
+    assert found.message.startswith("in case 'event': the sampled loop is unstable")
+    assert found.where == "--set cases.event.formation.gain=12"
 
 
 def test_only_the_cases_of_a_run_are_checked():
     read = document.read(TRIANGLE, ["cases.periodic.robots.KH01.start=[0.6, -0.45]", "duration_s=1"])
-    assert {each.code for each in check(read) if each.severity == "error"} == {"start-overlap"}
-    assert {each.code for each in check(read, ["periodic"]) if each.severity == "error"} == {"start-overlap"}
+    for cases in ([], ["periodic"]):
+        assert {each.code for each in check(read, cases) if each.severity == "error"} == {"start-overlap"}
     assert not [each for each in check(read, ["event"]) if each.severity == "error" or "in case" in each.message]
 
 
@@ -281,51 +263,40 @@ def test_place_is_in_the_case_that_changes_it(tmp_path):
     text = catalogue.path(PARK).read_text("utf-8")
     file = tmp_path / "mine.toml"
     file.write_text(f"{text}\n[cases.wild]\nformation = {{ gain = 12.0 }}\n", encoding="utf-8")
-    (unstable,) = (each for each in check(document.read(file)) if each.code == "unstable")
-    assert unstable.where == f"{file}:{text.count(chr(10)) + 3}:22"
+    assert findings(document.read(file))["unstable"].where == f"{file}:{text.count(chr(10)) + 3}:22"
 
 
 # ------------------------------------------------------------------ the command
 
 
 @pytest.mark.usefixtures("unflown")
-def test_the_table(capsys):
-    assert commands.check(PARK, settings=[], as_json=False) == 0
-    said = capsys.readouterr().out
-    assert "✓ the formation is rigid, rank 11 of 11" in said
-    assert "! KH01 follows at 0.095 m/s" in said
-    assert "periodic 350.0 per second, event" in said
-    assert said.endswith("no errors, 1 warning\n")
-    assert commands.check(PARK, settings=["formation.gain=12"], as_json=False) == 1
-    assert "✗ the sampled loop is unstable" in capsys.readouterr().out
+def test_command_prints_a_table():
+    output = invoke("check", PARK).stdout
+    assert "✓ the formation is rigid, rank 11 of 11" in output
+    assert "! KH01 follows at 0.095 m/s" in output
+    assert "periodic 350.0 per second, event" in output
+    assert output.endswith("no errors, 1 warning\n")
+    assert "✗ the sampled loop is unstable" in invoke("check", PARK, "--set", "formation.gain=12", code=1).stdout
 
 
 @pytest.mark.usefixtures("unflown")
-def test_json(capsys):
-    assert commands.check(PARK, settings=["robots.CF01.hover=0.81"], as_json=True) == 1
-    said = json.loads(capsys.readouterr().out)
-    assert said["file"].endswith("robotic-park.toml")
-    assert said["ok"] is False
-    assert said["findings"][0]["code"] == "too-high"
-    assert said["figures"].keys() == {"periodic", "event"}
-    assert said["figures"]["event"].keys() == set(CheckNumbers.__struct_fields__)
-    assert commands.check("triangle", settings=[], as_json=True) == 0
-    assert json.loads(capsys.readouterr().out)["ok"] is True
-
-
-def test_a_file_that_cannot_be_read(capsys):
-    with pytest.raises(DocumentError, match="no robot is called"):
-        commands.check(PARK, settings=["formation.leader=TB02"], as_json=False)
-    assert commands.check(PARK, settings=["formation.leader=TB02"], as_json=True) == 2
-    said = json.loads(capsys.readouterr().out)
-    assert (said["ok"], said["findings"][0]["code"], said["figures"]) == (False, "document", {})
+def test_command_prints_json():
+    told = json.loads(invoke("check", PARK, "--set", "robots.CF01.hover=0.81", "--json", code=1).stdout)
+    assert told["file"].endswith("robotic-park.toml")
+    assert told["ok"] is False
+    assert told["findings"][0]["code"] == "too-high"
+    assert told["figures"].keys() == {"periodic", "event"}
+    assert told["figures"]["event"].keys() == set(CheckNumbers.__struct_fields__)
+    assert json.loads(invoke("check", TRIANGLE, "--json").stdout)["ok"] is True
+    unread = json.loads(invoke("check", PARK, "--set", "formation.leader=TB02", "--json", code=2).stdout)
+    assert (unread["ok"], unread["findings"][0]["code"], unread["figures"]) == (False, "document", {})
 
 
 @pytest.mark.usefixtures("unflown")
-def test_a_terminal_without_greek(monkeypatch):
+def test_terminal_without_greek(monkeypatch):
     out = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
     monkeypatch.setattr(sys, "stdout", out)
-    assert commands.check("triangle", settings=[], as_json=False) == 0
+    assert commands.check(TRIANGLE, settings=[], as_json=False) == 0
     out.seek(0)
     assert "no errors, no warnings" in out.read()
 
@@ -348,9 +319,12 @@ def test_a_terminal_without_greek(monkeypatch):
         "rates.coordination_hz=0.01",
     ],
 )
-def test_absurd_numbers_end_in_findings(change, capsys):
-    assert commands.check(PARK, settings=[change, "timeline.0.at_s=3", "duration_s=6"], as_json=True) in (0, 1, 2)
-    assert "Infinity" not in capsys.readouterr().out
+def test_absurd_numbers_end_in_findings(change):
+    sets = [word for each in (change, "timeline.0.at_s=3", "duration_s=6") for word in ("--set", each)]
+    done = invoke("check", PARK, "--json", *sets, code=None)
+    assert done.exit_code in (0, 1, 2)
+    assert json.loads(done.stdout)["findings"]
+    assert "Infinity" not in done.stdout
 
 
 @st.composite
@@ -367,20 +341,16 @@ def experiments(draw: st.DrawFn) -> Experiment:
     pairs = [(i, j) for i in range(count) for j in range(i)]
     chosen = draw(st.lists(st.sampled_from(pairs), unique=True)) if pairs else []
     links = {f"R{i} {draw(st.sampled_from('>-'))} R{j}": draw(st.floats(0.05, 3.0)) for i, j in chosen}
-    leader = draw(st.sampled_from([None, *robots]))
-    move = [draw(place), draw(place)]
-    plan = {"kind": "line", "move_by": move, "speed": draw(st.floats(0.01, 1.0))}
-    legs = [LegTable(at_s=draw(st.floats(0.0, 4.0)), robot=draw(st.sampled_from(list(robots))), plan=plan)]
-    formation = Formation(links=links, leader=leader, gain=draw(st.floats(0.1, 30.0)))
-    return Experiment(
-        title="made", robots=robots, duration_s=draw(st.floats(5.0, 10.0)), formation=formation, timeline=legs
-    )
+    formation = Formation(links=links, leader=draw(st.sampled_from([None, *robots])), gain=draw(st.floats(0.1, 30.0)))
+    plan = {"kind": "line", "move_by": [draw(place), draw(place)], "speed": draw(st.floats(0.01, 1.0))}
+    leg = LegTable(at_s=draw(st.floats(0.0, 4.0)), robot=draw(st.sampled_from(list(robots))), plan=plan)
+    return small(robots, duration_s=draw(st.floats(5.0, 10.0)), formation=formation, timeline=[leg])
 
 
 @settings(max_examples=10)
 @given(experiments())
 def test_errors_and_warnings_have_remedies_and_places(made):
-    found, numbers = examine(of(made))
+    found, numbers = examine(as_read(made))
     assert found
     for each in found:
         assert each.message
@@ -389,29 +359,25 @@ def test_errors_and_warnings_have_remedies_and_places(made):
 
 
 def test_batteries_ending_before_the_run_are_all_named():
-    experiment = document.read(PARK).cases()["event"].experiment
-
-    def said(duration_s: float, **safety: float) -> list[str]:
-        limits = msgspec.structs.replace(experiment.safety, **safety)
-        made = msgspec.structs.replace(experiment, duration_s=duration_s, safety=limits)
+    def messages_after(duration_s: float, **safety: float) -> list[str]:
+        made = changed(reference(), duration_s=duration_s, safety=changed(reference().safety, **safety))
         standing = Prediction(np.zeros(1), np.zeros((1, len(made.robots), 3)))
         return [each.message for each in batteries(analyse(Plan(made), standing))]
 
-    wheels, drones = said(12000.0)
+    wheels, drones = messages_after(12000.0)
     assert "TB01 stops after about 8095 s of 12000 s" in wheels  # a Khepera lasts five hours
     assert "CF01, CF02, CF03 land after about 373 s" in drones
-    assert not said(300.0)
-    assert not said(12000.0, battery_low=0.0)
+    assert not messages_after(300.0)
+    assert not messages_after(12000.0, battery_low=0.0)
 
 
 @pytest.mark.usefixtures("unflown")
-def test_payload_of_what_a_law_says():
-    bare, said = (figures(document.read(name).cases()["event"]) for name in ("triangle", "average"))
+def test_payload_of_the_variables_of_a_law():
+    bare, average = (figures(document.read(name).cases()["event"]) for name in ("triangle", "average"))
     assert bare.words_bytes == 0
     assert 140 < bare.pose_bytes < 200
     assert bare.pose_kbit_s == pytest.approx(0.008 * bare.pose_bytes * 50.0)
-    assert said.words_bytes == len(',"shared":[]') + sum(
-        len(messages.encode(messages.Variable(name, [-1.234567e-05]), "json")) for name in "xqn"
-    ) + len(",,")  # fmt: skip
+    words = [messages.encode(messages.Variable(name, [-1.234567e-05]), "json") for name in "xqn"]
+    assert average.words_bytes == len(',"shared":[]') + sum(map(len, words)) + len(",,")
     periodic = figures(document.read("average").cases()["periodic"])
-    assert periodic.pose_kbit_s == pytest.approx(0.008 * said.pose_bytes * 10.0)
+    assert periodic.pose_kbit_s == pytest.approx(0.008 * average.pose_bytes * 10.0)

@@ -1,8 +1,5 @@
 """Verdicts of earlier checks: the same as a new one, and none once anything has changed."""
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -12,104 +9,87 @@ from experiments.check import kept
 from experiments.check.check import examine
 from experiments.check.kept import KeptVerdict, Verdict
 from experiments.file import document
+from tests.commands import zenpark
 from tests.tools.test_cli import loaded
 
-SAID = Verdict("park.toml", "A park", [], None)
-POINTS = "[zenpark.laws]\nmine = mine:Law\n"
+GOOD = Verdict("park.toml", "A park", [], None)
+FILES = {
+    "lab/park.toml": 'title = "A park"\nformation.law = { kind = "policy", file = "mine.onnx" }\n',
+    "lab/hall.toml": "[arena]\nsize = [4.0, 4.0, 2.5]\n",
+    "lab/mine.onnx": "one",
+    "site/mine/__init__.py": "GAIN = 1\n",
+    "site/mine-1.0.dist-info/METADATA": "Name: mine\nVersion: 1.0\n",
+    "site/mine-1.0.dist-info/entry_points.txt": "[zenpark.laws]\nmine = mine:Law\n",
+}
 
 
 @pytest.fixture
 def park(tmp_path, monkeypatch):
     """An experiment file beside an arena file, and a distribution with a plug-in, in a process of known code."""
     monkeypatch.setenv("ZENPARK_CACHE_DIR", str(tmp_path / "cache"))
-    monkeypatch.setattr(kept, "_strangers", lambda: iter(()))
+    monkeypatch.setattr(kept, "uncovered_modules", lambda: iter(()))
     monkeypatch.syspath_prepend(str(tmp_path / "site"))
-    (tmp_path / "site" / "mine").mkdir(parents=True)
-    (tmp_path / "site" / "mine" / "__init__.py").write_text("GAIN = 1\n")
-    (tmp_path / "site" / "mine-1.0.dist-info").mkdir()
-    (tmp_path / "site" / "mine-1.0.dist-info" / "METADATA").write_text("Name: mine\nVersion: 1.0\n")
-    (tmp_path / "site" / "mine-1.0.dist-info" / "entry_points.txt").write_text(POINTS)
-    (tmp_path / "lab").mkdir()
-    (tmp_path / "lab" / "hall.toml").write_text("[arena]\nsize = [4.0, 4.0, 2.5]\n")
-    file = tmp_path / "lab" / "park.toml"
-    (tmp_path / "lab" / "mine.onnx").write_bytes(b"one")
-    file.write_text('title = "A park"\nformation.law = { kind = "policy", file = "mine.onnx" }\n')
-    return file
+    for name, text in FILES.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    return tmp_path / "lab" / "park.toml"
 
 
-def renamed(park):
-    site = park.parents[1] / "site"
-    (site / "mine-1.0.dist-info").rename(site / "mine-1.1.dist-info")
-
-
-def appended(*parts):
-    def change(park):
-        with park.parents[1].joinpath(*parts).open("a") as file:
-            file.write("\n# changed")
-
-    return change
+def append(root, name, text="\n# changed"):
+    with (root / name).open("a") as file:
+        file.write(text)
 
 
 CHANGES = {
-    "experiment file": appended("lab", "park.toml"),
-    "arena file": appended("lab", "hall.toml"),
-    "arena file that hides one of the catalogue": appended("lab", "gate.arena.toml"),
-    "file of a law": lambda park: (park.parent / "mine.onnx").write_bytes(b"two"),
-    "code of a plug-in": appended("site", "mine", "__init__.py"),
-    "new body in a plug-in": appended("site", "mine", "body.py"),
-    "version of a plug-in": renamed,
-    "another plug-in": appended("site", "mine-1.0.dist-info", "entry_points.txt"),
-    "installed library": lambda park: (park.parents[1] / "site" / "numpy-9.9.dist-info").mkdir(),
-    "library without a distribution": lambda park: (park.parents[1] / "site" / "cflib").mkdir(),
+    "experiment file": lambda root: append(root, "lab/park.toml"),
+    "arena file": lambda root: append(root, "lab/hall.toml"),
+    "arena file that hides one of the catalogue": lambda root: append(root, "lab/gate.arena.toml"),
+    "file of a law": lambda root: append(root, "lab/mine.onnx"),
+    "code of a plug-in": lambda root: append(root, "site/mine/__init__.py"),
+    "new body in a plug-in": lambda root: append(root, "site/mine/body.py"),
+    "version of a plug-in": lambda root: (root / "site/mine-1.0.dist-info").rename(root / "site/mine-1.1.dist-info"),
+    "another plug-in": lambda root: append(root, "site/mine-1.0.dist-info/entry_points.txt", "other = mine:Other\n"),
+    "installed library": lambda root: (root / "site/numpy-9.9.dist-info").mkdir(),
+    "library without a distribution": lambda root: (root / "site/cflib").mkdir(),
 }
 
 
-def test_verdict_is_read_again(park):
+def test_verdict_is_read_again(park, tmp_path):
     assert KeptVerdict(str(park)).read() is None
-    KeptVerdict(str(park)).keep(SAID)
-    assert KeptVerdict(str(park)).read() == SAID
+    KeptVerdict(str(park)).keep(GOOD)
+    assert KeptVerdict(str(park)).read() == GOOD
+    (tmp_path / "site" / "runs").mkdir()
+    assert KeptVerdict(str(park)).read() == GOOD
 
 
 @pytest.mark.parametrize("what", CHANGES)
-def test_nothing_that_changes_keeps_its_verdict(park, what):
-    KeptVerdict(str(park)).keep(SAID)
-    if what == "another plug-in":
-        info = park.parents[1] / "site" / "mine-1.0.dist-info" / "entry_points.txt"
-        info.write_text(POINTS + "other = mine:Other\n")
-    else:
-        CHANGES[what](park)
+def test_nothing_that_changes_keeps_its_verdict(park, tmp_path, what):
+    KeptVerdict(str(park)).keep(GOOD)
+    CHANGES[what](tmp_path)
     assert KeptVerdict(str(park)).read() is None
 
 
-def test_folder_of_runs_changes_nothing(park):
-    KeptVerdict(str(park)).keep(SAID)
-    (park.parents[1] / "site" / "runs").mkdir()
-    assert KeptVerdict(str(park)).read() == SAID
-
-
 def test_options_and_code_have_verdicts_of_their_own(park, monkeypatch):
-    KeptVerdict(str(park), ["seed=2"], ["event"]).keep(SAID)
+    KeptVerdict(str(park), ["seed=2"], ["event"]).keep(GOOD)
     for options in ((), (["seed=3"], ["event"]), (["seed=2"], []), (["seed=2", "event"],), (["event"], ["seed=2"])):
         assert KeptVerdict(str(park), *options).read() is None
-    assert KeptVerdict(str(park), ["seed=2"], ["event"]).read() == SAID
+    assert KeptVerdict(str(park), ["seed=2"], ["event"]).read() == GOOD
     monkeypatch.setattr(kept.version, "digest", SimpleNamespace(__wrapped__=lambda: "another"))
     assert KeptVerdict(str(park), ["seed=2"], ["event"]).read() is None
 
 
-def test_change_during_a_check_keeps_nothing(park):
-    begun = KeptVerdict(str(park))
-    appended("site", "mine", "__init__.py")(park)
-    begun.keep(SAID)
-    again = KeptVerdict(str(park))
-    appended("lab", "park.toml")(park)
-    again.keep(SAID)
-    assert again.read() is None
-    assert not (park.parents[1] / "cache").exists()
+def test_change_during_a_check_keeps_nothing(park, tmp_path):
+    for changed in ("site/mine/__init__.py", "lab/park.toml"):
+        begun = KeptVerdict(str(park))
+        append(tmp_path, changed)
+        begun.keep(GOOD)
+    assert begun.read() is None
+    assert not (tmp_path / "cache").exists()
 
 
-def test_code_that_nothing_stands_for_keeps_nothing(tmp_path, monkeypatch):
+def test_uncovered_code_keeps_nothing(tmp_path, monkeypatch):
     monkeypatch.setenv("ZENPARK_CACHE_DIR", str(tmp_path))
-    KeptVerdict("triangle").keep(SAID)  # these tests are such code
+    KeptVerdict("triangle").keep(GOOD)  # these tests are such code
     assert not list(tmp_path.iterdir())
 
 
@@ -124,36 +104,36 @@ def test_code_that_nothing_stands_for_keeps_nothing(tmp_path, monkeypatch):
         lambda file: file.parent.chmod(0o777),
     ],
 )
-def test_spoilt_cache_is_none(park, spoil):
-    KeptVerdict(str(park)).keep(SAID)
-    (file,) = (park.parents[1] / "cache" / "check").iterdir()
+def test_spoilt_cache_is_none(park, tmp_path, spoil):
+    KeptVerdict(str(park)).keep(GOOD)
+    (file,) = (tmp_path / "cache" / "check").iterdir()
     spoil(file)
     assert KeptVerdict(str(park)).read() is None
-    KeptVerdict(str(park)).keep(SAID)
+    KeptVerdict(str(park)).keep(GOOD)
 
 
-def test_cache_that_cannot_be_written_is_none(park, monkeypatch):
-    (park.parents[1] / "cache").write_text("a file")
-    KeptVerdict(str(park)).keep(SAID)
+def test_cache_that_cannot_be_written_is_none(park, tmp_path, monkeypatch):
+    (tmp_path / "cache").write_text("a file")
+    KeptVerdict(str(park)).keep(GOOD)
     assert KeptVerdict(str(park)).read() is None
     monkeypatch.delenv("ZENPARK_CACHE_DIR")
     monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
     monkeypatch.setattr(Path, "home", lambda: (_ for _ in ()).throw(RuntimeError))
-    KeptVerdict(str(park)).keep(SAID)
+    KeptVerdict(str(park)).keep(GOOD)
     assert KeptVerdict(str(park)).read() is None
 
 
 @pytest.mark.parametrize("name", ["nowhere.toml", "a\0b", ".", "x" * 5000])
 def test_what_is_no_file_has_no_verdict(park, name):
-    KeptVerdict(name).keep(SAID)
+    KeptVerdict(name).keep(GOOD)
     assert KeptVerdict(name).read() is None
 
 
-def test_old_verdicts_go(park):
+def test_old_verdicts_go(park, tmp_path):
     for seed in range(13):
-        KeptVerdict(str(park), [f"seed={seed}"]).keep(SAID, most=10)
-    assert len(list((park.parents[1] / "cache" / "check").iterdir())) == 10
-    assert KeptVerdict(str(park), ["seed=8"]).read() == SAID
+        KeptVerdict(str(park), [f"seed={seed}"]).keep(GOOD, most=10)
+    assert len(list((tmp_path / "cache" / "check").iterdir())) == 10
+    assert KeptVerdict(str(park), ["seed=8"]).read() == GOOD
 
 
 @pytest.mark.slow
@@ -167,7 +147,7 @@ def test_findings_and_figures_come_back_as_they_were(park):
 @pytest.mark.slow
 def test_second_check_says_the_same_without_numpy(tmp_path):
     file = tmp_path / "mine.toml"
-    subprocess.run([sys.executable, "-m", "tools.guard", "new", "triangle", file], check=True, env=os.environ)
+    zenpark("new", "triangle", file)
     words = ["check", str(file), "--set", "duration_s=2.0"]
     first, modules = loaded(*words, ZENPARK_CACHE_DIR=str(tmp_path))
     assert "numpy" in modules

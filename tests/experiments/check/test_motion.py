@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -11,17 +10,19 @@ from agents.kinds.crazyflie import CRAZYFLIE
 from agents.plugins.laws import Distance
 from experiments.catalogue import index
 from experiments.check import ideal_run
-from experiments.check.check import check, figures
-from experiments.check.ideal_run import REPETITIONS, fly, isolated, linear_step, predict, repetitions
+from experiments.check.check import figures
+from experiments.check.ideal_run import REPETITIONS, isolated, linear_step, predict, repetitions
+from experiments.check.ideal_run import fly as simulated
 from experiments.check.theory import unused_gains
 from experiments.definition.experiment import Arena, Experiment, Formation, LegTable, RobotTable
 from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.sweep.runs import run_metrics
 from experiments.virtual_time import conductor, simulation, stretch
-from experiments.virtual_time.log import RunRecorder
-from tests.experiments.checked import GROUND, assert_found, bad, ground, of
-from tools.commands import check as commands
+from tests.commands import invoke
+from tests.experiments.checked import GROUND, assert_found, bad, findings, ground
+from tests.runs import fly
+from tests.small import changed, reference, small
 from twins.models.quadrotor import Quadrotor
 
 pytestmark = pytest.mark.slow  # each check flies the experiment on the virtual clock
@@ -29,147 +30,137 @@ pytestmark = pytest.mark.slow  # each check flies the experiment on the virtual 
 PARK, TRIANGLE = "robotic-park", "triangle"
 
 
-def robots_on_wheels(gain: float) -> Experiment:
+def robots_on_wheels(duration_s: float = 120.0, **formation: float | str) -> Experiment:
     """Three Kheperas that are to stand 1 m apart, and nearly do from the start."""
     places = {"KH01": [0.0, 0.0], "KH02": [1.2, 0.0], "KH03": [0.6, 1.04]}
-    return Experiment(
-        title="Three",
-        robots={name: RobotTable(kind="khepera4", start=start) for name, start in places.items()},
-        arena=Arena(size=(6.0, 6.0, 2.0)),
-        formation=Formation(links={"KH01 - KH02": 1.0, "KH02 - KH03": 1.0, "KH01 - KH03": 1.0}, gain=gain, clamp=0.1),
-        duration_s=120.0,
-    )
+    links = {"KH01 - KH02": 1.0, "KH02 - KH03": 1.0, "KH01 - KH03": 1.0}
+    return small(
+        {name: RobotTable(kind="khepera4", start=start) for name, start in places.items()},
+        arena=Arena(size=(6.0, 6.0, 2.0)), duration_s=duration_s,
+        formation=Formation(**{"links": links, "gain": 1.0, "clamp": 0.1, **formation}),
+    )  # fmt: skip
 
 
 @pytest.mark.nightly
 def test_wheels_stop_before_weak_formation_is_acquired():
-    weak = robots_on_wheels(0.05)
-    claims = {each.code: each for each in check(of(weak))}
+    weak = robots_on_wheels(gain=0.05)
+    claims = findings(weak)
     assert "acquired" not in claims
     found = claims["wheels-stop"]
     assert found.severity == "warning"
     assert "robots on wheels stop 5 mm before their goals: links may stay e = 5 mm/(μ d²) off" in found.message
     numbers = figures(Plan(weak))
     assert numbers.acquired_s is None
-    log = simulation.simulate(Plan(msgspec.structs.replace(weak, seed=7)), 7, lean=True)
-    run = run_metrics(RunRecorder(log, Plan(weak), "").trace())
-    assert run.values["acquired_s"] is None
-    last = log.true_position[log.time <= weak.duration_s][-1]
+    flown = fly(weak, 7)
+    assert run_metrics(flown.trace).values["acquired_s"] is None
+    last = flown.log.true_position[flown.log.time <= weak.duration_s][-1]
     off = max(abs(float(np.hypot(*(last[i] - last[j])[:2])) - 1.0) for i, j in ((0, 1), (1, 2), (0, 2)))
     assert numbers.end_error_mm == pytest.approx(1e3 * off, rel=0.1)
     assert 0.05 < off < 0.1
     gain = float(found.remedy.split()[3])
     assert 0.05 < gain < 0.15
-    strong = robots_on_wheels(gain)
-    assert "acquired" in {each.code for each in check(of(strong))}
+    assert "acquired" in findings(robots_on_wheels(gain=gain))
 
 
 def test_weak_link_remedy_names_the_laws_own_key(monkeypatch):
     monkeypatch.setattr(Distance, "PULLS_BY", "stiffness")
-    weak = robots_on_wheels(9.0)
-    weak = msgspec.structs.replace(
-        weak, formation=msgspec.structs.replace(weak.formation, stiffness=0.05), duration_s=40.0
-    )
-    found = {each.code: each for each in check(of(weak))}
+    found = findings(robots_on_wheels(40.0, gain=9.0, stiffness=0.05))
     assert "links may stay e = 5 mm/k off" in found["wheels-stop"].message
     assert found["wheels-stop"].remedy.startswith("raise stiffness to 0.0")
     assert "(h·k·λ)" in found["stable"].message
 
 
+def crowd(count: int, **parts: object) -> Experiment:
+    """The reference experiment with so many Kheperas, and without a formation."""
+    park = reference()
+    formation = changed(park.formation, links={}, leader=None)
+    robots = {f"R{k}": park.robots["KH01"] for k in range(count)}
+    return changed(park, robots=robots, formation=formation, timeline=[], duration_s=600.0, **parts)
+
+
 def test_prediction_is_a_flight_without_noise(monkeypatch):
-    park = document.read(PARK).cases()["event"].experiment
-    assert isolated(Plan(park)).experiment.duration_s == 45.0
-    flown = predict(Plan(park))
-    again = predict(Plan(msgspec.structs.replace(park, seed=8)))
+    assert isolated(Plan(reference())).experiment.duration_s == 45.0
+    flown = predict(Plan(reference()))
+    again = predict(Plan(changed(reference(), seed=8)))
     np.testing.assert_array_equal(flown.position, again.position)  # no seed matters
     np.testing.assert_allclose(flown.time, np.arange(451) / 10.0, atol=1e-9)
     assert not flown.incidents
     assert not flown.stuck
-    many = msgspec.structs.replace(park, robots={f"R{k}": park.robots["KH01"] for k in range(1000)}, duration_s=600.0)
     monkeypatch.setattr(ideal_run, "SPEED_UP", 1.0)
-    assert isolated(Plan(many)).experiment.duration_s == 2.0  # of many robots the beginning
+    assert isolated(Plan(crowd(1000))).experiment.duration_s == 2.0  # of many robots the beginning
 
 
 @pytest.mark.parametrize(("compiled", "flown_s"), [(False, 11.0), (True, 165.0)])
 def test_more_is_flown_where_it_is_compiled(monkeypatch, compiled, flown_s):
-    """Of two hundred robots."""
     monkeypatch.setattr(stretch, "possible", lambda _: compiled)
-    park = document.read(PARK).cases()["event"].experiment
-    formation = msgspec.structs.replace(park.formation, links={}, leader=None)
-    robots = {f"R{k}": park.robots["KH01"] for k in range(200)}
-    many = msgspec.structs.replace(park, robots=robots, formation=formation, timeline=[], duration_s=600.0)
-    assert isolated(Plan(many)).experiment.duration_s == flown_s
-    assert isolated(Plan(many).changed(duration_s=15.0)).experiment.duration_s == 11.0  # to compile takes longer
+    many = Plan(crowd(200))
+    assert isolated(many).experiment.duration_s == flown_s
+    assert isolated(many.changed(duration_s=15.0)).experiment.duration_s == 11.0  # to compile takes longer
 
 
-def flat_strip(gain: float, jitter: float = 0.01, duration_s: float = 30.0) -> Experiment:
+def flat_strip(jitter: float = 0.01, duration_s: float = 30.0) -> Experiment:
     """Two flat triangles of drones that start in their shape, shaken by hover jitter."""
     places = {f"CF{k}": (0.6 * k - 0.9, 0.2 * (k % 2)) for k in range(4)}
     pairs = [("CF0", "CF1"), ("CF0", "CF2"), ("CF1", "CF2"), ("CF1", "CF3"), ("CF2", "CF3")]
     links = {f"{i} - {j}": float(np.hypot(*np.subtract(places[i], places[j]))) for i, j in pairs}
-    return Experiment(
-        title="Strip",
-        robots={name: RobotTable(kind="crazyflie", start=list(place), hover=0.6) for name, place in places.items()},
-        arena=Arena(size=(8.0, 8.0, 2.0)),
-        formation=Formation(links=links, gain=gain),
-        disturbance={"all": Disturbance(hover_jitter=Jitter(jitter))},
-        duration_s=duration_s,
-    )
+    robots = {name: RobotTable(kind="crazyflie", start=list(place), hover=0.6) for name, place in places.items()}
+    return small(
+        robots, arena=Arena(size=(8.0, 8.0, 2.0)), formation=Formation(links=links, gain=0.3),
+        disturbance={"all": Disturbance(hover_jitter=Jitter(jitter))}, duration_s=duration_s,
+    )  # fmt: skip
 
 
 def late(experiment: Experiment, seeds: list[int]) -> int:
     """Number of runs with these seeds that acquire after 15 s, in the mean of the robots, or not at all."""
-    logs = (simulation.simulate(Plan(experiment), seed, lean=True) for seed in seeds)
-    runs = [run_metrics(RunRecorder(log, Plan(experiment), "").trace()) for log in logs]
-    return sum(run.values["acquired_s"] is None or run.values["acquired_s"] > 15.0 for run in runs)
+    times = [run_metrics(fly(experiment, seed).trace).values["acquired_s"] for seed in seeds]
+    return sum(acquired is None or acquired > 15.0 for acquired in times)
 
 
 def test_soft_formation_is_found_under_hover_jitter():
-    soft = flat_strip(0.3, duration_s=60.0)
-    claims = {each.code: each for each in check(of(soft))}
+    soft = flat_strip(duration_s=60.0)
+    claims = findings(soft)
     assert "after 0.0 s" in claims["acquired"].message  # without noise
     found = claims["soft"]
     assert (found.severity, found.where.startswith("made.json")) == ("warning", True)
     assert "acquired after 0.0 s without noise" in found.message
     assert "outside the tolerance of 50 mm later, in 5 of 5 flights (seeds 1 to 5)" in found.message
     assert late(soft, [101, 102]) == 2
-    calm = flat_strip(0.3, jitter=0.002)
-    assert "soft" not in {each.code for each in check(of(calm))}
+    calm = flat_strip(jitter=0.002)
+    assert "soft" not in findings(calm)
     assert late(calm, [101, 102]) == 0
 
 
 @pytest.mark.parametrize(
     "made",
     [
-        pytest.param(flat_strip(0.3, jitter=0.0), marks=pytest.mark.nightly),
-        flat_strip(0.3, jitter=0.0005),
-        robots_on_wheels(1.0),
+        pytest.param(flat_strip(jitter=0.0), marks=pytest.mark.nightly),
+        flat_strip(jitter=0.0005),
+        robots_on_wheels(),
     ],
 )
 def test_undisturbed_formation_is_not_called_soft(made):
-    codes = {each.code for each in check(of(made))}
-    assert "acquired" in codes
-    assert "soft" not in codes
+    claims = findings(made)
+    assert "acquired" in claims
+    assert "soft" not in claims
 
 
 def test_formations_that_settle_early_skip_flights_with_noise(monkeypatch):
     monkeypatch.setattr("experiments.check.noise.fly", lambda *_: pytest.fail("flown again"))
-    codes = {each.code for each in check(of(document.read("triangle").cases()["event"].experiment))}
-    assert "acquired" in codes
+    assert "acquired" in findings(document.read(TRIANGLE).cases()["event"].experiment)
 
 
 def test_flights_with_noise_are_those_of_their_seeds():
-    bare = isolated(Plan(flat_strip(0.3)).changed(duration_s=5.0, seed=7))
+    bare = isolated(Plan(flat_strip()).changed(duration_s=5.0, seed=7))
     assert repetitions(bare) == REPETITIONS
-    first, second, again = fly(bare, 7), fly(bare, 8), fly(bare, 8)
-    np.testing.assert_array_equal(second.position, again.position)
-    assert np.abs(first.position - second.position).max() > 1e-3
-    assert repetitions(bare.changed(robots={f"R{k}": bare.experiment.robots["CF0"] for k in range(1000)})) == 1
+    first, second, again = (simulated(bare, seed).position for seed in (7, 8, 8))
+    np.testing.assert_array_equal(second, again)
+    assert np.abs(first - second).max() > 1e-3
+    assert repetitions(Plan(crowd(1000))) == 1
 
 
 def test_flight_with_noise_counts_messages_alone(monkeypatch):
-    noisy = msgspec.structs.replace(document.read(PARK).cases()["event"].experiment, duration_s=5.0)
-    still = msgspec.structs.replace(noisy, disturbance={})
+    noisy = changed(reference(), duration_s=5.0)
+    still = changed(noisy, disturbance={})
     ideal, alone = predict(Plan(noisy)), predict(Plan(still))
     np.testing.assert_array_equal(ideal.position, alone.position)
     assert ideal.transmissions == alone.transmissions
@@ -188,21 +179,25 @@ def test_flight_with_noise_counts_messages_alone(monkeypatch):
     assert predict(Plan(noisy)).messages_hz == ideal.transmissions / 5.0
 
 
-def test_robots_that_never_begin_are_reported_with_reason(monkeypatch):
+def test_robots_that_never_begin_are_reported_with_reason(monkeypatch, tmp_path):
     def stuck(*_, **__):
         raise conductor.Stuck("not ready after 60 s: KH01 (its law wants something that is not finite)")
 
     monkeypatch.setattr(simulation, "simulate", stuck)
-    found = {each.code: each for each in check(of(robots_on_wheels(1.0)))}
+    wheels = robots_on_wheels()
+    found = findings(wheels)
     assert found["not-begun"].severity == "error"
     assert "not ready after 60 s: KH01" in found["not-begun"].message
     assert not {"acquired", "not-acquired", "wheels-stop"} & found.keys()
-    numbers = figures(of(robots_on_wheels(1.0)).plan)
+    numbers = figures(Plan(wheels))
     assert numbers.acquired_s is None
     assert numbers.end_error_mm is None
-    shown = commands._formatted(numbers)
-    labels = ("formation acquired after", "worst link at the end", "all end inside the arena")
-    assert {shown[label] for label in (*labels, "poses sent by all, estimated")} == {"-"}
+    (tmp_path / "wheels.json").write_bytes(document.write_json(Plan(wheels)))
+    lines = invoke("check", tmp_path / "wheels.json", code=1).stdout.splitlines()
+    labels = ("formation acquired after", "worst link at the end", "all end inside the arena", "poses sent by all")
+    for label in labels:
+        (line,) = [line for line in lines if label in line]
+        assert line.split()[-1] == "-"
 
 
 @pytest.mark.parametrize(
@@ -215,9 +210,8 @@ def test_robots_that_never_begin_are_reported_with_reason(monkeypatch):
     ],
 )
 def test_gain_of_another_law_is_named(law, changes, message):
-    plan = robots_on_wheels(1.0)
-    made = msgspec.structs.replace(plan, formation=msgspec.structs.replace(plan.formation, law=law, **changes))
-    found = [(each.message, each.where) for each in unused_gains([Plan(made)])]
+    plan = Plan(robots_on_wheels(law=law, **changes))
+    found = [(each.message, each.where) for each in unused_gains([plan])]
     assert found == ([(message, ("formation", next(iter(changes))))] if message else [])
 
 
@@ -226,62 +220,49 @@ def test_catalogue_sets_no_unused_gain(name):
     assert not [*unused_gains([*document.read(name).cases().values()])]
 
 
-def test_a_trigger_that_never_fires_is_named():
+def test_trigger_that_never_fires_is_named():
     found = bad(TRIANGLE, "trigger={ kind = 'send-on-delta', threshold = 15 }", "duration_s=10")
     assert "lags" not in found
-    assert "no robot transmits after its first pose: the trigger 'send-on-delta' fires at nothing" in found["silent"][1]
-    assert "metres" in found["silent"][2]
+    message = "no robot transmits after its first pose: the trigger 'send-on-delta' fires at nothing"
+    assert message in found["silent"].message
+    assert "metres" in found["silent"].remedy
 
 
 @pytest.mark.parametrize(
     ("name", "change", "expected", "message", "remedy"),
     [
-        (
-            PARK,
-            "timeline.0.plan.move_by=[2.0, 0.0]; duration_s=33",
-            ("error", "leaves-arena"),
-            "TB01 would leave the arena at 3",
-            "shorten",
-        ),
-        (
-            PARK,
-            "timeline.0.at_s=5; duration_s=18",
-            ("warning", "acquired-late"),
-            "when the plans begin at 5 s",
-            "begin later",
-        ),
+        (PARK, "timeline.0.plan.move_by=[2.0, 0.0]; duration_s=33", ("error", "leaves-arena"),
+         "TB01 would leave the arena at 3", "shorten"),
+        (PARK, "timeline.0.at_s=5; duration_s=18", ("warning", "acquired-late"), "when the plans begin at 5 s",
+         "begin later"),
         (PARK, "duration_s=24", ("warning", "lags"), "lags behind its leader", "slowly"),
         (TRIANGLE, "duration_s=2", ("warning", "not-acquired"), "mm off after 2 s", "duration_s"),
     ],
-)
+)  # fmt: skip
 def test_variants_that_do_not_work_in_flight(name, change, expected, message, remedy):
     assert_found(name, change, expected, message, remedy)
 
 
 def test_late_oscillation_blames_loop_not_starts():
     found = bad(TRIANGLE, "formation.gain=10", "channel.delay_s=0.6")
-    assert "swings between" in found["keeps-oscillating"][1]
-    assert "lower the gain" in found["keeps-oscillating"][2]
+    assert "swings between" in found["keeps-oscillating"].message
+    assert "lower the gain" in found["keeps-oscillating"].remedy
     assert not {"local-minimum", "not-acquired"} & found.keys()
+
+
+def leg(robot: str, **plan: object) -> LegTable:
+    return LegTable(at_s=1.0, robot=robot, plan={"kind": "line", **plan})
 
 
 def test_paths_that_cross():
     ways = {"A": [0.6, 0.6], "B": [-0.6, 0.6]}  # from (0, 0) and (1, 0): they meet in the middle
-    legs = [
-        LegTable(at_s=1.0, robot=name, plan={"kind": "line", "move_by": way, "speed": 0.1})
-        for name, way in ways.items()
-    ]
-    assert ground({}, timeline=legs)["too-close"].startswith("A and B come within")
+    legs = [leg(robot, move_by=way, speed=0.1) for robot, way in ways.items()]
+    assert ground({}, timeline=legs)["too-close"].message.startswith("A and B come within")
 
 
 def test_landing_beside_a_robot_that_is_heard():
-    robots = {
-        "G": RobotTable(kind="khepera4", start=[0.0, 0.0]),
-        "F": RobotTable(kind="crazyflie", start=[0.5, 0.0], hover=0.8),
-    }
-    formation = Formation(links={"G > F": 0.801})
-    made = Experiment(title="made", robots=robots, duration_s=30.0, tolerance=0.1, formation=formation)
-    found = {each.code: each for each in check(of(made))}
+    robots = {"G": "khepera4", "F": RobotTable(kind="crazyflie", start=[0.5, 0.0], hover=0.8)}
+    found = findings(small(robots, {"G > F": 0.801}, duration_s=30.0, tolerance=0.1))
     assert found["lands-beside"].message == "F ends above G, and goes aside before it lands"
     assert found["lands-beside"].severity == "note"
     assert "lands-on" not in found
@@ -294,25 +275,19 @@ def test_landing_on_a_robot():
         "F": RobotTable(kind="crazyflie", start=[0.0, 0.0], hover=0.8),
     }
     found = ground({"G - H": 0.7}, robots=robots, duration_s=30.0)
-    assert found["lands-on"] == "F ends above G, from which it receives no poses, and would land on it"
+    assert found["lands-on"].message == "F ends above G, from which it receives no poses, and would land on it"
 
 
-def test_a_robot_at_the_wall_is_held_back():
-    plan = {"kind": "line", "move_by": [-2.97, 0.0], "speed": 0.1}
-    found = ground({}, timeline=[LegTable(at_s=1.0, robot="A", plan=plan)])
-    assert found["near-wall"].startswith("A comes within the margin of 0.05 m of a wall at 32.")
+def test_robot_at_the_wall_is_held_back():
+    found = ground({}, timeline=[leg("A", move_by=[-2.97, 0.0], speed=0.1)])["near-wall"]
+    assert found.message.startswith("A comes within the margin of 0.05 m of a wall at 32.")
 
 
 @pytest.mark.parametrize(("hover", "top", "warned"), [(1.0, 1.05, True), (0.94, 1.05, False), (2.4, 2.5, True)])
 def test_overshoot_above_the_arena(hover, top, warned):
     """A Crazyflie overshoots its take-off by up to 11 %."""
-    made = Experiment(
-        title="Low",
-        robots={"F": RobotTable(kind="crazyflie", start=[0.0, 0.0], hover=hover)},
-        arena=Arena(size=(4.0, 4.0, top)),
-        duration_s=5.0,
-    )
-    found = {each.code: each for each in check(of(made))}
+    robot = RobotTable(kind="crazyflie", start=[0.0, 0.0], hover=hover)
+    found = findings(small({"F": robot}, arena=Arena(size=(4.0, 4.0, top)), duration_s=5.0))
     assert ("overshoots-arena" in found) == warned
     if warned:
         assert found["overshoots-arena"].severity == "warning"
@@ -320,17 +295,16 @@ def test_overshoot_above_the_arena(hover, top, warned):
         assert f"hover at {int(100 * top / 1.11) / 100:g} m at most" in found["overshoots-arena"].remedy
 
 
-def test_a_plan_for_ever_is_not_cut_off():
-    plan = {"kind": "circle", "radius": 0.5, "period_s": 40.0}
-    assert ground({}, timeline=[LegTable(at_s=1.0, robot="D", plan=plan)]) == {}
+def test_plan_for_ever_is_not_cut_off():
+    assert ground({}, timeline=[leg("D", kind="circle", radius=0.5, period_s=40.0)]) == {}
 
 
 @pytest.mark.nightly
-def test_a_long_run_is_predicted_in_part(monkeypatch):
+def test_long_run_is_predicted_in_part(monkeypatch):
     monkeypatch.setattr(stretch, "possible", lambda _: False)  # what is compiled flies more
-    made = Experiment(title="made", robots=GROUND, duration_s=86400.0)
+    made = small(GROUND, duration_s=86400.0)
     assert figures(Plan(made)).predicted_s == 550.0
-    assert "predicted-in-part" in {each.code for each in check(of(made))}
+    assert "predicted-in-part" in findings(made)
 
 
 def test_formation_lost_again_counts_acquired_and_names_stiffness(tmp_path):
@@ -340,61 +314,52 @@ def test_formation_lost_again_counts_acquired_and_names_stiffness(tmp_path):
         '[formation]\nlaw = "displacement"\nstiffness = 0.15\n[formation.links]\n"L > F" = { offset = [-0.5, 0.0] }\n'
         '[[timeline]]\nat_s = 8.0\nrobot = "L"\nplan = { kind = "line", move_by = [0.4, 0.0], speed = 0.08 }\n'
     )
-    _, message, remedy, _ = bad(str(tmp_path / "lost.toml"))["not-acquired"]
-    assert message.startswith("the formation, acquired after ")
-    assert " s, is not acquired again after 8 s: L - F is " in message
-    assert remedy.endswith("or raise the stiffness")
-
-
-def anchored(**changed) -> Experiment:
-    made = Experiment(
-        title="One robot, one anchor",
-        robots={"CF01": RobotTable(kind="crazyflie", start=[0.0, 0.3], hover=0.7)},
-        formation=Formation(anchors={"CF01": 1.0}),
-        duration_s=20.0,
-    )
-    return msgspec.structs.replace(made, **changed)
+    found = bad(str(tmp_path / "lost.toml"))["not-acquired"]
+    assert found.message.startswith("the formation, acquired after ")
+    assert " s, is not acquired again after 8 s: L - F is " in found.message
+    assert found.remedy.endswith("or raise the stiffness")
 
 
 def test_anchors_without_links_are_checked():
-    claims = {each.code: each.message for each in check(of(anchored()))}
-    assert "CF01 is 8 mm off at the end" in claims["anchored"]
-    assert "the anchors can be met" in claims["realisable"]
+    def anchored(**gain: float) -> Experiment:
+        robot = RobotTable(kind="crazyflie", start=[0.0, 0.3], hover=0.7)
+        return small({"CF01": robot}, formation=Formation(anchors={"CF01": 1.0}, **gain), duration_s=20.0)
+
+    claims = findings(anchored())
+    assert "CF01 is 8 mm off at the end" in claims["anchored"].message
+    assert "the anchors can be met" in claims["realisable"].message
     assert figures(Plan(anchored())).end_error_mm is None
-    late = {each.code: each for each in check(of(anchored(formation=Formation(anchors={"CF01": 1.0}, gain=1e-4))))}
-    assert late["anchor-missed"].severity == "warning"
-    assert "anchored" not in late
+    weak = findings(anchored(gain=1e-4))
+    assert weak["anchor-missed"].severity == "warning"
+    assert "anchored" not in weak
 
 
-def test_noise_that_frees_robots_is_good_news():
+def test_noise_that_frees_robots_is_a_note():
     """Three drones that start on a line: without noise they stay on it."""
     given = document.read(TRIANGLE, ["robots.CF01.start=[0.0,-0.5]"])
-    claims = {each.code: each for each in check(given, ["periodic"])}
+    claims = findings(given, ["periodic"])
     assert claims["acquired"].severity == "note"
     assert "in 5 of 5 flights (seeds 1 to 5); without noise it is not" in claims["acquired"].message
     assert not {"local-minimum", "not-acquired"} & claims.keys()
     still = document.read(TRIANGLE, ["robots.CF01.start=[0.0,-0.5]", "disturbance={}"])
-    assert "local-minimum" in {each.code for each in check(still, ["periodic"])}
-
-
-def test_what_noise_does_not_free_is_told():
-    found = {each.code: each.message for each in check(document.read(TRIANGLE, ["duration_s=2"]), ["periodic"])}
-    assert "nor is it with the noise of [disturbance], in any of 5 flights" in found["not-acquired"]
+    assert "local-minimum" in findings(still, ["periodic"])
+    short = findings(document.read(TRIANGLE, ["duration_s=2"]), ["periodic"])
+    assert "nor is it with the noise of [disturbance], in any of 5 flights" in short["not-acquired"].message
 
 
 def test_drones_above_one_another_do_not_touch():
-    def crossing(height: float) -> dict[str, str]:
+    def crossing(height: float) -> str:
         robots = {
             "CF01": RobotTable(kind="crazyflie", start=[-1.0, 0.0], hover=0.5),
             "TL01": RobotTable(kind="tello", start=[0.0, 0.0], hover=height),
         }
-        way = [LegTable(at_s=1.0, robot="CF01", plan={"kind": "line", "move_by": [2.0, 0.0], "speed": 0.3})]
-        made = Experiment(title="Crossing", robots=robots, timeline=way, duration_s=15.0)
-        return {each.code: each.message for each in check(of(made))}
+        way = [leg("CF01", move_by=[2.0, 0.0], speed=0.3)]
+        found = findings(small(robots, timeline=way, duration_s=15.0)).get("too-close")
+        return found.message if found else ""
 
-    assert "they touch at 0.17 m" in crossing(0.52)["too-close"]
-    assert "one is above the other then, with 0.07 m between them" in crossing(0.6)["too-close"]
-    assert "too-close" not in crossing(0.65)
+    assert "they touch at 0.17 m" in crossing(0.52)
+    assert "one is above the other then, with 0.07 m between them" in crossing(0.6)
+    assert crossing(0.65) == ""
 
 
 @pytest.mark.parametrize("axis", [0, 2])

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from agents.kinds.crazyflie import CRAZYFLIE
 from agents.kinds.khepera4 import KHEPERA4
 from agents.kinds.tello import TELLO
-from experiments.check.check import check
 from experiments.check.realisation import (
     Solids,
     algebraic_connectivity,
@@ -23,24 +22,12 @@ from experiments.check.realisation import (
     mirrored_robots,
     unfold_distances,
 )
-from experiments.definition.experiment import Experiment, Formation, RobotTable
+from experiments.definition.experiment import Formation, RobotTable
 from experiments.definition.graph import Links, links
 from experiments.file import document
-from tests.experiments.checked import of
+from tests.experiments.checked import PUBLISHED, findings
 from tests.experiments.traces import link_errors
-
-# where the reference formation may stand: TB01, KH01..03, CF01..03
-PUBLISHED = np.array(
-    [
-        (0, 0, 0),
-        (0.6, 0, 0),
-        (0.6, -0.6, 0),
-        (0, -0.6, 0),
-        (0.3, 0.098, 0.8),
-        (0.3, -0.502, 0.8),
-        (-0.2196, -0.2021, 0.8),
-    ]
-)
+from tests.small import small
 
 
 @pytest.fixture(scope="module")
@@ -48,21 +35,13 @@ def reference() -> Links:
     return document.read("robotic-park").plan.links
 
 
-def test_the_published_shape_meets_the_published_distances(reference):
+def test_published_shape_meets_the_published_distances(reference):
     assert link_errors(reference, PUBLISHED).max() < 1e-4  # four decimals were printed
     found = find_shapes(reference, [PUBLISHED], np.arange(7) > 0)
     assert len(found) == 1
     assert found[0].worst < 1e-9
     assert found[0].position[0].tolist() == [0.0, 0.0, 0.0]
     assert np.abs(found[0].position - PUBLISHED).max() < 1e-4
-
-
-def test_rigid_only_while_heights_are_held(reference):
-    planar, spatial = formation_rigidity(PUBLISHED, reference, np.array([0]))
-    assert (planar.rank, planar.needed) == (11, 2 * 7 - 3)
-    assert (spatial.rank, spatial.needed) == (12, 3 * 7 - 6)
-    assert planar.rigid
-    assert not spatial.rigid
 
 
 def test_two_leaders_stand_in_for_a_bar():
@@ -72,7 +51,7 @@ def test_two_leaders_stand_in_for_a_bar():
     assert formation_rigidity(position, net, np.array([0]))[0].rank == 2
 
 
-def test_the_height_at_which_the_reference_closes(reference):
+def test_height_at_which_the_reference_closes(reference):
     height = np.where(np.arange(7) < 4, 0.0, 0.81)
     found = conflicts(reference, height)
     assert [each.high for each in found] == [(4,), (5,)]
@@ -80,7 +59,7 @@ def test_the_height_at_which_the_reference_closes(reference):
     assert conflicts(reference, np.where(np.arange(7) < 4, 0.0, 0.805)) == []
 
 
-def test_a_height_that_exceeds_the_distance():
+def test_height_that_exceeds_the_distance():
     net = links([(1, 0)], [0.5], [1.0])
     (found,) = conflicts(net, np.array([0.2, 0.9]))
     assert (found.rows, found.high) == ((0, 1), (1,))
@@ -148,7 +127,6 @@ def test_shape_in_one_place_is_an_error():
     """A square of four links and a diagonal of nothing: two corners are to be in one place."""
     robots = {f"K{k}": RobotTable(kind="khepera4", start=[0.5 * k, 0.1 * k]) for k in range(4)}
     sides = {"K0 - K1": 1.0, "K1 - K2": 1.0, "K2 - K3": 1.0, "K0 - K3": 1.0, "K0 - K2": 0.01}
-    made = Experiment(title="Folded", robots=robots, formation=Formation(links=sides, gain=1.0), duration_s=5.0)
-    found = {each.code: each for each in check(of(made))}
+    found = findings(small(robots, formation=Formation(links=sides, gain=1.0), duration_s=5.0))
     assert found["in-one-place"].severity == "error"
     assert "K0 and K2 would stand 0.01 m apart" in found["in-one-place"].message

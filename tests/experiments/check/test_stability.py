@@ -14,20 +14,24 @@ from experiments.check.realisation import find_shapes
 from experiments.check.stability import modes
 from experiments.definition.formation import anchor_offsets, law_offsets
 from experiments.definition.graph import Links, links
-from experiments.file import document
+from experiments.definition.plan import Plan
+from tests.experiments.checked import PUBLISHED
+from tests.small import reference
 
-PUBLISHED = np.array(
-    [
-        (0, 0, 0), (0.6, 0, 0), (0.6, -0.6, 0), (0, -0.6, 0),
-        (0.3, 0.098, 0.8), (0.3, -0.502, 0.8), (-0.2196, -0.2021, 0.8),
-    ]
-)  # fmt: skip
+
+def linked(position, pairs, gain=1.0):
+    """Links of these pairs (row that receives, row that sends), with the distances that they have."""
+    distance = [float(np.linalg.norm(position[i] - position[j])) for i, j in pairs]
+    return links(pairs, distance, gain)
 
 
 def both_ways(made, gain):
-    pairs = [(int(i), int(j)) for i, j in made.pairs for i, j in ((i, j), (j, i))]
-    distance = [float(np.linalg.norm(made.position[i] - made.position[j])) for i, j in pairs]
-    return links(pairs, distance, [gain] * len(pairs))
+    pairs = made.pairs.tolist()
+    return linked(made.position, [*pairs, *(pair[::-1] for pair in pairs)], gain)
+
+
+def rounded(net, digits=4):
+    return Links(net.receiver, net.sender, np.round(net.distance, digits), net.gain)
 
 
 def by_hand(law, net, position, share, anchors=()):
@@ -50,11 +54,11 @@ def by_hand(law, net, position, share, anchors=()):
 
 
 def test_stiffest_and_slowest_mode_of_the_reference():
-    links, gain = document.read("robotic-park").plan.links, 3.0
-    reference = msgspec.structs.replace(links, gain=np.full(len(links), gain))
-    shape = find_shapes(reference, [PUBLISHED], np.arange(7) > 0)[0]
+    net, gain = Plan(reference()).links, 3.0
+    net = msgspec.structs.replace(net, gain=np.full(len(net), gain))
+    shape = find_shapes(net, [PUBLISHED], np.arange(7) > 0)[0]
     hz = 1000.0  # u applied as a velocity: h = 1 / hz
-    found = modes(Distance(), reference, shape.position, np.full(7, 1.0 / hz), hz)
+    found = modes(Distance(), net, shape.position, np.full(7, 1.0 / hz), hz)
     assert found.slowest_s * gain == pytest.approx(108.0, abs=0.5)
     assert 2.0 / (found.gain * hz / gain) == pytest.approx(1.05, abs=0.005)
     assert found.radius < 1.0
@@ -63,11 +67,10 @@ def test_stiffest_and_slowest_mode_of_the_reference():
 def test_rounded_shape_without_leader_has_no_hour_modes():
     made = layouts.hemisphere(8, 0.6, 0.25)
     net = both_ways(made, 1.5)
-    rounded = Links(net.receiver, net.sender, np.round(net.distance, 4), net.gain)
-    shape = find_shapes(rounded, [made.position], np.ones(8, dtype=bool))[0]
+    shape = find_shapes(rounded(net), [made.position], np.ones(8, dtype=bool))[0]
     share = np.full(8, 0.18)
-    found = modes(Distance(), rounded, shape.position, share, 10.0)
-    values = np.sort(by_hand(Distance(), rounded, shape.position, share).real)
+    found = modes(Distance(), rounded(net), shape.position, share, 10.0)
+    values = np.sort(by_hand(Distance(), rounded(net), shape.position, share).real)
     assert np.abs(values[:3]).max() < 1e-5  # two translations and a turn, rounded
     assert found.slowest_s == pytest.approx(-0.1 / np.log(1.0 - values[3]), rel=1e-3)
     assert found.gain == pytest.approx(values[-1])
@@ -81,18 +84,15 @@ LINKED = ((0, 1), (0, 2), (1, 2), (0, 3), (1, 3), (2, 3), (0, 4), (3, 4))  # one
 @pytest.mark.parametrize("digits", [4, 3])
 @pytest.mark.parametrize("led", [False, True])
 def test_rounded_lengths_make_no_slow_turning_mode(digits, led):
-    shapes = [(layouts.hemisphere(n, 0.6, 0.25).position, layouts.hemisphere(n, 0.6, 0.25).pairs) for n in (5, 8, 12)]
-    shapes += [(layouts.grid(3, 3, 0.5).position, layouts.grid(3, 3, 0.5).pairs), (MIXED, LINKED)]
-    for position, linked in shapes:
+    made = [*(layouts.hemisphere(count, 0.6, 0.25) for count in (5, 8, 12)), layouts.grid(3, 3, 0.5)]
+    for position, both in [*((each.position, each.pairs) for each in made), (MIXED, LINKED)]:
         rows = len(position)
-        pairs = [(int(i), int(j)) for i, j in linked for i, j in ((i, j), (j, i)) if not (led and i == 0)]
-        far = [float(np.linalg.norm(position[i] - position[j])) for i, j in pairs]
-        net = links(pairs, far, [1.0] * len(pairs))
+        pairs = [*both, *(pair[::-1] for pair in both)]
+        net = linked(position, [(int(i), int(j)) for i, j in pairs if not (led and i == 0)])
         share, moves = np.full(rows, 0.18), np.arange(rows) >= led
         exact = modes(Distance(), net, position, share, 10.0)
-        rounded = Links(net.receiver, net.sender, np.round(net.distance, digits), net.gain)
-        shape = find_shapes(rounded, [position], moves)[0]
-        found = modes(Distance(), rounded, shape.position, share, 10.0)
+        shape = find_shapes(rounded(net, digits), [position], moves)[0]
+        found = modes(Distance(), rounded(net, digits), shape.position, share, 10.0)
         assert found.slowest_s == pytest.approx(exact.slowest_s, rel=10.0**-digits * 300.0)
 
 
@@ -112,8 +112,7 @@ def test_derivative_by_links_is_that_by_robots(seed, rows, anchored):
     rng = np.random.default_rng(seed)
     position = rng.uniform(-1.0, 1.0, (rows, 3))
     pairs = [(i, j) for i in range(rows) for j in range(rows) if i != j and rng.random() < 0.6] or [(1, 0)]
-    distance = [float(np.linalg.norm(position[i] - position[j])) for i, j in pairs]
-    net = links(pairs, distance, rng.uniform(0.2, 0.6, len(pairs)).tolist())
+    net = linked(position, pairs, rng.uniform(0.2, 0.6, len(pairs)).tolist())
     anchors = []
     if anchored:
         reach = float(np.linalg.norm(position[0]))
