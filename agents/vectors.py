@@ -17,7 +17,6 @@ Pose = tuple[float, float, float, float]  # x, y, z [m] and yaw [rad]
 UNKNOWN: Final[Vector] = (nan, nan, nan)
 ZERO: Final[Vector] = (0.0, 0.0, 0.0)
 NO_SETPOINT: Final[Setpoint] = (nan, nan, nan, nan)
-ENDLESS: Final = inf
 
 # of settings
 Positive = Annotated[float, Meta(gt=0)]

@@ -64,7 +64,7 @@ def type_of(kind: Any) -> Any:
 
 
 @register_model(LayoutType)
-class _ThingModel(models.PrimitiveModel):  # type: ignore[misc]
+class _LayoutModel(models.PrimitiveModel):  # type: ignore[misc]
     def __init__(self, manager: Any, kind: Any) -> None:
         super().__init__(manager, kind, NUMBER)
 
