@@ -15,10 +15,6 @@ from unittest import mock
 import zenoh
 from zenoh.handlers import Callback
 
-from agents.network import messages, pubsub
-
-Orders = pubsub.Orders  # the real one: `Net.worn` replaces it
-
 
 class Payload:
     def __init__(self, data: bytes) -> None:
@@ -94,14 +90,6 @@ class Channel:
     close = undeclare
 
 
-def typed_orders(channel: Channel, kind: type[messages.Message]) -> pubsub.Orders[Any]:
-    """Orders of a kind that wait in a channel."""
-    orders = Orders.__new__(Orders)
-    orders._kind, orders._queries, orders.waiting, orders.malformed = kind, channel, channel.waiting, 0  # type: ignore[assignment]
-    orders.close = channel.close  # type: ignore[method-assign]
-    return orders
-
-
 class Mute:
     """The end of a key that speaks, a token, a last value: nobody listens."""
 
@@ -157,10 +145,13 @@ class Session:
         return self
 
     def declare_subscriber(self, key: str, handler: object = None, **_: object) -> Channel:
-        made = self._net.listen(key)
-        if isinstance(handler, Callback):
-            made.obey = handler
-        return made
+        return self._net.listen(key, handler)
+
+    def declare_queryable(self, key: str, handler: object, **_: object) -> Channel:
+        return self._net.listen(key, handler, asked=True)
+
+    def declare_token(self, _key: str) -> Mute:
+        return Mute()
 
     def get(self, *_: object, **__: object) -> list[Reply]:
         return list(self._net.replies)
@@ -196,8 +187,11 @@ class Net:
         """Everybody has left."""
         self.channels.clear()
 
-    def listen(self, key: str, *, asked: bool = False) -> Channel:
+    def listen(self, key: str, handler: object = None, *, asked: bool = False) -> Channel:
+        """The end of a key; its samples are given to `handler` as well if that is a callback."""
         made = Channel(key, asked=asked)
+        if isinstance(handler, Callback):
+            made.obey = handler
         self.channels.append(made)
         if key in self.first:
             made.add(self.first[key])
@@ -222,29 +216,12 @@ class Net:
 
     @contextmanager
     def worn(self) -> Iterator[Net]:
-        """`agents.network.session` is this network."""
-
-        def heard(_session: object, key: str, *_: object, **__: object) -> Channel:
-            return self.listen(key)
-
-        def ringing(_session: object, key: str, bell: pubsub.Bell, *_: object, **__: object) -> Channel:
-            made = self.listen(key)
-            made.obey = lambda _sample: bell.ring()
-            return made
-
-        def mute(*_: object, **__: object) -> Mute:
-            return Mute()
-
+        """`agents.network` has this network: advanced publishers and subscribers are plain, nobody asks for values."""
         declared: dict[str, Any] = {
-            "pose_subscriber": heard,
-            "RingingSubscriber": ringing,
-            "subscriber": heard,
-            "Orders": lambda _session, key, kind: typed_orders(self.listen(key, asked=True), kind),
-            "pose_publisher": mute,
-            "publisher": mute,
+            "declare_advanced_publisher": lambda *_, **__: Mute(),
+            "declare_advanced_subscriber": lambda _session, key, handler, **_: self.listen(key, handler),
             "source_of": lambda _publisher: None,
-            "LastValue": mute,
-            "alive_token": mute,
+            "LastValue": lambda *_: Mute(),
         }
         opened: dict[str, Any] = {
             "connected": lambda _session: True,
