@@ -15,16 +15,11 @@ Experience:
 
 Architecture:
   mode: {architecture}
-  node:
-    executable: none
-    name: none
-    pkg: none
+  node: {{executable: none, name: none, pkg: none}}
 
-CPU_Monitoring:
-  enable: False
+CPU_Monitoring: {{enable: False}}
 
-Interface:
-  enable: False
+Interface: {{enable: False}}
 
 Data_Logging:
   enable: {logging}
@@ -32,7 +27,6 @@ Data_Logging:
 
 Robots:
 """
-
 ROBOT = """  Robot{number:02d}:
     type: {place}
     name: {name}
@@ -45,10 +39,7 @@ ROBOT = """  Robot{number:02d}:
       enable: True
       protocol: Continuous
       period: 0.01
-      threshold:
-        type: Constant
-        co: 0.01
-        ai: 0.0
+      threshold: {{type: Constant, co: 0.01, ai: 0.0}}
     communication:
       type: {speaks}
       threshold:
@@ -70,48 +61,37 @@ ROBOT = """  Robot{number:02d}:
         upperLimit: 0.1
         lowerLimit: -0.1
         gain: {gain}
-        threshold:
-          type: Constant
-          co: 0.005
-          ai: 0.1
+        threshold: {{type: Constant, co: 0.005, ai: 0.1}}
       role: consensus
       type: {kind}
       relationship: {relationship}
 
 """
-
 TAIL = """Supervisor:
   enable: False
 
 Other:
 """
+USUAL = {
+    "place": "virtual", "kind": "distance", "positioning": "Intern", "speaks": "EventBased", "threshold": 0.01,
+    "pose_ms": 20, "law": "gradient", "protocol": "Continuous", "gain": 0.25,
+}  # fmt: skip
 
 
-def robot(number, name, pose, relations, *, place="virtual", kind="distance", **more):
+def robot(number, name, pose, relations, **more):
     """One of their robots, as text."""
-    khepera = name.startswith("khepera")
-    address = (
-        f"agent_ip: 192.168.0.{20 + number}\n    port_number: 50000" if khepera else
-        f"uri: radio://0/80/2M/E7E7E7E7{number:02d}"
-    )  # fmt: skip
+    address = f"uri: radio://0/80/2M/E7E7E7E7{number:02d}"
+    if name.startswith("khepera"):
+        address = f"agent_ip: 192.168.0.{20 + number}\n    port_number: 50000"
     given = {
         "number": number,
         "name": name,
         "pose": ", ".join(f"{value:.2f}" for value in pose),
         "relationship": ", ".join(relations) or "none_1.0",
         "task": bool(relations),
-        "place": place,
-        "kind": kind,
         "address": address,
-        "positioning": "Intern",
-        "speaks": "EventBased",
-        "threshold": 0.01,
-        "pose_ms": 20,
-        "law": "gradient",
-        "protocol": "Continuous",
-        "gain": 0.25,
     }
-    return ROBOT.format(**(given | more))
+    return ROBOT.format(**{**USUAL, **given, **more})
 
 
 def file(robots, mode="virtual", architecture="distributed", logging="False"):
@@ -119,38 +99,40 @@ def file(robots, mode="virtual", architecture="distributed", logging="False"):
     return SECTIONS.format(mode=mode, architecture=architecture, logging=logging) + "".join(robots) + TAIL
 
 
-def dome(count, *, origin=False, real=(), **more):
+def drones(place, starts, links, *, extra=(), real=(), **more):
+    """Drones that keep their distances in a shape; `links` are pairs of rows, `extra` relations of each."""
+    names = [f"dron{number:02d}" for number in range(1, len(place) + 1)]
+    robots = []
+    for row, name in enumerate(names):
+        others = [sum(pair) - row for pair in links if row in pair]
+        relations = [f"{names[j]}_{np.linalg.norm(place[row] - place[j]):.4f}" for j in others]
+        where = {"place": "physical"} if row in real else {}
+        robots.append(robot(row + 1, name, starts[row], [*relations, *extra], **{**more, **where}))
+    return file(robots, "hybrid" if real else "virtual")
+
+
+def dome(count, *, origin=False, **more):
     """Drones that spread over a dome, all from one height, their starts a third farther out than their places."""
     made = layouts.hemisphere(count, 0.6, 0.25)
     place = made.position
     last = 1.0 - (count - 0.5) / count * (1.0 - layouts.RIM)  # cosine of the lowest one's angle from the top
     radius = np.linalg.norm(place[-1, :2]) / np.sqrt(1.0 - last**2)
-    names = [f"dron{number:02d}" for number in range(1, count + 1)]
-    robots = []
-    for row, name in enumerate(names):
-        relations = []
-        for pair in made.pairs:
-            if row in pair:
-                other = int(pair.sum()) - row
-                relations.append(f"{names[other]}_{np.linalg.norm(place[row] - place[other]):.4f}")
-        if origin:
-            relations.append(f"origin_{radius:.4f}")
-        start = (*(1.3 * place[row, :2]), 0.7)
-        where = "physical" if row in real else "virtual"
-        robots.append(robot(row + 1, name, start, relations, place=where, **more))
-    return file(robots, "hybrid" if real else "virtual")
+    extra = [f"origin_{radius:.4f}"] if origin else []
+    starts = [(1.3 * x, 1.3 * y, 0.7) for x, y, _ in place]
+    return drones(place, starts, made.pairs.tolist(), extra=extra, **more)
 
 
 def column(count, drones=0, *, real=(), **more):
     """Robots in two rows behind a first one, each by its place behind two before it; the last of them drones."""
-    place = [(-0.4 * (k // 2), 0.5 * (k % 2), 0.7 if k >= count - drones else 0.0) for k in range(count)]
-    names = [f"dron{k:02d}" if k >= count - drones else f"khepera{k:02d}" for k in range(count)]
+    flies = [k >= count - drones for k in range(count)]
+    place = [(-0.4 * (k // 2), 0.5 * (k % 2), 0.7 if flies[k] else 0.0) for k in range(count)]
+    names = [f"dron{k:02d}" if flies[k] else f"khepera{k:02d}" for k in range(count)]
     robots = []
     for k, name in enumerate(names):
-        before = [j for j in (k - 1, k - 2) if j >= 0]
-        relations = [
-            f"{names[j]}_" + "_".join(f"{a - b:.2f}" for a, b in zip(place[k], place[j], strict=True)) for j in before
-        ]
+        relations = []
+        for j in range(k - 1, max(k - 3, -1), -1):
+            offset = "_".join(f"{a - b:.2f}" for a, b in zip(place[k], place[j], strict=True))
+            relations.append(f"{names[j]}_{offset}")
         x, y, z = place[k]
         start = (x + 0.1 * (k % 3 - 1) + 1.5, 1.4 * (y - 0.25), z)
         where = "digital_twin" if k in real else "virtual"
@@ -164,10 +146,7 @@ FLAT = """{name}:
   controller_type: PID_Continuous
   communication:
     type: {speaks}
-    threshold:
-      type: Constant
-      co: 0.02
-      ai: Null
+    threshold: {{type: Constant, co: 0.02, ai: Null}}
   task:
     enable: True
     T: 200
@@ -183,20 +162,15 @@ OTHERS = {
 }
 
 
-def flat(name, speaks="EvenBased", **changed):
+def flat(name, **changed):
     """Robot of a file of 2023, as text: a triangle of 0.8 m with a drone 0.7 m above its base."""
     wheels = name.startswith("khepera")
-    address = (
-        f"agent_ip: '192.168.0.{name[-1]}'\n  port_number: 50000\n  init_theta: -1.5"
-        if wheels
-        else "control_mode: HighLevel"
-    )
-    relations = ", ".join(f"{other}_{0.8 if wheels and other[0] == 'k' else 0.9}" for other in OTHERS[name])
+    address = f"agent_ip: '192.168.0.{name[-1]}'\n  port_number: 50000\n  init_theta: -1.5"
     given = {
         "name": name,
         "naming": "id" if wheels else "name",
-        "address": address,
-        "speaks": speaks,
-        "relations": relations,
+        "address": address if wheels else "control_mode: HighLevel",
+        "speaks": "EvenBased",
+        "relations": ", ".join(f"{other}_{0.8 if wheels and other[0] == 'k' else 0.9}" for other in OTHERS[name]),
     }
-    return FLAT.format(**(given | changed))
+    return FLAT.format(**{**given, **changed})
