@@ -5,17 +5,17 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 
-import msgspec
 import numpy as np
 
 from agents.network.messages import Event
 from agents.plugins.laws import Distance
 from experiments.arrays import PoseTable
-from experiments.definition.experiment import Arena, Experiment, Formation, LegTable, RobotTable
+from experiments.definition.experiment import Arena, Experiment, LegTable, RobotTable
 from experiments.definition.formation import law_offsets
 from experiments.definition.graph import links
 from experiments.definition.plan import Plan
 from experiments.recording.trace import Trace
+from tests.small import changed, reference, small
 from twins.arrays import Array, norm
 
 STEP = 0.02
@@ -30,17 +30,11 @@ def parse_links(experiment):
 def experiment(
     robots: Mapping[str, str], formation: Mapping[str, float], *, legs: Sequence[float] = (), **rest: object
 ) -> Experiment:
-    """`robots`: kind by name; `formation`: distance by link; a leg of the first robot at each of `legs`."""
-    leader = str(rest.pop("leader", "")) or None
-    return Experiment(
-        title=str(rest.pop("title", "A test")),
-        source="Nobody, Nowhere 2020",
-        robots={name: RobotTable(kind=kind, start=[0.0, 0.0]) for name, kind in robots.items()},
-        duration_s=45.0,
-        arena=rest.pop("arena", Arena(size=(4.0, 4.0, 2.5))),
-        formation=Formation(links=dict(formation), leader=leader),
-        timeline=[LegTable(at_s=at, robot=next(iter(robots)), plan="hold") for at in legs],
-    )
+    """Robots by kind, all started at the origin; a leg of the first one at each of `legs`."""
+    tables = {name: RobotTable(kind=kind, start=[0.0, 0.0]) for name, kind in robots.items()}
+    timeline = [LegTable(at_s=at, robot=next(iter(robots)), plan="hold") for at in legs]
+    fixed = {"source": "Nobody, Nowhere 2020", "duration_s": 45.0, "arena": Arena(size=(4.0, 4.0, 2.5))}
+    return small(tables, formation, timeline=timeline, **{**fixed, **rest})
 
 
 def trace(
@@ -59,51 +53,39 @@ def trace(
 
     It is as long as the run was to be, unless another length was `planned` [s].
     """
-    names = tuple(what.robots)
-    count = len(position)
-    what = msgspec.structs.replace(what, duration_s=max(count - 1, 1) * step if planned is None else planned)
+    names, count = tuple(what.robots), len(position)
+    rows, none = len(names), np.zeros(len(names), dtype=np.intp)
+    plan = Plan(changed(what, duration_s=max(count - 1, 1) * step if planned is None else planned))
     row = {name: i for i, name in enumerate(names)}
-    time = np.arange(count) * step
     sends = sorted((at, row[name], k) for name, times in (sent or {}).items() for k, at in enumerate(times, start=1))
     when = np.array([at for at, _, _ in sends])
     who = np.array([i for _, i, _ in sends], dtype=np.intp)
     number = np.array([k for _, _, k in sends], dtype=np.intp)
     place = position[np.clip(np.round(when / step).astype(int), 0, count - 1), who].reshape(-1, 3)
-    plan = Plan(what)
-    speaker = plan.pose_links.sender
-    pairs = [(k, link) for k, j in enumerate(who) for link in np.flatnonzero(speaker == j)]
-    take = np.array([k for k, _ in pairs], dtype=np.intp)
-    rows = len(names)
+    still = np.zeros_like(place)
+    pairs = [(k, link) for k, j in enumerate(who) for link in np.flatnonzero(plan.pose_links.sender == j)]
+    take, link = np.array(pairs, dtype=np.intp).reshape(-1, 2).T
     return Trace(
         case=case,
         plan=plan,
         seed=seed,
         robots=names,
         clock="virtual",
-        time=time,
+        time=np.arange(count) * step,
         position=position,
         yaw=np.zeros((count, rows)),
         true_position=position,
         goal=position,
         setpoint=np.zeros((count, rows, 4)),
-        sent=PoseTable(
-            who, number, when, when, place, np.zeros_like(place), np.zeros(len(when)), np.full(len(when), 100)
-        ),
-        received=PoseTable(
-            np.array([link for _, link in pairs], dtype=np.intp),
-            number[take],
-            when[take],
-            when[take] + delay,
-            place[take],
-            np.zeros_like(place[take]),
-        ),
-        lost=np.zeros(rows, dtype=np.intp),
-        missed_deadlines=np.zeros(rows, dtype=np.intp),
+        sent=PoseTable(who, number, when, when, place, still, np.zeros(len(when)), np.full(len(when), 100)),
+        received=PoseTable(link, number[take], when[take], when[take] + delay, place[take], still[take]),
+        lost=none,
+        missed_deadlines=none,
         ticks=np.full(rows, count),
         decisions=np.full(rows, count // 5),
         events=tuple(events),
-        interventions=np.zeros(rows, dtype=np.intp),
-        avoided=np.zeros(rows, dtype=np.intp),
+        interventions=none,
+        avoided=none,
     )
 
 
@@ -128,43 +110,13 @@ def pair(distance: Array, *, legs: Sequence[float] = (), target: float = 1.0, **
     return trace(what, position, **rest)
 
 
-ROBOTIC_PARK = {
-    "TB01 > KH01": 0.60,
-    "TB01 > KH03": 0.60,
-    "KH01 - KH02": 0.60,
-    "KH02 - KH03": 0.60,
-    "KH01 - KH03": 0.8485281374,
-    "TB01 > CF01": 0.86,
-    "KH01 - CF01": 0.86,
-    "KH02 - CF02": 0.86,
-    "KH03 - CF02": 0.86,
-    "CF01 - CF02": 0.60,
-    "CF01 - CF03": 0.60,
-    "CF02 - CF03": 0.60,
-}
-STARTS = {
-    "TB01": (-0.6, 0.8, 0.0),
-    "KH01": (-0.6, -0.8, 0.0),
-    "KH02": (0.6, -0.8, 0.0),
-    "KH03": (0.6, 0.8, 0.0),
-    "CF01": (-0.2, 0.4, 0.8),
-    "CF02": (0.4, -0.4, 0.8),
-    "CF03": (-0.2, -0.4, 0.8),
-}
-KINDS = {"TB": "turtlebot3", "KH": "khepera4", "CF": "crazyflie"}
-
-
 def park(case: str = "periodic", threshold: float = 0.0, *, seed: int = 1, duration: float = 45.0) -> Trace:
     """The reference formation with first-order robots; send-on-delta if there is a threshold [m]."""
-    what = experiment(
-        {name: KINDS[name[:2]] for name in STARTS},
-        ROBOTIC_PARK,
-        legs=[21.0] if duration > 21.0 else [],
-        leader="TB01",
-        title="Robotic Park: six robots hold a rigid formation behind a leader",
-        arena=Arena(size=(2.0, 2.0, 2.5)),
-    )
-    return simulate(what, np.array(list(STARTS.values())), case, threshold, seed=seed, duration=duration)
+    robots = reference("periodic").robots
+    legs = [LegTable(at_s=21.0, robot="TB01", plan="hold")] if duration > 21.0 else []
+    what = changed(reference("periodic"), source="Nobody, Nowhere 2020", timeline=legs)
+    start = np.array([(*robot.start[:2], robot.hover or 0.0) for robot in robots.values()])
+    return simulate(what, start, case, threshold, seed=seed, duration=duration)
 
 
 def crowd(rows: int, case: str = "periodic", threshold: float = 0.0, *, seed: int = 1, duration: float = 20.0) -> Trace:

@@ -11,11 +11,17 @@ from experiments.virtual_time import stretch
 from experiments.virtual_time.simulation import VirtualRun
 
 
-def flown(experiment, *, compiled, seed=1, lean=False):
-    """Log of a run, and the ticks of it that were compiled."""
+def flown(experiment, *, compiled, seed=1, lean=False, change=None):
+    """Log of a run with changed assignments, and the ticks of it that were compiled."""
+
+    class Changed(Plan):
+        def assignment(self, name):
+            given = super().assignment(name)
+            return given if change is None else change(given)
+
     stretch.WORK[0] = 1e6 if compiled else -1e6  # compilation pays, or nothing does
     try:
-        flight = VirtualRun(Plan(experiment), seed, quiet=False, lean=lean)
+        flight = VirtualRun(Changed(experiment), seed, quiet=False, lean=lean)
         flight.fly(landing=True, progress=lambda _: None, watch=None)
     finally:
         stretch.WORK[0] = 0.0
@@ -23,10 +29,10 @@ def flown(experiment, *, compiled, seed=1, lean=False):
     return flight.log(), 0 if flight.stretches is None else flight.stretches.flown
 
 
-def same(experiment, *, seed=1, lean=False):
+def same(experiment, **options):
     """Log of a plain run, the same as the compiled one in every bit, and the number of ticks that were compiled."""
-    plain, _ = flown(experiment, compiled=False, seed=seed, lean=lean)
-    other, ticks = flown(experiment, compiled=True, seed=seed, lean=lean)
+    plain, _ = flown(experiment, compiled=False, **options)
+    other, ticks = flown(experiment, compiled=True, **options)
     for field in fields(plain):
         assert alike(getattr(plain, field.name), getattr(other, field.name)), field.name
     return plain, ticks

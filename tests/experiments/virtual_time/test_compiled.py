@@ -10,7 +10,6 @@ from math import sqrt
 from pathlib import Path
 from typing import ClassVar
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -23,12 +22,12 @@ from agents.plugins.laws import Gradient
 from agents.plugins.registry import AVOIDANCES, LAWS, PREDICTORS, TRIGGERS, PluginError
 from agents.plugins.triggers import Trigger
 from agents.vectors import UNKNOWN
-from experiments.definition.experiment import ChannelTable, Experiment, Formation, LegTable, RobotTable, WorldTable
-from experiments.definition.plan import Plan
+from experiments.definition.experiment import ChannelTable, Formation, LegTable, RobotTable, WorldTable
 from experiments.virtual_time import stretch
 from tests.agents.plugins.test_every_plugin import made
-from tests.experiments.virtual_time import evaluators
 from tests.experiments.virtual_time.evaluators import flown, same
+from tests.small import changed
+from tests.small import pair as small_pair
 
 pytest.importorskip("numba")
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
@@ -61,32 +60,9 @@ def heard():
 
 def pair(**parts):
     """Two ground robots, of which B follows A."""
-    given = {
-        "title": "A pair",
-        "duration_s": 4.0,
-        "robots": {
-            "A": RobotTable(kind="khepera4", start=[-0.4, 0.0]),
-            "B": RobotTable(kind="khepera4", start=[0.4, 0.1]),
-        },
-        "formation": Formation(links={"A > B": 0.5}),
-        "disturbance": {"all": Disturbance(position_sigma=0.0005)},
-        **parts,
-    }
-    return Experiment(**given)
-
-
-@pytest.fixture
-def assigned(monkeypatch):
-    """A function that makes runs use changed assignments."""
-
-    def use(change):
-        class Changed(Plan):
-            def assignment(self, name):
-                return change(super().assignment(name))
-
-        monkeypatch.setattr(evaluators, "Plan", Changed)
-
-    return use
+    noise = {"all": Disturbance(position_sigma=0.0005)}
+    links = Formation(links={"A > B": 0.5})
+    return small_pair(**{"duration_s": 4.0, "formation": links, "disturbance": noise, "trigger": "periodic", **parts})
 
 
 def plugins(group, place=""):
@@ -95,7 +71,7 @@ def plugins(group, place=""):
 
 
 @pytest.mark.nightly
-def test_every_plugin_and_model(assigned):
+def test_every_plugin_and_model():
     """Each robot has the next law, trigger, predictor, avoidance and kind: one compilation covers all."""
     sending, updating = plugins(TRIGGERS, "communication"), plugins(TRIGGERS, "control")
     predictors, avoidances = plugins(PREDICTORS), plugins(AVOIDANCES)
@@ -104,35 +80,24 @@ def test_every_plugin_and_model(assigned):
 
     def change(given):
         k = int(given.name[1:])
-        law = laws[k % len(laws)]
-        links = tuple(
-            msgspec.structs.replace(
-                link, relative=(0.4, 0.3, 0.0), bearing=(0.6, 0.8, math.nan), wants=WANTS[law.NEEDS]
-            )
-            for link in given.neighbours
-        )
-        avoidance = (None, *avoidances)[k % (1 + len(avoidances))]
+        law, avoidance = laws[k % len(laws)], (None, *avoidances)[k % (1 + len(avoidances))]
+        seen = {"relative": (0.4, 0.3, 0.0), "bearing": (0.6, 0.8, math.nan), "wants": WANTS[law.NEEDS]}
         return replace(
-            given, law=law, neighbours=links, trigger=sending[k % len(sending)], update=updating[k % len(updating)],
+            given, law=law, neighbours=tuple(changed(link, **seen) for link in given.neighbours),
+            trigger=sending[k % len(sending)], update=updating[k % len(updating)],
             predictor=predictors[k % len(predictors)], avoidance=avoidance, avoids=avoidance is not None,
         )  # fmt: skip
 
-    robots = {
-        f"R{k}": RobotTable(
-            kind=KINDS[k % 4],
-            sensors=[],
-            hover=0.5 if k % 2 == 0 else None,
-            start=[0.7 * (k % 4 - 1.5), 0.7 * (k // 4 - 1.0)],
-        )
-        for k in range(count)
-    }
+    robots = {}
+    for k in range(count):
+        start, hover = [0.7 * (k % 4 - 1.5), 0.7 * (k // 4 - 1.0)], 0.5 if k % 2 == 0 else None
+        robots[f"R{k}"] = RobotTable(kind=KINDS[k % 4], sensors=[], hover=hover, start=start)
     links = {f"R{k} - R{(k + 1) % count}": 0.6 for k in range(count)}
     experiment = pair(
         robots=robots, formation=Formation(links=links), disturbance=NATURE, duration_s=5.0,
         avoidance={"kind": "potential"}, channel=ChannelTable(delay_s=0.03),
     )  # fmt: skip
-    assigned(change)
-    _, ticks = same(experiment)
+    _, ticks = same(experiment, change=change)
     assert ticks > 500
 
 
@@ -148,20 +113,16 @@ def test_every_motion_on_the_floor():
 def test_legs_hazard_and_several_stretches():
     """A compiled loop with a registered avoidance flies other seeds too, and samples of positions alone."""
     line = {"kind": "line", "move_by": [0.2, 0.1], "speed": 0.1}
-    legs = [
-        LegTable(at_s=2.0, robot="A", plan=line),
-        LegTable(at_s=11.3, robot="A", plan={"kind": "circle", "radius": 0.3, "period_s": 9.0}),
-    ]
-    robots = {
-        "A": RobotTable(kind="crazyflie", hover=0.5, start=[-0.4, 0.0]),
-        "B": RobotTable(kind="crazyflie", hover=0.5, start=[0.4, 0.1]),
-    }
+    circle = {"kind": "circle", "radius": 0.3, "period_s": 9.0}
+    legs = [LegTable(at_s=at, robot="A", plan=plan) for at, plan in ((2.0, line), (11.3, circle))]
+    starts = {"A": [-0.4, 0.0], "B": [0.4, 0.1]}
+    robots = {name: RobotTable(kind="crazyflie", hover=0.5, start=start) for name, start in starts.items()}
     made = pair(
         robots=robots, formation=Formation(links={"A > B": 0.8}), duration_s=25.0, timeline=legs,
         safety=Safety(battery_low=0.96), avoidance={"kind": "potential"},
     )  # fmt: skip
-    lands = robots | {"A": msgspec.structs.replace(robots["A"], lands_at_s=8.0)}
-    log, _ = same(msgspec.structs.replace(made, robots=lands, safety=Safety()))
+    lands = robots | {"A": changed(robots["A"], lands_at_s=8.0)}
+    log, _ = same(changed(made, robots=lands, safety=Safety()))
     assert log.phase[np.argmax(log.time > 14.0)].tolist() == [Phase.DONE, Phase.RUNNING]
     for seed, lean in ((1, False), (2, False), (3, True)):
         log, ticks = same(made, seed=seed, lean=lean)
@@ -249,7 +210,7 @@ def spring(folder, number, imports):
     return importlib.import_module(name).Spring()
 
 
-def test_laws_and_trigger_of_a_user(assigned, tmp_path, monkeypatch):
+def test_laws_and_trigger_of_a_user(tmp_path, monkeypatch):
     """Each follower of A has another law: one compilation covers all, and the run in which a law fails."""
     monkeypatch.syspath_prepend(str(tmp_path))
     trigger, predictor = made(TRIGGERS, "send-on-delta"), made(PREDICTORS, "constant-velocity")
@@ -260,7 +221,7 @@ def test_laws_and_trigger_of_a_user(assigned, tmp_path, monkeypatch):
         formation=Formation(links={f"A > {name}": 0.5 for name in "BCDE"}),
     )
 
-    def fly(farthest):
+    def with_laws(farthest):
         parts = {
             "A": {},
             "B": {"law": Foreign(), "trigger": Counting()},
@@ -268,44 +229,40 @@ def test_laws_and_trigger_of_a_user(assigned, tmp_path, monkeypatch):
             "D": {"law": Failing(farthest=farthest)},
             "E": {"law": names, "trigger": trigger},
         }
-        assigned(lambda given: replace(given, **parts[given.name]))
+        return lambda given: replace(given, **parts[given.name])
 
-    fly(9.0)
-    _, ticks = same(ring)
+    _, ticks = same(ring, change=with_laws(9.0))
     assert ticks > 300
-    fly(0.4)
     told = []
     for compiled in (False, True):
         with pytest.raises((PluginError, ValueError)) as caught:
-            flown(ring, compiled=compiled)
+            flown(ring, compiled=compiled, change=with_laws(0.4))
         told.append(str(caught.value))
     assert told[0] == told[1]
 
 
-@pytest.mark.nightly
-def test_names_of_a_module_are_flown_plain(assigned, tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(str(tmp_path))
-    law = spring(tmp_path, 0, "import zenpark as zp\n")
-    assigned(lambda given: replace(given, law=law))
-    _, ticks = same(pair(duration_s=2.0))
+def refusal(law):
+    """Reason for which a law is flown plain."""
+    _, ticks = same(pair(duration_s=1.0), change=lambda given: replace(given, law=law))
     assert ticks == 0
     (reason,) = stretch.REFUSED.values()
-    assert "uses zp" in reason
     stretch.REFUSED.clear()
+    return reason
+
+
+@pytest.mark.nightly
+def test_names_of_a_module_are_flown_plain(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(tmp_path))
+    assert "uses zp" in refusal(spring(tmp_path, 0, "import zenpark as zp\n"))
 
 
 @pytest.mark.parametrize(
     ("law", "fault"), [(Trying, "try"), pytest.param(Rounding, "hypot", marks=pytest.mark.nightly)]
 )
-def test_law_outside_of_the_subset_is_flown_plain(assigned, law, fault):
-    assigned(lambda given: replace(given, law=law()))
-    _, ticks = same(pair(duration_s=1.0))
-    assert ticks == 0
-    reasons = [*stretch.REFUSED.values()]
-    assert len(reasons) == 1
-    assert fault in reasons[0]
-    assert f"{Path(__file__).name}:" in reasons[0]
-    stretch.REFUSED.clear()
+def test_law_outside_of_the_subset_is_flown_plain(law, fault):
+    reason = refusal(law())
+    assert fault in reason
+    assert f"{Path(__file__).name}:" in reason
 
 
 @pytest.mark.parametrize("parts", [{"channel": ChannelTable(loss=0.1)}, {"world": WorldTable(engine="pymunk")}])

@@ -1,14 +1,23 @@
-"""Robots that change sides: with the barrier none touches another, and all arrive."""
+"""Robots whose ways cross at random: with the barrier none touches another, and all arrive.
 
-import msgspec
+Bodies are point masses: robots that touch go through each other, and the overlap of their cylinders can be measured.
+"""
+
+import itertools
+import math
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 
+from agents.body.interface import Disturbance, Jitter
+from agents.body.kinds import KINDS
 from agents.decision.lifecycle import RUNNING
-from experiments.definition.experiment import ChannelTable, Start
+from experiments.definition.experiment import Arena, ChannelTable, LegTable, Rates, RobotTable, Start
 from experiments.definition.plan import Plan
 from experiments.virtual_time.simulation import simulate
-from tests.experiments.encounters import ANGLES, Outcome, encounter, meet, random_pairs
+from tests.small import changed, small
+from twins.arrays import norm
 
 pytestmark = pytest.mark.slow
 
@@ -16,26 +25,112 @@ POTENTIAL = {"kind": "potential", "hears": "all"}
 BARRIER = {"kind": "barrier", "hears": "all"}
 SOME = (("khepera4", "turtlebot3"), ("tello", "tello"))
 FOUR = ("khepera4", "turtlebot3", "crazyflie", "tello")
+PAIRS = tuple(itertools.combinations_with_replacement(("crazyflie", "tello", "khepera4", "turtlebot3"), 2))
+CIRCLE = 0.8  # [m] robots begin about here and want to go to the other side
+ARRIVED = 0.05  # [m] nearer than this to its goal at the end a robot has arrived
+SPEED = {"twist": 0.2, "velocity": 0.4, "position": 0.4}  # [m/s] of the plans
+PATIENCE = 3.0  # times the time that the way would take alone; avoiding each other takes up to 2.6 of them
+ANGLES = (math.pi, 0.5 * math.pi)  # head-on, and across
+WOBBLE = Disturbance(hover_jitter=Jitter(0.01))
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Results of encounters (M)."""
+
+    gap: np.ndarray  # smallest distance between the surfaces of two robots beside each other [m]
+    missed: np.ndarray  # distance from its goal of the farthest robot at the end [m]
+    avoided: np.ndarray  # share of the ticks on which avoidance changed what some robot did
+
+    @property
+    def collided(self):
+        return self.gap < 0.0
+
+    @property
+    def arrived(self):
+        return self.missed <= ARRIVED
+
+    @classmethod
+    def joined(cls, parts):
+        columns = zip(*((part.gap, part.missed, part.avoided) for part in parts), strict=True)
+        return cls(*map(np.concatenate, columns))
+
+
+def encounter(kinds, avoidance, *, between=math.pi, stubborn=0, sensors=(), duration_s=None):
+    """Robots that want to change sides of a circle, all at the same time.
+
+    Args:
+        between: Angle between the starts of one robot and the next [rad]; more than two are spread evenly.
+        stubborn: Number of those, from the last, that avoid no robot.
+        duration_s: Of the run [s]; `PATIENCE` times the slowest's way if left out.
+    """
+    low = [KINDS[kind].height for kind in kinds if not KINDS[kind].flies]
+    height = 0.5 * min(low) if low else 0.5  # beside what drives [m]
+    speeds = [SPEED[KINDS[kind].takes] for kind in kinds]
+    robots, timeline = {}, []
+    for number, kind in enumerate(kinds):
+        angle = number * (between if len(kinds) == 2 else 2.0 * math.pi / len(kinds))
+        x, y = CIRCLE * math.cos(angle), CIRCLE * math.sin(angle)
+        name, hover = f"R{number}", height if KINDS[kind].flies else None
+        avoids, start = number < len(kinds) - stubborn, [x, y, angle + math.pi]
+        robots[name] = RobotTable(kind=kind, start=start, hover=hover, sensors=list(sensors), avoids=avoids)
+        plan = {"kind": "waypoints", "points": [[-x, -y]], "speed": speeds[number]}
+        timeline.append(LegTable(at_s=0.0, robot=name, plan=plan))
+    return small(
+        robots,
+        duration_s=2.0 * CIRCLE / min(speeds) * PATIENCE if duration_s is None else duration_s,
+        arena=Arena(size=(4.0, 4.0, 2.5)),
+        rates=Rates(state_hz=100.0),
+        timeline=timeline,
+        trigger={"kind": "send-on-delta", "threshold": 0.01},
+        disturbance={"all": Disturbance(position_sigma=0.0003), "crazyflie": WOBBLE, "tello": WOBBLE},
+        avoidance=avoidance,
+        start=Start(scatter=0.35, scatter_yaw=math.pi),
+    )
+
+
+def outcome(experiment, log):
+    kinds = [KINDS[robot.kind] for robot in experiment.robots.values()]
+    place = log.true_position[(log.phase == RUNNING).all(axis=1)]
+    gap = np.inf
+    for (i, first), (j, second) in itertools.combinations(enumerate(kinds), 2):
+        apart = place[:, i] - place[:, j]
+        over, up = norm(apart[:, :2]) - first.radius - second.radius, apart[:, 2]
+        beside = (up < second.height) & (up > -first.height)
+        gap = min(gap, over[beside].min(initial=np.inf))
+    goals = {leg.robot: leg.plan["points"][-1] for leg in experiment.timeline}
+    missed = norm(place[-1, :, :2] - np.array([goals[name] for name in log.names])).max()
+    return Outcome(*(np.array([each]) for each in (gap, missed, log.avoided.max() / log.ticks)))
+
+
+def meet(experiment, seeds):
+    """Encounters, one for each seed."""
+    return Outcome.joined(outcome(experiment, simulate(Plan(experiment), seed)) for seed in seeds)
 
 
 def met(kinds, avoidance, each, **settings):
+    """Encounters of robots head-on and across, `each` of either."""
     parts = (meet(encounter(kinds, avoidance, between=b, **settings), range(1, each + 1)) for b in ANGLES)
     return Outcome.joined(parts)
 
 
+def assert_clear(found, gap=0.0):
+    assert found.gap.min() > gap
+    assert found.arrived.all()
+
+
 def test_without_avoidance_robots_collide():
-    outcome = met(("turtlebot3", "turtlebot3"), None, 3, duration_s=12.0)
-    assert outcome.collided.sum() >= 3
-    assert outcome.gap.min() < -0.1
-    assert outcome.arrived.all()
-    assert not outcome.avoided.any()
+    found = met(("turtlebot3", "turtlebot3"), None, 3, duration_s=12.0)
+    assert found.collided.sum() >= 3
+    assert_clear(found, -np.inf)
+    assert found.gap.min() < -0.1
+    assert not found.avoided.any()
 
 
 def test_barrier_keeps_robots_apart_until_arrival():
-    outcome = met(("khepera4", "tello"), BARRIER, 3, duration_s=20.0)
-    assert outcome.gap.min() > 0.01
-    assert outcome.arrived.all()
-    assert (outcome.avoided > 0.0).any()
+    found = met(("khepera4", "tello"), BARRIER, 3, duration_s=20.0)
+    assert_clear(found, 0.01)
+    assert (found.avoided > 0.0).any()
 
 
 def test_gap_is_between_true_surfaces():
@@ -43,59 +138,45 @@ def test_gap_is_between_true_surfaces():
     log = simulate(Plan(experiment), 3)
     place = log.true_position[(log.phase == RUNNING).all(axis=1)]
     expected = np.hypot(*(place[:, 0] - place[:, 1])[:, :2].T).min() - 0.07 - 0.1
-    assert meet(experiment, [3]).gap[0] == pytest.approx(expected, abs=1e-12)
-    robots = {**experiment.robots, "R1": msgspec.structs.replace(experiment.robots["R1"], hover=0.5)}
-    assert np.isinf(meet(msgspec.structs.replace(experiment, robots=robots), [3]).gap[0])
+    assert outcome(experiment, log).gap[0] == pytest.approx(expected, abs=1e-12)
+    robots = {**experiment.robots, "R1": changed(experiment.robots["R1"], hover=0.5)}
+    assert np.isinf(meet(changed(experiment, robots=robots), [3]).gap[0])
 
 
 @pytest.mark.timeout(600)
 @pytest.mark.nightly
 def test_thousand_random_encounters_without_collision():
-    outcomes = random_pairs(BARRIER, 50)
-    whole = Outcome.joined(outcomes.values())
+    seeds = {math.pi: range(1, 51), 0.5 * math.pi: range(51, 101)}
+    pairs = itertools.product(PAIRS, ANGLES)
+    whole = Outcome.joined(meet(encounter(kinds, BARRIER, between=b), seeds[b]) for kinds, b in pairs)
     assert len(whole.gap) == 1000
-    assert whole.collided.sum() == 0
     assert whole.gap.min() > 0.02
     assert whole.arrived.sum() >= 995  # arrival is not guaranteed
 
 
 @pytest.mark.timeout(300)
 @pytest.mark.nightly
-def test_potential_keeps_pairs_apart():
-    whole = Outcome.joined([met(kinds, POTENTIAL, 10) for kinds in SOME])
-    assert whole.collided.sum() == 0
-    assert whole.arrived.all()
+@pytest.mark.parametrize(("avoidance", "stubborn"), [(POTENTIAL, 0), (BARRIER, 1)])
+def test_potential_and_one_sided_barrier_keep_pairs_apart(avoidance, stubborn):
+    assert_clear(Outcome.joined([met(kinds, avoidance, 10, stubborn=stubborn) for kinds in SOME]))
 
 
-def test_wheels_pass_edge_of_the_potential():
-    # these did, as long as the push jumped to its full size there
-    for between, seed in ((np.pi, 7), (0.5 * np.pi, 23)):
-        outcome = meet(encounter(("turtlebot3", "turtlebot3"), POTENTIAL, between=between), [seed])
-        assert outcome.arrived.all()
-        assert outcome.gap.min() > 0.1
+@pytest.mark.parametrize(("between", "seed"), [(np.pi, 7), (0.5 * np.pi, 23)])
+def test_wheels_pass_edge_of_the_potential(between, seed):
+    """A push that jumps to its full size at the edge stops these."""
+    assert_clear(meet(encounter(("turtlebot3", "turtlebot3"), POTENTIAL, between=between), [seed]), 0.1)
 
 
 @pytest.mark.parametrize("kinds", [("khepera4", "khepera4"), ("tello", "turtlebot3"), ("crazyflie", "crazyflie")])
 def test_head_on_encounters_pass(kinds):
-    experiment = msgspec.structs.replace(encounter(kinds, POTENTIAL), disturbance={}, start=Start())
-    outcome = meet(experiment, [1])
-    assert outcome.arrived.all()
-    assert outcome.gap.min() > 0.1
-
-
-@pytest.mark.timeout(300)
-@pytest.mark.nightly
-def test_robot_without_avoidance_is_avoided():
-    whole = Outcome.joined([met(kinds, BARRIER, 10, stubborn=1) for kinds in SOME])
-    assert whole.collided.sum() == 0
-    assert whole.arrived.all()
+    assert_clear(meet(changed(encounter(kinds, POTENTIAL), disturbance={}, start=Start()), [1]), 0.1)
 
 
 @pytest.mark.parametrize("seeds", [3, pytest.param(20, marks=pytest.mark.nightly)])
 def test_four_kinds_change_sides(seeds):
-    outcome = meet(encounter(FOUR, BARRIER), range(1, 1 + seeds))
-    assert outcome.collided.sum() == 0
-    assert outcome.arrived.mean() >= 0.95
+    found = meet(encounter(FOUR, BARRIER), range(1, 1 + seeds))
+    assert found.collided.sum() == 0
+    assert found.arrived.mean() >= 0.95
 
 
 @pytest.mark.parametrize(
@@ -103,15 +184,11 @@ def test_four_kinds_change_sides(seeds):
     [pytest.param("turtlebot3", ["lds01"], marks=pytest.mark.nightly), ("khepera4", ["infrared", "ultrasonic"])],
 )
 def test_robots_with_sensors_alone_keep_clear(kind, sensors):
-    outcome = met((kind, kind), {"kind": "barrier"}, 2, sensors=sensors)
-    assert outcome.collided.sum() == 0
-    assert outcome.arrived.all()
+    assert_clear(met((kind, kind), {"kind": "barrier"}, 2, sensors=sensors))
 
 
 @pytest.mark.nightly
-def test_bad_network_causes_no_collision():
+@pytest.mark.parametrize("kinds", [("tello", "tello"), ("crazyflie", "turtlebot3")])
+def test_bad_network_causes_no_collision(kinds):
     bad = ChannelTable(delay_s=0.02, jitter_s=0.02, loss=0.2)
-    for kinds in (("tello", "tello"), ("crazyflie", "turtlebot3")):
-        outcome = meet(msgspec.structs.replace(encounter(kinds, BARRIER), channel=bad), range(1, 21))
-        assert outcome.collided.sum() == 0
-        assert outcome.arrived.all()
+    assert_clear(meet(changed(encounter(kinds, BARRIER), channel=bad), range(1, 21)))

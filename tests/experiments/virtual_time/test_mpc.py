@@ -2,7 +2,6 @@
 
 import sys
 from dataclasses import replace
-from functools import cache
 from math import cos, dist, nan, pi, sin
 from random import Random
 
@@ -15,13 +14,11 @@ from agents.plugins.extras.mpc import Mpc, horizon
 from agents.plugins.law import NeighbourView
 from agents.plugins.registry import PluginError
 from agents.vectors import ZERO
-from experiments.catalogue import index
 from experiments.definition.plan import Plan
 from experiments.file import document
-from experiments.virtual_time.log import RunRecorder
-from experiments.virtual_time.simulation import simulate
 from tests.agents.bench import Bench
-from tests.agents.few import triangle
+from tests.runs import flown, fly
+from tests.small import triangle
 
 pytest.importorskip("daqp", reason="the law mpc is the extra [mpc]: ./zenpark install daqp")
 
@@ -56,20 +53,17 @@ def crowded(number):
     return random(number, 0.75, 0.4)
 
 
-def flown(starts, goals, *changes, case="periodic"):
+def traded(starts, goals, *changes, case="periodic"):
     """Trace of robots that fly from places to goals."""
     words = [f"robots.{name}.start=[{x:.4f}, {y:.4f}]" for name, (x, y) in zip(NAMES, starts, strict=True)]
     table = ", ".join(f"{name} = [{x:.4f}, {y:.4f}]" for name, (x, y) in zip(NAMES, goals, strict=True))
-    given = document.read(index.find_file("mpc"), [*words, f"formation.law.goal={{ {table} }}", *changes])
-    plan = given.cases()[case]
-    return RunRecorder(simulate(plan, plan.experiment.seed), plan, case).trace()
+    return flown("mpc", case, *words, f"formation.law.goal={{ {table} }}", *changes).trace
 
 
-@cache
 def swapped(swap, number, case="periodic"):
     """Trace of robots that change places, and their goals [m]."""
     starts, goals = swap(number)
-    return flown(starts, goals, case=case), goals
+    return traded(starts, goals, case=case), goals
 
 
 def nearest(trace):
@@ -108,7 +102,7 @@ def test_eight_robots_swap_places_without_contact(swap, number):
 )
 def test_contacts_and_deadlocks_are_those_of_the_page(swap, changes, touching, waiting):
     """Counts of 20 cases, as docs/mpc.md has them."""
-    ends = [(flown(starts, goals, *changes), goals) for starts, goals in map(swap, range(20))]
+    ends = [(traded(starts, goals, *changes), goals) for starts, goals in map(swap, range(20))]
     assert sum(nearest(trace) < CONTACT for trace, _ in ends) == touching
     assert sum(farthest(trace, goals) > 0.05 for trace, goals in ends) == waiting
 
@@ -139,8 +133,7 @@ law = { kind = "mpc", goal = { KH01 = [1.0, 0.6] } }
 @pytest.mark.parametrize("kind", ["crazyflie", "khepera4", "omni", "double-integrator"])
 def test_one_robot_reaches_its_goal_within_its_limits(kind):
     text = ALONE.replace("KIND", kind).replace("HOVER", "hover = 0.8" if kind == "crazyflie" else "")
-    plan = document.loads(text).cases()["periodic"]
-    trace = RunRecorder(simulate(plan, 1), plan, "periodic").trace()
+    trace = fly(document.loads(text).cases()["periodic"].experiment).trace
     assert trace.true_position[-1, 0, :2] == pytest.approx([1.0, 0.6], abs=0.02)
     state = trace.memory["state"][:, 0]
     known = state[np.isfinite(state).all(axis=1)]
@@ -200,7 +193,7 @@ def test_constraints_hold_where_they_can():
 
 
 def standing(place):
-    return NeighbourView(1, "B", (*place, 0.0), (0.0, 0.0, 0.0), 0.0, 0.0, {"path": (nan,) * 32}, None)
+    return NeighbourView(1, "B", (*place, 0.0), ZERO, 0.0, 0.0, {"path": (nan,) * 32}, None)
 
 
 def test_path_is_read_at_its_readers_time():
@@ -218,10 +211,13 @@ def test_a_missing_library_is_named_with_its_remedy(monkeypatch):
         Stepping(replace(Plan(triangle()).assignment("A"), law=Mpc()))
 
 
-def test_check_warns_of_goals_that_exclude_each_other():
-    plan = Plan(triangle())
-    assert list(Mpc(goal={"A": (0.0, 0.0), "B": (0.0, 1.0)}).analyse(plan)) == []
-    (near,) = Mpc(goal={"A": (0.0, 0.0), "B": (0.0, 0.3)}).analyse(plan)
-    assert near[0] == "warning"
-    (stranger,) = Mpc(goal={"A": (0.0, 0.0), "X": (0.0, 1.0)}).analyse(plan)
-    assert stranger[0] == "error"
+@pytest.mark.parametrize(
+    ("goal", "severities"),
+    [
+        ({"A": (0.0, 0.0), "B": (0.0, 1.0)}, []),
+        ({"A": (0.0, 0.0), "B": (0.0, 0.3)}, ["warning"]),
+        ({"A": (0.0, 0.0), "X": (0.0, 1.0)}, ["error"]),
+    ],
+)
+def test_check_warns_of_goals_that_exclude_each_other(goal, severities):
+    assert [severity for severity, *_ in Mpc(goal=goal).analyse(Plan(triangle()))] == severities

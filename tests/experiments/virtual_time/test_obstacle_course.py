@@ -1,7 +1,5 @@
 """The obstacle course of the catalogue: through a gap narrower than the formation, and back in shape."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -46,7 +46,7 @@ def test_a_policy_acts_in_flight_as_offline(case, most, monkeypatch):
         return control
 
     monkeypatch.setattr(Policy, "step", watched)
-    plan = document.read(index.find_file("policy"), []).cases()[case]
+    plan = document.read("policy").cases()[case]
     known = RunRecorder(simulate(plan, plan.experiment.seed), plan, case).trace()
     assert len(acted) > 4 * 190
     assert np.array(acted) == pytest.approx(offline(np.array(seen)), abs=1e-6)
@@ -56,26 +56,24 @@ def test_a_policy_acts_in_flight_as_offline(case, most, monkeypatch):
     assert apart[-1].max() < most
 
 
-def training():
-    """Functions of the program that trains the policy of the catalogue."""
-    return runpy.run_path(str(Path(__file__).parents[3] / "docs" / "policy_training.py"))
+TRAINING = runpy.run_path(str(Path(__file__).parents[3] / "docs" / "policy_training.py"))
+SITUATIONS = TRAINING["situations"](np.random.default_rng(3), 5000)
+
+
+def off_expert(actions):
+    """Root mean square of the difference from what the expert does."""
+    return np.sqrt(((actions - TRAINING["expert"](SITUATIONS)) ** 2).sum(axis=1).mean())
 
 
 def test_the_policy_of_the_catalogue_imitates_its_expert():
-    functions = training()
-    seen = functions["situations"](np.random.default_rng(3), 5000)
-    error = offline(seen) - functions["expert"](seen)
-    assert np.sqrt((error**2).sum(axis=1).mean()) < 0.015
+    assert off_expert(offline(SITUATIONS)) < 0.015
 
 
 @pytest.mark.nightly
 def test_training_anew_gives_such_a_policy(tmp_path):
-    functions = training()
-    functions["write"](functions["train"](), tmp_path / "new.onnx")
-    seen = functions["situations"](np.random.default_rng(3), 5000)
+    TRAINING["write"](TRAINING["train"](), tmp_path / "new.onnx")
     _, act = policy.load(b64encode((tmp_path / "new.onnx").read_bytes()).decode())
-    error = np.array([act(each) for each in seen]) - functions["expert"](seen)
-    assert np.sqrt((error**2).sum(axis=1).mean()) < 0.015
+    assert off_expert(np.array([act(each) for each in SITUATIONS])) < 0.015
 
 
 def test_observations():
@@ -92,17 +90,13 @@ def test_observations():
 
 def model(folder, inputs, outputs, kind=1):
     """File of a policy that is a matrix of zeros."""
-    helper = onnx.helper
+    made, value = onnx.helper, onnx.helper.make_tensor_value_info
     zeros = onnx.numpy_helper.from_array(np.zeros((inputs, outputs), dtype={1: np.float32, 11: float}[kind]), "w")
-    graph = helper.make_graph(
-        [helper.make_node("MatMul", ["o", "w"], ["v"])],
-        "zero",
-        [helper.make_tensor_value_info("o", kind, [1, inputs])],
-        [helper.make_tensor_value_info("v", kind, [1, outputs])],
-        [zeros],
-    )
-    made = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
-    (folder / "own.onnx").write_bytes(made.SerializeToString())
+    node = made.make_node("MatMul", ["o", "w"], ["v"])
+    ends = [value("o", kind, [1, inputs])], [value("v", kind, [1, outputs])]
+    graph = made.make_graph([node], "zero", *ends, [zeros])
+    whole = made.make_model(graph, opset_imports=[made.make_opsetid("", 17)], ir_version=8)
+    (folder / "own.onnx").write_bytes(whole.SerializeToString())
 
 
 def own(folder, name="own.onnx"):

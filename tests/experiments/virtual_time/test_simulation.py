@@ -2,66 +2,53 @@
 
 from dataclasses import fields
 
-import msgspec
 import numpy as np
 import pytest
 
 from agents.body.interface import Disturbance
 from agents.decision.lifecycle import AIRBORNE, DONE, IDLE, LANDING, READY, RUNNING
-from experiments.arrays import PoseTable
-from experiments.definition.experiment import ChannelTable, Experiment, Formation, LegTable, RobotTable, Start
+from experiments.definition.experiment import ChannelTable, LegTable, RobotTable, Start
 from experiments.definition.plan import Plan
-from experiments.file import document
 from experiments.virtual_time.conductor import LEAD_S, Stuck
 from experiments.virtual_time.simulation import VirtualRunLog, simulate
-
-
-def changed(experiment, **parts):
-    return msgspec.structs.replace(experiment, **parts)
+from tests.experiments.virtual_time.evaluators import alike
+from tests.runs import fly
+from tests.small import changed, pair, reference, small
 
 
 @pytest.fixture(scope="module")
 def park():
     """The reference experiment with everything that is random, cut short."""
-    experiment = document.read("robotic-park").cases()["event"].experiment
-    nature = {
-        **experiment.disturbance,
+    nature = reference().disturbance | {
         "KH02": Disturbance(odometry_drift=0.002, latency_s=0.02),
         "CF02": Disturbance(latency_s=0.03),
     }
     leg = LegTable(at_s=2.0, robot="TB01", plan={"kind": "line", "move_by": [0.2, 0.0], "speed": 0.2})
     trigger = {"kind": "send-on-delta", "threshold": 0.01, "maximum_silence_s": 0.2}
     channel = ChannelTable(delay_s=0.004, jitter_s=0.01, loss=0.2)
-    return changed(experiment, duration_s=4.0, disturbance=nature, timeline=[leg], trigger=trigger, channel=channel)
+    return changed(reference(), duration_s=4.0, disturbance=nature, timeline=[leg], trigger=trigger, channel=channel)
 
 
 def ground(**parts):
-    """Two ground robots that listen to each other."""
-    robots = {"A": RobotTable(kind="khepera4", start=[-0.4, 0.0]), "B": RobotTable(kind="khepera4", start=[0.4, 0.1])}
-    given = {"title": "A pair", "duration_s": 2.0, "robots": robots, "formation": Formation(links={"A - B": 0.5})}
-    return Experiment(**{**given, **parts})
+    """Log of two ground robots that listen to each other."""
+    return fly(pair(**{"duration_s": 2.0, "trigger": "periodic", **parts})).log
 
 
-def same(a: VirtualRunLog, b: VirtualRunLog):
+def assert_same(first, second):
     """To the last bit, NaN included."""
     for field in fields(VirtualRunLog):
-        one, other = getattr(a, field.name), getattr(b, field.name)
-        if isinstance(one, PoseTable):
-            one, other = msgspec.structs.astuple(one)[:6], msgspec.structs.astuple(other)[:6]
-        for x, y in zip(one, other, strict=True) if isinstance(one, tuple) else [(one, other)]:
-            np.testing.assert_array_equal(np.asarray(x), np.asarray(y), err_msg=field.name)
+        assert alike(getattr(first, field.name), getattr(second, field.name)), field.name
 
 
 @pytest.mark.slow
 def test_same_seed_gives_same_bits_and_another_others(park):
-    first = simulate(Plan(park), 7)
-    same(first, simulate(Plan(park), 7))
-    other = simulate(Plan(park), 8)
+    first, again, other = (simulate(Plan(park), seed) for seed in (7, 7, 8))
+    assert_same(first, again)
     assert not np.array_equal(first.position[-1], other.position[-1])
 
 
 def test_the_common_start_is_time_zero():
-    log = simulate(Plan(ground()), 1)
+    log = ground()
     k = int(np.argmin(np.abs(log.time)))
     assert log.time[k] == pytest.approx(0.0, abs=1e-9)
     np.testing.assert_allclose(np.diff(log.time), 0.02, atol=1e-9)  # state_hz
@@ -77,7 +64,7 @@ def test_the_common_start_is_time_zero():
 
 
 def test_phases_never_go_back(park):
-    log = simulate(Plan(park), 1)
+    log = fly(park).log
     assert (np.diff(log.phase, axis=0) >= 0).all()
     assert {IDLE, READY, AIRBORNE, RUNNING, LANDING, DONE} >= set(log.phase.ravel().tolist())
     assert (log.true_position[-1, 4:, 2] < 0.03).all()  # down, or about to touch down
@@ -85,50 +72,38 @@ def test_phases_never_go_back(park):
 
 
 def test_periodic_poses_are_all_sent_and_all_heard():
-    log = simulate(Plan(ground(trigger={"kind": "periodic", "period_s": 0.1})), 1)
-    time, row, seq, position = log.sent.stamp, log.sent.link, log.sent.seq, log.sent.position
-    run = (time >= -1e-9) & (time < 2.0 - 1e-9)
-    assert np.bincount(row[run]).tolist() == [20, 20]
-    for robot in range(2):
-        np.testing.assert_array_equal(seq[row == robot], np.arange(1, (row == robot).sum() + 1))
-    got = log.received
-    arrival, link, number, stamp, place = got.arrival, got.link, got.seq, got.stamp, got.position
-    np.testing.assert_allclose(arrival - stamp, 0.001, atol=1e-9)
-    for this, (listener, speaker) in enumerate([(0, 1), (1, 0)]):
-        assert listener != speaker
-        mine, theirs = link == this, row == speaker
-        count = mine.sum()
-        np.testing.assert_array_equal(number[mine], seq[theirs][:count])
-        np.testing.assert_array_equal(place[mine], position[theirs][:count])
-        assert count >= theirs.sum() - 1
+    log = ground(trigger={"kind": "periodic", "period_s": 0.1})
+    sent, got = log.sent, log.received
+    run = (sent.stamp >= -1e-9) & (sent.stamp < 2.0 - 1e-9)
+    assert np.bincount(sent.link[run]).tolist() == [20, 20]
+    np.testing.assert_allclose(got.arrival - got.stamp, 0.001, atol=1e-9)
+    for link, speaker in ((0, 1), (1, 0)):
+        theirs, mine = sent.take(sent.link == speaker), got.take(got.link == link)
+        count = len(mine)
+        assert theirs.seq.tolist() == [*range(1, len(theirs) + 1)]
+        np.testing.assert_array_equal(mine.seq, theirs.seq[:count])
+        np.testing.assert_array_equal(mine.position, theirs.position[:count])
+        assert count >= len(theirs) - 1
     assert not log.lost.any()
 
 
 def test_losses_are_counted_from_start_to_landing():
-    experiment = ground(channel=ChannelTable(loss=0.25), duration_s=10.0)
-    log = simulate(Plan(experiment), 1)
-    time, row = log.sent.stamp, log.sent.link
-    run = (time >= -1e-9) & (time < 10.0 - 1e-9)
-    heard = log.received
-    stamped = (heard.stamp >= -1e-9) & (heard.stamp < 10.0 - 1e-9)
+    log = ground(channel=ChannelTable(loss=0.25), duration_s=10.0)
+    sent, heard = (each.take((each.stamp >= -1e-9) & (each.stamp < 10.0 - 1e-9)) for each in (log.sent, log.received))
     for link, speaker in enumerate((1, 0)):
-        missing = (row[run] == speaker).sum() - (heard.link[stamped] == link).sum()
-        assert log.lost[link] == missing
-    assert log.lost.sum() / run.sum() == pytest.approx(0.25, abs=0.05)
+        assert log.lost[link] == (sent.link == speaker).sum() - (heard.link == link).sum()
+    assert log.lost.sum() / len(sent) == pytest.approx(0.25, abs=0.05)
 
 
 def test_one_robot_alone():
-    robots = {"F": RobotTable(kind="crazyflie", start=[0.2, -0.1], hover=0.6)}
-    plan = {"kind": "circle", "radius": 0.2, "period_s": 8.0}
-    leg = LegTable(at_s=0.0, robot="F", plan=plan)
-    log = simulate(Plan(Experiment(title="Alone", duration_s=8.0, robots=robots, timeline=[leg])), 1)
-    run = (log.time >= 0.0) & (log.time <= 8.0)
-    path = log.true_position[run, 0]
+    robot = RobotTable(kind="crazyflie", start=[0.2, -0.1], hover=0.6)
+    leg = LegTable(at_s=0.0, robot="F", plan={"kind": "circle", "radius": 0.2, "period_s": 8.0})
+    log = fly(small({"F": robot}, duration_s=8.0, timeline=[leg])).log
+    path = log.true_position[(log.time >= 0.0) & (log.time <= 8.0), 0]
     assert len(log.received) == 0
     assert np.abs(path[:, 2] - 0.6).max() < 0.05
-    centre = np.array([0.2, 0.1])
     # a position controller lags behind a circle and cuts it
-    assert np.linalg.norm(path[100:, :2] - centre, axis=1).max() < 0.21
+    assert np.linalg.norm(path[100:, :2] - [0.2, 0.1], axis=1).max() < 0.21
     assert np.ptp(path[:, 0]) > 0.3
     np.testing.assert_allclose(path[-1, :2], [0.2, -0.1], atol=0.1)
 
@@ -141,25 +116,18 @@ def test_three_robots_find_their_triangle():
         "F": RobotTable(kind="crazyflie", start=[0.1, 0.6], hover=0.6),
     }
     links = {"A - B": 0.6, "A - F": 0.8, "B - F": 0.8}
-    nature = {"all": Disturbance(position_sigma=0.0003)}
-    experiment = Experiment(
-        title="Triangle", duration_s=25.0, robots=robots, formation=Formation(links=links), disturbance=nature
-    )
-    log = simulate(Plan(experiment), 1)
-    a, b, f = log.true_position[np.flatnonzero(log.time <= 25.0)[-1]]
-    for one, other, distance in ((a, b, 0.6), (a, f, 0.8), (b, f, 0.8)):
-        assert np.linalg.norm(one - other) == pytest.approx(distance, abs=0.012)
-    assert not log.interventions.any()
+    run = fly(small(robots, links, duration_s=25.0, disturbance={"all": Disturbance(position_sigma=0.0003)}))
+    a, b, f = run.log.true_position[np.flatnonzero(run.log.time <= 25.0)[-1]]
+    lengths = [np.linalg.norm(one - other) for one, other in ((a, b), (a, f), (b, f))]
+    assert lengths == pytest.approx([0.6, 0.8, 0.8], abs=0.012)
+    assert not run.log.interventions.any()
 
 
 def test_the_reference_formation_is_acquired():
-    experiment = changed(document.read("robotic-park").cases()["event"].experiment, duration_s=18.0, timeline=[])
-    log = simulate(Plan(experiment), 1)
-    last = log.error[np.flatnonzero(log.time <= 18.0)[-1]]
+    log = fly(changed(reference(), duration_s=18.0, timeline=[])).log
     links_each = np.array([0, 4, 3, 4, 4, 4, 2])
-    assert (last <= 0.03 * links_each + 1e-9).all()
-    inside = np.abs(log.true_position[..., :2]).max()
-    assert inside < 1.0
+    assert (log.error[np.flatnonzero(log.time <= 18.0)[-1]] <= 0.03 * links_each + 1e-9).all()
+    assert np.abs(log.true_position[..., :2]).max() < 1.0
     sent = np.bincount(log.sent.link[(log.sent.stamp >= 0) & (log.sent.stamp < 18)], minlength=7) / 18.0
     assert sent[0] < 0.5  # the leader stands
     assert sent.max() < 20.0
@@ -167,23 +135,20 @@ def test_the_reference_formation_is_acquired():
 
 
 def test_who_hears_nobody_is_named():
+    deaf = pair(duration_s=2.0, channel=ChannelTable(delay_s=100.0))
     with pytest.raises(Stuck, match=r"not ready after 5 s: A, B \(never received B\)"):
-        simulate(Plan(ground(channel=ChannelTable(delay_s=100.0))), 1, patience_s=5.0)
+        simulate(Plan(deaf), 1, patience_s=5.0)
 
 
 def test_who_cannot_get_up_is_named(monkeypatch):
     monkeypatch.setattr("agents.decision.lifecycle.AT_HEIGHT", -1.0)  # nobody is ever near enough to his height
-    robots = {
-        "A": RobotTable(kind="khepera4", start=[0.0, 0.0]),
-        "F": RobotTable(kind="crazyflie", start=[0.5, 0.0], hover=0.5),
-        "G": RobotTable(kind="crazyflie", start=[-0.5, 0.0], hover=0.5),
-    }
+    stuck = small({"A": "khepera4", "F": "crazyflie", "G": "crazyflie"})
     with pytest.raises(Stuck, match=r"not airborne after 5 s: F, G"):
-        simulate(Plan(Experiment(title="Stuck", duration_s=1.0, robots=robots)), 1, patience_s=5.0)
+        simulate(Plan(stuck), 1, patience_s=5.0)
 
 
 def test_robot_goes_on_without_a_never_received_neighbour():
-    log = simulate(Plan(ground(channel=ChannelTable(delay_s=100.0), start=Start(deadline_s=1.0, missing="go-on"))), 1)
+    log = ground(channel=ChannelTable(delay_s=100.0), start=Start(deadline_s=1.0, missing="go-on"))
     run = (log.time >= 0.0) & (log.time <= 2.0)
     np.testing.assert_allclose(log.true_position[run], np.tile(log.true_position[0], (run.sum(), 1, 1)), atol=1e-9)
     assert not log.error.any()
@@ -191,7 +156,7 @@ def test_robot_goes_on_without_a_never_received_neighbour():
 
 
 def test_all_is_lost_inside_run_and_nothing_outside():
-    log = simulate(Plan(ground(channel=ChannelTable(loss=1.0))), 1)
+    log = ground(channel=ChannelTable(loss=1.0))
     stamp = log.received.stamp
     assert not ((stamp > -1e-9) & (stamp < 2.0 - 1e-9)).any()
     assert stamp.max() >= 2.0 - 1e-9

@@ -6,8 +6,7 @@ from scipy.special import gammaincinv
 
 from experiments.catalogue import index
 from experiments.file import document
-from experiments.virtual_time.log import RunRecorder
-from experiments.virtual_time.simulation import simulate
+from tests.runs import flown, fly
 
 
 def track_centrally(known, steps, seeing):
@@ -39,8 +38,8 @@ def track_centrally(known, steps, seeing):
 
 def track(case, seed, *changes):
     """Mean squared errors of a place [m²], of the robots and of a central filter, and normalised ones of the robots."""
-    plan = document.read(index.find_file("tracking"), changes).cases()[case]
-    known = RunRecorder(simulate(plan, seed), plan, case).trace()
+    run = flown("tracking", case, *changes, seed=seed)
+    plan, known = run.plan, run.trace
     seeing, steps = slice(1, None), np.arange(5, len(known.time), 5)
     place = known.true_position[:, 0, :2]
     truth = np.hstack([place, np.gradient(place, known.time, axis=0)])[steps]
@@ -78,8 +77,7 @@ def test_tracking_by_directions():
 def test_robots_without_sight_know_target_from_others():
     text = index.find_file("tracking").read_text("utf-8")
     bare = "\n".join(line for line in text.splitlines() if not line.startswith(('"TB01 > KH01"', '"TB01 > KH04"')))
-    plan = document.loads(bare).cases()["event"]
-    known = RunRecorder(simulate(plan, 1), plan, "event").trace()
+    known = fly(document.loads(bare).cases()["event"].experiment).trace
     late = known.time > 5.0
     assert np.isnan(known.measures["reading"][late][:, [1, 4]]).all()
     apart = known.memory["x"][late][:, 1:, :2] - known.true_position[late, :1, :2]
@@ -87,15 +85,16 @@ def test_robots_without_sight_know_target_from_others():
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
-    [("formation.law.target=KH99", "no robot of the experiment"), ("formation.law.target=KH02", "")],
+    ("target", "unseen", "found"),
+    [
+        ("KH99", "", "the target 'KH99' is no robot of the experiment"),
+        ("KH02", "", None),
+        ("TB01", "TB01 > ", "no robot sees TB01"),
+    ],
 )
-def test_a_target_is_a_robot_that_others_see(change, message):
-    plan = document.read(index.find_file("tracking"), [change]).plan
-    assert [severity for severity, text, _ in plan.law.analyse(plan) if message in text] == ["error"] * bool(message)
-
-
-def test_a_target_that_none_sees_is_an_error():
-    text = index.find_file("tracking").read_text("utf-8")
-    plan = document.loads("\n".join(line for line in text.splitlines() if "TB01 > " not in line)).plan
-    assert [message for _, message, _ in plan.law.analyse(plan)] == ["no robot sees TB01"]
+def test_a_target_is_a_robot_that_others_see(target, unseen, found):
+    lines = index.find_file("tracking").read_text("utf-8").splitlines()
+    text = "\n".join(line for line in lines if not unseen or unseen not in line)
+    plan = document.loads(text, f"formation.law.target={target}").plan
+    faults = [(severity, message) for severity, message, _ in plan.law.analyse(plan)]
+    assert faults == ([("error", found)] if found else [])
