@@ -124,6 +124,33 @@ def test_absent_file_names_the_nearest_of_the_catalogue(write):
     assert (problem.message, problem.hint) == ("is a folder", "name a file in it: some.toml")
 
 
+VALUES = [
+    "nan", "inf", "-1", "1e400", "true", '""', '"KH01"', "[]", "{}", "[[]]", "[{}]", "1979-05-27", "9" * 30,
+    "{ kind = [] }", '{"" = 1}',
+]  # fmt: skip
+
+
+def outcome(path, flags=()):
+    """What becomes of a file: its cases as they are sent, or why it is refused."""
+    try:
+        return [document.write_json(case) for case in read(path, flags).cases().values()]
+    except DocumentError as error:
+        return str(error).encode("utf-8")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "field", ["trigger", "robots", "cases", "timeline", "formation", "disturbance", "rates", "arena", "start"]
+)
+def test_any_value_of_any_field_is_read_or_refused(write, field):
+    """Whatever else is in a file: tests/fuzz."""
+    for value in VALUES:
+        for text in (f"{field} = {value}\n", f"cases.a.{field} = {value}\n"):
+            assert outcome(write(text))
+            assert outcome(write(text + MINIMAL))
+        assert outcome("robotic-park", [f"{field}={value}", f"cases.event.{field}={value}"])
+
+
 @pytest.mark.parametrize("name", ["a\0b", "x" * 5000, ""])
 def test_names_that_no_file_can_have(name):
     assert len(refused(name).problems) == 1
