@@ -113,6 +113,7 @@ def test_bad_choice_keeps_its_path(foreign, choice, message):
     ("group", "name", "message"),
     [
         (TRIGGERS, "periodc", r"no 'periodc' among the triggers; did you mean 'periodic'?"),
+        (TRIGGERS, "PERIODIC", r"did you mean 'periodic'?"),
         (TRIGGERS, "xyzzy", r"known: .*periodic.*send-on-delta"),
         ("zenpark.nothing", "xyzzy", "none is installed"),
     ],
@@ -168,19 +169,6 @@ def test_unusable_plug_ins_are_named_with_remedy(foreign, monkeypatch):
         f"left out: plug-in '{name}'" for name in ("function", "glider", "gone", "keeper", "misled", "misnamed")
     ] + ["left out: 'twice' among the test is ambiguous: plug-in 'twice'"]
     assert all(line.endswith("; mend or uninstall it (docs/plugins.md)") for line in lines)
-
-
-@pytest.mark.parametrize(
-    ("word", "known", "answer"),
-    [
-        ("treshold", ["threshold", "period_s"], "did you mean 'threshold'?"),
-        ("kh01", ["KH01", "CF01"], "did you mean 'KH01'?"),
-        ("zzz", ["a", "b"], "known: a, b"),
-        ("zzz", [], ""),
-    ],
-)
-def test_did_you_mean(word, known, answer):
-    assert registry.did_you_mean(word, known) == answer
 
 
 @pytest.mark.parametrize("owner", ["theirs", "zenpark"])

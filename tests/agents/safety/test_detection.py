@@ -3,8 +3,6 @@
 import math
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from agents.body.interface import RangeScan
 from agents.decision.situation import LATE_SHARE, SILENT_S, ProcessHealth
@@ -12,12 +10,7 @@ from agents.kinds.crazyflie import CRAZYFLIE
 from agents.kinds.khepera4 import KHEPERA4
 from agents.kinds.tello import TELLO
 from agents.kinds.turtlebot3 import TURTLEBOT3
-from agents.safety.detection import (
-    FOREIGN_S,
-    LOWEST_DESCENT_M_S,
-    tilt_angle,
-    tilted,
-)
+from agents.safety.detection import FOREIGN_S, LOWEST_DESCENT_M_S, tilt_angle, tilted
 from agents.safety.hazards import Cause, Outcome
 from agents.vectors import UNKNOWN, ZERO
 from tests.agents.safety.watched import DT, NAN, Watched
@@ -265,7 +258,7 @@ def test_guided_robot_waits_for_a_new_goal():
         assert held(robot, 0.1) == ticks
 
 
-# ---------------------------------------------------------------- climbing, landing, obedience
+# ---------------------------------------------------------------- climbing and landing
 
 
 def climbs(kind=CRAZYFLIE):
@@ -339,23 +332,6 @@ def test_robot_below_a_landing():
     assert robot.step().found == set()
 
 
-def run_away(robot):
-    robot.position = (robot.position[0] + 0.2 * DT, 0.0, 0.0)
-
-
-@pytest.mark.parametrize(
-    ("speed", "every_tick", "text"),
-    [
-        (0.2, None, "warn: it does not obey commands to move: 0."),
-        (0.0, run_away, "land: it moves without a command: 0."),
-    ],
-)
-def test_disobedient_wheels(speed, every_tick, text):
-    robot = Watched(KHEPERA4, hover=0.0)
-    robot.status.setpoint = (speed, 0.0, 0.0, 0.0)
-    assert robot.step(5.0, every_tick).texts[0].startswith(text)
-
-
 # ---------------------------------------------------------------- one robot
 
 
@@ -372,33 +348,3 @@ def test_disobedient_wheels(speed, every_tick, text):
 def test_tilt_is_an_angle_to_the_vertical(attitude, angle):
     assert tilted(attitude, 0.49) == (angle is not None and angle > 0.49)
     assert angle is None or tilt_angle(attitude) == pytest.approx(angle)
-
-
-number = st.one_of(st.floats(-3.0, 3.0), st.floats())
-vector = st.tuples(number, number, number)
-
-
-@settings(max_examples=40)
-@given(
-    st.sampled_from([CRAZYFLIE, TELLO, KHEPERA4]),
-    st.lists(
-        st.fixed_dictionaries(
-            {"status": st.booleans(), "setpoint": st.tuples(*[number] * 4)},
-            optional={
-                "position": vector, "velocity": vector, "yaw": number, "attitude": st.tuples(*[number] * 4),
-                "battery": number, "time": number, "ahead": number, "received": number, "flying": st.booleans(),
-                "flags": st.fixed_dictionaries({"invalid": st.booleans(), "outside": st.booleans()}),
-            },
-        ),
-        max_size=6,
-    ),
-)  # fmt: skip
-def test_any_numbers_are_judged_and_worded(kind, story):
-    robot = Watched(kind, [("B", KHEPERA4)], separation=0.4)
-    for measured in story:
-        status, robot.status.setpoint = measured.pop("status"), measured.pop("setpoint")
-        for name in ("ordered", "climbing", "landing", "unguided", "not_finite", "alone"):
-            setattr(robot.status, name, status)
-        robot.measure(**measured).step(0.35)
-        assert all(isinstance(robot.words(cause), str) for cause in robot.found)
-        assert robot.hazards.under_way or not robot.hazards.worst()

@@ -114,63 +114,40 @@ def test_robot_is_not_driven_farther_out(kind, setpoint, position, yaw, age):
 
 
 SHORT = Limits(low=LIMITS.low, high=LIMITS.high, max_goal_distance=0.1)
+K, T, V = KHEPERA4.response, TURTLEBOT3.response, TELLO.response  # [1/s]
 
 
 @pytest.mark.parametrize(
-    ("kind", "limits", "position", "setpoint", "safe"),
+    ("kind", "position", "given", "setpoint", "safe"),
     [
-        (CRAZYFLIE, ROOMY, (0.0, 0.0, 0.8), (0.1, 0.2, 0.8, 0.3), None),
-        (TELLO, ROOMY, (0.0, 0.0, 0.8), (0.2, 0.1, -0.1, 1.0), None),
-        (TELLO, ROOMY, (0.6, 0.6, 0.8), (0.2, 0.1, -0.1, 1.0), None),
-        (KHEPERA4, ROOMY, (0.0, 0.0, 0.0), (0.2, 2.0, 0.0, 0.0), None),
-        (KHEPERA4, ROOMY, (0.6, 0.6, 0.0), (0.2, 2.0, 0.0, 0.0), None),
-        (CRAZYFLIE, LIMITS, (0.0, 0.0, 2.3), (0.0, 0.0, 9.0, 0.5), (0.0, 0.0, 2.39, 0.5)),
+        (CRAZYFLIE, (0.0, 0.0, 0.8), {}, (0.1, 0.2, 0.8, 0.3), None),
+        (CRAZYFLIE, (0.0, 0.0, 2.3), {"limits": LIMITS}, (0.0, 0.0, 9.0, 0.5), (0.0, 0.0, 2.39, 0.5)),
+        (CRAZYFLIE, (0.3, 0.2, 0.8), {}, (nan, 0.0, 0.0, 0.0), (0.3, 0.2, 0.8, 0.0)),  # it stays
         # 0.5 m/s, closed at 2/s: a goal may be 0.25 m ahead
-        (CRAZYFLIE, LIMITS, (0.0, 0.0, 1.0), (0.9, 0.0, 1.0, 0.0), (0.25, 0.0, 1.0, 0.0)),
-        (CRAZYFLIE, SHORT, (0.0, 0.0, 1.0), (0.9, 0.0, 1.0, 0.0), (0.1, 0.0, 1.0, 0.0)),
-        (CRAZYFLIE, LIMITS, (0.3, 0.2, 0.8), (nan, 0.0, 0.0, 0.0), (0.3, 0.2, 0.8, 0.0)),  # it stays
-        (KHEPERA4, LIMITS, (0.0, 0.0, 0.0), (9.0, 0.0, 0.0, 0.0), (KHEPERA4.speed, 0.0, 0.0, 0.0)),
-        (TELLO, LIMITS, (0.0, 0.0, 1.0), (9.0, 0.0, 0.0, 0.0), (0.5, 0.0, 0.0, 0.0)),
-        (KHEPERA4, LIMITS, (0.97, 0.0, 0.0), (0.2, 1.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0)),
-        (KHEPERA4, LIMITS, (0.97, 0.0, 0.0), (-0.2, 1.0, 0.0, 0.0), None),  # back from beyond the margin
+        (CRAZYFLIE, (0.0, 0.0, 1.0), {"limits": LIMITS}, (0.9, 0.0, 1.0, 0.0), (0.25, 0.0, 1.0, 0.0)),
+        (CRAZYFLIE, (0.0, 0.0, 1.0), {"limits": SHORT}, (0.9, 0.0, 1.0, 0.0), (0.1, 0.0, 1.0, 0.0)),
+        (TELLO, (0.6, 0.6, 0.8), {}, (0.2, 0.1, -0.1, 1.0), None),
+        (TELLO, (0.0, 0.0, 1.0), {"limits": LIMITS}, (9.0, 0.0, 0.0, 0.0), (0.5, 0.0, 0.0, 0.0)),
+        (TELLO, (-0.5, 0.0, 1.0), {}, (1.0, 0.5, 0.0, 0.0), None),
+        (TELLO, (0.65, 0.0, 1.0), {}, (1.0, 0.5, 0.0, 0.0), (0.3 * V, 0.5, 0.0, 0.0)),
+        (TELLO, (0.65, 0.0, 1.0), {"age": 0.2}, (1.0, 0.5, 0.0, 0.0), (0.3 / (1 / V + 0.2), 0.5, 0.0, 0.0)),
+        (TELLO, (0.95, 0.0, 1.0), {}, (1.0, 0.5, 0.0, 0.0), (0.0, 0.5, 0.0, 0.0)),
+        (TELLO, (1.0, 0.0, 1.0), {}, (1.0, 0.5, 0.0, 0.0), (-0.05 * V, 0.5, 0.0, 0.0)),  # back
+        (KHEPERA4, (0.6, 0.6, 0.0), {}, (0.2, 2.0, 0.0, 0.0), None),
+        (KHEPERA4, (0.0, 0.0, 0.0), {}, (9.0, 0.0, 0.0, 0.0), (KHEPERA4.speed, 0.0, 0.0, 0.0)),
+        (KHEPERA4, (0.97, 0.0, 0.0), {}, (0.2, 1.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0)),
+        (KHEPERA4, (0.97, 0.0, 0.0), {}, (-0.2, 1.0, 0.0, 0.0), None),
+        (KHEPERA4, (0.85, 0.0, 0.0), {}, (0.2, 1.0, 0.0, 0.0), (0.1 * K, 1.0, 0.0, 0.0)),
+        (TURTLEBOT3, (0.85, 0.0, 0.0), {}, (0.2, 1.0, 0.0, 0.0), (0.1 * T, 1.0, 0.0, 0.0)),
+        (TURTLEBOT3, (0.85, 0.0, 0.0), {"yaw": pi}, (-0.2, 1.0, 0.0, 0.0), (-0.1 * T, 1.0, 0.0, 0.0)),
+        (TURTLEBOT3, (0.85, 0.0, 0.0), {"yaw": pi}, (0.2, 1.0, 0.0, 0.0), None),
+        (TURTLEBOT3, (0.85, 0.0, 0.0), {"yaw": 1.2}, (0.2, 1.0, 0.0, 0.0), None),  # along the wall
     ],
 )
-def test_setpoint_is_changed_where_it_must(kind, limits, position, setpoint, safe):
-    found, made = limited(kind, setpoint, position, limits=limits)
-    assert found == pytest.approx(safe) if safe else found == setpoint
+def test_setpoint_is_changed_where_it_must(kind, position, given, setpoint, safe):
+    found, made = limited(kind, setpoint, position, **{"limits": ROOMY, **given})
+    assert found == pytest.approx(safe, abs=1e-12) if safe else found == setpoint
     assert (made.changed, made.not_finite, made.avoided) == (safe is not None, isnan(setpoint[0]), False)
-
-
-@pytest.mark.parametrize(
-    ("x", "age", "speed"),
-    [
-        (-0.5, 0.0, 1.0),
-        (0.65, 0.0, 0.3 * TELLO.response),
-        (0.95, 0.0, 0.0),
-        (1.0, 0.0, -0.05 * TELLO.response),  # back
-        (0.65, 0.2, 0.3 / (1.0 / TELLO.response + 0.2)),  # it may have come nearer since
-    ],
-)
-def test_velocities_close_in_on_a_wall(x, age, speed):
-    (found, *_), _ = limited(TELLO, (1.0, 0.5, 0.0, 0.0), (x, 0.0, 1.0), age=age, limits=ROOMY)
-    assert found == pytest.approx(speed, abs=1e-12)
-
-
-@pytest.mark.parametrize("kind", [KHEPERA4, TURTLEBOT3], ids=lambda kind: kind.name)
-@pytest.mark.parametrize(
-    ("x", "yaw", "v", "share"),  # of the response
-    [
-        (0.85, 0.0, 0.2, 0.1),
-        (0.85, pi, 0.2, None),
-        (0.85, pi, -0.2, -0.1),
-        (0.85, 1.2, 0.2, None),
-        (0.96, 0.0, 0.2, 0.0),
-    ],
-    ids=["ahead", "away", "backward", "along", "beyond"],
-)
-def test_wheels_slow_down_toward_a_wall(kind, x, yaw, v, share):
-    (found, *_), _ = limited(kind, (v, 1.0, 0.0, 0.0), (x, 0.0, 0.0), yaw=yaw, limits=ROOMY)
-    assert found == (v if share is None else pytest.approx(share * kind.response))
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
