@@ -96,11 +96,6 @@ def test_twins_share_one_body():
     assert isinstance(both, TwinBody)
 
 
-def test_an_unknown_body_is_named():
-    with pytest.raises(registry.UnknownPlugin, match="hovercraft"):
-        assemble(request("hovercraft://1"))
-
-
 class Inspected(Recorded):
     """A body that knows the firmware of its rows."""
 

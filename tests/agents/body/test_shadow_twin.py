@@ -34,20 +34,13 @@ def differences(body, duration, speed=0.5):
     return ahead
 
 
-def test_faster_twin_runs_ahead_until_put_back():
-    body, _, twin = beside(restart=1.0, share=1.1)
+@pytest.mark.parametrize(("restart", "placed"), [(1.0, [0.0, 0.1, 1.1, 2.1]), (inf, [0.0, 0.1])])
+def test_faster_twin_runs_ahead_until_put_back(restart, placed):
+    body, _, twin = beside(restart=restart, share=1.1)
     ahead = differences(body, 3.05)
-    # driven at 0, seen to be driven at 0.1, and put back 1 s and 2 s after that
-    since = [max(k - 1, 0) % 10 * DT for k in range(31)]
-    assert ahead == pytest.approx([0.05 * seconds for seconds in since], abs=1e-12)
-    assert [at for at, *_ in twin.placed] == [0.0, 0.1, 1.1, 2.1]
-
-
-def test_once_is_when_it_is_first_driven():
-    body, _, twin = beside(share=1.1)
-    ahead = differences(body, 3.05)
-    assert ahead == pytest.approx([0.05 * max(k - 1, 0) * DT for k in range(31)], abs=1e-12)
-    assert [at for at, *_ in twin.placed] == [0.0, 0.1]
+    assert [at for at, *_ in twin.placed] == placed  # driven at 0, seen to be driven at 0.1
+    since = [k * DT - max((at for at in placed if at < k * DT + 1e-9), default=0.0) for k in range(31)]
+    assert ahead == pytest.approx([0.05 * max(seconds, 0.0) for seconds in since], abs=1e-12)
 
 
 def test_twin_takes_measured_place_and_speed():
@@ -110,10 +103,16 @@ def test_it_waits_for_a_pose_that_is_fresh():
     assert len(twin.placed) == 1
 
 
-@pytest.mark.parametrize("what", ["open", "read", "place", "command", "takeoff", "land", "stop", "close"])
-def test_failing_twin_is_left_alone(what):
+METHODS = ("open", "read", "place", "command", "takeoff", "land", "stop", "close")
+FAILURES = (AssertionError, MemoryError, StopIteration, SystemError, Exception)
+
+
+@pytest.mark.parametrize(
+    ("what", "failure"), [(what, BodyError) for what in METHODS] + [("command", failure) for failure in FAILURES]
+)
+def test_failing_twin_is_left_alone(what, failure):
     body, robot, twin = beside()
-    twin.broken = what
+    twin.broken, twin.failure = what, failure
     body.open()
     plain = [robot.read(k * DT)[0].position for k in range(3)]
     robot.t, robot.x[0] = 0.0, 0.0
@@ -128,17 +127,8 @@ def test_failing_twin_is_left_alone(what):
     body.close()
     assert robot.told == ["open", ("takeoff", [0], [1.0]), ("land", [0]), ("stop", [0]), ("command", [0.0]), "close"]
     if what != "close":
-        assert state.note == "its shadow failed: BodyError: no engine"
+        assert state.note == f"its shadow failed: {failure.__name__}: no engine"
         assert state.shadow_position is UNKNOWN
-
-
-@pytest.mark.parametrize("failure", [AssertionError, MemoryError, StopIteration, SystemError, Exception])
-def test_shadow_failures_of_any_kind_stay_without_effect(failure):
-    body, _, twin = beside()
-    twin.broken, twin.failure = "command", failure
-    body.read(0.0)
-    body.command(speeds(1.0))
-    assert body.read(DT)[0].note == f"its shadow failed: {failure.__name__}: no engine"
 
 
 def test_note_of_the_robot_is_kept():

@@ -61,8 +61,9 @@ class Life:
             "takeoff": self.life.takeoff,
             "start": lambda: self.life.start(self.t + 0.3),
             "start late": lambda: self.life.start(self.t - 0.5),
-            "land": lambda: self.life.land("told to"),
-            "stop": lambda: self.life.stop("told to"),
+            "land": lambda: self.life.land("land"),
+            "land again": lambda: self.life.land("again"),
+            "stop": lambda: self.life.stop("stop"),
             "nothing": str,
         }
         return orders[order]() or ""
@@ -149,32 +150,22 @@ def test_start_in_the_past_joins_or_lands():
     assert late.until(DONE).life.reason == "finished"
 
 
-@pytest.mark.parametrize("order", ["land", "stop"])
-def test_order_in_the_tick_of_take_off(order):
-    robot = ready()
-    robot.life.takeoff()
-    robot.order(order)
+@pytest.mark.parametrize(
+    ("phase", "orders", "told", "reason"),
+    [
+        (READY, ["takeoff", "land"], ["land"], "land"),  # in one tick
+        (READY, ["takeoff", "stop"], ["stop"], "stop"),
+        (AIRBORNE, ["land", "stop"], ["takeoff", "stop"], "stop"),
+        (AIRBORNE, ["land", "land again"], ["takeoff", "land"], "land"),
+    ],
+)
+def test_orders_in_one_tick(phase, orders, told, reason):
+    robot = airborne() if phase == AIRBORNE else ready()
+    for order in orders:
+        robot.order(order)
     robot.step()
-    robot.step()
-    assert robot.told == [order]
-    assert not robot.flying
-    assert robot.life.phase == DONE
-
-
-def test_stop_in_the_tick_of_landing():
-    robot = airborne()
-    robot.life.land("ordered to land")
-    robot.life.stop("ordered to stop")
-    robot.step()
-    assert robot.told == ["takeoff", "stop"]
-
-
-def test_second_landing_keeps_the_first_reason():
-    robot = airborne()
-    robot.life.land("first")
-    robot.life.land("second")
-    assert robot.until(DONE).life.reason == "first"
-    assert robot.told == ["takeoff", "land"]
+    robot.until(DONE)
+    assert (robot.told, robot.flying, robot.life.reason) == (told, False, reason)
 
 
 @pytest.mark.parametrize(

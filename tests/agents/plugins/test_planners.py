@@ -63,36 +63,41 @@ def test_speed_is_no_larger_than_needed(plan):
     assert dist(first, second) / dt == pytest.approx(planner.speed(), rel=1e-6)
 
 
-def test_line_ends_exactly_and_stays():
-    line, length = Line(move_by=[0.3, -0.4, 0.1], speed_=0.1, yaw=0.5), sqrt(0.26)
-    for elapsed, share in ((0.0, 0.0), (0.5 * length / 0.1, 0.5), (length / 0.1, 1.0), (1e6, 1.0)):
-        *place, yaw = line.target(elapsed, (1.0, 2.0, 3.0), 0.0)
-        assert place == pytest.approx([1.0 + 0.3 * share, 2.0 - 0.4 * share, 3.0 + 0.1 * share], abs=1e-12)
-        assert yaw == 0.5 if share == 1.0 else isnan(yaw)
+LINE, SQUARE = Line(move_by=[0.3, -0.4, 0.1], speed_=0.1, yaw=0.5), [[1.0, 0.0], [1.0, 1.0], [0.0, 1.0], [0.0, 0.0]]
+LENGTH_S = sqrt(0.26) / 0.1  # duration of the line
 
 
-def test_plans_that_stand():
+@pytest.mark.parametrize(
+    ("planner", "anchor", "path"),
+    [
+        (LINE, (1.0, 2.0, 3.0), {0.0: (1.0, 2.0, 3.0), 0.5 * LENGTH_S: (1.15, 1.8, 3.05), LENGTH_S: (1.3, 1.6, 3.1)}),
+        (LINE, (1.0, 2.0, 3.0), {1e6: (1.3, 1.6, 3.1)}),
+        (
+            Waypoints(points=[[1.0, 0.0], [1.0, 2.0], [0.0, 2.0, 1.0]], speed_=0.5),
+            ORIGIN,
+            {2.0: (1.0, 0.0, 0.0), 6.0: (1.0, 2.0, 0.0), 6.0 + sqrt(8.0): (0.0, 2.0, 1.0), 99.0: (0.0, 2.0, 1.0)},
+        ),
+        (  # one lap is 4 m: eight seconds
+            Waypoints(points=SQUARE, speed_=0.5, loop=True),
+            (2.0, 0.0, 0.3),
+            {**dict.fromkeys((2.0, 10.0, 26.0), (1.0, 0.0, 0.3)), 9.99: (0.995, 0.0, 0.3), 10.01: (1.0, 0.005, 0.3)},
+        ),
+        (Circle(radius=0.5, period_s=4.0, turns=0.5), ORIGIN, dict.fromkeys((2.0, 50.0), (0.0, 1.0, 0.0))),
+        (Lemniscate(size=0.5, period_s=8.0), (0.2, 0.1, 0.8), dict.fromkeys((0.0, 4.0, 8.0), (0.2, 0.1, 0.8))),
+    ],
+    ids=["line", "after it", "waypoints", "loop", "half circle", "lemniscate"],
+)
+def test_known_places_of_a_plan(planner, anchor, path):
+    for elapsed, place in path.items():
+        assert planner.target(elapsed, anchor, 0.0)[:3] == pytest.approx(place, abs=1e-12)
+
+
+def test_yaws_and_plans_that_stand():
     anchor = (1.0, 2.0, 0.7)
+    assert [LINE.target(t, anchor, 0.0)[3] for t in (0.0, LENGTH_S, 1e6)] == pytest.approx([nan, 0.5, 0.5], nan_ok=True)
     assert Line(move_by=[0.0, 0.0], speed_=1.0, yaw=2.0).target(0.0, anchor, 0.0) == (*anchor, 2.0)
     assert Hold(at=[0.0, 0.5], yaw=0.3).target(0.0, anchor, 0.0) == (0.0, 0.5, 0.7, 0.3)
     assert Hold(at=[0.0, 0.5]).speed() == 0.0
-
-
-def test_waypoints_pass_at_constant_speed():
-    plan = Waypoints(points=[[1.0, 0.0], [1.0, 2.0], [0.0, 2.0, 1.0]], speed_=0.5)
-    found = places(plan, (2.0, 6.0, 6.0 + sqrt(2) / 0.5, 99.0))
-    wanted = [(1, 0, 0), (1, 2, 0), (0, 2, 1), (0, 2, 1)]
-    assert all(place == pytest.approx(there, abs=1e-12) for place, there in zip(found, wanted, strict=True))
-
-
-def test_waypoints_loop_without_the_approach():
-    plan = Waypoints(points=[[1.0, 0.0], [1.0, 1.0], [0.0, 1.0], [0.0, 0.0]], speed_=0.5, loop=True)
-    anchor = (2.0, 0.0, 0.3)
-    for place in places(plan, (2.0, 10.0, 18.0, 26.0), anchor):  # one lap is 4 m: eight seconds
-        assert place == pytest.approx((1.0, 0.0, 0.3), abs=1e-12)
-    before, after = places(plan, (9.99, 10.01), anchor)
-    assert before == pytest.approx((0.995, 0.0, 0.3), abs=1e-12)
-    assert after == pytest.approx((1.0, 0.005, 0.3), abs=1e-12)
 
 
 @pytest.mark.parametrize(("radius", "side"), [(0.6, 1.0), (-0.4, -1.0)])
@@ -109,18 +114,10 @@ def test_circle_leaves_along_the_heading(radius, side):
     assert (y * cos(heading) - x * sin(heading)) * side > 0.0
 
 
-def test_circle_ends_after_its_turns():
-    for place in places(Circle(radius=0.5, period_s=4.0, turns=0.5), (2.0, 50.0)):
-        assert place == pytest.approx((0.0, 1.0, 0.0), abs=1e-12)
-
-
-def test_lemniscate_crosses_its_centre_twice():
-    plan, anchor = Lemniscate(size=0.5, period_s=8.0), (0.2, 0.1, 0.8)
-    for place in places(plan, (0.0, 4.0, 8.0), anchor, 0.7):
-        assert place == pytest.approx(anchor, abs=1e-12)
-    dense = places(plan, [0.01 * k for k in range(801)], anchor, 0.7)
-    assert max(dist(place, anchor) for place in dense) == pytest.approx(0.5, abs=1e-9)
-    assert atan2(dense[1][1] - anchor[1], dense[1][0] - anchor[0]) == pytest.approx(0.7, abs=1e-2)
+def test_lemniscate_leaves_along_the_heading():
+    path = places(Lemniscate(size=0.5, period_s=8.0), [0.01 * k for k in range(801)], heading=0.7)
+    assert max(dist(place, ORIGIN) for place in path) == pytest.approx(0.5, abs=1e-9)
+    assert atan2(path[1][1], path[1][0]) == pytest.approx(0.7, abs=1e-2)
 
 
 @pytest.mark.parametrize(
