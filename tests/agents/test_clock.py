@@ -1,7 +1,6 @@
-"""One clock for everybody: what a neighbour whose clock is 0.2 s ahead does to a listener, and what sets it right."""
+"""One clock for everybody: read once, shared by the processes of a machine, and slewed."""
 
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,63 +8,33 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from agents.clock import SLEW, STEP_S, Clock, correction_line, uptime
-from agents.decision.neighbours import Incoming, Neighbours
-from agents.kinds.khepera4 import KHEPERA4
-from agents.plugins.predictors import HOLD, ConstantVelocity, Predictor
 from experiments.real_time.hosts.launcher import Launcher
-
-AHEAD_S = 0.2
-SPEED = 0.3  # [m/s] of a neighbour along x
-T = 5.0  # [s] it is heard the moment it speaks,
-LATER = 1.0  # [s] and believed to be somewhere this much later
+from tests.commands import ROOT
 
 
-def misbelieved(stamp: float, predictor: Predictor) -> float:
-    """How far the listener's belief is from that by a right stamp [m]."""
-    return abs(believed(stamp, predictor) - believed(T, predictor))
+class Machine:
+    """Clocks of a machine: the wall clock, and those that go on or stand while it sleeps [s]."""
 
-
-def believed(stamp: float, predictor: Predictor) -> float:
-    """Where along x the listener believes the neighbour to be [m]."""
-    neighbours = Neighbours([Incoming(0, "B", KHEPERA4, 0.5)], 1.0)
-    neighbours.mark_alive(0)
-    neighbours.receive(0, (SPEED * T, 0.0, 0.0), (SPEED, 0.0, 0.0), stamp, T)
-    return neighbours.all[0].place(predictor, T + LATER)[0]
-
-
-def test_wrong_clock_moves_predicted_neighbours():
-    assert misbelieved(T + AHEAD_S, HOLD) == 0.0, "who holds the last pose does not look at its age"
-    assert misbelieved(T + AHEAD_S, ConstantVelocity()) == pytest.approx(SPEED * AHEAD_S)
-    assert misbelieved(T - AHEAD_S, ConstantVelocity()) == pytest.approx(SPEED * AHEAD_S)
-
-
-def test_corrected_where_stamps_are_made_it_moves_nobody(monkeypatch):
-    now = time.time()
-    monkeypatch.setattr(time, "time", lambda: now + AHEAD_S)
-    monkeypatch.setattr(time, "clock_gettime", lambda _clock: 7.0)
-    assert Clock().utc() == pytest.approx(now + AHEAD_S, abs=1e-6)
-    clock = Clock(-AHEAD_S)
-    assert misbelieved(T + clock.utc() - now, ConstantVelocity()) < 1e-6
+    def __init__(self, monkeypatch):
+        self.wall, self.up = 1000.0, {time.CLOCK_BOOTTIME: 50.0, time.CLOCK_MONOTONIC: 5.0}
+        monkeypatch.setattr(time, "time", lambda: self.wall)
+        monkeypatch.setattr(time, "clock_gettime", lambda clock: self.up[clock])
 
 
 def test_step_of_the_wall_clock_moves_nothing(monkeypatch):
-    wall, steady = 1000.0, 5.0
-    monkeypatch.setattr(time, "time", lambda: wall)
-    monkeypatch.setattr(time, "clock_gettime", lambda _clock: steady)
+    machine = Machine(monkeypatch)
     clock = Clock(0.5)
-    wall, steady = 1000.0 - 3600.0, 7.0
-    assert clock.utc() == clock.at(7.0) == 1002.5
-    assert clock.at(4.0) == 999.5
+    machine.wall -= 3600.0
+    machine.up[time.CLOCK_BOOTTIME] = 52.0
+    assert clock.utc() == clock.at(52.0) == 1002.5
+    assert clock.at(49.0) == 999.5
 
 
 def test_clock_goes_on_while_machine_sleeps(monkeypatch):
-    up = {time.CLOCK_BOOTTIME: 50.0, time.CLOCK_MONOTONIC: 5.0}
-    monkeypatch.setattr(time, "clock_gettime", up.__getitem__)
-    monkeypatch.setattr(time, "monotonic", lambda: up[time.CLOCK_MONOTONIC])
+    machine = Machine(monkeypatch)
     clock = Clock()
-    before = clock.utc()
-    up[time.CLOCK_BOOTTIME] += 3600.0
-    assert clock.utc() - before == 3600.0
+    machine.up[time.CLOCK_BOOTTIME] += 3600.0
+    assert clock.utc() == 1000.0 + 3600.0
 
 
 # of reports, figures and the live view: no robot moves by them
@@ -80,15 +49,12 @@ DATES = {
 
 
 def test_no_process_reads_the_wall_clock_itself():
-    root = Path(__file__).resolve().parents[2]
-    readers = {
-        file: [line.strip() for line in file.read_text().splitlines() if "time.time" in line]
-        for folder in ("agents", "bridges", "twins", "experiments")
-        for file in sorted((root / folder).rglob("*.py"))
-        if file.relative_to(root).as_posix() not in DATES
-    }
-    once = [line for lines in readers.values() for line in lines if "= time.time() - " not in line]
-    assert once == []
+    found = []
+    for folder in ("agents", "bridges", "twins", "experiments"):
+        for file in (ROOT / folder).rglob("*.py"):
+            if file.relative_to(ROOT).as_posix() not in DATES:
+                found += [line for line in file.read_text().splitlines() if "time.time" in line]
+    assert [line for line in found if "= time.time() - " not in line] == []
 
 
 def test_later_process_reads_the_same_clock(tmp_path, monkeypatch):

@@ -10,17 +10,25 @@ from agents.runtime.orders import carry_out
 from experiments.definition.experiment import Formation, LegTable, RobotTable, Start
 from experiments.definition.plan import Plan
 from tests.agents.bench import Bench
-from tests.agents.few import pair, triangle
 from tests.agents.swarm import Swarm
+from tests.small import PERIODIC, pair, small, triangle
 
 HERE = (-0.4, 0.0, 0.0)
-
-# ---------------------------------------------------------------- received poses
+LINE = {"kind": "line", "move_by": [0.3, 0.0], "speed": 0.1}
 
 
 def alone(experiment=None):
     """The decision of A; B is on link 0."""
     return Bench(Plan(experiment or pair()).assignment("A"), HERE)
+
+
+def followed(kind="khepera4", distance=0.5, **parts):
+    """L at the origin, and F behind it, which follows it."""
+    robots = {"L": kind, "F": RobotTable(kind="khepera4", start=[-0.5, 0.0])}
+    return Swarm(small(robots, {"L > F": distance}, **{"trigger": PERIODIC, "duration_s": 60.0, **parts}))
+
+
+# ---------------------------------------------------------------- received poses
 
 
 def test_older_samples_are_left_out():
@@ -31,12 +39,6 @@ def test_older_samples_are_left_out():
     assert (sender.position, sender.stamp) == ((1.0, 0.0, 0.0), 2.0)
     bench.hear(0, (0.5, 0.0, 0.0), stamp=2.5)
     assert (sender.position, sender.stamp) == ((0.5, 0.0, 0.0), 2.5)
-
-
-def test_nothing_is_known_of_unreceived_robots():
-    (sender,) = Swarm(pair(), [["A"]]).robot("A").neighbours.all
-    assert sender.position[0] != sender.position[0]
-    assert (sender.stamp, sender.arrival) == (-inf, -inf)
 
 
 def test_missing_neighbour_is_named():
@@ -69,41 +71,33 @@ def test_unknown_position_is_not_transmitted():
     bench.step()
     bench.position = HERE
     assert bench.step().said == []  # asked on every second tick
-    bench.step()
-    assert bench.said == [0.02]
+    assert bench.step().said == [0.02]
 
 
 # ---------------------------------------------------------------- neighbours that go and come back
 
 
-def active(swarm, name="A"):
-    """Senders that enter the law of a robot."""
-    return [sender.name for sender in swarm.robot(name).neighbours.all if sender.active]
-
-
 def test_lost_neighbour_is_left_out_until_found():
     swarm = Swarm(triangle()).running().run(0.5)
-    assert active(swarm) == ["B", "C"]
+    robot = swarm.robot("A")
+
+    def active():
+        return "".join(sender.name for sender in robot.neighbours.all if sender.active)
+
     swarm.lose("B", "A")
     swarm.run(1.0)
-    assert active(swarm) == ["B", "C"]
+    assert active() == "BC"
     swarm.run(0.02)
-    assert active(swarm) == ["C"]
-    assert swarm.robot("A").missing_neighbours() == ["B"]
+    assert active() == "C"
+    assert robot.missing_neighbours() == ["B"]
     before = swarm.last("A", "goal")
+    swarm.muted.clear()  # no pose brings it back
     assert swarm.run(0.1).last("A", "goal") != before  # it still follows C
+    assert robot.neighbours.all[0].arrival > swarm.t - 0.03
+    assert active() == "C"
     swarm.find("B", "A")
     swarm.step()
-    assert active(swarm) == ["B", "C"]
-
-
-def test_pose_does_not_bring_a_neighbour_back():
-    swarm = Swarm(triangle()).running().run(0.5)
-    swarm.lose("B", "A", since=5.0)
-    swarm.muted.clear()
-    swarm.run(0.04)
-    assert swarm.robot("A").neighbours.all[0].arrival > swarm.t - 0.03
-    assert active(swarm) == ["C"]
+    assert active() == "BC"
 
 
 def test_unreceived_neighbour_hides_no_lost_one():
@@ -121,42 +115,36 @@ def test_unreceived_neighbour_hides_no_lost_one():
     assert bench.robot.goal == HERE  # alone: it holds
 
 
-def test_robot_alone_holds_its_place():
-    swarm = Swarm(pair()).running().run(0.5)
-    moving = swarm.last("A", "goal")
-    swarm.lose("B", "A")
-    held = swarm.run(1.2).last("A", "goal")
-    assert held != moving
-    assert swarm.run(1.0).last("A", "goal") == held
-    assert dist(swarm.last("A", "truth"), held) < 0.02
-    swarm.find("B", "A")
-    assert swarm.run(0.2).last("A", "goal") != held
-
-
-def test_robot_without_router_holds_and_goes_on():
+@pytest.mark.parametrize("what", ["neighbour", "router"])
+def test_robot_alone_or_offline_holds_and_goes_on(what):
     swarm = Swarm(pair()).running().run(0.5)
     health = swarm.robot("A").health
-    health.offline_since = swarm.t
-    busy = swarm.run(1.0).last("A", "goal")
-    held = swarm.run(0.2).last("A", "goal")
+    if what == "neighbour":
+        swarm.lose("B", "A")
+    else:
+        health.offline_since = swarm.t
+    busy = swarm.run(0.9).last("A", "goal")
+    held = swarm.run(0.3).last("A", "goal")
     assert held != busy
-    assert swarm.run(0.5).last("A", "goal") == held
+    assert swarm.run(1.0).last("A", "goal") == held
+    assert dist(swarm.last("A", "truth"), held) < 0.02
+    if what == "neighbour":
+        swarm.find("B", "A")
     health.offline_since = inf
     assert swarm.run(0.2).last("A", "goal") != held
 
 
 def test_swapped_robots_are_refused():
     """Each stands where the other one begins: neither takes off, and each names the mistake."""
-    places = {"A": (0.15, 0.0, 0.0), "B": (-0.1, 0.0, 0.0)}
-    robots = {"A": RobotTable(kind="khepera4", start=[-0.1, 0.0]), "B": RobotTable(kind="khepera4", start=[0.15, 0.0])}
-    swarm = Swarm(pair(robots=robots))
-    for name, place in places.items():
-        swarm.spoil(name, lambda state, place=place: setattr(state, "position", place))
+    swarm = Swarm(small({"A": "khepera4", "B": RobotTable(kind="khepera4", start=[0.25, 0.0])}, {"A - B": 0.5}))
+    for name, x in (("A", 0.25), ("B", 0.0)):
+        swarm.spoil(name, lambda state, x=x: setattr(state, "position", (x, 0.0, 0.0)))
     swarm.run(1.0)
-    for name, other in (("A", "B"), ("B", "A")):
+    for name, other in ("AB", "BA"):
         life = swarm.robot(name).lifecycle
-        assert life.phase == IDLE
-        assert life.reason == f"it stands where {other} begins: addresses or markers are swapped"
+        assert (life.phase, life.reason) == (
+            IDLE, f"it stands where {other} begins: addresses or markers are swapped",
+        )  # fmt: skip
         assert life.takeoff()
 
 
@@ -179,18 +167,17 @@ def test_hold_and_start_again():
 
 
 def test_leader_goes_where_it_is_sent():
-    robots = {"L": RobotTable(kind="khepera4", start=[0.0, 0.0]), "F": RobotTable(kind="khepera4", start=[-0.5, 0.0])}
-    swarm = Swarm(pair(robots=robots, formation=Formation(links={"L > F": 0.5})))
+    swarm = followed()
     leader, order = swarm.robot("L"), Order("go", goal=(0.2, 0.1))
     assert "cannot go anywhere while idle" in carry_out(leader, order, 0.0, 0.0)[0]
     swarm.running()
-    for wrong, why in (
-        (Order("go", goal=(9.0, 0.0)), "outside the arena"),
-        (Order("go"), "needs a `goal`"),
-        (Order("go", goal=(nan, 0.0)), "needs a `goal`"),
+    for name, wrong, why in (
+        ("L", Order("go", goal=(9.0, 0.0)), "outside the arena"),
+        ("L", Order("go"), "needs a `goal`"),
+        ("L", Order("go", goal=(nan, 0.0)), "needs a `goal`"),
+        ("F", order, "only a leader"),
     ):
-        assert why in carry_out(leader, wrong, swarm.t, 0.0)[0]
-    assert "only a leader" in carry_out(swarm.robot("F"), order, swarm.t, 0.0)[0]
+        assert why in carry_out(swarm.robot(name), wrong, swarm.t, 0.0)[0]
     assert carry_out(leader, order, swarm.t, 0.0) == ("", None)
     gone = dist(swarm.run(0.5).last("L", "goal"), (0.0, 0.0, 0.0))
     assert 0.0 < gone < 0.5 * 0.5 * 0.28  # it goes at half its speed, not at once
@@ -228,30 +215,20 @@ def test_steps_of_goals_are_clamped():
     assert max(abs(a - b) for a, b in zip(goal, place, strict=True)) < 0.075
 
 
-@pytest.mark.parametrize("kind", ["khepera4", "crazyflie", "tello"])
-def test_leader_follows_its_plan(kind):
-    hover = None if kind == "khepera4" else 0.6
-    robots = {
-        "L": RobotTable(kind=kind, start=[0.0, 0.0], hover=hover),
-        "F": RobotTable(kind="khepera4", start=[-0.5, 0.0]),
-    }
-    plan = {"kind": "line", "move_by": [0.3, 0.0], "speed": 0.1}
-    legs = [LegTable(at_s=1.0, robot="L", plan=plan)]
-    swarm = Swarm(pair(robots=robots, formation=Formation(links={"L > F": 0.8}), timeline=legs)).running()
-    begin = swarm.last("L", "goal")
-    assert begin == pytest.approx((0.0, 0.0, hover or 0.0), abs=1e-9)
+@pytest.mark.parametrize(("kind", "height"), [("khepera4", 0.0), ("crazyflie", 0.5), ("tello", 0.5)])
+def test_leader_follows_its_plan(kind, height):
+    swarm = followed(kind, 0.8, timeline=[LegTable(at_s=1.0, robot="L", plan=LINE)]).running()
+    assert swarm.last("L", "goal") == pytest.approx((0.0, 0.0, height), abs=1e-9)
     for seconds, way, slack in ((1.0, 0.0, 1e-9), (2.0, 0.2, 0.0101), (6.0, 0.3, 1e-9)):
-        goal = swarm.run(seconds).last("L", "goal")
-        assert goal == pytest.approx((begin[0] + way, *begin[1:]), abs=slack)
-    assert swarm.last("L", "truth") == pytest.approx((begin[0] + 0.3, *begin[1:]), abs=0.006)
+        assert swarm.run(seconds).last("L", "goal") == pytest.approx((way, 0.0, height), abs=slack)
+    assert swarm.last("L", "truth") == pytest.approx((0.3, 0.0, height), abs=0.006)
 
 
 @pytest.mark.slow
 def test_follower_with_a_plan_is_pulled_by_both():
-    robots = {"L": RobotTable(kind="khepera4", start=[0.0, 0.0]), "F": RobotTable(kind="khepera4", start=[-0.5, 0.0])}
-    formation = Formation(links={"L > F": 0.5}, tracking_gain=3.0)
     legs = [LegTable(at_s=0.0, robot="F", plan={"kind": "hold", "at": [0.0, 0.5]})]
-    place = Swarm(pair(robots=robots, formation=formation, timeline=legs)).running().run(40.0).last("F", "truth")
+    swarm = followed(formation=Formation(links={"L > F": 0.5}, tracking_gain=3.0), timeline=legs)
+    place = swarm.running().run(40.0).last("F", "truth")
     assert dist(place, (0.0, 0.5, 0.0)) < 0.2  # the pull ends with the third power of what is left
     assert dist(place, (0.0, 0.0, 0.0)) == pytest.approx(0.5, abs=0.02)
 
@@ -262,11 +239,8 @@ def test_robot_without_links_and_plan_stays():
 
 
 def test_late_robot_joins_its_plan():
-    plan = {"kind": "line", "move_by": [0.3, 0.0], "speed": 0.1}
-    robots = {"L": RobotTable(kind="khepera4", start=[0.0, 0.0])}
-    swarm = Swarm(pair(robots=robots, formation=Formation(), timeline=[LegTable(at_s=1.0, robot="L", plan=plan)]))
-    swarm.run(0.05)
-    robot = swarm.robot("L")
+    swarm = Swarm(small({"L": "khepera4"}, timeline=[LegTable(at_s=1.0, robot="L", plan=LINE)]))
+    robot = swarm.run(0.05).robot("L")
     robot.lifecycle.takeoff()
     swarm.run(0.05)
     assert swarm.phase("L") == AIRBORNE

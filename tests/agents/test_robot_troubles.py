@@ -5,15 +5,18 @@ from math import dist, inf, isfinite, isnan, nan
 
 import pytest
 
+from agents.body.limits import Safety
 from agents.decision.lifecycle import AIRBORNE, DONE, IDLE, LANDING, READY, RUNNING, Phase
 from agents.plugins.laws import Distance
 from agents.safety.hazards import Cause
 from agents.vectors import NO_SETPOINT, UNKNOWN
-from experiments.definition.experiment import Experiment, Formation, RobotTable
+from experiments.definition.experiment import Formation, RobotTable
 from experiments.definition.plan import Plan
-from tests.agents.few import drone, pair
-from tests.agents.swarm import Swarm, changed
+from tests.agents.few import drone
+from tests.agents.swarm import Swarm
+from tests.small import pair, small
 
+STILL = (0.0, 0.0, 0.0, 0.0)
 LOST = {
     "nowhere": lambda state: setattr(state, "position", UNKNOWN),
     "half": lambda state: setattr(state, "position", (nan, *state.position[1:])),
@@ -83,25 +86,19 @@ def test_blind_drone_lands(what, moment):
 def test_blind_wheels_stop_and_go_on(what):
     swarm = Swarm(pair()).running().run(0.5)
     swarm.spoil("A", frozen(swarm.t) if what == "old" else LOST[what])
+    if what == "old":
+        assert isfinite(swarm.run(0.4).robot("A").error)
     swarm.run(1.0)
+    assert isnan(swarm.robot("A").error)
+    assert isfinite(swarm.robot("B").error)
     assert swarm.phase("A") == RUNNING
-    assert swarm.last("A", "setpoint") == (0.0, 0.0, 0.0, 0.0)
+    assert swarm.last("A", "setpoint") == STILL
     swarm.spoil("A", None)
     assert any(swarm.run(0.3).last("A", "setpoint"))
 
 
-def test_wheels_with_an_old_position_know_no_error():
-    swarm = Swarm(pair()).running().run(0.3)
-    swarm.spoil("A", frozen(swarm.t))
-    swarm.run(0.4)
-    assert isfinite(swarm.robot("A").error)
-    swarm.run(0.3)
-    assert isnan(swarm.robot("A").error)
-    assert isfinite(swarm.robot("B").error)
-
-
 def test_followers_of_blind_wheels_stop():
-    robots = {"A": RobotTable(kind="khepera4", start=[-1.5, 0.0]), "B": RobotTable(kind="khepera4", start=[-1.0, 0.0])}
+    robots = {name: RobotTable(kind="khepera4", start=[x, 0.0]) for name, x in (("A", -1.5), ("B", -1.0))}
     shape = Formation(links={"B > A": 0.5})
     swarm = Swarm(pair(robots=robots, formation=shape, prediction={"kind": "constant-velocity"})).running()
     assert swarm.robot("B").go((1.5, 0.0), swarm.t) == ""
@@ -114,12 +111,21 @@ def test_followers_of_blind_wheels_stop():
 # ---------------------------------------------------------------- positions that jump
 
 
-def test_wheels_that_jumped_hold_until_started():
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (shifted(0.5, 0.3), "it jumped by 0.58 m"),
+        (lambda state: setattr(state, "yaw", state.yaw + 1.2), "its yaw jumped by 1.2"),
+    ],
+    ids=["place", "yaw"],
+)
+def test_wheels_that_jumped_hold_until_started(change, text):
     swarm = Swarm(pair()).running().run(0.5)
-    swarm.spoil("A", shifted(0.5, 0.3))
+    swarm.spoil("A", change)
     swarm.run(0.5)
-    assert Cause.POSITION in cause(swarm, "A")
-    assert swarm.last("A", "setpoint") == (0.0, 0.0, 0.0, 0.0)
+    (incident,) = [each for each in swarm.robot("A").hazards.incidents if text in each.text]
+    assert incident.cause == Cause.POSITION
+    assert swarm.last("A", "setpoint") == STILL
     assert swarm.phase("A") == RUNNING
     assert not swarm.robot("A").resume()
     assert any(swarm.run(1.0).last("A", "setpoint"))
@@ -170,14 +176,6 @@ def test_jumped_wheels_lead_nobody_astray():
     texts = told(swarm, 20.0)
     assert all(dist(swarm.last(name, "truth"), before[name]) < 0.01 for name in "AB")
     assert texts == {"A": ["hold: its own position is lost: it jumped by 1.00 m"], "B": []}
-
-
-def test_wheels_whose_yaw_jumps_stand():
-    swarm = Swarm(pair()).running().run(0.5)
-    swarm.spoil("A", lambda state: setattr(state, "yaw", state.yaw + 1.2))
-    swarm.run(1.0)
-    assert any("its yaw jumped by 1.2" in each.text for each in swarm.robot("A").hazards.incidents)
-    assert swarm.last("A", "setpoint") == (0.0, 0.0, 0.0, 0.0)
 
 
 def test_refused_external_positions():
@@ -231,7 +229,7 @@ def test_stopped_motors_end_commands():
 
 def test_dead_wheels_are_found():
     swarm = Swarm(pair()).running()
-    (group, row), place = swarm.where["A"], swarm.last("A", "position")
+    place = swarm.last("A", "position")
 
     def dead(state):
         state.position, state.velocity = place, (0.0, 0.0, 0.0)
@@ -239,8 +237,8 @@ def test_dead_wheels_are_found():
     swarm.spoil("A", dead)
     swarm.run(10.0)
     assert Cause.UNRESPONSIVE in cause(swarm, "A")
-    assert group.robots[row].lifecycle.phase in (RUNNING, LANDING, DONE)
-    assert swarm.last("A", "setpoint") == (0.0, 0.0, 0.0, 0.0) or swarm.phase("A") == RUNNING
+    assert swarm.phase("A") in (RUNNING, LANDING, DONE)
+    assert swarm.last("A", "setpoint") == STILL or swarm.phase("A") == RUNNING
 
 
 def test_stubborn_wheels_are_found():
@@ -280,8 +278,7 @@ class Mad(Distance, frozen=True):
 def test_law_that_wants_nonsense_is_stopped(kind, monkeypatch):
     monkeypatch.setattr(Plan, "law", Mad())
     hover = None if kind == "khepera4" else 0.6
-    starts = {"A": [-0.4, 0.0], "B": [0.4, 0.0]}
-    robots = {name: RobotTable(kind=kind, start=start, hover=hover) for name, start in starts.items()}
+    robots = {name: RobotTable(kind=kind, start=[x, 0.0], hover=hover) for name, x in (("A", -0.4), ("B", 0.4))}
     swarm = Swarm(pair(robots=robots)).running()
     swarm.run(12.0)
     for name in "AB":
@@ -291,9 +288,8 @@ def test_law_that_wants_nonsense_is_stopped(kind, monkeypatch):
 
 
 def test_nonsense_is_known_before_take_off(monkeypatch):
-    robots = {"A": RobotTable(kind="khepera4", start=[-0.3, 0.0]), "B": RobotTable(kind="khepera4", start=[0.3, 0.0])}
     monkeypatch.setattr(Plan, "law", Mad())
-    swarm = Swarm(pair(robots=robots))
+    swarm = Swarm(small({"A": "khepera4", "B": "khepera4"}, {"A - B": 0.5}))
     swarm.run(0.2)
     life = swarm.robot("A").lifecycle
     assert (life.phase, life.reason) == (IDLE, "its law wants something that is not finite")
@@ -301,8 +297,7 @@ def test_nonsense_is_known_before_take_off(monkeypatch):
 
 
 def test_robots_that_nearly_touch_land():
-    experiment = pair()
-    swarm = Swarm(changed(experiment, safety=changed(experiment.safety, separation=0.3))).running().run(0.5)
+    swarm = Swarm(pair(safety=Safety(separation=0.3))).running().run(0.5)
     x, y, z = swarm.last("A", "position")
     swarm.robot("A").neighbours.receive(0, (x + 0.14, y, z), (0.0, 0.0, 0.0), 99.0, 99.0)
     swarm.step()
@@ -313,8 +308,8 @@ def test_robots_that_nearly_touch_land():
 
 
 def test_robots_too_near_stop_and_go_on():
-    experiment = pair(formation=Formation(links={"A - B": 0.35}))
-    swarm = Swarm(changed(experiment, safety=changed(experiment.safety, separation=0.3))).running().run(0.5)
+    experiment = pair(formation=Formation(links={"A - B": 0.35}), safety=Safety(separation=0.3))
+    swarm = Swarm(experiment).running().run(0.5)
     x, y, _ = swarm.last("A", "position")
     swarm.robot("A").neighbours.receive(0, (x + 0.25, y, 0.0), (0.0, 0.0, 0.0), swarm.t, swarm.t)
     swarm.muted.add(("B", "A"))
@@ -383,8 +378,8 @@ def test_whatever_happens_no_robot_comes_up_again(seed):
         "K": RobotTable(kind="khepera4", start=[0.0, 0.7]),
     }
     links = {"F - T": 0.7, "K - F": 0.8, "K - T": 0.9}
-    experiment = Experiment(title="x", duration_s=60.0, robots=robots, formation=Formation(links=links))
-    swarm = Swarm(changed(experiment, avoidance={"kind": "barrier", "hears": "all"})).running().run(1.0)
+    barrier = {"kind": "barrier", "hears": "all"}
+    swarm = Swarm(small(robots, links, duration_s=60.0, avoidance=barrier)).running().run(1.0)
     for _ in range(25):
         trouble(rng, swarm, rng.choice(swarm.names))()
         swarm.run(rng.uniform(0.05, 0.8))

@@ -2,7 +2,6 @@
 
 import ast
 import inspect
-from pathlib import Path
 from textwrap import dedent
 
 import pytest
@@ -11,32 +10,22 @@ from agents.plugins import registry
 from agents.plugins.laws import Gradient
 from agents.plugins.registry import AVOIDANCES, LAWS, PREDICTORS, TRIGGERS
 from experiments.virtual_time.source import faults
+from tests.commands import ROOT
 
-ROOT = Path(__file__).parents[2]
+QUIET = (
+    "decision/control_updates", "decision/position_control", "plugins/barrier", "plugins/laws", "plugins/predictors",
+    "plugins/trigger_families", "plugins/triggers", "safety/motion_check", "safety/positions",
+    "safety/setpoint_filter", "vectors",
+)  # fmt: skip
 # functions of quiet modules that are not quiet themselves, each with the reason
 RARE = {
+    **{f"agents/{name}.py": frozenset() for name in QUIET},
     "agents/plugins/avoidance.py": {"Nearby.reserve"},  # grows its list of things, outside of ticks
     "agents/decision/transmission.py": {"Transmitter.replace_trigger"},  # an order
-    "agents/decision/control_updates.py": set(),
-    "agents/decision/position_control.py": set(),
-    "agents/plugins/barrier.py": set(),
-    "agents/plugins/laws.py": set(),
-    "agents/plugins/predictors.py": set(),
-    "agents/plugins/trigger_families.py": set(),
-    "agents/plugins/triggers.py": set(),
-    "agents/safety/motion_check.py": set(),
-    "agents/safety/positions.py": set(),
-    "agents/safety/setpoint_filter.py": set(),
-    "agents/vectors.py": set(),
     **{str(path.relative_to(ROOT)): set() for path in sorted((ROOT / "twins" / "models").glob("*.py"))},
     "twins/models/quadrotor.py": {"Quadrotor.place"},  # puts a robot somewhere
-    "twins/models/noise.py": {
-        "stream",
-        "refill",
-        "Noise.refill",
-        "Noise.reserve",
-        "Noise._drawn",
-    },  # random numbers are drawn in blocks, outside of ticks
+    # random numbers are drawn in blocks, outside of ticks
+    "twins/models/noise.py": {"stream", "refill", "Noise.refill", "Noise.reserve", "Noise._drawn"},
 }
 
 
@@ -60,14 +49,10 @@ def outside(source: str, rare=frozenset(), first=1):
 
 @pytest.mark.parametrize("file", RARE)
 def test_quiet_functions_stay_in_the_subset(file):
-    found = outside((ROOT / file).read_text(encoding="utf-8"), RARE[file])
+    source = (ROOT / file).read_text(encoding="utf-8")
+    found = outside(source, RARE[file])
     assert not found, "\n".join(f"{file}:{line}: {name} uses {fault}" for line, name, fault in found)
-
-
-@pytest.mark.parametrize("file", RARE)
-def test_rare_functions_exist(file):
-    named = {name for name, _ in functions(ast.parse((ROOT / file).read_text(encoding="utf-8")))}
-    assert RARE[file] <= named
+    assert RARE[file] <= {name for name, _ in functions(ast.parse(source))}, "it is there"
 
 
 def plugin_faults(kind):

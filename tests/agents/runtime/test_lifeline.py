@@ -1,35 +1,42 @@
+"""The lifeline of a process: what counts as its loss, and the lines that it carries."""
+
 import os
-import subprocess
-import sys
 import threading
-from pathlib import Path
 
 import pytest
 
 from agents.network.endpoints import free_endpoint
 from agents.runtime.lifeline import Lifeline
-
-ROOT = Path(__file__).resolve().parents[3]
-
-
-def test_end_of_file_is_loss(pipe):
-    lost = threading.Event()
-    line = Lifeline(lost, timeout_s=60.0, fd=pipe[0])
-    line.start()
-    os.write(pipe[1], b"..")
-    os.close(pipe.pop())
-    line.join(10.0)
-    assert lost.is_set()
-    assert line.reason == "the starter is gone"
+from tests.commands import started
 
 
-def test_silence_is_loss(pipe):
-    lost = threading.Event()
-    line = Lifeline(lost, timeout_s=0.05, fd=pipe[0])
-    line.start()
-    line.join(10.0)
-    assert lost.is_set()
-    assert line.reason == "nothing from the starter for 0.05 s"
+@pytest.fixture
+def run(pipe):
+    """Runs a lifeline while `feed` acts on the two ends of its pipe; returns it and whether it was lost."""
+
+    def run(feed, timeout_s=60.0, **given):
+        lost, reader = threading.Event(), pipe[0]
+        line = Lifeline(lost, timeout_s=timeout_s, fd=reader, **given)
+        line.start()
+        feed(pipe)
+        line.join(10.0)
+        return line.reason, lost.is_set()
+
+    return run
+
+
+def hang_up(ends, *written):
+    for part in written:
+        os.write(ends[1], part)
+    os.close(ends.pop())
+
+
+def test_end_of_file_is_loss(run):
+    assert run(lambda ends: hang_up(ends, b"..")) == ("the starter is gone", True)
+
+
+def test_silence_is_loss(run):
+    assert run(lambda _ends: None, timeout_s=0.05) == ("nothing from the starter for 0.05 s", True)
 
 
 def test_a_descriptor_that_is_closed_is_loss(pipe):
@@ -41,41 +48,18 @@ def test_a_descriptor_that_is_closed_is_loss(pipe):
     assert line.reason == "the lifeline broke: Bad file descriptor"
 
 
-def test_nothing_is_lost_before_it_is(pipe):
-    lost = threading.Event()
-    line = Lifeline(lost, timeout_s=60.0, fd=pipe[0])
-    line.start()
-    os.write(pipe[1], b".")
-    assert line.reason is None
-    assert not lost.is_set()
-    os.close(pipe.pop())
-    line.join(10.0)
+def test_whole_lines_pass_without_heartbeats(run):
+    lines = []
+    parts = (b"\n\nclock -0.", b"2001\n", b"\n\nclock 1\nx", b"x" * 10_000)
+    run(lambda ends: hang_up(ends, *parts), on_line=lines.append)
+    assert lines == [b"clock -0.2001", b"clock 1"]
 
 
 @pytest.mark.mechanism("lifeline: the router ends with its starter")
 @pytest.mark.system
 def test_router_ends_with_its_starter():
     endpoint = free_endpoint(preferred_port=0)
-    process = subprocess.Popen(
-        [sys.executable, "-m", "agents.runtime.router", "--lifeline", "--listen", endpoint],
-        cwd=ROOT,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    assert process.stdout.readline() == f"router ready on {endpoint}\n"
-    _, said = process.communicate(timeout=30)
-    assert process.returncode == 0
-    assert said == "router: ends with its starter\n"
-
-
-def test_whole_lines_pass_without_heartbeats(pipe):
-    lines = []
-    line = Lifeline(threading.Event(), timeout_s=60.0, fd=pipe[0], on_line=lines.append)
-    line.start()
-    for part in (b"\n\nclock -0.", b"2001\n", b"\n\nclock 1\nx", b"x" * 10_000):
-        os.write(pipe[1], part)
-    os.close(pipe.pop())
-    line.join(10.0)
-    assert lines == [b"clock -0.2001", b"clock 1"]
+    with started("-m", "agents.runtime.router", "--lifeline", "--listen", endpoint) as process:
+        assert process.stdout.readline() == f"router ready on {endpoint}\n"
+        _, errors = process.communicate(timeout=30)
+        assert (process.returncode, errors) == (0, "router: ends with its starter\n")

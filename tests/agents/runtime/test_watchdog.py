@@ -4,67 +4,46 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
-import sys
 import threading
 import time
-from collections.abc import Callable
-from contextlib import contextmanager
 
-import numpy as np
 import psutil
 import pytest
 
 from agents.runtime.watchdog import HUNG, Watchdog
-from tests.conftest import ROOT
+from tests.commands import started
 from tests.waiting import until
-from twins.arrays import Index
-
-SILENCE_S = 0.1
-
-
-class Told:
-    """A body that writes down what it is told, and hangs in what it was asked to hang in."""
-
-    def __init__(self) -> None:
-        self.orders: list[tuple[str, list[int]]] = []
-        self.never = threading.Event()
-        self.stuck = ""
-
-    def land(self, rows: Index) -> None:
-        self.take("land", rows)
-
-    def stop(self, rows: Index) -> None:
-        self.take("stop", rows)
-
-    def take(self, what: str, rows: Index) -> None:
-        self.orders.append((what, rows.tolist()))
-        if self.stuck == what:
-            self.never.wait(10.0)
-
-    def count(self, what: str) -> int:
-        return sum(order == (what, [0, 1]) for order in self.orders)
 
 
 class Kennel:
-    def __init__(self, down_s: float = 10.0, silence_s: float = SILENCE_S) -> None:
-        self.body, self.alarms, self.ends = Told(), list[str](), list[int]()
+    """A watchdog and its body, which writes down what it is told, and hangs in what it was asked to hang in."""
+
+    def __init__(self, down_s: float = 10.0, silence_s: float = 0.1, stuck: str = "") -> None:
+        self.orders, self.alarms, self.ends = [], [], []
+        self.stuck, self.never = stuck, threading.Event()
         self.dog = Watchdog(
-            self.body,  # type: ignore[arg-type]
-            np.arange(2),
-            alarm=self.alarms.append,
-            silence_s=silence_s,
-            down_s=down_s,
-            end=self.ends.append,
+            self, (0, 1), alarm=self.alarms.append, silence_s=silence_s, down_s=down_s, end=self.ends.append
         )
 
-    @contextmanager
-    def watched(self):
+    def land(self, rows) -> None:
+        self.take("land", rows)
+
+    def stop(self, rows) -> None:
+        self.take("stop", rows)
+
+    def take(self, what: str, rows) -> None:
+        assert rows == (0, 1)
+        self.orders.append(what)
+        if self.stuck == what:
+            self.never.wait(10.0)
+
+    def __enter__(self) -> Kennel:
         self.dog.start()
-        try:
-            yield
-        finally:
-            self.dog.end()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.dog.end()
+        self.never.set()
 
     def beat_for(self, seconds: float) -> None:
         end, pause = time.monotonic() + seconds, threading.Event()
@@ -75,43 +54,35 @@ class Kennel:
 
 @pytest.mark.slow
 def test_a_loop_that_goes_round_is_left_alone():
-    kennel = Kennel(silence_s=1.0)  # a busy machine may hold up a loop for some tenths
-    with kennel.watched():
+    with Kennel(silence_s=1.0) as kennel:  # a busy machine may hold up a loop for some tenths
         kennel.beat_for(2.0)
-    assert not kennel.body.orders
-    assert not kennel.alarms
-    assert not kennel.dog.tripped
+    assert (kennel.orders, kennel.alarms, kennel.dog.tripped) == ([], [], "")
 
 
 @pytest.mark.slow
-def test_hanging_loop_is_landed_and_may_recover(eventually: Callable[[Callable[[], object]], None]):
-    kennel = Kennel(silence_s=0.5)
-    with kennel.watched():
+def test_hanging_loop_is_landed_and_may_recover():
+    with Kennel(silence_s=0.5) as kennel:
         kennel.beat_for(0.05)
-        eventually(lambda: kennel.body.count("land"))
-        eventually(lambda: kennel.alarms)
+        until(lambda: kennel.orders and kennel.alarms)
         assert kennel.dog.tripped == kennel.alarms[0]
         assert kennel.dog.tripped.startswith("its control loop hangs: no tick for ")
         assert kennel.dog.forgive() == kennel.alarms[0]
         assert not kennel.dog.tripped
         kennel.beat_for(1.0)
-    assert not kennel.body.count("stop")
+    assert set(kennel.orders) == {"land"}
     assert len(kennel.alarms) == 1
     assert not kennel.ends
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("stuck", ["", "land", "stop"])
-def test_endless_hang_is_cut_and_ended(stuck: str, eventually):
-    kennel = Kennel(down_s=0.8)
-    kennel.body.stuck = stuck
-    with kennel.watched():
-        eventually(lambda: kennel.ends)
-    kennel.body.never.set()
+def test_endless_hang_is_cut_and_ended(stuck):
+    with Kennel(down_s=0.8, stuck=stuck) as kennel:
+        until(lambda: kennel.ends)
     assert kennel.ends == [HUNG]
-    assert kennel.body.orders[-1] == ("stop", [0, 1])
-    assert kennel.body.count("stop") == 1
-    assert kennel.body.count("land") == 1 if stuck == "land" else kennel.body.count("land") >= 2
+    assert kennel.orders[-1] == "stop"
+    assert kennel.orders.count("stop") == 1
+    assert kennel.orders.count("land") == 1 if stuck == "land" else kennel.orders.count("land") >= 2
 
 
 FROZEN = """
@@ -140,17 +111,14 @@ threading.Event().wait()
 @pytest.mark.system
 def test_frozen_process_is_no_hanging_loop():
     """And one that hangs for good ends."""
-    process = subprocess.Popen(
-        [sys.executable, "-c", FROZEN], cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    )
-    assert process.stdout is not None
-    assert process.stdout.readline() == "runs\n"
-    os.kill(process.pid, signal.SIGSTOP)
-    until(lambda: psutil.Process(process.pid).status() == psutil.STATUS_STOPPED, "it is frozen")
-    frozen = time.monotonic()
-    until(lambda: time.monotonic() > frozen + 1.0, "it was frozen for twice as long as the watchdog allows")
-    os.kill(process.pid, signal.SIGCONT)
-    out, _ = process.communicate(timeout=30)
+    with started("-c", FROZEN) as process:
+        assert process.stdout.readline() == "runs\n"
+        os.kill(process.pid, signal.SIGSTOP)
+        until(lambda: psutil.Process(process.pid).status() == psutil.STATUS_STOPPED, "it is frozen")
+        frozen = time.monotonic()
+        until(lambda: time.monotonic() > frozen + 1.0, "it was frozen for twice as long as the watchdog allows")
+        os.kill(process.pid, signal.SIGCONT)
+        out, _ = process.communicate(timeout=30)
     assert process.returncode == HUNG
     before, *rest = out.splitlines()
     (alarm,) = [line for line in rest if line != "landed"]
