@@ -5,7 +5,7 @@ Every function takes and gives plain numbers and tuples: the same source runs as
 
 from __future__ import annotations
 
-from math import inf, isfinite, nan, pi, sqrt, tau
+from math import isfinite, nan, pi, sqrt, tau
 from typing import Annotated, Final
 
 from msgspec import Meta
