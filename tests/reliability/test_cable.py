@@ -1,53 +1,45 @@
 import os
 import signal
 import socket
-import subprocess
-import sys
+import socketserver
 import threading
 from contextlib import contextmanager, suppress
 
 import pytest
 
 from agents.network.endpoints import free_endpoint
+from tests.commands import started
 from tests.waiting import until
 
 
-def answer_everything(listener):
-    while True:
-        try:
-            end, _ = listener.accept()
-        except OSError:
-            return
-        threading.Thread(target=echo, args=(end,), daemon=True).start()
-
-
-def echo(end):
-    with end:
-        while data := end.recv(65536):
-            end.sendall(data)
+class Echo(socketserver.BaseRequestHandler):
+    def handle(self):
+        while data := self.request.recv(65536):
+            self.request.sendall(data)
 
 
 @contextmanager
 def laid():
+    """A cable, and an end of a connection through it, whose other end echoes."""
     near = int(free_endpoint(0).rpartition(":")[2])
-    with socket.create_server(("127.0.0.1", 0)) as far:
-        thread = threading.Thread(target=answer_everything, args=(far,), daemon=True)
-        thread.start()
-        words = [sys.executable, "-m", "tests.reliability.cable", str(near), str(far.getsockname()[1])]
-        with subprocess.Popen(words, stdin=subprocess.PIPE) as cable:
+    ends = []
 
-            def reached():
-                with suppress(ConnectionRefusedError):
-                    ends.append(socket.create_connection(("127.0.0.1", near), timeout=30.0))
-                return ends
+    def reached():
+        with suppress(ConnectionRefusedError):
+            ends.append(socket.create_connection(("127.0.0.1", near), timeout=30.0))
+        return ends
 
-            ends = []
-            until(reached, "it listens")
-            with ends[0] as end:
-                yield cable, end
-            cable.stdin.close()
-            assert cable.wait(30.0) == 0, "it ends with its standard input"
-        far.shutdown(socket.SHUT_RDWR)
+    with (
+        socketserver.ThreadingTCPServer(("127.0.0.1", 0), Echo) as far,
+        started("-m", "tests.reliability.cable", near, far.server_address[1]) as cable,
+    ):
+        threading.Thread(target=far.serve_forever, daemon=True).start()
+        until(reached, "it listens")
+        with ends[0] as end:
+            yield cable, end
+        cable.stdin.close()
+        assert cable.wait(30.0) == 0, "it ends with its standard input"
+        far.shutdown()
 
 
 def test_everything_passes():
