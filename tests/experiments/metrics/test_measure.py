@@ -287,13 +287,6 @@ def test_interrupted_run_is_measured_by_its_own_length():
     assert measure(cut(unseen(park(), (4.0, 45.1, 6)), 8.0)).died == ("CF03",)
 
 
-def test_growing_metrics_are_not_compared_with_interrupted_runs():
-    whole, half = measure(park("a")), measure(cut(park("b"), 20.0))
-    for index in ("iae", "messages", "f_hz", "rmse"):  # what fades depends on the length, too
-        assert statistics.ratios([half], [whole], index) == [None]
-    assert metrics_files.document("x", 1, [whole, half])["cases"]["b"]["ratio"]["itae"] is None
-
-
 def test_whole_run_may_end_one_sample_early():
     assert not measure(pair(np.ones(16), step=1.0, planned=15.5)).interrupted
     assert measure(pair(np.ones(14), step=1.0, planned=15.5)).interrupted

@@ -1,44 +1,32 @@
-"""A recording is read back as what was written: what is between, what is missing, when a run began and ended."""
+"""A recording is read back as what was written: what is between, what is missing, begin, end, clocks set right."""
 
 import math
 
 import msgspec
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
 
-from agents.network.messages import Event, HostClock, PoseReceipt
+from agents.network.messages import Event, GoalReceipt, HostClock, PoseReceipt, State
 from experiments.definition.experiment import Formation, Rates, RobotTable
+from experiments.recording.clocks import ClockSample, Correction, host_offset
 from experiments.recording.playback import NotStarted, read
 from experiments.recording.reader import RecordingError, recover
 from experiments.scene import tracks
-from tests.experiments.recordings import (
-    PAIR,
-    START,
-    begun,
-    broken,
-    changed,
-    landed,
-    pose,
-    seconds,
-    state,
-    status,
-    touched,
-    whole_run,
-    world,
-    write,
-)  # fmt: skip
+from tests.experiments import recordings as rec
 
 
 def test_a_run_is_read_back(path):
-    write(path, *whole_run())
+    rec.write(path, *rec.whole_run())
     playback = read(path)
     trace = playback.trace
-    assert (playback.complete, playback.messages, playback.started) == (True, 1 + 4 + 22 * 3 + 11, START)
+    assert (playback.complete, playback.messages, playback.started) == (True, 1 + 4 + 22 * 3 + 11, rec.START)
     assert (trace.case, trace.seed, trace.clock, trace.robots) == ("only", 4, "real", ("TB01", "CF01"))
-    assert trace.plan.experiment == PAIR
+    assert trace.plan.experiment == rec.PAIR
     assert (trace.contacts, trace.world) == (None, ())
     assert (trace.attitude, trace.shadow_position, trace.shadow_yaw) == (None, None, None)
     along = np.arange(11) / 10
@@ -68,15 +56,15 @@ def test_a_run_is_read_back(path):
 
 
 def test_what_the_world_said_is_read_back(path):
-    touches = [touched(0.7), touched(-0.1), touched(0.2, second="wall"), touched(1.2)]
-    broken(path, *whole_run(), world(-0.5), world(0.5), world(1.5), *touches)
+    touches = [rec.touched(0.7), rec.touched(-0.1), rec.touched(0.2, second="wall"), rec.touched(1.2)]
+    rec.broken(path, *rec.whole_run(), rec.world(-0.5), rec.world(0.5), rec.world(1.5), *touches)
     trace = read(path).trace
     assert [(each.first, each.second, round(each.stamp, 6)) for each in trace.contacts] == [
         ("TB01", "wall", 0.2),
         ("TB01", "CF01", 0.7),
     ]
     assert (trace.contacts[0].impulse, trace.contacts[0].overlap) == (0.25, 0.001)
-    assert [msgspec.structs.replace(each, stamp=START + 0.5) for each in trace.world] == [world(0.5)]
+    assert [msgspec.structs.replace(each, stamp=rec.START + 0.5) for each in trace.world] == [rec.world(0.5)]
     assert trace.world[0].stamp == pytest.approx(0.5)
     target = path.with_name("whole.mcap")
     assert recover(path, target).robots == ("TB01", "CF01")
@@ -90,16 +78,21 @@ def test_what_the_world_said_is_read_back(path):
 
 @pytest.mark.parametrize(
     ("said", "contacts"),
-    [([], None), ([world(0.5, "point-mass")], None), ([world(0.5, "nobody-has-it")], None), ([world(0.5)], ())],
+    [
+        ([], None),
+        ([rec.world(0.5, "point-mass")], None),
+        ([rec.world(0.5, "nobody-has-it")], None),
+        ([rec.world(0.5)], ()),
+    ],
 )
 def test_no_contacts_differ_from_no_contact_detection(path, said, contacts):
-    write(path, *whole_run(), *said)
+    rec.write(path, *rec.whole_run(), *said)
     assert read(path).trace.contacts == contacts
 
 
 def test_avoidance_interventions_are_counted_until_the_end(path):
-    said = [status(at=k - 0.5, interventions=5 * k, avoided=2 * k) for k in range(4)]
-    write(path, *whole_run()[:-2], *said)
+    said = [rec.status(at=k - 0.5, interventions=5 * k, avoided=2 * k) for k in range(4)]
+    rec.write(path, *rec.whole_run()[:-2], *said)
     trace = read(path).trace
     assert (trace.interventions.tolist(), trace.avoided.tolist()) == ([8, 0], [3, 0])
 
@@ -107,7 +100,9 @@ def test_avoidance_interventions_are_counted_until_the_end(path):
 def test_attitude_interpolates_the_short_way_on_recorded_side(path):
     half, sign = 0.1 * np.arange(12), np.array([-1.0 if k in {3, 4, 5} else 1.0 for k in range(12)])
     turned = (sign * [np.cos(half), 0.0 * half, np.sin(half), 0.0 * half]).T
-    write(path, begun(), *[state(at=k / 10 - 0.05, attitude=tuple(q)) for k, q in enumerate(turned.tolist())])
+    rec.write(
+        path, rec.begun(), *[rec.state(at=k / 10 - 0.05, attitude=tuple(q)) for k, q in enumerate(turned.tolist())]
+    )
     trace, half = read(path).trace, half[:11] + 0.05
     wanted = (sign[:11] * [np.cos(half), 0.0 * half, np.sin(half), 0.0 * half]).T
     np.testing.assert_allclose(trace.attitude[:, 0], wanted, atol=1e-6)
@@ -116,8 +111,8 @@ def test_attitude_interpolates_the_short_way_on_recorded_side(path):
 
 def test_where_the_twin_beside_a_robot_was(path):
     along = [k / 10 for k in range(11)]
-    beside = [state(at=at, x=at, shadow_position=(at, 0.1, 0.0), shadow_yaw=3.0 + at) for at in along]
-    write(path, begun(), *beside, *[state("CF01", at=at) for at in along])
+    beside = [rec.state(at=at, x=at, shadow_position=(at, 0.1, 0.0), shadow_yaw=3.0 + at) for at in along]
+    rec.write(path, rec.begun(), *beside, *[rec.state("CF01", at=at) for at in along])
     trace = read(path).trace
     np.testing.assert_allclose(trace.shadow_position[:, 0] - trace.position[:, 0], np.tile([0.0, 0.1, 0.0], (11, 1)))
     np.testing.assert_allclose(trace.shadow_yaw[:, 0], 3.0 + np.arange(11) / 10, atol=1e-6)
@@ -127,7 +122,7 @@ def test_where_the_twin_beside_a_robot_was(path):
 
 def test_samples_between_the_grid_are_interpolated(path):
     between = [(k / 10 + 0.05, math.remainder(k, math.tau)) for k in range(-1, 11)]
-    write(path, begun(), *[state(at=at, x=at, yaw=yaw) for at, yaw in between])
+    rec.write(path, rec.begun(), *[rec.state(at=at, x=at, yaw=yaw) for at, yaw in between])
     trace = read(path).trace
     np.testing.assert_allclose(trace.position[:, 0, 0], np.arange(11) / 10, atol=1e-6)
     np.testing.assert_allclose(trace.goal[:, 0, 0], np.arange(11) / 10 + 0.95, atol=1e-6)  # the last one before
@@ -140,14 +135,14 @@ BRANCHES = [math.remainder(0.9 * k, math.tau) for k in range(11)]
 
 @pytest.mark.parametrize("yaw", [BRANCHES, [None] * 5 + [0.3] * 6], ids=["jumps", "unknown at first"])
 def test_yaw_keeps_the_branch_it_was_recorded_on(path, yaw):
-    write(path, begun(), *[state(at=k / 10, yaw=value) for k, value in enumerate(yaw)])
+    rec.write(path, rec.begun(), *[rec.state(at=k / 10, yaw=value) for k, value in enumerate(yaw)])
     found, known = read(path).trace.yaw[:, 0], yaw.count(None)
     np.testing.assert_allclose(found[known:], yaw[known:], atol=1e-5)
     assert np.isnan(found[: max(known - 2, 0)]).all()
 
 
 def test_silence_is_nan_and_never_extrapolated(path):
-    write(path, begun(), landed(), *[state(at=k / 10, x=k / 10) for k in range(6)])
+    rec.write(path, rec.begun(), rec.landed(), *[rec.state(at=k / 10, x=k / 10) for k in range(6)])
     trace = read(path).trace
     np.testing.assert_allclose(trace.position[:8, 0, 0], [0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.5, 0.5], atol=1e-6)
     for array in (trace.position, trace.yaw, trace.true_position, trace.goal, trace.setpoint):
@@ -158,7 +153,7 @@ def test_silence_is_nan_and_never_extrapolated(path):
 
 def test_a_long_hole_is_not_interpolated_over(path):
     times = [0.0, 0.1, 0.6, 0.7, 2.0, 2.1]
-    write(path, begun(), *[state(at=at, x=at) for at in times], experiment=changed(duration_s=2.0))
+    rec.write(path, rec.begun(), *[rec.state(at=at, x=at) for at in times], experiment=rec.changed(duration_s=2.0))
     x = read(path).trace.position[:, 0, 0]
     np.testing.assert_allclose(x[:8], np.arange(8) / 10, atol=1e-6)
     assert np.flatnonzero(np.isnan(x)).tolist() == list(range(10, 18))
@@ -166,7 +161,7 @@ def test_a_long_hole_is_not_interpolated_over(path):
 
 def test_numbers_that_nobody_knows(path):
     places, unknown = [math.nan if k == 5 else k / 10 for k in range(11)], {"goal": None, "setpoint": None}
-    write(path, begun(), *[state(at=k / 10, x=x, yaw=math.nan, **unknown) for k, x in enumerate(places)])
+    rec.write(path, rec.begun(), *[rec.state(at=k / 10, x=x, yaw=math.nan, **unknown) for k, x in enumerate(places)])
     trace = read(path).trace
     np.testing.assert_allclose(trace.position[:, 0, 0], np.arange(11) / 10, atol=1e-6)
     for array in (trace.goal, trace.setpoint, trace.yaw):
@@ -175,12 +170,12 @@ def test_numbers_that_nobody_knows(path):
 
 def poses(*numbered):
     """Poses of TB01, by number and time [s]."""
-    return [pose(seq=seq, at=at) for seq, at in numbered]
+    return [rec.pose(seq=seq, at=at) for seq, at in numbered]
 
 
 def lost_of(*counted, **more):
     """Statuses of CF01 with what it lost of TB01, by time [s] and number."""
-    return [status("CF01", at=at, lost={"TB01": lost}, **more) for at, lost in counted]
+    return [rec.status("CF01", at=at, lost={"TB01": lost}, **more) for at, lost in counted]
 
 
 @pytest.mark.parametrize(
@@ -191,14 +186,14 @@ def lost_of(*counted, **more):
         (poses((8, 0.1), (9, 0.2), (3, 0.3), (4, 0.4)), 2),  # anew, the first two lost
         # a forged number: no more than 50 poses a second can have been said
         (poses((8, 0.1), (99_999_999, 0.12), (9, 0.14), (10, 0.16)), 2),
-        ([*poses((8, 0.1)), status(at=0.9, sent=99_999_999)], 40),
+        ([*poses((8, 0.1)), rec.status(at=0.9, sent=99_999_999)], 40),
         (poses((4, 0.1), (4, 0.1), (5, 0.2)), 0),  # the same twice: said again to a late one
         (poses((1, -2.0), (9, 0.1), (10, 0.2)), 0),  # a gap that began before the run
-        ([*poses((5, 0.9)), status(sent=8)], 3),  # the last three never came
-        ([*poses((5, 0.9), (6, 1.2)), status(sent=5)], 0),
-        ([*poses((9, 0.5)), status(sent=2, pid=8)], 0),  # a younger process counts from zero
-        ([status(at=-0.5, sent=4), status(sent=6)], 2),  # none of them recorded
-        ([*poses((3, -0.2)), status(at=-1.0, sent=2), status(sent=4)], 1),
+        ([*poses((5, 0.9)), rec.status(sent=8)], 3),  # the last three never came
+        ([*poses((5, 0.9), (6, 1.2)), rec.status(sent=5)], 0),
+        ([*poses((9, 0.5)), rec.status(sent=2, pid=8)], 0),  # a younger process counts from zero
+        ([rec.status(at=-0.5, sent=4), rec.status(sent=6)], 2),  # none of them recorded
+        ([*poses((3, -0.2)), rec.status(at=-1.0, sent=2), rec.status(sent=4)], 1),
         (lost_of((-0.5, 4), (1.0, 6)), 2),  # less what was before
         (lost_of((0.2, 1), (0.6, 1), (1.0, 3)), 3),  # counters go up
         (
@@ -209,14 +204,14 @@ def lost_of(*counted, **more):
     ],
 )
 def test_lost(path, messages, lost):
-    write(path, begun(), state(), *messages, landed())
+    rec.write(path, rec.begun(), rec.state(), *messages, rec.landed())
     assert read(path).trace.lost.tolist() == [lost, 0]
 
 
 def test_what_the_modelled_network_dropped_is_no_loss(path):
-    said = [status("CF01", at=at, dropped={"TB01": count}) for at, count in ((-0.5, 0), (0.4, 3), (1.0, 7))]
-    linked = changed(formation=Formation(links={"TB01 - CF01": 0.5}))
-    write(path, begun(), state(), *said, landed(), experiment=linked)
+    said = [rec.status("CF01", at=at, dropped={"TB01": count}) for at, count in ((-0.5, 0), (0.4, 3), (1.0, 7))]
+    linked = rec.changed(formation=Formation(links={"TB01 - CF01": 0.5}))
+    rec.write(path, rec.begun(), rec.state(), *said, rec.landed(), experiment=linked)
     trace = read(path).trace
     assert trace.dropped.tolist() == [0, 7]  # TB01 listens to CF01; CF01 to TB01
     assert trace.lost.tolist() == [0, 0]
@@ -225,14 +220,14 @@ def test_what_the_modelled_network_dropped_is_no_loss(path):
 def test_foreign_poses_count_once_for_all_receivers(path):
     robots = {name: RobotTable("tello", [float(k), 0.0]) for k, name in enumerate("ABC")}
     counts = (("B", -0.5, 2), ("C", -0.5, 0), ("B", 0.4, 5), ("C", 0.4, 1), ("B", 1.0, 9), ("C", 1.0, 3))
-    said = [status(name, at=at, foreign={"A": count}) for name, at, count in counts]
-    three = changed(robots=robots, formation=Formation(links={"A > B": 0.5, "A > C": 0.5}))
-    write(path, begun(), *(state(name) for name in robots), *said, landed(), experiment=three)
+    said = [rec.status(name, at=at, foreign={"A": count}) for name, at, count in counts]
+    three = rec.changed(robots=robots, formation=Formation(links={"A > B": 0.5, "A > C": 0.5}))
+    rec.write(path, rec.begun(), *(rec.state(name) for name in robots), *said, rec.landed(), experiment=three)
     assert read(path).trace.foreign.tolist() == [7, 0, 0]
 
 
 def test_only_poses_of_the_run_are_sent(path):
-    write(path, begun(), *[pose(seq=k + 5, at=k / 2) for k in range(-2, 5)], pose("XX99", at=0.5))
+    rec.write(path, rec.begun(), *[rec.pose(seq=k + 5, at=k / 2) for k in range(-2, 5)], rec.pose("XX99", at=0.5))
     sent = read(path).trace.sent
     assert sent.stamp.tolist() == [0.0, 0.5]  # the pose at the end, 1.0, belongs to the landing
     assert sent.seq.tolist() == [5, 6]
@@ -240,13 +235,13 @@ def test_only_poses_of_the_run_are_sent(path):
 
 def test_what_a_drifting_clock_stamped_is_set_right(path):
     """50 ppm over an hour are 0.18 s: what CF01 says at 3600 s it stamps 0.18 s later."""
-    clocks = [HostClock("lab2", START + at, lie, 1e-4, ["CF01"]) for at, lie in ((0.0, 0.2), (3600.0, 0.38))]
-    heard = [PoseReceipt("CF01", 9, START + 1800.09, START + 1800.01, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))]
-    messages = [begun(), *clocks]
+    clocks = [HostClock("lab2", rec.START + at, lie, 1e-4, ["CF01"]) for at, lie in ((0.0, 0.2), (3600.0, 0.38))]
+    heard = [PoseReceipt("CF01", 9, rec.START + 1800.09, rec.START + 1800.01, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))]
+    messages = [rec.begun(), *clocks]
     for k in range(0, 3601, 10):
-        messages += [state("TB01", k + 1, k, 0.001 * k), state("CF01", k + 1, k * (1 + 50e-6), 0.001 * k)]
-    messages += [state("TB01", 9000, 3600.5, 3.6, received=heard), pose("CF01", 1, 1800.09), landed(3600.0)]
-    write(path, *messages, experiment=changed(duration_s=3600.0, rates=Rates(state_hz=1.0)))
+        messages += [rec.state("TB01", k + 1, k, 0.001 * k), rec.state("CF01", k + 1, k * (1 + 50e-6), 0.001 * k)]
+    messages += [rec.state("TB01", 9000, 3600.5, 3.6, received=heard), rec.pose("CF01", 1, 1800.09), rec.landed(3600.0)]
+    rec.write(path, *messages, experiment=rec.changed(duration_s=3600.0, rates=Rates(state_hz=1.0)))
     trace = read(path).trace
     np.testing.assert_allclose(trace.position[[600, 1800, 3600], :, 0], [[x, x] for x in (0.6, 1.8, 3.6)], atol=1e-6)
     assert trace.sent.stamp[0] == pytest.approx(1800.0, abs=1e-4)
@@ -257,18 +252,32 @@ def test_what_a_drifting_clock_stamped_is_set_right(path):
 
 
 def test_the_start_is_the_conductors_else_the_robots(path, tmp_path):
-    write(path, state(at=0.0), state(at=0.5), status(started=START + 0.5), status("CF01", started=0.0), landed(1.5))
+    rec.write(
+        path,
+        rec.state(at=0.0),
+        rec.state(at=0.5),
+        rec.status(started=rec.START + 0.5),
+        rec.status("CF01", started=0.0),
+        rec.landed(1.5),
+    )
     assert np.isfinite(read(path).trace.position[:, 0, 0]).tolist() == [True] * 3 + [False] * 8
     both = tmp_path / "both.mcap"
-    write(both, state(at=0.0), begun(0.2), status(started=START + 0.5), state(at=0.5, x=1.0), landed(1.2))
+    rec.write(
+        both,
+        rec.state(at=0.0),
+        rec.begun(0.2),
+        rec.status(started=rec.START + 0.5),
+        rec.state(at=0.5, x=1.0),
+        rec.landed(1.2),
+    )
     np.testing.assert_allclose(read(both).trace.position[3, 0, 0], 1.0)
     assert read(both).trace.events[0].stamp == 0.0
 
 
 def test_trace_of_an_interrupted_run_ends_there(path):
-    sends = [pose(seq=k + 1, at=k / 10, x=k / 10) for k in range(11)]
-    said = [status(at=0.6, sent=7, ticks=60, decisions=6), status(at=2.5, sent=11, ticks=250, decisions=25)]
-    write(path, begun(), *seconds(11), *sends, *said, landed(0.75, "landing (interrupted)"))
+    sends = [rec.pose(seq=k + 1, at=k / 10, x=k / 10) for k in range(11)]
+    said = [rec.status(at=0.6, sent=7, ticks=60, decisions=6), rec.status(at=2.5, sent=11, ticks=250, decisions=25)]
+    rec.write(path, rec.begun(), *rec.seconds(11), *sends, *said, rec.landed(0.75, "landing (interrupted)"))
     trace = read(path).trace
     assert trace.time[-1] == pytest.approx(0.7)
     assert trace.position.shape == (8, 2, 3)
@@ -280,22 +289,22 @@ def test_trace_of_an_interrupted_run_ends_there(path):
 
 def follow(begin, end, phase="running"):
     """States of TB01 alone."""
-    return [state("TB01", k, k / 10, phase=phase) for k in range(begin, end)]
+    return [rec.state("TB01", k, k / 10, phase=phase) for k in range(begin, end)]
 
 
 @pytest.mark.parametrize(
     ("duration_s", "messages", "end", "silent"),
     [
-        (1.0, [*seconds(11), landed(1.3, "landing (interrupted)")], 1.0, False),
-        (1.0, [*seconds(11), landed(0.98)], 1.0, False),
-        (5.0, [*seconds(31), landed(3.0)], 3.0, False),
-        (20.0, [*seconds(31), *follow(31, 36), *follow(41, 60, "landing")], 3.0, False),
-        (20.0, [*seconds(31), *follow(31, 100)], 9.9, True),
+        (1.0, [*rec.seconds(11), rec.landed(1.3, "landing (interrupted)")], 1.0, False),
+        (1.0, [*rec.seconds(11), rec.landed(0.98)], 1.0, False),
+        (5.0, [*rec.seconds(31), rec.landed(3.0)], 3.0, False),
+        (20.0, [*rec.seconds(31), *follow(31, 36), *follow(41, 60, "landing")], 3.0, False),
+        (20.0, [*rec.seconds(31), *follow(31, 100)], 9.9, True),
     ],
     ids=["stopped after the end", "landed slightly early", "all landed", "no conductor", "one long silent"],
 )
 def test_end_of_a_run(path, duration_s, messages, end, silent):
-    write(path, begun(), *messages, experiment=changed(duration_s=duration_s))
+    rec.write(path, rec.begun(), *messages, experiment=rec.changed(duration_s=duration_s))
     trace = read(path).trace
     assert trace.time[-1] == pytest.approx(end)
     assert np.isfinite(trace.position[-1]).all(axis=1).tolist() == [True, not silent]
@@ -303,19 +312,19 @@ def test_end_of_a_run(path, duration_s, messages, end, silent):
 
 @pytest.mark.parametrize("end", [-0.5, 0.0, 0.05])
 def test_a_run_interrupted_before_its_start(path, end):
-    write(path, state(), begun(), landed(end, "landing (interrupted)"))
+    rec.write(path, rec.state(), rec.begun(), rec.landed(end, "landing (interrupted)"))
     with pytest.raises(NotStarted, match="ended before the common start"):
         read(path)
 
 
 def test_a_run_that_never_started(path):
-    write(path, state(), status(started=0.0))
+    rec.write(path, rec.state(), rec.status(started=0.0))
     with pytest.raises(RecordingError, match="no robot had started"):
         read(path)
 
 
 def test_a_run_without_any_message_of_a_robot(path):
-    write(path, begun())
+    rec.write(path, rec.begun())
     trace = read(path).trace
     assert trace.position.shape == (11, 2, 3)
     assert np.isnan(trace.position).all()
@@ -323,19 +332,25 @@ def test_a_run_without_any_message_of_a_robot(path):
 
 
 def test_impossible_messages_are_counted_and_left_out(path):
-    wrong = [state(seq=2**63), state(position="here"), state(phase="\ud800"), pose(seq=2**70), status(sent=2**64)]
-    recording = write(path, begun(), *wrong, Event(None, "k", "s", "t"))
+    wrong = [
+        rec.state(seq=2**63),
+        rec.state(position="here"),
+        rec.state(phase="\ud800"),
+        rec.pose(seq=2**70),
+        rec.status(sent=2**64),
+    ]
+    recording = rec.write(path, rec.begun(), *wrong, Event(None, "k", "s", "t"))
     assert recording.refused == 6
     assert read(path).messages == 1
 
 
 @pytest.mark.parametrize("stamp", [math.nan, math.inf, -1.0, 1e19])
 def test_broken_clock_does_not_stretch_the_timeline(path, stamp):
-    write(path, begun(), landed(), msgspec.structs.replace(state(), stamp=stamp))
+    rec.write(path, rec.begun(), rec.landed(), msgspec.structs.replace(rec.state(), stamp=stamp))
     with path.open("rb") as file:
         statistics = make_reader(file).get_summary().statistics
-    assert statistics.message_start_time == round(START * 1e9)
-    assert statistics.message_end_time == round((START + 1.0) * 1e9)
+    assert statistics.message_start_time == round(rec.START * 1e9)
+    assert statistics.message_end_time == round((rec.START + 1.0) * 1e9)
     assert np.isnan(read(path).trace.position).all()
 
 
@@ -359,7 +374,7 @@ ABOUT = {"case": "only", "seed": "4", "clock": "real"}
 
 def test_channels_of_others_are_passed_over(path, tmp_path):
     channels = [("/image", "sensor_msgs/msg/Image", b"uint8 data", b"junk"), ("/raw", "", b"", b"more")]
-    foreign(path, *channels, metadata=ABOUT | {"started": repr(START)}, attachment=msgspec.json.encode(PAIR))
+    foreign(path, *channels, metadata=ABOUT | {"started": repr(rec.START)}, attachment=msgspec.json.encode(rec.PAIR))
     playback = read(path)
     assert playback.messages == 2
     assert np.isnan(playback.trace.position).all()
@@ -379,8 +394,8 @@ def test_channels_of_others_are_passed_over(path, tmp_path):
         (ABOUT, None),
         (ABOUT, b"{}"),
         (ABOUT, b'{"title": "pair", "robots": {}, "duration_s": 1.0}'),
-        (ABOUT | {"seed": "four"}, msgspec.json.encode(PAIR)),
-        ({"case": "only"}, msgspec.json.encode(PAIR)),
+        (ABOUT | {"seed": "four"}, msgspec.json.encode(rec.PAIR)),
+        ({"case": "only"}, msgspec.json.encode(rec.PAIR)),
     ],
 )
 def test_a_file_without_an_experiment(path, metadata, attachment):
@@ -394,3 +409,58 @@ def test_a_file_of_another_version(path, read):
     foreign(path, ("/TB01/state", "zenpark_msgs/msg/State", b"string robot\n", b"\0\1\0\0"))
     with pytest.raises(RecordingError, match=r"/TB01/state was recorded by a version of zenpark with other fields"):
         read(path)
+
+
+SMALL = st.floats(0.0, 0.5)
+
+
+@given(st.floats(-10.0, 10.0), st.lists(st.tuples(SMALL, SMALL), min_size=1, max_size=20))
+def test_offset_is_within_uncertainty_despite_unequal_ways(true, ways):
+    samples = [
+        ClockSample(100.0 + k, 100.0 + k + there + true, 100.0 + k + there + back)
+        for k, (there, back) in enumerate(ways)
+    ]
+    found, uncertainty = host_offset(samples)
+    assert abs(found - true) <= uncertainty + 1e-9
+    assert uncertainty == pytest.approx(min(there + back for there, back in ways) / 2, abs=1e-9)
+
+
+def test_the_shortest_way_tells_most():
+    slow, quick = ClockSample(0.0, 0.2, 1.0), ClockSample(2.0, 2.2005, 2.001)
+    assert host_offset([slow, quick, slow]) == (pytest.approx(0.2), pytest.approx(0.0005))
+
+
+def clock_of(host, stamp, lies, robots=("CF01",)):
+    return HostClock(host, stamp, lies, 1e-4, list(robots))
+
+
+def test_drift_is_removed_after_the_initial_offset():
+    begin, drift = 1.7e9, 50e-6
+    said = [clock_of("lab2", begin, 0.2), clock_of("lab1", begin, 0.0, ["KH01"]), clock_of("lab2", begin + 600.0, 0.23)]
+    right = Correction(said)
+    true = begin + np.array([0.0, 10.0, 300.0, 600.0])
+    stamped = true + drift * (true - begin)  # its offset of 0.2 s was taken off when it stamped
+    assert stamped[-1] - true[-1] == pytest.approx(0.03, abs=1e-6), "six times what starts may differ"
+    assert [right("CF01", float(stamp)) for stamp in stamped] == pytest.approx(list(true), abs=1e-5)
+    assert right("KH01", begin + 5.0) == begin + 5.0, "measured once"
+    assert right("TB01", begin + 5.0) == begin + 5.0, "it ran here"
+    lab2, lab1 = right.offsets()
+    assert (lab2.host, lab2.robots, lab2.over) == ("lab2", ("CF01",), 600.0)
+    assert lab2.drift == pytest.approx(drift)
+    assert lab1.drift is None
+
+
+def test_goals_in_transit_keep_their_delay():
+    drift, true = 50e-6, 300.0
+    right = Correction([clock_of("lab2", 0.0, 0.2), clock_of("lab2", 600.0, 0.23)])
+    posed, acted = true * (1 + drift), (true + 0.1) * (1 + drift)
+    followed, rest = [GoalReceipt(7, 300.05, posed, acted)], (0.0, 0.0, 0.0)
+    said = State("CF01", 1, acted, "running", rest, rest, 0.0, None, None, 0.0, goal_receipts=followed)
+    goal = right.state(said).goal_receipts[0]
+    assert goal.stamp == 300.05, "the centre runs where the conductor does"
+    assert (goal.pose, goal.acted) == pytest.approx((true, true + 0.1), abs=1e-5)
+
+
+def test_nothing_measured_nothing_changed():
+    assert Correction([])("CF01", 12.5) == 12.5
+    assert Correction([]).offsets() == ()

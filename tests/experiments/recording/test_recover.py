@@ -83,13 +83,6 @@ def test_a_whole_file_needs_no_recovery(path, tmp_path, capsys):
     assert sorted(tmp_path.iterdir()) == [path]
 
 
-def test_the_command_writes_beside_the_source(path, capsys):
-    commands.recover(str(broken(path)), None)
-    target = path.with_name("run-recovered.mcap")
-    assert capsys.readouterr().out == f"{target}: 82 messages of TB01, CF01\n"
-    assert read(target).complete
-
-
 def test_recovery_overwrites_nothing(path, tmp_path):
     target = tmp_path / "precious"
     target.write_text("mine")
@@ -100,7 +93,7 @@ def test_recovery_overwrites_nothing(path, tmp_path):
     assert not read(path).complete
 
 
-def test_a_recorder_that_took_over_completes_the_recording(path, tmp_path):
+def test_a_recorder_that_took_over_completes_the_recording(path, tmp_path, capsys):
     """Its first messages are the last values and the events that publishers repeat."""
     run = sorted(whole_run(), key=lambda message: message.stamp)
     first, rest = run[:50], run[50:]
@@ -113,9 +106,10 @@ def test_a_recorder_that_took_over_completes_the_recording(path, tmp_path):
     (later.parent / "part3.mcap").touch()  # killed before its first record
     commands.recover(str(path), None)
     write(whole := tmp_path / "whole.mcap", *run)
-    made, wanted = (read(file) for file in (path.with_name("run-recovered.mcap"), whole))
-    assert made.complete
-    assert made.messages == wanted.messages
+    target = path.with_name("run-recovered.mcap")
+    made, wanted = read(target), read(whole)
+    assert (made.complete, made.messages) == (True, wanted.messages)
+    assert capsys.readouterr().out == f"{target}: {made.messages} messages of TB01, CF01\n"
     assert_same(made.trace, wanted.trace)
 
 

@@ -22,33 +22,20 @@ from experiments.recording.reader import RecordingError, recover
 from experiments.recording.ros2 import viewers
 from experiments.recording.topics import CHUNK_BYTES
 from experiments.scene import markers
-from tests.experiments.recordings import (
-    DOCUMENT,
-    PAIR,
-    START,
-    begun,
-    broken,
-    put,
-    recording,
-    scattered,
-    small_disk,
-    state,
-    whole_run,
-    write,
-)
+from tests.experiments import recordings as rec
 from tests.waiting import ManualClock
 
 
 def test_what_is_attached(path):
-    write(path, begun(), started=START)
+    rec.write(path, rec.begun(), started=rec.START)
     with path.open("rb") as file:
         reader = make_reader(file, validate_crcs=True)
         assert reader.get_header().profile == "ros2"
         attached = {one.name: one.data for one in reader.iter_attachments()}
         about = {one.name: one.metadata for one in reader.iter_metadata()}["zenpark"]
-    assert attached["experiment.toml"].decode() == DOCUMENT
-    assert msgspec.json.decode(attached["experiment.json"], type=Experiment) == PAIR
-    assert (about["case"], about["seed"], about["clock"], about["started"]) == ("only", "4", "real", repr(START))
+    assert attached["experiment.toml"].decode() == rec.DOCUMENT
+    assert msgspec.json.decode(attached["experiment.json"], type=Experiment) == rec.PAIR
+    assert (about["case"], about["seed"], about["clock"], about["started"]) == ("only", "4", "real", repr(rec.START))
     assert about["version"]
 
 
@@ -59,7 +46,7 @@ def decoded(path, topics=None):
 
 
 def test_others_read_it(path):
-    write(path, *whole_run())
+    rec.write(path, *rec.whole_run())
     with AnyReader([path]) as reader:
         seen = [(c.topic, t, reader.deserialize(raw, c.msgtype)) for c, t, raw in reader.messages()]
     states = [message for topic, _, message in seen if topic == "/CF01/state"]
@@ -68,7 +55,7 @@ def test_others_read_it(path):
     assert states[5].received[0].position.tolist() == [0.45, 0.0, 0.0]
     assert math.isnan(states[5].true_yaw)
     drawn = [(t, message) for topic, t, message in seen if topic == "/TB01/true_pose"]
-    assert drawn[3][0] == round((START + 0.3) * 1e9)
+    assert drawn[3][0] == round((rec.START + 0.3) * 1e9)
     assert (drawn[3][1].header.frame_id, drawn[3][1].pose.position.z) == ("map", 0.01)
     measured = [message for topic, _, message in seen if topic == "/CF01/true_pose"]
     assert measured[3].pose.position.x == -0.3
@@ -79,9 +66,9 @@ def test_others_read_it(path):
     assert [one.decoded_message.seq for one in sent] == list(range(1, 12))
     assert [one.message.sequence for one in sent] == list(range(1, 12))
     assert sent[2].decoded_message.size == 150
-    assert sent[2].decoded_message.received == START + 0.2 + 0.002
-    assert sent[2].message.log_time == round((START + 0.2 + 0.002) * 1e9)
-    assert sent[2].message.publish_time == round((START + 0.2) * 1e9)
+    assert sent[2].decoded_message.received == rec.START + 0.2 + 0.002
+    assert sent[2].message.log_time == round((rec.START + 0.2 + 0.002) * 1e9)
+    assert sent[2].message.publish_time == round((rec.START + 0.2) * 1e9)
     last = [one.decoded_message for one in found if one.channel.topic == "/CF01/status"][-1]
     assert (last.lost_keys, last.lost_values, math.isnan(last.battery)) == (["TB01"], [1], True)
     assert [one.decoded_message.kind for one in found if one.channel.topic == "/events"] == ["start"]
@@ -90,23 +77,23 @@ def test_others_read_it(path):
 def test_a_recording_is_never_overwritten(path):
     path.write_text("precious")
     with pytest.raises(RecordingError, match=r"run\.mcap: exists already; move it away"):
-        write(path)
+        rec.write(path)
     assert path.read_text() == "precious"
     with pytest.raises(RecordingError, match="cannot be created: No such file"):
-        write(path.parent / "none" / "run.mcap")
+        rec.write(path.parent / "none" / "run.mcap")
 
 
 def test_closed_twice_and_used_after(path):
-    made = write(path, begun())
+    made = rec.write(path, rec.begun())
     made.close()
     with pytest.raises(RecordingError, match="closed"):
-        made.write(state())
+        made.write(rec.state())
 
 
 def test_callers_error_leaves_a_finished_file(path):
     def fails():
-        with recording(path) as made:
-            put(made, whole_run())
+        with rec.recording(path) as made:
+            rec.put(made, rec.whole_run())
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -115,11 +102,11 @@ def test_callers_error_leaves_a_finished_file(path):
 
 
 def test_a_full_disk_keeps_what_was_written(path):
-    messages = scattered(2000)
-    made = recording(path)
-    with small_disk():
+    messages = rec.scattered(2000)
+    made = rec.recording(path)
+    with rec.small_disk():
         with pytest.raises(RecordingError, match=r"run\.mcap: cannot be written: .*zenpark recover"):
-            put(made, [begun(), *messages])
+            rec.put(made, [rec.begun(), *messages])
         with pytest.raises(RecordingError, match="make room"):
             made.write(messages[0])
         made.close()
@@ -131,25 +118,25 @@ def test_a_full_disk_keeps_what_was_written(path):
 
 
 def test_disk_too_full_for_record_or_recovery(path, tmp_path):
-    big = broken(tmp_path / "big.mcap", begun(), *scattered(2000))
-    with small_disk():
+    big = rec.broken(tmp_path / "big.mcap", rec.begun(), *rec.scattered(2000))
+    with rec.small_disk():
         with pytest.raises(RecordingError, match=r"run\.mcap: cannot be written"):
             recover(big, path)
         assert not path.exists()
         with pytest.raises(RecordingError, match="cannot be written"):
-            recording(path, document="#" * 50_000)
+            rec.recording(path, document="#" * 50_000)
 
 
 def test_interrupt_inside_a_write_ends_all_writing(path, monkeypatch):
     def interrupted(_):
         raise KeyboardInterrupt
 
-    made = recording(path)
+    made = rec.recording(path)
     monkeypatch.setattr(writer.McapFile, "flush", interrupted)
     with pytest.raises(KeyboardInterrupt):
         made.flush()
     with pytest.raises(RecordingError, match=r"interrupted while it wrote; run `\./zenpark recover`"):
-        made.write(begun())
+        made.write(rec.begun())
     made.close()
 
 
@@ -181,13 +168,13 @@ def test_file_equals_the_librarys_own(tmp_path):
 
 def drawn_scene(path):
     """Write the pair's recording with a scene, states out of order by 0.15 s, and an event from the future."""
-    clock = ManualClock(START)
-    with recording(path, draw=markers.drawing(Plan(PAIR)), utc=clock.utc) as made:
-        made.write(Event(START + 5.0, "start", "conductor", "common start"))
+    clock = ManualClock(rec.START)
+    with rec.recording(path, draw=markers.drawing(Plan(rec.PAIR)), utc=clock.utc) as made:
+        made.write(Event(rec.START + 5.0, "start", "conductor", "common start"))
         for k in range(300):
-            clock.now = START + 0.05 * k + 0.2
+            clock.now = rec.START + 0.05 * k + 0.2
             for robot, late in (("TB01", 0.0), ("CF01", 0.15)):
-                made.write(state(robot, seq=k + 1, at=0.05 * k + 0.2 - late, x=0.01 * k))
+                made.write(rec.state(robot, seq=k + 1, at=0.05 * k + 0.2 - late, x=0.01 * k))
             if k % 20 == 7:
                 made.write(Event(clock.now - 0.5, "robot", "CF01", "said late"))
 
@@ -202,7 +189,7 @@ def test_viewers_find_frames_and_scene_in_standard_types(path):
     last = [each for each in frames if each.child_frame_id == "TB01"][-1]
     assert last.header.frame_id == viewers.FRAME == bridge.FRAME
     assert (last.transform.translation.x, last.transform.rotation.w) == (2.99, 1.0)
-    assert last.header.stamp.sec + 1e-9 * last.header.stamp.nanosec == pytest.approx(START + 15.15, abs=1e-6)
+    assert last.header.stamp.sec + 1e-9 * last.header.stamp.nanosec == pytest.approx(rec.START + 15.15, abs=1e-6)
     scenes = [message.markers for topic, message in seen if topic == "/scene"]
     assert 60 <= len(scenes) <= 76, "five a second"
     groups = {marker.ns: marker for marker in scenes[-1]}
@@ -223,8 +210,8 @@ def test_size_of_chunks_changes_no_message(tmp_path):
     kept = []
     for size in (1_000, CHUNK_BYTES, 1_000_000):
         file = tmp_path / f"{size}.mcap"
-        with recording(file, chunk_bytes=size) as made:
-            put(made, [state("CF01", k, START + 0.02 * k) for k in range(200)])
+        with rec.recording(file, chunk_bytes=size) as made:
+            rec.put(made, [rec.state("CF01", k, rec.START + 0.02 * k) for k in range(200)])
         with file.open("rb") as stream:
             reader = make_reader(stream, validate_crcs=True)
             found = [(channel.topic, message) for _, channel, message in reader.iter_messages()]
@@ -242,5 +229,5 @@ def test_chunks_are_in_order_of_time(path):
     assert len(chunks) > 10
     for before, after in itertools.pairwise(chunks):
         assert before.message_end_time <= after.message_start_time
-    assert events[0].log_time == round(START * 1e9), "logged when it came"
-    assert events[0].publish_time == round((START + 5.0) * 1e9)
+    assert events[0].log_time == round(rec.START * 1e9), "logged when it came"
+    assert events[0].publish_time == round((rec.START + 5.0) * 1e9)

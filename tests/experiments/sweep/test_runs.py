@@ -4,6 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from experiments import run
 from experiments.definition.experiment import ChannelTable, Start, WorldTable
 from experiments.definition.plan import Plan
 from experiments.file import structure
@@ -124,3 +125,20 @@ def test_a_plug_in_that_changes_changes_the_code(park, tmp_path, monkeypatch):
     file.write_text("two")
     assert len({before, foreign, code_of(Plan(park))}) == 3
     runs.file_digest.cache_clear()
+
+
+@pytest.mark.slow
+def test_seeds_of_several_processes_are_those_of_one(monkeypatch, tmp_path):
+    read, told = load("triangle", "duration_s=1.0"), []
+    alone = run.simulate_seeds(read, range(4, 7), cases=["event"])
+    monkeypatch.setattr(run, "SHARED", 0.0)
+    monkeypatch.setattr(run, "cores", lambda: 2)
+    shared = run.simulate_seeds(read, range(4, 7), cases=["event"], folder=tmp_path, progress=lambda *t: told.append(t))
+    assert [each.seed for each in shared] == [4, 5, 6]
+    assert [file.name for file in tmp_path.iterdir()] == ["event.mcap"]
+    assert told[-1] == ("event", 1, 1)
+    for one, other in zip(alone, shared, strict=True):
+        ours, theirs = one.traces["event"], other.traces["event"]
+        assert np.array_equal(ours.true_position, theirs.true_position)
+        assert np.array_equal(ours.sent.stamp, theirs.sent.stamp)
+        assert repr(one.metrics["event"]) == repr(other.metrics["event"])

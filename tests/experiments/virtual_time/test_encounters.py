@@ -1,4 +1,4 @@
-"""Robots whose ways cross at random: with the barrier none touches another, and all arrive.
+"""Robots whose ways cross at random, and an obstacle course: with the barrier none touches another, and all arrive.
 
 Bodies are point masses: robots that touch go through each other, and the overlap of their cylinders can be measured.
 """
@@ -15,8 +15,12 @@ from agents.body.kinds import KINDS
 from agents.decision.lifecycle import RUNNING
 from experiments.definition.experiment import Arena, ChannelTable, LegTable, Rates, RobotTable, Start
 from experiments.definition.plan import Plan
+from experiments.file.document import load
 from experiments.virtual_time.simulation import simulate
+from tests.experiments.traces import link_errors
+from tests.runs import flown
 from tests.small import changed, small
+from twins import scene as outlines
 from twins.arrays import norm
 
 pytestmark = pytest.mark.slow
@@ -192,3 +196,32 @@ def test_robots_with_sensors_alone_keep_clear(kind, sensors):
 def test_bad_network_causes_no_collision(kinds):
     bad = ChannelTable(delay_s=0.02, jitter_s=0.02, loss=0.2)
     assert_clear(meet(changed(encounter(kinds, BARRIER), channel=bad), range(1, 21)))
+
+
+RADIUS = KINDS["turtlebot3"].radius
+
+
+def test_the_gap_is_narrower_than_the_formation():
+    experiment = load("obstacle-course").experiment
+    left, right = (experiment.arena.obstacles[name] for name in ("left", "right"))
+    gap = left.at[1] - right.at[1] - 0.5 * (left.box[1] + right.box[1])
+    wide = np.ptp([robot.start[1] for robot in experiment.robots.values()]) + 2.0 * RADIUS
+    assert gap == pytest.approx(0.6)
+    assert wide == pytest.approx(1.01)
+
+
+@pytest.mark.parametrize("case", [pytest.param("periodic", marks=pytest.mark.nightly), "event"])
+def test_it_passes_without_contact_and_recovers(case):
+    flight = flown("obstacle-course", case)
+    plan, log, scene = flight.plan, flight.log, flight.plan.scene
+    run = (log.time >= 0.0) & (log.time <= plan.experiment.duration_s)
+    time, place = log.time[run], log.true_position[run]
+    assert log.touches == ()
+    for k in range(len(scene.names)):
+        assert (outlines.distance(scene, k, scene.pose[k], place[..., :2]) > RADIUS + 0.04).all()
+    i, j = np.triu_indices(place.shape[1], 1)
+    assert (norm(place[:, i, :2] - place[:, j, :2]) > 2.0 * RADIUS + 0.04).all()
+    assert (place[-1, :, 0] > 0.5).all()  # all are through
+    error = link_errors(plan.links, place).max(axis=1)
+    assert error.max() > 0.3  # it had to fold
+    assert error[time > 75.0].max() < 0.025
