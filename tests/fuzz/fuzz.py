@@ -11,11 +11,14 @@ from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from tests.fuzz import targets_devices, targets_drones, targets_files, targets_network, targets_ros
 from tests.fuzz.mutate import Mutator
 from tests.fuzz.target import Place, Target
 
 SLOW_S = 1.0  # CPU time that no input of 64 kB may take
 HUGE_KB = 100 * 1024  # by which no input may make the process larger
+MODULES = (targets_network, targets_drones, targets_devices, targets_ros, targets_files)
+PLACES = {name: place for module in MODULES for name, place in module.PLACES.items()}
 
 
 @dataclass

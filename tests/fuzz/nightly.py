@@ -20,9 +20,8 @@ from collections.abc import Sequence
 from multiprocessing.connection import Connection
 from pathlib import Path
 
-from tests.fuzz.fuzz import Tally, drive, replay, save
+from tests.fuzz.fuzz import PLACES, Tally, drive, replay, save
 from tests.fuzz.mutate import LARGEST
-from tests.fuzz.places import PLACES
 
 MILLION = 1_000_000
 BLOCK = 1000  # inputs between two lines of progress, at most

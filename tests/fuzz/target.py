@@ -1,7 +1,8 @@
-"""What a target is: a place where bytes from outside are read."""
+"""What a target is: a place where bytes from outside are read, made ready; and sockets for those that need one."""
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -69,3 +70,35 @@ class Renewed:
     def close(self) -> None:
         if self._made is not None:
             self._made.close()
+
+
+class Wire:
+    """A socket without a network, fed by hand."""
+
+    def __init__(self) -> None:
+        self.waiting: deque[bytes] = deque()
+
+    def recvfrom(self, most: int) -> tuple[bytes, tuple[str, int]]:
+        if not self.waiting:
+            raise BlockingIOError
+        return self.waiting.popleft()[:most], ("127.0.0.1", 9)
+
+    def recv(self, most: int) -> bytes:
+        return self.recvfrom(most)[0]
+
+    def sendto(self, packet: bytes, _to: object = None) -> int:
+        assert isinstance(packet, bytes | bytearray)
+        return len(packet)
+
+    send = sendto
+
+    def close(self) -> None:
+        pass
+
+    def setsockopt(self, *_: object) -> None:
+        pass
+
+    setblocking = setsockopt
+
+    def getsockname(self) -> tuple[str, int]:
+        return "127.0.0.1", 1

@@ -12,8 +12,7 @@ import numpy as np
 
 from agents.protocols import vicon_datastream
 from agents.protocols.vicon_datastream import BlockKind, Segment
-from tests.fuzz.sockets import Wire
-from tests.fuzz.target import Inputs, Place, Renewed, Target
+from tests.fuzz.target import Inputs, Place, Renewed, Target, Wire
 from tests.requests import request
 from twins.devices.device import DeviceRequest, Faults
 

@@ -15,8 +15,7 @@ import numpy as np
 
 from agents.protocols import crtp
 from agents.protocols.crtp import HighLevel, Log, Misc, Port, Setpoint, SupervisorCommand
-from tests.fuzz.sockets import Wire
-from tests.fuzz.target import Inputs, Place, Renewed, Target
+from tests.fuzz.target import Inputs, Place, Renewed, Target, Wire
 from tests.requests import request
 from twins.devices.device import DeviceRequest, Faults
 

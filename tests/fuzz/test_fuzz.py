@@ -10,9 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.fuzz.fuzz import drive, replay
+from tests.fuzz.fuzz import PLACES, drive, replay
 from tests.fuzz.mutate import LARGEST, Mutator
-from tests.fuzz.places import PLACES
 from tests.fuzz.target import Target
 
 ONCE = sorted((Path(__file__).parent / "once").glob("*.bin"))
