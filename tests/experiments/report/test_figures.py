@@ -32,6 +32,18 @@ LARGE = "40 robots, 5 cases"
 EVERY = [pytest.param(name, marks=pytest.mark.nightly if name == LARGE else ()) for name in RUNS]
 
 
+def rendered(figure):
+    """Canvas of a drawn figure."""
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return canvas
+
+
+def thick(axes):
+    """Curves of whole cases."""
+    return [line for line in axes.lines if line.get_linewidth() == 1.3]
+
+
 @pytest.fixture(scope="module", params=EVERY)
 def run(request):
     return RUNS[request.param]()
@@ -51,9 +63,7 @@ def test_motions_are_drawn_in_one_column(draw, run):
 def test_bars_are_drawn_in_one_column(draw, run):
     figure = draw([measure(trace) for trace in run])
     assert figure.get_figwidth() == 3.5
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    renderer = canvas.get_renderer()
+    renderer = rendered(figure).get_renderer()
     for axes in figure.axes:
         boxes = [label.get_window_extent(renderer) for label in axes.get_xticklabels() if label.get_text()]
         assert not any(a.x1 > b.x0 for a, b in itertools.pairwise(boxes))
@@ -91,8 +101,8 @@ def test_plan_shows_surroundings_with_few_cases_overlaid():
 
 def test_an_error_axis_reaches_the_curves():
     (axes,) = figures.errors([pair(1.0 + np.exp(-np.arange(0.0, 9.0, 0.02)))]).axes  # down to 0.2 mm
-    (thick,) = [line for line in axes.lines if line.get_linewidth() == 1.3]
-    assert axes.get_ylim()[0] <= np.nanmin(thick.get_ydata()) < 3e-4
+    (curve,) = thick(axes)
+    assert axes.get_ylim()[0] <= np.nanmin(curve.get_ydata()) < 3e-4
 
 
 def test_a_legend_has_the_columns_that_fit():
@@ -118,11 +128,10 @@ def test_errors_of_cases_share_a_marked_logarithmic_axis():
     cases = [measure(each) for each in traces]
     (axes,) = figures.errors(traces, cases).axes
     assert axes.get_yscale() == "log"
-    thick = [line for line in axes.lines if line.get_linewidth() == 1.3]
-    assert len(thick) == 2
+    assert len(thick(axes)) == 2
     assert max(len(line.get_xdata()) for line in axes.lines) <= 1500
     marks = [line for line in axes.lines if line.get_marker() == "v"]
-    for case, line, mark in zip(cases, thick, marks, strict=True):
+    for case, line, mark in zip(cases, thick(axes), marks, strict=True):
         acquired = [start + at for start, at in zip(case.starts_s, case.acquired_s, strict=True)]
         assert list(mark.get_xdata()) == pytest.approx(acquired)
         assert set(mark.get_ydata()) == {case.tolerance}
@@ -136,7 +145,7 @@ def test_errors_of_cases_share_a_marked_logarithmic_axis():
 def test_errors_over_seeds_are_a_band():
     traces = [park("a", seed=seed, duration=5.0) for seed in (1, 2, 3)]
     (axes,) = figures.errors(traces).axes
-    assert len([line for line in axes.lines if line.get_linewidth() == 1.3]) == 1
+    assert len(thick(axes)) == 1
     assert len(axes.collections) == 1  # no curves of single robots beside it
     assert not [line for line in axes.lines if line.get_linewidth() == 0.4]
 
@@ -149,36 +158,32 @@ def test_a_periodic_case_is_a_line_of_text():
 
 
 def test_cases_and_robots_have_palettes_of_their_own():
-    assert not set(style.CASES[:-1]) & set(style.ROBOTS)
-    assert not set(style.CASES[:-1]) & {kind.colour for kind in KINDS.values()}
-
-
-def test_figures_show_themselves_in_notebooks():
-    assert figures.errors([park(duration=3.0)])._repr_svg_().startswith("<?xml")
+    assert not set(style.CASES[:-1]) & {*style.ROBOTS, *(kind.colour for kind in KINDS.values())}
 
 
 def test_long_legends_stay_inside_the_figure():
     cases = [measure(crowd(3, f"pentagon-2026-11-22T00-29-2{k} · periodic", duration=1.0)) for k in range(4)]
     for draw in OF_CASES:
         figure = draw(cases)
-        canvas = FigureCanvasAgg(figure)
-        canvas.draw()
-        box = figure.legends[0].get_window_extent(canvas.get_renderer())
+        box = figure.legends[0].get_window_extent(rendered(figure).get_renderer())
         assert 0.0 <= box.x0 < box.x1 <= figure.bbox.x1
 
 
-def test_raster_has_one_box_per_separate_transmission():
+def sending(leader, follower):
+    """Two robots that stand for 20 s and transmit at given times [s]."""
     what = experiment({"L": "turtlebot3", "F": "khepera4"}, {"L > F": 1.0})
-    known = trace(what, np.zeros((1001, 2, 3)), sent={"L": [1.0, 2.0, 2.01, 5.0], "F": []})
+    return trace(what, np.zeros((1001, 2, 3)), sent={"L": leader, "F": follower})
+
+
+def test_raster_has_one_box_per_separate_transmission():
+    known = sending([1.0, 2.0, 2.01, 5.0], [])
     outline = figures.events([known]).axes[0].patches[0].get_path()
     assert len(outline.vertices) == 3 * 5  # 2.00 and 2.01 touch in print
     assert outline.vertices[:, 0].min() == pytest.approx(1.0)
 
 
 def test_intervals_reach_one_at_the_longest():
-    what = experiment({"L": "turtlebot3", "F": "khepera4"}, {"L > F": 1.0})
-    known = trace(what, np.zeros((1001, 2, 3)), sent={"L": [1.0], "F": [0.0, 0.5, 1.0, 3.0]})
-    x, y = figures.intervals([known]).axes[0].lines[0].get_data()
+    x, y = figures.intervals([sending([1.0], [0.0, 0.5, 1.0, 3.0])]).axes[0].lines[0].get_data()
     assert (x[0], x[-1], y[0], y[-1]) == pytest.approx((0.5, 2.0, 0.0, 1.0))
     assert y[np.searchsorted(x, 0.5, side="right") - 1] == pytest.approx(2.0 / 3.0)
 
@@ -204,16 +209,6 @@ def test_cases_are_overlaid_in_space_with_final_links():
     assert [text.get_text() for text in axes.texts] == list(traces[0].robots)
 
 
-@pytest.mark.parametrize("draw", OF_TRACES, ids=lambda draw: draw.__name__)
-def test_dead_or_silent_robot_can_be_drawn(draw):
-    known = park(duration=3.0)
-    place = known.true_position.copy()
-    place[50:, 6] = np.nan
-    place[:, 5] = np.nan
-    silent = known.sent.take(np.arange(0))
-    assert "<svg" in figures.svg(draw([dataclasses.replace(known, true_position=place, sent=silent)]))
-
-
 def drawn(traces):
     """All figures, rendered."""
     measured = [measure(each) for each in traces if len(each.time) > 1]
@@ -232,15 +227,8 @@ def unknown(known, rows):
 WITHOUT_SPACE = ["errors", "robot_bars", "events", "intervals"]
 
 
-def test_no_trace_gives_no_figure():
-    assert figures.all_figures([], []) == {}
-
-
-def test_a_trace_that_ends_before_the_first_leg():
+def test_short_and_unknown_cases_are_drawn():
     assert drawn([cut(park(), 8.0)]) == ["plan_view", "formation", *WITHOUT_SPACE]
-
-
-def test_one_case_of_two_that_is_unknown():
     names = drawn([park("a", duration=23.0), unknown(park("b", duration=23.0), np.s_[:])])
     assert {"formation", "global_bars"} <= set(names)
 
@@ -253,23 +241,23 @@ def test_nothing_known_and_hardly_any_time(samples):
     assert drawn([unknown(known, np.s_[:])]) == [name for name in WITHOUT_SPACE if samples > 1 or name != "robot_bars"]
 
 
-def test_no_sample_gives_no_picture():
-    known = cut(park(), -1.0)
-    assert figures.all_figures([], [known]) == {}
+def test_no_trace_and_no_sample_give_no_figure():
+    assert figures.all_figures([], []) == figures.all_figures([], [cut(park(), -1.0)]) == {}
 
 
 @pytest.mark.parametrize("draw", OF_TRACES, ids=lambda draw: draw.__name__)
 def test_whatever_is_unknown_can_be_drawn(draw):
     known = park(duration=23.0)
-    for rows in (np.s_[:], np.s_[300:], np.s_[:1100], np.s_[1:]):
-        assert "<svg" in figures.svg(draw([unknown(known, rows)]))
+    silent = dataclasses.replace(known, sent=known.sent.take(np.arange(0)))
+    for rows in (np.s_[:], np.s_[300:], np.s_[:1100], np.s_[1:], np.s_[50:, 6], np.s_[:, 5]):
+        assert "<svg" in figures.svg(draw([unknown(silent if isinstance(rows, tuple) else known, rows)]))
 
 
 def test_saved_files_are_reproducible_vectors_with_real_fonts(tmp_path):
-    figure = figures.intervals([park(duration=3.0)])
-    page, drawing = tmp_path / "figures" / "intervals.pdf", tmp_path / "figures" / "intervals.svg"
-    text = style.save(figure, tmp_path / "figures", "intervals", pdf=True)
-    assert text == drawing.read_text() == figures.svg(figures.intervals([park(duration=3.0)]))
+    folder, known = tmp_path / "figures", [park(duration=3.0)]
+    page, drawing = folder / "intervals.pdf", folder / "intervals.svg"
+    text = style.save(figures.intervals(known), folder, "intervals", pdf=True)
+    assert text == drawing.read_text() == figures.svg(figures.intervals(known))
     assert "<text" not in text
     assert set(re.findall(r"https?://[^\"]*", text.split("<svg")[1])) <= {
         "http://www.w3.org/2000/svg",
@@ -282,12 +270,12 @@ def test_saved_files_are_reproducible_vectors_with_real_fonts(tmp_path):
 
 
 def test_pdf_is_written_on_request_and_kept_current(tmp_path):
-    page = tmp_path / "intervals.pdf"
-    style.save(figures.intervals([park(duration=3.0)]), tmp_path, "intervals")
+    page, known = tmp_path / "intervals.pdf", [park(duration=3.0)]
+    style.save(figures.intervals(known), tmp_path, "intervals")
     assert not page.exists()
-    style.save(figures.intervals([park(duration=3.0)]), tmp_path, "intervals", pdf=True)
+    style.save(figures.intervals(known), tmp_path, "intervals", pdf=True)
     narrow = page.read_bytes()
-    style.save(figures.intervals([park(duration=3.0)], 7.16), tmp_path, "intervals")
+    style.save(figures.intervals(known, 7.16), tmp_path, "intervals")
     assert page.read_bytes() != narrow
 
 
@@ -308,9 +296,7 @@ def test_figure_is_laid_out_once_for_both_files(draw, tmp_path, monkeypatch):
 def test_picture_of_space_is_as_high_as_content():
     for width in (3.5, 7.16):
         figure = figures.formation([park(duration=5.0)], width)
-        canvas = FigureCanvasAgg(figure)
-        canvas.draw()
-        shown = np.asarray(canvas.buffer_rgba())[..., :3].min(axis=2) < 250
+        shown = np.asarray(rendered(figure).buffer_rgba())[..., :3].min(axis=2) < 250
         rows = np.flatnonzero(shown.any(axis=1))
         empty = np.diff(rows).max(initial=0) / figure.dpi
         assert max(rows[0], len(shown) - 1 - rows[-1]) / figure.dpi < 0.15

@@ -64,8 +64,8 @@ def test_everything_stands_in_the_plan_where_it_stands(short):
 
 
 def test_sorts_of_obstacles_are_told_apart_without_colour(short):
-    axes = from_above(short, FULL)
-    post, crate, cart, arrived, lamp = (each for each in axes.patches if isinstance(each, Polygon))
+    patches = from_above(short, FULL).patches
+    post, crate, cart, arrived, lamp = (each for each in patches if isinstance(each, Polygon))
     assert crate.get_hatch()
     assert not post.get_hatch()
     assert lamp.get_linestyle() != post.get_linestyle()
@@ -90,16 +90,13 @@ def test_the_legend_names_what_there_is(short):
     assert "above the floor" not in scenery.legend([full], space=True)[1]
 
 
-def solids(axes):
-    return [each for each in axes.collections if isinstance(each, Poly3DCollection)]
-
-
 def test_spatial_obstacles_reach_over_the_shown_height(short):
     axes = trajectories.formation([within(short, FULL)]).axes[0]
     low, high = axes.get_zlim()
     assert low == 0.0
-    assert len(solids(axes)) == 2 * 3 + 1  # sides and ends of what is closed, the fence; the lamp hangs above it all
-    heights = [np.array(each._faces)[..., 2] if len(each._faces) else None for each in solids(axes)]
+    solids = [each for each in axes.collections if isinstance(each, Poly3DCollection)]
+    assert len(solids) == 2 * 3 + 1  # sides and ends of what is closed, the fence; the lamp hangs above it all
+    heights = [np.array(each._faces)[..., 2] if len(each._faces) else None for each in solids]
     assert max(height.max() for height in heights) == pytest.approx(high)
     fence = heights[-1]
     assert (fence.min(), fence.max()) == pytest.approx((0.0, 0.2))
@@ -110,9 +107,6 @@ def test_space_shows_whole_arena_unless_far_larger(short):
     assert near.get_xlim() == pytest.approx((-1.08 * 1.1, 1.08 * 1.1))
     far = trajectories.formation([within(short, Arena(size=(30.0, 30.0, 3.0)))]).axes[0]
     assert np.ptp(far.get_xlim()) < 3.0
-
-
-def test_space_shows_every_obstacle(short):
     hall = Arena(size=(30.0, 30.0, 3.0), obstacles={"pillar": Obstacle(radius=0.2, at=(-4.0, 3.0))})
     axes = trajectories.formation([within(short, hall)]).axes[0]
     assert axes.get_xlim()[0] < -4.2

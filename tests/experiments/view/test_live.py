@@ -21,7 +21,7 @@ from experiments.view.acting import WatchedRun, may_act, parameters
 from experiments.view.broadcast import Broadcast
 from experiments.view.heartbeat import RECORDED_S, SLOWEST_S, DataAge, frame_s, mark
 from experiments.view.replay import ReplayClock
-from tests.fuzz.loopnet import Mute, Net
+from tests.network import Mute, Net
 
 
 @pytest.mark.parametrize("size", [(2.0, 2.0, 0.95), (12.0, 12.0, 1.1), (4.3, 2.0, 0.95), (0.5, 6.0, 2.0)])

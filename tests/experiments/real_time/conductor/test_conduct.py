@@ -16,7 +16,7 @@ from experiments.file.problems import DocumentError
 from experiments.real_time.conductor.conduct import check_other_runs, hardware
 from experiments.real_time.conductor.emergency import STARTING_S, Emergency
 from experiments.real_time.hosts import run_registry
-from tests.agents.few import pair
+from tests.small import pair
 
 RADIO = "radio://0/80/2M/E7E7E7E701"
 REAL = pair(

@@ -20,7 +20,7 @@ from experiments.file import document
 from experiments.real_time.conductor import hot_changes
 from experiments.real_time.conductor.hot_changes import HotChanges
 from experiments.real_time.conductor.run_view import RobotView
-from tests.fuzz import loopnet
+from tests import network as loopnet
 
 KEYS = Keys()
 START = 1000.0

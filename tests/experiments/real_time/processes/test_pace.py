@@ -9,7 +9,7 @@ from experiments.real_time.processes import world as world_module
 from experiments.real_time.processes import world_network
 from experiments.real_time.processes.world_population import WorldBodies
 from tests.experiments.real_time.processes.joined import centre, world, world_plan
-from tests.fuzz.loopnet import Net
+from tests.network import Net
 
 BEGIN, WORLD_HZ = 1000.0, 100.0
 

@@ -17,7 +17,7 @@ from agents.network.name_ownership import NameTaken, OwnershipCheck, OwnershipTi
 from tests.conftest import RouterProcess
 from tests.experiments.real_time.processes import joined
 from tests.experiments.real_time.processes.joined import KEYS
-from tests.fuzz.loopnet import Attentive, Mute, Net, Reply, Sample
+from tests.network import Attentive, Mute, Net, Reply, Sample
 from tests.system.lab import Started
 from tests.waiting import until
 

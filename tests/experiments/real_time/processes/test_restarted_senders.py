@@ -7,9 +7,9 @@ from agents.network.keys import Keys
 from agents.robot import Robot
 from agents.runtime.goal_inbox import GoalInbox
 from experiments.definition.plan import Plan
-from tests.agents.few import pair
+from tests.small import pair
 from tests.experiments.real_time.processes.joined import KEYS, world_network
-from tests.fuzz.loopnet import Net
+from tests.network import Net
 from tests.fuzz.messages import sent
 
 UTC = 1.7e9
