@@ -10,22 +10,13 @@ import pytest
 
 from agents.body.kinds import KINDS
 from agents.network import messages
+from experiments.definition.experiment import Arena, LinkTable
 from experiments.definition.plan import Plan
-from experiments.file.document import load, loads
+from experiments.file.document import load
 from experiments.scene import markers, models, stage
-from experiments.scene.stage import (
-    BAD,
-    FAIR,
-    GOOD,
-    UNKNOWN,
-    BodyLocation,
-    Condition,
-    LinkTracker,
-    Moment,
-    SceneModel,
-    Trail,
-)
+from experiments.scene.stage import BodyLocation, Condition, LinkTracker, Moment, SceneModel, Trail
 from tests.experiments import moments
+from tests.small import small
 from twins.scene import Obstacle
 
 
@@ -74,7 +65,9 @@ def test_bodies_are_told_apart():
 
 def test_links_change_colour_with_their_error():
     colours = stage.link_colours(np.array([0.0, 0.024, 0.026, 0.049, 0.051, np.nan]))
-    assert [tuple(each) for each in colours.tolist()] == [GOOD, GOOD, FAIR, FAIR, BAD, UNKNOWN]
+    assert [tuple(each) for each in colours.tolist()] == [
+        stage.GOOD, stage.GOOD, stage.FAIR, stage.FAIR, stage.BAD, stage.UNKNOWN
+    ]  # fmt: skip
 
 
 def test_errors_are_those_of_the_law(park):
@@ -89,14 +82,8 @@ def test_errors_are_those_of_the_law(park):
 
 
 def test_links_that_are_not_there_have_no_error():
-    text = """
-        title = "two"
-        duration_s = 9.0
-        robots.A = { kind = "khepera4", start = [0.0, 0.0] }
-        robots.B = { kind = "khepera4", start = [0.5, 0.0] }
-        formation.links."A > B" = { distance = 0.5, from_s = 3.0 }
-    """
-    pair = SceneModel.of_plan(loads(text).cases()["default"])
+    link = LinkTable(distance=0.5, from_s=3.0)
+    pair = SceneModel.of_plan(Plan(small({"A": "khepera4", "B": "khepera4"}, {"A > B": link})))
     tracker, place = LinkTracker(pair), np.array([[0.0, 0.0, 0.0], [0.6, 0.0, 0.0]])
     assert np.isnan(tracker.errors(1.0, place)).all()
     assert tracker.errors(4.0, place) == pytest.approx([0.1])
@@ -187,10 +174,8 @@ def test_obstacles_stand_where_the_file_says():
 
 
 def test_hanging_obstacle_has_a_height_in_recordings():
-    triangle = next(iter(load("triangle").cases().values())).experiment
     lamp = Obstacle(radius=0.2, at=(0.5, 0.0), bottom=1.4, height=0.3)
-    arena = msgspec.structs.replace(triangle.arena, obstacles={"lamp": lamp})
-    drawn = markers.drawing(Plan(msgspec.structs.replace(triangle, arena=arena)))(0.0, {})
+    drawn = markers.drawing(Plan(small({"A": "khepera4"}, arena=Arena(obstacles={"lamp": lamp}))))(0.0, {})
     (marker,) = [each for each in drawn if each.group == "obstacles"]
     assert marker.scale[2] == pytest.approx(0.3)
     assert marker.position[2] == pytest.approx(1.55)

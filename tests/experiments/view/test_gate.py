@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from math import inf
 from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import pytest
 
@@ -46,25 +47,29 @@ def test_own_page_opens_its_websocket(host):
     assert answered(gate, "/secret/", ("Host", host)) == "/"
 
 
+OWN, EVIL = ("Origin", f"http://{HOST}"), ("Origin", "http://evil.example")
+HERE, THERE = ("Host", HOST), ("Host", "evil.example:8080")
+
+
 @pytest.mark.parametrize(
     ("path", "headers"),
     [
-        ("/", [("Host", HOST)]),
-        ("/", [("Host", HOST), ("Origin", f"http://{HOST}"), HANDSHAKE]),
-        ("/former-secret", [("Host", HOST), ("Origin", f"http://{HOST}"), HANDSHAKE]),
-        ("/clock", [("Host", HOST)]),
-        ("/open/guessed", [("Host", HOST)]),
-        ("/sécret", [("Host", HOST)]),
-        ("/secret", [("Host", HOST), HANDSHAKE]),
-        ("/secret", [("Host", HOST), ("Origin", "http://evil.example"), HANDSHAKE]),
-        ("/secret", [("Host", HOST), ("Origin", "null"), HANDSHAKE]),
-        ("/secret", [("Host", HOST), ("Origin", "http://127.0.0.1:3000"), HANDSHAKE]),
-        ("/secret", [("Host", HOST), ("Origin", f"http://{HOST}"), ("Origin", "http://evil.example"), HANDSHAKE]),
-        ("/secret", [("Host", "evil.example:8080"), ("Origin", "http://evil.example:8080"), HANDSHAKE]),
+        ("/", [HERE]),
+        ("/", [HERE, OWN, HANDSHAKE]),
+        ("/former-secret", [HERE, OWN, HANDSHAKE]),
+        ("/clock", [HERE]),
+        ("/open/guessed", [HERE]),
+        ("/sécret", [HERE]),
+        ("/secret", [HERE, HANDSHAKE]),
+        ("/secret", [HERE, EVIL, HANDSHAKE]),
+        ("/secret", [HERE, ("Origin", "null"), HANDSHAKE]),
+        ("/secret", [HERE, ("Origin", "http://127.0.0.1:3000"), HANDSHAKE]),
+        ("/secret", [HERE, OWN, EVIL, HANDSHAKE]),
+        ("/secret", [THERE, ("Origin", "http://evil.example:8080"), HANDSHAKE]),
         ("/secret", [("Host", "127.0.0.1.evil.example"), ("Origin", "http://127.0.0.1.evil.example"), HANDSHAKE]),
         ("/secret/", [("Host", "evil.example")]),
-        ("/secret/", [("Host", HOST), ("Host", HOST)]),
-        ("/secret/", [("Host", HOST), ("Origin", "http://evil.example")]),
+        ("/secret/", [HERE, HERE]),
+        ("/secret/", [HERE, EVIL]),
         ("/secret/", []),
     ],
 )
@@ -80,9 +85,9 @@ def test_address_for_once_leads_in_once():
 
 
 def test_secrets_differ_and_are_not_shown():
-    first, second = Gate(), Gate()
-    assert first.secret != second.secret
-    assert first.secret not in repr(first)
+    gate = Gate()
+    assert gate.secret != Gate().secret
+    assert gate.secret not in repr(gate)
 
 
 def test_page_reports_what_it_shows():
@@ -116,10 +121,10 @@ def operator(monkeypatch):
     monkeypatch.setattr(orders.orders, "stop_publisher", lambda *_: None)
     given = []
     monkeypatch.setattr(orders.orders, "send_order", lambda _s, _k, _r, order: given.append(order) or {})
-    made = orders.Acting(None, orders.WatchedRun(["tcp/127.0.0.1:7447"], "park", "operator"))
-    made._server = SimpleNamespace(gate=Gate(), get_clients=dict)
-    made._number = 2
-    return made, given
+    made, gate = orders.Acting(None, orders.WatchedRun(["tcp/127.0.0.1:7447"], "park", "operator")), Gate()
+    made.build(MagicMock(gate=gate))
+    made.set_stage(SceneModel.of_robots(()), 2)
+    return made, gate, given
 
 
 @pytest.mark.parametrize(
@@ -134,9 +139,9 @@ def operator(monkeypatch):
 )
 def test_old_pictures_order_no_motion(seen, ordered, operator, monkeypatch):
     monkeypatch.setattr(orders.time, "time", lambda: 1001.0)
-    acting, given = operator
+    acting, gate, given = operator
     if seen is not None:
-        acting._server.gate.seen[7] = seen
+        gate.seen[7] = seen
     for what in ("hold", "land", "resume"):
         acting.press(messages.Order(what), what, SimpleNamespace(client_id=7))
     assert [order.order for order in given] == ordered
@@ -150,8 +155,8 @@ def test_slider_values_are_limited_here(sent):
 
 
 def test_slider_orders_what_is_limited(operator):
-    acting, given = operator
-    acting._server.gate.seen[7] = Seen(time.time(), 2)
+    acting, gate, given = operator
+    gate.seen[7] = Seen(time.time(), 2)
     parameter = orders.Parameter("clamp", 0.1, "m")
     acting.slide(parameter, SimpleNamespace(client=object(), client_id=7, target=SimpleNamespace(value=1e6)))
     _, order = acting.due["clamp"]

@@ -8,21 +8,20 @@ import numpy as np
 import pytest
 
 from experiments.file.document import load
-from experiments.run import simulate
 from experiments.scene import models, tracks
 from experiments.scene.stage import Condition, SceneModel
 from experiments.view.panel import RobotRow, table
 from experiments.view.replay import Film
+from tests.runs import recorded
 
 SHORT = ("duration_s=3.0",)
 
 
 @pytest.fixture(scope="module")
-def flown(tmp_path_factory):
+def flown():
     """A recorded run of a law that says a place, as the trace in memory and as a replay."""
-    folder = tmp_path_factory.mktemp("run")
-    run = simulate(load("aggregative", *SHORT), cases=["event"], folder=folder)
-    return run.traces["event"], Film(tracks.read(folder / "event.mcap"))
+    run = recorded("aggregative", *SHORT, cases=("event",))
+    return run.traces["event"], Film(tracks.read(run.folder / "event.mcap"))
 
 
 def test_said_places_are_those_of_the_memory(flown):
@@ -55,12 +54,8 @@ def test_measures_stand_in_the_table(flown):
     assert all(isfinite(each) for row in rows for each in row.measures.values())
     text = table(rows, film.stage)
     assert all(name in text for name in list(trace.measures)[:3])
-    assert (
-        table([RobotRow("A", Condition.ACTIVE, measures={"<b>": 0.12345})], SceneModel.of_robots(("A",))).count(
-            "&lt;b&gt;"
-        )
-        == 1
-    )
+    bold = RobotRow("A", Condition.ACTIVE, measures={"<b>": 0.12345})
+    assert table([bold], SceneModel.of_robots(("A",))).count("&lt;b&gt;") == 1
 
 
 def test_a_mark_is_closed_and_looks_outward():

@@ -22,6 +22,7 @@ from experiments.view.broadcast import Broadcast
 from experiments.view.heartbeat import RECORDED_S, SLOWEST_S, DataAge, frame_s, mark
 from experiments.view.replay import ReplayClock
 from tests.network import Mute, Net
+from tests.runs import recorded
 
 
 @pytest.mark.parametrize("size", [(2.0, 2.0, 0.95), (12.0, 12.0, 1.1), (4.3, 2.0, 0.95), (0.5, 6.0, 2.0)])
@@ -42,23 +43,22 @@ def test_whole_arena_is_in_sight_and_fills_page(size, aspect):
     assert max(fills) == pytest.approx(1.0)
 
 
-def test_age_is_unknown_before_the_first_pose():
-    assert DataAge().seconds(1000.0, 0.0) is None
-
-
-def test_poses_that_came_late_are_old():
+@pytest.mark.parametrize(
+    ("added", "asked", "seconds"),
+    [
+        ([], (1000.0, 0.0), None),
+        ([(1000.0, 1000.1, 10.0)], (1000.1, 10.0), 0.1),
+        ([(1000.0, 1000.1, 10.0), (1001.0, 1046.0, 56.0)], (1046.0, 56.0), 45.0),  # 45 s in a queue
+        ([(1000.5, 1000.0, 10.0)], (1133.0, 143.0), 133.0),  # silence, and a clock ahead by half a second
+    ],
+)
+def test_age_of_poses(added, asked, seconds):
+    """Stamp, UTC and own clock of poses; then UTC and own clock [s]."""
     age = DataAge()
-    age.add(1000.0, utc=1000.1, now=10.0)
-    assert age.seconds(1000.1, 10.0) == pytest.approx(0.1)
-    age.add(1001.0, utc=1046.0, now=56.0)  # 45 s in a queue
-    assert age.seconds(1046.0, 56.0) == pytest.approx(45.0)
+    for stamp, utc, now in added:
+        age.add(stamp, utc=utc, now=now)
+    assert age.seconds(*asked) == (None if seconds is None else pytest.approx(seconds))
     assert not age.recorded
-
-
-def test_silence_makes_poses_old():
-    age = DataAge()
-    age.add(1000.5, utc=1000.0, now=10.0)  # a clock ahead by half a second
-    assert age.seconds(1133.0, 143.0) == pytest.approx(133.0)
 
 
 def test_recordings_are_as_old_as_their_delay_grew():
@@ -86,19 +86,17 @@ def test_slow_pages_get_fewer_pictures():
 
 
 def test_only_an_operator_of_a_lab_gives_orders(tmp_path):
-    known = {
-        name: lab.Identity(role=role, common_name=name, serial="1", until="2027-01-01T00:00:00")
-        for name, role in (("operator", "operator"), ("observer", "observer"), ("ana", "operator"))
-    }
+    roles = {"operator": "operator", "observer": "observer", "ana": "operator"}
+    known = {name: lab.Identity(role, name, "1", "2027-01-01T00:00:00") for name, role in roles.items()}
     (tmp_path / lab.REGISTER).write_bytes(msgspec.json.encode(lab.Register(known)))
-    endpoints = lab.secured(["tls/127.0.0.1:7447"], tmp_path)
-    found = {name: may_act(WatchedRun(endpoints, "park", name)) for name in (*known, "stranger")}
+
+    def acts(name, folder=None):
+        endpoints = ["tcp/127.0.0.1:7447"] if folder is None else lab.secured(["tls/127.0.0.1:7447"], folder)
+        return may_act(WatchedRun(endpoints, "park", name))
+
+    found = {name: acts(name, tmp_path) for name in (*known, "stranger")}
     assert found == {"operator": True, "observer": False, "ana": True, "stranger": False}
-    assert [may_act(WatchedRun(["tcp/127.0.0.1:7447"], "park", name)) for name in ("operator", "observer")] == [
-        True,
-        False,
-    ]
-    assert not may_act(WatchedRun(lab.secured(["tls/127.0.0.1:7447"], tmp_path / "no"), "park", "operator"))
+    assert (acts("operator"), acts("observer"), acts("operator", tmp_path / "no")) == (True, False, False)
 
 
 def test_trigger_and_law_numbers_have_sliders():
@@ -127,13 +125,6 @@ def test_watched_virtual_run_is_unchanged_bit_by_bit():
 KEYS = Keys()
 
 
-@pytest.fixture(scope="module")
-def recording(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("run")
-    simulate(load("triangle", "duration_s=2.0", "timeline=[]"), cases=["event"], folder=folder)
-    return folder / "event.mcap"
-
-
 @pytest.mark.parametrize(
     ("token", "shown"),
     [
@@ -143,7 +134,7 @@ def recording(tmp_path_factory):
         (KEYS.life(KEYS.alive("KH01"), "f00d"), ""),  # its own
     ],
 )
-def test_replay_ends_when_another_process_owns_a_name(token, shown, recording, monkeypatch):
+def test_replay_ends_when_another_process_owns_a_name(token, shown, monkeypatch):
     sent: list[bytes] = []
 
     class Counted(Mute):
@@ -154,7 +145,8 @@ def test_replay_ends_when_another_process_owns_a_name(token, shown, recording, m
 
     with Net().worn() as net:
         monkeypatch.setattr(pubsub, "publisher", lambda *_, **__: Counted())
-        played = Broadcast(net.session, recording, watch_s=0.0)
+        folder = recorded("triangle", "duration_s=2.0", "timeline=[]", cases=("event",)).folder
+        played = Broadcast(net.session, folder / "event.mcap", watch_s=0.0)
         clock = ReplayClock(0.0, played.end - played.begin)
         clock.playing, clock.speed = True, 10.0
         if shown:

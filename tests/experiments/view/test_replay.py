@@ -8,31 +8,32 @@ import msgspec
 import numpy as np
 import pytest
 
-from experiments.file.document import load
 from experiments.recording.playback import NotStarted
 from experiments.recording.reader import RecordingError
-from experiments.run import simulate
 from experiments.scene import tracks
 from experiments.scene.stage import BAD, FAIR, Condition
 from experiments.view.panel import History, RobotRow, css, event_list, link_table, table
 from experiments.view.replay import Film, ReplayClock, marks
+from tests.runs import recorded
 
 GUIDED = ("architecture=centralised",)
 
 
 @pytest.fixture(scope="module", params=[(), GUIDED], ids=["distributed", "centralised"])
-def flown(request, tmp_path_factory):
-    """A recorded run, as the trace in memory and as a replay."""
-    folder = tmp_path_factory.mktemp("run")
-    short = load("robotic-park", "duration_s=3.0", "timeline=[]", *request.param)
-    run = simulate(short, cases=["event"], folder=folder)
-    return run.traces["event"], folder / "event.mcap"
+def flown(request):
+    """A recorded run, as the trace in memory and as a file."""
+    run = recorded("robotic-park", "duration_s=3.0", "timeline=[]", *request.param, cases=("event",))
+    return run.traces["event"], run.folder / "event.mcap"
+
+
+@pytest.fixture
+def film(flown):
+    return Film(tracks.read(flown[1]))
 
 
 @pytest.mark.slow
-def test_positions_are_those_of_the_recording(flown):
-    trace, file = flown
-    film = Film(tracks.read(file))
+def test_positions_are_those_of_the_recording(flown, film):
+    trace, _ = flown
     assert film.tracks.robots == trace.robots
     for k in range(0, len(trace.time), 17):
         moment = film.moment(float(trace.time[k]))
@@ -66,15 +67,13 @@ def test_truncated_recording_is_replayed_to_its_end(flown, tmp_path):
     assert issubclass(NotStarted, RecordingError)
 
 
-def test_conditions_follow_the_phases(flown):
-    film = Film(tracks.read(flown[1]))
+def test_conditions_follow_the_phases(film):
     assert (film.moment(1.0).condition == Condition.ACTIVE).all()
     assert (film.moment(film.tracks.begin - 1.0).condition == Condition.WAITING).all()
     assert set(film.moment(film.tracks.end).condition.tolist()) <= {Condition.LANDING, Condition.DONE}
 
 
-def test_history_has_errors_and_rates_of_whole_case(flown):
-    film = Film(tracks.read(flown[1]))
+def test_history_has_errors_and_rates_of_whole_case(film):
     history = film.history()
     k = int(np.searchsorted(history.time, 2.0))
     moment = film.moment(history.time[k])
@@ -100,15 +99,13 @@ def test_the_clock_plays_pauses_and_ends():
     assert (clock.t, clock.playing) == (-2.0, True)
 
 
-def test_phases_stand_on_the_slider(flown):
-    film = Film(tracks.read(flown[1]))
+def test_phases_stand_on_the_slider(film):
     worded = [mark[1] for mark in marks([film]) if isinstance(mark, tuple)]
     assert "landing" in worded
 
 
-def test_table_has_recorded_content_and_no_empty_columns(flown):
-    read = tracks.read(flown[1])
-    film = Film(read)
+def test_table_has_recorded_content_and_no_empty_columns(film):
+    read = film.tracks
     assert {(row.battery, row.missed) for t in (0.0, read.end) for row in film.rows(t)} == {(None, None)}
     text = table(film.rows(read.end), film.stage)
     assert "f [Hz]" in text
@@ -124,10 +121,9 @@ def test_table_has_recorded_content_and_no_empty_columns(flown):
 
 
 @pytest.mark.slow
-def test_a_robot_without_links_has_no_error(tmp_path):
-    alone = load("robotic-park", "duration_s=1.0", "timeline=[]", "formation.links={}", "cases={}")
-    simulate(alone, folder=tmp_path)
-    film = Film(tracks.read(tmp_path / "default.mcap"))
+def test_a_robot_without_links_has_no_error():
+    alone = recorded("robotic-park", "duration_s=1.0", "timeline=[]", "formation.links={}", "cases={}")
+    film = Film(tracks.read(alone.folder / "default.mcap"))
     assert {row.error for row in film.rows(0.5)} == {None}
 
 
@@ -140,8 +136,8 @@ def test_curves_of_many_robots_are_three():
     assert (most[0], median[0], least[0]) == (39.0, 19.5, 0.0)
 
 
-def test_table_shows_the_worst_first_and_escapes_names(flown):
-    stage = Film(tracks.read(flown[1])).stage
+def test_table_shows_the_worst_first_and_escapes_names(film):
+    stage = film.stage
     rows = [RobotRow(f"R{k}", Condition.ACTIVE, error=0.001 * k) for k in range(30)]
     rows[3] = RobotRow("<b>", Condition.DEAD, note="<script>")
     text = table(rows, stage)
@@ -156,8 +152,8 @@ def test_table_shows_the_worst_first_and_escapes_names(flown):
     assert "12.3 ms" in links
 
 
-def test_warnings_misses_and_leaders_look_so(flown):
-    stage = Film(tracks.read(flown[1])).stage
+def test_warnings_misses_and_leaders_look_so(film):
+    stage = film.stage
     leader = next(name for row, name in enumerate(stage.names) if row not in stage.links.receiver)
     follower = next(name for name in stage.names if name != leader)
     rows = [
