@@ -2,59 +2,29 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
-import zenoh
 
 from agents.decision.lifecycle import Phase
-from agents.network import messages, pubsub
+from agents.network import messages
 from agents.network.keys import Keys
-from experiments.definition.experiment import Experiment, RobotTable
+from experiments.definition.experiment import RobotTable
 from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.real_time.conductor import hot_changes
 from experiments.real_time.conductor.hot_changes import HotChanges
 from experiments.real_time.conductor.run_view import RobotView
-from tests import network as loopnet
+from tests import network
+from tests.network import Query
+from tests.small import changed
+from tests.waiting import ManualClock
 
 KEYS = Keys()
 START = 1000.0
-
-
-class Clock:
-    """Time that passes when it is told to."""
-
-    now = 0.0
-
-    def monotonic(self) -> float:
-        return self.now
-
-    def utc(self) -> float:
-        return START + self.now
-
-
-class Query(loopnet.Query):
-    """An order to the conductor, and its answer."""
-
-    reply_sent: messages.RunReply | None = None
-    error = b""
-
-    def __init__(self, payload: bytes) -> None:
-        super().__init__(KEYS.run_order, messages.JSON, payload)
-
-    def reply(self, key: str, payload: bytes, encoding: str = "") -> None:
-        super().reply(key, payload, encoding)
-        assert key == self.key_expr
-        self.reply_sent = messages.decode(payload, encoding, messages.RunReply)
-
-    def reply_err(self, payload: bytes, encoding: str = "") -> None:
-        super().reply("", payload, encoding)
-        self.error = payload
 
 
 class View:
@@ -62,17 +32,10 @@ class View:
 
     def __init__(self, stage: Stage) -> None:
         self._stage, self.robots, self.clock = stage, stage.robots, stage.clock
-        self.waiting: deque[Query] = deque()
-        self.orders = self
-        self._queries, self._kind, self.malformed = self, messages.RunOrder, 0
+        channel = network.Channel(KEYS.run_order, asked=True)
+        self.add, self.orders = channel.add, network.typed_orders(channel, messages.RunOrder)
         self.given: list[tuple[str, str]] = []
         self.said: list[tuple[str, str, str]] = []
-
-    def read(self) -> Iterator[tuple[zenoh.Query, messages.RunOrder]]:
-        return pubsub.Orders.read(self)  # type: ignore[arg-type]
-
-    def try_recv(self) -> Query | None:
-        return self.waiting.popleft() if self.waiting else None
 
     def report(self, kind: str, source: str, text: str) -> None:
         self.said.append((kind, source, text))
@@ -132,11 +95,10 @@ class Stage:
     """The triangle in flight, a spare beside it."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, **more: Any) -> None:
-        self.clock = Clock()
+        self.clock = ManualClock(START)
         monkeypatch.setattr(hot_changes, "time", self.clock)
         spare = RobotTable(kind="crazyflie", start=[0.8, 0.8], hover=0.5)
-        experiment = msgspec.structs.replace(document.read("triangle").experiment, spares={"S1": spare}, **more)
-        self.experiment: Experiment = experiment
+        self.experiment = experiment = changed(document.read("triangle").experiment, spares={"S1": spare}, **more)
         self.robots = {name: RobotView(place=(*robot.start[:2], 0.0)) for name, robot in experiment.robots.items()}  # type: ignore[arg-type]
         self.hung: set[str] = set()
         self._pid = 1
@@ -173,8 +135,11 @@ class Stage:
             self.changes.mark_lost(name)
 
     def ask(self, what: messages.ChangeKind, *names: str, **more: Any) -> Query:
-        query = Query(messages.encode(messages.RunOrder(what, list(names), **more)))
-        self.view.waiting.append(query)
+        return self.put(messages.encode(messages.RunOrder(what, list(names), **more)))
+
+    def put(self, payload: bytes) -> Query:
+        query = Query(KEYS.run_order, messages.JSON, payload)
+        self.view.add(query)
         return query
 
     def go_on(self, seconds: float = 1.0) -> None:
@@ -184,8 +149,14 @@ class Stage:
 
     def after(self, query: Query, seconds: float = 1.0) -> messages.RunReply:
         self.go_on(seconds)
-        assert query.reply_sent is not None, self.view.said
-        return query.reply_sent
+        return reply_to(query)
+
+
+def reply_to(query: Query) -> messages.RunReply:
+    assert query.answer is not None
+    key, payload, encoding = query.answer
+    assert key == KEYS.run_order
+    return messages.decode(payload, encoding, messages.RunReply)
 
 
 @pytest.fixture
@@ -205,7 +176,7 @@ def test_order_for_several_is_answered_when_all_finish(stage: Stage) -> None:
     stage.hung.add("KH02")
     query = stage.ask("remove", "KH01", "KH02", "KH01")
     stage.go_on(2.0)
-    assert query.reply_sent is None
+    assert query.answer is None
     assert stage.robots["KH01"].left_because == "removed"
     reply = stage.after(query, 4.0)
     assert set(reply.done) == {"KH01", "KH02"}
@@ -241,10 +212,9 @@ def test_whole_orders_that_are_refused(stage: Stage) -> None:
         (stage.ask("replace", "KH01", "KH02", body="twin"), "one robot at a time"),
     ):
         assert said in stage.after(query).reason
-    mad = Query(b'{"order": "explode", "robots": []}')
-    stage.view.waiting.append(mad)
+    mad = stage.put(b'{"order": "explode", "robots": []}')
     stage.go_on()
-    assert b"not a RunOrder" in mad.error
+    assert b"not a RunOrder" in (mad.error or b"")
     assert not stage.view.given
 
 
@@ -260,8 +230,7 @@ def test_the_end_of_the_run_answers_everybody(stage: Stage) -> None:
     query = stage.ask("remove", "CF01")
     stage.go_on()
     stage.changes.close()
-    assert query.reply_sent is not None
-    assert query.reply_sent.refused == {"CF01": "the run is over"}
+    assert reply_to(query).refused == {"CF01": "the run is over"}
     assert "this run is not there" in stage.after(stage.ask("remove", "KH01")).reason
 
 

@@ -15,7 +15,7 @@ from agents.network import session as network
 from agents.network.keys import Keys
 from agents.safety.hazards import failed
 from experiments.real_time.conductor import orders
-from experiments.real_time.conductor.run_view import NetworkView, Progress, RobotView
+from experiments.real_time.conductor.run_view import NetworkView, RobotView
 from tests.conftest import RouterProcess
 from tests.experiments.recordings import START, status
 from tests.waiting import until
@@ -94,19 +94,21 @@ def test_replies_of_another_key_or_robot_are_none() -> None:
     assert orders.send_order(session, KEYS, ["A"], messages.Order("hold")) == {"A": good}  # type: ignore[arg-type]
 
 
+class View(NetworkView):
+    """The network as a conductor sees it, without a network."""
+
+    def __init__(self) -> None:
+        self.clock, self.robots = Clock(), {"TB01": RobotView()}
+        self.said: list[tuple[str, str, str]] = []
+
+    def report(self, kind: str, source: str, text: str, stamp: float | None = None) -> None:
+        self.said.append((kind, source, text))
+
+
 def test_robots_beginning_is_its_first_status_within_experiment() -> None:
-    view = NetworkView.__new__(NetworkView)
-    view.clock = Clock()
-    view._progress = Progress("case", "running", None, 1.0, {"TB01": RobotView()})
-    view.robots = view._progress.robots
-    view.report = lambda *_, **__: None  # type: ignore[method-assign]
+    view = View()
     for phase, at in (("airborne", -0.1), ("running", 0.28), ("running", 1.28), ("landing", 2.0)):
-        said = status(at=at)
-        view.receive_status(
-            messages.decode(
-                messages.encode(said).replace(b'"run"', f'"{phase}"'.encode()), messages.JSON, messages.Status
-            )
-        )
+        view.receive_status(msgspec.structs.replace(status(at=at), phase=phase))
     assert view.robots["TB01"].began == START + 0.28
     view.robots["TB01"].forget_process()
     assert view.robots["TB01"].began is None
@@ -128,19 +130,12 @@ def test_robots_beginning_is_its_first_status_within_experiment() -> None:
     ],
 )
 def test_unasked_landing_is_a_hazard_with_reason_once(reason: str, incidents: tuple[str, ...], fault: bool) -> None:
-    view = NetworkView.__new__(NetworkView)
-    view.clock = Clock()
-    view._progress = Progress("case", "running", None, 1.0, {"TB01": RobotView()})
-    view.robots = view._progress.robots
-    said = []
-    view.report = lambda kind, source, text: said.append((kind, source, text))  # type: ignore[method-assign]
+    view = View()
     told = [messages.Incident(k + 1, START, text) for k, text in enumerate(incidents)]
     for at, phase in enumerate(("running", "landing", "landing", "done")):
         down = phase != "running"
-        made = msgspec.structs.replace(
-            status(at=float(at)), phase=phase, reason=reason if down else "", incidents=told if down else []
-        )
-        view.receive_status(made)
-    found = [text for kind, source, text in said if (kind, source) == ("hazard", "TB01")]
+        changes = {"reason": reason, "incidents": told} if down else {}
+        view.receive_status(msgspec.structs.replace(status(at=float(at)), phase=phase, **changes))
+    found = [text for kind, source, text in view.said if (kind, source) == ("hazard", "TB01")]
     assert found == [*incidents, *([f"land: {reason}"] if fault else [])]
     assert any(failed(text) for text in found) == (fault or reason == "its battery is low")

@@ -7,18 +7,8 @@ import pytest
 
 from agents.network.lab import register
 from experiments.definition.experiment import Host
-from experiments.real_time.hosts import authority
-from experiments.real_time.hosts.certificates import (
-    FolderContent,
-    days_left,
-    ended,
-    faults,
-    fingerprint,
-    misplaced_keys,
-    of_host,
-    read_folder,
-    unnamed,
-)
+from experiments.real_time.hosts import authority, certificates
+from experiments.real_time.hosts.certificates import ended, faults, fingerprint, misplaced_keys, read_folder, unnamed
 
 ROBOTS = ["KH01", "CF01"]
 
@@ -47,20 +37,23 @@ def said(there, lab, clock=None):
 def test_nothing_is_said_of_what_counts(lab, there):
     found = read_folder(there, ROBOTS)
     assert said(there, lab) == list(misplaced_keys(found, "lab1")) == list(ended(lab, ROBOTS)) == []
-    assert days_left(lab, ROBOTS) == pytest.approx(90.0, abs=0.1)
+    assert certificates.days_left(lab, ROBOTS) == pytest.approx(90.0, abs=0.1)
     assert not any("PRIVATE" in text for text in (found.authority, *(each.certificate for each in found.identities)))
 
 
+INSTALL = "; `./zenpark hosts install"
+
+
 def test_each_fault_has_its_remedy(lab, there, tmp_path):
-    assert said(tmp_path / "nowhere", lab)[0].startswith("has no certificates of KH01, CF01; `./zenpark hosts install")
-    (there / "KH01.key").chmod(0o644)
-    assert said(there, lab)[0].startswith(
-        "others can read KH01.key; revoke it if they have read it; `./zenpark hosts install"
-    )
-    (there / "KH01.key").unlink()
-    assert said(there, lab)[0].startswith("KH01.key is missing; `./zenpark hosts install")
-    shutil.copy(lab / "CF01.key", there / "KH01.key")
-    assert said(there, lab)[0].startswith("KH01.key is not the key of KH01.pem; `./zenpark hosts install")
+    assert said(tmp_path / "nowhere", lab)[0].startswith(f"has no certificates of KH01, CF01{INSTALL}")
+    key = there / "KH01.key"
+    for spoil, fault in (
+        (lambda: key.chmod(0o644), f"others can read KH01.key; revoke it if they have read it{INSTALL}"),
+        (key.unlink, f"KH01.key is missing{INSTALL}"),
+        (lambda: shutil.copy(lab / "CF01.key", key), f"KH01.key is not the key of KH01.pem{INSTALL}"),
+    ):
+        spoil()
+        assert said(there, lab)[0].startswith(fault)
     shutil.copy(lab / "KH01.key", there)
     (there / "CF01.pem").write_text("nonsense")
     assert said(there, lab)[0].startswith("CF01.key is not the key of CF01.pem")
@@ -69,9 +62,8 @@ def test_each_fault_has_its_remedy(lab, there, tmp_path):
 def test_what_no_longer_counts_is_told_apart(lab, there, tmp_path):
     authority.renew(lab, ["KH01"])
     authority.revoke(lab, ["CF01"])
-    first, second = said(there, lab)
-    assert first.startswith("the certificate of KH01 there has been renewed since; `./zenpark hosts install")
-    assert second.startswith("the certificate of CF01 there has been revoked since; `./zenpark hosts install")
+    for fault, (name, fate) in zip(said(there, lab), (("KH01", "renewed"), ("CF01", "revoked")), strict=True):
+        assert fault.startswith(f"the certificate of {name} there has been {fate} since{INSTALL}")
     before = fingerprint((lab / "ca.pem").read_text())
     authority.renew(lab, authority=True)
     now = fingerprint((lab / "ca.pem").read_text())
@@ -87,23 +79,24 @@ def test_what_no_longer_counts_is_told_apart(lab, there, tmp_path):
 
 
 def test_expired_certificates_and_clocks_outside_validity_are_reported(lab, there):
-    authority.renew(lab, ["KH01"], days=-0.01)
-    for end in ("pem", "key"):
-        shutil.copy(lab / f"KH01.{end}", there)
+    def renew(**more):
+        authority.renew(lab, ["KH01"], **more)
+        for end in ("pem", "key"):
+            shutil.copy(lab / f"KH01.{end}", there)
+
+    renew(days=-0.01)
     (only,) = said(there, lab)
     assert only.startswith("the certificate of KH01 ended at ")
     assert f"`./zenpark lab renew {lab} KH01`, then `./zenpark hosts install FILE`" in only
     assert f"`./zenpark lab renew {lab} KH01`" in next(ended(lab, ROBOTS))
-    authority.renew(lab, ["KH01"])
-    for end in ("pem", "key"):
-        shutil.copy(lab / f"KH01.{end}", there)
+    renew()
     (first, second) = said(there, lab, 0.0)
     assert first.startswith("its clock says 1970-01-01 00:00 UTC, when KH01 has no valid certificate; set it (NTP)")
     assert "CF01" in second
 
 
 def test_robot_outside_the_lab_cannot_be_sent(lab, there):
-    found = FolderContent(read_folder(there, ROBOTS).authority, read_folder(there, ["TB01"]).identities)
+    found = certificates.FolderContent(read_folder(there, ROBOTS).authority, read_folder(there, ["TB01"]).identities)
     assert next(faults(found, lab, time.time())).startswith(f"TB01 is not in the lab {lab}; `./zenpark lab issue")
     assert next(ended(lab, ["TB01"])).startswith("TB01 is not in the lab")
     (lab / "CF01.key").unlink()
@@ -134,5 +127,5 @@ def test_two_hosts_that_are_one_folder_share_it():
         "b": Host(address="pi@x", robots=["CF01"]),
         "c": Host(address="pi@x", robots=["KH02"], lab="other"),
     }
-    assert of_host("a", hosts) == of_host("b", hosts) == ["KH01", "CF01"]
-    assert of_host("c", hosts) == ["KH02"]
+    assert certificates.of_host("a", hosts) == certificates.of_host("b", hosts) == ["KH01", "CF01"]
+    assert certificates.of_host("c", hosts) == ["KH02"]

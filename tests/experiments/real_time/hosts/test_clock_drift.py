@@ -1,5 +1,6 @@
 """Clocks that drift during a run: what is left in stamps when robots follow."""
 
+import threading
 import time
 
 import numpy as np
@@ -12,7 +13,7 @@ from agents.network.messages import HostClock
 from experiments.real_time.hosts import clock_drift
 from experiments.real_time.hosts.hosts import HostError
 from experiments.recording.clocks import Correction
-from tests.waiting import until
+from tests.waiting import PATIENCE_S, until
 
 DT, UNCERTAINTY_S = 0.01, 1e-4
 
@@ -96,16 +97,21 @@ def test_robots_are_told_drift_and_no_jump():
 
 
 def test_end_waits_only_for_the_host_being_asked():
-    asked = []
+    asked, ending = [], threading.Event()
 
     class Silent(Host):
         def measure(self, samples):
             asked.append(self)
-            following._over.set()
+            ending.wait(PATIENCE_S)
             return super().measure(samples)
 
     with clock_drift.Drift([Silent([]), Silent([]), Silent([])], 0.01) as following:
         until(lambda: asked, "the first is asked")
+        closing = threading.Thread(target=following.close)
+        closing.start()
+        threading.Event().wait(0.05)  # it has ended, and waits for the first
+        ending.set()
+        closing.join()
     assert len(asked) == 1
 
 

@@ -35,9 +35,8 @@ def dead() -> RegisteredRun:
 
 
 def test_run_is_listed_while_it_is_up(folder: Path) -> None:
-    run = own_entry(
-        "run", "two", nowhere(), folder=Path("here"), realm="hall", robots={"CF01": "radio://0", "KH01": ""}
-    )
+    robots = {"CF01": "radio://0", "KH01": ""}
+    run = own_entry("run", "two", nowhere(), folder=Path("here"), realm="hall", robots=robots)
     assert runs() == []
     with registered(run) as why:
         assert why == ""
@@ -67,20 +66,14 @@ def test_other_process_of_its_number_is_no_run() -> None:
     assert not msgspec.structs.replace(own_entry("run", "two", nowhere()), born="1").alive
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        b"",
-        b"\xff\x00",
-        b"[" * 100_000,
-        b"{}",
-        b'{"what":"run","pid":-1,"born":"","since":0,"title":"","folder":"","endpoints":["tcp/127.0.0.1:1"]}',
-        b'{"what":"run","pid":1,"born":"","since":0,"title":"","folder":"","endpoints":["nonsense"]}',
-        b'{"what":"run","pid":1,"born":"","since":0,"title":"","folder":"","endpoints":[]}',
-        b" " * (run_registry.MAX_ENTRY_BYTES + 1),
-    ],
-    ids=range(8),
-)
+ENTRY = b'{"what":"run","pid":%d,"born":"","since":0,"title":"","folder":"","endpoints":%b}'
+GARBAGE = [
+    b"", b"\xff\x00", b"[" * 100_000, b"{}", b" " * (run_registry.MAX_ENTRY_BYTES + 1),
+    ENTRY % (-1, b'["tcp/127.0.0.1:1"]'), ENTRY % (1, b'["nonsense"]'), ENTRY % (1, b"[]"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("text", GARBAGE, ids=range(8))
 def test_garbage_is_left_alone_and_hides_nobody(folder: Path, text: bytes) -> None:
     run = own_entry("run", "two", nowhere())
     with registered(run):

@@ -15,8 +15,8 @@ from experiments.real_time.processes.joining import Network
 from experiments.real_time.processes.world import WorldProcess
 from experiments.real_time.processes.world_network import WorldNetwork
 from experiments.real_time.processes.world_population import WorldBodies
-from tests.small import pair
 from tests.network import Net
+from tests.small import pair
 
 KEYS = Keys()
 DRONE = RobotTable(kind="crazyflie", start=[0.1, 0.2], hover=0.5, body="world")

@@ -7,10 +7,10 @@ from agents.network.keys import Keys
 from agents.robot import Robot
 from agents.runtime.goal_inbox import GoalInbox
 from experiments.definition.plan import Plan
-from tests.small import pair
 from tests.experiments.real_time.processes.joined import KEYS, world_network
-from tests.network import Net
 from tests.fuzz.messages import sent
+from tests.network import Net
+from tests.small import pair
 
 UTC = 1.7e9
 NOW, BEHIND = 1_700_000_000_000, 1_600_000_000_000  # milliseconds, at which numbers begin
