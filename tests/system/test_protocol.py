@@ -12,8 +12,8 @@ from mcap_ros2.decoder import DecoderFactory
 
 from experiments.real_time.hosts.launcher import LAND_S
 from experiments.recording import playback
-from tests.system.lab import NEAR, ROOT, Flight, gone, transmits_at_50_hz, until
 from tests.requests import request
+from tests.system.lab import NEAR, ROOT, Flight, gone, transmits_at_50_hz, until
 from tests.twins.loopback import Served
 from twins.devices import khepera4
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from agents.decision.lifecycle import Phase
-from agents.network import messages
+from agents.network import messages, pubsub
 from agents.network.keys import Keys
 from experiments.definition.experiment import RobotTable
 from experiments.definition.plan import Plan
@@ -18,8 +18,7 @@ from experiments.file import document
 from experiments.real_time.conductor import hot_changes
 from experiments.real_time.conductor.hot_changes import HotChanges
 from experiments.real_time.conductor.run_view import RobotView
-from tests import network
-from tests.network import Query
+from tests.network import Net, Query
 from tests.small import changed
 from tests.waiting import ManualClock
 
@@ -32,8 +31,9 @@ class View:
 
     def __init__(self, stage: Stage) -> None:
         self._stage, self.robots, self.clock = stage, stage.robots, stage.clock
-        channel = network.Channel(KEYS.run_order, asked=True)
-        self.add, self.orders = channel.add, network.typed_orders(channel, messages.RunOrder)
+        net = Net()
+        self.orders = pubsub.Orders(net.session, KEYS.run_order, messages.RunOrder)
+        self.add = net.channels[0].add
         self.given: list[tuple[str, str]] = []
         self.said: list[tuple[str, str, str]] = []
 
