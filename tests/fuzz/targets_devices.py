@@ -10,23 +10,26 @@ from typing import Any
 
 import numpy as np
 
-from agents.protocols import vicon_datastream
+from agents.protocols import khepera4, vicon_datastream
 from agents.protocols.vicon_datastream import BlockKind, Segment
+from bridges.khepera4.drivers import KTeam, RoboticParkServer, identify
+from bridges.khepera4.odometry import Odometer
+from bridges.vicon.client import Decoder
+from bridges.vicon.publisher import PoseFilter
 from tests.fuzz.target import Inputs, Place, Renewed, Target, Wire
 from tests.requests import request
 from twins.devices.device import DeviceRequest, Faults
+from twins.devices.khepera4 import KheperaDevice
+from twins.devices.vicon import ViconTwin, _Client
 
 # ---------------------------------------------------------------------- the Khepera IV
 
 
 def khepera_twin() -> Iterator[Target]:
     """Every server: the first byte says which."""
-    from agents.protocols.khepera4 import PARK  # noqa: PLC0415
-    from twins.devices import khepera4  # noqa: PLC0415
-
     park = ["d 10.0 0.5", "stop", "p", "t", "get_data", "g 1.0 0.5", "i 0.1 0.2 0.3", "d -81.0 -7"]
     kteam = ["B", "D,100,-100", "R", "G", "N", "O", "V,5", "U,31", "I", "E", "S", "T", "M,1,2", "K", "H", "J"]
-    letters = dict(zip("pqrstk", (*PARK, "kteam"), strict=True))
+    letters = dict(zip("pqrstk", (*khepera4.PARK, "kteam"), strict=True))
     examples = [letter.encode() + word.encode() for word in park for letter in "pqrst"]
     examples += [b"k" + "\r".join([word, "R", ""]).encode() for word in kteam]
 
@@ -35,7 +38,7 @@ def khepera_twin() -> Iterator[Target]:
             devices: dict[str, Any] = {}
             for letter, server in letters.items():
                 made = DeviceRequest(request("khepera4", "khepera4-twin", device={"server": server}), Faults())
-                devices[letter] = stack.enter_context(closing(khepera4.KheperaDevice(made)))
+                devices[letter] = stack.enter_context(closing(KheperaDevice(made)))
             for k in count():
                 data = yield
                 device = devices.get(data[:1].decode("ascii", "replace"), devices["p"])
@@ -54,9 +57,6 @@ def khepera_twin() -> Iterator[Target]:
 
 def khepera_bridge() -> Iterator[Target]:
     """Answers of all servers to everything that the link asks, apart by zero bytes."""
-    from agents.protocols import khepera4  # noqa: PLC0415
-    from bridges.khepera4.drivers import KTeam, RoboticParkServer, identify  # noqa: PLC0415
-    from bridges.khepera4.odometry import Odometer  # noqa: PLC0415
 
     class Line:
         def __init__(self, parts: list[bytes]) -> None:
@@ -137,8 +137,6 @@ def _vicon_stream() -> list[bytes]:
 
 def vicon_bridge() -> Iterator[Target]:
     """What a DataStream server sends, in chunks."""
-    from bridges.vicon.client import Decoder  # noqa: PLC0415
-    from bridges.vicon.publisher import PoseFilter  # noqa: PLC0415
 
     def make() -> Inputs:
         decoder, pose_filter = Decoder(), PoseFilter({"CF01": "cf1", "KH01": "kh1"}, lambda _: None)
@@ -160,8 +158,6 @@ def vicon_bridge() -> Iterator[Target]:
 
 def vicon_twin() -> Iterator[Target]:
     """What a client sends to the server."""
-    from twins.devices.vicon import ViconTwin, _Client  # noqa: PLC0415
-
     ask = vicon_datastream.packet(vicon_datastream.block(BlockKind.REQUEST_FRAME, b"\1"))
     one = vicon_datastream.packet(vicon_datastream.block(BlockKind.REQUEST_NEXT_FRAME))
     vicon = ViconTwin(["cf1", "kh1"])

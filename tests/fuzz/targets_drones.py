@@ -13,18 +13,22 @@ from typing import Any
 
 import numpy as np
 
+from agents.body.kinds import KINDS
 from agents.protocols import crtp
 from agents.protocols.crtp import HighLevel, Log, Misc, Port, Setpoint, SupervisorCommand
+from agents.protocols.tello import TelloSettings
+from bridges.tello.pilot import TelloPilot
 from tests.fuzz.target import Inputs, Place, Renewed, Target, Wire
 from tests.requests import request
+from twins.devices.crazyflie.device import CrazyflieTwin
 from twins.devices.device import DeviceRequest, Faults
+from twins.devices.tello import TelloDevice
 
 # ---------------------------------------------------------------------- the Crazyflie
 
 
 def crazyflie_twin() -> Iterator[Target]:
     """CRTP packets, one or more behind each other (length, bytes), in the air and on the ground."""
-    from twins.devices.crazyflie.device import CrazyflieTwin  # noqa: PLC0415
 
     def packet(port: Port, channel: int, data: bytes) -> bytes:
         return bytes((1 + len(data), crtp.header(port, channel))) + data
@@ -98,8 +102,6 @@ def crazyflie_twin() -> Iterator[Target]:
 
 def tello_twin() -> Iterator[Target]:
     """Words over UDP, datagrams apart by zero bytes."""
-    from twins.devices.tello import TelloDevice  # noqa: PLC0415
-
     words = [
         "command", "takeoff", "land", "emergency", "stop", "rc 10 -20 30 40", "rc 100 100 100 100", "up 50", "back 100",
         "cw 90", "ccw 360", "go 50 60 70 50", "speed 20", "battery?", "attitude?", "tof?", "sn?", "wifi?", "streamon",
@@ -151,10 +153,6 @@ class Drone:
 
 def tello_pilot() -> Iterator[Target]:
     """A drone's state lines and answers: state and answer with a zero byte between them."""
-    from agents.body.kinds import KINDS  # noqa: PLC0415
-    from agents.protocols.tello import TelloSettings  # noqa: PLC0415
-    from bridges.tello.pilot import TelloPilot  # noqa: PLC0415
-
     if "av" not in sys.modules and importlib.util.find_spec("av") is None:
         sys.modules["av"] = types.ModuleType("av")  # only its video would need it, see `bridges.tello.library`
     import djitellopy.tello  # noqa: PLC0415

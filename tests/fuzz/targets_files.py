@@ -19,18 +19,39 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+from mcap.writer import CompressionType, Writer
 
-from agents.body.interface import BodyError
+from agents.body.interface import BodyError, settings
 from agents.errors import ExplainedError
 from agents.network import messages as wire
+from agents.network import zenoh_config as sessions
 from agents.plugins import registry
+from agents.protocols import crazyflie, khepera4, tello, turtlebot3
+from bridges.crazyflie.positioning import stations
+from bridges.khepera4.link import KheperaAddress
+from bridges.vicon.publisher import parse_server
+from experiments.authoring.robotic_park.convert import convert_text
 from experiments.catalogue import index
+from experiments.definition.links import link_pairs
 from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.file.document import DocumentError, write_json
-from experiments.recording.reader import RecordingError
+from experiments.file.text import decoded
+from experiments.recording import bundle, playback
+from experiments.recording import writer as recording
+from experiments.recording.reader import RecordingError, Records, recover
+from experiments.recording.ros2.cdr import Undecodable, Unencodable, codec
+from experiments.recording.run_folder import METRICS, ORIGIN, SOURCE, differences, past_runs
+from experiments.recording.topics import SentGoal, SentPose
+from experiments.sweep import store
+from experiments.sweep.plan import arguments, cells, seeds_of
+from experiments.sweep.runs import RunMetrics
+from experiments.sweep.store import RUNS, Store, StoreOrigin
+from tests.experiments import robotic_park_files as theirs
 from tests.fuzz.messages import KEYS, good, of_all
 from tests.fuzz.target import Place, Target
+from tools.commands.network import key_expression
+from twins.devices.device import Faults
 
 MALFORMED = Path(__file__).parents[1] / "experiments" / "file" / "malformed"
 
@@ -123,10 +144,6 @@ def overrides() -> Iterator[Target]:
 
 def park_yaml() -> Iterator[Target]:
     """Files of Robotic Park's authors; what becomes of them is read."""
-    from experiments.authoring.robotic_park.convert import convert_text  # noqa: PLC0415
-    from experiments.file.text import decoded  # noqa: PLC0415
-    from tests.experiments import robotic_park_files as theirs  # noqa: PLC0415
-
     texts = [theirs.dome(4), theirs.column(3, 1), theirs.dome(5, origin=True, real=(0,))]
     examples = [text.encode() for text in (*texts, "".join(map(theirs.flat, theirs.OTHERS)))]
     with place_for("some.toml") as file:
@@ -146,11 +163,6 @@ def park_yaml() -> Iterator[Target]:
 
 def recording_bytes(*, plain: bool) -> list[bytes]:
     """Recordings of a second: as they are made, or neither compressed nor guarded by checksums."""
-    from mcap.writer import CompressionType, Writer  # noqa: PLC0415
-
-    from experiments.recording import writer as recording  # noqa: PLC0415
-    from experiments.recording.reader import Records  # noqa: PLC0415
-
     what = document.read("triangle", ["duration_s=1.0", "timeline=[]"]).experiment
     made = []
     with tempfile.TemporaryDirectory() as folder:
@@ -212,9 +224,6 @@ def resealed(data: bytes) -> bytes:
 
 def recording_of(*, plain: bool) -> Iterator[Target]:
     """A recording is read, analysed as `./zenpark report` begins, and recovered."""
-    from experiments.recording import playback  # noqa: PLC0415
-    from experiments.recording.reader import recover  # noqa: PLC0415
-
     with place_for("some.mcap") as file:
         target = file.with_name("other.mcap")
 
@@ -242,9 +251,6 @@ def forged() -> Iterator[Target]:
 
 def cdr() -> Iterator[Target]:
     """Every recorded struct: name and CDR with a zero byte between them; what is decoded can be encoded."""
-    from experiments.recording.ros2.cdr import Undecodable, Unencodable, codec  # noqa: PLC0415
-    from experiments.recording.topics import SentGoal, SentPose  # noqa: PLC0415
-
     said = good("KH01")
     pose: Any = said["pose"][0]
     fields = [getattr(pose, name) for name in ("robot", "seq", "stamp", "position", "velocity", "yaw")]
@@ -270,8 +276,6 @@ def cdr() -> Iterator[Target]:
 
 def run_files() -> Iterator[Target]:
     """`run.json`, `metrics.json` and the experiment file of a past run: what cannot be read is not known."""
-    from experiments.recording.run_folder import METRICS, ORIGIN, SOURCE, differences, past_runs  # noqa: PLC0415
-
     origin = {"command": "zenpark run a.toml", "file": "a.toml", "begun": 1e9, "tags": ["a"], "changes": ["seed=3"]}
     figures = [{"case": "a", "seed": 1, "mean": {"f_hz": 2.5, "iae": None}}]
     example = b"\0".join([json.dumps(origin).encode(), json.dumps(figures).encode(), b"title = 'A'\nx = [1, 2]\n"])
@@ -293,9 +297,6 @@ def run_files() -> Iterator[Target]:
 
 def bundles() -> Iterator[Target]:
     """Archives of runs: damaged and forged ones are refused, and nothing is written outside of their folder."""
-    from experiments.recording import bundle  # noqa: PLC0415
-    from experiments.recording.run_folder import ORIGIN, SOURCE  # noqa: PLC0415
-
     parts = {ORIGIN: b'{"file": "a.toml"}', SOURCE: b"title = 'A'\n"}
     sums = "".join(f"{hashlib.sha256(data).hexdigest()}  {name}\n" for name, data in parts.items())
     packed = io.BytesIO()
@@ -321,9 +322,6 @@ def bundles() -> Iterator[Target]:
 
 def sweep_runs() -> Iterator[Target]:
     """`runs.jsonl` and `origin.json` of a sweep: lines that cannot be read are counted, not fatal."""
-    from experiments.sweep.runs import RunMetrics  # noqa: PLC0415
-    from experiments.sweep.store import ORIGIN, RUNS, Store, StoreOrigin  # noqa: PLC0415
-
     kinds = {int: 1, float: 0.5, bool: True, str: "x"}
     blank = {
         field.name: next((value for kind, value in kinds.items() if field.type is kind), None)
@@ -336,19 +334,17 @@ def sweep_runs() -> Iterator[Target]:
         def take(data: bytes) -> None:
             runs, _, origin = data.partition(b"\0")
             file.write_bytes(runs)
-            (file.parent / ORIGIN).write_bytes(origin)
-            with Store(file.parent) as store:
-                store.runs("c", "d")
-                store.missing("c", "d", [1, 2, 3])
-                store.changed_since(StoreOrigin("1", "2", "3"))
+            (file.parent / store.ORIGIN).write_bytes(origin)
+            with Store(file.parent) as kept:
+                kept.runs("c", "d")
+                kept.missing("c", "d", [1, 2, 3])
+                kept.changed_since(StoreOrigin("1", "2", "3"))
 
         yield Target([line * 2 + b'\0{"version":"1","code":"2","file":"3"}', line + line[:30]], take, (DocumentError,))
 
 
 def sweep_arguments() -> Iterator[Target]:
     """Axes and seeds, one a line."""
-    from experiments.sweep.plan import arguments, cells, seeds_of  # noqa: PLC0415
-
     read = document.read("triangle")
     lines = [
         "trigger.threshold=0.002:0.05:log5", "formation.gain=2:4:lin3", "trigger.kind=mixed,relative", "seeds=5",
@@ -372,16 +368,6 @@ def sweep_arguments() -> Iterator[Target]:
 
 def words() -> Iterator[Target]:
     """Addresses, endpoints, settings of devices, faults, key expressions: kind and text with a zero byte between."""
-    from agents.body.interface import settings  # noqa: PLC0415
-    from agents.network import zenoh_config as sessions  # noqa: PLC0415
-    from agents.protocols import crazyflie, khepera4, tello, turtlebot3  # noqa: PLC0415
-    from bridges.crazyflie.positioning import stations  # noqa: PLC0415
-    from bridges.khepera4.link import KheperaAddress  # noqa: PLC0415
-    from bridges.vicon.publisher import parse_server  # noqa: PLC0415
-    from experiments.definition.links import link_pairs  # noqa: PLC0415
-    from tools.commands.network import key_expression  # noqa: PLC0415
-    from twins.devices.device import Faults  # noqa: PLC0415
-
     kinds = (crazyflie.CrazyflieSettings, khepera4.Khepera4Settings, tello.TelloSettings, turtlebot3.TurtleBot3Settings)
 
     def device(text: str) -> None:

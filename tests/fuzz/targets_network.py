@@ -15,18 +15,30 @@ from threading import Event
 import msgspec
 import numpy as np
 
+from agents.body.fleet import assemble
 from agents.network import messages as wire
 from agents.network.name_ownership import OwnershipCheck
 from agents.runtime.loop import Runtime, Setup
 from agents.vectors import Setpoint, is_finite
+from bridges.external import ExternalBody
 from experiments.definition import bodies
 from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.real_time.conductor import orders
+from experiments.real_time.conductor.case_context import CaseContext
+from experiments.real_time.conductor.conductor import Conductor
+from experiments.real_time.hosts.hosts import Hosts
+from experiments.real_time.processes.joining import Network
+from experiments.real_time.processes.recorder import Recorder
+from experiments.real_time.processes.world import WorldProcess
+from experiments.real_time.processes.world_population import WorldBodies
+from experiments.recording.writer import Recording
 from tests.fuzz.messages import KEYS, everything, good, of_all, sent
 from tests.fuzz.target import Inputs, Place, Renewed, Target
 from tests.network import Net, Reply, Sample
 from tests.requests import request
+from tools.commands.network import members, readable
+from twins.devices.vicon import TruthSubscription, ViconTwin
 
 RUBBISH = io.StringIO()  # where processes say what they would say on a terminal
 
@@ -56,8 +68,6 @@ def messages() -> Iterator[Target]:
 
 def robot() -> Iterator[Target]:
     """A robot's process: poses, tokens, orders, stops, positions, ranges; its body is never told nonsense."""
-    from agents.body.fleet import assemble  # noqa: PLC0415
-
     experiment = document.read("triangle", ["robots.KH01.position=external", "avoidance=barrier"]).experiment
 
     def make() -> Inputs:
@@ -101,10 +111,6 @@ def robot() -> Iterator[Target]:
 
 def world() -> Iterator[Target]:
     """The twin service: commands, states of those elsewhere, statuses, and orders to put things in and out."""
-    from experiments.real_time.processes.joining import Network  # noqa: PLC0415
-    from experiments.real_time.processes.world import WorldProcess  # noqa: PLC0415
-    from experiments.real_time.processes.world_population import WorldBodies  # noqa: PLC0415
-
     changes = ["robots.KH01.body=world", "robots.KH02.body=world", "world.engine=pymunk"]
     experiment = document.read("triangle", changes).experiment
 
@@ -128,9 +134,6 @@ def world() -> Iterator[Target]:
 
 def recorder() -> Iterator[Target]:
     """The recorder writes what is honest and counts the rest; what it wrote can be read."""
-    from experiments.real_time.processes.recorder import Recorder  # noqa: PLC0415
-    from experiments.recording.writer import Recording  # noqa: PLC0415
-
     experiment = document.read("triangle").experiment
 
     def make() -> Inputs:
@@ -148,10 +151,6 @@ def recorder() -> Iterator[Target]:
 
 def conductor() -> Iterator[Target]:
     """The conductor follows the robots' statuses, states and tokens, and changes robots when it is asked."""
-    from experiments.real_time.conductor.case_context import CaseContext  # noqa: PLC0415
-    from experiments.real_time.conductor.conductor import Conductor  # noqa: PLC0415
-    from experiments.real_time.hosts.hosts import Hosts  # noqa: PLC0415
-
     experiment = document.read("triangle").experiment
 
     class Nobody:
@@ -187,7 +186,6 @@ def conductor() -> Iterator[Target]:
 
 def external_body() -> Iterator[Target]:
     """A body elsewhere says where it is and what it sees."""
-    from bridges.external import ExternalBody  # noqa: PLC0415
 
     def make() -> Inputs:
         net.forget()
@@ -210,7 +208,6 @@ def external_body() -> Iterator[Target]:
 
 def vicon_truths() -> Iterator[Target]:
     """The simulated Vicon hears where twins are."""
-    from twins.devices.vicon import TruthSubscription, ViconTwin  # noqa: PLC0415
 
     def make() -> Inputs:
         net.forget()
@@ -227,8 +224,6 @@ def vicon_truths() -> Iterator[Target]:
 
 def answers() -> Iterator[Target]:
     """Whoever gives orders reads the answers; whoever looks at the network the admin space."""
-    from tools.commands.network import members, readable  # noqa: PLC0415
-
     examples = []
     for message in (wire.Reply("KH01", True, "ready", "", 0.1), wire.WorldReply(True, False, 1.0, "")):
         examples += sent("park/KH01/order", message)

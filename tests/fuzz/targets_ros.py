@@ -10,11 +10,16 @@ import numpy as np
 
 from agents.network.keys import Keys
 from agents.protocols import ros2
+from agents.protocols.ros2_node import Participant
 from agents.vectors import is_finite
+from bridges.ros2 import Graph
+from bridges.turtlebot3.body import TurtleBot3
+from tests.fuzz.messages import everything
 from tests.fuzz.target import Inputs, Place, Renewed, Target
 from tests.network import Net, Sample
 from tests.requests import request
 from twins.devices.device import DeviceRequest, Faults
+from twins.devices.turtlebot3 import TurtleBot3Twin
 
 # ---------------------------------------------------------------------- ROS 2
 
@@ -83,8 +88,6 @@ def ros() -> Iterator[Target]:
 
 def turtlebot_bridge() -> Iterator[Target]:
     """Odometry, scans, batteries and tokens of a robot."""
-    from bridges.turtlebot3.body import TurtleBot3  # noqa: PLC0415
-
     good = ros_messages()
     topics = {"odom": ros2.ODOMETRY, "scan": ros2.LASER_SCAN, "battery_state": ros2.BATTERY_STATE}
     examples = [f"tb3_0/{topic}\0\0".encode() + good[kind] for topic, kind in topics.items()]
@@ -111,8 +114,6 @@ def turtlebot_bridge() -> Iterator[Target]:
 
 def turtlebot_twin() -> Iterator[Target]:
     """Commands to the twin of a robot."""
-    from twins.devices.turtlebot3 import TurtleBot3Twin  # noqa: PLC0415
-
     good = ros_messages()
 
     def make() -> Inputs:
@@ -129,10 +130,6 @@ def turtlebot_twin() -> Iterator[Target]:
 
 def ros_graph() -> Iterator[Target]:
     """The bridge to ROS 2: states and statuses of robots, goals from ROS."""
-    from agents.protocols.ros2_node import Participant  # noqa: PLC0415
-    from bridges.ros2 import Graph  # noqa: PLC0415
-    from tests.fuzz.messages import everything  # noqa: PLC0415
-
     good = ros_messages()
     examples = everything("KH01", "KH02", only=("state", "ranges", "status"))
 
