@@ -1,3 +1,0 @@
-"""Former place of `tests.commands`."""
-
-from tests.commands import shell  # noqa: F401
