@@ -66,18 +66,15 @@ def test_who_reaches_it(text, loopback, wildcard):
     [
         ("listen", "tcp/0.0.0.0:7447", "SSH tunnel"),
         ("listen", "tcp/[::]:7447", "SSH tunnel"),
-        ("listen", "tcp/192.168.1.2:7447", "SSH tunnel"),
         ("listen", "tcp/host.example:7447", "SSH tunnel"),
         ("listen", "tcp/:1", "SSH tunnel"),
         ("connect", "127.0.0.1:7447", "not an endpoint"),
         ("connect", "tcp/", "not an endpoint"),
-        ("connect", "/127.0.0.1:7447", "not an endpoint"),
         ("connect", "", "not an endpoint"),
         ("connect", "tcp/127.0.0.1:7447\n", "not an endpoint"),
         ("connect", "t#tcp/localhost:1", "no such protocol"),
         ("connect", "http/127.0.0.1:1", "no such protocol"),
         ("connect", "udp/127.0.0.1:1", "lost messages"),
-        ("listen", "udp/127.0.0.1:1", "lost messages"),
         ("connect", "ws/127.0.0.1:1", "certificates"),
         ("connect", "wss/127.0.0.1:1", "certificates"),
         ("connect", "serial//dev/ttyUSB0", "no network"),
@@ -109,19 +106,19 @@ def test_free_endpoints_avoid_taken_ports():
 
 
 @pytest.mark.parametrize(
-    ("name", "mode", "listens", "connects"),
+    ("name", "listens", "connects"),
     [
-        ("A", "peer", [1], []),
-        ("B+C", "peer", [2], [1]),
-        ("B", "peer", [2], [1]),
-        ("D", "peer", [3], [1, 2]),
-        ("recorder", "peer", [4], [1, 2, 3]),
-        ("zenpark echo", "peer", [], [1, 2, 3, 4]),  # a visitor
+        ("A", [1], []),
+        ("B+C", [2], [1]),
+        ("B", [2], [1]),
+        ("D", [3], [1, 2]),
+        ("recorder", [4], [1, 2, 3]),
+        ("zenpark echo", [], [1, 2, 3, 4]),  # a visitor
     ],
 )
-def test_the_later_of_two_members_connects(name, mode, listens, connects):
+def test_the_later_of_two_members_connects(name, listens, connects):
     ends = endpoints.ends(MESH, name)
-    assert (ends.mode, ends.visits) == (mode, not listens)
+    assert (ends.mode, ends.visits) == ("peer", not listens)
     assert ends.listen == [f"tcp/127.0.0.1:{port}" for port in listens]
     assert ends.connect == [f"tcp/127.0.0.1:{port}" for port in connects]
 

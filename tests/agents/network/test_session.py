@@ -10,6 +10,7 @@ import threading
 import time
 from math import inf
 from pathlib import Path
+from types import SimpleNamespace
 
 import psutil
 import pytest
@@ -226,20 +227,13 @@ class Asked:
     """What `RouterWatch` needs of a session: who is linked, and questions that are answered by hand."""
 
     def __init__(self) -> None:
-        self.info = self
-        self.routers, self.peers = ["router"], []
-        self.questions: list[Question] = []
+        self.routers, self.peers, self.questions = ["router"], [], []
+        self.info = SimpleNamespace(routers_zid=lambda: self.routers, peers_zid=lambda: self.peers)
 
-    def routers_zid(self) -> list[str]:
-        return self.routers
+    def liveliness(self) -> SimpleNamespace:
+        return SimpleNamespace(get=self.ask)
 
-    def peers_zid(self) -> list[str]:
-        return self.peers
-
-    def liveliness(self) -> Asked:
-        return self
-
-    def get(self, *_: object, **__: object) -> Question:
+    def ask(self, *_: object, **__: object) -> Question:
         self.questions.append(Question())
         return self.questions[-1]
 
