@@ -15,7 +15,7 @@ from agents.vectors import ZERO, Vector
 from experiments.definition import bodies
 from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
-from tests.small import changed  # noqa: F401
+from tests.small import PERIODIC, small
 from twins.body import TwinBody
 
 LEAD_S = 0.5
@@ -31,7 +31,7 @@ class Group:
         self.robots = [Robot(plan.assignment(name), health) for name in names]
         self.body = TwinBody(bodies.body_request(plan, self.names, plan.experiment.seed))
         self.states: list[BodyState] = []
-        self.sending: list[int] = []
+        self.sending: list[int] = []  # rows
         self.spoil: dict[str, Callable[[BodyState], None]] = {}  # changes of measurements, by name
         for robot in self.robots:
             for link in range(len(robot.neighbours.all)):
@@ -47,12 +47,9 @@ class Group:
     def step(self, t: float) -> None:
         """One tick of the process."""
         self.states = [copy(state) for state in self.body.read(t)]
-        self.sending = []
-        for row, robot in enumerate(self.robots):
-            if self.names[row] in self.spoil:
-                self.spoil[self.names[row]](self.states[row])
-            if robot.transmit(t, self.states[row]):
-                self.sending.append(row)
+        for name, change in self.spoil.items():
+            change(self.states[self.names.index(name)])
+        self.sending = [row for row, robot in enumerate(self.robots) if robot.transmit(t, self.states[row])]
         for row, robot in enumerate(self.robots):
             robot.act(t)
             if robot.stops:
@@ -158,10 +155,8 @@ class Swarm:
 
     def _values(self, name: str) -> dict[str, Any]:
         (group, row), robot = self.where[name], self.robot(name)
-        state = group.states[row]
-        values = (
-            robot.lifecycle.phase, robot.goal, robot.error, robot.setpoint, state.position, state.true_position,
-        )  # fmt: skip
+        now = group.states[row]
+        values = (robot.lifecycle.phase, robot.goal, robot.error, robot.setpoint, now.position, now.true_position)
         return dict(zip(LOGGED, values, strict=True))
 
     def until(self, phase: int, most_s: float = 60.0) -> Swarm:
@@ -181,3 +176,8 @@ class Swarm:
     def running(self) -> Swarm:
         """Until the experiment begins."""
         return self.until(RUNNING)
+
+
+def drone(**parts: object) -> Swarm:
+    """One Crazyflie, 0.5 m above the origin."""
+    return Swarm(small({"F": "crazyflie"}, **{"duration_s": 60.0, "trigger": PERIODIC, **parts}))

@@ -1,18 +1,11 @@
 """However robots are grouped in processes and bodies, they do the same to the last bit."""
 
-import msgspec
 import pytest
 
 from agents.decision.lifecycle import DONE
 from experiments.definition.experiment import LegTable
-from experiments.file import document
-from tests.agents.few import NOISY
-from tests.agents.swarm import LOGGED, Swarm, changed
-
-
-@pytest.fixture(scope="module")
-def park():
-    return document.read("robotic-park").cases()["event"].experiment
+from tests.agents.swarm import LOGGED, Swarm
+from tests.small import NOISY, changed, reference
 
 
 def eventful(experiment, groups):
@@ -31,9 +24,9 @@ def eventful(experiment, groups):
 
 
 @pytest.mark.slow
-def test_processes_of_one_equal_one_of_seven(park):
+def test_processes_of_one_equal_one_of_seven():
     groups = [["CF03", "TB01", "KH02"], ["KH01", "CF01"], ["CF02", "KH03"]]
-    assert_the_same(park, [[name] for name in park.robots], groups)
+    assert_the_same(reference(), [[name] for name in reference().robots], groups)
 
 
 WAYS = {
@@ -56,9 +49,9 @@ BY_DAY = ("mixed", "dynamic", "predictive", "self-triggered ahead")
 @pytest.mark.parametrize(
     "way", [way if way in BY_DAY else pytest.param(way, marks=pytest.mark.nightly) for way in WAYS]
 )
-def test_every_trigger_predictor_and_smoothing(park, way):
-    trigger, prediction, update = WAYS[way]
-    formation = msgspec.structs.replace(park.formation, update=update)
+def test_every_trigger_predictor_and_smoothing(way):
+    park, (trigger, prediction, update) = reference(), WAYS[way]
+    formation = changed(park.formation, update=update)
     experiment = changed(park, trigger=trigger, prediction=prediction, formation=formation)
     groups = [["TB01"], ["CF03", "KH02"], ["KH01", "CF01"], ["CF02"], ["KH03"]]
     together = assert_the_same(experiment, groups, least=50)

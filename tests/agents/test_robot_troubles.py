@@ -12,8 +12,7 @@ from agents.safety.hazards import Cause
 from agents.vectors import NO_SETPOINT, UNKNOWN
 from experiments.definition.experiment import Formation, RobotTable
 from experiments.definition.plan import Plan
-from tests.agents.few import drone
-from tests.agents.swarm import Swarm
+from tests.agents.swarm import Swarm, drone
 from tests.small import pair, small
 
 STILL = (0.0, 0.0, 0.0, 0.0)

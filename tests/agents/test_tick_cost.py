@@ -9,8 +9,8 @@ from types import FrameType
 
 import pytest
 
-from tests.agents.few import NOISY, drone, pair
-from tests.agents.swarm import Swarm
+from tests.agents.swarm import Swarm, drone
+from tests.small import NOISY, pair
 
 TICKS = 20  # two decisions
 
