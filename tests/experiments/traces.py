@@ -1,22 +1,19 @@
 """Traces for tests: motions with known integrals, and a small simulated formation for figures and reports."""
 
-from __future__ import annotations
-
 import dataclasses
-from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from agents.network.messages import Event
 from agents.plugins.laws import Distance
 from experiments.arrays import PoseTable
-from experiments.definition.experiment import Arena, Experiment, LegTable, RobotTable
+from experiments.definition.experiment import Arena, LegTable, RobotTable
 from experiments.definition.formation import law_offsets
 from experiments.definition.graph import links
 from experiments.definition.plan import Plan
 from experiments.recording.trace import Trace
 from tests.small import changed, reference, small
-from twins.arrays import Array, norm
+from twins.arrays import norm
 
 STEP = 0.02
 TIMED = ("position", "yaw", "true_position", "goal", "setpoint")
@@ -27,9 +24,7 @@ def parse_links(experiment):
     return [(link.receiver, link.sender, link.wanted.distance, link.gain) for link in Plan(experiment).one_way_links]
 
 
-def experiment(
-    robots: Mapping[str, str], formation: Mapping[str, float], *, legs: Sequence[float] = (), **rest: object
-) -> Experiment:
+def experiment(robots, formation, *, legs=(), **rest):
     """Robots by kind, all started at the origin; a leg of the first one at each of `legs`."""
     tables = {name: RobotTable(kind=kind, start=[0.0, 0.0]) for name, kind in robots.items()}
     timeline = [LegTable(at_s=at, robot=next(iter(robots)), plan="hold") for at in legs]
@@ -37,18 +32,7 @@ def experiment(
     return small(tables, formation, timeline=timeline, **{**fixed, **rest})
 
 
-def trace(
-    what: Experiment,
-    position: Array,
-    *,
-    step: float = STEP,
-    sent: Mapping[str, Sequence[float]] | None = None,
-    delay: float = 0.0,
-    case: str = "only",
-    seed: int = 1,
-    events: Sequence[Event] = (),
-    planned: float | None = None,
-) -> Trace:
+def trace(what, position, *, step=STEP, sent=None, delay=0.0, case="only", seed=1, events=(), planned=None):
     """A trace of given positions (T, N, 3); robots in `sent` send their pose at those times, heard by all listeners.
 
     It is as long as the run was to be, unless another length was `planned` [s].
@@ -89,7 +73,7 @@ def trace(
     )
 
 
-def cut(whole: Trace, end: float) -> Trace:
+def cut(whole, end):
     """The trace of the same run, interrupted."""
     count = int(np.searchsorted(whole.time, end + 1e-9))
     parts = {name: getattr(whole, name)[:count] for name in TIMED}
@@ -102,7 +86,7 @@ def cut(whole: Trace, end: float) -> Trace:
     )
 
 
-def pair(distance: Array, *, legs: Sequence[float] = (), target: float = 1.0, **rest: object) -> Trace:
+def pair(distance, *, legs=(), target=1.0, **rest):
     """A leader at the origin and one follower whose distance over time is given; the follower should keep `target`."""
     position = np.zeros((len(distance), 2, 3))
     position[:, 1, 0] = distance
@@ -110,7 +94,7 @@ def pair(distance: Array, *, legs: Sequence[float] = (), target: float = 1.0, **
     return trace(what, position, **rest)
 
 
-def park(case: str = "periodic", threshold: float = 0.0, *, seed: int = 1, duration: float = 45.0) -> Trace:
+def park(case="periodic", threshold=0.0, *, seed=1, duration=45.0):
     """The reference formation with first-order robots; send-on-delta if there is a threshold [m]."""
     robots = reference("periodic").robots
     legs = [LegTable(at_s=21.0, robot="TB01", plan="hold")] if duration > 21.0 else []
@@ -119,7 +103,7 @@ def park(case: str = "periodic", threshold: float = 0.0, *, seed: int = 1, durat
     return simulate(what, start, case, threshold, seed=seed, duration=duration)
 
 
-def crowd(rows: int, case: str = "periodic", threshold: float = 0.0, *, seed: int = 1, duration: float = 20.0) -> Trace:
+def crowd(rows, case="periodic", threshold=0.0, *, seed=1, duration=20.0):
     """Any number of robots on a hemisphere, each linked to its nearest ones, starting off their places."""
     rng = np.random.default_rng(rows)
     height = np.linspace(0.15, 0.95, rows)
@@ -135,7 +119,7 @@ def crowd(rows: int, case: str = "periodic", threshold: float = 0.0, *, seed: in
     return simulate(what, start, case, threshold, seed=seed, duration=duration)
 
 
-def simulate(what: Experiment, start: Array, case: str, threshold: float, *, seed: int, duration: float) -> Trace:
+def simulate(what, start, case, threshold, *, seed, duration):
     """The distance law on first-order robots, decided at 10 Hz; what neighbours hold is what the trigger sent."""
     rng = np.random.default_rng(seed)
     names, rows = list(what.robots), len(what.robots)
@@ -148,7 +132,7 @@ def simulate(what: Experiment, start: Array, case: str, threshold: float, *, see
     wobble = np.zeros((rows, 3))
     count = round(duration / STEP) + 1
     record = np.zeros((count, rows, 3))
-    sent: dict[str, list[float]] = {name: [] for name in names}
+    sent = {name: [] for name in names}
     for k in range(count):
         t = k * STEP
         seen = place + wobble

@@ -2,7 +2,6 @@
 
 import csv
 import json
-import os
 import re
 import shlex
 
@@ -24,7 +23,7 @@ from experiments.sweep import runs
 from experiments.sweep.optimise import Limit, Objective, parse_objective
 from experiments.sweep.pareto import front
 from tests.agents.plugins.test_plugins_outside import install
-from tests.commands import ROOT, environment, python, shell
+from tests.commands import ROOT, shell
 from tests.experiments.sweep.cells import cell
 from tests.runs import fly
 from tests.small import changed
@@ -56,10 +55,6 @@ def installed(tmp_path_factory):
 def zenpark(installed):
     with shell(installed) as command:
         yield command
-
-
-def test_guide_metric_is_short():
-    assert len(WAY.strip().splitlines()) <= 22
 
 
 def test_fields_of_the_page_have_their_shapes(trace):
@@ -130,18 +125,6 @@ def test_installed_metric_is_a_limit_of_a_search(zenpark):
     done = zenpark(*words, *short, "--out", "tuned")
     assert done.returncode == 0, done.stderr
     assert re.search(r"^event threshold=.*: keeps Way ratio <= 1.02$", done.stdout, re.MULTILINE)
-
-
-@pytest.mark.slow
-def test_installed_metric_is_in_a_notebook(installed):
-    code = (
-        "from zenpark import load, simulate\n"
-        "run = simulate(load('triangle', 'duration_s=1.0'))\n"
-        "found = run.metrics['event']\n"
-        "print(found.mean['way_m'] > 0.0, found.robots[0].value('way_m') > 0.0, 'Way [m]' in run._repr_html_())"
-    )
-    path = os.pathsep.join(map(str, (installed, ROOT, ROOT / "face")))
-    assert python("-c", code, env=environment(PYTHONPATH=path)).stdout.split() == ["True", "True", "True"]
 
 
 class Way(Metric, frozen=True):

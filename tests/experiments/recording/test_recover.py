@@ -109,7 +109,7 @@ def test_a_recorder_that_took_over_completes_the_recording(path, tmp_path, capsy
     target = path.with_name("run-recovered.mcap")
     made, wanted = read(target), read(whole)
     assert (made.complete, made.messages) == (True, wanted.messages)
-    assert capsys.readouterr().out == f"{target}: {made.messages} messages of TB01, CF01\n"
+    assert capsys.readouterr().out == f"{target}: {82 + len(events) + 1} messages of TB01, CF01\n"
     assert_same(made.trace, wanted.trace)
 
 

@@ -3,7 +3,7 @@
 import pytest
 
 from experiments.file.problems import DocumentError
-from experiments.sweep.optimise import BROKEN, Limit, Objective, parse_objective, searched, tune
+from experiments.sweep.optimise import BROKEN, Limit, Objective, parse_objective, tune
 from experiments.sweep.page import fewest
 from experiments.sweep.pareto import by_environment, front
 from tests.experiments.sweep.cells import cell
@@ -62,10 +62,6 @@ def test_fronts_are_per_environment():
     parts = by_environment(rows)
     assert [front(part) for part in parts.values()] == [rows[:1], rows[2:]]
     assert [finding.text.split(":")[0] for finding in fewest(rows)] == ["With loss=0", "With loss=0.1"]
-
-
-def test_third_of_the_tuning_seeds_serves_the_search():
-    assert searched(range(1001, 1061)) == tuple(range(1001, 1021))
 
 
 @pytest.fixture(scope="module")

@@ -29,6 +29,12 @@ HYBRID = 'architecture={ kind = "hybrid", robots = ["CF01", "CF03"] }'
 EVERY_CASE = ["periodic", pytest.param("event", marks=NIGHTLY), "event-loss"]
 
 
+def limits(periodic, event, event_loss):
+    """Table of the cases with a limit each."""
+    rows = [("periodic", periodic), pytest.param("event", event, marks=NIGHTLY), ("event-loss", event_loss)]
+    return pytest.mark.parametrize(("case", "most"), rows)
+
+
 def trace(name, case, *changes):
     return flown(name, case, *changes).trace
 
@@ -97,9 +103,7 @@ def test_average_of_ramps_has_a_bounded_error():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("case", "most"), [("periodic", 1e-3), pytest.param("event", 3e-3, marks=NIGHTLY), ("event-loss", 0.01)]
-)
+@limits(1e-3, 3e-3, 0.01)
 def test_aggregative_team_descends_linearly_to_its_optimum(case, most):
     """Both ends of a link compare what was said: by events the averages keep no error but the threshold's ripple.
 
@@ -342,16 +346,15 @@ def test_coverage_makes_up_for_a_robot_landing_midflight(case):
     assert known.measures["mass"][-1, :5].sum() == pytest.approx(WEIGHT.sum(), rel=0.005)
 
 
-def test_cells_share_area_and_replace_a_lost_robot():
-    law, places = Coverage(), {"A": (-1.0, 0.5), "B": (0.3, -1.2), "C": (0.8, 0.9), "D": (0.1, 0.2)}
-    for names in ("ABCD", "ABC", "A"):
-        total = 0.0
-        for own in names:
-            others = [NeighbourView(0, n, (*places[n], 0.0), ZERO, 0.0, 0.0, {}, None) for n in names if n != own]
-            view = View(RobotFacts(own, 0, 4, False, 1.0, 0.1), {}, others)
-            view.position = (*places[own], 0.0)
-            total += law.step(view, {}).measures["mass"]
-        assert total == pytest.approx(16.0)
+@pytest.mark.parametrize("names", ["ABCD", "ABC", "A"])
+def test_cells_share_area_and_replace_a_lost_robot(names):
+    law, places, total = Coverage(), {"A": (-1.0, 0.5), "B": (0.3, -1.2), "C": (0.8, 0.9), "D": (0.1, 0.2)}, 0.0
+    for name in names:
+        others = [NeighbourView(0, n, (*places[n], 0.0), ZERO, 0.0, 0.0, {}, None) for n in names if n != name]
+        view = View(RobotFacts(name, 0, 4, False, 1.0, 0.1), {}, others)
+        view.position = (*places[name], 0.0)
+        total += law.step(view, {}).measures["mass"]
+    assert total == pytest.approx(16.0)
 
 
 def test_an_area_that_is_not_convex_is_refused():
@@ -368,9 +371,7 @@ def test_followers_without_any_leader_stop():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("case", "most"), [("periodic", 0.04), pytest.param("event", 0.05, marks=NIGHTLY), ("event-loss", 0.08)]
-)
+@limits(0.04, 0.05, 0.08)
 def test_flock_keeps_spacing_velocity_and_rendezvous_of_mean(case, most):
     known = trace("flocking", case)
     place = known.true_position[..., :2]
@@ -425,13 +426,10 @@ def out_of_place(known):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("case", "most"), [("periodic", 0.002), pytest.param("event", 0.005, marks=NIGHTLY), ("event-loss", 0.008)]
-)
+@limits(0.002, 0.005, 0.008)
 def test_integral_action_leaves_no_error_in_a_wind(case, most):
     known = trace("integral", case)
-    late = known.time > 37.0
-    assert np.linalg.norm(out_of_place(known)[late], axis=2).max() < most
+    assert np.linalg.norm(out_of_place(known)[known.time > 37.0], axis=2).max() < most
     for wind, z in zip(np.array([*WIND.values()]), known.memory["z"][-1, 1:], strict=True):
         beyond = max(SHELTER - LEASH / np.linalg.norm(wind), 0.0)  # what the reference of its place does not hold off
         assert z == pytest.approx(CRAZYFLIE.response * beyond * wind, abs=0.003)
