@@ -8,9 +8,10 @@ import re
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import psutil
@@ -21,29 +22,37 @@ from mcap_ros2.decoder import DecoderFactory
 from agents.network import messages, pubsub
 from agents.network import session as network
 from agents.network.keys import Keys
+from experiments.file import catalogue
 from experiments.real_time.conductor import orders
 from experiments.recording.trace import Trace
 from experiments.run import reopen
+from tests import commands
+from tests.commands import GUARD, ROOT, environment
 from tests.waiting import PATIENCE_S, until
 from tools.commands.run import SPOILED
 
-ROOT = Path(__file__).resolve().parents[2]
-ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT)}
+ENVIRONMENT = environment()
 # Robots of the reference experiment begin within some 0.3 m of where the formation ends up, which takes half the time.
 NEAR = [
-    part
-    for name, start in {
-        "KH01": "[-0.6, 0.0]", "KH02": "[0.2, 0.0]", "KH03": "[0.2, 0.8]", "CF01": "[-0.5, 0.2]", "CF02": "[0.2, 0.2]"
-    }.items()
-    for part in ("--set", f"robots.{name}.start={start}")
+    "robots.KH01.start=[-0.6, 0.0]", "robots.KH02.start=[0.2, 0.0]", "robots.KH03.start=[0.2, 0.8]",
+    "robots.CF01.start=[-0.5, 0.2]", "robots.CF02.start=[0.2, 0.2]",
 ]  # fmt: skip
-
+TRIANGLE = ("KH01", "KH02", "CF01")
 # The same of the triangle, whose drone is also soon up and down.
 NEAR_TRIANGLE = [
-    "--set", "robots.KH01.start=[-0.35, -0.3]", "--set", "robots.KH02.start=[0.35, -0.3]",
-    "--set", "robots.CF01.start=[0.05, 0.44]", "--set", "robots.CF01.hover=0.3",
-    "--set", "formation.gain=1.4",  # its links are more level than those of the file, and pull more
+    "robots.KH01.start=[-0.35, -0.3]", "robots.KH02.start=[0.35, -0.3]",
+    "robots.CF01.start=[0.05, 0.44]", "robots.CF01.hover=0.3",
+    "formation.gain=1.4",  # its links are more level than those of the file, and pull more
 ]  # fmt: skip
+
+
+def options(*words: object) -> list[str]:
+    """Words of a command; those like `duration_s=4` are settings."""
+    made: list[str] = []
+    for word in map(str, words):
+        is_setting = "=" in word and word[0] != "-" and made[-1:] not in (["--set"], ["--connect"])
+        made += ["--set", word] if is_setting else [word]
+    return made
 
 
 def zenpark(
@@ -51,7 +60,7 @@ def zenpark(
 ) -> subprocess.CompletedProcess[str]:
     """A command of zenpark, to its end."""
     return subprocess.run(
-        [sys.executable, "-m", module, *map(str, arguments)],
+        [sys.executable, "-m", module, *options(*arguments)],
         cwd=ROOT,
         env=ENVIRONMENT,
         stdin=subprocess.DEVNULL,
@@ -60,6 +69,14 @@ def zenpark(
         check=False,
         timeout=timeout_s,
     )
+
+
+def in_lab(folder: Path) -> Path:
+    """The triangle as a file beside its lab."""
+    file = folder / "triangle.toml"
+    file.write_text(catalogue.path("triangle").read_text("utf-8") + '\n[network]\nlab = "lab"\n', "utf-8")
+    commands.zenpark("lab", "init", folder / "lab", file)
+    return file
 
 
 def typed(file: Path, topic: str) -> list[Any]:
@@ -116,8 +133,32 @@ class Watcher(Looking):
     def phase(self, robot: str) -> str:
         return self.status[robot].phase if robot in self.status else ""
 
+    def until_all(self, phase: str, *names: str) -> None:
+        self.until(lambda: all(self.phase(name) == phase for name in names), f"{', '.join(names)}: {phase}")
+
     def order(self, robot: str, order: messages.Order) -> messages.Reply:
         return orders.send_order(self.session, self.keys, [robot], order, PATIENCE_S)[robot]
+
+    def give(self, order: messages.Order, *names: str) -> None:
+        """Order that all of them carry out."""
+        for name in names:
+            reply = self.order(name, order)
+            assert reply.ok, reply
+
+    def take_off(self, *names: str) -> None:
+        self.until_all("ready", *names)
+        self.give(messages.Order("takeoff"), *names)
+        self.until_all("airborne", *names)
+
+    def start(self, *names: str) -> None:
+        self.give(messages.Order("start", at=time.time() + 0.3), *names)
+        self.until_all("running", *names)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
     def close(self) -> None:
         self.session.close()
@@ -138,6 +179,27 @@ class Started:
             stderr=subprocess.STDOUT,
             text=True,
         )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Ends it, unless it has ended, even if it is frozen."""
+        if self.process.poll() is None:
+            self.thaw()
+            self.process.terminate()
+        self.wait()
+
+    def freeze(self) -> None:
+        self.process.send_signal(signal.SIGSTOP)
+
+    def thaw(self) -> None:
+        self.process.send_signal(signal.SIGCONT)
+
+    def said(self) -> str:
+        """The rest of its output, after its end."""
+        assert self.process.stdout is not None
+        return self.process.stdout.read()
 
     def end(self) -> int:
         """SIGTERM: robots land and a world's are waited for, then it ends."""
@@ -187,13 +249,14 @@ ROLES = {
 
 
 class Flight:
-    """`./zenpark run` in a process of its own."""
+    """`./zenpark run` in a process of its own; words like `duration_s=4` are settings."""
 
-    def __init__(self, folder: Path, file: str, *arguments: str) -> None:
+    def __init__(self, folder: Path, file: str | Path, *words: str, report: bool = False) -> None:
         self.folder = folder
+        words = words if report else (*words, "--no-report")
         self._errors = (folder.parent / f"{folder.name}.stderr").open("w+")
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "tools.guard", "run", file, "--out", str(folder), *arguments],
+            [sys.executable, *GUARD, "run", str(file), "--out", str(folder), *options(*words)],
             cwd=ROOT,
             env={**ENVIRONMENT, "PATH": os.environ["PATH"]},  # a test may put an ssh of its own there
             stdin=subprocess.DEVNULL,
@@ -226,6 +289,9 @@ class Flight:
     def said(self) -> str:
         return Path(self._errors.name).read_text()
 
+    def until_flown(self) -> None:
+        self.until_said("phase conductor: formation")
+
     def until_said(self, pattern: str, limit_s: float = 2.0 * PATIENCE_S) -> None:
         def said_or_over() -> bool:
             return bool(re.search(pattern, self.said())) or self.process.poll() is not None
@@ -242,6 +308,13 @@ class Flight:
     def signal(self, number: signal.Signals) -> None:
         self.process.send_signal(number)
 
+    def interrupt(self) -> str:
+        """Ctrl-C: all land; standard output."""
+        self.signal(signal.SIGINT)
+        code, out = self.finish()
+        assert code == 130, self.logs()
+        return out
+
     def finish(self, limit_s: float = 60.0) -> tuple[int, str]:
         """Exit code and standard output; a machine that was busy spoils figures, and nothing that is tested here."""
         assert self.process.stdout is not None
@@ -253,6 +326,16 @@ class Flight:
 def gone(processes: Sequence[psutil.Process]) -> bool:
     """Whether none of them runs any more; a zombie that nobody reaps counts as gone."""
     return not any(p.is_running() and p.status() != psutil.STATUS_ZOMBIE for p in processes)
+
+
+def assert_formed(trace: Trace, within_m: float, since_s: float) -> None:
+    """Mean error of each link of a distance since a time of the run [s]."""
+    late = trace.time > since_s
+    rows = {name: row for row, name in enumerate(trace.robots)}
+    for text, link in trace.plan.experiment.formation.links.items():
+        one, _, other = text.split()
+        apart = np.linalg.norm(trace.true_position[late, rows[one]] - trace.true_position[late, rows[other]], axis=1)
+        assert np.abs(apart - (link if isinstance(link, float) else link.distance)).mean() < within_m, text
 
 
 def transmits_at_50_hz(trace: Trace) -> None:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import shutil
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
+from typing import Self
 
 import msgspec
 import pytest
@@ -21,7 +21,8 @@ from agents.network.zenoh_config import config, settings
 from experiments.definition import access_rights
 from experiments.file.document import load
 from experiments.real_time.hosts import authority
-from tests.system.lab import ENVIRONMENT, ROOT, RobotProcess, Watcher, until
+from tests.commands import ROOT
+from tests.system.lab import RobotProcess, Started, Watcher
 
 FILE = ROOT / "tests" / "system" / "secured.toml"
 FLOWN = ("KH01", "KH02", "CF01")
@@ -45,39 +46,24 @@ class Laboratory:
         self.rights.write_bytes(msgspec.json.encode(rights))
         self.plain = free_endpoint(preferred_port=0, protocol=protocol)
         (self.endpoint,) = lab.secured([self.plain], self.folder)
-        self.robots: list[RobotProcess] = []
         self.last: dict[str, messages.Status] = {}
-        self.process: subprocess.Popen[str]
-        self.start()
+        self._stack = ExitStack()
+        self.serve(self.endpoint)
 
-    def start(self) -> None:
-        """Starts the router."""
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "agents.runtime.router", "--listen", self.endpoint, "--rights", str(self.rights)],
-            cwd=ROOT,
-            env=ENVIRONMENT,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        assert self.process.stdout is not None
-        assert self.process.stdout.readline() == f"router ready on {self.endpoint}\n"
+    def serve(self, endpoint: str, *more: str) -> None:
+        """Starts a router."""
+        words = ("--listen", endpoint, "--rights", str(self.rights), *more)
+        router = self._stack.enter_context(Started("agents.runtime.router", *words))
+        assert router.process.stdout is not None
+        assert router.process.stdout.readline() == f"router ready on {endpoint}\n"
 
     def fly(self) -> None:
         """Starts the robots and brings them to where they run."""
-        self.robots = [RobotProcess(self.endpoint, FILE, name) for name in FLOWN]
-        self.watcher = Watcher(self.endpoint)
-        self.reach("ready")
         for name in FLOWN:
-            assert self.watcher.order(name, messages.Order("takeoff")).ok
-        self.reach("airborne")
-        at = time.time() + 0.3
-        for name in FLOWN:
-            assert self.watcher.order(name, messages.Order("start", at=at)).ok
-        self.reach("running")
-
-    def reach(self, phase: str) -> None:
-        self.watcher.until(lambda: all(self.watcher.phase(name) == phase for name in FLOWN), f"all are {phase}")
+            self._stack.enter_context(RobotProcess(self.endpoint, FILE, name))
+        self.watcher = self._stack.enter_context(Watcher(self.endpoint))
+        self.watcher.take_off(*FLOWN)
+        self.watcher.start(*FLOWN)
 
     def statuses(self) -> dict[str, messages.Status]:
         """Fresh ones, of every robot."""
@@ -92,16 +78,11 @@ class Laboratory:
         (endpoint,) = lab.secured([self.plain], folder or self.folder)
         return zenoh.open(config(settings("client", connect=[endpoint], name="intruder", identity=identity)))
 
-    def close(self) -> None:
-        for robot in self.robots:
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                robot.end() if robot.process.returncode is None else None
-        if self.robots:
-            self.watcher.close()
-        self.process.terminate()
-        self.process.wait(30)
-        assert self.process.stdout is not None
-        self.process.stdout.close()
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
 
 
 def elsewhere(folder: Path, days: float = 90.0) -> Path:
@@ -116,16 +97,6 @@ def copy(folder: Path, target: Path) -> Path:
     return target
 
 
-@contextlib.contextmanager
-def flying(folder: Path) -> Iterator[Laboratory]:
-    made = Laboratory(folder)
-    try:
-        made.fly()
-        yield made
-    finally:
-        made.close()
-
-
 def steady(rate_hz: float, seconds: float) -> Iterator[int]:
     """Counts up, so many times a second."""
     begin, done = time.monotonic(), 0
@@ -135,6 +106,3 @@ def steady(rate_hz: float, seconds: float) -> Iterator[int]:
             yield done
             done += 1
         pause.wait(0.001)
-
-
-__all__ = ["FILE", "FLOWN", "Laboratory", "copy", "elsewhere", "flying", "steady", "until"]

@@ -20,7 +20,7 @@ from tests.system.lab import PATIENCE_S, Flight, RobotProcess, Started, Watcher
 
 pytestmark = pytest.mark.system
 
-SHORT = ("--json", "--set", "duration_s=2", "--no-report")
+SHORT = ("--case", "event", "--json", "duration_s=2")
 
 
 def experiment(folder: Path, endpoint: str) -> str:
@@ -31,34 +31,32 @@ def experiment(folder: Path, endpoint: str) -> str:
     return str(file)
 
 
-def test_present_robot_is_adopted_unless_it_has_flown(router: RouterProcess, tmp_path: Path) -> None:
+def test_present_robot_is_adopted_unless_it_has_flown(router: RouterProcess, watcher: Watcher, tmp_path: Path) -> None:
     file = experiment(tmp_path, router.endpoint)
-    short = ("--case", "event", *SHORT)
-    at_boot = RobotProcess(router.endpoint, "join", "KH02", "--once")
-    by_hand = RobotProcess(router.endpoint, "triangle", "CF01", "--case", "event")
-    watcher = Watcher(router.endpoint)
-    try:
+    with (
+        RobotProcess(router.endpoint, "join", "KH02", "--once") as at_boot,
+        RobotProcess(router.endpoint, "triangle", "CF01", "--case", "event") as by_hand,
+    ):
         watcher.until(lambda: "CF01" in watcher.alive, "it is there")
-        flight = Flight(tmp_path / "run", file, *short)
+        flight = Flight(tmp_path / "run", file, *SHORT)
         flight.until_said("adopted CF01: is there already, idle")
         flight.until_said("adopted KH02: is ")
-        watcher.until(lambda: watcher.phase("KH02") == "running", "it takes part")
+        watcher.until_all("running", "KH02")
         assert at_boot.wait() == 0, "with --once it ends when it is down, so that its service starts it anew"
         watcher.until(lambda: watcher.status["KH02"].reason == "finished", "it knew what --set had changed")
-        assert watcher.order("CF01", messages.Order("land")).ok, "its own file has twenty seconds"
-    finally:
-        watcher.close()
-    code, out = flight.finish()
-    assert code == 0
-    assert by_hand.process.poll() is None
-    assert sorted(file.stem for file in (tmp_path / "run" / "logs").glob("event-*")) == ["event-KH01", "event-recorder"]
-    assert set(json.loads(out)["cases"]["event"]["robots"]) == {"KH01", "KH02", "CF01"}
-    assert playback.read(tmp_path / "run" / "event.mcap").complete
+        watcher.give(messages.Order("land"), "CF01")  # its own file has twenty seconds
+        code, out = flight.finish()
+        assert code == 0
+        assert by_hand.process.poll() is None
+        logs = sorted(file.stem for file in (tmp_path / "run" / "logs").glob("event-*"))
+        assert logs == ["event-KH01", "event-recorder"]
+        assert set(json.loads(out)["cases"]["event"]["robots"]) == {"KH01", "KH02", "CF01"}
+        assert playback.read(tmp_path / "run" / "event.mcap").complete
 
-    again = Flight(tmp_path / "again", file, *short)
-    again.until_said("CF01: on the network already, and done; a robot that was started by hand flies once")
-    assert again.finish()[0] == 2
-    assert by_hand.end() == 0
+        again = Flight(tmp_path / "again", file, *SHORT)
+        again.until_said("CF01: on the network already, and done; a robot that was started by hand flies once")
+        assert again.finish()[0] == 2
+        assert by_hand.end() == 0
 
 
 def test_lab_member_needs_only_its_own_files(tmp_path: Path) -> None:
@@ -71,33 +69,27 @@ def test_lab_member_needs_only_its_own_files(tmp_path: Path) -> None:
     endpoint = free_endpoint(preferred_port=0, protocol="tls")
     file = experiment(tmp_path, endpoint)
     reach = ("--connect", endpoint, "--lab", str(own))
-    router = Started("tools.guard", "router", file, "--lab", str(lab), "--listen", endpoint)
-    joined = Started("tools.guard", "agent", "join", "KH02", *reach, "--once")
-    try:
+    with (
+        Started("tools.guard", "router", file, "--lab", str(lab), "--listen", endpoint) as router,
+        Started("tools.guard", "agent", "join", "KH02", *reach, "--once") as joined,
+    ):
         assert router.process.stdout is not None
         assert router.process.stdout.readline().startswith("router ready on tls/")
-        flight = Flight(tmp_path / "run", file, "--case", "event", "--lab", str(lab), *SHORT)
+        flight = Flight(tmp_path / "run", file, "--lab", str(lab), *SHORT)
         flight.until_said("adopted KH02: is ")
         assert flight.finish()[0] == 0
         assert joined.wait() == 0
-    finally:
-        joined.process.kill()
-        router.end()
     trace = playback.read(tmp_path / "run" / "event.mcap").trace
     assert not trace.lost.any()
 
 
-def test_who_joined_lands_when_the_conductor_is_dead(router: RouterProcess, tmp_path: Path) -> None:
-    joined = RobotProcess(router.endpoint, "join", "KH02", "--once")
-    flight = Flight(tmp_path / "run", experiment(tmp_path, router.endpoint), "--case", "event")
-    watcher = Watcher(router.endpoint)
-    try:
-        watcher.until(lambda: watcher.phase("KH02") == "running", "it takes part")
+def test_who_joined_lands_when_the_conductor_is_dead(router: RouterProcess, watcher: Watcher, tmp_path: Path) -> None:
+    with RobotProcess(router.endpoint, "join", "KH02", "--once") as joined:
+        flight = Flight(tmp_path / "run", experiment(tmp_path, router.endpoint), "--case", "event")
+        watcher.until_all("running", "KH02")
         flight.signal(signal.SIGKILL)
         flight.finish()
         assert joined.wait(PATIENCE_S) == 0
         watcher.look()
         assert (watcher.phase("KH02"), watcher.status["KH02"].reason) == ("done", "asked to end")
         watcher.until(lambda: not watcher.alive, "so do the others")
-    finally:
-        watcher.close()

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import signal
-import subprocess
-import sys
 import time
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +17,9 @@ from experiments.file.document import load
 from experiments.real_time.hosts import authority
 from experiments.recording import playback
 from experiments.run import reopen
+from tests.commands import python
 from tests.conftest import RouterProcess
-from tests.system.lab import ENVIRONMENT, ROOT, Flight, RobotProcess, Watcher, gone, until
+from tests.system.lab import Flight, RobotProcess, Started, Watcher, gone, until
 
 pytestmark = pytest.mark.system
 
@@ -51,24 +50,21 @@ HYBRID = '{ kind = "hybrid", robots = ["TB01", "KH01"] }'
 def test_robots_hold_while_the_centre_is_dead(tmp_path: Path) -> None:
     file, folder = tmp_path / "three.toml", tmp_path / "run"
     file.write_text(FAST.format(duration=12.0, architecture=HYBRID))
-    flight = Flight(folder, str(file), "--json", "--no-report")
-    flight.until_said(r"phase conductor: TB01 under way", 60.0)
+    flight = Flight(folder, file, "--json")
+    flight.until_said(r"phase conductor: TB01 under way")
     everyone = list(flight.children().values())
-    watcher = Watcher(flight.endpoint())
     names = ("TB01", "KH01")
-    watcher.until(lambda: all(name in watcher.state for name in names), "telemetry")
-    watcher.until(lambda: watcher.state["TB01"].position[0] < -0.45, "the leader drives")
-    children = flight.children()  # those of a dead zygote have no parent for a moment
-    children["zygote"].kill()  # without it the next centre is there after a tenth of a second
-    killed = time.time()
-    children["centre"].kill()
-    flight.until_said(r"centre conductor: the centre ended \(exit code unknown\); started again")
-    watcher.until(lambda: watcher.state["TB01"].position[0] < -0.6, "the leader goes on")
+    with Watcher(flight.endpoint()) as watcher:
+        watcher.until(lambda: all(name in watcher.state for name in names), "telemetry")
+        watcher.until(lambda: watcher.state["TB01"].position[0] < -0.45, "the leader drives")
+        children = flight.children()  # those of a dead zygote have no parent for a moment
+        children["zygote"].kill()  # without it the next centre is there after a tenth of a second
+        killed = time.time()
+        children["centre"].kill()
+        flight.until_said(r"centre conductor: the centre ended \(exit code unknown\); started again")
+        watcher.until(lambda: watcher.state["TB01"].position[0] < -0.6, "the leader goes on")
     everyone += list(flight.children().values())
-    watcher.close()
-    flight.signal(signal.SIGINT)
-    code, out = flight.finish(60.0)
-    assert code == 130
+    out = flight.interrupt()
     until(lambda: gone(everyone), "nothing is left")
 
     trace = playback.read(folder / "default.mcap").trace
@@ -103,72 +99,56 @@ def test_robots_hold_while_the_centre_is_dead(tmp_path: Path) -> None:
     assert case.lost == 0
 
 
-def test_by_hand_and_what_nobody_should_believe(router: RouterProcess, tmp_path: Path) -> None:
-    file = tmp_path / "three.toml"
+def test_by_hand_and_what_nobody_should_believe(router: RouterProcess, watcher: Watcher, tmp_path: Path) -> None:
+    file, names = tmp_path / "three.toml", ("TB01", "KH01", "KH02")
     file.write_text(FAST.format(duration=60.0, architecture='"centralised"'))
-    robots = [RobotProcess(router.endpoint, file, name) for name in ("TB01", "KH01", "KH02")]
-    watcher = Watcher(router.endpoint)
-    watcher.until(lambda: len(watcher.status) == 3, "they are there")
-    watcher.until(lambda: "never received centre" in watcher.status["KH01"].reason, "they wait for the centre")
-    assert watcher.status["KH01"].missing == ["centre"]
-    command = [sys.executable, "-m", "experiments.real_time.processes.centre", str(file), "--connect", router.endpoint]
-    centre = subprocess.Popen(
-        command, cwd=ROOT, env=ENVIRONMENT, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True
-    )
-    assert centre.stdout is not None
-    assert centre.stdout.readline().startswith("centre ready: guides TB01, KH01, KH02 at 10 Hz; realm park at")
-    watcher.until(lambda: all(watcher.phase(name) == "ready" for name in watcher.status), "they are ready")
-    second = subprocess.run(command, cwd=ROOT, env=ENVIRONMENT, capture_output=True, text=True, check=False, timeout=20)
-    assert second.returncode == 2
-    assert "a centre guides the robots in the realm 'park' already" in second.stderr
+    command = ("experiments.real_time.processes.centre", str(file), "--connect", router.endpoint)
+    with ExitStack() as stack:
+        robots = [stack.enter_context(RobotProcess(router.endpoint, file, name)) for name in names]
+        watcher.until(lambda: "never received centre" in watcher.status["KH01"].reason, "they wait for the centre")
+        assert watcher.status["KH01"].missing == ["centre"]
+        centre = stack.enter_context(Started(*command))
+        assert centre.process.stdout is not None
+        ready = "centre ready: guides TB01, KH01, KH02 at 10 Hz; realm park at"
+        assert centre.process.stdout.readline().startswith(ready)
+        watcher.until_all("ready", *names)
+        second = python("-m", *command, code=2, timeout_s=20)
+        assert "a centre guides the robots in the realm 'park' already" in second.stderr
+        watcher.take_off(*names)
+        watcher.start(*names)
+        watcher.until(lambda: watcher.state["KH01"].goal_receipts, "it is guided")
 
-    for name in watcher.status:
-        assert watcher.order(name, messages.Order("takeoff")).ok
-    watcher.until(lambda: all(watcher.phase(name) == "airborne" for name in watcher.status), "airborne")
-    at = time.time() + 0.3
-    for name in watcher.status:
-        assert watcher.order(name, messages.Order("start", at=at)).ok
-    watcher.until(
-        lambda: watcher.state["KH01"].phase == "running" and watcher.state["KH01"].goal_receipts, "it is guided"
-    )
-
-    refused = watcher.status["KH01"].malformed
-    late = watcher.state["KH01"].goal_receipts[-1]
-    assert 0.0 < late.acted - late.pose < 0.5
-    now = time.time()
-    nonsense = (
-        b"no goal at all",
-        messages.encode(messages.Goal("KH02", 2**52, now, (0.0, 0.0, 0.0), None, now)),
-        messages.encode(messages.Goal("KH01", 2**52, now, (1e3, 0.0, 0.0), None, now)),
-        messages.encode(messages.Goal("KH01", 2**52, now - 5.0, (0.0, 0.0, 0.0), None, now - 5.0)),
-        messages.encode(messages.Goal("KH01", 1, now, (0.0, 0.0, 0.0), None, now)),  # of a centre that came before
-    )
-    for payload in nonsense:
-        watcher.session.put(KEYS.goal("KH01"), payload, encoding=messages.JSON)
-    watcher.until(lambda: watcher.status["KH01"].malformed >= refused + 5, "all are refused")
-    assert watcher.state["KH01"].phase == "running"
-    assert abs(watcher.state["KH01"].goal[0]) < 3.0
-
-    subscriber = pubsub.pose_subscriber(watcher.session, KEYS.centre)
-    reports: list[messages.CentreState] = []
-
-    def reported() -> object:
-        came = network.received(subscriber.handler)
-        reports.extend(
-            messages.decode(each.payload.to_bytes(), str(each.encoding), messages.CentreState) for each in came
+        refused = watcher.status["KH01"].malformed
+        late = watcher.state["KH01"].goal_receipts[-1]
+        assert 0.0 < late.acted - late.pose < 0.5
+        now = time.time()
+        nonsense = (
+            b"no goal at all",
+            messages.encode(messages.Goal("KH02", 2**52, now, (0.0, 0.0, 0.0), None, now)),
+            messages.encode(messages.Goal("KH01", 2**52, now, (1e3, 0.0, 0.0), None, now)),
+            messages.encode(messages.Goal("KH01", 2**52, now - 5.0, (0.0, 0.0, 0.0), None, now - 5.0)),
+            messages.encode(messages.Goal("KH01", 1, now, (0.0, 0.0, 0.0), None, now)),  # of a centre that came before
         )
-        return bool(reports) and reports[-1].received["KH01"] > 0  # the first may be from before the run
+        for payload in nonsense:
+            watcher.session.put(KEYS.goal("KH01"), payload, encoding=messages.JSON)
+        watcher.until(lambda: watcher.status["KH01"].malformed >= refused + 5, "all are refused")
+        assert watcher.state["KH01"].phase == "running"
+        assert abs(watcher.state["KH01"].goal[0]) < 3.0
 
-    watcher.until(reported, "the centre says how it is, and that it hears KH01")
-    assert (reports[-1].robots, reports[-1].missing) == (["TB01", "KH01", "KH02"], [])
-    centre.terminate()
-    assert centre.wait(30) == 0
-    centre.stdout.close()
-    watcher.until(lambda: watcher.status["KH02"].missing == ["centre"], "its end is noticed")
-    for robot in robots:
-        robot.process.terminate()
-    assert [robot.wait() for robot in robots] == [0, 0, 0]
-    watcher.close()
+        inbox = pubsub.Inbox(pubsub.pose_subscriber(watcher.session, KEYS.centre), messages.CentreState)
+        reports: list[messages.CentreState] = []
+
+        def reported() -> object:
+            reports.extend(inbox.read())
+            return reports and reports[-1].received["KH01"] > 0  # the first may be from before the run
+
+        watcher.until(reported, "the centre says how it is, and that it hears KH01")
+        assert (reports[-1].robots, reports[-1].missing) == (["TB01", "KH01", "KH02"], [])
+        assert centre.end() == 0
+        watcher.until(lambda: watcher.status["KH02"].missing == ["centre"], "its end is noticed")
+        for robot in robots:
+            robot.process.terminate()
+        assert [robot.wait() for robot in robots] == [0, 0, 0]
 
 
 @pytest.mark.timeout(120)
@@ -179,33 +159,30 @@ def test_lab_lets_only_the_centre_decide(tmp_path: Path) -> None:
     robots = dict.fromkeys(load(file).experiment.robots, "robot")
     authority.create(tmp_path / "lab", {**{role: role for role in authority.SERVICES}, **robots})
     (tmp_path / "lab" / "ca.key").unlink()  # no run needs it
-    flight = Flight(folder, str(file), "--json", "--no-report")
-    flight.until_said(r"phase conductor: TB01 under way", 60.0)
-    watcher = Watcher(flight.endpoint())
-    watcher.until(lambda: {"TB01", "KH01", "KH02"} <= {*watcher.state}, "telemetry")
-    goal, own = (pubsub.subscriber(watcher.session, key) for key in (KEYS.goal("KH01"), KEYS.ranges("KH02")))
-    flight.children()["router"].kill()
-    flight.until_said(r"router conductor: the router ended \(killed by SIGKILL\); started again")
-    again = time.time()
-    watcher.until(
-        lambda: watcher.state["KH01"].goal_receipts and watcher.state["KH01"].stamp > again, "it is guided again"
-    )
-    with network.open_session([flight.endpoint()], name="KH02") as session:
-        before = watcher.status["KH01"].malformed
+    flight = Flight(folder, file, "--json")
+    flight.until_said(r"phase conductor: TB01 under way")
+    with Watcher(flight.endpoint()) as watcher:
+        watcher.until(lambda: {"TB01", "KH01", "KH02"} <= {*watcher.state}, "telemetry")
+        goal, own = (pubsub.subscriber(watcher.session, key) for key in (KEYS.goal("KH01"), KEYS.ranges("KH02")))
+        flight.children()["router"].kill()
+        flight.until_said(r"router conductor: the router ended \(killed by SIGKILL\); started again")
+        again, state = time.time(), watcher.state
+        watcher.until(lambda: state["KH01"].goal_receipts and state["KH01"].stamp > again, "it is guided again")
+        with network.open_session([flight.endpoint()], name="KH02") as session:
+            before = watcher.status["KH01"].malformed
 
-        def arrives() -> bool:
-            session.put(KEYS.goal("KH01"), b"of another robot", encoding=messages.JSON)
-            session.put(KEYS.ranges("KH02"), b"its own", encoding=messages.JSON)
-            return any(network.received(own.handler))
+            def arrives() -> bool:
+                session.put(KEYS.goal("KH01"), b"of another robot", encoding=messages.JSON)
+                session.put(KEYS.ranges("KH02"), b"its own", encoding=messages.JSON)
+                return any(network.received(own.handler))
 
-        watcher.until(arrives, "what it says on its own key is heard")
-    watcher.until(lambda: watcher.state["TB01"].position[0] < -0.7, "the leader goes on")
-    heard = [sample.payload.to_bytes() for sample in network.received(goal.handler)]
-    assert b"of another robot" not in heard
-    assert max(messages.decode(each, messages.JSON, messages.Goal).stamp for each in heard) > again
-    assert watcher.status["KH01"].malformed == before
-    watcher.close()
-    code, out = flight.finish(60.0)
+            watcher.until(arrives, "what it says on its own key is heard")
+        watcher.until(lambda: watcher.state["TB01"].position[0] < -0.7, "the leader goes on")
+        heard = [sample.payload.to_bytes() for sample in network.received(goal.handler)]
+        assert b"of another robot" not in heard
+        assert max(messages.decode(each, messages.JSON, messages.Goal).stamp for each in heard) > again
+        assert watcher.status["KH01"].malformed == before
+    code, out = flight.finish()
     assert code == 0
     assert json.loads(out)["cases"]["default"]["guidance"]["goals"] > 60
     assert set(reopen(folder).metrics["default"].guidance.guided) == {"TB01", "KH01"}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import subprocess
 from pathlib import Path
 
 import pytest
@@ -12,10 +11,6 @@ import pytest
 from tests.system.lab import NEAR_TRIANGLE, zenpark
 
 pytestmark = pytest.mark.system
-
-
-def chaos(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    return zenpark("--chaos", *arguments, "--out", folder, timeout_s=150.0, module="tests")
 
 
 @pytest.mark.parametrize(
@@ -29,9 +24,8 @@ def chaos(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 )
 def test_faults_are_made_and_recovered_from(tmp_path: Path, kinds: list[str]) -> None:
     folder = tmp_path / "chaos"
-    faults = str(len(kinds))
-    of = ("--faults", faults, "--seed", "1", "--kinds", ",".join(kinds), *NEAR_TRIANGLE, "--set", "duration_s=40")
-    done = chaos(folder, "triangle", *of, "--json")
+    of = ("--faults", len(kinds), "--seed", "1", "--kinds", ",".join(kinds), *NEAR_TRIANGLE, "duration_s=40")
+    done = zenpark("--chaos", "triangle", *of, "--json", "--out", folder, timeout_s=150.0, module="tests")
     assert done.stdout, done.stderr
     result = json.loads(done.stdout)
     assert sorted(each["fault"]["kind"] for each in result["outcomes"]) == sorted(kinds), done.stderr
@@ -42,7 +36,7 @@ def test_faults_are_made_and_recovered_from(tmp_path: Path, kinds: list[str]) ->
 
 
 def test_a_fault_that_nobody_knows_is_refused(tmp_path: Path) -> None:
-    done = chaos(tmp_path / "chaos", "triangle", "--kinds", "kil")
+    done = zenpark("--chaos", "triangle", "--kinds", "kil", module="tests")
     assert done.returncode == 2
     assert "--kinds kil: is not known" in done.stderr
     assert done.stderr.count("\n") <= 2

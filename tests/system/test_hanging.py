@@ -5,8 +5,6 @@ from __future__ import annotations
 import os
 import re
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,8 +14,9 @@ import zenoh
 
 from agents.network import messages, pubsub
 from agents.network import session as network
+from tests.commands import ROOT
 from tests.conftest import RouterProcess
-from tests.system.lab import ENVIRONMENT, ROOT, Flight, RobotProcess, Watcher, WorldProcess
+from tests.system.lab import ENVIRONMENT, Flight, RobotProcess, Watcher, WorldProcess
 
 pytestmark = pytest.mark.system
 
@@ -57,9 +56,8 @@ class Truth(Watcher):
 
 @pytest.fixture
 def watcher(router: RouterProcess) -> Iterator[Truth]:
-    made = Truth(router.endpoint)
-    yield made
-    made.close()
+    with Truth(router.endpoint) as made:
+        yield made
 
 
 def lonely(folder: Path, trigger: str = "") -> Path:
@@ -72,14 +70,15 @@ def lonely(folder: Path, trigger: str = "") -> Path:
     return file
 
 
-def fly(watcher: Truth) -> None:
-    watcher.until(lambda: watcher.phase("TE01") == "ready", "it is ready")
-    assert watcher.order("TE01", messages.Order("takeoff")).ok
-    watcher.until(lambda: watcher.phase("TE01") == "airborne", "it is up")
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    return lonely(tmp_path)
 
 
 @pytest.mark.mechanism("watchdog: control loop hangs")
-def test_a_loop_that_hangs_is_landed_and_said(router: RouterProcess, watcher: Truth, tmp_path: Path) -> None:
+def test_a_loop_that_hangs_is_landed_and_said(
+    router: RouterProcess, watcher: Truth, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "hangs.py").write_text(HANGS)
     about = tmp_path / "hangs-1.dist-info"
     about.mkdir()
@@ -87,110 +86,71 @@ def test_a_loop_that_hangs_is_landed_and_said(router: RouterProcess, watcher: Tr
     (about / "entry_points.txt").write_text("[zenpark.triggers]\nhangs = hangs:Hangs\n")
     flag = tmp_path / "now"
     file = lonely(tmp_path, f'trigger = {{ kind = "hangs", file = "{flag}" }}')
-    environment = {**ENVIRONMENT, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])}
-    here = ["--connect", router.endpoint]
-    started = []
-    try:
-        for module, *more in (
-            ["experiments.real_time.processes.world"],
-            ["experiments.real_time.processes.robot", "TE01"],
-        ):
-            command = [sys.executable, "-m", module, str(file), *more, *here]
-            started.append(
-                subprocess.Popen(
-                    command, cwd=ROOT, env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL
-                )
-            )
-            if module == "experiments.real_time.processes.world":
-                watcher.until(lambda: "TE01" in watcher.place, "the world goes")
-        robot = started[1]
-        fly(watcher)
+    monkeypatch.setitem(ENVIRONMENT, "PYTHONPATH", os.pathsep.join([str(tmp_path), str(ROOT)]))
+    with WorldProcess(router.endpoint, file) as world, RobotProcess(router.endpoint, file, "TE01") as robot:
+        watcher.take_off("TE01")
         flag.touch()
         watcher.until(lambda: watcher.status["TE01"].reason.startswith("its control loop hangs"), "it is said")
         assert watcher.phase("TE01") == "landing"
         watcher.until(lambda: "TE01" not in watcher.alive, "nobody counts on it")
         watcher.until(lambda: watcher.height("TE01") < 0.02, "it is down")
-        assert robot.poll() is None  # landed, not fallen
-    finally:
-        for process in reversed(started):
-            process.kill()
-            process.wait(30)
+        assert robot.process.poll() is None  # landed, not fallen
+        robot.kill()
+        world.kill()
 
 
-def test_process_frozen_aloft_is_landed_and_notices(router: RouterProcess, watcher: Truth, tmp_path: Path) -> None:
-    world = WorldProcess(router.endpoint, lonely(tmp_path))
-    robot = RobotProcess(router.endpoint, tmp_path / "lonely.toml", "TE01")
-    try:
-        fly(watcher)
+def test_process_frozen_aloft_is_landed_and_notices(router: RouterProcess, watcher: Truth, file: Path) -> None:
+    with WorldProcess(router.endpoint, file), RobotProcess(router.endpoint, file, "TE01") as robot:
+        watcher.take_off("TE01")
         high, stopped = watcher.height("TE01"), time.time()
-        robot.process.send_signal(signal.SIGSTOP)
+        robot.freeze()
         watcher.until(lambda: watcher.height("TE01") < 0.02, "the world lands it")
         held = [height for stamp, height in watcher.heights if stopped < stamp < stopped + 1.5]
         assert len(held) > 10
         assert min(held) > high - 0.1  # and holds it first
-        asked = watcher.session.get(
-            watcher.keys.order("TE01"), payload=messages.encode(messages.Order("takeoff")), timeout=0.1
-        )
+        again = messages.encode(messages.Order("takeoff"))
+        asked = watcher.session.get(watcher.keys.order("TE01"), payload=again, timeout=0.1)
         assert not [reply for reply in asked if reply.ok is not None]
-        robot.process.send_signal(signal.SIGCONT)
+        robot.thaw()
         watcher.until(lambda: watcher.status["TE01"].reason == "it came down by itself", "it knows")
         assert watcher.height("TE01") < 0.02
-        watcher.until(lambda: watcher.phase("TE01") == "done", "it is done")
-    finally:
-        robot.process.send_signal(signal.SIGCONT)
-        robot.end()
-        world.end()
+        watcher.until_all("done", "TE01")
 
 
-def test_frozen_process_leaves_body_to_its_replacement(router: RouterProcess, watcher: Truth, tmp_path: Path) -> None:
-    world = WorldProcess(router.endpoint, lonely(tmp_path))
-    started = [RobotProcess(router.endpoint, tmp_path / "lonely.toml", "TE01")]
-    try:
-        fly(watcher)
-        old = started[0].process
-        old.send_signal(signal.SIGSTOP)
+def test_frozen_process_leaves_body_to_its_replacement(router: RouterProcess, watcher: Truth, file: Path) -> None:
+    with WorldProcess(router.endpoint, file), RobotProcess(router.endpoint, file, "TE01") as old:
+        watcher.take_off("TE01")
+        old.freeze()
         watcher.until(lambda: watcher.height("TE01") < 0.02, "the world lands it")
         watcher.until(lambda: "TE01" not in watcher.alive, "its lease is over")
         watcher.status.clear()
-        started.append(RobotProcess(router.endpoint, tmp_path / "lonely.toml", "TE01"))
-        fly(watcher)
-        high = watcher.height("TE01")
-        old.send_signal(signal.SIGCONT)
-        heights = []
+        with RobotProcess(router.endpoint, file, "TE01"):
+            watcher.take_off("TE01")
+            heights = [watcher.height("TE01")]
+            old.thaw()
 
-        def left() -> bool:
-            heights.append(watcher.height("TE01"))
-            return old.poll() is not None
+            def left() -> bool:
+                heights.append(watcher.height("TE01"))
+                return old.process.poll() is not None
 
-        watcher.until(left, "the old one leaves")
-        assert old.returncode == 2
-        assert old.stdout is not None
-        assert "TE01: another process has taken this name" in old.stdout.read()
-        assert min(heights) > high - 0.05
-        assert watcher.phase("TE01") == "airborne"
-    finally:
-        for robot in started:
-            robot.process.send_signal(signal.SIGCONT)
-            robot.end()
-        world.end()
+            watcher.until(left, "the old one leaves")
+            assert old.process.returncode == 2
+            assert "TE01: another process has taken this name" in old.said()
+            assert min(heights) > heights[0] - 0.05
+            assert watcher.phase("TE01") == "airborne"
 
 
-def test_stop_behind_a_flood_of_deletions_is_obeyed(router: RouterProcess, watcher: Truth, tmp_path: Path) -> None:
-    world = WorldProcess(router.endpoint, lonely(tmp_path))
-    robot = RobotProcess(router.endpoint, tmp_path / "lonely.toml", "TE01")
-    try:
-        fly(watcher)
+def test_stop_behind_a_flood_of_deletions_is_obeyed(router: RouterProcess, watcher: Truth, file: Path) -> None:
+    with WorldProcess(router.endpoint, file), RobotProcess(router.endpoint, file, "TE01"):
+        watcher.take_off("TE01")
         for _ in range(2000):
             watcher.session.delete(watcher.keys.estop)
         said = messages.encode(messages.Stop("a test", "now"))
         block = zenoh.CongestionControl.BLOCK
         watcher.session.put(watcher.keys.estop, said, encoding=messages.JSON, congestion_control=block)
-        watcher.until(lambda: watcher.phase("TE01") == "done", "its motors are off")
+        watcher.until_all("done", "TE01")
         watcher.until(lambda: watcher.height("TE01") < 0.02, "it fell")
         assert watcher.status["TE01"].reason == "emergency stop by a test: now"
-    finally:
-        robot.end()
-        world.end()
 
 
 def test_process_hanging_in_final_landing_fails_the_run(tmp_path: Path) -> None:
@@ -200,11 +160,10 @@ def test_process_hanging_in_final_landing_fails_the_run(tmp_path: Path) -> None:
         '[robots.TE01]\nkind = "tello"\nstart = [0.0, 0.0]\nhover = 0.6\n'
         '[robots.KH01]\nkind = "khepera4"\nstart = [0.5, 0.5]\n'
     )
-    flight = Flight(tmp_path / "out", str(file))
+    flight = Flight(tmp_path / "out", file, report=True)
     try:
         flight.until_said("phase conductor: landing")
-        robot = flight.children()["TE01"]
-        robot.suspend()
+        flight.children()["TE01"].suspend()
         code, _ = flight.finish(90.0)
     finally:
         flight.signal(signal.SIGKILL)

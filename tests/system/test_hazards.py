@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from agents.network import messages, pubsub
+from agents.network import pubsub
 from experiments.recording import playback
 from tests.conftest import RouterProcess
 from tests.system.lab import Flight, RobotProcess, Watcher, typed
@@ -36,7 +36,7 @@ def written(folder: Path, safety: str) -> Path:
 
 def test_robot_too_near_holds_and_is_reported(tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    flight = Flight(folder, str(written(tmp_path, "separation = 0.5")), "--no-report")
+    flight = Flight(folder, written(tmp_path, "separation = 0.5"))
     flight.until_said(r"hazard [AB]: hold: minimum separation: 0\.\d\d m from [AB] \(limit 0\.5 m\)")
     assert flight.finish()[0] == 0
     (file,) = folder.glob("*.mcap")
@@ -53,8 +53,8 @@ def test_robot_too_near_holds_and_is_reported(tmp_path: Path) -> None:
 
 def test_drone_with_low_battery_lands_and_others_continue(tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    low = ("--set", "safety.battery_low=0.985", "--set", "duration_s=8")  # it flies for 7 minutes on a charge
-    flight = Flight(folder, "triangle", "--case", "event", "--no-report", *low)
+    low = "safety.battery_low=0.985"  # it flies for 7 minutes on a charge
+    flight = Flight(folder, "triangle", "--case", "event", low, "duration_s=8")
     flight.until_said(r"hazard CF01: land: its battery is low: 98% \(limit 98%\)")
     assert flight.finish()[0] == 1
     assert "zenpark: Failed in event: CF01 at " in flight.said()
@@ -69,52 +69,16 @@ def test_drone_with_low_battery_lands_and_others_continue(tmp_path: Path) -> Non
     assert ends["KH01"] == "done: finished"
 
 
-def test_scripted_landing_fails_no_run(tmp_path: Path) -> None:
-    folder = tmp_path / "run"
-    asked = ("--set", "robots.CF01.lands_at_s=3", "--set", "duration_s=6")
-    flight = Flight(folder, "triangle", "--case", "event", "--no-report", *asked)
-    flight.until_said(r"hazard KH01: warn: a neighbour is lost: CF01")
-    assert flight.finish()[0] == 0
-    played = playback.read(folder / "event.mcap")
-    sent = [pose.stamp - played.started for pose in typed(folder / "event.mcap", "/CF01/pose")]
-    assert max(sent) < 3.1
-    ends = {event.source: event.text for event in played.trace.events if event.kind == "robot"}
-    assert ends["CF01"] == "done: lands as its file says"
-    assert ends["KH01"] == "done: finished"
-
-
-def test_uncharged_robot_does_not_take_off_with_reason(router: RouterProcess, tmp_path: Path) -> None:
-    watcher = Watcher(router.endpoint)
-    robots = RobotProcess(router.endpoint, written(tmp_path, "battery_min = 1.0"), "A", "B")
-    try:
-        wanted = "its battery is at 100%, less than 100%"  # it uses some while it waits
-        watcher.until(lambda: "A" in watcher.status and watcher.status["A"].reason == wanted, "it says why")
-        reply = watcher.order("A", messages.Order("takeoff"))
-        assert (reply.ok, reply.reason) == (False, f"cannot take off while idle: {wanted}")
-    finally:
-        watcher.close()
-        assert robots.end() == 0
-
-
 @pytest.mark.mechanism("hazard: conductor lost")
-def test_robots_without_conductor_end_if_file_says_so(router: RouterProcess, tmp_path: Path) -> None:
-    watcher = Watcher(router.endpoint)
+def test_robots_without_conductor_end_if_file_says_so(router: RouterProcess, watcher: Watcher, tmp_path: Path) -> None:
     token = pubsub.alive_token(watcher.session, watcher.keys.conductor)
-    file = written(tmp_path, 'lost_conductor = "land"')
-    robots = RobotProcess(router.endpoint, file, "A", "B")
-    try:
-        watcher.until(lambda: [watcher.phase(name) for name in "AB"] == ["ready"] * 2, "ready")
-        for name in "AB":
-            assert watcher.order(name, messages.Order("takeoff")).ok
-        watcher.until(lambda: [watcher.phase(name) for name in "AB"] == ["airborne"] * 2, "waiting for the start")
+    with RobotProcess(router.endpoint, written(tmp_path, 'lost_conductor = "land"'), "A", "B"):
+        watcher.take_off("A", "B")
         token.undeclare()
-        watcher.until(lambda: [watcher.phase(name) for name in "AB"] == ["done"] * 2, "down")
+        watcher.until_all("done", "A", "B")
         status = watcher.status["A"]
         assert status.reason == "the conductor is gone"
         silent = re.fullmatch(r"land: the conductor is gone: for (\d+\.\d+) s.*", status.hazard)
         assert silent is not None
         assert float(silent[1]) >= 2.0
         assert [incident.text for incident in status.incidents] == [status.hazard]
-    finally:
-        watcher.close()
-        assert robots.end() == 0

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
 import signal
-import subprocess
-import sys
 import threading
 import time
 from functools import partial
@@ -17,29 +16,23 @@ from agents.network import pubsub
 from agents.network import session as network
 from agents.network.keys import Keys
 from agents.network.shutdown import leave
+from tests.commands import zenpark
 from tests.conftest import RouterProcess
-from tests.system.lab import ENVIRONMENT, ROOT, Flight, RobotProcess, Watcher, gone, until
+from tests.system.lab import TRIANGLE, Flight, RobotProcess, Watcher, gone, until
 
 pytestmark = pytest.mark.system
 
 CUT_OFF_S = 3.0  # until the loss of the router is noticed: before that good-byes are still taken
 
 
-def test_robot_leaves_a_router_that_does_not_answer(router: RouterProcess) -> None:
-    watcher = Watcher(router.endpoint)
-    robot = RobotProcess(router.endpoint, "triangle", "KH01")
-    try:
-        watcher.until(lambda: watcher.phase("KH01") == "idle", "it is there")
-        router.process.send_signal(signal.SIGSTOP)
-        threading.Event().wait(CUT_OFF_S)
-        began = time.monotonic()
-        assert robot.end() == 0
-        assert time.monotonic() - began < 10.0  # Zenoh alone takes 13 s
-    finally:
-        router.process.send_signal(signal.SIGCONT)
-        watcher.close()
-        if robot.process.returncode is None:
-            robot.kill()
+def test_robot_leaves_a_router_that_does_not_answer(router: RouterProcess, watcher: Watcher) -> None:
+    with RobotProcess(router.endpoint, "triangle", "KH01") as robot:
+        watcher.until_all("idle", "KH01")
+        with router.frozen():
+            threading.Event().wait(CUT_OFF_S)
+            began = time.monotonic()
+            assert robot.end() == 0
+            assert time.monotonic() - began < 10.0  # Zenoh alone takes 13 s
 
 
 def stopped(pid: int) -> bool:
@@ -60,38 +53,28 @@ def test_session_closes_in_time_and_live_ones_immediately(router: RouterProcess)
     sessions = [network.open_session([router.endpoint], name="test", lease_s=1.0) for _ in range(2)]
     declared = [pubsub.pose_subscriber(sessions[1], Keys().status("*"))]
     assert leave(sessions[0])
-    router.process.send_signal(signal.SIGSTOP)
-    try:
+    with router.frozen():
         threading.Event().wait(CUT_OFF_S)
         began = time.monotonic()
-        in_time = leave(sessions[1], declared, limit_s=0.5)
+        assert not leave(sessions[1], declared, limit_s=0.5)
         assert time.monotonic() - began < 1.5
-        assert not in_time
-    finally:
-        router.process.send_signal(signal.SIGCONT)
-        for thread in threading.enumerate():
-            if thread is not threading.main_thread() and thread.name == "leaving the network":
-                thread.join(15.0)
+    for thread in threading.enumerate():
+        if thread.name == "leaving the network":
+            thread.join(15.0)
 
 
 @pytest.mark.mechanism("emergency stop: frozen router")
 def test_an_estop_that_nobody_answers_ends(router: RouterProcess) -> None:
-    command = [sys.executable, "-m", "tools.guard", "estop", "--connect", router.endpoint]
-    router.process.send_signal(signal.SIGSTOP)
-    try:
-        done = subprocess.run(
-            command, cwd=ROOT, env=ENVIRONMENT, capture_output=True, text=True, timeout=30, check=False
-        )
-    finally:
-        router.process.send_signal(signal.SIGCONT)
+    with router.frozen():
+        done = zenpark("estop", "--connect", router.endpoint, code=None, timeout_s=30)
     assert done.returncode in {1, 2}
     assert "Traceback" not in done.stderr
 
 
 @pytest.mark.parametrize("bodies", ["twin", "world"])
 def test_frozen_robot_delays_nobody_when_launcher_is_killed(tmp_path: Path, bodies: str) -> None:
-    flight = Flight(tmp_path / "run", "triangle", "--bodies", bodies, "--set", "duration_s=60")
-    flight.until_said("formation")
+    flight = Flight(tmp_path / "run", "triangle", "--bodies", bodies, "duration_s=60")
+    flight.until_flown()
     children = flight.children()
     frozen = children.pop("KH01")
     frozen.suspend()
@@ -105,16 +88,14 @@ def test_frozen_robot_delays_nobody_when_launcher_is_killed(tmp_path: Path, bodi
     finally:
         flight.finish()
         for process in (frozen, *children.values()):
-            try:
+            with contextlib.suppress(psutil.NoSuchProcess):
                 process.kill()
-            except psutil.NoSuchProcess:
-                continue
 
 
 def test_suspended_conductor_gives_no_further_order(tmp_path: Path) -> None:
-    flight = Flight(tmp_path / "run", "triangle", "--case", "event", "--no-report")
-    flight.until_said(r"phase conductor: formation", 60.0)
-    robots = [process for name, process in flight.children().items() if name in ("KH01", "KH02", "CF01")]
+    flight = Flight(tmp_path / "run", "triangle", "--case", "event")
+    flight.until_flown()
+    robots = [process for name, process in flight.children().items() if name in TRIANGLE]
     flight.signal(signal.SIGSTOP)
     until(lambda: gone(robots), "the robots land and end", 40.0)
     flight.signal(signal.SIGCONT)

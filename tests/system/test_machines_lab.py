@@ -17,7 +17,7 @@ from agents.network.lab import register
 from experiments.file import catalogue
 from experiments.real_time.hosts import authority
 from experiments.recording import playback
-from tests.system.lab import typed, until
+from tests.system.lab import options, typed, until
 from tests.system.machines import Machines, machines, why_not
 from tests.system.test_machines import busy, zenpark
 from tools.commands.run import SPOILED
@@ -61,17 +61,8 @@ class Laboratory:
         return 0 if process.returncode == SPOILED else process.returncode, out
 
     def fly(self, duration_s: float = 2.0) -> tuple[int, str]:
-        more = [
-            "--case",
-            "event",
-            "--set",
-            f"duration_s={duration_s}",
-            "--anyway",
-            "--no-report",
-            "--out",
-            str(self.out),
-        ]
-        return self.zenpark("run", *more)
+        more = ("--case", "event", f"duration_s={duration_s}", "--anyway", "--no-report", "--out", self.out)
+        return self.zenpark("run", *options(*more))
 
     def flew(self, duration_s: float = 2.0) -> None:
         code, out = self.fly(duration_s)

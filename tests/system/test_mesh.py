@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import signal
 import time
 from contextlib import ExitStack
 from pathlib import Path
@@ -22,11 +21,13 @@ from experiments.definition import access_rights, mesh
 from experiments.file.document import load
 from experiments.real_time.hosts import authority
 from experiments.run import reopen
-from tests.system.lab import Flight, Started, Watcher
+from tests.system.lab import TRIANGLE, Flight, Started, Watcher
 from tools.commands import orders
 from tools.commands.network import members
 
 pytestmark = pytest.mark.system
+
+MESH = "network.topology=mesh"
 
 
 def peers(process: psutil.Process, ports: dict[int, str]) -> set[str]:
@@ -39,10 +40,8 @@ def peers(process: psutil.Process, ports: dict[int, str]) -> set[str]:
 
 
 def test_the_reference_experiment_without_a_router(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    flight = Flight(
-        tmp_path / "run", "robotic-park", "--case", "event", "--no-report", "--set", "network.topology=mesh"
-    )
-    flight.until_said("phase conductor: formation")
+    flight = Flight(tmp_path / "run", "robotic-park", "--case", "event", MESH)
+    flight.until_flown()
     endpoints = (flight.folder / "network.txt").read_text().split()
     ports = {int(topology.bare([each])[0].rpartition(":")[2]): topology.owner(each) for each in endpoints}
     children = flight.children()
@@ -58,23 +57,19 @@ def test_the_reference_experiment_without_a_router(tmp_path: Path, capsys: pytes
     for name, heard in hears.items():
         assert linked[name] == heard | {other for other in robots if name in hears[other]}, name
 
-    watcher = Watcher(*endpoints)
-    try:
+    with Watcher(*endpoints) as watcher:
+        status = watcher.status
         watcher.until(lambda: len(watcher.alive) == len(robots) == len(watcher.state), "everybody is seen")
         assert {"conductor", "recorder", *robots} <= {member.name for member in members(watcher.session)}
         children["CF02"].kill()
         near = linked["CF02"]
         watcher.until(
-            lambda: all((watcher.status[name].missing == ["CF02"]) == ("CF02" in hears[name]) for name in near),
+            lambda: all((status[name].missing == ["CF02"]) == ("CF02" in hears[name]) for name in near),
             "its neighbours miss it",
         )
-        begun = {name: watcher.status[name].decisions for name in robots if name != "CF02"}
-        watcher.until(
-            lambda: all(watcher.status[n].decisions > count for n, count in begun.items()), "the others go on"
-        )
-        assert all(not watcher.status[name].missing for name in begun if "CF02" not in hears[name])
-    finally:
-        watcher.close()
+        begun = {name: status[name].decisions for name in robots if name != "CF02"}
+        watcher.until(lambda: all(status[name].decisions > count for name, count in begun.items()), "the others go on")
+        assert all(not status[name].missing for name in begun if "CF02" not in hears[name])
     assert orders.estop(connect=endpoints, realm="park", identity="operator") == 0
     assert capsys.readouterr().out == f"stopped: {', '.join(sorted(begun))} (at a mesh)\n"
     flight.finish()
@@ -83,52 +78,39 @@ def test_the_reference_experiment_without_a_router(tmp_path: Path, capsys: pytes
 
 
 def test_robot_cut_off_from_everybody_holds(tmp_path: Path) -> None:
-    flight = Flight(
-        tmp_path / "run", "triangle", "--case", "periodic", "--no-report",
-        "--set", "network.topology=mesh", "--set", "duration_s=60",
-    )  # fmt: skip
-    flight.until_said("phase conductor: formation")
+    flight = Flight(tmp_path / "run", "triangle", "--case", "periodic", MESH, "duration_s=60")
+    flight.until_flown()
     endpoints = (flight.folder / "network.txt").read_text().split()
     children = flight.children()
-    watcher = Watcher(*endpoints)
-    try:
+    with Watcher(*endpoints) as watcher:
         watcher.until(lambda: "CF01" in watcher.state, "it is seen")
         for name in ("KH01", "KH02"):
             children[name].kill()
         watcher.until(lambda: sorted(watcher.status["CF01"].missing) == ["KH01", "KH02"], "it misses them")
         watcher.until(lambda: math.hypot(*watcher.state["CF01"].velocity) < 0.05, "it holds")
-    finally:
-        watcher.close()
-    flight.signal(signal.SIGINT)
-    assert flight.finish()[0] == 130
+    flight.interrupt()
 
 
 def test_an_endpoint_that_somebody_else_has_is_named(tmp_path: Path) -> None:
     taken = free_endpoint(0)
     with zenoh.open(config(settings("router", listen=[taken], name="stranger"))):
-        flight = Flight(
-            tmp_path / "run", "triangle", "--case", "periodic", "--no-report", "--set", "network.topology=mesh",
-            "--set", f'network.addresses={{KH01 = "{taken}"}}',
-        )  # fmt: skip
+        where = f'network.addresses={{KH01 = "{taken}"}}'
+        flight = Flight(tmp_path / "run", "triangle", "--case", "periodic", MESH, where)
         code, _ = flight.finish()
     assert code == 2
-    said = "".join(file.read_text() for file in tmp_path.glob("*.stderr"))
-    assert "KH01 cannot listen on" in said
-    assert "network.addresses" in said
+    assert "KH01 cannot listen on" in flight.said()
+    assert "network.addresses" in flight.said()
 
 
 @pytest.mark.mechanism("mesh")
 def test_a_silent_missing_link_is_named() -> None:
-    robots = ("KH01", "KH02", "CF01")
-    right = [topology.owned(endpoint, name) for endpoint, name in zip(free(3), robots, strict=True)]
+    right = [topology.owned(endpoint, name) for endpoint, name in zip(free(3), TRIANGLE, strict=True)]
     wrong = [topology.owned(free_endpoint(0), "KH01"), *right[1:]]  # where KH02 seeks it
     with ExitStack() as stack:
-        for name in robots:
+        for name in TRIANGLE:
             connect = [part for each in (wrong if name == "KH02" else right) for part in ("--connect", each)]
-            robot = Started("experiments.real_time.processes.robot", "triangle", name, *connect)
-            stack.callback(robot.end)
-        watcher = Watcher(*right)
-        stack.callback(watcher.close)
+            stack.enter_context(Started("experiments.real_time.processes.robot", "triangle", name, *connect))
+        watcher = stack.enter_context(Watcher(*right))
         watcher.until(lambda: watcher.phase("CF01") == "ready", "it hears both")
         watcher.until(lambda: watcher.status["KH02"].reason == "never received KH01", "and KH02 says whom it does not")
         assert watcher.phase("KH02") == watcher.phase("KH01") == "idle"
@@ -153,8 +135,8 @@ def test_lab_members_let_nobody_exceed_its_rights(tmp_path: Path) -> None:
     authority.create(
         tmp_path / "lab", {**identities, **dict.fromkeys((*case.names, "KH09"), "robot")}, listening=listening
     )
-    flight = Flight(tmp_path / "run", str(file), "--case", "periodic", "--no-report", "--set", "duration_s=6")
-    flight.until_said("phase conductor: formation")
+    flight = Flight(tmp_path / "run", file, "--case", "periodic", "duration_s=6")
+    flight.until_flown()
     endpoints = (flight.folder / "network.txt").read_text().split()
     stop = messages.encode(messages.Stop("mallory", "because"))
     pose = messages.encode(messages.pose("KH01", 10**9, time.time(), [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], yaw=0.0))
@@ -170,6 +152,6 @@ def test_lab_members_let_nobody_exceed_its_rights(tmp_path: Path) -> None:
     assert code == 0, flight.logs()
     run = reopen(flight.folder)
     assert not run.notes
-    for log in ("CF01", "KH01", "KH02"):
-        assert "emergency stop" not in (flight.folder / "logs" / f"periodic-{log}.log").read_text()
+    for name in TRIANGLE:
+        assert "emergency stop" not in (flight.folder / "logs" / f"periodic-{name}.log").read_text()
     assert run.metrics["periodic"].lost == 0, "a pose with a higher number would have made all after it old"

@@ -8,12 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.file.document import load
 from experiments.recording import playback
 from experiments.recording.trace import Trace
 from experiments.run import reopen
-from experiments.virtual_time.log import RunRecorder
-from experiments.virtual_time.simulation import simulate
+from tests.runs import flown
 from tests.system.lab import Flight, transmits_at_50_hz
 from twins.arrays import Index
 
@@ -33,20 +31,15 @@ def sent_and_heard(trace: Trace, listener: int, speaker: int, end: float) -> tup
 
 def virtual(duration_s: float) -> Trace:
     """The same in virtual time, longer: robots start sooner there, and their numbers must overlap."""
-    plan = load("triangle", *BAD, "formation.gain=1.4", f"duration_s={duration_s}").cases()["periodic"]
-    return RunRecorder(simulate(plan, plan.experiment.seed), plan, "periodic").trace()
+    return flown("triangle", "periodic", *BAD, "formation.gain=1.4", f"duration_s={duration_s}").trace
 
 
 @pytest.mark.mechanism("modelled channel in real time")
 def test_receivers_lose_what_the_virtual_network_loses(tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    changes = [
-        part
-        for change in (*BAD, "duration_s=3", "robots.CF01.hover=0.3", "formation.gain=1.4")
-        for part in ("--set", change)
-    ]
-    flight = Flight(folder, "triangle", "--case", "periodic", "--json", "--no-report", *changes)
-    code, out = flight.finish(60.0)
+    changes = (*BAD, "duration_s=3", "robots.CF01.hover=0.3", "formation.gain=1.4")
+    flight = Flight(folder, "triangle", "--case", "periodic", "--json", *changes)
+    code, out = flight.finish()
     assert code == 0, flight.said
     robots = json.loads(out)["cases"]["periodic"]["robots"]
     assert [robot["lost"] for robot in robots.values()] == [0, 0, 0], "of the real network nothing is lost"
@@ -75,10 +68,8 @@ def test_receivers_lose_what_the_virtual_network_loses(tmp_path: Path) -> None:
 
 def test_centre_communicates_over_the_same_network(tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    changes = [part for change in (*BAD, "duration_s=4") for part in ("--set", change)]
-    changes += ["--set", "architecture=centralised"]
-    flight = Flight(folder, "triangle", "--case", "periodic", "--json", "--no-report", *changes)
-    code, _ = flight.finish(60.0)
+    flight = Flight(folder, "triangle", "--case", "periodic", *BAD, "duration_s=4", "architecture=centralised")
+    code, _ = flight.finish()
     assert code == 0, flight.said
     case = reopen(folder).metrics["periodic"]
     centre = case.guidance

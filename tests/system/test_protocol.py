@@ -13,7 +13,7 @@ from mcap_ros2.decoder import DecoderFactory
 from experiments.real_time.hosts.launcher import LAND_S
 from experiments.recording import playback
 from tests.requests import request
-from tests.system.lab import NEAR, ROOT, Flight, gone, transmits_at_50_hz, until
+from tests.system.lab import NEAR, Flight, assert_formed, gone, transmits_at_50_hz, until
 from tests.twins.loopback import Served
 from twins.devices import khepera4
 
@@ -23,11 +23,9 @@ pytestmark = pytest.mark.system
 @pytest.mark.timeout(180)
 def test_the_reference_experiment_flies_behind_real_bridges(tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    flight = Flight(
-        folder, "robotic-park", "--bodies", "protocol", "--case", "event", "--json", "--no-report",
-        "--set", "duration_s=10", "--set", "timeline=[]", *NEAR,
-    )  # fmt: skip
-    flight.until_said(r"phase conductor: formation", 60.0)
+    words = ("--bodies", "protocol", "--case", "event", "--json", "duration_s=10", "timeline=[]")
+    flight = Flight(folder, "robotic-park", *words, *NEAR)
+    flight.until_flown()
     children = flight.children()
     bodies = {name: line for name in children for line in [children[name].cmdline()]}
     assert bodies["CF01"] == bodies["CF02"] == bodies["CF03"], "one radio, one process"
@@ -47,27 +45,7 @@ def test_the_reference_experiment_flies_behind_real_bridges(tmp_path: Path) -> N
     assert np.isfinite(trace.true_position).all(axis=(1, 2)).mean() > 0.98, "the truth is known"
     heights = trace.true_position[trace.time > 5.0][:, 4:, 2]
     assert np.abs(heights - 0.8).max() < 0.1
-    last = trace.time > trace.time[-1] - 1.0
-    rows = {name: row for row, name in enumerate(trace.robots)}
-    for text, link in trace.plan.experiment.formation.links.items():
-        one, _, other = text.split()
-        apart = np.linalg.norm(trace.true_position[last, rows[one]] - trace.true_position[last, rows[other]], axis=1)
-        distance = link if isinstance(link, float) else link.distance
-        assert np.abs(apart - distance).mean() < 0.05, text
-
-
-def test_two_tellos_and_three_crazyflies_fly_one_formation(tmp_path: Path) -> None:
-    file = str(ROOT / "tests" / "system" / "flock.toml")
-    flight = Flight(tmp_path / "run", file, "--bodies", "protocol", "--json", "--no-report")
-    code, out = flight.finish(90.0)
-    assert code == 0, flight.said()
-    robots = json.loads(out)["cases"]["event"]["robots"]
-    assert set(robots) == {"CF01", "CF02", "CF03", "TE01", "TE02"}
-    assert all(robot["acquired_s"] is not None and robot["lost"] == 0 for robot in robots.values()), robots
-    trace = playback.read(tmp_path / "run" / "event.mcap").trace
-    last = trace.true_position[trace.time > trace.time[-1] - 1.0]
-    centre = last.mean(axis=1, keepdims=True)
-    assert np.abs(np.linalg.norm((last - centre)[..., :2], axis=2).mean(axis=0) - 0.6).max() < 0.05
+    assert_formed(trace, 0.05, since_s=trace.time[-1] - 1.0)
 
 
 def heard_of(folder: Path) -> dict[str, object]:
@@ -85,12 +63,13 @@ def heard_of(folder: Path) -> dict[str, object]:
 
 def test_swap_is_one_word_without_difference_to_neighbours(tmp_path: Path) -> None:
     twins, protocol = tmp_path / "twins", tmp_path / "protocol"
-    short = ("--case", "periodic", "--no-report", "--set", "duration_s=4")
+    short = ("--case", "periodic", "duration_s=4")
     assert Flight(twins, "triangle", *short).finish()[0] == 0
-    one_word = ("--set", "robots.CF01.body=crazyflie-twin")
-    assert Flight(protocol, "triangle", *short, *one_word).finish()[0] == 0
-    addressed = json.loads((protocol / "cases" / "periodic" / "addressed.json").read_text())["robots"]
-    plain = json.loads((protocol / "cases" / "periodic" / "experiment.json").read_text())["robots"]
+    assert Flight(protocol, "triangle", *short, "robots.CF01.body=crazyflie-twin").finish()[0] == 0
+    addressed, plain = (
+        json.loads((protocol / "cases" / "periodic" / f"{name}.json").read_text())["robots"]
+        for name in ("addressed", "experiment")
+    )
     assert addressed["CF01"].pop("body").startswith("udp://127.0.0.1:")
     assert plain["CF01"].pop("body") == "crazyflie-twin"
     assert addressed == plain, "only the address differs"
@@ -113,8 +92,8 @@ formation.links = {{ "KH01 - KH02" = 0.4 }}
 trigger = {{ kind = "periodic", period_s = 0.05 }}
 """
         )
-        flight = Flight(tmp_path / "run", str(file), "--no-report")
-        code, out = flight.finish(60.0)
+        flight = Flight(tmp_path / "run", file)
+        code, out = flight.finish()
         assert abs(twin.truth()[0][0, 0]) < 0.001
     assert code == 1, out + flight.said()
     assert "hazard KH01: warn: it does not obey commands to move: 0." in flight.said()

@@ -1,4 +1,4 @@
-"""Robot processes started by hand: whom they hear, what they survive."""
+"""Robot processes started by hand: whom they hear, what they notice and survive, how they are stopped."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import time
 from contextlib import ExitStack
 from pathlib import Path
 
+import msgspec
 import pytest
 import zenoh
 
@@ -16,17 +17,15 @@ from agents.network import messages
 from experiments.file import catalogue, document
 from tests.conftest import RouterProcess
 from tests.experiments.traces import parse_links
-from tests.system.lab import RobotProcess, Watcher
+from tests.system.lab import TRIANGLE, RobotProcess, Watcher
 
 pytestmark = pytest.mark.system
 
-TRIANGLE = ("KH01", "KH02", "CF01")
+BLOCK = zenoh.CongestionControl.BLOCK  # a stop must not be dropped where a hundred kilobytes go before it
 
 
 def fly(stack: ExitStack, router: RouterProcess, file: str, *names: str) -> RobotProcess:
-    robot = RobotProcess(router.endpoint, file, *names)
-    stack.callback(lambda: robot.process.returncode is not None or robot.end())
-    return robot
+    return stack.enter_context(RobotProcess(router.endpoint, file, *names))
 
 
 @pytest.fixture
@@ -70,7 +69,7 @@ def test_each_robot_hears_exactly_its_neighbours(router: RouterProcess, watcher:
     with ExitStack() as stack:
         for name in experiment.robots:
             fly(stack, router, file, name)
-        watcher.until(lambda: all(watcher.phase(name) == "ready" for name in experiment.robots), "all ready")
+        watcher.until_all("ready", *experiment.robots)
         known = zids(watcher.session)
         keys = subscriptions(watcher.session)
         for name, neighbours in wanted.items():
@@ -90,7 +89,7 @@ def test_late_joiner_and_restarted_robot_receive_last_poses(router: RouterProces
             watcher.until(lambda name=name: watcher.status[name].missing == ["CF01"], "two hear each other")
             assert (watcher.phase(name), watcher.status[name].reason) == ("idle", "never received CF01")
         late = fly(stack, router, "triangle", "CF01")
-        watcher.until(lambda: all(watcher.phase(name) == "ready" for name in TRIANGLE), "all are ready")
+        watcher.until_all("ready", *TRIANGLE)
         late.kill()
         watcher.until(lambda: "CF01" not in watcher.alive, "the token is gone")
         watcher.until(lambda: watcher.status["KH01"].missing == ["CF01"], "its death is known")
@@ -106,7 +105,7 @@ def test_late_joiner_and_restarted_robot_receive_last_poses(router: RouterProces
 def test_orders_are_answered_and_refused_with_a_reason(router: RouterProcess, watcher: Watcher, low: str) -> None:
     with ExitStack() as stack:
         fly(stack, router, low, *TRIANGLE)
-        watcher.until(lambda: all(watcher.phase(name) == "ready" for name in TRIANGLE), "all are ready")
+        watcher.until_all("ready", *TRIANGLE)
         reply = watcher.order("CF01", messages.Order("start", at=time.time()))
         assert not reply.ok
         assert not watcher.order("CF01", messages.Order("hold")).ok
@@ -127,39 +126,23 @@ def test_orders_are_answered_and_refused_with_a_reason(router: RouterProcess, wa
             ("CF01", 0.05, ""), ("KH01", 0.1, ""), ("KH02", 0.1, "")
         ]  # fmt: skip
         assert {answer.reason for answer in answers if not answer.ok} == {"cannot hold while ready"}
-        for name in TRIANGLE:
-            assert watcher.order(name, messages.Order("takeoff")).ok
-        watcher.until(lambda: all(watcher.phase(name) == "airborne" for name in TRIANGLE), "all are up")
-        for name in TRIANGLE:
-            assert watcher.order(name, messages.Order("start", at=time.time() + 0.2)).ok
-        watcher.until(lambda: all(watcher.phase(name) == "running" for name in TRIANGLE), "all run")
-        assert watcher.order("CF01", messages.Order("hold")).ok
-        for name in TRIANGLE:
-            assert watcher.order(name, messages.Order("land")).ok
-        watcher.until(lambda: all(watcher.phase(name) == "done" for name in TRIANGLE), "all are down")
-
-
-def test_an_emergency_stop_cuts_all_motors(router: RouterProcess, watcher: Watcher) -> None:
-    with ExitStack() as stack:
-        fly(stack, router, "triangle", *TRIANGLE)
-        watcher.until(lambda: all(watcher.phase(name) == "ready" for name in TRIANGLE), "all are ready")
-        watcher.order("CF01", messages.Order("takeoff"))
-        watcher.until(lambda: watcher.phase("CF01") == "airborne", "it is up")
-        stop = messages.Stop("a test", "to see it fall")
-        watcher.session.put(watcher.keys.estop, messages.encode(stop), encoding=messages.JSON)
-        watcher.until(lambda: watcher.phase("CF01") == "done", "motors off")
-        assert watcher.status["CF01"].reason == "emergency stop by a test: to see it fall"
-        watcher.until(lambda: watcher.state["CF01"].position[2] < 0.03, "it fell")
+        watcher.take_off(*TRIANGLE)
+        watcher.start(*TRIANGLE)
+        watcher.give(messages.Order("hold"), "CF01")
+        watcher.give(messages.Order("land"), *TRIANGLE)
+        watcher.until_all("done", *TRIANGLE)
 
 
 def nonsense() -> list[tuple[bytes, str]]:
     honest = messages.Pose("KH02", 10**6, time.time(), (0.1, 0.1, 0.0), (0.0, 0.0, 0.0), 0.0)
-
-    def changed(**fields: object) -> bytes:
-        return messages.encode(
-            messages.Pose(**{**{f: getattr(honest, f) for f in honest.__struct_fields__}, **fields}), "msgpack"
-        )  # type: ignore[arg-type]
-
+    wrong: list[dict[str, object]] = [
+        *({"position": (x, 0.0, 0.0)} for x in (math.nan, math.inf, 1e6)),
+        *({"velocity": (x, 0.0, 0.0)} for x in (math.nan, 1e9)),
+        *({"stamp": stamp} for stamp in (math.nan, 1e300, time.time() + 3600.0)),
+        {"yaw": math.nan},
+        {"seq": -1},
+        {"robot": "CF01"},
+    ]
     return [
         (b"", messages.JSON),
         (os.urandom(200), messages.JSON),
@@ -170,17 +153,7 @@ def nonsense() -> list[tuple[bytes, str]]:
         (b'"text"', messages.JSON),
         (b"x" * 100_000, messages.JSON),
         (b"\xff\xfe", "text/plain"),
-        (changed(position=(math.nan, 0.0, 0.0)), messages.MSGPACK),
-        (changed(position=(math.inf, 0.0, 0.0)), messages.MSGPACK),
-        (changed(position=(1e6, 0.0, 0.0)), messages.MSGPACK),
-        (changed(velocity=(math.nan, 0.0, 0.0)), messages.MSGPACK),
-        (changed(velocity=(1e9, 0.0, 0.0)), messages.MSGPACK),
-        (changed(yaw=math.nan), messages.MSGPACK),
-        (changed(stamp=math.nan), messages.MSGPACK),
-        (changed(stamp=1e300), messages.MSGPACK),
-        (changed(stamp=time.time() + 3600.0), messages.MSGPACK),
-        (changed(seq=-1), messages.MSGPACK),
-        (changed(robot="CF01"), messages.MSGPACK),
+        *((messages.encode(msgspec.structs.replace(honest, **each), "msgpack"), messages.MSGPACK) for each in wrong),
     ]
 
 
@@ -188,19 +161,15 @@ def nonsense() -> list[tuple[bytes, str]]:
 def test_nonsense_on_every_key_is_counted_moving_nobody(router: RouterProcess, watcher: Watcher, low: str) -> None:
     with ExitStack() as stack:
         fly(stack, router, low, *TRIANGLE)
-        watcher.until(lambda: all(watcher.phase(name) == "ready" for name in TRIANGLE), "all are ready")
-        for name in TRIANGLE:
-            watcher.order(name, messages.Order("takeoff"))
-        watcher.until(lambda: all(watcher.phase(name) == "airborne" for name in TRIANGLE), "all are up")
-        expected = 0
-        for payload, mime in nonsense():
+        watcher.take_off(*TRIANGLE)
+        given = nonsense()
+        expected = 2 * len(given)  # a pose and an order each
+        for payload, mime in given:
             watcher.session.put(watcher.keys.pose("KH02"), payload, encoding=mime)
-            expected += 1
             for key in (watcher.keys.state("KH02"), watcher.keys.alive("KH02"), watcher.keys.event):
                 watcher.session.put(key, payload, encoding=mime)
             for reply in watcher.session.get(watcher.keys.order("CF01"), payload=payload, encoding=mime, timeout=2.0):
                 assert reply.err is not None
-            expected += 1
         watcher.session.put("park/*/pose", b"{}", encoding=messages.JSON)
         watcher.session.delete(watcher.keys.pose("KH02"))
         watcher.session.delete(watcher.keys.estop)
@@ -219,9 +188,7 @@ def test_nonsense_on_every_key_is_counted_moving_nobody(router: RouterProcess, w
 
 @pytest.mark.mechanism("lifeline: a robot lands with its starter")
 def test_a_robot_whose_starter_falls_silent_lands(router: RouterProcess, watcher: Watcher, low: str) -> None:
-    with ExitStack() as stack:
-        robot = RobotProcess(router.endpoint, low, *TRIANGLE, lifeline=True)
-        stack.callback(lambda: robot.process.returncode is not None or robot.end())
+    with RobotProcess(router.endpoint, low, *TRIANGLE, lifeline=True) as robot:
         stdin = robot.process.stdin
         assert stdin is not None
 
@@ -232,13 +199,46 @@ def test_a_robot_whose_starter_falls_silent_lands(router: RouterProcess, watcher
 
         watcher.until(starter_is_heard_and_all_are_ready, "all are ready")
         assert watcher.order("CF01", messages.Order("takeoff")).ok
-        watcher.until(
-            lambda: watcher.status["CF01"].reason.startswith("nothing from the starter"), "silence is noticed"
-        )
+        silent = "nothing from the starter"
+        watcher.until(lambda: watcher.status["CF01"].reason.startswith(silent), "silence is noticed")
         assert robot.wait() == 0
         watcher.look()
         assert watcher.phase("CF01") == "done"
         assert watcher.state["CF01"].position[2] < 0.03
+
+
+@pytest.mark.mechanism("frozen neighbour")
+def test_a_killed_and_a_frozen_neighbour_are_noticed(router: RouterProcess, watcher: Watcher) -> None:
+    with ExitStack() as stack:
+        robots = {name: fly(stack, router, "triangle", name) for name in TRIANGLE}
+        watcher.until_all("ready", *TRIANGLE)
+        with watcher.session.liveliness().declare_token("park/**"):  # somebody who says that everybody lives ...
+            watcher.until(lambda: "KH01" in watcher.state, "they go on")
+        told = watcher.state["KH01"].seq  # ... and then that everybody is dead
+        watcher.until(lambda: watcher.state["KH01"].seq > told + 10, "they still go on")
+        assert not any(watcher.status[name].missing for name in TRIANGLE)
+        robots["KH02"].freeze()
+        watcher.until(lambda: watcher.status["KH01"].missing == ["KH02"], "it hangs")
+        robots["KH02"].thaw()
+        watcher.until(lambda: not watcher.status["KH01"].missing, "it is back")
+        watcher.until(lambda: "KH02" in watcher.alive, "its token too")
+        robots["CF01"].kill()
+        watcher.until(lambda: watcher.status["KH01"].missing == ["CF01"], "it is dead")
+
+
+@pytest.mark.mechanism("emergency stop from any Zenoh client")
+def test_an_emergency_stop_reaches_every_process(router: RouterProcess, watcher: Watcher) -> None:
+    key = watcher.keys.estop
+    with ExitStack() as stack:
+        robots = [fly(stack, router, "triangle", name) for name in TRIANGLE]
+        watcher.until_all("ready", *TRIANGLE)
+        watcher.session.delete(key)  # no stop
+        watcher.until(lambda: not any(watcher.phase(name) == "done" for name in TRIANGLE), "nobody was stopped")
+        watcher.session.put(key, b"all of you", congestion_control=BLOCK)  # as zenoh-cli puts: without an encoding
+        watcher.until_all("done", *TRIANGLE)
+        assert {watcher.status[name].reason for name in TRIANGLE} == {"emergency stop by an unknown sender: all of you"}
+        assert all(watcher.status[name].malformed == 0 for name in TRIANGLE)
+        assert all(robot.process.poll() is None for robot in robots)
 
 
 def test_user_errors_are_reported_without_a_traceback(router: RouterProcess) -> None:

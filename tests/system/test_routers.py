@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import signal
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,7 +18,7 @@ from agents.network.endpoints import free_endpoint
 from agents.network.zenoh_config import config, settings
 from experiments.run import reopen
 from tests.conftest import RouterProcess
-from tests.system.lab import ENVIRONMENT, NEAR_TRIANGLE, ROOT, Flight, Watcher, assert_held_in_time, until
+from tests.system.lab import NEAR_TRIANGLE, TRIANGLE, Flight, Watcher, assert_held_in_time, until
 from tests.system.secured import FLOWN, Laboratory, refused
 
 pytestmark = pytest.mark.system
@@ -39,25 +36,18 @@ def routers(flight: Flight) -> list[tuple[psutil.Process, str]]:
 
 
 def test_a_killed_router_holds_nobody_up(tmp_path: Path) -> None:
-    changes = ("--set", "network.routers=2", "--set", "duration_s=8", "--case", "periodic", "--no-report")
-    flight = Flight(tmp_path / "run", "triangle", *changes)
-    flight.until_said("phase conductor: formation")
+    flight = Flight(tmp_path / "run", "triangle", "--case", "periodic", "network.routers=2", "duration_s=8")
+    flight.until_flown()
     (first, one), (_, other) = routers(flight)
-    watcher = Watcher(other)
-    try:
+    with Watcher(other) as watcher:
         watcher.until(lambda: len(watcher.state) == 3 == len(watcher.alive), "robots at one are seen at the other")
         first.kill()
         told = {name: state.seq for name, state in watcher.state.items()}
         watcher.until(lambda: all(watcher.state[name].seq > told[name] + 10 for name in told), "all go on")
         flight.until_said(r"the router ended \(killed by SIGKILL\); started again: all go on at another meanwhile")
-        late = Watcher(one)
-        try:
+        with Watcher(one) as late:
             late.until(lambda: len(late.state) == 3 == len(late.alive), "a newcomer at the first sees all")
-        finally:
-            late.close()
         watcher.until(lambda: all(not status.missing for status in watcher.status.values()), "nobody is missed")
-    finally:
-        watcher.close()
     code, _ = flight.finish()
     assert code == 0, flight.logs()
     run = reopen(flight.folder)
@@ -70,40 +60,20 @@ def test_a_killed_router_holds_nobody_up(tmp_path: Path) -> None:
 @pytest.fixture
 def laboratory(tmp_path: Path) -> Iterator[tuple[Laboratory, str]]:
     """Robots in flight at one router of a lab, and the endpoint of another that is linked with it."""
-    made = Laboratory(tmp_path, linked=True)
-    plain = free_endpoint(preferred_port=0, protocol="tls")
-    (other,) = lab.secured([plain], made.folder)
-    second = subprocess.Popen(
-        [sys.executable, "-m", "agents.runtime.router", "--listen", other, "--connect", made.endpoint,
-         "--rights", str(made.rights)],
-        cwd=ROOT,
-        env=ENVIRONMENT,
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        text=True,
-    )  # fmt: skip
-    try:
-        assert second.stdout is not None
-        assert second.stdout.readline() == f"router ready on {other}\n"
+    with Laboratory(tmp_path, linked=True) as made:
+        (other,) = lab.secured([free_endpoint(preferred_port=0, protocol="tls")], made.folder)
+        made.serve(other, "--connect", made.endpoint)
         made.fly()
         yield made, other
-    finally:
-        made.close()
-        second.terminate()
-        second.wait(30)
-        second.stdout.close()  # type: ignore[union-attr]
 
 
 def test_intruder_gets_nothing_at_the_other_router_either(laboratory: tuple[Laboratory, str]) -> None:
     made, other = laboratory
     keys = made.watcher.keys
     assert msgspec.json.decode(made.rights.read_bytes(), type=Rights).linked
-    looker = Watcher(other)  # as operator: through the link everything is seen, and orders are carried
-    try:
-        looker.until(lambda: all(looker.phase(name) == "running" for name in FLOWN), "seen through the link")
+    with Watcher(other) as looker:  # as operator: through the link everything is seen, and orders are carried
+        looker.until_all("running", *FLOWN)
         assert looker.order("KH01", messages.Order("get", name="speed")).robot == "KH01"
-    finally:
-        looker.close()
     before = made.statuses()
     forged = messages.encode(messages.pose("KH01", 10**9, time.time(), [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], yaw=0.0))
     stop = messages.encode(messages.Stop("mallory", "because"))
@@ -131,17 +101,16 @@ def test_intruder_gets_nothing_at_the_other_router_either(laboratory: tuple[Labo
 
 @pytest.mark.mechanism("router frozen")
 def test_robots_hold_while_a_long_lease_router_freezes(patient_router: RouterProcess, tmp_path: Path) -> None:
-    changes = ("--set", f'network.connect=["{patient_router.endpoint}"]', "--set", "safety.neighbour_timeout_s=0.6")
-    flight = Flight(tmp_path / "run", "triangle", "--case", "periodic", "--no-report", *NEAR_TRIANGLE, *changes)
-    flight.until_said("phase conductor: formation")
+    changes = (f'network.connect=["{patient_router.endpoint}"]', "safety.neighbour_timeout_s=0.6")
+    flight = Flight(tmp_path / "run", "triangle", "--case", "periodic", *NEAR_TRIANGLE, *changes)
+    flight.until_flown()
     with patient_router.frozen() as stopped:
         flight.until_said(r"router conductor: no router answers for \d+\.\d s")
         until(lambda: time.time() > stopped + 1.6, "every robot has had the time to hold")
     flight.until_said(r"router conductor: a router answers again, after \d+\.\d s")
-    for name in ("CF01", "KH01", "KH02"):
+    for name in TRIANGLE:
         flight.until_said(rf"hazard {name}: over: no connection to a router")
-    flight.signal(signal.SIGINT)
-    assert flight.finish()[0] == 130, flight.logs()
+    flight.interrupt()
     assert_held_in_time(flight, "periodic", stopped)
 
 
@@ -149,10 +118,8 @@ def test_run_continues_at_second_router_while_first_freezes(patient_router: Rout
     second = RouterProcess(lease_s=60.0)
     try:
         both = f'network.connect=["{patient_router.endpoint}", "{second.endpoint}"]'
-        flight = Flight(
-            tmp_path / "run", "triangle", "--case", "periodic", "--set", both, "--set", "duration_s=8", "--no-report"
-        )
-        flight.until_said("phase conductor: formation")
+        flight = Flight(tmp_path / "run", "triangle", "--case", "periodic", both, "duration_s=8")
+        flight.until_flown()
         with patient_router.frozen() as stopped:
             flight.until_said(r"router conductor: a router answers again, after \d\.\d s")
             code, _ = flight.finish()

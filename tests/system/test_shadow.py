@@ -18,9 +18,9 @@ pytestmark = pytest.mark.system
 def test_twins_shadow_a_crazyflie_and_a_khepera(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     flight = Flight(
-        folder, "triangle", "--case", "periodic", "--no-report", "--json", "--set", "duration_s=4",
-        "--set", "robots.CF01.body=crazyflie-twin", "--set", "robots.CF01.shadow={restart_s=1.5}",
-        "--set", "robots.KH01.body=khepera4-twin", "--set", "robots.KH01.shadow={}",
+        folder, "triangle", "--case", "periodic", "--json", "duration_s=4",
+        "robots.CF01.body=crazyflie-twin", "robots.CF01.shadow={restart_s=1.5}",
+        "robots.KH01.body=khepera4-twin", "robots.KH01.shadow={}",
     )  # fmt: skip
     code, out = flight.finish()
     assert code == 0, flight.said()

@@ -4,13 +4,13 @@ import json
 import signal
 import socket
 import subprocess
-import sys
-from contextlib import contextmanager
+from contextlib import ExitStack
 
 import psutil
 import pytest
 
-from tests.system.lab import ENVIRONMENT, ROOT, until
+from tests.commands import GUARD, environment, started
+from tests.system.lab import options, until
 
 pytestmark = pytest.mark.system
 
@@ -19,30 +19,15 @@ SETTINGS = ["duration_s=2.0"]
 RUNS = 7 * 6
 
 
-@contextmanager
-def started(*command, **options):
-    """A process of the test, ended with its children whatever happens."""
-    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    process = subprocess.Popen(
-        [sys.executable, *command], cwd=ROOT, env={**ENVIRONMENT, "OMP_NUM_THREADS": "1"}, **{**streams, **options}
-    )
-    try:
-        yield process
-    finally:
-        if process.poll() is None:
-            for each in [*psutil.Process(process.pid).children(recursive=True), process]:
-                each.kill()
-        process.wait()
-        for stream in (process.stdout, process.stderr):
-            if stream is not None:
-                stream.close()
-
-
 def zenpark(folder, *more, given=GIVEN):
-    settings = [part for setting in SETTINGS for part in ("--set", setting)]
-    return started(
-        "-m", "tools.guard", "sweep", "triangle", *given, *settings, "--out", str(folder), "--no-report", *more
-    )
+    words = options("sweep", "triangle", "--out", folder, "--no-report", *SETTINGS, *more)
+    return started(*GUARD, *words, *given, env=environment(OMP_NUM_THREADS="1"), stdin=subprocess.DEVNULL)
+
+
+def finished(folder, *more, **given):
+    with zenpark(folder, *more, **given) as process:
+        _, said = process.communicate()
+        assert process.returncode == 0, said
 
 
 def seeds_done(folder):
@@ -61,9 +46,7 @@ def tables(folder):
 def whole(tmp_path_factory):
     """The table of the same sweep in one process."""
     folder = tmp_path_factory.mktemp("whole")
-    with zenpark(folder, "--processes", "1") as process:
-        process.communicate()
-        assert process.returncode == 0
+    finished(folder, "--processes", "1")
     return tables(folder)
 
 
@@ -72,62 +55,52 @@ def test_seeds_of_one_experiment_are_split_over_processes(tmp_path):
     found = []
     for count in ("1", "2", "3"):
         folder = tmp_path / count
-        with zenpark(folder, "--processes", count, "--case", "event", given=["seeds=9"]) as process:
-            process.communicate()
-            assert process.returncode == 0
+        finished(folder, "--processes", count, "--case", "event", given=["seeds=9"])
         records = [json.loads(line) for line in (folder / "runs.jsonl").read_text().splitlines()]
         assert len(records) > int(count)
         found.append((tables(folder), sorted(json.dumps(run) for record in records for run in record["runs"])))
     assert found[0] == found[1] == found[2]
 
 
-def test_ctrl_c_keeps_results_and_the_command_resumes(tmp_path, whole):
-    with zenpark(tmp_path, "--processes", "2") as process:
-        until(lambda: seeds_done(tmp_path), "a cell is done")
+def interrupted(folder, end):
+    """Exit code and errors of a sweep that is ended after its first cell by `end`, which gets it and its children."""
+    with zenpark(folder, "--processes", "2") as process:
+        until(lambda: seeds_done(folder), "a cell is done")
         children = psutil.Process(process.pid).children(recursive=True)
         assert len(children) >= 2
-        process.send_signal(signal.SIGINT)
+        end(process, children)
         _, said = process.communicate()
-        assert process.returncode == 130
-        assert "the same command goes on from here" in said
         assert "Traceback" not in said
         assert not psutil.wait_procs(children, timeout=30.0)[1]
+        return process.returncode, said
+
+
+@pytest.mark.parametrize(
+    ("number", "code", "words"),
+    [
+        pytest.param(signal.SIGKILL, -signal.SIGKILL, "", marks=pytest.mark.mechanism("sweep: killed")),
+        (signal.SIGINT, 130, "the same command goes on from here"),
+    ],
+)
+def test_ended_sweep_leaves_no_process_and_resumes(tmp_path, whole, number, code, words):
+    ended, said = interrupted(tmp_path, lambda process, _: process.send_signal(number))
+    assert ended == code
+    assert words in said
     before = seeds_done(tmp_path)
     assert 0 < len(before) < RUNS
-    with zenpark(tmp_path, "--processes", "2") as process:
-        process.communicate()
-        assert process.returncode == 0
+    finished(tmp_path, "--processes", "2")
     done = seeds_done(tmp_path)
     assert len(done) == len(set(done)) == RUNS
     assert done[: len(before)] == before
     assert tables(tmp_path) == whole
 
 
-@pytest.mark.mechanism("sweep: killed")
-def test_killed_sweep_leaves_no_process_and_resumes(tmp_path, whole):
-    with zenpark(tmp_path, "--processes", "2") as process:
-        until(lambda: seeds_done(tmp_path), "a cell is done")
-        children = psutil.Process(process.pid).children(recursive=True)
-        process.kill()
-        assert not psutil.wait_procs(children, timeout=30.0)[1]
-    before = seeds_done(tmp_path)
-    with zenpark(tmp_path, "--processes", "2") as process:
-        process.communicate()
-        assert process.returncode == 0
-    assert seeds_done(tmp_path)[: len(before)] == before
-    assert tables(tmp_path) == whole
-
-
 def test_a_process_that_is_killed_is_explained(tmp_path):
-    with zenpark(tmp_path, "--processes", "2") as process:
-        until(lambda: seeds_done(tmp_path), "a cell is done")
-        children = psutil.Process(process.pid).children(recursive=True)
-        max(children, key=lambda child: child.memory_info().rss).kill()
-        _, said = process.communicate()
-        assert process.returncode == 2
-        assert "a process of the sweep was killed" in said
-        assert "Traceback" not in said
-        assert not psutil.wait_procs(children, timeout=30.0)[1]
+    code, said = interrupted(
+        tmp_path, lambda _, children: max(children, key=lambda child: child.memory_info().rss).kill()
+    )
+    assert code == 2
+    assert "a process of the sweep was killed" in said
 
 
 def test_cluster_with_a_killed_worker_gives_same_table(tmp_path, whole):
@@ -136,17 +109,15 @@ def test_cluster_with_a_killed_worker_gives_same_table(tmp_path, whole):
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     address = f"tcp://127.0.0.1:{port}"
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    quiet = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
     scheduler = ["-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", str(port), "--no-dashboard"]
     worker = ["-m", "distributed.cli.dask_worker", address, "--host", "127.0.0.1", "--nthreads", "1", "--no-nanny"]
     worker += ["--no-dashboard", "--local-directory"]
     folder = tmp_path / "sweep"
-    with (
-        started(*scheduler, **quiet),
-        started(*worker, str(tmp_path / "one"), **quiet) as one,
-        started(*worker, str(tmp_path / "two"), **quiet) as two,
-        zenpark(folder, "--scheduler", address) as process,
-    ):
+    with ExitStack() as stack:
+        stack.enter_context(started(*scheduler, **quiet))
+        one, two = (stack.enter_context(started(*worker, str(tmp_path / name), **quiet)) for name in ("one", "two"))
+        process = stack.enter_context(zenpark(folder, "--scheduler", address))
         until(lambda: seeds_done(folder), "a cell is done")
         (one if process.pid % 2 else two).kill()
         assert len(seeds_done(folder)) < RUNS

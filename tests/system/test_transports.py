@@ -32,7 +32,7 @@ def test_an_experiment_over_each_transport(tmp_path: Path, protocol: str) -> Non
     secure = protocol in ("tls", "quic")
     listen = free_endpoint(0, protocol) if secure else f"{protocol}/{tmp_path}/router.sock"
     lab = ("--lab", str(found(tmp_path / "lab"))) if secure else ()
-    flight = Flight(tmp_path / "run", "triangle", *SHORT, *lab, "--set", f'network.listen=["{listen}"]')
+    flight = Flight(tmp_path / "run", "triangle", *SHORT, *lab, f'network.listen=["{listen}"]')
     code, _ = flight.finish()
     assert code == 0, flight.logs()
     assert f"router ready on {listen}" in (flight.folder / "logs" / "router.log").read_text()

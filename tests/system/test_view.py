@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import threading
 import time
@@ -16,16 +17,18 @@ import pytest
 from agents.network import messages, pubsub
 from agents.network.endpoints import free_endpoint
 from agents.runtime.orders import PAUSED
-from experiments.definition.experiment import Experiment
+from experiments.definition.experiment import Arena
 from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.run import simulate
 from experiments.scene.stage import Condition, SceneModel
 from experiments.view import acting
+from tests.commands import zenpark
 from tests.conftest import RouterProcess
 from tests.experiments import moments
+from tests.small import small
 from tests.system.browser import Page, needs_chromium, opened
-from tests.system.lab import NEAR, ROOT, Flight, RobotProcess, Started, Watcher, typed, zenpark
+from tests.system.lab import NEAR, Flight, RobotProcess, Started, Watcher, in_lab, typed
 
 pytest.importorskip("viser", reason="needs viser")
 pytestmark = [pytest.mark.system, needs_chromium]
@@ -49,10 +52,8 @@ class ViewProcess(Started):
 @contextmanager
 def viewed(*arguments: object) -> Iterator[ViewProcess]:
     """A page, while its process runs."""
-    process = ViewProcess(*arguments)
-    try:
+    with ViewProcess(*arguments) as process:
         yield process
-    finally:
         assert process.end() == 0
 
 
@@ -67,58 +68,53 @@ def places(page: Page, what: str = "robots/{}/body", root: str = "/case") -> np.
 
 
 @contextmanager
-def announced(watcher: Watcher, park: Experiment, case: str) -> Iterator[None]:
-    """A case as a conductor announces it."""
+def announced(watcher: Watcher, endpoint: str, plan: Plan, folder: Path) -> Iterator[tuple[str, ...]]:
+    """Names of the robots of a case, which are there, and a conductor has announced it."""
+    file = folder / "event.json"
+    file.write_bytes(document.write_json(plan))
     told = pubsub.pose_publisher(watcher.session, watcher.keys.experiment, messages.JSON)
-    told.put(document.case_document(Plan(park), case))
-    yield
-    told.undeclare()
+    told.put(document.case_document(plan, "event"))
+    robots = RobotProcess(endpoint, file, *plan.names)
+    try:
+        yield plan.names
+    finally:
+        robots.kill()
+        told.undeclare()
 
 
 @pytest.mark.mechanism("view")
 def test_page_shows_seven_robots_and_stops_all(router: RouterProcess, watcher: Watcher, tmp_path: Path) -> None:
     low = (f"robots.{name}.hover=0.2" for name in ("CF01", "CF02", "CF03"))  # soon airborne
-    park = document.load("robotic-park", *NEAR[1::2], *low, "duration_s=60").cases()["event"].experiment
-    (tmp_path / "event.json").write_bytes(document.write_json(Plan(park)))
-    names, robots = list(park.robots), RobotProcess(router.endpoint, tmp_path / "event.json", *park.robots)
+    park = document.load("robotic-park", *NEAR, *low, "duration_s=60").cases()["event"]
 
     def taken_off(view: ViewProcess) -> str:
-        watcher.until(lambda: all(watcher.phase(name) == "ready" for name in names), "ready")
-        assert all(watcher.order(name, messages.Order("takeoff")).ok for name in names)
+        watcher.until_all("ready", *names)
+        watcher.give(messages.Order("takeoff"), *names)
         return view.address()
 
-    try:
-        with (
-            announced(watcher, park, "event"),
-            viewed("--connect", router.endpoint) as view,
-            opened(partial(taken_off, view), 480, 360) as page,
-        ):
-            watcher.until(lambda: all(watcher.phase(name) == "airborne" for name in names), "airborne")
-            page.until(lambda: np.all(places(page)[:, 2] > -1.0), "seen")
-            before, colours = places(page), page.nodes["/case/links"]["colors"]
-            at = time.time() + 0.2
-            assert all(watcher.order(name, messages.Order("start", at=at)).ok for name in names)
-            watcher.until(lambda: watcher.phase("TB01") == "running", "begun")
-            assert watcher.order("TB01", messages.Order("go", goal=(-0.4, 0.8))).ok
-            page.until(lambda: np.all(np.linalg.norm(places(page) - before, axis=1) > 0.01), "all move")
-            page.until(lambda: page.nodes["/case/links"]["colors"] != colours, "links change colour")
-            page.until(lambda: np.all(places(page, "goals/{}")[:, 2] > -1.0), "ghosts stand at the goals")
-            page.until(lambda: page.page.get_by_text("event: formation").count(), "case and phase")
-            page.button("EMERGENCY STOP").click()
-            page.until(lambda: page.page.get_by_text("stopped: CF01, CF02").count(), "answers are shown")
-            watcher.until(
-                lambda: all(watcher.status[name].reason.startswith("emergency stop by operator") for name in names),
-                "their statuses say so",
-            )
-            assert page.hosts == {f"127.0.0.1:{view.port}"}
-    finally:
-        robots.kill()
+    with (
+        announced(watcher, router.endpoint, park, tmp_path) as names,
+        viewed("--connect", router.endpoint) as view,
+        opened(partial(taken_off, view), 480, 360) as page,
+    ):
+        watcher.until_all("airborne", *names)
+        page.until(lambda: np.all(places(page)[:, 2] > -1.0), "seen")
+        before, colours = places(page), page.nodes["/case/links"]["colors"]
+        watcher.start(*names)
+        watcher.give(messages.Order("go", goal=(-0.4, 0.8)), "TB01")
+        page.until(lambda: np.all(np.linalg.norm(places(page) - before, axis=1) > 0.01), "all move")
+        page.until(lambda: page.nodes["/case/links"]["colors"] != colours, "links change colour")
+        page.until(lambda: np.all(places(page, "goals/{}")[:, 2] > -1.0), "ghosts stand at the goals")
+        page.until(lambda: page.page.get_by_text("event: formation").count(), "case and phase")
+        page.button("EMERGENCY STOP").click()
+        page.until(lambda: page.page.get_by_text("stopped: CF01, CF02").count(), "answers are shown")
+        stopped = "emergency stop by operator"
+        watcher.until(lambda: all(watcher.status[name].reason.startswith(stopped) for name in names), "they say so")
+        assert page.hosts == {f"127.0.0.1:{view.port}"}
 
 
 def test_page_orders_reach_robots_and_become_events(router: RouterProcess, watcher: Watcher, tmp_path: Path) -> None:
-    convoy = document.load("convoy", "timeline=[]").cases()["event"].experiment
-    (tmp_path / "event.json").write_bytes(document.write_json(Plan(convoy)))
-    names, robots = list(convoy.robots), RobotProcess(router.endpoint, tmp_path / "event.json", *convoy.robots)
+    convoy = document.load("convoy", "timeline=[]").cases()["event"]
     heard = pubsub.Inbox(
         pubsub.pose_subscriber(watcher.session, watcher.keys.event, 256, pubsub.EVENTS), messages.Event
     )
@@ -132,76 +128,66 @@ def test_page_orders_reach_robots_and_become_events(router: RouterProcess, watch
         watcher.look()
         return all(true(watcher.status[name]) for name in names)
 
-    try:
-        with (
-            announced(watcher, convoy, "event"),
-            viewed("--connect", router.endpoint) as view,
-            opened(view.address, 900, 600) as page,
-        ):
-            watcher.until(lambda: all(watcher.phase(name) == "ready" for name in names), "ready")
-            at = time.time() + 0.2
-            for order in (messages.Order("takeoff"), messages.Order("start", at=at)):
-                assert all(watcher.order(name, order).ok for name in names)
-            page.until(lambda: everywhere(lambda status: status.phase == "running"), "running")
+    with (
+        announced(watcher, router.endpoint, convoy, tmp_path) as names,
+        viewed("--connect", router.endpoint) as view,
+        opened(view.address, 900, 600) as page,
+    ):
+        watcher.until_all("ready", *names)
+        for order in (messages.Order("takeoff"), messages.Order("start", at=time.time() + 0.2)):
+            watcher.give(order, *names)
+        page.until(lambda: everywhere(lambda status: status.phase == "running"), "running")
 
-            page.page.get_by_label("Drag targets").check()
-            page.until(lambda: "/targets/TB01" in page.nodes, "the target is shown")
-            start = np.array(convoy.robots["TB01"].start[:2])
-            square = np.array([*start + 0.255 * acting.HANDLE * 3.0 / 2.5, 0.0])  # by which it is dragged in the plane
-            place = page.nodes["/targets/TB01"]
+        page.page.get_by_label("Drag targets").check()
+        page.until(lambda: "/targets/TB01" in page.nodes, "the target is shown")
+        start = np.array(convoy.experiment.robots["TB01"].start[:2])
+        square = np.array([*start + 0.255 * acting.HANDLE * 3.0 / 2.5, 0.0])  # by which it is dragged in the plane
+        place = page.nodes["/targets/TB01"]
 
-            def dragged(by: tuple[float, float], answer: str) -> None:
-                page.until(
-                    lambda: np.allclose(place.get("position", (np.inf,) * 3)[:2], start, atol=0.01), "it is at its goal"
-                )
-                del place["position"]  # it comes again when the target is back
-                page.drag(square, square + np.array([*by, 0.0]))
-                page.until(lambda: recorded(f"TB01 to {answer}"), f"sent: {events}")
+        def dragged(by: tuple[float, float], answer: str) -> None:
+            page.until(
+                lambda: np.allclose(place.get("position", (np.inf,) * 3)[:2], start, atol=0.01), "it is at its goal"
+            )
+            del place["position"]  # it comes again when the target is back
+            page.drag(square, square + np.array([*by, 0.0]))
+            page.until(lambda: recorded(f"TB01 to {answer}"), f"sent: {events}")
 
-            dragged((0.1, -1.2), "x = 0.10 m, y = -1.80 m: 0 of 1 robots; TB01: x = ")  # outside the arena
-            dragged((0.4, 0.3), "x = 0.40 m, y = -0.30 m: 1 of 1 robots")
-            page.until(lambda: (watcher.look(), watcher.state["TB01"].goal[0] > 0.1)[1], "the leader goes there")
-            assert np.linalg.norm(np.subtract(watcher.state["TB01"].goal[:2], start)) < 0.5, "not at once"
+        dragged((0.1, -1.2), "x = 0.10 m, y = -1.80 m: 0 of 1 robots; TB01: x = ")  # outside the arena
+        dragged((0.4, 0.3), "x = 0.40 m, y = -0.30 m: 1 of 1 robots")
+        page.until(lambda: (watcher.look(), watcher.state["TB01"].goal[0] > 0.1)[1], "the leader goes there")
+        assert np.linalg.norm(np.subtract(watcher.state["TB01"].goal[:2], start)) < 0.5, "not at once"
 
-            page.button("Hold all").click()
-            page.until(lambda: recorded("hold: 4 of 4 robots"), "held")
-            page.until(lambda: everywhere(lambda status: status.reason == PAUSED), "statuses say so")
-            page.button("Resume all").click()
-            page.until(lambda: recorded("resume: 4 of 4 robots"), "resumed")
-            page.until(lambda: everywhere(lambda status: not status.reason), "statuses say so")
+        page.button("Hold all").click()
+        page.until(lambda: recorded("hold: 4 of 4 robots"), "held")
+        page.until(lambda: everywhere(lambda status: status.reason == PAUSED), "statuses say so")
+        page.button("Resume all").click()
+        page.until(lambda: recorded("resume: 4 of 4 robots"), "resumed")
+        page.until(lambda: everywhere(lambda status: not status.reason), "statuses say so")
 
-            page.page.get_by_role("slider").first.press("ArrowRight")
-            page.until(lambda: recorded("trigger.threshold = 0.0102: 4 of 4 robots"), f"set: {events}")
-            changed = [watcher.order(name, messages.Order("get", name="trigger.threshold")).value for name in names]
-            assert changed == pytest.approx([0.0102] * 4)
+        page.page.get_by_role("slider").first.press("ArrowRight")
+        page.until(lambda: recorded("trigger.threshold = 0.0102: 4 of 4 robots"), f"set: {events}")
+        changed = [watcher.order(name, messages.Order("get", name="trigger.threshold")).value for name in names]
+        assert changed == pytest.approx([0.0102] * 4)
 
-            page.button("Land all").click()
-            page.until(lambda: recorded("land: 4 of 4 robots"), "landed")
-            page.until(lambda: everywhere(lambda status: status.phase == "done"), "statuses say so")
-    finally:
-        robots.kill()
+        page.button("Land all").click()
+        page.until(lambda: recorded("land: 4 of 4 robots"), "landed")
+        page.until(lambda: everywhere(lambda status: status.phase == "done"), "statuses say so")
 
 
 @pytest.mark.timeout(240)
 def test_lab_observer_watches_and_shift_s_stops_run(tmp_path: Path) -> None:
-    file = tmp_path / "triangle.toml"
-    text = (ROOT / "experiments" / "catalogue" / "triangle.toml").read_text("utf-8")
-    file.write_text(text + '\n[network]\nlab = "lab"\n', "utf-8")
-    assert zenpark("lab", "init", tmp_path / "lab", file).returncode == 0
-    flight = Flight(tmp_path / "run", str(file), "--case", "event", "--no-report", "--set", "duration_s=90")
-    flight.until_said("phase conductor: formation")
+    file = in_lab(tmp_path)
+    flight = Flight(tmp_path / "run", file, "--case", "event", "duration_s=90")
+    flight.until_flown()
     endpoint, _, lab = flight.endpoint().partition("#lab=")
     seen = zenpark("top", "--connect", endpoint, "--lab", lab)  # as an observer
-    assert seen.returncode == 0, seen.stderr
     title, heads, *rows = seen.stdout.splitlines()
     assert title.startswith("event: ")
     assert {row.split()[0] for row in rows[:3]} == {"KH01", "KH02", "CF01"}
     assert all(row.count("%") == 2 for row in rows[:3]), f"CPU and battery: {heads} {rows}"
     shown = json.loads(zenpark("top", "--json", "--connect", endpoint, "--lab", lab).stdout)
     assert (shown["case"], {row["name"] for row in shown["robots"]}) == ("event", {"KH01", "KH02", "CF01"})
-    missing = zenpark("top", "--connect", endpoint)
-    assert missing.returncode == 2
-    assert "--lab" in missing.stderr, missing.stderr
+    assert "--lab" in zenpark("top", "--connect", endpoint, code=2).stderr
     for identity, buttons in (("observer", 0), ("operator", 1)):
         with (
             viewed("--connect", endpoint, "--lab", lab, "--as", identity) as view,
@@ -249,23 +235,12 @@ def test_hundred_robots_are_drawn_at_twenty_frames() -> None:
     from experiments.view.live import Page  # noqa: PLC0415 - viser may be missing
     from experiments.view.serving import served  # noqa: PLC0415
 
-    crowd = document.loads(
-        'title = "a hundred"\nduration_s = 9.0\narena = { size = [12.0, 12.0, 3.0] }\n'
-        + "".join(
-            f'[robots.R{k}]\nkind = "{("khepera4", "crazyflie")[k % 2]}"\nstart = [{k % 10 - 4.5}, {k // 10 - 4.5}]\n'
-            + ("hover = 0.6\n" if k % 2 else "")
-            for k in range(100)
-        )
-        + "[formation.links]\n"
-        + "".join(f'"R{k} > R{k + 1}" = 1.0\n' for k in range(99))
-    ).cases()["default"]
-    crowd_stage = SceneModel.of_plan(crowd)
-    serving = ExitStack()
-    server = serving.enter_context(served(int(free_endpoint(preferred_port=0).rpartition(":")[2]), dark=False))
-    shown = Page(server, dark=False)
-    shown.begin(crowd_stage)
-    over = threading.Event()
-    moment = moments.unknown(crowd_stage)
+    names = [f"R{k}" for k in range(100)]
+    links = {f"{one} > {other}": 1.0 for one, other in itertools.pairwise(names)}
+    crowd = small({name: ("khepera4", "crazyflie")[k % 2] for k, name in enumerate(names)}, links,
+                  arena=Arena(size=(12.0, 12.0, 3.0)))  # fmt: skip
+    stage = SceneModel.of_plan(Plan(crowd))
+    over, moment = threading.Event(), moments.unknown(stage)
     grid = np.array([[k % 10 - 4.5, k // 10 - 4.5, 0.6 * (k % 2)] for k in range(100)])
     moment.condition[:], moment.yaw[:] = Condition.ACTIVE, 0.0
 
@@ -274,23 +249,23 @@ def test_hundred_robots_are_drawn_at_twenty_frames() -> None:
         while not over.wait(1.0 / 30.0):
             step += 1
             moment.position = grid + 0.2 * np.sin(0.1 * step)
-            moment.goal, moment.error = grid, np.full(len(crowd_stage.links), 0.03)
+            moment.goal, moment.error = grid, np.full(len(stage.links), 0.03)
             ages = 0.1 * (step - 3.0 * np.arange(30))
             moment.trail = grid[:, None] + 0.2 * np.sin(ages)[None, :, None]
             with server.atomic():
                 shown.drawing.draw(moment, trails=step % 6 == 0)
 
     moving = threading.Thread(target=move)
-    moving.start()
-    try:
-        with opened(server.address, 480, 320, drawn=True) as page:
-            page.until(lambda: "/case/robots/crazyflie/body" in page.nodes, "drawn")
-            page.until(lambda: np.all(page.positions("/case/robots/crazyflie/body")[:, 2] > -1.0), "seen")
-            rates = []
-            while len(rates) < 8 and max(rates, default=0.0) < 20.0:
-                rates.append(page.frames_alone())
-            assert max(rates) >= 20.0, rates
-    finally:
-        over.set()
-        moving.join()
-        serving.close()
+    with served(int(free_endpoint(preferred_port=0).rpartition(":")[2]), dark=False) as server, ExitStack() as stack:
+        shown = Page(server, dark=False)
+        shown.begin(stage)
+        moving.start()
+        stack.callback(moving.join)
+        stack.callback(over.set)
+        page = stack.enter_context(opened(server.address, 480, 320, drawn=True))
+        page.until(lambda: "/case/robots/crazyflie/body" in page.nodes, "drawn")
+        page.until(lambda: np.all(page.positions("/case/robots/crazyflie/body")[:, 2] > -1.0), "seen")
+        rates = []
+        while len(rates) < 8 and max(rates, default=0.0) < 20.0:
+            rates.append(page.frames_alone())
+        assert max(rates) >= 20.0, rates

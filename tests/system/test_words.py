@@ -18,12 +18,8 @@ RUN_S = 20.0
 @pytest.mark.mechanism("words")
 def test_robots_agree_on_an_average_in_real_time(tmp_path: Path) -> None:
     """With a fifth of the messages lost, in two processes of three robots."""
-    groups = [
-        part
-        for number in range(1, 7)
-        for part in ("--set", f"robots.KH0{number}.process={'even' if number % 2 == 0 else 'odd'}")
-    ]
-    flight = Flight(tmp_path / "run", "average", "--case", "event-loss", *groups, "--set", "duration_s=9")
+    groups = [f"robots.KH0{number}.process={'odd' if number % 2 else 'even'}" for number in range(1, 7)]
+    flight = Flight(tmp_path / "run", "average", "--case", "event-loss", *groups, "duration_s=9")
     code, _ = flight.finish(120.0)
     assert code == 0, flight.said()
     file = tmp_path / "run" / "event-loss.mcap"
@@ -42,19 +38,15 @@ def test_robots_agree_on_an_average_in_real_time(tmp_path: Path) -> None:
 @pytest.mark.mechanism("words: restart")
 def test_a_restarted_robot_joins_without_drawing_the_others(tmp_path: Path) -> None:
     """Its first words are a step old, not those of its beginning; the others keep to their average meanwhile."""
-    flight = Flight(
-        tmp_path / "run", "average", "--case", "periodic", "--set", 'on_loss="restart"', "--set", f"duration_s={RUN_S}"
-    )
-    flight.until_said("phase conductor: formation")
-    watcher = Watcher(flight.endpoint())
+    words = ("--case", "periodic", 'on_loss="restart"', f"duration_s={RUN_S}")
+    flight = Flight(tmp_path / "run", "average", *words)
+    flight.until_flown()
     agreed = RUN_S / 2.0  # they have agreed by then
-    watcher.until(
-        lambda: watcher.state["KH03"].stamp > watcher.status["KH03"].started + agreed > agreed,
-        "half of the run is over",
-    )
-    flight.children()["KH03"].kill()
-    code, _ = flight.finish(120.0)
-    watcher.close()
+    with Watcher(flight.endpoint()) as watcher:
+        state, status = watcher.state, watcher.status
+        watcher.until(lambda: state["KH03"].stamp > status["KH03"].started + agreed > agreed, "half of it is over")
+        flight.children()["KH03"].kill()
+        code, _ = flight.finish(120.0)
     assert code in (0, 1), flight.said()  # a robot was lost
     file = tmp_path / "run" / "periodic.mcap"
     trace = playback.read(file).trace

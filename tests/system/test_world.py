@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-import signal
 import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +26,7 @@ from tests.system.lab import (
     RobotProcess,
     Watcher,
     WorldProcess,
+    assert_formed,
     gone,
     typed,
     until,
@@ -42,20 +43,10 @@ size = [4.0, 4.0, 2.0]
 [arena.obstacles.post]
 radius = 0.1
 at = [1.5, 1.5]
-[robots.KH01]
-kind = "khepera4"
-body = "world"
-start = [0.0, 0.0]
-[robots.CF01]
-kind = "crazyflie"
-body = "world"
-start = [0.0, 1.0]
-hover = 0.6
-[robots.TE01]
-kind = "tello"
-body = "world"
-start = [-1.0, 1.0]
-hover = 0.6
+[robots]
+KH01 = { kind = "khepera4", body = "world", start = [0.0, 0.0] }
+CF01 = { kind = "crazyflie", body = "world", start = [0.0, 1.0], hover = 0.6 }
+TE01 = { kind = "tello", body = "world", start = [-1.0, 1.0], hover = 0.6 }
 """
 
 
@@ -70,11 +61,11 @@ class Desk(Looking):
     """The world as an operator, and a robot's process, see it."""
 
     def __init__(self, endpoint: str) -> None:
-        self.session = network.open_session([endpoint], name="desk")
-        self._positions = pubsub.subscriber(self.session, KEYS.position("*"), 4096)
-        self._worlds = pubsub.pose_subscriber(self.session, KEYS.world)
-        self._events = pubsub.subscriber(self.session, KEYS.event)
-        self._ranges = pubsub.subscriber(self.session, KEYS.ranges("*"))
+        self.session = session = network.open_session([endpoint], name="desk")
+        self._positions = pubsub.Inbox(pubsub.subscriber(session, KEYS.position("*"), 4096), messages.Position)
+        self._worlds = pubsub.Inbox(pubsub.pose_subscriber(session, KEYS.world), messages.WorldState)
+        self._events = pubsub.Inbox(pubsub.subscriber(session, KEYS.event), messages.Event)
+        self._ranges = pubsub.Inbox(pubsub.subscriber(session, KEYS.ranges("*")), messages.Ranges)
         self.at: dict[str, messages.Position] = {}
         self.ranges: dict[str, messages.Ranges] = {}
         self.events: list[messages.Event] = []
@@ -82,16 +73,11 @@ class Desk(Looking):
         self._seq = round(time.time() * 1e3)
 
     def look(self) -> None:
-        for sample in network.received(self._positions.handler):
-            position = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Position)
-            self.at[position.robot] = position
-        for sample in network.received(self._worlds.handler):
-            self.world = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.WorldState)
-        for sample in network.received(self._events.handler):
-            self.events.append(messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Event))
-        for sample in network.received(self._ranges.handler):
-            ranges = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Ranges)
-            self.ranges[ranges.robot] = ranges
+        self.at |= {position.robot: position for position in self._positions.read()}
+        self.ranges |= {ranges.robot: ranges for ranges in self._ranges.read()}
+        self.events += self._events.read()
+        for world in self._worlds.read():
+            self.world = world
 
     def x(self, name: str) -> list[float]:
         return list(self.at[name].position)
@@ -115,39 +101,29 @@ class Desk(Looking):
 
         self.until(seen, what)
 
-    def close(self) -> None:
-        self.session.close()
-
 
 @pytest.fixture
 def desk(router: RouterProcess) -> Iterator[Desk]:
     made = Desk(router.endpoint)
     yield made
-    made.close()
+    made.session.close()
 
 
 @pytest.fixture
 def world(router: RouterProcess, desk: Desk, file: Path) -> Iterator[WorldProcess]:
-    made = WorldProcess(router.endpoint, file)
-    assert made.ready == (
-        f"world ready: point-mass at 100 Hz carries KH01, CF01, TE01; mirrors none; realm park at {router.endpoint}"
-    )
-    desk.until(lambda: len(desk.at) == 3 and desk.world, "everybody is there")
-    yield made
-    assert made.process.returncode is not None or made.end() == 0
-
-
-# ---------------------------------------------------------------------- a run
+    carries = "world ready: point-mass at 100 Hz carries KH01, CF01, TE01; mirrors none"
+    with WorldProcess(router.endpoint, file) as made:
+        assert made.ready == f"{carries}; realm park at {router.endpoint}"
+        desk.until(lambda: len(desk.at) == 3 and desk.world, "everybody is there")
+        yield made
 
 
 @pytest.mark.timeout(180)
 def test_the_reference_experiment_forms_up_in_one_world(tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    flight = Flight(
-        folder, "robotic-park", "--bodies", "world", "--case", "event", "--json", "--no-report",
-        "--set", "duration_s=12", "--set", "timeline=[]", *NEAR,
-    )  # fmt: skip
-    flight.until_said(r"phase conductor: formation", 60.0)
+    words = ("--bodies", "world", "--case", "event", "--json", "duration_s=12", "timeline=[]")
+    flight = Flight(folder, "robotic-park", *words, *NEAR)
+    flight.until_flown()
     everyone = list(flight.children().values())
     assert "world" in flight.children()
     code, out = flight.finish(90.0)
@@ -158,24 +134,18 @@ def test_the_reference_experiment_forms_up_in_one_world(tmp_path: Path) -> None:
     assert all(robot["acquired_s"] is not None and robot["lost"] == 0 for robot in followers.values()), followers
     trace = playback.read(folder / "event.mcap").trace
     assert np.isfinite(trace.true_position).all(axis=(1, 2)).mean() > 0.98, "the truth is known"
-    last = trace.time > trace.time[-1] - 1.0
-    rows = {name: row for row, name in enumerate(trace.robots)}
-    for text, link in trace.plan.experiment.formation.links.items():
-        one, _, other = text.split()
-        apart = np.linalg.norm(trace.true_position[last, rows[one]] - trace.true_position[last, rows[other]], axis=1)
-        assert np.abs(apart - (link if isinstance(link, float) else link.distance)).mean() < 0.03, text
+    assert_formed(trace, 0.03, since_s=trace.time[-1] - 1.0)
 
 
 @pytest.mark.mechanism("world: killed", "way out: Ctrl-C")
 def test_killed_world_is_restarted_and_robots_continue(tmp_path: Path) -> None:
     """Until Ctrl-C, which lands everybody and leaves a valid recording."""
     folder = tmp_path / "run"
-    flight = Flight(folder, "triangle", "--bodies", "world", "--case", "event", "--no-report", *NEAR_TRIANGLE)
-    flight.until_said(r"phase conductor: formation", 60.0)
+    flight = Flight(folder, "triangle", "--bodies", "world", "--case", "event", *NEAR_TRIANGLE)
+    flight.until_flown()
     everyone = list(flight.children().values())
-    watcher = Watcher(flight.endpoint())
     desk = Desk(flight.endpoint())
-    try:
+    with Watcher(flight.endpoint()) as watcher:
         watcher.until(lambda: len(watcher.state) == 3, "they are there")
         begun = watcher.state["CF01"].stamp
         watcher.until(lambda: watcher.state["CF01"].stamp > begun + 0.5, "they are on their way")
@@ -186,12 +156,9 @@ def test_killed_world_is_restarted_and_robots_continue(tmp_path: Path) -> None:
         assert {state.phase for state in before.values()} == {"running"}
         desk.until(lambda: all(desk.at[name].stamp > again + 0.5 for name in before), "they are in the next world")
         everyone += list(flight.children().values())
-        flight.signal(signal.SIGINT)
-        assert flight.finish()[0] == 130
+        desk.session.close()
+        flight.interrupt()
         assert gone(everyone)
-    finally:
-        watcher.close()
-        desk.close()
     read = playback.read(folder / "event.mcap")
     assert read.complete
     with (folder / "event.mcap").open("rb") as stream:
@@ -208,42 +175,33 @@ def test_killed_world_is_restarted_and_robots_continue(tmp_path: Path) -> None:
     assert not [event for event in trace.events if event.kind == "robot" and "lost" in event.text]
 
 
-def test_climbs_and_landings_continue_in_the_next_world(router: RouterProcess, file: Path) -> None:
-    world = WorldProcess(router.endpoint, file)
-    watcher = Watcher(router.endpoint)
-    robots = RobotProcess(router.endpoint, file, "CF01", "TE01")
+def test_climbs_and_landings_continue_in_the_next_world(router: RouterProcess, watcher: Watcher, file: Path) -> None:
     both = ("CF01", "TE01")
 
     def height(name: str) -> float:
         return watcher.state[name].position[2] if name in watcher.state else 0.0
 
-    def again() -> WorldProcess:
-        world.kill()
-        made = WorldProcess(router.endpoint, file)
-        assert "CF01" in made.ready.rpartition(";")[2], "it asks them where they were"
-        return made
+    with ExitStack() as stack:
+        world = stack.enter_context(WorldProcess(router.endpoint, file))
+        stack.enter_context(RobotProcess(router.endpoint, file, *both))
 
-    try:
-        watcher.until(lambda: all(watcher.phase(name) == "ready" for name in both), "they are ready")
-        for name in both:
-            assert watcher.order(name, messages.Order("takeoff")).ok
+        def again(killed: WorldProcess) -> WorldProcess:
+            killed.kill()
+            made = stack.enter_context(WorldProcess(router.endpoint, file))
+            assert "CF01" in made.ready.rpartition(";")[2], "it asks them where they were"
+            return made
+
+        watcher.until_all("ready", *both)
+        watcher.give(messages.Order("takeoff"), *both)
         watcher.until(lambda: min(map(height, both)) > 0.25, "they climb")
-        world = again()
-        watcher.until(lambda: all(watcher.phase(name) == "airborne" for name in both), "they arrive")
+        world = again(world)
+        watcher.until_all("airborne", *both)
         assert min(map(height, both)) > 0.54
-        for name in both:
-            assert watcher.order(name, messages.Order("land")).ok
+        watcher.give(messages.Order("land"), *both)
         watcher.until(lambda: max(map(height, both)) < 0.4, "they sink")
-        world = again()
-        watcher.until(lambda: all(watcher.phase(name) == "done" for name in both), "they are down")
+        again(world)
+        watcher.until_all("done", *both)
         assert max(map(height, both)) < 0.06
-    finally:
-        robots.end()
-        world.end()
-        watcher.close()
-
-
-# ---------------------------------------------------------------------- orders
 
 
 def test_pause_resume_and_reset(world: WorldProcess, desk: Desk) -> None:
@@ -269,14 +227,9 @@ def test_what_a_world_cannot_use_is_counted(world: WorldProcess, desk: Desk) -> 
     assert [event.text for event in desk.events if "CF09 gets commands" in event.text] == [
         "CF09 gets commands, but is not in this world: start the world with the experiment that has it"
     ]
-    desk.session.put(KEYS.setpoint("KH01"), b"{", encoding=messages.JSON)
-    desk.session.put(
-        KEYS.setpoint("KH01"), messages.encode(messages.Command("KH02", 1, 1.0, "stop")), encoding=messages.JSON
-    )
+    for nonsense in (b"{", messages.encode(messages.Command("KH02", 1, 1.0, "stop"))):
+        desk.session.put(KEYS.setpoint("KH01"), nonsense, encoding=messages.JSON)
     desk.until(lambda: desk.world and desk.world.malformed == 2, "nonsense is counted")
-
-
-# ---------------------------------------------------------------------- robots
 
 
 def test_robots_without_commands_hold_and_then_land(world: WorldProcess, desk: Desk) -> None:
@@ -292,58 +245,48 @@ def test_robots_without_commands_hold_and_then_land(world: WorldProcess, desk: D
     assert {event.source for event in desk.events if event.kind == "silent"} == {"CF01", "TE01"}
 
 
-def test_second_world_and_useless_world_are_refused(world: WorldProcess, router: RouterProcess, file: Path) -> None:
-    second = WorldProcess(router.endpoint, file)
-    assert second.wait() == 2
-    assert second.ready.startswith("zenpark: a world runs in the realm 'park' already: end it first, choose another")
-    none = WorldProcess(router.endpoint, "triangle")
-    assert none.wait() == 2
-    assert "no robot of this experiment lives in a world" in none.ready
-    unknown = WorldProcess(router.endpoint, file, "--engine", "pymonk")
-    assert unknown.wait() == 2
-    assert "did you mean 'pymunk'?" in unknown.ready
+@pytest.mark.usefixtures("world")
+def test_second_world_and_useless_world_are_refused(router: RouterProcess, file: Path) -> None:
+    for arguments, reason in (
+        ((file,), "zenpark: a world runs in the realm 'park' already: end it first, choose another"),
+        (("triangle",), "no robot of this experiment lives in a world"),
+        ((file, "--engine", "pymonk"), "did you mean 'pymunk'?"),
+    ):
+        refused = WorldProcess(router.endpoint, *arguments)
+        assert refused.wait() == 2
+        assert reason in refused.ready
 
 
-def test_world_ordered_to_end_waits_for_robots(world: WorldProcess, router: RouterProcess, file: Path) -> None:
-    watcher = Watcher(router.endpoint)
-    robot = RobotProcess(router.endpoint, file, "CF01", lifeline=False)
-    try:
-        watcher.until(lambda: watcher.phase("CF01") == "ready", "it is ready")
-        assert watcher.order("CF01", messages.Order("takeoff")).ok
-        watcher.until(lambda: watcher.phase("CF01") == "airborne", "it is up")
+def test_world_ordered_to_end_waits_for_robots(
+    world: WorldProcess, router: RouterProcess, watcher: Watcher, file: Path
+) -> None:
+    with RobotProcess(router.endpoint, file, "CF01") as robot:
+        watcher.take_off("CF01")
         world.process.terminate()
         assert robot.end() == 0
         watcher.until(lambda: watcher.phase("CF01") == "done", "it landed in the world that was asked to end")
         assert world.wait(30) == 0
-    finally:
-        watcher.close()
 
 
 def test_a_robot_of_another_process_is_seen(router: RouterProcess, desk: Desk, tmp_path: Path) -> None:
     file = tmp_path / "mixed.toml"
     file.write_text(
-        'title = "mixed"\nduration_s = 30.0\n'
-        "[world]\nsensor_noise = 0.0\n"
-        '[robots.TB01]\nkind = "turtlebot3"\nbody = "world"\nstart = [0.0, 0.0]\n'
-        '[robots.TB02]\nkind = "turtlebot3"\nstart = [1.0, 0.0, 3.141592653589793]\nranges = "world"\n'
+        'title = "mixed"\nduration_s = 30.0\nworld.sensor_noise = 0.0\n[robots]\n'
+        'TB01 = { kind = "turtlebot3", body = "world", start = [0.0, 0.0] }\n'
+        'TB02 = { kind = "turtlebot3", start = [1.0, 0.0, 3.141592653589793], ranges = "world" }\n'
     )
-    world = WorldProcess(router.endpoint, file)
-    assert "carries TB01; mirrors TB02" in world.ready
-    desk.until(lambda: desk.world, "it is there")
-    robot = None
-    try:
-        desk.until(lambda: "TB01" in desk.ranges, "it looks ahead")
-        assert desk.ranges["TB01"].distance[0] == pytest.approx(2.0, abs=1e-3), "the wall"
-        robot = RobotProcess(router.endpoint, file, "TB02")
-        desk.until(lambda: desk.world and desk.world.mirrored == ["TB02"], "the other is there")
-        desk.until(lambda: desk.ranges["TB01"].distance[0] == pytest.approx(1.0 - 0.105, abs=1e-3), "it is seen")
-        desk.until(lambda: desk.ranges["TB02"].distance[0] == pytest.approx(1.0 - 0.105, abs=1e-3), "and sees")
-        robot.kill()
-        robot = None
-        desk.until(lambda: desk.ranges["TB01"].distance[0] == pytest.approx(2.0, abs=1e-3), "gone, it is no obstacle")
-        assert desk.world is not None
+
+    def ahead(robot: str, wanted: float) -> bool:
+        return desk.ranges[robot].distance[0] == pytest.approx(wanted, abs=1e-3)
+
+    with WorldProcess(router.endpoint, file) as world:
+        assert "carries TB01; mirrors TB02" in world.ready
+        desk.until(lambda: "TB01" in desk.ranges and desk.world, "it looks ahead")
+        assert ahead("TB01", 2.0), "the wall"
+        with RobotProcess(router.endpoint, file, "TB02") as robot:
+            desk.until(lambda: desk.world and desk.world.mirrored == ["TB02"], "the other is there")
+            for name in ("TB01", "TB02"):
+                desk.until(lambda name=name: ahead(name, 1.0 - 0.105), "it is seen, and sees")
+            robot.kill()
+        desk.until(lambda: ahead("TB01", 2.0), "gone, it is no obstacle")
         desk.until(lambda: desk.world and desk.world.mirrored == [], "and is said to be")
-    finally:
-        if robot is not None:
-            robot.end()
-        world.end()

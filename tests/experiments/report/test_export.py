@@ -1,6 +1,7 @@
 import csv
 import math
 import re
+import shutil
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,27 +11,23 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from agents.errors import ExplainedError
+from experiments.definition.experiment import Formation, LinkTable
 from experiments.definition.graph import laplacian
-from experiments.file.document import load, loads
 from experiments.metrics.signals import formation_errors
-from experiments.recording.run_folder import SOURCE
 from experiments.report import export
 from experiments.report.export import KEYWORDS, UNITS, matlab_names, structure
-from experiments.run import simulate
+from tests.runs import fly, recorded
+from tests.small import small
 from tools.commands import results as commands
 
 scipy_io = pytest.importorskip("scipy.io")
-
-SHORT = ("duration_s=4.0", "timeline=[]")
 
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory):
     """The folder of a run of the first experiment, 4 s of it, and the run."""
-    folder = tmp_path_factory.mktemp("run")
-    read = load("triangle", *SHORT)
-    read.keep(folder / SOURCE)
-    return folder, simulate(read, folder=folder)
+    run = recorded("triangle", "duration_s=4.0", "timeline=[]")
+    return shutil.copytree(run.folder, tmp_path_factory.mktemp("runs") / "run"), run
 
 
 @pytest.mark.slow
@@ -125,13 +122,9 @@ def test_units_are_of_what_is_there(flown, mat):
 
 
 def test_what_links_ask_for_besides_distances_is_told():
-    read = loads(
-        'title = "Two"\nduration_s = 1.0\n[robots]\n'
-        'KH01 = { kind = "khepera4", start = [-0.5, 0.0] }\nKH02 = { kind = "khepera4", start = [0.5, 0.0] }\n'
-        '[formation]\nlaw = "displacement"\n[formation.links]\n"KH01 > KH02" = { offset = [0.8, 0.1] }\n'
-    )
-    run = simulate(read)
-    made = structure(run.traces["default"], run.metrics["default"])
+    formation = Formation(law="displacement", links={"KH01 > KH02": LinkTable(offset=(0.8, 0.1))})
+    run = fly(small({"KH01": "khepera4", "KH02": "khepera4"}, formation=formation, duration_s=1.0))
+    made = structure(run.trace, run.metrics)
     assert made["links"]["relative"][0, :2].tolist() == [0.8, 0.1]  # KH02 from KH01
     assert (made["links"]["receiver"].tolist(), made["links"]["sender"].tolist()) == ([2.0], [1.0])
     assert made["adjacency"].tolist() == [[0.0, 0.0], [1.0, 0.0]]
@@ -139,8 +132,7 @@ def test_what_links_ask_for_besides_distances_is_told():
 
 def test_table_has_a_line_per_robot_and_time(flown, tmp_path):
     commands.export(str(flown[0]), str(tmp_path / "way.csv"), as_csv=False)
-    with (tmp_path / "way.csv").open(encoding="utf-8", newline="") as stream:
-        rows = list(csv.DictReader(stream))
+    rows = list(csv.DictReader((tmp_path / "way.csv").read_text("utf-8").splitlines()))
     assert len(rows) == 2 * 201 * 3
     trace = flown[1].traces["event"]
     last = rows[-1]
@@ -170,13 +162,14 @@ def test_names_that_are_valid_stay():
 
 def test_what_cannot_be_exported_is_explained(flown, tmp_path):
     folder, run = flown
-    with pytest.raises(ExplainedError, match=r"run\.txt: is no name"):
-        commands.export(str(folder), str(tmp_path / "run.txt"), as_csv=False)
-    with pytest.raises(ExplainedError, match=r"end with \.mat, \.csv"):
-        commands.export(str(folder), str(tmp_path / "run.mat"), as_csv=True)
-    for name in ("run.mat", "run.csv"):
-        with pytest.raises(ExplainedError, match="cannot be written: No such file or directory"):
-            commands.export(str(folder), str(tmp_path / "nowhere" / name), as_csv=False)
+    for name, as_csv, reason in (
+        ("run.txt", False, r"run\.txt: is no name"),
+        ("run.mat", True, r"end with \.mat, \.csv"),
+        ("nowhere/run.mat", False, "cannot be written: No such file or directory"),
+        ("nowhere/run.csv", False, "cannot be written: No such file or directory"),
+    ):
+        with pytest.raises(ExplainedError, match=reason):
+            commands.export(str(folder), str(tmp_path / name), as_csv=as_csv)
     with pytest.raises(ExplainedError, match=r"periodic has 0\.0 GB"):
         export.write_mat(run.traces, run.metrics, tmp_path / "run.mat", most_bytes=1000)
 

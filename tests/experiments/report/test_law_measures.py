@@ -54,17 +54,19 @@ def test_figures_show_measures_and_no_errors(traces, measured):
     assert len(drawn["robot_bars"].axes) == 1  # of f alone
 
 
+def rows_of(file):
+    return list(csv.DictReader(file.read_text().splitlines()))
+
+
 def test_files_have_columns_of_the_law(tmp_path, traces, measured):
     export.write_csv(traces, tmp_path / "trajectories.csv")
-    with (tmp_path / "trajectories.csv").open() as file:
-        rows = [row for row in csv.DictReader(file) if row["case"] == "event"]
+    rows = [row for row in rows_of(tmp_path / "trajectories.csv") if row["case"] == "event"]
     known = traces["event"]
     assert float(rows[-1]["memory_x"]) == known.memory["x"][-1, -1, 0]
     assert float(rows[-1]["measure_disagreement"]) == known.measures["disagreement"][-1, -1]
     assert rows[-1]["error"] == ""
     metrics_files.write_csv(tmp_path / "metrics.csv", measured)
-    with (tmp_path / "metrics.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(tmp_path / "metrics.csv")
     assert float(rows[0]["measure_disagreement_end"]) == measured[0].robots[0].measures["disagreement"].end
     means = [row for row in rows if row["robot"] == "mean"]
     assert float(means[1]["measure_disagreement_mean"]) == measured[1].measures["disagreement"].mean

@@ -8,9 +8,8 @@ import re
 import numpy as np
 import pytest
 
-from experiments.file.document import load
 from experiments.report import replay, trajectories
-from experiments.run import simulate
+from tests.runs import flown
 from tests.system.browser import CHROMIUM, needs_chromium
 
 pytestmark = pytest.mark.slow  # whole runs, drawn
@@ -20,8 +19,7 @@ CASES = ["periodic", "event"]
 
 @pytest.fixture(scope="module")
 def traces():
-    run = simulate(load("robotic-park", "duration_s=3.0", "timeline=[]"), cases=CASES)
-    return [run.traces[case] for case in CASES]
+    return [flown("robotic-park", case, "duration_s=3.0", "timeline=[]").trace for case in CASES]
 
 
 def film_of(page):

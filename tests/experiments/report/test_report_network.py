@@ -1,21 +1,18 @@
 """What a report says of a modelled network: how much it dropped, how long the rest took, link by link."""
 
-import msgspec
 import numpy as np
 import pytest
 
 from experiments.definition.experiment import ChannelTable, LinkChannelTable
-from experiments.definition.plan import Plan
-from experiments.file.document import load
 from experiments.metrics.measure import measure
 from experiments.recording import playback
 from experiments.report import report
 from experiments.report.page import number
 from experiments.report.tables import network_tables, proof_tables, whole_tables
 from experiments.report.verdict import findings
-from experiments.virtual_time.log import RunRecorder
-from experiments.virtual_time.simulation import simulate
 from tests.experiments.traces import pair
+from tests.runs import fly
+from tests.small import changed, reference
 
 pytestmark = pytest.mark.slow  # runs and reports, whole
 
@@ -24,13 +21,11 @@ BAD = ChannelTable(delay_s=0.05, loss=0.2, links={"TB01 > KH01": LinkChannelTabl
 
 @pytest.fixture(scope="module")
 def run():
-    park = load("robotic-park").cases()["periodic"].experiment
-    park = msgspec.structs.replace(park, duration_s=4.0, timeline=[], channel=BAD)
-    return RunRecorder(simulate(Plan(park), 1), Plan(park), "bad")
+    return fly(changed(reference("periodic"), duration_s=4.0, timeline=[], channel=BAD), case="bad")
 
 
 def test_dropped_differs_from_lost(run):
-    measured = measure(run.trace())
+    measured = run.metrics
     assert measured.modelled
     assert measured.lost == 0
     links = {(each.sender, each.receiver): each for each in measured.link_deliveries}
@@ -50,7 +45,7 @@ def test_dropped_differs_from_lost(run):
 
 
 def test_verdict_and_tables_have_dropped_poses(run):
-    measured = measure(run.trace())
+    measured = run.metrics
     said = [each.text for each in findings([measured])]
     assert any(text.startswith("No pose was lost") for text in said)
     (text,) = [text for text in said if text.startswith("The modelled network dropped")]
@@ -66,7 +61,7 @@ def test_verdict_and_tables_have_dropped_poses(run):
 
 
 def test_report_has_network_section(tmp_path, run):
-    text = report.write(tmp_path, [run.trace()]).read_text(encoding="utf-8")
+    text = report.write(tmp_path, [run.trace]).read_text(encoding="utf-8")
     assert "Network model" in text
     assert "TB01 &gt; KH01" in text
 
@@ -81,8 +76,8 @@ def test_plain_network_has_no_section():
 
 
 def test_recording_keeps_dropped_poses(tmp_path, run):
-    run.record(tmp_path / "bad.mcap", "")
-    read, trace = playback.read(tmp_path / "bad.mcap").trace, run.trace()
+    run.recorder.record(tmp_path / "bad.mcap", "")
+    read, trace = playback.read(tmp_path / "bad.mcap").trace, run.trace
     assert trace.dropped.sum() > 500
     np.testing.assert_array_equal(read.dropped, trace.dropped)
     np.testing.assert_array_equal(read.lost, 0)
