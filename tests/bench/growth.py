@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 
 from tests.bench.drivers.peer_zenpark import DURATION_S
+from tests.bench.measuring import markdown
 from tests.bench.peers import COMPILED_WHEELS, WHEELS, Driver
 
 # simulated time [s] by number of robots: a compiled flight of seven takes milliseconds for ten seconds
@@ -39,13 +40,11 @@ def report(sizes: Sequence[int] = tuple(DURATIONS), rounds: int = ROUNDS, settin
     for name in settings:
         headings += [f"{name.split()[-1]}: µs per agent-step", "ratio to 7 robots"]
     headings += [heading for heading, _ in COLUMNS.values()]
-    lines = [f"| {' | '.join(headings)} |", f"|{'---|' * len(headings)}"]
-    lines += [line(robots, rounds, settings) for robots in sizes]
-    return "\n".join(lines)
+    return markdown([headings, *(line(robots, rounds, settings) for robots in sizes)])
 
 
-def line(robots: int, rounds: int, settings: Sequence[str]) -> str:
-    """The line of a number of robots."""
+def line(robots: int, rounds: int, settings: Sequence[str]) -> list[str]:
+    """Cells of the line of a number of robots."""
     simulated_s, complete = DURATIONS.get(robots, DURATION_S), robots <= COMPLETE
     found: dict[str, list[dict[str, float]]] = {name: [] for name in settings}
     ratios: dict[str, list[float]] = {name: [] for name in settings}
@@ -70,7 +69,7 @@ def line(robots: int, rounds: int, settings: Sequence[str]) -> str:
     for figure, (_, form) in COLUMNS.items():
         values = [each[figure] for each in found[settings[-1]] if figure in each]
         cells.append(f"{statistics.median(values):{form}}" if values else "")
-    return f"| {' | '.join(cells)} |"
+    return cells
 
 
 def main() -> int:

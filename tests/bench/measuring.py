@@ -7,7 +7,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -75,6 +75,12 @@ def virtual() -> Iterator[Figure]:
         yield Figure("virtual", f"{case}, {span:g} s, recorded", taken, "s CPU", span / taken, "× real time")
     taken = cpu(partial(simulate_seeds, read, range(SEEDS), cases=["event"]), 1)
     yield Figure("virtual", f"event, {SEEDS} seeds side by side", taken, "s CPU", SEEDS * span / taken, "× real time")
+
+
+def markdown(rows: Sequence[Sequence[str]]) -> str:
+    """Pipe table of rows, the head first."""
+    head, *others = (f"| {' | '.join(row)} |" for row in rows)
+    return "\n".join([head, f"|{'---|' * len(rows[0])}", *others])
 
 
 def unit_of_work() -> None:

@@ -27,6 +27,7 @@ from typing import Any
 from agents.user_folder import cache_folder
 from experiments.file import document
 from tests.bench.drivers import peer_zenpark, ring
+from tests.bench.measuring import markdown
 from tests.bench.process import FLIGHT_S, process
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -164,15 +165,8 @@ class Driver:
         self.errors = tempfile.TemporaryFile(  # noqa: SIM115 - closed by `close`
             "w+", encoding="utf-8", errors="replace"
         )
-        self.process = subprocess.Popen(
-            command,
-            cwd=ROOT,
-            env=environment(),
-            text=True,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=self.errors,
-        )
+        streams = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": self.errors}
+        self.process = subprocess.Popen(command, cwd=ROOT, env=environment(), text=True, **streams)
         self.about = self._line()
 
     def measure(self) -> dict[str, Any]:
@@ -270,28 +264,21 @@ def title(name: str) -> str:
 
 def table(rows: Sequence[Row]) -> str:
     """Markdown."""
-    lines = ["| robots | simulator | step [ms] | agent-steps per CPU second | ratio |", "|---|---|---|---|---|"]
+    lines = [["robots", "simulator", "step [ms]", "agent-steps per CPU second", "ratio"]]
     for row in rows:
         ratios = [f"{ratio:.2g} × {other}" for other, ratio in row.ratios.items() if other != row.name]
         speed = f"{float(f'{row.speed:.2g}'):,.0f}"
-        cells = [
-            f"{row.robots:,}",
-            f"{title(row.name)} {row.version}".strip(),
-            f"{1e3 * row.step_s:g}",
-            speed,
-            ", ".join(ratios),
-        ]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+        name = f"{title(row.name)} {row.version}".strip()
+        lines.append([f"{row.robots:,}", name, f"{1e3 * row.step_s:g}", speed, ", ".join(ratios)])
+    return markdown(lines)
 
 
 def limits(names: Sequence[str]) -> str:
     """Markdown: bodies and limits of simulators; nothing without any."""
     if not names:
         return ""
-    lines = ["| simulator | bodies | what limits it |", "|---|---|---|"]
-    lines += [f"| {title(name)} | {PEERS[name].bodies} | {PEERS[name].limit} |" for name in names]
-    return "\n".join(lines)
+    rows = [[title(name), PEERS[name].bodies, PEERS[name].limit] for name in names]
+    return markdown([["simulator", "bodies", "what limits it"], *rows])
 
 
 def main() -> int:
