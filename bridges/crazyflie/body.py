@@ -30,16 +30,18 @@ from bridges.crazyflie.telemetry import BEARING, ELEVATION, Telemetry
 STALE_S: Final = 0.5  # the note reports poses older than this
 POLL_S: Final = 0.01
 WINDOW_S: Final = 0.25  # in which the exchanges of a radio are counted
-MEASURING_S: Final = (
-    8.0  # [s] a radio that carries too little in each window of this time is refused; others may still start
-)
+MEASURING_S: Final = 8.0  # time in which a radio is measured: others may still start on it
 
 
 class CrazyflieBody(Body):
-    """Crazyflies. Raises BodyError for an invalid address or setting."""
+    """Crazyflies. Raises BodyError for an invalid address or setting.
 
-    def __init__(self, request: BodyRequest) -> None:
-        self._names = request.names
+    Args:
+        measuring_s: A radio that carries too little in each window of this time is refused [s].
+    """
+
+    def __init__(self, request: BodyRequest, measuring_s: float = MEASURING_S) -> None:
+        self._names, self._measuring_s = request.names, measuring_s
         for name, kind in zip(request.names, request.kinds, strict=True):
             if kind.name != "crazyflie":
                 raise BodyError(f"{name} is a {kind.name}: this body flies Crazyflies")
@@ -106,7 +108,7 @@ class CrazyflieBody(Body):
         """Measure what a radio carries while its drones log; returns why it is too little, or an empty text."""
         settings = [self._settings[row] for row in rows]
         refusal, best = "", 0.0
-        end = time.monotonic() + MEASURING_S
+        end = time.monotonic() + self._measuring_s
         while time.monotonic() < end:
             before, begin = self.exchanges(rows), time.monotonic()
             time.sleep(WINDOW_S)
@@ -186,10 +188,10 @@ class CrazyflieBody(Body):
             capacity_hz=self._capacity.get(self._dongles[row]),
         )
 
-    def close(self) -> None:
-        """See `Body.close`. Drones in the air are landed first."""
+    def close(self, *, land: bool = True) -> None:
+        """See `Body.close`. Drones in the air are landed first, unless they are to be left as they are."""
         for pilot in self.pilots:
-            pilot.close()
+            pilot.close(land=land)
         for pilot in self.pilots:
             pilot.join()
         self._claims.release()

@@ -96,7 +96,7 @@ def _tables() -> Any:  # noqa: ANN401 - cflib's
     from cflib.crazyflie.toccache import TocCache  # noqa: PLC0415
 
     class Tables(TocCache):  # type: ignore[misc]
-        known: ClassVar[dict[int, Any]] = _KNOWN_TABLES
+        known: ClassVar[dict[int, Any]] = KNOWN_TABLES
 
         def fetch(self, crc: int) -> Any:  # noqa: ANN401
             if crc not in self.known and (table := super().fetch(crc)):
@@ -110,7 +110,7 @@ def _tables() -> Any:  # noqa: ANN401 - cflib's
     return Tables(rw_cache=str(cache()))
 
 
-_KNOWN_TABLES: dict[int, Any] = {}
+KNOWN_TABLES: dict[int, Any] = {}
 
 
 def _plain(table: Any) -> Any:  # noqa: ANN401 - cflib's

@@ -142,9 +142,9 @@ class CrazyfliePilot:
         """Version of the firmware; None before the drone has said it."""
         return None if self.link is None else self.link.firmware
 
-    def close(self) -> None:
-        """Land the drone if it flies, then end the thread."""
-        self._end_by = time.monotonic() + max(LANDING_S, self._flight.landing_s)
+    def close(self, *, land: bool = True) -> None:
+        """Land the drone if it flies, unless it is to be left as it is, then end the thread."""
+        self._end_by = time.monotonic() + (max(LANDING_S, self._flight.landing_s) if land else 0.0)
         self._ending.set()
         self._wake.set()
 

@@ -7,7 +7,6 @@ replaced by what it does: it polls its drones in turn, and has room for one pack
 import math
 import random
 import threading
-import types
 from collections import deque
 
 import numpy as np
@@ -22,7 +21,9 @@ from bridges.crazyflie.link import BUSY_S
 from bridges.crazyflie.pilot import LOGS_S, LOOP_HZ
 from bridges.crazyflie.telemetry import Telemetry
 from tests.requests import request
+from tests.waiting import ManualClock
 from twins.devices.crazyflie.device import CrazyflieTwin
+from twins.devices.crazyflie.supervisor import SupervisorState
 from twins.devices.crazyflie.tables import LOG_CODES, PACKINGS
 from twins.devices.device import DeviceRequest, Faults
 
@@ -82,12 +83,13 @@ class Drone:
         self.flight = FlightControl(
             fleet.settings, self.telemetry, lambda seconds: self.thread.pause(fleet.now + seconds)
         )
-        self.trajectories = trajectory.TrajectoryMemory(self._send_at_once)
+        self.transmit = self._send_at_once
+        self.trajectories = trajectory.TrajectoryMemory(lambda *packet: self.transmit(*packet))  # noqa: PLW0108
         self.trajectories.memory = fleet.twin.drones[row].memories.kinds.index(crtp.MemoryKind.TRAJECTORY)
         self.trajectories.define()
         self.telemetry.start_logging(self, log_hz=fleet.settings.log_hz, ranges_hz=None)
         fleet.twin.lines[row].queue.clear()  # answers
-        self.trajectories._send = self._send
+        self.transmit = self._send
         self.flight.link = self
         self.error, self._received, self._gap = None, fleet.now, 0.0
         self.cf = self.commander = self.high_level_commander = self
@@ -150,7 +152,7 @@ class Drone:
     def _control(self):
         """Loop of the pilot's thread."""
         fleet = self._fleet
-        ticks = Ticks(max(fleet.settings.stream_hz, LOOP_HZ), clock=lambda: fleet.now)
+        ticks = Ticks(max(fleet.settings.stream_hz, LOOP_HZ), clock=fleet.monotonic)
         while True:
             if fleet.now >= ticks.zero + ticks.next:
                 ticks.begin()
@@ -164,13 +166,19 @@ class Drone:
             self.thread.pause(ticks.zero + ticks.next)
 
 
-class Fleet:
+def clocked(monkeypatch, clock):
+    """Let flight control, telemetry and trajectories take their time from a clock."""
+    for module in (flight, telemetry, trajectory):
+        monkeypatch.setattr(module, "time", clock)
+
+
+class Fleet(ManualClock):
     """Crazyflies on a radio with `hz` exchanges per second; closed at the end of a `with` statement."""
 
     def __init__(self, monkeypatch, rows, hz, **device):
-        self.hz, self.now, self.random = hz, 100.0, random.Random(rows)
-        for module in (flight, telemetry, trajectory):
-            monkeypatch.setattr(module, "time", types.SimpleNamespace(monotonic=lambda: self.now))
+        super().__init__(100.0)
+        self.hz, self.random = hz, random.Random(rows)
+        clocked(monkeypatch, self)
         asked = request("crazyflie", ["crazyflie-twin"] * rows, device={"link": "radio"} | device)
         self.settings = chosen("", device, external=False)
         self.twin = CrazyflieTwin(DeviceRequest(body=asked, faults=Faults()))
@@ -234,6 +242,22 @@ class Fleet:
     @property
     def troubles(self):
         return {drone.flight.trouble for drone in self.drones} - {""}
+
+    @property
+    def supervised(self):
+        """State of the first drone's supervisor."""
+        return SupervisorState(self.twin.flock.supervisor.state[0])
+
+    def landed(self):
+        """Fly on until the motors of the first drone are off: whether it was on the floor then, and never fast."""
+        while self.twin.flock.quadrotor.flying[0]:
+            self.run(0.02)
+        return self.heights[0] < 0.02 and self.soft
+
+    @property
+    def soft(self):
+        """Whether no descent was a fall."""
+        return self.fastest < 0.55 and self.touch < 0.4
 
     def _advance(self, speed):
         """Step of the twins; then the robots' loop reads and commands."""

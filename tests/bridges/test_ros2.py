@@ -4,11 +4,8 @@ import math
 import re
 import signal
 import struct
-import subprocess
-import sys
 import threading
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,10 +23,12 @@ from agents.network.pubsub import alive_token, pose_publisher, publisher
 from agents.network.session import open_session, received
 from agents.protocols import ros2
 from bridges.ros2 import GoalHeight, main, ros_name, scan, transform
+from tests.commands import started
+from tests.waiting import until
 from twins.sensing.range_sensors import fan, sensors
 
-ROOT = Path(__file__).resolve().parents[2]
 JSON = "application/json"
+TYPES = ros2.types("jazzy")
 
 HASHES = {
     "std_msgs/msg/String": "df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18",
@@ -50,52 +49,45 @@ HASHES = {
 def test_hashes_are_the_published_ones(distro):
     types = ros2.types(distro)
     assert {kind: types.hash(kind) for kind in HASHES} == {kind: f"RIHS01_{code}" for kind, code in HASHES.items()}
-
-
-def test_humble_has_no_hashes():
     assert ros2.types("humble").hash(ros2.TWIST) == "TypeHashNotSupported"
 
 
+def stamped_twist(types, *numbers, stamp=12.5, frame=""):
+    twist = types.twist(numbers[:3], numbers[3:])
+    return types.make(ros2.TWIST_STAMPED, header=types.header(stamp, frame), twist=twist)
+
+
 def test_cdr_matches_its_encapsulation_byte_by_byte():
-    types = ros2.types("jazzy")
-    twist = types.encode(types.twist((0.22, 0.0, 0.0), (0.0, 0.0, -2.84)), ros2.TWIST)
+    twist = TYPES.encode(TYPES.twist((0.22, 0.0, 0.0), (0.0, 0.0, -2.84)), ros2.TWIST)
     assert twist == b"\0\1\0\0" + struct.pack("<6d", 0.22, 0.0, 0.0, 0.0, 0.0, -2.84)
-    stamped = types.make(
-        ros2.TWIST_STAMPED,
-        header=types.header(1700000000.25, "map"),
-        twist=types.twist((1.0, 2.0, 3.0), (4.0, 5.0, 6.0)),
-    )
+    stamped = stamped_twist(TYPES, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, stamp=1700000000.25, frame="map")
     head = struct.pack("<iI", 1700000000, 250000000) + struct.pack("<I", 4) + b"map\0"
-    assert types.encode(stamped, ros2.TWIST_STAMPED) == b"\0\1\0\0" + head + struct.pack("<6d", 1, 2, 3, 4, 5, 6)
+    assert TYPES.encode(stamped, ros2.TWIST_STAMPED) == b"\0\1\0\0" + head + struct.pack("<6d", 1, 2, 3, 4, 5, 6)
 
 
 @pytest.mark.parametrize("distro", ["humble", "jazzy"])
-@pytest.mark.parametrize("kind", [ros2.TWIST, ros2.TWIST_STAMPED, ros2.POSE_STAMPED])
-def test_cdr_is_identical_to_rosbags(distro, kind):
+def test_cdr_is_identical_to_rosbags(distro):
     types, store = ros2.types(distro), get_typestore(Stores[f"ROS2_{distro.upper()}"])
-    if kind == ros2.POSE_STAMPED:
-        point = types.make("geometry_msgs/msg/Point", x=1.0, y=-2.0, z=0.5)
-        turn = types.make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.6, w=0.8)
-        pose = types.make("geometry_msgs/msg/Pose", position=point, orientation=turn)
-        message = types.make(kind, header=types.header(12.5, "odom"), pose=pose)
-    else:
-        message = types.twist((0.1, 0.2, 0.3), (0.4, 0.5, 0.6))
-        if kind == ros2.TWIST_STAMPED:
-            message = types.make(kind, header=types.header(12.5, ""), twist=message)
-    raw = types.encode(message, kind)
-    assert raw == bytes(store.serialize_cdr(store.deserialize_cdr(raw, kind), kind))
-    assert len(raw) == {ros2.TWIST: 52, ros2.TWIST_STAMPED: 68, ros2.POSE_STAMPED: 84}[kind]
+    numbers = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
+    pose = types.make(ros2.POSE_STAMPED, header=types.header(12.5, "odom"), pose=types.pose(1.0, -2.0, 0.5, 1.2))
+    for kind, message, size in (
+        (ros2.TWIST, types.twist(numbers[:3], numbers[3:]), 52),
+        (ros2.TWIST_STAMPED, stamped_twist(types, *numbers), 68),
+        (ros2.POSE_STAMPED, pose, 84),
+    ):
+        raw = types.encode(message, kind)
+        assert raw == bytes(store.serialize_cdr(store.deserialize_cdr(raw, kind), kind))
+        assert len(raw) == size
 
 
 def test_transforms_match_tf_bytes_and_are_read_back():
-    types = ros2.types("jazzy")
     state = messages.State("tb3-0", 1, 12.5, "running", (1.0, -2.0, 0.5), None, math.pi, None, None, 0.0)
-    made = transform(types, state, (1.0, -2.0, 0.5), "tb3_0")
-    raw = types.encode(types.make(ros2.TF_MESSAGE, transforms=[made]), ros2.TF_MESSAGE)
+    made = transform(TYPES, state, (1.0, -2.0, 0.5), "tb3_0")
+    raw = TYPES.encode(TYPES.make(ros2.TF_MESSAGE, transforms=[made]), ros2.TF_MESSAGE)
     head = struct.pack("<IiI", 1, 12, 500000000) + struct.pack("<I", 4) + b"map\0" + struct.pack("<I", 6) + b"tb3_0\0"
     numbers = struct.pack("<7d", 1.0, -2.0, 0.5, 0.0, 0.0, 1.0, math.cos(math.pi / 2))
     assert raw == b"\0\1\0\0" + head + b"\0\0" + numbers
-    (back,) = types.decode(raw, ros2.TF_MESSAGE).transforms
+    (back,) = TYPES.decode(raw, ros2.TF_MESSAGE).transforms
     assert (back.header.frame_id, back.child_frame_id, back.transform) == ("map", "tb3_0", made.transform)
     assert (ros2.TRANSFORMS, ros2.yaw_of(back.transform.rotation)) == ("::,100:,:,:,,", pytest.approx(math.pi))
 
@@ -117,10 +109,10 @@ NAN, INF = math.nan, math.inf
     ],
 )  # fmt: skip
 def test_range_readings_are_a_scan_of_equal_steps(bearing, up, distance, grid, places):
-    types, up = ros2.types("jazzy"), [*[0.0] * (len(bearing) - 1), up]
+    up = [*[0.0] * (len(bearing) - 1), up]
     angles = np.radians([bearing, up]).round(6).tolist()  # as they are sent
-    made = scan(types, messages.Ranges("CF01", 12.5, *angles, distance), "CF01")
-    back = types.decode(types.encode(made, ros2.LASER_SCAN), ros2.LASER_SCAN)
+    made = scan(TYPES, messages.Ranges("CF01", 12.5, *angles, distance), "CF01")
+    back = TYPES.decode(TYPES.encode(made, ros2.LASER_SCAN), ros2.LASER_SCAN)
     assert (back.header.frame_id, back.header.stamp.sec) == ("CF01", 12)
     assert np.degrees([back.angle_min, back.angle_increment]) == pytest.approx(grid, abs=1e-3)
     assert back.angle_max == pytest.approx(back.angle_min + back.angle_increment * (len(places) - 1), abs=1e-5)
@@ -133,7 +125,7 @@ def test_each_sensor_becomes_a_scan_that_loses_nothing(name):
     flat = np.abs(sensor.elevation) < 0.01
     distance = (0.5 + 0.01 * np.arange(len(flat))).tolist()
     ranges = messages.Ranges("R", 12.5, sensor.bearing.round(6).tolist(), sensor.elevation.round(6).tolist(), distance)
-    made = scan(ros2.types("jazzy"), ranges, "R")
+    made = scan(TYPES, ranges, "R")
     there = np.isfinite(made.ranges)
     assert sorted(made.ranges[there].tolist()) == pytest.approx(np.array(distance)[flat].tolist(), abs=1e-6)
     angles = made.angle_min + made.angle_increment * np.flatnonzero(there)
@@ -143,26 +135,23 @@ def test_each_sensor_becomes_a_scan_that_loses_nothing(name):
 
 
 def test_rays_to_the_ceiling_are_no_scan():
-    assert scan(ros2.types("jazzy"), messages.Ranges("R", 1.0, [0.0], [1.570796], [2.0]), "R") is None
+    assert scan(TYPES, messages.Ranges("R", 1.0, [0.0], [1.570796], [2.0]), "R") is None
 
 
 @given(st.binary(max_size=120), st.sampled_from([ros2.TWIST, ros2.TWIST_STAMPED, ros2.ODOMETRY, ros2.LASER_SCAN]))
 def test_bytes_that_are_no_message_are_refused(raw, kind):
-    types = ros2.types("jazzy")
     try:
-        types.decode(b"\0\1\0\0" + raw, kind)
+        TYPES.decode(b"\0\1\0\0" + raw, kind)
     except ros2.UnknownMessage as error:
         assert kind in str(error)  # noqa: PT017 - most bytes are refused, a few are a message
 
 
 def test_twist_and_stamped_twist_are_told_apart():
-    types = ros2.types("jazzy")
-    twist = types.twist((0.1, 0.0, 0.0), (0.0, 0.0, 0.0))
-    stamped = types.make(ros2.TWIST_STAMPED, header=types.header(1.0, "base_link"), twist=twist)
+    twist, stamped = TYPES.twist((0.1, 0.0, 0.0), (0.0, 0.0, 0.0)), stamped_twist(TYPES, *[0.1] * 6, frame="base_link")
     with pytest.raises(ros2.UnknownMessage, match="TwistStamped"):
-        types.decode(types.encode(twist, ros2.TWIST), ros2.TWIST_STAMPED)
+        TYPES.decode(TYPES.encode(twist, ros2.TWIST), ros2.TWIST_STAMPED)
     with pytest.raises(ros2.UnknownMessage, match="Twist"):
-        types.decode(types.encode(stamped, ros2.TWIST_STAMPED), ros2.TWIST)
+        TYPES.decode(TYPES.encode(stamped, ros2.TWIST_STAMPED), ros2.TWIST)
 
 
 def test_attachment_is_that_of_zenoh_ext():
@@ -182,9 +171,8 @@ def test_gid_is_xxh3_of_token_low_half_first():
 
 
 def test_keys_of_both_styles():
-    types = ros2.types("jazzy")
-    plain = ros2.topic_key("ros2dds", "/tb3_0/cmd_vel", ros2.TWIST, domain=0, types=types)
-    rmw = ros2.topic_key("rmw", "/tb3_0/cmd_vel", ros2.TWIST, domain=30, types=types)
+    plain = ros2.topic_key("ros2dds", "/tb3_0/cmd_vel", ros2.TWIST, domain=0, types=TYPES)
+    rmw = ros2.topic_key("rmw", "/tb3_0/cmd_vel", ros2.TWIST, domain=30, types=TYPES)
     assert plain == "tb3_0/cmd_vel"
     assert rmw == f"30/tb3_0/cmd_vel/geometry_msgs::msg::dds_::Twist_/RIHS01_{HASHES[ros2.TWIST]}"
     assert ros2.absolute("", "cmd_vel") == "/cmd_vel"
@@ -195,7 +183,7 @@ def test_tokens_are_those_of_rmw_zenoh():
     zid = "aac3178e146ba6f1fc6e6a4085e77f21"
     assert ros2.node_token(2, zid, 0, "", "listener") == f"@ros2_lv/2/{zid}/0/0/NN/%/%/listener"
     assert ros2.node_token(0, zid, 3, "a/b", "n") == f"@ros2_lv/0/{zid}/3/3/NN/%/%a%b/n"
-    rest = ros2.endpoint_topic("/chatter", "std_msgs/msg/String", ros2.qos(depth=7), ros2.types("jazzy"))
+    rest = ros2.endpoint_topic("/chatter", "std_msgs/msg/String", ros2.qos(depth=7), TYPES)
     token = ros2.endpoint_token(2, zid, 0, 10, "MP", "", "talker", rest)
     assert token == (
         f"@ros2_lv/2/{zid}/0/10/MP/%/%/talker/%chatter/std_msgs::msg::dds_::String_/"
@@ -238,19 +226,19 @@ def test_wrong_command_lines_end_without_a_traceback(capsys):
 class RosNode:
     """Plain zenoh and rosbags: keys, tokens and attachments are spelled here once more, by hand."""
 
-    def __init__(self, session, domain=0):
-        self.session, self.domain = session, domain
-        self.store = get_typestore(Stores.ROS2_JAZZY)
-        self.tokens = {}
-        self.watch = session.liveliness().declare_subscriber(f"@ros2_lv/{domain}/**", RingChannel(256), history=True)
+    def __init__(self, session):
+        self.session, self.store, self.tokens = session, get_typestore(Stores.ROS2_JAZZY), set()
+        self.watch = session.liveliness().declare_subscriber("@ros2_lv/7/**", RingChannel(256), history=True)
+
+    def key(self, topic, kind):
+        package, _, name = kind.split("/")
+        return f"7/{topic}/{package}::msg::dds_::{name}_/{f'RIHS01_{HASHES[kind]}' if kind in HASHES else '*'}"
 
     def subscribe(self, topic, kind):
-        package, _, name = kind.split("/")
-        code = f"RIHS01_{HASHES[kind]}" if kind in HASHES else "*"
-        key = f"{self.domain}/{topic}/{package}::msg::dds_::{name}_/{code}"
-        return self.session.declare_subscriber(key, RingChannel(64)), kind
+        return self.session.declare_subscriber(self.key(topic, kind), RingChannel(64)), kind
 
     def take(self, subscription):
+        """Messages that have come, with sequence numbers and senders."""
         subscriber, kind = subscription
         found = []
         while (sample := subscriber.try_recv()) is not None:
@@ -260,13 +248,17 @@ class RosNode:
             found.append((self.store.deserialize_cdr(sample.payload.to_bytes(), kind), sequence, gid))
         return found
 
+    def taken(self, subscription, feed=lambda: None, least=1):
+        """As `take`, with patience: `feed` is called again and again."""
+        found = []
+        until(lambda: feed() or found.extend(self.take(subscription)) or len(found) >= least)
+        return found
+
     def graph(self):
         while (sample := self.watch.try_recv()) is not None:
-            if sample.kind == zenoh.SampleKind.PUT:
-                self.tokens[str(sample.key_expr)] = True
-            else:
-                self.tokens.pop(str(sample.key_expr), None)
-        return set(self.tokens)
+            change = self.tokens.add if sample.kind == zenoh.SampleKind.PUT else self.tokens.discard
+            change(str(sample.key_expr))
+        return self.tokens
 
     def topics(self):
         """Role, topic and type of every endpoint, as `ros2 topic list -t` would show them."""
@@ -281,148 +273,124 @@ class Realm:
         self.session, self.keys, self.tokens, self.out = session, Keys("park"), {}, {}
 
     def enter(self, name):
-        self.out[name] = (
-            publisher(self.session, self.keys.state(name), JSON),
-            pose_publisher(self.session, self.keys.status(name), JSON),
-            publisher(self.session, self.keys.ranges(name), JSON),
-        )
+        self.out[name] = {
+            "state": publisher(self.session, self.keys.state(name), JSON),
+            "status": pose_publisher(self.session, self.keys.status(name), JSON),
+            "ranges": publisher(self.session, self.keys.ranges(name), JSON),
+        }
         self.tokens[name] = alive_token(self.session, self.keys.alive(name))
 
     def leave(self, name):
         self.tokens.pop(name).undeclare()
 
-    def state(self, name, position, velocity, yaw):
+    def state(self, name, position=(0.0, 0.0, 0.5), velocity=(0.0, 0.0, 0.0), yaw=0.0):
         state = messages.State(name, 1, 1700000000.5, "running", position, velocity, yaw, None, None, 0.0)
-        self.out[name][0].put(messages.encode(state))
+        self.out[name]["state"].put(messages.encode(state))
 
     def ranges(self, name):
-        quarter = round(math.pi / 2, 6)
-        sweep = messages.Ranges(name, 1700000000.5, [0.0, quarter], [0.0, 0.0], [1.5, None])
-        self.out[name][2].put(messages.encode(sweep))
+        sweep = messages.Ranges(name, 1700000000.5, [0.0, round(math.pi / 2, 6)], [0.0, 0.0], [1.5, None])
+        self.out[name]["ranges"].put(messages.encode(sweep))
 
     def status(self, name, body=""):
         status = messages.Status(
             name, time.time(), "running", "", body, battery=0.75, sent=10, received=20, lost={"CF02": 1}, ticks=100,
             missed=2, decisions=50, interventions=3, late_s=0.01, pid=1, cpu_s=0.5, rss_mb=30.0,
         )  # fmt: skip
-        self.out[name][1].put(messages.encode(status))
+        self.out[name]["status"].put(messages.encode(status))
 
 
 @pytest.fixture
 def bridge(router):
-    process = subprocess.Popen(
-        [sys.executable, "-m", "bridges.ros2", "--connect", router.endpoint, "--domain", "7"],
-        cwd=ROOT,
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    assert process.stdout.readline() == "ros2 ready: node /zenpark, domain 7, jazzy\n"
-    yield process
-    process.send_signal(signal.SIGTERM)
-    assert process.wait(30) == 0
-    process.stdout.close()
+    with started("-m", "bridges.ros2", "--connect", router.endpoint, "--domain", "7", stderr=None) as process:
+        assert process.stdout.readline() == "ros2 ready: node /zenpark, domain 7, jazzy\n"
+        yield process
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(30) == 0
 
 
-@pytest.mark.mechanism("ROS 2 bridge")
-@pytest.mark.system
-def test_robots_are_in_the_graph_of_ros(router, bridge, eventually):
+@pytest.fixture
+def sides(router, bridge):
+    """A ROS node and a realm with the bridge between them."""
     with (
         open_session([router.endpoint], name="realm") as inside,
         open_session([router.endpoint], name="ros") as outside,
     ):
-        node, realm = RosNode(outside, 7), Realm(inside)
-        eventually(lambda: any("/NN/%/%/zenpark" in token for token in node.graph()))
-        diagnostics = node.subscribe("diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
-        poses = node.subscribe("CF01/pose", "geometry_msgs/msg/PoseStamped")
-        frames = node.subscribe("tf", "tf2_msgs/msg/TFMessage")
-        scans = node.subscribe("CF01/scan", "sensor_msgs/msg/LaserScan")
-        speeds = node.subscribe("CF01/velocity", "geometry_msgs/msg/TwistStamped")
-        realm.enter("CF01")
-        realm.enter("tb3-0")
-        wanted = {
-            (role, f"/{name}/{topic}", f"geometry_msgs::msg::dds_::{kind}_")
-            for name in ("CF01", "tb3_0")
-            for role, topic, kind in (
-                ("MP", "pose", "PoseStamped"),
-                ("MP", "velocity", "TwistStamped"),
-                ("MS", "goal", "PoseStamped"),
-            )
-        }
-        wanted |= {
-            ("MP", "/diagnostics", "diagnostic_msgs::msg::dds_::DiagnosticArray_"),
-            ("MP", "/tf", "tf2_msgs::msg::dds_::TFMessage_"),
-        }
-        eventually(lambda: node.topics() == wanted)
-        assert all(
-            re.fullmatch(r"RIHS01_[0-9a-f]{64}", token.split("/")[11]) for token in node.graph() if "/NN/" not in token
-        )
+        yield RosNode(outside), Realm(inside)
 
-        got = []
 
-        def pose_came():
-            realm.state("CF01", (1.0, -2.0, 0.5), (0.1, 0.2, -0.3), math.pi / 2)
-            got.extend(node.take(poses))
-            return len(got) >= 3
+def endpoint(role, topic, kind):
+    package, _, name = kind.split("/")
+    return role, topic, f"{package}::msg::dds_::{name}_"
 
-        eventually(pose_came)
-        message, _, gid = got[0]
-        assert message.header.frame_id == "map"
-        assert (message.header.stamp.sec, message.header.stamp.nanosec) == (1700000000, 500000000)
-        place, turn = message.pose.position, message.pose.orientation
-        assert (place.x, place.y, place.z) == (1.0, -2.0, 0.5)
-        assert (turn.z, turn.w) == pytest.approx((math.sqrt(0.5), math.sqrt(0.5)))
-        assert [sequence for _, sequence, _ in got] == list(range(1, len(got) + 1))
-        token = next(token for token in node.graph() if "/MP/" in token and "%CF01%pose" in token)
-        assert gid == xxhash.xxh3_128_intdigest(token.encode()).to_bytes(16, "little")
-        speed = node.take(speeds)[0][0].twist.linear
-        assert (speed.x, speed.y, speed.z) == (0.1, 0.2, -0.3)
-        frame = node.take(frames)[0][0].transforms[0]
-        assert (frame.header.frame_id, frame.child_frame_id, frame.header.stamp.sec) == ("map", "CF01", 1700000000)
-        assert (frame.transform.translation.x, frame.transform.rotation) == (1.0, turn)
 
-        swept = []
+def endpoints(name):
+    """Those of a robot."""
+    return {
+        endpoint("MP", f"/{name}/pose", ros2.POSE_STAMPED),
+        endpoint("MP", f"/{name}/velocity", ros2.TWIST_STAMPED),
+        endpoint("MS", f"/{name}/goal", ros2.POSE_STAMPED),
+    }
 
-        def scan_came():
-            realm.ranges("CF01")
-            swept.extend(node.take(scans))
-            return swept
 
-        eventually(scan_came)
-        assert (swept[0][0].header.frame_id, swept[0][0].ranges.tolist()) == ("CF01", [1.5, INF])
-        scanner = {("MP", "/CF01/scan", "sensor_msgs::msg::dds_::LaserScan_")}
-        assert node.topics() == wanted | scanner, "the other robot has no range readings"
+OF_ALL = {
+    endpoint("MP", "/diagnostics", "diagnostic_msgs/msg/DiagnosticArray"),
+    endpoint("MP", "/tf", ros2.TF_MESSAGE),
+}
 
-        found = []
 
-        def report_came():
-            realm.status("CF01", "LOCKED")
-            for array, _, _ in node.take(diagnostics):
-                found.extend(array.status)
-            return bool(found)
+@pytest.mark.mechanism("ROS 2 bridge")
+@pytest.mark.system
+def test_robots_are_in_the_graph_of_ros(sides):
+    node, realm = sides
+    until(lambda: any("/NN/%/%/zenpark" in token for token in node.graph()))
+    diagnostics = node.subscribe("diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
+    poses = node.subscribe("CF01/pose", ros2.POSE_STAMPED)
+    frames = node.subscribe("tf", ros2.TF_MESSAGE)
+    scans = node.subscribe("CF01/scan", ros2.LASER_SCAN)
+    speeds = node.subscribe("CF01/velocity", ros2.TWIST_STAMPED)
+    realm.enter("CF01")
+    realm.enter("tb3-0")
+    wanted = endpoints("CF01") | endpoints("tb3_0") | OF_ALL
+    until(lambda: node.topics() == wanted)
+    codes = [token.split("/")[11] for token in node.graph() if "/NN/" not in token]
+    assert all(re.fullmatch(r"RIHS01_[0-9a-f]{64}", code) for code in codes)
 
-        eventually(report_came)
-        assert (found[0].name, found[0].level, found[0].hardware_id) == ("zenpark: CF01", 1, "CF01")
-        assert "LOCKED" in found[0].message
-        values = {pair.key: pair.value for pair in found[0].values}
-        assert (values["battery"], values["lost"], values["missed ticks"]) == ("0.750", "1", "2 of 100")
+    got = node.taken(poses, lambda: realm.state("CF01", (1.0, -2.0, 0.5), (0.1, 0.2, -0.3), math.pi / 2), least=3)
+    message, _, gid = got[0]
+    assert message.header.frame_id == "map"
+    assert (message.header.stamp.sec, message.header.stamp.nanosec) == (1700000000, 500000000)
+    place, turn = message.pose.position, message.pose.orientation
+    assert (place.x, place.y, place.z) == (1.0, -2.0, 0.5)
+    assert (turn.z, turn.w) == pytest.approx((math.sqrt(0.5), math.sqrt(0.5)))
+    assert [sequence for _, sequence, _ in got] == list(range(1, len(got) + 1))
+    token = next(token for token in node.graph() if "/MP/" in token and "%CF01%pose" in token)
+    assert gid == xxhash.xxh3_128_intdigest(token.encode()).to_bytes(16, "little")
+    speed = node.take(speeds)[0][0].twist.linear
+    assert (speed.x, speed.y, speed.z) == (0.1, 0.2, -0.3)
+    frame = node.take(frames)[0][0].transforms[0]
+    assert (frame.header.frame_id, frame.child_frame_id, frame.header.stamp.sec) == ("map", "CF01", 1700000000)
+    assert (frame.transform.translation.x, frame.transform.rotation) == (1.0, turn)
 
-        realm.leave("CF01")
-        eventually(
-            lambda: (
-                {topic for _, topic, _ in node.topics()}
-                == {"/diagnostics", "/tf", "/tb3_0/pose", "/tb3_0/velocity", "/tb3_0/goal"}
-            )
-        )
-        found.clear()
-        eventually(
-            lambda: (
-                found.extend(s for a, _, _ in node.take(diagnostics) for s in a.status)
-                or "gone" in {s.message for s in found}
-            )
-        )
-        realm.enter("CF01")
-        eventually(lambda: node.topics() == wanted)
+    swept = node.taken(scans, lambda: realm.ranges("CF01"))[0][0]
+    assert (swept.header.frame_id, swept.ranges.tolist()) == ("CF01", [1.5, INF])
+    scanner = {endpoint("MP", "/CF01/scan", ros2.LASER_SCAN)}
+    assert node.topics() == wanted | scanner, "the other robot has no range readings"
+
+    statuses = [
+        status
+        for array, _, _ in node.taken(diagnostics, lambda: realm.status("CF01", "LOCKED"))
+        for status in array.status
+    ]
+    assert (statuses[0].name, statuses[0].level, statuses[0].hardware_id) == ("zenpark: CF01", 1, "CF01")
+    assert "LOCKED" in statuses[0].message
+    values = {pair.key: pair.value for pair in statuses[0].values}
+    assert (values["battery"], values["lost"], values["missed ticks"]) == ("0.750", "1", "2 of 100")
+
+    realm.leave("CF01")
+    until(lambda: node.topics() == endpoints("tb3_0") | OF_ALL)
+    until(lambda: any("gone" in {each.message for each in array.status} for array, _, _ in node.take(diagnostics)))
+    realm.enter("CF01")
+    until(lambda: node.topics() == wanted)
 
 
 def test_a_goal_without_height_keeps_the_height():
@@ -436,73 +404,65 @@ def test_a_goal_without_height_keeps_the_height():
 
 
 @pytest.mark.system
-def test_goals_come_in(router, bridge, eventually):
-    with (
-        open_session([router.endpoint], name="realm") as inside,
-        open_session([router.endpoint], name="ros") as outside,
-    ):
-        node, realm = RosNode(outside, 7), Realm(inside)
-        goals = inside.declare_subscriber("park/CF01/goal", RingChannel(16))
-        realm.enter("CF01")
-        poses = node.subscribe("CF01/pose", "geometry_msgs/msg/PoseStamped")
-        eventually(lambda: ("MS", "/CF01/goal", "geometry_msgs::msg::dds_::PoseStamped_") in node.topics())
-        key = f"7/CF01/goal/geometry_msgs::msg::dds_::PoseStamped_/RIHS01_{HASHES['geometry_msgs/msg/PoseStamped']}"
-        kinds = node.store.types
-        out = outside.declare_publisher(key)
+def test_goals_come_in(sides):
+    node, realm = sides
+    goals = realm.session.declare_subscriber("park/CF01/goal", RingChannel(16))
+    realm.enter("CF01")
+    poses = node.subscribe("CF01/pose", ros2.POSE_STAMPED)
+    until(lambda: endpoint("MS", "/CF01/goal", ros2.POSE_STAMPED) in node.topics())
+    out, kinds = node.session.declare_publisher(node.key("CF01/goal", ros2.POSE_STAMPED)), node.store.types
 
-        def send(frame, x, turn):
-            message = kinds["geometry_msgs/msg/PoseStamped"](
-                header=kinds["std_msgs/msg/Header"](
-                    stamp=kinds["builtin_interfaces/msg/Time"](sec=0, nanosec=0), frame_id=frame
-                ),
-                pose=kinds["geometry_msgs/msg/Pose"](
-                    position=kinds["geometry_msgs/msg/Point"](x=x, y=0.25, z=0.5),
-                    orientation=kinds["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=turn[0], w=turn[1]),
-                ),
-            )
-            raw = bytes(node.store.serialize_cdr(message, "geometry_msgs/msg/PoseStamped"))
-            out.put(raw, attachment=struct.pack("<qqB16s", 1, time.time_ns(), 16, bytes(16)))
+    def put(raw):
+        out.put(raw, attachment=struct.pack("<qqB16s", 1, time.time_ns(), 16, bytes(16)))
 
-        def known():
-            realm.state("CF01", (0.0, 0.0, 0.5), (0.0, 0.0, 0.0), 0.0)
-            return node.take(poses)
+    def send(frame, x, turn):
+        def make(kind, **parts):
+            return kinds[kind](**parts)
 
-        eventually(known)
-        out.put(b"\0\1\0\0garbage", attachment=struct.pack("<qqB16s", 1, time.time_ns(), 16, bytes(16)))
-        send("odom", 3.0, (0.0, 1.0))  # another frame
-        send("map", math.nan, (0.0, 1.0))
-        send("map", 1.5, (math.sin(0.25), math.cos(0.25)))
-        send("", 2.5, (0.0, 0.0))
-        samples = []
-        eventually(lambda: samples.extend(received(goals)) or len(samples) >= 2)
-        first, second = (messages.decode(s.payload.to_bytes(), str(s.encoding), messages.Goal) for s in samples)
-        for goal in (first, second):
-            validation.check_goal(goal, now=time.time(), valid_box=(3.0, 3.0, 3.0), oldest_s=1.0)
-        assert (second.seq - first.seq, first.pose) == (1, 1700000000.5)
-        assert (first.robot, first.position) == ("CF01", (1.5, 0.25, 0.5))
-        assert first.yaw == pytest.approx(0.5)
-        assert (second.position, second.yaw) == ((2.5, 0.25, 0.5), None)
-        assert str(samples[0].encoding) == JSON
+        stamp = make("builtin_interfaces/msg/Time", sec=0, nanosec=0)
+        place = make("geometry_msgs/msg/Point", x=x, y=0.25, z=0.5)
+        orientation = make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=turn[0], w=turn[1])
+        message = make(
+            ros2.POSE_STAMPED,
+            header=make("std_msgs/msg/Header", stamp=stamp, frame_id=frame),
+            pose=make("geometry_msgs/msg/Pose", position=place, orientation=orientation),
+        )
+        put(bytes(node.store.serialize_cdr(message, ros2.POSE_STAMPED)))
 
-        def passed_on():
-            send("map", 1.0, (0.0, 1.0))
-            threading.Event().wait(0.2)
-            return list(received(goals))
+    node.taken(poses, lambda: realm.state("CF01"))
+    put(b"\0\1\0\0garbage")
+    send("odom", 3.0, (0.0, 1.0))  # another frame
+    send("map", math.nan, (0.0, 1.0))
+    send("map", 1.5, (math.sin(0.25), math.cos(0.25)))
+    send("", 2.5, (0.0, 0.0))
+    samples = []
+    until(lambda: samples.extend(received(goals)) or len(samples) >= 2)
+    first, second = (messages.decode(s.payload.to_bytes(), str(s.encoding), messages.Goal) for s in samples)
+    for goal in (first, second):
+        validation.check_goal(goal, now=time.time(), valid_box=(3.0, 3.0, 3.0), oldest_s=1.0)
+    assert (second.seq - first.seq, first.pose) == (1, 1700000000.5)
+    assert (first.robot, first.position) == ("CF01", (1.5, 0.25, 0.5))
+    assert first.yaw == pytest.approx(0.5)
+    assert (second.position, second.yaw) == ((2.5, 0.25, 0.5), None)
+    assert str(samples[0].encoding) == JSON
 
-        token = alive_token(inside, "park/centre/here")  # two cannot guide one robot
-        eventually(lambda: not passed_on())
-        token.undeclare()
-        eventually(passed_on)
+    def passed_on():
+        send("map", 1.0, (0.0, 1.0))
+        threading.Event().wait(0.2)
+        return list(received(goals))
+
+    token = alive_token(realm.session, "park/centre/here")  # two cannot guide one robot
+    until(lambda: not passed_on())
+    token.undeclare()
+    until(passed_on)
 
 
 @pytest.mark.system
-def test_the_graph_survives_its_router(router, bridge, eventually):
-    with open_session([router.endpoint], name="ros") as outside:
-        node = RosNode(outside, 7)
-        realm = Realm(outside)
-        realm.enter("CF01")
-        eventually(lambda: len(node.topics()) == 5)
-        router.kill()
-        eventually(lambda: not [token for token in node.graph() if "zenpark" in token])
-        router.start()
-        eventually(lambda: len(node.topics()) == 5)
+def test_the_graph_survives_its_router(sides, router):
+    node, realm = sides
+    realm.enter("CF01")
+    until(lambda: len(node.topics()) == 5)
+    router.kill()
+    until(lambda: not [token for token in node.graph() if "zenpark" in token])
+    router.start()
+    until(lambda: len(node.topics()) == 5)

@@ -8,9 +8,8 @@ import pytest
 from cflib.drivers import crazyradio
 
 from agents.protocols.crtp import Port
-from bridges.crazyflie import body, link, pilot
-from bridges.crazyflie.body import CrazyflieBody
-from tests.bridges.crazyflie_flight import Process, flown, supervised, truth
+from bridges.crazyflie import link
+from tests.bridges.crazyflie_flight import connected, flown, motors, supervised, truth
 from tests.requests import request
 from tests.twins.loopback import Served
 from twins.devices.crazyflie.device import CrazyflieTwin
@@ -25,7 +24,7 @@ SINKS = 0.5  # [m/s] a landing is slower, a fall from this height six times as f
 
 @pytest.fixture(autouse=True)
 def known_tables(toc_cache):
-    if link._KNOWN_TABLES:
+    if link.KNOWN_TABLES:
         return
     with Served(CrazyflieTwin, request("crazyflie", ["x"])) as twin:  # over UDP a thousand entries are read in no time
         link.prepare(twin.addresses)
@@ -34,41 +33,54 @@ def known_tables(toc_cache):
         reader.close()
 
 
+def watching(process, notice):
+    """Call something with each state that a process reads."""
+    tick = process.tick
+
+    def ticked():
+        state = tick()
+        notice(state)
+        return state
+
+    process.tick = ticked
+
+
 class Descent:
     """Fastest descent of each row [m/s], by the twin's own velocities; read at every tick of a process."""
 
     def __init__(self, twin, process):
-        self.fastest = np.zeros(len(twin.addresses))
-        self._twin, self._tick = twin, process.tick
-        process.tick = self._ticked
+        self.fastest, self._flock = np.zeros(len(twin.addresses)), twin.device.flock
+        watching(process, self._notice)
 
-    def _ticked(self):
-        velocity = self._twin.device.flock.quadrotor.velocity[:, 2]
-        self.fastest = np.maximum(self.fastest, -velocity)
-        return self._tick()
+    def _notice(self, _state):
+        self.fastest = np.maximum(self.fastest, -self._flock.quadrotor.velocity[:, 2])
+
+    def soft(self):
+        return self.fastest.max() < SINKS
 
 
 def hovering(process, rows=1, x=0.0):
-    process.setpoint = [(x, float(row), HEIGHT, 0.0) for row in range(rows)]
-    return process
+    return process.lead(*[(x, float(row), HEIGHT, 0.0) for row in range(rows)])
 
 
-def test_flight_over_the_radio():
+@pytest.mark.parametrize("loss", [0.0, 0.2, 0.4])
+def test_flight_over_the_radio(loss):
     """Taken off, led to a goal and landed, without a fall at the end: the planner keeps the order to land."""
-    with flown(device=RADIO) as (twin, process):
+    with flown(device=RADIO, loss=loss) as (twin, process):
         descent = Descent(twin, process)
         assert twin.device.lines[0].safelink
         process.takeoff(HEIGHT)
         hovering(process, x=0.2)
         process.until(lambda: abs(truth(twin)[0] - 0.2) < 0.03, "goal")
-        assert np.abs(process.state.position - twin.truth()[0]).max() < 0.05
+        assert loss or np.abs(process.state.position - twin.truth()[0]).max() < 0.05
         process.land()
-        assert descent.fastest.max() < SINKS
+        assert descent.soft()
         assert supervised(twin) != SupervisorState.LOCKED
+        assert not any(word in process.state.note[0] for word in ("refused", "link lost", "landed"))
 
 
 def test_short_gaps_are_flown_through():
-    """Gaps of 0.15 to 0.7 s: the drone holds or flies on, and then follows its setpoints again over the same link."""
+    """The drone holds or flies on, and then follows its setpoints again over the same link."""
     with flown(device=RADIO) as (twin, process):
         process.takeoff(HEIGHT)
         descent = Descent(twin, process)
@@ -79,27 +91,29 @@ def test_short_gaps_are_flown_through():
             process.run(gap)
             process.until(lambda: abs(truth(twin)[0] - 0.1 * x) < 0.03 and process.state.flying[0], "goal")  # noqa: B023
             assert abs(truth(twin)[2] - HEIGHT) < 0.1
-        assert descent.fastest.max() < SINKS
+        assert descent.soft()
         assert process.body.pilots[0].link is link
         assert supervised(twin) == SupervisorState.FLYING
         process.cut()
 
 
 @pytest.mark.mechanism("Crazyflie bridge: radio gap")
-def test_a_long_gap_ends_in_a_landing():
-    with flown(device=RADIO, exchanges_hz=1000.0) as (twin, process):
+def test_a_long_gap_lands_that_drone_alone():
+    with flown(rows=3, device=RADIO) as (twin, process):
         process.takeoff(HEIGHT)
         descent = Descent(twin, process)
-        hovering(process).run(0.1)
-        twin.device.lines[0].silence(1.1)
-        process.run(1.1)
+        hovering(process, rows=3, x=0.2).run(0.2)
+        twin.device.lines[0].silence(1.2)
         process.until(lambda: not process.state.flying[0], "landed")
         assert truth(twin)[2] == pytest.approx(0.0, abs=0.02)
-        assert descent.fastest.max() < SINKS
+        assert process.state.flying[1:].all()
+        assert np.abs(twin.truth()[0][1:] - [[0.2, 1.0, HEIGHT], [0.2, 2.0, HEIGHT]]).max() < 0.05
         assert supervised(twin) != SupervisorState.LOCKED
         process.until(
             lambda: process.t - process.state.time[0] < 0.3, "logs again: the firmware has removed its blocks"
         )
+        assert descent.soft()
+        process.cut()
 
 
 @pytest.mark.parametrize("begins", ["setpoints", "hold", "take-off", "landing"])
@@ -136,105 +150,46 @@ def test_nothing_is_received_any_more(begins):
             assert z[row][t > 3.0].max() < HEIGHT - 0.1, "a hover without command"
             landed = t[np.flatnonzero(z[row] == 0.0)[0]]
             assert z[row][t > landed].max() < 1e-3, "lifted again"
-        assert descent.fastest.max() < SINKS
+        assert descent.soft()
         assert not any(supervised(twin, row) == SupervisorState.LOCKED for row in range(3))
-        assert not twin.device.flock.quadrotor.flying[:2].any()
+        assert not any(motors(twin, row) for row in range(2))
         assert process.state.flying[2], "nothing is seen of its motors"
         twin.device.lines[2].silence(0.0)
         process.until(lambda: not process.state.flying[2], "in reach again")
-        assert not twin.device.flock.quadrotor.flying[2]
+        assert not motors(twin, 2)
         assert "connected again" not in process.state.note[2]
 
 
 def test_radio_gap_with_motion_capture_ends_in_landing():
     """The estimator is blind, and drifts: it is down before it is far away, and stays there with its motors on."""
     with flown(device=RADIO, external=True) as (twin, process):
-        process.located_as = twin
+        process.truth = twin.truth
         process.until(lambda: np.isfinite(process.state.position).all(), "settled")
         process.takeoff(0.6)
-        process.setpoint = [(0.0, 0.0, 0.6, 0.0)]
-        process.run(1.0)
+        process.lead((0.0, 0.0, 0.6, 0.0)).run(1.0)
         descent = Descent(twin, process)
         twin.device.lines[0].silence(1e6)
         process.until(lambda: truth(twin)[2] == 0.0, "down")
         process.run(2.0)
         assert np.abs(truth(twin)[:2]).max() < 0.3
-        assert twin.device.flock.quadrotor.flying[0]
+        assert motors(twin)
         assert process.state.flying[0], "its motors may be on"
-        assert descent.fastest.max() < SINKS
-
-
-def test_neighbours_of_a_silent_drone_fly_on():
-    with flown(rows=3, device=RADIO) as (twin, process):
-        process.takeoff(HEIGHT)
-        descent = Descent(twin, process)
-        hovering(process, rows=3, x=0.2).run(0.2)
-        twin.device.lines[0].silence(1.2)
-        process.until(lambda: not process.state.flying[0], "landed")
-        assert process.state.flying[1:].all()
-        assert np.abs(twin.truth()[0][1:] - [[0.2, 1.0, HEIGHT], [0.2, 2.0, HEIGHT]]).max() < 0.05
-        assert descent.fastest.max() < SINKS
-        process.cut()
-
-
-@pytest.mark.parametrize("loss", [0.05, 0.2, 0.4])
-def test_random_losses(loss):
-    with flown(device=RADIO, loss=loss) as (twin, process):
-        descent = Descent(twin, process)
-        process.takeoff(HEIGHT)
-        hovering(process, x=0.2)
-        process.until(lambda: abs(truth(twin)[0] - 0.2) < 0.03, "goal")
-        process.land()
-        assert descent.fastest.max() < SINKS
-        assert supervised(twin) != SupervisorState.LOCKED
-        assert not any(word in process.state.note[0] for word in ("refused", "link lost", "landed"))
+        assert descent.soft()
 
 
 def test_setpoints_go_on_beside_external_positions():
     """Two packets in each period, and room for one in the queue of the driver: neither starves the other."""
     with flown(rows=2, device=RADIO, external=True) as (twin, process):
-        tick, oldest = process.tick, np.zeros(2)
-
-        def located():
-            for row in range(2):
-                process.body.locate(row, process.t, tuple(truth(twin, row).tolist()), 0.0)
-            return tick()
-
-        process.tick = located
+        process.truth, flock, ages = twin.truth, twin.device.flock, []
         process.until(lambda: np.isfinite(process.state.position).all(), "settled")
         process.takeoff(HEIGHT)
         hovering(process, rows=2).run(0.5)
-        received = twin.device.flock.estimator.received.copy()
-        end = process.t + 4.0
-        while process.t < end:
-            process.tick()
-            flock = twin.device.flock
-            oldest = np.maximum(oldest, flock.commander.setpoint_age(flock.t))
-        assert oldest.max() < 0.4, "the firmware levels out after 0.5 s"
-        assert (twin.device.flock.estimator.received - received).min() > 30
+        received = flock.estimator.received.copy()
+        watching(process, lambda _: ages.append(flock.commander.setpoint_age(flock.t)))
+        process.run(4.0)
+        assert np.max(ages) < 0.4, "the firmware levels out after 0.5 s"
+        assert (flock.estimator.received - received).min() > 30
         process.land()
-
-
-class Unanswered:
-    """Loses the answers of a drone on one port."""
-
-    def __init__(self, twin, port, row=0):
-        send = twin.device.drones[row].send
-        twin.device.drones[row].send = lambda at, channel, data: None if at == port else send(at, channel, data)
-
-
-def test_a_lost_answer_is_no_refusal():
-    """Answers of the planner never come: the drone flies, follows its setpoints and lands as if they came."""
-    with flown(device=RADIO) as (twin, process):
-        descent = Descent(twin, process)
-        Unanswered(twin, Port.HIGH_LEVEL)
-        process.takeoff(HEIGHT)
-        process.run(2.0)
-        assert "refused" not in process.state.note[0]
-        assert process.state.flying[0]
-        process.land()
-        assert descent.fastest.max() < SINKS
-        assert supervised(twin) != SupervisorState.LOCKED
 
 
 def test_a_session_that_begins_while_safelink_is_on():
@@ -243,12 +198,9 @@ def test_a_session_that_begins_while_safelink_is_on():
         process.close()
         assert twin.device.lines[0].safelink
         twin.device.lines[0].silence(0.5)
-        again = Process(CrazyflieBody(request("crazyflie", twin.addresses)))
-        try:
+        with connected(twin.addresses) as again:
             again.takeoff(HEIGHT)
             again.cut()
-        finally:
-            again.close()
 
 
 def test_queue_filling_in_the_air_ends_in_landing():
@@ -256,8 +208,8 @@ def test_queue_filling_in_the_air_ends_in_landing():
     with flown(device=RADIO, exchanges_hz=300.0) as (twin, process):
         process.takeoff(HEIGHT)
         descent = Descent(twin, process)
-        line, queue = twin.device.lines[0], twin.device.lines[0].queue
-        send = line.send
+        line = twin.device.lines[0]
+        send, queue = line.send, line.queue
         line.send = lambda port, channel, data: [
             send(port, channel, data) for _ in range(20 if (port, channel) == (Port.LOG, 2) and len(queue) < 160 else 1)
         ]
@@ -266,77 +218,64 @@ def test_queue_filling_in_the_air_ends_in_landing():
         assert process.state.flying[0]
         process.land()  # as the robot's loop does then
         process.until(lambda: supervised(twin) in {SupervisorState.LANDED, SupervisorState.READY}, "landed")
-        assert descent.fastest.max() < SINKS
+        assert descent.soft()
 
 
-def test_a_radio_that_becomes_slow_gets_fewer_logs(monkeypatch):
+def test_a_radio_that_becomes_slow_gets_fewer_logs():
     """Fewer exchanges than logs: their rates are halved until poses are young again, and the drone flies on.
 
     On the ground, over a radio that is fast again, they are restored.
     """
-    monkeypatch.setattr(pilot, "CALM_S", 1.0)
     with flown(device=RADIO) as (twin, process):
         process.takeoff(HEIGHT)
         hovering(process).run(0.2)
         (dongle,) = crazyradio._find_devices()
         dongle.air = dongle.air._replace(hz=22.0)
-        process.until(lambda: "fewer logs" in process.state.note[0], "note")
+        process.noted("fewer logs")
         process.until(lambda: process.t - process.state.time[0] < 0.3, "young poses")
         dongle.air = dongle.air._replace(hz=500.0)
         assert "fewer logs" in process.state.note[0]
         process.land()
         assert supervised(twin) != SupervisorState.LOCKED
         process.until(lambda: "fewer logs" not in process.state.note[0], "the rates that were chosen")
-        blocks = process.body.pilots[0].link.blocks
-        assert blocks["state"].period == 5
+        assert process.body.pilots[0].link.blocks["state"].period == 5
 
 
 def test_recovery_from_a_crash_is_asked_for():
     with flown(device=RADIO) as (twin, process):
         twin.device.flock.supervisor.state[0] = SupervisorState.CRASHED
-        process.until(lambda: "crashed: put it upright" in process.state.note[0], "note")
+        process.noted("crashed: put it upright")
         process.body.takeoff([0], [HEIGHT])
         process.until(lambda: "no take-off: crashed" in process.state.note[0] and not process.state.flying[0], "no")
         assert supervised(twin) == SupervisorState.CRASHED
         process.close()
-        again = Process(CrazyflieBody(request("crazyflie", twin.addresses, device={"recover": True})))
-        try:
+        with connected(twin.addresses, device={"recover": True}) as again:
             again.takeoff(HEIGHT)
             again.cut()
-        finally:
-            again.close()
 
 
 @pytest.mark.timeout(120)
 def test_a_fleet_on_one_radio(monkeypatch, tmp_path):
-    """Connected from a cold cache, taken off, led and landed; no command is refused. `test_budget` has the ages."""
+    """Connected from a cold cache, taken off, led and landed; no command is refused. `test_simulated` has the ages."""
     monkeypatch.setenv("ZENPARK_CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr(link, "_KNOWN_TABLES", {})
+    link.KNOWN_TABLES.clear()
     rows = 8
     with flown(rows=rows, device=RADIO | {"stream_hz": 5.0}) as (twin, process):
         assert process.body.exchanges(list(range(rows))) < 60 * 250, "a minute of a slow radio"
         descent, notes = Descent(twin, process), set()
-        tick = process.tick
-
-        def watched():
-            state = tick()
-            notes.update(state.note)
-            return state
-
-        process.tick = watched
+        watching(process, lambda state: notes.update(state.note))
         process.takeoff(HEIGHT)
         hovering(process, rows, x=0.2).run(4.0)
         assert np.abs(twin.truth()[0][:, 0] - 0.2).max() < 0.05
         process.land()
         assert not any("refused" in note or "landed" in note for note in notes), notes
-        assert descent.fastest.max() < SINKS
+        assert descent.soft()
 
 
-def test_a_radio_that_carries_too_little_is_refused(monkeypatch):
-    monkeypatch.setattr(body, "MEASURING_S", 0.5)
+def test_a_radio_that_carries_too_little_is_refused():
     device = RADIO | {"log_hz": 50.0, "stream_hz": 100.0, "positioning": {"system": "external", "rate_hz": 100.0}}
     with (
         pytest.raises(RuntimeError, match=r"radio 0: 2 robots ask for 700 packets/s.*write log_hz = .*stream_hz"),
-        flown(rows=2, device=device, external=True, exchanges_hz=300.0),
+        flown(rows=2, device=device, external=True, exchanges_hz=300.0, measuring_s=0.5),
     ):
         pass

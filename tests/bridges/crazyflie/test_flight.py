@@ -2,6 +2,8 @@
 
 import math
 import types
+from collections import Counter
+from itertools import count
 
 import numpy as np
 import pytest
@@ -12,24 +14,25 @@ from agents.protocols.crazyflie import CrazyflieSettings
 from agents.protocols.crtp import HighLevel, Info, LogStatus, Port
 from agents.safety.detection import LOWEST_DESCENT_M_S
 from bridges.crazyflie import flight as module
-from bridges.crazyflie import telemetry as telemetry_module
-from bridges.crazyflie import trajectory as trajectory_module
 from bridges.crazyflie.flight import FlightControl, FlightPhase
 from bridges.crazyflie.telemetry import Telemetry
 from bridges.crazyflie.trajectory import HOLD_S, SINK, TAKEOFFS, TrajectoryMemory
+from tests.bridges.crazyflie_clock import clocked
+from tests.waiting import ManualClock
 
 PLACE = (0.1, 0.2, 0.5, 0.0)
 
 
-class Air:
+class Air(ManualClock):
     """A clock, and a Crazyflie that notes what is sent and when; no answer ever comes from it."""
 
-    def __init__(self, monkeypatch, **chosen):
-        self.now, self.sent = 100.0, []
-        for each in (module, telemetry_module, trajectory_module):
-            monkeypatch.setattr(each, "time", types.SimpleNamespace(monotonic=lambda: self.now))
+    def __init__(self, monkeypatch):
+        super().__init__(100.0)
+        clocked(monkeypatch, self)
+        self.sent, self.replies, self.written = [], {}, 0
+        self.target = lambda: PLACE  # of the robot's loop; None: it does not command
         self.telemetry = Telemetry(lighthouse=False)
-        self.flight = FlightControl(CrazyflieSettings(**chosen), self.telemetry, self.pause)
+        self.flight = FlightControl(CrazyflieSettings(), self.telemetry, lambda seconds: self.sleep(seconds))  # noqa: PLW0108
         self.flight.link = types.SimpleNamespace(
             cf=self,
             error=None,
@@ -37,7 +40,6 @@ class Air:
             planner_reply=lambda command: self.replies.get(command, (0, 0)),
             trajectories=TrajectoryMemory(self.wire),
         )
-        self.replies = {}
         self.supervisor = self.commander = self.high_level_commander = self
         self.flying, self.info = True, Info.ARMED | Info.CAN_FLY
 
@@ -50,15 +52,19 @@ class Air:
         """Notes starts of trajectories, and confirms what is written."""
         trajectories = self.flight.link.trajectories
         if port == Port.MEMORY:
+            self.written += 1
             trajectories.note_answer(crtp.MEMORY.unpack_from(data)[1], 0)
         elif data[0] == HighLevel.START_2:
             self.sent.append((self.now, "climb" if data[5] in TAKEOFFS else "setpoint"))
 
-    def pause(self, seconds):
-        self.now += seconds
+    def stand(self, *, info=Info.ARMED | Info.CAN_FLY):
+        """On the ground, its position known."""
+        self.telemetry.settled, self.telemetry.pose = True, (0.0,) * 7
+        self.flying, self.info = False, info
+        return self.pass_(0.1)
 
     def fly(self):
-        self.telemetry.settled, self.telemetry.pose = True, [0.1, 0.2, 0.5, 0.0, 0.0, 0.0, 0.0]
+        self.telemetry.settled, self.telemetry.pose = True, (0.1, 0.2, 0.5, *[0.0] * 4)
         self.flight.enter(FlightPhase.CLIMBING)
         return self.pass_(0.1)
 
@@ -69,13 +75,24 @@ class Air:
             self.now += 0.02
             self.telemetry.status_time = self.telemetry.pose_time = self.telemetry.arrival = self.now
             self.telemetry.info = self.info | (Info.FLYING if self.flying else 0)
-            self.flight.set_target(self.now, PLACE)
+            if self.target is not None:
+                self.flight.set_target(self.now, self.target())
             self.flight.update_phase(self.now)
             self.flight.send_due(self.now)
         return self
 
-    def times(self, *whats):
-        return [at for at, what in self.sent if what in whats]
+    def times(self, what, since=-math.inf):
+        return [at for at, sent in self.sent if sent == what and at > since]
+
+    def during(self, seconds):
+        """How often each thing is sent in the next seconds."""
+        self.sent.clear()
+        self.pass_(seconds)
+        return Counter(what for _, what in self.sent)
+
+    @property
+    def phase(self):
+        return self.flight.phase
 
 
 @pytest.fixture
@@ -83,137 +100,156 @@ def air(monkeypatch):
     return Air(monkeypatch).fly()
 
 
-def test_unanswered_landing_is_ordered_again(air):
+@pytest.fixture
+def ground(monkeypatch):
+    return Air(monkeypatch).stand()
+
+
+def sweep(*places):
+    """Targets with these x [m], one after the other."""
+    endless = (places[k % len(places)] for k in count())
+    return lambda: (next(endless), *PLACE[1:])
+
+
+# ---------------------------------------------------------------------- take-off
+
+
+def test_a_take_off_without_an_answer_goes_on(ground):
+    ground.flight.takeoff(0.5)
+    assert ground.phase is FlightPhase.CLIMBING
+    assert ground.pass_(1.0).flight.trouble == ""
+    assert ground.pass_(3.0).phase is FlightPhase.GROUND
+    assert ground.flight.trouble == "its motors do not turn"
+
+
+def test_end_of_climb_is_held_until_first_setpoint(ground):
+    """By the robot's loop, which may wait for others; without it, the drone is landed."""
+    ground.flight.takeoff(0.5)
+    ground.flying, ground.target = True, lambda: None
+    assert ground.pass_(6.0).phase is FlightPhase.CLIMBING
+    held = ground.times("setpoint")
+    assert held[0] - ground.times("climb")[-1] < 1.5 + HOLD_S
+    assert np.diff(held).max() < 0.5 * HOLD_S
+    ground.target = None
+    assert ground.pass_(2.0).phase is FlightPhase.LANDING
+
+
+def test_no_take_off_with_a_wrong_yaw(air):
+    """The decision turns by the yaw from outside, the firmware by its own."""
+    air.flight.note_external(0.0, 0.3)
+    assert air.flight.takeoff_refusal() == ""
+    air.flight.note_external(0.0, 0.5 + math.tau)
+    assert "its own yaw is 29° beside" in air.flight.takeoff_refusal()
+
+
+@pytest.mark.parametrize("info", [Info.CRASHED, Info.TUMBLED])
+def test_crashed_drone_is_not_recovered_by_take_off(monkeypatch, info):
+    air = Air(monkeypatch).stand(info=Info.ARMED | info)
+    air.flight.takeoff(0.5)
+    assert (air.phase, air.sent) == (FlightPhase.GROUND, [])
+    assert "no take-off" in air.flight.trouble
+
+
+def test_armed_is_not_yet_able_to_fly(monkeypatch):
+    """Motors that are checked after arming: no take-off before the supervisor permits it, and one request to arm."""
+    air = Air(monkeypatch).stand(info=Info.ARMED)
+
+    def spun_up(seconds):
+        air.now += seconds
+        if air.now > 101.5:
+            air.telemetry.info = Info.ARMED | Info.CAN_FLY
+
+    air.sleep = spun_up
+    air.flight.takeoff(0.5)
+    assert air.phase is FlightPhase.CLIMBING
+    assert min(air.times("climb")) > 101.5
+    assert air.times("send_arming_request") == []
+
+
+@pytest.mark.parametrize("order", ["stop", "land"])
+def test_order_while_arming_disarms(monkeypatch, order):
+    """It is repeated until the status confirms it."""
+    air = Air(monkeypatch).stand(info=Info(0))
+
+    def replaced(seconds):
+        air.now += seconds
+        if air.times("send_arming_request"):
+            raise RuntimeError
+
+    air.sleep = replaced
+    with pytest.raises(RuntimeError):
+        air.flight.takeoff(0.5)
+    del air.sleep
+    air.info = Info.ARMED
     air.sent.clear()
-    air.flight.land()
-    assert air.flight.phase is FlightPhase.LANDING
-    assert not air.times("setpoint"), "a start would make the planner forget the landing"
-    assert len(air.times("land")) == module.TRIES
-    air.telemetry.pose = [0.0] * 7
-    air.pass_(air.flight.span_s)
-    assert 2 < len(air.times("land")[module.TRIES :]) < 5
-    air.sent.clear()
-    air.pass_(module.AGAIN_S)
-    assert len(air.times("land")) == module.TRIES
+    getattr(air.flight, order)()
+    air.pass_(1.0)
+    assert {what for _, what in air.sent} == {"send_arming_request"}
+    assert 4 < len(air.sent) < 10
+    air.info = Info(0)
+    assert air.during(1.0) == {}
+
+
+# ---------------------------------------------------------------------- setpoints
 
 
 def test_constant_setpoint_is_repeated_in_time(air):
     """Before the descent behind it begins; one that changes is sent at the rate of setpoints."""
-    air.pass_(2.0)
-    assert np.diff(air.times("setpoint")[3:]).max() < 0.5 * HOLD_S
-    begin, places = air.now, iter(np.linspace(0.2, 0.8, 1000))
-    setpoint = air.flight.set_target
-    air.flight.set_target = lambda now, _: setpoint(now, (0.1, next(places), 0.5, 0.0))
-    air.pass_(2.0)
-    assert 15 < len([at for at in air.times("setpoint") if at > begin]) < 25
-
-
-def test_setpoint_change_below_wire_resolution_is_no_change(air):
-    places = iter(np.tile([0.1, 0.1004], 1000))
-    setpoint = air.flight.set_target
-    air.flight.set_target = lambda now, _: setpoint(now, (next(places), 0.2, 0.5, 0.0))
-    begin = air.now
-    air.pass_(2.0)
-    assert len([at for at in air.times("setpoint") if at > begin]) < 10
+    assert np.diff(air.pass_(2.0).times("setpoint")[3:]).max() < 0.5 * HOLD_S
+    air.target = sweep(*np.linspace(0.2, 0.8, 1000))
+    assert 15 < air.during(2.0)["setpoint"] < 25
+    air.target = sweep(0.1, 0.1004)  # below the wire's resolution: no change
+    assert air.during(2.0)["setpoint"] < 10
 
 
 def test_slow_radio_gets_rarer_setpoints_held_longer(air):
     air.flight.scale_setpoints(0.1)
-    places = iter(np.linspace(0.2, 0.8, 1000))
-    setpoint = air.flight.set_target
-    air.flight.set_target = lambda now, _: setpoint(now, (0.1, next(places), 0.5, 0.0))
+    air.target = sweep(*np.linspace(0.2, 0.8, 1000))
     begin = air.now
-    air.pass_(4.0)
-    sent = [at for at in air.times("setpoint") if at > begin]
-    assert np.diff(sent).min() > 0.9 / module.SLOWEST_HZ
-    assert np.diff(sent).max() < 0.5 * air.flight.hold_s
+    gaps = np.diff(air.pass_(4.0).times("setpoint", since=begin))
+    assert gaps.min() > 0.9 / module.SLOWEST_HZ
+    assert gaps.max() < 0.5 * air.flight.hold_s
 
 
-def test_end_of_climb_is_held_until_first_setpoint(monkeypatch):
-    """By the robot's loop, which may wait for others; without it, the drone is landed."""
-    air = Air(monkeypatch)
-    air.telemetry.settled, air.telemetry.pose = True, [0.1, 0.2, 0.0, 0.0, 0.0, 0.0, 0.0]
-    air.flying = False
+def test_setpoints_of_others_end_in_flight(air):
+    """Before a start: at once where the drone reports that it follows no plan, else every second."""
+    air.telemetry.reports_plans, air.info = True, air.info | Info.PLANNER_ACTIVE
+    assert 1 <= len(air.pass_(2.0).times("send_notify_setpoint_stop")) <= 3
+    air.info &= ~Info.PLANNER_ACTIVE
     air.pass_(0.1)
-    air.flight.takeoff(0.5)
-    air.flying, setpoint = True, air.flight.set_target
-    air.flight.set_target = lambda now, _: setpoint(now, None)
-    air.pass_(6.0)
-    assert air.flight.phase is FlightPhase.CLIMBING
-    held = air.times("setpoint")
-    assert held[0] - air.times("climb")[-1] < 1.5 + HOLD_S
-    assert np.diff(held).max() < 0.5 * HOLD_S
-    air.flight.set_target = lambda _now, _: None
-    air.pass_(2.0)
-    assert air.flight.phase is FlightPhase.LANDING
+    found = air.during(0.5)
+    assert [what for _, what in air.sent][:2] == ["send_notify_setpoint_stop", "setpoint"]
+    assert found["send_notify_setpoint_stop"] == found["setpoint"]
 
 
-def test_emergency_stop_is_repeated_until_answered(air):
-    air.flight.stop()
-    before = air.now
-    air.pass_(10.0)
-    assert len(air.times("send_emergency_stop")) > 400
-    assert not [at for at in air.times("setpoint") if at > before]
-    assert air.flight.airborne
-    assert air.flight.trouble == UNANSWERED
-    air.info |= Info.LOCKED
-    air.pass_(0.04)
-    assert air.flight.phase is FlightPhase.STOPPED
-    assert not air.flight.airborne
-    assert air.flight.trouble == ""
+def test_stalled_process_sends_no_stale_setpoint(air):
+    """Between the choice of a setpoint and its start, too; then the robot's loop has been silent, and it lands."""
     air.sent.clear()
-    air.pass_(5.0)
+    chosen = air.now
+    air.now += 3.0
+    air.flight.stream(chosen + 0.2)
     assert air.sent == []
+    air.flight.send_due(air.now)
+    assert {what for _, what in air.sent} == {"land", "send_notify_setpoint_stop"}
 
 
-def test_firmware_without_lock_flag_stops_once_not_flying(air):
-    air.flight.stop()
+@pytest.mark.parametrize(("age", "written"), [(0.4, False), (0.2, True)])
+def test_setpoints_of_old_poses_are_ignored(air, age, written):
+    air.telemetry.pose_time, before = air.now - age, air.written
+    air.flight.set_target(air.now, (1.0, 0.2, 0.5, 0.0))
+    air.flight.stream(air.now + 1.0)
+    assert (air.written > before) == written
+
+
+def test_an_old_status_tells_of_an_earlier_phase(air):
+    """Behind a full queue: `flying` of before the take-off's end, `not flying` of before the take-off."""
     air.flying = False
-    air.pass_(2.2)
-    assert air.flight.phase is FlightPhase.STOPPED
-
-
-def test_a_stop_outlives_the_link(monkeypatch):
-    air = Air(monkeypatch).fly()
-    air.flight.stop()
-    air.flight.mark_out_of_reach()
-    assert air.flight.airborne
-    assert air.flight.resume()
-    air.sent.clear()
-    air.pass_(0.1)
-    assert air.times("send_emergency_stop")
-
-
-def test_one_that_stands_is_not_locked(monkeypatch):
-    air = Air(monkeypatch)
-    air.flying = False
-    air.pass_(0.1)
-    air.flight.stop()
-    assert air.sent == []
-
-
-def test_drone_flying_unasked_is_landed_and_not_cut(monkeypatch):
-    """Its take-off was given up, or another session began it: the flag of the supervisor counts."""
-    air = Air(monkeypatch)
-    air.telemetry.pose = [0.1, 0.2, 0.8, 0.0, 0.0, 0.0, 0.0]
-    air.pass_(0.1)
-    assert air.flight.phase is FlightPhase.LANDING
-    assert air.flight.airborne
-    assert air.times("land")
-    assert not air.times("send_emergency_stop")
-
-
-def test_a_take_off_without_an_answer_goes_on(monkeypatch):
-    air = Air(monkeypatch)
-    air.telemetry.settled, air.flying, air.telemetry.pose = True, False, (0.0,) * 7
-    air.pass_(0.1)
-    air.flight.takeoff(0.5)
-    assert air.flight.phase is FlightPhase.CLIMBING
-    air.pass_(1.0)
-    assert air.flight.trouble == ""
-    air.pass_(3.0)  # its motors never turn
-    assert air.flight.phase is FlightPhase.GROUND
-    assert air.flight.trouble == "its motors do not turn"
+    for _ in range(200):
+        air.now += 0.02
+        air.telemetry.arrival, air.telemetry.status_time = air.now, 100.0
+        air.flight.set_target(air.now, PLACE)
+        air.flight.update_phase(air.now)
+    assert air.phase is FlightPhase.FLYING
 
 
 @pytest.mark.parametrize(
@@ -221,7 +257,7 @@ def test_a_take_off_without_an_answer_goes_on(monkeypatch):
 )
 def test_after_a_gap(air, gap, phase):
     air.flight.land_after_gap(gap)
-    assert air.flight.phase is phase
+    assert air.phase is phase
 
 
 def test_a_drone_out_of_reach_counts_as_flying(air):
@@ -236,24 +272,71 @@ def test_a_drone_out_of_reach_counts_as_flying(air):
     assert "motors may be on" in air.flight.trouble
     air.telemetry.info = air.info
     assert not air.flight.resume()
-    assert air.flight.phase is FlightPhase.GROUND
+    assert air.phase is FlightPhase.GROUND
+
+
+def test_nothing_is_ordered_into_a_silent_radio(air):
+    """Neither for setpoints that are not confirmed nor for a landing: packets would wait for the end of the gap."""
+    air.pass_(1.0)
+    air.flight.link.busy = True
+    assert air.during(2.9) == {}
+    air.flight.link.busy = False
+    air.flight.land()
+    air.flight.link.busy = True
+    assert air.during(1.5) == {}
+
+
+# ---------------------------------------------------------------------- landing
+
+
+def test_unanswered_landing_is_ordered_again(air):
+    air.sent.clear()
+    air.flight.land()
+    assert air.phase is FlightPhase.LANDING
+    assert not air.times("setpoint"), "a start would make the planner forget the landing"
+    assert len(air.times("land")) == module.TRIES
+    air.telemetry.pose = (0.0,) * 7
+    assert 2 < air.during(air.flight.span_s)["land"] < 5
+    assert air.during(module.AGAIN_S)["land"] == module.TRIES
+
+
+def test_setpoints_of_others_end_at_each_landing(air):
+    """Before the order to land; and again, because those that follow mute or end it."""
+    air.sent.clear()
+    air.flight.land()
+    air.telemetry.pose = (0.0,) * 7
+    air.pass_(air.flight.span_s)
+    assert [what for _, what in air.sent] == ["send_notify_setpoint_stop", "land"] * (len(air.sent) // 2)
+    repeated = air.times("land")[module.TRIES :]
+    assert np.diff(repeated).max() < 0.6, "the drone locks 2 s after the last setpoint of the other"
+    assert repeated[-1] < air.flight.phase_since + air.flight.span_s - module.NEAR_S
+    air.replies[HighLevel.LAND] = 1, 0
+    air.pass_(0.1)
+    assert air.now - air.flight.phase_since < 0.2, "it was not landing any more"
+
+
+def test_drone_flying_unasked_is_landed_and_not_cut(monkeypatch):
+    """Its take-off was given up, or another session began it: the flag of the supervisor counts."""
+    air = Air(monkeypatch)
+    air.telemetry.pose = [0.1, 0.2, 0.8, 0.0, 0.0, 0.0, 0.0]
+    assert air.pass_(0.1).phase is FlightPhase.LANDING
+    assert air.flight.airborne
+    assert air.times("land")
+    assert not air.times("send_emergency_stop")
 
 
 @pytest.mark.parametrize("pose", [0.3, math.nan])
 @pytest.mark.parametrize("set_point", [False, True])
-def test_landing_lasts_from_the_highest_place(monkeypatch, pose, set_point):
+def test_landing_lasts_from_the_highest_place(ground, pose, set_point):
     """In a gap the drone climbs on; an estimate may be below what motion capture sees."""
-    air = Air(monkeypatch)
-    air.telemetry.settled, air.flying, air.telemetry.pose = True, False, (0.0,) * 7
-    air.pass_(0.1)
-    air.flight.takeoff(2.0)
-    air.flying = True
+    ground.flight.takeoff(2.0)
+    ground.flying = True
     if set_point:
-        air.flight.set_target(air.now, (0.0, 0.0, 2.0, 0.0))
-        air.flight.stream(air.now + 1.0)
-    air.telemetry.pose = (0.0, 0.0, pose, *(0.0,) * 4)
-    air.flight.land_after_gap(0.9)
-    assert air.flight.span_s == pytest.approx(2.1 / module.DESCENT)
+        ground.flight.set_target(ground.now, (0.0, 0.0, 2.0, 0.0))
+        ground.flight.stream(ground.now + 1.0)
+    ground.telemetry.pose = (0.0, 0.0, pose, *(0.0,) * 4)
+    ground.flight.land_after_gap(0.9)
+    assert ground.flight.span_s == pytest.approx(2.1 / module.DESCENT)
 
 
 @pytest.mark.parametrize("height", [0.2, 0.8, 8.0])
@@ -271,156 +354,50 @@ def test_the_height_seen_from_outside_counts(air):
     assert air.flight.span_s == pytest.approx(1.6 / module.DESCENT)
 
 
-def test_setpoints_of_others_end_at_each_landing(air):
-    """Before the order to land; and again, because those that follow mute or end it."""
-    air.sent.clear()
-    air.flight.land()
-    air.telemetry.pose = [0.0] * 7
-    air.pass_(air.flight.span_s)
-    assert [what for _, what in air.sent] == ["send_notify_setpoint_stop", "land"] * (len(air.sent) // 2)
-    repeated = air.times("land")[module.TRIES :]
-    assert np.diff(repeated).max() < 0.6, "the drone locks 2 s after the last setpoint of the other"
-    assert repeated[-1] < air.flight.phase_since + air.flight.span_s - module.NEAR_S
-    air.replies[HighLevel.LAND] = 1, 0
-    air.pass_(0.1)
-    assert air.now - air.flight.phase_since < 0.2, "it was not landing any more"
-
-
-def test_nothing_is_ordered_into_a_silent_radio(air):
-    """Neither for setpoints that are not confirmed nor for a landing: packets would wait for the end of the gap."""
-    air.pass_(1.0)
-    air.flight.link.busy = True
-    air.sent.clear()
-    air.pass_(2.9)
-    assert air.sent == []
-    air.flight.link.busy = False
-    air.flight.land()
-    air.flight.link.busy = True
-    air.sent.clear()
-    air.pass_(1.5)
-    assert air.sent == []
-
-
 def test_landing_on_a_table_ends(air):
     """Where it stands is as high as it would fly if another client had ended the landing: a few more attempts."""
     air.flight.land()
     orders, begun, end = len(air.times("land")), 1, air.now + air.flight.span_s
     for _ in range(1500):
         air.flying = air.now < end + 2.0
-        air.pass_(0.02)
-        answered = len(air.times("land"))
+        answered = len(air.pass_(0.02).times("land"))
         if answered > orders:
             accepted = air.now > end
             orders, air.replies[HighLevel.LAND] = answered, (answered, LogStatus.OK if accepted else LogStatus.REFUSED)
             begun, end = begun + accepted, air.now + air.flight.span_s if accepted else end
     assert begun == 1 + module.LATE_LANDINGS
-    assert air.flight.phase is FlightPhase.GROUND
+    assert air.phase is FlightPhase.GROUND
 
 
-def test_setpoints_of_others_end_in_flight(air):
-    """Before a start: at once where the drone reports that it follows no plan, else every second."""
-    air.telemetry.reports_plans, air.info = True, air.info | Info.PLANNER_ACTIVE
-    air.pass_(2.0)
-    assert 1 <= len(air.times("send_notify_setpoint_stop")) <= 3
-    air.info &= ~Info.PLANNER_ACTIVE
-    air.pass_(0.1)
-    air.sent.clear()
-    air.pass_(0.5)
-    assert [what for _, what in air.sent][:2] == ["send_notify_setpoint_stop", "setpoint"]
-    assert len(air.times("send_notify_setpoint_stop")) == len(air.times("setpoint"))
+# ---------------------------------------------------------------------- emergency stop
 
 
-@pytest.mark.parametrize("order", ["stop", "land"])
-def test_order_while_arming_disarms(monkeypatch, order):
-    """It is repeated until the status confirms it."""
-    air = Air(monkeypatch)
-    air.telemetry.settled, air.flying, air.info, air.telemetry.pose = True, False, Info(0), (0.0,) * 7
-    air.pass_(0.1)
-    pause = air.pause
-
-    def replaced(seconds):
-        pause(seconds)
-        if air.times("send_arming_request"):
-            raise RuntimeError
-
-    air.flight._pause = replaced
-    with pytest.raises(RuntimeError):
-        air.flight.takeoff(0.5)
-    air.flight._pause, air.info = pause, Info.ARMED
-    air.sent.clear()
-    getattr(air.flight, order)()
-    air.pass_(1.0)
-    assert {what for _, what in air.sent} == {"send_arming_request"}
-    assert 4 < len(air.sent) < 10
-    air.info = Info(0)
-    air.sent.clear()
-    air.pass_(1.0)
-    assert air.sent == []
+def test_emergency_stop_is_repeated_until_answered(air):
+    air.flight.stop()
+    found = air.during(10.0)
+    assert (found["send_emergency_stop"] > 400, found["setpoint"]) == (True, 0)
+    assert air.flight.airborne
+    assert air.flight.trouble == UNANSWERED
+    air.info |= Info.LOCKED
+    assert air.pass_(0.04).phase is FlightPhase.STOPPED
+    assert (air.flight.airborne, air.flight.trouble) == (False, "")
+    assert air.during(5.0) == {}
 
 
-def test_no_take_off_with_a_wrong_yaw(air):
-    """The decision turns by the yaw from outside, the firmware by its own."""
-    air.telemetry.settled = True
-    air.flight.note_external(0.0, 0.3)
-    assert air.flight.takeoff_refusal() == ""
-    air.flight.note_external(0.0, 0.5 + math.tau)
-    assert "its own yaw is 29° beside" in air.flight.takeoff_refusal()
-
-
-def test_stalled_process_sends_no_stale_setpoint(air):
-    """Between the choice of a setpoint and its start, too; then the robot's loop has been silent, and it lands."""
-    air.sent.clear()
-    chosen = air.now
-    air.now += 3.0
-    air.flight.stream(chosen + 0.2)
-    assert air.sent == []
-    air.flight.send_due(air.now)
-    assert {what for _, what in air.sent} == {"land", "send_notify_setpoint_stop"}
-
-
-def test_an_old_status_tells_of_an_earlier_phase(air):
-    """Behind a full queue: `flying` of before the take-off's end, `not flying` of before the take-off."""
+def test_firmware_without_lock_flag_stops_once_not_flying(air):
+    air.flight.stop()
     air.flying = False
-    for _ in range(200):
-        air.now += 0.02
-        air.telemetry.arrival, air.telemetry.status_time = air.now, 100.0
-        air.flight.set_target(air.now, PLACE)
-        air.flight.update_phase(air.now)
-    assert air.flight.phase is FlightPhase.FLYING
+    assert air.pass_(2.2).phase is FlightPhase.STOPPED
 
 
-def test_setpoints_of_old_poses_are_ignored(air):
-    air.telemetry.pose_time = air.now - 0.4
-    air.flight.set_target(air.now, (1.0, 0.2, 0.5, 0.0))
-    air.flight.stream(air.now + 1.0)
-    assert air.flight._target == PLACE
+def test_a_stop_outlives_the_link(air):
+    air.flight.stop()
+    air.flight.mark_out_of_reach()
+    assert air.flight.airborne
+    assert air.flight.resume()
+    assert air.during(0.1)["send_emergency_stop"]
 
 
-@pytest.mark.parametrize("info", [Info.CRASHED, Info.TUMBLED])
-def test_crashed_drone_is_not_recovered_by_take_off(monkeypatch, info):
-    air = Air(monkeypatch)
-    air.telemetry.settled, air.flying, air.info = True, False, Info.ARMED | info
-    air.pass_(0.1)
-    air.flight.takeoff(0.5)
-    assert air.flight.phase is FlightPhase.GROUND
-    assert "no take-off" in air.flight.trouble
-    assert air.sent == []
-
-
-def test_armed_is_not_yet_able_to_fly(monkeypatch):
-    """Motors that are checked after arming: no take-off before the supervisor permits it, and one request to arm."""
-    air = Air(monkeypatch)
-    air.telemetry.settled, air.flying, air.info, air.telemetry.pose = True, False, Info.ARMED, (0.0,) * 7
-    air.pass_(0.1)
-    pause = air.pause
-
-    def spun_up(seconds):
-        pause(seconds)
-        if air.now > 101.5:
-            air.telemetry.info = Info.ARMED | Info.CAN_FLY
-
-    air.flight._pause = spun_up
-    air.flight.takeoff(0.5)
-    assert air.flight.phase is FlightPhase.CLIMBING
-    assert min(air.times("climb")) > 101.5
-    assert air.times("send_arming_request") == []
+def test_one_that_stands_is_not_locked(ground):
+    ground.flight.stop()
+    assert ground.sent == []

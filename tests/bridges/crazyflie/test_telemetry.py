@@ -7,59 +7,45 @@ from agents.protocols.crtp import Info
 from bridges.crazyflie.telemetry import PacketAge, Telemetry
 
 
-def ages(packets):
-    """Ages of packets, each given as stamp [ms] and arrival [s]."""
+@pytest.mark.parametrize(
+    ("packets", "ages"),
+    [
+        # ten poses a second are measured, five arrive: the tenth is a second old, although it arrives like the first
+        pytest.param([(1000 + 100 * k, 50.0 + 0.2 * k) for k in range(11)], [0.1 * k for k in range(11)], id="queue"),
+        pytest.param([(1000, 50.03), (1100, 50.11), (1200, 50.25), (1300, 50.31)], [0, 0, 0.04, 0], id="fastest"),
+        pytest.param([((1 << 24) - 50, 50.0), (50, 50.1), (150, 50.5)], [0, 0, 0.3], id="overflow"),
+    ],
+)
+def test_age_is_lateness_behind_the_fastest_packet(packets, ages):
     stamps = PacketAge()
-    return [stamps.age(arrival, stamp) for stamp, arrival in packets]
-
-
-def test_a_queue_makes_poses_old():
-    """Ten poses a second are measured, five arrive: the tenth is a second old, although it arrives like the first."""
-    found = ages([(1000 + 100 * number, 50.0 + 0.2 * number) for number in range(11)])
-    assert found[0] == 0.0
-    assert found[10] == pytest.approx(1.0, abs=1e-3)
-
-
-def test_the_fastest_packet_is_the_measure():
-    found = ages([(1000, 50.03), (1100, 50.11), (1200, 50.25), (1300, 50.31)])
-    assert found == pytest.approx([0.0, 0.0, 0.04, 0.0], abs=1e-4)
-
-
-def test_stamps_overflow():
-    found = ages([((1 << 24) - 50, 50.0), (50, 50.1), (150, 50.5)])
-    assert found == pytest.approx([0.0, 0.0, 0.3], abs=1e-3)
+    assert [stamps.age(arrival, stamp) for stamp, arrival in packets] == pytest.approx(ages, abs=1e-3)
+    assert not stamps.restarted
 
 
 def test_clocks_drift():
     """A drone whose clock is 50 ppm slow for an hour: its poses do not seem to grow old."""
-    found = ages([(int(1000 * second * (1.0 - 50e-6)) % (1 << 24), 50.0 + second) for second in range(3600)])
-    assert max(found) < 2e-3
-
-
-def test_a_drone_that_was_switched_off_and_on():
     stamps = PacketAge()
-    stamps.age(50.0, 100_000)
-    assert not stamps.restarted
-    assert stamps.age(52.0, 500) == 0.0
-    assert stamps.restarted
+    assert max(stamps.age(50.0 + s, int(1000 * s * (1.0 - 50e-6)) % (1 << 24)) for s in range(3600)) < 2e-3
 
 
-def test_restart_half_an_overflow_later():
-    """On a charger for hours: the stamp of the new start is ahead of the old one, counted around."""
+@pytest.mark.parametrize(
+    ("before", "arrival", "stamp", "anew", "restarted"),
+    [
+        (100_000, 52.0, 500, False, True),
+        (10_000_000, 53.0, 2_000, False, True),  # on a charger for hours: ahead of the old stamp, counted around
+        # switched off and on soon after its first start: ten seconds later its clock has advanced by three
+        (5_000, 60.0, 8_000, True, True),
+        (5_000, 60.0, 14_000, True, False),
+        (5_000, 60.0, 15_000, True, False),
+    ],
+)
+def test_a_drone_that_was_switched_off_and_on(before, arrival, stamp, anew, restarted):
     stamps = PacketAge()
-    stamps.age(50.0, 10_000_000)
-    assert stamps.age(53.0, 2_000) == 0.0
-    assert stamps.restarted
-
-
-@pytest.mark.parametrize(("stamp", "restarted"), [(15_000, False), (14_000, False), (8_000, True)])
-def test_restart_found_with_a_larger_stamp(stamp, restarted):
-    """Switched off and on soon after its first start: ten seconds later its clock has advanced by three."""
-    stamps = PacketAge()
-    stamps.age(50.0, 5_000)
-    stamps.connected_anew = True
-    stamps.age(60.0, stamp)
+    stamps.age(50.0, before)
+    stamps.connected_anew = anew
+    age = stamps.age(arrival, stamp)
     assert stamps.restarted is restarted
+    assert not restarted or age == 0.0
 
 
 class Blocks:
@@ -73,8 +59,12 @@ class Blocks:
         self.logged[name] = logged
 
 
-def test_poses_carry_the_time_of_their_measurement():
-    telemetry = Telemetry(lighthouse=False)
+@pytest.fixture
+def telemetry():
+    return Telemetry(lighthouse=False)
+
+
+def test_poses_carry_the_time_of_their_measurement(telemetry):
     blocks = Blocks(telemetry)
     state = {"stateEstimateZ.x": 1500, "stateEstimateZ.vy": -20, "stateEstimate.yaw": 90.0}
     blocks.logged["state"](10.0, 5000, state)
@@ -83,8 +73,7 @@ def test_poses_carry_the_time_of_their_measurement():
     assert telemetry.pose_time == pytest.approx(10.02, abs=1e-3)
 
 
-def test_charge_by_the_voltage_under_load():
-    telemetry = Telemetry(lighthouse=False)
+def test_charge_by_the_voltage_under_load(telemetry):
     blocks = Blocks(telemetry)
 
     def after(seconds, volts, info):
@@ -100,3 +89,13 @@ def test_charge_by_the_voltage_under_load():
     sagged = after(0.2, 3.1, Info.CAN_FLY | Info.FLYING)
     assert sagged > 0.6, "a short load is no empty battery"
     assert after(10.0, 3.25, Info.CAN_FLY | Info.FLYING) < 0.1, "low at 3.27 V, before the firmware's own 3.2 V"
+
+
+def test_firmware_without_supervisor(telemetry):
+    """What older firmwares say instead is enough to take off and to land."""
+    flags = {"pm.state": 3, "sys.canfly": 1, "sys.isFlying": 1, "sys.isTumbled": 0}
+    Blocks(telemetry).logged["state"](1.0, 0, {"pm.vbat": 3.55, **flags})
+    assert telemetry.info == Info.ARMED | Info.CAN_FLY | Info.FLYING
+    assert telemetry.battery == pytest.approx(0.5)
+    assert telemetry.battery_low
+    assert telemetry.status_text() == "battery low"

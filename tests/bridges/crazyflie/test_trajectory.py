@@ -1,7 +1,6 @@
 """Trajectories that end on the floor, as the twin's memory and planner read them."""
 
 import array
-import types
 
 import numpy as np
 import pytest
@@ -11,6 +10,8 @@ from agents.protocols.crazyradio import COUNTERS, NULL
 from agents.protocols.crtp import HighLevel, MemoryKind, Port
 from bridges.crazyflie import trajectory as module
 from bridges.crazyflie.trajectory import COMPRESSED, HOLD_S, POLYNOMIALS, REPEAT_S, SINK, START_EXPIRY_S, TAKEOFFS
+from tests.bridges.crazyflie_clock import clocked
+from tests.waiting import ManualClock
 from twins.devices.crazyflie.memory import Memories
 from twins.devices.crazyflie.planner import OnboardPlanners, evaluate, polynomial
 from twins.devices.crazyflie.trajectories import Trajectories
@@ -19,13 +20,13 @@ DT = 0.01
 TOUCHES = 0.5  # [m/s] faster at the floor is no landing
 
 
-class Board:
-    """Memory, planner and answers of a Crazyflie; `lost`: so many answers about the memory do not come."""
+class Board(ManualClock):
+    """Clock, memory, planner and answers of a Crazyflie; `lost`: so many answers about the memory do not come."""
 
     def __init__(self, monkeypatch):
+        super().__init__(100.0)
         self.memories, self.planner, self.lost = Memories(), OnboardPlanners(1), 0
-        self.now = 100.0
-        monkeypatch.setattr(module, "time", types.SimpleNamespace(monotonic=lambda: self.now))
+        clocked(monkeypatch, self)
         self.trajectories = Trajectories(self.memories)
         self.sent, self.started = [], []
         self.client = module.TrajectoryMemory(self.receive)
