@@ -6,67 +6,72 @@ import json
 import os
 import signal
 import subprocess
-import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
 from agents.network import messages, pubsub
 from agents.network import session as network
-from tests.bridges.test_external import ALONE, KEYS, PLACES
+from agents.network.keys import Keys
+from tests.commands import started
 from tests.conftest import ROOT, RouterProcess
 from tests.system.lab import Flight, RobotProcess, Watcher, until
 
+PLACES = {"KH01": (-0.6, -0.5), "KH02": (0.6, -0.5), "CF01": (0.1, 0.6)}
+SIMULATOR = Path(__file__).with_name("simulator.py")
+TAKES = {"KH": "twist", "CF": "position", "TE": "velocity"}
 
-class Simulator:
+
+@contextmanager
+def simulator(endpoint: str, *names: str) -> Iterator[subprocess.Popen[str]]:
     """tests/bridges/simulator.py, which knows nothing of zenpark."""
+    places = {name: PLACES.get(name, (0.0, 0.0)) for name in names}
+    robots = [f"{name}:{TAKES[name[:2]]}:{x}:{y}:0" for name, (x, y) in places.items()]
+    alone = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    with started(SIMULATOR, endpoint, *robots, cwd="/", env=alone, stderr=None) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        yield process
 
-    def __init__(self, endpoint: str, *names: str) -> None:
-        takes = {"KH": "twist", "CF": "position", "TE": "velocity"}
-        robots = [f"{n}:{takes[n[:2]]}:{':'.join(map(str, {**PLACES, **ALONE}[n]))}:0" for n in names]
-        environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
-        self.process = subprocess.Popen(
-            [sys.executable, str(Path(__file__).with_name("simulator.py")), endpoint, *robots],
-            cwd="/",
-            env=environment,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        assert self.process.stdout is not None
-        assert self.process.stdout.readline() == "ready\n"
 
-    def kill(self) -> None:
-        self.process.kill()
-        self.process.wait(30)
-        assert self.process.stdout is not None
-        self.process.stdout.close()
+@contextmanager
+def process_of(endpoint: str, file: Path, *names: str) -> Iterator[RobotProcess]:
+    made = RobotProcess(endpoint, file, *names)
+    try:
+        yield made
+    finally:
+        if made.process.returncode is None:
+            made.end()
 
 
 @pytest.fixture
-def simulator(router: RouterProcess) -> Iterator[Simulator]:
-    made = Simulator(router.endpoint, *PLACES)
+def watcher(router: RouterProcess) -> Iterator[Watcher]:
+    made = Watcher(router.endpoint)
     yield made
-    made.kill()
+    made.close()
 
 
-def elsewhere(*names: str) -> list[str]:
-    return [part for name in names for part in ("--set", f'robots.{name}.body="external"')]
+def take_off(watcher: Watcher, name: str) -> None:
+    watcher.until(lambda: watcher.phase(name) == "ready", "it is ready")
+    assert watcher.order(name, messages.Order("takeoff")).ok
 
 
 def test_the_simulator_owes_nothing_to_zenpark() -> None:
-    text = Path(__file__).with_name("simulator.py").read_text()
-    imported = {line.split()[1] for line in text.splitlines() if line.startswith(("import", "from"))}
-    assert imported == {"json", "math", "sys", "time", "zenoh"}
+    lines = SIMULATOR.read_text().splitlines()
+    assert {line.split()[1] for line in lines if line.startswith(("import", "from"))} == {
+        "json", "math", "sys", "time", "zenoh",
+    }  # fmt: skip
 
 
 @pytest.mark.system
-def test_the_triangle_forms_up_in_a_strangers_simulator(
-    router: RouterProcess, simulator: Simulator, tmp_path: Path
-) -> None:
-    settings = [*elsewhere(*PLACES), "--set", f'network.connect=["{router.endpoint}"]', "--set", "duration_s=8"]
-    flight = Flight(tmp_path / "run", "triangle", "--json", "--no-report", "--case", "event", *settings)
-    code, out = flight.finish(60.0)
+def test_the_triangle_forms_up_in_a_strangers_simulator(router: RouterProcess, tmp_path: Path) -> None:
+    elsewhere = [part for name in PLACES for part in ("--set", f'robots.{name}.body="external"')]
+    settings = [*elsewhere, "--set", f'network.connect=["{router.endpoint}"]', "--set", "duration_s=8"]
+    with simulator(router.endpoint, *PLACES):
+        flight = Flight(tmp_path / "run", "triangle", "--json", "--no-report", "--case", "event", *settings)
+        code, out = flight.finish(60.0)
     assert code == 0, out
     robots = json.loads(out)["cases"]["event"]["robots"]
     assert set(robots) == set(PLACES)
@@ -77,63 +82,46 @@ def test_the_triangle_forms_up_in_a_strangers_simulator(
 
 @pytest.mark.mechanism("foreign simulator hangs")
 @pytest.mark.system
-def test_hanging_simulator_lands_its_robots_and_others_stay(router: RouterProcess, tmp_path: Path) -> None:
-    flying = Simulator(router.endpoint, "CF01")
-    watcher = Watcher(router.endpoint)
+def test_hanging_simulator_lands_its_robots_and_others_stay(
+    router: RouterProcess, watcher: Watcher, tmp_path: Path
+) -> None:
     file = ROOT / "experiments" / "catalogue" / "triangle.toml"
     text = file.read_text().replace('kind = "crazyflie" ', 'body = "external"\nkind = "crazyflie" ')
     assert "external" in text
     changed = tmp_path / "triangle.toml"
     changed.write_text(text)
-    robots = RobotProcess(router.endpoint, changed, "KH01", "KH02", "CF01")
-    try:
-        watcher.until(lambda: watcher.phase("CF01") == "ready", "it is ready")
-        assert watcher.order("CF01", messages.Order("takeoff")).ok
-        assert watcher.order("KH01", messages.Order("takeoff")).ok
+    with simulator(router.endpoint, "CF01") as flying, process_of(router.endpoint, changed, *PLACES):
+        take_off(watcher, "CF01")
+        take_off(watcher, "KH01")
         watcher.until(lambda: watcher.phase("CF01") == "airborne", "it is up")
-        flying.process.send_signal(signal.SIGSTOP)
+        flying.send_signal(signal.SIGSTOP)
         watcher.until(lambda: watcher.phase("CF01") == "landing", "silence is noticed")
         assert watcher.status["CF01"].reason == "its own position is lost"
         assert watcher.phase("KH01") == "airborne"
-        flying.process.send_signal(signal.SIGCONT)
+        flying.send_signal(signal.SIGCONT)
         watcher.until(lambda: watcher.phase("CF01") == "done", "it lands as soon as the simulator goes on")
         assert watcher.state["CF01"].position[2] < 0.1
         assert watcher.phase("KH01") == "airborne"
-    finally:
-        flying.process.send_signal(signal.SIGCONT)
-        robots.end()
-        flying.kill()
-        watcher.close()
 
 
 @pytest.mark.system
-def test_dead_robot_process_is_landed_by_simulator(router: RouterProcess, tmp_path: Path) -> None:
+def test_dead_robot_process_is_landed_by_simulator(router: RouterProcess, watcher: Watcher, tmp_path: Path) -> None:
     """What `docs/external-simulators.md` asks of a simulator, kept by ours."""
     file = tmp_path / "alone.toml"
     file.write_text(
         'title = "alone"\nduration_s = 30.0\n[arena]\nsize = [2.0, 2.0, 2.0]\n'
         '[robots.TE01]\nkind = "tello"\nbody = "external"\nstart = [0.0, 0.0]\nhover = 0.6\n'
     )
-    simulator = Simulator(router.endpoint, "TE01")
-    watcher = Watcher(router.endpoint)
-    positions = pubsub.subscriber(watcher.session, KEYS.position("TE01"), 64)
-    height = [0.0]
+    positions, heights = pubsub.subscriber(watcher.session, Keys().position("TE01"), 64), [0.0]
 
     def look() -> float:
-        for sample in network.received(positions.handler):
-            height[0] = json.loads(sample.payload.to_string())["position"][2]
-        return height[0]
+        told = [json.loads(sample.payload.to_string()) for sample in network.received(positions.handler)]
+        heights.extend(each["position"][2] for each in told)
+        return heights[-1]
 
-    robot = RobotProcess(router.endpoint, file, "TE01")
-    try:
-        watcher.until(lambda: watcher.phase("TE01") == "ready", "it is ready")
-        assert watcher.order("TE01", messages.Order("takeoff")).ok
+    with simulator(router.endpoint, "TE01"), process_of(router.endpoint, file, "TE01") as robot:
+        take_off(watcher, "TE01")
         watcher.until(lambda: watcher.phase("TE01") == "airborne", "it is up")
         assert look() == pytest.approx(0.6, abs=0.06)
         robot.kill()
         until(lambda: look() < 0.02, "it is down")
-    finally:
-        if robot.process.returncode is None:
-            robot.end()
-        simulator.kill()
-        watcher.close()
