@@ -135,10 +135,19 @@ class Bridge:
     """Publishes the stream of a DataStream server; reconnects after its restarts."""
 
     def __init__(
-        self, host: str, port: int, pose_filter: PoseFilter, positions: Positions, print_line: Callable[[str], None]
+        self,
+        host: str,
+        port: int,
+        pose_filter: PoseFilter,
+        positions: Positions,
+        print_line: Callable[[str], None],
+        *,
+        connect: Callable[[str, int, float], Reader] = Reader,
+        pause_s: float = PAUSE_S,
     ) -> None:
         self._host, self._port = host, port
         self._filter, self._positions, self._print_line = pose_filter, positions, print_line
+        self._connect, self._pause_s = connect, pause_s
         self._clock = Clock()
         self._state = ""
 
@@ -152,10 +161,10 @@ class Bridge:
             if not ever and left <= 0.0:
                 return False
             try:
-                reader = Reader(self._host, self._port, ATTEMPT_S if ever else min(ATTEMPT_S, max(0.1, left)))
+                reader = self._connect(self._host, self._port, ATTEMPT_S if ever else min(ATTEMPT_S, max(0.1, left)))
             except (OSError, MalformedBlock) as error:
                 self._report_once(f"no connection to {self._host}:{self._port}: {describe_error(error)}; trying again")
-                pause.wait(PAUSE_S)
+                pause.wait(self._pause_s)
                 continue
             ever = True
             self._report_once(f"connected to {self._host}:{self._port}")
@@ -165,7 +174,7 @@ class Bridge:
                 self._report_once(f"lost {self._host}:{self._port}: {describe_error(error)}; trying again")
             finally:
                 reader.close()
-            pause.wait(PAUSE_S)
+            pause.wait(self._pause_s)
         return True
 
     def _pump(self, reader: Reader, over: Callable[[], bool]) -> None:

@@ -192,17 +192,6 @@ def test_setpoints_go_on_beside_external_positions():
         process.land()
 
 
-def test_a_session_that_begins_while_safelink_is_on():
-    """Safelink is still on from a session that ended without a word, and the air is gone as the next begins."""
-    with flown(device=RADIO) as (twin, process):
-        process.close()
-        assert twin.device.lines[0].safelink
-        twin.device.lines[0].silence(0.5)
-        with connected(twin.addresses) as again:
-            again.takeoff(HEIGHT)
-            again.cut()
-
-
 def test_queue_filling_in_the_air_ends_in_landing():
     """Twenty times as many logs as asked for, more than there are polls: answers and the status wait behind them."""
     with flown(device=RADIO, exchanges_hz=300.0) as (twin, process):
@@ -242,6 +231,7 @@ def test_a_radio_that_becomes_slow_gets_fewer_logs():
 
 
 def test_recovery_from_a_crash_is_asked_for():
+    """In another session: safelink is still on from this one, which ends without a word, and the air is gone."""
     with flown(device=RADIO) as (twin, process):
         twin.device.flock.supervisor.state[0] = SupervisorState.CRASHED
         process.noted("crashed: put it upright")
@@ -249,6 +239,8 @@ def test_recovery_from_a_crash_is_asked_for():
         process.until(lambda: "no take-off: crashed" in process.state.note[0] and not process.state.flying[0], "no")
         assert supervised(twin) == SupervisorState.CRASHED
         process.close()
+        assert twin.device.lines[0].safelink
+        twin.device.lines[0].silence(0.5)
         with connected(twin.addresses, device={"recover": True}) as again:
             again.takeoff(HEIGHT)
             again.cut()

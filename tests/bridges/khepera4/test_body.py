@@ -485,10 +485,20 @@ def test_process_woken_from_suspension_sends_only_a_stop():
     assert not [text for text in after if text.startswith("d 10.0")]
 
 
-@pytest.mark.system
-def test_serial_line_in_use_is_left_alone():
+@pytest.fixture
+def line():
+    """A pseudo terminal: our end, and the address of the other."""
     ours, theirs = os.openpty()
-    address = KheperaAddress.parse("KH01", f"kteam://{os.ttyname(theirs)}")
+    tty.setraw(theirs)
+    yield ours, f"kteam://{os.ttyname(theirs)}"
+    os.close(ours)
+    os.close(theirs)
+
+
+@pytest.mark.system
+def test_serial_line_in_use_is_left_alone(line):
+    ours, place = line
+    address = KheperaAddress.parse("KH01", place)
     first, link = address.connect(), link_of(address)
     link.start()
     try:
@@ -498,14 +508,11 @@ def test_serial_line_in_use_is_left_alone():
         link.end()
         first.close()
     address.connect().close()  # free again
-    os.close(ours)
-    os.close(theirs)
 
 
-def test_kteam_over_a_serial_line():
-    """A pseudo terminal with the twin's side of the protocol at its other end."""
-    ours, theirs = os.openpty()
-    tty.setraw(theirs)
+def test_kteam_over_a_serial_line(line):
+    """The twin's side of the protocol at its other end."""
+    ours, place = line
     device = KheperaDevice(DeviceRequest(replace(ONE, device=(KTEAM,)), Faults()))
     ending, heard = threading.Event(), []
 
@@ -514,14 +521,14 @@ def test_kteam_over_a_serial_line():
         while not ending.is_set():
             if select.select([ours], [], [], 0.02)[0]:
                 *lines, begun = (begun + os.read(ours, 255)).split(b"\r")
-                for line in map(bytes.decode, lines):
-                    heard.append(line)
-                    os.write(ours, f"{answer_kteam(device.servers[0].robot, line)}\r\n".encode())
+                for text in map(bytes.decode, lines):
+                    heard.append(text)
+                    os.write(ours, f"{answer_kteam(device.servers[0].robot, text)}\r\n".encode())
 
     server = threading.Thread(target=serve, daemon=True)
     server.start()
     try:
-        with opened(request("khepera4", [f"kteam://{os.ttyname(theirs)}"])) as driver:
+        with opened(request("khepera4", [place])) as driver:
             driver.tick()
             driver.body.command([(0.1, 0.5, 0.0, 0.0)])
             driver.until(lambda: "D,109,186" in heard)
@@ -531,7 +538,5 @@ def test_kteam_over_a_serial_line():
         ending.set()
         server.join()
         device.close()
-        os.close(ours)
-        os.close(theirs)
     assert heard[:3] == ["D,0,0", "B", "U,31"]
     assert heard[-4:] == ["D,0,0"] * 3 + ["R"]

@@ -1,18 +1,12 @@
 """The Vicon bridge: what it believes, what it says, what it survives; and what robots make of it."""
 
-from __future__ import annotations
-
 import math
 import signal
 import socket
-import subprocess
-import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,60 +18,70 @@ from agents.network import session as network
 from agents.network.keys import Keys
 from agents.protocols import vicon_datastream
 from agents.protocols.vicon_datastream import Segment
-from bridges.vicon import publisher
 from bridges.vicon.client import Frame
-from bridges.vicon.publisher import PoseFilter, heading, parse_maps, parse_server
+from bridges.vicon.publisher import Bridge, PoseFilter, heading, parse_maps, parse_server
 from experiments.file import document
-from tests.conftest import ROOT, RouterProcess
-from tests.system.lab import RobotProcess, Watcher, until
+from tests.commands import started
+from tests.system.lab import Looking, RobotProcess, Watcher, until
 from tests.twins import camera as cameras
+from tests.waiting import ManualClock
 from twins.devices.vicon import upright
 
 Camera = partial(cameras.Camera, sigma=1e-9)  # what repeats itself is not believed
 UPRIGHT = tuple(upright(0.3).ravel().tolist())
 
 
-def frame(
-    number: int = 1, *, latency: float = 0.0, z_up: bool = True, **poses: tuple[float, float, float] | Segment | None
-) -> Frame:
+def frame(number=1, *, latency=0.0, z_up=True, **poses):
     seen = {name: Segment(0, pose, UPRIGHT) if type(pose) is tuple else pose for name, pose in poses.items()}
-    return Frame(number, latency, seen, z_up)  # type: ignore[arg-type]
+    return Frame(number, latency, seen, z_up)
 
 
-class Frames:
-    """Stands in for a reader of the DataStream: a frame every 10 ms of a clock that this test moves."""
+@pytest.fixture
+def said():
+    """Lines for users."""
+    return []
 
-    def __init__(self, *_: object) -> None:
-        self.number = 0
 
-    def newest(self, _timeout: float) -> Frame:
+class Stream(ManualClock):
+    """A reader of the DataStream and its clock: a frame every 10 ms, the same one again and again from `last` on."""
+
+    def __init__(self, monkeypatch, said, last=math.inf):
+        super().__init__(5.0)
+        self.number, self._last, self.published = 0, last, []
+        self.wall_step = 0.0
+        monkeypatch.setattr(time, "clock_gettime", lambda _: self.now)
+        monkeypatch.setattr(time, "time", lambda: 1.8e9 + self.now + self.wall_step)
+        pose_filter = PoseFilter({"CF01": "CF01"}, said.append)
+        self.bridge = Bridge("nowhere", 1, pose_filter, self, said.append, connect=lambda *_: self, pause_s=0.0)
+
+    def newest(self, _timeout):
+        self.now += 0.01
         self.number += 1
-        Frames.steady += 0.01
-        return frame(self.number, CF01=(0.001 * self.number, 0.0, 0.5))
+        return frame(int(min(self.number, self._last)), CF01=(0.001 * self.number, 0.0, 0.5))
 
-    def close(self) -> None: ...
+    def close(self): ...
 
-    steady = 0.0
+    def publish(self, _robot, stamp, segment, _yaw):
+        self.published.append((stamp, segment.position[0]))
 
 
 @pytest.mark.parametrize("step", [-1.0, 3.0])
-def test_wall_clock_step_moves_no_position(monkeypatch: pytest.MonkeyPatch, step: float) -> None:
-    Frames.steady, wall = 5.0, 1.8e9
-    monkeypatch.setattr(publisher, "Reader", Frames)
-    monkeypatch.setattr(time, "clock_gettime", lambda _clock: Frames.steady)
-    monkeypatch.setattr(time, "time", lambda: wall + Frames.steady + (step if Frames.steady > 6.0 else 0.0))
-    stamps: list[float] = []
-
-    class Ear:
-        def publish(self, _robot: str, stamp: float, *_: object) -> None:
-            stamps.append(stamp)
-
-    pose_filter = PoseFilter({"CF01": "CF01"}, lambda _: None)
-    bridge = publisher.Bridge("nowhere", 1, pose_filter, Ear(), lambda _: None)  # type: ignore[arg-type]
-    assert bridge.run(lambda: Frames.steady > 7.0)
+def test_wall_clock_step_moves_no_position(monkeypatch, said, step):
+    stream = Stream(monkeypatch, said)
+    assert stream.bridge.run(lambda: stream.now > 6.0)
+    stream.wall_step = step
+    assert stream.bridge.run(lambda: stream.now > 7.0)
+    stamps = [stamp for stamp, _ in stream.published]
     assert len(stamps) > 150
     np.testing.assert_allclose(np.diff(stamps), 0.01, atol=1e-6)
-    assert stamps[-1] == pytest.approx(wall + Frames.steady, abs=1e-6)
+    assert stamps[-1] == pytest.approx(1.8e9 + stream.now, abs=1e-6)
+
+
+def test_a_frame_that_repeats_its_number_is_none(monkeypatch, said):
+    stream = Stream(monkeypatch, said, last=50)
+    assert stream.bridge.run(lambda: any("no new frame" in line for line in said))
+    assert [len(stream.published), stream.published[49][1]] == [50, pytest.approx(0.05)]
+    assert said[-1].startswith("lost nowhere:1: no new frame for 2 s")
 
 
 # ---------------------------------------------------------------------- what it believes
@@ -87,7 +91,7 @@ angle = st.floats(-3.1, 3.1)
 
 
 @given(angle, st.floats(-1.4, 1.4), angle, st.floats(1.01, 3.0))
-def test_heading_follows_the_nose_and_only_rotations(yaw: float, pitch: float, roll: float, scale: float) -> None:
+def test_heading_follows_the_nose_and_only_rotations(yaw, pitch, roll, scale):
     tilt = np.array([[math.cos(pitch), 0, math.sin(pitch)], [0, 1, 0], [-math.sin(pitch), 0, math.cos(pitch)]])
     bank = np.array([[1, 0, 0], [0, math.cos(roll), -math.sin(roll)], [0, math.sin(roll), math.cos(roll)]])
     turned = upright(yaw) @ tilt @ bank
@@ -97,8 +101,7 @@ def test_heading_follows_the_nose_and_only_rotations(yaw: float, pitch: float, r
         assert math.isnan(heading(wrong.ravel().tolist()))
 
 
-def test_what_was_not_seen_is_not_said() -> None:
-    said: list[str] = []
+def test_what_was_not_seen_is_not_said(said):
     pose_filter = PoseFilter({"CF01": "cf_1", "KH01": "kh_1"}, said.append)
     nan = Segment(0, (math.nan, 0.0, 0.0), UPRIGHT)
     flat = Segment(0, (0.0, 0.0, 0.0), (0.0,) * 9)
@@ -117,7 +120,7 @@ def test_what_was_not_seen_is_not_said() -> None:
     ]
 
 
-def test_jump_is_not_believed_until_it_lasts() -> None:
+def test_jump_is_not_believed_until_it_lasts():
     pose_filter = PoseFilter({"CF01": "CF01"}, lambda _: None)
     believed = []
     for tick in range(200):
@@ -137,8 +140,7 @@ def test_jump_is_not_believed_until_it_lasts() -> None:
     assert np.sort(steps)[-2:] == pytest.approx([0.01, 1.11], abs=1e-9)
 
 
-def test_a_pose_that_repeats_itself_is_not_published() -> None:
-    said: list[str] = []
+def test_a_pose_that_repeats_itself_is_not_published(said):
     pose_filter = PoseFilter({"CF01": "CF01"}, said.append)
     published = [
         tick
@@ -151,34 +153,7 @@ def test_a_pose_that_repeats_itself_is_not_published() -> None:
     assert said == [seen, frozen, seen, frozen]
 
 
-class Frozen(Frames):
-    """The same frame again and again, from the fiftieth on."""
-
-    def newest(self, timeout: float) -> Frame:
-        newest = super().newest(timeout)
-        return frame(min(newest.number, 50), CF01=newest.poses["CF01"])
-
-
-def test_a_frame_that_repeats_its_number_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
-    Frames.steady = 5.0
-    monkeypatch.setattr(publisher, "Reader", Frozen)
-    monkeypatch.setattr(publisher, "uptime", lambda: Frames.steady)
-    published: list[float] = []
-
-    class Ear:
-        def publish(self, _robot: str, _stamp: float, segment: Segment, _yaw: float) -> None:
-            published.append(segment.position[0])
-
-    said: list[str] = []
-    bridge = publisher.Bridge("nowhere", 1, PoseFilter({"CF01": "CF01"}, said.append), Ear(), said.append)  # type: ignore[arg-type]
-    monkeypatch.setattr(publisher, "PAUSE_S", 0.0)
-    assert bridge.run(lambda: any("no new frame" in line for line in said))
-    assert [len(published), published[49]] == [50, pytest.approx(0.05)]
-    assert said[-1].startswith("lost nowhere:1: no new frame for 2 s")
-
-
-def test_overtaking_frames_and_false_axes_are_left_out() -> None:
-    said: list[str] = []
+def test_overtaking_frames_and_false_axes_are_left_out(said):
     pose_filter = PoseFilter({"CF01": "CF01"}, said.append)
     assert len(pose_filter.filter_poses(frame(CF01=(0.0, 0.0, 1.0)), 1.00)) == 1
     assert pose_filter.filter_poses(frame(CF01=(0.0, 0.0, 1.0), latency=0.02), 1.01) == []  # measured before the last
@@ -190,7 +165,7 @@ def test_overtaking_frames_and_false_axes_are_left_out() -> None:
     ]
 
 
-def test_the_command_line_is_understood_or_refused() -> None:
+def test_the_command_line_is_understood_or_refused():
     assert parse_server("vicon") == ("vicon", 801)
     assert parse_server("10.0.0.7:8801") == ("10.0.0.7", 8801)
     assert parse_maps(["CF01=cf_1", "KH01"]) == {"CF01": "cf_1", "KH01": "KH01"}
@@ -206,94 +181,75 @@ def test_the_command_line_is_understood_or_refused() -> None:
 
 
 class BridgeProcess:
-    """`python -m bridges.vicon.publisher` and what it says."""
+    """What `python -m bridges.vicon.publisher` says."""
 
-    def __init__(self, endpoint: str, server: str, *arguments: str) -> None:
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "bridges.vicon.publisher", server, "--connect", endpoint, *arguments],
-            cwd=ROOT,
-            stdin=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        self.lines: list[str] = []
-        self.over = False
+    def __init__(self, process):
+        self.process, self.lines = process, []
         self._ears = threading.Thread(target=self._hear, daemon=True)
         self._ears.start()
 
-    def _hear(self) -> None:
-        assert self.process.stderr is not None
+    def _hear(self):
         for line in self.process.stderr:
             self.lines.append(line.rstrip())
 
-    def until_said(self, words: str, times: int = 1) -> None:
+    def until_said(self, words, times=1):
         until(lambda: sum(words in line for line in self.lines) >= times, f"{words!r} in {self.lines}")
 
-    def end(self, number: signal.Signals = signal.SIGTERM) -> int:
-        if self.process.poll() is None:
-            self.process.send_signal(number)
+    def end(self, number=signal.SIGTERM):
+        self.process.send_signal(number)
         return self.wait()
 
-    def wait(self) -> int:
+    def wait(self):
         code = self.process.wait(30)
         self._ears.join(5)
-        for stream in (self.process.stdin, self.process.stderr):
-            assert stream is not None
-            stream.close()
-        self.over = True
         return code
 
 
-Start = Callable[..., BridgeProcess]
-
-
 @pytest.fixture
-def start(router: RouterProcess) -> Iterator[Start]:
+def start(router):
     """Starts bridges and sees to their end."""
-    made: list[BridgeProcess] = []
+    with ExitStack() as stack:
 
-    def begin(server: str, *arguments: str) -> BridgeProcess:
-        made.append(BridgeProcess(router.endpoint, server, *arguments))
-        return made[-1]
+        def begin(server, *arguments):
+            command = ("-m", "bridges.vicon.publisher", server, "--connect", router.endpoint, *arguments)
+            return BridgeProcess(stack.enter_context(started(*command, stdout=None)))
 
-    yield begin
-    for bridge in made:
-        if not bridge.over:
-            bridge.end()
+        yield begin
 
 
-class Listener:
+class Listener(Looking):
     """Positions of a robot, as it would hear them."""
 
-    def __init__(self, session: network.zenoh.Session, robot: str) -> None:
+    def __init__(self, session, robot):
         self._subscriber = pubsub.subscriber(session, Keys().position(robot), 4096)
-        self.heard: list[messages.Position] = []
+        self.heard = []
 
-    def look(self) -> int:
+    def look(self):
         for sample in network.received(self._subscriber.handler):
             self.heard.append(messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Position))
         return len(self.heard)
 
-    def until(self, more: int) -> None:
-        wanted = self.look() + more
-        until(lambda: self.look() >= wanted, f"{more} more positions")
+    def more(self, count):
+        """Wait for more positions."""
+        wanted = self.look() + count
+        self.until(lambda: len(self.heard) >= wanted, f"{count} more positions")
 
 
 @pytest.fixture
-def session(router: RouterProcess) -> Iterator[network.zenoh.Session]:
+def session(router):
     with network.open_session([router.endpoint], name="test") as made:
         yield made
 
 
 @pytest.mark.system
-def test_positions_arrive_as_placed_and_when_measured(start: Start, session: network.zenoh.Session) -> None:
+def test_positions_arrive_as_placed_and_when_measured(start, session):
     with Camera(["cf_1", "KH01"], rate_hz=200.0) as camera:
         camera.place("cf_1", [0.123456789, -0.5, 1.0], 0.3)
         camera.place("KH01", [-1.0, 0.25, 0.06], -2.0)
         camera.twin.latency_s = 0.25
         drone, rover = Listener(session, "CF01"), Listener(session, "KH01")
         bridge = start(camera.twin.address, "--map", "CF01=cf_1", "--map", "KH01")
-        drone.until(200)
+        drone.more(200)
         rover.look()
         now = time.time()
         assert bridge.end() == 0
@@ -312,21 +268,21 @@ def test_positions_arrive_as_placed_and_when_measured(start: Start, session: net
 
 
 @pytest.mark.system
-def test_occlusion_is_a_gap_not_a_wrong_pose(start: Start, session: network.zenoh.Session) -> None:
+def test_occlusion_is_a_gap_not_a_wrong_pose(start, session):
     begin = time.monotonic()
     with Camera(["CF01"], look=lambda: camera.twin.place(0, place(), upright(0.0))) as camera:
 
-        def place() -> np.ndarray:
+        def place():
             return np.array([0.4 * (time.monotonic() - begin), 0.0, 1.0])
 
         listener = Listener(session, "CF01")
         bridge = start(camera.twin.address, "--map", "CF01")
-        listener.until(50)
+        listener.more(50)
         camera.occlude(0.3)
-        listener.until(50)
+        listener.more(50)
         camera.occlude(1.0)
         bridge.until_said("CF01 is not seen")
-        listener.until(50)
+        listener.more(50)
         bridge.until_said("CF01 is seen", 2)
         assert bridge.end(signal.SIGINT) == 0
     stamps = np.array([p.stamp for p in listener.heard])
@@ -339,13 +295,13 @@ def test_occlusion_is_a_gap_not_a_wrong_pose(start: Start, session: network.zeno
 
 
 @pytest.mark.system
-def test_lost_server_and_nonsense_server_are_survived(start: Start, session: network.zenoh.Session) -> None:
+def test_lost_server_and_nonsense_server_are_survived(start, session):
     listener = Listener(session, "CF01")
     with Camera(["CF01"]) as camera:
         camera.place("CF01", [0.0, 0.0, 1.0])
         port = camera.port
         bridge = start(camera.twin.address, "--map", "CF01")
-        listener.until(20)
+        listener.more(20)
     bridge.until_said(f"lost {camera.twin.address}")
     offer = vicon_datastream.pack_kinds(vicon_datastream.POSES)
     good = vicon_datastream.packet(vicon_datastream.pack_frame_number(1))
@@ -365,7 +321,7 @@ def test_lost_server_and_nonsense_server_are_survived(start: Start, session: net
     before = listener.look()
     with Camera(["CF01"], port=port) as camera:
         camera.place("CF01", [0.0, 0.0, 1.5])
-        listener.until(20)
+        listener.more(20)
         bridge.until_said(f"connected to {camera.twin.address}", 2)
     assert bridge.end() == 0
     assert {round(p.position[2], 6) for p in listener.heard[:before]} == {1.0}
@@ -373,28 +329,24 @@ def test_lost_server_and_nonsense_server_are_survived(start: Start, session: net
 
 
 @pytest.mark.system
-def test_a_wrong_host_is_said_and_ends_it(
-    start: Start, router: RouterProcess, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_wrong_host_is_said_and_ends_it(start):
     with socket.create_server(("127.0.0.1", 0)) as closed:
         port = closed.getsockname()[1]
-    monkeypatch.setattr(publisher, "FIRST_S", 0.8)
-    assert publisher.main([f"127.0.0.1:{port}", "--map", "CF01", "--connect", router.endpoint]) == 2
-    first, *_, last = capsys.readouterr().err.splitlines()
-    assert first == f"vicon: no connection to 127.0.0.1:{port}: Connection refused; trying again"
-    assert f"no answer from 127.0.0.1:{port} in 0.8 s" in last
-    assert "firewall let TCP port" in last
-    wrong = start("127.0.0.1:vicon", "--map", "CF01")
+    silent, wrong = (start(f"127.0.0.1:{each}", "--map", "CF01") for each in (port, "vicon"))
     assert wrong.wait() == 2
     assert wrong.lines == ["zenpark: '127.0.0.1:vicon' is neither HOST nor HOST:PORT, such as 192.168.0.10:801"]
+    assert silent.wait() == 2
+    first, *_, last = silent.lines
+    assert first == f"vicon: no connection to 127.0.0.1:{port}: Connection refused; trying again"
+    assert f"no answer from 127.0.0.1:{port} in 5 s" in last
+    assert "firewall let TCP port" in last
 
 
 @pytest.mark.system
-def test_it_ends_with_its_starter(start: Start) -> None:
+def test_it_ends_with_its_starter(start):
     with Camera(["CF01"]) as camera:
         bridge = start(camera.twin.address, "--map", "CF01", "--lifeline")
         bridge.until_said("connected")
-        assert bridge.process.stdin is not None
         bridge.process.stdin.close()
         assert bridge.wait() == 0
 
@@ -404,7 +356,7 @@ def test_it_ends_with_its_starter(start: Start) -> None:
 
 @pytest.mark.mechanism("motion capture: occlusion")
 @pytest.mark.system
-def test_short_occlusion_is_flown_through_long_one_lands(start: Start, router: RouterProcess, tmp_path: Path) -> None:
+def test_short_occlusion_is_flown_through_long_one_lands(start, router, tmp_path):
     """The whole way round: simulated bodies, a Vicon that sees them, its stream, the bridge, the robots' process."""
     file = tmp_path / "seen.toml"
     text = document.read("triangle").text.replace("hover = 0.6", 'hover = 0.3\nposition = "external"')
@@ -413,7 +365,7 @@ def test_short_occlusion_is_flown_through_long_one_lands(start: Start, router: R
     keys, heights = watcher.keys, [0.0]
     states = pubsub.subscriber(watcher.session, keys.state("CF01"), 64)
 
-    def look() -> None:
+    def look():
         for sample in network.received(states.handler):
             state = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.State)
             assert state.true_position is not None
