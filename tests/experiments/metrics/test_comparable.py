@@ -36,37 +36,31 @@ def texts(*cases):
     return " ".join(each.text for each in findings(cases))
 
 
-@pytest.mark.parametrize(
-    ("columns", "reason"),
-    [
-        ({"missed_deadlines": 10, "ticks": 90}, "10 % of the deadlines were missed"),
-        ({"missed_deadlines": 300, "ticks": 100}, "75 % of the deadlines were missed"),
-        ({"missed_deadlines": 1, "ticks": 999}, ""),
-        ({"lost": 100}, "of the poses were lost"),
-        ({"lost": 1}, ""),
-    ],
-)
-def test_what_spoils_a_run(trace, columns, reason):
-    spoiled = changed(trace, **columns).spoiled
-    assert reason in spoiled[0] if reason else not spoiled
+LATE = "began 0.70 s after the common start"
 
 
 @pytest.mark.parametrize(
-    ("kind", "text", "spoils"),
+    ("columns", "event", "reason"),
     [
-        ("late", "began 0.70 s after the common start", True),
-        ("late", "still waits for the start; ordered again", False),
-        ("unread", "could not read 3 messages on park/A/pose", True),
+        ({"missed_deadlines": 10, "ticks": 90}, None, "10 % of the deadlines were missed"),
+        ({"missed_deadlines": 300, "ticks": 100}, None, "75 % of the deadlines were missed"),
+        ({"missed_deadlines": 1, "ticks": 999}, None, None),
+        ({"lost": 100}, None, "of the poses were lost"),
+        ({"lost": 1}, None, None),
+        ({}, Event(1.0, "late", "CF01", LATE), ""),
+        ({}, Event(1.0, "late", "CF01", "still waits for the start; ordered again"), None),
+        ({}, Event(1.0, "unread", "CF01", "could not read 3 messages on park/A/pose"), ""),
+        ({}, Event(2.0, "lost", "CF01", "its process ended"), "robots failed"),
     ],
 )
-def test_troubles_that_spoil_a_run(trace, kind, text, spoils):
-    troubled = measure(dataclasses.replace(trace, events=(*trace.events, Event(1.0, kind, "CF01", text))))
-    assert bool(troubled.spoiled) == spoils
+def test_what_spoils_a_run(trace, columns, event, reason):
+    events = trace.events if event is None else (*trace.events, event)
+    found = changed(dataclasses.replace(trace, events=events), **columns)
+    assert reasons(found) == found.spoiled
+    assert reason in found.spoiled[0] if reason is not None else not found.spoiled
 
 
-def test_a_lost_robot_or_slow_world_spoils(trace):
-    lost = measure(dataclasses.replace(trace, events=(Event(2.0, "lost", "CF01", "its process ended"),)))
-    assert reasons(lost) == lost.spoiled == ("robots failed",)
+def test_a_slow_world_spoils(trace):
     assert reasons(replace(measure(trace), world_factor=0.5)) == ("the world ran at 0.50 of real time",)
 
 

@@ -5,10 +5,9 @@ import pytest
 
 from agents.body.limits import Safety
 from agents.decision.lifecycle import DONE, LANDING, RUNNING
-from experiments.check.check import check
 from experiments.definition.experiment import Formation, RobotTable
 from experiments.recording import playback
-from tests.experiments.checked import of as document_of
+from tests.experiments.checked import findings
 from tests.runs import fly
 from tests.small import changed, pair, reference, small
 
@@ -93,5 +92,4 @@ def test_scripted_landing_silences_and_loses_a_robot(architecture):
     ],
 )
 def test_check_finds_settings_that_make_no_sense(settings, code):
-    made = document_of(pair(safety=Safety(**settings), duration_s=20.0))
-    assert code in {finding.code for finding in check(made)}
+    assert code in findings(pair(safety=Safety(**settings), duration_s=20.0))
