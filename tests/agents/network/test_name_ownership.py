@@ -7,6 +7,7 @@ import random
 import signal
 import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from math import inf
 from types import SimpleNamespace
@@ -62,23 +63,19 @@ class Table(ManualClock):
     def together(self, **works: Callable[[Session], object]) -> dict[str, object]:
         """The outcome of what some sessions do at the same time."""
         self._running = set(works)
-        results: dict[str, object] = {}
 
-        def work(name: str, do: Callable[[Session], object]) -> None:
+        def work(name: str, do: Callable[[Session], object]) -> object:
             try:
-                results[name] = do(Session(self, name))
+                return do(Session(self, name))
             except (NameTaken, network.Unreachable) as error:
-                results[name] = error
-            with self._turn:
-                self._running.discard(name)
-                self._draw()
+                return error
+            finally:
+                with self._turn:
+                    self._running.discard(name)
+                    self._draw()
 
-        threads = [threading.Thread(target=work, args=each) for each in works.items()]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-        return results
+        with ThreadPoolExecutor(len(works)) as pool:
+            return dict(zip(works, pool.map(work, works, works.values()), strict=True))
 
     def lose(self, name: str) -> list[str]:
         """Drop the tokens of a session, as routers do when it is silent for longer than its lease."""

@@ -281,20 +281,17 @@ def test_after_reconnection_tokens_may_come_in_any_order(a):
     assert (a.live, a.x) == (True, 0.5)
 
 
-def test_new_process_before_its_token_is_received(a):
+@pytest.mark.parametrize(("session", "early"), [("two", True), (None, False)], ids=["restarted", "other make"])
+def test_new_process_takes_the_name(a, session, early):
     a.begin("one", 7)
     a.lose("one", 3.0)  # the router dies; meanwhile B is restarted
-    a.hear(1, 0.6, "two")
-    a.token("two")
-    a.after()
-    assert (a.live, a.x) == (True, 0.6)
-
-
-def test_robot_of_another_make_may_take_the_name(a):
-    a.begin("one", 7)
-    a.lose("one", 3.0)
-    a.token(None)
-    a.hear(1, 0.6, None)
+    if early:  # before its token
+        a.hear(1, 0.6, session)
+        a.token(session)
+        a.after()
+    else:
+        a.token(session)
+        a.hear(1, 0.6, session)
     assert (a.live, a.x) == (True, 0.6)
 
 
