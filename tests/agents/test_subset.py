@@ -55,27 +55,21 @@ def test_quiet_functions_stay_in_the_subset(file):
     assert RARE[file] <= {name for name, _ in functions(ast.parse(source))}, "it is there"
 
 
-def plugin_faults(kind):
-    """Faults of a registered class, with the file and the lines of its source."""
+COMPILED = [
+    kind
+    for group in (LAWS, TRIGGERS, PREDICTORS, AVOIDANCES)
+    for kind in (registry.struct(group, name) for name in registry.names(group))
+    if kind.__module__.startswith("agents.") and (group != LAWS or issubclass(kind, Gradient))
+]
+
+
+@pytest.mark.parametrize("kind", COMPILED)
+def test_plugins_of_zenpark_stay_in_the_subset(kind):
+    """Those of others may leave it and run as plain Python, as do laws that remember."""
     source, first = inspect.getsourcelines(kind)
+    found = outside(dedent("".join(source)), first=first)
     file = inspect.getsourcefile(kind)
-    return [(f"{file}:{line}", name, fault) for line, name, fault in outside(dedent("".join(source)), first=first)]
-
-
-@pytest.mark.parametrize(
-    ("group", "name"),
-    [(group, name) for group in (LAWS, TRIGGERS, PREDICTORS, AVOIDANCES) for name in registry.names(group)],
-)
-def test_registered_plug_ins_and_the_subset(group, name):
-    """Ours stay within it; one of others may leave it, and is told: it runs, as plain Python."""
-    kind = registry.struct(group, name)
-    if group == LAWS and not issubclass(kind, Gradient):
-        pytest.skip(f"{name} remembers: it is never compiled")
-    found = [f"{place}: {method} uses {fault}" for place, method, fault in plugin_faults(kind)]
-    if kind.__module__.startswith("agents."):
-        assert not found, "\n".join(found)
-    elif found:
-        pytest.skip(f"{name} runs uncompiled: " + "; ".join(found))
+    assert not found, "\n".join(f"{file}:{line}: {name} uses {fault}" for line, name, fault in found)
 
 
 SAMPLE = '''
