@@ -7,6 +7,7 @@ import math
 import subprocess
 import sys
 import threading
+from contextlib import closing
 
 import pytest
 from cflib import crtp
@@ -17,7 +18,8 @@ from cflib.crazyflie.syncCrazyflie import SyncCrazyflie
 from cflib.crazyflie.syncLogger import SyncLogger
 from cflib.utils.power_switch import PowerSwitch
 
-from tests.twins.loopback import Served, request
+from tests.requests import request
+from tests.twins.loopback import Served
 from tests.waiting import until
 from twins.devices.crazyflie.device import CrazyflieTwin
 from twins.devices.device import DeviceRequest, Faults
@@ -30,7 +32,6 @@ ANSWER_S = 20.0
 @pytest.fixture(scope="module")
 def connected(tmp_path_factory):
     """A twin, and cflib connected to it with all parameters read."""
-
     if not crtp.CLASSES:
         crtp.init_drivers()
     with Served(CrazyflieTwin, request("crazyflie", ["crazyflie-twin"])) as twin:
@@ -42,18 +43,26 @@ def connected(tmp_path_factory):
 
 
 @pytest.fixture
-def cf(connected):
-    return connected[0].cf
+def scf(connected):
+    return connected[0]
 
 
 @pytest.fixture
-def scf(connected):
-    return connected[0]
+def cf(scf):
+    return scf.cf
 
 
 def memory(cf, kind):
     (found,) = cf.mem.get_mems(kind)
     return found
+
+
+def updates(cf, name):
+    """Values of a parameter that arrive from now on, as text."""
+    said = []
+    group, own = name.split(".")
+    cf.param.add_update_callback(group=group, name=own, cb=lambda _, text: said.append(text))
+    return said
 
 
 def answered(call, *arguments):
@@ -71,7 +80,6 @@ def answered(call, *arguments):
 
 def logged(scf, period_ms=10, rows=1, **variables):
     """Values of `rows` rows of a log block."""
-
     block = LogConfig("test", period_ms)
     for name, kind in variables.items():
         block.add_variable(name.replace("__", "."), kind)
@@ -79,12 +87,7 @@ def logged(scf, period_ms=10, rows=1, **variables):
         return [values for _, (_, values, _) in zip(range(rows), logger, strict=False)]
 
 
-# ---------------------------------------------------------------------- parameters
-
-
-def test_self_test_passed(cf):
-    """All acceptance tests begin with it."""
-    assert int(cf.param.get_value("system.selftestPassed")) == 1
+# parameters
 
 
 @pytest.mark.parametrize(
@@ -112,9 +115,7 @@ def test_self_test_passed(cf):
     ],
 )
 def test_parameters_of_examples(cf, name, value):
-    group, own = name.split(".")
-    said = []
-    cf.param.add_update_callback(group=group, name=own, cb=lambda _, text: said.append(text))
+    said = updates(cf, name)
     cf.param.set_value(name, value)
     until(lambda: said and float(said[-1]) == pytest.approx(value), f"{name} confirmed")
     assert float(cf.param.get_value(name)) == pytest.approx(value)
@@ -123,8 +124,7 @@ def test_parameters_of_examples(cf, name, value):
 @pytest.mark.parametrize("deck", ["bcFlow2", "bcZRanger2"])
 def test_deck_that_examples_wait_for(cf, deck):
     """sbs_motion_commander and its like: 'No flow deck detected' otherwise."""
-    said = []
-    cf.param.add_update_callback(group="deck", name=deck, cb=lambda _, text: said.append(text))
+    said = updates(cf, f"deck.{deck}")
     cf.param.request_param_update(f"deck.{deck}")
     until(lambda: said == ["1"], "the deck is there")
 
@@ -134,34 +134,35 @@ def test_read_only_and_persistent_parameters(cf):
     assert element("deck.bcLighthouse4").get_readable_access() == "RO"
     with pytest.raises(AttributeError):
         cf.param.set_value("deck.bcLighthouse4", 1)
-    assert (element("ring.effect").is_extended(), element("ring.effect").is_persistent()) == (True, True)
-    assert (element("stabilizer.stop").is_extended(), element("stabilizer.stop").is_persistent()) == (False, False)
+    for name, kept in (("ring.effect", True), ("stabilizer.stop", False)):
+        assert element(name).is_extended() == element(name).is_persistent() == kept
     with pytest.raises(AttributeError):
         cf.param.persistent_get_state("stabilizer.stop", lambda *_: None)
 
 
 def test_stored_parameters(cf):
     name = "sound.effect"
-    _, state = answered(cf.param.persistent_get_state, name)
-    assert (state.is_stored, state.default_value, state.stored_value) == (False, 0, None)
+
+    def state():
+        _, kept = answered(cf.param.persistent_get_state, name)
+        return kept.is_stored, kept.default_value, kept.stored_value
+
+    assert state() == (False, 0, None)
     cf.param.set_value(name, 11)
     assert answered(cf.param.persistent_store, name) == [name, True]
-    _, state = answered(cf.param.persistent_get_state, name)
-    assert (state.is_stored, state.stored_value) == (True, 11)
+    assert state() == (True, 0, 11)
     assert answered(cf.param.persistent_clear, name) == [name, True]
-    _, state = answered(cf.param.persistent_get_state, name)
-    assert not state.is_stored
+    assert state() == (False, 0, None)
 
 
 def test_raw_parameter(cf):
-    said = []
-    cf.param.add_update_callback(group="ring", name="effect", cb=lambda _, text: said.append(int(text)))
+    said = updates(cf, "ring.effect")
     cf.param.set_value_raw("ring.effect", 0x08, 13)
     cf.param.request_param_update("ring.effect")
-    until(lambda: 13 in said, "set by its name")
+    until(lambda: "13" in said, "set by its name")
 
 
-# ---------------------------------------------------------------------- logs
+# logs
 
 
 def test_largest_log_block(scf):
@@ -186,12 +187,11 @@ def test_variables_of_examples(scf):
     assert (supervisor["supervisor.info"] & 8, supervisor["sys.canfly"], supervisor["radio.isConnected"]) == (8, 1, 1)
 
 
-# ---------------------------------------------------------------------- memories
+# memories
 
 
 def test_memory_tester(scf, cf):
     """As the swarm test rig: 1,000 bytes read, 1,000 written, no error counted."""
-
     tester = memory(cf, MemoryElement.TYPE_MEMORY_TESTER)
     assert answered(tester.read_data, 5, 1000) == [tester]
     cf.param.set_value("memTst.resetW", "1")
@@ -201,7 +201,6 @@ def test_memory_tester(scf, cf):
 
 def test_eeprom(cf):
     """read_eeprom, write_eeprom: radio settings with a valid checksum, written and read back."""
-
     eeprom = memory(cf, MemoryElement.TYPE_I2C)
     answered(eeprom.update)
     assert eeprom.valid
@@ -214,14 +213,7 @@ def test_eeprom(cf):
     assert (eeprom.valid, eeprom.elements["pitch_trim"]) == (True, 1.5)
 
 
-def test_deck_memory(cf):
-    """read_deck_mem: a manager that lists no deck with a memory."""
-
-    assert answered(memory(cf, MemoryElement.TYPE_DECK_MEMORY).query_decks) == [{}]
-
-
 def test_memories_of_the_led_ring(cf):
-
     ring = memory(cf, MemoryElement.TYPE_DRIVER_LED)
     ring.leds[3].set(r=0, g=100, b=0)
     assert answered(ring.write_data)[0] is ring
@@ -230,8 +222,9 @@ def test_memories_of_the_led_ring(cf):
     assert answered(timings.write_data)[0] is timings
 
 
-def test_one_wire_memories_of_decks(cf):
-    """read_ow, and the acceptance test of memories: each deck says its name."""
+def test_memories_of_decks(cf):
+    """read_deck_mem: no deck has a memory; read_ow, and the acceptance test of memories: each says its name."""
+    assert answered(memory(cf, MemoryElement.TYPE_DECK_MEMORY).query_decks) == [{}]
     deck = memory(cf, MemoryElement.TYPE_1W)
     answered(deck.update)
     assert deck.valid
@@ -239,7 +232,7 @@ def test_one_wire_memories_of_decks(cf):
     assert (deck.vid, deck.pid) == (0xBC, 0x0F)
 
 
-# ---------------------------------------------------------------------- the rest
+# the rest
 
 
 def test_console(cf):
@@ -250,6 +243,7 @@ def test_console(cf):
 
 
 def test_supervisor(cf):
+    assert int(cf.param.get_value("system.selftestPassed")) == 1  # all acceptance tests begin with it
     assert cf.supervisor.is_auto_armed
     assert cf.supervisor.can_fly
     assert not any((cf.supervisor.is_crashed, cf.supervisor.is_tumbled, cf.supervisor.is_locked))
@@ -268,21 +262,16 @@ def test_scan():
 
 def test_power_cycle():
     """As the acceptance tests restart a drone; the link of cflib itself does not notice."""
-
-    with Served(CrazyflieTwin, request("crazyflie", ["crazyflie-twin"])) as other:
-        switch = PowerSwitch(other.addresses[0])
-        try:
-            switch.stm_power_down()
-            until(lambda: not other.device.drones[0].on, "it is off")
-            switch.stm_power_up()
-            until(lambda: other.device.drones[0].on, "it is on again")
-        finally:
-            switch.close()
+    other = Served(CrazyflieTwin, request("crazyflie", ["crazyflie-twin"]))
+    with other, closing(PowerSwitch(other.addresses[0])) as switch:
+        switch.stm_power_down()
+        until(lambda: not other.device.drones[0].on, "it is off")
+        switch.stm_power_up()
+        until(lambda: other.device.drones[0].on, "it is on again")
 
 
 def test_trajectories_and_spirals_are_flown(connected):
     """autonomous_sequence_high_level, ..._compressed, circling_square, christmas_tree: flown, not only answered."""
-
     scf, twin = connected
     cf, high = scf.cf, scf.cf.high_level_commander
     rise = [0.0, 0.0, 0.0, 0.0, 35.0, -84.0, 70.0, -20.0]  # from 0 to 1 m in 1 s, at rest at both ends
@@ -317,7 +306,6 @@ def test_trajectories_and_spirals_are_flown(connected):
 
 
 def test_too_many_variables_and_blocks(cf):
-
     blocks = [LogConfig(f"many {i}", 1000) for i in range(17)]
     for block in blocks:
         block.add_variable("radio.rssi", "uint8_t")
