@@ -1,5 +1,4 @@
 import json
-import os
 import re
 import subprocess
 import sys
@@ -11,16 +10,11 @@ from typer.testing import CliRunner
 
 from agents.network.endpoints import EndpointError
 from experiments.recording.version import DIGEST_CHARACTERS, digest, provenance
+from tests.commands import ROOT, environment, invoke, python, zenpark
 from tools.main import app, main, part_for
 from tools.options import PANELS
 
-ROOT = Path(__file__).resolve().parents[2]
 COMMANDS = sorted(typer.main.get_command(app).commands)
-
-
-def typed(*words):
-    """Result of a command in this process."""
-    return CliRunner().invoke(app, list(words))
 
 
 def test_commands():
@@ -34,16 +28,12 @@ def test_commands():
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_has_help(command):
-    said = typed(command, "--help")
-    assert said.exit_code == 0
-    assert said.stdout.startswith(f"Usage: zenpark {command} ")
+    assert invoke(command, "--help").stdout.startswith(f"Usage: zenpark {command} ")
 
 
 @pytest.mark.parametrize("bridge", ["vicon", "ros2"])
 def test_each_bridge_explains_its_options(bridge):
-    said = typed("bridge", bridge, "--help")
-    assert said.exit_code == 0
-    assert said.stdout.startswith(f"usage: zenpark bridge {bridge} ")
+    assert invoke("bridge", bridge, "--help").stdout.startswith(f"usage: zenpark bridge {bridge} ")
 
 
 LOADED = """
@@ -57,16 +47,9 @@ finally:
 """
 
 
-def loaded(*words, program=LOADED, cwd=ROOT, **environment):
+def loaded(*words, program=LOADED, cwd=ROOT, **more):
     """Output of a command, and the modules that it has imported when it ends."""
-    done = subprocess.run(
-        [sys.executable, "-c", program, *words],
-        cwd=cwd,
-        env={**os.environ, "PYTHONPATH": str(ROOT), **environment},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = python("-c", program, *words, cwd=cwd, env=environment(**more), code=None)
     return done.stdout, set(done.stderr.split())
 
 
@@ -99,7 +82,7 @@ def test_help_shows_commands_with_their_whole_description():
     shown = typer.main.get_command(app).commands
     panels = [name for names in PANELS.values() for name in names.split()]
     assert sorted(panels) == sorted(name for name, command in shown.items() if not command.hidden)
-    said = typed("--help").stdout
+    said = invoke("--help").stdout
     assert [line for line in said.splitlines()[1:] if "..." in line or len(line) > 80] == []
     assert [line[:-1] for line in said.splitlines() if line[:-1] in PANELS] == list(PANELS)
     words = " ".join(said.split())
@@ -124,7 +107,7 @@ def test_call_builds_only_its_own_commands_parameters():
         assert set(with_parameters(built)) == {" ".join(words[:2]), *words[:1]} & set(with_parameters(whole))
         assert built.commands.keys() == whole.commands.keys()
     for word in ("--help", "robot"):
-        assert CliRunner().invoke(part_for([word]), [word]).stdout == typed(word).stdout
+        assert CliRunner().invoke(part_for([word]), [word]).stdout == invoke(word, code=None).stdout
 
 
 @pytest.mark.parametrize(
@@ -143,7 +126,7 @@ def test_errors_are_json_where_it_is_asked_for(arguments, why, monkeypatch, caps
 
 
 def test_plugin_of_two_places_has_parameters_once():
-    lines = typed("explain", "send-on-delta").stdout.splitlines()
+    lines = invoke("explain", "send-on-delta").stdout.splitlines()
     assert lines[:2] == ["trigger(send-on-delta)", "formation.update(send-on-delta) "]
     (threshold,) = [line for line in lines if ".threshold" in line]
     assert threshold.startswith("trigger(send-on-delta).threshold δ: ")
@@ -151,10 +134,10 @@ def test_plugin_of_two_places_has_parameters_once():
 
 
 def test_tables_are_json_where_it_is_asked_for():
-    shown = json.loads(typed("list", "--json").stdout)
+    shown = json.loads(invoke("list", "--json").stdout)
     assert "event" not in shown
     assert shown["experiments"][-1]["name"] == "triangle"
-    said = typed("explain", "disturbance.hover_jitter", "--json").stdout
+    said = invoke("explain", "disturbance.hover_jitter", "--json").stdout
     assert json.loads(said)[0]["key"].startswith("disturbance.")
 
 
@@ -165,11 +148,11 @@ def test_results_of_actions_are_json_on_request(tmp_path, monkeypatch):
     for name in ("experiment.toml", "default.mcap"):
         (past / name).touch()
     (past / "run.json").write_text('{"begun": 1.0}')
-    said = json.loads(typed("clean", "--older", "0", "--recordings", "--json").stdout)
+    said = json.loads(invoke("clean", "--older", "0", "--recordings", "--json").stdout)
     assert said == [{"folder": "runs/past", "parts": ["runs/past/default.mcap"], "removed": False}]
-    made = json.loads(typed("lab", "init", "lab", "KH01", "--json").stdout)
+    made = json.loads(invoke("lab", "init", "lab", "KH01", "--json").stdout)
     assert made["identities"]["KH01"]["role"] == "robot"
-    assert list(json.loads(typed("lab", "issue", "lab", "ana", "--json").stdout)["identities"]) == ["ana"]
+    assert list(json.loads(invoke("lab", "issue", "lab", "ana", "--json").stdout)["identities"]) == ["ana"]
 
 
 def test_routers_come_from_environment_option_or_file(monkeypatch, tmp_path):
@@ -178,28 +161,29 @@ def test_routers_come_from_environment_option_or_file(monkeypatch, tmp_path):
     for words, endpoint in (
         ([], "udp"), (["--connect", "option"], "option"), (["--connect", f"@{tmp_path / 'network.txt'}"], "file")
     ):  # fmt: skip
-        wrong = typed("keys", *words).exception
+        wrong = invoke("keys", *words, code=None).exception
         assert isinstance(wrong, EndpointError)
         assert repr(endpoint) in str(wrong)
-    assert "[env var: ZENPARK_CONNECT]" in typed("robot", "hold", "--help").stdout
+    assert "[env var: ZENPARK_CONNECT]" in invoke("robot", "hold", "--help").stdout
 
 
 @pytest.mark.slow
 def test_version():
-    command = [sys.executable, "-m", "tools.guard", "--version"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    done = zenpark("--version")
     assert (done.stdout, done.stderr) == (f"{provenance().words[0]}\n", "")
     assert done.stdout.startswith(f"zenpark 0.1.0, code {digest()[:DIGEST_CHARACTERS]}")
 
 
 def test_a_configuration_for_zenohd_is_printed():
     made = json.loads(
-        typed("router", "--print-config", "--listen", "tcp/127.0.0.1:7999", "--connect", "tcp/lab:1").stdout
+        invoke("router", "--print-config", "--listen", "tcp/127.0.0.1:7999", "--connect", "tcp/lab:1").stdout
     )
     assert made["listen"] == {"endpoints": ["tcp/127.0.0.1:7999"]}
     assert made["connect"]["endpoints"] == ["tcp/lab:1"]
     assert made["scouting"]["multicast"] == {"enabled": False}
-    assert "will not listen" in str(typed("router", "--print-config", "--listen", "tcp/0.0.0.0:1").exception)
+    assert "will not listen" in str(
+        invoke("router", "--print-config", "--listen", "tcp/0.0.0.0:1", code=None).exception
+    )
 
 
 COMPLETED = {
@@ -248,7 +232,7 @@ def test_output_that_goes_nowhere_makes_no_traceback(output, code, unbuffered):
     done = subprocess.run(
         ["sh", "-c", f'exec "$0" -m tools.guard explain rates {output}', sys.executable],
         cwd=ROOT, stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, timeout=60, check=False,
-        env={**os.environ, "PYTHONUNBUFFERED": unbuffered},
+        env=environment(PYTHONUNBUFFERED=unbuffered),
     )  # fmt: skip
     assert done.returncode == code
     assert "Traceback" not in done.stderr

@@ -1,25 +1,16 @@
 import os
 import signal
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 
+from tests.commands import ROOT, python, zenpark
 from tools.guard import PACKAGES, intruders
-
-ROOT = Path(__file__).resolve().parents[2]
-
-
-def python(*words, cwd=ROOT, path=(), **options):
-    """A process of Python, ended; with these first on its import path."""
-    path = {"PYTHONPATH": os.pathsep.join(map(str, path))} if path else {}
-    command, environment = [sys.executable, *words], os.environ | path
-    return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, check=False, **options)
 
 
 def start(folder, *path):
-    return python("-c", "from tools.guard import main; main()", "--version", cwd=folder, path=path)
+    """The command line, started in a folder and with these first on the import path."""
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, path))}
+    return python("-c", "from tools.guard import main; main()", "--version", cwd=folder, env=environment, code=None)
 
 
 def test_everything_that_is_elsewhere_is_an_intruder(tmp_path):
@@ -38,8 +29,8 @@ def test_ctrl_c_while_python_starts_prints_no_traceback():
         signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
         os.kill(os.getpid(), signal.SIGINT)
 
-    done = python("-m", "tools.guard", "--version", preexec_fn=interrupted)
-    assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
+    done = zenpark("--version", code=130, preexec_fn=interrupted)
+    assert (done.stdout, done.stderr) == ("", "")
 
 
 def test_ctrl_c_while_script_imports_prints_no_traceback():
@@ -51,8 +42,7 @@ def test_ctrl_c_while_script_imports_prints_no_traceback():
         "sys.meta_path.insert(0, Interrupted)\n"
         "runpy.run_path('zenpark', run_name='__main__')"
     )
-    done = python("-c", program)
-    assert (done.returncode, done.stderr) == (130, "")
+    assert python("-c", program, code=130).stderr == ""
 
 
 @pytest.mark.slow
@@ -81,8 +71,7 @@ def test_imports_nothing_of_ours_and_nothing_heavy():
     ("words", "code"), [(["station"], 0), (["agent", "-", "KH01", "--clock-correction=-0.5", "--lifeline"], 2)]
 )
 def test_run_needs_no_typer_on_its_hosts(words, code):
-    done = python("-X", "importtime", "-m", "tools.guard", *words, stdin=subprocess.DEVNULL)
-    assert done.returncode == code, done.stderr[-500:]
+    done = python("-X", "importtime", "-m", "tools.guard", *words, code=code)
     loaded = {line.rpartition("|")[2].strip() for line in done.stderr.splitlines()}
     assert "experiments.real_time.hosts.station" in loaded or "experiments.real_time.processes.robot" in loaded
     assert not loaded & {"typer", "pydantic", "tools.main"}

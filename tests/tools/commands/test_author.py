@@ -2,20 +2,20 @@
 
 import re
 import tomllib
+from functools import partial
 
 import pytest
-from typer.testing import CliRunner
 
 from experiments.file import document
+from tests.commands import invoke
 from tests.experiments.robotic_park_files import dome
-from tools.main import app
 
 
 @pytest.fixture
 def typed(tmp_path, monkeypatch):
     """Result of a command in an empty folder."""
     monkeypatch.chdir(tmp_path)
-    return lambda *words: CliRunner().invoke(app, [*words])
+    return invoke
 
 
 @pytest.mark.parametrize(
@@ -29,9 +29,7 @@ def typed(tmp_path, monkeypatch):
     ],
 )
 def test_formations(typed, words, file, robots):
-    result = typed("new", *words.split())
-    assert result.exit_code == 0, result.output
-    assert f"zenpark check {file}" in result.output
+    assert f"zenpark check {file}" in typed("new", *words.split()).output
     experiment = document.read(file).experiment
     assert len(experiment.robots) == robots
     if "--duration" in words:
@@ -47,17 +45,13 @@ def test_formations(typed, words, file, robots):
     ],
 )
 def test_one_formation_at_a_time(typed, tmp_path, words, said):
-    result = typed("new", *words.split())
-    assert result.exit_code == 2
-    assert said in result.output
+    assert said in typed("new", *words.split(), code=2).output
     assert list(tmp_path.iterdir()) == []
 
 
 def test_import(typed, tmp_path):
     (tmp_path / "five.yaml").write_text(dome(5))
-    result = typed("import", "five.yaml", "--duration", "30")
-    assert result.exit_code == 0, result.output
-    assert "Not carried over" in result.output
+    assert "Not carried over" in typed("import", "five.yaml", "--duration", "30").output
     assert document.read("five.toml").experiment.duration_s == 30.0
 
 
@@ -80,30 +74,28 @@ D = { kind = "khepera4", start = [0.0, 0.8] }
 
 
 @pytest.fixture
-def square(typed, tmp_path):
-    """A file whose links contradict each other; `check`, in its folder."""
+def check(typed, tmp_path):
+    """`check`, in the folder of a file whose links contradict each other."""
     (tmp_path / "square.toml").write_text(CONTRADICTION)
-    return lambda *words: typed("check", *words)
+    return partial(typed, "check")
 
 
 @pytest.mark.slow
-def test_experiment_error_exits_1_and_malformed_file_2(square, tmp_path):
+def test_experiment_error_exits_1_and_malformed_file_2(check, tmp_path):
     (tmp_path / "wrong.toml").write_text("title = ")
-    assert square("square.toml").exit_code == 1
-    assert square("wrong.toml", "--json").exit_code == 2
-    assert square("triangle", "--set", "duration_s=3", "--plot", "a.svg").exit_code == 0
+    check("square.toml", code=1)
+    check("wrong.toml", "--json", code=2)
+    check("triangle", "--set", "duration_s=3", "--plot", "a.svg")
     assert (tmp_path / "a.svg").read_text().count("<path") > 20
 
 
 @pytest.mark.slow
-def test_fix_prints_links_that_fit_together(square, tmp_path):
-    said = square("square.toml", "--fix").stdout
+def test_fix_prints_links_that_fit_together(check, tmp_path):
+    said = check("square.toml", "--fix", code=None).stdout
     links = said[said.index("[formation.links]") :]
     fixed = tomllib.loads(links)["formation"]["links"]
     assert set(fixed) == {"A - B", "B - C", "C - D", "A - D", "A - C", "B - D"}
     assert fixed["A - D"]["gain"] == 2.0
     assert fixed["A - C"] == pytest.approx(2**0.5 * fixed["A - B"], abs=2e-3)
     (tmp_path / "fixed.toml").write_text(CONTRADICTION[: CONTRADICTION.index("[formation.links]")] + links)
-    again = square("fixed.toml")
-    assert again.exit_code == 0
-    assert float(re.search(r"distances met to +([0-9.]+) mm", again.stdout)[1]) < 0.2
+    assert float(re.search(r"distances met to +([0-9.]+) mm", check("fixed.toml").stdout)[1]) < 0.2

@@ -1,11 +1,8 @@
 """The live table: what fits a terminal, in which order, and in which colour."""
 
-from __future__ import annotations
-
 import msgspec
 import pytest
 from rich.console import Console
-from rich.segment import Segment
 
 from agents.network.messages import Event, Status
 from tools.live_table import HEADS, LiveRow, Rank, Trends, drawn, heading, worst_first
@@ -17,7 +14,7 @@ STATUS = Status(
 EVENTS = [Event(float(k), "hazard", "robot-01", f"number {k} " + "far " * 40) for k in range(9)]
 
 
-def rows(count: int) -> list[LiveRow]:
+def rows(count):
     return [
         LiveRow(f"robot-{k:02}", "running", error=0.001 * k, rate=12.5, late=0, lost=3, cpu=0.04, battery=0.8, sent=900,
             note="", pid=k + 1)
@@ -25,16 +22,16 @@ def rows(count: int) -> list[LiveRow]:
     ]  # fmt: skip
 
 
-def segments(title: str, rows: list[LiveRow], events: list[Event], width: int, height: int) -> list[list[Segment]]:
+def segments(title, rows, events, width, height):
     """The table, line by line."""
     return Console(width=width, height=height).render_lines(drawn(title, rows, events, width, height), pad=False)
 
 
-def lines(title: str, rows: list[LiveRow], events: list[Event], width: int, height: int) -> list[str]:
+def lines(title, rows, events, width, height):
     return ["".join(part.text for part in line).rstrip() for line in segments(title, rows, events, width, height)]
 
 
-def styles(*rows: LiveRow) -> dict[str, str]:
+def styles(*rows):
     return {part.text.strip(): str(part.style) for line in segments("t", [*rows], [], 140, 10) for part in line}
 
 

@@ -1,16 +1,13 @@
 """What the emergency stop prints: whom it stopped, whom not, and where."""
 
-from __future__ import annotations
-
 import json
 
 import pytest
 
-from agents.network import messages, pubsub
+from agents.network import pubsub
 from agents.network import session as network
 from agents.network.keys import Keys
 from experiments.real_time.conductor.orders import EmergencyStop
-from tests.conftest import RouterProcess
 from tests.waiting import until
 from tools.commands import orders
 
@@ -19,16 +16,16 @@ DEFAULT = "tcp/127.0.0.1:7447"
 
 
 @pytest.fixture
-def stop(monkeypatch: pytest.MonkeyPatch) -> type[EmergencyStop]:
+def stop(monkeypatch):
     """Stops without a network: at port 1 are fifty robots, of which CF001 to CF030 do not stop; elsewhere is nobody."""
 
-    def look(self: EmergencyStop) -> None:
+    def look(self):
         if self.endpoints == ["tcp/127.0.0.1:1"]:
             self.seen = set(NAMES)
         else:
             self.failure = ConnectionError("no router answers")
 
-    def send(self: EmergencyStop, _reason: str) -> None:
+    def send(self, _reason):
         look(self)
         self.moving = self.seen & {*NAMES[:30]}
 
@@ -40,7 +37,7 @@ def stop(monkeypatch: pytest.MonkeyPatch) -> type[EmergencyStop]:
 
 
 @pytest.mark.usefixtures("stop")
-def test_estop_names_both_kinds_of_robots(capsys: pytest.CaptureFixture[str]) -> None:
+def test_estop_names_both_kinds_of_robots(capsys):
     assert orders.estop() == 1
     out, err = capsys.readouterr()
     assert out == f"stopped: {', '.join(NAMES[30:])} (at tcp/127.0.0.1:1)\n"
@@ -54,9 +51,7 @@ def test_estop_names_both_kinds_of_robots(capsys: pytest.CaptureFixture[str]) ->
 
 
 @pytest.mark.usefixtures("stop")
-def test_dry_run_names_robots_and_sends_no_stop(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_dry_run_names_robots_and_sends_no_stop(monkeypatch, capsys):
     monkeypatch.delattr(EmergencyStop, "send")
     assert orders.estop(dry_run=True, connect=["tcp/127.0.0.1:1"]) == 0
     first = ", ".join(NAMES[:20])
@@ -68,11 +63,11 @@ def test_dry_run_names_robots_and_sends_no_stop(
 
 
 @pytest.mark.system
-def test_dry_run_finds_robots_that_hear_nothing(router: RouterProcess) -> None:
+def test_dry_run_finds_robots_that_hear_nothing(router):
     keys = Keys()
     with network.open_session([router.endpoint], name="CF01") as robot:
         _token = pubsub.alive_token(robot, keys.alive("CF01"))
-        stops: list[messages.Stop] = []
+        stops = []
         _heard = pubsub.ImmediateSubscriber(robot, keys.estop, stops.append)
         until(lambda: network.tokens_present(robot, keys.alive("CF01")), "the robot is there")
         look = EmergencyStop([router.endpoint], "park", "operator")

@@ -7,29 +7,27 @@ import shutil
 from types import SimpleNamespace
 
 import pytest
-from typer.testing import CliRunner
 
+from agents.errors import ExplainedError
 from experiments.file.problems import DocumentError
 from experiments.metrics.statistics import spread
 from experiments.report.tables import ratio_words
+from tests.commands import invoke
 from tests.experiments.recording.test_bundle import SHORT
 from tools.commands.run import _acquired
-from tools.main import app
 from tools.options import known_words
 
 pytestmark = pytest.mark.slow  # whole runs and their reports
 
 
-def zenpark(*words):
-    done = CliRunner().invoke(app, [*map(str, words)])
-    assert done.exit_code == 0, done.output
-    return done.stdout
+def zenpark(*words, code=0):
+    return invoke(*words, code=code).stdout
 
 
 def refusal(*words):
     """Why a command is refused."""
-    error = CliRunner().invoke(app, [*map(str, words)]).exception
-    assert isinstance(error, DocumentError)
+    error = invoke(*words, code=None).exception
+    assert isinstance(error, ExplainedError)
     return str(error)
 
 
@@ -58,9 +56,7 @@ def another(first, tmp_path):
 
     def run(*options, folder="x", code=0):
         words = ["run", first.parent / "short.toml", "--virtual", "--no-report", "--out", tmp_path / folder, *options]
-        done = CliRunner().invoke(app, [*map(str, words)])
-        assert done.exit_code == code, done.output
-        return tmp_path / folder, done.stdout
+        return tmp_path / folder, zenpark(*words, code=code)
 
     return run
 
@@ -97,7 +93,7 @@ def test_figure_of_errors_stays_without_all_seeds_errors(first, again):
 def test_metrics_of_another_version_are_not_overwritten(again):
     before = (again / "metrics.json").read_text().replace('"iae"', '"iae_of_old"')
     (again / "metrics.json").write_text(before)
-    assert CliRunner().invoke(app, ["report", str(again)]).exit_code != 0
+    assert refusal("report", again)
     assert (again / "metrics.json").read_text() == before
 
 
@@ -199,8 +195,8 @@ def test_interrupted_run_over_seeds_reports_what_is_kept(made, kept, first, tmp_
         raise KeyboardInterrupt
 
     monkeypatch.setattr("experiments.run.simulate_seeds", interrupted)
-    options = ["--virtual", "--seeds", "60", "--out", str(tmp_path / "run")]
-    done = CliRunner().invoke(app, ["run", str(first.parent / "short.toml"), *options])
+    options = ["--virtual", "--seeds", "60", "--out", tmp_path / "run"]
+    done = invoke("run", first.parent / "short.toml", *options, code=None)
     assert done.exit_code != 0
     assert f"interrupted: {kept}" in done.stderr
     assert "`./zenpark sweep` keeps every seed" in done.stderr
