@@ -116,12 +116,13 @@ class Listener:
 def listen(hub, eventually):
     opened = []
 
-    def make(faults=None, style="ros2dds", distro="jazzy", **kinds):
+    def make(faults=None, style="ros2dds", distro="jazzy", ready=True, **kinds):
         device = {"style": style, "distro": distro} | kinds.pop("device", {})
         twin = TurtleBot3Twin(DeviceRequest(request(hub.endpoint, device=device, **kinds), faults or Faults()))
         session = open_session([hub.endpoint], name="listener")
         opened.extend([twin, session])
-        return Listener(session, twin, style, distro, eventually).ready()
+        listener = Listener(session, twin, style, distro, eventually)
+        return listener.ready() if ready else listener
 
     yield make
     for each in opened:
@@ -237,16 +238,20 @@ def test_announces_itself(listen, eventually):
 
 
 @pytest.mark.system
-def test_loss_is_of_both_directions_delay_of_one(listen):
-    listener = listen()
-    listener.twin.link.faults = Faults(loss=0.3)
+def test_loss_is_a_share_of_both_directions(listen):
+    listener = listen(faults=Faults(loss=0.3))
     assert 0.6 < listener.count(20.0) / 400 < 0.8
     for _ in range(20):
         for _ in range(10):
             listener.tell(0.0, 0.0)
-        listener.after(0.01)
+        listener.settle()
+        listener.advance(0.01)
     assert 0.55 < listener.twin.commands_received[0] / 200 < 0.85
-    listener.twin.link.faults = Faults(delay_s=0.5)
+
+
+@pytest.mark.system
+def test_delay_is_of_what_it_says(listen):
+    listener = listen(faults=Faults(delay_s=0.5), ready=False)
     assert listener.count(0.5) == 0
     assert listener.count(0.5) == 10
 
