@@ -13,14 +13,9 @@ from tools import consent
 REACHING = """
 title = "two"
 duration_s = 5.0
-[robots.A]
-kind = "crazyflie"
-start = [-0.4, 0.0]
-hover = 0.5
-body = "radio://0/80/2M/E7E7E7E701"
-[robots.B]
-kind = "khepera4"
-start = [0.4, 0.0]
+[robots]
+A = { kind = "crazyflie", start = [-0.4, 0.0], hover = 0.5, body = "radio://0/80/2M/E7E7E7E701" }
+B = { kind = "khepera4", start = [0.4, 0.0] }
 [formation.links]
 "A - B" = 0.8
 [hosts.pi]
@@ -42,14 +37,10 @@ def test_devices_and_machines_are_named():
     assert "ssh pi@192.0.2.7" in machine
 
 
-def test_simulated_runs_ask_nothing(monkeypatch):
-    asking(monkeypatch, None)
-    consent.require("a.zip", load("robotic-park").cases(), given=False)
-
-
 @pytest.mark.parametrize(("answer", "runs"), [("y", True), ("YES", True), ("n", False), ("", False), (None, False)])
 def test_others_files_run_when_agreed(answer, runs, monkeypatch):
     asking(monkeypatch, answer)
+    consent.require("a.zip", load("robotic-park").cases(), given=False)  # it is simulated
     cases = loads(REACHING).cases()
     consent.require("a.zip", cases, given=True)
     if runs:

@@ -184,26 +184,22 @@ def test_placed_robot_rests_or_moves_as_commanded():
     assert twin.read(201 * DT)[0].true_position == pytest.approx((1.001, 1.0, 0.0))  # wheels roll ahead alone
 
 
-@pytest.mark.slow
 def test_odometry_drifts_with_the_way():
-    errors = []
-    for seed in range(40):
-        twin = body(KHEPERA4, Disturbance(odometry_drift=0.02), seed)
-        _, state = run(twin, 300, command=(0.2, 0.5, 0.0, 0.0))
-        errors.append(np.subtract(state.position, state.true_position)[:2])
+    twin = TwinBody(request([KHEPERA4] * 40, disturbance=Disturbance(odometry_drift=0.02)))
+    for tick in range(300):
+        states = twin.read(tick * DT)
+        twin.command([(0.2, 0.5, 0.0, 0.0)] * 40)
+    errors = [np.subtract(state.position, state.true_position)[:2] for state in states]
     assert np.std(errors) == pytest.approx(0.02 * np.sqrt(0.2 * 3.0), rel=0.2)
 
 
-@pytest.mark.parametrize("order", ["land", "stop"])
-def test_land_and_stop_halt_wheels(order):
-    twin = body(TURTLEBOT3)
-    run(twin, 50, command=AHEAD)
-    getattr(twin, order)([0])
-    run(twin, 30, 50)
-    assert twin.engine.motions[0].velocity == ZERO
-
-
-def test_emergency_stop_in_the_air_is_a_fall():
+def test_stop_halts_wheels_and_is_a_fall_aloft():
+    for order in ("land", "stop"):
+        twin = body(TURTLEBOT3)
+        run(twin, 50, command=AHEAD)
+        getattr(twin, order)([0])
+        run(twin, 30, 50)
+        assert twin.engine.motions[0].velocity == ZERO
     twin = body(CRAZYFLIE)
     twin.takeoff([0], [0.5])
     run(twin, 500)

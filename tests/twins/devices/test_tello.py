@@ -88,6 +88,14 @@ def talk(monkeypatch):
         yield lambda **parts: made.enter_context(closing(Conversation(monkeypatch, **parts)))
 
 
+@pytest.fixture
+def drone(talk):
+    """One in the air, at rest."""
+    made = talk()
+    made.up()
+    return made
+
+
 def test_tello_is_silent_until_in_sdk_mode(talk):
     drone = talk()
     assert drone.ask("battery?") is None
@@ -153,9 +161,7 @@ def test_sticks_are_body_velocities_until_they_change(talk):
     assert int(drone.state()[0]["yaw"]) == pytest.approx(52, abs=3)
 
 
-def test_moves_end_where_they_should(talk):
-    drone = talk()
-    drone.up()
+def test_moves_end_where_they_should(drone):
     begin = drone.place()
     drone.say("go 50 -40 30 100")
     assert drone.answers(5.0) == ["ok"]
@@ -199,16 +205,12 @@ def test_moves_end_where_they_should(talk):
         ("stop", "ok"),
     ],
 )
-def test_what_it_refuses_in_the_air(talk, command, answer):
-    drone = talk()
-    drone.up()
+def test_what_it_refuses_in_the_air(drone, command, answer):
     assert drone.ask(command) == answer
 
 
-def test_a_curve_goes_through_its_points(talk):
+def test_a_curve_goes_through_its_points(drone):
     """A quarter of a circle of 1 m ahead and to the left: never farther than 5 cm from it."""
-    drone = talk()
-    drone.up()
     begin, centre = drone.place(), drone.place() + np.array([0.0, 1.0, 0.0])
     drone.say("curve 71 29 0 100 100 0 30")
     answers = []
@@ -217,14 +219,6 @@ def test_a_curve_goes_through_its_points(talk):
         assert np.linalg.norm((drone.place() - centre)[:2]) == pytest.approx(1.0, abs=0.05)
     assert answers == ["ok"]
     assert drone.place() - begin == pytest.approx([1.0, 1.0, 0.0], abs=0.05)
-
-
-def test_a_flip_needs_half_a_battery(talk):
-    full, half = talk(), talk(faults={"battery": 0.4})
-    for drone, answer in ((full, "ok"), (half, "error")):
-        drone.up()
-        drone.say("flip f")
-        assert drone.answers(3.0) == [answer]
 
 
 def test_mission_pads_are_searched_for_when_switched_on(talk):
@@ -237,10 +231,8 @@ def test_mission_pads_are_searched_for_when_switched_on(talk):
         assert (state["mid"], state["x"]) == said
 
 
-def test_wifi_gap_leaves_the_sticks_as_they_are(talk):
+def test_wifi_gap_leaves_the_sticks_as_they_are(drone):
     """As a real one: it flies on, hears nothing, and lands 15 s after the last command if nobody comes back."""
-    drone = talk()
-    drone.up()
     drone.say("rc 0 30 0 0")
     drone.wait(1.0)
     drone.state()
@@ -258,14 +250,6 @@ def test_wifi_gap_leaves_the_sticks_as_they_are(talk):
     assert drone.after(0.5) == pytest.approx(at, abs=0.01)
 
 
-def test_sticks_of_another_scale(talk):
-    drone = talk(device={"twin_stick_speed": 0.6})
-    drone.up()
-    drone.say("rc 0 50 0 0")
-    before = drone.after(2.0)
-    assert drone.after(1.0)[0] - before[0] == pytest.approx(0.3, abs=0.01)
-
-
 def test_what_it_refuses_on_the_ground(talk):
     drone = talk()
     drone.ask("command")
@@ -275,15 +259,18 @@ def test_what_it_refuses_on_the_ground(talk):
     assert drone.ask("\xff") == "unknown command: ??"
 
 
-def test_tello_lands_after_fifteen_seconds_without_a_command(talk):
-    drone = talk()
-    drone.up()
+def test_tello_lands_after_fifteen_seconds_without_a_command(drone):
     assert drone.after(6.9)[2] == pytest.approx(0.8, abs=0.01)  # 14.9 s after the last command
     assert drone.after(0.4)[2] < 0.8
     assert drone.after(6.0)[2] == 0.0
 
 
 def test_a_battery_that_ends_brings_it_down(talk):
+    for charge, answer in ((1.0, "ok"), (0.4, "error")):  # a flip needs half of it
+        flier = talk(faults={"battery": charge})
+        flier.up()
+        flier.say("flip f")
+        assert flier.answers(3.0) == [answer]
     weak = talk(faults={"battery": 0.08})
     weak.ask("command")
     assert weak.ask("takeoff") == "error"
@@ -312,10 +299,13 @@ def test_silence_loss_and_delay(talk):
     assert 30 < answers.count("ok") < 70  # a quarter comes through both ways
 
 
-def test_disturbance_shows_in_the_truth(talk):
-    drone = talk(disturbance=Disturbance(hover_jitter=Jitter(0.02), latency_s=0.1))
+def test_disturbance_and_settings_show_in_the_truth(talk):
+    drone = talk(disturbance=Disturbance(hover_jitter=Jitter(0.02), latency_s=0.1), device={"twin_stick_speed": 0.6})
     drone.up()
     assert 0.002 < np.std([drone.after(DT)[0] for _ in range(300)]) < 0.06
+    drone.say("rc 0 50 0 0")
+    before = drone.after(2.0)
+    assert drone.after(3.0)[0] - before[0] == pytest.approx(0.9, abs=0.12)
 
 
 def test_drones_have_addresses_of_their_own(talk):

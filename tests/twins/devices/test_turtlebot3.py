@@ -86,10 +86,13 @@ class Listener:
         return self.inbox[topic][-1][0] if self.inbox[topic] else None
 
     def settle(self):
-        """Whatever was under way has arrived: a query to and fro on the same links is slower than a sample."""
-        for _ in range(2):
+        """Whatever was under way has arrived: two queries to and fro on the same links bring nothing more."""
+        quiet = 0
+        while quiet < 2:
+            before = [len(box) for box in self.inbox.values()]
             list(self.session.liveliness().get("nobody/**", timeout=1.0))
-        self.take()
+            self.take()
+            quiet = quiet + 1 if before == [len(box) for box in self.inbox.values()] else 0
 
     def tell(self, v, w, kind=None):
         made = STORE.types
