@@ -191,30 +191,39 @@ def test_a_client_may_ask_for_single_frames():
         assert [list(frame.poses) for frame in frames] == [["CF01"], ["CF01"]]
 
 
-@pytest.mark.system
+class Viewer:
+    """A client of a twin whose time is told."""
+
+    def __init__(self, subjects, **settings):
+        self.twin = ViconTwin(subjects, **settings)
+        self.client = socket.create_connection(("127.0.0.1", int(self.twin.address.rpartition(":")[2])), 2.0)
+        self.framer, self.decoder = Framer(), Decoder()
+        self.client.sendall(vicon_datastream.packet(vicon_datastream.block(BlockKind.REQUEST_FRAME, b"\x01")))
+        for ready in range(2):  # who listens, and then the connection
+            select.select(self.twin.sockets()[ready:], [], [], 2.0)
+            self.twin.serve(self.twin.sockets()[ready], 0.0)
+        assert self.client.recv(65536) == vicon_datastream.pack_kinds(vicon_datastream.POSES)
+
+    def close(self):
+        self.client.close()
+        self.twin.close()
+
+    def frames(self, t):
+        """Frames that arrive when it is `t` [s]."""
+        self.twin.advance(t)
+        if not select.select([self.client], [], [], 0.05)[0]:
+            return []
+        return [self.decoder.frame(body) for body in self.framer.feed(self.client.recv(65536))]
+
+
 def test_delayed_frame_comes_late_but_unchanged():
-    twin = ViconTwin(["CF01"], faults=Faults(delay_s=0.05))
-    with socket.create_connection(("127.0.0.1", int(twin.address.rpartition(":")[2])), 2.0) as client:
-        listener = twin.sockets()[0]
-        select.select([listener], [], [], 2.0)
-        twin.serve(listener, 0.0)
-        client.sendall(vicon_datastream.packet(vicon_datastream.block(BlockKind.REQUEST_FRAME, b"\x01")))
-        select.select(twin.sockets(), [], [], 2.0)
-        twin.serve(twin.sockets()[1], 0.0)
-        assert client.recv(65536) == vicon_datastream.pack_kinds(vicon_datastream.POSES)
+    with closing(Viewer(["CF01"], faults=Faults(delay_s=0.05))) as viewer:
         for t, height in ((0.01, 1.0), (0.02, 2.0), (0.055, 3.0)):
-            twin.place(0, np.array([0.0, 0.0, height]), upright(0.0))
-            twin.advance(t)
-        client.setblocking(False)
-        with pytest.raises(BlockingIOError):
-            client.recv(65536)
-        twin.advance(0.061)
-        client.settimeout(2.0)
-        (body,) = Framer().feed(client.recv(65536))
-        frame = Decoder().frame(body)
-        assert frame.number == 1
-        assert frame.poses["CF01"].position == (0.0, 0.0, 1.0)
-    twin.close()
+            viewer.twin.place(0, np.array([0.0, 0.0, height]), upright(0.0))
+            assert viewer.frames(t) == []
+        (frame,) = viewer.frames(0.061)
+    assert frame.number == 1
+    assert frame.poses["CF01"].position == (0.0, 0.0, 1.0)
 
 
 @pytest.mark.system
@@ -316,16 +325,13 @@ def test_user_errors_are_reported_without_a_traceback():
 
 def told(fault):
     """Frames of two moving subjects, before and during a fault."""
-    twin = ViconTwin(["CF01", "CF02"], sigma=0.001)
-    decoder, frames = Decoder(), []
-    with closing(twin):
+    frames = []
+    with closing(Viewer(["CF01", "CF02"], sigma=0.001)) as viewer:
         for k in range(1, 7):
-            twin.link.faults = Faults(capture=fault if k > 3 else "")
+            viewer.twin.link.faults = Faults(capture=fault if k > 3 else "")
             for row in range(2):
-                twin.place(row, np.array([0.1 * k, float(row), 0.5]), upright(0.0))
-            twin.frames_sent = k
-            blocks = twin._frame(0.01 * k)
-            frames.append(decoder.frame(twin._names() + blocks))
+                viewer.twin.place(row, np.array([0.1 * k, float(row), 0.5]), upright(0.0))
+            frames += viewer.frames(0.01 * k)
     return frames[:3], frames[3:]
 
 

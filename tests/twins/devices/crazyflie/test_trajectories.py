@@ -146,11 +146,3 @@ def test_a_spiral_goes_round_its_centre(clockwise, sideways):
     _, speed, _ = planner.state(0, 0.0)
     along = sense * np.array([math.sin(to_centre), -math.cos(to_centre)])
     assert along @ speed[:2] == pytest.approx(0.5 * angle / span)
-
-
-@pytest.mark.slow
-def test_a_spiral_is_flown():
-    wire = Wire().hovering()
-    assert wire.plan(HighLevel.SPIRAL, "??fffff", 0, 0, math.pi / 2, 0.5, 0.5, 0.2, 3.0) == LogStatus.OK
-    assert wire.after(6.0).position == pytest.approx([0.5, 0.5, 1.2], abs=0.02)
-    assert wire.yaw == pytest.approx(math.pi / 2, abs=0.02)
