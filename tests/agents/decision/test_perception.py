@@ -56,9 +56,6 @@ def rays(bearing, distance, *, elevation=0.0, time=0.0):
     return RangeScan(time, tuple(bearing), tuple(flat), tuple(distance))
 
 
-# ---------------------------------------------------------------- oneself
-
-
 @pytest.mark.parametrize("absurd", [nan, inf, -inf, 51.0, -1e8, 1e38])
 def test_absurd_velocity_is_not_known(absurd):
     sight = Sight()
@@ -76,9 +73,6 @@ def test_robot_knows_kind_pose_and_lower_limit(kind, speed, takes, lag):
     own = sight.perception.own
     assert (own.speed, (own.by_position, own.by_twist), own.lag) == (speed, takes, lag)
     assert (own.position, own.yaw, own.velocity) == ((1.0, 0.0, 1.0), 2.0, (0.0, 0.2, 0.0))
-
-
-# ---------------------------------------------------------------- received robots
 
 
 @pytest.mark.parametrize(("t", "age"), [(1.0, 0.0), (1.04, 0.04), (1.3, AHEAD_S), (0.9, 0.0)])
@@ -152,9 +146,6 @@ def test_lost_robot_knows_of_nothing(how):
     sight = Sight().hear((0.5, 0.0, 0.0))
     assert len(sight.sense(0.0)) == 1
     assert sight.sense(0.0, **how) == []
-
-
-# ---------------------------------------------------------------- range readings
 
 
 def test_ray_ends_where_it_points():

@@ -21,9 +21,6 @@ from tests.small import pair
 QUICK = Potential(velocity=0.2, period_s=0.1)  # h v = 0.02 m
 
 
-# ---------------------------------------------------------------- the potential
-
-
 @pytest.mark.parametrize("gap", [0.02, 0.1, 0.15, 0.29])
 def test_push_is_minus_the_gradient_of_equation_2(gap):
     potential, step = Potential(strength=2e-4), 1e-7
@@ -81,9 +78,6 @@ def test_far_things_change_nothing():
 
 def test_thing_in_the_same_place_gives_numbers():
     assert all(map(isfinite, Potential().deviate(ZERO, own(KHEPERA4, (0.5, 0.5)), near((0.5, 0.5)), 0.01)))
-
-
-# ---------------------------------------------------------------- in the decision
 
 
 @pytest.mark.parametrize(

@@ -134,9 +134,6 @@ def test_parameters_are_checked(plan):
         built(plan)
 
 
-# ---------------------------------------------------------------- itineraries
-
-
 @FEW
 @given(st.lists(st.sampled_from(range(len(PLANS))), min_size=1, max_size=4), ANCHOR, HEADING)
 def test_legs_follow_without_a_jump(chosen, start, yaw):
