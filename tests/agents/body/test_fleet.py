@@ -1,18 +1,88 @@
-"""Several bodies in one process look like one."""
+"""Several bodies in one process look like one; a twin beside a robot is told the same, and never in its way."""
+
+from math import inf, isfinite, isnan, nan
 
 import pytest
 
 from agents.body import fleet
 from agents.body.fleet import Fleet, assemble
-from agents.body.interface import BodyError
+from agents.body.interface import Body, BodyError, BodyState, Disturbance
+from agents.body.shadow_twin import Shadowed, shadowed
 from agents.network.messages import Inspection
 from agents.plugins import registry
+from agents.vectors import NO_SETPOINT, UNKNOWN, ZERO
 from experiments.definition import bodies
 from experiments.definition.experiment import RobotTable
 from experiments.definition.plan import Plan
-from tests.agents.body.recorded import Recorded
+from tests.requests import request
 from tests.small import small
 from twins.body import TwinBody
+
+
+class Recorded(Body):
+    """Robots that move along x as told, at a `share` of the speed, measured off by a constant [m].
+
+    Attributes:
+        told: Calls with their arguments, one after the other.
+        placed: Moments and arguments of `place`.
+        broken: The method that raises `failure`.
+    """
+
+    def __init__(self, rows, *, share=1.0, off=0.0, start=0.0):
+        self.x, self.yaw = [start + row for row in range(rows)], [0.0] * rows
+        self.speed, self.flying = [0.0] * rows, [False] * rows
+        self.share, self.off = share, off
+        self.told, self.placed = [], []
+        self.t = self.stale = 0.0
+        self.note = self.broken = ""
+        self.failure = BodyError
+
+    def _tell(self, what, *arguments):
+        if self.broken == what:
+            raise self.failure("no engine")
+        self.told.append((what, *arguments) if arguments else what)
+
+    def open(self):
+        self._tell("open")
+
+    def read(self, t):
+        if self.broken == "read":
+            raise self.failure("no engine")
+        self.x = [x + (t - self.t) * self.share * speed for x, speed in zip(self.x, self.speed, strict=True)]
+        self.t = t
+        return [
+            BodyState(t - self.stale, (x + self.off, 0.0, 0.0), (speed, 0.0, 0.0), yaw, flying=flying, note=self.note)
+            for x, speed, yaw, flying in zip(self.x, self.speed, self.yaw, self.flying, strict=True)
+        ]
+
+    def command(self, setpoints):
+        self._tell("command", [setpoint[0] for setpoint in setpoints])
+        for row, (speed, *_) in enumerate(setpoints):
+            self.speed[row] = speed if isfinite(speed) else self.speed[row]
+
+    def takeoff(self, rows, heights):
+        self._tell("takeoff", rows, heights)
+        for row in rows:
+            self.flying[row] = True
+
+    def land(self, rows):
+        self._tell("land", rows)
+
+    def stop(self, rows):
+        self._tell("stop", rows)
+
+    def locate(self, row, t, position, yaw):
+        self._tell("locate", row, t, position, yaw)
+
+    def close(self):
+        self._tell("close")
+
+    def place(self, rows, positions, yaws, flying, velocities=None):
+        if self.broken == "place":
+            raise self.failure("no engine")
+        self.placed.append((round(self.t, 6), rows, [x for x, _, _ in positions], flying, velocities))
+        for row, (x, _, _), yaw in zip(rows, positions, yaws, strict=True):
+            self.x[row], self.yaw[row] = x, yaw
 
 
 def interleaved():
@@ -63,7 +133,7 @@ def test_failing_body_keeps_no_other_from_orders(what):
     assert b.told == (["close"] if what == "close" else [(what, [0, 1, 2])])
 
 
-def request(*addresses):
+def bodies_at(*addresses):
     robots = {
         f"R{k}": RobotTable(kind="crazyflie" if k == 1 else "khepera4", start=[0.5 * k, 0.0], body=address, hover=0.5)
         for k, address in enumerate(addresses)
@@ -81,7 +151,7 @@ def test_addresses_choose_the_bodies(monkeypatch):
 
         return opened
 
-    wanted = request("radio://0/80", "twin", "radio://0/81")
+    wanted = bodies_at("radio://0/80", "twin", "radio://0/81")
     monkeypatch.setattr(fleet.registry, "load", load)
     assemble(wanted)
     assert asked == [
@@ -91,7 +161,7 @@ def test_addresses_choose_the_bodies(monkeypatch):
 
 
 def test_twins_share_one_body():
-    both = assemble(request("twin", "twin", "twin"))
+    both = assemble(bodies_at("twin", "twin", "twin"))
     assert len(both.read(0.0)) == 3
     assert isinstance(both, TwinBody)
 
@@ -106,3 +176,169 @@ class Inspected(Recorded):
 def test_rows_are_inspected_by_their_bodies():
     both = Fleet([((0, 2), Inspected(2)), ((1,), Recorded(1))])
     assert [both.inspect(row) for row in range(3)] == [Inspection("7.0"), Inspection(), Inspection("7.1")]
+
+
+# ---------------------------------------------------------------- a twin beside a robot
+
+DT = 0.1
+
+
+def beside(rows=1, shadows=(0,), restart=inf, *, share=1.0, off=0.0):
+    """A robot and its twin, which is faster by `share` and measured `off` [m]."""
+    robot, twin = Recorded(rows, off=off), Recorded(len(shadows), share=share)
+    return Shadowed(robot, twin, shadows, [restart] * len(shadows)), robot, twin
+
+
+def speeds(*values):
+    """Setpoints that say how fast to go along x."""
+    return [(value, 0.0, 0.0, 0.0) for value in values]
+
+
+def differences(body, duration, speed=0.5):
+    """What the twin is ahead, at each tick."""
+    ahead = []
+    for k in range(round(duration / DT) + 1):
+        states = body.read(k * DT)
+        ahead.append(states[0].shadow_position[0] - states[0].position[0])
+        body.command(speeds(*[speed] * len(states)))
+    return ahead
+
+
+@pytest.mark.parametrize(("restart", "placed"), [(1.0, [0.0, 0.1, 1.1, 2.1]), (inf, [0.0, 0.1])])
+def test_faster_twin_runs_ahead_until_put_back(restart, placed):
+    body, _, twin = beside(restart=restart, share=1.1)
+    ahead = differences(body, 3.05)
+    assert [at for at, *_ in twin.placed] == placed  # driven at 0, seen to be driven at 0.1
+    since = [k * DT - max((at for at in placed if at < k * DT + 1e-9), default=0.0) for k in range(31)]
+    assert ahead == pytest.approx([0.05 * max(seconds, 0.0) for seconds in since], abs=1e-12)
+
+
+def test_twin_takes_measured_place_and_speed():
+    body, robot, twin = beside(off=0.25)
+    body.read(0.0)
+    assert twin.placed[0][2] == [0.25]
+    robot.speed[0] = 0.3
+    body.command(speeds(0.4))
+    (state,) = body.read(0.1)
+    assert twin.placed[1][4] == [(0.4, 0.0, 0.0)]
+    assert state.shadow_position == pytest.approx(state.position)
+
+
+def test_orders_reach_twins_by_their_own_rows():
+    body, robot, twin = beside(rows=3, shadows=(0, 2))
+    body.open()
+    states = body.read(0.0)
+    assert states[1].shadow_position is UNKNOWN
+    assert [isnan(state.shadow_yaw) for state in states] == [False, True, False]
+    body.takeoff([1, 2], [0.5, 0.7])
+    body.command(speeds(0.1, 0.2, 0.3))
+    body.land([1])
+    body.land([2, 0])
+    body.stop([0, 1, 2])
+    body.locate(2, 0.0, ZERO, 0.0)
+    body.close()
+    assert robot.told == [
+        "open", ("takeoff", [1, 2], [0.5, 0.7]), ("command", [0.1, 0.2, 0.3]), ("land", [1]), ("land", [2, 0]),
+        ("stop", [0, 1, 2]), ("locate", 2, 0.0, ZERO, 0.0), "close",
+    ]  # fmt: skip
+    assert twin.told == [
+        "open", ("takeoff", [1], [0.7]), ("command", [0.1, 0.3]), ("land", []), ("land", [1, 0]), ("stop", [0, 1]),
+        "close",
+    ]  # fmt: skip
+
+
+def test_restarts_wait_while_standing_or_landing():
+    body, robot, twin = beside(restart=0.5)
+    robot.flying[0] = True
+    for k in range(10):
+        body.read(k * DT)
+        body.command([NO_SETPOINT] if k % 2 else speeds(0.0))
+    assert [at for at, *_ in twin.placed] == [0.0]
+    body.command(speeds(0.2))
+    body.read(1.0)
+    body.land([0])
+    for k in range(11, 30):
+        body.read(k * DT)
+    assert [(at, flying) for at, _, _, flying, _ in twin.placed] == [(0.0, [True]), (1.0, [True])]
+
+
+def test_it_waits_for_a_pose_that_is_fresh():
+    body, robot, twin = beside()
+    robot.stale = 1.0
+    assert body.read(0.0)[0].shadow_position is UNKNOWN
+    robot.stale, robot.x[0] = 0.0, nan
+    assert body.read(0.1)[0].shadow_position is UNKNOWN
+    robot.x[0] = 2.0
+    assert body.read(0.2)[0].shadow_position[0] == 2.0
+    assert len(twin.placed) == 1
+
+
+METHODS = ("open", "read", "place", "command", "takeoff", "land", "stop", "close")
+FAILURES = (AssertionError, MemoryError, StopIteration, SystemError, Exception)
+
+
+@pytest.mark.parametrize(
+    ("what", "failure"), [(what, BodyError) for what in METHODS] + [("command", failure) for failure in FAILURES]
+)
+def test_failing_twin_is_left_alone(what, failure):
+    body, robot, twin = beside()
+    twin.broken, twin.failure = what, failure
+    body.open()
+    plain = [robot.read(k * DT)[0].position for k in range(3)]
+    robot.t, robot.x[0] = 0.0, 0.0
+    for k in range(3):
+        (state,) = body.read(k * DT)
+        assert state.position == plain[k]
+        if k == 0:
+            body.takeoff([0], [1.0])
+            body.land([0])
+            body.stop([0])
+            body.command(speeds(0.0))
+    body.close()
+    assert robot.told == ["open", ("takeoff", [0], [1.0]), ("land", [0]), ("stop", [0]), ("command", [0.0]), "close"]
+    if what != "close":
+        assert state.note == f"its shadow failed: {failure.__name__}: no engine"
+        assert state.shadow_position is UNKNOWN
+
+
+def test_note_of_the_robot_is_kept():
+    body, robot, twin = beside(rows=2, shadows=(1,))
+    robot.note = "locked"
+    assert [state.note for state in body.read(0.0)] == ["locked"] * 2
+    twin.broken = "read"
+    assert [state.note for state in body.read(DT)] == ["locked", "locked; its shadow failed: BodyError: no engine"]
+
+
+def test_a_failure_of_the_robot_is_not_hidden():
+    body, robot, _ = beside()
+    robot.broken = "read"
+    with pytest.raises(BodyError, match="no engine"):
+        body.read(0.0)
+
+
+DISTURBED = {
+    "disturbance": Disturbance(position_sigma=0.1, latency_s=0.1, odometry_drift=0.1),
+    "external": True,
+    "device": {"tx_power": 3},
+    "addresses": "radio://0/80/2M/E7E7E7E701",
+    "start": [(0.0, 0.0)] * 2,
+}
+
+
+def test_nobody_with_a_shadow_means_the_body_itself():
+    robot = Recorded(2)
+    assert shadowed(robot, request(["khepera4", "tello"], **DISTURBED), [nan, nan]) is robot
+
+
+@pytest.mark.parametrize("kind", ["khepera4", "tello"])
+def test_twin_is_undisturbed(kind):
+    robot = Recorded(2)
+    robot.flying = [kind == "tello"] * 2
+    body = shadowed(robot, request(["crazyflie", kind], **DISTURBED), [nan, 1.0])
+    for k in range(101):
+        first, second = body.read(k / 100)
+        body.command([NO_SETPOINT, (0.2, 0.0, 0.0, 0.0)])
+    assert first.shadow_position is UNKNOWN
+    assert second.position[0] == pytest.approx(1.2)
+    # it took over the robot's speed with its place
+    assert second.shadow_position == (pytest.approx(1.2), 0.0, 0.0)

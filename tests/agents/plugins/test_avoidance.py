@@ -1,21 +1,28 @@
-"""The potential of the paper, and an avoidance in the decision of a robot."""
+"""Avoidances: the potential of the paper, and the barrier, which finds the nearest allowed velocity, exactly."""
 
 from dataclasses import replace
-from math import isfinite, sqrt
+from math import atan2, cos, dist, hypot, inf, isfinite, pi, radians, sin, sqrt
 
 import msgspec
+import numpy as np
 import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from scipy.optimize import linprog
 
+from agents.body.kinds import KINDS
 from agents.kinds.crazyflie import CRAZYFLIE
 from agents.kinds.khepera4 import KHEPERA4
 from agents.kinds.tello import TELLO
 from agents.kinds.turtlebot3 import TURTLEBOT3
-from agents.plugins.avoidance import Potential
+from agents.plugins.avoidance import Nearby, Plane, Potential, measure_gap
+from agents.plugins.barrier import Barrier, closest
 from agents.plugins.registry import AVOIDANCES, build
 from agents.vectors import ZERO
 from experiments.definition.plan import Plan
 from tests.agents.bench import Bench
 from tests.agents.things import NOTHING, near, own
+from tests.cases import for_each
 from tests.small import pair
 
 QUICK = Potential(velocity=0.2, period_s=0.1)  # h v = 0.02 m
@@ -94,3 +101,274 @@ def test_avoidance_acts_near_others_alone(kind, gap, acts):
     assert robot.avoided == acts
     assert robot.setpoint[0] < 0.0 if acts else robot.setpoint == (0.0, 0.0, 0.0, 0.0)
     assert robot.goal == pytest.approx(ZERO)  # that of the decision itself is not shifted
+
+
+# ---------------------------------------------------------------- the barrier
+
+FEW, MANY = settings(max_examples=50), settings(max_examples=400, deadline=None)
+EVERY_KIND = pytest.mark.parametrize("kind", KINDS.values(), ids=lambda kind: kind.name)
+ROUNDING = 1e-7  # [m/s]
+BARRIER = Barrier()
+# bearings that face each other or are alike, or differ enough for a test to know whether there is a common point
+BEARING = st.integers(-720, 720).map(lambda number: number * pi / 720)
+NUMBER, PLANE = st.floats(-1.5, 1.5), st.tuples(BEARING, st.floats(-0.5, 1.0))
+STILL = (0.0, 0.0, 0.0, 0.0)
+
+
+def all_of(*groups):
+    """Things of several groups together."""
+    together = near()
+    together.things = [thing for group in groups for thing in group.things[: group.count]]
+    together.count = len(together.things)
+    together.planes = [Plane() for _ in together.things]
+    return together
+
+
+def moving(x, y, velocity, is_robot, **robot):
+    """A thing, which moves if it is a robot."""
+    given = {"velocity": velocity, "is_robot": True, **robot} if is_robot else {}
+    return near((x, y), **given)
+
+
+# ---------------------------------------------------------------- the quadratic program
+
+
+def nearest(wanted, planes, speed=inf):
+    """Result of the program for half-planes, each an angle and a bound."""
+    space = Nearby()
+    space.reserve(len(planes))
+    space.count = len(planes)
+    for plane, (angle, bound) in zip(space.planes, planes, strict=False):
+        plane.x, plane.y, plane.b = cos(angle), sin(angle), bound
+    return closest(*wanted, speed, space)
+
+
+def violation(point, planes):
+    return max(cos(angle) * point[0] + sin(angle) * point[1] - bound for angle, bound in planes)
+
+
+def half_planes(planes):
+    angle, bound = (np.array(column) for column in zip(*planes, strict=True))
+    return np.stack([np.cos(angle), np.sin(angle)], axis=1), bound
+
+
+def least_speed(planes):
+    """Norm of the slowest velocity that obeys half-planes, by trying all corners and feet; infinite: there is none."""
+    normal, bound = half_planes(planes)
+    i, j = np.triu_indices(len(planes), 1)
+    sine = normal[i, 0] * normal[j, 1] - normal[i, 1] * normal[j, 0]
+    known = np.abs(sine) > 1e-6
+    i, j, sine = i[known], j[known], sine[known]
+    corner = np.stack([bound[i] * normal[j, 1] - bound[j] * normal[i, 1],
+                       bound[j] * normal[i, 0] - bound[i] * normal[j, 0]], axis=1) / sine[:, None]  # fmt: skip
+    points = np.concatenate([np.zeros((1, 2)), bound[:, None] * normal, corner])
+    allowed = (points @ normal.T <= bound + 1e-12 * (1.0 + np.abs(points).max(axis=1, keepdims=True))).all(axis=1)
+    return np.linalg.norm(points[allowed], axis=1).min(initial=inf)
+
+
+def least_violation(planes):
+    """Least of the largest violation of bounds below 0, while the others are obeyed [m/s]."""
+    normal, bound = half_planes(planes)
+    shared = -(bound < 0.0).astype(float)
+    found = linprog([0, 0, 1], np.column_stack([normal, shared]), bound, bounds=[(None, None)] * 2 + [(0, None)])
+    assert found.success
+    return found.fun
+
+
+def holds(found, planes, speed):
+    """What is promised of a velocity for half-planes and a limit of speed."""
+    assert hypot(*found) <= speed * (1.0 + 1e-12)
+    standing = [plane for plane in planes if plane[1] >= 0.0]
+    assert not standing or violation(found, standing) <= ROUNDING
+    slowest = least_speed(planes)
+    if slowest < inf and slowest <= speed - ROUNDING:
+        assert violation(found, planes) <= ROUNDING
+    elif ROUNDING + speed < slowest < inf:  # too quick to flee from: every bound below 0 is kept by the same share
+        free = nearest(found, planes)
+        assert violation(free, planes) <= ROUNDING
+    elif slowest == inf and hypot(*found) < speed - ROUNDING:
+        assert violation(found, planes) <= least_violation(planes) + ROUNDING
+
+
+WANTED = st.tuples(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0))
+
+
+@MANY
+@given(st.lists(PLANE, min_size=1, max_size=12), WANTED, st.one_of(st.floats(0.05, 2.0), st.just(inf)))
+def test_half_planes_are_obeyed_if_possible(planes, wanted, speed):
+    holds(nearest(wanted, planes, speed), planes, speed)
+
+
+@MANY
+@given(st.lists(PLANE, min_size=1, max_size=12), WANTED)
+def test_no_allowed_velocity_is_nearer(planes, wanted):
+    found = nearest(wanted, planes, 1.5)
+    normal, bound = half_planes(planes)
+    grid = np.stack(np.meshgrid(*[np.linspace(-1.5, 1.5, 101)] * 2), axis=-1).reshape(-1, 2)
+    grid = grid[(np.linalg.norm(grid, axis=1) <= 1.5) & (grid @ normal.T <= bound).all(axis=1)]
+    assert not len(grid) or dist(found, wanted) <= np.linalg.norm(grid - wanted, axis=1).min() + ROUNDING
+
+
+@given(st.floats(0.1, 1.0), st.floats(0.0, 3.0), st.floats(-pi, pi), WANTED)
+def test_fleeing_keeps_the_direction_at_full_speed(speed, beyond, angle, wanted):
+    """Something comes faster than the robot can flee: the share of the bound that its speed allows is kept."""
+    planes = [(angle, -speed - 0.01 - beyond)]
+    free, found = nearest(wanted, planes), nearest(wanted, planes, speed)
+    share = speed / hypot(*free)
+    assert found == pytest.approx((share * free[0], share * free[1]), abs=ROUNDING)
+    assert violation(found, [(angle, share * planes[0][1])]) <= ROUNDING
+
+
+SCENE = st.lists(
+    st.tuples(BEARING, st.floats(-0.05, 1.0), st.tuples(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5)), st.booleans()),
+    min_size=1,
+    max_size=12,
+)
+
+
+@MANY
+@given(SCENE, WANTED)
+@example([(0.0, 0.0, None, False), (0.125, 0.0, None, False), (2.75, 0.125, None, False)], (0.0, 0.0))
+def test_things_all_around_are_obeyed(scene, wanted):
+    here, reach = own(TELLO, (3.0, -2.0), velocity=(0.1, 0.2, 0.0)), TELLO.radius
+    places = [(3.0 + (reach + gap) * cos(a), -2.0 + (reach + gap) * sin(a)) for a, gap, *_ in scene]
+    things = all_of(*(moving(*place, *rest, lag=0.3) for place, (_, _, *rest) in zip(places, scene, strict=True)))
+    u = BARRIER.restrain((*wanted, 0.0, 0.0), here, things)
+    planes = [(atan2(-thing.away_y, -thing.away_x), BARRIER.bound(thing, 1.0)) for thing in things.things]
+    if violation(wanted, planes) > 1e-9:
+        holds(u[:2], planes, TELLO.speed)
+    else:
+        assert u[:2] == wanted
+
+
+@pytest.mark.parametrize(
+    ("wanted", "planes", "found"),
+    [
+        ((0.1, 1 / 3), [(0.0, 0.3), (2.0, 0.4)], (0.1, 1 / 3)),
+        ((1.0, 1.0), [(0.0, 0.1), (0.5 * pi, 0.2)], (0.1, 0.2)),  # a corner
+        ((0.0, 0.0), [(0.0, -0.1), (pi, -0.3)], (0.1, 0.0)),  # the least violation of both
+        ((1.0, 1.0), [(radians(angle), -0.2) for angle in (0.0, 120.0, 240.0)], (0.0, 0.0)),
+    ],
+)
+def test_nearest_velocities_that_are_known(wanted, planes, found):
+    assert nearest(wanted, planes) == pytest.approx(found, abs=1e-6)
+
+
+# ---------------------------------------------------------------- what is allowed
+
+
+def test_bound_is_half_the_gap_or_less():
+    here, place = own(TELLO, (0.0, 0.0, 1.0), velocity=(0.3, 0.0, 0.0)), TELLO.radius + CRAZYFLIE.radius + 0.05 + 0.4
+    left = 0.4 - 0.3 * TELLO.lag
+    closer = left - 0.2 * CRAZYFLIE.lag
+
+    def bound(**given):
+        (thing,) = near((place, 0.0), radius=CRAZYFLIE.radius, **given).things
+        measure_gap(here, thing)
+        assert (thing.away_x, thing.away_y) == (-1.0, 0.0)
+        return BARRIER.bound(thing, 1.0)
+
+    robot = {"is_robot": True, "lag": CRAZYFLIE.lag}
+    assert bound() == pytest.approx(0.5 * 3.0 * left)
+    assert bound(velocity=(0.2, 0.0), **robot) == pytest.approx(1.5 * left)
+    assert bound(velocity=(-0.2, 0.7), **robot) == pytest.approx(min(1.5 * closer, 3.0 * closer - 0.2))
+
+
+@for_each("gap", [-0.04 + 0.016 * k for k in range(40)])
+def test_both_halves_use_no_more_than_the_gap(gap):
+    far, robot = 0.25 + gap, {"radius": TELLO.radius, "is_robot": True}
+    barrier = Barrier(right=0.0)
+    u = barrier.restrain((1.0, 0.0, 0.0, 0.0), own(TELLO, (0.0, 0.0)), near((far, 0.0), **robot))[0]
+    v = barrier.restrain((-1.0, 0.0, 0.0, 0.0), own(TELLO, (far, 0.0)), near((0.0, 0.0), **robot))[0]
+    assert u - v <= max(3.0 * gap, 6.0 * gap * (gap < 0)) + 1e-9
+    assert gap >= -0.01 or u < 0.0 < v
+
+
+@pytest.mark.parametrize("kind", [TELLO, CRAZYFLIE])
+def test_velocities_and_positions_are_restrained_alike(kind):
+    here, (x, y) = own(kind, (0.2, -0.1, 1.0)), (0.4, 0.3)
+    thing = near((0.2 + kind.radius + 0.05 + 0.1, -0.1))
+    setpoint = (x, y, 0.1, 0.2) if kind is TELLO else (0.2 + x / kind.response, -0.1 + y / kind.response, 1.1, 0.2)
+    a, b, *rest = Barrier(right=0.0).restrain(setpoint, here, thing)
+    u = (a, b) if kind is TELLO else (kind.response * (a - 0.2), kind.response * (b + 0.1))
+    assert u == pytest.approx((0.15, 0.3), abs=1e-9)
+    assert tuple(rest) == setpoint[2:]
+
+
+@for_each("yaw", [-3.1 + 0.31 * k for k in range(21)])
+def test_wheels_are_slowed_along_their_heading(yaw):
+    reach, here = KHEPERA4.radius + 0.05, own(KHEPERA4, (0.0, 0.0), yaw=yaw)
+    v, *rest = BARRIER.restrain((0.25, 3.0, 0.0, 0.0), here, near((reach + 0.06, 0.0)))
+    assert v == pytest.approx(0.25 if 0.25 * cos(yaw) <= 0.09 else 0.09 / cos(yaw))
+    assert rest == [3.0, 0.0, 0.0]  # it may always turn
+    assert BARRIER.restrain((0.25, 3.0, 0.0, 0.0), here, near((reach, 0.0)))[0] * cos(yaw) <= 1e-9
+
+
+def test_wheels_back_off_and_stand_where_torn():
+    here, inside = own(KHEPERA4, (0.0, 0.0)), KHEPERA4.radius + 0.03  # 2 cm of the margin are used up
+    assert -0.06 <= BARRIER.restrain(STILL, here, near((inside, 0.0)))[0] < -0.05
+    assert BARRIER.restrain((0.2, 0.0, 0.0, 0.0), here, near((inside, 0.0), (-inside, 0.0)))[0] == 0.0
+    fast = near((0.3, 0.0), velocity=(-2.0, 0.0), is_robot=True)
+    assert BARRIER.restrain(STILL, here, fast)[0] == -KHEPERA4.speed
+
+
+# ---------------------------------------------------------------- whatever comes in
+
+
+@EVERY_KIND
+@FEW
+@given(
+    pose=st.tuples(*[st.tuples(*[NUMBER] * 3)] * 2, st.floats(-7, 7)),
+    things=st.lists(st.tuples(NUMBER, NUMBER, st.tuples(NUMBER, NUMBER), st.booleans()), max_size=12),
+    setpoint=st.tuples(*[NUMBER] * 4),
+    parameters=st.fixed_dictionaries({"right": st.floats(0, 2), "alpha": st.floats(0.1, 10)}),
+)
+def test_results_are_numbers_within_the_limits(kind, pose, things, setpoint, parameters):
+    place, velocity, yaw = pose
+    here, barrier = own(kind, place, yaw=yaw, velocity=velocity), Barrier(**parameters)
+    around = all_of(*(moving(*thing, radius=0.1) for thing in things))
+    out = barrier.restrain(setpoint, here, around)
+    goal = barrier.deviate((place[0] + 0.1, place[1], place[2]), here, around, 0.01)
+    assert all(map(isfinite, (*out, *goal)))
+    assert out[2:] == setpoint[2:]
+    u = out[:2]
+    if here.by_position:
+        u = (kind.response * (out[0] - place[0]), kind.response * (out[1] - place[1]))
+    if here.by_twist:
+        assert out[1] == setpoint[1]
+        u = (out[0], 0.0)
+    assert out == setpoint or hypot(*u[:2]) <= kind.speed * (1 + 1e-9)
+    assert things or out == setpoint
+
+
+@EVERY_KIND
+@for_each("exponent", range(2, 39))
+def test_absurd_velocities_are_answered_within_limits(kind, exponent):
+    """Beyond 1e8 m/s no half-plane is met exactly, and one alone has no pair that it could give way to."""
+    here = own(kind, (0.0, 0.0), velocity=(-(10.0**exponent), 0.0, 0.0))
+    out = BARRIER.restrain((-1.0, 0.0, 0.0, 0.0), here, near((-0.5, 0.07), radius=0.07, is_robot=True, lag=0.1))
+    assert all(map(isfinite, out))
+    assert hypot(*out[:2]) * (kind.response if kind.takes == "position" else 1.0) <= kind.speed + 1e-9
+
+
+# ---------------------------------------------------------------- what it leads to
+
+
+def test_robots_that_meet_head_on_pass_right():
+    """Without the preference they would stand: tests/experiments/virtual_time/test_encounters.py has whole runs."""
+    ahead, here = near((0.35, 0.0), radius=TELLO.radius, is_robot=True, lag=TELLO.lag), own(TELLO, (0.0, 0.0))
+    assert BARRIER.restrain((1.0, 0.0, 0.0, 0.0), here, ahead)[1] < -0.1
+    assert Barrier(right=0.0).restrain((1.0, 0.0, 0.0, 0.0), here, ahead)[1] == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_too_fast_ones_are_dodged_sideways(side):
+    comes = near((0.6, -0.05 * side), velocity=(-0.8, 0.0), radius=0.1, is_robot=True, lag=0.1)
+    goal = BARRIER.deviate((0.0, 0.0, 0.0), own(TURTLEBOT3, (0.0, 0.0)), comes, 0.01)
+    assert goal[1] * side > 0.02
+
+
+def test_wheels_are_steered_around_things():
+    here, ahead = own(KHEPERA4, (0.0, 0.0)), (1.0, 0.0, 0.0)
+    assert BARRIER.deviate(ahead, here, near((0.3, 0.0), radius=0.07, is_robot=True), 0.01)[1] < -0.05  # to the right
+    assert BARRIER.deviate(ahead, here, near((-0.3, 0.0), radius=0.07, is_robot=True), 0.01) is ahead
