@@ -140,10 +140,10 @@ def module(group: str, name: str) -> str:
     return registered(group)[name][0].module
 
 
-def unusable(use: Callable[[str, str], object]) -> list[str]:
+def unusable(use: Callable[[str, str], object], groups: Iterable[str] = CHOSEN) -> list[str]:
     """Reasons why plug-ins that a file may name cannot be used: a line for each one that `use(group, name)` refuses."""
     lines = []
-    for group in CHOSEN:
+    for group in groups:
         for name in names(group):
             try:
                 use(group, name)

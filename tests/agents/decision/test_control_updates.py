@@ -1,6 +1,6 @@
 """The place of control: a goal is kept while the input of the law stays."""
 
-from math import dist
+from math import dist, nan
 
 import pytest
 
@@ -9,6 +9,7 @@ from agents.decision.neighbours import Incoming, Neighbours
 from agents.kinds.khepera4 import KHEPERA4
 from agents.plugins.predictors import HOLD, ConstantVelocity
 from agents.plugins.triggers import SendOnDelta
+from agents.vectors import ZERO
 from experiments.definition.experiment import Formation, LegTable
 from tests.agents.swarm import Swarm
 from tests.small import changed, triangle
@@ -80,23 +81,22 @@ def test_follower_with_a_plan_always_computes():
 @pytest.mark.parametrize("anchored", [False, True])
 def test_deviation_is_the_largest_change_on_a_link(anchored):
     neighbours = Neighbours([Incoming(k, name, KHEPERA4, 0.5) for k, name in enumerate("BC")], 1.0)
-    updates, still = ControlUpdates(SendOnDelta(threshold=0.05), 2, anchored=anchored), (0.0, 0.0, 0.0)
+    updates = ControlUpdates(SendOnDelta(threshold=0.05), 2, anchored=anchored)
     for link in range(2):
         neighbours.mark_alive(link)
         neighbours.receive(link, (1.0, float(link), 0.0), (0.1, 0.0, 0.0), 0.0, 0.0)
     neighbours.update_active(0.0)
 
-    def due(t, position, predictor=HOLD):
-        return updates.due(
-            t, position, still, neighbours, predictor, since_start=t, offset=still, error=0.0, energy=0.0
-        )
+    def due(t, x, predictor=HOLD):
+        place = (x, 0.0, 0.0)
+        return updates.due(t, place, ZERO, neighbours, predictor, since_start=t, offset=ZERO, error=0.0, energy=0.0)
 
-    assert due(0.0, still)
-    assert not due(0.1, (float("nan"), 0.0, 0.0))
-    neighbours.receive(1, (1.04, 1.0, 0.0), still, 0.1, 0.1)
-    assert not due(0.1, still)
+    assert due(0.0, 0.0)
+    assert not due(0.1, nan)
+    neighbours.receive(1, (1.04, 1.0, 0.0), ZERO, 0.1, 0.1)
+    assert not due(0.1, 0.0)
     assert updates.asking.view.deviation == pytest.approx(0.04)
-    assert due(0.2, (-0.03, 0.0, 0.0))
+    assert due(0.2, -0.03)
     assert updates.asking.view.deviation == pytest.approx(0.07)
-    assert not due(0.3, (0.01, 0.0, 0.0))  # 4 cm on both links
-    assert due(1.0, (0.01, 0.0, 0.0), ConstantVelocity())  # the first sender is believed to have moved on
+    assert not due(0.3, 0.01)  # 4 cm on both links
+    assert due(1.0, 0.01, ConstantVelocity())  # the first sender is believed to have moved on

@@ -178,7 +178,14 @@ def fires_when(trigger, seed, margin, predictor=HOLD):
     assert decided > TICKS / 2
 
 
+def waited(q, own, drift, longest):
+    """Time since the last event [s] beyond what a self-triggered one waits at a `drift` [m/s]."""
+    wait = (sqrt(drift**2 + 2.0 * own.acceleration * own.threshold) - drift) / own.acceleration
+    return q.t - q.t_k - min(wait, longest) + 1e-6
+
+
 FOLLOWING = st.builds(Predictive, threshold=LENGTH)
+FORESEEING = st.builds(SelfTriggered, threshold=LENGTH, acceleration=st.floats(0.05, 5.0), longest_s=st.just(1.0))
 CASES = {  # triggers without memory: when they must fire, and what is believed of the robot
     "periodic": (st.builds(Periodic, period_s=st.integers(1, 20).map(lambda ticks: ticks * DT)),
                  lambda q, own: q.t - q.t_k - own.period_s + 1e-6, HOLD),
@@ -191,6 +198,8 @@ CASES = {  # triggers without memory: when they must fire, and what is believed 
     "predictive, hold": (FOLLOWING, lambda q, own: q.gap - own.threshold, HOLD),
     "predictive": (FOLLOWING, lambda q, own: q.gap - own.threshold, ConstantVelocity()),
     "predictive, horizon": (FOLLOWING, lambda q, own: q.gap - own.threshold, ConstantVelocity(horizon_s=0.1)),
+    "self-triggered": (FORESEEING, lambda q, own: waited(q, own, hypot(*q.then.velocity), 1.0), HOLD),
+    "self-triggered, horizon": (FORESEEING, lambda q, own: waited(q, own, 0.0, 0.3), ConstantVelocity(horizon_s=0.3)),
     "lyapunov": (
         st.builds(Lyapunov, level=st.floats(0.2, 0.9), floor=st.floats(0.0, 0.2), largest=st.floats(0.05, 1.0)),
         lambda q, own: max(own.level * q.then.energy - 0.5 * own.floor**2 - q.now.energy,
@@ -240,18 +249,6 @@ def test_integral(seed, area):
         return so_far - area
 
     fires_when(IntegralTrigger(area=area), seed, margin)
-
-
-@pytest.mark.parametrize(("predictor", "reach"), [(HOLD, 9.0), (ConstantVelocity(horizon_s=0.3), 0.3)])
-@SOME
-@given(SEEDS, LENGTH, st.floats(0.05, 5.0))
-def test_self_triggered(predictor, reach, seed, threshold, bound):
-    def margin(q):
-        drift = hypot(*q.then.velocity) if predictor is HOLD else 0.0
-        wait = min((sqrt(drift**2 + 2.0 * bound * threshold) - drift) / bound, 1.0, reach)
-        return q.t - q.t_k - wait + 1e-6
-
-    fires_when(SelfTriggered(threshold=threshold, acceleration=bound, longest_s=1.0), seed, margin, predictor)
 
 
 @SOME
