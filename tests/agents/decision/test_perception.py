@@ -204,5 +204,7 @@ def test_received_robot_is_not_seen_twice():
     assert [thing.is_robot for thing in things].count(True) == 1
     assert [thing.is_robot for thing in things].count(False) == hits.count(False) == 10
     assert len(Sight().sense(0.0, scan=scan)) == len(bearing)
+    beside = Sight(TELLO, CRAZYFLIE).hear((far, 0.0, 1.0))
+    assert len(beside.sense(0.0, (0.0, 0.0, 1.0), scan=rays([0.0], [far - CRAZYFLIE.radius]))) == 1
     # a drone overhead is not what the rays met
     assert len(Sight(KHEPERA4, CRAZYFLIE).hear((far, 0.0, 1.0)).sense(0.0, scan=scan)) == len(bearing)
