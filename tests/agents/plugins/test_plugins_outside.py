@@ -25,6 +25,7 @@ from tests.agents.bench import Bench
 from tests.agents.signals import Play, standing
 from tests.agents.things import near, own
 from tests.commands import ROOT, environment, python, shell
+from tests.requests import request
 from tests.small import triangle
 from tests.system import lab
 from tests.waiting import until
@@ -212,10 +213,7 @@ def four_rovers(tmp_path):
 
 
 def rovers(*addresses):
-    count = len(addresses)
-    names = tuple(f"R{k}" for k in range(count))
-    request = SimpleNamespace(names=names, addresses=addresses, start=((0.0, 0.0, 0.0),) * count, yaw=(0.0,) * count)
-    return made_in_guide("Rovers")(request)
+    return made_in_guide("Rovers")(request(["khepera4"] * len(addresses), addresses))
 
 
 def test_body_of_the_docs_drives_over_udp(four_rovers, tmp_path):
