@@ -176,7 +176,7 @@ def swept_metrics() -> dict[str, Metric]:
 
 def foreign_metrics(cases: Iterable[CaseMetrics] = ()) -> dict[str, Metric]:
     """Metrics of other distributions, and those in files that criteria of the cases name."""
-    return _installed()[0] | metrics_of_criteria([each for case in cases for each in case.criteria])[0]
+    return installed_metrics()[0] | metrics_of_criteria([each for case in cases for each in case.criteria])[0]
 
 
 def console_metrics() -> dict[str, Metric]:
@@ -202,7 +202,7 @@ def metrics_of_criteria(criteria: Iterable[Criterion]) -> tuple[dict[str, Metric
     for name in dict.fromkeys(each.metric for each in criteria if each.metric):
         if files.is_choice(name):
             try:
-                found[files.plain(name)] = _made(name)
+                found[files.plain(name)] = usable_metric(name)
             except registry.PluginError as error:
                 left_out.append(f"metric {files.plain(name)} is unknown: {' '.join(str(error).split())}")
     return found, tuple(left_out)
@@ -210,7 +210,7 @@ def metrics_of_criteria(criteria: Iterable[Criterion]) -> tuple[dict[str, Metric
 
 def unusable_metrics() -> tuple[str, ...]:
     """Reasons why registered metrics are left out, a sentence each."""
-    return _installed()[1]
+    return installed_metrics()[1]
 
 
 def short_name(name: str) -> str:
@@ -219,17 +219,18 @@ def short_name(name: str) -> str:
 
 
 @cache
-def _installed() -> tuple[dict[str, Metric], tuple[str, ...]]:
+def installed_metrics() -> tuple[dict[str, Metric], tuple[str, ...]]:
+    """Metrics of installed packages by name, and a sentence for each one that is left out."""
     found, left_out = {}, []
     for name in registry.names(registry.METRICS):
         try:
-            found[name] = _made(name)
+            found[name] = usable_metric(name)
         except registry.PluginError as error:
             left_out.append(f"metric {name} is left out: {' '.join(str(error).split())} (docs/metrics.md)")
     return found, tuple(left_out)
 
 
-def _made(name: str) -> Metric:
+def usable_metric(name: str) -> Metric:
     """The metric registered under a name; raises PluginError if it cannot be used."""
     plugin = cast(type[Metric], registry.struct(registry.METRICS, name))
     wrong = ""

@@ -89,15 +89,13 @@ def test_numbers_that_can_be_judged(cases, criterion, passed):
 
 
 def test_the_value_farthest_out_of_range_is_named(cases):
-    def texts(**limits):
-        found = [replace(case, seed=k, case="one") for k, case in enumerate(cases)]
-        return criteria_met(with_criteria(found, Criterion(metric="f_hz", **limits)))[1].text
-
+    found = [replace(case, seed=k, case="one") for k, case in enumerate(cases)]
     event, periodic = sorted(case.mean["f_hz"] for case in cases)
     middle = 0.5 * (event + periodic)
-    near, far = texts(at_least=middle - 0.1, at_most=middle + 0.2), texts(at_least=middle - 0.2, at_most=middle + 0.1)
-    assert f"is {number(event)} for 2 of 2 seeds, the farthest, not at most" in near
-    assert f"is {number(periodic)} for 2 of 2 seeds" in far
+    for below, above, farthest in ((0.1, 0.2, f"{number(event)} for 2 of 2 seeds, the farthest, not at most"),
+                                   (0.2, 0.1, f"{number(periodic)} for 2 of 2 seeds")):  # fmt: skip
+        limits = Criterion(metric="f_hz", at_least=middle - below, at_most=middle + above)
+        assert f"is {farthest}" in criteria_met(with_criteria(found, limits))[1].text
 
 
 def test_what_was_not_run_is_not_judged(cases):

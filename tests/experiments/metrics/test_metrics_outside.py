@@ -171,7 +171,7 @@ def known(monkeypatch):
     """Metrics that are installed, by name."""
 
     def put(**metrics):
-        monkeypatch.setattr(metric, "_installed", lambda: (metrics, ()))
+        monkeypatch.setattr(metric, "installed_metrics", lambda: (metrics, ()))
 
     return put
 
@@ -282,4 +282,4 @@ def test_wrong_metric_is_refused(name, facts, message, monkeypatch):
     made = type(Way)("Made", (Way,), {"__module__": __name__, **facts}, frozen=True)
     monkeypatch.setattr(registry, "struct", lambda _group, _name: made)
     with pytest.raises(registry.PluginError, match=re.escape(message)):
-        metric._made(name)
+        metric.usable_metric(name)

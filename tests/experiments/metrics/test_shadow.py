@@ -52,8 +52,8 @@ def test_a_constant_difference_is_bias_and_rmse():
 
 def test_a_lag_is_a_bias_along_the_way():
     heading, speed, lag = 0.6, 0.2, 0.15
-    along = np.array([math.cos(heading), math.sin(heading), 0.0])
-    (mine, _) = agreement(shadowed(speed * T[:, None] * along, speed * (T - lag)[:, None] * along, yaw=heading))
+    along = speed * np.array([math.cos(heading), math.sin(heading), 0.0])
+    (mine, _) = agreement(shadowed(T[:, None] * along, (T - lag)[:, None] * along, yaw=heading))
     assert (mine.along, mine.across) == (pytest.approx(-speed * lag), pytest.approx(0.0, abs=1e-12))
     assert mine.rmse == pytest.approx(speed * lag)
     assert mine.correlation[:2] == pytest.approx((1.0, 1.0))
@@ -63,8 +63,7 @@ def test_a_lag_is_a_bias_along_the_way():
 
 def test_lag_behind_a_swing_shows_in_correlation():
     frequency, lag = math.pi, 0.1  # whole periods
-    swing = np.column_stack([0.2 * np.sin(frequency * T), 0.0 * T, 0.0 * T])
-    late = np.column_stack([0.2 * np.sin(frequency * (T - lag)), 0.0 * T, 0.0 * T])
+    swing, late = (np.outer(0.2 * np.sin(frequency * at), [1.0, 0.0, 0.0]) for at in (T, T - lag))
     (mine, _) = agreement(shadowed(swing, late, restart=None))
     assert mine.correlation[0] == pytest.approx(math.cos(frequency * lag), abs=1e-3)
     assert mine.rmse == pytest.approx(0.2 * math.sqrt(2.0) * math.sin(0.5 * frequency * lag), rel=1e-3)
@@ -73,12 +72,10 @@ def test_lag_behind_a_swing_shows_in_correlation():
 
 
 def test_reset_twin_has_its_horizons_error_and_speed():
-    speed = 0.1 + 0.05 * np.sin(T)
-    way = np.concatenate([[0.0], np.cumsum(speed[:-1]) * STEP])
-    since = np.mod(T + 1e-9, 5.0)
-    ahead = 0.01 * since  # 1 cm/s too fast
-    line = np.column_stack([way, 0.0 * T, 0.0 * T])
-    (mine, _) = agreement(shadowed(line, line + ahead[:, None] * [1.0, 0.0, 0.0]))
+    speed, forward = 0.1 + 0.05 * np.sin(T), [1.0, 0.0, 0.0]
+    line = np.outer(np.concatenate([[0.0], np.cumsum(speed[:-1]) * STEP]), forward)
+    ahead = np.outer(0.01 * np.mod(T + 1e-9, 5.0), forward)  # 1 cm/s too fast
+    (mine, _) = agreement(shadowed(line, line + ahead))
     assert mine.along == pytest.approx(0.025, rel=6e-3)
     assert mine.rmse == pytest.approx(0.05 / math.sqrt(3.0), rel=6e-3)
     assert mine.largest == pytest.approx(0.05, rel=1e-2)

@@ -9,7 +9,6 @@ from msgspec.structs import replace
 
 from agents.errors import ExplainedError
 from agents.plugins.triggers import SendOnDelta
-from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
 from experiments.file.document import load
 from experiments.file.problems import DocumentError
@@ -27,6 +26,7 @@ from experiments.sweep.runs import Stuck
 from experiments.sweep.sweep import folder_of, side_by_side, sweep
 from experiments.sweep.table import parameter_columns
 from experiments.sweep.workers import Work, workers
+from tests.small import small
 from tools.commands import sweep as commands
 from tools.commands.results import report
 
@@ -96,13 +96,11 @@ def test_nothing_is_run_twice(done):
 
 
 def test_a_sweep_that_was_interrupted_goes_on(done, tmp_path):
-    progress = Progress(end_after=3)
-    part = swept(tmp_path, progress=progress, most_seeds=2)
+    part = swept(tmp_path, progress=Progress(end_after=3), most_seeds=2)
     assert (part.missing, [row.seeds for row in part.rows]) == (5, [2, 2])  # cases take turns
     with (tmp_path / "runs.jsonl").open("ab") as file:
         file.write(b'{"cell":"cut off in mid')
-    progress = Progress()
-    whole = swept(tmp_path, progress=progress)
+    whole = swept(tmp_path, progress=(progress := Progress()))
     assert (progress.ran, whole.missing) == (5, 0)
     assert tables(whole) == tables(done)
     assert swept(tmp_path, progress=(quiet := Progress())).rows == done.rows
@@ -158,11 +156,10 @@ def test_tuning_word_and_open_range_belong_to_search(tmp_path):
         swept(tmp_path, "trigger.threshold=0.01:0.02:log")
 
 
-def test_number_of_parallel_flights_depends_on_robots():
-    triangle = load("triangle").experiment
-    assert side_by_side(Plan(triangle)) == 100
-    many = {f"R{k}": triangle.robots["KH01"] for k in range(1000)}
-    assert side_by_side(Plan(Experiment(title="t", robots=many, duration_s=45.0))) == 1
+@pytest.mark.parametrize(("robots", "flights"), [(4, 100), (1000, 1)])
+def test_number_of_parallel_flights_depends_on_robots(robots, flights):
+    crowd = dict.fromkeys([f"R{k}" for k in range(robots)], "khepera4")
+    assert side_by_side(Plan(small(crowd, duration_s=45.0))) == flights
 
 
 def test_workers_of_other_code_or_nowhere_are_refused():

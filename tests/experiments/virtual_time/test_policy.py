@@ -126,10 +126,10 @@ def test_what_is_no_model_is_refused(tmp_path):
 
 
 def test_absent_file_is_a_fault_of_its_line(tmp_path):
-    with pytest.raises(DocumentError, match=r"own\.onnx cannot be read"):
-        own(tmp_path)
-    with pytest.raises(DocumentError, match="is no name of a file"):
-        own(tmp_path, "../own.onnx")
+    faults = {"own.onnx": r"own\.onnx cannot be read", "../own.onnx": "is no name of a file"}
+    for name, fault in faults.items():
+        with pytest.raises(DocumentError, match=fault):
+            own(tmp_path, name)
     (tmp_path / "own.onnx").write_bytes(bytes(1_000_001))
     with pytest.raises(DocumentError, match="is longer than 1 MB"):
         own(tmp_path)
