@@ -200,11 +200,3 @@ def test_hand_started_robot_leaves_and_is_readmitted(router: RouterProcess, lab:
         assert set(lab.change("add", "CF01").done) == {"CF01"}
         watcher.until_all("running", "CF01")
         lab.end()
-
-
-def test_spare_takes_over_from_a_lost_robot(lab: Lab) -> None:
-    lab.fly("on_loss=replace")
-    os.kill(lab.watcher.status["CF01"].pid, signal.SIGKILL)
-    lab.flight.until_said("changed CF01: S1 has its name and takes part")
-    lab.end()
-    assert "lost" not in str(reopen(lab.folder / "run").notes)

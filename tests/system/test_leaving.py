@@ -16,6 +16,7 @@ from agents.network import pubsub
 from agents.network import session as network
 from agents.network.keys import Keys
 from agents.network.shutdown import leave
+from experiments.recording import playback
 from tests.commands import zenpark
 from tests.conftest import RouterProcess
 from tests.system.lab import TRIANGLE, Flight, RobotProcess, Watcher, gone, until
@@ -73,7 +74,7 @@ def test_an_estop_that_nobody_answers_ends(router: RouterProcess) -> None:
 
 @pytest.mark.parametrize("bodies", ["twin", "world"])
 def test_frozen_robot_delays_nobody_when_launcher_is_killed(tmp_path: Path, bodies: str) -> None:
-    flight = Flight(tmp_path / "run", "triangle", "--bodies", bodies, "duration_s=60")
+    flight = Flight(tmp_path / "run", "triangle", "--case", "event", "--bodies", bodies, "duration_s=60")
     flight.until_flown()
     children = flight.children()
     frozen = children.pop("KH01")
@@ -83,6 +84,8 @@ def test_frozen_robot_delays_nobody_when_launcher_is_killed(tmp_path: Path, bodi
         flight.process.kill()
         until(lambda: gone([children["CF01"], children["KH02"]]), "the robots have landed")
         until(lambda: gone(list(children.values())), "everybody else is gone")
+        assert playback.read(flight.folder / "event.mcap").complete
+        assert flight.logs().count("done (the starter is gone)") == 2
         frozen.resume()
         until(lambda: gone([frozen]), "the frozen one too")
     finally:

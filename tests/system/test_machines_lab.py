@@ -13,7 +13,6 @@ from pathlib import Path
 
 import pytest
 
-from agents.network.lab import register
 from experiments.file import catalogue
 from experiments.real_time.hosts import authority
 from experiments.recording import playback
@@ -119,33 +118,6 @@ def test_remote_robots_reach_a_router_listening_for_them(lab: Machines, tmp_path
     shutil.rmtree(made.out)
     authority.renew(made.keys, ["router"], hosts=[here])
     made.flew()
-
-
-def test_faults_of_certificates_are_reported_with_remedy(lab: Machines, tmp_path: Path) -> None:
-    made = Laboratory(lab, tmp_path)
-    assert made.zenpark("hosts", "install")[0] == 0
-    authority.revoke(made.keys, ["KH01"])
-    authority.renew(made.keys, ["CF01"])
-    foreign = tmp_path / "foreign"
-    authority.create(foreign, {"KH02": "robot"})
-    for name in ("ca.pem", "KH02.pem", "KH02.key"):
-        shutil.copy(foreign / name, made.there["lab2"])
-    for code, out in (made.zenpark("hosts", "check"), made.fly()):
-        assert code != 0
-        assert "lab1: the certificate of KH01 there has been revoked since; `./zenpark hosts install FILE`" in out
-        assert "lab1: the certificate of CF01 there has been renewed since" in out
-        assert "lab2: its certificates are of another lab" in out
-        assert "Traceback" not in out
-    assert made.zenpark("hosts", "install")[0] == 0
-    assert made.zenpark("hosts", "check")[0] == 0
-    authority.renew(made.keys, ["KH02"], days=-0.01)
-    (made.there["lab1"] / "CF01.key").chmod(0o640)
-    until(lambda: register(made.keys), "a moment passes")
-    code, out = made.zenpark("hosts", "install")
-    assert code == 1
-    assert "KH02" in out
-    code, out = made.zenpark("hosts", "check")
-    assert "the certificate of KH02" in out
 
 
 def test_robots_follow_a_clock_that_drifts_meanwhile(lab: Machines, tmp_path: Path) -> None:

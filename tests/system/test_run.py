@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import re
-import signal
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,7 +15,7 @@ from rosbags.highlevel import AnyReader
 
 from experiments.recording import playback
 from experiments.recording.reader import RecordingError
-from tests.system.lab import NEAR_TRIANGLE, TRIANGLE, Flight, Watcher, assert_formed, gone, typed, until
+from tests.system.lab import NEAR_TRIANGLE, Flight, assert_formed, gone, typed, until
 
 pytestmark = pytest.mark.system
 
@@ -122,25 +121,6 @@ def test_formation_holds_without_zygote_and_router(tmp_path: Path) -> None:
     read = playback.read(begun.file)
     assert read.complete
     assert_formed(read.trace, 0.05, since_s=7.0)
-
-
-def test_killed_conductor_leaves_no_orphan_and_readable_recording(tmp_path: Path) -> None:
-    begun = Begun(tmp_path)
-    with Watcher(begun.flight.endpoint()) as watcher:
-        watcher.until_all("running", *TRIANGLE)
-        watcher.until(lambda: "CF01" in watcher.state, "it tells where it is")
-        since = watcher.state["CF01"].stamp
-        watcher.until(lambda: watcher.state["CF01"].stamp > since + 1.0, "a second of the experiment")
-        begun.flight.signal(signal.SIGKILL)
-        begun.flight.finish()
-        watcher.until_all("done", *TRIANGLE)
-        assert watcher.status["CF01"].reason == "the starter is gone"
-        assert watcher.state["CF01"].true_position is not None
-        assert watcher.state["CF01"].true_position[2] < 0.03
-    until(lambda: gone(list(begun.children.values())), "no orphan")
-    read = playback.read(begun.file)
-    assert read.complete
-    assert len(read.trace.time) > 40, "a second at 50 Hz"
 
 
 def test_killed_recorder_is_replaced_and_fails_the_run(tmp_path: Path) -> None:

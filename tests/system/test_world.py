@@ -181,27 +181,26 @@ def test_climbs_and_landings_continue_in_the_next_world(router: RouterProcess, w
     def height(name: str) -> float:
         return watcher.state[name].position[2] if name in watcher.state else 0.0
 
-    with ExitStack() as stack:
-        world = stack.enter_context(WorldProcess(router.endpoint, file))
-        stack.enter_context(RobotProcess(router.endpoint, file, *both))
+    def again(killed: WorldProcess) -> WorldProcess:
+        killed.kill()
+        made = worlds.enter_context(WorldProcess(router.endpoint, file))
+        assert "CF01" in made.ready.rpartition(";")[2], "it asks them where they were"
+        return made
 
-        def again(killed: WorldProcess) -> WorldProcess:
-            killed.kill()
-            made = stack.enter_context(WorldProcess(router.endpoint, file))
-            assert "CF01" in made.ready.rpartition(";")[2], "it asks them where they were"
-            return made
-
-        watcher.until_all("ready", *both)
-        watcher.give(messages.Order("takeoff"), *both)
-        watcher.until(lambda: min(map(height, both)) > 0.25, "they climb")
-        world = again(world)
-        watcher.until_all("airborne", *both)
-        assert min(map(height, both)) > 0.54
-        watcher.give(messages.Order("land"), *both)
-        watcher.until(lambda: max(map(height, both)) < 0.4, "they sink")
-        again(world)
-        watcher.until_all("done", *both)
-        assert max(map(height, both)) < 0.06
+    with ExitStack() as worlds:
+        world = worlds.enter_context(WorldProcess(router.endpoint, file))
+        with RobotProcess(router.endpoint, file, *both):
+            watcher.until_all("ready", *both)
+            watcher.give(messages.Order("takeoff"), *both)
+            watcher.until(lambda: min(map(height, both)) > 0.25, "they climb")
+            world = again(world)
+            watcher.until_all("airborne", *both)
+            assert min(map(height, both)) > 0.54
+            watcher.give(messages.Order("land"), *both)
+            watcher.until(lambda: max(map(height, both)) < 0.4, "they sink")
+            again(world)
+            watcher.until_all("done", *both)
+            assert max(map(height, both)) < 0.06
 
 
 def test_pause_resume_and_reset(world: WorldProcess, desk: Desk) -> None:

@@ -211,11 +211,22 @@ def test_report_of_run_with_dead_robot_and_losses(tmp_path):
         assert words in page.words
 
 
-def test_comparison_has_a_column_per_run_and_case(tmp_path, run):
-    runs = [("monday", measured(run)), ("tuesday", measured([park("event", 0.02)]))]
+@pytest.mark.parametrize(
+    ("names", "shown"),
+    [
+        (("monday", "tuesday"), ("monday · periodic", "monday · event", "tuesday", "relative to monday · periodic.")),
+        (("a", "a", "a"), ("a, a (2), a (3)", "relative to a.", "a (3) · event")),
+    ],
+)
+def test_comparison_has_a_column_per_run_and_case(tmp_path, run, names, shown):
+    cases = (run, run[1:]) if len(names) == 2 else (run[:1], run[:1], run)
+    runs = [(name, measured(each)) for name, each in zip(names, cases, strict=True)]
     page = checked(report.compare(tmp_path / "there" / "compare.html", runs).read_text())
-    for words in ("monday · periodic", "monday · event", "tuesday", "× is relative to monday · periodic."):
+    for words in shown:
         assert words in page.words
+    assert "±" not in page.words.split("Definitions")[0]
+    assert "95 % confidence over" not in page.words
+    assert "Seeds" not in page.words
 
 
 def test_comparison_shows_first_how_the_runs_differ(tmp_path, run):
@@ -226,16 +237,6 @@ def test_comparison_shows_first_how_the_runs_differ(tmp_path, run):
     assert "! B differs in duration_s 45 → 44; seeds: 1 → 2 and 1 more." in said
     assert html.index('id="differences"') < html.index('id="results"')
     assert "A runs/a the reference B runs/b duration_s 45 → 44; seeds: 1 → 2; x 1 → 2" in said
-
-
-def test_the_same_run_twice_is_two_columns(tmp_path, run):
-    runs = [("a", measured(each)) for each in (run[:1], run[:1], run)]
-    page = checked(report.compare(tmp_path / "c.html", runs).read_text())
-    for words in ("a, a (2), a (3)", "relative to a.", "a (3) · event"):
-        assert words in page.words
-    assert "±" not in page.words.split("Definitions")[0]
-    assert "95 % confidence over" not in page.words
-    assert "Seeds" not in page.words
 
 
 def test_an_interrupted_run_says_so_first(tmp_path):

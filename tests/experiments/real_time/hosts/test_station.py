@@ -126,6 +126,8 @@ def test_a_preloaded_station_forks_its_robots(number):
                 forked.kill()
             elif number is not None:
                 robot.send_signal(number)
+            if number is not None:
+                robot.wait(30)  # before its lifeline ends
             out, errors = robot.communicate(timeout=30)
             assert robot.returncode == (2 if number is None else -number)
             assert (out, "no experiment came" in errors) == ("", number is None)
