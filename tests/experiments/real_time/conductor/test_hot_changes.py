@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -26,16 +25,37 @@ KEYS = Keys()
 START = 1000.0
 
 
-class View:
-    """Robots that do at once what they are told, unless they hang."""
+class Stage:
+    """The triangle in flight, a spare beside it, as the view and the processes of a run.
 
-    def __init__(self, stage: Stage) -> None:
-        self._stage, self.robots, self.clock = stage, stage.robots, stage.clock
-        net = Net()
-        self.orders = pubsub.Orders(net.session, KEYS.run_order, messages.RunOrder)
-        self.add = net.channels[0].add
+    Processes start and end at once; robots do at once what they are told, unless they hang.
+    """
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, **more: Any) -> None:
+        self.clock = ManualClock(START)
+        monkeypatch.setattr(hot_changes, "time", self.clock)
+        spare = RobotTable(kind="crazyflie", start=[0.8, 0.8], hover=0.5)
+        experiment = changed(document.read("triangle").experiment, spares={"S1": spare}, **more)
+        self.bodies = dict(experiment.robots)
+        self.robots = {name: RobotView(place=(*robot.start[:2], 0.0)) for name, robot in self.bodies.items()}  # type: ignore[arg-type]
+        self.hung: set[str] = set()
+        self.running = set(self.robots)
+        self.adopted: set[str] = set()
+        self.away: dict[str, str] = {}
         self.given: list[tuple[str, str]] = []
         self.said: list[tuple[str, str, str]] = []
+        self.did: list[tuple[str, ...]] = []
+        self._pid = 1
+        net = Net()
+        self.orders = pubsub.Orders(net.session, KEYS.run_order, messages.RunOrder)
+        self._add = net.channels[0].add
+        for name in self.robots:
+            self.appear(name)
+            self.told(name, "start")
+        self.changes = HotChanges(Plan(experiment), self, self, KEYS)  # type: ignore[arg-type]
+        self.changes.begin(START)
+
+    # as a view
 
     def report(self, kind: str, source: str, text: str) -> None:
         self.said.append((kind, source, text))
@@ -45,24 +65,14 @@ class View:
 
     def _order(self, name: str, order: messages.Order) -> messages.Reply:
         self.given.append((name, order.order))
-        if name in self._stage.hung:
+        if name in self.hung:
             return messages.Reply(name, ok=False, phase="unknown", reason="no answer")
         if order.order in {"takeoff", "start"}:
             assert order.at == START
-        self._stage.told(name, order.order)
+        self.told(name, order.order)
         return messages.Reply(name, ok=True, phase=self.robots[name].phase)
 
-
-class Crew:
-    """Processes that start and end at once."""
-
-    def __init__(self, stage: Stage) -> None:
-        self._stage = stage
-        self.adopted: set[str] = set()
-        self.away: dict[str, str] = {}
-        self.running = {name for name, seen in stage.robots.items() if not seen.gone}
-        self.bodies = dict(stage.experiment.robots)
-        self.did: list[tuple[str, ...]] = []
+    # as processes
 
     def companions(self, name: str) -> list[str]:
         return [name]
@@ -81,34 +91,16 @@ class Crew:
 
     def kill(self, name: str) -> None:
         self.did.append(("kill", name))
-        self._stage.end(name)
+        self.end(name)
 
     def start_again(self, names: tuple[str, ...], bodies: dict[str, RobotTable] | None = None) -> None:
         self.did.append(("start", *names))
         self.bodies |= bodies or {}
         for name in names:
             self.running.add(name)
-            self._stage.appear(name)
-
-
-class Stage:
-    """The triangle in flight, a spare beside it."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, **more: Any) -> None:
-        self.clock = ManualClock(START)
-        monkeypatch.setattr(hot_changes, "time", self.clock)
-        spare = RobotTable(kind="crazyflie", start=[0.8, 0.8], hover=0.5)
-        self.experiment = experiment = changed(document.read("triangle").experiment, spares={"S1": spare}, **more)
-        self.robots = {name: RobotView(place=(*robot.start[:2], 0.0)) for name, robot in experiment.robots.items()}  # type: ignore[arg-type]
-        self.hung: set[str] = set()
-        self._pid = 1
-        self.view = View(self)
-        self.crew = Crew(self)
-        for name in self.robots:
             self.appear(name)
-            self.told(name, "start")
-        self.changes = HotChanges(Plan(experiment), self.crew, self.view, KEYS)  # type: ignore[arg-type]
-        self.changes.begin(START)
+
+    # as the test
 
     def appear(self, name: str) -> None:
         self._pid += 1
@@ -129,7 +121,7 @@ class Stage:
 
     def end(self, name: str) -> None:
         """Its process is over."""
-        self.crew.running.discard(name)
+        self.running.discard(name)
         self.robots[name].alive = False
         if not self.changes.expects(name, "its process ended"):
             self.changes.mark_lost(name)
@@ -139,7 +131,7 @@ class Stage:
 
     def put(self, payload: bytes) -> Query:
         query = Query(KEYS.run_order, messages.JSON, payload)
-        self.view.add(query)
+        self._add(query)
         return query
 
     def go_on(self, seconds: float = 1.0) -> None:
@@ -167,8 +159,8 @@ def stage(monkeypatch: pytest.MonkeyPatch) -> Stage:
 def test_restart_lands_starts_and_joins_by_common_clock(stage: Stage) -> None:
     reply = stage.after(stage.ask("restart", "CF01"), 5.0)
     assert set(reply.done) == {"CF01"}
-    assert stage.view.given == [("CF01", "leave"), ("CF01", "takeoff"), ("CF01", "start")]
-    assert stage.crew.did == [("start", "CF01")]
+    assert stage.given == [("CF01", "leave"), ("CF01", "takeoff"), ("CF01", "start")]
+    assert stage.did == [("start", "CF01")]
     assert (stage.robots["CF01"].phase, stage.robots["CF01"].left_because) == ("running", "")
 
 
@@ -180,26 +172,27 @@ def test_order_for_several_is_answered_when_all_finish(stage: Stage) -> None:
     assert stage.robots["KH01"].left_because == "removed"
     reply = stage.after(query, 4.0)
     assert set(reply.done) == {"KH01", "KH02"}
-    assert stage.crew.did == [("release", "KH02"), ("kill", "KH02")], "who hangs lands if it can, and is ended else"
+    assert stage.did == [("release", "KH02"), ("kill", "KH02")], "who hangs lands if it can, and is ended else"
 
 
 @pytest.mark.parametrize("away", [0.3, 0.1])
 def test_a_place_is_free_or_not(stage: Stage, away: float) -> None:
-    x, y = stage.experiment.robots["CF01"].start[:2]
+    x, y = stage.bodies["CF01"].start[:2]
     stage.robots["KH01"].place = (x + away, y, 0.0)
     reply = stage.after(stage.ask("restart", "CF01"), 5.0)
     assert bool(reply.done) == (away > 0.2), reply
     assert reply.done or "m from KH01: it needs 0.1 m around it" in reply.refused["CF01"]
-    assert bool(stage.view.given) == bool(reply.done), "who is refused is left alone"
+    assert bool(stage.given) == bool(reply.done), "who is refused is left alone"
 
 
 def test_body_lying_where_lost_counts_unless_a_twin(stage: Stage) -> None:
-    x, y = stage.experiment.robots["CF01"].start[:2]
+    x, y = stage.bodies["CF01"].start[:2]
     stage.robots["KH01"].place = (x, y, 0.0)
     stage.end("KH01")
-    stage.crew.bodies["KH01"] = msgspec.structs.replace(stage.crew.bodies["KH01"], body="khepera4://192.0.2.1")
+    twin = stage.bodies["KH01"]
+    stage.bodies["KH01"] = changed(twin, body="khepera4://192.0.2.1")
     assert "from KH01" in stage.after(stage.ask("restart", "CF01"), 2.0).refused["CF01"]
-    stage.crew.bodies["KH01"] = stage.experiment.robots["KH01"]
+    stage.bodies["KH01"] = twin
     assert stage.after(stage.ask("restart", "CF01"), 5.0).done
 
 
@@ -215,7 +208,7 @@ def test_whole_orders_that_are_refused(stage: Stage) -> None:
     mad = stage.put(b'{"order": "explode", "robots": []}')
     stage.go_on()
     assert b"not a RunOrder" in (mad.error or b"")
-    assert not stage.view.given
+    assert not stage.given
 
 
 def test_who_is_being_changed_is_not_changed_again(stage: Stage) -> None:
@@ -243,25 +236,25 @@ def test_a_lost_robot_is_started_again_three_times(monkeypatch: pytest.MonkeyPat
         assert stage.robots["KH01"].phase == "running"
     stage.end("KH01")
     stage.go_on(5.0)
-    assert (stage.robots["KH01"].left_because, stage.view.said[-1]) == ("lost", ("given up", "KH01", "lost 4 times"))
+    assert (stage.robots["KH01"].left_because, stage.said[-1]) == ("lost", ("given up", "KH01", "lost 4 times"))
 
 
 def test_a_spare_takes_over_once(monkeypatch: pytest.MonkeyPatch) -> None:
     stage = Stage(monkeypatch, on_loss="replace")
     stage.end("CF01")
     stage.go_on(5.0)
-    assert stage.crew.bodies["CF01"].start == [0.8, 0.8]
+    assert stage.bodies["CF01"].start == [0.8, 0.8]
     assert stage.robots["CF01"].phase == "running"
     stage.end("CF01")
     stage.go_on(5.0)
-    kind, source, text = stage.view.said[-1]
+    kind, source, text = stage.said[-1]
     assert (kind, source) == ("refused", "CF01")
     assert "no spare crazyflie left" in text
 
 
 def test_process_that_ends_while_joining_is_reported(stage: Stage) -> None:
     query = stage.ask("restart", "KH01")
-    stage.crew.start_again = lambda names, bodies=None: stage.end("KH01")  # type: ignore[method-assign]
+    stage.start_again = lambda names, bodies=None: stage.end("KH01")  # type: ignore[method-assign]
     reply = stage.after(query, 5.0)
     assert reply.refused == {"KH01": "KH01: its process ended"}
     assert stage.robots["KH01"].left_because == "removed"
@@ -270,13 +263,13 @@ def test_process_that_ends_while_joining_is_reported(stage: Stage) -> None:
 
 def test_lost_orders_are_repeated_within_limited_time(stage: Stage) -> None:
     query = stage.ask("restart", "KH01")
-    start = stage.crew.start_again
+    start = stage.start_again
 
     def hanging(names: tuple[str, ...], bodies: dict[str, RobotTable] | None = None) -> None:
         start(names, bodies)
         stage.hung.add("KH01")
 
-    stage.crew.start_again = hanging  # type: ignore[method-assign]
+    stage.start_again = hanging  # type: ignore[method-assign]
     reply = stage.after(query, 10.0)
     assert reply.refused == {"KH01": "KH01, takeoff: no answer"}
-    assert stage.view.given.count(("KH01", "takeoff")) > 3
+    assert stage.given.count(("KH01", "takeoff")) > 3
