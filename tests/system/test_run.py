@@ -15,11 +15,14 @@ from rosbags.highlevel import AnyReader
 
 from experiments.recording import playback
 from experiments.recording.reader import RecordingError
-from tests.system.lab import NEAR_TRIANGLE, Flight, assert_formed, gone, typed, until
+from experiments.run import reopen
+from tests.system.lab import NEAR_TRIANGLE, ROOT, Flight, assert_formed, gone, typed, until
 
 pytestmark = pytest.mark.system
 
 EVENT = ("--case", "event", "--json")
+COURSE = ROOT / "docs" / "course"
+LAW = "formation.law=solutions/01_rendezvous.py:Meet"
 
 
 class Whole(NamedTuple):
@@ -158,3 +161,19 @@ def test_unstartable_robot_ends_run_as_the_file_says(tmp_path: Path) -> None:
     robots = json.loads(out)["cases"]["event"]["robots"]
     assert robots["KH01"]["messages"] > 5, "the others fly"
     assert robots["CF01"]["messages"] == 0
+
+
+@pytest.mark.timeout(150)
+@pytest.mark.parametrize(("changes", "passed"), [((), False), ((LAW, "criteria.0.at_most=0.6"), True)])
+def test_a_run_in_real_time_is_judged(changes: tuple[str, ...], passed: bool, tmp_path: Path) -> None:
+    """By criteria, with a law and metrics in files beside the experiment."""
+    file, out = str(COURSE / "01-rendezvous.toml"), tmp_path / "run"
+    flight = Flight(out, file, *changes, "duration_s=6", "--json", report=True)
+    code, text = flight.finish(120.0)
+    found = json.loads(text)
+    assert found["passed"] is passed, flight.said()
+    assert code == (0 if passed else 1), flight.said()
+    assert ("Passed: 2 of 2" if passed else "The robots are to meet") in (out / "report.html").read_text("utf-8")
+    assert (out / "measures.py").is_file()
+    assert (out / LAW.partition("=")[2].partition(":")[0]).is_file() is passed
+    assert reopen(out).summary()["passed"] is passed
