@@ -272,13 +272,11 @@ def test_tests_run_in_three_parts_without_retries(bootstrap, started, monkeypatc
     assert re.search(r"part 3 of 3, whole runs, one at a time: failed in \d+ s\n$", said)
 
 
-def test_all_prepares_what_the_tests_of_processes_need(bootstrap, started):
+def test_arguments_replace_the_parts(bootstrap, started):
+    bootstrap.test(["--quick", "tests/agents", "-x"])
+    assert started[3:] == [["pytest", "-m", bootstrap.QUICK, "tests/agents", "-x"]]
+    started.clear()
     bootstrap.test(["--all"])
     modules = [module[0] for module in started[3:]]
     assert modules == ["pytest", "tests.fuzz", "tests.system.zenohd", "tests.system.rclpy_wheels", "pytest"]
     assert [module[2] for module in (started[3], started[7])] == ["not system", "system"]
-
-
-def test_arguments_replace_the_parts_for_pytest(bootstrap, started):
-    bootstrap.test(["--quick", "tests/agents", "-x"])
-    assert started[3:] == [["pytest", "-m", bootstrap.QUICK, "tests/agents", "-x"]]

@@ -9,8 +9,7 @@ import typer.main
 from typer.testing import CliRunner
 
 from agents.network.endpoints import EndpointError
-from experiments.recording.version import DIGEST_CHARACTERS, digest, provenance
-from tests.commands import ROOT, environment, invoke, python, zenpark
+from tests.commands import ROOT, environment, invoke, python
 from tools.main import app, main, part_for
 from tools.options import PANELS
 
@@ -26,14 +25,9 @@ def test_commands():
     assert words.split() == COMMANDS
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", [*COMMANDS, "bridge vicon", "bridge ros2"])
 def test_every_command_has_help(command):
-    assert invoke(command, "--help").stdout.startswith(f"Usage: zenpark {command} ")
-
-
-@pytest.mark.parametrize("bridge", ["vicon", "ros2"])
-def test_each_bridge_explains_its_options(bridge):
-    assert invoke("bridge", bridge, "--help").stdout.startswith(f"usage: zenpark bridge {bridge} ")
+    assert invoke(*command.split(), "--help").stdout.lower().startswith(f"usage: zenpark {command} ")
 
 
 LOADED = """
@@ -165,13 +159,6 @@ def test_routers_come_from_environment_option_or_file(monkeypatch, tmp_path):
         assert isinstance(wrong, EndpointError)
         assert repr(endpoint) in str(wrong)
     assert "[env var: ZENPARK_CONNECT]" in invoke("robot", "hold", "--help").stdout
-
-
-@pytest.mark.slow
-def test_version():
-    done = zenpark("--version")
-    assert (done.stdout, done.stderr) == (f"{provenance().words[0]}\n", "")
-    assert done.stdout.startswith(f"zenpark 0.1.0, code {digest()[:DIGEST_CHARACTERS]}")
 
 
 def test_a_configuration_for_zenohd_is_printed():

@@ -3,6 +3,7 @@ import signal
 
 import pytest
 
+from experiments.recording.version import DIGEST_CHARACTERS, digest, provenance
 from tests.commands import ROOT, python, zenpark
 from tools.guard import PACKAGES, intruders
 
@@ -20,8 +21,8 @@ def test_everything_that_is_elsewhere_is_an_intruder(tmp_path):
 
 def test_passes_when_the_packages_are_ours(tmp_path):
     done = start(tmp_path, ROOT)
-    assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout.startswith("zenpark ")
+    assert (done.returncode, done.stdout, done.stderr) == (0, f"{provenance().words[0]}\n", "")
+    assert done.stdout.startswith(f"zenpark 0.1.0, code {digest()[:DIGEST_CHARACTERS]}")
 
 
 def test_ctrl_c_while_python_starts_prints_no_traceback():

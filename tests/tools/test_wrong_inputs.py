@@ -13,28 +13,16 @@ from experiments.file.document import loads
 from tools.main import main
 
 TRIANGLE = (Path(__file__).parents[2] / "experiments" / "catalogue" / "triangle.toml").read_text("utf-8")
-LEG = '[[timeline]]\nat_s = 90.0\nrobot = "KH01"\nplan = { kind = "line", move_by = [1.0, 0.0], speed = 0.1 }\n[arena]'
 RADIO = 'body = "radio://0/80/2M/E7E7E7E701"\n'
 START = "start = [-0.6, -0.5]"
 
 # a part of the triangle, what stands there instead; place and remedy that are told
 FILES = (
     ("duration_s = 15.0", "duration = 15", ":6:1: unknown key", "did you mean 'duration_s'?"),
-    ("duration_s = 15.0", "duration_s = -5", ":6:14: 'duration_s' must be a number > 0", "from the common start"),
-    ("duration_s = 15.0", "duration_s = 1e12", ":6:14: ", "must be a number <= 86400"),
     ('kind = "khepera4" ', 'kind = "kephera" ', ":13:8: no 'kephera' among the kinds", "did you mean 'khepera4'?"),
     ("threshold = 0.01", "treshold = 0.01", "parameter 'treshold' of 'send-on-delta'", "did you mean 'threshold'?"),
-    ('"KH01 - KH02"', '"KH01 -> KH02"', ":28:1: 'KH01 -> KH02' is no link", 'write "KH01 > KH02"'),
-    ('"KH01 - KH02"', '"KH01 - KH07"', ":28:1: no robot is called 'KH07'", "did you mean 'KH02'?"),
-    ('"KH01 - KH02"', '"KH01 - KH01"', ":28:1: 'KH01' cannot receive from itself", "name two robots"),
-    ('"KH02 - CF01"', '"CF01 > KH02" = 0.8\n"KH02 - CF01"', "the link from CF01 to KH02 stands again", "r"),
-    ("hover = 0.6", "hover = 60", ":23:9: 'CF01' cannot hover at 60 m", "use a hover of at most 1.95"),
     (START, "start = [-6.6, -0.5]", ":14:10: 'KH01' starts outside of the arena", "x lies between -1 and 1"),
     ('"send-on-delta", threshold', '"relative-control", floor', "decides when the law is recomputed", "[formation]"),
-    ("[arena]", LEG, "this leg begins at 90 s, when the run of 15 s is over", "begin earlier"),
-    ("[robots.KH01]", "[robots.Rób₁]", ":12:10: ", "names are letters, digits and _"),
-    ("[robots.KH01]", '[robots."Röb1"]', ":12:9: 'Röb1' cannot be a name", "use letters, digits and _"),
-    ("[robots.KH01]", '[robots."a/b"]', ":12:9: 'a/b' cannot be a name", "use letters, digits and _"),
     ("position_sigma = 0.0003", "hover_jitter = 0.02", "must be a table", "write hover_jitter = { sigma"),
     (START, START + "\n" + RADIO, "'radio' drives a crazyflie, and KH01 is a khepera4", "kteam, khepera4-twin"),
     ("hover = 0.6", 'hover = 0.6\nbody = "radoi://0"', ":24:8: no 'radoi' among the bodies", "did you mean 'radio'?"),

@@ -46,14 +46,10 @@ def test_distance_is_to_the_nearest_point(x, y, obstacle):
     assert abs(found) == pytest.approx(nearest, abs=2e-4)
 
 
-def test_inside_is_negative():
+def test_distances_of_many_points_are_negative_inside():
     there = scene(BOX, POST, FENCE)
     found = [float(outlines.distance(there, k, there.pose[k], there.pose[k, :2])) for k in range(3)]
     assert found == pytest.approx([-0.1, -0.2, 0.0])
-
-
-def test_distances_of_many_points_at_once():
-    there = scene(BOX)
     pose = np.zeros((5, 1, 3))
     pose[:, 0, 0] = np.arange(5.0)
     point = np.zeros((5, 2, 2))

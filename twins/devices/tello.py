@@ -141,8 +141,10 @@ class _Drone(FaultyLink[tuple[bytes, tuple[str, int]]]):
 class TelloDevice:
     """Tellos; implements `twins.devices.device.Device`."""
 
-    def __init__(self, request: DeviceRequest) -> None:
+    def __init__(self, request: DeviceRequest, state_port: int = protocol.STATE_PORT) -> None:
+        """`state_port`: UDP port of a client, to which the states are sent."""
         body = request.body
+        self._state_port = state_port
         chosen = [
             settings(protocol.TelloSettings, name, table) for name, table in zip(body.names, body.device, strict=True)
         ]
@@ -188,7 +190,7 @@ class TelloDevice:
                 late = t - drone.state_due
                 period = 1.0 / protocol.STATE_HZ
                 drone.state_due += period if late < period else late + period  # missed packets are not repeated
-                drone.send(self._state(row), (drone.peer[0], protocol.STATE_PORT))
+                drone.send(self._state(row), (drone.peer[0], self._state_port))
             drone.flush()
 
     def truth(self) -> tuple[Array, Array]:

@@ -190,12 +190,6 @@ def test_install_leaves_alone_what_is_not_its_own(home, tmp_path, capsys, there,
     assert (home / "zenpark" / "zenpark").read_text().startswith("#!/bin/sh")
 
 
-@pytest.mark.parametrize("place", ["zenpark", "~/zenpark", "/zenpark", "bin/zp"])
-def test_host_command_needs_a_folder_of_its_own(place):
-    with pytest.raises(HostError, match="names no folder of its own"):
-        put("lab1", Host(address="a", zenpark=place))
-
-
 # certificates
 
 
@@ -232,10 +226,13 @@ def test_what_is_not_its_own_is_left_alone(home, lab):
         shutil.rmtree(there)
 
 
-@pytest.mark.parametrize("place", ["", "~/", "/", ".", "../keys"])
-def test_keys_need_a_folder_of_their_own(lab, place):
-    with pytest.raises(HostError, match="names no folder of its own"):
-        send("lab1", Host(address="lab1", lab=place), lab, ["KH01"])
+def test_hosts_need_folders_of_their_own(lab):
+    for place in ("zenpark", "~/zenpark", "/zenpark", "bin/zp"):
+        with pytest.raises(HostError, match="names no folder of its own"):
+            put("lab1", Host(address="a", zenpark=place))
+    for place in ("", "~/", "/", ".", "../keys"):
+        with pytest.raises(HostError, match="names no folder of its own"):
+            send("lab1", Host(address="lab1", lab=place), lab, ["KH01"])
 
 
 def test_what_cannot_be_sent_is_said_before(home, lab):

@@ -18,12 +18,12 @@ DT = 0.01
 class Conversation:
     """A client of one or more drones that lets their time pass tick by tick."""
 
-    def __init__(self, monkeypatch, rows=1, **parts):
+    def __init__(self, rows=1, **parts):
         self.states = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.states.bind(("127.0.0.1", 0))
-        monkeypatch.setattr(tello.protocol, "STATE_PORT", self.states.getsockname()[1])
         faults = Faults(**parts.pop("faults", {}))
-        self.device = tello.TelloDevice(DeviceRequest(request("tello", ["tello-twin"] * rows, **parts), faults))
+        asked = DeviceRequest(request("tello", ["tello-twin"] * rows, **parts), faults)
+        self.device = tello.TelloDevice(asked, state_port=self.states.getsockname()[1])
         self.wire = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.wire.bind(("127.0.0.1", 0))
         self.tick = 0
@@ -83,9 +83,9 @@ class Conversation:
 
 
 @pytest.fixture
-def talk(monkeypatch):
+def talk():
     with ExitStack() as made:
-        yield lambda **parts: made.enter_context(closing(Conversation(monkeypatch, **parts)))
+        yield lambda **parts: made.enter_context(closing(Conversation(**parts)))
 
 
 @pytest.fixture

@@ -343,21 +343,15 @@ def test_frozen_capture_counts_its_frames_repeated_does_not():
     assert during == [before[-1]] * 3
 
 
-def test_swapped_subjects_have_the_pose_of_the_other():
+def test_swapped_and_renamed_subjects():
     before, during = told("swapped")
     for frames, expected in ((before, [0.0, 1.0]), (during, [1.0, 0.0])):
         for frame in frames:
             assert [frame.poses[name].position[1] for name in ("CF01", "CF02")] == pytest.approx(expected, abs=0.02)
     assert [round(frame.poses["CF01"].position[0], 1) for frame in during] == [0.4, 0.5, 0.6]
-
-
-def test_renamed_subject_is_missing():
     before, during = told("renamed")
     assert {tuple(frame.poses) for frame in before} == {("CF01", "CF02")}
     assert {tuple(frame.poses) for frame in during} == {("CF01-renamed", "CF02")}
-
-
-def test_faults_of_capture_have_their_time():
     faults = Faults(capture="swapped", capture_from_s=2.0, capture_for_s=1.0)
     assert [faults.captured(t)[0] for t in (1.9, 2.0, 2.9, 3.0)] == ["", "swapped", "swapped", ""]
 

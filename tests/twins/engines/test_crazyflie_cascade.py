@@ -47,6 +47,8 @@ def test_ahead_pitches_nose_down_and_left_rolls_left():
     assert pitch == 0.0
     turned = guided([[0.0, 0.1, 0.0]], yaw=math.pi / 2).angles[0, :2]  # what is left of the room is ahead of it
     np.testing.assert_allclose(turned, [0.0, 25.0 * 0.2 + 0.2 * OUTER * DT], atol=1e-12)
+    by_velocity = guided([[9.0, 9.0, 9.0]], wanted=[0.2, 0.0, 0.0]).angles[0, :2]  # instead of by position
+    np.testing.assert_allclose(by_velocity, [0.0, 25.0 * 0.2 + 0.2 * OUTER * DT])
 
 
 def test_limits_of_speed_tilt_and_thrust():
@@ -61,11 +63,6 @@ def test_limits_of_speed_tilt_and_thrust():
     np.testing.assert_allclose(down, np.full((1, 4), LEAST / FULL))
     rest = guided().advance_inner_loops(*level)
     np.testing.assert_allclose(4 * 0.12 * rest[0, 0], 0.995 * 0.027 * 9.81, rtol=1e-3)
-
-
-def test_velocities_are_flown_instead_of_positions():
-    made = guided([[9.0, 9.0, 9.0]], wanted=[0.2, 0.0, 0.0])
-    np.testing.assert_allclose(made.angles[0, :2], [0.0, 25.0 * 0.2 + 0.2 * OUTER * DT])
 
 
 def test_torques_turn_the_right_way():
