@@ -52,7 +52,7 @@ class Receiver:
         pose = messages.pose("B", seq, UTC + self.t - age, [x, 0.0, 0.0], [speed, 0.0, 0.0], yaw=0.0)
         self.add(KEYS.pose("B"), messages.encode(pose), session=session)
 
-    def hear(self, seq: int, x: float, session: str | None, *, age: float = 0.0, then: float = 0.02) -> None:
+    def receive(self, seq: int, x: float, session: str | None, *, age: float = 0.0, then: float = 0.02) -> None:
         """A pose of B is received; `then` [s] go by."""
         self.pose(seq, x, session, age=age)
         self.after(then)
@@ -70,7 +70,7 @@ class Receiver:
     def begin(self, session: str | None, seq: int = 1) -> None:
         """A process of B takes the name and sends its first pose."""
         self.token(session)
-        self.hear(seq, 0.4, session)
+        self.receive(seq, 0.4, session)
 
     def lose(self, session: str | None, then: float = 2.0) -> None:
         """The tokens of B vanish; `then` [s] go by."""
@@ -129,7 +129,7 @@ def a():
 
 
 def test_pose_without_a_token_is_not_believed(a):
-    a.hear(1, 0.4, "one", then=5.0)  # the last value of a robot that has landed, and has taken its token back
+    a.receive(1, 0.4, "one", then=5.0)  # the last value of a robot that has landed, and has taken its token back
     a.after()
     assert not a.live
     assert a.missing
@@ -142,7 +142,7 @@ def test_pose_without_a_token_is_not_believed(a):
 def test_late_sample_revives_nobody(a):
     a.begin("one")
     a.lose("one", 4.0)
-    a.hear(2, 0.5, "one", age=2.5)
+    a.receive(2, 0.5, "one", age=2.5)
     assert not a.live
     assert a.missing
     a.after(500.0)
@@ -154,15 +154,15 @@ def test_late_sample_revives_nobody(a):
 def test_restarted_neighbour_is_received_at_once(a, behind_s):
     a.token("one")
     for seq in range(1, 100):
-        a.hear(seq, 0.4, "one", age=min(0.0, behind_s))
+        a.receive(seq, 0.4, "one", age=min(0.0, behind_s))
     a.lose("one")
     a.token("two")
     a.after()
     assert not a.live  # where the former process was is not where this one is
     assert a.missing
-    a.hear(1, -0.4, "two", age=max(0.0, behind_s))
+    a.receive(1, -0.4, "two", age=max(0.0, behind_s))
     assert (a.live, a.x, a.sender.lost) == (True, -0.4, 0)
-    a.hear(100, 0.4, "one")  # held back by the network since the first life
+    a.receive(100, 0.4, "one")  # held back by the network since the first life
     assert a.found == (True, -0.4, 1)
 
 
@@ -181,11 +181,11 @@ def test_other_make_begins_anew_with_its_token(a):
     a.begin(None, 7)
     a.lose(None, 1.0)
     a.token(None)
-    a.hear(1, 0.3, None, age=30.0)
+    a.receive(1, 0.3, None, age=30.0)
     assert (a.live, a.x) == (True, 0.3)
-    a.hear(2, 0.2, None, age=90.0)  # its clock steps while it runs: the number says that it is newer
+    a.receive(2, 0.2, None, age=90.0)  # its clock steps while it runs: the number says that it is newer
     assert a.x == 0.2
-    a.hear(1, 0.9, None, age=95.0)
+    a.receive(1, 0.9, None, age=95.0)
     assert (a.x, a.sender.stale) == (0.2, 1)
 
 
@@ -193,7 +193,7 @@ def test_other_sessions_do_not_replace_the_robot(a):
     a.begin("one")
     for source in ("other", None):  # another process, or a tool that puts old poses again
         a.pose(9, 3.0, source)
-        a.hear(9000, 3.0, source, age=100.0)
+        a.receive(9000, 3.0, source, age=100.0)
     assert a.found == (True, 0.4, 4)
     assert a.hazards == ["4 foreign"]
     a.t += 1.0
@@ -204,13 +204,13 @@ def test_superseded_session_is_received_again(a):
     a.begin("one", 7)
     a.lose("one")  # it stands still
     a.token("two")  # a second process of its name comes,
-    a.hear(1, 0.9, "two")
+    a.receive(1, 0.9, "two")
     assert a.x == 0.9
     a.lose("two")  # and goes
     a.token("one")
-    a.hear(8, 0.5, "one")
+    a.receive(8, 0.5, "one")
     assert a.found == (True, 0.5, 0)
-    a.hear(2, 0.9, "two")  # held back by the network
+    a.receive(2, 0.9, "two")  # held back by the network
     assert a.found == (True, 0.5, 1)
 
 
@@ -221,7 +221,7 @@ def test_remaining_one_of_two_claims_is_received(a, lives):
     a.after()
     a.life("loser", gone=True)
     a.add(ALIVE)
-    a.hear(1, 0.4, "owner")
+    a.receive(1, 0.4, "owner")
     assert a.found == (True, 0.4, 0)
 
 
@@ -229,7 +229,7 @@ def test_returning_session_displaces_nobody(a):
     a.begin("two")
     a.life("one")  # it was cut off, and will give way
     a.pose(900, 0.9, "one")
-    a.hear(2, 0.5, "two")
+    a.receive(2, 0.5, "two")
     assert a.found == (True, 0.5, 1)
 
 
@@ -248,19 +248,19 @@ def test_restarted_robot_leaves_the_law(a):
     a.add(ALIVE)
     a.after()
     assert (a.live, a.x) == (False, 0.4)
-    a.hear(1, -0.2, "two")
+    a.receive(1, -0.2, "two")
     assert (a.live, a.x) == (True, -0.2)
     assert not a.neighbour.silent
 
 
 @pytest.mark.parametrize("source", [None, "storage"])
 def test_stored_pose_before_the_first_token_is_void(a, source):
-    a.hear(5000, 0.9, source, age=600.0)  # the answer of a storage to the first query
+    a.receive(5000, 0.9, source, age=600.0)  # the answer of a storage to the first query
     a.token("one")
     a.after()
     assert not a.live
     assert a.missing
-    a.hear(1, 0.4, "one")
+    a.receive(1, 0.4, "one")
     assert (a.live, a.x, a.sender.lost) == (True, 0.4, 0)
 
 
@@ -275,9 +275,9 @@ def test_after_reconnection_tokens_may_come_in_any_order(a):
     a.begin("one", 7)
     a.lose("one", 0.02)
     a.add(ALIVE)
-    a.hear(9000, 0.9, None, age=100.0)
+    a.receive(9000, 0.9, None, age=100.0)
     a.life("one")
-    a.hear(8, 0.5, "one")
+    a.receive(8, 0.5, "one")
     assert (a.live, a.x) == (True, 0.5)
 
 
@@ -286,12 +286,12 @@ def test_new_process_takes_the_name(a, session, early):
     a.begin("one", 7)
     a.lose("one", 3.0)  # the router dies; meanwhile B is restarted
     if early:  # before its token
-        a.hear(1, 0.6, session)
+        a.receive(1, 0.6, session)
         a.token(session)
         a.after()
     else:
         a.token(session)
-        a.hear(1, 0.6, session)
+        a.receive(1, 0.6, session)
     assert (a.live, a.x) == (True, 0.6)
 
 
@@ -333,7 +333,7 @@ def test_remaining_process_is_received_after_any_turmoil(a, seed):
         speak("one", 0.4)
         a.after()
     for session in (None, "two"):
-        a.hear(9999, 0.9, session)
+        a.receive(9999, 0.9, session)
     assert (a.live, a.x, a.robot.missing_neighbours()) == (True, 0.4, [])
 
 
@@ -346,33 +346,29 @@ def test_neighbour_whose_poses_are_all_refused_is_lost(a, sends):
     for seq in range(2, 72):
         if sends:
             a.pose(seq, 0.4, "one", age=-8.0)  # this process, or that one, has a wrong clock
-        a.hear(seq, 0.4, "other", age=-8.0)  # which says nothing about B
+        a.receive(seq, 0.4, "other", age=-8.0)  # which says nothing about B
     assert a.missing == sends
     assert a.hazards == ["refused"] * sends + ["70 foreign"]
     assert a.inbox.malformed == 70 * sends
-    a.hear(90, 0.4, "one")
+    a.receive(90, 0.4, "one")
     a.after(1.0)
     assert (a.live, a.robot.missing_neighbours(), a.hazards) == (True, [], [])
 
 
 def test_poses_that_are_always_old_are_a_hazard(a):
     a.token("one")
-    a.hear(1, 0.4, "one", age=60.0)  # the last value of a robot that is silent: no proof
+    a.receive(1, 0.4, "one", age=60.0)  # the last value of a robot that is silent: no proof
     assert a.hazards == []
     for seq in range(2, 5):
-        a.hear(seq, 0.4, "one", age=LATE_S + 1.0)
+        a.receive(seq, 0.4, "one", age=LATE_S + 1.0)
     assert a.hazards == ["behind by 4.0 s"]
-    a.hear(9, 0.4, "one")
+    a.receive(9, 0.4, "one")
     assert a.hazards == []
-
-
-def test_waiting_poses_prove_no_slow_clock(a):
-    a.token("one")
     a.t = 100.0
-    for seq in range(1, 8):
-        a.pose(seq, 0.4, "one", age=10.0 - seq)
+    for seq in range(10, 17):
+        a.pose(seq, 0.4, "one", age=19.0 - seq)
     a.after()
-    assert a.hazards == []
+    assert a.hazards == [], "poses that waited prove no slow clock"
 
 
 @pytest.mark.parametrize("delay", [0.0, 5.0])
