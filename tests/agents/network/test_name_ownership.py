@@ -18,7 +18,7 @@ from agents.network import messages, name_ownership, pubsub
 from agents.network import session as network
 from agents.network.keys import Keys
 from agents.network.name_ownership import NameTaken, OwnershipTiming, claim, confirm_ownership
-from tests.agents.runtime.process import DRONE, Airborne, process
+from tests.agents.runtime.process import DRONE, QUICK, Airborne, process
 from tests.cases import for_each
 from tests.conftest import RouterProcess
 from tests.fuzz.messages import sent
@@ -311,7 +311,7 @@ def test_late_alarm_leaves_the_tokens(monkeypatch):
 
     with Net().worn() as net, monkeypatch.context() as patched:
         patched.setattr(pubsub, "alive_token", declared)
-        runtime = process(pair(), body)
+        runtime = process(pair(), body, descent=QUICK)
         body.looks = partial(next, steps(), None)
         with pytest.raises(OSError, match="the test is over"):
             runtime.run()

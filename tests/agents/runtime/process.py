@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from math import inf
 from typing import Any
 
 import pytest
@@ -14,6 +15,7 @@ from agents.decision.lifecycle import Phase
 from agents.network import name_ownership
 from agents.network.keys import Keys
 from agents.runtime import descent, loop
+from agents.runtime.descent import DescentTiming
 from agents.runtime.loop import Runtime, Setup
 from experiments.definition import bodies
 from experiments.definition.experiment import Experiment
@@ -25,6 +27,7 @@ from tests.waiting import ManualClock
 BEGIN = 1000.0  # of simulated clocks [s]
 DRONE = small({"F": "crazyflie"})
 TICKS = 5  # that a loop makes before something breaks
+QUICK = DescentTiming(landing_s=0.3, stop_s=0.1, slowest=inf)
 
 
 def twins(experiment: Experiment, names: Sequence[str] = ()) -> Body:

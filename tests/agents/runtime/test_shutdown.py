@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 from collections.abc import Sequence
 from dataclasses import replace
-from math import inf
 from typing import Any
 
 import pytest
@@ -20,13 +19,12 @@ from agents.runtime.descent import Descent, DescentTiming
 from agents.ticks import Ticks
 from experiments.definition.experiment import Arena
 from experiments.definition.plan import Plan
-from tests.agents.runtime.process import DRONE, Airborne, process
+from tests.agents.runtime.process import DRONE, QUICK, Airborne, process
 from tests.fuzz.messages import sent
 from tests.network import Net
 from tests.small import small
 
 STOP = sent("park/estop", messages.Stop("a test", "to see"))[0]
-QUICK = DescentTiming(landing_s=0.3, stop_s=0.1, slowest=inf)
 
 
 def run(body: Airborne, silence_s: float = 5.0, timing: DescentTiming = QUICK) -> None:
