@@ -55,22 +55,6 @@ def options(*words: object) -> list[str]:
     return made
 
 
-def zenpark(
-    *arguments: object, timeout_s: float = 60.0, module: str = "tools.guard"
-) -> subprocess.CompletedProcess[str]:
-    """A command of zenpark, to its end."""
-    return subprocess.run(
-        [sys.executable, "-m", module, *options(*arguments)],
-        cwd=ROOT,
-        env=ENVIRONMENT,
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=timeout_s,
-    )
-
-
 def in_lab(folder: Path) -> Path:
     """The triangle as a file beside its lab."""
     file = folder / "triangle.toml"

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.system.lab import NEAR_TRIANGLE, zenpark
+from tests.commands import python
+from tests.system.lab import NEAR_TRIANGLE, options
 
 pytestmark = pytest.mark.system
 
@@ -25,7 +26,8 @@ pytestmark = pytest.mark.system
 def test_faults_are_made_and_recovered_from(tmp_path: Path, kinds: list[str]) -> None:
     folder = tmp_path / "chaos"
     of = ("--faults", len(kinds), "--seed", "1", "--kinds", ",".join(kinds), *NEAR_TRIANGLE, "duration_s=40")
-    done = zenpark("--chaos", "triangle", *of, "--json", "--out", folder, timeout_s=150.0, module="tests")
+    words = options("-m", "tests", "--chaos", "triangle", *of, "--json", "--out", folder)
+    done = python(*words, code=None, timeout_s=150.0)
     assert done.stdout, done.stderr
     result = json.loads(done.stdout)
     assert sorted(each["fault"]["kind"] for each in result["outcomes"]) == sorted(kinds), done.stderr
@@ -36,15 +38,14 @@ def test_faults_are_made_and_recovered_from(tmp_path: Path, kinds: list[str]) ->
 
 
 def test_a_fault_that_nobody_knows_is_refused(tmp_path: Path) -> None:
-    done = zenpark("--chaos", "triangle", "--kinds", "kil", module="tests")
-    assert done.returncode == 2
+    done = python("-m", "tests", "--chaos", "triangle", "--kinds", "kil", code=2)
     assert "--kinds kil: is not known" in done.stderr
     assert done.stderr.count("\n") <= 2
 
 
 def test_three_robots_for_a_few_seconds(tmp_path: Path) -> None:
     asked = ("triangle", "--minutes", "0.1", "--json", "--out", str(tmp_path / "soak"))
-    done = zenpark("--soak", *asked, timeout_s=120.0, module="tests")
+    done = python("-m", "tests", "--soak", *asked, code=None, timeout_s=120.0)
     assert done.stdout, done.stderr
     said = json.loads(done.stdout)
     texts = [finding["text"] for finding in said["findings"]]
