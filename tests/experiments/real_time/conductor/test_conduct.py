@@ -1,22 +1,34 @@
-"""Runs that are conducted, and their emergency stop."""
+"""Runs that are conducted: their hardware, their emergency stop, and what serves them and is started again."""
 
+from __future__ import annotations
+
+import math
+import socket
 import threading
+import time
+from contextlib import ExitStack, nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
-import msgspec
 import pytest
 
-from agents.network.endpoints import free_endpoint
+from agents.network.endpoints import Endpoint, free_endpoint
 from agents.network.keys import Keys
 from agents.network.session import Unreachable
 from agents.runtime.router import serve_router
 from experiments.definition.experiment import Formation, Host, RobotTable
 from experiments.definition.plan import Plan
+from experiments.file import document
 from experiments.file.problems import DocumentError
-from experiments.real_time.conductor.conduct import check_other_runs, hardware
+from experiments.real_time.conductor import conduct
+from experiments.real_time.conductor.case_context import CaseContext
+from experiments.real_time.conductor.conduct import PORT_CHOICES, RunOptions, Supervision, run_setup, with_bodies
 from experiments.real_time.conductor.emergency import STARTING_S, Emergency
+from experiments.real_time.conductor.support import STARTS, RouterEnded, SupportProcesses
 from experiments.real_time.hosts import run_registry
-from tests.small import pair
+from experiments.real_time.hosts.hosts import Hosts
+from experiments.real_time.hosts.launcher import ROUTER, Launcher
+from tests.small import changed, pair
 
 RADIO = "radio://0/80/2M/E7E7E7E701"
 REAL = pair(
@@ -33,12 +45,12 @@ REAL = pair(
 
 def run(robots: dict[str, str], title: str = "here", born: str | None = None) -> run_registry.RegisteredRun:
     made = run_registry.own_entry("run", title, ["tcp/127.0.0.1:7448"], folder=Path("/runs/other"), robots=robots)
-    return made if born is None else msgspec.structs.replace(made, born=born)
+    return made if born is None else changed(made, born=born)
 
 
 def test_hardware_is_known_by_address_settings_and_host() -> None:
-    away = msgspec.structs.replace(REAL, hosts={"lab2": Host(address="ana@lab2", robots=["TE01"])})
-    assert hardware([Plan(REAL), Plan(away)]) == {
+    away = changed(REAL, hosts={"lab2": Host(address="ana@lab2", robots=["TE01"])})
+    assert conduct.hardware([Plan(REAL), Plan(away)]) == {
         "CF01": RADIO,
         "TE01": "tello on lab2",
         "KH01": 'khepera4://10.0.0.7 {"port": 344}',
@@ -63,23 +75,21 @@ def test_hardware_that_another_run_has_is_refused(
 ) -> None:
     me, other = run(mine), run(theirs, "there", born="another")
     monkeypatch.setattr(run_registry, "born", lambda _pid: "another")
+    there = "there, /runs/other, at tcp/127.0.0.1:7448"
     if not refused:
-        same = sorted(mine.keys() & theirs.keys())
-        assert check_other_runs(me, [me, other], "x.toml") == [
-            f"another run is up with robots of these names ({name}): there, /runs/other, at tcp/127.0.0.1:7448"
-            for name in same
-        ]
+        told = [f"another run is up with robots of these names ({name}): {there}" for name in mine.keys() & theirs]
+        assert conduct.check_other_runs(me, [me, other], "x.toml") == told
         return
     with pytest.raises(DocumentError) as caught:
-        check_other_runs(me, [me, other], "x.toml")
+        conduct.check_other_runs(me, [me, other], "x.toml")
     (problem,) = caught.value.problems
     (name, body), *_ = mine.items()
-    assert problem.message == f"{name} ({body}) is in another run, there, /runs/other, at tcp/127.0.0.1:7448"
+    assert problem.message == f"{name} ({body}) is in another run, {there}"
     assert problem.hint.endswith("or `./zenpark estop --connect tcp/127.0.0.1:7448`")
 
 
 def test_a_run_that_has_died_has_nothing() -> None:
-    assert check_other_runs(run({"CF01": RADIO}), [run({"CF01": RADIO}, born="long ago")], "x.toml") == []
+    assert conduct.check_other_runs(run({"CF01": RADIO}), [run({"CF01": RADIO}, born="long ago")], "x.toml") == []
 
 
 KEYS = Keys("park")
@@ -106,3 +116,68 @@ def test_router_that_just_started_is_waited_for(endpoint):
 def test_one_of_somebody_else_is_not(endpoint):
     with pytest.raises(Unreachable), Emergency().throughout([endpoint], KEYS, "operator", 0.2):
         pass
+
+
+class Starts:
+    """Stands for a launcher, and keeps what it was to start."""
+
+    def __init__(self) -> None:
+        self.told: list[tuple[str, ...]] = []
+
+    def start(self, *words: str) -> None:
+        self.told.append(words)
+
+
+def test_dead_router_listens_again_where_machines_expect_it(tmp_path):
+    launcher = Starts()
+    here, everywhere = "tcp/127.0.0.1:7447", "tcp/0.0.0.0:7447"
+    experiment = document.read("triangle").experiment
+    hosts = Hosts(launcher, [everywhere])
+    servants = SupportProcesses(
+        CaseContext(Plan(experiment), "only", tmp_path, tmp_path / "case.toml", [here], launcher, hosts)
+    )
+    dead = SimpleNamespace(name=ROUTER, exit="killed by SIGKILL")
+    said = [servants.again(dead) for _ in range(STARTS)]
+    assert [words[:2] for words in launcher.told] == [(ROUTER, "agents.runtime.router")] * (STARTS - 1)
+    assert all(words[2:4] == ("--listen", everywhere) for words in launcher.told)
+    assert said[0] == (ROUTER, "the router ended (killed by SIGKILL); started again")
+    assert said[-1] == (ROUTER, "the router ended (killed by SIGKILL); given up: the robots hold, and land at the end")
+    assert servants.again(SimpleNamespace(name="only-KH01", exit="exit code 2")) is None
+
+
+@pytest.mark.system
+def test_router_with_port_taken_meanwhile_listens_elsewhere(tmp_path, monkeypatch):
+    taken = free_endpoint(preferred_port=0)
+    with socket.create_server(("127.0.0.1", Endpoint.parse(taken).port)):
+        free = [[taken], [taken], [free_endpoint(preferred_port=0)]]
+        chosen = iter(free)
+        monkeypatch.setattr(conduct, "free_endpoints", lambda *_, **__: next(chosen))
+        read, user = document.read("triangle"), Supervision(nullcontext(), lambda: False)
+        with run_setup(read, with_bodies(read, RunOptions()), tmp_path, RunOptions(), user) as stage:
+            assert stage.context("event").endpoints == free[-1]
+            (run,) = [run for run in run_registry.runs() if run.folder == str(tmp_path)]
+            assert run.endpoints == free[-1]
+        chosen = iter([[taken]] * PORT_CHOICES)
+        with pytest.raises(RouterEnded, match="already in use"), ExitStack() as up:
+            up.enter_context(run_setup(read, with_bodies(read, RunOptions()), tmp_path, RunOptions(), user))
+
+
+def test_suspended_launcher_knows_when_its_robots_have_landed(tmp_path, monkeypatch):
+    launcher, zero = Launcher(tmp_path), time.monotonic()
+    for since, silence in ((3.0, -math.inf), (3.7, zero + 3.7), (40.0, zero + 40.0)):
+        with monkeypatch.context() as patched:
+            patched.setattr(time, "monotonic", lambda at=zero + since: at)
+            assert launcher.last_silence == silence
+
+
+@pytest.mark.parametrize("word", ["experiment", "joining", "changed", "addressed"])
+def test_no_name_of_a_case_shares_a_file(tmp_path, word):
+    hosts, experiment = Hosts(Starts(), []), document.read("triangle").experiment
+    names = ["rights", "run", "metrics", "x", "x-joining", "x-changed", "cases"]
+    files = [
+        CaseContext(Plan(experiment), name, tmp_path, tmp_path / "a.toml", [], Starts(), hosts).variant(word)
+        for name in names
+    ]
+    assert len(set(files)) == len(names)
+    assert all(file.relative_to(tmp_path).parts[0] == "cases" for file in files)
+    assert all(len(file.relative_to(tmp_path).parts) == 3 for file in files)
