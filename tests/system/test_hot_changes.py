@@ -65,7 +65,7 @@ class Lab:
         order = messages.RunOrder(what, list(names), **more)  # type: ignore[arg-type]
         return orders.send_run_order(self.watcher.session, self.watcher.keys, order)
 
-    def zenpark(self, *words: str, code: int | None = 0) -> subprocess.CompletedProcess[str]:
+    def zenpark(self, *words: str, code: int | None = None) -> subprocess.CompletedProcess[str]:
         return zenpark("robot", *words, "--connect", self.endpoint, code=code)
 
     def end(self) -> None:
@@ -118,7 +118,7 @@ def test_killed_robot_is_restarted_and_takes_part(lab: Lab) -> None:
 @pytest.mark.mechanism("hot change: hold, remove, add")
 def test_robots_hold_leave_and_come_while_others_continue(lab: Lab) -> None:
     watcher = lab.fly()
-    assert lab.zenpark("hold", "CF01").stdout == "CF01: holds where it is\n"
+    assert lab.zenpark("hold", "CF01", code=0).stdout == "CF01: holds where it is\n"
     watcher.until(lambda: watcher.status["CF01"].reason == "ordered to hold", "its status says so")
     assert lab.running("KH01", "KH02", "CF01")
     assert lab.zenpark("resume").stdout.splitlines() == ["CF01: goes on", "KH01: goes on", "KH02: goes on"]
@@ -130,7 +130,7 @@ def test_robots_hold_leave_and_come_while_others_continue(lab: Lab) -> None:
     watcher.until(lambda: "KH02" in watcher.status["CF01"].missing, "its neighbours know")
     assert (watcher.status["KH02"].phase, watcher.status["KH02"].reason) == ("done", "ordered to leave")
     assert lab.running("KH01", "CF01"), "the others go on"
-    assert lab.zenpark("hold", "KH02", code=None).stderr.startswith("KH02: no: no answer\n")
+    assert lab.zenpark("hold", "KH02").stderr.startswith("KH02: no: no answer\n")
     assert "takes part" in lab.change("add", "KH02").done["KH02"], "who was removed may come back"
     watcher.until(lambda: watcher.status["KH02"].pid != before and lab.running("KH02"), "it runs")
     assert "already" in lab.change("add", "KH02").refused["KH02"]
