@@ -13,6 +13,7 @@ from tools import consent
 REACHING = """
 title = "two"
 duration_s = 5.0
+positioning = "vicon://192.0.2.9:801"
 [robots]
 A = { kind = "crazyflie", start = [-0.4, 0.0], hover = 0.5, body = "radio://0/80/2M/E7E7E7E701" }
 B = { kind = "khepera4", start = [0.4, 0.0] }
@@ -32,9 +33,10 @@ def asking(monkeypatch, answer):
 
 
 def test_devices_and_machines_are_named():
-    device, machine = consent.touched(loads(REACHING).cases().values())
+    device, machine, cameras = consent.touched(loads(REACHING).cases().values())
     assert "A: radio://0/80/2M/E7E7E7E701" in device
     assert "ssh pi@192.0.2.7" in machine
+    assert cameras == "motion capture: vicon://192.0.2.9:801"
 
 
 @pytest.mark.parametrize(("answer", "runs"), [("y", True), ("YES", True), ("n", False), ("", False), (None, False)])

@@ -17,7 +17,7 @@ from agents.kinds.turtlebot3 import TURTLEBOT3
 from agents.plugins.registry import load
 from agents.vectors import NO_SETPOINT, ZERO
 from tests.requests import request
-from twins.body import CATCH_UP_S, TwinBody
+from twins.body import CATCH_UP_S, TwinBody, instants
 from twins.engines.engine import World
 from twins.engines.point_mass import PointMass
 from twins.engines.pymunk_engine import Planar
@@ -227,6 +227,7 @@ def test_missed_ticks_are_made_up_for():
         twin.takeoff([0], [0.5])
         ends.add([twin.read(tick * DT)[0].true_position for tick in times][-1])
     assert len(ends) == 1
+    assert instants(1.0, 1.03, 0.01) == pytest.approx([1.01, 1.02, 1.03])
 
 
 def test_substeps_are_ticks_of_a_faster_body():

@@ -16,7 +16,7 @@ from twins.scene import Obstacle, Scene
 
 BOX = Obstacle(box=(0.4, 0.2), at=(1.0, 0.5), yaw=0.5)
 POST = Obstacle(radius=0.2, at=(-0.5, 0.3))
-FENCE = Obstacle(wall=[(0.0, 0.0), (0.5, 0.0), (0.5, 0.8)], at=(0.2, -0.7), yaw=-0.4)
+FENCE = Obstacle(wall=[(0.5, 0.8), (0.5, 0.0), (0.0, 0.0)], at=(0.2, -0.7), yaw=-0.4)
 metres = st.floats(-2.0, 2.0)
 
 

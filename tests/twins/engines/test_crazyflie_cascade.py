@@ -106,23 +106,3 @@ def test_outer_loops_run_at_a_fifth_rate():
         np.testing.assert_array_equal(made.angles, before)
     made.advance_outer_loops(np.array([[0.0, 0.1, 0.0]]), NONE, NONE, np.array([False]), np.zeros(1))
     assert made.angles[0, 0] < -4.9
-
-
-def test_rows_do_not_know_of_each_other():
-    rng = np.random.default_rng(3)
-    together, alone = Firmware(3, DT), [Firmware(1, DT) for _ in range(3)]
-    for tick in range(40):
-        given_ = [rng.standard_normal((3, 3)) for _ in range(5)]
-        yaw = rng.standard_normal(3)
-        by_velocity = np.array([False, True, False])
-        if tick == 20:
-            together.reset(np.array([2]))
-            alone[2].reset(np.array([0]))
-        together.advance_outer_loops(given_[0], given_[1], given_[2], by_velocity, yaw)
-        motors = together.advance_inner_loops(given_[3], given_[4], yaw)
-        for row, single in enumerate(alone):
-            one = slice(row, row + 1)
-            single.advance_outer_loops(given_[0][one], given_[1][one], given_[2][one], by_velocity[one], yaw[one])
-            np.testing.assert_array_equal(
-                single.advance_inner_loops(given_[3][one], given_[4][one], yaw[one])[0], motors[row]
-            )

@@ -94,21 +94,6 @@ def test_limits_count_from_sensor_readings_from_centre(kind, sensor, gap, expect
     np.testing.assert_allclose(facing(kind, sensor, gap), [expected], atol=1e-12)
 
 
-def test_without_noise_readings_are_geometry():
-    """A TurtleBot3 turned by 0.3 rad in a room of 6 m × 5 m with a pillar."""
-    asked = request([TURTLEBOT3], start=[(0.4, -0.2)], yaw=[0.3])
-    pillar = {"pillar": Obstacle(radius=0.25, at=(1.4, -0.2))}
-    seen, _ = swept(asked, placed([TURTLEBOT3], [("lds01",)], obstacles=pillar, size=(6.0, 5.0, 2.5)))
-    angle = np.radians(np.arange(360.0)) + 0.3
-    c, s = np.cos(angle), np.sin(angle)
-    walls = np.minimum((3.0 * np.sign(c) - 0.4) / c, (2.5 * np.sign(s) + 0.2) / s)
-    with np.errstate(invalid="ignore"):
-        pillars = np.where(c > 0.0, c - np.sqrt(0.25**2 - s**2), np.inf)  # it is 1 m ahead in x
-    expected = np.fmin(walls, pillars)
-    assert np.isfinite(pillars).sum() == 29
-    np.testing.assert_allclose(seen[0], np.where(expected > 3.5, np.nan, expected), atol=1e-12)
-
-
 def test_rays_are_in_the_order_of_sensors():
     kinds = [KHEPERA4, CRAZYFLIE, TURTLEBOT3, KHEPERA4]
     carried = [("ultrasonic", "infrared", "ultrasonic"), (), ("lds01",), ("infrared",)]
