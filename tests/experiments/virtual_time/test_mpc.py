@@ -14,11 +14,11 @@ from agents.plugins.extras.mpc import Mpc, horizon
 from agents.plugins.law import NeighbourView
 from agents.plugins.registry import PluginError
 from agents.vectors import ZERO
+from experiments.definition.experiment import Formation, RobotTable
 from experiments.definition.plan import Plan
-from experiments.file import document
 from tests.agents.bench import Bench
 from tests.runs import flown, fly
-from tests.small import triangle
+from tests.small import small, triangle
 
 pytest.importorskip("daqp", reason="the law mpc is the extra [mpc]: ./zenpark install daqp")
 
@@ -116,24 +116,12 @@ def test_swap_by_events_and_with_losses(case):
     assert len(trace.sent) < 0.7 * len(swapped(opposite, 0)[0].sent)
 
 
-ALONE = """
-title = "One robot"
-duration_s = 12.0
-[robots.KH01]
-kind = "KIND"
-start = [-1.0, -0.5]
-HOVER
-[formation]
-law = { kind = "mpc", goal = { KH01 = [1.0, 0.6] } }
-[cases.periodic]
-"""
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["crazyflie", "khepera4", "omni", "double-integrator"])
 def test_one_robot_reaches_its_goal_within_its_limits(kind):
-    text = ALONE.replace("KIND", kind).replace("HOVER", "hover = 0.8" if kind == "crazyflie" else "")
-    trace = fly(document.loads(text).cases()["periodic"].experiment).trace
+    law = {"kind": "mpc", "goal": {"A": [1.0, 0.6]}}
+    robot = RobotTable(kind=kind, start=[-1.0, -0.5], hover=0.8 if kind == "crazyflie" else None)
+    trace = fly(small({"A": robot}, formation=Formation(law=law), duration_s=12.0)).trace
     assert trace.true_position[-1, 0, :2] == pytest.approx([1.0, 0.6], abs=0.02)
     state = trace.memory["state"][:, 0]
     known = state[np.isfinite(state).all(axis=1)]

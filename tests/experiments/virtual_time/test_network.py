@@ -1,6 +1,5 @@
 """The network in virtual time: delays, losses and sizes as the file has them, for poses and for goals."""
 
-from dataclasses import dataclass, field
 from math import inf
 
 import numpy as np
@@ -8,37 +7,26 @@ import pytest
 
 from agents.network import messages
 from agents.robot import Robot
-from experiments.definition import experiment as definition
-from experiments.definition.experiment import ChannelTable, Formation, LinkChannelTable, NetworkTable, Outage
+from experiments.definition.experiment import ChannelTable, LinkChannelTable, NetworkTable, Outage, RobotTable
 from experiments.definition.plan import Plan
 from experiments.recording.trace import EPOCH
 from experiments.virtual_time.network import VirtualNetwork
-from tests.small import pair
+from tests.small import small
 
 DT = 0.01
 LINKS = {"A - B": 0.5, "A > C": 0.5, "B > C": 0.5}  # A and B receive each other, C receives both
 A_TO_B, B_TO_A, A_TO_C, B_TO_C = 1, 0, 2, 3
 
 
-@dataclass
 class Talk:
     """Robots that transmit their number and the time, tick by tick."""
 
-    channel: ChannelTable
-    links: dict[str, float] = field(default_factory=lambda: dict(LINKS))
-    seed: int = 1
-    start: float = 0.0
-    more: dict[str, object] = field(default_factory=dict)
-    tick: int = 0
-
-    def __post_init__(self):
-        robots = {name: definition.RobotTable(kind="khepera4", start=[k, 0.0]) for k, name in enumerate("ABC")}
-        experiment = pair(
-            duration_s=1e4, robots=robots, formation=Formation(links=self.links), channel=self.channel, **self.more
-        )
-        plan = Plan(experiment)
+    def __init__(self, channel, links=LINKS, *, seed=1, start=0.0, **more):
+        robots = {name: RobotTable(kind="khepera4", start=[k, 0.0]) for k, name in enumerate("ABC")}
+        plan = Plan(small(robots, links, duration_s=1e4, channel=channel, **more))
         self.robots = [Robot(plan.assignment(name)) for name in plan.names]
-        self.network = VirtualNetwork(plan, self.robots, self.seed, lean=False)
+        self.network = VirtualNetwork(plan, self.robots, seed, lean=False)
+        self.start, self.tick = start, 0
 
     def run(self, ticks, rows=()):
         """Some ticks: what arrived first, then these rows transmit."""
@@ -117,7 +105,7 @@ def test_nothing_is_lost_before_the_start():
 def test_samples_have_their_size_on_the_wire(encoding):
     bandwidth = 10_000.0
     channel = ChannelTable(delay_s=0.0, bandwidth=bandwidth)
-    got = Talk(channel, more={"network": NetworkTable(encoding=encoding)}).run(1, [0, 1]).run(40).received
+    got = Talk(channel, network=NetworkTable(encoding=encoding)).run(1, [0, 1]).run(40).received
     for link, row in ((A_TO_B, 0), (A_TO_C, 0), (B_TO_A, 1), (B_TO_C, 1)):
         pose = messages.pose("AB"[row], 1, EPOCH, [float(row), 0.0, 1.0], [-float(row), -0.0, -1.0], yaw=0.0)
         size = len(messages.encode(pose, encoding))
@@ -151,7 +139,7 @@ def test_instant_network(channel, instant):
 
 
 def test_poses_to_the_centre_are_lost_alike():
-    talk = Talk(ChannelTable(loss=0.5), more={"architecture": "centralised"}).run(400, [0, 1, 2]).run(1)
+    talk = Talk(ChannelTable(loss=0.5), architecture="centralised").run(400, [0, 1, 2]).run(1)
     centre = talk.network.logged(0.0)["centre"]
     assert len(centre.received.link) + centre.lost_poses.sum() == 3 * 400
     assert centre.lost_poses / 400 == pytest.approx(0.5, abs=0.1)
