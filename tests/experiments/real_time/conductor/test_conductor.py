@@ -47,13 +47,15 @@ class Course(Conductor):
         )
         self._changes = self._drift = nothing
         self._context: Any = SimpleNamespace(ended=lambda: False)
-        self._processes: Any = SimpleNamespace(
+        self.processes: Any = SimpleNamespace(
             deaths=self._died, recording=True, kill_recorder=lambda: setattr(self, "killed", self.killed + 1)
         )
-        self._view: Any = SimpleNamespace(
+        self.view: Any = SimpleNamespace(
             update=self._phase, report=lambda *_, **__: None, report_drift=lambda *_: None, order=lambda *_: {},
             recorder_stands_still=False, recording_begun=True, await_recorder=lambda: None,
         )  # fmt: skip
+        self._processes, self._view = self.processes, self.view
+        self.update = self._update
 
     def _show_progress(self) -> None: ...
 
@@ -119,22 +121,22 @@ def test_a_recorder_is_awaited_again_before_the_start() -> None:
 
 def test_nothing_flies_without_a_recorder() -> None:
     course = Course({0.0: "ready"})
-    course._processes.recording = False
+    course.processes.recording = False
     with pytest.raises(RunFailed, match="nothing would be recorded"):
         course.await_phase("ready", 10.0, recorder=True)
 
 
 def test_a_recorder_that_stands_still_is_killed() -> None:
     course = Course({0.0: "running"})
-    course._view.recorder_stands_still = True
-    course._update()
+    course.view.recorder_stands_still = True
+    course.update()
     assert course.killed == 1
 
 
 def test_output_of_a_lost_robot_is_told_once():
     course = Course({})
     lost, late = list(course.robots)[:2]
-    course._processes.last_line = lambda name: f"last words of {name}"
+    course.processes.last_line = lambda name: f"last words of {name}"
     course.robots[lost].left_because = "lost"
     told = course.start_failure([lost, late], "could not start")
     assert told.count("could not start") == 1
