@@ -122,9 +122,9 @@ def said(**parts):
     ("robots", "say", "words"),
     [
         (("external", "CF01", "TE01"), lambda far: far.say("CF01", [0.0, 0.0, 0.0]), "TE01: nothing is published on "
-         "park/TE01/position: is the simulator running and connected to tcp/"),
+         "park/TE01/position: is the simulator running and connected to {}?"),
         (("world", "CF01"), lambda _: None, "CF01: nothing is published on park/CF01/position: is `./zenpark world "
-         "serve` with this experiment running and connected to tcp/"),
+         "serve` with this experiment running and connected to {}?"),
         (("external", "KH01"), said(stamp=12.5), "stamps are UTC seconds, not simulation time"),
         (("external", "KH01"), said(stamp=time.time() - 7.0), "s ago by its stamp"),
         (("external", "KH01"), said(), "no yaw, without which a robot on wheels cannot steer"),
@@ -137,7 +137,7 @@ def test_missing_positions_are_named_with_reasons(router, far, robots, say, word
     far.repeat(lambda: say(far))
     with pytest.raises(BodyError) as caught:
         body_of(router.endpoint, *names, address=address).open()
-    assert words in str(caught.value)
+    assert words.format(router.endpoint) in str(caught.value)
     assert "\n" not in str(caught.value)
 
 

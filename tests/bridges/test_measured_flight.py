@@ -10,13 +10,15 @@ from bridges.measured_flight import GROUNDED_S, LANDING_S, MeasuredFlight
 DT = 0.1
 
 
-class Seen:
+class Seen(MeasuredFlight):
     """A robot that is measured all the time."""
 
-    def __init__(self, start):
-        self.flight, self.now, self.at = MeasuredFlight(), 0.0, start
-        self.flight.take_off(self.at)
-        self.climbing = False
+    def __init__(self, start, to=None, seconds=4.0):
+        super().__init__()
+        self.now, self.at, self.climbing = 0.0, start, False
+        self.take_off(start)
+        if to is not None:
+            self.go(to, seconds)
 
     def go(self, to, seconds):
         """Fly to a place in so long; returns whether the flight is over."""
@@ -24,14 +26,11 @@ class Seen:
         for _ in range(round(seconds / DT)):
             self.now += DT
             self.at = tuple(here + DT * speed for here, speed in zip(self.at, velocity, strict=True))
-            self.flight.update(self.now, self.now, self.at, velocity, climbing=self.climbing)
-        return not self.flight.flying
+            self.update(self.now, self.now, self.at, velocity, climbing=self.climbing)
+        return not self.flying
 
     def stay(self, seconds):
         return self.go(self.at, seconds)
-
-    def land(self):
-        self.flight.land(self.now)
 
 
 @pytest.mark.parametrize("start", [(0.0, 0.0, 0.0), (0.0, 0.0, 0.08), (0.0, 0.0, 0.7)])
@@ -40,14 +39,13 @@ def test_flight_from_floor_or_table_ends_in_place(start):
     assert not seen.go((0.0, 0.0, 1.2), 2.0)
     assert not seen.go((1.0, 0.0, 1.2), 5.0)
     assert not seen.go((0.0, 0.0, 1.2), 5.0)
-    seen.land()
+    seen.land(seen.now)
     assert not seen.go((start[0], start[1], start[2] + 0.06), 2.0)
     assert seen.go(start, 0.5) or seen.stay(0.2)
 
 
 def test_slow_flight_below_its_table_goes_on():
-    seen = Seen((0.0, 0.0, 0.7))
-    seen.go((0.0, 0.0, 1.0), 2.0)
+    seen = Seen((0.0, 0.0, 0.7), to=(0.0, 0.0, 1.0))
     seen.go((1.0, 0.0, 0.4), 4.0)
     assert not seen.stay(20.0)
     seen.go((1.0, 0.0, 0.7), 4.0)
@@ -57,18 +55,16 @@ def test_slow_flight_below_its_table_goes_on():
 
 
 def test_landing_on_another_table_ends():
-    seen = Seen((0.0, 0.0, 0.0))
-    seen.go((1.0, 0.0, 1.2), 4.0)
-    seen.land()
+    seen = Seen((0.0, 0.0, 0.0), to=(1.0, 0.0, 1.2))
+    seen.land(seen.now)
     seen.go((1.0, 0.0, 0.7), 2.0)
     assert not seen.stay(LANDING_S - 1.0)
     assert seen.stay(1.5)
 
 
 def test_hover_that_refuses_to_land_goes_on():
-    seen = Seen((0.0, 0.0, 0.0))
-    seen.go((0.0, 0.0, 1.2), 4.0)
-    seen.land()
+    seen = Seen((0.0, 0.0, 0.0), to=(0.0, 0.0, 1.2))
+    seen.land(seen.now)
     assert not seen.stay(60.0)
 
 

@@ -332,10 +332,7 @@ def endpoints(name):
     }
 
 
-OF_ALL = {
-    endpoint("MP", "/diagnostics", "diagnostic_msgs/msg/DiagnosticArray"),
-    endpoint("MP", "/tf", ros2.TF_MESSAGE),
-}
+OF_ALL = {endpoint("MP", "/diagnostics", "diagnostic_msgs/msg/DiagnosticArray"), endpoint("MP", "/tf", ros2.TF_MESSAGE)}
 
 
 @pytest.mark.mechanism("ROS 2 bridge")

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from agents.body.interface import BodyError
 from agents.protocols.crtp import MemoryKind
@@ -15,21 +16,17 @@ from twins.devices.crazyflie.supervisor import SupervisorState
 
 pytestmark = pytest.mark.system
 
-STATION = """
-    origin: [{x}, 0.5, 2.0]
-    rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
-"""
-SWEEP = "{phase: 0.1, tilt: 0.02, curve: 0.0, gibmag: 0.0, gibphase: 1.0, ogeemag: 0.0, ogeephase: 1.5}"
+SWEEP = {"phase": 0.1, "tilt": 0.02, "curve": 0.0, "gibmag": 0.0, "gibphase": 1.0, "ogeemag": 0.0, "ogeephase": 1.5}
+TURN = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
 BRUSHLESS = {"platform": "brushless"}
 
 
 def lighthouse_file(folder: Path, *numbers: int) -> str:
-    lines = ["type: lighthouse_system_configuration", "version: '1'", "systemType: 2", "geos:"]
-    lines += [f"  {number}:" + STATION.format(x=number + 0.25) for number in numbers]
-    lines.append("calibs:")
-    lines += [f"  {number}:\n    sweeps: [{SWEEP}, {SWEEP}]\n    uid: {1000 + number}" for number in numbers]
+    stations = {number: {"origin": [number + 0.25, 0.5, 2.0], "rotation": TURN} for number in numbers}
+    calibrations = {number: {"sweeps": [SWEEP, SWEEP], "uid": 1000 + number} for number in numbers}
+    kind = {"type": "lighthouse_system_configuration", "version": "1", "systemType": 2}
     path = folder / "stations.yaml"
-    path.write_text("\n".join(lines))
+    path.write_text(yaml.safe_dump(kind | {"geos": stations, "calibs": calibrations}))
     return str(path)
 
 

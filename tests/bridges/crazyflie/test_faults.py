@@ -12,7 +12,6 @@ import pytest
 from agents.body.interface import BodyError
 from agents.protocols.crazyflie import CrazyflieSettings, Outside, capacity, overload
 from bridges.crazyflie import link
-from bridges.crazyflie.body import CrazyflieBody
 from tests.bridges.crazyflie_flight import connected, flown, motors, supervised, truth
 from tests.commands import started
 from tests.requests import request
@@ -207,31 +206,6 @@ def test_nothing_plugged_in(address, said):
 
 
 # ---------------------------------------------------------------------- before anything is opened
-
-
-@pytest.mark.parametrize(
-    "address", ["radio://0/80/3M/E7", "radio://0/130/2M", "udp://127.0.0.1", "usb://", "http://somewhere", ""]
-)
-def test_wrong_address(address):
-    with pytest.raises(BodyError, match=r"R0: .* is no Crazyflie's address; write radio://0/80/2M/E7E7E7E701"):
-        CrazyflieBody(request("crazyflie", [address]))
-
-
-@pytest.mark.parametrize(
-    ("kind", "device", "said"),
-    [
-        ("crazyflie", {"contrl": "position"}, "R0: device: .*contrl"),
-        ("crazyflie", {"platform": "plane"}, "R0: device: .*platform"),
-        ("crazyflie", {"log_hz": 500.0}, "R0: device: .*log_hz"),
-        ("crazyflie", {"positioning": {"system": "gps"}}, "R0: device: .*positioning"),
-        ("crazyflie", {"positioning": {"system": "external"}}, 'needs position = "external"'),
-        ("crazyflie", {}, "several robots have the address"),
-        ("tello", {}, "R0 is a tello"),
-    ],
-)
-def test_wrong_rows(kind, device, said):
-    with pytest.raises(BodyError, match=said):
-        CrazyflieBody(request(kind, [RADIO] * (1 if device else 2), device=device))
 
 
 @pytest.mark.parametrize("version", ["0.1.31", "0.1.20.1", "0.0.9"])

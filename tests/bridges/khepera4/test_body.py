@@ -131,15 +131,6 @@ def test_addresses(address, expected):
 
 
 @pytest.mark.parametrize(
-    "address",
-    ["khepera4", "khepera4://", "kteam://10.0.0.3", "khepera4://h:port", "kteam:", "khepera4://h?server=2024",
-     "khepera4://h?year=2023"],
-)  # fmt: skip
-def test_wrong_addresses_are_named(address):
-    assert refusal(request("khepera4", [address])).startswith(f"R0: {address}: ")
-
-
-@pytest.mark.parametrize(
     ("address", "device", "server"),
     [
         ("khepera4://h", {}, None),
@@ -151,19 +142,6 @@ def test_wrong_addresses_are_named(address):
 )
 def test_server_is_named_in_address_or_table(address, device, server):
     assert KheperaAddress.parse("R0", address).server_of("R0", protocol.Khepera4Settings(**device)) == server
-
-
-@pytest.mark.parametrize(
-    ("device", "said"),
-    [
-        ({"poll_hz": 100.0}, "poll_hz must be 2 to 30"),
-        ({"servre": "fork"}, "`servre`; its fields are server, poll_hz"),
-        ({"server": "2023-04-10", "ranges": True}, "ranges: the server of 2023-04-10 has no range poll"),
-        ({"server": "fork", "poll_hz": 10}, "poll_hz must be 22 to 30 with server = 'fork'"),
-    ],
-)
-def test_wrong_settings_are_named(device, said):
-    assert re.match(f"R0: device: .*{said}", refusal(request("khepera4", ["khepera4://h"], device=device)))
 
 
 @pytest.mark.parametrize(

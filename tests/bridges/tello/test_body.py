@@ -14,7 +14,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from agents.body.interface import BodyError, settings
 from agents.protocols import tello as protocol
 from bridges.tello import pilot
 from bridges.tello.body import TelloBody
@@ -38,33 +37,6 @@ NOTHING_COMES = SimpleNamespace(receive=lambda: None)
 )
 def test_addresses(address, place):
     assert protocol.endpoint("T", address) == place
-
-
-@pytest.mark.parametrize("address", ["tello://kitchen", "tello://1.2.3", "tello://1.2.3.256", "tello://1.2.3.4:x"])
-def test_wrong_addresses_are_named(address):
-    with pytest.raises(BodyError, match=r"^R0: .*tello://192\.168\.10\.1"):
-        TelloBody(request("tello", [address], external=True))
-
-
-@pytest.mark.parametrize(
-    ("addresses", "options", "said"),
-    [
-        (["tello"], {"external": False}, 'R0: a Tello does not measure its position: write position = "external"'),
-        (["tello://10.0.0.2", "tello://10.0.0.2:1"], {}, r"R1: another Tello .* has the address 10\.0\.0\.2"),
-        (["tello"], {"device": {"silence_s": 0.01}}, r"R0: device: .*silence_s must be 0.3 to 10 s"),
-    ],
-)
-def test_rows_that_cannot_be_flown(addresses, options, said):
-    with pytest.raises(BodyError, match=said):
-        TelloBody(request("tello", addresses, **{"external": True} | options))
-
-
-@pytest.mark.parametrize(
-    "table", [{"rc_hz": 500.0}, {"low_battery": 20}, {"low_battery": "half"}, {"colour": "red"}, {"rc_hz": True}]
-)
-def test_wrong_settings_are_named(table):
-    with pytest.raises(BodyError, match=rf"^T1: device: .*{next(iter(table))}"):
-        settings(protocol.TelloSettings, "T1", table)
 
 
 # ---------------------------------------------------------------------- pilots without a network

@@ -145,21 +145,19 @@ def test_process_woken_from_suspension_sends_nothing_stale(flown):
     assert rising.said == ["land"]
 
 
-def test_a_process_that_does_nothing_loses_its_drone(flown):
-    flown.attended = False
-    assert flown.pass_(0.1).duty is Duty.LAND
-    assert "its process did nothing for 2 s" in flown.note
-
-
-def test_a_low_battery_brings_it_down():
-    cockpit = Cockpit(low_battery=0.2).fly().pass_(0.2, bat=19)
-    assert (cockpit.duty, cockpit.pilot.battery) == (Duty.LAND, 0.19)
-    assert cockpit.note == "landing: battery at 19%"
-
-
-def test_a_drone_that_landed_by_itself_is_seen(flown):
-    assert not flown.pass_(3.5, h=0).flying
-    assert flown.note == "landed by itself, battery at 80%"
+@pytest.mark.parametrize(
+    ("attended", "seconds", "report", "duty", "note"),
+    [
+        (False, 0.1, {}, Duty.LAND, "landing: its process did nothing for 2 s"),
+        (True, 0.2, {"bat": 19}, Duty.LAND, "landing: battery at 19%"),
+        (True, 3.5, {"h": 0}, Duty.REST, "landed by itself, battery at 80%"),
+    ],
+)
+def test_what_ends_a_flight_is_said(attended, seconds, report, duty, note):
+    cockpit = Cockpit(low_battery=0.2).fly()
+    cockpit.attended = attended
+    assert (cockpit.pass_(seconds, **report).duty, cockpit.note) == (duty, note)
+    assert cockpit.pilot.battery == cockpit.report["bat"] / 100.0
 
 
 def test_drone_that_flies_unordered_is_landed(standing):

@@ -14,8 +14,6 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 from zenoh.handlers import RingChannel
 
-from agents.body.interface import BodyError
-from agents.kinds.khepera4 import KHEPERA4
 from agents.network.session import open_session
 from agents.protocols import ros2, turtlebot3
 from bridges.turtlebot3.body import TurtleBot3
@@ -55,29 +53,6 @@ def test_every_whole_speed_survives_the_truncation():
 )
 def test_charge(voltage, percentage, charge):
     assert turtlebot3.charge(voltage, percentage) == pytest.approx(charge, abs=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("address", "device", "message"),
-    [
-        ("ros2dds://tb3-0", {}, "TB0: 'tb3-0' is no ROS namespace"),
-        ("rmw://tb3_0?domain=500", {}, "domain '500' is no number from 0 to 232"),
-        ("rmw://tb3_0?distro=foxy", {}, "distro 'foxy' is not known"),
-        ("rmw://tb3_0?colour=red", {}, "'colour' is no part"),
-        ("radio://0", {}, "is no TurtleBot3: write it like ros2dds://tb3_0"),
-        ("ros2dds://", {"speed": 1.0}, r"TB0: device: Object contains unknown field `speed`"),
-        ("ros2dds://", {"domain": -1}, r"`int` >= 0 - at `\$.domain`"),
-        ("ros2dds://", {"distro": "foxy"}, r"at `\$.distro`"),
-    ],
-)
-def test_wrong_addresses_and_settings_are_named(address, device, message):
-    with pytest.raises(BodyError, match=message):
-        TurtleBot3(request(NOWHERE, address, device=device))
-
-
-def test_drives_turtlebots_only():
-    with pytest.raises(BodyError, match="TB0 is a khepera4"):
-        TurtleBot3(replace(request(NOWHERE, "ros2dds://"), kinds=(KHEPERA4,)))
 
 
 def test_addresses():

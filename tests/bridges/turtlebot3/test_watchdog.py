@@ -9,9 +9,10 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace as Thing
+from unittest.mock import MagicMock
 
 import pytest
 
@@ -71,49 +72,33 @@ def test_zero_is_what_does_not_move(v: float, w: float, moves: bool) -> None:
     assert moving(twist(v, w)) == moves
 
 
-class FakeNode:
-    """As much of rclpy and its nodes as the watchdog uses."""
-
-    def __init__(self) -> None:
-        self.sent: list[Thing] = []
-        self.receivers: list[Thing] = []
-        self.create_node = lambda _name: self
-        self.get_name = lambda: "cmd_vel_watchdog"
-        self.get_subscriptions_info_by_topic = lambda _topic: self.receivers
-        self.create_publisher = lambda *_: Thing(publish=self.sent.append)
-        self.get_logger = lambda: Thing(info=lambda _: None, warning=lambda _: None)
-        self.get_clock = lambda: Thing(now=lambda: Thing(to_msg=lambda: "now"))
-
-    def create_subscription(self, _kind: object, _topic: str, hear: Callable[[Thing], None], _depth: int) -> None:
-        self.hear = hear
-
-    def create_timer(self, _period: float, check: Callable[[], None]) -> None:
-        self.check = check
-
-
 @pytest.mark.parametrize("kind", ["twist", "stamped"])
 def test_node_sends_zeros_of_the_robots_type(monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
-    stamped = lambda v=0.0: Thing(header=Thing(stamp=None), twist=twist(v))  # noqa: E731
-    messages = Thing(Twist=twist, TwistStamped=stamped)
+    messages = Thing(Twist=twist, TwistStamped=lambda: Thing(header=Thing(stamp=None), twist=twist()))
     monkeypatch.setitem(sys.modules, "geometry_msgs", messages)
     monkeypatch.setitem(sys.modules, "geometry_msgs.msg", messages)
-    ros, clock = FakeNode(), ManualClock(100.0)
+    ros, clock = MagicMock(), ManualClock(100.0)
     monkeypatch.setattr(watchdog, "time", clock)
     WatchdogNode(ros, "cmd_vel", TYPES[kind], 0.5)
-    ros.hear(twist(0.1) if kind == "twist" else stamped(0.1))
+    node = ros.create_node.return_value
+    (_, _, hear, _), (_, check) = node.create_subscription.call_args.args, node.create_timer.call_args.args
+    hear(twist(0.1) if kind == "twist" else Thing(twist=twist(0.1)))
     for _ in range(50):
         clock.sleep(0.02)
-        ros.check()
-    assert 8 <= len(ros.sent) <= 11
-    assert ros.sent[0] == (twist() if kind == "twist" else Thing(header=Thing(stamp="now"), twist=twist()))
+        check()
+    sent = [call.args[0] for call in node.create_publisher.return_value.publish.call_args_list]
+    stamp = node.get_clock().now().to_msg()
+    assert 8 <= len(sent) <= 11
+    assert sent[0] == (twist() if kind == "twist" else Thing(header=Thing(stamp=stamp), twist=twist()))
 
 
 def test_type_is_the_robots_not_the_watchdogs() -> None:
-    ros = FakeNode()
-    assert type_of_robot(ros, "cmd_vel") == ""
-    names = {"cmd_vel_watchdog": "twist", "turtlebot3_node": "stamped"}
-    ros.receivers = [Thing(node_name=name, topic_type=TYPES[kind]) for name, kind in names.items()]
-    assert type_of_robot(ros, "cmd_vel") == TYPES["stamped"]
+    node = MagicMock(get_name=lambda: "cmd_vel_watchdog", get_subscriptions_info_by_topic=lambda _: found)
+    found: list[Thing] = []
+    assert type_of_robot(node, "cmd_vel") == ""
+    for name, kind in {"cmd_vel_watchdog": "twist", "turtlebot3_node": "stamped"}.items():
+        found.append(Thing(node_name=name, topic_type=TYPES[kind]))
+    assert type_of_robot(node, "cmd_vel") == TYPES["stamped"]
 
 
 # ---------------------------------------------------------------------- over ssh
@@ -122,21 +107,14 @@ SSHD = shutil.which("sshd") or "/usr/sbin/sshd"
 ROS = {
     "rclpy/__init__.py": '''"""A ROS that does nothing, for the watchdog on a robot that is not there."""
 import sys, time
-class _Node:
-    def get_name(self): return "watchdog"
-    def destroy_node(self): pass
-    def get_subscriptions_info_by_topic(self, topic):
-        return [type("Info", (), {"node_name": "turtlebot3_node", "topic_type": "geometry_msgs/msg/TwistStamped"})]
-    def create_publisher(self, *a): return type("Publisher", (), {"publish": staticmethod(lambda m: None)})
-    def create_subscription(self, *a): pass
-    create_timer = create_subscription
-    def get_logger(self): return type("Log", (), {"info": staticmethod(lambda t: print(t, sys.argv, flush=True))})
-def init(args=None, signal_handler_options=None): pass
-def create_node(name): return _Node()
-def spin_once(node, timeout_sec=0): pass
-def spin(node): time.sleep(600)
-def ok(): return False
-def shutdown(): pass
+from unittest.mock import MagicMock
+robot = MagicMock(node_name="turtlebot3_node", topic_type="geometry_msgs/msg/TwistStamped")
+log = MagicMock(info=lambda text: print(text, sys.argv, flush=True))
+node = MagicMock(get_subscriptions_info_by_topic=lambda topic: [robot], get_logger=lambda: log)
+create_node = lambda name: node
+init = spin_once = shutdown = MagicMock()
+ok = lambda: False
+spin = lambda node: time.sleep(600)
 ''',
     "rclpy/utilities.py": "def remove_ros_args(args): return args[:args.index('--ros-args')]\n",
     "rclpy/signals.py": "class SignalHandlerOptions: NO = None\n",

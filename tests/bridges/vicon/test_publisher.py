@@ -379,7 +379,7 @@ def test_short_occlusion_is_flown_through_long_one_lands(start, router, tmp_path
         stack.enter_context(camera)
         start(camera.twin.address, "--map", "CF01")
         robots = RobotProcess(router.endpoint, file, "KH01", "KH02", "CF01")
-        stack.callback(lambda: robots.process.returncode is not None or robots.end())
+        stack.callback(robots.end)
         watcher.until(lambda: watcher.phase("CF01") == "ready", "it is ready")
         assert watcher.order("CF01", messages.Order("takeoff")).ok
         watcher.until(lambda: watcher.phase("CF01") == "airborne", "it is up")

@@ -1,0 +1,157 @@
+"""What all bodies refuse: wrong rows before they open, and a device that another process drives."""
+
+import socket
+
+import pytest
+
+from agents.body.device_locks import Claims
+from agents.body.interface import BodyError
+from agents.protocols.crazyflie import device_of
+from bridges.crazyflie.body import CrazyflieBody
+from bridges.khepera4.body import KheperaBody
+from bridges.khepera4.link import KheperaAddress
+from bridges.tello.body import TelloBody
+from bridges.turtlebot3.body import TurtleBot3
+from tests.bridges import turtlebots
+from tests.requests import request
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("ZENPARK_RUNTIME_DIR", str(tmp_path / "runs"))
+
+
+BODIES = {"crazyflie": CrazyflieBody, "khepera4": KheperaBody, "tello": TelloBody, "turtlebot3": TurtleBot3}
+RADIO, KHEPERA, TELLO, ROS = "radio://0/80/2M/E7E7E7E701", "khepera4://h", "tello://10.0.0.2", "ros2dds://"
+NO_CRAZYFLIE = r"R0: .* is no Crazyflie's address; write radio://0/80/2M/E7E7E7E701"
+NO_TELLO = r"^R0: .*tello://192\.168\.10\.1"
+
+
+@pytest.mark.parametrize(
+    ("kind", "address", "said"),
+    [
+        ("crazyflie", "radio://0/80/3M/E7", NO_CRAZYFLIE),
+        ("crazyflie", "radio://0/130/2M", NO_CRAZYFLIE),
+        ("crazyflie", "udp://127.0.0.1", NO_CRAZYFLIE),
+        ("crazyflie", "usb://", NO_CRAZYFLIE),
+        ("crazyflie", "http://somewhere", NO_CRAZYFLIE),
+        ("crazyflie", "", NO_CRAZYFLIE),
+        ("khepera4", "khepera4", "^R0: khepera4: "),
+        ("khepera4", "khepera4://", "^R0: khepera4://: "),
+        ("khepera4", "kteam://10.0.0.3", r"^R0: kteam://10\.0\.0\.3: "),
+        ("khepera4", "khepera4://h:port", "^R0: khepera4://h:port: "),
+        ("khepera4", "kteam:", "^R0: kteam:: "),
+        ("khepera4", "khepera4://h?server=2024", r"^R0: khepera4://h\?server=2024: "),
+        ("khepera4", "khepera4://h?year=2023", r"^R0: khepera4://h\?year=2023: "),
+        ("tello", "tello://kitchen", NO_TELLO),
+        ("tello", "tello://1.2.3", NO_TELLO),
+        ("tello", "tello://1.2.3.256", NO_TELLO),
+        ("tello", "tello://1.2.3.4:x", NO_TELLO),
+        ("turtlebot3", "ros2dds://tb3-0", "R0: 'tb3-0' is no ROS namespace"),
+        ("turtlebot3", "rmw://tb3_0?domain=500", "domain '500' is no number from 0 to 232"),
+        ("turtlebot3", "rmw://tb3_0?distro=foxy", "distro 'foxy' is not known"),
+        ("turtlebot3", "rmw://tb3_0?colour=red", "'colour' is no part"),
+        ("turtlebot3", "radio://0", "is no TurtleBot3: write it like ros2dds://tb3_0"),
+    ],
+)
+def test_wrong_addresses_are_named(kind, address, said):
+    with pytest.raises(BodyError, match=said):
+        BODIES[kind](request(kind, [address], external=kind == "tello"))
+
+
+@pytest.mark.parametrize(
+    ("kind", "address", "device", "said"),
+    [
+        ("crazyflie", RADIO, {"contrl": "position"}, "contrl"),
+        ("crazyflie", RADIO, {"platform": "plane"}, "platform"),
+        ("crazyflie", RADIO, {"log_hz": 500.0}, "log_hz"),
+        ("crazyflie", RADIO, {"positioning": {"system": "gps"}}, "positioning"),
+        ("khepera4", KHEPERA, {"poll_hz": 100.0}, "poll_hz must be 2 to 30"),
+        ("khepera4", KHEPERA, {"servre": "fork"}, "`servre`; its fields are server, poll_hz"),
+        (
+            "khepera4",
+            KHEPERA,
+            {"server": "2023-04-10", "ranges": True},
+            "ranges: the server of 2023-04-10 has no range",
+        ),
+        ("khepera4", KHEPERA, {"server": "fork", "poll_hz": 10}, "poll_hz must be 22 to 30 with server = 'fork'"),
+        ("tello", TELLO, {"rc_hz": 500.0}, "rc_hz"),
+        ("tello", TELLO, {"rc_hz": True}, "rc_hz"),
+        ("tello", TELLO, {"low_battery": 20}, "low_battery"),
+        ("tello", TELLO, {"low_battery": "half"}, "low_battery"),
+        ("tello", TELLO, {"colour": "red"}, "colour"),
+        ("tello", TELLO, {"silence_s": 0.01}, "silence_s must be 0.3 to 10 s"),
+        ("turtlebot3", ROS, {"speed": 1.0}, "Object contains unknown field `speed`"),
+        ("turtlebot3", ROS, {"domain": -1}, r"`int` >= 0 - at `\$.domain`"),
+        ("turtlebot3", ROS, {"distro": "foxy"}, r"at `\$.distro`"),
+    ],
+)
+def test_wrong_settings_are_named(kind, address, device, said):
+    with pytest.raises(BodyError, match=rf"^R0: device: .*{said}"):
+        BODIES[kind](request(kind, [address], device=device, external=kind == "tello"))
+
+
+@pytest.mark.parametrize(
+    ("body", "kind", "addresses", "options", "said"),
+    [
+        (CrazyflieBody, "tello", [RADIO], {}, "R0 is a tello"),
+        (CrazyflieBody, "crazyflie", [RADIO] * 2, {}, "several robots have the address"),
+        (CrazyflieBody, "crazyflie", [RADIO], {"device": {"positioning": {"system": "external"}}}, "needs position = "),
+        (TurtleBot3, "khepera4", [ROS], {}, "R0 is a khepera4"),
+        (TelloBody, "tello", ["tello"], {}, 'a Tello does not measure its position: write position = "external"'),
+        (TelloBody, "tello", [TELLO, f"{TELLO}:1"], {"external": True}, "R1: another Tello .* has the address 10"),
+    ],
+)
+def test_rows_that_cannot_be_driven(body, kind, addresses, options, said):
+    with pytest.raises(BodyError, match=said):
+        body(request(kind, addresses, **options))
+
+
+def crazyflie(port):
+    return CrazyflieBody(request("crazyflie", [f"udp://127.0.0.1:{port}"])), device_of(f"udp://localhost:{port}")
+
+
+def khepera(port):
+    device = KheperaAddress.parse("R0", f"kteam://localhost:{port}").device
+    return KheperaBody(request("khepera4", [f"khepera4://127.0.0.1:{port}"])), device
+
+
+def tello(port):
+    return TelloBody(request("tello", [f"tello://127.0.0.1:{port}"], external=True)), "tello://127.0.0.1"
+
+
+def turtlebot(port):
+    endpoint = f"tcp/127.0.0.1:{port}"
+    return TurtleBot3(turtlebots.request(endpoint, "ros2dds://tb3_0?distro=humble")), f"ros2dds://tb3_0 by {endpoint}"
+
+
+@pytest.mark.parametrize("opened", [crazyflie, khepera, tello, turtlebot])
+def test_driven_device_gets_nothing_from_a_second_process(opened):
+    with socket.socket(type=socket.SOCK_DGRAM) as packets, socket.socket() as connections:
+        packets.bind(("127.0.0.1", 0))
+        port = packets.getsockname()[1]
+        connections.bind(("127.0.0.1", port))
+        connections.listen()
+        packets.setblocking(False)
+        connections.setblocking(False)
+        body, device = opened(port)
+        first = Claims(["CF07"], [device])
+        first.take()
+        with pytest.raises(BodyError, match="is in use: this process drives it for CF07; end that first"):
+            body.open()
+        body.close()
+        with pytest.raises(BlockingIOError):
+            packets.recv(1)
+        with pytest.raises(BlockingIOError):
+            connections.accept()
+        first.release()
+
+
+@pytest.mark.slow
+def test_unopened_body_leaves_its_device_to_others():
+    with socket.socket() as nobody:
+        nobody.bind(("127.0.0.1", 0))
+        body, device = khepera(nobody.getsockname()[1])  # refuses connections: it does not listen
+        with pytest.raises(BodyError, match="no Khepera answers"):
+            body.open()
+        Claims(["CF07"], [device]).take()
