@@ -123,15 +123,16 @@ def test_schema_takes_what_the_parser_takes(old, new, taken, tmp_path):
     assert jsonschema.Draft7Validator(json_schema.schema()).is_valid(tomllib.loads(text)) == taken
 
 
-def test_unlimited_numbers_have_no_default_in_the_schema():
-    def numbers(node):
-        if isinstance(node, dict):
-            yield from [node] if node.get("type") == "number" else []
-            node = list(node.values())
-        for each in node if isinstance(node, list) else ():
-            yield from numbers(each)
+def nodes(node, path=""):
+    """Every table of the schema with its path."""
+    if isinstance(node, dict):
+        yield path, node
+    for key, each in node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ():
+        yield from nodes(each, f"{path}.{key}")
 
-    found = list(numbers(json_schema.schema()))
+
+def test_unlimited_numbers_have_no_default_in_the_schema():
+    found = [node for _, node in nodes(json_schema.schema()) if node.get("type") == "number"]
     assert len(found) > 100
     assert not [each for each in found if each.get("default", 0.0) is None]
 
@@ -147,18 +148,12 @@ def test_schema_describes_every_field_of_zenpark(monkeypatch, foreign):
     installed = registry.registered
     more = {registry.LAWS: {entry.name: [entry] for entry in foreign}}
     monkeypatch.setattr(registry, "registered", lambda group: installed(group) | more.get(group, {}))
-    own = {entry.name for entry in metadata.distribution("zenpark").entry_points}
-
-    def undescribed(node, path):
-        if isinstance(node, dict):
-            fields = node.get("properties", {})
-            if fields.get("kind", {}).get("const", "") not in {"", *own}:
-                return  # parameters of a user's plug-in
-            yield from (f"{path}.{name}" for name, each in fields.items() if not {"description", "const"} & set(each))
-            for key, each in node.items():
-                yield from undescribed(each, f"{path}.{key}")
-        elif isinstance(node, list):
-            for number, each in enumerate(node):
-                yield from undescribed(each, f"{path}[{number}]")
-
-    assert list(undescribed(json_schema.described(), "")) == []
+    own = {"", *(entry.name for entry in metadata.distribution("zenpark").entry_points)}  # of others: their parameters
+    tables = ((path, node.get("properties", {})) for path, node in nodes(json_schema.described()))
+    fields = {
+        f"{path}.{name}": field
+        for path, table in tables
+        if isinstance(table, dict) and table.get("kind", {}).get("const", "") in own
+        for name, field in table.items()
+    }
+    assert [name for name, field in fields.items() if not {"description", "const"} & set(field)] == []

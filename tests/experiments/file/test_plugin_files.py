@@ -224,7 +224,6 @@ import numpy as np
 
 from zenpark import Metric
 
-
 class Spread(Metric, frozen=True):
     label = "Spread"
     unit = "m"
@@ -233,14 +232,12 @@ class Spread(Metric, frozen=True):
     def of(self, trace, shared):
         return np.ptp(trace.true_position[-1], axis=0).max()
 
-
 class Last(Metric, frozen=True):
     label = "x in the end"
     unit = "m"
 
     def of(self, trace, shared):
         return trace.true_position[-1, :, 0]
-
 
 class Broken(Metric, frozen=True):
     unit = "m"
@@ -309,13 +306,11 @@ from math import nan
 
 from zenpark import Avoidance, Planner, Predictor, Trigger, distance
 
-
 class Every(Trigger, frozen=True):
     metres: float = 0.1
 
     def fires(self, view):
         return distance(view.position, view.last.position) > self.metres
-
 
 class Still(Predictor, frozen=True):
     def position(self, pose, age):
@@ -324,14 +319,12 @@ class Still(Predictor, frozen=True):
     def velocity(self, pose, age):
         return 0.0, 0.0, 0.0
 
-
 class Aside(Planner, frozen=True):
     def target(self, elapsed, anchor, heading):
         return anchor[0], anchor[1] + 0.05 * elapsed, anchor[2], nan
 
     def speed(self):
         return 0.05
-
 
 class Bold(Avoidance, frozen=True):
     def deviate(self, goal, own, near, period):
