@@ -88,6 +88,7 @@ def test_surroundings_are_judged(text, severity, code, message, remedy):
     found = findings(loads(HEAD + text))[code]
     assert found.severity == severity
     assert message in found.message
+    assert not found.message.startswith("in case")  # there is one alone
     assert remedy in found.remedy
 
 
