@@ -40,10 +40,12 @@ class KheperaBody(Body):
 
     def open(self) -> None:
         """See `Body.open`. Robots without answer are retried while the others drive."""
+        places = zip(self._names, self._addresses, self._settings, self._start, strict=True)
+        links = [Khepera4Link(*place, self._first_answer_s) for place in places]  # raises before a claim is taken
         self._claims.take()
-        for place in zip(self._names, self._addresses, self._settings, self._start, strict=True):
-            self._links.append(Khepera4Link(*place, self._first_answer_s))
-            self._links[-1].start()
+        self._links = links
+        for link in links:
+            link.start()
         deadline, pause = uptime() + self._open_s, threading.Event()
         while uptime() < deadline and any(
             link.odometry.stamp == -math.inf and not link.refused for link in self._links
