@@ -166,7 +166,7 @@ def test_no_module_is_a_mere_part_of_another():
     for name, others in imports().items():
         for other in others:
             importers[other].add(name)
-    entries = started() | plugged_in() | commands()
+    entries = entry_modules() | plugged_in() | commands()
     small = [
         f"{name} belongs into {next(iter(users))}"
         for name, users in importers.items()
@@ -176,7 +176,7 @@ def test_no_module_is_a_mere_part_of_another():
     assert not small
 
 
-def started() -> set[str]:
+def entry_modules() -> set[str]:
     """Modules that run as processes: what `python -m` can start."""
     return {name for name, file in modules().items() if 'if __name__ == "__main__":' in file.read_text("utf-8")}
 

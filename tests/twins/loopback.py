@@ -5,7 +5,6 @@ import threading
 import time
 from dataclasses import replace
 
-from tests.requests import request  # noqa: F401
 from twins.devices.device import DeviceRequest, Faults
 
 

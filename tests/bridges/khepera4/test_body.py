@@ -424,7 +424,7 @@ DRIVING = """
 import sys, time
 from bridges.khepera4.body import KheperaBody
 from tests.bridges.driver import Driver, constant
-from tests.twins.loopback import request
+from tests.requests import request
 
 body = KheperaBody(request("khepera4", [sys.argv[1]]))
 body.open()
