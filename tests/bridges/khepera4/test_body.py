@@ -423,14 +423,20 @@ def test_wheels_with_link_broken_at_end_are_stopped():
 DRIVING = """
 import sys, time
 from bridges.khepera4.body import KheperaBody
-from tests.bridges.driver import Driver, constant
+from tests.bridges.driver import Driver
 from tests.requests import request
+
+change = float(sys.argv[2])
+
+
+def decide(states):
+    return [(0.10 if time.monotonic() < change else 0.05, 0.0, 0.0, 0.0)]
+
 
 body = KheperaBody(request("khepera4", [sys.argv[1]]))
 body.open()
-driver, change = Driver(body, fast=5.0), float(sys.argv[2])
+driver = Driver(body, decide, fast=5.0)
 while True:
-    driver.decide = constant(0.10 if time.monotonic() < change else 0.05)
     driver.tick()
 """
 

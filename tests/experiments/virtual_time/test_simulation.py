@@ -108,6 +108,21 @@ def test_one_robot_alone():
     np.testing.assert_allclose(path[-1, :2], [0.2, -0.1], atol=0.1)
 
 
+@pytest.mark.slow
+def test_three_robots_find_their_triangle():
+    robots = {
+        "A": RobotTable(kind="khepera4", start=[-0.6, -0.5]),
+        "B": RobotTable(kind="khepera4", start=[0.6, -0.5]),
+        "F": RobotTable(kind="crazyflie", start=[0.1, 0.6], hover=0.6),
+    }
+    links = {"A - B": 0.6, "A - F": 0.8, "B - F": 0.8}
+    run = fly(small(robots, links, duration_s=25.0, disturbance={"all": Disturbance(position_sigma=0.0003)}))
+    a, b, f = run.log.true_position[np.flatnonzero(run.log.time <= 25.0)[-1]]
+    lengths = [np.linalg.norm(one - other) for one, other in ((a, b), (a, f), (b, f))]
+    assert lengths == pytest.approx([0.6, 0.8, 0.8], abs=0.012)
+    assert not run.log.interventions.any()
+
+
 def test_the_reference_formation_is_acquired():
     log = fly(changed(reference(), duration_s=18.0, timeline=[])).log
     links_each = np.array([0, 4, 3, 4, 4, 4, 2])
