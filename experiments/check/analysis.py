@@ -324,10 +324,12 @@ def _shapes(  # noqa: PLR0917 - one caller
     plan: Plan, wanted: Links, there: Mask, prediction: Prediction, aloft: Array, silent: Index
 ) -> list[Shape]:
     """Shapes from the ends, the starts, the scaled distances and random places as guesses, until one is exact."""
-    experiment, end = plan.experiment, prediction.position[-1]
+    experiment, end = plan.experiment, prediction.position[-1].copy()
     rows, links = len(aloft), wanted.take(there)
     moves = np.ones(rows, dtype=bool)
     moves[silent] = False
+    landed = moves & (end[:, 2] < aloft[:, 2] / 2)  # before the end: on the floor it has no place in the shape
+    end[landed, 2] = aloft[landed, 2]
     rng = np.random.default_rng(experiment.seed)
 
     def guesses() -> Iterator[Array]:

@@ -381,3 +381,10 @@ def test_payload_of_the_variables_of_a_law():
     assert average.words_bytes == len(',"shared":[]') + sum(map(len, words)) + len(",,")
     periodic = figures(document.read("average").cases()["periodic"])
     assert periodic.pose_kbit_s == pytest.approx(0.008 * average.pose_bytes * 10.0)
+
+
+@pytest.mark.slow
+def test_landed_drone_keeps_its_height_in_the_shape():
+    found = {each.code for each in check(document.read("triangle", ["safety.battery_low=0.985", "duration_s=8"]))}
+    assert "stable" in found
+    assert "unstable" not in found
