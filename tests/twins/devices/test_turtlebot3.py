@@ -10,7 +10,7 @@ import zenoh
 from rosbags.typesys import Stores, get_typestore
 from zenoh.handlers import RingChannel
 
-from agents.body.interface import Disturbance
+from agents.body.interface import BodyError, Disturbance
 from agents.network.session import open_session
 from tests.bridges.turtlebots import request
 from twins.devices.device import DeviceRequest, Faults
@@ -281,6 +281,12 @@ def test_an_empty_battery(listen):
     charges = [battery.percentage for battery, _ in listener.inbox["battery_state"]]
     assert np.diff(charges) == pytest.approx([-10.0] * (len(charges) - 1), abs=0.2)
     assert listener.after(6.0, "battery_state").percentage == 0.0
+
+
+@pytest.mark.system
+def test_wrong_settings_are_named(hub):
+    with pytest.raises(BodyError, match=r"TB0: device: .*`colour`"):
+        TurtleBot3Twin(DeviceRequest(request(hub.endpoint, device={"colour": 1}), Faults()))
 
 
 @pytest.mark.system

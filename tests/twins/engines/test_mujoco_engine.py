@@ -27,9 +27,9 @@ from twins.engines.mujoco_engine import LIFT, RigidBody
 DT = 0.01
 
 
-def hovering(kind=CRAZYFLIE, height=1.0, dt=DT, scene=None):
+def hovering(kind=CRAZYFLIE, height=1.0, dt=DT, lag=0.03, scene=None):
     """One drone that holds its place."""
-    made = RigidBody().build(stage((kind,), [(0, 0)], scene=scene, dt=dt))
+    made = RigidBody(motor_lag_s=lag).build(stage((kind,), [(0, 0)], scene=scene, dt=dt))
     made.place([0], [(0.0, 0.0, height)], [0.0], [True])
     fly(made, [[0.0, 0.0, height, 0.0]] if kind is CRAZYFLIE else [[0.0] * 4], 0.5, dt)
     return made
@@ -126,6 +126,12 @@ def test_steps_beside_the_fitted_law(axis, step, rise, overshoot):
     assert mine[0] == pytest.approx(rise, rel=0.02)
     assert mine[1] == pytest.approx(overshoot, abs=0.01)
     assert path[-1] == pytest.approx(step, abs=0.06 * step)  # the vertical integrals need some ten seconds
+
+
+@pytest.mark.slow
+def test_lag_of_motors_hardly_shows():
+    quick, slow = (fly(hovering(lag=lag), [[0.5, 0.2, 1.0, 0.5]], 4.0)[:, 0, :2] for lag in (0.02, 0.06))
+    assert np.abs(quick - slow).max() < 0.01
 
 
 def test_tilt_and_speed_stay_within_the_limits():
