@@ -1,4 +1,4 @@
-"""What tests that start processes share: a real router, patience, and the proof that nothing is left."""
+"""Fixtures of tests that start processes: a real router, patience, and the proof that nothing is left."""
 
 from __future__ import annotations
 

@@ -124,7 +124,7 @@ class Attentive:
 
 
 class Session:
-    """What is used of a session itself."""
+    """Session, in the parts that zenpark uses."""
 
     def __init__(self, net: Net) -> None:
         self._net = net

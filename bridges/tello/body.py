@@ -148,7 +148,7 @@ class TelloBody(Body):
             self.step(library)
 
     def step(self, library: TelloLibrary) -> None:
-        """One round of the thread: receive datagrams, and let each pilot act."""
+        """Round of the thread: receive datagrams, and let each pilot act."""
         with self._lock:
             with contextlib.suppress(Exception):  # no datagram may end the thread
                 library.receive()

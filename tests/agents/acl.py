@@ -1,4 +1,4 @@
-"""What a Zenoh router makes of an `access_control`, as a model: enough of it to ask who may do what."""
+"""Model of a Zenoh router's `access_control`: enough to ask for the rights of an identity."""
 
 from __future__ import annotations
 

@@ -178,7 +178,7 @@ def test_jumped_wheels_lead_nobody_astray():
 
 
 def test_refused_external_positions():
-    """What is measured from outside and jumps does not reach the robot; it does once it lasts on the floor."""
+    """An external position that jumps does not reach the robot, except once it lasts on the floor."""
     swarm = drone().running().run(0.5)
     robot = swarm.robot("F")
     x, y, z = swarm.last("F", "position")

@@ -79,7 +79,7 @@ def truth(twin, row=0):
 
 
 def supervised(twin, row=0):
-    """What its supervisor is at."""
+    """State of the supervisor."""
     return SupervisorState(twin.device.flock.supervisor.state[row])
 
 

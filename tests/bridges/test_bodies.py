@@ -1,4 +1,4 @@
-"""What all bodies refuse: wrong rows before they open, and a device that another process drives."""
+"""Refusals of all bodies: wrong rows before they open, and a device that another process drives."""
 
 import socket
 

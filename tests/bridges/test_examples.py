@@ -49,7 +49,7 @@ class Session:
 
 @pytest.fixture
 def modules(monkeypatch):
-    """What the examples import."""
+    """Modules that the examples import."""
     made = {"zenoh": MagicMock()}
     for example in (webots_controller, gazebo_bridge):
         monkeypatch.setattr(example.importlib, "import_module", made.__getitem__)

@@ -106,7 +106,7 @@ def test_hanging_simulator_lands_its_robots_and_others_stay(
 
 @pytest.mark.system
 def test_dead_robot_process_is_landed_by_simulator(router: RouterProcess, watcher: Watcher, tmp_path: Path) -> None:
-    """What `docs/external-simulators.md` asks of a simulator, kept by ours."""
+    """Requirements of `docs/external-simulators.md`, kept by our simulator."""
     file = tmp_path / "alone.toml"
     file.write_text(
         'title = "alone"\nduration_s = 30.0\n[arena]\nsize = [2.0, 2.0, 2.0]\n'

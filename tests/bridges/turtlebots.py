@@ -84,7 +84,7 @@ class Stage(Driver):
         return super().run(seconds)
 
     def note(self, seconds, *setpoint):
-        """What the first robot notes after some seconds."""
+        """Note of the first robot after some seconds."""
         return self.run(seconds, *setpoint).note[0]
 
     def moved(self, seconds, *setpoint):

@@ -1,4 +1,4 @@
-"""What README and docs refer to exists: modules, names in them, files, and links between pages."""
+"""References of README and docs exist: modules, names in them, files, and links between pages."""
 
 from __future__ import annotations
 

@@ -92,7 +92,7 @@ def test_goals_are_delayed_by_network_and_decision_grid():
 
 
 def test_deciding_robots_are_unaffected_by_guided_ones():
-    """Who is guided moves as before where it hears at once; what it says is heard as ever."""
+    """Without delay a guided robot moves as before, and its poses are received as before."""
     park = short(PERIODIC, duration_s=3.0, timeline=[])
     first, second = fly(with_delay(park, 0.0)), fly(with_delay(park, 0.0, HYBRID))
     np.testing.assert_array_equal(first.log.sent.link, second.log.sent.link)

@@ -23,7 +23,7 @@ PLACES = {name: place for module in MODULES for name, place in module.PLACES.ite
 
 @dataclass
 class Tally:
-    """What came of the inputs of a target.
+    """Results of the inputs of a target.
 
     Attributes:
         inputs: Number of inputs tried.
@@ -42,19 +42,19 @@ class Tally:
     taken: float = 0.0
 
     def keep(self, way: str, data: bytes, text: str) -> None:
-        """One more failure."""
+        """Add a failure."""
         self.escaped[way] += 1
         self.kept.setdefault(way, (data, text))
 
     def add(self, other: Tally) -> None:
-        """What came of further inputs."""
+        """Add the results of further inputs."""
         self.inputs, self.refused = self.inputs + other.inputs, self.refused + other.refused
         self.escaped, self.kept = self.escaped + other.escaped, other.kept | self.kept
         self.slowest, self.taken = max(self.slowest, other.slowest), self.taken + other.taken
 
 
 def drive(target: Target, inputs: int, seed: object, *, slot: mmap.mmap | None = None, bombs: bool = False) -> Tally:
-    """What comes of spoilt inputs.
+    """Results of spoilt inputs.
 
     Args:
         target: To be driven.
@@ -106,7 +106,7 @@ def save(folder: Path, name: str, data: bytes, text: str) -> Path:
 
 
 def replay(place: Place, data: bytes) -> str:
-    """What becomes of one input: "read", or why it is refused; raises what escapes."""
+    """Result of one input: "read", or the reason of the refusal; raises any other error."""
     with place.open() as target:
         try:
             target.take(data)

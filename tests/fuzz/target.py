@@ -1,4 +1,4 @@
-"""What a target is: a place where bytes from outside are read, made ready; and sockets for those that need one."""
+"""Targets: places where bytes from outside are read, made ready, with sockets for those that need one."""
 
 from __future__ import annotations
 

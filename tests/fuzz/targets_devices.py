@@ -136,7 +136,7 @@ def _vicon_stream() -> list[bytes]:
 
 
 def vicon_bridge() -> Iterator[Target]:
-    """What a DataStream server sends, in chunks."""
+    """Output of a DataStream server, in chunks."""
 
     def make() -> Inputs:
         decoder, pose_filter = Decoder(), PoseFilter({"CF01": "cf1", "KH01": "kh1"}, lambda _: None)
@@ -157,7 +157,7 @@ def vicon_bridge() -> Iterator[Target]:
 
 
 def vicon_twin() -> Iterator[Target]:
-    """What a client sends to the server."""
+    """Requests of a client to the server."""
     ask = vicon_datastream.packet(vicon_datastream.block(BlockKind.REQUEST_FRAME, b"\1"))
     one = vicon_datastream.packet(vicon_datastream.block(BlockKind.REQUEST_NEXT_FRAME))
     vicon = ViconTwin(["cf1", "kh1"])

@@ -131,7 +131,7 @@ def tello_twin() -> Iterator[Target]:
 
 
 class Drone:
-    """What djitellopy shows of a drone, parsed by djitellopy itself."""
+    """State of a drone, parsed by djitellopy itself."""
 
     def __init__(self) -> None:
         self.state: dict[str, Any] = {}

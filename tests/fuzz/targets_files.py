@@ -65,7 +65,7 @@ def place_for(name: str) -> Iterator[Path]:
 
 
 def refusing_well(take: Callable[[bytes], None]) -> Callable[[bytes], None]:
-    """What is refused is said, and can be printed."""
+    """A refusal has a text that can be printed."""
 
     def checked(data: bytes) -> None:
         try:
@@ -125,7 +125,7 @@ def arena() -> Iterator[Target]:
 
 
 def overrides() -> Iterator[Target]:
-    """What stands behind `--set`, one a line."""
+    """Arguments of `--set`, one a line."""
     flags = [
         "robots.KH01.start=[0.1, 0.2]", "formation.gain=2.5", "trigger.threshold=0.02", "trigger.kind=mixed",
         "cases.event.trigger=periodic", "timeline.0.at_s=3", 'formation.links."KH01 - KH02"=0.5', "seed=7",

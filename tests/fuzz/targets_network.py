@@ -223,7 +223,7 @@ def vicon_truths() -> Iterator[Target]:
 
 
 def answers() -> Iterator[Target]:
-    """Whoever gives orders reads the answers; whoever looks at the network the admin space."""
+    """Answers to orders, and the admin space that network tools read."""
     examples = []
     for message in (wire.Reply("KH01", True, "ready", "", 0.1), wire.WorldReply(True, False, 1.0, "")):
         examples += sent("park/KH01/order", message)

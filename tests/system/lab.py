@@ -285,7 +285,7 @@ class Flight:
         assert re.search(pattern, self.said()), f"{pattern!r} not said, but:\n{self.said()}\n{self.logs()}"
 
     def logs(self) -> str:
-        """What its processes said."""
+        """Output of the processes."""
         files = sorted((self.folder / "logs").glob("*.log"))
         return "\n".join(f"{file.name}: {file.read_text()[-500:]}" for file in files)
 

@@ -195,7 +195,7 @@ def speeds(*values):
 
 
 def differences(body, duration, speed=0.5):
-    """What the twin is ahead, at each tick."""
+    """Lead of the twin at each tick."""
     ahead = []
     for k in range(round(duration / DT) + 1):
         states = body.read(k * DT)

@@ -132,7 +132,7 @@ def test_drone_is_in_the_way_below_too(height, speed, stamp, reach):
 
 @pytest.mark.parametrize(("height", "before", "after"), [(0.0, 0, 1), (0.9, 1, 1), (1.3, 0, 0)])
 def test_lost_drone_may_have_come_down(height, before, after):
-    """It hovered at 1 m and fell silent: from then on it may be anywhere from there to the floor."""
+    """A drone that hovered at 1 m and fell silent may be anywhere from there to the floor."""
     sight = Sight(TURTLEBOT3 if height == 0.0 else CRAZYFLIE, CRAZYFLIE).hear((0.1, 0.0, 1.0), stamp=7.0)
     sight.neighbours.mark_lost(0, 8.5)  # a second of silence is borne
     assert len(sight.sense(9.0, (0.0, 0.0, height))) == before

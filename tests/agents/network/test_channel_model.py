@@ -67,7 +67,7 @@ def test_first_numbers_of_splitmix64():
 
 
 def test_keys_differ_by_seed_names_and_order():
-    """Whoever changes a key loses other samples than runs did before."""
+    """Another key loses other samples than earlier runs did."""
     made = [key(1, "A", "B"), key(2, "A", "B"), key(1, "B", "A"), key(1, "AB"), key(1, "A", "B", ""), key(11, "B")]
     assert made[0] == 0x2E2988F8CB8FE3C8
     assert len(set(made)) == len(made)

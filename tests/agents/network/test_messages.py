@@ -1,4 +1,4 @@
-"""What goes out comes back in both encodings, and whatever else comes in is `Malformed`, never anything worse."""
+"""Messages come back in both encodings; any other payload is `Malformed`, never anything worse."""
 
 import math
 from contextlib import suppress

@@ -137,7 +137,7 @@ def claiming(began: float) -> Callable[[Session], object]:
 
 
 def waking(tokens: list[str]) -> Callable[[Session], object]:
-    """What an owner does that was cut off: Zenoh declares its tokens anew, one by one, and then it asks."""
+    """Owner that was cut off: Zenoh declares its tokens again, one by one, and then the owner asks."""
 
     def work(session: Session) -> object:
         for token in tokens:

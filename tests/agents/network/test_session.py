@@ -224,7 +224,7 @@ class Question:
 
 
 class Asked:
-    """What `RouterWatch` needs of a session: who is linked, and questions that are answered by hand."""
+    """Session for `RouterWatch`: its links, and queries that are answered by hand."""
 
     def __init__(self) -> None:
         self.routers, self.peers, self.questions = ["router"], [], []
@@ -239,7 +239,7 @@ class Asked:
 
 
 def looks(watch: RouterWatch, begin: float, end: float) -> float:
-    """What a watch says at last that is looked at 50 times a second."""
+    """Last answer of a watch that is asked 50 times a second."""
     ticks = range(round(begin * 50), round(end * 50) + 1)
     return [watch.silent_since(tick / 50) for tick in ticks][-1]
 

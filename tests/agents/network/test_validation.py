@@ -1,4 +1,4 @@
-"""What no robot, clock or sensor can have is refused, and says why."""
+"""Values that no robot, clock or sensor can have are refused with a reason."""
 
 from functools import partial
 from math import inf, nan

@@ -176,7 +176,7 @@ def least_violation(planes):
 
 
 def holds(found, planes, speed):
-    """What is promised of a velocity for half-planes and a limit of speed."""
+    """Promises about a velocity for half-planes and a limit of speed."""
     assert hypot(*found) <= speed * (1.0 + 1e-12)
     standing = [plane for plane in planes if plane[1] >= 0.0]
     assert not standing or violation(found, standing) <= ROUNDING

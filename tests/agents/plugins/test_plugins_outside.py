@@ -45,7 +45,7 @@ def source_of(name):
 
 
 def made_in_guide(name):
-    """What the guide defines by this name."""
+    """Object that the guide defines by this name."""
     names = {"__name__": "guide"}
     exec(source_of(name), names)
     return names[name]

@@ -45,7 +45,7 @@ class Plain(Law):
 
 
 class Distributed:
-    """What a distribution is asked for."""
+    """Distribution with the parts that the registry reads."""
 
     def __init__(self, name):
         self.name = name

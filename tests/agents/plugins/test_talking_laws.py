@@ -70,7 +70,7 @@ def law_findings(name, *changes):
 
 
 def one_way(name, link):
-    """What a law says of such an experiment if this link goes one way."""
+    """Findings of a law about the experiment if this link goes one way."""
     text = index.find_file(name).read_text("utf-8").replace(link, link.replace(" - ", " > "))
     plan = document.loads(text).cases()["periodic"]
     ((severity, message, remedy),) = plan.law.analyse(plan)

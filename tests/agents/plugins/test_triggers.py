@@ -151,7 +151,7 @@ TICKS = 150
 
 @dataclass
 class Question:
-    """What is known at one question; `then` is the moment of the last event."""
+    """Knowledge at one question; `then` is the moment of the last event."""
 
     t: float
     t_k: float

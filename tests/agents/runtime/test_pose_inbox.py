@@ -24,7 +24,7 @@ ALIVE = KEYS.alive("B")
 
 
 class Sample(network.Sample):
-    """What Zenoh hands out: of a token, or of a pose from a session."""
+    """Sample as Zenoh gives it: of a token, or of a pose from a session."""
 
     def __init__(self, key: str, payload: bytes = b"", *, gone: bool = False, session: str | None = None) -> None:
         super().__init__(key, messages.JSON, payload, gone=gone)
@@ -108,7 +108,7 @@ class Receiver:
 
     @property
     def hazards(self) -> list[str]:
-        """What the checks of safety find in its neighbours."""
+        """Findings of the safety checks about the neighbours."""
         neighbours, found = self.robot.neighbours, []
         if neighbours.lagging:
             found.append(f"behind by {self.neighbour.behind:.1f} s")

@@ -169,7 +169,7 @@ def landed_otherwise(bench, drone):
 
 @pytest.mark.parametrize(("event", "sinks_at"), [(fallen, inf), (landed_otherwise, inf), (blind, DT)])
 def test_way_aside_ends(event, sinks_at):
-    """It sinks by itself if it only lost its pose; else something has told the body."""
+    """A robot that only lost its pose sinks by itself; otherwise an order has reached the body."""
     bench, drone = above()
     bench.step()
     assert drone.landing.aside

@@ -156,7 +156,7 @@ def test_loco():
 
 
 def test_external_position():
-    """It does not fly before it was told where it is, and knows it; then it flies the estimate that comes of that."""
+    """A drone takes off only when its estimator has taken over an external position; then it flies that estimate."""
     device = {"positioning": {"system": "external", "position_sigma": 0.02}}
     with flown(device=device, external=True, start=[[0.5, 0.2, 0.0]]) as (twin, process):
         process.run(0.2)
@@ -177,7 +177,7 @@ def test_external_position():
 
 @pytest.mark.parametrize(("order", "after_s"), [("stop", 0.3), ("land", 0.1), ("close", 0.0)])
 def test_order_during_arming(order, after_s):
-    """It replaces the take-off: the motors stay off, and nothing stays armed; then it arms and flies."""
+    """The order replaces the take-off: motors stay off and disarmed; afterwards the drone arms and flies."""
     with flown(device=BRUSHLESS) as (twin, process):
         process.tick()
         assert supervised(twin) == SupervisorState.DISARMED

@@ -1,4 +1,4 @@
-"""What goes wrong between a Crazyflie bridge and its robot: the robot ends on the ground, the others go on."""
+"""Faults between a Crazyflie bridge and its robot: the robot ends on the ground, the others go on."""
 
 import os
 import signal
@@ -210,7 +210,7 @@ def test_nothing_plugged_in(address, said):
 
 @pytest.mark.parametrize("version", ["0.1.31", "0.1.20.1", "0.0.9"])
 def test_library_is_too_old(monkeypatch, version):
-    """It flies a drone, and cannot stop it."""
+    """Process that flies a drone and cannot stop it."""
     monkeypatch.setattr(link, "version", lambda _: version)
     with pytest.raises(BodyError, match=rf"cflib {version} is too old, Crazyflies need 0\.1\.32: pip install"):
         connected([RADIO])

@@ -168,7 +168,7 @@ def test_armed_is_not_yet_able_to_fly(monkeypatch):
 
 @pytest.mark.parametrize("order", ["stop", "land"])
 def test_order_while_arming_disarms(monkeypatch, order):
-    """It is repeated until the status confirms it."""
+    """The order is repeated until the status confirms it."""
     air = Air(monkeypatch).stand(info=Info(0))
 
     def replaced(seconds):

@@ -167,7 +167,7 @@ def test_gap_in_the_climb(fleet, hover, gap, begin, speed):
 
 @pytest.mark.parametrize("stays_s", [0.0, nightly(2.0), 5.0])
 def test_flight_by_another_client_is_landed(fleet, stays_s):
-    """It leaves at once, or when it has ended the landing again and again."""
+    """The process leaves at once, or after it has ended the landing repeatedly."""
     client = Client(fleet, 0.8)
     while fleet.phases != {FlightPhase.LANDING}:
         fleet.run(0.02)

@@ -92,7 +92,7 @@ def test_charge_by_the_voltage_under_load(telemetry):
 
 
 def test_firmware_without_supervisor(telemetry):
-    """What older firmwares say instead is enough to take off and to land."""
+    """Telemetry of older firmwares is enough to take off and to land."""
     flags = {"pm.state": 3, "sys.canfly": 1, "sys.isFlying": 1, "sys.isTumbled": 0}
     Blocks(telemetry).logged["state"](1.0, 0, {"pm.vbat": 3.55, **flags})
     assert telemetry.info == Info.ARMED | Info.CAN_FLY | Info.FLYING

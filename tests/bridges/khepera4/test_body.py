@@ -443,7 +443,7 @@ while True:
 
 @pytest.mark.system
 def test_process_woken_from_suspension_sends_only_a_stop():
-    """It drives at 0.10 m/s until a moment at which it is suspended, and at 0.05 m/s when it goes on."""
+    """The process drives at 0.10 m/s until it is suspended, and at 0.05 m/s afterwards."""
     with recording() as (place, clients):
         begin = time.monotonic()
         child = subprocess.Popen([sys.executable, "-c", DRIVING, place, str(begin + 8.0)])

@@ -110,7 +110,7 @@ def refusal(address):
 
 
 def refusals():
-    """What cannot be opened, and what refuses to take off."""
+    """Devices that cannot be opened, and refused take-offs."""
     told = {}
     with socket.socket(type=socket.SOCK_DGRAM) as other:  # another program that flies Tellos
         other.bind(("", 8889))

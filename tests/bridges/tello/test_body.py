@@ -135,7 +135,7 @@ def test_telemetry_outlives_bytes_of_nonsense():
 
 
 def fly(scenario):
-    """What a scenario reports; the ports of djitellopy are the host's, so they take turns."""
+    """Report of a scenario; the ports of djitellopy are the host's, so they take turns."""
     command = [sys.executable, "-m", "tests.bridges.tello.scenarios", scenario]
     with (Path(tempfile.gettempdir()) / "zenpark-tello.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)

@@ -250,7 +250,7 @@ def test_landing_before_the_motors_start_is_repeated(standing):
 
 
 def test_drone_that_does_not_land_rests_its_sticks(flown):
-    """It keeps the last sticks that it was told."""
+    """The drone keeps the last sticks that it received."""
     flown.aim(0.5, 0.0, 0.0, 0.0)
     assert flown.pass_(0.1).sticks[-1] == (0, 50, 0, 0)
     flown.forget().land()

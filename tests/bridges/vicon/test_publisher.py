@@ -181,7 +181,7 @@ def test_the_command_line_is_understood_or_refused():
 
 
 class BridgeProcess:
-    """What `python -m bridges.vicon.publisher` says."""
+    """Output of `python -m bridges.vicon.publisher`."""
 
     def __init__(self, process):
         self.process, self.lines = process, []

@@ -47,7 +47,7 @@ READ, WRITE = ("hear", "last"), ("put", "keep")
 
 
 def wanted(who, *, own, heard, guided):
-    """What `who` may do on `park/<robot>/<what>`: pairs of an action and `what`.
+    """Rights of `who` on `park/<robot>/<what>`: pairs of an action and `what`.
 
     Args:
         own: It is this robot, or shares a process with it.
@@ -201,7 +201,7 @@ def test_linked_routers_pass_on_what_either_admits():
 
 
 def test_avoidance_gives_ears_and_nothing_else():
-    """Who keeps clear of those that it hears must hear them, though no link says so."""
+    """Avoidance by received poses needs the right to receive them, even without a link."""
     one = next(iter(load("crowd").cases().values()))
     grants = access_rights.rights([one]).robots
     mates = [name for name, robot in one.experiment.robots.items() if robot.process == "squad_E1"]

@@ -131,7 +131,7 @@ VALUES = [
 
 
 def outcome(path, flags=()):
-    """What becomes of a file: its cases as they are sent, or why it is refused."""
+    """Result of a file: its cases as they are sent, or the reason of the refusal."""
     try:
         return [document.write_json(case) for case in read(path, flags).cases().values()]
     except DocumentError as error:

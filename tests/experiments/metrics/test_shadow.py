@@ -1,4 +1,4 @@
-"""What is said of the twin beside a robot is what is known of it: bias, lag, correlation."""
+"""Figures of the twin beside a robot are the known ones: bias, lag, correlation."""
 
 import dataclasses
 import math

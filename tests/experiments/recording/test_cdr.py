@@ -1,4 +1,4 @@
-"""What is encoded must be what two other implementations of CDR read, and byte for byte what one of them writes."""
+"""Two other implementations of CDR read our bytes, and one of them writes the same bytes."""
 
 import math
 import struct

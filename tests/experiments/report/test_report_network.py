@@ -1,4 +1,4 @@
-"""What a report says of a modelled network: how much it dropped, how long the rest took, link by link."""
+"""Report of a modelled network: dropped poses and delays, link by link."""
 
 import numpy as np
 import pytest

@@ -37,7 +37,7 @@ AXIS = "trigger.threshold=0.005,0.02"
 
 
 class Progress:
-    """What a sweep told: the number of runs so far."""
+    """Progress of a sweep: the number of runs so far."""
 
     def __init__(self, end_after=None):
         self.ran, self._end_after = 0, end_after

@@ -1,4 +1,4 @@
-"""What goes wrong in a virtual run is in its trace and in its recording, and nothing is where nothing does."""
+"""Faults of a virtual run are in its trace and in its recording; a run without faults has none."""
 
 import numpy as np
 import pytest

@@ -48,7 +48,7 @@ def recorder(log, engine="point-mass", **parts):
 
 @pytest.fixture(scope="module")
 def log():
-    """What the engine does not know is made up."""
+    """Log of a run, with attitudes and contacts of the test, which this engine does not compute."""
     plain = simulate(Plan(experiment()), 3)
     half = np.linspace(0.0, 2.0, len(plain.time))[:, None] * [1.0, 0.5]
     attitude = np.stack([np.cos(half), np.sin(half), 0.0 * half, 0.0 * half], axis=-1)

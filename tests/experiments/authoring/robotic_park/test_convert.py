@@ -26,7 +26,7 @@ FILES = {
 
 @cache
 def converted(text):
-    """What was read of the file that was made, and the notes on what was not carried over."""
+    """Document of the converted file, and the notes on all that was not carried over."""
     made, notes = convert_text(text, "park.yaml", 20.0)
     return document.loads(made), " | ".join(notes)
 

@@ -91,7 +91,7 @@ def test_a_run_that_ended_early_has_failed(landing: float, failures: list[str]) 
     ("reason", "spoilt"), [("ordered to land", True), ("ordered to stop", True), ("its battery is low", False)]
 )
 def test_robot_that_was_ordered_down_spoils_the_run(reason: str, spoilt: bool) -> None:
-    """What lands a robot else is a hazard of the recording."""
+    """Any other landing is a hazard of the recording."""
     course = Course({0.0: "running", 10.0: "landing"})
     name = next(iter(course.robots))
     course.reasons = {name: reason}

@@ -1,4 +1,4 @@
-"""What a machine holds of a lab's certificates, and what is said of it."""
+"""Certificates of a lab on a machine, and the findings about them."""
 
 import shutil
 import time

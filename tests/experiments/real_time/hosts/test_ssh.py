@@ -1,4 +1,4 @@
-"""What ssh says, in words that help."""
+"""Errors of ssh, with remedies."""
 
 import shlex
 

@@ -1,4 +1,4 @@
-"""What goes over the network is taken down, and what is nonsense is not."""
+"""Messages on the network are recorded, malformed ones are not."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Who is in a world and where, and what a world believes; no process and no network."""
+"""Robots of a world, their places, and accepted input; no process and no network."""
 
 from __future__ import annotations
 
