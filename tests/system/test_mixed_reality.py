@@ -24,7 +24,7 @@ pytestmark = pytest.mark.system
 
 WORLD = """
 title = "{real} stands in the way of {twin}"
-duration_s = 30.0   # the test ends the run when the twin has arrived
+duration_s = 40.0   # the test ends the run when the twin has arrived
 positioning = "vicon-twin"
 [arena]
 size = [4.0, 4.0, 2.0]
@@ -35,7 +35,7 @@ sensor_noise = 0.0
 kind = "barrier"
 hears = "{hears}"
 [[timeline]]
-at_s = 1.4
+at_s = {begins}
 robot = "{twin}"
 plan = {{ kind = "waypoints", points = [[0.33, 0.0]], speed = 0.23 }}
 """
@@ -53,15 +53,17 @@ GOAL, NEAR_M, STAYS_S = (0.33, 0.0), 0.08, 0.3
 
 
 class Way(NamedTuple):
-    """A twin, the real robot that stands in its way, and the `hears` of the twin's avoidance.
+    """A twin, the real robot that stands in its way, the `hears` of the twin's avoidance, and the begin of its way [s].
 
-    A Khepera sees a TurtleBot; four thin rays miss much of a drone of 29 mm, which is why drones hear each other.
+    A Khepera sees a TurtleBot; four thin rays miss much of a drone of 29 mm, which is why drones hear each other. Like
+    the firmware's, the take-off of a protocol twin overshoots: by 37 mm at 0.5 m, too high for these rays for 9 s.
     """
 
     hears: str
     robots: str
     twin: str
     real: str
+    begins: float
 
 
 def ahead(scan: messages.Ranges) -> float:
@@ -87,16 +89,16 @@ def kill_positioning(flight: Flight, session: zenoh.Session, robot: str) -> None
     "way",
     [
         pytest.param(
-            Way("neighbours", ON_THE_FLOOR, "KH01", "TB01"),
+            Way("neighbours", ON_THE_FLOOR, "KH01", "TB01", 1.4),
             marks=pytest.mark.mechanism("mixed reality", "motion capture: processes killed"),
         ),
-        Way("all", IN_THE_AIR, "CF02", "CF01"),
+        Way("all", IN_THE_AIR, "CF02", "CF01", 12.0),
     ],
 )
 def test_twin_sees_and_avoids_a_real_robot(tmp_path: Path, router: RouterProcess, way: Way) -> None:
     twin, real = way.twin, way.real
     file, folder = tmp_path / "mixed.toml", tmp_path / "run"
-    file.write_text(WORLD.format(hears=way.hears, twin=twin, real=real) + way.robots)
+    file.write_text(WORLD.format(hears=way.hears, twin=twin, real=real, begins=way.begins) + way.robots)
     flight = Flight(folder, file, "--json", f'network.connect=["{router.endpoint}"]')
     with network.open_session([router.endpoint], name="observer") as session:
         ranges = pubsub.Inbox(pubsub.subscriber(session, Keys().ranges(twin), 4096), messages.Ranges)
@@ -124,9 +126,9 @@ def test_twin_sees_and_avoids_a_real_robot(tmp_path: Path, router: RouterProcess
     at = {name: row for row, name in enumerate(trace.robots)}
     radius = {name: KINDS[robot.kind].radius for name, robot in trace.plan.experiment.robots.items()}
     truth, measured = trace.true_position[:, :, :2], trace.position[:, :, :2]
-    still = (trace.time > 0.2) & (trace.time < 1.4)
+    still = (trace.time > way.begins - 1.2) & (trace.time < way.begins)
     away = np.median(np.linalg.norm(measured[still, at[real]] - truth[still, at[twin]], axis=1))
-    readings = [ahead(scan) for scan in scans if 0.2 < scan.stamp - played.started < 1.4]
+    readings = [ahead(scan) for scan in scans if -1.2 < scan.stamp - played.started - way.begins < 0.0]
     assert len(readings) >= 10
     assert np.nanmedian(readings) == pytest.approx(away - radius[real], abs=0.001)
     apart = np.linalg.norm(truth[:, at[twin]] - truth[:, at[real]], axis=1)

@@ -22,6 +22,7 @@ class Commander:
 
     def __init__(self, rows: int) -> None:
         self.target = np.full((rows, 3), np.nan)  # position setpoints [m], NaN on axes without one
+        self.thrust = np.full(rows, np.nan)  # raw thrust instead of vertical setpoints, of 65,535; NaN without one
         self.on = np.zeros(rows, dtype=bool)  # motors requested
         self._velocity = np.full((rows, 3), np.nan)
         self._body = np.zeros(rows, dtype=bool)
@@ -42,6 +43,7 @@ class Commander:
         turn: float = 0.0,
         body: bool = False,
         lean: tuple[float, float] = (0.0, 0.0),
+        thrust: float = np.nan,
         on: bool = True,
     ) -> None:
         """Set a low-level setpoint.
@@ -53,9 +55,10 @@ class Commander:
             turn: Yaw rate [rad/s].
             body: Velocity along the axes of the robot.
             lean: Roll to the right and pitch nose up [rad]; they count on axes without setpoint.
+            thrust: Raw thrust, of 65,535; it counts without a vertical setpoint.
             on: Motors on.
         """
-        self.target[row], self._velocity[row] = target, velocity
+        self.target[row], self._velocity[row], self.thrust[row] = target, velocity, thrust
         self._heading[row], self._turn[row], self._body[row], self.on[row] = heading, turn, body, on
         roll, pitch = np.clip(lean, -STEEPEST, STEEPEST)
         self._lean[row] = -GRAVITY * np.tan([pitch, roll])
@@ -75,7 +78,7 @@ class Commander:
         listening = ~self._low_level
         planned = listening & np.isfinite(goal[:, 0])
         self.target[listening], self._velocity[listening], self._body[listening] = goal[listening, :3], np.nan, False
-        self._lean[listening] = 0.0
+        self._lean[listening], self.thrust[listening] = 0.0, np.nan
         self._heading[planned], self._turn[planned] = goal[planned, 3], 0.0
         self.on[listening] = planned[listening]
         self._received[listening] = t

@@ -50,7 +50,6 @@ LEAST: Final = "posCtlPid.thrustMin"
 MAX_WHOLE_PARAMETER: Final = 2.0**32  # upper bound of whole parameters, far above any length, angle or speed
 LEAST_THRUST, MOST_THRUST = 1000, 60000
 DEFAULT_SPEED: Final = 0.5  # [m/s] mean speed of take-offs and landings with velocity that name none
-CLIMB_THRUST: Final = 24000.0  # additional thrust for a climb of about 1 m/s
 
 
 @dataclass
@@ -293,9 +292,8 @@ class Drone:
         roll, pitch, turn, thrust = _numbers(crtp.THRUST, data)
         self.thrust_locked = self.thrust_locked and thrust > 0
         on = thrust >= LEAST_THRUST and not self.thrust_locked
-        climb = (min(thrust, MOST_THRUST) - self.flock.vertical.hover[self.row]) / CLIMB_THRUST
         lean = math.radians(roll), math.radians(pitch)
-        self._command(on=on, velocity=(math.nan, math.nan, climb), turn=math.radians(turn), lean=lean)
+        self._command(on=on, thrust=min(thrust, MOST_THRUST), turn=math.radians(turn), lean=lean)
 
     def _setpoint(self, channel: int, data: bytes) -> None:
         if channel == 1:

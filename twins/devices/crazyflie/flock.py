@@ -357,7 +357,7 @@ class Flock:
         quadrotor = self.quadrotor
         wanted = np.where(np.isnan(self.commander.target[:, 2]), self._gain[2] * offset, np.nan)
         climb = before[:, 2] + self.estimator.rate[:, 2]
-        acceleration = self.vertical.advance(quadrotor.flying, offset, climb, wanted)
+        acceleration = self.vertical.advance(quadrotor.flying, offset, climb, wanted, self.commander.thrust)
         speed = before[:, 2] + self.dt * acceleration
         quadrotor.velocity[:, 2] = np.where(quadrotor.flying, speed, quadrotor.velocity[:, 2])
         quadrotor.position[:, 2] = np.where(quadrotor.flying, place[:, 2] + self.dt * speed, quadrotor.position[:, 2])

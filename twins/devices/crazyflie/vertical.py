@@ -42,7 +42,7 @@ class VerticalLoops:
         """Rows (N,) that slide when they press on the floor, with the least thrust."""
         return np.asarray(self.least > SLIDES * self.hover)
 
-    def advance(self, spinning: Mask, offset: Array, climb: Array, wanted: Array) -> Array:
+    def advance(self, spinning: Mask, offset: Array, climb: Array, wanted: Array, raw: Array) -> Array:
         """Advance one step; returns vertical accelerations (N,) in the air [m/s²].
 
         Args:
@@ -50,15 +50,19 @@ class VerticalLoops:
             offset: (N,) from the estimated height to the target [m].
             climb: (N,) estimated climb rate [m/s].
             wanted: (N,) setpoint of the climb rate [m/s]; NaN in rows that follow a height.
+            raw: (N,) thrust of rows without loops, of 65,535; NaN in the others. As in the firmware, a change from
+                raw thrust to height or climb rate resets the loops.
         """
-        for state in (self.thrust, self._height, self._climb):
-            state[~spinning] = 0.0
+        self.thrust[~spinning] = 0.0
+        looped = spinning & np.isnan(raw)
+        self._height[~looped] = self._climb[~looped] = 0.0
         by_height = np.isnan(wanted)
-        self._height += self._dt * np.where(spinning & by_height, offset, 0.0)
+        self._height += self._dt * np.where(looped & by_height, offset, 0.0)
         reference = clamp(POSITION.p[UP] * offset + POSITION.i[UP] * self._height, -SPEED, SPEED)
         error = np.where(by_height, reference, wanted) - climb
-        self._climb += self._dt * np.where(spinning, error, 0.0)
+        self._climb += self._dt * np.where(looped, error, 0.0)
         lift = THRUST_SCALE * (VELOCITY.p[UP] * error + VELOCITY.i[UP] * self._climb)
         command = clamp(self._base + clamp(lift, -0.5 * FULL, 0.5 * FULL), self.least, FULL)
+        command = np.where(np.isnan(raw), command, raw)
         self.thrust += self._lag * np.where(spinning, command - self.thrust, 0.0)
         return np.asarray(GRAVITY * (self.thrust / self.hover - 1.0))

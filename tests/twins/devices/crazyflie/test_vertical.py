@@ -73,6 +73,21 @@ def test_thrust_in_hover_carries_the_weight():
     assert brushless().hovering().flock.vertical.thrust == pytest.approx([31750.0], rel=0.002)
 
 
+@pytest.mark.parametrize("waited_s", [0.2, 3.0])
+def test_raw_thrust_has_no_memory(waited_s):
+    """Thrust of 45,000 accelerates 39,300 of weight, however long too little thrust came before."""
+    wire = Wire()
+    wire.zero()
+    wire.after(waited_s, lambda: wire.thrust(20000))
+    assert wire.motors
+    rise = wire.after(1.0, lambda: wire.thrust(45000)).position[2]
+    spun_up_s = 0.03 * np.log((45000 - 20000) / (45000 - 39300))
+    assert rise == pytest.approx(0.5 * 9.81 * (45000 / 39300 - 1.0) * (0.97 - spun_up_s) ** 2, rel=0.03)
+    wire.after(1.0, lambda: wire.thrust(39300))
+    height = wire.position[2] + 0.1 * wire.velocity[2]
+    assert heights(wire, 6.0, lambda: wire.goal(0.0, 0.0, height))[-1] == pytest.approx(height, abs=0.05)
+
+
 @pytest.mark.slow
 def test_second_flight_overshoots_as_the_first():
     """Motors off, the loops forget."""
