@@ -4,51 +4,46 @@ from __future__ import annotations
 
 import statistics
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
+from experiments.definition.graph import Links
 from experiments.metrics.results import CentralisedMetrics
 from experiments.recording.trace import Trace
-from twins.arrays import Array, Index, Mask
+from twins.arrays import Array
 
 
 def _delays(delay: Array) -> dict[str, float | None]:
     """Mean, 95th percentile and maximum of delays (A,) [s], by their names in the results; None without any."""
-    found = (delay.mean(), np.quantile(delay, 0.95), delay.max()) if len(delay) else (None,) * 3
-    return {
-        f"delay_{what}_s": None if each is None else float(each)
-        for what, each in zip(("mean", "p95", "max"), found, strict=True)
-    }
+    if not len(delay):
+        return dict.fromkeys(("delay_mean_s", "delay_p95_s", "delay_max_s"))
+    found = {"mean": delay.mean(), "p95": np.quantile(delay, 0.95), "max": delay.max()}
+    return {f"delay_{what}_s": float(each) for what, each in found.items()}
 
 
-def guided_rows(trace: Trace) -> Mask:
-    """Robots (N,) that the central controller guides."""
-    return np.isin(np.array(trace.robots), trace.plan.guided)
-
-
-def received_by_centre(trace: Trace) -> Mask:
-    """Senders (N,) of poses to the central controller: the robots that it guides, and their neighbours."""
-    rows = guided_rows(trace)
-    net = trace.plan.links
-    hears = rows.copy()
-    hears[net.sender[rows[net.receiver]]] = True
-    return np.asarray(hears & rows.any())
-
-
-def delays(trace: Trace) -> list[dict[str, float | None]]:
-    """Delays of the goals to each robot, as fields of its metrics."""
-    goals = trace.goals
-    rows = range(len(trace.robots))
-    return [_delays(np.zeros(0) if goals is None else goals.delay[goals.follower == row]) for row in rows]
-
-
-def goals_to(trace: Trace) -> tuple[Index, Index]:
-    """Number of goals sent to each robot (N,), and their payload (N,) [bytes]."""
+def columns(trace: Trace, net: Links) -> dict[str, list[Any]]:
+    """Receivers, deliveries and goals of each robot (N,), as fields of its metrics; `net` are the formation's links."""
     rows, goals = len(trace.robots), trace.goals
-    if goals is None:
-        return np.zeros(rows, dtype=np.intp), np.zeros(rows, dtype=np.intp)
-    size = np.bincount(goals.sent.link, weights=goals.sent.bytes, minlength=rows)
-    return np.bincount(goals.sent.link, minlength=rows), size.astype(np.intp)
+    guided = np.isin(np.array(trace.robots), trace.plan.guided)  # the centre receives their neighbours' poses
+    links, ends = trace.plan.links, trace.plan.pose_links
+    to_centre = guided.copy()
+    to_centre[links.sender[guided[links.receiver]]] = True
+    counted = np.zeros((rows, rows), dtype=bool)  # links for avoidance alone do not belong to the formation
+    counted[net.receiver, net.sender] = ~guided[net.receiver]
+    taken = trace.received.link[counted[ends.receiver, ends.sender][trace.received.link]]
+    found = {
+        "receivers": np.bincount(net.sender[~guided[net.receiver]], minlength=rows) + to_centre,
+        "received": np.bincount(ends.sender[taken], minlength=rows),
+    }
+    delays = [_delays(np.zeros(0) if goals is None else goals.delay[goals.follower == row]) for row in range(rows)]
+    if goals is not None:
+        size = np.bincount(goals.sent.link, weights=goals.sent.bytes, minlength=rows).astype(np.intp)
+        found["received"] += goals.received
+        found |= {"goals": np.bincount(goals.sent.link, minlength=rows), "goal_bytes": size}
+    return {name: column.tolist() for name, column in found.items()} | {
+        name: [each[name] for each in delays] for name in delays[0]
+    }
 
 
 def deliveries(trace: Trace) -> int:
@@ -62,14 +57,14 @@ def guidance(trace: Trace) -> CentralisedMetrics | None:
     goals = trace.goals
     if goals is None:
         return None
-    duration = float(trace.time[-1] - trace.time[0])
+    assert goals.sent.bytes is not None
     load = [report.load for report in goals.reports] if trace.clock == "real" else []
     missed = [report.missed for report in goals.reports]
     return CentralisedMetrics(
         guided=trace.plan.guided,
         goals=len(goals.sent),
-        goals_hz=len(goals.sent) / duration,
-        goal_bytes=int(goals_to(trace)[1].sum()),
+        goals_hz=len(goals.sent) / float(trace.time[-1] - trace.time[0]),
+        goal_bytes=int(goals.sent.bytes.sum()),
         goals_lost=max(0, len(goals.sent) - int(goals.reached.sum())),
         received=int(goals.received.sum()),
         poses_lost=int(goals.lost.sum() + goals.dropped.sum()),

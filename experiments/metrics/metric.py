@@ -273,11 +273,16 @@ def values_of(
     found: dict[str, list[Number]] = {}
     failed = []
     for name, metric in metrics.items():
-        count = len(shared.trace.robots) if metric.per == "robot" else 1
+        count, wanted = 1, "one number"
+        if metric.per == "robot":
+            count = len(trace.robots)
+            wanted = f"{count} numbers, one for each robot"
         try:
             with np.errstate(all="ignore"):
-                values = metric.of(trace if name in OURS else shown, shared)
-                found[name] = _numbers(metric, np.asarray(values), count)
+                values = np.asarray(metric.of(trace if name in OURS else shown, shared))
+            if values.shape != ((count,) if metric.per == "robot" else ()) or values.dtype.kind not in "iuf":
+                raise ValueError(f"it gives {values.dtype} {values.shape}, not {wanted}")
+            found[name] = [each if isfinite(each) else None for each in values.reshape(count).tolist()]
         except registry.FAILURES as error:
             if name in OURS:
                 raise
@@ -287,14 +292,6 @@ def values_of(
             where = f"{Path(at.filename).name}:{at.lineno}"
             failed.append(f"metric {name} failed: {type(error).__name__}: {error} ({where})")
     return found, tuple(failed)
-
-
-def _numbers(metric: Metric, values: Array, count: int) -> list[Number]:
-    shape = (count,) if metric.per == "robot" else ()
-    if values.shape != shape or values.dtype.kind not in "iuf":
-        wanted = f"{count} numbers, one for each robot" if metric.per == "robot" else "one number"
-        raise ValueError(f"it gives {values.dtype} {values.shape}, not {wanted}")
-    return [each if isfinite(each) else None for each in values.reshape(count).tolist()]
 
 
 def case_values(

@@ -6,7 +6,7 @@ Positions that are unknown are NaN; nothing here lets one robot's NaN reach anot
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from math import inf, nan
@@ -40,19 +40,12 @@ def phase_starts(trace: Trace) -> tuple[float, ...]:
     return (first, *sorted(at for at in begins if first < at < last))
 
 
-def leaders(trace: Trace) -> tuple[str, ...]:
-    """Robots that means leave out; none if that would leave out all."""
-    leading = trace.plan.leaders
-    return () if len(leading) == len(trace.robots) else leading
-
-
-def own_links(net: Links, rows: int) -> Array:
-    """Links that count for each robot (E, N): those on which it receives, or without any, those on which it sends."""
-    link = np.arange(len(net))
-    as_receiver, as_sender = np.zeros((2, len(net), rows))
-    as_receiver[link, net.receiver] = 1.0
-    as_sender[link, net.sender] = 1.0
-    return np.where(as_receiver.any(axis=0), as_receiver, as_sender)
+def bounds_of(trace: Trace) -> list[tuple[float, int, int]]:
+    """Start [s], first row and last row + 1 of each phase; legs that begin within one sample are one phase."""
+    starts = phase_starts(trace)
+    begins, first = np.unique(np.searchsorted(trace.time, np.array(starts) - 1e-9), return_index=True)
+    ends = [*begins[1:], len(trace.time)]
+    return [(starts[k], int(begin), int(end)) for k, begin, end in zip(first, begins, ends, strict=True)]
 
 
 @dataclass(frozen=True)
@@ -61,7 +54,8 @@ class LinkErrors:
 
     time: Array  # (T,) [s]
     net: Links
-    own: Array  # (E, N) 1 where a link counts for a robot, see `own_links`
+    # (E, N) 1 where a link counts for a robot: those on which it receives, or without any, those on which it sends
+    own: Array
     # (T, E) as the law measures it, |‖p_i − p_j‖ − d_ij| for distances [m]; NaN where an end is unknown or the link
     # is not there
     error: Array
@@ -70,27 +64,30 @@ class LinkErrors:
     # when an unknown position tells nothing of it
     there: Mask
     gone: Mask  # (T, N) from then on neither a robot's position nor an error of its links is known any more
+    away_s: float  # [s] without any known position in the whole trace, see `network_away`
 
     @classmethod
     def of_trace(cls, trace: Trace) -> LinkErrors:
-        pattern = trace.plan.formation
+        pattern, rows = trace.plan.formation, len(trace.robots)
         alive = np.asarray(np.isfinite(trace.true_position).all(axis=2))
-        own, (_, away) = own_links(pattern.links, len(trace.robots)), network_away(alive, trace.time)
-        there = np.repeat(~away[:, None], len(trace.robots), axis=1)
+        away_s, away = network_away(alive, trace.time)
+        there = np.repeat(~away[:, None], rows, axis=1)
         if trace.joined is not None:
             there &= trace.time[:, None] >= trace.joined
         blind = without_position(trace)
         alive &= ~blind
         place = np.where(blind[:, :, None], np.nan, trace.true_position) if blind.any() else trace.true_position
+        as_receiver, as_sender = (np.eye(rows)[ends] for ends in (pattern.links.receiver, pattern.links.sender))
+        own = np.where(as_receiver.any(axis=0), as_receiver, as_sender)
         error = errors_over_time(trace.plan.law, pattern, trace.time, place)
         gone = ~np.maximum.accumulate((alive & (np.isfinite(error) @ own > 0.0))[::-1])[::-1]
-        return cls(trace.time, pattern.links, own, error, alive, there, np.asarray(gone))
+        return cls(trace.time, pattern.links, own, error, alive, there, np.asarray(gone), away_s)
 
     def part(self, begin: int, end: int) -> LinkErrors:
         """The same from one row in time to another."""
         rows = slice(begin, end)
-        masks = (self.alive[rows], self.there[rows], self.gone[rows])
-        return LinkErrors(self.time[rows], self.net, self.own, self.error[rows], *masks)
+        parts = {name: getattr(self, name)[rows] for name in ("time", "error", "alive", "there", "gone")}
+        return replace(self, **parts)
 
     def per_robot(self) -> Array:
         """e_i(t) = Σ_j e_ij (T, N) [m] over its own links, see `error`; NaN where none of them is known."""
@@ -123,9 +120,11 @@ class LinkErrors:
                     found.append((row, float(self.time[begin]), float(self.time[end])))
         return found
 
-    def expected(self) -> Mask:
-        """(T, E) samples at which both ends of each link were to be there."""
-        return np.asarray(self.there[:, self.net.receiver] & self.there[:, self.net.sender])
+    def coverage(self) -> Array:
+        """(N,) known share of the errors of each robot's links while both ends were to be there; 0 without links."""
+        there = self.there[:, self.net.receiver] & self.there[:, self.net.sender]
+        covered = (np.isfinite(self.error) & there).sum(axis=0) / np.maximum(there.sum(axis=0), 1)
+        return np.asarray((covered @ self.own) / np.maximum(self.own.sum(axis=0), 1.0))
 
     def known(self) -> Array:
         """(N,) share of the time at which each robot was to be there, at which its position is known; 0 without any."""
@@ -195,11 +194,6 @@ def network_away(alive: Mask, time: Array) -> tuple[float, Mask]:
     return float(none_known.sum() * (time[1] - time[0])), np.asarray((near & ~alive.all(axis=1)) | none_known)
 
 
-def formation_errors(trace: Trace) -> Array:
-    """e_i(t) (T, N) [m] of each robot over its own links, see `LinkErrors.per_robot`."""
-    return LinkErrors.of_trace(trace).per_robot()
-
-
 def mean_known(values: Array) -> Array:
     """Mean of the finite values over the first axis; NaN where there is none (`nanmean` would warn)."""
     known = np.isfinite(values)
@@ -212,14 +206,6 @@ def integral(values: Array, time: Array) -> Array:
     """Trapezoidal integral over the first axis of (T, N), over the part that is known."""
     parts = 0.5 * (values[1:] + values[:-1]) * np.diff(time)[:, None]
     return np.asarray(np.where(np.isfinite(parts), parts, 0.0).sum(axis=0))
-
-
-def integrals(total: Array, time: Array) -> tuple[Array, Array, Array]:
-    """∫ e dt [m s], ∫ t·e dt [m s²] and √(mean e²) [m] of errors (T, N); NaN where nothing is known."""
-    rmse = np.sqrt(mean_known(total**2))
-    known = np.isfinite(rmse)
-    iae, itae = integral(total, time), integral(time[:, None] * total, time)
-    return np.where(known, iae, np.nan), np.where(known, itae, np.nan), np.asarray(rmse)
 
 
 def after_last(bad: Mask, time: Array) -> list[float | None]:
@@ -305,19 +291,6 @@ def outside_arena(trace: Trace) -> Array:
     return np.asarray(np.where(np.isfinite(beyond), beyond, -np.inf).max(axis=0))
 
 
-def transmission_gaps(trace: Trace) -> list[Array]:
-    """Times between transmissions, per robot [s]."""
-    return [np.diff(np.sort(trace.sent_by(row).stamp)) for row in range(len(trace.robots))]
-
-
-def transmissions(trace: Trace) -> tuple[Index, Index]:
-    """Per robot: poses sent, by the running numbers, and those of them in the recording."""
-    tables, rate = [trace.sent_by(row) for row in range(len(trace.robots))], trace.plan.experiment.rates.pose_hz
-    missing = [count_unrecorded(zip(own.stamp.tolist(), own.seq.tolist(), strict=True), rate) for own in tables]
-    recorded = np.array([len(own) for own in tables], dtype=np.intp)
-    return recorded + np.array(missing, dtype=np.intp), recorded
-
-
 def link_deliveries(trace: Trace) -> tuple[LinkDelivery, ...]:
     """Delivery statistics of every link, those that only avoidance needs included."""
     links, received = trace.plan.pose_links, trace.received
@@ -350,16 +323,20 @@ class Measurement:
 
     def __init__(self, trace: Trace) -> None:
         self.trace = trace
+        self.has_errors = isinstance(trace.plan.law, Gradient)  # only gradient laws measure errors of links
+        leading = trace.plan.leaders
+        self.leaders = () if len(leading) == len(trace.robots) else leading  # robots that means leave out
+        self.bounds = bounds_of(trace)  # phases
+
+    @cached_property
+    def window(self) -> int:
+        """Samples of the moving mean."""
+        return max(1, round(WINDOW_S / float(self.trace.time[1] - self.trace.time[0])))
 
     @cached_property
     def errors(self) -> LinkErrors:
         """Errors of the links [m]."""
         return LinkErrors.of_trace(self.trace)
-
-    @cached_property
-    def has_errors(self) -> bool:
-        """Whether links have errors: only gradient laws measure them."""
-        return isinstance(self.trace.plan.law, Gradient)
 
     @cached_property
     def robot_errors(self) -> Array:
@@ -368,8 +345,11 @@ class Measurement:
 
     @cached_property
     def integrals(self) -> tuple[Array, Array, Array]:
-        """IAE [m s], ITAE [m s²] and RMSE [m] of each robot, (N,) each."""
-        return integrals(self.robot_errors, self.trace.time)
+        """∫ e dt [m s], ∫ t·e dt [m s²] and √(mean e²) [m] of each robot, (N,) each."""
+        total, time = self.robot_errors, self.trace.time
+        rmse = np.sqrt(mean_known(total**2))
+        iae, itae = np.where(np.isfinite(rmse), [integral(total, time), integral(time[:, None] * total, time)], np.nan)
+        return iae, itae, np.asarray(rmse)
 
     @cached_property
     def clearance(self) -> Clearance:
@@ -383,18 +363,53 @@ class Measurement:
 
     @cached_property
     def cost(self) -> float:
-        """J2, see `benchmark_cost`; NaN for laws without errors."""
-        return benchmark_cost(self.trace, self.errors) if self.has_errors else nan
+        """J2 of the authors' benchmark (`benchmark_evaluation.m` of 2024), summed over the robots that receive poses.
+
+        The cost of a robot is 0.02 n_m + 0.1 n_u + 0.3 t_s + 0.1 IAE + 0.01 ITAE, all until the settling time t_s. With
+        r the distances to its neighbours and anchors and d the wanted ones, t_s is the last time at which g = Σ(r² −
+        d²) differs from its end by more than 2 % of |g(0) − g(end)|. n_m are transmissions, n_u computed goals; IAE and
+        ITAE are those of Σ|r − d|, halved because a link has two ends (their script takes the ITAE of the last
+        neighbour only, which is taken for a slip). Without distances, and where wanted distances change, g is their
+        error. Goals are counted by their changes in the samples, in proportion to all that were computed. NaN for laws
+        without errors.
+        """
+        if not self.has_errors:
+            return nan
+        trace, errors = self.trace, self.errors
+        plan, time, place = trace.plan, trace.time, trace.true_position
+        links, anchors = errors.net, plan.anchors_by_row
+        plain = isinstance(plan.law, Distance) and not plan.formation.changes
+        new = (np.diff(trace.goal, axis=0) != 0.0).any(axis=2) & np.isfinite(trace.goal[1:]).all(axis=2)
+        cost = 0.0
+        for i in sorted({*links.receiver.tolist()}):
+            own = np.flatnonzero(links.receiver == i)
+            error, gap = errors.error[:, own], errors.error[:, own]
+            if plain:
+                gap = norm(place[:, i, None] - place[:, links.sender[own]]) ** 2 - links.distance[own] ** 2
+            for anchor in (each for row, each in anchors if row == i):
+                away = norm(np.array([anchor.displacement(tuple(each)) for each in place[:, i].tolist()]))[:, None]
+                error = np.hstack([error, np.abs(away - anchor.distance)])
+                gap = np.hstack([gap, away**2 - anchor.distance**2])
+            signal = np.where(np.isfinite(gap), gap, 0.0).sum(axis=1)
+            known = np.flatnonzero(np.isfinite(gap).any(axis=1))
+            if not len(known):
+                continue
+            first, end = signal[known[[0, -1]]]
+            outside = known[np.abs(signal[known] - end) > BAND * abs(first - end)]
+            last = int(outside[-1]) if len(outside) else 0
+            settled = slice(0, last + 1)
+            e, t = np.where(np.isfinite(error[settled]), error[settled], 0.0).sum(axis=1)[:, None], time[settled]
+            sent = int((trace.sent_by(i).stamp < time[last] - ROUNDING_S).sum())
+            before, all_new = int(new[:last, i].sum()), int(new[:, i].sum())
+            share = before / all_new if all_new else last / (len(time) - 1)
+            effort = 0.02 * sent + 0.1 * share * int(trace.decisions[i]) + 0.3 * float(time[last] - time[0])
+            cost += effort + 0.05 * float(integral(e, t)[0]) + 0.005 * float(integral(t[:, None] * e, t)[0])
+        return cost
 
     @cached_property
     def known(self) -> Array:
         """Share of the time at which the position of each robot is known (N,)."""
         return self.errors.known()
-
-    @cached_property
-    def leaders(self) -> tuple[str, ...]:
-        """Robots that lead: means leave them out."""
-        return leaders(self.trace)
 
     @cached_property
     def died(self) -> tuple[str, ...]:
@@ -407,16 +422,6 @@ class Measurement:
         """Rows of the robots in the means."""
         out = {*self.leaders, *self.died}
         return [i for i, name in enumerate(self.trace.robots) if name not in out]
-
-    @cached_property
-    def bounds(self) -> list[tuple[float, int, int]]:
-        """Phases, see `bounds_of`."""
-        return bounds_of(self.trace)
-
-    @cached_property
-    def window(self) -> int:
-        """Samples of the moving mean."""
-        return max(1, round(WINDOW_S / float(self.trace.time[1] - self.trace.time[0])))
 
     @cached_property
     def acquired(self) -> list[float | None]:
@@ -433,6 +438,24 @@ class Measurement:
             found.append([PhaseMetrics(start, when, *left) for when, left in zip(acquired, worst, strict=True)])
         return found
 
+    @cached_property
+    def together(self) -> tuple[float | None, ...]:
+        """Per phase: from when on all robots in the means have acquired [s]; None if one never does."""
+        linked = [i for i in self.kept if self.errors.own[:, i].any()]
+        times = [[when for i in linked if (when := phase[i].acquired_s) is not None] for phase in self.phases]
+        return tuple(max(each) if each and len(each) == len(linked) else None for each in times)
+
+    @cached_property
+    def rotation(self) -> tuple[float | None, ...]:
+        """Per phase: net rotation of the robots in the means from acquisition on [rad/s]; None before any shape."""
+        place, time = self.trace.true_position[:, self.kept], self.trace.time
+        found: list[float | None] = []
+        for k, ((_, begin, end), acquired) in enumerate(zip(self.bounds, self.together, strict=True)):
+            after = begin + round((acquired or 0.0) / float(time[1] - time[0]))
+            formed = k > 0 or acquired is not None
+            found.append(net_rotation(place[after:end], time[after:end]) if formed else None)
+        return tuple(found)
+
     def _acquired(self, phase: int) -> list[float | None]:
         _, begin, end = self.bounds[phase]
         return self.errors.part(begin, end).acquired(self.window, self.trace.plan.experiment.tolerance)
@@ -447,21 +470,25 @@ class Measurement:
     @cached_property
     def transmissions(self) -> tuple[Index, Index]:
         """Poses sent by each robot, by their running numbers, and those of them in the recording, (N,) each."""
-        return transmissions(self.trace)
+        trace, rows = self.trace, range(len(self.trace.robots))
+        recorded, rate = np.bincount(trace.sent.link, minlength=len(rows)), trace.plan.experiment.rates.pose_hz
+        poses = ((own.stamp.tolist(), own.seq.tolist()) for own in map(trace.sent_by, rows))
+        missing = [count_unrecorded(zip(*columns, strict=True), rate) for columns in poses]
+        return recorded + np.array(missing, dtype=np.intp), recorded
 
     @cached_property
     def rate(self) -> Array:
         """Poses that each robot sent in a second, from when it takes part (N,) [Hz]."""
-        trace, rows = self.trace, range(len(self.trace.robots))
-        time, joined = trace.time, np.zeros(len(rows)) if trace.joined is None else trace.joined
+        trace, time, sent = self.trace, self.trace.time, self.transmissions[0]
+        joined = np.zeros(len(sent)) if trace.joined is None else trace.joined
         present = np.maximum(time[-1] - np.maximum(joined, time[0]), time[1] - time[0])
-        early = np.array([(trace.sent_by(i).stamp < joined[i]).sum() for i in rows], dtype=np.intp)
-        return np.asarray((self.transmissions[0] - early) / present)
+        early = np.array([(trace.sent_by(i).stamp < when).sum() for i, when in enumerate(joined)], dtype=np.intp)
+        return np.asarray((sent - early) / present)
 
     @cached_property
     def waits(self) -> list[Array]:
         """Times between the transmissions of each robot [s]."""
-        return transmission_gaps(self.trace)
+        return [np.diff(np.sort(self.trace.sent_by(i).stamp)) for i in range(len(self.trace.robots))]
 
     @cached_property
     def payload(self) -> Index:
@@ -478,52 +505,3 @@ class Measurement:
         if dropped is None:
             return np.zeros(rows, dtype=np.intp)
         return np.bincount(self.trace.plan.pose_links.sender, weights=dropped, minlength=rows).astype(np.intp)
-
-
-def benchmark_cost(trace: Trace, errors: LinkErrors) -> float:
-    """J2 of the authors' benchmark (`benchmark_evaluation.m` of 2024), summed over the robots that receive poses.
-
-    The cost of a robot is 0.02 n_m + 0.1 n_u + 0.3 t_s + 0.1 IAE + 0.01 ITAE, all until the settling time t_s. With r
-    the distances to its neighbours and anchors and d the wanted ones, t_s is the last time at which g = Σ(r² − d²)
-    differs from its end by more than 2 % of |g(0) − g(end)|. n_m are transmissions, n_u computed goals; IAE and ITAE
-    are those of Σ|r − d|, halved because a link has two ends (their script takes the ITAE of the last neighbour only,
-    which is taken for a slip). For laws without distances, and where wanted distances change, g is their error. Goals
-    are counted by their changes in the samples, in proportion to all that were computed.
-    """
-    plan, time, place = trace.plan, trace.time, trace.true_position
-    links, anchors = errors.net, plan.anchors_by_row
-    plain = isinstance(plan.law, Distance) and not plan.formation.changes
-    new = (np.diff(trace.goal, axis=0) != 0.0).any(axis=2) & np.isfinite(trace.goal[1:]).all(axis=2)
-    cost = 0.0
-    for i in sorted({*links.receiver.tolist()}):
-        own = np.flatnonzero(links.receiver == i)
-        error, gap = errors.error[:, own], errors.error[:, own]
-        if plain:
-            gap = norm(place[:, i, None] - place[:, links.sender[own]]) ** 2 - links.distance[own] ** 2
-        for anchor in (each for row, each in anchors if row == i):
-            away = norm(np.array([anchor.displacement(tuple(each)) for each in place[:, i].tolist()]))[:, None]
-            error = np.hstack([error, np.abs(away - anchor.distance)])
-            gap = np.hstack([gap, away**2 - anchor.distance**2])
-        signal = np.where(np.isfinite(gap), gap, 0.0).sum(axis=1)
-        known = np.flatnonzero(np.isfinite(gap).any(axis=1))
-        if not len(known):
-            continue
-        first, end = signal[known[[0, -1]]]
-        outside = known[np.abs(signal[known] - end) > BAND * abs(first - end)]
-        last = int(outside[-1]) if len(outside) else 0
-        settled = slice(0, last + 1)
-        e, t = np.where(np.isfinite(error[settled]), error[settled], 0.0).sum(axis=1)[:, None], time[settled]
-        sent = int((trace.sent_by(i).stamp < time[last] - ROUNDING_S).sum())
-        before, all_new = int(new[:last, i].sum()), int(new[:, i].sum())
-        share = before / all_new if all_new else last / (len(time) - 1)
-        effort = 0.02 * sent + 0.1 * share * int(trace.decisions[i]) + 0.3 * float(time[last] - time[0])
-        cost += effort + 0.05 * float(integral(e, t)[0]) + 0.005 * float(integral(t[:, None] * e, t)[0])
-    return cost
-
-
-def bounds_of(trace: Trace) -> list[tuple[float, int, int]]:
-    """Start [s], first row and last row + 1 of each phase; legs that begin within one sample are one phase."""
-    starts = phase_starts(trace)
-    begins, first = np.unique(np.searchsorted(trace.time, np.array(starts) - 1e-9), return_index=True)
-    ends = [*begins[1:], len(trace.time)]
-    return [(starts[k], int(begin), int(end)) for k, begin, end in zip(first, begins, ends, strict=True)]

@@ -20,7 +20,7 @@ from agents.errors import ExplainedError
 from experiments.definition.graph import adjacency
 from experiments.metrics.metric import PLAIN, known_metrics
 from experiments.metrics.results import CaseMetrics, RobotMetrics
-from experiments.metrics.signals import formation_errors, phase_starts
+from experiments.metrics.signals import Measurement, phase_starts
 from experiments.recording.trace import Trace
 from twins.arrays import Array
 
@@ -110,7 +110,7 @@ def write_csv(traces: Mapping[str, Trace], file: Path) -> None:
                 parts = (trace.position, trace.yaw[..., None], trace.true_position, trace.goal)
                 told, unknown = _of_law(trace), np.full(trace.yaw.shape, np.nan)
                 more = [told.get(name, unknown)[..., None] for name in of_law]
-                values = np.concatenate([*parts, formation_errors(trace)[..., None], *more], axis=2)
+                values = np.concatenate([*parts, Measurement(trace).robot_errors[..., None], *more], axis=2)
                 cells = values.astype(object)
                 cells[~np.isfinite(values)] = None
                 for t, rows in zip(trace.time.tolist(), cells.tolist(), strict=True):
@@ -179,7 +179,7 @@ def structure(trace: Trace, metrics: CaseMetrics) -> dict[str, Any]:
         **{name: getattr(trace, name) for name in ("case", "seed", "clock", "robots", *arrays)},
         "title": experiment.title,
         "kinds": [experiment.robots[name].kind for name in trace.robots],
-        "error": formation_errors(trace),
+        "error": Measurement(trace).robot_errors,
         "tolerance": experiment.tolerance,
         "phase_start": phase_starts(trace),
         "sent": {

@@ -24,7 +24,7 @@ from agents.plugins.laws import Gradient
 from experiments.metrics.metric import ERRORS, FORMULA, known_metrics
 from experiments.metrics.results import CaseMetrics
 from experiments.metrics.shadow import differences, in_heading
-from experiments.metrics.signals import WINDOW_S, LinkErrors, bounds_of, leaders, moving_mean, transmission_gaps
+from experiments.metrics.signals import WINDOW_S, Measurement, moving_mean
 from experiments.metrics.statistics import Spread, by_case, ratios, spread
 from experiments.recording.trace import Trace
 from experiments.report.metrics_files import Band
@@ -306,9 +306,10 @@ def error_bands(traces: Sequence[Trace]) -> dict[str, Band]:
 def _worst_links(trace: Trace) -> Array:
     """Error of the worst link of each follower (T, N) [m], moving mean over one second; NaN where none is known."""
     window = max(1, round(WINDOW_S / float(trace.time[1] - trace.time[0]))) if len(trace.time) > 1 else 1
-    known = LinkErrors.of_trace(trace)
-    mean = np.concatenate([moving_mean(known.error[begin:end], window) for _, begin, end in bounds_of(trace)])
-    followers = [row for row, name in enumerate(trace.robots) if name not in leaders(trace)]
+    shared = Measurement(trace)
+    known = shared.errors
+    mean = np.concatenate([moving_mean(known.error[begin:end], window) for _, begin, end in shared.bounds])
+    followers = [row for row, name in enumerate(trace.robots) if name not in shared.leaders]
     return np.stack([_largest(mean[:, known.own[:, row] > 0.0]) for row in followers], axis=1)
 
 
@@ -395,12 +396,9 @@ def intervals(traces: Sequence[Trace], width: float = WIDTH) -> Figure:
     handles: dict[str, Line2D] = {}
     for k, trace in enumerate(traces):
         colour = CASES[k % len(CASES)]
-        out = leaders(trace)
-        waits = [
-            wait
-            for wait, name in zip(transmission_gaps(trace), trace.robots, strict=True)
-            if name not in out and len(wait)
-        ]
+        shared = Measurement(trace)
+        named = zip(shared.waits, trace.robots, strict=True)
+        waits = [wait for wait, name in named if name not in shared.leaders and len(wait)]
         for wait in waits if len(waits) > 1 else []:
             axes.plot(*_steps(wait), color=colour, linewidth=0.5, alpha=0.45, drawstyle="steps-post")
         if waits:

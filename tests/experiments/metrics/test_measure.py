@@ -16,7 +16,7 @@ from experiments.metrics import statistics
 from experiments.metrics.measure import measure
 from experiments.metrics.metric import OURS
 from experiments.metrics.results import CaseMetrics
-from experiments.metrics.signals import belief_errors, formation_errors, net_rotation
+from experiments.metrics.signals import Measurement, belief_errors, net_rotation
 from experiments.report import metrics_files, verdict
 from tests.experiments.traces import STEP, cut, experiment, pair, park, trace
 
@@ -54,7 +54,7 @@ def test_error_sums_over_links_that_a_robot_receives():
     place = np.zeros((2, 3, 3))
     place[:, 1, 0], place[:, 2, 1] = 1.25, 3.0
     gap = math.hypot(1.25, 3.0) - 1.0
-    assert formation_errors(trace(what, place))[0] == pytest.approx([0.25, 0.25 + gap, gap])
+    assert Measurement(trace(what, place)).robot_errors[0] == pytest.approx([0.25, 0.25 + gap, gap])
 
 
 def test_acquired_when_the_one_second_mean_stays_inside():

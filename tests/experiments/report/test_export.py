@@ -13,7 +13,7 @@ from PIL import Image
 from agents.errors import ExplainedError
 from experiments.definition.experiment import Formation, LinkTable
 from experiments.definition.graph import laplacian
-from experiments.metrics.signals import formation_errors
+from experiments.metrics.signals import Measurement
 from experiments.report import export
 from experiments.report.export import KEYWORDS, UNITS, matlab_names, structure
 from tests.runs import fly, recorded
@@ -68,7 +68,7 @@ def test_arrays_come_back_as_they_were(flown, mat, case):
         assert read[name].dtype == float
         assert read[name] == pytest.approx(getattr(trace, name), abs=1e-6, nan_ok=True)  # through the recording
     assert read["position"].shape == (201, 3, 3)
-    assert read["error"] == pytest.approx(formation_errors(trace), abs=1e-6)
+    assert read["error"] == pytest.approx(Measurement(trace).robot_errors, abs=1e-6)
 
 
 def test_who_spoke_and_who_listens_count_from_one(flown, mat):
@@ -138,7 +138,7 @@ def test_table_has_a_line_per_robot_and_time(flown, tmp_path):
     last = rows[-1]
     assert (last["case"], last["robot"], float(last["time"])) == ("event", "CF01", pytest.approx(4.0))
     assert float(last["true_z"]) == pytest.approx(trace.true_position[-1, 2, 2], abs=1e-6)
-    assert float(last["error"]) == pytest.approx(formation_errors(trace)[-1, 2], abs=1e-6)
+    assert float(last["error"]) == pytest.approx(Measurement(trace).robot_errors[-1, 2], abs=1e-6)
     assert not any("nan" in row.values() for row in rows)
 
 
