@@ -150,7 +150,7 @@ def preflight(
     from agents.runtime.command_line import interrupts
     from experiments.file.document import chosen, load
     from experiments.real_time.conductor.conduct import RunOptions, Supervision
-    from experiments.real_time.conductor.emergency import Emergency
+    from experiments.real_time.conductor.orders import Emergency
     from experiments.real_time.conductor.preflight import Trials, check_robots
     from experiments.recording.run_folder import new_folder, remove_unused
     from tools.progress import shown

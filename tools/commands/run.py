@@ -301,7 +301,7 @@ def _conduct(read: Document, folder: Path, options: RunOptions, *, quiet: bool) 
 
     from agents.runtime.command_line import interrupts
     from experiments.real_time.conductor.conduct import Supervision, conduct
-    from experiments.real_time.conductor.emergency import Emergency
+    from experiments.real_time.conductor.orders import Emergency
     from experiments.recording.run_folder import keep_origin, read_origin
     from experiments.run import read_back
     from tools.progress import shown

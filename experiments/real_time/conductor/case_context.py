@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from experiments.definition.plan import Plan
-from experiments.real_time.conductor.emergency import Emergency
+from experiments.real_time.conductor.orders import Emergency
 from experiments.real_time.hosts.hosts import Hosts
 from experiments.real_time.hosts.launcher import Launcher, Process
 from experiments.recording.reader import PARTS

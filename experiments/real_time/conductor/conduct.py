@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -30,7 +30,7 @@ from experiments.file.document import Document, chosen
 from experiments.file.problems import refusal
 from experiments.real_time.conductor.case_context import CaseContext
 from experiments.real_time.conductor.conductor import CaseResult, Conductor
-from experiments.real_time.conductor.emergency import STARTING_S, Emergency
+from experiments.real_time.conductor.orders import STARTING_S, Emergency
 from experiments.real_time.conductor.run_view import ProgressDisplay
 from experiments.real_time.conductor.support import RouterEnded, make_routers, start_routers
 from experiments.real_time.hosts import run_registry
@@ -91,16 +91,16 @@ def conduct(read: Document, folder: Path, options: RunOptions, user: Supervision
     results: dict[str, CaseResult] = {}
     embodied = with_bodies(read, options)
     emergency = user.emergency
-    with run_setup(read, embodied, folder, options, user) as setup, user.show as show:
-        for name in embodied:
-            if user.interrupted() or emergency:
+    with run_setup(read, embodied, folder, options, user) as (contexts, left), user.show as show:
+        for name, context in contexts.items():
+            if context.ended():
                 break
-            results[name] = Conductor(setup.context(name), show).run()
+            results[name] = Conductor(context, show).run()
     unflown = ", ".join(name for name in embodied if name not in results)
     stopped = [emergency.words + (f"; not run: {unflown}" if unflown else "")] if emergency else []
     failures = [f"{case}: {why}" for case, result in results.items() for why in result.failures]
     begun = {case: result.recording for case, result in results.items() if result.start is not None}
-    return Conducted(begun, [*stopped, *failures, *setup.left], failures)
+    return Conducted(begun, [*stopped, *failures, *left], failures)
 
 
 def with_bodies(read: Document, options: RunOptions) -> dict[str, Plan]:
@@ -114,21 +114,13 @@ def with_bodies(read: Document, options: RunOptions) -> dict[str, Plan]:
     return embodied
 
 
-@dataclass
-class RunSetup:
-    """Routers and hosts of a run, while it is up."""
-
-    context: Callable[[str], CaseContext]  # of a case, by its name
-    left: list[str] = field(default_factory=list)  # what was left behind on hosts, known at the end
+# contexts of the cases, and what was left behind on hosts, known at the end
+RunSetup = tuple[dict[str, CaseContext], list[str]]
 
 
 @contextmanager
 def run_setup(
-    read: Document,
-    embodied: Mapping[str, Plan],
-    folder: Path,
-    options: RunOptions,
-    user: Supervision,
+    read: Document, embodied: Mapping[str, Plan], folder: Path, options: RunOptions, user: Supervision
 ) -> Iterator[RunSetup]:
     """Put routers and hosts up for some cases, list the run on this machine, and listen for emergency stops.
 
@@ -148,11 +140,7 @@ def run_setup(
 
 @contextmanager
 def _run_setup(
-    read: Document,
-    embodied: Mapping[str, Plan],
-    folder: Path,
-    options: RunOptions,
-    user: Supervision,
+    read: Document, embodied: Mapping[str, Plan], folder: Path, options: RunOptions, user: Supervision
 ) -> Iterator[RunSetup]:
     """`run_setup`, at ports that are free now."""
     network = read.experiment.network
@@ -174,39 +162,28 @@ def _run_setup(
         "run", read.experiment.title or read.path.stem, endpoints,
         folder=folder, realm=network.realm, identity=options.identity, robots=hardware(embodied.values()),
     )  # fmt: skip
-    with run_registry.registered(me) as unlisted, user.launching(folder / "logs") as launcher:
+    with ExitStack() as up:
+        unlisted = up.enter_context(run_registry.registered(me))
+        launcher = up.enter_context(user.launching(folder / "logs"))
         user.tell([*([unlisted] if unlisted else []), *check_other_runs(me, run_registry.runs(), str(read.path))])
         launcher.preload()
         routers = make_routers(listening, network.routers) if own_router else []
         start_routers(launcher, routers, rights)
         hosts = Hosts(launcher, endpoints if meshed else listening)
         # a mesh has no members yet: only the session of each case receives stops there
-        keys = Keys(network.realm)
-        stops = (
-            nullcontext()
-            if meshed
-            else user.emergency.throughout(endpoints, keys, options.identity, STARTING_S if own_router else ASK_S)
+        if not meshed:
+            wait_s = STARTING_S if own_router else ASK_S
+            up.enter_context(user.emergency.throughout(endpoints, Keys(network.realm), options.identity, wait_s))
+        common = (launcher, hosts, user.interrupted, rights, options.identity, user.emergency)
+        left: list[str] = []
+        yield (
+            {
+                name: CaseContext(plan, name, folder, folder / SOURCE, endpoints, *common)
+                for name, plan in embodied.items()
+            },
+            left,
         )
-
-        def context(name: str) -> CaseContext:
-            return CaseContext(
-                embodied[name],
-                name,
-                folder,
-                source=folder / SOURCE,
-                endpoints=endpoints,
-                launcher=launcher,
-                hosts=hosts,
-                interrupted=user.interrupted,
-                rights=rights,
-                identity=options.identity,
-                emergency=user.emergency,
-            )
-
-        setup = RunSetup(context)
-        with stops:
-            yield setup
-        setup.left += hosts.sweep()
+        left += hosts.sweep()
 
 
 def hardware(cases: Iterable[Plan]) -> dict[str, str]:

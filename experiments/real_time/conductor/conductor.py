@@ -10,6 +10,7 @@ from collections import deque
 from collections.abc import Callable, Container, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from math import inf
 from pathlib import Path
 from typing import Final
 
@@ -294,10 +295,15 @@ class Conductor(CaseRun):
             self._view.report("stop", "conductor", f"{self._context.emergency.words}; the run ends here")
         how = "emergency stop" if self._context.emergency else "interrupted" if self._context.ended() else ""
         self._view.report("phase", "conductor", "landing" + (f" ({how})" if how else ""))
-        if any(not (view.gone or view.reached("landing")) for view in self._robots.values()):
-            self._order(messages.Order("land"))
-        deadline = time.monotonic() + LAND_S
-        while (late := self._not_down()) and time.monotonic() < deadline:
+        deadline, repeat_at = time.monotonic() + LAND_S, -inf
+        while True:
+            if time.monotonic() >= repeat_at:  # a busy machine may have lost the order
+                up = [name for name, view in self._robots.items() if not view.reached("landing")]
+                self._order(messages.Order("land"), up)
+                repeat_at = time.monotonic() + LATE_S
+            late = self._not_down()
+            if not late or time.monotonic() >= deadline:
+                break
             self._update()
             time.sleep(POLL_S)
         for name in late:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import partial
 from typing import TYPE_CHECKING, Final, TypeVar
 
 import zenoh
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from experiments.real_time.hosts.run_registry import RegisteredRun
 
 REPLY_S: Final = 1.0
+STARTING_S: Final = 10.0  # limit for routers that were just started: on a busy machine that takes seconds
 LEAD_S: Final = 0.5  # from the order to the common start: every robot has it by then,
 LEAD_EACH_S: Final = 0.01  # and the additional time for each robot
 STOP_ANSWER_S: Final = 2.0
@@ -45,7 +46,7 @@ def send_order(
     asked = {robot: _ask(session, keys.order(robot), order, wait_s) for robot in robots}
     replies = {}
     for robot, answers in asked.items():
-        reply, why = _read(answers, keys.order(robot), messages.Reply, partial(_is_of, robot))
+        reply, why = _read(answers, keys.order(robot), messages.Reply, robot)
         replies[robot] = reply or messages.Reply(robot, ok=False, phase="unknown", reason=why or "no answer")
     return replies
 
@@ -89,14 +90,8 @@ def _ask(
     )
 
 
-def _is_of(robot: str, reply: messages.Reply) -> bool:
-    return reply.robot == robot
-
-
-def _read(
-    asked: Iterable[zenoh.Reply], key: str, kind: type[R], wanted: Callable[[R], bool] = lambda _: True
-) -> tuple[R | None, str]:
-    """The first wanted reply on the key, or the reason why there is none; empty without any answer."""
+def _read(asked: Iterable[zenoh.Reply], key: str, kind: type[R], robot: str | None = None) -> tuple[R | None, str]:
+    """The first reply on the key, of `robot` if one is named, or the reason why there is none; empty: no answer."""
     why = ""
     for reply in asked:
         if reply.ok is not None and str(reply.ok.key_expr) == key:
@@ -105,7 +100,7 @@ def _read(
             except messages.Malformed as error:
                 why = why or f"malformed reply: {error}"
             else:
-                if wanted(found):
+                if getattr(found, "robot", None) == robot:
                     return found, ""
         elif reply.err is not None:
             why = reply.err.payload.to_bytes().decode(errors="replace")
@@ -198,3 +193,37 @@ class EmergencyStop:
         """Whether more members of a mesh may still be linked."""
         late = time.monotonic() > begun + network.GATHER_S
         return topology.is_mesh(self.endpoints) and not late and network.count_links(session) < len(self.endpoints)
+
+
+class Emergency:
+    """Reception of emergency stops."""
+
+    def __init__(self) -> None:
+        self.stop: messages.Stop | None = None  # the first one received
+
+    def __bool__(self) -> bool:
+        return self.stop is not None
+
+    @property
+    def words(self) -> str:
+        """Sender and reason of the stop; empty without one."""
+        return "" if self.stop is None else self.stop.words
+
+    def listen(self, session: zenoh.Session, keys: Keys) -> pubsub.ImmediateSubscriber:
+        """Receive stops in a realm until the subscriber is closed."""
+
+        def receive(stop: messages.Stop) -> None:
+            self.stop = self.stop or stop
+
+        return pubsub.ImmediateSubscriber(session, keys.estop, receive)
+
+    @contextmanager
+    def throughout(self, endpoints: Sequence[str], keys: Keys, identity: str, wait_s: float) -> Iterator[None]:
+        """Receive stops by a session of its own: those of the cases are closed between them.
+
+        `identity` is the name in the certificate, in a lab. Raises Unreachable if no router answers in `wait_s`.
+        """
+        opened = network.open_session(endpoints, name="emergency stops", identity=identity, wait_s=wait_s)
+        with closing_cleanly(opened) as (session, declared):
+            declared.append(self.listen(session, keys))
+            yield

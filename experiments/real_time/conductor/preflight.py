@@ -71,8 +71,8 @@ def check_robots(
         The checks of each robot; none if the user ended them before they began.
     """
     plan = alone(next(iter(with_bodies(read, options).values())))
-    with run_setup(read, {PREFLIGHT: plan}, folder, options, user) as setup, user.show as show:
-        return Inspector(setup.context(PREFLIGHT), show, trials).run()
+    with run_setup(read, {PREFLIGHT: plan}, folder, options, user) as (contexts, _), user.show as show:
+        return Inspector(contexts[PREFLIGHT], show, trials).run()
 
 
 def alone(plan: Plan) -> Plan:

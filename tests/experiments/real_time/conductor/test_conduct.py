@@ -23,7 +23,7 @@ from experiments.file.problems import DocumentError
 from experiments.real_time.conductor import conduct
 from experiments.real_time.conductor.case_context import CaseContext
 from experiments.real_time.conductor.conduct import PORT_CHOICES, RunOptions, Supervision, run_setup, with_bodies
-from experiments.real_time.conductor.emergency import STARTING_S, Emergency
+from experiments.real_time.conductor.orders import STARTING_S, Emergency
 from experiments.real_time.conductor.support import STARTS, RouterEnded, SupportProcesses
 from experiments.real_time.hosts import run_registry
 from experiments.real_time.hosts.hosts import Hosts
@@ -153,8 +153,8 @@ def test_router_with_port_taken_meanwhile_listens_elsewhere(tmp_path, monkeypatc
         chosen = iter(free)
         monkeypatch.setattr(conduct, "free_endpoints", lambda *_, **__: next(chosen))
         read, user = document.read("triangle"), Supervision(nullcontext(), lambda: False)
-        with run_setup(read, with_bodies(read, RunOptions()), tmp_path, RunOptions(), user) as stage:
-            assert stage.context("event").endpoints == free[-1]
+        with run_setup(read, with_bodies(read, RunOptions()), tmp_path, RunOptions(), user) as (contexts, _):
+            assert contexts["event"].endpoints == free[-1]
             (run,) = [run for run in run_registry.runs() if run.folder == str(tmp_path)]
             assert run.endpoints == free[-1]
         chosen = iter([[taken]] * PORT_CHOICES)

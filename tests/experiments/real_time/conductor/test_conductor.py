@@ -32,7 +32,8 @@ class Course(Conductor):
     """A conductor whose robots are in `phases`, by the time since the common start."""
 
     def __init__(self, phases: dict[float, str], deaths: dict[float, Death] | None = None) -> None:
-        self._clock: Any = Clock()
+        self.clock = Clock()
+        self._clock: Any = self.clock
         self._experiment = EXPERIMENT
         self.robots = self._robots = {name: RobotView() for name in EXPERIMENT.robots}
         self._progress = Progress("only", "", None, 10.0, self._robots)
@@ -43,19 +44,21 @@ class Course(Conductor):
         self.reasons: dict[str, str] = {}  # of robots that have landed at 3 s, before all others
         self.killed = 0
         nothing: Any = SimpleNamespace(
-            under_way=set(), begin=lambda _: None, advance=lambda: None, news=lambda: ((), ())
+            under_way=set(), begin=lambda _: None, advance=lambda: None, news=lambda: ((), ()), close=lambda: None
         )
         self._changes = self._drift = nothing
-        self._context: Any = SimpleNamespace(ended=lambda: False)
+        self._context: Any = SimpleNamespace(ended=lambda: False, emergency=None)
         self.processes: Any = SimpleNamespace(
             deaths=self._died, recording=True, kill_recorder=lambda: setattr(self, "killed", self.killed + 1)
         )
         self.view: Any = SimpleNamespace(
             update=self._phase, report=lambda *_, **__: None, report_drift=lambda *_: None, order=lambda *_: {},
             recorder_stands_still=False, recording_begun=True, await_recorder=lambda: None,
+            refuse_joining=lambda: None,
         )  # fmt: skip
         self._processes, self._view = self.processes, self.view
-        self.update = self._update
+        self.update, self.land = self._update, self._land
+        self._show: Any = lambda _: None
 
     def _show_progress(self) -> None: ...
 
@@ -131,6 +134,17 @@ def test_a_recorder_that_stands_still_is_killed() -> None:
     course.view.recorder_stands_still = True
     course.update()
     assert course.killed == 1
+
+
+def test_order_to_land_is_repeated_until_all_obey(monkeypatch):
+    course = Course({0.0: "running", 4.0: "done"})
+    monkeypatch.setattr(module, "time", SimpleNamespace(sleep=lambda _: None, monotonic=lambda: course.clock.now))
+    asked: list[tuple[str, list[str]]] = []
+    course.view.order = lambda names, order: asked.append((order.order, names)) or {}
+    course.update()
+    course.land()
+    assert asked[:3] == [("land", list(course.robots))] * 3
+    assert not any(view.left_because for view in course.robots.values())
 
 
 def test_output_of_a_lost_robot_is_told_once():
