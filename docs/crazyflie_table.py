@@ -110,7 +110,7 @@ def law_difference(setpoints: Array) -> tuple[float, float]:
         engine.place([0], [(0.0, 0.0, 1.0)], [0.0], [True])
         path = []
         for x, y, z, yaw in setpoints.tolist():
-            engine.command([(x, y, z, yaw)])
+            engine.motions[0].command((x, y, z, yaw))
             engine.advance(0.0, [(0.0, 0.0)])
             path.append(engine.motions[0].position)
         paths.append(np.array(path))

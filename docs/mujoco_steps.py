@@ -27,7 +27,7 @@ def flown(engine: Engine, axis: int, step: float) -> Array:
     x, y, z, yaw = (value + step * (number == axis) for number, value in enumerate(hold))
     motion, path = engine.motions[0], [0.0]
     for _ in range(round(SECONDS / DT)):
-        engine.command([(x, y, z, yaw)])
+        engine.motions[0].command((x, y, z, yaw))
         engine.advance(0.0, [(0.0, 0.0)])
         path.append([*motion.position, motion.yaw][axis] - hold[axis])
     return np.column_stack([DT * np.arange(len(path)), path])

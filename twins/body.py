@@ -14,10 +14,11 @@ from agents.body.interface import BodyRequest, BodyState, Disturbance
 from agents.body.kinds import Kind
 from agents.body.shadow_twin import Placeable
 from agents.vectors import NO_SETPOINT, ZERO, Setpoint, Vector
-from twins.engines.engine import Engine, EngineInput, Motion, Touch, World
+from twins.engines.engine import Engine, EngineInput, Touch, World
 from twins.engines.point_mass import PointMassEngine, model, require_models
 from twins.models import noise
 from twins.models.disturbance import HoverJitter, Latency, MeasurementNoise, OdometryDrift
+from twins.models.motion import Motion
 from twins.models.onboard_flight import OnboardFlight
 
 if TYPE_CHECKING:  # a process of one robot needs no scene, which needs numpy
@@ -260,7 +261,7 @@ class TwinBody(Placeable):
         self._measure()
         for row, velocity in zip(rows, moving, strict=True):
             if velocities is not None and self._alone is not None:
-                self._alone.push(row, velocity)
+                self._alone.motions[row].push(velocity)
             self.twins[row].settle(velocity)
             self._states[row].velocity = velocity
 

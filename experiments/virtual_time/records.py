@@ -136,7 +136,7 @@ class Layouts:
         owner: type = type(thing)
         fields, fixed = dict[str, Any](), dict[str, Any]()
         names = getattr(owner, "FIXED", ())
-        for name in attributes(owner) or getattr(thing, "__dict__", ()):
+        for name in (*attributes(owner), *getattr(thing, "__dict__", ())):
             try:
                 value = getattr(thing, name)
             except AttributeError:  # never set

@@ -29,7 +29,8 @@ def furnished(obstacles, plans=None, size=(4.0, 4.0, 3.0), walled=False):
 
 
 def command(engine, setpoints):
-    engine.command([tuple(setpoint) for setpoint in np.array(setpoints, dtype=float).tolist()])
+    for motion, setpoint in zip(engine.motions, np.array(setpoints, dtype=float).tolist(), strict=True):
+        motion.command(tuple(setpoint))
 
 
 def columns(engine, name):

@@ -5,15 +5,17 @@ Engines are found by the entry-point group `zenpark.engines`: a frozen struct of
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Protocol
+from typing import TYPE_CHECKING, ClassVar
 
 import msgspec
 
-from agents.body.interface import NO_ATTITUDE, Attitude, BodyError
+from agents.body.interface import NO_ATTITUDE, BodyError
 from agents.body.kinds import Kind
-from agents.vectors import UNKNOWN, ZERO, Setpoint, Vector
+from agents.vectors import UNKNOWN, ZERO, Vector
+from twins.models.motion import Motion
 
 if TYPE_CHECKING:  # a process of one robot needs no scene, which needs numpy
     from twins.scene import Scene
@@ -45,52 +47,8 @@ class Touch:
     overlap: float  # [m]
 
 
-class Motion(Protocol):
-    """Motion of one robot."""
-
-    position: Vector  # the truth, hover jitter included [m]
-    velocity: Vector  # as known by the robot's controller: without hover jitter [m/s]
-    yaw: float  # [rad]
-    flying: bool  # motors on, in the air or about to be
-    attitude: Attitude  # unit quaternion from robot to world; NaN: upright
-    wobble: Planar  # hover jitter of the next step [m]
-
-    def move(self, dt: float) -> None:
-        """One step of `dt` [s] by itself; of no effect where the engine moves robots together."""
-        ...
-
-    def command(self, setpoint: Setpoint) -> None:
-        """Set the setpoint as in `agents.body.interface.Body.command`; NaN keeps the last one."""
-        ...
-
-    def takeoff(self, height: float) -> None:
-        """Climb to `height` [m], if the robot flies."""
-        ...
-
-    def land(self) -> None:
-        """Descend and switch off; on wheels, halt."""
-        ...
-
-    def stop(self) -> None:
-        """Switch motors off at once."""
-        ...
-
-    def place(self, position: Vector, yaw: float, *, flying: bool) -> None:
-        """Set position [m] and yaw [rad], at rest; a flying robot holds them."""
-        ...
-
-
-class Mirrored:
+class Mirrored(Motion):
     """Motion of a robot that really is elsewhere: as `shown`, absent (NaN) before. Orders have no effect."""
-
-    __slots__ = ("_position", "_velocity", "_yaw", "attitude", "flying", "position", "velocity", "wobble", "yaw")
-
-    position: Vector  # [m]
-    velocity: Vector  # [m/s]
-    yaw: float  # [rad]
-    flying: bool
-    attitude: Attitude
-    wobble: Planar
 
     def __init__(self, yaw: float) -> None:
         self.position = self._position = UNKNOWN
@@ -103,49 +61,16 @@ class Mirrored:
         self._position, self._yaw, self._velocity = position, yaw, velocity
 
     def move(self, dt: float) -> None:
-        """One step of `dt` [s]."""
         self.position, self.yaw, self.velocity = self._position, self._yaw, self._velocity
 
-    def command(self, setpoint: Setpoint) -> None:
-        """Of no effect."""
 
-    def takeoff(self, height: float) -> None:
-        """Of no effect."""
-
-    def land(self) -> None:
-        """Of no effect."""
-
-    def stop(self) -> None:
-        """Of no effect."""
-
-    def place(self, position: Vector, yaw: float, *, flying: bool) -> None:
-        """Of no effect."""
-
-
-class Engine(Protocol):
+class Engine(ABC):
     """Motion of n robots and of the obstacles."""
 
-    @property
-    def motions(self) -> Sequence[Motion]: ...  # of the robots; the same objects for ever
-    @property
-    def obstacles(self) -> Sequence[Pose]: ...  # current poses of the obstacles
+    motions: Sequence[Motion]  # of the robots; the same objects for ever
+    obstacles: Sequence[Pose]  # current poses of the obstacles
 
-    def command(self, setpoints: Sequence[Setpoint]) -> None:
-        """Set a setpoint for each robot, see `Motion.command`."""
-        ...
-
-    def takeoff(self, rows: Sequence[int], heights: Sequence[float]) -> None:
-        """Make flying robots climb to `heights` [m]."""
-        ...
-
-    def land(self, rows: Sequence[int]) -> None:
-        """Make flying robots descend and switch off, and ground robots halt."""
-        ...
-
-    def stop(self, rows: Sequence[int]) -> None:
-        """Switch motors off at once."""
-        ...
-
+    @abstractmethod
     def advance(self, t: float, wobble: Sequence[Planar]) -> None:
         """Advance one step of dt, to `t` [s] after the common start (negative before).
 
@@ -153,23 +78,41 @@ class Engine(Protocol):
             t: Time for obstacles with a plan.
             wobble: Hover jitter: horizontal displacement added to each flying robot at the end of the step [m].
         """
-        ...
+
+    def takeoff(self, rows: Sequence[int], heights: Sequence[float]) -> None:
+        """Make flying robots climb to `heights` [m]."""
+        for row, height in zip(rows, heights, strict=True):
+            self.motions[row].takeoff(height)
+
+    def land(self, rows: Sequence[int]) -> None:
+        """Make flying robots descend and switch off, and ground robots halt."""
+        for row in rows:
+            self.motions[row].land()
+
+    def stop(self, rows: Sequence[int]) -> None:
+        """Switch motors off at once."""
+        for row in rows:
+            self.motions[row].stop()
 
     def place(
         self, rows: Sequence[int], positions: Sequence[Vector], yaws: Sequence[float], flying: Sequence[bool]
     ) -> None:
         """Set positions [m] and yaws [rad], at rest; flying robots hold them."""
-        ...
+        for row, position, yaw, flies in zip(rows, positions, yaws, flying, strict=True):
+            self.motions[row].place(position, yaw, flying=flies)
 
     def mirror(
         self, rows: Sequence[int], positions: Sequence[Vector], yaws: Sequence[float], velocities: Sequence[Vector]
     ) -> None:
         """Set the state of mirrored robots from the next step on: [m], [rad], [m/s]; NaN: absent."""
-        ...
+        for row, position, yaw, velocity in zip(rows, positions, yaws, velocities, strict=True):
+            motion = self.motions[row]
+            if isinstance(motion, Mirrored):
+                motion.show(position, yaw, velocity)
 
     def touches(self) -> list[Touch]:
         """Contacts that began since the last call; always empty in an engine without contacts."""
-        ...
+        return []
 
 
 class EngineFactory(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -21,9 +21,10 @@ from agents.body.kinds import Kind
 from agents.vectors import ZERO, Vector
 from twins.arrays import Array, Index, Mask, any_true, clamp, norm
 from twins.engines.crazyflie_cascade import RATE_HZ, Firmware
-from twins.engines.engine import EngineFactory, EngineInput, Mirrored, Planar, Pose, Touch
+from twins.engines.engine import Engine, EngineFactory, EngineInput, Mirrored, Planar
 from twins.engines.mujoco_model import mjcf
-from twins.engines.point_mass import MotionOrders, Moving, model, require_models
+from twins.engines.point_mass import model, require_models
+from twins.models.motion import Motion
 from twins.models.onboard_flight import OnboardFlight
 from twins.models.quadrotor import GRAVITY
 from twins.scene import Scene
@@ -47,8 +48,8 @@ class RigidBody(EngineFactory, frozen=True):
         return RigidBodyEngine(stage, self.motor_lag_s)
 
 
-class RigidBodyEngine(MotionOrders["MujocoDrone | Moving"]):
-    """Implements `twins.engines.engine.Engine`; ground robots are those of the point-mass engine."""
+class RigidBodyEngine(Engine):
+    """Engine of rigid drones; ground robots are those of the point-mass engine."""
 
     def __init__(self, stage: EngineInput, motor_lag: float) -> None:
         """`motor_lag`: of a thrust [s]; raises BodyError for a kind without a twin, or without MuJoCo."""
@@ -56,7 +57,7 @@ class RigidBodyEngine(MotionOrders["MujocoDrone | Moving"]):
         self._dt, self._scene = stage.dt, stage.scene
         self._air = [row for row, kind in enumerate(stage.kinds) if kind.flies and not stage.mirrored[row]]
         self.drones = Drones([stage.kinds[row] for row in self._air], stage.dt, scene=stage.scene, motor_lag=motor_lag)
-        self.motions: list[MujocoDrone | Moving] = []
+        self.motions: list[Motion] = []
         for row, kind in enumerate(stage.kinds):
             start, yaw = stage.start[row], stage.yaw[row]
             if stage.mirrored[row]:
@@ -65,7 +66,7 @@ class RigidBodyEngine(MotionOrders["MujocoDrone | Moving"]):
                 self.motions.append(self.drones.add(kind, start, yaw))
             else:
                 self.motions.append(model(kind, start, yaw))
-        self.obstacles: list[Pose] = stage.scene.start
+        self.obstacles = stage.scene.start
         self._update_attitudes()
 
     def place(
@@ -84,10 +85,6 @@ class RigidBodyEngine(MotionOrders["MujocoDrone | Moving"]):
         self._update_attitudes()
         if any(self._scene.plans):
             self.obstacles = self._scene.poses(t)
-
-    def touches(self) -> list[Touch]:
-        """See `Engine.touches`: always empty."""
-        return []
 
     def _update_attitudes(self) -> None:
         """Update the attitude of what stays upright."""

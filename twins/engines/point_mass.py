@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Final, Generic, TypeVar
+from collections.abc import Callable, Iterable, Sequence
+from typing import TYPE_CHECKING, Final
 
 from agents.body.interface import BodyError
 from agents.body.kinds import Flight, Holonomic, Kind, Steered, Wheels
 from agents.plugins import registry
-from agents.vectors import Setpoint, Vector
-from twins.engines.engine import EngineFactory, EngineInput, Mirrored, Motion, Planar, Pose, Touch
+from agents.vectors import Vector
+from twins.engines.engine import Engine, EngineFactory, EngineInput, Mirrored, Planar
 from twins.models.differential import Differential
-from twins.models.ground import Bicycle, Ground, Omni
+from twins.models.ground import Bicycle, Omni
+from twins.models.motion import Motion
 from twins.models.quadrotor import Quadrotor
 
 if TYPE_CHECKING:  # a process of one robot needs no scene, which needs numpy
     from twins.scene import Scene
-
-Moving = Quadrotor | Differential | Ground | Mirrored
 
 
 class PointMass(EngineFactory, frozen=True):
@@ -30,12 +29,9 @@ class PointMass(EngineFactory, frozen=True):
 TWINLESS: Final = "give the kind a `motion` (docs/plugins.md), or name another body"  # if `has_model` is false
 
 
-MODELS: Final[dict[type, type[Quadrotor | Differential | Ground]]] = {
-    Flight: Quadrotor,
-    Wheels: Differential,
-    Holonomic: Omni,
-    Steered: Bicycle,
-}
+MODELS: Final[dict[type, Callable[[Kind, Vector, float], Motion]]] = {
+    Flight: Quadrotor, Wheels: Differential, Holonomic: Omni, Steered: Bicycle,
+}  # fmt: skip
 SETPOINTS: Final = {Flight: ("position", "velocity"), Wheels: "twist", Holonomic: "velocity", Steered: "twist"}
 
 
@@ -53,17 +49,17 @@ def require_models(kinds: Iterable[Kind]) -> None:
         raise BodyError(f"no twin of {', '.join(map(repr, unknown))}; {TWINLESS}")
 
 
-def model(kind: Kind, start: Vector, yaw: float) -> Quadrotor | Differential | Ground:
+def model(kind: Kind, start: Vector, yaw: float) -> Motion:
     """Motion model of a robot at rest at `start` [m], `yaw` [rad]; raises PluginError if its kind names none."""
     motion = kind.motion
     assert motion is not None
     if isinstance(motion, str):
-        made: Ground = registry.find(motion, f"motion of the kind {kind.name!r}")(kind, start, yaw)
+        made: Motion = registry.find(motion, f"motion of the kind {kind.name!r}")(kind, start, yaw)
         return made
     return MODELS[type(motion)](kind, start, yaw)
 
 
-def moving_models(stage: EngineInput) -> list[Moving]:
+def moving_models(stage: EngineInput) -> list[Motion]:
     """Motion models of all robots; raises BodyError for a kind without one."""
     require_models(stage.kinds)
     return [
@@ -72,53 +68,14 @@ def moving_models(stage: EngineInput) -> list[Moving]:
     ]
 
 
-MotionT = TypeVar("MotionT", bound=Motion)
+class PointMassEngine(Engine):
+    """Engine of robots that may as well be moved one by one, see `twins.body.Twin`."""
 
-
-class MotionOrders(Generic[MotionT]):
-    """Orders to robots by their rows."""
-
-    motions: list[MotionT]
-
-    def command(self, setpoints: Sequence[Setpoint]) -> None:
-        for motion, setpoint in zip(self.motions, setpoints, strict=True):
-            motion.command(setpoint)
-
-    def takeoff(self, rows: Sequence[int], heights: Sequence[float]) -> None:
-        for row, height in zip(rows, heights, strict=True):
-            self.motions[row].takeoff(height)
-
-    def land(self, rows: Sequence[int]) -> None:
-        for row in rows:
-            self.motions[row].land()
-
-    def stop(self, rows: Sequence[int]) -> None:
-        for row in rows:
-            self.motions[row].stop()
-
-    def place(
-        self, rows: Sequence[int], positions: Sequence[Vector], yaws: Sequence[float], flying: Sequence[bool]
-    ) -> None:
-        for row, position, yaw, flies in zip(rows, positions, yaws, flying, strict=True):
-            self.motions[row].place(position, yaw, flying=flies)
-
-    def mirror(
-        self, rows: Sequence[int], positions: Sequence[Vector], yaws: Sequence[float], velocities: Sequence[Vector]
-    ) -> None:
-        for row, position, yaw, velocity in zip(rows, positions, yaws, velocities, strict=True):
-            motion = self.motions[row]
-            if isinstance(motion, Mirrored):
-                motion.show(position, yaw, velocity)
-
-
-class PointMassEngine(MotionOrders[Moving]):
-    """Implements `twins.engines.engine.Engine`. Its robots may as well be moved one by one, see `twins.body.Twin`."""
-
-    def __init__(self, motions: list[Moving], dt: float, scene: Scene | None = None) -> None:
+    def __init__(self, motions: list[Motion], dt: float, scene: Scene | None = None) -> None:
         self.motions = motions
         self._dt, self._scene = dt, scene
         self.moves_obstacles = scene is not None and any(scene.plans)
-        self.obstacles: list[Pose] = [] if scene is None else scene.start
+        self.obstacles = [] if scene is None else scene.start
 
     def advance(self, t: float, wobble: Sequence[Planar]) -> None:
         dt = self._dt
@@ -132,13 +89,3 @@ class PointMassEngine(MotionOrders[Moving]):
         """Move obstacles with a plan to where they are at `t` [s] after the common start."""
         if self._scene is not None:
             self.obstacles = self._scene.poses(t)
-
-    def push(self, row: int, velocity: Vector) -> None:
-        """Set a velocity [m/s]; of a ground robot the component along its heading."""
-        motion = self.motions[row]
-        if not isinstance(motion, Mirrored):
-            motion.push(velocity)
-
-    def touches(self) -> list[Touch]:
-        """See `Engine.touches`: always empty."""
-        return []

@@ -13,9 +13,9 @@ from msgspec import Meta
 
 from agents.body.kinds import Flight, Kind, Wheels
 from agents.vectors import Share, Vector, clamp, is_finite
-from twins.engines.engine import EngineFactory, EngineInput, Mirrored, Pose, Touch, require_carried
+from twins.engines.engine import Engine, EngineFactory, EngineInput, Mirrored, Pose, Touch, require_carried
 from twins.engines.engine import Planar as Displacement
-from twins.engines.point_mass import MotionOrders, Moving, moving_models, require_models
+from twins.engines.point_mass import moving_models, require_models
 from twins.engines.pymunk_contacts import Contacts, Layers
 from twins.engines.pymunk_space import ArenaSpace, Surfaces
 from twins.models.differential import Differential
@@ -60,8 +60,8 @@ class Planar(EngineFactory, frozen=True):
         return PlanarEngine(stage, self)
 
 
-class PlanarEngine(MotionOrders[Moving]):
-    """Implements `twins.engines.engine.Engine`.
+class PlanarEngine(Engine):
+    """Engine with contacts.
 
     The motion models compute the velocity of each robot after this tick. Forces within the grip of the wheels, or the
     thrust of a tilted quadrotor, bring the body to that velocity; pymunk's solver adds the contacts. Without contact a

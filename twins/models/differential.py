@@ -8,25 +8,19 @@ from __future__ import annotations
 
 from math import cos, isfinite, sin
 
-from agents.body.interface import NO_ATTITUDE, Attitude
+from agents.body.interface import NO_ATTITUDE
 from agents.body.kinds import Kind, Wheels
 from agents.vectors import ZERO, Setpoint, Vector, clamp
+from twins.models.motion import Motion
 
 
-class Differential:
+class Differential(Motion):
     """One differential robot."""
 
     __slots__ = (
         "_acceleration", "_base", "_half_base", "_left", "_limit", "_right", "_wanted_left", "_wanted_right",
-        "attitude", "flying", "position", "velocity", "wobble", "yaw",
     )  # fmt: skip
 
-    position: Vector  # [m]; z stays as it is
-    velocity: Vector  # [m/s]
-    yaw: float  # [rad]
-    flying: bool  # never
-    attitude: Attitude  # NaN: upright
-    wobble: tuple[float, float]  # of no effect: hover jitter is of flying robots
     _base: float  # distance between the wheels [m],
     _half_base: float  # and half of it
     _limit: float  # largest rim speed [m/s]
@@ -52,24 +46,15 @@ class Differential:
         if isfinite(left):
             self._wanted_left, self._wanted_right = left, v + half
 
-    def takeoff(self, height: float) -> None:
-        """Of no effect."""
-
     def land(self) -> None:
         """Command zero wheel speed."""
         self._wanted_left = self._wanted_right = 0.0
 
-    def stop(self) -> None:
-        """Command zero wheel speed."""
-        self._wanted_left = self._wanted_right = 0.0
-
     def place(self, position: Vector, yaw: float, *, flying: bool) -> None:
-        """Set position [m] and yaw [rad], at rest."""
         self.position, self.velocity, self.yaw = position, ZERO, yaw
         self._left = self._right = self._wanted_left = self._wanted_right = 0.0
 
     def push(self, velocity: Vector) -> None:
-        """Drive straight ahead with the component of a velocity [m/s] along the heading."""
         speed = velocity[0] * cos(self.yaw) + velocity[1] * sin(self.yaw)
         self._left = self._right = self._wanted_left = self._wanted_right = speed
 

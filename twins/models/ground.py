@@ -8,24 +8,19 @@ from __future__ import annotations
 from math import atan, cos, sin, sqrt, tan
 from typing import Final
 
-from agents.body.interface import NO_ATTITUDE, Attitude
+from agents.body.interface import NO_ATTITUDE
 from agents.body.kinds import Holonomic, Kind, Steered
 from agents.vectors import ZERO, Setpoint, Vector, clamp
+from twins.models.motion import Motion
 
 REST: Final[Setpoint] = (0.0, 0.0, 0.0, 0.0)
 CREEP: Final = 1e-6  # [m/s] a slower twist says nothing of the steering angle
 
 
-class Ground:
+class Ground(Motion):
     """One robot on the floor. A model adds `move`, and what it remembers as attributes that `rest` sets."""
 
-    position: Vector  # [m]; z stays as it is
-    velocity: Vector  # [m/s]
-    yaw: float  # [rad]
     setpoint: Setpoint  # the last command: v_x, v_y [m/s], 0, yaw rate [rad/s] in the room; or v, ω, 0, 0
-    flying: bool  # never
-    attitude: Attitude  # NaN: upright
-    wobble: tuple[float, float]  # of no effect: hover jitter is of flying robots
 
     def __init__(self, kind: Kind, start: Vector, yaw: float) -> None:
         """At rest at `start` [m] with `yaw` [rad]."""
@@ -38,14 +33,7 @@ class Ground:
         if x == x:  # noqa: PLR0124 - not NaN
             self.setpoint = setpoint
 
-    def takeoff(self, height: float) -> None:
-        """Of no effect."""
-
     def land(self) -> None:
-        """Command standing still."""
-        self.setpoint = REST
-
-    def stop(self) -> None:
         """Command standing still."""
         self.setpoint = REST
 
@@ -56,14 +44,6 @@ class Ground:
 
     def rest(self) -> None:
         """Set what a model remembers to that of a robot at rest."""
-
-    def push(self, velocity: Vector) -> None:
-        """Set the velocity [m/s]."""
-        self.velocity = velocity
-
-    def move(self, dt: float) -> None:
-        """One step of `dt` [s]: set position, velocity and yaw."""
-        raise NotImplementedError
 
 
 class Omni(Ground):
@@ -119,7 +99,6 @@ class Bicycle(Ground):
         self._along, self._angle = 0.0, 0.0  # speed along the heading [m/s], steering angle [rad]
 
     def push(self, velocity: Vector) -> None:
-        """Drive straight ahead with the component of a velocity [m/s] along the heading."""
         self._along = velocity[0] * cos(self.yaw) + velocity[1] * sin(self.yaw)
         self.setpoint = (self._along, 0.0, 0.0, 0.0)
 

@@ -4,31 +4,25 @@ from __future__ import annotations
 
 from typing import Final
 
-from agents.body.interface import NO_ATTITUDE, Attitude
+from agents.body.interface import NO_ATTITUDE
 from agents.body.kinds import Kind
 from agents.vectors import ZERO, Setpoint, Vector
+from twins.models.motion import Motion
 
 CLIMB: Final = 0.4  # [m/s] mean speed of take-offs and landings
 SHORTEST_S: Final = 0.5  # duration of a take-off or landing
 TOUCHDOWN: Final = 0.02  # [m] a landing robot below this height is down
 
 
-class OnboardFlight:
+class OnboardFlight(Motion):
     """State, setpoints, take-offs and landings of a quadrotor; subclasses add the motion."""
 
     __slots__ = (
         "_by_velocity", "_climb_s", "_climbing", "_elapsed", "_from", "_landing", "_target", "_to",
-        "_velocity_setpoint", "_yaw_rate", "_yaw_setpoint", "attitude", "flying", "held", "position", "velocity",
-        "wind", "wobble", "yaw",
+        "_velocity_setpoint", "_yaw_rate", "_yaw_setpoint", "held", "wind",
     )  # fmt: skip
 
-    position: Vector  # the truth, hover jitter included [m]
-    held: Vector  # as the controller knows it: without hover jitter [m]
-    velocity: Vector  # as the controller knows it [m/s]
-    yaw: float  # [rad]
-    flying: bool  # motors on
-    attitude: Attitude  # NaN where it is always upright
-    wobble: tuple[float, float]  # hover jitter of the next step [m]
+    held: Vector  # position as the controller knows it: without hover jitter [m]
     wind: tuple[float, float]  # acceleration that it adds while the motors are on [m/s²]
     _by_velocity: bool  # setpoints are velocity and yaw rate
     _target: Vector  # setpoint of the position [m],
@@ -81,7 +75,6 @@ class OnboardFlight:
         self.flying = self._landing = False
 
     def place(self, position: Vector, yaw: float, *, flying: bool) -> None:
-        """Set position [m] and yaw [rad], at rest; a flying robot holds them."""
         self.position = self.held = self._target = position
         self.velocity = self._velocity_setpoint = ZERO
         self.yaw = self._yaw_setpoint = yaw

@@ -42,10 +42,6 @@ class Quadrotor(OnboardFlight):
         super().place(position, yaw, flying=flying)
         self._change = ZERO
 
-    def push(self, velocity: Vector) -> None:
-        """Set the velocity [m/s]."""
-        self.velocity = velocity
-
     def move(self, dt: float) -> None:
         """One step of `dt` [s]: v_cmd = clip(k_p (target − p), ± limit), a = k_v (v_cmd − v), delayed by tilting.
 
