@@ -102,14 +102,7 @@ class Trends:
         return known
 
     def row(
-        self,
-        name: str,
-        status: Status | None,
-        *,
-        now: float,
-        error: float | None,
-        gone: str = "",
-        lost: bool = False,
+        self, name: str, status: Status | None, *, now: float, error: float | None, gone: str = "", lost: bool = False
     ) -> LiveRow:
         """The row of a robot.
 

@@ -103,9 +103,7 @@ def example(*lines: str) -> str:
 File = Annotated[
     str,
     typer.Argument(
-        metavar="FILE",
-        help="Experiment file, or the name of a ready-made one.",
-        autocompletion=completion.experiments,
+        metavar="FILE", help="Experiment file, or the name of a ready-made one.", autocompletion=completion.experiments
     ),
 ]
 Connect = Annotated[
@@ -132,8 +130,7 @@ KeyExpression = Annotated[str, typer.Argument(metavar="KEY", help="Key expressio
 Seconds = Annotated[float | None, typer.Option(min=0.0, help="End after this time [s].")]
 Realm = Annotated[str, typer.Option(metavar="NAME", help="First chunk of the keys.")]
 Case = Annotated[
-    str | None,
-    typer.Option(metavar="NAME", help="A case of the file. [the first]", autocompletion=completion.cases),
+    str | None, typer.Option(metavar="NAME", help="A case of the file. [the first]", autocompletion=completion.cases)
 ]
 Cases = Annotated[
     list[str] | None,
@@ -144,8 +141,7 @@ Out = Annotated[str | None, typer.Option(metavar="FOLDER", help="Folder for the 
 Bodies = Annotated[
     str | None,
     typer.Option(
-        metavar="twin|world|protocol",
-        help="Bodies: a twin per robot, one world, or protocol twins (real time).",
+        metavar="twin|world|protocol", help="Bodies: a twin per robot, one world, or protocol twins (real time)."
     ),
 ]
 Here = Annotated[bool, typer.Option("--here", help="Run all robots on this machine, ignoring [hosts].")]

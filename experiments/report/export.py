@@ -43,14 +43,7 @@ UNITS: Final[dict[str, Any]] = {
     "tolerance": "m",
     "phase_start": "s",
     "adjacency": "1 if the robot of the row receives poses of that of the column",
-    "sent": {
-        "time": "s",
-        "robot": "row in robots",
-        "position": "m",
-        "velocity": "m/s",
-        "yaw": "rad",
-        "bytes": "bytes",
-    },
+    "sent": {"time": "s", "robot": "row in robots", "position": "m", "velocity": "m/s", "yaw": "rad", "bytes": "bytes"},
     "links": {
         "receiver": "row in robots",
         "sender": "row in robots",

@@ -42,6 +42,8 @@ from experiments.report.style import (
     Drawing,
     Line,
     boxes,
+    case_curve,
+    labelled,
     legend_above,
     mark_phases,
     merged,
@@ -67,10 +69,7 @@ __all__ = ["formation", "plan_view", "svg"]  # besides those of this module
 
 
 def all_figures(
-    cases: Sequence[CaseMetrics],
-    traces: Sequence[Trace],
-    width: float = WIDTH,
-    bands: Mapping[str, Band] | None = None,
+    cases: Sequence[CaseMetrics], traces: Sequence[Trace], width: float = WIDTH, bands: Mapping[str, Band] | None = None
 ) -> dict[str, Figure]:
     """All figures of a run by name; motions of the first seed, `errors` of all seeds.
 
@@ -146,7 +145,7 @@ def global_bars(cases: Sequence[CaseMetrics], width: float = WIDTH) -> Figure:
         axes.yaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 2.5, 5, 10]))
         axes.grid(axis="y")
     panels[0].set_ylabel(f"relative to {plain(reference)}")
-    legend_above(figure, panels[-1].get_legend_handles_labels(), columns=3)
+    legend_above(figure, labelled(panels[-1]), columns=3)
     return figure
 
 
@@ -197,7 +196,7 @@ def robot_bars(cases: Sequence[CaseMetrics], width: float = WIDTH) -> Figure:
     panels[-1].set_xticks(range(len(names)), words, rotation=upright, fontsize=size)
     panels[-1].set_xlim(-0.6, len(names) - 0.4)
     figure.align_ylabels(list(panels))
-    legend_above(figure, panels[-1].get_legend_handles_labels(), columns=3)
+    legend_above(figure, labelled(panels[-1]), columns=3)
     return figure
 
 
@@ -223,7 +222,7 @@ def errors(
     handles: dict[str, Artist] = {}
     lowest, highest, tolerance = np.inf, 0.0, traces[0].plan.experiment.tolerance
     for k, (name, band) in enumerate((bands or error_bands(traces)).items()):
-        line: Line = {"color": CASES[k % len(CASES)], "linestyle": ("-", (0, (5, 1.5)), "-.", ":")[k % 4]}
+        line = case_curve(k)
         if band.seeds > 1:
             axes.fill_between(band.time, band.low, band.high, color=line["color"], alpha=0.25, linewidth=0.0)
         elif name in first:
@@ -250,7 +249,7 @@ def errors(
     axes.grid()
     time_axis(axes, traces)
     axes.set_ylabel("error of the worst link [m]")
-    legend_above(figure, (list(handles.values()), list(handles)), columns=6)
+    legend_above(figure, handles, columns=6)
     return figure
 
 
@@ -266,7 +265,7 @@ def measures(traces: Sequence[Trace], width: float = WIDTH) -> Figure:
         for k, trace in enumerate(traces):
             if name not in trace.measures:
                 continue
-            line: Line = {"color": CASES[k % len(CASES)], "linestyle": ("-", (0, (5, 1.5)), "-.", ":")[k % 4]}
+            line = case_curve(k)
             few = thinned(trace, len(names) * len(traces))
             values = trace.measures[name][few]
             axes.plot(trace.time[few], values, color=line["color"], linewidth=0.4, alpha=0.45)
@@ -279,7 +278,7 @@ def measures(traces: Sequence[Trace], width: float = WIDTH) -> Figure:
         axes.yaxis.set_major_locator(MaxNLocator(4))
     time_axis(panels[-1], traces)
     figure.align_ylabels(list(panels))
-    legend_above(figure, (list(handles.values()), list(handles)), columns=6)
+    legend_above(figure, handles, columns=6)
     return figure
 
 
@@ -414,7 +413,7 @@ def intervals(traces: Sequence[Trace], width: float = WIDTH) -> Figure:
     axes.set_xlabel("time between transmissions [s]")
     axes.set_ylabel("share of intervals")
     axes.grid()
-    legend_above(figure, (list(handles.values()), list(handles)), columns=3)
+    legend_above(figure, handles, columns=3)
     return figure
 
 
@@ -490,9 +489,9 @@ def shadows(traces: Sequence[Trace], width: float = WIDTH) -> Figure:
         _differences(beside, trace, row, len(shown))
     panels[-1, 0].set_xlabel("$x$ [m]")
     panels[-1, 1].set_xlabel("$t$ [s]")
-    lines = [Line2D([], [], color=INK), Line2D([], [], color=MAGENTA, linestyle="--")]
-    lines += [Line2D([], [], color=colour, linestyle=style) for _, colour, style in PARTS]
-    legend_above(figure, (lines, ["robot", "twin", *(label for label, *_ in PARTS)]), columns=5)
+    lines = {"robot": Line2D([], [], color=INK), "twin": Line2D([], [], color=MAGENTA, linestyle="--")}
+    lines |= {label: Line2D([], [], color=colour, linestyle=style) for label, colour, style in PARTS}
+    legend_above(figure, lines, columns=5)
     return figure
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
@@ -17,25 +17,9 @@ from experiments.metrics.statistics import by_case
 from experiments.recording.run_folder import RunOrigin, read_origin
 from experiments.recording.trace import Trace
 from experiments.recording.version import provenance
-from experiments.report import figures, page, replay
+from experiments.report import figures, page, replay, tables
 from experiments.report.metrics_files import Band
-from experiments.report.tables import (
-    architecture_table,
-    clearance_tables,
-    clocks_table,
-    collision_table,
-    criteria_table,
-    definitions,
-    events_tables,
-    network_tables,
-    over_seeds,
-    proof_tables,
-    robot_tables,
-    shadow_tables,
-    summary_table,
-    whole_tables,
-)
-from experiments.report.verdict import failures, findings, interruptions, left_out, spoiled
+from experiments.report.verdict import findings, left_out
 
 PROOF: Final = (
     "Every pose carries a running number, so a gap proves a loss. Received poses are counted over all receivers "
@@ -131,20 +115,20 @@ def write(
         drawn = figures.all_figures(cases, traces, bands=bands)
         drawings = {name: figures.svg(figure) for name, figure in drawn.items()}
     pictures = _pictures(cases, traces, bands, drawings)
-    short, every_event = events_tables(first)
+    short, every_event = tables.events_tables(first)
     listing = text or msgspec.json.format(msgspec.json.encode(experiment), indent=2).decode()
     sections = [
-        *_tables("Criteria", CRITERIA, [criteria_table(cases)], folded=False),
+        *_tables("Criteria", CRITERIA, [tables.criteria_table(cases)], folded=False),
         *_results(cases),
         page.Section("Figures", (FOR_A_PAPER,), pictures=pictures),
         page.Section("Events", tables=(short,), more=every_event),
         *_details(cases),
         *_of_worlds(cases, drawings, len(pictures)),
-        *_tables("Clocks of other machines", CLOCKS, [clocks_table(first)]),
+        *_tables("Clocks of other machines", CLOCKS, [tables.clocks_table(first)]),
         page.Section("Experiment file", listing=listing, folded=f"{len(listing.splitlines())} lines"),
         _defined(cases),
     ]
-    first_of_all, verdict = [*failures(cases), *spoiled(cases), *interruptions(cases)], findings(cases)
+    verdict = findings(cases, notes)
     if len(seeds) > 1 and not (experiment.start.scatter or experiment.start.scatter_yaw):
         verdict.append(page.VerdictLine("plain", SAME_STARTS))
     return page.render(
@@ -153,7 +137,7 @@ def write(
         source=experiment.source,
         facts=facts,
         command=made.command,
-        verdict=[*first_of_all, *(page.VerdictLine("fair", note) for note in notes), *verdict[len(first_of_all) :]],
+        verdict=verdict,
         sections=sections,
         foot=() if made.made_by is None else made.made_by.words,  # of an old run it is not known
         replay=replay.embedded(traces),
@@ -162,11 +146,13 @@ def write(
 
 def labelled(runs: Sequence[tuple[str, Sequence[CaseMetrics]]]) -> list[CaseMetrics]:
     """Metrics of all cases of several runs, by names that tell the runs apart."""
-    return [
-        msgspec.structs.replace(case, case=_label(name, case, cases), criteria=())
-        for name, (_, cases) in zip(_distinct([name for name, _ in runs]), runs, strict=True)
-        for case in cases
-    ]
+    found = []
+    for name, (_, cases) in zip(_distinct([name for name, _ in runs]), runs, strict=True):
+        several = len({case.case for case in cases}) > 1
+        for case in cases:
+            label = f"{name} · {case.case}" if several else name
+            found.append(msgspec.structs.replace(case, case=label, criteria=()))
+    return found
 
 
 def result_tables(cases: Sequence[CaseMetrics], chosen: Sequence[str] = ()) -> list[page.Table]:
@@ -176,19 +162,19 @@ def result_tables(cases: Sequence[CaseMetrics], chosen: Sequence[str] = ()) -> l
         cases: The first one is the reference.
         chosen: Indices of the first table, which is then the only one.
     """
-    summary, seeds = summary_table(cases, chosen), max(map(len, by_case(cases).values()))
+    summary, seeds = tables.summary_table(cases, chosen), max(map(len, by_case(cases).values()))
     if chosen:
         return [summary]
-    whole, robots = whole_tables(cases), robot_tables(cases)
+    whole, robots = tables.whole_tables(cases), tables.robot_tables(cases)
     if seeds > 1:
-        whole = tuple(
-            table
-            if table.head[0].startswith("Sum ")
-            else replace(table, note=f"{over_seeds(seeds)} {table.note}".strip())
-            for table in whole
-        )
-        robots = tuple(replace(table, note=f"Means over {seeds} seeds. {table.note}".strip()) for table in robots)
+        means = tables.over_seeds(seeds)
+        whole = tuple(each if each.head[0].startswith("Sum ") else _noting(means, each) for each in whole)
+        robots = tuple(_noting(f"Means over {seeds} seeds.", each) for each in robots)
     return [summary, *whole, *robots]
+
+
+def _noting(text: str, table: page.Table) -> page.Table:
+    return replace(table, note=f"{text} {table.note}".strip())
 
 
 def compare(
@@ -212,17 +198,12 @@ def compare(
     names, cases = _distinct([name for name, _ in runs]), labelled(runs)
     if not cases:
         raise ValueError("there is no run to compare")
-    drawn = [figures.global_bars(cases), figures.robot_bars(cases)]
-    captions = (_global_caption(cases), _robot_caption(cases))
-    facts = [
-        ("Date", page.date_of(time.time())),
-        ("Runs", ", ".join(names)),
-        ("Reference", cases[0].case),
-    ]
+    drawn = ((figures.global_bars(cases), _global_caption(cases)), (figures.robot_bars(cases), _robot_caption(cases)))
+    facts = [("Date", page.date_of(time.time())), ("Runs", ", ".join(names)), ("Reference", cases[0].case)]
     sections = [
         *_tables("Differences", DIFFERENCES, [differences_table(differences)], folded=False),
         *_results(cases),
-        page.Section("Figures", pictures=page.numbered(zip(drawn, captions, strict=True))),
+        page.Section("Figures", pictures=page.numbered(drawn)),
         *_details(cases),
         _defined(cases),
     ]
@@ -239,50 +220,48 @@ def compare(
 
 def differences_table(differences: Sequence[tuple[str, str, Sequence[str]]]) -> page.Table:
     """Name and folder of each run, and its differences from the first one."""
-    how = [
-        page.TableRow(
-            (name, folder, "; ".join(found) or ("the same file, seeds and versions" if k else "the reference"))
-        )
-        for k, (name, folder, found) in enumerate(differences)
-    ]
-    return page.Table(("Run", "Folder", "Differs from the first in"), tuple(how), words=True)
+    rows = []
+    for name, folder, found in differences:
+        same = "the same file, seeds and versions" if rows else "the reference"
+        rows.append(page.TableRow((name, folder, "; ".join(found) or same)))
+    return page.Table(("Run", "Folder", "Differs from the first in"), tuple(rows), words=True)
 
 
-def _noted(differences: Sequence[tuple[str, str, Sequence[str]]]) -> list[page.VerdictLine]:
+def _noted(differences: Sequence[tuple[str, str, Sequence[str]]]) -> Iterator[page.VerdictLine]:
     """Differences of the runs from the first one."""
-    found = []
     for name, _, how in differences[1:]:
         more = f" and {len(how) - 2} more" if len(how) > 2 else ""
         same = "has the same file, seeds and versions as the reference"
         text = f"{name} differs in {'; '.join(how[:2])}{more}." if how else f"{name} {same}."
-        found.append(page.VerdictLine("fair" if how else "plain", text))
-    return found
+        yield page.VerdictLine("fair" if how else "plain", text)
 
 
-def _tables(title: str, prose: str, tables: Iterable[page.Table | None], *, folded: bool = True) -> list[page.Section]:
+def _tables(title: str, prose: str, given: Iterable[page.Table | None], *, folded: bool = True) -> list[page.Section]:
     """A section of tables with rows; none without any."""
-    shown = tuple(table for table in tables if table is not None and table.rows)
+    shown = tuple(table for table in given if table is not None and table.rows)
     rows = f"{sum(len(table.rows) for table in shown)} rows"
     return [page.Section(title, (prose,), shown, folded=rows if folded else "")] if shown else []
 
 
 def _defined(cases: Sequence[CaseMetrics]) -> page.Section:
-    terms = definitions(cases)
+    terms = tables.definitions(cases)
     return page.Section("Definitions", terms=terms, folded=f"{len(terms)} terms")
 
 
 def _results(cases: Sequence[CaseMetrics]) -> list[page.Section]:
     return [
-        page.Section("Results", (left_out(cases),), (summary_table(cases), *whole_tables(cases))),
-        *_tables("Architecture", ARCHITECTURE, [architecture_table(cases)], folded=False),
+        page.Section("Results", (left_out(cases),), (tables.summary_table(cases), *tables.whole_tables(cases))),
+        *_tables("Architecture", ARCHITECTURE, [tables.architecture_table(cases)], folded=False),
     ]
 
 
 def _details(cases: Sequence[CaseMetrics]) -> list[page.Section]:
     return [
-        page.Section("Each robot", tables=robot_tables(cases), folded="metrics of every robot"),
-        page.Section("Data integrity", (PROOF,), proof_tables(cases), folded="poses sent, recorded, received, lost"),
-        *_tables("Network model", NETWORK, network_tables(cases)),
+        page.Section("Each robot", tables=tables.robot_tables(cases), folded="metrics of every robot"),
+        page.Section(
+            "Data integrity", (PROOF,), tables.proof_tables(cases), folded="poses sent, recorded, received, lost"
+        ),
+        *_tables("Network model", NETWORK, tables.network_tables(cases)),
     ]
 
 
@@ -315,22 +294,16 @@ def _of_worlds(cases: Sequence[CaseMetrics], drawings: Mapping[str, str], figure
     """Contacts, close approaches and shadow twins, where there are any."""
     sections = []
     if any(case.near or case.near_arena or case.collisions for case in cases):
-        touched = (collision_table(cases),) if any(case.collisions for case in cases) else ()
         count = sum(len(case.collisions) for case in cases)
-        contacts = f"{count} collisions" if count else "closest approaches"
+        shown = (*((tables.collision_table(cases),) if count else ()), *tables.clearance_tables(cases))
         source = FROM_WORLD if all(case.watched for case in cases) else FROM_POSITIONS
-        sections.append(
-            page.Section("Contacts and clearances", (source,), (*touched, *clearance_tables(cases)), folded=contacts)
-        )
-    if tables := shadow_tables(cases):
+        contacts = f"{count} collisions" if count else "closest approaches"
+        sections.append(page.Section("Contacts and clearances", (source,), shown, folded=contacts))
+    if shadows := tables.shadow_tables(cases):
         seed = f" Seed {cases[0].seed}." if len({case.seed for case in cases}) > 1 else ""
         drawn = ((svg, f"{SHADOWS}{seed}") for name, svg in drawings.items() if name == "shadows")
-        pictures = page.numbered(drawn, figures_before + 1)
-        sections.append(
-            page.Section(
-                "Twins beside robots", tables=tables, pictures=pictures, folded="shadow twins against their robots"
-            )
-        )
+        pictures, folded = page.numbered(drawn, figures_before + 1), "shadow twins against their robots"
+        sections.append(page.Section("Twins beside robots", tables=shadows, pictures=pictures, folded=folded))
     return sections
 
 
@@ -353,10 +326,6 @@ def _distinct(names: Sequence[str]) -> list[str]:
 
 def _length(case: CaseMetrics) -> str:
     return f"{case.duration_s:.1f} s of {case.planned_s:g} s" if case.interrupted else f"{case.duration_s:g} s"
-
-
-def _label(name: str, case: CaseMetrics, cases: Sequence[CaseMetrics]) -> str:
-    return name if len({each.case for each in cases}) == 1 else f"{name} · {case.case}"
 
 
 def _interval_note(cases: Sequence[CaseMetrics]) -> str:

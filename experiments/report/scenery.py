@@ -54,7 +54,7 @@ def from_above(axes: Axes, plan: Plan) -> None:
     x, y, _ = arena.size
     border: dict[str, Any] = {"linewidth": 1.0} if arena.walls else {"linewidth": 0.6, "linestyle": (0, (6, 3))}
     axes.add_patch(Rectangle((-x / 2, -y / 2), x, y, fill=False, edgecolor=INK, zorder=0.6, **border))
-    way = _obstacle_paths(plan, scene)
+    way = _obstacle_paths(plan)
     for k, name in enumerate(scene.names):
         outline = scene.outline[k]
         if outline is not None and not scene.closed[k]:
@@ -82,7 +82,7 @@ def in_space(axes: Axes3D, plan: Plan, low: Array, high: Array) -> None:
     style: dict[str, Any] = {"linewidth": 0.8} if arena.walls else {"linewidth": 0.5, "linestyle": (0, (6, 3))}
     if (scene.low[:2] >= low[:2]).all() and (scene.high[:2] <= high[:2]).all():
         _loop(axes, 0.5 * np.array(arena.size[:2]) * _SQUARE, color=EDGE, **style)
-    way = _obstacle_paths(plan, scene)
+    way = _obstacle_paths(plan)
     for k in range(len(scene.names)):
         bottom, top = float(scene.bottom[k]), float(min(scene.top[k], high[2]))
         if bottom >= top:
@@ -106,7 +106,7 @@ def around(plan: Plan, low: Array, high: Array) -> tuple[Array, Array]:
     """
     arena, scene = plan.experiment.arena, plan.scene
     rings = [_ring(scene, k, scene.pose[k]) for k in range(len(scene.names))]
-    rings += [_ring(scene, k, pose) for k in scene.moving for pose in _obstacle_paths(plan, scene)[[-1], k]]
+    rings += [_ring(scene, k, pose) for k in scene.moving for pose in _obstacle_paths(plan)[[-1], k]]
     rings += [np.array(box.at) + 0.5 * np.array(box.size) * _SQUARE for box in arena.starts.values()]
     if rings:
         points = np.clip(np.concatenate(rings), scene.low[:2], scene.high[:2])
@@ -116,13 +116,8 @@ def around(plan: Plan, low: Array, high: Array) -> tuple[Array, Array]:
     return low, high
 
 
-def tall(plan: Plan, most: float) -> float:
-    """Height of the tallest obstacle [m], at most `most`; 0 without any."""
-    return min(float(plan.scene.top.max(initial=0.0)), most)
-
-
-def legend(plans: Sequence[Plan], *, space: bool = False) -> tuple[list[Artist], list[str]]:
-    """Handles and labels of what stands in the arenas, from above or in space; nothing for empty ones."""
+def legend(plans: Sequence[Plan], *, space: bool = False) -> dict[str, Artist]:
+    """What stands in the arenas, by its label, from above or in space; nothing for empty ones."""
     found: dict[str, Artist] = {}
     for arena in (plan.experiment.arena for plan in plans):
         for obstacle in arena.obstacles.values():
@@ -138,7 +133,7 @@ def legend(plans: Sequence[Plan], *, space: bool = False) -> tuple[list[Artist],
                 found["obstacle's path"] = Line2D([], [], **_PATH)
         if arena.starts:
             found["start box"] = Patch(**_BOX)
-    return list(found.values()), list(found)
+    return found
 
 
 _SQUARE: Final = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
@@ -150,9 +145,9 @@ def _style(scene: Scene, k: int) -> dict[str, Any]:
     return _HANGS if scene.bottom[k] > 0.0 else _STANDS
 
 
-def _obstacle_paths(plan: Plan, scene: Scene) -> Array:
+def _obstacle_paths(plan: Plan) -> Array:
     """Poses (T, M, 3) of obstacles over the run, as finely as a picture shows them."""
-    return scene.along(np.linspace(0.0, plan.experiment.duration_s, 400))
+    return plan.scene.along(np.linspace(0.0, plan.experiment.duration_s, 400))
 
 
 def _ring(scene: Scene, k: int, pose: Array) -> Array:

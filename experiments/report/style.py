@@ -8,10 +8,11 @@ from __future__ import annotations
 import io
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final, ParamSpec
 
 import matplotlib as mpl
@@ -21,6 +22,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.path import Path as Outline
+from matplotlib.patheffects import withStroke
 from matplotlib.text import Annotation
 from matplotlib.transforms import Bbox
 
@@ -40,6 +42,7 @@ ALL_POINTS: Final = 40_000  # of all curves of a figure, so that many robots do 
 INK: Final = "#000000"
 PAPER: Final = "#ffffff"
 MAGENTA: Final = "#D6007F"
+HALO: Final = [withStroke(linewidth=1.5, foreground=PAPER)]  # of a name upon curves
 # Okabe and Ito; yellow is left out because it vanishes on white paper
 CASES: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
 HATCHES: Final = ("", "////", "....", "xxxx", "\\\\\\\\", "----", "++++")
@@ -165,6 +168,11 @@ def robot_lines(trace: Trace) -> list[Line]:
     return [{"color": KINDS[kind].colour, "linewidth": 0.6, "alpha": 0.7} for kind in kinds]
 
 
+def case_curve(k: int) -> Line:
+    """Style of the curve of a case over time."""
+    return {"color": CASES[k % len(CASES)], "linestyle": ("-", (0, (5, 1.5)), "-.", ":")[k % 4]}
+
+
 def case_line(k: int) -> Line:
     """Style of the path of a case upon others: the first one broad and pale, so that the next ones are seen on it."""
     if k == 0:
@@ -176,17 +184,14 @@ def case_line(k: int) -> Line:
     }
 
 
-def robot_legend(
-    figure: Figure, traces: Sequence[Trace], more: tuple[Sequence[Artist], Sequence[str]] = ((), ())
-) -> None:
-    """Legend of the lines of robots, or of kinds of robots, and of `more`, handles and labels."""
+def robot_legend(figure: Figure, traces: Sequence[Trace], more: Mapping[str, Artist] = MappingProxyType({})) -> None:
+    """Legend of the lines of robots, or of kinds of robots, and of `more`."""
     trace = max(traces, key=lambda each: len(each.robots))
     label = trace.robots
     if len(label) > MAX_COLOURED_ROBOTS:
         label = tuple(trace.plan.experiment.robots[name].kind for name in trace.robots)
-    shown = {name: Line2D([], [], **line) for name, line in zip(label, robot_lines(trace), strict=True)}
-    entries = [*shown.values(), *more[0]], [*shown, *more[1]]
-    legend_above(figure, entries, columns={4: 4, 6: 3, 7: 4, 8: 4}.get(len(entries[1]), 5))
+    shown = {name: Line2D([], [], **line) for name, line in zip(label, robot_lines(trace), strict=True)} | more
+    legend_above(figure, shown, columns={4: 4, 6: 3, 7: 4, 8: 4}.get(len(shown), 5))
 
 
 def spread_texts(axes: Axes) -> None:
@@ -210,13 +215,20 @@ def spread_texts(axes: Axes) -> None:
             text.remove()
 
 
-def legend_above(figure: Figure, entries: tuple[Sequence[Any], Sequence[str]], columns: int) -> None:
+def labelled(axes: Axes) -> dict[str, Any]:
+    """What is drawn in a panel with a label, for its legend."""
+    handles, labels = axes.get_legend_handles_labels()
+    return dict(zip(labels, handles, strict=True))
+
+
+def legend_above(figure: Figure, entries: Mapping[str, Any], columns: int) -> None:
     """A legend above all panels, with as many columns as fit between the edges; none without entries."""
-    if entries[1]:
-        figure.legend(*entries, loc="outside upper center", ncols=fitting(figure.get_figwidth(), entries[1], columns))
+    if entries:
+        fits = fitting(figure.get_figwidth(), entries, columns)
+        figure.legend([*entries.values()], [*entries], loc="outside upper center", ncols=fits)
 
 
-def fitting(width: float, labels: Sequence[str], columns: int) -> int:
+def fitting(width: float, labels: Collection[str], columns: int) -> int:
     """Columns of a legend, at most `columns`, that fit into a width [in]; labels fill one column after the other."""
     wide = [31.0 + 3.2 * len(label) for label in labels]  # [pt]
     for count in range(min(columns, len(labels)), 1, -1):
@@ -253,10 +265,3 @@ def boxes(begin: Array, end: Array, row: int) -> Outline:
     corners = np.array([[begin, low], [end, low], [end, high], [begin, high], [begin, low]])
     codes = np.tile([Outline.MOVETO, *[Outline.LINETO] * 3, Outline.CLOSEPOLY], len(begin))
     return Outline(corners.transpose(2, 0, 1).reshape(-1, 2), codes)
-
-
-def last_known(trace: Trace) -> Array:
-    """Last known position of each robot (N, 3) [m]."""
-    alive = np.asarray(np.isfinite(trace.true_position).all(axis=2))
-    last = len(alive) - 1 - alive[::-1].argmax(axis=0)
-    return np.asarray(trace.true_position[last, np.arange(len(trace.robots))])

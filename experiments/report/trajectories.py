@@ -15,7 +15,6 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 from matplotlib.transforms import Bbox
 from mpl_toolkits.mplot3d import Axes3D, proj3d  # type: ignore[import-untyped]
@@ -28,11 +27,11 @@ from experiments.definition.graph import edges
 from experiments.recording.trace import Trace
 from experiments.report import scenery
 from experiments.report.style import (
+    HALO,
     INK,
     MAGENTA,
     MARKERS,
     MAX_COLOURED_ROBOTS,
-    PAPER,
     ROBOTS,
     STYLE,
     WIDTH,
@@ -40,7 +39,6 @@ from experiments.report.style import (
     Line,
     case_line,
     fitting,
-    last_known,
     legend_above,
     plain,
     robot_legend,
@@ -75,7 +73,7 @@ def plan_view(traces: Sequence[Trace], width: float = WIDTH) -> Figure:
     low, high = 0.5 * (low + high) - 0.56 * size, 0.5 * (low + high) + 0.56 * size
     things = scenery.legend([trace.plan for trace in traces])
     tallest = min(0.62 * width, 3.6) if overlaid else 3.2
-    figure, grid = _plane(len(panels), width, (low, high), tallest, 0.7 + 0.17 * bool(things[1]))
+    figure, grid = _plane(len(panels), width, (low, high), tallest, 0.7 + 0.17 * bool(things))
     for axes, shown in zip(grid, panels, strict=True):
         scenery.from_above(axes, shown[0].plan)
         for k, trace in enumerate(shown):
@@ -86,8 +84,7 @@ def plan_view(traces: Sequence[Trace], width: float = WIDTH) -> Figure:
         axes.yaxis.set_major_locator(MaxNLocator(5))
     if overlaid:
         grid[0].set(xlabel="$x$ [m]", ylabel="$y$ [m]")
-        entries = _case_entries(traces) | _end_entries()
-        legend_above(figure, ([*entries.values(), *things[0]], [*entries, *things[1]]), columns=6)
+        legend_above(figure, _case_entries(traces) | _end_entries() | things, columns=6)
     else:
         _label_plane(figure)
         robot_legend(figure, traces, things)
@@ -119,26 +116,20 @@ def _label_plane(figure: Figure) -> None:
 
 def _draw_from_above(axes: Axes, trace: Trace, few: slice, style: Line | None) -> None:
     """Paths of a case from above: in one style, robots named, or with a colour for each robot."""
-    place, last = trace.true_position, last_known(trace)
-    first = place[np.isfinite(place).all(axis=2).argmax(axis=0), np.arange(place.shape[1])]
+    place, (first, last) = trace.true_position, _ends(trace)
     ink = "#8a8a8a" if style is None else style["color"]
     for pair in edges(trace.plan.links):
         axes.plot(*last[pair, :2].T, color=ink, linewidth=0.5, alpha=1.0 if style is None else 0.6, zorder=1)
-    small = 3.0 if len(trace.robots) <= MAX_COLOURED_ROBOTS else 2.0
+    few_robots = len(trace.robots) <= MAX_COLOURED_ROBOTS
+    small, named = 3.0 if few_robots else 2.0, few_robots and style is not None and "alpha" in style
     for i, line in enumerate(robot_lines(trace)):
         colour = line["color"] if style is None else ink
-        marker = MARKERS[i] if style is not None and len(trace.robots) <= MAX_COLOURED_ROBOTS else "o"
+        marker = MARKERS[i] if style is not None and few_robots else "o"
         path = {**line, "linewidth": 0.8} if style is None else style
         axes.plot(place[few, i, 0], place[few, i, 1], **path)
         axes.plot(*last[i, :2], marker, ms=small + 0.5, mec="none", color=colour)
         axes.plot(*first[i, :2], marker, ms=small, mec=colour, mfc="none", mew=0.7)
-        if (
-            style is not None
-            and "alpha" in style
-            and len(trace.robots) <= MAX_COLOURED_ROBOTS
-            and np.isfinite(last[i, :2]).all()
-        ):
-            halo = [withStroke(linewidth=1.5, foreground=PAPER)]
+        if named and np.isfinite(last[i, :2]).all():
             axes.annotate(
                 trace.robots[i],
                 (float(last[i, 0]), float(last[i, 1])),
@@ -146,7 +137,7 @@ def _draw_from_above(axes: Axes, trace: Trace, few: slice, style: Line | None) -
                 textcoords="offset points",
                 fontsize=6,
                 ha="center",
-                path_effects=halo,
+                path_effects=HALO,
             )
 
 
@@ -168,7 +159,6 @@ def expected_motion(analyses: Mapping[str, Analysis]) -> Figure:
     cases = list(analyses.items())
     half = 0.53 * np.array(cases[0][1].plan.experiment.arena.size[:2])
     figure, grid = _plane(len(cases), WIDTH, (-half, half), 3.2, 0.6)
-    halo = [withStroke(linewidth=1.5, foreground=PAPER)]
     for axes, (name, known) in zip(grid, cases, strict=True):
         experiment, motion = known.plan.experiment, known.prediction.position
         scenery.from_above(axes, known.plan)
@@ -192,14 +182,14 @@ def expected_motion(analyses: Mapping[str, Analysis]) -> Figure:
                 textcoords="offset points",
                 fontsize=5,
                 color=colour,
-                path_effects=halo,
+                path_effects=HALO,
                 zorder=5,
             )
         axes.set_title(plain(name), pad=3.0)
     _label_plane(figure)
     entries = _end_entries()
     entries["target shape"] = Line2D([], [], color=MAGENTA, linewidth=0.8, marker="D", ms=3.5, mfc="none", mew=0.7)
-    legend_above(figure, (list(entries.values()), list(entries)), columns=3)
+    legend_above(figure, entries, columns=3)
     return figure
 
 
@@ -233,10 +223,9 @@ def formation(traces: Sequence[Trace], width: float = WIDTH) -> Figure:
     """
     shown = [trace for trace in traces if has_positions(trace)]
     things = scenery.legend([trace.plan for trace in traces], space=True)
-    entries = (_case_entries(traces) if len(traces) > 1 else {}) | _end_entries()
-    labels = [*entries, *things[1]]
-    fits = fitting(width, labels, 6)
-    above = 0.12 + 0.15 * math.ceil(len(labels) / fits)
+    entries = (_case_entries(traces) if len(traces) > 1 else {}) | _end_entries() | things
+    fits = fitting(width, entries, 6)
+    above = 0.12 + 0.15 * math.ceil(len(entries) / fits)
     height = min(0.7 * width, 3.9)
     whole = height + above
     figure = Drawing(figsize=(width, whole))
@@ -250,7 +239,7 @@ def formation(traces: Sequence[Trace], width: float = WIDTH) -> Figure:
         if has_positions(trace):
             _draw_in_space(axes, trace, case_line(k) if len(traces) > 1 else None)
     _frame(axes, shown)
-    figure.legend([*entries.values(), *things[0]], labels, loc="upper center", ncols=fits, bbox_to_anchor=(0.5, 1.0))
+    figure.legend([*entries.values()], [*entries], loc="upper center", ncols=fits, bbox_to_anchor=(0.5, 1.0))
     _crop(figure, axes, above)
     return figure
 
@@ -298,7 +287,7 @@ def film(traces: Sequence[Trace]) -> tuple[Figure, Callable[[float], None]]:
             trails = [axes.plot([], [], [], **{**style, "linewidth": 0.8, "zorder": 3})[0] for style in styles]
             dots = [axes.plot([], [], [], "o", ms=5, mec="none", color=style["color"])[0] for style in styles]
             few = len(trace.robots) <= MAX_COLOURED_ROBOTS
-            halo = {"path_effects": [withStroke(linewidth=1.5, foreground=PAPER)], "zorder": 7}
+            halo = {"path_effects": HALO, "zorder": 7}
             names = [axes.text(0, 0, 0, name, fontsize=6, ha="center", **halo) for name in trace.robots if few]
             plan = trace.plan
             error = errors_over_time(plan.law, plan.formation, trace.time, trace.true_position)
@@ -323,12 +312,17 @@ def film(traces: Sequence[Trace]) -> tuple[Figure, Callable[[float], None]]:
     return figure, show
 
 
+def _ends(trace: Trace) -> tuple[Array, Array]:
+    """First and last known position of each robot (N, 3) [m]."""
+    place, rows = trace.true_position, np.arange(len(trace.robots))
+    known = np.asarray(np.isfinite(place).all(axis=2))
+    return place[known.argmax(axis=0), rows], place[len(known) - 1 - known[::-1].argmax(axis=0), rows]
+
+
 def _draw_in_space(axes: Axes3D, trace: Trace, case: Line | None) -> None:
     """Paths of a case in space: in its style among several, or in those of its robots; the first case names them."""
     colour = None if case is None else case["color"]
-    place = trace.true_position
-    known = np.asarray(np.isfinite(place).all(axis=2))
-    starts, ends = place[known.argmax(axis=0), np.arange(place.shape[1])], last_known(trace)
+    place, (starts, ends) = trace.true_position, _ends(trace)
     few_robots = len(trace.robots) <= MAX_COLOURED_ROBOTS
     if len(pairs := edges(trace.plan.links)):
         lines = Line3DCollection(ends[pairs], colors=colour or "#8a8a8a", linewidths=0.5, alpha=0.7, zorder=1)
@@ -344,9 +338,8 @@ def _draw_in_space(axes: Axes3D, trace: Trace, case: Line | None) -> None:
             *ends[i, :, None], "o", ms=size + 0.5 + 1.5 * (named and bool(colour)), color=ink, mec="none", zorder=6
         )
         if few_robots and named:
-            halo = [withStroke(linewidth=1.5, foreground=PAPER)]
             above = ends[i] + [0.0, 0.0, 0.05]
-            axes.text(*above, trace.robots[i], fontsize=6, ha="center", va="bottom", zorder=7, path_effects=halo)
+            axes.text(*above, trace.robots[i], fontsize=6, ha="center", va="bottom", zorder=7, path_effects=HALO)
 
 
 def _frame(axes: Axes3D, traces: Sequence[Trace]) -> None:
@@ -362,7 +355,8 @@ def _frame(axes: Axes3D, traces: Sequence[Trace]) -> None:
     ground = bool(low[2] > -0.1)
     low, high = middle - 0.54 * size, middle + 0.54 * size
     if ground:
-        low[2], high[2] = 0.0, max(high[2], scenery.tall(plan, FLAT * float((high - low)[:2].max())))
+        tallest = float(plan.scene.top.max(initial=0.0))  # of the obstacles
+        low[2], high[2] = 0.0, max(high[2], min(tallest, FLAT * float((high - low)[:2].max())))
     scenery.in_space(axes, plan, low, high)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
     x, y, z = (high - low) / math.dist(high, low)

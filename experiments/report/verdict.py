@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 
 from agents.plugins.registry import did_you_mean
 from experiments.metrics import criteria
@@ -15,29 +15,35 @@ from experiments.metrics.statistics import by_case, ratios, same_length, spread
 from experiments.report.page import Mark, VerdictLine, interval, number
 from experiments.report.tables import dropped_share, mean_delay, ratio_words
 
+Lines = Iterator[VerdictLine]
+
 KEPT_UP = 0.99  # a world that is slower than this share of real time falls behind
 UNFINISHED_M = 0.3  # a robot that is nearer to where its plan wants it merely lags
 NAMED = 3  # collisions, or twins, that are named; the tables have them all
 
 
-def findings(cases: Sequence[CaseMetrics]) -> list[VerdictLine]:
-    """The verdict over all cases, the first one being the reference; nothing is praised if one of them was spoiled."""
+def findings(cases: Sequence[CaseMetrics], notes: Sequence[str] = ()) -> list[VerdictLine]:
+    """The verdict over all cases, the first one being the reference; nothing is praised if one of them was spoiled.
+
+    `notes` of the run stand behind what a reader must know first.
+    """
     formation = any(case.belief for case in cases)
     judged = [case for case in cases if case.belief and case.has_errors]  # others have laws without errors
     found = [
         *failures(cases),
         *spoiled(cases),
         *interruptions(cases),
+        *(VerdictLine("fair", note) for note in notes),
         *criteria_met(cases),
         *_troubles(cases),
         *metric_faults(cases),
         *_lost_poses(cases),
-        *_of_each_case(cases, _foreign),
-        *_of_each_case(cases, _modelled),
+        *_foreign(cases),
+        *_modelled(cases),
         *_deadlines(cases),
         *_gaps(cases),
-        *_of_each_case(cases, _died),
-        *_of_each_case(cases, _guided),
+        *_died(cases),
+        *_guided(cases),
         *([*_acquired(judged), _worst_link(judged)] if judged else []),
         *(_against_the_first(cases) if formation else []),
         *contacts(cases),
@@ -57,7 +63,7 @@ def criteria_met(cases: Sequence[CaseMetrics]) -> list[VerdictLine]:
     found = criteria.judge(cases)
     if not found:
         return []
-    bad, unknown = [each for each in found if each.passed is False], [each for each in found if each.passed is None]
+    bad, unknown = ([each for each in found if each.passed is what] for what in (False, None))
     count = f"{len(found) - len(bad) - len(unknown)} of {len(found)} criteria are met"
     seeds = max(len(each.values) for each in found)
     count += f" by all {seeds} seeds" * (seeds > 1)
@@ -92,65 +98,48 @@ def _missed(judgement: criteria.Judgement) -> str:
     return f"{judgement.what} {is_what}{which}, not {judgement.limit}. {asked.why}".rstrip()
 
 
-def _of_each_case(
-    cases: Sequence[CaseMetrics], find: Callable[[str, Sequence[CaseMetrics]], VerdictLine | None]
-) -> list[VerdictLine]:
-    """Findings about each case, from its name and its runs of all seeds."""
-    return [found for name, runs in by_case(cases).items() if (found := find(name, runs)) is not None]
-
-
 def failures(cases: Sequence[CaseMetrics]) -> list[VerdictLine]:
     """Robots that did not do their part: the first thing that a reader must know."""
-    return [
-        VerdictLine("bad", f"Failed in {case.case}: {_first_few(case.failures)}.") for case in cases if case.failures
-    ]
+    failed = [case for case in cases if case.failures]
+    return [VerdictLine("bad", f"Failed in {case.case}: {_first_few(case.failures)}.") for case in failed]
 
 
-def spoiled(cases: Sequence[CaseMetrics]) -> list[VerdictLine]:
+def spoiled(cases: Sequence[CaseMetrics]) -> Lines:
     """Cases that are not compared with others, and the reasons."""
-    found = []
     for name, runs in by_case(cases).items():
         bad = [run for run in runs if run.spoiled]
         if bad:
             which = name if len(runs) == 1 else f"{name} ({len(bad)} of {len(runs)} seeds)"
             why = "; ".join(dict.fromkeys(reason for run in bad for reason in run.spoiled))
-            found.append(VerdictLine("bad", f"Spoiled, and compared with nothing: {which}: {why}."))
-    return found
+            yield VerdictLine("bad", f"Spoiled, and compared with nothing: {which}: {why}.")
 
 
-def _troubles(cases: Sequence[CaseMetrics]) -> list[VerdictLine]:
+def _troubles(cases: Sequence[CaseMetrics]) -> Lines:
     """Findings of conductor and recorder."""
-    return [
-        VerdictLine(
-            "bad" if any(map(spoils, case.troubles)) else "fair", f"In {case.case}: {_first_few(case.troubles)}."
-        )
-        for case in cases
-        if case.troubles
-    ]
+    for case in cases:
+        if case.troubles:
+            mark: Mark = "bad" if any(map(spoils, case.troubles)) else "fair"
+            yield VerdictLine(mark, f"In {case.case}: {_first_few(case.troubles)}.")
 
 
 def metric_faults(cases: Sequence[CaseMetrics]) -> list[VerdictLine]:
     """Metrics of other distributions that failed, once each."""
-    return [
-        VerdictLine("fair", f"{text}.") for text in dict.fromkeys(text for run in cases for text in run.metric_faults)
-    ]
+    texts = dict.fromkeys(text for run in cases for text in run.metric_faults)
+    return [VerdictLine("fair", f"{text}.") for text in texts]
 
 
-def interruptions(cases: Sequence[CaseMetrics]) -> list[VerdictLine]:
+def interruptions(cases: Sequence[CaseMetrics]) -> Lines:
     """Runs that ended early, or were without a network."""
-    found, several = [], len(by_case(cases)) > 1
+    several = len(by_case(cases)) > 1
     for run in cases:
         if run.interrupted:
             where = f"{run.case} was interrupted" if several else "Interrupted"
-            text = (
-                f"{where} after {run.duration_s:.1f} s of {run.planned_s:g} s: all {'its ' if several else ''}figures"
-            )
-            found.append(VerdictLine("fair", f"{text} are up to there."))
+            when, its = f"{run.duration_s:.1f} s of {run.planned_s:g} s", "its " if several else ""
+            yield VerdictLine("fair", f"{where} after {when}: all {its}figures are up to there.")
         if run.away_s:
             where = f"In {run.case} the" if several else "The"
             text = f"{where} network was away for {run.away_s:.1f} s: errors are over the rest of the time."
-            found.append(VerdictLine("fair", text))
-    return found
+            yield VerdictLine("fair", text)
 
 
 def left_out(cases: Sequence[CaseMetrics]) -> str:
@@ -187,35 +176,33 @@ def _without_status(cases: Sequence[CaseMetrics]) -> list[str]:
     return list(dict.fromkeys(robot.robot for robot in real if robot.missed_share is None))
 
 
-def _foreign(name: str, runs: Sequence[CaseMetrics]) -> VerdictLine | None:
+def _foreign(cases: Sequence[CaseMetrics]) -> Lines:
     """Poses that robots refused since another session sent them."""
-    counts = Counter[str]()
-    for run in runs:
-        counts.update({robot.robot: robot.foreign for robot in run.robots if robot.foreign})
-    if not counts:
-        return None
-    robots = _list([f"{number(count)} of {robot}" for robot, count in counts.items()])
-    return VerdictLine(
-        "bad",
-        f"Poses from other sessions than the robots' own were refused in {name}: {robots}. Look for a second process "
-        "of that name; in a lab, revoke the certificate.",
-    )
+    for name, runs in by_case(cases).items():
+        counts = Counter[str]()
+        for run in runs:
+            counts.update({robot.robot: robot.foreign for robot in run.robots if robot.foreign})
+        if counts:
+            robots = _list([f"{number(count)} of {robot}" for robot, count in counts.items()])
+            text = f"Poses from other sessions than the robots' own were refused in {name}: {robots}"
+            advice = "Look for a second process of that name; in a lab, revoke the certificate."
+            yield VerdictLine("bad", f"{text}. {advice}")
 
 
-def _modelled(name: str, runs: Sequence[CaseMetrics]) -> VerdictLine | None:
+def _modelled(cases: Sequence[CaseMetrics]) -> Lines:
     """Loss and delay of a modelled network."""
-    if not runs[0].modelled:
-        return None
-    links = [link for run in runs for link in run.link_deliveries]
-    dropped = sum(link.dropped for link in links)
-    every = dropped + sum(link.received for link in links)
-    text = f"The modelled network dropped {number(dropped)} of {number(every)} samples in {name}"
-    text += f" ({number(dropped_share(links))} %)" if dropped else ""
-    mean = mean_delay(links)
-    if mean is not None:
-        longest = max(link.delay_max for link in links if link.delay_max is not None)
-        text += f"; those received took {number(mean, 1e3)} ms, at most {number(longest, 1e3)} ms"
-    return VerdictLine("plain", f"{text}.")
+    for name, runs in by_case(cases).items():
+        if not runs[0].modelled:
+            continue
+        links = [link for run in runs for link in run.link_deliveries]
+        dropped = sum(link.dropped for link in links)
+        every = dropped + sum(link.received for link in links)
+        text = f"The modelled network dropped {number(dropped)} of {number(every)} samples in {name}"
+        text += f" ({number(dropped_share(links))} %)" if dropped else ""
+        if (mean := mean_delay(links)) is not None:
+            longest = max(link.delay_max for link in links if link.delay_max is not None)
+            text += f"; those received took {number(mean, 1e3)} ms, at most {number(longest, 1e3)} ms"
+        yield VerdictLine("plain", f"{text}.")
 
 
 def _deadlines(cases: Sequence[CaseMetrics]) -> list[VerdictLine]:
@@ -223,9 +210,8 @@ def _deadlines(cases: Sequence[CaseMetrics]) -> list[VerdictLine]:
         return []
     if not any(case.missed_deadlines for case in cases):
         if silent := _without_status(cases):
-            return [
-                VerdictLine("plain", f"Whether {_list(silent)} missed deadlines is unknown: no status was recorded.")
-            ]
+            text = f"Whether {_list(silent)} missed deadlines is unknown: no status was recorded."
+            return [VerdictLine("plain", text)]
         return [VerdictLine("good", "No deadline was missed.")]
     words = []
     for name, runs in by_case(cases).items():
@@ -236,42 +222,39 @@ def _deadlines(cases: Sequence[CaseMetrics]) -> list[VerdictLine]:
     return [VerdictLine("fair" if worst < MISSED else "bad", f"Deadlines were missed: {_list(words)}.")]
 
 
-def _gaps(cases: Sequence[CaseMetrics]) -> list[VerdictLine]:
+def _gaps(cases: Sequence[CaseMetrics]) -> Lines:
     """Times without the position of a robot that came back."""
-    return [
-        VerdictLine(
-            "fair", f"Position unknown in {case.case}: {_first_few(case.gaps)}; neither in nor out of the tolerance."
-        )
-        for case in cases
-        if case.gaps
-    ]
+    for case in cases:
+        if case.gaps:
+            text = f"Position unknown in {case.case}: {_first_few(case.gaps)}; neither in nor out of the tolerance."
+            yield VerdictLine("fair", text)
 
 
-def _died(name: str, runs: Sequence[CaseMetrics]) -> VerdictLine | None:
-    died = list(dict.fromkeys(robot for run in runs for robot in run.died))
-    if not died:
-        return None
-    return VerdictLine("bad", f"In {name}, {_list(died)} dropped out; the means leave {_verb(died, 'it', 'them')} out.")
+def _died(cases: Sequence[CaseMetrics]) -> Lines:
+    for name, runs in by_case(cases).items():
+        if died := list(dict.fromkeys(robot for run in runs for robot in run.died)):
+            them = _verb(died, "it", "them")
+            yield VerdictLine("bad", f"In {name}, {_list(died)} dropped out; the means leave {them} out.")
 
 
-def _guided(name: str, runs: Sequence[CaseMetrics]) -> VerdictLine | None:
+def _guided(cases: Sequence[CaseMetrics]) -> Lines:
     """Cost of the central controller."""
-    centres = [run.guidance for run in runs if run.guidance is not None]
-    if not centres:
-        return None
-    delay = spread([centre.delay_mean_s for centre in centres])
-    busy = spread([centre.load for centre in centres])
-    text = f"In {name} a centre decides for {_list(centres[0].guided)}"
-    text += f": {interval(spread([centre.goals_hz for centre in centres]))} goals per second"
-    if delay.mean is not None:
-        text += f", acted on {interval(delay, 1000.0)} ms after the pose on which they rest"
-    if busy.mean is not None:
-        text += f"; its process took {interval(busy, 100.0)} % of a core"
-    return VerdictLine("plain", f"{text}.")
+    for name, runs in by_case(cases).items():
+        centres = [run.guidance for run in runs if run.guidance is not None]
+        if not centres:
+            continue
+        delay = spread([centre.delay_mean_s for centre in centres])
+        busy = spread([centre.load for centre in centres])
+        text = f"In {name} a centre decides for {_list(centres[0].guided)}"
+        text += f": {interval(spread([centre.goals_hz for centre in centres]))} goals per second"
+        if delay.mean is not None:
+            text += f", acted on {interval(delay, 1000.0)} ms after the pose on which they rest"
+        if busy.mean is not None:
+            text += f"; its process took {interval(busy, 100.0)} % of a core"
+        yield VerdictLine("plain", f"{text}.")
 
 
-def _acquired(cases: Sequence[CaseMetrics]) -> list[VerdictLine]:
-    found = []
+def _acquired(cases: Sequence[CaseMetrics]) -> Lines:
     tolerance = f"{100.0 * cases[0].tolerance:g} cm"
     longest = max(cases, key=lambda case: len(case.starts_s))
     for k, start in enumerate(longest.starts_s):
@@ -289,13 +272,12 @@ def _acquired(cases: Sequence[CaseMetrics]) -> list[VerdictLine]:
         formation = "The formation" if k == 0 else f"After the leg at {start:g} s it"
         if reached:
             text = f"{formation} was acquired by all {'again' if k else f'to {tolerance}'} after {_list(reached)}."
-            found.append(VerdictLine("fair" if missing else "good", text))
+            yield VerdictLine("fair" if missing else "good", text)
         if missing:
-            found.append(VerdictLine("bad", f"{formation} never stayed within {tolerance} in {_list(missing)}."))
+            yield VerdictLine("bad", f"{formation} never stayed within {tolerance} in {_list(missing)}.")
         if cut:
             text = f"{formation} was not within {tolerance} when {_list(cut)} {_verb(cut, 'was', 'were')} interrupted."
-            found.append(VerdictLine("plain", text))
-    return found
+            yield VerdictLine("plain", text)
 
 
 def _worst_link(cases: Sequence[CaseMetrics]) -> VerdictLine:
@@ -317,10 +299,8 @@ def _worst_link(cases: Sequence[CaseMetrics]) -> VerdictLine:
     return VerdictLine(mark, f"By the end the worst link{of} was off by {_list(words)}.")
 
 
-def _against_the_first(cases: Sequence[CaseMetrics]) -> list[VerdictLine]:
-    grouped = by_case(cases)
-    (reference, first), *others = grouped.items()
-    found = []
+def _against_the_first(cases: Sequence[CaseMetrics]) -> Lines:
+    (reference, first), *others = by_case(cases).items()
     for name, runs in others:
         rate = spread(ratios(runs, first, "f_hz"))
         some = f" (seeds compared: {rate.n} of {len(runs)})" if rate.n < len(runs) else ""
@@ -332,23 +312,21 @@ def _against_the_first(cases: Sequence[CaseMetrics]) -> list[VerdictLine]:
             means = [interval(spread([run.mean["f_hz"] for run in group])) for group in (runs, first)]
             text = f"{name} needs {how}: f {means[0]} rather than {means[1]} Hz"
             text += f"{_with_leaders(runs, first)}{some}."
-            found.append(VerdictLine("good" if fewer > 0.0 and float(share) and not some else "plain", text))
+            yield VerdictLine("good" if fewer > 0.0 and float(share) and not some else "plain", text)
         errors = [(OURS[name].label, spread(ratios(runs, first, name))) for name in ERRORS]
         known = [(label, each) for label, each in errors if each.mean is not None]
         if not same_length([*runs, *first]):
-            text = f"Runs of different length of {name} and {reference} are not compared."
-            found.append(VerdictLine("fair", text))
+            yield VerdictLine("fair", f"Runs of different length of {name} and {reference} are not compared.")
         if known:
             parts = [f"{label} {ratio_words(each)}" for label, each in known]
             worse = max(each.mean for _, each in known if each.mean is not None)
             text = f"Its errors relative to {reference}: {_list(parts)}{some}."
             mark: Mark = "good" if worse <= 1.0 and not some else "plain" if worse < 1.25 else "fair"
-            found.append(VerdictLine(mark, text))
+            yield VerdictLine(mark, text)
         judged = all(run.has_errors for run in (*runs, *first))
         if judged and "IAE" not in dict(known) and rate.mean is not None:
             text = f"Less is known of one of {name} and {reference}: integrals of errors are not compared."
-            found.append(VerdictLine("fair", text))
-    return found
+            yield VerdictLine("fair", text)
 
 
 def _with_leaders(runs: Sequence[CaseMetrics], first: Sequence[CaseMetrics]) -> str:
@@ -398,53 +376,47 @@ def _collision(each: Collision) -> str:
     return f"{each.first}–{each.second} at {each.time_s:.2f} s" + (f" ({', '.join(parts)})" if parts else "")
 
 
-def _avoided(cases: Sequence[CaseMetrics]) -> list[VerdictLine]:
-    found = []
-    for case in cases:
-        if case.avoided_share:
-            most = max(case.robots, key=lambda robot: robot.avoided)
-            text = f"Avoidance was at work on {number(case.avoided_share, 100.0)} % of all ticks in {case.case}"
-            found.append(VerdictLine("plain", f"{text}, most on those of {most.robot} ({number(most.avoided)})."))
-    return found[:NAMED]
+def _avoided(cases: Sequence[CaseMetrics]) -> Lines:
+    for case in [case for case in cases if case.avoided_share][:NAMED]:
+        most = max(case.robots, key=lambda robot: robot.avoided)
+        text = f"Avoidance was at work on {number(case.avoided_share, 100.0)} % of all ticks in {case.case}"
+        yield VerdictLine("plain", f"{text}, most on those of {most.robot} ({number(most.avoided)}).")
 
 
-def _pace(cases: Sequence[CaseMetrics]) -> list[VerdictLine]:
+def _pace(cases: Sequence[CaseMetrics]) -> Lines:
     factors = [(case.world_factor, case.case) for case in cases if case.world_factor is not None]
     factor, case = min(factors, default=(1.0, ""))
-    if factor >= KEPT_UP:
-        return []
-    text = f"The world fell behind: at its slowest it ran at {factor:.2f} of real time, in {case}."
-    return [VerdictLine("fair" if factor >= SLOW else "bad", text)]
+    if factor < KEPT_UP:
+        text = f"The world fell behind: at its slowest it ran at {factor:.2f} of real time, in {case}."
+        yield VerdictLine("fair" if factor >= SLOW else "bad", text)
 
 
-def _shadows(cases: Sequence[CaseMetrics]) -> list[VerdictLine]:
+def _shadows(cases: Sequence[CaseMetrics]) -> Lines:
     found = [(case, robot, robot.shadow) for case in cases for robot in case.robots if robot.shadow is not None]
     found.sort(key=lambda each: -each[2].rmse)
-    if not found:
-        return []
     shown = []
     for case, robot, shadow in found[:NAMED]:
         ahead = "over the whole run" if shadow.horizon_s is None else f"up to {shadow.horizon_s:g} s ahead"
         shown.append(f"{robot.robot} to {number(shadow.rmse, 100.0)} cm RMSE {ahead} ({case.case})")
-    rest = "; the others more closely" if len(found) > NAMED else ""
-    return [VerdictLine("plain", f"Twins beside robots foresaw {_list(shown)}{rest}.")]
+    if shown:
+        rest = "; the others more closely" if len(found) > NAMED else ""
+        yield VerdictLine("plain", f"Twins beside robots foresaw {_list(shown)}{rest}.")
 
 
-def _unfinished(cases: Sequence[CaseMetrics]) -> list[VerdictLine]:
+def _unfinished(cases: Sequence[CaseMetrics]) -> Lines:
     """Robots that did not get where their plan wanted them."""
-    found = []
     for case in cases:
         short = [each for each in case.robots if each.short is not None and each.short > UNFINISHED_M]
         if short:
             names = _list([f"{each.robot} by {number(each.short, 100.0)} cm" for each in short])
-            found.append(VerdictLine("bad", f"Not where the plan wanted them at the end of {case.case}: {names}."))
-    return found
+            yield VerdictLine("bad", f"Not where the plan wanted them at the end of {case.case}: {names}.")
 
 
-def _room(cases: Sequence[CaseMetrics]) -> list[VerdictLine]:
+def _room(cases: Sequence[CaseMetrics]) -> Lines:
     far = max(cases, key=lambda case: case.excursion)
-    text = f"{far.excursion_robot} was {number(far.excursion, 100.0)} cm outside the arena in {far.case}."
-    return [VerdictLine("fair" if far.excursion < 0.02 else "bad", text)] if far.excursion > 0.0 else []
+    if far.excursion > 0.0:
+        text = f"{far.excursion_robot} was {number(far.excursion, 100.0)} cm outside the arena in {far.case}."
+        yield VerdictLine("fair" if far.excursion < 0.02 else "bad", text)
 
 
 def _first_few(texts: Sequence[str]) -> str:

@@ -22,6 +22,7 @@ from experiments.report.style import (
     WIDTH,
     Drawing,
     fitting,
+    labelled,
     legend_above,
     plain,
     spread_texts,
@@ -93,8 +94,8 @@ def pareto(rows: Sequence[CellRow], index: str = "iae", *, joined: bool = True, 
         axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axes.xaxis.set_minor_formatter(NullFormatter())
     axes.grid()
-    entries = axes.get_legend_handles_labels()
-    lines = math.ceil(len(entries[1]) / fitting(width, entries[1], 4))
+    entries = labelled(axes)
+    lines = math.ceil(len(entries) / fitting(width, entries, 4))
     figure.set_figheight(figure.get_figheight() + LEGEND_LINE * max(0, lines - 1))
     legend_above(figure, entries, columns=4)
     spread_texts(axes)

@@ -28,12 +28,7 @@ from experiments.view.replay import ReplayClock
 
 STEP_S: Final = 0.01
 SEEN_S: Final = 1.0  # until the tokens of a run that is up have come
-ENCODED: Final = (
-    messages.State,
-    messages.Status,
-    messages.Pose,
-    messages.Goal,
-)  # the rest is JSON
+ENCODED: Final = (messages.State, messages.Status, messages.Pose, messages.Goal)  # the rest is JSON
 
 
 class Broadcast:

@@ -56,11 +56,7 @@ def served(port: int, *, dark: bool) -> Iterator[PageServer]:
     """Serve a page to this machine alone, at `port` or the next free one."""
     server = PageServer(port)
     server.gui.configure_theme(
-        dark_mode=dark,
-        show_logo=False,
-        show_share_button=False,
-        control_width="large",
-        brand_color=(0, 114, 178),
+        dark_mode=dark, show_logo=False, show_share_button=False, control_width="large", brand_color=(0, 114, 178)
     )
     server.gui.main_panel.dock_right()
     light(server)

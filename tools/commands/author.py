@@ -70,8 +70,7 @@ def import_(
         float, typer.Option(min=1.0, max=86400.0, help="Duration, which their files do not give [s].")
     ] = 60.0,
     poses: Annotated[
-        str | None,
-        typer.Option(metavar="FILE", help="Starts: an index of robots (.yaml), or a Webots world (.wbt)."),
+        str | None, typer.Option(metavar="FILE", help="Starts: an index of robots (.yaml), or a Webots world (.wbt).")
     ] = None,
     as_json: AsJson = False,
 ) -> None:

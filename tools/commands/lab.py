@@ -19,8 +19,7 @@ Folder = Annotated[str, typer.Argument(metavar="LAB", help="Folder of the lab.")
 Names = Annotated[list[str], typer.Argument(metavar="NAME...", help="Identities.")]
 Days = Annotated[float, typer.Option(min=0.01, help="Validity of a certificate [days].")]
 Hosts = Annotated[
-    list[str] | None,
-    typer.Option("--host", metavar="HOST", help="Name or address of its endpoint; may be repeated."),
+    list[str] | None, typer.Option("--host", metavar="HOST", help="Name or address of its endpoint; may be repeated.")
 ]
 SOON_DAYS: Final = 14.0
 

@@ -30,9 +30,7 @@ def report(
     runs: Annotated[
         list[str],
         typer.Argument(
-            metavar="RUN...",
-            help="Folders of runs, or full of runs, or of a sweep.",
-            autocompletion=completion.folders,
+            metavar="RUN...", help="Folders of runs, or full of runs, or of a sweep.", autocompletion=completion.folders
         ),
     ],
     out: Annotated[

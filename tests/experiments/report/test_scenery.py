@@ -82,12 +82,12 @@ def test_a_border_without_walls_is_dashed(short):
 
 
 def test_the_legend_names_what_there_is(short):
-    assert scenery.legend([short.plan]) == ([], [])
+    assert scenery.legend([short.plan]) == {}
     full = within(short, FULL).plan
-    _, said = scenery.legend([full])
+    said = [*scenery.legend([full])]
     assert said == ["obstacle", "can be pushed", "obstacle's path", "wall", "above the floor", "start box"]
-    assert scenery.legend([full, full])[1] == said
-    assert "above the floor" not in scenery.legend([full], space=True)[1]
+    assert [*scenery.legend([full, full])] == said
+    assert "above the floor" not in scenery.legend([full], space=True)
 
 
 def test_spatial_obstacles_reach_over_the_shown_height(short):
