@@ -220,7 +220,7 @@ def compare(
 
 def differences_table(differences: Sequence[tuple[str, str, Sequence[str]]]) -> page.Table:
     """Name and folder of each run, and its differences from the first one."""
-    rows = []
+    rows: list[page.TableRow] = []
     for name, folder, found in differences:
         same = "the same file, seeds and versions" if rows else "the reference"
         rows.append(page.TableRow((name, folder, "; ".join(found) or same)))

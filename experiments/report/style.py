@@ -190,7 +190,8 @@ def robot_legend(figure: Figure, traces: Sequence[Trace], more: Mapping[str, Art
     label = trace.robots
     if len(label) > MAX_COLOURED_ROBOTS:
         label = tuple(trace.plan.experiment.robots[name].kind for name in trace.robots)
-    shown = {name: Line2D([], [], **line) for name, line in zip(label, robot_lines(trace), strict=True)} | more
+    lines = {name: Line2D([], [], **line) for name, line in zip(label, robot_lines(trace), strict=True)}
+    shown: dict[str, Artist] = {**lines, **more}
     legend_above(figure, shown, columns={4: 4, 6: 3, 7: 4, 8: 4}.get(len(shown), 5))
 
 
