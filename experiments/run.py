@@ -10,10 +10,10 @@ import importlib
 import math
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -158,12 +158,14 @@ def simulate_seeds(
     *,
     cases: Sequence[str] = (),
     folder: str | Path | None = None,
+    processes: int | None = None,
     progress: Progress = lambda *_: None,
     watch: Watch = lambda *_: None,
 ) -> list[Run]:
     """As `simulate`, once for each seed; recordings are made of the first seed only.
 
-    Many seeds are shared between processes, which import the script: there under `if __name__ == "__main__"`.
+    Many seeds are shared between processes (as many as this machine has cores), which import the script: there under
+    `if __name__ == "__main__"`.
     `progress` is called repeatedly. `watch` gives for each case what the simulation of the first seed calls, see
     `simulation.simulate`.
     """
@@ -176,11 +178,12 @@ def simulate_seeds(
     first, *others = seeds
     traces: list[dict[str, Trace]] = [{} for _ in seeds]
     metrics: list[dict[str, CaseMetrics]] = [{} for _ in seeds]
-    with _processes(works, len(others)) as processes:
+    count = min(_profitable_processes(works, len(others)) if processes is None else processes, len(works) * len(others))
+    with pool(count) if count > 1 else nullcontext() as workers:
         shared = (
             {}
-            if processes is None
-            else {(name, seed): processes.submit(_flown, name, works[name], seed) for name in works for seed in others}
+            if workers is None
+            else {(name, seed): workers.submit(_flown, name, works[name], seed) for name in works for seed in others}
         )
         for name, plan in works.items():
             duration_s = plan.experiment.duration_s
@@ -221,16 +224,10 @@ def _result(future: Future[Flown]) -> Flown:
         raise ExplainedError(f"a process of the run {KILLED}: take fewer --seeds, or `./zenpark sweep`") from None
 
 
-@contextmanager
-def _processes(works: Mapping[str, Plan], seeds: int) -> Iterator[ProcessPoolExecutor | None]:
-    """Processes for `seeds` more seeds of these cases; None if starting them would take longer."""
+def _profitable_processes(works: Mapping[str, Plan], seeds: int) -> int:
+    """Number of processes for `seeds` more seeds of these cases; 1 if starting them would take longer."""
     ticks = sum(plan.experiment.duration_s * plan.experiment.rates.body_hz * len(plan.names) for plan in works.values())
-    count = min(cores(), len(works) * seeds)
-    if count < 2 or seeds * ticks < SHARED:
-        yield None
-        return
-    with pool(count) as processes:
-        yield processes
+    return 1 if seeds * ticks < SHARED else cores()
 
 
 def _refuse_too_much(plan: Plan, seeds: int) -> None:

@@ -184,7 +184,7 @@ class Net:
         self.session = Session(self)
 
     def forget(self) -> None:
-        """Everybody has left."""
+        """Drop all channels."""
         self.channels.clear()
 
     def listen(self, key: str, handler: object = None, *, asked: bool = False) -> Channel:

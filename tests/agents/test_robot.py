@@ -135,7 +135,7 @@ def test_robot_alone_or_offline_holds_and_goes_on(what):
 
 
 def test_swapped_robots_are_refused():
-    """Each stands where the other one begins: neither takes off, and each names the mistake."""
+    """Robots at each other's start do not take off, and both name the mistake."""
     swarm = Swarm(small({"A": "khepera4", "B": RobotTable(kind="khepera4", start=[0.25, 0.0])}, {"A - B": 0.5}))
     for name, x in (("A", 0.25), ("B", 0.0)):
         swarm.spoil(name, lambda state, x=x: setattr(state, "position", (x, 0.0, 0.0)))

@@ -65,7 +65,7 @@ COMPILED = [
 
 @pytest.mark.parametrize("kind", COMPILED)
 def test_plugins_of_zenpark_stay_in_the_subset(kind):
-    """Those of others may leave it and run as plain Python, as do laws that remember."""
+    """Plug-ins of others may leave the subset and run as plain Python, as do laws that remember."""
     source, first = inspect.getsourcelines(kind)
     found = outside(dedent("".join(source)), first=first)
     file = inspect.getsourcefile(kind)

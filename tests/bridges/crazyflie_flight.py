@@ -62,7 +62,7 @@ def connected(addresses, *, measuring_s=MEASURING_S, **options):
 
 
 @contextmanager
-def flown(rows=1, *, device=None, external=False, start=None, serve=None, measuring_s=MEASURING_S, **faults):
+def connected_twins(rows=1, *, device=None, external=False, start=None, serve=None, measuring_s=MEASURING_S, **faults):
     """Twins of Crazyflies, and a process that is connected to them; `serve`: settings of the twins, if others."""
     options = {"device": device, "external": external, "start": start}
     asked = request("crazyflie", ["crazyflie-twin"] * rows, **options | ({"device": serve} if serve else {}))

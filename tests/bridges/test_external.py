@@ -56,12 +56,12 @@ class FarEnd:
     def repeat(self, say):
         """Calls something 100 times a second, in a thread, until `hush`."""
 
-        def run():
+        def keep_saying():
             while not self._quiet.wait(0.01):
                 say()
 
         self._quiet.clear()
-        self._thread = threading.Thread(target=run)
+        self._thread = threading.Thread(target=keep_saying)
         self._thread.start()
 
     def talk(self, *names):

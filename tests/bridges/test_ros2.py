@@ -324,7 +324,7 @@ def endpoint(role, topic, kind):
 
 
 def endpoints(name):
-    """Those of a robot."""
+    """Endpoints of a robot."""
     return {
         endpoint("MP", f"/{name}/pose", ros2.POSE_STAMPED),
         endpoint("MP", f"/{name}/velocity", ros2.TWIST_STAMPED),

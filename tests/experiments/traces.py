@@ -19,12 +19,12 @@ STEP = 0.02
 TIMED = ("position", "yaw", "true_position", "goal", "setpoint")
 
 
-def parse_links(experiment):
+def parse_links(at_origin):
     """Every directed link: listener, speaker, distance [m], gain."""
-    return [(link.receiver, link.sender, link.wanted.distance, link.gain) for link in Plan(experiment).one_way_links]
+    return [(link.receiver, link.sender, link.wanted.distance, link.gain) for link in Plan(at_origin).one_way_links]
 
 
-def experiment(robots, formation, *, legs=(), **rest):
+def at_origin(robots, formation, *, legs=(), **rest):
     """Robots by kind, all started at the origin; a leg of the first one at each of `legs`."""
     tables = {name: RobotTable(kind=kind, start=[0.0, 0.0]) for name, kind in robots.items()}
     timeline = [LegTable(at_s=at, robot=next(iter(robots)), plan="hold") for at in legs]
@@ -90,7 +90,7 @@ def pair(distance, *, legs=(), target=1.0, **rest):
     """A leader at the origin and one follower whose distance over time is given; the follower should keep `target`."""
     position = np.zeros((len(distance), 2, 3))
     position[:, 1, 0] = distance
-    what = experiment({"L": "turtlebot3", "F": "khepera4"}, {"L > F": target}, legs=legs)
+    what = at_origin({"L": "turtlebot3", "F": "khepera4"}, {"L > F": target}, legs=legs)
     return trace(what, position, **rest)
 
 
@@ -114,7 +114,7 @@ def crowd(rows, case="periodic", threshold=0.0, *, seed=1, duration=20.0):
     near = {tuple(sorted((i, int(j)))) for i in range(rows) for j in np.argsort(gap[i])[1:5]}
     names = [f"CF{i + 1:02d}" for i in range(rows)]
     formation = {f"{names[i]} - {names[j]}": float(gap[i, j]) for i, j in near}
-    what = experiment(dict.fromkeys(names, "crazyflie"), formation, title=f"{rows} robots on a hemisphere")
+    what = at_origin(dict.fromkeys(names, "crazyflie"), formation, title=f"{rows} robots on a hemisphere")
     start = place + rng.normal(0.0, 0.15, place.shape) * [1.0, 1.0, 0.0]
     return simulate(what, start, case, threshold, seed=seed, duration=duration)
 

@@ -323,7 +323,7 @@ def assert_formed(trace: Trace, within_m: float, since_s: float) -> None:
 
 
 def transmits_at_50_hz(trace: Trace) -> None:
-    """Each robot has transmitted 50 times a second, but for ticks that it counted as missed."""
+    """Robots transmit 50 times a second, except at ticks that they counted as missed."""
     wanted = 50.0 * trace.plan.experiment.duration_s
     sent = np.bincount(trace.sent.link, minlength=len(trace.robots))
     assert (sent <= wanted + 1).all()

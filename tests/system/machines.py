@@ -106,7 +106,7 @@ class Machine:
             file.write(f"{self.address} {known[0]} {known[1]}\n")
         until((self.folder / "sshd.pid").exists, f"sshd of {self.name} runs", 10.0)
 
-    def zenpark(self, *, offset_s: float = 0.0, drift: float = 0.0) -> Path:
+    def zenpark_file(self, *, offset_s: float = 0.0, drift: float = 0.0) -> Path:
         """The zenpark of this machine, as a command; its clock may be wrong."""
         command = self.folder / "zenpark"
         fake = self.folder / "site"

@@ -23,7 +23,7 @@ pytestmark = pytest.mark.system
 SHORT = ("--case", "event", "--json", "duration_s=2")
 
 
-def experiment(folder: Path, endpoint: str) -> str:
+def file_with_board(folder: Path, endpoint: str) -> str:
     file = folder / "x.toml"
     text = catalogue.path("triangle").read_text("utf-8")
     text += f'\n[network]\nconnect = ["{endpoint}"]\n[hosts.board]\nrobots = ["KH02"]\n'
@@ -32,7 +32,7 @@ def experiment(folder: Path, endpoint: str) -> str:
 
 
 def test_present_robot_is_adopted_unless_it_has_flown(router: RouterProcess, watcher: Watcher, tmp_path: Path) -> None:
-    file = experiment(tmp_path, router.endpoint)
+    file = file_with_board(tmp_path, router.endpoint)
     with (
         RobotProcess(router.endpoint, "join", "KH02", "--once") as at_boot,
         RobotProcess(router.endpoint, "triangle", "CF01", "--case", "event") as by_hand,
@@ -67,7 +67,7 @@ def test_lab_member_needs_only_its_own_files(tmp_path: Path) -> None:
     for name in ("ca.pem", "KH02.pem", "KH02.key"):
         (lab / name).rename(own / name) if name.startswith("KH02") else shutil.copy(lab / name, own)
     endpoint = free_endpoint(preferred_port=0, protocol="tls")
-    file = experiment(tmp_path, endpoint)
+    file = file_with_board(tmp_path, endpoint)
     reach = ("--connect", endpoint, "--lab", str(own))
     with (
         Started("tools.guard", "router", file, "--lab", str(lab), "--listen", endpoint) as router,
@@ -85,7 +85,7 @@ def test_lab_member_needs_only_its_own_files(tmp_path: Path) -> None:
 
 def test_who_joined_lands_when_the_conductor_is_dead(router: RouterProcess, watcher: Watcher, tmp_path: Path) -> None:
     with RobotProcess(router.endpoint, "join", "KH02", "--once") as joined:
-        flight = Flight(tmp_path / "run", experiment(tmp_path, router.endpoint), "--case", "event")
+        flight = Flight(tmp_path / "run", file_with_board(tmp_path, router.endpoint), "--case", "event")
         watcher.until_all("running", "KH02")
         flight.signal(signal.SIGKILL)
         flight.finish()

@@ -153,7 +153,7 @@ def test_by_hand_and_what_nobody_should_believe(router: RouterProcess, watcher: 
 
 @pytest.mark.timeout(120)
 def test_lab_lets_only_the_centre_decide(tmp_path: Path) -> None:
-    """Its own certificate is its right: a robot's gives none over others, and a router that died enforces it again."""
+    """The centre's certificate is its right: a robot's gives none over others; a restarted router enforces it again."""
     file, folder = tmp_path / "three.toml", tmp_path / "run"
     file.write_text(FAST.format(duration=8.0, architecture=HYBRID) + '[network]\nlab = "lab"\n')
     robots = dict.fromkeys(load(file).experiment.robots, "robot")

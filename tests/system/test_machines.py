@@ -37,7 +37,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machines]:
         yield made
 
 
-def experiment(lab: Machines, folder: Path, duration_s: float) -> Path:
+def park_file(lab: Machines, folder: Path, duration_s: float) -> Path:
     """The reference experiment, its robots on the lab's machines."""
     text = catalogue.path("robotic-park").read_text("utf-8")
     text = text.replace("duration_s = 45.0", f"duration_s = {duration_s}").replace("at_s = 21.0", "at_s = 1.0")
@@ -53,14 +53,14 @@ def triangle(lab: Machines, folder: Path, duration_s: float) -> Path:
 def on_hosts(lab: Machines, folder: Path, text: str, robots: dict[str, list[str]]) -> Path:
     for host, names in robots.items():
         wrong = {"offset_s": OFFSET_S, "drift": DRIFT} if host == "lab2" else {}
-        zenpark = lab[host].zenpark(**wrong)
+        zenpark = lab[host].zenpark_file(**wrong)
         text += f'\n[hosts.{host}]\naddress = "{host}"\nzenpark = "{zenpark}"\nrobots = {json.dumps(names)}\n'
     file = folder / "experiment.toml"
     file.write_text(text)
     return file
 
 
-def zenpark(lab: Machines, *arguments: str) -> subprocess.Popen[str]:
+def begin_at_desk(lab: Machines, *arguments: str) -> subprocess.Popen[str]:
     return subprocess.Popen(
         lab["desk"].command(sys.executable, "-m", "tools.guard", *arguments),
         cwd=ROOT,
@@ -72,7 +72,7 @@ def zenpark(lab: Machines, *arguments: str) -> subprocess.Popen[str]:
     )
 
 
-def flown(flight: subprocess.Popen[str], lab: Machines) -> str:
+def output_of_success(flight: subprocess.Popen[str], lab: Machines) -> str:
     """What a run said that went well; nothing of it is left on any machine."""
     out, _ = flight.communicate(timeout=100)
     assert flight.returncode in {0, SPOILED}, out
@@ -86,9 +86,9 @@ def busy(lab: Machines) -> list[str]:
 
 
 def test_one_command_flies_reference_and_fetches_all_files(lab: Machines, tmp_path: Path) -> None:
-    file, folder = experiment(lab, tmp_path, 4.0), tmp_path / "run"
-    flight = zenpark(lab, "run", str(file), "--case", "periodic", "--out", str(folder), "--anyway", "--json")
-    assert "lab2/CF01| CF01: running" in flown(flight, lab), "output is streamed, with where it comes from"
+    file, folder = park_file(lab, tmp_path, 4.0), tmp_path / "run"
+    flight = begin_at_desk(lab, "run", str(file), "--case", "periodic", "--out", str(folder), "--anyway", "--json")
+    assert "lab2/CF01| CF01: running" in output_of_success(flight, lab), "output is streamed, with where it comes from"
 
     for robots in ROBOTS.values():
         for robot in robots:
@@ -129,8 +129,8 @@ def test_one_command_flies_reference_and_fetches_all_files(lab: Machines, tmp_pa
 def test_centre_here_guides_remote_robots_by_one_clock(lab: Machines, tmp_path: Path) -> None:
     file, folder = triangle(lab, tmp_path, 3.0), tmp_path / "run"
     options = ["--case", "periodic", "--set", "architecture=centralised", "--anyway", "--no-report"]
-    flight = zenpark(lab, "run", str(file), *options, "--out", str(folder))
-    flown(flight, lab)
+    flight = begin_at_desk(lab, "run", str(file), *options, "--out", str(folder))
+    output_of_success(flight, lab)
     trace = playback.read(folder / "periodic.mcap").trace
     assert trace.goals is not None
     sent = np.bincount(trace.goals.sent.link, minlength=len(trace.robots))
@@ -146,7 +146,7 @@ def test_centre_here_guides_remote_robots_by_one_clock(lab: Machines, tmp_path: 
 def test_launchers_death_lands_everybody_and_clears_all(lab: Machines, tmp_path: Path) -> None:
     file, folder = triangle(lab, tmp_path, 20.0), tmp_path / "run"
     words = options("--case", "periodic", "--out", folder, "--anyway", *NEAR_TRIANGLE)
-    flight = zenpark(lab, "run", str(file), *words)
+    flight = begin_at_desk(lab, "run", str(file), *words)
     logs = folder / "logs"
     for robot in TRIANGLE:
         until(lambda robot=robot: f"{robot}: running" in said(logs, robot, "periodic"), "it runs", 60.0)
@@ -167,7 +167,7 @@ def test_launchers_death_lands_everybody_and_clears_all(lab: Machines, tmp_path:
 def begun(lab: Machines, file: Path, folder: Path) -> subprocess.Popen[str]:
     """A run of the triangle in which CF01 runs."""
     words = ("--case", "event", "--out", str(folder), "--anyway", "--no-report")
-    flight = zenpark(lab, "run", str(file), *words)
+    flight = begin_at_desk(lab, "run", str(file), *words)
     until(lambda: "running" in said(folder / "logs", "CF01"), "it runs", 60.0)
     return flight
 
@@ -211,8 +211,10 @@ def test_dead_robot_on_a_machine_is_restarted_there(lab: Machines, tmp_path: Pat
     file, folder = tmp_path / "x.toml", tmp_path / "run"
     text = catalogue.path("triangle").read_text("utf-8").replace("duration_s = 15.0", "duration_s = 12.0")
     text = text.replace("seed = 1 ", 'on_loss = "restart"\nseed = 1 ')
-    file.write_text(f'{text}\n[hosts.lab1]\naddress = "lab1"\nzenpark = "{lab["lab1"].zenpark()}"\nrobots = ["KH01"]\n')
-    flight = zenpark(lab, "run", str(file), "--case", "event", "--out", str(folder), "--no-report")
+    file.write_text(
+        f'{text}\n[hosts.lab1]\naddress = "lab1"\nzenpark = "{lab["lab1"].zenpark_file()}"\nrobots = ["KH01"]\n'
+    )
+    flight = begin_at_desk(lab, "run", str(file), "--case", "event", "--out", str(folder), "--no-report")
     until(lambda: "running" in said(folder / "logs", "KH01"), "it runs", 60.0)
     (first,) = (each for each in lab["lab1"].processes() if "KH01" in each.cmdline())
     first.kill()
@@ -226,7 +228,7 @@ def test_dead_robot_on_a_machine_is_restarted_there(lab: Machines, tmp_path: Pat
 
 def test_a_preflight_starts_robots_on_their_machines(lab: Machines, tmp_path: Path) -> None:
     file = triangle(lab, tmp_path, 5.0)
-    preflight = zenpark(lab, "preflight", str(file), "--hop", "--out", str(tmp_path / "out"), "--json")
+    preflight = begin_at_desk(lab, "preflight", str(file), "--hop", "--out", str(tmp_path / "out"), "--json")
     out, _ = preflight.communicate(timeout=120)
     said = json.loads(out[out.index("\n{") :])
     assert said["ok"], out
@@ -236,12 +238,12 @@ def test_a_preflight_starts_robots_on_their_machines(lab: Machines, tmp_path: Pa
 
 
 def test_faults_of_machines_are_reported_with_remedy(lab: Machines, tmp_path: Path) -> None:
-    file = experiment(lab, tmp_path, 4.0)
+    file = park_file(lab, tmp_path, 4.0)
     text = file.read_text()
     text = text.replace(str(lab["lab1"].folder / "zenpark"), "nowhere/zenpark")
     text = text.replace('"lab2"', '"10.77.0.99"').replace('"lab3"', f'"127.0.0.1@{lab["lab3"].address}"')
     file.write_text(text)
-    flight = zenpark(lab, "run", str(file), "--case", "event", "--out", str(tmp_path / "run"), "--anyway")
+    flight = begin_at_desk(lab, "run", str(file), "--case", "event", "--out", str(tmp_path / "run"), "--anyway")
     out, _ = flight.communicate(timeout=60)
     assert flight.returncode == 2
     assert "lab1: there is no zenpark at 'nowhere/zenpark'; `./zenpark hosts install FILE` puts it there" in out
@@ -251,7 +253,7 @@ def test_faults_of_machines_are_reported_with_remedy(lab: Machines, tmp_path: Pa
     known = lab.known_hosts.read_text()
     try:
         lab.known_hosts.write_text("")
-        checked = zenpark(lab, "hosts", "check", str(file), "--on", "lab1")
+        checked = begin_at_desk(lab, "hosts", "check", str(file), "--on", "lab1")
         out, _ = checked.communicate(timeout=60)
     finally:
         lab.known_hosts.write_text(known)

@@ -18,7 +18,7 @@ from experiments.real_time.hosts import authority
 from experiments.recording import playback
 from tests.system.lab import options, typed, until
 from tests.system.machines import Machines, machines, why_not
-from tests.system.test_machines import busy, zenpark
+from tests.system.test_machines import begin_at_desk, busy
 from tools.commands.run import SPOILED
 
 LACKING = why_not()
@@ -42,16 +42,16 @@ class Laboratory:
         text += f'\n[network]\nlab = "lab"\n{network}\n'
         self.there = {host: folder / "there" / host for host in ROBOTS}
         for host, robots in ROBOTS.items():
-            text += f'\n[hosts.{host}]\naddress = "{host}"\nzenpark = "{lab[host].zenpark(drift=drift)}"\n'
+            text += f'\n[hosts.{host}]\naddress = "{host}"\nzenpark = "{lab[host].zenpark_file(drift=drift)}"\n'
             text += f'lab = "{self.there[host]}"\nrobots = {json.dumps(robots)}\n'
         self.file.write_text(text, "utf-8")
         robots = [robot for each in ROBOTS.values() for robot in each]
         authority.create(self.keys, {**{role: role for role in authority.SERVICES}, **dict.fromkeys(robots, "robot")})
 
-    def zenpark(self, *arguments: str, limit_s: float = 60.0) -> tuple[int, str]:
+    def finish_command(self, *arguments: str, limit_s: float = 60.0) -> tuple[int, str]:
         """Exit code and all that it said."""
         command, *rest = arguments
-        process = zenpark(self.lab, command, *rest[: command != "run"], str(self.file), *rest[command != "run" :])
+        process = begin_at_desk(self.lab, command, *rest[: command != "run"], str(self.file), *rest[command != "run" :])
         try:
             out, _ = process.communicate(timeout=limit_s)
         except subprocess.TimeoutExpired:
@@ -61,7 +61,7 @@ class Laboratory:
 
     def fly(self, duration_s: float = 2.0) -> tuple[int, str]:
         more = ("--case", "event", f"duration_s={duration_s}", "--anyway", "--no-report", "--out", self.out)
-        return self.zenpark("run", *options(*more))
+        return self.finish_command("run", *options(*more))
 
     def flew(self, duration_s: float = 2.0) -> None:
         code, out = self.fly(duration_s)
@@ -76,7 +76,7 @@ class Laboratory:
 
 def test_machines_get_own_keys_and_fly_through_ssh(lab: Machines, tmp_path: Path) -> None:
     made = Laboratory(lab, tmp_path)
-    code, out = made.zenpark("hosts", "check")
+    code, out = made.finish_command("hosts", "check")
     assert code == 1, out
     assert "lab1: has no certificates of KH01, CF01; `./zenpark hosts install FILE`" in out
     code, out = made.fly()
@@ -87,7 +87,7 @@ def test_machines_get_own_keys_and_fly_through_ssh(lab: Machines, tmp_path: Path
         made.there["lab1"].mkdir(parents=True)
         shutil.copy(made.keys / "KH02.key", made.there["lab1"])  # it ran there yesterday
 
-    code, out = made.zenpark("hosts", "install")
+    code, out = made.finish_command("hosts", "install")
     assert code == 0, out
     assert "lab1: certificates of KH01, CF01 put into" in out
     assert "removed KH02.key" in out
@@ -97,11 +97,11 @@ def test_machines_get_own_keys_and_fly_through_ssh(lab: Machines, tmp_path: Path
         wanted = {"ca.pem", *(f"{robot}.{end}" for robot in robots for end in ("pem", "key"))}
         assert {file.name for file in there.iterdir()} == wanted, "neither the authority's key nor others'"
         assert {stat.S_IMODE(file.stat().st_mode) for file in there.iterdir()} == {0o600}
-    code, out = made.zenpark("hosts", "install")
+    code, out = made.finish_command("hosts", "install")
     assert (code, out.count("has its certificates")) == (0, 2), out
     for robot in ("KH01", "KH02", "CF01"):
         (made.keys / f"{robot}.key").unlink()  # they are where they are needed
-    code, out = made.zenpark("hosts", "check")
+    code, out = made.finish_command("hosts", "check")
     assert code == 0, out
     assert out.count("✓") == 14, out
     made.flew()
@@ -110,7 +110,7 @@ def test_machines_get_own_keys_and_fly_through_ssh(lab: Machines, tmp_path: Path
 @pytest.mark.parametrize("protocol", ["tls", "quic"])
 def test_remote_robots_reach_a_router_listening_for_them(lab: Machines, tmp_path: Path, protocol: str) -> None:
     made = Laboratory(lab, tmp_path, f'listen = ["{protocol}/0.0.0.0:7447"]')
-    assert made.zenpark("hosts", "install")[0] == 0
+    assert made.finish_command("hosts", "install")[0] == 0
     code, out = made.fly()
     assert code == 2, out
     here = lab["desk"].address
@@ -123,7 +123,7 @@ def test_remote_robots_reach_a_router_listening_for_them(lab: Machines, tmp_path
 def test_robots_follow_a_clock_that_drifts_meanwhile(lab: Machines, tmp_path: Path) -> None:
     drift = 2e-3  # forty times what is bad, so that seconds show it
     made = Laboratory(lab, tmp_path, drift=drift)
-    assert made.zenpark("hosts", "install")[0] == 0
+    assert made.finish_command("hosts", "install")[0] == 0
     made.flew(8.0)
     file = made.out / "event.mcap"
     lies = {lie.host: lie for lie in playback.read(file).trace.clocks}

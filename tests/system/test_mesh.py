@@ -126,7 +126,7 @@ def free(count: int) -> list[str]:
 
 
 def test_lab_members_let_nobody_exceed_its_rights(tmp_path: Path) -> None:
-    """There is no router that could refuse anything: whoever is told it does."""
+    """No router could refuse anything in a mesh: the receiver of an order does."""
     file = tmp_path / "mesh.toml"
     file.write_text(load("triangle").path.read_text() + '\n[network]\ntopology = "mesh"\nlab = "lab"\n')
     case = load(file).plan

@@ -25,7 +25,7 @@ pytestmark = pytest.mark.system
 
 
 def routers(flight: Flight) -> list[tuple[psutil.Process, str]]:
-    """Those of a run, and where each listens."""
+    """Routers of a run, with their endpoints."""
     found = []
     for child in psutil.Process(flight.process.pid).children():
         line = child.cmdline()

@@ -19,13 +19,13 @@ SETTINGS = ["duration_s=2.0"]
 RUNS = 7 * 6
 
 
-def zenpark(folder, *more, given=GIVEN):
+def begun_sweep(folder, *more, given=GIVEN):
     words = options("sweep", "triangle", "--out", folder, "--no-report", *SETTINGS, *more)
     return started(*GUARD, *words, *given, env=environment(OMP_NUM_THREADS="1"), stdin=subprocess.DEVNULL)
 
 
 def finished(folder, *more, **given):
-    with zenpark(folder, *more, **given) as process:
+    with begun_sweep(folder, *more, **given) as process:
         _, said = process.communicate()
         assert process.returncode == 0, said
 
@@ -64,7 +64,7 @@ def test_seeds_of_one_experiment_are_split_over_processes(tmp_path):
 
 def interrupted(folder, end):
     """Exit code and errors of a sweep that is ended after its first cell by `end`, which gets it and its children."""
-    with zenpark(folder, "--processes", "2") as process:
+    with begun_sweep(folder, "--processes", "2") as process:
         until(lambda: seeds_done(folder), "a cell is done")
         children = psutil.Process(process.pid).children(recursive=True)
         assert len(children) >= 2
@@ -117,7 +117,7 @@ def test_cluster_with_a_killed_worker_gives_same_table(tmp_path, whole):
     with ExitStack() as stack:
         stack.enter_context(started(*scheduler, **quiet))
         one, two = (stack.enter_context(started(*worker, str(tmp_path / name), **quiet)) for name in ("one", "two"))
-        process = stack.enter_context(zenpark(folder, "--scheduler", address))
+        process = stack.enter_context(begun_sweep(folder, "--scheduler", address))
         until(lambda: seeds_done(folder), "a cell is done")
         (one if process.pid % 2 else two).kill()
         assert len(seeds_done(folder)) < RUNS

@@ -37,7 +37,7 @@ def test_robots_agree_on_an_average_in_real_time(tmp_path: Path) -> None:
 
 @pytest.mark.mechanism("words: restart")
 def test_a_restarted_robot_joins_without_drawing_the_others(tmp_path: Path) -> None:
-    """Its first words are a step old, not those of its beginning; the others keep to their average meanwhile."""
+    """The first words of a restarted robot are a step old; the others keep to their average meanwhile."""
     words = ("--case", "periodic", 'on_loss="restart"', f"duration_s={RUN_S}")
     flight = Flight(tmp_path / "run", "average", *words)
     flight.until_flown()

@@ -253,8 +253,7 @@ def started(bootstrap, monkeypatch):
     return modules
 
 
-def test_tests_run_in_three_parts_without_retries(bootstrap, started, monkeypatch, capsys):
-    monkeypatch.setattr(bootstrap, "ROOT", ROOT)
+def test_tests_run_in_three_parts_without_retries(bootstrap, started, capsys):
     assert bootstrap.test([]) == 1
     assert [module[0] for module in started] == ["ruff", "ruff", "mypy", "pytest", "pytest", "pytest"]
     computing, devices, runs = started[3:]

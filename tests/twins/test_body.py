@@ -44,7 +44,7 @@ def body(kind, disturbance=None, seed=3):
     return TwinBody(request([kind], disturbance=disturbance, seeds=[seed]))
 
 
-def run(twin, ticks, first=0, command=None):
+def advance(twin, ticks, first=0, command=None):
     """(ticks, 3) true positions; the state is the body's own."""
     path = []
     for tick in range(first, first + ticks):
@@ -95,7 +95,7 @@ def test_robots_are_the_same_alone():
 
 def test_nothing_changes_within_a_tick():
     twin = body(KHEPERA4, Disturbance(position_sigma=0.001))
-    measured = run(twin, 10, command=AHEAD)[1].position
+    measured = advance(twin, 10, command=AHEAD)[1].position
     assert twin.read(9 * DT)[0].position == measured  # no new noise either
 
 
@@ -115,20 +115,20 @@ def test_robot_left_alone_climbs(latency):
     twin = body(CRAZYFLIE, Disturbance(latency_s=latency))
     twin.read(0.0)
     twin.command([(1.0, 1.0, 1.0, 0.0)])  # on the ground: of no effect, now or later
-    run(twin, 19, 1)
+    advance(twin, 19, 1)
     twin.takeoff([0], [0.5])
-    path, _ = run(twin, 580, 20, NO_SETPOINT)
+    path, _ = advance(twin, 580, 20, NO_SETPOINT)
     assert path[-1] == pytest.approx([0.0, 0.0, 0.5], abs=1e-3)
 
 
 def test_hover_jitter_fades_on_the_way_down():
     twin = body(CRAZYFLIE, Disturbance(hover_jitter=Jitter(0.01)))
-    assert not run(twin, 50)[0].any()
+    assert not advance(twin, 50)[0].any()
     twin.takeoff([0], [0.5])
-    path, _ = run(twin, 3000, 50)
+    path, _ = advance(twin, 3000, 50)
     assert path[500:, :2].std() == pytest.approx(0.01, rel=0.3)
     twin.land([0])
-    _, state = run(twin, 600, 3050)
+    _, state = advance(twin, 600, 3050)
     assert (state.true_position, state.flying) == (ZERO, False)
 
 
@@ -174,7 +174,7 @@ def test_velocity_is_that_of_motion_capture():
 
 def test_placed_robot_rests_or_moves_as_commanded():
     twin = body(KHEPERA4)
-    _, state = run(twin, 200, command=AHEAD)
+    _, state = advance(twin, 200, command=AHEAD)
     assert state.velocity == pytest.approx((0.2, 0.0, 0.0), abs=1e-6)
     twin.place([0], [(1.0, 1.0, 0.0)], [0.0], [False])
     for tick in (199, 200):
@@ -196,15 +196,15 @@ def test_odometry_drifts_with_the_way():
 def test_stop_halts_wheels_and_is_a_fall_aloft():
     for order in ("land", "stop"):
         twin = body(TURTLEBOT3)
-        run(twin, 50, command=AHEAD)
+        advance(twin, 50, command=AHEAD)
         getattr(twin, order)([0])
-        run(twin, 30, 50)
+        advance(twin, 30, 50)
         assert twin.engine.motions[0].velocity == ZERO
     twin = body(CRAZYFLIE)
     twin.takeoff([0], [0.5])
-    run(twin, 500)
+    advance(twin, 500)
     twin.stop([0])
-    height = run(twin, 60, 500)[0][:, 2]
+    height = advance(twin, 60, 500)[0][:, 2]
     assert height[10] > 0.3
     assert height[-1] == 0.0
 
@@ -242,10 +242,10 @@ def test_substeps_are_ticks_of_a_faster_body():
 
 def test_batteries_last_as_the_kind_says():
     twin = body(CRAZYFLIE)
-    assert run(twin, 101)[1].battery == 1.0  # motors off
+    assert advance(twin, 101)[1].battery == 1.0  # motors off
     twin.takeoff([0], [0.5])
-    assert run(twin, 200, 101)[1].battery == pytest.approx(1.0 - 2.0 / CRAZYFLIE.endurance_s)
-    assert run(body(KHEPERA4), 101)[1].battery == pytest.approx(1.0 - 1.0 / KHEPERA4.endurance_s, abs=1e-6)
+    assert advance(twin, 200, 101)[1].battery == pytest.approx(1.0 - 2.0 / CRAZYFLIE.endurance_s)
+    assert advance(body(KHEPERA4), 101)[1].battery == pytest.approx(1.0 - 1.0 / KHEPERA4.endurance_s, abs=1e-6)
 
 
 def test_external_pose_replaces_the_measured_one():

@@ -265,21 +265,33 @@ def estop(
     as_json: AsJson = False,
 ) -> int:
     """Cut the motors of every robot of every run of this machine, or at a router."""
+    from agents.network.endpoints import DEFAULT_ENDPOINT
+    from experiments.real_time.conductor.orders import EmergencyStop
+
+    if given := routers(connect, lab):
+        stops = [EmergencyStop(given, realm or "park", identity or IDENTITY)]
+    else:
+        others = _of_environment(lab), [DEFAULT_ENDPOINT]  # of another machine; of a zenohd, say
+        stops = stops_of_all_runs(*others, realm=realm, identity=identity)
+    return stop_all(stops, dry_run=dry_run, as_json=as_json)
+
+
+def stops_of_all_runs(
+    *groups: Sequence[str], realm: str | None = None, identity: str | None = None
+) -> list[EmergencyStop]:
+    """One stop for each run of this machine, and one for each of other `groups` of routers."""
     from agents.network import endpoints as topology
     from experiments.real_time.conductor.orders import EmergencyStop
     from experiments.real_time.hosts import run_registry
 
-    if given := routers(connect, lab):
-        stops = [EmergencyStop(given, realm or "park", identity or IDENTITY)]
-        return _stop_all(stops, dry_run=dry_run, as_json=as_json)
     up = run_registry.runs()
     stops = [EmergencyStop(run.endpoints, realm or run.realm, identity or run.identity, run) for run in up]
     known = {endpoint for stop in stops for endpoint in topology.bare(stop.endpoints)}
-    for others in (_of_environment(lab), [topology.DEFAULT_ENDPOINT]):  # of another machine; of a zenohd, say
+    for others in groups:
         if others and known.isdisjoint(topology.bare(others)):
             stops.append(EmergencyStop(others, realm or "park", identity or IDENTITY))
             known |= {*topology.bare(others)}
-    return _stop_all(stops, dry_run=dry_run, as_json=as_json)
+    return stops
 
 
 def _of_environment(lab: str | None) -> list[str]:
@@ -295,7 +307,7 @@ def _of_environment(lab: str | None) -> list[str]:
         return []
 
 
-def _stop_all(stops: Sequence[EmergencyStop], *, dry_run: bool, as_json: bool) -> int:
+def stop_all(stops: Sequence[EmergencyStop], *, dry_run: bool, as_json: bool) -> int:
     """Send all stops at the same time, or only look whom they would reach, and print the results.
 
     Returns:

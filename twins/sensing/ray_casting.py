@@ -21,7 +21,7 @@ from twins.scene import Scene
 
 STRIDE: Final = 16.0  # between the bearings of two fans in one sorted array: more than two turns
 SLACK: Final = 1e-9  # [rad] and share of an edge: a ray into the corner of two edges hits one of them
-BUDGET: Final = 1 << 18  # pairs processed at once: a few MB for each number of a pair
+BUDGET: Final = 1 << 18  # pairs: a few MB for each number of a pair
 CROWDED: Final = 8  # objects per ray for which memory is planned; more cost more rounds
 FULL: Final = 2.0 * np.pi
 
@@ -44,11 +44,11 @@ class Fan:
 class Beams:
     """Fans of rays on rows, arranged for `Caster.cast`: fan after fan, each in its own order."""
 
-    def __init__(self, fans: Sequence[Fan], row: Index, which: Index) -> None:
-        """Row `row` (F,) sends `fans[which]` (F,)."""
+    def __init__(self, fans: Sequence[Fan], row: Index, which: Index, budget: int = BUDGET) -> None:
+        """Row `row` (F,) sends `fans[which]` (F,); `budget` pairs of ray and object are processed at once."""
         count = np.array([len(fan.bearing) for fan in fans], dtype=np.intp)[which]
         self.size = int(count.sum())  # number of rays (R)
-        self.row = row
+        self.row, self.budget = row, budget
         self.first = np.cumsum(count) - count  # (F,) number of each fan's first ray
         self.height = np.array([fan.height for fan in fans])[which]  # (F,) above the row's position [m]
         self.reach = np.array([fan.reach for fan in fans])[which]  # (F,) from the row's centre [m]
@@ -88,8 +88,8 @@ class Beams:
         if not len(total) or not total[-1]:
             return
         cuts = [0, len(count)]
-        if total[-1] > BUDGET:
-            inner = np.searchsorted(total, np.arange(BUDGET, total[-1], BUDGET))
+        if total[-1] > self.budget:
+            inner = np.searchsorted(total, np.arange(self.budget, total[-1], self.budget))
             cuts = np.unique(np.concatenate([inner, cuts])).tolist()
         before = total - count
         for i, j in pairwise(cuts):
@@ -141,15 +141,16 @@ class Caster:
         distance = np.full(beams.size, np.inf)
         geometry = self._place_geometry(position, obstacles)
         share = len(self._radius) + len(self._owner)
-        step = max(1, BUDGET // (share + CROWDED * beams.widest))
+        step = max(1, beams.budget // (share + CROWDED * beams.widest))
         for begin in range(0, len(beams.row), step):
             fans = np.arange(begin, min(begin + step, len(beams.row)))
             origins = _FanOrigins(beams, fans, position, yaw)
             self._cast_on_cylinders(distance, origins, geometry)
             if len(self._owner):
                 self._cast_on_edges(distance, origins, geometry)
-        for begin in range(0, len(beams.upright), max(1, BUDGET // share)):
-            self._cast_on_upright(distance, beams, slice(begin, begin + max(1, BUDGET // share)), position, geometry)
+        step = max(1, beams.budget // share)
+        for begin in range(0, len(beams.upright), step):
+            self._cast_on_upright(distance, beams, slice(begin, begin + step), position, geometry)
         distance[~(distance <= beams.ray_reach)] = np.nan
         return distance
 

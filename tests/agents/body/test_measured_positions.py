@@ -54,7 +54,7 @@ def test_stamps_ahead_count_as_now_and_are_reported():
         assert heard.trouble[1] == "position of 'A' on the key of 'T'"
 
 
-def flown(ahead, seconds, frozen_s=inf):
+def flight_events(ahead, seconds, frozen_s=inf):
     """A Tello at 100 Hz whose positions are stamped `ahead(t)` of t [s] (None: there are none); what was said, when.
 
     From `frozen_s` on they stay the same.
@@ -89,7 +89,7 @@ def flown(ahead, seconds, frozen_s=inf):
 @pytest.mark.parametrize("ahead", [0.0, 2.0, 4.5])
 def test_blindness_is_noticed_in_time_despite_stamps_ahead(ahead):
     silent = 3.0
-    _, said = flown(lambda t: ahead if t < silent else None, 4.5)
+    _, said = flight_events(lambda t: ahead if t < silent else None, 4.5)
     blind, text = next((t, text) for t, text in said if "its own position is lost" in text)
     assert blind == pytest.approx(silent + 0.5, abs=0.03)
     assert text.startswith("hold: its own position is lost: the last is 0.5")
@@ -99,7 +99,7 @@ def test_blindness_is_noticed_in_time_despite_stamps_ahead(ahead):
 
 
 def test_stamps_behind_are_reported_before_positions_expire():
-    _, said = flown(lambda t: 0.0 if t < 2.0 else -0.4, 4.0)
+    _, said = flight_events(lambda t: 0.0 if t < 2.0 else -0.4, 4.0)
     (t, text), *_ = [each for each in said if "clock" in each[1]]
     assert t == pytest.approx(2.5, abs=0.03)
     assert text == "warn: the clock that stamps its positions is off: positions of T are stamped 0.4 s behind"
@@ -107,7 +107,7 @@ def test_stamps_behind_are_reported_before_positions_expire():
 
 
 def test_waiting_robot_reports_positions_of_another_clock():
-    runtime, _ = flown(lambda _: -3600.0, 0.5)
+    runtime, _ = flight_events(lambda _: -3600.0, 0.5)
     assert runtime.robots[0].lifecycle.reason == "no position of its own: positions of T are stamped 3.6e+03 s behind"
 
 
@@ -125,7 +125,7 @@ def test_a_pose_that_repeats_itself_is_none(exact, expected):
 
 @pytest.mark.parametrize(("frozen_s", "phase"), [(0.0, "idle"), (1.2, "done"), (4.0, "done")])
 def test_frozen_motion_capture_lands_what_flies(frozen_s, phase):
-    runtime, said = flown(lambda _: 0.0, frozen_s + 7.0, frozen_s)
+    runtime, said = flight_events(lambda _: 0.0, frozen_s + 7.0, frozen_s)
     assert Phase(runtime.robots[0].lifecycle.phase).word == phase
     assert runtime.states[0].note == FROZEN
     if frozen_s:

@@ -22,7 +22,7 @@ YAW = st.floats(-pi, pi)
 UNIT = Agility(response=1.0, turn_response=1.5, speed=1.0, turn_rate=9.0)
 
 
-def run(kind, start, yaw, goal, goal_yaw, *, seconds=16.0, dt=0.02, late=0):
+def drive_to(kind, start, yaw, goal, goal_yaw, *, seconds=16.0, dt=0.02, late=0):
     """Drive a twin to its goal: the twin, and all setpoints."""
     twin, control = Differential(kind, (*start, 0.0), yaw), PositionController(kind)
     seen, setpoints = [(twin.position, twin.yaw)] * late, []
@@ -38,7 +38,7 @@ def run(kind, start, yaw, goal, goal_yaw, *, seconds=16.0, dt=0.02, late=0):
 @FEW
 @given(PLACE, YAW, PLACE, st.one_of(YAW, st.just(nan)))
 def test_ground_robots_arrive_and_stand(kind, start, yaw, goal, goal_yaw):
-    twin, setpoints = run(kind, start, yaw, goal, goal_yaw)
+    twin, setpoints = drive_to(kind, start, yaw, goal, goal_yaw)
     assert hypot(twin.position[0] - goal[0], twin.position[1] - goal[1]) <= REACHED
     assert not any(any(setpoint) for setpoint in setpoints[-25:])
     if isfinite(goal_yaw):
@@ -58,7 +58,7 @@ def test_end_that_drives_ahead_is_chosen_once(kind, late):
                 (0.0 if abs(degrees) == 90 and yaw == 0.0 else distance * cos(yaw + bearing)),
                 distance * sin(yaw + bearing),
             )
-            twin, setpoints = run(kind, (0.0, 0.0), yaw, goal, nan, late=late)
+            twin, setpoints = drive_to(kind, (0.0, 0.0), yaw, goal, nan, late=late)
             assert hypot(twin.position[0] - goal[0], twin.position[1] - goal[1]) <= REACHED
             ends = [v > 0.0 for v, *_ in setpoints if v]
             assert all(ends) or not any(ends)

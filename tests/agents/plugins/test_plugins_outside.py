@@ -81,7 +81,7 @@ def path_with(folder):
 
 
 @pytest.fixture(scope="module")
-def zenpark(installed):
+def shelled(installed):
     with shell(installed) as command:
         yield command
 
@@ -91,27 +91,27 @@ def test_every_group_has_an_example():
 
 
 @pytest.mark.slow
-def test_trigger_of_the_docs_runs_from_outside(zenpark):
+def test_trigger_of_the_docs_runs_from_outside(shelled):
     assert len(source_of("SendEvery").splitlines()) <= 20
-    listed = zenpark("list").stdout
+    listed = shelled("list").stdout
     assert re.search(r"Triggers: .*\bsend-every\b", listed)
     assert re.search(r"Laws: .*\bspring\b", listed)
     assert not [name for name, _, _, group in REGISTERED if group != "zenpark.bodies" and name not in listed]
     choice = 'cases.event.trigger={ kind = "send-every", metres = 0.02, maximum_silence_s = 5.0 }'
-    run = zenpark("run", "triangle", "--virtual", "--json", "--no-report", "--set", "duration_s=5", "--set", choice)
+    run = shelled("run", "triangle", "--virtual", "--json", "--no-report", "--set", "duration_s=5", "--set", choice)
     assert run.returncode == 0, run.stderr
     cases = json.loads(run.stdout)["cases"]
     assert 0.0 < cases["event"]["mean"]["f_hz"] < 0.1 * cases["periodic"]["mean"]["f_hz"]
-    wrong = zenpark("run", "triangle", "--virtual", "--set", choice.replace("metres", "meters"))
+    wrong = shelled("run", "triangle", "--virtual", "--set", choice.replace("metres", "meters"))
     assert wrong.returncode != 0
     assert "did you mean 'metres'?" in wrong.stderr
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("line", re.findall(r"^    \./zenpark (run triangle --virtual .*)$", GUIDE, re.MULTILINE))
-def test_every_run_of_the_guide_ends_well(zenpark, line, tmp_path):
+def test_every_run_of_the_guide_ends_well(shelled, line, tmp_path):
     words = shlex.split(line)
-    done = zenpark(*words, "--case", "event", "--set", "duration_s=6", "--no-report", "--out", str(tmp_path / "run"))
+    done = shelled(*words, "--case", "event", "--set", "duration_s=6", "--no-report", "--out", str(tmp_path / "run"))
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "run" / "metrics.csv").exists()
 
@@ -133,15 +133,15 @@ assert {{each for each in sys.modules if each.startswith("experiments")}} == {{"
 
 
 @pytest.mark.slow
-def test_kind_of_the_docs_is_known_everywhere(zenpark, tmp_path):
-    assert re.search(r"Kinds of robots: .*\bhovercraft\b", zenpark("list").stdout)
-    assert "0.8 kg" in zenpark("explain", "hovercraft").stdout
-    assert '"hovercraft"' in zenpark("schema").stdout
+def test_kind_of_the_docs_is_known_everywhere(shelled, tmp_path):
+    assert re.search(r"Kinds of robots: .*\bhovercraft\b", shelled("list").stdout)
+    assert "0.8 kg" in shelled("explain", "hovercraft").stdout
+    assert '"hovercraft"' in shelled("schema").stdout
     words = ["triangle", "--set", "robots.KH01.kind=hovercraft", "--set", "duration_s=4"]
-    assert zenpark("check", *words).returncode == 0
-    refused = zenpark("check", *words, "--set", "world.engine=pymunk")
+    assert shelled("check", *words).returncode == 0
+    refused = shelled("check", *words, "--set", "world.engine=pymunk")
     assert "'hovercraft' does not move in this engine" in refused.stderr + refused.stdout
-    run = zenpark("run", *words, "--virtual", "--no-report", "--out", str(tmp_path / "run"))
+    run = shelled("run", *words, "--virtual", "--no-report", "--out", str(tmp_path / "run"))
     assert run.returncode == 0, run.stderr
     (tmp_path / "none").mkdir()
     with shell(tmp_path / "none") as uninstalled:
@@ -165,13 +165,13 @@ def test_broken_kind_is_left_out(tmp_path):
     """A broken plug-in spoils neither the help nor experiments without it."""
     install(tmp_path, "broken", "1", {"zenpark.kinds": {"wreck": "wrecks:WRECK"}})
     (tmp_path / "wrecks.py").write_text("raise LookupError('on purpose')\n")
-    with shell(tmp_path) as zenpark:
-        assert zenpark("--help").returncode == 0
-        listed = zenpark("list")
+    with shell(tmp_path) as shelled:
+        assert shelled("--help").returncode == 0
+        listed = shelled("list")
         assert listed.returncode == 0
         assert re.search(r"left out: .*wreck.*on purpose", listed.stderr)
-        assert zenpark("check", "triangle").returncode == 0
-        refused = zenpark("check", "triangle", "--set", "robots.KH01.kind=wreck")
+        assert shelled("check", "triangle").returncode == 0
+        refused = shelled("check", "triangle", "--set", "robots.KH01.kind=wreck")
     assert "the kind 'wreck' cannot be used" in refused.stderr + refused.stdout
 
 

@@ -11,10 +11,10 @@ from tests.commands import started
 
 
 @pytest.fixture
-def run(pipe):
+def lifeline_end(pipe):
     """Runs a lifeline while `feed` acts on the two ends of its pipe; returns it and whether it was lost."""
 
-    def run(feed, timeout_s=60.0, **given):
+    def lifeline_end(feed, timeout_s=60.0, **given):
         lost, reader = threading.Event(), pipe[0]
         line = Lifeline(lost, timeout_s=timeout_s, fd=reader, **given)
         line.start()
@@ -22,7 +22,7 @@ def run(pipe):
         line.join(10.0)
         return line.reason, lost.is_set()
 
-    return run
+    return lifeline_end
 
 
 def hang_up(ends, *written):
@@ -31,12 +31,12 @@ def hang_up(ends, *written):
     os.close(ends.pop())
 
 
-def test_end_of_file_is_loss(run):
-    assert run(lambda ends: hang_up(ends, b"..")) == ("the starter is gone", True)
+def test_end_of_file_is_loss(lifeline_end):
+    assert lifeline_end(lambda ends: hang_up(ends, b"..")) == ("the starter is gone", True)
 
 
-def test_silence_is_loss(run):
-    assert run(lambda _ends: None, timeout_s=0.05) == ("nothing from the starter for 0.05 s", True)
+def test_silence_is_loss(lifeline_end):
+    assert lifeline_end(lambda _ends: None, timeout_s=0.05) == ("nothing from the starter for 0.05 s", True)
 
 
 def test_a_descriptor_that_is_closed_is_loss(pipe):
@@ -48,10 +48,10 @@ def test_a_descriptor_that_is_closed_is_loss(pipe):
     assert line.reason == "the lifeline broke: Bad file descriptor"
 
 
-def test_whole_lines_pass_without_heartbeats(run):
+def test_whole_lines_pass_without_heartbeats(lifeline_end):
     lines = []
     parts = (b"\n\nclock -0.", b"2001\n", b"\n\nclock 1\nx", b"x" * 10_000)
-    run(lambda ends: hang_up(ends, *parts), on_line=lines.append)
+    lifeline_end(lambda ends: hang_up(ends, *parts), on_line=lines.append)
     assert lines == [b"clock -0.2001", b"clock 1"]
 
 

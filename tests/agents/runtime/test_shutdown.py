@@ -27,7 +27,7 @@ from tests.small import small
 STOP = sent("park/estop", messages.Stop("a test", "to see"))[0]
 
 
-def run(body: Airborne, silence_s: float = 5.0, timing: DescentTiming = QUICK) -> None:
+def run_to_end(body: Airborne, silence_s: float = 5.0, timing: DescentTiming = QUICK) -> None:
     """Run a robot with that body to its end, on a network of its own."""
     with Net().worn() as body.net:
         process(DRONE, body, loop_timeout_s=silence_s, descent=timing).run()
@@ -36,14 +36,14 @@ def run(body: Airborne, silence_s: float = 5.0, timing: DescentTiming = QUICK) -
 def run_and_break(body: Airborne, **given: Any) -> None:
     """Run a robot to the error of its loop."""
     with pytest.raises(OSError, match="the loop breaks"):
-        run(body, **given)
+        run_to_end(body, **given)
 
 
 @pytest.mark.parametrize("broken", [(), ("read",), ("land",), ("stop",), ("close",), ("read", "land", "stop", "close")])
 def test_shutdown_tries_everything_and_raises(broken):
     body = Airborne(*broken)
     with pytest.raises(OSError, match="fails" if broken else "the loop breaks") as error:
-        run(body)
+        run_to_end(body)
     assert body.order == ["open", "land", "stop", "close"]
     chain, one = [], error.value
     while one is not None:
@@ -86,7 +86,7 @@ def test_order_is_repeated_until_it_succeeds(broken, steps, lands):
     """A body that cannot be read gets time to land: the first order may have got lost."""
     body = Airborne(broken, steps=steps)
     with pytest.raises(OSError, match=f"{broken} fails"):
-        run(body, timing=replace(QUICK, again_s=0.02))
+        run_to_end(body, timing=replace(QUICK, again_s=0.02))
     assert body.calls.count("land") >= lands
     assert ("land" in body.calls) == (lands > 0)
     assert body.calls.count("stop") > 1

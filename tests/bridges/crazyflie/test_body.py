@@ -11,7 +11,7 @@ import yaml
 
 from agents.body.interface import BodyError
 from agents.protocols.crtp import MemoryKind
-from tests.bridges.crazyflie_flight import connected, flown, motors, supervised, truth
+from tests.bridges.crazyflie_flight import connected, connected_twins, motors, supervised, truth
 from twins.devices.crazyflie.supervisor import SupervisorState
 
 pytestmark = pytest.mark.system
@@ -33,7 +33,7 @@ def lighthouse_file(folder: Path, *numbers: int) -> str:
 def test_flight_and_next_session():
     """Take-off, a goal by streamed positions, landing; and again by another client, which the first must not hinder."""
     begin = time.monotonic()
-    with flown() as (twin, process):
+    with connected_twins() as (twin, process):
         assert time.monotonic() - begin < 5.0
         process.until(lambda: process.body.inspect(0).firmware == "twin", "version of the firmware")
         assert 3.0 < process.body.inspect(0).volts < 4.3
@@ -60,7 +60,7 @@ def test_flight_and_next_session():
 
 def test_a_goal_with_a_yaw():
     """Sent as polynomials, of which only the parts that change are written; the drone turns, and flies on at yaw 0."""
-    with flown() as (twin, process):
+    with connected_twins() as (twin, process):
         process.takeoff(0.3)
         for goal in ((0.3, -0.2, 0.5, 1.2), (0.2, -0.2, 0.4, -2.0), (0.2, 0.0, 0.4, 0.0)):
             process.lead(goal)
@@ -72,7 +72,7 @@ def test_a_goal_with_a_yaw():
 @pytest.mark.mechanism("Crazyflie bridge: emergency stop")
 def test_emergency_stop():
     """Motors off in mid-air; the twin is locked, says so, and refuses to fly again."""
-    with flown() as (twin, process):
+    with connected_twins() as (twin, process):
         process.takeoff()
         process.body.stop([0])
         process.until(lambda: supervised(twin) == SupervisorState.LOCKED, "locked")
@@ -85,7 +85,7 @@ def test_emergency_stop():
 
 
 def test_parameters_are_set():
-    with flown(device={"parameters": {"hlCommander.vtoff": 0.7, "stabilizer.controller": 2}}) as (twin, _):
+    with connected_twins(device={"parameters": {"hlCommander.vtoff": 0.7, "stabilizer.controller": 2}}) as (twin, _):
         value = twin.device.drones[0].value
         assert (value("posCtlPid.thrustMin"), value("stabilizer.controller")) == (5000, 2)
         assert value("hlCommander.vtoff") == pytest.approx(0.7)
@@ -109,7 +109,7 @@ LIGHTHOUSE = {"system": "lighthouse"}
     ],
 )
 def test_what_cannot_be_set_up(device, serve, said):
-    with pytest.raises(BodyError, match=said), flown(device=device, serve=serve):
+    with pytest.raises(BodyError, match=said), connected_twins(device=device, serve=serve):
         pass
 
 
@@ -119,7 +119,7 @@ def test_lighthouse(tmp_path):
     def device(*stations):
         return {"positioning": LIGHTHOUSE | {"file": lighthouse_file(tmp_path, *stations)}}
 
-    with flown(device=device(0, 1)) as (twin, process):
+    with connected_twins(device=device(0, 1)) as (twin, process):
         memories = twin.device.flock.decks.memories[0]
         assert (memories.geometries, memories.calibrations) == (0b11, 0b11)
         assert memories.stored == (0b1111, 0b1111)
@@ -138,7 +138,7 @@ def test_lighthouse(tmp_path):
 def test_flow_deck_begins_at_the_start():
     """Without positioning from outside the estimator is told where the robot stands, and is not left at (0, 0)."""
     start = [[0.7, -0.4, 0.0]]
-    with flown(start=start) as (twin, process):
+    with connected_twins(start=start) as (twin, process):
         assert [twin.device.drones[0].value(f"kalman.initial{axis}") for axis in "XYZ"] == pytest.approx(start[0])
         process.until(lambda: np.abs(process.state.position - start).max() < 0.05, "there")
 
@@ -147,7 +147,7 @@ def test_loco():
     """Anchors are told where they are, and say so; the mode is set; the estimate settles."""
     anchors = [[-2.0, -2.0, 0.0], [2.0, -2.0, 2.5], [2.0, 2.0, 0.0], [-2.0, 2.0, 2.5]]
     device = {"positioning": {"system": "loco", "mode": "tdoa3", "anchors": anchors}}
-    with flown(device=device) as (twin, _):
+    with connected_twins(device=device) as (twin, _):
         known = twin.device.flock.decks.memories[0].anchors()
         assert {number: list(place) for number, place in known.items()} == dict(enumerate(anchors))
         value = twin.device.drones[0].value
@@ -158,7 +158,7 @@ def test_loco():
 def test_external_position():
     """A drone takes off only when its estimator has taken over an external position; then it flies that estimate."""
     device = {"positioning": {"system": "external", "position_sigma": 0.02}}
-    with flown(device=device, external=True, start=[[0.5, 0.2, 0.0]]) as (twin, process):
+    with connected_twins(device=device, external=True, start=[[0.5, 0.2, 0.0]]) as (twin, process):
         process.run(0.2)
         assert np.isnan(process.state.position[0]).all()
         assert "no position from outside" in process.state.note[0]
@@ -178,7 +178,7 @@ def test_external_position():
 @pytest.mark.parametrize(("order", "after_s"), [("stop", 0.3), ("land", 0.1), ("close", 0.0)])
 def test_order_during_arming(order, after_s):
     """The order replaces the take-off: motors stay off and disarmed; afterwards the drone arms and flies."""
-    with flown(device=BRUSHLESS) as (twin, process):
+    with connected_twins(device=BRUSHLESS) as (twin, process):
         process.tick()
         assert supervised(twin) == SupervisorState.DISARMED
         process.body.takeoff([0], [0.5])
@@ -199,7 +199,7 @@ def test_order_during_arming(order, after_s):
 
 def test_another_session_finds_it_in_the_air():
     """A process that was killed has left it there: it is landed, then set up, and nothing says that it flies."""
-    with flown() as (twin, process):
+    with connected_twins() as (twin, process):
         process.takeoff(0.4)
         process.lead((0.0, 0.0, 0.4, 0.0)).run(0.2)
         process.body.close(land=False)
@@ -213,7 +213,7 @@ def test_another_session_finds_it_in_the_air():
 
 def test_ranges():
     """Distances to the walls of the twin's room, as a scan."""
-    with flown(device={"multiranger": True, "ranges_hz": 20.0}, start=[[0.5, 0.0, 0.0]]) as (_, process):
+    with connected_twins(device={"multiranger": True, "ranges_hz": 20.0}, start=[[0.5, 0.0, 0.0]]) as (_, process):
         process.until(lambda: process.state.scan[0] is not None, "scan")
         scan = process.state.scan[0]
         assert scan.distance == pytest.approx([1.5, 2.5, 2.0, 2.0, 2.5], abs=2e-3)

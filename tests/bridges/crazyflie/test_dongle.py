@@ -9,7 +9,7 @@ from cflib.drivers import crazyradio
 
 from agents.protocols.crtp import Port
 from bridges.crazyflie import link
-from tests.bridges.crazyflie_flight import connected, flown, motors, supervised, truth
+from tests.bridges.crazyflie_flight import connected, connected_twins, motors, supervised, truth
 from tests.requests import request
 from tests.twins.loopback import Served
 from twins.devices.crazyflie.device import CrazyflieTwin
@@ -66,7 +66,7 @@ def hovering(process, rows=1, x=0.0):
 @pytest.mark.parametrize("loss", [0.0, 0.2, 0.4])
 def test_flight_over_the_radio(loss):
     """Taken off, led to a goal and landed, without a fall at the end: the planner keeps the order to land."""
-    with flown(device=RADIO, loss=loss) as (twin, process):
+    with connected_twins(device=RADIO, loss=loss) as (twin, process):
         descent = Descent(twin, process)
         assert twin.device.lines[0].safelink
         process.takeoff(HEIGHT)
@@ -81,7 +81,7 @@ def test_flight_over_the_radio(loss):
 
 @pytest.mark.mechanism("Crazyflie bridge: radio gap")
 def test_a_long_gap_lands_that_drone_alone():
-    with flown(rows=3, device=RADIO) as (twin, process):
+    with connected_twins(rows=3, device=RADIO) as (twin, process):
         process.takeoff(HEIGHT)
         descent = Descent(twin, process)
         hovering(process, rows=3, x=0.2).run(0.2)
@@ -110,7 +110,7 @@ def test_nothing_is_received_any_more(begins):
     Once the radio is back the motors are stopped, and no packet of before the gap lifts the drone again.
     """
     gaps = (2.5, 5.0, 1e6)
-    with flown(rows=3, device=RADIO, exchanges_hz=1000.0) as (twin, process):
+    with connected_twins(rows=3, device=RADIO, exchanges_hz=1000.0) as (twin, process):
         descent = Descent(twin, process)
         if begins == "take-off":
             process.body.takeoff(range(3), [HEIGHT] * 3)
@@ -149,7 +149,7 @@ def test_nothing_is_received_any_more(begins):
 
 def test_radio_gap_with_motion_capture_ends_in_landing():
     """The estimator is blind, and drifts: it is down before it is far away, and stays there with its motors on."""
-    with flown(device=RADIO, external=True) as (twin, process):
+    with connected_twins(device=RADIO, external=True) as (twin, process):
         process.truth = twin.truth
         process.until(lambda: np.isfinite(process.state.position).all(), "settled")
         process.takeoff(0.6)
@@ -166,7 +166,7 @@ def test_radio_gap_with_motion_capture_ends_in_landing():
 
 def test_setpoints_go_on_beside_external_positions():
     """Two packets in each period, and room for one in the queue of the driver: neither starves the other."""
-    with flown(rows=2, device=RADIO, external=True) as (twin, process):
+    with connected_twins(rows=2, device=RADIO, external=True) as (twin, process):
         process.truth, flock, ages = twin.truth, twin.device.flock, []
         process.until(lambda: np.isfinite(process.state.position).all(), "settled")
         process.takeoff(HEIGHT)
@@ -181,7 +181,7 @@ def test_setpoints_go_on_beside_external_positions():
 
 def test_queue_filling_in_the_air_ends_in_landing():
     """Twenty times as many logs as asked for, more than there are polls: answers and the status wait behind them."""
-    with flown(device=RADIO, exchanges_hz=300.0) as (twin, process):
+    with connected_twins(device=RADIO, exchanges_hz=300.0) as (twin, process):
         process.takeoff(HEIGHT)
         descent = Descent(twin, process)
         line = twin.device.lines[0]
@@ -202,7 +202,7 @@ def test_a_radio_that_becomes_slow_gets_fewer_logs():
 
     On the ground, over a radio that is fast again, they are restored.
     """
-    with flown(device=RADIO) as (twin, process):
+    with connected_twins(device=RADIO) as (twin, process):
         process.takeoff(HEIGHT)
         hovering(process).run(0.2)
         (dongle,) = crazyradio._find_devices()
@@ -219,7 +219,7 @@ def test_a_radio_that_becomes_slow_gets_fewer_logs():
 
 def test_recovery_from_a_crash_is_asked_for():
     """In another session: safelink is still on from this one, which ends without a word, and the air is gone."""
-    with flown(device=RADIO) as (twin, process):
+    with connected_twins(device=RADIO) as (twin, process):
         twin.device.flock.supervisor.state[0] = SupervisorState.CRASHED
         process.noted("crashed: put it upright")
         process.body.takeoff([0], [HEIGHT])
@@ -239,7 +239,7 @@ def test_a_fleet_on_one_radio(monkeypatch, tmp_path):
     monkeypatch.setenv("ZENPARK_CACHE_DIR", str(tmp_path))
     link.KNOWN_TABLES.clear()
     rows = 8
-    with flown(rows=rows, device=RADIO | {"stream_hz": 5.0}) as (twin, process):
+    with connected_twins(rows=rows, device=RADIO | {"stream_hz": 5.0}) as (twin, process):
         assert process.body.exchanges(list(range(rows))) < 60 * 250, "a minute of a slow radio"
         descent, notes = Descent(twin, process), set()
         watching(process, lambda state: notes.update(state.note))
@@ -255,6 +255,6 @@ def test_a_radio_that_carries_too_little_is_refused():
     device = RADIO | {"log_hz": 50.0, "stream_hz": 100.0, "positioning": {"system": "external", "rate_hz": 100.0}}
     with (
         pytest.raises(RuntimeError, match=r"radio 0: 2 robots ask for 700 packets/s.*write log_hz = .*stream_hz"),
-        flown(rows=2, device=device, external=True, exchanges_hz=300.0, measuring_s=0.5),
+        connected_twins(rows=2, device=device, external=True, exchanges_hz=300.0, measuring_s=0.5),
     ):
         pass

@@ -12,7 +12,7 @@ import pytest
 from agents.body.interface import BodyError
 from agents.protocols.crazyflie import CrazyflieSettings, Outside, capacity, overload
 from bridges.crazyflie import link
-from tests.bridges.crazyflie_flight import connected, flown, motors, supervised, truth
+from tests.bridges.crazyflie_flight import connected, connected_twins, motors, supervised, truth
 from tests.commands import started
 from tests.requests import request
 from tests.twins.loopback import Served
@@ -82,7 +82,7 @@ def test_faulty_drones_fail_differently_while_others_fly_on():
 @pytest.mark.system
 def test_loop_that_stops_commanding():
     """A robot whose loop hangs is landed by its own thread."""
-    with flown() as (twin, process):
+    with connected_twins() as (twin, process):
         process.takeoff(0.3)
         process.lead((0.0, 0.0, 0.3, 0.0)).run(0.2)
         until(lambda: truth(twin)[2] == 0.0, "it was landed")
@@ -94,7 +94,7 @@ def test_loop_that_stops_commanding():
 @pytest.mark.system
 def test_reset_in_the_air():
     """A brown-out: nothing lifts it again, and all that was set up is set up again."""
-    with flown() as (twin, process):
+    with connected_twins() as (twin, process):
         process.takeoff(0.4)
         process.lead((0.0, 0.0, 0.4, 0.0)).run(0.3)
         drone = twin.device.drones[0]
@@ -111,7 +111,7 @@ def test_reset_in_the_air():
 @pytest.mark.system
 def test_new_link_does_not_move_a_flow_deck():
     """Where it has landed it stays, and is not told again to stand at its start; switched off and on, it is."""
-    with flown() as (twin, process):
+    with connected_twins() as (twin, process):
         process.takeoff(0.3)
         process.lead((0.4, 0.0, 0.3, 0.0))
         process.until(lambda: abs(truth(twin)[0] - 0.4) < 0.02, "goal")
@@ -161,7 +161,7 @@ def test_process_woken_from_suspension_lifts_no_drone(link):
 
 @pytest.mark.system
 def test_refused_arming():
-    with flown(refuse_arming=True) as (twin, process):
+    with connected_twins(refuse_arming=True) as (twin, process):
         process.tick()
         process.body.takeoff([0], [0.5])
         process.noted("arming refused")

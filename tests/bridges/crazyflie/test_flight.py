@@ -316,7 +316,7 @@ def test_setpoints_of_others_end_at_each_landing(air):
 
 
 def test_drone_flying_unasked_is_landed_and_not_cut(monkeypatch):
-    """Its take-off was given up, or another session began it: the flag of the supervisor counts."""
+    """The take-off was given up, or belongs to another session: the flag of the supervisor counts."""
     air = Air(monkeypatch)
     air.telemetry.pose = [0.1, 0.2, 0.8, 0.0, 0.0, 0.0, 0.0]
     assert air.pass_(0.1).phase is FlightPhase.LANDING

@@ -188,7 +188,7 @@ def circling(fleet):
 
 
 def test_another_client_in_flight_is_ended(circling):
-    """Its setpoint mutes the planner: 2 s later the drone would lock. It flies on."""
+    """A client's setpoint mutes the planner, and the drone would lock 2 s later: it flies on."""
     client = Client(circling, 0.5)
     circling.run(0.02, speed=0.3)
     client.leave()
@@ -229,7 +229,7 @@ def test_memory_that_takes_no_setpoint(circling, how):
 
 
 def test_short_gaps_one_after_the_other(circling):
-    """Each is flown through, with a moment between them that is enough for one setpoint."""
+    """Gaps are flown through, with a moment between two that is enough for one setpoint."""
     for gap, between in ((0.7, 0.1), (0.5, 0.05), (0.3, 0.02)):
         for _ in range(5):
             circling.twin.lines[0].silence(gap)

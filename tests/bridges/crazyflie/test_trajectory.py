@@ -50,7 +50,7 @@ class Board(ManualClock):
             self.planner.follow(0, 0.0, pieces)
             self.started.append(number)
 
-    def flown(self, seconds):
+    def sampled(self, seconds):
         """Poses (k, 4) of the plan, `DT` apart."""
         return np.array([self.planner.goal(k * DT)[0] for k in range(round(seconds / DT))])
 
@@ -78,7 +78,7 @@ def board(monkeypatch):
 def test_setpoint_is_held_and_then_left_downwards(board, height, yaw):
     while not board.started:
         board.client.hold((1.5, -2.0, height, yaw), HOLD_S)
-    poses = board.flown(30.0)
+    poses = board.sampled(30.0)
     assert poses[0] == pytest.approx([1.5, -2.0, height, yaw])
     assert poses[:, [0, 1, 3]] == pytest.approx(np.tile(poses[0, [0, 1, 3]], (len(poses), 1)))
     assert poses[round(HOLD_S / DT) - 1, 2] == pytest.approx(height)
@@ -97,7 +97,7 @@ def test_a_climb_ends_on_the_floor_too(board, yaw, packets):
     board.climb((0.1, 0.2, 0.02, yaw), (0.8, 2.0))
     assert board.started == [TAKEOFFS[packets > 2]]
     assert len(board.sent) == packets + 1
-    poses = board.flown(12.0)
+    poses = board.sampled(12.0)
     assert poses[:, [0, 1, 3]] == pytest.approx(np.tile([0.1, 0.2, yaw], (len(poses), 1)))
     ways = polynomial(2.0, (np.array([0.02]), *[np.zeros(1)] * 2), (np.array([0.8]), *[np.zeros(1)] * 2))
     assert poses[:200, 2] == pytest.approx(evaluate(ways, np.arange(200) * DT)[0], abs=1e-3)
@@ -118,7 +118,7 @@ def test_parts_are_written_singly_and_started_when_confirmed(board):
     board.now += REPEAT_S + 0.1
     assert board.hold(1.3, yaw=0.3) > 5
     assert board.started == [POLYNOMIALS[0]]
-    assert board.flown(DT)[0] == pytest.approx([1.0, 2.0, 0.5, 0.3])
+    assert board.sampled(DT)[0] == pytest.approx([1.0, 2.0, 0.5, 0.3])
 
 
 @pytest.mark.parametrize(("yaw", "numbers", "least"), [(0.0, COMPRESSED, 2), (0.3, POLYNOMIALS, 3)])
@@ -127,7 +127,7 @@ def test_the_trajectory_that_is_flown_is_never_written(board, yaw, numbers, leas
     for k in range(6):
         packets = board.hold(0.1 * k, yaw)
         assert board.started[-1] == numbers[k % 2]
-        assert board.flown(DT)[0] == pytest.approx([0.1 * k, 2.0, 0.5, yaw])
+        assert board.sampled(DT)[0] == pytest.approx([0.1 * k, 2.0, 0.5, yaw])
     assert packets == least, "x of each piece"
     assert board.hold(0.5, yaw) == 1
     assert board.hold(0.4, yaw) == 1, "the one before is still there"
@@ -139,7 +139,7 @@ def test_setpoint_from_before_a_gap_is_not_started(board):
     board.now += START_EXPIRY_S + 0.1
     board.client.note_answer(0, 0)
     board.hold(1.0)
-    assert board.flown(DT)[0] == pytest.approx([1.0, 2.0, 0.5, 0.0])
+    assert board.sampled(DT)[0] == pytest.approx([1.0, 2.0, 0.5, 0.0])
     assert len(board.started) == 1
 
 
@@ -149,7 +149,7 @@ def test_setpoints_of_an_earlier_flight_are_not_started(board):
     board.climb((0.0, 0.0, 0.0, 0.3), (0.5, 1.5))
     board.hold(0.2)
     assert board.started == [TAKEOFFS[1], COMPRESSED[0]]
-    assert board.flown(DT)[0] == pytest.approx([0.2, 2.0, 0.5, 0.0])
+    assert board.sampled(DT)[0] == pytest.approx([0.2, 2.0, 0.5, 0.0])
 
 
 def test_an_old_start_is_not_transmitted(board):

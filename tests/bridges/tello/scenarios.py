@@ -25,7 +25,7 @@ ONE = request("tello", ["tello-twin"], external=True)
 NOBODY = "tello://127.0.0.77:18889"
 
 
-def flown(rows, *twins, addresses=(), open_s=3.0):
+def piloted(rows, *twins, addresses=(), open_s=3.0):
     """A process that flies twins, which are seen from outside, and perhaps robots at further addresses."""
     places = [*(served.addresses[0] for served in twins), *addresses] if addresses else twins[0].addresses
     body = TelloBody(reached(rows, places), open_s)
@@ -41,7 +41,7 @@ def formation():
     """Two drones take off to different heights, fly to two places with another yaw, hold, and land."""
     rows = request("tello", ["tello-twin"] * 2, external=True, yaw=0.5)
     with Served(TelloDevice, rows) as served:
-        driver = flown(rows, served)
+        driver = piloted(rows, served)
         driver.run(0.3)
         driver.body.takeoff(range(2), [0.6, 1.1])
         driver.until(lambda: np.allclose(served.truth()[0][:, 2], [0.6, 1.1], atol=0.03))
@@ -70,7 +70,7 @@ def faults():
     good, _, killed, weak, _ = twins
     begin = time.monotonic()
     rows = request("tello", ["-"] * 6, external=True)
-    driver = flown(rows, *twins, addresses=["tello://127.0.0.99:18889"], open_s=1.0)
+    driver = piloted(rows, *twins, addresses=["tello://127.0.0.99:18889"], open_s=1.0)
     body, told = driver.body, {"opened": time.monotonic() - begin}
     driver.run(0.3)
     told |= {"absent": driver.state.note[5], "blind": bool(np.isnan(driver.state.position[5, 0]))}
@@ -118,7 +118,7 @@ def refusals():
     begin = time.monotonic()
     told |= {"absent": refusal(NOBODY), "seconds": time.monotonic() - begin}
     with Served(TelloDevice, ONE) as served:
-        driver = flown(ONE, served)
+        driver = piloted(ONE, served)
         truth, driver.truth = driver.truth, None
         driver.tick()
         driver.body.takeoff([0], [0.6])

@@ -53,7 +53,7 @@ def body_of(*cockpits):
 
 
 @pytest.fixture
-def flown():
+def airborne():
     return Cockpit().fly()
 
 
@@ -63,46 +63,46 @@ def other():
 
 
 @pytest.mark.parametrize("kind", [AssertionError, MemoryError, StopIteration, KeyError])
-def test_failing_pilot_lands_and_others_fly(flown, other, kind):
+def test_failing_pilot_lands_and_others_fly(airborne, other, kind):
     def fail():
         raise kind("broken")
 
-    flown.get_own_udp_object = fail
-    body = body_of(flown, other)
+    airborne.get_own_udp_object = fail
+    body = body_of(airborne, other)
     for _ in range(3):
         body.step(NOTHING_COMES)
     assert len(other.sticks) == 3
-    assert set(flown.said) == {"land"}
-    assert flown.pilot.trouble == f"cannot be driven: {kind.__name__}: {kind('broken')}"
+    assert set(airborne.said) == {"land"}
+    assert airborne.pilot.trouble == f"cannot be driven: {kind.__name__}: {kind('broken')}"
 
 
-def test_undrivable_drone_keeps_no_other_from_stopping(flown, other):
-    body = body_of(flown, other)
-    flown.get_own_udp_object = dict
+def test_undrivable_drone_keeps_no_other_from_stopping(airborne, other):
+    body = body_of(airborne, other)
+    airborne.get_own_udp_object = dict
     for what in (body.land, body.stop):
         with pytest.raises(KeyError, match="responses"):
             what(range(2))
     assert other.said == ["land", "emergency"]
 
 
-def test_sleep_of_the_machine_ends_its_flight(flown, monkeypatch):
+def test_sleep_of_the_machine_ends_its_flight(airborne, monkeypatch):
     """The machine's monotonic clock stands still meanwhile; its uptime goes on."""
-    body = body_of(flown)
+    body = body_of(airborne)
     body.command([(0.5, 0.0, 0.0, 0.0)])
     gettime = time.clock_gettime
     monkeypatch.setattr(time, "clock_gettime", lambda which: gettime(which) + 3.0)
     body.step(NOTHING_COMES)
-    assert (flown.duty, flown.sticks) == (Duty.LAND, [(0, 0, 0, 0)])
+    assert (airborne.duty, airborne.sticks) == (Duty.LAND, [(0, 0, 0, 0)])
 
 
-def test_stop_counts_while_the_body_closes(flown, monkeypatch):
-    body = body_of(flown)
+def test_stop_counts_while_the_body_closes(airborne, monkeypatch):
+    body = body_of(airborne)
     monkeypatch.setattr(pilot.time, "sleep", lambda _: body.stop([0]))
     body.close()
-    assert flown.said[:2] == ["land", "emergency"]
-    assert set(flown.said[1:-1]) == {"emergency"}
+    assert airborne.said[:2] == ["land", "emergency"]
+    assert set(airborne.said[1:-1]) == {"emergency"}
     body.stop([0])  # nobody is left
-    assert flown.said[-1] == "(end)"
+    assert airborne.said[-1] == "(end)"
 
 
 @pytest.mark.skipif(find_spec("djitellopy") is None, reason="needs djitellopy")

@@ -19,7 +19,7 @@ def standing():
 
 
 @pytest.fixture
-def flown():
+def airborne():
     return Cockpit().fly()
 
 
@@ -87,15 +87,15 @@ def test_a_drone_that_never_gets_up_is_landed(standing):
 # ---------------------------------------------------------------------- flight
 
 
-def test_tello_climbs_and_holds_until_setpoints_come(flown):
-    flown.pilot.position, flown.pilot.yaw = (0.9, 2.0, 0.8), 0.0
-    assert flown.pass_(0.05).sticks[-1] == (0, 10, -20, 0)
-    flown.pilot.position = (np.nan,) * 3
-    assert flown.pass_(0.05).sticks[-1] == (0, 0, 0, 0)
-    flown.aim(0.0, 0.3, 0.0, 0.0)
-    assert flown.pass_(0.5).sticks[-1] == (-30, 0, 0, 0)
-    assert flown.pass_(0.1).sticks[-1] == (0, 0, 0, 0), "a setpoint of half a second ago is none"
-    assert len(flown.forget().pass_(10.0).sticks) == 200, "the sticks keep it alive"
+def test_tello_climbs_and_holds_until_setpoints_come(airborne):
+    airborne.pilot.position, airborne.pilot.yaw = (0.9, 2.0, 0.8), 0.0
+    assert airborne.pass_(0.05).sticks[-1] == (0, 10, -20, 0)
+    airborne.pilot.position = (np.nan,) * 3
+    assert airborne.pass_(0.05).sticks[-1] == (0, 0, 0, 0)
+    airborne.aim(0.0, 0.3, 0.0, 0.0)
+    assert airborne.pass_(0.5).sticks[-1] == (-30, 0, 0, 0)
+    assert airborne.pass_(0.1).sticks[-1] == (0, 0, 0, 0), "a setpoint of half a second ago is none"
+    assert len(airborne.forget().pass_(10.0).sticks) == 200, "the sticks keep it alive"
 
 
 def test_sticks_of_another_scale():
@@ -123,23 +123,23 @@ def test_the_stick_test_closes_no_loop():
     assert lost.pass_(2.0).sticks[-1] == (0, 0, 0, 0)
 
 
-def test_a_climb_with_markers_on_the_floor_ends(flown):
-    flown.pilot.position = (1.0, 2.0, 0.02)
-    assert flown.pass_(1.0, h=150, time=5).duty is Duty.HOLD
-    assert flown.pass_(0.2, h=170).duty is Duty.LAND
-    assert flown.said[-1] == "land"
-    assert flown.pilot.trouble == "landing: it is 1.7 m high, and its positions do not rise with it"
+def test_a_climb_with_markers_on_the_floor_ends(airborne):
+    airborne.pilot.position = (1.0, 2.0, 0.02)
+    assert airborne.pass_(1.0, h=150, time=5).duty is Duty.HOLD
+    assert airborne.pass_(0.2, h=170).duty is Duty.LAND
+    assert airborne.said[-1] == "land"
+    assert airborne.pilot.trouble == "landing: it is 1.7 m high, and its positions do not rise with it"
 
 
-def test_process_woken_from_suspension_sends_nothing_stale(flown):
+def test_process_woken_from_suspension_sends_nothing_stale(airborne):
     """Suspended in the middle of a step, which is a stick of before; then it lands, as it does in a take-off."""
-    flown.aim(0.0, 0.3, 0.0, 0.0)
-    read, flown.stall_s = flown.now, 3.0
-    flown.pilot.step(flown.now, read)
-    assert flown.sticks == []
-    flown.now, flown.stall_s = flown.now + 3.0, 0.0
-    flown.pilot.step(flown.now, read)
-    assert (flown.duty, flown.sticks, flown.said) == (Duty.LAND, [(0, 0, 0, 0)], ["land"])
+    airborne.aim(0.0, 0.3, 0.0, 0.0)
+    read, airborne.stall_s = airborne.now, 3.0
+    airborne.pilot.step(airborne.now, read)
+    assert airborne.sticks == []
+    airborne.now, airborne.stall_s = airborne.now + 3.0, 0.0
+    airborne.pilot.step(airborne.now, read)
+    assert (airborne.duty, airborne.sticks, airborne.said) == (Duty.LAND, [(0, 0, 0, 0)], ["land"])
     rising = Cockpit().take_off(0.6).forget()
     rising.pilot.step(rising.now + 8.0, rising.now)
     assert rising.said == ["land"]
@@ -172,20 +172,20 @@ def test_drone_that_flies_unordered_is_landed(standing):
     assert standing.note == "landing: it flew without an order"
 
 
-def test_refused_sticks_are_counted(flown):
-    assert flown.answer(b"error", b"error Not joystick").note == ""
-    assert flown.answer(b"error Not joystick").note == "refuses the sticks, 3 times: 'error Not joystick'"
-    assert flown.pass_(1.1).note == ""
+def test_refused_sticks_are_counted(airborne):
+    assert airborne.answer(b"error", b"error Not joystick").note == ""
+    assert airborne.answer(b"error Not joystick").note == "refuses the sticks, 3 times: 'error Not joystick'"
+    assert airborne.pass_(1.1).note == ""
 
 
-def test_a_network_that_is_down_is_named(flown):
-    flown.broken = True
-    flown.pass_(0.05)
-    flown.land()
-    flown.cut()
-    assert "cannot send: Network is unreachable" in flown.note
-    flown.broken = False
-    assert flown.pass_(0.2).note == ""
+def test_a_network_that_is_down_is_named(airborne):
+    airborne.broken = True
+    airborne.pass_(0.05)
+    airborne.land()
+    airborne.cut()
+    assert "cannot send: Network is unreachable" in airborne.note
+    airborne.broken = False
+    assert airborne.pass_(0.2).note == ""
 
 
 def test_yaw_counts_from_where_it_was_opened(standing):
@@ -199,10 +199,10 @@ def test_yaw_counts_from_where_it_was_opened(standing):
 # ---------------------------------------------------------------------- landing
 
 
-def test_landing_ends_when_answered_and_low(flown):
-    flown.land()
-    assert flown.answer(b"ok").duty is Duty.LAND  # of the sticks: some firmware answers them
-    assert flown.pass_(0.5, h=0).answer(b"ok").duty is Duty.REST
+def test_landing_ends_when_answered_and_low(airborne):
+    airborne.land()
+    assert airborne.answer(b"ok").duty is Duty.LAND  # of the sticks: some firmware answers them
+    assert airborne.pass_(0.5, h=0).answer(b"ok").duty is Duty.REST
 
 
 class Climber(Cockpit):
@@ -249,13 +249,13 @@ def test_landing_before_the_motors_start_is_repeated(standing):
     assert standing.said[-2:] == ["land", "land"]
 
 
-def test_drone_that_does_not_land_rests_its_sticks(flown):
+def test_drone_that_does_not_land_rests_its_sticks(airborne):
     """The drone keeps the last sticks that it received."""
-    flown.aim(0.5, 0.0, 0.0, 0.0)
-    assert flown.pass_(0.1).sticks[-1] == (0, 50, 0, 0)
-    flown.forget().land()
-    assert flown.pass_(1.0).sticks == [(0, 0, 0, 0)], "a landing that is obeyed is left alone"
-    assert flown.answer(b"error").sticks == [(0, 0, 0, 0)] * 2
+    airborne.aim(0.5, 0.0, 0.0, 0.0)
+    assert airborne.pass_(0.1).sticks[-1] == (0, 50, 0, 0)
+    airborne.forget().land()
+    assert airborne.pass_(1.0).sticks == [(0, 0, 0, 0)], "a landing that is obeyed is left alone"
+    assert airborne.answer(b"error").sticks == [(0, 0, 0, 0)] * 2
 
 
 def test_height_of_motion_capture_counts_in_the_air(standing):
@@ -271,50 +271,50 @@ def test_height_of_motion_capture_counts_in_the_air(standing):
     assert standing.pass_(3.2).duty is Duty.REST
 
 
-def test_silent_drone_is_landed_until_surely_down(flown):
-    flown.speaks = False
-    flown.pass_(1.2)
-    assert flown.pilot.silent(flown.now)
-    assert flown.note.startswith("silent for 1 s")
-    flown.land()
-    assert flown.forget().pass_(5.05).said == ["land"] * 5
-    assert flown.flying
-    assert not flown.pass_(15.0).flying
-    assert "landed by itself" in flown.note
-    assert flown.forget().pass_(1.0).said == ["command"] * 2  # once on again, it must be put into SDK mode
-    flown.speaks = True
-    assert not flown.pass_(0.2).pilot.silent(flown.now)
+def test_silent_drone_is_landed_until_surely_down(airborne):
+    airborne.speaks = False
+    airborne.pass_(1.2)
+    assert airborne.pilot.silent(airborne.now)
+    assert airborne.note.startswith("silent for 1 s")
+    airborne.land()
+    assert airborne.forget().pass_(5.05).said == ["land"] * 5
+    assert airborne.flying
+    assert not airborne.pass_(15.0).flying
+    assert "landed by itself" in airborne.note
+    assert airborne.forget().pass_(1.0).said == ["command"] * 2  # once on again, it must be put into SDK mode
+    airborne.speaks = True
+    assert not airborne.pass_(0.2).pilot.silent(airborne.now)
 
 
-def test_drone_left_aloft_lands_when_process_ends(flown):
-    flown.pilot.leave()
-    assert flown.said == ["land"] * 5 + ["(end)"]
+def test_drone_left_aloft_lands_when_process_ends(airborne):
+    airborne.pilot.leave()
+    assert airborne.said == ["land"] * 5 + ["(end)"]
 
 
 # ---------------------------------------------------------------------- emergency stop
 
 
-def test_emergency_stop_is_repeated_until_motors_stand(flown):
-    flown.cut()
-    assert flown.said == ["emergency"]
-    flown.cut()  # the loop's own stop, after that of the thread that receives
+def test_emergency_stop_is_repeated_until_motors_stand(airborne):
+    airborne.cut()
+    assert airborne.said == ["emergency"]
+    airborne.cut()  # the loop's own stop, after that of the thread that receives
     for second in range(4, 9):  # all are lost: the clock of its motors runs on
-        assert flown.pass_(1.0, time=second).said == ["emergency"] * (2 + 20 * (second - 3))
-        assert flown.flying
-        assert (UNANSWERED in flown.note) == (second > 5)
-    assert flown.pass_(0.4, h=0).flying  # one is heard
-    assert flown.pass_(0.3).duty is Duty.REST
-    assert flown.note == ""
-    assert flown.forget().pass_(1.0).said == []
+        assert airborne.pass_(1.0, time=second).said == ["emergency"] * (2 + 20 * (second - 3))
+        assert airborne.flying
+        assert (UNANSWERED in airborne.note) == (second > 5)
+    assert airborne.pass_(0.4, h=0).flying  # one is heard
+    assert airborne.pass_(0.3).duty is Duty.REST
+    assert airborne.note == ""
+    assert airborne.forget().pass_(1.0).said == []
 
 
-def test_silent_drone_is_stopped_until_surely_landed(flown):
-    flown.speaks = False
-    flown.cut()
-    assert flown.forget().pass_(19.0).said == ["emergency"] * 380
-    assert UNANSWERED in flown.note
-    assert flown.pass_(1.2).duty is Duty.REST
-    assert "landed by itself" in flown.note
+def test_silent_drone_is_stopped_until_surely_landed(airborne):
+    airborne.speaks = False
+    airborne.cut()
+    assert airborne.forget().pass_(19.0).said == ["emergency"] * 380
+    assert UNANSWERED in airborne.note
+    assert airborne.pass_(1.2).duty is Duty.REST
+    assert "landed by itself" in airborne.note
 
 
 def test_standing_drone_answers_a_stop_at_once(standing):

@@ -33,7 +33,7 @@ def control(*experiments, **identities):
     return rules(access_rights.rights([Plan(each) for each in experiments]), Register({**known, **identities}))
 
 
-def experiment(links, processes=(), architecture="distributed", **more):
+def four_robots(links, processes=(), architecture="distributed", **more):
     robots = {f"R{k}": RobotTable(**{"kind": "khepera4", "start": [0.1 * k, 0.0], **more}) for k in range(4)}
     for group, names in enumerate(processes):
         for name in names:
@@ -84,7 +84,7 @@ ARCHITECTURES = {0: "distributed", 2: Hybrid("hybrid", ["R0", "R1"]), 4: "centra
 @settings(max_examples=15)
 @given(links=LINKS, groups=GROUPS, guided=GUIDED)
 def test_every_right_is_the_wanted_one(links, groups, guided):
-    made = control(experiment(links, groups, ARCHITECTURES[len(guided)]))
+    made = control(four_robots(links, groups, ARCHITECTURES[len(guided)]))
     for who in (*ROBOTS, *ROLES[1:], OUTSIDER):
         mates = next((group for group in groups if who in group), (who,))
         heard = {f"R{a}" for a, b in links if f"R{b}" in mates and f"R{b}" not in guided}  # these need no neighbours
@@ -115,12 +115,12 @@ def test_every_right_is_the_wanted_one(links, groups, guided):
     ],
 )
 def test_what_keeps_an_experiment_going_is_allowed(who, action, keys):
-    made = control(experiment({(0, 1)}))
+    made = control(four_robots({(0, 1)}))
     assert [key for key in keys if not may(made, who, action, key)] == []
 
 
 def test_what_a_centre_needs_is_allowed():
-    made = control(experiment({(0, 1)}, architecture="centralised"))
+    made = control(four_robots({(0, 1)}, architecture="centralised"))
     assert may(made, "centre", "keep", KEYS.centre)
     assert may(made, "centre", "be", KEYS.centre_alive)
     assert all(may(made, who, "watch", KEYS.centre_alive) for who in ("centre", "R0", "ros2"))
@@ -140,7 +140,7 @@ def test_what_a_centre_needs_is_allowed():
     ],
 )
 def test_robot_holds_its_own_tokens_alone(token, granted):
-    made = held(control(experiment({(0, 1)})), "R0")
+    made = held(control(four_robots({(0, 1)})), "R0")
     assert permitted(made, "ingress", "liveliness_token", token) == granted
 
 
@@ -171,12 +171,12 @@ BROAD = (KEYS.estop, "park/**", "park/*/pose", "park/*", "**", "*/*/*", "park/R3
     ],
 )  # fmt: skip
 def test_what_would_do_harm_is_denied(who, action, key):
-    assert not may(control(experiment({(1, 0)})), who, action, key)
+    assert not may(control(four_robots({(1, 0)})), who, action, key)
 
 
 @pytest.mark.parametrize(("who", "part"), [("observer", "pose"), ("operator", "pose"), ("operator", "order")])
 def test_queryable_wildcard_reaches_every_robot(who, part):
-    made, key = control(experiment({(0, 1)})), f"park/*/{part}"
+    made, key = control(four_robots({(0, 1)})), f"park/*/{part}"
     assert may(made, who, "ask", key)
     for robot in ("R0", "R3"):
         assert permitted(held(made, robot), "egress", "query", key)
@@ -188,7 +188,7 @@ def test_queryable_wildcard_reaches_every_robot(who, part):
 
 
 def test_linked_routers_pass_on_what_either_admits():
-    alone = experiment({(1, 0)})
+    alone = four_robots({(1, 0)})
     for network in (NetworkTable(routers=2), NetworkTable(connect=["tls/a:7447", "tls/b:7447"])):
         linked = control(changed(alone, network=network))
         for key, action in product(("park/R0/pose", KEYS.estop, KEYS.event, "park/R1/order"), ACTIONS):
@@ -210,7 +210,7 @@ def test_avoidance_gives_ears_and_nothing_else():
 
 
 def test_body_carriers_publish_for_their_own_robots_only():
-    four = experiment({(0, 1)})
+    four = four_robots({(0, 1)})
     robots = {**four.robots, "R1": changed(four.robots["R1"], body="world"),
               "R2": changed(four.robots["R2"], ranges="world"),
               "R3": changed(four.robots["R3"], position="external")}  # fmt: skip
@@ -244,7 +244,7 @@ def test_ros_2_is_reached_on_its_own_keys():
 
 
 def test_rmw_robot_has_its_domain():
-    one = experiment(set(), kind="turtlebot3", body="rmw://tb3_0?domain=7")
+    one = four_robots(set(), kind="turtlebot3", body="rmw://tb3_0?domain=7")
     made = control(one)
     assert may(made, "R0", "put", "7/tb3_0/cmd_vel/geometry_msgs::msg::dds_::Twist_/RIHS01_0")
     assert may(made, "R0", "watch", "@ros2_lv/7/**")
@@ -252,7 +252,7 @@ def test_rmw_robot_has_its_domain():
 
 
 def test_cases_that_share_a_router_share_their_rights():
-    one, other = experiment({(0, 1)}), experiment({(2, 1)})
+    one, other = four_robots({(0, 1)}), four_robots({(2, 1)})
     made = control(one, other)
     assert may(made, "R1", "hear", "park/R0/pose")
     assert may(made, "R1", "hear", "park/R2/pose")
@@ -269,18 +269,18 @@ def test_rights_go_through_a_file():
 
 def test_certificate_on_an_earlier_name_gives_no_right():
     moved = Identity("robot", "R0.2", "1", "2100-01-01")
-    made = control(experiment({(0, 1)}), R0=moved)
+    made = control(four_robots({(0, 1)}), R0=moved)
     assert not may(made, "R0", "put", "park/R0/pose")
     assert may(made, "R0.2", "put", "park/R0/pose")
 
 
 def test_robot_cannot_take_the_name_of_an_office():
     with pytest.raises(LabError, match=r"'R0' is a robot of the experiment and operator of the lab"):
-        control(experiment(set()), R0=Identity("operator", "R0", "1", "2100-01-01"))
+        control(four_robots(set()), R0=Identity("operator", "R0", "1", "2100-01-01"))
 
 
 def test_size_limits_bind_robots_but_not_the_experiment():
-    (limit,) = sizes(access_rights.rights([Plan(experiment(set()))]))
+    (limit,) = sizes(access_rights.rights([Plan(four_robots(set()))]))
     assert limit["size_limit"] == 65536
     assert "park/R0/**" in limit["key_exprs"]
     assert "park/R0/**/@adv/**" in limit["key_exprs"]

@@ -67,7 +67,7 @@ def written(text, duration=40.0):
     return document.loads(ROBOTS.format(duration=duration) + text)
 
 
-def flown(plan):
+def errors_in_flight(plan):
     """The true positions (T, N, 3) from the common start on, their times, and the links' errors (T, E)."""
     log = fly(plan.experiment).log
     running = (log.time >= 0.0) & (log.time < plan.experiment.duration_s)
@@ -129,14 +129,14 @@ D = { distance = 0.7, gain = 9.0 }
 def test_formations_come_together(text, worst):
     given = written(text, 60.0)
     assert not [each for each in check.check(given) if each.severity == "error"]
-    _, _, error = flown(given.plan)
+    _, _, error = errors_in_flight(given.plan)
     assert error[0].max() > 0.3
     assert error[-50:].max() < worst
 
 
 def test_formation_that_turns_and_grows():
     given = written(SQUARE + "[[formation.changes]]\nat_s = 10.0\nrotate = 1.5708\nscale = 1.4\n", 30.0)
-    time, position, error = flown(given.plan)
+    time, position, error = errors_in_flight(given.plan)
     before, after = position[time < 10.0][-1], position[-1]
     assert error[time < 10.0][-1].max() < 0.02
     assert error[-1].max() < 0.02
@@ -152,14 +152,14 @@ links = { "A - B" = 0.5, "B - C" = 0.8, "C - A" = 0.8, "D - C" = 0.5, "D - A" = 
 changes = [{ at_s = 15.0, over_s = 3.0, links = { "B - A" = 0.8, "D - C" = 0.7 } }]
 """
     given = written(text)
-    _, position, error = flown(given.plan)
+    _, position, error = errors_in_flight(given.plan)
     assert error[-1].max() < 0.02
     assert np.linalg.norm(position[-1, 0] - position[-1, 1]) == pytest.approx(0.8, abs=0.02)
 
 
 def test_links_by_range_and_by_the_clock():
     text = "[formation]\ngain = 1.5\n[formation.proximity]\nrange = 1.1\ndistance = 0.75\n"
-    _, position, error = flown(written(text).plan)
+    _, position, error = errors_in_flight(written(text).plan)
     apart = np.linalg.norm(position[:, :, None] - position[:, None], axis=3)
     there = ~np.isnan(error)
     pairs = [(i, j) for i in range(4) for j in range(4) if i != j]
@@ -169,7 +169,7 @@ def test_links_by_range_and_by_the_clock():
     assert 0 < there[0].sum() < len(pairs)
     assert np.nanmax(error[-1]) < 0.05
 
-    time, _, error = flown(written(PARTED).plan)
+    time, _, error = errors_in_flight(written(PARTED).plan)
     there = ~np.isnan(error)
     assert (there.sum(axis=1) == np.where((time >= 8.0 - 1e-6) & (time < 20.0 - 1e-6), 6, 4)).all()
 
@@ -199,7 +199,7 @@ plan = { kind = "line", move_by = [0.5, 0.3], speed = 0.05 }
 """
     given = written(text, 45.0)
     assert not [each for each in check.check(given) if each.severity == "error"]
-    _, position, error = flown(given.plan)
+    _, position, error = errors_in_flight(given.plan)
     np.testing.assert_allclose(position[-1, 0, :2], [0.0, -0.2], atol=0.08)
     assert error[-1].max() < 0.05
 

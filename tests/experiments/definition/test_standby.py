@@ -31,13 +31,13 @@ BOT = RobotTable(kind="khepera4", start=[0.0, 0.0])
 FLY = RobotTable(kind="crazyflie", start=[0.5, 0.5], hover=0.5)
 
 
-def experiment(**parts: Any) -> Experiment:
+def with_standby(**parts: Any) -> Experiment:
     robots = {"A": BOT, "B": changed(BOT, start=[0.5, 0.0]), "C": changed(FLY, standby=True)}
     return small(robots, {"A - B": 0.5, "A - C": 0.7, "C > B": 0.7}, duration_s=5.0, **parts)
 
 
 def test_without_those_on_standby_nothing_names_them() -> None:
-    whole = experiment(
+    whole = with_standby(
         timeline=[LegTable(at_s=1.0, robot="C", plan="hold")],
         architecture=Hybrid("hybrid", ["A", "C"]),
         channel=ChannelTable(
@@ -54,20 +54,20 @@ def test_without_those_on_standby_nothing_names_them() -> None:
     assert [(outage.from_s, outage.robots) for outage in made.channel.outages] == [(2.0, ["B"]), (3.0, [])]
     assert made.architecture == Hybrid("hybrid", ["A"])
     assert not list(consistency.faults(plan))
-    assert not list(consistency.faults(Plan(experiment(spares={"S": FLY, "T": BOT}, on_loss="replace"))))
+    assert not list(consistency.faults(Plan(with_standby(spares={"S": FLY, "T": BOT}, on_loss="replace"))))
     assert reserves.without_standby(plan) is plan
 
 
 def test_virtual_time_flies_without_those_on_standby(tmp_path: Path) -> None:
     file = tmp_path / "x.json"
-    file.write_bytes(document.write_json(Plan(experiment())))
+    file.write_bytes(document.write_json(Plan(with_standby())))
     (trace,) = run.simulate(document.read(file)).traces.values()
     assert trace.robots == ("A", "B")
 
 
 @pytest.mark.parametrize("standby", [True, False])
 def test_nobody_waits_for_a_robot_on_standby(standby: bool) -> None:
-    case = experiment()
+    case = with_standby()
     told = Plan(changed(case, robots={**case.robots, "C": changed(FLY, standby=standby)})).assignment("A")
     robot = Robot(told)
     assert robot.missing_neighbours() == ["B", "C"]
@@ -88,7 +88,7 @@ def order(**more: object) -> messages.RunOrder:
 
 def test_spare_brings_its_body_and_keeps_the_rest() -> None:
     spare = changed(BOT, start=[0.2, 0.3, 1.0], body="khepera4://192.0.2.1", avoids=False)
-    spares = Spares(Plan(experiment(spares={"F": FLY, "S": spare})))
+    spares = Spares(Plan(with_standby(spares={"F": FLY, "S": spare})))
     old = changed(BOT, ranges="world")
     robot, whose = spares.successor("A", old, order())
     assert whose == "S", "the first of its kind"
@@ -117,4 +117,4 @@ def test_spare_brings_its_body_and_keeps_the_rest() -> None:
 )
 def test_what_cannot_take_over_a_name(asked: messages.RunOrder, said: str) -> None:
     with pytest.raises(Refusal, match=said):
-        Spares(Plan(experiment(spares={"F": FLY, "S": BOT}))).successor("A", BOT, asked)
+        Spares(Plan(with_standby(spares={"F": FLY, "S": BOT}))).successor("A", BOT, asked)

@@ -16,7 +16,7 @@ from agents.network.messages import Contact
 from experiments.definition.experiment import Arena
 from experiments.metrics.clearance import Clearance, collisions
 from experiments.metrics.results import Approach, Collision
-from tests.experiments.traces import STEP, experiment, trace
+from tests.experiments.traces import STEP, at_origin, trace
 from twins.scene import Obstacle
 
 R = KHEPERA4.radius
@@ -26,7 +26,7 @@ T = np.arange(0.0, 4.0 + STEP / 2, STEP)
 
 def pair(way, kinds=("khepera4", "khepera4"), arena=ROOM, **more):
     """One robot at the origin, and one whose place (T, 3) is given."""
-    what = experiment({"A": kinds[0], "B": kinds[1]}, {"A - B": 1.0}, arena=arena)
+    what = at_origin({"A": kinds[0], "B": kinds[1]}, {"A - B": 1.0}, arena=arena)
     place = np.zeros((len(way), 2, 3))
     place[:, 1] = way
     return trace(what, place, **more)
@@ -37,7 +37,7 @@ def along_x(x, height=0.0):
 
 
 def alone(way, arena, kind="khepera4"):
-    return trace(experiment({"A": kind}, {}, arena=arena), np.asarray(way, dtype=float).reshape(-1, 1, 3))
+    return trace(at_origin({"A": kind}, {}, arena=arena), np.asarray(way, dtype=float).reshape(-1, 1, 3))
 
 
 def test_closest_approach_of_surfaces_has_time_and_names():

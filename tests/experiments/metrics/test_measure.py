@@ -18,7 +18,7 @@ from experiments.metrics.metric import OURS
 from experiments.metrics.results import CaseMetrics
 from experiments.metrics.signals import Measurement, belief_errors, net_rotation
 from experiments.report import metrics_files, verdict
-from tests.experiments.traces import STEP, cut, experiment, pair, park, trace
+from tests.experiments.traces import STEP, at_origin, cut, pair, park, trace
 
 T = np.arange(0.0, 20.0 + STEP / 2, STEP)
 
@@ -50,7 +50,7 @@ def test_integrals_of_a_decaying_error():
 
 
 def test_error_sums_over_links_that_a_robot_receives():
-    what = experiment({"A": "tello", "B": "tello", "C": "tello"}, {"A > B": 1.0, "B - C": 1.0})
+    what = at_origin({"A": "tello", "B": "tello", "C": "tello"}, {"A > B": 1.0, "B - C": 1.0})
     place = np.zeros((2, 3, 3))
     place[:, 1, 0], place[:, 2, 1] = 1.25, 3.0
     gap = math.hypot(1.25, 3.0) - 1.0
@@ -111,7 +111,7 @@ def test_each_phase_is_measured_from_its_leg():
 
 
 def test_residual_is_worst_link_in_phases_last_second():
-    what = experiment(dict.fromkeys("ABC", "tello"), {"A > C": 1.0, "B > C": 1.0}, legs=[10.0])
+    what = at_origin(dict.fromkeys("ABC", "tello"), {"A > C": 1.0, "B > C": 1.0}, legs=[10.0])
     place = np.zeros((len(T), 3, 3))
     place[:, 0, 0] = np.select([T < 9.0, T < 10.0], [-3.0, -1.02], -1.3)
     place[:, 1, 0] = 1.1
@@ -136,9 +136,9 @@ def test_net_rotation_after_acquisition_counts_beyond_full_turn():
     place = np.zeros((len(T), 4, 3))
     place[:, 1:, 0], place[:, 1:, 1] = np.cos(angle), np.sin(angle)
     names = dict.fromkeys("LABC", "khepera4")
-    what = experiment(names, {"L > A": 1.0, "L > B": 1.0, "L > C": 1.0, "A - B": math.sqrt(3.0)})
+    what = at_origin(names, {"L > A": 1.0, "L > B": 1.0, "L > C": 1.0, "A - B": math.sqrt(3.0)})
     assert measure(trace(what, place)).rotation_rad_s == (pytest.approx(0.5),)
-    wrong = experiment(names, {"L > A": 2.0})
+    wrong = at_origin(names, {"L > A": 2.0})
     assert measure(trace(wrong, place)).rotation_rad_s == (None,)  # nothing was formed that could turn
 
 
@@ -146,7 +146,7 @@ def moving(**rest):
     """The speaker moves at 0.1 m/s and says so once a second."""
     place = np.zeros((len(T), 2, 3))
     place[:, 0, 0] = 0.1 * T
-    what = experiment({"L": "turtlebot3", "F": "khepera4"}, {"L > F": 1.0})
+    what = at_origin({"L": "turtlebot3", "F": "khepera4"}, {"L > F": 1.0})
     return trace(what, place, sent={"L": np.arange(0.0, 20.0, 1.0).tolist()}, **rest)
 
 
@@ -242,7 +242,7 @@ def test_unseen_and_unlinked_robots_have_no_errors():
     robot = follower(measured)
     assert (robot.iae, robot.rmse, robot.coverage, robot.known) == (None, None, 0.0, 0.0)
     assert measured.mean["closest"] is None
-    alone = measure(trace(experiment({"A": "tello"}, {}), np.zeros((100, 1, 3))))
+    alone = measure(trace(at_origin({"A": "tello"}, {}), np.zeros((100, 1, 3))))
     assert alone.leaders == ()  # nobody would be left
     assert (alone.mean["closest"], alone.mean["belief_rms"], alone.acquired_s) == (None, None, (None,))
     assert alone.robots[0].iae is None

@@ -52,7 +52,7 @@ def installed(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def zenpark(installed):
+def shelled(installed):
     with shell(installed) as command:
         yield command
 
@@ -78,13 +78,13 @@ def rows_of(file):
 
 
 @pytest.mark.slow
-def test_installed_metric_is_everywhere(installed, zenpark):
-    listed = zenpark("list")
+def test_installed_metric_is_everywhere(installed, shelled):
+    listed = shelled("list")
     assert re.search(r"^Added metrics: broken, gap_m, gone, way_m$", listed.stdout, re.MULTILINE)
     assert "metric gone is left out: plug-in 'gone' (no_such_module:Way) of my-metrics fails to import" in listed.stderr
-    assert "Length of the path of a robot" in zenpark("explain", "way_m").stdout
+    assert "Length of the path of a robot" in shelled("explain", "way_m").stdout
 
-    run = zenpark("run", "triangle", "--virtual", "--seeds", "2", *SHORT, "--out", "run")
+    run = shelled("run", "triangle", "--virtual", "--seeds", "2", *SHORT, "--out", "run")
     assert run.returncode == 0, run.stderr
     assert re.search(r"event: f .*, Way \d.* m, .*\(ratios: f .*, Way \d", run.stdout)
     assert "metric broken failed: ZeroDivisionError: division by zero (my_metrics.py:" in run.stdout
@@ -94,7 +94,7 @@ def test_installed_metric_is_everywhere(installed, zenpark):
     assert [bool(row["gap_m"]) for row in rows] == [row["robot"] == "mean" for row in rows]
     page = (installed / "run" / "report.html").read_text("utf-8")
     assert all(text in page for text in ("Way [m]", "Length of the path", "Gap [m] of the case", "broken failed"))
-    assert "Way [m]" in zenpark("report", "run", "--markdown").stdout
+    assert "Way [m]" in shelled("report", "run", "--markdown").stdout
     made = json.loads((installed / "run" / "run.json").read_text())["made_by"]
     assert made["plugins"] == {"my-metrics": "0.1"}
 
@@ -103,8 +103,8 @@ ALONE = ["--processes", "1"]
 
 
 @pytest.mark.slow
-def test_installed_metric_is_swept(installed, zenpark):
-    done = zenpark("sweep", "triangle", "trigger.threshold=0.01,0.03", "seeds=3", *SHORT, *ALONE, "--out", "swept")
+def test_installed_metric_is_swept(installed, shelled):
+    done = shelled("sweep", "triangle", "trigger.threshold=0.01,0.03", "seeds=3", *SHORT, *ALONE, "--out", "swept")
     assert done.returncode == 0, done.stderr
     assert re.search(r"^note: metric broken failed: ZeroDivisionError", done.stdout, re.MULTILINE)
     assert "Way ratio" in done.stdout
@@ -113,16 +113,16 @@ def test_installed_metric_is_swept(installed, zenpark):
     assert 0.0 < cell["ratio"]["way_m"]["ci95"] < 0.2
     assert cell["mean"]["broken"]["n"] == 0
     assert (installed / "swept" / "figures" / "pareto_way_m.svg").is_file()
-    table = zenpark("report", "swept", "--markdown", "--metrics", "messages,way_m").stdout
+    table = shelled("report", "swept", "--markdown", "--metrics", "messages,way_m").stdout
     assert "| Messages ratio | Way ratio |" in table
 
 
 @pytest.mark.slow
-def test_installed_metric_is_a_limit_of_a_search(zenpark):
+def test_installed_metric_is_a_limit_of_a_search(shelled):
     (line,) = re.findall(r"^    \./zenpark (sweep .*--optimise.*)$", GUIDE, re.MULTILINE)
     words = [word for word in shlex.split(line) if not word.startswith(("seeds=", "tuning="))]
     short = ["seeds=1:2", "tuning=1001:1006", "--set", "duration_s=1", *ALONE, "--anyway", "--no-report"]
-    done = zenpark(*words, *short, "--out", "tuned")
+    done = shelled(*words, *short, "--out", "tuned")
     assert done.returncode == 0, done.stderr
     assert re.search(r"^event threshold=.*: keeps Way ratio <= 1.02$", done.stdout, re.MULTILINE)
 

@@ -11,14 +11,14 @@ from experiments.definition.experiment import Shadow
 from experiments.metrics import measure
 from experiments.metrics.shadow import agreement
 from experiments.report import figures
-from tests.experiments.traces import STEP, experiment, trace
+from tests.experiments.traces import STEP, at_origin, trace
 
 T = np.arange(0.0, 20.0 + STEP / 2, STEP)
 
 
 def shadowed(way, twin, *, yaw=0.0, twin_yaw=None, restart=5.0):
     """A robot with a twin beside it, and one without; the paths (T, 3) of robot and twin."""
-    what = experiment({"A": "crazyflie", "B": "crazyflie"}, {"A - B": 1.0})
+    what = at_origin({"A": "crazyflie", "B": "crazyflie"}, {"A - B": 1.0})
     robots = {**what.robots, "A": msgspec.structs.replace(what.robots["A"], shadow=Shadow(restart_s=restart))}
     place = np.stack([way, np.full_like(way, 1.0)], axis=1)
     known = trace(msgspec.structs.replace(what, robots=robots), place)
@@ -90,7 +90,7 @@ def test_what_is_unknown_is_left_out():
     assert mine.known == pytest.approx(0.5, abs=2e-3)
     assert mine.correlation_speed == pytest.approx(1.0)
     assert agreement(shadowed(way, np.full_like(way, np.nan))) == [None, None]
-    plain = trace(experiment({"A": "crazyflie"}, {}), winding(T)[:, None])
+    plain = trace(at_origin({"A": "crazyflie"}, {}), winding(T)[:, None])
     assert agreement(plain) == [None]
     assert measure.measure(plain).robots[0].shadow is None
     assert "shadows" not in figures.all_figures([], [plain])

@@ -30,7 +30,7 @@ trigger = { kind = "send-on-delta", threshold = 0.01 }
 
 
 @pytest.fixture(scope="module")
-def flown(tmp_path_factory):
+def bundled(tmp_path_factory):
     """Folder of a run with two seeds, one of two cases and a changed value."""
     folder = tmp_path_factory.mktemp("bundle")
     (folder / "short.toml").write_text(SHORT)
@@ -40,31 +40,31 @@ def flown(tmp_path_factory):
     return folder
 
 
-def test_run_records_how_where_and_with_what(flown):
-    origin = run_folder.read_origin(flown / "run")
-    command = f"./zenpark run {flown / 'short.toml'} --virtual --case event --set 'safety.margin"
+def test_run_records_how_where_and_with_what(bundled):
+    origin = run_folder.read_origin(bundled / "run")
+    command = f"./zenpark run {bundled / 'short.toml'} --virtual --case event --set 'safety.margin"
     assert origin.command.startswith(command)
     assert (origin.seeds, origin.cases, origin.tags) == (2, ["event"], ["demo"])
     assert origin.ended >= origin.begun
     made, numpy = origin.made_by, origin.made_by.packages["numpy"]
     assert (made.code, numpy) == (version.digest(), version.provenance().packages["numpy"])
-    records = Records(flown / "run" / "event.mcap")
+    records = Records(bundled / "run" / "event.mcap")
     list(records.messages())
     about = records.metadata[0].metadata
     assert (about["code"], about["numpy"], about["host"]) == (made.code, numpy, made.host)
-    foot = (flown / "run" / "report.html").read_text("utf-8").partition("<footer>")[2]
+    foot = (bundled / "run" / "report.html").read_text("utf-8").partition("<footer>")[2]
     assert f"code {made.code[: version.DIGEST_CHARACTERS]}" in foot
     assert f"Python {made.python}, numpy {numpy}" in foot
 
 
-def test_bundle_repeats_its_run_bit_by_bit(flown, tmp_path):
+def test_bundle_repeats_its_run_bit_by_bit(bundled, tmp_path):
     again = tmp_path / "again"
-    done = invoke("run", flown / "run.zip", "--no-report", "--out", again)
+    done = invoke("run", bundled / "run.zip", "--no-report", "--out", again)
     assert done.stdout.endswith("the same as in the bundle, to the last bit: figures and recordings\n")
-    assert (again / "metrics.json").read_bytes() == (flown / "run" / "metrics.json").read_bytes()
+    assert (again / "metrics.json").read_bytes() == (bundled / "run" / "metrics.json").read_bytes()
     origin = run_folder.read_origin(again)
-    assert (origin.command, origin.file) == (f"./zenpark run {flown / 'run.zip'}", "short.toml")
-    done = invoke("run", flown / "run.zip", "--no-report", "--json", "--out", tmp_path / "once more")
+    assert (origin.command, origin.file) == (f"./zenpark run {bundled / 'run.zip'}", "short.toml")
+    done = invoke("run", bundled / "run.zip", "--no-report", "--json", "--out", tmp_path / "once more")
     assert {"cases"} <= json.loads(done.stdout).keys()
 
 
@@ -76,15 +76,15 @@ def rewritten(source, target, **changed):
     return target
 
 
-def test_what_comes_out_otherwise_is_said(flown, tmp_path):
+def test_what_comes_out_otherwise_is_said(bundled, tmp_path):
     unpacked = tmp_path / "former"
-    bundle.unpack(flown / "run.zip", unpacked)
-    assert bundle.differences(flown / "run", unpacked) == []
+    bundle.unpack(bundled / "run.zip", unpacked)
+    assert bundle.differences(bundled / "run", unpacked) == []
     figures = json.loads((unpacked / "metrics.json").read_bytes())
     figures[0]["mean"]["iae"] += 1e-15
     (unpacked / "metrics.json").write_text(json.dumps(figures))
     (unpacked / "other.mcap").write_bytes((unpacked / "event.mcap").read_bytes())
-    found = bundle.differences(flown / "run", unpacked)
+    found = bundle.differences(bundled / "run", unpacked)
     assert [each.partition(" ")[0] for each in found] == ["figures:", "other.mcap"]
     assert "[0].mean.iae" in found[0]
 
@@ -93,8 +93,8 @@ def test_what_comes_out_otherwise_is_said(flown, tmp_path):
     ("member", "says"),
     [("experiment_toml", "experiment.toml is not what was put into it"), ("SHA256SUMS", "nothing.txt is missing")],
 )
-def test_a_damaged_bundle_is_refused(flown, tmp_path, member, says):
-    damaged = rewritten(flown / "run.zip", tmp_path / "damaged.zip", **{member: b"0  nothing.txt\n"})
+def test_a_damaged_bundle_is_refused(bundled, tmp_path, member, says):
+    damaged = rewritten(bundled / "run.zip", tmp_path / "damaged.zip", **{member: b"0  nothing.txt\n"})
     error = invoke("run", damaged, "--out", tmp_path / "out", code=None).exception
     assert isinstance(error, RecordingError)
     assert says in str(error)
@@ -114,40 +114,40 @@ def test_what_is_no_bundle_is_refused(tmp_path):
         bundle.write(tmp_path, tmp_path / "run.zip", [])
 
 
-def test_links_stay_out_and_large_files_are_chunked(flown, tmp_path):
-    folder = shutil.copytree(flown / "run", tmp_path / "run")
+def test_links_stay_out_and_large_files_are_chunked(bundled, tmp_path):
+    folder = shutil.copytree(bundled / "run", tmp_path / "run")
     (tmp_path / "secret").write_text("of the user")
     (folder / "notes.txt").symlink_to(tmp_path / "secret")
     (folder / "more").symlink_to(tmp_path)
     archive = bundle.write(folder, tmp_path / "run.zip", [])
-    assert archive.read_bytes() == (flown / "run.zip").read_bytes()
+    assert archive.read_bytes() == (bundled / "run.zip").read_bytes()
     (folder / "large").write_bytes(large := bytes(range(256)) * 10_000)  # more than two pieces
     bundle.unpack(bundle.write(folder, tmp_path / "large.zip", []), tmp_path / "into")
     assert (tmp_path / "into" / "large").read_bytes() == large
 
 
-def test_failed_bundles_leave_the_former_one(flown, tmp_path):
+def test_failed_bundles_leave_the_former_one(bundled, tmp_path):
     target = tmp_path / "run.zip"
     target.write_text("the former one")
     with small_disk(10_000), pytest.raises(RecordingError, match="File too large"):
-        bundle.write(flown / "run", target, [])
+        bundle.write(bundled / "run", target, [])
     assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [("run.zip", "the former one")]
 
 
 @pytest.mark.parametrize("name", ["run.json", "metrics.json", "a\0b.toml", f"{'x' * 300}.toml", "experiment.toml"])
-def test_names_in_bundles_overwrite_nothing(name, flown, tmp_path):
-    origin, source = json.loads((flown / "run" / "run.json").read_bytes()), flown / "run.zip"
+def test_names_in_bundles_overwrite_nothing(name, bundled, tmp_path):
+    origin, source = json.loads((bundled / "run" / "run.json").read_bytes()), bundled / "run.zip"
     changed = json.dumps(origin | {"file": f"sub/{name}"}).encode()
     with zipfile.ZipFile(source) as old:
         sums = old.read("SHA256SUMS").decode().splitlines(keepends=True)
     kept = "".join(line for line in sums if not line.endswith("  run.json\n")).encode()
     bundle.unpack(rewritten(source, tmp_path / "odd.zip", run_json=changed, SHA256SUMS=kept), tmp_path / "into")
     assert (tmp_path / "into" / "run.json").read_bytes() == changed
-    assert (tmp_path / "into" / "metrics.json").read_bytes() == (flown / "run" / "metrics.json").read_bytes()
+    assert (tmp_path / "into" / "metrics.json").read_bytes() == (bundled / "run" / "metrics.json").read_bytes()
 
 
-def test_control_sequences_of_a_bundle_stay_out(flown, tmp_path):
-    folder = shutil.copytree(flown / "run", tmp_path / "run")
+def test_control_sequences_of_a_bundle_stay_out(bundled, tmp_path):
+    folder = shutil.copytree(bundled / "run", tmp_path / "run")
     origin = json.loads((folder / "run.json").read_bytes())
     origin["made_by"]["packages"]["numpy"] = origin["title"] = "\x1b]0;owned\x07\x1b[2J"
     (folder / "run.json").write_text(json.dumps(origin))
@@ -159,10 +159,10 @@ def test_control_sequences_of_a_bundle_stay_out(flown, tmp_path):
     assert "owned" in again.output + compared.output
 
 
-def test_tags_are_words_and_bundles_take_no_options(flown):
-    done = invoke("run", flown / "run.zip", "--seed", "7", code=None)
+def test_tags_are_words_and_bundles_take_no_options(bundled):
+    done = invoke("run", bundled / "run.zip", "--seed", "7", code=None)
     assert "a bundle repeats its own run" in str(done.exception)
-    done = invoke("run", flown / "short.toml", "--virtual", "--tag", "a,b", code=2)
+    done = invoke("run", bundled / "short.toml", "--virtual", "--tag", "a,b", code=2)
     assert "a tag is a word without commas" in done.output
 
 

@@ -94,7 +94,7 @@ def test_recovery_overwrites_nothing(path, tmp_path):
 
 
 def test_a_recorder_that_took_over_completes_the_recording(path, tmp_path, capsys):
-    """Its first messages are the last values and the events that publishers repeat."""
+    """The first messages of the second recorder are the last values and the events that publishers repeat."""
     run = sorted(whole_run(), key=lambda message: message.stamp)
     first, rest = run[:50], run[50:]
     events, poses = ([each for each in first if isinstance(each, kind)] for kind in (Event, Pose))

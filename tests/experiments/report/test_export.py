@@ -24,16 +24,16 @@ scipy_io = pytest.importorskip("scipy.io")
 
 
 @pytest.fixture(scope="module")
-def flown(tmp_path_factory):
+def recorded_run(tmp_path_factory):
     """The folder of a run of the first experiment, 4 s of it, and the run."""
     run = recorded("triangle", "duration_s=4.0", "timeline=[]")
     return shutil.copytree(run.folder, tmp_path_factory.mktemp("runs") / "run"), run
 
 
 @pytest.mark.slow
-def test_film_shows_the_run_from_start_to_end(flown):
-    file = flown[0] / "film.gif"
-    commands.export(str(flown[0]), video=file, speed=8.0)
+def test_film_shows_the_run_from_start_to_end(recorded_run):
+    file = recorded_run[0] / "film.gif"
+    commands.export(str(recorded_run[0]), video=file, speed=8.0)
     with Image.open(file) as film:
         assert film.n_frames == math.ceil(4.0 / (8.0 / export.FRAMES_HZ))
         pictures = []
@@ -43,24 +43,24 @@ def test_film_shows_the_run_from_start_to_end(flown):
     assert np.abs(pictures[1] - pictures[0]).mean() > 0.5  # the robots are elsewhere
 
 
-def test_a_film_needs_its_encoder_and_a_name(flown, tmp_path, monkeypatch):
+def test_a_film_needs_its_encoder_and_a_name(recorded_run, tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(ExplainedError, match="needs the program ffmpeg"):
-        commands.export(str(flown[0]), video=tmp_path / "film.mp4")
+        commands.export(str(recorded_run[0]), video=tmp_path / "film.mp4")
     with pytest.raises(ExplainedError, match=r"\.mp4 or \.gif"):
-        commands.export(str(flown[0]), video=tmp_path / "film.avi")
+        commands.export(str(recorded_run[0]), video=tmp_path / "film.avi")
 
 
 @pytest.fixture(scope="module")
-def mat(flown):
+def mat(recorded_run):
     """The run as it is read back from the file that the command writes."""
-    commands.export(str(flown[0]), None, as_csv=False)
-    return scipy_io.loadmat(flown[0] / "run.mat", simplify_cells=True)
+    commands.export(str(recorded_run[0]), None, as_csv=False)
+    return scipy_io.loadmat(recorded_run[0] / "run.mat", simplify_cells=True)
 
 
 @pytest.mark.parametrize("case", ["periodic", "event"])
-def test_arrays_come_back_as_they_were(flown, mat, case):
-    trace, read = flown[1].traces[case], mat[case]
+def test_arrays_come_back_as_they_were(recorded_run, mat, case):
+    trace, read = recorded_run[1].traces[case], mat[case]
     assert (read["case"], read["clock"], read["seed"]) == (case, "virtual", 1.0)
     assert tuple(read["robots"]) == trace.robots
     assert list(read["kinds"]) == ["khepera4", "khepera4", "crazyflie"]
@@ -71,8 +71,8 @@ def test_arrays_come_back_as_they_were(flown, mat, case):
     assert read["error"] == pytest.approx(Measurement(trace).robot_errors, abs=1e-6)
 
 
-def test_who_spoke_and_who_listens_count_from_one(flown, mat):
-    trace, read = flown[1].traces["event"], mat["event"]
+def test_who_spoke_and_who_listens_count_from_one(recorded_run, mat):
+    trace, read = recorded_run[1].traces["event"], mat["event"]
     assert read["sent"]["time"] == pytest.approx(trace.sent.stamp, abs=1e-6)
     assert read["sent"]["robot"].tolist() == (trace.sent.link + 1.0).tolist()
     assert read["sent"]["position"] == pytest.approx(trace.sent.position, abs=1e-6)
@@ -85,8 +85,8 @@ def test_who_spoke_and_who_listens_count_from_one(flown, mat):
     assert max(read["sent"]["robot"]) == 3.0
 
 
-def test_metrics_are_those_of_the_report(flown, mat):
-    measured, read = flown[1].metrics["event"], mat["event"]["metrics"]
+def test_metrics_are_those_of_the_report(recorded_run, mat):
+    measured, read = recorded_run[1].metrics["event"], mat["event"]["metrics"]
     assert list(read["robot"]) == [robot.robot for robot in measured.robots]
     assert read["iae"] == pytest.approx([robot.iae for robot in measured.robots], rel=1e-6)
     assert read["messages"].tolist() == [robot.messages for robot in measured.robots]
@@ -97,15 +97,15 @@ def test_metrics_are_those_of_the_report(flown, mat):
     assert read["f_hz"] == pytest.approx(by_hand)
 
 
-def test_struct_is_a_cell_array_with_matlab_columns(flown, mat):
-    raw = scipy_io.loadmat(flown[0] / "run.mat")["event"][0, 0]
+def test_struct_is_a_cell_array_with_matlab_columns(recorded_run, mat):
+    raw = scipy_io.loadmat(recorded_run[0] / "run.mat")["event"][0, 0]
     assert raw["robots"].shape == (3, 1)
     assert raw["robots"].dtype == object
     assert raw["time"].shape == (201, 1)
     assert raw["sent"][0, 0]["robot"].shape[1] == 1
 
 
-def test_units_are_of_what_is_there(flown, mat):
+def test_units_are_of_what_is_there(recorded_run, mat):
     def fits(units, values):
         for name, unit in units.items():
             if isinstance(unit, dict):
@@ -114,7 +114,7 @@ def test_units_are_of_what_is_there(flown, mat):
                 assert name in values
             assert re.fullmatch("[a-z][a-z0-9_]*", name)
 
-    made = structure(flown[1].traces["event"], flown[1].metrics["event"])
+    made = structure(recorded_run[1].traces["event"], recorded_run[1].metrics["event"])
     fits(UNITS, made)
     arrays = {name for name, value in made.items() if isinstance(value, np.ndarray) and value.dtype == float}
     assert arrays <= set(UNITS)
@@ -130,11 +130,11 @@ def test_what_links_ask_for_besides_distances_is_told():
     assert made["adjacency"].tolist() == [[0.0, 0.0], [1.0, 0.0]]
 
 
-def test_table_has_a_line_per_robot_and_time(flown, tmp_path):
-    commands.export(str(flown[0]), str(tmp_path / "way.csv"), as_csv=False)
+def test_table_has_a_line_per_robot_and_time(recorded_run, tmp_path):
+    commands.export(str(recorded_run[0]), str(tmp_path / "way.csv"), as_csv=False)
     rows = list(csv.DictReader((tmp_path / "way.csv").read_text("utf-8").splitlines()))
     assert len(rows) == 2 * 201 * 3
-    trace = flown[1].traces["event"]
+    trace = recorded_run[1].traces["event"]
     last = rows[-1]
     assert (last["case"], last["robot"], float(last["time"])) == ("event", "CF01", pytest.approx(4.0))
     assert float(last["true_z"]) == pytest.approx(trace.true_position[-1, 2, 2], abs=1e-6)
@@ -160,8 +160,8 @@ def test_names_that_are_valid_stay():
     ]  # fmt: skip
 
 
-def test_what_cannot_be_exported_is_explained(flown, tmp_path):
-    folder, run = flown
+def test_what_cannot_be_exported_is_explained(recorded_run, tmp_path):
+    folder, run = recorded_run
     for name, as_csv, reason in (
         ("run.txt", False, r"run\.txt: is no name"),
         ("run.mat", True, r"end with \.mat, \.csv"),
@@ -174,14 +174,14 @@ def test_what_cannot_be_exported_is_explained(flown, tmp_path):
         export.write_mat(run.traces, run.metrics, tmp_path / "run.mat", most_bytes=1000)
 
 
-def test_without_scipy_it_says_what_to_install(flown, monkeypatch):
+def test_without_scipy_it_says_what_to_install(recorded_run, monkeypatch):
     def missing(name):
         raise ModuleNotFoundError(name)
 
     monkeypatch.setattr(export, "import_module", missing)
     with pytest.raises(ExplainedError, match=r"\./zenpark install scipy"):
-        commands.export(str(flown[0]), None, as_csv=False)
-    commands.export(str(flown[0]), None, as_csv=True)
+        commands.export(str(recorded_run[0]), None, as_csv=False)
+    commands.export(str(recorded_run[0]), None, as_csv=True)
 
 
 def test_a_run_without_a_case_has_nothing(monkeypatch, tmp_path):

@@ -15,7 +15,7 @@ from agents.body.kinds import KINDS
 from experiments.definition.experiment import Arena
 from experiments.metrics.measure import measure
 from experiments.report import figures, style
-from tests.experiments.traces import crowd, cut, experiment, pair, park, trace
+from tests.experiments.traces import at_origin, crowd, cut, pair, park, trace
 
 pytestmark = pytest.mark.slow  # runs and reports, whole
 
@@ -45,23 +45,23 @@ def thick(axes):
 
 
 @pytest.fixture(scope="module", params=EVERY)
-def run(request):
+def drawn_trace(request):
     return RUNS[request.param]()
 
 
 @pytest.mark.parametrize("draw", OF_TRACES, ids=lambda draw: draw.__name__)
-def test_motions_are_drawn_in_one_column(draw, run):
-    figure = draw(run)
+def test_motions_are_drawn_in_one_column(draw, drawn_trace):
+    figure = draw(drawn_trace)
     assert figure.get_figwidth() == 3.5
     assert 1.0 < figure.get_figheight() <= 9.3
-    assert len(figure.axes) >= (len(run) if draw is figures.events else 1)
-    assert draw(run, width=7.16).get_figwidth() == 7.16
+    assert len(figure.axes) >= (len(drawn_trace) if draw is figures.events else 1)
+    assert draw(drawn_trace, width=7.16).get_figwidth() == 7.16
     assert "<metadata" not in figures.svg(figure)
 
 
 @pytest.mark.parametrize("draw", OF_CASES, ids=lambda draw: draw.__name__)
-def test_bars_are_drawn_in_one_column(draw, run):
-    figure = draw([measure(trace) for trace in run])
+def test_bars_are_drawn_in_one_column(draw, drawn_trace):
+    figure = draw([measure(trace) for trace in drawn_trace])
     assert figure.get_figwidth() == 3.5
     renderer = rendered(figure).get_renderer()
     for axes in figure.axes:
@@ -171,7 +171,7 @@ def test_long_legends_stay_inside_the_figure():
 
 def sending(leader, follower):
     """Two robots that stand for 20 s and transmit at given times [s]."""
-    what = experiment({"L": "turtlebot3", "F": "khepera4"}, {"L > F": 1.0})
+    what = at_origin({"L": "turtlebot3", "F": "khepera4"}, {"L > F": 1.0})
     return trace(what, np.zeros((1001, 2, 3)), sent={"L": leader, "F": follower})
 
 

@@ -19,7 +19,7 @@ from experiments.report.metrics_files import write_csv
 from experiments.report.page import Section, Table, TableRow, date_of, inline, interval, number
 from experiments.report.tables import events_tables, proof_tables, robot_tables, summary_table, whole_tables
 from experiments.report.verdict import findings, left_out
-from tests.experiments.traces import crowd, cut, experiment, park, trace
+from tests.experiments.traces import at_origin, crowd, cut, park, trace
 
 pytestmark = pytest.mark.slow  # runs and reports, whole
 
@@ -90,18 +90,18 @@ def marks_of(*traces):
 
 
 @pytest.fixture(scope="module")
-def run():
+def two_cases():
     return [park(), park("event", 0.01)]
 
 
 @pytest.fixture(scope="module")
-def written(tmp_path_factory, run):
+def written(tmp_path_factory, two_cases):
     """The report of the run as HTML; written twice it is the same."""
     folder = tmp_path_factory.mktemp("written")
     (folder / "run.json").write_bytes(msgspec.json.encode(RunOrigin("zenpark run <this> --seed 1", "2030-01-02")))
 
     def again():
-        return report.write(folder / "new" / "run", run, run=folder, notes=["It rained."])
+        return report.write(folder / "new" / "run", two_cases, run=folder, notes=["It rained."])
 
     path = again()
     assert path == folder / "new" / "run" / "report.html"
@@ -218,8 +218,8 @@ def test_report_of_run_with_dead_robot_and_losses(tmp_path):
         (("a", "a", "a"), ("a, a (2), a (3)", "relative to a.", "a (3) · event")),
     ],
 )
-def test_comparison_has_a_column_per_run_and_case(tmp_path, run, names, shown):
-    cases = (run, run[1:]) if len(names) == 2 else (run[:1], run[:1], run)
+def test_comparison_has_a_column_per_run_and_case(tmp_path, two_cases, names, shown):
+    cases = (two_cases, two_cases[1:]) if len(names) == 2 else (two_cases[:1], two_cases[:1], two_cases)
     runs = [(name, measured(each)) for name, each in zip(names, cases, strict=True)]
     page = checked(report.compare(tmp_path / "there" / "compare.html", runs).read_text())
     for words in shown:
@@ -229,9 +229,11 @@ def test_comparison_has_a_column_per_run_and_case(tmp_path, run, names, shown):
     assert "Seeds" not in page.words
 
 
-def test_comparison_shows_first_how_the_runs_differ(tmp_path, run):
+def test_comparison_shows_first_how_the_runs_differ(tmp_path, two_cases):
     differ = [("A", "runs/a", []), ("B", "runs/b", ["duration_s 45 → 44", "seeds: 1 → 2", "x 1 → 2"])]
-    path = report.compare(tmp_path / "c.html", [("A", measured(run[:1])), ("B", measured(run[1:]))], differences=differ)
+    path = report.compare(
+        tmp_path / "c.html", [("A", measured(two_cases[:1])), ("B", measured(two_cases[1:]))], differences=differ
+    )
     html = path.read_text(encoding="utf-8")
     said = checked(html).words.split("</style>")[-1]
     assert "! B differs in duration_s 45 → 44; seeds: 1 → 2 and 1 more." in said
@@ -299,9 +301,9 @@ def test_nothing_to_report():
         report.compare("x", [("a", [])])  # type: ignore[arg-type]
 
 
-def test_verdict_says_what_was_measured(run):
-    periodic, event = cases = measured(run)
-    said = marks_of(*run)
+def test_verdict_says_what_was_measured(two_cases):
+    periodic, event = cases = measured(two_cases)
+    said = marks_of(*two_cases)
     fewer = 100.0 * (1.0 - event.mean["f_hz"] / periodic.mean["f_hz"])
     sent, again = (sum(robot.f_hz for robot in case.robots) for case in cases)  # the means leave the leader out
     first, after = periodic.acquired_s
@@ -322,7 +324,7 @@ def test_verdict_says_what_was_measured(run):
 
 
 def test_verdict_of_a_formation_never_acquired():
-    what = experiment({"L": "turtlebot3", "F": "khepera4"}, {"L > F": 1.0})
+    what = at_origin({"L": "turtlebot3", "F": "khepera4"}, {"L > F": 1.0})
     place = np.zeros((200, 2, 3))
     place[:, 1, 0] = 1.5
     place[:, 1, 1] = 2.1
@@ -333,7 +335,7 @@ def test_verdict_of_a_formation_never_acquired():
 
 def side_by_side(*, apart=0.5, seed=1):
     """Two Kheperas that stand for two seconds, in an arena without walls."""
-    what = experiment({"A": "khepera4", "B": "khepera4"}, {"A - B": apart}, arena=Arena(walls=False))
+    what = at_origin({"A": "khepera4", "B": "khepera4"}, {"A - B": apart}, arena=Arena(walls=False))
     place = np.zeros((101, 2, 3))
     place[:, 1, 0] = apart
     return trace(what, place, seed=seed)
@@ -411,33 +413,33 @@ def test_report_shows_avoidance_and_shadow_twins(tmp_path):
     assert (float(row["shadow_bias_y"]), float(row["intervened_share"])) == (pytest.approx(0.012), 0.1)
 
 
-def test_tables_have_one_unit_and_no_empty_rows(run):
+def test_tables_have_one_unit_and_no_empty_rows(two_cases):
     def tables_of(*traces):
         return {table.head[0]: [row.cells[0] for row in table.rows] for table in whole_tables(measured(traces))}
 
-    tables = tables_of(*run)
+    tables = tables_of(*two_cases)
     assert tables["Acquired by all followers [s]"] == ["from the start", "after 21 s"]
     assert tables["Distances [cm]"][:2] == ["Worst link before 21 s", "Worst link at the end"]
     assert not {"Collisions", "Share of all ticks [%]", "Delay of poses [ms]"} & set(tables)
     assert not any("[" in row for rows in tables.values() for row in rows)
-    assert tables_of(dataclasses.replace(run[0], clock="real"))["Delay of poses [ms]"] == ["mean", "longest"]
+    assert tables_of(dataclasses.replace(two_cases[0], clock="real"))["Delay of poses [ms]"] == ["mean", "longest"]
 
 
-def test_left_out_of_the_means(run):
-    assert left_out([measure(run[0])]) == "TB01 leads and is left out of the means."
+def test_left_out_of_the_means(two_cases):
+    assert left_out([measure(two_cases[0])]) == "TB01 leads and is left out of the means."
     assert left_out([measure(crowd(3, duration=2.0))]) == "The means are over all robots."
 
 
-def test_proof_adds_up(run):
-    rows = proof_tables([measure(run[1])])[0].rows
+def test_proof_adds_up(two_cases):
+    rows = proof_tables([measure(two_cases[1])])[0].rows
     counts = [[int(cell.replace("\u202f", "")) for cell in row.cells[2:]] for row in rows]
     assert counts[-1] == [sum(column) for column in zip(*counts[:-1], strict=True)]
     assert counts[-1][2] == counts[-1][3]
-    assert counts[-1][0] == len(run[1].sent.stamp)
+    assert counts[-1][0] == len(two_cases[1].sent.stamp)
 
 
-def test_robot_table_has_means_by_kind(run):
-    table = robot_tables([measure(run[0])])[0]
+def test_robot_table_has_means_by_kind(two_cases):
+    table = robot_tables([measure(two_cases[0])])[0]
     assert table.rows[0].cells[0] == ("(TB01)", "turtlebot3")
     assert [row.cells[0] for row in table.rows if row.sum] == [
         ("mean of 3", "khepera4"), ("mean of 3", "crazyflie"), ("mean of 6", "")

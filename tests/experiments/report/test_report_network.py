@@ -20,12 +20,12 @@ BAD = ChannelTable(delay_s=0.05, loss=0.2, links={"TB01 > KH01": LinkChannelTabl
 
 
 @pytest.fixture(scope="module")
-def run():
+def dropping_run():
     return fly(changed(reference("periodic"), duration_s=4.0, timeline=[], channel=BAD), case="bad")
 
 
-def test_dropped_differs_from_lost(run):
-    measured = run.metrics
+def test_dropped_differs_from_lost(dropping_run):
+    measured = dropping_run.metrics
     assert measured.modelled
     assert measured.lost == 0
     links = {(each.sender, each.receiver): each for each in measured.link_deliveries}
@@ -44,8 +44,8 @@ def test_dropped_differs_from_lost(run):
     assert sum(of.values()) == measured.dropped
 
 
-def test_verdict_and_tables_have_dropped_poses(run):
-    measured = run.metrics
+def test_verdict_and_tables_have_dropped_poses(dropping_run):
+    measured = dropping_run.metrics
     said = [each.text for each in findings([measured])]
     assert any(text.startswith("No pose was lost") for text in said)
     (text,) = [text for text in said if text.startswith("The modelled network dropped")]
@@ -60,8 +60,8 @@ def test_verdict_and_tables_have_dropped_poses(run):
     assert dropped in [row.cells for table in whole_tables([measured]) for row in table.rows]
 
 
-def test_report_has_network_section(tmp_path, run):
-    text = report.write(tmp_path, [run.trace]).read_text(encoding="utf-8")
+def test_report_has_network_section(tmp_path, dropping_run):
+    text = report.write(tmp_path, [dropping_run.trace]).read_text(encoding="utf-8")
     assert "Network model" in text
     assert "TB01 &gt; KH01" in text
 
@@ -75,9 +75,9 @@ def test_plain_network_has_no_section():
     assert not any("modelled" in each.text for each in findings([measured]))
 
 
-def test_recording_keeps_dropped_poses(tmp_path, run):
-    run.recorder.record(tmp_path / "bad.mcap", "")
-    read, trace = playback.read(tmp_path / "bad.mcap").trace, run.trace
+def test_recording_keeps_dropped_poses(tmp_path, dropping_run):
+    dropping_run.recorder.record(tmp_path / "bad.mcap", "")
+    read, trace = playback.read(tmp_path / "bad.mcap").trace, dropping_run.trace
     assert trace.dropped.sum() > 500
     np.testing.assert_array_equal(read.dropped, trace.dropped)
     np.testing.assert_array_equal(read.lost, 0)

@@ -128,12 +128,12 @@ def test_a_plug_in_that_changes_changes_the_code(park, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_seeds_of_several_processes_are_those_of_one(monkeypatch, tmp_path):
+def test_seeds_of_several_processes_are_those_of_one(tmp_path):
     read, told = load("triangle", "duration_s=1.0"), []
     alone = run.simulate_seeds(read, range(4, 7), cases=["event"])
-    monkeypatch.setattr(run, "SHARED", 0.0)
-    monkeypatch.setattr(run, "cores", lambda: 2)
-    shared = run.simulate_seeds(read, range(4, 7), cases=["event"], folder=tmp_path, progress=lambda *t: told.append(t))
+    shared = run.simulate_seeds(
+        read, range(4, 7), cases=["event"], folder=tmp_path, processes=2, progress=lambda *t: told.append(t)
+    )
     assert [each.seed for each in shared] == [4, 5, 6]
     assert [file.name for file in tmp_path.iterdir()] == ["event.mcap"]
     assert told[-1] == ("event", 1, 1)

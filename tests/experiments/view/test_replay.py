@@ -22,20 +22,20 @@ GUIDED = ("architecture=centralised",)
 
 
 @pytest.fixture(scope="module", params=[(), GUIDED], ids=["distributed", "centralised"])
-def flown(request):
+def recorded_case(request):
     """A recorded run, as the trace in memory and as a file."""
     run = recorded("robotic-park", "duration_s=3.0", "timeline=[]", *request.param, cases=("event",))
     return run.traces["event"], run.folder / "event.mcap"
 
 
 @pytest.fixture
-def film(flown):
-    return Film(tracks.read(flown[1]))
+def film(recorded_case):
+    return Film(tracks.read(recorded_case[1]))
 
 
 @pytest.mark.slow
-def test_positions_are_those_of_the_recording(flown, film):
-    trace, _ = flown
+def test_positions_are_those_of_the_recording(recorded_case, film):
+    trace, _ = recorded_case
     assert film.tracks.robots == trace.robots
     for k in range(0, len(trace.time), 17):
         moment = film.moment(float(trace.time[k]))
@@ -48,8 +48,8 @@ def test_positions_are_those_of_the_recording(flown, film):
 
 
 @pytest.mark.slow
-def test_transmissions_are_those_of_the_recording(flown):
-    trace, file = flown
+def test_transmissions_are_those_of_the_recording(recorded_case):
+    trace, file = recorded_case
     read = tracks.read(file)
     for row, track in enumerate(read.tracks):
         sent = track.sent[(track.sent >= -1e-6) & (track.sent < 3.0 - 1e-6)]
@@ -57,8 +57,8 @@ def test_transmissions_are_those_of_the_recording(flown):
     assert [event.kind for event in read.events if event.kind in ("start", "phase")]
 
 
-def test_truncated_recording_is_replayed_to_its_end(flown, tmp_path):
-    _, file = flown
+def test_truncated_recording_is_replayed_to_its_end(recorded_case, tmp_path):
+    _, file = recorded_case
     whole = tracks.read(file)
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(file.read_bytes()[: int(0.7 * file.stat().st_size)])

@@ -11,7 +11,7 @@ from experiments.virtual_time import stretch
 from experiments.virtual_time.simulation import VirtualRun
 
 
-def flown(experiment, *, compiled, seed=1, lean=False, change=None):
+def evaluated(experiment, *, compiled, seed=1, lean=False, change=None):
     """Log of a run with changed assignments, and the ticks of it that were compiled."""
 
     class Changed(Plan):
@@ -31,8 +31,8 @@ def flown(experiment, *, compiled, seed=1, lean=False, change=None):
 
 def same(experiment, **options):
     """Log of a plain run, the same as the compiled one in every bit, and the number of ticks that were compiled."""
-    plain, _ = flown(experiment, compiled=False, **options)
-    other, ticks = flown(experiment, compiled=True, **options)
+    plain, _ = evaluated(experiment, compiled=False, **options)
+    other, ticks = evaluated(experiment, compiled=True, **options)
     for field in fields(plain):
         assert alike(getattr(plain, field.name), getattr(other, field.name)), field.name
     return plain, ticks

@@ -25,7 +25,7 @@ from agents.vectors import UNKNOWN
 from experiments.definition.experiment import ChannelTable, Formation, LegTable, RobotTable, WorldTable
 from experiments.virtual_time import stretch
 from tests.agents.plugins.test_every_plugin import made
-from tests.experiments.virtual_time.evaluators import flown, same
+from tests.experiments.virtual_time.evaluators import evaluated, same
 from tests.small import changed
 from tests.small import pair as small_pair
 
@@ -72,7 +72,7 @@ def plugins(group, place=""):
 
 @pytest.mark.nightly
 def test_every_plugin_and_model():
-    """Each robot has the next law, trigger, predictor, avoidance and kind: one compilation covers all."""
+    """Robot after robot has the next law, trigger, predictor, avoidance and kind: one compilation covers all."""
     sending, updating = plugins(TRIGGERS, "communication"), plugins(TRIGGERS, "control")
     predictors, avoidances = plugins(PREDICTORS), plugins(AVOIDANCES)
     laws = [law for law in plugins(LAWS) if isinstance(law, Gradient)]  # those that remember are flown plain
@@ -211,7 +211,7 @@ def spring(folder, number, imports):
 
 
 def test_laws_and_trigger_of_a_user(tmp_path, monkeypatch):
-    """Each follower of A has another law: one compilation covers all, and the run in which a law fails."""
+    """Followers of A have different laws: one compilation covers all, and the run in which a law fails."""
     monkeypatch.syspath_prepend(str(tmp_path))
     trigger, predictor = made(TRIGGERS, "send-on-delta"), made(PREDICTORS, "constant-velocity")
     homes, names = spring(tmp_path, 0, HOMES), spring(tmp_path, 1, "from zenpark import Gradient, clamp, norm\n")
@@ -236,7 +236,7 @@ def test_laws_and_trigger_of_a_user(tmp_path, monkeypatch):
     told = []
     for compiled in (False, True):
         with pytest.raises((PluginError, ValueError)) as caught:
-            flown(ring, compiled=compiled, change=with_laws(0.4))
+            evaluated(ring, compiled=compiled, change=with_laws(0.4))
         told.append(str(caught.value))
     assert told[0] == told[1]
 

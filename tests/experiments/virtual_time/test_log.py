@@ -26,7 +26,7 @@ from twins.scene import Obstacle
 CART = Obstacle(box=(0.2, 0.2), at=(-0.8, 0.8), plan={"kind": "line", "move_by": [0.5, 0.0], "speed": 0.1})
 
 
-def experiment(engine="point-mass", **parts):
+def mixed_pair(engine="point-mass", **parts):
     robots = {
         "KH": RobotTable(kind="khepera4", start=[-0.4, 0.0], shadow=Shadow(restart_s=1.0)),
         "CF": RobotTable(kind="crazyflie", start=[0.4, 0.1], hover=0.5),
@@ -43,13 +43,13 @@ def experiment(engine="point-mass", **parts):
 
 
 def recorder(log, engine="point-mass", **parts):
-    return RunRecorder(log, Plan(experiment(engine, **parts)), "only")
+    return RunRecorder(log, Plan(mixed_pair(engine, **parts)), "only")
 
 
 @pytest.fixture(scope="module")
 def log():
     """Log of a run, with attitudes and contacts of the test, which this engine does not compute."""
-    plain = simulate(Plan(experiment()), 3)
+    plain = simulate(Plan(mixed_pair()), 3)
     half = np.linspace(0.0, 2.0, len(plain.time))[:, None] * [1.0, 0.5]
     attitude = np.stack([np.cos(half), np.sin(half), 0.0 * half, 0.0 * half], axis=-1)
     touches = (

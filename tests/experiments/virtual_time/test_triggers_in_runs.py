@@ -77,17 +77,17 @@ def test_triggers_where_they_make_sense_are_not(change):
 
 
 @pytest.fixture(scope="module")
-def flown():
+def delayed_run():
     """A short run with the chosen trigger on a network with a delay."""
     parts = {"trigger": CHOSEN, "duration_s": 8.0, "timeline": [], "channel": ChannelTable(delay_s=0.05)}
     return fly(changed(PARK, **parts), 4)
 
 
-def test_received_poses_equal_sent_ones_with_velocity(flown):
-    sent, heard = flown.trace.sent, flown.trace.received
+def test_received_poses_equal_sent_ones_with_velocity(delayed_run):
+    sent, heard = delayed_run.trace.sent, delayed_run.trace.received
     said = np.column_stack([sent.position, sent.velocity])
     by_number = dict(zip(zip(sent.link.tolist(), sent.seq.tolist(), strict=True), said.tolist(), strict=True))
-    senders = flown.plan.pose_links.sender[heard.link].tolist()
+    senders = delayed_run.plan.pose_links.sender[heard.link].tolist()
     got = np.column_stack([heard.position, heard.velocity]).tolist()
     pairs = [
         (by_number[key], pose)
@@ -99,18 +99,18 @@ def test_received_poses_equal_sent_ones_with_velocity(flown):
     assert np.abs(heard.velocity).max() > 0.05
 
 
-def test_what_is_said_is_smoothed(flown):
-    trace = flown.trace
+def test_what_is_said_is_smoothed(delayed_run):
+    trace = delayed_run.trace
     drone = trace.robots.index("CF02")
     mine = trace.sent_by(drone)
     at = np.searchsorted(trace.time, mine.stamp - 1e-9)
     off = mine.position - trace.position[at, drone]
     assert 0.002 < np.sqrt((off[:, :2] ** 2).mean()) < 0.03
-    assert flown.log.sent.position.shape == flown.log.sent.velocity.shape
+    assert delayed_run.log.sent.position.shape == delayed_run.log.sent.velocity.shape
 
 
-def test_belief_error_is_that_of_the_prediction(flown):
-    trace, net = flown.trace, flown.plan.links
+def test_belief_error_is_that_of_the_prediction(delayed_run):
+    trace, net = delayed_run.trace, delayed_run.plan.links
     found = signals.belief_errors(trace, net)
     listener, speaker, heard, ends = net.receiver, net.sender, trace.received, trace.plan.pose_links
     for link in np.flatnonzero(speaker > 0)[::5]:  # the leader stands, and says nothing after the start

@@ -58,7 +58,7 @@ def home(tmp_path, monkeypatch):
     return folder
 
 
-def experiment(folder, **hosts):
+def file_with_hosts(folder, **hosts):
     file = folder / "x.toml"
     text = catalogue.path("triangle").read_text("utf-8")
     for name, fields in hosts.items():
@@ -69,7 +69,7 @@ def experiment(folder, **hosts):
 
 @pytest.mark.system
 def test_check_makes_a_row_of_each(home, tmp_path, capsys):
-    file = experiment(
+    file = file_with_hosts(
         tmp_path,
         lab1={"address": "lab1", "robots": ["CF01"], "tags": ["radio"]},
         lab2={"address": "nobody", "robots": ["KH01"]},
@@ -90,7 +90,7 @@ def test_check_makes_a_row_of_each(home, tmp_path, capsys):
 
 @pytest.mark.system
 def test_a_run_here_and_there(home, tmp_path):
-    file = experiment(tmp_path, lab1={"address": "lab1", "robots": ["CF01", "KH01"]})
+    file = file_with_hosts(tmp_path, lab1={"address": "lab1", "robots": ["CF01", "KH01"]})
     assert Flight(tmp_path / "run", file, *SHORT).finish(60.0)[0] == 0
     trace = playback.read(tmp_path / "run" / "event.mcap").trace
     assert [lie.host for lie in trace.clocks] == ["lab1"]
@@ -100,7 +100,7 @@ def test_a_run_here_and_there(home, tmp_path):
 
 @pytest.mark.system
 def test_hosts_can_be_left_out(home, tmp_path):
-    file = experiment(tmp_path, lab1={"address": "nobody", "robots": ["CF01", "KH01"]})
+    file = file_with_hosts(tmp_path, lab1={"address": "nobody", "robots": ["CF01", "KH01"]})
     assert Flight(tmp_path / "here", file, *SHORT, "--here").finish(60.0)[0] == 0
     assert playback.read(tmp_path / "here" / "event.mcap").trace.clocks == ()
 
@@ -111,7 +111,7 @@ def test_another_zenpark_is_refused_before_anything_moves(home, tmp_path):
     serve = "from experiments.real_time.hosts.station import serve; serve()"
     old = f"import experiments.recording.version as v; v.digest = lambda: 'f' * 64; {serve}"
     command.write_text(f'#!/bin/sh\nPYTHONPATH={ROOT} exec {sys.executable} -c "{old}"\n')
-    flight = Flight(tmp_path / "run", experiment(tmp_path, lab1={"address": "lab1", "robots": ["CF01"]}))
+    flight = Flight(tmp_path / "run", file_with_hosts(tmp_path, lab1={"address": "lab1", "robots": ["CF01"]}))
     flight.until_said("another zenpark is there")
     said = flight.said()
     assert flight.finish()[0] == 2
@@ -158,7 +158,7 @@ def prepared(home, bootstrap):
 @pytest.mark.mechanism("hosts: installation")
 @pytest.mark.system
 def test_install_puts_this_one_there_once(home, tmp_path, capsys, bootstrap):
-    file = experiment(tmp_path, lab1={"address": "lab1", "robots": ["CF01"]})
+    file = file_with_hosts(tmp_path, lab1={"address": "lab1", "robots": ["CF01"]})
     command = home / "zenpark" / "zenpark"
     command.write_text("#!/bin/sh\nexit 9\n")
     (home / "zenpark" / "agents").mkdir()
@@ -185,7 +185,7 @@ def test_install_leaves_alone_what_is_not_its_own(home, tmp_path, capsys, there,
         (home / "zenpark" / "zenpark").write_text("#!/bin/sh\nexit 9\n")
         program(home / "zenpark" / there, "")
     address = "lab1" if there is not None else "nobody"
-    assert tool.install(experiment(tmp_path, lab1={"address": address, "robots": ["CF01"]})) == 1
+    assert tool.install(file_with_hosts(tmp_path, lab1={"address": address, "robots": ["CF01"]})) == 1
     assert message in capsys.readouterr().err
     assert (home / "zenpark" / "zenpark").read_text().startswith("#!/bin/sh")
 

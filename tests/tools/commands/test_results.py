@@ -20,7 +20,7 @@ from tools.options import known_words
 pytestmark = pytest.mark.slow  # whole runs and their reports
 
 
-def zenpark(*words, code=0):
+def stdout_of(*words, code=0):
     return invoke(*words, code=code).stdout
 
 
@@ -36,7 +36,7 @@ def three(tmp_path_factory):
     """Folder of a run of two cases and three seeds, and what the command printed."""
     folder = tmp_path_factory.mktemp("results")
     (folder / "short.toml").write_text(SHORT)
-    return folder / "run", zenpark("run", folder / "short.toml", "--virtual", "--seeds", 3, "--out", folder / "run")
+    return folder / "run", stdout_of("run", folder / "short.toml", "--virtual", "--seeds", 3, "--out", folder / "run")
 
 
 @pytest.fixture
@@ -54,17 +54,17 @@ def again(first, tmp_path):
 def another(first, tmp_path):
     """A run of the same file with one seed and other options; returns its folder and what was printed."""
 
-    def run(*options, folder="x", code=0):
+    def rerun(*options, folder="x", code=0):
         words = ["run", first.parent / "short.toml", "--virtual", "--no-report", "--out", tmp_path / folder, *options]
-        return tmp_path / folder, zenpark(*words, code=code)
+        return tmp_path / folder, stdout_of(*words, code=code)
 
-    return run
+    return rerun
 
 
 def test_new_report_keeps_seeds_without_recordings(first, again):
     for k, file in enumerate(("event.mcap", "periodic.mcap")):
         os.utime(again / file, (k, k))  # as unpacked from an archive: the reference stays the first one
-    found = json.loads(zenpark("report", again, "--json"))
+    found = json.loads(stdout_of("report", again, "--json"))
     assert found["runs"][0]["across"]["seeds"] == [1, 2, 3]
     before, after = (json.loads((folder / "metrics.json").read_bytes()) for folder in (first, again))
     assert [(each["case"], each["seed"]) for each in after] == [(each["case"], each["seed"]) for each in before]
@@ -75,9 +75,9 @@ def test_new_report_keeps_seeds_without_recordings(first, again):
 
 def test_figures_are_pdf_on_demand(first, again):
     assert not list(again.glob("figures/*.pdf"))
-    for text in ((again / "report.html").read_text(), zenpark("run", "--help")):
+    for text in ((again / "report.html").read_text(), stdout_of("run", "--help")):
         assert "./zenpark report FOLDER --pdf" in " ".join(text.split())
-    zenpark("report", again, "--pdf")
+    stdout_of("report", again, "--pdf")
     assert {file.stem for file in again.glob("figures/*.pdf")} == {file.stem for file in again.glob("figures/*.svg")}
     assert refusal("report", again, "--latex", "--pdf")
     assert refusal("report", again, first, "--pdf")
@@ -85,7 +85,7 @@ def test_figures_are_pdf_on_demand(first, again):
 
 def test_figure_of_errors_stays_without_all_seeds_errors(first, again):
     (again / "figures" / "errors.csv").unlink()
-    zenpark("report", again)
+    stdout_of("report", again)
     assert (again / "figures/errors.svg").read_bytes() == (first / "figures/errors.svg").read_bytes()
     assert "Recordings of the others are not kept." in (again / "report.html").read_text()
 
@@ -99,12 +99,12 @@ def test_metrics_of_another_version_are_not_overwritten(again):
 
 def test_paper_tables_are_over_seeds_with_chosen_metrics(first, tmp_path):
     for form in ("--latex", "--markdown"):
-        text = zenpark("report", first, form)
+        text = stdout_of("report", first, form)
         assert "3 seeds" in text
         assert text.count("±") + text.count(r"\pm") > 10
-        assert "3 seeds" in zenpark("report", first, first, form)
+        assert "3 seeds" in stdout_of("report", first, first, form)
     file = tmp_path / "paper" / "t.tex"
-    assert zenpark("report", first, "--latex", "--out", file, "--metrics", "f,iae").strip() == str(file)
+    assert stdout_of("report", first, "--latex", "--out", file, "--metrics", "f,iae").strip() == str(file)
     rows = [line for line in file.read_text().splitlines() if line.startswith(("f ", "IAE", "ITAE", "RMSE"))]
     assert [row.split(" [")[0] for row in rows] == ["f", "IAE"]
     assert "--metrics speed: is not known" in refusal("report", first, "--latex", "--metrics", "speed")
@@ -124,22 +124,22 @@ def test_console_gives_the_digits_an_interval_supports(three):
 
 def test_sweep_has_figures_and_a_paper_table(first, tmp_path):
     folder, figures = tmp_path / "swept", tmp_path / "swept" / "figures"
-    said = zenpark("sweep", first.parent / "short.toml", "trigger.threshold=0.01,0.05", "seeds=2", "--out", folder)
+    said = stdout_of("sweep", first.parent / "short.toml", "trigger.threshold=0.01,0.05", "seeds=2", "--out", folder)
     assert f"figures: {figures}" in said
     narrow = (figures / "pareto_iae.svg").read_text()
-    assert zenpark("report", folder, "--width", "7.16").strip() == str(figures)
+    assert stdout_of("report", folder, "--width", "7.16").strip() == str(figures)
     assert (figures / "pareto_iae.svg").read_text() != narrow
     assert not list(figures.glob("*.pdf"))
-    zenpark("report", folder, "--pdf")
+    stdout_of("report", folder, "--pdf")
     assert {file.stem for file in figures.glob("*.pdf")} == {"pareto_iae", "pareto_itae"}
-    text = zenpark("report", folder, "--latex")
+    text = stdout_of("report", folder, "--latex")
     assert r"\caption{Cases, Two, for three seconds." in text
     assert "event & 0.05 & " in text
-    chosen = zenpark("report", folder, "--latex", "--metrics", "messages,iae").splitlines()
+    chosen = stdout_of("report", folder, "--latex", "--metrics", "messages,iae").splitlines()
     assert r"Case & threshold [m] & Messages ratio & IAE ratio \\" in chosen
     assert "--metrics speed: is not known" in refusal("report", folder, "--latex", "--metrics", "speed")
-    assert f"a sweep: `./zenpark report {folder}`" in zenpark("runs", "--past", "--in", tmp_path)
-    (known,) = json.loads(zenpark("runs", "--past", "--in", tmp_path, "--json"))["sweeps"]
+    assert f"a sweep: `./zenpark report {folder}`" in stdout_of("runs", "--past", "--in", tmp_path)
+    (known,) = json.loads(stdout_of("runs", "--past", "--in", tmp_path, "--json"))["sweeps"]
     assert (known["folder"], known["cells"], known["seeds"]) == (str(folder), 3, [1, 2])
 
 
@@ -154,10 +154,10 @@ def test_hazards_of_a_virtual_run_are_printed(three, another):
 
 def test_runs_of_several_seeds_are_pooled_to_one(first, another, tmp_path):
     runs = [another("--seed", seed, folder=f"seed{seed}")[0] for seed in (1, 2, 3)]
-    tables = zenpark("report", *runs, "--pool", "--latex", "--metrics", "f,iae")
-    assert tables == zenpark("report", first, "--latex", "--metrics", "f,iae")
+    tables = stdout_of("report", *runs, "--pool", "--latex", "--metrics", "f,iae")
+    assert tables == stdout_of("report", first, "--latex", "--metrics", "f,iae")
     page = tmp_path / "seed1-pooled" / "report.html"
-    assert zenpark("report", *runs, "--pool").strip() == str(page)
+    assert stdout_of("report", *runs, "--pool").strip() == str(page)
     assert f"Of 3 runs together: {', '.join(map(str, runs))}." in page.read_text()
     assert "median and range of 3 seeds" in page.read_text()
     assert "seed 1 is there twice" in refusal("report", runs[0], runs[0], "--pool")
@@ -169,7 +169,7 @@ def test_a_comparison_has_the_intervals_of_the_report(three, again, tmp_path):
     first, printed = three
     (again / "event.mcap").unlink()  # `clean --recordings` leaves the metrics
     page = tmp_path / "comparison.html"
-    lines = zenpark("report", first, tmp_path, "--out", page).splitlines()
+    lines = stdout_of("report", first, tmp_path, "--out", page).splitlines()
     assert re.fullmatch(rf"B +{re.escape(str(again))} +the same file, seeds and versions", lines[2])
     event = next(line for line in lines if line.startswith("B · event "))
     (reported,) = [line for line in printed.splitlines() if line.startswith("       event: ")]
@@ -180,7 +180,7 @@ def test_a_comparison_has_the_intervals_of_the_report(three, again, tmp_path):
     assert "Means over 3 seeds ± half-width" in lines[-2]
     assert lines[-1] == str(page)
     assert "Comparison of runs" in page.read_text()
-    found = json.loads(zenpark("report", first, again, "--out", page, "--json"))
+    found = json.loads(stdout_of("report", first, again, "--out", page, "--json"))
     assert found["differences"] == {str(again): []}
     figures = found["runs"][0]["cases"]["event"]["iae"]
     assert figures["n"] == 3
@@ -229,8 +229,8 @@ def test_a_spoiled_run_is_not_compared(first, another, tmp_path):
     out, printed = another("--set", "cases.event.safety.battery_low=0.999999", "--anyway", code=1)
     assert "✗ Spoiled, and compared with nothing: event: robots failed." in printed
     assert "ratios" not in printed
-    compared = zenpark("report", first, out, "--out", tmp_path / "comparison.html")
+    compared = stdout_of("report", first, out, "--out", tmp_path / "comparison.html")
     assert "×" not in next(line for line in compared.splitlines() if line.startswith("B · event "))
     assert "Spoiled, and compared with nothing: B · event: " in compared
-    assert "robots failed" in zenpark("runs", "--past", "--in", out)
+    assert "robots failed" in stdout_of("runs", "--past", "--in", out)
     assert "is no whole run that nothing spoiled" in refusal("report", out, first, "--pool")

@@ -235,7 +235,7 @@ def test_drones_are_the_same_alone():
     commands = rng.uniform([-0.5, -0.5, 0.3, -0.5], [0.5, 0.5, 0.9, 0.5], (150, 4, 4))
     wobbles = 0.01 * rng.standard_normal((150, 4, 2))
 
-    def run(rows):
+    def heights_of(rows):
         engine = RigidBody().build(stage([kinds[r] for r in rows], [start[r] for r in rows]))
         seen = []
         for tick in range(150):
@@ -251,9 +251,9 @@ def test_drones_are_the_same_alone():
             seen.append([(*m.position, *m.velocity, m.yaw, *m.attitude) for m in engine.motions])
         return np.array(seen)
 
-    together = run([0, 1, 2, 3])
+    together = heights_of([0, 1, 2, 3])
     for rows in ([0], [1], [2], [3], [3, 1], [2, 0]):
-        np.testing.assert_array_equal(run(rows), together[:, rows])
+        np.testing.assert_array_equal(heights_of(rows), together[:, rows])
     assert (np.abs(together[-1, :, :3] - np.array(start)).max(axis=1) > 0.05).all()
 
 

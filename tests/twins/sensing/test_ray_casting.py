@@ -14,8 +14,7 @@ from agents.kinds.khepera4 import KHEPERA4
 from agents.kinds.tello import TELLO
 from agents.kinds.turtlebot3 import TURTLEBOT3
 from twins.scene import Obstacle, Scene
-from twins.sensing import ray_casting
-from twins.sensing.ray_casting import Beams, Caster, Fan
+from twins.sensing.ray_casting import BUDGET, Beams, Caster, Fan
 
 LOW = 0.01  # [m] everything that stands on the floor spans this height
 UP, DOWN = 0.5 * math.pi, -0.5 * math.pi
@@ -30,14 +29,14 @@ def furnished(obstacles=None, *, walled=False, size=(6.0, 6.0, 2.5)):
     return Scene.furnished(size, obstacles or {}, {}, walled=walled)
 
 
-def look(position, fans, *, kinds=None, yaw=None, scene=None, obstacles=None, row=None, which=None):
+def look(position, fans, *, kinds=None, yaw=None, scene=None, obstacles=None, row=None, which=None, **options):
     """Distances (F, m) that rows see, one fan each unless said otherwise."""
     position = np.asarray(position, dtype=float)
     n = len(position)
     scene = furnished() if scene is None else scene
     obstacles = scene.pose if obstacles is None else obstacles
     row = np.arange(n) if row is None else np.asarray(row)
-    beams = Beams(fans, row, np.zeros(len(row), dtype=int) if which is None else np.asarray(which))
+    beams = Beams(fans, row, np.zeros(len(row), dtype=int) if which is None else np.asarray(which), **options)
     caster = Caster(scene, kinds or [KHEPERA4] * n)
     seen = caster.cast(beams, position, np.zeros(n) if yaw is None else np.asarray(yaw), obstacles)
     return seen.reshape(len(row), -1) if which is None else seen
@@ -88,9 +87,8 @@ def by_pymunk(position, angles, reach, scene, pose):
     return seen
 
 
-@pytest.mark.parametrize("budget", [ray_casting.BUDGET, 300])
-def test_random_scenes_are_seen_as_pymunk_sees_them(budget, monkeypatch):
-    monkeypatch.setattr(ray_casting, "BUDGET", budget)  # however memory is portioned
+@pytest.mark.parametrize("budget", [BUDGET, 300])
+def test_random_scenes_are_seen_as_pymunk_sees_them(budget):
     rng = np.random.default_rng(4)
     scene = furnished(THINGS, walled=True, size=(4.0, 3.0, 2.5))
     n, reach = len(CROWD), 2.2
@@ -100,7 +98,7 @@ def test_random_scenes_are_seen_as_pymunk_sees_them(budget, monkeypatch):
         position, yaw = np.zeros((n, 3)), rng.uniform(-20.0, 20.0, n)
         position[:, :2] = rng.uniform([-1.9, -1.4], [1.9, 1.4], (n, 2))
         pose = rng.uniform([-2.0, -1.5, -9.0], [2.0, 1.5, 9.0], (len(THINGS), 3))
-        seen = look(position, [fan(bearing, reach)], kinds=CROWD, yaw=yaw, scene=scene, obstacles=pose)
+        seen = look(position, [fan(bearing, reach)], kinds=CROWD, yaw=yaw, scene=scene, obstacles=pose, budget=budget)
         expected = by_pymunk(position, yaw[:, None] + bearing, reach, scene, pose)
         assert np.isfinite(expected).mean() > 0.6
         outside = (expected != 0.0).all(axis=1)  # inside a thing pymunk says 0, and we see through it

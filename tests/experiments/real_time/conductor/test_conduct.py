@@ -43,7 +43,7 @@ REAL = pair(
 )
 
 
-def run(robots: dict[str, str], title: str = "here", born: str | None = None) -> run_registry.RegisteredRun:
+def registered(robots: dict[str, str], title: str = "here", born: str | None = None) -> run_registry.RegisteredRun:
     made = run_registry.own_entry("run", title, ["tcp/127.0.0.1:7448"], folder=Path("/runs/other"), robots=robots)
     return made if born is None else changed(made, born=born)
 
@@ -73,7 +73,7 @@ def test_hardware_is_known_by_address_settings_and_host() -> None:
 def test_hardware_that_another_run_has_is_refused(
     monkeypatch: pytest.MonkeyPatch, mine: dict[str, str], theirs: dict[str, str], refused: bool
 ) -> None:
-    me, other = run(mine), run(theirs, "there", born="another")
+    me, other = registered(mine), registered(theirs, "there", born="another")
     monkeypatch.setattr(run_registry, "born", lambda _pid: "another")
     there = "there, /runs/other, at tcp/127.0.0.1:7448"
     if not refused:
@@ -89,7 +89,10 @@ def test_hardware_that_another_run_has_is_refused(
 
 
 def test_a_run_that_has_died_has_nothing() -> None:
-    assert conduct.check_other_runs(run({"CF01": RADIO}), [run({"CF01": RADIO}, born="long ago")], "x.toml") == []
+    assert (
+        conduct.check_other_runs(registered({"CF01": RADIO}), [registered({"CF01": RADIO}, born="long ago")], "x.toml")
+        == []
+    )
 
 
 KEYS = Keys("park")

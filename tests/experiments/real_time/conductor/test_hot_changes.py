@@ -120,7 +120,7 @@ class Stage:
             self.phase(name, {"takeoff": "airborne", "start": "running"}[order])
 
     def end(self, name: str) -> None:
-        """Its process is over."""
+        """End the process of a robot."""
         self.running.discard(name)
         self.robots[name].alive = False
         if not self.changes.expects(name, "its process ended"):

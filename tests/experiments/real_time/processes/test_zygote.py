@@ -106,9 +106,8 @@ def test_an_ended_zygote_takes_no_process_along(launcher: Launcher, end: Callabl
     assert process.exit == "exit code unknown"
 
 
-def test_a_zygote_that_stands_still_is_done_without(launcher: Launcher, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_zygote_that_stands_still_is_done_without(launcher: Launcher) -> None:
     process = begin(launcher, "a", "3")
-    monkeypatch.setattr(zygote, "REPLY_S", 0.5)
     os.kill(launcher.get(ZYGOTE).handle.pid, signal.SIGSTOP)
     assert not isinstance(begin(launcher, "b", "stay").handle, zygote.Forked)
     until(lambda: not process.alive, "it ends")

@@ -270,7 +270,7 @@ def test_arming():
 
 
 def test_battery():
-    """It empties in flight only, as fast as told; empty, the motors stop."""
+    """A battery empties in flight only, at the set rate; empty, it stops the motors."""
     wire = Wire(battery=0.5, drain=10.0)
     charge = wire.after(5.0).flock.batteries.charge
     assert charge[0] == 0.5
@@ -323,7 +323,7 @@ def test_a_fall_ends_upside_down():
 
 
 def test_a_collision():
-    """It lies on its side from a time on: its motors stop, it falls; upright again it can be recovered."""
+    """A drone on its side stops its motors and falls; upright again it can be recovered."""
     wire = Wire(tumbled_from_s=19.0, tumbled_for_s=3.0).hovering()
     assert wire.after(1.5).state == SupervisorState.CRASHED
     assert wire.after(3.0).state == SupervisorState.CRASHED
@@ -335,7 +335,7 @@ def test_a_collision():
 
 
 def test_flow_deck_does_not_measure_where_it_is():
-    """It believes to be where it was switched on, in the air too, until its estimator is reset elsewhere."""
+    """The estimate begins where the drone was switched on, in the air too, until the estimator is reset elsewhere."""
     wire = Wire(start=[[0.5, 0.2, 0.0]]).hovering()
     assert wire.estimate == pytest.approx([0.0, 0.0, 1.0], abs=0.01)
     wire.go_to(0.3, 0.0, 1.0, 0.0, 2.0)

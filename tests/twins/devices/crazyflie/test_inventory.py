@@ -20,7 +20,7 @@ CTYPES = {"u8": "uint8_t", "u16": "uint16_t", "u32": "uint32_t", "i8": "int8_t",
 
 @pytest.fixture
 def files(tmp_path):
-    """Both tables of that firmware, as cflib writes them to its cache."""
+    """Tables of parameters and logs of that firmware, as cflib writes them to its cache."""
     if not FIRMWARE.exists():
         pytest.skip(f"{FIRMWARE} with the firmware's tables is not there")
     parameters, logs = json.loads(FIRMWARE.read_text())

@@ -223,7 +223,7 @@ def test_lighthouse_memory():
 
 
 def test_loco_anchors():
-    """They say where they are once they have been told; four are enough for an estimate."""
+    """Anchors report the positions that were written to them; four are enough for an estimate."""
     wire = Wire(device={"positioning": {"system": "loco"}})
     for anchor in range(4):
         assert not wire.flock.decks.ready()[0]
@@ -287,7 +287,7 @@ def test_malformed_packets_are_dropped():
 
 
 def test_loss():
-    """Each way on its own: of 1000 pings at 20 % come back 64 %."""
+    """Both ways lose packets independently: 64 % of 1000 pings come back at 20 %."""
     with Client(loss=0.2) as client:
         back = 0
         for i in range(1000):

@@ -38,7 +38,7 @@ def pose(pieces, t):
     raise AssertionError
 
 
-def flown(trajectories, start=None, **options):
+def flown_pieces(trajectories, start=None, **options):
     options = {"turned": False, "reverse": False, "scale": 1.0} | options
     status, pieces = trajectories.pieces(3, start, **options)
     assert status == LogStatus.OK
@@ -54,21 +54,21 @@ def corner():
 
 
 def test_pieces_of_the_memory(corner):
-    pieces = flown(corner)
+    pieces = flown_pieces(corner)
     assert [span for span, _ in pieces] == [1.0, 2.0]
     assert pose(pieces, 0.5) == pytest.approx([0.5, 0.5, 1.0, 0.0])
     assert pose(pieces, 2.0) == pytest.approx([1.0, 0.75, 1.0, 0.3])
-    assert pose(flown(corner, scale=2.0), 4.0) == pytest.approx([1.0, 0.75, 1.0, 0.3])  # slower
-    assert pose(flown(corner, reverse=True), 1.0) == pytest.approx([1.0, 0.75, 1.0, 0.3])
-    assert pose(flown(corner, reverse=True), 2.75) == pytest.approx([Polynomial(RISE)(0.25), 0.5, 1.0, 0.0])
+    assert pose(flown_pieces(corner, scale=2.0), 4.0) == pytest.approx([1.0, 0.75, 1.0, 0.3])  # slower
+    assert pose(flown_pieces(corner, reverse=True), 1.0) == pytest.approx([1.0, 0.75, 1.0, 0.3])
+    assert pose(flown_pieces(corner, reverse=True), 2.75) == pytest.approx([Polynomial(RISE)(0.25), 0.5, 1.0, 0.0])
 
 
 def test_relative_trajectories(corner):
     """Shifted to where it is; with a relative yaw turned as well, as the firmware does it."""
     start = np.array([2.0, 2.0, 0.4, 0.5 * math.pi])
-    assert pose(flown(corner, start), 0.0) == pytest.approx([2.0, 2.0, 0.4, 0.0])
-    assert pose(flown(corner, start), 1.0) == pytest.approx([3.0, 2.0, 0.4, 0.0])
-    turned = flown(uploaded(piece(1.0, RISE), count=1), start, turned=True)
+    assert pose(flown_pieces(corner, start), 0.0) == pytest.approx([2.0, 2.0, 0.4, 0.0])
+    assert pose(flown_pieces(corner, start), 1.0) == pytest.approx([3.0, 2.0, 0.4, 0.0])
+    turned = flown_pieces(uploaded(piece(1.0, RISE), count=1), start, turned=True)
     assert pose(turned, 1.0) == pytest.approx([2.0, 3.0, 0.4, 0.5 * math.pi])
 
 
@@ -78,7 +78,7 @@ def test_compressed_pieces():
     first = struct.pack("<BH", 0 | 1 << 2 | 2 << 4 | 0 << 6, 1500) + struct.pack("<h3h", 300, 1000, 1400, 1200)
     high = [600, 700, 800, 900, 1000, 1100, 1250]
     second = struct.pack("<BH", 3 | 0 << 2 | 0 << 4 | 1 << 6, 1000) + struct.pack("<7hh", *high, 0)
-    pieces = flown(uploaded(start + first + second + b"\0\0\0", COMPRESSED))
+    pieces = flown_pieces(uploaded(start + first + second + b"\0\0\0", COMPRESSED))
     assert [span for span, _ in pieces] == [1.5, 1.0]
 
     def bezier(points, s):
@@ -100,7 +100,7 @@ def test_what_is_not_there(corner):
     assert corner.define(10, IN_MEMORY, UNCOMPRESSED, 0, 1) == LogStatus.NO_COMMAND
     for data in (piece(1.0, [1e30]), piece(math.nan), b""):
         with pytest.raises(ValueError, match="no numbers"):
-            flown(uploaded(data, count=1))
+            flown_pieces(uploaded(data, count=1))
 
 
 @pytest.mark.slow
