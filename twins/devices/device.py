@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import select
 import socket
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from math import inf
-from typing import Final, Generic, Literal, Protocol, TypeVar, get_args
+from typing import Final, Generic, Literal, TypeVar, get_args
 
 import msgspec
 import numpy as np
@@ -20,6 +21,7 @@ import numpy as np
 from agents.body.interface import BodyRequest
 from agents.ticks import Ticks
 from twins.arrays import Array
+from twins.models.motion import Motion
 
 # what motion capture tells wrongly: the same poses in new frames, the same frame again, two subjects exchanged, and one
 # under another name
@@ -105,32 +107,34 @@ class FaultyLink(Generic[Item]):
             yield self._waiting.popleft()[1]
 
 
-class Server(Protocol):
+class Server(ABC):
     """Simulated far end of a protocol."""
 
     def sockets(self) -> Sequence[socket.socket]:
         """Sockets to wait on; read again after every `serve`, because clients come and go."""
-        ...
+        return ()
 
-    def serve(self, ready: socket.socket, t: float) -> None:
+    def serve(self, ready: socket.socket, t: float) -> None:  # noqa: B027 - not called without sockets
         """Read from a socket that is ready, at time `t` [s]. Never blocks."""
-        ...
 
+    @abstractmethod
     def advance(self, t: float) -> None:
         """Advance the models to `t` [s] and send due packets; called once per tick of `request.rate_hz`."""
-        ...
+
+    @abstractmethod
+    def close(self) -> None:
+        """Leave the network."""
 
 
-class Device(Server, Protocol):
+class Device(Server):
     """Simulated device for some robots of one kind, made with a `DeviceRequest`."""
 
     addresses: tuple[str, ...]  # one per row: the body's address for the bridge, such as "udp://127.0.0.1:19850"
+    models: Sequence[Motion]  # of the rows, for `truth`
 
     def truth(self) -> tuple[Array, Array]:
         """True positions (n, 3) [m] and yaws (n,) [rad] of the robots."""
-        ...
-
-    def close(self) -> None: ...
+        return np.array([model.position for model in self.models]), np.array([model.yaw for model in self.models])
 
 
 def serve_until_next(server: Server, ticks: Ticks) -> float:

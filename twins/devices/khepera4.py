@@ -11,14 +11,11 @@ import socket
 from collections.abc import Callable, Sequence
 from typing import Final
 
-import numpy as np
-
 from agents.body.interface import BodyError, BodyRequest, settings
 from agents.kinds.khepera4 import KHEPERA4
 from agents.protocols import khepera4 as protocol
-from twins.arrays import Array
 from twins.body import instants
-from twins.devices.device import DeviceRequest, Faults, FaultyLink
+from twins.devices.device import Device, DeviceRequest, Faults, FaultyLink
 from twins.models.differential import Differential
 from twins.models.disturbance import Latency, OdometryDrift
 from twins.models.noise import refill
@@ -315,8 +312,8 @@ class _Server:
         return "".join(f"{answer}\r\n" for answer in answers).encode()
 
 
-class KheperaDevice:
-    """Khepera IV robots; implements `twins.devices.device.Device`. Their range sensors measure nothing."""
+class KheperaDevice(Device):
+    """Khepera IV robots. Their range sensors measure nothing."""
 
     def __init__(self, request: DeviceRequest) -> None:
         body, self._faults = request.body, request.faults
@@ -337,6 +334,7 @@ class KheperaDevice:
             self.close()
             raise
         self.addresses = tuple(addresses)
+        self.models = [server.robot.model for server in self.servers]
 
     def sockets(self) -> Sequence[socket.socket]:
         return [wire for server in self.servers for wire in server.sockets(silent=self._silent(server, self._t))]
@@ -355,10 +353,6 @@ class KheperaDevice:
         for server in self.servers:
             if not self._faults.silent(t):
                 server.flush()
-
-    def truth(self) -> tuple[Array, Array]:
-        models = [server.robot.model for server in self.servers]
-        return np.array([model.position for model in models]), np.array([model.yaw for model in models])
 
     def close(self) -> None:
         for server in self.servers:

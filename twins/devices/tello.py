@@ -19,7 +19,7 @@ from agents.protocols import tello as protocol
 from agents.vectors import NO_SETPOINT, ZERO, Setpoint, Vector, difference, norm
 from twins.arrays import Array
 from twins.body import instants
-from twins.devices.device import DeviceRequest, Faults, FaultyLink
+from twins.devices.device import Device, DeviceRequest, Faults, FaultyLink
 from twins.models.disturbance import HoverJitter, Latency
 from twins.models.noise import refill
 from twins.models.quadrotor import Quadrotor
@@ -80,7 +80,7 @@ class _Drone(FaultyLink[tuple[bytes, tuple[str, int]]]):
         self.model.blow(disturbance.wind or (0.0, 0.0))
         self._jitter = HoverJitter(disturbance, name, seed, self._dt)
         self._latency = Latency(disturbance, self._dt)
-        self.start_yaw = body.yaw[row]
+        self.number, self.start_yaw = row, body.yaw[row]
         self.stick_speed = chosen.twin_stick_speed  # [m/s] at full deflection
         self.seeks_pads = False  # mission pads are switched on
         self.mode = Mode.GROUND
@@ -103,19 +103,18 @@ class _Drone(FaultyLink[tuple[bytes, tuple[str, int]]]):
         """Whether the drone accepts motion commands."""
         return self.mode in (Mode.STICKS, Mode.MOVE, Mode.TURN)
 
-    def fly(self, setpoint: Setpoint) -> None:
+    def step(self) -> None:
         """One step; the setpoint takes effect after the latency."""
         model = self.model
-        model.command(self._latency.delay(setpoint))
+        model.command(self._latency.delay(self._setpoint()))
         if self._jitter.present:
             model.wobble = self._jitter.advance(model.held[2])
             refill(self._jitter.noise)
         model.move(self._dt)
+        self._update()
 
-    def hover(self) -> None:
-        """Hover at the current place, if the drone is in controlled flight."""
-        if self.aloft:
-            self.mode, self.sticks = Mode.STICKS, (0, 0, 0, 0)
+    def _hover(self) -> None:
+        self.mode, self.sticks = Mode.STICKS, (0, 0, 0, 0)
 
     def send(self, text: str, to: tuple[str, int]) -> None:
         """Queue a packet; sent at once, or after the injected delay."""
@@ -137,17 +136,198 @@ class _Drone(FaultyLink[tuple[bytes, tuple[str, int]]]):
             self.send(text, self.answer_to)
         self.answer_to = None
 
+    def receive(self, packet: bytes, sender: tuple[str, int]) -> None:
+        """Execute a packet and answer it."""
+        words = packet.decode("ascii", "replace").split()
+        if not words:
+            return
+        word = words[0]
+        if word == "command":
+            self.sdk = True
+        if not self.sdk:
+            return  # before `command` the drone listens to the phone only
+        self.peer, self.last_command = sender, self.t
+        try:
+            answer = self._answer(word) if word.endswith("?") else self._execute(word, words[1:], sender)
+        except _Refusal as refusal:
+            answer = str(refusal)
+        if answer:
+            self.send(answer, sender)
 
-class TelloDevice:
-    """Tellos; implements `twins.devices.device.Device`."""
+    def _answer(self, question: str) -> str:
+        height = self.model.position[2]
+        answers = {
+            "battery?": f"{round(100.0 * self.charge)}\r\n",
+            "speed?": f"{100.0 * self.pace:.1f}\r\n",
+            "time?": f"{int(self.motors_s)}s\r\n",
+            "height?": f"{int(10.0 * height)}dm\r\n",
+            "temp?": "63~66C\r\n",
+            "attitude?": f"pitch:0;roll:0;yaw:{self._yaw()};\r\n",
+            "baro?": f"{170.0 + height:.6f}\r\n",
+            "acceleration?": "agx:-6.00;agy:1.00;agz:-999.00;\r\n",
+            "tof?": f"{max(100, round(1000.0 * height))}mm\r\n",
+            "wifi?": "90\r\n",
+            "sdk?": "20\r\n",
+            "sn?": f"0TQTWIN{self.number:04d}\r\n",
+        }
+        return answers.get(question, f"unknown command: {question}")
+
+    def _execute(self, word: str, arguments: list[str], sender: tuple[str, int]) -> str:
+        """Execute a command; returns the answer, empty if there is none, or none yet; raises _Refusal."""
+        if word in MANOEUVRES:
+            _require("error Motor stop", met=self.aloft)
+            self._begin_manoeuvre(word, arguments)
+            self.answer_to = sender
+            return ""
+        if word not in OTHERS:
+            return TEXT_ANSWERS.get(word, f"unknown command: {word}")
+        values = _integers(arguments)
+        if word in ("takeoff", "land", "emergency"):
+            return self._start_automatic(word, sender)
+        if word == "rc":
+            _require("error", met=len(values) == 4)
+            right, forward, up, clockwise = (max(-protocol.STICK, min(protocol.STICK, value)) for value in values)
+            self.sticks = (right, forward, up, clockwise)
+            return ""
+        if word == "stop":
+            _require("error Motor stop", met=self.aloft)
+            self._hover()
+        elif word == "speed":
+            _require("out of range", met=len(values) == 1 and 10 <= values[0] <= 100)
+            self.pace = 0.01 * values[0]
+        elif word in ("mon", "moff"):
+            self.seeks_pads = word == "mon"
+        return "ok"
+
+    def _start_automatic(self, word: str, sender: tuple[str, int]) -> str:
+        """Start an automatic manoeuvre: take-off, landing or emergency stop; returns an immediate answer, or empty."""
+        if word == "emergency":
+            self.model.stop()
+            self.mode, self.answer_to, self.sticks = Mode.FALL, None, (0, 0, 0, 0)
+            return "ok"
+        if word == "takeoff":
+            if self.mode is not Mode.GROUND or self.charge < LOWEST_TAKEOFF_CHARGE:
+                return "error"
+            self.model.takeoff(protocol.TAKEOFF_HEIGHT)
+            self.mode, self.answer_to, self.sticks = Mode.CLIMB, sender, (0, 0, 0, 0)
+            return ""
+        self.landing_due = min(self.landing_due, self.t + self.faults.refuse_landing_s)
+        if self.mode in (Mode.GROUND, Mode.CLIMB, Mode.FALL) or self.t < self.landing_due:
+            return "error"  # busy with its take-off it obeys `emergency` only
+        if self.mode is not Mode.LAND:  # a repeated command changes nothing
+            self.model.land()
+        self.mode, self.answer_to = Mode.LAND, sender
+        return ""
+
+    def _begin_manoeuvre(self, word: str, arguments: list[str]) -> None:
+        """Begin a move or turn; raises _Refusal."""
+        yaw = self.model.yaw
+        if word in ("cw", "ccw"):
+            (angle,) = _integers(arguments, 1)
+            _require("out of range", met=1 <= angle <= 360)
+            self.mode = Mode.TURN
+            self.heading = yaw + math.radians(angle) * (-1.0 if word == "cw" else 1.0)
+        else:
+            ways, self.pace = self._path_of_move(word, arguments)
+            cos, sin = math.cos(yaw), math.sin(yaw)
+            x, y, z = self.model.held
+            points = [(x + cos * a - sin * b, y + sin * a + cos * b, z + c) for a, b, c in np.array(ways).tolist()]
+            self.goal, *self.further = points
+            self.mode = Mode.MOVE
+
+    def _path_of_move(self, word: str, arguments: list[str]) -> tuple[list[Array], float]:
+        """Points (3,) of a move one after the other [m], forward, left and up of the drone, and its pace [m/s]."""
+        if word == "flip":  # attitude is not simulated: a short way in its direction
+            direction = FLIPS.get(" ".join(arguments))
+            if direction is None or self.charge < LOWEST_FLIP_CHARGE:
+                raise _Refusal("error")
+            return [FLIP_M * np.array(MOVES[direction])], self.pace
+        if arguments and PAD.fullmatch(arguments[-1]):
+            raise _Refusal("error No valid marker")  # there are no mission pads
+        if word in MOVES:
+            (distance,) = _integers(arguments, 1)
+            _require("out of range", met=20 <= distance <= 500)
+            return [0.01 * distance * np.array(MOVES[word])], self.pace
+        count, fastest = {"go": (1, 100), "curve": (2, 60)}.get(word, (0, 0))
+        _require("error", met=count > 0)
+        *way, speed = _integers(arguments, 3 * count + 1)
+        _require("out of range", met=max(map(abs, way)) <= 500 and 10 <= speed <= fastest)
+        points = 0.01 * np.array(way).reshape(count, 3)
+        _require("error", met=bool((np.abs(points) >= 0.2).any(axis=1).all()))
+        return ([points[0]] if word == "go" else _arc(*points)), 0.01 * speed
+
+    def _yaw(self) -> int:
+        """Yaw as reported: degrees clockwise from the yaw at power-on, -180 to 179."""
+        return (round(-math.degrees(self.model.yaw - self.start_yaw)) + 180) % 360 - 180
+
+    def state(self) -> str:
+        """The line that is sent at `STATE_HZ`."""
+        height = self.model.position[2]
+        pad, at = (-1, -100) if self.seeks_pads else (-2, -200)  # none seen; not searched for
+        right, forward, up, _ = protocol.sticks(self.model.velocity, 0.0, self.model.yaw)
+        return (
+            f"mid:{pad};x:{at};y:{at};z:{at};mpry:0,0,0;pitch:0;roll:0;yaw:{self._yaw()};"
+            f"vgx:{int(forward / 10)};vgy:{int(right / 10)};vgz:{int(-up / 10)};templ:63;temph:66;"
+            f"tof:{max(10, round(100.0 * height))};h:{10 * int(10.0 * height + 1e-6)};"
+            f"bat:{round(100.0 * self.charge)};baro:{170.0 + height:.2f};time:{int(self.motors_s)};"
+            "agx:-6.00;agy:1.00;agz:-999.00;\r\n"
+        )
+
+    def _setpoint(self) -> Setpoint:
+        yaw = self.model.yaw
+        if self.mode is Mode.STICKS:
+            return protocol.motion(self.sticks, yaw, self.stick_speed)
+        if self.mode is Mode.TURN:
+            rate = max(-protocol.STICK_TURN, min(protocol.STICK_TURN, 4.0 * (self.heading - yaw)))
+            return 0.0, 0.0, 0.0, rate
+        if self.mode is Mode.MOVE:
+            way = difference(self.goal, self.model.held)
+            pace = min(self.pace / max(norm(way), 1e-9), 1.5)
+            return way[0] * pace, way[1] * pace, way[2] * pace, 0.0
+        return NO_SETPOINT
+
+    def _update(self) -> None:
+        """Update after a step: end of manoeuvres, battery, automatic landing."""
+        z, flying = self.model.held[2], self.model.flying
+        if self.mode is Mode.CLIMB and abs(z - protocol.TAKEOFF_HEIGHT) < NEAR:
+            self.mode = Mode.STICKS
+            self.finish("ok")
+        elif self.mode is Mode.LAND and not flying:
+            self.mode = Mode.GROUND
+            self.finish("ok")
+        elif self.mode is Mode.FALL and z <= 0.0:
+            self.mode = Mode.GROUND
+        elif self.mode in (Mode.MOVE, Mode.TURN) and self._arrived():
+            if self.mode is Mode.MOVE and self.further:
+                self.goal = self.further.pop(0)
+            else:
+                self._hover()
+                self.finish("ok")
+        if not flying:
+            return
+        self.motors_s += self._dt
+        self.charge = max(0.0, self.charge - self.faults.drain * self._dt / TELLO.endurance_s)
+        alone = self.t - self.last_command > protocol.AUTO_LAND_S
+        if self.mode is not Mode.LAND and (alone or self.charge <= LANDING_CHARGE):
+            self.model.land()
+            self.finish("error Auto land")
+            self.mode = Mode.LAND
+
+    def _arrived(self) -> bool:
+        if self.mode is Mode.TURN:
+            return abs(self.heading - self.model.yaw) < NEAR_YAW
+        near = PASSED if self.further else NEAR
+        return max(map(abs, difference(self.goal, self.model.held))) < near
+
+
+class TelloDevice(Device):
+    """Tellos."""
 
     def __init__(self, request: DeviceRequest, state_port: int = protocol.STATE_PORT) -> None:
         """`state_port`: UDP port of a client, to which the states are sent."""
         body = request.body
         self._state_port = state_port
-        chosen = [
-            settings(protocol.TelloSettings, name, table) for name, table in zip(body.names, body.device, strict=True)
-        ]
+        chosen = [settings(protocol.TelloSettings, *row) for row in zip(body.names, body.device, strict=True)]
         self._dt = 1.0 / body.rate_hz
         self._t = 0.0
         self._drones: list[_Drone] = []
@@ -158,6 +338,7 @@ class TelloDevice:
         except BodyError:
             self.close()
             raise
+        self.models = [drone.model for drone in self._drones]
         places = (drone.wire.getsockname() for drone in self._drones)
         self.addresses = tuple(f"tello://{host}:{port}" for host, port in places)
 
@@ -169,7 +350,7 @@ class TelloDevice:
         return [drone.wire for drone in self._drones]
 
     def serve(self, ready: socket.socket, t: float) -> None:
-        for row, drone in enumerate(self._drones):
+        for drone in self._drones:
             if drone.wire is ready:
                 drone.t = t
                 try:
@@ -177,229 +358,26 @@ class TelloDevice:
                 except OSError:
                     return
                 if not drone.lost():
-                    self._receive(row, packet, sender)
+                    drone.receive(packet, sender)
 
     def advance(self, t: float) -> None:
         for drone in self._drones:
             drone.t = t
         for _ in instants(self._t, t, self._dt):
-            self._step()
+            for drone in self._drones:
+                drone.step()
         self._t = t
-        for row, drone in enumerate(self._drones):
+        for drone in self._drones:
             if drone.sdk and drone.peer is not None and t >= drone.state_due - 0.5 * self._dt:
                 late = t - drone.state_due
                 period = 1.0 / protocol.STATE_HZ
                 drone.state_due += period if late < period else late + period  # missed packets are not repeated
-                drone.send(self._state(row), (drone.peer[0], self._state_port))
+                drone.send(drone.state(), (drone.peer[0], self._state_port))
             drone.flush()
-
-    def truth(self) -> tuple[Array, Array]:
-        models = [drone.model for drone in self._drones]
-        return np.array([model.position for model in models]), np.array([model.yaw for model in models])
 
     def close(self) -> None:
         for drone in self._drones:
             drone.wire.close()
-
-    # ------------------------------------------------------------------ the protocol
-
-    def _receive(self, row: int, packet: bytes, sender: tuple[str, int]) -> None:
-        words = packet.decode("ascii", "replace").split()
-        if not words:
-            return
-        drone, word = self._drones[row], words[0]
-        if word == "command":
-            drone.sdk = True
-        if not drone.sdk:
-            return  # before `command` the drone listens to the phone only
-        drone.peer, drone.last_command = sender, drone.t
-        answer = self._answer(row, word) if word.endswith("?") else self._execute(row, word, words[1:], sender)
-        if answer:
-            drone.send(answer, sender)
-
-    def _answer(self, row: int, question: str) -> str:
-        drone = self._drones[row]
-        height = drone.model.position[2]
-        answers = {
-            "battery?": f"{round(100.0 * drone.charge)}\r\n",
-            "speed?": f"{100.0 * drone.pace:.1f}\r\n",
-            "time?": f"{int(drone.motors_s)}s\r\n",
-            "height?": f"{int(10.0 * height)}dm\r\n",
-            "temp?": "63~66C\r\n",
-            "attitude?": f"pitch:0;roll:0;yaw:{self._yaw(row)};\r\n",
-            "baro?": f"{170.0 + height:.6f}\r\n",
-            "acceleration?": "agx:-6.00;agy:1.00;agz:-999.00;\r\n",
-            "tof?": f"{max(100, round(1000.0 * height))}mm\r\n",
-            "wifi?": "90\r\n",
-            "sdk?": "20\r\n",
-            "sn?": f"0TQTWIN{row:04d}\r\n",
-        }
-        return answers.get(question, f"unknown command: {question}")
-
-    def _execute(self, row: int, word: str, arguments: list[str], sender: tuple[str, int]) -> str:
-        """Execute a command; returns the answer, empty if there is none, or none yet."""
-        drone = self._drones[row]
-        if word in MANOEUVRES:
-            return self._manoeuvre(row, word, arguments, sender) if drone.aloft else "error Motor stop"
-        if word not in OTHERS:
-            return TEXT_ANSWERS.get(word, f"unknown command: {word}")
-        try:
-            values = [int(argument) for argument in arguments]
-        except ValueError:
-            return "error"
-        if word in ("takeoff", "land", "emergency"):
-            return self._start_automatic(row, word, sender)
-        if word == "rc" and len(values) == 4:
-            right, forward, up, clockwise = (max(-protocol.STICK, min(protocol.STICK, value)) for value in values)
-            drone.sticks = (right, forward, up, clockwise)
-            return ""
-        if word == "stop":
-            answer = "ok" if drone.aloft else "error Motor stop"
-            drone.hover()
-        elif word == "speed":
-            answer = "ok" if len(values) == 1 and 10 <= values[0] <= 100 else "out of range"
-            drone.pace = 0.01 * values[0] if answer == "ok" else drone.pace
-        else:
-            drone.seeks_pads = word == "mon" or (word != "moff" and drone.seeks_pads)
-            answer = "error" if word == "rc" else "ok"
-        return answer
-
-    def _start_automatic(self, row: int, word: str, sender: tuple[str, int]) -> str:
-        """Start an automatic manoeuvre: take-off, landing or emergency stop; returns an immediate answer, or empty."""
-        drone = self._drones[row]
-        if word == "emergency":
-            drone.model.stop()
-            drone.mode, drone.answer_to, drone.sticks = Mode.FALL, None, (0, 0, 0, 0)
-            return "ok"
-        if word == "takeoff":
-            if drone.mode is not Mode.GROUND or drone.charge < LOWEST_TAKEOFF_CHARGE:
-                return "error"
-            drone.model.takeoff(protocol.TAKEOFF_HEIGHT)
-            drone.mode, drone.answer_to, drone.sticks = Mode.CLIMB, sender, (0, 0, 0, 0)
-            return ""
-        drone.landing_due = min(drone.landing_due, drone.t + drone.faults.refuse_landing_s)
-        if drone.mode in (Mode.GROUND, Mode.CLIMB, Mode.FALL) or drone.t < drone.landing_due:
-            return "error"  # busy with its take-off it obeys `emergency` only
-        if drone.mode is not Mode.LAND:  # a repeated command changes nothing
-            drone.model.land()
-        drone.mode, drone.answer_to = Mode.LAND, sender
-        return ""
-
-    def _manoeuvre(self, row: int, word: str, arguments: list[str], sender: tuple[str, int]) -> str:
-        """Begin a move or turn; returns the answer of a refusal, else nothing yet."""
-        drone, yaw = self._drones[row], self._drones[row].model.yaw
-        try:
-            if word in ("cw", "ccw"):
-                (angle,) = _integers(arguments, 1)
-                _require("out of range", met=1 <= angle <= 360)
-                drone.mode = Mode.TURN
-                drone.heading = yaw + math.radians(angle) * (-1.0 if word == "cw" else 1.0)
-            else:
-                ways, drone.pace = self._path_of_move(drone, word, arguments)
-                cos, sin = math.cos(yaw), math.sin(yaw)
-                x, y, z = drone.model.held
-                points = [(x + cos * a - sin * b, y + sin * a + cos * b, z + c) for a, b, c in np.array(ways).tolist()]
-                drone.goal, *drone.further = points
-                drone.mode = Mode.MOVE
-        except _Refusal as refusal:
-            return str(refusal)
-        drone.answer_to = sender
-        return ""
-
-    @staticmethod
-    def _path_of_move(drone: _Drone, word: str, arguments: list[str]) -> tuple[list[Array], float]:
-        """Points (3,) of a move one after the other [m], forward, left and up of the drone, and its pace [m/s]."""
-        if word == "flip":  # attitude is not simulated: a short way in its direction
-            direction = FLIPS.get(" ".join(arguments))
-            if direction is None or drone.charge < LOWEST_FLIP_CHARGE:
-                raise _Refusal("error")
-            return [FLIP_M * np.array(MOVES[direction])], drone.pace
-        if arguments and PAD.fullmatch(arguments[-1]):
-            raise _Refusal("error No valid marker")  # there are no mission pads
-        if word in MOVES:
-            (distance,) = _integers(arguments, 1)
-            _require("out of range", met=20 <= distance <= 500)
-            return [0.01 * distance * np.array(MOVES[word])], drone.pace
-        count, fastest = {"go": (1, 100), "curve": (2, 60)}.get(word, (0, 0))
-        _require("error", met=count > 0)
-        *way, speed = _integers(arguments, 3 * count + 1)
-        _require("out of range", met=max(map(abs, way)) <= 500 and 10 <= speed <= fastest)
-        points = 0.01 * np.array(way).reshape(count, 3)
-        _require("error", met=bool((np.abs(points) >= 0.2).any(axis=1).all()))
-        return ([points[0]] if word == "go" else _arc(*points)), 0.01 * speed
-
-    def _yaw(self, row: int) -> int:
-        """Yaw as reported: degrees clockwise from the yaw at power-on, -180 to 179."""
-        drone = self._drones[row]
-        return (round(-math.degrees(drone.model.yaw - drone.start_yaw)) + 180) % 360 - 180
-
-    def _state(self, row: int) -> str:
-        drone = self._drones[row]
-        height = drone.model.position[2]
-        pad, at = (-1, -100) if drone.seeks_pads else (-2, -200)  # none seen; not searched for
-        right, forward, up, _ = protocol.sticks(drone.model.velocity, 0.0, drone.model.yaw)
-        return (
-            f"mid:{pad};x:{at};y:{at};z:{at};mpry:0,0,0;pitch:0;roll:0;yaw:{self._yaw(row)};"
-            f"vgx:{int(forward / 10)};vgy:{int(right / 10)};vgz:{int(-up / 10)};templ:63;temph:66;"
-            f"tof:{max(10, round(100.0 * height))};h:{10 * int(10.0 * height + 1e-6)};"
-            f"bat:{round(100.0 * drone.charge)};baro:{170.0 + height:.2f};time:{int(drone.motors_s)};"
-            "agx:-6.00;agy:1.00;agz:-999.00;\r\n"
-        )
-
-    # ------------------------------------------------------------------ the model
-
-    def _step(self) -> None:
-        for drone in self._drones:
-            drone.fly(self._model_setpoint(drone))
-            self._update(drone)
-
-    @staticmethod
-    def _model_setpoint(drone: _Drone) -> Setpoint:
-        yaw = drone.model.yaw
-        if drone.mode is Mode.STICKS:
-            return protocol.motion(drone.sticks, yaw, drone.stick_speed)
-        if drone.mode is Mode.TURN:
-            rate = max(-protocol.STICK_TURN, min(protocol.STICK_TURN, 4.0 * (drone.heading - yaw)))
-            return 0.0, 0.0, 0.0, rate
-        if drone.mode is Mode.MOVE:
-            way = difference(drone.goal, drone.model.held)
-            pace = min(drone.pace / max(norm(way), 1e-9), 1.5)
-            return way[0] * pace, way[1] * pace, way[2] * pace, 0.0
-        return NO_SETPOINT
-
-    def _update(self, drone: _Drone) -> None:
-        """Update a drone after a step: end of manoeuvres, battery, automatic landing."""
-        z, flying = drone.model.held[2], drone.model.flying
-        if drone.mode is Mode.CLIMB and abs(z - protocol.TAKEOFF_HEIGHT) < NEAR:
-            drone.mode = Mode.STICKS
-            drone.finish("ok")
-        elif drone.mode is Mode.LAND and not flying:
-            drone.mode = Mode.GROUND
-            drone.finish("ok")
-        elif drone.mode is Mode.FALL and z <= 0.0:
-            drone.mode = Mode.GROUND
-        elif drone.mode in (Mode.MOVE, Mode.TURN) and self._arrived(drone):
-            if drone.mode is Mode.MOVE and drone.further:
-                drone.goal = drone.further.pop(0)
-            else:
-                drone.hover()
-                drone.finish("ok")
-        if not flying:
-            return
-        drone.motors_s += self._dt
-        drone.charge = max(0.0, drone.charge - drone.faults.drain * self._dt / TELLO.endurance_s)
-        alone = drone.t - drone.last_command > protocol.AUTO_LAND_S
-        if drone.mode is not Mode.LAND and (alone or drone.charge <= LANDING_CHARGE):
-            drone.model.land()
-            drone.finish("error Auto land")
-            drone.mode = Mode.LAND
-
-    @staticmethod
-    def _arrived(drone: _Drone) -> bool:
-        if drone.mode is Mode.TURN:
-            return abs(drone.heading - drone.model.yaw) < NEAR_YAW
-        near = PASSED if drone.further else NEAR
-        return max(map(abs, difference(drone.goal, drone.model.held))) < near
 
 
 class _Refusal(Exception):
@@ -411,12 +389,12 @@ def _require(answer: str, *, met: bool) -> None:
         raise _Refusal(answer)
 
 
-def _integers(arguments: list[str], count: int) -> list[int]:
+def _integers(arguments: list[str], count: int | None = None) -> list[int]:
     try:
         values = [int(argument) for argument in arguments]
     except ValueError:
         raise _Refusal("error") from None
-    _require("out of range", met=len(values) == count)
+    _require("out of range", met=count in (None, len(values)))
     return values
 
 

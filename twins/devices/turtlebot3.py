@@ -7,8 +7,6 @@ for cmd_vel. `watchdog_s` in the robot's settings adds such a limit.
 
 from __future__ import annotations
 
-import socket
-from collections.abc import Sequence
 from dataclasses import dataclass
 from math import cos, inf, isfinite, nan, pi, sin
 from typing import Final
@@ -24,9 +22,8 @@ from agents.protocols.ros2 import Message
 from agents.protocols.ros2_node import Participant, Publisher, Subscriber
 from agents.protocols.turtlebot3 import TurtleBot3Settings, TurtleBotAddress
 from agents.vectors import clamp
-from twins.arrays import Array
 from twins.body import instants
-from twins.devices.device import DeviceRequest, FaultyLink
+from twins.devices.device import Device, DeviceRequest, FaultyLink
 from twins.models.differential import Differential
 from twins.models.disturbance import MeasurementNoise, OdometryDrift
 from twins.models.noise import refill
@@ -88,8 +85,8 @@ class _TurtleBot:
         return ahead, left, yaw - yaw0, speed, turned * turtlebot3.ODOMETRY_HZ
 
 
-class TurtleBot3Twin:
-    """TurtleBot3 robots behind ROS topics: a `Device`; raises BodyError for a wrong setting, or Unreachable."""
+class TurtleBot3Twin(Device):
+    """TurtleBot3 robots behind ROS topics; raises BodyError for a wrong setting, or Unreachable."""
 
     def __init__(self, request: DeviceRequest) -> None:
         body = request.body
@@ -120,6 +117,7 @@ class TurtleBot3Twin:
             self.close()
             raise
         self.addresses = tuple(addresses)
+        self.models = [robot.model for robot in self.robots]
 
     def _participant(self, endpoints: tuple[str, ...], where: TurtleBotAddress) -> Participant:
         if endpoints not in self._sessions:
@@ -132,13 +130,6 @@ class TurtleBot3Twin:
             domain=where.domain,
             announces=True,  # with ros2dds the twin includes the bridge on the robot
         )
-
-    def sockets(self) -> Sequence[socket.socket]:
-        """None: Zenoh is polled in `advance`."""
-        return ()
-
-    def serve(self, ready: socket.socket, t: float) -> None:
-        """Never called."""
 
     def advance(self, t: float) -> None:
         steps = instants(self._t, t, self._dt)
@@ -161,17 +152,12 @@ class TurtleBot3Twin:
             if not silent:
                 publisher.send(payload)
 
-    def truth(self) -> tuple[Array, Array]:
-        models = [robot.model for robot in self.robots]
-        return np.array([model.position for model in models]), np.array([model.yaw for model in models])
-
     @property
     def commands_received(self) -> list[int]:
         """Executed commands of each robot."""
         return [robot.executed for robot in self.robots]
 
     def close(self) -> None:
-        """Leaves the network."""
         for session in self._sessions.values():
             session.close()
         self._sessions.clear()

@@ -29,7 +29,7 @@ from agents.runtime.command_line import NetworkLaunch, on_termination
 from agents.runtime.lifeline import Lifeline
 from agents.ticks import Ticks
 from twins.arrays import Array
-from twins.devices.device import CaptureFault, Faults, FaultyLink, serve_until_next
+from twins.devices.device import CaptureFault, Faults, FaultyLink, Server, serve_until_next
 
 BACKLOG: Final = 1 << 18  # [bytes] largest queue of a client; a slower client misses frames
 VALID_BOX: Final = (1e3, 1e3, 1e3)  # [m] bounds of valid positions: any room
@@ -53,7 +53,7 @@ class _Client:
     named: bool = False  # names of the subjects were sent
 
 
-class ViconTwin:
+class ViconTwin(Server):
     """DataStream server for subjects with poses set by `place`.
 
     Attributes:

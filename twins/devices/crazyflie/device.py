@@ -18,7 +18,7 @@ from twins.arrays import Array
 from twins.devices.crazyflie.drone import Drone
 from twins.devices.crazyflie.flock import Flock
 from twins.devices.crazyflie.radio import HOST, Air, RadioLink
-from twins.devices.device import DeviceRequest, FaultyLink
+from twins.devices.device import Device, DeviceRequest, FaultyLink
 
 SCANNED_PORTS: Final = range(19850, 19860)  # at which cflib looks for simulations
 MAX_PACKET_BYTES: Final = 64  # [bytes]
@@ -89,8 +89,8 @@ def _bind(wire: socket.socket, ports: Sequence[int]) -> None:
             return
 
 
-class CrazyflieTwin:
-    """Crazyflies with CRTP over UDP or over a software radio; implements `twins.devices.device.Device`.
+class CrazyflieTwin(Device):
+    """Crazyflies with CRTP over UDP or over a software radio.
 
     Raises BodyError if a row is no Crazyflie, or has invalid settings.
     """
