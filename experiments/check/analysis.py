@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -11,10 +10,7 @@ from typing import Final, cast
 import msgspec
 import numpy as np
 
-from agents.body.kinds import Kind
 from agents.body.limits import Limits
-from agents.decision.position_control import REACHED
-from agents.plugins.law import Law
 from agents.plugins.laws import Gradient
 from agents.plugins.planners import Planner
 from experiments.check.findings import FORGIVEN
@@ -31,14 +27,7 @@ from experiments.check.realisation import (
 )
 from experiments.check.stability import Modes, modes
 from experiments.definition.experiment import LinkTable
-from experiments.definition.formation import (
-    Anchored,
-    Pattern,
-    anchor_errors,
-    anchor_offsets,
-    errors_over_time,
-    law_offsets,
-)
+from experiments.definition.formation import anchor_errors, errors_over_time
 from experiments.definition.graph import Links, components, edges
 from experiments.definition.links import held_height, link_pairs
 from experiments.definition.plan import Plan
@@ -46,44 +35,19 @@ from experiments.definition.rigidity import Redundancy, Rigidity
 from experiments.file.problems import Path
 from experiments.metrics.signals import WINDOW_S, after_last, moving_mean
 from twins.arrays import Array, Index, Mask, norm
-from twins.scene import Scene
 
-MANY_ROBOTS: Final = (
-    500  # robots of which it is not asked any more what can be lost: the time grows with their third power
-)
+MOST_ROBOTS: Final = 500  # of which it is asked what can be lost: the time grows with their third power
 FITTING: Final = 1e-4  # [m] between a target and that of the best shape
-STANDS: Final = 0.001  # [m] moved by less in `WINDOW_S`
+FAR_OFF: Final = 0.01  # [m] a shape that misses a distance by more is another shape
 GUESSES: Final = 400  # random places of robots from which a shape is sought: each costs time with their number
 
 
 @dataclass(frozen=True)
 class Analysis:
-    """Figures of one case."""
+    """Figures of one case; each is computed at its first use."""
 
     plan: Plan  # the case, compiled
-    without_neighbours: Index  # rows without neighbours
-    start: Array  # (N, 3) on the floor [m]
-    parts: int  # of the network
-    asked: Links  # the links of the beginning, with what the law takes them to ask for
-    standing: Mask  # (E,) those that are there at the beginning, however far the robots are from each other
-    # places that were tried for the last stage of the formation, the best of which is to be its end
-    shapes: tuple[Shape, ...]
-    shape: Shape | None  # the best for the beginning; None if no link stands then
-    later: tuple[Shape, ...]  # the best after each change
-    planar: Rigidity | None  # rigidity with heights held
-    spatial: Rigidity | None  # rigidity in full space
-    # what the formation can lose and stay rigid, of the pairs `edges(...)` of the links that stand at the beginning;
-    # None if it is not rigid, if its links ask for more than distances, or if it has too many robots
-    spare: Redundancy | None
-    modes: Modes | None  # of the sampled loop at the shape
     prediction: Prediction  # the motion
-    error: Array  # (T, E) of each link along it [m]; 0 while it is not there
-    anchored: Array  # (T, A) of each anchor along it [m]
-    scene: Scene  # what stands in the arena
-
-    @property
-    def pattern(self) -> Pattern:
-        return self.plan.formation
 
     @property
     def law(self) -> Gradient:
@@ -95,58 +59,186 @@ class Analysis:
         """Whether the law pulls toward targets of its links; else there is neither shape nor error."""
         return isinstance(self.plan.law, Gradient)
 
-    @property
-    def links(self) -> Links:
-        """Every link of the law that there may be, with the targets of the beginning."""
-        return self.plan.links
+    @cached_property
+    def without_neighbours(self) -> Index:
+        """Rows with neither incoming links nor an anchor."""
+        held = [row for row, _ in self.plan.anchors_by_row]
+        return np.setdiff1d(np.arange(len(self.plan.names)), [*self.plan.links.receiver.tolist(), *held])
 
-    @property
-    def anchors(self) -> Anchored:
-        return self.plan.anchors_by_row
+    @cached_property
+    def parts(self) -> int:
+        """Parts of the network."""
+        return components(self.plan.links, len(self.plan.names))
 
-    @property
-    def kinds(self) -> tuple[Kind, ...]:
-        return self.plan.kinds
+    @cached_property
+    def start(self) -> Array:
+        """(N, 3) on the floor [m]."""
+        return np.array(self.plan.start_poses()[0])
 
-    @property
+    @cached_property
     def height(self) -> Array:
         """(N,) that each robot holds [m]: 0 on wheels."""
-        return np.array([held_height(self.plan.experiment, name) for name in self.names])
+        return np.array([held_height(self.plan.experiment, name) for name in self.plan.names])
 
-    @property
+    @cached_property
     def limits(self) -> Limits:
         """Limits of every robot, except `hold_s`."""
-        return self.plan.limits(self.names[0])
+        return self.plan.limits(self.plan.names[0])
+
+    # ------------------------------------------------------------------ the formation
+
+    @cached_property
+    def asked(self) -> Links:
+        """Every possible link, with what the law takes it to ask for at the beginning."""
+        return targets_of_law(self.plan.law, self.plan.links)
+
+    @cached_property
+    def standing(self) -> Mask:
+        """(E,) links that exist at the beginning, however far the robots are from each other."""
+        return self.plan.formation.planned_at(0.0)
+
+    @cached_property
+    def first_links(self) -> Links:
+        """The standing ones of the asked links."""
+        return self.asked.take(self.standing)
+
+    @cached_property
+    def stages(self) -> list[list[Shape]]:
+        """Shapes that were tried for the beginning, and for the time after each change.
+
+        Empty of a law that is no gradient, or without links and anchors.
+        """
+        plan, pattern = self.plan, self.plan.formation
+        if not self.is_gradient or not (self.standing.any() or plan.anchors_by_row):
+            return []
+        times = (0.0, *(each.at + each.over for each in pattern.changes))
+        return [
+            self._shapes(targets_of_law(plan.law, wanted), pattern.planned_at(at))
+            for at, wanted in zip(times, pattern.stages(), strict=True)
+        ]
+
+    @cached_property
+    def shape(self) -> Shape | None:
+        """The best for the beginning."""
+        return best_shape(self.stages[0]) if self.stages else None
 
     @property
-    def names(self) -> tuple[str, ...]:
-        return self.plan.names
+    def met_shape(self) -> Shape | None:
+        """The shape, if it misses no target by more than `FAR_OFF`."""
+        return None if self.shape is None or self.shape.worst > FAR_OFF else self.shape
+
+    @cached_property
+    def rigidity(self) -> tuple[Rigidity | None, Rigidity | None]:
+        """With heights held, and in full space; None without a shape, in space with other targets than distances."""
+        if self.shape is None:
+            return None, None
+        anchors = self.plan.anchors_by_row
+        return formation_rigidity(self.shape.position, self.first_links, self.without_neighbours, anchors)
+
+    @cached_property
+    def spare(self) -> Redundancy | None:
+        """What the formation can lose and stay rigid, of the pairs `edges(first_links)`.
+
+        None if it is not rigid, if its links ask for more than distances, or if it has too many robots.
+        """
+        planar, spatial = self.rigidity
+        if self.shape is None or planar is None or spatial is None:
+            return None
+        if not planar.rigid or len(self.plan.names) > MOST_ROBOTS:
+            return None
+        return formation_redundancy(self.shape.position, self.first_links, self.without_neighbours)
 
     @property
+    def vital_links(self) -> tuple[str, ...]:
+        """Pairs without which the formation is not rigid any more."""
+        names = self.plan.names
+        pairs = [] if self.spare is None else edges(self.first_links)[~self.spare.pairs].tolist()
+        return tuple(f"{names[first]} - {names[second]}" for first, second in pairs)
+
+    @property
+    def vital_robots(self) -> tuple[str, ...]:
+        """Robots without which the formation is not rigid any more."""
+        return () if self.spare is None else tuple(self.plan.names[row] for row in np.flatnonzero(~self.spare.robots))
+
+    @cached_property
+    def modes(self) -> Modes | None:
+        """Modes of the sampled loop at the shape."""
+        if self.shape is None:
+            return None
+        kinds, hz = self.plan.kinds, self.plan.experiment.rates.coordination_hz
+        return modes(
+            self.law, self.first_links, self.shape.position, closed_shares(kinds, hz), hz,
+            bearable=bearable_factors(kinds, hz), anchors=self.plan.anchors_by_row,
+            within_s=self.plan.experiment.duration_s,
+        )  # fmt: skip
+
+    def _shapes(self, wanted: Links, there: Mask) -> list[Shape]:
+        """Shapes from the ends, the starts, the scaled distances and random places as guesses, until one is exact."""
+        experiment, silent, end = self.plan.experiment, self.without_neighbours, self.prediction.position[-1].copy()
+        rows, links = len(end), wanted.take(there)
+        aloft = np.column_stack([self.start[:, :2], self.height])
+        moves = np.ones(rows, dtype=bool)
+        moves[silent] = False
+        landed = moves & (end[:, 2] < aloft[:, 2] / 2)  # before the end: on the floor it has no place in the shape
+        end[landed, 2] = aloft[landed, 2]
+        rng = np.random.default_rng(experiment.seed)
+
+        def places() -> Iterator[Array]:
+            yield end
+            plane = unfold_distances(links, aloft[:, 2])
+            anchor = silent[:1] if len(silent) else np.arange(rows)
+            for mirror in (1.0, -1.0):
+                flipped = plane * [1.0, mirror, 1.0]
+                flipped[:, :2] += (end[anchor] - flipped[anchor]).mean(axis=0)[:2]
+                yield flipped
+            yield aloft
+            for _ in range(min(10, GUESSES // rows)):
+                place = rng.uniform(-0.5, 0.5, (rows, 2)) * experiment.arena.size[:2]
+                yield np.column_stack([place, aloft[:, 2]])
+
+        guesses = (np.where(moves[:, None], each, end) for each in places())  # leaders are where their plans leave them
+        found, solids = [], Solids.of(self.plan.kinds, links, moves)
+        for each in find_shapes(links, guesses, moves, self.plan.anchors_by_row, solids=solids):
+            error = np.zeros(len(there))
+            error[there] = each.error
+            found.append(replace(each, error=error))
+        return found
+
+    # ------------------------------------------------------------------ the motion
+
+    @cached_property
+    def error(self) -> Array:
+        """(T, E) of each link along the motion [m]; 0 while it is not there."""
+        plan, motion = self.plan, self.prediction
+        return np.nan_to_num(errors_over_time(plan.law, plan.formation, motion.time, motion.position))
+
+    @cached_property
+    def mean_error(self) -> Array:
+        """(T, E) of each link over the last `WINDOW_S` [m]."""
+        return moving_mean(self.error, max(1, round(WINDOW_S * self.plan.experiment.rates.coordination_hz)))
+
+    @cached_property
+    def anchored(self) -> Array:
+        """(T, A) of each anchor along the motion [m]."""
+        return anchor_errors(self.plan.anchors_by_row, self.prediction.position)
+
+    @cached_property
     def speed(self) -> Array:
         """(N,) that each robot may drive or fly at [m/s]."""
-        own = np.array([kind.speed for kind in self.kinds])
-        return np.asarray(np.minimum(own, self.limits.top_speed))
+        return np.minimum([kind.speed for kind in self.plan.kinds], self.limits.top_speed)
 
-    @property
+    @cached_property
     def pull(self) -> Array:
         """(N,) the speed at which each robot follows its law [m/s]: a velocity, or a goal that is a full clamp away."""
-        hz = self.plan.experiment.rates.coordination_hz
-        clamped = np.minimum(self.speed, closed_shares(self.kinds, hz) * self.plan.experiment.formation.clamp * hz)
+        experiment, hz = self.plan.experiment, self.plan.experiment.rates.coordination_hz
+        clamped = np.minimum(self.speed, closed_shares(self.plan.kinds, hz) * experiment.formation.clamp * hz)
         return np.where(self.prediction.velocities or False, self.speed, clamped)
 
-    @property
+    @cached_property
     def legs(self) -> list[tuple[int, str, Planner]]:
         """Number in the timeline, robot and planner of each leg."""
         built = {name: iter(legs) for name, legs in self.plan.legs_by_robot.items()}
         return [(k, leg.robot, next(built[leg.robot]).planner) for k, leg in enumerate(self.plan.experiment.timeline)]
-
-    @property
-    def departure(self) -> float:
-        """Time of the first moving leg or the first change of shape after the start [s]; infinity without either."""
-        timeline = self.plan.experiment.timeline
-        leaves = [timeline[k].at_s for k, _, plan in self.legs if plan.speed() > 0]
-        return min((at for at in (*leaves, *(each.at for each in self.pattern.changes)) if at > 0), default=math.inf)
 
     @property
     def fastest(self) -> tuple[int, str, Planner] | None:
@@ -156,36 +248,28 @@ class Analysis:
     @property
     def follower(self) -> int | None:
         """The slowest row that follows the formation and no plan."""
-        planned = [self.names.index(robot) for _, robot, _ in self.legs]
-        rows = np.setdiff1d(self.links.receiver, np.array(planned, dtype=np.intp))
+        planned = [self.plan.names.index(robot) for _, robot, _ in self.legs]
+        rows = np.setdiff1d(self.plan.links.receiver, planned)
         return int(rows[self.pull[rows].argmin()]) if len(rows) else None
 
     @property
-    def mean_error(self) -> Array:
-        """(T, E) of each link over the last `WINDOW_S` [m]."""
-        window = max(1, round(WINDOW_S * self.plan.experiment.rates.coordination_hz))
-        return moving_mean(self.error, window)
+    def departure(self) -> float:
+        """Time of the first moving leg or the first change of shape after the start [s]; without either the end."""
+        timeline = self.plan.experiment.timeline
+        leaves = [timeline[k].at_s for k, _, plan in self.legs if plan.speed() > 0]
+        leaves += [each.at for each in self.plan.formation.changes]
+        return min([*(at for at in leaves if at > 0), self.prediction.end_s])
 
     @property
     def spans_end(self) -> tuple[float, ...]:
         """Times until which the formation is to be acquired: before any plan begins, and at the end [s]."""
-        end = float(self.prediction.time[-1])
-        return tuple(dict.fromkeys((min(self.departure, end), end)))
-
-    def flown(self, prediction: Prediction) -> Analysis:
-        """The same with another motion."""
-        return replace(
-            self,
-            prediction=prediction,
-            error=link_errors(self.plan.law, self.pattern, prediction),
-            anchored=anchor_errors(self.anchors, prediction.position),
-        )
+        return tuple(dict.fromkeys((self.departure, self.prediction.end_s)))
 
     @cached_property
     def noisy(self) -> Analysis | None:
         """The same with the motion of the flight with noise beside the ideal one, if there was one."""
         beside = self.prediction.noisy
-        return None if beside is None or beside.stuck else self.flown(beside)
+        return None if beside is None or beside.stuck else Analysis(self.plan, beside)
 
     @cached_property
     def acquired_for_good(self) -> float | None:
@@ -201,35 +285,18 @@ class Analysis:
         worst = self.mean_error[time <= until + 1e-9].max(axis=1, initial=0.0)[:, None]
         return after_last(worst > self.plan.experiment.tolerance + FORGIVEN, time)[0] if len(worst) else None
 
-    def stopped(self, at: int) -> Index:
-        """Robots on wheels that stand at sample `at`, because their goals are too near to drive to."""
-        at %= len(self.prediction.time)
-        time, position, pattern = self.prediction.time, self.prediction.position, self.pattern
-        links, hz = pattern.at(float(time[at])), self.plan.experiment.rates.coordination_hz
-        there, here = pattern.present(time[at : at + 1], position[at : at + 1]), position[at]
-        links = links if there is None else links.take(there[0])
-        offset = law_offsets(self.law, here, here[links.sender], links) + anchor_offsets(self.anchors, here)
-        stands = norm(position[at] - position[max(0, at - round(WINDOW_S * hz))]) < STANDS
-        wheels = np.array([not kind.flies for kind in self.kinds])
-        length = norm(offset[:, :2])
-        return np.flatnonzero(wheels & stands & (length > 0.1 * REACHED) & (length < 2.0 * REACHED))
+    # ------------------------------------------------------------------ links in words
 
-    def link(self, number: int) -> str:
-        links = self.links
-        return f"{self.names[links.sender[number]]} - {self.names[links.receiver[number]]}"
-
-    def pair(self, number: int) -> str:
-        """A pair of `edges(...)` of the links that stand at the beginning, in words."""
-        first, second = edges(self.asked.take(self.standing))[number]
-        return f"{self.names[first]} - {self.names[second]}"
+    def link(self, number: int | np.intp) -> str:
+        names, links = self.plan.names, self.plan.links
+        return f"{names[links.sender[number]]} - {names[links.receiver[number]]}"
 
     def link_path(self, number: int) -> Path:
-        wanted = self.links.receiver[number], self.links.sender[number]
-        ends = tuple(self.names[row] for row in wanted)
-        return next(
-            (("formation", "links", text) for text in self.plan.experiment.formation.links if ends in link_pairs(text)),
-            ("formation", "links"),
-        )
+        links, names = self.plan.links, self.plan.names
+        ends = names[links.receiver[number]], names[links.sender[number]]
+        given = self.plan.experiment.formation.links
+        text = next((text for text in given if ends in link_pairs(text)), None)
+        return ("formation", "links") if text is None else ("formation", "links", text)
 
     def fitting_links(self) -> dict[str, LinkTable]:
         """The links of the file with the nearest targets that fit together: those of the best shape, rounded to 0.1 mm.
@@ -238,7 +305,7 @@ class Analysis:
         """
         if self.shape is None:
             return {}
-        place = dict(zip(self.names, np.round(self.shape.position, 5), strict=True))
+        place = dict(zip(self.plan.names, np.round(self.shape.position, 5), strict=True))
         return {
             text: _fitting(
                 given if isinstance(given, LinkTable) else LinkTable(distance=given), *link_pairs(text)[0], place
@@ -260,99 +327,3 @@ def _fitting(given: LinkTable, second: str, first: str, place: Mapping[str, Arra
             return given
         return msgspec.structs.replace(given, offset=np.round(offset[:count], 4).tolist())
     return msgspec.structs.replace(given, bearing=np.round(offset[:count] / norm(offset[:count]), 4).tolist())
-
-
-def analyse(plan: Plan, prediction: Prediction) -> Analysis:
-    """Analysis of one case with this predicted motion."""
-    experiment, names = plan.experiment, plan.names
-    law, kinds, pattern, anchors = plan.law, plan.kinds, plan.formation, plan.anchors_by_row
-    links, rows, hz = pattern.links, len(names), experiment.rates.coordination_hz
-    starts, _ = plan.start_poses()
-    start = np.array(starts)
-    aloft = start.copy()
-    aloft[:, 2] = [held_height(experiment, name) for name in names]
-    anchored = np.array([row for row, _ in anchors], dtype=np.intp)
-    silent = np.setdiff1d(np.arange(rows), np.concatenate([links.receiver, anchored]))
-    standing = pattern.planned_at(0.0)
-    stages: list[list[Shape]] = []
-    shape, planar, spatial, spare, loop = None, None, None, None, None
-    asked = targets_of_law(law, links)
-    if isinstance(law, Gradient) and (standing.any() or len(anchored)):
-        for at, wanted in zip((0.0, *(each.at + each.over for each in pattern.changes)), pattern.stages(), strict=True):
-            there = pattern.planned_at(at)
-            stage = _shapes(plan, targets_of_law(law, wanted), there, prediction, aloft, silent)
-            stages.append(stage)
-        shape = best_shape(stages[0])
-        here = asked.take(standing)
-        planar, spatial = formation_rigidity(shape.position, here, silent, anchors)
-        if planar.rigid and spatial is not None and rows <= MANY_ROBOTS:
-            spare = formation_redundancy(shape.position, here, silent)
-        share = closed_shares(kinds, hz)
-        within = experiment.duration_s
-        bearable = bearable_factors(kinds, hz)
-        loop = modes(
-            law, here, shape.position, share, hz,
-            bearable=bearable, anchors=anchors, within_s=within,
-        )  # fmt: skip
-    return Analysis(
-        plan=plan,
-        without_neighbours=silent,
-        start=start,
-        parts=components(links, rows),
-        asked=asked,
-        standing=standing,
-        shapes=tuple(stages[-1]) if stages else (),
-        shape=shape,
-        later=tuple(best_shape(each) for each in stages[1:]),
-        planar=planar,
-        spatial=spatial,
-        spare=spare,
-        modes=loop,
-        prediction=prediction,
-        error=link_errors(law, pattern, prediction),
-        anchored=anchor_errors(anchors, prediction.position),
-        scene=plan.scene,
-    )
-
-
-def link_errors(law: Law, pattern: Pattern, prediction: Prediction) -> Array:
-    """Error of each link (T, E) along the motion [m]; 0 while it is not there."""
-    return np.nan_to_num(errors_over_time(law, pattern, prediction.time, prediction.position))
-
-
-def _shapes(  # noqa: PLR0917 - one caller
-    plan: Plan, wanted: Links, there: Mask, prediction: Prediction, aloft: Array, silent: Index
-) -> list[Shape]:
-    """Shapes from the ends, the starts, the scaled distances and random places as guesses, until one is exact."""
-    experiment, end = plan.experiment, prediction.position[-1].copy()
-    rows, links = len(aloft), wanted.take(there)
-    moves = np.ones(rows, dtype=bool)
-    moves[silent] = False
-    landed = moves & (end[:, 2] < aloft[:, 2] / 2)  # before the end: on the floor it has no place in the shape
-    end[landed, 2] = aloft[landed, 2]
-    rng = np.random.default_rng(experiment.seed)
-
-    def guesses() -> Iterator[Array]:
-        yield end
-        plane = unfold_distances(links, aloft[:, 2])
-        anchor = silent[:1] if len(silent) else np.arange(rows)
-        for mirror in (1.0, -1.0):
-            flipped = plane * [1.0, mirror, 1.0]
-            flipped[:, :2] += (end[anchor] - flipped[anchor]).mean(axis=0)[:2]
-            yield _resting_place(flipped, end, moves)
-        yield _resting_place(aloft, end, moves)
-        for _ in range(min(10, GUESSES // rows)):
-            place = rng.uniform(-0.5, 0.5, (rows, 2)) * experiment.arena.size[:2]
-            yield _resting_place(np.column_stack([place, aloft[:, 2]]), end, moves)
-
-    found, solids = [], Solids.of(plan.kinds, links, moves)
-    for each in find_shapes(links, guesses(), moves, plan.anchors_by_row, solids=solids):
-        error = np.zeros(len(there))
-        error[there] = each.error
-        found.append(replace(each, error=error))
-    return found
-
-
-def _resting_place(guess: Array, end: Array, moves: Mask) -> Array:
-    """The guess, with leaders where their plans leave them."""
-    return np.where(moves[:, None], guess, end)

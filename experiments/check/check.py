@@ -1,8 +1,4 @@
-"""`./zenpark check`: findings on an experiment before anything moves.
-
-`experiments.file.document` reads the file; here each case is compared with theory (`theory`) and with an ideal run
-(`motion`).
-"""
+"""`./zenpark check`: findings on an experiment before anything moves, by theory and an ideal run."""
 
 from __future__ import annotations
 
@@ -15,7 +11,7 @@ import numpy as np
 from agents.plugins.files import plain
 from experiments.check import motion, noise, safety, theory
 from experiments.check import obstacles as surroundings
-from experiments.check.analysis import Analysis, analyse
+from experiments.check.analysis import Analysis
 from experiments.check.findings import FORGIVEN, MARK, NOT_RANDOM, CheckNumbers, Finding, first_of_each_code
 from experiments.check.ideal_run import predict, ticking_plugins
 from experiments.check.realisation import algebraic_connectivity
@@ -46,38 +42,18 @@ def compilation(analysis: Analysis) -> Iterator[Finding]:
                 yield Finding("note", "uncompiled", f"laws that remember are not compiled: {cost}")
             continue
         for text in outside(plugin)[:1]:
-            yield Finding(
-                "note", "uncompiled", f"{plain(text)}, which is not compiled: {cost} (docs/plugins.md, the subset)"
-            )
+            message = f"{plain(text)}, which is not compiled: {cost} (docs/plugins.md, the subset)"
+            yield Finding("note", "uncompiled", message)
 
 
 SUBJECTS: Final = (
-    *(
-        theory.network,
-        theory.presence,
-        theory.lengths,
-        theory.realisation,
-        theory.offsets,
-        theory.rigidity,
-        theory.redundancy,
-        theory.stability,
-        theory.law,
-    ),
-    *(surroundings.contacts, surroundings.obstacles, surroundings.perception, surroundings.reality),
-    *(motion.flight, motion.starts, motion.formation, motion.anchors, noise.softness, motion.walls, motion.ceiling),
-    *(motion.encounters, motion.speeds, motion.turning_circle, motion.rates, motion.ends),
-    safety.architecture,
-    safety.safety,
-    safety.batteries,
-    safety.libraries,
-    safety.devices,
-    *(chance, compilation),
-)
-
-
-OF_SHAPES: Final = (  # a law that is no gradient has no shape to which it pulls
-    theory.lengths, theory.realisation, theory.rigidity, theory.redundancy, theory.stability,
-    motion.formation, motion.anchors, noise.softness,
+    theory.network, theory.presence, theory.lengths, theory.realisation, theory.offsets, theory.rigidity,
+    theory.redundancy, theory.stability, theory.law,
+    surroundings.contacts, surroundings.obstacles, surroundings.perception, surroundings.reality,
+    motion.flight, motion.starts, motion.formation, motion.anchors, noise.softness, motion.walls, motion.ceiling,
+    motion.encounters, motion.speeds, motion.turning_circle, motion.rates, motion.ends,
+    safety.architecture, safety.safety, safety.batteries, safety.libraries, safety.devices,
+    chance, compilation,
 )  # fmt: skip
 
 
@@ -87,21 +63,22 @@ def check(given: Document, cases: Sequence[str] = ()) -> list[Finding]:
     Raises:
         DocumentError: If the experiment has no case of that name.
     """
-    return _findings(given, _analyses(chosen(given, cases)))
+    return _findings(given, analyses(chosen(given, cases)))
 
 
-def analyses(given: Document) -> dict[str, Analysis]:
+@QUIET
+def analyses(cases: Mapping[str, Plan]) -> dict[str, Analysis]:
     """Analysis of each case, by its name."""
-    return _analyses(given.cases())
+    bare = {name: standby.without_standby(case) for name, case in cases.items()}
+    return {name: Analysis(case, predict(case)) for name, case in bare.items()}
 
 
 def examine(
-    given: Document, analyses: Mapping[str, Analysis] | None = None
+    given: Document, analysed: Mapping[str, Analysis] | None = None
 ) -> tuple[list[Finding], dict[str, CheckNumbers]]:
     """Findings of all cases, as `check`, and the figures of each case by its name."""
-    analyses = _analyses(given.cases()) if analyses is None else analyses
-    figures_of = {name: _figures(analysis) for name, analysis in analyses.items()}
-    return _findings(given, analyses), figures_of
+    analysed = analysed or analyses(given.cases())
+    return _findings(given, analysed), {name: _figures(analysis) for name, analysis in analysed.items()}
 
 
 def unreadable(problem: Problem) -> Finding:
@@ -109,13 +86,7 @@ def unreadable(problem: Problem) -> Finding:
 
 
 def figures(plan: Plan) -> CheckNumbers:
-    return _figures(_analyses({"": plan})[""])
-
-
-@QUIET
-def _analyses(cases: Mapping[str, Plan]) -> dict[str, Analysis]:
-    cases = {name: standby.without_standby(case) for name, case in cases.items()}
-    return {name: analyse(case, predict(case)) for name, case in cases.items()}
+    return _figures(analyses({"": plan})[""])
 
 
 @QUIET
@@ -124,20 +95,17 @@ def _findings(given: Document, analyses: Mapping[str, Analysis]) -> list[Finding
     holders: dict[Finding, list[str]] = {}
     for name, analysis in analyses.items():
         for subject in SUBJECTS:
-            if subject in OF_SHAPES and not analysis.is_gradient:
-                continue
             for finding in first_of_each_code(subject(analysis)):
                 holders.setdefault(finding, []).append(name)
     for finding in theory.unused_gains([*given.cases().values()]):
         holders[finding] = [*analyses]
-    source = given.source
     found = []
     for finding, names in holders.items():
         message = finding.message
         if len(names) < len(analyses):
             words = ", ".join(f"'{name}'" for name in names)
             message = f"in case{'s' * (len(names) > 1)} {words}: {message}"
-        where = finding.where if isinstance(finding.where, str) else _place(source, finding.where, names)
+        where = finding.where if isinstance(finding.where, str) else _place(given.source, finding.where, names)
         found.append(replace(finding, message=message, where=where))
     return sorted(found, key=lambda each: list(MARK).index(each.severity))
 
@@ -156,25 +124,20 @@ def _finite(value: float) -> float | None:
 
 @QUIET
 def _figures(analysis: Analysis) -> CheckNumbers:
-    experiment = analysis.plan.experiment
-    shape, planar, spatial, loop = analysis.shape, analysis.planar, analysis.spatial, analysis.modes
-    spare = analysis.spare
-    links, prediction, limits = analysis.links, analysis.prediction, analysis.limits
-    end, fastest, follower = prediction.position[-1], analysis.fastest, analysis.follower
-    last = float(prediction.time[-1])
+    plan, links, limits, prediction = analysis.plan, analysis.plan.links, analysis.limits, analysis.prediction
+    arena, end, fastest, follower = plan.experiment.arena, prediction.position[-1], analysis.fastest, analysis.follower
+    shape, (planar, spatial), spare, loop = analysis.shape, analysis.rigidity, analysis.spare, analysis.modes
     flown = not prediction.stuck  # else the robots stand at their starts, which says nothing of a run
     payload, words, load = theory.load(analysis)
     return CheckNumbers(
-        robots=len(analysis.names),
-        arena=experiment.arena.size,
-        obstacles={
-            name: surroundings.describe_obstacle(obstacle) for name, obstacle in experiment.arena.obstacles.items()
-        },
+        robots=len(plan.names),
+        arena=arena.size,
+        obstacles={name: surroundings.describe_obstacle(obstacle) for name, obstacle in arena.obstacles.items()},
         links=len(links),
         edges=len(edges(links)),
         parts=analysis.parts,
-        leaders=analysis.plan.leaders,
-        algebraic_connectivity=algebraic_connectivity(links, len(analysis.names)),
+        leaders=plan.leaders,
+        algebraic_connectivity=algebraic_connectivity(links, len(plan.names)),
         rank=planar.rank if planar else None,
         rank_needed=planar.needed if planar else None,
         rank_space=spatial.rank if spatial else None,
@@ -182,23 +145,23 @@ def _figures(analysis: Analysis) -> CheckNumbers:
         smallest_singular=planar.smallest if planar else None,
         smallest_eigenvalue=planar.smallest**2 if planar else None,
         spare_links=int(spare.pairs.sum()) if spare else None,
-        vital_links=tuple(analysis.pair(int(k)) for k in np.flatnonzero(~spare.pairs)) if spare else (),
+        vital_links=analysis.vital_links,
         spare_robots=int(spare.robots.sum()) if spare else None,
-        vital_robots=tuple(analysis.names[row] for row in np.flatnonzero(~spare.robots)) if spare else (),
+        vital_robots=analysis.vital_robots,
         residual_mm=_finite(1e3 * shape.worst) if shape else None,
         loop_gain=_finite(loop.gain) if loop else None,
         slowest_mode_s=_finite(loop.slowest_s) if loop else None,
         free_modes=loop.free if loop else 0,
         speed_needed=_finite(fastest[2].speed()) if fastest else None,
         speed_available=None if follower is None else float(analysis.pull[follower]),
-        acquired_s=analysis.acquired(min(analysis.departure, last)) if shape and flown else None,
-        acquired_noisy_s=analysis.noisy.acquired(min(analysis.departure, last)) if shape and analysis.noisy else None,
+        acquired_s=analysis.acquired(analysis.departure) if shape and flown else None,
+        acquired_noisy_s=analysis.noisy.acquired(analysis.departure) if shape and analysis.noisy else None,
         end_error_mm=_finite(1e3 * float(analysis.error[-1].max())) if shape and len(links) and flown else None,
-        end={name: (float(x), float(y), float(z)) for name, (x, y, z) in zip(analysis.names, end, strict=True)},
+        end={name: (float(x), float(y), float(z)) for name, (x, y, z) in zip(plan.names, end, strict=True)},
         end_inside=bool(((end >= np.array(limits.low) - FORGIVEN) & (end <= np.array(limits.high) + FORGIVEN)).all()),
         messages_hz=prediction.messages_hz,
         pose_bytes=payload,
         words_bytes=words,
         pose_kbit_s=load,
-        predicted_s=last,
+        predicted_s=prediction.end_s,
     )

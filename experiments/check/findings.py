@@ -16,23 +16,25 @@ SHOWN_FINDINGS: Final = 5  # findings of one sort; the others are counted
 NOT_RANDOM: Final = "not-random"  # code of the warning that no seed changes anything
 FORGIVEN: Final = 1e-6  # of rounding
 DELAYED: Final = 1.2  # times the acquisition without noise, from which on the one with noise is given as well
-
-
 MARK: Final[dict[Severity, str]] = {"error": "✗", "warning": "!", "note": "✓"}
 
 
 @dataclass(frozen=True)
 class Finding:
-    """Finding on an experiment: an error, a warning or a note, with remedy and place."""
+    """Finding on an experiment.
 
-    # of an error, the experiment cannot work; of a warning, it may not do what was meant; a note is good news, or
-    # explains
+    Attributes:
+        severity: Error: it cannot work; warning: it may not do what was meant; note: good news, or a reason.
+        code: One word for programs (docs/check.md).
+        message: What it is, with numbers.
+        remedy: What to change; empty for notes.
+        where: Path in the file; of those that `check` returns file:line:column, or the `--set` at fault; empty for all.
+    """
+
     severity: Severity
-    code: str  # one word for programs
-    message: str  # what it is, with numbers
-    remedy: str = ""  # what to change; empty for notes
-    # path in the file; of those that `check` returns file:line:column, or the `--set` at fault; empty where it concerns
-    # the whole
+    code: str
+    message: str
+    remedy: str = ""
     where: Path | str = ""
 
     def __str__(self) -> str:

@@ -40,14 +40,17 @@ class Prediction:
 
     time: Array  # (T,) [s] after the common start
     position: Array  # (T, N, 3) [m]
+    transmissions: int  # of all robots in the run
+    messages_hz: float  # of all robots, with the noise of the experiment, which makes robots transmit
     incidents: tuple[tuple[int, HazardChange], ...] = ()  # hazards on the way, each with the row of its robot
-    transmissions: int = 1  # of all robots in the run
-    messages_hz: float = (
-        0.0  # transmissions of all robots with the noise of the experiment, which makes robots transmit
-    )
     velocities: tuple[bool, ...] = ()  # (N) robots with a velocity from the last step of their law; empty if stuck
     stuck: str = ""  # reason why the run does not begin; the robots stay at their starts then
     noisy: Prediction | None = None  # the flight beside it with the noise of the experiment and its seed, if there was
+
+    @property
+    def end_s(self) -> float:
+        """Time of the last position [s]."""
+        return float(self.time[-1])
 
 
 def closed_shares(kinds: Sequence[Kind], hz: float) -> Array:
@@ -148,14 +151,13 @@ def ticking_plugins(plan: Plan) -> list[type]:
 def predict(plan: Plan) -> Prediction:
     """Flight without noise from the common start to the end; a flight with noise at its side counts the messages."""
     bare = isolated(plan)
-    seed, duration_s = bare.experiment.seed, bare.experiment.duration_s
-    ideal = fly(bare, seed, quiet=True)
+    ideal = fly(bare, bare.experiment.seed, quiet=True)
     if not has_noise(bare) or bare.trigger.TIMED:
-        return replace(ideal, messages_hz=ideal.transmissions / duration_s)
-    noisy = fly(bare, seed)
+        return ideal
+    noisy = fly(bare, bare.experiment.seed)
     if noisy.stuck and not ideal.stuck:  # only the noise holds the robots back
-        return replace(ideal, messages_hz=ideal.transmissions / duration_s)
-    return replace(ideal, messages_hz=noisy.transmissions / duration_s, noisy=noisy)
+        return ideal
+    return replace(ideal, messages_hz=noisy.messages_hz, noisy=noisy)
 
 
 def repetitions(bare: Plan) -> int:
@@ -166,22 +168,16 @@ def repetitions(bare: Plan) -> int:
 
 def fly(bare: Plan, seed: int, *, quiet: bool = False) -> Prediction:
     """Flight of what `isolated` made with a seed, `quiet`: without noise."""
-    experiment = bare.experiment
     try:
         log = simulation.simulate(bare, seed, quiet=quiet, lean=True, landing=False)
     except conductor.Stuck as stuck:
-        starts, _ = bare.start_poses()
-        position = np.array(starts)
-        position[:, 2] = [robot.hover or 0.0 for robot in experiment.robots.values()]
-        return Prediction(np.zeros(1), position[None], transmissions=0, stuck=str(stuck))
-    run = log.time >= -ROUNDING_S
-    begun = (
-        (row, each)
-        for row, each in log.incidents
-        if each.outcome > Outcome.NONE and 0.0 <= each.time < experiment.duration_s
-    )
-    sent = sent_in_run(log.sent, experiment.duration_s)
-    return Prediction(log.time[run], log.true_position[run], tuple(begun), len(sent), velocities=log.velocities)
+        position = np.array(bare.start_poses()[0])
+        position[:, 2] = [robot.hover or 0.0 for robot in bare.experiment.robots.values()]
+        return Prediction(np.zeros(1), position[None], transmissions=0, messages_hz=0.0, stuck=str(stuck))
+    run, duration_s = log.time >= -ROUNDING_S, bare.experiment.duration_s
+    begun = tuple(each for each in log.incidents if each[1].outcome > Outcome.NONE and 0.0 <= each[1].time < duration_s)
+    sent = len(sent_in_run(log.sent, duration_s))
+    return Prediction(log.time[run], log.true_position[run], sent, sent / duration_s, begun, log.velocities)
 
 
 PASSES_ABOVE: Final = 1e3  # [m] more than the sum of two radii
@@ -192,6 +188,7 @@ class PairApproach(NamedTuple):
 
     first: int
     second: int
+    touch: float  # sum of their radii [m]
     distance: float  # in the plane [m]
     gap: float  # free height between them then, negative where none is above the other [m]
     time: float  # [s]
@@ -214,12 +211,12 @@ def approaches(prediction: Prediction, kinds: Sequence[Kind], clearance: float) 
         between = np.maximum(offset[..., 2] - height[i], -offset[..., 2] - height[j])
         far = norm(offset[..., :2])
         # where bodies pass through each other comes before where one is above the other
-        rank = np.where(between < 0.0, far, np.where(between < clearance, far + PASSES_ABOVE, np.inf))
         touch = radius[i] + radius[j]
-        rank = np.where(far < touch, rank, np.inf)
+        where = [far >= touch, between < 0.0, between < clearance]
+        rank = np.select(where, [np.inf, far, far + PASSES_ABOVE], np.inf)
         at = rank.argmin(axis=0)
         for k in np.flatnonzero(np.isfinite(rank.min(axis=0))):
             when = at[k]
             there = float(far[when, k]), float(between[when, k]), float(prediction.time[when])
-            found.append(PairApproach(i, int(j[k]), *there))
+            found.append(PairApproach(i, int(j[k]), float(touch[k]), *there))
     return found

@@ -10,7 +10,6 @@ import numpy as np
 
 from agents.decision.position_control import REACHED
 from agents.formation.link import BY_DISTANCE, BY_RELATIVE
-from agents.plugins.laws import Gradient
 from agents.plugins.planners import Planner
 from agents.safety.hazards import Cause
 from experiments.check import noise
@@ -18,35 +17,34 @@ from experiments.check.analysis import Analysis
 from experiments.check.findings import FORGIVEN, Finding, join_names
 from experiments.check.ideal_run import approaches
 from experiments.check.realisation import OFF, mirrored_robots
-from experiments.check.theory import FAR_OFF, GAIN, strength
+from experiments.check.theory import strength
+from experiments.definition.formation import anchor_offsets, law_offsets
+from experiments.definition.graph import adjacency
 from experiments.definition.links import gain_key
-from experiments.file.problems import Path
-from twins.arrays import Array, Mask, norm
+from experiments.metrics.signals import WINDOW_S
+from twins.arrays import Array, Index, Mask, norm
 
 CLEARANCE: Final = 0.1  # [m] between one robot's top and another's bottom
 NEARLY: Final = 0.9  # of its speed: the rest is needed to catch up
 LATE: Final = 0.25  # share of a run, at its end, in which a formation must be at rest
 SWINGS: Final = 6.0  # ways of an error there, as multiples of its range, that make it an oscillation
-SETTLED: Final = 1e-3  # [m] travel per decision below which robots are at rest
+SETTLED: Final = 1e-3  # [m] travel per decision below which robots are at rest, and in `WINDOW_S` one on wheels stands
 
 
 def starts(analysis: Analysis) -> Iterator[Finding]:
     """Check that robots start inside the arena and clear of one another; flying ones too start on the floor."""
-    names, limits, start = analysis.names, analysis.limits, analysis.start[:, :2]
+    names, limits, start = analysis.plan.names, analysis.limits, analysis.start[:, :2]
     inside = np.minimum(start - limits.low[:2], np.array(limits.high[:2]) - start).min(axis=1)
     problems = []
     for row in np.flatnonzero(inside < limits.margin - FORGIVEN):
-        message = (
-            f"{names[row]} starts {max(0.0, inside[row]):.2f} m from a wall, inside the margin of {limits.margin:g} m"
-        )
+        wall = f"{max(0.0, inside[row]):.2f} m from a wall"
+        message = f"{names[row]} starts {wall}, inside the margin of {limits.margin:g} m"
         remedy = "start it farther inside, or reduce margin in [safety]"
         problems.append(Finding("warning", "start-margin", message, remedy, ("robots", names[row], "start")))
-    radius = np.array([kind.radius for kind in analysis.kinds])
-    i, j = np.triu_indices(len(names), 1)
-    apart = norm(start[i] - start[j])
-    for k in np.flatnonzero(apart < radius[i] + radius[j] - FORGIVEN):
-        first, second, needed = names[i[k]], names[j[k]], radius[i[k]] + radius[j[k]]
-        message = f"{first} and {second} start {apart[k]:.2f} m apart, but need {needed:.2f} m to stand side by side"
+    for i, j in zip(*np.nonzero(np.triu(_overlap_at_start(analysis))), strict=True):
+        first, second, apart = names[i], names[j], norm(start[i] - start[j])
+        needed = analysis.plan.kinds[i].radius + analysis.plan.kinds[j].radius
+        message = f"{first} and {second} start {apart:.2f} m apart, but need {needed:.2f} m to stand side by side"
         remedy = "all start on the floor, flying ones too: move one of them"
         problems.append(Finding("error", "start-overlap", message, remedy, ("robots", second, "start")))
     yield from problems
@@ -54,21 +52,27 @@ def starts(analysis: Analysis) -> Iterator[Finding]:
         yield Finding("note", "starts", "every robot starts inside the arena, clear of the others")
 
 
+def _overlap_at_start(analysis: Analysis) -> Mask:
+    """(N, N) whether two robots are too near to stand side by side at the start."""
+    start, radius = analysis.start, np.array([kind.radius for kind in analysis.plan.kinds])
+    near: Mask = norm(start[:, None] - start) < radius[:, None] + radius - FORGIVEN
+    return near & ~np.eye(len(start), dtype=bool)
+
+
 def flight(analysis: Analysis) -> Iterator[Finding]:
     """Report disturbances or the stop of the ideal run, and the share of it that was flown."""
-    experiment, prediction = analysis.plan.experiment, analysis.prediction
+    prediction = analysis.prediction
     if prediction.stuck:
         message = f"the run does not begin, even undisturbed: {prediction.stuck}"
         yield Finding("error", "not-begun", message, "see what its robots wait for", ("robots",))
         return
-    end = float(prediction.time[-1])
     if _cut(analysis):
-        message = f"flown for the first {end:g} s of {experiment.duration_s:g} s only"
+        message = f"flown for the first {prediction.end_s:g} s of {analysis.plan.experiment.duration_s:g} s only"
         yield Finding("note", "predicted-in-part", message, "", ("duration_s",))
     for row, each in prediction.incidents:
         if each.cause == Cause.BATTERY:  # a finding of its own, of all robots
             continue
-        name = analysis.names[row]
+        name = analysis.plan.names[row]
         message = f"{name} at {each.time:.1f} s, though nothing disturbs it: {each.text}"
         yield Finding("warning", "hazard", message, "see docs/safety.md for what this means", ("robots", name))
 
@@ -76,7 +80,7 @@ def flight(analysis: Analysis) -> Iterator[Finding]:
 def _cut(analysis: Analysis) -> bool:
     """Whether only the first part of the run was flown."""
     experiment = analysis.plan.experiment
-    return bool(analysis.prediction.time[-1] < experiment.duration_s - 1.0 / experiment.rates.coordination_hz)
+    return analysis.prediction.end_s < experiment.duration_s - 1.0 / experiment.rates.coordination_hz
 
 
 def formation(analysis: Analysis) -> Iterator[Finding]:
@@ -86,24 +90,18 @@ def formation(analysis: Analysis) -> Iterator[Finding]:
 
 
 def _formation(analysis: Analysis) -> Iterator[Finding]:
-    experiment, prediction, shape = analysis.plan.experiment, analysis.prediction, analysis.shape
-    last = analysis.error[-1]
-    if (
-        shape is None
-        or not len(last)
-        or shape.worst > FAR_OFF
-        or prediction.stuck
-        or (_cut(analysis) and last.max() > experiment.tolerance)
-    ):
+    experiment, prediction, last = analysis.plan.experiment, analysis.prediction, analysis.error[-1]
+    undecided = _cut(analysis) and last.max(initial=0.0) > experiment.tolerance
+    if analysis.met_shape is None or prediction.stuck or not len(last) or undecided:
         return
     if (finding := _oscillation(analysis)) is not None:
         yield finding
         return
-    end, worst = float(prediction.time[-1]), int(last.argmax())
+    end, worst = prediction.end_s, int(last.argmax())
     left = f"{analysis.link(worst)} is {1e3 * last[worst]:.0f} mm off after {end:g} s"
     allowed = f"(tolerance {1e3 * experiment.tolerance:g} mm)"
     if last[worst] <= experiment.tolerance:
-        departure = min(analysis.departure, end)
+        departure = analysis.departure
         formed = analysis.acquired(departure)
         if formed is not None:
             yield noise.acquired_note(analysis, formed, left)
@@ -114,10 +112,10 @@ def _formation(analysis: Analysis) -> Iterator[Finding]:
         if (stopped := _stopped(analysis, at, early)) is not None:
             yield stopped
             return
-        changes = any(each.at == departure for each in analysis.pattern.changes)
+        changes = any(each.at == departure for each in analysis.plan.formation.changes)
         what, path = ("shape changes", ("formation", "changes")) if changes else ("plans begin", ("timeline",))
         message = f"the formation is not acquired when the {what} at {departure:g} s: {early}"
-        remedy = f"begin later, start nearer to the shape, or raise {strength(analysis)}"
+        remedy = f"begin later, start nearer to the shape, or raise {strength(analysis)[0]}"
         yield Finding("warning", "acquired-late", message, remedy, path)
     elif not prediction.transmissions and experiment.architecture == "distributed":
         moved = float(norm(prediction.position - prediction.position[0]).max())
@@ -129,27 +127,24 @@ def _formation(analysis: Analysis) -> Iterator[Finding]:
         yield Finding("error", "silent", message, remedy, ("trigger",))
     elif (stopped := _stopped(analysis, -1, f"{left} {allowed}")) is not None:
         yield stopped
-    elif analysis.shapes[0].worst > OFF:
+    elif analysis.stages[-1][0].worst > OFF:
         message = f"from these starts the robots end in another shape, a local minimum: {left} {allowed}"
         remedy = "start them nearer to the shape, in the order in which they stand in it"
         if turned := _on_the_wrong_side(analysis):
             message, remedy = f"{message}; {turned[0]}", turned[1]
         yield Finding("warning", "local-minimum", message, remedy, ("formation", "links"))
-    elif (
-        len(prediction.time) > 1
-        and np.ptp(prediction.position[-2:, analysis.without_neighbours], axis=0).max(initial=0.0) > SETTLED
-    ):
+    elif np.ptp(prediction.position[-2:, analysis.without_neighbours], axis=0).max(initial=0.0) > SETTLED:
         message = f"the formation lags behind its leader: {left} {allowed}"
-        remedy = f"lead more slowly, or raise {strength(analysis)} or the clamp"
+        remedy = f"lead more slowly, or raise {strength(analysis)[0]} or the clamp"
         yield Finding("warning", "lags", message, remedy, ("timeline",))
     else:
-        departure = min(analysis.departure, end)
-        formed = analysis.acquired(departure)
-        late = f"again after {departure:g} s" if formed is not None else "in time"
-        before = f", acquired after {formed:.1f} s," if formed is not None else ""
+        formed = analysis.acquired(analysis.departure)
+        before, late, other = "", "in time", "start nearer to the shape"
+        if formed is not None:
+            before, late = f", acquired after {formed:.1f} s,", f"again after {analysis.departure:g} s"
+            other = "change or lead more slowly"
         message = f"the formation{before} is not acquired {late}: {left} {allowed}"
-        other = "start nearer to the shape" if formed is None else "change or lead more slowly"
-        remedy = f"give a longer duration_s, {other}, or raise {strength(analysis)}"
+        remedy = f"give a longer duration_s, {other}, or raise {strength(analysis)[0]}"
         yield Finding("warning", "not-acquired", message, remedy, ("duration_s",))
 
 
@@ -170,38 +165,34 @@ def _oscillation(analysis: Analysis) -> Finding | None:
         f"{analysis.link(link)} swings between {1e3 * late[:, link].min():.0f} and {1e3 * late[:, link].max():.0f} mm "
         f"(tolerance {1e3 * tolerance:g} mm)"
     )
-    remedy = f"the loop, not the starts, is at fault: lower {strength(analysis)}, or let bodies and messages lag less"
-    name = gain_key(analysis.law, BY_DISTANCE if analysis.asked.wants is None else BY_RELATIVE)
-    path: Path = ("formation", name) if strength(analysis) in GAIN.values() else ("formation", "law")
+    own, path = strength(analysis, BY_DISTANCE if analysis.asked.wants is None else BY_RELATIVE)
+    remedy = f"the loop, not the starts, is at fault: lower {own}, or let bodies and messages lag less"
     return Finding("warning", "keeps-oscillating", message, remedy, path)
 
 
 def anchors(analysis: Analysis) -> Iterator[Finding]:
     """Check that anchored robots reach their places."""
-    shape, places, end = analysis.shape, analysis.anchors, float(analysis.prediction.time[-1])
-    if shape is None or not places or shape.worst > FAR_OFF or analysis.prediction.stuck or _cut(analysis):
+    plan, last = analysis.plan, analysis.anchored[-1]
+    if analysis.met_shape is None or not len(last) or analysis.prediction.stuck or _cut(analysis):
         return
-    last = analysis.anchored[-1]
-    name, worst = analysis.names[places[int(last.argmax())][0]], 1e3 * float(last.max())
-    if worst <= 1e3 * analysis.plan.experiment.tolerance:
-        yield Finding(
-            "note", "anchored", f"anchored robots reach their places: {name} is {worst:.0f} mm off at the end"
-        )
+    name, worst = plan.names[plan.anchors_by_row[int(last.argmax())][0]], 1e3 * float(last.max())
+    if worst <= 1e3 * plan.experiment.tolerance:
+        message = f"anchored robots reach their places: {name} is {worst:.0f} mm off at the end"
+        yield Finding("note", "anchored", message)
         return
-    message = f"{name} is {worst:.0f} mm off its anchor after {end:g} s"
+    message = f"{name} is {worst:.0f} mm off its anchor after {analysis.prediction.end_s:g} s"
     remedy = "raise the gain of the anchor, start nearer to it, or give a longer duration_s"
     yield Finding("warning", "anchor-missed", message, remedy, ("formation", "anchors", name))
 
 
 def _on_the_wrong_side(analysis: Analysis) -> tuple[str, str] | None:
     """Robots that end at the mirror image of their place in the shape, and the remedy; None if it does not help."""
-    end, links = analysis.prediction.position[-1], analysis.asked.take(analysis.standing)
+    names, end = analysis.plan.names, analysis.prediction.position[-1]
     moves = np.ones(len(end), dtype=bool)
     moves[analysis.without_neighbours] = False
-    flips = mirrored_robots(links, end, moves, analysis.anchors)
+    flips = mirrored_robots(analysis.first_links, end, moves, analysis.plan.anchors_by_row)
     if not flips:
         return None
-    names = analysis.names
     sides = [
         f"{names[each.row]} is on the wrong side of {names[each.ends[0]]} - {names[each.ends[1]]}" for each in flips
     ]
@@ -211,37 +202,51 @@ def _on_the_wrong_side(analysis: Analysis) -> tuple[str, str] | None:
 
 def _stopped(analysis: Analysis, at: int, left: str) -> Finding | None:
     """Finding that wheeled robots which stand still at sample `at` prevent acquisition."""
-    experiment, links = analysis.plan.experiment, analysis.pattern.links
+    experiment, links = analysis.plan.experiment, analysis.plan.links
     off = np.flatnonzero(analysis.error[at] > experiment.tolerance)
     ends = np.union1d(links.receiver[off], links.sender[off])
-    stopped = np.intersect1d(analysis.stopped(at), ends)
+    stopped = np.intersect1d(_standing_wheels(analysis, at), ends)
     if not len(stopped) or np.setdiff1d(ends, np.union1d(stopped, analysis.without_neighbours)).size:
         return None
     near = f"{1e3 * REACHED:g} mm"
-    by_distance = links.wants is None or (links.wants[off] == BY_DISTANCE).any()
-    name = gain_key(analysis.law, BY_DISTANCE if by_distance else BY_RELATIVE)
+    wants = BY_DISTANCE if links.wants is None or (links.wants[off] == BY_DISTANCE).any() else BY_RELATIVE
+    own, path = strength(analysis, wants)
+    name = gain_key(analysis.law, wants)
     message = (
         f"the formation is not acquired, because robots on wheels stop {near} before their goals: links may stay "
         f"e = {near}/{'(μ d²)' if name == 'gain' else 'k'} off; {left}"
     )
-    enough = 1.1 * getattr(experiment.formation, name) * float(analysis.error[at].max()) / experiment.tolerance
-    remedy, path = f"raise {name} to {enough:.2g} or more, or allow a larger tolerance", ("formation", name)
-    if (own := strength(analysis)) not in GAIN.values():
-        remedy, path = f"raise {own}, or allow a larger tolerance", ("formation", "law")
-    return Finding("warning", "wheels-stop", message, remedy, path)
+    if path[-1] == name:
+        enough = 1.1 * getattr(experiment.formation, name) * float(analysis.error[at].max()) / experiment.tolerance
+        own = f"{name} to {enough:.2g} or more"
+    return Finding("warning", "wheels-stop", message, f"raise {own}, or allow a larger tolerance", path)
+
+
+def _standing_wheels(analysis: Analysis, at: int) -> Index:
+    """Rows on wheels that stand at sample `at`, because their goals are too near to drive to."""
+    plan, time, position = analysis.plan, analysis.prediction.time, analysis.prediction.position
+    at %= len(time)
+    here, before = position[at], position[max(0, at - round(WINDOW_S * plan.experiment.rates.coordination_hz))]
+    links, there = plan.formation.at(float(time[at])), plan.formation.present(time[at : at + 1], position[at : at + 1])
+    links = links if there is None else links.take(there[0])
+    offset = law_offsets(analysis.law, here, here[links.sender], links) + anchor_offsets(plan.anchors_by_row, here)
+    length, wheels = norm(offset[:, :2]), np.array([not kind.flies for kind in plan.kinds])
+    return np.flatnonzero(
+        wheels & (norm(here - before) < SETTLED) & (length > 0.1 * REACHED) & (length < 2.0 * REACHED)
+    )
 
 
 def walls(analysis: Analysis) -> Iterator[Finding]:
     """Check that no robot leaves the arena, or is held back by the margin at a wall."""
-    names, limits, track = analysis.names, analysis.limits, analysis.prediction.position
+    names, limits, track = analysis.plan.names, analysis.limits, analysis.prediction.position
     beyond = np.maximum(track - limits.high, limits.low - track)  # (T, N, 3), positive outside
     outside = beyond.max(axis=2) > FORGIVEN
     tight = beyond[..., :2].max(axis=2) > FORGIVEN - limits.margin
     tight &= ~tight[0]  # a start there is a finding of `starts`
     problems = [_left_arena(analysis, int(row), outside[:, row]) for row in np.flatnonzero(outside.any(axis=0))]
     for row in np.flatnonzero(tight.any(axis=0) & ~outside.any(axis=0)):
-        time, place = _first_time(analysis, int(row), tight[:, row])
-        message = f"{names[row]} comes within the margin of {limits.margin:g} m of a wall at {time:.1f} s, at {place}"
+        _, when = _first_time(analysis, int(row), tight[:, row])
+        message = f"{names[row]} comes within the margin of {limits.margin:g} m of a wall {when}"
         remedy = "it will be held back there: enlarge size in [arena], or lead the formation away from the wall"
         problems.append(Finding("warning", "near-wall", message, remedy, ("arena", "size")))
     yield from problems
@@ -251,40 +256,33 @@ def walls(analysis: Analysis) -> Iterator[Finding]:
 
 def encounters(analysis: Analysis) -> Iterator[Finding]:
     """Check that no robots collide or land on each other; pairs too near at the start are not repeated."""
-    names, kinds, start = analysis.names, analysis.kinds, analysis.start
-    radius = np.array([kind.radius for kind in kinds])
-    near = [
-        each
-        for each in approaches(analysis.prediction, kinds, CLEARANCE)
-        if norm(start[each.first] - start[each.second]) >= radius[each.first] + radius[each.second] - FORGIVEN
-    ]
-    near.sort(key=lambda each: (each.gap >= 0.0, each.distance))
-    for each in near:
+    names, kinds, experiment = analysis.plan.names, analysis.plan.kinds, analysis.plan.experiment
+    overlap = _overlap_at_start(analysis)
+    near = [each for each in approaches(analysis.prediction, kinds, CLEARANCE) if not overlap[each.first, each.second]]
+    for each in sorted(near, key=lambda each: (each.gap >= 0.0, each.distance)):
         first, second = names[each.first], names[each.second]
-        touch = radius[each.first] + radius[each.second]
-        how = f"they touch at {touch:.2f} m"
+        how, remedy = f"they touch at {each.touch:.2f} m", "move the start of one of them"
         if each.gap >= 0.0:
             how = f"one is above the other then, with {each.gap:.2f} m between them, less than {CLEARANCE:g} m"
+            remedy = "hold heights that are farther apart"
         message = f"{first} and {second} come within {each.distance:.2f} m at {each.time:.1f} s; {how}"
         path = ("robots", second, "start")
-        robots = analysis.plan.experiment.robots
-        if analysis.plan.experiment.avoidance is None or not (robots[first].avoids or robots[second].avoids):
-            remedy = "move the start of one of them" if each.gap < 0.0 else "hold heights that are farther apart"
+        if experiment.avoidance is None or not (experiment.robots[first].avoids or experiment.robots[second].avoids):
             yield Finding("warning", "too-close", message, remedy, path)
         else:
             yield Finding("note", "avoidance-acts", f"{message}: avoidance will have to act", "", path)
     if _cut(analysis) or analysis.prediction.stuck:
         return
-    final, links = analysis.prediction.position[-1], analysis.links
+    final, radius = analysis.prediction.position[-1], np.array([kind.radius for kind in kinds])
+    heard = adjacency(analysis.plan.links, len(names)) > 0
     for row in np.flatnonzero([kind.flies for kind in kinds]):
         below = (final[:, 2] < final[row, 2] - FORGIVEN) & (norm(final[:, :2] - final[row, :2]) < radius + radius[row])
         for under in np.flatnonzero(below):
-            targets = ("formation", "links")
-            if ((links.receiver == row) & (links.sender == under)).any():
-                message = f"{names[row]} ends above {names[under]}, and goes aside before it lands"
-                yield Finding("note", "lands-beside", message, "", targets)
+            ends, targets = f"{names[row]} ends above {names[under]}", ("formation", "links")
+            if heard[row, under]:
+                yield Finding("note", "lands-beside", f"{ends}, and goes aside before it lands", "", targets)
                 continue
-            message = f"{names[row]} ends above {names[under]}, from which it receives no poses, and would land on it"
+            message = f"{ends}, from which it receives no poses, and would land on it"
             remedy = "change their distances, link them, or end the timeline elsewhere"
             yield Finding("warning", "lands-on", message, remedy, targets)
 
@@ -292,30 +290,28 @@ def encounters(analysis: Analysis) -> Iterator[Finding]:
 def ceiling(analysis: Analysis) -> Iterator[Finding]:
     """Check that the overshoot of a take-off stays below the top of the arena."""
     top = analysis.plan.experiment.arena.size[2]
-    for name, kind, hover in zip(analysis.names, analysis.kinds, analysis.height.tolist(), strict=True):
+    for name, kind, hover in zip(analysis.plan.names, analysis.plan.kinds, analysis.height.tolist(), strict=True):
         highest = (1.0 + kind.overshoot) * hover
         if kind.overshoot and highest > top + FORGIVEN:
-            message = (
-                f"{name} hovers at {hover:g} m, and the take-off of a {kind.name} overshoots by up to "
-                f"{kind.overshoot:.0%}: to {highest:.2f} m, in an arena {top:g} m high"
-            )
+            how = f"the take-off of a {kind.name} overshoots by up to {kind.overshoot:.0%}"
+            message = f"{name} hovers at {hover:g} m, and {how}: to {highest:.2f} m, in an arena {top:g} m high"
             lower = math.floor(100.0 * top / (1.0 + kind.overshoot)) / 100.0
             remedy = f"hover at {lower:g} m at most, or enlarge size in [arena] if the room is higher"
             yield Finding("warning", "overshoots-arena", message, remedy, ("robots", name, "hover"))
 
 
 def _first_time(analysis: Analysis, row: int, where: Mask) -> tuple[float, str]:
-    """Time at which a row is first there, and its place then in words."""
+    """Time at which a row is first there, and when and where that is in words."""
     at = int(where.argmax())
-    x, y, _ = analysis.prediction.position[at, row]
-    return float(analysis.prediction.time[at]), f"({x:.2f}, {y:.2f})"
+    time, (x, y, _) = float(analysis.prediction.time[at]), analysis.prediction.position[at, row]
+    return time, f"at {time:.1f} s, at ({x:.2f}, {y:.2f})"
 
 
 def _left_arena(analysis: Analysis, row: int, outside: Mask) -> Finding:
-    name = analysis.names[row]
-    time, place = _first_time(analysis, row, outside)
-    begun = [k for k, robot, _ in analysis.legs if robot == name and analysis.plan.experiment.timeline[k].at_s <= time]
-    message = f"{name} would leave the arena at {time:.1f} s, at {place}"
+    name, timeline = analysis.plan.names[row], analysis.plan.experiment.timeline
+    time, when = _first_time(analysis, row, outside)
+    begun = [k for k, robot, _ in analysis.legs if robot == name and timeline[k].at_s <= time]
+    message = f"{name} would leave the arena {when}"
     if row in analysis.without_neighbours and begun:
         remedy = "shorten the plan, start it elsewhere, or enlarge size in [arena]"
         return Finding("error", "leaves-arena", f"{message}, by its plan", remedy, ("timeline", begun[-1], "plan"))
@@ -325,12 +321,12 @@ def _left_arena(analysis: Analysis, row: int, outside: Mask) -> Finding:
 
 def speeds(analysis: Analysis) -> Iterator[Finding]:
     """Check that plans ask for no more speed than the robots have."""
-    names, timeline, problems = analysis.names, analysis.plan.experiment.timeline, []
+    names, experiment, problems = analysis.plan.names, analysis.plan.experiment, []
     for number, robot, plan in analysis.legs:
         row, asked, path = names.index(robot), plan.speed(), ("timeline", number, "plan")
         leads = row in analysis.without_neighbours
         has = float((analysis.speed if leads else analysis.pull)[row])
-        what = f"the leg at {timeline[number].at_s:g} s asks {robot} for {asked:.3g} m/s"
+        what = f"the leg at {experiment.timeline[number].at_s:g} s asks {robot} for {asked:.3g} m/s"
         remedy = f"plan for less than {NEARLY * has:.2g} m/s"
         if leads and asked > has * (1.0 + 1e-9):
             problems.append(Finding("error", "leader-too-fast", f"{what}; it has {has:.3g} m/s", remedy, path))
@@ -344,29 +340,25 @@ def speeds(analysis: Analysis) -> Iterator[Finding]:
         if has < asked:
             rates = f"follows at {has:.2g} m/s at most, {robot} leads at {asked:.2g} m/s"
             message = f"{names[analysis.follower]} {rates}: it lags, and catches up afterwards"
-            clamp = math.ceil(110.0 * analysis.plan.experiment.formation.clamp * asked / has) / 100.0
-            slow = asked > analysis.speed[analysis.follower]
-            remedy = "lead more slowly" if slow else f"lead more slowly, or raise clamp in [formation] to {clamp:g}"
+            remedy = "lead more slowly"
+            if asked <= analysis.speed[analysis.follower]:
+                clamp = math.ceil(110.0 * experiment.formation.clamp * asked / has) / 100.0
+                remedy += f", or raise clamp in [formation] to {clamp:g}"
             problems.append(Finding("warning", "followers-lag", message, remedy, ("timeline", number, "plan")))
     yield from problems
     if not problems and fastest is not None:
-        asked = fastest[2].speed()
-        yield Finding("note", "speeds", f"no plan asks for more than the robots have ({asked:.2g} m/s at most)")
+        most = f"{fastest[2].speed():.2g} m/s at most"
+        yield Finding("note", "speeds", f"no plan asks for more than the robots have ({most})")
 
 
 def turning_circle(analysis: Analysis) -> Iterator[Finding]:
     """Report robots that cannot turn on the spot and follow goals that a gradient law moves a little at a time."""
-    if not isinstance(analysis.law, Gradient):
-        return
-    rows = sorted(set(analysis.plan.links.receiver.tolist()))
-    wide = [row for row in rows if analysis.kinds[row].turn_radius > 0.0]
-    if wide:
-        names = [analysis.names[row] for row in wide]
-        radius = max(analysis.kinds[row].turn_radius for row in wide)
-        message = (
-            f"{join_names(names)} cannot turn on the spot (radius up to {radius:g} m), and the goals of a gradient law "
-            "are nearer: shuffling"
-        )
+    plan = analysis.plan
+    wide = [row for row in np.unique(plan.links.receiver) if plan.kinds[row].turn_radius > 0.0]
+    if analysis.is_gradient and wide:
+        names, radius = [plan.names[row] for row in wide], max(plan.kinds[row].turn_radius for row in wide)
+        reason = f"cannot turn on the spot (radius up to {radius:g} m), and the goals of a gradient law are nearer"
+        message = f"{join_names(names)} {reason}: shuffling"
         remedy = "lead by a plan, or choose a law that gives velocities, or another kind"
         yield Finding("warning", "turning-circle", message, remedy, ("robots", names[0], "kind"))
 
@@ -395,13 +387,12 @@ def rates(analysis: Analysis) -> Iterator[Finding]:
 
 def ends(analysis: Analysis) -> Iterator[Finding]:
     """Check that the last leg of each robot ends before the run."""
-    timeline, duration = analysis.plan.experiment.timeline, analysis.plan.experiment.duration_s
+    experiment, duration = analysis.plan.experiment, analysis.plan.experiment.duration_s
     last = {robot: (number, plan) for number, robot, plan in analysis.legs}
     for robot, (number, plan) in last.items():
-        at, row = timeline[number].at_s, analysis.names.index(robot)
-        when = min(round(at * analysis.plan.experiment.rates.coordination_hz), len(analysis.prediction.time) - 1)
-        start = analysis.plan.experiment.robots[robot].start
-        lasts = _plan_duration(plan, analysis.prediction.position[when, row], start)
+        at, row = experiment.timeline[number].at_s, analysis.plan.names.index(robot)
+        when = min(round(at * experiment.rates.coordination_hz), len(analysis.prediction.time) - 1)
+        lasts = _plan_duration(plan, analysis.prediction.position[when, row], experiment.robots[robot].start)
         if lasts is not None and at + lasts > duration * (1.0 + 1e-9) + 0.1:
             message = f"the leg of {robot} at {at:g} s lasts {lasts:.3g} s, but the run ends at {duration:g} s"
             remedy = f"give a duration_s of {math.ceil(at + lasts):g} or more, or a faster or shorter plan"
@@ -410,9 +401,8 @@ def ends(analysis: Analysis) -> Iterator[Finding]:
 
 def _plan_duration(plan: Planner, anchor: Array, start: Sequence[float]) -> float | None:
     """Duration for which a plan moves its robot [s], to within 1 %; None: for ever."""
-    elapsed, heading = np.geomspace(0.01, 1e6, 2000), start[2] if len(start) > 2 else 0.0
-    begin = tuple(anchor.tolist())
-    target = np.array([plan.target(t, begin, heading)[:3] for t in elapsed.tolist()])
+    elapsed, (_, _, heading) = np.geomspace(0.01, 1e6, 2000), (*start, 0.0)[:3]
+    target = np.array([plan.target(t, tuple(anchor.tolist()), heading)[:3] for t in elapsed.tolist()])
     away = np.flatnonzero(norm(target - target[-1]) > OFF)
     if not len(away):
         return 0.0

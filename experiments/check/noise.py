@@ -11,7 +11,7 @@ import numpy as np
 from experiments.check.analysis import Analysis
 from experiments.check.findings import DELAYED, FORGIVEN, Finding
 from experiments.check.ideal_run import fly, has_noise, isolated, repetitions
-from experiments.check.theory import FAR_OFF, strength
+from experiments.check.theory import strength
 from experiments.metrics.signals import WINDOW_S
 
 SOFT: Final = 3.0  # time constants of a mode that must fit into the run: 5 % of its error are left then
@@ -30,7 +30,7 @@ WITHOUT: Final = {  # findings that noise may refute: what robots do without it
 class Flights:
     """Flights with noise, of several seeds."""
 
-    flown: tuple[Analysis, ...]  # the case with these motions
+    flown: list[Analysis]  # the case with these motions
     seeds: str  # of all, in words
     count: int
 
@@ -41,7 +41,7 @@ class Flights:
         flown = [] if beside is None else [beside]
         flown += [fly(bare, seed) for seed in range(first + len(flown), first + count)]
         seeds = f"seed {first}" if count == 1 else f"seeds {first} to {first + count - 1}"
-        return cls(tuple(analysis.flown(each) for each in flown if not each.stuck), seeds, count)
+        return cls([Analysis(analysis.plan, each) for each in flown if not each.stuck], seeds, count)
 
     @property
     def acquired(self) -> list[float]:
@@ -97,54 +97,52 @@ def softness(analysis: Analysis) -> Iterator[Finding]:
 
     Experiments with a late flight with noise, and soft ones, are flown with more seeds.
     """
-    experiment, loop, shape = analysis.plan.experiment, analysis.modes, analysis.shape
-    formed = analysis.acquired_for_good
-    if (
-        loop is None
-        or shape is None
-        or shape.worst > FAR_OFF
-        or formed is None
-        or analysis.prediction.stuck
-        or not has_noise(analysis.plan)
-    ):
+    experiment, loop, formed = analysis.plan.experiment, analysis.modes, analysis.acquired_for_good
+    if analysis.met_shape is None or loop is None or formed is None:
+        return
+    if analysis.prediction.stuck or not has_noise(analysis.plan):
         return
     soft = bool(loop.free) or SOFT * loop.slowest_s > experiment.duration_s
     late = max(LATER * formed, formed + WINDOW_S)
     if not (soft or _doubtful(analysis, formed, late)):
         return
     flights = Flights.of(analysis)
+    count, times, most = flights.count, flights.acquired, experiment.tolerance + FORGIVEN
     spans = [(analysis.acquired(until) or 0.0, until) for until in analysis.spans_end]
-    lost, worst, worst_link = 0, experiment.tolerance + FORGIVEN, ""
-    for each in flights.flown:
-        time = each.prediction.time
-        due = np.any([(time > (begin + until) / 2.0) & (time <= until + 1e-9) for begin, until in spans], axis=0)
-        off = each.mean_error[due]
-        largest = float(off.max(initial=0.0))
-        lost += largest > experiment.tolerance + FORGIVEN
-        if largest > worst:
-            worst = largest
-            at, link = np.unravel_index(off.argmax(), off.shape)
-            worst_link = f": {analysis.link(int(link))} is {1e3 * worst:.0f} mm off at {time[due][at]:.1f} s"
-    times = flights.acquired
+    largest = [_largest_error(each, spans) for each in flights.flown]
+    lost = sum(error > most for error, _ in largest)
     delayed = len(flights.flown) - sum(at <= late for at in times)
-    if not flights.enough(lost) and not flights.enough(delayed):
-        return
-    free = f"{loop.free} mode{'s' * (loop.free > 1)} slower than the run"
-    modes = free if loop.free else f"slowest mode {loop.slowest_s:.1f} s"
-    begin = (
-        f"soft formation, {modes}: acquired after {formed:.1f} s without noise, but with the noise of [disturbance] "
-    )
     if flights.enough(lost):
-        message = (
-            f"{begin}outside the tolerance of {1e3 * experiment.tolerance:g} mm later, in {lost} of {flights.count} "
-            f"flights ({flights.seeds}){worst_link}"
+        _, where = max(largest)
+        how = f"outside the tolerance of {1e3 * experiment.tolerance:g} mm later, in {lost} of {count} flights"
+        how = f"{how} ({flights.seeds}): {where}"
+    elif flights.enough(delayed):
+        how = (
+            f"after {span_of(times)}, in {len(times)} of {count} flights" if times else f"not at all in {count} flights"
         )
+        how = f"{how} ({flights.seeds})"
     else:
-        when = f"after {span_of(times)}" if times else "not at all"
-        rest = f", in {len(times)} of {flights.count} flights" if times else f" in {flights.count} flights"
-        message = f"{begin}{when}{rest} ({flights.seeds})"
-    remedy = f"raise {strength(analysis)}, add links that stiffen the formation, or allow a larger tolerance"
-    yield Finding("warning", "soft", message, remedy, ("formation", "links"))
+        return
+    modes = f"slowest mode {loop.slowest_s:.1f} s"
+    if loop.free:
+        modes = f"{loop.free} mode{'s' * (loop.free > 1)} slower than the run"
+    message = (
+        f"soft formation, {modes}: acquired after {formed:.1f} s without noise, but with the noise of [disturbance]"
+    )
+    remedy = f"raise {strength(analysis)[0]}, add links that stiffen the formation, or allow a larger tolerance"
+    yield Finding("warning", "soft", f"{message} {how}", remedy, ("formation", "links"))
+
+
+def _largest_error(flight: Analysis, spans: list[tuple[float, float]]) -> tuple[float, str]:
+    """Largest mean error of a link in the second half of one of the spans [s], in metres and in words."""
+    time = flight.prediction.time
+    due = np.any([(time > (begin + until) / 2.0) & (time <= until + 1e-9) for begin, until in spans], axis=0)
+    off = flight.mean_error[due]
+    if not off.size:
+        return 0.0, ""
+    at, link = np.unravel_index(off.argmax(), off.shape)
+    worst = float(off[at, link])
+    return worst, f"{flight.link(link)} is {1e3 * worst:.0f} mm off at {time[due][at]:.1f} s"
 
 
 def _doubtful(analysis: Analysis, formed: float, late: float) -> bool:

@@ -31,10 +31,10 @@ def describe_obstacle(obstacle: Obstacle) -> str:
 
 def obstacles(analysis: Analysis) -> Iterator[Finding]:
     """Check that no predicted path meets an obstacle; with avoidance, note that it will act."""
-    scene, prediction = analysis.scene, analysis.prediction
+    scene, prediction = analysis.plan.scene, analysis.prediction
     if not scene.names:
         return
-    radius = np.array([kind.radius for kind in analysis.kinds])
+    radius = np.array([kind.radius for kind in analysis.plan.kinds])
     low, high = _heights(analysis, prediction.position[..., 2])
     poses = scene.along(prediction.time)
     robots = analysis.plan.experiment.robots.values()
@@ -61,7 +61,7 @@ def obstacles(analysis: Analysis) -> Iterator[Finding]:
 
 def _met(analysis: Analysis, number: int, rows: Index, near: Mask, *, keeps: bool) -> Finding:
     """Finding that `rows` (K,) meet an obstacle at the times `near` (T, K); `keeps`: avoidance is on."""
-    scene, prediction, names = analysis.scene, analysis.prediction, analysis.names
+    scene, prediction, names = analysis.plan.scene, analysis.prediction, analysis.plan.names
     name, path = scene.names[number], ("arena", "obstacles", scene.names[number])
     which = int(near.argmax(axis=0).argmin())
     first, at = int(rows[which]), int(near[:, which].argmax())
@@ -80,7 +80,7 @@ def _met(analysis: Analysis, number: int, rows: Index, near: Mask, *, keeps: boo
 
 def contacts(analysis: Analysis) -> Iterator[Finding]:
     """Check that the engine computes the contacts for which the arena is made."""
-    experiment, scene = analysis.plan.experiment, analysis.scene
+    experiment, scene = analysis.plan.experiment, analysis.plan.scene
     touching = analysis.plan.finds_contacts
     for name, obstacle in experiment.arena.obstacles.items():
         if obstacle.mass is not None and not touching:
@@ -91,8 +91,8 @@ def contacts(analysis: Analysis) -> Iterator[Finding]:
     if touching and scene.walled:
         start = analysis.start[:, :2]
         gap = np.minimum(start - scene.low[:2], scene.high[:2] - start).min(axis=1)
-        for row in np.flatnonzero(gap < [kind.radius - FORGIVEN for kind in analysis.kinds]):
-            name, needed = analysis.names[row], analysis.kinds[row].radius
+        for row in np.flatnonzero(gap < [kind.radius - FORGIVEN for kind in analysis.plan.kinds]):
+            name, needed = analysis.plan.names[row], analysis.plan.kinds[row].radius
             message = f"{name} starts in a wall of the arena: {max(gap[row], 0.0):.2f} m off, but needs {needed:.2f} m"
             remedy = "start it farther inside, or leave the walls out: walls = false in [arena]"
             yield Finding("error", "start-overlap", message, remedy, ("robots", name, "start"))
@@ -100,19 +100,19 @@ def contacts(analysis: Analysis) -> Iterator[Finding]:
 
 def perception(analysis: Analysis) -> Iterator[Finding]:
     """Check that robots with avoidance have sensors or neighbours to avoid by."""
-    experiment, scene = analysis.plan.experiment, analysis.scene
+    experiment, scene = analysis.plan.experiment, analysis.plan.scene
     avoidance = analysis.plan.avoidance
     if avoidance is None:
         return
-    isolated = set() if avoidance.hears == "all" else {analysis.names[row] for row in analysis.without_neighbours}
+    isolated = set() if avoidance.hears == "all" else {analysis.plan.names[row] for row in analysis.without_neighbours}
     height = analysis.height
     low, high = _heights(analysis, height)
-    for row, name in enumerate(analysis.names):
+    for row, name in enumerate(analysis.plan.names):
         if sensors_of(experiment.robots[name]) or not experiment.robots[name].avoids:
             continue
         in_height = [k for k in range(len(scene.names)) if outlines.at_height(scene, k, low[row], high[row])]
         there = [f"'{scene.names[k]}'" for k in in_height]
-        flies = analysis.kinds[row].flies
+        flies = analysis.plan.kinds[row].flies
         remedy = f'give it some: sensors = ["{"multiranger" if flies else "lds01"}"] in [robots.{name}]'
         if there:
             message = f"{name} has no range sensors: it cannot avoid {join_names(there)}"
@@ -151,7 +151,7 @@ def reality(analysis: Analysis) -> Iterator[Finding]:
 
 def _heights(analysis: Analysis, z: Array) -> tuple[Array, Array]:
     """Lower and upper end (..., N) of robots at positions `z` (..., N) [m]."""
-    kinds = analysis.kinds
+    kinds = analysis.plan.kinds
     height = np.array([kind.height for kind in kinds])
     low = np.where([kind.flies for kind in kinds], z - 0.5 * height, 0.0)
     return low, low + height

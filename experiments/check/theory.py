@@ -16,9 +16,9 @@ from agents.network import messages
 from agents.plugins.calls import unknown_reads
 from agents.plugins.laws import Gradient
 from agents.vectors import ZERO
-from experiments.check.analysis import Analysis
+from experiments.check.analysis import FAR_OFF, Analysis
 from experiments.check.findings import FORGIVEN, Finding, Severity, join_names
-from experiments.check.realisation import OFF, Conflict, Shape, conflicts, contradictions
+from experiments.check.realisation import OFF, Conflict, Shape, best_shape, conflicts, contradictions
 from experiments.definition.experiment import Formation
 from experiments.definition.formation import law_offsets, unlinked
 from experiments.definition.graph import components, reachable
@@ -27,7 +27,6 @@ from experiments.definition.plan import Plan
 from experiments.file.problems import Path
 from twins.arrays import Index, Mask, norm
 
-FAR_OFF: Final = 0.01  # [m] a shape that misses a distance by more is another shape
 FEW: Final = 6  # names that are listed
 GAIN: Final = {"gain": "the gain", "stiffness": "the stiffness", "by link": "the gain or the stiffness"}  # of the file
 UNSTABLE_GAIN: Final = 2.0  # share of an error that one decision corrects
@@ -36,60 +35,48 @@ LONG_POSE: Final = (1_000_000, 1.7e9 + 0.123456, (-1.234567,) * 3, (-0.123456,) 
 LONG_YAW: Final = -1.234567  # [rad]
 LONG_NUMBER: Final = -1.234567e-05  # of what is said
 MILLIMETRES: Final = 50.0  # [m] a longer link is probably written in millimetres
-OSCILLATING_GAIN: Final = (
-    1.2  # beyond 1 an error changes its sign; the rest to 2 is for lag that the model does not have
-)
+OSCILLATING_GAIN: Final = 1.2  # beyond 1 an error changes its sign; the rest to 2 is for lag that no model has
 
 
 def network(analysis: Analysis) -> Iterator[Finding]:
     """Check that the network is connected, and that every robot is reached by a leader."""
-    names, links = analysis.names, analysis.links
-    path = ("formation", "links")
+    experiment, names, links = analysis.plan.experiment, analysis.plan.names, analysis.plan.links
+    path, rows, problems = ("formation", "links"), len(names), list[Finding]()
     if not len(links):
-        how = "goes to its anchor" if analysis.plan.experiment.formation.anchors else "follows its own plan"
+        how = "goes to its anchor" if experiment.formation.anchors else "follows its own plan"
         yield Finding("note", "no-formation", f"no links: every robot {how}, or stays where it is")
         return
-    rows = len(names)
     linked = np.union1d(links.receiver, links.sender)
-    named = analysis.plan.experiment.formation.leader
-    leaders = tuple(name for name in analysis.plan.leaders if name == named or names.index(name) in linked)
-    sources = np.array([names.index(name) for name in leaders], dtype=np.intp)
-    receives = np.isin(np.arange(rows), links.receiver)
-    anchored = np.array([row for row, _ in analysis.anchors], dtype=np.intp)
-    if len(anchored) and len(sources):  # an anchored robot is led by its place
-        sources = np.union1d(sources, anchored)
-    problems = []
-    if len(sources):
-        lost = np.flatnonzero(~reachable(links, rows, sources) & receives)
+    named = experiment.formation.leader
+    leaders = [name for name in analysis.plan.leaders if name == named or names.index(name) in linked]
+    anchored = np.array([row for row, _ in analysis.plan.anchors_by_row], dtype=np.intp)
+    if leaders:
+        sources = np.union1d([names.index(name) for name in leaders], anchored)  # an anchored robot is led by its place
+        lost = np.setdiff1d(links.receiver, np.flatnonzero(reachable(links, rows, sources)))
         if len(lost):
             subject = join_names([names[row] for row in lost])
             message = f"{subject} cannot be reached by the leader ({join_names(leaders)}), directly or through others"
             remedy = f'add a link to one that does, such as "{leaders[0]} > {names[lost[0]]}"'
             problems.append(Finding("error", "leader-unknown", message, remedy, path))
     parts = analysis.parts - (rows - len(linked))  # robots without links go their own way
-    apart = analysis.plan.experiment.avoidance is not None and len(leaders) >= analysis.parts
     if parts > 1 and len(anchored) and reachable(links, rows, anchored)[linked].all():
         yield Finding("note", "parts", f"{parts} formations, each of which is anchored", "", path)
-    elif parts > 1 and apart:
-        message = f"{parts} formations that know of each other only to keep clear"
-        yield Finding("note", "parts", message, "", path)
+    elif parts > 1 and experiment.avoidance is not None and len(leaders) >= analysis.parts:
+        yield Finding("note", "parts", f"{parts} formations that know of each other only to keep clear", "", path)
     elif parts > 1:
         message = f"the network falls into {parts} parts that know nothing of each other"
-        problems.append(
-            Finding("error", "parts", message, "join them by links, or make them separate experiments", path)
-        )
+        remedy = "join them by links, or make them separate experiments"
+        problems.append(Finding("error", "parts", message, remedy, path))
     isolated = [names[row] for row in analysis.without_neighbours if names[row] not in leaders]
     if isolated:
         message = f"{join_names(isolated)} has no links: it takes no part in the formation"
-        problems.append(
-            Finding("warning", "no-incoming-links", message, f'add "... > {isolated[0]}" to its links', path)
-        )
+        remedy = f'add "... > {isolated[0]}" to its links'
+        problems.append(Finding("warning", "no-incoming-links", message, remedy, path))
+    severity: Severity = "error" if len(leaders) == 1 else "warning"
     for name in leaders:
         if names.index(name) not in links.sender:
             message, remedy = f"no robot receives from the leader {name}", f'add "{name} > ..." for one of the others'
-            problems.append(
-                Finding("error" if len(leaders) == 1 else "warning", "leader-not-received", message, remedy, path)
-            )
+            problems.append(Finding(severity, "leader-not-received", message, remedy, path))
     yield from problems
     if not problems:
         whole = "the network is whole; " if analysis.parts == 1 else ""
@@ -101,7 +88,7 @@ def network(analysis: Analysis) -> Iterator[Finding]:
 def lengths(analysis: Analysis) -> Iterator[Finding]:
     """Check that distances are no millimetres: most of them longer than the arena."""
     distance, size = analysis.asked.distance[_measured(analysis)], np.array(analysis.plan.experiment.arena.size)
-    if not len(distance) or float(np.median(distance)) <= float(norm(size)):
+    if not analysis.is_gradient or not len(distance) or np.median(distance) <= norm(size):
         return
     longest = int(np.flatnonzero(_measured(analysis))[distance.argmax()])
     asked, whole = float(distance.max()), " × ".join(f"{length:g}" for length in size)
@@ -125,7 +112,7 @@ def realisation(analysis: Analysis) -> Iterator[Finding]:
         yield from _unrealisable(analysis, shape)
     given = analysis.plan.experiment.formation.changes
     in_order = sorted(range(len(given)), key=lambda k: given[k].at_s)  # their numbers in the file
-    for number, later in zip(in_order, analysis.later, strict=False):
+    for number, later in zip(in_order, map(best_shape, analysis.stages[1:]), strict=True):
         if later.worst > OFF and shape.worst <= OFF:
             severity: Severity = "error" if later.worst > FAR_OFF else "warning"
             worst = analysis.link(int(later.error.argmax()))
@@ -145,7 +132,7 @@ def _asked(analysis: Analysis) -> str:
 
 def _in_one_place(analysis: Analysis, shape: Shape) -> Finding:
     """Finding on targets that are met only where robots stand in one another."""
-    names, (first, second) = analysis.names, shape.overlaps[0].tolist()
+    names, (first, second) = analysis.plan.names, shape.overlaps[0].tolist()
     apart = float(norm((shape.position[first] - shape.position[second])[:2]))
     more = f", and {len(shape.overlaps) - 1} more like this" if len(shape.overlaps) > 1 else ""
     message = (
@@ -165,8 +152,8 @@ def offsets(analysis: Analysis) -> Iterator[Finding]:
 
 def _contradictions(analysis: Analysis, severity: Severity, more: str = "") -> Iterator[Finding]:
     """Finding on the shortest ring of links with offsets that do not add up."""
-    for ring in contradictions(analysis.asked.take(analysis.standing))[:1]:
-        names = [analysis.names[row] for row in ring.rows]
+    for ring in contradictions(analysis.first_links)[:1]:
+        names = [analysis.plan.names[row] for row in ring.rows]
         way = f"around {join_names([*names, names[0]], 8)}" if len(names) > 2 else f"between {names[0]} and {names[1]}"
         message = f"the offsets {way} do not add up: their ends are {1e3 * ring.gap:.1f} mm apart{more}"
         link = int(np.flatnonzero(analysis.standing)[ring.link])
@@ -176,9 +163,9 @@ def _contradictions(analysis: Analysis, severity: Severity, more: str = "") -> I
 
 def _unrealisable(analysis: Analysis, shape: Shape) -> Iterator[Finding]:
     severity: Severity = "error" if shape.worst > FAR_OFF else "warning"
-    anchors = analysis.anchors
+    anchors = analysis.plan.anchors_by_row
     if anchors and shape.anchored.max(initial=0.0) >= shape.error.max(initial=0.0):
-        name = analysis.names[anchors[int(shape.anchored.argmax())][0]]
+        name = analysis.plan.names[anchors[int(shape.anchored.argmax())][0]]
         message = f"{name} cannot keep the distance of its anchor: at best, it is {1e3 * shape.worst:.1f} mm off"
         remedy = "change it, or the links of this robot; it holds its height, and distances are in space"
         yield Finding(severity, "anchor-not-realisable", message, remedy, ("formation", "anchors", name))
@@ -222,9 +209,9 @@ def _inside(analysis: Analysis, conflict: Conflict) -> Index:
 
 def _pair(analysis: Analysis, link: int | np.intp) -> str:
     """Name of a link, the same for both directions."""
-    links = analysis.links
+    links = analysis.plan.links
     i, j = sorted((int(links.sender[link]), int(links.receiver[link])))
-    return f"{analysis.names[i]} - {analysis.names[j]}"
+    return f"{analysis.plan.names[i]} - {analysis.plan.names[j]}"
 
 
 def _sides(analysis: Analysis, conflict: Conflict) -> str:
@@ -234,7 +221,7 @@ def _sides(analysis: Analysis, conflict: Conflict) -> str:
 
 
 def _too_high(analysis: Analysis, conflict: Conflict, off: str) -> Finding:
-    names = analysis.names
+    names = analysis.plan.names
     subject = join_names([names[row] for row in conflict.high])
     held = max(float(analysis.height[row]) for row in conflict.high)
     message = f"{subject} is too high at {held:g} m for {_sides(analysis, conflict)}; {off}"
@@ -244,7 +231,7 @@ def _too_high(analysis: Analysis, conflict: Conflict, off: str) -> Finding:
 
 def rigidity(analysis: Analysis) -> Iterator[Finding]:
     """Check rigidity in the motions that the robots have."""
-    planar, spatial = analysis.planar, analysis.spatial
+    planar, spatial = analysis.rigidity
     if planar is None or not analysis.standing.any() or analysis.parts > 1:
         return
     rank = f"rank {planar.rank} of {planar.needed} in the motions that the robots have"
@@ -255,58 +242,52 @@ def rigidity(analysis: Analysis) -> Iterator[Finding]:
         remedy = f"add {more} link{'s' * (more > 1)} at least, between robots that are not linked yet"
         yield Finding("warning", "not-rigid", message, remedy, ("formation", "links"))
     else:
-        flying = (
-            ""
-            if spatial is None or spatial.rigid
-            else f"; in space {spatial.rank} of {spatial.needed}, not needed while heights are held"
-        )
-        yield Finding("note", "rigid", f"the formation is rigid, {rank}{flying}")
+        if spatial is not None and not spatial.rigid:
+            rank += f"; in space {spatial.rank} of {spatial.needed}, not needed while heights are held"
+        yield Finding("note", "rigid", f"the formation is rigid, {rank}")
 
 
 def presence(analysis: Analysis) -> Iterator[Finding]:
     """Check that the network stays connected along the predicted motion while links come and go."""
-    pattern, prediction = analysis.pattern, analysis.prediction
-    there = pattern.present(prediction.time, prediction.position)
+    plan, time = analysis.plan, analysis.prediction.time
+    there = plan.formation.present(time, analysis.prediction.position)
     if there is None or analysis.parts > 1:
         return
     begins = np.concatenate([[0], 1 + np.flatnonzero((there[1:] != there[:-1]).any(axis=1))])
-    apart = np.array([components(pattern.links.take(mask), len(analysis.names)) for mask in there[begins]])
-    broken = np.flatnonzero(apart > 1)
-    count = there.sum(axis=1)
-    if not len(broken):
+    apart = np.array([components(plan.links.take(mask), len(plan.names)) for mask in there[begins]])
+    if (apart == 1).all():
+        count = there.sum(axis=1)
         message = f"links come and go, {count.min()} to {count.max()} at a time, and the network is always whole"
         yield Finding("note", "whole", message)
         return
-    first = int(broken[0])
-    end = float(prediction.time[begins[first + 1]]) if first + 1 < len(begins) else analysis.plan.experiment.duration_s
+    first = int((apart > 1).argmax())
+    begin, end = [*time[begins], plan.experiment.duration_s][first : first + 2]
     message = (
-        f"the network falls into {apart[first]} parts from {prediction.time[begins[first]]:.1f} s "
-        f"to {end:.1f} s, because links come and go"
+        f"the network falls into {apart[first]} parts from {begin:.1f} s to {end:.1f} s, because links come and go"
     )
-    near = analysis.plan.experiment.formation.proximity is not None
-    remedy = "start nearer to each other, or give a longer range" if near else "let links overlap in time"
-    path: Path = ("formation", "proximity", "range") if near else ("formation", "links")
+    path: Path = ("formation", "links")
+    remedy = "let links overlap in time"
+    if plan.experiment.formation.proximity is not None:
+        path, remedy = ("formation", "proximity", "range"), "start nearer to each other, or give a longer range"
     yield Finding("warning", "comes-apart", message, remedy, path)
 
 
 def redundancy(analysis: Analysis) -> Iterator[Finding]:
     """Report the single links and robots that the formation can lose and stay rigid."""
-    spare = analysis.spare
-    if spare is None or analysis.parts > 1:
-        return
-    links = _lost("link", spare.pairs, [analysis.pair(int(k)) for k in np.flatnonzero(~spare.pairs)])
-    robots = _lost("robot", spare.robots, [analysis.names[int(row)] for row in np.flatnonzero(~spare.robots)])
-    yield Finding("note", "redundancy", f"{links}; {robots}")
+    if analysis.spare is not None and analysis.parts == 1:
+        links = _lost("link", len(analysis.spare.pairs), analysis.vital_links)
+        robots = _lost("robot", len(analysis.spare.robots), analysis.vital_robots)
+        yield Finding("note", "redundancy", f"{links}; {robots}")
 
 
-def _lost(what: str, spare: Mask, needed: list[str]) -> str:
+def _lost(what: str, count: int, needed: Sequence[str]) -> str:
     """Sentence on what can be lost."""
     if not needed:
         return f"it stays rigid without any one {what}"
-    if len(needed) == len(spare):
+    if len(needed) == count:
         return f"it stays rigid only with every {what}"
     if len(needed) > FEW:
-        return f"{len(spare) - len(needed)} of its {len(spare)} {what}s can be lost, one at a time"
+        return f"{count - len(needed)} of its {count} {what}s can be lost, one at a time"
     return f"it stays rigid without any one {what} but {join_names(needed)}"
 
 
@@ -342,9 +323,9 @@ def unused_gains(plans: Sequence[Plan]) -> Iterator[Finding]:
 def _unknown_reads(analysis: Analysis) -> str:
     """Words on what the law of the first robot with neighbours reads at the start although it is unknown."""
     plan, starts = analysis.plan, analysis.start.tolist()
-    if not len(analysis.links):
+    if not len(analysis.plan.links):
         return ""
-    row = int(analysis.links.receiver[0])
+    row = int(analysis.plan.links.receiver[0])
     goals = GoalComputer(plan.assignment(plan.names[row], centrally=plan.names[row] in plan.guided))
     for number, sender in enumerate(goals.neighbours.all):
         goals.neighbours.mark_alive(number)
@@ -356,7 +337,7 @@ def _unknown_reads(analysis: Analysis) -> str:
 def load(analysis: Analysis) -> tuple[int, int, float]:
     """Payload of a pose with its numbers at their longest, and of what is said [bytes]; its largest rate [kbit/s]."""
     plan, experiment = analysis.plan, analysis.plan.experiment
-    name = max(analysis.names, key=len)
+    name = max(analysis.plan.names, key=len)
     said = Stepping(plan.assignment(name)).says if plan.law.SAYS else {}
     bare, whole = (
         len(messages.encode(messages.pose(name, *LONG_POSE, yaw=LONG_YAW, words=words), experiment.network.encoding))
@@ -364,51 +345,52 @@ def load(analysis: Analysis) -> tuple[int, int, float]:
     )
     rate = experiment.rates.pose_hz
     if plan.trigger.TIMED:
-        rate = min(rate, analysis.prediction.messages_hz / len(analysis.names))
+        rate = min(rate, analysis.prediction.messages_hz / len(analysis.plan.names))
     return whole, whole - bare, 8e-3 * whole * rate
 
 
-def strength(analysis: Analysis) -> str:
-    """Parameters that make the law ask for more or less: one of `GAIN`, or its own if it goes by these alone."""
+def strength(analysis: Analysis, wants: int = BY_DISTANCE) -> tuple[str, Path]:
+    """Parameters that make the law ask for more or less, in words and by their place in the file.
+
+    The gain of [formation] for links with such a target, or the law's own parameters if it goes by these alone.
+    """
     law, links = analysis.law, analysis.asked
     place = analysis.start + 0.1 * np.random.default_rng(0).normal(size=analysis.start.shape)
     single = law_offsets(law, place, place[links.sender], links)
     stronger = msgspec.structs.replace(links, gain=2.0 * links.gain)
     double = law_offsets(law, place, place[links.sender], stronger)
-    if analysis.anchors or not np.array_equal(single, double, equal_nan=True):
-        return GAIN[law.PULLS_BY]
-    return f"the law's own parameters ({', '.join(law.__struct_fields__) or 'it has none yet'})"
+    if analysis.plan.anchors_by_row or not np.array_equal(single, double, equal_nan=True):
+        return GAIN[law.PULLS_BY], ("formation", gain_key(law, wants))
+    return f"the law's own parameters ({', '.join(law.__struct_fields__) or 'it has none yet'})", ("formation", "law")
 
 
 def stability(analysis: Analysis) -> Iterator[Finding]:
     """Check that the sampled loop is stable near the shape."""
-    loop, shape, formation = analysis.modes, analysis.shape, analysis.plan.experiment.formation
-    if loop is None or shape is None or shape.worst > FAR_OFF or next(lengths(analysis), None) is not None:
+    loop, shape, formation = analysis.modes, analysis.met_shape, analysis.plan.experiment.formation
+    if loop is None or shape is None or next(lengths(analysis), None) is not None:
         return
     law, choice = analysis.law, analysis.plan.law_name
     if not math.isfinite(loop.gain):
         place, links = shape.position, analysis.asked
         offset = law_offsets(law, place, place[links.sender], links)
-        bad = join_names([analysis.names[row] for row in np.flatnonzero(~np.isfinite(offset).all(axis=1))])
+        bad = join_names([analysis.plan.names[row] for row in np.flatnonzero(~np.isfinite(offset).all(axis=1))])
         what = f"for {bad} no number" if bad else "numbers that jump between neighbouring places"
         message = f"the law '{choice}' gives {what} where the formation is met"
         apart = [tuple(each) for each in (place[links.receiver] - place[links.sender]).tolist()]
-        reads = unknown_reads(
+        message += unknown_reads(
             law,
             lambda watched: [law.pull(each, watched(link)) for each, link in zip(apart, unlinked(links), strict=True)],
         )
-        message += reads
         remedy = "look for a length of 0 and for fields of `links` that are NaN (docs/plugins.md)"
         yield Finding("error", "not-finite", message, remedy, ("formation", "law"))
         return
-    name = gain_key(law, BY_DISTANCE if _measured(analysis).any() or not analysis.standing.any() else BY_RELATIVE)
-    path, gain = ("formation", name), float(getattr(formation, name))
-    took = f"gain {loop.gain:.3g} (h·{'μ' if name == 'gain' else 'k'}·λ)"
-    calm = f"use a {name} below {gain * OSCILLATING_GAIN / max(loop.gain, 1e-12):.2g}"
-    if (own := strength(analysis)) not in GAIN.values():
-        took = f"gain {loop.gain:.3g}"
-        calm = f"the law '{choice}' does not use `links.gain`: let it ask for less by {own}"
-        path = ("formation", "law")
+    wants = BY_DISTANCE if _measured(analysis).any() or not analysis.standing.any() else BY_RELATIVE
+    own, path = strength(analysis, wants)
+    took = f"gain {loop.gain:.3g}"
+    calm = f"the law '{choice}' does not use `links.gain`: let it ask for less by {own}"
+    if path[-1] == (name := gain_key(law, wants)):
+        took += f" (h·{'μ' if name == 'gain' else 'k'}·λ)"
+        calm = f"use a {name} below {getattr(formation, name) * OSCILLATING_GAIN / max(loop.gain, 1e-12):.2g}"
     if loop.gain >= UNSTABLE_GAIN:
         yield Finding("error", "unstable", f"the sampled loop is unstable: {took}, limit {UNSTABLE_GAIN:g}", calm, path)
     elif shape.worst <= FORGIVEN and loop.radius > 1.0 + FORGIVEN:

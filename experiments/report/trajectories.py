@@ -167,9 +167,9 @@ def expected_motion(analyses: Mapping[str, Analysis]) -> Figure:
         for link, (i, j) in enumerate(zip(known.asked.receiver, known.asked.sender, strict=True)):
             style = "-" if error[link] <= experiment.tolerance else (0, (2, 2))
             axes.plot(*target[[i, j], :2].T, color=MAGENTA, linewidth=0.8, linestyle=style, zorder=1)
-        for row, robot in enumerate(known.names):
+        for row, robot in enumerate(known.plan.names):
             colour = ROBOTS[row % len(ROBOTS)]
-            if len(known.names) > MAX_COLOURED_ROBOTS:
+            if len(known.plan.names) > MAX_COLOURED_ROBOTS:
                 colour = KINDS[experiment.robots[robot].kind].colour
             axes.plot(motion[:, row, 0], motion[:, row, 1], color=colour, linewidth=0.6)
             axes.plot(*known.start[row, :2], "o", ms=3.0, mec=colour, mfc="none", mew=0.7)
@@ -199,7 +199,7 @@ def _laid_upon(known: Analysis, shape: Array, place: Array) -> Array:
     Leaders and anchors keep it where it is. Distances leave it free to turn and be mirrored, about a single leader.
     """
     fixed = known.without_neighbours
-    if known.anchors:
+    if known.plan.anchors_by_row:
         return shape
     about = fixed if len(fixed) else np.arange(len(shape))
     middle, at = shape[about, :2].mean(axis=0), place[about, :2].mean(axis=0)

@@ -88,7 +88,7 @@ def _examined(file: str, settings: Sequence[str], kept: KeptVerdict) -> tuple[Ve
     from experiments.file import document
 
     given = document.read(file, settings)
-    analysed = analyses(given)
+    analysed = analyses(given.cases())
     verdict = Verdict(str(given.path), given.experiment.title, *examine(given, analysed))
     kept.keep(verdict)
     return verdict, analysed

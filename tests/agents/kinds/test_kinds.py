@@ -17,7 +17,7 @@ from agents.kinds.omni import OMNI
 from agents.kinds.theory import DOUBLE_INTEGRATOR, POINT, UNICYCLE
 from agents.plugins.registry import PluginError
 from agents.safety.setpoint_filter import SetpointFilter
-from experiments.check.analysis import analyse
+from experiments.check.analysis import Analysis
 from experiments.check.ideal_run import predict
 from experiments.check.motion import turning_circle
 from experiments.file.document import loads
@@ -93,7 +93,7 @@ def test_a_formation_follows_without_hazards(kind):
 def test_check_says_what_cannot_turn_on_the_spot():
     for kind, codes in (("ackermann", ["turning-circle"]), ("omni", [])):
         (case,) = following(kind).cases().values()
-        assert [each.code for each in turning_circle(analyse(case, predict(case)))] == codes
+        assert [each.code for each in turning_circle(Analysis(case, predict(case)))] == codes
 
 
 @pytest.mark.parametrize("kind", ["omni", "ackermann", "point", "double-integrator"])

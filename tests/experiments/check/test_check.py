@@ -19,7 +19,7 @@ from agents.plugins import registry
 from agents.plugins.law import Control, Law
 from agents.plugins.laws import Gradient
 from agents.vectors import UNKNOWN, ZERO, norm
-from experiments.check.analysis import analyse
+from experiments.check.analysis import Analysis
 from experiments.check.check import check, examine, figures
 from experiments.check.findings import CheckNumbers
 from experiments.check.ideal_run import Prediction
@@ -361,8 +361,8 @@ def test_errors_and_warnings_have_remedies_and_places(made):
 def test_batteries_ending_before_the_run_are_all_named():
     def messages_after(duration_s: float, **safety: float) -> list[str]:
         made = changed(reference(), duration_s=duration_s, safety=changed(reference().safety, **safety))
-        standing = Prediction(np.zeros(1), np.zeros((1, len(made.robots), 3)))
-        return [each.message for each in batteries(analyse(Plan(made), standing))]
+        standing = Prediction(np.zeros(1), np.zeros((1, len(made.robots), 3)), 0, 0.0)
+        return [each.message for each in batteries(Analysis(Plan(made), standing))]
 
     wheels, drones = messages_after(12000.0)
     assert "TB01 stops after about 8095 s of 12000 s" in wheels  # a Khepera lasts five hours

@@ -8,7 +8,7 @@ import pytest
 
 from agents.body.interface import BodyError
 from agents.body.kinds import KINDS, Kind
-from experiments.check.analysis import analyse
+from experiments.check.analysis import Analysis
 from experiments.check.ideal_run import predict
 from experiments.definition.bodies import choose_bodies
 from experiments.file.document import load, loads
@@ -71,5 +71,5 @@ def test_kind_without_protocol_twin_is_refused_by_name(monkeypatch):
 def test_many_robots_of_an_uncoloured_kind_are_drawn(monkeypatch):
     monkeypatch.setitem(KINDS.loaded, KIND, MOVING)
     cases = loads(ROVERS).cases()
-    figure = trajectories.expected_motion({name: analyse(case, predict(case)) for name, case in cases.items()})
+    figure = trajectories.expected_motion({name: Analysis(case, predict(case)) for name, case in cases.items()})
     assert ALPHABOT.colour in {line.get_color() for line in figure.axes[0].lines}

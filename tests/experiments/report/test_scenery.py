@@ -132,10 +132,10 @@ def test_robots_on_the_floor_stand_on_it(short):
 @pytest.mark.slow
 def test_target_shape_is_laid_on_the_leader():
     given = document.read("robotic-park", ["timeline=[]", "duration_s=15"])
-    known = analyses(given)["event"]
+    known = analyses(given.cases())["event"]
     axes = expected_motion({"event": known}).axes[0]
     target = [line.get_xydata()[0] for line in axes.lines if line.get_marker() == "D"]
-    leader = known.names.index("TB01")
+    leader = known.plan.names.index("TB01")
     assert target[leader] == pytest.approx(known.start[leader, :2], abs=1e-9)
     ends = [line.get_xydata()[0] for line in axes.lines if line.get_marker() == "o" and line.get_markersize() == 3.5]
     assert np.array(ends) == pytest.approx(known.prediction.position[-1, :, :2])
