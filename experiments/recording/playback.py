@@ -170,7 +170,7 @@ def read(path: Path) -> Playback:
         NotStarted: If the run ended before its common start.
         RecordingError: If the file is no recording of zenpark, or of another version.
     """
-    content = _Content(Records(path))
+    content = Content(Records(path))
     messages = content.fill()
     records = content.records
     about = AboutRun.of(records)
@@ -185,7 +185,7 @@ def read(path: Path) -> Playback:
     return Playback(trace, start, records.complete, messages)
 
 
-class _Content:
+class Content:
     """The messages of a recording, by kind."""
 
     def __init__(self, records: Records) -> None:
@@ -249,16 +249,16 @@ class _Content:
         return lambda data: append(decode(data))
 
 
-def _trace(content: _Content, about: AboutRun, run: tuple[float, float]) -> Trace:
+def _trace(content: Content, about: AboutRun, run: tuple[float, float]) -> Trace:
     """The trace of a run by its common start, UTC, and its length [s]."""
     plan, experiment, robots = about.plan, about.plan.experiment, about.plan.names
     rate, (start, duration) = experiment.rates.state_hz, run
     time = np.arange(math.floor(duration * rate + 1e-9) + 1) / rate
-    states = _by_robot(content[State], robots)
+    states = by_robot(content[State], robots)
     poses = [
-        list({(pose.stamp, pose.seq): pose for pose in own}.values()) for own in _by_robot(content[SentPose], robots)
+        list({(pose.stamp, pose.seq): pose for pose in own}.values()) for own in by_robot(content[SentPose], robots)
     ]
-    statuses = _by_robot(content[Status], robots)
+    statuses = by_robot(content[Status], robots)
 
     def counted(what: str) -> Index:
         """A counter of each robot at the end of the run, 0 without a status."""
@@ -269,7 +269,7 @@ def _trace(content: _Content, about: AboutRun, run: tuple[float, float]) -> Trac
     known = {what: each for what, each in columns.items() if what not in OPTIONAL or np.isfinite(each).any()}
     contacts = messages_in_run(content[Contact], start, duration)
     world = messages_in_run(content[WorldState], start, duration)
-    told, stepping = _by_robot(content[LawMemory], robots), HOLD_PERIODS / min(rate, experiment.rates.coordination_hz)
+    told, stepping = by_robot(content[LawMemory], robots), HOLD_PERIODS / min(rate, experiment.rates.coordination_hz)
     goals = _goals(content, states, robots, start, duration) if plan.guided else None
     return Trace(
         case=about.case,
@@ -303,7 +303,7 @@ def _trace(content: _Content, about: AboutRun, run: tuple[float, float]) -> Trac
     )
 
 
-def _by_robot(messages: Iterable[M], robots: Sequence[str]) -> list[list[M]]:
+def by_robot(messages: Iterable[M], robots: Sequence[str]) -> list[list[M]]:
     """For each robot its messages in order of time."""
     found: dict[str, list[M]] = {robot: [] for robot in robots}
     for message in messages:
@@ -421,7 +421,7 @@ def _received(states: list[list[State]], plan: Plan, start: float, duration: flo
     return received_in_run(replace(_table(rows), yaw=None, bytes=None).since(start), duration)
 
 
-def _goals(content: _Content, states: list[list[State]], robots: Sequence[str], start: float, duration: float) -> Goals:
+def _goals(content: Content, states: list[list[State]], robots: Sequence[str], start: float, duration: float) -> Goals:
     """Messages between the central controller and the robots that it guides."""
     row = {name: number for number, name in enumerate(robots)}
     own = (goal for goal in content[SentGoal] if goal.robot in row and is_count(goal.seq))

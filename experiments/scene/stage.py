@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import cached_property
@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 from agents.body.kinds import Kind
 from agents.decision.lifecycle import Phase
 from agents.kinds.theory import POINT
-from agents.network.messages import EMERGENCY, Ranges, Status, WorldState
+from agents.network.messages import EMERGENCY, Ranges, State, Status, WorldState
 from agents.plugins import registry
 from agents.plugins.laws import Gradient
+from experiments.arrays import known_rows
 from experiments.definition.experiment import WORLD
 from experiments.definition.graph import Links, links
 from experiments.definition.plan import Plan
@@ -90,6 +91,7 @@ CONDITIONS: Final[dict[Condition, tuple[str, Colour]]] = {
     Condition.DEAD: ("dead", (213, 50, 30)),
 }
 RINGED: Final = (Condition.LANDING, Condition.HELD, Condition.SILENT, Condition.STOPPED, Condition.DEAD)
+AT_REST: Final = (Condition.WAITING, Condition.DONE)  # their goals are not drawn
 PALED: Final = (Condition.SILENT, Condition.STOPPED, Condition.DEAD)
 
 
@@ -265,6 +267,23 @@ class Moment:
     time: float | None = None  # [s] since the common start; None before it
     places: Array | None = None  # (N, P, 3) [m] that the robots say, see `SceneModel.said_places`
     measures: Sequence[Mapping[str, float]] = ()  # of the law, by robot; none known if empty
+
+
+NO_STATE: Final = State("", 0, math.nan, "")
+
+
+def drawn_columns(states: Iterable[State | None]) -> dict[str, Array]:
+    """Drawn fields of states as rows, by their names in `Moment`; NaN where unknown."""
+    known = [NO_STATE if state is None else state for state in states]
+    yaws = (each.yaw if each.true_yaw is None else each.true_yaw for each in known)
+    return {
+        "position": known_rows((each.true_position or each.position for each in known), 3),
+        "yaw": known_rows(yaws)[:, 0],
+        "goal": known_rows((each.goal for each in known), 3),
+        "attitude": known_rows((each.attitude for each in known), 4),
+        "shadow": known_rows((each.shadow_position for each in known), 3),
+        "shadow_yaw": known_rows(each.shadow_yaw for each in known)[:, 0],
+    }
 
 
 class LinkTracker:

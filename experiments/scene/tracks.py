@@ -2,41 +2,30 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
-from itertools import accumulate, islice, pairwise
+from functools import cached_property
+from itertools import pairwise
 from math import nan
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Final, TypeVar
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from agents.decision.lifecycle import Phase
-from agents.network.messages import Event, HostClock, LawMemory, State, Status, WorldState
+from agents.network.messages import Event, LawMemory, State, Status, WorldState
 from experiments.definition.plan import Plan
-from experiments.recording.clocks import Correction
-from experiments.recording.playback import AboutRun, topic_of
-from experiments.recording.reader import HEAD, RecordingError, Records
-from experiments.recording.ros2.cdr import Undecodable, codec
+from experiments.recording.playback import AboutRun, Content, by_robot
+from experiments.recording.reader import Records
 from experiments.recording.topics import SentPose
 from experiments.recording.trace import ROUNDING_S
+from experiments.scene.stage import drawn_columns
 from twins.arrays import Array, Index
 
-M = TypeVar("M", Status, LawMemory)
+M = TypeVar("M", Event, Status, LawMemory, WorldState)
 LOST_S: Final = 1.0  # time without a sample after which a robot is silent
 WORDS: Final = {phase.word: int(phase) for phase in Phase}
-NOWHERE: Final = (nan, nan, nan)
-COLUMNS: Final = np.cumsum([1, 1, 3, 1, 3, 4, 3, 1])  # ends of the columns of `_sample`
-BATCH: Final = 200  # pieces of the file that are taken apart at once
-# fields of a state that are drawn, with their widths
-FIELDS: Final = {
-    "stamp": 1, "position": 3, "yaw": 1, "goal": 3, "true_position": 3, "true_yaw": 1, "attitude": 4,
-    "shadow_position": 3, "shadow_yaw": 1,
-}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -54,6 +43,24 @@ class Track:
     sent: Array  # (P,) [s] of each pose to the neighbours
     statuses: tuple[Status, ...]  # stamps since the common start
     memories: tuple[LawMemory, ...] = ()  # of a law that remembers, likewise
+
+    @classmethod
+    def of_states(
+        cls, states: Sequence[State], sent: Sequence[SentPose], start: float, statuses: Sequence[Status],
+        memories: Sequence[LawMemory],
+    ) -> Track:  # fmt: skip
+        """The track of a robot by its messages, in order of time, of a run that began at `start` [s, UTC]."""
+        # of several states of one sample the first has the pose
+        time, first = np.unique(np.array([state.stamp for state in states], dtype=float), return_index=True)
+        kept = [states[k] for k in first.tolist()]
+        return cls(
+            time=time - start,
+            phase=np.array([WORDS.get(state.phase, 0) for state in kept], dtype=np.intp),
+            sent=np.unique(np.array([pose.stamp for pose in sent], dtype=float)) - start,
+            statuses=_since(start, statuses),
+            memories=_since(start, memories),
+            **drawn_columns(kept),
+        )
 
     def at(self, t: float) -> int:
         """Number of the last sample at or before `t` [s]; −1 before the first."""
@@ -95,141 +102,31 @@ def read(path: Path) -> Tracks:
         NotStarted: If no robot had started when the recording ended.
         RecordingError: If the file is no recording of zenpark, or of another version.
     """
-    records = Records(path)
-    samples: dict[str, list[Array]] = {}
-    sent: dict[str, list[Array]] = {}
-    rare: dict[type, list[Any]] = {kind: [] for kind in (Event, Status, WorldState, HostClock, LawMemory)}
-    for data, starts in _batches(records):
-        heads = _gathered(data, starts, HEAD)[:, 0]
-        for channel in np.unique(heads["channel"]).tolist():
-            if channel not in records.channels or (topic := topic_of(records, channel)) is None:
-                continue
-            kind, name = topic.recorded, records.channels[channel].topic
-            rows = np.flatnonzero(heads["channel"] == channel)
-            robot = name.split("/")[1]
-            if issubclass(kind, SentPose):
-                sent.setdefault(robot, []).append(heads["published"][rows] / 1e9)
-                continue
-            begins, ends = starts[rows] + HEAD.itemsize, starts[rows] + heads["length"][rows].astype(np.intp) + 9
-            try:
-                if kind is State:
-                    samples.setdefault(robot, []).append(_samples(data, begins, ends, robot))
-                elif kind in rare:
-                    rare[kind] += [codec(kind).decode(data[at:end]) for at, end in zip(begins, ends, strict=True)]
-            except Undecodable as error:
-                raise RecordingError(f"{path}: a message of {name} is damaged: {error}") from None
-    run = AboutRun.of(records)
-    plan = run.plan
-    events, statuses = sorted(rare[Event], key=lambda event: event.stamp), rare[Status]
-    start = run.start(events, statuses, path)
-    right = Correction(rare[HostClock])
-    robots = plan.names
-
-    def since(robot: str, stamps: Array) -> Array:
-        return right.stamps(robot, stamps) - start
-
-    def told(name: str, messages: Sequence[M]) -> tuple[M, ...]:
-        own = sorted((each for each in messages if each.robot == name), key=lambda each: each.stamp)
-        return tuple(msgspec.structs.replace(each, stamp=float(since(name, np.array(each.stamp)))) for each in own)
-
-    def track(name: str) -> Track:
-        table = np.concatenate([np.zeros((0, COLUMNS[-1])), *samples.get(name, ())])
-        time = since(name, table[:, 0])
-        _, order = np.unique(time, return_index=True)  # several states of one sample: the first has the pose
-        order = order[np.isfinite(time[order])]
-        _, phase, position, yaw, goal, attitude, shadow, shadow_yaw, _ = np.split(table[order], COLUMNS, axis=1)
-        poses = since(name, np.unique(np.concatenate([np.zeros(0), *sent.get(name, ())])))
-        return Track(
-            time[order], phase[:, 0].astype(np.intp), position, yaw[:, 0], goal, attitude, shadow, shadow_yaw[:, 0],
-            sent=poses[np.isfinite(poses)],
-            statuses=told(name, statuses),
-            memories=told(name, rare[LawMemory]),
-        )  # fmt: skip
-
-    tracks = tuple(map(track, robots))
-    said = [msgspec.structs.replace(event, stamp=event.stamp - start) for event in events]
-    if not any(event.kind == "hazard" for event in said):
-        said += _incidents(tracks)
-    reports = tuple(msgspec.structs.replace(each, stamp=each.stamp - start) for each in rare[WorldState])
+    content = Content(Records(path))
+    content.fill()
+    run = AboutRun.of(content.records)
+    robots, start = run.plan.names, run.start(content[Event], content[Status], path)
+    states, sent = by_robot(content[State], robots), by_robot(content[SentPose], robots)
+    statuses, memories = by_robot(content[Status], robots), by_robot(content[LawMemory], robots)
+    tracks = tuple(
+        Track.of_states(*own[:2], start, *own[2:]) for own in zip(states, sent, statuses, memories, strict=True)
+    )
+    events = _since(start, content[Event])
+    if not any(event.kind == "hazard" for event in events):
+        events = (*events, *_incidents(tracks))
     there = [track.time for track in tracks if len(track.time)]
     return Tracks(
-        run.case, plan, run.clock, robots, tracks, tuple(sorted(said, key=lambda event: event.stamp)), reports,
+        run.case, run.plan, run.clock, robots, tracks,
+        events=tuple(sorted(events, key=lambda event: event.stamp)),
+        world=_since(start, content[WorldState]),
         begin=min([0.0, *(float(time[0]) for time in there)]),
         end=max([0.0, *(float(time[-1]) for time in there)]),
     )  # fmt: skip
 
 
-def _batches(records: Records) -> Iterator[tuple[bytes, Index]]:
-    """Several pieces of the file as one, with the places of the messages in it."""
-    pieces = records.pieces()
-    while batch := list(islice(pieces, BATCH)):
-        offsets = accumulate((len(data) for data, _ in batch), initial=0)
-        places = [np.array(own, dtype=np.intp) + at for (_, own), at in zip(batch, offsets, strict=False)]
-        yield b"".join(data for data, _ in batch), np.concatenate(places)
-
-
-def _gathered(data: bytes, places: Index, kind: str | np.dtype[Any], width: int = 1) -> NDArray[Any]:
-    """`width` values of a type (K, width) at each of some places (K,) in bytes."""
-    size = np.dtype(kind).itemsize * width
-    found: NDArray[Any] = np.frombuffer(data, np.uint8)[places[:, None] + np.arange(size)].view(kind)
-    return found
-
-
-def _samples(data: bytes, begins: Index, ends: Index, robot: str) -> Array:
-    """Rows as of `_sample` (K, 17) of the states of a robot that lie between places in bytes (K,).
-
-    A state costs a tenth of its decoding. The drawn fields are taken out of all states of one phase at once, by their
-    places after the beginning, or before the end if they follow a list. Only states of other layouts are decoded.
-    """
-    table = np.full((len(begins), COLUMNS[-1]), nan)
-    left = np.arange(len(begins))
-    for word, number in WORDS.items():
-        fields, text, least = _layout(robot, word)
-        rows = left[(ends - begins)[left] >= least]
-        same = _gathered(data, begins[rows] + fields["stamp"][0] + 8, f"V{len(text)}") == np.void(text)
-        rows = rows[(same & (_gathered(data, ends[rows] - 4, "<u4") == 0))[:, 0]]  # no goals of a centre at the end
-        found = {
-            name: _gathered(data, (begins if at > 0 else ends)[rows] + at, "<f8", width)
-            for name, (at, width) in fields.items()
-        }
-        for name in ("position", "yaw"):
-            found[name] = np.where(np.isnan(found["true_" + name]), found[name], found["true_" + name])
-        drawn = ("position", "yaw", "goal", "attitude", "shadow_position", "shadow_yaw")
-        table[rows] = np.column_stack([found["stamp"], np.full(len(rows), number), *(found[name] for name in drawn)])
-        left = np.setdiff1d(left, rows)
-    for row in left.tolist():
-        table[row] = _sample(codec(State).decode(data[begins[row] : ends[row]]))
-    return table
-
-
-@lru_cache(256)
-def _layout(robot: str, phase: str) -> tuple[dict[str, tuple[int, int]], bytes, int]:
-    """Places of the drawn fields in the bytes of a state [bytes], with their widths, found by a state of known numbers.
-
-    Also the bytes of its phase, which follow the stamp, and the least length of a state.
-    """
-    marks = {name: tuple(1e9 + 100.0 * k + j for j in range(width)) for k, (name, width) in enumerate(FIELDS.items())}
-    values: dict[str, Any] = {name: mark if len(mark) > 1 else mark[0] for name, mark in marks.items()}
-    made = codec(State).encode(State(robot, 0, phase=phase, **values))
-    places = {name: made.index(struct.pack("<d", mark[0])) for name, mark in marks.items()}
-    text = made[places["stamp"] + 8 :][: 4 + len(phase) + 1]
-    behind = places["attitude"]  # lists stand before it
-    return {n: (at if at < behind else at - len(made), FIELDS[n]) for n, at in places.items()}, text, len(made)
-
-
-def _sample(state: State) -> tuple[float, ...]:
-    """The row of a state: stamp, phase, position, yaw, goal, attitude, position and yaw of the shadow twin."""
-    yaw = state.yaw if state.true_yaw is None else state.true_yaw
-    return (
-        state.stamp,
-        WORDS.get(state.phase, 0),
-        *(state.true_position or state.position or NOWHERE),
-        nan if yaw is None else yaw,
-        *(state.goal or NOWHERE),
-        *(state.attitude or (*NOWHERE, nan)),
-        *(state.shadow_position or NOWHERE),
-        nan if state.shadow_yaw is None else state.shadow_yaw,
-    )
+def _since(start: float, messages: Sequence[M]) -> tuple[M, ...]:
+    """Messages with stamps that count from `start` [s, UTC]."""
+    return tuple(msgspec.structs.replace(each, stamp=each.stamp - start) for each in messages)
 
 
 def _incidents(tracks: Sequence[Track]) -> Iterator[Event]:

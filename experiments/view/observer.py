@@ -17,10 +17,9 @@ from agents.clock import Clock
 from agents.network import messages, pubsub
 from agents.network.keys import Keys
 from agents.network.session import received
-from experiments.arrays import known_rows
 from experiments.file import document
 from experiments.file.problems import DocumentError
-from experiments.scene.stage import SILENT_S, Condition, LinkTracker, Moment, SceneModel, Trail, condition
+from experiments.scene.stage import AT_REST, SILENT_S, LinkTracker, Moment, SceneModel, Trail, condition, drawn_columns
 from experiments.view.heartbeat import DataAge
 
 UNKNOWN_S: Final = 2.0  # time without an experiment after which robots are drawn that are known by name only
@@ -205,27 +204,22 @@ class Observer:
     def moment(self) -> Moment:
         now, stage = time.monotonic(), self.stage
         reports = [self.robots[name] for name in stage.names]
-        states = [report.state for report in reports]
-        position = known_rows((s.true_position or s.position if s else None for s in states), 3)
+        columns = drawn_columns(report.state for report in reports)
+        position = columns["position"]
         elapsed = self.elapsed
         error = self._tracker.errors(elapsed, position)
         self._trail.add(now, position)
-        conditions = [condition(r.status, alive=r.alive, silent=now - r.heard_at > SILENT_S) for r in reports]
-        under_way = [None if s is None or c in (Condition.WAITING, Condition.DONE) else s.goal
-                     for s, c in zip(states, conditions, strict=True)]  # fmt: skip
+        silent = [now - report.heard_at > SILENT_S for report in reports]
+        conditions = [condition(r.status, alive=r.alive, silent=s) for r, s in zip(reports, silent, strict=True)]
+        columns["goal"][np.isin(conditions, AT_REST)] = np.nan
         return Moment(
-            position=position,
-            yaw=known_rows((s.yaw if s.true_yaw is None else s.true_yaw) if s else None for s in states)[:, 0],
-            goal=known_rows(under_way, 3),
+            **columns,
             condition=np.array(conditions, dtype=np.intp),
             silent_for=np.array([now - report.sent_at for report in reports]),
             error=error,
             broken=stage.broken_links(np.array(conditions), [report.status for report in reports]),
             obstacles=stage.obstacles_at(elapsed or 0.0, self.world),
             trail=self._trail.points,
-            attitude=known_rows((s.attitude if s else None for s in states), 4),
-            shadow=known_rows((s.shadow_position if s else None for s in states), 3),
-            shadow_yaw=known_rows(s.shadow_yaw if s else None for s in states)[:, 0],
             time=elapsed,
             places=stage.said_places([report.memory.variables for report in reports], position),
             measures=[report.memory.numbers for report in reports],

@@ -16,7 +16,7 @@ from agents.network.messages import LawMemory, Status, WorldState
 from experiments.definition.formation import errors_over_time
 from experiments.recording.trace import ROUNDING_S
 from experiments.scene.drawing import SceneDrawing
-from experiments.scene.stage import TRAIL, TRAIL_S, Condition, LinkTracker, Moment, SceneModel, condition
+from experiments.scene.stage import AT_REST, TRAIL, TRAIL_S, Condition, LinkTracker, Moment, SceneModel, condition
 from experiments.scene.tracks import LOST_S, Track, Tracks
 from experiments.view.live import FRAME_S, IDLE_S, TABLE_S, Page
 from experiments.view.panel import HISTORY_S, PLOT_S, History, RobotRow, known, robot_row
@@ -50,7 +50,7 @@ class Film:
         conditions = np.array([_condition(track, k, t) for track, k in zip(tracks, at, strict=True)], dtype=np.intp)
         goal = _taken(tracks, at, "goal", 3)
         memories = [_last_status(track.memories, t) or NOTHING for track in tracks]
-        goal[np.isin(conditions, (Condition.WAITING, Condition.DONE))] = nan
+        goal[np.isin(conditions, AT_REST)] = nan
         return Moment(
             position=position,
             yaw=_taken(tracks, at, "yaw", 1)[:, 0],
