@@ -118,7 +118,7 @@ def world() -> Iterator[Target]:
         net.forget()
         joint = Network(net.session, KEYS, [], [], OwnershipCheck([]))  # type: ignore[arg-type]
         process = WorldProcess(Plan(experiment), WorldBodies(Plan(experiment)), joint, Event())
-        process.exchange.utc = time.time()
+        process.utc = time.time()
         for k in count(1):
             net.deliver((yield))
             process._tick(0.01 * k)

@@ -42,7 +42,6 @@ class CaseProcesses:
     """Starts, watches and ends the processes of one case."""
 
     def __init__(self, context: CaseContext) -> None:
-        """Start nothing yet."""
         self._context = context
         self._launcher = context.launcher
         self._groups = context.plan.experiment.processes  # by process, without the case
@@ -67,7 +66,6 @@ class CaseProcesses:
             self._addressed.write_bytes(write_json(self._reached))
 
     def _record(self) -> Process:
-        """Start a recorder, which writes a file of its own."""
         context = self._context
         first = not self._parts
         self._parts.append(context.recording if first else context.file.with_name(f"part{len(self._parts) + 1}.mcap"))
@@ -77,7 +75,6 @@ class CaseProcesses:
 
     @property
     def recording(self) -> bool:
-        """Whether a recorder runs."""
         return self._launcher.running(self._context.process("recorder"))
 
     def kill_recorder(self) -> None:
@@ -194,22 +191,21 @@ class CaseProcesses:
         """Processes that ended since the last call; recorder, router, world, centre and positioning restart,
         a few times."""
         for process in self._launcher.died():
-            again = self._support.again(process)
-            if again is not None:
+            role, end, because = process.name.removeprefix(self._context.process("")), process.exit, process.because
+            if (again := self._support.again(process)) is not None:
                 yield Death(again[0], "conductor", again[1])
             elif process.name in self._support.standins:
-                what = process.name.removeprefix(self._context.process(""))
-                text = f"the {what} ended ({process.exit}); robots that need it hold, or land{process.because}"
+                text = f"the {role} ended ({end}); robots that need it hold, or land{because}"
                 yield Death("device", "conductor", text)
             elif process.name == ZYGOTE:
-                what = f"the zygote ended ({process.exit}); processes are started without it{process.because}"
-                yield Death("zygote", "conductor", what)
+                text = f"the zygote ended ({end}); processes are started without it{because}"
+                yield Death("zygote", "conductor", text)
             elif process.name.startswith(STATION):
-                what = f"the connection to it ended ({process.exit}); without a router robots hold{process.because}"
-                yield Death("host", process.name.removeprefix(STATION), what)
+                text = f"the connection to it ended ({end}); without a router robots hold{because}"
+                yield Death("host", process.name.removeprefix(STATION), text)
             else:
-                for name in self._groups.get(process.name.removeprefix(self._context.process("")), []):
-                    yield Death("lost", name, f"its process ended ({process.exit}){process.because}")
+                for name in self._groups.get(role, []):
+                    yield Death("lost", name, f"its process ended ({end}){because}")
 
     def output(self) -> Iterator[tuple[str, str]]:
         """Lines that processes on other machines have printed since the last call, each with its place."""

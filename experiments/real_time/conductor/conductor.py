@@ -48,8 +48,6 @@ LEAVE_S: Final = 8.0  # limit for robots of the previous case to end [s]
 
 @dataclass(frozen=True)
 class CaseResult:
-    """End of a case."""
-
     recording: Path
     start: float | None
     ready_s: float | None
@@ -278,7 +276,6 @@ class Conductor(CaseRun):
             self._view.order(late, messages.Order("start", at=start))
 
     def _report_tardy(self, start: float) -> None:
-        """Report robots that began after the common start."""
         for name in list(self._starting):
             view = self._robots[name]
             if view.began is None and not view.gone and name not in self._changes.under_way:
@@ -328,7 +325,6 @@ class Conductor(CaseRun):
     # ------------------------------------------------------------------ what happens meanwhile
 
     def _update(self) -> None:
-        """Receive all since the last update."""
         now, report = self._clock.utc(), self._view.report
         for name in self._view.update():
             self._miss(name)

@@ -7,7 +7,7 @@ time, so that the conductor never waits.
 from __future__ import annotations
 
 import time
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -18,9 +18,8 @@ from agents.network import messages
 from agents.network.keys import Keys
 from agents.plugins.registry import did_you_mean
 from experiments.definition.plan import Plan
-from experiments.real_time.conductor import replacement
 from experiments.real_time.conductor.case_processes import CaseProcesses
-from experiments.real_time.conductor.replacement import in_the_way
+from experiments.real_time.conductor.replacement import TWIN, Spares, in_the_way
 from experiments.real_time.conductor.run_view import FROZEN_S, NetworkView
 from experiments.real_time.hosts.launcher import LAND_S
 
@@ -37,8 +36,6 @@ Steps = Generator[None, None, str]  # returns the result, in words
 
 @dataclass
 class _Asked:
-    """An order, and its answers so far."""
-
     order: messages.RunOrder
     query: zenoh.Query | None = None
     done: dict[str, str] = field(default_factory=dict)
@@ -67,11 +64,10 @@ class HotChanges:
         self._leaving: set[str] = set()
         self._ended: dict[str, str] = {}  # robots with a process that ended while they joined, and its end
         self._losses: dict[str, int] = {}
-        self._spares = replacement.Spares(plan)
+        self._spares = Spares(plan)
 
     @property
     def under_way(self) -> set[str]:
-        """Robots that are being changed."""
         return {name for change in self._changes for name in change.names}
 
     def begin(self, start: float) -> None:
@@ -261,12 +257,14 @@ class HotChanges:
                 f"{', '.join(foreign)} was not started from here: end its process and start it again where it runs, "
                 f"then `./zenpark robot add {' '.join(foreign)}`"
             )
-        self._require_whole(names)
-        automatic = order.operator == "on_loss"
-        places = {
-            name: tuple(processes.place(name)) for name in names if processes.robot(name).body == replacement.TWIN
-        }
-        yield from self._room(places, ROOM_S if automatic else 0.0)
+        together = processes.companions(names[0])
+        if others := [name for name in together if name not in names]:
+            raise Refusal(
+                f"{', '.join(names)} shares a process with {', '.join(others)}: name them all, "
+                f"`./zenpark robot restart {' '.join(together)}`"
+            )
+        places = {name: processes.place(name) for name in names if processes.robot(name).body == TWIN}
+        yield from self._room(places, ROOM_S if order.operator == "on_loss" else 0.0)
         yield from self._leave(names)
         processes.start_again(names)
         yield from self._join(names)
@@ -278,8 +276,8 @@ class HotChanges:
         if len(self._processes.companions(name)) > 1:
             raise Refusal(f"{name} shares its process with others: restart them together instead")
         next_one, spare = self._spares.successor(name, self._processes.robot(name), order)
-        if next_one.body == replacement.TWIN:
-            places = {name: tuple(self._processes.place(name, next_one))}
+        if next_one.body == TWIN:
+            places = {name: self._processes.place(name, next_one)}
             yield from self._room(places, ROOM_S if order.operator == "on_loss" else 0.0, body_stays=True)
         yield from self._leave(names)
         self._processes.start_again(names, {name: next_one})
@@ -295,14 +293,15 @@ class HotChanges:
             robots[name].left_because = ""
         try:
             yield from self._reach(names, "ready", self._experiment.start.deadline_s + READY_S)
-            yield from self._room({name: self._last_place(name) for name in names}, ROOM_S)
+            yield from self._room({name: robots[name].place or self._processes.place(name) for name in names}, ROOM_S)
             for name in names:
-                takeoff = messages.Order("takeoff", at=self._start, origin=robots[name].origin)
-                yield from self._repeat_order([name], takeoff)
+                yield from self._repeat_order(
+                    name, messages.Order("takeoff", at=self._start, origin=robots[name].origin)
+                )
             yield from self._reach(names, "airborne", CLIMB_S)
             for name in names:
-                start = messages.Order("start", at=self._start, origin=robots[name].origin)
-                yield from self._repeat_order([name], start)
+                order = messages.Order("start", at=self._start, origin=robots[name].origin)
+                yield from self._repeat_order(name, order)
             yield from self._reach(names, "running", FROZEN_S)
         except Refusal:
             self._leaving |= {*names}
@@ -312,14 +311,13 @@ class HotChanges:
                 robots[name].left_because = "removed"
             raise
 
-    def _repeat_order(self, names: Sequence[str], order: messages.Order) -> Generator[None]:
+    def _repeat_order(self, name: str, order: messages.Order) -> Generator[None]:
         """Repeat an order until it is accepted: a robot may not be ready yet, and a busy machine lose an answer."""
-        began, left = time.monotonic(), list(names)
-        while refused := {name: reply for name, reply in self._view.order(left, order).items() if not reply.ok}:
+        began = time.monotonic()
+        while not (reply := self._view.order([name], order)[name]).ok:
             asked = time.monotonic()
             if asked - began > INSIST_S:
-                raise Refusal("; ".join(f"{name}, {order.order}: {reply.reason}" for name, reply in refused.items()))
-            left = list(refused)
+                raise Refusal(f"{name}, {order.order}: {reply.reason}")
             while time.monotonic() - asked < AGAIN_S:
                 yield
 
@@ -334,23 +332,8 @@ class HotChanges:
                 raise Refusal(f"{', '.join(late)}: not {phase} after {limit_s:g} s: {why}")
             yield
 
-    def _require_whole(self, names: Sequence[str]) -> None:
-        """Refuse to restart a process for only some of its robots."""
-        together = self._processes.companions(names[0])
-        if others := [name for name in together if name not in names]:
-            raise Refusal(
-                f"{', '.join(names)} shares a process with {', '.join(others)}: name them all, "
-                f"`./zenpark robot restart {' '.join(together)}`"
-            )
-
-    # ------------------------------------------------------------------ room
-
-    def _last_place(self, name: str) -> tuple[float, ...]:
-        place = self._robots[name].place
-        return tuple(self._processes.place(name)) if place is None else place[:2]
-
     def _room(
-        self, places: dict[str, tuple[float, ...]], patience_s: float, *, body_stays: bool = False
+        self, places: Mapping[str, Sequence[float]], patience_s: float, *, body_stays: bool = False
     ) -> Generator[None]:
         """Wait for at most `patience_s` [s] until the `places`, x, y [m], where robots begin are free.
 

@@ -113,7 +113,6 @@ class Inspector(CaseRun):
     """Checks the robots of one case, see `check_robots`."""
 
     def __init__(self, context: CaseContext, show: ShowProgress, trials: Trials) -> None:
-        """Write the case as a file for its processes; nothing is started yet."""
         super().__init__(context, show)
         self._trials = trials
         self._ended: dict[str, str] = {}  # last words of processes that have ended
@@ -135,9 +134,9 @@ class Inspector(CaseRun):
                 observed = self._observe()
                 today = datetime.now(UTC).date()
                 found = checks.at_rest(observed, self._experiment.safety, today)
-                for name, each in observed.items():
-                    if each.status is not None:
-                        found[name].append(self._stop_at_rest(name))
+                for name in (name for name, each in observed.items() if each.status is not None):
+                    self._phase(f"{name}: stop, motors off")
+                    found[name].append(checks.stop_at_rest(self._experiment.robots[name], self._stop(name, Tried())))
                 self._processes.end_robots()
                 for name, each in observed.items():
                     found[name] += self._try(name, each, red=any(check.verdict == "bad" for check in found[name]))
@@ -150,7 +149,6 @@ class Inspector(CaseRun):
     # ------------------------------------------------------------------ at rest
 
     def _observe(self) -> dict[str, Observed]:
-        """Observe all robots for `SAMPLE_S`."""
         self._phase("observing all at rest")
         observed = {name: Observed(self._experiment.robots[name]) for name in self._robots}
         self._states = {name: each.states for name, each in observed.items()}
@@ -168,14 +166,8 @@ class Inspector(CaseRun):
                 each.ended = "its host has no address: it is started there by hand or at boot; check it there"
         return observed
 
-    def _stop_at_rest(self, name: str) -> Check:
-        self._phase(f"{name}: stop, motors off")
-        tried = Tried()
-        self._stop(name, tried)
-        return checks.stop_at_rest(self._experiment.robots[name], tried)
-
-    def _stop(self, name: str, tried: Tried) -> None:
-        """Order the motors off, and wait until the robot reports that."""
+    def _stop(self, name: str, tried: Tried) -> Tried:
+        """Order the motors off, wait until the robot reports that, and add to what was tried."""
         tried.states = self._states[name] = []
         begun = time.monotonic()
         reply = self._order(name, messages.Order("stop"))
@@ -194,6 +186,7 @@ class Inspector(CaseRun):
         if reply.ok and self._wait(STOP_LIMIT_S, obeyed):
             tried.stopped_s = time.monotonic() - begun
         tried.note = "" if seen.status is None else seen.status.body
+        return tried
 
     # ------------------------------------------------------------------ in motion
 
@@ -201,28 +194,24 @@ class Inspector(CaseRun):
         """Hop or drive, then stop in motion, of one robot; what is red is not moved."""
         robot, asked, safety = each.robot, self._trials, self._experiment.safety
         trials: list[tuple[str, str, bool, Callable[[], Check]]] = [
-            (checks.hop_of(robot), "--hop", asked.hop, lambda: checks.hop(each, self._move(name, robot), safety)),
-            ("stop, motors on", "--stop", asked.stop,
+            (checks.hop_of(robot), "hop", asked.hop, lambda: checks.hop(each, self._move(name, robot), safety)),
+            ("stop, motors on", "stop", asked.stop,
              lambda: checks.stop_in_motion(each, self._move(name, robot, stop=True))),
         ]  # fmt: skip
         own = KINDS[robot.kind].trial
         if own is not None:  # first: the other flights are steered by what it measures
             tries = partial(checks.trial, own, each)
-            trials.insert(0, (own.name, f"--{own.name}", asked.own, lambda: tries(self._own_trial(name, own))))
+            trials.insert(0, (own.name, own.name, asked.own, lambda: tries(self._own_trial(name, own))))
         for check, option, wanted, judge in trials:
-            if not wanted:
-                yield checks.not_tried(check, f"{option} tries it")
-            elif self._context.ended():
-                yield checks.not_tried(check, "not tried: interrupted")
-            elif red:
-                yield checks.not_tried(check, "not tried: mend that first")
-            else:
+            why = "" if wanted else f"--{option} tries it"
+            if wanted and (red or self._context.ended()):
+                why = f"not tried: {'interrupted' if self._context.ended() else 'mend that first'}"
+            if not why:
                 self._phase(f"{name}: {check}")
                 made = judge()
-                if self._context.ended():
-                    made = checks.not_tried(check, "interrupted; it is down")
+                why = "interrupted; it is down" if self._context.ended() else ""
                 red = made.verdict == "bad"
-                yield made
+            yield Check(check, "unknown", why) if why else made
 
     def _own_trial(self, name: str, own: Trial) -> Tried:
         """Trial of a kind, flown at the height of its take-off."""
@@ -281,9 +270,8 @@ class Inspector(CaseRun):
             if time.monotonic() - measured > INSPECT_S:
                 measured = time.monotonic()
                 for _, inspection in self._inspect([name]):
-                    tried.volts = min(tried.volts, math.inf if inspection.volts is None else inspection.volts)
-            charge = None if seen.status is None else seen.status.battery
-            tried.charge = min(tried.charge, math.inf if charge is None else charge)
+                    tried.volts = _lowest(tried.volts, inspection.volts)
+            tried.charge = _lowest(tried.charge, None if seen.status is None else seen.status.battery)
 
         def over() -> bool:
             measure()
@@ -315,16 +303,14 @@ class Inspector(CaseRun):
         self._show(self._progress)
 
     def _update(self) -> None:
-        """Take in what has happened since the last update."""
         self._view.update()
         for state in self._progress.states:
             if state.robot in self._states:
                 self._states[state.robot].append(state)
         for death in self._processes.deaths():
             if death.kind == "lost":
-                self._ended[death.source] = (
-                    self._processes.last_line(death.source).removeprefix("zenpark: ") or death.text
-                )
+                last = self._processes.last_line(death.source).removeprefix("zenpark: ")
+                self._ended[death.source] = last or death.text
             else:
                 self._view.report(death.kind, death.source, death.text)
         self._show_progress()
@@ -364,8 +350,12 @@ class Inspector(CaseRun):
 
 def _moved(states: Sequence[messages.State], robot: RobotTable) -> bool:
     """Whether a robot has begun to climb or to drive."""
-    known = [state.position for state in states if state.position is not None]
-    if len(known) < 2:
+    positions = checks.positions_of(states)
+    if not len(positions):
         return False
-    first, last = known[0], known[-1]
-    return math.dist(first[:2], last[:2]) > MOVED_M if robot.hover is None else last[2] - first[2] > RISEN_M
+    x, y, z = positions[-1] - positions[0]
+    return bool(math.hypot(x, y) > MOVED_M if robot.hover is None else z > RISEN_M)
+
+
+def _lowest(*values: float | None) -> float | None:
+    return min((value for value in values if value is not None), default=None)

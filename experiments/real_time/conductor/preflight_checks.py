@@ -41,7 +41,7 @@ STOP_WAY_M: Final = 0.05  # a robot on wheels rolls no farther after a stop
 RELEASE: Final = re.compile(r"(20\d\d)\.(\d{1,2})")  # as Bitcraze numbers them
 
 
-class Check(msgspec.Struct, frozen=True, kw_only=True):
+class Check(msgspec.Struct, frozen=True):
     """Check of a robot: verdict, reading and remedy."""
 
     check: str
@@ -74,14 +74,10 @@ class Observed:
     inspections: list[messages.Inspection] = field(default_factory=list)
     behind_s: float = math.inf  # least time from a stamp of it to its arrival
 
-    def positions(self) -> Array:
-        """Measured positions (n, 3) [m]."""
-        return np.array([state.position for state in self.states if state.position is not None]).reshape(-1, 3)
-
     def yaw(self) -> float | None:
         """Mean measured yaw [rad]; None if it is not measured."""
-        turned = np.array([state.yaw for state in self.states if state.yaw is not None])
-        return math.atan2(np.sin(turned).sum(), np.cos(turned).sum()) if len(turned) else None
+        turned = [state.yaw for state in self.states if state.yaw is not None]
+        return math.atan2(np.sin(turned).sum(), np.cos(turned).sum()) if turned else None
 
     @property
     def last(self) -> messages.Inspection:
@@ -96,9 +92,14 @@ class Tried:
     failure: str = ""  # why it could not be tried, or what went wrong on the way
     stopped_s: float = math.nan  # from the order to motors off
     states: list[messages.State] = field(default_factory=list)  # from the order to move on, or from that to stop on
-    volts: float = math.inf  # lowest
-    charge: float = math.inf  # lowest
+    volts: float | None = None  # lowest
+    charge: float | None = None  # lowest
     note: str = ""  # of the body, at the end
+
+
+def positions_of(states: Sequence[messages.State]) -> Array:
+    """Measured positions (n, 3) [m]."""
+    return np.array([state.position for state in states if state.position is not None]).reshape(-1, 3)
 
 
 def at_rest(observed: Mapping[str, Observed], safety: Safety, today: date) -> dict[str, list[Check]]:
@@ -122,15 +123,16 @@ def _address(each: Observed) -> Check:
     kind = driven_kind(registry.body_name(each.robot.body))  # another body knows its robot better than we do
     remedy = (kind.connect if kind else "") or "is it switched on, and its address right?"
     if each.status is None:
-        return _bad("address", each.ended or "its process says nothing", remedy)
-    silent = not len(each.positions()) and each.status.battery is None and each.last.firmware is None
-    if silent and each.status.body:
-        return _bad("address", each.status.body, remedy)
+        return Check("address", "bad", each.ended or "its process says nothing", remedy)
+    silent = not len(positions_of(each.states)) and each.status.battery is None and each.last.firmware is None
+    trouble = each.status.body
+    if silent and trouble:
+        return Check("address", "bad", trouble, remedy)
     if silent:
-        return Check(check="address", verdict="unknown", found="it does not say whether it answers")
-    if each.status.body:
-        return Check(check="address", verdict="warn", found=f"answers; {each.status.body}", remedy="its bridge says so")
-    return Check(check="address", verdict="ok", found="answers")
+        return Check("address", "unknown", "it does not say whether it answers")
+    if trouble:
+        return Check("address", "warn", f"answers; {trouble}", "its bridge says so")
+    return Check("address", "ok", "answers")
 
 
 def _firmware(name: str, observed: Mapping[str, Observed], today: date) -> Check:
@@ -148,50 +150,51 @@ def _firmware(name: str, observed: Mapping[str, Observed], today: date) -> Check
             remedy = f"older than {OLD_MONTHS} months: flash the current release"
     if other is not None and not remedy:
         remedy = f"{other} has {observed[other].last.firmware}: flash the same to all of a kind"
-    return Check(check="firmware", verdict="warn" if remedy else "ok", found=found, remedy=remedy)
+    return Check("firmware", "warn" if remedy else "ok", found, remedy)
 
 
 def _battery(each: Observed, status: messages.Status, safety: Safety) -> Check:
     charge, volts = status.battery, each.last.volts
     if charge is None and volts is None:
         return _not_known("battery", each)
-    said = _charged(math.inf if charge is None else charge, math.inf if volts is None else volts)
+    said = _charged(charge, volts)
     if charge is not None and charge < safety.battery_min:
-        return _bad("battery", f"{said}, less than {safety.battery_min:.0%}", KINDS[each.robot.kind].charge)
-    return Check(check="battery", verdict="ok", found=f"{said} at rest")
+        return Check("battery", "bad", f"{said}, less than {safety.battery_min:.0%}", KINDS[each.robot.kind].charge)
+    return Check("battery", "ok", f"{said} at rest")
 
 
-def _charged(charge: float, volts: float) -> str:
-    parts = [f"{charge:.0%}"] if charge < math.inf else []
-    return ", ".join([*parts, *([f"{volts:.2f} V"] if volts < math.inf else [])])
+def _charged(charge: float | None, volts: float | None) -> str:
+    known = ("" if charge is None else f"{charge:.0%}", "" if volts is None else f"{volts:.2f} V")
+    return ", ".join(filter(None, known))
 
 
 def _position(each: Observed, safety: Safety) -> Check:
-    positions = each.positions()
+    positions = positions_of(each.states)
     source = "motion capture" if each.robot.position == "external" else "its positioning system"
     frozen = f"{source} is frozen: is it live, and not paused? It must not fly by that"
     if each.status is not None and FROZEN in each.status.body:
-        return _bad("position", FROZEN, frozen)
+        return Check("position", "bad", FROZEN, frozen)
     if not len(positions):
-        return _bad("position", "none", f"does {source} see it where it stands? `./zenpark echo 'park/*/position'`")
+        remedy = f"does {source} see it where it stands? `./zenpark echo 'park/*/position'`"
+        return Check("position", "bad", "none", remedy)
     spread = float(positions.std(axis=0).max())
     captured = each.robot.position == "external" and registry.body_name(each.robot.body) != WORLD
     if captured and len(positions) > 1 and not np.ptp(positions, axis=0).any():
-        return _bad("position", "the same to the last bit, which no measurement is", frozen)
-    ages = [seen.age_s for seen in each.inspections if seen.age_s is not None]
-    oldest = max(ages, default=0.0)
+        return Check("position", "bad", "the same to the last bit, which no measurement is", frozen)
+    oldest = max((seen.age_s for seen in each.inspections if seen.age_s is not None), default=0.0)
     found = f"spread {1e3 * spread:.1f} mm, at most {1e3 * oldest:.0f} ms old"
     if oldest > STALE * safety.position_timeout_s:
-        return _bad("position", found, f"gaps in {source}: markers or stations hidden, network or radio overloaded")
+        remedy = f"gaps in {source}: markers or stations hidden, network or radio overloaded"
+        return Check("position", "bad", found, remedy)
     if spread > STEADY_M:
         remedy = f"{source} is unsteady for a robot at rest: calibrate it, remove reflections, look for lost markers"
-        return Check(check="position", verdict="bad" if spread > UNSTEADY_M else "warn", found=found, remedy=remedy)
-    return Check(check="position", verdict="ok", found=found)
+        return Check("position", "bad" if spread > UNSTEADY_M else "warn", found, remedy)
+    return Check("position", "ok", found)
 
 
 def _start(name: str, observed: Mapping[str, Observed], safety: Safety) -> Check:
     each = observed[name]
-    positions = each.positions()
+    positions = positions_of(each.states)
     if not len(positions):
         return _not_known("start pose", each)
     here = np.median(positions[:, :2], axis=0)
@@ -202,18 +205,18 @@ def _start(name: str, observed: Mapping[str, Observed], safety: Safety) -> Check
     nearer = min(observed, key=lambda other: _distance(here, observed[other].robot))
     if _distance(here, observed[nearer].robot) < min(away, safety.start_within):
         remedy = f"it stands where {nearer} begins: addresses, markers or robots are swapped"
-        return _bad("start pose", said, remedy)
+        return Check("start pose", "bad", said, remedy)
     if safety.start_within and away > safety.start_within:
         remedy = (
             f"put it at ({each.robot.start[0]:g}, {each.robot.start[1]:g}) m, or correct `start`; its positioning "
             "system may have another origin"
         )
-        return _bad("start pose", said, remedy)
+        return Check("start pose", "bad", said, remedy)
     if turned is not None and abs(turned) > TURNED:
-        return _bad("start pose", said, f"turn it to {wanted:g} rad, or correct `start`")
+        return Check("start pose", "bad", said, f"turn it to {wanted:g} rad, or correct `start`")
     if _counts_from_start(each.robot):
-        return Check(check="start pose", verdict="unknown", found="counts from `start`")
-    return Check(check="start pose", verdict="ok", found=said)
+        return Check("start pose", "unknown", "counts from `start`")
+    return Check("start pose", "ok", said)
 
 
 def _counts_from_start(robot: RobotTable) -> bool:
@@ -230,49 +233,51 @@ def _distance(here: Array, robot: RobotTable) -> float:
 def _radio(each: Observed) -> Check:
     asked, carried = each.last.packets_hz, each.last.capacity_hz
     if asked is None or carried is None:
-        return Check(check="radio", verdict="unknown", found="no shared radio")
+        return Check("radio", "unknown", "no shared radio")
     found = f"{asked:.0f} of {carried:.0f} packets/s"
     if asked > carried:
-        return _bad("radio", found, "lower stream_hz and log_hz, or plug in another radio for some robots")
-    return Check(check="radio", verdict="ok", found=found)
+        return Check("radio", "bad", found, "lower stream_hz and log_hz, or plug in another radio for some robots")
+    return Check("radio", "ok", found)
 
 
 def _clock(name: str, each: Observed, safety: Safety) -> Check:
     if each.behind_s == math.inf:
         return _not_known("clock", each)
     if not AHEAD_S < each.behind_s < BEHIND_S:
-        return _bad("clock", f"its computer's is {-each.behind_s:+.2f} s off", "set it (chrony or NTP), or use [hosts]")
+        found = f"its computer's is {-each.behind_s:+.2f} s off"
+        return Check("clock", "bad", found, "set it (chrony or NTP), or use [hosts]")
     ahead = math.nan if each.last.ahead_s is None else each.last.ahead_s
     if clock_off(ahead, safety.position_timeout_s):
-        return _bad("clock", clock_text(name, ahead), "set the clock of the computer that measures positions")
-    return Check(check="clock", verdict="ok", found=f"{1e3 * each.behind_s:.1f} ms from stamp to arrival")
+        return Check("clock", "bad", clock_text(name, ahead), "set the clock of the computer that measures positions")
+    return Check("clock", "ok", f"{1e3 * each.behind_s:.1f} ms from stamp to arrival")
 
 
 def _ready(status: messages.Status) -> Check:
     """Conditions of take-off, as the robot's own process checks them in a run (`agents.safety.preflight`)."""
     if status.phase == "ready":
-        return Check(check="ready", verdict="ok", found="yes")
+        return Check("ready", "ok", "yes")
     why = status.reason or f"it is {status.phase}"
-    return _bad("ready", why, "docs/safety.md, section `Before take-off`, has every condition")
+    return Check("ready", "bad", why, "docs/safety.md, section `Before take-off`, has every condition")
 
 
 def stop_in_motion(observed: Observed, tried: Tried) -> Check:
     """Emergency stop of a drone that begins to climb, or of a robot that drives."""
     check = stop("stop, motors on", tried)
-    way = _largest_displacement(tried.states)
+    positions = positions_of(tried.states)
+    way = float(np.linalg.norm(positions - positions[:1], axis=1).max(initial=0.0))
     if check.verdict == "ok" and observed.robot.hover is None and way > STOP_WAY_M:
-        return _bad(check.check, f"rolled on for {way:.2f} m", "lower its speed; do its brakes and wheels hold?")
+        remedy = "lower its speed; do its brakes and wheels hold?"
+        return Check(check.check, "bad", f"rolled on for {way:.2f} m", remedy)
     if check.verdict == "ok" and KINDS[observed.robot.kind].locks:
         return msgspec.structs.replace(check, found=f"{check.found}; locked until it is switched off and on")
     return check
 
 
 def stop_at_rest(robot: RobotTable, tried: Tried) -> Check:
-    """Emergency stop of a robot that stands."""
     check = stop("stop, motors off", tried)
     kind = driven_kind(registry.body_name(robot.body))
     if check.verdict == "ok" and kind is not None and kind.locks:
-        return not_tried(check.check, "not tried: --stop tries it")
+        return Check(check.check, "unknown", "not tried: --stop tries it")
     return check
 
 
@@ -280,11 +285,11 @@ def stop(what: str, tried: Tried) -> Check:
     """Emergency stop: order accepted, motors off."""
     remedy = "do not fly it: end its other clients, look at its log, and keep a hand on its switch"
     if tried.failure:
-        return _bad(what, tried.failure, remedy)
+        return Check(what, "bad", tried.failure, remedy)
     if not tried.stopped_s <= STOP_S:
         took = f"not in {STOP_S:g} s" if math.isnan(tried.stopped_s) else f"after {tried.stopped_s:.2f} s"
-        return _bad(what, f"motors off {took}" + (f": {tried.note}" if tried.note else ""), remedy)
-    return Check(check=what, verdict="ok", found=f"after {tried.stopped_s:.2f} s")
+        return Check(what, "bad", f"motors off {took}" + (f": {tried.note}" if tried.note else ""), remedy)
+    return Check(what, "ok", f"after {tried.stopped_s:.2f} s")
 
 
 def hop(observed: Observed, tried: Tried, safety: Safety) -> Check:
@@ -292,29 +297,30 @@ def hop(observed: Observed, tried: Tried, safety: Safety) -> Check:
     what = hop_of(observed.robot)
     load = _charged(tried.charge, tried.volts)
     loaded = f"; battery {load} under load" if load else ""
-    positions = np.array([state.position for state in tried.states if state.position is not None]).reshape(-1, 3)
+    positions = positions_of(tried.states)
     if tried.failure:
-        return _bad(what, tried.failure + loaded, "look at its log; do not fly it before the cause is clear")
+        return Check(what, "bad", tried.failure + loaded, "look at its log; do not fly it before the cause is clear")
     if not len(positions):
-        return _bad(what, "its position was not known", "see the line on its position")
+        return Check(what, "bad", "its position was not known", "see the line on its position")
     side = float(np.hypot(*(positions[:, :2] - positions[0, :2]).T).max())
+    remedy = ""
     if what == "drive":
-        said, remedy = f"{side:.3f} m of {DRIVE_M:g} m{loaded}", _drive_remedy(side)
+        said = f"{side:.3f} m of {DRIVE_M:g} m{loaded}"
+        if side < DRIVE_OFF_M:
+            remedy = "does not drive although commanded to: motors on, wheels free, server and message type right?"
+        elif abs(side - DRIVE_M) > DRIVE_OFF_M:
+            remedy = "its speed is not the commanded one: units and wheel sizes of its server, slipping wheels"
     else:
         wanted = observed.robot.hover or HOP_M
         height = float(np.median(positions[-HELD:, 2]) - positions[0, 2])
         said = f"{height:.2f} m of {wanted:g} m high, {side:.2f} m to the side{loaded}"
-        remedy = _hop_remedy(height - wanted, side)
-    if not remedy and tried.charge < safety.battery_low:
-        remedy = KINDS[observed.robot.kind].charge
-    return Check(check=what, verdict="bad" if remedy else "ok", found=said, remedy=remedy)
-
-
-def trial(asked: Trial, observed: Observed, tried: Tried) -> Check:
-    """Trial of a kind."""
-    judge = registry.find(asked.judge, f"trial {asked.name}")
-    found, remedy = judge(tried.states, tried.failure, observed.robot.device)
-    return Check(check=asked.name, verdict="bad" if remedy else "ok", found=found, remedy=remedy)
+        if abs(height - wanted) > HOP_OFF_M:
+            remedy = "does not keep its height: propellers, battery, trim, height of its positioning system"
+        elif side > HOP_DRIFT_M:
+            remedy = "drifts: yaw of its positioning system against its nose, propellers, calibration of its IMU"
+    if not remedy and tried.charge is not None and tried.charge < safety.battery_low:
+        return Check(what, "bad", said, KINDS[observed.robot.kind].charge)
+    return Check(what, "bad" if remedy else "ok", said, remedy)
 
 
 def hop_of(robot: RobotTable) -> Literal["hop", "drive"]:
@@ -322,38 +328,11 @@ def hop_of(robot: RobotTable) -> Literal["hop", "drive"]:
     return "drive" if robot.hover is None else "hop"
 
 
-def _drive_remedy(way: float) -> str:
-    """Remedy for a drive of `way` [m]; nothing if that is right."""
-    if way < DRIVE_OFF_M:
-        return "does not drive although commanded to: motors on, wheels free, server and message type right?"
-    wrong = abs(way - DRIVE_M) > DRIVE_OFF_M
-    return "its speed is not the commanded one: units and wheel sizes of its server, slipping wheels" if wrong else ""
-
-
-def _hop_remedy(above: float, side: float) -> str:
-    """Remedy for a hop `above` its height [m] and `side` [m] to the side; nothing if that is right."""
-    if abs(above) > HOP_OFF_M:
-        return "does not keep its height: propellers, battery, trim, height of its positioning system"
-    drifts = side > HOP_DRIFT_M
-    return (
-        "drifts: yaw of its positioning system against its nose, propellers, calibration of its IMU" if drifts else ""
-    )
-
-
-def _largest_displacement(states: Sequence[messages.State]) -> float:
-    """Largest distance from the first known position [m]; 0 if none is known."""
-    positions = np.array([state.position for state in states if state.position is not None]).reshape(-1, 3)
-    return float(np.linalg.norm(positions - positions[0], axis=1).max()) if len(positions) else 0.0
-
-
-def not_tried(what: str, why: str) -> Check:
-    """A check that was not made."""
-    return Check(check=what, verdict="unknown", found=why)
-
-
-def _bad(check: str, found: str, remedy: str) -> Check:
-    return Check(check=check, verdict="bad", found=found, remedy=remedy)
+def trial(asked: Trial, observed: Observed, tried: Tried) -> Check:
+    judge = registry.find(asked.judge, f"trial {asked.name}")
+    found, remedy = judge(tried.states, tried.failure, observed.robot.device)
+    return Check(asked.name, "bad" if remedy else "ok", found, remedy)
 
 
 def _not_known(check: str, each: Observed) -> Check:
-    return Check(check=check, verdict="unknown", found=f"not known by a {each.robot.kind} at {each.robot.body}")
+    return Check(check, "unknown", f"not known by a {each.robot.kind} at {each.robot.body}")

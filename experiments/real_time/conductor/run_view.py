@@ -96,7 +96,6 @@ class EventFeed:
         self._shown, self._case = 0, ""
 
     def new_events(self, progress: Progress) -> list[messages.Event]:
-        """Events since the last call."""
         if progress.case != self._case:
             self._case, self._shown = progress.case, 0
         events = progress.events[self._shown :]
@@ -194,7 +193,6 @@ class NetworkView:
         return self._missing_tokens()
 
     def order(self, names: Sequence[str], order: messages.Order) -> dict[str, messages.Reply]:
-        """Give an order to robots, see `orders.send_order`."""
         return orders.send_order(self.session, self._keys, names, order)
 
     def report(self, kind: str, source: str, text: str, stamp: float | None = None) -> None:

@@ -189,7 +189,6 @@ class Station:
         return self.clock
 
     def folder_content(self, names: Sequence[str]) -> certificates.FolderContent:
-        """Certificates of some robots in its folder."""
         return self.ask(Question("certificates", lab=self.folder, names=list(names)))[0].content
 
     def distrusted(self, names: Sequence[str]) -> list[str]:
@@ -273,7 +272,6 @@ class Hosts:
         return measured
 
     def in_use(self) -> list[Station]:
-        """Hosts of the case."""
         return list(dict.fromkeys(self.by_robot.values()))
 
     def sweep(self) -> list[str]:

@@ -55,7 +55,6 @@ class Process:
 
     @property
     def exit(self) -> str:
-        """End of the process, in words."""
         code = self.handle.poll()
         if code is None:
             return "still running"
@@ -65,7 +64,6 @@ class Process:
 
     @property
     def output(self) -> str:
-        """Output of the process until now."""
         return self.log.read_bytes()[self.begins :].decode(errors="replace")
 
     def news(self) -> list[str]:
@@ -80,7 +78,6 @@ class Process:
         return lines.decode(errors="replace").splitlines()
 
     def tail(self) -> str:
-        """The end of its output."""
         try:
             lines = self.output.splitlines()
         except OSError:
@@ -208,7 +205,6 @@ class Launcher:
         return self._processes[name]
 
     def running(self, name: str) -> bool:
-        """Whether a process of that name runs."""
         with self._lock:
             return name in self._processes and self._processes[name].alive
 

@@ -48,7 +48,6 @@ class RegisteredRun(msgspec.Struct, frozen=True):
 
     @property
     def where(self) -> str:
-        """Routers, for people."""
         return topology.describe(self.endpoints)
 
     @property

@@ -45,8 +45,6 @@ UDEV: Final = "add a udev rule for it and plug it in again (docs/crazyflie.md)"
 
 
 class Question(msgspec.Struct, frozen=True, omit_defaults=True):
-    """A launcher's question."""
-
     ask: Literal["hello", "clock", "reach", "devices", "certificates", "sweep", "preload"]
     endpoints: list[str] = []  # routers to reach
     bodies: list[str] = []  # robots with devices in question
@@ -63,8 +61,6 @@ class HostCheck(msgspec.Struct, frozen=True):
 
 
 class Answer(msgspec.Struct, frozen=True, omit_defaults=True):
-    """A station's answer."""
-
     zenpark: str  # digest of its code
     clock: float  # [s] UTC of this machine when the question was read
     version: str = ""

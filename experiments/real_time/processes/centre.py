@@ -112,7 +112,6 @@ class CentreProcess:
         token.undeclare()
 
     def _receive(self, t: float) -> None:
-        """Receives all since the last decision."""
         was_cut_off, self._cut_off = self._cut_off, isfinite(self._router.silent_since(t))
         if was_cut_off and not self._cut_off:
             self._ownership.begin(self._session)
@@ -143,7 +142,6 @@ class CentreProcess:
         self._start[row] = status.started - self._utc if status.started > 0.0 else inf
 
     def _send(self, goals: Sequence[CentreGoal], t: float) -> None:
-        """Sends goals, rounded as poses are."""
         self._seq += 1
         for row, (x, y, z), yaw, pose_stamp, velocity in goals:
             goal = messages.Goal(
@@ -159,7 +157,6 @@ class CentreProcess:
         self._sent += len(goals)
 
     def _send_memories(self, t: float) -> None:
-        """Sends what the laws of the guided robots remember and measure."""
         for row, publisher in self._memories.items():
             stepping = self.centre.robots[row].computer.stepping
             if stepping is not None:

@@ -37,8 +37,6 @@ NAMED: Final = 100  # reported keys with unreadable messages
 
 
 class Recorder:
-    """Records the messages of robots, world, central controller and conductor."""
-
     def __init__(self, session: zenoh.Session, keys: Keys, recording: Recording) -> None:
         self._keys, self._recording = keys, recording
         self._connected = True
@@ -57,7 +55,6 @@ class Recorder:
 
     @property
     def alone(self) -> bool:
-        """Whether no robot is left."""
         return not self._alive
 
     def receive(self, *, last: bool = False) -> None:

@@ -92,7 +92,6 @@ def fly(launch: RobotLaunch) -> int:
 
 
 def _run(plan: Plan, launch: RobotLaunch, endpoints: Sequence[str]) -> int:
-    """Runs robots of a case until they end."""
     experiment, names, clock = plan.experiment, launch.names, Clock(launch.clock_correction)
     endpoints = mesh.neighbour_endpoints(plan, names, endpoints)
     request = replace(bodies.body_request(plan, names, experiment.seed, endpoints), clock=clock)
@@ -153,7 +152,6 @@ def _ranging(robot: RobotTable) -> Ranging:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line of the process."""
     return command_line.run("zenpark agent", RobotLaunch, fly, arguments)
 
 

@@ -9,14 +9,14 @@ from __future__ import annotations
 import gc
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Final
 
 import msgspec
 import zenoh
 
-from agents.clock import uptime
+from agents.clock import Clock, uptime
 from agents.errors import Refusal
 from agents.network import messages, pubsub
 from agents.network.keys import Keys
@@ -27,7 +27,7 @@ from experiments.definition.experiment import WORLD
 from experiments.definition.plan import Plan
 from experiments.file.problems import refusal
 from experiments.real_time.processes.joining import Launch, Network, joined
-from experiments.real_time.processes.world_network import WorldNetwork
+from experiments.real_time.processes.world_network import Commands, Events, Publications, States
 from experiments.real_time.processes.world_population import WorldBodies
 
 REPORT_S: Final = 1.0
@@ -71,7 +71,12 @@ class WorldProcess:
         self._population, self._session, self._lost = population, session, lost
         self._engine, hz = plan.engine_name, plan.experiment.rates.body_hz
         self._ticks = Ticks(hz, catch_up=round(SLIP_S * hz), clock=clock)
-        self.exchange = WorldNetwork(plan, population, joint)
+        self._clock = Clock()
+        self.utc = self._clock.utc()  # at which the clock of the world was 0 [s]
+        self.events = Events(joint, self._clock)
+        self.commands = Commands(plan, population, joint, self.events)
+        self.states = States(plan, population, joint, self.events, self._clock)
+        self.publications = Publications(plan, population, joint, self.events)
         self._reports = pubsub.pose_publisher(session, self._keys.world, messages.JSON)
         self._orders = pubsub.Orders(session, self._keys.world_order, messages.WorldOrder)
         self._pace = Pace()
@@ -82,10 +87,10 @@ class WorldProcess:
 
     def run(self, over: threading.Event) -> None:
         """Runs until `over` is set, or until launcher and then robots are gone."""
-        exchange, pace, ticks = self.exchange, self._pace, self._ticks
+        pace, ticks = self._pace, self._ticks
         gc.collect()
         gc.freeze()  # imported objects live as long as the process: a collection need not visit them
-        exchange.begin(ticks.start())
+        self.utc = self._clock.at(ticks.start())
         token = pubsub.alive_token(self._session, self._keys.world_alive)
         self._report(0.0)
         self._over = over
@@ -95,7 +100,7 @@ class WorldProcess:
                 continue
             ticks.until_next()  # a sleep that lasted too long is lost time as well
             if missed := ticks.begin():
-                exchange.commands.forgive(missed * ticks.period, ticks.t)
+                self.commands.forgive(missed * ticks.period, ticks.t)
             began = ticks.elapsed()
             self._tick(ticks.t)
             pace.worked += ticks.elapsed() - began
@@ -114,14 +119,15 @@ class WorldProcess:
             changed |= self._obey(query, order)
         if self._lost.is_set() and self.paused:
             self.paused, changed = False, True  # robots that must land cannot wait
-        self.exchange.receive(t)
+        self.commands.receive(t)
+        self.states.receive(t, self.utc)
         if not self.paused:
-            self.exchange.commands.apply(t)
+            self.commands.apply(t)
             self._population.advance()
             self._pace.ticks += 1
         if self._ownership.wait_while_checking(self._session, self._ended):
             return
-        self.exchange.publish(t)
+        self.publications.publish(round(self.utc + t, 6))
         if changed:
             self._report(t)
 
@@ -132,38 +138,33 @@ class WorldProcess:
         with query:
             reason = ""
             try:
-                self._carry_out(order)
+                if order.order == "reset":
+                    self._population.reset(order.name)
+                    self.commands.restart()
+                    self.states.update_body()
+                    self.publications.restart()
+                else:
+                    self.paused = order.order == "pause"
             except Refusal as refusal:
                 reason = str(refusal)
-                self.exchange.events.refuse("world", f"{order.order}: {reason}")
+                self.events.refuse("world", f"{order.order}: {reason}")
             reply = messages.WorldReply(not reason, self.paused, round(self._population.time, 6), reason)
             query.reply(self._keys.world_order, messages.encode(reply), encoding=messages.JSON)
             return not reason
 
-    def _carry_out(self, order: messages.WorldOrder) -> None:
-        """Raises Refusal."""
-        population, what = self._population, order.order
-        if what == "pause":
-            self.paused = True
-        elif what == "resume":
-            self.paused = False
-        else:
-            population.reset(order.name)
-            self.exchange.restart()
-
     def _report(self, t: float) -> None:
-        population, exchange, events = self._population, self.exchange, self.exchange.events
+        population, events = self._population, self.events
         state = messages.WorldState(
-            stamp=exchange.utc + t,
+            stamp=self.utc + t,
             engine=self._engine,
             time=round(population.time, 6),
             factor=round(self._pace.factor, 4),
             load=round(self._pace.load, 4),
             paused=self.paused,
             robots=self.carried,
-            mirrored=exchange.states.mirrored(),
+            mirrored=self.states.mirrored(),
             obstacles=[messages.ObstaclePose(name, pose) for name, pose in population.obstacles().items()],
-            contacts=exchange.publications.contacts,
+            contacts=self.publications.contacts,
             refused=events.refused,
             malformed=events.malformed + self._orders.malformed,
             trouble=events.trouble,
@@ -206,13 +207,15 @@ def serve(launch: WorldLaunch) -> int:
         there = _alive(joint.session, joint.keys)
         world = WorldProcess(plan, population, joint, lost)
         joint.declared.append(world)
-        back = world.exchange.restore_positions(there)
+        back = world.states.restore(there)
+        for name, flying in back.items():
+            world.commands.expect(name, flying=flying)
         print(_ready(plan, world.carried, endpoints, back), flush=True)
         world.run(over)
     return 0
 
 
-def _ready(plan: Plan, carried: Sequence[str], endpoints: Sequence[str], back: Sequence[str]) -> str:
+def _ready(plan: Plan, carried: Sequence[str], endpoints: Sequence[str], back: Iterable[str]) -> str:
     experiment = plan.experiment
     mirrored = ", ".join(name for name in plan.names if name not in carried) or "none"
     return (

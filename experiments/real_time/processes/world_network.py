@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence, Set
+from collections.abc import Callable, Iterable, Set
+from dataclasses import dataclass
 from functools import partial
 from math import inf, isfinite
 from typing import Final
@@ -15,7 +16,6 @@ from typing import Final
 import msgspec
 import zenoh
 
-from agents.body.interface import BodyState
 from agents.clock import Clock
 from agents.network import messages, pubsub, validation
 from agents.network import session as network
@@ -25,7 +25,7 @@ from agents.vectors import NO_SETPOINT, UNKNOWN, ZERO, Vector
 from experiments.definition.experiment import WORLD
 from experiments.definition.plan import Plan
 from experiments.real_time.processes.joining import Network
-from experiments.real_time.processes.world_population import HOLD_S, ContactBegin, WorldBodies
+from experiments.real_time.processes.world_population import HOLD_S, WorldBodies
 
 DEPTH: Final = 16_384  # queued commands: those of two hundred robots in 0.8 s
 TRUTH_HZ: Final = 50.0
@@ -40,46 +40,6 @@ UP: Final = ("ready", "airborne", "running", "landing")  # phases in which a rob
 UNDER_WAY: Final = ("airborne", "running")
 
 
-class WorldNetwork:
-    """The network of a world. Times `t` are on the clock of the world [s]."""
-
-    utc: float  # [s] UTC at which the clock of the world was 0
-
-    def __init__(self, plan: Plan, population: WorldBodies, joint: Network) -> None:
-        self._clock = Clock()
-        self.utc = self._clock.utc()
-        self.events = Events(joint, self._clock)
-        self.commands = Commands(plan, population, joint, self.events)
-        self.states = States(plan, population, joint, self.events, self._clock)
-        self.publications = Publications(plan, population, joint, self.events)
-
-    def begin(self, up: float) -> None:
-        """Sets the clock of the world to 0 at a time `up` of the clock `uptime` [s]."""
-        self.utc = self._clock.at(up)
-
-    def restart(self) -> None:
-        """Follows a new body: it has no commands, and does not know the mirrored robots."""
-        self.commands.restart()
-        self.states.update_body()
-        self.publications.restart()
-
-    def restore_positions(self, there: Set[str]) -> list[str]:
-        """Places simulated robots that are on the network at the poses of their states; returns their names."""
-        found = self.states.restore(there)
-        for name, flying in found.items():
-            self.commands.expect(name, flying=flying)
-        return list(found)
-
-    def receive(self, t: float) -> None:
-        """Receives all until `t`."""
-        self.commands.receive(t)
-        self.states.receive(t, self.utc)
-
-    def publish(self, t: float) -> None:
-        """Publishes positions, true poses, range readings and contacts."""
-        self.publications.publish(round(self.utc + t, 6))
-
-
 class Events:
     """Events of a world, for recorder and viewers; what it has refused."""
 
@@ -91,12 +51,10 @@ class Events:
         self._publisher = pubsub.publisher(joint.session, joint.keys.event, messages.JSON)
 
     def publish(self, kind: str, source: str, text: str) -> None:
-        """Publishes an event."""
         print(f"{kind} {source}: {text}", flush=True)
         self._publisher.put(messages.encode(messages.Event(self._clock.utc(), kind, source, text)))
 
     def refuse(self, source: str, reason: str) -> None:
-        """Counts and publishes a refusal."""
         self.refused += 1
         self.trouble = reason
         self.publish("refused", source, reason)
@@ -134,7 +92,6 @@ class Commands:
         self.restart()
 
     def restart(self) -> None:
-        """Forgets what was commanded."""
         rows = len(self._population.names)
         self._held = [False] * rows
         self._given = [NO_SETPOINT] * rows  # setpoints since the last step
@@ -145,7 +102,6 @@ class Commands:
         self.quiet[row] = CLIMB_S if flying and self._population.flies[row] else inf
 
     def receive(self, t: float) -> None:
-        """Receives all until `t`."""
         was_cut_off, self._cut_off = self._cut_off, self._router.silent_since(t) < inf
         if was_cut_off and not self._cut_off:
             self._ownership.begin(self._session)
@@ -214,24 +170,18 @@ class Commands:
 
     def _known(self, key: str) -> bool:
         """Whether a command is for a robot of this world; one that is for no robot of this system is refused."""
-        known = key in self._row
-        if not known and key not in self._elsewhere:
-            self._reject_unknown(key)
-        return known
-
-    def _reject_unknown(self, key: str) -> None:
+        if key in self._row or key in self._elsewhere:
+            return key in self._row
         name = self._keys.whose(key)
         if name is None:
             self._events.malformed += 1
-            return
+            return False
         self._events.refused += 1
         if name not in self._strangers and len(self._strangers) < STRANGERS:
             self._strangers.add(name)
-            self._events.publish(
-                "refused",
-                "world",
-                f"{name} gets commands, but is not in this world: start the world with the experiment that has it",
-            )
+            text = f"{name} gets commands, but is not in this world: start the world with the experiment that has it"
+            self._events.publish("refused", "world", text)
+        return False
 
 
 class States:
@@ -258,7 +208,6 @@ class States:
         return [self._names[mirror.row] for mirror in self._mirrors if isfinite(mirror.place[0])]
 
     def update_body(self) -> None:
-        """Tells the body of the mirrored robots."""
         mirrors = self._mirrors
         self._population.body.mirror(
             [mirror.row for mirror in mirrors],
@@ -288,12 +237,8 @@ class States:
 
     def receive(self, t: float, utc: float) -> None:
         """Receives all until `t` [s] of a clock that was 0 at `utc` [s]."""
-        self._update_poses(t)
         for status in self._statuses.read():
             self._update_start(status, utc + t)
-
-    def _update_poses(self, t: float) -> None:
-        """Updates the poses of mirrored robots."""
         changed = False
         for mirror in self._mirrors:
             state = self._newest(mirror.inbox)
@@ -371,42 +316,31 @@ class Publications:
                 truth = _rounded(states[row].true_position, states[row].true_yaw)
                 _publish(publisher, messages.position(names[row], stamp, *truth), encoding)
         self._ticks += 1
-        self._publish_sweeps(states, stamp)
-        for meeting in self._population.meetings():
-            self._publish_contact(meeting, stamp)
-
-    def _publish_contact(self, meeting: ContactBegin, stamp: float) -> None:
-        self.contacts += 1
-        contact = messages.Contact(stamp, meeting.first, meeting.second, meeting.impulse, meeting.overlap)
-        self._contacts.put(messages.encode(contact))
-        pair = frozenset((meeting.first, meeting.second))
-        if pair not in self._met:
-            self._met.add(pair)
-            self._events.publish("contact", meeting.first, f"touches {meeting.second} ({meeting.impulse:.3g} N s)")
-
-    def _publish_sweeps(self, states: Sequence[BodyState], stamp: float) -> None:
-        """Publishes new range readings."""
         for row, publisher in self._ranges.items():
             scan = states[row].scan
             if scan is not None and scan.time > self._scanned[row]:
                 self._scanned[row] = scan.time
-                message = range_inbox.message(self._names[row], stamp, msgspec.structs.replace(scan, time=0.0))
-                publisher.put(messages.encode(message, self._encoding))
+                message = range_inbox.message(names[row], stamp, msgspec.structs.replace(scan, time=0.0))
+                publisher.put(messages.encode(message, encoding))
+        for contact in self._population.meetings(stamp):
+            self.contacts += 1
+            self._contacts.put(messages.encode(contact))
+            pair = frozenset((contact.first, contact.second))
+            if pair not in self._met:
+                self._met.add(pair)
+                self._events.publish("contact", contact.first, f"touches {contact.second} ({contact.impulse:.3g} N s)")
 
 
+@dataclass(slots=True)
 class _Mirror:
     """A robot that another process carries, as its states show it."""
 
-    __slots__ = ("inbox", "place", "received_at", "row", "velocity", "yaw")
-
-    place: Vector  # [m], NaN while it is absent
-    velocity: Vector  # [m/s]
-    yaw: float  # [rad]
-    received_at: float  # of the last state [s]
-
-    def __init__(self, row: int, inbox: pubsub.Inbox[messages.State]) -> None:
-        self.row, self.inbox = row, inbox
-        self.place, self.velocity, self.yaw, self.received_at = UNKNOWN, ZERO, 0.0, -inf
+    row: int
+    inbox: pubsub.Inbox[messages.State]
+    place: Vector = UNKNOWN  # [m], NaN while it is absent
+    velocity: Vector = ZERO  # [m/s]
+    yaw: float = 0.0  # [rad]
+    received_at: float = -inf  # of the last state [s]
 
 
 def _rounded(position: Vector, yaw: float) -> tuple[Vector, float]:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Container, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
 from agents.body.interface import BodyState
 from agents.errors import Refusal
+from agents.network import messages
 from agents.plugins import registry
 from agents.vectors import NO_SETPOINT, Setpoint
 from experiments.definition import bodies
@@ -21,16 +22,6 @@ from twins.body import TwinBody
 
 WALL: Final = "wall"  # name of the walls of the arena in contacts
 HOLD_S: Final = 0.5  # without a command for this long a flying robot holds its position
-
-
-@dataclass(frozen=True)
-class ContactBegin:
-    """Begin of a contact, by names."""
-
-    first: str
-    second: str
-    impulse: float  # [N s]
-    overlap: float  # [m]
 
 
 class WorldBodies:
@@ -64,7 +55,6 @@ class WorldBodies:
     # ------------------------------------------------------------------ motion
 
     def advance(self) -> None:
-        """Simulates one tick."""
         self._ticks += 1
         self.time += self._dt
         self.states = self.body.read(self._ticks * self._dt)
@@ -95,13 +85,13 @@ class WorldBodies:
         self.body.place([row], [(x, y, z if flies else 0.0)], [yaw], [flying and flies])
         self.states = self.body.read(self._ticks * self._dt)
 
-    def meetings(self) -> list[ContactBegin]:
-        """Contacts that have begun since the last call."""
+    def meetings(self, stamp: float) -> list[messages.Contact]:
+        """Contacts that have begun since the last call, with a stamp."""
         obstacles = (*self._scene.names, WALL)
         found = []
         for touch in self.body.touches():
             second = self.names[touch.second] if touch.second >= 0 else obstacles[-1 - touch.second]
-            found.append(ContactBegin(self.names[touch.first], second, touch.impulse, touch.overlap))
+            found.append(messages.Contact(stamp, self.names[touch.first], second, touch.impulse, touch.overlap))
         return found
 
     def obstacles(self) -> dict[str, tuple[float, float, float]]:

@@ -17,7 +17,7 @@ from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.real_time.conductor import preflight_checks as checks
 from experiments.real_time.conductor.preflight import alone
-from experiments.real_time.conductor.preflight_checks import Observed, Tried
+from experiments.real_time.conductor.preflight_checks import Check, Observed, Tried
 
 TODAY = date(2026, 3, 1)
 RADIO = "radio://0/80/2M/E7E7E7E70"
@@ -137,7 +137,7 @@ def test_captured_positions_that_never_change_are_red(body, position, verdict):
 
 def test_a_stop_at_rest_tries_no_crazyflie():
     tried = Tried(stopped_s=0.1)
-    assert checks.stop_at_rest(DRONE, tried) == checks.not_tried("stop, motors off", "not tried: --stop tries it")
+    assert checks.stop_at_rest(DRONE, tried) == Check("stop, motors off", "unknown", "not tried: --stop tries it")
     for robot in (WHEELS, msgspec.structs.replace(DRONE, body="twin")):
         assert checks.stop_at_rest(robot, tried).verdict == "ok"
     assert checks.stop_at_rest(DRONE, Tried(failure="refused: no answer")).verdict == "bad"

@@ -13,7 +13,6 @@ from experiments.definition.plan import Plan
 from experiments.real_time.processes.centre import CentreProcess
 from experiments.real_time.processes.joining import Network
 from experiments.real_time.processes.world import WorldProcess
-from experiments.real_time.processes.world_network import WorldNetwork
 from experiments.real_time.processes.world_population import WorldBodies
 from tests.network import Net
 from tests.small import pair
@@ -30,16 +29,11 @@ def world_plan(name: str = "F") -> Plan:
     return Plan(pair(robots={name: DRONE}, formation=Formation()))
 
 
-def world_network(net: Net, name: str = "F") -> WorldNetwork:
-    plan = world_plan(name)
-    return WorldNetwork(plan, WorldBodies(plan), joint(net))
-
-
 def world(
     net: Net, bodies: WorldBodies | None = None, ownership: OwnershipCheck | None = None,
-    clock: Callable[[], float] = uptime,
+    clock: Callable[[], float] = uptime, name: str = "F",
 ) -> WorldProcess:  # fmt: skip
-    plan = world_plan()
+    plan = world_plan(name)
     return WorldProcess(plan, bodies or WorldBodies(plan), joint(net, ownership), threading.Event(), clock)
 
 

@@ -96,7 +96,7 @@ def test_lateness_is_caught_up_and_standstill_lost(stands_s, lost, forgiven, asl
     monkeypatch.setattr(bodies, "advance", stand)
     with Net().worn() as net:
         process = world(net, bodies, clock=lambda: now[0])
-        monkeypatch.setattr(process.exchange.commands, "forgive", lambda seconds, t: slept.append((seconds, t)))
+        monkeypatch.setattr(process.commands, "forgive", lambda seconds, t: slept.append((seconds, t)))
         process.run(over)
     assert bodies.time == pytest.approx(150 / WORLD_HZ), "each tick simulates its period"
     assert now[0] - BEGIN == pytest.approx((149 + lost) / WORLD_HZ + 0.001), "in time again"

@@ -7,7 +7,7 @@ from agents.network.keys import Keys
 from agents.robot import Robot
 from agents.runtime.goal_inbox import GoalInbox
 from experiments.definition.plan import Plan
-from tests.experiments.real_time.processes.joined import KEYS, world_network
+from tests.experiments.real_time.processes.joined import KEYS, world
 from tests.fuzz.messages import sent
 from tests.network import Net
 from tests.small import pair
@@ -22,14 +22,14 @@ def own(net: Net, alive: str, session: str, *, gone: bool = False) -> None:
 
 def test_world_obeys_sender_with_clock_behind():
     with Net().worn() as net:
-        world = world_network(net)
+        process = world(net)
 
         def order(seq: int, action: str, **more: object) -> bool:
             """Whether it is carried out."""
-            before = world.commands.done.get("F", 0)
+            before = process.commands.done.get("F", 0)
             net.deliver(sent(KEYS.setpoint("F"), messages.Command("F", seq, UTC, action, **more))[0])
-            world.receive(0.0)
-            return world.commands.done.get("F", 0) != before
+            process.commands.receive(0.0)
+            return process.commands.done.get("F", 0) != before
 
         own(net, KEYS.alive("F"), "one")
         assert order(NOW, "takeoff", height=0.5)
@@ -44,12 +44,12 @@ def test_world_obeys_sender_with_clock_behind():
 def test_world_of_many_robots_knows_name_owners():
     names = [f"F{row:03}" for row in range(120)]  # each with a token, a claim and the token of an owner
     with Net().worn() as net:
-        world = world_network(net, "F000")
+        process = world(net, name="F000")
         for alive in map(KEYS.alive, names):
             for token in (alive, Keys.life(alive, "one"), Keys.claim(alive, Keys.rank(1.0, "one"))):
                 net.deliver(f"{token}\0\0".encode())
-        world.receive(0.0)
-    assert world.commands.lives == dict.fromkeys(names, "one")
+        process.commands.receive(0.0)
+    assert process.commands.lives == dict.fromkeys(names, "one")
 
 
 def test_centre_with_clock_behind_is_followed():

@@ -143,7 +143,7 @@ def test_contacts_have_names() -> None:
     found = []
     for _ in range(200):
         world.go(1, **dict.fromkeys(world.names, FORWARD))
-        found += world.meetings()
+        found += world.meetings(0.0)
     pairs = {frozenset((meeting.first, meeting.second)) for meeting in found}
     assert pairs == {frozenset(("KH01", "KH02")), frozenset(("KH03", "wall")), frozenset(("KH04", "post"))}
     assert all(meeting.impulse > 0.0 and meeting.overlap < 1e-3 for meeting in found)
