@@ -35,11 +35,12 @@ def test_servers_and_recorders_wait_for_the_longest_descent() -> None:
 def test_recorder_keeps_plausible_messages_of_the_world(
     router: RouterProcess, eventually: Callable[[Callable[[], object]], None]
 ) -> None:
+    lost = messages.ObstaclePose("box", (0.0, math.nan, 0.0))
     said: list[tuple[str, messages.Message]] = [
         (KEYS.contact, msgspec.structs.replace(touched(0.1), impulse=math.nan)),
         (KEYS.contact, msgspec.structs.replace(touched(0.1), stamp=math.inf)),
         (KEYS.contact, world(0.1)),
-        (KEYS.world, world(0.1, obstacles=[messages.ObstaclePose("box", (0.0, math.nan, 0.0))])),
+        (KEYS.world, msgspec.structs.replace(world(0.1), obstacles=[lost])),
         (KEYS.world, touched(0.1)),
         (KEYS.world, world(0.2)),
         (KEYS.contact, touched(0.3)),
