@@ -215,7 +215,7 @@ SEES_EXPERIMENTS = ("experiments.definition", "experiments.file", "experiments.a
 COMPILES = {"experiments.definition.plan", "experiments.file.document"}
 CHOOSES_PLUGINS = {
     "experiments.definition.plan",
-    "experiments.file.structure",  # structs of parameters, for the check of types
+    "experiments.file.choices",  # structs of parameters, for the reader
     "experiments.metrics.metric",
 }
 

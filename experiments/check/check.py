@@ -18,7 +18,8 @@ from experiments.check.realisation import algebraic_connectivity
 from experiments.definition import standby
 from experiments.definition.graph import edges
 from experiments.definition.plan import Plan
-from experiments.file.document import Document, Source, chosen
+from experiments.file.cases import Source
+from experiments.file.document import Document, chosen
 from experiments.file.problems import Fault, Path, Problem, TextPosition, nearest
 from experiments.virtual_time.source import is_foreign, outside
 

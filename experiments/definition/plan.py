@@ -28,7 +28,7 @@ from agents.vectors import Vector
 from experiments.definition.experiment import VICON_TWIN, WORLD, Choice, Experiment, Hybrid
 from experiments.definition.formation import Pattern, compile_anchors, linked
 from experiments.definition.graph import Links, adjacency
-from experiments.definition.links import TARGET_KINDS, OneWay, TargetKind, one_way_links
+from experiments.definition.links import OneWay, one_way_links
 from twins.arrays import Index
 from twins.engines.engine import EngineFactory
 from twins.scene import Scene
@@ -105,11 +105,6 @@ class Plan:
     def law(self) -> Law:
         built: Law = _built(registry.LAWS, self.experiment.formation.law)
         return built
-
-    @property
-    def target_kind(self) -> TargetKind:
-        """Kind of target that the law takes of a link."""
-        return TARGET_KINDS[self.law.NEEDS]
 
     @property
     def trigger_name(self) -> str:

@@ -6,7 +6,7 @@ single table [arena]; the experiment's own keys win over it, obstacles and start
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -18,7 +18,7 @@ from experiments.catalogue import index
 from experiments.definition.experiment import Arena, FileTable
 from experiments.file import structure
 from experiments.file import text as syntax
-from experiments.file.consistency import arena_faults
+from experiments.file.consistency.arena import arena_faults
 from experiments.file.problems import Fault, Text, refusal
 
 LOOKED_AT: Final = 100  # files beside an experiment, for the one that was meant
@@ -56,6 +56,12 @@ def arena_file_name(document: Mapping[str, Any]) -> str | None:
     return name if isinstance(name, str) else None
 
 
+def named_in(document: Mapping[str, Any], folder: Path, known: Iterable[ArenaFile]) -> ArenaFile | None:
+    """The arena file that a document names, one of those `known` or read; None if it names none; raises as `load`."""
+    name = arena_file_name(document)
+    return None if name is None else next((each for each in known if each.name == name), None) or load(name, folder)
+
+
 def load(name: str, folder: Path) -> ArenaFile:
     """Reads and checks an arena file.
 
@@ -86,8 +92,8 @@ def load(name: str, folder: Path) -> ArenaFile:
     except RecursionError:
         raise refusal(label, "tables or lists are nested too deeply", "flatten them") from None
     read = ArenaFile(label, text, is_json=False, name=name, table=content.get("arena", {}))
-    read.refuse([*structure.number_faults(content), *_faults_of_shape(content)])
-    read.refuse(arena_faults(msgspec.convert(content, _Whole).arena))
+    read.refuse([*syntax.number_faults(content), *_faults_of_shape(content)])
+    read.refuse(arena_faults(msgspec.convert(content, _Whole).arena, {}))
     return read
 
 

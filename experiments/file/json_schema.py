@@ -17,10 +17,12 @@ import msgspec
 from agents.body.kinds import KINDS
 from agents.plugins import files, registry
 from experiments.definition.experiment import Experiment
-from experiments.file.consistency import judged_metrics
-from experiments.file.overrides import ALONE, SHAPE
+from experiments.file.choices import group_of, struct_of
+from experiments.file.completion import ALONE
+from experiments.file.consistency.whole import judged_metrics
+from experiments.file.overrides import SHAPE
 from experiments.file.problems import Path
-from experiments.file.structure import MAX_NUMBER, group_of, struct_of
+from experiments.file.text import MAX_NUMBER
 
 _OWNERS: Final[dict[str, Path]] = {  # structs with a choice of a plug-in, and where each stands in a file
     "Experiment": (),

@@ -2,33 +2,25 @@
 
 from __future__ import annotations
 
-import math
-import pathlib
 import re
 import tomllib
-from base64 import b64encode
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from operator import attrgetter
-from typing import Any, Final, cast
+from typing import Any, Final
 
-from agents.plugins import registry
-from agents.plugins.law import Law, Need
 from agents.plugins.registry import did_you_mean
-from experiments.catalogue import index
 from experiments.definition.experiment import Experiment
-from experiments.definition.links import TARGET_KINDS, link_pairs, pairs_or_none
-from experiments.file.problems import DocumentError, Fault, Path, refusal
-from experiments.file.structure import group_of, parameters, struct_of
+from experiments.definition.links import pairs_or_none
+from experiments.file.choices import Adopted, group_of, parameters
+from experiments.file.problems import DocumentError, Path, refusal
+from experiments.file.text import number_faults
 
 _PART: Final = re.compile(r"\s*+(?:\"([^\"]*)\"|'([^']*)'|([^.\"']++))\s*+(?:\.|$)")
 _KEY: Final = re.compile(rf"(?:{_PART.pattern})++(?<!\.)")
 _SHAPES: Final = frozenset({"box", "radius", "wall"})
 SHAPE: Final = "shape"  # a link with its target from [formation.shape]
-ALONE: Final = "link"  # a link without a target
-_TARGETS: Final = frozenset({"distance", "offset", "bearing"})
-LARGEST_FILE: Final = 1_000_000  # bytes that a law reads from a file
 _DEFAULTS: Final = Experiment(title="", robots={}, duration_s=1.0)
 
 
@@ -52,6 +44,24 @@ class Override:
 
 def of_flag(flag: str, message: str, hint: str) -> DocumentError:
     return refusal(f"--set {flag}", message, hint)
+
+
+def parse_all(flags: Sequence[str], document: Mapping[str, Any], adopted: Adopted) -> list[Override]:
+    """The changes, with files of plug-ins adopted; raises DocumentError with all that is wrong in them."""
+    overrides, problems = [], []
+    for flag in flags:
+        try:
+            override = parse(flag, document)
+        except DocumentError as error:
+            problems += error.problems
+            continue
+        value, faults = adopted.adopt(override.value, override.path)
+        overrides.append(replace(override, value=value))
+        for fault in [*number_faults(value, override.path), *faults]:
+            problems += override.refused(fault.message, fault.hint).problems
+    if problems:
+        raise DocumentError(problems)
+    return overrides
 
 
 def parse(flag: str, document: Mapping[str, Any]) -> Override:
@@ -131,129 +141,6 @@ def merged(document: Mapping[str, Any], changes: Mapping[str, Any], path: Path =
         other = group_of(here) and isinstance(old, dict) and value.get("kind", old.get("kind")) != old.get("kind")
         result[key] = merged(old, value, here) if isinstance(old, dict) and not other else value
     return result
-
-
-def fill_from_shape(document: dict[str, Any]) -> list[Fault]:
-    """Gives the links without a target of their own, in place, the one that the places of [formation.shape] have.
-
-    What is malformed otherwise is left for the checks that follow.
-    """
-    formation = document.get("formation")
-    links = formation.get("links") if isinstance(formation, dict) else None
-    if not isinstance(formation, dict) or not isinstance(links, dict):
-        return []
-    shape, faults = formation.get("shape"), list[Fault]()
-    bare = [
-        text
-        for text, given in links.items()
-        if given == SHAPE or (shape is not None and isinstance(given, dict) and not _TARGETS & given.keys())
-    ]
-    links.update({text: {} for text, given in links.items() if given == ALONE})
-    word = TARGET_KINDS[_needed_target(formation.get("law", _DEFAULTS.formation.law))].fields[0]
-    for text in bare:
-        try:
-            target = _target_in(shape or {}, document.get("robots"), text, word)
-        except _NoPlace as error:
-            faults.append(Fault(("formation", "links", text), *error.args))
-            target = 1.0 if word == "distance" else [1.0, 0.0]
-        given = links[text]
-        links[text] = {**given, word: target} if isinstance(given, dict) else {word: target}
-    changes = formation.get("changes")
-    for number, change in enumerate(changes if isinstance(changes, list) else []):
-        if isinstance(change, dict) and isinstance(change.get("shape"), dict):
-            own = change.setdefault("links", {})
-            for text in (text for text in bare if isinstance(own, dict) and text not in own):
-                try:
-                    own[text] = {word: _target_in(change["shape"], document.get("robots"), text, word)}
-                except _NoPlace as error:
-                    faults.append(Fault(("formation", "changes", number, "shape"), *error.args))
-    return faults
-
-
-def fill_from_files(document: dict[str, Any], folder: pathlib.Path) -> list[Fault]:
-    """Gives the law, in place, the content of the files that it names, which are in `folder` or the catalogue.
-
-    Without such a file it keeps the content that it has: the experiment comes from where the file was.
-    """
-    formation, faults = document.get("formation"), list[Fault]()
-    law = formation.get("law") if isinstance(formation, dict) else None
-    if not isinstance(formation, dict) or not isinstance(law, dict):
-        return []
-    formation["law"] = law = dict(law)
-    for parameter, content in law_files(law).items():
-        path, name = ("formation", "law", parameter), law.get(parameter)
-        if not isinstance(name, str) or not name:
-            continue
-        if "\0" in name or pathlib.Path(name).name != name:
-            hint = "put it beside the experiment file, and give its name alone"
-            faults.append(Fault(path, f"{name!r} is no name of a file", hint))
-            continue
-        file = next((each for each in (folder / name, index.FOLDER / name) if each.is_file()), folder / name)
-        try:
-            with file.open("rb") as stream:
-                found = stream.read(LARGEST_FILE + 1)
-        except OSError as error:
-            if content not in law:
-                hint = "put it beside the experiment file"
-                faults.append(Fault(path, f"{file} cannot be read: {error.strerror or error}", hint))
-            continue
-        if len(found) > LARGEST_FILE:
-            message = f"{name} is longer than {LARGEST_FILE // 1_000_000} MB"
-            faults.append(Fault(path, message, "take a smaller one: it goes with the experiment to every robot"))
-        law[content] = b64encode(found[:LARGEST_FILE]).decode()
-    return faults
-
-
-def law_files(law: object) -> Mapping[str, str]:
-    """Parameters of a law that name files, and those that get their content; none of a law that cannot be used."""
-    name = law.get("kind") if isinstance(law, Mapping) else law
-    try:
-        return cast(type[Law], struct_of(registry.LAWS, name)).FILES if isinstance(name, str) else {}
-    except registry.PluginError:  # said with its place where the law is read
-        return {}
-
-
-class _NoPlace(ValueError):
-    """A link between robots without places; message and remedy."""
-
-
-def _needed_target(law: object) -> Need:
-    """Target that a law needs of every link; "any" if no such law is installed."""
-    name = law.get("kind") if isinstance(law, Mapping) else law
-    if not isinstance(name, str):
-        return "any"
-    try:
-        return cast(type[Law], struct_of(registry.LAWS, name)).NEEDS
-    except registry.PluginError:  # said with its place where the law is read
-        return "any"
-
-
-def _target_in(shape: Mapping[str, Any], robots: object, text: str, word: str) -> float | list[float]:
-    """Distance [m], offset [m] or bearing of a link between places."""
-    if not pairs_or_none(text):
-        return 1.0 if word == "distance" else [1.0, 0.0]
-    second, first = link_pairs(text)[0]
-    if first == second:
-        raise _NoPlace(f"'{first}' cannot receive from itself", "name two robots")
-    places = []
-    for name in (first, second):
-        place = shape.get(name)
-        if not (isinstance(place, list) and 2 <= len(place) <= 3 and all(type(x) in (int, float) for x in place)):
-            if isinstance(robots, Mapping) and name not in robots:
-                raise _NoPlace(f"no robot is called '{name}'", registry.did_you_mean(name, robots))
-            hint = f"add {name} = [0.5, 0.0] to [formation.shape], or give the link a distance"
-            raise _NoPlace(f"{name} has no place in the shape", hint)
-        robot = robots.get(name) if isinstance(robots, Mapping) else None
-        height = robot.get("hover") if isinstance(robot, Mapping) else None
-        places.append([*place, height if type(height) in (int, float) else 0.0][:3])
-    offset = [b - a for a, b in zip(*places, strict=True)]
-    length = math.hypot(*offset)
-    if length == 0.0:
-        raise _NoPlace(f"{first} and {second} are at one place of the shape", "move one of them")
-    if word == "distance":
-        return length
-    planar = len(shape[first]) == len(shape[second]) == 2
-    return offset[:2] if planar else offset
 
 
 def _known(at: Any, step: str | int, path: Path, override: Override, *, part: bool) -> Any:  # noqa: ANN401

@@ -254,6 +254,12 @@ class Text:
         return at_offset(self.label, self.text, offset, fault.message, fault.hint)
 
 
+def key_name(path: Path) -> str:
+    """Name of a path for people: the last key, with its indices."""
+    first = max((number for number, step in enumerate(path) if isinstance(step, str)), default=0)
+    return "".join(f"[{step}]" if isinstance(step, int) else str(step) for step in path[first:])
+
+
 def shown(value: object) -> str:
     """A value of the document, short enough for one line."""
     words = {True: "true", False: "false", None: "null"}

@@ -6,26 +6,20 @@ the same annotations and lets msgspec judge one value at a time, so that everyth
 
 from __future__ import annotations
 
-import importlib
-import math
-import pathlib
 import re
 import types
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
-from inspect import getfile
 from typing import Annotated, Any, Final, Literal, Union, get_args, get_origin
 
 import msgspec
 
-from agents.body.kinds import KINDS
 from agents.plugins import files, registry
 from agents.plugins.registry import did_you_mean
 from experiments.definition.experiment import Experiment
-from experiments.definition.plan import Plan
-from experiments.file.problems import DocumentError, Fault, Path, Problem, refusal, shown
+from experiments.file.choices import group_of, parameters, struct_of
+from experiments.file.problems import DocumentError, Fault, Path, Problem, key_name, refusal, shown
 
-MAX_NUMBER: Final = 1e12  # in any unit; squares and products of larger numbers are not finite for long
 _REMEDY: Final = {  # of a missing key
     "title": 'add title = "what this experiment shows"',
     "duration_s": "add duration_s = 30.0",
@@ -39,35 +33,8 @@ _WORDS: Final = {
     "float": "a number", "int": "a whole number", "str": "text", "bool": "true or false", "array": "a list",
     "object": "a table",
 }  # fmt: skip
-# entry-point group of each choice of a plug-in; `int` is any number in a list, `str` any name
-_GROUPS: Final[dict[tuple[str | int | type, ...], str]] = {
-    ("trigger",): registry.TRIGGERS,
-    ("formation", "update"): registry.TRIGGERS,
-    ("prediction",): registry.PREDICTORS,
-    ("formation", "law"): registry.LAWS,
-    ("timeline", int, "plan"): registry.PLANNERS,
-    ("arena", "obstacles", str, "plan"): registry.PLANNERS,
-    ("avoidance",): registry.AVOIDANCES,
-    ("world", "engine"): registry.ENGINES,
-}
 LINK: Final = 'write "{name}" = 0.5, in metres; or "{name}" = {{ offset = [0.5, 0.0] }}, or "{name}" = "shape"'
 _FIELDS: Final = frozenset(Experiment.__struct_fields__)
-
-
-def number_faults(value: object, path: Path = ()) -> Iterator[Fault]:
-    """Faults of numbers that TOML can write and no experiment can hold."""
-    if isinstance(value, dict):
-        for key, each in value.items():
-            yield from number_faults(each, (*path, key))
-    elif isinstance(value, list):
-        for number, each in enumerate(value):
-            yield from number_faults(each, (*path, number))
-    elif isinstance(value, float) and not math.isfinite(value):
-        yield Fault(path, f"'{_name(path)}' is {value}, which is no quantity", "give a finite number")
-    elif isinstance(value, float) and abs(value) > MAX_NUMBER:
-        yield Fault(path, f"'{_name(path)}' is {value:g}, larger than anything here can be", "give a smaller number")
-    elif isinstance(value, int) and not -(2**63) <= value < 2**63:
-        yield Fault(path, f"'{_name(path)}' has more digits than a 64-bit integer holds", "give a smaller number")
 
 
 def faults(document: Mapping[str, Any], struct: type[msgspec.Struct] = Experiment) -> list[Fault]:
@@ -77,76 +44,6 @@ def faults(document: Mapping[str, Any], struct: type[msgspec.Struct] = Experimen
     return [
         fault for fault in found if fault.path or not any(f"'{key}' is missing" == fault.message for key in strayed)
     ]
-
-
-def group_of(path: Path) -> str | None:
-    """Entry-point group of the plug-in choice at a path; None if no choice stands there."""
-    return _GROUPS.get(path if len(path) < 3 else (*path[:-2], type(path[-2]), path[-1]))
-
-
-def plugin_files(plan: Plan) -> set[pathlib.Path]:
-    """Modules of the plug-ins and kinds that an experiment chooses; what those import is not among them."""
-    experiment = plan.experiment
-    kinds = {KINDS[robot.kind] for robot in (*experiment.robots.values(), *experiment.spares.values())}
-    modules = {registry.module(registry.ROBOTS, kind.name) for kind in kinds}
-    modules |= {kind.motion.partition(":")[0] for kind in kinds if isinstance(kind.motion, str)}
-    modules |= {type(kind.steering).__module__ for kind in kinds if kind.steering is not None}
-    modules_of_kinds = {pathlib.Path(getfile(importlib.import_module(name))) for name in modules}
-    return modules_of_kinds | {pathlib.Path(getfile(struct_of(group, kind))) for group, kind in chosen(experiment)}
-
-
-def chosen(experiment: Experiment) -> list[tuple[str, str]]:
-    """Group and name of every plug-in that an experiment chooses, kinds of robots aside."""
-    found = _choices(msgspec.to_builtins(experiment), ())
-    return [(group, registry.split(choice)[0]) for group, choice in found]
-
-
-def _choices(value: Any, path: Path) -> Iterator[tuple[str, Any]]:  # noqa: ANN401 - a document
-    """Every plug-in that is chosen in a document: its group, and the choice."""
-    group = group_of(path)
-    if group is not None and value is not None:
-        yield group, value
-    elif isinstance(value, dict):
-        for key, each in value.items():
-            yield from _choices(each, (*path, key))
-    elif isinstance(value, list | tuple):
-        for number, each in enumerate(value):
-            yield from _choices(each, (*path, number))
-
-
-def with_choices(value: Any, path: Path, change: Callable[[str, Path], str]) -> Any:  # noqa: ANN401 - a document
-    """A part of a document, which stands at `path`, with the name of every plug-in that is chosen in it changed."""
-    if group_of(path) is not None:
-        if isinstance(value, str):
-            return change(value, path)
-        if isinstance(value, dict) and isinstance(value.get("kind"), str):
-            return {**value, "kind": change(value["kind"], (*path, "kind"))}
-        return value
-    if isinstance(value, dict) and _leads_to_choice(path):
-        return {key: with_choices(each, (*path, key), change) for key, each in value.items()}
-    if isinstance(value, list) and _leads_to_choice(path):
-        return [with_choices(each, (*path, number), change) for number, each in enumerate(value)]
-    return value
-
-
-def _leads_to_choice(path: Path) -> bool:
-    """Whether a choice of a plug-in may stand below a path: thousands of robots and links are passed over."""
-    return any(
-        all(step == part or type(step) is part for step, part in zip(path, each, strict=False)) for each in _GROUPS
-    )
-
-
-def struct_of(group: str, kind: str) -> type[msgspec.Struct]:
-    """The struct of parameters of a plug-in; raises PluginError if it cannot be used."""
-    return registry.struct(group, kind)
-
-
-def parameters(group: str, kind: str) -> list[str]:
-    """Names of the parameters of a plug-in, none if it cannot be used."""
-    try:
-        return list(_fields_of(struct_of(group, kind)))
-    except registry.PluginError:
-        return []
 
 
 def _value(value: object, annotation: object, path: Path, note: str) -> list[Fault]:
@@ -165,7 +62,9 @@ def _value(value: object, annotation: object, path: Path, note: str) -> list[Fau
             inner += _key(key, of_key, (*path, key)) or _value(each, of_value, (*path, key), note)
     elif get_origin(plain) is list and isinstance(value, dict):
         header = ".".join(map(str, path))
-        return [Fault(path, f"'{_name(path)}' must be a list, not a table", f"write [[{header}]], with two brackets")]
+        return [
+            Fault(path, f"'{key_name(path)}' must be a list, not a table", f"write [[{header}]], with two brackets")
+        ]
     elif get_origin(plain) is list and isinstance(value, list):
         for number, each in enumerate(value):
             inner += _value(each, get_args(plain)[0], (*path, number), note)
@@ -225,13 +124,13 @@ def _choice(value: str | dict[str, Any], group: str, path: Path) -> list[Fault]:
     if isinstance(value, dict) and not isinstance(value.get("kind"), str):
         for key in value:
             if key != "kind" and (hint := did_you_mean(key, ["kind"])).startswith("did you mean"):
-                message = f"unknown key '{key}' in '{_name(path)}', which lacks its kind"
+                message = f"unknown key '{key}' in '{key_name(path)}', which lacks its kind"
                 return [Fault((*path, key), message, hint, on_key=True)]
         likely = _kinds_with(group, [key for key in value if key != "kind"])
         hint = f'add kind = "{likely[0]}"' if likely else f'add kind = "..."; known: {", ".join(known)}'
-        return [Fault((*path, "kind"), f"'{_name(path)}' needs its kind, as text", hint)]
-    kind, given = registry.split(value)
-    where = path if isinstance(value, str) else (*path, "kind")
+        return [Fault((*path, "kind"), f"'{key_name(path)}' needs its kind, as text", hint)]
+    kind, where = (value, path) if isinstance(value, str) else (value["kind"], (*path, "kind"))
+    given = {} if isinstance(value, str) else {key: each for key, each in value.items() if key != "kind"}
     if kind not in known and not files.is_choice(kind):
         return [Fault(where, f"no {shown(kind)} among the {what}", did_you_mean(kind, known))]
     try:
@@ -271,7 +170,7 @@ def _judged(value: object, annotation: object, path: Path, note: str) -> list[Fa
 
 
 def _in_words(text: str, value: object, annotation: object, path: Path, note: str) -> Fault:
-    name = _name(path)
+    name = key_name(path)
     plain, _ = _plain(annotation, note)
     if get_origin(plain) is Literal:
         return Fault(path, f"'{name}' cannot be {shown(value)}", did_you_mean(str(value), map(str, get_args(plain))))
@@ -313,7 +212,7 @@ def _no_table(value: object, path: Path) -> Fault:
     header = ".".join(map(str, path))
     if isinstance(value, list) and path == ("robots",):
         return Fault(path, "'robots' must be tables with names", "write [robots.KH01], one header for each robot")
-    return Fault(path, f"'{_name(path)}' must be a table, not {shown(value)}", f"write [{header}] above its keys")
+    return Fault(path, f"'{key_name(path)}' must be a table, not {shown(value)}", f"write [{header}] above its keys")
 
 
 def _plain(annotation: object, note: str) -> tuple[Any, str]:
@@ -329,14 +228,8 @@ def _is_struct(annotation: object) -> bool:
     return isinstance(annotation, type) and issubclass(annotation, msgspec.Struct)
 
 
-def _name(path: Path) -> str:
-    """Name of a path for the user: the last key, with its indices."""
-    first = max((number for number, step in enumerate(path) if isinstance(step, str)), default=0)
-    return "".join(f"[{step}]" if isinstance(step, int) else str(step) for step in path[first:])
-
-
 def _place_in_file(path: Path) -> str:
-    return f" in '{_name(path)}'" if path else ""
+    return f" in '{key_name(path)}'" if path else ""
 
 
 OBJECT: Final = "write an object, '{\"name\": value}'"

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import math
 import re
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
 import msgspec
 
-from experiments.file.problems import DocumentError, Problem, at_offset, refusal
+from experiments.file.problems import DocumentError, Fault, Problem, at_offset, key_name, refusal
+from experiments.file.problems import Path as Keys
 
+MAX_NUMBER: Final = 1e12  # in any unit; squares and products of larger numbers are not finite for long
 MAX_TEXT_BYTES: Final = 4_000_000  # bytes; a hundred robots take ten thousand
 BEGIN: Final = "./zenpark new copies an experiment to begin with"
 _AT: Final = re.compile(r" \(at (?:line (\d+), column (\d+)|end of document)\)$")
@@ -90,6 +94,22 @@ def parsed(text: str, label: str, *, json: bool) -> dict[str, Any]:
     if not document:
         raise refusal(label, "holds nothing but comments", BEGIN)
     return document
+
+
+def number_faults(value: object, path: Keys = ()) -> Iterator[Fault]:
+    """Faults of numbers that TOML can write and no experiment can hold."""
+    if isinstance(value, dict):
+        for key, each in value.items():
+            yield from number_faults(each, (*path, key))
+    elif isinstance(value, list):
+        for number, each in enumerate(value):
+            yield from number_faults(each, (*path, number))
+    elif isinstance(value, float) and not math.isfinite(value):
+        yield Fault(path, f"'{key_name(path)}' is {value}, which is no quantity", "give a finite number")
+    elif isinstance(value, float) and abs(value) > MAX_NUMBER:
+        yield Fault(path, f"'{key_name(path)}' is {value:g}, larger than anything here can be", "give a smaller number")
+    elif isinstance(value, int) and not -(2**63) <= value < 2**63:
+        yield Fault(path, f"'{key_name(path)}' has more digits than a 64-bit integer holds", "give a smaller number")
 
 
 def _toml_problem(text: str, label: str, message: str) -> Problem:

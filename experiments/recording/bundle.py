@@ -17,7 +17,7 @@ from typing import Final
 import msgspec
 
 from experiments.definition.plan import Plan
-from experiments.file.structure import plugin_files
+from experiments.file.choices import plugin_files
 from experiments.recording.reader import RecordingError, Records
 from experiments.recording.run_folder import METRICS, ORIGIN, SOURCE, RunOrigin, flattened, read_origin
 from experiments.recording.version import PACKAGES, ROOT

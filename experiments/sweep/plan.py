@@ -23,10 +23,10 @@ import numpy as np
 from agents.plugins.registry import TRIGGERS
 from experiments.definition.plan import Plan
 from experiments.file import document
+from experiments.file.choices import group_of
 from experiments.file.document import Document, chosen
 from experiments.file.overrides import Override, parse
 from experiments.file.problems import DocumentError, Problem, refusal
-from experiments.file.structure import group_of
 from experiments.sweep.runs import digest
 
 SEEDS: Final = 20  # if no number is given

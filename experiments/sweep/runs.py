@@ -16,7 +16,7 @@ from agents.body.interface import BodyError
 from agents.plugins import registry
 from experiments.definition.plan import Plan
 from experiments.definition.standby import without_standby
-from experiments.file.structure import plugin_files
+from experiments.file.choices import plugin_files
 from experiments.metrics.measure import ended_early, failures
 from experiments.metrics.metric import LEAN, case_values, foreign_metrics, swept_metrics, values_of
 from experiments.metrics.signals import Measurement

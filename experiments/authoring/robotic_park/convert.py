@@ -31,7 +31,7 @@ from experiments.catalogue import index
 from experiments.check.findings import join_names
 from experiments.file import catalogue as entries
 from experiments.file import document
-from experiments.file.consistency import divisor
+from experiments.file.consistency.whole import divisor
 from experiments.file.reference import written
 
 V = TypeVar("V", bound=Hashable)

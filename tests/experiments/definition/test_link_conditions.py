@@ -7,7 +7,7 @@ from agents.network import channel_model
 from experiments.definition import link_conditions
 from experiments.definition.experiment import ChannelTable, LinkChannelTable, Outage
 from experiments.definition.plan import Plan
-from experiments.file import consistency
+from experiments.file.consistency.whole import consistency_faults
 from tests.small import small
 
 NAMES = ("A", "B", "C")
@@ -69,13 +69,13 @@ def test_keys_come_from_the_seed_and_the_names():
     ],
 )
 def test_what_is_possible_is_accepted(channel):
-    assert list(consistency.faults(planned(channel))) == []
+    assert list(consistency_faults(planned(channel))) == []
 
 
 def test_links_of_avoidance_alone_are_links():
     channel = ChannelTable(links={"C > A": LinkChannelTable(loss=0.5)})
     plan = planned(channel, avoidance={"kind": "potential", "hears": "all"})
-    assert list(consistency.faults(plan)) == []
+    assert list(consistency_faults(plan)) == []
     links = plan.pose_links
     ends = [(NAMES[j], NAMES[i]) for i, j in zip(links.receiver, links.sender, strict=True)]
     made = link_conditions.conditions_of(plan, ends, 1)

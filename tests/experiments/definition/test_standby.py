@@ -23,7 +23,8 @@ from experiments.definition.experiment import (
     RobotTable,
 )
 from experiments.definition.plan import Plan
-from experiments.file import consistency, document
+from experiments.file import document
+from experiments.file.consistency.whole import consistency_faults
 from experiments.real_time.conductor.replacement import Spares
 from tests.small import changed, small
 
@@ -53,8 +54,8 @@ def test_without_those_on_standby_nothing_names_them() -> None:
     assert list(made.channel.links) == ["A > B"]
     assert [(outage.from_s, outage.robots) for outage in made.channel.outages] == [(2.0, ["B"]), (3.0, [])]
     assert made.architecture == Hybrid("hybrid", ["A"])
-    assert not list(consistency.faults(plan))
-    assert not list(consistency.faults(Plan(with_standby(spares={"S": FLY, "T": BOT}, on_loss="replace"))))
+    assert not list(consistency_faults(plan))
+    assert not list(consistency_faults(Plan(with_standby(spares={"S": FLY, "T": BOT}, on_loss="replace"))))
     assert reserves.without_standby(plan) is plan
 
 

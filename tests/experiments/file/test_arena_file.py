@@ -99,7 +99,7 @@ def test_case_changes_the_arena_or_takes_another_file(lab, tmp_path):
     assert list(found["hall"].obstacles) == ["pillar"]
     assert found["hall"].size == (9.0, 9.0, 3.0)
     assert given.experiment.arena.obstacles["post"].radius == 0.1
-    files = {name: file.name for name, file in given.arenas.items()}
+    files = {name: file.name for name, file in given.source.arenas.items()}
     assert files == {"": "lab.toml", "lab": "lab.toml", "hall": "hall.toml"}
 
 

@@ -9,8 +9,8 @@ import pytest
 
 from agents.plugins import files, registry
 from experiments.check.check import check
+from experiments.file.choices import plugin_files
 from experiments.file.document import DocumentError, case_document, load, loads, received, write_json
-from experiments.file.structure import plugin_files
 from experiments.metrics.criteria import judge
 from experiments.recording import bundle
 from experiments.recording.reader import RecordingError

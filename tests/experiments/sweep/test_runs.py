@@ -7,7 +7,7 @@ import pytest
 from experiments import run
 from experiments.definition.experiment import ChannelTable, Start, WorldTable
 from experiments.definition.plan import Plan
-from experiments.file import structure
+from experiments.file import choices
 from experiments.file.document import load
 from experiments.metrics import measure
 from experiments.metrics.metric import swept_metrics
@@ -118,8 +118,8 @@ def test_a_plug_in_that_changes_changes_the_code(park, tmp_path, monkeypatch):
     file = tmp_path / "my_triggers.py"
     file.write_text("one")
     before = code_of(Plan(park))
-    real = structure.getfile
-    monkeypatch.setattr(structure, "getfile", lambda of: str(file) if of.__name__ == "SendOnDelta" else real(of))
+    real = choices.getfile
+    monkeypatch.setattr(choices, "getfile", lambda of: str(file) if of.__name__ == "SendOnDelta" else real(of))
     foreign = code_of(Plan(park))
     runs.file_digest.cache_clear()
     file.write_text("two")

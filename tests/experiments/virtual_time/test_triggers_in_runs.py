@@ -9,7 +9,7 @@ import pytest
 from agents.plugins.predictors import HOLD, ConstantVelocity
 from experiments.definition.experiment import ChannelTable, Formation
 from experiments.definition.plan import Plan
-from experiments.file import consistency
+from experiments.file.consistency.whole import consistency_faults
 from experiments.metrics import signals
 from tests.runs import fly
 from tests.small import changed, reference, small
@@ -56,7 +56,7 @@ SMOOTH = {"kind": "mixed", "smoothing_s": 0.1}
     ],
 )
 def test_triggers_where_they_make_no_sense_are_refused(change, path, message, hint):
-    (fault,) = consistency.faults(Plan(updating(**change)))
+    (fault,) = consistency_faults(Plan(updating(**change)))
     assert ".".join(fault.path) == path
     assert message in fault.message
     assert hint in fault.hint
@@ -73,7 +73,7 @@ def test_triggers_where_they_make_no_sense_are_refused(change, path, message, hi
     ],
 )
 def test_triggers_where_they_make_sense_are_not(change):
-    assert not list(consistency.faults(Plan(updating(**change))))
+    assert not list(consistency_faults(Plan(updating(**change))))
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from experiments.definition.experiment import Experiment, LinkChannelTable
 from experiments.definition.link_conditions import link_effects
 from experiments.definition.links import pairs_or_none
 from experiments.definition.plan import Plan
-from experiments.file import structure
+from experiments.file.choices import chosen
 from experiments.file.problems import Fault, Path, after_the_end, shown, unknown_robot
 
 _WHAT: Final = {"address": "address that ssh takes", "zenpark": "path of a command", "lab": "path of a folder"}
@@ -27,8 +27,8 @@ _WRITE: Final = {
 def host_faults(experiment: Experiment) -> Iterator[Fault]:
     """Faults of hosts: robots of two hosts or of none, processes that cannot be divided, endpoints that clash."""
     where: dict[str, str] = {}
-    chosen = structure.chosen(experiment) if experiment.hosts else []
-    if here := [files.plain(name) for _, name in chosen if files.is_choice(name)]:
+    choices = chosen(experiment) if experiment.hosts else []
+    if here := [files.plain(name) for _, name in choices if files.is_choice(name)]:
         message = f"'{here[0]}' is a file of this machine, which robots of other machines do not load"
         yield Fault(("hosts",), message, "make it a plug-in to install (docs/plugins.md), or leave [hosts] out")
     for host, each in experiment.hosts.items():

@@ -1,0 +1,4 @@
+"""Consistency of an experiment: contradictions between fields, each with its path in the file.
+
+May import: agents, twins, experiments.definition, experiments.file.problems, experiments.file.choices.
+"""

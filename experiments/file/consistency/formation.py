@@ -1,0 +1,141 @@
+"""Consistency of a formation: links and their targets, anchors, changes, and links by range."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final
+
+from agents.formation.link import BY_BEARING
+from agents.plugins.registry import did_you_mean
+from experiments.definition.experiment import ChangeTable, Experiment, LinkTable, TargetTable
+from experiments.definition.links import FORM, NO_TARGET, TARGET_KINDS, held_height, link_pairs
+from experiments.definition.plan import Plan
+from experiments.file.problems import Fault, Path, after_the_end, unknown_robot
+
+ROUNDED: Final = 1e-3  # [m] heights written with three decimals
+
+
+def formation_faults(plan: Plan) -> Iterator[Fault]:
+    """All contradictions in [formation]."""
+    experiment, formation = plan.experiment, plan.experiment.formation
+    found = list(_links(experiment))
+    yield from found
+    places = [("anchors", name) for name in formation.anchors] + [("shape", name) for name in formation.shape]
+    for table, name in places:
+        yield from unknown_robot(("formation", table, name), name, experiment.robots, on_key=True)
+    if found:
+        return  # what follows looks links up
+    for text, link in formation.links.items():
+        path = ("formation", "links", text)
+        yield from _asked(plan, text, link, path)
+        if isinstance(link, LinkTable):
+            yield from after_the_end((*path, "from_s"), "link", link.from_s, experiment.duration_s)
+    for number, change in enumerate(formation.changes):
+        yield from _change(plan, number, change)
+    near = formation.proximity
+    if near is not None and near.distance is None and not formation.links:
+        message = "there are no links that could come and go by range"
+        hint = "add distance = 0.5, which any two robots keep while they are near each other, or [formation.links]"
+        yield Fault(("formation", "proximity"), message, hint)
+
+
+def _links(experiment: Experiment) -> Iterator[Fault]:
+    robots = experiment.robots
+    if experiment.formation.leader is not None:
+        yield from unknown_robot(("formation", "leader"), experiment.formation.leader, robots)
+    given: dict[tuple[str, str], str] = {}
+    for text in experiment.formation.links:
+        path = ("formation", "links", text)
+        try:
+            both = link_pairs(text)
+        except ValueError as error:
+            hint = str(error)
+            yield Fault(path, f"{text!r} is no link", hint if hint == FORM else f"{hint}; {FORM}", on_key=True)
+            continue
+        for name in dict.fromkeys(reversed(both[0])):
+            yield from unknown_robot(path, name, robots, on_key=True)
+        if both[0][0] == both[0][1]:
+            yield Fault(path, f"'{both[0][0]}' cannot receive from itself", "name two robots", on_key=True)
+            continue
+        again = [pair for pair in both if pair in given]
+        if again:
+            receiver, sender = again[0]
+            first = given[again[0]]
+            what = f"stands twice, as '{first}' and" if f"{sender} > {receiver}" != first else "stands again in"
+            message = f"the link from {sender} to {receiver} {what} '{text}'"
+            yield Fault(path, message, "remove one of the two: 'A - B' is 'A > B' and 'B > A'", on_key=True)
+        given.update(dict.fromkeys(both, text))
+
+
+def _kind_of(given: TargetTable | float) -> str:
+    """Name of the target of a link."""
+    if not isinstance(given, TargetTable):
+        return "distance"
+    return next((name for name in ("distance", "offset", "bearing") if getattr(given, name) is not None), NO_TARGET)
+
+
+def _asked(plan: Plan, text: str, given: TargetTable | float, path: Path) -> Iterator[Fault]:
+    """Targets that the law does not take, or that robots with held heights cannot meet."""
+    experiment, needs, kind = plan.experiment, TARGET_KINDS[plan.law.NEEDS], _kind_of(given)
+    if kind not in needs.fields and kind == NO_TARGET:
+        message = f"the law '{plan.law_name}' needs a target of every link, and {text!r} has none"
+        yield Fault(path, message, f"give {needs.words}")
+        return
+    if kind not in needs.fields:
+        message = f"the law '{plan.law_name}' needs {needs.words} of every link; this one asks for a {kind}"
+        hint = (
+            f'draw all in [formation.shape] and write "{text}" = "shape", or write such as "{text}" = {needs.example}'
+        )
+        yield Fault(path, message, f'{hint}, or take law = "mixed", which goes by each link')
+        return
+    if not isinstance(given, TargetTable):
+        return
+    second, first = link_pairs(text)[0]
+    rise = held_height(experiment, second) - held_height(experiment, first)
+    if given.offset is not None:
+        if needs.wants == BY_BEARING and not any(given.offset) and rise == 0.0:
+            yield Fault((*path, "offset"), "an offset of zeros has no direction", "give x, y other than 0")
+        if len(given.offset) == 3 and abs(given.offset[2] - rise) > ROUNDED:
+            message = f"'{second}' is held {rise:g} m above '{first}', not {given.offset[2]:g} m"
+            yield Fault((*path, "offset", 2), message, "leave the third number out, or change hover")
+    slope = given.bearing[2] if given.bearing is not None and len(given.bearing) == 3 else None
+    if slope is not None and slope * rise <= 0.0 and not slope == rise == 0.0:
+        message = f"'{second}' is held {rise:g} m above '{first}': this direction is never met"
+        yield Fault((*path, "bearing", 2), message, "leave the third number out: a direction seen from above")
+
+
+def _change(plan: Plan, number: int, change: ChangeTable) -> Iterator[Fault]:
+    experiment, path = plan.experiment, ("formation", "changes", number)
+    yield from after_the_end((*path, "at_s"), "change", change.at_s, experiment.duration_s)
+    before = {pair: given for text, given in experiment.formation.links.items() for pair in link_pairs(text)}
+    kinds = {_kind_of(given) for given in before.values()}
+    for text, given in change.links.items():
+        where = (*path, "links", text)
+        try:
+            both = link_pairs(text)
+        except ValueError as error:
+            yield Fault(where, f"{text!r} is no link", str(error), on_key=True)
+            continue
+        if not set(both) <= set(before):
+            hint = did_you_mean(text, experiment.formation.links)
+            yield Fault(where, f"{text!r} is none of the formation's links", hint, on_key=True)
+            continue
+        old, new = _kind_of(before[both[0]]), _kind_of(given)
+        if old != new:
+            message = f"{text!r} asks for a {old} before, and for a {new} then: there is no way between them"
+            yield Fault(where, message, f"give a {old}")
+        else:
+            yield from _asked(plan, text, given, where)
+    if change.rotate and kinds == {"distance"}:
+        message = "nothing here knows a direction: distances are met whichever way the formation faces"
+        yield Fault((*path, "rotate"), message, "give links an offset or a bearing, and law a law that goes by them")
+    if change.scale != 1.0:
+        for text, given in experiment.formation.links.items():
+            if (
+                isinstance(given, TargetTable)
+                and given.bearing is not None
+                and len(given.bearing) == 3
+                and given.bearing[2]
+            ):
+                message = f"the slope of {text!r} changes when the formation grows and heights are held"
+                yield Fault((*path, "scale"), message, "give that bearing as seen from above, without the third number")
