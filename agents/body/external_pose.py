@@ -5,6 +5,7 @@ All of it runs on quiet ticks.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from math import inf, isfinite, isnan, nan
 from typing import Final
 
@@ -36,22 +37,17 @@ def velocity_after(velocity: Vector, moved: Vector, since: float) -> Vector:
     )
 
 
+@dataclass(eq=False)
 class External:
     """The last external pose of a robot, and a filtered derivative of it."""
 
-    __slots__ = ("_turned", "_turned_at", "position", "refused", "time", "velocity", "yaw")
-
-    time: float  # of the pose [s], minus infinity before the first
-    position: Vector  # [m], NaN before the first pose
-    velocity: Vector  # [m/s]
-    yaw: float  # [rad], NaN while the newest pose has none
-    refused: int  # poses that jumped farther than a robot can move
-    _turned: float  # last measured yaw less the body's own at that time [rad], NaN before the first
-    _turned_at: float  # and that time [s]
-
-    def __init__(self) -> None:
-        self.time, self.position, self.velocity, self.yaw, self.refused = -inf, UNKNOWN, ZERO, nan, 0
-        self._turned = self._turned_at = nan
+    time: float = -inf  # of the pose [s], minus infinity before the first
+    position: Vector = UNKNOWN  # [m], NaN before the first pose
+    velocity: Vector = ZERO  # [m/s]
+    yaw: float = nan  # [rad], NaN while the newest pose has none
+    refused: int = 0  # poses that jumped farther than a robot can move
+    _turned: float = nan  # last measured yaw less the body's own at that time [rad], NaN before the first
+    _turned_at: float = nan  # and that time [s]
 
     def update(self, t: float, position: Vector, yaw: float) -> bool:
         """Store a pose; returns False if it is old, or jumps farther than a robot can move."""

@@ -93,68 +93,26 @@ class RangeScan(msgspec.Struct, frozen=True):
     distance: Sequence[float]  # from the robot's centre [m]; NaN where nothing is in reach
 
 
+@dataclass(eq=False)
 class BodyState:
     """State of the body of one robot; unknown numbers are NaN."""
 
-    __slots__ = (
-        "ahead",
-        "attitude",
-        "battery",
-        "flying",
-        "note",
-        "position",
-        "received",
-        "refusal",
-        "scan",
-        "shadow_position",
-        "shadow_yaw",
-        "time",
-        "true_position",
-        "true_yaw",
-        "velocity",
-        "yaw",
-    )  # fmt: skip
-
-    time: float  # when the pose was measured, on the clock of `Body.read` [s]
-    position: Vector  # measured [m]
-    velocity: Vector  # measured or estimated [m/s]
-    yaw: float  # measured [rad]
-    true_position: Vector  # the truth of a twin [m]
-    true_yaw: float  # the truth of a twin [rad]
-    battery: float  # charge, 0 to 1
-    flying: bool  # motors on, off the ground or about to be
-    attitude: Attitude  # of bodies that measure more than yaw
-    shadow_position: Vector  # of the twin that runs beside the robot [m] (`agents.body.shadow_twin`)
-    shadow_yaw: float  # of that twin [rad]
-    ahead: float  # stamp of the last external position less the time of its arrival [s]
-    received: float  # newest answer of the device, on the clock of `Body.read` [s]
-    note: str  # report of the hardware (supervisor, link), for people
-    refusal: str  # why the device would refuse to take off now; empty if it would not, or does not tell
-    scan: RangeScan | None  # the newest sweep of its range sensors
-
-    def __init__(
-        self,
-        time: float = nan,
-        position: Vector = UNKNOWN,
-        velocity: Vector = UNKNOWN,
-        yaw: float = nan,
-        *,
-        true_position: Vector = UNKNOWN,
-        true_yaw: float = nan,
-        battery: float = nan,
-        flying: bool = False,
-        attitude: Attitude = NO_ATTITUDE,
-        ahead: float = nan,
-        received: float = nan,
-        note: str = "",
-        refusal: str = "",
-        scan: RangeScan | None = None,
-    ) -> None:
-        self.time, self.position, self.velocity, self.yaw = time, position, velocity, yaw
-        self.true_position, self.true_yaw, self.battery, self.flying = true_position, true_yaw, battery, flying
-        self.attitude, self.ahead, self.received = attitude, ahead, received
-        self.shadow_position, self.shadow_yaw = UNKNOWN, nan
-        self.note, self.refusal, self.scan = note, refusal, scan
+    time: float = nan  # when the pose was measured, on the clock of `Body.read` [s]
+    position: Vector = UNKNOWN  # measured [m]
+    velocity: Vector = UNKNOWN  # measured or estimated [m/s]
+    yaw: float = nan  # measured [rad]
+    true_position: Vector = UNKNOWN  # the truth of a twin [m]
+    true_yaw: float = nan  # the truth of a twin [rad]
+    battery: float = nan  # charge, 0 to 1
+    flying: bool = False  # motors on, off the ground or about to be
+    attitude: Attitude = NO_ATTITUDE  # of bodies that measure more than yaw
+    shadow_position: Vector = UNKNOWN  # of the twin that runs beside the robot [m] (`agents.body.shadow_twin`)
+    shadow_yaw: float = nan  # of that twin [rad]
+    ahead: float = nan  # stamp of the last external position less the time of its arrival [s]
+    received: float = nan  # newest answer of the device, on the clock of `Body.read` [s]
+    note: str = ""  # report of the hardware (supervisor, link), for people
+    refusal: str = ""  # why the device would refuse to take off now; empty if it would not, or does not tell
+    scan: RangeScan | None = None  # the newest sweep of its range sensors
 
 
 class Body(ABC):

@@ -34,11 +34,6 @@ class CentreGoal(NamedTuple):
 class Followed:
     """A robot as the central controller knows it."""
 
-    __slots__ = (
-        "computer", "goal", "goal_yaw", "guided", "held", "keeping", "lost_since", "needed", "pose_stamp", "position",
-        "receivers", "sent_at", "stamp", "updates", "velocity", "words", "yaw",
-    )  # fmt: skip
-
     guided: bool  # gets goals
     held: bool  # by its safety, as far as known; set by the caller
     words: Mapping[str, Values]  # variables that its law says, as they were at the last decision
@@ -209,8 +204,6 @@ class Centre:
 
 class ReceivedGoals:
     """Goal received from the central controller, its age, and liveliness of the controller."""
-
-    __slots__ = ("_flies", "_silence_s", "fresh", "goal", "goal_yaw", "lost_since", "stamp", "velocity")
 
     goal: Vector  # last received [m]
     goal_yaw: float  # wanted there [rad], NaN for any

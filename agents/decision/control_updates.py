@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from math import inf
 
 from agents.decision.neighbours import Neighbours
 from agents.plugins.predictors import Predictor
 from agents.plugins.triggers import Trigger, TriggerState
-from agents.vectors import Vector, difference, distance, is_finite, norm
+from agents.vectors import ZERO, Vector, difference, distance, is_finite, norm
 
 
+@dataclass(eq=False)
 class Input:
     """Input of the law on one link at the last computation."""
 
-    __slots__ = ("apart", "rate")
-
-    apart: Vector  # p_i − p̂_j [m]
-    rate: Vector  # its rate [m/s]
-
-    def __init__(self) -> None:
-        self.apart, self.rate = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+    apart: Vector = ZERO  # p_i − p̂_j [m]
+    rate: Vector = ZERO  # its rate [m/s]
 
 
 class ControlUpdates:
@@ -29,8 +26,6 @@ class ControlUpdates:
     relative positions p_i − p̂_j on the links, as the robot estimates them, and p_i if it keeps a distance to a fixed
     object. ‖ε‖ is their largest change.
     """
-
-    __slots__ = ("_anchored", "_inputs", "asking")
 
     asking: TriggerState
 

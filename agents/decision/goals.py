@@ -6,6 +6,7 @@ guides from that robot's last received pose. `errors`, `law_offset` and `decide`
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from math import isfinite, isnan, nan
 from typing import ClassVar, cast
 
@@ -26,12 +27,6 @@ class GoalComputer:
     """Goals of one robot."""
 
     FIXED: ClassVar = ("_gated", "_reshapes", "follows", "needs_company")
-    __slots__ = (
-        "_anchors", "_changes", "_detour", "_detour_since", "_flies", "_gated", "_given", "_predictor", "_reshapes",
-        "_updating", "clamp", "energy", "error", "follows", "goal", "ground", "itinerary", "law", "needs_company",
-        "neighbours", "offset", "stepping", "tracking_gain", "yaw",
-    )  # fmt: skip
-
     law: Gradient  # where `stepping` is None
     stepping: Stepping | None  # a law that is no gradient, at work
     neighbours: Neighbours
@@ -290,17 +285,13 @@ class GoalComputer:
             self.require_update()
 
 
+@dataclass(eq=False)
 class StationKeeping:
     """The place where the hold of a robot began."""
 
-    __slots__ = ("at", "ground", "held")
-
-    at: Vector  # [m]
-    held: bool
-
-    def __init__(self, ground: float) -> None:
-        """Hold at the height `ground` [m]."""
-        self.ground, self.at, self.held = ground, UNKNOWN, False
+    ground: float  # its height [m]
+    at: Vector = UNKNOWN  # [m]
+    held: bool = False
 
     def hold(self, held: bool, position: Vector) -> None:
         """Begin, go on or end a hold; a robot without a position stays at the first known one."""

@@ -43,11 +43,6 @@ SETTLED: Final = 0.1  # [m/s] slower: climbing or rolling has ended
 class Lifecycle:
     """Phases of one robot."""
 
-    __slots__ = (
-        "_before", "_ends_after", "_flies", "_hover", "_scripted", "_waits", "climbing", "failing", "land_due",
-        "moved", "phase", "reason", "settled_until", "start_at", "stop_due", "takeoff_due",
-    )  # fmt: skip
-
     phase: int  # of `Phase`
     climbing: bool  # on its way up
     start_at: float  # the common start on the process's clock [s]; infinity before it is known

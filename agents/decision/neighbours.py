@@ -40,12 +40,6 @@ class Incoming(msgspec.Struct, frozen=True):
 class Neighbour:
     """Sender of one link: its target, its last pose, and its liveliness."""
 
-    __slots__ = (
-        "active", "arrival", "available", "awaited", "behind", "doubt", "foreign", "height", "in_law", "lag", "link",
-        "lost_since", "name", "position", "present", "radius", "reach", "release", "said", "sender", "since", "stamp",
-        "targets", "until", "velocity", "yaw",
-    )  # fmt: skip
-
     link: Link  # its target now
     position: Vector  # last received [m], NaN before; that of a former process until its successor has sent one
     velocity: Vector  # [m/s]
@@ -94,8 +88,6 @@ class Neighbour:
 
 class Neighbours:
     """All senders of one robot."""
-
-    __slots__ = ("all", "foreign_at", "incomplete", "lagging", "refused", "silence_s")
 
     all: list[Neighbour]  # in the order of the links
     incomplete: bool  # a sender is missing or lost, so that time alone can change the active links

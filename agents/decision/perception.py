@@ -39,23 +39,6 @@ class Point(NamedTuple):
 class Perception:
     """Inputs of the avoidance of a robot."""
 
-    __slots__ = (
-        "_clearance",
-        "_height",
-        "_horizon",
-        "_in_time",
-        "_links",
-        "_neighbour_timeout_s",
-        "_points",
-        "_position_timeout_s",
-        "_radius",
-        "_scan",
-        "avoidance",
-        "near",
-        "own",
-        "sees",
-    )  # fmt: skip
-
     FIXED: ClassVar = ("sees",)
 
     sees: bool  # there are range readings

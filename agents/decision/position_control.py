@@ -22,8 +22,6 @@ BROADSIDE: Final = 0.02  # cosine of α below which a goal is abeam: wheels turn
 class PositionController:
     """Position controller of a robot of any kind."""
 
-    __slots__ = ("_agility", "_drives", "_flies", "_flies_to", "_steering")
-
     _flies_to: bool  # its body takes positions, and closes in on them by itself
     _drives: bool  # its body takes twists; one that takes neither takes velocities
     _flies: bool
@@ -66,8 +64,6 @@ class VelocityFollower:
     The reference of a robot that takes twists is its measured place. That of any other is carried on with the velocity:
     a measured one would be a random walk.
     """
-
-    __slots__ = ("_by_twist", "_flies", "_ground", "_response", "_speed", "reference")
 
     reference: Vector  # [m]; NaN: the next one is the place of the robot
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from math import expm1, inf, isfinite, nan
 from typing import Final
 
 from agents.body.interface import BodyState
-from agents.vectors import Vector
+from agents.vectors import UNKNOWN, Vector
 
 # a neighbour silent for this long after a suspension had nothing new: missed poses come with the next heartbeat of its
 # publisher, 0.5 s after its last pose, or with the history that is requested after a reconnection
@@ -15,20 +16,16 @@ LATE_WINDOW_S: Final = 1.0  # window in which missed ticks are counted
 LATE_SHARE: Final = 0.9  # with a larger share of missed ticks the control loop fails
 
 
+@dataclass(eq=False)
 class ProcessHealth:
     """State of the process around a decision, set by the process."""
 
-    __slots__ = (
-        "conductor_lost_since", "connected_since", "missed_share", "offline_since", "resumed_at", "suspended_s",
-    )  # fmt: skip
-
-    def __init__(self) -> None:
-        self.offline_since = inf  # loss of the router [s]; infinity while connected
-        self.conductor_lost_since = inf  # loss of the conductor [s]; infinity while alive, or never seen
-        self.missed_share = 0.0  # of the last ticks, 0 to 1
-        self.resumed_at = -inf  # end of the last suspension [s]
-        self.suspended_s = 0.0  # its duration [s]
-        self.connected_since = -inf  # begin of the connection to a router after it [s]
+    offline_since: float = inf  # loss of the router [s]; infinity while connected
+    conductor_lost_since: float = inf  # loss of the conductor [s]; infinity while alive, or never seen
+    missed_share: float = 0.0  # of the last ticks, 0 to 1
+    resumed_at: float = -inf  # end of the last suspension [s]
+    suspended_s: float = 0.0  # its duration [s]
+    connected_since: float = -inf  # begin of the connection to a router after it [s]
 
     def mark_resumed(self, t: float, slept: float) -> None:
         """The process resumed at `t` [s] after a suspension of `slept` [s]."""
@@ -60,34 +57,23 @@ class ProcessHealth:
                 self.missed_share = 0.0
 
 
+@dataclass(eq=False)
 class Situation:
     """One robot on a tick; overwritten on each."""
 
-    __slots__ = (
-        "excess", "flyaway", "invalid", "jump", "outside", "outside_wall", "position", "sound", "state", "t",
-        "velocity", "yaw", "yaw_jump",
-    )  # fmt: skip
-
-    t: float  # now [s]
-    state: BodyState  # as the body gave it; the decision uses what follows
-    position: Vector  # measured [m]; NaN where it jumped
-    velocity: Vector  # measured or estimated [m/s]
-    yaw: float  # measured [rad]
-    jump: float  # length of the jump of its position [m]; NaN: it did not jump
-    yaw_jump: float  # size of the jump of its yaw [rad]; NaN: it did not jump
-    sound: bool  # pose known, fresh and inside the arena: the five below are False and 0
-    invalid: bool  # own pose missing, stale or not finite: no closed loop is possible
-    outside_wall: bool  # outside a wall, or above the ceiling
-    outside: bool  # outside the arena beyond any doubt
-    flyaway: bool  # so far outside that a flying robot must be stopped there
-    excess: float  # distance from the arena along the worst axis [m]; 0 inside
-
-    def __init__(self) -> None:
-        self.t, self.state, self.jump, self.yaw_jump = 0.0, BodyState(), nan, nan
-        self.begin(0.0)
-        self.sound = True
-        self.invalid = self.outside_wall = self.outside = self.flyaway = False
-        self.excess = 0.0
+    t: float = 0.0  # now [s]
+    state: BodyState = field(default_factory=BodyState)  # as the body gave it; the decision uses what follows
+    position: Vector = UNKNOWN  # measured [m]; NaN where it jumped
+    velocity: Vector = UNKNOWN  # measured or estimated [m/s]
+    yaw: float = nan  # measured [rad]
+    jump: float = nan  # length of the jump of its position [m]; NaN: it did not jump
+    yaw_jump: float = nan  # size of the jump of its yaw [rad]; NaN: it did not jump
+    sound: bool = True  # pose known, fresh and inside the arena: the five below are False and 0
+    invalid: bool = False  # own pose missing, stale or not finite: no closed loop is possible
+    outside_wall: bool = False  # outside a wall, or above the ceiling
+    outside: bool = False  # outside the arena beyond any doubt
+    flyaway: bool = False  # so far outside that a flying robot must be stopped there
+    excess: float = 0.0  # distance from the arena along the worst axis [m]; 0 inside
 
     def begin(self, t: float) -> None:
         """Begin a tick at `t` [s] with the state of the body."""

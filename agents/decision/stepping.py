@@ -30,8 +30,6 @@ class Speech:
     not move yet.
     """
 
-    __slots__ = ("_metres", "_stepped", "now", "said", "spoken", "words")
-
     now: dict[str, Values]  # variables as they are
     said: dict[str, Values]  # and as said last; at first as they begin
     spoken: bool  # it has said something
@@ -69,11 +67,6 @@ class Speech:
 
 class Stepping:
     """A law at work for one robot."""
-
-    __slots__ = (
-        "_law", "_stepped", "_target", "alone", "control", "facts", "measures", "memory", "moves", "scan", "speech",
-        "tick", "tick_s",
-    )  # fmt: skip
 
     memory: dict[str, Values]
     measures: dict[str, float]  # of the last step

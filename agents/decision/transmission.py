@@ -19,8 +19,6 @@ class Transmitter:
     """Transmissions of one robot."""
 
     FIXED: ClassVar = ("_smooths", "_speaks")
-    __slots__ = ("_smooths", "_speaks", "asking", "position", "predictor", "smoothed", "speech", "velocity")
-
     asking: TriggerState
     predictor: Predictor  # of the receivers
     position: Vector  # of the last question: what would be transmitted [m],
@@ -94,10 +92,6 @@ class LowPass:
     the model-based control of networked systems", Automatica 39(10), 2003. Where the robot deviates from its model by
     Δv, p_f is off by τ·Δv.
     """
-
-    __slots__ = (
-        "_by_place", "_driven_x", "_driven_y", "_flies", "_lag", "_response", "_speed", "_t", "position", "velocity",
-    )  # fmt: skip
 
     position: Vector  # smoothed [m], NaN at the beginning
     velocity: Vector  # likewise [m/s]

@@ -102,8 +102,6 @@ class Conditions(msgspec.Struct, frozen=True):
 class LinkChannel:
     """Carries samples over one link."""
 
-    __slots__ = ("_conditions", "_enter", "_free", "_leave", "delay", "dropped", "plain")
-
     dropped: int  # samples that were lost
     delay: float  # [s]
     plain: bool  # the delay is all that there is

@@ -7,6 +7,7 @@ after all other limits (safety level; the barrier). Both are quiet.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from math import inf, sqrt
 from typing import Annotated, Final, Literal
 
@@ -23,32 +24,25 @@ ASIDE: Final = 0.1  # of the pull against a push: the step aside
 HURRY: Final = 2.0  # times its limit of speed: no robot is faster, not along the diagonal of limits per axis either
 
 
+@dataclass(eq=False)
 class Thing:
     """Thing near a robot: an upright cylinder, a robot with a received pose or the end of a range reading.
 
     What follows `lag` is set by `measure`.
     """
 
-    __slots__ = (
-        "away_x", "away_y", "gap", "high", "is_robot", "lag", "low", "radius", "velocity_x", "velocity_y", "x", "y",
-    )  # fmt: skip
-
-    x: float  # believed now [m]
-    y: float
-    velocity_x: float  # believed [m/s]; 0 for range readings
-    velocity_y: float
-    radius: float  # [m]; 0 for range readings
-    low: float  # lower end [m]
-    high: float  # upper end [m]
-    is_robot: bool  # robot of this experiment, which may avoid as well; else a range reading
-    lag: float  # time constant of its velocity [s]; 0 for range readings
-    away_x: float  # unit vector from the thing to the robot
-    away_y: float
-    gap: float  # between surfaces once both have stopped closing in [m]
-
-    def __init__(self) -> None:
-        self.away_x = self.away_y = self.gap = 0.0
-        self.vanish()
+    x: float = ABSENT_M  # believed now [m]
+    y: float = ABSENT_M
+    velocity_x: float = 0.0  # believed [m/s]; 0 for range readings
+    velocity_y: float = 0.0
+    radius: float = 0.0  # [m]; 0 for range readings
+    low: float = 0.0  # lower end [m]
+    high: float = 0.0  # upper end [m]
+    is_robot: bool = False  # robot of this experiment, which may avoid as well; else a range reading
+    lag: float = 0.0  # time constant of its velocity [s]; 0 for range readings
+    away_x: float = 0.0  # unit vector from the thing to the robot
+    away_y: float = 0.0
+    gap: float = 0.0  # between surfaces once both have stopped closing in [m]
 
     def vanish(self) -> None:
         """Be a point at rest, out of reach of everything."""
@@ -57,23 +51,17 @@ class Thing:
         self.is_robot = False
 
 
+@dataclass(eq=False)
 class Plane:
     """Half-plane a·u ≤ b of velocities u."""
 
-    __slots__ = ("b", "x", "y")
-
-    x: float  # unit vector a
-    y: float
-    b: float  # [m/s]
-
-    def __init__(self) -> None:
-        self.x = self.y = self.b = 0.0
+    x: float = 0.0  # unit vector a
+    y: float = 0.0
+    b: float = 0.0  # [m/s]
 
 
 class Nearby:
     """Things near a robot: the first `count` of `things`. The list has room for more, which stand `ABSENT_M` away."""
-
-    __slots__ = ("count", "planes", "things")
 
     count: int
     things: list[Thing]
@@ -100,32 +88,22 @@ class Nearby:
             self.things[k].vanish()
 
 
+@dataclass(eq=False)
 class OwnState:
     """State and properties of a robot."""
 
-    __slots__ = (
-        "by_position", "by_twist", "flies", "height", "lag", "position", "radius", "response", "speed", "turn_rate",
-        "velocity", "yaw",
-    )  # fmt: skip
-
-    position: Vector  # measured [m]
-    velocity: Vector  # measured or estimated, 0 where unknown [m/s]
-    yaw: float  # measured [rad]
-    radius: float  # [m]
-    height: float  # vertical size, from the position up [m]
-    speed: float  # limit [m/s]
-    turn_rate: float  # limit [rad/s]
-    response: float  # rate at which a body that takes positions closes a position error [1/s]
-    lag: float  # time constant from commanded to true velocity [s]
-    by_position: bool  # takes a position
-    by_twist: bool  # takes a twist
-    flies: bool
-
-    def __init__(self) -> None:
-        self.position = self.velocity = ZERO
-        self.yaw = self.radius = self.height = self.lag = 0.0
-        self.speed = self.turn_rate = self.response = 1.0
-        self.by_position = self.by_twist = self.flies = False
+    position: Vector = ZERO  # measured [m]
+    velocity: Vector = ZERO  # measured or estimated, 0 where unknown [m/s]
+    yaw: float = 0.0  # measured [rad]
+    radius: float = 0.0  # [m]
+    height: float = 0.0  # vertical size, from the position up [m]
+    speed: float = 1.0  # limit [m/s]
+    turn_rate: float = 1.0  # limit [rad/s]
+    response: float = 1.0  # rate at which a body that takes positions closes a position error [1/s]
+    lag: float = 0.0  # time constant from commanded to true velocity [s]
+    by_position: bool = False  # takes a position
+    by_twist: bool = False  # takes a twist
+    flies: bool = False
 
 
 def measure_gap(own: OwnState, thing: Thing) -> None:

@@ -9,6 +9,7 @@ its subclass `agents.plugins.laws.Gradient`.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from math import isfinite, nan
 from typing import Any, ClassVar, Literal, TypeVar
 
@@ -35,10 +36,9 @@ class Said(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     place: int | None = None
 
 
+@dataclass(eq=False)
 class RobotFacts:
     """A robot as its law knows it before anything happens."""
-
-    __slots__ = ("count", "flies", "name", "number", "speed", "step_s")
 
     name: str
     number: int  # among all robots of the experiment, from 0 on
@@ -46,12 +46,6 @@ class RobotFacts:
     flies: bool
     speed: float  # of its kind [m/s]
     step_s: float  # from one step to the next [s]
-
-    def __init__(  # noqa: PLR0917 - one for each attribute
-        self, name: str, number: int, count: int, flies: bool, speed: float, step_s: float
-    ) -> None:
-        self.name, self.number, self.count, self.flies = name, number, count, flies
-        self.speed, self.step_s = speed, step_s
 
     def of(self, table: Mapping[str, T], default: T | None = None) -> T:
         """Value of this robot in a table by names; raises ValueError if it has none and there is no default."""
@@ -61,10 +55,9 @@ class RobotFacts:
         return value
 
 
+@dataclass(eq=False)
 class NeighbourView:
     """A neighbour as the robot believes it, with the link to it."""
-
-    __slots__ = ("age", "link", "name", "number", "position", "said", "velocity", "yaw")
 
     number: int  # among all robots of the experiment
     name: str
@@ -75,42 +68,27 @@ class NeighbourView:
     said: Memory  # variables as it said them last; NaN before the first
     link: Link  # its target and gain
 
-    def __init__(  # noqa: PLR0917 - one for each attribute
-        self, number: int, name: str, position: Vector, velocity: Vector, yaw: float, age: float, said: Memory,
-        link: Link,
-    ) -> None:  # fmt: skip
-        self.number, self.name, self.position, self.velocity = number, name, position, velocity
-        self.yaw, self.age, self.said, self.link = yaw, age, said, link
 
-
+@dataclass(eq=False)
 class View:
     """Knowledge of a robot at a step of its law."""
 
-    __slots__ = (
-        "leads", "moves", "neighbours", "position", "robot", "said", "scan", "step_s", "target", "target_velocity",
-        "time", "velocity", "yaw",
-    )  # fmt: skip
-
     robot: RobotFacts
-    time: float  # since the common start, by ticks [s]
-    step_s: float  # since the last step, by ticks [s]
-    position: Vector  # own, measured [m]
-    velocity: Vector  # own, measured [m/s]
-    yaw: float  # own [rad]
-    target: Vector  # of the robot's plan now [m]; NaN without one
-    target_velocity: Vector  # of that target [m/s]; 0 at first
-    scan: Any  # range readings, see `agents.body.interface.RangeScan`; None without
-    leads: bool  # the law does not move it: it has no links, and follows a plan or stays
-    moves: bool  # False while safety holds it: integrals of what its motion must mend stop then
     said: Memory  # own variables, as said last: what the neighbours believe of this robot
     neighbours: Sequence[NeighbourView]  # those of its links that are there, in the order of their numbers
+    time: float = 0.0  # since the common start, by ticks [s]
+    step_s: float = field(init=False)  # since the last step, by ticks [s]
+    position: Vector = UNKNOWN  # own, measured [m]
+    velocity: Vector = ZERO  # own, measured [m/s]
+    yaw: float = 0.0  # own [rad]
+    target: Vector = UNKNOWN  # of the robot's plan now [m]; NaN without one
+    target_velocity: Vector = ZERO  # of that target [m/s]; 0 at first
+    scan: Any = None  # range readings, see `agents.body.interface.RangeScan`; None without
+    leads: bool = False  # the law does not move it: it has no links, and follows a plan or stays
+    moves: bool = True  # False while safety holds it: integrals of what its motion must mend stop then
 
-    def __init__(self, robot: RobotFacts, said: Memory, neighbours: Sequence[NeighbourView]) -> None:
-        self.robot, self.said, self.neighbours = robot, said, neighbours
-        self.time, self.step_s, self.yaw = 0.0, robot.step_s, 0.0
-        self.position, self.velocity, self.target, self.target_velocity = UNKNOWN, ZERO, UNKNOWN, ZERO
-        self.scan = None
-        self.leads, self.moves = False, True
+    def __post_init__(self) -> None:
+        self.step_s = self.robot.step_s
 
     def known(self, *names: str) -> list[NeighbourView]:
         """Neighbours that have said all variables of these names."""

@@ -158,8 +158,6 @@ class Leg(msgspec.Struct, frozen=True):
 class Itinerary:
     """Legs that a robot follows one after the other, and where each began."""
 
-    __slots__ = ("_anchor", "_heading", "_leg", "legs", "next_at", "origin")
-
     legs: tuple[Leg, ...]
     next_at: float  # time of the next leg [s]; infinity after the last
     origin: Pose | None  # x, y, z [m] and yaw [rad] where its first leg began; None before

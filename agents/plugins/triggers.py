@@ -9,6 +9,7 @@ the two basic ones; the others are in `agents.plugins.trigger_families`. `fires`
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from math import inf
 from types import SimpleNamespace
 from typing import Annotated, Any, ClassVar, Final, Literal
@@ -24,29 +25,19 @@ ROUNDING_S: Final = 1e-6  # ticks are multiples of a period that binary fraction
 NOWHERE: Final[Vector] = (inf, inf, inf)
 
 
+@dataclass(eq=False)
 class LastEvent:
     """State of a robot at its last event: its last transmission, or the last computation of its law."""
 
-    __slots__ = ("energy", "offset", "position", "time", "velocity")
-
-    position: Vector  # transmitted [m]; infinite before the first event
-    velocity: Vector  # transmitted [m/s]
-    offset: Vector  # of the law [m]
-    time: float  # of the event [s]; minus infinity before the first
-    energy: float  # of the formation error [m²]
-
-    def __init__(self) -> None:
-        self.position, self.velocity, self.offset = NOWHERE, ZERO, ZERO
-        self.time, self.energy = -inf, 0.0
+    position: Vector = NOWHERE  # transmitted [m]; infinite before the first event
+    velocity: Vector = ZERO  # transmitted [m/s]
+    offset: Vector = ZERO  # of the law [m]
+    time: float = -inf  # of the event [s]; minus infinity before the first
+    energy: float = 0.0  # of the formation error [m²]
 
 
 class TriggerView:
     """Quantities that a trigger may use; overwritten at each question."""
-
-    __slots__ = (
-        "deviation", "drift", "energy", "error", "last", "memory", "offset", "position", "reach_s", "since_event",
-        "since_start", "t", "velocity",
-    )  # fmt: skip
 
     t: float  # now [s]
     position: Vector  # own [m]; for communication the pose to transmit, smoothed if asked for
@@ -97,8 +88,6 @@ class Trigger(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 class TriggerState:
     """A trigger at work for one robot: its view, its last event and its last evaluation."""
-
-    __slots__ = ("evaluated_at", "last", "trigger", "view")
 
     trigger: Trigger  # may be replaced by one of the same kind
     view: TriggerView  # for the next question

@@ -6,6 +6,7 @@ Quiet: all but `Detector.words`, `nearest_robot`, `clock_text` and `tilt_angle`,
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from math import asin, degrees, hypot, inf, isfinite, nan, sin, sqrt
 from typing import ClassVar, Final
 
@@ -36,31 +37,22 @@ NOT_UNIT: Final = 0.1  # largest deviation of the squared norm of a quaternion f
 BEHIND: Final = 0.5  # share of the age at which a position is invalid: stamps this far behind give a warning
 
 
+@dataclass(eq=False)
 class RobotStatus:
     """Status of a robot in its experiment, for `Detector`; the robot overwrites it on each tick."""
 
-    __slots__ = (
-        "alone", "aside", "climbing", "cruising", "goal_height", "goal_stamp", "landing", "not_finite", "ordered",
-        "setpoint", "unguided", "unstarted",
-    )  # fmt: skip
-
-    ordered: bool  # holds by order
-    cruising: bool  # at its height or running: its setpoints are followed
-    climbing: bool  # on its way up
-    landing: bool  # descending
-    alone: bool  # the law has no input
-    unguided: bool  # running without the guidance that it needs
-    goal_stamp: float  # decision time of the goal of a guided robot [s]; −inf: it is not guided
-    unstarted: bool  # on its way up, or in the air, without a start order
-    goal_height: float  # [m]
-    setpoint: Setpoint  # of the tick before, NaN when the body drives by itself
-    not_finite: bool  # the last setpoint was not finite
-    aside: bool  # on its way to a landing place
-
-    def __init__(self) -> None:
-        self.ordered = self.cruising = self.climbing = self.landing = self.alone = False
-        self.unguided = self.unstarted = self.not_finite = self.aside = False
-        self.goal_stamp, self.goal_height, self.setpoint = -inf, nan, NO_SETPOINT
+    ordered: bool = False  # holds by order
+    cruising: bool = False  # at its height or running: its setpoints are followed
+    climbing: bool = False  # on its way up
+    landing: bool = False  # descending
+    alone: bool = False  # the law has no input
+    unguided: bool = False  # running without the guidance that it needs
+    goal_stamp: float = -inf  # decision time of the goal of a guided robot [s]; −inf: it is not guided
+    unstarted: bool = False  # on its way up, or in the air, without a start order
+    goal_height: float = nan  # [m]
+    setpoint: Setpoint = NO_SETPOINT  # of the tick before, NaN when the body drives by itself
+    not_finite: bool = False  # the last setpoint was not finite
+    aside: bool = False  # on its way to a landing place
 
 
 class Ascent:
@@ -69,10 +61,6 @@ class Ascent:
     If the measured height does not follow, it is a wrong one, and the robot flies higher and higher: its markers lie on
     the floor.
     """
-
-    __slots__ = (
-        "aside", "begin", "carried", "climbing", "free", "highest", "hover", "patience_s", "risen_at", "stalled",
-    )  # fmt: skip
 
     climbing: bool  # on the last tick
     hover: float  # height at the end [m]
@@ -105,23 +93,17 @@ class Ascent:
         self.stalled = climbing and self.hover - height > SUNK and t - self.risen_at > self.patience_s
 
 
+@dataclass(eq=False)
 class LandingProgress:
     """Progress of a landing."""
 
-    __slots__ = ("due", "hovers", "landing", "late", "lowered_at", "lowest", "room")
-
     room: float  # height from which a robot of unknown height descends [m]
-    landing: bool  # on the last tick
-    due: float  # when it is down, at the slowest [s]
-    lowest: float  # last step of height [m],
-    lowered_at: float  # and its time [s]
-    late: bool  # its motors do no good
-    hovers: bool  # it stays at a height; it is never cut: it would fall
-
-    def __init__(self, room: float) -> None:
-        self.room = room
-        self.landing = self.late = self.hovers = False
-        self.due = self.lowest = self.lowered_at = 0.0
+    landing: bool = False  # on the last tick
+    due: float = 0.0  # when it is down, at the slowest [s]
+    lowest: float = 0.0  # last step of height [m],
+    lowered_at: float = 0.0  # and its time [s]
+    late: bool = False  # its motors do no good
+    hovers: bool = False  # it stays at a height; it is never cut: it would fall
 
     def update(self, t: float, landing: bool, valid: bool, height: float, velocity: Vector) -> None:
         """Follow a robot that may be `landing` at `t` [s]; the `height` [m] of a `valid` pose is known.
@@ -143,12 +125,6 @@ class Detector:
     """Detector of the causes of hazards of one robot."""
 
     FIXED: ClassVar = ("flies", "sees")
-    __slots__ = (
-        "ascent", "avoids", "battery_low", "behind_s", "descent", "fastest", "fastest_squared", "flies", "lean",
-        "leaned", "leans_since", "limits", "motion_check", "name", "predictor", "radius", "scan", "scanned", "sees",
-        "separation", "silence_s", "slow_squared",
-    )  # fmt: skip
-
     name: str  # of the robot
     limits: Limits
     predictor: Predictor  # of neighbours

@@ -161,11 +161,6 @@ class HazardChange(NamedTuple):
 class Hazards:
     """State machine of one robot; a set of causes is an int with the bits `1 << cause`."""
 
-    __slots__ = (
-        "after_s", "begun", "clears_s", "first", "held", "incidents", "landing", "last", "lasted_s", "level", "open",
-        "place", "present", "repeats", "since", "texts", "then", "then_s", "under_way", "unresolved",
-    )  # fmt: skip
-
     held: bool  # the robot must keep its place
     under_way: bool  # a hazard exists, or its begin or end is pending: `update` must be called
     incidents: list[HazardChange]  # since the reader emptied the list

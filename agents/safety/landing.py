@@ -38,8 +38,6 @@ class Occupied(NamedTuple):
 class Landing:
     """Robot on its way to a place where it can land."""
 
-    __slots__ = ("_assignment", "_nearest", "_until", "aside", "place")
-
     aside: bool  # it must land and is not at its place yet
     place: Vector  # its landing place [m], NaN: none
     _until: float  # when it lands in place [s]

@@ -27,10 +27,6 @@ class Continuity:
     It has jumped until its position is back, or until it is forgotten: an outlier lasts a sample.
     """
 
-    __slots__ = (
-        "_fastest", "_jump_m", "_place", "_squared", "_time", "_turn_rate", "_wheels", "_yaw", "jumped", "yaw_jump",
-    )  # fmt: skip
-
     jumped: bool  # it has jumped
     yaw_jump: float  # size of the jump of its yaw [rad]; NaN: it did not jump
     _jump_m: float  # a jump is longer [m]
@@ -96,10 +92,6 @@ class ExternalPositions:
     A moving robot has jumped if it moved by more than its own size beyond its possible travel. Two robots that are
     mistaken for each other are at least that distance apart. Smaller errors show as disobedience.
     """
-
-    __slots__ = (
-        "_continuity", "_flipped", "_time", "_turn_rate", "_yaw", "_yaw_time", "deceived", "doubted", "jump",
-    )  # fmt: skip
 
     jump: float  # length of its jump [m]; NaN: it did not jump
     deceived: bool  # its positions are wrong for good

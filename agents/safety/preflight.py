@@ -6,7 +6,6 @@ The plug-ins of a robot are rehearsed: called before take-off, and their results
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from copy import deepcopy
 from itertools import chain
 from math import degrees, hypot, inf, isnan
 from numbers import Real
@@ -36,8 +35,6 @@ NUMBERS: Final = {1: "a number", 3: "three numbers", 4: "four numbers"}  # of a 
 
 class Preflight:
     """Checks of a robot, and the duration of their failure."""
-
-    __slots__ = ("_assignment", "_covered", "_limits", "_nearest_start", "_other_starts", "_since")
 
     def __init__(self, assignment: Assignment) -> None:
         self._assignment, self._limits = assignment, assignment.limits
@@ -156,10 +153,9 @@ def rehearse(
             apart = sender.apart(position, predictor, t)
             _expect("law", law, "pull", law.pull(apart, sender.link), 3)
             _expect("law", law, "error", law.error(apart, sender.link), 1)
-    trigger, update = transmitter.asking.trigger, assignment.update
-    _expect_bool(trigger, trigger.fires(deepcopy(transmitter.asking.view)))
-    if update is not None:
-        _expect_bool(update, update.fires(TriggerView(update.MEMORY)))
+    for trigger in (transmitter.asking.trigger, assignment.update):
+        if trigger is not None:
+            _expect_bool(trigger, trigger.fires(TriggerView(trigger.MEMORY)))
     for leg in assignment.legs:
         _expect("planner", leg.planner, "target", leg.planner.target(0.0, position, 0.0), 4)
     if perception is not None:

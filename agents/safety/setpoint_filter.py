@@ -25,11 +25,6 @@ REST: Final[Setpoint] = (0.0, 0.0, 0.0, 0.0)  # of robots that take velocities o
 class SetpointFilter:
     """Filter for the setpoints of a robot."""
 
-    __slots__ = (
-        "_closes_s", "_cut_beyond_m", "_drives", "_far", "_flies_to", "_high", "_low", "_position_timeout_s", "_speed",
-        "_step", "_turn_radius", "_turn_rate", "_walls_high", "_walls_low", "avoided", "changed", "not_finite",
-    )  # fmt: skip
-
     changed: bool  # the last setpoint differs from the decided one
     avoided: bool  # it was changed by avoidance
     not_finite: bool  # the decided one was not finite although the pose is valid: the robot is kept in place instead

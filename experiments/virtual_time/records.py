@@ -136,7 +136,7 @@ class Layouts:
         owner: type = type(thing)
         fields, fixed = dict[str, Any](), dict[str, Any]()
         names = getattr(owner, "FIXED", ())
-        for name in (*attributes(owner), *getattr(thing, "__dict__", ())):
+        for name in (*attributes(owner), *(each for each in getattr(thing, "__dict__", ()) if each not in LEFT_OUT)):
             try:
                 value = getattr(thing, name)
             except AttributeError:  # never set
