@@ -7,8 +7,8 @@ import inspect
 import sys
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
-from functools import wraps
-from typing import TYPE_CHECKING, Annotated, Any, Final, Self, get_type_hints
+from functools import partial, wraps
+from typing import TYPE_CHECKING, Annotated, Any, Final, get_type_hints
 
 import typer
 from typer.core import TyperCommand, TyperGroup
@@ -34,12 +34,8 @@ PANELS: Final = {
 class _Coercion:
     """Value of a parameter as its type; by typer's pydantic (70 ms of imports) only where it is not already."""
 
-    def __init__(self, parameter: Any) -> None:  # noqa: ANN401 - of typer's private click
-        self._build = parameter.get_runtime_param
-
-    def itself(self) -> Self:
-        """Stands in the place of typer's `get_runtime_param`."""
-        return self
+    def __init__(self, build: Any) -> None:  # noqa: ANN401 - `get_runtime_param` of a parameter of typer's private click
+        self._build = build
 
     def coerce(self, value: Any, param: Any, ctx: Any) -> Any:  # noqa: ANN401 - likewise
         """Coerce a value; raises typer.BadParameter for one that is not of the type."""
@@ -57,7 +53,7 @@ class _Coercion:
 def _quick(parameters: list[Any]) -> list[Any]:
     for each in parameters:
         if "get_runtime_param" not in vars(each):
-            each.get_runtime_param = _Coercion(each).itself
+            each.get_runtime_param = partial(_Coercion, each.get_runtime_param)
     return parameters
 
 

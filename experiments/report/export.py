@@ -8,7 +8,8 @@ from __future__ import annotations
 import csv
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 from types import NoneType
@@ -82,11 +83,8 @@ def write_mat(
     for name, case in cases.items():
         if (size := _bytes(case)) >= most_bytes:
             raise ExplainedError(f"{file}: {name} has {size / 1e9:.1f} GB, MATLAB reads 2.1; export a table: --csv")
-    try:
-        with file.open("wb") as stream:
-            savemat(stream, cases, long_field_names=True, do_compression=True, oned_as="column")
-    except OSError as error:
-        raise _unwritable(file, error) from None
+    with _writing(file), file.open("wb") as stream:
+        savemat(stream, cases, long_field_names=True, do_compression=True, oned_as="column")
 
 
 def write_csv(traces: Mapping[str, Trace], file: Path) -> None:
@@ -95,21 +93,18 @@ def write_csv(traces: Mapping[str, Trace], file: Path) -> None:
     Behind the columns of all runs stand those of laws that remember, see `_of_law`.
     """
     of_law = dict.fromkeys(name for trace in traces.values() for name in _of_law(trace))
-    try:
-        with file.open("w", newline="", encoding="utf-8") as stream:
-            table = csv.writer(stream)
-            table.writerow(["case", "time", "robot", *COLUMNS, *of_law])
-            for case, trace in traces.items():
-                parts = (trace.position, trace.yaw[..., None], trace.true_position, trace.goal)
-                told, unknown = _of_law(trace), np.full(trace.yaw.shape, np.nan)
-                more = [told.get(name, unknown)[..., None] for name in of_law]
-                values = np.concatenate([*parts, Measurement(trace).robot_errors[..., None], *more], axis=2)
-                cells = values.astype(object)
-                cells[~np.isfinite(values)] = None
-                for t, rows in zip(trace.time.tolist(), cells.tolist(), strict=True):
-                    table.writerows([case, t, robot, *row] for robot, row in zip(trace.robots, rows, strict=True))
-    except OSError as error:
-        raise _unwritable(file, error) from None
+    with _writing(file), file.open("w", newline="", encoding="utf-8") as stream:
+        table = csv.writer(stream)
+        table.writerow(["case", "time", "robot", *COLUMNS, *of_law])
+        for case, trace in traces.items():
+            parts = (trace.position, trace.yaw[..., None], trace.true_position, trace.goal)
+            told, unknown = _of_law(trace), np.full(trace.yaw.shape, np.nan)
+            more = [told.get(name, unknown)[..., None] for name in of_law]
+            values = np.concatenate([*parts, Measurement(trace).robot_errors[..., None], *more], axis=2)
+            cells = values.astype(object)
+            cells[~np.isfinite(values)] = None
+            for t, rows in zip(trace.time.tolist(), cells.tolist(), strict=True):
+                table.writerows([case, t, robot, *row] for robot, row in zip(trace.robots, rows, strict=True))
 
 
 def _of_law(trace: Trace) -> dict[str, Array]:
@@ -144,20 +139,18 @@ def write_video(traces: Mapping[str, Trace], file: Path, speed: float = 4.0) -> 
         raise ExplainedError(f"{file}: no position is known in this run; there is nothing to show")
     figure, show = trajectories.film(shown)
     writer = FFMpegWriter(FRAMES_HZ, bitrate=2000) if mp4 else PillowWriter(FRAMES_HZ)  # type: ignore[arg-type]
-    try:
-        with writer.saving(figure, str(file), 150 if mp4 else 110):
-            for t in np.arange(0.0, max(float(trace.time[-1]) for trace in shown), speed / FRAMES_HZ):
-                show(float(t))
-                writer.grab_frame()
-    except OSError as error:
-        raise _unwritable(file, error) from None
+    with _writing(file), writer.saving(figure, str(file), 150 if mp4 else 110):
+        for t in np.arange(0.0, max(float(trace.time[-1]) for trace in shown), speed / FRAMES_HZ):
+            show(float(t))
+            writer.grab_frame()
 
 
 def structure(trace: Trace, metrics: CaseMetrics) -> dict[str, Any]:
     """A case as what becomes a struct: texts, arrays of doubles, arrays of texts, and structs in it."""
     net, sent, experiment = trace.plan.links, trace.sent, trace.plan.experiment
     arrays = ("time", "position", "yaw", "true_position", "goal", "setpoint")
-    columns = [name for name, kind in get_type_hints(RobotMetrics).items() if _is_number(kind)]
+    kinds = get_type_hints(RobotMetrics).items()
+    columns = [name for name, kind in kinds if set(get_args(kind) or (kind,)) <= {int, float, NoneType}]
     columns += [name for robot in metrics.robots[:1] for name in robot.extra]
     measured = {name: metric.unit.translate(PLAIN) for name, metric in known_metrics().items() if metric.unit}
     links = {
@@ -225,12 +218,13 @@ def matlab_names(names: Iterable[str]) -> dict[str, str]:
     return found
 
 
-def _is_number(kind: Any) -> bool:  # noqa: ANN401 - an annotation
-    return set(get_args(kind) or (kind,)) <= {int, float, NoneType}
-
-
-def _unwritable(file: Path, error: OSError) -> ExplainedError:
-    return ExplainedError(f"{file}: cannot be written: {error.strerror}; name another place")
+@contextmanager
+def _writing(file: Path) -> Iterator[None]:
+    """Raises ExplainedError if `file` cannot be written inside."""
+    try:
+        yield
+    except OSError as error:
+        raise ExplainedError(f"{file}: cannot be written: {error.strerror}; name another place") from None
 
 
 def _bytes(value: Any) -> int:  # noqa: ANN401 - any field of a struct

@@ -80,11 +80,10 @@ class SceneDrawing:
     """One case in a scene."""
 
     def __init__(self, server: viser.ViserServer, stage: SceneModel, look: Look, root: str = "/case") -> None:
-        """Draws what does not move; `root` is the name of the node that carries everything, which `offset` moves."""
+        """Draws what does not move; `root` is the name of the node that carries everything, which `move_to` moves."""
         self._scene, self.stage, self._look, self._root = server.scene, stage, look, root
         self.shown = VisibleParts()
         self._round = 0
-        self._offset = (0.0, 0.0, 0.0)
         self._frame = self._scene.add_frame(root, show_axes=False)
         self._few = len(stage.names) <= LABELS
         self._add_arena()
@@ -106,22 +105,15 @@ class SceneDrawing:
         self._labels: dict[int, Any] = {}
         self._texts: dict[int, str] = {}
 
-    @property
-    def offset(self) -> tuple[float, float, float]:
-        """Place of the arena's middle in the scene [m]."""
-        return self._offset
-
-    @offset.setter
-    def offset(self, place: tuple[float, float, float]) -> None:
-        self._offset = place
+    def move_to(self, place: tuple[float, float, float]) -> None:
+        """Puts the arena's middle there in the scene [m]."""
         self._frame.position = place
 
     def name(self, text: str) -> None:
         """Writes a name in front of the arena."""
         low = self.stage.scene.low
-        self._scene.add_label(
-            f"{self._root}/name", text, position=(0.0, float(low[1]) - 0.12, 0.0), anchor="top-center"
-        )
+        place = (0.0, float(low[1]) - 0.12, 0.0)
+        self._scene.add_label(f"{self._root}/name", text, position=place, anchor="top-center")
 
     def remove(self) -> None:
         self._frame.remove()
@@ -151,11 +143,10 @@ class SceneDrawing:
             self._lines(f"starts/{name}", np.concatenate([ends, np.full((4, 2, 1), 0.002)], axis=2), look.section)
 
     def _add_obstacle(self, number: int) -> Any:  # noqa: ANN401 - handles of viser
-        stage, scene = self.stage, replace(self.stage.scene, top=self.stage.tops)
+        scene = replace(self.stage.scene, top=self.stage.tops)
         opacity = 0.55 if np.isfinite(scene.mass[number]) else 0.85
-        return self._mesh(
-            f"obstacles/{stage.scene.names[number]}", models.obstacle(scene, number), self._look.obstacle, opacity
-        )
+        mesh = models.obstacle(scene, number)
+        return self._mesh(f"obstacles/{scene.names[number]}", mesh, self._look.obstacle, opacity)
 
     def _add_kind(self, name: str) -> _Kind:
         stage = self.stage
@@ -193,13 +184,9 @@ class SceneDrawing:
         )  # fmt: skip
 
     def _lines(self, name: str, ends: Array, colours: Any = (140, 140, 140), thickness: float = 1.5) -> Any:  # noqa: ANN401
-        return self._scene.add_line_segments(
-            f"{self._root}/{name}",
-            ends.astype(np.float32),
-            colours if np.ndim(colours) == 1 else _linear(colours),  # a single one is not taken for linear light
-            thickness=thickness,
-            thickness_units="screen",
-        )
+        colours = colours if np.ndim(colours) == 1 else _linear(colours)  # a single one is not taken for linear light
+        points, place = ends.astype(np.float32), f"{self._root}/{name}"
+        return self._scene.add_line_segments(place, points, colours, thickness=thickness, thickness_units="screen")
 
     # ------------------------------------------------------------------ what moves
 
@@ -288,15 +275,11 @@ class SceneDrawing:
 
     def _draw_margins(self, moment: Moment) -> None:
         if self.shown.margins and self._margins is None:
-            outer = self.stage.radius + max(self.stage.margin, 0.0)
-            self._margins = self._batch(
-                "margins", models.annulus(0.92, 1.0), len(outer), self.stage.colours, scales=outer, cast=False
-            )
+            outer, ring = self.stage.radius + max(self.stage.margin, 0.0), models.annulus(0.92, 1.0)
+            self._margins = self._batch("margins", ring, len(outer), self.stage.colours, scales=outer, cast=False)
         if self._margins is not None:
-            hidden = np.full_like(moment.position, np.nan)
-            _update(
-                self._margins, "batched_positions", appearance.shown(moment.position if self.shown.margins else hidden)
-            )
+            _show(self._margins, shown=self.shown.margins)
+            _update(self._margins, "batched_positions", appearance.shown(moment.position))
 
     def _draw_ranges(self, moment: Moment, scans: Mapping[str, Ranges]) -> None:
         if not self.shown.ranges and self._ranges is None:
@@ -309,7 +292,8 @@ class SceneDrawing:
     def _draw_labels(self, moment: Moment) -> None:
         wanted: Mask = np.isfinite(moment.position).all(axis=1) & np.asarray(self.shown.names)
         if not self._few:
-            notable = np.isin(moment.condition, appearance.RINGED) | self._leading()
+            leading = np.isin(np.array(self.stage.names), self.stage.leaders)
+            notable = np.isin(moment.condition, appearance.RINGED) | leading
             wanted &= notable & (np.cumsum(wanted & notable) <= LABELS)
         for row in [row for row in self._labels if not wanted[row]]:
             self._labels.pop(row).remove()
@@ -326,9 +310,6 @@ class SceneDrawing:
                 )
             elif np.abs(handle.position - at).max() > 1e-4:
                 handle.position = at
-
-    def _leading(self) -> Mask:
-        return np.isin(np.array(self.stage.names), self.stage.leaders)
 
 
 def _linear(colours: Colours | Array | Colour) -> Colours:

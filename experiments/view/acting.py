@@ -152,20 +152,17 @@ class Acting:
         watched = self._watched
         stop = messages.encode(messages.Stop(watched.identity, REASON))
         sent = orders.EmergencyStop(watched.endpoints, watched.realm, watched.identity, watched.run)
-        sending = threading.Thread(target=sent.send, args=(REASON,), daemon=True)  # the session here may be blocked
+        sending = threading.Thread(target=sent.send, args=(REASON,), daemon=True)
         sending.start()
-        self._urgent.put(stop)
+        # the session here may be blocked or closed, which must not keep the result from the page
+        threading.Thread(target=self._urgent.put, args=(stop,), daemon=True).start()
         sending.join()
-        if sent.failure is not None:
-            said, bad = f"NOT known to have stopped: {sent.failure}. {LAST}", True
-        elif sent.moving:
-            said, bad = f"NOT known to have stopped: {', '.join(sorted(sent.moving))}. {LAST}", True
-        elif sent.seen:
-            said, bad = f"stopped: {', '.join(sorted(sent.seen))}", False
-        else:
-            said, bad = f"no robot is seen. {LAST}", True
+        doubtful = sent.failure or ", ".join(sorted(sent.moving))
+        said = f"stopped: {', '.join(sorted(sent.seen))}" if sent.seen else f"no robot is seen. {LAST}"
+        if doubtful:
+            said = f"NOT known to have stopped: {doubtful}. {LAST}"
+        self._note("Emergency stop", f"{sent.where}: {said}", bad=bool(doubtful) or not sent.seen, stays=True)
         self._record("emergency stop", said)
-        self._note("Emergency stop", f"{sent.where}: {said}", bad=bad, stays=True)
 
     def _show_targets(self, *, shown: bool) -> None:
         """Handles at the goals of the leaders, by which they are dragged."""
@@ -237,8 +234,8 @@ class Acting:
         said = f"{len(done)} of {len(replies)} robots"
         if refused:
             said += "; " + "; ".join(f"{name}: {reason}" for name, reason in list(refused.items())[:5])
-        self._record(what, said)
         self._note(what, said, bad=bool(refused) or not replies)
+        self._record(what, said)
 
     def _record(self, what: str, said: str) -> None:
         event = messages.Event(self._clock.utc(), "order", self._watched.identity, f"{what}: {said}")

@@ -6,11 +6,10 @@ import hmac
 import re
 import secrets
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from http import HTTPStatus
 from math import inf
-from types import MappingProxyType
 from typing import Final
 from urllib.parse import parse_qs, urlsplit
 
@@ -74,7 +73,7 @@ class Gate:
         if _upgrades(request.headers):
             return inner(connection, request)
         if redeemed or not slash:  # without it names in the page would be beside its folder, not in it
-            return _moved(self.secret)
+            return _text(HTTPStatus.SEE_OTHER, "", Location=f"/{self.secret}/")
         if rest == CLOCK:
             self._note(target.query)
             return _text(HTTPStatus.OK, f"{time.time():.4f}")
@@ -134,11 +133,7 @@ def _page(inner: Handler, connection: ServerConnection, request: Request, path: 
     return response
 
 
-def _text(status: HTTPStatus, text: str, more: Mapping[str, str] = MappingProxyType({})) -> Response:
+def _text(status: HTTPStatus, text: str, **more: str) -> Response:
     body = text.encode()
     headers = {"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body)), **PRIVATE, **more}
     return Response(status.value, status.phrase, Headers(**headers), body)
-
-
-def _moved(secret: str) -> Response:
-    return _text(HTTPStatus.SEE_OTHER, "", {"Location": f"/{secret}/"})

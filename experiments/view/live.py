@@ -234,8 +234,7 @@ class LiveView:
             phase = "waiting for robots" if not stage.names else "not started"
         duration = stage.plan.experiment.duration_s if stage.plan is not None else 0.0
         panel.show_head(observer.case, phase, elapsed, duration, self._watched.words)
-        panel.show_robots(rows)
         net, names = stage.links, stage.names
         ends = zip(net.receiver.tolist(), net.sender.tolist(), strict=True)
-        panel.show_links(moment.error, [observer.robots[names[i]].delay.get(names[j]) for i, j in ends])
-        panel.show_events(list(observer.events), start)
+        delay = [observer.robots[names[i]].delay.get(names[j]) for i, j in ends]
+        panel.show_tables(rows, moment.error, list(observer.events), start, delay)

@@ -144,9 +144,7 @@ class PacedView:
         phase = "running" if moment.time is not None and moment.time >= 0.0 else "taking off"
         where = f"virtual time, {self.clock.speed:g} times as fast" + ("" if self.clock.playing else ", paused")
         panel.show_head(self._case, phase, moment.time, self._plan.experiment.duration_s, where)
-        panel.show_robots(rows)
-        panel.show_links(moment.error, [None] * len(moment.error))
-        panel.show_events(self._events, 0.0)
+        panel.show_tables(rows, moment.error, self._events, 0.0)
 
 
 def _column(states: Sequence[BodyState], name: str) -> Array:

@@ -21,7 +21,6 @@ from experiments.scene.stage import (
     GOOD_M,
     PLACES,
     UNKNOWN,
-    Colour,
     Condition,
     SceneModel,
 )
@@ -184,22 +183,23 @@ class Panel:
         if abs(self._bar.value - share) >= 0.5:
             self._bar.value = share
 
-    def show_robots(self, rows: Sequence[RobotRow]) -> None:
-        _set(self._table, table(rows, self.stage))
+    def show_tables(
+        self, rows: Sequence[RobotRow], error: Array, events: Sequence[Event], start: float | None,
+        delay: Sequence[float | None] = (),
+    ) -> None:  # fmt: skip
+        """Robots, links with errors (E,) [m] and delays of the last poses (E,) [s] if known, and the last events.
 
-    def show_links(self, error: Array, delay: Sequence[float | None]) -> None:
-        """Errors (E,) [m] and delays of the last poses (E,) [s] of the links, the largest errors first."""
+        Times of events are since the common start [s, UTC] if that is known.
+        """
+        _set(self._table, table(rows, self.stage))
         _set(self._links, link_table(self.stage, error, delay))
+        _set(self._list, event_list(events, start))
 
     def show_plots(self) -> None:
         if self._error is None or len(self.history.time) < 2:
             return
         self._error.data = self.history.curves(self.history.error, self._followers)
         self._rate.data = self.history.curves(self.history.rate)
-
-    def show_events(self, events: Sequence[Event], start: float | None) -> None:
-        """The last events; times since the common start [s, UTC] if that is known."""
-        _set(self._list, event_list(events, start))
 
 
 def _set(handle: Any, text: str) -> None:  # noqa: ANN401
@@ -219,25 +219,22 @@ def _cells(row: RobotRow) -> tuple[str, ...]:
     """Row of a robot in the table, below `HEADS`."""
     error = row.error
     return (
-        "" if error is None else _coloured(f"{100 * error:.1f} cm", _graded(error)),
+        "" if error is None else _coloured_error(error),
         "" if row.rate is None else f"{row.rate:.1f}",
         "" if row.battery is None else f"{100 * row.battery:.0f} %",
-        "" if row.missed is None else _coloured(f"{row.missed}", _graded_share(row.missed_share)),
+        "" if row.missed is None else _coloured_missed(row.missed, row.missed_share),
         "" if row.delay is None else _milliseconds(row.delay),
     )
 
 
-def _measures(row: RobotRow, names: Sequence[str]) -> tuple[str, ...]:
-    return tuple(f"{row.measures[name]:.3g}" if name in row.measures else "" for name in names)
+def _coloured_error(error: float) -> str:
+    colour = GOOD if error <= GOOD_M else FAIR if error <= FAIR_M else BAD
+    return f"<span style='color:{css(colour)}'>{100 * error:.1f} cm</span>"
 
 
-def _coloured(text: str, colour: Colour | None) -> str:
-    return text if colour is None else f"<span style='color:{css(colour)}'>{text}</span>"
-
-
-def _graded_share(missed: float) -> Colour | None:
-    """Colour of a share of missed ticks; none for none."""
-    return None if missed == 0.0 else FAIR if missed <= FEW_MISSED else BAD
+def _coloured_missed(missed: int, share: float) -> str:
+    """Missed ticks in the colour of their share; in none without any."""
+    return f"<span style='color:{css(FAIR if share <= FEW_MISSED else BAD)}'>{missed}</span>" if share else f"{missed}"
 
 
 def _milliseconds(seconds: float) -> str:
@@ -255,11 +252,12 @@ def table(rows: Sequence[RobotRow], stage: SceneModel) -> str:
         shown = shown[:TABLE]
     measures = [*dict.fromkeys(name for row in shown for name in row.measures)][:MEASURES]
     every = (*HEADS, *map(escape, measures))
-    filled = [(*_cells(row), *_measures(row, measures)) for row in shown]
+    filled = []
+    for row in shown:
+        more = (f"{row.measures[name]:.3g}" if name in row.measures else "" for name in measures)
+        filled.append((*_cells(row), *more))
     columns = [k for k in range(len(every)) if not filled or any(cells[k] for cells in filled)]
-    leading = {stage.names[row] for row in range(len(stage.names))} - {
-        stage.names[row] for row in stage.links.receiver.tolist()
-    }
+    leading = {*stage.names} - {stage.names[row] for row in stage.links.receiver.tolist()}
     filled = [(NONE, *cells[1:]) if row.name in leading and not cells[0] else cells
               for row, cells in zip(shown, filled, strict=True)]  # fmt: skip
     heads = "".join(f"<th style='text-align:right;font-weight:500;opacity:0.6'>{every[k]}</th>" for k in columns)
@@ -286,14 +284,13 @@ def table(rows: Sequence[RobotRow], stage: SceneModel) -> str:
 
 
 def link_table(stage: SceneModel, error: Array, delay: Sequence[float | None]) -> str:
-    """Table of links as HTML; links that are not there, or not known, are left out."""
+    """Table of links as HTML, the largest errors first; links that are not there, or not known, are left out."""
     order = [k for k in np.argsort(-np.nan_to_num(error)).tolist() if np.isfinite(error[k])][:LINKS]
     lines = []
     for k in order:
         ends = (stage.names[int(stage.links.sender[k])], stage.names[int(stage.links.receiver[k])])
-        late = "" if (seconds := delay[k]) is None else _milliseconds(seconds)
-        shown = f"<span style='color:{css(_graded(float(error[k])))}'>{100 * error[k]:.1f} cm</span>"
-        cells = (" &rarr; ".join(map(escape, ends)), shown, late)
+        late = "" if not delay or (seconds := delay[k]) is None else _milliseconds(seconds)
+        cells = (" &rarr; ".join(map(escape, ends)), _coloured_error(float(error[k])), late)
         lines.append("<tr>" + "".join(f"<td style='text-align:right'>{cell}</td>" for cell in cells) + "</tr>")
     left = len(error) - len(order)
     more = f"<div style='opacity:0.6'>and {left} more</div>" if left else ""
@@ -301,10 +298,6 @@ def link_table(stage: SceneModel, error: Array, delay: Sequence[float | None]) -
         "<div style='padding:0 1em;font-size:0.75em;font-variant-numeric:tabular-nums'>"
         f"<table style='width:100%'>{''.join(lines)}</table>{more}</div>"
     )
-
-
-def _graded(error: float) -> Colour:
-    return GOOD if error <= GOOD_M else FAIR if error <= FAIR_M else BAD
 
 
 def event_list(events: Sequence[Event], start: float | None) -> str:

@@ -189,7 +189,7 @@ class ReplayView:
         with server.atomic():
             for k, film in enumerate(films):
                 drawing = SceneDrawing(server, film.stage, page.look, root=f"/case{k}")
-                drawing.offset = ((k - 0.5 * (len(films) - 1)) * pitch, 0.0, 0.0)
+                drawing.move_to(((k - 0.5 * (len(films) - 1)) * pitch, 0.0, 0.0))
                 page.fit(film.stage)
                 drawing.shown = page.shown
                 if len(films) > 1:
@@ -264,10 +264,8 @@ class ReplayView:
         said = [event for event in tracks.events if event.stamp <= t]
         phase = next((event.text for event in reversed(said) if event.kind == "phase"), "")
         panel.show_head(tracks.case, phase, t, tracks.plan.experiment.duration_s, self._where)
-        panel.show_robots(film.rows(min(t, tracks.end)))
-        error = film.moment(min(t, tracks.end)).error
-        panel.show_links(error, [None] * len(error))
-        panel.show_events(said, 0.0)
+        at = min(t, tracks.end)
+        panel.show_tables(film.rows(at), film.moment(at).error, said, 0.0)
         first, last = np.searchsorted(history.time, (t - HISTORY_S, t))
         first = min(int(first), int(last) - 2)
         if first >= 0:

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
@@ -37,15 +37,20 @@ REACH_S: Final = 15.0
 
 @dataclass
 class HostRow:
-    """Result of one host: a cell of each column, and the remedies."""
+    """Result of one host: its cells by column, and the remedies."""
 
-    cells: list[str]
+    cells: dict[str, str]
     trouble: list[str] = field(default_factory=list)
+    blank: str = NOTHING  # of columns without a cell
 
     @property
     def well(self) -> bool:
         """Whether nothing stands in the way of a run."""
-        return not any(cell.startswith(NO) for cell in self.cells)
+        return not any(cell.startswith(NO) for cell in (self.blank, *self.cells.values()))
+
+    def shown(self, heading: Sequence[str]) -> dict[str, str]:
+        """Cells of all columns."""
+        return {column: self.cells.get(column, self.blank) for column in heading}
 
 
 @turtlebot_app.command(epilog=example("turtlebot watchdog ubuntu@192.168.0.31 --namespace tb3_0"))
@@ -89,17 +94,22 @@ def check(file: File, settings: Settings = None, on: On = None, lab: Lab = None,
     experiment = read.experiment
     chosen = choose(experiment.hosts, on or [])
     heading = HEADING if endpoints.lab_folder(read.plan, read.path, lab) is None else SECURED
-    rows = [_without_address(name, read.plan, heading) for name, host in chosen.items() if host.address is None]
+    rows = []
+    for name, host in chosen.items():
+        if host.address is None:  # its robots join by themselves
+            text = f"{NOTHING} no address: {', '.join(host.robots) or 'no robots'} started there"
+            rows.append(HostRow({"host": name, "reachable": text}))
     with stations(read, {name: host for name, host in chosen.items() if host.address is not None}, lab) as found:
-        rows += [_row(each, read.plan, heading) for each in found]
+        rows += [_row(each, read.plan) for each in found]
+    well = all(row.well for row in rows)
     if as_json:
-        shown = [{**dict(zip(heading, row.cells, strict=True)), "ok": row.well, "trouble": row.trouble} for row in rows]
-        print_json({"ok": all(row.well for row in rows), "hosts": shown})
+        shown = [{**row.shown(heading), "ok": row.well, "trouble": row.trouble} for row in rows]
+        print_json({"ok": well, "hosts": shown})
     else:
-        print("\n".join(columns([heading, *(row.cells for row in rows)])))
+        print("\n".join(columns([heading, *([*row.shown(heading).values()] for row in rows)])))
         for each in (each for row in rows for each in row.trouble):
             print(each, file=sys.stderr)
-    return 0 if all(row.well for row in rows) else 1
+    return int(not well)
 
 
 @app.command(epilog=example("hosts install lab.toml"))
@@ -122,10 +132,9 @@ def install(file: File, settings: Settings = None, on: On = None, lab: Lab = Non
             row: dict[str, str | bool] = {"host": name, "ok": True}
             shown.append(row)
             same = not isinstance(there, HostError) and there.same_version
+            own = version.digest()[: version.DIGEST_CHARACTERS]
             try:
-                row["zenpark"] = (
-                    f"has it already ({version.digest()[: version.DIGEST_CHARACTERS]})" if same else put(name, host)
-                )
+                row["zenpark"] = f"has it already ({own})" if same else put(name, host)
                 if not as_json:
                     print(f"{name}: {row['zenpark']}", flush=True)
                 if folder is not None and host.robots:
@@ -210,48 +219,37 @@ def stations(
         yield found
 
 
-def _without_address(name: str, plan: Plan, heading: Sequence[str] = HEADING) -> HostRow:
-    """A host without an address: its robots join by themselves."""
-    robots = ", ".join(plan.experiment.hosts[name].robots) or "no robots"
-    return HostRow([name, f"{NOTHING} no address: {robots} started there", *[NOTHING] * (len(heading) - 2)])
-
-
-def _row(there: Station | HostError, plan: Plan, heading: Sequence[str]) -> HostRow:
+def _row(there: Station | HostError, plan: Plan) -> HostRow:
     """Everything about one host."""
     from experiments.real_time.hosts.hosts import HostError
 
     if isinstance(there, HostError):
-        name = str(there).partition(":")[0]
-        return HostRow([name, NO, *[NOTHING] * (len(heading) - 2)], [str(there)])
-    row = HostRow([there.name])
+        return HostRow({"host": str(there).partition(":")[0], "reachable": NO}, [str(there)])
+    row = HostRow({"host": there.name, "reachable": f"{YES} {there.hello.machine}"})
     try:
         _fill(row, there, plan)
     except HostError as error:
-        row.cells += [NO] * (len(heading) - len(row.cells))
+        row.blank = NO
         row.trouble.append(str(error))
     return row
 
 
 def _fill(row: HostRow, there: Station, plan: Plan) -> None:
-    from msgspec.structs import replace
-
-    from experiments.real_time.hosts import certificates
     from experiments.real_time.hosts.station import Question
     from experiments.recording import version
 
     here = version.digest()[: version.DIGEST_CHARACTERS]
-    row.cells.append(f"{YES} {there.hello.machine}")
-    if there.same_version:
-        row.cells.append(f"{YES} {here}")
-    else:
-        row.cells.append(f"{NO} {there.hello.zenpark[: version.DIGEST_CHARACTERS]}, here {here}")
+    row.cells["zenpark"] = f"{YES} {here}"
+    if not there.same_version:
+        row.cells["zenpark"] = f"{NO} {there.hello.zenpark[: version.DIGEST_CHARACTERS]}, here {here}"
         row.trouble.append(
             f"{there.name}: another zenpark is there; `./zenpark hosts install FILE` puts this one there"
         )
-    row.cells.append(f"{YES} {there.hello.python}")
+    row.cells["Python"] = f"{YES} {there.hello.python}"
     clock = there.measure()
     vague = clock.uncertainty > VAGUE_S
-    row.cells.append(f"{DOUBTFUL if vague else YES} {clock.offset * 1e3:+.2f} ± {clock.uncertainty * 1e3:.2f} ms")
+    offset = f"{clock.offset * 1e3:+.2f} ± {clock.uncertainty * 1e3:.2f} ms"
+    row.cells["clock"] = f"{DOUBTFUL if vague else YES} {offset}"
     if vague:
         row.trouble.append(
             f"{there.name}: the connection is slow, so robots there may start ± {clock.uncertainty * 1e3:.0f} ms apart "
@@ -261,19 +259,16 @@ def _fill(row: HostRow, there: Station, plan: Plan) -> None:
     devices = there.ask(Question("devices", bodies=bodies), REACH_S)[0].found
     wrong = [each for each in devices if not each.well]
     words = ", ".join(each.what for each in devices) or "none needed"
-    row.cells.append(f"{NO if wrong else YES} {words}")
+    row.cells["devices"] = f"{NO if wrong else YES} {words}"
     row.trouble += [f"{there.name}: {each.what} {each.text}" for each in wrong]
-    if there.lab is not None and not _recognised(
-        row, there, there.lab, certificates.of_host(there.name, plan.experiment.hosts)
-    ):
-        row.cells.append(f"{NOTHING} needs its certificates")
+    if there.lab is not None and not _recognised(row, there, there.lab, plan):
+        row.cells["router"] = f"{NOTHING} needs its certificates"
         return
-    shown = Question("reach", endpoints=there.endpoints)
-    if there.lab is not None:
-        shown = replace(shown, lab=there.folder, names=there.host.robots)
-    routers = there.ask(shown, REACH_S)[0].found
+    lab: dict[str, Any] = {} if there.lab is None else {"lab": there.folder, "names": there.host.robots}
+    routers = there.ask(Question("reach", endpoints=there.endpoints, **lab), REACH_S)[0].found
     unreached = [each for each in routers if not each.well]
-    row.cells.append(f"{NO if unreached else YES} {', '.join(each.text for each in routers if each.well)}".rstrip())
+    reached = ", ".join(each.text for each in routers if each.well)
+    row.cells["router"] = f"{NO if unreached else YES} {reached}".rstrip()
     row.trouble += [
         f"{there.name}: {each.what} cannot be reached from there; {_router_remedy(there, each, plan)}"
         for each in unreached
@@ -293,17 +288,17 @@ def _router_remedy(there: Station, router: HostCheck, plan: Plan) -> str:
     return "ssh carries it: does sshd there allow that (AllowTcpForwarding yes)? Else add listen to [network]"
 
 
-def _recognised(row: HostRow, there: Station, folder: Path, robots: Sequence[str]) -> bool:
+def _recognised(row: HostRow, there: Station, folder: Path, plan: Plan) -> bool:
     """Add what a host holds of the lab's certificates to its row; whether its robots would be let in."""
     from experiments.real_time.hosts import certificates
 
     wrong = there.distrusted(there.host.robots)
-    content = there.folder_content(robots)
+    content = there.folder_content(certificates.of_host(there.name, plan.experiment.hosts))
     misplaced_keys = [f"{there.name}: {each}" for each in certificates.misplaced_keys(content, there.name)]
     left = certificates.days_left(folder, there.host.robots)
     soon = not wrong and left < SOON_DAYS
     mark = NO if wrong or misplaced_keys else DOUBTFUL if soon else YES
-    row.cells.append(f"{mark} {len(content.identities)}, {left:.0f} days left" if not wrong else mark)
+    row.cells["certificates"] = f"{mark} {len(content.identities)}, {left:.0f} days left" if not wrong else mark
     row.trouble += [*wrong, *misplaced_keys]
     if soon:
         remedy = f"`./zenpark lab renew {folder} {' '.join(there.host.robots)}`, then `./zenpark hosts install FILE`"

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from tools.options import AsJson, example, group, print_json
+from tools.options import AsJson, example, group, print_result
 
 if TYPE_CHECKING:
     from agents.network.lab import Register, Role
@@ -47,12 +47,11 @@ def init(
         raise LabError(f"{', '.join(clash)}: every lab has an identity of that name; rename the robot")
     identities |= dict.fromkeys(robots, "robot")
     known = create(place, identities, hosts=host or [], listening=listening, days=days)
-    _print(place, known, list(known.identities), as_json=as_json)
-    _advise(
-        as_json,
+    advice = (
         f"{place}/ca.key makes new identities: keep it here. A robot's computer needs ca.pem and its own .pem and .key,"
-        f" a router's ca.pem, lab.json, router.*\nNow: ./zenpark run FILE --lab {place}, or [network] lab in the file",
+        f" a router's ca.pem, lab.json, router.*\nNow: ./zenpark run FILE --lab {place}, or [network] lab in the file"
     )
+    _print(place, known, [], advice, as_json=as_json)
 
 
 @app.command(epilog=example("lab issue lab ana --role operator"))
@@ -93,7 +92,7 @@ def renew(
     from experiments.real_time.hosts.authority import renew as made
 
     known = made(Path(folder), names or [], hosts=host or [], days=days, authority=authority)
-    _print(Path(folder), known, names or list(known.identities), as_json=as_json)
+    _print(Path(folder), known, names or [], as_json=as_json)
 
 
 @app.command(epilog=example("lab revoke lab KH01"))
@@ -101,14 +100,13 @@ def revoke(folder: Folder, names: Names, days: Days = 90.0, as_json: AsJson = Fa
     """Take all rights from certificates that are lost or stolen, and make new ones."""
     from experiments.real_time.hosts.authority import revoke as made
 
-    _print(Path(folder), made(Path(folder), names, days=days), names, as_json=as_json)
-    _advise(
-        as_json,
+    advice = (
         "The old keys have no rights at a `./zenpark router` that reads this lab.json: one that runs notices it in a "
         "second; copy the file to routers elsewhere. Poses of their owners are not received any more: give them new "
         "files. A zenohd notices nothing, and the old keys go on working: print its file again (./zenpark router FILE "
-        "--lab LAB --print-config) and restart it",
+        "--lab LAB --print-config) and restart it"
     )
+    _print(Path(folder), made(Path(folder), names, days=days), names, advice, as_json=as_json)
 
 
 @app.command(epilog=example("lab show lab"))
@@ -117,7 +115,7 @@ def show(folder: Folder, as_json: AsJson = False) -> int:
     from agents.network.lab import register
 
     known = register(Path(folder))
-    _print(Path(folder), known, list(known.identities), as_json=as_json)
+    _print(Path(folder), known, [], as_json=as_json)
     now = datetime.now(UTC)
     return int(any(datetime.fromisoformat(each.until) < now for each in known.identities.values()))
 
@@ -146,26 +144,18 @@ def _members(given: list[str]) -> tuple[dict[str, None], dict[str, list[str]]]:
     return robots, listening
 
 
-def _advise(as_json: bool, text: str) -> None:
-    """Say what is to be done now, to people."""
-    if not as_json:
-        typer.echo(text)
+def _print(folder: Path, known: Register, names: list[str], advice: str = "", *, as_json: bool) -> None:
+    """Print these members of a lab, all if none is named, and advice for people; as JSON a register of them alone."""
+    from msgspec.structs import replace
 
-
-def _print(folder: Path, known: Register, names: list[str], *, as_json: bool) -> None:
-    """Print these members of a lab; as JSON a register that has them alone."""
-    if as_json:
-        from msgspec.structs import replace
-
-        print_json(replace(known, identities={name: known.identities[name] for name in names}))
-        return
-    now = datetime.now(UTC)
-    width = max(map(len, names))
-    for name in names:
-        each = known.identities[name]
+    shown = {name: known.identities[name] for name in names or known.identities}
+    now, width = datetime.now(UTC), max(map(len, shown), default=0)
+    lines = []
+    for name, each in shown.items():
         left = (datetime.fromisoformat(each.until) - now).total_seconds() / 86400.0
         state = "ENDED" if left < 0 else f"{left:.0f} days left" + ("  renew it" if left < SOON_DAYS else "")
         as_name = "" if each.common_name == name else f"  as {each.common_name}"
         hosts = f"  listens at {', '.join(each.hosts)}" if each.hosts else ""
-        typer.echo(f"{name:<{width}}  {each.role:<11}  until {each.until[:16]}  {state}{as_name}{hosts}")
-    typer.echo(f"lab: {folder}")
+        lines.append(f"{name:<{width}}  {each.role:<11}  until {each.until[:16]}  {state}{as_name}{hosts}")
+    lines += [f"lab: {folder}", *([advice] if advice else [])]
+    print_result(replace(known, identities=shown), *lines, as_json=as_json)

@@ -49,21 +49,13 @@ NamesOrAll = Annotated[
 IDENTITY: Final = "operator"
 WAIT_S: Final = 2.0  # for a router
 MOST_NAMES: Final = 20  # robots that a line of the emergency stop names; --json names all
-# orders to the robots themselves, in a run or by hand; without names to all of them
-ORDERS: Final[Mapping[messages.OrderKind, str]] = {
-    "takeoff": "Let robots take off that were started by hand.",
-    "start": "Begin the experiment of robots that were started by hand, at one common time.",
-    "hold": "Let robots hold where they are; the others go on.",
-    "resume": "Let robots continue after a hold.",
-    "land": "Land robots where they are.",
-}
-DONE: Final[Mapping[str, str]] = {
-    "takeoff": "takes off",
-    "start": "starts",
-    "hold": "holds where it is",
-    "resume": "goes on",
-    "land": "lands",
-    "stop": "stops",
+# orders to the robots themselves, in a run or by hand, without names to all of them: help, and what a robot does then
+ORDERS: Final[Mapping[messages.OrderKind, tuple[str, str]]] = {
+    "takeoff": ("Let robots take off that were started by hand.", "takes off"),
+    "start": ("Begin the experiment of robots that were started by hand, at one common time.", "starts"),
+    "hold": ("Let robots hold where they are; the others go on.", "holds where it is"),
+    "resume": ("Let robots continue after a hold.", "goes on"),
+    "land": ("Land robots where they are.", "lands"),
 }
 # changes of a run, which its conductor makes
 CHANGES: Final[Mapping[messages.ChangeKind, str]] = {
@@ -123,7 +115,8 @@ def _order_robots(what: messages.OrderKind, robots: Sequence[str], by: Operator)
             return by.refuse(f"no robot in the realm '{by.realm}'; `./zenpark keys` shows the members")
         at = time.time() + orders.start_lead_s(len(receivers)) if what == "start" else None
         replies = orders.send_order(opened, keys, receivers, messages.Order(what, at=at))
-        done = {name: reply.reason or DONE[what] for name, reply in replies.items() if reply.ok}
+        _, does = ORDERS.get(what, ("", "stops"))
+        done = {name: reply.reason or does for name, reply in replies.items() if reply.ok}
         refused = {name: reply.reason or reply.phase for name, reply in replies.items() if not reply.ok}
         text = f"{what}: {', '.join(done) or 'no robot'}"
         if refused:
@@ -162,10 +155,9 @@ def _change_command(what: messages.ChangeKind) -> Callable[..., int]:
     return with_options(change)
 
 
-for _order, _help in ORDERS.items():
-    robot_app.command(name=_order, help=_help, epilog=example(f"robot {_order}", f"robot {_order} CF01"))(
-        _order_command(_order)
-    )
+for _order, (_help, _) in ORDERS.items():
+    _lines = example(f"robot {_order}", f"robot {_order} CF01")
+    robot_app.command(name=_order, help=_help, epilog=_lines)(_order_command(_order))
 
 
 @robot_app.command(epilog=example("robot stop KH01"))
@@ -343,13 +335,10 @@ def stop_all(stops: Sequence[EmergencyStop], *, dry_run: bool, as_json: bool) ->
 def _as_json(stop: EmergencyStop, *, dry_run: bool) -> Mapping[str, object]:
     failure = None if stop.failure is None else str(stop.failure)
     if dry_run:
-        return {"where": stop.where, "would_be_stopped": sorted(stop.seen), "failure": failure}
-    return {
-        "where": stop.where,
-        "stopped": sorted(stop.seen - stop.moving),
-        "not_known_to_have_stopped": sorted(stop.moving),
-        "failure": failure,
-    }
+        found = {"would_be_stopped": sorted(stop.seen)}
+    else:
+        found = {"stopped": sorted(stop.seen - stop.moving), "not_known_to_have_stopped": sorted(stop.moving)}
+    return {"where": stop.where, **found, "failure": failure}
 
 
 def _print_stop(stop: EmergencyStop, *, dry_run: bool) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from math import inf
 from types import SimpleNamespace
@@ -145,6 +146,28 @@ def test_old_pictures_order_no_motion(seen, ordered, operator, monkeypatch):
     for what in ("hold", "land", "resume"):
         acting.press(messages.Order(what), what, SimpleNamespace(client_id=7))
     assert [order.order for order in given] == ordered
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+@pytest.mark.parametrize("blocked", [False, True])
+def test_emergency_stop_tells_its_result_without_session(blocked, operator, monkeypatch):
+    acting, _, _ = operator
+    free = threading.Event()
+
+    def put(_):
+        if blocked:
+            free.wait(30.0)
+        raise RuntimeError("closed")
+
+    acting._urgent = acting._events = SimpleNamespace(put=put)
+    monkeypatch.setattr(orders.orders.EmergencyStop, "send", lambda self, _: self.seen.add("KH01"))
+    page = MagicMock()
+    acting._server.get_clients = lambda: {1: page}
+    stopping = threading.Thread(target=acting.emergency_stop, daemon=True)
+    stopping.start()
+    stopping.join(2.0)
+    free.set()
+    assert "stopped: KH01" in page.add_notification.call_args.args[1]
 
 
 @pytest.mark.parametrize("sent", [-1.0, 0.0, 1e9, inf, float("nan")])
