@@ -154,7 +154,7 @@ class Acting:
         sent = orders.EmergencyStop(watched.endpoints, watched.realm, watched.identity, watched.run)
         sending = threading.Thread(target=sent.send, args=(REASON,), daemon=True)
         sending.start()
-        # the session here may be blocked or closed, which must not keep the result from the page
+        # the session here may be blocked or closed, which must not keep the result from the page, nor later clicks
         threading.Thread(target=self._urgent.put, args=(stop,), daemon=True).start()
         sending.join()
         doubtful = sent.failure or ", ".join(sorted(sent.moving))
@@ -162,7 +162,7 @@ class Acting:
         if doubtful:
             said = f"NOT known to have stopped: {doubtful}. {LAST}"
         self._note("Emergency stop", f"{sent.where}: {said}", bad=bool(doubtful) or not sent.seen, stays=True)
-        self._record("emergency stop", said)
+        threading.Thread(target=self._record, args=("emergency stop", said), daemon=True).start()
 
     def _show_targets(self, *, shown: bool) -> None:
         """Handles at the goals of the leaders, by which they are dragged."""

@@ -236,5 +236,5 @@ class LiveView:
         panel.show_head(observer.case, phase, elapsed, duration, self._watched.words)
         net, names = stage.links, stage.names
         ends = zip(net.receiver.tolist(), net.sender.tolist(), strict=True)
-        delay = [observer.robots[names[i]].delay.get(names[j]) for i, j in ends]
-        panel.show_tables(rows, moment.error, list(observer.events), start, delay)
+        delays = [observer.robots[names[i]].delay.get(names[j]) for i, j in ends]
+        panel.show_tables(rows, moment.error, list(observer.events), start, delays)

@@ -155,9 +155,9 @@ def test_emergency_stop_tells_its_result_without_session(blocked, operator, monk
     free = threading.Event()
 
     def put(_):
-        if blocked:
-            free.wait(30.0)
-        raise RuntimeError("closed")
+        if not blocked:
+            raise RuntimeError("closed")
+        free.wait(30.0)
 
     acting._urgent = acting._events = SimpleNamespace(put=put)
     monkeypatch.setattr(orders.orders.EmergencyStop, "send", lambda self, _: self.seen.add("KH01"))
