@@ -237,7 +237,7 @@ def _refuse_too_much(plan: Plan, seeds: int) -> None:
     if samples > MOST_SAMPLES:
         message = f"a run in virtual time of {samples:.2g} samples; {MOST_SAMPLES:.0e} fit into memory"
         hint = (
-            "take fewer --seeds (`./zenpark sweep` runs any number, cell by cell), a lower rates.state_hz or duration_s"
+            "take fewer --seeds (`./zenpark sweep` runs any number, one by one), a lower rates.state_hz or duration_s"
         )
         raise refusal("--seeds" if seeds > 1 else "duration_s", message, hint)
 
@@ -257,14 +257,15 @@ def reopen(folder: str | Path) -> Run:
     folder = Path(folder)
     if not folder.is_dir():
         raise RecordingError(f"{folder}: is no folder of a run; `./zenpark run` prints the folder that it makes")
-    order = [each.case for each in case_figures(folder / METRICS)]  # a copy's files have other times
+    figures = case_figures(folder / METRICS)
+    order = [each.case for each in figures]  # a copy's files have other times
     files = sorted(folder.glob("*.mcap"), key=lambda file: file.stat().st_mtime_ns)
     files.sort(key=lambda file: order.index(file.stem) if file.stem in order else len(order))
     if not files:
         raise RecordingError(f"{folder}: holds no recording (.mcap); name the folder of a run")
     told = origin.failures if (origin := read_origin(folder)) else []
     found = read_back(folder, {file.stem: file for file in files}, [], told)
-    seeds = list(dict.fromkeys(each.seed for each in case_figures(folder / METRICS)))
+    seeds = {each.seed for each in figures}
     if len(seeds) > 1:
         note = f"{ALONE} {found.seed} of {len(seeds)}: of the others metrics are kept, `reopen_seeds` gives them"
         return replace(found, notes=(*found.notes, note))
@@ -286,10 +287,8 @@ def reopen_seeds(folder: str | Path) -> list[Run]:
     try:
         kept = metrics_files.read_json(file)
     except ValueError as error:
-        raise RecordingError(
-            f"{file}: was written by another version ({error}), and most of its seeds are not recorded; "
-            "repeat the run, or keep this report"
-        ) from None
+        why = f"was written by another version ({error}), and most of its seeds are not recorded"
+        raise RecordingError(f"{file}: {why}; repeat the run, or keep this report") from None
     recorded = replace(recorded, notes=tuple(note for note in recorded.notes if not note.startswith(ALONE)))
     runs = {seed: Run(recorded.title, seed, {}, {}, recorded.folder, recorded.source) for seed in seeds}
     for case in kept:
@@ -369,26 +368,15 @@ def read_back(folder: Path, recordings: Mapping[str, Path], notes: Sequence[str]
         made.append(played.started if played.trace.clock == "real" else file.stat().st_mtime)
         if not played.complete:
             remarks.append(f"{case}: the recording was cut off; `./zenpark recover {file}` mends it")
-    seeds = {case: trace.seed for case, trace in traces.items()}
-    if len({*seeds.values()}) > 1:
-        remarks.append(
-            f"the recordings are of different seeds: {', '.join(f'{case} {k}' for case, k in seeds.items())}"
-        )
-    source = folder / SOURCE
-    arenas = sorted(set(folder.glob("*.toml")) - {source}) if source.exists() else []
-    text = document.join_texts([file.read_text("utf-8") for file in [source, *arenas]]) if source.exists() else ""
-    title = next((trace.plan.experiment.title for trace in traces.values()), "")
-    run = _measured(title, traces, folder, text, remarks)
-    told = {
-        case: [each.removeprefix(f"{case}: ") for each in failures if each.startswith(f"{case}: ")] for case in traces
-    }
-    failed = {case: comparable.with_failures(found, told[case]) for case, found in run.metrics.items()}
-    return replace(run, metrics=failed, made=min(made, default=0.0))
-
-
-def _measured(
-    title: str, traces: Mapping[str, Trace], folder: Path | None, source: str, notes: Sequence[str] = ()
-) -> Run:
-    measured = {case: measure.measure(trace) for case, trace in traces.items()}
-    seed = next((trace.seed for trace in traces.values()), 0)
-    return Run(title, seed, dict(traces), measured, folder, source, tuple(notes))
+    if len({trace.seed for trace in traces.values()}) > 1:
+        seeds = ", ".join(f"{case} {trace.seed}" for case, trace in traces.items())
+        remarks.append(f"the recordings are of different seeds: {seeds}")
+    metrics = {}
+    for case, trace in traces.items():
+        told = [each.removeprefix(f"{case}: ") for each in failures if each.startswith(f"{case}: ")]
+        metrics[case] = comparable.with_failures(measure.measure(trace), told)
+    source, first = folder / SOURCE, next(iter(traces.values()), None)
+    files = [source, *sorted(set(folder.glob("*.toml")) - {source})] if source.exists() else []
+    text = document.join_texts([file.read_text("utf-8") for file in files])
+    title, seed = ("", 0) if first is None else (first.plan.experiment.title, first.seed)
+    return Run(title, seed, traces, metrics, folder, text, tuple(remarks), min(made, default=0.0))

@@ -18,9 +18,8 @@ from experiments.definition.experiment import VICON_TWIN, WORLD, RobotTable
 from experiments.definition.plan import Plan
 
 REMOTE_BODIES: Final = ("external", WORLD)  # bodies with poses from the process that carries them
-MANY_SENDERS: Final = (
-    16  # senders from which on the right is "*", if they are all robots: a router reads N² keys for minutes
-)
+# senders from which on the right is "*", if they are all robots: a router reads N² keys for minutes
+MANY_SENDERS: Final = 16
 
 
 def rights(cases: Iterable[Plan]) -> Rights:
@@ -61,6 +60,7 @@ def _rights(plan: Plan) -> Rights:
         if len(others) >= MANY_SENDERS and {*others, *group} == set(experiment.robots):
             others = ["*"]
         led = [name for name in group if name in guided]
+        centre = [keys.lives(keys.centre_alive)] if led else []
         inputs = [*_key_per_name(group, keys.position, keys.ranges), *map(keys.goal, led)]
         own = [keys.below(name) for name in group]
         foreign, tokens = _ros_keys(group, plan)
@@ -70,13 +70,7 @@ def _rights(plan: Plan) -> Rights:
             answer=own,
             queried=[keys.pose("*"), keys.order("*")],
             tokens=[*(key for name in group for key in keys.owner_tokens(keys.alive(name))), *tokens],
-            watch=[
-                *own,
-                *(keys.lives(keys.alive(other)) for other in others),
-                keys.conductor,
-                *([keys.lives(keys.centre_alive)] if led else []),
-                *tokens,
-            ],
+            watch=[*own, *(keys.lives(keys.alive(other)) for other in others), keys.conductor, *centre, *tokens],
         )
         robots |= dict.fromkeys(group, grant)
     network = experiment.network
@@ -88,6 +82,7 @@ def _roles(plan: Plan, keys: Keys) -> dict[str, Grant]:
     names = plan.experiment.robots
     far = [name for name, robot in names.items() if robot.body in REMOTE_BODIES]
     ranged = [name for name, robot in names.items() if robot.body in REMOTE_BODIES or robot.ranges == WORLD]
+    ranges = _key_per_name(ranged, keys.ranges)
     located = plan.externally_measured
     twins = [name for name, robot in names.items() if robot.body in registry.names(registry.DEVICES)]
     measured = sorted({*located, *twins})
@@ -107,12 +102,7 @@ def _roles(plan: Plan, keys: Keys) -> dict[str, Grant]:
             watch=everything,
         ),
         "world": Grant(
-            publish=[
-                keys.below("world"),
-                keys.event,
-                *_key_per_name(far, keys.position, keys.truth),
-                *_key_per_name(ranged, keys.ranges),
-            ],
+            publish=[keys.below("world"), keys.event, *_key_per_name(far, keys.position, keys.truth), *ranges],
             subscribe=[keys.setpoint("*"), keys.status("*"), keys.state("*"), keys.estop],
             answer=[keys.world_order],
             tokens=[keys.below("world")],

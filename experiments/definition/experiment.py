@@ -19,6 +19,14 @@ from twins.scene import Obstacle, Planar
 
 WORLD: Final = "world"  # the body of a robot that lives in the twin service
 VICON_TWIN: Final = "vicon-twin"  # motion capture that is simulated as well
+TARGETS: Final = ("distance", "offset", "bearing")  # fields of the target of a link, of which it has one
+NO_TARGET: Final = "nothing"  # in place of a field: a link alone
+
+
+def doc(description: str, **limits: Any) -> Meta:  # noqa: ANN401 - as Meta takes them
+    """Description of a field and limits of its value, for the reader, the schema and the reference."""
+    return Meta(description=description, **limits)
+
 
 Rate = Annotated[float, Meta(gt=0, le=2000)]
 Name = Annotated[str, Meta(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
@@ -34,47 +42,42 @@ class FileTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
 class StartBox(FileTable, frozen=True):
     """Part of the floor where robots may start."""
 
-    at: Annotated[Planar, Meta(description="centre x, y [m]")]
-    size: Annotated[tuple[Positive, Positive], Meta(description="width along x and y [m]")]
+    at: Annotated[Planar, doc("centre x, y [m]")]
+    size: Annotated[tuple[Positive, Positive], doc("width along x and y [m]")]
 
 
 class Shadow(FileTable, frozen=True):
     """Shadow twin: runs beside a robot with the same setpoints, to measure how far they agree."""
 
     restart_s: Annotated[
-        Positive | None,
-        Meta(description="period at which the twin is reset to the robot [s]; left out: once, at the common start"),
+        Positive | None, doc("period at which the twin is reset to the robot [s]; left out: once, at the common start")
     ] = 5.0
 
 
 class Arena(FileTable, frozen=True):
     """Box that the robots must not leave: centred on the origin, floor at z = 0."""
 
-    size: Annotated[Spatial, Meta(description="size along x, y, z [m]")] = (4.0, 4.0, 2.5)
-    file: Annotated[
-        str | None, Meta(description="arena file, beside the experiment file; its [arena] is the base of this one")
-    ] = None
-    walls: Annotated[bool, Meta(description="whether its border is a wall that robots touch and range sensors see")] = (
-        True
-    )
-    obstacles: Annotated[dict[Name, Obstacle], Meta(description="obstacles by name")] = {}
+    size: Annotated[Spatial, doc("size along x, y, z [m]")] = (4.0, 4.0, 2.5)
+    file: Annotated[str | None, doc("arena file beside the experiment file; its [arena] is the base of this")] = None
+    walls: Annotated[bool, doc("whether its border is a wall that robots touch and range sensors see")] = True
+    obstacles: Annotated[dict[Name, Obstacle], doc("obstacles by name")] = {}
     starts: Annotated[
-        dict[Name, StartBox], Meta(description="areas where robots may be put before a run; none given: anywhere")
+        dict[Name, StartBox], doc("areas where robots may be put before a run; none given: anywhere")
     ] = {}
 
 
 class Rates(FileTable, frozen=True):
     """Rates [Hz]; pose_hz, coordination_hz and state_hz divide body_hz."""
 
-    body_hz: Annotated[Rate, Meta(description="position control and body [1/s]")] = 100.0
-    pose_hz: Annotated[Rate, Meta(description="rate of questions to the trigger [1/s]")] = 50.0
-    coordination_hz: Annotated[Rate, Meta(description="rate of decisions on a new goal [1/s]")] = 10.0
-    state_hz: Annotated[Rate, Meta(description="telemetry for recorder and viewers [1/s]")] = 50.0
+    body_hz: Annotated[Rate, doc("position control and body [1/s]")] = 100.0
+    pose_hz: Annotated[Rate, doc("rate of questions to the trigger [1/s]")] = 50.0
+    coordination_hz: Annotated[Rate, doc("rate of decisions on a new goal [1/s]")] = 10.0
+    state_hz: Annotated[Rate, doc("telemetry for recorder and viewers [1/s]")] = 50.0
     wake: Annotated[
         bool | None,
-        Meta(
-            description="whether poses in real time are received on arrival, not on the next tick of body_hz; left "
-            "out: yes, unless the trigger is timed"
+        doc(
+            "whether poses in real time are received on arrival, not on the next tick of body_hz; left out: yes, "
+            "unless the trigger is timed"
         ),
     ] = None
 
@@ -82,106 +85,80 @@ class Rates(FileTable, frozen=True):
 class RobotTable(FileTable, frozen=True):
     """Robot: kind, start, body and settings."""
 
-    kind: Annotated[
-        str, Meta(description="kind of robot, which sets size, speed and setpoint: `./zenpark explain crazyflie`")
-    ]
-    start: Annotated[
-        list[float], Meta(min_length=2, max_length=3, description="start x, y [m] and, if wanted, yaw [rad]")
-    ]
+    kind: Annotated[str, doc("kind of robot, which sets size, speed and setpoint: `./zenpark explain crazyflie`")]
+    start: Annotated[list[float], doc("start x, y [m] and, if wanted, yaw [rad]", min_length=2, max_length=3)]
     body: Annotated[
-        str, Meta(description="twin (in its own process), world (in the twin service), or the address of the real one")
+        str, doc("twin (in its own process), world (in the twin service), or the address of the real one")
     ] = "twin"
-    hover: Annotated[Positive | None, Meta(description="height that a flying robot holds [m]")] = None
+    hover: Annotated[Positive | None, doc("height that a flying robot holds [m]")] = None
     position: Annotated[
-        Literal["body", "external"],
-        Meta(description="source of its position: its own estimate, or messages on its key `position`"),
+        Literal["body", "external"], doc("source of its position: its own estimate, or messages on its key `position`")
     ] = "body"
-    device: Annotated[dict[str, Any], Meta(description="settings of its hardware, defined by the body")] = {}
-    process: Annotated[Name | None, Meta(description="name of its process; robots with the same name share one")] = None
-    sensors: Annotated[
-        list[str] | None, Meta(description="range sensors of its twin; left out: those that its kind has")
-    ] = None
-    ranges: Annotated[
-        Literal["body", "world"], Meta(description="source of its ranges: its own sensors, or those of the world")
-    ] = "body"
-    shadow: Annotated[Shadow | None, Meta(description="shadow twin beside the robot")] = None
-    avoids: Annotated[bool, Meta(description="whether it keeps clear of others if the experiment has an avoidance")] = (
-        True
-    )
+    device: Annotated[dict[str, Any], doc("settings of its hardware, defined by the body")] = {}
+    process: Annotated[Name | None, doc("name of its process; robots with the same name share one")] = None
+    sensors: Annotated[list[str] | None, doc("range sensors of its twin; left out: those that its kind has")] = None
+    ranges: Annotated[Literal["body", "world"], doc("source of its ranges: its own sensors, or the world")] = "body"
+    shadow: Annotated[Shadow | None, doc("shadow twin beside the robot")] = None
+    avoids: Annotated[bool, doc("whether it keeps clear of others if the experiment has an avoidance")] = True
     lands_at_s: Annotated[
         Positive | None,
-        Meta(
-            description="when it lands in mid-run, silent and lost to the others, as after a fault [s]; left out: never"
-        ),
+        doc("when it lands in mid-run, silent and lost to the others, as after a fault [s]; left out: never"),
     ] = None
-    standby: Annotated[
-        bool, Meta(description="whether it stays out of the run until `./zenpark robot add` lets it join")
-    ] = False
+    standby: Annotated[bool, doc("whether it stays out of the run until `./zenpark robot add` lets it join")] = False
 
 
 class TargetTable(FileTable, frozen=True):
     """Target of a link, one of three: distance, offset or bearing."""
 
-    distance: Annotated[Positive | None, Meta(description="distance to keep [m]")] = None
+    distance: Annotated[Positive | None, doc("distance to keep [m]")] = None
     offset: Annotated[
         Vector | None,
-        Meta(
-            description="place x, y (, z) of the second robot relative to the first [m]; z left out: by their heights"
-        ),
+        doc("place x, y (, z) of the second robot relative to the first [m]; z left out: by their heights"),
     ] = None
     bearing: Annotated[
-        Vector | None,
-        Meta(description="direction x, y (, z) from the first robot to the second; z left out: as seen from above"),
+        Vector | None, doc("direction x, y (, z) from the first robot to the second; z left out: as seen from above")
     ] = None
 
     def __post_init__(self) -> None:
-        given = [name for name in ("distance", "offset", "bearing") if getattr(self, name) is not None]
+        given = [name for name in TARGETS if getattr(self, name) is not None]
         if len(given) != 1:
             words = " and ".join(given) or "none of them"
             raise ValueError(f"a link asks for distance, offset or bearing, not for {words}; give one of the three")
         if self.bearing is not None and not any(self.bearing):
             raise ValueError("a bearing of zeros has no direction; give x, y, such as [1.0, 0.0]")
 
+    @property
+    def kind(self) -> str:
+        """Field that gives the target; `NO_TARGET` if none does, as in links for laws that need none."""
+        return next((name for name in TARGETS if getattr(self, name) is not None), NO_TARGET)
+
 
 class LinkTable(TargetTable, frozen=True):
     """Link with a target other than a distance or without one, a gain of its own, or a limited time."""
 
     gain: Annotated[
-        Positive | None,
-        Meta(description="gain [1/(m²·decision)] of a distance, else [1/decision]; left out: that of the formation"),
+        Positive | None, doc("gain [1/(m²·decision)] of a distance, else [1/decision]; left out: that of the formation")
     ] = None
-    from_s: Annotated[NotNegative, Meta(description="start of the link [s]")] = 0.0
-    until_s: Annotated[Positive | None, Meta(description="end of the link [s]; left out: end of the run")] = None
+    from_s: Annotated[NotNegative, doc("start of the link [s]")] = 0.0
+    until_s: Annotated[Positive | None, doc("end of the link [s]; left out: end of the run")] = None
 
     def __post_init__(self) -> None:
-        if not self.alone:
+        if self.kind != NO_TARGET:
             TargetTable.__post_init__(self)
         if self.until_s is not None and self.until_s <= self.from_s:
             raise ValueError("`until_s` must be later than `from_s`; or leave it out")
-
-    @property
-    def alone(self) -> bool:
-        """Whether it has no target, as for laws that need none."""
-        return self.distance is None and self.offset is None and self.bearing is None
 
 
 class AnchorTable(FileTable, frozen=True):
     """Distance of a robot to a point, to a line through it, or to a plane through it."""
 
-    distance: Annotated[NotNegative, Meta(description="distance to keep [m]; 0: on it")] = 0.0
-    to: Annotated[Vector | None, Meta(description="point x, y (, z) [m]; left out: the origin")] = None
-    along: Annotated[
-        Vector | None, Meta(description="direction x, y (, z) of a line through that point, of any length")
-    ] = None
-    across: Annotated[
-        Vector | None, Meta(description="direction x, y (, z) across a plane through that point, of any length")
-    ] = None
+    distance: Annotated[NotNegative, doc("distance to keep [m]; 0: on it")] = 0.0
+    to: Annotated[Vector | None, doc("point x, y (, z) [m]; left out: the origin")] = None
+    along: Annotated[Vector | None, doc("direction x, y (, z) of a line through that point, any length")] = None
+    across: Annotated[Vector | None, doc("direction x, y (, z) across a plane through that point, any length")] = None
     gain: Annotated[
         Positive | None,
-        Meta(
-            description="gain [1/(m²·decision)]; left out: twice that of the formation, or its stiffness if distance "
-            "is 0"
-        ),
+        doc("gain [1/(m²·decision)]; left out: twice that of the formation, or its stiffness if distance is 0"),
     ] = None
 
     def __post_init__(self) -> None:
@@ -196,37 +173,29 @@ class AnchorTable(FileTable, frozen=True):
 class ChangeTable(FileTable, frozen=True):
     """Smooth transition of the formation to another shape, from `at_s` on."""
 
-    at_s: Annotated[NotNegative, Meta(description="start of the transition, after the common start [s]")]
-    over_s: Annotated[NotNegative, Meta(description="duration [s]; 0: at once")] = 5.0
-    links: Annotated[
-        dict[str, Positive | TargetTable],
-        Meta(description="links that get another target"),
-    ] = {}
+    at_s: Annotated[NotNegative, doc("start of the transition, after the common start [s]")]
+    over_s: Annotated[NotNegative, doc("duration [s]; 0: at once")] = 5.0
+    links: Annotated[dict[str, Positive | TargetTable], doc("links that get another target")] = {}
     shape: Annotated[
         dict[Name, Vector],
-        Meta(description="places of robots, x, y (, z) [m]: new targets of the links that have theirs from a shape"),
+        doc("places of robots, x, y (, z) [m]: new targets of the links that have theirs from a shape"),
     ] = {}
     scale: Annotated[
-        Positive, Meta(description="size of the shape seen from above, as a multiple of the shape before; heights stay")
+        Positive, doc("size of the shape seen from above, as a multiple of the shape before; heights stay")
     ] = 1.0
-    rotate: Annotated[
-        float, Meta(description="rotation to the left [rad]; not for distances, which have no direction")
-    ] = 0.0
+    rotate: Annotated[float, doc("rotation to the left [rad]; not for distances, which have no direction")] = 0.0
 
 
 class Proximity(FileTable, frozen=True):
     """Links that exist while two robots are near each other."""
 
-    range: Annotated[Positive, Meta(description="distance below which robots become neighbours [m]")]
+    range: Annotated[Positive, doc("distance below which robots become neighbours [m]")]
     release: Annotated[
-        Positive | None, Meta(description="distance above which they stop being neighbours [m]; left out: 1.1 range")
+        Positive | None, doc("distance above which they stop being neighbours [m]; left out: 1.1 range")
     ] = None
     distance: Annotated[
         Positive | None,
-        Meta(
-            description="distance to keep by neighbours without a link in the file [m]; left out: only links of the "
-            "file act"
-        ),
+        doc("distance to keep by neighbours without a link in the file [m]; left out: only links of the file act"),
     ] = None
 
     def __post_init__(self) -> None:
@@ -237,55 +206,49 @@ class Proximity(FileTable, frozen=True):
 class Formation(FileTable, frozen=True):
     """Formation: links with their targets, anchors, and the law."""
 
-    law: Annotated[Choice, Meta(description="a registered law")] = "distance"
+    law: Annotated[Choice, doc("a registered law")] = "distance"
     update: Annotated[
-        Choice | None,
-        Meta(description="trigger that decides when a robot recomputes the law; left out: at every decision"),
+        Choice | None, doc("trigger that decides when a robot recomputes the law; left out: at every decision")
     ] = None
-    gain: Annotated[
-        Positive, Meta(description="μ of links with a distance as their target [1/(m²·decision)] (paper, eq. (6))")
-    ] = 3.0
+    gain: Annotated[Positive, doc("μ of links with a distance as target [1/(m²·decision)] (paper, eq. (6))")] = 3.0
     stiffness: Annotated[
-        Positive,
-        Meta(
-            description="k of links with an offset or a bearing as their target, or of all for some laws [1/decision]"
-        ),
+        Positive, doc("k of links with an offset or a bearing as their target, or of all for some laws [1/decision]")
     ] = 0.5
-    clamp: Annotated[Positive, Meta(description="largest step of the goal per axis and decision [m]")] = 0.1
-    tracking_gain: Annotated[
-        NotNegative, Meta(description="k of followers of a leader [1/(m²·decision)] (paper, eq. (7))")
-    ] = 3.0
-    leader: Annotated[Name | None, Meta(description="robot that leads; left out: every robot without neighbours")] = (
-        None
-    )
+    clamp: Annotated[Positive, doc("largest step of the goal per axis and decision [m]")] = 0.1
+    tracking_gain: Annotated[NotNegative, doc("k of followers of a leader [1/(m²·decision)] (paper, eq. (7))")] = 3.0
+    leader: Annotated[Name | None, doc("robot that leads; left out: every robot without neighbours")] = None
     links: Annotated[
         dict[str, Positive | LinkTable],
-        Meta(
-            description='"A > B": B receives from A; "A - B": both receive; distance [m], a table with another target,'
-            ' "shape": as in [formation.shape], or "link": none, for laws that need no target'
+        doc(
+            '"A > B": B receives from A; "A - B": both receive; distance [m], a table with another target, '
+            '"shape": as in [formation.shape], or "link": none, for laws that need no target'
         ),
     ] = {}
     anchors: Annotated[
-        dict[Name, Positive | AnchorTable],
-        Meta(description="by robot: distance to the origin [m], or to another place"),
+        dict[Name, Positive | AnchorTable], doc("by robot: distance to the origin [m], or to another place")
     ] = {}
     shape: Annotated[
         dict[Name, Vector],
-        Meta(
-            description='places of robots, x, y (, z) [m], about any origin: a link `"A > B" = "shape"`'
-            " gets its distance, offset or bearing from there, as the law needs; z left out: by their heights"
+        doc(
+            'places of robots, x, y (, z) [m], about any origin: a link `"A > B" = "shape"` gets its distance, offset '
+            "or bearing from there, as the law needs; z left out: by their heights"
         ),
     ] = {}
-    changes: Annotated[list[ChangeTable], Meta(description="other shapes, in order of time")] = []
-    proximity: Annotated[Proximity | None, Meta(description="links by range; left out: links are permanent")] = None
+    changes: Annotated[list[ChangeTable], doc("other shapes, in order of time")] = []
+    proximity: Annotated[Proximity | None, doc("links by range; left out: links are permanent")] = None
+
+    @property
+    def link_tables(self) -> dict[str, LinkTable]:
+        """The links in their long form."""
+        return {text: to if isinstance(to, LinkTable) else LinkTable(distance=to) for text, to in self.links.items()}
 
 
 class LegTable(FileTable, frozen=True):
     """Plan that a robot follows from `at_s` on."""
 
-    at_s: Annotated[NotNegative, Meta(description="start of the plan, after the common start [s]")]
-    robot: Annotated[Name, Meta(description="name of the robot")]
-    plan: Annotated[Choice, Meta(description="a registered planner")]
+    at_s: Annotated[NotNegative, doc("start of the plan, after the common start [s]")]
+    robot: Annotated[Name, doc("name of the robot")]
+    plan: Annotated[Choice, doc("a registered planner")]
 
 
 class LinkChannelTable(FileTable, frozen=True):
@@ -302,13 +265,12 @@ class LinkChannelTable(FileTable, frozen=True):
 class Outage(FileTable, frozen=True):
     """Time in which nothing passes on some links."""
 
-    from_s: Annotated[NotNegative, Meta(description="start of the outage, after the common start [s]")]
-    until_s: Annotated[Positive | None, Meta(description="end of the outage [s]; left out: end of the run")] = None
+    from_s: Annotated[NotNegative, doc("start of the outage, after the common start [s]")]
+    until_s: Annotated[Positive | None, doc("end of the outage [s]; left out: end of the run")] = None
     links: Annotated[
-        list[str],
-        Meta(description='links; "A > B": poses from A to B; "A - B": both ways; left out, with robots too: all'),
+        list[str], doc('links; "A > B": poses from A to B; "A - B": both ways; left out, with robots too: all')
     ] = []
-    robots: Annotated[list[Name], Meta(description="robots with all their links")] = []
+    robots: Annotated[list[Name], doc("robots with all their links")] = []
 
     def __post_init__(self) -> None:
         if self.until_s is not None and self.until_s <= self.from_s:
@@ -318,50 +280,38 @@ class Outage(FileTable, frozen=True):
 class ChannelTable(LinkEffects, FileTable, frozen=True):
     """Effects of the network on poses between robots: modelled in virtual time, added at the receiver in real time."""
 
-    outages: Annotated[list[Outage], Meta(description="times in which nothing passes")] = []
+    outages: Annotated[list[Outage], doc("times in which nothing passes")] = []
     links: Annotated[
-        dict[str, LinkChannelTable], Meta(description='effects by link; "A > B": poses from A to B; "A - B": both ways')
+        dict[str, LinkChannelTable], doc('effects by link; "A > B": poses from A to B; "A - B": both ways')
     ] = {}
 
 
 class NetworkTable(FileTable, frozen=True):
     """Network of a run in real time."""
 
-    realm: Annotated[Name, Meta(description="first chunk of every key")] = "park"
-    connect: Annotated[
-        list[str] | None, Meta(description="endpoints of routers that run already; left out: one is started")
-    ] = None
+    realm: Annotated[Name, doc("first chunk of every key")] = "park"
+    connect: Annotated[list[str] | None, doc("endpoints of routers that run already; left out: one is started")] = None
     listen: Annotated[
         list[str] | None,
-        Meta(
-            description="endpoints of the router that is started; left out: on loopback, and hosts reach it through "
-            "their ssh connection; of several routers, each has one in turn"
+        doc(
+            "endpoints of the router that is started; left out: on loopback, and hosts reach it through their ssh "
+            "connection; of several routers, each has one in turn"
         ),
     ] = None
     topology: Annotated[
         Literal["routers", "mesh"],
-        Meta(description="connections: all at routers; or, without routers, each robot with exactly its neighbours"),
+        doc("connections: all at routers; or, without routers, each robot with exactly its neighbours"),
     ] = "routers"
-    addresses: Annotated[
-        dict[Name, str],
-        Meta(description="endpoints of robots in a mesh; left out: free ports on loopback"),
-    ] = {}
+    addresses: Annotated[dict[Name, str], doc("endpoints of robots in a mesh; left out: free ports on loopback")] = {}
     routers: Annotated[
-        int,
-        Meta(
-            ge=1,
-            le=8,
-            description="number of routers, each in a process; a member that loses one goes on at the next",
-        ),
+        int, doc("number of routers, each in a process; a member that loses one goes on at the next", ge=1, le=8)
     ] = 1
     address: Annotated[
-        str | None,
-        Meta(description="name of this machine for hosts, where `listen` is given; left out: as ssh came from there"),
+        str | None, doc("name of this machine for hosts, where `listen` is given; left out: as ssh came from there")
     ] = None
-    encoding: Annotated[Literal["json", "msgpack"], Meta(description="of the payloads")] = "json"
+    encoding: Annotated[Literal["json", "msgpack"], doc("of the payloads")] = "json"
     lab: Annotated[
-        str | None,
-        Meta(description="folder of certificates (`./zenpark lab init`), beside this file; left out: loopback only"),
+        str | None, doc("folder of certificates (`./zenpark lab init`), beside this file; left out: loopback only")
     ] = None
 
 
@@ -370,60 +320,50 @@ class Host(FileTable, frozen=True):
 
     address: Annotated[
         str | None,
-        Meta(
-            description="address for ssh: a name of its configuration, user@machine, ssh://user@machine:port; left "
-            "out: its robots are started there by hand or at boot, and join"
+        doc(
+            "address for ssh: a name of its configuration, user@machine, ssh://user@machine:port; left out: its robots "
+            "are started there by hand or at boot, and join"
         ),
     ] = None
-    zenpark: Annotated[str, Meta(description="command of zenpark there; a path counts from the home folder")] = (
-        "zenpark/zenpark"
-    )
+    zenpark: Annotated[str, doc("command of zenpark there; a path counts from the home folder")] = "zenpark/zenpark"
     lab: Annotated[
-        str, Meta(description="folder there for the certificates of its robots, in a lab; counts from the home folder")
+        str, doc("folder there for the certificates of its robots, in a lab; counts from the home folder")
     ] = "zenpark-lab"
-    robots: Annotated[list[Name], Meta(description="robots there; those that no host names run here")] = []
-    tags: Annotated[list[Name], Meta(description="labels by which `./zenpark hosts` chooses among hosts")] = []
+    robots: Annotated[list[Name], doc("robots there; those that no host names run here")] = []
+    tags: Annotated[list[Name], doc("labels by which `./zenpark hosts` chooses among hosts")] = []
 
 
 class WorldTable(FileTable, frozen=True):
     """World that all twins share in virtual time, and those with `body = "world"` in real time."""
 
-    engine: Annotated[Choice, Meta(description="a registered engine")] = "point-mass"
-    sensor_noise: Annotated[
-        NotNegative, Meta(description="noise of range sensors, as a multiple of that of real ones")
-    ] = 1.0
+    engine: Annotated[Choice, doc("a registered engine")] = "point-mass"
+    sensor_noise: Annotated[NotNegative, doc("noise of range sensors, as a multiple of that of real ones")] = 1.0
     wheel_watchdog_s: Annotated[
         Positive | None,
-        Meta(
-            description="time without a command after which robots on wheels stop, like by a watchdog [s]; left out: "
-            "they drive on, as Khepera IV and TurtleBot3 do, unless `watchdog_s` is in their `device` table"
+        doc(
+            "time without a command after which robots on wheels stop, like by a watchdog [s]; left out: they drive "
+            "on, as Khepera IV and TurtleBot3 do, unless `watchdog_s` is in their `device` table"
         ),
     ] = None
-    patience_s: Annotated[
-        Positive, Meta(description="time for which a robot without its world holds before it lands [s]")
-    ] = 30.0
+    patience_s: Annotated[Positive, doc("time for which a robot without its world holds before it lands [s]")] = 30.0
 
 
 class Start(FileTable, frozen=True):
     """Beginning of a run."""
 
-    deadline_s: Annotated[Positive, Meta(description="time limit for all robots to be ready [s]")] = 20.0
-    missing: Annotated[Literal["abort", "go-on"], Meta(description="reaction to a robot that is not ready by then")] = (
-        "abort"
-    )
+    deadline_s: Annotated[Positive, doc("time limit for all robots to be ready [s]")] = 20.0
+    missing: Annotated[Literal["abort", "go-on"], doc("reaction to a robot that is not ready by then")] = "abort"
     scatter: Annotated[
-        NotNegative, Meta(description="largest random offset of a twin from `start`, on each axis, by the seed [m]")
+        NotNegative, doc("largest random offset of a twin from `start`, on each axis, by the seed [m]")
     ] = 0.0
-    scatter_yaw: Annotated[
-        NotNegative, Meta(description="largest random yaw offset of each start, by the seed [rad]")
-    ] = 0.0
+    scatter_yaw: Annotated[NotNegative, doc("largest random yaw offset of each start, by the seed [rad]")] = 0.0
 
 
 class Hybrid(FileTable, frozen=True):
     """Hybrid architecture: some robots are guided by the central controller, the others decide for themselves."""
 
-    kind: Annotated[Literal["hybrid"], Meta(description='"hybrid"')]
-    robots: Annotated[list[Name], Meta(min_length=1, description="robots that the centre guides")]
+    kind: Annotated[Literal["hybrid"], doc('"hybrid"')]
+    robots: Annotated[list[Name], doc("robots that the centre guides", min_length=1)]
 
 
 # metrics of zenpark that a criterion can name; those of other distributions come beside them
@@ -440,22 +380,17 @@ class Criterion(FileTable, frozen=True):
     """Limit that a run must keep to pass: of a metric, or of a measure of the law."""
 
     metric: Annotated[
-        str | None, Meta(description='metric, also one in a file beside this one ("way.py:Way"); or give `measure`')
+        str | None, doc('metric, also one in a file beside this one ("way.py:Way"); or give `measure`')
     ] = None
-    measure: Annotated[
-        str | None, Meta(description="a number that the law measures, averaged over the last second of the run")
-    ] = None
+    measure: Annotated[str | None, doc("number that the law measures, averaged over the last second of the run")] = None
     of: Annotated[
-        str,
-        Meta(description="mean over robots, worst (largest for `at_most`, smallest for `at_least`), or a robot's name"),
+        str, doc("mean over robots, worst (largest for `at_most`, smallest for `at_least`), or a robot's name")
     ] = MEAN
-    case: Annotated[str | None, Meta(description="judged case; left out: each case")] = None
-    at_most: Annotated[float | None, Meta(description="upper limit, in the unit of the metric")] = None
-    at_least: Annotated[float | None, Meta(description="lower limit, in the unit of the metric")] = None
-    relative_to: Annotated[
-        str | None, Meta(description="a case: limits are multiples of the value there, seed by seed")
-    ] = None
-    why: Annotated[str, Meta(description="reason, printed if it is not met")] = ""
+    case: Annotated[str | None, doc("judged case; left out: each case")] = None
+    at_most: Annotated[float | None, doc("upper limit, in the unit of the metric")] = None
+    at_least: Annotated[float | None, doc("lower limit, in the unit of the metric")] = None
+    relative_to: Annotated[str | None, doc("a case: limits are multiples of the value there, seed by seed")] = None
+    why: Annotated[str, doc("reason, printed if it is not met")] = ""
 
     def __post_init__(self) -> None:
         if (self.metric is None) == (self.measure is None):
@@ -476,61 +411,46 @@ class Criterion(FileTable, frozen=True):
 class Experiment(FileTable, frozen=True):
     """Experiment, or a case of it after `document.cases`."""
 
-    title: Annotated[str, Meta(description="subject of the experiment, for people")]
-    robots: Annotated[dict[Name, RobotTable], Meta(description="robots by name", min_length=1)]
-    duration_s: Annotated[Positive, Meta(description="duration from the common start [s]", le=86400)]
+    title: Annotated[str, doc("subject of the experiment, for people")]
+    robots: Annotated[dict[Name, RobotTable], doc("robots by name", min_length=1)]
+    duration_s: Annotated[Positive, doc("duration from the common start [s]", le=86400)]
     spares: Annotated[
-        dict[Name, RobotTable], Meta(description="robots that wait to take over the name of another one of their kind")
+        dict[Name, RobotTable], doc("robots that wait to take over the name of another one of their kind")
     ] = {}
     on_loss: Annotated[
         Literal["none", "restart", "replace"],
-        Meta(
-            description="reaction to a robot lost in mid-run: continue without it, restart it, or let a spare take over"
-        ),
+        doc("reaction to a robot lost in mid-run: continue without it, restart it, or let a spare take over"),
     ] = "none"
-    source: Annotated[str, Meta(description="publication that it reproduces")] = ""
-    seed: Annotated[int, Meta(description="seed of all random numbers: noise, starts, network", ge=0, le=2**32 - 1)] = 1
-    tolerance: Annotated[Positive, Meta(description="error below which a link must stay to count as acquired [m]")] = (
-        0.05
-    )
-    arena: Annotated[Arena, Meta(description="size, obstacles and start boxes")] = Arena()
-    rates: Annotated[Rates, Meta(description="rates of body, poses, decisions and telemetry [Hz]")] = Rates()
-    formation: Annotated[Formation, Meta(description="links with their targets, anchors, and the law")] = Formation()
-    timeline: Annotated[list[LegTable], Meta(description="plans of robots, for each robot in order of time")] = []
+    source: Annotated[str, doc("publication that it reproduces")] = ""
+    seed: Annotated[int, doc("seed of all random numbers: noise, starts, network", ge=0, le=2**32 - 1)] = 1
+    tolerance: Annotated[Positive, doc("error below which a link must stay to count as acquired [m]")] = 0.05
+    arena: Annotated[Arena, doc("size, obstacles and start boxes")] = Arena()
+    rates: Annotated[Rates, doc("rates of body, poses, decisions and telemetry [Hz]")] = Rates()
+    formation: Annotated[Formation, doc("links with their targets, anchors, and the law")] = Formation()
+    timeline: Annotated[list[LegTable], doc("plans of robots, for each robot in order of time")] = []
     architecture: Annotated[
         Literal["distributed", "centralised"] | Hybrid,
-        Meta(
-            description="distributed: each robot decides for itself; centralised: one process for all; hybrid: for some"
-        ),
+        doc("distributed: each robot decides for itself; centralised: one process for all; hybrid: for some"),
     ] = "distributed"
-    trigger: Annotated[Choice, Meta(description="registered trigger that decides when a robot transmits")] = "periodic"
+    trigger: Annotated[Choice, doc("registered trigger that decides when a robot transmits")] = "periodic"
     prediction: Annotated[
-        Choice | None,
-        Meta(description="estimate of a robot's place between two messages; left out: as the trigger needs it"),
+        Choice | None, doc("estimate of a robot's place between two messages; left out: as the trigger needs it")
     ] = None
-    positioning: Annotated[
-        str | None, Meta(description='source of `position = "external"`: vicon://HOST[:PORT], or vicon-twin')
-    ] = None
+    positioning: Annotated[str | None, doc('source of `position = "external"`: vicon://HOST[:PORT], vicon-twin')] = None
     disturbance: Annotated[
-        dict[str, Disturbance], Meta(description='by kind or by robot; "all" for every one; the narrower wins')
+        dict[str, Disturbance], doc('by kind or by robot; "all" for every one; the narrower wins')
     ] = {}
-    avoidance: Annotated[
-        Choice | None, Meta(description="how robots avoid obstacles and each other; left out: they do not")
-    ] = None
-    world: Annotated[WorldTable, Meta(description="simulated world of the twins")] = WorldTable()
-    channel: Annotated[ChannelTable, Meta(description="modelled delays and losses of poses")] = ChannelTable()
-    network: Annotated[NetworkTable, Meta(description="routers and certificates of a run in real time")] = (
-        NetworkTable()
-    )
-    hosts: Annotated[dict[Name, Host], Meta(description="other machines, and which robots run there")] = {}
-    safety: Annotated[Safety, Meta(description="limits at which robots hold, land or stop")] = Safety()
-    start: Annotated[Start, Meta(description="start of a run: its deadline and the scatter of the robots")] = Start()
-    criteria: Annotated[
-        list[Criterion], Meta(description="limits that a run must keep to pass; `run` says which it does not")
-    ] = []
+    avoidance: Annotated[Choice | None, doc("how robots avoid obstacles and each other; left out: they do not")] = None
+    world: Annotated[WorldTable, doc("simulated world of the twins")] = WorldTable()
+    channel: Annotated[ChannelTable, doc("modelled delays and losses of poses")] = ChannelTable()
+    network: Annotated[NetworkTable, doc("routers and certificates of a run in real time")] = NetworkTable()
+    hosts: Annotated[dict[Name, Host], doc("other machines, and which robots run there")] = {}
+    safety: Annotated[Safety, doc("limits at which robots hold, land or stop")] = Safety()
+    start: Annotated[Start, doc("start of a run: its deadline and the scatter of the robots")] = Start()
+    criteria: Annotated[list[Criterion], doc("limits that a run must keep to pass; `run` says which it does not")] = []
     cases: Annotated[
         dict[Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")], dict[str, Any]],
-        Meta(description="each may override any field; the first is the reference of every ratio"),
+        doc("each may override any field; the first is the reference of every ratio"),
     ] = {}
 
     @property

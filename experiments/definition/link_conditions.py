@@ -14,9 +14,8 @@ from experiments.definition.experiment import ChannelTable, LinkChannelTable
 from experiments.definition.links import link_pairs
 from experiments.definition.plan import Plan
 
-OWN_S: Final = (
-    ChannelTable().delay_s
-)  # any real network takes as long: to wait for it would cost a tick in ten milliseconds
+# any real network takes as long: to wait for it would cost a tick in ten milliseconds
+OWN_S: Final = ChannelTable().delay_s
 TO_CENTRE, FROM_CENTRE = "to centre", "from centre"  # streams
 
 Ends = Sequence[tuple[str, str]]  # sender and receiver of each link, by name

@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 
 from agents.formation.link import BY_BEARING, BY_DISTANCE, BY_NOTHING, BY_RELATIVE
 from agents.plugins.law import Law, Need
-from experiments.definition.experiment import Experiment, LinkTable, TargetTable
+from experiments.definition.experiment import NO_TARGET, TARGETS, Experiment, TargetTable
 
 _LINK: Final = re.compile(r"\s*(\w+)\s*([>-])\s*(\w+)\s*", re.ASCII)
 _ALMOST: Final = re.compile(r"\s*(\w+)\s*([^\w\s]+)\s*(\w+)\s*", re.ASCII)
@@ -27,8 +27,7 @@ class TargetKind(NamedTuple):
     wants: int | None  # how the law takes every link, see `agents.formation.link`; None: by its own target
 
 
-NO_TARGET: Final = "nothing"  # in place of a field: a link alone
-_ANY: Final = TargetKind(("distance", "offset", "bearing"), "a distance, an offset or a bearing", "0.6", None)
+_ANY: Final = TargetKind(TARGETS, "a distance, an offset or a bearing", "0.6", None)
 TARGET_KINDS: Final[dict[Need, TargetKind]] = {
     "distance": TargetKind(("distance", "offset"), "a distance or an offset", "0.6", BY_DISTANCE),
     "relative": TargetKind(("offset",), "an offset", "{ offset = [0.6, 0.0] }", BY_RELATIVE),
@@ -91,8 +90,7 @@ def one_way_links(experiment: Experiment, law: Law) -> list[OneWay]:
     near = formation.proximity
     reach, release = (math.inf, math.inf) if near is None else (near.range, near.release or RELEASE * near.range)
     found = []
-    for text, link in formation.links.items():
-        given = link if isinstance(link, LinkTable) else LinkTable(distance=link)
+    for text, given in formation.link_tables.items():
         for receiver, sender in link_pairs(text):
             wanted = link_target(experiment, text, given, receiver)
             gain = _gain(experiment, law, wanted.wants) if given.gain is None else given.gain
@@ -115,7 +113,7 @@ def one_way_links(experiment: Experiment, law: Law) -> list[OneWay]:
 def link_target(experiment: Experiment, text: str, given: TargetTable | float, receiver: str) -> LinkTarget:
     """Target of a link for one of its ends, as distance, offset and bearing."""
     given = given if isinstance(given, TargetTable) else TargetTable(distance=given)
-    if isinstance(given, LinkTable) and given.alone:
+    if given.kind == NO_TARGET:
         return LinkTarget(BY_NOTHING, math.nan)
     if given.distance is not None:
         return LinkTarget(BY_DISTANCE, given.distance)

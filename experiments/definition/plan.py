@@ -44,10 +44,6 @@ def _plain(choice: Choice) -> str:
     return files.plain(_name(choice))
 
 
-def _built(group: str, choice: Choice) -> Any:  # noqa: ANN401 - what it is depends on the group
-    return registry.build(group, choice)
-
-
 def finds_contacts(engine: Choice) -> bool:
     """Whether an engine finds contacts; not where a recording is read and that engine is not installed."""
     try:
@@ -103,7 +99,7 @@ class Plan:
 
     @cached_property
     def law(self) -> Law:
-        built: Law = _built(registry.LAWS, self.experiment.formation.law)
+        built: Law = registry.build(registry.LAWS, self.experiment.formation.law)
         return built
 
     @property
@@ -112,7 +108,7 @@ class Plan:
 
     @cached_property
     def trigger(self) -> Trigger:
-        built: Trigger = _built(registry.TRIGGERS, self.experiment.trigger)
+        built: Trigger = registry.build(registry.TRIGGERS, self.experiment.trigger)
         return built
 
     @property
@@ -130,7 +126,7 @@ class Plan:
     def update(self) -> Trigger | None:
         """The control trigger; None: the law is computed at every decision."""
         chosen = self.experiment.formation.update
-        return None if chosen is None else _built(registry.TRIGGERS, chosen)
+        return None if chosen is None else registry.build(registry.TRIGGERS, chosen)
 
     @property
     def needs_prediction(self) -> bool:
@@ -143,13 +139,13 @@ class Plan:
         chosen = self.experiment.prediction
         if chosen is None:
             chosen = self.trigger.PREDICTION if self.needs_prediction else self.law.PREDICTION
-        built: Predictor = _built(registry.PREDICTORS, chosen)
+        built: Predictor = registry.build(registry.PREDICTORS, chosen)
         return HOLD if built == HOLD else built
 
     @cached_property
     def avoidance(self) -> Avoidance | None:
         chosen = self.experiment.avoidance
-        return None if chosen is None else _built(registry.AVOIDANCES, chosen)
+        return None if chosen is None else registry.build(registry.AVOIDANCES, chosen)
 
     @property
     def engine_name(self) -> str:
@@ -157,19 +153,18 @@ class Plan:
 
     @cached_property
     def engine(self) -> EngineFactory:
-        built: EngineFactory = _built(registry.ENGINES, self.experiment.world.engine)
+        built: EngineFactory = registry.build(registry.ENGINES, self.experiment.world.engine)
         return built
 
     @property
     def finds_contacts(self) -> bool:
-        """Whether the engine finds contacts."""
         return finds_contacts(self.experiment.world.engine)
 
     @cached_property
     def legs_by_robot(self) -> dict[str, tuple[Leg, ...]]:
         found: dict[str, tuple[Leg, ...]] = {}
         for leg in self.experiment.timeline:
-            planned = Leg(leg.at_s, _built(registry.PLANNERS, leg.plan))
+            planned = Leg(leg.at_s, registry.build(registry.PLANNERS, leg.plan))
             found[leg.robot] = (*found.get(leg.robot, ()), planned)
         return found
 
@@ -342,11 +337,8 @@ class Plan:
     def scene(self) -> Scene:
         """Obstacles and walls of the arena."""
         arena = self.experiment.arena
-        plans = {
-            name: _built(registry.PLANNERS, obstacle.plan)
-            for name, obstacle in arena.obstacles.items()
-            if obstacle.plan is not None
-        }
+        moving = {name: each.plan for name, each in arena.obstacles.items() if each.plan is not None}
+        plans = {name: registry.build(registry.PLANNERS, plan) for name, plan in moving.items()}
         return Scene.furnished(arena.size, arena.obstacles, plans, walled=arena.walls)
 
     def disturbance(self, name: str) -> Disturbance:

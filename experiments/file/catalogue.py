@@ -18,7 +18,7 @@ def path(name: str) -> Path:
     """The file of a catalogue entry; raises DocumentError if there is none of that name."""
     if name not in index.names():
         raise no_entry(name)
-    return _entry(name)
+    return index.FOLDER / f"{name}.toml"
 
 
 def copy_entry(name: str, target: Path) -> Path:
@@ -63,10 +63,6 @@ def _arena_beside(text: str, folder: Path) -> ArenaFile | None:
         hint = "choose another folder, or rename that file; nothing was changed"
         raise refusal(str(there), "is another arena than that of the entry", hint)
     return wanted
-
-
-def _entry(name: str) -> Path:
-    return index.FOLDER / f"{name}.toml"
 
 
 def no_entry(name: str) -> DocumentError:

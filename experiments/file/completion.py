@@ -12,7 +12,7 @@ from agents.plugins import registry
 from agents.plugins.law import Law
 from agents.plugins.registry import did_you_mean
 from experiments.catalogue import index
-from experiments.definition.experiment import Formation
+from experiments.definition.experiment import TARGETS, Formation
 from experiments.definition.links import TARGET_KINDS, link_pairs, pairs_or_none
 from experiments.file.choices import struct_of
 from experiments.file.overrides import SHAPE
@@ -20,7 +20,6 @@ from experiments.file.problems import Fault
 
 ALONE: Final = "link"  # a link without a target
 LARGEST_FILE: Final = 1_000_000  # bytes that a law reads from a file
-_TARGETS: Final = frozenset({"distance", "offset", "bearing"})
 
 
 def fill_from_shape(document: dict[str, Any]) -> list[Fault]:
@@ -36,7 +35,7 @@ def fill_from_shape(document: dict[str, Any]) -> list[Fault]:
     bare = [
         text
         for text, given in links.items()
-        if given == SHAPE or (shape is not None and isinstance(given, dict) and not _TARGETS & given.keys())
+        if given == SHAPE or (shape is not None and isinstance(given, dict) and not {*TARGETS} & given.keys())
     ]
     links.update({text: {} for text, given in links.items() if given == ALONE})
     law = _law(formation.get("law", Formation().law))

@@ -16,7 +16,7 @@ import msgspec
 
 from agents.body.kinds import KINDS
 from agents.plugins import files, registry
-from experiments.definition.experiment import Experiment
+from experiments.definition.experiment import TARGETS, Experiment
 from experiments.file.choices import group_of, struct_of
 from experiments.file.completion import ALONE
 from experiments.file.consistency.whole import judged_metrics
@@ -32,7 +32,6 @@ _OWNERS: Final[dict[str, Path]] = {  # structs with a choice of a plug-in, and w
     "WorldTable": ("world",),
 }
 _CASE: Final = "InCase"
-TARGETS: Final = ("distance", "offset", "bearing")  # of a link, of which one is given
 SHAPES: Final = ("box", "radius", "wall")  # of an obstacle, likewise
 WORD: Final = 2**63  # integers lie below it, and not below its negative
 

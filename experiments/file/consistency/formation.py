@@ -7,8 +7,8 @@ from typing import Final
 
 from agents.formation.link import BY_BEARING
 from agents.plugins.registry import did_you_mean
-from experiments.definition.experiment import ChangeTable, Experiment, LinkTable, TargetTable
-from experiments.definition.links import FORM, NO_TARGET, TARGET_KINDS, held_height, link_pairs
+from experiments.definition.experiment import NO_TARGET, ChangeTable, Experiment, TargetTable
+from experiments.definition.links import FORM, TARGET_KINDS, held_height, link_pairs
 from experiments.definition.plan import Plan
 from experiments.file.problems import Fault, Path, after_the_end, unknown_robot
 
@@ -25,11 +25,10 @@ def formation_faults(plan: Plan) -> Iterator[Fault]:
         yield from unknown_robot(("formation", table, name), name, experiment.robots, on_key=True)
     if found:
         return  # what follows looks links up
-    for text, link in formation.links.items():
+    for text, link in formation.link_tables.items():
         path = ("formation", "links", text)
         yield from _asked(plan, text, link, path)
-        if isinstance(link, LinkTable):
-            yield from after_the_end((*path, "from_s"), "link", link.from_s, experiment.duration_s)
+        yield from after_the_end((*path, "from_s"), "link", link.from_s, experiment.duration_s)
     for number, change in enumerate(formation.changes):
         yield from _change(plan, number, change)
     near = formation.proximity
@@ -67,28 +66,17 @@ def _links(experiment: Experiment) -> Iterator[Fault]:
         given.update(dict.fromkeys(both, text))
 
 
-def _kind_of(given: TargetTable | float) -> str:
-    """Name of the target of a link."""
-    if not isinstance(given, TargetTable):
-        return "distance"
-    return next((name for name in ("distance", "offset", "bearing") if getattr(given, name) is not None), NO_TARGET)
-
-
-def _asked(plan: Plan, text: str, given: TargetTable | float, path: Path) -> Iterator[Fault]:
+def _asked(plan: Plan, text: str, given: TargetTable, path: Path) -> Iterator[Fault]:
     """Targets that the law does not take, or that robots with held heights cannot meet."""
-    experiment, needs, kind = plan.experiment, TARGET_KINDS[plan.law.NEEDS], _kind_of(given)
-    if kind not in needs.fields and kind == NO_TARGET:
-        message = f"the law '{plan.law_name}' needs a target of every link, and {text!r} has none"
-        yield Fault(path, message, f"give {needs.words}")
-        return
-    if kind not in needs.fields:
-        message = f"the law '{plan.law_name}' needs {needs.words} of every link; this one asks for a {kind}"
-        hint = (
-            f'draw all in [formation.shape] and write "{text}" = "shape", or write such as "{text}" = {needs.example}'
-        )
-        yield Fault(path, message, f'{hint}, or take law = "mixed", which goes by each link')
-        return
-    if not isinstance(given, TargetTable):
+    experiment, needs = plan.experiment, TARGET_KINDS[plan.law.NEEDS]
+    if given.kind not in needs.fields:
+        message = f"the law '{plan.law_name}' needs {needs.words} of every link; this one asks for a {given.kind}"
+        hint = f'draw all in [formation.shape] and write "{text}" = "shape", or write such as "{text}" = '
+        hint = f'{hint}{needs.example}, or take law = "mixed", which goes by each link'
+        if given.kind == NO_TARGET:
+            message = f"the law '{plan.law_name}' needs a target of every link, and {text!r} has none"
+            hint = f"give {needs.words}"
+        yield Fault(path, message, hint)
         return
     second, first = link_pairs(text)[0]
     rise = held_height(experiment, second) - held_height(experiment, first)
@@ -106,36 +94,29 @@ def _asked(plan: Plan, text: str, given: TargetTable | float, path: Path) -> Ite
 
 def _change(plan: Plan, number: int, change: ChangeTable) -> Iterator[Fault]:
     experiment, path = plan.experiment, ("formation", "changes", number)
+    links = experiment.formation.link_tables
     yield from after_the_end((*path, "at_s"), "change", change.at_s, experiment.duration_s)
-    before = {pair: given for text, given in experiment.formation.links.items() for pair in link_pairs(text)}
-    kinds = {_kind_of(given) for given in before.values()}
-    for text, given in change.links.items():
+    before = {pair: link.kind for text, link in links.items() for pair in link_pairs(text)}
+    for text, to in change.links.items():
         where = (*path, "links", text)
+        new = to if isinstance(to, TargetTable) else TargetTable(distance=to)
         try:
             both = link_pairs(text)
         except ValueError as error:
             yield Fault(where, f"{text!r} is no link", str(error), on_key=True)
             continue
         if not set(both) <= set(before):
-            hint = did_you_mean(text, experiment.formation.links)
-            yield Fault(where, f"{text!r} is none of the formation's links", hint, on_key=True)
-            continue
-        old, new = _kind_of(before[both[0]]), _kind_of(given)
-        if old != new:
-            message = f"{text!r} asks for a {old} before, and for a {new} then: there is no way between them"
+            message = f"{text!r} is none of the formation's links"
+            yield Fault(where, message, did_you_mean(text, links), on_key=True)
+        elif (old := before[both[0]]) != new.kind:
+            message = f"{text!r} asks for a {old} before, and for a {new.kind} then: there is no way between them"
             yield Fault(where, message, f"give a {old}")
         else:
-            yield from _asked(plan, text, given, where)
-    if change.rotate and kinds == {"distance"}:
+            yield from _asked(plan, text, new, where)
+    if change.rotate and {*before.values()} == {"distance"}:
         message = "nothing here knows a direction: distances are met whichever way the formation faces"
         yield Fault((*path, "rotate"), message, "give links an offset or a bearing, and law a law that goes by them")
-    if change.scale != 1.0:
-        for text, given in experiment.formation.links.items():
-            if (
-                isinstance(given, TargetTable)
-                and given.bearing is not None
-                and len(given.bearing) == 3
-                and given.bearing[2]
-            ):
-                message = f"the slope of {text!r} changes when the formation grows and heights are held"
-                yield Fault((*path, "scale"), message, "give that bearing as seen from above, without the third number")
+    for text, link in links.items() if change.scale != 1.0 else ():
+        if link.bearing is not None and any(link.bearing[2:]):
+            message = f"the slope of {text!r} changes when the formation grows and heights are held"
+            yield Fault((*path, "scale"), message, "give that bearing as seen from above, without the third number")
