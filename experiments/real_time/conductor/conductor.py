@@ -33,7 +33,7 @@ from experiments.real_time.conductor.run_view import (
     RunFailed,
     ShowProgress,
 )
-from experiments.real_time.hosts.clock_drift import Drift
+from experiments.real_time.hosts.hosts import Drift
 from experiments.real_time.hosts.launcher import LAND_S
 from experiments.recording.playback import EARLY_S
 

@@ -1,4 +1,4 @@
-"""Hot changes: robots are removed, restarted, replaced or added while the run goes on.
+"""Hot changes: robots are removed, restarted, added or replaced, by a spare or another body, while the run goes on.
 
 The conductor answers orders on a key of its own. A change takes seconds: it is a generator that advances one step at a
 time, so that the conductor never waits.
@@ -6,21 +6,25 @@ time, so that the conductor never waits.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
+import msgspec
 import zenoh
 
+from agents.body.kinds import KINDS
 from agents.errors import Refusal
 from agents.network import messages
 from agents.network.keys import Keys
+from agents.plugins import registry
 from agents.plugins.registry import did_you_mean
+from experiments.definition.experiment import WORLD, RobotTable
 from experiments.definition.plan import Plan
 from experiments.real_time.conductor.case_processes import CaseProcesses
-from experiments.real_time.conductor.replacement import TWIN, Spares, in_the_way
-from experiments.real_time.conductor.run_view import FROZEN_S, NetworkView
+from experiments.real_time.conductor.run_view import FROZEN_S, NetworkView, RobotView
 from experiments.real_time.hosts.launcher import LAND_S
 
 CLIMB_S: Final = 15.0  # limit for a robot to climb
@@ -30,6 +34,10 @@ RESTARTS: Final = 3  # a robot that is lost more often is not helped by a restar
 MAX_ORDERS: Final = 100  # orders at once
 INSIST_S: Final = 5.0  # an order that a robot refuses is repeated for this long,
 AGAIN_S: Final = 0.5  # with this period
+
+MARGIN_M: Final = 0.1  # free space around a robot that begins to move
+TWIN: Final = "twin"  # a body that is there as long as its process
+OF_BODY: Final = ("body", "start", "hover", "position", "device", "sensors", "ranges")  # fields of a spare
 
 Steps = Generator[None, None, str]  # returns the result, in words
 
@@ -81,7 +89,7 @@ class HotChanges:
             change.steps.close()
             self._answer(change, refused="the run is over")
         self._changes.clear()
-        self._reply()
+        self._reply_to_finished()
 
     def expects(self, name: str, how: str) -> bool:
         """Whether the end of a robot's process, or of its token, is part of a change: then it is no loss."""
@@ -120,17 +128,15 @@ class HotChanges:
             else:
                 continue
             self._changes.remove(change)
-        self._reply()
+        self._reply_to_finished()
 
     # ------------------------------------------------------------------ orders and answers
 
     def _accept(self, query: zenoh.Query, order: messages.RunOrder) -> None:
         if refusal := next(self._refusals(order), None):
-            with query:
-                reply = messages.RunReply(reason=refusal)
-                query.reply(self._keys.run_order, messages.encode(reply), encoding=messages.JSON)
-            return
-        self._begin(_Asked(order, query))
+            self._reply(query, messages.RunReply(reason=refusal))
+        else:
+            self._begin(_Asked(order, query))
 
     def _refusals(self, order: messages.RunOrder) -> Iterator[str]:
         """Reasons to refuse the whole order."""
@@ -164,7 +170,8 @@ class HotChanges:
             left = [name for name in left if name not in names]
             for name in names:
                 self._view.report(asked.order.order, name, f"asked by {operator}")
-            change = _Change(names, self._steps(asked.order, names), asked)
+            steps = {"remove": self._remove, "replace": self._replace}.get(asked.order.order, self._admit)
+            change = _Change(names, steps(names, asked.order), asked)
             if busy := sorted(self.under_way & {*names}):
                 self._answer(change, refused=f"{', '.join(busy)}: is being changed already; wait for that")
             else:
@@ -181,26 +188,19 @@ class HotChanges:
                 change.asked.done[name] = done
                 self._view.report("changed", name, done)
 
-    def _reply(self) -> None:
+    def _reply_to_finished(self) -> None:
         for asked in list(self._pending):
             if asked.done.keys() | asked.refused.keys() >= {*asked.order.robots} and asked.query is not None:
                 self._pending.remove(asked)
-                reply = messages.RunReply(asked.done, asked.refused)
-                with asked.query:
-                    asked.query.reply(self._keys.run_order, messages.encode(reply), encoding=messages.JSON)
+                self._reply(asked.query, messages.RunReply(asked.done, asked.refused))
+
+    def _reply(self, query: zenoh.Query, reply: messages.RunReply) -> None:
+        with query:
+            query.reply(self._keys.run_order, messages.encode(reply), encoding=messages.JSON)
 
     # ------------------------------------------------------------------ what is done
 
-    def _steps(self, order: messages.RunOrder, names: tuple[str, ...]) -> Steps:
-        match order.order:
-            case "remove":
-                return self._remove(names)
-            case "replace":
-                return self._replace(names, order)
-            case _:
-                return self._admit(names, order)
-
-    def _remove(self, names: Sequence[str]) -> Steps:
+    def _remove(self, names: Sequence[str], _order: messages.RunOrder) -> Steps:
         yield from self._leave(names)
         return "removed: it is down, and the others go on"
 
@@ -348,3 +348,92 @@ class HotChanges:
             if time.monotonic() - began >= patience_s:
                 raise Refusal(next(filter(None, found)))
             yield
+
+
+class Spares:
+    """Spares of an experiment."""
+
+    used: dict[str, str]  # names that they have taken over, by spare
+
+    def __init__(self, plan: Plan) -> None:
+        self._spares, self._arena = plan.experiment.spares, plan.experiment.arena
+        self.used = {}
+
+    def successor(self, name: str, robot: RobotTable, order: messages.RunOrder) -> tuple[RobotTable, str | None]:
+        """The robot with the name `name` from now on, and the name of the spare, if it is one."""
+        spare = order.spare
+        if spare is None and order.body is None:
+            spare = self._first_spare(name, robot.kind)
+        if spare is not None and order.body is not None:
+            raise Refusal("a spare has a body of its own: leave --body or --with out")
+        made = self._of_spare(spare, name, robot) if spare is not None else self._of_body(order.body or "", robot)
+        if WORLD in (robot.body, made.body) and robot.body != made.body:
+            raise Refusal("a robot cannot go into the world, or out of it, in mid-run")
+        if order.at is not None:
+            made = self._put(made, order.at, order.yaw)
+        return made, spare
+
+    def _first_spare(self, name: str, kind: str) -> str:
+        for spare, robot in self._spares.items():
+            if robot.kind == kind and spare not in self.used:
+                return spare
+        raise Refusal(
+            f"the file has no spare {kind} left for {name}: say which body takes over, --body URI, or add [spares.NAME]"
+        )
+
+    def _of_spare(self, spare: str, name: str, robot: RobotTable) -> RobotTable:
+        spares = self._spares
+        if spare not in spares:
+            there = did_you_mean(spare[:50], spares) if spares else "the file has none"
+            raise Refusal(f"no spare '{spare[:50]}'; {there}")
+        if spare in self.used:
+            raise Refusal(f"{spare} has taken over {self.used[spare]} already")
+        if spares[spare].kind != robot.kind:
+            raise Refusal(f"{spare} is a {spares[spare].kind} and cannot be {name}, a {robot.kind}")
+        brought = {field: getattr(spares[spare], field) for field in OF_BODY}
+        return msgspec.structs.replace(robot, **brought, process=None, shadow=None)
+
+    @staticmethod
+    def _of_body(body: str, robot: RobotTable) -> RobotTable:
+        word, known = registry.body_name(body), registry.names(registry.BODIES)
+        if word in registry.names(registry.DEVICES):
+            raise Refusal(f"{word} needs a simulated device, which is started before the run only")
+        if word not in known:
+            raise Refusal(f"no {word[:50]!r} among the bodies; {did_you_mean(word[:50], known)}")
+        device = robot.device if word == registry.body_name(robot.body) else {}
+        return msgspec.structs.replace(robot, body=body, device=device, process=None, shadow=None)
+
+    def _put(self, robot: RobotTable, at: tuple[float, float], yaw: float) -> RobotTable:
+        if robot.body != TWIN:
+            raise Refusal("only a twin can be put somewhere: put the robot there yourself, and leave --at out")
+        half = [size / 2 for size in self._arena.size[:2]]
+        if not math.isfinite(yaw) or not all(abs(x) <= limit for x, limit in zip(at, half, strict=True)):
+            raise Refusal(f"--at lies outside of the arena, ±{half[0]:g} by ±{half[1]:g} m")
+        return msgspec.structs.replace(robot, start=[*at, yaw])
+
+
+def in_the_way(
+    name: str,
+    place: Sequence[float],
+    robots: Mapping[str, RobotTable],
+    views: Mapping[str, RobotView],
+    *,
+    body_stays: bool,
+) -> str:
+    """Refusal of `place`, x, y [m], for the robot `name` to begin there, whatever its height; empty if it is free.
+
+    `body_stays`: the body that had this name lies in the way as any other.
+    """
+    radius = KINDS[robots[name].kind].radius
+    for other, known in views.items():
+        vanished = robots[other].body == TWIN and not known.alive  # it was a part of its process
+        if known.place is None or vanished or (other == name and (known.alive or not body_stays)):
+            continue
+        gap = math.dist(known.place[:2], place[:2]) - radius - KINDS[robots[other].kind].radius
+        if gap < MARGIN_M:
+            x, y = place[:2]
+            return (
+                f"{name} would begin at ({x:.2f}, {y:.2f}) m, {max(gap, 0.0):.2f} m from {other}: it needs "
+                f"{MARGIN_M:g} m around it; move one of them, or wait"
+            )
+    return ""

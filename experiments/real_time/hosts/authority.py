@@ -97,12 +97,7 @@ def issue(folder: Path, identities: Mapping[str, Role], *, hosts: Sequence[str] 
 
 
 def renew(
-    folder: Path,
-    names: Sequence[str] = (),
-    *,
-    hosts: Sequence[str] = (),
-    days: float = DAYS,
-    authority: bool = False,
+    folder: Path, names: Sequence[str] = (), *, hosts: Sequence[str] = (), days: float = DAYS, authority: bool = False
 ) -> Register:
     """Make new keys and certificates on the same names; those before stay valid until they end.
 
@@ -129,16 +124,11 @@ def revoke(folder: Path, names: Sequence[str], *, days: float = DAYS) -> Registe
     Raises LabError if there is no such identity, or the authority's key is not on this machine.
     """
     known = register(folder)
-    moved = {
-        name: msgspec.structs.replace(identity, common_name=_next_steps(name, identity.common_name))
-        for name, identity in _named(known, names).items()
-    }
+    moved = {}
+    for name, identity in _named(known, names).items():
+        number = 1 if identity.common_name == name else int(identity.common_name.removeprefix(f"{name}."))
+        moved[name] = msgspec.structs.replace(identity, common_name=f"{name}.{number + 1}")
     return _issued(_opened(folder), known, moved, days=days)
-
-
-def _next_steps(name: str, common_name: str) -> str:
-    number = int(common_name.removeprefix(f"{name}.")) if common_name != name else 1
-    return f"{name}.{number + 1}"
 
 
 def _named(known: Register, names: Iterable[str]) -> dict[str, Identity]:
@@ -178,12 +168,7 @@ def _opened(folder: Path) -> Authority:
 
 
 def _issued(
-    authority: Authority,
-    known: Register,
-    identities: Mapping[str, Identity],
-    *,
-    hosts: Sequence[str] = (),
-    days: float,
+    authority: Authority, known: Register, identities: Mapping[str, Identity], *, hosts: Sequence[str] = (), days: float
 ) -> Register:
     """Write a key and a certificate for each identity, and last the register, which makes them count."""
     for name in identities:
@@ -230,17 +215,9 @@ def _builder(
     signs: bool,
 ) -> x509.CertificateBuilder:
     """A certificate of the authority itself, which `signs` others, or of an identity."""
-    usage = x509.KeyUsage(
-        digital_signature=not signs,
-        key_cert_sign=signs,
-        crl_sign=signs,
-        content_commitment=False,
-        key_encipherment=False,
-        data_encipherment=False,
-        key_agreement=False,
-        encipher_only=False,
-        decipher_only=False,
-    )
+    others = ("content_commitment", "key_encipherment", "data_encipherment", "key_agreement")
+    unused = dict.fromkeys((*others, "encipher_only", "decipher_only"), False)
+    usage = x509.KeyUsage(digital_signature=not signs, key_cert_sign=signs, crl_sign=signs, **unused)
     return (
         x509.CertificateBuilder()
         .subject_name(subject)
@@ -268,9 +245,8 @@ def _alternative(host: str) -> x509.GeneralName:
 def _write_pair(place: Path, key: ec.EllipticCurvePrivateKey, certificate: x509.Certificate) -> None:
     """Write a key and its certificate."""
     pem, plain = serialization.Encoding.PEM, serialization.NoEncryption()
-    _write(
-        place.with_name(f"{place.name}.key"), key.private_bytes(pem, serialization.PrivateFormat.PKCS8, plain), 0o600
-    )
+    secret = key.private_bytes(pem, serialization.PrivateFormat.PKCS8, plain)
+    _write(place.with_name(f"{place.name}.key"), secret, 0o600)
     _write(place.with_name(f"{place.name}.pem"), certificate.public_bytes(pem), 0o644)
 
 

@@ -3,6 +3,10 @@
 Each host has one connection to a `./zenpark station`, which tells its version and its clock, and carries the hosts' way
 to a router that listens on loopback only. Each robot's process has a connection of its own: what it prints, its exit
 code and its lifeline are those of the `ssh` here.
+
+Clocks are measured before a run and every second in it: a host that drifts by 50 ppm is 0.18 s off after an hour. The
+robots' processes get their new correction on their lifelines (`agents.clock`), which only the launcher holds; no
+network of the experiment is needed. A correction moves only as far as a measurement proves that it is off.
 """
 
 from __future__ import annotations
@@ -12,15 +16,16 @@ import secrets
 import select
 import shutil
 import subprocess
+import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
-from typing import Final
+from typing import Final, Self
 
 import msgspec
 
 from agents import clock
-from agents.clock import Clock
+from agents.clock import STEP_S, Clock
 from agents.errors import ExplainedError
 from agents.network import lab
 from agents.network.endpoints import Endpoint
@@ -34,7 +39,9 @@ from experiments.recording import clocks, version
 
 HELLO_S: Final = 60.0  # the first start of a zenpark that was changed brings its packages up to date
 ANSWER_S: Final = 5.0
-SAMPLES: Final = 24
+SAMPLES: Final = 24  # of a clock, before a run,
+DRIFT_SAMPLES: Final = 8  # and in it, with this period:
+DRIFT_S: Final = 1.0  # NTP slews a clock by at most 500 ppm: 0.5 ms
 HANDSHAKES: Final = 6  # at once with one machine: sshd refuses some of more than ten (MaxStartups)
 POLL_S: Final = 0.02
 STATION: Final = "host@"  # prefix of the process of the connection to a host: no name of a case has this sign
@@ -208,7 +215,8 @@ class Station:
         return self.host.lab.removeprefix("~/")
 
     def start(self, name: str, robots: Sequence[str], document: bytes) -> Process:
-        while len(self._under_way()) >= HANDSHAKES:
+        deadline = time.monotonic() + HELLO_S
+        while self._connecting() >= HANDSHAKES and time.monotonic() < deadline:
             time.sleep(POLL_S)
         connect = [part for endpoint in self.endpoints for part in ("--connect", endpoint)]
         connect += [] if self.lab is None else ["--lab", self.folder]
@@ -219,10 +227,10 @@ class Station:
         self._robots.append(process)
         return process
 
-    def _under_way(self) -> list[Process]:
-        """Processes with an ssh that has not connected yet: the other end prints a line at once."""
+    def _connecting(self) -> int:
+        """Number of processes with an ssh that has not connected yet: the other end prints a line at once."""
         self._starting = [each for each in self._starting if each.alive and not each.output]
-        return self._starting
+        return len(self._starting)
 
 
 class Hosts:
@@ -252,7 +260,10 @@ class Hosts:
             try:
                 station.greet(plan.experiment.network.address)
                 if not station.same_version:
-                    trouble.append(_other_version(station))
+                    digits = version.DIGEST_CHARACTERS
+                    codes = f"{station.hello.zenpark[:digits]}, here {version.digest()[:digits]}"
+                    remedy = "`./zenpark hosts install FILE` puts this one there"
+                    trouble.append(f"{station.name}: another zenpark is there ({codes}); {remedy}")
                 else:
                     trouble += station.distrusted(station.host.robots)
                     if len(station.host.robots) > 1:
@@ -284,7 +295,69 @@ class Hosts:
         return killed
 
 
-def _other_version(station: Station) -> str:
-    there, here = station.hello.zenpark[: version.DIGEST_CHARACTERS], version.digest()[: version.DIGEST_CHARACTERS]
-    remedy = "`./zenpark hosts install FILE` puts this one there"
-    return f"{station.name}: another zenpark is there ({there}, here {here}); {remedy}"
+def applied(now: HostClock, before: float) -> float:
+    """Correction of stamps from now on [s]: `before`, moved only by the error that the measurement proves."""
+    return min(max(before, now.offset - now.uncertainty), now.offset + now.uncertainty)
+
+
+class Drift:
+    """Measures and corrects the clocks of some hosts in a thread of its own, for an answer may take long."""
+
+    def __init__(self, hosts: Iterable[Station], period_s: float = DRIFT_S) -> None:
+        """`hosts` were measured once already."""
+        self._hosts, self._period_s = list(hosts), period_s
+        self._over = threading.Event()
+        self._measured: list[HostClock] = []
+        self._trouble: list[str] = []
+        self._lock = threading.Lock()
+        self._thread = threading.Thread(target=self._run, name="drift", daemon=True)
+
+    def __enter__(self) -> Self:
+        if self._hosts:
+            self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End it; a second call does nothing."""
+        self._over.set()
+        if self._thread.is_alive():
+            self._thread.join()
+
+    def news(self) -> tuple[list[HostClock], list[str]]:
+        """Measurements since the last call, and the reasons of those that failed or were not applied."""
+        with self._lock:
+            found = self._measured, self._trouble
+            self._measured, self._trouble = [], []
+        return found
+
+    def _run(self) -> None:
+        while self._hosts and not self._over.wait(self._period_s):
+            for host in list(self._hosts):
+                if self._over.is_set():  # the end does not wait for hosts, each of which may be silent
+                    return
+                try:
+                    self._measure(host)
+                except HostError as error:
+                    self._hosts.remove(host)
+                    with self._lock:
+                        self._trouble.append(f"{error}; its clock is not corrected any more")
+
+    def _measure(self, host: Station) -> None:
+        """Measure one clock and correct its robots."""
+        before = host.clock
+        assert before is not None
+        assert before.applied is not None
+        now = host.measure(DRIFT_SAMPLES)
+        step, last = (applied(each, before.applied) - before.applied for each in (now, before))
+        if abs(step) <= STEP_S:
+            now = host.correct(before.applied + step)
+        with self._lock:
+            self._measured.append(now)
+            if abs(last) <= STEP_S < abs(step):
+                self._trouble.append(
+                    f"{host.name}: its clock jumped by {step:+.3f} s, which is no drift and is not "
+                    "corrected: was it suspended? Start the run again"
+                )

@@ -21,7 +21,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import inf
 from pathlib import Path
-from types import TracebackType
 from typing import IO, Final, Self
 
 from agents.clock import Clock
@@ -41,13 +40,11 @@ class Process:
 
     name: str
     handle: subprocess.Popen[bytes] | Forked
+    lifeline: IO[bytes]  # its standard input
     log: Path  # begins with the output of processes of this name before it
-    begins: int = 0  # [bytes] where its own output begins there
+    begins: int  # [bytes] where its own output begins there
+    shown: int  # [bytes] end of what `news` has returned
     unsent: bytearray = field(default_factory=bytearray)  # input that its pipe has not taken yet
-    shown: int = 0  # [bytes] end of what `news` has returned
-
-    def __post_init__(self) -> None:
-        self.shown = self.begins
 
     @property
     def alive(self) -> bool:
@@ -89,9 +86,31 @@ class Process:
         """Last output line with a leading colon, for messages; may be empty."""
         return "".join(f": {line}" for line in self.tail().strip().splitlines()[-1:])
 
+    def write(self) -> None:
+        """Write as much of the input as fits into the pipe: the reader may be slow."""
+        with contextlib.suppress(OSError, ValueError):  # dead, or frozen with a full pipe
+            while self.unsent:
+                del self.unsent[: os.write(self.lifeline.fileno(), self.unsent)]
+
+    def close(self) -> None:
+        """Cut the lifeline."""
+        with contextlib.suppress(OSError):
+            self.lifeline.close()
+
+    def forget(self) -> None:
+        """Close the pipe of its answers, once it is over."""
+        if self.handle.stdout is not None:
+            self.handle.stdout.close()
+
+    def signal(self, number: signal.Signals) -> None:
+        """Send a signal to the process while it runs, and to all that it has started."""
+        if self.alive:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(self.handle.pid, number)
+
 
 def is_router(process: str) -> bool:
-    return process.removeprefix(ROUTER).isdecimal() if process != ROUTER else True
+    return process == ROUTER or process.removeprefix(ROUTER).isdecimal()
 
 
 class Launcher:
@@ -115,9 +134,7 @@ class Launcher:
         self._beat.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.end([name for name in self._processes if not is_router(name)], grace_s=LAND_S)
         self.end(list(self._processes), grace_s=0.0)  # all robots are down: no router is needed any more
         self._forget_zygote()
@@ -188,10 +205,10 @@ class Launcher:
             handle = start(output)
         assert handle.stdin is not None
         os.set_blocking(handle.stdin.fileno(), False)  # a stopped process must not stop the heartbeat of the others
-        process = Process(name, handle, log, begins, bytearray(first_input))
+        process = Process(name, handle, handle.stdin, log, begins, begins, bytearray(first_input))
         with self._lock:
             self._processes[name] = process
-            self._write(process)
+            process.write()
         return process
 
     def send_line(self, process: Process, line: bytes) -> None:
@@ -199,7 +216,7 @@ class Launcher:
         with self._lock:
             if not process.unsent:
                 process.unsent += line
-                self._write(process)
+                process.write()
 
     def get(self, name: str) -> Process:
         return self._processes[name]
@@ -212,13 +229,13 @@ class Launcher:
         """Cut the lifeline of a process: robots land by themselves, then it ends, which `died` reports."""
         with self._lock:
             if name in self._processes:
-                self._close(self._processes[name])
+                self._processes[name].close()
 
     def kill(self, name: str) -> None:
         """End a process that ignores its lifeline, at once; `died` reports its end."""
         with self._lock:
             if name in self._processes:
-                self._signal(self._processes[name], signal.SIGKILL)
+                self._processes[name].signal(signal.SIGKILL)
 
     def died(self) -> list[Process]:
         """Processes that have ended by themselves since the last call; they are forgotten."""
@@ -227,8 +244,8 @@ class Launcher:
             for process in dead:
                 del self._processes[process.name]
         for process in dead:
-            self._close(process)
-            self._forget(process)
+            process.close()
+            process.forget()
         return dead
 
     def end(self, names: Iterable[str], grace_s: float) -> list[Process]:
@@ -236,16 +253,16 @@ class Launcher:
         with self._lock:
             ending = [self._processes.pop(name) for name in names if name in self._processes]
         for process in ending:
-            self._close(process)
+            process.close()
         self._wait(ending, grace_s)
         stubborn: list[Process] = []
         for number, wait_s in ((signal.SIGTERM, 2.0), (signal.SIGKILL, 2.0)):
             stubborn = [process for process in ending if process.alive]
             for process in stubborn:
-                self._signal(process, number)
+                process.signal(number)
             self._wait(stubborn, wait_s)
         for process in ending:
-            self._forget(process)
+            process.forget()
         return [each for each in ending if each in stubborn or each.handle.returncode == -signal.SIGKILL]
 
     def _forget_zygote(self) -> None:
@@ -254,30 +271,11 @@ class Launcher:
             self._zygote = None
 
     @staticmethod
-    def _signal(process: Process, number: signal.Signals) -> None:
-        """Send a signal to a process that runs, and to all that it has started."""
-        if process.alive:
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(process.handle.pid, number)
-
-    @staticmethod
     def _wait(processes: Sequence[Process], limit_s: float) -> None:
         deadline = time.monotonic() + limit_s
         for process in processes:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.handle.wait(max(0.0, deadline - time.monotonic()))
-
-    @staticmethod
-    def _close(process: Process) -> None:
-        if process.handle.stdin is not None:
-            with contextlib.suppress(OSError):
-                process.handle.stdin.close()
-
-    @staticmethod
-    def _forget(process: Process) -> None:
-        """Close the pipe of its answers, once it is over."""
-        if process.handle.stdout is not None:
-            process.handle.stdout.close()
 
     @property
     def last_silence(self) -> float:
@@ -291,15 +289,7 @@ class Launcher:
             with self._lock:
                 for process in self._processes.values():
                     process.unsent += b"" if process.unsent else b"\n"
-                    self._write(process)
-
-    @staticmethod
-    def _write(process: Process) -> None:
-        """Write as much as fits into the pipe: the reader may be slow."""
-        if process.handle.stdin is not None:
-            with contextlib.suppress(OSError, ValueError):  # dead, or frozen with a full pipe
-                while process.unsent:
-                    del process.unsent[: os.write(process.handle.stdin.fileno(), process.unsent)]
+                    process.write()
 
 
 def _fork(request: zygote.Request, path: Path, log: IO[bytes]) -> Forked:

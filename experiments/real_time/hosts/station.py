@@ -72,21 +72,9 @@ class Answer(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 def answer(question: Question, clock: float) -> Answer:
-    code = version.digest()
+    code, found = version.digest(), list[HostCheck]()
     match question.ask:
-        case "clock" | "preload":
-            return Answer(code, clock)
-        case "reach":
-            return Answer(code, clock, found=[_reach(endpoint, question) for endpoint in question.endpoints])
-        case "certificates":
-            return Answer(code, clock, content=certificates.read_folder(Path(question.lab or "."), question.names))
-        case "devices":
-            return Answer(code, clock, found=list(devices(question.bodies)))
-        case "sweep":
-            return Answer(
-                code, clock, found=[HostCheck(str(pid), False, "was killed") for pid in kill(_other_processes())]
-            )
-        case _:
+        case "hello":
             return Answer(
                 code,
                 clock,
@@ -95,6 +83,15 @@ def answer(question: Question, clock: float) -> Answer:
                 machine=f"{socket.gethostname()} ({platform.system()} {platform.machine()})",
                 seen_from=os.environ.get("SSH_CONNECTION", "").partition(" ")[0],
             )
+        case "certificates":
+            return Answer(code, clock, content=certificates.read_folder(Path(question.lab or "."), question.names))
+        case "reach":
+            found = [_reach(endpoint, question) for endpoint in question.endpoints]
+        case "devices":
+            found = list(devices(question.bodies))
+        case "sweep":
+            found = [HostCheck(str(pid), False, "was killed") for pid in kill(_other_processes())]
+    return Answer(code, clock, found=found)
 
 
 def _reach(endpoint: str, question: Question) -> HostCheck:
@@ -114,12 +111,8 @@ def devices(bodies: Sequence[str]) -> Iterator[HostCheck]:
     for library in sorted(filter(None, {missing_library(word) for word in words})):
         yield HostCheck(library, False, "is missing: `./zenpark hardware` there adds it")
     if words & {"radio", "usb"}:
-        radios = list(_radios())
-        yield from radios or [
-            HostCheck(
-                "Crazyradio", False, "none is plugged in: plug one in there, or let its robots run on another host"
-            )
-        ]
+        none = "none is plugged in: plug one in there, or let its robots run on another host"
+        yield from list(_radios()) or [HostCheck("Crazyradio", False, none)]
     for port in sorted({match[0] for body in bodies if (match := re.search(r"/dev/[\w./-]+", body))}):
         if not Path(port).exists():
             yield HostCheck(port, False, "is not there: is it plugged in?")

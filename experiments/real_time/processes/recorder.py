@@ -162,14 +162,7 @@ def record(launch: RecorderLaunch) -> int:
     with (
         joined(plan, endpoints, name="recorder", stop=asked, on_signal=asked.set, lost=lost) as joint,
         Recording(
-            target,
-            plan,
-            text,
-            case=launch.name,
-            seed=seed,
-            clock="real",
-            draw=markers.drawing(plan),
-            utc=Clock().utc,
+            target, plan, text, case=launch.name, seed=seed, clock="real", draw=markers.drawing(plan), utc=Clock().utc
         ) as recording,
     ):
         recorder = Recorder(joint.session, joint.keys, recording)

@@ -34,10 +34,9 @@ from agents.network.shutdown import end
 from agents.plugins import registry
 from agents.runtime import command_line
 from agents.runtime.lifeline import FAR_SILENCE_S, SILENCE_S
-from agents.runtime.loop import Ranging, Runtime, Setup
+from agents.runtime.loop import Runtime, Setup
 from experiments.definition import bodies, mesh
 from experiments.definition.endpoints import router_endpoints
-from experiments.definition.experiment import RobotTable
 from experiments.definition.link_conditions import FROM_CENTRE, Ends, conditions_of
 from experiments.definition.plan import Plan
 from experiments.file import document
@@ -96,7 +95,7 @@ def _run(plan: Plan, launch: RobotLaunch, endpoints: Sequence[str]) -> int:
     endpoints = mesh.neighbour_endpoints(plan, names, endpoints)
     request = replace(bodies.body_request(plan, names, experiment.seed, endpoints), clock=clock)
     body = shadowed(assemble(request), request, bodies.shadow_periods(plan, names))
-    assignments = [plan.assignment(name) for name in names]
+    assignments, robots = [plan.assignment(name) for name in names], [experiment.robots[name] for name in names]
     setup = Setup(
         keys=Keys(experiment.network.realm),
         endpoints=endpoints,
@@ -104,9 +103,10 @@ def _run(plan: Plan, launch: RobotLaunch, endpoints: Sequence[str]) -> int:
         state_hz=experiment.rates.state_hz,
         lifeline=launch.lifeline,
         lifeline_s=FAR_SILENCE_S if launch.file == STDIN else SILENCE_S,
-        externally_measured=[experiment.robots[name].position == "external" for name in names],
+        externally_measured=[robot.position == "external" for robot in robots],
         exact=[name not in plan.externally_measured for name in names],
-        ranging=[_ranging(experiment.robots[name]) for name in names],
+        # bodies in other processes receive their range readings by themselves
+        ranging=["remote" if registry.body_name(robot.body) in REMOTE_BODIES else robot.ranges for robot in robots],
         conditions=[
             _conditions(plan, [(link.name, name) for link in each.neighbours])
             for name, each in zip(names, assignments, strict=True)
@@ -142,13 +142,6 @@ def read_experiment() -> str:
             break
     hint = "a robot with FILE - reads the experiment there, as JSON in one line"
     raise refusal("standard input", f"no experiment came within {EXPERIMENT_S:g} s", hint)
-
-
-def _ranging(robot: RobotTable) -> Ranging:
-    """Source of the range readings of a robot: bodies in other processes receive them by themselves."""
-    if registry.body_name(robot.body) in REMOTE_BODIES:
-        return "remote"
-    return robot.ranges
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

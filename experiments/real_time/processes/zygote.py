@@ -193,9 +193,8 @@ class Zygote:
     def __init__(self, listener: socket.socket, lifeline: int = 0) -> None:
         self._listener, self._lifeline = listener, lifeline
         self._path = Path(listener.getsockname())
-        self._children: dict[
-            int, tuple[int, socket.socket]
-        ] = {}  # by pidfd: id, and the socket that gets the exit code
+        # by pidfd: id, and the socket that gets the exit code
+        self._children: dict[int, tuple[int, socket.socket]] = {}
         self._waiting = select.poll()
 
     def serve(self) -> Request | None:

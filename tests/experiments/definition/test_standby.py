@@ -25,7 +25,7 @@ from experiments.definition.experiment import (
 from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.file.consistency.whole import consistency_faults
-from experiments.real_time.conductor.replacement import Spares
+from experiments.real_time.conductor.hot_changes import Spares
 from tests.small import changed, small
 
 BOT = RobotTable(kind="khepera4", start=[0.0, 0.0])

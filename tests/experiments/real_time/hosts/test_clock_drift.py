@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from agents.clock import STEP_S, Clock, correction_line
 from agents.network.messages import HostClock
-from experiments.real_time.hosts import clock_drift
+from experiments.real_time.hosts import hosts
 from experiments.real_time.hosts.hosts import HostError
 from experiments.recording.clocks import Correction
 from tests.waiting import PATIENCE_S, until
@@ -24,12 +24,12 @@ def simulated(ppm, seconds, *, follows):
     true = np.arange(round(seconds / DT)) * DT
     offset = 0.2 + ppm * 1e-6 * true
     before = HostClock("lab2", 0.0, 0.2, UNCERTAINTY_S, ["CF01"], 0.2)
-    clock, measured, left, due = Clock(-0.2), [before], [], clock_drift.PERIOD_S
+    clock, measured, left, due = Clock(-0.2), [before], [], hosts.DRIFT_S
     for t, lies in zip(true, offset, strict=True):
         if t >= due:
             now = HostClock("lab2", t, lies + rng.uniform(-1, 1) * UNCERTAINTY_S, UNCERTAINTY_S, ["CF01"])
-            due = t + clock_drift.PERIOD_S
-            wanted = clock_drift.applied(now, measured[-1].applied) if follows else 0.2
+            due = t + hosts.DRIFT_S
+            wanted = hosts.applied(now, measured[-1].applied) if follows else 0.2
             clock.follow(correction_line(-wanted).strip())
             measured.append(HostClock("lab2", t, now.offset, UNCERTAINTY_S, ["CF01"], wanted))
         clock.slew(DT)
@@ -55,7 +55,7 @@ def test_remaining_drift_stays_small_whatever_the_runs_length(ppm, most):
 
 @given(st.floats(-1.0, 1.0), st.floats(0.0, 0.1), st.floats(-1.0, 1.0))
 def test_a_measurement_never_makes_it_worse(offset, uncertainty, before):
-    now = clock_drift.applied(HostClock("lab2", 1.0, offset, uncertainty, []), before)
+    now = hosts.applied(HostClock("lab2", 1.0, offset, uncertainty, []), before)
     for true in np.linspace(offset - uncertainty, offset + uncertainty, 5):
         assert abs(now - true) <= abs(before - true) + 1e-12
 
@@ -88,7 +88,7 @@ def test_robots_are_told_drift_and_no_jump():
             every.extend(more)
         return len(trouble) >= 2
 
-    with clock_drift.Drift([host], 0.01) as following:
+    with hosts.Drift([host], 0.01) as following:
         until(followed, "a jump and silence are noticed")
     assert host.told == pytest.approx([0.21 - UNCERTAINTY_S, 0.22 - UNCERTAINTY_S])
     assert [each.offset for each in measured] == pytest.approx([0.21, 0.21 + 2 * STEP_S, 0.22])
@@ -105,7 +105,7 @@ def test_end_waits_only_for_the_host_being_asked():
             ending.wait(PATIENCE_S)
             return super().measure(samples)
 
-    with clock_drift.Drift([Silent([]), Silent([]), Silent([])], 0.01) as following:
+    with hosts.Drift([Silent([]), Silent([]), Silent([])], 0.01) as following:
         until(lambda: asked, "the first is asked")
         closing = threading.Thread(target=following.close)
         closing.start()
@@ -116,5 +116,5 @@ def test_end_waits_only_for_the_host_being_asked():
 
 
 def test_nobody_abroad_nothing_to_follow():
-    with clock_drift.Drift([]) as following:
+    with hosts.Drift([]) as following:
         assert following.news() == ([], [])
