@@ -1,9 +1,19 @@
-"""Many small cases in one test, all of whose failures are told at once: a test of its own costs more than its check."""
+"""Tables of cases: in one test, whose failures are all told at once, or as tests of which --quick runs some."""
 
 from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterable
+
+import pytest
+
+
+def mostly_slow(cases: Iterable[object], every: int) -> list[object]:
+    """Parameters of `pytest.mark.parametrize`: --quick runs the first one, and of those behind it one in `every`."""
+    return [
+        case if k % every == 0 else pytest.param(*(case if isinstance(case, tuple) else [case]), marks=pytest.mark.slow)
+        for k, case in enumerate(cases)
+    ]
 
 
 def for_each(names: str, cases: Iterable[object]) -> Callable[[Callable[..., None]], Callable[..., None]]:

@@ -75,14 +75,15 @@ def imports() -> dict[str, set[str]]:
 
 
 @cache
-def importing(file: Path) -> list[ast.Import | ast.ImportFrom]:
-    """Statements of a file that import, wherever they stand."""
-    nodes = ast.walk(ast.parse(file.read_text("utf-8")))
-    return [node for node in nodes if isinstance(node, ast.Import | ast.ImportFrom)]
+def statements(file: Path) -> tuple[list[ast.Import | ast.ImportFrom], list[str]]:
+    """Statements of a file that import, and names of its classes, wherever they stand."""
+    nodes = list(ast.walk(ast.parse(file.read_text("utf-8"))))
+    imports = [node for node in nodes if isinstance(node, ast.Import | ast.ImportFrom)]
+    return imports, [node.name for node in nodes if isinstance(node, ast.ClassDef)]
 
 
 def imported(file: Path) -> Iterator[str]:
-    for node in importing(file):
+    for node in statements(file)[0]:
         if isinstance(node, ast.ImportFrom) and node.module:
             for alias in node.names:
                 inner = f"{node.module}.{alias.name}"
@@ -105,9 +106,8 @@ def floor_of(entry: str) -> int:
 def test_names_of_classes_stand_once():
     places: dict[str, list[str]] = {}
     for module, file in modules().items():
-        for node in ast.walk(ast.parse(file.read_text("utf-8"))):
-            if isinstance(node, ast.ClassDef):
-                places.setdefault(node.name, []).append(module)
+        for name in statements(file)[1]:
+            places.setdefault(name, []).append(module)
     assert {name: where for name, where in places.items() if len(where) > 1} == {}
 
 
@@ -130,7 +130,7 @@ def test_no_circle():
 
 def outside(file: Path) -> set[str]:
     """Packages that a module imports, wherever that stands."""
-    return packages(importing(file))
+    return packages(statements(file)[0])
 
 
 def packages(nodes: Iterable[ast.AST]) -> set[str]:
@@ -227,7 +227,7 @@ def calling(call: str) -> set[str]:
 
 
 def sees_experiments(name: str) -> bool:
-    froms = [node for node in importing(modules()[name]) if isinstance(node, ast.ImportFrom)]
+    froms = [node for node in statements(modules()[name])[0] if isinstance(node, ast.ImportFrom)]
     words = {alias.name for node in froms if node.module == "experiments.definition.experiment" for alias in node.names}
     return "Experiment" in words
 

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import ast
-import io
 import re
-import tokenize
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -22,6 +20,7 @@ PHRASES = re.compile(
 )
 FIRST = re.compile(r"\A(?:It|Its|They|Their|Who|What|Which|Whose|This|That|These|Those|He|She|We|You|There|How|Why)\b")
 FENCE = re.compile(r"^ *(```|~~~).*?^ *\1|^(?: {4,}[^\n]*\n)+", re.MULTILINE | re.DOTALL)
+COMMENT = re.compile(r"(?:^|(?<=\s))#.*")  # in a text of several lines, what looks like one as well
 ITEM = re.compile(r"\n\s*\n|\n(?=\s*(?:[-*|>#]|\d+\.|`?\w[\w., ]*`?:) )")
 ASIDE = re.compile(r" ?\([^()]*\)|(?<=\])\([^()]*\)")
 WORD = re.compile(r"\b(?:[^\W\d_]{2,}|a)\b")
@@ -46,9 +45,9 @@ def texts(file: Path) -> Iterator[tuple[int, str, bool]]:
             and " " in node.value
         ):
             yield node.lineno, node.value, False
-    for token in tokenize.generate_tokens(io.StringIO(source).readline):
-        if token.type == tokenize.COMMENT:
-            yield token.start[0], token.string, False
+    for number, line in enumerate(source.splitlines(), 1):
+        if comment := COMMENT.search(line):
+            yield number, comment[0], False
 
 
 def sentences(text: str) -> Iterator[str]:

@@ -117,7 +117,7 @@ def around(plan: Plan, low: Array, high: Array) -> tuple[Array, Array]:
 
 
 def legend(plans: Sequence[Plan], *, space: bool = False) -> dict[str, Artist]:
-    """What stands in the arenas, by its label, from above or in space; nothing for empty ones."""
+    """Artists of the obstacles in arenas, by their labels, from above or in space."""
     found: dict[str, Artist] = {}
     for arena in (plan.experiment.arena for plan in plans):
         for obstacle in arena.obstacles.values():

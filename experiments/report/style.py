@@ -217,7 +217,7 @@ def spread_texts(axes: Axes) -> None:
 
 
 def labelled(axes: Axes) -> dict[str, Any]:
-    """What is drawn in a panel with a label, for its legend."""
+    """Labelled artists of a panel, for its legend."""
     handles, labels = axes.get_legend_handles_labels()
     return dict(zip(labels, handles, strict=True))
 

@@ -12,6 +12,7 @@ from agents.decision.lifecycle import AIRBORNE
 from agents.plugins import registry
 from agents.robot import Robot
 from experiments.file.document import load
+from tests.cases import mostly_slow
 
 ODD = (nan, inf, -inf, 0.0, -0.0, 1e308, -1e308, 1e-308, 5e-324, 1e154, -1e154, 1e6, -1e6)
 SLOW = partial(pytest.param, marks=pytest.mark.slow)
@@ -79,7 +80,7 @@ def keeps_limits(robot: Robot) -> bool:
 
 
 @pytest.mark.parametrize("name", ["robotic-park", *map(SLOW, ["obstacle-course", "convoy", "architectures"])])
-@pytest.mark.parametrize("trigger", registry.names(registry.TRIGGERS))
+@pytest.mark.parametrize("trigger", mostly_slow(registry.names(registry.TRIGGERS), 3))
 def test_nonsense_raises_nothing(name, trigger):
     for number, given in enumerate(load(name).cases().values()):
         plan = given.changed(trigger={"kind": trigger})

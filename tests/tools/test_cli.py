@@ -9,6 +9,7 @@ import typer.main
 from typer.testing import CliRunner
 
 from agents.network.endpoints import EndpointError
+from tests.cases import mostly_slow
 from tests.commands import ROOT, environment, invoke, python
 from tools.main import app, main, part_for
 from tools.options import PANELS
@@ -49,15 +50,18 @@ def loaded(*words, program=LOADED, cwd=ROOT, **more):
 
 @pytest.mark.parametrize(
     ("words", "said", "heavy"),
-    [
-        ("--help", "Usage: zenpark ", "numpy zenoh matplotlib msgspec pymunk rich asyncio jinja2 mcap pydantic"),
-        ("list", "", "numpy matplotlib zenoh pydantic"),
-        ("list --json", "{", "numpy matplotlib zenoh pydantic"),
-        ("check --help", "Usage: zenpark check ", "numpy matplotlib zenoh pydantic"),
-        ("explain --help", "Usage: zenpark explain ", "numpy matplotlib zenoh pydantic"),
-        ("runs", "no run is up on this machine\n", "numpy matplotlib mcap"),
-        ("hosts check none.toml --lab lab --json", '{\n  "ok": false,\n  "error": "none.toml: ', "pydantic"),
-    ],
+    mostly_slow(
+        [
+            ("--help", "Usage: zenpark ", "numpy zenoh matplotlib msgspec pymunk rich asyncio jinja2 mcap pydantic"),
+            ("list", "", "numpy matplotlib zenoh pydantic"),
+            ("list --json", "{", "numpy matplotlib zenoh pydantic"),
+            ("check --help", "Usage: zenpark check ", "numpy matplotlib zenoh pydantic"),
+            ("explain --help", "Usage: zenpark explain ", "numpy matplotlib zenoh pydantic"),
+            ("runs", "no run is up on this machine\n", "numpy matplotlib mcap"),
+            ("hosts check none.toml --lab lab --json", '{\n  "ok": false,\n  "error": "none.toml: ', "pydantic"),
+        ],
+        3,
+    ),
 )
 def test_light_commands_import_no_libraries(words, said, heavy, tmp_path):
     out, modules = loaded(*words.split(), cwd=tmp_path)
@@ -212,7 +216,7 @@ def test_completion_is_right_and_light(tmp_path):
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux has a device that is always full")
-@pytest.mark.parametrize("unbuffered", ["", "1"])
+@pytest.mark.parametrize("unbuffered", mostly_slow(["", "1"], 2))
 @pytest.mark.parametrize(("output", "code"), [("> /dev/full", 2), (">&-", 0)])
 def test_output_that_goes_nowhere_makes_no_traceback(output, code, unbuffered):
     """A full disk is named; an output that the caller closed is none."""

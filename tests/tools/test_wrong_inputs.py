@@ -10,6 +10,7 @@ from experiments.check.safety import devices, libraries
 from experiments.definition.experiment import RobotTable
 from experiments.definition.plan import Plan
 from experiments.file.document import loads
+from tests.cases import mostly_slow
 from tools.main import main
 
 TRIANGLE = (Path(__file__).parents[2] / "experiments" / "catalogue" / "triangle.toml").read_text("utf-8")
@@ -141,7 +142,7 @@ def test_a_file_is_refused(part, instead, told, remedy, refuse):
     assert remedy in said
 
 
-@pytest.mark.parametrize(("command", "told", "remedy"), COMMANDS, ids=[row[0] for row in COMMANDS])
+@pytest.mark.parametrize(("command", "told", "remedy"), mostly_slow(COMMANDS, 3), ids=[row[0] for row in COMMANDS])
 def test_a_command_is_refused(command, told, remedy, refuse):
     said = refuse(*command.split())
     assert told in said

@@ -23,6 +23,7 @@ from experiments.check.motion import turning_circle
 from experiments.file.document import loads
 from experiments.file.problems import DocumentError
 from experiments.run import simulate
+from tests.cases import mostly_slow
 from twins.engines.point_mass import has_model, model
 
 NEW = (OMNI, ACKERMANN, POINT, DOUBLE_INTEGRATOR, UNICYCLE)
@@ -82,7 +83,7 @@ def following(kind, extra=""):
     return loads(extra + FOLLOW.replace("KIND", kind))
 
 
-@new
+@pytest.mark.parametrize("kind", mostly_slow(NEW, 3), ids=lambda kind: kind.name)
 def test_a_formation_follows_without_hazards(kind):
     run = simulate(following(kind.name))
     (trace,), (metrics,) = run.traces.values(), run.metrics.values()

@@ -100,7 +100,7 @@ def tick(bench):
 
 
 def lives(given, company):
-    """Traces of a robot over 3 s, while `company` robots of the same plug-ins are asked in between."""
+    """Traces of a robot over 2 s, while `company` robots of the same plug-ins are asked in between."""
     first, trace = Bench(given, PLACES["A"]), []
     others = [Bench(given, (0.1 * k, -0.1 * k, 0.0)) for k in range(company)]
 
@@ -114,7 +114,7 @@ def lives(given, company):
     assert first.life.takeoff() == "", first.life.reason
     first.step(0.02, recorded)
     assert first.robot.start(first.t) == ""
-    for _ in range(300):
+    for _ in range(200):
         first.step(0.01, recorded)
         for other in others:
             other.step(0.01, tick)
@@ -125,7 +125,7 @@ def lives(given, company):
 @pytest.mark.parametrize(("group", "name"), EVERY)
 def test_same_alone_and_in_company(group, name):
     given = assignment(group, name)
-    assert lives(given, 0) == lives(given, 3)
+    assert lives(given, 0) == lives(given, 2)
 
 
 @pytest.mark.parametrize(("group", "name"), EVERY)
@@ -225,7 +225,7 @@ def test_remembering_laws_ignore_the_order_of_arrival(name):
 def test_remembering_laws_bear_a_period_three_times_longer(name):
     given = assignment(LAWS, name)
     bench = Bench(replace(given, decide_every=3 * given.decide_every), PLACES["A"])
-    bench.running(talk).step(10.0, talk)
+    bench.running(talk).step(6.0, talk)
     stepping = bench.robot.stepping
     assert all(abs(number) < 1e6 for values in stepping.memory.values() for number in values if isfinite(number))
     assert all(map(isfinite, bench.robot.setpoint))
@@ -244,7 +244,7 @@ def test_range_readings_beyond_the_horizon_change_nothing(name, kind):
         angle = random.uniform(-pi, pi)
         return distance * cos(angle), distance * sin(angle)
 
-    for _ in range(300):
+    for _ in range(150):
         here = own(kind, (0.0, 0.0), yaw=random.uniform(-pi, pi), velocity=(*any_of(kind.speed), 0.0))
         horizon = min(kind.radius + avoidance.horizon(here), 1e3)
         close = [at(random.uniform(kind.radius, horizon)) for _ in range(3)]

@@ -24,6 +24,7 @@ from agents.safety.setpoint_filter import SetpointFilter
 from agents.vectors import clamp
 from experiments.definition.experiment import LegTable, RobotTable
 from tests.agents.swarm import Swarm
+from tests.cases import mostly_slow
 from tests.small import small
 
 DT = 0.01
@@ -217,7 +218,7 @@ def test_lost_drone_above_may_have_come_down(lost):
     assert isfinite(lower.sinks_at) != lost
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", mostly_slow(range(12), 4))
 def test_landing_drones_touch_no_robot(seed):
     """All drones land at once over and beside robots on wheels; 12 x 10 scenes on 1.4 m x 1.4 m."""
     rng, made = random.Random(seed), 0
@@ -308,7 +309,7 @@ def farthest(kind, axis, side, latency_s):
 
 @pytest.mark.parametrize(
     ("kind", "axis", "side", "latency_s"),
-    [*((*wall, 0.0) for wall in WALLS), *((kind, 0, 1.0, 0.15) for kind in KINDS)],
+    mostly_slow([*((*wall, 0.0) for wall in WALLS), *((kind, 0, 1.0, 0.15) for kind in KINDS)], 3),
 )
 def test_no_robot_gets_beyond_a_wall(kind, axis, side, latency_s):
     assert -0.1 < farthest(kind, axis, side, latency_s) < 0.001

@@ -11,6 +11,7 @@ from agents.protocols.crtp import HighLevel, MemoryKind, Port
 from bridges.crazyflie import trajectory as module
 from bridges.crazyflie.trajectory import COMPRESSED, HOLD_S, POLYNOMIALS, REPEAT_S, SINK, START_EXPIRY_S, TAKEOFFS
 from tests.bridges.crazyflie_clock import clocked
+from tests.cases import mostly_slow
 from tests.waiting import ManualClock
 from twins.devices.crazyflie.memory import Memories
 from twins.devices.crazyflie.planner import OnboardPlanners, evaluate, polynomial
@@ -73,7 +74,7 @@ def board(monkeypatch):
     return Board(monkeypatch)
 
 
-@pytest.mark.parametrize("height", [0.2, 0.8, 3.0])
+@pytest.mark.parametrize("height", mostly_slow([0.2, 0.8, 3.0], 3))
 @pytest.mark.parametrize("yaw", [0.0, 1.2])
 def test_setpoint_is_held_and_then_left_downwards(board, height, yaw):
     while not board.started:

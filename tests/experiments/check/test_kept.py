@@ -9,6 +9,7 @@ from experiments.check import kept
 from experiments.check.check import examine
 from experiments.check.kept import KeptVerdict, Verdict
 from experiments.file import document
+from tests.cases import mostly_slow
 from tests.commands import zenpark
 from tests.tools.test_cli import loaded
 
@@ -62,7 +63,7 @@ def test_verdict_is_read_again(park, tmp_path):
     assert KeptVerdict(str(park)).read() == GOOD
 
 
-@pytest.mark.parametrize("what", CHANGES)
+@pytest.mark.parametrize("what", mostly_slow(CHANGES, 4))
 def test_nothing_that_changes_keeps_its_verdict(park, tmp_path, what):
     KeptVerdict(str(park)).keep(GOOD)
     CHANGES[what](tmp_path)
@@ -130,10 +131,10 @@ def test_what_is_no_file_has_no_verdict(park, name):
 
 
 def test_old_verdicts_go(park, tmp_path):
-    for seed in range(13):
-        KeptVerdict(str(park), [f"seed={seed}"]).keep(GOOD, most=10)
-    assert len(list((tmp_path / "cache" / "check").iterdir())) == 10
-    assert KeptVerdict(str(park), ["seed=8"]).read() == GOOD
+    for seed in range(4):
+        KeptVerdict(str(park), [f"seed={seed}"]).keep(GOOD, most=3)
+    assert len(list((tmp_path / "cache" / "check").iterdir())) == 3
+    assert KeptVerdict(str(park), ["seed=2"]).read() == GOOD
 
 
 @pytest.mark.slow

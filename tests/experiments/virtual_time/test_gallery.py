@@ -82,7 +82,7 @@ def exchange(law, places, memory, rounds, *, links=(NOWHERE, NOWHERE), **facts):
     [
         ("periodic", 1e-4, ()),
         pytest.param("event", 0.015, (), marks=pytest.mark.slow),
-        ("event-loss", 0.02, ()),
+        pytest.param("event-loss", 0.02, (), marks=pytest.mark.slow),
         pytest.param("periodic", 1e-4, (CENTRALISED,), marks=pytest.mark.slow),
     ],
 )
@@ -152,7 +152,7 @@ def test_robots_fly_to_the_tasks_that_they_won(case):
         pytest.param("event", (), 0.01, marks=[pytest.mark.slow, NIGHTLY]),
         pytest.param("event-loss", (), 0.01, marks=pytest.mark.slow),
         ("periodic", (CENTRALISED,), 0.01),
-        ("periodic", (HYBRID,), 0.02),
+        pytest.param("periodic", (HYBRID,), 0.02, marks=pytest.mark.slow),
     ],
 )
 def test_consensus_meets_mean_at_the_graphs_rate(case, changes, moved):

@@ -22,6 +22,7 @@ from twins.scene import Obstacle, Scene
 
 pytest.importorskip("mujoco", reason="the engine mujoco is the extra [mujoco]: ./zenpark install mujoco-core")
 
+from tests.cases import mostly_slow
 from twins.engines.mujoco_engine import LIFT, RigidBody
 
 DT = 0.01
@@ -257,7 +258,7 @@ def test_drones_are_the_same_alone():
     assert (np.abs(together[-1, :, :3] - np.array(start)).max(axis=1) > 0.05).all()
 
 
-@pytest.mark.parametrize("dt", [0.02, 0.004, 1.0 / 64.0, 1.0 / 30.0])
+@pytest.mark.parametrize("dt", mostly_slow([0.02, 0.004, 1.0 / 64.0, 1.0 / 30.0], 4))
 def test_any_step_divides_into_firmware_rate(dt):
     path = fly(hovering(dt=dt), [[0.3, 0.0, 1.0, 0.0]], 4.0, dt)[:, 0, 0]
     rise, overshoot = rise_and_overshoot(path, 0.3, dt)
