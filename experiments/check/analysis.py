@@ -137,7 +137,7 @@ class Analysis:
 
     @cached_property
     def spare(self) -> Redundancy | None:
-        """What the formation can lose and stay rigid, of the pairs `edges(first_links)`.
+        """Pairs that the formation can lose and stay rigid, of the pairs `edges(first_links)`.
 
         None if it is not rigid, if its links ask for more than distances, or if it has too many robots.
         """
