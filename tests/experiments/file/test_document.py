@@ -84,7 +84,7 @@ def test_every_misspelt_key_is_found_in_its_line(write):
     tried = set()
     for name in index.names():
         found = list(slips(entries.path(name).read_text("utf-8")))
-        assert len(found) > 10
+        assert len(found) > 5
         for place, number, text in found:
             if place not in tried:  # the same key of the same table in another file is read by the same rules
                 tried.add(place)
