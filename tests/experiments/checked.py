@@ -13,6 +13,7 @@ from experiments.check.findings import Finding
 from experiments.definition.experiment import Arena, Experiment, Formation, RobotTable
 from experiments.definition.plan import Plan
 from experiments.file import document
+from experiments.file.cases import Source
 from experiments.file.document import Document
 from tests.small import small
 
@@ -32,7 +33,8 @@ GROUND = {
 def as_read(experiment: Experiment) -> Document:
     """As if it had been read from a file."""
     plan = Plan(experiment)
-    return Document(Path("made.json"), document.write_json(plan).decode(), plan, {"default": plan})
+    source = Source("made.json", document.write_json(plan).decode(), True)
+    return Document(Path("made.json"), source, plan, {"default": plan}, {})
 
 
 def findings(given: Document | Experiment, cases: Sequence[str] = ()) -> dict[str, Finding]:

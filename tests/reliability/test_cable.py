@@ -33,7 +33,7 @@ def laid():
         socketserver.ThreadingTCPServer(("127.0.0.1", 0), Echo) as far,
         started("-m", "tests.reliability.cable", near, far.server_address[1]) as cable,
     ):
-        threading.Thread(target=far.serve_forever, daemon=True).start()
+        threading.Thread(target=far.serve_forever, args=(0.01,), daemon=True).start()
         until(reached, "it listens")
         with ends[0] as end:
             yield cable, end

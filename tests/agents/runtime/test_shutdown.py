@@ -20,6 +20,7 @@ from agents.ticks import Ticks
 from experiments.definition.experiment import Arena
 from experiments.definition.plan import Plan
 from tests.agents.runtime.process import DRONE, QUICK, Airborne, process
+from tests.cases import mostly_slow
 from tests.fuzz.messages import sent
 from tests.network import Net
 from tests.small import small
@@ -39,7 +40,9 @@ def run_and_break(body: Airborne, **given: Any) -> None:
         run_to_end(body, **given)
 
 
-@pytest.mark.parametrize("broken", [(), ("read",), ("land",), ("stop",), ("close",), ("read", "land", "stop", "close")])
+@pytest.mark.parametrize(
+    "broken", mostly_slow([[], ["read"], ["land"], ["stop"], ["close"], ["read", "land", "stop", "close"]], 5)
+)
 def test_shutdown_tries_everything_and_raises(broken):
     body = Airborne(*broken)
     with pytest.raises(OSError, match="fails" if broken else "the loop breaks") as error:

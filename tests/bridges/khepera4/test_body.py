@@ -26,6 +26,7 @@ from bridges.khepera4.body import OPEN_S, KheperaBody
 from bridges.khepera4.link import Khepera4Link, KheperaAddress, KheperaOdometry
 from bridges.khepera4.odometry import Odometer
 from tests.bridges.driver import Driver, constant, toward
+from tests.cases import mostly_slow
 from tests.requests import request
 from tests.twins.loopback import Served, reached
 from tests.waiting import until
@@ -155,7 +156,7 @@ def test_address_and_table_must_not_contradict_one_another(address, device):
             KheperaBody(request("khepera4", [address], device=device)).open()
 
 
-@pytest.mark.parametrize("failure", [AssertionError, MemoryError, UnicodeError, StopIteration])
+@pytest.mark.parametrize("failure", mostly_slow([AssertionError, MemoryError, UnicodeError, StopIteration], 4))
 def test_link_outlives_failures_of_any_kind(failure):
     tried = []
 

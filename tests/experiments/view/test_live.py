@@ -21,6 +21,7 @@ from experiments.view.acting import WatchedRun, may_act, parameters
 from experiments.view.broadcast import Broadcast
 from experiments.view.heartbeat import RECORDED_S, SLOWEST_S, DataAge, frame_s, mark
 from experiments.view.replay import ReplayClock
+from tests.cases import mostly_slow
 from tests.network import Mute, Net
 from tests.runs import recorded
 
@@ -127,12 +128,15 @@ KEYS = Keys()
 
 @pytest.mark.parametrize(
     ("token", "shown"),
-    [
-        (KEYS.life(KEYS.alive("KH01"), "beef"), "park/KH01/alive"),  # of a recorded name
-        (KEYS.alive("other"), "park/other/alive"),
-        (KEYS.claim(KEYS.alive("KH01"), KEYS.rank(1.0, "beef")), ""),  # of a robot that is refused
-        (KEYS.life(KEYS.alive("KH01"), "f00d"), ""),  # its own
-    ],
+    mostly_slow(
+        [
+            (KEYS.life(KEYS.alive("KH01"), "beef"), "park/KH01/alive"),  # of a recorded name
+            (KEYS.alive("other"), "park/other/alive"),
+            (KEYS.claim(KEYS.alive("KH01"), KEYS.rank(1.0, "beef")), ""),  # of a robot that is refused
+            (KEYS.life(KEYS.alive("KH01"), "f00d"), ""),  # its own
+        ],
+        3,
+    ),
 )
 def test_replay_ends_when_another_process_owns_a_name(token, shown, monkeypatch):
     sent: list[bytes] = []

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from agents.body.interface import BodyError, Disturbance
 from agents.protocols import khepera4 as protocol
+from tests.cases import mostly_slow
 from tests.requests import request
 from twins.devices import khepera4
 from twins.devices.device import DeviceRequest, Faults
@@ -109,8 +110,8 @@ def test_only_some_servers_obey_a_speed(talk, server):
 
 @pytest.mark.parametrize(
     ("server", "words"),
-    [("2023-01-07", b"d 5 0"), ("2023-01-15", b"g 5 0"), ("2023-04-10", b"g 0 5"), ("2025-05", b"d 5 0"),
-     ("fork", b"d 5 0"), ("kteam", b"D,74,74\r")],
+    mostly_slow([("2023-01-07", b"d 5 0"), ("2023-01-15", b"g 5 0"), ("2023-04-10", b"g 0 5"), ("2025-05", b"d 5 0"),
+     ("fork", b"d 5 0"), ("kteam", b"D,74,74\r")], 5),
 )  # fmt: skip
 def test_no_watchdog_and_clients_that_leave(talk, server, words):
     """Some stop when their client leaves; those of 2023 accept one client per life."""
