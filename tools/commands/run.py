@@ -32,6 +32,7 @@ from tools.options import (
     print_json,
     print_result,
     warn,
+    with_options,
 )
 from tools.terminal import say
 
@@ -51,7 +52,29 @@ SPOILED: Final = 3  # of a run with figures that cannot be compared
 FEW: Final = 6  # hazards of runs in virtual time that are printed
 
 
+@dataclass(frozen=True)
+class Handling:
+    """Options of a run that its results do not depend on: identity, consent, destination and display."""
+
+    out: Out = None
+    as_json: AsJson = False
+    report: Report = True
+    open_report: OpenReport = False
+    lab: Lab = None
+    identity: As = "operator"
+    yes: Annotated[
+        bool,
+        typer.Option("--yes", help="Agree to machines, devices and code that a bundle or another person's file names."),
+    ] = False
+    view: Annotated[bool, typer.Option("--view", help="Show it in the browser, in three dimensions.")] = False
+    pace: Annotated[
+        float | None,
+        typer.Option(min=0.01, max=100.0, help="Speed of --virtual --view, as a multiple of real time. [1]"),
+    ] = None
+
+
 @app.command(epilog=example("run robotic-park --virtual --seed 1", "run triangle --case event --tag paper"))
+@with_options
 def run(
     file: File,
     *,
@@ -59,78 +82,40 @@ def run(
         bool, typer.Option("--virtual", help="Run in virtual time, in this process, as fast as possible.")
     ] = False,
     case: Cases = None,
-    out: Out = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed of all randomness, instead of the file's.")] = None,
     settings: Settings = None,
-    as_json: AsJson = False,
     seeds: Annotated[
         int, typer.Option(min=1, max=100_000, help="Number of seeds: mean and 95 % interval (virtual only).")
     ] = 1,
     bodies: Bodies = None,
     here: Here = False,
     anyway: Anyway = False,
-    report: Report = True,
-    open_report: OpenReport = False,
     tag: Annotated[
         list[str] | None, typer.Option("--tag", metavar="WORD", help="Label by which `./zenpark runs --past` finds it.")
     ] = None,
-    lab: Lab = None,
-    identity: As = "operator",
-    yes: Annotated[
-        bool,
-        typer.Option("--yes", help="Agree to machines, devices and code that a bundle or another person's file names."),
-    ] = False,
-    view: Annotated[bool, typer.Option("--view", help="Show it in the browser, in three dimensions.")] = False,
-    pace: Annotated[
-        float | None,
-        typer.Option(min=0.01, max=100.0, help="Speed of --virtual --view, as a multiple of real time. [1]"),
-    ] = None,
+    handling: Handling,
 ) -> int:
     """Run an experiment: one process per robot, or in virtual time; a bundle repeats its run."""
     from experiments.file.problems import refusal
-    from experiments.real_time.conductor.conduct import RunOptions
     from experiments.recording import bundle
     from experiments.recording.run_folder import RunOrigin
 
     if any(not word.isprintable() or not word.strip() or "," in word for word in tag or []):
         raise typer.BadParameter("a tag is a word without commas", param_hint="--tag")
-    options = RunOptions(case or [], bodies, here, lab, identity)
+    changes = [*(settings or []), *([] if seed is None else [f"seed={seed}"])]
     origin = RunOrigin(
-        file=file,
-        virtual=virtual,
-        cases=list(options.cases),
-        changes=[*(settings or []), *([] if seed is None else [f"seed={seed}"])],
-        seeds=seeds,
-        bodies=bodies,
-        here=here,
-        anyway=anyway,
-        tags=tag or [],
-    )
-    show = _OutputOptions(out, as_json, report, open_report, view, pace, yes)
+        file=file, virtual=virtual, cases=case or [], changes=changes, seeds=seeds, bodies=bodies, here=here,
+        anyway=anyway, tags=tag or [],
+    )  # fmt: skip
     if not bundle.is_bundle(file):
-        return _run(origin, options, show)
+        return _run(origin, handling)
     if origin != RunOrigin(file=file, virtual=virtual, tags=origin.tags):
         hint = "unpack it, and run its experiment file with other options"
         raise refusal(file, "a bundle repeats its own run, and takes no options of it", hint)
-    return _repeat(origin, show, lab, identity)
+    return _repeat(origin, handling)
 
 
-@dataclass(frozen=True)
-class _OutputOptions:
-    """Destination of the results of a run, and their display."""
-
-    out: str | None
-    as_json: bool
-    report: bool
-    open_report: bool
-    view: bool
-    pace: float | None  # simulated seconds in one second, in a view
-    agreed: bool  # to what an experiment of others touches
-
-
-def _run(
-    origin: RunOrigin, options: RunOptions, show: _OutputOptions, *, former: Path | None = None, bundle: str = ""
-) -> int:
+def _run(origin: RunOrigin, handling: Handling, *, former: Path | None = None, bundle: str = "") -> int:
     """Run an experiment.
 
     Args:
@@ -140,40 +125,42 @@ def _run(
     from experiments.check.kept import KeptVerdict
     from experiments.file.document import load
     from experiments.metrics.criteria import has_passed, judge
+    from experiments.real_time.conductor.conduct import RunOptions
     from experiments.recording.cleaning import using
     from experiments.recording.run_folder import SOURCE, check_folder, new_folder, remove_unused
     from experiments.report import verdict
 
-    kept = KeptVerdict(origin.file, origin.changes, options.cases)
+    options = RunOptions(origin.cases, origin.bodies, origin.here, handling.lab, handling.identity)
+    kept = KeptVerdict(origin.file, origin.changes, origin.cases)
     read = load(origin.file, *origin.changes)
-    check_folder(show.out)
-    _refuse(options, show, virtual=origin.virtual, seeds=origin.seeds)
-    if not sound(read, kept, options.cases, seeds=origin.seeds, as_json=show.as_json, anyway=origin.anyway):
+    check_folder(handling.out)
+    _refuse(origin, handling)
+    if not sound(read, kept, origin.cases, seeds=origin.seeds, as_json=handling.as_json, anyway=origin.anyway):
         return 2
     if not origin.virtual:
         from experiments.real_time.conductor.conduct import with_bodies
         from tools import consent
 
         if bundle or consent.belongs_to_another(read.path):
-            consent.require(bundle or str(read.path), with_bodies(read, options), given=show.agreed)
-    folder = new_folder(read, show.out)
+            consent.require(bundle or str(read.path), with_bodies(read, options), given=handling.yes)
+    folder = new_folder(read, handling.out)
     try:
         read.keep(folder / SOURCE)
         with using(folder), _kept_origin(folder, origin, read, options):
             if origin.virtual:
-                with viewing.paced(show.pace or 1.0) if show.view else nullcontext(lambda *_: None) as watch:
+                with viewing.paced(handling.pace or 1.0) if handling.view else nullcontext(lambda *_: None) as watch:
                     runs, stopped, code = _simulate(read, folder, options, origin.seeds, watch), "", 0
             else:
-                with viewing.following(folder, options.identity) if show.view else nullcontext():
-                    runs, stopped, code = _conduct(read, folder, options, quiet=show.as_json)
+                with viewing.following(folder, options.identity) if handling.view else nullcontext():
+                    runs, stopped, code = _conduct(read, folder, options, quiet=handling.as_json)
         if not runs:
             return code
         if not runs[0].traces:
             why = stopped or "interrupted"
             why += f", before the common start: there is nothing to report; logs: {folder / 'logs'}"
-            print_result({"ok": False, "error": why}, why, as_json=show.as_json)
+            print_result({"ok": False, "error": why}, why, as_json=handling.as_json)
             return code or (FAILED if stopped else 130)
-        _write(runs, folder, show)
+        _write(runs, folder, handling)
         if stopped:
             warn([stopped])
         if not code:
@@ -183,7 +170,7 @@ def _run(
             code = FAILED if failures or stopped or has_passed(judge(cases)) is False else 0
             if not code and any(case.spoiled for case in cases):
                 code = SPOILED
-        return code if former is None else max(code, _print_differences(folder, former, quiet=show.as_json))
+        return code if former is None else max(code, _print_differences(folder, former, quiet=handling.as_json))
     finally:
         remove_unused(folder)
 
@@ -217,14 +204,13 @@ def _kept_origin(folder: Path, origin: RunOrigin, read: Document, options: RunOp
         keep_origin(folder, msgspec.structs.replace(read_origin(folder) or made, ended=time.time(), load_after=load()))
 
 
-def _repeat(asked: RunOrigin, show: _OutputOptions, lab: str | None, identity: str) -> int:
+def _repeat(asked: RunOrigin, handling: Handling) -> int:
     """Repeat the run of a bundle; in virtual time the results are compared to the last bit."""
     from tempfile import TemporaryDirectory
 
     import msgspec
 
     from experiments.file.problems import refusal
-    from experiments.real_time.conductor.conduct import RunOptions
     from experiments.recording import bundle
     from experiments.recording.run_folder import SOURCE
     from experiments.recording.version import provenance
@@ -233,7 +219,7 @@ def _repeat(asked: RunOrigin, show: _OutputOptions, lab: str | None, identity: s
         former = Path(unpacked)
         origin = bundle.unpack(Path(asked.file), former)
         code = [file.name for file in sorted(former.rglob("*.py")) if file.parent.name != "plugins"]
-        if code and not show.agreed:
+        if code and not handling.yes:
             hint = "unpack it and look at them, then agree with --yes"
             raise refusal(asked.file, f"its run executes Python files of the bundle: {', '.join(code)}", hint)
         if origin.made_by is not None:
@@ -250,8 +236,7 @@ def _repeat(asked: RunOrigin, show: _OutputOptions, lab: str | None, identity: s
         )
         if again.virtual:
             again = msgspec.structs.replace(again, bodies=None, here=False)
-        options = RunOptions(again.cases, again.bodies, again.here, lab, identity)
-        return _run(again, options, show, former=former if origin.virtual else None, bundle=asked.file)
+        return _run(again, handling, former=former if origin.virtual else None, bundle=asked.file)
 
 
 def _print_differences(folder: Path, former: Path, *, quiet: bool) -> int:
@@ -321,32 +306,32 @@ def _conduct(read: Document, folder: Path, options: RunOptions, *, quiet: bool) 
     return runs, emergency.words or failed, STOPPED if emergency else 130 if interrupted() else 0
 
 
-def _write(runs: Sequence[Run], folder: Path, show: _OutputOptions) -> None:
+def _write(runs: Sequence[Run], folder: Path, handling: Handling) -> None:
     """Write and print the results."""
     write_metrics(runs, folder)
-    page = write_report(runs, folder) if show.report else None
+    page = write_report(runs, folder) if handling.report else None
     found = summary(runs)
-    print_result(found, *_lines(runs, found, page), as_json=show.as_json)
-    if show.open_report and page is not None:
+    print_result(found, *_lines(runs, found, page), as_json=handling.as_json)
+    if handling.open_report and page is not None:
         open_in_browser(page.resolve().as_uri())
 
 
-def _refuse(options: RunOptions, show: _OutputOptions, *, virtual: bool, seeds: int) -> None:
+def _refuse(origin: RunOrigin, handling: Handling) -> None:
     """Raise DocumentError for options that do not go together, before anything is started."""
     from experiments.file.problems import refusal
 
-    if seeds > 1 and not virtual:
+    if origin.seeds > 1 and not origin.virtual:
         hint = "in real time, run once per --seed; `./zenpark report RUN RUN --pool` makes one of them"
         raise refusal("--seeds", "only for --virtual", hint)
-    check_bodies(options.bodies)
-    for option, given in (("--bodies", options.bodies), ("--lab", options.lab)):
-        if given is not None and virtual:
+    check_bodies(origin.bodies)
+    for option, given in (("--bodies", origin.bodies), ("--lab", handling.lab)):
+        if given is not None and origin.virtual:
             raise refusal(option, "only for real time", "leave out --virtual")
-    if show.pace is not None and not (virtual and show.view):
+    if handling.pace is not None and not (origin.virtual and handling.view):
         raise refusal("--pace", "only for --virtual --view", "add both, or leave it out")
-    if show.view:
+    if handling.view:
         viewing.require_viser()
-        if seeds > 1:
+        if origin.seeds > 1:
             raise refusal("--seeds", "one run is viewed", "leave out --view or --seeds")
 
 
