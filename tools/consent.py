@@ -47,13 +47,7 @@ def touched(cases: Iterable[Plan]) -> list[str]:
 def require(file: str, cases: Mapping[str, Plan], *, given: bool) -> None:
     """Let the user agree to what a run in real time touches, which is named; nothing is asked where that is nothing.
 
-    Args:
-        file: The experiment file, or the bundle, for people.
-        cases: Those that are run.
-        given: Whether the command line agrees already.
-
-    Raises:
-        DocumentError: If the user does not agree, or cannot be asked.
+    Raises DocumentError if the user does not agree, or cannot be asked; `given`: the command line agrees already.
     """
     lines = touched(cases.values())
     if not lines:

@@ -205,14 +205,8 @@ def _cells(row: LiveRow) -> list[Text]:
 
 
 def drawn(title: str, rows: Sequence[LiveRow], events: Sequence[Event], width: int, height: int) -> Group:
-    """The table with its title and events, no wider than `width`, no more than `height` lines.
-
-    Args:
-        rows: One a robot, in the order of the experiment.
-        events: Below the table, as many of the last as have room.
-        width: Of the terminal [characters].
-        height: Of the terminal [lines].
-    """
+    """The table with its title, and below it as many of the last events as have room, of `width` [characters] and
+    `height` [lines] at most; a row a robot, in the order of the experiment."""
     from rich.console import Group
     from rich.table import Table
     from rich.text import Text
@@ -224,7 +218,7 @@ def drawn(title: str, rows: Sequence[LiveRow], events: Sequence[Event], width: i
     if not fit:
         chosen.append(totals(rows, len(chosen)))
     cells = [_cells(row) for row in chosen]
-    widths = [max(len(HEADS[k]), *(len(line[k].plain) for line in cells)) for k in range(len(HEADS) - 1)]
+    widths = [max(map(len, (HEADS[k], *(line[k].plain for line in cells)))) for k in range(len(HEADS) - 1)]
     ends = [*accumulate(widths, lambda end, wide: end + GAP + wide), 0]
     kept = max(1, sum(0 < end <= width for end in ends))
     noted = kept == len(widths) and width - ends[kept - 1] - GAP >= NOTE

@@ -198,9 +198,7 @@ def print_result(result: Any, *lines: str, as_json: bool) -> None:  # noqa: ANN4
 def routers(connect: list[str] | None, lab: str | None) -> list[str]:
     """Endpoints as given on the command line, with the certificates of a lab where one is named.
 
-    Raises:
-        EndpointError: If a file of endpoints cannot be read.
-        LabError: If one of them asks for no certificate.
+    Raises EndpointError if a file of endpoints cannot be read, LabError if one of them asks for no certificate.
     """
     from agents.network.lab import secured
     from experiments.definition.endpoints import read_endpoints

@@ -129,8 +129,7 @@ def _order_robots(what: messages.OrderKind, robots: Sequence[str], by: Operator)
 def _change(order: messages.RunOrder, by: Operator) -> int:
     """Give an order to the conductor, wait until it is done, and print the result for each robot.
 
-    Returns:
-        The exit code: 0, 1 if something was refused, 2 if the whole order was.
+    Returns the exit code: 0, 1 if something was refused, 2 if the whole order was.
     """
     from experiments.real_time.conductor import orders
 

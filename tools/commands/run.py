@@ -116,12 +116,7 @@ def run(
 
 
 def _run(origin: RunOrigin, handling: Handling, *, former: Path | None = None, bundle: str = "") -> int:
-    """Run an experiment.
-
-    Args:
-        former: Folder with the same run, with which results in virtual time are compared.
-        bundle: Archive from which it comes.
-    """
+    """Run an experiment; of a `bundle`, in virtual time the results are compared with those of the folder `former`."""
     from experiments.check.kept import KeptVerdict
     from experiments.file.document import load
     from experiments.metrics.criteria import has_passed, judge
@@ -278,9 +273,7 @@ def _simulate(read: Document, folder: Path, options: RunOptions, seeds: int, wat
 def _conduct(read: Document, folder: Path, options: RunOptions, *, quiet: bool) -> tuple[list[Run], str, int]:
     """Run in real time.
 
-    Returns:
-        The run, none if it was ended at once; the reason of an emergency stop or of a failure, else empty; the exit
-        code.
+    Returns the run, none if it was ended at once; why it was stopped or failed, else an empty text; the exit code.
     """
     import msgspec
 
@@ -338,18 +331,9 @@ def _refuse(origin: RunOrigin, handling: Handling) -> None:
 def sound(
     read: Document, kept: KeptVerdict, cases: Sequence[str] = (), *, seeds: int, as_json: bool, anyway: bool
 ) -> bool:
-    """Print the warnings and errors of the check of a run; False if errors prevent the run.
+    """Print the warnings and errors of the check of a run, errors that prevent it as JSON too; False if there are such.
 
-    Args:
-        read: The experiment.
-        kept: Verdict of an earlier check.
-        cases: Names of the cases to be run; all if none is named.
-        seeds: Number of seeds to run.
-        as_json: Whether errors that prevent the run are on standard output as JSON too.
-        anyway: Whether it is run in spite of errors.
-
-    Raises:
-        DocumentError: If there is no such case.
+    Raises DocumentError if there is no such case.
     """
     from experiments.check.findings import NOT_RANDOM
     from experiments.check.kept import Verdict

@@ -31,6 +31,7 @@ app: Final = typer.Typer()
 PORT: Final = 8080
 START_S: Final = 30.0  # until a run that was started just now is registered
 POLL_S: Final = 0.1
+END_S: Final = 10.0  # limit for the page of a run to end with it
 REFRESH_S: Final = 0.25  # of the table
 FIRST_S: Final = 5.0  # limit for the reports of a table that is printed once
 
@@ -260,7 +261,11 @@ def following(folder: Path, identity: str) -> Iterator[None]:
         yield
     finally:
         viewer.terminate()
-        viewer.wait()
+        try:
+            viewer.wait(END_S)
+        except subprocess.TimeoutExpired:  # the results of the run must not wait for it
+            viewer.kill()
+            viewer.wait()
 
 
 @contextmanager

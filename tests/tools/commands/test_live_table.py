@@ -67,6 +67,10 @@ def test_a_wide_table_has_all_columns_and_totals():
     assert text[2].startswith("robot-99"), "where rows do not fit, the largest error comes first"
 
 
+def test_a_table_without_robots_has_its_heads():
+    assert lines("realm park", [], EVENTS, 80, 24)[:2] == ["realm park", "  ".join(HEADS).rstrip()]
+
+
 def test_rows_that_fit_stay_in_their_order():
     few = rows(5)
     assert worst_first(few, fit=True) == few
