@@ -13,6 +13,7 @@ from copy import copy
 from typing import Annotated, Final
 
 import typer
+from typer import Option
 from typer.models import CommandInfo
 
 from agents.errors import ExplainedError
@@ -79,13 +80,7 @@ def _version(asked: bool) -> None:
 @app.callback()
 def _zenpark(
     version: Annotated[
-        bool,
-        typer.Option(
-            "--version",
-            callback=_version,
-            is_eager=True,
-            help="Show version, digest of the code and commit, as run.json has them.",
-        ),
+        bool, Option("--version", callback=_version, is_eager=True, help="Show version, digest of the code and commit.")
     ] = False,
 ) -> None: ...
 

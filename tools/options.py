@@ -11,6 +11,7 @@ from functools import partial, wraps
 from typing import TYPE_CHECKING, Annotated, Any, Final, get_type_hints
 
 import typer
+from typer import Argument, Option
 from typer.core import TyperCommand, TyperGroup
 
 from tools import completion
@@ -98,54 +99,49 @@ def example(*lines: str) -> str:
 
 File = Annotated[
     str,
-    typer.Argument(
-        metavar="FILE", help="Experiment file, or the name of a ready-made one.", autocompletion=completion.experiments
+    Argument(
+        metavar="FILE", help="Experiment file, or name of a ready-made one.", autocompletion=completion.experiments
     ),
 ]
 Connect = Annotated[
     list[str] | None,
-    typer.Option(
+    Option(
         metavar="ENDPOINT",
         envvar=CONNECT,
-        help="A router; may be repeated. @FILE: those of a running run. [tcp/127.0.0.1:7447]",
+        help="A router; may be repeated. @FILE: those of a run. [tcp/127.0.0.1:7447]",
     ),
 ]
-Lab = Annotated[str | None, typer.Option(metavar="FOLDER", help="Certificates of a lab (`./zenpark lab init`).")]
-As = Annotated[str, typer.Option("--as", metavar="NAME", help="Name of the certificate, in a lab.")]
+Lab = Annotated[str | None, Option(metavar="FOLDER", help="Certificates of a lab (`./zenpark lab init`).")]
+As = Annotated[str, Option("--as", metavar="NAME", help="Name of the certificate, in a lab.")]
 Settings = Annotated[
     list[str] | None,
-    typer.Option(
+    Option(
         "--set",
         metavar="PATH=VALUE",
         help="Change a value of the file; may be repeated.",
         autocompletion=completion.paths,
     ),
 ]
-AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
-KeyExpression = Annotated[str, typer.Argument(metavar="KEY", help="Key expression, such as park/*/pose.")]
-Seconds = Annotated[float | None, typer.Option(min=0.0, help="End after this time [s].")]
-Realm = Annotated[str, typer.Option(metavar="NAME", help="First chunk of the keys.")]
+AsJson = Annotated[bool, Option("--json", help="Print the result as JSON.")]
+KeyExpression = Annotated[str, Argument(metavar="KEY", help="Key expression, such as park/*/pose.")]
+Seconds = Annotated[float | None, Option(min=0.0, help="End after this time [s].")]
+Realm = Annotated[str, Option(metavar="NAME", help="First chunk of the keys.")]
 Case = Annotated[
-    str | None, typer.Option(metavar="NAME", help="A case of the file. [the first]", autocompletion=completion.cases)
+    str | None, Option(metavar="NAME", help="A case of the file. [the first]", autocompletion=completion.cases)
 ]
 Cases = Annotated[
     list[str] | None,
-    typer.Option("--case", metavar="NAME", help="Only this case; may be repeated.", autocompletion=completion.cases),
+    Option("--case", metavar="NAME", help="Only this case; may be repeated.", autocompletion=completion.cases),
 ]
-Lifeline = Annotated[bool, typer.Option("--lifeline", help="End when standard input ends or falls silent.")]
-Out = Annotated[str | None, typer.Option(metavar="FOLDER", help="Folder for the results. [runs/...]")]
+Lifeline = Annotated[bool, Option("--lifeline", help="End when standard input ends or falls silent.")]
+Out = Annotated[str | None, Option(metavar="FOLDER", help="Folder for the results. [runs/...]")]
 Bodies = Annotated[
-    str | None,
-    typer.Option(
-        metavar="twin|world|protocol", help="Bodies: a twin per robot, one world, or protocol twins (real time)."
-    ),
+    str | None, Option(metavar="twin|world|protocol", help="Bodies: a twin per robot, one world, or protocol twins.")
 ]
-Here = Annotated[bool, typer.Option("--here", help="Run all robots on this machine, ignoring [hosts].")]
-Report = Annotated[
-    bool, typer.Option(help="Write the report; `./zenpark report FOLDER --pdf` adds its figures as PDF.")
-]
-Anyway = Annotated[bool, typer.Option("--anyway", help="Run it in spite of errors of the check.")]
-OpenReport = Annotated[bool, typer.Option("--open", help="Open it in the browser.")]
+Here = Annotated[bool, Option("--here", help="Run all robots on this machine, ignoring [hosts].")]
+Report = Annotated[bool, Option(help="Write the report; `./zenpark report FOLDER --pdf` adds its figures as PDF.")]
+Anyway = Annotated[bool, Option("--anyway", help="Run it in spite of errors of the check.")]
+OpenReport = Annotated[bool, Option("--open", help="Open it in the browser.")]
 
 
 def with_options(command: Callable[..., int]) -> Callable[..., int]:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated, Final
 
 import typer
+from typer import Argument, Option
 
 from experiments.catalogue import index
 from tools.options import WIDEST, AsJson, example, print_result, warn
@@ -18,28 +19,25 @@ app: Final = typer.Typer()
 def new(
     name: Annotated[
         str | None,
-        typer.Argument(
-            metavar="NAME",
-            help="A ready-made experiment (`./zenpark list`); TARGET behind a formation.",
-            autocompletion=index.names,
+        Argument(
+            metavar="NAME", help="Ready-made (`./zenpark list`); TARGET behind a formation.", autocompletion=index.names
         ),
     ] = None,
-    target: Annotated[str | None, typer.Argument(metavar="TARGET", help="The file to write. [NAME.toml]")] = None,
+    target: Annotated[str | None, Argument(metavar="TARGET", help="The file to write. [NAME.toml]")] = None,
     *,
-    polygon: Annotated[int | None, typer.Option(metavar="N", help="Place robots on a regular polygon.")] = None,
-    grid: Annotated[str | None, typer.Option(metavar="RxC", help="Place robots on a grid, such as 5x8.")] = None,
+    polygon: Annotated[int | None, Option(metavar="N", help="Place robots on a regular polygon.")] = None,
+    grid: Annotated[str | None, Option(metavar="RxC", help="Place robots on a grid, such as 5x8.")] = None,
     hemisphere: Annotated[
-        int | None, typer.Option(metavar="N", help="Place robots on a hemisphere, with Delaunay links.")
+        int | None, Option(metavar="N", help="Place robots on a hemisphere, with Delaunay links.")
     ] = None,
-    kind: Annotated[str, typer.Option(metavar="KIND", help="Kind of the robots of a formation.")] = "crazyflie",
-    spacing: Annotated[float, typer.Option(min=0.01, max=1000.0, help="Distance between neighbours [m].")] = 0.6,
+    kind: Annotated[str, Option(metavar="KIND", help="Kind of the robots of a formation.")] = "crazyflie",
+    spacing: Annotated[float, Option(min=0.01, max=1000.0, help="Distance between neighbours [m].")] = 0.6,
     scatter: Annotated[
-        float | None,
-        typer.Option(min=0.0, max=1000.0, help="Largest random offset of starts, by seed [m]. [0.3 spacing]"),
+        float | None, Option(min=0.0, max=1000.0, help="Largest random offset of starts, by seed [m]. [0.3 spacing]")
     ] = None,
-    law: Annotated[str, typer.Option(metavar="distance|displacement", help="Law of a formation.")] = "distance",
-    seed: Annotated[int, typer.Option(min=0, help="Of the file.")] = 1,
-    duration: Annotated[float, typer.Option(min=1.0, max=86400.0, help="[s]")] = 60.0,
+    law: Annotated[str, Option(metavar="distance|displacement", help="Law of a formation.")] = "distance",
+    seed: Annotated[int, Option(min=0, help="Of the file.")] = 1,
+    duration: Annotated[float, Option(min=1.0, max=86400.0, help="[s]")] = 60.0,
 ) -> None:
     """Begin an experiment file from a ready-made one, or with a formation of any size."""
     from experiments.authoring.generate import LayoutOptions, generate
@@ -64,14 +62,10 @@ def new(
 
 @app.command(name="import", epilog=example("import park.yaml park.toml --duration 60"))
 def import_(
-    file: Annotated[str, typer.Argument(metavar="FILE.yaml", help="An experiment of Robotic Park's authors.")],
-    target: Annotated[str | None, typer.Argument(metavar="TARGET", help="The file to write. [FILE.toml]")] = None,
-    duration: Annotated[
-        float, typer.Option(min=1.0, max=86400.0, help="Duration, which their files do not give [s].")
-    ] = 60.0,
-    poses: Annotated[
-        str | None, typer.Option(metavar="FILE", help="Starts: an index of robots (.yaml), or a Webots world (.wbt).")
-    ] = None,
+    file: Annotated[str, Argument(metavar="FILE.yaml", help="An experiment of Robotic Park's authors.")],
+    target: Annotated[str | None, Argument(metavar="TARGET", help="The file to write. [FILE.toml]")] = None,
+    duration: Annotated[float, Option(min=1.0, max=86400.0, help="Duration, which their files lack [s].")] = 60.0,
+    poses: Annotated[str | None, Option(metavar="FILE", help="Starts: index (.yaml) or Webots world (.wbt).")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Turn an experiment file of Robotic Park's authors into one of zenpark."""

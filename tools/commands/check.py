@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
+from typer import Option
 
 from tools.options import (
     WIDEST,
@@ -43,12 +44,8 @@ def check(
     file: File,
     *,
     settings: Settings = None,
-    fix: Annotated[
-        bool, typer.Option("--fix", help="Print the links with the nearest targets that fit together.")
-    ] = False,
-    plot: Annotated[
-        Path | None, typer.Option("--plot", help="Draw target shape, links and expected ways (.svg, .pdf, .png).")
-    ] = None,
+    fix: Annotated[bool, Option("--fix", help="Print the links with the nearest targets that fit together.")] = False,
+    plot: Annotated[Path | None, Option("--plot", help="Draw shape, links, expected ways (.svg, .pdf, .png).")] = None,
     as_json: AsJson = False,
 ) -> int:
     """Check an experiment file and say what theory says of it; exit code 2 for errors of the file, 1 of theory."""
@@ -129,15 +126,9 @@ def preflight(
     case: Cases = None,
     settings: Settings = None,
     bodies: Bodies = None,
-    hop: Annotated[
-        bool, typer.Option("--hop", help="Robot by robot: a drone hops 20 cm, a robot on wheels drives 10 cm.")
-    ] = False,
-    stop: Annotated[
-        bool, typer.Option("--stop", help="Robot by robot: an emergency stop while it begins to climb, or drives.")
-    ] = False,
-    sticks: Annotated[
-        bool, typer.Option("--sticks", help="Tello by Tello: measures how fast it flies at a fifth of its sticks.")
-    ] = False,
+    hop: Annotated[bool, Option("--hop", help="Robot by robot: drones hop 20 cm, others drive 10 cm.")] = False,
+    stop: Annotated[bool, Option("--stop", help="Robot by robot: an emergency stop as it climbs or drives.")] = False,
+    sticks: Annotated[bool, Option("--sticks", help="Tello by Tello: its speed at a fifth of its sticks.")] = False,
     here: Here = False,
     lab: Lab = None,
     identity: As = "operator",

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
+from typer import Argument
 
 from experiments.catalogue import index
 from tools.options import WIDEST, AsJson, example, print_json, print_result, warn
@@ -23,9 +24,7 @@ LISTED: Final = 6  # keys about a word that is no key
 
 @app.command(epilog=example("explain", "explain disturbance.hover_jitter", "explain plan.circle"))
 def explain(
-    key: Annotated[
-        str, typer.Argument(help="such as disturbance.hover_jitter, safety, trigger, circle; left out: all at the top")
-    ] = "",
+    key: Annotated[str, Argument(help="such as disturbance.hover_jitter, safety, circle; none: all at the top")] = "",
     as_json: AsJson = False,
 ) -> int:
     """Explain a key of the experiment file, a plug-in, a kind of robot or a metric: text, unit, limits, an example."""

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
-import typer
+from typer import Argument, Option
 
 from tools.commands.lab import SOON_DAYS
 from tools.options import AsJson, File, Lab, Settings, example, group, known_words, print_json
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 app: Final = group("Check the other machines of an experiment, and put zenpark there.")
 turtlebot_app: Final = group("Prepare a TurtleBot3 for experiments.")
 On = Annotated[
-    list[str] | None, typer.Option(metavar="HOST|TAG", help="Only this host, or those with this tag; may be repeated.")
+    list[str] | None, Option(metavar="HOST|TAG", help="Only this host, or those with this tag; may be repeated.")
 ]
 
 YES, NO, DOUBTFUL, NOTHING = "✓", "✗", "!", "–"
@@ -56,15 +56,13 @@ class HostRow:
 @turtlebot_app.command(epilog=example("turtlebot watchdog ubuntu@192.168.0.31 --namespace tb3_0"))
 def watchdog(
     robot: Annotated[
-        str | None, typer.Argument(metavar="[USER@ROBOT]", help="TurtleBot3 that ssh reaches; none: print the file.")
+        str | None, Argument(metavar="[USER@ROBOT]", help="TurtleBot3 that ssh reaches; none: print the file.")
     ] = None,
     *,
-    namespace: Annotated[str, typer.Option(help="Namespace of the robot's nodes, such as tb3_0.")] = "",
-    domain: Annotated[int, typer.Option(min=0, max=232, help="ROS_DOMAIN_ID of the robot.")] = 30,
-    silence: Annotated[
-        float, typer.Option(min=0.1, max=5.0, help="Time without a command after which it stops [s].")
-    ] = 0.5,
-    remove: Annotated[bool, typer.Option("--remove", help="Remove it.")] = False,
+    namespace: Annotated[str, Option(help="Namespace of the robot's nodes, such as tb3_0.")] = "",
+    domain: Annotated[int, Option(min=0, max=232, help="ROS_DOMAIN_ID of the robot.")] = 30,
+    silence: Annotated[float, Option(min=0.1, max=5.0, help="Time without a command after which it stops [s].")] = 0.5,
+    remove: Annotated[bool, Option("--remove", help="Remove it.")] = False,
 ) -> None:
     """Install a watchdog on a TurtleBot3, which stops it when no command arrives."""
     from agents.protocols import turtlebot3

@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
-import typer
+from typer import Argument, Option
 
 from tools.options import AsJson, example, group, print_result
 
@@ -15,12 +15,10 @@ if TYPE_CHECKING:
 
 app: Final = group("Make, renew and revoke the certificates of a lab: robots, people, routers.")
 
-Folder = Annotated[str, typer.Argument(metavar="LAB", help="Folder of the lab.")]
-Names = Annotated[list[str], typer.Argument(metavar="NAME...", help="Identities.")]
-Days = Annotated[float, typer.Option(min=0.01, help="Validity of a certificate [days].")]
-Hosts = Annotated[
-    list[str] | None, typer.Option("--host", metavar="HOST", help="Name or address of its endpoint; may be repeated.")
-]
+Folder = Annotated[str, Argument(metavar="LAB", help="Folder of the lab.")]
+Names = Annotated[list[str], Argument(metavar="NAME...", help="Identities.")]
+Days = Annotated[float, Option(min=0.01, help="Validity of a certificate [days].")]
+Hosts = Annotated[list[str] | None, Option("--host", metavar="HOST", help="Host of its endpoint; may be repeated.")]
 SOON_DAYS: Final = 14.0
 
 
@@ -29,7 +27,7 @@ def init(
     folder: Folder,
     given: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[FILE|ROBOT...]", help="Experiments, for all their robots; or names of robots."),
+        Argument(metavar="[FILE|ROBOT...]", help="Experiments, for all their robots; or names of robots."),
     ] = None,
     *,
     host: Hosts = None,
@@ -59,7 +57,7 @@ def issue(
     folder: Folder,
     names: Names,
     *,
-    role: Annotated[str, typer.Option(help="Role: robot, operator, observer, router, ... [by the name]")] = "",
+    role: Annotated[str, Option(help="Role: robot, operator, observer, router, ... [by the name]")] = "",
     host: Hosts = None,
     days: Days = 90.0,
     as_json: AsJson = False,
@@ -79,13 +77,11 @@ def issue(
 @app.command(epilog=example("lab renew lab", "lab renew lab router --host 192.168.0.10"))
 def renew(
     folder: Folder,
-    names: Annotated[list[str] | None, typer.Argument(metavar="[NAME...]", help="Names; all if none is given.")] = None,
+    names: Annotated[list[str] | None, Argument(metavar="[NAME...]", help="Names; all if none is given.")] = None,
     *,
     host: Hosts = None,
     days: Days = 90.0,
-    authority: Annotated[
-        bool, typer.Option("--authority", help="Make a new authority too; every earlier file is then refused.")
-    ] = False,
+    authority: Annotated[bool, Option("--authority", help="A new authority too, which refuses earlier files.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Make new certificates for the same names; those before are valid until they end."""

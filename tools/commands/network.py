@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
+from typer import Option
 
 from agents.errors import ExplainedError
 from tools.options import As, AsJson, Connect, KeyExpression, Lab, Seconds, example, print_json, session
@@ -157,9 +158,7 @@ def echo(
     key: KeyExpression,
     *,
     connect: Connect = None,
-    count: Annotated[
-        int | None, typer.Option("--count", "-n", min=1, help="Number of samples after which to end.")
-    ] = None,
+    count: Annotated[int | None, Option("--count", "-n", min=1, help="Number of samples after which to end.")] = None,
     seconds: Seconds = None,
     lab: Lab = None,
     identity: As = "observer",
@@ -239,7 +238,7 @@ def hz(
     seconds: Seconds = None,
     lab: Lab = None,
     identity: As = "observer",
-    as_json: Annotated[bool, typer.Option("--json", help="Print a line of JSON for each key and second.")] = False,
+    as_json: Annotated[bool, Option("--json", help="Print a line of JSON for each key and second.")] = False,
 ) -> None:
     """Print the rate, bytes and intervals of each key, second by second."""
     import msgspec

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
+from typer import Argument, Option
 
 from tools import completion
 from tools.options import (
@@ -41,9 +42,9 @@ robot_app: Final = group("Give orders to robots: those of a run that is under wa
 world_app: Final = group("Run a world by hand, and give orders to the one that is running.")
 
 Place = tuple[float, float]
-Names = Annotated[list[str], typer.Argument(metavar="NAME...", help="Robots.", autocompletion=completion.robots)]
+Names = Annotated[list[str], Argument(metavar="NAME...", help="Robots.", autocompletion=completion.robots)]
 NamesOrAll = Annotated[
-    list[str] | None, typer.Argument(metavar="[NAME...]", help="Robots. [all]", autocompletion=completion.robots)
+    list[str] | None, Argument(metavar="[NAME...]", help="Robots. [all]", autocompletion=completion.robots)
 ]
 
 IDENTITY: Final = "operator"
@@ -173,12 +174,12 @@ for _what, _help in CHANGES.items():
 @robot_app.command(epilog=example("robot replace CF02 --with S1", "robot replace KH01 --body twin --at 0.5 -0.2"))
 @with_options
 def replace(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="A robot of the run.", autocompletion=completion.robots)],
+    name: Annotated[str, Argument(metavar="NAME", help="A robot of the run.", autocompletion=completion.robots)],
     *,
-    spare: Annotated[str | None, typer.Option("--with", metavar="SPARE", help="A spare of the file.")] = None,
-    body: Annotated[str | None, typer.Option(metavar="URI", help="Address of another body.")] = None,
-    at: Annotated[Place | None, typer.Option(metavar="X Y", help="Start of a twin [m]. [the file's]")] = None,
-    yaw: Annotated[float, typer.Option(help="Yaw of a twin that is moved [rad].")] = 0.0,
+    spare: Annotated[str | None, Option("--with", metavar="SPARE", help="A spare of the file.")] = None,
+    body: Annotated[str | None, Option(metavar="URI", help="Address of another body.")] = None,
+    at: Annotated[Place | None, Option(metavar="X Y", help="Start of a twin [m]. [the file's]")] = None,
+    yaw: Annotated[float, Option(help="Yaw of a twin that is moved [rad].")] = 0.0,
     by: Operator,
 ) -> int:
     """Let another body take over a robot's name, links and plan; by default a spare of its kind."""
@@ -223,7 +224,7 @@ def resume(*, by: Operator) -> int:
 @world_app.command(epilog=example("world reset", "world reset KH01"))
 @with_options
 def reset(
-    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="A robot. [all, and pushed obstacles]")] = None,
+    name: Annotated[str | None, Argument(metavar="[NAME]", help="A robot. [all, and pushed obstacles]")] = None,
     *,
     by: Operator,
 ) -> int:
@@ -239,19 +240,17 @@ def estop(
     *,
     connect: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             metavar="ENDPOINT",
             help="Only this router, or those of one run (@RUN/network.txt); may be repeated. "
             f"[all runs of this machine, the routers of ${CONNECT}, and tcp/127.0.0.1:7447]",
         ),
     ] = None,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Only print which robots would be stopped; nothing is sent to them.")
-    ] = False,
-    realm: Annotated[str | None, typer.Option(metavar="NAME", help="First chunk of the keys. [the run's]")] = None,
+    dry_run: Annotated[bool, Option("--dry-run", help="Print which robots would be stopped; send nothing.")] = False,
+    realm: Annotated[str | None, Option(metavar="NAME", help="First chunk of the keys. [the run's]")] = None,
     lab: Lab = None,
     identity: Annotated[
-        str | None, typer.Option("--as", metavar="NAME", help="Name of the certificate, in a lab. [the run's operator]")
+        str | None, Option("--as", metavar="NAME", help="Name of the certificate, in a lab. [the run's operator]")
     ] = None,
     as_json: AsJson = False,
 ) -> int:

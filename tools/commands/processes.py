@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, TypeVar
 
 import typer
+from typer import Argument, Option
 
 from tools import completion
 from tools.commands.orders import world_app
@@ -45,14 +46,13 @@ class Started:
 def agent(
     file: File,
     names: Annotated[
-        list[str],
-        typer.Argument(metavar="NAME...", help="The robots of this process.", autocompletion=completion.members),
+        list[str], Argument(metavar="NAME...", help="The robots of this process.", autocompletion=completion.members)
     ],
     *,
     clock_correction: Annotated[
-        float, typer.Option(metavar="SECONDS", help="Offset from this machine's clock to the conductor's.")
+        float, Option(metavar="SECONDS", help="Offset from this machine's clock to the conductor's.")
     ] = 0.0,
-    once: Annotated[bool, typer.Option("--once", help="End when down after the experiment.")] = False,
+    once: Annotated[bool, Option("--once", help="End when down after the experiment.")] = False,
     realm: Realm = "park",
     started: Started,
 ) -> int:
@@ -79,23 +79,17 @@ def station() -> int:
 
 @app.command(epilog=example("router", "router lab.toml --lab lab --listen tls/192.168.0.10:7447"))
 def router(
-    file: Annotated[
-        str | None, typer.Argument(metavar="[FILE]", help="Experiment with the rights to enforce, in a lab.")
-    ] = None,
+    file: Annotated[str | None, Argument(metavar="[FILE]", help="Experiment with the rights in a lab.")] = None,
     *,
     listen: Annotated[
         list[str] | None,
-        typer.Option(metavar="ENDPOINT", help="Without a lab on loopback; may be repeated. [tcp/127.0.0.1:7447]"),
+        Option(metavar="ENDPOINT", help="Without a lab on loopback; may be repeated. [tcp/127.0.0.1:7447]"),
     ] = None,
-    connect: Annotated[
-        list[str] | None, typer.Option(metavar="ENDPOINT", help="Another router to connect to; may be repeated.")
-    ] = None,
+    connect: Annotated[list[str] | None, Option(metavar="ENDPOINT", help="Another router; may be repeated.")] = None,
     lifeline: Lifeline = False,
     lab: Lab = None,
     bodies: Bodies = None,
-    print_config: Annotated[
-        bool, typer.Option("--print-config", help="Print the configuration for a zenohd with the same role.")
-    ] = False,
+    print_config: Annotated[bool, Option("--print-config", help="Print a zenohd's configuration instead.")] = False,
 ) -> int:
     """Run the Zenoh router that the robots meet at."""
     import json
@@ -172,7 +166,7 @@ def centre(file: File, *, started: Started) -> int:
 def world(
     file: File,
     *,
-    engine: Annotated[str | None, typer.Option(metavar="NAME", help="Engine of the twins. [the file's]")] = None,
+    engine: Annotated[str | None, Option(metavar="NAME", help="Engine of the twins. [the file's]")] = None,
     started: Started,
 ) -> int:
     """Run the world of an experiment: its twins, with obstacles, contacts and range sensors."""
@@ -183,15 +177,15 @@ def world(
 
 @app.command(epilog=example("twin crazyflie --count 2", "twin tello --faults '{\"loss\": 0.05}'"))
 def twin(
-    kind: Annotated[str, typer.Argument(metavar="KIND", help="Kind with a protocol twin, such as crazyflie.")],
+    kind: Annotated[str, Argument(metavar="KIND", help="Kind with a protocol twin, such as crazyflie.")],
     *,
-    count: Annotated[int, typer.Option(min=1, max=99, help="Number of robots.")] = 1,
+    count: Annotated[int, Option(min=1, max=99, help="Number of robots.")] = 1,
     connect: Connect = None,
-    faults: Annotated[str, typer.Option(metavar="JSON", help="Faults, such as '{\"loss\": 0.05}'.")] = "{}",
-    device: Annotated[str, typer.Option(metavar="JSON", help="Settings of the device.")] = "{}",
+    faults: Annotated[str, Option(metavar="JSON", help="Faults, such as '{\"loss\": 0.05}'.")] = "{}",
+    device: Annotated[str, Option(metavar="JSON", help="Settings of the device.")] = "{}",
     table: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             metavar="FILE",
             help="A Crazyflie: parameters or log variables that it lists, a file of cflib's cache; may be repeated.",
         ),
@@ -212,7 +206,7 @@ def twin(
 )
 def bridge(
     context: typer.Context,
-    what: Annotated[str, typer.Argument(metavar="vicon|ros2", help="`./zenpark bridge vicon --help` says more.")],
+    what: Annotated[str, Argument(metavar="vicon|ros2", help="`./zenpark bridge vicon --help` says more.")],
 ) -> int:
     """Bring motion capture in (vicon), or show the robots to ROS 2 (ros2)."""
     from importlib import import_module

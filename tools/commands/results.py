@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
+from typer import Argument, Option
 
 from agents.errors import ExplainedError
 from tools import completion
@@ -29,30 +30,22 @@ app: Final = typer.Typer()
 def report(
     runs: Annotated[
         list[str],
-        typer.Argument(
-            metavar="RUN...", help="Folders of runs, or full of runs, or of a sweep.", autocompletion=completion.folders
+        Argument(
+            metavar="RUN...", help="Folders of runs, full of runs, or of a sweep.", autocompletion=completion.folders
         ),
     ],
-    out: Annotated[
-        str | None, typer.Option(metavar="FILE", help="Folder for the report, or the tables. [the run's folder]")
-    ] = None,
+    out: Annotated[str | None, Option(metavar="FILE", help="Folder for report or tables. [the run's folder]")] = None,
     *,
-    label: Annotated[
-        list[str] | None, typer.Option(metavar="NAME", help="Name of each run of a comparison, in order. [A, B, ...]")
-    ] = None,
-    pool: Annotated[
-        bool, typer.Option("--pool", help="Pool runs that differ in their seed only: means and intervals.")
-    ] = False,
+    label: Annotated[list[str] | None, Option(metavar="NAME", help="Name of each run, in order. [A, B, ...]")] = None,
+    pool: Annotated[bool, Option("--pool", help="Pool runs that differ in seed only: means and intervals.")] = False,
     width: Annotated[
-        float, typer.Option(min=2.0, max=12.0, metavar="INCHES", help="Width of figures and LaTeX tables: 3.5 or 7.16.")
+        float, Option(min=2.0, max=12.0, metavar="INCHES", help="Width of figures and LaTeX tables: 3.5 or 7.16.")
     ] = 3.5,
-    pdf: Annotated[bool, typer.Option("--pdf", help="Write the figures as PDF as well, into figures/.")] = False,
-    as_latex: Annotated[
-        bool, typer.Option("--latex", help="Print the tables as LaTeX (booktabs, adjustbox) instead.")
-    ] = False,
-    as_markdown: Annotated[bool, typer.Option("--markdown", help="Print the tables as Markdown instead.")] = False,
+    pdf: Annotated[bool, Option("--pdf", help="Write the figures as PDF as well, into figures/.")] = False,
+    as_latex: Annotated[bool, Option("--latex", help="Print LaTeX tables (booktabs, adjustbox) instead.")] = False,
+    as_markdown: Annotated[bool, Option("--markdown", help="Print the tables as Markdown instead.")] = False,
     metrics: Annotated[
-        str | None, typer.Option(metavar="NAMES", help="Metrics for --latex or --markdown, as f,iae,itae.")
+        str | None, Option(metavar="NAMES", help="Metrics for --latex or --markdown, as f,iae,itae.")
     ] = None,
     as_json: AsJson = False,
 ) -> int:
@@ -226,20 +219,14 @@ def _as_json(run: PastRun) -> dict[str, Any]:
 
 @app.command(epilog=example("export runs/first --csv", "export runs/first supplement.zip --bundle"))
 def export(  # noqa: PLR0917 - a command line
-    folder: Annotated[str, typer.Argument(metavar="RUN", help="Folder of a run.", autocompletion=completion.folders)],
-    target: Annotated[
-        str | None, typer.Argument(metavar="FILE", help="FILE.mat, .csv or .zip. [run.mat in the run's folder]")
-    ] = None,
-    as_csv: Annotated[bool, typer.Option("--csv", help="A table of trajectories: case, time, robot, x, ...")] = False,
-    as_bundle: Annotated[
-        bool, typer.Option("--bundle", help="Archive to repeat the run, for a paper's supplement.")
-    ] = False,
+    folder: Annotated[str, Argument(metavar="RUN", help="Folder of a run.", autocompletion=completion.folders)],
+    target: Annotated[str | None, Argument(metavar="FILE", help="FILE.mat, .csv or .zip. [run.mat in RUN]")] = None,
+    as_csv: Annotated[bool, Option("--csv", help="A table of trajectories: case, time, robot, x, ...")] = False,
+    as_bundle: Annotated[bool, Option("--bundle", help="Archive that repeats the run, for a supplement.")] = False,
     video: Annotated[
-        Path | None, typer.Option("--video", metavar="FILE", help="A film of all cases: FILE.mp4 (by ffmpeg) or .gif.")
+        Path | None, Option("--video", metavar="FILE", help="A film of all cases: FILE.mp4 (by ffmpeg) or .gif.")
     ] = None,
-    speed: Annotated[
-        float, typer.Option(min=0.1, max=100.0, help="Speed of a film, as a multiple of real time.")
-    ] = 4.0,
+    speed: Annotated[float, Option(min=0.1, max=100.0, help="Speed of a film, as a multiple of real time.")] = 4.0,
     as_json: AsJson = False,
 ) -> None:
     """Write a run for MATLAB, as one table, as a film, or as a bundle that `./zenpark run` repeats."""
@@ -275,8 +262,8 @@ def export(  # noqa: PLR0917 - a command line
 
 @app.command(epilog=example("recover runs/first/event.mcap"))
 def recover(
-    file: Annotated[str, typer.Argument(metavar="FILE", help="A recording that was cut off.")],
-    target: Annotated[str | None, typer.Argument(metavar="TARGET", help="Path of the repaired recording.")] = None,
+    file: Annotated[str, Argument(metavar="FILE", help="A recording that was cut off.")],
+    target: Annotated[str | None, Argument(metavar="TARGET", help="Path of the repaired recording.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Repair a recording after its writer was killed."""
@@ -354,17 +341,15 @@ def write_report(runs: Sequence[Run], folder: Path, width: float = 3.5, *, pdf: 
     )
 
 
-Words = Annotated[
-    list[str] | None, typer.Argument(metavar="[WORD...]", help="Runs with all of these as tag, or in name and title.")
-]
-Below = Annotated[list[str] | None, typer.Option("--in", metavar="FOLDER", help="Folder of runs. [runs]")]
+Words = Annotated[list[str] | None, Argument(metavar="[WORD...]", help="Runs with all these in tags, name or title.")]
+Below = Annotated[list[str] | None, Option("--in", metavar="FOLDER", help="Folder of runs. [runs]")]
 
 
 @app.command(epilog=example("runs", "runs --past paper --json"))
 def runs(
     words: Words = None,
     *,
-    past: Annotated[bool, typer.Option("--past", help="List runs that have ended.")] = False,
+    past: Annotated[bool, Option("--past", help="List runs that have ended.")] = False,
     below: Below = None,
     as_json: AsJson = False,
 ) -> None:
@@ -468,12 +453,10 @@ def _sweep_as_json(folder: Path) -> dict[str, Any]:
 def clean(
     words: Words = None,
     *,
-    older: Annotated[float | None, typer.Option(min=0.0, metavar="DAYS", help="Least age of the runs [days].")] = None,
-    recordings: Annotated[
-        bool, typer.Option("--recordings", help="Only recordings and logs; figures, report and file stay.")
-    ] = False,
-    tagged: Annotated[bool, typer.Option("--tagged", help="Include runs with a tag.")] = False,
-    yes: Annotated[bool, typer.Option("--yes", help="Remove; without it, only list.")] = False,
+    older: Annotated[float | None, Option(min=0.0, metavar="DAYS", help="Least age of the runs [days].")] = None,
+    recordings: Annotated[bool, Option("--recordings", help="Only recordings and logs; the results stay.")] = False,
+    tagged: Annotated[bool, Option("--tagged", help="Include runs with a tag.")] = False,
+    yes: Annotated[bool, Option("--yes", help="Remove; without it, only list.")] = False,
     below: Below = None,
     as_json: AsJson = False,
 ) -> int:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
+from typer import Option
 
 from tools.commands import view as viewing
 from tools.commands.results import summary, write_metrics, write_report
@@ -63,13 +64,11 @@ class Handling:
     lab: Lab = None
     identity: As = "operator"
     yes: Annotated[
-        bool,
-        typer.Option("--yes", help="Agree to machines, devices and code that a bundle or another person's file names."),
+        bool, Option("--yes", help="Agree to machines, devices and code that a bundle or another person's file names.")
     ] = False
-    view: Annotated[bool, typer.Option("--view", help="Show it in the browser, in three dimensions.")] = False
+    view: Annotated[bool, Option("--view", help="Show it in the browser, in three dimensions.")] = False
     pace: Annotated[
-        float | None,
-        typer.Option(min=0.01, max=100.0, help="Speed of --virtual --view, as a multiple of real time. [1]"),
+        float | None, Option(min=0.01, max=100.0, help="Speed of --virtual --view, as a multiple of real time. [1]")
     ] = None
 
 
@@ -78,20 +77,16 @@ class Handling:
 def run(
     file: File,
     *,
-    virtual: Annotated[
-        bool, typer.Option("--virtual", help="Run in virtual time, in this process, as fast as possible.")
-    ] = False,
+    virtual: Annotated[bool, Option("--virtual", help="Run in virtual time, in this process, at full speed.")] = False,
     case: Cases = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Seed of all randomness, instead of the file's.")] = None,
+    seed: Annotated[int | None, Option(min=0, help="Seed of all randomness, instead of the file's.")] = None,
     settings: Settings = None,
-    seeds: Annotated[
-        int, typer.Option(min=1, max=100_000, help="Number of seeds: mean and 95 % interval (virtual only).")
-    ] = 1,
+    seeds: Annotated[int, Option(min=1, max=100_000, help="Number of seeds: means and intervals (virtual only).")] = 1,
     bodies: Bodies = None,
     here: Here = False,
     anyway: Anyway = False,
     tag: Annotated[
-        list[str] | None, typer.Option("--tag", metavar="WORD", help="Label by which `./zenpark runs --past` finds it.")
+        list[str] | None, Option("--tag", metavar="WORD", help="Label by which `./zenpark runs --past` finds it.")
     ] = None,
     handling: Handling,
 ) -> int:

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
+from typer import Argument, Option
 
 from tools.options import (
     Anyway,
@@ -44,7 +45,7 @@ def sweep(
     file: File,
     given: Annotated[
         list[str] | None,
-        typer.Argument(
+        Argument(
             metavar="[PATH=VALUES...]",
             help="Axes: trigger.threshold=0.002:0.05:log12, or lin12, or a list 1,2,3; several make a grid. "
             "seeds=50 or seeds=101:150 [20 from the file's on]; tuning=1001:1060 for --optimise.",
@@ -55,7 +56,7 @@ def sweep(
     settings: Settings = None,
     optimise: Annotated[
         str | None,
-        typer.Option(
+        Option(
             "--optimise",
             "--optimise",
             metavar="WISH",
@@ -63,9 +64,9 @@ def sweep(
         ),
     ] = None,
     out: Out = None,
-    processes: Annotated[int | None, typer.Option(min=1, help="Number at once. [one per core]")] = None,
+    processes: Annotated[int | None, Option(min=1, help="Number at once. [one per core]")] = None,
     scheduler: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="Dask scheduler with the workers to use, tcp://HOST:PORT.")
+        str | None, Option(metavar="ADDRESS", help="Dask scheduler with the workers to use, tcp://HOST:PORT.")
     ] = None,
     as_json: AsJson = False,
     anyway: Anyway = False,

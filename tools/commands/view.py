@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, TextIO
 
 import typer
+from typer import Argument, Option
 
 from agents.errors import ExplainedError
 from tools import completion
@@ -40,11 +41,7 @@ FIRST_S: Final = 5.0  # limit for the reports of a table that is printed once
 def view(
     run: Annotated[
         str | None,
-        typer.Argument(
-            metavar="[RUN]",
-            help="Folder of a run. [the run that is up on this machine]",
-            autocompletion=completion.folders,
-        ),
+        Argument(metavar="[RUN]", help="Folder of a run. [that which is up here]", autocompletion=completion.folders),
     ] = None,
     *,
     connect: Connect = None,
@@ -52,18 +49,12 @@ def view(
     lab: Lab = None,
     identity: Annotated[
         str | None,
-        typer.Option(
-            "--as", metavar="NAME", help="Name of the certificate, in a lab; only an operator gives orders. [observer]"
-        ),
+        Option("--as", metavar="NAME", help="Name of the certificate, in a lab; operators give orders. [observer]"),
     ] = None,
-    port: Annotated[
-        int, typer.Option(min=1, max=65535, help="Port of the page; the next free one if it is taken.")
-    ] = PORT,
-    dark: Annotated[bool, typer.Option("--dark", help="Use dark colours.")] = False,
-    open_page: Annotated[bool, typer.Option("--open", help="Open it in the browser.")] = False,
-    with_run: Annotated[
-        bool, typer.Option("--with-run", hidden=True, help="Wait for the run, and end with it.")
-    ] = False,
+    port: Annotated[int, Option(min=1, max=65535, help="Port of the page; the next free one if it is taken.")] = PORT,
+    dark: Annotated[bool, Option("--dark", help="Use dark colours.")] = False,
+    open_page: Annotated[bool, Option("--open", help="Open it in the browser.")] = False,
+    with_run: Annotated[bool, Option("--with-run", hidden=True, help="Wait for the run, and end with it.")] = False,
 ) -> int:
     """Show a run in the browser, in three dimensions: a live one, or a recording."""
     require_viser()
@@ -184,13 +175,13 @@ class _Top:
 
 @app.command(epilog=example("replay runs/first", "replay runs/first --case event --rate 5 --loop"))
 def replay(
-    run: Annotated[str, typer.Argument(metavar="RUN", help="Folder of a run, or a recording (.mcap).")],
+    run: Annotated[str, Argument(metavar="RUN", help="Folder of a run, or a recording (.mcap).")],
     *,
     case: Case = None,
-    rate: Annotated[float, typer.Option(min=0.01, max=100.0, help="Speed, as a multiple of real time.")] = 1.0,
-    loop: Annotated[bool, typer.Option("--loop", help="Restart at the end.")] = False,
+    rate: Annotated[float, Option(min=0.01, max=100.0, help="Speed, as a multiple of real time.")] = 1.0,
+    loop: Annotated[bool, Option("--loop", help="Restart at the end.")] = False,
     connect: Connect = None,
-    realm: Annotated[str | None, typer.Option(metavar="NAME", help="First chunk of the keys. [the run's]")] = None,
+    realm: Annotated[str | None, Option(metavar="NAME", help="First chunk of the keys. [the run's]")] = None,
     lab: Lab = None,
     identity: As = "operator",
 ) -> None:
