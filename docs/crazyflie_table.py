@@ -11,9 +11,10 @@ from math import factorial, pi
 import numpy as np
 
 from agents.kinds.crazyflie import CRAZYFLIE
+from agents.vectors import ZERO
 from twins.arrays import Array
-from twins.devices.crazyflie.flock import LOST, Estimator
-from twins.devices.crazyflie.planner import ORDER, OnboardPlanners, evaluate, polynomial
+from twins.devices.crazyflie.planner import ORDER, OnboardPlanner, evaluate, polynomial
+from twins.devices.crazyflie.vehicle import LOST, Estimator
 from twins.engines.engine import Engine, EngineInput
 from twins.engines.mujoco_engine import RigidBody
 from twins.engines.point_mass import PointMass
@@ -51,15 +52,15 @@ def minimum_snap_difference(rng: np.random.Generator) -> float:
 
 def spiral_difference(angle: float, last: float) -> float:
     """Largest distance [m] from an arc of `angle` [rad] from a radius of 1 m to `last` [m] to the spiral itself."""
-    planner, span = OnboardPlanners(1), 5.0
+    planner, span = OnboardPlanner(), 5.0
     planner.spiral(
-        0, 0.0, np.zeros(4), angle=angle, radii=(1.0, last), climb=0.0, span=span, sideways=False, clockwise=False
+        0.0, np.zeros(4), angle=angle, radii=(1.0, last), climb=0.0, span=span, sideways=False, clockwise=False
     )
     worst = 0.0
     for share in np.linspace(0.0, 1.0, 101):
         radius, turn = 1.0 + (last - 1.0) * share, angle * share
         spiral = np.array([radius * np.sin(turn), 1.0 - radius * np.cos(turn)])
-        worst = max(worst, float(np.linalg.norm(planner.goal(span * share)[0, :2] - spiral)))
+        worst = max(worst, float(np.linalg.norm(planner.state(span * share)[0][:2] - spiral)))
     return worst
 
 
@@ -83,14 +84,14 @@ def kalman() -> Callable[[], float]:
 
 def twin() -> Callable[[], float]:
     """Variance [m²] of the twin's estimate, tick by tick."""
-    estimator, tick, no = Estimator(1), 0, np.array([False])
+    estimator, tick = Estimator(ZERO, 0.0), 0
 
     def advance() -> float:
         nonlocal tick
         tick += 1
-        estimator.add_external(0, DT * tick, (0.0, 0.0, 0.0), np.zeros(3))
-        estimator.advance(DT * tick, DT, no, no, flying=no)
-        return float(estimator.variance[0])
+        estimator.add_external(DT * tick, ZERO, ZERO)
+        estimator.advance(DT * tick, DT, ready=False, flow=False, flying=False)
+        return estimator.variance
 
     return advance
 
@@ -127,11 +128,11 @@ def step(axis: int, size: float) -> Array:
 
 def planned(span: float) -> Array:
     """Setpoints (T, 4) of a plan of 2 m along x in `span` [s]."""
-    planner = OnboardPlanners(1)
+    planner = OnboardPlanner()
     start = np.array([0.0, 0.0, 1.0, 0.0])
     goal = start + np.array([2.0, 0.0, 0.0, 0.0])
-    planner.go_to(0, 0.0, start, np.zeros(3), goal=goal, span=span, relative=False, linear=False)
-    return np.array([planner.goal(DT * k)[0] for k in range(round((span + 2.0) / DT))])
+    planner.go_to(0.0, start, ZERO, goal=goal, span=span, relative=False, linear=False)
+    return np.array([planner.state(DT * k)[0] for k in range(round((span + 2.0) / DT))])
 
 
 def main() -> None:

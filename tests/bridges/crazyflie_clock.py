@@ -15,6 +15,7 @@ from agents.protocols import crtp
 from agents.protocols.crazyflie import chosen
 from agents.protocols.crtp import HighLevel, Log, Port
 from agents.ticks import Ticks
+from agents.vectors import ZERO
 from bridges.crazyflie import flight, telemetry, trajectory
 from bridges.crazyflie.flight import FlightControl, FlightPhase
 from bridges.crazyflie.link import BUSY_S
@@ -23,7 +24,6 @@ from bridges.crazyflie.telemetry import Telemetry
 from tests.requests import request
 from tests.waiting import ManualClock
 from twins.devices.crazyflie.device import CrazyflieTwin
-from twins.devices.crazyflie.supervisor import SupervisorState
 from twins.devices.crazyflie.tables import LOG_CODES, PACKINGS
 from twins.devices.device import DeviceRequest, Faults
 
@@ -182,7 +182,9 @@ class Fleet(ManualClock):
         asked = request("crazyflie", ["crazyflie-twin"] * rows, device={"link": "radio"} | device)
         self.settings = chosen("", device, external=False)
         self.twin = CrazyflieTwin(DeviceRequest(body=asked, faults=Faults()))
-        self.twin.flock.estimator.error[:] = self.twin.flock.estimator.turn[:] = 0.0  # set up
+        self.vehicles = [drone.vehicle for drone in self.twin.drones]
+        for vehicle in self.vehicles:
+            vehicle.estimator.error, vehicle.estimator.turn = ZERO, 0.0  # set up
         self.drones = [Drone(self, row) for row in range(rows)]
         self.ages = []  # (k, rows) ages of poses [s]
         self.fastest = self.touch = 0.0  # fastest descent, and fastest near the floor [m/s]
@@ -233,7 +235,7 @@ class Fleet(ManualClock):
 
     @property
     def heights(self):
-        return self.twin.flock.place[:, 2]
+        return self.twin.truth()[0][:, 2]
 
     @property
     def phases(self):
@@ -246,11 +248,11 @@ class Fleet(ManualClock):
     @property
     def supervised(self):
         """State of the first drone's supervisor."""
-        return SupervisorState(self.twin.flock.supervisor.state[0])
+        return self.vehicles[0].supervisor.state
 
     def landed(self):
         """Fly on until the motors of the first drone are off: whether it was on the floor then, and never fast."""
-        while self.twin.flock.quadrotor.flying[0]:
+        while self.vehicles[0].model.flying:
             self.run(0.02)
         return self.heights[0] < 0.02 and self.soft
 
@@ -264,7 +266,7 @@ class Fleet(ManualClock):
         self.client()
         self.twin.advance(self.now - self._begin)
         self.ages.append(self.now - np.array([drone.telemetry.pose_time for drone in self.drones]))
-        sinks = -self.twin.flock.quadrotor.velocity[:, 2]
+        sinks = -np.array([vehicle.model.velocity[2] for vehicle in self.vehicles])
         self.fastest = max(self.fastest, sinks.max())
         self.touch = max(self.touch, sinks[self.heights < NEAR].max(initial=0.0))
         for row, drone in enumerate(self.drones):

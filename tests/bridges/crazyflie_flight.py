@@ -9,7 +9,6 @@ from tests.bridges.driver import Driver
 from tests.requests import request
 from tests.twins.loopback import Served
 from twins.devices.crazyflie.device import CrazyflieTwin
-from twins.devices.crazyflie.supervisor import SupervisorState
 
 
 class Process(Driver):
@@ -80,9 +79,9 @@ def truth(twin, row=0):
 
 def supervised(twin, row=0):
     """State of the supervisor."""
-    return SupervisorState(twin.device.flock.supervisor.state[row])
+    return twin.device.drones[row].vehicle.supervisor.state
 
 
 def motors(twin, row=0):
     """Whether its motors run."""
-    return bool(twin.device.flock.quadrotor.flying[row])
+    return twin.device.drones[row].vehicle.model.flying

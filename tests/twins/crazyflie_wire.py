@@ -3,11 +3,12 @@
 import pickle
 import struct
 
+import numpy as np
+
 from agents.protocols.crtp import HighLevel, Port, Setpoint, SupervisorCommand
 from tests.requests import request
 from twins.devices.crazyflie.drone import Drone
-from twins.devices.crazyflie.flock import Flock
-from twins.devices.crazyflie.supervisor import SupervisorState
+from twins.devices.crazyflie.vehicle import Vehicle
 from twins.devices.device import Faults
 
 DT = 0.01
@@ -20,14 +21,14 @@ class Wire:
 
     def __init__(self, device=None, start=None, yaw=0.0, external=False, **faults):
         asked = request("crazyflie", ["x"], device=device, start=start, yaw=yaw, external=external)
-        self.flock = Flock(asked, Faults(**faults))
-        self.flock.estimator.turn[:] = 0.0  # it was told how it stands
+        self.vehicle = Vehicle(asked, Faults(**faults), 0)
+        self.vehicle.estimator.turn = 0.0  # it was told how it stands
         self.sent = []
         self._make_drone()
         self.ticks = 0
 
     def _make_drone(self):
-        self.drone = Drone(self.flock, 0, lambda port, channel, data: self.sent.append((port, channel, data)))
+        self.drone = Drone(self.vehicle, lambda port, channel, data: self.sent.append((port, channel, data)))
 
     @property
     def t(self):
@@ -35,37 +36,38 @@ class Wire:
 
     @property
     def position(self):
-        return self.flock.quadrotor.position[0]
+        return np.array(self.vehicle.model.held)
 
     @property
     def velocity(self):
-        return self.flock.quadrotor.velocity[0]
+        return np.array(self.vehicle.model.velocity)
 
     @property
     def yaw(self):
-        return self.flock.quadrotor.yaw[0]
+        return self.vehicle.model.yaw
 
     @property
     def estimate(self):
         """Position as the drone believes it."""
-        return self.flock.estimate[0]
+        return np.array(self.vehicle.estimate)
 
     @property
     def planned(self):
         """Pose that the planner asks for now."""
-        return self.flock.planner.goal(self.t)[0]
+        goal = self.vehicle.planner.goal(self.t)
+        return np.full(4, np.nan) if goal is None else goal
 
     @property
     def info(self):
-        return self.flock.info(0)
+        return self.vehicle.info
 
     @property
     def state(self):
-        return SupervisorState(self.flock.supervisor.state[0])
+        return self.vehicle.supervisor.state
 
     @property
     def motors(self):
-        return bool(self.flock.quadrotor.flying[0])
+        return self.vehicle.model.flying
 
     def put(self, port, channel, *data):
         """Sends a packet; returns the answers."""
@@ -86,7 +88,7 @@ class Wire:
             if each is not None:
                 each()
             self.ticks += 1
-            self.flock.advance(self.t)
+            self.vehicle.advance(self.t)
             self.sent.clear()
             for packet in self.drone.logs.due(self.t):
                 self.drone.send(Port.LOG, 2, packet)
@@ -156,16 +158,16 @@ class Wire:
 
     def hovering(self, height=1.0):
         """In the air, at rest, held by the planner; what begins alike takes off once."""
-        begin, values = pickle.dumps((self.flock, self.ticks, height)), self.drone.values
+        begin, values = pickle.dumps((self.vehicle, self.ticks, height)), self.drone.values
         if begin in HOVERING:
-            self.flock, self.ticks = pickle.loads(HOVERING[begin])  # noqa: S301 (made here)
+            self.vehicle, self.ticks = pickle.loads(HOVERING[begin])  # noqa: S301 (made here)
             self._make_drone()
             assert self.drone.values == values  # no parameter was set
             return self
         assert self.takeoff(height, 2.0) == 0
         self.wait(SETTLED_S)
         assert abs(self.position[2] - height) < 0.01
-        HOVERING[begin] = pickle.dumps((self.flock, self.ticks))
+        HOVERING[begin] = pickle.dumps((self.vehicle, self.ticks))
         return self
 
     def streaming(self, height=1.0):

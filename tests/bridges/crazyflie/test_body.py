@@ -120,12 +120,12 @@ def test_lighthouse(tmp_path):
         return {"positioning": LIGHTHOUSE | {"file": lighthouse_file(tmp_path, *stations)}}
 
     with connected_twins(device=device(0, 1)) as (twin, process):
-        memories = twin.device.flock.decks.memories[0]
+        memories = twin.device.drones[0].vehicle.decks.memories
         assert (memories.geometries, memories.calibrations) == (0b11, 0b11)
         assert memories.stored == (0b1111, 0b1111)
         assert struct.unpack("<fff", memories.read(MemoryKind.LIGHTHOUSE, 0x100, 12)) == pytest.approx((1.25, 0.5, 2.0))
         assert twin.device.drones[0].value("stabilizer.estimator") == 2
-        assert twin.device.flock.estimator.variance[0] < 1e-2
+        assert twin.device.drones[0].vehicle.estimator.variance < 1e-2
         process.until(lambda: process.state.note[0] == "", "nothing to say")
         process.close()
         memories.stored = (0, 0)
@@ -148,11 +148,11 @@ def test_loco():
     anchors = [[-2.0, -2.0, 0.0], [2.0, -2.0, 2.5], [2.0, 2.0, 0.0], [-2.0, 2.0, 2.5]]
     device = {"positioning": {"system": "loco", "mode": "tdoa3", "anchors": anchors}}
     with connected_twins(device=device) as (twin, _):
-        known = twin.device.flock.decks.memories[0].anchors()
+        known = twin.device.drones[0].vehicle.decks.memories.anchors()
         assert {number: list(place) for number, place in known.items()} == dict(enumerate(anchors))
         value = twin.device.drones[0].value
         assert (value("loco.mode"), value("stabilizer.estimator")) == (3, 2)
-        assert twin.device.flock.estimator.variance[0] < 1e-2
+        assert twin.device.drones[0].vehicle.estimator.variance < 1e-2
 
 
 def test_external_position():
@@ -168,7 +168,7 @@ def test_external_position():
         process.truth = twin.truth
         process.until(lambda: np.isfinite(process.state.position[0]).all(), "settled")
         assert twin.device.drones[0].value("locSrv.extPosStdDev") == pytest.approx(0.02)
-        assert twin.device.flock.estimator.received[0] > 10
+        assert twin.device.drones[0].vehicle.estimator.received > 10
         process.takeoff(0.3)
         process.lead((0.3, 0.1, 0.4, 0.0))
         process.until(lambda: np.abs(truth(twin) - [0.3, 0.1, 0.4]).max() < 0.03, "goal")

@@ -49,11 +49,11 @@ class Descent:
     """Fastest descent of each row [m/s], by the twin's own velocities; read at every tick of a process."""
 
     def __init__(self, twin, process):
-        self.fastest, self._flock = np.zeros(len(twin.addresses)), twin.device.flock
+        self.fastest, self._drones = np.zeros(len(twin.addresses)), twin.device.drones
         watching(process, self._notice)
 
     def _notice(self, _state):
-        self.fastest = np.maximum(self.fastest, -self._flock.quadrotor.velocity[:, 2])
+        self.fastest = np.maximum(self.fastest, [-drone.vehicle.model.velocity[2] for drone in self._drones])
 
     def soft(self):
         return self.fastest.max() < SINKS
@@ -167,15 +167,16 @@ def test_radio_gap_with_motion_capture_ends_in_landing():
 def test_setpoints_go_on_beside_external_positions():
     """Two packets in each period, and room for one in the queue of the driver: neither starves the other."""
     with connected_twins(rows=2, device=RADIO, external=True) as (twin, process):
-        process.truth, flock, ages = twin.truth, twin.device.flock, []
+        process.truth, ages = twin.truth, []
+        vehicles = [drone.vehicle for drone in twin.device.drones]
         process.until(lambda: np.isfinite(process.state.position).all(), "settled")
         process.takeoff(HEIGHT)
         hovering(process, rows=2).run(0.5)
-        received = flock.estimator.received.copy()
-        watching(process, lambda _: ages.append(flock.commander.setpoint_age(flock.t)))
+        received = [vehicle.estimator.received for vehicle in vehicles]
+        watching(process, lambda _: ages.extend(vehicle.t - vehicle.commander.received for vehicle in vehicles))
         process.run(4.0)
         assert np.max(ages) < 0.4, "the firmware levels out after 0.5 s"
-        assert (flock.estimator.received - received).min() > 30
+        assert min(np.subtract([vehicle.estimator.received for vehicle in vehicles], received)) > 30
         process.land()
 
 
@@ -220,7 +221,7 @@ def test_a_radio_that_becomes_slow_gets_fewer_logs():
 def test_recovery_from_a_crash_is_asked_for():
     """In another session: safelink is still on from this one, which ends without a word, and the air is gone."""
     with connected_twins(device=RADIO) as (twin, process):
-        twin.device.flock.supervisor.state[0] = SupervisorState.CRASHED
+        twin.device.drones[0].vehicle.supervisor.state = SupervisorState.CRASHED
         process.noted("crashed: put it upright")
         process.body.takeoff([0], [HEIGHT])
         process.until(lambda: "no take-off: crashed" in process.state.note[0] and not process.state.flying[0], "no")

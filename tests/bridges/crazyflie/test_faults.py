@@ -37,14 +37,14 @@ def test_faulty_drones_fail_differently_while_others_fly_on():
         Served(CrazyflieTwin, request("crazyflie", ["crazyflie-twin"], start=[[0.0, 5.0, 0.0]])) as other,
         connected([*twin.addresses, *other.addresses]) as process,
     ):
-        lines, charge = twin.device.lines, twin.device.flock.batteries.charge
+        lines, battery = twin.device.lines, twin.device.drones[empty].vehicle.battery
         process.until(lambda: np.isfinite(process.state.position).all(), "all are connected")
         lines[lossy].faults = Faults(loss=0.05)  # not before: 402 parameters take long without repetitions
         process.takeoff(0.3)
         process.lead(*places).run(0.3)
         lines[mute].faults = Faults(silent_from_s=0.0)
         lines[blinking].faults = Faults(silent_from_s=lines[blinking].t, silent_for_s=1.2)
-        charge[empty] = 0.05
+        battery.charge = 0.05
         other.kill()
         process.lead(*[(0.3, *place[1:]) for place in places[:2]], *places[2:])
         said = [set() for _ in range(6)]
@@ -70,7 +70,7 @@ def test_faulty_drones_fail_differently_while_others_fly_on():
         assert process.state.flying[: lossy + 1].all(), said[lossy]
         process.until(lambda: np.abs(twin.truth()[0][:2, 0] - 0.3).max() < 0.03, "goals")
         assert process.t - process.state.time[well] < 0.5
-        charge[empty] = 0.02  # without load its voltage has recovered
+        battery.charge = 0.02  # without load its voltage has recovered
         process.until(lambda: process.state.note[empty].endswith("; battery low"), "empty battery")
         process.body.takeoff([empty], [0.5])
         process.noted("no take-off: battery low", row=empty)
@@ -98,7 +98,7 @@ def test_reset_in_the_air():
         process.takeoff(0.4)
         process.lead((0.0, 0.0, 0.4, 0.0)).run(0.3)
         drone = twin.device.drones[0]
-        twin.device.flock.restart(0)
+        twin.device.drones[0].vehicle.restart()
         drone.start()
         process.until(lambda: not process.state.flying[0], "seen")
         process.decide = None
@@ -122,7 +122,7 @@ def test_new_link_does_not_move_a_flow_deck():
         process.until(lambda: pilot.link is not link_before and not process.state.note[0], "a new link")
         assert process.state.position[0, 0] == pytest.approx(truth(twin)[0], abs=0.02)
         assert truth(twin)[0] > 0.3
-        twin.device.flock.restart(0)
+        twin.device.drones[0].vehicle.restart()
         twin.device.drones[0].start()
         process.until(lambda: abs(process.state.position[0, 0]) < 0.02 and not process.state.note[0], "at its start")
 

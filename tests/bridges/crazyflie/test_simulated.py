@@ -54,7 +54,8 @@ def test_rates_that_a_radio_carries_leave_poses_young(monkeypatch, rows, exchang
 def test_take_off_with_yaw_leaves_poses_young(monkeypatch):
     """Seventeen parts of polynomials, one at a time: in a burst their answers made poses 0.2 s old."""
     with Fleet(monkeypatch, 8, 400.0, stream_hz=4.0) as fleet:
-        fleet.twin.flock.quadrotor.yaw[:] = 0.5
+        for vehicle in fleet.vehicles:
+            vehicle.model.yaw = 0.5
         assert np.percentile(flight_of(fleet), 99) < YOUNG_S
 
 
@@ -71,7 +72,7 @@ def test_full_queue_ages_poses_and_prevents_take_off(monkeypatch):
         assert "s old; is its radio too full" in trouble
         assert fleet.phases == {FlightPhase.GROUND}
         assert line.dropped == 0
-        assert not fleet.twin.flock.quadrotor.flying.any()
+        assert not fleet.vehicles[0].model.flying
 
 
 def test_gaps_after_the_take_off(monkeypatch):
@@ -94,11 +95,11 @@ def test_ready_at_height_in_spite_of_the_overshoot(fleet, height, soon):
     """Followed by lifecycle and detectors as in a robot's process, for 12 s at its height."""
     lifecycle, setpoint = Lifecycle(CRAZYFLIE, height, 100.0), (0.0, 0.0, height, 0.0)
     ascent, motion_check = Ascent(CRAZYFLIE, height), MotionCheck(CRAZYFLIE)
-    flock = fleet.twin.flock
+    (vehicle,) = fleet.vehicles
 
     def advance(t, *, ready=False):
-        position, velocity = (tuple(each[0].tolist()) for each in (flock.place, flock.velocity))
-        flying, yaw = bool(flock.quadrotor.flying[0]), float(flock.quadrotor.yaw[0])
+        position, velocity = vehicle.place, vehicle.velocity
+        flying, yaw = vehicle.model.flying, vehicle.model.yaw
         lifecycle.advance(t, position, velocity, flying=flying, ready=ready)
         ascent.update(t, lifecycle.climbing, flying, position)
         motion_check.update(t, setpoint, position, yaw, not lifecycle.climbing)

@@ -14,7 +14,7 @@ from tests.bridges.crazyflie_clock import clocked
 from tests.cases import mostly_slow
 from tests.waiting import ManualClock
 from twins.devices.crazyflie.memory import Memories
-from twins.devices.crazyflie.planner import OnboardPlanners, evaluate, polynomial
+from twins.devices.crazyflie.planner import OnboardPlanner, evaluate, polynomial
 from twins.devices.crazyflie.trajectories import Trajectories
 
 DT = 0.01
@@ -26,7 +26,7 @@ class Board(ManualClock):
 
     def __init__(self, monkeypatch):
         super().__init__(100.0)
-        self.memories, self.planner, self.lost = Memories(), OnboardPlanners(1), 0
+        self.memories, self.planner, self.lost = Memories(), OnboardPlanner(), 0
         clocked(monkeypatch, self)
         self.trajectories = Trajectories(self.memories)
         self.sent, self.started = [], []
@@ -48,12 +48,12 @@ class Board(ManualClock):
             relative, turned, reverse, number, scale = crtp.START_2.unpack_from(data, 2)
             assert not relative
             _, pieces = self.trajectories.pieces(number, None, turned=turned, reverse=reverse, scale=scale)
-            self.planner.follow(0, 0.0, pieces)
+            self.planner.follow(0.0, pieces)
             self.started.append(number)
 
     def sampled(self, seconds):
         """Poses (k, 4) of the plan, `DT` apart."""
-        return np.array([self.planner.goal(k * DT)[0] for k in range(round(seconds / DT))])
+        return np.array([self.planner.goal(k * DT) for k in range(round(seconds / DT))])
 
     def hold(self, x, yaw=0.0):
         """Called again and again until the setpoint is started; returns the packets that were sent."""

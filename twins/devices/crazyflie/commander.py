@@ -2,128 +2,116 @@
 
 from __future__ import annotations
 
+from math import cos, inf, isnan, nan, radians, remainder, sin, tan, tau
 from typing import Final
 
-import numpy as np
-from numpy.typing import NDArray
-
-from twins.arrays import Array, Mask
+from agents.vectors import UNKNOWN, Setpoint, Vector, clamp
+from twins.arrays import Array
 from twins.models.quadrotor import GRAVITY
 
-STEEPEST: Final = np.radians(20.0)  # the firmware's default limit of roll and pitch
-NEITHER: Final = (np.nan, np.nan, np.nan)
+STEEPEST: Final = radians(20.0)  # the firmware's default limit of roll and pitch
 
 
 class Commander:
-    """Setpoints of N rows: each axis of a row follows a position, a velocity, or nothing.
+    """Setpoint of one drone: each axis follows a position, a velocity, or nothing.
 
     A low-level setpoint has priority over the planner for ever, unless the client announces the end of its setpoints.
     """
 
-    def __init__(self, rows: int) -> None:
-        self.target = np.full((rows, 3), np.nan)  # position setpoints [m], NaN on axes without one
-        self.thrust = np.full(rows, np.nan)  # raw thrust instead of vertical setpoints, of 65,535; NaN without one
-        self.on = np.zeros(rows, dtype=bool)  # motors requested
-        self._velocity = np.full((rows, 3), np.nan)
-        self._body = np.zeros(rows, dtype=bool)
-        self._heading = np.full(rows, np.nan)
-        self._turn = np.zeros(rows)
-        self._lean = np.zeros((rows, 2))  # acceleration along the axes of the robot, on axes without setpoint [m/s²]
-        self._received = np.full(rows, -np.inf)
-        self._low_level: NDArray[np.bool_] = np.zeros(rows, dtype=bool)
+    def __init__(self) -> None:
+        self.command(-inf, on=False)
+        self._low_level = False
 
     def command(
         self,
-        row: int,
         t: float,
         *,
-        target: tuple[float, float, float] = NEITHER,
-        velocity: tuple[float, float, float] = NEITHER,
-        heading: float = np.nan,
+        target: Vector = UNKNOWN,
+        velocity: Vector = UNKNOWN,
+        heading: float = nan,
         turn: float = 0.0,
         body: bool = False,
         lean: tuple[float, float] = (0.0, 0.0),
-        thrust: float = np.nan,
+        thrust: float | None = None,
         on: bool = True,
     ) -> None:
         """Set a low-level setpoint.
 
         Args:
+            t: [s].
             target: Position [m]; NaN on axes without one.
             velocity: [m/s]; NaN on axes without one.
             heading: Yaw [rad], or NaN: use `turn`.
             turn: Yaw rate [rad/s].
             body: Velocity along the axes of the robot.
             lean: Roll to the right and pitch nose up [rad]; they count on axes without setpoint.
-            thrust: Raw thrust, of 65,535; it counts without a vertical setpoint.
+            thrust: Raw thrust instead of a vertical setpoint, of 65,535.
             on: Motors on.
         """
-        self.target[row], self._velocity[row], self.thrust[row] = target, velocity, thrust
-        self._heading[row], self._turn[row], self._body[row], self.on[row] = heading, turn, body, on
-        roll, pitch = np.clip(lean, -STEEPEST, STEEPEST)
-        self._lean[row] = -GRAVITY * np.tan([pitch, roll])
-        self._received[row] = t
-        self._low_level[row] = True
+        self.target, self._velocity, self.thrust = target, velocity, thrust
+        self._heading, self._turn, self._body = heading, turn, body
+        roll, pitch = (clamp(angle, -STEEPEST, STEEPEST) for angle in lean)
+        # acceleration along the axes of the robot, on axes without setpoint [m/s²]
+        self._lean = -GRAVITY * tan(pitch), -GRAVITY * tan(roll)
+        self.on, self.received, self._low_level = on, t, True
 
-    def stop(self, row: int) -> None:
-        """Forget the setpoint of a row: motors off."""
-        self.on[row] = self._low_level[row] = False
+    def stop(self) -> None:
+        """Forget the setpoint: motors off."""
+        self.on = self._low_level = False
 
-    def release(self, row: int) -> None:
+    def release(self) -> None:
         """End the client's setpoints: the planner's setpoints count again."""
-        self._low_level[row] = False
+        self._low_level = False
 
-    def take_planned(self, t: float, goal: Array) -> Mask:
-        """Use the planners' setpoints (N, 4), NaN for none; returns the rows (N,) without low-level setpoints."""
-        listening = ~self._low_level
-        planned = listening & np.isfinite(goal[:, 0])
-        self.target[listening], self._velocity[listening], self._body[listening] = goal[listening, :3], np.nan, False
-        self._lean[listening], self.thrust[listening] = 0.0, np.nan
-        self._heading[planned], self._turn[planned] = goal[planned, 3], 0.0
-        self.on[listening] = planned[listening]
-        self._received[listening] = t
-        return listening
-
-    def setpoint_age(self, t: float) -> Array:
-        """Age (N,) of the current setpoints [s]."""
-        return t - self._received
+    def take_planned(self, t: float, goal: Array | None) -> None:
+        """Use the planner's setpoint (4,), None without a plan, unless there is a low-level setpoint."""
+        if self._low_level:
+            return
+        if goal is None:
+            self.command(t, on=False)
+        else:
+            x, y, z, yaw = goal.tolist()
+            self.command(t, target=(x, y, z), heading=yaw)
+        self._low_level = False
 
     def model_setpoint(
         self,
-        position: Array,
-        velocity: Array,
-        yaw: Array,
+        position: Vector,
+        velocity: Vector,
+        yaw: float,
         *,
-        level: Mask,
-        gain: Array,
+        level: bool,
+        gain: Vector,
         speed_gain: float,
         turn_gain: float,
-    ) -> Array:
-        """Setpoints as positions and yaws (N, 4), the input of the motion model.
+    ) -> Setpoint:
+        """Setpoint as position and yaw, the input of the motion model.
 
         Args:
-            position: (N, 3) estimated positions [m].
-            velocity: (N, 3) [m/s].
-            yaw: (N,) [rad].
-            level: (N,) rows without horizontal setpoint.
-            gain: (3,) of the model's position controller [1/s]: a velocity v is the position v / gain ahead.
+            position: Estimated [m].
+            velocity: [m/s].
+            yaw: [rad].
+            level: Without horizontal setpoint.
+            gain: Of the model's position controller [1/s]: a velocity v is the position v / gain ahead.
             speed_gain: Of its horizontal velocity controller [1/s]: an acceleration a is a / speed_gain faster.
             turn_gain: Likewise of its yaw controller [1/s].
         """
-        cos, sin = np.cos(yaw), np.sin(yaw)
-        v, body = self._velocity, self._body
-        speed = v.copy()
-        speed[:, 0] = np.where(body, cos * v[:, 0] - sin * v[:, 1], v[:, 0])
-        speed[:, 1] = np.where(body, sin * v[:, 0] + cos * v[:, 1], v[:, 1])
-        target = self.target.copy()
-        target[level, :2] = speed[level, :2] = np.nan
-        free = velocity.copy()  # axes without setpoint keep their velocity, or lean
-        lean = np.where(level[:, None], 0.0, self._lean) / speed_gain
-        free[:, 0] += cos * lean[:, 0] - sin * lean[:, 1]
-        free[:, 1] += sin * lean[:, 0] + cos * lean[:, 1]
-        speed = np.where(np.isnan(speed), free, speed)
-        target = np.where(np.isnan(target), position + speed / gain, target)
-        turning = np.isnan(self._heading) | level
-        heading = np.where(turning, yaw + np.where(level, 0.0, self._turn) / turn_gain, self._heading)
-        near = yaw + (heading - yaw + np.pi) % (2.0 * np.pi) - np.pi
-        return np.concatenate([target, near[:, None]], axis=1)
+        c, s = cos(yaw), sin(yaw)
+        (ahead, left), (v_x, v_y, v_z), (x, y, z) = self._lean, self._velocity, self.target
+        if self._body:
+            v_x, v_y = c * v_x - s * v_y, s * v_x + c * v_y
+        if level:
+            x = y = v_x = v_y = nan
+            ahead = left = 0.0
+        free_x, free_y, free_z = velocity  # axes without setpoint keep their velocity, or lean
+        free_x += (c * ahead - s * left) / speed_gain
+        free_y += (s * ahead + c * left) / speed_gain
+        axes = zip((x, y, z), (v_x, v_y, v_z), (free_x, free_y, free_z), position, gain, strict=True)
+        x, y, z = (
+            place + (free if isnan(speed) else speed) / k if isnan(target) else target
+            for target, speed, free, place, k in axes
+        )
+        turn = 0.0 if level else self._turn / turn_gain
+        if not level and not isnan(self._heading):
+            turn = remainder(self._heading - yaw, tau)
+        return x, y, z, yaw + turn

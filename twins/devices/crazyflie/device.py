@@ -6,6 +6,7 @@ import errno
 import socket
 import struct
 from collections.abc import Sequence
+from math import inf
 from typing import Final
 
 import numpy as np
@@ -16,8 +17,8 @@ from agents.protocols import crazyradio
 from agents.protocols.crtp import Port, header
 from twins.arrays import Array
 from twins.devices.crazyflie.drone import Drone
-from twins.devices.crazyflie.flock import Flock
 from twins.devices.crazyflie.radio import HOST, Air, RadioLink
+from twins.devices.crazyflie.vehicle import Vehicle
 from twins.devices.device import Device, DeviceRequest, FaultyLink
 
 SCANNED_PORTS: Final = range(19850, 19860)  # at which cflib looks for simulations
@@ -100,14 +101,14 @@ class CrazyflieTwin(Device):
         strange = sorted({kind.name for kind in body.kinds if kind != CRAZYFLIE})
         if strange:
             raise BodyError(f"the Crazyflie twin is no twin of a {', '.join(strange)}; name another body")
-        self.flock = Flock(body, request.faults)
+        vehicles = [Vehicle(body, request.faults, row) for row in range(len(body.names))]
         self._air: Air | None = None
         self._row: dict[socket.socket, int] = {}
         self.lines = self._open_links(request)
-        self.drones = [Drone(self.flock, row, line.send) for row, line in enumerate(self.lines)]
+        self.drones = [Drone(vehicle, line.send) for vehicle, line in zip(vehicles, self.lines, strict=True)]
         self.addresses = tuple(line.address for line in self.lines)
-        self._gaps = [sorted(gaps) for gaps in self.flock.gaps]  # that have not begun
-        self._took_off = np.full(len(self.lines), np.inf)  # [s] first time of each
+        self._gaps = [sorted(vehicle.settings.gaps) for vehicle in vehicles]  # that have not begun
+        self._took_off = [inf] * len(vehicles)  # [s] first time of each
 
     def _open_links(self, request: DeviceRequest) -> Sequence[UdpLink | RadioLink]:
         random = [np.random.default_rng([seed, row]) for row, seed in enumerate(request.body.seeds)]
@@ -143,14 +144,14 @@ class CrazyflieTwin(Device):
             return  # not a packet of this protocol
 
     def advance(self, t: float) -> None:
-        locked = self.flock.advance(t)
-        self._took_off[self.flock.quadrotor.flying & (self._took_off > t)] = t
-        for line, drone in zip(self.lines, self.drones, strict=True):
+        for row, (line, drone, gaps) in enumerate(zip(self.lines, self.drones, self._gaps, strict=True)):
             line.t = t
-            gaps = self._gaps[drone.row]
-            if gaps and t - self._took_off[drone.row] >= gaps[0][0]:
+            locked = drone.vehicle.advance(t)
+            if drone.vehicle.model.flying:
+                self._took_off[row] = min(self._took_off[row], t)
+            if gaps and t - self._took_off[row] >= gaps[0][0]:
                 line.silence(gaps.pop(0)[1])
-            if locked[drone.row]:
+            if locked:
                 drone.console("SUP: Locked, reboot required\n")
             if not line.connected:
                 drone.logs.reset()
@@ -159,7 +160,8 @@ class CrazyflieTwin(Device):
             line.send_due()
 
     def truth(self) -> tuple[Array, Array]:
-        return self.flock.place.copy(), self.flock.quadrotor.yaw.copy()
+        vehicles = [drone.vehicle for drone in self.drones]
+        return np.array([vehicle.place for vehicle in vehicles]), np.array([vehicle.model.yaw for vehicle in vehicles])
 
     def close(self) -> None:
         for used in self.sockets():

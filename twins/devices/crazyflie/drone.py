@@ -23,8 +23,8 @@ from agents.protocols.crtp import (
     SupervisorCommand,
     Toc,
 )
+from agents.vectors import difference
 from twins.arrays import Array
-from twins.devices.crazyflie.flock import Flock
 from twins.devices.crazyflie.logs import LogBlocks
 from twins.devices.crazyflie.memory import ANCHORS
 from twins.devices.crazyflie.planner import PlannerState
@@ -38,6 +38,7 @@ from twins.devices.crazyflie.tables import (
     pack,
 )
 from twins.devices.crazyflie.trajectories import Trajectories
+from twins.devices.crazyflie.vehicle import Vehicle
 
 CONSOLE_TEXTS: Final = {  # parameters that make a Crazyflie write to its console
     "system.assertInfo": "SYS: No assert information found\n",
@@ -54,24 +55,23 @@ DEFAULT_SPEED: Final = 0.5  # [m/s] mean speed of take-offs and landings with ve
 
 @dataclass
 class Drone:
-    """Row `row` of a flock; answers go to `send`.
+    """Protocol of a vehicle; answers go to `send`.
 
     A packet that is too short raises `struct.error` or `IndexError`, one with invalid numbers `ValueError`; the device
     drops such packets.
     """
 
-    flock: Flock
-    row: int
+    vehicle: Vehicle
     send: Send
     stored: dict[int, float] = field(default_factory=dict)  # parameters stored on board
     on: bool = True
     thrust_locked: bool = True  # no thrust before a packet of zero thrust
 
     def __post_init__(self) -> None:
-        tables = inventory(self.flock.tables[self.row])
+        tables = inventory(tuple(self.vehicle.settings.tables))
         self.parameters, self.log_table = tables.parameters, tables.logs
-        self.memories = self.flock.decks.memories[self.row]
-        self.logs = LogBlocks(self.flock, self.row, self.value, tables.logs)
+        self.memories = self.vehicle.decks.memories
+        self.logs = LogBlocks(self.vehicle, self.value, tables.logs)
         self.start()
         # answer to a packet on the same port and channel, or None
         self._answer: dict[Port, Callable[[int, bytes], bytes | None]] = {
@@ -89,26 +89,26 @@ class Drone:
 
     def start(self) -> None:
         """State after switching on."""
-        flock, row = self.flock, self.row
+        vehicle, decks = self.vehicle, self.vehicle.decks
         self.thrust_locked = True
         self.memories.restart()
         self.trajectories = Trajectories(self.memories)
-        self.logs.began = flock.t
+        self.logs.began = vehicle.t
         self.values = [variable.value for variable in self.parameters.variables]
         present = {
-            "deck.bcLighthouse4": flock.decks.lighthouse[row],
-            "deck.bcLoco": flock.decks.loco[row],
-            "deck.bcDWM1000": flock.decks.loco[row],
-            "deck.bcMultiranger": flock.decks.multiranger[row],
-            "deck.bcFlow2": bool(flock.decks.flow[row]),
-            "deck.bcZRanger2": bool(flock.decks.flow[row]),
+            "deck.bcLighthouse4": decks.lighthouse,
+            "deck.bcLoco": decks.loco,
+            "deck.bcDWM1000": decks.loco,
+            "deck.bcMultiranger": decks.multiranger,
+            "deck.bcFlow2": decks.flow,
+            "deck.bcZRanger2": decks.flow,
         }
         for name, deck in present.items():
             if name in self.parameters.number:
                 self.values[self.parameters.number[name]] = int(deck)
         for number, value in self.stored.items():
             self.values[number] = value
-        flock.vertical.least[row] = self.value(LEAST)
+        vehicle.vertical.least = self.value(LEAST)
         self.logs.reset()
 
     def value(self, name: str) -> float:
@@ -136,7 +136,7 @@ class Drone:
             if data[1] == PowerSwitch.RESET_BEGIN:
                 return data[:2] + crtp.ADDRESS
             self.on = data[1] in (PowerSwitch.ON, PowerSwitch.RESET)
-            self.flock.restart(self.row)
+            self.vehicle.restart()
             self.start()
             return data[:2]
         answers = {0: data, 1: crtp.GREETING, 3: None if data else b""}  # 0: echo
@@ -154,25 +154,25 @@ class Drone:
 
     def _arm(self, *, on: bool) -> bytes:
         """Arm or disarm; returns success and state."""
-        return bytes((self.flock.arm(self.row, on=on), self.flock.supervisor.armed(self.row)))
+        return bytes((self.vehicle.arm(on=on), self.vehicle.supervisor.armed))
 
     def _recover(self) -> bytes:
         """Recover from a crash; returns success, and whether it has recovered."""
-        done = self.flock.supervisor.recover(self.row)
+        done = self.vehicle.supervisor.recover()
         return bytes((done, done))
 
     def _supervisor(self, channel: int, data: bytes) -> bytes | None:
         command, answer = (channel, data[0]), bytes((data[0] | SupervisorCommand.ANSWER,))
         if command == (0, SupervisorCommand.ASK):
-            return answer + struct.pack("<H", self.flock.info(self.row))
+            return answer + struct.pack("<H", self.vehicle.info)
         if command == (1, SupervisorCommand.ARM):
             return answer + self._arm(on=bool(data[1]))
         if command == (1, SupervisorCommand.RECOVER):
             return answer + self._recover()
         if command == (1, SupervisorCommand.STOP):
-            self.flock.supervisor.stop(self.row)
+            self.vehicle.supervisor.stop()
         elif command == (1, SupervisorCommand.WATCHDOG):
-            self.flock.supervisor.reset_watchdog(self.row, self.flock.t)
+            self.vehicle.supervisor.reset_watchdog(self.vehicle.t)
         return None
 
     # ------------------------------------------------------------------ parameters, logs, memories
@@ -242,17 +242,17 @@ class Drone:
     def _set(self, number: int, value: float) -> None:
         """Set a parameter and apply its effect."""
         before, self.values[number] = self.values[number], value
-        name, flock = self.parameters.variables[number].name, self.flock
+        name, vehicle = self.parameters.variables[number].name, self.vehicle
         if name == "kalman.resetEstimation" and value:
-            place = np.array([self.value(f"kalman.initial{axis}") for axis in "XYZ"])
-            yaw = self.value("kalman.initialYaw") - flock.quadrotor.yaw[self.row]
-            flock.estimator.reset(self.row, place - flock.place[self.row], yaw)
+            place = self.value("kalman.initialX"), self.value("kalman.initialY"), self.value("kalman.initialZ")
+            yaw = self.value("kalman.initialYaw") - vehicle.model.yaw
+            vehicle.estimator.reset(difference(place, vehicle.place), yaw)
         elif name == LEAST:
-            flock.vertical.least[self.row] = value
+            vehicle.vertical.least = value
         elif name == "lighthouse.systemType" and value != before:
             self.memories.clear_stations()
         elif name == "stabilizer.stop" and value:
-            flock.supervisor.stop(self.row)
+            vehicle.supervisor.stop()
         elif name == "memTst.resetW" and value:
             self.memories.write_errors = 0
         elif name in CONSOLE_TEXTS and value:
@@ -264,7 +264,7 @@ class Drone:
         if channel != 1:
             return None
         block = data[1] if len(data) > 1 else 0
-        return bytes((data[0], block, self.logs.execute(data[0], block, data[2:], self.flock.t)))
+        return bytes((data[0], block, self.logs.execute(data[0], block, data[2:], self.vehicle.t)))
 
     def _memory(self, channel: int, data: bytes) -> bytes | None:
         memories = self.memories
@@ -285,8 +285,8 @@ class Drone:
     # ------------------------------------------------------------------ motion
 
     def _command(self, **setpoint: object) -> None:
-        self.flock.planner.stop(self.row)
-        self.flock.commander.command(self.row, self.flock.t, **setpoint)  # type: ignore[arg-type]
+        self.vehicle.planner.stop()
+        self.vehicle.commander.command(self.vehicle.t, **setpoint)  # type: ignore[arg-type]
 
     def _thrust(self, _channel: int, data: bytes) -> None:
         roll, pitch, turn, thrust = _numbers(crtp.THRUST, data)
@@ -298,7 +298,7 @@ class Drone:
     def _setpoint(self, channel: int, data: bytes) -> None:
         if channel == 1:
             if data[0] == 0:
-                self.flock.commander.release(self.row)
+                self.vehicle.commander.release()
             return
         kind, rest, free = data[0], data[1:], math.nan
         sense = -1.0 if kind in (Setpoint.OLD_VELOCITY, Setpoint.OLD_HEIGHT, Setpoint.OLD_HOVER) else 1.0
@@ -327,7 +327,7 @@ class Drone:
         return data[:3].ljust(3, b"\0") + bytes((self._plan(data[0], data[1], data[2:]),))
 
     def _plan(self, command: int, group: int, data: bytes) -> LogStatus:
-        flock, row, planner = self.flock, self.row, self.flock.planner
+        vehicle, planner = self.vehicle, self.vehicle.planner
         if command == HighLevel.DEFINE:  # for all groups: the number of the trajectory is in the place of the mask
             return self.trajectories.define(group, *crtp.DEFINE.unpack_from(data))
         if command == HighLevel.GROUP:
@@ -337,7 +337,7 @@ class Drone:
         if group and not group & int(self.value("hlCommander.groupmask")):
             return LogStatus.OK
         if command == HighLevel.STOP:
-            planner.stop(row)
+            planner.stop()
             return LogStatus.OK
         begin = {
             HighLevel.TAKEOFF: self._climb,
@@ -352,10 +352,10 @@ class Drone:
             HighLevel.START: self._follow,
             HighLevel.START_2: self._follow,
         }.get(command)  # type: ignore[call-overload]
-        if begin is None or not flock.supervisor.may_fly[row]:
+        if begin is None or not vehicle.supervisor.may_fly:
             return LogStatus.NO_COMMAND if begin is None else LogStatus.BUSY
         # the firmware plans from its last setpoint while a plan runs, else from its estimate
-        pose = flock.pose(row) if planner.plan[row] == PlannerState.IDLE else planner.state(row, flock.t)[0]
+        pose = vehicle.pose if planner.plan == PlannerState.IDLE else planner.state(vehicle.t)[0]
         status: LogStatus = begin(command, pose, data)
         return status
 
@@ -370,28 +370,26 @@ class Drone:
         else:
             height, yaw, keep, span = _numbers(crtp.CLIMB, data)
         yaw = float(pose[3]) if keep else yaw
-        return self.flock.planner.climb(
-            self.row, self.flock.t, pose, height=height, yaw=yaw, span=span, landing=landing
-        )
+        vehicle = self.vehicle
+        return vehicle.planner.climb(vehicle.t, pose, height=height, yaw=yaw, span=span, landing=landing)
 
     def _go_to(self, command: int, pose: Array, data: bytes) -> LogStatus:
         old = command == HighLevel.OLD_GO_TO
         packing = crtp.OLD_GO_TO if old else crtp.GO_TO
-        if any(map(math.isnan, packing.unpack_from(data))) and self.flock.quadrotor.flying[self.row]:
-            self.flock.supervisor.stop(self.row)  # no plan has such values: motors off, and locked
+        if any(map(math.isnan, packing.unpack_from(data))) and self.vehicle.model.flying:
+            self.vehicle.supervisor.stop()  # no plan has such values: motors off, and locked
             return LogStatus.OK
         relative, *straight, x, y, z, yaw, span = _numbers(packing, data)
         linear = any(straight)
-        goal, velocity = np.array([x, y, z, yaw]), self.flock.quadrotor.velocity[self.row]
-        return self.flock.planner.go_to(
-            self.row, self.flock.t, pose, velocity, goal=goal, span=span, relative=relative, linear=linear
+        goal, vehicle = np.array([x, y, z, yaw]), self.vehicle
+        return vehicle.planner.go_to(
+            vehicle.t, pose, vehicle.model.velocity, goal=goal, span=span, relative=relative, linear=linear
         )
 
     def _spiral(self, _: int, pose: Array, data: bytes) -> LogStatus:
         sideways, clockwise, angle, first, last, climb, span = _numbers(crtp.SPIRAL, data)
-        return self.flock.planner.spiral(
-            self.row,
-            self.flock.t,
+        return self.vehicle.planner.spiral(
+            self.vehicle.t,
             pose,
             angle=angle,
             radii=(first, last),
@@ -409,32 +407,32 @@ class Drone:
         start = pose if relative else None
         status, pieces = self.trajectories.pieces(number, start, turned=turned, reverse=reverse, scale=scale)
         if pieces:
-            self.flock.planner.follow(self.row, self.flock.t, pieces)
+            self.vehicle.planner.follow(self.vehicle.t, pieces)
         return status
 
     # ------------------------------------------------------------------ position
 
     def _location(self, channel: int, data: bytes) -> bytes | None:
-        flock, row = self.flock, self.row
+        vehicle, decks = self.vehicle, self.vehicle.decks
         if channel == 0:
-            flock.estimator.add_external(row, flock.t, _numbers(crtp.VECTOR, data), flock.place[row])
+            vehicle.estimator.add_external(vehicle.t, _numbers(crtp.VECTOR, data), vehicle.place)
             return None
         kind, rest = data[0], data[1:]
         if kind == Location.POSE:
             x, y, z, qx, qy, qz, qw = _numbers(crtp.POSE, rest)
-            flock.estimator.add_external(row, flock.t, (x, y, z), flock.place[row])
+            vehicle.estimator.add_external(vehicle.t, (x, y, z), vehicle.place)
             yaw = math.atan2(2.0 * (qw * qz + qx * qy), 1.0 - 2.0 * (qy * qy + qz * qz))
-            flock.estimator.turn[row] = math.remainder(yaw - flock.quadrotor.yaw[row], math.tau)
-        elif kind == Location.LPP and flock.decks.loco[row]:
+            vehicle.estimator.turn = math.remainder(yaw - vehicle.model.yaw, math.tau)
+        elif kind == Location.LPP and decks.loco:
             if rest[1] == crtp.ANCHOR_POSITION and rest[0] < ANCHORS:
-                flock.decks.memories[row].set_anchor(rest[0], *_numbers(crtp.VECTOR, rest[2:]))
+                decks.memories.set_anchor(rest[0], *_numbers(crtp.VECTOR, rest[2:]))
         elif kind == Location.STORE_LIGHTHOUSE:
-            flock.decks.memories[row].stored = struct.unpack_from("<HH", rest)
+            decks.memories.stored = struct.unpack_from("<HH", rest)
             return bytes((Location.STORE_LIGHTHOUSE, 1))
         elif kind == Location.STOP:
-            flock.supervisor.stop(row)
+            vehicle.supervisor.stop()
         elif kind == Location.WATCHDOG:
-            flock.supervisor.reset_watchdog(row, flock.t)
+            vehicle.supervisor.reset_watchdog(vehicle.t)
         return None
 
 

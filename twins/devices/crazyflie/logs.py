@@ -12,9 +12,10 @@ import numpy as np
 
 from agents.protocols import crtp
 from agents.protocols.crtp import Info, Log, LogStatus
+from agents.vectors import ZERO, Vector
 from twins.arrays import Array
-from twins.devices.crazyflie.flock import Flock
 from twins.devices.crazyflie.tables import LOG_TYPES, PACKINGS, VariableTable, pack
+from twins.devices.crazyflie.vehicle import Vehicle
 from twins.models.quadrotor import GRAVITY
 
 ROOM: Final = (2.0, 2.0, 2.5)  # [m] from the origin to the walls, and height: measured by the Multi-ranger
@@ -25,6 +26,7 @@ MILLISECONDS: Final = 0xFFFFFF
 BEHIND_S: Final = 1.0  # a block that is later restarts its period
 
 Read = Callable[[], float]
+Numbers = Vector | Array
 
 
 @dataclass
@@ -44,10 +46,10 @@ class Block:
 class LogBlocks:
     """The log blocks of one Crazyflie."""
 
-    def __init__(self, flock: Flock, row: int, parameter: Callable[[str], float], table: VariableTable) -> None:
+    def __init__(self, vehicle: Vehicle, parameter: Callable[[str], float], table: VariableTable) -> None:
         self.began = 0.0  # time at which the drone was switched on [s]
         self._blocks: dict[int, Block] = {}
-        known = _motion(flock, row) | _system(flock, row, parameter)  # the others are constants of the table
+        known = _motion(vehicle) | _system(vehicle, parameter)  # the others are constants of the table
         self._read: list[Read] = [
             known.get(variable.name, partial(float, variable.value)) for variable in table.variables
         ]
@@ -110,29 +112,28 @@ class LogBlocks:
         return LogStatus.OK
 
 
-def _motion(flock: Flock, row: int) -> dict[str, Read]:
+def _motion(vehicle: Vehicle) -> dict[str, Read]:
     """Estimates, sensors of motion, setpoints."""
-    quadrotor = flock.quadrotor
-    noise = np.random.default_rng(row)
+    noise = np.random.default_rng(vehicle.row)
     read: dict[str, Read] = {}
 
-    def vector(names: str, of: Callable[[], Array], scale: float = 1.0, sigma: float = 0.0) -> None:
+    def vector(names: str, of: Callable[[], Numbers], scale: float = 1.0, sigma: float = 0.0) -> None:
         """Add the components of a vector under their names."""
         for i, name in enumerate(names.split()):
             read[name] = lambda i=i: float(scale * of()[i]) + (sigma * noise.standard_normal() if sigma else 0.0)  # type: ignore[misc]
 
-    def level(of: Array) -> Array:
-        """Vector of the world (3,) in the level frame with the robot's yaw."""
-        cos, sin = math.cos(flock.estimated_yaw(row)), math.sin(flock.estimated_yaw(row))
+    def level(of: Vector) -> Array:
+        """Vector of the world in the level frame with the robot's yaw."""
+        cos, sin = math.cos(vehicle.yaw), math.sin(vehicle.yaw)
         return np.array([cos * of[0] + sin * of[1], cos * of[1] - sin * of[0], of[2]])
 
     def angles() -> Array:
-        return np.degrees([*flock.attitude[row], math.remainder(flock.estimated_yaw(row), math.tau)])
+        return np.degrees([*vehicle.attitude, math.remainder(vehicle.yaw, math.tau)])
 
     def force() -> Array:
         """Specific force [g], which is measured; none in free fall."""
-        falls = not quadrotor.flying[row] and flock.place[row, 2] > 0.0
-        return np.zeros(3) if falls else level(flock.acceleration[row]) / GRAVITY + [0.0, 0.0, 1.0]
+        falls = not vehicle.model.flying and vehicle.place[2] > 0.0
+        return np.zeros(3) if falls else level(vehicle.acceleration) / GRAVITY + [0.0, 0.0, 1.0]
 
     def attitude() -> Array:
         """Quaternion x, y, z, w."""
@@ -148,67 +149,67 @@ def _motion(flock: Flock, row: int) -> dict[str, Read]:
         )
 
     def thrust() -> float:
-        return float(flock.vertical.thrust[row])
+        return float(vehicle.vertical.thrust)
 
     def target() -> Array:
-        return np.asarray(np.nan_to_num(flock.commander.target[row]))
+        return np.asarray(np.nan_to_num(vehicle.commander.target))
 
     millimetres = 1.0 / crtp.MM
-    vector("stateEstimate.x stateEstimate.y stateEstimate.z", lambda: flock.estimate[row])
-    vector("kalman.stateX kalman.stateY kalman.stateZ", lambda: flock.estimate[row])
-    vector("stateEstimate.vx stateEstimate.vy stateEstimate.vz", lambda: flock.velocity[row])
-    vector("kalman.statePX kalman.statePY kalman.statePZ", lambda: level(flock.velocity[row]))
-    vector("stateEstimate.ax stateEstimate.ay stateEstimate.az", lambda: flock.acceleration[row], 1.0 / GRAVITY)
-    vector("stateEstimateZ.x stateEstimateZ.y stateEstimateZ.z", lambda: flock.estimate[row], millimetres)
-    vector("stateEstimateZ.vx stateEstimateZ.vy stateEstimateZ.vz", lambda: flock.velocity[row], millimetres)
-    vector("stateEstimateZ.ax stateEstimateZ.ay stateEstimateZ.az", lambda: flock.acceleration[row], millimetres)
+    vector("stateEstimate.x stateEstimate.y stateEstimate.z", lambda: vehicle.estimate)
+    vector("kalman.stateX kalman.stateY kalman.stateZ", lambda: vehicle.estimate)
+    vector("stateEstimate.vx stateEstimate.vy stateEstimate.vz", lambda: vehicle.velocity)
+    vector("kalman.statePX kalman.statePY kalman.statePZ", lambda: level(vehicle.velocity))
+    vector("stateEstimate.ax stateEstimate.ay stateEstimate.az", lambda: vehicle.acceleration, 1.0 / GRAVITY)
+    vector("stateEstimateZ.x stateEstimateZ.y stateEstimateZ.z", lambda: vehicle.estimate, millimetres)
+    vector("stateEstimateZ.vx stateEstimateZ.vy stateEstimateZ.vz", lambda: vehicle.velocity, millimetres)
+    vector("stateEstimateZ.ax stateEstimateZ.ay stateEstimateZ.az", lambda: vehicle.acceleration, millimetres)
     for group in ("stateEstimate", "stabilizer", "controller"):
         vector(f"{group}.roll {group}.pitch {group}.yaw", angles)
     vector("stateEstimate.qx stateEstimate.qy stateEstimate.qz stateEstimate.qw", attitude)
     vector("kalman.q1 kalman.q2 kalman.q3 kalman.q0", attitude)
     vector("acc.x acc.y acc.z", force, sigma=0.005)
-    vector("gyro.x gyro.y gyro.z", lambda: np.zeros(3), sigma=0.05)
-    vector("gyro.xRaw gyro.yRaw gyro.zRaw", lambda: np.zeros(3), sigma=2.0)
+    vector("gyro.x gyro.y gyro.z", lambda: ZERO, sigma=0.05)
+    vector("gyro.xRaw gyro.yRaw gyro.zRaw", lambda: ZERO, sigma=2.0)
     vector("ctrltarget.x ctrltarget.y ctrltarget.z", target)
     vector("posCtl.targetX posCtl.targetY posCtl.targetZ", target)
     vector("ctrltargetZ.x ctrltargetZ.y ctrltargetZ.z", target, millimetres)
-    vector("locSrv.x locSrv.y locSrv.z", lambda: flock.estimator.external[row])
-    vector("ext_pos.X ext_pos.Y ext_pos.Z", lambda: flock.estimator.external[row])
+    vector("locSrv.x locSrv.y locSrv.z", lambda: vehicle.estimator.external)
+    vector("ext_pos.X ext_pos.Y ext_pos.Z", lambda: vehicle.estimator.external)
     for axis in "XYZ":
         for name in (f"kalman.varP{axis}", f"kalman.var{axis}"):
-            read[name] = lambda: float(flock.estimator.variance[row])
+            read[name] = lambda: float(vehicle.estimator.variance)
     for name in ("stabilizer.thrust", "ctrltarget.thrust", "controller.cmd_thrust", "controller.actuatorThrust"):
         read[name] = thrust
     for number in range(1, 5):
         read[f"motor.m{number}"] = read[f"motor.m{number}req"] = thrust
     read["supervisor.accNorm"] = lambda: float(np.linalg.norm(force()))
-    read["baro.asl"] = lambda: 72.5 + float(flock.place[row, 2]) + 0.05 * noise.standard_normal()
+    read["baro.asl"] = lambda: 72.5 + float(vehicle.place[2]) + 0.05 * noise.standard_normal()
     return read
 
 
-def _system(flock: Flock, row: int, parameter: Callable[[str], float]) -> dict[str, Read]:
+def _system(vehicle: Vehicle, parameter: Callable[[str], float]) -> dict[str, Read]:
     """Decks, battery, supervisor."""
-    memories, read = flock.decks.memories[row], dict[str, Read]()
-    for sensor, bearing in SENSORS.items() if flock.decks.multiranger[row] else ():
-        read[f"range.{sensor}"] = lambda bearing=bearing: _distance(flock, row, bearing)  # type: ignore[misc]
-    if flock.decks.multiranger[row]:
-        read["range.up"] = lambda: _in_reach(ROOM[2] - flock.place[row, 2])
-    if flock.decks.flow[row]:
-        read["range.zrange"] = lambda: _in_reach(flock.place[row, 2])
-    if flock.decks.loco[row]:
+    memories, read = vehicle.decks.memories, dict[str, Read]()
+    for sensor, bearing in SENSORS.items() if vehicle.decks.multiranger else ():
+        read[f"range.{sensor}"] = lambda bearing=bearing: _distance(vehicle, bearing)  # type: ignore[misc]
+    if vehicle.decks.multiranger:
+        read["range.up"] = lambda: _in_reach(ROOM[2] - vehicle.place[2])
+    if vehicle.decks.flow:
+        read["range.zrange"] = lambda: _in_reach(vehicle.place[2])
+    if vehicle.decks.loco:
         read["loco.spiWr"] = read["loco.spiRe"] = lambda: 500.0  # [1/s] accesses of the deck's driver
     read |= {
-        "pm.vbat": lambda: float(flock.batteries.volts[row]),
-        "pm.vbatMV": lambda: crtp.SECONDS_MS * float(flock.batteries.volts[row]),
-        "pm.batteryLevel": lambda: flock.batteries.level(row),
-        "pm.state": lambda: flock.batteries.power(row),
-        "supervisor.info": lambda: flock.info(row),
-        "sys.canfly": lambda: bool(flock.info(row) & Info.CAN_FLY),
-        "sys.isFlying": lambda: bool(flock.info(row) & Info.FLYING),
-        "sys.isTumbled": lambda: bool(flock.info(row) & Info.TUMBLED),
+        "pm.vbat": lambda: float(vehicle.battery.volts),
+        "pm.vbatMV": lambda: crtp.SECONDS_MS * float(vehicle.battery.volts),
+        "pm.batteryLevel": lambda: vehicle.battery.level,
+        "pm.state": lambda: vehicle.battery.power,
+        "supervisor.info": lambda: vehicle.info,
+        "sys.canfly": lambda: bool(vehicle.info & Info.CAN_FLY),
+        "sys.isFlying": lambda: bool(vehicle.info & Info.FLYING),
+        "sys.isTumbled": lambda: bool(vehicle.info & Info.TUMBLED),
         "memTst.errCntW": lambda: memories.write_errors,
-        "lighthouse.status": lambda: flock.decks.station_status(row),
-        "lighthouse.bsReceive": lambda: memories.geometries if flock.decks.lighthouse[row] else 0,
+        "lighthouse.status": lambda: vehicle.decks.station_status,
+        "lighthouse.bsReceive": lambda: memories.geometries if vehicle.decks.lighthouse else 0,
         "lighthouse.bsActive": lambda: memories.geometries & memories.calibrations,
         "lighthouse.bsGeoVal": lambda: memories.geometries,
         "lighthouse.bsCalVal": lambda: memories.calibrations,
@@ -218,10 +219,10 @@ def _system(flock: Flock, row: int, parameter: Callable[[str], float]) -> dict[s
     return read
 
 
-def _distance(flock: Flock, row: int, bearing: float) -> float:
-    """Distance from a row to the wall in the direction `bearing` from its nose [mm]."""
-    x, y, _ = flock.place[row]
-    angle = float(flock.quadrotor.yaw[row]) + bearing
+def _distance(vehicle: Vehicle, bearing: float) -> float:
+    """Distance to the wall in the direction `bearing` from the nose [mm]."""
+    x, y, _ = vehicle.place
+    angle = float(vehicle.model.yaw) + bearing
     ahead = []
     for place, way, wall in ((x, math.cos(angle), ROOM[0]), (y, math.sin(angle), ROOM[1])):
         if abs(way) > 1e-9:

@@ -12,10 +12,10 @@ from math import cos, pi, sin
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from agents.protocols.crtp import LogStatus
-from twins.arrays import Array, Mask
+from agents.vectors import Vector, clamp
+from twins.arrays import Array
 
 SHORTEST: Final = 0.01  # [s]
 ORDER: Final = 7  # of the polynomials
@@ -52,60 +52,56 @@ def polynomial(span: float, begin: tuple[Array, Array, Array], end: tuple[Array,
     )
 
 
-def evaluate(coefficients: Array, t: Array) -> tuple[Array, Array, Array]:
-    """Value, first and second derivative of polynomials (..., 8) at `t` (...), by Horner's scheme."""
-    value = first = half = np.zeros(np.broadcast_shapes(coefficients.shape[:-1], np.shape(t)))
-    for k in range(coefficients.shape[-1] - 1, -1, -1):
+def evaluate(coefficients: Array, t: float) -> tuple[Array, Array, Array]:
+    """Value, first and second derivative (k,) of polynomials (k, 8) at `t`, by Horner's scheme."""
+    value = first = half = np.zeros(len(coefficients))
+    for power in coefficients.T[::-1]:
         half = half * t + first
         first = first * t + value
-        value = value * t + coefficients[..., k]
+        value = value * t + power
     return value, first, 2.0 * half
 
 
-class OnboardPlanners:
-    """Planners of N rows; a pose is (4,): x, y, z [m], yaw [rad]."""
+class OnboardPlanner:
+    """Planner of one drone; a pose is (4,): x, y, z [m], yaw [rad]."""
 
-    def __init__(self, rows: int) -> None:
-        self.plan: NDArray[np.int8] = np.zeros(rows, dtype=np.int8)  # (N,) `PlannerState` of each row
-        self._begin = np.zeros(rows)
-        self._span = np.ones(rows)
-        self._coefficients = np.zeros((rows, 4, ORDER + 1))
-        self._rest: list[list[Piece]] = [[] for _ in range(rows)]  # pieces after the current one
+    def __init__(self) -> None:
+        self.plan = PlannerState.IDLE
+        self._begin, self._span = 0.0, 1.0  # of the current piece [s]
+        self._coefficients = np.zeros((4, ORDER + 1))
+        self._rest: list[Piece] = []  # pieces after the current one
 
-    def climb(
-        self, row: int, t: float, pose: Array, *, height: float, yaw: float, span: float, landing: bool
-    ) -> LogStatus:
+    def climb(self, t: float, pose: Array, *, height: float, yaw: float, span: float, landing: bool) -> LogStatus:
         """Plan a vertical motion to `height` [m]: a landing with motors off at its end, or a take-off.
 
         A take-off is refused unless idle, a landing while landing.
         """
-        possible = self.plan[row] != PlannerState.LANDING if landing else self.plan[row] == PlannerState.IDLE
+        possible = self.plan != PlannerState.LANDING if landing else self.plan == PlannerState.IDLE
         if not possible:
             return LogStatus.REFUSED
         span, zero = max(span, SHORTEST), np.zeros(4)
         goal = self._shorter_turn(pose, np.array([pose[0], pose[1], height, yaw]))
-        self._start(row, t, [(span, polynomial(span, (pose, zero, zero), (goal, zero, zero)))])
-        self.plan[row] = PlannerState.LANDING if landing else PlannerState.FLYING
+        self._start(t, [(span, polynomial(span, (pose, zero, zero), (goal, zero, zero)))])
+        self.plan = PlannerState.LANDING if landing else PlannerState.FLYING
         return LogStatus.OK
 
     def go_to(
         self,
-        row: int,
         t: float,
         pose: Array,
-        velocity: Array,
+        velocity: Vector,
         *,
         goal: Array,
         span: float,
         relative: bool,
         linear: bool,
     ) -> LogStatus:
-        """Plan a motion to the pose `goal`, from the current trajectory or else from `pose` and `velocity` (3,)."""
+        """Plan a motion to the pose `goal`, from the current trajectory or else from `pose` and `velocity`."""
         span = max(span, SHORTEST)
         zero = np.zeros(4)
-        speed, acceleration = np.append(velocity, 0.0), zero
-        if self.plan[row] != PlannerState.IDLE:
-            pose, speed, acceleration = self.state(row, t)
+        speed, acceleration = np.array([*velocity, 0.0]), zero
+        if self.plan != PlannerState.IDLE:
+            pose, speed, acceleration = self.state(t)
         if relative:
             goal = pose + goal
         goal = self._shorter_turn(pose, goal)
@@ -114,12 +110,11 @@ class OnboardPlanners:
             ends = (pose, even, zero), (goal, even, zero)
         else:
             ends = (pose, speed, acceleration), (goal, zero, zero)
-        self.follow(row, t, [(span, polynomial(span, *ends))])
+        self.follow(t, [(span, polynomial(span, *ends))])
         return LogStatus.OK
 
     def spiral(
         self,
-        row: int,
         t: float,
         pose: Array,
         *,
@@ -165,50 +160,41 @@ class OnboardPlanners:
             )
         (begin, v, a), (end, w, b) = ends
         goal = pose + (end - begin) + [0.0, 0.0, climb, 0.0]
-        self.follow(row, t, [(span, polynomial(span, (pose, v, a), (goal, w, b)))])
+        self.follow(t, [(span, polynomial(span, (pose, v, a), (goal, w, b)))])
         return LogStatus.OK
 
-    def follow(self, row: int, t: float, pieces: Sequence[Piece]) -> None:
+    def follow(self, t: float, pieces: Sequence[Piece]) -> None:
         """Follow pieces one after the other, then hold the last pose."""
-        self._start(row, t, pieces)
-        self.plan[row] = PlannerState.FLYING
+        self._start(t, pieces)
+        self.plan = PlannerState.FLYING
 
-    def stop(self, row: int) -> None:
-        """Drop the plan of a row."""
-        self.plan[row] = PlannerState.IDLE
+    def stop(self) -> None:
+        """Drop the plan."""
+        self.plan = PlannerState.IDLE
 
-    def finished(self, t: float) -> Mask:
-        """Rows (N,) at the end of their plan, or without one."""
-        last = np.array([not rest for rest in self._rest])
-        return np.asarray((self.plan == PlannerState.IDLE) | (last & (t - self._begin >= self._span)))
+    def finished(self, t: float) -> bool:
+        """Whether the plan is at its end, or there is none."""
+        return self.plan == PlannerState.IDLE or (not self._rest and t - self._begin >= self._span)
 
-    def goal(self, t: float) -> Array:
-        """Current planned poses (N, 4), NaN for idle rows; a row that has landed becomes idle."""
-        for row, rest in enumerate(self._rest):
-            if rest:
-                self._advance(row, t)
-        self.plan[(self.plan == PlannerState.LANDING) & (t - self._begin >= self._span)] = PlannerState.IDLE
-        elapsed = np.clip(t - self._begin, 0.0, self._span)
-        pose, _, _ = evaluate(self._coefficients, elapsed[:, None])
-        return np.asarray(np.where((self.plan == PlannerState.IDLE)[:, None], np.nan, pose))
+    def goal(self, t: float) -> Array | None:
+        """Current planned pose (4,), None without a plan; after a landing there is none."""
+        if self.plan == PlannerState.LANDING and self.finished(t):
+            self.plan = PlannerState.IDLE
+        return None if self.plan == PlannerState.IDLE else self.state(t)[0]
 
-    def state(self, row: int, t: float) -> tuple[Array, Array, Array]:
-        """Pose, speed and acceleration (4,) on the plan of a row; at rest after the end of the plan."""
-        self._advance(row, t)
-        elapsed = t - self._begin[row]
-        pose, speed, acceleration = evaluate(self._coefficients[row], np.clip(elapsed, 0.0, self._span[row]))
-        if elapsed >= self._span[row]:
+    def state(self, t: float) -> tuple[Array, Array, Array]:
+        """Pose, speed and acceleration (4,) on the plan; at rest after the end of the plan."""
+        while self._rest and t - self._begin >= self._span:
+            self._start(self._begin + self._span, self._rest)
+        elapsed = t - self._begin
+        pose, speed, acceleration = evaluate(self._coefficients, clamp(elapsed, 0.0, self._span))
+        if elapsed >= self._span:
             speed, acceleration = np.zeros(4), np.zeros(4)
         return pose, speed, acceleration
 
-    def _start(self, row: int, t: float, pieces: Sequence[Piece]) -> None:
-        (self._span[row], self._coefficients[row]), *self._rest[row] = pieces
-        self._begin[row] = t
-
-    def _advance(self, row: int, t: float) -> None:
-        """Proceed to the piece of time `t`."""
-        while self._rest[row] and t - self._begin[row] >= self._span[row]:
-            self._start(row, self._begin[row] + self._span[row], self._rest[row])
+    def _start(self, t: float, pieces: Sequence[Piece]) -> None:
+        (self._span, self._coefficients), *self._rest = pieces
+        self._begin = t
 
     @staticmethod
     def _shorter_turn(pose: Array, goal: Array) -> Array:

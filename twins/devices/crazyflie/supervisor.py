@@ -7,13 +7,10 @@ without setpoints does not count as landed; it locks.
 from __future__ import annotations
 
 from enum import IntEnum
+from math import inf
 from typing import Final
 
-import numpy as np
-from numpy.typing import NDArray
-
 from agents.protocols.crtp import Info
-from twins.arrays import Array, Mask
 
 LEVEL_S: Final = 0.5  # an older low-level setpoint is ignored: the drone levels out
 LOCK_S: Final = 2.0  # time without setpoints after which the drone locks
@@ -37,121 +34,113 @@ class SupervisorState(IntEnum):
     CRASHED = 7  # until it stands upright again and recovery is requested
 
 
+MAY_FLY: Final = (SupervisorState.READY, SupervisorState.FLYING, SupervisorState.LEVEL, SupervisorState.LANDED)
+
+
 class Supervisor:
-    """Supervisors of N rows."""
+    """Supervisor of one drone."""
 
-    def __init__(self, auto_arm: Mask) -> None:
-        rows = len(auto_arm)
+    def __init__(self, *, auto_arm: bool) -> None:
         self._auto = auto_arm
-        self.state: NDArray[np.int8] = np.where(auto_arm, SupervisorState.READY, SupervisorState.DISARMED).astype(
-            np.int8
-        )
-        self.tumbled: NDArray[np.bool_] = np.zeros(rows, dtype=bool)  # upside down, or on their side
-        self._since = np.zeros(rows)  # time of arming or landing [s]
-        self._motors_ran = np.full(rows, -np.inf)
-        self._watchdog = np.full(rows, np.inf)  # watchdog; infinity while it is not in use
-        self._stop = np.zeros(rows, dtype=bool)
+        self.tumbled = False  # upside down, or on its side
+        self._since = 0.0  # time of arming or landing [s]
+        self.restart()
+
+    def restart(self) -> None:
+        """State after switching on."""
+        self.state = SupervisorState.READY if self._auto else SupervisorState.DISARMED
+        self._motors_ran = -inf
+        self._watchdog = inf  # infinity while it is not in use
+        self._stop = False
 
     @property
-    def may_fly(self) -> Mask:
-        """Rows (N,) with motors that may turn."""
-        state = self.state
-        return np.asarray(
-            (state == SupervisorState.READY)
-            | (state == SupervisorState.FLYING)
-            | (state == SupervisorState.LEVEL)
-            | (state == SupervisorState.LANDED)
-        )
+    def may_fly(self) -> bool:
+        """Whether the motors may turn."""
+        return self.state in MAY_FLY
 
     @property
-    def level(self) -> Mask:
-        """Rows (N,) that ignore horizontal setpoints."""
-        return np.asarray(self.state == SupervisorState.LEVEL)
+    def level(self) -> bool:
+        """Whether horizontal setpoints are ignored."""
+        return self.state == SupervisorState.LEVEL
 
-    def restart(self, row: int) -> None:
-        """State after switching off and on."""
-        self.state[row] = SupervisorState.READY if self._auto[row] else SupervisorState.DISARMED
-        self._motors_ran[row], self._watchdog[row], self._stop[row] = -np.inf, np.inf, False
+    @property
+    def armed(self) -> bool:
+        return self.may_fly or self.state == SupervisorState.ARMING
 
-    def arm(self, row: int, t: float, *, on: bool) -> bool:
-        """Arm or disarm a row; False if not possible in its state."""
-        if on and self.state[row] == SupervisorState.DISARMED and not self.tumbled[row]:
-            self.state[row], self._since[row] = SupervisorState.ARMING, t
-        elif not on and self.state[row] in (SupervisorState.FLYING, SupervisorState.LEVEL) and not self._auto[row]:
-            self._stop[row] = True  # disarmed in the air, it locks
-        elif not on and self.state[row] not in (SupervisorState.LOCKED, SupervisorState.CRASHED):
-            self.state[row] = SupervisorState.DISARMED
-        return bool(self.armed(row) == on)
+    def arm(self, t: float, *, on: bool) -> bool:
+        """Arm or disarm; False if not possible in this state."""
+        if on and self.state == SupervisorState.DISARMED and not self.tumbled:
+            self.state, self._since = SupervisorState.ARMING, t
+        elif not on and self.state in (SupervisorState.FLYING, SupervisorState.LEVEL) and not self._auto:
+            self._stop = True  # disarmed in the air, it locks
+        elif not on and self.state not in (SupervisorState.LOCKED, SupervisorState.CRASHED):
+            self.state = SupervisorState.DISARMED
+        return self.armed == on
 
-    def recover(self, row: int) -> bool:
-        """Recover a row from a crash, once it stands upright; whether it is in order."""
-        if self.state[row] == SupervisorState.CRASHED and not self.tumbled[row]:
-            self.state[row] = SupervisorState.DISARMED
-        return bool(self.state[row] != SupervisorState.CRASHED)
+    def recover(self) -> bool:
+        """Recover from a crash, once it stands upright; whether it is in order."""
+        if self.state == SupervisorState.CRASHED and not self.tumbled:
+            self.state = SupervisorState.DISARMED
+        return self.state != SupervisorState.CRASHED
 
-    def armed(self, row: int) -> bool:
-        return bool(self.may_fly[row] or self.state[row] == SupervisorState.ARMING)
+    def stop(self) -> None:
+        """Request an emergency stop."""
+        self._stop = True
 
-    def stop(self, row: int) -> None:
-        """Request an emergency stop of a row."""
-        self._stop[row] = True
-
-    def reset_watchdog(self, row: int, t: float) -> None:
+    def reset_watchdog(self, t: float) -> None:
         """Restart the emergency watchdog, which is active from its first packet on."""
-        self._watchdog[row] = t
+        self._watchdog = t
 
-    def advance(self, t: float, spinning: Mask, age: Array) -> Mask:
-        """Advance one tick; returns the rows (N,) that have just been locked or have crashed.
+    def advance(self, t: float, age: float, *, spinning: bool) -> bool:
+        """Advance one tick to `t` [s]; returns whether the drone has just been locked or has crashed.
 
-        Args:
-            t: Current time [s].
-            spinning: (N,) motors turn.
-            age: (N,) of the newest setpoint [s].
+        `age`: of the newest setpoint [s]; `spinning`: motors turn.
         """
-        self._motors_ran[spinning] = t
-        flying, state = t - self._motors_ran < FLYING_S, self.state
-        airborne = (state == SupervisorState.FLYING) | (state == SupervisorState.LEVEL)
-        lock = (state != SupervisorState.LOCKED) & (
-            self._stop
-            | (t - self._watchdog > WATCHDOG_S)
-            | (airborne & (age > LOCK_S))
-            | ((state == SupervisorState.LEVEL) & self.tumbled)
-        )
-        crash = (state == SupervisorState.FLYING) & self.tumbled & ~lock
-        settled = t - self._since
-        rules = (
-            (lock, SupervisorState.LOCKED),
-            (crash, SupervisorState.CRASHED),
-            (
-                self.tumbled & ((state == SupervisorState.READY) | (state == SupervisorState.ARMING)),
-                SupervisorState.DISARMED,
-            ),
-            ((state == SupervisorState.DISARMED) & self._auto & ~self.tumbled, SupervisorState.READY),
-            ((state == SupervisorState.ARMING) & (settled >= SPIN_UP_S), SupervisorState.READY),
-            ((state == SupervisorState.FLYING) & (age > LEVEL_S), SupervisorState.LEVEL),
-            ((state == SupervisorState.LEVEL) & (age <= LEVEL_S), SupervisorState.FLYING),
-            ((state == SupervisorState.FLYING) & ~flying, SupervisorState.LANDED),
-            (((state == SupervisorState.READY) | (state == SupervisorState.LANDED)) & flying, SupervisorState.FLYING),
-            ((state == SupervisorState.READY) & ~self._auto & (settled > PREFLIGHT_S), SupervisorState.DISARMED),
-            ((state == SupervisorState.LANDED) & (settled > LANDED_S), SupervisorState.DISARMED),
-        )
-        after = state.copy()
-        for rule, to in reversed(rules):  # the first that applies counts; np.select takes five times as long
-            after[rule] = to
-        self._since[((after == SupervisorState.LANDED) | (after == SupervisorState.READY)) & (state != after)] = t
-        self.state = after
-        return np.asarray(lock | crash)
+        if spinning:
+            self._motors_ran = t
+        before = self.state
+        self.state = self._next(t, age)
+        if self.state != before and self.state in (SupervisorState.LANDED, SupervisorState.READY):
+            self._since = t
+        return self.state != before and self.state in (SupervisorState.LOCKED, SupervisorState.CRASHED)
 
-    def info(self, row: int) -> Info:
-        """Flags of a row, without those of the planner."""
-        state, tumbled = self.state[row], self.tumbled[row]
+    def _next(self, t: float, age: float) -> SupervisorState:  # noqa: PLR0911 - a table of transitions
+        state, flying, settled = self.state, t - self._motors_ran < FLYING_S, t - self._since
+        airborne = state in (SupervisorState.FLYING, SupervisorState.LEVEL)
+        late = self._stop or t - self._watchdog > WATCHDOG_S or (airborne and age > LOCK_S)
+        if late or (state == SupervisorState.LEVEL and self.tumbled):
+            return SupervisorState.LOCKED
+        if state == SupervisorState.FLYING and self.tumbled:
+            return SupervisorState.CRASHED
+        if self.tumbled and state in (SupervisorState.READY, SupervisorState.ARMING):
+            return SupervisorState.DISARMED
+        if state == SupervisorState.DISARMED and self._auto and not self.tumbled:
+            return SupervisorState.READY
+        if state == SupervisorState.ARMING and settled >= SPIN_UP_S:
+            return SupervisorState.READY
+        if airborne and (state == SupervisorState.LEVEL) != (age > LEVEL_S):
+            return SupervisorState.LEVEL if age > LEVEL_S else SupervisorState.FLYING
+        if state == SupervisorState.FLYING and not flying:
+            return SupervisorState.LANDED
+        if state in (SupervisorState.READY, SupervisorState.LANDED) and flying:
+            return SupervisorState.FLYING
+        if state == SupervisorState.READY and not self._auto and settled > PREFLIGHT_S:
+            return SupervisorState.DISARMED
+        if state == SupervisorState.LANDED and settled > LANDED_S:
+            return SupervisorState.DISARMED
+        return state
+
+    @property
+    def info(self) -> Info:
+        """Flags, without those of the planner."""
+        state = self.state
         flags = {
-            Info.CAN_BE_ARMED: state == SupervisorState.DISARMED and not tumbled,
-            Info.ARMED: self.armed(row),
-            Info.CAN_FLY: self.may_fly[row],
-            Info.AUTO_ARM: self._auto[row],
+            Info.CAN_BE_ARMED: state == SupervisorState.DISARMED and not self.tumbled,
+            Info.ARMED: self.armed,
+            Info.CAN_FLY: self.may_fly,
+            Info.AUTO_ARM: self._auto,
             Info.FLYING: state in (SupervisorState.FLYING, SupervisorState.LEVEL),
-            Info.TUMBLED: tumbled,
+            Info.TUMBLED: self.tumbled,
             Info.LOCKED: state == SupervisorState.LOCKED,
             Info.CRASHED: state == SupervisorState.CRASHED,
         }

@@ -63,7 +63,7 @@ class Trajectories:
         if reverse:
             pieces = [(span, _reversed(span, coefficients)) for span, coefficients in reversed(pieces)]
         if start is not None and pieces:
-            first, _, _ = evaluate(pieces[0][1], np.zeros(4))
+            first, _, _ = evaluate(pieces[0][1], 0.0)
             turn = wrap(start[3] - first[3]) if turned else 0.0
             cos, sin = np.cos(turn), np.sin(turn)
             rotation = np.array(

@@ -6,12 +6,10 @@ the floor at first, and must be discharged above the height.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from math import exp
 from typing import Final
 
-import numpy as np
-
-from twins.arrays import Array, Mask, clamp
+from agents.vectors import clamp
 from twins.engines.crazyflie_cascade import BASE, FULL, LEAST, POSITION, SPEED, THRUST_SCALE, VELOCITY
 from twins.models.quadrotor import GRAVITY
 
@@ -25,44 +23,45 @@ UP: Final = 2  # axis
 
 
 class VerticalLoops:
-    """Loops of N rows."""
+    """Loops of one drone."""
 
-    def __init__(self, platforms: Sequence[str], dt: float) -> None:
-        """`platforms` (N) of the firmware; `dt`: period [s]."""
-        rows = len(platforms)
-        self.hover = np.array([HOVER[each] for each in platforms])  # (N,) thrust that carries the weight
-        self.least = np.full(rows, LEAST)  # (N,) least thrust in the air
-        self.thrust = np.zeros(rows)  # (N,) of the motors, of 65,535
-        self._base = np.array([BASES[each] for each in platforms])
-        self._height, self._climb = np.zeros(rows), np.zeros(rows)  # integrals [m s], [m]
-        self._dt, self._lag = dt, -np.expm1(-dt / MOTOR_S)
+    def __init__(self, platform: str, dt: float) -> None:
+        """`platform` of the firmware; `dt`: period [s]."""
+        self.least = LEAST  # thrust in the air, of 65,535
+        self._hover, self._base = HOVER[platform], BASES[platform]
+        self._dt, self._lag = dt, 1.0 - exp(-dt / MOTOR_S)
+        self.reset()
+
+    def reset(self) -> None:
+        """Motors off."""
+        self.thrust = 0.0  # of the motors, of 65,535
+        self._height = self._climb = 0.0  # integrals [m s], [m]
 
     @property
-    def sliding(self) -> Mask:
-        """Rows (N,) that slide when they press on the floor, with the least thrust."""
-        return np.asarray(self.least > SLIDES * self.hover)
+    def sliding(self) -> bool:
+        """Whether a drone that presses on the floor slides, with the least thrust."""
+        return self.least > SLIDES * self._hover
 
-    def advance(self, spinning: Mask, offset: Array, climb: Array, wanted: Array, raw: Array) -> Array:
-        """Advance one step; returns vertical accelerations (N,) in the air [m/s²].
+    def advance(self, offset: float, climb: float, wanted: float | None, raw: float | None) -> float:
+        """Advance one step with motors on; returns the vertical acceleration in the air [m/s²].
 
         Args:
-            spinning: (N,) motors on; the loops of others are reset.
-            offset: (N,) from the estimated height to the target [m].
-            climb: (N,) estimated climb rate [m/s].
-            wanted: (N,) setpoint of the climb rate [m/s]; NaN in rows that follow a height.
-            raw: (N,) thrust of rows without loops, of 65,535; NaN in the others. As in the firmware, a change from
-                raw thrust to height or climb rate resets the loops.
+            offset: From the estimated height to the target [m].
+            climb: Estimated climb rate [m/s].
+            wanted: Setpoint of the climb rate [m/s]; None: follow the height.
+            raw: Thrust without loops, of 65,535; None: by the loops. As in the firmware, a change from raw thrust to
+                height or climb rate resets the loops.
         """
-        self.thrust[~spinning] = 0.0
-        looped = spinning & np.isnan(raw)
-        self._height[~looped] = self._climb[~looped] = 0.0
-        by_height = np.isnan(wanted)
-        self._height += self._dt * np.where(looped & by_height, offset, 0.0)
-        reference = clamp(POSITION.p[UP] * offset + POSITION.i[UP] * self._height, -SPEED, SPEED)
-        error = np.where(by_height, reference, wanted) - climb
-        self._climb += self._dt * np.where(looped, error, 0.0)
-        lift = THRUST_SCALE * (VELOCITY.p[UP] * error + VELOCITY.i[UP] * self._climb)
-        command = clamp(self._base + clamp(lift, -0.5 * FULL, 0.5 * FULL), self.least, FULL)
-        command = np.where(np.isnan(raw), command, raw)
-        self.thrust += self._lag * np.where(spinning, command - self.thrust, 0.0)
-        return np.asarray(GRAVITY * (self.thrust / self.hover - 1.0))
+        if raw is not None:
+            self._height = self._climb = 0.0
+            command = raw
+        else:
+            if wanted is None:
+                self._height += self._dt * offset
+                wanted = clamp(POSITION.p[UP] * offset + POSITION.i[UP] * self._height, -SPEED, SPEED)
+            error = wanted - climb
+            self._climb += self._dt * error
+            lift = THRUST_SCALE * (VELOCITY.p[UP] * error + VELOCITY.i[UP] * self._climb)
+            command = clamp(self._base + clamp(lift, -0.5 * FULL, 0.5 * FULL), self.least, FULL)
+        self.thrust += self._lag * (command - self.thrust)
+        return GRAVITY * (self.thrust / self._hover - 1.0)

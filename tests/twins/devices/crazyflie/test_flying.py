@@ -22,7 +22,7 @@ from agents.protocols.crtp import (
     yaw_of,
 )
 from tests.twins.crazyflie_wire import Wire, brushless
-from twins.devices.crazyflie.planner import OnboardPlanners, evaluate, polynomial
+from twins.devices.crazyflie.planner import OnboardPlanner, evaluate, polynomial
 from twins.devices.crazyflie.supervisor import SupervisorState
 
 pytestmark = pytest.mark.slow  # seconds of firmware, in steps of milliseconds
@@ -44,34 +44,33 @@ def test_polynomial_meets_both_ends(begin, end, span):
             got = path.deriv(order)(t) if order else path(t)
             assert abs(got - value) < 1e-9 * scale * max(1.0, span**-order) * 1e3
     t = 0.3 * span
-    assert evaluate(coefficients, np.array(t)) == pytest.approx((path(t), path.deriv(1)(t), path.deriv(2)(t)))
+    values = [float(value[0]) for value in evaluate(coefficients[None], t)]
+    assert values == pytest.approx([path(t), path.deriv(1)(t), path.deriv(2)(t)])
 
 
 def test_chained_plans_are_smooth():
     """A new goal in the middle of a plan: position and velocity do not jump."""
-    planner = OnboardPlanners(1)
-    planner.climb(0, 0.0, np.zeros(4), height=1.0, yaw=0.0, span=2.0, landing=False)
+    planner = OnboardPlanner()
+    planner.climb(0.0, np.zeros(4), height=1.0, yaw=0.0, span=2.0, landing=False)
     for t, goal in ((1.0, [1.0, 0.5, 1.2, 1.0]), (1.7, [-0.5, 0.2, 0.8, -2.9]), (2.1, [0.0, 0.0, 1.0, 2.9])):
-        before = [planner.goal(t - h)[0] for h in (2e-4, 1e-4)]
-        planner.go_to(0, t, np.zeros(4), np.zeros(3), goal=np.array(goal), span=1.5, relative=False, linear=False)
-        after = [planner.goal(t + h)[0] for h in (0.0, 1e-4)]
+        before = [planner.goal(t - h) for h in (2e-4, 1e-4)]
+        planner.go_to(t, np.zeros(4), np.zeros(3), goal=np.array(goal), span=1.5, relative=False, linear=False)
+        after = [planner.goal(t + h) for h in (0.0, 1e-4)]
         assert after[0] == pytest.approx(before[1], abs=1e-3)
         assert (after[1] - after[0]) / 1e-4 == pytest.approx((before[1] - before[0]) / 1e-4, abs=2e-2)
-    end = planner.goal(10.0)[0]
+    end = planner.goal(10.0)
     assert end[:3] == pytest.approx([0.0, 0.0, 1.0])
     assert math.cos(end[3] - 2.9) == pytest.approx(1.0)
-    assert planner.finished(10.0)[0]
+    assert planner.finished(10.0)
 
 
 def test_relative_and_linear_plans():
-    planner = OnboardPlanners(2)
-    for row in range(2):
-        planner.climb(row, 0.0, np.zeros(4), height=1.0, yaw=0.0, span=1.0, landing=False)
+    planner = OnboardPlanner()
+    planner.climb(0.0, np.zeros(4), height=1.0, yaw=0.0, span=1.0, landing=False)
     goal, at = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(4)
-    planner.go_to(0, 2.0, at, np.zeros(3), goal=goal, span=2.0, relative=True, linear=True)
-    assert planner.goal(2.5)[0] == pytest.approx([0.25, 0.0, 1.0, 0.0])
-    assert planner.goal(5.0)[0] == pytest.approx([1.0, 0.0, 1.0, 0.0])
-    assert planner.goal(5.0)[1] == pytest.approx([0.0, 0.0, 1.0, 0.0])  # each row for itself
+    planner.go_to(2.0, at, np.zeros(3), goal=goal, span=2.0, relative=True, linear=True)
+    assert planner.goal(2.5) == pytest.approx([0.25, 0.0, 1.0, 0.0])
+    assert planner.goal(5.0) == pytest.approx([1.0, 0.0, 1.0, 0.0])
 
 
 # high level
@@ -135,13 +134,13 @@ def test_plans_begin_at_the_last_setpoint():
 def test_streamed_positions():
     """In plan, the law of the twin in the robot's own process: what virtual time predicts is what a stream gives."""
     wire = Wire().streaming()
-    model = Wire().streaming().flock.quadrotor
+    model = Wire().streaming().vehicle.model
     for _ in range(150):
         wire.wait(0.01, lambda: wire.goal(0.4, -0.3, 1.1, 30.0))
-        model.command(np.array([[0.4, -0.3, 1.1, math.radians(30.0)]]))
-        model.advance()
-    assert wire.position[:2] == pytest.approx(model.position[0, :2], abs=1e-6)
-    assert wire.yaw == pytest.approx(model.yaw[0], abs=1e-6)
+        model.command((0.4, -0.3, 1.1, math.radians(30.0)))
+        model.move(0.01)
+    assert wire.position[:2] == pytest.approx(model.held[:2], abs=1e-6)
+    assert wire.yaw == pytest.approx(model.yaw, abs=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -272,36 +271,37 @@ def test_arming():
 def test_battery():
     """A battery empties in flight only, at the set rate; empty, it stops the motors."""
     wire = Wire(battery=0.5, drain=10.0)
-    charge = wire.after(5.0).flock.batteries.charge
-    assert charge[0] == 0.5
+    battery = wire.after(5.0).vehicle.battery
+    assert battery.charge == 0.5
     wire.takeoff(1.0, 2.0)
     wire.wait(4.0)
-    assert 0.5 - charge[0] == pytest.approx(4.0 * 10.0 / 420.0, rel=0.01)
+    assert 0.5 - battery.charge == pytest.approx(4.0 * 10.0 / 420.0, rel=0.01)
     assert wire.after(0.4 * 42.0 + 1.0).position[2] == 0.0
-    assert charge[0] == 0.0
+    assert battery.charge == 0.0
 
 
 def test_battery_level_is_that_of_the_firmware():
     """10 % from 3.00 to 3.78 V; 90 % is the most that it says; under load the voltage sags."""
-    flock = Wire().flock
+    vehicle = Wire().vehicle
     levels = {1.0: 90, 0.95: 90, 0.85: 90, 0.55: 60, 0.15: 20, 0.09: 10, 0.01: 10, 0.0: 0}
     for charge, level in levels.items():
-        flock.batteries.charge[0] = charge
-        assert flock.batteries.level(0) == level
-    flock.batteries.charge[0] = 0.6
-    assert flock.batteries.volts[0] == pytest.approx(3.96)
-    flock.quadrotor.flying[0] = True
-    assert flock.batteries.volts[0] == pytest.approx(3.66)
-    assert flock.batteries.level(0) == 10
+        vehicle.battery.charge = charge
+        assert vehicle.battery.level == level
+    vehicle.battery.charge = 0.6
+    assert vehicle.battery.volts == pytest.approx(3.96)
+    vehicle.model.flying = True
+    assert vehicle.battery.volts == pytest.approx(3.66)
+    assert vehicle.battery.level == 10
 
 
 def test_an_empty_battery_is_reported_after_five_seconds():
     wire = Wire(battery=0.05)
     wire.takeoff(0.5, 2.0)
-    batteries = wire.after(4.0).flock.batteries
-    assert batteries.volts[0] < 3.2
-    assert batteries.power(0) == Power.BATTERY
-    assert wire.after(1.5).flock.batteries.power(0) == Power.LOW
+    battery = wire.after(4.0).vehicle.battery
+    assert battery.volts < 3.2
+    assert battery.power == Power.BATTERY
+    wire.wait(1.5)
+    assert battery.power == Power.LOW
 
 
 # the floor, and crashes
@@ -316,7 +316,7 @@ def test_a_fall_ends_upside_down():
     assert Info.CRASHED | Info.TUMBLED in wire.info
     assert wire.ask(Port.SUPERVISOR, 1, SupervisorCommand.RECOVER) == b"\x82\0\0"
     assert wire.takeoff(0.5, 1.0) == LogStatus.BUSY
-    wire.flock.supervisor.tumbled[0] = False
+    wire.vehicle.supervisor.tumbled = False
     assert wire.takeoff(0.5, 1.0) == LogStatus.BUSY
     assert wire.ask(Port.PLATFORM, 0, Platform.RECOVER) == b"\2\1\1"  # before version 12
     assert wire.after(0.1).hovering(0.5).state == SupervisorState.FLYING
@@ -350,14 +350,14 @@ def test_position_from_outside():
     """Before the first one it believes to stand where it was told to; after that, it flies what it is told."""
     wire = Wire(external=True, start=[[0.5, 0.2, 0.0]])
     assert wire.estimate == pytest.approx([0.0, 0.0, 0.0])
-    assert wire.after(1.0).flock.estimator.variance[0] >= 100.0
+    assert wire.after(1.0).vehicle.estimator.variance >= 100.0
 
     def locate():  # the cameras are not where they believe to be
         wire.locate(np.add(wire.position, [0.1, 0.0, 0.0]))
 
     assert wire.after(3.0, locate).estimate == pytest.approx([0.6, 0.2, 0.0], abs=1e-3)
-    assert wire.flock.estimator.variance[0] < 1e-4
+    assert wire.vehicle.estimator.variance < 1e-4
     assert wire.takeoff(0.5, 1.0) == LogStatus.OK
     wire.after(2.0, locate).go_to(0.0, 0.0, 0.5, 0.0, 2.0)
     assert wire.after(12.0, locate).position == pytest.approx([-0.1, 0.0, 0.5], abs=0.01)
-    assert wire.after(1.5).flock.estimator.variance[0] > 0.5  # nobody tells it any more
+    assert wire.after(1.5).vehicle.estimator.variance > 0.5  # nobody tells it any more

@@ -16,9 +16,9 @@ from tests.requests import request
 from tests.twins.crazyflie_wire import Wire
 from twins.body import TwinBody
 from twins.devices.crazyflie.device import CrazyflieTwin
-from twins.devices.crazyflie.flock import Flock
 from twins.devices.crazyflie.memory import ANCHOR_PAGES, CALIBRATION, Memories
 from twins.devices.crazyflie.tables import LOG_CODES, PACKINGS, inventory
+from twins.devices.crazyflie.vehicle import Vehicle
 from twins.devices.device import DeviceRequest, Faults
 
 PARAMETER_TABLE, LOG_TABLE = inventory().parameters, inventory().logs
@@ -179,7 +179,7 @@ def test_power_switch():
     wire.put(Port.LINK, 3, NRF, PowerSwitch.OFF)
     assert wire.after(1.0).position[2] == 0.0
     assert wire.put(Port.LINK, 0, b"echo") == []
-    wire.flock.supervisor.tumbled[0] = False
+    wire.vehicle.supervisor.tumbled = False
     assert wire.ask(Port.LINK, 3, NRF, PowerSwitch.RESET_BEGIN) == b"\xfe\xff\xe7\xe7\xe7\xe7"
     wire.put(Port.LINK, 3, NRF, PowerSwitch.ON)
     assert wire.ask(Port.LINK, 0, b"echo") == b"echo"
@@ -198,21 +198,21 @@ def test_memories_are_listed():
     assert eeprom[:7] == b"0xBC\1P\2"
     assert sum(eeprom[:20]) % 256 == eeprom[20]
     wire.put(Port.MEMORY, 2, at(MemoryKind.TESTER, 5), bytes((5, 6, 7, 99)))
-    assert wire.flock.decks.memories[0].write_errors == 1
+    assert wire.vehicle.decks.memories.write_errors == 1
 
 
 def test_lighthouse_memory():
     """Four base stations; a change of the version erases them."""
     wire = Wire(device={"positioning": {"system": "lighthouse"}})
-    decks, memory = wire.flock.decks, wire.flock.decks.memories[0]
-    assert decks.station_status(0) == 1
+    decks, memory = wire.vehicle.decks, wire.vehicle.decks.memories
+    assert decks.station_status == 1
     for begin, size in ((0, 49), (CALIBRATION, 61)):
         page = bytes(range(size - 1)) + b"\1"
         for offset in range(0, size, 24):
             where = at(MemoryKind.LIGHTHOUSE, begin + 0x100 + offset)
             assert wire.ask(Port.MEMORY, 2, where, page[offset : offset + 24]) == where + b"\0"
     assert memory.geometries == memory.calibrations == 0b10
-    assert decks.station_status(0) == 2
+    assert decks.station_status == 2
     beyond = at(MemoryKind.LIGHTHOUSE, 0x400)
     assert wire.ask(Port.MEMORY, 2, beyond, b"\1")[-1] == LogStatus.IO
     assert wire.ask(Port.MEMORY, 1, beyond, 4) == beyond + bytes((LogStatus.IO,))
@@ -226,9 +226,9 @@ def test_loco_anchors():
     """Anchors report the positions that were written to them; four are enough for an estimate."""
     wire = Wire(device={"positioning": {"system": "loco"}})
     for anchor in range(4):
-        assert not wire.flock.decks.ready()[0]
+        assert not wire.vehicle.decks.ready
         assert wire.put(Port.LOCATION, 1, 2, anchor, 1, struct.pack("<fff", anchor, 1.0, 2.0)) == []
-    assert wire.flock.decks.ready()[0]
+    assert wire.vehicle.decks.ready
     where = at(MemoryKind.LOCO, ANCHOR_PAGES + 0x300)
     assert struct.unpack("<fff?", wire.ask(Port.MEMORY, 1, where, 13)[6:]) == (3.0, 1.0, 2.0, True)
     assert wire.ask(Port.MEMORY, 2, where, b"\0")[-1] == LogStatus.IO  # written by radio only
@@ -330,7 +330,7 @@ def test_newest_client_is_served_and_told_of_locks():
         assert other.recv(64)[1:] == b"y"
         client.ping(0.1)
         assert len(client.heard()) == 1
-        client.device.flock.supervisor.stop(0)
+        client.device.drones[0].vehicle.supervisor.stop()
         client.device.advance(0.2)
         assert b"Locked" in b"".join(packet[1:] for packet in client.heard() if packet[0] >> 4 == Port.CONSOLE)
         with pytest.raises(BlockingIOError):
@@ -343,16 +343,16 @@ def test_nature_is_that_of_the_other_twin():
     """Wobble and noise come out of the same models, with the same seeds, as in the robot's own process."""
     nature = Disturbance(hover_jitter=Jitter(0.05), position_sigma=0.01, latency_s=0.1, wind=(0.5, 0.0))
     asked = request("crazyflie", ["x"], disturbance=nature)
-    flock, plain = Flock(asked, Faults()), TwinBody(asked)
+    vehicle, plain = Vehicle(asked, Faults(), 0), TwinBody(asked)
     plain.takeoff([0], [0.5])
-    flock.planner.climb(0, 0.0, np.zeros(4), height=0.5, yaw=0.0, span=1.25, landing=False)
+    vehicle.planner.climb(0.0, np.zeros(4), height=0.5, yaw=0.0, span=1.25, landing=False)
     noise = []
     for tick in range(1, 401):
-        flock.advance(0.01 * tick)
+        vehicle.advance(0.01 * tick)
         (state,) = plain.read(0.01 * tick)
-        noise.append(flock.estimate[0] - flock.place[0])
-    assert flock.place[0, :2] == pytest.approx(state.true_position[:2], abs=1e-3)
-    assert abs(flock.place[0, 0]) > 1e-3
+        noise.append(np.subtract(vehicle.estimate, vehicle.place))
+    assert vehicle.place[:2] == pytest.approx(state.true_position[:2], abs=1e-3)
+    assert abs(vehicle.place[0]) > 1e-3
     assert np.std(noise) == pytest.approx(0.01, rel=0.1)
 
 

@@ -10,7 +10,7 @@ from numpy.polynomial import Polynomial
 from agents.protocols.crtp import COMPRESSED, IN_MEMORY, UNCOMPRESSED, HighLevel, LogStatus, MemoryKind, Port
 from tests.twins.crazyflie_wire import Wire
 from twins.devices.crazyflie.memory import Memories
-from twins.devices.crazyflie.planner import OnboardPlanners, evaluate
+from twins.devices.crazyflie.planner import OnboardPlanner, evaluate
 from twins.devices.crazyflie.trajectories import Trajectories
 
 RISE = [0.0, 0.0, 0.0, 0.0, 35.0, -84.0, 70.0, -20.0]  # from 0 to 1 in 1 s, at rest at both ends
@@ -33,7 +33,7 @@ def pose(pieces, t):
     """Pose (4,) on pieces at time `t` [s]."""
     for span, coefficients in pieces:
         if t <= span:
-            return evaluate(coefficients, np.full(4, t))[0]
+            return evaluate(coefficients, t)[0]
         t -= span
     raise AssertionError
 
@@ -115,9 +115,9 @@ def test_a_trajectory_is_flown():
     assert wire.ask(Port.HIGH_LEVEL, 0, HighLevel.DEFINE, 1, struct.pack("<BBIB", 1, 0, 0, 1))[3] == LogStatus.OK
     assert wire.plan(HighLevel.START_2, "???Bf", False, False, False, 1, 1.0) == LogStatus.OK
     assert wire.after(1.0).planned[0] == pytest.approx(0.5)
-    assert not wire.flock.planner.finished(wire.t)[0]
+    assert not wire.vehicle.planner.finished(wire.t)
     assert wire.after(4.0).position == pytest.approx([1.0, 0.0, 1.0], abs=0.01)
-    assert wire.flock.planner.finished(wire.t)[0]
+    assert wire.vehicle.planner.finished(wire.t)
     assert wire.plan(HighLevel.START, "??Bf", True, True, 1, 1.0) == LogStatus.OK  # back, protocol 9
     assert wire.after(5.0).position == pytest.approx([0.0, 0.0, 1.0], abs=0.01)
 
@@ -129,20 +129,20 @@ def test_a_trajectory_is_flown():
 @pytest.mark.parametrize("sideways", [False, True])
 def test_a_spiral_goes_round_its_centre(clockwise, sideways):
     """A quarter of a circle that widens and climbs: distance to its centre, speed, and where the nose points."""
-    planner, yaw, angle, span = OnboardPlanners(1), 0.3, 0.5 * math.pi, 4.0
+    planner, yaw, angle, span = OnboardPlanner(), 0.3, 0.5 * math.pi, 4.0
     start = np.array([0.2, -0.1, 1.0, yaw])
     planner.spiral(
-        0, 0.0, start, angle=angle, radii=(0.5, 0.7), climb=0.4, span=span, sideways=sideways, clockwise=clockwise
+        0.0, start, angle=angle, radii=(0.5, 0.7), climb=0.4, span=span, sideways=sideways, clockwise=clockwise
     )
     sense = -1.0 if clockwise else 1.0
     to_centre = yaw + (0.0 if clockwise else math.pi) if sideways else yaw + sense * 0.5 * math.pi
     centre = start[:2] + 0.5 * np.array([math.cos(to_centre), math.sin(to_centre)])
     for share in (0.0, 0.25, 0.5, 0.75, 1.0):
-        x, y, z, heading = planner.goal(span * share)[0]
+        x, y, z, heading = planner.goal(span * share)
         out = np.array([x, y]) - centre
         assert math.hypot(*out) == pytest.approx(0.5 + 0.2 * share, abs=0.01)  # one polynomial is no spiral: 1 cm
         assert z == pytest.approx(1.0 + 0.4 * share, abs=1e-9)
         assert heading == pytest.approx(yaw + sense * angle * share, abs=1e-9)
-    _, speed, _ = planner.state(0, 0.0)
+    _, speed, _ = planner.state(0.0)
     along = sense * np.array([math.sin(to_centre), -math.cos(to_centre)])
     assert along @ speed[:2] == pytest.approx(0.5 * angle / span)

@@ -150,17 +150,17 @@ def test_frozen_positions_shoot_it_up():
 def test_a_wrong_yaw_leads_astray(wrong, far):
     """A goal ahead is approached on a curve; beyond a right angle not at all."""
     wire = Wire(yaw=math.radians(-wrong))
-    wire.flock.estimator.turn[0] = math.radians(wrong)
+    wire.vehicle.estimator.turn = math.radians(wrong)
     wire.hovering(0.5)
-    assert wire.flock.pose(0)[3] == pytest.approx(0.0)
+    assert wire.vehicle.pose[3] == pytest.approx(0.0)
     wire.go_to(0.5, 0.0, 0.5, 0.0, 2.0)
     away = math.dist(wire.after(8.0).position[:2], [0.5, 0.0])
-    assert wire.flock.estimated_yaw(0) == pytest.approx(0.0, abs=0.01)
+    assert wire.vehicle.yaw == pytest.approx(0.0, abs=0.01)
     assert away < far if wrong < 90.0 else away > far
 
 
 def test_an_external_attitude_corrects_the_yaw():
     wire = Wire(external=True, yaw=1.0)
-    wire.flock.estimator.turn[0] = 0.7
+    wire.vehicle.estimator.turn = 0.7
     wire.put(Port.LOCATION, 1, Location.POSE, struct.pack("<7f", 0, 0, 0, 0, 0, math.sin(0.5), math.cos(0.5)))
-    assert wire.flock.estimated_yaw(0) == pytest.approx(1.0)
+    assert wire.vehicle.yaw == pytest.approx(1.0)

@@ -8,12 +8,19 @@ import pytest
 from agents.protocols.crtp import LogStatus
 from tests.requests import request
 from tests.twins.crazyflie_wire import DT, Wire, brushless
-from twins.devices.crazyflie.flock import Flock
+from twins.devices.crazyflie.vehicle import Vehicle
 from twins.devices.device import Faults
 
 
 def heights(wire, seconds, each=None):
     return np.array([wire.after(DT, each).position[2] for _ in range(round(seconds / DT))])
+
+
+def advance(vehicles, t):
+    """Their heights [m] at a time."""
+    for vehicle in vehicles:
+        vehicle.advance(t)
+    return [vehicle.model.held[2] for vehicle in vehicles]
 
 
 @pytest.mark.slow
@@ -22,18 +29,15 @@ def test_take_off_overshoots_and_returns():
     climbs = [(0.5, 1.5), (0.8, 2.0), (1.0, 2.5), (1.0, 2.0), (2.0, 5.0)]
     asked = request("crazyflie", ["x"] * 2 * len(climbs))
     platforms = ({"platform": platform} for platform in ("crazyflie", "brushless") for _ in climbs)
-    flock = Flock(replace(asked, device=tuple(platforms)), Faults())
-    for row in range(5, 10):
-        assert flock.arm(row, on=True)
+    asked = replace(asked, device=tuple(platforms))
+    vehicles = [Vehicle(asked, Faults(), row) for row in range(2 * len(climbs))]
+    assert all(vehicle.arm(on=True) for vehicle in vehicles[len(climbs) :])
     begin, at = 0.6, np.zeros(4)  # the motors of those that are armed spin up
     for t in np.arange(DT, begin + DT / 2, DT):
-        flock.advance(t)
-    for row, (height, span) in enumerate(climbs * 2):
-        flock.planner.climb(row, flock.t, at, height=height, yaw=0.0, span=span, landing=False)
-    reached = []
-    for t in begin + np.arange(DT, 20.0, DT):
-        flock.advance(t)
-        reached.append(flock.quadrotor.position[:, 2].copy())
+        advance(vehicles, t)
+    for vehicle, (height, span) in zip(vehicles, climbs * 2, strict=True):
+        vehicle.planner.climb(vehicle.t, at, height=height, yaw=0.0, span=span, landing=False)
+    reached = [advance(vehicles, t) for t in begin + np.arange(DT, 20.0, DT)]
     share = np.array(reached) / [height for height, _ in climbs * 2] - 1.0
     for row in share.T:
         assert 0.07 < row.max() < 0.11
@@ -69,8 +73,8 @@ def test_landing_from_the_overshoot_ends_on_the_floor(wait):
 @pytest.mark.slow
 def test_thrust_in_hover_carries_the_weight():
     """29 g, and 39.3 g of a Brushless with guards, each with a deck, by the firmware's curves of thrust."""
-    assert Wire().hovering().flock.vertical.thrust == pytest.approx([39300.0], rel=0.002)
-    assert brushless().hovering().flock.vertical.thrust == pytest.approx([31750.0], rel=0.002)
+    assert Wire().hovering().vehicle.vertical.thrust == pytest.approx(39300.0, rel=0.002)
+    assert brushless().hovering().vehicle.vertical.thrust == pytest.approx(31750.0, rel=0.002)
 
 
 @pytest.mark.parametrize("waited_s", [0.2, 3.0])

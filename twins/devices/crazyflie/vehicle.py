@@ -1,0 +1,351 @@
+"""One Crazyflie below its protocol: motion, estimator, battery, decks and on-board logic."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from math import atan2, cos, exp, inf, isnan, radians, sin
+from typing import Final
+
+import numpy as np
+
+from agents.body.external_pose import velocity_after
+from agents.body.interface import BodyRequest
+from agents.body.kinds import Flight
+from agents.kinds.crazyflie import CRAZYFLIE
+from agents.protocols.crazyflie import CrazyflieSettings, Lighthouse, Loco, chosen
+from agents.protocols.crtp import Info, Power
+from agents.vectors import ZERO, Setpoint, Vector, clamp, difference
+from twins.arrays import Array
+from twins.body import instants
+from twins.devices.crazyflie.commander import Commander
+from twins.devices.crazyflie.memory import Memories
+from twins.devices.crazyflie.planner import OnboardPlanner, PlannerState
+from twins.devices.crazyflie.supervisor import Supervisor
+from twins.devices.crazyflie.vertical import VerticalLoops
+from twins.devices.device import Faults
+from twins.models.disturbance import HoverJitter, Latency, MeasurementNoise
+from twins.models.noise import refill
+from twins.models.quadrotor import GRAVITY, Quadrotor
+
+SETTLING_S: Final = 0.1  # time constant of the convergence of estimate and variance with measurements
+PRECISE: Final = 1e-5  # [m²] final variance
+LOST: Final = 100.0  # [m²] variance after a reset
+GROWTH: Final = 1.0  # [m²/s] of the variance without measurements
+DRIFT: Final = (0.05, -0.05)  # [m/s²] along x, y: 0.3° of error in the attitude, twice
+FRESH_S: Final = 0.5  # older external positions are ignored
+
+
+class Estimator:
+    """Estimator of position and yaw, by its errors."""
+
+    def __init__(self, error: Vector, turn: float) -> None:
+        """See `reset`."""
+        self.external = ZERO  # last external position [m]
+        self.received = 0  # number of external positions
+        self.rate = ZERO  # of the error [m/s]: the estimate of the velocity is wrong by as much
+        self._external_error = ZERO  # of the last external position [m]
+        self._external_time = -inf
+        self._drift = (0.0, 0.0)  # rate of the error without measurements [m/s]
+        self.reset(error, turn)
+
+    def reset(self, error: Vector, turn: float) -> None:
+        """Restart with an error of the position [m] and of the yaw [rad]: estimate minus truth."""
+        self.error, self.variance, self.turn = error, LOST, turn  # variance per axis [m²]
+
+    def add_external(self, t: float, position: Vector, truth: Vector) -> None:
+        """Add an external position [m] of a drone at `truth` [m]; accelerometers measure how it moves on."""
+        self.external, self._external_time = position, t
+        self._external_error = difference(position, truth)
+        self.received += 1
+
+    def advance(self, t: float, dt: float, *, ready: bool, flow: bool, flying: bool) -> None:
+        """Advance one step of dt [s].
+
+        Args:
+            t: Current time [s].
+            dt: [s].
+            ready: A positioning system on board works.
+            flow: A Flow deck measures velocity and height, so an error of the place stays.
+            flying: In the air, without measurements, the error of the attitude is integrated.
+        """
+        measured = ready or t - self._external_time <= FRESH_S
+        share = 1.0 - exp(-dt / SETTLING_S)
+        before = x, y, z = self.error
+        to_x, to_y, to_z = ZERO if ready or flow else self._external_error
+        if measured:
+            x, y = x + share * (to_x - x), y + share * (to_y - y)
+        if measured or flow:
+            z += share * (to_z - z)
+            self._drift = (0.0, 0.0)
+        elif flying:
+            self._drift = self._drift[0] + dt * DRIFT[0], self._drift[1] + dt * DRIFT[1]
+            x, y = x + dt * self._drift[0], y + dt * self._drift[1]
+        else:
+            self._drift = (0.0, 0.0)
+        self.error = x, y, z
+        self.rate = (x - before[0]) / dt, (y - before[1]) / dt, (z - before[2]) / dt
+        if measured:
+            self.variance += share * (PRECISE - self.variance)
+        elif not flow:
+            self.variance = min(self.variance + GROWTH * dt, LOST)
+
+
+# voltage [V] of a battery at rest by charge, in steps of 10 %: the curve from which the firmware gives pm.batteryLevel
+VOLTS: Final = (3.0, 3.78, 3.83, 3.87, 3.89, 3.92, 3.96, 4.0, 4.04, 4.1, 4.2)
+SAG_V: Final = 0.3  # under the load of hovering: 2 A through 0.15 ohm
+LOW_V: Final = 3.2  # the firmware's own threshold
+LOW_S: Final = 5.0  # from the first voltage below it to the state "low"
+IMPACT: Final = 4.2  # [m/s] a robot that hits the floor faster (a fall of 0.9 m) ends on its side
+SKATING: Final = 2.0  # [m/s] largest speed of that
+TRIM: Final = (radians(0.4), radians(-0.3))  # roll, pitch of a robot at rest [rad]: none is exactly level
+LEANING_S: Final = 0.05  # time constant of the attitude
+ENOUGH_ANCHORS: Final = 4  # for three dimensions and a common clock
+
+
+class Battery:
+    """Battery, under load while the motors turn."""
+
+    def __init__(self, model: Quadrotor, faults: Faults, dt: float) -> None:
+        self.charge = faults.battery  # 0 to 1
+        self._model, self._t = model, 0.0
+        self._low_since = inf  # [s]
+        self._drain = dt * faults.drain / CRAZYFLIE.endurance_s
+
+    def advance(self, t: float) -> None:
+        """Drain by one step until `t` [s]."""
+        self._t = t
+        if self._model.flying:
+            self.charge = max(self.charge - self._drain, 0.0)
+        self._low_since = min(self._low_since, t) if self.volts < LOW_V else inf
+
+    @property
+    def volts(self) -> float:
+        """Voltage [V]; under load it sags."""
+        tenths = 10.0 * self.charge
+        step = min(int(tenths), len(VOLTS) - 2)
+        return VOLTS[step] + (tenths - step) * (VOLTS[step + 1] - VOLTS[step]) - SAG_V * self._model.flying
+
+    @property
+    def level(self) -> int:
+        """Log variable pm.batteryLevel [%], in steps of 10."""
+        return 10 * bisect_left(VOLTS, self.volts, hi=len(VOLTS) - 2)
+
+    @property
+    def power(self) -> Power:
+        """State of the power management."""
+        if self.charge <= 0.0:
+            return Power.SHUTDOWN
+        return Power.LOW if self._t - self._low_since > LOW_S else Power.BATTERY
+
+
+class Decks:
+    """Decks, with the memories that they bring; positioning on board needs their contents."""
+
+    def __init__(self, settings: CrazyflieSettings) -> None:
+        self.lighthouse = isinstance(settings.positioning, Lighthouse)
+        self.loco = isinstance(settings.positioning, Loco)
+        self.multiranger, self.flow = settings.multiranger, settings.positioning is None
+        boards = {
+            "bcLighthouse4": self.lighthouse, "bcDWM1000": self.loco, "bcMultiranger": self.multiranger,
+            "bcFlow2": self.flow,
+        }  # fmt: skip
+        self.memories = Memories([board for board, present in boards.items() if present])
+
+    @property
+    def station_status(self) -> int:
+        """Log variable lighthouse.status: 0 nothing received, 1 geometry or calibration missing, 2 measuring."""
+        if not self.lighthouse:
+            return 0
+        return 2 if self.memories.geometries & self.memories.calibrations else 1
+
+    @property
+    def ready(self) -> bool:
+        """Whether a positioning system on board works."""
+        return self.station_status == 2 or (self.loco and len(self.memories.anchors()) >= ENOUGH_ANCHORS)
+
+
+class Vehicle:
+    """One Crazyflie; its protocol is a `twins.devices.crazyflie.drone.Drone`."""
+
+    def __init__(self, request: BodyRequest, faults: Faults, row: int) -> None:
+        """Raises BodyError for invalid settings."""
+        name, seed, kind = request.names[row], request.seeds[row], request.kinds[row]
+        disturbance, yaw = request.disturbance[row], request.yaw[row]
+        self.settings = settings = chosen(name, request.device[row], external=request.external[row])
+        self.row, self.dt = row, 1.0 / request.rate_hz  # tick [s]
+        self.t = 0.0  # current time [s]
+        self.model = Quadrotor(kind, request.start[row], yaw)  # `held` is its true position without hover jitter
+        self.model.blow(disturbance.wind or (0.0, 0.0))
+        self._jitter = HoverJitter(disturbance, name, seed, self.dt)
+        self._measurement = MeasurementNoise(disturbance, name, seed, spatial=True)
+        self._latency = Latency(disturbance, self.dt)
+        self.decks = Decks(settings)
+        self._faults, self._fault_tumbled = faults, False
+        self.supervisor = Supervisor(auto_arm=not (faults.refuse_arming or settings.platform == "brushless"))
+        self.planner, self.commander = OnboardPlanner(), Commander()
+        self.battery = Battery(self.model, faults, self.dt)
+        self.vertical = VerticalLoops(settings.platform, self.dt)
+        flight = CRAZYFLIE.motion
+        assert isinstance(flight, Flight)
+        self._gain, self._speed_gain, self._turn_gain = flight.position, flight.velocity[0], kind.turn_response
+        # it believes to be where it was switched on, and to look along x
+        self.estimator = Estimator(difference(ZERO, self.model.held), -yaw)
+        self.place = self._last_measured = self.model.held  # true position [m]
+        self.estimate = ZERO  # reported position [m]
+        self.velocity = ZERO  # reported, from measured positions [m/s]
+        self.acceleration = ZERO  # [m/s²]
+        self.attitude = TRIM  # roll to the right, pitch nose up [rad]
+
+    @property
+    def pose(self) -> Array:
+        """Estimated pose (4,): x, y, z [m], yaw [rad]."""
+        return np.array([*self._believed, self.yaw])
+
+    @property
+    def yaw(self) -> float:
+        """Estimated yaw [rad]."""
+        return self.model.yaw + self.estimator.turn
+
+    @property
+    def _believed(self) -> Vector:
+        """Estimated position, without noise [m]."""
+        (x, y, z), (dx, dy, dz) = self.model.held, self.estimator.error
+        return x + dx, y + dy, z + dz
+
+    @property
+    def info(self) -> Info:
+        """Flags of supervisor and planner."""
+        info = self.supervisor.info
+        if self.planner.plan != PlannerState.IDLE:
+            info |= Info.PLANNER_ACTIVE
+        if self.planner.finished(self.t):
+            info |= Info.PLANNER_FINISHED
+        return info
+
+    def arm(self, *, on: bool) -> bool:
+        """Arm or disarm; False if refused."""
+        if on and self._faults.refuse_arming:
+            return False
+        done = self.supervisor.arm(self.t, on=on)
+        if not on:
+            self.planner.stop()
+            self.commander.stop()
+        return done
+
+    def restart(self) -> None:
+        """Switch off and on: motors off, estimator at its start."""
+        self.planner.stop()
+        self.commander.stop()
+        self.supervisor.restart()
+        self.model.stop()
+        self.estimator.reset(difference(ZERO, self.model.held), -self.model.yaw)
+
+    def advance(self, t: float) -> bool:
+        """Advance to time `t` [s] by steps of dt; returns whether it was locked or crashed on the way."""
+        locked = False
+        for now in instants(self.t, t, self.dt) or [t]:
+            locked |= self._step(now)
+        return locked
+
+    def _step(self, t: float) -> bool:
+        self.t = t
+        model, commander, supervisor, estimator, dt = (
+            self.model, self.commander, self.supervisor, self.estimator, self.dt
+        )  # fmt: skip
+        if self._faults.tumbled(t) != self._fault_tumbled:
+            supervisor.tumbled = self._fault_tumbled = not self._fault_tumbled
+        commander.take_planned(t, self.planner.goal(t))
+        locked = supervisor.advance(t, t - commander.received, spinning=model.flying)
+        if locked:
+            self.planner.stop()
+        model.flying = commander.on and supervisor.may_fly and self.battery.charge > 0.0
+        setpoint = self._true_setpoint(
+            commander.model_setpoint(
+                self._believed,
+                model.velocity,
+                self.yaw,
+                level=supervisor.level,
+                gain=self._gain,
+                speed_gain=self._speed_gain,
+                turn_gain=self._turn_gain,
+            )
+        )
+        delayed = self._latency.delay(setpoint)
+        model.command(delayed)
+        before, place = model.velocity, model.held
+        model.move(dt)
+        if model.flying:
+            self._climb(before[2], place[2], delayed[2])
+        else:
+            self.vertical.reset()
+        self._touch_floor(before, place, setpoint)
+        self._update_attitude(before)
+        x, y, z = model.held
+        if self._jitter.present:
+            dx, dy = self._jitter.advance(z)
+            x, y = x + dx, y + dy
+        self.place = x, y, z
+        self.battery.advance(t)
+        estimator.advance(t, dt, ready=self.decks.ready, flow=self.decks.flow, flying=model.flying)
+        if self._measurement.present:
+            dx, dy, dz, _ = self._measurement.draw()
+            x, y, z = x + dx, y + dy, z + dz
+        refill(self._jitter.noise, self._measurement.noise)
+        wrong_x, wrong_y, wrong_z = estimator.error
+        self.estimate = x + wrong_x, y + wrong_y, z + wrong_z
+        self.velocity = velocity_after(self.velocity, difference((x, y, z), self._last_measured), dt)
+        self._last_measured = x, y, z
+        return locked
+
+    def _climb(self, before: float, height: float, target: float) -> None:
+        """Move vertically, from a speed `before` [m/s] and a height toward a target [m]; NaN: stay.
+
+        The controller takes what the estimate does not see of the horizontal velocity for none.
+        """
+        model, (rate_x, rate_y, rate_z) = self.model, self.estimator.rate
+        offset = 0.0 if isnan(target) else target - height
+        wanted = self._gain[2] * offset if isnan(self.commander.target[2]) else None
+        acceleration = self.vertical.advance(offset, before + rate_z, wanted, self.commander.thrust)
+        (x, y, _), (v_x, v_y, _), speed = model.held, model.velocity, before + self.dt * acceleration
+        model.held = x, y, height + self.dt * speed
+        lag = self.dt * self._speed_gain
+        model.velocity = v_x - lag * rate_x, v_y - lag * rate_y, speed
+
+    def _true_setpoint(self, setpoint: Setpoint) -> Setpoint:
+        """Setpoint of position and yaw as it is flown: the controller uses the estimate, not the truth."""
+        estimator, (x, y, z, yaw) = self.estimator, setpoint
+        wrong_x, wrong_y, wrong_z = estimator.error
+        x, y = x - wrong_x, y - wrong_y
+        if estimator.turn != 0.0:  # it turns its accelerations by a wrong yaw
+            (x0, y0, _), c, s = self.model.held, cos(estimator.turn), sin(estimator.turn)
+            x, y = x0 + c * (x - x0) + s * (y - y0), y0 + c * (y - y0) - s * (x - x0)
+        return x, y, z - wrong_z, yaw - estimator.turn
+
+    def _touch_floor(self, before: Vector, place: Vector, setpoint: Setpoint) -> None:
+        """Stop at the floor; a drone that hits it hard, with `before` [m/s], ends on its side.
+
+        If the motors still carry much of the weight, it slides from its `place` [m] toward `setpoint`, as its estimate
+        leads.
+        """
+        model, dt = self.model, self.dt
+        height = model.held[2]
+        self.supervisor.tumbled |= height <= 0.0 and before[2] < -IMPACT
+        if height >= 0.0:
+            return
+        x, y, v_x, v_y = place[0], place[1], 0.0, 0.0
+        if model.flying and self.vertical.sliding:
+            wanted_x = clamp(self._gain[0] * (setpoint[0] - x), -SKATING, SKATING)
+            wanted_y = clamp(self._gain[1] * (setpoint[1] - y), -SKATING, SKATING)
+            share = dt * self._speed_gain
+            v_x, v_y = before[0] + share * (wanted_x - before[0]), before[1] + share * (wanted_y - before[1])
+        model.velocity, model.held = (v_x, v_y, 0.0), (x + dt * v_x, y + dt * v_y, 0.0)
+
+    def _update_attitude(self, before: Vector) -> None:
+        """Attitude that gives the acceleration from `before` [m/s] on, with a lag."""
+        (v_x, v_y, v_z), dt = self.model.velocity, self.dt
+        moved = (v_x - before[0]) / dt, (v_y - before[1]) / dt, (v_z - before[2]) / dt
+        self.acceleration = x, y, z = moved if self.model.flying else ZERO
+        c, s, lift = cos(self.model.yaw), sin(self.model.yaw), GRAVITY + z
+        share, (roll, pitch) = 1.0 - exp(-dt / LEANING_S), self.attitude
+        wanted_roll, wanted_pitch = TRIM[0] + atan2(s * x - c * y, lift), TRIM[1] - atan2(c * x + s * y, lift)
+        self.attitude = roll + share * (wanted_roll - roll), pitch + share * (wanted_pitch - pitch)
