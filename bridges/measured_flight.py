@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from math import hypot, inf, isfinite, isnan
 from typing import Final
 
@@ -17,22 +18,16 @@ TABLE_M: Final = 0.3  # [m] horizontally from there it ends
 SETTLED: Final = 0.1  # [m/s] slower robots stand
 
 
+@dataclass(slots=True)
 class MeasuredFlight:
     """Flight of a robot, and since when it lands; all times are on the clock of the body [s]."""
 
-    __slots__ = ("_grounded_since", "_highest", "_start", "_still_since", "flying", "landing_since")
-
-    flying: bool
-    landing_since: float  # order to land or to stop; infinity without one
-    _start: Vector  # place of the take-off [m]
-    _highest: float  # since the order to land [m]
-    _still_since: float
-    _grounded_since: float  # measured on the ground although it should fly
-
-    def __init__(self) -> None:
-        self.flying, self.landing_since = False, inf
-        self._start, self._highest = ZERO, -inf
-        self._still_since = self._grounded_since = inf
+    flying: bool = False
+    landing_since: float = inf  # order to land or to stop; infinity without one
+    _start: Vector = ZERO  # place of the take-off [m]
+    _highest: float = -inf  # since the order to land [m]
+    _still_since: float = inf
+    _grounded_since: float = inf  # measured on the ground although it should fly
 
     def take_off(self, position: Vector) -> None:
         """Begin a flight at a position [m], NaN if unknown."""

@@ -123,7 +123,7 @@ class TurtleBot3(Body):
                 hint = f"it is published with type hash {found.hash}: set another distro than {where.distro}."
         if others:
             hint += f" Namespaces with odometry there: {', '.join(sorted(others))}"
-        return f"{robot.name}: no odometry on '{robot.odometry_key}': {hint}"
+        return f"{robot.name}: no odometry on '{robot.odometry_inbox.key}': {hint}"
 
     def read(self, t: float) -> Sequence[BodyState]:
         now = self._read_at = self._clock()
@@ -161,7 +161,7 @@ class TurtleBot3(Body):
         """See `Body.command`: v [m/s] and ω [rad/s]."""
         for robot, (v, w, _, _) in zip(self.robots, setpoints, strict=True):
             if isfinite(v) and isfinite(w):
-                robot.drive(v, w, self._read_at)
+                robot.commanded.drive(v, w, self._read_at)
             robot.send_command(self._clock())
 
     def takeoff(self, rows: Sequence[int], heights: Sequence[float]) -> None:

@@ -41,7 +41,7 @@ class RepeatedVelocity:
         self._zeros = ZEROS  # nothing to repeat: nothing is sent before the first command
 
     def drive(self, v: float, w: float, now: float) -> None:
-        """Drive until the next command, for `FRESH_S` at most."""
+        """Drive at v [m/s], ω [rad/s] until the next command, for `FRESH_S` at most."""
         self._commanded = now
         if v or w:
             self.halted_since = inf
@@ -121,7 +121,7 @@ class TurtleBotConnection:
         self._types = participant.types
         self._command_type = turtlebot3.command_type(where.distro, self.settings.stamped)
         node = participant.node(f"zenpark_{self.name}", where.namespace)
-        self._odometry_inbox = node.subscriber(turtlebot3.ODOMETRY, ros2.ODOMETRY, depth=4)
+        self.odometry_inbox = node.subscriber(turtlebot3.ODOMETRY, ros2.ODOMETRY, depth=4)
         self._scan = node.subscriber(turtlebot3.SCAN, ros2.LASER_SCAN, ros2.SENSOR_DATA, depth=1)
         self._battery = node.subscriber(turtlebot3.BATTERY, ros2.BATTERY_STATE, depth=1)
         self._command = node.publisher(self.settings.command_topic, self._command_type)
@@ -137,15 +137,11 @@ class TurtleBotConnection:
         domain = f"?domain={where.domain}" if where.style == "rmw" else ""
         return f"{where.style}://{where.namespace}{domain} by {', '.join(self.endpoints)}"
 
-    @property
-    def odometry_key(self) -> str:
-        return self._odometry_inbox.key
-
     # ------------------------------------------------------------------ reception
 
     def receive_messages(self, t: float, now: float) -> None:
         """Process received messages at `t` on the clock of `Body.read` and `now` on the monotonic clock [s]."""
-        for message in self._odometry_inbox.received():
+        for message in self.odometry_inbox.received():
             if self.odometry.update(message, now) and not self.odometry.unsteady(now):
                 self.time = t - self.odometry.age
         if (scan := self._scan.newest()) is not None:
@@ -170,10 +166,6 @@ class TurtleBotConnection:
         return self.odometry.standing and self.commanded.settled
 
     # ------------------------------------------------------------------ commands
-
-    def drive(self, v: float, w: float, now: float) -> None:
-        """Drive at v [m/s], ω [rad/s] until the next command, for `FRESH_S` at most."""
-        self.commanded.drive(v, w, now)
 
     def halt(self, now: float) -> None:
         """Stop the robot: send zeros at once and repeat them."""

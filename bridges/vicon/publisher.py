@@ -13,7 +13,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Final
 
 import msgspec
-import zenoh
 from msgspec import Meta
 
 from agents.body.external_pose import External
@@ -118,19 +117,6 @@ class PoseFilter:
 NOT_Z_UP: Final = "no positions: the server's z axis does not point up; change this in its options"
 
 
-class Positions:
-    """Publishes the poses of robots, each on its key `position`."""
-
-    def __init__(self, session: zenoh.Session, keys: Keys, robots: Sequence[str]) -> None:
-        mime = messages.MIME["json"]
-        self._publishers = {robot: pubsub.publisher(session, keys.position(robot), mime) for robot in robots}
-
-    def publish(self, robot: str, stamp: float, segment: Segment, yaw: float) -> None:
-        """Publish the pose of a robot at UTC time `stamp` [s]."""
-        publisher, said = self._publishers[robot], messages.position(robot, stamp, segment.position, yaw)
-        publisher.put(messages.encode(said), source_info=pubsub.source_of(publisher))
-
-
 class Bridge:
     """Publishes the stream of a DataStream server; reconnects after its restarts."""
 
@@ -139,14 +125,14 @@ class Bridge:
         host: str,
         port: int,
         pose_filter: PoseFilter,
-        positions: Positions,
+        publish: Callable[[messages.Position], object],
         print_line: Callable[[str], None],
         *,
         connect: Callable[[str, int, float], Reader] = Reader,
         pause_s: float = PAUSE_S,
     ) -> None:
         self._host, self._port = host, port
-        self._filter, self._positions, self._print_line = pose_filter, positions, print_line
+        self._filter, self._publish, self._print_line = pose_filter, publish, print_line
         self._connect, self._pause_s = connect, pause_s
         self._clock = Clock()
         self._state = ""
@@ -188,7 +174,7 @@ class Bridge:
                 continue
             heard, number = now, frame.number
             for robot, measured, segment, yaw in self._filter.filter_poses(frame, now):
-                self._positions.publish(robot, self._clock.at(measured), segment, yaw)
+                self._publish(messages.position(robot, self._clock.at(measured), segment.position, yaw))
 
     def _report_once(self, state: str) -> None:
         if state != self._state:
@@ -233,7 +219,14 @@ def serve(launch: ViconLaunch) -> int:
     ):
         keys, robots = Keys(launch.realm), list(subjects)
         farewell = Farewell(session, keys, robots, lost)
-        made = Bridge(host, port, PoseFilter(subjects, print_line), Positions(session, keys, robots), print_line)
+        mime = messages.MIME["json"]
+        publishers = {robot: pubsub.publisher(session, keys.position(robot), mime) for robot in robots}
+
+        def publish(position: messages.Position) -> None:
+            publisher = publishers[position.robot]
+            publisher.put(messages.encode(position), source_info=pubsub.source_of(publisher))
+
+        made = Bridge(host, port, PoseFilter(subjects, print_line), publish, print_line)
         declared += [farewell, made]
         if made.run(lambda: stop.is_set() or farewell.over()):
             return 0

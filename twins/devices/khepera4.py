@@ -206,15 +206,7 @@ def answer_kteam(robot: _WheeledRobot, line: str) -> str:
     except ValueError:
         return "$"
     sounds = (protocol.SOUND_NOTHING if robot.sounding >> bit & 1 else 2000 for bit in range(5))
-    measured = {
-        0: 7000 + 1400 * robot.charge,
-        1: -420,
-        2: -410,
-        3: 3400 * robot.charge,
-        4: 29,
-        5: 100 * robot.charge,
-        6: 0,
-    }
+    measured = (7000 + 1400 * robot.charge, -420, -410, 3400 * robot.charge, 29, 100 * robot.charge, 0)
     answers: dict[str, Callable[[], tuple[object, ...]]] = {
         "B": lambda: ("C", 4),
         "E": lambda: tuple(round(speed) for speed in robot.speed),
@@ -231,7 +223,7 @@ def answer_kteam(robot: _WheeledRobot, line: str) -> str:
         robot.sounding = values[0]
     elif letter == "I":
         robot.pulses = (0.0, 0.0)
-    elif letter == "V" and values and values[0] in measured:
+    elif letter == "V" and values and values[0] in range(len(measured)):
         return f"v,{round(measured[values[0]])}"
     elif letter in answers:
         return ",".join([letter.lower(), *map(str, answers[letter]())])

@@ -7,7 +7,6 @@ for cmd_vel. `watchdog_s` in the robot's settings adds such a limit.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from math import cos, inf, isfinite, nan, pi, sin
 from typing import Final
 
@@ -19,7 +18,7 @@ from agents.kinds.turtlebot3 import TURTLEBOT3
 from agents.network import session as network
 from agents.protocols import ros2, turtlebot3
 from agents.protocols.ros2 import Message
-from agents.protocols.ros2_node import Participant, Publisher, Subscriber
+from agents.protocols.ros2_node import Participant, Publisher
 from agents.protocols.turtlebot3 import TurtleBot3Settings, TurtleBotAddress
 from agents.vectors import clamp
 from twins.body import instants
@@ -31,24 +30,21 @@ from twins.models.noise import refill
 JOIN_S: Final = 5.0  # deadline of the router's answer
 
 
-@dataclass
-class _Node:
-    """The ROS side of a robot."""
-
-    types: ros2.Types
-    command: Subscriber
-    stamped: bool
-    odometry: Publisher
-    scan: Publisher
-    battery: Publisher
-    watchdog: float
-
-
 class _TurtleBot:
-    """Wheels, odometry and node of one robot."""
+    """Wheels, odometry and ROS node of one robot."""
 
-    def __init__(self, node: _Node, body: BodyRequest, row: int) -> None:
-        self.node, self._dt = node, 1.0 / body.rate_hz
+    def __init__(
+        self, participant: Participant, where: TurtleBotAddress, chosen: TurtleBot3Settings, body: BodyRequest, row: int
+    ) -> None:
+        kind = turtlebot3.command_type(where.distro, chosen.stamped)
+        node = participant.node("turtlebot3_node", where.namespace)
+        self.types, self.stamped = participant.types, kind == ros2.TWIST_STAMPED
+        self.commands = node.subscriber(chosen.command_topic, kind, depth=10)
+        self.odometry = node.publisher(turtlebot3.ODOMETRY, ros2.ODOMETRY)
+        self.scan = node.publisher(turtlebot3.SCAN, ros2.LASER_SCAN, ros2.SENSOR_DATA)
+        self.battery = node.publisher(turtlebot3.BATTERY, ros2.BATTERY_STATE)
+        self.watchdog_s = chosen.watchdog_s or inf
+        self._dt = 1.0 / body.rate_hz
         self.model = Differential(body.kinds[row], body.start[row], body.yaw[row])
         self.start = (*body.start[row][:2], body.yaw[row])
         disturbance, name, seed = body.disturbance[row], body.names[row], body.seeds[row]
@@ -68,7 +64,7 @@ class _TurtleBot:
             self._drift.advance(self.model.position[0] - x, self.model.position[1] - y)
             refill(self._drift.noise)
 
-    def odometry(self) -> tuple[float, float, float, float, float]:
+    def measure(self) -> tuple[float, float, float, float, float]:
         """Measured x, y [m] and yaw [rad] from the start; speed [m/s] and mean yaw rate since the last call [rad/s]."""
         model = self.model
         (x, y, _), yaw = model.position, model.yaw
@@ -111,7 +107,7 @@ class TurtleBot3Twin(Device):
                 which = (endpoints, where.style, where.distro, where.domain)
                 if which not in participants:
                     participants[which] = self._participant(endpoints, where)
-                self.robots.append(_TurtleBot(_node(participants[which], where, chosen), body, row))
+                self.robots.append(_TurtleBot(participants[which], where, chosen, body, row))
                 addresses.append(str(where))
         except BaseException:
             self.close()
@@ -166,11 +162,10 @@ class TurtleBot3Twin(Device):
 
     def _receive_commands(self, t: float) -> None:
         for robot in self.robots:
-            node = robot.node
-            for message in node.command.received():
+            for message in robot.commands.received():
                 if self.link.lost():
                     continue
-                said = message.twist if node.stamped else message
+                said = message.twist if robot.stamped else message
                 v, w = said.linear.x, said.angular.z
                 if not (isfinite(v) and isfinite(w) and max(abs(v), abs(w)) < 1e6):
                     continue
@@ -178,7 +173,7 @@ class TurtleBot3Twin(Device):
                 robot.twist = clamp(turtlebot3.cut(v), -speed, speed), clamp(turtlebot3.cut(w), -rate, rate)
                 robot.commanded = t
                 robot.executed += 1
-            if t - robot.commanded > node.watchdog:
+            if t - robot.commanded > robot.watchdog_s:
                 robot.twist = (0.0, 0.0)
 
     # ------------------------------------------------------------------ published topics
@@ -190,26 +185,25 @@ class TurtleBot3Twin(Device):
     def _odometry(self) -> None:
         now = self._clock.utc()
         for robot in self.robots:
-            node = robot.node
-            make = node.types.make
-            ahead, left, turned, speed, rate = robot.odometry()
-            pose = node.types.pose(ahead, left, 0.0, turned)
-            twist = node.types.twist((speed, 0.0, 0.0), (0.0, 0.0, rate))
+            types, make = robot.types, robot.types.make
+            ahead, left, turned, speed, rate = robot.measure()
+            pose = types.pose(ahead, left, 0.0, turned)
+            twist = types.twist((speed, 0.0, 0.0), (0.0, 0.0, rate))
             message = make(
                 ros2.ODOMETRY,
-                header=node.types.header(now, "odom"),
+                header=types.header(now, "odom"),
                 child_frame_id="base_footprint",
                 pose=make("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=np.zeros(36)),
                 twist=make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=np.zeros(36)),
             )
-            self._publish(node.odometry, node.types, message)
+            self._publish(robot.odometry, types, message)
 
     def _scan(self) -> None:
         now, step = self._clock.utc(), 2.0 * pi / turtlebot3.RAYS
-        for node in (robot.node for robot in self.robots):
-            message = node.types.make(
+        for robot in self.robots:
+            message = robot.types.make(
                 ros2.LASER_SCAN,
-                header=node.types.header(now, "base_scan"),
+                header=robot.types.header(now, "base_scan"),
                 angle_min=0.0,
                 angle_max=step * (turtlebot3.RAYS - 1),
                 angle_increment=step,
@@ -220,17 +214,17 @@ class TurtleBot3Twin(Device):
                 ranges=np.full(turtlebot3.RAYS, inf, np.float32),  # nothing is in reach
                 intensities=np.zeros(turtlebot3.RAYS, np.float32),
             )
-            self._publish(node.scan, node.types, message)
+            self._publish(robot.scan, robot.types, message)
 
     def _battery(self) -> None:
         spent = self._used * self.link.faults.drain / TURTLEBOT3.endurance_s
         charge = max(0.0, self.link.faults.battery - spent)
         voltage = turtlebot3.EMPTY_V + charge * (turtlebot3.FULL_V - turtlebot3.EMPTY_V)
         now = self._clock.utc()
-        for node in (robot.node for robot in self.robots):
-            message = node.types.make(
+        for robot in self.robots:
+            message = robot.types.make(
                 ros2.BATTERY_STATE,
-                header=node.types.header(now, ""),
+                header=robot.types.header(now, ""),
                 voltage=voltage,
                 temperature=nan,
                 current=nan,
@@ -247,19 +241,4 @@ class TurtleBot3Twin(Device):
                 location="",
                 serial_number="",
             )
-            self._publish(node.battery, node.types, message)
-
-
-def _node(participant: Participant, where: TurtleBotAddress, chosen: TurtleBot3Settings) -> _Node:
-    """The node of one robot."""
-    kind = turtlebot3.command_type(where.distro, chosen.stamped)
-    node = participant.node("turtlebot3_node", where.namespace)
-    return _Node(
-        types=participant.types,
-        command=node.subscriber(chosen.command_topic, kind, depth=10),
-        stamped=kind == ros2.TWIST_STAMPED,
-        odometry=node.publisher(turtlebot3.ODOMETRY, ros2.ODOMETRY),
-        scan=node.publisher(turtlebot3.SCAN, ros2.LASER_SCAN, ros2.SENSOR_DATA),
-        battery=node.publisher(turtlebot3.BATTERY, ros2.BATTERY_STATE),
-        watchdog=chosen.watchdog_s or inf,
-    )
+            self._publish(robot.battery, robot.types, message)

@@ -189,7 +189,7 @@ def test_stale_commands_are_followed_by_zeros():
     _, good = FakeRos(body.robots[0], StopIteration()), FakeRos(body.robots[1])
     for robot in body.robots:
         robot.odometry.received = 1e9
-        robot.drive(0.1, 0.0, 100.0)
+        robot.commanded.drive(0.1, 0.0, 100.0)
     for _ in range(20):
         now.sleep(0.05)
         body.stop_stale()
@@ -201,9 +201,9 @@ def test_command_from_before_suspension_becomes_zeros():
     robot = TurtleBotConnection(request(NOWHERE, "ros2dds://tb3_0?distro=humble"), 0)
     ros = FakeRos(robot)
     robot.odometry.received = 103.0
-    robot.drive(0.1, 0.0, 100.0)  # decided on what was read then, commanded after the suspension
+    robot.commanded.drive(0.1, 0.0, 100.0)  # decided on what was read then, commanded after the suspension
     robot.send_command(103.0)
     assert ros.sent == [0.0]
-    robot.drive(0.1, 0.0, 103.0)
+    robot.commanded.drive(0.1, 0.0, 103.0)
     robot.send_command(103.1)
     assert ros.sent[-1] == pytest.approx(0.102)

@@ -52,7 +52,7 @@ class Stream(ManualClock):
         monkeypatch.setattr(time, "clock_gettime", lambda _: self.now)
         monkeypatch.setattr(time, "time", lambda: 1.8e9 + self.now + self.wall_step)
         pose_filter = PoseFilter({"CF01": "CF01"}, said.append)
-        self.bridge = Bridge("nowhere", 1, pose_filter, self, said.append, connect=lambda *_: self, pause_s=0.0)
+        self.bridge = Bridge("nowhere", 1, pose_filter, self.publish, said.append, connect=lambda *_: self, pause_s=0.0)
 
     def newest(self, _timeout):
         self.now += 0.01
@@ -61,8 +61,8 @@ class Stream(ManualClock):
 
     def close(self): ...
 
-    def publish(self, _robot, stamp, segment, _yaw):
-        self.published.append((stamp, segment.position[0]))
+    def publish(self, position):
+        self.published.append((position.stamp, position.position[0]))
 
 
 @pytest.mark.parametrize("step", [-1.0, 3.0])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from math import cos, inf, isnan, nan, radians, remainder, sin, tan, tau
 from typing import Final
 
+from agents.body.kinds import Flight
 from agents.vectors import UNKNOWN, Setpoint, Vector, clamp
 from twins.arrays import Array
 from twins.models.quadrotor import GRAVITY
@@ -18,7 +19,9 @@ class Commander:
     A low-level setpoint has priority over the planner for ever, unless the client announces the end of its setpoints.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, flight: Flight, turn_response: float) -> None:
+        """Gains of the model's loops: a velocity v is the position v / gain ahead; `turn_response` of the yaw [1/s]."""
+        self._gain, self._speed_gain, self._turn_gain = flight.position, flight.velocity[0], turn_response
         self.command(-inf, on=False)
         self._low_level = False
 
@@ -74,27 +77,10 @@ class Commander:
             self.command(t, target=(x, y, z), heading=yaw)
         self._low_level = False
 
-    def model_setpoint(
-        self,
-        position: Vector,
-        velocity: Vector,
-        yaw: float,
-        *,
-        level: bool,
-        gain: Vector,
-        speed_gain: float,
-        turn_gain: float,
-    ) -> Setpoint:
-        """Setpoint as position and yaw, the input of the motion model.
+    def model_setpoint(self, position: Vector, velocity: Vector, yaw: float, *, level: bool) -> Setpoint:
+        """Setpoint as position and yaw, the input of the motion model, of a drone as it believes to be [m, m/s, rad].
 
-        Args:
-            position: Estimated [m].
-            velocity: [m/s].
-            yaw: [rad].
-            level: Without horizontal setpoint.
-            gain: Of the model's position controller [1/s]: a velocity v is the position v / gain ahead.
-            speed_gain: Of its horizontal velocity controller [1/s]: an acceleration a is a / speed_gain faster.
-            turn_gain: Likewise of its yaw controller [1/s].
+        `level`: without horizontal setpoint.
         """
         c, s = cos(yaw), sin(yaw)
         (ahead, left), (v_x, v_y, v_z), (x, y, z) = self._lean, self._velocity, self.target
@@ -104,14 +90,14 @@ class Commander:
             x = y = v_x = v_y = nan
             ahead = left = 0.0
         free_x, free_y, free_z = velocity  # axes without setpoint keep their velocity, or lean
-        free_x += (c * ahead - s * left) / speed_gain
-        free_y += (s * ahead + c * left) / speed_gain
-        axes = zip((x, y, z), (v_x, v_y, v_z), (free_x, free_y, free_z), position, gain, strict=True)
+        free_x += (c * ahead - s * left) / self._speed_gain
+        free_y += (s * ahead + c * left) / self._speed_gain
+        axes = zip((x, y, z), (v_x, v_y, v_z), (free_x, free_y, free_z), position, self._gain, strict=True)
         x, y, z = (
             place + (free if isnan(speed) else speed) / k if isnan(target) else target
             for target, speed, free, place, k in axes
         )
-        turn = 0.0 if level else self._turn / turn_gain
+        turn = 0.0 if level else self._turn / self._turn_gain
         if not level and not isnan(self._heading):
             turn = remainder(self._heading - yaw, tau)
         return x, y, z, yaw + turn

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -50,6 +50,8 @@ Send = Callable[[Port, int, bytes], None]
 LEAST: Final = "posCtlPid.thrustMin"
 MAX_WHOLE_PARAMETER: Final = 2.0**32  # upper bound of whole parameters, far above any length, angle or speed
 LEAST_THRUST, MOST_THRUST = 1000, 60000
+TAKEOFFS: Final = (HighLevel.TAKEOFF, HighLevel.OLD_TAKEOFF, HighLevel.TAKEOFF_VELOCITY)
+LANDINGS: Final = (HighLevel.LAND, HighLevel.OLD_LAND, HighLevel.LAND_VELOCITY)
 DEFAULT_SPEED: Final = 0.5  # [m/s] mean speed of take-offs and landings with velocity that name none
 
 
@@ -85,6 +87,12 @@ class Drone:
             Port.SETPOINT: self._setpoint,
             Port.HIGH_LEVEL: self._high_level,
             Port.LOCATION: self._location,
+        }
+        self._plans: dict[Sequence[int], Callable[[int, Array, bytes], LogStatus]] = {
+            (*TAKEOFFS, *LANDINGS): self._climb,
+            (HighLevel.GO_TO, HighLevel.OLD_GO_TO): self._go_to,
+            (HighLevel.SPIRAL,): self._spiral,
+            (HighLevel.START, HighLevel.START_2): self._follow,
         }
 
     def start(self) -> None:
@@ -339,28 +347,15 @@ class Drone:
         if command == HighLevel.STOP:
             planner.stop()
             return LogStatus.OK
-        begin = {
-            HighLevel.TAKEOFF: self._climb,
-            HighLevel.LAND: self._climb,
-            HighLevel.OLD_TAKEOFF: self._climb,
-            HighLevel.OLD_LAND: self._climb,
-            HighLevel.TAKEOFF_VELOCITY: self._climb,
-            HighLevel.LAND_VELOCITY: self._climb,
-            HighLevel.GO_TO: self._go_to,
-            HighLevel.OLD_GO_TO: self._go_to,
-            HighLevel.SPIRAL: self._spiral,
-            HighLevel.START: self._follow,
-            HighLevel.START_2: self._follow,
-        }.get(command)  # type: ignore[call-overload]
+        begin = next((plans for commands, plans in self._plans.items() if command in commands), None)
         if begin is None or not vehicle.supervisor.may_fly:
             return LogStatus.NO_COMMAND if begin is None else LogStatus.BUSY
         # the firmware plans from its last setpoint while a plan runs, else from its estimate
         pose = vehicle.pose if planner.plan == PlannerState.IDLE else planner.state(vehicle.t)[0]
-        status: LogStatus = begin(command, pose, data)
-        return status
+        return begin(command, pose, data)
 
     def _climb(self, command: int, pose: Array, data: bytes) -> LogStatus:
-        landing = command in (HighLevel.LAND, HighLevel.OLD_LAND, HighLevel.LAND_VELOCITY)
+        landing = command in LANDINGS
         if command in (HighLevel.OLD_TAKEOFF, HighLevel.OLD_LAND):
             (height, span), yaw, keep = _numbers(crtp.OLD_CLIMB, data), 0.0, False
         elif command in (HighLevel.TAKEOFF_VELOCITY, HighLevel.LAND_VELOCITY):

@@ -182,12 +182,12 @@ class Vehicle:
         self.decks = Decks(settings)
         self._faults, self._fault_tumbled = faults, False
         self.supervisor = Supervisor(auto_arm=not (faults.refuse_arming or settings.platform == "brushless"))
-        self.planner, self.commander = OnboardPlanner(), Commander()
         self.battery = Battery(self.model, faults, self.dt)
         self.vertical = VerticalLoops(settings.platform, self.dt)
         flight = CRAZYFLIE.motion
         assert isinstance(flight, Flight)
-        self._gain, self._speed_gain, self._turn_gain = flight.position, flight.velocity[0], kind.turn_response
+        self._gain, self._speed_gain = flight.position, flight.velocity[0]
+        self.planner, self.commander = OnboardPlanner(), Commander(flight, kind.turn_response)
         # it believes to be where it was switched on, and to look along x
         self.estimator = Estimator(difference(ZERO, self.model.held), -yaw)
         self.place = self._last_measured = self.model.held  # true position [m]
@@ -259,17 +259,8 @@ class Vehicle:
         if locked:
             self.planner.stop()
         model.flying = commander.on and supervisor.may_fly and self.battery.charge > 0.0
-        setpoint = self._true_setpoint(
-            commander.model_setpoint(
-                self._believed,
-                model.velocity,
-                self.yaw,
-                level=supervisor.level,
-                gain=self._gain,
-                speed_gain=self._speed_gain,
-                turn_gain=self._turn_gain,
-            )
-        )
+        believed = commander.model_setpoint(self._believed, model.velocity, self.yaw, level=supervisor.level)
+        setpoint = self._true_setpoint(believed)
         delayed = self._latency.delay(setpoint)
         model.command(delayed)
         before, place = model.velocity, model.held
