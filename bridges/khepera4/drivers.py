@@ -18,6 +18,7 @@ NEVER: Final = math.inf
 REPORTED_S: Final = (0.004, 0.045)  # a report of way that covers less or more is not used to complete another
 GAP_S: Final = 0.3  # [s] commands further apart were parted by a gap of the link
 FIRST_ANSWER_S: Final = 3.0  # [s] for the first answer: a late one spends the only client of a server of 2023
+MAX_INPUT_BYTES: Final = 1 << 16  # [bytes] longest input: no robot sends as much
 PLACED_S: Final = 1.0  # [s] between two positions that are given to a server which does not tell its own
 
 Ranges = tuple[Sequence[float], Sequence[float]]  # bearings [rad], distances from the robot's centre [m]
@@ -44,10 +45,10 @@ class Wire:
         os.write(self._descriptor, data)
 
     def pending(self) -> bytes:
-        """Input that has come so far; raises ConnectionError if the other end has closed."""
+        """Input that has come so far; raises ConnectionError if the other end has closed, UnknownAnswer for a flood."""
         data = b""
         while self._poll.poll(0):
-            data += self._read()
+            data = _limited(data + self._read())
         return data
 
     def receive(self, until: float) -> bytes:
@@ -311,6 +312,13 @@ def identify(
     return (RoboticParkServer if kind.drives else GoalPark)(wire, chosen, kind)
 
 
+def _limited(data: bytes) -> bytes:
+    """Input, unless it is too long."""
+    if len(data) > MAX_INPUT_BYTES:
+        raise UnknownAnswer("sends without end; is this a Khepera?")
+    return data
+
+
 def _shown(answer: bytes) -> str:
     return repr(answer[:40].decode("ascii", "replace"))
 
@@ -353,7 +361,7 @@ class KTeam:
         answer = b""
         while not answer.endswith(b"\n"):
             try:
-                answer += self._wire.receive(until)
+                answer = _limited(answer + self._wire.receive(until))
             except TimeoutError as error:
                 raise TimeoutError(f"no answer to {request}") from error
         letter, _, rest = answer.decode("ascii", "replace").strip().rpartition("\n")[2].partition(",")

@@ -1,12 +1,13 @@
 """The Khepera bridge with each published server of Robotic Park, on a simulated clock: motion, gaps, refusals."""
 
 import math
+import socket
 
 import pytest
 
 from agents.protocols import khepera4 as protocol
 from bridges.khepera4 import drivers
-from bridges.khepera4.drivers import WrongServer
+from bridges.khepera4.drivers import KTeam, UnknownAnswer, Wire, WrongServer
 from tests.bridges.khepera4.lab import Lab
 
 
@@ -146,3 +147,36 @@ def test_first_answer_may_take_seconds(lab):
 
     robot.receive = late
     assert drivers.identify(robot, protocol.Khepera4Settings(), None).server == protocol.PARK["2025-05"]
+
+
+def test_endless_input_holds_no_thread():
+    """Of a wrong device, which sends on and on: it is no answer, and the connection can be closed."""
+    ours, theirs = socket.socketpair()
+    theirs.setblocking(False)
+    with theirs:
+        wire, sent = Wire(ours.fileno(), ours.close), 0
+        while sent <= 2 * drivers.MAX_INPUT_BYTES:
+            sent += theirs.send(bytes(1 << 12))
+        with pytest.raises(UnknownAnswer, match="without end"):
+            wire.pending()
+        wire.close()
+    assert ours.fileno() == -1
+
+
+def test_endless_answer_of_kteam_is_refused():
+    class Endless:
+        """Wire of a device that never ends its line."""
+
+        reads = 0
+
+        def pending(self): ...
+
+        def send(self, data): ...
+
+        def receive(self, until):
+            self.reads += 1
+            assert self.reads < 1000
+            return b"x" * 1024
+
+    with pytest.raises(UnknownAnswer, match="without end"):
+        KTeam(Endless(), protocol.Khepera4Settings()).begin()
