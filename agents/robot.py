@@ -204,10 +204,6 @@ class Robot:
             names.append(CENTRE)
         return names
 
-    def skip_ticks(self, ticks: int) -> None:
-        """Skip `ticks` that are too late; called before each tick, mostly with 0."""
-        self.tick += ticks
-
     @property
     def descending(self) -> bool:
         """Whether the robot lands or has landed, and is not on its way to a landing place."""

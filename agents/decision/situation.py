@@ -50,11 +50,10 @@ class ProcessHealth:
 
     def count_tick(self, missed: int, period: float) -> None:
         """Count a tick after `missed` ones that did not take place; they are `period` apart [s]."""
-        if missed or self.missed_share > 0.0:
-            forget = -expm1(-period * (1 + missed) / LATE_WINDOW_S)
-            self.missed_share += forget * (missed / (1 + missed) - self.missed_share)
-            if self.missed_share < 1e-3:
-                self.missed_share = 0.0
+        forget = -expm1(-period * (1 + missed) / LATE_WINDOW_S)
+        self.missed_share += forget * (missed / (1 + missed) - self.missed_share)
+        if self.missed_share < 1e-3:
+            self.missed_share = 0.0
 
 
 @dataclass(eq=False)

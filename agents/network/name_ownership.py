@@ -114,13 +114,12 @@ class _Claim:
             if time.monotonic() > deadline:
                 raise network.Unreachable(f"no router answers who owns the name, for {answer_s:g} s: is it overloaded?")
             self.pause.wait(self.timing.retry_s)
-        return [key for key, tokens in found.items() if any(self._is_rival(key, each, owners) for each in tokens or ())]
 
-    def _is_rival(self, alive: str, token: str, owners: bool) -> bool:
-        """Whether a token stands in the way."""
-        if (other := Keys.rank_of(alive, token)) is not None:
-            return other < self.rank
-        return owners and token != Keys.life(alive, self.mine)
+        def stands_in_the_way(alive: str, token: str) -> bool:
+            other = Keys.rank_of(alive, token)
+            return other < self.rank if other is not None else owners and token != Keys.life(alive, self.mine)
+
+        return [key for key, tokens in found.items() if any(stands_in_the_way(key, each) for each in tokens or ())]
 
 
 def confirm_ownership(
@@ -232,7 +231,7 @@ class NameKeeper:
         """Names of a process that began at `began`, UTC [s]."""
         self.hands_off = False  # another process drives the bodies, or may do so
         self._keys, self._names, self._began, self._timing = keys, names, began, timing
-        self._check = OwnershipCheck([keys.alive(name) for name in names], network.ROBOT_LEASE_S, timing)
+        self.ownership = OwnershipCheck([keys.alive(name) for name in names], network.ROBOT_LEASE_S, timing)
         self._owned: list[zenoh.LivelinessToken] = []
         self._tokens: dict[int, zenoh.LivelinessToken] = {}  # by row
         self._lock = threading.Lock()
@@ -242,20 +241,12 @@ class NameKeeper:
         alive = [self._keys.alive(name) for name in self._names]
         try:
             self._owned = claim(session, alive, began=self._began, endpoints=endpoints, stop=stop, timing=self._timing)
-            self._check.check_standstill()
+            self.ownership.check_standstill()
         except NameTaken as taken:
             raise NameTaken(
                 f"{self._owners_text(taken)}: a robot of this name is on the network already; end it first "
                 "(`./zenpark keys` lists its members), or choose another router with --connect"
             ) from None
-
-    def check_standstill(self) -> bool:
-        """Whether the process stood still since the last call for longer than its names are safe."""
-        return self._check.check_standstill()
-
-    def begin_check(self, session: zenoh.Session) -> None:
-        """Starts a check of the ownership."""
-        self._check.begin(session)
 
     def is_owner(self) -> bool:
         """Whether the names belong to this process; False while a check runs.
@@ -263,7 +254,7 @@ class NameKeeper:
         Raises NameTaken if they belong to another one; the bodies are that one's then.
         """
         try:
-            return self._check.finished()
+            return self.ownership.finished()
         except NameTaken as taken:
             self.hands_off = True
             raise NameTaken(
@@ -284,10 +275,6 @@ class NameKeeper:
             tokens = [self._tokens.pop(row) for row in rows if row in self._tokens] if only_if() else []
         for token in tokens:
             token.undeclare()
-
-    def end(self) -> None:
-        """Ends a running check."""
-        self._check.end()
 
     def _owners_text(self, taken: NameTaken) -> str:
         return ", ".join(self._keys.whose(token) or token for token in str(taken).split(", "))

@@ -185,7 +185,8 @@ class Inbox(Generic[M]):
     ) -> None:
         """Reads `kind` from the queue of a subscription."""
         self._subscription, self._kind, self._keys, self._on_refusal = subscription, kind, keys, on_refusal
-        self._next = subscription.handler.try_recv  # Zenoh makes a new handler at each access
+        # the next queued sample, or None; Zenoh makes a new handler at each access
+        self.take = subscription.handler.try_recv
         self._robots = robots
         self._key, self._owner = "", None if keys is None else keys.whose("")  # of the last sample: mostly the next's
         self.malformed, self.trouble = 0, ""  # refused payloads, and the reason of the last refusal
@@ -201,16 +202,17 @@ class Inbox(Generic[M]):
 
         Empty, and false, if nothing is queued.
         """
-        first = self._next()
-        return () if first is None else self._decoded(first, check, wanted)
+        first = self.take()
+        return () if first is None else self.read_from(first, check, wanted)
 
-    def _decoded(
+    def read_from(
         self,
         first: zenoh.Sample,
-        check: Callable[[M], object] | None,
-        wanted: Callable[[str], bool] | None,
+        check: Callable[[M], object] | None = None,
+        wanted: Callable[[str], bool] | None = None,
     ) -> Iterator[tuple[M, zenoh.Sample]]:
-        for sample in chain((first,), iter(self._next, None)):
+        """As `read_samples`, of a first sample and those that are queued."""
+        for sample in chain((first,), iter(self.take, None)):
             key = str(sample.key_expr)
             if wanted is not None and not wanted(key):
                 continue

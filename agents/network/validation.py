@@ -38,7 +38,7 @@ def taken(stamp: float, now: float) -> float:
 
 def check_pose(pose: Pose, *, now: float, valid_box: Vector) -> None:
     """Refuses an impossible pose: stamp in the future, position outside `valid_box`, no robot's velocity."""
-    if not (is_count(pose.seq) and _possible(pose.stamp, now)):
+    if not (is_count(pose.seq) and 0.0 < pose.stamp < now + FUTURE_S):
         raise Malformed(f"sequence number {pose.seq} or stamp {pose.stamp} is impossible")
     _refuse_place(pose.position, valid_box)
     _refuse_motion(pose.velocity, pose.yaw)
@@ -63,7 +63,7 @@ def check_position(measured: Position, *, now: float, valid_box: Vector) -> None
 
 def check_goal(goal: Goal, *, now: float, valid_box: Vector, oldest_s: float) -> None:
     """Refuses a goal that is impossible or too old, or younger than the pose on which it rests."""
-    if not (is_count(goal.seq) and now - oldest_s <= goal.stamp and _possible(goal.stamp, now)):
+    if not (is_count(goal.seq) and now - oldest_s <= goal.stamp and 0.0 < goal.stamp < now + FUTURE_S):
         raise Malformed(f"sequence number {goal.seq} or stamp {goal.stamp} is impossible, or the goal is old")
     if not 0.0 < goal.pose <= goal.stamp + FUTURE_S:  # the robot's clock may be ahead
         raise Malformed(f"a goal of {goal.stamp} cannot rest on a pose of {goal.pose}")
@@ -120,12 +120,8 @@ def is_count(seq: int) -> bool:
     return 0 < seq < 2**53  # what JSON carries exactly
 
 
-def _possible(stamp: float, now: float) -> bool:
-    return 0.0 < stamp < now + FUTURE_S
-
-
 def _refuse_stamp(stamp: float, now: float) -> None:
-    if not _possible(stamp, now):
+    if not 0.0 < stamp < now + FUTURE_S:
         raise Malformed(f"stamp {stamp} is impossible")
 
 

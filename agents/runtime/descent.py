@@ -73,11 +73,12 @@ class Descent:
         wheels halt after `neighbour_timeout_s`. After `offline_s`, or `ANSWER_S` if the process is asked to end, all
         land. The process then drives its bodies again, until it learns that they belong to another one.
         """
-        if not self._keeper.check_standstill() or self.watchdog.tripped:  # the watchdog handles a loop that hangs
+        ownership = self._keeper.ownership
+        if not ownership.check_standstill() or self.watchdog.tripped:  # the watchdog handles a loop that hangs
             return False
         limits, drives = self._limits, self._on_wheels
         woke, self._keeper.hands_off = self._ticks.elapsed(), True
-        self._keeper.begin_check(self.session)
+        ownership.begin(self.session)
         while not self._keeper.is_owner():
             waited = self._ticks.elapsed() - woke
             if waited > limits.offline_s or (waited > ANSWER_S and self.reason_to_end() is not None):
@@ -88,7 +89,7 @@ class Descent:
                 drives = ()
             self.watchdog.beat()
             time.sleep(self._ticks.period)
-        self._keeper.check_standstill()
+        ownership.check_standstill()
         self._keeper.hands_off = False
         return True
 

@@ -23,7 +23,7 @@ from agents.body.interface import Body, BodyState, call_all
 from agents.body.measured_positions import MeasuredPositions
 from agents.clock import Clock, uptime
 from agents.decision.assignment import Assignment
-from agents.decision.lifecycle import TOLD_TO_END, Phase
+from agents.decision.lifecycle import DONE, RUNNING, TOLD_TO_END
 from agents.decision.situation import ProcessHealth
 from agents.network import messages, pubsub, validation
 from agents.network import session as network
@@ -46,6 +46,7 @@ from agents.runtime.range_inbox import RangeInbox
 from agents.runtime.telemetry import Counts, TelemetryPublisher
 from agents.runtime.watchdog import SILENCE_S
 from agents.ticks import Ticks
+from agents.vectors import Setpoint
 
 STOP_YIELD_S: Final = 0.05  # sleep after an emergency stop, so that other processes get the CPU to stop their motors
 ROUTER_S: Final = 0.045  # between two checks of the router
@@ -142,7 +143,7 @@ class Runtime:
             out.callback(leave, session, self)
             self.subscribe_to_stops(session)
             self.keeper.claim(session, self._setup.endpoints, asked)
-            out.callback(self.keeper.end)
+            out.callback(self.keeper.ownership.end)
             self._body.open()
             self._descent.register(out)
             self.join(session)
@@ -229,7 +230,8 @@ class Runtime:
             missed = ticks.begin()
             counts.missed += missed
             counts.late_s = max(counts.late_s, ticks.late_s)
-            self._skip_ticks(missed)
+            if missed or self.health.missed_share > 0.0:
+                self._skip_ticks(missed)
             if missed * self._dt > self._setup.loop_timeout_s:
                 self._hold_after_suspend(missed * self._dt)
             t = ticks.t
@@ -241,7 +243,7 @@ class Runtime:
                 for robot in self.robots:
                     robot.lifecycle.land(reason)
             if (self._stopping is not None or self._setup.once) and (
-                t > farewell or all(robot.lifecycle.phase == Phase.DONE for robot in self.robots)
+                t > farewell or all(robot.lifecycle.phase == DONE for robot in self.robots)
             ):
                 self._telemetry.send_statuses(t, everything=True)
                 return
@@ -305,10 +307,12 @@ class Runtime:
     def _read(self, t: float) -> Sequence[BodyState]:
         """States of the bodies, completed by what others measure."""
         states = self._body.read(t)
-        self._descent.airborne = any(state.flying for state in states)
+        airborne = False
         for row, state in enumerate(states):
+            airborne = airborne or state.flying
             if isnan(state.velocity[0]):
                 self._estimators[row].estimate(t, state)
+        self._descent.airborne = airborne
         if self._located is not None:
             self._located.annotate(states, t)
         if self._ranges is not None:
@@ -321,34 +325,40 @@ class Runtime:
         for row, robot in enumerate(self.robots):
             if robot.transmit(t, states[row]) and row not in self._retired:
                 self._send_pose(row, robot, states[row].yaw, t)
+        ordered, setpoints = False, []
         for robot in self.robots:
             robot.act(t)
-            running = running and robot.lifecycle.phase == Phase.RUNNING
-        self._act()
+            running = running and robot.lifecycle.phase == RUNNING
+            ordered = ordered or robot.stops or robot.lands or robot.takes_off
+            setpoints.append(robot.setpoint)
+        self._act(setpoints, ordered=ordered)
         if not begun and self.robots[0].decisions:
             counts.begin()
         return running
 
-    def _act(self) -> None:
-        """Commands the body, motors-off first."""
-        robots, body = self.robots, self._body
+    def _act(self, setpoints: Sequence[Setpoint], *, ordered: bool) -> None:
+        """Commands the body, motors-off first; `ordered`: some robot stops, lands or takes off."""
         stale = self._descent.await_ownership()
         overruled = self._cut_off or self.watchdog.tripped  # another thread has ordered the body to stop or to land
+        if ordered:
+            self._order(stale=stale, overruled=bool(overruled))
+        if not overruled and not stale:
+            self._body.command(setpoints)
+        if self._cut_off and not overruled:  # the stop came in between: it has the last word
+            self._body.stop(self._everyone)
+
+    def _order(self, *, stale: bool, overruled: bool) -> None:
+        robots, body = self.robots, self._body
         stops = [row for row, robot in enumerate(robots) if robot.stops]
         lands = [row for row, robot in enumerate(robots) if robot.lands]
-        if stops or lands:
-            call_all(partial(order, rows) for order, rows in ((body.stop, stops), (body.land, lands)) if rows)
-        if rises := [row for row, robot in enumerate(robots) if robot.takes_off]:
-            if stale:  # the order is old now
-                for row in rises:
-                    robots[row].lifecycle.land("its process stood still at its take-off")
-            elif not overruled:
-                self._descent.airborne = True
-                body.takeoff(rises, [robots[row].assignment.hover for row in rises])
-        if not overruled and not stale:
-            body.command([robot.setpoint for robot in robots])
-        if self._cut_off and not overruled:  # the stop came in between: it has the last word
-            body.stop(self._everyone)
+        call_all(partial(order, rows) for order, rows in ((body.stop, stops), (body.land, lands)) if rows)
+        rises = [row for row, robot in enumerate(robots) if robot.takes_off]
+        if stale:  # the order is old now
+            for row in rises:
+                robots[row].lifecycle.land("its process stood still at its take-off")
+        elif rises and not overruled:
+            self._descent.airborne = True
+            body.takeoff(rises, [robots[row].assignment.hover for row in rises])
 
     def _send_pose(self, row: int, robot: Robot, yaw: float, t: float) -> None:
         self.counts.sent[row] += 1
@@ -380,7 +390,7 @@ class Runtime:
             life = robot.lifecycle
             during.append(isfinite(life.start_at) and t < life.start_at + self._duration)
             # support processes without a launcher end with the last token (`agents.network.shutdown`)
-            down = robot.descending if self._stopping is None else life.phase == Phase.DONE
+            down = robot.descending if self._stopping is None else life.phase == DONE
             unasked = during[row] and not life.reason.startswith((messages.EMERGENCY, LAND, STOP))
             if down and (unasked or row in self._orders.leaving) and row not in self._retired:
                 self._retired.add(row)
@@ -414,11 +424,10 @@ class Runtime:
         time.sleep(STOP_YIELD_S)
 
     def _skip_ticks(self, ticks: int) -> None:
-        """Count a tick after `ticks` that are too late, mostly 0."""
+        """Count a tick after `ticks` that are too late."""
         self.health.count_tick(ticks, self._dt)
-        if ticks:
-            for robot in self.robots:
-                robot.skip_ticks(ticks)
+        for robot in self.robots:
+            robot.tick += ticks
 
     def _hold_after_suspend(self, slept: float) -> None:
         """Holds position until neighbour poses are fresh again, after the loop was suspended for `slept` [s]."""
@@ -431,7 +440,7 @@ class Runtime:
             self._router_due = t + ROUTER_S
             before, self._silent_since = self._silent_since, self._router.silent_since(t, self._neighbours.arrived)
             if before < inf and self._silent_since == inf:
-                self.keeper.begin_check(self._session)  # it was cut off
+                self.keeper.ownership.begin(self._session)  # it was cut off
             self.keeper.is_owner()
         return self._silent_since
 

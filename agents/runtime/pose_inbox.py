@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from enum import Enum
 from math import inf, nan
 from typing import Final, Protocol
@@ -71,6 +71,7 @@ class NeighbourSubscription:
             else pubsub.RingingSubscriber(session, key, bell, depth)
         )
         self._poses = pubsub.Inbox(subscription, messages.Pose, keys=keys)
+        self.take = self._poses.take  # the next queued sample, or None
         self._token = keys.alive(name)
         self._alive = pubsub.AliveWatch(session, keys.lives(self._token))
         self.tokens = self._alive.waiting  # queued for `token_changes`, nearly always none
@@ -91,20 +92,15 @@ class NeighbourSubscription:
     def malformed(self) -> int:
         return self._poses.malformed + self._refused
 
-    def new_poses(self, now: float) -> Iterable[ReceivedPose]:
+    def new_poses(self, first: zenoh.Sample, now: float) -> Iterator[ReceivedPose]:
         """Poses received until `now` (UTC [s]), oldest first, without invalid, foreign and known ones.
 
-        A new session of the robot resets the order of poses, as does a clock that was set back in one session.
+        `first` is the first queued sample. A new session of the robot resets the order of poses, as does a clock that
+        was set back in one session.
         """
-        received = self._poses.read_samples()
-        return self._newer_poses(received, now) if received else ()
-
-    def _newer_poses(
-        self, received: Iterable[tuple[messages.Pose, zenoh.Sample]], now: float
-    ) -> Iterator[ReceivedPose]:
         before = self._received_at  # poses that waited while this process stood still count as one reception
         order = self._order
-        for pose, sample in received:
+        for pose, sample in self._poses.read_from(first):
             session = pubsub.session_of(sample)
             if order.is_foreign(session):
                 self.foreign += 1
@@ -204,6 +200,7 @@ class ModelledInbox:
         ]
         self.arrived = 0  # poses before the modelled channel, without those of robots of this process
         self.changed = False  # a sender appeared or vanished since the caller reset this
+        self.heard = False  # the last call of `receive` took a sample, accepted or not
         self._doubted = [False] * len(self.senders)
 
     @property
@@ -223,13 +220,17 @@ class ModelledInbox:
         `start` tells a modelled channel the common start of the receiver on a link [s], `own` are robots of this
         process.
         """
+        self.heard = False
         for sender in self.senders:
             for change in sender.token_changes() if sender.tokens else ():
-                self.changed = True
+                self.changed = self.heard = True
                 self._note_change(sender, change, t)
         now, arrived = utc + t, list[Arrived]()
         for sender in self.senders:
-            for received in sender.new_poses(now):
+            if (first := sender.take()) is None:
+                continue
+            self.heard = True
+            for received in sender.new_poses(first, now):
                 if received.missed and self._counted(received.pose.stamp - utc):
                     sender.lost += received.missed
                 self.arrived += sender.name not in own
@@ -237,7 +238,8 @@ class ModelledInbox:
                     self._begin(sender)
                     arrived = [each for each in arrived if each[0] not in sender.links]
                 arrived += [(link, t, received) for link in sender.links]
-        self._follow_doubts(t)
+        if self.heard:
+            self._follow_doubts(t)
         channel = self._channel
         if channel.ideal:
             return arrived
@@ -339,8 +341,8 @@ class PoseInbox(ModelledInbox):
     def deliver(self, t: float, utc: float) -> None:
         """Passes all poses until `t` [s] of a clock that was 0 at `utc` [s] to the robots and to telemetry."""
         got = self.receive(t, utc, self._start, self._own)
-        if (marks := [(sender.behind, sender.doubt, sender.foreign) for sender in self.senders]) != self._marks:
-            self._mark(marks, t)
+        if self.heard:
+            self._mark([(sender.behind, sender.doubt, sender.foreign) for sender in self.senders], t)
         for link, arrival, received in got:
             pose = received.pose
             (row, k), velocity = self._ends[link], pose.velocity or messages.STILL
@@ -355,7 +357,9 @@ class PoseInbox(ModelledInbox):
             self.received[row] += 1
 
     def _mark(self, marks: list[tuple[float, str, int]], t: float) -> None:
-        """Tell the robots what is wrong with poses of their neighbours."""
+        """Tell the robots what is wrong with poses of their neighbours, if that has changed."""
+        if marks == self._marks:
+            return
         for sender, (_, _, foreign) in zip(self.senders, self._marks, strict=True):
             for link in sender.links:
                 row, k = self._ends[link]

@@ -254,6 +254,6 @@ def test_skipped_ticks_skip_no_decision():
     swarm = Swarm(pair()).running().run(0.45)
     robot = swarm.robot("A")
     before = robot.decisions
-    robot.skip_ticks(12)
+    robot.tick += 12
     swarm.step()
     assert robot.decisions == before + 1
