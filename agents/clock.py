@@ -14,7 +14,6 @@ from __future__ import annotations
 import os
 import sys
 import time
-from functools import partial
 from math import isfinite
 from typing import Final
 
@@ -22,9 +21,12 @@ SLEW: Final = 0.005  # [s/s] a hundred times the drift of quartz, harmless for a
 STEP_S: Final = 0.5  # larger changes are no drift: a suspended or mistaken peer
 READING: Final = "ZENPARK_CLOCK"  # environment: UTC at which the machine's `uptime` was 0 [s]
 _WORD: Final = b"clock "
+_UPTIME: Final = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)
 
-# time [s] since the machine was started, on a clock that goes on while the machine sleeps
-uptime: Final = partial(time.clock_gettime, getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))
+
+def uptime() -> float:
+    """Time [s] since the machine was started, on a clock that goes on while the machine sleeps."""
+    return time.clock_gettime(_UPTIME)
 
 
 def correction_line(correction_s: float) -> bytes:

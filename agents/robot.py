@@ -17,7 +17,7 @@ from agents.body.interface import BodyState
 from agents.decision.assignment import Assignment
 from agents.decision.centralised import ReceivedGoals
 from agents.decision.goals import GoalComputer, StationKeeping
-from agents.decision.lifecycle import AIRBORNE, IDLE, LANDING, READY, RUNNING, Lifecycle, Phase
+from agents.decision.lifecycle import AIRBORNE, IDLE, LANDING, PAUSED, READY, RUNNING, Lifecycle, Phase
 from agents.decision.neighbours import Neighbours
 from agents.decision.perception import Perception
 from agents.decision.position_control import PositionController, VelocityFollower
@@ -113,14 +113,19 @@ class Robot:
         """Order to stay in place; returns the reason of a refusal, empty when accepted."""
         if self.lifecycle.phase not in (AIRBORNE, RUNNING):
             return f"cannot hold while {Phase(self.lifecycle.phase).word}"
-        self._ordered = True
+        self._ordered, self.lifecycle.reason = True, PAUSED
         return ""
 
     def resume(self) -> None:
         """Order to go on after a hold, from where the robot is now."""
-        self._ordered = False
+        self._end_hold()
         self._continuity.forget()
         self._external.forget()
+
+    def _end_hold(self) -> None:
+        self._ordered = False
+        if self.lifecycle.reason == PAUSED:
+            self.lifecycle.reason = ""
 
     def believes(self, t: float, position: Vector) -> bool:
         """Whether a `position` [m] that was measured from outside at `t` [s] may be used; ask for each one.
@@ -133,12 +138,14 @@ class Robot:
         """The `yaw` [rad] of a position that is believed, or NaN: then the body's own goes on."""
         return self._external.believed_yaw(t, yaw, watched=self.lifecycle.in_motion)
 
-    def go(self, goal: tuple[float, float], t: float) -> str:
+    def go(self, goal: tuple[float, float] | None, t: float) -> str:
         """Order of a leader to a place x, y [m], from `t` [s] on, instead of its plan; returns as `hold`.
 
         The robot moves as on a leg of its plan: avoidance, setpoint filter and hazards are the same.
         """
         limits, phase = self.assignment.limits, Phase(self.lifecycle.phase)
+        if goal is None or not all(map(isfinite, goal)):
+            return "an order to go needs a `goal`, x and y in metres"
         if phase != RUNNING:
             return f"cannot go anywhere while {phase.word}"
         if self.guidance is not None:
@@ -168,7 +175,7 @@ class Robot:
         refusal = self.lifecycle.start(at)
         if not refusal:
             if waits and self.assignment.kind.flies:  # the common start confirms no position that jumped in the air
-                self._ordered = False
+                self._end_hold()
             else:
                 self.resume()
             if origin is not None and waits:

@@ -18,23 +18,14 @@ FARTHEST: Final = 1e6  # [m] largest coordinate
 PATIENCE_S: Final = 0.5  # after this silence any position is accepted
 
 
-def velocity_along(velocity: float, moved: float, since: float) -> float:
-    """The velocity estimate of one axis after one more measured position.
+def velocity_after(velocity: Vector, moved: Vector, since: float) -> Vector:
+    """The velocity estimate [m/s] after one more measured position, `moved` [m] in `since` [s], above 0.
 
     A low-pass with `SMOOTHING_S` on the difference quotient, used for motion capture and odometry. White noise σ of the
-    positions makes σ / `SMOOTHING_S` of noise, at any rate. The position `moved` [m] in `since` [s], above 0;
-    velocities [m/s].
+    positions makes σ / `SMOOTHING_S` of noise, at any rate.
     """
-    return velocity + since / (SMOOTHING_S + since) * (moved / since - velocity)
-
-
-def velocity_after(velocity: Vector, moved: Vector, since: float) -> Vector:
-    """The velocity estimate after one more measured position, each axis as `velocity_along`."""
-    return (
-        velocity_along(velocity[0], moved[0], since),
-        velocity_along(velocity[1], moved[1], since),
-        velocity_along(velocity[2], moved[2], since),
-    )
+    (u, v, w), (x, y, z), share = velocity, moved, since / (SMOOTHING_S + since)
+    return u + share * (x / since - u), v + share * (y / since - v), w + share * (z / since - w)
 
 
 @dataclass(eq=False)

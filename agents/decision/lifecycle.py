@@ -37,6 +37,7 @@ ABOVE_HEIGHT: Final = 0.1  # or above it: a Crazyflie overshoots, and takes 10 s
 FINISHED: Final = "finished"  # reasons for a landing that is no fault; orders are others
 SCRIPTED: Final = "lands as its file says"
 TOLD_TO_END: Final = "asked to end"
+PAUSED: Final = "ordered to hold"
 SETTLED: Final = 0.1  # [m/s] slower: climbing or rolling has ended
 
 

@@ -34,16 +34,14 @@ class GoalInbox:
         `conditions` are the effects of the modelled channel on the goals of each robot; empty: none.
         """
         self._session, self._robots, self._valid_box = session, robots, valid_box
-        guided = [row for row, robot in enumerate(robots) if robot.guidance is not None]
+        self._guidance = {row: robot.guidance for row, robot in enumerate(robots) if robot.guidance is not None}
+        own = {row: keys.goal(robots[row].assignment.name) for row in self._guidance}
         self._inboxes = {
-            row: pubsub.Inbox(
-                pubsub.subscriber(session, keys.goal(robots[row].assignment.name), 8), messages.Goal, keys=keys
-            )
-            for row in guided
+            row: pubsub.Inbox(pubsub.subscriber(session, key, 8), messages.Goal, keys=keys) for row, key in own.items()
         }
         self._watch = pubsub.AliveWatch(session, keys.lives(keys.centre_alive))
         self._centre, self._life = keys.centre_alive, ""
-        self._seq = dict.fromkeys(guided, 0)
+        self._seq = dict.fromkeys(self._guidance, 0)
         self._channel = Channel(conditions or [Conditions()] * len(robots))
         # by row, for telemetry, which empties them
         self.unreported = [deque[messages.GoalReceipt](maxlen=MAX_UNREPORTED) for _ in robots]
@@ -58,7 +56,8 @@ class GoalInbox:
             if token != self._centre:
                 self._begin(Keys.life_of(token), there=there)
             elif there or network.connected(self._session):  # without a router every token vanishes: proves nothing
-                self._mark(t, there=there)
+                for guidance in self._guidance.values():
+                    guidance.mark_alive() if there else guidance.mark_lost(t)
         for row, inbox in self._inboxes.items():
             for goal, sample in inbox.read_samples(partial(self._check, row, utc + t)):
                 self._seq[row] = goal.seq
@@ -66,19 +65,10 @@ class GoalInbox:
                 size = len(sample.payload)
                 self._channel.send(row, (goal, stamp), goal.seq, stamp, start=start, size=size, now=t)
         for row, _, (goal, stamp) in self._channel.due(t):
-            guidance = self._robots[row].guidance
             yaw = nan if goal.yaw is None else goal.yaw
             x, y, z = (*(goal.velocity or (nan, nan)), nan)[:3]
-            if guidance is not None and guidance.receive(goal.position, yaw, stamp, (x, y, z)):
+            if self._guidance[row].receive(goal.position, yaw, stamp, (x, y, z)):
                 self.unreported[row].append(messages.GoalReceipt(goal.seq, goal.stamp, goal.pose, utc + t))
-
-    def _mark(self, t: float, *, there: bool) -> None:
-        for row in self._inboxes:
-            guidance = self._robots[row].guidance
-            if guidance is not None and there:
-                guidance.mark_alive()
-            elif guidance is not None:
-                guidance.mark_lost(t)
 
     def _begin(self, life: str | None, *, there: bool) -> None:
         """Resets the numbers for a new central controller: its clock may be behind that of the former one."""
@@ -86,10 +76,8 @@ class GoalInbox:
             return
         if self._life:
             self._seq = dict.fromkeys(self._seq, 0)
-            for row in self._inboxes:
-                guidance = self._robots[row].guidance
-                if guidance is not None:
-                    guidance.begin_anew()
+            for guidance in self._guidance.values():
+                guidance.begin_anew()
         self._life = life
 
     def _check(self, row: int, now: float, goal: messages.Goal) -> None:

@@ -163,7 +163,7 @@ class Runtime:
         self._opened = True
         keys, names = self._setup.keys, self._names
         self._session = self._descent.session = session
-        self._router_due, self._silent_since = -inf, inf
+        self._router_due = -inf
         self._router = network.RouterWatch(session, keys.alive(names[0]), self._setup.endpoints)
         self._poses = [pubsub.pose_publisher(session, keys.pose(name), self._mime) for name in names]
         self._last = [pubsub.LastValue(session, keys.pose(name), self._mime) for name in names]
@@ -286,7 +286,8 @@ class Runtime:
 
     def _receive(self, t: float) -> None:
         health = self.health
-        health.offline_since = self._cut_off_since(t)
+        if t >= self._router_due:  # a check of the router costs as much as a law
+            health.offline_since = self._cut_off_since(t)
         for _, there in self._conductor.changes() if self._conductor.waiting else ():
             health.conductor_lost_since = inf if there else min(health.conductor_lost_since, t)
         self._neighbours.deliver(t, self._utc)
@@ -436,13 +437,12 @@ class Runtime:
 
     def _cut_off_since(self, t: float) -> float:
         """Time [s] since which no router answers; infinity while one does."""
-        if t >= self._router_due:  # a check of the router costs as much as a law
-            self._router_due = t + ROUTER_S
-            before, self._silent_since = self._silent_since, self._router.silent_since(t, self._neighbours.arrived)
-            if before < inf and self._silent_since == inf:
-                self.keeper.ownership.begin(self._session)  # it was cut off
-            self.keeper.is_owner()
-        return self._silent_since
+        self._router_due = t + ROUTER_S
+        silent_since = self._router.silent_since(t, self._neighbours.arrived)
+        if self.health.offline_since < inf and silent_since == inf:
+            self.keeper.ownership.begin(self._session)  # it was cut off
+        self.keeper.is_owner()
+        return silent_since
 
     def _leave_formation(self, why: str) -> None:
         """Removes the robots from the formation while their loop hangs, or is over; called by the watchdog's thread."""

@@ -24,7 +24,6 @@ LAND: Final = "ordered to land"
 STOP: Final = "ordered to stop"
 OWN: Final = ("clamp", "tracking_gain")
 NEEDS_AT: Final = "a start needs `at`, a UTC time in seconds"
-PAUSED: Final = "ordered to hold"
 
 Answer = tuple[str, float | None]  # reason of a refusal (empty: none), and the value of a parameter
 
@@ -101,16 +100,14 @@ def carry_out(robot: Robot, order: Order, t: float, utc: float) -> Answer:
     """Carries out an order to one robot at `t` [s] of a clock that was 0 at `utc` [s]."""
     refusal = ""  # also of "inspect": the desk adds the inspection to the reply
     match order.order:
-        case "takeoff":
-            refusal = _take_off(robot, order, t, utc)
-        case "start":
-            refusal = _start(robot, order, t, utc)
+        case "takeoff" | "start":
+            refusal = _begin(robot, order, t, utc)
         case "go":
-            refusal = _send_to_goal(robot, order.goal, t)
+            refusal = robot.go(order.goal, t)
         case "hold":
-            refusal = _hold(robot)
+            refusal = robot.hold()
         case "resume":
-            _resume(robot)
+            robot.resume()
         case "leave":
             robot.lifecycle.land("ordered to leave")
         case "land":
@@ -122,40 +119,17 @@ def carry_out(robot: Robot, order: Order, t: float, utc: float) -> Answer:
     return refusal, None
 
 
-def _hold(robot: Robot) -> str:
-    refusal = robot.hold()
-    if not refusal:
-        robot.lifecycle.reason = PAUSED
-    return refusal
-
-
-def _resume(robot: Robot) -> None:
-    robot.resume()
-    if robot.lifecycle.reason == PAUSED:
-        robot.lifecycle.reason = ""
-
-
-def _send_to_goal(robot: Robot, goal: tuple[float, float] | None, t: float) -> str:
-    if goal is None or not all(map(isfinite, goal)):
-        return "an order to go needs a `goal`, x and y in metres"
-    return robot.go(goal, t)
-
-
-def _take_off(robot: Robot, order: Order, t: float, utc: float) -> str:
+def _begin(robot: Robot, order: Order, t: float, utc: float) -> str:
+    """Common start, or take-off: into a run under way if the order says when that began."""
     if order.at is None:
-        return robot.lifecycle.takeoff()
-    refusal = _misdated(robot, order.at, order.origin, t, utc) or robot.lifecycle.takeoff()
+        return robot.lifecycle.takeoff() if order.order == "takeoff" else NEEDS_AT
+    if refusal := _misdated(robot, order.at, order.origin, t, utc):
+        return refusal
+    if order.order == "start":
+        return robot.start(order.at - utc, t, order.origin)
+    refusal = robot.lifecycle.takeoff()
     if not refusal:
         robot.join(order.at - utc, t, order.origin)
-    return refusal
-
-
-def _start(robot: Robot, order: Order, t: float, utc: float) -> str:
-    if order.at is None:
-        return NEEDS_AT
-    refusal = _misdated(robot, order.at, order.origin, t, utc) or robot.start(order.at - utc, t, order.origin)
-    if not refusal:
-        _resume(robot)
     return refusal
 
 
@@ -178,15 +152,10 @@ def _parameter(robot: Robot, order: Order) -> Answer:
         return f"no parameter '{name}'; known: {', '.join(sorted([*of_trigger, *OWN]))}", None
     if name in OWN and robot.assignment.guided:
         return f"'{name}' is the centre's: change the experiment file, and start the centre again", None
-    if order.order == "set":
-        refusal = _set(robot, name, of_trigger.get(name), order.value)
-        if refusal:
-            return refusal, None
-    value = (
-        getattr(robot.transmitter.asking.trigger, of_trigger[name])
-        if name in of_trigger
-        else getattr(robot.goals, name)
-    )
+    field = of_trigger.get(name)
+    if order.order == "set" and (refusal := _set(robot, name, field, order.value)):
+        return refusal, None
+    value = getattr(robot.goals, name) if field is None else getattr(robot.transmitter.asking.trigger, field)
     return ("", float(value)) if isinstance(value, int | float) else (f"'{name}' is not set", None)
 
 
@@ -196,9 +165,10 @@ def _set(robot: Robot, name: str, of_trigger: str | None, value: float | None) -
     if of_trigger is None:
         setattr(robot.goals, name, value)
         return ""
+    trigger = robot.transmitter.asking.trigger
     try:
-        changed = {**msgspec.structs.asdict(robot.transmitter.asking.trigger), of_trigger: value}
-        robot.transmitter.replace_trigger(msgspec.convert(changed, type(robot.transmitter.asking.trigger)))
+        changed = {**msgspec.structs.asdict(trigger), of_trigger: value}
+        robot.transmitter.replace_trigger(msgspec.convert(changed, type(trigger)))
     except msgspec.ValidationError as error:
         return f"'{name}' cannot be {value:g}: {error}"
     return ""

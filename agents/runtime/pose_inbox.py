@@ -160,7 +160,7 @@ MAX_UNREPORTED: Final = 20_000  # poses that wait for telemetry, which empties t
 
 
 class Knowledge(Protocol):
-    """Recipient of what an inbox learns of the senders on its links."""
+    """Recipient of what an inbox learns of the sender on a link, by the number of the link there."""
 
     def mark_alive(self, link: int) -> None: ...
 
@@ -181,7 +181,7 @@ class ModelledInbox:
         keys: Keys,
         links: Mapping[str, Sequence[int]],  # links of each sender
         conditions: Sequence[Conditions],  # effects of the modelled channel on each link
-        knowledge: Knowledge,
+        knowledge: Sequence[tuple[Knowledge, int]],  # recipient of each link, and its number there
         *,
         valid_box: messages.Vector,
         rate: float,
@@ -253,29 +253,31 @@ class ModelledInbox:
             self._begin(sender)
             return
         for link in sender.links:
+            knowledge, number = self._knowledge[link]
             if change is TokenChange.APPEARED:
-                self._knowledge.mark_alive(link)
+                knowledge.mark_alive(number)
             else:
                 self._channel.forget(link)
-                self._knowledge.mark_lost(link, t)
+                knowledge.mark_lost(number, t)
 
     def _follow_doubts(self, t: float) -> None:
         """A sender of which no pose can be believed is lost, although its token stands."""
         if (doubted := [bool(sender.doubt) for sender in self.senders]) == self._doubted:
             return
         for sender, doubt, before in zip(self.senders, doubted, self._doubted, strict=True):
-            for link in sender.links:
+            for knowledge, number in (self._knowledge[link] for link in sender.links):
                 if doubt and not before:
-                    self._knowledge.mark_lost(link, t)
+                    knowledge.mark_lost(number, t)
                 elif before and not doubt and sender.alive:
-                    self._knowledge.mark_alive(link)
+                    knowledge.mark_alive(number)
         self._doubted, self.changed = doubted, True
 
     def _begin(self, sender: NeighbourSubscription) -> None:
         """Forgets a sender that has a new session."""
         for link in sender.links:
             self._channel.forget(link)
-            self._knowledge.discard_pose(link)
+            knowledge, number = self._knowledge[link]
+            knowledge.discard_pose(number)
 
 
 class PoseInbox(ModelledInbox):
@@ -306,25 +308,14 @@ class PoseInbox(ModelledInbox):
         ideal = [Conditions()] * len(self._ends)
         first = robots[0].assignment
         super().__init__(
-            session, keys, links, [each for own in conditions for each in own] or ideal, self,
+            session, keys, links, [each for own in conditions for each in own] or ideal,
+            [(robots[row].neighbours, k) for row, k in self._ends],
             valid_box=valid_box, rate=first.body_hz / first.pose_every, bell=bell,
         )  # fmt: skip
         # (n) newest received poses of each robot, for telemetry, which empties them
         self.unreported = [deque[messages.PoseReceipt](maxlen=MAX_UNREPORTED) for _ in robots]
         self.received = [0] * len(robots)  # (n) received poses of each robot
         self._marks = [(0.0, "", 0)] * len(self.senders)
-
-    def mark_alive(self, link: int) -> None:
-        row, k = self._ends[link]
-        self._robots[row].neighbours.mark_alive(k)
-
-    def mark_lost(self, link: int, t: float) -> None:
-        row, k = self._ends[link]
-        self._robots[row].neighbours.mark_lost(k, t)
-
-    def discard_pose(self, link: int) -> None:
-        row, k = self._ends[link]
-        self._robots[row].neighbours.discard_pose(k)
 
     def senders_of(self, row: int) -> list[NeighbourSubscription]:
         """Subscriptions of a robot."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from agents.body.external_pose import velocity_along
+from agents.body.external_pose import velocity_after
 from agents.protocols import khepera4 as protocol
 
 
@@ -63,4 +63,4 @@ class Odometer:
         since, self._stamp = stamp - self._stamp, stamp
         if since > 0.0:
             vx, vy = self.velocity
-            self.velocity = velocity_along(vx, dx, since), velocity_along(vy, dy, since)
+            self.velocity = velocity_after((vx, vy, 0.0), (dx, dy, 0.0), since)[:2]

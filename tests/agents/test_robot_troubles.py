@@ -7,7 +7,9 @@ import pytest
 
 from agents.body.limits import Safety
 from agents.decision.lifecycle import AIRBORNE, DONE, IDLE, LANDING, READY, RUNNING, Phase
+from agents.network.messages import Order
 from agents.plugins.laws import Distance
+from agents.runtime.orders import carry_out
 from agents.safety.hazards import Cause
 from agents.vectors import NO_SETPOINT, UNKNOWN
 from experiments.definition.experiment import Formation, RobotTable
@@ -175,6 +177,15 @@ def test_jumped_wheels_lead_nobody_astray():
     texts = told(swarm, 20.0)
     assert all(dist(swarm.last(name, "truth"), before[name]) < 0.01 for name in "AB")
     assert texts == {"A": ["hold: its own position is lost: it jumped by 1.00 m"], "B": []}
+
+
+def test_start_order_confirms_no_jump_in_the_air():
+    swarm = drone().until(AIRBORNE)
+    jump(swarm, "F", inf)
+    swarm.run(0.1)
+    assert carry_out(swarm.robot("F"), Order("start", at=swarm.t + 0.2), swarm.t, 0.0) == ("", None)
+    swarm.step()
+    assert isnan(swarm.robot("F").now.position[0])
 
 
 def test_refused_external_positions():

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from agents.decision.lifecycle import PAUSED
 from agents.network import messages, pubsub
 from agents.network.endpoints import free_endpoint
-from agents.runtime.orders import PAUSED
 from experiments.definition.experiment import Arena
 from experiments.definition.plan import Plan
 from experiments.file import document

@@ -60,7 +60,8 @@ class CentreProcess:
         rows, ends = centre.needed, [(name, name) for name in names]
         self._poses = ModelledInbox(
             session, keys, {names[row]: [row] for row in rows},
-            conditions_of(plan, ends, experiment.seed, stream=TO_CENTRE, real=True), centre,
+            conditions_of(plan, ends, experiment.seed, stream=TO_CENTRE, real=True),
+            [(centre, row) for row in range(len(names))],
             valid_box=valid_box_of(common.limits.low, common.limits.high), rate=experiment.rates.pose_hz, depth=DEPTH,
             counted=self._within_run,
         )  # fmt: skip
