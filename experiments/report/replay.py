@@ -15,7 +15,7 @@ from experiments.report import trajectories
 from experiments.report.page import inline, template
 from experiments.report.style import svg
 from experiments.scene.models import ROUND, circle
-from experiments.scene.stage import FAIR_M, GOOD_M, SceneModel
+from experiments.scene.stage import FAIR_M, GOOD_M, SceneModel, link_levels
 from twins.arrays import Array
 
 CASES: Final = 2  # side by side
@@ -96,7 +96,7 @@ def _case(trace: Trace, step: float) -> dict[str, Any]:
     level = np.full((len(grid), len(stage.links)), -1)
     if stage.plan is not None and len(stage.links):
         error = errors_over_time(stage.plan.law, stage.plan.formation, grid, place)
-        level = np.where(np.isnan(error), -1, (error > GOOD_M).astype(int) + (error > FAIR_M))
+        level = link_levels(error)
     poses = np.stack([stage.scene.at(float(t)) for t in grid]).reshape(len(grid), -1)
     return {
         "name": trace.case,

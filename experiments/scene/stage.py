@@ -363,10 +363,14 @@ def shown(position: Array) -> Array:
     return np.where(np.isfinite(position).all(axis=-1, keepdims=True), position, NOWHERE)
 
 
+def link_levels(error: Array) -> Index:
+    """Levels of links by their errors [m]: 0 for a good one, 1 fair, 2 bad, −1 unknown."""
+    return np.where(np.isnan(error), -1, (error > GOOD_M).astype(int) + (error > FAIR_M))
+
+
 def link_colours(error: Array) -> Colours:
     """Colours (E, 3) of links by their errors (E,) [m]."""
-    level = np.where(np.isnan(error), 3, (error > GOOD_M).astype(int) + (error > FAIR_M))
-    return np.array([GOOD, FAIR, BAD, UNKNOWN], dtype=np.uint8)[level]
+    return np.array([GOOD, FAIR, BAD, UNKNOWN], dtype=np.uint8)[link_levels(error)]
 
 
 def segments(stage: SceneModel, position: Array) -> Array:
@@ -434,10 +438,9 @@ def rays(stage: SceneModel, moment: Moment, scans: Mapping[str, Ranges]) -> Arra
         scan = scans.get(name)
         if scan is None or not np.isfinite(moment.position[row]).all():
             continue
-        reach = np.array([np.nan if each is None else each for each in scan.distance])
-        there = np.isfinite(reach)
-        bearing = np.array(scan.bearing)[there] + np.nan_to_num(moment.yaw[row])
-        up, reach = np.array(scan.elevation)[there], reach[there]
+        beams = [each for each in zip(scan.distance, scan.bearing, scan.elevation, strict=False) if each[0] is not None]
+        reach, bearing, up = np.array(beams, dtype=float).reshape(-1, 3).T
+        bearing = bearing + np.nan_to_num(moment.yaw[row])
         way = np.stack([np.cos(up) * np.cos(bearing), np.cos(up) * np.sin(bearing), np.sin(up)], axis=1)
         begin = moment.position[row] + np.array([0.0, 0.0, 0.8 * stage.kinds[row].height])
         made.append(np.stack([np.broadcast_to(begin, way.shape), begin + reach[:, None] * way], axis=1))

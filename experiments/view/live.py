@@ -35,7 +35,7 @@ FAREWELL_S: Final = 0.5  # until the last words have reached the pages
 IDLE_S: Final = 0.2  # between two rounds while no page is open
 TABLE_S: Final = 0.5
 FOV: Final = 0.8  # [rad] upright
-ASPECT: Final = 1.2  # width over height of a page that is not known yet
+ASPECT: Final = 1.2  # width over height of a page that is not known
 FROM: Final = np.array([-0.40, -0.77, 0.50])  # direction of the camera, as seen from the arena
 FREE: Final = np.array([-0.92, 0.92])  # of a page from its middle to its edges, where the arena is shown
 PHONE: Final = 0.7  # width over height of a page with its panel below, not beside
@@ -93,7 +93,8 @@ class Camera:
             self._place(client)
 
     def _place(self, client: viser.ClientHandle) -> None:
-        place, at = standpoint(self._size, client.camera.aspect)
+        aspect = client.camera.aspect
+        place, at = standpoint(self._size, aspect if 0.0 < aspect < inf else ASPECT)  # a hidden page has no shape
         self._placed[client.client_id] = place
         client.camera.position, client.camera.look_at = place, at
 

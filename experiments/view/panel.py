@@ -23,6 +23,7 @@ from experiments.scene.stage import (
     UNKNOWN,
     Condition,
     SceneModel,
+    link_colours,
 )
 from twins.arrays import Array
 
@@ -228,8 +229,7 @@ def _cells(row: RobotRow) -> tuple[str, ...]:
 
 
 def _coloured_error(error: float) -> str:
-    colour = GOOD if error <= GOOD_M else FAIR if error <= FAIR_M else BAD
-    return f"<span style='color:{css(colour)}'>{100 * error:.1f} cm</span>"
+    return f"<span style='color:{css(link_colours(np.array(error)))}'>{100 * error:.1f} cm</span>"
 
 
 def _coloured_missed(missed: int, share: float) -> str:

@@ -134,10 +134,11 @@ def test_trail_has_five_fading_points_a_second(park):
     assert colours[58, 1].tolist() == [204, 226, 239]  # nearly that of the background
 
 
-def test_ranges_reach_from_robot_to_what_it_sees(park):
+@pytest.mark.parametrize("bearing", [[0.0, 1.0], [0.0]], ids=["whole", "cut"])
+def test_ranges_reach_from_robot_to_what_it_sees(park, bearing):
     moment = at_start(park)
     moment.yaw[:] = np.pi / 2
-    scan = messages.Ranges("KH01", 0.0, [0.0, 1.0], [0.0, 0.0], [0.5, None])
+    scan = messages.Ranges("KH01", 0.0, bearing, [0.0, 0.0], [0.5, None, 0.3] if len(bearing) == 1 else [0.5, None])
     (line,) = stage.rays(park, moment, {"KH01": scan})
     assert line[1] - line[0] == pytest.approx([0.0, 0.5, 0.0])
 

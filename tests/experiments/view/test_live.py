@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from itertools import product
+from unittest.mock import MagicMock
 
 import msgspec
 import numpy as np
@@ -42,6 +43,16 @@ def test_whole_arena_is_in_sight_and_fills_page(size, aspect):
     assert low - 1e-4 <= up.min() <= up.max() <= high + 1e-4
     fills = np.ptp(over) / np.ptp(live.FREE), np.ptp(up) / (high - low)
     assert max(fills) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("aspect", [0.0, float("nan"), float("inf")])
+def test_camera_of_a_hidden_page_has_a_place(aspect):
+    page = MagicMock(client_id=1)
+    page.camera.aspect = aspect
+    server = MagicMock()
+    server.get_clients.return_value = {1: page}
+    live.Camera(server).show(np.array([4.0, 4.0, 1.0]))
+    assert np.isfinite([*page.camera.position, *page.camera.look_at]).all()
 
 
 @pytest.mark.parametrize(
