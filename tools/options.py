@@ -175,12 +175,16 @@ def open_in_browser(address: str, by_hand: str = "") -> None:
         warn([f"no browser was found here: open {by_hand or address} by hand"])
 
 
-def print_json(value: Any) -> None:  # noqa: ANN401 - whatever JSON can hold, structs included
-    """Print a result as JSON: what every command does with `--json`; NaN is null, a path its text."""
+def json_text(value: Any) -> str:  # noqa: ANN401 - whatever JSON can hold, structs included
+    """A result as JSON: what every command prints with `--json`; NaN is null, a path its text."""
     import msgspec
 
     text = msgspec.json.encode(value, enc_hook=lambda other: other.item() if hasattr(other, "item") else str(other))
-    print(msgspec.json.format(text, indent=2).decode())
+    return msgspec.json.format(text, indent=2).decode()
+
+
+def print_json(value: Any) -> None:  # noqa: ANN401 - likewise
+    print(json_text(value))
 
 
 def print_result(result: Any, *lines: str, as_json: bool) -> None:  # noqa: ANN401 - as `print_json`

@@ -105,12 +105,10 @@ def summary_table(cases: Sequence[CaseMetrics], chosen: Sequence[str] = ()) -> T
         return text, f"× {ratio_words(share)}"
 
     shown = {name: metric for name, metric in summary_metrics(cases).items() if not chosen or name in chosen}
-    rows = [
-        TableRow(
-            (metric.head + " of the case" * (metric.per == "case"), *(cell(runs, name) for runs in grouped.values()))
-        )
-        for name, metric in shown.items()
-    ]
+    rows = []
+    for name, metric in shown.items():
+        head = metric.head + " of the case" * (metric.per == "case")
+        rows.append(TableRow((head, *(cell(runs, name) for runs in grouped.values()))))
     seeds = max(len(runs) for runs in grouped.values())
     note = f"× is relative to {next(iter(grouped))}." if len(grouped) > 1 else ""
     note += f" {over_seeds(seeds)}" if seeds > 1 else ""
@@ -358,14 +356,9 @@ def network_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
         ("Mean delay [ms]", lambda links: number(mean_delay(links), 1e3)),
         ("Longest [ms]", _cell(max, "delay_max", 1e3)),
     ]
-    link = partial(
-        _table_by_row,
-        head="Link",
-        items=attrgetter("link_deliveries"),
-        name="{0.sender} > {0.receiver}".format,
-        totals=True,
-    )
-    return tuple(link(name, runs, columns) for name, runs in by_case(cases).items() if runs[0].modelled)
+    items, name = attrgetter("link_deliveries"), "{0.sender} > {0.receiver}".format
+    link = partial(_table_by_row, head="Link", items=items, name=name, totals=True)
+    return tuple(link(case, runs, columns) for case, runs in by_case(cases).items() if runs[0].modelled)
 
 
 def dropped_share(links: Sequence[LinkDelivery]) -> float | None:
@@ -385,16 +378,16 @@ def mean_delay(links: Sequence[LinkDelivery]) -> float | None:
 def clearance_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
     """Closest approaches of each robot and its changed ticks, per case; over seeds the nearest and the mean."""
 
-    def gap(near: Approach | None) -> Cell:
-        return NONE if near is None else (number(near.gap, 100.0), near.between[1])
+    def gap(near: Approach) -> Cell:
+        return number(near.gap, 100.0), near.between[1]
 
-    def at(near: Approach | None) -> str:
-        return NONE if near is None else f"{near.at_s:.2f}"
+    def at(near: Approach) -> str:
+        return f"{near.at_s:.2f}"
 
-    def nearest(show: Callable[[Approach | None], Cell], field: str) -> Callable[[Sequence[RobotMetrics]], Cell]:
+    def nearest(show: Callable[[Approach], Cell], field: str) -> Callable[[Sequence[RobotMetrics]], Cell]:
         def cell(robots: Sequence[RobotMetrics]) -> Cell:
             known = [near for near in map(attrgetter(field), robots) if near is not None]
-            return show(min(known, key=attrgetter("gap"), default=None))
+            return show(min(known, key=attrgetter("gap"))) if known else NONE
 
         return cell
 
@@ -467,11 +460,9 @@ def criteria_table(cases: Sequence[CaseMetrics]) -> Table:
     """Criteria of the file with what was reached, over the seeds, and how many seeds keep them."""
     rows = []
     for each in judge(cases):
-        kept = len(each.values) - len(each.failed)
+        kept, reached = len(each.values) - len(each.failed), interval(spread([*each.values.values()]))
         answer = "not judged" if each.passed is None else f"{kept} of {len(each.values)}"
-        rows.append(
-            TableRow((each.what, each.limit, interval(spread([*each.values.values()])), answer, each.criterion.why))
-        )
+        rows.append(TableRow((each.what, each.limit, reached, answer, each.criterion.why)))
     return Table(("Criterion", "Limit", "Reached", "Seeds", "Why"), tuple(rows), words=True)
 
 

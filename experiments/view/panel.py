@@ -229,7 +229,7 @@ def _cells(row: RobotRow) -> tuple[str, ...]:
 
 
 def _coloured_error(error: float) -> str:
-    return f"<span style='color:{css(link_colours(np.array(error)))}'>{100 * error:.1f} cm</span>"
+    return f"<span style='color:{css(link_colours(np.array(error)).tolist())}'>{100 * error:.1f} cm</span>"
 
 
 def _coloured_missed(missed: int, share: float) -> str:

@@ -24,6 +24,7 @@ from tools.options import (
     Settings,
     check_bodies,
     example,
+    json_text,
     print_json,
     warn,
 )
@@ -136,8 +137,6 @@ def preflight(
     as_json: AsJson = False,
 ) -> int:
     """Check the robots of an experiment before the first flight; motors turn with --hop, --stop and --sticks only."""
-    import msgspec
-
     from agents.runtime.command_line import interrupts
     from experiments.file.document import chosen, load
     from experiments.real_time.conductor.conduct import RunOptions, Supervision
@@ -153,24 +152,18 @@ def preflight(
     folder, emergency = new_folder(read, out, "preflight"), Emergency()
     try:
         with interrupts() as interrupted:
-            found = check_robots(
-                read,
-                folder,
-                options,
-                Trials(hop=hop, stop=stop, own=sticks),
-                Supervision(shown(quiet=as_json), interrupted, emergency, tell=warn),
-            )
+            user = Supervision(shown(quiet=as_json), interrupted, emergency, tell=warn)
+            found = check_robots(read, folder, options, Trials(hop=hop, stop=stop, own=sticks), user)
             ended = interrupted()
     finally:
         remove_unused(folder)
     red = [each.robot for each in found if each.red]
     ok = not (red or ended or emergency)
-    said = msgspec.to_builtins({"file": str(read.path), "ok": ok, "robots": found, "folder": str(folder)})
-    text = msgspec.json.format(msgspec.json.encode(said), indent=2)
+    text = json_text({"file": read.path, "ok": ok, "robots": found, "folder": folder})
     if folder.exists():
-        (folder / "preflight.json").write_bytes(text + b"\n")
+        (folder / "preflight.json").write_text(f"{text}\n", encoding="utf-8")
     if as_json:
-        print(text.decode())
+        print(text)
     else:
         _print_checks(found)
         verdict = f"red: {', '.join(red)}" if red else "interrupted" if ended else "nothing is red"
