@@ -17,12 +17,11 @@ from typing import Final
 from agents.network import messages
 from agents.network.endpoints import free_endpoint
 from experiments.file.document import Document, load
-from experiments.real_time.conductor.case_context import CaseContext
+from experiments.real_time.conductor.case_processes import CaseContext
 from experiments.real_time.conductor.conductor import Conductor
 from experiments.real_time.conductor.run_view import Progress
-from experiments.real_time.conductor.support import start_router
 from experiments.real_time.hosts.hosts import Hosts
-from experiments.real_time.hosts.launcher import Launcher
+from experiments.real_time.hosts.launcher import ROUTER, Launcher, Router
 from experiments.recording.run_folder import SOURCE
 from tests.bench.measuring import Figure
 from tests.reliability.soak_sampler import Usage, usage_of
@@ -87,7 +86,7 @@ def process(read: Document | None = None) -> Iterator[Figure]:
         folder, endpoints = Path(name), [free_endpoint()]
         with Launcher(folder / "logs") as launcher:
             launcher.preload()
-            start_router(launcher, endpoints)
+            Router(ROUTER, endpoints).start(launcher)
             for robot in experiment.robots:
                 senders = [link.name for link in plan.assignment(robot).neighbours]
                 rate = f"{experiment.rates.pose_hz:g}"

@@ -35,8 +35,7 @@ from experiments.definition.experiment import Arena, Formation, Rates, RobotTabl
 from experiments.definition.plan import Plan
 from experiments.file.document import write_json
 from experiments.real_time.conductor import orders
-from experiments.real_time.conductor.support import start_router
-from experiments.real_time.hosts.launcher import Launcher
+from experiments.real_time.hosts.launcher import ROUTER, Launcher, Router
 from tests.bench.measuring import Figure
 from tests.reliability import spoilt_process
 from tests.reliability.spoilt_process import ROBOT, Switch
@@ -172,7 +171,7 @@ class _Park:
         file = folder / "ring.json"
         file.write_bytes(write_json(plan))
         endpoints = [free_endpoint(0)]
-        start_router(self._launcher, endpoints)
+        Router(ROUTER, endpoints).start(self._launcher)
         self._session = stack.enter_context(network.open_session(endpoints, name="bench"))
         listener = stack.enter_context(network.open_session(endpoints, name="bench listens"))
         callbacks: dict[str, Callable[[zenoh.Sample], None]] = {

@@ -25,7 +25,7 @@ from experiments.definition import bodies
 from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.real_time.conductor import orders
-from experiments.real_time.conductor.case_context import CaseContext
+from experiments.real_time.conductor.case_processes import CaseContext
 from experiments.real_time.conductor.conductor import Conductor
 from experiments.real_time.hosts.hosts import Hosts
 from experiments.real_time.processes.joining import Network

@@ -184,9 +184,8 @@ def stations(
     from agents.network.endpoints import free_endpoint
     from experiments.definition import endpoints
     from experiments.real_time.conductor.conduct import write_rights
-    from experiments.real_time.conductor.support import start_router
     from experiments.real_time.hosts.hosts import HostError, Station
-    from experiments.real_time.hosts.launcher import Launcher
+    from experiments.real_time.hosts.launcher import ROUTER, Launcher, Router
 
     experiment = read.experiment
     with tempfile.TemporaryDirectory() as folder, Launcher(Path(folder)) as launcher:
@@ -197,7 +196,7 @@ def stations(
         elif network.connect is None:
             own = network.listen or [free_endpoint(protocol="tls" if secure else "tcp")]
             routers = endpoints.router_endpoints(read.plan, read.path, own, lab)
-            start_router(launcher, routers, write_rights(read.cases().values(), routers, Path(folder)))
+            Router(ROUTER, routers).start(launcher, write_rights(read.cases().values(), routers, Path(folder)))
         else:
             routers = endpoints.router_endpoints(read.plan, read.path, network.connect, lab)
         begun: list[Station | HostError] = []

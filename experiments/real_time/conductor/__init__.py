@@ -1,5 +1,4 @@
 """`./zenpark run`: starts a case, walks its phases, changes robots, lands.
 
-May import: agents, twins, experiments.definition, experiments.file, experiments.recording,
-experiments.real_time.hosts.
+May import: agents, twins, experiments.definition, experiments.file, experiments.recording, experiments.real_time.hosts.
 """

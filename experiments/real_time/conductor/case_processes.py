@@ -1,4 +1,4 @@
-"""Processes of one case: recorder, stand-ins for hardware, robots, routers.
+"""Processes of one case: recorder, stand-ins for hardware, support processes, robots; restarts of routers.
 
 Robots are started on the machines that the file names, or by others. All other processes run on the launcher's machine,
 and its clock is that of the experiment.
@@ -6,25 +6,178 @@ and its clock is that of the experiment.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Final
 
 import msgspec
 
+from agents.plugins import registry
 from experiments.definition import bodies, standby
-from experiments.definition.experiment import RobotTable
+from experiments.definition.access_rights import has_world
+from experiments.definition.experiment import VICON_TWIN, RobotTable
 from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.file.document import write_json
-from experiments.real_time.conductor.case_context import CaseContext
-from experiments.real_time.conductor.support import SupportProcesses
-from experiments.real_time.hosts.hosts import STATION
-from experiments.real_time.hosts.launcher import LAND_S, ZYGOTE, Process
-from experiments.recording.reader import RecordingError, recover
+from experiments.real_time.conductor.orders import Emergency
+from experiments.real_time.hosts.hosts import STATION, Hosts
+from experiments.real_time.hosts.launcher import LAND_S, ZYGOTE, Launcher, Process, is_router, make_routers
+from experiments.recording.reader import PARTS, RecordingError, recover
 
 ALONE_S: Final = 3.0  # limit for a robot that joins a run under way to wait for silent neighbours
+LEAST_SIGMA: Final = 1e-5  # [m] noise of simulated motion capture: what repeats itself to the last bit is not believed
+STARTS: Final = 4  # a process that dies more often is not helped by another start
+VICON: Final = "vicon://"
+HOLD: Final = ": robots hold meanwhile"
+
+
+@dataclass(frozen=True)
+class CaseContext:
+    """Case of a run, the place of its files, and the means to run it."""
+
+    plan: Plan  # overrides applied
+    case: str  # its name, with which the names of its processes and files begin
+    folder: Path  # for the recording, and for the processes' output in logs/
+    source: Path  # the experiment file as it was written, for the recording
+    endpoints: Sequence[str]  # routers as this machine reaches them
+    launcher: Launcher
+    hosts: Hosts  # other machines, on which robots may be started; it has the endpoints at which our routers listen
+    interrupted: Callable[[], bool] = lambda: False  # whether the user wants to end the run
+    rights: Path | None = None  # access rights for a router that is started again, in a lab
+    identity: str = "operator"  # identity of the conductor, in a lab
+    emergency: Emergency = field(default_factory=Emergency)  # emergency stops, which end the run as well
+
+    @property
+    def file(self) -> Path:
+        """The case as its processes read it."""
+        return self.variant("experiment")
+
+    def variant(self, word: str) -> Path:
+        """File of a variant of the case, in a folder that no other file of the run can share, however it is called."""
+        return self.folder / PARTS / self.case / f"{word}.json"
+
+    @property
+    def recording(self) -> Path:
+        """The file of the recorder; a recorder that is started again writes another, see `CaseProcesses.join_parts`."""
+        return self.folder / f"{self.case}.mcap"
+
+    def ended(self) -> bool:
+        """Whether the user or an emergency stop ends the run."""
+        return bool(self.emergency) or self.interrupted()
+
+    def process(self, role: str) -> str:
+        return f"{self.case}-{role}"
+
+    def start(self, role: str, module: str, *arguments: str) -> Process:
+        """Start a process of this case on this machine, with a lifeline and the routers."""
+        connect = [part for endpoint in self.endpoints for part in ("--connect", endpoint)]
+        return self.launcher.start(self.process(role), module, *arguments, *connect, "--lifeline", forked=True)
+
+
+@dataclass
+class _Supervised:
+    """Supervised process; texts for the robots' state meanwhile, and when it is given up."""
+
+    start: Callable[[], object]
+    meanwhile: str
+    given_up: str
+    starts: int = 1
+
+
+class SupportProcesses:
+    """Supervised processes of one case: routers, world, central controller, motion capture; and protocol twins."""
+
+    standins: list[str]  # processes of protocol twins, world and motion capture
+
+    def __init__(self, context: CaseContext) -> None:
+        """Start nothing: routers are started by others."""
+        self._context = context
+        self.standins = []
+        count = context.plan.experiment.network.routers
+        self._known = {
+            each.name: _Supervised(
+                partial(each.start, context.launcher, context.rights),
+                ": all go on at another meanwhile" if count > 1 else "",
+                ": no other takes its place" if count > 1 else ": the robots hold, and land at the end",
+            )
+            for each in make_routers(context.hosts.routers, count)
+        }
+
+    def supervise(self, start: Callable[[], Process], meanwhile: str = HOLD, given_up: str = "") -> Process:
+        """Start a process of the case, and again when it dies; texts as of `_Supervised`."""
+        process = start()
+        self._known[process.name] = _Supervised(start, meanwhile, given_up)
+        return process
+
+    def start(self) -> Plan:
+        """Start what the robots of the case need; return the case with the addresses of its robots.
+
+        Raises StandInError if a protocol twin or a positioning system does not start in time.
+        """
+        context, experiment = self._context, self._context.plan.experiment
+        world: Process | None = None
+        if has_world(context.plan):
+            start = partial(context.start, "world", "experiments.real_time.processes.world", str(context.file))
+            world = self.supervise(start)
+        words = registry.names(registry.DEVICES)
+        groups: dict[str, list[str]] = {}
+        for name, robot in experiment.robots.items():
+            if robot.body in words:
+                groups.setdefault(robot.body, []).append(name)
+        module = "experiments.real_time.processes.protocol_twins"
+        processes = {word: context.start(word, module, str(context.file), *names) for word, names in groups.items()}
+        addresses: dict[str, str] = {}
+        for word, names in groups.items():
+            addresses |= processes[word].await_lines(r"^address (\w+) (\S+)$", len(names), context.ended)
+            self.standins.append(processes[word].name)
+        if world is not None:
+            world.await_lines(r"^(world) (ready)\b", 1, context.ended)
+            self.standins.append(world.name)
+        robots = {
+            name: msgspec.structs.replace(robot, body=addresses.get(name, robot.body))
+            for name, robot in experiment.robots.items()
+        }
+        addressed = context.plan.changed(robots=robots)
+        self._start_positioning(addressed)
+        if context.plan.guided:
+            centre = partial(context.start, "centre", "experiments.real_time.processes.centre", str(context.file))
+            self.supervise(centre, given_up=": the robots that it guides hold, and land at the end")
+        return addressed
+
+    def _start_positioning(self, plan: Plan) -> None:
+        """Start the motion capture of the case; its robots have addresses."""
+        context, experiment, measured = self._context, plan.experiment, plan.externally_measured
+        if experiment.positioning is None or not measured:
+            return
+        realm = ["--realm", experiment.network.realm]
+        host = experiment.positioning.removeprefix(VICON)
+        if experiment.positioning == VICON_TWIN:
+            asked = (plan.disturbance(name).position_sigma or 0.0 for name in measured)
+            sigma = max(LEAST_SIGMA, *asked)
+            noise = ["--sigma", str(sigma), "--seed", str(experiment.seed)]
+            arguments = ["--listen", "127.0.0.1:0", *measured, *noise, *realm]
+            twin = context.start(VICON_TWIN, "twins.devices.vicon", *arguments)
+            self.standins.append(twin.name)
+            host = twin.await_lines(r"^vicon (ready on) (\S+)$", 1, context.ended)["ready on"]
+        maps = [part for name in measured for part in ("--map", f"{name}={name}")]
+        bridge = partial(context.start, "vicon", "bridges.vicon.publisher", host, *maps, *realm)
+        hold = ": robots without a position hold, drones land"
+        self.standins.append(self.supervise(bridge, hold, hold).name)
+
+    def again(self, process: Process) -> tuple[str, str] | None:
+        """Restart a process that has died; its role and the text of the event. None if it is not supervised."""
+        servant = self._known.get(process.name)
+        if servant is None:
+            return None
+        kind = process.name.removeprefix(self._context.process(""))
+        more = servant.starts < STARTS
+        if more:
+            servant.starts += 1
+            servant.start()
+        what = f"started again{servant.meanwhile}" if more else f"given up{servant.given_up}"
+        return kind, f"the {kind} ended ({process.exit}); {what}{'' if is_router(process.name) else process.because}"
 
 
 @dataclass(frozen=True)

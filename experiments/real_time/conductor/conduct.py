@@ -28,14 +28,13 @@ from experiments.definition.experiment import WORLD
 from experiments.definition.plan import Plan
 from experiments.file.document import Document, chosen
 from experiments.file.problems import refusal
-from experiments.real_time.conductor.case_context import CaseContext
+from experiments.real_time.conductor.case_processes import CaseContext
 from experiments.real_time.conductor.conductor import CaseResult, Conductor
 from experiments.real_time.conductor.orders import STARTING_S, Emergency
 from experiments.real_time.conductor.run_view import ProgressDisplay
-from experiments.real_time.conductor.support import RouterEnded, make_routers, start_routers
 from experiments.real_time.hosts import run_registry
 from experiments.real_time.hosts.hosts import Hosts
-from experiments.real_time.hosts.launcher import Launcher
+from experiments.real_time.hosts.launcher import Launcher, RouterEnded, make_routers, start_routers
 from experiments.recording.run_folder import SOURCE
 
 PORT_CHOICES: Final = 3  # of a run with no `network.listen`: a free port may be taken before its router listens there

@@ -19,8 +19,7 @@ from agents.network import messages
 from agents.network.keys import Keys
 from agents.runtime.orders import LAND, STOP
 from experiments.file.document import write_json
-from experiments.real_time.conductor.case_context import CaseContext
-from experiments.real_time.conductor.case_processes import CaseProcesses
+from experiments.real_time.conductor.case_processes import CaseContext, CaseProcesses
 from experiments.real_time.conductor.hot_changes import CLIMB_S, HotChanges
 from experiments.real_time.conductor.orders import start_lead_s
 from experiments.real_time.conductor.run_view import (
@@ -109,7 +108,9 @@ class Conductor(CaseRun):
                 self._join(stack)
                 self._adopt()
                 self._processes.start()
-                if self.await_phase("ready", self._patience(), recorder=True):
+                begin = self._experiment.start  # robots that go on without a neighbour report it after the deadline
+                limit_s = begin.deadline_s + (GO_ON_S if begin.missing == "go-on" else 0.0)
+                if self.await_phase("ready", limit_s, recorder=True):
                     ready = time.monotonic() - began
                     self._view.report_clocks(clocks)
                     self._drift = stack.enter_context(Drift(self._context.hosts.in_use()))
@@ -201,11 +202,6 @@ class Conductor(CaseRun):
                 refused.extend(self._order(messages.Order("takeoff"), [name]))
 
         return self.await_phase("airborne", CLIMB_S, meanwhile=again)
-
-    def _patience(self) -> float:
-        """Limit for all robots to be ready [s]: robots that go on without a neighbour report it after the deadline."""
-        begin = self._experiment.start
-        return begin.deadline_s + (GO_ON_S if begin.missing == "go-on" else 0.0)
 
     def _start(self) -> float:
         """Order the common start; returns its time [s, UTC]."""

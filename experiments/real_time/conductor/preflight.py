@@ -25,7 +25,7 @@ from experiments.definition.experiment import ChannelTable, Formation, LegTable,
 from experiments.definition.plan import Plan
 from experiments.file.document import Document
 from experiments.real_time.conductor import preflight_checks as checks
-from experiments.real_time.conductor.case_context import CaseContext
+from experiments.real_time.conductor.case_processes import CaseContext
 from experiments.real_time.conductor.conduct import RunOptions, Supervision, run_setup, with_bodies
 from experiments.real_time.conductor.conductor import CaseRun
 from experiments.real_time.conductor.hot_changes import CLIMB_S
@@ -61,14 +61,9 @@ class Trials:
 def check_robots(
     read: Document, folder: Path, options: RunOptions, trials: Trials, user: Supervision
 ) -> list[RobotChecks]:
-    """Check the robots of an experiment before the first flight.
+    """Check the robots of the first of the chosen cases; return no check if the user ended that before it began.
 
-    Args:
-        read: The experiment; of several cases, the first of the chosen ones.
-        user: After an interrupt the robot that moves lands; emergency stops end the checks as well.
-
-    Returns:
-        The checks of each robot; none if the user ended them before they began.
+    After an interrupt the robot that moves lands; emergency stops end the checks as well.
     """
     plan = alone(next(iter(with_bodies(read, options).values())))
     with run_setup(read, {PREFLIGHT: plan}, folder, options, user) as (contexts, _), user.show as show:

@@ -23,7 +23,7 @@ from agents.runtime.lifeline import SILENCE_S
 from experiments.definition import mesh
 from experiments.file import document
 from experiments.real_time.conductor import orders
-from experiments.real_time.conductor.case_context import CaseContext
+from experiments.real_time.conductor.case_processes import CaseContext
 
 ORDER: Final = tuple(phase.word for phase in Phase)
 AHEAD_S: Final = -0.02  # what comes before it was said is from a clock that is ahead [s],

@@ -53,14 +53,9 @@ def create(
 ) -> Register:
     """Make a lab: its folder, its authority, and a certificate for each identity.
 
-    Args:
-        folder: Must not hold a lab.
-        identities: Role by name.
-        hosts: Names and addresses at which the routers can be reached, beside this machine.
-        listening: The same for other members that listen, by name: those of a mesh.
-
-    Raises:
-        LabError: If there is a lab already, the folder cannot be written, or its path, a name or an address is wrong.
+    `identities` are roles by name, `hosts` the names and addresses at which the routers can be reached, beside this
+    machine, and `listening` those of other members that listen, by name: of a mesh. Raises LabError if the folder holds
+    a lab or cannot be written, or its path, a name or an address is wrong.
     """
     check_path(folder)
     if (folder / REGISTER).exists() or (folder / f"{AUTHORITY}.key").exists():
@@ -101,13 +96,9 @@ def renew(
 ) -> Register:
     """Make new keys and certificates on the same names; those before stay valid until they end.
 
-    Args:
-        names: Of identities; all if none is named.
-        hosts: Names and addresses at which those named may listen from now on, beside those from before.
-        authority: Whether to make a new authority; from then on only its certificates count, so all are renewed.
-
-    Raises:
-        LabError: If there is no such identity, or the authority's key is not on this machine.
+    All are renewed if none is named, and with a new `authority`: from then on only its certificates count. `hosts` are
+    names and addresses at which those named may listen from now on, beside those from before. Raises LabError if there
+    is no such identity, or the authority's key is not on this machine.
     """
     known = register(folder)
     if authority and names:

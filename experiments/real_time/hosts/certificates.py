@@ -17,11 +17,9 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from agents.network.endpoints import Endpoint
-from agents.network.lab import AUTHORITY, LabError, files, register
+from agents.network.lab import AUTHORITY, LabError, Register, files, register
 
 if TYPE_CHECKING:
-    from cryptography import x509
-
     from experiments.definition.experiment import Host
 
 INSTALL: Final = "`./zenpark hosts install FILE` puts the right ones there"
@@ -90,17 +88,25 @@ def of_host(name: str, hosts: Mapping[str, Host]) -> list[str]:
 
 def ended(folder: Path, names: Sequence[str]) -> Iterator[str]:
     """Reasons why identities of a lab on this machine cannot be sent, each with its remedy."""
-    known = register(folder).identities
+    known = register(folder)
     for name in names:
-        if name not in known:
-            yield f"{name} is not in the lab {folder}; `./zenpark lab issue {folder} {name}` adds it"
-        elif (until := datetime.fromisoformat(known[name].until)) < datetime.now(UTC):
-            yield f"the certificate of {name} ended at {until:%Y-%m-%d %H:%M}; `./zenpark lab renew {folder} {name}`"
-        else:
-            try:
-                files(folder, name)
-            except LabError as error:
-                yield str(error)
+        if why := _of_register(known, folder, name):
+            yield why
+            continue
+        try:
+            files(folder, name)
+        except LabError as error:
+            yield str(error)
+
+
+def _of_register(known: Register, folder: Path, name: str) -> str:
+    """Fault of an identity by the register, with the remedy; empty if it may have a certificate that counts."""
+    if name not in known.identities:
+        return f"{name} is not in the lab {folder}; `./zenpark lab issue {folder} {name}`"
+    until = datetime.fromisoformat(known.identities[name].until)
+    if until < datetime.now(UTC):
+        return f"the certificate of {name} ended at {until:%Y-%m-%d %H:%M}; `./zenpark lab renew {folder} {name}`"
+    return ""
 
 
 def days_left(folder: Path, names: Sequence[str]) -> float:
@@ -111,11 +117,9 @@ def days_left(folder: Path, names: Sequence[str]) -> float:
 
 
 def faults(found: FolderContent, folder: Path, there: float) -> Iterator[str]:
-    """Faults of the certificates of a machine, each with its remedy.
+    """Faults of the certificates of a machine, whose clock is at `there` [s, UTC], each with its remedy.
 
-    Args:
-        folder: Of the lab, on this machine: its register and `ca.pem`.
-        there: That machine's clock, UTC [s].
+    `folder` is that of the lab on this machine, with its register and `ca.pem`.
     """
     from cryptography import x509  # noqa: PLC0415 - 4.5 MB that runs without a lab do without
 
@@ -130,10 +134,10 @@ def faults(found: FolderContent, folder: Path, there: float) -> Iterator[str]:
             f"{theirs[:FINGERPRINT_DIGITS]}, here {ours[:FINGERPRINT_DIGITS]}); {INSTALL}"
         )
         return
-    known = register(folder).identities
+    known = register(folder)
     for each in found.identities:
-        if each.name not in known:
-            yield f"{each.name} is not in the lab {folder}; `./zenpark lab issue {folder} {each.name}`, then {INSTALL}"
+        if why := _of_register(known, folder, each.name):
+            yield f"{why}, then {INSTALL}"
             continue
         if each.wrong:
             yield f"{each.wrong}; {INSTALL}"
@@ -143,15 +147,11 @@ def faults(found: FolderContent, folder: Path, there: float) -> Iterator[str]:
         except ValueError:
             yield f"{each.name}.pem is no certificate; {INSTALL}"
             continue
-        mine = known[each.name]
-        if f"{certificate.serial_number:x}" != mine.serial:
-            what = "renewed" if _common_name(certificate) == mine.common_name else "revoked"
+        registered = known.identities[each.name]
+        if f"{certificate.serial_number:x}" != registered.serial:
+            same = any(attribute.value == registered.common_name for attribute in certificate.subject)
+            what = "renewed" if same else "revoked"
             yield f"the certificate of {each.name} there has been {what} since; {INSTALL}"
-        elif certificate.not_valid_after_utc < datetime.now(UTC):
-            yield (
-                f"the certificate of {each.name} ended at {certificate.not_valid_after_utc:%Y-%m-%d %H:%M}; "
-                f"`./zenpark lab renew {folder} {each.name}`, then {INSTALL}"
-            )
         elif not certificate.not_valid_before_utc.timestamp() < there < certificate.not_valid_after_utc.timestamp():
             now = datetime.fromtimestamp(there, UTC)
             yield f"its clock says {now:%Y-%m-%d %H:%M} UTC, when {each.name} has no valid certificate; set it (NTP)"
@@ -174,9 +174,3 @@ def misplaced_keys(found: FolderContent, host: str) -> Iterator[str]:
     if found.others:
         keys = ", ".join(f"{name}.key" for name in found.others)
         yield f"holds {keys}, which do not belong on {host}; `./zenpark hosts install FILE` removes them"
-
-
-def _common_name(certificate: x509.Certificate) -> str:
-    from cryptography.x509.oid import NameOID  # noqa: PLC0415
-
-    return "".join(str(each.value) for each in certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME))

@@ -52,11 +52,7 @@ def put(name: str, host: Host) -> str:
 
 
 def packed(root: Path, names: Sequence[str], mode: int | None = None) -> bytes:
-    """Files of a folder as a compressed tar without user names and without files made by running it.
-
-    Args:
-        mode: Of all files; None: as they have it.
-    """
+    """Files of a folder as a compressed tar without user names and files made by running it; `mode` of all, if any."""
     sink = io.BytesIO()
 
     def kept(member: tarfile.TarInfo) -> tarfile.TarInfo | None:
@@ -72,14 +68,9 @@ def packed(root: Path, names: Sequence[str], mode: int | None = None) -> bytes:
 
 
 def send(name: str, host: Host, folder: Path, robots: Sequence[str]) -> str:
-    """Put the certificates of some robots on a host, in place of what its folder held; return what was done.
+    """Put the certificates of some robots on a host, in place of all that its folder held; return what was done.
 
-    Args:
-        robots: Their names; no other certificates stay there.
-
-    Raises:
-        HostError: If some cannot be sent, or there is no place for them.
-        LabError: If the register of the lab cannot be read.
+    Raises HostError if some cannot be sent, or there is no place for them; LabError without a register of the lab.
     """
     if trouble := list(certificates.ended(folder, robots)):
         raise HostError("\n".join(f"{name}: {each}" for each in trouble))

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import secrets
 import signal
 import subprocess
@@ -24,6 +25,8 @@ from pathlib import Path
 from typing import IO, Final, Self
 
 from agents.clock import Clock
+from agents.errors import ExplainedError
+from agents.network.endpoints import from_here
 from agents.runtime.lifeline import BEAT_S, SILENCE_S
 from experiments.real_time.processes import zygote
 from experiments.real_time.processes.zygote import Forked, NoZygote
@@ -31,6 +34,9 @@ from experiments.real_time.processes.zygote import Forked, NoZygote
 ROUTER: Final = "router"  # the first; others are router2, router3, ...
 ZYGOTE: Final = "zygote"
 LAND_S: Final = 15.0  # for robots to come down after their lifeline was cut
+LINGER_S: Final = 15.0  # the router outlives a killed conductor, so that the landing is recorded
+READY_S: Final = 15.0  # limit for a process to say that it is ready
+POLL_S: Final = 0.02
 TAIL: Final = 12  # lines of a dead process's output that are worth showing
 
 
@@ -86,6 +92,18 @@ class Process:
         """Last output line with a leading colon, for messages; may be empty."""
         return "".join(f": {line}" for line in self.tail().strip().splitlines()[-1:])
 
+    def await_lines(self, pattern: str, count: int, interrupted: Callable[[], bool]) -> dict[str, str]:
+        """Wait until it has printed `count` lines of a form; returns the two groups of each."""
+        deadline = time.monotonic() + READY_S
+        while True:
+            found = dict(re.findall(pattern, self.output, re.MULTILINE))
+            if len(found) >= count:
+                return found
+            if interrupted() or not self.alive or time.monotonic() > deadline:
+                what = "was interrupted" if interrupted() else f"did not start ({self.exit})"
+                raise StandInError(f"{self.name} {what}: {self.tail() or 'no output'}")
+            time.sleep(POLL_S)
+
     def write(self) -> None:
         """Write as much of the input as fits into the pipe: the reader may be slow."""
         with contextlib.suppress(OSError, ValueError):  # dead, or frozen with a full pipe
@@ -107,10 +125,6 @@ class Process:
         if self.alive:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(self.handle.pid, number)
-
-
-def is_router(process: str) -> bool:
-    return process == ROUTER or process.removeprefix(ROUTER).isdecimal()
 
 
 class Launcher:
@@ -303,6 +317,58 @@ def _fork(request: zygote.Request, path: Path, log: IO[bytes]) -> Forked:
         raise
     finally:
         os.close(end)
+
+
+class StandInError(ExplainedError):
+    """A process that did not start, with its output."""
+
+
+class RouterEnded(StandInError):
+    """A router that ended instead of listening: its port was taken, or its lab cannot be used."""
+
+
+@dataclass(frozen=True)
+class Router:
+    """Router of a run."""
+
+    name: str  # of its process
+    listen: Sequence[str]  # where it listens
+    # routers before it, which it connects to for as long as it lives, so that any two are linked once
+    link: Sequence[str] = ()
+
+    def start(self, launcher: Launcher, rights: Path | None = None) -> Process:
+        """Start the router; it outlives a killed launcher until robots have landed. In a lab it enforces `rights`."""
+        listen = [part for endpoint in self.listen for part in ("--listen", endpoint)]
+        link = [part for endpoint in self.link for part in ("--connect", endpoint)]
+        enforced = [] if rights is None else ["--rights", str(rights)]
+        linger = ["--lifeline", "--linger", str(LINGER_S)]
+        return launcher.start(self.name, "agents.runtime.router", *listen, *link, *enforced, *linger)
+
+
+def make_routers(endpoints: Sequence[str], count: int) -> list[Router]:
+    """`count` routers, with these endpoints in turn."""
+    made: list[Router] = []
+    for number in range(count):
+        link = [from_here(before.listen[0]) for before in made]
+        made.append(Router(f"{ROUTER}{number + 1}" if number else ROUTER, list(endpoints[number::count]), link))
+    return made
+
+
+def is_router(process: str) -> bool:
+    return process == ROUTER or process.removeprefix(ROUTER).isdecimal()
+
+
+def start_routers(launcher: Launcher, routers: Sequence[Router], rights: Path | None) -> None:
+    """Start routers, and wait until they listen.
+
+    Without that, robots would join a stranger's router where another run took the port at the same moment. Raises
+    RouterEnded if one ends instead, StandInError if one does not listen in time.
+    """
+    for process in [router.start(launcher, rights) for router in routers]:
+        try:
+            process.await_lines(r"^(router) (ready)\b", 1, lambda: False)
+        except StandInError as error:
+            raise (error if process.alive else RouterEnded(str(error))) from None
 
 
 RUN: Final = "ZENPARK_RUN"  # in the environment of every process of a run, here or on a host, by which they are found

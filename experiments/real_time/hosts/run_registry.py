@@ -149,7 +149,7 @@ def _read(file: Path) -> RegisteredRun | None:
 def _answers(endpoint: str) -> bool:
     """Whether the endpoint takes connections; of QUIC this is unknown before the first packet."""
     where = Endpoint.parse(endpoint)
-    with suppress(OSError):
+    with suppress(OSError, ValueError):  # ValueError: no such name can be asked for
         if where.protocol == UNIX:
             return stat.S_ISSOCK(Path(where.host).stat().st_mode)
         with socket.create_connection((where.host, where.port), KNOCK_S):

@@ -194,11 +194,7 @@ def kill(pids: Sequence[int]) -> list[int]:
 
 
 def serve(fd: int = 0, patience_s: float = LAND_S) -> int:
-    """Answer until the lifeline is lost, then wait until the robots have landed; return the exit code of the process.
-
-    Args:
-        patience_s: Time for robots to land and to end [s].
-    """
+    """Answer until the lifeline is lost, then wait for `patience_s` [s] until the robots are down; return 0."""
     here = Clock()
     decoder = msgspec.json.Decoder(Question)
     waiting = select.poll()

@@ -139,14 +139,9 @@ def _readable(fd: int, timeout_s: float | None) -> bool:
 
 
 def fork(path: Path, request: Request, streams: Sequence[int], stdin: BinaryIO | None = None) -> Forked:
-    """Have the zygote at a socket fork a process.
+    """Have the zygote at a socket fork a process; `stdin` is the other end of the first of its standard `streams`.
 
-    Args:
-        streams: File descriptors of its standard input, output and error.
-        stdin: The other end of its standard input.
-
-    Raises:
-        NoZygote: Without an answer. A process that is forked late all the same ends with its lifeline.
+    Raises NoZygote without an answer. A process that is forked late all the same ends with its lifeline.
     """
     zygote = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     try:
@@ -161,10 +156,9 @@ def fork(path: Path, request: Request, streams: Sequence[int], stdin: BinaryIO |
 
 
 def stand_for(run: str, arguments: Sequence[str]) -> int | None:
-    """Have the zygote of a run fork a robot's process with the standard streams of this one.
+    """Have the zygote of a run fork a robot's process with the standard streams of this one; return its exit code.
 
-    Returns:
-        Its exit code, at its end; signals are passed on, in both directions. None without a zygote.
+    Signals are passed on, in both directions. Returns None without a zygote.
     """
     try:
         forked = fork(address(run), Request("robot", ROBOT, arguments), (0, 1, 2))
@@ -200,8 +194,7 @@ class Zygote:
     def serve(self) -> Request | None:
         """Fork on request until the lifeline is lost; the starter of the zygote ends its processes before that.
 
-        Returns:
-            None in the zygote, at its end; in each forked process, the request that it must run.
+        Returns None in the zygote, at its end; in each forked process, the request that it must run.
         """
         for fd in (self._listener.fileno(), self._lifeline):
             self._waiting.register(fd, select.POLLIN)

@@ -21,13 +21,12 @@ from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.file.problems import DocumentError
 from experiments.real_time.conductor import conduct
-from experiments.real_time.conductor.case_context import CaseContext
+from experiments.real_time.conductor.case_processes import STARTS, CaseContext, SupportProcesses
 from experiments.real_time.conductor.conduct import PORT_CHOICES, RunOptions, Supervision, run_setup, with_bodies
 from experiments.real_time.conductor.orders import STARTING_S, Emergency
-from experiments.real_time.conductor.support import STARTS, RouterEnded, SupportProcesses
 from experiments.real_time.hosts import run_registry
 from experiments.real_time.hosts.hosts import Hosts
-from experiments.real_time.hosts.launcher import ROUTER, Launcher
+from experiments.real_time.hosts.launcher import ROUTER, Launcher, RouterEnded
 from tests.small import changed, pair
 
 RADIO = "radio://0/80/2M/E7E7E7E701"

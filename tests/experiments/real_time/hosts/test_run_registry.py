@@ -84,6 +84,12 @@ def test_garbage_is_left_alone_and_hides_nobody(folder: Path, text: bytes) -> No
         assert (folder / "0.json").exists()
 
 
+def test_host_that_cannot_be_asked_for_hides_nobody() -> None:
+    run = own_entry("run", "two", nowhere())
+    with registered(msgspec.structs.replace(dead(), endpoints=[f"tcp/{'a' * 70}:7447"])), registered(run):
+        assert runs() == [run]
+
+
 def test_folder_writable_by_others_is_refused(folder: Path) -> None:
     folder.mkdir(0o700)
     (folder / "0.json").write_bytes(msgspec.json.encode(own_entry("run", "two", nowhere())))
