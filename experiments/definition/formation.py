@@ -9,7 +9,6 @@ from functools import cached_property
 from typing import Final
 
 import numpy as np
-from msgspec.structs import replace
 
 from agents.formation import anchors
 from agents.formation.changes import Change, Target, change_target, exists, planned_at
@@ -42,7 +41,7 @@ class Pattern:
         in_order = sorted(experiment.formation.changes, key=lambda each: each.at_s)
         after = [_targets(experiment, each, there) for each in in_order]
         return cls(
-            linked([_link(each) for each in there], [(row[each.receiver], row[each.sender]) for each in there]),
+            linked([each.target for each in there], [(row[each.receiver], row[each.sender]) for each in there]),
             tuple(there),
             tuple(Change(each.at_s, each.over_s, each.scale, each.rotate) for each in in_order),
             tuple(zip(*after, strict=True)) if after else ((),) * len(there),
@@ -53,17 +52,14 @@ class Pattern:
         """Whether a link comes or goes."""
         return any(link.since > 0.0 or min(link.until, link.reach, link.release) < math.inf for link in self.one_way)
 
-    @cached_property
-    def _given(self) -> list[Link]:
-        return [_link(each) for each in self.one_way]
-
     def targets_at(self, elapsed: float) -> list[Link]:
         """Targets of the links `elapsed` [s] after the common start."""
+        given = [each.target for each in self.one_way]
         if not self.changes:
-            return self._given
-        found = [_link(each) for each in self.one_way]
-        for link, given, targets in zip(found, self._given, self.targets, strict=True):
-            change_target(link, given, self.changes, targets, elapsed)
+            return given
+        found = [Link(to.distance, to.gain, to.relative, to.bearing, to.wants) for to in given]
+        for link, begin, targets in zip(found, given, self.targets, strict=True):
+            change_target(link, begin, self.changes, targets, elapsed)
         return found
 
     def at(self, elapsed: float) -> Links:
@@ -207,11 +203,6 @@ def compile_anchors(experiment: Experiment) -> dict[str, tuple[anchors.Anchor, .
     return found
 
 
-def _link(one_way: OneWay) -> Link:
-    wanted = one_way.wanted
-    return Link(wanted.distance, one_way.gain, wanted.relative, wanted.bearing, wanted.wants)
-
-
 def _targets(experiment: Experiment, described: ChangeTable, one_way: Sequence[OneWay]) -> list[Target]:
     """Target of each link after a change."""
     new = {
@@ -222,11 +213,8 @@ def _targets(experiment: Experiment, described: ChangeTable, one_way: Sequence[O
     found = []
     for link in one_way:
         rise = held_height(experiment, link.receiver) - held_height(experiment, link.sender)
-        then = new.get((link.receiver, link.sender))
-        target = Target(rise=rise)
-        if then is not None:
-            target = replace(target, distance=then.distance, relative=then.relative, bearing=then.bearing)
-        found.append(target)
+        then = new.get((link.receiver, link.sender), Link())
+        found.append(Target(then.distance, then.relative, then.bearing, rise))
     return found
 
 

@@ -7,14 +7,14 @@ import re
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-from agents.formation.link import BY_BEARING, BY_DISTANCE, BY_NOTHING, BY_RELATIVE
+from agents.formation.link import BY_BEARING, BY_DISTANCE, BY_NOTHING, BY_RELATIVE, Link
 from agents.plugins.law import Law, Need
+from agents.vectors import UNKNOWN
 from experiments.definition.experiment import NO_TARGET, TARGETS, Experiment, TargetTable
 
 _LINK: Final = re.compile(r"\s*(\w+)\s*([>-])\s*(\w+)\s*", re.ASCII)
 _ALMOST: Final = re.compile(r"\s*(\w+)\s*([^\w\s]+)\s*(\w+)\s*", re.ASCII)
 FORM: Final = 'a link reads "A > B" (B receives from A) or "A - B" (both receive)'
-UNKNOWN: Final = (math.nan, math.nan, math.nan)
 RELEASE: Final = 1.1  # of the range: what separates coming from going, so that a link does not flicker
 
 
@@ -38,23 +38,12 @@ TARGET_KINDS: Final[dict[Need, TargetKind]] = {
 
 
 @dataclass(frozen=True)
-class LinkTarget:
-    """Target of a one-way link, see `agents.formation.link.Link`."""
-
-    wants: int
-    distance: float
-    relative: tuple[float, float, float] = UNKNOWN
-    bearing: tuple[float, float, float] = UNKNOWN
-
-
-@dataclass(frozen=True)
 class OneWay:
-    """One-way link: sender and receiver, target, gain, and the time or range in which it exists."""
+    """One-way link: sender and receiver, target, and the time or range in which it exists."""
 
     receiver: str  # name
     sender: str  # name
-    wanted: LinkTarget  # what it asks for
-    gain: float  # of the law
+    target: Link  # at the beginning; a change makes copies
     since: float = 0.0  # from when on [s]
     until: float = math.inf  # until when [s], infinity to the end
     reach: float = math.inf  # nearer than this it is there [m], infinity always
@@ -92,16 +81,15 @@ def one_way_links(experiment: Experiment, law: Law) -> list[OneWay]:
     found = []
     for text, given in formation.link_tables.items():
         for receiver, sender in link_pairs(text):
-            wanted = link_target(experiment, text, given, receiver)
-            gain = _gain(experiment, law, wanted.wants) if given.gain is None else given.gain
+            target = link_target(experiment, text, given, receiver)
+            target.gain = given.gain or getattr(formation, gain_key(law, target.wants))
             until = math.inf if given.until_s is None else given.until_s
-            found.append(OneWay(receiver, sender, wanted, gain, given.from_s, until, reach, release, text))
+            found.append(OneWay(receiver, sender, target, given.from_s, until, reach, release, text))
     if near is not None and near.distance is not None:
         there = {(link.receiver, link.sender) for link in found}
-        wanted = LinkTarget(BY_DISTANCE, near.distance)
-        gain = _gain(experiment, law, BY_DISTANCE)
+        target = Link(near.distance, getattr(formation, gain_key(law, BY_DISTANCE)))
         found += [
-            OneWay(a, b, wanted, gain, reach=reach, release=release)
+            OneWay(a, b, target, reach=reach, release=release)
             for a in experiment.robots
             for b in experiment.robots
             if a != b and (a, b) not in there
@@ -110,25 +98,25 @@ def one_way_links(experiment: Experiment, law: Law) -> list[OneWay]:
     return sorted(found, key=lambda link: (row[link.receiver], row[link.sender]))
 
 
-def link_target(experiment: Experiment, text: str, given: TargetTable | float, receiver: str) -> LinkTarget:
-    """Target of a link for one of its ends, as distance, offset and bearing."""
+def link_target(experiment: Experiment, text: str, given: TargetTable | float, receiver: str) -> Link:
+    """Target of a link for one of its ends, as distance, offset and bearing; its gain is left open."""
     given = given if isinstance(given, TargetTable) else TargetTable(distance=given)
     if given.kind == NO_TARGET:
-        return LinkTarget(BY_NOTHING, math.nan)
+        return Link(wants=BY_NOTHING)
     if given.distance is not None:
-        return LinkTarget(BY_DISTANCE, given.distance)
+        return Link(given.distance)
     second, first = link_pairs(text)[0]
     sign = 1.0 if receiver == second else -1.0
     if given.bearing is not None:
         length = math.hypot(*given.bearing)
-        toward = [sign * value / length for value in given.bearing]
-        return LinkTarget(BY_BEARING, math.nan, UNKNOWN, (*toward, math.nan)[:3])  # type: ignore[arg-type]
+        x, y, z = (*(sign * value / length for value in given.bearing), math.nan)[:3]
+        return Link(bearing=(x, y, z), wants=BY_BEARING)
     offset = list(given.offset or ())
     rise = held_height(experiment, second) - held_height(experiment, first)
     x, y, z = (sign * value for value in (offset if len(offset) == 3 else [*offset, rise]))
     length = math.hypot(x, y, z)
     bearing = (x / length, y / length, z / length) if length > 0.0 else UNKNOWN
-    return LinkTarget(BY_RELATIVE, length, (x, y, z), bearing)
+    return Link(length, relative=(x, y, z), bearing=bearing, wants=BY_RELATIVE)
 
 
 def held_height(experiment: Experiment, name: str) -> float:
@@ -141,10 +129,6 @@ def gain_key(law: Law, wants: int) -> str:
     if law.PULLS_BY == "by link":
         return "gain" if wants == BY_DISTANCE else "stiffness"
     return law.PULLS_BY
-
-
-def _gain(experiment: Experiment, law: Law, wants: int) -> float:
-    return float(getattr(experiment.formation, gain_key(law, wants)))
 
 
 def _remedy(text: str) -> str:

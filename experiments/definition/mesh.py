@@ -24,20 +24,15 @@ def member_endpoints(cases: Iterable[Plan], *, secure: bool) -> list[str]:
     Args:
         secure: Whether ports that are chosen ask for certificates.
     """
-    found: dict[str, str] = {}
-    services: dict[str, None] = {"recorder": None}
+    found, services = dict[str, str](), ["recorder"]
     for plan in cases:
         case = plan.experiment
         for group in case.processes.values():
             given = next((case.network.addresses[name] for name in group if name in case.network.addresses), "")
             found.setdefault(topology.TOGETHER.join(group), given)
-        if access_rights.has_world(plan):
-            services["world"] = None
-        if plan.guided:
-            services["centre"] = None
-        if case.positioning == VICON_TWIN:
-            services[VICON_TWIN] = None
-    services["conductor"] = None
+        services += ["world"] * access_rights.has_world(plan) + ["centre"] * bool(plan.guided)
+        services += [VICON_TWIN] * (case.positioning == VICON_TWIN)
+    services = [*dict.fromkeys(services), "conductor"]
     taken = set(found.values())
     for name in (*found, *services):
         while not found.get(name):

@@ -421,10 +421,10 @@ class Plan:
         found = []
         for number in self._links_to.get(name, ()) if in_law else ():
             link = self.one_way_links[number]
-            wanted, sender = link.wanted, link.sender
+            to, sender = link.target, link.sender
             found.append(Incoming(
-                self._row[sender], sender, kinds[sender], wanted.distance, link.gain, wanted.relative, wanted.bearing,
-                wanted.wants, True, not robots[sender].standby, self.formation.targets[number],
+                self._row[sender], sender, kinds[sender], to.distance, to.gain, to.relative, to.bearing, to.wants, True,
+                not robots[sender].standby, self.formation.targets[number],
                 link.since, link.until, link.reach, link.release,
             ))  # fmt: skip
         only_seen = self.avoidance_senders.get(name, ()) if avoidance else ()

@@ -61,14 +61,7 @@ def rigid_motions(position: Array, free: Mask) -> int:
     x, y, z = (position - position.mean(axis=0)).T
     zero, one = np.zeros_like(x), np.ones_like(x)
     motions = np.array(
-        [
-            [one, zero, zero],
-            [zero, one, zero],
-            [zero, zero, one],
-            [zero, -z, y],
-            [z, zero, -x],
-            [-y, x, zero],
-        ]
+        [[one, zero, zero], [zero, one, zero], [zero, zero, one], [zero, -z, y], [z, zero, -x], [-y, x, zero]]
     ).transpose(0, 2, 1)  # (6, N, 3)
     held = motions[:, ~free]
     kept = _null_space(held.T) if held.size else np.eye(6)

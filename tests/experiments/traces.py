@@ -21,7 +21,9 @@ TIMED = ("position", "yaw", "true_position", "goal", "setpoint")
 
 def parse_links(at_origin):
     """Every directed link: listener, speaker, distance [m], gain."""
-    return [(link.receiver, link.sender, link.wanted.distance, link.gain) for link in Plan(at_origin).one_way_links]
+    return [
+        (link.receiver, link.sender, link.target.distance, link.target.gain) for link in Plan(at_origin).one_way_links
+    ]
 
 
 def at_origin(robots, formation, *, legs=(), **rest):

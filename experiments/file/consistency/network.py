@@ -16,11 +16,11 @@ from experiments.definition.plan import Plan
 from experiments.file.choices import chosen
 from experiments.file.problems import Fault, Path, after_the_end, shown, unknown_robot
 
-_WHAT: Final = {"address": "address that ssh takes", "zenpark": "path of a command", "lab": "path of a folder"}
-_WRITE: Final = {
-    "address": "write it like lab1, pi@192.0.2.7 or ssh://pi@192.0.2.7:2222; all else belongs in ~/.ssh/config",
-    "zenpark": "write it like zenpark/zenpark, without blanks or options",
-    "lab": "write it like zenpark-lab, without blanks",
+_SSH: Final = "write it like lab1, pi@192.0.2.7 or ssh://pi@192.0.2.7:2222; all else belongs in ~/.ssh/config"
+_WORDS: Final = {  # of a host: what each is, and how to write it
+    "address": ("address that ssh takes", _SSH),
+    "zenpark": ("path of a command", "write it like zenpark/zenpark, without blanks or options"),
+    "lab": ("path of a folder", "write it like zenpark-lab, without blanks"),
 }
 
 
@@ -32,10 +32,10 @@ def host_faults(experiment: Experiment) -> Iterator[Fault]:
         message = f"'{here[0]}' is a file of this machine, which robots of other machines do not load"
         yield Fault(("hosts",), message, "make it a plug-in to install (docs/plugins.md), or leave [hosts] out")
     for host, each in experiment.hosts.items():
-        for name, value in (("address", each.address), ("zenpark", each.zenpark), ("lab", each.lab)):
+        for name, (what, hint) in _WORDS.items():
+            value = getattr(each, name)
             if value is not None and not re.fullmatch(r"[^\s\x00-\x1f-][^\s\x00-\x1f]*", value):
-                message = f"{shown(value)} is no {_WHAT[name]}"
-                yield Fault(("hosts", host, name), message, _WRITE[name])
+                yield Fault(("hosts", host, name), f"{shown(value)} is no {what}", hint)
         for number, robot in enumerate(each.robots):
             path = ("hosts", host, "robots", number)
             if robot not in experiment.robots:
@@ -45,17 +45,12 @@ def host_faults(experiment: Experiment) -> Iterator[Fault]:
                 yield Fault(path, message, "name it once: a robot is one process on one machine")
             else:
                 where[robot] = host
-                yield from _body(experiment, host, number)
+                body = experiment.robots[robot].body
+                if body in registry.names(registry.DEVICES):
+                    message = f"'{robot}' is behind a protocol twin ('{body}'), which runs on this machine alone"
+                    yield Fault(path, message, "let it run here, or give it another body")
     yield from _processes(experiment, where)
     yield from _network(experiment)
-
-
-def _body(experiment: Experiment, host: str, number: int) -> Iterator[Fault]:
-    robot = experiment.hosts[host].robots[number]
-    body = experiment.robots[robot].body
-    if body in registry.names(registry.DEVICES):
-        message = f"'{robot}' is behind a protocol twin ('{body}'), which runs on this machine and cannot be seen there"
-        yield Fault(("hosts", host, "robots", number), message, "let it run here, or give it another body")
 
 
 def _processes(experiment: Experiment, where: dict[str, str]) -> Iterator[Fault]:

@@ -21,7 +21,7 @@ from experiments.file.problems import Fault, after_the_end, unknown_robot
 def consistency_faults(plan: Plan) -> Iterator[Fault]:
     """All contradictions between fields, with their paths in the file."""
     experiment = plan.experiment
-    yield from _rates(experiment)
+    yield from _numbers(experiment)
     yield from _case_names(experiment.cases)
     yield from _architecture(experiment)
     yield from _timeline(experiment)
@@ -67,13 +67,20 @@ def _case_names(names: Iterable[str]) -> Iterator[Fault]:
             yield Fault(("cases", name), message, "rename one of them", on_key=True)
 
 
-def _rates(experiment: Experiment) -> Iterator[Fault]:
+def _numbers(experiment: Experiment) -> Iterator[Fault]:
+    """Rates that do not divide, a margin that fills the arena, a run without telemetry."""
     body = experiment.rates.body_hz
     for name in ("pose_hz", "coordination_hz", "state_hz"):
         ratio = body / getattr(experiment.rates, name)
         if abs(ratio - max(1, round(ratio))) > 1e-9 * ratio:
             hint = f"the nearest that does: {name} = {divisor(body, body / ratio):g}"
             yield Fault(("rates", name), f"{name} = {body / ratio:g} does not divide body_hz = {body:g}", hint)
+
+    width, depth, _ = experiment.arena.size
+    margin, widest = experiment.safety.margin, min(width, depth) / 2.0
+    if margin >= widest:  # every goal would be clamped to beyond the middle, where the robots meet
+        message = f"a margin of {margin:g} m leaves no place for goals in an arena of {width:g} by {depth:g} m"
+        yield Fault(("safety", "margin"), message, f"give less than {widest:g}, in metres, or enlarge size in [arena]")
 
     samples = experiment.duration_s * experiment.rates.state_hz
     if samples < 1.0 - 1e-9:

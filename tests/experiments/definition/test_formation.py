@@ -84,16 +84,16 @@ def codes(given):
 
 def test_both_ends_of_a_link_want_the_same():
     links = written(SQUARE).plan.one_way_links
-    asked = {(link.receiver, link.sender): link.wanted for link in links}
+    asked = {(link.receiver, link.sender): link.target for link in links}
     assert asked["B", "A"].relative == (0.6, 0.0, 0.0)  # B stands 0.6 m along x from A
     assert asked["A", "B"].relative == (-0.6, -0.0, -0.0)
     assert asked["C", "B"].relative == (0.0, 0.6, 0.6)  # the heights that they hold
     assert asked["B", "C"].distance == pytest.approx(np.hypot(0.6, 0.6))
-    assert {link.gain for link in links} == {0.5}  # the stiffness, not the gain of distances
+    assert {link.target.gain for link in links} == {0.5}  # the stiffness, not the gain of distances
 
 
 def test_each_link_has_the_gain_of_its_target():
-    assert {f"{link.sender}{link.receiver}": link.gain for link in written(MIXED).plan.one_way_links} == {
+    assert {f"{link.sender}{link.receiver}": link.target.gain for link in written(MIXED).plan.one_way_links} == {
         "AB": 0.5, "CB": 3.0, "BC": 3.0, "AC": 3.0, "DC": 3.0, "CD": 3.0, "AD": 0.5
     }  # fmt: skip
 

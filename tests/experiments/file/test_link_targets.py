@@ -91,7 +91,7 @@ def test_averaging_law_refuses_what_it_does_not_support(change, message):
 def test_averaging_law_needs_no_targets():
     plan = document.read(AVERAGE, ['formation.links={ "KH01 > KH04" = { from_s = 2.0 } }']).cases()["event"]
     (link,) = plan.one_way_links
-    assert (link.sender, link.receiver, link.since, link.wanted.wants) == ("KH01", "KH04", 2.0, BY_NOTHING)
+    assert (link.sender, link.receiver, link.since, link.target.wants) == ("KH01", "KH04", 2.0, BY_NOTHING)
 
 
 @pytest.mark.slow
