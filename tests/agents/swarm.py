@@ -13,7 +13,7 @@ from agents.decision.situation import ProcessHealth
 from agents.robot import Robot
 from agents.vectors import ZERO, Vector
 from experiments.definition import bodies
-from experiments.definition.experiment import Experiment
+from experiments.definition.experiment import Experiment, RobotTable
 from experiments.definition.plan import Plan
 from tests.small import PERIODIC, small
 from twins.body import TwinBody
@@ -176,6 +176,12 @@ class Swarm:
     def running(self) -> Swarm:
         """Until the experiment begins."""
         return self.until(RUNNING)
+
+
+def followed(kind: str = "khepera4", distance: float = 0.5, **parts: object) -> Swarm:
+    """L at the origin, and F behind it, which follows it."""
+    robots: dict[str, str | RobotTable] = {"L": kind, "F": RobotTable(kind="khepera4", start=[-0.5, 0.0])}
+    return Swarm(small(robots, {"L > F": distance}, **{"trigger": PERIODIC, "duration_s": 60.0, **parts}))
 
 
 def drone(**parts: object) -> Swarm:

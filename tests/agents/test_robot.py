@@ -10,8 +10,8 @@ from agents.runtime.orders import carry_out
 from experiments.definition.experiment import Formation, LegTable, RobotTable, Start
 from experiments.definition.plan import Plan
 from tests.agents.bench import Bench
-from tests.agents.swarm import Swarm
-from tests.small import PERIODIC, pair, small, triangle
+from tests.agents.swarm import Swarm, followed
+from tests.small import pair, small, triangle
 
 HERE = (-0.4, 0.0, 0.0)
 LINE = {"kind": "line", "move_by": [0.3, 0.0], "speed": 0.1}
@@ -20,12 +20,6 @@ LINE = {"kind": "line", "move_by": [0.3, 0.0], "speed": 0.1}
 def alone(experiment=None):
     """The decision of A; B is on link 0."""
     return Bench(Plan(experiment or pair()).assignment("A"), HERE)
-
-
-def followed(kind="khepera4", distance=0.5, **parts):
-    """L at the origin, and F behind it, which follows it."""
-    robots = {"L": kind, "F": RobotTable(kind="khepera4", start=[-0.5, 0.0])}
-    return Swarm(small(robots, {"L > F": distance}, **{"trigger": PERIODIC, "duration_s": 60.0, **parts}))
 
 
 # ---------------------------------------------------------------- received poses

@@ -10,7 +10,7 @@ import pytest
 from agents.network import pubsub
 from experiments.recording import playback
 from tests.conftest import RouterProcess
-from tests.system.lab import Flight, RobotProcess, Watcher, typed
+from tests.system.lab import NEAR_TRIANGLE, Flight, RobotProcess, Watcher, typed
 
 pytestmark = pytest.mark.system
 
@@ -67,6 +67,17 @@ def test_drone_with_low_battery_lands_and_others_continue(tmp_path: Path) -> Non
     ends = {event.source: event.text for event in trace.events if event.kind == "robot"}
     assert ends["CF01"] == "done: its battery is low"
     assert ends["KH01"] == "done: finished"
+
+
+def test_run_with_a_scripted_landing_succeeds(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    flight = Flight(folder, "triangle", "--case", "event", *NEAR_TRIANGLE, "robots.CF01.lands_at_s=2", "duration_s=5")
+    code, _ = flight.finish()
+    assert code == 0, flight.said()
+    trace = playback.read(folder / "event.mcap").trace
+    ends = {event.source: (event.stamp, event.text) for event in trace.events if event.kind == "robot"}
+    assert ends["CF01"][1] == "done: lands as its file says"
+    assert 2.0 < ends["CF01"][0] < 5.0 < ends["KH01"][0]
 
 
 @pytest.mark.mechanism("hazard: conductor lost")

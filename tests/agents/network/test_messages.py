@@ -2,6 +2,7 @@
 
 import math
 from contextlib import suppress
+from typing import get_args
 
 import msgspec
 import pytest
@@ -31,6 +32,13 @@ messages = st.one_of(
     ),
     st.builds(wire.Reply, word, st.booleans(), word, word, st.none() | number),
     st.builds(Stop, word, word),
+    st.builds(
+        Order, st.sampled_from(get_args(wire.OrderKind)), st.none() | number, st.none() | word, st.none() | number,
+        st.none() | st.tuples(number, number), st.none() | st.tuples(number, number, number, number),
+    ),
+    st.builds(
+        wire.Goal, word, count, number, vector, st.none() | number, number, st.none() | st.lists(number, max_size=3)
+    ),
     st.builds(wire.Event, number, word, word, word),
     st.sampled_from([message for kind in good("CF01").values() for message in kind]),
 )  # fmt: skip

@@ -68,6 +68,14 @@ def test_drone_that_lands_is_lost_to_the_formation(architecture, low, planar):
     assert np.linalg.norm(end[1] - end[[0, 2]], axis=1) == pytest.approx([planar, 0.9], abs=0.02)
 
 
+def test_tello_between_other_kinds_keeps_its_links():
+    robots = {"K": "khepera4", "T": "tello", "F": "crazyflie"}
+    run = fly(small(robots, {"K > T": 0.8, "F - T": 0.6}, duration_s=15.0))
+    assert not hazards(run.trace)
+    end = run.log.true_position[np.searchsorted(run.log.time, 14.9)]
+    assert [np.linalg.norm(end[1] - end[k]) for k in (0, 2)] == pytest.approx([0.8, 0.6], abs=0.05)
+
+
 @pytest.mark.parametrize("architecture", ["distributed", "centralised"])
 def test_scripted_landing_silences_and_loses_a_robot(architecture):
     run = fly(pair(**three(lands_at_s=4.0), architecture=architecture))

@@ -258,7 +258,7 @@ def test_drones_are_the_same_alone():
     assert (np.abs(together[-1, :, :3] - np.array(start)).max(axis=1) > 0.05).all()
 
 
-@pytest.mark.parametrize("dt", mostly_slow([0.02, 0.004, 1.0 / 64.0, 1.0 / 30.0], 4))
+@pytest.mark.parametrize("dt", mostly_slow([DT, 0.02, 0.004, 1.0 / 64.0, 1.0 / 30.0], 5))
 def test_any_step_divides_into_firmware_rate(dt):
     path = fly(hovering(dt=dt), [[0.3, 0.0, 1.0, 0.0]], 4.0, dt)[:, 0, 0]
     rise, overshoot = rise_and_overshoot(path, 0.3, dt)

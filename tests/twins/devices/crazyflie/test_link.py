@@ -199,6 +199,10 @@ def test_memories_are_listed():
     assert sum(eeprom[:20]) % 256 == eeprom[20]
     wire.put(Port.MEMORY, 2, at(MemoryKind.TESTER, 5), bytes((5, 6, 7, 99)))
     assert wire.vehicle.decks.memories.write_errors == 1
+    for value in (0, 1):
+        wire.set("memTst.resetW", "B", value)
+        assert wire.vehicle.decks.memories.write_errors == 1 - value
+    assert Wire(external=True).ask(Port.MEMORY, 0, 1) == bytes((1, count))  # without a deck
 
 
 def test_lighthouse_memory():

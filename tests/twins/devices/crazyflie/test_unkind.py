@@ -103,8 +103,8 @@ def test_a_flat_fall_is_a_landing(height, end):
 
 
 def test_a_plan_that_is_no_number_locks():
-    wire = Wire().hovering(0.5)
-    wire.go_to(math.nan, 0.0, 0.5, 0.0, 1.0)
+    wire = Wire().hovering()
+    wire.go_to(math.nan, 0.0, 1.0, 0.0, 1.0)
     assert wire.after(0.1).state == SupervisorState.LOCKED
     assert not wire.motors
 
