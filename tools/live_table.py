@@ -205,8 +205,10 @@ def _cells(row: LiveRow) -> list[Text]:
 
 
 def drawn(title: str, rows: Sequence[LiveRow], events: Sequence[Event], width: int, height: int) -> Group:
-    """The table with its title, and below it as many of the last events as have room, of `width` [characters] and
-    `height` [lines] at most; a row a robot, in the order of the experiment."""
+    """Table of robots, in the order of the experiment, with a title and, below it, as many last events as have room.
+
+    `width` [characters] and `height` [lines] are limits of all of it.
+    """
     from rich.console import Group
     from rich.table import Table
     from rich.text import Text

@@ -53,9 +53,9 @@ def create(
 ) -> Register:
     """Make a lab: its folder, its authority, and a certificate for each identity.
 
-    `identities` are roles by name, `hosts` the names and addresses at which the routers can be reached, beside this
-    machine, and `listening` those of other members that listen, by name: of a mesh. Raises LabError if the folder holds
-    a lab or cannot be written, or its path, a name or an address is wrong.
+    `identities` are roles by name. `hosts` are names and addresses of the routers, beside this machine; `listening`
+    those of other members that listen, by name: of a mesh. Raises LabError if the folder holds a lab or cannot be
+    written, or its path, a name or an address is wrong.
     """
     check_path(folder)
     if (folder / REGISTER).exists() or (folder / f"{AUTHORITY}.key").exists():
