@@ -42,9 +42,6 @@ class CrazyflieBody(Body):
 
     def __init__(self, request: BodyRequest, measuring_s: float = MEASURING_S) -> None:
         self._names, self._measuring_s = request.names, measuring_s
-        for name, kind in zip(request.names, request.kinds, strict=True):
-            if kind.name != "crazyflie":
-                raise BodyError(f"{name} is a {kind.name}: this body flies Crazyflies")
         self._addresses = addresses = [address(*pair) for pair in zip(request.names, request.addresses, strict=True)]
         devices = [device_of(each) for each in addresses]
         shared = {each for each, device in zip(addresses, devices, strict=True) if devices.count(device) > 1}

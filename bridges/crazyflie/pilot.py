@@ -159,8 +159,8 @@ class CrazyfliePilot:
         while not self._ending.is_set() or (self._flight.airborne and time.monotonic() < self._end_by):
             try:
                 link = self._connect_in_turn()
-            except LinkError as error:
-                self._connection_note = str(error)
+            except Exception as error:  # noqa: BLE001 - of any kind: the robot must stay in reach of a stop
+                self._connection_note = _text(error)
                 self._fail(error)
                 if self._flight.mark_out_of_reach() and self._ending.is_set():
                     break
@@ -177,8 +177,7 @@ class CrazyfliePilot:
                 self._fail(error)
                 self._ending.wait(RETRY_S)
             except Exception as error:  # noqa: BLE001 - of any kind: the robot must be landed
-                what = str(error) if isinstance(error, LinkError) else f"{type(error).__name__}: {error}"
-                self._connection_note = f"link lost: {what}; connecting again"
+                self._connection_note = f"link lost: {_text(error)}; connecting again"
                 self._fail(error)
                 if self._flight.airborne:
                     self.give_order("land")
@@ -190,7 +189,7 @@ class CrazyfliePilot:
     def _fail(self, error: Exception) -> None:
         """Record a failure of the first connection; retries go on, because other drones of the body may fly."""
         if not self.opened.is_set():
-            self.failure = BodyError(f"{self._name}: {error}")
+            self.failure = BodyError(f"{self._name}: {_text(error)}")
 
     def _connect_in_turn(self) -> CrazyflieLink:
         """Connect for the first time when no other drone of the radio does; again at once, because it may fly.
@@ -222,9 +221,9 @@ class CrazyfliePilot:
                 waited = time.monotonic() - begin
                 if self._ending.is_set() or waited > (self._settings.connect_s if answered else NO_ANSWER_S):
                     raise LinkError(f"{error} at {self._address}: {self._remedy()}") from None
-            except LinkError as error:
+            except Exception as error:
                 self._discard(link)
-                raise LinkError(f"{self._address}: {error}; {self._remedy()}") from None
+                raise LinkError(f"{self._address}: {_text(error)}; {self._remedy()}") from error
             else:
                 return link
 
@@ -470,3 +469,7 @@ class CrazyfliePilot:
                 self._arrive()
             elif now > self._settle_deadline:
                 self._connection_note = "its position has not settled: are the external positions those of this robot?"
+
+
+def _text(error: Exception) -> str:
+    return str(error) if isinstance(error, LinkError | BodyError) else f"{type(error).__name__}: {error}"

@@ -11,7 +11,7 @@ from typing import Final
 
 import zenoh
 
-from agents.body.interface import FRESH_S, UNANSWERED, BodyError, BodyRequest, RangeScan, settings
+from agents.body.interface import FRESH_S, UNANSWERED, BodyRequest, RangeScan, settings
 from agents.network import pubsub
 from agents.network import session as network
 from agents.protocols import ros2, turtlebot3
@@ -97,8 +97,6 @@ class TurtleBotConnection:
 
     def __init__(self, request: BodyRequest, row: int) -> None:
         name, kind = request.names[row], request.kinds[row]
-        if kind.name != "turtlebot3":
-            raise BodyError(f"{name} is a {kind.name}; '{request.addresses[row]}' drives a turtlebot3")
         chosen = settings(turtlebot3.TurtleBot3Settings, name, request.device[row])
         where = turtlebot3.address(name, request.addresses[row], chosen)
         self.name, self.address, self.settings = name, where, chosen

@@ -94,10 +94,8 @@ def test_wrong_settings_are_named(kind, address, device, said):
 @pytest.mark.parametrize(
     ("body", "kind", "addresses", "options", "said"),
     [
-        (CrazyflieBody, "tello", [RADIO], {}, "R0 is a tello"),
         (CrazyflieBody, "crazyflie", [RADIO] * 2, {}, "several robots have the address"),
         (CrazyflieBody, "crazyflie", [RADIO], {"device": {"positioning": {"system": "external"}}}, "needs position = "),
-        (TurtleBot3, "khepera4", [ROS], {}, "R0 is a khepera4"),
         (TelloBody, "tello", ["tello"], {}, 'a Tello does not measure its position: write position = "external"'),
         (TelloBody, "tello", [TELLO, f"{TELLO}:1"], {"external": True}, "R1: another Tello .* has the address 10"),
     ],

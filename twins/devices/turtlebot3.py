@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 import zenoh
 
-from agents.body.interface import BodyError, BodyRequest, settings
+from agents.body.interface import BodyRequest, settings
 from agents.kinds.turtlebot3 import TURTLEBOT3
 from agents.network import session as network
 from agents.protocols import ros2, turtlebot3
@@ -99,8 +99,6 @@ class TurtleBot3Twin(Device):
         participants: dict[tuple[object, ...], Participant] = {}
         try:
             for row, name in enumerate(body.names):
-                if body.kinds[row].name != "turtlebot3":
-                    raise BodyError(f"{name} is a {body.kinds[row].name}, this is the twin of a turtlebot3")
                 chosen = settings(TurtleBot3Settings, name, body.device[row])
                 where = turtlebot3.twin(name, chosen)
                 endpoints = (chosen.endpoint,) if chosen.endpoint else body.endpoints

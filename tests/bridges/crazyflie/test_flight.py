@@ -1,6 +1,7 @@
 """Flying one Crazyflie, against a link and a clock made by hand: what is sent when answers are lost."""
 
 import math
+import threading
 import types
 from collections import Counter
 from itertools import count
@@ -13,12 +14,14 @@ from agents.protocols import crtp
 from agents.protocols.crazyflie import CrazyflieSettings
 from agents.protocols.crtp import HighLevel, Info, LogStatus, Port
 from agents.safety.detection import LOWEST_DESCENT_M_S
+from agents.vectors import ZERO
 from bridges.crazyflie import flight as module
+from bridges.crazyflie import pilot
 from bridges.crazyflie.flight import FlightControl, FlightPhase
 from bridges.crazyflie.telemetry import Telemetry
 from bridges.crazyflie.trajectory import HOLD_S, SINK, TAKEOFFS, TrajectoryMemory
 from tests.bridges.crazyflie_clock import clocked
-from tests.waiting import ManualClock
+from tests.waiting import ManualClock, until
 
 PLACE = (0.1, 0.2, 0.5, 0.0)
 
@@ -401,3 +404,28 @@ def test_a_stop_outlives_the_link(air):
 def test_one_that_stands_is_not_locked(ground):
     ground.flight.stop()
     assert ground.sent == []
+
+
+class NoRoom:
+    """A link that cannot be made, such as with a full disk, where cflib keeps its tables."""
+
+    made = 0
+
+    def __init__(self, _address):
+        NoRoom.made += 1
+        raise OSError(28, "No space left on device")
+
+
+def test_link_that_cannot_be_made_is_tried_again(monkeypatch):
+    """The thread lives on: it alone can send a stop."""
+    monkeypatch.setattr(pilot, "CrazyflieLink", NoRoom)
+    settings = CrazyflieSettings()
+    flown = pilot.CrazyfliePilot(
+        "CF01", "udp://127.0.0.1:1", settings, Telemetry(lighthouse=False), place=(ZERO, 0.0), turn=threading.Lock()
+    )
+    flown.start()
+    until(lambda: NoRoom.made >= 2, "it is tried again")
+    assert "No space left" in str(flown.failure)
+    assert "No space left" in flown.note
+    flown.close()
+    flown.join()

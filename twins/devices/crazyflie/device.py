@@ -11,8 +11,6 @@ from typing import Final
 
 import numpy as np
 
-from agents.body.interface import BodyError
-from agents.kinds.crazyflie import CRAZYFLIE
 from agents.protocols import crazyradio
 from agents.protocols.crtp import Port, header
 from twins.arrays import Array
@@ -93,14 +91,11 @@ def _bind(wire: socket.socket, ports: Sequence[int]) -> None:
 class CrazyflieTwin(Device):
     """Crazyflies with CRTP over UDP or over a software radio.
 
-    Raises BodyError if a row is no Crazyflie, or has invalid settings.
+    Raises BodyError for invalid settings.
     """
 
     def __init__(self, request: DeviceRequest) -> None:
         body = request.body
-        strange = sorted({kind.name for kind in body.kinds if kind != CRAZYFLIE})
-        if strange:
-            raise BodyError(f"the Crazyflie twin is no twin of a {', '.join(strange)}; name another body")
         vehicles = [Vehicle(body, request.faults, row) for row in range(len(body.names))]
         self._air: Air | None = None
         self._row: dict[socket.socket, int] = {}
