@@ -135,11 +135,9 @@ class SupportProcesses:
         if world is not None:
             world.await_lines(r"^(world) (ready)\b", 1, context.ended)
             self.standins.append(world.name)
-        robots = {
-            name: msgspec.structs.replace(robot, body=addresses.get(name, robot.body))
-            for name, robot in experiment.robots.items()
-        }
-        addressed = context.plan.changed(robots=robots)
+        robots = experiment.robots
+        twins = {name: msgspec.structs.replace(robots[name], body=address) for name, address in addresses.items()}
+        addressed = context.plan.changed(robots={**robots, **twins})
         self._start_positioning(addressed)
         if context.plan.guided:
             centre = partial(context.start, "centre", "experiments.real_time.processes.centre", str(context.file))

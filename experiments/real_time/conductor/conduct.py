@@ -35,6 +35,7 @@ from experiments.real_time.conductor.run_view import ProgressDisplay
 from experiments.real_time.hosts import run_registry
 from experiments.real_time.hosts.hosts import Hosts
 from experiments.real_time.hosts.launcher import Launcher, RouterEnded, make_routers, start_routers
+from experiments.real_time.hosts.run_registry import RegisteredRun
 from experiments.recording.run_folder import SOURCE
 
 PORT_CHOICES: Final = 3  # of a run with no `network.listen`: a free port may be taken before its router listens there
@@ -173,15 +174,11 @@ def _run_setup(
         if not meshed:
             wait_s = STARTING_S if own_router else ASK_S
             up.enter_context(user.emergency.throughout(endpoints, Keys(network.realm), options.identity, wait_s))
-        common = (launcher, hosts, user.interrupted, rights, options.identity, user.emergency)
         left: list[str] = []
-        yield (
-            {
-                name: CaseContext(plan, name, folder, folder / SOURCE, endpoints, *common)
-                for name, plan in embodied.items()
-            },
-            left,
-        )
+        rest = (launcher, hosts, user.interrupted, rights, options.identity, user.emergency)
+        source = folder / SOURCE
+        contexts = {name: CaseContext(plan, name, folder, source, endpoints, *rest) for name, plan in embodied.items()}
+        yield contexts, left
         left += hosts.sweep()
 
 
@@ -200,9 +197,7 @@ def hardware(cases: Iterable[Plan]) -> dict[str, str]:
     return found
 
 
-def check_other_runs(
-    me: run_registry.RegisteredRun, others: Iterable[run_registry.RegisteredRun], file: str
-) -> list[str]:
+def check_other_runs(me: RegisteredRun, others: Iterable[RegisteredRun], file: str) -> list[str]:
     """Notes on other runs that are up and have robots of the same names.
 
     Raises DocumentError if a robot of the run is hardware that another one has.
@@ -223,7 +218,7 @@ def check_other_runs(
     return notes
 
 
-def _drives_same_device(other: run_registry.RegisteredRun, name: str, body: str) -> bool:
+def _drives_same_device(other: RegisteredRun, name: str, body: str) -> bool:
     """Whether another run drives the same device: an address that names none belongs to the robot of that name."""
     if plugins.body_name(body) == body:
         return other.robots.get(name) == body

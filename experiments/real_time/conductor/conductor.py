@@ -19,19 +19,10 @@ from agents.network import messages
 from agents.network.keys import Keys
 from agents.runtime.orders import LAND, STOP
 from experiments.file.document import write_json
+from experiments.real_time.conductor import run_view
 from experiments.real_time.conductor.case_processes import CaseContext, CaseProcesses
 from experiments.real_time.conductor.hot_changes import CLIMB_S, HotChanges
 from experiments.real_time.conductor.orders import start_lead_s
-from experiments.real_time.conductor.run_view import (
-    AHEAD_S,
-    BEHIND_S,
-    OUTPUT,
-    NetworkView,
-    Progress,
-    RobotView,
-    RunFailed,
-    ShowProgress,
-)
 from experiments.real_time.hosts.hosts import Drift
 from experiments.real_time.hosts.launcher import LAND_S
 from experiments.recording.playback import EARLY_S
@@ -57,9 +48,9 @@ class CaseResult:
 class CaseRun:
     """A case with its processes, and its network as this process sees it."""
 
-    _view: NetworkView
+    _view: run_view.NetworkView
 
-    def __init__(self, context: CaseContext, show: ShowProgress) -> None:
+    def __init__(self, context: CaseContext, show: run_view.ShowProgress) -> None:
         """Write the case as a file for its processes; nothing is started yet."""
         self._context, self._show = context, show
         self._plan = plan = context.plan
@@ -71,23 +62,24 @@ class CaseRun:
         self._clock = context.launcher.clock = Clock()
         linked = {plan.names[row] for row in plan.links.receiver.tolist()} - {*plan.guided}
         self._robots = {
-            name: RobotView(linked=name in linked, left_because="standby" if robot.standby else "")
+            name: run_view.RobotView(linked=name in linked, left_because="standby" if robot.standby else "")
             for name, robot in experiment.robots.items()
         }
-        self._progress = Progress(
+        self._progress = run_view.Progress(
             context.case, "starting", None, experiment.duration_s, self._robots, clock=self._clock
         )
         self._processes = CaseProcesses(context)
 
     def _join(self, stack: ExitStack) -> None:
         """Join the network; `stack` leaves it."""
-        self._view = NetworkView(stack, self._context, self._progress)
+        self._view = run_view.NetworkView(stack, self._context, self._progress)
         stack.callback(self._context.emergency.listen(self._view.session, self._keys).close)
 
     def _show_progress(self) -> None:
         """Show the progress, with new output of processes on other machines."""
         now = self._clock.utc()
-        self._progress.events += [messages.Event(now, OUTPUT, place, line) for place, line in self._processes.output()]
+        for place, line in self._processes.output():
+            self._progress.events.append(messages.Event(now, run_view.OUTPUT, place, line))
         self._show(self._progress)
 
 
@@ -125,7 +117,7 @@ class Conductor(CaseRun):
                     self._view.report_drift(*self._drift.news())
                 for name in self._processes.end_robots():
                     self._leave_behind(name, "its process hung after the landing, and was killed")
-        except RunFailed as failure:
+        except run_view.RunFailed as failure:
             self._progress.phase = str(failure).partition(";")[0]  # ending the others takes a while: show it now
             self._show(self._progress)
             raise
@@ -150,7 +142,7 @@ class Conductor(CaseRun):
                 self._update()
                 time.sleep(POLL_S)
         if flown := self._flown():
-            raise RunFailed(
+            raise run_view.RunFailed(
                 f"{', '.join(flown)}: on the network already, and {self._robots[flown[0]].phase}; a robot that was "
                 "started by hand flies once: end its process and start it again, next time with --once"
             )
@@ -179,14 +171,14 @@ class Conductor(CaseRun):
             late = [name for name, view in self._robots.items() if not (view.reached(phase) or view.gone)]
             lost = [name for name, view in self._robots.items() if view.left_because == "lost"]
             if lost and self._experiment.start.missing == "abort":
-                raise RunFailed(self.start_failure(lost, "could not start"))
+                raise run_view.RunFailed(self.start_failure(lost, "could not start"))
             if recorder and not self._processes.recording:
-                raise RunFailed("nothing would be recorded: the recorder ended each time; its log says why")
+                raise run_view.RunFailed("nothing would be recorded: the recorder ended each time; its log says why")
             if not late and (not recorder or self._view.recording_begun):
                 return True
             if time.monotonic() > deadline:
                 if late and self._experiment.start.missing == "abort":
-                    raise RunFailed(self.start_failure(late, f"not {phase} after {limit_s:g} s"))
+                    raise run_view.RunFailed(self.start_failure(late, f"not {phase} after {limit_s:g} s"))
                 for name in late:
                     self._view.report("late", name, f"not {phase} after {limit_s:g} s: {self._reason(name)}")
                 return True
@@ -206,11 +198,9 @@ class Conductor(CaseRun):
     def _start(self) -> float:
         """Order the common start; returns its time [s, UTC]."""
         for name, view in self._robots.items():
-            if not (view.gone or AHEAD_S < view.behind < BEHIND_S):
-                remedy = "set it (NTP), or let zenpark start the robot: [hosts]"
-                self._view.report(
-                    "clock", name, f"its clock is {-view.behind:+.2f} s off and it will start so; {remedy}"
-                )
+            if not (view.gone or run_view.AHEAD_S < view.behind < run_view.BEHIND_S):
+                off = f"its clock is {-view.behind:+.2f} s off and it will start so"
+                self._view.report("clock", name, f"{off}; set it (NTP), or let zenpark start the robot: [hosts]")
         there = [name for name, view in self._robots.items() if view.reached("airborne") and not view.gone]
         at = self._clock.utc() + start_lead_s(len(there))
         self._view.report("start", "conductor", "common start", stamp=at)
@@ -306,11 +296,8 @@ class Conductor(CaseRun):
 
     def _not_down(self) -> list[str]:
         """Robots that are left and have neither landed nor never risen."""
-        return [
-            name
-            for name, view in self._robots.items()
-            if not (view.gone or view.reached("done") or view.phase in {"starting", "idle"})
-        ]
+        left = {name: view.phase for name, view in self._robots.items() if not (view.gone or view.reached("done"))}
+        return [name for name, phase in left.items() if phase not in {"starting", "idle"}]
 
     def _leave_behind(self, name: str, why: str) -> None:
         """Report a robot that did not end as ordered: it counts as lost, once, and fails the run."""
@@ -351,7 +338,7 @@ class Conductor(CaseRun):
             self._view.report("lost", name, "is not on the network any more")
             self._changes.mark_lost(name)
 
-    def _come_back(self, name: str, view: RobotView) -> None:
+    def _come_back(self, name: str, view: run_view.RobotView) -> None:
         """Take back a robot that was only away, or was started again."""
         if name in self._changes.under_way:
             return

@@ -295,9 +295,8 @@ class HotChanges:
             yield from self._reach(names, "ready", self._experiment.start.deadline_s + READY_S)
             yield from self._room({name: robots[name].place or self._processes.place(name) for name in names}, ROOM_S)
             for name in names:
-                yield from self._repeat_order(
-                    name, messages.Order("takeoff", at=self._start, origin=robots[name].origin)
-                )
+                order = messages.Order("takeoff", at=self._start, origin=robots[name].origin)
+                yield from self._repeat_order(name, order)
             yield from self._reach(names, "airborne", CLIMB_S)
             for name in names:
                 order = messages.Order("start", at=self._start, origin=robots[name].origin)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -76,32 +76,17 @@ def alone(plan: Plan) -> Plan:
     A drone that climbs to a height of its own before it obeys is not sent down to `HOP_M` from there.
     """
     fixed = [name for name, kind in zip(plan.names, plan.kinds, strict=True) if math.isfinite(kind.takeoff_height)]
-    robots = {
-        name: msgspec.structs.replace(
-            robot,
-            hover=robot.hover if robot.hover is None or name in fixed else min(HOP_M, robot.hover),
-            shadow=None,
-            standby=False,
-        )
-        for name, robot in plan.experiment.robots.items()
-    }
-    arc = {
-        "kind": "circle",
-        "radius": RADIUS_M,
-        "period_s": math.tau * RADIUS_M / DRIVE_M_S,
-        "turns": DRIVE_M / (math.tau * RADIUS_M),
-    }
+    robots = {}
+    for name, robot in plan.experiment.robots.items():
+        hover = robot.hover if robot.hover is None or name in fixed else min(HOP_M, robot.hover)
+        robots[name] = msgspec.structs.replace(robot, hover=hover, shadow=None, standby=False)
+    around = math.tau * RADIUS_M  # [m]
+    arc = {"kind": "circle", "radius": RADIUS_M, "period_s": around / DRIVE_M_S, "turns": DRIVE_M / around}
+    drives = [LegTable(at_s=0.0, robot=name, plan=arc) for name, robot in robots.items() if robot.hover is None]
     return plan.changed(
-        robots=robots,
-        duration_s=DRIVE_S,
-        formation=Formation(),
-        timeline=[LegTable(at_s=0.0, robot=name, plan=arc) for name, robot in robots.items() if robot.hover is None],
-        architecture="distributed",
-        avoidance=None,
-        channel=ChannelTable(),
-        on_loss="none",
-        cases={},
-    )
+        robots=robots, duration_s=DRIVE_S, timeline=drives, formation=Formation(), channel=ChannelTable(),
+        architecture="distributed", avoidance=None, on_loss="none", cases={},
+    )  # fmt: skip
 
 
 class Inspector(CaseRun):
@@ -187,7 +172,7 @@ class Inspector(CaseRun):
 
     def _try(self, name: str, each: Observed, *, red: bool) -> Iterator[Check]:
         """Hop or drive, then stop in motion, of one robot; what is red is not moved."""
-        robot, asked, safety = each.robot, self._trials, self._experiment.safety
+        robot, asked, safety = self._processes.robot(name), self._trials, self._experiment.safety
         trials: list[tuple[str, str, bool, Callable[[], Check]]] = [
             (checks.hop_of(robot), "hop", asked.hop, lambda: checks.hop(each, self._move(name, robot), safety)),
             ("stop, motors on", "stop", asked.stop,
@@ -215,21 +200,13 @@ class Inspector(CaseRun):
         robot = msgspec.structs.replace(
             robot, hover=height if math.isfinite(height) else robot.hover, device={**robot.device, **own.device}
         )
-        return self._move(name, robot, changed={name: robot}, hold_s=own.hold_s)
+        return self._move(name, robot, hold_s=own.hold_s)
 
-    def _move(
-        self,
-        name: str,
-        robot: RobotTable,
-        *,
-        stop: bool = False,
-        changed: Mapping[str, RobotTable] | None = None,
-        hold_s: float = HOLD_S,
-    ) -> Tried:
-        """Trial of a robot in a process of its own: it hops or drives, and lands or is stopped."""
+    def _move(self, name: str, robot: RobotTable, *, stop: bool = False, hold_s: float = HOLD_S) -> Tried:
+        """Trial of a robot, with its address, in a process of its own: it hops or drives, and lands or is stopped."""
         tried = Tried()
         self._robots[name].forget_process()
-        self._processes.start([name], changed)
+        self._processes.start([name], {name: robot})
         try:
             self._wait_ready([name])
             if not self._robots[name].reached("ready"):

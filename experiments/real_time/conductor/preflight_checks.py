@@ -106,16 +106,9 @@ def at_rest(observed: Mapping[str, Observed], safety: Safety, today: date) -> di
     """Checks of robots that stand, by robot; some compare one robot with the others."""
     made = {name: [_address(each)] for name, each in observed.items()}
     for name, each in observed.items():
-        if each.status is not None:  # else there is nothing to look at
-            made[name] += [
-                _firmware(name, observed, today),
-                _battery(each, each.status, safety),
-                _position(each, safety),
-                _start(name, observed, safety),
-                _radio(each),
-                _clock(name, each, safety),
-                _ready(each.status),
-            ]
+        if (status := each.status) is not None:  # else there is nothing to look at
+            made[name] += [_firmware(name, observed, today), _battery(each, status, safety), _position(each, safety)]
+            made[name] += [_start(name, observed, safety), _radio(each), _clock(name, each, safety), _ready(status)]
     return made
 
 

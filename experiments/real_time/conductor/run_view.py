@@ -120,13 +120,8 @@ class NetworkView:
         self._launcher, self._begun = context.launcher, time.monotonic()
         experiment, endpoints = context.plan.experiment, context.endpoints
         self._keys = keys = Keys(experiment.network.realm)
-        opened = network.open_session(
-            endpoints,
-            name="conductor",
-            wait_s=ROUTER_S,
-            identity=context.identity,
-            rights=mesh.member_rights(context.plan, endpoints),
-        )
+        identity, rights = context.identity, mesh.member_rights(context.plan, endpoints)
+        opened = network.open_session(endpoints, name="conductor", wait_s=ROUTER_S, identity=identity, rights=rights)
         self.session, declared = stack.enter_context(closing_cleanly(opened))
         declared.append(self)
         session = self.session

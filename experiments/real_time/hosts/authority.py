@@ -26,6 +26,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from agents.network.lab import AUTHORITY, REGISTER, ROLES, Identity, LabError, Register, Role, check_path, register
 
+Key = ec.EllipticCurvePrivateKey
 SERVICES: Final[tuple[Role, ...]] = tuple(role for role in ROLES if role != "robot")
 HERE: Final = ("localhost", "127.0.0.1", "::1")
 DAYS: Final = 90.0  # of a certificate
@@ -40,7 +41,7 @@ class Authority:
 
     folder: Path
     certificate: x509.Certificate
-    key: ec.EllipticCurvePrivateKey
+    key: Key
 
 
 def create(
@@ -153,7 +154,7 @@ def _opened(folder: Path) -> Authority:
         raise LabError(f"{error.filename}: {error.strerror}; do this where the authority of the lab is kept") from None
     except (ValueError, TypeError, UnsupportedAlgorithm) as error:
         raise LabError(f"{file}: is no key of a lab: {error}") from None
-    if not isinstance(key, ec.EllipticCurvePrivateKey):
+    if not isinstance(key, Key):
         raise LabError(f"{file}: is no key of a lab: it is not of an elliptic curve")
     return Authority(folder, certificate, key)
 
@@ -191,19 +192,12 @@ def _certified(authority: Authority, name: str, identity: Identity, days: float)
         builder = builder.add_extension(names, critical=False)
     certificate = builder.sign(authority.key, hashes.SHA256())
     _write_pair(authority.folder / name, key, certificate)
-    return msgspec.structs.replace(
-        identity, serial=f"{certificate.serial_number:x}", until=end.isoformat(timespec="seconds")
-    )
+    until = end.isoformat(timespec="seconds")
+    return msgspec.structs.replace(identity, serial=f"{certificate.serial_number:x}", until=until)
 
 
 def _builder(
-    subject: x509.Name,
-    issuer: x509.Name,
-    key: ec.EllipticCurvePrivateKey,
-    begin: datetime,
-    end: datetime,
-    *,
-    signs: bool,
+    subject: x509.Name, issuer: x509.Name, key: Key, begin: datetime, end: datetime, *, signs: bool
 ) -> x509.CertificateBuilder:
     """A certificate of the authority itself, which `signs` others, or of an identity."""
     others = ("content_commitment", "key_encipherment", "data_encipherment", "key_agreement")
@@ -233,7 +227,7 @@ def _alternative(host: str) -> x509.GeneralName:
     return x509.DNSName(host)
 
 
-def _write_pair(place: Path, key: ec.EllipticCurvePrivateKey, certificate: x509.Certificate) -> None:
+def _write_pair(place: Path, key: Key, certificate: x509.Certificate) -> None:
     """Write a key and its certificate."""
     pem, plain = serialization.Encoding.PEM, serialization.NoEncryption()
     secret = key.private_bytes(pem, serialization.PrivateFormat.PKCS8, plain)

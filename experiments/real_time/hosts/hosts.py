@@ -203,11 +203,8 @@ class Station:
         if self.lab is None:
             return []
         answer = self.ask(Question("certificates", lab=self.folder, names=list(names)))[0]
-        found = [
-            *certificates.faults(answer.content, self.lab, answer.clock),
-            *certificates.unnamed(self.endpoints, self.lab),
-        ]
-        return [f"{self.name}: {fault}" for fault in found]
+        faults = certificates.faults(answer.content, self.lab, answer.clock)
+        return [f"{self.name}: {fault}" for fault in (*faults, *certificates.unnamed(self.endpoints, self.lab))]
 
     @property
     def folder(self) -> str:

@@ -39,15 +39,9 @@ def put(name: str, host: Host) -> str:
         raise HostError(f"{name}: this zenpark is no checkout, which is what can be copied; start ./zenpark of one")
     wanted = [*version.PACKAGES, *FILES, *sorted(path.name for path in version.ROOT.glob("requirements*.lock"))]
     names = [each for each in wanted if (version.ROOT / each).exists()]
-    output = run_script(
-        name,
-        host,
-        (PUT_ZENPARK, place.parent, *names),
-        packed(version.ROOT, names),
-        limit_s=INSTALL_S,
-        late=f"not ready after {INSTALL_S / 60:g} minutes; start {place} there by hand",
-        failed="not installed: ",
-    )
+    script, content = (PUT_ZENPARK, place.parent, *names), packed(version.ROOT, names)
+    late = f"not ready after {INSTALL_S / 60:g} minutes; start {place} there by hand"
+    output = run_script(name, host, script, content, limit_s=INSTALL_S, late=late, failed="not installed: ")
     return f"{output.strip()} ({version.digest()[: version.DIGEST_CHARACTERS]}) installed"
 
 
@@ -79,15 +73,9 @@ def send(name: str, host: Host, folder: Path, robots: Sequence[str]) -> str:
         raise HostError(f"{name}: '{host.lab}' names no folder of its own; write lab = \"zenpark-lab\"")
     # the key before its certificate: a process that reads them in between finds that they do not fit, and tries again
     files = [f"{AUTHORITY}.pem", *(f"{robot}.{end}" for robot in robots for end in ("key", "pem"))]
-    output = run_script(
-        name,
-        host,
-        (PUT_CERTIFICATES, place, *files),
-        packed(folder, files, mode=0o600),
-        limit_s=SEND_S,
-        late=f"has not taken its certificates in {SEND_S:g} s; is it overloaded?",
-        failed="certificates not put there: ",
-    )
+    script, content = (PUT_CERTIFICATES, place, *files), packed(folder, files, mode=0o600)
+    late, failed = f"has not taken its certificates in {SEND_S:g} s; is it overloaded?", "certificates not put there: "
+    output = run_script(name, host, script, content, limit_s=SEND_S, late=late, failed=failed)
     removed = output.split()
     more = f"; removed {', '.join(removed)}" if removed else ""
     return f"certificates of {', '.join(robots)} put into {place}{more}"
@@ -115,6 +103,5 @@ def remove_watchdog(robot: str) -> list[str]:
 
 def _watchdog_script(robot: str, *script: str) -> list[str]:
     late = f"did not answer within {WATCHDOG_S:g} s; try it by hand: ssh {robot}"
-    return run_script(
-        robot, Host(address=robot), script, WATCHDOG.read_bytes(), limit_s=WATCHDOG_S, late=late
-    ).splitlines()
+    host, given = Host(address=robot), WATCHDOG.read_bytes()
+    return run_script(robot, host, script, given, limit_s=WATCHDOG_S, late=late).splitlines()

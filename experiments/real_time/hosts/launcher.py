@@ -39,13 +39,15 @@ READY_S: Final = 15.0  # limit for a process to say that it is ready
 POLL_S: Final = 0.02
 TAIL: Final = 12  # lines of a dead process's output that are worth showing
 
+Handle = subprocess.Popen[bytes] | Forked
+
 
 @dataclass
 class Process:
     """A started process: its name, its handle, and the file that its output goes to."""
 
     name: str
-    handle: subprocess.Popen[bytes] | Forked
+    handle: Handle
     lifeline: IO[bytes]  # its standard input
     log: Path  # begins with the output of processes of this name before it
     begins: int  # [bytes] where its own output begins there
@@ -209,9 +211,7 @@ class Launcher:
 
         return self._begin(name, popen, first_input)
 
-    def _begin(
-        self, name: str, start: Callable[[IO[bytes]], subprocess.Popen[bytes] | Forked], first_input: bytes = b""
-    ) -> Process:
+    def _begin(self, name: str, start: Callable[[IO[bytes]], Handle], first_input: bytes = b"") -> Process:
         """Start a process in one of the ways, with its log, and hold its lifeline."""
         log = self._logs / f"{name}.log"
         with log.open("ab") as output:

@@ -75,14 +75,10 @@ def answer(question: Question, clock: float) -> Answer:
     code, found = version.digest(), list[HostCheck]()
     match question.ask:
         case "hello":
-            return Answer(
-                code,
-                clock,
-                version=version.installed("zenpark") or "unknown",
-                python=platform.python_version(),
-                machine=f"{socket.gethostname()} ({platform.system()} {platform.machine()})",
-                seen_from=os.environ.get("SSH_CONNECTION", "").partition(" ")[0],
-            )
+            installed = version.installed("zenpark") or "unknown"
+            machine = f"{socket.gethostname()} ({platform.system()} {platform.machine()})"
+            seen_from = os.environ.get("SSH_CONNECTION", "").partition(" ")[0]
+            return Answer(code, clock, installed, platform.python_version(), machine, seen_from)
         case "certificates":
             return Answer(code, clock, content=certificates.read_folder(Path(question.lab or "."), question.names))
         case "reach":

@@ -73,11 +73,8 @@ class CentreProcess:
         }
         mime = messages.MIME[self._encoding]
         self._goals = {row: pubsub.publisher(session, keys.goal(names[row]), mime) for row in self.guided}
-        self._memories = {
-            row: pubsub.publisher(session, keys.memory(names[row]), mime)
-            for row in self.guided
-            if centre.robots[row].computer.stepping is not None
-        }
+        remembering = [row for row in self.guided if centre.robots[row].computer.stepping is not None]
+        self._memories = {row: pubsub.publisher(session, keys.memory(names[row]), mime) for row in remembering}
         self._reports = pubsub.pose_publisher(session, keys.centre, messages.JSON)
         self._phase, self._start = [IDLE] * len(names), [inf] * len(names)
         self._begun = inf
@@ -144,16 +141,11 @@ class CentreProcess:
 
     def _send(self, goals: Sequence[CentreGoal], t: float) -> None:
         self._seq += 1
+        stamp = round(self._utc + t, 6)
         for row, (x, y, z), yaw, pose_stamp, velocity in goals:
-            goal = messages.Goal(
-                self._names[row],
-                self._seq,
-                round(self._utc + t, 6),
-                (round(x, 6), round(y, 6), round(z, 6)),
-                round(yaw, 6) if isfinite(yaw) else None,
-                round(self._utc + pose_stamp, 6),
-                messages.wanted(velocity),
-            )
+            place, turned = (round(x, 6), round(y, 6), round(z, 6)), round(yaw, 6) if isfinite(yaw) else None
+            measured, wanted = round(self._utc + pose_stamp, 6), messages.wanted(velocity)
+            goal = messages.Goal(self._names[row], self._seq, stamp, place, turned, measured, wanted)
             self._goals[row].put(messages.encode(goal, self._encoding))
         self._sent += len(goals)
 

@@ -89,9 +89,8 @@ class Recorder:
         key = topic.key(self._keys)
         if not topic.repeated:
             return pubsub.subscriber(self._session, key, topic.depth)
-        return pubsub.pose_subscriber(
-            self._session, key, topic.depth, pubsub.EVENTS if topic.message is messages.Event else 1
-        )
+        kept = pubsub.EVENTS if topic.message is messages.Event else 1
+        return pubsub.pose_subscriber(self._session, key, topic.depth, kept)
 
     def _note_unread(self, key: str, reason: str) -> None:
         self.unread[key] = self.unread.get(key, (0, ""))[0] + 1, reason

@@ -77,12 +77,8 @@ class Commands:
         self._ownership = joint.ownership
         self._router = network.RouterWatch(session, keys.world_alive, joint.endpoints)
         self._cut_off = False
-        self._inbox = pubsub.Inbox(
-            pubsub.subscriber(session, keys.setpoint("*"), DEPTH),
-            messages.Command,
-            keys=keys,
-            on_refusal=events.count_malformed,
-        )
+        commands = pubsub.subscriber(session, keys.setpoint("*"), DEPTH)
+        self._inbox = pubsub.Inbox(commands, messages.Command, keys=keys, on_refusal=events.count_malformed)
         self.done: dict[str, int] = {}  # number of the last executed command
         # session that owns the name of a robot: a new one restarts the numbers of its commands
         self.lives: dict[str, str] = {}
@@ -192,11 +188,8 @@ class States:
         self._clock, self._names = clock, population.names
         x, y, z = plan.experiment.arena.size
         self._valid_box = validation.valid_box_of((-0.5 * x, -0.5 * y, 0.0), (0.5 * x, 0.5 * y, z))
-        self._statuses = pubsub.Inbox(
-            pubsub.pose_subscriber(joint.session, joint.keys.status("*"), 1024),
-            messages.Status,
-            on_refusal=events.count_malformed,
-        )
+        statuses = pubsub.pose_subscriber(joint.session, joint.keys.status("*"), 1024)
+        self._statuses = pubsub.Inbox(statuses, messages.Status, on_refusal=events.count_malformed)
         self._started: dict[str, float] = {}
         self._begun = inf
         mirrored = [row for row, here in enumerate(population.carried) if not here]
