@@ -123,7 +123,7 @@ class HotChanges:
                 next(change.steps)
             except StopIteration as end:
                 self._answer(change, done=str(end.value))
-            except Refusal as refusal:
+            except (Refusal, OSError) as refusal:  # OSError: a full disk, where a process would have begun
                 self._answer(change, refused=str(refusal))
             else:
                 continue

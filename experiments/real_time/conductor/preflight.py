@@ -209,7 +209,7 @@ class Inspector(CaseRun):
         self._processes.start([name], {name: robot})
         try:
             self._wait_ready([name])
-            if not self._robots[name].reached("ready"):
+            if self._context.ended() or not self._robots[name].reached("ready"):
                 tried.failure = f"not ready: {self._reason(name)}"
                 return tried
             tried.states = self._states[name] = []
@@ -229,6 +229,8 @@ class Inspector(CaseRun):
         reply = self._order(name, messages.Order("takeoff"))
         if reply.ok and robot.hover is None:
             self._wait(TRY_S, lambda: self._robots[name].reached("airborne"))
+            if self._context.ended():
+                return "interrupted"
             reply = self._order(name, messages.Order("start", at=self._clock.utc() + start_lead_s(1)))
         return "" if reply.ok else f"refused: {reply.reason}"
 

@@ -337,7 +337,7 @@ class Drift:
                     return
                 try:
                     self._measure(host)
-                except HostError as error:
+                except (HostError, OSError, ValueError) as error:  # the pipes of a host that ends now may be closed
                     self._hosts.remove(host)
                     with self._lock:
                         self._trouble.append(f"{error}; its clock is not corrected any more")

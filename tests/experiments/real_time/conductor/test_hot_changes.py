@@ -261,6 +261,17 @@ def test_process_that_ends_while_joining_is_reported(stage: Stage) -> None:
     assert stage.changes.under_way == set()
 
 
+def test_full_disk_refuses_a_restart_and_ends_no_run(stage: Stage) -> None:
+    def full(_names: tuple[str, ...], _bodies: dict[str, RobotTable] | None = None) -> None:
+        raise OSError(28, "No space left on device")
+
+    stage.start_again = full  # type: ignore[method-assign]
+    reply = stage.after(stage.ask("restart", "KH01"), 5.0)
+    assert "No space left on device" in reply.refused["KH01"]
+    assert stage.robots["KH01"].left_because == "removed"
+    assert stage.after(stage.ask("remove", "KH02")).done
+
+
 def test_lost_orders_are_repeated_within_limited_time(stage: Stage) -> None:
     query = stage.ask("restart", "KH01")
     start = stage.start_again

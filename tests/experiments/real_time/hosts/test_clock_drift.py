@@ -96,6 +96,17 @@ def test_robots_are_told_drift_and_no_jump():
     assert "says nothing; its clock is not corrected any more" in trouble[1]
 
 
+def test_host_that_ends_meanwhile_leaves_the_others_corrected():
+    class Ended(Host):
+        def measure(self, samples):
+            raise ValueError("I/O operation on closed file")
+
+    other, trouble = Host([0.21, 0.22]), []
+    with hosts.Drift([Ended([]), other], 0.01) as following:
+        until(lambda: trouble.extend(following.news()[1]) or len(trouble) == 2, "both are out")
+    assert len(other.told) == 2
+
+
 def test_end_waits_only_for_the_host_being_asked():
     asked, ending = [], threading.Event()
 
