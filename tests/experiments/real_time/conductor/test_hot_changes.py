@@ -261,7 +261,7 @@ def test_process_that_ends_while_joining_is_reported(stage: Stage) -> None:
     assert stage.changes.under_way == set()
 
 
-def test_full_disk_refuses_a_restart_and_ends_no_run(stage: Stage) -> None:
+def test_full_disk_refuses_a_restart(stage: Stage) -> None:
     def full(_names: tuple[str, ...], _bodies: dict[str, RobotTable] | None = None) -> None:
         raise OSError(28, "No space left on device")
 
