@@ -94,7 +94,7 @@ def far(router):
 
 
 @pytest.fixture
-def drive(router, far):
+def driven_body(router, far):
     """Drives a body that is open, at the other end of `far`, which talks."""
     far.talk(*ROWS)
     body = body_of(router.endpoint, open_s=5.0)
@@ -105,9 +105,9 @@ def drive(router, far):
     body.close()
 
 
-def lowest(drive):
+def lowest(driven_body):
     """Height of the lower of both drones [m]."""
-    return drive.state.position[:2, 2].min()
+    return driven_body.state.position[:2, 2].min()
 
 
 # ---------------------------------------------------------------------- opening
@@ -153,15 +153,15 @@ def test_settings_and_absent_routers_are_named():
 
 
 @pytest.mark.system
-def test_poses_are_as_published_and_grow_old(drive, far):
+def test_poses_are_as_published_and_grow_old(driven_body, far):
     far.hush()
-    drive.until(lambda: drive.state.note[0], "what was said before is old")
-    utc, clock = time.time(), time.monotonic() - drive.zero
+    driven_body.until(lambda: driven_body.state.note[0], "what was said before is old")
+    utc, clock = time.time(), time.monotonic() - driven_body.zero
     for step in range(30):  # half a metre a second along x, with one frame that is elsewhere
         jump = 3.0 if step == 20 else 0.0
         far.say("CF01", [0.005 * step + jump, 0.0, 0.0], stamp=utc - 0.29 + 0.01 * step, yaw=None)
-    drive.until(lambda: drive.state.position[0, 0] >= 0.14, "the last of them is heard")
-    state = drive.state
+    driven_body.until(lambda: driven_body.state.position[0, 0] >= 0.14, "the last of them is heard")
+    state = driven_body.state
     assert state.position[0] == pytest.approx((0.145, 0.0, 0.0), abs=1e-12)
     assert state.velocity[0] == pytest.approx((0.5, 0.0, 0.0), abs=0.05)
     assert state.time[0] == pytest.approx(clock, abs=0.01)
@@ -169,21 +169,23 @@ def test_poses_are_as_published_and_grow_old(drive, far):
     assert np.isnan(state.true_position).all()
     assert np.isnan(state.battery).all()
     assert not state.flying.any()
-    drive.until(lambda: all("no position for" in note for note in drive.state.note), "they grow old")
-    assert drive.state.time == pytest.approx(state.time, abs=0.02)
+    driven_body.until(lambda: all("no position for" in note for note in driven_body.state.note), "they grow old")
+    assert driven_body.state.time == pytest.approx(state.time, abs=0.02)
     far.put("CF01", b"\xff\x00")
     far.say("CF01", [nan, 0.0, 0.0])
     far.say("CF01", [0.0, 0.0, 0.0], stamp=time.time() + 3600.0)
     far.put("CF01", b'{"robot":"KH01","stamp":1.0,"position":[0,0,0]}')
-    drive.until(lambda: "4 positions refused" in drive.state.note[0], "nonsense is counted")
-    assert drive.state.position[0] == pytest.approx((0.145, 0.0, 0.0), abs=1e-12)
+    driven_body.until(lambda: "4 positions refused" in driven_body.state.note[0], "nonsense is counted")
+    assert driven_body.state.position[0] == pytest.approx((0.145, 0.0, 0.0), abs=1e-12)
     far.talk(*ROWS)
-    drive.until(lambda: drive.state.position[0, 0] == 0.0 and "no position" not in drive.state.note[0], "it is back")
+    driven_body.until(
+        lambda: driven_body.state.position[0, 0] == 0.0 and "no position" not in driven_body.state.note[0], "it is back"
+    )
 
 
 @pytest.mark.system
-def test_what_robots_see_comes_from_the_far_end(drive, far):
-    assert drive.state.scan == (None,) * 3
+def test_what_robots_see_comes_from_the_far_end(driven_body, far):
+    assert driven_body.state.scan == (None,) * 3
 
     def say(name, *distance, robot=None):
         angles = [0.1 * k for k in range(len(distance))]
@@ -192,87 +194,89 @@ def test_what_robots_see_comes_from_the_far_end(drive, far):
 
     say("KH01", 0.25, None, 1.5)
     say("CF01", 2.0)
-    drive.until(lambda: drive.state.scan[0] is not None and drive.state.scan[2] is not None, "they are heard")
-    first, second, third = drive.state.scan
+    driven_body.until(
+        lambda: driven_body.state.scan[0] is not None and driven_body.state.scan[2] is not None, "they are heard"
+    )
+    first, second, third = driven_body.state.scan
     assert second is None
     assert first.distance == (2.0,)
     assert third.distance == (0.25, pytest.approx(nan, nan_ok=True), 1.5)
     assert third.bearing == pytest.approx((0.0, 0.1, 0.2))
-    assert third.time == pytest.approx(time.monotonic() - drive.zero, abs=0.5)
+    assert third.time == pytest.approx(time.monotonic() - driven_body.zero, abs=0.5)
     say("KH01", 0.1, robot="TE01")
-    drive.until(lambda: any("1 sweeps refused" in note for note in drive.state.note), "nonsense is counted")
-    drive.until(lambda: drive.state.scan == (None,) * 3, "what is old is forgotten")
+    driven_body.until(lambda: any("1 sweeps refused" in note for note in driven_body.state.note), "nonsense is counted")
+    driven_body.until(lambda: driven_body.state.scan == (None,) * 3, "what is old is forgotten")
 
 
 # ---------------------------------------------------------------------- what it says
 
 
 @pytest.mark.system
-def test_restarted_simulator_hears_orders_under_way(drive, far):
+def test_restarted_simulator_hears_orders_under_way(driven_body, far):
     """The twin service was killed while one robot climbed and the other landed; its successor knows of neither."""
-    drive.body.takeoff([0, 1], [0.6, 0.8])
+    driven_body.body.takeoff([0, 1], [0.6, 0.8])
     far.place["CF01"] = far.place["TE01"] = [0.0, 0.0, 0.3]
-    drive.until(lambda: lowest(drive) > 0.2, "they are up")
-    drive.body.land([1])
-    drive.until(lambda: far.actions("TE01", "land"), "one lands")
+    driven_body.until(lambda: lowest(driven_body) > 0.2, "they are up")
+    driven_body.body.land([1])
+    driven_body.until(lambda: far.actions("TE01", "land"), "one lands")
     climb, landing = far.actions("CF01", "takeoff")[-1].seq, far.actions("TE01", "land")[-1].seq
     far.hush()
-    drive.until(lambda: any("no position" in note for note in drive.state.note), "silence is noticed")
-    assert drive.state.flying.tolist() == [True, True, False]
+    driven_body.until(lambda: any("no position" in note for note in driven_body.state.note), "silence is noticed")
+    assert driven_body.state.flying.tolist() == [True, True, False]
     assert far.actions("TE01", "drive") == []
     told = len(far.actions("CF01", "takeoff"))
     far.talk(*ROWS)
-    drive.until(lambda: len(far.actions("CF01", "takeoff")) >= told + 5, "it is told again to climb")
+    driven_body.until(lambda: len(far.actions("CF01", "takeoff")) >= told + 5, "it is told again to climb")
     assert {command.seq for command in far.actions("CF01", "takeoff")} == {climb}
     assert {command.seq for command in far.actions("TE01", "land")} == {landing}
-    drive.decide = lambda _: [(0.0, 0.0, 0.6, 0.0), NO_SETPOINT, NO_SETPOINT]
-    drive.until(lambda: far.actions("CF01", "drive"), "it is steered")
+    driven_body.decide = lambda _: [(0.0, 0.0, 0.6, 0.0), NO_SETPOINT, NO_SETPOINT]
+    driven_body.until(lambda: far.actions("CF01", "drive"), "it is steered")
     told = len(far.actions("CF01", "takeoff"))
     driven = len(far.actions("CF01", "drive"))
-    drive.until(lambda: len(far.actions("CF01", "drive")) > driven + 40, "it is steered on")
+    driven_body.until(lambda: len(far.actions("CF01", "drive")) > driven + 40, "it is steered on")
     assert len(far.actions("CF01", "takeoff")) <= told + 1, "what is steered need not climb"
 
 
 @pytest.mark.mechanism("external body: orders are repeated")
 @pytest.mark.system
-def test_orders_are_repeated_until_obeyed(drive, far):
+def test_orders_are_repeated_until_obeyed(driven_body, far):
     rows = range(3)
-    drive.body.takeoff(rows, [0.6, 0.8, 0.0])
-    drive.until(lambda: len(far.actions("CF01", "takeoff")) >= 3, "takeoff is repeated")
-    assert drive.state.flying.tolist() == [True, True, False]
+    driven_body.body.takeoff(rows, [0.6, 0.8, 0.0])
+    driven_body.until(lambda: len(far.actions("CF01", "takeoff")) >= 3, "takeoff is repeated")
+    assert driven_body.state.flying.tolist() == [True, True, False]
     first = far.actions("CF01", "takeoff")[0].seq
     assert {(c.seq, c.height) for c in far.actions("CF01", "takeoff")} == {(first, 0.6)}
     assert {c.height for c in far.actions("TE01", "takeoff")} == {0.8}
     assert far.actions("KH01", "takeoff") == []
     far.place["CF01"] = [0.0, 0.0, 0.3]
     far.place["TE01"] = [0.0, 0.0, 0.3]
-    drive.until(lambda: lowest(drive) > 0.2, "they are up")
+    driven_body.until(lambda: lowest(driven_body) > 0.2, "they are up")
     told = len(far.actions("CF01", "takeoff"))
-    drive.until(lambda: len(far.actions("CF01", "takeoff")) >= told + 5, "another may answer half-way up")
+    driven_body.until(lambda: len(far.actions("CF01", "takeoff")) >= told + 5, "another may answer half-way up")
     silent = len(far.actions("CF01", "takeoff"))
     again = len(far.actions("TE01", "takeoff"))
 
-    drive.body.land(rows)
-    drive.until(lambda: len(far.actions("CF01", "land")) >= 3, "land is repeated")
+    driven_body.body.land(rows)
+    driven_body.until(lambda: len(far.actions("CF01", "land")) >= 3, "land is repeated")
     assert len(far.actions("CF01", "takeoff")) - silent <= 1
     assert len(far.actions("TE01", "takeoff")) - again <= 1
-    assert drive.state.flying.tolist() == [True, True, False]
+    assert driven_body.state.flying.tolist() == [True, True, False]
     assert {c.seq for c in far.actions("CF01", "land")} == {first + 1}
     assert len(far.actions("KH01", "land")) >= 1
     far.place["CF01"] = [0.0, 0.0, 0.01]
-    drive.until(lambda: not drive.state.flying[0], "one is down")
-    assert drive.state.flying.tolist() == [False, True, False]
+    driven_body.until(lambda: not driven_body.state.flying[0], "one is down")
+    assert driven_body.state.flying.tolist() == [False, True, False]
 
-    drive.body.stop([1, 2])
-    drive.body.land([1, 2])  # a stop is the last word
-    drive.decide = constant(1.0, 1.0, 1.0, 1.0)
-    drive.until(lambda: len(far.actions("TE01", "stop")) >= 5, "stop is repeated")
-    assert drive.state.flying.tolist() == [False, True, False]  # it is seen where it was
-    drive.until(lambda: UNANSWERED in drive.state.note[1], "it is said")
-    assert UNANSWERED not in drive.state.note[2]  # it stands
+    driven_body.body.stop([1, 2])
+    driven_body.body.land([1, 2])  # a stop is the last word
+    driven_body.decide = constant(1.0, 1.0, 1.0, 1.0)
+    driven_body.until(lambda: len(far.actions("TE01", "stop")) >= 5, "stop is repeated")
+    assert driven_body.state.flying.tolist() == [False, True, False]  # it is seen where it was
+    driven_body.until(lambda: UNANSWERED in driven_body.state.note[1], "it is said")
+    assert UNANSWERED not in driven_body.state.note[2]  # it stands
     far.place["TE01"] = [0.0, 0.0, 0.0]
-    drive.until(lambda: not drive.state.flying.any(), "it has come down")
-    assert not any(drive.state.note)
+    driven_body.until(lambda: not driven_body.state.flying.any(), "it has come down")
+    assert not any(driven_body.state.note)
     assert {c.seq for c in far.actions("TE01", "stop")} == {first + 2}
     assert len(far.actions("KH01", "stop")) >= 5
     assert far.actions("TE01", "drive") == far.actions("KH01", "drive") == []  # a stop is the last word
@@ -280,10 +284,10 @@ def test_orders_are_repeated_until_obeyed(drive, far):
 
 
 @pytest.mark.system
-def test_setpoints_are_sent_once_nan_never(drive, far):
+def test_setpoints_are_sent_once_nan_never(driven_body, far):
     for step in range(10):
         x = 4.0 * step
-        drive.body.command([(x, x + 1.0, x + 2.0, x + 3.0), NO_SETPOINT, (x + 200.0, 0.0, 0.0, 0.0)])
+        driven_body.body.command([(x, x + 1.0, x + 2.0, x + 3.0), NO_SETPOINT, (x + 200.0, 0.0, 0.0, 0.0)])
     until(lambda: len(far.look()) >= 20, "they arrive")
     for name, first in (("CF01", 0.0), ("KH01", 200.0)):
         drives = far.actions(name, "drive")
@@ -296,14 +300,14 @@ def test_setpoints_are_sent_once_nan_never(drive, far):
 
 @pytest.mark.mechanism("external body: router loss")
 @pytest.mark.system
-def test_it_outlives_its_router(drive, far, router):
+def test_it_outlives_its_router(driven_body, far, router):
     router.kill()
-    drive.decide = constant(1.0, 1.0, 1.0, 1.0)
-    drive.until(lambda: drive.state.note[0], "silence is noticed")
+    driven_body.decide = constant(1.0, 1.0, 1.0, 1.0)
+    driven_body.until(lambda: driven_body.state.note[0], "silence is noticed")
     before = len(far.look())
     router.start()
-    drive.until(lambda: not any(drive.state.note), "it is back")
-    drive.until(lambda: len(far.look()) > before, "it is heard again")
+    driven_body.until(lambda: not any(driven_body.state.note), "it is back")
+    driven_body.until(lambda: len(far.look()) > before, "it is heard again")
 
 
 # ---------------------------------------------------------------------- on a clock of its own

@@ -3,7 +3,6 @@
 import resource
 from contextlib import contextmanager
 
-import msgspec
 import numpy as np
 
 from agents.network.messages import Contact, Event, ObstaclePose, Pose, PoseReceipt, State, Status, WorldState
@@ -66,7 +65,7 @@ def touched(at, first="TB01", second="CF01"):
     return Contact(START + at, first, second, 0.25, 0.001)
 
 
-def world(at, engine="pymunk"):
+def world_state(at, engine="pymunk"):
     obstacles = [ObstaclePose("box", (1.0, 0.5 * at, 0.1)), ObstaclePose("post", (0.0, 0.0, 0.0))]
     return WorldState(
         START + at, engine, at + 3.0, 0.98, 0.4, False, ["TB01"], ["CF01"], obstacles, 2, 0, 1, "none"
@@ -107,11 +106,6 @@ def broken(path, *messages):
     write(path, *(messages or whole_run()))
     path.write_bytes(path.read_bytes()[:-1])
     return path
-
-
-def changed(**parts):
-    """The pair of this module with other parts."""
-    return msgspec.structs.replace(PAIR, **parts)
 
 
 @contextmanager

@@ -34,7 +34,7 @@ trigger = { kind = "send-on-delta", threshold = 0.01 }
 
 
 @pytest.fixture
-def file(tmp_path: Path) -> Path:
+def two_cases_file(tmp_path: Path) -> Path:
     made = tmp_path / "two.toml"
     made.write_text(TWO_CASES)
     return made
@@ -42,11 +42,11 @@ def file(tmp_path: Path) -> Path:
 
 @pytest.mark.timeout(120)
 def test_every_run_of_the_machine_ends_with_reason(
-    file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    two_cases_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    flight = Flight(tmp_path / "run", file)
+    flight = Flight(tmp_path / "run", two_cases_file)
     flight.until_flown()
-    other = Flight(tmp_path / "other", file)
+    other = Flight(tmp_path / "other", two_cases_file)
     other.until_flown()
     there = f"two that stay together, {flight.folder}"
     assert f"another run is up with robots of these names (CF01, KH01): {there}" in other.said()
@@ -75,8 +75,8 @@ def test_every_run_of_the_machine_ends_with_reason(
 
 @pytest.mark.mechanism("emergency stop of a run")
 @pytest.mark.timeout(120)
-def test_before_the_common_start_too(file: Path, tmp_path: Path) -> None:
-    flight = Flight(tmp_path / "run", file, "robots.CF01.hover=2.0", 'formation.links={"CF01 - KH01" = 2.2}')
+def test_before_the_common_start_too(two_cases_file: Path, tmp_path: Path) -> None:
+    flight = Flight(tmp_path / "run", two_cases_file, "robots.CF01.hover=2.0", 'formation.links={"CF01 - KH01" = 2.2}')
     flight.until_said(r"ready conductor: 2 robots", 60.0)
     # not by a process: on a busy machine its start takes as long as a climb, after which comes the common start
     stop = EmergencyStop([flight.endpoint()], "park", "operator")

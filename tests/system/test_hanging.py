@@ -62,16 +62,16 @@ def watcher(router: RouterProcess) -> Iterator[Truth]:
 
 def lonely(folder: Path, trigger: str = "") -> Path:
     """One Tello in a world."""
-    file = folder / "lonely.toml"
-    file.write_text(
+    lonely_file = folder / "lonely.toml"
+    lonely_file.write_text(
         f'title = "lonely"\nduration_s = 60.0\n{trigger}\n[arena]\nsize = [2.0, 2.0, 2.0]\n'
         '[robots.TE01]\nkind = "tello"\nbody = "world"\nstart = [0.0, 0.0]\nhover = 0.6\n'
     )
-    return file
+    return lonely_file
 
 
 @pytest.fixture
-def file(tmp_path: Path) -> Path:
+def lonely_file(tmp_path: Path) -> Path:
     return lonely(tmp_path)
 
 
@@ -85,9 +85,12 @@ def test_a_loop_that_hangs_is_landed_and_said(
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: hangs\nVersion: 1\n")
     (about / "entry_points.txt").write_text("[zenpark.triggers]\nhangs = hangs:Hangs\n")
     flag = tmp_path / "now"
-    file = lonely(tmp_path, f'trigger = {{ kind = "hangs", file = "{flag}" }}')
+    lonely_file = lonely(tmp_path, f'trigger = {{ kind = "hangs", file = "{flag}" }}')
     monkeypatch.setitem(ENVIRONMENT, "PYTHONPATH", os.pathsep.join([str(tmp_path), str(ROOT)]))
-    with WorldProcess(router.endpoint, file) as world, RobotProcess(router.endpoint, file, "TE01") as robot:
+    with (
+        WorldProcess(router.endpoint, lonely_file) as world,
+        RobotProcess(router.endpoint, lonely_file, "TE01") as robot,
+    ):
         watcher.take_off("TE01")
         flag.touch()
         watcher.until(lambda: watcher.status["TE01"].reason.startswith("its control loop hangs"), "it is said")
@@ -99,8 +102,8 @@ def test_a_loop_that_hangs_is_landed_and_said(
         world.kill()
 
 
-def test_process_frozen_aloft_is_landed_and_notices(router: RouterProcess, watcher: Truth, file: Path) -> None:
-    with WorldProcess(router.endpoint, file), RobotProcess(router.endpoint, file, "TE01") as robot:
+def test_process_frozen_aloft_is_landed_and_notices(router: RouterProcess, watcher: Truth, lonely_file: Path) -> None:
+    with WorldProcess(router.endpoint, lonely_file), RobotProcess(router.endpoint, lonely_file, "TE01") as robot:
         watcher.take_off("TE01")
         high, stopped = watcher.height("TE01"), time.time()
         robot.freeze()
@@ -117,14 +120,16 @@ def test_process_frozen_aloft_is_landed_and_notices(router: RouterProcess, watch
         watcher.until_all("done", "TE01")
 
 
-def test_frozen_process_leaves_body_to_its_replacement(router: RouterProcess, watcher: Truth, file: Path) -> None:
-    with WorldProcess(router.endpoint, file), RobotProcess(router.endpoint, file, "TE01") as old:
+def test_frozen_process_leaves_body_to_its_replacement(
+    router: RouterProcess, watcher: Truth, lonely_file: Path
+) -> None:
+    with WorldProcess(router.endpoint, lonely_file), RobotProcess(router.endpoint, lonely_file, "TE01") as old:
         watcher.take_off("TE01")
         old.freeze()
         watcher.until(lambda: watcher.height("TE01") < 0.02, "the world lands it")
         watcher.until(lambda: "TE01" not in watcher.alive, "its lease is over")
         watcher.status.clear()
-        with RobotProcess(router.endpoint, file, "TE01"):
+        with RobotProcess(router.endpoint, lonely_file, "TE01"):
             watcher.take_off("TE01")
             heights = [watcher.height("TE01")]
             old.thaw()
@@ -140,8 +145,8 @@ def test_frozen_process_leaves_body_to_its_replacement(router: RouterProcess, wa
             assert watcher.phase("TE01") == "airborne"
 
 
-def test_stop_behind_a_flood_of_deletions_is_obeyed(router: RouterProcess, watcher: Truth, file: Path) -> None:
-    with WorldProcess(router.endpoint, file), RobotProcess(router.endpoint, file, "TE01"):
+def test_stop_behind_a_flood_of_deletions_is_obeyed(router: RouterProcess, watcher: Truth, lonely_file: Path) -> None:
+    with WorldProcess(router.endpoint, lonely_file), RobotProcess(router.endpoint, lonely_file, "TE01"):
         watcher.take_off("TE01")
         for _ in range(2000):
             watcher.session.delete(watcher.keys.estop)
@@ -154,13 +159,13 @@ def test_stop_behind_a_flood_of_deletions_is_obeyed(router: RouterProcess, watch
 
 
 def test_process_hanging_in_final_landing_fails_the_run(tmp_path: Path) -> None:
-    file = tmp_path / "short.toml"
-    file.write_text(
+    lonely_file = tmp_path / "short.toml"
+    lonely_file.write_text(
         'title = "short"\nduration_s = 1.5\ntrigger = { kind = "periodic" }\n'
         '[robots.TE01]\nkind = "tello"\nstart = [0.0, 0.0]\nhover = 0.6\n'
         '[robots.KH01]\nkind = "khepera4"\nstart = [0.5, 0.5]\n'
     )
-    flight = Flight(tmp_path / "out", file, report=True)
+    flight = Flight(tmp_path / "out", lonely_file, report=True)
     try:
         flight.until_said("phase conductor: landing")
         flight.children()["TE01"].suspend()

@@ -28,7 +28,7 @@ links = {{ "A - B" = 0.3 }}
 """
 
 
-def written(folder: Path, safety: str) -> Path:
+def pair_file(folder: Path, safety: str) -> Path:
     file = folder / "pair.toml"
     file.write_text(PAIR.format(safety=safety))
     return file
@@ -36,7 +36,7 @@ def written(folder: Path, safety: str) -> Path:
 
 def test_robot_too_near_holds_and_is_reported(tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    flight = Flight(folder, written(tmp_path, "separation = 0.5"))
+    flight = Flight(folder, pair_file(tmp_path, "separation = 0.5"))
     flight.until_said(r"hazard [AB]: hold: minimum separation: 0\.\d\d m from [AB] \(limit 0\.5 m\)")
     assert flight.finish()[0] == 0
     (file,) = folder.glob("*.mcap")
@@ -83,7 +83,7 @@ def test_run_with_a_scripted_landing_succeeds(tmp_path: Path) -> None:
 @pytest.mark.mechanism("hazard: conductor lost")
 def test_robots_without_conductor_end_if_file_says_so(router: RouterProcess, watcher: Watcher, tmp_path: Path) -> None:
     token = pubsub.alive_token(watcher.session, watcher.keys.conductor)
-    with RobotProcess(router.endpoint, written(tmp_path, 'lost_conductor = "land"'), "A", "B"):
+    with RobotProcess(router.endpoint, pair_file(tmp_path, 'lost_conductor = "land"'), "A", "B"):
         watcher.take_off("A", "B")
         token.undeclare()
         watcher.until_all("done", "A", "B")

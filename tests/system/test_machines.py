@@ -44,7 +44,7 @@ def park_file(lab: Machines, folder: Path, duration_s: float) -> Path:
     return on_hosts(lab, folder, text, ROBOTS)
 
 
-def triangle(lab: Machines, folder: Path, duration_s: float) -> Path:
+def triangle_file(lab: Machines, folder: Path, duration_s: float) -> Path:
     """The first experiment, one robot on each machine: enough for what does not depend on their number."""
     text = catalogue.path("triangle").read_text("utf-8").replace("duration_s = 15.0", f"duration_s = {duration_s}")
     return on_hosts(lab, folder, text, dict(zip(ROBOTS, (["KH01"], ["KH02"], ["CF01"]), strict=True)))
@@ -127,7 +127,7 @@ def test_one_command_flies_reference_and_fetches_all_files(lab: Machines, tmp_pa
 
 
 def test_centre_here_guides_remote_robots_by_one_clock(lab: Machines, tmp_path: Path) -> None:
-    file, folder = triangle(lab, tmp_path, 3.0), tmp_path / "run"
+    file, folder = triangle_file(lab, tmp_path, 3.0), tmp_path / "run"
     options = ["--case", "periodic", "--set", "architecture=centralised", "--anyway", "--no-report"]
     flight = begin_at_desk(lab, "run", str(file), *options, "--out", str(folder))
     output_of_success(flight, lab)
@@ -144,7 +144,7 @@ def test_centre_here_guides_remote_robots_by_one_clock(lab: Machines, tmp_path: 
 
 @pytest.mark.mechanism("hosts: way out")
 def test_launchers_death_lands_everybody_and_clears_all(lab: Machines, tmp_path: Path) -> None:
-    file, folder = triangle(lab, tmp_path, 20.0), tmp_path / "run"
+    file, folder = triangle_file(lab, tmp_path, 20.0), tmp_path / "run"
     words = options("--case", "periodic", "--out", folder, "--anyway", *NEAR_TRIANGLE)
     flight = begin_at_desk(lab, "run", str(file), *words)
     logs = folder / "logs"
@@ -178,7 +178,7 @@ def said(logs: Path, robot: str, case: str = "event") -> str:
 
 
 def test_machine_cut_off_lands_its_robots_only(lab: Machines, tmp_path: Path) -> None:
-    file, folder = triangle(lab, tmp_path, 8.0), tmp_path / "run"
+    file, folder = triangle_file(lab, tmp_path, 8.0), tmp_path / "run"
     flight = begun(lab, file, folder)
     try:
         lab["lab3"].unplug()
@@ -196,7 +196,7 @@ def test_machine_cut_off_lands_its_robots_only(lab: Machines, tmp_path: Path) ->
 
 def test_a_short_cut_of_the_cable_lands_nobody(lab: Machines, tmp_path: Path) -> None:
     """TCP sends what was lost again 3 s after the cut, although the cable is back after 2 s."""
-    file, folder = triangle(lab, tmp_path, 10.0), tmp_path / "run"
+    file, folder = triangle_file(lab, tmp_path, 10.0), tmp_path / "run"
     flight = begun(lab, file, folder)
     lab["lab3"].unplug()
     threading.Event().wait(CUT_S)
@@ -227,7 +227,7 @@ def test_dead_robot_on_a_machine_is_restarted_there(lab: Machines, tmp_path: Pat
 
 
 def test_a_preflight_starts_robots_on_their_machines(lab: Machines, tmp_path: Path) -> None:
-    file = triangle(lab, tmp_path, 5.0)
+    file = triangle_file(lab, tmp_path, 5.0)
     preflight = begin_at_desk(lab, "preflight", str(file), "--hop", "--out", str(tmp_path / "out"), "--json")
     out, _ = preflight.communicate(timeout=120)
     said = json.loads(out[out.index("\n{") :])

@@ -24,7 +24,7 @@ pytestmark = pytest.mark.system
 BLOCK = zenoh.CongestionControl.BLOCK  # a stop must not be dropped where a hundred kilobytes go before it
 
 
-def fly(stack: ExitStack, router: RouterProcess, file: str, *names: str) -> RobotProcess:
+def robots_flying(stack: ExitStack, router: RouterProcess, file: str, *names: str) -> RobotProcess:
     return stack.enter_context(RobotProcess(router.endpoint, file, *names))
 
 
@@ -68,7 +68,7 @@ def test_each_robot_hears_exactly_its_neighbours(router: RouterProcess, watcher:
     }
     with ExitStack() as stack:
         for name in experiment.robots:
-            fly(stack, router, file, name)
+            robots_flying(stack, router, file, name)
         watcher.until_all("ready", *experiment.robots)
         known = zids(watcher.session)
         keys = subscriptions(watcher.session)
@@ -82,19 +82,19 @@ def test_each_robot_hears_exactly_its_neighbours(router: RouterProcess, watcher:
 
 def test_late_joiner_and_restarted_robot_receive_last_poses(router: RouterProcess, watcher: Watcher) -> None:
     with ExitStack() as stack:
-        fly(stack, router, "triangle", "KH01")
-        fly(stack, router, "triangle", "KH02")
+        robots_flying(stack, router, "triangle", "KH01")
+        robots_flying(stack, router, "triangle", "KH02")
         for name in ("KH01", "KH02"):
             watcher.until(lambda name=name: name in watcher.status, "it says something")
             watcher.until(lambda name=name: watcher.status[name].missing == ["CF01"], "two hear each other")
             assert (watcher.phase(name), watcher.status[name].reason) == ("idle", "never received CF01")
-        late = fly(stack, router, "triangle", "CF01")
+        late = robots_flying(stack, router, "triangle", "CF01")
         watcher.until_all("ready", *TRIANGLE)
         late.kill()
         watcher.until(lambda: "CF01" not in watcher.alive, "the token is gone")
         watcher.until(lambda: watcher.status["KH01"].missing == ["CF01"], "its death is known")
         before = watcher.status["CF01"].pid
-        again = fly(stack, router, "triangle", "CF01")
+        again = robots_flying(stack, router, "triangle", "CF01")
         watcher.until(lambda: watcher.status["CF01"].pid not in (before,) and watcher.phase("CF01") == "ready", "back")
         assert watcher.status["CF01"].received >= 2
         watcher.until(lambda: not watcher.status["KH01"].missing, "it is heard again")
@@ -104,7 +104,7 @@ def test_late_joiner_and_restarted_robot_receive_last_poses(router: RouterProces
 @pytest.mark.mechanism("orders")
 def test_orders_are_answered_and_refused_with_a_reason(router: RouterProcess, watcher: Watcher, low: str) -> None:
     with ExitStack() as stack:
-        fly(stack, router, low, *TRIANGLE)
+        robots_flying(stack, router, low, *TRIANGLE)
         watcher.until_all("ready", *TRIANGLE)
         reply = watcher.order("CF01", messages.Order("start", at=time.time()))
         assert not reply.ok
@@ -160,7 +160,7 @@ def nonsense() -> list[tuple[bytes, str]]:
 @pytest.mark.mechanism("malformed messages")
 def test_nonsense_on_every_key_is_counted_moving_nobody(router: RouterProcess, watcher: Watcher, low: str) -> None:
     with ExitStack() as stack:
-        fly(stack, router, low, *TRIANGLE)
+        robots_flying(stack, router, low, *TRIANGLE)
         watcher.take_off(*TRIANGLE)
         given = nonsense()
         expected = 2 * len(given)  # a pose and an order each
@@ -210,7 +210,7 @@ def test_a_robot_whose_starter_falls_silent_lands(router: RouterProcess, watcher
 @pytest.mark.mechanism("frozen neighbour")
 def test_a_killed_and_a_frozen_neighbour_are_noticed(router: RouterProcess, watcher: Watcher) -> None:
     with ExitStack() as stack:
-        robots = {name: fly(stack, router, "triangle", name) for name in TRIANGLE}
+        robots = {name: robots_flying(stack, router, "triangle", name) for name in TRIANGLE}
         watcher.until_all("ready", *TRIANGLE)
         with watcher.session.liveliness().declare_token("park/**"):  # somebody who says that everybody lives ...
             watcher.until(lambda: "KH01" in watcher.state, "they go on")
@@ -230,7 +230,7 @@ def test_a_killed_and_a_frozen_neighbour_are_noticed(router: RouterProcess, watc
 def test_an_emergency_stop_reaches_every_process(router: RouterProcess, watcher: Watcher) -> None:
     key = watcher.keys.estop
     with ExitStack() as stack:
-        robots = [fly(stack, router, "triangle", name) for name in TRIANGLE]
+        robots = [robots_flying(stack, router, "triangle", name) for name in TRIANGLE]
         watcher.until_all("ready", *TRIANGLE)
         watcher.session.delete(key)  # no stop
         watcher.until(lambda: not any(watcher.phase(name) == "done" for name in TRIANGLE), "nobody was stopped")

@@ -60,7 +60,7 @@ def viewed(*arguments: object) -> Iterator[ViewProcess]:
 KINDS = ("turtlebot3", "khepera4", "crazyflie")  # of the reference experiment
 
 
-def places(page: Page, what: str = "robots/{}/body", root: str = "/case") -> np.ndarray:
+def drawn_places(page: Page, what: str = "robots/{}/body", root: str = "/case") -> np.ndarray:
     """Positions (7, 3) of the robots of the reference experiment in the page [m], or of what else it draws of them."""
     names = [f"{root}/{what.format(kind)}" for kind in KINDS]
     page.until(lambda: all(name in page.nodes for name in names), "drawn")
@@ -98,13 +98,13 @@ def test_page_shows_seven_robots_and_stops_all(router: RouterProcess, watcher: W
         opened(partial(taken_off, view), 480, 360) as page,
     ):
         watcher.until_all("airborne", *names)
-        page.until(lambda: np.all(places(page)[:, 2] > -1.0), "seen")
-        before, colours = places(page), page.nodes["/case/links"]["colors"]
+        page.until(lambda: np.all(drawn_places(page)[:, 2] > -1.0), "seen")
+        before, colours = drawn_places(page), page.nodes["/case/links"]["colors"]
         watcher.start(*names)
         watcher.give(messages.Order("go", goal=(-0.4, 0.8)), "TB01")
-        page.until(lambda: np.all(np.linalg.norm(places(page) - before, axis=1) > 0.01), "all move")
+        page.until(lambda: np.all(np.linalg.norm(drawn_places(page) - before, axis=1) > 0.01), "all move")
         page.until(lambda: page.nodes["/case/links"]["colors"] != colours, "links change colour")
-        page.until(lambda: np.all(places(page, "goals/{}")[:, 2] > -1.0), "ghosts stand at the goals")
+        page.until(lambda: np.all(drawn_places(page, "goals/{}")[:, 2] > -1.0), "ghosts stand at the goals")
         page.until(lambda: page.page.get_by_text("event: formation").count(), "case and phase")
         page.button("EMERGENCY STOP").click()
         page.until(lambda: page.page.get_by_text("stopped: CF01, CF02").count(), "answers are shown")
@@ -215,19 +215,19 @@ def test_slider_moves_robots_to_recorded_places(tmp_path: Path) -> None:
     run = simulate(document.load("robotic-park", "duration_s=6", "timeline=[]"), cases=["event"], folder=tmp_path)
     trace = run.traces["event"]
     with viewed(tmp_path) as view, opened(view.address, 640, 480) as page:
-        assert places(page, root="/case0").shape == trace.true_position[0].shape
+        assert drawn_places(page, root="/case0").shape == trace.true_position[0].shape
         time_box = page.page.locator("input[type=text]").nth(0)
         for t in (4.0, 0.5, 2.5):
             wanted = trace.true_position[int(np.searchsorted(trace.time, t - 1e-6))]
             time_box.fill(str(t))
             time_box.press("Enter")
             page.until(
-                lambda wanted=wanted: np.abs(places(page, root="/case0") - wanted).max() < 1e-3,
+                lambda wanted=wanted: np.abs(drawn_places(page, root="/case0") - wanted).max() < 1e-3,
                 f"robots are where they were at {t} s",
             )
         page.button("Play").click()
-        before = places(page, root="/case0")
-        page.until(lambda: np.any(places(page, root="/case0") != before), "it plays")
+        before = drawn_places(page, root="/case0")
+        page.until(lambda: np.any(drawn_places(page, root="/case0") != before), "it plays")
         assert page.hosts == {f"127.0.0.1:{view.port}"}
 
 

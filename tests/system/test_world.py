@@ -51,7 +51,7 @@ TE01 = { kind = "tello", body = "world", start = [-1.0, 1.0], hover = 0.6 }
 
 
 @pytest.fixture
-def file(tmp_path: Path) -> Path:
+def three_file(tmp_path: Path) -> Path:
     made = tmp_path / "three.toml"
     made.write_text(THREE)
     return made
@@ -110,9 +110,9 @@ def desk(router: RouterProcess) -> Iterator[Desk]:
 
 
 @pytest.fixture
-def world(router: RouterProcess, desk: Desk, file: Path) -> Iterator[WorldProcess]:
+def world(router: RouterProcess, desk: Desk, three_file: Path) -> Iterator[WorldProcess]:
     carries = "world ready: point-mass at 100 Hz carries KH01, CF01, TE01; mirrors none"
-    with WorldProcess(router.endpoint, file) as made:
+    with WorldProcess(router.endpoint, three_file) as made:
         assert made.ready == f"{carries}; realm park at {router.endpoint}"
         desk.until(lambda: len(desk.at) == 3 and desk.world, "everybody is there")
         yield made
@@ -175,7 +175,9 @@ def test_killed_world_is_restarted_and_robots_continue(tmp_path: Path) -> None:
     assert not [event for event in trace.events if event.kind == "robot" and "lost" in event.text]
 
 
-def test_climbs_and_landings_continue_in_the_next_world(router: RouterProcess, watcher: Watcher, file: Path) -> None:
+def test_climbs_and_landings_continue_in_the_next_world(
+    router: RouterProcess, watcher: Watcher, three_file: Path
+) -> None:
     both = ("CF01", "TE01")
 
     def height(name: str) -> float:
@@ -183,13 +185,13 @@ def test_climbs_and_landings_continue_in_the_next_world(router: RouterProcess, w
 
     def again(killed: WorldProcess) -> WorldProcess:
         killed.kill()
-        made = worlds.enter_context(WorldProcess(router.endpoint, file))
+        made = worlds.enter_context(WorldProcess(router.endpoint, three_file))
         assert "CF01" in made.ready.rpartition(";")[2], "it asks them where they were"
         return made
 
     with ExitStack() as worlds:
-        world = worlds.enter_context(WorldProcess(router.endpoint, file))
-        with RobotProcess(router.endpoint, file, *both):
+        world = worlds.enter_context(WorldProcess(router.endpoint, three_file))
+        with RobotProcess(router.endpoint, three_file, *both):
             watcher.until_all("ready", *both)
             watcher.give(messages.Order("takeoff"), *both)
             watcher.until(lambda: min(map(height, both)) > 0.25, "they climb")
@@ -245,11 +247,11 @@ def test_robots_without_commands_hold_and_then_land(world: WorldProcess, desk: D
 
 
 @pytest.mark.usefixtures("world")
-def test_second_world_and_useless_world_are_refused(router: RouterProcess, file: Path) -> None:
+def test_second_world_and_useless_world_are_refused(router: RouterProcess, three_file: Path) -> None:
     for arguments, reason in (
-        ((file,), "zenpark: a world runs in the realm 'park' already: end it first, choose another"),
+        ((three_file,), "zenpark: a world runs in the realm 'park' already: end it first, choose another"),
         (("triangle",), "no robot of this experiment lives in a world"),
-        ((file, "--engine", "pymonk"), "did you mean 'pymunk'?"),
+        ((three_file, "--engine", "pymonk"), "did you mean 'pymunk'?"),
     ):
         refused = WorldProcess(router.endpoint, *arguments)
         assert refused.wait() == 2
@@ -257,9 +259,9 @@ def test_second_world_and_useless_world_are_refused(router: RouterProcess, file:
 
 
 def test_world_ordered_to_end_waits_for_robots(
-    world: WorldProcess, router: RouterProcess, watcher: Watcher, file: Path
+    world: WorldProcess, router: RouterProcess, watcher: Watcher, three_file: Path
 ) -> None:
-    with RobotProcess(router.endpoint, file, "CF01") as robot:
+    with RobotProcess(router.endpoint, three_file, "CF01") as robot:
         watcher.take_off("CF01")
         world.process.terminate()
         assert robot.end() == 0
@@ -268,8 +270,8 @@ def test_world_ordered_to_end_waits_for_robots(
 
 
 def test_a_robot_of_another_process_is_seen(router: RouterProcess, desk: Desk, tmp_path: Path) -> None:
-    file = tmp_path / "mixed.toml"
-    file.write_text(
+    three_file = tmp_path / "mixed.toml"
+    three_file.write_text(
         'title = "mixed"\nduration_s = 30.0\nworld.sensor_noise = 0.0\n[robots]\n'
         'TB01 = { kind = "turtlebot3", body = "world", start = [0.0, 0.0] }\n'
         'TB02 = { kind = "turtlebot3", start = [1.0, 0.0, 3.141592653589793], ranges = "world" }\n'
@@ -278,11 +280,11 @@ def test_a_robot_of_another_process_is_seen(router: RouterProcess, desk: Desk, t
     def ahead(robot: str, wanted: float) -> bool:
         return desk.ranges[robot].distance[0] == pytest.approx(wanted, abs=1e-3)
 
-    with WorldProcess(router.endpoint, file) as world:
+    with WorldProcess(router.endpoint, three_file) as world:
         assert "carries TB01; mirrors TB02" in world.ready
         desk.until(lambda: "TB01" in desk.ranges and desk.world, "it looks ahead")
         assert ahead("TB01", 2.0), "the wall"
-        with RobotProcess(router.endpoint, file, "TB02") as robot:
+        with RobotProcess(router.endpoint, three_file, "TB02") as robot:
             desk.until(lambda: desk.world and desk.world.mirrored == ["TB02"], "the other is there")
             for name in ("TB01", "TB02"):
                 desk.until(lambda name=name: ahead(name, 1.0 - 0.105), "it is seen, and sees")

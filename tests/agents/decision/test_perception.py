@@ -47,7 +47,7 @@ class Sight:
         return self.perception.near.things[: self.perception.near.count]
 
 
-def places(things):
+def places_of(things):
     return [pytest.approx((thing.x, thing.y), abs=1e-12) for thing in things]
 
 
@@ -151,7 +151,7 @@ def test_lost_robot_knows_of_nothing(how):
 def test_ray_ends_where_it_points():
     scan = rays([0.0, pi / 2, 1.0], [0.4, 0.9, nan])
     things, c, s = Sight().sense(0.0, (1.0, 2.0, 0.0), yaw=0.5, scan=scan), cos(0.5), sin(0.5)
-    assert places(things) == [(1 + 0.4 * c, 2 + 0.4 * s), (1 - 0.9 * s, 2 + 0.9 * c)]
+    assert places_of(things) == [(1 + 0.4 * c, 2 + 0.4 * s), (1 - 0.9 * s, 2 + 0.9 * c)]
     assert not any(thing.radius or thing.is_robot or thing.velocity_x for thing in things)
 
 
@@ -165,15 +165,15 @@ def test_ray_ends_where_it_points():
 def test_ray_without_direction_or_length_is_ignored(wrong):
     ray = {"bearing": 1.0, "elevation": 0.0, "distance": 0.4} | wrong
     scan = rays([ray["bearing"], 0.0], [ray["distance"], 0.9], elevation=[ray["elevation"], 0.0])
-    assert places(Sight().sense(0.0, scan=scan)) == [(0.9, 0.0)]
+    assert places_of(Sight().sense(0.0, scan=scan)) == [(0.9, 0.0)]
 
 
 def test_seen_things_stay_until_replaced_or_old():
     sight, scan = Sight(), rays([0.0, 1.0], [0.5, 0.6], time=1.0)
     seen = [(0.5, 0.0), (0.6 * cos(1), 0.6 * sin(1))]
-    assert places(sight.sense(1.0, scan=scan)) == seen
+    assert places_of(sight.sense(1.0, scan=scan)) == seen
     moved = (0.04, 0.01, 0.0)
-    assert places(sight.sense(1.15, moved, yaw=0.7, scan=scan)) == seen
+    assert places_of(sight.sense(1.15, moved, yaw=0.7, scan=scan)) == seen
     assert sight.sense(1.0 + SCAN_S + 0.01, moved, scan=scan) == []
     assert len(sight.sense(1.3, moved, scan=rays([0.0, 1.0], [0.5, nan], time=1.3))) == 1
     assert sight.sense(1.4, moved) == []  # a body without readings
@@ -181,7 +181,7 @@ def test_seen_things_stay_until_replaced_or_old():
 
 def test_late_scan_is_laid_where_the_robot_was():
     scan = rays([0.0], [0.5], time=4.9)
-    assert places(Sight().sense(5.0, (1.0, 0.0, 0.0), velocity=(0.2, 0.0, 0.0), scan=scan)) == [(1.48, 0.0)]
+    assert places_of(Sight().sense(5.0, (1.0, 0.0, 0.0), velocity=(0.2, 0.0, 0.0), scan=scan)) == [(1.48, 0.0)]
 
 
 def test_rays_that_look_up_are_left_out():

@@ -83,7 +83,7 @@ def hear(bench, order=1, *, silent=True):
             bench.neighbours.receive(link, (x + swing, y - swing, z), velocity, t, t, yaw=0.3, said=said)
 
 
-def drive(bench):
+def follow_setpoint(bench):
     """Follow the last setpoint, as wheels do, and see a wall."""
     v, omega, *_ = bench.robot.setpoint
     x, y, z = bench.position
@@ -96,7 +96,7 @@ def drive(bench):
 
 def tick(bench):
     hear(bench)
-    drive(bench)
+    follow_setpoint(bench)
 
 
 def lives(given, company):
@@ -142,7 +142,7 @@ def test_losses_restarts_and_unknown_positions(group, name):
     bench.neighbours.mark_alive(0)
     bench.step(0.3, watched)
     bench.neighbours.discard_pose(1)  # a new process, without a pose at first
-    bench.step(0.3, drive).step(0.3, watched)
+    bench.step(0.3, follow_setpoint).step(0.3, watched)
     place = bench.position
     for unknown in (UNKNOWN, (nan, 0.0, 0.0)):
         bench.position = unknown
@@ -167,7 +167,7 @@ REMEMBERING = [name for name in registry.names(LAWS) if not issubclass(registry.
 
 def talk(bench, order=1):
     hear(bench, order, silent=False)
-    drive(bench)
+    follow_setpoint(bench)
 
 
 def known(memory):
@@ -189,12 +189,12 @@ def test_laws_that_remember_keep_what_they_know(name):
 
     for link in (0, 1):  # one, then all
         bench.neighbours.mark_lost(link, bench.t)
-        bear(1.5, drive)
+        bear(1.5, follow_setpoint)
     for link in (0, 1):
         bench.neighbours.mark_alive(link)
         bear(0.5, talk)
     bench.neighbours.discard_pose(1)
-    bear(0.5, drive)
+    bear(0.5, follow_setpoint)
     bear(0.5, hear)  # poses without words
     place, bench.position = bench.position, UNKNOWN
     bear(0.3, talk)
@@ -207,7 +207,7 @@ def test_laws_that_remember_keep_what_they_know(name):
         return bench.neighbours.all[0].said
 
     unknown = say(nan, 0.0)
-    bear(0.5, drive)
+    bear(0.5, follow_setpoint)
     assert say(9.0, 1.0) is unknown  # late words are left out
 
 

@@ -12,7 +12,7 @@ from tests.bridges.khepera4.lab import Lab
 
 
 @pytest.fixture
-def lab(monkeypatch):
+def begin_lab(monkeypatch):
     made = []
 
     def begin(server, **parts):
@@ -25,128 +25,128 @@ def lab(monkeypatch):
 
 
 @pytest.fixture(params=protocol.PARK)
-def robot(lab, request):
+def served(begin_lab, request):
     """A robot with each of the servers."""
-    return lab(request.param)
+    return begin_lab(request.param)
 
 
 @pytest.mark.parametrize(("goal", "seconds"), [((0.6, 0.0), 15.0), ((0.3, 0.3), 12.0)])
-def test_motion_within_5_percent_of_what_was_asked(robot, goal, seconds):
-    robot.go_to(goal, seconds)
-    x, y, _ = robot.truth
+def test_motion_within_5_percent_of_what_was_asked(served, goal, seconds):
+    served.go_to(goal, seconds)
+    x, y, _ = served.truth
     assert math.hypot(x - goal[0], y - goal[1]) < 0.05 * math.hypot(*goal)
-    assert (robot.odometer.x, robot.odometer.y) == pytest.approx((x, y), abs=0.006)
-    assert robot.stands()
+    assert (served.odometer.x, served.odometer.y) == pytest.approx((x, y), abs=0.006)
+    assert served.stands()
 
 
-def test_a_goal_behind_is_reached(robot):
-    robot.go_to((-0.3, 0.05), 18.0)
-    assert robot.truth[:2] == pytest.approx((-0.3, 0.05), abs=0.015)
+def test_a_goal_behind_is_reached(served):
+    served.go_to((-0.3, 0.05), 18.0)
+    assert served.truth[:2] == pytest.approx((-0.3, 0.05), abs=0.015)
 
 
-def test_speeds_are_those_that_were_asked_for(robot):
-    robot.exchange(0.08, 0.3, periods=10)
-    x, y, yaw = robot.truth
-    robot.exchange(0.08, 0.3, periods=50)
-    now = robot.truth
+def test_speeds_are_those_that_were_asked_for(served):
+    served.exchange(0.08, 0.3, periods=10)
+    x, y, yaw = served.truth
+    served.exchange(0.08, 0.3, periods=50)
+    now = served.truth
     assert now[2] - yaw == pytest.approx(0.6, rel=0.05)
     chord = 0.08 / 0.3 * 2.0 * math.sin(0.3)
     assert math.hypot(now[0] - x, now[1] - y) == pytest.approx(chord, rel=0.05)
-    assert robot.odometer.yaw == pytest.approx(now[2], abs=0.02)
+    assert served.odometer.yaw == pytest.approx(now[2], abs=0.02)
 
 
-def test_link_gap_ends_in_stop_over_same_connection(robot):
-    robot.exchange(0.1, periods=25)
-    begin, x = robot.now, robot.truth[0]
-    robot.gap_until = begin + 0.7
+def test_link_gap_ends_in_stop_over_same_connection(served):
+    served.exchange(0.1, periods=25)
+    begin, x = served.now, served.truth[0]
+    served.gap_until = begin + 0.7
     with pytest.raises(TimeoutError):
-        robot.exchange(0.1)
-    robot.driver.patience_s = 0.2  # as `Khepera4Link` does
+        served.exchange(0.1)
+    served.driver.patience_s = 0.2  # as `Khepera4Link` does
     while True:
         try:
-            robot.exchange(0.0)
+            served.exchange(0.0)
             break
         except TimeoutError:
-            assert robot.now < begin + 1.5
-    robot.sleep(0.1)
-    assert robot.stands()
-    assert robot.truth[0] - x < 0.1  # all that it drove since the gap began
-    assert robot.odometer.x == pytest.approx(robot.truth[0], abs=0.02)  # what it drove unheard is estimated
+            assert served.now < begin + 1.5
+    served.sleep(0.1)
+    assert served.stands()
+    assert served.truth[0] - x < 0.1  # all that it drove since the gap began
+    assert served.odometer.x == pytest.approx(served.truth[0], abs=0.02)  # what it drove unheard is estimated
 
 
-def test_command_that_waited_too_long_becomes_a_stop(robot):
-    robot.exchange(0.1, periods=25)
-    robot.driver.drive(0.1, 0.0, robot.now - 0.1)  # the process was suspended between decision and sending
-    robot.driver.move(robot.odometer)
-    robot.sleep(0.2)
-    assert robot.stands()
+def test_command_that_waited_too_long_becomes_a_stop(served):
+    served.exchange(0.1, periods=25)
+    served.driver.drive(0.1, 0.0, served.now - 0.1)  # the process was suspended between decision and sending
+    served.driver.move(served.odometer)
+    served.sleep(0.2)
+    assert served.stands()
 
 
-def test_nothing_sent_looks_like_a_goal_to_servers(robot):
-    robot.exchange(0.1, periods=5)
-    goals = [read for read in robot.heard if read[:1] == b"g"]
-    assert not robot.driver.ranged
-    assert bool(goals) == (not robot.driver.server.drives)
+def test_nothing_sent_looks_like_a_goal_to_servers(served):
+    served.exchange(0.1, periods=5)
+    goals = [read for read in served.heard if read[:1] == b"g"]
+    assert not served.driver.ranged
+    assert bool(goals) == (not served.driver.server.drives)
     assert b"get_data" not in goals
 
 
-def test_way_during_machine_sleep_is_counted(robot):
+def test_way_during_machine_sleep_is_counted(served):
     """The robot drives on; the machine's monotonic clock leaves the sleep out, its uptime does not."""
-    robot.exchange(0.1, periods=25)
-    x, counted = robot.truth[0], robot.odometer.x
-    robot.sleep(10.0)
-    robot.monotonic = lambda: robot.now - 10.0
-    robot.exchange(0.0, periods=25)
-    assert robot.odometer.x - counted == pytest.approx(robot.truth[0] - x, abs=0.1)
+    served.exchange(0.1, periods=25)
+    x, counted = served.truth[0], served.odometer.x
+    served.sleep(10.0)
+    served.monotonic = lambda: served.now - 10.0
+    served.exchange(0.0, periods=25)
+    assert served.odometer.x - counted == pytest.approx(served.truth[0] - x, abs=0.1)
 
 
-def test_way_that_is_reported_late_is_counted_once(lab):
-    robot = lab("2023-01-07")
-    robot.driver.patience_s = 0.2
-    robot.exchange(0.2)
-    robot.gap_until = robot.now + 0.5
+def test_way_that_is_reported_late_is_counted_once(begin_lab):
+    served = begin_lab("2023-01-07")
+    served.driver.patience_s = 0.2
+    served.exchange(0.2)
+    served.gap_until = served.now + 0.5
     for _ in range(2):
         with pytest.raises(TimeoutError):
-            robot.exchange(0.0)
-    robot.sleep(0.3)
-    robot.exchange(0.0, periods=20)
-    assert robot.odometer.x == pytest.approx(robot.truth[0], abs=0.001)
+            served.exchange(0.0)
+    served.sleep(0.3)
+    served.exchange(0.0, periods=20)
+    assert served.odometer.x == pytest.approx(served.truth[0], abs=0.001)
 
 
 @pytest.mark.parametrize("server", ["2023-04-10", "2025-05"])
-def test_server_that_gives_its_year_is_identified(lab, server):
-    assert lab(server, named=False).driver.server == protocol.PARK[server]
+def test_server_that_gives_its_year_is_identified(begin_lab, server):
+    assert begin_lab(server, named=False).driver.server == protocol.PARK[server]
 
 
 @pytest.mark.parametrize("server", ["2023-01-07", "2023-01-15", "fork"])
-def test_ambiguous_server_is_asked_for_and_not_driven(lab, server):
+def test_ambiguous_server_is_asked_for_and_not_driven(begin_lab, server):
     with pytest.raises(WrongServer, match=r'2023-01-07, 2023-01-15, fork do: .* device = { server = "2023-01-07" }'):
-        lab(server, named=False)
+        begin_lab(server, named=False)
 
 
-def test_server_other_than_the_named_is_refused(lab):
-    robot = lab("2025-05")
+def test_server_other_than_the_named_is_refused(begin_lab):
+    served = begin_lab("2025-05")
     with pytest.raises(WrongServer, match="as the server of 2025-05 does, not that of 2023-01-07"):
-        drivers.identify(robot, protocol.Khepera4Settings(server="2023-01-07"), "2023-01-07")
-    robot.program.kind = protocol.ParkServer("pose", 3, drives=True, per_turn=False, clients=1)
+        drivers.identify(served, protocol.Khepera4Settings(server="2023-01-07"), "2023-01-07")
+    served.program.kind = protocol.ParkServer("pose", 3, drives=True, per_turn=False, clients=1)
     with pytest.raises(WrongServer, match="as no known server does"):
-        drivers.identify(robot, protocol.Khepera4Settings(), None)
-    assert set(robot.heard) == {b"stop", b"p"}
+        drivers.identify(served, protocol.Khepera4Settings(), None)
+    assert set(served.heard) == {b"stop", b"p"}
 
 
-def test_first_answer_may_take_seconds(lab):
+def test_first_answer_may_take_seconds(begin_lab):
     """A server of 2023 has one client in its life: one that does not wait for its answer is lost."""
-    robot = lab("2025-05")
-    receive = robot.receive
+    served = begin_lab("2025-05")
+    receive = served.receive
 
     def late(until):
-        if until < robot.now + 2.5:
+        if until < served.now + 2.5:
             raise TimeoutError
-        robot.sleep(2.5)
+        served.sleep(2.5)
         return receive(until)
 
-    robot.receive = late
-    assert drivers.identify(robot, protocol.Khepera4Settings(), None).server == protocol.PARK["2025-05"]
+    served.receive = late
+    assert drivers.identify(served, protocol.Khepera4Settings(), None).server == protocol.PARK["2025-05"]
 
 
 def test_endless_input_holds_no_thread():

@@ -100,7 +100,7 @@ def faults():
     return told
 
 
-def refusal(address):
+def refused_open(address):
     """Why a body cannot be opened."""
     try:
         TelloBody(reached(ONE, [address])).open()
@@ -114,9 +114,9 @@ def refusals():
     told = {}
     with socket.socket(type=socket.SOCK_DGRAM) as other:  # another program that flies Tellos
         other.bind(("", 8889))
-        told["second"] = refusal(NOBODY)
+        told["second"] = refused_open(NOBODY)
     begin = time.monotonic()
-    told |= {"absent": refusal(NOBODY), "seconds": time.monotonic() - begin}
+    told |= {"absent": refused_open(NOBODY), "seconds": time.monotonic() - begin}
     with Served(TelloDevice, ONE) as served:
         driver = piloted(ONE, served)
         truth, driver.truth = driver.truth, None

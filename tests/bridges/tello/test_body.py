@@ -134,7 +134,7 @@ def test_telemetry_outlives_bytes_of_nonsense():
 # ---------------------------------------------------------------------- djitellopy and twins
 
 
-def fly(scenario):
+def report_of(scenario):
     """Report of a scenario; the ports of djitellopy are the host's, so they take turns."""
     command = [sys.executable, "-m", "tests.bridges.tello.scenarios", scenario]
     with (Path(tempfile.gettempdir()) / "zenpark-tello.lock").open("w") as lock:
@@ -146,7 +146,7 @@ def fly(scenario):
 
 @pytest.mark.system
 def test_the_unmodified_library_flies_two_twins():
-    told = fly("vendor")
+    told = report_of("vendor")
     assert (told["sdk"], told["battery"], told["serial"]) == ("20", 100, "0TQTWIN0001")
     assert (told["grounded"], told["unknown"]) == ("error Motor stop", "unknown command: dance")
     assert told["height"] == pytest.approx([0.8, 0.8], abs=0.05)
@@ -161,7 +161,7 @@ def test_the_unmodified_library_flies_two_twins():
 
 @pytest.mark.system
 def test_the_bridge_flies_two_twins():
-    told = fly("formation")
+    told = report_of("formation")
     assert told["height"] == 0.0
     assert told["error"] < 0.02
     assert told["velocity"] < 0.2
@@ -173,7 +173,7 @@ def test_the_bridge_flies_two_twins():
 @pytest.mark.mechanism("Tello bridge: one of several fails")
 @pytest.mark.system
 def test_fault_of_one_drone_leaves_others_flying():
-    told = fly("faults")
+    told = report_of("faults")
     assert told["opened"] > 1.0
     assert told["flying"] == [True, True, True, True, False, False]
     assert (told["absent"], told["absent takeoff"], told["blind"]) == ("no answer", "no answer", True)
@@ -187,7 +187,7 @@ def test_fault_of_one_drone_leaves_others_flying():
 
 @pytest.mark.system
 def test_what_does_not_take_off_says_why():
-    told = fly("refusals")
+    told = report_of("refusals")
     assert told["seconds"] < 5.0
     assert told["absent"].startswith("R0 at 127.0.0.77:18889: no answer (switch it on, join its Wi-Fi")
     assert told["nowhere"].startswith("no take-off: no fresh external position")

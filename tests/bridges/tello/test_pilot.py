@@ -14,7 +14,7 @@ SPEED = st.floats(-1.0, 1.0)
 
 
 @pytest.fixture
-def standing():
+def grounded():
     return Cockpit()
 
 
@@ -41,47 +41,47 @@ def test_sticks_by_hand():
 # ---------------------------------------------------------------------- take-off
 
 
-def test_take_off_is_sent_once_and_answered_aloft(standing):
-    standing.pass_(0.2).responses.append(b"ok")  # of something that was said before
-    standing.take_off(0.6, rested_s=0.0).pass_(0.5)
-    assert (standing.flying, standing.duty) == (True, Duty.RISE)
-    standing.answer(b"ok").pass_(2.9)  # too early: no drone is up by then
-    assert standing.duty is Duty.RISE
-    standing.answer(b"ok\r\n")
-    assert standing.duty is Duty.HOLD
-    assert standing.said == ["takeoff"]
+def test_take_off_is_sent_once_and_answered_aloft(grounded):
+    grounded.pass_(0.2).responses.append(b"ok")  # of something that was said before
+    grounded.take_off(0.6, rested_s=0.0).pass_(0.5)
+    assert (grounded.flying, grounded.duty) == (True, Duty.RISE)
+    grounded.answer(b"ok").pass_(2.9)  # too early: no drone is up by then
+    assert grounded.duty is Duty.RISE
+    grounded.answer(b"ok\r\n")
+    assert grounded.duty is Duty.HOLD
+    assert grounded.said == ["takeoff"]
 
 
 @pytest.mark.parametrize("answer", [b"error", b"out of range", b"unknown command: takeoff"])
-def test_a_drone_that_refuses_says_so(standing, answer):
-    standing.take_off(0.6).answer(answer)
-    assert standing.duty is Duty.REST
-    assert "refuses to take off" in standing.note
+def test_a_drone_that_refuses_says_so(grounded, answer):
+    grounded.take_off(0.6).answer(answer)
+    assert grounded.duty is Duty.REST
+    assert "refuses to take off" in grounded.note
 
 
-def test_refused_second_take_off_means_it_flies(standing):
-    standing.take_off(0.6).pass_(2.0, h=80).answer(b"error")
-    assert standing.duty is Duty.HOLD
+def test_refused_second_take_off_means_it_flies(grounded):
+    grounded.take_off(0.6).pass_(2.0, h=80).answer(b"error")
+    assert grounded.duty is Duty.HOLD
 
 
-def test_lost_answers_and_lost_commands(standing):
-    standing.take_off(0.6).pass_(6.5)  # nothing happens: the command was lost
-    assert standing.said == ["takeoff", "takeoff"]
-    standing.pass_(6.5, h=80, time=6)  # it is up: the answer was lost
-    assert standing.duty is Duty.HOLD
-    standing.land()
-    standing.pass_(2.2)
-    assert standing.said[2:] == ["land", "land", "land"]
-    standing.pass_(3.3, h=10)  # it is down, its motors' clock stands
-    assert (standing.duty, standing.flying) == (Duty.REST, False)
+def test_lost_answers_and_lost_commands(grounded):
+    grounded.take_off(0.6).pass_(6.5)  # nothing happens: the command was lost
+    assert grounded.said == ["takeoff", "takeoff"]
+    grounded.pass_(6.5, h=80, time=6)  # it is up: the answer was lost
+    assert grounded.duty is Duty.HOLD
+    grounded.land()
+    grounded.pass_(2.2)
+    assert grounded.said[2:] == ["land", "land", "land"]
+    grounded.pass_(3.3, h=10)  # it is down, its motors' clock stands
+    assert (grounded.duty, grounded.flying) == (Duty.REST, False)
 
 
-def test_a_drone_that_never_gets_up_is_landed(standing):
-    standing.take_off(0.6).pass_(20.2)
-    assert standing.said[-1] == "land"
-    standing.pass_(1.2)  # it may have obeyed the last of the orders to take off, 3 s ago
-    assert not standing.flying
-    assert "did not take off in 20 s" in standing.note
+def test_a_drone_that_never_gets_up_is_landed(grounded):
+    grounded.take_off(0.6).pass_(20.2)
+    assert grounded.said[-1] == "land"
+    grounded.pass_(1.2)  # it may have obeyed the last of the orders to take off, 3 s ago
+    assert not grounded.flying
+    assert "did not take off in 20 s" in grounded.note
 
 
 # ---------------------------------------------------------------------- flight
@@ -160,16 +160,16 @@ def test_what_ends_a_flight_is_said(attended, seconds, report, duty, note):
     assert cockpit.pilot.battery == cockpit.report["bat"] / 100.0
 
 
-def test_drone_that_flies_unordered_is_landed(standing):
-    standing.pass_(5.0).pass_(5.0, h=120)
-    assert not standing.flying, "carried: its motors stand"
-    standing.report["h"] = 0
+def test_drone_that_flies_unordered_is_landed(grounded):
+    grounded.pass_(5.0).pass_(5.0, h=120)
+    assert not grounded.flying, "carried: its motors stand"
+    grounded.report["h"] = 0
     for second in range(1, 4):
-        standing.pass_(1.0, time=second)
-    assert (standing.duty, standing.flying) == (Duty.REST, False)  # low: carried, or on the floor
-    standing.pass_(0.1, h=80)
-    assert (standing.said[-1], standing.flying) == ("land", True)
-    assert standing.note == "landing: it flew without an order"
+        grounded.pass_(1.0, time=second)
+    assert (grounded.duty, grounded.flying) == (Duty.REST, False)  # low: carried, or on the floor
+    grounded.pass_(0.1, h=80)
+    assert (grounded.said[-1], grounded.flying) == ("land", True)
+    assert grounded.note == "landing: it flew without an order"
 
 
 def test_refused_sticks_are_counted(airborne):
@@ -188,12 +188,12 @@ def test_a_network_that_is_down_is_named(airborne):
     assert airborne.pass_(0.2).note == ""
 
 
-def test_yaw_counts_from_where_it_was_opened(standing):
-    assert standing.pass_(0.2).pilot.turned == 0.0
-    assert standing.pass_(0.2, yaw=-70).pilot.turned == pytest.approx(np.pi / 2), "clockwise is positive to the drone"
-    standing.pass_(0.2, yaw="garbled", bat=None, h="", time=1.5)
-    assert standing.pilot.turned == pytest.approx(np.pi / 2)
-    assert standing.pilot.battery == 0.8
+def test_yaw_counts_from_where_it_was_opened(grounded):
+    assert grounded.pass_(0.2).pilot.turned == 0.0
+    assert grounded.pass_(0.2, yaw=-70).pilot.turned == pytest.approx(np.pi / 2), "clockwise is positive to the drone"
+    grounded.pass_(0.2, yaw="garbled", bat=None, h="", time=1.5)
+    assert grounded.pilot.turned == pytest.approx(np.pi / 2)
+    assert grounded.pilot.battery == 0.8
 
 
 # ---------------------------------------------------------------------- landing
@@ -240,13 +240,13 @@ def test_refused_landing_is_repeated_until_down():
     assert not climber.flying
 
 
-def test_landing_before_the_motors_start_is_repeated(standing):
+def test_landing_before_the_motors_start_is_repeated(grounded):
     """A drone that rested for long and has just been told to take off is not on the ground for that."""
-    standing.take_off(0.8, rested_s=10.0).pass_(0.1)
-    standing.land()
-    standing.answer(b"ok").pass_(1.0)  # of anything but a landing: no drone is down again so soon
-    assert standing.duty is Duty.LAND
-    assert standing.said[-2:] == ["land", "land"]
+    grounded.take_off(0.8, rested_s=10.0).pass_(0.1)
+    grounded.land()
+    grounded.answer(b"ok").pass_(1.0)  # of anything but a landing: no drone is down again so soon
+    assert grounded.duty is Duty.LAND
+    assert grounded.said[-2:] == ["land", "land"]
 
 
 def test_drone_that_does_not_land_rests_its_sticks(airborne):
@@ -258,17 +258,17 @@ def test_drone_that_does_not_land_rests_its_sticks(airborne):
     assert airborne.answer(b"error").sticks == [(0, 0, 0, 0)] * 2
 
 
-def test_height_of_motion_capture_counts_in_the_air(standing):
+def test_height_of_motion_capture_counts_in_the_air(grounded):
     """A drone without a counter of motor seconds whose own height stays at zero."""
-    del standing.report["time"]
-    standing.take_off(1.0, at=(0.0, 0.0, 0.05)).pass_(3.0)
-    standing.responses.append(b"ok")
-    standing.pilot.position = (0.0, 0.0, 1.0)
-    assert standing.pass_(5.0).duty is Duty.HOLD
-    standing.land()
-    assert standing.answer(b"ok").duty is Duty.LAND
-    standing.pilot.position = (0.0, 0.0, 0.05)
-    assert standing.pass_(3.2).duty is Duty.REST
+    del grounded.report["time"]
+    grounded.take_off(1.0, at=(0.0, 0.0, 0.05)).pass_(3.0)
+    grounded.responses.append(b"ok")
+    grounded.pilot.position = (0.0, 0.0, 1.0)
+    assert grounded.pass_(5.0).duty is Duty.HOLD
+    grounded.land()
+    assert grounded.answer(b"ok").duty is Duty.LAND
+    grounded.pilot.position = (0.0, 0.0, 0.05)
+    assert grounded.pass_(3.2).duty is Duty.REST
 
 
 def test_silent_drone_is_landed_until_surely_down(airborne):
@@ -317,13 +317,13 @@ def test_silent_drone_is_stopped_until_surely_landed(airborne):
     assert "landed by itself" in airborne.note
 
 
-def test_standing_drone_answers_a_stop_at_once(standing):
-    standing.pass_(2.0).cut()
-    assert standing.said[-1] == "emergency"
-    assert not standing.pass_(0.05).flying
+def test_standing_drone_answers_a_stop_at_once(grounded):
+    grounded.pass_(2.0).cut()
+    assert grounded.said[-1] == "emergency"
+    assert not grounded.pass_(0.05).flying
 
 
-def test_stopped_take_off_counts_as_flying_until_standing(standing):
-    standing.take_off(0.6, rested_s=5.0).pass_(0.1).cut()  # its motors' clock has not moved yet
-    assert standing.pass_(1.4).flying
-    assert not standing.pass_(0.5).flying
+def test_stopped_take_off_counts_as_flying_until_standing(grounded):
+    grounded.take_off(0.6, rested_s=5.0).pass_(0.1).cut()  # its motors' clock has not moved yet
+    assert grounded.pass_(1.4).flying
+    assert not grounded.pass_(0.5).flying

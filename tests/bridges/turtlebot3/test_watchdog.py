@@ -123,7 +123,7 @@ spin = lambda node: time.sleep(600)
 }
 
 
-def written(path: Path, text: str, *, runs: bool = False) -> Path:
+def write(path: Path, text: str, *, runs: bool = False) -> Path:
     """A file in a folder that may be new."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text)
@@ -133,23 +133,23 @@ def written(path: Path, text: str, *, runs: bool = False) -> Path:
 
 
 @pytest.fixture
-def robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+def robot_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """The home folder of a robot with a real sshd on loopback, a ROS of ours, and no cron; ssh finds it as `robot`."""
     if not Path(SSHD).exists() or shutil.which("ssh-keygen") is None:
         pytest.skip("needs openssh-server")
     home, site, bin_ = tmp_path / "home", tmp_path / "site", tmp_path / "bin"
     home.mkdir()
     for name, text in ROS.items():
-        written(site / name, text)
-    written(site / "setup.sh", f"export PYTHONPATH={site}\n")
+        write(site / name, text)
+    write(site / "setup.sh", f"export PYTHONPATH={site}\n")
     table = f'#!/bin/sh\n[ "$1" = -l ] && exec cat {home}/crontab\nexec cat > {home}/crontab\n'
-    written(bin_ / "crontab", table, runs=True)
+    write(bin_ / "crontab", table, runs=True)
     for name in ("host_key", "key"):
         subprocess.run(["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", str(tmp_path / name)], check=True)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    config = written(
+    config = write(
         tmp_path / "sshd_config",
         f"Port {port}\nListenAddress 127.0.0.1\nHostKey {tmp_path}/host_key\nAuthorizedKeysFile {tmp_path}/key.pub\n"
         f"PidFile {tmp_path}/sshd.pid\nPasswordAuthentication no\nUsePAM no\nStrictModes no\n"
@@ -158,12 +158,12 @@ def robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     Path("/run/sshd").mkdir(exist_ok=True)
     with (tmp_path / "sshd.log").open("wb") as log:
         sshd = subprocess.Popen([SSHD, "-D", "-e", "-f", str(config)], stdin=subprocess.DEVNULL, stdout=log, stderr=log)
-    ours = written(
+    ours = write(
         tmp_path / "ssh_config",
         f"Host robot\n HostName 127.0.0.1\n Port {port}\n User {getpass.getuser()}\n IdentityFile {tmp_path}/key\n"
         f" StrictHostKeyChecking no\n UserKnownHostsFile {tmp_path}/known\n",
     )
-    ssh = written(tmp_path / "ours" / "ssh", f'#!/bin/sh\nexec {shutil.which("ssh")} -F {ours} "$@"\n', runs=True)
+    ssh = write(tmp_path / "ours" / "ssh", f'#!/bin/sh\nexec {shutil.which("ssh")} -F {ours} "$@"\n', runs=True)
     monkeypatch.setenv("PATH", f"{ssh.parent}:{os.environ['PATH']}")
     until((tmp_path / "sshd.pid").exists, "its sshd runs")
     yield home
@@ -176,26 +176,26 @@ def robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 @pytest.mark.mechanism("TurtleBot3: watchdog on the robot")
 @pytest.mark.system
-def test_watchdog_is_installed_kept_and_removed_over_ssh(robot: Path) -> None:
+def test_watchdog_is_installed_kept_and_removed_over_ssh(robot_home: Path) -> None:
     for attempt in range(2):  # a second time replaces the first
         said = installation.put_watchdog("robot", namespace="tb3_0", domain=30, silence_s=0.5)
         assert "it is started at each boot (crontab -l)" in said
         assert "watches cmd_vel (geometry_msgs/msg/TwistStamped): stops the robot after 0.5 s" in said[-1], attempt
         assert "__ns:=/tb3_0" in said[-1]
-    folder = robot / "zenpark-watchdog"
-    assert (robot / "crontab").read_text() == f"@reboot {folder}/run\n"
+    folder = robot_home / "zenpark-watchdog"
+    assert (robot_home / "crontab").read_text() == f"@reboot {folder}/run\n"
     assert (folder / "watchdog.py").read_bytes() == installation.WATCHDOG.read_bytes()
     first = int((folder / "pid").read_text())
     os.kill(first, signal.SIGKILL)
     until(lambda: int((folder / "pid").read_text() or first) != first, "it is started anew")
     assert installation.remove_watchdog("robot") == ["removed"]
     assert not folder.exists()
-    assert (robot / "crontab").read_text() == ""
+    assert (robot_home / "crontab").read_text() == ""
     assert installation.remove_watchdog("robot") == ["there is none"]
 
 
 @pytest.mark.system
-def test_a_robot_without_ros_is_named(robot: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_robot_without_ros_is_named(robot_home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         installation, "PUT_WATCHDOG", installation.PUT_WATCHDOG.replace("${ROS_SETUP:-$setup}", "$setup")
     )

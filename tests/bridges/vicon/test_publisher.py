@@ -37,7 +37,7 @@ def frame(number=1, *, latency=0.0, z_up=True, **poses):
 
 
 @pytest.fixture
-def said():
+def printed():
     """Lines for users."""
     return []
 
@@ -45,14 +45,16 @@ def said():
 class Stream(ManualClock):
     """A reader of the DataStream and its clock: a frame every 10 ms, the same one again and again from `last` on."""
 
-    def __init__(self, monkeypatch, said, last=math.inf):
+    def __init__(self, monkeypatch, printed, last=math.inf):
         super().__init__(5.0)
         self.number, self._last, self.published = 0, last, []
         self.wall_step = 0.0
         monkeypatch.setattr(time, "clock_gettime", lambda _: self.now)
         monkeypatch.setattr(time, "time", lambda: 1.8e9 + self.now + self.wall_step)
-        pose_filter = PoseFilter({"CF01": "CF01"}, said.append)
-        self.bridge = Bridge("nowhere", 1, pose_filter, self.publish, said.append, connect=lambda *_: self, pause_s=0.0)
+        pose_filter = PoseFilter({"CF01": "CF01"}, printed.append)
+        self.bridge = Bridge(
+            "nowhere", 1, pose_filter, self.publish, printed.append, connect=lambda *_: self, pause_s=0.0
+        )
 
     def newest(self, _timeout):
         self.now += 0.01
@@ -66,8 +68,8 @@ class Stream(ManualClock):
 
 
 @pytest.mark.parametrize("step", [-1.0, 3.0])
-def test_wall_clock_step_moves_no_position(monkeypatch, said, step):
-    stream = Stream(monkeypatch, said)
+def test_wall_clock_step_moves_no_position(monkeypatch, printed, step):
+    stream = Stream(monkeypatch, printed)
     assert stream.bridge.run(lambda: stream.now > 6.0)
     stream.wall_step = step
     assert stream.bridge.run(lambda: stream.now > 7.0)
@@ -77,11 +79,11 @@ def test_wall_clock_step_moves_no_position(monkeypatch, said, step):
     assert stamps[-1] == pytest.approx(1.8e9 + stream.now, abs=1e-6)
 
 
-def test_a_frame_that_repeats_its_number_is_none(monkeypatch, said):
-    stream = Stream(monkeypatch, said, last=50)
-    assert stream.bridge.run(lambda: any("no new frame" in line for line in said))
+def test_a_frame_that_repeats_its_number_is_none(monkeypatch, printed):
+    stream = Stream(monkeypatch, printed, last=50)
+    assert stream.bridge.run(lambda: any("no new frame" in line for line in printed))
     assert [len(stream.published), stream.published[49][1]] == [50, pytest.approx(0.05)]
-    assert said[-1].startswith("lost nowhere:1: no new frame for 2 s")
+    assert printed[-1].startswith("lost nowhere:1: no new frame for 2 s")
 
 
 # ---------------------------------------------------------------------- what it believes
@@ -101,8 +103,8 @@ def test_heading_follows_the_nose_and_only_rotations(yaw, pitch, roll, scale):
         assert math.isnan(heading(wrong.ravel().tolist()))
 
 
-def test_what_was_not_seen_is_not_said(said):
-    pose_filter = PoseFilter({"CF01": "cf_1", "KH01": "kh_1"}, said.append)
+def test_what_was_not_seen_is_not_said(printed):
+    pose_filter = PoseFilter({"CF01": "cf_1", "KH01": "kh_1"}, printed.append)
     nan = Segment(0, (math.nan, 0.0, 0.0), UPRIGHT)
     flat = Segment(0, (0.0, 0.0, 0.0), (0.0,) * 9)
     (first,) = pose_filter.filter_poses(
@@ -112,9 +114,9 @@ def test_what_was_not_seen_is_not_said(said):
     for pose in (nan, flat, None):
         assert pose_filter.filter_poses(frame(cf_1=pose, kh_1=pose), 1.1) == []
     assert pose_filter.refused == 4
-    assert said == ["CF01 is seen as 'cf_1'", "KH01 is not seen: markers hidden, or subject 'kh_1' is switched off"]
+    assert printed == ["CF01 is seen as 'cf_1'", "KH01 is not seen: markers hidden, or subject 'kh_1' is switched off"]
     pose_filter.filter_poses(frame(other=(0.0, 0.0, 0.0)), 1.6)
-    assert said[2:] == [
+    assert printed[2:] == [
         "CF01: no subject 'cf_1' (there are: other); name another with --map CF01=SUBJECT",
         "KH01: no subject 'kh_1' (there are: other); name another with --map KH01=SUBJECT",
     ]
@@ -140,8 +142,8 @@ def test_jump_is_not_believed_until_it_lasts():
     assert np.sort(steps)[-2:] == pytest.approx([0.01, 1.11], abs=1e-9)
 
 
-def test_a_pose_that_repeats_itself_is_not_published(said):
-    pose_filter = PoseFilter({"CF01": "CF01"}, said.append)
+def test_a_pose_that_repeats_itself_is_not_published(printed):
+    pose_filter = PoseFilter({"CF01": "CF01"}, printed.append)
     published = [
         tick
         for tick in range(200)
@@ -150,16 +152,16 @@ def test_a_pose_that_repeats_itself_is_not_published(said):
     assert published == [*range(30), *range(50, 180)]
     frozen = "CF01: the pose of 'CF01' repeats itself to the last bit: the motion capture is frozen"
     seen = "CF01 is seen as 'CF01'"
-    assert said == [seen, frozen, seen, frozen]
+    assert printed == [seen, frozen, seen, frozen]
 
 
-def test_overtaking_frames_and_false_axes_are_left_out(said):
-    pose_filter = PoseFilter({"CF01": "CF01"}, said.append)
+def test_overtaking_frames_and_false_axes_are_left_out(printed):
+    pose_filter = PoseFilter({"CF01": "CF01"}, printed.append)
     assert len(pose_filter.filter_poses(frame(CF01=(0.0, 0.0, 1.0)), 1.00)) == 1
     assert pose_filter.filter_poses(frame(CF01=(0.0, 0.0, 1.0), latency=0.02), 1.01) == []  # measured before the last
     assert pose_filter.filter_poses(frame(CF01=(0.0, 0.0, 1.0), z_up=False), 1.02) == []
     assert len(pose_filter.filter_poses(frame(CF01=(0.0, 0.0, 1.0)), 1.03)) == 1
-    assert said[1:] == [
+    assert printed[1:] == [
         "no positions: the server's z axis does not point up; change this in its options",
         "the z axis points up",
     ]

@@ -17,7 +17,7 @@ from experiments.file.problems import DocumentError
 from tests.runs import fly
 
 
-def written(what, size, **options):
+def generated(what, size, **options):
     chosen = LayoutOptions(**options)
     return document.loads(experiment_file(layout(what, size, chosen), chosen))
 
@@ -35,7 +35,7 @@ def written(what, size, **options):
     ],
 )
 def test_files_pass_the_check(what, size, kind):
-    read = written(what, size, kind=kind)
+    read = generated(what, size, kind=kind)
     found, figures = examine(read)
     assert [each for each in found if each.severity != "note"] == []
     (numbers,) = figures.values()
@@ -54,13 +54,13 @@ def test_every_robot_and_every_link_has_a_line():
     assert sum(line.startswith("CF") for line in lines) == 100
     assert sum(line.startswith('"CF') for line in lines) == len(made.pairs)
     assert max(map(len, lines)) < 100
-    heights = [robot.hover for robot in written("hemisphere", "100").experiment.robots.values()]
+    heights = [robot.hover for robot in generated("hemisphere", "100").experiment.robots.values()]
     assert min(heights) == pytest.approx(0.4)
     assert len(set(heights)) > 90
 
 
 def test_starts_do_not_overlap_whatever_the_seed():
-    plan = written("hemisphere", "40").plan
+    plan = generated("hemisphere", "40").plan
     for seed in range(5):
         scattered, _ = bodies.scattered_poses(plan, tuple(plan.experiment.robots), seed)
         place = np.array(scattered)
@@ -72,7 +72,7 @@ def test_starts_do_not_overlap_whatever_the_seed():
 @pytest.mark.nightly
 @pytest.mark.parametrize("seed", [1, 2])
 def test_hundred_drones_form_hemisphere_from_random_starts(seed):
-    plan = written("hemisphere", "100", duration_s=25.0).plan
+    plan = generated("hemisphere", "100", duration_s=25.0).plan
     log, net = fly(plan.experiment, seed).log, plan.links
     apart = np.linalg.norm(log.true_position[:, net.receiver] - log.true_position[:, net.sender], axis=2)
     worst = np.abs(apart - net.distance).max(axis=1)[(log.time >= 0.0) & (log.time <= 25.0)]
@@ -82,7 +82,7 @@ def test_hundred_drones_form_hemisphere_from_random_starts(seed):
 
 @pytest.mark.slow
 def test_offsets_are_met_from_anywhere():
-    read = written("hemisphere", "20", law="displacement", scatter=3.0, duration_s=30.0)
+    read = generated("hemisphere", "20", law="displacement", scatter=3.0, duration_s=30.0)
     assert [found for found in check(read) if found.severity != "note"] == []
     log, links = fly(read.experiment).log, read.plan.links
     begin, end = (log.true_position[np.searchsorted(log.time, at)] for at in (0.0, 29.9))
@@ -93,8 +93,8 @@ def test_offsets_are_met_from_anywhere():
 
 @pytest.mark.slow
 def test_large_formations_say_less_of_themselves():
-    assert written("polygon", "100").experiment.rates.state_hz == 50.0
-    large = written("polygon", "1000").experiment
+    assert generated("polygon", "100").experiment.rates.state_hz == 50.0
+    large = generated("polygon", "1000").experiment
     assert large.rates.state_hz == 5.0
     assert len(large.robots) == 1000
 
@@ -115,7 +115,7 @@ def test_large_formations_say_less_of_themselves():
 )
 def test_what_cannot_be_had(what, size, wanted, said):
     with pytest.raises(LayoutError, match=said):
-        written(what, size, **wanted)
+        generated(what, size, **wanted)
 
 
 def test_generate_writes_a_file_and_never_overwrites(tmp_path):

@@ -24,12 +24,12 @@ NAMES = ("TB01", "KH01", "KH02", "KH03", "CF01", "CF02", "CF03")
 
 
 @pytest.fixture(scope="module")
-def park():
+def reference_plan():
     return Plan(reference("periodic"))
 
 
-def test_part_of_the_leader(park):
-    made = park.assignment("TB01")
+def test_part_of_the_leader(reference_plan):
+    made = reference_plan.assignment("TB01")
     assert (made.name, made.kind, made.neighbours, made.guided) == ("TB01", TURTLEBOT3, (), False)
     assert math.isnan(made.hover)
     assert made.law == Distance()
@@ -41,16 +41,16 @@ def test_part_of_the_leader(park):
     assert (leg.at, leg.planner) == (21.0, Line(move_by=[0.75, 0.0], speed_=0.15))
 
 
-def test_kinds_and_heights_of_all(park):
-    parts = [park.assignment(name) for name in NAMES]
+def test_kinds_and_heights_of_all(reference_plan):
+    parts = [reference_plan.assignment(name) for name in NAMES]
     assert [part.kind for part in parts] == [TURTLEBOT3] + [KHEPERA4] * 3 + [CRAZYFLIE] * 3
     assert [part.ground for part in parts] == [0.0] * 4 + [0.8] * 3
     assert [bool(part.legs) for part in parts] == [True] + [False] * 6
 
 
-def test_links_of_the_paper(park):
+def test_links_of_the_paper(reference_plan):
     """Eq. (11) and figure 11: 12 edges, three of them from the leader only."""
-    net = park.links
+    net = reference_plan.links
     heard = {NAMES[i]: {NAMES[j] for j in net.sender[net.receiver == i]} for i in range(7)}
     assert heard == {
         "TB01": set(),
@@ -70,16 +70,16 @@ def test_links_of_the_paper(park):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_robot_knows_its_own_links(park, name):
-    whole, row = park.links, NAMES.index(name)
+def test_robot_knows_its_own_links(reference_plan, name):
+    whole, row = reference_plan.links, NAMES.index(name)
     wanted = zip(whole.receiver.tolist(), whole.sender.tolist(), whole.distance.tolist(), strict=True)
-    made = park.assignment(name).neighbours
+    made = reference_plan.assignment(name).neighbours
     assert [(link.sender, link.distance) for link in made] == [(j, d) for i, j, d in wanted if i == row]
     assert all(link.name == NAMES[link.sender] and link.in_law for link in made)
 
 
-def test_bodies_of_other_seeds_are_alike(park):
-    made, other = bodies.body_request(park, NAMES, 5), bodies.body_request(park, NAMES, 6)
+def test_bodies_of_other_seeds_are_alike(reference_plan):
+    made, other = bodies.body_request(reference_plan, NAMES, 5), bodies.body_request(reference_plan, NAMES, 6)
     assert made.names == NAMES
     assert (made.seeds, other.seeds) == ((5,) * 7, (6,) * 7)
     assert made.addresses == ("twin",) * 7

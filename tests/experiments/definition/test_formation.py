@@ -62,7 +62,7 @@ leader = "A"
 PARTED = '[formation.links]\n"A - B" = 0.5\n"C - D" = 0.5\n"B - C" = { distance = 0.8, from_s = 8.0, until_s = 20.0 }\n'
 
 
-def written(text, duration=40.0):
+def four_with(text, duration=40.0):
     """Four robots with this formation."""
     return document.loads(ROBOTS.format(duration=duration) + text)
 
@@ -83,7 +83,7 @@ def codes(given):
 
 
 def test_both_ends_of_a_link_want_the_same():
-    links = written(SQUARE).plan.one_way_links
+    links = four_with(SQUARE).plan.one_way_links
     asked = {(link.receiver, link.sender): link.target for link in links}
     assert asked["B", "A"].relative == (0.6, 0.0, 0.0)  # B stands 0.6 m along x from A
     assert asked["A", "B"].relative == (-0.6, -0.0, -0.0)
@@ -93,14 +93,14 @@ def test_both_ends_of_a_link_want_the_same():
 
 
 def test_each_link_has_the_gain_of_its_target():
-    assert {f"{link.sender}{link.receiver}": link.target.gain for link in written(MIXED).plan.one_way_links} == {
+    assert {f"{link.sender}{link.receiver}": link.target.gain for link in four_with(MIXED).plan.one_way_links} == {
         "AB": 0.5, "CB": 3.0, "BC": 3.0, "AC": 3.0, "DC": 3.0, "CD": 3.0, "AD": 0.5
     }  # fmt: skip
 
 
 @pytest.mark.usefixtures("unflown")
 def test_law_of_distances_takes_offsets_for_distances():
-    given = written(SQUARE.replace('"displacement"', '"distance"'))
+    given = four_with(SQUARE.replace('"displacement"', '"distance"'))
     assert given.plan.formation.links.distance[:2].tolist() == pytest.approx([0.6, np.hypot(0.6, 0.6)])
     assert "realisable" in codes(given)
 
@@ -114,7 +114,7 @@ D = { distance = 0.7, gain = 9.0 }
 [formation.links]
 "A - B" = 0.5
 """
-    anchors = compile_anchors(written(anchored).experiment)
+    anchors = compile_anchors(four_with(anchored).experiment)
     assert [anchor.gain for (anchor,) in anchors.values()] == [6.0, 0.5, 6.0, 9.0]
     place = np.array([[1.0, 0.0, 0.0], [0.5, 7.0, 0.0], [3.0, 4.0, 0.6], [0.0, 0.7, 0.0]])
     for (anchor,), at in zip(anchors.values(), place.tolist(), strict=True):
@@ -127,7 +127,7 @@ D = { distance = 0.7, gain = 9.0 }
 @pytest.mark.usefixtures("unflown")  # it is flown beside the check
 @pytest.mark.parametrize(("text", "worst"), [(SQUARE, 0.015), (BEARINGS, 0.05), (MIXED, 0.06)], ids=["s", "b", "m"])
 def test_formations_come_together(text, worst):
-    given = written(text, 60.0)
+    given = four_with(text, 60.0)
     assert not [each for each in check.check(given) if each.severity == "error"]
     _, _, error = errors_in_flight(given.plan)
     assert error[0].max() > 0.3
@@ -135,7 +135,7 @@ def test_formations_come_together(text, worst):
 
 
 def test_formation_that_turns_and_grows():
-    given = written(SQUARE + "[[formation.changes]]\nat_s = 10.0\nrotate = 1.5708\nscale = 1.4\n", 30.0)
+    given = four_with(SQUARE + "[[formation.changes]]\nat_s = 10.0\nrotate = 1.5708\nscale = 1.4\n", 30.0)
     time, position, error = errors_in_flight(given.plan)
     before, after = position[time < 10.0][-1], position[-1]
     assert error[time < 10.0][-1].max() < 0.02
@@ -151,7 +151,7 @@ gain = 1.2
 links = { "A - B" = 0.5, "B - C" = 0.8, "C - A" = 0.8, "D - C" = 0.5, "D - A" = 0.9 }
 changes = [{ at_s = 15.0, over_s = 3.0, links = { "B - A" = 0.8, "D - C" = 0.7 } }]
 """
-    given = written(text)
+    given = four_with(text)
     _, position, error = errors_in_flight(given.plan)
     assert error[-1].max() < 0.02
     assert np.linalg.norm(position[-1, 0] - position[-1, 1]) == pytest.approx(0.8, abs=0.02)
@@ -159,7 +159,7 @@ changes = [{ at_s = 15.0, over_s = 3.0, links = { "B - A" = 0.8, "D - C" = 0.7 }
 
 def test_links_by_range_and_by_the_clock():
     text = "[formation]\ngain = 1.5\n[formation.proximity]\nrange = 1.1\ndistance = 0.75\n"
-    _, position, error = errors_in_flight(written(text).plan)
+    _, position, error = errors_in_flight(four_with(text).plan)
     apart = np.linalg.norm(position[:, :, None] - position[:, None], axis=3)
     there = ~np.isnan(error)
     pairs = [(i, j) for i in range(4) for j in range(4) if i != j]
@@ -169,7 +169,7 @@ def test_links_by_range_and_by_the_clock():
     assert 0 < there[0].sum() < len(pairs)
     assert np.nanmax(error[-1]) < 0.05
 
-    time, _, error = errors_in_flight(written(PARTED).plan)
+    time, _, error = errors_in_flight(four_with(PARTED).plan)
     there = ~np.isnan(error)
     assert (there.sum(axis=1) == np.where((time >= 8.0 - 1e-6) & (time < 20.0 - 1e-6), 6, 4)).all()
 
@@ -197,7 +197,7 @@ at_s = 15.0
 robot = "A"
 plan = { kind = "line", move_by = [0.5, 0.3], speed = 0.05 }
 """
-    given = written(text, 45.0)
+    given = four_with(text, 45.0)
     assert not [each for each in check.check(given) if each.severity == "error"]
     _, position, error = errors_in_flight(given.plan)
     np.testing.assert_allclose(position[-1, 0, :2], [0.0, -0.2], atol=0.08)
@@ -230,20 +230,20 @@ def test_calm_event_triggered_ring_does_not_turn():
 
 @pytest.mark.usefixtures("unflown")
 def test_offsets_that_do_not_add_up():
-    given = written(SQUARE.replace("[0.0, -0.6]", "[0.0, -0.7]"))
+    given = four_with(SQUARE.replace("[0.0, -0.6]", "[0.0, -0.7]"))
     found = codes(given)["offsets-contradict"]
     assert (found.severity, found.where.rsplit(":", 2)[1]) == ("error", "15")
     assert "100.0 mm" in found.message
     (first, *_) = contradictions(given.plan.formation.links)
     assert sorted(first.rows) == [0, 1, 2, 3]
-    assert contradictions(Plan(written(SQUARE).experiment).formation.links) == []
+    assert contradictions(Plan(four_with(SQUARE).experiment).formation.links) == []
 
 
 @pytest.mark.usefixtures("unflown")
 def test_averaging_offsets_that_do_not_add_up():
     square = SQUARE.replace("displacement", "leader-observer")
-    assert "offsets-contradict" not in codes(written(square))
-    found = codes(written(square.replace("[0.0, -0.6]", "[0.0, -0.7]")))["offsets-contradict"]
+    assert "offsets-contradict" not in codes(four_with(square))
+    found = codes(four_with(square.replace("[0.0, -0.6]", "[0.0, -0.7]")))["offsets-contradict"]
     assert found.severity == "warning"
 
 
@@ -268,7 +268,7 @@ changes = [{ at_s = 10.0, links = { "A - B" = 1.5 } }]
     ],
 )
 def test_check_judges_formations(text, code, severity, message):
-    found = codes(written(text))[code]
+    found = codes(four_with(text))[code]
     assert found.severity == severity
     assert message in found.message
 
@@ -276,11 +276,11 @@ def test_check_judges_formations(text, code, severity, message):
 @pytest.mark.usefixtures("unflown")
 def test_unstable_law_of_offsets_names_its_stiffness():
     stiff = SQUARE.replace('"displacement"', '"displacement"\nstiffness = 9.0')
-    assert "stiffness" in codes(written(stiff))["unstable"].remedy
+    assert "stiffness" in codes(four_with(stiff))["unstable"].remedy
 
 
 def test_links_that_leave_robots_alone():
-    found = codes(written(PARTED, 21.0))["comes-apart"]
+    found = codes(four_with(PARTED, 21.0))["comes-apart"]
     assert "falls into 2 parts from 0.0 s to 8.0 s" in found.message
     always = SQUARE + "[formation.proximity]\nrange = 3.0\n"
-    assert codes(written(always, 10.0))["whole"].severity == "note"
+    assert codes(four_with(always, 10.0))["whole"].severity == "note"

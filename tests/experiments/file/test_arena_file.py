@@ -42,7 +42,7 @@ start = [-1.5, 0.0]
 
 
 @pytest.fixture
-def lab(tmp_path):
+def write_files(tmp_path):
     """Writes an experiment and its arena file; gives the path of the experiment."""
 
     def written(experiment=ONE, arena=LAB):
@@ -60,8 +60,8 @@ def refused(file, *changes):
     return caught.value.problems
 
 
-def test_arena_is_that_of_the_file(lab, tmp_path):
-    given = read(lab())
+def test_arena_is_that_of_the_file(write_files, tmp_path):
+    given = read(write_files())
     arena = given.experiment.arena
     assert arena.size == (4.0, 3.0, 2.0)
     assert not arena.walls
@@ -76,11 +76,11 @@ def test_arena_is_that_of_the_file(lab, tmp_path):
     assert read(kept / "experiment.toml").experiment == given.experiment
 
 
-def test_own_keys_win_and_obstacles_merge_by_name(lab):
+def test_own_keys_win_and_obstacles_merge_by_name(write_files):
     own = "walls = true\n[arena.obstacles.post]\nheight = 0.5\n[arena.obstacles.cart]\nradius = 0.2\n"
     own += "[arena.obstacles.new]\nradius = 0.3\nat = [1.0, -1.0]\n"
     own += "[arena.starts.east]\nat = [1.5, 0.0]\nsize = [0.5, 0.5]\n"
-    arena = read(lab(ONE.replace('"lab.toml"\n', f'"lab.toml"\n{own}'))).experiment.arena
+    arena = read(write_files(ONE.replace('"lab.toml"\n', f'"lab.toml"\n{own}'))).experiment.arena
     assert arena.walls
     assert arena.size == (4.0, 3.0, 2.0)
     assert list(arena.obstacles) == ["post", "cart", "new"]
@@ -90,10 +90,10 @@ def test_own_keys_win_and_obstacles_merge_by_name(lab):
     assert list(arena.starts) == ["west", "east"]
 
 
-def test_case_changes_the_arena_or_takes_another_file(lab, tmp_path):
+def test_case_changes_the_arena_or_takes_another_file(write_files, tmp_path):
     (tmp_path / "hall.toml").write_text("[arena]\nsize = [9.0, 9.0, 3.0]\n[arena.obstacles.pillar]\nradius = 0.4\n")
     cases = '[cases.lab.arena.obstacles.post]\nradius = 0.2\n[cases.hall.arena]\nfile = "hall.toml"\n'
-    given = read(lab(ONE + cases))
+    given = read(write_files(ONE + cases))
     found = {name: plan.experiment.arena for name, plan in given.cases().items()}
     assert found["lab"].obstacles["post"].radius == 0.2
     assert list(found["hall"].obstacles) == ["pillar"]
@@ -103,8 +103,8 @@ def test_case_changes_the_arena_or_takes_another_file(lab, tmp_path):
     assert files == {"": "lab.toml", "lab": "lab.toml", "hall": "hall.toml"}
 
 
-def test_command_line_changes_find_what_the_file_holds(lab, tmp_path):
-    file = lab()
+def test_command_line_changes_find_what_the_file_holds(write_files, tmp_path):
+    file = write_files()
     found = read(file, ["arena.obstacles.cart.plan.speed=0.2", "arena.obstacles.post.at=[0.5, 0.5]"]).experiment.arena
     assert found.obstacles["cart"].plan == {"kind": "line", "move_by": [1.0, 0.0], "speed": 0.2}
     assert found.obstacles["post"].at == (0.5, 0.5)
@@ -116,8 +116,8 @@ def test_command_line_changes_find_what_the_file_holds(lab, tmp_path):
     assert "no plan of this experiment has a parameter 'radius'" in problem.message
 
 
-def test_what_processes_read_needs_no_arena_file(lab, tmp_path):
-    found = read(lab()).experiment
+def test_what_processes_read_needs_no_arena_file(write_files, tmp_path):
+    found = read(write_files()).experiment
     file = tmp_path / "elsewhere" / "case.json"
     file.parent.mkdir()
     file.write_bytes(document.write_json(Plan(found)))
@@ -149,8 +149,8 @@ def test_what_processes_read_needs_no_arena_file(lab, tmp_path):
         ("arena = " + "[" * 5000 + "]" * 5000, (0, 0), "nested too deeply", ""),
     ],
 )
-def test_wrong_arena_file_is_refused_where_wrong(lab, arena, place, message, hint):
-    file = lab(arena=arena)
+def test_wrong_arena_file_is_refused_where_wrong(write_files, arena, place, message, hint):
+    file = write_files(arena=arena)
     problem = refused(file)[0]
     assert problem.file == str(file.parent / "lab.toml")
     assert (problem.line, problem.column) == place
@@ -158,20 +158,20 @@ def test_wrong_arena_file_is_refused_where_wrong(lab, arena, place, message, hin
     assert hint in problem.hint
 
 
-def test_conflicts_with_the_arena_point_into_both_files(lab):
+def test_conflicts_with_the_arena_point_into_both_files(write_files):
     small = ONE.replace('"lab.toml"\n', '"lab.toml"\nsize = [2.0, 3.0, 2.0]\n')
-    robot, box = refused(lab(small))
+    robot, box = refused(write_files(small))
     assert (robot.file.rpartition("/")[2], robot.line) == ("one.toml", 8)
     assert (box.file.rpartition("/")[2], box.line) == ("lab.toml", 16)
-    problem = refused(lab(ONE + "[cases.small.arena]\nsize = [3.9, 1.0, 2.0]\n"))[0]
+    problem = refused(write_files(ONE + "[cases.small.arena]\nsize = [3.9, 1.0, 2.0]\n"))[0]
     assert (problem.file.rpartition("/")[2], problem.line) == ("one.toml", 8)
     assert problem.message.startswith("in case 'small', arena.obstacles.cart.at: 'cart' stands outside")
 
 
 @pytest.mark.slow
-def test_check_findings_point_into_the_arena_file(lab):
+def test_check_findings_point_into_the_arena_file(write_files):
     plan = '[[timeline]]\nat_s = 2.0\nrobot = "KH01"\nplan = { kind = "line", move_by = [2.6, 0.0], speed = 0.2 }\n'
-    file = lab(ONE + plan)
+    file = write_files(ONE + plan)
     (found,) = [each for each in check(read(file)) if each.code == "hits-obstacle"]
     assert found.where == f"{file.parent / 'lab.toml'}:6:1"
     assert "KH01 would run into 'post' at 14.7 s" in found.message
@@ -191,12 +191,12 @@ def test_catalogue_arena_files_are_no_experiments(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["experiment.toml", "Experiment.TOML", "run.json", "metrics.json", "event.mcap"])
-def test_names_of_a_runs_own_files_are_refused(name, lab, tmp_path):
+def test_names_of_a_runs_own_files_are_refused(name, write_files, tmp_path):
     (tmp_path / name).write_text(LAB)
     with pytest.raises(DocumentError, match="call it otherwise"):
-        read(lab(ONE.replace("lab.toml", name)))
+        read(write_files(ONE.replace("lab.toml", name)))
 
 
-def test_catalogue_arena_need_not_stand_beside(lab):
-    arena = read(lab(ONE.replace("lab.toml", "gate.arena.toml"))).experiment.arena
+def test_catalogue_arena_need_not_stand_beside(write_files):
+    arena = read(write_files(ONE.replace("lab.toml", "gate.arena.toml"))).experiment.arena
     assert list(arena.obstacles) == ["left", "right"]

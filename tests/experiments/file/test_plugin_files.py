@@ -72,7 +72,7 @@ def refused(file, *changes):
     return str(caught.value)
 
 
-def changed(task, old, new):
+def refused_with(task, old, new):
     """The experiment with another text, refused."""
     task.write_text(TASK.replace(old, new, 1), "utf-8")
     return refused(task)
@@ -103,7 +103,7 @@ def test_law_beside_the_experiment_moves_robots(task):
     ],
 )
 def test_wrong_choice_names_place_and_remedy(task, law, message, hint):
-    text = changed(task, 'law = "meet.py:Meet"', f'law = "{law}"')
+    text = refused_with(task, 'law = "meet.py:Meet"', f'law = "{law}"')
     assert f"{task}:11:7: " in text
     assert message in text
     assert hint in text
@@ -112,7 +112,7 @@ def test_wrong_choice_names_place_and_remedy(task, law, message, hint):
 
 @pytest.mark.parametrize("kind", ["meet.py:Meet", "none.py:BARROW"])
 def test_kind_in_a_file_is_refused(task, kind):
-    text = changed(task, 'kind = "khepera4"', f'kind = "{kind}"')
+    text = refused_with(task, 'kind = "khepera4"', f'kind = "{kind}"')
     assert f"{task}:5:8: " in text
     assert "a kind cannot be named by its file" in text
     assert "docs/plugins.md#a-kind-of-robot" in text
@@ -120,7 +120,7 @@ def test_kind_in_a_file_is_refused(task, kind):
 
 def test_pipe_is_not_waited_for(task):
     os.mkfifo(task.parent / "pipe.py")
-    assert "pipe.py is no file" in changed(task, 'law = "meet.py:Meet"', 'law = "pipe.py:Meet"')
+    assert "pipe.py is no file" in refused_with(task, 'law = "meet.py:Meet"', 'law = "pipe.py:Meet"')
 
 
 @pytest.mark.parametrize(
@@ -137,7 +137,7 @@ def test_broken_file_is_named_with_its_line(task, old, new, message):
 
 
 def test_unknown_parameters_are_found(task):
-    assert "unknown parameter 'gian' of 'meet.py:Meet'" in changed(task, "gain = 0.2", "gian = 0.2")
+    assert "unknown parameter 'gian' of 'meet.py:Meet'" in refused_with(task, "gain = 0.2", "gian = 0.2")
 
 
 def test_file_that_others_may_write_is_not_loaded(task):
@@ -194,7 +194,7 @@ def test_copy_that_was_changed_is_not_loaded(task):
 
 def test_hosts_do_not_load_it(task):
     hosts = '[hosts.lab1]\naddress = "lab1"\nrobots = ["A"]\n'
-    assert "is a file of this machine" in changed(task, "[cases.slow]\n", f"{hosts}[cases.slow]\n")
+    assert "is a file of this machine" in refused_with(task, "[cases.slow]\n", f"{hosts}[cases.slow]\n")
 
 
 @pytest.mark.slow

@@ -24,7 +24,7 @@ ROOM = Arena(size=(10.0, 10.0, 3.0), walls=False)
 T = np.arange(0.0, 4.0 + STEP / 2, STEP)
 
 
-def pair(way, kinds=("khepera4", "khepera4"), arena=ROOM, **more):
+def passing(way, kinds=("khepera4", "khepera4"), arena=ROOM, **more):
     """One robot at the origin, and one whose place (T, 3) is given."""
     what = at_origin({"A": kinds[0], "B": kinds[1]}, {"A - B": 1.0}, arena=arena)
     place = np.zeros((len(way), 2, 3))
@@ -41,7 +41,7 @@ def alone(way, arena, kind="khepera4"):
 
 
 def test_closest_approach_of_surfaces_has_time_and_names():
-    found = Clearance.of_trace(pair(along_x(0.3 + 0.2 * np.cos(T))))
+    found = Clearance.of_trace(passing(along_x(0.3 + 0.2 * np.cos(T))))
     closest = pytest.approx(0.1 - 2.0 * R, abs=1e-5)
     at = pytest.approx(math.pi, abs=STEP)
     assert found.robots == (Approach(("A", "B"), closest, at), Approach(("B", "A"), closest, at))
@@ -49,10 +49,10 @@ def test_closest_approach_of_surfaces_has_time_and_names():
 
 
 def test_each_contact_is_one_collision_with_greatest_depth():
-    found = Clearance.of_trace(pair(along_x(0.14 + 0.05 * np.cos(2.0 * np.pi * T))))
+    found = Clearance.of_trace(passing(along_x(0.14 + 0.05 * np.cos(2.0 * np.pi * T))))
     depth = pytest.approx(0.05, abs=1e-5)
     assert found.overlaps == tuple(Collision(pytest.approx(k + 0.26), "A", "B", None, depth) for k in range(4))
-    apart = Clearance.of_trace(pair(along_x(np.full_like(T, 2.0 * R))))
+    apart = Clearance.of_trace(passing(along_x(np.full_like(T, 2.0 * R))))
     assert apart.overlaps == ()  # they stand side by side
 
 
@@ -60,7 +60,7 @@ def test_drone_over_ground_robot_is_its_height_away():
     kinds, gap = ("turtlebot3", "crazyflie"), 0.5 - TURTLEBOT3.height
     level = 0.5 - CRAZYFLIE.radius - TURTLEBOT3.radius
     above, beside, into = (
-        Clearance.of_trace(pair(along_x(np.full(50, x), z), kinds))
+        Clearance.of_trace(passing(along_x(np.full(50, x), z), kinds))
         for x, z in ((0.02, 0.5), (0.5, 0.5), (0.02, TURTLEBOT3.height - 0.5 * CRAZYFLIE.height))
     )
     assert (above.robots[0].gap, above.overlaps) == (pytest.approx(gap), ())
@@ -120,9 +120,9 @@ def test_distance_to_the_walls(x, y, size):
 def test_what_is_unknown_touches_nothing():
     way = along_x(np.full_like(T, 0.1))
     way[50:100] = np.nan
-    found = Clearance.of_trace(pair(way, arena=Arena(size=(10.0, 10.0, 3.0))))
+    found = Clearance.of_trace(passing(way, arena=Arena(size=(10.0, 10.0, 3.0))))
     assert [each.time_s for each in found.overlaps] == [0.0, pytest.approx(2.0)]
-    nobody = Clearance.of_trace(pair(np.full_like(way, np.nan), arena=Arena(size=(10.0, 10.0, 3.0))))
+    nobody = Clearance.of_trace(passing(np.full_like(way, np.nan), arena=Arena(size=(10.0, 10.0, 3.0))))
     assert (nobody.robots, nobody.arena[1], nobody.overlaps) == ((None, None), None, ())
 
 
@@ -133,7 +133,7 @@ def with_contacts(known, *contacts, clock="virtual", **bodies):
 
 
 def test_what_an_engine_saw_stands_for_what_overlaps():
-    known = pair(along_x(np.full_like(T, 0.1)))
+    known = passing(along_x(np.full_like(T, 0.1)))
     seen = with_contacts(known, Contact(1.5, "B", "wall", 0.2, 0.001), Contact(0.5, "A", "B", 0.1, 0.0005))
     assert [each.time_s for each in collisions(known, Clearance.of_trace(known))] == [0.0]
     assert collisions(seen, Clearance.of_trace(seen)) == (
@@ -146,7 +146,7 @@ def test_what_an_engine_saw_stands_for_what_overlaps():
 
 @pytest.mark.parametrize(("bodies", "count"), [({}, 1), ({"A": "world"}, 0), ({"A": "world", "B": "world"}, 0)])
 def test_robots_without_a_world_are_watched_by_position(bodies, count):
-    known = with_contacts(pair(along_x(np.full_like(T, 0.1))), clock="real", **bodies)
+    known = with_contacts(passing(along_x(np.full_like(T, 0.1))), clock="real", **bodies)
     assert len(collisions(known, Clearance.of_trace(known))) == count
 
 

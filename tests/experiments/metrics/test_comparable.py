@@ -19,13 +19,13 @@ from tests.experiments.traces import crowd, cut
 
 
 @pytest.fixture(scope="module")
-def trace():
+def live_trace():
     return dataclasses.replace(crowd(3, "periodic", duration=4.0), clock="real")
 
 
-def changed(trace, **columns):
+def measured_with(live_trace, **columns):
     arrays = {name: np.full(3, value) for name, value in columns.items()}
-    return measure(dataclasses.replace(trace, **arrays))
+    return measure(dataclasses.replace(live_trace, **arrays))
 
 
 def marks(*cases):
@@ -53,19 +53,19 @@ LATE = "began 0.70 s after the common start"
         ({}, Event(2.0, "lost", "CF01", "its process ended"), "robots failed"),
     ],
 )
-def test_what_spoils_a_run(trace, columns, event, reason):
-    events = trace.events if event is None else (*trace.events, event)
-    found = changed(dataclasses.replace(trace, events=events), **columns)
+def test_what_spoils_a_run(live_trace, columns, event, reason):
+    events = live_trace.events if event is None else (*live_trace.events, event)
+    found = measured_with(dataclasses.replace(live_trace, events=events), **columns)
     assert reasons(found) == found.spoiled
     assert reason in found.spoiled[0] if reason is not None else not found.spoiled
 
 
-def test_a_slow_world_spoils(trace):
-    assert reasons(replace(measure(trace), world_factor=0.5)) == ("the world ran at 0.50 of real time",)
+def test_a_slow_world_spoils(live_trace):
+    assert reasons(replace(measure(live_trace), world_factor=0.5)) == ("the world ran at 0.50 of real time",)
 
 
-def test_losses_that_no_recorder_saw_spoil(trace):
-    good = measure(trace)
+def test_losses_that_no_recorder_saw_spoil(live_trace):
+    good = measure(live_trace)
     assert with_failures(good, []) is good
     told = with_failures(good, ["lost CF01, CF02", "the recorder ended"])
     assert (told.failures, told.spoiled) == (("lost CF01, CF02", "the recorder ended"), ("robots failed",))
@@ -73,8 +73,8 @@ def test_losses_that_no_recorder_saw_spoil(trace):
     assert with_failures(known, ["lost CF01"]) is known
 
 
-def test_spoiled_runs_have_neither_ratio_nor_praise(trace, tmp_path):
-    good, bad = measure(trace), changed(trace, missed_deadlines=50)
+def test_spoiled_runs_have_neither_ratio_nor_praise(live_trace, tmp_path):
+    good, bad = measure(live_trace), measured_with(live_trace, missed_deadlines=50)
     other = replace(bad, case="event")
     assert "good" in marks(good, replace(good, case="event"))
     assert "good" not in marks(good, other)
@@ -91,8 +91,8 @@ def test_spoiled_runs_have_neither_ratio_nor_praise(trace, tmp_path):
     assert json.loads((tmp_path / "m.json").read_bytes())[0]["spoiled"] == list(bad.spoiled)
 
 
-def test_a_spoiled_seed_is_left_out_of_ratios(trace):
-    first = [replace(measure(trace), seed=seed) for seed in (1, 2, 3)]
+def test_a_spoiled_seed_is_left_out_of_ratios(live_trace):
+    first = [replace(measure(live_trace), seed=seed) for seed in (1, 2, 3)]
     others = [replace(each, case="event") for each in first]
     others[1] = replace(others[1], spoiled=("robots failed",))
     assert ratios(others, first, "iae") == [1.0, None, 1.0]
@@ -100,28 +100,28 @@ def test_a_spoiled_seed_is_left_out_of_ratios(trace):
     assert "seeds compared: 2 of 3" in texts(*first, *others)
 
 
-def test_integrals_over_holes_are_not_compared(trace):
-    place = trace.true_position.copy()
+def test_integrals_over_holes_are_not_compared(live_trace):
+    place = live_trace.true_position.copy()
     place[40:48] = np.nan  # of the whole formation, too short to be dead
-    whole, holed = measure(trace), measure(dataclasses.replace(trace, true_position=place, position=place))
+    whole, holed = measure(live_trace), measure(dataclasses.replace(live_trace, true_position=place, position=place))
     assert ratios([holed], [whole], "iae") == [pytest.approx(1.0, abs=0.1)]  # an absence of all does not count
-    place = trace.true_position.copy()
+    place = live_trace.true_position.copy()
     place[40:48, 0] = np.nan
-    holed = measure(dataclasses.replace(trace, true_position=place, position=place))
+    holed = measure(dataclasses.replace(live_trace, true_position=place, position=place))
     assert ratios([holed], [whole], "iae") == ratios([whole], [holed], "itae") == [None]
     assert ratios([holed], [whole], "f_hz") == [pytest.approx(1.0)]
 
 
-def test_what_was_never_measured_is_unknown(trace):
-    silent = measure(dataclasses.replace(trace, ticks=np.array([0, 100, 100])))
+def test_what_was_never_measured_is_unknown(live_trace):
+    silent = measure(dataclasses.replace(live_trace, ticks=np.array([0, 100, 100])))
     assert "Whether CF01 missed deadlines is unknown" in texts(silent)
     assert "what CF01 received is unknown" in texts(silent)
-    mute = measure(dataclasses.replace(trace, sent=trace.sent.take(trace.sent.stamp < 0.0)))
+    mute = measure(dataclasses.replace(live_trace, sent=live_trace.sent.take(live_trace.sent.stamp < 0.0)))
     assert "No pose was sent: whether any would have been lost is unknown." in texts(mute)
 
 
-def test_a_shorter_run_is_not_compared(trace):
-    whole, short = measure(trace), replace(measure(cut(trace, 2.0)), case="short")
+def test_a_shorter_run_is_not_compared(live_trace):
+    whole, short = measure(live_trace), replace(measure(cut(live_trace, 2.0)), case="short")
     for index in ("f_hz", "iae", "rmse", "messages"):  # what fades depends on the length, too
         assert ratios([short], [whole], index) == [None]
     assert metrics_files.document("x", 1, [whole, short])["cases"]["short"]["ratio"]["itae"] is None

@@ -57,8 +57,8 @@ def shelled(installed):
         yield command
 
 
-def test_fields_of_the_page_have_their_shapes(trace):
-    sizes = {"T": len(trace.time), "N": len(trace.robots), "E": len(trace.plan.pose_links)}
+def test_fields_of_the_page_have_their_shapes(short_trace):
+    sizes = {"T": len(short_trace.time), "N": len(short_trace.robots), "E": len(short_trace.plan.pose_links)}
     shapes = {}
     for names, given in re.findall(r"^\| (`.*`) \| (\([TNE].*\)) \|", GUIDE, re.MULTILINE):
         fields, found = re.findall(r"`(\w+)`", names), re.findall(r"\(([^)]+)\)", given)
@@ -66,7 +66,7 @@ def test_fields_of_the_page_have_their_shapes(trace):
     assert {"time", "true_position", "goal", "dropped"} < shapes.keys()
     for name, shape in shapes.items():
         words = [each for each in shape.replace(" ", "").split(",") if each]
-        assert np.shape(getattr(trace, name)) == tuple(sizes.get(each) or int(each) for each in words), name
+        assert np.shape(getattr(short_trace, name)) == tuple(sizes.get(each) or int(each) for each in words), name
 
 
 SHORT = ["--set", "duration_s=5"]
@@ -135,8 +135,8 @@ class Way(Metric, frozen=True):
     sums = True
     figure = True
 
-    def of(self, trace, shared):
-        return np.nansum(np.linalg.norm(np.diff(trace.true_position, axis=0), axis=2), axis=0)
+    def of(self, short_trace, shared):
+        return np.nansum(np.linalg.norm(np.diff(short_trace.true_position, axis=0), axis=2), axis=0)
 
 
 class Height(Metric, frozen=True):
@@ -147,8 +147,8 @@ class Height(Metric, frozen=True):
     better = "more"
     needs = ("goal",)
 
-    def of(self, trace, shared):
-        return np.nanmax(trace.goal[..., 2])
+    def of(self, short_trace, shared):
+        return np.nanmax(short_trace.goal[..., 2])
 
 
 class Careless(Height, frozen=True):
@@ -162,7 +162,7 @@ class Wrong(Metric, frozen=True):
 
     label = "Wrong"
 
-    def of(self, trace, shared):
+    def of(self, short_trace, shared):
         return np.zeros(30)
 
 
@@ -177,72 +177,72 @@ def known(monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def triangle():
+def short_triangle():
     return changed(load("triangle").cases()["event"].experiment, duration_s=2.0)
 
 
 @pytest.fixture(scope="module")
-def trace(triangle):
-    return fly(triangle, case="event").trace
+def short_trace(short_triangle):
+    return fly(short_triangle, case="event").trace
 
 
 @pytest.fixture(scope="module")
-def older(trace):
+def older(short_trace):
     """A case that was measured before a metric was installed."""
-    return msgspec.json.decode(msgspec.json.encode(measure(trace)), type=CaseMetrics)
+    return msgspec.json.decode(msgspec.json.encode(measure(short_trace)), type=CaseMetrics)
 
 
-def test_metric_of_wrong_shape_is_unknown(known, trace):
+def test_metric_of_wrong_shape_is_unknown(known, short_trace):
     known(wrong=Wrong(), way_m=Way())
-    found = measure(trace)
+    found = measure(short_trace)
     (fault,) = found.metric_faults
     assert fault.startswith("metric wrong failed: ValueError: it gives float64 (30,), not 3 numbers")
     assert found.mean["wrong"] is None
     assert found.mean["way_m"] == pytest.approx(np.mean([robot.extra["way_m"] for robot in found.robots]))
 
 
-def test_reports_of_older_runs_have_an_empty_column(known, trace, older, tmp_path):
+def test_reports_of_older_runs_have_an_empty_column(known, short_trace, older, tmp_path):
     known(way_m=Way(), height=Height())
     assert older.mean.get("way_m") is None
-    assert ratios([measure(trace)], [older], "way_m") == [None]
+    assert ratios([measure(short_trace)], [older], "way_m") == [None]
     (row,) = [row for row in tables.summary_table([older]).rows if row.cells[0] == "Way [m]"]
     assert row.cells[1] == tables.NONE
     (table,) = tables.robot_tables([older])
     assert {row.cells[table.head.index("Way [m]")] for row in table.rows} == {tables.NONE}
     assert figures.robot_bars([older]).axes
-    metrics_files.write_csv(tmp_path / "metrics.csv", [older, measure(trace)])
+    metrics_files.write_csv(tmp_path / "metrics.csv", [older, measure(short_trace)])
     assert [bool(row["way_m"]) for row in rows_of(tmp_path / "metrics.csv")] == [False] * 4 + [True] * 4
 
 
-def test_sweep_keeps_what_metrics_need(known, triangle):
+def test_sweep_keeps_what_metrics_need(known, short_triangle):
     known(way_m=Way())
     assert runs.lean_enough()
-    ((lean,), _) = runs.fly_seeds(Plan(triangle), (1,))
+    ((lean,), _) = runs.fly_seeds(Plan(short_triangle), (1,))
     known(way_m=Way(), height=Height())
     assert not runs.lean_enough()
-    ((whole,), _) = runs.fly_seeds(Plan(triangle), (1,))
+    ((whole,), _) = runs.fly_seeds(Plan(short_triangle), (1,))
     assert whole.values.items() > lean.values.items()
     assert whole.values["height"] is not None
     assert whole.metric_faults == ()
 
 
-def test_sweep_names_a_field_missing_in_needs(known, triangle, trace):
+def test_sweep_names_a_field_missing_in_needs(known, short_triangle, short_trace):
     known(goal=Careless())
-    assert measure(trace).metric_faults == ()
-    ((run,), _) = runs.fly_seeds(Plan(triangle), (1,))
+    assert measure(short_trace).metric_faults == ()
+    ((run,), _) = runs.fly_seeds(Plan(short_triangle), (1,))
     assert run.values["goal"] is None
     (fault,) = run.metric_faults
     assert "it reads 'goal', which its `needs` does not name" in fault
     assert "(test_metrics_outside.py:" in fault
 
 
-def test_store_of_a_sweep_knows_the_metrics(known, triangle, monkeypatch):
+def test_store_of_a_sweep_knows_the_metrics(known, short_triangle, monkeypatch):
     known()
-    before = runs.code_of(Plan(triangle))
+    before = runs.code_of(Plan(short_triangle))
     known(way_m=Way())
-    with_way = runs.code_of(Plan(triangle))
+    with_way = runs.code_of(Plan(short_triangle))
     monkeypatch.setattr(runs, "file_digest", lambda _file: "changed")
-    assert len({before, with_way, runs.code_of(Plan(triangle))}) == 3
+    assert len({before, with_way, runs.code_of(Plan(short_triangle))}) == 3
 
 
 def test_metrics_of_one_label_are_told_apart():

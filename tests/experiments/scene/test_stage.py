@@ -25,14 +25,14 @@ def status(phase: str = "running", **fields: object) -> messages.Status:
 
 
 @pytest.fixture(scope="module")
-def park() -> SceneModel:
+def park_scene() -> SceneModel:
     return SceneModel.of_plan(load("robotic-park").cases()["event"])
 
 
-def at_start(park: SceneModel) -> Moment:
-    moment = moments.unknown(park)
-    assert park.plan is not None
-    for row, robot in enumerate(park.plan.experiment.robots.values()):
+def at_start(park_scene: SceneModel) -> Moment:
+    moment = moments.unknown(park_scene)
+    assert park_scene.plan is not None
+    for row, robot in enumerate(park_scene.plan.experiment.robots.values()):
         moment.position[row] = (*robot.start[:2], robot.hover or 0.0)
     return moment
 
@@ -70,14 +70,14 @@ def test_links_change_colour_with_their_error():
     ]  # fmt: skip
 
 
-def test_errors_are_those_of_the_law(park):
-    moment = at_start(park)
-    error = LinkTracker(park).errors(None, moment.position)
-    net = park.links
+def test_errors_are_those_of_the_law(park_scene):
+    moment = at_start(park_scene)
+    error = LinkTracker(park_scene).errors(None, moment.position)
+    net = park_scene.links
     apart = np.linalg.norm(moment.position[net.receiver] - moment.position[net.sender], axis=1)
     assert error == pytest.approx(np.abs(apart - net.distance))
-    of_robots = LinkTracker(park).of_robots(error)
-    assert [park.names[k] for k in np.flatnonzero(np.isnan(of_robots))] == ["TB01"], "it receives on no link"
+    of_robots = LinkTracker(park_scene).of_robots(error)
+    assert [park_scene.names[k] for k in np.flatnonzero(np.isnan(of_robots))] == ["TB01"], "it receives on no link"
     assert of_robots[1] == pytest.approx(error[net.receiver == 1].sum())
 
 
@@ -89,17 +89,17 @@ def test_links_that_are_not_there_have_no_error():
     assert tracker.errors(4.0, place) == pytest.approx([0.1])
 
 
-def test_link_is_lit_after_its_sender_transmits(park):
-    moment = at_start(park)
-    moment.silent_for[park.names.index("TB01")] = 0.05
-    senders = {park.names[row] for row in park.links.sender[stage.lit(park, moment)]}
+def test_link_is_lit_after_its_sender_transmits(park_scene):
+    moment = at_start(park_scene)
+    moment.silent_for[park_scene.names.index("TB01")] = 0.05
+    senders = {park_scene.names[row] for row in park_scene.links.sender[stage.lit(park_scene, moment)]}
     assert senders == {"TB01"}
 
 
-def test_unknown_robots_are_out_of_sight(park):
-    moment = moments.unknown(park)
+def test_unknown_robots_are_out_of_sight(park_scene):
+    moment = moments.unknown(park_scene)
     assert (stage.shown(moment.position)[:, 2] < -100.0).all()
-    ends = stage.segments(park, moment.position)
+    ends = stage.segments(park_scene, moment.position)
     assert (stage.visible(ends, np.ones(len(ends), dtype=bool))[..., 2] < -100.0).all()
     assert len(stage.dashes(ends)) == 0
 
@@ -111,35 +111,35 @@ def test_dashes_lie_on_link_and_leave_half_free():
     assert made[..., 0].max() <= 1.0
 
 
-def test_robots_needing_attention_have_ring_and_word(park):
-    moment = at_start(park)
-    row = park.names.index("CF02")
+def test_robots_needing_attention_have_ring_and_word(park_scene):
+    moment = at_start(park_scene)
+    row = park_scene.names.index("CF02")
     moment.condition[:] = Condition.ACTIVE
     moment.condition[row] = Condition.DEAD
     places, _ = stage.rings(moment)
     assert np.flatnonzero(places[:, 2] > -100.0).tolist() == [row]
-    assert stage.label(park, row, Condition.DEAD) == "CF02 · DEAD"
-    assert stage.label(park, row, Condition.ACTIVE) == "CF02"
-    assert (stage.accents(park, moment)[row] != park.colours[row]).any()
+    assert stage.label(park_scene, row, Condition.DEAD) == "CF02 · DEAD"
+    assert stage.label(park_scene, row, Condition.ACTIVE) == "CF02"
+    assert (stage.accents(park_scene, moment)[row] != park_scene.colours[row]).any()
 
 
-def test_trail_has_five_fading_points_a_second(park):
+def test_trail_has_five_fading_points_a_second(park_scene):
     trail = Trail(2)
     kept = [trail.add(0.1 * k, np.full((2, 3), 0.1 * k)) for k in range(9)]
     assert kept == [True, False, True, False, True, False, True, False, True]
     assert trail.points[0, :5, 0] == pytest.approx([0.8, 0.6, 0.4, 0.2, 0.0])
     ends = stage.trail_segments(trail.points)
     assert (ends[:, 0, 2] > -100.0).sum() == 2 * 4
-    colours = stage.trail_colours(park, 60, (255, 255, 255))
+    colours = stage.trail_colours(park_scene, 60, (255, 255, 255))
     assert colours[58, 1].tolist() == [204, 226, 239]  # nearly that of the background
 
 
 @pytest.mark.parametrize("bearing", [[0.0, 1.0], [0.0]], ids=["whole", "cut"])
-def test_ranges_reach_from_robot_to_what_it_sees(park, bearing):
-    moment = at_start(park)
+def test_ranges_reach_from_robot_to_what_it_sees(park_scene, bearing):
+    moment = at_start(park_scene)
     moment.yaw[:] = np.pi / 2
     scan = messages.Ranges("KH01", 0.0, bearing, [0.0, 0.0], [0.5, None, 0.3] if len(bearing) == 1 else [0.5, None])
-    (line,) = stage.rays(park, moment, {"KH01": scan})
+    (line,) = stage.rays(park_scene, moment, {"KH01": scan})
     assert line[1] - line[0] == pytest.approx([0.0, 0.5, 0.0])
 
 
@@ -182,11 +182,11 @@ def test_hanging_obstacle_has_a_height_in_recordings():
     assert marker.position[2] == pytest.approx(1.55)
 
 
-def test_case_with_absent_plugin_is_drawn_without_errors(park):
-    assert park.plan is not None
-    formation = msgspec.structs.replace(park.plan.experiment.formation, law="not-here")
-    other = SceneModel.of_plan(park.plan.changed(formation=formation, avoidance="not-here"))
-    assert np.isnan(LinkTracker(other).errors(0.0, at_start(park).position)).all()
+def test_case_with_absent_plugin_is_drawn_without_errors(park_scene):
+    assert park_scene.plan is not None
+    formation = msgspec.structs.replace(park_scene.plan.experiment.formation, law="not-here")
+    other = SceneModel.of_plan(park_scene.plan.changed(formation=formation, avoidance="not-here"))
+    assert np.isnan(LinkTracker(other).errors(0.0, at_start(park_scene).position)).all()
 
 
 def test_robots_without_an_experiment_are_drawn_too():

@@ -13,7 +13,7 @@ from experiments.sweep.plan import Span, arguments, cells, seeds_of
 
 
 @pytest.fixture(scope="module")
-def triangle():
+def triangle_document():
     return load("triangle")
 
 
@@ -53,8 +53,8 @@ def test_seeds(text, seeds):
     assert seeds_of(text, 5) == seeds
 
 
-def test_a_case_without_the_parameter_is_one_cell(triangle):
-    plan = planned(triangle, "trigger.threshold=0.01,0.02,0.04")
+def test_a_case_without_the_parameter_is_one_cell(triangle_document):
+    plan = planned(triangle_document, "trigger.threshold=0.01,0.02,0.04")
     assert [(cell.case, dict(cell.parameters)) for cell in plan] == [
         ("periodic", {}),
         ("event", {"trigger.threshold": 0.01}),
@@ -65,36 +65,38 @@ def test_a_case_without_the_parameter_is_one_cell(triangle):
     assert plan[2].plan.experiment.trigger == {"kind": "send-on-delta", "threshold": 0.02}
 
 
-def test_reference_shares_values_with_what_it_is_compared(triangle):
-    plan = planned(triangle, "formation.gain=2,3", "trigger.threshold=0.01,0.02")
+def test_reference_shares_values_with_what_it_is_compared(triangle_document):
+    plan = planned(triangle_document, "formation.gain=2,3", "trigger.threshold=0.01,0.02")
     assert len(plan) == 2 + 4
     gain = {cell.digest: cell.parameters["formation.gain"] for cell in plan if cell.case == "periodic"}
     assert all(gain[cell.reference] == cell.parameters["formation.gain"] for cell in plan)
 
 
-def test_value_of_one_case_and_a_chosen_case(triangle):
-    plan = planned(triangle, "cases.event.trigger.threshold=0.01,0.02", cases=["event"])
+def test_value_of_one_case_and_a_chosen_case(triangle_document):
+    plan = planned(triangle_document, "cases.event.trigger.threshold=0.01,0.02", cases=["event"])
     assert [cell.case for cell in plan] == ["periodic", "event", "event"]
-    assert planned(triangle, "trigger.threshold=0.01,0.02", cases=["periodic"])[0].parameters == {}
-    plan = planned(triangle, "cases.periodic.trigger.period_s=0.02,0.1", cases=["event"])
+    assert planned(triangle_document, "trigger.threshold=0.01,0.02", cases=["periodic"])[0].parameters == {}
+    plan = planned(triangle_document, "cases.periodic.trigger.period_s=0.02,0.1", cases=["event"])
     assert [cell.parameters.get("cases.periodic.trigger.period_s") for cell in plan] == [0.02, 0.1, None]
 
 
-def test_loss_is_environment_and_threshold_is_chosen(triangle):
+def test_loss_is_environment_and_threshold_is_chosen(triangle_document):
     plan = planned(
-        triangle, "trigger.threshold=0.005,0.02", "channel.loss=0,0.1", "cases.event.channel.delay_s=0.01,0.02"
+        triangle_document, "trigger.threshold=0.005,0.02", "channel.loss=0,0.1", "cases.event.channel.delay_s=0.01,0.02"
     )
     met = {frozenset(cell.environment) for cell in plan if cell.case == "event"}
     assert met == {frozenset(("channel.loss", "cases.event.channel.delay_s"))}
     assert {reference.unit(path) for path in ("trigger.threshold", "cases.event.trigger.threshold")} == {"m"}
 
 
-def test_trigger_of_the_reference_stays_as_written(triangle):
+def test_trigger_of_the_reference_stays_as_written(triangle_document):
     """Also what the file leaves at its default is swept; the first case becomes one of those that are compared."""
-    plan = planned(triangle, "trigger.minimum_interval_s=0.05,0.1", "formation.gain=2,3")
+    plan = planned(triangle_document, "trigger.minimum_interval_s=0.05,0.1", "formation.gain=2,3")
     first = [cell for cell in plan if cell.digest == cell.reference]
     assert [dict(cell.parameters) for cell in first] == [{"formation.gain": 2}, {"formation.gain": 3}]
-    assert all(cell.plan.experiment.trigger == triangle.cases()["periodic"].experiment.trigger for cell in first)
+    assert all(
+        cell.plan.experiment.trigger == triangle_document.cases()["periodic"].experiment.trigger for cell in first
+    )
     swept = [dict(cell.parameters) for cell in plan if cell.case == "periodic" and cell not in first]
     assert swept == [
         {"trigger.minimum_interval_s": interval, "formation.gain": gain} for interval in (0.05, 0.1) for gain in (2, 3)
@@ -125,9 +127,9 @@ def test_trigger_of_the_reference_stays_as_written(triangle):
         ("trigger.\x07=1", "no text", "leave them out"),
     ],
 )
-def test_what_is_wrong_with_an_axis(triangle, argument, message, hint):
+def test_what_is_wrong_with_an_axis(triangle_document, argument, message, hint):
     with pytest.raises(DocumentError) as caught:
-        planned(triangle, argument)
+        planned(triangle_document, argument)
     (problem,) = caught.value.problems
     assert problem.file == argument
     assert message in problem.message
@@ -140,16 +142,16 @@ def test_what_is_wrong_with_seeds(text):
         seeds_of(f"seeds={text}", 1)
 
 
-def test_too_many_cells_and_the_same_axis_twice(triangle):
+def test_too_many_cells_and_the_same_axis_twice(triangle_document):
     many = ["formation.gain=1:2:lin200", "formation.clamp=0.1:0.2:lin200"]
     with pytest.raises(DocumentError, match="40000 combinations"):
-        planned(triangle, *many)
+        planned(triangle_document, *many)
     with pytest.raises(DocumentError, match=r"'formation\.gain' is given twice"):
         arguments(["formation.gain=1", "formation.gain=2"])
 
 
-def test_file_without_cases_has_nothing_to_compare(tmp_path, triangle):
+def test_file_without_cases_has_nothing_to_compare(tmp_path, triangle_document):
     file = tmp_path / "alone.toml"
-    file.write_text(triangle.text.partition("[cases.")[0])
+    file.write_text(triangle_document.text.partition("[cases.")[0])
     with pytest.raises(DocumentError, match=r"no case in it to compare with\n.*\[cases.periodic\]"):
         planned(load(file), "formation.gain=1,2")

@@ -22,15 +22,15 @@ from tests.small import changed, reference
 
 
 @pytest.fixture(scope="module")
-def park():
+def short_park():
     return changed(reference(), duration_s=6.0, timeline=[])
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [3, 8])
-def test_lean_figures_are_those_of_the_report(park, seed):
-    logs = [simulate(Plan(park), seed, lean=lean) for lean in (True, False)]
-    lean, whole = (RunRecorder(log, Plan(park), "event").trace() for log in logs)
+def test_lean_figures_are_those_of_the_report(short_park, seed):
+    logs = [simulate(Plan(short_park), seed, lean=lean) for lean in (True, False)]
+    lean, whole = (RunRecorder(log, Plan(short_park), "event").trace() for log in logs)
     figures, measured = run_metrics(lean), measure.measure(whole)
     assert figures == run_metrics(whole)
     assert figures.seed == seed
@@ -54,9 +54,9 @@ def result(experiment, seeds):
 
 
 @pytest.mark.slow
-def test_run_depends_on_its_seed_alone(park):
+def test_run_depends_on_its_seed_alone(short_park):
     channel = ChannelTable(delay_s=0.05, jitter_s=0.4, loss=0.2)
-    lossy = changed(park, duration_s=2.0, channel=channel, start=Start(scatter=0.05))
+    lossy = changed(short_park, duration_s=2.0, channel=channel, start=Start(scatter=0.05))
     together = result(lossy, [1, 2, 3, 4]).runs
     assert [run.seed for run in together] == [1, 2, 3, 4]
     assert result(lossy, [4, 2]).runs == [together[3], together[1]]
@@ -92,8 +92,8 @@ def test_runs_of_other_length_have_no_ratio():
     ],
     ids=["words and seed", "duration", "order of robots"],
 )
-def test_digest_knows_what_changes_a_run(park, parts, same):
-    assert (digest(Plan(changed(park, **parts))) == digest(Plan(park))) is same
+def test_digest_knows_what_changes_a_run(short_park, parts, same):
+    assert (digest(Plan(changed(short_park, **parts))) == digest(Plan(short_park))) is same
 
 
 @pytest.mark.parametrize(
@@ -104,8 +104,8 @@ def test_digest_knows_what_changes_a_run(park, parts, same):
         ({"formation": changed(reference().formation, law="mpc")}, "daqp"),
     ],
 )
-def test_versions_of_used_libraries_count(park, monkeypatch, parts, library):
-    plain, using, found = Plan(park), Plan(changed(park, **parts)), []
+def test_versions_of_used_libraries_count(short_park, monkeypatch, parts, library):
+    plain, using, found = Plan(short_park), Plan(changed(short_park, **parts)), []
     for number in ("4.0", "4.1"):
         monkeypatch.setattr(version, "installed", lambda name, number=number: number if name == library else None)
         found.append((code_of(plain), code_of(using)))
@@ -114,16 +114,16 @@ def test_versions_of_used_libraries_count(park, monkeypatch, parts, library):
     assert library in version.LIBRARIES
 
 
-def test_a_plug_in_that_changes_changes_the_code(park, tmp_path, monkeypatch):
+def test_a_plug_in_that_changes_changes_the_code(short_park, tmp_path, monkeypatch):
     file = tmp_path / "my_triggers.py"
     file.write_text("one")
-    before = code_of(Plan(park))
+    before = code_of(Plan(short_park))
     real = choices.getfile
     monkeypatch.setattr(choices, "getfile", lambda of: str(file) if of.__name__ == "SendOnDelta" else real(of))
-    foreign = code_of(Plan(park))
+    foreign = code_of(Plan(short_park))
     runs.file_digest.cache_clear()
     file.write_text("two")
-    assert len({before, foreign, code_of(Plan(park))}) == 3
+    assert len({before, foreign, code_of(Plan(short_park))}) == 3
     runs.file_digest.cache_clear()
 
 

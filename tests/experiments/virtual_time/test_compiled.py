@@ -58,7 +58,7 @@ def heard():
     assert not stretch.REFUSED
 
 
-def pair(**parts):
+def follower(**parts):
     """Two ground robots, of which B follows A."""
     noise = {"all": Disturbance(position_sigma=0.0005)}
     links = Formation(links={"A > B": 0.5})
@@ -93,7 +93,7 @@ def test_every_plugin_and_model():
         start, hover = [0.7 * (k % 4 - 1.5), 0.7 * (k // 4 - 1.0)], 0.5 if k % 2 == 0 else None
         robots[f"R{k}"] = RobotTable(kind=KINDS[k % 4], sensors=[], hover=hover, start=start)
     links = {f"R{k} - R{(k + 1) % count}": 0.6 for k in range(count)}
-    experiment = pair(
+    experiment = follower(
         robots=robots, formation=Formation(links=links), disturbance=NATURE, duration_s=5.0,
         avoidance={"kind": "potential"}, channel=ChannelTable(delay_s=0.03),
     )  # fmt: skip
@@ -106,7 +106,7 @@ def test_every_motion_on_the_floor():
     kinds = ("omni", "ackermann", "double-integrator")
     robots = {f"R{k}": RobotTable(kind=kind, start=[0.9 * k - 0.9, 0.3 * k]) for k, kind in enumerate(kinds)}
     formation = Formation(law="distance", links={"R0 - R1": 0.7, "R1 - R2": 0.7, "R2 - R0": 0.7})
-    _, ticks = same(pair(robots=robots, formation=formation))
+    _, ticks = same(follower(robots=robots, formation=formation))
     assert ticks > 300
 
 
@@ -117,7 +117,7 @@ def test_legs_hazard_and_several_stretches():
     legs = [LegTable(at_s=at, robot="A", plan=plan) for at, plan in ((2.0, line), (11.3, circle))]
     starts = {"A": [-0.4, 0.0], "B": [0.4, 0.1]}
     robots = {name: RobotTable(kind="crazyflie", hover=0.5, start=start) for name, start in starts.items()}
-    made = pair(
+    made = follower(
         robots=robots, formation=Formation(links={"A > B": 0.8}), duration_s=25.0, timeline=legs,
         safety=Safety(battery_low=0.96), avoidance={"kind": "potential"},
     )  # fmt: skip
@@ -216,7 +216,7 @@ def test_laws_and_trigger_of_a_user(tmp_path, monkeypatch):
     trigger, predictor = made(TRIGGERS, "send-on-delta"), made(PREDICTORS, "constant-velocity")
     homes, names = spring(tmp_path, 0, HOMES), spring(tmp_path, 1, "from zenpark import Gradient, clamp, norm\n")
     starts = {"A": [0.0, 0.0], "B": [0.4, 0.1], "C": [-0.4, 0.1], "D": [0.0, 0.3], "E": [0.0, -0.45]}
-    ring = pair(
+    ring = follower(
         robots={name: RobotTable(kind="khepera4", start=start) for name, start in starts.items()},
         formation=Formation(links={f"A > {name}": 0.5 for name in "BCDE"}),
     )
@@ -241,9 +241,9 @@ def test_laws_and_trigger_of_a_user(tmp_path, monkeypatch):
     assert told[0] == told[1]
 
 
-def refusal(law):
+def plain_because(law):
     """Reason for which a law is flown plain."""
-    _, ticks = same(pair(duration_s=1.0), change=lambda given: replace(given, law=law))
+    _, ticks = same(follower(duration_s=1.0), change=lambda given: replace(given, law=law))
     assert ticks == 0
     (reason,) = stretch.REFUSED.values()
     stretch.REFUSED.clear()
@@ -253,21 +253,21 @@ def refusal(law):
 @pytest.mark.nightly
 def test_names_of_a_module_are_flown_plain(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(tmp_path))
-    assert "uses zp" in refusal(spring(tmp_path, 0, "import zenpark as zp\n"))
+    assert "uses zp" in plain_because(spring(tmp_path, 0, "import zenpark as zp\n"))
 
 
 @pytest.mark.parametrize(
     ("law", "fault"), [(Trying, "try"), pytest.param(Rounding, "hypot", marks=pytest.mark.nightly)]
 )
 def test_law_outside_of_the_subset_is_flown_plain(law, fault):
-    reason = refusal(law())
+    reason = plain_because(law())
     assert fault in reason
     assert f"{Path(__file__).name}:" in reason
 
 
 @pytest.mark.parametrize("parts", [{"channel": ChannelTable(loss=0.1)}, {"world": WorldTable(engine="pymunk")}])
 def test_what_is_not_compiled(parts):
-    _, ticks = same(pair(duration_s=1.0, **parts))
+    _, ticks = same(follower(duration_s=1.0, **parts))
     assert ticks == 0
 
 
@@ -277,7 +277,7 @@ def test_cache_folder_that_cannot_be_made(monkeypatch, tmp_path):
     monkeypatch.setenv("ZENPARK_CACHE_DIR", str(file / "folder"))
     stretch.DRIVERS.clear()
     stretch.RECENT.clear()
-    _, ticks = same(pair(duration_s=1.0))
+    _, ticks = same(follower(duration_s=1.0))
     assert ticks == 0
     stretch.DRIVERS.clear()
     stretch.REFUSED.clear()

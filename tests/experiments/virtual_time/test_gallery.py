@@ -35,7 +35,7 @@ def limits(periodic, event, event_loss):
     return pytest.mark.parametrize(("case", "most"), rows)
 
 
-def trace(name, case, *changes):
+def trace_from(name, case, *changes):
     return flown(name, case, *changes).trace
 
 
@@ -87,7 +87,7 @@ def exchange(law, places, memory, rounds, *, links=(NOWHERE, NOWHERE), **facts):
     ],
 )
 def test_average_of_constant_signals_has_no_error(case, most, changes):
-    known = trace("average", case, *changes)
+    known = trace_from("average", case, *changes)
     assert np.abs(known.memory["x"][-1] - 3.0).max() < most
     assert np.abs(known.memory["x"][0] - 3.0).max() > 1.0
     assert known.measures["disagreement"].shape == (len(known.time), 6)
@@ -95,7 +95,7 @@ def test_average_of_constant_signals_has_no_error(case, most, changes):
 
 @pytest.mark.slow
 def test_average_of_ramps_has_a_bounded_error():
-    known = trace("average", "periodic", "formation.law.ramp={ KH01 = 0.3, KH04 = -0.1 }", "duration_s=60")
+    known = trace_from("average", "periodic", "formation.law.ramp={ KH01 = 0.3, KH04 = -0.1 }", "duration_s=60")
     error = known.memory["x"][..., 0] - 3.0 - known.time[:, None] * 0.2 / 6
     later = np.abs(error[known.time > 30.0])
     assert later.max() < 0.3
@@ -109,7 +109,7 @@ def test_aggregative_team_descends_linearly_to_its_optimum(case, most):
 
     A lost message lets the two ends believe different values, of some thresholds of 1 cm, until the next one.
     """
-    known = trace("aggregative", case)
+    known = trace_from("aggregative", case)
     law, names = known.plan.law, known.robots
     targets, places = np.array([law.targets[name] for name in names]), np.array([*law.places.values()])
     share = law.team * len(places) / len(names)
@@ -127,7 +127,7 @@ def test_aggregative_team_descends_linearly_to_its_optimum(case, most):
 @pytest.mark.slow
 @pytest.mark.parametrize("case", EVERY_CASE)
 def test_robots_fly_to_the_tasks_that_they_won(case):
-    known = trace("auction", case)
+    known = trace_from("auction", case)
     law, place = known.plan.experiment.formation.law, known.true_position[..., :2]
     tasks = np.array([*law["tasks"], *(each[:2] for each in law["later"])])
     chosen = np.where(known.measures["calm"] >= law.get("calm_s", 1.0), known.measures["task"], -1.0)
@@ -156,7 +156,7 @@ def test_robots_fly_to_the_tasks_that_they_won(case):
     ],
 )
 def test_consensus_meets_mean_at_the_graphs_rate(case, changes, moved):
-    known = trace("consensus", case, *changes)
+    known = trace_from("consensus", case, *changes)
     offset = np.array([*known.plan.experiment.formation.law["offset"].values()])
     mean = (known.true_position[..., :2] - offset).mean(axis=1)
     assert np.abs(mean - mean[0]).max() < moved
@@ -183,7 +183,7 @@ def apart_from_mean(known):
 )
 def test_event_consensus_stays_bounded_and_keeps_events_apart(case, floor, extra):
     """Seyboth, Dimarogonas, Johansson, Automatica 49(1), 2013: thresholds c₀ + c₁ exp(−α t), α below k λ₂."""
-    known = trace("consensus", case, NOISELESS)
+    known = trace_from("consensus", case, NOISELESS)
     spectrum, alpha, root = np.linalg.eigvalsh(RING), 0.25, np.sqrt(5.0)
     rate, norm = 0.3 * spectrum[1], 0.3 * spectrum[-1]
     moving = known.time >= 2.0  # the bodies follow
@@ -241,7 +241,7 @@ def test_followers_go_into_the_hull_of_their_leaders():
 @pytest.mark.parametrize("share", [0.6, 1.0, 1.2])
 def test_pursuit_meets_circles_or_leaves_by_its_angle(case, share):
     angle, gain, half = share * np.pi / 6.0, 0.3, np.pi / 6.0
-    known = trace("cyclic-pursuit", case, f"formation.law.angle={angle:.5f}", "duration_s=10")
+    known = trace_from("cyclic-pursuit", case, f"formation.law.angle={angle:.5f}", "duration_s=10")
     place = known.true_position[..., 0] + 1j * known.true_position[..., 1]
     mean = place.mean(axis=1)
     assert np.abs(mean - mean[0]).max() < 0.01
@@ -273,7 +273,7 @@ def lag(known):
     ],
 )
 def test_followers_of_a_constant_leader_do_not_lag(case, most, changes):
-    known = trace("leader-observer", case, *changes)
+    known = trace_from("leader-observer", case, *changes)
     window = (known.time > 20.0) & (known.time < 38.0)
     assert np.abs(known.memory["v"][window] - [0.12, 0.0]).max() < 1e-3
     assert lag(known)[window].max() < most
@@ -282,7 +282,7 @@ def test_followers_of_a_constant_leader_do_not_lag(case, most, changes):
 
 @pytest.mark.slow
 def test_followers_without_velocity_lag_by_speed_over_gain():
-    known = trace("leader-observer", "periodic", "formation.law.observer=1e-9", "duration_s=20")
+    known = trace_from("leader-observer", "periodic", "formation.law.observer=1e-9", "duration_s=20")
     assert lag(known)[-1, 1:3] == pytest.approx(0.12 / 0.5, rel=0.05)
 
 
@@ -312,7 +312,7 @@ def off_centroid(places):
 @pytest.mark.slow
 @pytest.mark.parametrize("case", EVERY_CASE)
 def test_coverage_lowers_its_cost_and_ends_at_centroids(case):
-    known = trace("coverage", case)
+    known = trace_from("coverage", case)
     ways = known.true_position[::25, :, :2]
     found = costs(ways)
     assert np.diff(found).max() < 0.005
@@ -333,7 +333,7 @@ def five_alone():
 def test_coverage_makes_up_for_a_robot_landing_midflight(case):
     """The battery of CF06, a Crazyflie among Tellos, is low first."""
     others = tuple(f'robots.CF0{number}.kind="tello"' for number in range(1, 6))
-    known = trace("coverage", case, *others, "safety.battery_low=0.975", "duration_s=16")
+    known = trace_from("coverage", case, *others, "safety.battery_low=0.975", "duration_s=16")
     ((lost, name),) = {(event.stamp, event.source) for event in known.events if event.text.startswith("land: its batt")}
     assert name == "CF06"
     assert 7.0 < lost < 9.0
@@ -373,7 +373,7 @@ def test_followers_without_any_leader_stop():
 @pytest.mark.slow
 @limits(0.04, 0.05, 0.08)
 def test_flock_keeps_spacing_velocity_and_rendezvous_of_mean(case, most):
-    known = trace("flocking", case)
+    known = trace_from("flocking", case)
     place = known.true_position[..., :2]
     apart = np.linalg.norm(place[:, :, None] - place[:, None], axis=3)[:, *np.triu_indices(7, 1)]
     assert apart.min() > 0.5
@@ -428,7 +428,7 @@ def out_of_place(known):
 @pytest.mark.slow
 @limits(0.002, 0.005, 0.008)
 def test_integral_action_leaves_no_error_in_a_wind(case, most):
-    known = trace("integral", case)
+    known = trace_from("integral", case)
     assert np.linalg.norm(out_of_place(known)[known.time > 37.0], axis=2).max() < most
     for wind, z in zip(np.array([*WIND.values()]), known.memory["z"][-1, 1:], strict=True):
         beyond = max(SHELTER - LEASH / np.linalg.norm(wind), 0.0)  # what the reference of its place does not hold off
@@ -449,7 +449,7 @@ def test_integral_action_needs_no_leader_for_the_shape(case):
 @pytest.mark.slow
 @pytest.mark.parametrize("case", EVERY_CASE)
 def test_displacement_keeps_an_error_in_a_wind(case):
-    known = trace("integral", case, 'formation.law={ kind = "displacement" }')
+    known = trace_from("integral", case, 'formation.law={ kind = "displacement" }')
     links = np.array([[2, 0, -1, 0], [0, 2, 0, -1], [-1, 0, 3, -1], [0, -1, -1, 2]])
     expected = np.linalg.solve(known.plan.experiment.formation.stiffness * links, SHELTER * np.array([*WIND.values()]))
     assert np.linalg.norm(expected, axis=1).min() > 0.15
@@ -474,7 +474,7 @@ def test_integral_stops_at_limit_and_for_held_robots():
 @pytest.mark.slow
 @pytest.mark.parametrize("case", EVERY_CASE)
 def test_robots_enclose_a_target_that_two_see(case):
-    known = trace("enclosing", case)
+    known = trace_from("enclosing", case)
     place = known.true_position[..., :2]
     assert known.memory["links"][-1, :, 0].tolist() == [0.0, 1.0, 2.0, 1.0, 2.0, 2.0]
     from_target = place[:, 1:] - place[:, :1]

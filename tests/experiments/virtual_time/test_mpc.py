@@ -169,7 +169,9 @@ def test_lost_robots_transmitted_path_is_no_longer_avoided(meeting):
 def test_constraints_hold_where_they_can():
     """Of a plan beside one other: n·p ≥ b at its step, and limits."""
     ahead = horizon(15, 0.2, 0.1)
-    (found,) = ahead.conflicts(ahead.positions((0.0, 0.0), (0.3, 0.0), ahead.rest), [standing((0.6, 0.0))], 0.35, 0.0)
+    (found,) = ahead.conflicts(
+        ahead.positions((0.0, 0.0), (0.3, 0.0), ahead.rest), [still_neighbour((0.6, 0.0))], 0.35, 0.0
+    )
     step, normal, bound = found
     assert (step, normal, bound) == (4, (-1.0, 0.0), pytest.approx(-0.25))
     a, slack = ahead.plan((0.0, 0.0), (0.3, 0.0), (2.0, 0.5), [found], (0.5, 1.0, 100.0))
@@ -180,7 +182,7 @@ def test_constraints_hold_where_they_can():
     assert np.abs(0.3 * np.array([1.0, 0.0]) + 0.2 * np.cumsum(a, axis=0)).max() <= 0.5 + 1e-6
 
 
-def standing(place):
+def still_neighbour(place):
     return NeighbourView(1, "B", (*place, 0.0), ZERO, 0.0, 0.0, {"path": (nan,) * 32}, None)
 
 

@@ -17,7 +17,7 @@ from tests.small import changed, pair, reference, small
 
 
 @pytest.fixture(scope="module")
-def park():
+def random_park():
     """The reference experiment with everything that is random, cut short."""
     nature = reference().disturbance | {
         "KH02": Disturbance(odometry_drift=0.002, latency_s=0.02),
@@ -41,8 +41,8 @@ def assert_same(first, second):
 
 
 @pytest.mark.slow
-def test_same_seed_gives_same_bits_and_another_others(park):
-    first, again, other = (simulate(Plan(park), seed) for seed in (7, 7, 8))
+def test_same_seed_gives_same_bits_and_another_others(random_park):
+    first, again, other = (simulate(Plan(random_park), seed) for seed in (7, 7, 8))
     assert_same(first, again)
     assert not np.array_equal(first.position[-1], other.position[-1])
 
@@ -63,8 +63,8 @@ def test_the_common_start_is_time_zero():
     assert (log.decisions, log.ticks) == (20, 200)
 
 
-def test_phases_never_go_back(park):
-    log = fly(park).log
+def test_phases_never_go_back(random_park):
+    log = fly(random_park).log
     assert (np.diff(log.phase, axis=0) >= 0).all()
     assert {IDLE, READY, AIRBORNE, RUNNING, LANDING, DONE} >= set(log.phase.ravel().tolist())
     assert (log.true_position[-1, 4:, 2] < 0.03).all()  # down, or about to touch down

@@ -126,12 +126,12 @@ def test_a_table_has_straight_columns():
 
 
 def test_hosts_are_chosen_by_name_or_tag():
-    lab = {"lab1": Host(address="a", tags=["radio"]), "lab2": Host(address="b")}
-    assert list(choose(lab, [])) == ["lab1", "lab2"]
-    assert list(choose(lab, ["radio"])) == ["lab1"]
-    assert list(choose(lab, ["lab2", "radio"])) == ["lab1", "lab2"]
+    lab_folder = {"lab1": Host(address="a", tags=["radio"]), "lab2": Host(address="b")}
+    assert list(choose(lab_folder, [])) == ["lab1", "lab2"]
+    assert list(choose(lab_folder, ["radio"])) == ["lab1"]
+    assert list(choose(lab_folder, ["lab2", "radio"])) == ["lab1", "lab2"]
     with pytest.raises(DocumentError, match="there are: lab1, lab2, radio"):
-        choose(lab, ["lab9"])
+        choose(lab_folder, ["lab9"])
     with pytest.raises(DocumentError, match="all robots run here"):
         choose({}, [])
 
@@ -194,53 +194,53 @@ def test_install_leaves_alone_what_is_not_its_own(home, tmp_path, capsys, there,
 
 
 @pytest.fixture
-def lab(tmp_path):
+def lab_folder(tmp_path):
     folder = tmp_path / "lab"
     authority.create(folder, {"router": "router", "KH01": "robot", "CF01": "robot"})
     return folder
 
 
-def test_folder_holds_only_what_it_was_sent(home, lab):
+def test_folder_holds_only_what_it_was_sent(home, lab_folder):
     host, there = Host(address="lab1", lab="~/keys of mine"), home / "keys of mine"
-    assert send("lab1", host, lab, ["KH01", "CF01"]) == "certificates of KH01, CF01 put into keys of mine"
+    assert send("lab1", host, lab_folder, ["KH01", "CF01"]) == "certificates of KH01, CF01 put into keys of mine"
     before = (there / "KH01.key").read_bytes()
-    authority.renew(lab, ["KH01"])
-    assert send("lab1", host, lab, ["KH01"]).endswith("; removed CF01.pem, CF01.key")
+    authority.renew(lab_folder, ["KH01"])
+    assert send("lab1", host, lab_folder, ["KH01"]).endswith("; removed CF01.pem, CF01.key")
     assert {file.name for file in there.iterdir()} == {"KH01.key", "KH01.pem", "ca.pem"}
-    assert before != (there / "KH01.key").read_bytes() == (lab / "KH01.key").read_bytes()
+    assert before != (there / "KH01.key").read_bytes() == (lab_folder / "KH01.key").read_bytes()
     assert stat.S_IMODE(there.stat().st_mode) == 0o700
     assert {stat.S_IMODE(file.stat().st_mode) for file in there.iterdir()} == {0o600}
 
 
-def test_what_is_not_its_own_is_left_alone(home, lab):
+def test_what_is_not_its_own_is_left_alone(home, lab_folder):
     there = home / "zenpark-lab"
     for strange, said in (("ca.key", "is the lab's own folder"), ("thesis.tex", "holds something else (thesis.tex)")):
         there.mkdir()
         (there / strange).touch()
         (there / "CF01.key").touch()
         with pytest.raises(HostError, match="certificates not put there") as caught:
-            send("lab1", Host(address="lab1"), lab, ["KH01"])
+            send("lab1", Host(address="lab1"), lab_folder, ["KH01"])
         assert said in str(caught.value)
         assert 'lab = "zenpark-lab"' in str(caught.value)
         assert {file.name for file in there.iterdir()} == {strange, "CF01.key"}
         shutil.rmtree(there)
 
 
-def test_hosts_need_folders_of_their_own(lab):
+def test_hosts_need_folders_of_their_own(lab_folder):
     for place in ("zenpark", "~/zenpark", "/zenpark", "bin/zp"):
         with pytest.raises(HostError, match="names no folder of its own"):
             put("lab1", Host(address="a", zenpark=place))
     for place in ("", "~/", "/", ".", "../keys"):
         with pytest.raises(HostError, match="names no folder of its own"):
-            send("lab1", Host(address="lab1", lab=place), lab, ["KH01"])
+            send("lab1", Host(address="lab1", lab=place), lab_folder, ["KH01"])
 
 
-def test_what_cannot_be_sent_is_said_before(home, lab):
-    authority.renew(lab, ["CF01"], days=-0.01)
+def test_what_cannot_be_sent_is_said_before(home, lab_folder):
+    authority.renew(lab_folder, ["CF01"], days=-0.01)
     with pytest.raises(HostError) as caught:
-        send("lab1", Host(address="lab1"), lab, ["KH01", "CF01", "TB01"])
+        send("lab1", Host(address="lab1"), lab_folder, ["KH01", "CF01", "TB01"])
     assert "lab1: the certificate of CF01 ended at" in str(caught.value)
     assert "lab1: TB01 is not in the lab" in str(caught.value)
     assert not (home / "zenpark-lab").exists()
     with pytest.raises(HostError, match="lab1: it cannot be reached"):
-        send("lab1", Host(address="nobody"), lab, ["KH01"])
+        send("lab1", Host(address="nobody"), lab_folder, ["KH01"])

@@ -24,7 +24,7 @@ def stdout_of(*words, code=0):
     return invoke(*words, code=code).stdout
 
 
-def refusal(*words):
+def refused_command(*words):
     """Why a command is refused."""
     error = invoke(*words, code=None).exception
     assert isinstance(error, ExplainedError)
@@ -32,7 +32,7 @@ def refusal(*words):
 
 
 @pytest.fixture(scope="module")
-def three(tmp_path_factory):
+def three_seeds(tmp_path_factory):
     """Folder of a run of two cases and three seeds, and what the command printed."""
     folder = tmp_path_factory.mktemp("results")
     (folder / "short.toml").write_text(SHORT)
@@ -40,8 +40,8 @@ def three(tmp_path_factory):
 
 
 @pytest.fixture
-def first(three):
-    return three[0]
+def first(three_seeds):
+    return three_seeds[0]
 
 
 @pytest.fixture
@@ -79,8 +79,8 @@ def test_figures_are_pdf_on_demand(first, again):
         assert "./zenpark report FOLDER --pdf" in " ".join(text.split())
     stdout_of("report", again, "--pdf")
     assert {file.stem for file in again.glob("figures/*.pdf")} == {file.stem for file in again.glob("figures/*.svg")}
-    assert refusal("report", again, "--latex", "--pdf")
-    assert refusal("report", again, first, "--pdf")
+    assert refused_command("report", again, "--latex", "--pdf")
+    assert refused_command("report", again, first, "--pdf")
 
 
 def test_figure_of_errors_stays_without_all_seeds_errors(first, again):
@@ -93,7 +93,7 @@ def test_figure_of_errors_stays_without_all_seeds_errors(first, again):
 def test_metrics_of_another_version_are_not_overwritten(again):
     before = (again / "metrics.json").read_text().replace('"iae"', '"iae_of_old"')
     (again / "metrics.json").write_text(before)
-    assert refusal("report", again)
+    assert refused_command("report", again)
     assert (again / "metrics.json").read_text() == before
 
 
@@ -107,19 +107,19 @@ def test_paper_tables_are_over_seeds_with_chosen_metrics(first, tmp_path):
     assert stdout_of("report", first, "--latex", "--out", file, "--metrics", "f,iae").strip() == str(file)
     rows = [line for line in file.read_text().splitlines() if line.startswith(("f ", "IAE", "ITAE", "RMSE"))]
     assert [row.split(" [")[0] for row in rows] == ["f", "IAE"]
-    assert "--metrics speed: is not known" in refusal("report", first, "--latex", "--metrics", "speed")
+    assert "--metrics speed: is not known" in refused_command("report", first, "--latex", "--metrics", "speed")
     with pytest.raises(DocumentError, match="did you mean 'acquired'"):
         known_words("--metrics", ["acquired_s"], ["f", "iae", "acquired"])
 
 
-def test_console_gives_the_digits_an_interval_supports(three):
-    lines = three[1].splitlines()
+def test_console_gives_the_digits_an_interval_supports(three_seeds):
+    lines = three_seeds[1].splitlines()
     half = re.search(r"IAE (\d\.\d+) ± (\d\.\d+) m s, ", lines[0])
     assert len(half[1]) == len(half[2])
     assert re.search(r"\(ratios: f \d\.\d+ ± \d\.\d+, IAE \d\.\d+ ± \d\.\d+\)", lines[1])
     assert ratio_words(spread([0.0610, 0.0611, 0.0612])) == "0.0611 ± 0.0002"
     assert ratio_words(spread([1.0784])) == "1.078"
-    assert lines[-1] == f"replay in the browser: ./zenpark view {three[0]}"
+    assert lines[-1] == f"replay in the browser: ./zenpark view {three_seeds[0]}"
 
 
 def test_sweep_has_figures_and_a_paper_table(first, tmp_path):
@@ -137,19 +137,19 @@ def test_sweep_has_figures_and_a_paper_table(first, tmp_path):
     assert "event & 0.05 & " in text
     chosen = stdout_of("report", folder, "--latex", "--metrics", "messages,iae").splitlines()
     assert r"Case & threshold [m] & Messages ratio & IAE ratio \\" in chosen
-    assert "--metrics speed: is not known" in refusal("report", folder, "--latex", "--metrics", "speed")
+    assert "--metrics speed: is not known" in refused_command("report", folder, "--latex", "--metrics", "speed")
     assert f"a sweep: `./zenpark report {folder}`" in stdout_of("runs", "--past", "--in", tmp_path)
     (known,) = json.loads(stdout_of("runs", "--past", "--in", tmp_path, "--json"))["sweeps"]
     assert (known["folder"], known["cells"], known["seeds"]) == (str(folder), 3, [1, 2])
 
 
-def test_hazards_of_a_virtual_run_are_printed(three, another):
+def test_hazards_of_a_virtual_run_are_printed(three_seeds, another):
     _, printed = another("--set", "safety.separation=0.7", "--anyway")
     lines = [line for line in printed.splitlines() if ": hazard " in line]
     assert len(lines) == 6
     assert all("minimum separation" in line for line in lines)
     assert "more, in the recording and the report" in printed
-    assert "hazard" not in three[1]
+    assert "hazard" not in three_seeds[1]
 
 
 def test_runs_of_several_seeds_are_pooled_to_one(first, another, tmp_path):
@@ -160,13 +160,13 @@ def test_runs_of_several_seeds_are_pooled_to_one(first, another, tmp_path):
     assert stdout_of("report", *runs, "--pool").strip() == str(page)
     assert f"Of 3 runs together: {', '.join(map(str, runs))}." in page.read_text()
     assert "median and range of 3 seeds" in page.read_text()
-    assert "seed 1 is there twice" in refusal("report", runs[0], runs[0], "--pool")
+    assert "seed 1 is there twice" in refused_command("report", runs[0], runs[0], "--pool")
     other, _ = another("--set", "duration_s=2.5")
-    assert "differs from" in refusal("report", runs[1], other, "--pool")
+    assert "differs from" in refused_command("report", runs[1], other, "--pool")
 
 
-def test_a_comparison_has_the_intervals_of_the_report(three, again, tmp_path):
-    first, printed = three
+def test_a_comparison_has_the_intervals_of_the_report(three_seeds, again, tmp_path):
+    first, printed = three_seeds
     (again / "event.mcap").unlink()  # `clean --recordings` leaves the metrics
     page = tmp_path / "comparison.html"
     lines = stdout_of("report", first, tmp_path, "--out", page).splitlines()
@@ -233,4 +233,4 @@ def test_a_spoiled_run_is_not_compared(first, another, tmp_path):
     assert "×" not in next(line for line in compared.splitlines() if line.startswith("B · event "))
     assert "Spoiled, and compared with nothing: B · event: " in compared
     assert "robots failed" in stdout_of("runs", "--past", "--in", out)
-    assert "is no whole run that nothing spoiled" in refusal("report", out, first, "--pool")
+    assert "is no whole run that nothing spoiled" in refused_command("report", out, first, "--pool")

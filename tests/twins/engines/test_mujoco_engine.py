@@ -32,11 +32,11 @@ def hovering(kind=CRAZYFLIE, height=1.0, dt=DT, lag=0.03, scene=None):
     """One drone that holds its place."""
     made = RigidBody(motor_lag_s=lag).build(stage((kind,), [(0, 0)], scene=scene, dt=dt))
     made.place([0], [(0.0, 0.0, height)], [0.0], [True])
-    fly(made, [[0.0, 0.0, height, 0.0]] if kind is CRAZYFLIE else [[0.0] * 4], 0.5, dt)
+    path_of(made, [[0.0, 0.0, height, 0.0]] if kind is CRAZYFLIE else [[0.0] * 4], 0.5, dt)
     return made
 
 
-def fly(engine, setpoints, seconds, dt=DT):
+def path_of(engine, setpoints, seconds, dt=DT):
     """(T, robots, 4) positions and yaw under one setpoint each."""
     path, still = [], [(0.0, 0.0)] * len(engine.motions)
     for _ in range(round(seconds / dt)):
@@ -90,7 +90,7 @@ def test_motors_carry_the_weight(kind):
 
 @pytest.mark.slow
 def test_small_step_is_that_of_linear_cascade():
-    path = fly(hovering(), [[0.1, 0.0, 1.0, 0.0]], 4.0)[:, 0, 0]
+    path = path_of(hovering(), [[0.1, 0.0, 1.0, 0.0]], 4.0)[:, 0, 0]
     theory = linear_cascade(0.1, 4.0)
     np.testing.assert_allclose(path[: len(theory)], theory[: len(path)], atol=0.0025)
     (rise, overshoot), (due, most) = rise_and_overshoot(path, 0.1), rise_and_overshoot(theory, 0.1)
@@ -120,7 +120,7 @@ def test_steps_beside_the_fitted_law(axis, step, rise, overshoot):
     for _ in range(600):
         law.move(DT)
         fitted.append((*law.position, law.yaw)[axis])
-    path = fly(engine, [setpoint], 6.0)[:, 0, axis] - before[axis]
+    path = path_of(engine, [setpoint], 6.0)[:, 0, axis] - before[axis]
     mine, fitted = rise_and_overshoot(path, step), rise_and_overshoot(np.array(fitted) - before[axis], step)
     assert fitted[0] == pytest.approx(mine[0], rel=0.10)
     assert abs(mine[1] - fitted[1]) < 0.04
@@ -131,7 +131,7 @@ def test_steps_beside_the_fitted_law(axis, step, rise, overshoot):
 
 @pytest.mark.slow
 def test_lag_of_motors_hardly_shows():
-    quick, slow = (fly(hovering(lag=lag), [[0.5, 0.2, 1.0, 0.5]], 4.0)[:, 0, :2] for lag in (0.02, 0.06))
+    quick, slow = (path_of(hovering(lag=lag), [[0.5, 0.2, 1.0, 0.5]], 4.0)[:, 0, :2] for lag in (0.02, 0.06))
     assert np.abs(quick - slow).max() < 0.01
 
 
@@ -139,7 +139,7 @@ def test_tilt_and_speed_stay_within_the_limits():
     engine = hovering()
     lean, speed = [], []
     for _ in range(300):
-        fly(engine, [[20.0, -20.0, 1.0, 0.0]], DT)
+        path_of(engine, [[20.0, -20.0, 1.0, 0.0]], DT)
         w, x, y, z = engine.motions[0].attitude
         lean.append(math.degrees(math.acos(1.0 - 2.0 * (x * x + y * y))))
         speed.append(max(map(abs, engine.motions[0].velocity[:2])))
@@ -153,10 +153,10 @@ def test_tilt_and_speed_stay_within_the_limits():
 @pytest.mark.slow
 def test_nose_points_where_drone_flies():
     engine = hovering()
-    fly(engine, [[0.0, 0.0, 1.0, math.pi / 2]], 4.0)
+    path_of(engine, [[0.0, 0.0, 1.0, math.pi / 2]], 4.0)
     w, x, y, z = engine.motions[0].attitude
     assert 2.0 * math.atan2(z, w) == pytest.approx(math.pi / 2, abs=0.05)  # its integral is slow
-    fly(engine, [[0.0, 0.5, 1.0, math.pi / 2]], 0.3)
+    path_of(engine, [[0.0, 0.5, 1.0, math.pi / 2]], 0.3)
     w, x, y, z = engine.motions[0].attitude
     assert 2.0 * (x * z - w * y) < -0.1  # the nose is down
     assert abs(2.0 * (y * z + w * x)) < 0.02  # and the left side is level
@@ -167,15 +167,15 @@ def test_nose_points_where_drone_flies():
 @pytest.mark.parametrize("kind", [CRAZYFLIE, TELLO])
 def test_take_off_and_landing(kind):
     engine = RigidBody().build(stage((kind,), [(0.3, -0.2)]))
-    fly(engine, [[1.0, 1.0, 1.0, 1.0]], 0.5)
+    path_of(engine, [[1.0, 1.0, 1.0, 1.0]], 0.5)
     assert engine.motions[0].position == pytest.approx((0.3, -0.2, 0.0), abs=2e-4)  # setpoints on the ground do nothing
     engine.takeoff([0], [0.8])
-    path = fly(engine, [[np.nan] * 4], 8.0)[:, 0]
+    path = path_of(engine, [[np.nan] * 4], 8.0)[:, 0]
     np.testing.assert_allclose(path[-1], [0.3, -0.2, 0.8, 0.0], atol=0.03)
     np.testing.assert_allclose(path[:, :2], np.tile([0.3, -0.2], (800, 1)), atol=2e-3)
     assert path[:, 2].max() < 0.9
     engine.land([0])
-    fly(engine, [[5.0, 5.0, 5.0, 1.0]], 8.0)
+    path_of(engine, [[5.0, 5.0, 5.0, 1.0]], 8.0)
     assert not engine.motions[0].flying
     assert engine.motions[0].position == pytest.approx((0.3, -0.2, 0.0), abs=3e-3)
     assert engine.motions[0].velocity == ZERO
@@ -184,7 +184,7 @@ def test_take_off_and_landing(kind):
 def test_motors_off_is_a_fall():
     engine = hovering(height=1.5)
     engine.stop([0])
-    heights = fly(engine, [[0.0, 0.0, 9.0, 0.0]], 1.5)[:, 0, 2]
+    heights = path_of(engine, [[0.0, 0.0, 9.0, 0.0]], 1.5)[:, 0, 2]
     lag = 0.03  # the propellers run down: that much later by mechanics
     fallen = 0.3 - lag * (1.0 - math.exp(-0.3 / lag))
     assert heights[29] == pytest.approx(1.5 - 0.5 * GRAVITY * fallen**2, abs=0.02)
@@ -192,11 +192,11 @@ def test_motors_off_is_a_fall():
     assert heights[-1] == pytest.approx(0.0, abs=2e-3)
 
     spinning = hovering(height=2.0)
-    fly(spinning, [[3.0, 0.0, 2.0, 0.0]], 0.08)
+    path_of(spinning, [[3.0, 0.0, 2.0, 0.0]], 0.08)
     spinning.stop([0])
     lean = []
     for _ in range(300):
-        fly(spinning, [[np.nan] * 4], DT)
+        path_of(spinning, [[np.nan] * 4], DT)
         _, x, y, _ = spinning.motions[0].attitude
         lean.append(math.degrees(math.acos(np.clip(1.0 - 2.0 * (x * x + y * y), -1.0, 1.0))))
     assert max(lean[:60]) > 20.0  # it goes on turning as it falls
@@ -207,24 +207,24 @@ def test_motors_off_is_a_fall():
 def test_drone_on_its_back_is_switched_off():
     engine = hovering()
     engine.drones.state[0, 4:8] = [0.0, 1.0, 0.0, 0.0]
-    fly(engine, [[0.0, 0.0, 1.0, 0.0]], 3.0)
+    path_of(engine, [[0.0, 0.0, 1.0, 0.0]], 3.0)
     assert not engine.motions[0].flying
     engine.takeoff([0], [0.5])
-    fly(engine, [[np.nan] * 4], 1.0)
+    path_of(engine, [[np.nan] * 4], 1.0)
     assert not engine.motions[0].flying
     engine.place([0], [ZERO], [0.0], [False])  # someone puts it on its feet
     engine.takeoff([0], [0.5])
-    fly(engine, [[np.nan] * 4], 4.0)
+    path_of(engine, [[np.nan] * 4], 4.0)
     assert engine.motions[0].position[2] == pytest.approx(0.5, abs=0.05)
 
 
 @pytest.mark.slow
 def test_tello_follows_velocities():
     engine = hovering(TELLO)
-    path = fly(engine, [[0.5, 0.0, 0.0, 0.3]], 3.0)[:, 0]
+    path = path_of(engine, [[0.5, 0.0, 0.0, 0.3]], 3.0)[:, 0]
     assert engine.motions[0].velocity == pytest.approx((0.5, 0.0, 0.0), abs=0.03)  # in the room, while it turns
     assert path[-1, 3] == pytest.approx(0.9, abs=0.1)
-    fly(engine, [[9.0, 0.0, 0.0, 0.0]], 5.0)
+    path_of(engine, [[9.0, 0.0, 0.0, 0.0]], 5.0)
     assert engine.motions[0].velocity[0] == pytest.approx(1.0, abs=0.03)
 
 
@@ -260,7 +260,7 @@ def test_drones_are_the_same_alone():
 
 @pytest.mark.parametrize("dt", mostly_slow([DT, 0.02, 0.004, 1.0 / 64.0, 1.0 / 30.0], 5))
 def test_any_step_divides_into_firmware_rate(dt):
-    path = fly(hovering(dt=dt), [[0.3, 0.0, 1.0, 0.0]], 4.0, dt)[:, 0, 0]
+    path = path_of(hovering(dt=dt), [[0.3, 0.0, 1.0, 0.0]], 4.0, dt)[:, 0, 0]
     rise, overshoot = rise_and_overshoot(path, 0.3, dt)
     assert rise == pytest.approx(0.487, abs=0.5 * dt + 0.01)
     assert overshoot == pytest.approx(0.112, abs=0.015)
@@ -276,10 +276,10 @@ def test_fixed_obstacles_are_in_the_way():
     scene = Scene.furnished((4.0, 4.0, 2.5), obstacles, {}, walled=True)
     engine = hovering(scene=scene)
     engine.stop([0])
-    fly(engine, [[np.nan] * 4], 2.0)
+    path_of(engine, [[np.nan] * 4], 2.0)
     assert engine.motions[0].position == pytest.approx((0.0, 0.0, 0.5), abs=3e-3)
     for target, reach in (((1.5, 0.0), 0.9), ((-1.5, 0.0), 1.0 - 0.005), ((0.0, 5.0), 2.0)):
-        path = fly(hovering(scene=scene), [[*target, 1.0, 0.0]], 5.0)[:, 0, :2]
+        path = path_of(hovering(scene=scene), [[*target, 1.0, 0.0]], 5.0)[:, 0, :2]
         assert np.abs(path).max() == pytest.approx(reach - 0.046, abs=0.02)  # it leans there, a corner ahead or behind
 
 
@@ -288,7 +288,7 @@ def test_mirrored_robots_are_where_they_are_shown():
     assert np.isnan(columns(engine, "position")).all()
     places = [(0.1, 0.2, 0.9), (0.5, 0.5, 0.0)]
     engine.mirror([0, 1], places, [0.3, 1.0], [ZERO] * 2)
-    fly(engine, [[np.nan] * 4] * 2, 0.1)
+    path_of(engine, [[np.nan] * 4] * 2, 0.1)
     assert [motion.position for motion in engine.motions] == places
     assert columns(engine, "attitude")[:, 3] == pytest.approx(np.sin([0.15, 0.5]))
     assert engine.touches() == []

@@ -23,7 +23,7 @@ def flying(kind=CRAZYFLIE, height=0.8, yaw=0.0):
     return made
 
 
-def fly(quadrotor, setpoint, seconds, dt=DT):
+def path_of(quadrotor, setpoint, seconds, dt=DT):
     """(T, 4) positions and yaws under one setpoint."""
     path = []
     for _ in range(round(seconds / dt)):
@@ -53,7 +53,7 @@ def exact(response, axis, target, times):
 def test_steps_solve_stated_law(axis, target):
     dt, setpoint = 0.001, [0.0, 0.0, 0.8, 0.0]
     setpoint[axis] += target
-    path = fly(flying(), tuple(setpoint), 5.0, dt)[:, axis] - (0.8 if axis == 2 else 0.0)
+    path = path_of(flying(), tuple(setpoint), 5.0, dt)[:, axis] - (0.8 if axis == 2 else 0.0)
     truth = exact(CRAZYFLIE.motion, axis, target, dt * np.arange(5001))
     np.testing.assert_allclose(path, truth[1:], atol=3e-3 * target)
     assert path[-1] == pytest.approx(target, rel=0.01)
@@ -66,12 +66,12 @@ def test_steps_rise_like_firmware(axis, step, rise_ms):
     """Rise times are those of the maker's firmware, compiled and run on a rigid body of 29 g."""
     dt, setpoint = 0.001, [0.0, 0.0, 0.8, 0.0]
     setpoint[axis] += step
-    path = (fly(flying(), tuple(setpoint), 3.0, dt)[:, axis] - (0.8 if axis == 2 else 0.0)) / step
+    path = (path_of(flying(), tuple(setpoint), 3.0, dt)[:, axis] - (0.8 if axis == 2 else 0.0)) / step
     assert dt * ((path > 0.9).argmax() - (path > 0.1).argmax()) == pytest.approx(1e-3 * rise_ms, rel=0.10)
 
 
 def test_axes_keep_their_speed_limit():
-    path = fly(flying(), (50.0, -50.0, 30.0, 0.0), 3.0)[:, :3]
+    path = path_of(flying(), (50.0, -50.0, 30.0, 0.0), 3.0)[:, :3]
     speed = np.abs(np.diff(path, axis=0)) / DT
     limit = CRAZYFLIE.motion.speed
     # a third state may pass a limit by its overshoot
@@ -81,26 +81,26 @@ def test_axes_keep_their_speed_limit():
 
 def test_yaw_turns_the_shorter_way():
     begin = math.radians(178.0)
-    yaw = fly(flying(yaw=begin), (0.0, 0.0, 0.8, math.radians(-178.0)), 3.0)[:, 3]
+    yaw = path_of(flying(yaw=begin), (0.0, 0.0, 0.8, math.radians(-178.0)), 3.0)[:, 3]
     assert yaw[-1] - begin == pytest.approx(math.radians(4.0), abs=1e-3)
     assert np.diff(yaw).min() >= 0.0
 
 
 def test_yaw_follows_exponentially_up_to_its_rate():
-    yaw = fly(flying(), (0.0, 0.0, 0.8, 3.0), 1.0)[:, 3]
+    yaw = path_of(flying(), (0.0, 0.0, 0.8, 3.0), 1.0)[:, 3]
     assert np.diff(yaw, prepend=0.0).max() / DT == pytest.approx(CRAZYFLIE.turn_rate)
-    yaw = fly(flying(), (0.0, 0.0, 0.8, 1.0), 0.5)[-1, 3]
+    yaw = path_of(flying(), (0.0, 0.0, 0.8, 1.0), 0.5)[-1, 3]
     assert yaw == pytest.approx(1.0 - math.exp(-CRAZYFLIE.turn_response * 0.5), abs=0.01)
 
 
 def test_velocity_robot_follows_with_lag():
     tello = flying(TELLO)
-    path = fly(tello, (0.5, 0.0, 0.0, 0.3), 3.0)
+    path = path_of(tello, (0.5, 0.0, 0.0, 0.3), 3.0)
     gain = TELLO.motion.velocity[0]
     assert path[-1, 0] == pytest.approx(0.5 * (3.0 - (1.0 - math.exp(-gain * 3.0)) / gain), abs=0.01)
     assert tello.velocity == pytest.approx((0.5, 0.0, 0.0), abs=1e-3)
     assert tello.yaw == pytest.approx(0.9)
-    fly(tello, (9.0, 0.0, 0.0, 0.0), 5.0)
+    path_of(tello, (9.0, 0.0, 0.0, 0.0), 5.0)
     assert tello.velocity[0] == pytest.approx(1.0, abs=1e-3)
 
 
@@ -109,7 +109,7 @@ def test_take_off_climbs_over_its_place(kind):
     quadrotor = Quadrotor(kind, (0.3, -0.2, 0.0), 0.5)
     quadrotor.takeoff(0.8)
     assert quadrotor.flying
-    path = fly(quadrotor, NO_SETPOINT, 9.0)
+    path = path_of(quadrotor, NO_SETPOINT, 9.0)
     np.testing.assert_allclose(path[:, :2], np.tile([0.3, -0.2], (900, 1)), atol=1e-12)
     assert path[-1, 2:] == pytest.approx([0.8, 0.5], abs=1e-3)
     halfway = 0.8 / CLIMB  # by then the polynomial has ended; the body lags behind it
@@ -121,7 +121,7 @@ def test_take_off_climbs_over_its_place(kind):
 def test_landing_ends_on_floor_with_motors_off(kind):
     quadrotor = flying(kind)
     quadrotor.land()
-    height = fly(quadrotor, (5.0, 5.0, 5.0, 1.0), 8.0)[:, 2]  # setpoints do not interrupt a landing
+    height = path_of(quadrotor, (5.0, 5.0, 5.0, 1.0), 8.0)[:, 2]  # setpoints do not interrupt a landing
     assert (quadrotor.flying, quadrotor.position, quadrotor.velocity) == (False, ZERO, ZERO)
     assert (height >= 0.0).all()
     aloft = height[height > 0.0]
@@ -144,7 +144,7 @@ def test_landing_ordered_again_takes_no_longer():
 def test_motors_off_is_a_fall():
     quadrotor = flying(height=1.5)
     quadrotor.stop()
-    height = fly(quadrotor, (0.0, 0.0, 9.0, 0.0), 1.5)[:, 2]
+    height = path_of(quadrotor, (0.0, 0.0, 9.0, 0.0), 1.5)[:, 2]
     assert (height <= TOUCHDOWN).argmax() * DT == pytest.approx(math.sqrt(2 * 1.5 / 9.81), abs=0.03)
     assert height[round(0.3 / DT) - 1] == pytest.approx(1.5 - 0.5 * 9.81 * 0.3**2, abs=0.02)
     assert (height[-1], quadrotor.velocity) == (0.0, ZERO)
@@ -153,32 +153,32 @@ def test_motors_off_is_a_fall():
 @pytest.mark.parametrize("kind", [CRAZYFLIE, TELLO])
 def test_setpoints_on_ground_have_no_effect(kind):
     quadrotor = Quadrotor(kind, ZERO, 0.0)
-    fly(quadrotor, (1.0, 1.0, 1.0, 1.0), 1.0)
+    path_of(quadrotor, (1.0, 1.0, 1.0, 1.0), 1.0)
     quadrotor.land()
-    assert not fly(quadrotor, (1.0, 1.0, 1.0, 1.0), 1.0).any()
+    assert not path_of(quadrotor, (1.0, 1.0, 1.0, 1.0), 1.0).any()
     quadrotor.takeoff(0.5)
-    path = fly(quadrotor, NO_SETPOINT, 6.0)
+    path = path_of(quadrotor, NO_SETPOINT, 6.0)
     assert path[-1] == pytest.approx([0.0, 0.0, 0.5, 0.0], abs=1e-3)  # nothing was kept for later
 
 
 def test_setpoint_ends_a_climb_and_is_kept():
     quadrotor = Quadrotor(CRAZYFLIE, ZERO, 0.0)
     quadrotor.takeoff(2.0)
-    fly(quadrotor, NO_SETPOINT, 2.0)
+    path_of(quadrotor, NO_SETPOINT, 2.0)
     quadrotor.command((0.5, 0.0, 0.6, 0.0))
-    assert fly(quadrotor, NO_SETPOINT, 8.0)[-1] == pytest.approx([0.5, 0.0, 0.6, 0.0], abs=1e-3)
+    assert path_of(quadrotor, NO_SETPOINT, 8.0)[-1] == pytest.approx([0.5, 0.0, 0.6, 0.0], abs=1e-3)
 
 
 def test_wobble_is_added_to_place_not_motion():
     still, wobbling = flying(), flying()
     wobbling.wobble = (0.01, -0.02)
-    path, other = (fly(each, (0.3, 0.2, 0.9, 0.0), 1.0) for each in (still, wobbling))
+    path, other = (path_of(each, (0.3, 0.2, 0.9, 0.0), 1.0) for each in (still, wobbling))
     np.testing.assert_allclose(other - path, np.tile([0.01, -0.02, 0.0, 0.0], (100, 1)), atol=1e-15)
     assert (wobbling.held, wobbling.velocity) == (still.position, still.velocity)
 
 
 def test_steps_of_another_length_fit():
     coarse, fine = flying(), flying()
-    fly(coarse, (0.5, 0.0, 0.8, 0.0), 1.0, 0.01)
-    fly(fine, (0.5, 0.0, 0.8, 0.0), 1.0, 0.005)
+    path_of(coarse, (0.5, 0.0, 0.8, 0.0), 1.0, 0.01)
+    path_of(fine, (0.5, 0.0, 0.8, 0.0), 1.0, 0.005)
     assert coarse.position == pytest.approx(fine.position, abs=5e-3)

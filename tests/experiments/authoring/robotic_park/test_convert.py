@@ -31,7 +31,7 @@ def converted(text):
     return document.loads(made), " | ".join(notes)
 
 
-def three(relations, architecture="distributed", mode="virtual", kind="khepera", **more):
+def trio(relations, architecture="distributed", mode="virtual", kind="khepera", **more):
     """Robots on a triangle of 0.8 m, or near it; `relations` of each."""
     place = [(0.01 if kind == "dron" else 0.0, 0.0, 0.0), (0.9, 0.0, 0.0), (0.4, 0.7, 0.0)]
     robots = [robot(k + 1, f"khepera0{k + 1}", place[k], relations[k], **more) for k in range(3)]
@@ -44,7 +44,7 @@ OFF = TASK.replace("True", "False")
 
 
 def triangle_with(relation, **more):
-    return three([[*each, relation] for each in TRIANGLE], **more)
+    return trio([[*each, relation] for each in TRIANGLE], **more)
 
 
 # ------------------------------------------------------------------ files like theirs
@@ -125,7 +125,7 @@ def test_control_on_events_and_positions_from_outside():
 
 def test_one_way_links_and_those_of_two_minds():
     relations = (["khepera02_0.8"], ["khepera01_0.9", "khepera03_0.8"], ["khepera02_0.8", "khepera01_0.8"])
-    read, notes = converted(three(relations))
+    read, notes = converted(trio(relations))
     assert dict(read.experiment.formation.links) == {
         "khepera02 > khepera01": 0.8,
         "khepera01 > khepera02": 0.9,
@@ -136,30 +136,30 @@ def test_one_way_links_and_those_of_two_minds():
 
 
 def test_robot_with_another_gain_keeps_it():
-    links = converted(three(TRIANGLE).replace("gain: 0.25", "gain: 0.4", 1))[0].experiment.formation.links
+    links = converted(trio(TRIANGLE).replace("gain: 0.25", "gain: 0.4", 1))[0].experiment.formation.links
     assert links["khepera02 > khepera01"].gain == pytest.approx(0.8)  # 2 · 0.4
     assert links["khepera01 > khepera02"] == 0.8
     assert links["khepera03 - khepera02"] == 0.8
 
 
-PERIOD = three(TRIANGLE).replace("period: 0.1\n", "period: 0.2\n")
+PERIOD = trio(TRIANGLE).replace("period: 0.1\n", "period: 0.2\n")
 FASTER = ("      T: 100\n", "      T: 50\n")
 
 
 @pytest.mark.parametrize(
     ("text", "path", "expected"),
     [
-        (three(TRIANGLE, law="pid"), "formation.gain", pytest.approx(0.25 / 0.64, rel=1e-3)),  # pulls as the square
+        (trio(TRIANGLE, law="pid"), "formation.gain", pytest.approx(0.25 / 0.64, rel=1e-3)),  # pulls as the square
         (PERIOD.replace("type: gradient", "type: gradient_v"), "formation.gain", pytest.approx(0.1)),
         (PERIOD.replace("type: gradient", "type: gradient_v"), "formation.clamp", pytest.approx(0.02)),
-        (three([["khepera02_-0.3/-0.3/0.2"], [], []]).replace("type: distance", "type: relative_pose"),
+        (trio([["khepera02_-0.3/-0.3/0.2"], [], []]).replace("type: distance", "type: relative_pose"),
          "formation.links.khepera02 > khepera01.offset", [-0.3, -0.3]),
-        (three(TRIANGLE, mode="physical", place="physical").replace("agent_ip:", "ip:"), "robots.khepera02.body",
+        (trio(TRIANGLE, mode="physical", place="physical").replace("agent_ip:", "ip:"), "robots.khepera02.body",
          "khepera4://192.168.0.22:50000"),
-        (three(TRIANGLE).replace("pose: 0.90, 0.00, 0.00", "pose: {y: 0.0, x: 0.9}"), "robots.khepera02.start",
+        (trio(TRIANGLE).replace("pose: 0.90, 0.00, 0.00", "pose: {y: 0.0, x: 0.9}"), "robots.khepera02.start",
          [0.9, 0.0]),
-        (three(TRIANGLE, kind="dron", place="physical").replace(*FASTER), "rates.coordination_hz", 20.0),
-        (three(TRIANGLE, kind="dron").replace(*FASTER), "rates.coordination_hz", 10.0),
+        (trio(TRIANGLE, kind="dron", place="physical").replace(*FASTER), "rates.coordination_hz", 20.0),
+        (trio(TRIANGLE, kind="dron").replace(*FASTER), "rates.coordination_hz", 10.0),
     ],
 )  # fmt: skip
 def test_keys_become_those_of_zenpark(text, path, expected):
@@ -180,7 +180,7 @@ def test_keys_become_those_of_zenpark(text, path, expected):
     ],
 )
 def test_relations_to_places_become_anchors(relation, anchor, note):
-    read, notes = converted(three(([*TRIANGLE[0], relation], *TRIANGLE[1:])))
+    read, notes = converted(trio(([*TRIANGLE[0], relation], *TRIANGLE[1:])))
     assert anchor in read.text
     assert ("[formation.anchors]" in read.text) == bool(anchor)
     assert note in notes
@@ -229,10 +229,10 @@ def test_central_controller_reads_relations_of_disabled_tasks(spelt, noted):
 
 
 def test_tasks_that_are_off_are_counted():
-    read, notes = converted(three(TRIANGLE).replace(TASK, OFF))
+    read, notes = converted(trio(TRIANGLE).replace(TASK, OFF))
     assert not read.experiment.formation.links
     assert "khepera01, khepera02, khepera03: 6 relations are left out" in notes
-    assert converted(three(TRIANGLE).replace(TASK, OFF.replace("100", "-5"), 1))[0].experiment.robots
+    assert converted(trio(TRIANGLE).replace(TASK, OFF.replace("100", "-5"), 1))[0].experiment.robots
 
 
 @pytest.mark.parametrize("recent", [False, True])
@@ -286,7 +286,7 @@ def test_flat_formation_stays_flat_whatever_the_origin():
 
 def test_enabled_tools_are_reported_and_no_others():
     off = "  Agent00:\n    enable: False\n  Agent01:\n    enable: True\n  Reconfiguration:\n    enable: True\n"
-    notes = converted(three(TRIANGLE) + off)[1]
+    notes = converted(trio(TRIANGLE) + off)[1]
     assert "Agent00" not in notes
     assert "Other.Agent01: zenpark records" in notes
     assert "the first shape is imported" in notes
@@ -342,7 +342,7 @@ def test_zero_threshold_is_refused_and_co_precedes_threshold():
     ],
 )  # fmt: skip
 def test_error_names_the_key_or_the_line(old, new, said, line):
-    text = three(TRIANGLE)
+    text = trio(TRIANGLE)
     assert old in text
     with pytest.raises(DocumentError) as raised:
         convert_text(text.replace(old, new), "park.yaml", 20.0)

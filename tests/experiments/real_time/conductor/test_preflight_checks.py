@@ -31,7 +31,7 @@ def states(*places, yaw: float | None = 0.0) -> list[State]:
     return [State("CF01", k, 0.02 * k, "idle", place, yaw=yaw) for k, place in enumerate(places)]
 
 
-def standing(
+def observed_still(
     robot=DRONE, *, place=(0.0, 0.5, 0.0), noise=0.0, yaw: float | None = 0.0, said=None, **inspected
 ) -> Observed:
     """A robot at rest: what its process says, and what its device has told."""
@@ -51,7 +51,7 @@ def found(each: Observed, check: str, **others: Observed):
 
 
 def test_a_robot_that_is_in_order_is_green():
-    made = checked(standing(packets_hz=180.0, capacity_hz=250.0))
+    made = checked(observed_still(packets_hz=180.0, capacity_hz=250.0))
     assert {each.check: each.verdict for each in made} == dict.fromkeys(
         ["address", "firmware", "battery", "position", "start pose", "radio", "clock", "ready"], "ok"
     )
@@ -85,12 +85,12 @@ LOCKED = "locked: switch it off and on"
     ],
 )
 def test_what_is_measured_at_rest(changed, check, verdict, text):
-    made = found(standing(**changed), check)
+    made = found(observed_still(**changed), check)
     assert (made.verdict, bool(made.remedy), made.found) == (verdict, verdict in ("warn", "bad"), text)
 
 
 def test_clock_of_another_computer_is_compared():
-    each = standing()
+    each = observed_still()
     each.behind_s = -1.5
     assert found(each, "clock").found == "its computer's is +1.50 s off"
 
@@ -98,11 +98,11 @@ def test_clock_of_another_computer_is_compared():
 @pytest.mark.parametrize(("other_y", "here_y", "there_y"), [(-0.5, -0.5, 0.5), (0.3, 0.38, 0.42)])
 def test_swapped_robots_are_named(other_y, here_y, there_y):
     other = msgspec.structs.replace(OTHER, start=[0.0, other_y, 0.0])
-    there = standing(other, place=(0.0, there_y, 0.0))
-    assert found(standing(place=(0.0, here_y, 0.0)), "start pose", CF02=there).remedy == (
+    there = observed_still(other, place=(0.0, there_y, 0.0))
+    assert found(observed_still(place=(0.0, here_y, 0.0)), "start pose", CF02=there).remedy == (
         "it stands where CF02 begins: addresses, markers or robots are swapped"
     )
-    assert found(standing(place=(0.0, 0.41, 0.0)), "start pose", CF02=there).verdict == "ok"
+    assert found(observed_still(place=(0.0, 0.41, 0.0)), "start pose", CF02=there).verdict == "ok"
 
 
 @pytest.mark.parametrize(
@@ -118,8 +118,8 @@ def test_swapped_robots_are_named(other_y, here_y, there_y):
 )
 def test_robots_that_count_from_start_are_unknown(robot, verdict):
     x, y = robot.start[:2]
-    assert found(standing(robot, place=(x, y, 0.0), noise=0.0005), "start pose").verdict == verdict
-    assert found(standing(robot, place=(5.0, 5.0, 0.0)), "start pose").verdict == "bad"
+    assert found(observed_still(robot, place=(x, y, 0.0), noise=0.0005), "start pose").verdict == verdict
+    assert found(observed_still(robot, place=(5.0, 5.0, 0.0)), "start pose").verdict == "bad"
 
 
 @pytest.mark.parametrize(
@@ -128,9 +128,9 @@ def test_robots_that_count_from_start_are_unknown(robot, verdict):
 )
 def test_captured_positions_that_never_change_are_red(body, position, verdict):
     robot = msgspec.structs.replace(DRONE, body=body, position=position)
-    assert found(standing(robot), "position").verdict == verdict
+    assert found(observed_still(robot), "position").verdict == verdict
     if position == "external":
-        each = standing(robot, said={"body": f"{FROZEN}; connected"})
+        each = observed_still(robot, said={"body": f"{FROZEN}; connected"})
         each.states = []
         assert (found(each, "position").verdict, found(each, "position").found) == ("bad", FROZEN)
 
@@ -144,7 +144,7 @@ def test_a_stop_at_rest_tries_no_crazyflie():
 
 
 def test_robots_of_a_kind_have_the_same_firmware():
-    made = found(standing(), "firmware", CF02=standing(OTHER, firmware="2025.09"))
+    made = found(observed_still(), "firmware", CF02=observed_still(OTHER, firmware="2025.09"))
     assert (made.verdict, made.remedy) == ("warn", "CF02 has 2025.09: flash the same to all of a kind")
 
 
@@ -165,13 +165,13 @@ def test_one_drone_of_a_process_that_never_answered():
         "reason": "no position of its own",
         "body": "no answer at radio://0/80/...",
     }
-    each = standing(said=said)
+    each = observed_still(said=said)
     each.states, each.inspections = states(None), [Inspection()]
     assert found(each, "address").verdict == found(each, "ready").verdict == "bad"
 
 
 def test_robot_without_position_is_not_placed_anywhere():
-    each = standing()
+    each = observed_still()
     each.states = []
     assert [found(each, check).verdict for check in ("position", "start pose")] == ["bad", "unknown"]
 
@@ -187,14 +187,14 @@ def test_robot_without_position_is_not_placed_anywhere():
 )
 def test_stops(tried, verdict):
     assert checks.stop("stop, motors off", tried).verdict == verdict
-    made = checks.stop_in_motion(standing(), tried)
+    made = checks.stop_in_motion(observed_still(), tried)
     assert (made.verdict, "locked" in made.found) == (verdict, verdict == "ok")
 
 
 def test_wheeled_robot_that_rolls_on_after_the_stop():
     rolled = Tried(stopped_s=0.5, states=states((0.0, 0.0, 0.0), (0.1, 0.0, 0.0)))
-    assert checks.stop_in_motion(standing(WHEELS), rolled).verdict == "bad"
-    assert checks.stop_in_motion(standing(WHEELS), Tried(stopped_s=0.5)).verdict == "ok"
+    assert checks.stop_in_motion(observed_still(WHEELS), rolled).verdict == "bad"
+    assert checks.stop_in_motion(observed_still(WHEELS), Tried(stopped_s=0.5)).verdict == "ok"
 
 
 @pytest.mark.parametrize(
@@ -210,11 +210,11 @@ def test_wheeled_robot_that_rolls_on_after_the_stop():
 )
 def test_hops_and_drives(robot, end, verdict, remedy):
     tried = Tried(states=states((0.0, 0.5, 0.0), end, end), volts=3.7, charge=0.6)
-    made = checks.hop(standing(robot), tried, Safety())
+    made = checks.hop(observed_still(robot), tried, Safety())
     assert made.verdict == verdict
     assert made.remedy.startswith(remedy)
     assert made.found.endswith("; battery 60%, 3.70 V under load")
-    assert checks.hop(standing(robot), Tried(states=tried.states, charge=0.05), Safety()).verdict == "bad"
+    assert checks.hop(observed_still(robot), Tried(states=tried.states, charge=0.05), Safety()).verdict == "bad"
 
 
 def test_robots_are_checked_without_formation_and_low():

@@ -13,31 +13,31 @@ ROBOTS = {"router": "router", "operator": "operator", "CF01": "robot", "CF02": "
 
 
 @pytest.fixture
-def folder(tmp_path):
+def new_lab(tmp_path):
     authority.create(tmp_path / "lab", ROBOTS, hosts=["192.0.2.7", "lab.example.org"], days=30.0)
     return tmp_path / "lab"
 
 
-def certificate(folder, name):
-    return x509.load_pem_x509_certificate((folder / f"{name}.pem").read_bytes())
+def certificate(new_lab, name):
+    return x509.load_pem_x509_certificate((new_lab / f"{name}.pem").read_bytes())
 
 
-def common_name(folder, name):
-    return certificate(folder, name).subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value
+def common_name(new_lab, name):
+    return certificate(new_lab, name).subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value
 
 
 def extension(made, kind):
     return made.extensions.get_extension_for_class(kind).value
 
 
-def purposes(folder, name):
-    return set(extension(certificate(folder, name), x509.ExtendedKeyUsage))
+def purposes(new_lab, name):
+    return set(extension(certificate(new_lab, name), x509.ExtendedKeyUsage))
 
 
-def names_of(folder, name, kind):
+def names_of(new_lab, name, kind):
     return [
         str(each)
-        for each in extension(certificate(folder, name), x509.SubjectAlternativeName).get_values_for_type(kind)
+        for each in extension(certificate(new_lab, name), x509.SubjectAlternativeName).get_values_for_type(kind)
     ]
 
 
@@ -45,16 +45,16 @@ def days_left(made):
     return (made.not_valid_after_utc - datetime.now(UTC)) / timedelta(days=1.0)
 
 
-def test_certificate_says_who_until_when_and_who_vouches(folder):
-    ca = certificate(folder, "ca")
+def test_certificate_says_who_until_when_and_who_vouches(new_lab):
+    ca = certificate(new_lab, "ca")
     assert extension(ca, x509.BasicConstraints) == x509.BasicConstraints(ca=True, path_length=0)
     for name in ROBOTS:
-        made = certificate(folder, name)
+        made = certificate(new_lab, name)
         made.verify_directly_issued_by(ca)
-        assert common_name(folder, name) == name
+        assert common_name(new_lab, name) == name
         assert made.public_key().curve.name == "secp256r1"
         assert 29.9 < days_left(made) < 30.0
-        known = register(folder).identities[name]
+        known = register(new_lab).identities[name]
         assert int(known.serial, 16) == made.serial_number
         assert datetime.fromisoformat(known.until) == made.not_valid_after_utc
         assert not extension(made, x509.BasicConstraints).ca
@@ -66,64 +66,64 @@ def test_a_lab_may_have_a_long_name(tmp_path, name):
     assert len(common_name(tmp_path / name, "ca")) <= 64
 
 
-def test_only_who_listens_can_pose_as_a_router(folder):
+def test_only_who_listens_can_pose_as_a_router(new_lab):
     client, server = ExtendedKeyUsageOID.CLIENT_AUTH, ExtendedKeyUsageOID.SERVER_AUTH
-    assert purposes(folder, "router") == {client, server}
-    assert names_of(folder, "router", x509.DNSName) == ["localhost", "lab.example.org"]
-    assert names_of(folder, "router", x509.IPAddress) == ["127.0.0.1", "::1", "192.0.2.7"]
+    assert purposes(new_lab, "router") == {client, server}
+    assert names_of(new_lab, "router", x509.DNSName) == ["localhost", "lab.example.org"]
+    assert names_of(new_lab, "router", x509.IPAddress) == ["127.0.0.1", "::1", "192.0.2.7"]
     for name in set(ROBOTS) - {"router"}:
-        assert purposes(folder, name) == {client}
-    authority.issue(folder, {"KH01": "robot"}, hosts=["192.0.2.9"])
-    assert server in purposes(folder, "KH01")
-    assert names_of(folder, "KH01", x509.IPAddress) == ["192.0.2.9"]
-    authority.issue(folder, {"KH02": "robot"})
-    assert purposes(folder, "KH02") == {client}
+        assert purposes(new_lab, name) == {client}
+    authority.issue(new_lab, {"KH01": "robot"}, hosts=["192.0.2.9"])
+    assert server in purposes(new_lab, "KH01")
+    assert names_of(new_lab, "KH01", x509.IPAddress) == ["192.0.2.9"]
+    authority.issue(new_lab, {"KH02": "robot"})
+    assert purposes(new_lab, "KH02") == {client}
 
 
-def test_keys_are_for_their_owner_alone(folder):
-    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
-    for key in folder.glob("*.key"):
+def test_keys_are_for_their_owner_alone(new_lab):
+    assert stat.S_IMODE(new_lab.stat().st_mode) == 0o700
+    for key in new_lab.glob("*.key"):
         assert stat.S_IMODE(key.stat().st_mode) == 0o600
-    assert [file.name for file in folder.glob(".*")] == [".gitignore"], "nothing half-written is left"
+    assert [file.name for file in new_lab.glob(".*")] == [".gitignore"], "nothing half-written is left"
 
 
-def test_revoking_moves_the_name_that_counts(folder):
-    before = (folder / "CF01.key").read_bytes()
-    authority.revoke(folder, ["CF01"])
-    assert common_name(folder, "CF01") == register(folder).identities["CF01"].common_name == "CF01.2"
-    assert (folder / "CF01.key").read_bytes() != before
-    authority.revoke(folder, ["CF01"])
-    assert common_name(folder, "CF01") == "CF01.3"
-    assert common_name(folder, "CF02") == "CF02"
+def test_revoking_moves_the_name_that_counts(new_lab):
+    before = (new_lab / "CF01.key").read_bytes()
+    authority.revoke(new_lab, ["CF01"])
+    assert common_name(new_lab, "CF01") == register(new_lab).identities["CF01"].common_name == "CF01.2"
+    assert (new_lab / "CF01.key").read_bytes() != before
+    authority.revoke(new_lab, ["CF01"])
+    assert common_name(new_lab, "CF01") == "CF01.3"
+    assert common_name(new_lab, "CF02") == "CF02"
 
 
-def test_renewing_keeps_the_name(folder):
-    authority.revoke(folder, ["CF01"])
-    serial = register(folder).identities["CF01"].serial
-    authority.renew(folder, ["CF01"], days=60.0)
-    assert common_name(folder, "CF01") == "CF01.2"
-    assert register(folder).identities["CF01"].serial != serial
-    assert 59.9 < days_left(certificate(folder, "CF01")) < 60.0
-    assert "192.0.2.7" in authority.renew(folder).identities["router"].hosts
+def test_renewing_keeps_the_name(new_lab):
+    authority.revoke(new_lab, ["CF01"])
+    serial = register(new_lab).identities["CF01"].serial
+    authority.renew(new_lab, ["CF01"], days=60.0)
+    assert common_name(new_lab, "CF01") == "CF01.2"
+    assert register(new_lab).identities["CF01"].serial != serial
+    assert 59.9 < days_left(certificate(new_lab, "CF01")) < 60.0
+    assert "192.0.2.7" in authority.renew(new_lab).identities["router"].hosts
 
 
-def test_a_router_can_be_given_another_address(folder):
-    authority.renew(folder, ["router"], hosts=["192.0.2.99"])
-    assert {"192.0.2.7", "192.0.2.99", "127.0.0.1"} <= set(register(folder).identities["router"].hosts)
+def test_a_router_can_be_given_another_address(new_lab):
+    authority.renew(new_lab, ["router"], hosts=["192.0.2.99"])
+    assert {"192.0.2.7", "192.0.2.99", "127.0.0.1"} <= set(register(new_lab).identities["router"].hosts)
     with pytest.raises(LabError, match="only routers need --host"):
-        authority.renew(folder, hosts=["192.0.2.99"])
+        authority.renew(new_lab, hosts=["192.0.2.99"])
 
 
-def test_a_new_authority_signs_everybody_anew(folder):
-    before = certificate(folder, "ca")
-    authority.renew(folder, authority=True)
-    after = certificate(folder, "ca")
+def test_a_new_authority_signs_everybody_anew(new_lab):
+    before = certificate(new_lab, "ca")
+    authority.renew(new_lab, authority=True)
+    after = certificate(new_lab, "ca")
     assert after.subject != before.subject
     for name in ROBOTS:
-        certificate(folder, name).verify_directly_issued_by(after)
-        files(folder, name)
+        certificate(new_lab, name).verify_directly_issued_by(after)
+        files(new_lab, name)
     with pytest.raises(LabError, match="give no name with --authority"):
-        authority.renew(folder, ["CF01"], authority=True)
+        authority.renew(new_lab, ["CF01"], authority=True)
 
 
 def test_no_certificate_outlives_the_authority(tmp_path):
@@ -132,42 +132,45 @@ def test_no_certificate_outlives_the_authority(tmp_path):
     assert certificate(tmp_path / "lab", "CF01").not_valid_after_utc == end
 
 
-def test_what_cannot_be_done_is_said(folder, tmp_path):
+def test_what_cannot_be_done_is_said(new_lab, tmp_path):
     for act, reason in (
-        (lambda: authority.create(folder, ROBOTS), "is a lab already"),
-        (lambda: authority.issue(folder, {"CF01": "robot"}), "CF01: in the lab already"),
-        (lambda: authority.revoke(folder, ["CF07"]), "CF07: not in this lab, which knows router, operator, CF01, CF02"),
+        (lambda: authority.create(new_lab, ROBOTS), "is a lab already"),
+        (lambda: authority.issue(new_lab, {"CF01": "robot"}), "CF01: in the lab already"),
+        (
+            lambda: authority.revoke(new_lab, ["CF07"]),
+            "CF07: not in this lab, which knows router, operator, CF01, CF02",
+        ),
     ):
         with pytest.raises(LabError, match=reason):
             act()
     for name in ("ca", "a/b", "", "../x", "é", "1a", "CF01.2"):
         with pytest.raises(LabError, match="cannot be an identity"):
-            authority.issue(folder, {name: "robot"})
+            authority.issue(new_lab, {name: "robot"})
     for host in ("a b", "lab_1.org", "300.1.1.1.1;", "*"):
         with pytest.raises(LabError, match="neither a host's name nor an address"):
-            authority.issue(folder, {"KH01": "robot"}, hosts=[host])
-    assert not (folder / "KH01.pem").exists()
-    (folder / "ca.key").rename(tmp_path / "away.key")
+            authority.issue(new_lab, {"KH01": "robot"}, hosts=[host])
+    assert not (new_lab / "KH01.pem").exists()
+    (new_lab / "ca.key").rename(tmp_path / "away.key")
     with pytest.raises(LabError, match="where the authority of the lab is kept"):
-        authority.renew(folder)
+        authority.renew(new_lab)
 
 
 @pytest.mark.slow
 def test_the_commands(tmp_path):
-    folder = tmp_path / "lab"
-    first = invoke("lab", "init", folder, "robotic-park", "KH09", "--host", "192.0.2.7", "--days", "10")
-    assert {"TB01", "KH03", "CF02", "KH09", "observer", "operator"} < register(folder).identities.keys()
+    new_lab = tmp_path / "lab"
+    first = invoke("lab", "init", new_lab, "robotic-park", "KH09", "--host", "192.0.2.7", "--days", "10")
+    assert {"TB01", "KH03", "CF02", "KH09", "observer", "operator"} < register(new_lab).identities.keys()
     assert "10 days left  renew it  listens at localhost, 127.0.0.1, ::1, 192.0.2.7" in first.stdout
     assert "zenpark run FILE --lab" in first.stdout
-    invoke("lab", "issue", folder, "ana", "--role", "operator")
-    assert register(folder).identities["ana"].role == "operator"
-    revoked = invoke("lab", "revoke", folder, "ana").stdout
+    invoke("lab", "issue", new_lab, "ana", "--role", "operator")
+    assert register(new_lab).identities["ana"].role == "operator"
+    revoked = invoke("lab", "revoke", new_lab, "ana").stdout
     assert revoked.count("as ana.2") == 1
     assert "A zenohd notices nothing" in revoked
-    invoke("lab", "renew", folder, "--authority")
-    invoke("lab", "show", folder)
-    assert '"ana.2"' in invoke("lab", "show", folder, "--json").stdout
-    for wrong in (("init", tmp_path / "b", "router"), ("issue", folder, "bob", "--role", "operater")):
+    invoke("lab", "renew", new_lab, "--authority")
+    invoke("lab", "show", new_lab)
+    assert '"ana.2"' in invoke("lab", "show", new_lab, "--json").stdout
+    for wrong in (("init", tmp_path / "b", "router"), ("issue", new_lab, "bob", "--role", "operater")):
         assert isinstance(invoke("lab", *wrong, code=None).exception, LabError)
 
 

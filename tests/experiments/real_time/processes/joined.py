@@ -29,7 +29,7 @@ def world_plan(name: str = "F") -> Plan:
     return Plan(pair(robots={name: DRONE}, formation=Formation()))
 
 
-def world(
+def joined_world(
     net: Net, bodies: WorldBodies | None = None, ownership: OwnershipCheck | None = None,
     clock: Callable[[], float] = uptime, name: str = "F",
 ) -> WorldProcess:  # fmt: skip

@@ -8,7 +8,7 @@ import pytest
 from experiments.real_time.processes import world as world_module
 from experiments.real_time.processes import world_network
 from experiments.real_time.processes.world_population import WorldBodies
-from tests.experiments.real_time.processes.joined import centre, world, world_plan
+from tests.experiments.real_time.processes.joined import centre, joined_world, world_plan
 from tests.network import Net
 
 BEGIN, WORLD_HZ = 1000.0, 100.0
@@ -95,7 +95,7 @@ def test_lateness_is_caught_up_and_standstill_lost(stands_s, lost, forgiven, asl
     monkeypatch.setattr(world_module, "time", types.SimpleNamespace(sleep=sleep))
     monkeypatch.setattr(bodies, "advance", stand)
     with Net().worn() as net:
-        process = world(net, bodies, clock=lambda: now[0])
+        process = joined_world(net, bodies, clock=lambda: now[0])
         monkeypatch.setattr(process.commands, "forgive", lambda seconds, t: slept.append((seconds, t)))
         process.run(over)
     assert bodies.time == pytest.approx(150 / WORLD_HZ), "each tick simulates its period"

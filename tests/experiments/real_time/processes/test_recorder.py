@@ -14,7 +14,7 @@ from agents.network.keys import Keys
 from agents.network.shutdown import FAREWELL_S, STOPPED_S
 from experiments.real_time.processes.recorder import AFTER_S, Recorder, with_truth
 from tests.conftest import RouterProcess
-from tests.experiments.recordings import START, state, touched, world
+from tests.experiments.recordings import START, state, touched, world_state
 
 KEYS = Keys()
 
@@ -39,10 +39,10 @@ def test_recorder_keeps_plausible_messages_of_the_world(
     said: list[tuple[str, messages.Message]] = [
         (KEYS.contact, msgspec.structs.replace(touched(0.1), impulse=math.nan)),
         (KEYS.contact, msgspec.structs.replace(touched(0.1), stamp=math.inf)),
-        (KEYS.contact, world(0.1)),
-        (KEYS.world, msgspec.structs.replace(world(0.1), obstacles=[lost])),
+        (KEYS.contact, world_state(0.1)),
+        (KEYS.world, msgspec.structs.replace(world_state(0.1), obstacles=[lost])),
         (KEYS.world, touched(0.1)),
-        (KEYS.world, world(0.2)),
+        (KEYS.world, world_state(0.2)),
         (KEYS.contact, touched(0.3)),
     ]
     taken = Taken()
@@ -60,7 +60,7 @@ def test_recorder_keeps_plausible_messages_of_the_world(
             return {type(message) for message in taken} >= {messages.Contact, messages.WorldState}
 
         eventually(heard)
-    assert set(map(str, taken)) == {str(touched(0.3)), str(world(0.2))}
+    assert set(map(str, taken)) == {str(touched(0.3)), str(world_state(0.2))}
     assert sum(count for count, _ in recorder.unread.values()) >= 5
     taken.clear()
     for last in (False, False, True):  # each once

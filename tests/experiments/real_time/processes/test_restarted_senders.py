@@ -7,7 +7,7 @@ from agents.network.keys import Keys
 from agents.robot import Robot
 from agents.runtime.goal_inbox import GoalInbox
 from experiments.definition.plan import Plan
-from tests.experiments.real_time.processes.joined import KEYS, world
+from tests.experiments.real_time.processes.joined import KEYS, joined_world
 from tests.fuzz.messages import sent
 from tests.network import Net
 from tests.small import pair
@@ -22,7 +22,7 @@ def own(net: Net, alive: str, session: str, *, gone: bool = False) -> None:
 
 def test_world_obeys_sender_with_clock_behind():
     with Net().worn() as net:
-        process = world(net)
+        process = joined_world(net)
 
         def order(seq: int, action: str, **more: object) -> bool:
             """Whether it is carried out."""
@@ -44,7 +44,7 @@ def test_world_obeys_sender_with_clock_behind():
 def test_world_of_many_robots_knows_name_owners():
     names = [f"F{row:03}" for row in range(120)]  # each with a token, a claim and the token of an owner
     with Net().worn() as net:
-        process = world(net, name="F000")
+        process = joined_world(net, name="F000")
         for alive in map(KEYS.alive, names):
             for token in (alive, Keys.life(alive, "one"), Keys.claim(alive, Keys.rank(1.0, "one"))):
                 net.deliver(f"{token}\0\0".encode())
