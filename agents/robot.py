@@ -42,36 +42,6 @@ class Robot:
     """Decision of one robot."""
 
     FIXED: ClassVar = ("_flies", "_predicts")
-    __slots__ = (
-        "_asked", "_blind", "_continuity", "_controller", "_decide_every", "_decided", "_detector", "_dt",
-        "_external", "_filter", "_flies", "_follower", "_ordered", "_origin", "_perception", "_place", "_pose_every",
-        "_predicts", "_preflight", "_run_began", "_status", "_stepping", "assignment", "avoided", "begun", "causes",
-        "changed", "decision_due", "decisions", "error", "evasions", "goal", "goal_yaw", "goals", "guidance", "hazards",
-        "health", "interventions", "keeping", "landing", "lands", "lifecycle", "neighbours", "now", "sent_position",
-        "sent_velocity", "setpoint", "stops", "takes_off", "tick", "transmitter", "updates",
-    )  # fmt: skip
-
-    tick: int  # number of the next tick; 0 at the common start, so that robots decide together
-    now: Situation  # of this tick
-    goal: Vector  # pursued [m]
-    goal_yaw: float  # wanted at the goal [rad], NaN for any
-    error: float  # Σ of the link errors as the robot knows them [m]; 0 if guided, NaN without a position
-    setpoint: Setpoint  # of the last tick, NaN where the body drives by itself
-    changed: bool  # decided setpoint changed by safety
-    avoided: bool  # decided setpoint changed by avoidance
-    takes_off: bool  # commands to the body on this tick
-    lands: bool
-    stops: bool
-    sent_position: Vector  # what is transmitted, where `transmit` says so [m]
-    sent_velocity: Vector  # [m/s]
-    decisions: int  # since the common start
-    updates: int  # decisions that recomputed the goal; of a guided robot, received goals
-    interventions: int  # ticks on which safety changed the setpoint, from the common start on
-    evasions: int  # ticks on which avoidance did, likewise
-    causes: int  # of hazards on this tick, a bit for each
-    decision_due: bool  # whether the goal is decided on this tick; known from its first half on
-    begun: bool  # whether the robot has begun to run
-    _run_began: float  # common start of a run under way that the robot joins [s]; infinity: it joins none
 
     def __init__(self, assignment: Assignment, health: ProcessHealth | None = None) -> None:
         """Take the `assignment`, and the `health` of the process, which sets it."""
@@ -97,15 +67,27 @@ class Robot:
         self._dt = 1.0 / assignment.body_hz
         avoids = assignment.avoidance is not None and assignment.avoids
         self._perception = Perception(assignment) if avoids else None
-        self.now = Situation()
-        self.goal, self.goal_yaw, self.error, self.setpoint = UNKNOWN, nan, 0.0, NO_SETPOINT
-        self.tick = self.decisions = self.updates = self.interventions = self.evasions = self.causes = 0
-        self.changed = self.avoided = self.takes_off = self.lands = self.stops = False
-        self.begun = self.decision_due = self._ordered = self._blind = False
-        self.sent_position, self.sent_velocity, self._place = UNKNOWN, UNKNOWN, UNKNOWN
+        self.now = Situation()  # of this tick
+        self.tick = 0  # number of the next tick; 0 at the common start, so that robots decide together
+        self.goal, self.goal_yaw = UNKNOWN, nan  # pursued [m], and wanted there [rad], NaN for any
+        self.error = 0.0  # Σ of the link errors as the robot knows them [m]; 0 if guided, NaN without a position
+        self.setpoint = NO_SETPOINT  # of the last tick, NaN where the body drives by itself
+        self.changed = self.avoided = False  # decided setpoint changed by safety, by avoidance
+        self.takes_off = self.lands = self.stops = False  # commands to the body on this tick
+        # what is transmitted, where `transmit` says so [m], [m/s]
+        self.sent_position = self.sent_velocity = UNKNOWN
+        self.decisions = 0  # since the common start
+        self.updates = 0  # decisions that recomputed the goal; of a guided robot, received goals
+        # ticks on which safety, and avoidance, changed the setpoint, from the common start on
+        self.interventions = self.evasions = 0
+        self.causes = 0  # of hazards on this tick, a bit for each
+        self.decision_due = False  # whether the goal is decided on this tick; known from its first half on
+        self.begun = False  # whether the robot has begun to run
+        self._ordered = self._blind = False
         self._decided = self._asked = -1
-        self._run_began = inf
+        self._place = UNKNOWN
         self._origin: Pose | None = None
+        self._run_began = inf  # common start of a run under way that the robot joins [s]; infinity: it joins none
 
     # ------------------------------------------------------------------ inputs
 

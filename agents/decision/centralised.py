@@ -34,29 +34,20 @@ class CentreGoal(NamedTuple):
 class Followed:
     """A robot as the central controller knows it."""
 
-    guided: bool  # gets goals
-    held: bool  # by its safety, as far as known; set by the caller
-    words: Mapping[str, Values]  # variables that its law says, as they were at the last decision
-    needed: bool  # its poses are needed
-    computer: GoalComputer  # of its goals
-    receivers: list[tuple[GoalComputer, int]]  # guided robots that receive its poses, and by which link
-    position: Vector  # last received [m]
-    velocity: Vector  # [m/s]
-    yaw: float  # [rad]
-    stamp: float  # [s]; minus infinity before the first pose
-    lost_since: float  # [s]; infinity: alive; minus infinity: never seen
-    goal: Vector  # last goal [m]
-    goal_yaw: float  # wanted there [rad], NaN for any
-    pose_stamp: float  # of the pose on which it rests [s]
-    sent_at: float  # [s]
-    updates: int  # decisions that recomputed its goal
-
     def __init__(self, assignment: Assignment) -> None:
-        self.guided = self.needed = assignment.guided
-        self.computer, self.keeping = GoalComputer(assignment), StationKeeping(assignment.ground)
-        self.receivers, self.held, self.words = [], False, NO_WORDS
-        self.position, self.velocity, self.yaw, self.stamp, self.lost_since = UNKNOWN, ZERO, 0.0, -inf, -inf
-        self.goal, self.goal_yaw, self.pose_stamp, self.sent_at, self.updates = UNKNOWN, nan, -inf, -inf, 0
+        self.guided = self.needed = assignment.guided  # gets goals; its poses are needed
+        self.held = False  # by its safety, as far as known; set by the caller
+        self.words: Mapping[str, Values] = NO_WORDS  # what its law says, as it was at the last decision
+        self.computer, self.keeping = GoalComputer(assignment), StationKeeping(assignment.ground)  # of its goals
+        # guided robots that receive its poses, and by which link
+        self.receivers: list[tuple[GoalComputer, int]] = []
+        self.position, self.velocity, self.yaw = UNKNOWN, ZERO, 0.0  # last received [m], [m/s], [rad]
+        self.stamp = -inf  # [s]; minus infinity before the first pose
+        self.lost_since = -inf  # [s]; infinity: alive; minus infinity: never seen
+        self.goal, self.goal_yaw = UNKNOWN, nan  # last goal [m], and what is wanted there [rad], NaN for any
+        self.pose_stamp = -inf  # of the pose on which it rests [s]
+        self.sent_at = -inf  # [s]
+        self.updates = 0  # decisions that recomputed its goal
 
 
 class Centre:
@@ -205,18 +196,14 @@ class Centre:
 class ReceivedGoals:
     """Goal received from the central controller, its age, and liveliness of the controller."""
 
-    goal: Vector  # last received [m]
-    goal_yaw: float  # wanted there [rad], NaN for any
-    velocity: Vector  # wanted [m/s], its third NaN: the height is held; NaN: the robot goes to the goal
-    stamp: float  # time of its decision [s]; minus infinity before the first
-    fresh: bool  # not used yet
-    lost_since: float  # loss of the controller [s]; infinity while it is alive
-
     def __init__(self, *, flies: bool, silence_s: float) -> None:
         """Start without a goal; on wheels it is on the floor, and none is older than `silence_s` [s]."""
         self._flies, self._silence_s = flies, silence_s
-        self.goal, self.goal_yaw, self.stamp, self.fresh, self.lost_since = UNKNOWN, nan, -inf, False, inf
-        self.velocity = UNKNOWN
+        self.goal, self.goal_yaw = UNKNOWN, nan  # last received [m], and wanted there [rad], NaN for any
+        self.velocity = UNKNOWN  # wanted [m/s], its third NaN: the height is held; NaN: the robot goes to the goal
+        self.stamp = -inf  # time of its decision [s]; minus infinity before the first
+        self.fresh = False  # not used yet
+        self.lost_since = inf  # loss of the controller [s]; infinity while it is alive
 
     def receive(self, goal: Vector, yaw: float, stamp: float, velocity: Vector = UNKNOWN) -> bool:
         """Store a goal that was decided at `stamp` [s]; returns whether it was new."""

@@ -6,8 +6,8 @@ guides from that robot's last received pose. `errors`, `law_offset` and `decide`
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from math import isfinite, isnan, nan
+from dataclasses import dataclass, replace
+from math import inf, isfinite, isnan, nan
 from typing import ClassVar, cast
 
 from agents.decision.assignment import Assignment
@@ -15,7 +15,6 @@ from agents.decision.control_updates import ControlUpdates
 from agents.decision.neighbours import Neighbours
 from agents.decision.stepping import Stepping, is_sound
 from agents.formation.changes import change_target, exists, planned_at
-from agents.formation.link import Link
 from agents.plugins.calls import unknown_reads
 from agents.plugins.law import NeighbourView, View
 from agents.plugins.laws import Gradient, goal_position, tracking_offset
@@ -27,41 +26,29 @@ class GoalComputer:
     """Goals of one robot."""
 
     FIXED: ClassVar = ("_gated", "_reshapes", "follows", "needs_company")
-    law: Gradient  # where `stepping` is None
-    stepping: Stepping | None  # a law that is no gradient, at work
-    neighbours: Neighbours
-    follows: bool  # the law moves it: it has links or anchors, or needs none
-    needs_company: bool  # without neighbours it stays in place
-    clamp: float  # largest step of a goal per axis and decision [m]
-    tracking_gain: float  # k of (7) [1/(m² decision)]
-    ground: float  # height that it holds [m]
-    goal: Vector  # decided last [m]
-    yaw: float  # wanted at the goal [rad], NaN for any
-    offset: Vector  # of the law at the last decision, before it was clamped [m]
-    error: float  # Σ|e| of the links, of the last call of `errors` [m]
-    energy: float  # Σ ½e², likewise [m²]
 
     def __init__(self, assignment: Assignment, *, passive: bool = False) -> None:
         """Of a robot with an `assignment`; `passive`: its goals come from elsewhere."""
-        links = assignment.neighbours
-        self.law = cast(Gradient, assignment.law)
+        links, legs = assignment.neighbours, assignment.legs
+        # a law that is no gradient, at work; without one `law` is a gradient
         self.stepping = None if isinstance(assignment.law, Gradient) else Stepping(assignment)
+        self.law = cast(Gradient, assignment.law)
         self._anchors, self._predictor, self._changes = assignment.anchors, assignment.predictor, assignment.changes
         self.neighbours = Neighbours(links, assignment.limits.neighbour_timeout_s)
-        self.clamp, self.tracking_gain = assignment.clamp, assignment.tracking_gain
-        self._flies, self.ground = assignment.kind.flies, assignment.ground
-        linked, legs = any(link.in_law for link in links), assignment.legs
+        self.clamp = assignment.clamp  # largest step of a goal per axis and decision [m]
+        self.tracking_gain = assignment.tracking_gain  # k of (7) [1/(m² decision)]
+        self._flies, self.ground = assignment.kind.flies, assignment.ground  # height that it holds [m]
+        linked = any(link.in_law for link in links)
         alone = self.stepping is not None and self.stepping.alone and not (passive or legs)
-        self.follows = bool(self._anchors) or linked or alone
+        self.follows = bool(self._anchors) or linked or alone  # the law moves it
+        # without neighbours it stays in place
         self.needs_company = linked and not self._anchors and not assignment.law.ALONE
-        self._given = [Link(each.distance, each.gain, each.relative, each.bearing, each.wants) for each in links]
-        bounded = [
-            sender for sender in self.neighbours.all if not planned_at(sender.since, sender.until, sender.reach, 0.0)
-        ]
-        comes_and_goes = any(sender.until < float("inf") for sender in self.neighbours.all)
-        self._reshapes = bool(self._changes or bounded or comes_and_goes)
+        self._given = [replace(sender.link) for sender in self.neighbours.all]
+        self._reshapes = bool(self._changes)
         for sender in self.neighbours.all:
-            sender.present = sender.in_law and planned_at(sender.since, sender.until, sender.reach, 0.0)
+            planned = planned_at(sender.since, sender.until, sender.reach, 0.0)
+            sender.present = sender.in_law and planned
+            self._reshapes = self._reshapes or not planned or sender.until < inf
         self.itinerary: Itinerary | None = None
         if legs or not (self.follows or passive):  # neither law nor plan: stay in place
             self.itinerary = Itinerary(legs, holds_before=not self.follows)
@@ -71,7 +58,9 @@ class GoalComputer:
         self._updating = None
         if assignment.update is not None:
             self._updating = ControlUpdates(assignment.update, len(links), anchored=bool(self._anchors))
-        self.goal, self.yaw, self.offset, self.error, self.energy = UNKNOWN, nan, ZERO, 0.0, 0.0
+        self.goal, self.yaw = UNKNOWN, nan  # decided last [m], and wanted there [rad], NaN for any
+        self.offset = ZERO  # of the law at the last decision, before it was clamped [m]
+        self.error = self.energy = 0.0  # Σ|e| of the links [m] and Σ ½e² [m²], of the last call of `errors`
 
     def update_links(self, t: float) -> None:
         """Update the active links at `t` [s] for neighbours that appeared or were lost."""

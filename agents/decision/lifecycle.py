@@ -44,25 +44,19 @@ SETTLED: Final = 0.1  # [m/s] slower: climbing or rolling has ended
 class Lifecycle:
     """Phases of one robot."""
 
-    phase: int  # of `Phase`
-    climbing: bool  # on its way up
-    start_at: float  # the common start on the process's clock [s]; infinity before it is known
-    settled_until: float  # the robot runs, and goes on, until then [s]: there is no need to advance
-    moved: bool  # whether the phase changed on the last tick, or by an order since the one before
-    takeoff_due: bool  # commands that the body has not received yet
-    land_due: bool
-    stop_due: bool
-    reason: str  # why it is not ready, or has landed
-    failing: str  # check that fails on this tick, though the robot may be ready; empty: none
-
     def __init__(self, kind: Kind, hover: float, duration: float, lands_at: float = inf) -> None:
         """Of a robot that hovers at `hover` [m], in an experiment of `duration`, and lands at `lands_at` [s] in it."""
         self._flies, self._hover = kind.flies, hover
         self._ends_after, self._scripted = min(duration, lands_at), lands_at < duration
-        self.phase = self._before = IDLE
-        self.start_at, self.settled_until = inf, -inf
-        self.climbing = self.moved = self.takeoff_due = self.land_due = self.stop_due = False
-        self.reason = self._waits = self.failing = ""
+        self.phase = self._before = IDLE  # of `Phase`
+        self.climbing = False  # on its way up
+        self.start_at = inf  # the common start on the process's clock [s]; infinity before it is known
+        self.settled_until = -inf  # the robot runs, and goes on, until then [s]: there is no need to advance
+        self.moved = False  # whether the phase changed on the last tick, or by an order since the one before
+        # commands that the body has not received yet
+        self.takeoff_due = self.land_due = self.stop_due = False
+        self.reason = self._waits = ""  # why it is not ready, or has landed
+        self.failing = ""  # check that fails on this tick, though the robot may be ready; empty: none
 
     def takeoff(self) -> str:
         """Order to climb; returns the reason of a refusal, empty when accepted."""

@@ -40,33 +40,27 @@ class Incoming(msgspec.Struct, frozen=True):
 class Neighbour:
     """Sender of one link: its target, its last pose, and its liveliness."""
 
-    link: Link  # its target now
-    position: Vector  # last received [m], NaN before; that of a former process until its successor has sent one
-    velocity: Vector  # [m/s]
-    yaw: float  # [rad], NaN where unknown
-    said: Mapping[str, tuple[float, ...]]  # variables beside its last pose, by name
-    stamp: float  # time of measurement, limited to plausible values [s]; −inf before the first pose
-    arrival: float  # time of reception [s]
-    lost_since: float  # loss of the sender [s]; inf: alive; −inf: token never seen, a pose is no sign of life
-    available: bool  # pose received, sender not lost for long
-    present: bool  # part of the formation now
-    active: bool  # enters the law
-    behind: float  # age of its poses on arrival where its clock lags [s], else 0
-    doubt: str  # why all its poses are refused; empty: they are not
-    foreign: int  # poses from another source than the sender
-
     def __init__(self, incoming: Incoming) -> None:
         self.sender, self.name = incoming.sender, incoming.name
         self.radius, self.height, self.lag = incoming.kind.radius, incoming.kind.height, incoming.kind.lag
         self.in_law, self.awaited, self.targets = incoming.in_law, incoming.awaited, incoming.targets
         self.since, self.until = incoming.since, incoming.until
         self.reach, self.release = incoming.reach, incoming.release
+        # its target now
         self.link = Link(incoming.distance, incoming.gain, incoming.relative, incoming.bearing, incoming.wants)
-        self.position, self.velocity, self.yaw, self.said = UNKNOWN, ZERO, nan, NO_WORDS
-        self.stamp = self.arrival = self.lost_since = -inf
-        self.available = self.active = False
-        self.present = incoming.in_law
-        self.behind, self.doubt, self.foreign = 0.0, "", 0
+        self.position = UNKNOWN  # last received [m], NaN before; of a former process until its successor has sent one
+        self.velocity = ZERO  # [m/s]
+        self.yaw = nan  # [rad], NaN where unknown
+        self.said = NO_WORDS  # variables beside its last pose, by name
+        self.stamp = -inf  # time of measurement, limited to plausible values [s]; −inf before the first pose
+        self.arrival = -inf  # time of reception [s]
+        self.lost_since = -inf  # its loss [s]; inf: alive; −inf: token never seen, a pose is no sign of life
+        self.available = False  # pose received, sender not lost for long
+        self.present = incoming.in_law  # part of the formation now
+        self.active = False  # enters the law
+        self.behind = 0.0  # age of its poses on arrival where its clock lags [s], else 0
+        self.doubt = ""  # why all its poses are refused; empty: they are not
+        self.foreign = 0  # poses from another source than the sender
 
     @property
     def silent(self) -> bool:
@@ -89,17 +83,14 @@ class Neighbour:
 class Neighbours:
     """All senders of one robot."""
 
-    all: list[Neighbour]  # in the order of the links
-    incomplete: bool  # a sender is missing or lost, so that time alone can change the active links
-    lagging: bool  # the clock of a sender lags
-    refused: bool  # all poses of a sender are refused
-    foreign_at: float  # time of the last pose from another source than its sender [s]
-
     def __init__(self, incoming: Sequence[Incoming], silence_s: float) -> None:
         """Start without poses; lost senders leave the law after `silence_s` [s]."""
-        self.all = [Neighbour(each) for each in incoming]
-        self.incomplete, self.lagging, self.refused = True, False, False
-        self.foreign_at, self.silence_s = -inf, silence_s
+        self.all = [Neighbour(each) for each in incoming]  # in the order of the links
+        self.incomplete = True  # a sender is missing or lost, so that time alone can change the active links
+        self.lagging = False  # the clock of a sender lags
+        self.refused = False  # all poses of a sender are refused
+        self.foreign_at = -inf  # time of the last pose from another source than its sender [s]
+        self.silence_s = silence_s
 
     def receive(
         self, link: int, position: Vector, velocity: Vector, stamp: float, arrival: float,

@@ -41,29 +41,24 @@ class Perception:
 
     FIXED: ClassVar = ("sees",)
 
-    sees: bool  # there are range readings
-    avoidance: Avoidance
-    own: OwnState  # of the last call of `sense`
-    near: Nearby  # likewise
-
     def __init__(self, assignment: Assignment) -> None:
         assert assignment.avoidance is not None
         kind, limits, self.avoidance = assignment.kind, assignment.limits, assignment.avoidance
         self._position_timeout_s, self._neighbour_timeout_s = limits.position_timeout_s, limits.neighbour_timeout_s
         self._clearance = assignment.avoidance.clearance  # things farther above or below are ignored [m]
         self._radius, self._height = kind.radius, kind.height
-        self.own, self.near = OwnState(), Nearby()
         self._links = len(assignment.neighbours)
+        self.near = Nearby()  # of the last call of `sense`
         self.near.reserve(self._links)
-        own = self.own
+        own = self.own = OwnState()  # likewise
         own.radius, own.height, own.turn_rate = kind.radius, kind.height, kind.turn_rate
         own.speed, own.response, own.lag = min(kind.speed, limits.top_speed), kind.response, kind.lag
         own.by_position, own.by_twist = kind.takes == "position", kind.takes == "twist"
         own.flies = kind.flies
         self._horizon = kind.radius + _horizon(self.avoidance, own)  # from the own axis [m]
         self._in_time = self._horizon + HURRY * own.speed * SCAN_S  # what comes within the horizon before it is old
+        self.sees = False  # there are range readings
         self._scan: RangeScan | None = None
-        self.sees = False
         self._points: list[Point] = []
 
     def sense(self, t: float, now: Situation, neighbours: Neighbours) -> None:

@@ -22,15 +22,10 @@ BROADSIDE: Final = 0.02  # cosine of α below which a goal is abeam: wheels turn
 class PositionController:
     """Position controller of a robot of any kind."""
 
-    _flies_to: bool  # its body takes positions, and closes in on them by itself
-    _drives: bool  # its body takes twists; one that takes neither takes velocities
-    _flies: bool
-    _steering: Steering  # of a kind that takes twists
-    _agility: Agility
-
     def __init__(self, kind: Kind) -> None:
+        # its body takes positions, and closes in on them by itself, or twists; one that takes neither takes velocities
         self._flies_to, self._drives = kind.takes == "position", kind.takes == "twist"
-        self._flies, self._steering = kind.flies, kind.steering or TwoWheels()
+        self._flies, self._steering = kind.flies, kind.steering or TwoWheels()  # of a kind that takes twists
         self._agility = Agility(kind.response, kind.turn_response, kind.speed, kind.turn_rate)
 
     def setpoint(self, goal: Vector, goal_yaw: float, position: Vector, yaw: float) -> Setpoint:
@@ -65,13 +60,11 @@ class VelocityFollower:
     a measured one would be a random walk.
     """
 
-    reference: Vector  # [m]; NaN: the next one is the place of the robot
-
     def __init__(self, kind: Kind, ground: float) -> None:
         """`ground`: height that the robot holds [m]."""
         self._by_twist, self._flies, self._ground = kind.takes == "twist", kind.flies, ground
         self._response, self._speed = kind.response, kind.speed
-        self.reference = UNKNOWN
+        self.reference = UNKNOWN  # [m]; NaN: the next one is the place of the robot
 
     def goal(self, velocity: Vector, position: Vector, dt: float) -> Vector:
         """Goal [m] of a robot at `position` [m] that moves with `velocity` [m/s] for a tick of `dt` [s].

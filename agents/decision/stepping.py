@@ -15,7 +15,7 @@ from agents.network.validation import ENORMOUS, MAX_NUMBERS
 from agents.plugins.calls import failure, wrong
 from agents.plugins.law import Control, Law, Memory, RobotFacts, Said, Values, View, is_known
 from agents.plugins.registry import FAILURES, PluginError
-from agents.vectors import Vector, is_finite
+from agents.vectors import UNKNOWN, Vector, is_finite
 
 Words = tuple[tuple[str, Values], ...]  # what a robot says beside its pose: variables by name
 
@@ -30,20 +30,17 @@ class Speech:
     not move yet.
     """
 
-    now: dict[str, Values]  # variables as they are
-    said: dict[str, Values]  # and as said last; at first as they begin
-    spoken: bool  # it has said something
-    words: Words  # variables as said last, those that are known
-
     def __init__(self, law: Law, memory: Memory) -> None:
         self._metres = {name: said.metre for name, said in law.SAYS.items()}
         self.update(memory)
-        self.said, self.spoken, self._stepped, self.words = self.now, False, False, ()
+        self.said = self.now  # variables as said last; at first as they begin
+        self.spoken = self._stepped = False  # it has said something
+        self.words: Words = ()  # variables as said last, those that are known
 
     def update(self, memory: Memory) -> None:
         """The variables are these after a step."""
         self._stepped = True
-        self.now = {name: tuple(map(rounded, memory[name])) for name in self._metres}
+        self.now: dict[str, Values] = {name: tuple(map(rounded, memory[name])) for name in self._metres}
 
     def deviation(self, of_pose: float) -> float:
         """Largest deviation of what neighbours know, in metres, of pose and variables; infinite if one is new."""
@@ -68,28 +65,23 @@ class Speech:
 class Stepping:
     """A law at work for one robot."""
 
-    memory: dict[str, Values]
-    measures: dict[str, float]  # of the last step
-    control: Control  # of the last step
-    alone: bool  # the law moves a robot without neighbours
-    speech: Speech | None  # None: the law says nothing
-    moves: bool  # the robot may move; set by its caller, and likewise
-    scan: Any  # range readings
-    tick: int  # number of the tick since the common start
-
     def __init__(self, assignment: Assignment) -> None:
         """Begin; raises PluginError if `begin` of the law fails or gives what cannot be used."""
         law, kind = assignment.law, assignment.kind
-        self._law, self.alone, self.tick_s = law, law.ALONE, 1.0 / assignment.body_hz
+        self._law, self.tick_s = law, 1.0 / assignment.body_hz
+        self.alone = law.ALONE  # the law moves a robot without neighbours
         self.facts = RobotFacts(
             assignment.name, assignment.number, assignment.count, kind.flies, kind.speed,
             assignment.decide_every * self.tick_s,
         )  # fmt: skip
         self.memory = self._begin()
-        self.speech = Speech(law, self.memory) if law.SAYS else None
-        self.control, self.measures = Control(), {}
-        self.moves, self.scan, self.tick, self._stepped = True, None, 0, -1
-        self._target: Vector = (nan, nan, nan)
+        self.speech = Speech(law, self.memory) if law.SAYS else None  # None: the law says nothing
+        self.control = Control()  # of the last step
+        self.measures: dict[str, float] = {}  # likewise
+        self.moves = True  # the robot may move; set by its caller, and likewise
+        self.scan: Any = None  # range readings
+        self.tick, self._stepped = 0, -1  # number of the tick since the common start
+        self._target = UNKNOWN
 
     def _begin(self) -> dict[str, Values]:
         law = self._law

@@ -19,17 +19,13 @@ class Transmitter:
     """Transmissions of one robot."""
 
     FIXED: ClassVar = ("_smooths", "_speaks")
-    asking: TriggerState
-    predictor: Predictor  # of the receivers
-    position: Vector  # of the last question: what would be transmitted [m],
-    velocity: Vector  # and its velocity [m/s], NaN where unknown
-    smoothed: LowPass
-    speech: Speech  # what is said beside the pose, if anything is
 
     def __init__(self, trigger: Trigger, predictor: Predictor, kind: Kind, speech: Speech | None = None) -> None:
-        self.asking, self.predictor, self.smoothed = TriggerState(trigger), predictor, LowPass(kind)
+        self.asking, self.smoothed = TriggerState(trigger), LowPass(kind)
+        self.predictor = predictor  # of the receivers
         self._smooths, self._speaks = trigger.smoothing_s > 0.0, speech is not None
-        self.speech = cast(Speech, speech)
+        self.speech = cast(Speech, speech)  # what is said beside the pose, if anything is
+        # of the last question: what would be transmitted [m], [m/s], NaN where unknown
         self.position = self.velocity = UNKNOWN
         self.asking.view.reach_s = predictor.reach()
 
@@ -93,15 +89,12 @@ class LowPass:
     Δv, p_f is off by τ·Δv.
     """
 
-    position: Vector  # smoothed [m], NaN at the beginning
-    velocity: Vector  # likewise [m/s]
-
     def __init__(self, kind: Kind) -> None:
         self._flies, self._by_place = kind.flies, kind.takes == "position"
         self._response, self._speed, self._lag = kind.response, kind.speed, kind.lag
         self._t = -inf
         self._driven_x = self._driven_y = nan
-        self.position = self.velocity = UNKNOWN
+        self.position = self.velocity = UNKNOWN  # smoothed [m], [m/s]; NaN at the beginning
 
     def smooth(self, t: float, position: Vector, velocity: Vector, constant_s: float, setpoint: Setpoint) -> None:
         """Smooth a measured `position` [m] and `velocity` [m/s] at `t` [s], with the last setpoint.

@@ -102,14 +102,12 @@ class Conditions(msgspec.Struct, frozen=True):
 class LinkChannel:
     """Carries samples over one link."""
 
-    dropped: int  # samples that were lost
-    delay: float  # [s]
-    plain: bool  # the delay is all that there is
-
     def __init__(self, conditions: Conditions) -> None:
-        self._conditions, self.dropped, self.delay = conditions, 0, conditions.delay
+        self._conditions, self.delay = conditions, conditions.delay  # [s]
+        self.dropped = 0  # samples that were lost
         self._enter, self._leave = _thresholds(conditions)
         self._free = -inf  # when the link has sent all that it has taken [s]
+        # the delay is all that there is
         self.plain = not (conditions.random or conditions.bandwidth < inf or conditions.outages)
 
     def arrival(self, seq: int, stamp: float, since: float, size: int) -> float:

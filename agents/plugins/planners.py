@@ -14,7 +14,7 @@ from typing import Annotated, Final
 import msgspec
 from msgspec import Meta
 
-from agents.vectors import Pose, Positive, Vector, distance, is_finite
+from agents.vectors import ZERO, Pose, Positive, Vector, distance, is_finite
 
 Offset = Annotated[list[float], Meta(min_length=2, max_length=3)]
 NO_TARGET: Final[Pose] = (nan, nan, nan, nan)
@@ -158,19 +158,15 @@ class Leg(msgspec.Struct, frozen=True):
 class Itinerary:
     """Legs that a robot follows one after the other, and where each began."""
 
-    legs: tuple[Leg, ...]
-    next_at: float  # time of the next leg [s]; infinity after the last
-    origin: Pose | None  # x, y, z [m] and yaw [rad] where its first leg began; None before
-
     def __init__(self, legs: Sequence[Leg], *, holds_before: bool) -> None:
         """Follow `legs`, given in order of time; the first may begin later than 0.
 
         With `holds_before` the robot stays at its start until the first leg; else it has no target then.
         """
         self.legs = (Leg(0.0, Hold()), *legs) if holds_before else tuple(legs)
-        self.origin = None
-        self._leg, self._anchor, self._heading = -1, (0.0, 0.0, 0.0), 0.0
-        self.next_at = self.legs[0].at if self.legs else inf
+        self.origin: Pose | None = None  # x, y, z [m] and yaw [rad] where its first leg began; None before
+        self._leg, self._anchor, self._heading = -1, ZERO, 0.0
+        self.next_at = self.legs[0].at if self.legs else inf  # time of the next leg [s]; infinity after the last
 
     def target(self, t: float, position: Vector, yaw: float) -> Pose:
         """Target x, y, z [m] and yaw [rad] at time `t` [s]; NaN before the first leg.

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from enum import Enum
 from math import inf, nan
-from typing import Final, Protocol
+from typing import Final, Literal, Protocol
 
 import msgspec
 import zenoh
@@ -16,19 +15,15 @@ from agents.network import messages, pubsub, validation
 from agents.network.channel_model import Channel, Conditions
 from agents.network.keys import Keys
 from agents.robot import Robot
-from agents.runtime.pose_order import Freshness, PoseOrder
+from agents.runtime.pose_order import PoseOrder
 
 LATE_S: Final = 3.0  # longest delay of a pose in a network: Zenoh holds one back for 2 s behind a missing one
 PROOFS: Final = 3  # late poses in succession that prove a slow clock: one may be the last value of a silent robot
 DOUBT_S: Final = 0.5  # time in which all poses of a robot are refused before the robot counts as lost
 
 
-class TokenChange(Enum):
-    """Change of the liveliness of a robot."""
-
-    APPEARED = 1
-    VANISHED = 2
-    NEW_SESSION = 3  # its process is another one than before
+# of the liveliness of a robot; "new session": its process is another one than before
+TokenChange = Literal["appeared", "vanished", "new session"]
 
 
 class ReceivedPose(msgspec.Struct, frozen=True):
@@ -112,20 +107,20 @@ class NeighbourSubscription:
                 continue
             seq, stamp = order.seq, order.stamp
             news = order.compare(session, pose.seq, pose.stamp)
-            if news in (Freshness.OLD, Freshness.REPEATED):
-                self.stale += news is Freshness.OLD
+            if news in {"old", "repeated"}:
+                self.stale += news == "old"
                 continue
             age, missed = now - pose.stamp, 0
             if age > LATE_S or self._old:
                 self._detect_lag(now, age)
-            if news is Freshness.NEXT and seq and pose.seq != seq + 1:
+            if news == "next" and seq and pose.seq != seq + 1:
                 missed = validation.missed(seq, pose.seq, pose.stamp - stamp, self._rate)
             # A clock that is behind: a predictor must not extrapolate over that time. A pose from before the last
             # reception, too late for a network, proves it at once; the first pose ever may be that of a silent robot.
             slow = self.behind or (pose.stamp < before and age > LATE_S)
             measured = now - LATE_S if slow else validation.taken(pose.stamp, now)
             self._received_at, self._refusals, self.doubt = now, 0, ""
-            yield ReceivedPose(pose, len(sample.payload), missed, measured, news is Freshness.ANEW)
+            yield ReceivedPose(pose, len(sample.payload), missed, measured, news == "anew")
 
     def _note_refusal(self, now: float, reason: str) -> None:
         """Counts a refused pose of the robot; after several in succession, for long, the robot is in doubt."""
@@ -141,11 +136,11 @@ class NeighbourSubscription:
         for token, there in self._alive.changes():
             if token == self._token:
                 if there and self.alive is False and self._order.return_token():
-                    yield TokenChange.NEW_SESSION
+                    yield "new session"
                 self.alive, self._refusals, self.doubt = there, 0, ""
-                yield TokenChange.APPEARED if there else TokenChange.VANISHED
+                yield "appeared" if there else "vanished"
             elif (session := Keys.life_of(token)) is not None and self._order.note_life(session, there=there):
-                yield TokenChange.NEW_SESSION
+                yield "new session"
 
     def _detect_lag(self, now: float, age: float) -> None:
         """Detects a clock that is behind, from the `age` [s] of poses on arrival."""
@@ -249,12 +244,12 @@ class ModelledInbox:
         return channel.due(t)
 
     def _note_change(self, sender: NeighbourSubscription, change: TokenChange, t: float) -> None:
-        if change is TokenChange.NEW_SESSION:
+        if change == "new session":
             self._begin(sender)
             return
         for link in sender.links:
             knowledge, number = self._knowledge[link]
-            if change is TokenChange.APPEARED:
+            if change == "appeared":
                 knowledge.mark_alive(number)
             else:
                 self._channel.forget(link)

@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from enum import Enum
+from typing import Literal
 
-
-class Freshness(Enum):
-    """Result of the comparison of a pose with the last one."""
-
-    NEXT = 1
-    ANEW = 2  # first of another process, or of a clock that was set back: earlier poses are void
-    OLD = 3
-    REPEATED = 4  # the last one again, after a reconnection
+# Result of the comparison of a pose with the last one. "anew": first of another process, or of a clock that was set
+# back, so that earlier poses are void; "repeated": the last one again, after a reconnection.
+Freshness = Literal["next", "anew", "old", "repeated"]
 
 
 class PoseOrder:
@@ -59,9 +54,9 @@ class PoseOrder:
         """Compare a pose from a source that is not foreign, and store it if it is newer."""
         other = session is not None and session != self._session
         if stamp <= self.stamp and (other or seq <= self.seq or (session is None and self._session is not None)):
-            return Freshness.REPEATED if stamp == self.stamp else Freshness.OLD
+            return "repeated" if stamp == self.stamp else "old"
         anew = stamp <= self.stamp or (other and self._session is not None)
         if other:
             self._session = session
         self.seq, self.stamp = seq, stamp
-        return Freshness.ANEW if anew else Freshness.NEXT
+        return "anew" if anew else "next"

@@ -12,7 +12,6 @@ from typing import ClassVar, Final
 
 from agents.body.interface import Attitude, BodyState, RangeScan
 from agents.body.kinds import Kind
-from agents.body.limits import Limits
 from agents.decision.assignment import Assignment
 from agents.decision.neighbours import Neighbour, Neighbours
 from agents.decision.perception import SCAN_S
@@ -62,23 +61,17 @@ class Ascent:
     the floor.
     """
 
-    climbing: bool  # on the last tick
-    hover: float  # height at the end [m]
-    begin: Vector  # position at the begin [m]
-    free: float  # distance from there that is no matter [m]
-    aside: float  # distance from there, seen from above [m]
-    carried: bool  # it is carried aside
-    patience_s: float  # time for a step of height [s]
-    highest: float  # last step of height [m],
-    risen_at: float  # and its time [s]
-    stalled: bool  # it is measured to stay low
-
     def __init__(self, kind: Kind, hover: float) -> None:
-        self.hover, self.free = hover, RUSH_S * kind.speed + kind.radius
-        self.patience_s = STALLS_VELOCITY_S if kind.takes == "velocity" else STALLS_S
-        self.climbing = self.carried = self.stalled = False
-        self.begin, self.aside = UNKNOWN, 0.0
-        self.highest = self.risen_at = 0.0
+        self.climbing = False  # on the last tick
+        self.hover = hover  # height at the end [m]
+        self.begin = UNKNOWN  # position at the begin [m]
+        self.free = RUSH_S * kind.speed + kind.radius  # distance from there that is no matter [m]
+        self.aside = 0.0  # distance from there, seen from above [m]
+        self.carried = False  # it is carried aside
+        self.patience_s = STALLS_VELOCITY_S if kind.takes == "velocity" else STALLS_S  # time for a step of height [s]
+        self.highest = 0.0  # last step of height [m],
+        self.risen_at = 0.0  # and its time [s]
+        self.stalled = False  # it is measured to stay low
 
     def update(self, t: float, climbing: bool, flying: bool, position: Vector) -> None:
         """Follow a robot that may be `climbing` and `flying` at `t` [s], at a `position` [m]."""
@@ -125,47 +118,28 @@ class Detector:
     """Detector of the causes of hazards of one robot."""
 
     FIXED: ClassVar = ("flies", "sees")
-    name: str  # of the robot
-    limits: Limits
-    predictor: Predictor  # of neighbours
-    flies: bool
-    radius: float  # of the robot [m]
-    fastest: float  # [m/s] a faster robot has lost control
-    fastest_squared: float  # [m²/s²]
-    slow_squared: float  # slower robots neither sink nor race [m²/s²]
-    lean: float  # largest x² + y² of an attitude
-    battery_low: float
-    silence_s: float  # of the device, and of the pose, that is too long [s]
-    behind_s: float  # stamps that are older have a wrong clock [s]
-    separation: float  # least distance of robots [m]; 0: any
-    avoids: bool  # needs range readings, once there were some
-    motion_check: MotionCheck
-    ascent: Ascent
-    descent: LandingProgress
-    leaned: bool  # on the tick before
-    leans_since: float  # time of the first sample of that [s]
-    sees: bool  # it avoids, and has range readings
-    scan: RangeScan | None  # on the tick before
-    scanned: float  # time of the newest range readings [s]; infinity before the first
 
     def __init__(self, assignment: Assignment) -> None:
         kind, limits = assignment.kind, assignment.limits
         self.name, self.limits, self.predictor = assignment.name, limits, assignment.predictor
         self.flies, self.radius = kind.flies, kind.radius
-        # the speed of flying kinds is per axis
+        # [m/s] a faster robot has lost control; the speed of flying kinds is per axis
         self.fastest = limits.overspeed * (sqrt(3.0) if kind.flies else 1.0) * kind.speed
         self.fastest_squared = self.fastest * self.fastest
-        self.slow_squared = min(self.fastest_squared, SINKS * SINKS)
+        self.slow_squared = min(self.fastest_squared, SINKS * SINKS)  # slower robots neither sink nor race [m²/s²]
         half = sin(0.5 * limits.tilt)
-        self.lean = half * half
-        self.battery_low, self.silence_s = limits.battery_low, limits.position_timeout_s
-        self.behind_s = BEHIND * limits.position_timeout_s
-        self.separation = 0.0 if limits.separation is None else limits.separation
-        self.avoids = assignment.avoidance is not None and assignment.avoids
+        self.lean = half * half  # largest x² + y² of an attitude
+        self.battery_low = limits.battery_low
+        self.silence_s = limits.position_timeout_s  # of the device, and of the pose, that is too long [s]
+        self.behind_s = BEHIND * limits.position_timeout_s  # stamps that are older have a wrong clock [s]
+        self.separation = 0.0 if limits.separation is None else limits.separation  # of robots, least [m]; 0: any
         self.motion_check, self.ascent = MotionCheck(kind), Ascent(kind, assignment.hover)
         self.descent = LandingProgress(limits.high[2])
-        self.leaned, self.leans_since, self.sees = False, 0.0, False
-        self.scan, self.scanned = None, inf
+        self.leaned = False  # on the tick before
+        self.leans_since = 0.0  # time of the first sample of that [s]
+        self.sees = False  # it avoids, and has range readings
+        self.scan: RangeScan | None = None  # on the tick before
+        self.scanned = inf  # time of the newest range readings [s]; infinity before the first
 
     def causes(self, now: Situation, status: RobotStatus, neighbours: Neighbours, health: ProcessHealth) -> int:
         """Causes that are present, as a set of bits `1 << cause`; call it once on every tick."""

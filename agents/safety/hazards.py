@@ -161,31 +161,12 @@ class HazardChange(NamedTuple):
 class Hazards:
     """State machine of one robot; a set of causes is an int with the bits `1 << cause`."""
 
-    held: bool  # the robot must keep its place
-    under_way: bool  # a hazard exists, or its begin or end is pending: `update` must be called
-    incidents: list[HazardChange]  # since the reader emptied the list
-    # as in `Rule`, by the number of the cause, or as a set
-    first: list[int]
-    after_s: list[float]
-    then: list[int]
-    then_s: list[float]
-    clears_s: list[float]
-    repeats: int
-    place: int
-    landing: int
-    # by the number of the cause, or as a set
-    since: list[float]  # begin of its presence without a break [s]; infinity: absent
-    begun: list[float]  # begin of its hazard [s]; infinity: none
-    last: list[float]  # last presence [s]
-    lasted_s: list[float]  # duration of its last hazard that ended [s]
-    level: list[int]  # outcome
-    present: int  # on the last tick
-    open: int  # present on the last tick, or with a hazard
-    unresolved: int  # present until the robot ended, on the last tick
-    texts: dict[Cause, str]  # of hazards
-
     def __init__(self, kind: Kind, limits: Limits) -> None:
         table = rules(limits)
+        self.held = False  # the robot must keep its place
+        self.under_way = False  # a hazard exists, or its begin or end is pending: `update` must be called
+        self.incidents: list[HazardChange] = []  # since the reader emptied the list
+        # as in `Rule`, by the number of the cause, or as a set
         self.first, self.after_s = [int(rule.first) for rule in table], [rule.after_s for rule in table]
         self.then = [int(rule.then if kind.flies or rule.grounded is None else rule.grounded) for rule in table]
         self.then_s = [rule.then_s + (0.0 if kind.flies else rule.grounded_s) for rule in table]
@@ -193,12 +174,16 @@ class Hazards:
         self.repeats = sum(1 << cause for cause in Cause if table[cause].repeats)
         self.place = sum(1 << cause for cause in Cause if table[cause].place)
         self.landing = sum(1 << cause for cause in Cause if table[cause].landing)
-        self.since, self.begun = [NEVER] * len(table), [NEVER] * len(table)
-        self.last, self.lasted_s = [-NEVER] * len(table), [0.0] * len(table)
-        self.level = [0] * len(table)
-        self.present = self.open = self.unresolved = 0
-        self.held = self.under_way = False
-        self.incidents, self.texts = [], {}
+        # by the number of the cause, or as a set
+        self.since = [NEVER] * len(table)  # begin of its presence without a break [s]; infinity: absent
+        self.begun = [NEVER] * len(table)  # begin of its hazard [s]; infinity: none
+        self.last = [-NEVER] * len(table)  # last presence [s]
+        self.lasted_s = [0.0] * len(table)  # duration of its last hazard that ended [s]
+        self.level = [0] * len(table)  # outcome
+        self.present = 0  # on the last tick
+        self.open = 0  # present on the last tick, or with a hazard
+        self.unresolved = 0  # present until the robot ended, on the last tick
+        self.texts: dict[Cause, str] = {}  # of hazards
 
     def update(
         self, t: float, causes: int, words: Callable[[Cause], str], *, active: bool, landing: bool

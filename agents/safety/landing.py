@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 from agents.decision.assignment import Assignment
 from agents.decision.neighbours import Neighbours
 from agents.decision.situation import ProcessHealth, Situation
-from agents.vectors import UNKNOWN, Vector, clamp, is_finite, norm, planar
+from agents.vectors import UNKNOWN, clamp, is_finite, norm, planar
 
 NEAR: Final = 0.05  # [m] between surfaces, seen from above: with less a robot does not land in place
 ROOM: Final = 0.12  # [m] the same at the place aside
@@ -38,15 +38,13 @@ class Occupied(NamedTuple):
 class Landing:
     """Robot on its way to a place where it can land."""
 
-    aside: bool  # it must land and is not at its place yet
-    place: Vector  # its landing place [m], NaN: none
-    _until: float  # when it lands in place [s]
-    _nearest: str  # robot below it
-
     def __init__(self, assignment: Assignment) -> None:
         """Of a robot; the senders on its links, for the law or for avoidance, are considered."""
         self._assignment = assignment
-        self.aside, self.place, self._until, self._nearest = False, UNKNOWN, -inf, ""
+        self.aside = False  # it must land and is not at its place yet
+        self.place = UNKNOWN  # its landing place [m], NaN: none
+        self._until = -inf  # when it lands in place [s]
+        self._nearest = ""  # robot below it
 
     def filter_land(
         self, now: Situation, neighbours: Neighbours, health: ProcessHealth, *, ordered: bool, landing: bool

@@ -34,13 +34,6 @@ TURN: Final = 1.5  # tolerated uncommanded rotation of a wheeled robot [rad]
 class MotionCheck:
     """Commanded and measured motion of one robot."""
 
-    __slots__ = (
-        "anchor", "anchor_yaw", "begin", "begin_yaw", "by_position", "by_twist", "commanded", "commanded_s",
-        "commanded_turn", "drift", "drifted", "due", "flies", "free", "last", "response", "rim", "samples",
-        "slow", "speed", "turn", "turn_before", "unanswered", "unanswered_turn", "uncommanded",
-        "uncommanded_turn", "unresponsive", "way", "way_before", "without", "x", "y", "z",
-    )  # fmt: skip
-
     unresponsive: bool  # it does not obey commands to move
     uncommanded: bool  # it moves without a command
     commanded: float  # commanded travel that it has not moved [m]

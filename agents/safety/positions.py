@@ -27,22 +27,16 @@ class Continuity:
     It has jumped until its position is back, or until it is forgotten: an outlier lasts a sample.
     """
 
-    jumped: bool  # it has jumped
-    yaw_jump: float  # size of the jump of its yaw [rad]; NaN: it did not jump
-    _jump_m: float  # a jump is longer [m]
-    _squared: float  # and that squared [m²]
-    _fastest: float  # speed that it can have [m/s]
-    _turn_rate: float  # and turn rate [rad/s]
-    _wheels: bool
-    _place: Vector  # last plausible position [m], NaN: none
-    _time: float  # and its time [s]
-    _yaw: float  # last plausible yaw [rad], NaN: none
-
     def __init__(self, kind: Kind, jump_m: float = JUMP_M) -> None:
         """A jump is longer than `jump_m` [m]."""
-        self._jump_m, self._squared, self._fastest = jump_m, jump_m * jump_m, PLAUSIBLE_SPEED * kind.speed
-        self._wheels, self._turn_rate = kind.takes == "twist", PLAUSIBLE_SPEED * kind.turn_rate
-        self._place, self._time, self._yaw, self.jumped, self.yaw_jump = UNKNOWN, 0.0, nan, False, nan
+        self.jumped = False  # it has jumped
+        self.yaw_jump = nan  # size of the jump of its yaw [rad]; NaN: it did not jump
+        self._jump_m, self._squared = jump_m, jump_m * jump_m
+        self._fastest = PLAUSIBLE_SPEED * kind.speed  # that it can be [m/s]
+        self._turn_rate = PLAUSIBLE_SPEED * kind.turn_rate  # and turn [rad/s]
+        self._wheels = kind.takes == "twist"
+        self._place, self._time = UNKNOWN, 0.0  # last plausible position [m], NaN: none, and its time [s]
+        self._yaw = nan  # last plausible yaw [rad], NaN: none
 
     def jump(self, time: float, position: Vector, yaw: float, watched: bool) -> float:
         """Length [m] of the jump of the robot, or NaN.
@@ -93,20 +87,15 @@ class ExternalPositions:
     mistaken for each other are at least that distance apart. Smaller errors show as disobedience.
     """
 
-    jump: float  # length of its jump [m]; NaN: it did not jump
-    deceived: bool  # its positions are wrong for good
-    doubted: bool  # its position is not believed
-    _continuity: Continuity
-    _time: float  # of the last position [s]
-    _turn_rate: float  # that it can have [rad/s]
-    _yaw: float  # last measured [rad]
-    _yaw_time: float  # and when [s]
-    _flipped: float  # sum of the jumps of the yaw [rad]
-
     def __init__(self, kind: Kind) -> None:
-        self._continuity, self._turn_rate = Continuity(kind, 2.0 * kind.radius), PLAUSIBLE_SPEED * kind.turn_rate
-        self._time, self._yaw, self._yaw_time, self._flipped = -inf, nan, nan, 0.0
-        self.jump, self.deceived, self.doubted = nan, False, False
+        self.jump = nan  # length of its jump [m]; NaN: it did not jump
+        self.deceived = False  # its positions are wrong for good
+        self.doubted = False  # its position is not believed
+        self._continuity = Continuity(kind, 2.0 * kind.radius)
+        self._time = -inf  # of the last position [s]
+        self._turn_rate = PLAUSIBLE_SPEED * kind.turn_rate  # that it can have [rad/s]
+        self._yaw = self._yaw_time = nan  # last measured [rad], and when [s]
+        self._flipped = 0.0  # sum of the jumps of the yaw [rad]
 
     def believes(self, time: float, position: Vector, *, watched: bool) -> bool:
         """Whether the robot is at `position` [m], measured at `time` [s]; older ones than before are left out.

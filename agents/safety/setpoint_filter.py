@@ -12,7 +12,7 @@ from agents.body.kinds import Kind
 from agents.body.limits import Limits
 from agents.decision.situation import Situation
 from agents.plugins.avoidance import Avoidance, Nearby, OwnState
-from agents.vectors import NO_SETPOINT, Setpoint, Vector, clamp
+from agents.vectors import NO_SETPOINT, Setpoint, clamp
 
 FLOOR_M: Final = 0.05  # [m] least height of a goal above the floor, or the robot's own: a descent overshoots its goal
 OUTSIDE_M: Final = 0.25  # [m] outside the arena: no longer under control
@@ -25,38 +25,26 @@ REST: Final[Setpoint] = (0.0, 0.0, 0.0, 0.0)  # of robots that take velocities o
 class SetpointFilter:
     """Filter for the setpoints of a robot."""
 
-    changed: bool  # the last setpoint differs from the decided one
-    avoided: bool  # it was changed by avoidance
-    not_finite: bool  # the decided one was not finite although the pose is valid: the robot is kept in place instead
-    _flies_to: bool  # the body takes positions
-    _drives: bool  # the body takes twists; one that takes neither takes velocities
-    _low: Vector  # of goals, −inf and inf where heights do not matter [m]
-    _high: Vector  # likewise
-    _walls_low: Vector  # of the arena [m]
-    _walls_high: Vector  # likewise
-    _cut_beyond_m: float  # [m] of the limits
-    _position_timeout_s: float  # [s] of the limits
-    _speed: float  # [m/s]
-    _turn_rate: float  # [rad/s]
-    _turn_radius: float  # smallest [m]; 0: it turns on the spot
-    _closes_s: float  # time in which the body closes a position error [s]: it goes as fast as its goal is far
-    _far: float  # way that it can drive in that time, and as long as a pose is valid [m]
-    _step: float  # longest way to a goal [m]
-
     def __init__(self, kind: Kind, limits: Limits) -> None:
+        self.changed = False  # the last setpoint differs from the decided one
+        self.avoided = False  # it was changed by avoidance
+        # the decided one was not finite although the pose is valid: the robot is kept in place instead
+        self.not_finite = False
+        # the body takes positions, or twists; one that takes neither takes velocities
         self._flies_to, self._drives = kind.takes == "position", kind.takes == "twist"
-        self._speed, self._turn_rate = min(kind.speed, limits.top_speed), kind.turn_rate
-        self._turn_radius = kind.turn_radius
+        self._speed, self._turn_rate = min(kind.speed, limits.top_speed), kind.turn_rate  # [m/s], [rad/s]
+        self._turn_radius = kind.turn_radius  # smallest [m]; 0: it turns on the spot
+        # time in which the body closes a position error [s]: it goes as fast as its goal is far
         self._closes_s = 1.0 / kind.response
+        # way that it can drive in that time, and as long as a pose is valid [m]
         self._far = self._speed * (self._closes_s + limits.position_timeout_s)
-        self._step = min(limits.max_goal_distance, self._speed * self._closes_s)
-        low, high, margin = limits.low, limits.high, limits.margin
+        self._step = min(limits.max_goal_distance, self._speed * self._closes_s)  # longest way to a goal [m]
+        self._walls_low, self._walls_high, margin = limits.low, limits.high, limits.margin  # of the arena [m]
         # a goal on the floor would be flown into it; heights do not limit ground robots
-        bottom, top = (low[2] + max(kind.height, FLOOR_M), high[2] - margin) if kind.flies else (-inf, inf)
-        self._low, self._high = (low[0] + margin, low[1] + margin, bottom), (high[0] - margin, high[1] - margin, top)
-        self._walls_low, self._walls_high = low, high
+        (x, y, z), (far_x, far_y, far_z) = limits.low, limits.high
+        bottom, top = (z + max(kind.height, FLOOR_M), far_z - margin) if kind.flies else (-inf, inf)
+        self._low, self._high = (x + margin, y + margin, bottom), (far_x - margin, far_y - margin, top)  # of goals [m]
         self._cut_beyond_m, self._position_timeout_s = limits.cut_beyond_m, limits.position_timeout_s
-        self.changed = self.avoided = self.not_finite = False
 
     def judge(self, now: Situation) -> None:
         """Judge the pose of a situation: known, fresh, inside the arena.
