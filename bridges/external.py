@@ -157,7 +157,7 @@ class ExternalBody(Body):
                 robot.velocity(now),
                 robot.yaw,
                 flying=robot.flight.flying,
-                ahead=self._positions.ahead[row],
+                ahead=self._positions.sources[row].ahead,
                 note=self._note(row, now),
             )
             for row, robot in enumerate(self._robots)
@@ -245,8 +245,8 @@ class ExternalBody(Body):
             key = self._keys.position(name)
             if not isfinite(age):
                 found.append(
-                    f"{name}: samples on {key} are not positions: {self._positions.trouble[row]}"
-                    if self._positions.malformed[row]
+                    f"{name}: samples on {key} are not positions: {self._positions.sources[row].inbox.trouble}"
+                    if self._positions.sources[row].inbox.malformed
                     else f"{name}: nothing is published on {key}: is {_source_name(robot)} running and connected to "
                     f"{', '.join(self._endpoints)}?"
                 )
@@ -270,13 +270,13 @@ class ExternalBody(Body):
                         robot.repeated = None
 
     def _note(self, row: int, now: float) -> str:
-        robot, positions = self._robots[row], self._positions
+        robot, positions = self._robots[row], self._positions.sources[row].inbox
         parts = [UNANSWERED] if now - robot.stopped_since > ANSWER_S and robot.goes_on(now) else []
         if (age := now - robot.measured) > FRESH_S:
             what = "yaw" if robot.measured < robot.pose.time else "position"
             parts.append(f"no {what} for {age:.0f} s")
-        if positions.malformed[row]:
-            parts.append(f"{positions.malformed[row]} positions refused, the last because {positions.trouble[row]}")
+        if positions.malformed:
+            parts.append(f"{positions.malformed} positions refused, the last because {positions.trouble}")
         if self._ranges.malformed:
             parts.append(f"{self._ranges.malformed} sweeps refused, the last because {self._ranges.trouble}")
         return "; ".join(parts)
@@ -324,7 +324,7 @@ class ExternalBody(Body):
             publishers = self._setpoints if command.action == "drive" else self._orders
             publishers[row].put(messages.encode(command))
         except zenoh.ZError as error:
-            self._positions.trouble[row] = f"commands cannot be sent: {error}"
+            self._positions.sources[row].inbox.trouble = f"commands cannot be sent: {error}"
 
 
 def _source_name(robot: _ExternalRobot) -> str:

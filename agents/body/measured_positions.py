@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from functools import partial
+from dataclasses import dataclass
 from math import inf, isnan, nan
 from typing import Final
 
@@ -18,6 +18,37 @@ REPEATED_S: Final = 0.3  # time without a new pose that makes the note [s]
 SECOND_S: Final = 1.0  # time after the last sample of a second source for which the note stays [s]
 SECOND: Final = "a second source sends its position, and is refused"  # note of such a robot
 FROZEN: Final = "its measured position repeats itself to the last bit"  # note of such a robot
+
+
+@dataclass(eq=False)
+class PositionSource:
+    """Source of the positions of one robot."""
+
+    inbox: pubsub.Inbox[messages.Position]
+    exact: bool  # noise-free positions from a simulation, which may repeat
+    session: str | None = None  # that its samples name, if they do
+    alive_at: float = -inf  # arrival of its last position that was new [s]; minus infinity: none yet
+    foreign_at: float = -inf  # arrival of the last position from a second source [s]
+    # stamp of the last position less the time of its arrival [s]: the clock of the source is ahead by at least this
+    # value, or, if it is negative, behind or late; NaN before the first
+    ahead: float = nan
+    last: tuple[Vector, float | None] | None = None  # position [m] and yaw [rad]
+    new_at: float = -inf  # arrival of the last pose that was new [s],
+    repeats: bool = False  # and whether others came since
+
+    def measures(self, session: str | None, pose: tuple[Vector, float | None], now: float) -> bool:
+        """Whether a pose was measured; of the first one of a session that is known when the next one differs."""
+        if session != self.session or self.alive_at == -inf:
+            self.session, self.last, self.alive_at = session, None, now
+        elif self.exact or pose != self.last:  # a frozen source is not alive
+            self.alive_at = now
+        if self.exact:
+            return True
+        before, self.last = self.last, pose
+        self.repeats = pose == before
+        if not self.repeats:
+            self.new_at = now
+        return before is not None and not self.repeats
 
 
 class MeasuredPositions:
@@ -44,97 +75,51 @@ class MeasuredPositions:
             exact: Rows with noise-free positions from a simulation, which may repeat.
             silence_s: Time without a new position after which another source takes over [s].
         """
-        self._names, self._valid_box = tuple(names), valid_box
-        # stamp of the last position of each robot less the time of its arrival [s]: the clock of its source is ahead by
-        # at least this value, or, if it is negative, behind or late; NaN before the first
-        self.ahead = [nan] * len(self._names)
-        self.malformed = [0] * len(self._names)  # refused positions of each robot
-        self.trouble = [""] * len(self._names)  # reason of the last refusal of each robot
-        self._exact, self._silence_s = frozenset(exact), silence_s
-        self._sources: dict[int, str | None] = {}  # session of the source of each row, None if it names none,
-        self._alive_at: dict[int, float] = {}  # and the arrival of its last position that was new [s]
-        self._foreign_at: dict[int, float] = {}  # arrival of the last position from a second source [s]
+        self._valid_box, self._silence_s = valid_box, silence_s
         self._received_at = -inf  # the last call [s]
-        self._last: dict[int, tuple[Vector, float | None]] = {}
-        self._new_at: dict[int, float] = {}  # arrival of the last pose that was new [s],
-        self._repeats: dict[int, bool] = {}  # and whether others came since
-        self._inboxes = {
-            row: pubsub.Inbox(
-                pubsub.subscriber(session, keys.position(self._names[row]), 32),
-                messages.Position,
-                keys=keys,
-                on_refusal=partial(self._note_refusal, row),
-            )
-            for row in rows
-        }
+        self.sources: dict[int, PositionSource] = {}  # by row
+        for row in rows:
+            subscriber = pubsub.subscriber(session, keys.position(names[row]), 32)
+            inbox = pubsub.Inbox(subscriber, messages.Position, keys=keys)
+            self.sources[row] = PositionSource(inbox, row in exact)
+
+    @property
+    def malformed(self) -> int:
+        """Refused positions."""
+        return sum(source.inbox.malformed for source in self.sources.values())
 
     def receive(self, utc: float, now: float) -> Iterator[tuple[int, float, Vector, float]]:
         """Positions received until `now` [s] of a clock that was 0 at `utc`.
 
         Yields row, time of measurement [s], position [m], and yaw [rad], NaN if unknown.
         """
-        if now - self._received_at > self._silence_s:  # a standstill here is no silence of a source
-            self._alive_at = dict.fromkeys(self._alive_at, now)
-        self._received_at = now
-        for row, inbox in self._inboxes.items():
-            for measured, sample in inbox.read_samples():
-                source = pubsub.session_of(sample)
-                if self._is_foreign(row, source, now):
-                    self._foreign_at[row] = now
-                    self._note_refusal(row, "", SECOND)
+        slept, self._received_at = now - self._received_at > self._silence_s, now
+        for row, source in self.sources.items():
+            if slept and source.alive_at > -inf:  # a standstill here is no silence of a source
+                source.alive_at = now
+            for measured, sample in source.inbox.read_samples():
+                session = pubsub.session_of(sample)
+                if session != source.session and now - source.alive_at <= self._silence_s:
+                    source.foreign_at = now
+                    source.inbox.refuse(SECOND)
                     continue
+                source.ahead = measured.stamp - utc - now  # also of a stamp that is refused
                 try:
-                    self._check(row, utc, now, measured)
+                    validation.check_position(measured, now=utc + now, valid_box=self._valid_box)
                 except messages.Malformed as error:
-                    self._note_refusal(row, "", str(error))
+                    source.inbox.refuse(str(error))
                     continue
-                self._note_source(row, source, (measured.position, measured.yaw), now)
-                if not self._is_new(row, (measured.position, measured.yaw), now):
-                    continue
-                yaw = nan if measured.yaw is None else measured.yaw
-                yield row, validation.taken(measured.stamp - utc, now), measured.position, yaw
-
-    def _is_foreign(self, row: int, source: str | None, now: float) -> bool:
-        """Whether another source than `source` is there for a row."""
-        if row not in self._sources or source == self._sources[row]:
-            return False
-        return now - self._alive_at[row] <= self._silence_s
-
-    def _note_source(self, row: int, source: str | None, pose: tuple[Vector, float | None], now: float) -> None:
-        """A pose of a row from the source that is not foreign; a frozen source is not alive."""
-        if row not in self._sources or source != self._sources[row]:
-            self._sources[row] = source
-            self._last.pop(row, None)
-            self._alive_at[row] = now
-        elif row in self._exact or pose != self._last.get(row):
-            self._alive_at[row] = now
-
-    def _is_new(self, row: int, pose: tuple[Vector, float | None], now: float) -> bool:
-        """Whether a pose was measured; of the first one that is known when the next one differs."""
-        if row in self._exact:
-            return True
-        before, self._last[row] = self._last.get(row), pose
-        self._repeats[row] = pose == before
-        if not self._repeats[row]:
-            self._new_at[row] = now
-        return before is not None and not self._repeats[row]
+                if source.measures(session, (measured.position, measured.yaw), now):
+                    yaw = nan if measured.yaw is None else measured.yaw
+                    yield row, validation.taken(measured.stamp - utc, now), measured.position, yaw
 
     def annotate(self, states: Sequence[BodyState], now: float) -> None:
         """Write to the states of the bodies at `now` [s] how far stamps are ahead, and what is wrong with sources."""
-        for row, ahead in enumerate(self.ahead):
-            if not isnan(ahead):
-                states[row].ahead = ahead
-        frozen = [row for row, repeats in self._repeats.items() if repeats and now - self._new_at[row] > REPEATED_S]
-        second = [row for row, at in self._foreign_at.items() if now - at <= SECOND_S]
-        for what, rows in ((FROZEN, frozen), (SECOND, second)):
-            for row in rows:
-                state = states[row]
-                state.note = f"{what}; {state.note}" if state.note else what
-
-    def _check(self, row: int, utc: float, now: float, measured: messages.Position) -> None:
-        self.ahead[row] = measured.stamp - utc - now  # also of a stamp that is refused
-        validation.check_position(measured, now=utc + now, valid_box=self._valid_box)
-
-    def _note_refusal(self, row: int, _key: str, reason: str) -> None:
-        self.malformed[row] += 1
-        self.trouble[row] = reason
+        for row, source in self.sources.items():
+            state = states[row]
+            if not isnan(source.ahead):
+                state.ahead = source.ahead
+            frozen = source.repeats and now - source.new_at > REPEATED_S
+            for what, there in ((FROZEN, frozen), (SECOND, now - source.foreign_at <= SECOND_S)):
+                if there:
+                    state.note = f"{what}; {state.note}" if state.note else what

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from math import expm1, inf, isfinite, nan
+from math import expm1, inf, nan
 from typing import Final
 
 from agents.body.interface import BodyState
@@ -43,11 +43,6 @@ class ProcessHealth:
         """Whether the control loop misses too many ticks to control the robot."""
         return self.missed_share > LATE_SHARE
 
-    @property
-    def troubled(self) -> bool:
-        """Whether router, conductor or control loop fails."""
-        return self.offline_since < inf or self.conductor_lost_since < inf or self.missed_share > LATE_SHARE
-
     def count_tick(self, missed: int, period: float) -> None:
         """Count a tick after `missed` ones that did not take place; they are `period` apart [s]."""
         forget = -expm1(-period * (1 + missed) / LATE_WINDOW_S)
@@ -78,7 +73,3 @@ class Situation:
         """Begin a tick at `t` [s] with the state of the body."""
         state = self.state
         self.t, self.position, self.velocity, self.yaw = t, state.position, state.velocity, state.yaw
-
-    @property
-    def jumped(self) -> bool:
-        return isfinite(self.jump)

@@ -189,10 +189,6 @@ class Channel:
         """Delay of each link [s]."""
         return [link.delay for link in self._links]
 
-    def clear(self) -> list[tuple[int, float, Any]]:
-        """Take all samples that are under way, as `due` does."""
-        return self.due(inf)
-
     @property
     def dropped(self) -> list[int]:
         """Samples that were lost on each link."""

@@ -227,13 +227,17 @@ class Inbox(Generic[M]):
                 if check is not None:
                     check(message)
             except messages.Malformed as error:
-                self.malformed += 1
-                self.trouble = str(error)
+                self.refuse(str(error))
                 if self._on_refusal is not None:
                     self._on_refusal(key, self.trouble)
             else:
                 if self._robots is None or getattr(message, "robot", "") in self._robots:
                     yield message, sample
+
+    def refuse(self, reason: str) -> None:
+        """Count a payload as refused."""
+        self.malformed += 1
+        self.trouble = reason
 
     def close(self) -> None:
         self._subscription.undeclare()

@@ -465,6 +465,6 @@ class Runtime:
         return (
             self._orders.malformed
             + (self._goals.malformed if self._goals is not None else 0)
-            + (sum(self._located.malformed) if self._located is not None else 0)
+            + (self._located.malformed if self._located is not None else 0)
             + (self._ranges.malformed if self._ranges is not None else 0)
         )

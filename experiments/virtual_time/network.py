@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import nan
+from math import inf, nan
 from operator import itemgetter
 from typing import Any, Final, NamedTuple
 
@@ -276,7 +276,7 @@ class VirtualNetwork:
 
     def board(self, ways: Sequence[Way]) -> list[tuple[int, float, Sample]]:
         """Hand all samples that are under way to the `ways` of their links; returns them."""
-        under_way = self._channel.clear()
+        under_way = self._channel.due(inf)
         for way in ways:
             way.first = way.next = 0
         for link, _, sample in under_way:

@@ -42,16 +42,16 @@ def test_stamps_ahead_count_as_now_and_are_reported():
     net = Net()
     with net.worn():
         heard = listening(net, exact=[1])
-        assert all(map(isnan, heard.ahead))
+        assert all(isnan(source.ahead) for source in heard.sources.values())
         for ahead, taken in ((-0.02, [7.98]), (2.3, [8.0]), (3600.0, []), (-7.0, [1.0])):
             net.deliver(position(UTC + 8.0 + ahead))
             assert [when for _, when, *_ in heard.receive(UTC, 8.0)] == pytest.approx(taken, abs=1e-6)
-            assert heard.ahead[1] == pytest.approx(ahead, abs=1e-6)
+            assert heard.sources[1].ahead == pytest.approx(ahead, abs=1e-6)
         net.deliver(position(UTC, robot="A"))
         assert not list(heard.receive(UTC, 8.0))
-        assert heard.ahead[1] == pytest.approx(-7.0, abs=1e-6), "of another robot"
-        assert heard.malformed == [0, 2]
-        assert heard.trouble[1] == "position of 'A' on the key of 'T'"
+        assert heard.sources[1].ahead == pytest.approx(-7.0, abs=1e-6), "of another robot"
+        assert heard.malformed == 2
+        assert heard.sources[1].inbox.trouble == "position of 'A' on the key of 'T'"
 
 
 def flight_events(ahead, seconds, frozen_s=inf):
@@ -151,7 +151,7 @@ def test_the_first_of_two_sources_stays_until_silent():
         both = [("a", 1.0), ("b", 2.0)]
         taken = [tell(8.0 + 0.1 * tick, *both) for tick in range(4)]
         assert taken == [[], [1], [1], [1]]
-        assert heard.malformed == [4]
+        assert heard.malformed == 4
         state = BodyState(note="locked")
         heard.annotate([state], 8.4)
         assert state.note == f"{SECOND}; locked"
