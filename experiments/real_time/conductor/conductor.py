@@ -84,8 +84,6 @@ class CaseRun:
 
 
 class Conductor(CaseRun):
-    """Runs one case."""
-
     def run(self) -> CaseResult:
         """Run the case to its end, or until the user interrupts it; the robots are down in any case."""
         began = time.monotonic()
@@ -154,8 +152,6 @@ class Conductor(CaseRun):
     def _flown(self) -> list[str]:
         """Robots that are there and have flown, or do."""
         return [name for name, view in self._robots.items() if view.alive and view.reached("airborne")]
-
-    # ------------------------------------------------------------------ phases
 
     def await_phase(
         self, phase: str, limit_s: float, *, recorder: bool = False, meanwhile: Callable[[], None] = lambda: None
@@ -305,8 +301,6 @@ class Conductor(CaseRun):
             self._robots[name].left_because = "lost"
             self._view.report("lost", name, why)
 
-    # ------------------------------------------------------------------ what happens meanwhile
-
     def _update(self) -> None:
         now, report = self._clock.utc(), self._view.report
         for name in self._view.update():
@@ -356,8 +350,6 @@ class Conductor(CaseRun):
         for name, reason in refused.items():
             self._view.report("refused", name, f"{order.order}: {reason}")
         return list(refused)
-
-    # ------------------------------------------------------------------ words
 
     def _reason(self, name: str) -> str:
         status = self._robots[name].status

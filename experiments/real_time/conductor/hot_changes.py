@@ -60,8 +60,6 @@ class _Change:
 
 
 class HotChanges:
-    """Changes of the robots of one case."""
-
     def __init__(self, plan: Plan, processes: CaseProcesses, view: NetworkView, keys: Keys) -> None:
         """Refuse everything until `begin`."""
         self._experiment, self._processes, self._view, self._keys = plan.experiment, processes, view, keys
@@ -130,8 +128,6 @@ class HotChanges:
             self._changes.remove(change)
         self._reply_to_finished()
 
-    # ------------------------------------------------------------------ orders and answers
-
     def _accept(self, query: zenoh.Query, order: messages.RunOrder) -> None:
         if refusal := next(self._refusals(order), None):
             self._reply(query, messages.RunReply(reason=refusal))
@@ -198,32 +194,36 @@ class HotChanges:
         with query:
             query.reply(self._keys.run_order, messages.encode(reply), encoding=messages.JSON)
 
-    # ------------------------------------------------------------------ what is done
-
     def _remove(self, names: Sequence[str], _order: messages.RunOrder) -> Steps:
         yield from self._leave(names)
         return "removed: it is down, and the others go on"
 
     def _leave(self, names: Sequence[str]) -> Generator[None]:
         """Robots land and leave the network; their process ends if no other robot needs it."""
-        there = [name for name in names if self._robots[name].alive or self._processes.runs(name)]
+        processes = self._processes
+        there = [name for name in names if self._robots[name].alive or processes.runs(name)]
+        together = processes.companions(names[0])
+        staying = [other for other in together if other not in names and not self._robots[other].gone]
+        kept = f"shares its process with {', '.join(staying)}: name them all" if staying else ""
+        if any(name in processes.adopted for name in there):
+            kept = "was not started from here: end its process where it runs"
         self._leaving |= {*there}
         for name, reply in self._view.order(there, messages.Order("leave")).items():
-            if not reply.ok and name in self._processes.adopted:
-                raise Refusal(f"{name} does not answer, and was not started from here: end its process where it runs")
+            if not reply.ok and kept:
+                raise Refusal(f"{name} does not answer, and {kept}")
             if not reply.ok:
                 self._view.report("silent", name, f"does not answer ({reply.reason}): its lifeline is cut")
-                self._processes.release(name)
+                processes.release(name)
         began, killed = time.monotonic(), False
-        while still := [name for name in there if self._robots[name].alive or self._process_must_end(name, names)]:
+        while still := [name for name in there if self._robots[name].alive or (processes.runs(name) and not staying)]:
             past = time.monotonic() - began
-            if past > LAND_S and any(name in self._processes.adopted for name in still):
-                raise Refusal(f"{', '.join(still)}: ordered to land, but still there after {LAND_S:g} s")
-            if not killed and (past > LAND_S or (past > FROZEN_S and all(map(self._frozen, still)))):
+            if past > LAND_S and kept:
+                raise Refusal(f"{', '.join(still)}: ordered to land, but still there after {LAND_S:g} s; it {kept}")
+            if not (killed or kept) and (past > LAND_S or (past > FROZEN_S and all(map(self._frozen, still)))):
                 killed = True
                 for name in still:
                     self._view.report("killed", name, f"still there after {past:.0f} s")
-                    self._processes.kill(name)
+                    processes.kill(name)
             if past > LAND_S + FROZEN_S:
                 raise Refusal(f"{', '.join(still)}: cannot be ended")
             yield
@@ -231,11 +231,6 @@ class HotChanges:
             self._robots[name].left_because = "removed"
             self._robots[name].forget_process()
         self._leaving -= {*names}  # the next end of a process is that of another one
-
-    def _process_must_end(self, name: str, names: Sequence[str]) -> bool:
-        """Whether a robot's process is still there although it has no other robots that stay."""
-        others = {*self._processes.companions(name)} - {*names}
-        return self._processes.runs(name) and all(self._robots[other].gone for other in others)
 
     def _frozen(self, name: str) -> bool:
         status = self._robots[name].status
@@ -350,8 +345,6 @@ class HotChanges:
 
 
 class Spares:
-    """Spares of an experiment."""
-
     used: dict[str, str]  # names that they have taken over, by spare
 
     def __init__(self, plan: Plan) -> None:
@@ -362,7 +355,10 @@ class Spares:
         """The robot with the name `name` from now on, and the name of the spare, if it is one."""
         spare = order.spare
         if spare is None and order.body is None:
-            spare = self._first_spare(name, robot.kind)
+            fits = (each for each, other in self._spares.items() if other.kind == robot.kind and each not in self.used)
+            if (spare := next(fits, None)) is None:
+                why = f"the file has no spare {robot.kind} left for {name}"
+                raise Refusal(f"{why}: say which body takes over, --body URI, or add [spares.NAME]")
         if spare is not None and order.body is not None:
             raise Refusal("a spare has a body of its own: leave --body or --with out")
         made = self._of_spare(spare, name, robot) if spare is not None else self._of_body(order.body or "", robot)
@@ -371,14 +367,6 @@ class Spares:
         if order.at is not None:
             made = self._put(made, order.at, order.yaw)
         return made, spare
-
-    def _first_spare(self, name: str, kind: str) -> str:
-        for spare, robot in self._spares.items():
-            if robot.kind == kind and spare not in self.used:
-                return spare
-        raise Refusal(
-            f"the file has no spare {kind} left for {name}: say which body takes over, --body URI, or add [spares.NAME]"
-        )
 
     def _of_spare(self, spare: str, name: str, robot: RobotTable) -> RobotTable:
         spares = self._spares

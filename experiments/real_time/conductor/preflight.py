@@ -126,8 +126,6 @@ class Inspector(CaseRun):
         robots = self._experiment.robots
         return [RobotChecks(name, robots[name].kind, robots[name].body, each) for name, each in found.items()]
 
-    # ------------------------------------------------------------------ at rest
-
     def _observe(self) -> dict[str, Observed]:
         self._phase("observing all at rest")
         observed = {name: Observed(self._experiment.robots[name]) for name in self._robots}
@@ -167,8 +165,6 @@ class Inspector(CaseRun):
             tried.stopped_s = time.monotonic() - begun
         tried.note = "" if seen.status is None else seen.status.body
         return tried
-
-    # ------------------------------------------------------------------ in motion
 
     def _try(self, name: str, each: Observed, *, red: bool) -> Iterator[Check]:
         """Hop or drive, then stop in motion, of one robot; what is red is not moved."""
@@ -268,8 +264,6 @@ class Inspector(CaseRun):
             tried.failure = tried.failure or self._reason(name)
         elif robot.hover is not None and not tried.failure:
             tried.failure = f"came down by itself: {self._reason(name)}"
-
-    # ------------------------------------------------------------------ parts of the above
 
     def _phase(self, text: str) -> None:
         self._progress.phase = text

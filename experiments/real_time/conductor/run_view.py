@@ -185,7 +185,13 @@ class NetworkView:
         for token, there in self._watch.changes():
             if (known := self.robots.get(self._keys.whose(token) or "")) is not None:
                 known.alive, known.vanished = there, inf if there else time.monotonic()
-        return self._missing_tokens()
+        now = time.monotonic()
+        self._watch_router(now)
+        # with another router, a token comes back at once
+        missed = [name for name, view in self.robots.items() if now - max(view.vanished, self._cut_off) > MISSED_S]
+        for name in missed:
+            self.robots[name].vanished = inf
+        return missed
 
     def order(self, names: Sequence[str], order: messages.Order) -> dict[str, messages.Reply]:
         return orders.send_order(self.session, self._keys, names, order)
@@ -209,15 +215,6 @@ class NetworkView:
             self._clock.put(messages.encode(each))
         for text in trouble:
             self.report("clock", "conductor", text)
-
-    def _missing_tokens(self) -> list[str]:
-        """Robots with a token that has been missing for long: with another router, it comes back at once."""
-        now = time.monotonic()
-        self._watch_router(now)
-        missed = [name for name, view in self.robots.items() if now - max(view.vanished, self._cut_off) > MISSED_S]
-        for name in missed:
-            self.robots[name].vanished = inf
-        return missed
 
     def _watch_router(self, now: float) -> None:
         """Report once that the router is silent for longer than `neighbour_timeout_s`, and once that it is back."""

@@ -129,9 +129,6 @@ def _named(known: Register, names: Iterable[str]) -> dict[str, Identity]:
     return {name: known.identities[name] for name in names}
 
 
-# ---------------------------------------------------------------------- certificates
-
-
 def _found(folder: Path) -> Authority:
     """A new authority, written to the folder of its lab."""
     key = ec.generate_private_key(ec.SECP256R1())

@@ -329,8 +329,6 @@ class RouterEnded(StandInError):
 
 @dataclass(frozen=True)
 class Router:
-    """Router of a run."""
-
     name: str  # of its process
     listen: Sequence[str]  # where it listens
     # routers before it, which it connects to for as long as it lives, so that any two are linked once

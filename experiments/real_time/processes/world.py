@@ -131,8 +131,6 @@ class WorldProcess:
         if changed:
             self._report(t)
 
-    # ------------------------------------------------------------------ orders
-
     def _obey(self, query: zenoh.Query, order: messages.WorldOrder) -> bool:
         """Carries out one order, and replies; returns whether it changed anything."""
         with query:

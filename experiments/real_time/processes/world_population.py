@@ -52,8 +52,6 @@ class WorldBodies:
         self.time = 0.0
         self._create_body()
 
-    # ------------------------------------------------------------------ motion
-
     def advance(self) -> None:
         self._ticks += 1
         self.time += self._dt
@@ -98,8 +96,6 @@ class WorldBodies:
         """Pose of each obstacle: x, y [m], yaw [rad]."""
         poses = zip(self._scene.names, self.body.engine.obstacles, strict=True)
         return {name: (round(x, 6), round(y, 6), round(yaw, 6)) for name, (x, y, yaw) in poses}
-
-    # ------------------------------------------------------------------ back to the start
 
     def reset(self, name: str | None) -> None:
         """Puts a robot back to its start, or all robots and pushed obstacles; a flying robot keeps its height."""

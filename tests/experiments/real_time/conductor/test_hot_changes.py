@@ -39,6 +39,7 @@ class Stage:
         self.bodies = dict(experiment.robots)
         self.robots = {name: RobotView(place=(*robot.start[:2], 0.0)) for name, robot in self.bodies.items()}  # type: ignore[arg-type]
         self.hung: set[str] = set()
+        self.together: tuple[str, ...] = ()  # robots of one process
         self.running = set(self.robots)
         self.adopted: set[str] = set()
         self.away: dict[str, str] = {}
@@ -75,7 +76,7 @@ class Stage:
     # as processes
 
     def companions(self, name: str) -> list[str]:
-        return [name]
+        return list(self.together) if name in self.together else [name]
 
     def runs(self, name: str) -> bool:
         return name in self.running
@@ -173,6 +174,17 @@ def test_order_for_several_is_answered_when_all_finish(stage: Stage) -> None:
     reply = stage.after(query, 4.0)
     assert set(reply.done) == {"KH01", "KH02"}
     assert stage.did == [("release", "KH02"), ("kill", "KH02")], "who hangs lands if it can, and is ended else"
+
+
+@pytest.mark.parametrize("answers", [True, False])
+def test_process_of_a_flying_companion_is_never_ended(stage: Stage, answers: bool) -> None:
+    stage.together = ("KH01", "KH02")
+    stage.hung |= set() if answers else {"KH01"}
+    stage.end = lambda name: None  # type: ignore[method-assign]  # it lands, and goes on landing
+    reply = stage.after(stage.ask("remove", "KH01"), 20.0)
+    assert "shares its process with KH02: name them all" in reply.refused["KH01"]
+    assert stage.did == []
+    assert stage.robots["KH02"].phase == "running"
 
 
 @pytest.mark.parametrize("away", [0.3, 0.1])
