@@ -3,6 +3,7 @@
 import resource
 from contextlib import contextmanager
 
+import msgspec
 import numpy as np
 
 from agents.network.messages import Contact, Event, ObstaclePose, Pose, PoseReceipt, State, Status, WorldState
@@ -106,6 +107,11 @@ def broken(path, *messages):
     write(path, *(messages or whole_run()))
     path.write_bytes(path.read_bytes()[:-1])
     return path
+
+
+def pair_with(**parts):
+    """The pair of this module with other parts."""
+    return msgspec.structs.replace(PAIR, **parts)
 
 
 @contextmanager

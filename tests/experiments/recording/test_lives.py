@@ -67,7 +67,7 @@ def test_share_of_missed_deadlines_stays_below_one(path):
 
 
 STANDBY = {"KH01": replace(rec.PAIR.robots["TB01"], standby=True)}
-LINKED = rec.changed(
+LINKED = rec.pair_with(
     duration_s=4.0, robots=rec.PAIR.robots | STANDBY,
     formation=Formation(links={"TB01 - CF01": 1.0, "TB01 - KH01": 1.0}),
 )  # fmt: skip

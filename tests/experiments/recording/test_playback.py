@@ -57,14 +57,14 @@ def test_a_run_is_read_back(path):
 
 def test_what_the_world_said_is_read_back(path):
     touches = [rec.touched(0.7), rec.touched(-0.1), rec.touched(0.2, second="wall"), rec.touched(1.2)]
-    rec.broken(path, *rec.whole_run(), rec.world(-0.5), rec.world(0.5), rec.world(1.5), *touches)
+    rec.broken(path, *rec.whole_run(), rec.world_state(-0.5), rec.world_state(0.5), rec.world_state(1.5), *touches)
     trace = read(path).trace
     assert [(each.first, each.second, round(each.stamp, 6)) for each in trace.contacts] == [
         ("TB01", "wall", 0.2),
         ("TB01", "CF01", 0.7),
     ]
     assert (trace.contacts[0].impulse, trace.contacts[0].overlap) == (0.25, 0.001)
-    assert [msgspec.structs.replace(each, stamp=rec.START + 0.5) for each in trace.world] == [rec.world(0.5)]
+    assert [msgspec.structs.replace(each, stamp=rec.START + 0.5) for each in trace.world] == [rec.world_state(0.5)]
     assert trace.world[0].stamp == pytest.approx(0.5)
     target = path.with_name("whole.mcap")
     assert recover(path, target).robots == ("TB01", "CF01")
@@ -80,9 +80,9 @@ def test_what_the_world_said_is_read_back(path):
     ("said", "contacts"),
     [
         ([], None),
-        ([rec.world(0.5, "point-mass")], None),
-        ([rec.world(0.5, "nobody-has-it")], None),
-        ([rec.world(0.5)], ()),
+        ([rec.world_state(0.5, "point-mass")], None),
+        ([rec.world_state(0.5, "nobody-has-it")], None),
+        ([rec.world_state(0.5)], ()),
     ],
 )
 def test_no_contacts_differ_from_no_contact_detection(path, said, contacts):
@@ -153,7 +153,7 @@ def test_silence_is_nan_and_never_extrapolated(path):
 
 def test_a_long_hole_is_not_interpolated_over(path):
     times = [0.0, 0.1, 0.6, 0.7, 2.0, 2.1]
-    rec.write(path, rec.begun(), *[rec.state(at=at, x=at) for at in times], experiment=rec.changed(duration_s=2.0))
+    rec.write(path, rec.begun(), *[rec.state(at=at, x=at) for at in times], experiment=rec.pair_with(duration_s=2.0))
     x = read(path).trace.position[:, 0, 0]
     np.testing.assert_allclose(x[:8], np.arange(8) / 10, atol=1e-6)
     assert np.flatnonzero(np.isnan(x)).tolist() == list(range(10, 18))
@@ -210,7 +210,7 @@ def test_lost(path, messages, lost):
 
 def test_what_the_modelled_network_dropped_is_no_loss(path):
     said = [rec.status("CF01", at=at, dropped={"TB01": count}) for at, count in ((-0.5, 0), (0.4, 3), (1.0, 7))]
-    linked = rec.changed(formation=Formation(links={"TB01 - CF01": 0.5}))
+    linked = rec.pair_with(formation=Formation(links={"TB01 - CF01": 0.5}))
     rec.write(path, rec.begun(), rec.state(), *said, rec.landed(), experiment=linked)
     trace = read(path).trace
     assert trace.dropped.tolist() == [0, 7]  # TB01 listens to CF01; CF01 to TB01
@@ -221,7 +221,7 @@ def test_foreign_poses_count_once_for_all_receivers(path):
     robots = {name: RobotTable("tello", [float(k), 0.0]) for k, name in enumerate("ABC")}
     counts = (("B", -0.5, 2), ("C", -0.5, 0), ("B", 0.4, 5), ("C", 0.4, 1), ("B", 1.0, 9), ("C", 1.0, 3))
     said = [rec.status(name, at=at, foreign={"A": count}) for name, at, count in counts]
-    three = rec.changed(robots=robots, formation=Formation(links={"A > B": 0.5, "A > C": 0.5}))
+    three = rec.pair_with(robots=robots, formation=Formation(links={"A > B": 0.5, "A > C": 0.5}))
     rec.write(path, rec.begun(), *(rec.state(name) for name in robots), *said, rec.landed(), experiment=three)
     assert read(path).trace.foreign.tolist() == [7, 0, 0]
 
@@ -241,7 +241,7 @@ def test_what_a_drifting_clock_stamped_is_set_right(path):
     for k in range(0, 3601, 10):
         messages += [rec.state("TB01", k + 1, k, 0.001 * k), rec.state("CF01", k + 1, k * (1 + 50e-6), 0.001 * k)]
     messages += [rec.state("TB01", 9000, 3600.5, 3.6, received=heard), rec.pose("CF01", 1, 1800.09), rec.landed(3600.0)]
-    rec.write(path, *messages, experiment=rec.changed(duration_s=3600.0, rates=Rates(state_hz=1.0)))
+    rec.write(path, *messages, experiment=rec.pair_with(duration_s=3600.0, rates=Rates(state_hz=1.0)))
     trace = read(path).trace
     np.testing.assert_allclose(trace.position[[600, 1800, 3600], :, 0], [[x, x] for x in (0.6, 1.8, 3.6)], atol=1e-6)
     assert trace.sent.stamp[0] == pytest.approx(1800.0, abs=1e-4)
@@ -304,7 +304,7 @@ def follow(begin, end, phase="running"):
     ids=["stopped after the end", "landed slightly early", "all landed", "no conductor", "one long silent"],
 )
 def test_end_of_a_run(path, duration_s, messages, end, silent):
-    rec.write(path, rec.begun(), *messages, experiment=rec.changed(duration_s=duration_s))
+    rec.write(path, rec.begun(), *messages, experiment=rec.pair_with(duration_s=duration_s))
     trace = read(path).trace
     assert trace.time[-1] == pytest.approx(end)
     assert np.isfinite(trace.position[-1]).all(axis=1).tolist() == [True, not silent]

@@ -8,14 +8,14 @@ import pytest
 from experiments.metrics.measure import measure
 from experiments.report import export, figures, metrics_files, verdict
 from experiments.report.tables import whole_tables
-from tests.experiments.virtual_time.test_gallery import trace
+from tests.experiments.virtual_time.test_gallery import trace_from
 
 CASES = ("periodic", "event")
 
 
 @pytest.fixture(scope="module")
 def traces():
-    return {case: trace("average", case, "duration_s=5") for case in CASES}
+    return {case: trace_from("average", case, "duration_s=5") for case in CASES}
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +76,7 @@ def test_files_have_columns_of_the_law(tmp_path, traces, measured):
 
 
 def test_numbers_of_one_variable_are_columns_each(tmp_path):
-    known = trace("leader-observer", "periodic", "duration_s=3")
+    known = trace_from("leader-observer", "periodic", "duration_s=3")
     wide = next(name for name, values in known.memory.items() if values.shape[2] > 1)
     export.write_csv({"periodic": known}, tmp_path / "trajectories.csv")
     head = (tmp_path / "trajectories.csv").read_text().splitlines()[0].split(",")
