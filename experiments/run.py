@@ -16,6 +16,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -165,9 +166,8 @@ def simulate_seeds(
     """As `simulate`, once for each seed; recordings are made of the first seed only.
 
     Many seeds are shared between processes (as many as this machine has cores), which import the script: there under
-    `if __name__ == "__main__"`.
-    `progress` is called repeatedly. `watch` gives for each case what the simulation of the first seed calls, see
-    `simulation.simulate`.
+    `if __name__ == "__main__"`. `progress` is called repeatedly. `watch` gives for each case what the simulation of the
+    first seed calls, see `simulation.simulate`.
     """
     _refuse_too_much(read.plan, len(seeds))
     folder = None if folder is None else Path(folder)
@@ -175,36 +175,30 @@ def simulate_seeds(
         with suppress(OSError):  # the recording says so
             folder.mkdir(parents=True, exist_ok=True)
     works = {name: standby.without_standby(case) for name, case in chosen(read, cases).items()}
-    first, *others = seeds
-    traces: list[dict[str, Trace]] = [{} for _ in seeds]
-    metrics: list[dict[str, CaseMetrics]] = [{} for _ in seeds]
+    runs = [Run(read.experiment.title, seed, {}, {}, folder, read.listing) for seed in seeds]
+    first, *others = runs
     count = min(_profitable_processes(works, len(others)) if processes is None else processes, len(works) * len(others))
     with pool(count) if count > 1 else nullcontext() as workers:
-        shared = (
-            {}
-            if workers is None
-            else {(name, seed): workers.submit(_flown, name, works[name], seed) for name in works for seed in others}
-        )
+        shared = dict[tuple[str, int], Future[Flown]]()
+        if workers is not None:
+            for name, run in product(works, others):
+                shared[name, run.seed] = workers.submit(_flown, name, works[name], run.seed)
         for name, plan in works.items():
             duration_s = plan.experiment.duration_s
             passing = partial(_pass_progress, progress, name, duration_s)
-            log = simulation.simulate(plan, first, progress=passing, watch=watch(name, plan))
+            log = simulation.simulate(plan, first.seed, progress=passing, watch=watch(name, plan))
             logbook = RunRecorder(log, plan, name)
-            traces[0][name] = logbook.trace()
-            metrics[0][name] = measure.measure(traces[0][name])
+            first.traces[name] = logbook.trace()
+            first.metrics[name] = measure.measure(first.traces[name])
             if folder is not None:
                 logbook.record(folder / f"{name}.mcap", read.text)
-            for k, seed in enumerate(others, 1):
-                future = shared.get((name, seed))
-                found = _flown(name, plan, seed, passing) if future is None else _result(future)
-                traces[k][name], metrics[k][name] = found
-                passing(duration_s * (k + 1) / len(seeds))
+            for number, run in enumerate(others, 2):
+                future = shared.get((name, run.seed))
+                found = _flown(name, plan, run.seed, passing) if future is None else _result(future)
+                run.traces[name], run.metrics[name] = found
+                passing(duration_s * number / len(seeds))
             passing(math.inf)
-    title, text = read.experiment.title, read.listing
-    return [
-        Run(title, seed, flown, measured, folder, text)
-        for seed, flown, measured in zip(seeds, traces, metrics, strict=True)
-    ]
+    return runs
 
 
 Flown = tuple[Trace, CaseMetrics]
@@ -236,9 +230,7 @@ def _refuse_too_much(plan: Plan, seeds: int) -> None:
     samples = experiment.duration_s * experiment.rates.state_hz * len(experiment.robots) * seeds
     if samples > MOST_SAMPLES:
         message = f"a run in virtual time of {samples:.2g} samples; {MOST_SAMPLES:.0e} fit into memory"
-        hint = (
-            "take fewer --seeds (`./zenpark sweep` runs any number, one by one), a lower rates.state_hz or duration_s"
-        )
+        hint = "take fewer --seeds (`./zenpark sweep` runs any number), a lower rates.state_hz or duration_s"
         raise refusal("--seeds" if seeds > 1 else "duration_s", message, hint)
 
 

@@ -85,20 +85,18 @@ def experiment_file(made: Layout, wanted: LayoutOptions) -> str:
     first, second = position[made.pairs].transpose(1, 0, 2)
     distance = norm(first - second)
     needed = 2.0 * kind.radius + PASSING
-    if distance.min() < needed:
-        raise LayoutError(
-            f"robots of kind {kind.name} need a spacing of {needed:.2f} m or more, not {distance.min():.2f} m"
-        )
+    least = distance.min()
+    if least < needed:
+        raise LayoutError(f"robots of kind {kind.name} need a spacing of {needed:.2f} m or more, not {least:.2f} m")
     scatter = round(FREE * wanted.spacing, 3) if wanted.scatter is None else wanted.scatter
     digits = max(2, len(str(len(made))))
     names = [f"{kind.prefix}{number:0{digits}d}" for number in range(1, len(made) + 1)]
     size = _arena(position, kind, scatter)
     width = max(len(f"{x:.3f}, {y:.3f}") for x, y in position[:, :2])
-    robots = []
-    for name, (x, y, z) in zip(names, position.tolist(), strict=True):
-        start = f"[{x:.3f}, {y:.3f}]".ljust(width + 2)
-        held = f", hover = {z:.3f}" if kind.flies else ""
-        robots.append(f'{name} = {{ kind = "{kind.name}", start = {start}{held} }}')
+    starts = [f"[{x:.3f}, {y:.3f}]".ljust(width + 2) for x, y in position[:, :2].tolist()]
+    held = [f", hover = {z:.3f}" if kind.flies else "" for z in position[:, 2].tolist()]
+    rows = zip(names, starts, held, strict=True)
+    robots = [f'{name} = {{ kind = "{kind.name}", start = {start}{hover} }}' for name, start, hover in rows]
     by_offset = wanted.law == "displacement"
     links = []
     for (i, j), (x, y, _), d in zip(made.pairs.tolist(), (second - first).tolist(), distance.tolist(), strict=True):
@@ -200,9 +198,8 @@ def _taken(position: Array, made: Layout, kind: Kind, highest: float, *, by_offs
     for _ in range(POWER):
         stretch = way[i] - way[j]
         pull = stretch if by_offset else np.vecdot(offset, stretch)[:, None] * offset
-        way = np.column_stack(
-            [np.bincount(i, pull[:, k], len(way)) - np.bincount(j, pull[:, k], len(way)) for k in (0, 1)]
-        )
+        sums = [np.bincount(i, pull[:, k], len(way)) - np.bincount(j, pull[:, k], len(way)) for k in (0, 1)]
+        way = np.column_stack(sums)
         stiffest = float(np.sqrt(np.vdot(way, way)))
         way = way / stiffest
     gain = min(highest, 0.5 * TAKEN * float(bearable_factors([kind], 10.0)[0]) / stiffest)

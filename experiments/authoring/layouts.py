@@ -37,7 +37,8 @@ def polygon(count: int, spacing: float) -> Layout:
 
     The ring alone could fold; with the second neighbours it is rigid in the plane.
     """
-    _at_least(count, 3, "polygon")
+    if count < 3:
+        raise LayoutError(f"a polygon needs 3 robots or more, not {count}")
     first = np.arange(count)
     angle, radius = 2.0 * math.pi * first / count, spacing / (2.0 * math.sin(math.pi / count))
     position = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(count)])
@@ -50,12 +51,8 @@ def grid(rows: int, columns: int, spacing: float) -> Layout:
     if min(rows, columns) < 2:
         raise LayoutError(f"a grid of {rows}x{columns} is a line, which bends: give 2x2 or more")
     number = np.arange(rows * columns).reshape(rows, columns)
-    neighbours = (
-        (number[:, :-1], number[:, 1:]),
-        (number[:-1], number[1:]),
-        (number[:-1, :-1], number[1:, 1:]),
-        (number[1:, :-1], number[:-1, 1:]),
-    )
+    beside, behind = (number[:, :-1], number[:, 1:]), (number[:-1], number[1:])
+    neighbours = beside, behind, (number[:-1, :-1], number[1:, 1:]), (number[1:, :-1], number[:-1, 1:])
     both = np.concatenate([np.column_stack([one.ravel(), other.ravel()]) for one, other in neighbours])
     y, x = np.divmod(np.arange(rows * columns), columns)
     place = np.column_stack([x - (columns - 1) / 2.0, (rows - 1) / 2.0 - y, np.zeros(rows * columns)])
@@ -65,16 +62,16 @@ def grid(rows: int, columns: int, spacing: float) -> Layout:
 def hemisphere(count: int, spacing: float, apart: float) -> Layout:
     """`count` robots spread evenly over a hemisphere, linked by its Delaunay triangulation.
 
-    The links are those of the Delaunay triangulation on the sphere. Points that are projected stereographically from
-    the opposite pole have the same triangulation in the plane, because circles of the sphere become circles. Blunt
-    triangles of
-    the rim are left out: their long sides would only make the formation slower.
+    Points that are projected stereographically from the opposite pole have the same triangulation in the plane, because
+    circles of the sphere become circles. Blunt triangles of the rim are left out: their long sides would only make the
+    formation slower.
 
     Args:
         spacing: Least distance of two of them [m].
         apart: Least distance seen from above [m], so that they can start and land below their places.
     """
-    _at_least(count, 4, "hemisphere")
+    if count < 4:
+        raise LayoutError(f"a hemisphere needs 4 robots or more, not {count}")
     from matplotlib.tri import Triangulation  # noqa: PLC0415 - takes half a second, and only this needs it
 
     number = np.arange(count)
@@ -117,8 +114,3 @@ def _nearest(points: Array) -> float:
 def _each_once(pairs: Index) -> Index:
     """Pairs (M, 2), smaller row first, sorted, each once."""
     return np.unique(np.sort(pairs, axis=1), axis=0).astype(np.intp)
-
-
-def _at_least(count: int, least: int, what: str) -> None:
-    if count < least:
-        raise LayoutError(f"a {what} needs {least} robots or more, not {count}")

@@ -27,6 +27,13 @@ def arenas() -> list[str]:
     return sorted(file.name for file in FOLDER.glob(f"*{_ARENA}"))
 
 
+def file_beside(name: str, folder: Path) -> Path | None:
+    """The file of that plain name in a folder, or else in the catalogue; None if it is none, but a path or a blank."""
+    if not name.strip() or "\0" in name or Path(name).name != name:
+        return None
+    return next((file for file in (folder / name, FOLDER / name) if file.is_file()), folder / name)
+
+
 def find_file(name: str | Path) -> Path:
     """File of that name, or of the catalogue entry; a folder of the same name does not hide an entry."""
     file = Path(name)

@@ -120,9 +120,8 @@ def unlinked(links: Links) -> list[Link]:
     relative = blank if links.relative is None else [tuple(each) for each in links.relative.tolist()]
     bearing = blank if links.bearing is None else [tuple(each) for each in links.bearing.tolist()]
     wants = [BY_DISTANCE] * count if links.wants is None else links.wants.tolist()
-    return [
-        Link(*each) for each in zip(links.distance.tolist(), links.gain.tolist(), relative, bearing, wants, strict=True)
-    ]
+    columns = links.distance.tolist(), links.gain.tolist(), relative, bearing, wants
+    return [Link(*each) for each in zip(*columns, strict=True)]
 
 
 def law_offsets(law: Gradient, position: Array, received: Array, links: Links) -> Array:
@@ -168,11 +167,10 @@ def errors_over_time(law: Law, pattern: Pattern, time: Array, position: Array) -
         return np.full((len(time), len(links)), np.nan)
     if type(law) is Distance and not pattern.changes:
         step = max(1, AT_ONCE // max(1, len(links)))
-        parts = [
-            np.abs(norm(position[k : k + step, links.receiver] - position[k : k + step, links.sender]) - links.distance)
-            for k in range(0, len(time), step)
-        ]
-        error = np.concatenate([np.zeros((0, len(links))), *parts])
+        error = np.empty((len(time), len(links)))
+        for k in range(0, len(time), step):
+            part = position[k : k + step]
+            error[k : k + step] = np.abs(norm(part[:, links.receiver] - part[:, links.sender]) - links.distance)
     else:
         error = np.empty((len(time), len(links)))
         targets = pattern.targets_at(0.0)

@@ -220,14 +220,13 @@ class Plan:
     @cached_property
     def hops(self) -> float:
         """Largest number of links from any robot to any other, D; infinite where there is no way."""
-        hears, rows = adjacency(self.links, len(self.names)) > 0, len(self.names)
-        reached, hops = np.eye(rows, dtype=bool), 0
-        while not reached.all():
-            wider = reached | (hears @ reached)
-            if (wider == reached).all():
-                return math.inf
-            reached, hops = wider, hops + 1
-        return hops
+        hears = adjacency(self.links, len(self.names)) > 0
+        reached = np.eye(len(self.names), dtype=bool)
+        for hops in range(len(self.names)):
+            if reached.all():
+                return hops
+            reached = reached | (hears @ reached)
+        return math.inf
 
     def laplacian_eigenvalues(self, weight: Callable[[float, float], float]) -> list[complex]:
         """Eigenvalues of the Laplacian of the links (N).
@@ -260,23 +259,20 @@ class Plan:
     @cached_property
     def starts(self) -> tuple[tuple[str, float, float, float], ...]:
         """Name of each robot, x and y where it begins [m], and its radius [m]."""
-        starts, _ = self.start_poses()
-        return tuple(
-            (name, x, y, kind.radius) for name, (x, y, _), kind in zip(self.names, starts, self.kinds, strict=True)
-        )
+        rows = zip(self.names, self.start_poses()[0], self.kinds, strict=True)
+        return tuple((name, x, y, kind.radius) for name, (x, y, _), kind in rows)
 
     @cached_property
     def pose_links(self) -> Links:
         """Every link on which robots receive poses, receiver by receiver, those that only avoidance needs last."""
-        guided, row = set(self.guided), self._row
-        targets, ends, given = [], [], self.formation.targets_at(0.0)
+        guided, row, given = set(self.guided), self._row, self.formation.targets_at(0.0)
+        targets, ends = list[Link](), list[tuple[int, int]]()
         for receiver in self.names:
-            for number in () if receiver in guided else self._links_to.get(receiver, ()):
-                targets.append(given[number])
-                ends.append((row[receiver], row[self.one_way_links[number].sender]))
-            for sender in self.avoidance_senders.get(receiver, ()):
-                targets.append(Link())
-                ends.append((row[receiver], row[sender]))
+            numbers = () if receiver in guided else self._links_to.get(receiver, ())
+            seen = self.avoidance_senders.get(receiver, ())
+            targets += [*(given[number] for number in numbers), *(Link() for _ in seen)]
+            senders = [*(self.one_way_links[number].sender for number in numbers), *seen]
+            ends += [(row[receiver], row[sender]) for sender in senders]
         return linked(targets, ends)
 
     @cached_property
@@ -304,24 +300,17 @@ class Plan:
         The world itself publishes positions of its robots, as two sources would contradict each other. With a simulated
         motion capture, which sees these robots as well, the world does not publish them.
         """
-        simulated = self.experiment.positioning == VICON_TWIN
-        robots = self.experiment.robots.items()
-        return tuple(
-            name for name, robot in robots if robot.position == "external" and (simulated or robot.body != WORLD)
-        )
+        simulated, robots = self.experiment.positioning == VICON_TWIN, self.experiment.robots.items()
+        measured = [(name, robot.body) for name, robot in robots if robot.position == "external"]
+        return tuple(name for name, body in measured if simulated or body != WORLD)
 
     @property
     def uses_chance(self) -> bool:
         """Whether anything depends on the seed: starts, noise of twins, the modelled network."""
         experiment = self.experiment
         nature = [self.disturbance(name) for name in self.names]
-        noisy = any(
-            each.position_sigma
-            or each.yaw_sigma
-            or each.odometry_drift
-            or (each.hover_jitter and each.hover_jitter.sigma)
-            for each in nature
-        )
+        jitters = [each.hover_jitter.sigma for each in nature if each.hover_jitter is not None]
+        noisy = any(jitters) or any(each.position_sigma or each.yaw_sigma or each.odometry_drift for each in nature)
         scattered = bool(experiment.start.scatter or experiment.start.scatter_yaw)
         channel, links = experiment.channel, experiment.channel.links.values()
         lossy = channel.loss or channel.jitter_s or any(each.loss or each.jitter_s for each in links)
@@ -365,12 +354,8 @@ class Plan:
 
     def _patience(self, name: str) -> float:
         """Time for which a robot holds without a position [s]; without its world it cannot move, and may wait."""
-        experiment = self.experiment
-        return (
-            experiment.world.patience_s
-            if experiment.robots[name].body == WORLD
-            else experiment.safety.land_without_position_s
-        )
+        worldly, safety = self.experiment.robots[name].body == WORLD, self.experiment.safety
+        return self.experiment.world.patience_s if worldly else safety.land_without_position_s
 
     def assignment(self, name: str, *, centrally: bool = False) -> Assignment:
         """The part of a robot.
@@ -427,13 +412,10 @@ class Plan:
                 not robots[sender].standby, self.formation.targets[number],
                 link.since, link.until, link.reach, link.release,
             ))  # fmt: skip
-        only_seen = self.avoidance_senders.get(name, ()) if avoidance else ()
-        return (*found, *(
-            Incoming(
-                self._row[sender], sender, kinds[sender], math.nan, in_law=False, awaited=not robots[sender].standby
-            )
-            for sender in only_seen
-        ))  # fmt: skip
+        for sender in self.avoidance_senders.get(name, ()) if avoidance else ():
+            row, awaited = self._row[sender], not robots[sender].standby
+            found.append(Incoming(row, sender, kinds[sender], math.nan, in_law=False, awaited=awaited))
+        return tuple(found)
 
     @cached_property
     def _row(self) -> dict[str, int]:

@@ -26,18 +26,12 @@ def without_standby(plan: Plan, added: Collection[str] = ()) -> Plan:
         msgspec.structs.replace(change, links={text: to for text, to in change.links.items() if text in links})
         for change in formation.changes
     ]
-    outages = [
-        msgspec.structs.replace(
-            outage,
-            links=list(_links_between(dict.fromkeys(outage.links), robots)),
-            robots=[name for name in outage.robots if name in robots],
-        )
-        for outage in channel.outages
-    ]
-    outages = [  # an outage without names would mean all links
-        short for short, whole in zip(outages, channel.outages, strict=True)
-        if short.links or short.robots or not (whole.links or whole.robots)
-    ]  # fmt: skip
+    outages = []
+    for outage in channel.outages:
+        between = list(_links_between(dict.fromkeys(outage.links), robots))
+        cut_off = [name for name in outage.robots if name in robots]
+        if between or cut_off or not (outage.links or outage.robots):  # one without names would mean all links
+            outages.append(msgspec.structs.replace(outage, links=between, robots=cut_off))
     if isinstance(architecture, Hybrid):
         led = [name for name in architecture.robots if name in robots]
         hybrid = Hybrid(architecture.kind, led)

@@ -69,18 +69,13 @@ def load(name: str, folder: Path) -> ArenaFile:
         Misnamed: If there is no such file.
         DocumentError: With everything that is wrong in it.
     """
-    if not name.strip() or "\0" in name or Path(name).name != name:
+    file = index.file_beside(name, folder)
+    if file is None:
         hint = "put it beside the experiment file, and give its name alone"
         raise Misnamed(Fault(_HERE, f"{name!r} is no name of a file", hint))
-    if name.lower() == KEPT or Path(name).suffix.lower() != SUFFIX:
-        hint = f"call it otherwise, such as lab{SUFFIX}"
-        why = (
-            "is the experiment itself in the folder of a run" if name.lower() == KEPT else f"does not end with {SUFFIX}"
-        )
-        raise Misnamed(Fault(_HERE, f"{name!r} {why}", hint))
-    file = folder / name
-    if not file.exists() and (index.FOLDER / name).is_file():
-        file = index.FOLDER / name
+    if name.lower() == KEPT or file.suffix.lower() != SUFFIX:
+        why = f"does not end with {SUFFIX}" if name.lower() != KEPT else "is the experiment in the folder of a run"
+        raise Misnamed(Fault(_HERE, f"{name!r} {why}", f"call it otherwise, such as lab{SUFFIX}"))
     label = str(file)
     try:
         text = syntax.content(file, label)

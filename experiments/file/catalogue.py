@@ -36,9 +36,11 @@ def write_new(text: str, target: Path, *, furnished: bool = False) -> Path:
     Raises:
         DocumentError: If the target exists or cannot be written, or another arena file of that name is there.
     """
+    created = False
     try:
         beside = _arena_beside(text, target.parent) if furnished else None
         with target.open("x", encoding="utf-8") as new:
+            created = True
             new.write(text)
         if beside is not None:
             (target.parent / beside.name).write_text(beside.text, encoding="utf-8")
@@ -48,6 +50,8 @@ def write_new(text: str, target: Path, *, furnished: bool = False) -> Path:
         hint = "choose another name; nothing was changed"
         raise refusal(str(target), "exists already", hint) from None
     except (OSError, ValueError) as error:
+        if created:  # half of it would stand in the way of the next attempt
+            target.unlink(missing_ok=True)
         hint = "choose a place that exists and may be written to"
         raise refusal(str(target), f"cannot be written: {reason(error)}", hint) from error
     return target

@@ -74,18 +74,18 @@ def fill_from_files(document: dict[str, Any], folder: pathlib.Path) -> list[Faul
         path, name = ("formation", "law", parameter), law.get(parameter)
         if not isinstance(name, str) or not name:
             continue
-        if "\0" in name or pathlib.Path(name).name != name:
+        file = index.file_beside(name, folder)
+        if file is None:
             hint = "put it beside the experiment file, and give its name alone"
             faults.append(Fault(path, f"{name!r} is no name of a file", hint))
             continue
-        file = next((each for each in (folder / name, index.FOLDER / name) if each.is_file()), folder / name)
         try:
             with file.open("rb") as stream:
                 found = stream.read(LARGEST_FILE + 1)
         except OSError as error:
             if content not in law:
-                hint = "put it beside the experiment file"
-                faults.append(Fault(path, f"{file} cannot be read: {error.strerror or error}", hint))
+                message = f"{file} cannot be read: {error.strerror or error}"
+                faults.append(Fault(path, message, "put it beside the experiment file"))
             continue
         if len(found) > LARGEST_FILE:
             message = f"{name} is longer than {LARGEST_FILE // 1_000_000} MB"

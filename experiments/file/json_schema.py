@@ -5,7 +5,6 @@ Draft 7, because Taplo (the TOML extension of most editors) misreads the tuples 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from itertools import combinations
 from math import inf
@@ -66,12 +65,9 @@ def described() -> dict[str, Any]:
     partial = {name + _CASE: _partial(each) for name, each in definitions.items()}
     for key in ("cases", "criteria"):
         del partial["Experiment" + _CASE]["properties"][key]
-    definitions["Experiment"]["properties"]["cases"]["additionalProperties"] = {
-        "$ref": f"#/definitions/Experiment{_CASE}"
-    }
-    top = definitions.pop(
-        "Experiment"
-    )  # in full: a reference at the top would hide its neighbours from draft-7 readers
+    case = {"$ref": f"#/definitions/Experiment{_CASE}"}
+    definitions["Experiment"]["properties"]["cases"]["additionalProperties"] = case
+    top = definitions.pop("Experiment")  # in full: a reference would hide its neighbours from draft-7 readers
     whole = {"$schema": "http://json-schema.org/draft-07/schema#", **top, "definitions": definitions | partial}
     return dict(msgspec.to_builtins(whole))
 
@@ -94,13 +90,8 @@ def _exclude(definitions: dict[str, Any]) -> None:
 
 
 def _bounded(node: Mapping[str, Any]) -> dict[str, Any]:
-    """The same with bounds of all numbers, and with names that do not end with a line end.
-
-    Infinite defaults are left out: JSON has no infinity.
-    """
+    """The same with bounds of all numbers, and with names that do not end with a line end."""
     result = _map_children(node, _bounded)
-    if result.get("default") == math.inf:
-        del result["default"]
     largest = {"number": MAX_NUMBER, "integer": WORD - 1}.get(str(node.get("type")))
     if largest is not None:
         if not {"minimum", "exclusiveMinimum"} & node.keys():

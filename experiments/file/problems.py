@@ -124,11 +124,9 @@ class _Scan:
 
     def value(self, path: Path, at: int) -> int:
         """Scan the value behind `=`; return its end."""
-        opening = self.text[at : at + 1]
-        if opening == "[":
-            return self.several(path, at, "]")
-        if opening == "{":
-            return self.several(path, at, "}")
+        closing = {"[": "]", "{": "}"}.get(self.text[at : at + 1])
+        if closing is not None:
+            return self.several(path, at, closing)
         string = _STRING.match(self.text, at)
         return string.end() if string else _end(_BARE_VALUE, self.text, at)
 

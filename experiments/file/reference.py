@@ -21,32 +21,19 @@ from experiments.file.json_schema import described
 
 NONE: Final[Mapping[str, object]] = {}
 _NAMES: Final = {  # tables with names as keys, and an example of such a name
-    "robots": ("ROBOT", "CF01"),
-    "disturbance": ("KIND", "crazyflie"),
-    "hosts": ("HOST", "lab1"),
-    "cases": ("CASE", "event"),
-    "obstacles": ("OBSTACLE", "post"),
-    "starts": ("PLACE", "left"),
-    "links": ("LINK", '"TB01 > KH01"'),
-    "anchors": ("ROBOT", "TB01"),
-}
+    "robots": ("ROBOT", "CF01"), "disturbance": ("KIND", "crazyflie"), "hosts": ("HOST", "lab1"),
+    "cases": ("CASE", "event"), "obstacles": ("OBSTACLE", "post"), "starts": ("PLACE", "left"),
+    "links": ("LINK", '"TB01 > KH01"'), "anchors": ("ROBOT", "TB01"),
+}  # fmt: skip
 _LISTS: Final = ("timeline", "changes", "outages", "criteria")  # keys that are lists of tables
 _LIMITS: Final = {
-    "minimum": "≥ {}",
-    "exclusiveMinimum": "> {}",
-    "maximum": "≤ {}",
-    "exclusiveMaximum": "< {}",
-    "pattern": "matches `{}`",
-    "minProperties": "at least {} of them",
-}
+    "minimum": "≥ {}", "exclusiveMinimum": "> {}", "maximum": "≤ {}", "exclusiveMaximum": "< {}",
+    "pattern": "matches `{}`", "minProperties": "at least {} of them",
+}  # fmt: skip
 _TYPES: Final = {
-    "number": "a number",
-    "integer": "a whole number",
-    "string": "a text",
-    "boolean": "true or false",
-    "object": "a table",
-    "null": "",
-}
+    "number": "a number", "integer": "a whole number", "string": "a text", "boolean": "true or false",
+    "object": "a table", "null": "",
+}  # fmt: skip
 
 
 class Entry(msgspec.Struct, frozen=True):
@@ -83,7 +70,7 @@ def matching(asked: str) -> list[Entry]:
     if asked in KINDS:
         return [_kind(KINDS[asked])]
     sought = "".join(f".{part}" for part in re.split(r"[.()\[\]]+", asked.strip().strip('"')) if part)
-    found = [entry for entry in entries() if sought and re.fullmatch("".join(_patterns(entry)), sought)]
+    found = [entry for entry in entries() if sought and re.fullmatch("".join(map(_pattern, _split(entry.key))), sought)]
     if not found and sought:
         ends = [entry for entry in entries() if _has_end(entry, sought)]
         found = sorted(ends, key=lambda entry: len(entry.words))
@@ -129,17 +116,17 @@ def _split(key: str) -> list[str]:
     return [part for part in re.split(r"\.|(\([^)]*\))", key) if part]
 
 
-def _patterns(entry: Entry) -> list[str]:
-    """Pattern of each part of a key: words as they are; names, and plug-ins in the place of their kind, if given."""
-    return [
-        r"(\.[^.]+)?" if part.isupper() else rf"(\.{re.escape(part[1:-1])})?" if part[0] == "(" else rf"\.{part}"
-        for part in _split(entry.key)
-    ]
+def _pattern(part: str) -> str:
+    """Pattern of a part of a key: words as they are; names, and plug-ins in the place of their kind, if given."""
+    if part.isupper():
+        return r"(\.[^.]+)?"
+    return rf"(\.{re.escape(part[1:-1])})?" if part[0] == "(" else rf"\.{part}"
 
 
 def _has_end(entry: Entry, sought: str) -> bool:
     """Whether a key ends with `sought`, from a word or a plug-in on."""
-    parts, patterns = _split(entry.key), _patterns(entry)
+    parts = _split(entry.key)
+    patterns = [*map(_pattern, parts)]
     return any(re.fullmatch("".join(patterns[k:]), sought) for k in range(1, len(parts)) if not parts[k].isupper())
 
 
@@ -230,11 +217,8 @@ def written(value: object) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, Mapping):
-        return (
-            "{ " + ", ".join(f"{_quoted(key)} = {written(each)}" for key, each in value.items()) + " }"
-            if value
-            else "{}"
-        )
+        pairs = ", ".join(f"{_quoted(key)} = {written(each)}" for key, each in value.items())
+        return f"{{ {pairs} }}" if pairs else "{}"
     if isinstance(value, list | tuple):
         return "[" + ", ".join(written(each) for each in value) + "]"
     return f"{value:g}" if isinstance(value, float) and not value.is_integer() else str(value)
@@ -248,9 +232,8 @@ def _example(key: str, field: Mapping[str, Any], definitions: Mapping[str, Any],
     value = field.get("default") or next(iter(field.get("examples", ())), None)
     made = _made(field, definitions) if value in (None, {}, [], math.inf) else value
     names = dict(_NAMES.values())
-    return _lines(
-        [(names.get(part, "A"), None) if part.isupper() else (part, part in _LISTS) for part in parts], made, needed
-    )
+    path = [(names.get(part, "A"), None) if part.isupper() else (part, part in _LISTS) for part in parts]
+    return _lines(path, made, needed)
 
 
 @cache

@@ -33,6 +33,7 @@ _WORDS: Final = {
     "float": "a number", "int": "a whole number", "str": "text", "bool": "true or false", "array": "a list",
     "object": "a table",
 }  # fmt: skip
+_UNIONS: Final = (Union, types.UnionType)
 LINK: Final = 'write "{name}" = 0.5, in metres; or "{name}" = {{ offset = [0.5, 0.0] }}, or "{name}" = "shape"'
 _FIELDS: Final = frozenset(Experiment.__struct_fields__)
 
@@ -40,10 +41,8 @@ _FIELDS: Final = frozenset(Experiment.__struct_fields__)
 def faults(document: Mapping[str, Any], struct: type[msgspec.Struct] = Experiment) -> list[Fault]:
     """All faults of type, range and key; empty if `msgspec.convert` takes the document."""
     found = _table(document, struct, ())
-    strayed = {str(fault.path[-1]) for fault in found if "belongs at the top" in fault.hint}
-    return [
-        fault for fault in found if fault.path or not any(f"'{key}' is missing" == fault.message for key in strayed)
-    ]
+    strayed = {f"'{fault.path[-1]}' is missing" for fault in found if "belongs at the top" in fault.hint}
+    return [fault for fault in found if fault.path or fault.message not in strayed]
 
 
 def _value(value: object, annotation: object, path: Path, note: str) -> list[Fault]:
@@ -68,7 +67,7 @@ def _value(value: object, annotation: object, path: Path, note: str) -> list[Fau
     elif get_origin(plain) is list and isinstance(value, list):
         for number, each in enumerate(value):
             inner += _value(each, get_args(plain)[0], (*path, number), note)
-    elif get_origin(plain) in (Union, types.UnionType) and isinstance(value, dict):
+    elif get_origin(plain) in _UNIONS and isinstance(value, dict):
         tables = [each for each in get_args(plain) if _is_struct(each)]
         if len(tables) == 1:
             return _table(value, tables[0], path)
@@ -172,11 +171,10 @@ def _judged(value: object, annotation: object, path: Path, note: str) -> list[Fa
 def _in_words(text: str, value: object, annotation: object, path: Path, note: str) -> Fault:
     name = key_name(path)
     plain, _ = _plain(annotation, note)
-    if get_origin(plain) is Literal:
-        return Fault(path, f"'{name}' cannot be {shown(value)}", did_you_mean(str(value), map(str, get_args(plain))))
-    words = [word for part in get_args(plain) if get_origin(part) is Literal for word in get_args(part)]
-    if get_origin(plain) in (Union, types.UnionType) and words and isinstance(value, str):
-        return Fault(path, f"'{name}' cannot be {shown(value)}", did_you_mean(value, words))
+    literals = [part for part in (plain, *get_args(plain)) if get_origin(part) is Literal]
+    if literals and (literals[0] is plain or (isinstance(value, str) and get_origin(plain) in _UNIONS)):
+        words = [str(word) for part in literals for word in get_args(part)]
+        return Fault(path, f"'{name}' cannot be {shown(value)}", did_you_mean(str(value), words))
     match = re.fullmatch(r"Expected `([^`]+)`(.*?)(?:, got `.*`)?", text)
     if match is None:
         return Fault(path, f"'{name}': {text}", note)
@@ -190,9 +188,8 @@ def _in_words(text: str, value: object, annotation: object, path: Path, note: st
     if path[:2] == ("formation", "links"):
         return Fault(path, f"'{name}' must be {' or '.join(wanted)}{limit}", LINK.format(name=name))
     if path[-2:-1] == ("shape",) and isinstance(value, list):
-        return Fault(
-            path, f"'{name}' must be numbers, x, y (, z) [m], not {shown(value)}", f"write {name} = [0.5, 0.0]"
-        )
+        message = f"'{name}' must be numbers, x, y (, z) [m], not {shown(value)}"
+        return Fault(path, message, f"write {name} = [0.5, 0.0]")
     for table in tables[:1] if not isinstance(value, dict) else []:
         fields = msgspec.structs.fields(table)
         needed = [field.encode_name for field in fields if field.required] or [fields[0].encode_name]

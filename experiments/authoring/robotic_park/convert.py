@@ -16,16 +16,8 @@ from typing import Any, Final, TypeVar
 import numpy as np
 
 from agents.body.kinds import KINDS
-from experiments.authoring.robotic_park.file import (
-    PLACES,
-    SURFACES,
-    ParkExperiment,
-    ParkRobot,
-    Task,
-    read,
-    starts_from,
-    text_of,
-)
+from experiments.authoring.robotic_park import file as park_files
+from experiments.authoring.robotic_park.file import PLACES, SURFACES, ParkExperiment, ParkRobot, Task
 from experiments.authoring.robotic_park.heights import Heights, find_heights, origin_of
 from experiments.catalogue import index
 from experiments.check.findings import join_names
@@ -51,7 +43,7 @@ def convert(file: str, target: str | None, duration_s: float, poses: str | None 
     Raises:
         DocumentError: If the file cannot be read, is no experiment of theirs, or the new one cannot be written.
     """
-    text = text_of(file, "name an experiment file of Robotic Park's authors (.yaml)")
+    text = park_files.text_of(file, "name an experiment file of Robotic Park's authors (.yaml)")
     made, notes = convert_text(text, file, duration_s, poses)
     path = entries.write_new(made, Path(target or f"{Path(file).stem}.toml"))
     document.read(path)
@@ -69,7 +61,7 @@ def convert_text(text: str, label: str, duration_s: float, poses: str | None = N
         DocumentError: With the errors in theirs, by the path of the key.
     """
     notes: list[str] = []
-    park = read(label, text, {} if poses is None else starts_from(poses), notes)
+    park = park_files.read(label, text, {} if poses is None else park_files.starts_from(poses), notes)
     notes += _notes_on_robots(park)
     pose_hz = _rate("local_pose.T", "poses", [1e-3 * robot.local_pose.T for robot in park.robots], notes)
     periods = [park.period(robot) for robot, _ in park.tasks] or [0.1]
@@ -157,21 +149,18 @@ def _notes_on_robots(park: ParkExperiment) -> Iterator[str]:
     """Notes on settings of the authors' robots that zenpark does not have."""
     robots = park.robots
     idle = [robot for robot in robots if robot.task.written and not robot.task.enable]
+    homeless = [robot for robot in robots if robot.type != "virtual" and not _body(robot)]
+    captured = [robot for robot in robots if robot.positioning != "Intern"]
+    waiting = [robot for robot in robots if "EventBased" in robot.controller.protocol + robot.controller_type]
+    left = sum(len(robot.task.written) for robot in idle)
     rows = {
-        "{}: real, but without an address of a known kind; twins instead": [
-            robot for robot in robots if robot.type != "virtual" and not _body(robot)
-        ],
+        "{}: real, but without an address of a known kind; twins instead": homeless,
         "real robots ({}) keep their addresses; try the file with --virtual or --bodies twin first": [
-            robot for robot in robots if _body(robot)
+            *filter(_body, robots)
         ],
-        "positioning Extern ({}): the motion capture's address is not in their file; positioning is a twin of it": [
-            robot for robot in robots if robot.positioning != "Intern"
-        ],
-        "{}: position controllers that act on events; zenpark's run at every tick": [
-            robot for robot in robots if "EventBased" in robot.controller.protocol + robot.controller_type
-        ],
-        f"task.enable is False for {{}}: {sum(len(robot.task.written) for robot in idle)} relations are left out, and"
-        " these robots have no neighbours": idle,
+        "positioning Extern ({}): the motion capture's address is not in their file; its twin is taken": captured,
+        "{}: position controllers that act on events; zenpark's run at every tick": waiting,
+        f"task.enable is False for {{}}: {left} relations are left out, and these robots have no neighbours": idle,
     }
     yield from (note.format(join_names([robot.name for robot in those])) for note, those in rows.items() if those)
     triggers = [robot.communication for robot in robots] + [task.controller for _, task in park.tasks]
@@ -220,12 +209,8 @@ def _formation(
         return {"law": "distance"}, {}, {}
     if unknown := dict.fromkeys(task.law for _, task in jobs if task.law not in ("gradient", "pid")):
         notes.append(f"task.controller.type: {', '.join(unknown)}; taken as gradient")
-    distances = [
-        relation.values[0]
-        for _, task in jobs
-        for relation in task.relations
-        if task.kind == "distance" and relation.name not in PLACES
-    ]
+    kept = [relation for _, task in jobs if task.kind == "distance" for relation in task.relations]
+    distances = [relation.values[0] for relation in kept if relation.name not in PLACES]
     mean = float(np.mean(distances)) if distances else 1.0
     gains = {robot.name: _gain(park, robot, task, mean) for robot, task in jobs}
     of_kind = {kind: [gains[robot.name] for robot, task in jobs if task.kind == kind] for kind in LAWS}
@@ -234,10 +219,8 @@ def _formation(
     if "distance" in usual:
         table["gain"] = usual["distance"]
         if scaled := [robot.name for robot, task in jobs if task.law == "pid" or _divides(park, robot)]:
-            notes.append(
-                f"gain of {join_names(scaled)}: their driver divides by the distance, so its pull is zenpark's near"
-                " the distance that is wanted and weaker beyond"
-            )
+            why = "their driver divides by the distance, so its pull is zenpark's near the distance that is wanted and"
+            notes.append(f"gain of {join_names(scaled)}: {why} weaker beyond")
         if park.recent and not park.central and any(robot.type == "virtual" for robot, _ in jobs):
             notes.append(
                 "gain in Webots: the file does not say for which driver it is; taken is that of February 2024 and"

@@ -70,8 +70,7 @@ class ParkTrigger(Struct, frozen=True):
         """c0 and a of a threshold c0 + a·|·|; None if no event is waited for."""
         if self.protocol == "Continuous":
             return None
-        given = self.threshold.co, self.threshold.threshold, 0.01
-        constant = next(each for each in given if each is not None)
+        constant = next(each for each in (self.threshold.co, self.threshold.threshold, 0.01) if each is not None)
         if constant <= 0.0:
             raise ValueError("a threshold of 0 or less is crossed always: give metres, such as 0.01")
         return constant, 0.0 if isinstance(self.threshold.ai, str) else self.threshold.ai
@@ -176,9 +175,8 @@ class ParkRobot(Struct, frozen=True):
     def __post_init__(self) -> None:
         if not self.kind:
             known = ", ".join(part for kind in KINDS.usable() for part in kind.aliases)
-            raise ValueError(
-                f"no kind of robot is in the name '{self.name}': use letters, digits and _, and in it one of {known}"
-            )
+            hint = f"use letters, digits and _, and in it one of {known}"
+            raise ValueError(f"no kind of robot is in the name '{self.name}': {hint}")
         _ = self.communication.event
 
     @property
@@ -233,9 +231,7 @@ class ParkExperiment:
     mode: str  # physical, virtual, hybrid
     robots: list[ParkRobot]
     central: bool  # decided by a central controller
-    recent: (
-        bool  # for drivers of 2024, which read `mars_data`; the first of them have the law of before, later ones not
-    )
+    recent: bool  # for drivers of 2024, which read `mars_data`; the first have the law of before, later ones not
 
     def period(self, robot: ParkRobot) -> float:
         """Time between decisions of a robot [s]."""
@@ -274,8 +270,7 @@ class YamlValue(NamedTuple):
 
     def tables(self) -> list[YamlValue]:
         """The tables in it."""
-        path = f"{self.key}." if self.key else ""
-        found = self.value.items()
+        path, found = f"{self.key}." if self.key else "", self.value.items()
         return [YamlValue(self.file, path + key, value) for key, value in found if isinstance(value, dict)]
 
 
@@ -296,9 +291,8 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc] # PyYAML has no types
         keys = set()
         for key, _ in node.value:
             if key.value in keys and isinstance(key, yaml.ScalarNode):
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"'{key.value}' stands twice in its table", key.start_mark
-                )
+                words = f"'{key.value}' stands twice in its table"
+                raise yaml.constructor.ConstructorError(None, None, words, key.start_mark)
             keys.add(str(key.value))
         made = {str(key): value for key, value in super().construct_mapping(node, deep).items() if value is not None}
         if isinstance(pose := made.get("pose"), str):

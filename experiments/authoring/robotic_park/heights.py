@@ -126,15 +126,12 @@ def find_heights(park: ParkExperiment, notes: list[str]) -> Heights:
         found = find_shape(wanted, (), start, flies, room)
         if found.worst <= SHAPE_MET:
             how = f"misses by {1e3 * missed:.0f} mm" if missed > SHAPE_MET else "has robots in one place or too low"
-            notes.append(
-                "distances to the origin: no shape was found that meets them and those between robots; the best one"
-                f" {how}, so those to the origin are left out"
-            )
+            unmet = "no shape was found that meets them and those between robots; the best one"
+            notes.append(f"distances to the origin: {unmet} {how}, so those to the origin are left out")
     if found.worst > SHAPE_MET:
-        notes.append(
-            f"the distances: no shape was found that meets them with robots apart from one another, even in space; the"
-            f" best one misses by {1e3 * found.worst:.0f} mm, so drones hold the heights at which they start"
-        )
+        unmet = "no shape was found that meets them with robots apart from one another, even in space; the best one"
+        missed_by = f"misses by {1e3 * found.worst:.0f} mm, so drones hold the heights at which they start"
+        notes.append(f"the distances: {unmet} {missed_by}")
         return plain
     shape, lift = found.position, 0.0
     flat = not (np.abs(shape[:, 2] - start[:, 2])[flies] > MOVED).any()
@@ -194,12 +191,8 @@ def _wanted_distances(park: ParkExperiment, start: Array, flies: Mask) -> tuple[
     wants, distance = np.where(by_pose, BY_RELATIVE, BY_DISTANCE), np.where(by_pose, np.nan, value[:, 0])
     links = Links(i, j, distance, np.ones(len(i)), value, np.full_like(value, np.nan), wants)
     rings = [(robot, each) for robot, _, each in every if each.name == "origin" and len(each.values) != 3]
-    return links, [
-        (row[robot.name], Anchor(_point(park, robot, each), (0.0, 0.0, 0.0), 1.0, 0.0, each.values[0], 1.0))
-        for robot, each in rings
-    ]
-
-
-def _point(park: ParkExperiment, robot: ParkRobot, relation: Relation) -> tuple[float, float, float]:
-    x, y, z = origin_of(park, robot, relation) or (0.0, 0.0, 0.0)
-    return x, y, z
+    anchors = []
+    for robot, each in rings:
+        x, y, z = origin_of(park, robot, each) or (0.0, 0.0, 0.0)
+        anchors.append((row[robot.name], Anchor((x, y, z), (0.0, 0.0, 0.0), 1.0, 0.0, each.values[0], 1.0)))
+    return links, anchors

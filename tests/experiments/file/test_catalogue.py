@@ -6,6 +6,7 @@ import math
 import re
 import tomllib
 from importlib import metadata
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -53,6 +54,14 @@ def test_copy_gives_a_readable_experiment_and_never_overwrites(tmp_path):
         with pytest.raises(DocumentError, match=message):
             entries.copy_entry(name, place)
     assert read(target).experiment == read("triangle").experiment
+
+
+def test_full_disk_leaves_no_half_file(tmp_path, monkeypatch):
+    monkeypatch.setattr(entries, "write_schema", lambda _: Path("/dev/full").write_text("{}"))
+    with pytest.raises(DocumentError, match="cannot be written: No space left"):
+        entries.copy_entry("triangle", tmp_path / "mine.toml")
+    monkeypatch.undo()
+    assert read(entries.copy_entry("triangle", tmp_path / "mine.toml")).experiment == read("triangle").experiment
 
 
 @pytest.mark.parametrize("name", index.names())
