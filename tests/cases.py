@@ -6,6 +6,12 @@ import inspect
 from collections.abc import Callable, Iterable
 
 import pytest
+from hypothesis import settings
+
+
+def examples(count: int) -> settings:
+    """Settings of a test with this many random examples; --quick has fewer."""
+    return settings() if settings.get_current_profile_name() == "quick" else settings(max_examples=count)
 
 
 def mostly_slow(cases: Iterable[object], every: int) -> list[object]:

@@ -42,19 +42,10 @@ ROOT = Path(__file__).resolve().parent.parent
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Refuses two tests for one mechanism: each costs seconds in which nothing else runs.
-
-    With the profile `quick`, a test that names its number of random examples has no more than the others either.
-    """
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Refuses two tests for one mechanism: each costs seconds in which nothing else runs."""
     shown: dict[str, str] = {}
     for item in items:
-        own = getattr(getattr(item, "obj", None), "_hypothesis_internal_use_settings", None)
-        if own is not None and config.getoption("--hypothesis-profile") == "quick":
-            fewer = hypothesis_settings(
-                own, max_examples=min(own.max_examples, hypothesis_settings.default.max_examples)
-            )
-            item.obj._hypothesis_internal_use_settings = fewer
         if (marker := item.get_closest_marker("mechanism")) is not None:
             if item.get_closest_marker("system") is None:
                 raise pytest.UsageError(f"{item.nodeid}: the mark `mechanism` is for tests with the mark `system`")
@@ -155,6 +146,13 @@ def patient_router() -> Iterator[RouterProcess]:
     made = RouterProcess(lease_s=60.0)
     yield made
     assert made.process.returncode is not None or made.stop() == 0
+
+
+@pytest.fixture
+def runtime_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder of this test for what runs and devices keep while they are up; it does not exist yet."""
+    monkeypatch.setenv("ZENPARK_RUNTIME_DIR", str(tmp_path / "runs"))
+    return tmp_path / "runs"
 
 
 @pytest.fixture

@@ -199,7 +199,7 @@ def split(choice: str | Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
 
 def culprit(error: BaseException) -> str | None:
     """The line of another distribution's plug-in in which an error came about; None if there is none."""
-    owners = {entry.module: _name(dist) for entry, dist in _foreign()}
+    owners = {entry.module: distribution_name(dist) for entry, dist in _foreign()}
     for frame, line in reversed(list(walk_tb(error.__traceback__))):
         module = frame.f_globals.get("__name__", "")
         if module.startswith(files.PREFIX):
@@ -220,7 +220,7 @@ def distributions(text: str | None = None) -> dict[str, str]:
     used = [
         (entry, dist) for entry, dist in _foreign() if entry.group == METRICS or words is None or entry.name in words
     ]
-    owners = {_name(dist): dist.version for _, dist in used}
+    owners = {distribution_name(dist): dist.version for _, dist in used}
     return dict(sorted(owners.items()))
 
 
@@ -228,7 +228,11 @@ def _foreign() -> list[tuple[EntryPoint, Distribution]]:
     """Entry points of other distributions than ours."""
     groups = (BODIES, DEVICES, METRICS, *CHOSEN)
     entries = (entry for group in groups for entry in installed().select(group=group))
-    return [(entry, entry.dist) for entry in entries if entry.dist is not None and _name(entry.dist) != "zenpark"]
+    return [
+        (entry, entry.dist)
+        for entry in entries
+        if entry.dist is not None and distribution_name(entry.dist) != "zenpark"
+    ]
 
 
 @cache
@@ -240,7 +244,7 @@ def _literals(base: type) -> dict[str, tuple[object, ...]]:
 
 
 @cache
-def _name(distribution: Distribution) -> str:
+def distribution_name(distribution: Distribution) -> str:
     """Cached: a distribution parses its whole metadata for it."""
     return distribution.name
 
@@ -275,7 +279,7 @@ def _origin_of(group: str, name: str) -> str:
 
 
 def _origin(entry: EntryPoint) -> str:
-    distribution = _name(entry.dist) if entry.dist is not None else "an unnamed distribution"
+    distribution = distribution_name(entry.dist) if entry.dist is not None else "an unnamed distribution"
     return f"plug-in {entry.name!r} ({entry.value}) of {distribution}"
 
 

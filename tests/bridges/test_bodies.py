@@ -15,11 +15,7 @@ from bridges.turtlebot3.body import TurtleBot3
 from tests.bridges import turtlebots
 from tests.requests import request
 
-
-@pytest.fixture(autouse=True)
-def folder(tmp_path, monkeypatch):
-    monkeypatch.setenv("ZENPARK_RUNTIME_DIR", str(tmp_path / "runs"))
-
+pytestmark = pytest.mark.usefixtures("runtime_folder")
 
 BODIES = {"crazyflie": CrazyflieBody, "khepera4": KheperaBody, "tello": TelloBody, "turtlebot3": TurtleBot3}
 RADIO, KHEPERA, TELLO, ROS = "radio://0/80/2M/E7E7E7E701", "khepera4://h", "tello://10.0.0.2", "ros2dds://"

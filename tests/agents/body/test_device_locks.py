@@ -7,6 +7,8 @@ from agents.body.interface import BodyError
 from agents.protocols.crazyflie import device_of
 from tests.commands import started
 
+pytestmark = pytest.mark.usefixtures("runtime_folder")
+
 HOLDER = """
 from agents.body.device_locks import Claims
 Claims(["CF07"], ["radio 80"]).take()
@@ -15,19 +17,13 @@ input()
 """
 
 
-@pytest.fixture(autouse=True)
-def folder(tmp_path, monkeypatch):
-    monkeypatch.setenv("ZENPARK_RUNTIME_DIR", str(tmp_path / "runs"))
-    return tmp_path / "runs"
-
-
-def test_device_has_one_holder_until_released(folder):
+def test_device_has_one_holder_until_released(runtime_folder):
     first, second = Claims(["A", "B"], ["one", "two"]), Claims(["C", "D"], ["three", "two"])
     first.take()
     with pytest.raises(BodyError, match=r"^D: two is in use: this process drives it for B; end that first$"):
         second.take()
     second.release()  # refused: what the first has is left alone
-    assert len(list(folder.iterdir())) == 2
+    assert len(list(runtime_folder.iterdir())) == 2
     Claims(["C"], ["three"]).take()  # which the second has let go of
     first.release()
     second.release()
@@ -37,21 +33,21 @@ def test_device_has_one_holder_until_released(folder):
     third.release()
 
 
-def test_holder_is_named_and_its_death_frees_device(folder):
+def test_holder_is_named_and_its_death_frees_device(runtime_folder):
     mine = Claims(["CF01"], ["radio 80"])
     with started("-c", HOLDER) as other:
         assert other.stdout.readline() == "has it\n"
         with pytest.raises(BodyError, match=f"^CF01: radio 80 is in use: process {other.pid} drives it for CF07; end"):
             mine.take()
-    assert len(list(folder.iterdir())) == 1  # the file is left, the lock is not
+    assert len(list(runtime_folder.iterdir())) == 1  # the file is left, the lock is not
     mine.take()
     mine.release()
-    assert list(folder.iterdir()) == []
+    assert list(runtime_folder.iterdir()) == []
 
 
-def test_without_a_folder_nothing_is_driven(folder):
-    folder.mkdir(0o755)
-    folder.chmod(0o777)
+def test_without_a_folder_nothing_is_driven(runtime_folder):
+    runtime_folder.mkdir(0o755)
+    runtime_folder.chmod(0o777)
     with pytest.raises(
         BodyError, match=r"no lock on radio 80, .* set ZENPARK_RUNTIME_DIR to a folder that is yours alone"
     ):

@@ -3,12 +3,13 @@
 from math import nan
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from agents.decision.lifecycle import AIRBORNE, DONE, IDLE, LANDING, READY, RUNNING, Lifecycle, Phase
 from agents.kinds.crazyflie import CRAZYFLIE
 from agents.kinds.khepera4 import KHEPERA4
+from tests.cases import examples
 
 DT, HOVER = 0.1, 0.8
 ORDERS = ("takeoff", "start", "start late", "land", "stop", "nothing", "nothing")
@@ -70,7 +71,7 @@ class Life:
 
 
 @pytest.mark.slow
-@settings(max_examples=100)
+@examples(100)
 @given(st.booleans(), st.lists(st.tuples(st.sampled_from(ORDERS), st.integers(0, 12)), max_size=25), st.booleans())
 def test_any_orders_in_any_order(flies, orders, ready):
     robot = Life(flies)

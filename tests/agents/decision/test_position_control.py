@@ -4,7 +4,7 @@ import math
 from math import cos, hypot, inf, isfinite, isnan, nan, pi, remainder, sin, tau
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from agents.body.kinds import KINDS, Agility
@@ -13,9 +13,10 @@ from agents.kinds.crazyflie import CRAZYFLIE
 from agents.kinds.khepera4 import KHEPERA4
 from agents.kinds.tello import TELLO
 from agents.kinds.turtlebot3 import TURTLEBOT3
+from tests.cases import examples
 from twins.models.differential import Differential
 
-FEW = settings(max_examples=25)
+FEW = examples(25)
 GROUND = pytest.mark.parametrize("kind", [KHEPERA4, TURTLEBOT3], ids=lambda kind: kind.name)
 PLACE = st.tuples(*[st.floats(-0.6, 0.6)] * 2)
 YAW = st.floats(-pi, pi)

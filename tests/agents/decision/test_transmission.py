@@ -4,7 +4,7 @@ from math import exp, floor, inf, isnan, log, nan
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from agents.decision.transmission import LowPass, Transmitter
@@ -14,6 +14,7 @@ from agents.kinds.tello import TELLO
 from agents.plugins.predictors import HOLD, ConstantVelocity
 from agents.plugins.triggers import SendOnDelta
 from agents.vectors import NO_SETPOINT
+from tests.cases import examples
 
 DT = 0.02
 STILL, LOST = (0.0, 0.0, 0.0), (nan, nan, nan)
@@ -23,7 +24,7 @@ def say(transmitter, t, position, velocity=STILL):
     return transmitter.transmits(t, position, velocity, 0.0, 0.0, t, STILL, NO_SETPOINT)
 
 
-@settings(max_examples=25)
+@examples(25)
 @given(st.floats(0.05, 2.0), st.floats(-0.5, 0.5))
 def test_low_pass_does_not_lag(constant, speed):
     smooth, velocity = LowPass(KHEPERA4), (speed, 0.0, 0.0)

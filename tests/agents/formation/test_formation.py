@@ -4,7 +4,7 @@ from itertools import pairwise
 from math import cos, hypot, inf, isnan, nan, sin, sqrt
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from agents.formation.anchors import Anchor
@@ -12,8 +12,9 @@ from agents.formation.changes import Change, Target, change_target, exists, plan
 from agents.formation.link import BY_DISTANCE, Link
 from agents.vectors import UNKNOWN, norm
 from tests.agents.plugins.test_laws import BEARING, VECTOR, slope
+from tests.cases import examples
 
-FEW = settings(max_examples=50)
+FEW = examples(50)
 TIME = st.floats(10.0, 14.0)
 SPREAD = VECTOR.filter(lambda v: hypot(v[0], v[1]) > 0.05)
 
@@ -95,7 +96,7 @@ SORTS = {"point": (1.0, 0.0), "line": (1.0, -1.0), "plane": (0.0, 1.0)}  # `whol
 
 @pytest.mark.parametrize("sort", SORTS)
 @pytest.mark.parametrize("distance", [0.0, 0.7])
-@settings(max_examples=25)
+@examples(25)
 @given(st.tuples(VECTOR, VECTOR, VECTOR.filter(lambda v: norm(v) > 0.1)), st.floats(0.5, 3.0))
 def test_pull_is_a_gradient(sort, distance, vectors, gain):
     place, point, axis = vectors

@@ -7,10 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from agents.network.channel_model import LOSS, USES, Channel, Conditions, LinkChannel, key, uniform
+from tests.cases import examples
 
 MANY = 40_000
 
@@ -105,7 +106,7 @@ def test_shortest_bursts_are_chance():
     assert (lost(loss=0.25, count=4000) == lost(loss=0.25, burst=1 / 0.75, count=4000)).all()
 
 
-@settings(max_examples=40)
+@examples(40)
 @given(st.integers(0, 2**32 - 1), st.floats(0.01, 0.9), st.floats(1.0, 30.0))
 def test_bursts_are_a_chain_without_memory(seed, loss, more):
     burst, word = more / (1 - loss), key(seed, "S", "L0")
@@ -117,7 +118,7 @@ def test_bursts_are_a_chain_without_memory(seed, loss, more):
     assert lost(seed=seed, loss=loss, burst=burst, count=300).tolist() == expected
 
 
-@settings(max_examples=30)
+@examples(30)
 @given(st.integers(0, 2**32 - 1), st.permutations(range(1, 61)), st.sampled_from([nan, 8.0]))
 def test_fate_depends_on_no_other_sample(seed, order, burst):
     values = {"seed": seed, "loss": 0.3, "burst": burst, "jitter": 0.01}
@@ -262,7 +263,7 @@ def test_end_of_run_and_outage(values, passes):
 
 
 @pytest.mark.slow
-@settings(max_examples=25)
+@examples(25)
 @given(st.integers(0, 2**32 - 1), st.lists(st.floats(0.0, 0.04), min_size=100, max_size=100))
 def test_real_receiver_loses_what_virtual_does(seed, took):
     """The same sequence at both: as transmitted, and as it comes in over a real network."""

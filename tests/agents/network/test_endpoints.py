@@ -4,7 +4,7 @@ import socket
 import threading
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from agents.network import endpoints, zenoh_config
@@ -12,12 +12,13 @@ from agents.network.endpoints import Endpoint, EndpointError, free_endpoint, fre
 from agents.network.keys import Keys
 from agents.network.session import Unreachable, open_session
 from agents.network.zenoh_config import config
+from tests.cases import examples
 
 HOSTS = st.one_of(st.ip_addresses().map(str), st.from_regex(r"[a-z][a-z0-9-]{0,20}(\.[a-z]{2,5})?", fullmatch=True))
 MESH = ["tcp/127.0.0.1:1#of=A", "tcp/127.0.0.1:2#of=B+C", "tcp/127.0.0.1:3#of=D", "tcp/127.0.0.1:4#of=recorder"]
 
 
-@settings(max_examples=40)
+@examples(40)
 @given(
     st.sampled_from(["tcp", "tls", "quic"]), HOSTS, st.integers(1, 65535), st.sampled_from(["", "#iface=eth0", "?a=1"])
 )

@@ -6,15 +6,16 @@ from typing import get_args
 
 import msgspec
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from agents.network import messages as wire
 from agents.network import validation
 from agents.network.messages import JSON, MSGPACK, Malformed, Order, Pose, PoseReceipt, State, Stop
+from tests.cases import examples
 from tests.fuzz.messages import good
 
-FEW = settings(max_examples=60)
+FEW = examples(60)
 KINDS = (Pose, State, wire.Status, Order, wire.Reply, Stop, wire.Event, wire.Goal, wire.CentreState)
 ENCODINGS = ("json", "msgpack")
 

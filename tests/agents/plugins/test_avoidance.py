@@ -6,7 +6,7 @@ from math import atan2, cos, dist, hypot, inf, isfinite, pi, radians, sin, sqrt
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
@@ -22,7 +22,7 @@ from agents.vectors import ZERO
 from experiments.definition.plan import Plan
 from tests.agents.bench import Bench
 from tests.agents.things import NOTHING, near, own
-from tests.cases import for_each
+from tests.cases import examples, for_each
 from tests.small import pair
 
 QUICK = Potential(velocity=0.2, period_s=0.1)  # h v = 0.02 m
@@ -105,7 +105,7 @@ def test_avoidance_acts_near_others_alone(kind, gap, acts):
 
 # ---------------------------------------------------------------- the barrier
 
-FEW, MANY = settings(max_examples=50), settings(max_examples=400, deadline=None)
+FEW, MANY = examples(50), examples(400)
 EVERY_KIND = pytest.mark.parametrize("kind", KINDS.values(), ids=lambda kind: kind.name)
 ROUNDING = 1e-7  # [m/s]
 BARRIER = Barrier()

@@ -4,14 +4,15 @@ from math import cos, hypot, nan, sin, sqrt
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from agents.formation.link import BY_BEARING, BY_DISTANCE, BY_RELATIVE, Link
 from agents.plugins.laws import Bearing, Displacement, Distance, Mixed, goal_position, tracking_offset
 from agents.vectors import difference, is_finite, norm
+from tests.cases import examples
 
-FEW = settings(max_examples=25)
+FEW = examples(25)
 NUMBER = st.floats(-1.5, 1.5)
 VECTOR = st.tuples(NUMBER, NUMBER, NUMBER)
 GAIN, LENGTH = st.floats(0.5, 5.0), st.floats(0.3, 1.5)

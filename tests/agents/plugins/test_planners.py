@@ -4,11 +4,12 @@ from math import atan2, cos, dist, hypot, inf, isnan, nan, pi, sin, sqrt
 
 import msgspec
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from agents.plugins import registry
 from agents.plugins.planners import Circle, Hold, Itinerary, Leg, Lemniscate, Line, Waypoints
+from tests.cases import examples
 
 PLANS = [
     {"kind": "hold"},
@@ -22,7 +23,7 @@ PLANS = [
     {"kind": "circle", "radius": -0.4, "period_s": 9.0, "turns": 1.25},
     {"kind": "lemniscate", "size": 0.5, "period_s": 15.0},
 ]
-FEW = settings(max_examples=25)
+FEW = examples(25)
 NUMBER = st.floats(-1, 1)
 ANCHOR, HEADING = st.tuples(NUMBER, NUMBER, NUMBER), st.floats(-pi, pi)
 ORIGIN = (0.0, 0.0, 0.0)

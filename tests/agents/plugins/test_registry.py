@@ -185,5 +185,7 @@ def test_foreign_culprit_is_named_with_its_line(owner, monkeypatch):
 
 
 def test_sound_struct_reads_no_metadata(monkeypatch):
-    monkeypatch.setattr(registry, "_name", lambda _: pytest.fail("the metadata of a distribution were read"))
+    monkeypatch.setattr(
+        registry, "distribution_name", lambda _: pytest.fail("the metadata of a distribution were read")
+    )
     assert registry.struct(registry.TRIGGERS, "periodic").__name__ == "Periodic"

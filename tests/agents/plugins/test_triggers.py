@@ -9,7 +9,7 @@ from typing import get_type_hints
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from agents.decision.neighbours import Incoming, Neighbours
@@ -30,6 +30,7 @@ from agents.plugins.trigger_families import (
 from agents.plugins.triggers import LastEvent, Periodic, SendOnDelta, Trigger, TriggerState, TriggerView
 from tests.agents import signals
 from tests.agents.signals import DT, Play, standing, wander
+from tests.cases import examples
 
 NAMES = registry.names(registry.TRIGGERS)
 FAMILIES = {
@@ -37,7 +38,7 @@ FAMILIES = {
     "self-triggered", "lyapunov", "relative-control",
 }  # fmt: skip
 SEEDS = st.integers(0, 2**32 - 1)
-FEW = settings(max_examples=10)
+FEW = examples(10)
 
 
 def made(name, **parameters):
@@ -144,7 +145,7 @@ def test_docs_table_has_families_and_defaults():
 
 # ---------------------------------------------------------------- families
 
-SOME = settings(max_examples=15)
+SOME = examples(15)
 LENGTH, SHARE = st.floats(0.002, 0.1), st.floats(0.01, 0.9)
 TICKS = 150
 

@@ -1,13 +1,14 @@
 """Hazards: each cause has its outcome in its time."""
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from agents.body.limits import Limits
 from agents.kinds.crazyflie import CRAZYFLIE
 from agents.kinds.khepera4 import KHEPERA4
 from agents.safety.hazards import Cause, Hazards, Outcome, failed, is_blind, rules
+from tests.cases import examples
 
 ROOM = {"low": (-2.0, -2.0, 0.0), "high": (2.0, 2.0, 2.5)}
 DT = 0.01
@@ -176,7 +177,7 @@ def test_hazards_on_the_ground_and_while_landing():
     assert {each.outcome for each in bench.hazards.incidents if each.cause in cut} == {Outcome.CUT}
 
 
-@settings(max_examples=60)
+@examples(60)
 @given(
     st.lists(st.tuples(st.sets(st.sampled_from(Cause)), st.integers(1, 60), st.booleans())),
     st.sampled_from(["drop", "hold", "land"]),

@@ -3,7 +3,7 @@
 from math import cos, dist, inf, isfinite, isnan, nan, pi, sin
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from agents.body.interface import BodyState
@@ -15,8 +15,9 @@ from agents.kinds.khepera4 import KHEPERA4
 from agents.kinds.tello import TELLO
 from agents.kinds.turtlebot3 import TURTLEBOT3
 from agents.safety.setpoint_filter import FLOOR_M, OUTSIDE_M, SetpointFilter
+from tests.cases import examples
 
-FEW = settings(max_examples=100)
+FEW = examples(100)
 EACH = pytest.mark.parametrize("kind", KINDS.values(), ids=lambda kind: kind.name)
 LIMITS = Limits(low=(-1.0, -1.0, 0.0), high=(1.0, 1.0, 2.5), margin=0.05, speed=0.5, max_goal_distance=0.4)
 ROOMY = Limits(low=(-1.0, -1.0, 0.0), high=(1.0, 1.0, 2.5), margin=0.05)

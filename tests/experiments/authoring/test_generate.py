@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from experiments.authoring import layouts
@@ -14,6 +14,7 @@ from experiments.definition.formation import law_errors
 from experiments.definition.rigidity import rigidity
 from experiments.file import document
 from experiments.file.problems import DocumentError
+from tests.cases import examples
 from tests.runs import fly
 
 
@@ -167,7 +168,7 @@ def test_grids_have_all_neighbours(rows, columns):
 
 
 @pytest.mark.slow
-@settings(max_examples=8)
+@examples(8)
 @given(st.integers(4, 80))
 def test_hemispheres_are_rigid_and_keep_their_distances(count):
     made = layouts.hemisphere(count, 0.6, 0.25)

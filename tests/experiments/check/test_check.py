@@ -10,7 +10,7 @@ from importlib.metadata import EntryPoint
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from agents.decision.position_control import REACHED
@@ -27,6 +27,7 @@ from experiments.check.safety import batteries
 from experiments.definition.experiment import Experiment, Formation, LegTable, RobotTable
 from experiments.definition.plan import Plan
 from experiments.file import catalogue, document
+from tests.cases import examples
 from tests.commands import invoke
 from tests.experiments.checked import GROUND, as_read, assert_found, bad, findings, ground
 from tests.small import changed, reference, small
@@ -347,7 +348,7 @@ def experiments(draw: st.DrawFn) -> Experiment:
     return small(robots, duration_s=draw(st.floats(5.0, 10.0)), formation=formation, timeline=[leg])
 
 
-@settings(max_examples=10)
+@examples(10)
 @given(experiments())
 def test_errors_and_warnings_have_remedies_and_places(made):
     found, numbers = examine(as_read(made))

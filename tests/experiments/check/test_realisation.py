@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from agents.kinds.crazyflie import CRAZYFLIE
@@ -25,6 +25,7 @@ from experiments.check.realisation import (
 from experiments.definition.experiment import Formation, RobotTable
 from experiments.definition.graph import Links, links
 from experiments.file import document
+from tests.cases import examples
 from tests.experiments.checked import PUBLISHED, findings
 from tests.experiments.traces import link_errors
 from tests.small import small
@@ -80,7 +81,7 @@ def test_connectivity_of_known_graphs():
     assert algebraic_connectivity(links([], [], []), 1) == 0.0
 
 
-@settings(max_examples=25)
+@examples(25)
 @given(seed=st.integers(0, 10_000), rows=st.integers(3, 10))
 def test_distances_of_a_drawing_are_met_again(seed, rows):
     rng = np.random.default_rng(seed)

@@ -3,7 +3,7 @@
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from agents.formation.anchors import Anchor
@@ -15,6 +15,7 @@ from experiments.check.stability import modes
 from experiments.definition.formation import anchor_offsets, law_offsets
 from experiments.definition.graph import Links, links
 from experiments.definition.plan import Plan
+from tests.cases import examples
 from tests.experiments.checked import PUBLISHED
 from tests.small import reference
 
@@ -106,7 +107,7 @@ def test_modes_slower_than_the_run_are_free():
     assert (few.gain, few.radius, few.slowest_s) == (every.gain, every.radius, every.slowest_s)
 
 
-@settings(max_examples=30)
+@examples(30)
 @given(st.integers(0, 2**32 - 1), st.integers(3, 8), st.booleans())
 def test_derivative_by_links_is_that_by_robots(seed, rows, anchored):
     rng = np.random.default_rng(seed)

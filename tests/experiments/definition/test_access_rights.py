@@ -6,7 +6,7 @@ from itertools import product
 
 import msgspec
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from agents.network.access_control import Rights, rules, sizes
@@ -18,7 +18,7 @@ from experiments.definition.experiment import Experiment, Formation, Hybrid, Net
 from experiments.definition.plan import Plan
 from experiments.file.document import load
 from tests.agents.acl import ACTIONS, held, may, permitted
-from tests.cases import for_each
+from tests.cases import examples, for_each
 from tests.small import changed, reference
 
 KEYS = Keys()
@@ -81,7 +81,7 @@ ARCHITECTURES = {0: "distributed", 2: Hybrid("hybrid", ["R0", "R1"]), 4: "centra
 
 
 @pytest.mark.slow
-@settings(max_examples=15)
+@examples(15)
 @given(links=LINKS, groups=GROUPS, guided=GUIDED)
 def test_every_right_is_the_wanted_one(links, groups, guided):
     made = control(four_robots(links, groups, ARCHITECTURES[len(guided)]))

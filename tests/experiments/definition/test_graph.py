@@ -5,11 +5,12 @@ from itertools import combinations
 import networkx as nx
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from experiments.definition.graph import adjacency, components, degree, edges, laplacian, links, reachable
 from experiments.definition.rigidity import redundancy, rigidity, rigidity_matrix
+from tests.cases import examples
 from tests.experiments.checked import PUBLISHED
 
 # paper, eq. (11): rows from which each robot receives
@@ -32,7 +33,7 @@ def as_networkx(rows, pairs):
     return graph
 
 
-@settings(max_examples=40)
+@examples(40)
 @given(digraphs(), st.data())
 def test_graph_is_that_of_networkx(made, data):
     rows, pairs = made
@@ -105,7 +106,7 @@ def triangulation(rng, rows, dimension):
     return np.array(pairs, dtype=np.intp)
 
 
-@settings(max_examples=30)
+@examples(30)
 @given(st.integers(0, 2**32 - 1), st.integers(4, 12), st.sampled_from([2, 3]))
 def test_triangulation_is_rigid_only_with_all_edges(seed, rows, dimension):
     rng = np.random.default_rng(seed)
@@ -139,7 +140,7 @@ def rigid_motions(position, free):
     return np.linalg.matrix_rank(motions @ allowed, tol=1e-8) if allowed.size else 0
 
 
-@settings(max_examples=40)
+@examples(40)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 7), st.booleans())
 def test_rank_needed_is_what_rigid_motions_leave(seed, rows, flat):
     rng = np.random.default_rng(seed)
@@ -181,7 +182,7 @@ def one_by_one(position, pairs, free):
     return without_link, without_robot
 
 
-@settings(max_examples=60)
+@examples(60)
 @given(st.integers(0, 2**32 - 1), st.integers(3, 9), st.sampled_from([0.5, 0.7, 0.9]), st.booleans())
 def test_redundancy_is_that_of_leaving_each_out(seed, rows, share, in_space):
     rng = np.random.default_rng(seed)

@@ -6,7 +6,7 @@ import math
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from agents.kinds.crazyflie import CRAZYFLIE
@@ -16,6 +16,7 @@ from agents.network.messages import Contact
 from experiments.definition.experiment import Arena
 from experiments.metrics.clearance import Clearance, collisions
 from experiments.metrics.results import Approach, Collision
+from tests.cases import examples
 from tests.experiments.traces import STEP, at_origin, trace
 from twins.scene import Obstacle
 
@@ -107,7 +108,7 @@ def test_what_moves_is_where_it_is_then():
     assert found.arena[0] == Approach(("A", "cart"), pytest.approx(-0.2 - R), pytest.approx(2.0))
 
 
-@settings(max_examples=30)
+@examples(30)
 @given(x=st.floats(-2.0, 2.0), y=st.floats(-1.5, 1.5), size=st.tuples(st.floats(3.0, 6.0), st.floats(3.0, 6.0)))
 def test_distance_to_the_walls(x, y, size):
     arena = Arena(size=(*size, 2.0), walls=True)

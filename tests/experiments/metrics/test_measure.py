@@ -7,7 +7,7 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from agents.network.messages import Event
@@ -18,6 +18,7 @@ from experiments.metrics.metric import OURS
 from experiments.metrics.results import CaseMetrics
 from experiments.metrics.signals import Measurement, belief_errors, net_rotation
 from experiments.report import metrics_files, verdict
+from tests.cases import examples
 from tests.experiments.traces import STEP, at_origin, cut, pair, park, trace
 
 T = np.arange(0.0, 20.0 + STEP / 2, STEP)
@@ -120,7 +121,7 @@ def test_residual_is_worst_link_in_phases_last_second():
     assert robot.by_the_end == (pytest.approx(0.3), "A")
 
 
-@settings(max_examples=40)
+@examples(40)
 @given(rate=st.floats(-0.5, 0.5), drift=st.floats(-0.3, 0.3), seed=st.integers(0, 1000))
 def test_net_rotation_finds_the_rate_whatever_else_moves(rate, drift, seed):
     shape = np.random.default_rng(seed).normal(size=(5, 3))
@@ -346,7 +347,7 @@ def test_json_holds_everything(tmp_path):
     assert msgspec.json.decode(file.read_bytes(), type=list[CaseMetrics]) == [measured]
 
 
-@settings(max_examples=20)
+@examples(20)
 @given(turn=st.floats(-3.0, 3.0), x=st.floats(-5.0, 5.0), y=st.floats(-5.0, 5.0))
 def test_errors_do_not_depend_on_where_formation_stands(turn, x, y):
     known = park(duration=3.0)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
@@ -14,6 +14,7 @@ from rosbags.highlevel import AnyReader
 from agents.network.messages import Event, Pose
 from experiments.recording.playback import read
 from experiments.recording.reader import RecordingError, Recovered, recover
+from tests.cases import examples
 from tests.experiments.recordings import DOCUMENT, begun, broken, scattered, whole_run, write
 from tools.commands import results as commands
 
@@ -162,7 +163,7 @@ def test_a_file_cut_anywhere(path, tmp_path, recorded):
 
 
 @pytest.mark.slow
-@settings(max_examples=60)
+@examples(60)
 @given(data=st.data())
 def test_a_file_damaged_anywhere(tmp_path_factory, recorded, data):
     folder = tmp_path_factory.mktemp("damaged")

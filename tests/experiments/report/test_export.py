@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
@@ -16,6 +16,7 @@ from experiments.definition.graph import laplacian
 from experiments.metrics.signals import Measurement
 from experiments.report import export
 from experiments.report.export import KEYWORDS, UNITS, matlab_names, structure
+from tests.cases import examples
 from tests.runs import fly, recorded
 from tests.small import small
 from tools.commands import results as commands
@@ -142,7 +143,7 @@ def test_table_has_a_line_per_robot_and_time(recorded_run, tmp_path):
     assert not any("nan" in row.values() for row in rows)
 
 
-@settings(max_examples=30)
+@examples(30)
 @given(st.lists(st.from_regex(r"[A-Za-z0-9][A-Za-z0-9_.-]*", fullmatch=True), unique=True, max_size=20))
 def test_names_are_valid_in_matlab(names):
     found = matlab_names(names)

@@ -6,13 +6,14 @@ from itertools import pairwise
 import numpy as np
 import pymunk
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from agents.kinds.crazyflie import CRAZYFLIE
 from agents.kinds.khepera4 import KHEPERA4
 from agents.kinds.tello import TELLO
 from agents.kinds.turtlebot3 import TURTLEBOT3
+from tests.cases import examples
 from twins.scene import Obstacle, Scene
 from twins.sensing.ray_casting import BUDGET, Beams, Caster, Fan
 
@@ -198,7 +199,7 @@ def test_ray_beginning_inside_a_thing_misses_it():
     yaw=st.floats(-10.0, 10.0),
     corner=st.sampled_from([(2.0, 2.0), (2.0, -2.0), (-2.0, 2.0), (-2.0, -2.0)]),
 )
-@settings(max_examples=200)
+@examples(200)
 def test_corners_are_tight(x, y, yaw, corner):
     """A ray aimed exactly at the corner of two walls meets one of them."""
     aim = math.atan2(corner[1] - y, corner[0] - x) - yaw

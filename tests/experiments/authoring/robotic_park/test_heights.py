@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from agents.formation.anchors import Anchor
@@ -11,6 +11,7 @@ from experiments.authoring import layouts
 from experiments.authoring.robotic_park.heights import Room, find_shape
 from experiments.check.realisation import ENOUGH, Solids
 from experiments.definition.graph import Links, links
+from tests.cases import examples
 
 
 def asked(position, pairs=None, *, relative=False):
@@ -27,7 +28,7 @@ def to_origin(position, *rows):
     return [(row, Anchor(zero, zero, 1.0, 0.0, float(np.linalg.norm(position[row])), 1.0)) for row in rows]
 
 
-@settings(max_examples=30)
+@examples(30)
 @given(st.integers(0, 2**32 - 1), st.integers(4, 9), st.booleans())
 def test_a_shape_is_found_again_from_nearby(seed, rows, relative):
     rng = np.random.default_rng(seed)

@@ -13,11 +13,7 @@ from agents.network.endpoints import free_endpoint
 from experiments.real_time.hosts import run_registry
 from experiments.real_time.hosts.run_registry import RegisteredRun, born, own_entry, registered, runs
 
-
-@pytest.fixture(autouse=True)
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("ZENPARK_RUNTIME_DIR", str(tmp_path / "runs"))
-    return tmp_path / "runs"
+pytestmark = pytest.mark.usefixtures("runtime_folder")
 
 
 def nowhere() -> list[str]:
@@ -34,7 +30,7 @@ def dead() -> RegisteredRun:
     return msgspec.structs.replace(own_entry("run", "dead", nowhere()), pid=process.pid, born=started)
 
 
-def test_run_is_listed_while_it_is_up(folder: Path) -> None:
+def test_run_is_listed_while_it_is_up(runtime_folder: Path) -> None:
     robots = {"CF01": "radio://0", "KH01": ""}
     run = own_entry("run", "two", nowhere(), folder=Path("here"), realm="hall", robots=robots)
     assert runs() == []
@@ -46,15 +42,15 @@ def test_run_is_listed_while_it_is_up(folder: Path) -> None:
             assert [each.what for each in runs()] == ["run", "router"]
         assert run.words == f"two, {Path('here').absolute()}, at {run.endpoints[0]}"
     assert runs() == []
-    assert list(folder.iterdir()) == []
-    assert folder.stat().st_mode & 0o777 == 0o700
+    assert list(runtime_folder.iterdir()) == []
+    assert runtime_folder.stat().st_mode & 0o777 == 0o700
 
 
-def test_dead_run_is_listed_while_its_router_answers(folder: Path) -> None:
+def test_dead_run_is_listed_while_its_router_answers(runtime_folder: Path) -> None:
     run = dead()
     with registered(run):
         assert runs() == []
-        assert list(folder.iterdir()) == [], "cleaned"
+        assert list(runtime_folder.iterdir()) == [], "cleaned"
     with socket.create_server(("127.0.0.1", 0)) as router:
         left = msgspec.structs.replace(run, endpoints=[f"tcp/127.0.0.1:{router.getsockname()[1]}"])
         with registered(left):
@@ -74,14 +70,14 @@ GARBAGE = [
 
 
 @pytest.mark.parametrize("text", GARBAGE, ids=range(8))
-def test_garbage_is_left_alone_and_hides_nobody(folder: Path, text: bytes) -> None:
+def test_garbage_is_left_alone_and_hides_nobody(runtime_folder: Path, text: bytes) -> None:
     run = own_entry("run", "two", nowhere())
     with registered(run):
-        (folder / "0.json").write_bytes(text)
-        (folder / "1.json").mkdir()
-        (folder / "2.json").symlink_to("/dev/zero")
+        (runtime_folder / "0.json").write_bytes(text)
+        (runtime_folder / "1.json").mkdir()
+        (runtime_folder / "2.json").symlink_to("/dev/zero")
         assert runs() == [run]
-        assert (folder / "0.json").exists()
+        assert (runtime_folder / "0.json").exists()
 
 
 def test_host_that_cannot_be_asked_for_hides_nobody() -> None:
@@ -90,16 +86,16 @@ def test_host_that_cannot_be_asked_for_hides_nobody() -> None:
         assert runs() == [run]
 
 
-def test_folder_writable_by_others_is_refused(folder: Path) -> None:
-    folder.mkdir(0o700)
-    (folder / "0.json").write_bytes(msgspec.json.encode(own_entry("run", "two", nowhere())))
+def test_folder_writable_by_others_is_refused(runtime_folder: Path) -> None:
+    runtime_folder.mkdir(0o700)
+    (runtime_folder / "0.json").write_bytes(msgspec.json.encode(own_entry("run", "two", nowhere())))
     assert len(runs()) == 1
-    folder.chmod(0o770)
+    runtime_folder.chmod(0o770)
     assert runs() == []
     with registered(own_entry("run", "two", nowhere())) as why:
         assert "no folder of yours alone" in why
-    folder.rename(folder.with_name("elsewhere"))
-    folder.symlink_to(folder.with_name("elsewhere"))
+    runtime_folder.rename(runtime_folder.with_name("elsewhere"))
+    runtime_folder.symlink_to(runtime_folder.with_name("elsewhere"))
     assert runs() == []
 
 
