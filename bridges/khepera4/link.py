@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import math
 import os
@@ -210,7 +211,7 @@ class Khepera4Link:
                     self.trouble = f"{self._address}: {_text(error)}"
                     if isinstance(error, TimeoutError):
                         self.trouble += "; another program may hold it, or the robot uses the other protocol"
-                    if isinstance(error, WrongServer):
+                    if isinstance(error, WrongServer) and self.odometry.stamp == -math.inf:  # else noise
                         self.refused = True
                         return
                 finally:
@@ -236,8 +237,16 @@ class Khepera4Link:
         return "is the robot on, and is the address right?"
 
     def _run_connection(self, driver: Driver) -> None:
-        """Loop of one connection, until it breaks or the link ends."""
+        """Loop of one connection, until it breaks or the link ends; first and last command are stops."""
         driver.begin()
+        try:
+            self._exchange(driver)
+        except Exception:
+            with contextlib.suppress(Exception):  # most servers drive on without a client, some accept no other
+                driver.drive(0.0, 0.0)
+            raise
+
+    def _exchange(self, driver: Driver) -> None:
         driver.move(self._odometer)  # before any motion: counters at zero show that the robot was switched off and on
         self._stands = True
         ticks = Ticks(self._settings.poll_hz, clock=uptime)

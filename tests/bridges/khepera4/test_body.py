@@ -254,6 +254,34 @@ def test_link_gap_stops_robot_and_keeps_the_connection(served):
         driver.until(lambda: twins.truth()[0][0, 0] > stood + 0.2)
 
 
+@pytest.mark.parametrize(
+    ("speaks", "question", "comes_back"), [(ONCE, b"p", False), (PARK, b"p", True), (KTEAM, b"R", True)]
+)
+def test_garbled_answer_stops_the_robot(served, speaks, question, comes_back):
+    """Noise on the line: the robot stands, whether or not its server accepts another client; then it goes on."""
+    rows = replace(ONE, device=(speaks,))
+    twins = served(rows)
+    (server,) = twins.device.servers
+    answered = server._answer
+
+    def garbled(received, t):
+        if not received.startswith(question):
+            return answered(received, t)
+        server._answer = answered
+        return b"?\r\n"
+
+    body = KheperaBody(reached(rows, twins.addresses), first_answer_s=0.5)
+    body.open()
+    with closing(body):
+        driver = Driver(body, constant(0.1))
+        driver.until(lambda: server.robot.model.velocity[0] > 0.05)
+        server._answer = garbled
+        driver.until(lambda: driver.state.note[0], "the fault is noted")
+        driver.until(lambda: server.robot.twist == (0.0, 0.0), "it stands")
+        if comes_back:
+            driver.until(lambda: not driver.state.note[0] and server.robot.model.velocity[0] > 0.05, "it goes on")
+
+
 @pytest.mark.system
 def test_external_position_replaces_odometry(served):
     rows = request("khepera4", ["khepera4-twin"], external=True, start=[[0.3, 0.0, 0.0]])
