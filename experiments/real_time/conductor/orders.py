@@ -53,8 +53,7 @@ def send_order(
 
 def send_world_order(session: zenoh.Session, keys: Keys, order: messages.WorldOrder) -> messages.WorldReply:
     """Give an order to the world and return its reply; one that says no, and why, when it does not answer."""
-    asked = _ask(session, keys.world_order, order, REPLY_S)
-    reply, why = _read(asked, keys.world_order, messages.WorldReply)
+    reply, why = _read(_ask(session, keys.world_order, order, REPLY_S), keys.world_order, messages.WorldReply)
     nobody = "no world answers: is `./zenpark world serve` running in this realm?"
     return reply or messages.WorldReply(ok=False, paused=False, time=0.0, reason=why or nobody)
 
@@ -63,8 +62,7 @@ def send_run_order(
     session: zenoh.Session, keys: Keys, order: messages.RunOrder, wait_s: float = CHANGE_S
 ) -> messages.RunReply:
     """Give an order to the conductor and return its reply when all is done, or that no conductor answers."""
-    asked = _ask(session, keys.run_order, order, wait_s)
-    reply, why = _read(asked, keys.run_order, messages.RunReply)
+    reply, why = _read(_ask(session, keys.run_order, order, wait_s), keys.run_order, messages.RunReply)
     nobody = (
         "no conductor answers: is `./zenpark run` running in this realm, at this router (--connect), and is this an "
         "operator (--as)?"

@@ -23,7 +23,7 @@ from agents.network.endpoints import DEFAULT_ENDPOINT
 from agents.network.keys import Keys
 from agents.network.name_ownership import NameTaken, OwnershipCheck, claim
 from agents.network.shutdown import closing_cleanly
-from agents.runtime.command_line import on_termination
+from agents.runtime.command_line import detach, on_termination
 from agents.runtime.lifeline import SILENCE_S, Lifeline
 from experiments.definition import mesh
 from experiments.definition.endpoints import router_endpoints
@@ -81,6 +81,7 @@ def joined(
     """
     began, realm = Clock().utc(), plan.experiment.network.realm
     if lost is not None:
+        detach()  # a full disk, which takes no output, ends no process
         Lifeline(lost).start()
     with on_termination(on_signal):
         session = network.open_session(endpoints, name=name, stop=stop, rights=mesh.member_rights(plan, endpoints))
@@ -142,11 +143,14 @@ class ConductorWatch:
 
     def _watch_token(self) -> None:
         there, missing_s = True, 0.0
-        while not self._over.wait(LOOK_S):
-            for _, alive in self._watch.changes():
-                there = alive
-            missing_s = 0.0 if there or not network.connected(self._session) else missing_s + LOOK_S
-            if missing_s > SILENCE_S:
-                print("the conductor is gone", flush=True)
+        try:
+            while missing_s <= SILENCE_S:
+                if self._over.wait(LOOK_S):
+                    return
+                for _, alive in self._watch.changes():
+                    there = alive
+                missing_s = 0.0 if there or not network.connected(self._session) else missing_s + LOOK_S
+            print("the conductor is gone", flush=True)
+        finally:  # robots land whatever ends this watch, such as a terminal that is closed
+            if not self._over.is_set():
                 os.kill(os.getpid(), signal.SIGTERM)
-                return

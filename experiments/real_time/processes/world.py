@@ -9,7 +9,7 @@ from __future__ import annotations
 import gc
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Final
 
@@ -208,20 +208,16 @@ def serve(launch: WorldLaunch) -> int:
         back = world.states.restore(there)
         for name, flying in back.items():
             world.commands.expect(name, flying=flying)
-        print(_ready(plan, world.carried, endpoints, back), flush=True)
+        mirrored = ", ".join(name for name in plan.names if name not in world.carried) or "none"
+        print(
+            f"world ready: {plan.engine_name} at {plan.experiment.rates.body_hz:g} Hz "
+            f"carries {', '.join(world.carried) or 'none'}; mirrors {mirrored}; "
+            f"realm {joint.keys.realm} at {', '.join(endpoints)}"
+            + (f"; {', '.join(back)} where they were" if back else ""),
+            flush=True,
+        )
         world.run(over)
     return 0
-
-
-def _ready(plan: Plan, carried: Sequence[str], endpoints: Sequence[str], back: Iterable[str]) -> str:
-    experiment = plan.experiment
-    mirrored = ", ".join(name for name in plan.names if name not in carried) or "none"
-    return (
-        f"world ready: {plan.engine_name} at {experiment.rates.body_hz:g} Hz "
-        f"carries {', '.join(carried) or 'none'}; mirrors {mirrored}; "
-        f"realm {experiment.network.realm} at {', '.join(endpoints)}"
-        + (f"; {', '.join(back)} where they were" if back else "")
-    )
 
 
 def _alive(session: zenoh.Session, keys: Keys) -> set[str]:
