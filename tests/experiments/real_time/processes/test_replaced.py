@@ -48,7 +48,7 @@ def test_replaced_process_sends_nothing(what, way, monkeypatch):
     ownership = OwnershipCheck([token], timing=OwnershipTiming(vanish_s=0.0))
     with Net().worn() as net:
         monkeypatch.setattr(pubsub, "publisher", lambda *_, **__: Counted())
-        process = (joined.world if what == "world" else joined.centre)(net, ownership=ownership)
+        process = (joined.joined_world if what == "world" else joined.centre)(net, ownership=ownership)
         if what == "centre":
             monkeypatch.setattr(process.centre, "decide", lambda *_: [CentreGoal(0, (0.0, 0.0, 0.0), 0.0, 0.0)])
         with pytest.raises(NameTaken):
