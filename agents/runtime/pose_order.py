@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Literal
 
-# Result of the comparison of a pose with the last one. "anew": first of another process, or of a clock that was set
-# back, so that earlier poses are void; "repeated": the last one again, after a reconnection.
+# Result of the comparison of a pose with the last one. `anew`: first of another process, or of a clock that was set
+# back, so that earlier poses are void; `repeated`: the last one again, after a reconnection.
 Freshness = Literal["next", "anew", "old", "repeated"]
 
 

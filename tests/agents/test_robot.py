@@ -17,7 +17,7 @@ HERE = (-0.4, 0.0, 0.0)
 LINE = {"kind": "line", "move_by": [0.3, 0.0], "speed": 0.1}
 
 
-def alone(experiment=None):
+def lone_robot(experiment=None):
     """The decision of A; B is on link 0."""
     return Bench(Plan(experiment or pair()).assignment("A"), HERE)
 
@@ -26,7 +26,7 @@ def alone(experiment=None):
 
 
 def test_older_samples_are_left_out():
-    bench = alone()
+    bench = lone_robot()
     (sender,) = bench.neighbours.all
     for x, stamp in ((1.0, 2.0), (9.0, 1.0), (9.0, 2.0)):
         bench.hear(0, (x, 0.0, 0.0), stamp=stamp)
@@ -36,7 +36,7 @@ def test_older_samples_are_left_out():
 
 
 def test_missing_neighbour_is_named():
-    bench = alone()
+    bench = lone_robot()
     bench.step()
     assert (bench.life.phase, bench.life.reason) == (IDLE, "never received B")
     assert bench.robot.missing_neighbours() == ["B"]
@@ -54,13 +54,13 @@ def test_missing_neighbour_is_named():
 
 
 def test_patience_ends():
-    bench = alone(pair(start=Start(deadline_s=2.0, missing="go-on"))).step(2.0)
+    bench = lone_robot(pair(start=Start(deadline_s=2.0, missing="go-on"))).step(2.0)
     assert bench.life.phase == IDLE
     assert bench.step(0.02).life.phase == READY
 
 
 def test_unknown_position_is_not_transmitted():
-    bench = alone()
+    bench = lone_robot()
     bench.position = (nan, 0.0, 0.0)
     bench.step()
     bench.position = HERE
@@ -95,7 +95,7 @@ def test_lost_neighbour_is_left_out_until_found():
 
 
 def test_unreceived_neighbour_hides_no_lost_one():
-    bench = alone(triangle(start=Start(deadline_s=0.1, missing="go-on")))  # B is never received
+    bench = lone_robot(triangle(start=Start(deadline_s=0.1, missing="go-on")))  # B is never received
 
     def hear(bench):
         bench.hear(1, (0.0, -0.5, 0.0))

@@ -12,7 +12,7 @@ from bridges.examples import gazebo_bridge, webots_controller
 DRIVE = [0.1, 0.0, 0.0, 0.0]
 
 
-def command(seq, action):
+def encoded(seq, action):
     return json.dumps({"robot": "KH01", "seq": seq, "action": action, "setpoint": DRIVE if action == "drive" else None})
 
 
@@ -83,7 +83,12 @@ def speeds_in_gazebo(modules):
 @pytest.mark.parametrize("speeds", [speeds_in_webots, speeds_in_gazebo])
 def test_stop_with_lower_number_is_the_last_word(modules, speeds):
     """Of repeated and overtaken commands none is obeyed after it."""
-    commands = [command(7, "drive"), command(5, "stop"), command(6, "drive"), command(7, "drive")]
+    commands = [
+        encoded(7, "drive"),
+        encoded(5, "stop"),
+        encoded(6, "drive"),
+        encoded(7, "drive"),
+    ]
     modules["zenoh"].open.return_value = Session(commands)
     moving, *stopped = speeds(modules)
     assert moving > 0.0

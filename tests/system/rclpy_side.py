@@ -39,7 +39,7 @@ def forward(kind, message):
     return (message.twist if kind.endswith("Stamped") else message).linear
 
 
-def command(kind):
+def obeyed(kind):
     """Commands a robot until it is killed, once robot and watchdog listen."""
     made = class_of(kind)
     node, message = rclpy.create_node("commander", namespace="tb3_0"), made()
@@ -92,5 +92,5 @@ def drive(kind, watchdog):
 if __name__ == "__main__":
     rclpy.init()
     what, *words = sys.argv[1:]
-    print(json.dumps({"types": types, "drive": drive, "command": command}[what](*words or [json.load(sys.stdin)])))
+    print(json.dumps({"types": types, "drive": drive, "command": obeyed}[what](*words or [json.load(sys.stdin)])))
     rclpy.shutdown()

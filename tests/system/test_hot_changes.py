@@ -82,120 +82,120 @@ class Lab:
 
 
 @pytest.fixture
-def lab(tmp_path: Path) -> Iterator[Lab]:
+def hot_lab(tmp_path: Path) -> Iterator[Lab]:
     made = Lab(tmp_path)
     yield made
     made.close()
 
 
-def test_killed_robot_is_restarted_and_takes_part(lab: Lab) -> None:
-    watcher = lab.fly()
+def test_killed_robot_is_restarted_and_takes_part(hot_lab: Lab) -> None:
+    watcher = hot_lab.fly()
     status = watcher.status
     first = status["CF01"].pid
     os.kill(first, signal.SIGKILL)
-    lab.flight.until_said("lost CF01: its process ended")
+    hot_lab.flight.until_said("lost CF01: its process ended")
     died = status["KH01"].stamp
     watcher.until(lambda: status["KH01"].stamp > died + 1.5, "a gap of telemetry that is not bridged")
-    reply = lab.change("restart", "CF01")
+    reply = hot_lab.change("restart", "CF01")
     assert set(reply.done) == {"CF01"}, reply
-    watcher.until(lambda: status["CF01"].pid != first and lab.running("CF01"), "it runs")
+    watcher.until(lambda: status["CF01"].pid != first and hot_lab.running("CF01"), "it runs")
     watcher.until(lambda: set(status["KH01"].missing) <= {"KH03"}, "it is heard again")
     assert abs(status["CF01"].started - status["KH01"].started) < 0.1, "its time is that of the others"
     watcher.until(lambda: status["CF01"].decisions >= 10, "it has taken part for a while")
-    lab.end()
-    read = playback.read(lab.folder / "run" / "event.mcap")
+    hot_lab.end()
+    read = playback.read(hot_lab.folder / "run" / "event.mcap")
     assert read.complete
     told = {event.kind for event in read.trace.events if event.source == "CF01"}
     assert told >= {"lost", "restart", "changed"}
-    run = reopen(lab.folder / "run")
+    run = reopen(hot_lab.folder / "run")
     of = {robot.robot: robot for robot in run.metrics["event"].robots}
     assert 0.0 < of["CF01"].known < of["KH01"].known
     assert "KH03" not in of  # on standby, never added
-    page = report.write(lab.folder / "report", list(run.traces.values()), notes=run.notes).read_text("utf-8")
+    page = report.write(hot_lab.folder / "report", list(run.traces.values()), notes=run.notes).read_text("utf-8")
     assert "takes part again after" in page
 
 
 @pytest.mark.mechanism("hot change: hold, remove, add")
-def test_robots_hold_leave_and_come_while_others_continue(lab: Lab) -> None:
-    watcher = lab.fly()
-    assert lab.zenpark("hold", "CF01", code=0).stdout == "CF01: holds where it is\n"
+def test_robots_hold_leave_and_come_while_others_continue(hot_lab: Lab) -> None:
+    watcher = hot_lab.fly()
+    assert hot_lab.zenpark("hold", "CF01", code=0).stdout == "CF01: holds where it is\n"
     watcher.until(lambda: watcher.status["CF01"].reason == "ordered to hold", "its status says so")
-    assert lab.running("KH01", "KH02", "CF01")
-    assert lab.zenpark("resume").stdout.splitlines() == ["CF01: goes on", "KH01: goes on", "KH02: goes on"]
+    assert hot_lab.running("KH01", "KH02", "CF01")
+    assert hot_lab.zenpark("resume").stdout.splitlines() == ["CF01: goes on", "KH01: goes on", "KH02: goes on"]
     watcher.until(lambda: watcher.status["CF01"].reason == "", "it goes on")
 
     before = watcher.status["KH02"].pid
-    assert "removed" in lab.change("remove", "KH02").done["KH02"]
+    assert "removed" in hot_lab.change("remove", "KH02").done["KH02"]
     watcher.until(lambda: "KH02" not in watcher.alive, "its process is over")
     watcher.until(lambda: "KH02" in watcher.status["CF01"].missing, "its neighbours know")
     assert (watcher.status["KH02"].phase, watcher.status["KH02"].reason) == ("done", "ordered to leave")
-    assert lab.running("KH01", "CF01"), "the others go on"
-    assert lab.zenpark("hold", "KH02").stderr.startswith("KH02: no: no answer\n")
-    assert "takes part" in lab.change("add", "KH02").done["KH02"], "who was removed may come back"
-    watcher.until(lambda: watcher.status["KH02"].pid != before and lab.running("KH02"), "it runs")
-    assert "already" in lab.change("add", "KH02").refused["KH02"]
+    assert hot_lab.running("KH01", "CF01"), "the others go on"
+    assert hot_lab.zenpark("hold", "KH02").stderr.startswith("KH02: no: no answer\n")
+    assert "takes part" in hot_lab.change("add", "KH02").done["KH02"], "who was removed may come back"
+    watcher.until(lambda: watcher.status["KH02"].pid != before and hot_lab.running("KH02"), "it runs")
+    assert "already" in hot_lab.change("add", "KH02").refused["KH02"]
 
-    assert set(lab.change("add", "KH03").done) == {"KH03"}, "who was on standby joins"
-    watcher.until(lambda: lab.running("KH03") and not watcher.status["KH01"].missing, "it is a neighbour")
-    lab.end()
-    events = playback.read(lab.folder / "run" / "event.mcap").trace.events
+    assert set(hot_lab.change("add", "KH03").done) == {"KH03"}, "who was on standby joins"
+    watcher.until(lambda: hot_lab.running("KH03") and not watcher.status["KH01"].missing, "it is a neighbour")
+    hot_lab.end()
+    events = playback.read(hot_lab.folder / "run" / "event.mcap").trace.events
     assert ("order", "operator", "hold: CF01") in [(event.kind, event.source, event.text) for event in events]
-    assert " lost " not in lab.flight.said()
+    assert " lost " not in hot_lab.flight.said()
 
 
-def test_a_spare_takes_over_a_name(lab: Lab) -> None:
-    watcher = lab.fly()
-    unknown = lab.zenpark("restart", "CF02", code=2)
+def test_a_spare_takes_over_a_name(hot_lab: Lab) -> None:
+    watcher = hot_lab.fly()
+    unknown = hot_lab.zenpark("restart", "CF02", code=2)
     assert "no robot 'CF02' in this run; did you mean 'CF01'" in unknown.stderr
-    wrong = lab.zenpark("replace", "CF01", "--with", "S2", code=1)
+    wrong = hot_lab.zenpark("replace", "CF01", "--with", "S2", code=1)
     assert wrong.stderr == "CF01: no: S2 is a khepera4 and cannot be CF01, a crazyflie\n"
     watcher.look()
     x, y, _ = watcher.state["KH02"].position
-    near = lab.change("replace", "KH01", body="twin", at=(round(x, 3), round(y + 0.1, 3)))
+    near = hot_lab.change("replace", "KH01", body="twin", at=(round(x, 3), round(y + 0.1, 3)))
     assert "needs 0.1 m around it" in near.refused["KH01"]
     before, began = watcher.status["CF01"].pid, watcher.status["CF01"].origin
     os.kill(before, signal.SIGSTOP)  # it hangs: its process is ended for it
-    reply = lab.change("replace", "CF01", spare="S1")
+    reply = hot_lab.change("replace", "CF01", spare="S1")
     assert "S1 has its name" in reply.done["CF01"], reply
-    watcher.until(lambda: watcher.status["CF01"].pid != before and lab.running("CF01"), "it runs")
+    watcher.until(lambda: watcher.status["CF01"].pid != before and hot_lab.running("CF01"), "it runs")
     assert watcher.status["CF01"].origin == began  # plans of the name begin where they began
-    assert "S1 has taken over CF01 already" in lab.change("replace", "CF01", spare="S1").refused["CF01"]
-    lab.end()
-    orphan = lab.zenpark("restart", "CF01", code=2)
+    assert "S1 has taken over CF01 already" in hot_lab.change("replace", "CF01", spare="S1").refused["CF01"]
+    hot_lab.end()
+    orphan = hot_lab.zenpark("restart", "CF01", code=2)
     assert orphan.stdout == ""
     assert re.search("no router answers|this run is not there", orphan.stderr)  # its port may be somebody else's by now
 
 
-def test_robots_of_one_process_come_together(lab: Lab) -> None:
-    text = lab.file.read_text()
+def test_robots_of_one_process_come_together(hot_lab: Lab) -> None:
+    text = hot_lab.file.read_text()
     for name in ("KH01", "KH02"):
         text = text.replace(f"[robots.{name}]", f'[robots.{name}]\nprocess = "pair"', 1)
-    lab.file.write_text(text)
-    watcher = lab.fly()
+    hot_lab.file.write_text(text)
+    watcher = hot_lab.fly()
     pid = watcher.status["KH01"].pid
     assert pid == watcher.status["KH02"].pid
-    assert set(lab.change("remove", "KH01").done) == {"KH01"}
+    assert set(hot_lab.change("remove", "KH01").done) == {"KH01"}
     watcher.until(lambda: "KH01" not in watcher.alive, "it has left")
     watcher.until(lambda: "KH01" in watcher.status["CF01"].missing, "its neighbours know")
-    assert lab.running("KH02", "CF01")
-    reply = lab.change("add", "KH01")
+    assert hot_lab.running("KH02", "CF01")
+    reply = hot_lab.change("add", "KH01")
     assert "`./zenpark robot restart KH01 KH02`" in reply.refused["KH01"], reply
-    assert "shares its process" in lab.change("replace", "KH02", body="twin").refused["KH02"]
-    assert set(lab.change("restart", "KH01", "KH02").done) == {"KH01", "KH02"}
-    watcher.until(lambda: watcher.status["KH01"].pid != pid and lab.running("KH01", "KH02"), "both run")
+    assert "shares its process" in hot_lab.change("replace", "KH02", body="twin").refused["KH02"]
+    assert set(hot_lab.change("restart", "KH01", "KH02").done) == {"KH01", "KH02"}
+    watcher.until(lambda: watcher.status["KH01"].pid != pid and hot_lab.running("KH01", "KH02"), "both run")
     assert watcher.status["KH01"].pid == watcher.status["KH02"].pid
-    lab.end()
+    hot_lab.end()
 
 
-def test_hand_started_robot_leaves_and_is_readmitted(router: RouterProcess, lab: Lab) -> None:
-    lab.file.write_text(lab.file.read_text() + f'\n[network]\nconnect = ["{router.endpoint}"]\n')
-    with RobotProcess(router.endpoint, lab.file, "CF01", "--case", "event") as by_hand:
-        watcher = lab.fly(endpoint=router.endpoint)
-        assert set(lab.change("remove", "CF01").done) == {"CF01"}
+def test_hand_started_robot_leaves_and_is_readmitted(router: RouterProcess, hot_lab: Lab) -> None:
+    hot_lab.file.write_text(hot_lab.file.read_text() + f'\n[network]\nconnect = ["{router.endpoint}"]\n')
+    with RobotProcess(router.endpoint, hot_lab.file, "CF01", "--case", "event") as by_hand:
+        watcher = hot_lab.fly(endpoint=router.endpoint)
+        assert set(hot_lab.change("remove", "CF01").done) == {"CF01"}
         assert by_hand.wait() == 0
-        assert "started from here" in lab.change("restart", "CF01").refused["CF01"]
-    with RobotProcess(router.endpoint, lab.file, "CF01", "--case", "event"):
+        assert "started from here" in hot_lab.change("restart", "CF01").refused["CF01"]
+    with RobotProcess(router.endpoint, hot_lab.file, "CF01", "--case", "event"):
         watcher.until(lambda: "CF01" in watcher.alive and watcher.phase("CF01") == "ready", "it is back")
-        assert set(lab.change("add", "CF01").done) == {"CF01"}
+        assert set(hot_lab.change("add", "CF01").done) == {"CF01"}
         watcher.until_all("running", "CF01")
-        lab.end()
+        hot_lab.end()

@@ -29,7 +29,7 @@ def robots_flying(stack: ExitStack, router: RouterProcess, file: str, *names: st
 
 
 @pytest.fixture
-def low(tmp_path: Path) -> str:
+def low_file(tmp_path: Path) -> str:
     """The triangle, whose drone is soon up and soon down."""
     file = tmp_path / "low.toml"
     file.write_text(catalogue.path("triangle").read_text("utf-8").replace("hover = 0.6", "hover = 0.3"), "utf-8")
@@ -102,9 +102,9 @@ def test_late_joiner_and_restarted_robot_receive_last_poses(router: RouterProces
 
 
 @pytest.mark.mechanism("orders")
-def test_orders_are_answered_and_refused_with_a_reason(router: RouterProcess, watcher: Watcher, low: str) -> None:
+def test_orders_are_answered_and_refused_with_a_reason(router: RouterProcess, watcher: Watcher, low_file: str) -> None:
     with ExitStack() as stack:
-        robots_flying(stack, router, low, *TRIANGLE)
+        robots_flying(stack, router, low_file, *TRIANGLE)
         watcher.until_all("ready", *TRIANGLE)
         reply = watcher.order("CF01", messages.Order("start", at=time.time()))
         assert not reply.ok
@@ -158,9 +158,9 @@ def nonsense() -> list[tuple[bytes, str]]:
 
 
 @pytest.mark.mechanism("malformed messages")
-def test_nonsense_on_every_key_is_counted_moving_nobody(router: RouterProcess, watcher: Watcher, low: str) -> None:
+def test_nonsense_on_every_key_is_counted_moving_nobody(router: RouterProcess, watcher: Watcher, low_file: str) -> None:
     with ExitStack() as stack:
-        robots_flying(stack, router, low, *TRIANGLE)
+        robots_flying(stack, router, low_file, *TRIANGLE)
         watcher.take_off(*TRIANGLE)
         given = nonsense()
         expected = 2 * len(given)  # a pose and an order each
@@ -187,8 +187,8 @@ def test_nonsense_on_every_key_is_counted_moving_nobody(router: RouterProcess, w
 
 
 @pytest.mark.mechanism("lifeline: a robot lands with its starter")
-def test_a_robot_whose_starter_falls_silent_lands(router: RouterProcess, watcher: Watcher, low: str) -> None:
-    with RobotProcess(router.endpoint, low, *TRIANGLE, lifeline=True) as robot:
+def test_a_robot_whose_starter_falls_silent_lands(router: RouterProcess, watcher: Watcher, low_file: str) -> None:
+    with RobotProcess(router.endpoint, low_file, *TRIANGLE, lifeline=True) as robot:
         stdin = robot.process.stdin
         assert stdin is not None
 

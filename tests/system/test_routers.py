@@ -58,7 +58,7 @@ def test_a_killed_router_holds_nobody_up(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def laboratory(tmp_path: Path) -> Iterator[tuple[Laboratory, str]]:
+def router_lab(tmp_path: Path) -> Iterator[tuple[Laboratory, str]]:
     """Robots in flight at one router of a lab, and the endpoint of another that is linked with it."""
     with Laboratory(tmp_path, linked=True) as made:
         (other,) = lab.secured([free_endpoint(preferred_port=0, protocol="tls")], made.folder)
@@ -67,8 +67,8 @@ def laboratory(tmp_path: Path) -> Iterator[tuple[Laboratory, str]]:
         yield made, other
 
 
-def test_intruder_gets_nothing_at_the_other_router_either(laboratory: tuple[Laboratory, str]) -> None:
-    made, other = laboratory
+def test_intruder_gets_nothing_at_the_other_router_either(router_lab: tuple[Laboratory, str]) -> None:
+    made, other = router_lab
     keys = made.watcher.keys
     assert msgspec.json.decode(made.rights.read_bytes(), type=Rights).linked
     with Watcher(other) as looker:  # as operator: through the link everything is seen, and orders are carried

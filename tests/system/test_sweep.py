@@ -43,7 +43,7 @@ def tables(folder):
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory):
+def whole_table(tmp_path_factory):
     """The table of the same sweep in one process."""
     folder = tmp_path_factory.mktemp("whole")
     finished(folder, "--processes", "1")
@@ -82,7 +82,7 @@ def interrupted(folder, end):
         (signal.SIGINT, 130, "the same command goes on from here"),
     ],
 )
-def test_ended_sweep_leaves_no_process_and_resumes(tmp_path, whole, number, code, words):
+def test_ended_sweep_leaves_no_process_and_resumes(tmp_path, whole_table, number, code, words):
     ended, said = interrupted(tmp_path, lambda process, _: process.send_signal(number))
     assert ended == code
     assert words in said
@@ -92,7 +92,7 @@ def test_ended_sweep_leaves_no_process_and_resumes(tmp_path, whole, number, code
     done = seeds_done(tmp_path)
     assert len(done) == len(set(done)) == RUNS
     assert done[: len(before)] == before
-    assert tables(tmp_path) == whole
+    assert tables(tmp_path) == whole_table
 
 
 def test_a_process_that_is_killed_is_explained(tmp_path):
@@ -103,7 +103,7 @@ def test_a_process_that_is_killed_is_explained(tmp_path):
     assert "a process of the sweep was killed" in said
 
 
-def test_cluster_with_a_killed_worker_gives_same_table(tmp_path, whole):
+def test_cluster_with_a_killed_worker_gives_same_table(tmp_path, whole_table):
     pytest.importorskip("distributed")
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -125,7 +125,7 @@ def test_cluster_with_a_killed_worker_gives_same_table(tmp_path, whole):
         assert process.returncode == 0, said
     done = seeds_done(folder)
     assert len(done) == len(set(done)) == RUNS
-    assert tables(folder) == whole
+    assert tables(folder) == whole_table
 
 
 SCRIPT = """
@@ -138,10 +138,10 @@ if __name__ == "__main__":
 """
 
 
-def test_the_same_from_a_script(tmp_path, whole):
+def test_the_same_from_a_script(tmp_path, whole_table):
     script = tmp_path / "script.py"
     script.write_text(SCRIPT.format(given=GIVEN, settings=SETTINGS, folder=str(tmp_path)))
     with started(str(script)) as process:
         _, said = process.communicate()
     assert (process.returncode, said) == (0, "")
-    assert (tmp_path / "sweep.csv").read_bytes() == whole[0]
+    assert (tmp_path / "sweep.csv").read_bytes() == whole_table[0]

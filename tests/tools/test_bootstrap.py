@@ -77,7 +77,7 @@ def replaced(bootstrap, monkeypatch):
 
 
 @pytest.fixture
-def installed(bootstrap, replaced, monkeypatch):
+def installed_levels(bootstrap, replaced, monkeypatch):
     """Levels that were installed, in order; `fast` comes without numba."""
     levels = []
     monkeypatch.setattr(bootstrap, "install", lambda level: levels.append(level) or stamp(bootstrap, level))
@@ -102,13 +102,13 @@ def installed(bootstrap, replaced, monkeypatch):
         ("hardware", ["hardware"]),
     ],
 )
-def test_level_of_a_command(bootstrap, installed, words, levels):
+def test_level_of_a_command(bootstrap, installed_levels, words, levels):
     bootstrap.main(words.split())
     bootstrap.main(words.split())
-    assert installed == levels
+    assert installed_levels == levels
 
 
-def test_many_runs_without_numba_say_so(bootstrap, installed, capsys):
+def test_many_runs_without_numba_say_so(bootstrap, installed_levels, capsys):
     bootstrap.main(SWEEP)
     assert capsys.readouterr().err.count("no numba") == 1
     (bootstrap.VENV / "lib" / "python3.11" / "site-packages" / "numba").mkdir(parents=True)
@@ -117,7 +117,7 @@ def test_many_runs_without_numba_say_so(bootstrap, installed, capsys):
 
 
 @pytest.fixture
-def commands(bootstrap, monkeypatch):
+def failing_commands(bootstrap, monkeypatch):
     """The core is there and works; commands of an installation are kept and those that get packages fail."""
     kept = []
 
@@ -133,21 +133,21 @@ def commands(bootstrap, monkeypatch):
     return kept
 
 
-def test_offline_a_sweep_goes_on_with_the_core(bootstrap, commands, replaced, capsys):
+def test_offline_a_sweep_goes_on_with_the_core(bootstrap, failing_commands, replaced, capsys):
     bootstrap.main(SWEEP)
     assert [command[2:] for command, _ in replaced] == [SWEEP]
     assert bootstrap.ready("core")
-    assert [environment["UV_HTTP_RETRIES"] for _, environment in commands] == ["0"]
+    assert [environment["UV_HTTP_RETRIES"] for _, environment in failing_commands] == ["0"]
     assert capsys.readouterr().err.splitlines()[-1].startswith("zenpark: no numba (offline")
 
 
-def test_failed_hardware_keeps_the_core(bootstrap, commands):
+def test_failed_hardware_keeps_the_core(bootstrap, failing_commands):
     assert bootstrap.main(["hardware"]) == 2
     assert bootstrap.ready("core")
-    assert "UV_HTTP_RETRIES" not in commands[0][1]
+    assert "UV_HTTP_RETRIES" not in failing_commands[0][1]
 
 
-def test_higher_level_only_adds_packages(bootstrap, commands, monkeypatch):
+def test_higher_level_only_adds_packages(bootstrap, failing_commands, monkeypatch):
     done = []
     monkeypatch.setattr(bootstrap, "call", lambda command, *_: done.append(command))
     bootstrap.prepare("view")
@@ -156,9 +156,9 @@ def test_higher_level_only_adds_packages(bootstrap, commands, monkeypatch):
 
 
 def test_ready_only_for_what_was_installed(bootstrap):
-    for installed, ready in ((None, []), ("core", ["core"]), ("dev", ["core", "dev"])):
-        if installed is not None:
-            stamp(bootstrap, installed)
+    for installed_levels, ready in ((None, []), ("core", ["core"]), ("dev", ["core", "dev"])):
+        if installed_levels is not None:
+            stamp(bootstrap, installed_levels)
         assert [level for level in ("core", "dev") if bootstrap.ready(level)] == ready
     for text in ("", "core", "a b c", "0000 core"):
         bootstrap.STAMP.write_text(text)
@@ -245,7 +245,7 @@ def test_measurements_run_in_the_folder_of_the_user(bootstrap, replaced, monkeyp
 
 
 @pytest.fixture
-def started(bootstrap, monkeypatch):
+def started_modules(bootstrap, monkeypatch):
     """The modules that `./zenpark test` starts; those of tests fail."""
     modules = []
     monkeypatch.setattr(bootstrap, "add_needed", lambda: None)
@@ -253,10 +253,10 @@ def started(bootstrap, monkeypatch):
     return modules
 
 
-def test_tests_run_in_three_parts_without_retries(bootstrap, started, capsys):
+def test_tests_run_in_three_parts_without_retries(bootstrap, started_modules, capsys):
     assert bootstrap.test([]) == 1
-    assert [module[0] for module in started] == ["ruff", "ruff", "mypy", "pytest", "pytest", "pytest"]
-    computing, devices, runs = started[3:]
+    assert [module[0] for module in started_modules] == ["ruff", "ruff", "mypy", "pytest", "pytest", "pytest"]
+    computing, devices, runs = started_modules[3:]
     assert computing[2] == "not system and not nightly"
     assert [part[2:5] for part in (devices, runs)] == [["mechanism", "-n", "2"], ["mechanism", "-n", "1"]]
     for whole_runs, part in enumerate((devices, runs)):
@@ -271,11 +271,11 @@ def test_tests_run_in_three_parts_without_retries(bootstrap, started, capsys):
     assert re.search(r"part 3 of 3, whole runs, one at a time: failed in \d+ s\n$", said)
 
 
-def test_arguments_replace_the_parts(bootstrap, started):
+def test_arguments_replace_the_parts(bootstrap, started_modules):
     bootstrap.test(["--quick", "tests/agents", "-x"])
-    assert started[3:] == [["pytest", "-m", bootstrap.QUICK, "tests/agents", "-x"]]
-    started.clear()
+    assert started_modules[3:] == [["pytest", "-m", bootstrap.QUICK, "tests/agents", "-x"]]
+    started_modules.clear()
     bootstrap.test(["--all"])
-    modules = [module[0] for module in started[3:]]
+    modules = [module[0] for module in started_modules[3:]]
     assert modules == ["pytest", "tests.fuzz", "tests.system.zenohd", "tests.system.rclpy_wheels", "pytest"]
-    assert [module[2] for module in (started[3], started[7])] == ["not system", "system"]
+    assert [module[2] for module in (started_modules[3], started_modules[7])] == ["not system", "system"]

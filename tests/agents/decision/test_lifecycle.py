@@ -132,21 +132,21 @@ def ready(flies=True, duration=5.0):
     return robot
 
 
-def airborne(*, flies=True):
+def life_aloft(*, flies=True):
     robot = ready(flies)
     robot.life.takeoff()
     return robot.until(AIRBORNE)
 
 
 def test_start_in_the_past_joins_or_lands():
-    robot = airborne()
+    robot = life_aloft()
     begin = robot.t - 3.0
     robot.life.start(begin)
     robot.step()
     assert robot.life.phase == RUNNING
     robot.until(LANDING)
     assert robot.tick - 1 == round((begin + 5.0) / DT)
-    late = airborne()
+    late = life_aloft()
     late.life.start(late.t - 99.0)
     assert late.until(DONE).life.reason == "finished"
 
@@ -161,7 +161,7 @@ def test_start_in_the_past_joins_or_lands():
     ],
 )
 def test_orders_in_one_tick(phase, orders, told, reason):
-    robot = airborne() if phase == AIRBORNE else ready()
+    robot = life_aloft() if phase == AIRBORNE else ready()
     for order in orders:
         robot.order(order)
     robot.step()
@@ -173,7 +173,7 @@ def test_orders_in_one_tick(phase, orders, told, reason):
     ("speeds", "phases"), [((nan, nan), (LANDING, DONE)), ((0.2, 0.2, 0.05), (LANDING, LANDING, DONE))]
 )
 def test_wheels_are_done_when_they_stand(speeds, phases):
-    robot = airborne(flies=False)
+    robot = life_aloft(flies=False)
     robot.life.land("told to")
     for speed, phase in zip(speeds, phases, strict=True):
         robot.speed = (speed, 0.0, 0.0)

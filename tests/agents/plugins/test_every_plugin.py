@@ -165,7 +165,7 @@ def test_losses_restarts_and_unknown_positions(group, name):
 REMEMBERING = [name for name in registry.names(LAWS) if not issubclass(registry.struct(LAWS, name), Gradient)]
 
 
-def talk(bench, order=1):
+def follow_talking(bench, order=1):
     hear(bench, order, silent=False)
     follow_setpoint(bench)
 
@@ -178,7 +178,7 @@ def known(memory):
 def test_laws_that_remember_keep_what_they_know(name):
     """Whatever is lost: what was known stays known, and setpoints stay finite."""
     bench = Bench(assignment(LAWS, name), PLACES["A"])
-    bench.running(talk).step(0.5, talk)
+    bench.running(follow_talking).step(0.5, follow_talking)
     stepping = bench.robot.stepping
     at_first = known(stepping.memory)
 
@@ -192,14 +192,14 @@ def test_laws_that_remember_keep_what_they_know(name):
         bear(1.5, follow_setpoint)
     for link in (0, 1):
         bench.neighbours.mark_alive(link)
-        bear(0.5, talk)
+        bear(0.5, follow_talking)
     bench.neighbours.discard_pose(1)
     bear(0.5, follow_setpoint)
     bear(0.5, hear)  # poses without words
     place, bench.position = bench.position, UNKNOWN
-    bear(0.3, talk)
+    bear(0.3, follow_talking)
     bench.position = place
-    bear(0.5, talk)
+    bear(0.5, follow_talking)
 
     def say(number, age):
         said = {name: (number,) * size for name, size in stepping.says.items()}
@@ -215,7 +215,7 @@ def test_laws_that_remember_keep_what_they_know(name):
 def test_remembering_laws_ignore_the_order_of_arrival(name):
     ends = []
     for order in (1, -1):
-        bench, said = Bench(assignment(LAWS, name), PLACES["A"]), partial(talk, order=order)
+        bench, said = Bench(assignment(LAWS, name), PLACES["A"]), partial(follow_talking, order=order)
         bench.running(said).step(2.0, said)
         ends.append(repr((bench.robot.stepping.memory, bench.robot.stepping.measures, bench.robot.setpoint)))
     assert ends[0] == ends[1]
@@ -225,7 +225,7 @@ def test_remembering_laws_ignore_the_order_of_arrival(name):
 def test_remembering_laws_bear_a_period_three_times_longer(name):
     given = assignment(LAWS, name)
     bench = Bench(replace(given, decide_every=3 * given.decide_every), PLACES["A"])
-    bench.running(talk).step(6.0, talk)
+    bench.running(follow_talking).step(6.0, follow_talking)
     stepping = bench.robot.stepping
     assert all(abs(number) < 1e6 for values in stepping.memory.values() for number in values if isfinite(number))
     assert all(map(isfinite, bench.robot.setpoint))

@@ -297,44 +297,44 @@ def woken(slept=0.6, neighbours=(("B", KHEPERA4),)):
     return robot
 
 
-def held(robot, seconds):
+def held_s(robot, seconds):
     """Ticks on which a robot is held."""
     return sum(robot.step().hazards.held for _ in range(round(seconds / DT)))
 
 
 def test_standstill_holds_until_neighbours_are_heard():
     robot = woken()
-    assert held(robot, 0.03) == 3
+    assert held_s(robot, 0.03) == 3
     robot.hear(0, (1.0, 0.0, 0.0))
-    assert held(robot, 3.0) == 0
+    assert held_s(robot, 3.0) == 0
     begin, end = robot.texts
     assert begin == "hold: its process stood still: for 0.6 s; it waits for its neighbours"
     assert end.startswith("over: its process stood still, after ")
     lost = woken()
     lost.neighbours.mark_lost(0, lost.t)
-    assert held(lost, 0.5) == held(woken(neighbours=()), 0.5) == 0
+    assert held_s(lost, 0.5) == held_s(woken(neighbours=()), 0.5) == 0
 
 
 @pytest.mark.parametrize("slept", [0.6, 1.5, 2.2])
 def test_silent_neighbours_are_not_awaited_for_long(slept):
-    assert held(woken(slept), 3.0) == pytest.approx(SILENT_S / DT, abs=1)
+    assert held_s(woken(slept), 3.0) == pytest.approx(SILENT_S / DT, abs=1)
 
 
 def test_waiting_begins_when_the_router_is_back():
     robot = woken()
     robot.health.offline_since = robot.t
-    assert held(robot, 3.0) == 300
+    assert held_s(robot, 3.0) == 300
     robot.health.offline_since = math.inf
-    assert held(robot, 3.0) == pytest.approx(SILENT_S / DT, abs=1)
+    assert held_s(robot, 3.0) == pytest.approx(SILENT_S / DT, abs=1)
     robot.health.offline_since = robot.t  # much later: that standstill is over
-    assert held(robot, 0.5) == 0
+    assert held_s(robot, 0.5) == 0
 
 
 def test_guided_robot_waits_for_a_new_goal():
     robot = woken(neighbours=())
     for goal_stamp, ticks in ((robot.t - 0.5, 10), (robot.t, 0)):
         robot.status.goal_stamp = goal_stamp
-        assert held(robot, 0.1) == ticks
+        assert held_s(robot, 0.1) == ticks
 
 
 # ---------------------------------------------------------------- climbing and landing

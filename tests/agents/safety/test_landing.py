@@ -143,7 +143,7 @@ def late(bench, drone):
     drone.health.missed_share = 1.0
 
 
-def outside(bench, drone):
+def leave_arena(bench, drone):
     for robot in bench.robots:
         robot.position = robot.position[0] + 3.05, *robot.position[1:]
 
@@ -156,7 +156,7 @@ def fallen(bench, drone):
     drone.lands = False
 
 
-@pytest.mark.parametrize("spoil", [blind, late, outside, low, fallen])
+@pytest.mark.parametrize("spoil", [blind, late, leave_arena, low, fallen])
 def test_drone_that_cannot_go_aside_lands_in_place(spoil):
     bench, drone = above()
     spoil(bench, drone)

@@ -40,7 +40,7 @@ class Swerve:
 STOP, AHEAD, SLOW = (0.0, 0.0, 0.0, 0.0), (0.3, 0.0, 0.0, 0.0), (0.1, 0.0, 0.0, 0.0)
 
 
-def judged(kind, position, *, yaw=0.0, age=0.0, limits=LIMITS):
+def filtered(kind, position, *, yaw=0.0, age=0.0, limits=LIMITS):
     """A filter, and a situation that it judged."""
     made, now = SetpointFilter(kind, limits), Situation()
     now.state = BodyState(-age, position, (0.0, 0.0, 0.0), yaw)
@@ -50,7 +50,7 @@ def judged(kind, position, *, yaw=0.0, age=0.0, limits=LIMITS):
 
 
 def limited(kind, setpoint, position, **given):
-    made, now = judged(kind, position, **given)
+    made, now = filtered(kind, position, **given)
     return made.limit(setpoint, now), made
 
 
@@ -70,7 +70,7 @@ def bounds(kind):
     st.one_of(st.floats(0, 1), anything),
 )
 def test_lawful_setpoint_for_whatever_comes(kind, setpoint, position, yaw, age):
-    made, now = judged(kind, position, yaw=yaw, age=age)
+    made, now = filtered(kind, position, yaw=yaw, age=age)
     safe = made.limit(setpoint, now)
     believable = all(abs(each) < 1e6 for each in (*position, yaw))
     assert now.invalid == (not (believable and abs(age) <= LIMITS.position_timeout_s))
@@ -157,14 +157,14 @@ def test_far_outside_is_outside_for_sure(axis, side):
     for beyond, escaped in ((OUTSIDE_M - 0.01, False), (OUTSIDE_M + 0.01, True)):
         place = [0.0, 0.0, 1.25]
         place[axis] = (LIMITS.high[axis] if side > 0 else LIMITS.low[axis]) + side * beyond
-        _, now = judged(CRAZYFLIE, tuple(place))
+        _, now = filtered(CRAZYFLIE, tuple(place))
         assert (now.outside, now.invalid, now.sound, now.flyaway) == (escaped, False, False, False)
         assert now.excess == pytest.approx(beyond)
         assert now.outside_wall == (axis < 2 or side > 0)  # floors are measured a little below themselves
 
 
 def test_sound_pose_clears_what_was_judged_before():
-    made, now = judged(CRAZYFLIE, (3.0, 0.0, 1.0))
+    made, now = filtered(CRAZYFLIE, (3.0, 0.0, 1.0))
     assert (now.outside_wall, now.outside, now.flyaway, now.excess) == (True, True, True, 2.0)
     for position, sound in (((nan, 0.0, 1.0), False), ((0.0, 0.0, 1.0), True)):
         now.position = position
@@ -175,7 +175,7 @@ def test_sound_pose_clears_what_was_judged_before():
 
 @pytest.mark.parametrize(("age", "old"), [(0.0, False), (0.5, False), (0.51, True), (inf, True), (nan, True)])
 def test_an_old_position_is_none(age, old):
-    made, now = judged(TELLO, (0.0, 0.0, 1.0), age=age)
+    made, now = filtered(TELLO, (0.0, 0.0, 1.0), age=age)
     assert now.invalid == old
     assert made.limit(SLOW, now) == (STOP if old else SLOW)
 
@@ -192,7 +192,7 @@ def test_an_old_position_is_none(age, old):
     ],
 )
 def test_avoidance_is_held_to_the_limits(age, setpoint, avoids, safe, avoided):
-    made, now = judged(TELLO, (0.0, 0.0, 1.0), age=age)
+    made, now = filtered(TELLO, (0.0, 0.0, 1.0), age=age)
     assert made.check(setpoint, now, Swerve(*avoids), None, None) == safe
     assert (made.avoided, made.not_finite) == (avoided, isnan(setpoint[0]))
     assert made.changed == (avoided or made.not_finite)

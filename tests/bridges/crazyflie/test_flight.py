@@ -104,7 +104,7 @@ def air(monkeypatch):
 
 
 @pytest.fixture
-def ground(monkeypatch):
+def grounded(monkeypatch):
     return Air(monkeypatch).stand()
 
 
@@ -117,24 +117,24 @@ def sweep(*places):
 # ---------------------------------------------------------------------- take-off
 
 
-def test_a_take_off_without_an_answer_goes_on(ground):
-    ground.flight.takeoff(0.5)
-    assert ground.phase is FlightPhase.CLIMBING
-    assert ground.pass_(1.0).flight.trouble == ""
-    assert ground.pass_(3.0).phase is FlightPhase.GROUND
-    assert ground.flight.trouble == "its motors do not turn"
+def test_a_take_off_without_an_answer_goes_on(grounded):
+    grounded.flight.takeoff(0.5)
+    assert grounded.phase is FlightPhase.CLIMBING
+    assert grounded.pass_(1.0).flight.trouble == ""
+    assert grounded.pass_(3.0).phase is FlightPhase.GROUND
+    assert grounded.flight.trouble == "its motors do not turn"
 
 
-def test_end_of_climb_is_held_until_first_setpoint(ground):
+def test_end_of_climb_is_held_until_first_setpoint(grounded):
     """By the robot's loop, which may wait for others; without it, the drone is landed."""
-    ground.flight.takeoff(0.5)
-    ground.flying, ground.target = True, lambda: None
-    assert ground.pass_(6.0).phase is FlightPhase.CLIMBING
-    held = ground.times("setpoint")
-    assert held[0] - ground.times("climb")[-1] < 1.5 + HOLD_S
+    grounded.flight.takeoff(0.5)
+    grounded.flying, grounded.target = True, lambda: None
+    assert grounded.pass_(6.0).phase is FlightPhase.CLIMBING
+    held = grounded.times("setpoint")
+    assert held[0] - grounded.times("climb")[-1] < 1.5 + HOLD_S
     assert np.diff(held).max() < 0.5 * HOLD_S
-    ground.target = None
-    assert ground.pass_(2.0).phase is FlightPhase.LANDING
+    grounded.target = None
+    assert grounded.pass_(2.0).phase is FlightPhase.LANDING
 
 
 def test_no_take_off_with_a_wrong_yaw(air):
@@ -330,16 +330,16 @@ def test_drone_flying_unasked_is_landed_and_not_cut(monkeypatch):
 
 @pytest.mark.parametrize("pose", [0.3, math.nan])
 @pytest.mark.parametrize("set_point", [False, True])
-def test_landing_lasts_from_the_highest_place(ground, pose, set_point):
+def test_landing_lasts_from_the_highest_place(grounded, pose, set_point):
     """In a gap the drone climbs on; an estimate may be below what motion capture sees."""
-    ground.flight.takeoff(2.0)
-    ground.flying = True
+    grounded.flight.takeoff(2.0)
+    grounded.flying = True
     if set_point:
-        ground.flight.set_target(ground.now, (0.0, 0.0, 2.0, 0.0))
-        ground.flight.stream(ground.now + 1.0)
-    ground.telemetry.pose = (0.0, 0.0, pose, *(0.0,) * 4)
-    ground.flight.land_after_gap(0.9)
-    assert ground.flight.span_s == pytest.approx(2.1 / module.DESCENT)
+        grounded.flight.set_target(grounded.now, (0.0, 0.0, 2.0, 0.0))
+        grounded.flight.stream(grounded.now + 1.0)
+    grounded.telemetry.pose = (0.0, 0.0, pose, *(0.0,) * 4)
+    grounded.flight.land_after_gap(0.9)
+    assert grounded.flight.span_s == pytest.approx(2.1 / module.DESCENT)
 
 
 @pytest.mark.parametrize("height", [0.2, 0.8, 8.0])
@@ -401,9 +401,9 @@ def test_a_stop_outlives_the_link(air):
     assert air.during(0.1)["send_emergency_stop"]
 
 
-def test_one_that_stands_is_not_locked(ground):
-    ground.flight.stop()
-    assert ground.sent == []
+def test_one_that_stands_is_not_locked(grounded):
+    grounded.flight.stop()
+    assert grounded.sent == []
 
 
 class NoRoom:

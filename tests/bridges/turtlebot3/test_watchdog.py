@@ -123,7 +123,7 @@ spin = lambda node: time.sleep(600)
 }
 
 
-def write(path: Path, text: str, *, runs: bool = False) -> Path:
+def new_file(path: Path, text: str, *, runs: bool = False) -> Path:
     """A file in a folder that may be new."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text)
@@ -140,16 +140,16 @@ def robot_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path
     home, site, bin_ = tmp_path / "home", tmp_path / "site", tmp_path / "bin"
     home.mkdir()
     for name, text in ROS.items():
-        write(site / name, text)
-    write(site / "setup.sh", f"export PYTHONPATH={site}\n")
+        new_file(site / name, text)
+    new_file(site / "setup.sh", f"export PYTHONPATH={site}\n")
     table = f'#!/bin/sh\n[ "$1" = -l ] && exec cat {home}/crontab\nexec cat > {home}/crontab\n'
-    write(bin_ / "crontab", table, runs=True)
+    new_file(bin_ / "crontab", table, runs=True)
     for name in ("host_key", "key"):
         subprocess.run(["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", str(tmp_path / name)], check=True)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    config = write(
+    config = new_file(
         tmp_path / "sshd_config",
         f"Port {port}\nListenAddress 127.0.0.1\nHostKey {tmp_path}/host_key\nAuthorizedKeysFile {tmp_path}/key.pub\n"
         f"PidFile {tmp_path}/sshd.pid\nPasswordAuthentication no\nUsePAM no\nStrictModes no\n"
@@ -158,12 +158,12 @@ def robot_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path
     Path("/run/sshd").mkdir(exist_ok=True)
     with (tmp_path / "sshd.log").open("wb") as log:
         sshd = subprocess.Popen([SSHD, "-D", "-e", "-f", str(config)], stdin=subprocess.DEVNULL, stdout=log, stderr=log)
-    ours = write(
+    ours = new_file(
         tmp_path / "ssh_config",
         f"Host robot\n HostName 127.0.0.1\n Port {port}\n User {getpass.getuser()}\n IdentityFile {tmp_path}/key\n"
         f" StrictHostKeyChecking no\n UserKnownHostsFile {tmp_path}/known\n",
     )
-    ssh = write(tmp_path / "ours" / "ssh", f'#!/bin/sh\nexec {shutil.which("ssh")} -F {ours} "$@"\n', runs=True)
+    ssh = new_file(tmp_path / "ours" / "ssh", f'#!/bin/sh\nexec {shutil.which("ssh")} -F {ours} "$@"\n', runs=True)
     monkeypatch.setenv("PATH", f"{ssh.parent}:{os.environ['PATH']}")
     until((tmp_path / "sshd.pid").exists, "its sshd runs")
     yield home

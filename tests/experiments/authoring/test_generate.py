@@ -143,7 +143,7 @@ def lengths(made):
     return np.linalg.norm(made.position[made.pairs[:, 0]] - made.position[made.pairs[:, 1]], axis=1)
 
 
-def nearest(points):
+def nearest_gap(points):
     apart = np.linalg.norm(points[:, None] - points[None], axis=2)
     return apart[np.triu_indices(len(points), 1)].min()
 
@@ -152,7 +152,7 @@ def nearest(points):
 def test_polygons_are_regular_and_rigid(count):
     made = layouts.polygon(count, 0.6)
     assert held(made).rigid
-    assert nearest(made.position) == pytest.approx(0.6)
+    assert nearest_gap(made.position) == pytest.approx(0.6)
     around = np.linalg.norm(made.position, axis=1)
     assert around == pytest.approx(np.full(count, 0.3 / np.sin(np.pi / count)))
     assert len(made.pairs) == min(2 * count, count * (count - 1) // 2)
@@ -173,8 +173,8 @@ def test_grids_have_all_neighbours(rows, columns):
 def test_hemispheres_are_rigid_and_keep_their_distances(count):
     made = layouts.hemisphere(count, 0.6, 0.25)
     assert held(made).rigid
-    assert nearest(made.position) >= 0.6 - 1e-9
-    assert nearest(made.position[:, :2]) >= 0.25 - 1e-9
+    assert nearest_gap(made.position) >= 0.6 - 1e-9
+    assert nearest_gap(made.position[:, :2]) >= 0.25 - 1e-9
     assert made.position[:, 2].min() == pytest.approx(layouts.LOWEST)
     assert lengths(made).max() < 2.1 * 0.6  # no link bridges a bay of the rim
 

@@ -160,7 +160,7 @@ class Listing(Steep, frozen=True):
 
 
 @pytest.fixture
-def install(monkeypatch):
+def install_plugin(monkeypatch):
     """Registers a law of this module as 'mine'."""
 
     def installed(law):
@@ -171,8 +171,8 @@ def install(monkeypatch):
     return installed
 
 
-def test_uncompiled_law_is_noted_once(install):
-    install("Listing")
+def test_uncompiled_law_is_noted_once(install_plugin):
+    install_plugin("Listing")
     (found,) = [each for each in check(document.read(TRIANGLE, ["formation.law=mine"])) if each.code == "uncompiled"]
     assert found.severity == "note"
     assert "Listing.error uses" in found.message
@@ -188,8 +188,8 @@ def test_uncompiled_law_is_noted_once(install):
         ("Weak", "not-acquired", "not acquired in time", "raise the law's own parameters (largest)"),
     ],
 )
-def test_remedy_for_a_users_law_names_the_law(install, law, code, message, remedy):
-    install(law)
+def test_remedy_for_a_users_law_names_the_law(install_plugin, law, code, message, remedy):
+    install_plugin(law)
     found = bad(TRIANGLE, "formation.law=mine", "duration_s=1")[code]
     assert message in found.message
     assert remedy in found.remedy

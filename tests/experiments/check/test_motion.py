@@ -258,7 +258,7 @@ def wheels(x: float, y: float) -> RobotTable:
     return RobotTable(kind="khepera4", start=[x, y])
 
 
-def drone(x: float, y: float, hover: float, kind: str = "crazyflie") -> RobotTable:
+def lone_drone(x: float, y: float, hover: float, kind: str = "crazyflie") -> RobotTable:
     return RobotTable(kind=kind, start=[x, y], hover=hover)
 
 
@@ -269,16 +269,16 @@ OVER = [leg("CF01", move_by=[2.0, 0.0], speed=0.3)]
 
 def low(hover: float, top: float) -> Experiment:
     """A Crazyflie overshoots its take-off by up to 11 %."""
-    return small({"F": drone(0.0, 0.0, hover)}, arena=Arena(size=(4.0, 4.0, top)), duration_s=5.0)
+    return small({"F": lone_drone(0.0, 0.0, hover)}, arena=Arena(size=(4.0, 4.0, top)), duration_s=5.0)
 
 
 def crossed(height: float) -> Experiment:
-    robots = {"CF01": drone(-1.0, 0.0, 0.5), "TL01": drone(0.0, 0.0, height, "tello")}
+    robots = {"CF01": lone_drone(-1.0, 0.0, 0.5), "TL01": lone_drone(0.0, 0.0, height, "tello")}
     return small(robots, timeline=OVER, duration_s=15.0)
 
 
-LANDING = {"G": wheels(0.0, 0.01), "H": wheels(0.5, 0.5), "F": drone(0.0, 0.0, 0.8)}
-BESIDE = {"G": wheels(0.0, 0.0), "F": drone(0.5, 0.0, 0.8)}
+LANDING = {"G": wheels(0.0, 0.01), "H": wheels(0.5, 0.5), "F": lone_drone(0.0, 0.0, 0.8)}
+BESIDE = {"G": wheels(0.0, 0.0), "F": lone_drone(0.5, 0.0, 0.8)}
 
 
 @pytest.mark.parametrize(

@@ -34,7 +34,7 @@ MOVING = replace(ALPHABOT, motion=KINDS["khepera4"].motion)
 
 
 @pytest.fixture(autouse=True)
-def known(monkeypatch):
+def new_kind(monkeypatch):
     monkeypatch.setitem(KINDS.loaded, KIND, ALPHABOT)
 
 

@@ -23,7 +23,7 @@ MINIMAL = 'title = "One"\nduration_s = 10.0\n[robots.KH01]\nkind = "khepera4"\ns
 TWO = MINIMAL + '[robots.KH02]\nkind = "khepera4"\nstart = [1.0, 0.0]\n'
 
 
-def refused(path, *overrides):
+def refusal(path, *overrides):
     with pytest.raises(DocumentError) as caught:
         read(path, overrides)
     return caught.value
@@ -43,7 +43,7 @@ def write(tmp_path):
 
 @pytest.mark.parametrize("file", sorted(MALFORMED.glob("*.toml")), ids=lambda file: file.stem)
 def test_malformed_file_is_refused_in_place_with_remedy(file):
-    error, expected = refused(file), EXPECTED.findall(file.read_text("utf-8"))
+    error, expected = refusal(file), EXPECTED.findall(file.read_text("utf-8"))
     assert [(p.line, p.column) for p in error.problems] == [(int(line), int(column)) for line, column, *_ in expected]
     for problem, (_, _, message, remedy) in zip(error.problems, expected, strict=True):
         assert message in problem.message
@@ -54,7 +54,7 @@ def test_malformed_file_is_refused_in_place_with_remedy(file):
 
 def test_problem_shows_the_line_and_the_column(write):
     file = write(MINIMAL + "\n[formation]\n\tgian = 2.0\n")
-    assert str(refused(file)) == (
+    assert str(refusal(file)) == (
         f"{file}:8:2: unknown key 'gian' in 'formation'\n"
         "     8 | \tgian = 2.0\n"
         "       | \t^\n"
@@ -63,7 +63,7 @@ def test_problem_shows_the_line_and_the_column(write):
 
 
 def test_long_line_is_cut_around_the_place(write):
-    error = refused(write(f'title = "{"x" * 500}"\n' + MINIMAL[14:].replace("10.0", " " * 300 + '"no" # ' + "y" * 300)))
+    error = refusal(write(f'title = "{"x" * 500}"\n' + MINIMAL[14:].replace("10.0", " " * 300 + '"no" # ' + "y" * 300)))
     _, source, caret, _ = str(error).split("\n")
     assert len(source) < 120
     assert source[caret.index("^") :].startswith('"no"')
@@ -88,7 +88,7 @@ def test_every_misspelt_key_is_found_in_its_line(write):
         for place, number, text in found:
             if place not in tried:  # the same key of the same table in another file is read by the same rules
                 tried.add(place)
-                lines = [(problem.line, problem.column) for problem in refused(write(text)).problems]
+                lines = [(problem.line, problem.column) for problem in refusal(write(text)).problems]
                 assert (number, 1) in lines, (name, place)
     assert len(tried) > 30
 
@@ -110,17 +110,17 @@ def test_every_misspelt_key_is_found_in_its_line(write):
     ],
 )
 def test_file_that_is_no_experiment(write, content, place, message, hint):
-    (problem,) = refused(write(content)).problems
+    (problem,) = refusal(write(content)).problems
     assert (problem.line, problem.column) == place
     assert message in problem.message
     assert hint in problem.hint
 
 
 def test_absent_file_names_the_nearest_of_the_catalogue(write):
-    (problem,) = refused("robotic-prk").problems
+    (problem,) = refusal("robotic-prk").problems
     assert "neither a file nor an experiment of the catalogue" in problem.message
     assert "did you mean 'robotic-park'?" in problem.hint
-    (problem,) = refused(write(MINIMAL).parent).problems
+    (problem,) = refusal(write(MINIMAL).parent).problems
     assert (problem.message, problem.hint) == ("is a folder", "name a file in it: some.toml")
 
 
@@ -153,7 +153,7 @@ def test_any_value_is_read_or_refused(write, field):
 
 @pytest.mark.parametrize("name", ["a\0b", "x" * 5000, ""])
 def test_names_that_no_file_can_have(name):
-    assert len(refused(name).problems) == 1
+    assert len(refusal(name).problems) == 1
 
 
 def test_foreign_line_ends_and_byte_order_marks_work(write):
@@ -295,7 +295,7 @@ def test_set_of_a_link_however_it_is_written(flag, distance, gain):
     ],
 )
 def test_wrong_set_names_the_flag(flag, message, hint):
-    (problem,) = refused("robotic-park", flag).problems
+    (problem,) = refusal("robotic-park", flag).problems
     assert problem.file == f"--set {flag}"
     assert message in problem.message
     assert hint in problem.hint
@@ -303,14 +303,14 @@ def test_wrong_set_names_the_flag(flag, message, hint):
 
 
 def test_leg_has_a_number_and_no_name():
-    (problem,) = refused("triangle", "timeline.first.plan.speed=1").problems
+    (problem,) = refusal("triangle", "timeline.first.plan.speed=1").problems
     assert problem.message == "'timeline' must be a list, not a table"
     assert problem.hint == "write [[timeline]], with two brackets"
 
 
 def test_set_hides_no_fault_of_the_file(write):
     file = write(MINIMAL + "[formation]\ngian = 2.0\n")
-    problems = refused(file, "formation.gain=x").problems
+    problems = refusal(file, "formation.gain=x").problems
     assert [(p.file, p.line) for p in problems] == [("--set formation.gain=x", 0), (str(file), 7)]
 
 
@@ -338,7 +338,7 @@ def test_json_says_the_same(name, write):
     ],
 )
 def test_json_that_is_none(write, content, line, column, message):
-    (problem,) = refused(write(content, "some.json")).problems
+    (problem,) = refusal(write(content, "some.json")).problems
     assert (problem.line, problem.column) == (line, column)
     assert message in problem.message
 
@@ -346,7 +346,7 @@ def test_json_that_is_none(write, content, line, column, message):
 def test_fault_in_json_is_located(write):
     experiment = json.loads(document.write_json(read("triangle").plan))
     experiment["robots"]["KH02"]["start"][1] = 7.5
-    (problem,) = refused(write(json.dumps(experiment, indent=2), "some.json")).problems
+    (problem,) = refusal(write(json.dumps(experiment, indent=2), "some.json")).problems
     assert problem.source.strip() == "7.5"
     assert problem.column == problem.source.index("7.5") + 1
 

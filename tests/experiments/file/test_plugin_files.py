@@ -66,7 +66,7 @@ def task(tmp_path, monkeypatch):
     return file
 
 
-def refused(file, *changes):
+def refused_text(file, *changes):
     with pytest.raises(DocumentError) as caught:
         load(file, *changes)
     return str(caught.value)
@@ -75,7 +75,7 @@ def refused(file, *changes):
 def refused_with(task, old, new):
     """The experiment with another text, refused."""
     task.write_text(TASK.replace(old, new, 1), "utf-8")
-    return refused(task)
+    return refused_text(task)
 
 
 def test_law_beside_the_experiment_moves_robots(task):
@@ -133,7 +133,7 @@ def test_pipe_is_not_waited_for(task):
 )
 def test_broken_file_is_named_with_its_line(task, old, new, message):
     (task.parent / "meet.py").write_text(MEET.replace(old, new), "utf-8")
-    assert message in refused(task)
+    assert message in refused_text(task)
 
 
 def test_unknown_parameters_are_found(task):
@@ -142,7 +142,7 @@ def test_unknown_parameters_are_found(task):
 
 def test_file_that_others_may_write_is_not_loaded(task):
     (task.parent / "meet.py").chmod(0o666)
-    assert "others may write to it" in refused(task)
+    assert "others may write to it" in refused_text(task)
 
 
 def test_changed_file_is_another_plug_in(task):
@@ -277,7 +277,7 @@ def test_criterion_names_a_metric_in_a_file(spread, criterion, low, high):
 
 def test_unusable_metric_in_a_file_is_named(spread):
     for metric, message in (("spread.py:Spred", "it has no Spred, only"), ("sprad.py:Spread", "cannot be read")):
-        assert message in refused(with_criterion(spread, metric=metric, at_most=1.0))
+        assert message in refused_text(with_criterion(spread, metric=metric, at_most=1.0))
     (only,) = judged(spread, metric="spread.py:Broken", at_most=1.0)
     assert only.passed is False
 

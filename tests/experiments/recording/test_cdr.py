@@ -229,14 +229,14 @@ def test_an_empty_struct_is_no_message():
 HUMBLE = get_typestore(Stores.ROS2_HUMBLE)
 
 
-def drawn(stamp, position=(0.0, 0.0, 0.0), yaw=0.0, attitude=None):
+def drawn_messages(stamp, position=(0.0, 0.0, 0.0), yaw=0.0, attitude=None):
     return viewers.pose(State("CF01", 1, stamp, "running", position, yaw=yaw, attitude=attitude))
 
 
 @pytest.mark.slow
 @given(st.floats(0, 2**31 - 1), vector, st.floats(-10, 10))
 def test_pose_stamped_is_what_rosbags_writes(stamp, position, yaw):
-    data = drawn(stamp, position, yaw)
+    data = drawn_messages(stamp, position, yaw)
     theirs = HUMBLE.deserialize_cdr(data, viewers.POSE)
     assert theirs.header.stamp.sec * 10**9 + theirs.header.stamp.nanosec == round(stamp * 1e9)
     assert theirs.header.frame_id == viewers.FRAME
@@ -248,7 +248,7 @@ def test_pose_stamped_is_what_rosbags_writes(stamp, position, yaw):
 
 
 def test_an_attitude_stands_for_the_yaw():
-    data = drawn(1.0, yaw=3.0, attitude=(0.1, 0.2, 0.4, 0.8))
+    data = drawn_messages(1.0, yaw=3.0, attitude=(0.1, 0.2, 0.4, 0.8))
     turn = HUMBLE.deserialize_cdr(data, viewers.POSE).pose.orientation
     assert (turn.w, turn.x, turn.y, turn.z) == (0.1, 0.2, 0.4, 0.8)
 
@@ -263,4 +263,4 @@ def test_schema_of_pose_stamped_is_the_standard():
 @pytest.mark.parametrize("stamp", [math.nan, math.inf, 2.0**31, -(2.0**32)])
 def test_a_stamp_that_ros_cannot_hold_is_refused(stamp):
     with pytest.raises(Unencodable, match="PoseStamped"):
-        drawn(stamp)
+        drawn_messages(stamp)

@@ -65,7 +65,7 @@ class Page(HTMLParser):
         return re.sub(r"[ \n]+", " ", " ".join(self.text))
 
 
-def checked(html: str) -> Page:
+def checked_page(html: str) -> Page:
     page = Page(html)
     assert page.open == []
     assert len(page.ids) == len(set(page.ids))
@@ -77,7 +77,7 @@ def checked(html: str) -> Page:
 
 
 def page_of(folder, *traces, **more):
-    return checked(report.write(folder, traces, **more).read_text("utf-8"))
+    return checked_page(report.write(folder, traces, **more).read_text("utf-8"))
 
 
 def measured(traces):
@@ -111,7 +111,7 @@ def written(tmp_path_factory, two_cases):
 
 
 def test_report_of_a_run_stands_alone(written):
-    page = checked(written)
+    page = checked_page(written)
     assert page.ids.count("f1-figure_1") == page.ids.count("f7-figure_1") == 1
     for words in (
         "Robotic Park: six robots hold a rigid formation behind a leader",
@@ -221,7 +221,7 @@ def test_report_of_run_with_dead_robot_and_losses(tmp_path):
 def test_comparison_has_a_column_per_run_and_case(tmp_path, two_cases, names, shown):
     cases = (two_cases, two_cases[1:]) if len(names) == 2 else (two_cases[:1], two_cases[:1], two_cases)
     runs = [(name, measured(each)) for name, each in zip(names, cases, strict=True)]
-    page = checked(report.compare(tmp_path / "there" / "compare.html", runs).read_text())
+    page = checked_page(report.compare(tmp_path / "there" / "compare.html", runs).read_text())
     for words in shown:
         assert words in page.words
     assert "±" not in page.words.split("Definitions")[0]
@@ -235,7 +235,7 @@ def test_comparison_shows_first_how_the_runs_differ(tmp_path, two_cases):
         tmp_path / "c.html", [("A", measured(two_cases[:1])), ("B", measured(two_cases[1:]))], differences=differ
     )
     html = path.read_text(encoding="utf-8")
-    said = checked(html).words.split("</style>")[-1]
+    said = checked_page(html).words.split("</style>")[-1]
     assert "! B differs in duration_s 45 → 44; seeds: 1 → 2 and 1 more." in said
     assert html.index('id="differences"') < html.index('id="results"')
     assert "A runs/a the reference B runs/b duration_s 45 → 44; seeds: 1 → 2; x 1 → 2" in said

@@ -99,7 +99,7 @@ def model(folder, inputs, outputs, kind=1):
     (folder / "own.onnx").write_bytes(whole.SerializeToString())
 
 
-def own(folder, name="own.onnx"):
+def own_policy(folder, name="own.onnx"):
     """Experiment with a policy that is beside it."""
     text = index.find_file("policy").read_text("utf-8").replace("policy.onnx", name)
     (folder / "own.toml").write_text(text, "utf-8")
@@ -114,13 +114,13 @@ def begin(given):
 def test_a_model_of_other_sizes_is_refused(tmp_path, inputs, outputs, kind):
     model(tmp_path, inputs, outputs, kind)
     with pytest.raises(PluginError, match="one float input of 4 \\+ 4n numbers"):
-        begin(own(tmp_path))
+        begin(own_policy(tmp_path))
 
 
 def test_what_is_no_model_is_refused(tmp_path):
     (tmp_path / "own.onnx").write_bytes(b"nothing")
     with pytest.raises(PluginError, match="cannot use its file"):
-        begin(own(tmp_path))
+        begin(own_policy(tmp_path))
     with pytest.raises(PluginError, match="give `file`"):
         policy.load("")
 
@@ -129,15 +129,15 @@ def test_absent_file_is_a_fault_of_its_line(tmp_path):
     faults = {"own.onnx": r"own\.onnx cannot be read", "../own.onnx": "is no name of a file"}
     for name, fault in faults.items():
         with pytest.raises(DocumentError, match=fault):
-            own(tmp_path, name)
+            own_policy(tmp_path, name)
     (tmp_path / "own.onnx").write_bytes(bytes(1_000_001))
     with pytest.raises(DocumentError, match="is longer than 1 MB"):
-        own(tmp_path)
+        own_policy(tmp_path)
 
 
 def test_a_model_goes_with_the_experiment(tmp_path):
     model(tmp_path, 8, 2)
-    given = own(tmp_path)
+    given = own_policy(tmp_path)
     law = given.cases()["event"].experiment.formation.law
     assert b64decode(law["model"]) == (tmp_path / "own.onnx").read_bytes()
     (tmp_path / "run").mkdir()
@@ -152,7 +152,7 @@ def test_a_model_goes_with_the_experiment(tmp_path):
 
 def test_more_neighbours_than_places_are_a_warning(tmp_path):
     model(tmp_path, 8, 2)
-    plan = own(tmp_path).cases()["periodic"]
+    plan = own_policy(tmp_path).cases()["periodic"]
     severity, message, _ = next(iter(plan.law.analyse(plan)))
     assert (severity, message.partition(",")[0]) == ("warning", "CF01 has 3 neighbours")
 

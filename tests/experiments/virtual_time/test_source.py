@@ -51,7 +51,7 @@ class Thing:
         return f"{self.part}"
 
 
-def made(function, fixed):
+def built(function, fixed):
     code, names = specialised(function, fixed)
     space = dict(function.__globals__)
     exec(code, space)
@@ -71,7 +71,7 @@ def made(function, fixed):
     ],
 )
 def test_constants_are_decided_and_branches_left_out(method, fixed, attributes, arguments, value):
-    function, names = made(method, fixed)
+    function, names = built(method, fixed)
     assert attributes in (None, function.__code__.co_names)
     assert arguments is None or function(*arguments) == value
     assert names >= ({"range", "len"} if value == 7 else set())

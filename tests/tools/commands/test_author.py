@@ -12,7 +12,7 @@ from tests.experiments.robotic_park_files import dome
 
 
 @pytest.fixture
-def typed(tmp_path, monkeypatch):
+def parsed_options(tmp_path, monkeypatch):
     """Result of a command in an empty folder."""
     monkeypatch.chdir(tmp_path)
     return invoke
@@ -28,8 +28,8 @@ def typed(tmp_path, monkeypatch):
         ("triangle", "triangle.toml", 3),
     ],
 )
-def test_formations(typed, words, file, robots):
-    assert f"zenpark check {file}" in typed("new", *words.split()).output
+def test_formations(parsed_options, words, file, robots):
+    assert f"zenpark check {file}" in parsed_options("new", *words.split()).output
     experiment = document.read(file).experiment
     assert len(experiment.robots) == robots
     if "--duration" in words:
@@ -44,14 +44,14 @@ def test_formations(typed, words, file, robots):
         ("--polygon 5 a.toml b.toml", "'b.toml' is too much"),
     ],
 )
-def test_one_formation_at_a_time(typed, tmp_path, words, said):
-    assert said in typed("new", *words.split(), code=2).output
+def test_one_formation_at_a_time(parsed_options, tmp_path, words, said):
+    assert said in parsed_options("new", *words.split(), code=2).output
     assert list(tmp_path.iterdir()) == []
 
 
-def test_import(typed, tmp_path):
+def test_import(parsed_options, tmp_path):
     (tmp_path / "five.yaml").write_text(dome(5))
-    assert "Not carried over" in typed("import", "five.yaml", "--duration", "30").output
+    assert "Not carried over" in parsed_options("import", "five.yaml", "--duration", "30").output
     assert document.read("five.toml").experiment.duration_s == 30.0
 
 
@@ -74,10 +74,10 @@ D = { kind = "khepera4", start = [0.0, 0.8] }
 
 
 @pytest.fixture
-def check(typed, tmp_path):
+def check(parsed_options, tmp_path):
     """`check`, in the folder of a file whose links contradict each other."""
     (tmp_path / "square.toml").write_text(CONTRADICTION)
-    return partial(typed, "check")
+    return partial(parsed_options, "check")
 
 
 @pytest.mark.slow
