@@ -40,17 +40,6 @@ STANDSTILL_S: Final = 1.0  # longest wait of `close` until stopped robots are me
 VALID_BOX: Final = (1e3, 1e3, 1e3)  # [m] bounds of valid positions: any room
 
 
-class _RepeatedOrder(msgspec.Struct):
-    """An order repeated under its own sequence number until it is completed or `until`.
-
-    Until completed, not begun: the simulator may be restarted half-way through a climb or a landing, and then knows no
-    earlier order.
-    """
-
-    order: messages.Command
-    until: float  # [s]
-
-
 @dataclass(slots=True)
 class _ExternalRobot:
     """Last state of a robot, and its orders."""
@@ -66,7 +55,10 @@ class _ExternalRobot:
     pose: External = field(default_factory=External)
     flight: MeasuredFlight = field(default_factory=MeasuredFlight)
     stopped_since: float = inf
-    repeated: _RepeatedOrder | None = None
+    # order repeated under its own sequence number until it is completed, not begun: the simulator may be restarted
+    # half-way through a climb or a landing, and then knows no earlier order
+    repeated: messages.Command | None = None
+    repeated_until: float = inf  # at most [s]
 
     @property
     def stopped(self) -> bool:
@@ -177,10 +169,10 @@ class ExternalBody(Body):
                     repeated = robot.repeated
                     if repeated is None:
                         continue
-                    if now > repeated.until:
+                    if now > robot.repeated_until:
                         robot.repeated = None
                     else:
-                        self._put(row, msgspec.structs.replace(repeated.order, stamp=self._stamp()))
+                        self._put(row, msgspec.structs.replace(repeated, stamp=self._stamp()))
 
     def takeoff(self, rows: Sequence[int], heights: Sequence[float]) -> None:
         """See `Body.takeoff`; no effect on ground robots, or after a stop."""
@@ -243,11 +235,12 @@ class ExternalBody(Body):
         for row, robot in enumerate(self._robots):
             name, age = robot.name, now - robot.pose.time
             key = self._keys.position(name)
+            source = "`./zenpark world serve` with this experiment" if robot.address == WORLD else "the simulator"
             if not isfinite(age):
                 found.append(
                     f"{name}: samples on {key} are not positions: {self._positions.sources[row].inbox.trouble}"
                     if self._positions.sources[row].inbox.malformed
-                    else f"{name}: nothing is published on {key}: is {_source_name(robot)} running and connected to "
+                    else f"{name}: nothing is published on {key}: is {source} running and connected to "
                     f"{', '.join(self._endpoints)}?"
                 )
             elif age > FRESH_S:
@@ -289,7 +282,7 @@ class ExternalBody(Body):
             if robot.stopped:
                 return
             self._put(row, self._next_command(robot, "drive", setpoint))
-            if robot.repeated is not None and robot.repeated.order.action == "takeoff":
+            if robot.repeated is not None and robot.repeated.action == "takeoff":
                 robot.repeated = None  # setpoints replace a take-off
 
     def _send_order(self, row: int, action: Action, seconds: float, height: float | None = None) -> None:
@@ -299,7 +292,7 @@ class ExternalBody(Body):
             if action != "stop" and robot.stopped:
                 return  # stopped meanwhile, by another thread
             order = self._next_command(robot, action, height=height)
-            robot.repeated = _RepeatedOrder(order, self._now() + seconds)
+            robot.repeated, robot.repeated_until = order, self._now() + seconds
             self._put(row, order)
 
     def _outnumber_successor(self) -> None:
@@ -325,7 +318,3 @@ class ExternalBody(Body):
             publishers[row].put(messages.encode(command))
         except zenoh.ZError as error:
             self._positions.sources[row].inbox.trouble = f"commands cannot be sent: {error}"
-
-
-def _source_name(robot: _ExternalRobot) -> str:
-    return "`./zenpark world serve` with this experiment" if robot.address == WORLD else "the simulator"

@@ -15,11 +15,7 @@ from agents.protocols.crtp import MM, Info, Power
 from bridges.crazyflie.link import CrazyflieLink
 
 # for firmwares without a supervisor
-OLD_INFO: Final = {
-    "sys.canfly": Info.ARMED | Info.CAN_FLY,
-    "sys.isFlying": Info.FLYING,
-    "sys.isTumbled": Info.TUMBLED,
-}
+OLD_INFO: Final = {"sys.canfly": Info.ARMED | Info.CAN_FLY, "sys.isFlying": Info.FLYING, "sys.isTumbled": Info.TUMBLED}
 PLACE: Final = tuple(f"stateEstimateZ.{name}" for name in ("x", "y", "z", "vx", "vy", "vz"))  # [mm], [mm/s]
 YAW: Final = "stateEstimate.yaw"  # [degrees]
 STATE: Final = (

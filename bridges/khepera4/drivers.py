@@ -7,8 +7,9 @@ import os
 import re
 import select
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Final, Protocol
+from typing import Final
 
 from agents.clock import uptime
 from agents.protocols import khepera4 as protocol
@@ -73,39 +74,41 @@ class Wire:
         return data
 
 
-class Driver(Protocol):
+class Driver(ABC):
     """Protocol of a server. Every method raises OSError if the robot does not answer, or not in this protocol."""
 
-    ranged: bool  # whether it reads ranges
-    patience_s: float  # [s] without an answer after which a request fails
+    def __init__(self, wire: Wire, chosen: protocol.Khepera4Settings, *, ranged: bool) -> None:
+        """`ranged`: it reads ranges."""
+        self._wire, self.ranged = wire, ranged
+        self.patience_s = chosen.silence_s  # [s] without an answer after which a request fails
 
+    @abstractmethod
     def begin(self) -> None:
         """Stop the robot of a new connection, then make sure which server runs on it."""
-        ...
 
+    @abstractmethod
     def drive(self, v: float, turn: float, until: float = NEVER) -> None:
         """Drive at v [m/s], ω [rad/s]; zeros stop the robot, as does whatever is sent after `until` [s, `uptime`]."""
-        ...
 
+    @abstractmethod
     def move(self, odometer: Odometer) -> None:
         """Request odometry and update `odometer`; the answer shows that the last command was read."""
-        ...
 
+    @abstractmethod
     def ranges(self) -> Ranges:
         """Bearings [rad] and distances from the robot's centre [m]."""
-        ...
 
     def battery(self) -> float:
         """Charge, 0 to 1; NaN if the protocol has no such value."""
-        ...
+        return math.nan
 
 
-class RoboticParkServer:
+class RoboticParkServer(Driver):
     """A server of Robotic Park that obeys `d`; what else it does is in `protocol.PARK`."""
 
     def __init__(self, wire: Wire, chosen: protocol.Khepera4Settings, server: protocol.ParkServer) -> None:
-        self._wire, self.server = wire, server
-        self.ranged, self.patience_s = bool(chosen.ranges), chosen.silence_s
+        super().__init__(wire, chosen, ranged=bool(chosen.ranges))
+        self.server = server
         self._number = re.compile(rf"[-+]?\d+\.\d{{{server.decimals}}}")
         self._count = 3 if server.answer == "pose" else 2
         self._angle = server.base / protocol.BASE  # of a true angle, per angle that the server counts
@@ -145,9 +148,6 @@ class RoboticParkServer:
         if len(sound) != len(protocol.SOUND_BEARING):
             raise UnknownAnswer(f"answers get_data with {_shown(answer)}; leave ranges out of its device table")
         return protocol.SOUND_BEARING, [protocol.sound_distance(each) for each in sound]
-
-    def battery(self) -> float:
-        return math.nan
 
     def _send(self, command: bytes, instead: bytes = b"", until: float = NEVER) -> float:
         """Send a command in a segment of its own, or `instead` if it is past `until`; returns when [s]."""
@@ -323,12 +323,11 @@ def _shown(answer: bytes) -> str:
     return repr(answer[:40].decode("ascii", "replace"))
 
 
-class KTeam:
+class KTeam(Driver):
     """K-Team's `kh4server`."""
 
     def __init__(self, wire: Wire, chosen: protocol.Khepera4Settings) -> None:
-        self._wire = wire
-        self.ranged, self.patience_s = chosen.ranges is not False, chosen.silence_s
+        super().__init__(wire, chosen, ranged=chosen.ranges is not False)
 
     def begin(self) -> None:
         self.drive(0.0, 0.0)

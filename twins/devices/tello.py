@@ -18,10 +18,8 @@ from agents.kinds.tello import TELLO
 from agents.protocols import tello as protocol
 from agents.vectors import NO_SETPOINT, ZERO, Setpoint, Vector, difference, norm
 from twins.arrays import Array
-from twins.body import instants
+from twins.body import Twin, instants
 from twins.devices.device import Device, DeviceRequest, Faults, FaultyLink
-from twins.models.disturbance import HoverJitter, Latency
-from twins.models.noise import refill
 from twins.models.quadrotor import Quadrotor
 
 PORT: Final = 18889  # not the drone's own 8889: djitellopy binds that on every address of this host
@@ -77,9 +75,7 @@ class _Drone(FaultyLink[tuple[bytes, tuple[str, int]]]):
         super().__init__(faults, np.random.default_rng([seed, zlib.crc32(name.encode()), zlib.crc32(b"loss")]))
         self.wire, self._dt = wire, 1.0 / body.rate_hz
         self.model = Quadrotor(body.kinds[row], body.start[row], body.yaw[row])
-        self.model.blow(disturbance.wind or (0.0, 0.0))
-        self._jitter = HoverJitter(disturbance, name, seed, self._dt)
-        self._latency = Latency(disturbance, self._dt)
+        self._twin = Twin(self.model, body.kinds[row], disturbance, name=name, seed=seed, dt=self._dt)
         self.number, self.start_yaw = row, body.yaw[row]
         self.stick_speed = chosen.twin_stick_speed  # [m/s] at full deflection
         self.seeks_pads = False  # mission pads are switched on
@@ -105,12 +101,9 @@ class _Drone(FaultyLink[tuple[bytes, tuple[str, int]]]):
 
     def step(self) -> None:
         """One step; the setpoint takes effect after the latency."""
-        model = self.model
-        model.command(self._latency.delay(self._setpoint()))
-        if self._jitter.present:
-            model.wobble = self._jitter.advance(model.held[2])
-            refill(self._jitter.noise)
-        model.move(self._dt)
+        self._twin.command(self._setpoint())
+        if self._twin.advance(self.t, self._dt):
+            self._twin.refill()
         self._update()
 
     def _hover(self) -> None:

@@ -285,13 +285,7 @@ def run(launch: ViconTwinLaunch) -> int:
         rng = np.random.default_rng(launch.seed)
         try:
             vicon = ViconTwin(
-                launch.robots,
-                rate_hz=launch.rate,
-                sigma=launch.sigma,
-                rng=rng,
-                faults=faults,
-                host=host,
-                port=port,
+                launch.robots, rate_hz=launch.rate, sigma=launch.sigma, rng=rng, faults=faults, host=host, port=port
             )
         except OSError as error:
             raise ValueError(f"cannot listen on {launch.listen}: {error.strerror}; choose another port") from None

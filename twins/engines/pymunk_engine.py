@@ -173,23 +173,15 @@ class PlanarEngine(Engine):
 class _RobotBody:
     """A robot's body, and its wheels, in the numbers of a space."""
 
-    __slots__ = (
-        "_at", "_cells", "_drift", "_force", "_stands", "_target", "_wheels", "_wobble", "flies", "foot", "grip",
-        "tall",
-    )  # fmt: skip
-
-    flies: bool
-    tall: float  # [m]
-    foot: pymunk.PivotJoint | None  # friction of a landed robot with the floor,
-    grip: float  # and its force [N]
-
     def __init__(self, cells: memoryview[float], at: int, wheels: int, kind: Kind, step: float) -> None:
         """Numbers from `at` and, of the wheels, from `wheels` on."""
         self._cells, self._at, self._wheels = cells, at, wheels
         self._force = kind.mass / step  # changes the speed by 1 m/s in one step
         self._wobble = self._drift = self._target = (0.0, 0.0)  # of the last tick [m], [m/s], [m/s]
         self._stands = True
-        self.flies, self.tall, self.foot, self.grip = kind.flies, kind.height, None, 0.0
+        self.flies, self.tall = kind.flies, kind.height  # [m]
+        self.foot: pymunk.PivotJoint | None = None  # friction of a landed robot with the floor,
+        self.grip = 0.0  # and its force [N]
 
     def put(self, position: Vector, yaw: float) -> None:
         """Place the body at rest."""

@@ -86,15 +86,7 @@ class OnboardPlanner:
         return LogStatus.OK
 
     def go_to(
-        self,
-        t: float,
-        pose: Array,
-        velocity: Vector,
-        *,
-        goal: Array,
-        span: float,
-        relative: bool,
-        linear: bool,
+        self, t: float, pose: Array, velocity: Vector, *, goal: Array, span: float, relative: bool, linear: bool
     ) -> LogStatus:
         """Plan a motion to the pose `goal`, from the current trajectory or else from `pose` and `velocity`."""
         span = max(span, SHORTEST)

@@ -249,9 +249,7 @@ class Vehicle:
 
     def _step(self, t: float) -> bool:
         self.t = t
-        model, commander, supervisor, estimator, dt = (
-            self.model, self.commander, self.supervisor, self.estimator, self.dt
-        )  # fmt: skip
+        model, commander, supervisor, dt = self.model, self.commander, self.supervisor, self.dt
         if self._faults.tumbled(t) != self._fault_tumbled:
             supervisor.tumbled = self._fault_tumbled = not self._fault_tumbled
         commander.take_planned(t, self.planner.goal(t))
@@ -277,12 +275,12 @@ class Vehicle:
             x, y = x + dx, y + dy
         self.place = x, y, z
         self.battery.advance(t)
-        estimator.advance(t, dt, ready=self.decks.ready, flow=self.decks.flow, flying=model.flying)
+        self.estimator.advance(t, dt, ready=self.decks.ready, flow=self.decks.flow, flying=model.flying)
         if self._measurement.present:
             dx, dy, dz, _ = self._measurement.draw()
             x, y, z = x + dx, y + dy, z + dz
         refill(self._jitter.noise, self._measurement.noise)
-        wrong_x, wrong_y, wrong_z = estimator.error
+        wrong_x, wrong_y, wrong_z = self.estimator.error
         self.estimate = x + wrong_x, y + wrong_y, z + wrong_z
         self.velocity = velocity_after(self.velocity, difference((x, y, z), self._last_measured), dt)
         self._last_measured = x, y, z
