@@ -28,7 +28,7 @@ HIGHEST: Final = 3.0  # gain of the reference experiment
 FREE: Final = 0.3  # share of the spacing that starts may be scattered by, on each axis
 PASSING: Final = 0.1  # [m] between robots on their way
 MAX_ROBOTS: Final = 5000  # robots: five times as many as anything here was tried with
-TELEMETRY: Final = 5000.0  # samples in a second, of all robots
+TELEMETRY: Final = 5000.0  # samples in a second, of all robots: 1,000 at 50 Hz are 10 MB, which fill a disk
 WOBBLE: Final = "# hover_jitter = { sigma = 0.01, correlation_s = 0.5 }   # m, s: real drones wobble"
 
 
@@ -97,6 +97,8 @@ def experiment_file(made: Layout, wanted: LayoutOptions) -> str:
     held = [f", hover = {z:.3f}" if kind.flies else "" for z in position[:, 2].tolist()]
     rows = zip(names, starts, held, strict=True)
     robots = [f'{name} = {{ kind = "{kind.name}", start = {start}{hover} }}' for name, start, hover in rows]
+    hz = next((each for each in (50.0, 25.0, 20.0, 10.0, 5.0, 4.0, 2.0) if each * len(made) <= TELEMETRY), 1.0)
+    rates = ["[rates]", f"state_hz = {hz:g}".ljust(31) + "# telemetry", ""] if hz < 50.0 else []
     by_offset = wanted.law == "displacement"
     links = []
     for (i, j), (x, y, _), d in zip(made.pairs.tolist(), (second - first).tolist(), distance.tolist(), strict=True):
@@ -115,7 +117,7 @@ def experiment_file(made: Layout, wanted: LayoutOptions) -> str:
             "[arena]",
             f"size = [{size[0]:g}, {size[1]:g}, {size[2]:g}]",
             "",
-            *_rates(len(made)),
+            *rates,
             "[start]",
             f"scatter = {scatter:g}".ljust(31) + "# m, on each axis: where a robot starts is drawn around its place",
             f"deadline_s = {20.0 + 0.2 * len(made):g}",
@@ -152,14 +154,6 @@ def generate(what: str, size: str, target: str | None, wanted: LayoutOptions) ->
         raise refusal(f"--{what} {size}", message, hint) from None
     path = entries.write_new(text, Path(target or f"{what}-{size.lower().replace('×', 'x')}.toml"))
     return path, made
-
-
-def _rates(count: int) -> tuple[str, ...]:
-    """Telemetry that does not fill a disk: 1,000 robots at 50 Hz are 10 MB in a second."""
-    if 50.0 * count <= TELEMETRY:
-        return ()
-    hz = next((each for each in (25.0, 20.0, 10.0, 5.0, 4.0, 2.0) if each * count <= TELEMETRY), 1.0)
-    return "[rates]", f"state_hz = {hz:g}".ljust(31) + "# telemetry", ""
 
 
 def _kind(wanted: LayoutOptions) -> Kind:

@@ -91,14 +91,11 @@ def shared_world(plan: Plan, names: Sequence[str], *, sensing: bool | None = Non
     """World that `names` share; with range sensors where avoidance uses them, or as `sensing` says."""
     experiment = plan.experiment
     used = experiment.avoidance is not None if sensing is None else sensing
-    carried = []
-    for name in names:
-        robot = experiment.robots[name]
-        carried.append(sensors_of(robot) if used or robot.sensors else ())
+    robots = [experiment.robots[name] for name in names]
     return World(
         scene=plan.scene,
         engine=plan.engine,
-        sensors=tuple(carried),
+        sensors=tuple(sensors_of(robot) if used or robot.sensors else () for robot in robots),
         sensor_noise=experiment.world.sensor_noise,
         mirrored=(False,) * len(names),
     )
@@ -106,11 +103,8 @@ def shared_world(plan: Plan, names: Sequence[str], *, sensing: bool | None = Non
 
 def shadow_periods(plan: Plan, names: Sequence[str]) -> list[float]:
     """Period at which each shadow twin is reset to its robot [s]: infinite for once, NaN without a shadow."""
-    periods = []
-    for name in names:
-        shadow = plan.experiment.robots[name].shadow
-        periods.append(nan if shadow is None else inf if shadow.restart_s is None else shadow.restart_s)
-    return periods
+    shadows = [plan.experiment.robots[name].shadow for name in names]
+    return [nan if shadow is None else shadow.restart_s or inf for shadow in shadows]
 
 
 def body_request(
@@ -166,17 +160,14 @@ def behind_protocols(plan: Plan) -> Plan:
     Raises BodyError if the kind of a robot has no protocol twin.
     """
     given = plan.experiment.robots
-    twins = {name: KINDS[robot.kind].twin for name, robot in given.items()}
-    if strangers := sorted({given[name].kind for name, twin in twins.items() if twin is None}):
+    twins = {name: twin for name, robot in given.items() if (twin := KINDS[robot.kind].twin) is not None}
+    if strangers := sorted({repr(robot.kind) for name, robot in given.items() if name not in twins}):
         known = ", ".join(kind.name for kind in KINDS.usable() if kind.twin is not None)
-        message = f"no protocol twin of {', '.join(map(repr, strangers))}, only of {known}"
+        message = f"no protocol twin of {', '.join(strangers)}, only of {known}"
         raise BodyError(f"--bodies protocol: {message}; choose --bodies twin or world")
     robots = {}
     for name, twin in twins.items():
-        if twin is not None:
-            robot = given[name]
-            robots[name] = msgspec.structs.replace(
-                robot, body=twin.body, process=twin.process, position=twin.position,
-                device={**robot.device, **twin.device},
-            )  # fmt: skip
+        device = {**given[name].device, **twin.device}
+        where = {"body": twin.body, "process": twin.process, "position": twin.position, "device": device}
+        robots[name] = msgspec.structs.replace(given[name], **where)
     return plan.changed(robots=robots, positioning=VICON_TWIN)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final
 
@@ -69,12 +69,11 @@ class Pattern:
 
     def stages(self) -> list[Links]:
         """The links with their targets at the beginning, and after each change."""
-        ends = [change.at + change.over for change in self.changes]
-        return [self.links, *(self._after(k + 1).at(end + 1.0) for k, end in enumerate(ends))]
-
-    def _after(self, count: int) -> Pattern:
-        """The same with the first `count` changes alone."""
-        return Pattern(self.links, self.one_way, self.changes[:count], tuple(each[:count] for each in self.targets))
+        found = [self.links]
+        for count, change in enumerate(self.changes, 1):
+            so_far = replace(self, changes=self.changes[:count], targets=tuple(each[:count] for each in self.targets))
+            found.append(so_far.at(change.at + change.over + 1.0))
+        return found
 
     def planned_at(self, elapsed: float) -> Mask:
         """Links (E,) that exist at a time [s] whatever the distance of the robots."""

@@ -344,18 +344,12 @@ class Plan:
 
     def limits(self, name: str) -> Limits:
         """Limits of a robot."""
-        x, y, z = self.experiment.arena.size
-        return Limits(
-            low=(-x / 2, -y / 2, 0.0),
-            high=(x / 2, y / 2, z),
-            hold_s=self._patience(name),
-            **msgspec.structs.asdict(self.experiment.safety),
-        )
-
-    def _patience(self, name: str) -> float:
-        """Time for which a robot holds without a position [s]; without its world it cannot move, and may wait."""
-        worldly, safety = self.experiment.robots[name].body == WORLD, self.experiment.safety
-        return self.experiment.world.patience_s if worldly else safety.land_without_position_s
+        (x, y, z), safety = self.experiment.arena.size, self.experiment.safety
+        hold_s = safety.land_without_position_s
+        if self.experiment.robots[name].body == WORLD:  # without its world it cannot move, and may wait
+            hold_s = self.experiment.world.patience_s
+        low, high = (-x / 2, -y / 2, 0.0), (x / 2, y / 2, z)
+        return Limits(low=low, high=high, hold_s=hold_s, **msgspec.structs.asdict(safety))
 
     def assignment(self, name: str, *, centrally: bool = False) -> Assignment:
         """The part of a robot.
@@ -402,25 +396,21 @@ class Plan:
 
     def _incoming(self, name: str, *, in_law: bool, avoidance: bool) -> tuple[Incoming, ...]:
         """Links on which a robot receives: those of its law, then those that only its avoidance needs."""
-        robots, kinds = self.experiment.robots, self._kind_of
-        found = []
+        robots, found = self.experiment.robots, list[Incoming]()
         for number in self._links_to.get(name, ()) if in_law else ():
             link = self.one_way_links[number]
             to, sender = link.target, link.sender
+            row = self._row[sender]
             found.append(Incoming(
-                self._row[sender], sender, kinds[sender], to.distance, to.gain, to.relative, to.bearing, to.wants, True,
+                row, sender, self.kinds[row], to.distance, to.gain, to.relative, to.bearing, to.wants, True,
                 not robots[sender].standby, self.formation.targets[number],
                 link.since, link.until, link.reach, link.release,
             ))  # fmt: skip
         for sender in self.avoidance_senders.get(name, ()) if avoidance else ():
             row, awaited = self._row[sender], not robots[sender].standby
-            found.append(Incoming(row, sender, kinds[sender], math.nan, in_law=False, awaited=awaited))
+            found.append(Incoming(row, sender, self.kinds[row], math.nan, in_law=False, awaited=awaited))
         return tuple(found)
 
     @cached_property
     def _row(self) -> dict[str, int]:
         return {name: number for number, name in enumerate(self.names)}
-
-    @cached_property
-    def _kind_of(self) -> dict[str, Kind]:
-        return dict(zip(self.names, self.kinds, strict=True))

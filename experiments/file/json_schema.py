@@ -30,7 +30,7 @@ _OWNERS: Final[dict[str, Path]] = {  # structs with a choice of a plug-in, and w
     "Obstacle": ("arena", "obstacles", "any"),
     "WorldTable": ("world",),
 }
-_CASE: Final = "InCase"
+CASE: Final = "InCase"
 SHAPES: Final = ("box", "radius", "wall")  # of an obstacle, likewise
 WORD: Final = 2**63  # integers lie below it, and not below its negative
 
@@ -62,10 +62,10 @@ def described() -> dict[str, Any]:
     definitions["RobotTable"]["properties"]["kind"]["enum"] = [kind.name for kind in KINDS.usable()]
     judged = definitions["Criterion"]["properties"]["metric"]
     judged["anyOf"] = [{"enum": judged_metrics()}, {"type": "string", "pattern": f"^{files.CHOICE}$"}]
-    partial = {name + _CASE: _partial(each) for name, each in definitions.items()}
+    partial = {name + CASE: _partial(each) for name, each in definitions.items()}
     for key in ("cases", "criteria"):
-        del partial["Experiment" + _CASE]["properties"][key]
-    case = {"$ref": f"#/definitions/Experiment{_CASE}"}
+        del partial["Experiment" + CASE]["properties"][key]
+    case = {"$ref": f"#/definitions/Experiment{CASE}"}
     definitions["Experiment"]["properties"]["cases"]["additionalProperties"] = case
     top = definitions.pop("Experiment")  # in full: a reference would hide its neighbours from draft-7 readers
     whole = {"$schema": "http://json-schema.org/draft-07/schema#", **top, "definitions": definitions | partial}
@@ -76,7 +76,7 @@ def _exclude(definitions: dict[str, Any]) -> None:
     """Adds the choices between fields of which one is given: in a case none may be, the file has it."""
     for name, fields in (("TargetTable", TARGETS), ("LinkTable", TARGETS), ("Obstacle", SHAPES)):
         several = [{"required": list(pair)} for pair in combinations(fields, 2)]
-        for each in (name, name + _CASE):
+        for each in (name, name + CASE):
             definitions[each]["not"] = {"anyOf": several}
     for owner, key, elsewhere, fields in (
         ("Formation", "links", "shape", TARGETS), ("ChangeTable", "links", "shape", TARGETS),
@@ -91,7 +91,7 @@ def _exclude(definitions: dict[str, Any]) -> None:
 
 def _bounded(node: Mapping[str, Any]) -> dict[str, Any]:
     """The same with bounds of all numbers, and with names that do not end with a line end."""
-    result = _map_children(node, _bounded)
+    result = map_children(node, _bounded)
     largest = {"number": MAX_NUMBER, "integer": WORD - 1}.get(str(node.get("type")))
     if largest is not None:
         if not {"minimum", "exclusiveMinimum"} & node.keys():
@@ -149,7 +149,7 @@ def _parameters(group: str, name: str) -> tuple[dict[str, Any], dict[str, Any]]:
 
 def _draft7(node: Mapping[str, Any]) -> dict[str, Any]:
     """Tuples as draft 7 writes them; an infinite default, which no file can have, is none."""
-    result = _map_children(node, _draft7)
+    result = map_children(node, _draft7)
     if result.get("default") == inf:
         del result["default"]
     if "prefixItems" in result:
@@ -159,13 +159,13 @@ def _draft7(node: Mapping[str, Any]) -> dict[str, Any]:
 
 def _partial(node: Mapping[str, Any]) -> dict[str, Any]:
     """The same with nothing required: a case holds only what it changes."""
-    result = _map_children(node, _partial)
+    result = map_children(node, _partial)
     if "$ref" in result:
-        result["$ref"] += _CASE
+        result["$ref"] += CASE
     return {key: value for key, value in result.items() if key not in ("required", "default")}
 
 
-def _map_children(node: Mapping[str, Any], change: Callable[[Mapping[str, Any]], dict[str, Any]]) -> dict[str, Any]:
+def map_children(node: Mapping[str, Any], change: Callable[[Mapping[str, Any]], dict[str, Any]]) -> dict[str, Any]:
     """A node with every node right below it changed."""
     result: dict[str, Any] = {}
     for key, value in node.items():

@@ -108,8 +108,8 @@ def assign(document: dict[str, Any], override: Override, *, part: bool = False) 
         step, below = _known(at, name, path, override, part=part), override.path[len(path)]
         group = group_of(path)
         inside = at[step] if isinstance(at, list) else at.get(step)
-        if inside is None and group and not part:
-            inside = _default(path)
+        if inside is None and group and not part and len(path) <= 2:  # where the file makes no choice; no plan has one
+            inside = attrgetter(".".join(map(str, path)))(_DEFAULTS)
         inside = {} if inside is None else _as_table(inside, path)
         if not isinstance(inside, dict | list):
             raise override.refused(f"'{step}' is no table, so it has no '{below}'", f"set {step} itself")
@@ -154,11 +154,6 @@ def _known(at: Any, step: str | int, path: Path, override: Override, *, part: bo
     if path[0] == "robots" and len(path) == 2 and not part and step not in at:
         raise override.refused(f"no robot is called '{step}'", did_you_mean(str(step), at))
     return str(step)
-
-
-def _default(path: Path) -> object:
-    """The choice that holds where the file makes none; None of a plan, which has no default."""
-    return attrgetter(".".join(map(str, path)))(_DEFAULTS) if len(path) <= 2 else None
 
 
 def _as_table(value: object, path: Path) -> object:

@@ -21,13 +21,11 @@ from agents.plugins.registry import did_you_mean
 
 Path = tuple[str | int, ...]
 
-_BLANK: Final = re.compile(r"(?:\s+|#[^\n]*)*")
-_SPACE: Final = re.compile(r"[ \t]*")
-_STRING: Final = re.compile(
-    r'"""(?:[^\\]|\\.)*?"{3,5}|' + r"'''.*?'{3,5}|" + r'"(?:[^"\\\n]|\\.)*"|' + r"'[^'\n]*'", re.DOTALL
-)
-_BARE_KEY: Final = re.compile(r"[^\s.=:\[\]{}\"'#,]+")
-_BARE_VALUE: Final = re.compile(r"[^,\]}#\n]*")
+# patterns that match everywhere, if need be the empty text
+_BLANK: Final = re.compile(r"(?:\s+|#[^\n]*)*")  # white space, line ends and comments
+_STRING: Final = r'"""(?:[^\\]|\\.)*?"{3,5}|' + r"'''.*?'{3,5}|" + r'"(?:[^"\\\n]|\\.)*"|' + r"'[^'\n]*'"
+_KEY_PART: Final = re.compile(rf"[ \t]*({_STRING}|[^\s.=:\[\]{{}}\"'#,]*)[ \t]*(\.?)", re.DOTALL)
+_VALUE: Final = re.compile(rf"{_STRING}|[^,\]}}#\n]*", re.DOTALL)
 
 
 @dataclass(frozen=True)
@@ -106,29 +104,21 @@ class _Scan:
 
     def key(self, at: int) -> tuple[list[tuple[str, int]], int]:
         """The parts of a dotted key with their offsets, and where the delimiter behind it stands."""
-        parts = []
-        while True:
-            at = _end(_SPACE, self.text, at)
-            quoted = _STRING.match(self.text, at)
-            end = quoted.end() if quoted else _end(_BARE_KEY, self.text, at)
-            parts.append((self.unquoted(at, end) if quoted else self.text[at:end], at))
-            at = _end(_SPACE, self.text, end)
-            if self.text[at : at + 1] != ".":
-                return parts, at
-            at += 1
-
-    def unquoted(self, start: int, end: int) -> str:
-        """A quoted key without its quotes and escapes."""
-        quoted = self.text[start:end]
-        return str(msgspec.json.decode(quoted) if self.json else tomllib.loads(f"key = {quoted}")["key"])
+        parts, dot = [], "."
+        while dot:
+            match = _match(_KEY_PART, self.text, at)
+            name, dot, at = match[1], match[2], match.end()
+            if name[:1] in ('"', "'"):  # without its quotes and escapes
+                name = str(msgspec.json.decode(name) if self.json else tomllib.loads(f"key = {name}")["key"])
+            parts.append((name, match.start(1)))
+        return parts, at
 
     def value(self, path: Path, at: int) -> int:
         """Scan the value behind `=`; return its end."""
         closing = {"[": "]", "{": "}"}.get(self.text[at : at + 1])
         if closing is not None:
             return self.several(path, at, closing)
-        string = _STRING.match(self.text, at)
-        return string.end() if string else _end(_BARE_VALUE, self.text, at)
+        return _match(_VALUE, self.text, at).end()
 
     def several(self, path: Path, at: int, closing: str) -> int:
         """Scan a list or an inline table; return its end."""
@@ -147,14 +137,15 @@ class _Scan:
         return at + 1
 
 
-def _end(pattern: re.Pattern[str], text: str, at: int) -> int:
+def _match(pattern: re.Pattern[str], text: str, at: int) -> re.Match[str]:
     match = pattern.match(text, at)
-    return match.end() if match else at
+    assert match is not None
+    return match
 
 
 def _blank(text: str, at: int) -> int:
     """Offset behind white space, line ends and comments."""
-    return _end(_BLANK, text, at)
+    return _match(_BLANK, text, at).end()
 
 
 SHOWN_CHARACTERS = 100  # characters of a source line; longer ones are cut around the place

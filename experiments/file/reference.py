@@ -17,7 +17,7 @@ import msgspec
 
 from agents.body.kinds import KINDS, Kind
 from experiments.catalogue.index import FOLDER
-from experiments.file.json_schema import described
+from experiments.file.json_schema import CASE, described, map_children
 
 NONE: Final[Mapping[str, object]] = {}
 _NAMES: Final = {  # tables with names as keys, and an example of such a name
@@ -57,7 +57,15 @@ class Entry(msgspec.Struct, frozen=True):
 def entries() -> tuple[Entry, ...]:
     """Every key, tables before their keys, in the order of the structs."""
     whole = described()
-    return tuple(_walk(whole, whole["definitions"], ""))
+    return tuple(_walk(_inlined(whole, whole["definitions"]), ""))
+
+
+def _inlined(node: Mapping[str, Any], definitions: Mapping[str, Any]) -> dict[str, Any]:
+    """A node of the schema with the definitions that it refers to in their places, but for those of cases."""
+    name = node.get("$ref", CASE).rpartition("/")[2]
+    inner = {} if name.endswith(CASE) else definitions[name]
+    own = {key: value for key, value in node.items() if key not in ("$ref", "definitions")}
+    return map_children({**inner, **own}, lambda each: _inlined(each, definitions))
 
 
 def matching(asked: str) -> list[Entry]:
@@ -130,54 +138,42 @@ def _has_end(entry: Entry, sought: str) -> bool:
     return any(re.fullmatch("".join(patterns[k:]), sought) for k in range(1, len(parts)) if not parts[k].isupper())
 
 
-def _walk(
-    node: Mapping[str, Any], definitions: Mapping[str, Any], path: str, needed: Mapping[str, object] = NONE
-) -> Iterator[Entry]:
+def _walk(node: Mapping[str, Any], path: str, needed: Mapping[str, object] = NONE) -> Iterator[Entry]:
     """Entries below a path; in a plug-in with the parameters that it cannot do without."""
     for name, field in node.get("properties", {}).items():
         if name == "kind" and {"const", "pattern"} & field.keys():  # of a plug-in
             continue
         key = f"{path}.{name}" if path else name
-        yield _entry(key, field, name in node.get("required", []), definitions, needed)
+        yield _entry(key, field, name in node.get("required", []), needed)
         if key != "cases":  # a case repeats what stands above
-            yield from _keys_below(key, name, field, definitions)
+            yield from _keys_below(key, name, field)
 
 
-def _keys_below(key: str, name: str, field: Mapping[str, Any], definitions: Mapping[str, Any]) -> Iterator[Entry]:
+def _keys_below(key: str, name: str, field: Mapping[str, Any]) -> Iterator[Entry]:
     """Keys of the tables that a field can hold."""
-    for option in field.get("anyOf", [field]):
-        inner = _resolved(option, definitions)
+    for inner in field.get("anyOf", [field]):
         if isinstance(more := inner.get("additionalProperties"), dict):
             named = f"{key}.{_NAMES.get(name, ('NAME', ''))[0]}"
             for each in more.get("anyOf", [more]):
-                yield from _walk(_resolved(each, definitions), definitions, named)
+                yield from _walk(each, named)
         elif inner.get("type") == "array" and isinstance(inner.get("items"), dict):
-            yield from _walk(_resolved(inner["items"], definitions), definitions, key)
+            yield from _walk(inner["items"], key)
         elif "kind" in inner.get("properties", {}) and "const" in inner["properties"]["kind"]:
             plugin = f"{key}({inner['properties']['kind']['const']})"
             text = _joined(inner.get("description", ""))
-            needed = {each: _made(inner["properties"][each], definitions) for each in inner.get("required", [])}
+            needed = {each: _made(inner["properties"][each]) for each in inner.get("required", [])}
             needed.pop("kind", None)
-            yield Entry(plugin, text, "a plug-in", "", "", False, _example(plugin, {}, definitions, needed))
-            yield from _walk(inner, definitions, plugin, needed)
+            yield Entry(plugin, text, "a plug-in", "", "", False, _example(plugin, {}, needed))
+            yield from _walk(inner, plugin, needed)
         else:
-            yield from _walk(inner, definitions, key)
+            yield from _walk(inner, key)
 
 
-def _resolved(node: Mapping[str, Any], definitions: Mapping[str, Any]) -> Mapping[str, Any]:
-    while "$ref" in node:
-        node = definitions[node["$ref"].rpartition("/")[2]]
-    return node
-
-
-def _entry(
-    key: str, field: Mapping[str, Any], required: bool, definitions: Mapping[str, Any], needed: Mapping[str, object]
-) -> Entry:
-    inner = _resolved(field, definitions)
-    text = _joined(field.get("description") or inner.get("description", ""))
+def _entry(key: str, field: Mapping[str, Any], required: bool, needed: Mapping[str, object]) -> Entry:
+    text = _joined(field.get("description", ""))
     default = "" if "default" not in field or field["default"] is None else written(field["default"])
-    example = _example(key, field, definitions, needed)
-    return Entry(key, text, _type(field, definitions), _limits(inner), default, required, example)
+    example = _example(key, field, needed)
+    return Entry(key, text, _type(field), _limits(field), default, required, example)
 
 
 def _joined(text: str) -> str:
@@ -185,23 +181,22 @@ def _joined(text: str) -> str:
     return "\n\n".join(" ".join(part.split()) for part in re.split(r"\n\s*\n", text.strip()))
 
 
-def _type(field: Mapping[str, Any], definitions: Mapping[str, Any]) -> str:
-    inner = _resolved(field, definitions)
-    if "enum" in inner:
-        return "one of " + ", ".join(written(each) for each in inner["enum"])
-    if "anyOf" in inner:
-        kinds = dict.fromkeys(_type(each, definitions) for each in inner["anyOf"])
+def _type(field: Mapping[str, Any]) -> str:
+    if "enum" in field:
+        return "one of " + ", ".join(written(each) for each in field["enum"])
+    if "anyOf" in field:
+        kinds = dict.fromkeys(_type(each) for each in field["anyOf"])
         return " or ".join(kind for kind in kinds if kind)
-    if inner.get("type") == "array":
-        items = inner.get("items", {})
-        each = _resolved(items[0] if isinstance(items, list) and items else items, definitions)
-        least, most = inner.get("minItems"), inner.get("maxItems")
+    if field.get("type") == "array":
+        items = field.get("items", {})
+        each = items[0] if isinstance(items, list) and items else items
+        least, most = field.get("minItems"), field.get("maxItems")
         count = f"{least} " if least == most and least else f"{least} to {most} " if most else ""
         many = {"number": "numbers", "integer": "whole numbers", "string": "texts", "array": "lists"}
         return f"a list of {count}{many.get(each.get('type', ''), 'tables')}"
-    if isinstance(inner.get("additionalProperties"), dict) and not inner.get("properties"):
+    if isinstance(field.get("additionalProperties"), dict) and not field.get("properties"):
         return "a table of names"
-    return _TYPES.get(str(inner.get("type")), "a value")
+    return _TYPES.get(str(field.get("type")), "a value")
 
 
 def _limits(field: Mapping[str, Any]) -> str:
@@ -224,13 +219,13 @@ def written(value: object) -> str:
     return f"{value:g}" if isinstance(value, float) and not value.is_integer() else str(value)
 
 
-def _example(key: str, field: Mapping[str, Any], definitions: Mapping[str, Any], needed: Mapping[str, object]) -> str:
+def _example(key: str, field: Mapping[str, Any], needed: Mapping[str, object]) -> str:
     """Lines from a ready-made experiment, or else made of the default and the limits."""
     parts = _split(key)
     if found := [lines for document in _documents() for lines in _occurrences(document, parts, ())]:
         return min(found, key=len)
     value = field.get("default") or next(iter(field.get("examples", ())), None)
-    made = _made(field, definitions) if value in (None, {}, [], math.inf) else value
+    made = _made(field) if value in (None, {}, [], math.inf) else value
     names = dict(_NAMES.values())
     path = [(names.get(part, "A"), None) if part.isupper() else (part, part in _LISTS) for part in parts]
     return _lines(path, made, needed)
@@ -287,25 +282,24 @@ def _lines(path: Sequence[Step], value: object, needed: Mapping[str, object] = N
     return (f"[[{header}]]\n" if many else f"[{header}]\n" if header else "") + f"{last} = {written(value)}"
 
 
-def _made(field: Mapping[str, Any], definitions: Mapping[str, Any]) -> object:
+def _made(field: Mapping[str, Any]) -> object:
     """A value that the schema permits."""
-    inner = _resolved(field, definitions)
-    value: object = {"boolean": True, "string": "a text"}.get(str(inner.get("type")), 1.0)
-    if "enum" in inner:
-        value = inner["enum"][0]
-    elif "anyOf" in inner:
-        value = _made(next(each for each in inner["anyOf"] if each.get("type") != "null"), definitions)
-    elif inner.get("type") == "array":
-        items = inner.get("items", {"type": "number"})
-        each = items if isinstance(items, list) else [items] * max(1, inner.get("minItems", 1))
-        value = [_made(item, definitions) for item in each]
-    elif inner.get("type") == "object":
-        needed = {name: _made(inner["properties"][name], definitions) for name in inner.get("required", [])}
-        more = inner.get("additionalProperties")
-        value = {"A": _made(more, definitions)} if not needed and isinstance(more, dict) else needed
-    elif inner.get("type") in {"number", "integer"}:
-        least = inner.get("minimum", inner.get("exclusiveMinimum", 0))
-        most = inner.get("maximum", inner.get("exclusiveMaximum", least + 2))
+    value: object = {"boolean": True, "string": "a text"}.get(str(field.get("type")), 1.0)
+    if "enum" in field:
+        value = field["enum"][0]
+    elif "anyOf" in field:
+        value = _made(next(each for each in field["anyOf"] if each.get("type") != "null"))
+    elif field.get("type") == "array":
+        items = field.get("items", {"type": "number"})
+        each = items if isinstance(items, list) else [items] * max(1, field.get("minItems", 1))
+        value = [_made(item) for item in each]
+    elif field.get("type") == "object":
+        needed = {name: _made(field["properties"][name]) for name in field.get("required", [])}
+        more = field.get("additionalProperties")
+        value = {"A": _made(more)} if not needed and isinstance(more, dict) else needed
+    elif field.get("type") in {"number", "integer"}:
+        least = field.get("minimum", field.get("exclusiveMinimum", 0))
+        most = field.get("maximum", field.get("exclusiveMaximum", least + 2))
         number = (least + most) / 2 if most < least + 2 else least + 1
-        value = int(number) if inner["type"] == "integer" else number
+        value = int(number) if field["type"] == "integer" else number
     return value

@@ -51,9 +51,8 @@ def content(file: Path, label: str) -> str:
     except (OSError, ValueError) as error:
         raise refusal(label, f"cannot be read: {reason(error)}", "check the name and the permissions") from error
     if len(found) > MAX_TEXT_BYTES:
-        raise refusal(
-            label, f"is longer than {MAX_TEXT_BYTES // 1_000_000} MB", "name the experiment file, not a recording"
-        )
+        message = f"is longer than {MAX_TEXT_BYTES // 1_000_000} MB"
+        raise refusal(label, message, "name the experiment file, not a recording")
     return decoded(found, label)
 
 

@@ -353,7 +353,10 @@ def read(file: str, text: str, poses: Mapping[str, Pose], notes: list[str]) -> P
             task.value["enable"] = bool(related) or task.value.get("enable", True)
     robots, problems = dict[str, ParkRobot](), list[Problem]()
     for entry in entries:
-        _strip_idle_task(entry)
+        idle = entry.value.get("task")
+        if isinstance(idle, dict) and str(idle.get("enable", True)).lower() == "false":
+            # of a task that is switched off what is counted is read: other values in it may be anything
+            entry.value["task"] = {key: idle[key] for key in ("enable", "relationship") if key in idle}
         try:
             robots[entry.key] = (entry if given.robots else _settings(entry)).typed(ParkRobot)
             task = entry.value.get("task", {}) if given.robots else {}
@@ -388,13 +391,6 @@ def _counted(file: str, problems: list[Problem]) -> list[Problem]:
     shown = ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
     message = f"names {len(names)} file{'s' * (len(names) > 1)} of robots that are not beside it: {shown}"
     return [*(each for each in problems if each not in missing), Problem(file, 0, 0, message, missing[0].hint)]
-
-
-def _strip_idle_task(entry: YamlValue) -> None:
-    """Leave of a task that is switched off what is counted: other values in it may be anything."""
-    task = entry.value.get("task")
-    if isinstance(task, dict) and str(task.get("enable", True)).lower() == "false":
-        entry.value["task"] = {key: task[key] for key in ("enable", "relationship") if key in task}
 
 
 def _entries(root: YamlValue) -> list[YamlValue]:
