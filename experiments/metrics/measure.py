@@ -21,21 +21,10 @@ from experiments.definition.graph import Links
 from experiments.metrics import centralised
 from experiments.metrics.clearance import collisions
 from experiments.metrics.comparable import reasons
-from experiments.metrics.metric import (
-    case_values,
-    known_metrics,
-    metrics_of_criteria,
-    unusable_metrics,
-    values_of,
-)
+from experiments.metrics.metric import case_values, known_metrics, metrics_of_criteria, unusable_metrics, values_of
 from experiments.metrics.results import Approach, Belief, CaseMetrics, Collision, LawMeasure, RobotMetrics
 from experiments.metrics.shadow import agreement
-from experiments.metrics.signals import (
-    Measurement,
-    link_deliveries,
-    mean_known,
-    outside_arena,
-)
+from experiments.metrics.signals import Measurement, link_deliveries, mean_known, outside_arena
 from experiments.recording.trace import Trace
 from twins.arrays import Array, norm
 

@@ -159,11 +159,7 @@ class VirtualRun:
         return self._body is self.twin and self.twin.lonely and self.network.is_plain
 
     def fly(
-        self,
-        *,
-        landing: bool,
-        progress: Callable[[float], object],
-        watch: Callable[[Snapshot], object] | None,
+        self, *, landing: bool, progress: Callable[[float], object], watch: Callable[[Snapshot], object] | None
     ) -> None:
         """Flies until all robots are done, or to the end of the run without `landing`."""
         conductor, dt, first = self._conductor, self.dt, self.robots[0]
