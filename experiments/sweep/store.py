@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import fcntl
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Final, Self
 
@@ -38,17 +39,11 @@ class StoreOrigin(msgspec.Struct, frozen=True):
 
 
 class Store:
-    """The runs in a folder; a context manager, because two sweeps must not write into one folder.
-
-    Attributes:
-        damaged: Lines that could not be read.
-    """
+    """The runs in a folder; a context manager, because two sweeps must not write into one folder."""
 
     def __init__(self, folder: Path) -> None:
         self._folder, self._path = folder, folder / RUNS
-        self._runs: dict[tuple[str, str], dict[int, RunMetrics]] = {}
-        self._failed: dict[tuple[str, str], dict[int, str]] = {}
-        self.damaged = 0
+        self._known: dict[tuple[str, str], dict[int, RunMetrics | str]] = {}  # reasons of those that failed
 
     def __enter__(self) -> Self:
         """Opens the folder, and reads what is there.
@@ -90,18 +85,9 @@ class Store:
             found.append("the experiment file has changed: affected runs are repeated")
         return found
 
-    def runs(self, cell: str, code: str) -> dict[int, RunMetrics]:
-        """Runs of a cell that are done, by seed."""
-        return self._runs.get((cell, code), {})
-
-    def failed(self, cell: str, code: str) -> dict[int, str]:
-        """Reasons by seed that failed."""
-        return self._failed.get((cell, code), {})
-
-    def missing(self, cell: str, code: str, seeds: Sequence[int]) -> list[int]:
-        """Seeds that are neither done nor known to fail."""
-        done, failed = self.runs(cell, code), self.failed(cell, code)
-        return [seed for seed in seeds if seed not in done and seed not in failed]
+    def known(self, cell: str, code: str) -> Mapping[int, RunMetrics | str]:
+        """Runs of a cell that are done, by seed; of one that failed the reason."""
+        return self._known.get((cell, code), {})
 
     def add(self, cell: str, code: str, outcome: WorkResult) -> None:
         """Keeps results of some seeds; they are on the disk when this returns.
@@ -123,13 +109,9 @@ class Store:
             self._file.write(b"\n")  # a line that was cut off must not swallow the next
             self._file.flush()
         for text in content.splitlines():
-            if text:
-                try:
-                    self._keep(msgspec.json.decode(text, type=_Line))
-                except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
-                    self.damaged += 1
+            with suppress(msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+                self._keep(msgspec.json.decode(text, type=_Line))
 
     def _keep(self, line: _Line) -> None:
-        key = (line.cell, line.code)
-        self._runs.setdefault(key, {}).update({run.seed: run for run in line.runs})
-        self._failed.setdefault(key, {}).update(line.failed)
+        known = self._known.setdefault((line.cell, line.code), {})
+        known |= line.failed | {run.seed: run for run in line.runs}

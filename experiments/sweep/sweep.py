@@ -164,18 +164,18 @@ class SweepRunner:
 
     def missing(self, cell: Cell, seeds: Sequence[int]) -> list[int]:
         """Seeds of a cell that are still to be done."""
-        return self.store.missing(cell.digest, code_of(cell.plan), seeds)
+        known = self._known(cell, seeds)
+        return [seed for seed in seeds if seed not in known]
 
     def rows(self, plan: Sequence[Cell], seeds: Sequence[int]) -> list[CellRow]:
         """The cells of which anything is done."""
         by_digest = {cell.digest: cell for cell in plan}
         found = []
         for cell in plan:
-            mine = self._runs(cell, seeds)
-            failed = self.store.failed(cell.digest, code_of(cell.plan))
-            lost = sum(seed in failed for seed in seeds)
-            if mine or lost:
-                found.append(table.row(cell, mine, self._runs(by_digest[cell.reference], seeds), lost))
+            known, mine = self._known(cell, seeds), self._runs(cell, seeds)
+            if known:
+                reference = self._runs(by_digest[cell.reference], seeds)
+                found.append(table.row(cell, mine, reference, len(known) - len(mine)))
         return found
 
     def failures(self, plan: Sequence[Cell], seeds: Sequence[int]) -> tuple[str, ...]:
@@ -183,8 +183,8 @@ class SweepRunner:
         return tuple(
             f"{cell.case} {' '.join(f'{path}={value}' for path, value in cell.parameters.items())}, seed {seed}: {why}"
             for cell in _distinct(plan)
-            for seed, why in self.store.failed(cell.digest, code_of(cell.plan)).items()
-            if seed in seeds
+            for seed, why in self._known(cell, seeds).items()
+            if isinstance(why, str)
         )
 
     def metric_faults(self, plan: Sequence[Cell], seeds: Sequence[int]) -> list[str]:
@@ -192,9 +192,12 @@ class SweepRunner:
         runs = (run for cell in _distinct(plan) for run in self._runs(cell, seeds).values())
         return [*unusable_metrics(), *dict.fromkeys(text for run in runs for text in run.metric_faults)]
 
+    def _known(self, cell: Cell, seeds: Sequence[int]) -> dict[int, RunMetrics | str]:
+        known = self.store.known(cell.digest, code_of(cell.plan))
+        return {seed: known[seed] for seed in seeds if seed in known}
+
     def _runs(self, cell: Cell, seeds: Sequence[int]) -> dict[int, RunMetrics]:
-        done = self.store.runs(cell.digest, code_of(cell.plan))
-        return {seed: done[seed] for seed in seeds if seed in done}
+        return {seed: run for seed, run in self._known(cell, seeds).items() if not isinstance(run, str)}
 
 
 def side_by_side(plan: Plan) -> int:

@@ -138,12 +138,6 @@ def read_json(path: Path) -> tuple[dict[str, Any], list[CellRow]]:
         raise ValueError(str(error)) from None
 
 
-def _of_seeds(row: CellRow, text: str, index: str) -> str:
-    """A ratio in words, and of how many seeds it is, unless it is of all."""
-    known = row.value(index).n
-    return text if known in {0, row.seeds} else f"{text} ({known} of {row.seeds})"
-
-
 def _mean_of(row: CellRow, metric: Metric, name: str) -> str:
     """Mean over the seeds; of a metric that must be known of all robots, with the number of seeds in which it is."""
     mean = row.mean.get(name, UNKNOWN)
@@ -155,7 +149,9 @@ def _mean_of(row: CellRow, metric: Metric, name: str) -> str:
 
 
 def _ratio_of(row: CellRow, name: str) -> str:
-    return _of_seeds(row, ratio_words(row.ratio.get(name, UNKNOWN)), name)
+    """Ratio, and of how many seeds it is, unless it is of all."""
+    ratio = row.ratio.get(name, UNKNOWN)
+    return ratio_words(ratio) + (f" ({ratio.n} of {row.seeds})" if ratio.n not in {0, row.seeds} else "")
 
 
 def numbers() -> dict[str, tuple[str, Callable[[CellRow], str]]]:

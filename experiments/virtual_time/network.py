@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import chain
 from math import inf, nan
 from operator import itemgetter
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from msgspec.structs import replace
@@ -17,15 +18,13 @@ from agents.decision.stepping import Words
 from agents.network import messages
 from agents.network.channel_model import ROUNDING_S, Channel
 from agents.robot import Robot
-from agents.vectors import UNKNOWN, ZERO, Vector
+from agents.vectors import ZERO, Vector
 from experiments.arrays import PoseTable
 from experiments.definition.link_conditions import FROM_CENTRE, TO_CENTRE, conditions_of
 from experiments.definition.plan import Plan
 from experiments.recording.trace import EPOCH
 from experiments.virtual_time.company import SENT, Ledger, Member, Way
 from twins.arrays import Array, Index
-
-NOTHING: Final[Vector] = UNKNOWN
 
 
 class Sample(NamedTuple):
@@ -77,10 +76,8 @@ class VirtualCentre:
         self._link_of = {row: link for link, row in enumerate(self._needed)}
         self._goal_link = {row: link for link, row in enumerate(self._guided)}
         self._seq = [0] * len(robots)
-        self._sent: list[Arrived] = []
-        self._followed: list[Arrived] = []
-        self._received: list[Arrived] = []
-        self._sizes = _Sizes(plan)
+        self._plan, self._sent, self._followed, self._received = plan, _Samples(1), _Samples(1), _Samples()
+        self.instant = self._goals.instant  # goals are received within the tick
 
     def transmit(self, sample: Sample, start: float, size: int) -> None:
         """A robot transmits its pose to the central controller; see `VirtualNetwork.transmit`."""
@@ -92,14 +89,14 @@ class VirtualCentre:
         for link, arrival, sample in self._poses.due(t):
             row = self._needed[link]
             self.centre.receive(row, sample.position, sample.velocity, sample.stamp, arrival, yaw=sample.yaw)
-            self._received.append((row, arrival, sample))
+            self._received.add(row, arrival, sample)
         newest = {link: sample for link, _, sample in sorted(self._goals.due(t), key=lambda each: each[2].stamp)}
         for link, sample in sorted(newest.items()):  # of several for one robot the newest counts
             row = self._guided[link]
             guidance = self._robots[row].guidance
             assert guidance is not None
             if guidance.receive(sample.position, sample.yaw, sample.stamp, sample.velocity):
-                self._followed.append((row, t, sample))
+                self._followed.add(row, t, sample, (sample.pose,))
 
     def retire(self, row: int, t: float) -> None:
         """A robot is lost to the central controller at `t` [s]; see `VirtualNetwork.retire`."""
@@ -117,56 +114,24 @@ class VirtualCentre:
             row = goal.row
             self._seq[row] += 1
             sample = Sample(row, self._seq[row], t, goal.goal, goal.velocity, goal.yaw, goal.pose_stamp)
-            size = self._sizes.of(sample._replace(velocity=ZERO), min(starts)) if self._goals.limited else 0
+            size = _size(self._plan, sample._replace(velocity=ZERO), min(starts)) if self._goals.limited else 0
             self._goals.send(self._goal_link[row], sample, sample.seq, t, start=min(starts), size=size)
-            self._sent.append((row, t, sample))
-
-    @property
-    def instant(self) -> bool:
-        return self._goals.instant
+            self._sent.add(row, t, sample, (sample.pose,))
 
     def logged(self, begin: float) -> CentreLog:
         """The log, with times since the common start at `begin` [s]."""
         lost = np.zeros(len(self._seq), dtype=np.intp)
         lost[self._needed] = self._poses.dropped
-        return CentreLog(
-            sent=_table(self._sent, begin, goals=True),
-            followed=_table(self._followed, begin, bare=True, goals=True),
-            received=_table(self._received, begin, bare=True),
-            lost_poses=lost,
-        )
+        goals = (self._sent.table(begin), self._followed.table(begin, bare=True))
+        sent, followed = (replace(each, extra=each.extra - begin) for each in goals if each.extra is not None)
+        return CentreLog(sent, followed, self._received.table(begin, bare=True), lost)
 
 
-class _Sizes:
-    """Sizes of payloads, as a real network carries them."""
-
-    def __init__(self, plan: Plan) -> None:
-        self._names, self._encoding = plan.names, plan.experiment.network.encoding
-
-    def of(self, sample: Sample, start: float) -> int:
-        """Bytes of a pose; `start` is the common start [s]."""
-        stamp = EPOCH + (sample.stamp - start if sample.stamp >= start else 0.0)
-        pose = messages.pose(
-            self._names[sample.row], sample.seq, stamp, sample.position, sample.velocity,
-            yaw=sample.yaw, words=sample.words,
-        )  # fmt: skip
-        return len(messages.encode(pose, self._encoding))
-
-
-def _table(arrived: Sequence[Arrived], begin: float, *, bare: bool = False, goals: bool = False) -> PoseTable:
-    """A table of samples, with times since the common start at `begin` [s]; `bare`: numbers and times alone."""
-    samples = [sample for _, _, sample in arrived]
-    count = len(samples)
-    return PoseTable(
-        np.array([link for link, _, _ in arrived], dtype=np.intp),
-        np.array([sample.seq for sample in samples], dtype=np.intp),
-        np.array([sample.stamp for sample in samples], dtype=float) - begin,
-        np.array([arrival for _, arrival, _ in arrived], dtype=float) - begin,
-        np.zeros((count, 0)) if bare else np.array([each.position for each in samples], dtype=float).reshape(-1, 3),
-        np.zeros((count, 0)) if bare else np.array([each.velocity for each in samples], dtype=float).reshape(-1, 3),
-        None if bare else np.array([each.yaw for each in samples], dtype=float),
-        extra=np.array([[each.pose - begin] for each in samples], dtype=float).reshape(-1, 1) if goals else None,
-    )
+def _size(plan: Plan, sample: Sample, start: float) -> int:
+    """Bytes of a pose, as a real network carries it; `start` is the common start [s]."""
+    name, stamp = plan.names[sample.row], EPOCH + (sample.stamp - start if sample.stamp >= start else 0.0)
+    pose = messages.pose(name, sample.seq, stamp, sample.position, sample.velocity, yaw=sample.yaw, words=sample.words)
+    return len(messages.encode(pose, plan.experiment.network.encoding))
 
 
 class VirtualNetwork:
@@ -174,7 +139,7 @@ class VirtualNetwork:
 
     def __init__(self, plan: Plan, robots: Sequence[Robot], seed: int, *, lean: bool) -> None:
         """Network of all robots; `lean` as for `experiments.virtual_time.simulation.simulate`."""
-        self._robots, self._lean = robots, lean
+        self._plan, self._robots, self._lean = plan, robots, lean
         ends = [(sender.name, robot.assignment.name) for robot in robots for sender in robot.neighbours.all]
         self._channel = Channel(conditions_of(plan, ends, seed))
         # by link: the robot that receives on it, and the number among its links
@@ -187,26 +152,23 @@ class VirtualNetwork:
         self.centre = VirtualCentre(plan, robots, seed) if guided else None
         self.seq = [0] * len(robots)  # number of the last pose of each robot
         self.retired: set[int] = set()  # robots that are silent
-        self._sizes = _Sizes(plan)
-        self._sent, self._received = _Samples(), _Samples()
-        self._words: list[Words] = []  # said with the poses, where they say something
         # names and sizes of the variables that they say
         self.says = {} if robots[0].stepping is None else robots[0].stepping.says
-
-    @property
-    def instant(self) -> bool:
-        """Whether poses that are transmitted are received within the tick."""
-        return self._channel.instant
+        self._sent, self._received = _Samples(0 if lean else sum(self.says.values())), _Samples()
+        self.instant = self._channel.instant  # poses that are transmitted are received within the tick
+        self.delays = self._channel.delays  # of each link [s]
+        self.is_plain = self.centre is None and self._channel.plain  # all that a link does is to take its time
 
     def transmit(self, row: int, robot: Robot, t: float, yaw: float, start: float) -> None:
         """A robot transmits its pose at `t` [s]. Before the common start at `start` [s] nothing is lost."""
         self.seq[row] += 1
         seq, channel = self.seq[row], self._channel
         sample = Sample(row, seq, t, robot.sent_position, robot.sent_velocity, yaw, words=robot.words)
-        self._sent.add((row, t, sample))
+        said: dict[str, tuple[float, ...]] = {}
         if self.says and not self._lean:
-            self._words.append(sample.words)
-        size = self._sizes.of(sample, start) if channel.limited else 0
+            said = {name: (nan,) * size for name, size in self.says.items()} | dict(robot.words)
+        self._sent.add(row, t, sample, tuple(chain.from_iterable(said.values())))
+        size = _size(self._plan, sample, start) if channel.limited else 0
         for link in self._links[row]:
             channel.send(link, sample, seq, t, start=start, size=size)
         if self.centre is not None:
@@ -236,7 +198,7 @@ class VirtualNetwork:
                 said=dict(sample.words) if sample.words else NO_WORDS,
             )
             if not self._lean:
-                self._received.add((link, arrival, sample))
+                self._received.add(link, arrival, sample)
         if self.centre is not None:
             self.centre.deliver(t)
 
@@ -245,34 +207,14 @@ class VirtualNetwork:
         received = self._received.table(begin)
         received = received.take(np.lexsort((received.link, received.arrival)))  # as a recording has them
         return {
-            "sent": replace(self._sent.table(begin, bare=self._lean), extra=self._extra()),
+            "sent": self._sent.table(begin, bare=self._lean),
             "says": self.says,
-            "received": PoseTable(
-                received.link, received.seq, received.stamp, received.arrival, received.position, received.velocity
-            ),
+            "received": replace(received, yaw=None),
             "lost": np.array(self._channel.dropped, dtype=np.intp),
             "centre": None if self.centre is None else self.centre.logged(begin),
         }
 
-    def _extra(self) -> Array | None:
-        """Variables said with each pose (M, k), in the order of their names in `says`; None: none are."""
-        if not self._words:
-            return None
-        blank = {name: (nan,) * size for name, size in self.says.items()}
-        said = [{**blank, **dict(words)} for words in self._words]
-        return np.array([[number for values in each.values() for number in values] for each in said])
-
     # ------------------------------------------------------------------ compiled stretches
-
-    @property
-    def delays(self) -> list[float]:
-        """Delay of each link [s], where `is_plain`."""
-        return self._channel.delays
-
-    @property
-    def is_plain(self) -> bool:
-        """Whether all that a link does is to take its time."""
-        return self.centre is None and self._channel.plain
 
     def board(self, ways: Sequence[Way]) -> list[tuple[int, float, Sample]]:
         """Hand all samples that are under way to the `ways` of their links; returns them."""
@@ -332,13 +274,16 @@ def _row(sample: Sample) -> tuple[float, ...]:
 class _Samples:
     """Samples with their links and arrivals, in the order in which they were noted."""
 
-    def __init__(self) -> None:
+    def __init__(self, extra: int = 0) -> None:
+        """`extra`: how many more numbers each sample has."""
         self._parts: list[Array] = []  # (K, 12): link, arrival [s], and the numbers of a sample
         self._last: list[tuple[float, ...]] = []
+        self._width, self._extra = extra, list[tuple[float, ...]]()
 
-    def add(self, arrived: Arrived) -> None:
-        link, arrival, sample = arrived
+    def add(self, link: int, arrival: float, sample: Sample, extra: tuple[float, ...] = ()) -> None:
         self._last.append((float(link), arrival, *_row(sample)))
+        if extra:
+            self._extra.append(extra)
 
     def extend(self, samples: Array, arrival: Array, link: Array) -> None:
         """Add samples (K, 10) with their `arrival` (K,) [s] and `link` (K,)."""
@@ -363,4 +308,5 @@ class _Samples:
             nothing if bare else all_of_them[:, 5:8],
             nothing if bare else all_of_them[:, 8:11],
             None if bare else all_of_them[:, 11],
+            extra=np.array(self._extra).reshape(-1, self._width) if self._width else None,
         )

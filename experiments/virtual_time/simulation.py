@@ -135,6 +135,8 @@ class VirtualRun:
         self.twin = TwinBody(request, shared_world(plan, names))
         self._body = shadowed(self.twin, request, shadow_periods(plan, names))
         self.network = VirtualNetwork(plan, self.robots, seed, lean=lean)
+        # each robot moves by itself, and the network does nothing but take its time
+        self.lonely = self._body is self.twin and self.twin.lonely and self.network.is_plain
         self._laws = [robot.stepping for robot in self.robots]  # those of guided robots are the centre's
         if (centre := self.network.centre) is not None:
             guides = centre.centre.robots
@@ -152,11 +154,6 @@ class VirtualRun:
         self._touches: list[Touch] = []
         # memory and measures of each robot at each sample
         self._remembered: list[list[tuple[Memory, Mapping[str, float]]]] = []
-
-    @property
-    def lonely(self) -> bool:
-        """Whether each robot moves by itself, and the network does nothing but take its time."""
-        return self._body is self.twin and self.twin.lonely and self.network.is_plain
 
     def fly(
         self, *, landing: bool, progress: Callable[[float], object], watch: Callable[[Snapshot], object] | None

@@ -96,11 +96,7 @@ class Flown(Protocol):
     dt: float  # of a tick [s]
     log_every: int  # ticks from one sample to the next
     lean: bool  # of samples true positions alone
-
-    @property
-    def lonely(self) -> bool:
-        """Whether each robot moves by itself, and the network does nothing but take its time."""
-        ...
+    lonely: bool  # each robot moves by itself, and the network does nothing but take its time
 
     def note(self, ledger: Ledger) -> None:
         """Note the samples of a stretch."""

@@ -336,8 +336,7 @@ def sweep_runs() -> Iterator[Target]:
             file.write_bytes(runs)
             (file.parent / store.ORIGIN).write_bytes(origin)
             with Store(file.parent) as kept:
-                kept.runs("c", "d")
-                kept.missing("c", "d", [1, 2, 3])
+                kept.known("c", "d")
                 kept.changed_since(StoreOrigin("1", "2", "3"))
 
         yield Target([line * 2 + b'\0{"version":"1","code":"2","file":"3"}', line + line[:30]], take, (DocumentError,))
