@@ -164,7 +164,7 @@ def eventually() -> Callable[[Callable[[], object]], None]:
 @pytest.fixture
 def unflown(monkeypatch: pytest.MonkeyPatch) -> None:
     """`check` flies one second only: enough for findings that take no flight."""
-    monkeypatch.setattr("experiments.check.ideal_run.WORK", 0.0)
+    monkeypatch.setattr("experiments.check.ideal_run.flown_ticks", lambda *_: 0.0)
 
 
 @pytest.fixture(autouse=True)

@@ -127,11 +127,11 @@ def isolated(plan: Plan) -> Plan:
         rates=msgspec.structs.replace(experiment.rates, state_hz=experiment.rates.coordination_hz),
     )
     rate = experiment.rates.body_hz * len(robots)
-    seconds = max(1.0, math.floor(_work(bare, experiment.duration_s * rate) / rate))
+    seconds = max(1.0, math.floor(flown_ticks(bare, experiment.duration_s * rate) / rate))
     return bare.changed(duration_s=min(experiment.duration_s, seconds))
 
 
-def _work(bare: Plan, ticks: float) -> float:
+def flown_ticks(bare: Plan, ticks: float) -> float:
     """Robot ticks that are flown, of `ticks`."""
     most = SPEED_UP * WORK
     if FLIGHTS * stretch.TICK_S * min(ticks, most) < stretch.COMPILES_S:  # to compile would take longer

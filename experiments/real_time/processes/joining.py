@@ -125,13 +125,13 @@ def wait_for_experiment(session: zenoh.Session, keys: Keys, names: Sequence[str]
 
 
 class ConductorWatch:
-    """Ends this process, as SIGTERM does, when the conductor's token is gone for `SILENCE_S`: its robots land first.
+    """Ends this process, as SIGTERM does, when the conductor's token is gone for `silence_s`: its robots land first.
 
     Without a router every token is gone, which proves nothing; the robots do what they do without a router.
     """
 
-    def __init__(self, session: zenoh.Session, keys: Keys) -> None:
-        self._session = session
+    def __init__(self, session: zenoh.Session, keys: Keys, silence_s: float = SILENCE_S) -> None:
+        self._session, self._silence_s = session, silence_s
         self._watch = pubsub.AliveWatch(session, keys.conductor)
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._watch_token, name="conductor watch", daemon=True)
@@ -144,7 +144,7 @@ class ConductorWatch:
     def _watch_token(self) -> None:
         there, missing_s = True, 0.0
         try:
-            while missing_s <= SILENCE_S:
+            while missing_s <= self._silence_s:
                 if self._over.wait(LOOK_S):
                     return
                 for _, alive in self._watch.changes():

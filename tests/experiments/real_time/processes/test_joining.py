@@ -43,12 +43,11 @@ def test_robots_land_although_nobody_reads_their_output(monkeypatch: pytest.Monk
 
     signals: list[int] = []
     monkeypatch.setattr(joining.pubsub, "AliveWatch", Gone)
-    monkeypatch.setattr(joining, "SILENCE_S", 0.0)
     monkeypatch.setattr(network, "connected", lambda _: True)
     monkeypatch.setattr("builtins.print", unread)
     monkeypatch.setattr(os, "kill", lambda _, number: signals.append(number))
     with Net().worn() as net:
-        watch = joining.ConductorWatch(net.session, Keys())  # type: ignore[arg-type]
+        watch = joining.ConductorWatch(net.session, Keys(), 0.0)  # type: ignore[arg-type]
         until(lambda: signals, "it ends its process")
         watch.close()
     assert signals == [signal.SIGTERM]
