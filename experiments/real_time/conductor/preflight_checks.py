@@ -174,15 +174,16 @@ def _position(each: Observed, safety: Safety) -> Check:
     captured = each.robot.position == "external" and registry.body_name(each.robot.body) != WORLD
     if captured and len(positions) > 1 and not np.ptp(positions, axis=0).any():
         return Check("position", "bad", "the same to the last bit, which no measurement is", frozen)
-    oldest = max((seen.age_s for seen in each.inspections if seen.age_s is not None), default=0.0)
-    found = f"spread {1e3 * spread:.1f} mm, at most {1e3 * oldest:.0f} ms old"
-    if oldest > STALE * safety.position_timeout_s:
+    ages = [seen.age_s for seen in each.inspections if seen.age_s is not None]
+    age = f"at most {1e3 * max(ages):.0f} ms old" if ages else "of unknown age"
+    found = f"spread {1e3 * spread:.1f} mm, {age}"
+    if ages and max(ages) > STALE * safety.position_timeout_s:
         remedy = f"gaps in {source}: markers or stations hidden, network or radio overloaded"
         return Check("position", "bad", found, remedy)
     if spread > STEADY_M:
         remedy = f"{source} is unsteady for a robot at rest: calibrate it, remove reflections, look for lost markers"
         return Check("position", "bad" if spread > UNSTEADY_M else "warn", found, remedy)
-    return Check("position", "ok", found)
+    return Check("position", "ok" if ages else "unknown", found)
 
 
 def _start(name: str, observed: Mapping[str, Observed], safety: Safety) -> Check:

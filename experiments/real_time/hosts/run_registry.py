@@ -9,8 +9,9 @@ from __future__ import annotations
 import os
 import socket
 import stat
+import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final, Literal
@@ -114,21 +115,36 @@ def runs() -> list[RegisteredRun]:
 
     Files of runs that are gone are removed; what is none of ours, or cannot be read, is left alone.
     """
-    found: list[RegisteredRun] = []
     try:
         files = sorted(runtime_folder().glob("*.json"))
     except OSError:
-        return found
-    for file in files:
-        run = _read(file)
-        if run is None:
-            continue
-        if run.alive or any(map(_answers, topology.bare(run.endpoints))):
-            found.append(run)
-        else:
+        return []
+    found = {file: run for file in files if (run := _read(file)) is not None}
+    dead = {file: topology.bare(run.endpoints) for file, run in found.items() if not run.alive}
+    silent = _silent({endpoint for endpoints in dead.values() for endpoint in endpoints})
+    for file, endpoints in dead.items():
+        if silent.issuperset(endpoints):
+            del found[file]
             with suppress(OSError):
                 file.unlink()
-    return sorted(found, key=lambda run: run.since)
+    return sorted(found.values(), key=lambda run: run.since)
+
+
+def _silent(endpoints: Iterable[str]) -> set[str]:
+    """Endpoints that take no connections; not those of which it is unknown in time, as names that nobody resolves."""
+    silent: list[str] = []
+
+    def knock(endpoint: str) -> None:
+        if not _answers(endpoint):
+            silent.append(endpoint)
+
+    threads = [threading.Thread(target=knock, args=(endpoint,), daemon=True) for endpoint in endpoints]
+    deadline = time.monotonic() + 2.0 * KNOCK_S
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(max(0.0, deadline - time.monotonic()))
+    return set(silent)
 
 
 def _read(file: Path) -> RegisteredRun | None:

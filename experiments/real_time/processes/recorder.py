@@ -39,12 +39,11 @@ NAMED: Final = 100  # reported keys with unreadable messages
 class Recorder:
     def __init__(self, session: zenoh.Session, keys: Keys, recording: Recording) -> None:
         self._keys, self._recording = keys, recording
-        self._connected = True
         self._session = session
         self._arrival = Clock()
         self.unread: dict[str, tuple[int, str]] = {}  # by key: how many, and why the last
         self._reported: dict[str, int] = {}
-        self._alive: set[str] = set()
+        self.alive: set[str] = set()  # tokens of the robots that are left
         topics = [topic for topic in TOPICS if topic is not SPOKEN]
         self._inboxes = [(topic, self._inbox(self._subscribe(topic), topic.message)) for topic in topics]
         self._truths = self._inbox(pubsub.subscriber(session, keys.truth("*"), DEPTH), messages.Position)
@@ -53,14 +52,10 @@ class Recorder:
         self._watch = pubsub.AliveWatch(session, keys.alive("*"))
         self._token = pubsub.alive_token(session, keys.recorder)
 
-    @property
-    def alone(self) -> bool:
-        return not self._alive
-
     def receive(self, *, last: bool = False) -> None:
         """Writes received messages; states of protocol twins wait for the next true pose, except the `last` time."""
         for token, there in self._watch.changes():
-            (self._alive.add if there else self._alive.discard)(token)
+            (self.alive.add if there else self.alive.discard)(token)
         for truth in self._truths.read(_require_finite):
             self._store_truth(truth)
         for topic, inbox in self._inboxes:
@@ -179,7 +174,7 @@ def record(launch: RecorderLaunch) -> int:
                 flush_at = now + FLUSH_S
             if lost.is_set():
                 last = min(last, now + AFTER_S)
-                if recorder.alone or now > last or not network.connected(joint.session):
+                if not recorder.alive or now > last or not network.connected(joint.session):
                     break
         recorder.receive(last=True)
         recorder.report_malformed(last=True)

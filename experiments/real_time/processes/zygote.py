@@ -37,6 +37,7 @@ PRELOADED: Final = (ROBOT, "numpy.random", "twins.body", "bridges.external")
 SWITCH: Final = "ZENPARK_ZYGOTE"  # in the environment: 0 spawns each process
 ONE_THREAD: Final = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}  # numpy starts others at its import
 TITLE: Final = 4096  # room for the command line that tools show [bytes]
+LIFELINE: Final = 0  # standard input
 NAME: Final = 15  # of a process, as `ps` and `top` show it [bytes]
 PACKET: Final = 65536  # [bytes]
 REPLY_S: Final = 10.0  # for an answer; before the first one the zygote imports
@@ -184,8 +185,8 @@ def stand_for(run: str, arguments: Sequence[str]) -> int | None:
 class Zygote:
     """Forks, and passes the ends of its children on."""
 
-    def __init__(self, listener: socket.socket, lifeline: int = 0) -> None:
-        self._listener, self._lifeline = listener, lifeline
+    def __init__(self, listener: socket.socket) -> None:
+        self._listener = listener
         self._path = Path(listener.getsockname())
         # by pidfd: id, and the socket that gets the exit code
         self._children: dict[int, tuple[int, socket.socket]] = {}
@@ -196,7 +197,7 @@ class Zygote:
 
         Returns None in the zygote, at its end; in each forked process, the request that it must run.
         """
-        for fd in (self._listener.fileno(), self._lifeline):
+        for fd in (self._listener.fileno(), LIFELINE):
             self._waiting.register(fd, select.POLLIN)
         while True:
             for fd, _ in self._waiting.poll():

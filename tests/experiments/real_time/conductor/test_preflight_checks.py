@@ -69,6 +69,7 @@ LOCKED = "locked: switch it off and on"
         ({"firmware": "twin"}, "firmware", "ok", "twin"),
         ({"firmware": None}, "firmware", "unknown", "not known by a crazyflie at radio://0/80/2M/E7E7E7E701"),
         ({"age_s": 0.3}, "position", "bad", "spread 0.0 mm, at most 300 ms old"),
+        ({"age_s": None}, "position", "unknown", "spread 0.0 mm, of unknown age"),
         ({"noise": 0.001}, "position", "ok", "spread 1.0 mm, at most 20 ms old"),
         ({"noise": 0.03}, "position", "warn", "spread 30.0 mm, at most 20 ms old"),
         ({"noise": 0.2}, "position", "bad", "spread 200.0 mm, at most 20 ms old"),

@@ -4,6 +4,8 @@ import os
 import socket
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
 
 import msgspec
@@ -84,6 +86,21 @@ def test_host_that_cannot_be_asked_for_hides_nobody() -> None:
     run = own_entry("run", "two", nowhere())
     with registered(msgspec.structs.replace(dead(), endpoints=[f"tcp/{'a' * 70}:7447"])), registered(run):
         assert runs() == [run]
+
+
+def test_silent_names_delay_no_emergency_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+    run, resolved = own_entry("run", "two", nowhere()), threading.Event()
+
+    def resolve(*_: object) -> None:
+        resolved.wait(60.0)
+        raise OSError
+
+    monkeypatch.setattr(run_registry.socket, "create_connection", resolve)
+    with registered(dead()), registered(dead()), registered(dead()), registered(run):
+        began = time.monotonic()
+        assert run in runs()
+        assert time.monotonic() - began < 5.0
+    resolved.set()
 
 
 def test_folder_writable_by_others_is_refused(runtime_folder: Path) -> None:
