@@ -20,7 +20,7 @@ from agents.body.kinds import Flight, Kind
 from agents.safety.hazards import HazardChange, Outcome
 from experiments.definition.experiment import WorldTable
 from experiments.definition.plan import Plan
-from experiments.recording.trace import ROUNDING_S, sent_in_run
+from experiments.recording.trace import ROUNDING_S, poses_in_run
 from experiments.virtual_time import conductor, simulation, stretch
 from experiments.virtual_time.source import outside
 from twins.arrays import Array, norm
@@ -176,7 +176,7 @@ def fly(bare: Plan, seed: int, *, quiet: bool = False) -> Prediction:
         return Prediction(np.zeros(1), position[None], transmissions=0, messages_hz=0.0, stuck=str(stuck))
     run, duration_s = log.time >= -ROUNDING_S, bare.experiment.duration_s
     begun = tuple(each for each in log.incidents if each[1].outcome > Outcome.NONE and 0.0 <= each[1].time < duration_s)
-    sent = len(sent_in_run(log.sent, duration_s))
+    sent = len(poses_in_run(log.sent, duration_s, "stamp"))
     return Prediction(log.time[run], log.true_position[run], sent, sent / duration_s, begun, log.velocities)
 
 

@@ -70,26 +70,21 @@ class Correction:
 
     def __init__(self, measured: Iterable[HostClock]) -> None:
         """`measured` are all offsets of a run, in order of time for each host."""
-        self._series: dict[str, tuple[Array, Array, Array, Array]] = {}
+        self._series: dict[str, tuple[Array, Array, Array, Array]] = {}  # by host
         self._measured: dict[str, list[HostClock]] = {}
         for each in measured:
             self._measured.setdefault(each.host, []).append(each)
-        for own in self._measured.values():
-            stamps = np.array([each.stamp for each in own])
-            offsets = np.array([each.offset for each in own])
-            for robot in own[-1].robots:
-                self._series[robot] = stamps, offsets, *correction_series(own)
+        for host, own in self._measured.items():
+            stamps, offsets = np.array([(each.stamp, each.offset) for each in own]).T
+            self._series[host] = stamps, offsets, *correction_series(own)
+        self._host = {robot: host for host, own in self._measured.items() for robot in own[-1].robots}
 
     def __call__(self, robot: str, stamp: float) -> float:
         """A stamp [s] that a robot's process made, on the conductor's clock."""
-        return float(self.stamps(robot, np.array(stamp))) if robot in self._series else stamp
-
-    def stamps(self, robot: str, made: Array) -> Array:
-        """As a call, for stamps (...) [s]."""
-        if robot not in self._series:
-            return made
-        stamps, offsets, when, what = self._series[robot]
-        return np.asarray(made - (np.interp(made, stamps, offsets) - np.interp(made, when, what)))
+        if robot not in self._host:
+            return stamp
+        stamps, offsets, when, what = self._series[self._host[robot]]
+        return float(stamp - (np.interp(stamp, stamps, offsets) - np.interp(stamp, when, what)))
 
     def state(self, state: State) -> State:
         """Telemetry with all stamps corrected: its own, and those of received poses and goals.
@@ -111,22 +106,12 @@ class Correction:
         return replace(status, stamp=self(status.robot, status.stamp), started=self(status.robot, status.started))
 
     def offsets(self) -> tuple[ClockOffset, ...]:
-        return tuple(
-            ClockOffset(
-                host,
-                tuple(measured[-1].robots),
-                measured[0].offset,
-                measured[-1].offset,
-                max(each.uncertainty for each in measured),
-                measured[-1].stamp - measured[0].stamp,
-                _worst(measured),
-            )
-            for host, measured in self._measured.items()
-        )
-
-
-def _worst(clocks: Sequence[HostClock]) -> float:
-    """Largest difference between a measured offset and the correction at that time [s]."""
-    stamps = np.array([each.stamp for each in clocks])
-    offsets = np.array([each.offset for each in clocks])
-    return float(np.abs(offsets - np.interp(stamps, *correction_series(clocks))).max())
+        found = []
+        for host, measured in self._measured.items():
+            first, last = measured[0], measured[-1]
+            stamps, offsets, when, what = self._series[host]
+            worst = float(np.abs(offsets - np.interp(stamps, when, what)).max())
+            uncertainty = max(each.uncertainty for each in measured)
+            places = (tuple(last.robots), first.offset, last.offset)
+            found.append(ClockOffset(host, *places, uncertainty, last.stamp - first.stamp, worst))
+        return tuple(found)

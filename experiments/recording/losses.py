@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import pairwise
-from typing import Final, Literal, Protocol, TypeVar
+from typing import Final, Literal, TypeVar
 
 import numpy as np
 
-from agents.network.messages import Status
+from agents.network.messages import CentreState, Status
 from agents.network.validation import missed, most_poses
 from experiments.definition.plan import Plan
 from experiments.recording.topics import SentPose
@@ -96,17 +96,7 @@ def _by_sender(
     return total
 
 
-class Report(Protocol):
-    """A message with counters of a process."""
-
-    @property
-    def pid(self) -> int: ...
-
-    @property
-    def stamp(self) -> float: ...
-
-
-R = TypeVar("R", bound=Report)
+R = TypeVar("R", Status, CentreState)  # messages with counters of a process
 
 
 def lives(reports: Iterable[R], made: Callable[[R], int]) -> list[list[R]]:

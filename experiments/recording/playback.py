@@ -53,8 +53,7 @@ from experiments.recording.trace import (
     Trace,
     contacts_watched,
     messages_in_run,
-    received_in_run,
-    sent_in_run,
+    poses_in_run,
 )
 from twins.arrays import Array, Index
 
@@ -332,7 +331,7 @@ def _possible(message: State | SentPose | Status | LawMemory) -> bool:
         case Status():
             counts = (message.sent, message.ticks, message.missed, message.decisions)
             changed = (message.interventions, message.avoided)
-            by_name = (*message.lost.values(), *message.dropped.values())
+            by_name = (*message.lost.values(), *message.dropped.values(), *message.foreign.values())
             return all(count == 0 or is_count(count) for count in (*counts, *changed, *by_name))
         case _:
             return True
@@ -389,20 +388,11 @@ def _number(value: float | None) -> float:
 
 def _sent(poses: list[list[SentPose]], start: float, duration: float) -> PoseTable:
     rows = [
-        (
-            row,
-            pose.seq,
-            pose.stamp,
-            pose.stamp,
-            *pose.position,
-            *(pose.velocity or NOWHERE),
-            _number(pose.yaw),
-            pose.size,
-        )
+        (row, p.seq, p.stamp, p.stamp, *p.position, *(p.velocity or NOWHERE), _number(p.yaw), p.size)
         for row, own in enumerate(poses)
-        for pose in own
+        for p in own
     ]
-    return sent_in_run(_table(rows).since(start), duration)
+    return poses_in_run(_table(rows).since(start), duration, "stamp")
 
 
 def _received(states: list[list[State]], plan: Plan, start: float, duration: float) -> PoseTable:
@@ -418,7 +408,7 @@ def _received(states: list[list[State]], plan: Plan, start: float, duration: flo
         if (row, each.sender) in links and is_count(each.seq)
     }  # a state that is recorded twice repeats its receipts
     rows = [(*about, *each.position, *each.velocity, math.nan, 0) for about, each in found.items()]
-    return received_in_run(replace(_table(rows), yaw=None, bytes=None).since(start), duration)
+    return poses_in_run(replace(_table(rows), yaw=None, bytes=None).since(start), duration, "arrival")
 
 
 def _goals(content: Content, states: list[list[State]], robots: Sequence[str], start: float, duration: float) -> Goals:

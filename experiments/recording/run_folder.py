@@ -64,11 +64,19 @@ def keep_origin(folder: Path, origin: RunOrigin) -> None:
 
 def check_folder(out: str | None) -> None:
     """Refuse a folder for a run that cannot be used, before anything is made; raises DocumentError."""
-    if out is None or not Path(out).exists():
+    if out is None:
         return
-    if not Path(out).is_dir():
-        raise refusal(out, "is a file, and the results of a run need a folder", "name a new folder with --out")
-    if any(Path(out).iterdir()):
+    try:
+        taken = any(Path(out).iterdir())
+    except FileNotFoundError:
+        return
+    except NotADirectoryError:
+        raise refusal(
+            out, "is a file, and the results of a run need a folder", "name a new folder with --out"
+        ) from None
+    except OSError as error:
+        raise refusal(out, f"cannot be read: {error.strerror}", "name a new folder with --out") from None
+    if taken:
         raise refusal(out, "holds something already", "name a new folder with --out")
 
 
@@ -82,12 +90,10 @@ def new_folder(read: Document, out: str | None, what: str = "") -> Path:
         folder.mkdir(parents=True, exist_ok=True)
         if out is None:
             return _folder_of_now(folder, "-".join(part for part in (read.path.stem, what) if part))
-        taken = any(folder.iterdir())
     except OSError as error:
         hint = "choose a place that may be written to with --out"
         raise refusal(str(folder), f"cannot be made: {error.strerror}", hint) from None
-    if taken:
-        raise refusal(str(folder), "holds something already", "name a new folder with --out")
+    check_folder(out)
     return folder
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Final, TypeVar
+from typing import Final, Literal, TypeVar
 
 import msgspec
 import numpy as np
@@ -108,18 +108,11 @@ def in_run(time: Array, duration: float) -> Mask:
     return np.asarray((time >= -ROUNDING_S) & (time < duration - ROUNDING_S))
 
 
-def sent_in_run(table: PoseTable, duration: float) -> PoseTable:
-    """Poses that were sent in a run of `duration` [s], in order of time."""
-    kept = table.take(in_run(table.stamp, duration))
-    kept = msgspec.structs.replace(kept, stamp=np.maximum(kept.stamp, 0.0))
-    return kept.take(np.argsort(kept.stamp, kind="stable"))
-
-
-def received_in_run(table: PoseTable, duration: float) -> PoseTable:
-    """Poses that were received in a run of `duration` [s], in order of arrival."""
-    kept = table.take(in_run(table.arrival, duration))
-    kept = msgspec.structs.replace(kept, arrival=np.maximum(kept.arrival, 0.0))
-    return kept.take(np.argsort(kept.arrival, kind="stable"))
+def poses_in_run(table: PoseTable, duration: float, by: Literal["stamp", "arrival"]) -> PoseTable:
+    """Poses that were sent (`stamp`) or received (`arrival`) in a run of `duration` [s], in order of that time."""
+    kept = table.take(in_run(getattr(table, by), duration))
+    times = np.maximum(getattr(kept, by), 0.0)
+    return msgspec.structs.replace(kept, **{by: times}).take(np.argsort(times, kind="stable"))
 
 
 @dataclass(frozen=True)

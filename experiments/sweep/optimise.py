@@ -55,7 +55,9 @@ class Limit:
     least: bool = False  # the metric must not be smaller; else not larger
 
     def __str__(self) -> str:
-        return f"{_word(self.index)} {'>=' if self.least else '<='} {self.bound:g}"
+        relative = relative_metrics()
+        word = f"{relative[self.index].label} ratio" if self.index in relative else self.index
+        return f"{word} {'>=' if self.least else '<='} {self.bound:g}"
 
     def excess(self, value: float) -> float:
         """Distance beyond the bound; negative within."""
@@ -80,7 +82,9 @@ class Objective:
             if value.mean is None or (metrics[limit.index].mean == "all" and value.n < row.seeds):
                 return 2.0 * BROKEN
             excess += max(0.0, limit.excess(value.mean) + (value.ci95 or 0.0)) / max(abs(limit.bound), 1e-9)
-        return BROKEN * (1.0 + min(excess, 1.0)) if excess > 0.0 else _aim(self.index, aim)
+        if excess > 0.0:
+            return BROKEN * (1.0 + min(excess, 1.0))
+        return -aim if metrics[self.index].better == "more" else aim
 
     def kept(self, row: CellRow) -> bool:
         """Whether the means of a row keep all limits."""
@@ -102,11 +106,6 @@ class TuningResult:
     chosen: tuple[CellRow, ...]
     folder: Path  # of the runs
     notes: tuple[str, ...]  # for the user
-
-    @property
-    def searched(self) -> tuple[int, ...]:
-        """Seeds of the search, see `tried`."""
-        return searched(self.tuning)
 
 
 def parse_objective(text: str) -> Objective:
@@ -132,11 +131,6 @@ def parse_objective(text: str) -> Objective:
     if not limits:
         raise refusal(place, "without a limit the best is to say nothing", "add one, such as iae<=1.01")
     return Objective(least, tuple(limits))
-
-
-def _aim(index: str, value: float) -> float:
-    """The value of a metric with its sign turned where more is better."""
-    return -value if swept_metrics()[index].better == "more" else value
 
 
 def searched(tuning: Sequence[int]) -> tuple[int, ...]:
@@ -292,8 +286,3 @@ def _known(name: str, place: str) -> str:
     if name.lower() not in names:
         raise refusal(place, f"no metric is called '{name}'", did_you_mean(name, names))
     return names[name.lower()]
-
-
-def _word(index: str) -> str:
-    relative = relative_metrics()
-    return f"{relative[index].label} ratio" if index in relative else index

@@ -10,7 +10,7 @@ from typing import Final
 from experiments.metrics.metric import foreign_metrics
 from experiments.report import page, style
 from experiments.report.tables import over_seeds, ratio_words
-from experiments.sweep.optimise import TuningResult
+from experiments.sweep.optimise import TuningResult, searched
 from experiments.sweep.pareto import by_environment, front, pareto
 from experiments.sweep.sweep import SweepResult
 from experiments.sweep.table import CellRow, numbers, parameter_columns, relative_metrics
@@ -87,11 +87,11 @@ def _swept(found: SweepResult) -> list[page.Section]:
 
 def _searched(tuned: TuningResult) -> list[page.Section]:
     reference = [row for row in tuned.rows if row.reference]
-    seeds, searched = page.seeds_in_words(tuned.seeds), page.seeds_in_words(tuned.searched)
+    seeds, tried = page.seeds_in_words(tuned.seeds), page.seeds_in_words(searched(tuned.tuning))
     drawn = pictures(tuned.folder, [*reference, *tuned.tried], joined=False)
     return [
         page.Section("Result", (f"On seeds {seeds}, which no choice has seen.",), (table(tuned.rows),)),
-        page.Section("All points of the search", (f"On seeds {searched}.",), pictures=drawn),
+        page.Section("All points of the search", (f"On seeds {tried}.",), pictures=drawn),
         page.Section("Table of the search", tables=(table(tuned.tried),), folded="Show the table"),
     ]
 

@@ -16,7 +16,7 @@ from typing import Final, Self
 
 import msgspec
 
-from experiments.file.problems import refusal
+from experiments.file.problems import DocumentError, refusal
 from experiments.sweep.runs import RunMetrics, WorkResult
 
 RUNS: Final = "runs.jsonl"
@@ -73,9 +73,12 @@ class Store:
         path = self._folder / ORIGIN
         try:
             before = msgspec.json.decode(path.read_bytes(), type=StoreOrigin)
-        except (FileNotFoundError, msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        except (OSError, msgspec.DecodeError, UnicodeDecodeError, RecursionError):
             before = now
-        path.write_bytes(msgspec.json.format(msgspec.json.encode(now), indent=2) + b"\n")
+        try:
+            path.write_bytes(msgspec.json.format(msgspec.json.encode(now), indent=2) + b"\n")
+        except OSError as error:
+            raise self._full(error) from None
         found = []
         if before.version != now.version:
             found.append(f"this is zenpark {now.version}, not {before.version}: all runs are repeated")
@@ -100,8 +103,11 @@ class Store:
             self._file.flush()
             os.fsync(self._file.fileno())
         except OSError as error:
-            raise refusal(str(self._path), f"cannot be written: {error.strerror}", "make room, then go on") from None
+            raise self._full(error) from None
         self._keep(line)
+
+    def _full(self, error: OSError) -> DocumentError:
+        return refusal(str(self._folder), f"cannot be written: {error.strerror}", "make room, then go on")
 
     def _read(self) -> None:
         content = self._path.read_bytes()

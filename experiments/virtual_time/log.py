@@ -31,8 +31,7 @@ from experiments.recording.trace import (
     contacts_watched,
     in_run,
     messages_in_run,
-    received_in_run,
-    sent_in_run,
+    poses_in_run,
 )
 from experiments.recording.writer import Recording
 from experiments.scene import markers
@@ -64,7 +63,7 @@ class RunRecorder:
         if centre is None:
             return None
         sizes = [len(messages.encode(goal, self._encoding)) for _, goal in self._goal_messages(centre)]
-        received = received_in_run(centre.received, self._experiment.duration_s)
+        received = poses_in_run(centre.received, self._experiment.duration_s, "arrival")
         return Goals.of_run(
             replace(centre.sent, bytes=np.array(sizes, dtype=np.intp)),
             centre.followed,
@@ -94,8 +93,8 @@ class RunRecorder:
             robots=log.names,
             clock="virtual",
             time=np.round(log.time[run], 9),
-            sent=sent_in_run(sent, duration),
-            received=received_in_run(self._log.received, duration),
+            sent=poses_in_run(sent, duration, "stamp"),
+            received=poses_in_run(self._log.received, duration, "arrival"),
             lost=np.zeros(rows, dtype=np.intp),
             missed_deadlines=np.zeros(rows, dtype=np.intp),
             ticks=np.full(rows, log.ticks, dtype=np.intp),

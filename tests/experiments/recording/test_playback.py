@@ -226,6 +226,11 @@ def test_foreign_poses_count_once_for_all_receivers(path):
     assert read(path).trace.foreign.tolist() == [7, 0, 0]
 
 
+def test_impossible_counts_of_foreign_poses_are_left_out(path):
+    rec.write(path, *rec.whole_run()[:-2], rec.status(at=0.5), rec.status(at=0.9, foreign={"TB01": 2**60}))
+    assert not read(path).trace.foreign.any()
+
+
 def test_only_poses_of_the_run_are_sent(path):
     rec.write(path, rec.begun(), *[rec.pose(seq=k + 5, at=k / 2) for k in range(-2, 5)], rec.pose("XX99", at=0.5))
     sent = read(path).trace.sent

@@ -30,6 +30,11 @@ def test_runs_of_the_same_second_have_own_folders(tmp_path, monkeypatch):
     assert all(folder.is_dir() for folder in folders)
 
 
+def test_folder_that_cannot_be_looked_into_is_refused():
+    with pytest.raises(DocumentError):
+        run_folder.check_folder("x" * 300)  # longer than a file system takes
+
+
 def test_folder_without_a_run_is_removed(tmp_path):
     read = document.load("triangle")
     empty, failed, flown = folders = [run_folder.new_folder(read, str(tmp_path / name)) for name in "abc"]

@@ -23,6 +23,7 @@ from experiments.sweep import table as sweep_table
 from experiments.sweep.pareto import curves, front, pareto
 from experiments.sweep.plan import Axis
 from experiments.sweep.runs import Stuck
+from experiments.sweep.store import ORIGIN, Store, StoreOrigin
 from experiments.sweep.sweep import folder_of, side_by_side, sweep
 from experiments.sweep.table import parameter_columns
 from experiments.sweep.workers import Work, workers
@@ -147,6 +148,12 @@ def test_two_sweeps_do_not_share_a_folder(tmp_path):
             swept(tmp_path, "seeds=1")
 
     swept(tmp_path, "seeds=1", progress=meanwhile)
+
+
+def test_origin_that_cannot_be_written_is_refused(tmp_path):
+    (tmp_path / ORIGIN).mkdir()
+    with Store(tmp_path) as kept, pytest.raises(DocumentError):
+        kept.changed_since(StoreOrigin("1", "2", "3"))
 
 
 def test_tuning_word_and_open_range_belong_to_search(tmp_path):
