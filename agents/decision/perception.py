@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import cos, hypot, inf, isfinite, sin
+from math import cos, inf, isfinite, sin
 from typing import ClassVar, Final, NamedTuple
 
 from agents.body.interface import RangeScan
@@ -13,7 +13,7 @@ from agents.network.validation import MAX_SPEED
 from agents.plugins.avoidance import HURRY, Avoidance, Nearby, OwnState
 from agents.plugins.calls import failure, wrong
 from agents.plugins.registry import FAILURES
-from agents.vectors import Vector, clamp, is_finite
+from agents.vectors import Vector, clamp, is_finite, planar
 
 SIGHT_M: Final = 3.0  # [m] between axes; farther things are ignored
 AHEAD_S: Final = 0.1  # received positions are extrapolated for this long: a silent robot may have stopped
@@ -130,7 +130,7 @@ class Perception:
         vx, vy, vz = (each if isfinite(each) else 0.0 for each in now.velocity)
         x, y, z = now.position[0] - vx * then, now.position[1] - vy * then, now.position[2] - vz * then
         # those of which a point can be; never received: NaN
-        close = [each for each in neighbours.all if _apart(each, now.position) <= SIGHT_M + 1.0]
+        close = [each for each in neighbours.all if planar(each.position, now.position) <= SIGHT_M + 1.0]
         farthest = min(SIGHT_M, self._in_time)
         for bearing, elevation, far in zip(scan.bearing, scan.elevation, scan.distance, strict=True):
             # NaN: nothing was hit; nothing is inside the robot either
@@ -165,11 +165,6 @@ def _horizon(avoidance: Avoidance, own: OwnState) -> float:
     if not (isinstance(horizon, float | int) and horizon >= 0.0):
         raise wrong("avoidance", avoidance, "horizon", horizon, "a distance of 0 m or more")
     return horizon
-
-
-def _apart(sender: Neighbour, here: Vector) -> float:
-    """Horizontal distance from the last received place of a robot [m]; NaN before the first."""
-    return hypot(sender.position[0] - here[0], sender.position[1] - here[1])
 
 
 def _lies_on(point: Point, sender: Neighbour, time: float) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from math import expm1, inf, isfinite, nan
-from typing import ClassVar, Final, cast
+from typing import ClassVar, cast
 
 from agents.body.kinds import Kind
 from agents.decision.stepping import Speech
@@ -11,8 +11,6 @@ from agents.network.validation import MAX_SPEED
 from agents.plugins.predictors import Predictor
 from agents.plugins.triggers import Trigger, TriggerState
 from agents.vectors import UNKNOWN, ZERO, Setpoint, Vector, clamp, distance, is_finite
-
-STILL: Final[Vector] = ZERO
 
 
 class Transmitter:
@@ -51,7 +49,7 @@ class Transmitter:
         """
         known = abs(velocity[0]) <= MAX_SPEED and abs(velocity[1]) <= MAX_SPEED and abs(velocity[2]) <= MAX_SPEED
         if not known:  # implausible, hence unknown
-            velocity = STILL
+            velocity = ZERO
         asking = self.asking
         if self._smooths:
             smoothed = self.smoothed

@@ -65,61 +65,48 @@ def claim(
     """
     pause = stop or threading.Event()
     mine = str(session.zid())
-    asked = _Claim(session, alive, mine, Keys.rank(began, mine), pause, timing)
+    rank = Keys.rank(began, mine)
+
+    def stands_in_the_way(key: str, token: str, owners: bool) -> bool:
+        other = Keys.rank_of(key, token)
+        return other < rank if other is not None else owners and token != Keys.life(key, mine)
+
+    def rivals(*, owners: bool) -> list[str]:
+        """Names with an earlier claim, or with another owner if `owners` count."""
+        deadline = time.monotonic() + timing.answer_s
+        while True:
+            found = {key: network.tokens_present(session, Keys.lives(key)) for key in alive}
+            if pause.is_set():
+                raise network.Unreachable("asked to end before the name was taken")
+            if None not in found.values() and network.connected(session):
+                break
+            if time.monotonic() > deadline:
+                raise network.Unreachable(
+                    f"no router answers who owns the name, for {timing.answer_s:g} s: is it overloaded?"
+                )
+            pause.wait(timing.retry_s)
+        return [
+            key for key, tokens in found.items() if any(stands_in_the_way(key, each, owners) for each in tokens or ())
+        ]
+
     settle_s = SETTLE_S if len(endpoints) > 1 else 0.0
-    tokens = [pubsub.alive_token(session, Keys.claim(key, asked.rank)) for key in alive]
+    tokens = [pubsub.alive_token(session, Keys.claim(key, rank)) for key in alive]
     try:
         pause.wait(settle_s)
-        asked.await_free_names()
+        deadline = time.monotonic() + timing.vanish_s
+        while others := rivals(owners=True):
+            if time.monotonic() > deadline:
+                raise NameTaken(", ".join(others))
+            pause.wait(timing.retry_s)
         tokens += [pubsub.alive_token(session, Keys.life(key, mine)) for key in alive]
         pause.wait(settle_s)
-        if others := asked.rivals(owners=False):
+        if others := rivals(owners=False):
             raise NameTaken(", ".join(others))
     except BaseException:
         for token in tokens:
             token.undeclare()
         raise
     return tokens
-
-
-@dataclass(frozen=True)
-class _Claim:
-    """The claim `rank` of the session `mine` on names (their liveliness keys)."""
-
-    session: zenoh.Session
-    alive: Sequence[str]
-    mine: str
-    rank: str
-    pause: threading.Event
-    timing: OwnershipTiming
-
-    def await_free_names(self) -> None:
-        """Waits until no other process owns a name or has an earlier claim."""
-        deadline = time.monotonic() + self.timing.vanish_s
-        while others := self.rivals(owners=True):
-            if time.monotonic() > deadline:
-                raise NameTaken(", ".join(others))
-            self.pause.wait(self.timing.retry_s)
-
-    def rivals(self, *, owners: bool) -> list[str]:
-        """Names with an earlier claim, or with another owner if `owners` count."""
-        answer_s = self.timing.answer_s
-        deadline = time.monotonic() + answer_s
-        while True:
-            found = {key: network.tokens_present(self.session, Keys.lives(key)) for key in self.alive}
-            if self.pause.is_set():
-                raise network.Unreachable("asked to end before the name was taken")
-            if None not in found.values() and network.connected(self.session):
-                break
-            if time.monotonic() > deadline:
-                raise network.Unreachable(f"no router answers who owns the name, for {answer_s:g} s: is it overloaded?")
-            self.pause.wait(self.timing.retry_s)
-
-        def stands_in_the_way(alive: str, token: str) -> bool:
-            other = Keys.rank_of(alive, token)
-            return other < self.rank if other is not None else owners and token != Keys.life(alive, self.mine)
-
-        return [key for key, tokens in found.items() if any(stands_in_the_way(key, each) for each in tokens or ())]
 
 
 def confirm_ownership(

@@ -35,6 +35,8 @@ LONGEST_ORDER: Final = 4096  # [bytes] an order to land or to stop is shorter
 TOKEN_CHANGES: Final = 256  # queued
 NO_ORDER: Final = 'an order is a query with a payload, such as {"order": "land"}'
 
+_RECOVERY: Final = RecoveryConfig(periodic_queries=None, heartbeat=True)
+
 T = TypeVar("T")
 
 
@@ -67,13 +69,7 @@ def pose_subscriber(
     The history is limited to the `kept` of the publisher: without a limit a single frozen publisher stalls a wildcard
     for 10 s.
     """
-    return declare_advanced_subscriber(
-        session,
-        key,
-        RingChannel(depth),
-        history=_history(kept),
-        recovery=RecoveryConfig(periodic_queries=None, heartbeat=True),
-    )
+    return declare_advanced_subscriber(session, key, RingChannel(depth), history=_history(kept), recovery=_RECOVERY)
 
 
 def _history(kept: int) -> HistoryConfig:
@@ -111,7 +107,7 @@ class RingingSubscriber:
             key,
             Callback(self._append, indirect=False),
             history=_history(kept),
-            recovery=RecoveryConfig(periodic_queries=None, heartbeat=True),
+            recovery=_RECOVERY,
         )
 
     @property

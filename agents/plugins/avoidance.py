@@ -63,12 +63,10 @@ class Plane:
 class Nearby:
     """Things near a robot: the first `count` of `things`. The list has room for more, which stand `ABSENT_M` away."""
 
-    count: int
-    things: list[Thing]
-    planes: list[Plane]  # for an avoidance to write on, as many as things
-
     def __init__(self) -> None:
-        self.count, self.things, self.planes = 0, [], []
+        self.count = 0
+        self.things: list[Thing] = []
+        self.planes: list[Plane] = []  # for an avoidance to write on, as many as things
         self.reserve(1)  # a compiler wants to see what is in a list
 
     def reserve(self, count: int) -> None:

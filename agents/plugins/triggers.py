@@ -39,22 +39,25 @@ class LastEvent:
 class TriggerView:
     """Quantities that a trigger may use; overwritten at each question."""
 
+    t: float  # now [s]
+    position: Vector  # own [m]; for communication the pose to transmit, smoothed if asked for
+    velocity: Vector  # own [m/s]
+    deviation: float  # ‖ε‖: distance of the held value from the true one [m]; infinite before the first transmission
+    since_event: float  # t − t_k: time since the last event [s], infinite before the first
+    since_start: float  # time since the robot's start in the experiment [s], 0 before
+    error: float  # Σ|e| of its links, as the robot itself knows them [m]
+    energy: float  # edge potential Σ ½e² of its links [m²]
+    offset: Vector  # u of the law [m]: of the last decision; for control, as it would be now
+    drift: float  # rate at which ε began to grow after the last event, as known then [m/s]
+    reach_s: float  # time after an event for which `drift` holds at constant speed [s]
+    last: LastEvent
+    memory: Any  # an attribute for each of the trigger's MEMORY, to be read and set
+
     def __init__(self, memory: Mapping[str, float]) -> None:
-        self.t = 0.0  # now [s]
-        self.position = ZERO  # own [m]; for communication the pose to transmit, smoothed if asked for
-        self.velocity = ZERO  # own [m/s]
-        # ‖ε‖: distance of the held value from the true one [m]; infinite before the first transmission
-        self.deviation = inf
-        self.since_event = inf  # t − t_k: time since the last event [s], infinite before the first
-        self.since_start = 0.0  # time since the robot's start in the experiment [s], 0 before
-        self.error = 0.0  # Σ|e| of its links, as the robot itself knows them [m]
-        self.energy = 0.0  # edge potential Σ ½e² of its links [m²]
-        self.offset = ZERO  # u of the law [m]: of the last decision; for control, as it would be now
-        self.drift = 0.0  # rate at which ε began to grow after the last event, as known then [m/s]
-        self.reach_s = inf  # time after an event for which `drift` holds at constant speed [s]
-        self.last = LastEvent()
-        # an attribute for each of the trigger's MEMORY, to be read and set
-        self.memory: Any = SimpleNamespace(**{name: float(first) for name, first in memory.items()})
+        self.t = self.since_start = self.error = self.energy = self.drift = 0.0
+        self.deviation = self.since_event = self.reach_s = inf
+        self.position = self.velocity = self.offset = ZERO
+        self.last, self.memory = LastEvent(), SimpleNamespace(**{name: float(first) for name, first in memory.items()})
 
 
 class Trigger(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

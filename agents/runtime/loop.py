@@ -96,7 +96,7 @@ class Runtime:
         self._mime = messages.MIME[setup.encoding]
         self._dt = 1.0 / common.body_hz
         self._state_every = round(common.body_hz / setup.state_hz)
-        self.counts = Counts(len(self._names))
+        self.counts = Counts([0] * len(self._names))
         self._state_slot = 0
         self._stopping: str | None = None
         self._retired: set[int] = set()  # rows that land, or have landed, while the run goes on

@@ -10,6 +10,7 @@ import resource
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from math import inf, isfinite
 from typing import Final
 
@@ -32,13 +33,15 @@ WORDS: Final = tuple(phase.word for phase in Phase)
 UNDER_WAY: Final = ("airborne", "running")
 
 
+@dataclass(eq=False)
 class Counts:
     """Counters of a process of n robots; ticks and interventions since the common start."""
 
-    def __init__(self, rows: int) -> None:
-        self.sent = [0] * rows  # (n) poses
-        self.refused = self.ticks = self.missed = 0  # orders, ticks, skipped ticks
-        self.late_s = 0.0  # [s] largest lateness of a tick since the last status
+    sent: list[int]  # (n) poses
+    refused: int = 0  # orders
+    ticks: int = 0
+    missed: int = 0  # skipped ticks
+    late_s: float = 0.0  # [s] largest lateness of a tick since the last status
 
     def begin(self) -> None:
         """Resets the counters that begin at the common start."""

@@ -34,55 +34,36 @@ TURN: Final = 1.5  # tolerated uncommanded rotation of a wheeled robot [rad]
 class MotionCheck:
     """Commanded and measured motion of one robot."""
 
-    unresponsive: bool  # it does not obey commands to move
-    uncommanded: bool  # it moves without a command
-    commanded: float  # commanded travel that it has not moved [m]
-    drifted: float  # uncommanded travel [m]
-    # of its kind
-    flies: bool
-    by_position: bool  # takes positions as setpoints
-    by_twist: bool  # takes twists
-    speed: float  # [m/s]
-    response: float  # [1/s]
-    rim: float  # [m] turning moves wheels by it
-    slow: float  # slower setpoints are no command to move [m/s]
-    without: float  # least commanded travel without motion that counts [m]
-    free: float  # tolerated uncommanded travel [m]
-    # commanded in this sample
-    last: float  # time of the last tick [s]
-    due: float  # end of the sample [s]
-    x: float  # [m]
-    y: float
-    z: float
-    commanded_turn: float  # [rad]
-    # commanded in this piece and in the one before: a body is late and moves after its command has ended
-    samples: int  # of this piece
-    way: Vector  # [m]
-    way_before: Vector
-    turn: float  # [rad]
-    turn_before: float
-    begin: Vector  # position at the begin of the piece [m]; NaN: there is none
-    begin_yaw: float  # [rad]
-    drift: Vector  # recent uncommanded travel [m]
-    uncommanded_turn: float  # recent uncommanded rotation [rad]
-    # commanded since its last motion
-    anchor: Vector  # position then [m]
-    anchor_yaw: float  # [rad]
-    commanded_s: float  # [s], less the pauses
-    unanswered: Vector  # way [m]
-    unanswered_turn: float  # [rad]
-
     def __init__(self, kind: Kind) -> None:
         self.flies, self.speed, self.response = kind.flies, kind.speed, kind.response
         self.by_position, self.by_twist = kind.takes == "position", kind.takes == "twist"
-        self.rim = 0.0 if kind.flies else kind.radius
-        self.slow = (SLOW_FLIES if kind.flies else SLOW_WHEELS) * kind.speed
+        self.rim = 0.0 if kind.flies else kind.radius  # [m] turning moves wheels by it
+        self.slow = (SLOW_FLIES if kind.flies else SLOW_WHEELS) * kind.speed  # slower: no command to move [m/s]
+        # least commanded travel without motion that counts [m]
         self.without = WITHOUT_S * kind.speed * (1.0 if kind.flies else 0.5)
-        self.free = RUSH_S * kind.speed + kind.radius
-        self.last = self.due = -inf
-        self.x = self.y = self.z = self.commanded_turn = 0.0
-        self.samples = 0
+        self.free = RUSH_S * kind.speed + kind.radius  # tolerated uncommanded travel [m]
+        self.last = self.due = -inf  # time of the last tick, and end of the sample [s]
+        self.x = self.y = self.z = self.commanded_turn = 0.0  # commanded in this sample [m], [rad]
+        self.samples = 0  # of this piece
         self.forget(UNKNOWN, nan)
+
+    def forget(self, position: Vector, yaw: float) -> None:
+        """Restart at a `position` [m] and `yaw` [rad]."""
+        self.unresponsive = False  # it does not obey commands to move
+        self.uncommanded = False  # it moves without a command
+        # commanded in this piece and in the one before [m], [rad]: a body is late and moves after its command has ended
+        self.way = self.way_before = ZERO
+        self.turn = self.turn_before = 0.0
+        self.drift, self.drifted = ZERO, 0.0  # recent uncommanded travel [m], and its length [m]
+        self.uncommanded_turn = 0.0  # recent uncommanded rotation [rad]
+        # commanded since its last motion: travel not moved [m], time less the pauses [s], way [m] and turn [rad]
+        self.commanded = self.commanded_s = 0.0
+        self.unanswered, self.unanswered_turn = ZERO, 0.0
+        # pose at the begin of the piece, and at its last motion [m], [rad]; a place of which a part is unknown is none:
+        # nothing would ever be nearer to it
+        known = is_finite(position) and isfinite(yaw)
+        self.begin = self.anchor = position if known else UNKNOWN
+        self.begin_yaw = self.anchor_yaw = yaw
 
     def update(self, t: float, setpoint: Setpoint, position: Vector, yaw: float, watched: bool) -> None:
         """Add up the commanded motion, and compare at the end of each sample; call it on every tick, at `t` [s].
@@ -201,14 +182,3 @@ class MotionCheck:
         self.way_before, self.turn_before = self.way, self.turn
         self.way, self.turn = ZERO, 0.0
         self.begin, self.begin_yaw = position, yaw
-
-    def forget(self, position: Vector, yaw: float) -> None:
-        """Restart at a `position` [m] and `yaw` [rad]."""
-        self.unresponsive = self.uncommanded = False
-        self.commanded = self.commanded_s = self.drifted = self.unanswered_turn = self.uncommanded_turn = 0.0
-        self.turn = self.turn_before = 0.0
-        self.unanswered = self.drift = self.way = self.way_before = ZERO
-        # a place of which a part is unknown is no begin: nothing would ever be nearer to it
-        known = is_finite(position) and isfinite(yaw)
-        self.begin = self.anchor = position if known else UNKNOWN
-        self.begin_yaw = self.anchor_yaw = yaw

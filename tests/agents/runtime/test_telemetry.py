@@ -30,7 +30,7 @@ class Reporter:
         self.states = []
         self.telemetry = TelemetryPublisher(
             session, KEYS, "json",
-            robots=[self.robot], neighbours=self.inbox, counts=Counts(1), malformed=lambda: 0, ranged=[True],
+            robots=[self.robot], neighbours=self.inbox, counts=Counts([0]), malformed=lambda: 0, ranged=[True],
         )  # fmt: skip
         self.telemetry.utc = UTC
 
