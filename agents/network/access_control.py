@@ -122,13 +122,7 @@ def rules(rights: Rights, register: Register) -> dict[str, Any]:
         made += own
         subjects.append({"id": name, "cert_common_names": [identity.common_name]})
         policies.append({"rules": [rule["id"] for rule in own], "subjects": [name]})
-    return {
-        "enabled": True,
-        "default_permission": "deny",
-        "rules": made,
-        "subjects": subjects,
-        "policies": policies,
-    }
+    return {"enabled": True, "default_permission": "deny", "rules": made, "subjects": subjects, "policies": policies}
 
 
 def _rules(name: str, grant: Grant, realm: str) -> Iterator[dict[str, Any]]:

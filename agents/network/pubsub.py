@@ -103,11 +103,7 @@ class RingingSubscriber:
         self._waiting: deque[zenoh.Sample] = deque(maxlen=depth)
         self._bell = bell
         self._subscriber = declare_advanced_subscriber(
-            session,
-            key,
-            Callback(self._append, indirect=False),
-            history=_history(kept),
-            recovery=_RECOVERY,
+            session, key, Callback(self._append, indirect=False), history=_history(kept), recovery=_RECOVERY
         )
 
     @property

@@ -130,8 +130,7 @@ class Avoidance(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
         Meta(description="robots with poses received for it: neighbours of the formation, or all"),
     ] = "neighbours"
     clearance: Annotated[
-        NotNegative,
-        Meta(description="things farther above or below than this are ignored [m]; more against downwash"),
+        NotNegative, Meta(description="things farther above or below than this are ignored [m]; more against downwash")
     ] = 0.1
 
     def horizon(self, own: OwnState) -> float:
