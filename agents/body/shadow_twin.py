@@ -80,18 +80,15 @@ class Shadowed(Body):
     def takeoff(self, rows: Sequence[int], heights: Sequence[float]) -> None:
         self._body.takeoff(rows, heights)
         to = [height for row, height in zip(rows, heights, strict=True) if row in self._rows]
-        mine = self._twin_rows(rows)
-        self._try(lambda twin: twin.takeoff(mine, to))
+        self._try(lambda twin: twin.takeoff(self._twin_rows(rows), to))
 
     def land(self, rows: Sequence[int]) -> None:
         self._body.land(rows)
-        mine = self._twin_rows(rows)
-        self._try(lambda twin: twin.land(mine))
+        self._try(lambda twin: twin.land(self._twin_rows(rows)))
 
     def stop(self, rows: Sequence[int]) -> None:
         self._body.stop(rows)
-        mine = self._twin_rows(rows)
-        self._try(lambda twin: twin.stop(mine))
+        self._try(lambda twin: twin.stop(self._twin_rows(rows)))
 
     def locate(self, row: int, t: float, position: Vector, yaw: float) -> None:
         """See `Body.locate`; the twin needs no external pose."""

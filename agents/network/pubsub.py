@@ -72,7 +72,7 @@ def pose_subscriber(
     return declare_advanced_subscriber(session, key, RingChannel(depth), history=_history(kept), recovery=_RECOVERY)
 
 
-def _history(kept: int) -> HistoryConfig:
+def _history(kept: int = 1) -> HistoryConfig:
     return HistoryConfig(max_samples=kept, detect_late_publishers=True)
 
 
@@ -99,11 +99,11 @@ class RingingSubscriber:
     callback may only append and ring: Zenoh calls it under a lock of the subscriber.
     """
 
-    def __init__(self, session: zenoh.Session, key: str, bell: Bell, depth: int = POSES, kept: int = 1) -> None:
+    def __init__(self, session: zenoh.Session, key: str, bell: Bell, depth: int) -> None:
         self._waiting: deque[zenoh.Sample] = deque(maxlen=depth)
         self._bell = bell
         self._subscriber = declare_advanced_subscriber(
-            session, key, Callback(self._append, indirect=False), history=_history(kept), recovery=_RECOVERY
+            session, key, Callback(self._append, indirect=False), history=_history(), recovery=_RECOVERY
         )
 
     @property

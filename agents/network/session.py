@@ -101,12 +101,9 @@ def _connections() -> Iterator[list[_Connection]]:
                 continue
             with suppress(OSError):  # it listens, or is not connected any more
                 if one.family in _INET and one.type == socket.SOCK_STREAM:
-                    found.append(_Connection(one, *(_address(end, one.family) for end in _ends(one))))
+                    near, far = one.getsockname(), one.getpeername()
+                    found.append(_Connection(one, _address(near, one.family), _address(far, one.family)))
         yield found
-
-
-def _ends(connection: socket.socket) -> tuple[tuple[str, int], tuple[str, int]]:
-    return connection.getsockname(), connection.getpeername()
 
 
 def _address(name: tuple[str, int], family: int) -> str:

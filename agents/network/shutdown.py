@@ -39,13 +39,13 @@ def _close(session: zenoh.Session, _declared: tuple[object, ...]) -> None:
 
 
 @contextmanager
-def closing_cleanly(session: zenoh.Session, limit_s: float = LEAVE_S) -> Iterator[tuple[zenoh.Session, list[object]]]:
+def closing_cleanly(session: zenoh.Session) -> Iterator[tuple[zenoh.Session, list[object]]]:
     """Inside, a session is open; at the end it is left. The items of the list count as `declared`."""
     declared: list[object] = []
     try:
         yield session, declared
     finally:
-        leave(session, declared, limit_s=limit_s)
+        leave(session, declared)
 
 
 def end(code: int) -> NoReturn:

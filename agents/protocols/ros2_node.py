@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator
 from itertools import count
 from typing import Final
 
 import zenoh
-from zenoh.handlers import Handler
 
 from agents.clock import Clock
 from agents.network import pubsub
@@ -76,8 +76,8 @@ class Node:
             self._token.undeclare()
 
 
-class Publisher:
-    """Publisher of a topic."""
+class _Endpoint:
+    """What a node announces of a topic."""
 
     def __init__(self, node: Node, kind: str, key: str, token: str) -> None:
         participant = node.participant
@@ -85,12 +85,24 @@ class Publisher:
         self.kind: Final = kind
         self.key: Final = key
         self._types = participant.types
+        self._token = pubsub.alive_token(participant.session, token) if participant.announces else None
+
+    def close(self) -> None:
+        if self._token is not None:
+            self._token.undeclare()
+
+
+class Publisher(_Endpoint):
+    """Publisher of a topic."""
+
+    def __init__(self, node: Node, kind: str, key: str, token: str) -> None:
+        participant = node.participant
         self._gid = ros2.gid(token) if participant.style == "rmw" else None
         self._sequence = 0
         self._publisher = participant.session.declare_publisher(
             key, congestion_control=zenoh.CongestionControl.DROP, priority=zenoh.Priority.DATA_HIGH
         )
-        self._token = _announce(participant, token)
+        super().__init__(node, kind, key, token)
 
     def put(self, message: Message) -> None:
         self.send(self._types.encode(message, self.kind))
@@ -105,23 +117,17 @@ class Publisher:
         self._publisher.put(payload, attachment=ros2.attachment(self._sequence, now, self._gid))
 
     def close(self) -> None:
-        if self._token is not None:
-            self._token.undeclare()
+        super().close()
         self._publisher.undeclare()
 
 
-class Subscriber:
+class Subscriber(_Endpoint):
     """Subscriber of a topic."""
 
     def __init__(self, node: Node, kind: str, key: str, token: str, depth: int) -> None:
-        participant = node.participant
-        self._node = node  # as above
-        self.kind: Final = kind
-        self.key: Final = key
         self.malformed = 0  # samples that were no message of the topic's type
-        self._types = participant.types
-        self._subscriber: zenoh.Subscriber[Handler[zenoh.Sample]] = pubsub.subscriber(participant.session, key, depth)
-        self._token = _announce(participant, token)
+        self._subscriber = pubsub.subscriber(node.participant.session, key, depth)
+        super().__init__(node, kind, key, token)
 
     def received(self) -> Iterator[Message]:
         """The messages that wait, oldest first."""
@@ -132,16 +138,8 @@ class Subscriber:
                 self.malformed += 1
 
     def newest(self) -> Message | None:
-        last = None
-        for last in self.received():  # noqa: B007
-            pass
-        return last
+        return next(iter(deque(self.received(), maxlen=1)), None)
 
     def close(self) -> None:
-        if self._token is not None:
-            self._token.undeclare()
+        super().close()
         self._subscriber.undeclare()
-
-
-def _announce(participant: Participant, token: str) -> zenoh.LivelinessToken | None:
-    return pubsub.alive_token(participant.session, token) if participant.announces else None
