@@ -25,7 +25,7 @@ from agents.vectors import UNKNOWN, ZERO, Pose, Vector, difference, is_finite, n
 class GoalComputer:
     """Goals of one robot."""
 
-    FIXED: ClassVar = ("_gated", "_reshapes", "follows", "needs_company")
+    FIXED: ClassVar = ("_gated", "changes_shape", "follows", "needs_company")
 
     def __init__(self, assignment: Assignment, *, passive: bool = False) -> None:
         """Of a robot with an `assignment`; `passive`: its goals come from elsewhere."""
@@ -44,11 +44,11 @@ class GoalComputer:
         # without neighbours it stays in place
         self.needs_company = linked and not self._anchors and not assignment.law.ALONE
         self._given = [replace(sender.link) for sender in self.neighbours.all]
-        self._reshapes = bool(self._changes)
+        self.changes_shape = bool(self._changes)  # targets or links of the formation change
         for sender in self.neighbours.all:
             planned = planned_at(sender.since, sender.until, sender.reach, 0.0)
             sender.present = sender.in_law and planned
-            self._reshapes = self._reshapes or not planned or sender.until < inf
+            self.changes_shape = self.changes_shape or not planned or sender.until < inf
         self.itinerary: Itinerary | None = None
         if legs or not (self.follows or passive):  # neither law nor plan: stay in place
             self.itinerary = Itinerary(legs, holds_before=not self.follows)
@@ -85,11 +85,6 @@ class GoalComputer:
             self.itinerary.target(elapsed_s, (place[0], place[1], self.ground), yaw)
 
     @property
-    def changes_shape(self) -> bool:
-        """Whether targets or links of the formation change."""
-        return self._reshapes
-
-    @property
     def leads(self) -> bool:
         """Whether the robot has neither links nor anchors: it follows a plan, or stays."""
         return not self.follows
@@ -120,7 +115,7 @@ class GoalComputer:
         if self.stepping is not None:
             return self._decide_by_steps(t, position, velocity, yaw, start)
         elapsed = t - start
-        if self._reshapes:
+        if self.changes_shape:
             self._reshape(elapsed, position, t)
         offset = ZERO
         if self.follows:
@@ -186,7 +181,7 @@ class GoalComputer:
 
     def step(self, t: float, position: Vector, velocity: Vector, yaw: float, start: float) -> None:
         """Let a law that is no gradient step; for the arguments see `decide`. Not quiet."""
-        if self._reshapes:
+        if self.changes_shape:
             self._reshape(t - start, position, t)
         if self.stepping is not None:
             self.stepping.step(self._view(t, position, velocity, yaw, start))

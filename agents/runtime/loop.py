@@ -457,7 +457,7 @@ class Runtime:
         for robot in self.robots:
             if robot.lifecycle.active:
                 robot.lifecycle.land(why)
-            robot.landing.land_in_place()  # the body lands by other means
+            robot.landing.aside = False  # the body lands by other means
         self._declare_tokens()
 
     def _malformed(self) -> int:

@@ -66,10 +66,6 @@ class Landing:
             self._choose(now, neighbours)
         return due and not self.aside
 
-    def land_in_place(self) -> None:
-        """A robot on its way aside lands in place."""
-        self.aside = False
-
     def robot_below(self) -> str:
         """Robot below one that moves aside, in words."""
         return f"{self._nearest}; it goes aside first"

@@ -165,7 +165,7 @@ def test_drone_that_cannot_go_aside_lands_in_place(spoil):
 
 
 def landed_otherwise(bench, drone):
-    drone.landing.land_in_place()
+    drone.landing.aside = False
 
 
 @pytest.mark.parametrize(("event", "sinks_at"), [(fallen, inf), (landed_otherwise, inf), (blind, DT)])
