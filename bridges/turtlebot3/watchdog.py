@@ -26,10 +26,11 @@ TYPES = {"twist": "geometry_msgs/msg/Twist", "stamped": "geometry_msgs/msg/Twist
 class StopTimer:
     """Decision when zeros are due. Times in seconds on any one clock that never steps."""
 
-    def __init__(self, silence_s: float) -> None:
-        self._silence_s = silence_s
-        self._heard = self._stopped_at = self._zero_at = -1e9
-        self._moves = False  # the last command was no zero
+    def __init__(self, silence_s: float, begin: float) -> None:
+        """`begin`: time now; the robot may be driving by a command from before."""
+        self._silence_s, self._heard = silence_s, begin
+        self._stopped_at = self._zero_at = -1e9
+        self._moves = True  # the last command was no zero
         self.stops = 0  # times that the robot was stopped
 
     def hear(self, t: float, *, moves: bool) -> None:
@@ -69,7 +70,7 @@ class WatchdogNode:
     def __init__(self, rclpy: Any, topic: str, kind: str, silence_s: float) -> None:
         messages = importlib.import_module("geometry_msgs.msg")
         self.node = rclpy.create_node("cmd_vel_watchdog")
-        self.watchdog = StopTimer(silence_s)
+        self.watchdog = StopTimer(silence_s, time.monotonic())
         self._make = messages.TwistStamped if kind == TYPES["stamped"] else messages.Twist
         self._stamped = kind == TYPES["stamped"]
         self._publisher = self.node.create_publisher(self._make, topic, 10)

@@ -71,7 +71,8 @@ def drive(kind, watchdog):
         dog = start(watchdog, "--ros-args", "-r", "__ns:=/tb3_0")
         until(lambda: node.count_publishers("/tb3_0/cmd_vel") == 1)
         commander = start(__file__, "command", kind)
-        until(lambda: len(heard) >= 20)
+        until(lambda: heard.count(0.1) >= 20)
+        del heard[: heard.index(0.1)]
         commander.kill()
         commander.wait()
         until(lambda: heard.count(0.0) >= 10)

@@ -34,7 +34,7 @@ def zeros(dog: StopTimer, begin: float, end: float) -> list[float]:
 
 
 def test_moving_robot_stops_after_half_a_second_silence() -> None:
-    dog = StopTimer(0.5)
+    dog = StopTimer(0.5, 0.0)
     dog.hear(10.0, moves=True)
     sent = zeros(dog, 10.0, 14.0)
     assert sent[0] == pytest.approx(10.52)
@@ -44,8 +44,9 @@ def test_moving_robot_stops_after_half_a_second_silence() -> None:
 
 
 def test_commanded_or_standing_robot_is_left_alone() -> None:
-    dog = StopTimer(0.5)
-    assert zeros(dog, 0.0, 5.0) == []  # nobody has ever moved it
+    dog = StopTimer(0.5, 0.0)
+    dog.hear(0.0, moves=False)
+    assert zeros(dog, 0.0, 5.0) == []
     for k in range(50):
         dog.hear(5.0 + 0.4 * k, moves=True)
         assert zeros(dog, 5.0 + 0.4 * k, 5.4 + 0.4 * k) == []
@@ -53,8 +54,15 @@ def test_commanded_or_standing_robot_is_left_alone() -> None:
     assert zeros(dog, 25.0, 40.0) == []
 
 
+def test_robot_that_drives_when_the_watchdog_starts_is_stopped() -> None:
+    """By a command from before, of a sender that is gone."""
+    sent = zeros(StopTimer(0.5, 7.0), 7.0, 12.0)
+    assert sent[0] == pytest.approx(7.52)
+    assert sent[-1] <= 8.6
+
+
 def test_its_own_zeros_are_heard_and_end_nothing() -> None:
-    dog = StopTimer(0.5)
+    dog = StopTimer(0.5, 0.0)
     dog.hear(0.0, moves=True)
     first = zeros(dog, 0.0, 0.6)
     dog.hear(0.6, moves=False)
