@@ -168,12 +168,12 @@ class EmergencyStop:
             stop = messages.encode(messages.Stop(self.identity, reason))
             urgent = stop_publisher(session, keys)
             urgent.put(stop)
-            begun = time.monotonic()
             statuses = pubsub.pose_subscriber(session, keys.status("*"), 4096)
             inbox = pubsub.Inbox(statuses, messages.Status, keys=keys)
             declared += [urgent, statuses]
             self.seen = alive(session, keys)
             self.moving = set(self.seen)
+            begun = time.monotonic()  # after the question who is there, which may take as long
             watch = pubsub.AliveWatch(session, keys.alive("*"))
             while (self.moving or self._awaited(session, begun)) and time.monotonic() < begun + STOP_ANSWER_S:
                 urgent.put(stop)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from contextlib import nullcontext
 from types import SimpleNamespace
 
 import msgspec
@@ -18,7 +19,8 @@ from experiments.real_time.conductor import orders
 from experiments.real_time.conductor.run_view import NetworkView, RobotView
 from tests.conftest import RouterProcess
 from tests.experiments.recordings import START, status
-from tests.waiting import until
+from tests.network import Net
+from tests.waiting import ManualClock, until
 
 KEYS = Keys()
 
@@ -92,6 +94,25 @@ def test_replies_of_another_key_or_robot_are_none() -> None:
     others = messages.Reply("B", ok=True, phase="ready", reason="")
     session = Replies((KEYS.order("A"), others), (KEYS.order("B"), late), (KEYS.order("A"), good))
     assert orders.send_order(session, KEYS, ["A"], messages.Order("hold")) == {"A": good}  # type: ignore[arg-type]
+
+
+def test_stop_is_repeated_although_a_router_hangs(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock, stops = ManualClock(), []
+
+    def alive(*_: object) -> set[str]:
+        clock.now += orders.STOP_ANSWER_S
+        return {"A"}
+
+    with Net().worn() as net:
+        monkeypatch.setattr(orders, "time", clock)
+        monkeypatch.setattr(orders, "alive", alive)
+        monkeypatch.setattr(network, "open_session", lambda *_, **__: net.session)
+        monkeypatch.setattr(orders, "closing_cleanly", lambda session: nullcontext((session, [])))
+        monkeypatch.setattr(orders, "stop_publisher", lambda *_: SimpleNamespace(put=stops.append))
+        stop = orders.EmergencyStop(["tcp/127.0.0.1:1"], "park", "operator")
+        stop.send("a test")
+    assert (stop.failure, stop.moving) == (None, {"A"})
+    assert len(stops) > orders.STOP_ANSWER_S / orders.STOP_AGAIN_S
 
 
 class View(NetworkView):
