@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from functools import cache
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from agents.body.interface import Body, BodyError, BodyRequest, BodyState, call_all
@@ -62,54 +62,33 @@ __all__ = [  # noqa: RUF022 - by subject, as in docs/python.md
     "graph", "rigidity", "ideal_run", "signals", "pareto", "style",
 ]  # fmt: skip
 
-HOMES: Final = {  # modules, and what of them is named above
-    "agents.body.interface": "Body BodyError BodyRequest BodyState call_all",
-    "agents.body.kinds": "KINDS Flight Holonomic Kind Steered Wheels",
-    "agents.formation.link": "Link",
-    "agents.network.keys": "Keys",
-    "agents.network.messages": "RunOrder",
-    "agents.plugins.avoidance": "Avoidance measure_gap",
-    "agents.plugins.law": "Control Law Memory RobotFacts Said View",
-    "agents.plugins.laws": "Gradient",
-    "agents.plugins.planners": "Planner",
-    "agents.plugins.predictors": "Predictor",
-    "agents.plugins.registry": "PluginError",
-    "agents.plugins.triggers": "Trigger",
-    "agents.vectors": "Vector clamp distance norm wrap",
-    "experiments.check": "ideal_run",
-    "experiments.check.check": "check figures",
-    "experiments.definition": "graph rigidity",
-    "experiments.file.document": "Document load loads",
-    "experiments.metrics": "signals",
-    "experiments.metrics.signals": "Measurement",
-    "experiments.metrics.metric": "Metric",
-    "experiments.real_time.conductor.orders": "send_run_order",
-    "experiments.recording.trace": "Trace",
-    "experiments.report": "style",
-    "experiments.run": "folder reopen reopen_seeds show simulate",
-    "experiments.sweep": "pareto",
-    "experiments.sweep.sweep": "sweep",
-    "twins.arrays": "Array",
-    "twins.engines.engine": "EngineFactory",
-    "twins.engines.point_mass": "PointMassEngine moving_models",
-    "twins.models.ground": "Ground",
-}
-HOME: Final = {name: module for module, names in HOMES.items() for name in names.split()}
+
+@cache
+def homes() -> dict[str, str]:
+    """Module of each name, as the imports above have it."""
+    import ast  # noqa: PLC0415 - with the first name
+    from pathlib import Path  # noqa: PLC0415 - likewise
+
+    nodes = [
+        each for each in ast.walk(ast.parse(Path(__file__).read_text("utf-8"))) if isinstance(each, ast.ImportFrom)
+    ]
+    found = {alias.name: node.module or "" for node in nodes for alias in node.names}
+    return {name: found[name] for name in __all__}
 
 
 @cache
 def __getattr__(name: str) -> Any:  # noqa: ANN401 - a class, a function or a module
     """Object behind a name; raises AttributeError, with the nearest name, if there is none."""
-    if name not in HOME:
+    if name not in __all__:
         message = f"module 'zenpark' has no attribute {name!r}"
         if not name.startswith("__"):  # those Python itself asks for
             from agents.plugins.registry import did_you_mean  # noqa: PLC0415 - in trouble only
 
             message += f"; {did_you_mean(name, __all__)}"
         raise AttributeError(message, name=name)
-    module = import_module(HOME[name])
-    found = getattr(module, name, None)
-    return import_module(f"{HOME[name]}.{name}") if found is None else found
+    home = homes()[name]
+    found = getattr(import_module(home), name, None)
+    return import_module(f"{home}.{name}") if found is None else found
 
 
 def __dir__() -> list[str]:

@@ -49,9 +49,7 @@ class StartBox(FileTable, frozen=True):
 class Shadow(FileTable, frozen=True):
     """Shadow twin: runs beside a robot with the same setpoints, to measure how far they agree."""
 
-    restart_s: Annotated[
-        Positive | None, doc("period at which the twin is reset to the robot [s]; left out: once, at the common start")
-    ] = 5.0
+    restart_s: Annotated[Positive | None, doc("period of its resets to the robot [s]; left out: once, at start")] = 5.0
 
 
 class Arena(FileTable, frozen=True):
@@ -61,9 +59,7 @@ class Arena(FileTable, frozen=True):
     file: Annotated[str | None, doc("arena file beside the experiment file; its [arena] is the base of this")] = None
     walls: Annotated[bool, doc("whether its border is a wall that robots touch and range sensors see")] = True
     obstacles: Annotated[dict[Name, Obstacle], doc("obstacles by name")] = {}
-    starts: Annotated[
-        dict[Name, StartBox], doc("areas where robots may be put before a run; none given: anywhere")
-    ] = {}
+    starts: Annotated[dict[Name, StartBox], doc("areas where robots may be put before a run; none: anywhere")] = {}
 
 
 class Rates(FileTable, frozen=True):
@@ -87,13 +83,9 @@ class RobotTable(FileTable, frozen=True):
 
     kind: Annotated[str, doc("kind of robot, which sets size, speed and setpoint: `./zenpark explain crazyflie`")]
     start: Annotated[list[float], doc("start x, y [m] and, if wanted, yaw [rad]", min_length=2, max_length=3)]
-    body: Annotated[
-        str, doc("twin (in its own process), world (in the twin service), or the address of the real one")
-    ] = "twin"
+    body: Annotated[str, doc("twin (its own process), world (the twin service), or address of the real one")] = "twin"
     hover: Annotated[Positive | None, doc("height that a flying robot holds [m]")] = None
-    position: Annotated[
-        Literal["body", "external"], doc("source of its position: its own estimate, or messages on its key `position`")
-    ] = "body"
+    position: Annotated[Literal["body", "external"], doc("source of its position: itself, or key `position`")] = "body"
     device: Annotated[dict[str, Any], doc("settings of its hardware, defined by the body")] = {}
     process: Annotated[Name | None, doc("name of its process; robots with the same name share one")] = None
     sensors: Annotated[list[str] | None, doc("range sensors of its twin; left out: those that its kind has")] = None
@@ -111,13 +103,8 @@ class TargetTable(FileTable, frozen=True):
     """Target of a link, one of three: distance, offset or bearing."""
 
     distance: Annotated[Positive | None, doc("distance to keep [m]")] = None
-    offset: Annotated[
-        Vector | None,
-        doc("place x, y (, z) of the second robot relative to the first [m]; z left out: by their heights"),
-    ] = None
-    bearing: Annotated[
-        Vector | None, doc("direction x, y (, z) from the first robot to the second; z left out: as seen from above")
-    ] = None
+    offset: Annotated[Vector | None, doc("x, y (, z) of the second relative to the first [m]; no z: by heights")] = None
+    bearing: Annotated[Vector | None, doc("direction x, y (, z) from the first to the second; no z: from above")] = None
 
     def __post_init__(self) -> None:
         given = [name for name in TARGETS if getattr(self, name) is not None]
@@ -176,13 +163,8 @@ class ChangeTable(FileTable, frozen=True):
     at_s: Annotated[NotNegative, doc("start of the transition, after the common start [s]")]
     over_s: Annotated[NotNegative, doc("duration [s]; 0: at once")] = 5.0
     links: Annotated[dict[str, Positive | TargetTable], doc("links that get another target")] = {}
-    shape: Annotated[
-        dict[Name, Vector],
-        doc("places of robots, x, y (, z) [m]: new targets of the links that have theirs from a shape"),
-    ] = {}
-    scale: Annotated[
-        Positive, doc("size of the shape seen from above, as a multiple of the shape before; heights stay")
-    ] = 1.0
+    shape: Annotated[dict[Name, Vector], doc("new places, x, y (, z) [m], of links that get targets by a shape")] = {}
+    scale: Annotated[Positive, doc("size of the shape from above, as a multiple of that before; heights stay")] = 1.0
     rotate: Annotated[float, doc("rotation to the left [rad]; not for distances, which have no direction")] = 0.0
 
 
@@ -190,9 +172,7 @@ class Proximity(FileTable, frozen=True):
     """Links that exist while two robots are near each other."""
 
     range: Annotated[Positive, doc("distance below which robots become neighbours [m]")]
-    release: Annotated[
-        Positive | None, doc("distance above which they stop being neighbours [m]; left out: 1.1 range")
-    ] = None
+    release: Annotated[Positive | None, doc("distance above which they cease to be so [m]; left out: 1.1 range")] = None
     distance: Annotated[
         Positive | None,
         doc("distance to keep by neighbours without a link in the file [m]; left out: only links of the file act"),
@@ -207,9 +187,7 @@ class Formation(FileTable, frozen=True):
     """Formation: links with their targets, anchors, and the law."""
 
     law: Annotated[Choice, doc("a registered law")] = "distance"
-    update: Annotated[
-        Choice | None, doc("trigger that decides when a robot recomputes the law; left out: at every decision")
-    ] = None
+    update: Annotated[Choice | None, doc("trigger of a recomputation of the law; left out: every decision")] = None
     gain: Annotated[Positive, doc("μ of links with a distance as target [1/(m²·decision)] (paper, eq. (6))")] = 3.0
     stiffness: Annotated[
         Positive, doc("k of links with an offset or a bearing as their target, or of all for some laws [1/decision]")
@@ -224,9 +202,7 @@ class Formation(FileTable, frozen=True):
             '"shape": as in [formation.shape], or "link": none, for laws that need no target'
         ),
     ] = {}
-    anchors: Annotated[
-        dict[Name, Positive | AnchorTable], doc("by robot: distance to the origin [m], or to another place")
-    ] = {}
+    anchors: Annotated[dict[Name, Positive | AnchorTable], doc("by robot: distance to the origin [m], or a place")] = {}
     shape: Annotated[
         dict[Name, Vector],
         doc(
@@ -267,9 +243,7 @@ class Outage(FileTable, frozen=True):
 
     from_s: Annotated[NotNegative, doc("start of the outage, after the common start [s]")]
     until_s: Annotated[Positive | None, doc("end of the outage [s]; left out: end of the run")] = None
-    links: Annotated[
-        list[str], doc('links; "A > B": poses from A to B; "A - B": both ways; left out, with robots too: all')
-    ] = []
+    links: Annotated[list[str], doc('links; "A > B": from A to B; "A - B": both ways; left out with robots: all')] = []
     robots: Annotated[list[Name], doc("robots with all their links")] = []
 
     def __post_init__(self) -> None:
@@ -281,9 +255,7 @@ class ChannelTable(LinkEffects, FileTable, frozen=True):
     """Effects of the network on poses between robots: modelled in virtual time, added at the receiver in real time."""
 
     outages: Annotated[list[Outage], doc("times in which nothing passes")] = []
-    links: Annotated[
-        dict[str, LinkChannelTable], doc('effects by link; "A > B": poses from A to B; "A - B": both ways')
-    ] = {}
+    links: Annotated[dict[str, LinkChannelTable], doc('by link; "A > B": poses from A to B; "A - B": both ways')] = {}
 
 
 class NetworkTable(FileTable, frozen=True):
@@ -303,16 +275,10 @@ class NetworkTable(FileTable, frozen=True):
         doc("connections: all at routers; or, without routers, each robot with exactly its neighbours"),
     ] = "routers"
     addresses: Annotated[dict[Name, str], doc("endpoints of robots in a mesh; left out: free ports on loopback")] = {}
-    routers: Annotated[
-        int, doc("number of routers, each in a process; a member that loses one goes on at the next", ge=1, le=8)
-    ] = 1
-    address: Annotated[
-        str | None, doc("name of this machine for hosts, where `listen` is given; left out: as ssh came from there")
-    ] = None
+    routers: Annotated[int, doc("number of routers, each a process; who loses one goes on at the next", ge=1, le=8)] = 1
+    address: Annotated[str | None, doc("name of this machine for hosts, with `listen`; none: as ssh found it")] = None
     encoding: Annotated[Literal["json", "msgpack"], doc("of the payloads")] = "json"
-    lab: Annotated[
-        str | None, doc("folder of certificates (`./zenpark lab init`), beside this file; left out: loopback only")
-    ] = None
+    lab: Annotated[str | None, doc("certificates (`./zenpark lab init`): folder beside this; none: loopback")] = None
 
 
 class Host(FileTable, frozen=True):
@@ -326,9 +292,7 @@ class Host(FileTable, frozen=True):
         ),
     ] = None
     zenpark: Annotated[str, doc("command of zenpark there; a path counts from the home folder")] = "zenpark/zenpark"
-    lab: Annotated[
-        str, doc("folder there for the certificates of its robots, in a lab; counts from the home folder")
-    ] = "zenpark-lab"
+    lab: Annotated[str, doc("folder of its robots' certificates, in a lab; from the home folder")] = "zenpark-lab"
     robots: Annotated[list[Name], doc("robots there; those that no host names run here")] = []
     tags: Annotated[list[Name], doc("labels by which `./zenpark hosts` chooses among hosts")] = []
 
@@ -353,9 +317,7 @@ class Start(FileTable, frozen=True):
 
     deadline_s: Annotated[Positive, doc("time limit for all robots to be ready [s]")] = 20.0
     missing: Annotated[Literal["abort", "go-on"], doc("reaction to a robot that is not ready by then")] = "abort"
-    scatter: Annotated[
-        NotNegative, doc("largest random offset of a twin from `start`, on each axis, by the seed [m]")
-    ] = 0.0
+    scatter: Annotated[NotNegative, doc("largest offset of a twin from `start`, per axis, by the seed [m]")] = 0.0
     scatter_yaw: Annotated[NotNegative, doc("largest random yaw offset of each start, by the seed [rad]")] = 0.0
 
 
@@ -379,13 +341,9 @@ WORST: Final = "worst"  # of them
 class Criterion(FileTable, frozen=True):
     """Limit that a run must keep to pass: of a metric, or of a measure of the law."""
 
-    metric: Annotated[
-        str | None, doc('metric, also one in a file beside this one ("way.py:Way"); or give `measure`')
-    ] = None
+    metric: Annotated[str | None, doc('metric, also in a file beside this ("way.py:Way"); or give `measure`')] = None
     measure: Annotated[str | None, doc("number that the law measures, averaged over the last second of the run")] = None
-    of: Annotated[
-        str, doc("mean over robots, worst (largest for `at_most`, smallest for `at_least`), or a robot's name")
-    ] = MEAN
+    of: Annotated[str, doc("mean over robots, worst (largest for `at_most`, smallest for `at_least`), or name")] = MEAN
     case: Annotated[str | None, doc("judged case; left out: each case")] = None
     at_most: Annotated[float | None, doc("upper limit, in the unit of the metric")] = None
     at_least: Annotated[float | None, doc("lower limit, in the unit of the metric")] = None
@@ -414,9 +372,7 @@ class Experiment(FileTable, frozen=True):
     title: Annotated[str, doc("subject of the experiment, for people")]
     robots: Annotated[dict[Name, RobotTable], doc("robots by name", min_length=1)]
     duration_s: Annotated[Positive, doc("duration from the common start [s]", le=86400)]
-    spares: Annotated[
-        dict[Name, RobotTable], doc("robots that wait to take over the name of another one of their kind")
-    ] = {}
+    spares: Annotated[dict[Name, RobotTable], doc("robots that wait to take over the name of one of their kind")] = {}
     on_loss: Annotated[
         Literal["none", "restart", "replace"],
         doc("reaction to a robot lost in mid-run: continue without it, restart it, or let a spare take over"),
@@ -433,13 +389,9 @@ class Experiment(FileTable, frozen=True):
         doc("distributed: each robot decides for itself; centralised: one process for all; hybrid: for some"),
     ] = "distributed"
     trigger: Annotated[Choice, doc("registered trigger that decides when a robot transmits")] = "periodic"
-    prediction: Annotated[
-        Choice | None, doc("estimate of a robot's place between two messages; left out: as the trigger needs it")
-    ] = None
+    prediction: Annotated[Choice | None, doc("estimated place between messages; left out: as the trigger needs")] = None
     positioning: Annotated[str | None, doc('source of `position = "external"`: vicon://HOST[:PORT], vicon-twin')] = None
-    disturbance: Annotated[
-        dict[str, Disturbance], doc('by kind or by robot; "all" for every one; the narrower wins')
-    ] = {}
+    disturbance: Annotated[dict[str, Disturbance], doc('by kind or robot; "all" for every one; the narrower wins')] = {}
     avoidance: Annotated[Choice | None, doc("how robots avoid obstacles and each other; left out: they do not")] = None
     world: Annotated[WorldTable, doc("simulated world of the twins")] = WorldTable()
     channel: Annotated[ChannelTable, doc("modelled delays and losses of poses")] = ChannelTable()
