@@ -54,7 +54,7 @@ def test_commanded_or_standing_robot_is_left_alone() -> None:
     assert zeros(dog, 25.0, 40.0) == []
 
 
-def test_robot_that_drives_when_the_watchdog_starts_is_stopped() -> None:
+def test_start_stops_a_robot_that_drives() -> None:
     """By a command from before, of a sender that is gone."""
     sent = zeros(StopTimer(0.5, 7.0), 7.0, 12.0)
     assert sent[0] == pytest.approx(7.52)
