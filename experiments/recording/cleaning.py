@@ -64,7 +64,7 @@ def remove(folder: Path, parts: Sequence[Path] | None = None, *, really: bool = 
         if not certain and origin is not None and origin.ended is None:
             raise InUse(f"{folder} may be in use: it has no end, and its file system has no locks")
         if parts is None:
-            for below in _runs_below(folder):
+            for below in (file.parent for file in folder.rglob(ORIGIN) if file.parent != folder):  # other runs
                 with locked(below, fcntl.LOCK_EX | fcntl.LOCK_NB):
                     pass
         if not really:
@@ -73,11 +73,6 @@ def remove(folder: Path, parts: Sequence[Path] | None = None, *, really: bool = 
             _remove(part)
         if parts is None:
             folder.rmdir()
-
-
-def _runs_below(folder: Path) -> list[Path]:
-    """Folders of other runs inside that of a run."""
-    return [file.parent for file in folder.rglob(ORIGIN) if file.parent != folder]
 
 
 def _remove(part: Path) -> None:

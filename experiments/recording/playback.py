@@ -51,9 +51,8 @@ from experiments.recording.trace import (
     ROUNDING_S,
     Goals,
     Trace,
-    contacts_watched,
-    messages_in_run,
     poses_in_run,
+    world_in_run,
 )
 from twins.arrays import Array, Index
 
@@ -266,8 +265,7 @@ def _trace(content: Content, about: AboutRun, run: tuple[float, float]) -> Trace
     sampled = [_sampled(own, start, time, HOLD_PERIODS / rate) for own in states]
     columns = {what: np.stack([own[what] for own in sampled], axis=1) for what in sampled[0]}
     known = {what: each for what, each in columns.items() if what not in OPTIONAL or np.isfinite(each).any()}
-    contacts = messages_in_run(content[Contact], start, duration)
-    world = messages_in_run(content[WorldState], start, duration)
+    contacts, world = world_in_run(content[Contact], content[WorldState], start, duration)
     told, stepping = by_robot(content[LawMemory], robots), HOLD_PERIODS / min(rate, experiment.rates.coordination_hz)
     goals = _goals(content, states, robots, start, duration) if plan.guided else None
     return Trace(
@@ -291,7 +289,7 @@ def _trace(content: Content, about: AboutRun, run: tuple[float, float]) -> Trace
         ),
         interventions=counted("interventions"),
         avoided=counted("avoided"),
-        contacts=contacts if contacts_watched(contacts, world) else None,
+        contacts=contacts,
         world=world,
         goals=goals,
         clocks=Correction(content[HostClock]).offsets(),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Final, Literal, TypeVar
@@ -24,19 +24,26 @@ WALL: Final = "wall"  # of the arena, in contacts
 M = TypeVar("M", Contact, WorldState)
 
 
-def messages_in_run(sent: Iterable[M], start: float, duration: float) -> tuple[M, ...]:
-    """Messages of a run that began at `start` [s], in order of time, with stamps that count from there."""
+def world_in_run(
+    contacts: Iterable[Contact], world: Iterable[WorldState], start: float, duration: float
+) -> tuple[tuple[Contact, ...] | None, tuple[WorldState, ...]]:
+    """Contacts and reports of the world in a run that began at `start` [s], which stamps count from.
+
+    Contacts are None where nobody watched for them: there are none, nor an engine that would have found them.
+    """
+    touched, reports = _messages_in_run(contacts, start, duration), _messages_in_run(world, start, duration)
+    watched = bool(touched) or any(finds_contacts(engine) for engine in {report.engine for report in reports})
+    return touched if watched else None, reports
+
+
+def _messages_in_run(sent: Iterable[M], start: float, duration: float) -> tuple[M, ...]:
+    """Those in the run, in order of time."""
     kept = [
         msgspec.structs.replace(each, stamp=max(each.stamp - start, 0.0))
         for each in sent
         if -ROUNDING_S <= each.stamp - start <= duration + ROUNDING_S
     ]
     return tuple(sorted(kept, key=lambda each: each.stamp))
-
-
-def contacts_watched(contacts: Sequence[Contact], world: Iterable[WorldState]) -> bool:
-    """Whether contacts were watched for: there are some, or an engine that would have found them."""
-    return bool(contacts) or any(finds_contacts(engine) for engine in {report.engine for report in world})
 
 
 @dataclass(frozen=True)

@@ -95,6 +95,7 @@ def provenance(text: str | None = None) -> Provenance:
     """Code, versions and machine of this process, now; of plug-ins only those that the text of an experiment names."""
     libraries = dict.fromkeys([*LIBRARIES, *(kind.library for kind in KINDS.usable() if kind.library)])
     packages = {name: found for name in libraries if (found := installed(name)) is not None}
+    memory = 0.0
     with suppress(OSError, ValueError):
         memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
     return Provenance(

@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from io import FileIO
 from math import inf
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -235,12 +236,19 @@ class Recording:
         )
         self._over = ""  # why nothing more can be written
         try:
-            file = _Unbuffered(path)
+            file = _Unbuffered(path, "xb")
         except FileExistsError:
             raise RecordingError(f"{path}: exists already; move it away or record under another name") from None
         except OSError as error:
             raise RecordingError(f"{path}: cannot be created: {error.strerror}; record somewhere else") from error
-        self._file = McapFile(file, path.parent, chunk_bytes)
+        try:
+            self._file = McapFile(file, path.parent, chunk_bytes)
+        except OSError as error:
+            file.close()
+            path.unlink()
+            raise RecordingError(
+                f"{path.parent}: holds no recording: {error.strerror}; record somewhere else"
+            ) from error
         made = version.provenance()
         about = {"case": case, "seed": str(seed), "clock": clock, "version": made.zenpark}
         about |= {"code": made.code, "commit": made.commit, "python": made.python, "host": made.host, "cpu": made.cpu}
@@ -396,20 +404,11 @@ class _Written:
     encode: Callable[[Any], bytes]
 
 
-class _Unbuffered:
+class _Unbuffered(FileIO):
     """An unbuffered file: a write is the kernel's when it returns, so that a kill loses none of it."""
 
-    def __init__(self, path: Path) -> None:
-        self._raw = path.open("xb", buffering=0)
-
-    def write(self, data: bytes) -> int:
+    def write(self, data: bytes) -> int:  # type: ignore[override]
         rest = memoryview(data)
         while rest:  # a disk that is nearly full takes a part, and refuses only the next
-            rest = rest[self._raw.write(rest) :]
+            rest = rest[super().write(rest) :]
         return len(data)
-
-    def tell(self) -> int:
-        return self._raw.tell()
-
-    def close(self) -> None:
-        self._raw.close()

@@ -28,10 +28,9 @@ from experiments.recording.trace import (
     WALL,
     Goals,
     Trace,
-    contacts_watched,
     in_run,
-    messages_in_run,
     poses_in_run,
+    world_in_run,
 )
 from experiments.recording.writer import Recording
 from experiments.scene import markers
@@ -82,8 +81,7 @@ class RunRecorder:
         if not log.lean:
             sizes = [len(messages.encode(pose, self._encoding)) for pose in self._poses(sent)]
             sent = replace(sent, bytes=np.array(sizes, dtype=np.intp))
-        contacts = messages_in_run(self._contacts(), EPOCH, duration)
-        world = messages_in_run(self._world(), EPOCH, duration)
+        contacts, world = world_in_run(self._contacts(), self._world(), EPOCH, duration)
         columns: dict[str, Any] = {what: getattr(log, what) for what in (*SAMPLED, *OPTIONAL)}
         columns = {what: None if each is None else each[run] for what, each in columns.items()}
         return Trace(
@@ -104,7 +102,7 @@ class RunRecorder:
             ),
             interventions=log.interventions,
             avoided=log.avoided,
-            contacts=contacts if contacts_watched(contacts, world) else None,
+            contacts=contacts,
             world=world,
             dropped=self._log.lost,
             foreign=np.zeros(len(log.names), dtype=np.intp),

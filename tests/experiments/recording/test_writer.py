@@ -1,5 +1,6 @@
 """Others read a recording; nothing is written over, and a full disk or a mistake leaves a file that can be read."""
 
+import errno
 import io
 import itertools
 import math
@@ -125,6 +126,16 @@ def test_disk_too_full_for_record_or_recovery(path, tmp_path):
         assert not path.exists()
         with pytest.raises(RecordingError, match="cannot be written"):
             rec.recording(path, document="#" * 50_000)
+
+
+def test_recording_without_room_for_indices_leaves_no_file(path, monkeypatch):
+    def full(**_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(writer, "TemporaryFile", full)
+    with pytest.raises(RecordingError, match="No space left"):
+        rec.write(path, *rec.whole_run())
+    assert not path.exists()
 
 
 def test_interrupt_inside_a_write_ends_all_writing(path, monkeypatch):
