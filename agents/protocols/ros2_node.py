@@ -77,7 +77,7 @@ class Node:
 
 
 class _Endpoint:
-    """What a node announces of a topic."""
+    """Announcement of one end of a topic by a node."""
 
     def __init__(self, node: Node, kind: str, key: str, token: str) -> None:
         participant = node.participant

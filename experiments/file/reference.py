@@ -61,7 +61,7 @@ def entries() -> tuple[Entry, ...]:
 
 
 def _inlined(node: Mapping[str, Any], definitions: Mapping[str, Any]) -> dict[str, Any]:
-    """A node of the schema with the definitions that it refers to in their places, but for those of cases."""
+    """A node of the schema with the definitions that it refers to in their places, except those of cases."""
     name = node.get("$ref", CASE).rpartition("/")[2]
     inner = {} if name.endswith(CASE) else definitions[name]
     own = {key: value for key, value in node.items() if key not in ("$ref", "definitions")}
