@@ -86,7 +86,7 @@ def experiment_file(made: Layout, wanted: LayoutOptions) -> str:
     distance = norm(first - second)
     needed = 2.0 * kind.radius + PASSING
     least = distance.min()
-    if least < needed:
+    if not least >= needed:  # nor if it is no number
         raise LayoutError(f"robots of kind {kind.name} need a spacing of {needed:.2f} m or more, not {least:.2f} m")
     scatter = round(FREE * wanted.spacing, 3) if wanted.scatter is None else wanted.scatter
     digits = max(2, len(str(len(made))))

@@ -106,6 +106,7 @@ def test_large_formations_say_less_of_themselves():
         ("hemisphere", "9", {"kind": "khepera4"}, "robots that fly"),
         ("polygon", "5", {"kind": "kehpera4"}, "khepera4"),
         ("polygon", "5", {"spacing": 0.1}, "0.23 m or more"),
+        ("polygon", "5", {"spacing": float("nan")}, "0.23 m or more, not nan"),
         ("polygon", "5", {"law": "bearing"}, "distance or displacement"),
         ("grid", "5", {}, "such as 5x8"),
         ("grid", "5xx", {}, "such as 5x8"),
