@@ -29,7 +29,7 @@ def world_in_run(
 ) -> tuple[tuple[Contact, ...] | None, tuple[WorldState, ...]]:
     """Contacts and reports of the world in a run that began at `start` [s], which stamps count from.
 
-    Contacts are None where nobody watched for them: there are none, nor an engine that would have found them.
+    Contacts are None if there are none and no engine of the run finds contacts.
     """
     touched, reports = _messages_in_run(contacts, start, duration), _messages_in_run(world, start, duration)
     watched = bool(touched) or any(finds_contacts(engine) for engine in {report.engine for report in reports})
@@ -37,7 +37,7 @@ def world_in_run(
 
 
 def _messages_in_run(sent: Iterable[M], start: float, duration: float) -> tuple[M, ...]:
-    """Those in the run, in order of time."""
+    """Messages of the run, in order of time."""
     kept = [
         msgspec.structs.replace(each, stamp=max(each.stamp - start, 0.0))
         for each in sent

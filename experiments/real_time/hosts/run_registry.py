@@ -131,7 +131,7 @@ def runs() -> list[RegisteredRun]:
 
 
 def _silent(endpoints: Iterable[str]) -> set[str]:
-    """Endpoints that take no connections; an endpoint without an answer in time, such as a name without an address, is not one."""
+    """Endpoints that take no connections; one without an answer in time, such as an unknown name, is left out."""
     silent: list[str] = []
 
     def knock(endpoint: str) -> None:
