@@ -19,8 +19,7 @@ from experiments.definition import bodies, standby
 from experiments.definition.access_rights import has_world
 from experiments.definition.experiment import VICON_TWIN, RobotTable
 from experiments.definition.plan import Plan
-from experiments.file import document
-from experiments.file.document import write_json
+from experiments.file.document import case_document, write_json
 from experiments.real_time.conductor.orders import Emergency
 from experiments.real_time.hosts.hosts import STATION, Hosts
 from experiments.real_time.hosts.launcher import LAND_S, ZYGOTE, Launcher, Process, is_router, make_routers
@@ -86,17 +85,27 @@ class _Supervised:
     starts: int = 1
 
 
-class SupportProcesses:
-    """Supervised processes of one case: routers, world, central controller, motion capture; and protocol twins."""
+@dataclass(frozen=True)
+class Death:
+    """Unexpected end of a process."""
 
-    standins: list[str]  # processes of protocol twins, world and motion capture
+    # "lost" (a robot's process), "host" (the connection to one), "device" (a protocol twin), "zygote", or the
+    # role of a process that was started again
+    kind: str
+    source: str  # robot or host concerned, or "conductor"
+    text: str
+
+
+class CaseProcesses:
+    """Starts, watches and ends the processes of one case, except its routers, which it only starts again."""
 
     def __init__(self, context: CaseContext) -> None:
-        """Start nothing: routers are started by others."""
         self._context = context
-        self.standins = []
+        self._launcher = context.launcher
+        self._groups = context.plan.experiment.processes  # by process, without the case
+        self._standins: list[str] = []  # processes of protocol twins, world and motion capture
         count = context.plan.experiment.network.routers
-        self._known = {
+        self._supervised = {
             each.name: _Supervised(
                 partial(each.start, context.launcher, context.rights),
                 ": all go on at another meanwhile" if count > 1 else "",
@@ -104,23 +113,41 @@ class SupportProcesses:
             )
             for each in make_routers(context.hosts.routers, count)
         }
+        self.adopted: set[str] = set()  # robots that others have started, or will
+        # hosts without address, by the robots that are started there
+        self.away = standby.robots_without_address(context.plan)
+        self._addressed, self._reached = context.file, context.plan
+        self._joining = context.variant("joining")
+        self._parts: list[Path] = []  # recordings of this case, one of each recorder
+        self._abroad: dict[str, Process] = {}  # by host and group
 
-    def supervise(self, start: Callable[[], Process], meanwhile: str = HOLD, given_up: str = "") -> Process:
-        """Start a process of the case, and again when it dies; texts as of `_Supervised`."""
-        process = start()
-        self._known[process.name] = _Supervised(start, meanwhile, given_up)
-        return process
-
-    def start(self) -> Plan:
-        """Start what the robots of the case need; return the case with the addresses of its robots.
+    def prepare(self, *, recorder: bool = True) -> None:
+        """Start all but router and robots: the recorder, if one is wanted, then what robots need.
 
         Raises StandInError if a protocol twin or a positioning system does not start in time.
         """
+        context = self._context
+        if recorder:
+            missing = ": messages from between are missing in the recording"
+            self._supervise(self._record, missing, ": the recording stops here")
+        self._reached = self._start_support()
+        if self._standins:
+            self._addressed = context.variant("addressed")
+            self._addressed.write_bytes(write_json(self._reached))
+
+    def _supervise(self, start: Callable[[], Process], meanwhile: str = HOLD, given_up: str = "") -> Process:
+        """Start a process of the case, and again when it dies; texts as of `_Supervised`."""
+        process = start()
+        self._supervised[process.name] = _Supervised(start, meanwhile, given_up)
+        return process
+
+    def _start_support(self) -> Plan:
+        """Start what the robots of the case need; return the case with the addresses of its robots."""
         context, experiment = self._context, self._context.plan.experiment
         world: Process | None = None
         if has_world(context.plan):
             start = partial(context.start, "world", "experiments.real_time.processes.world", str(context.file))
-            world = self.supervise(start)
+            world = self._supervise(start)
         words = registry.names(registry.DEVICES)
         groups: dict[str, list[str]] = {}
         for name, robot in experiment.robots.items():
@@ -131,17 +158,17 @@ class SupportProcesses:
         addresses: dict[str, str] = {}
         for word, names in groups.items():
             addresses |= processes[word].await_lines(r"^address (\w+) (\S+)$", len(names), context.ended)
-            self.standins.append(processes[word].name)
+            self._standins.append(processes[word].name)
         if world is not None:
             world.await_lines(r"^(world) (ready)\b", 1, context.ended)
-            self.standins.append(world.name)
+            self._standins.append(world.name)
         robots = experiment.robots
         twins = {name: msgspec.structs.replace(robots[name], body=address) for name, address in addresses.items()}
         addressed = context.plan.changed(robots={**robots, **twins})
         self._start_positioning(addressed)
         if context.plan.guided:
             centre = partial(context.start, "centre", "experiments.real_time.processes.centre", str(context.file))
-            self.supervise(centre, given_up=": the robots that it guides hold, and land at the end")
+            self._supervise(centre, given_up=": the robots that it guides hold, and land at the end")
         return addressed
 
     def _start_positioning(self, plan: Plan) -> None:
@@ -157,64 +184,25 @@ class SupportProcesses:
             noise = ["--sigma", str(sigma), "--seed", str(experiment.seed)]
             arguments = ["--listen", "127.0.0.1:0", *measured, *noise, *realm]
             twin = context.start(VICON_TWIN, "twins.devices.vicon", *arguments)
-            self.standins.append(twin.name)
+            self._standins.append(twin.name)
             host = twin.await_lines(r"^vicon (ready on) (\S+)$", 1, context.ended)["ready on"]
         maps = [part for name in measured for part in ("--map", f"{name}={name}")]
         bridge = partial(context.start, "vicon", "bridges.vicon.publisher", host, *maps, *realm)
         hold = ": robots without a position hold, drones land"
-        self.standins.append(self.supervise(bridge, hold, hold).name)
+        self._standins.append(self._supervise(bridge, hold, hold).name)
 
     def again(self, process: Process) -> tuple[str, str] | None:
         """Restart a process that has died; its role and the text of the event. None if it is not supervised."""
-        servant = self._known.get(process.name)
-        if servant is None:
+        supervised = self._supervised.get(process.name)
+        if supervised is None:
             return None
         kind = process.name.removeprefix(self._context.process(""))
-        more = servant.starts < STARTS
+        more = supervised.starts < STARTS
         if more:
-            servant.starts += 1
-            servant.start()
-        what = f"started again{servant.meanwhile}" if more else f"given up{servant.given_up}"
+            supervised.starts += 1
+            supervised.start()
+        what = f"started again{supervised.meanwhile}" if more else f"given up{supervised.given_up}"
         return kind, f"the {kind} ended ({process.exit}); {what}{'' if is_router(process.name) else process.because}"
-
-
-@dataclass(frozen=True)
-class Death:
-    """Unexpected end of a process."""
-
-    # "lost" (a robot's process), "host" (the connection to one), "device" (a protocol twin), "zygote", or the
-    # role of a process that was started again
-    kind: str
-    source: str  # robot or host concerned, or "conductor"
-    text: str
-
-
-class CaseProcesses:
-    """Starts, watches and ends the processes of one case."""
-
-    def __init__(self, context: CaseContext) -> None:
-        self._context = context
-        self._launcher = context.launcher
-        self._groups = context.plan.experiment.processes  # by process, without the case
-        self._support = SupportProcesses(context)
-        self.adopted: set[str] = set()  # robots that others have started, or will
-        # hosts without address, by the robots that are started there
-        self.away = standby.robots_without_address(context.plan)
-        self._addressed, self._reached = context.file, context.plan
-        self._joining = context.variant("joining")
-        self._parts: list[Path] = []  # recordings of this case, one of each recorder
-        self._abroad: dict[str, Process] = {}  # by host and group
-
-    def prepare(self, *, recorder: bool = True) -> None:
-        """Start all but router and robots: the recorder, if one is wanted, then what robots need."""
-        context = self._context
-        if recorder:
-            missing = ": messages from between are missing in the recording"
-            self._support.supervise(self._record, missing, ": the recording stops here")
-        self._reached = self._support.start()
-        if self._support.standins:
-            self._addressed = context.variant("addressed")
-            self._addressed.write_bytes(write_json(self._reached))
 
     def _record(self) -> Process:
         context = self._context
@@ -293,7 +281,7 @@ class CaseProcesses:
         group = self._group(names[0])
         station = self._context.hosts.by_robot.get(names[0])
         if station is not None:
-            case = document.case_document(plan)
+            case = case_document(plan)
             self._abroad[f"{station.name}/{group}"] = station.start(self._process(names[0]), names, case)
         else:
             self._context.start(group, "experiments.real_time.processes.robot", str(file), *names)
@@ -331,7 +319,7 @@ class CaseProcesses:
         self.end_robots()
         self._launcher.end([self._context.process("centre")], grace_s=2.0)  # its last report is recorded
         self._launcher.end([self._context.process("recorder")], grace_s=5.0)
-        self._launcher.end(self._support.standins, grace_s=2.0)
+        self._launcher.end(self._standins, grace_s=2.0)
 
     def end_robots(self) -> list[str]:
         """End the processes of all robots, which land first; return the robots with a process that had to be killed."""
@@ -343,9 +331,9 @@ class CaseProcesses:
         a few times."""
         for process in self._launcher.died():
             role, end, because = process.name.removeprefix(self._context.process("")), process.exit, process.because
-            if (again := self._support.again(process)) is not None:
+            if (again := self.again(process)) is not None:
                 yield Death(again[0], "conductor", again[1])
-            elif process.name in self._support.standins:
+            elif process.name in self._standins:
                 text = f"the {role} ended ({end}); robots that need it hold, or land{because}"
                 yield Death("device", "conductor", text)
             elif process.name == ZYGOTE:

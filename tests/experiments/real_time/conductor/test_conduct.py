@@ -21,7 +21,7 @@ from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.file.problems import DocumentError
 from experiments.real_time.conductor import conduct
-from experiments.real_time.conductor.case_processes import STARTS, CaseContext, SupportProcesses
+from experiments.real_time.conductor.case_processes import STARTS, CaseContext, CaseProcesses
 from experiments.real_time.conductor.conduct import PORT_CHOICES, RunOptions, Supervision, run_setup, with_bodies
 from experiments.real_time.conductor.orders import STARTING_S, Emergency
 from experiments.real_time.hosts import run_registry
@@ -135,16 +135,16 @@ def test_dead_router_listens_again_where_machines_expect_it(tmp_path):
     here, everywhere = "tcp/127.0.0.1:7447", "tcp/0.0.0.0:7447"
     experiment = document.read("triangle").experiment
     hosts = Hosts(launcher, [everywhere])
-    servants = SupportProcesses(
+    processes = CaseProcesses(
         CaseContext(Plan(experiment), "only", tmp_path, tmp_path / "case.toml", [here], launcher, hosts)
     )
     dead = SimpleNamespace(name=ROUTER, exit="killed by SIGKILL")
-    said = [servants.again(dead) for _ in range(STARTS)]
+    said = [processes.again(dead) for _ in range(STARTS)]
     assert [words[:2] for words in launcher.told] == [(ROUTER, "agents.runtime.router")] * (STARTS - 1)
     assert all(words[2:4] == ("--listen", everywhere) for words in launcher.told)
     assert said[0] == (ROUTER, "the router ended (killed by SIGKILL); started again")
     assert said[-1] == (ROUTER, "the router ended (killed by SIGKILL); given up: the robots hold, and land at the end")
-    assert servants.again(SimpleNamespace(name="only-KH01", exit="exit code 2")) is None
+    assert processes.again(SimpleNamespace(name="only-KH01", exit="exit code 2")) is None
 
 
 @pytest.mark.system
