@@ -83,12 +83,7 @@ def speeds_in_gazebo(modules):
 @pytest.mark.parametrize("speeds", [speeds_in_webots, speeds_in_gazebo])
 def test_stop_with_lower_number_is_the_last_word(modules, speeds):
     """Of repeated and overtaken commands none is obeyed after it."""
-    commands = [
-        encoded(7, "drive"),
-        encoded(5, "stop"),
-        encoded(6, "drive"),
-        encoded(7, "drive"),
-    ]
+    commands = [encoded(7, "drive"), encoded(5, "stop"), encoded(6, "drive"), encoded(7, "drive")]
     modules["zenoh"].open.return_value = Session(commands)
     moving, *stopped = speeds(modules)
     assert moving > 0.0

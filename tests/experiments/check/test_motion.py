@@ -130,11 +130,7 @@ def test_soft_formation_is_found_under_hover_jitter():
 
 @pytest.mark.parametrize(
     "made",
-    [
-        pytest.param(flat_strip(jitter=0.0), marks=pytest.mark.nightly),
-        flat_strip(jitter=0.0005),
-        robots_on_wheels(),
-    ],
+    [pytest.param(flat_strip(jitter=0.0), marks=pytest.mark.nightly), flat_strip(jitter=0.0005), robots_on_wheels()],
 )
 def test_undisturbed_formation_is_not_called_soft(made):
     claims = findings(made)

@@ -135,8 +135,8 @@ class Way(Metric, frozen=True):
     sums = True
     figure = True
 
-    def of(self, short_trace, shared):
-        return np.nansum(np.linalg.norm(np.diff(short_trace.true_position, axis=0), axis=2), axis=0)
+    def of(self, trace, shared):
+        return np.nansum(np.linalg.norm(np.diff(trace.true_position, axis=0), axis=2), axis=0)
 
 
 class Height(Metric, frozen=True):
@@ -147,8 +147,8 @@ class Height(Metric, frozen=True):
     better = "more"
     needs = ("goal",)
 
-    def of(self, short_trace, shared):
-        return np.nanmax(short_trace.goal[..., 2])
+    def of(self, trace, shared):
+        return np.nanmax(trace.goal[..., 2])
 
 
 class Careless(Height, frozen=True):
@@ -162,7 +162,7 @@ class Wrong(Metric, frozen=True):
 
     label = "Wrong"
 
-    def of(self, short_trace, shared):
+    def of(self, trace, shared):
         return np.zeros(30)
 
 

@@ -46,8 +46,7 @@ def test_a_value_of_a_range_lies_within_it(low, factor, share, scale):
 
 
 @pytest.mark.parametrize(
-    ("text", "seeds"),
-    [("seeds=3", (5, 6, 7)), ("seeds=101:103", (101, 102, 103)), (None, tuple(range(5, 25)))],
+    ("text", "seeds"), [("seeds=3", (5, 6, 7)), ("seeds=101:103", (101, 102, 103)), (None, tuple(range(5, 25)))]
 )
 def test_seeds(text, seeds):
     assert seeds_of(text, 5) == seeds

@@ -7,14 +7,7 @@ import numpy as np
 import pytest
 
 from agents.body.interface import Disturbance
-from experiments.definition.experiment import (
-    Arena,
-    LegTable,
-    Rates,
-    RobotTable,
-    Shadow,
-    WorldTable,
-)
+from experiments.definition.experiment import Arena, LegTable, Rates, RobotTable, Shadow, WorldTable
 from experiments.definition.plan import Plan
 from experiments.recording import playback
 from experiments.virtual_time.log import RunRecorder
