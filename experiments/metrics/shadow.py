@@ -73,21 +73,15 @@ def _of_speeds(time: Array, robot: Array, twin: Array, known: Mask) -> float | N
     if len(time) <= width:
         return None
     broken = ~known
-    broken[1:] |= _jumps(twin - robot)
+    change = norm(np.diff(twin - robot, axis=0))
+    usual = change[np.isfinite(change)]
+    if len(usual):  # it changes as it never does by itself where the twin was put onto the robot
+        broken[1:] |= change > JUMP * np.median(usual) + JUMP_M
     count = np.concatenate([[0], np.cumsum(broken)])
     whole = count[width + 1 :] == count[1 : len(time) - width + 1]  # no break after the first of width + 1 samples
     whole &= known[: len(time) - width]
     speeds = [norm(path[width:] - path[:-width])[whole] / SPEED_S for path in (robot, twin)]
     return _correlation(speeds[0], speeds[1], STILL_M_S)
-
-
-def _jumps(apart: Array) -> Mask:
-    """(T − 1,) where a difference (T, 3) changes as it never does by itself."""
-    change = norm(np.diff(apart, axis=0))
-    usual = change[np.isfinite(change)]
-    if not len(usual):
-        return np.zeros(len(change), dtype=bool)
-    return np.asarray(change > JUMP * np.median(usual) + JUMP_M)
 
 
 def _correlation(one: Array, other: Array, still: float) -> float | None:

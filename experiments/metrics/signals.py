@@ -89,13 +89,6 @@ class LinkErrors:
         parts = {name: getattr(self, name)[rows] for name in ("time", "error", "alive", "there", "gone")}
         return replace(self, **parts)
 
-    def per_robot(self) -> Array:
-        """e_i(t) = Σ_j e_ij (T, N) [m] over its own links, see `error`; NaN where none of them is known."""
-        known = np.isfinite(self.error)
-        total = np.where(known, self.error, 0.0) @ self.own
-        total[known.astype(float) @ self.own == 0.0] = np.nan
-        return np.asarray(total)
-
     def acquired(self, window: int, tolerance: float) -> list[float | None]:
         """Per robot, from when on the mean of each of its links over `window` samples stays within the tolerance [m].
 
@@ -125,10 +118,6 @@ class LinkErrors:
         there = self.there[:, self.net.receiver] & self.there[:, self.net.sender]
         covered = (np.isfinite(self.error) & there).sum(axis=0) / np.maximum(there.sum(axis=0), 1)
         return np.asarray((covered @ self.own) / np.maximum(self.own.sum(axis=0), 1.0))
-
-    def known(self) -> Array:
-        """(N,) share of the time at which each robot was to be there, at which its position is known; 0 without any."""
-        return np.asarray((self.alive & self.there).sum(axis=0) / np.maximum(self.there.sum(axis=0), 1))
 
     def worst(self, names: Sequence[str]) -> list[tuple[float | None, str]]:
         """Per robot the mean error of its worst link [m], and the robot at its other end."""
@@ -340,8 +329,12 @@ class Measurement:
 
     @cached_property
     def robot_errors(self) -> Array:
-        """e(t) of each robot (T, N) [m], over its own links."""
-        return self.errors.per_robot()
+        """e_i(t) = Σ_j e_ij (T, N) [m] over the own links of each robot; NaN where none of them is known."""
+        error, own = self.errors.error, self.errors.own
+        known = np.isfinite(error)
+        total = np.where(known, error, 0.0) @ own
+        total[known.astype(float) @ own == 0.0] = np.nan
+        return np.asarray(total)
 
     @cached_property
     def integrals(self) -> tuple[Array, Array, Array]:
@@ -408,8 +401,9 @@ class Measurement:
 
     @cached_property
     def known(self) -> Array:
-        """Share of the time at which the position of each robot is known (N,)."""
-        return self.errors.known()
+        """Share of the time at which each robot was to be there, at which its position is known (N,); 0 without any."""
+        there = self.errors.there
+        return np.asarray((self.errors.alive & there).sum(axis=0) / np.maximum(there.sum(axis=0), 1))
 
     @cached_property
     def died(self) -> tuple[str, ...]:
@@ -426,14 +420,14 @@ class Measurement:
     @cached_property
     def acquired(self) -> list[float | None]:
         """Acquisition of each robot in the first phase [s]; None if never."""
-        return self._acquired(0)
+        return [each.acquired_s for each in self.phases[0]]
 
     @cached_property
     def phases(self) -> list[list[PhaseMetrics]]:
         """Per phase and robot: time of acquisition and residual error."""
         found = []
-        for k, (start, begin, end) in enumerate(self.bounds):
-            acquired = self._acquired(k) if k else self.acquired
+        for start, begin, end in self.bounds:
+            acquired = self.errors.part(begin, end).acquired(self.window, self.trace.plan.experiment.tolerance)
             worst = self.errors.part(max(begin, end - self.window), end).worst(self.trace.robots)
             found.append([PhaseMetrics(start, when, *left) for when, left in zip(acquired, worst, strict=True)])
         return found
@@ -455,10 +449,6 @@ class Measurement:
             formed = k > 0 or acquired is not None
             found.append(net_rotation(place[after:end], time[after:end]) if formed else None)
         return tuple(found)
-
-    def _acquired(self, phase: int) -> list[float | None]:
-        _, begin, end = self.bounds[phase]
-        return self.errors.part(begin, end).acquired(self.window, self.trace.plan.experiment.tolerance)
 
     @cached_property
     def settled(self) -> list[float | None]:

@@ -39,11 +39,6 @@ def ratios(runs: Sequence[CaseMetrics], reference: Sequence[CaseMetrics], index:
     return [ratio(known, others[seed] if paired else mean) for seed, known in values.items()]
 
 
-def same_length(runs: Sequence[CaseMetrics]) -> bool:
-    """Whether all runs are equally long."""
-    return equally_long(run.duration_s for run in runs)
-
-
 def by_case(cases: Sequence[CaseMetrics]) -> dict[str, list[CaseMetrics]]:
     """Runs of the same case together, cases in the order of their first run."""
     grouped: dict[str, list[CaseMetrics]] = {}

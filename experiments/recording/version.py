@@ -91,6 +91,11 @@ def digest(root: Path = ROOT, packages: Sequence[str] = PACKAGES) -> str:
     return total.hexdigest()
 
 
+@cache
+def file_digest(file: Path) -> str:
+    return hashlib.sha256(file.read_bytes()).hexdigest()
+
+
 def provenance(text: str | None = None) -> Provenance:
     """Code, versions and machine of this process, now; of plug-ins only those that the text of an experiment names."""
     libraries = dict.fromkeys([*LIBRARIES, *(kind.library for kind in KINDS.usable() if kind.library)])

@@ -8,10 +8,10 @@ from collections.abc import Iterator, Sequence
 
 from agents.plugins.registry import did_you_mean
 from experiments.metrics import criteria
-from experiments.metrics.comparable import LOST, MISSED, SLOW, lost_share, spoils
+from experiments.metrics.comparable import LOST, MISSED, SLOW, equally_long, lost_share, spoils
 from experiments.metrics.metric import ERRORS, OURS
 from experiments.metrics.results import CaseMetrics, Collision
-from experiments.metrics.statistics import by_case, ratios, same_length, spread
+from experiments.metrics.statistics import by_case, ratios, spread
 from experiments.report.page import Mark, VerdictLine, interval, number
 from experiments.report.tables import dropped_share, mean_delay, ratio_words
 
@@ -315,7 +315,7 @@ def _against_the_first(cases: Sequence[CaseMetrics]) -> Lines:
             yield VerdictLine("good" if fewer > 0.0 and float(share) and not some else "plain", text)
         errors = [(OURS[name].label, spread(ratios(runs, first, name))) for name in ERRORS]
         known = [(label, each) for label, each in errors if each.mean is not None]
-        if not same_length([*runs, *first]):
+        if not equally_long(run.duration_s for run in (*runs, *first)):
             yield VerdictLine("fair", f"Runs of different length of {name} and {reference} are not compared.")
         if known:
             parts = [f"{label} {ratio_words(each)}" for label, each in known]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from functools import cache
 from inspect import getfile
 from pathlib import Path
 from typing import Final
@@ -21,7 +20,7 @@ from experiments.metrics.measure import ended_early, failures
 from experiments.metrics.metric import LEAN, case_values, foreign_metrics, swept_metrics, values_of
 from experiments.metrics.signals import Measurement
 from experiments.recording.trace import Trace
-from experiments.recording.version import ROOT, engine_versions
+from experiments.recording.version import ROOT, engine_versions, file_digest
 from experiments.recording.version import digest as digest_of_code
 from experiments.virtual_time import stretch
 from experiments.virtual_time.conductor import Stuck
@@ -139,8 +138,3 @@ def run_metrics(trace: Trace) -> RunMetrics:
 def _early_end(trace: Trace) -> str:
     """Text on the end of a run that ended early; else empty."""
     return f"ended at {trace.time[-1]:.1f} s of {trace.plan.experiment.duration_s:g} s" if ended_early(trace) else ""
-
-
-@cache
-def file_digest(file: Path) -> str:
-    return hashlib.sha256(file.read_bytes()).hexdigest()

@@ -28,7 +28,6 @@ from experiments.recording.trace import (
     WALL,
     Goals,
     Trace,
-    in_run,
     poses_in_run,
     world_in_run,
 )
@@ -77,7 +76,7 @@ class RunRecorder:
         log, duration = self._log, self._experiment.duration_s
         begin, end = np.searchsorted(log.time, -ROUNDING_S), np.searchsorted(log.time, duration + ROUNDING_S, "right")
         run = slice(int(begin), int(end))  # a part of the log, no copy
-        rows, sent = len(log.names), self._log.sent.take(in_run(self._log.sent.stamp, duration))
+        rows, sent = len(log.names), poses_in_run(log.sent, duration, "stamp")
         if not log.lean:
             sizes = [len(messages.encode(pose, self._encoding)) for pose in self._poses(sent)]
             sent = replace(sent, bytes=np.array(sizes, dtype=np.intp))
@@ -91,7 +90,7 @@ class RunRecorder:
             robots=log.names,
             clock="virtual",
             time=np.round(log.time[run], 9),
-            sent=poses_in_run(sent, duration, "stamp"),
+            sent=sent,
             received=poses_in_run(self._log.received, duration, "arrival"),
             lost=np.zeros(rows, dtype=np.intp),
             missed_deadlines=np.zeros(rows, dtype=np.intp),

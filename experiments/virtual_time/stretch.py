@@ -15,7 +15,6 @@ import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from functools import cache
 from importlib.util import find_spec
 from inspect import isfunction
 from pathlib import Path
@@ -30,7 +29,7 @@ from agents.plugins.planners import NO_TARGET, Itinerary
 from agents.robot import Robot
 from agents.user_folder import cache_folder
 from experiments.definition.plan import Plan
-from experiments.recording.version import digest
+from experiments.recording.version import digest, file_digest
 from experiments.virtual_time import company
 from experiments.virtual_time.company import AT_END, Ledger, Member, Planned, Way
 from experiments.virtual_time.network import VirtualNetwork
@@ -324,7 +323,7 @@ def code_of(owners: Iterable[type]) -> str:
         file = getattr(module, "__file__", None)
         values = vars(module)
         numbers = {key: each for key, each in values.items() if isinstance(each, int | float | tuple)}
-        total.append(f"{name} {_digest(Path(file)) if file else time()} {numbers}")  # of a notebook: never the same
+        total.append(f"{name} {file_digest(Path(file)) if file else time()} {numbers}")  # of a notebook: never the same
         waiting |= {str(each.__module__) for each in values.values() if isfunction(each)}
     return " ".join(sorted(total))
 
@@ -379,11 +378,6 @@ def _layouts(kinds: Sequence[Any]) -> Iterator[RecordLayout]:
         elif isinstance(kind, RecordLayout):
             yield kind
             yield from _layouts(list(kind.fields.values()))
-
-
-@cache
-def _digest(file: Path) -> str:
-    return hashlib.sha256(file.read_bytes()).hexdigest()
 
 
 @contextmanager

@@ -110,7 +110,8 @@ class Marker:
         out.numbers("I", len(self.colours))
         out.colours(self.colours, self.opacity)
         out.text("")  # texture
-        out.header(0, 0, "")
+        out.numbers("I", 0, 0)
+        out.text("")
         out.text("")
         out.numbers("I", 0, 0)
         out.text(self.text)
@@ -135,10 +136,6 @@ class _Cdr:
     def text(self, value: str) -> None:
         self.numbers("I", len(value.encode()) + 1)
         self.data += value.encode() + b"\0"
-
-    def header(self, seconds: int, nanoseconds: int, frame: str) -> None:
-        self.numbers("I", seconds, nanoseconds)
-        self.text(frame)
 
     def colours(self, colours: Sequence[Colour], opacity: float) -> None:
         self.numbers("f", *(part for r, g, b in colours for part in (r / 255.0, g / 255.0, b / 255.0, opacity)))
