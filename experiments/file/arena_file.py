@@ -42,46 +42,36 @@ class ArenaFile(Text):
     table: dict[str, Any]  # its [arena]
 
 
-class Misnamed(ValueError):
-    """Arena file that cannot be read; the fault is in the experiment file."""
-
-    def __init__(self, fault: Fault) -> None:
-        super().__init__(fault.message)
-        self.fault = fault
-
-
 def arena_file_name(document: Mapping[str, Any]) -> str | None:
     arena = document.get("arena")
     name = arena.get("file") if isinstance(arena, dict) else None
     return name if isinstance(name, str) else None
 
 
-def named_in(document: Mapping[str, Any], folder: Path, known: Iterable[ArenaFile]) -> ArenaFile | None:
-    """The arena file that a document names, one of those `known` or read; None if it names none; raises as `load`."""
+def named_in(document: Mapping[str, Any], folder: Path, known: Iterable[ArenaFile]) -> ArenaFile | Fault | None:
+    """The arena file that a document names, one of those `known` or as by `load`; None if it names none."""
     name = arena_file_name(document)
     return None if name is None else next((each for each in known if each.name == name), None) or load(name, folder)
 
 
-def load(name: str, folder: Path) -> ArenaFile:
-    """Reads and checks an arena file.
+def load(name: str, folder: Path) -> ArenaFile | Fault:
+    """Reads and checks an arena file; if there is none of that name, the fault in the experiment file.
 
-    Raises:
-        Misnamed: If there is no such file.
-        DocumentError: With everything that is wrong in it.
+    Raises DocumentError with everything that is wrong in it.
     """
     file = index.file_beside(name, folder)
     if file is None:
         hint = "put it beside the experiment file, and give its name alone"
-        raise Misnamed(Fault(_HERE, f"{name!r} is no name of a file", hint))
+        return Fault(_HERE, f"{name!r} is no name of a file", hint)
     if name.lower() == KEPT or file.suffix.lower() != SUFFIX:
         why = f"does not end with {SUFFIX}" if name.lower() != KEPT else "is the experiment in the folder of a run"
-        raise Misnamed(Fault(_HERE, f"{name!r} {why}", f"call it otherwise, such as lab{SUFFIX}"))
+        return Fault(_HERE, f"{name!r} {why}", f"call it otherwise, such as lab{SUFFIX}")
     label = str(file)
     try:
         text = syntax.content(file, label)
     except FileNotFoundError:
         hint = did_you_mean(name, _known_arena_files(folder))
-        raise Misnamed(Fault(_HERE, f"there is no arena file {label}", hint or "write one beside this file")) from None
+        return Fault(_HERE, f"there is no arena file {label}", hint or "write one beside this file")
     try:
         content = syntax.parsed(text, label, json=False)
     except RecursionError:

@@ -82,13 +82,10 @@ def resolve(source: Source, content: Table, folder: Path) -> tuple[dict[str | No
 
 def _add_arena_file(source: Source, document: Table, case: str | None, folder: Path) -> None:
     """Merge the arena file into the [arena] of a document, which then names no file."""
-    try:
-        file = arena_file.named_in(document, folder, source.arenas.values())
-    except arena_file.Misnamed as error:
-        path = error.fault.path if case is None else ("cases", case, *error.fault.path)
-        source.refuse([replace(error.fault, path=path)])
-        raise
-    if file is not None:
+    file = arena_file.named_in(document, folder, source.arenas.values())
+    if isinstance(file, Fault):
+        source.refuse([file if case is None else replace(file, path=("cases", case, *file.path))])
+    elif file is not None:
         source.arenas[case or ""] = file
         table = {key: value for key, value in document["arena"].items() if key != "file"}
         document["arena"] = deepcopy(merged(file.table, table, ("arena",)))

@@ -10,7 +10,7 @@ from experiments.catalogue import index
 from experiments.file import arena_file
 from experiments.file.arena_file import ArenaFile
 from experiments.file.json_schema import write_schema
-from experiments.file.problems import DocumentError, refusal
+from experiments.file.problems import DocumentError, Fault, refusal
 from experiments.file.text import reason
 
 
@@ -63,6 +63,8 @@ def _arena_beside(text: str, folder: Path) -> ArenaFile | None:
     if name is None:
         return None
     wanted, there = arena_file.load(name, index.FOLDER), folder / name
+    if isinstance(wanted, Fault):
+        raise refusal(name, wanted.message, wanted.hint)
     if there.exists() and there.read_text("utf-8") != wanted.text:
         hint = "choose another folder, or rename that file; nothing was changed"
         raise refusal(str(there), "is another arena than that of the entry", hint)
