@@ -16,7 +16,7 @@ from experiments.definition.experiment import TARGETS, Formation
 from experiments.definition.links import TARGET_KINDS, link_pairs, pairs_or_none
 from experiments.file.choices import struct_of
 from experiments.file.overrides import SHAPE
-from experiments.file.problems import Fault
+from experiments.file.problems import Fault, Path
 
 ALONE: Final = "link"  # a link without a target
 LARGEST_FILE: Final = 1_000_000  # bytes that a law reads from a file
@@ -31,7 +31,7 @@ def fill_from_shape(document: dict[str, Any]) -> list[Fault]:
     links = formation.get("links") if isinstance(formation, dict) else None
     if not isinstance(formation, dict) or not isinstance(links, dict):
         return []
-    shape, faults = formation.get("shape"), list[Fault]()
+    shape, robots, faults = formation.get("shape"), document.get("robots"), list[Fault]()
     bare = [
         text
         for text, given in links.items()
@@ -41,22 +41,22 @@ def fill_from_shape(document: dict[str, Any]) -> list[Fault]:
     law = _law(formation.get("law", Formation().law))
     word = TARGET_KINDS["any" if law is None else law.NEEDS].fields[0]
     for text in bare:
-        try:
-            target = _target_in(shape or {}, document.get("robots"), text, word)
-        except _NoPlace as error:
-            faults.append(Fault(("formation", "links", text), *error.args))
+        target = _target_in(shape, robots, text, word, ("formation", "links", text))
+        if isinstance(target, Fault):
+            faults.append(target)
             target = 1.0 if word == "distance" else [1.0, 0.0]
         given = links[text]
         links[text] = {**given, word: target} if isinstance(given, dict) else {word: target}
     changes = formation.get("changes")
     for number, change in enumerate(changes if isinstance(changes, list) else []):
         if isinstance(change, dict) and isinstance(change.get("shape"), dict):
-            own = change.setdefault("links", {})
+            own, path = change.setdefault("links", {}), ("formation", "changes", number, "shape")
             for text in (text for text in bare if isinstance(own, dict) and text not in own):
-                try:
-                    own[text] = {word: _target_in(change["shape"], document.get("robots"), text, word)}
-                except _NoPlace as error:
-                    faults.append(Fault(("formation", "changes", number, "shape"), *error.args))
+                target = _target_in(change["shape"], robots, text, word, path)
+                if isinstance(target, Fault):
+                    faults.append(target)
+                else:
+                    own[text] = {word: target}
     return faults
 
 
@@ -109,33 +109,28 @@ def _law(choice: object) -> type[Law] | None:
         return None
 
 
-class _NoPlace(ValueError):
-    """A link between robots without places; message and remedy."""
-
-
-def _target_in(shape: Mapping[str, Any], robots: object, text: str, word: str) -> float | list[float]:
-    """Distance [m], offset [m] or bearing of a link between places."""
+def _target_in(shape: object, robots: object, text: str, word: str, path: Path) -> float | list[float] | Fault:
+    """Distance [m], offset [m] or bearing of a link between places; the fault at `path` if they give none."""
     if not pairs_or_none(text):
         return 1.0 if word == "distance" else [1.0, 0.0]
     second, first = link_pairs(text)[0]
     if first == second:
-        raise _NoPlace(f"'{first}' cannot receive from itself", "name two robots")
-    places = []
+        return Fault(path, f"'{first}' cannot receive from itself", "name two robots")
+    places, planar = [], True
     for name in (first, second):
-        place = shape.get(name)
+        place = shape.get(name) if isinstance(shape, Mapping) else None
         if not (isinstance(place, list) and 2 <= len(place) <= 3 and all(type(x) in (int, float) for x in place)):
             if isinstance(robots, Mapping) and name not in robots:
-                raise _NoPlace(f"no robot is called '{name}'", did_you_mean(name, robots))
+                return Fault(path, f"no robot is called '{name}'", did_you_mean(name, robots))
             hint = f"add {name} = [0.5, 0.0] to [formation.shape], or give the link a distance"
-            raise _NoPlace(f"{name} has no place in the shape", hint)
+            return Fault(path, f"{name} has no place in the shape", hint)
         robot = robots.get(name) if isinstance(robots, Mapping) else None
         height = robot.get("hover") if isinstance(robot, Mapping) else None
+        planar = planar and len(place) == 2
         places.append([*place, height if type(height) in (int, float) else 0.0][:3])
     offset = [b - a for a, b in zip(*places, strict=True)]
     length = math.hypot(*offset)
     if length == 0.0:
-        raise _NoPlace(f"{first} and {second} are at one place of the shape", "move one of them")
-    if word == "distance":
-        return length
-    planar = len(shape[first]) == len(shape[second]) == 2
-    return offset[:2] if planar else offset
+        return Fault(path, f"{first} and {second} are at one place of the shape", "move one of them")
+    kept = offset[:2] if planar else offset
+    return length if word == "distance" else kept
