@@ -106,10 +106,6 @@ def _add(archive: zipfile.ZipFile, name: str, data: Path | bytes) -> str:
     return total.hexdigest()
 
 
-def is_bundle(file: str) -> bool:
-    return file.lower().endswith(SUFFIX)
-
-
 def unpack(bundle: Path, into: Path) -> RunOrigin:
     """Unpack a bundle into an empty folder; raises RecordingError if it is no bundle, or a damaged one.
 

@@ -80,7 +80,10 @@ class Records:
         try:
             with self.path.open("rb") as file:
                 if (magic := file.read(len(MCAP0_MAGIC))) != MCAP0_MAGIC:
-                    raise RecordingError(_foreign_format(self.path, magic))
+                    why = "not an MCAP file; give the .mcap file of a run"
+                    if MCAP0_MAGIC.startswith(magic):
+                        why = "nothing was recorded, the recorder ended before its first record; delete the file"
+                    raise RecordingError(f"{self.path}: {why}")
                 yield from self._walk(file, self.path.stat().st_size)
         except OSError as error:
             raise RecordingError(
@@ -141,12 +144,6 @@ class Records:
             self.attachments.append(Attachment.read(stream))
         elif opcode == Opcode.METADATA:
             self.metadata.append(Metadata.read(stream))
-
-
-def _foreign_format(path: Path, magic: bytes) -> str:
-    if MCAP0_MAGIC.startswith(magic):
-        return f"{path}: nothing was recorded, the recorder ended before its first record; delete the file"
-    return f"{path}: not an MCAP file; give the .mcap file of a run"
 
 
 @dataclass(frozen=True)

@@ -101,11 +101,9 @@ def verdict(tuned: TuningResult) -> list[page.VerdictLine]:
     limits = " and ".join(map(str, tuned.objective.limits))
     found = []
     for row in (row for row in tuned.rows if not row.reference):
-        what = f"{row.label}: {_saved(row)}"
-        if tuned.objective.kept(row):
-            found.append(page.VerdictLine("good", f"{what}, keeps {limits}"))
-        else:
-            found.append(page.VerdictLine("bad", f"{what}, does not keep {limits}"))
+        kept = tuned.objective.kept(row)
+        text = f"{row.label}: {_saved(row)}, {'keeps' if kept else 'does not keep'} {limits}"
+        found.append(page.VerdictLine("good" if kept else "bad", text))
     return found
 
 

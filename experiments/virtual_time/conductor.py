@@ -44,14 +44,21 @@ class VirtualConductor:
         return -(-tick // every) * every
 
     def give_orders(self, t: float, dt: float) -> None:
-        """Gives the orders that are due after the tick at `t`, of length `dt` [s]."""
+        """Gives the orders that are due after the tick at `t`, of length `dt` [s].
+
+        Raises Stuck if robots have not reached the stage for too long.
+        """
         lowest = min([robot.lifecycle.phase for robot in self._robots])
         if self._stage == Phase.RUNNING:
             if lowest >= Phase.LANDING:
                 self._since, self._stage = t, Phase.DONE
             return
         if lowest < self._stage:
-            self._await(t)
+            if t - self._since > self._patience_s:
+                late = [robot for robot in self._robots if robot.lifecycle.phase < self._stage]
+                names = ", ".join(sorted(robot.assignment.name for robot in late))
+                reason = late[0].lifecycle.reason
+                raise Stuck(f"not {self._stage.word} after {self._patience_s:g} s: {names} ({reason})")
             return
         if self._stage < Phase.RUNNING and round(t / dt) % max(1, round(ORDERS_S / dt)):
             return
@@ -68,11 +75,3 @@ class VirtualConductor:
             self._stage = Phase.RUNNING
         else:
             self.over = True
-
-    def _await(self, t: float) -> None:
-        """Raises Stuck if robots have not reached the stage for too long."""
-        if t - self._since > self._patience_s:
-            late = [robot for robot in self._robots if robot.lifecycle.phase < self._stage]
-            names = ", ".join(sorted(robot.assignment.name for robot in late))
-            reason = late[0].lifecycle.reason
-            raise Stuck(f"not {self._stage.word} after {self._patience_s:g} s: {names} ({reason})")

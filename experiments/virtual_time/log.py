@@ -273,12 +273,13 @@ class RunRecorder:
     def statuses(self) -> Iterator[messages.Status]:
         """The counters at the end of the run and at the end of everything."""
         log = self._log
-        sent = self._counts(self._log.sent.link, self._log.sent.stamp)
-        received = self._counts(self._links.receiver[self._log.received.link], self._log.received.arrival)
+        receiver = self._links.receiver[log.received.link]
         early = [each.lands_at_s or math.inf for each in self._experiment.robots.values()]
         ends = {row: SCRIPTED for row, at in enumerate(early) if at < self._experiment.duration_s}
         ends |= {row: each.text for row, each in log.incidents if each.outcome >= Outcome.LAND}
-        for end, phase, done in ((self._experiment.duration_s, "landing", 0), (log.ended, "done", 1)):
+        for end, phase, until in ((self._experiment.duration_s, "landing", ROUNDING_S), (log.ended, "done", math.inf)):
+            sent = np.bincount(log.sent.link[log.sent.stamp <= end + until], minlength=len(log.names))
+            received = np.bincount(receiver[log.received.arrival <= end + until], minlength=len(log.names))
             for row, name in enumerate(log.names):
                 mine = self._links.receiver == row
                 each = zip(self._links.sender[mine].tolist(), self._log.lost[mine].tolist(), strict=True)
@@ -287,8 +288,8 @@ class RunRecorder:
                     stamp=EPOCH + end,
                     phase=phase,
                     reason=ends.get(row, FINISHED),
-                    sent=int(sent[done][row]),
-                    received=int(received[done][row]),
+                    sent=int(sent[row]),
+                    received=int(received[row]),
                     lost={log.names[s]: 0 for s in self._links.sender[mine].tolist()},
                     dropped={log.names[s]: n for s, n in each if n},
                     ticks=log.ticks,
@@ -330,12 +331,6 @@ class RunRecorder:
                 ],
                 contacts=int(np.searchsorted(touched, t, side="right")),
             )
-
-    def _counts(self, row: Index, time: Array) -> tuple[Index, Index]:
-        """Number of times each row occurs until the end of the run, and until the end of the log."""
-        rows = len(self._log.names)
-        messages_in_run = time <= self._experiment.duration_s + ROUNDING_S
-        return np.bincount(row[messages_in_run], minlength=rows), np.bincount(row, minlength=rows)
 
     def _events(self) -> Iterator[tuple[float, str, str, str]]:
         """Events of the conductor and hazards, in order of time."""

@@ -102,7 +102,7 @@ def run(
         file=file, virtual=virtual, cases=case or [], changes=changes, seeds=seeds, bodies=bodies, here=here,
         anyway=anyway, tags=tag or [],
     )  # fmt: skip
-    if not bundle.is_bundle(file):
+    if not file.lower().endswith(bundle.SUFFIX):
         return _run(origin, handling)
     if origin != RunOrigin(file=file, virtual=virtual, tags=origin.tags):
         hint = "unpack it, and run its experiment file with other options"
