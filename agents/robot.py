@@ -42,6 +42,15 @@ class Robot:
     """Decision of one robot."""
 
     FIXED: ClassVar = ("_flies", "_predicts")
+    # more than CPython keeps beside an object: the tick would look each up in a dictionary
+    __slots__ = (
+        "_asked", "_blind", "_continuity", "_controller", "_decide_every", "_decided", "_detector", "_dt",
+        "_external", "_filter", "_flies", "_follower", "_ordered", "_origin", "_perception", "_place", "_pose_every",
+        "_predicts", "_preflight", "_run_began", "_status", "_stepping", "assignment", "avoided", "begun", "causes",
+        "changed", "decision_due", "decisions", "error", "evasions", "goal", "goal_yaw", "goals", "guidance", "hazards",
+        "health", "interventions", "keeping", "landing", "lands", "lifecycle", "neighbours", "now", "sent_position",
+        "sent_velocity", "setpoint", "stops", "takes_off", "tick", "transmitter", "updates",
+    )  # fmt: skip
 
     def __init__(self, assignment: Assignment, health: ProcessHealth | None = None) -> None:
         """Take the `assignment`, and the `health` of the process, which sets it."""

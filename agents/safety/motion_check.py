@@ -34,6 +34,14 @@ TURN: Final = 1.5  # tolerated uncommanded rotation of a wheeled robot [rad]
 class MotionCheck:
     """Commanded and measured motion of one robot."""
 
+    # more than CPython keeps beside an object: the tick would look each up in a dictionary
+    __slots__ = (
+        "anchor", "anchor_yaw", "begin", "begin_yaw", "by_position", "by_twist", "commanded", "commanded_s",
+        "commanded_turn", "drift", "drifted", "due", "flies", "free", "last", "response", "rim", "samples",
+        "slow", "speed", "turn", "turn_before", "unanswered", "unanswered_turn", "uncommanded",
+        "uncommanded_turn", "unresponsive", "way", "way_before", "without", "x", "y", "z",
+    )  # fmt: skip
+
     def __init__(self, kind: Kind) -> None:
         self.flies, self.speed, self.response = kind.flies, kind.speed, kind.response
         self.by_position, self.by_twist = kind.takes == "position", kind.takes == "twist"
