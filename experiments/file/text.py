@@ -17,6 +17,8 @@ from experiments.file.problems import Path as Keys
 MAX_NUMBER: Final = 1e12  # in any unit; squares and products of larger numbers are not finite for long
 MAX_TEXT_BYTES: Final = 4_000_000  # bytes; a hundred robots take ten thousand
 BEGIN: Final = "./zenpark new copies an experiment to begin with"
+# key of many parts, for 20,000 of which `tomllib` takes seconds and gigabytes; numbers in lists are none
+_ENDLESS: Final = re.compile(r"""(?<![\w"'.-])(?:["']?[\w-]++["']?[ \t]*+\.[ \t]*+){50}""")
 _AT: Final = re.compile(r" \(at (?:line (\d+), column (\d+)|end of document)\)$")
 _REMEDIES: Final = (
     ("Invalid value", 'text stands in quotes, as in kind = "crazyflie"; numbers have a point, not a comma'),
@@ -86,6 +88,8 @@ def parsed(text: str, label: str, *, json: bool) -> dict[str, Any]:
     """
     if json:
         return _json(text, label)
+    if _ENDLESS.search(text):
+        raise refusal(label, "a key has more than 50 parts", "no value of an experiment lies so deep; shorten it")
     try:
         document = tomllib.loads(text)
     except ValueError as error:  # TOMLDecodeError, or an integer of thousands of digits

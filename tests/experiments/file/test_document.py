@@ -106,6 +106,7 @@ def test_every_misspelt_key_is_found_in_its_line(write):
         (b"\xef\xbb\xbf", (0, 0), "is empty", "zenpark new"),
         (b"a = " + b"1" * 5000, (0, 0), "is no TOML", "smaller number"),
         (b"a = " + b"[" * 5000 + b"]" * 5000, (0, 0), "nested too deeply", "flatten"),
+        (b"a." * 50 + b"a = 1", (0, 0), "more than 50 parts", "shorten"),
         (b"#" * (MAX_TEXT_BYTES + 1), (0, 0), "is longer than 4 MB", "not a recording"),
     ],
 )
