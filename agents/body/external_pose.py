@@ -28,7 +28,7 @@ def velocity_after(velocity: Vector, moved: Vector, since: float) -> Vector:
     return u + share * (x / since - u), v + share * (y / since - v), w + share * (z / since - w)
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, slots=True)
 class External:
     """The last external pose of a robot, and a filtered derivative of it."""
 

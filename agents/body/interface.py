@@ -93,7 +93,7 @@ class RangeScan(msgspec.Struct, frozen=True):
     distance: Sequence[float]  # from the robot's centre [m]; NaN where nothing is in reach
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, slots=True)
 class BodyState:
     """State of the body of one robot; unknown numbers are NaN."""
 

@@ -11,7 +11,7 @@ from agents.plugins.triggers import Trigger, TriggerState
 from agents.vectors import ZERO, Vector, difference, distance, is_finite, norm
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, slots=True)
 class Input:
     """Input of the law on one link at the last computation."""
 

@@ -269,7 +269,7 @@ class GoalComputer:
             self.require_update()
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, slots=True)
 class StationKeeping:
     """The place where the hold of a robot began."""
 

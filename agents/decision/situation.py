@@ -16,7 +16,7 @@ LATE_WINDOW_S: Final = 1.0  # window in which missed ticks are counted
 LATE_SHARE: Final = 0.9  # with a larger share of missed ticks the control loop fails
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, slots=True)
 class ProcessHealth:
     """State of the process around a decision, set by the process."""
 
@@ -51,7 +51,7 @@ class ProcessHealth:
             self.missed_share = 0.0
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, slots=True)
 class Situation:
     """One robot on a tick; overwritten on each."""
 

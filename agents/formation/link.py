@@ -14,7 +14,7 @@ BY_BEARING: Final = 2
 BY_NOTHING: Final = 3  # a link alone
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, slots=True)
 class Link:
     """Target of one link from a sender j to the robot i: a distance, a relative position or a direction.
 

@@ -24,7 +24,7 @@ ASIDE: Final = 0.1  # of the pull against a push: the step aside
 HURRY: Final = 2.0  # times its limit of speed: no robot is faster, not along the diagonal of limits per axis either
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, slots=True)
 class Thing:
     """Thing near a robot: an upright cylinder, a robot with a received pose or the end of a range reading.
 
@@ -51,7 +51,7 @@ class Thing:
         self.is_robot = False
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, slots=True)
 class Plane:
     """Half-plane a·u ≤ b of velocities u."""
 
@@ -86,7 +86,7 @@ class Nearby:
             self.things[k].vanish()
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, slots=True)
 class OwnState:
     """State and properties of a robot."""
 

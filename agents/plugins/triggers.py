@@ -25,7 +25,7 @@ ROUNDING_S: Final = 1e-6  # ticks are multiples of a period that binary fraction
 NOWHERE: Final[Vector] = (inf, inf, inf)
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, slots=True)
 class LastEvent:
     """State of a robot at its last event: its last transmission, or the last computation of its law."""
 

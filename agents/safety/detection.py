@@ -36,7 +36,7 @@ NOT_UNIT: Final = 0.1  # largest deviation of the squared norm of a quaternion f
 BEHIND: Final = 0.5  # share of the age at which a position is invalid: stamps this far behind give a warning
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, slots=True)
 class RobotStatus:
     """Status of a robot in its experiment, for `Detector`; the robot overwrites it on each tick."""
 
@@ -86,7 +86,7 @@ class Ascent:
         self.stalled = climbing and self.hover - height > SUNK and t - self.risen_at > self.patience_s
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, slots=True)
 class LandingProgress:
     """Progress of a landing."""
 
