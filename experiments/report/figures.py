@@ -27,34 +27,8 @@ from experiments.metrics.shadow import differences, in_heading
 from experiments.metrics.signals import WINDOW_S, Measurement, moving_mean
 from experiments.metrics.statistics import Spread, by_case, ratios, spread
 from experiments.recording.trace import Trace
+from experiments.report import style
 from experiments.report.metrics_files import Band
-from experiments.report.style import (
-    CASES,
-    HATCHES,
-    INK,
-    MAGENTA,
-    MARKERS,
-    MAX_COLOURED_ROBOTS,
-    PAPER,
-    SHORTEST_S,
-    TALLEST,
-    WIDTH,
-    Drawing,
-    Line,
-    boxes,
-    case_curve,
-    labelled,
-    legend_above,
-    mark_phases,
-    merged,
-    panel_height,
-    plain,
-    robot_lines,
-    styled,
-    svg,
-    thinned,
-    time_axis,
-)
 from experiments.report.trajectories import LOW, formation, has_positions, plan_view
 from twins.arrays import Array
 
@@ -65,11 +39,14 @@ MOST_SEEDS: Final = 50  # of a case, for the range of its errors
 MOST_MEASURES: Final = 6  # of a law, each with a panel
 SOLID: Final = 0.95  # share of the time that marks cover where there is nothing to see between them
 
-__all__ = ["formation", "plan_view", "svg"]  # besides those of this module
+__all__ = ["formation", "plan_view"]  # besides those of this module
 
 
 def all_figures(
-    cases: Sequence[CaseMetrics], traces: Sequence[Trace], width: float = WIDTH, bands: Mapping[str, Band] | None = None
+    cases: Sequence[CaseMetrics],
+    traces: Sequence[Trace],
+    width: float = style.WIDTH,
+    bands: Mapping[str, Band] | None = None,
 ) -> dict[str, Figure]:
     """All figures of a run by name; motions of the first seed, `errors` of all seeds.
 
@@ -103,8 +80,8 @@ def all_figures(
     return figures
 
 
-@styled
-def global_bars(cases: Sequence[CaseMetrics], width: float = WIDTH) -> Figure:
+@style.styled
+def global_bars(cases: Sequence[CaseMetrics], width: float = style.WIDTH) -> Figure:
     """Mean transmission rate, and in an axis of their own mean errors, over those of the first case (paper, figure 12).
 
     Cases of one name and several seeds become one bar, the mean of the ratios, with its 95 % confidence interval; the
@@ -112,61 +89,55 @@ def global_bars(cases: Sequence[CaseMetrics], width: float = WIDTH) -> Figure:
     """
     grouped = by_case(cases)
     (reference, first), *others = grouped.items()
-    figure = Drawing(figsize=(width, 1.9 if len(others) <= 4 else 2.3), layout="constrained")
+    figure = style.Drawing(figsize=(width, 1.9 if len(others) <= 4 else 2.3), layout="constrained")
     bars = _bar_metrics(cases)
     parts = [part for part in (bars[:1], bars[1:]) if part]
     panels = figure.subplots(1, len(parts), width_ratios=[len(part) for part in parts], squeeze=False)[0]
     share = min(0.8 / max(1, len(others)), 0.5)
+    text: style.Line = {"textcoords": "offset points", "fontsize": 6.0 if len(others) <= 3 else 5.0}
+    text["rotation"] = 0 if len(others) <= 2 else 90
     for axes, indices in zip(panels, parts, strict=True):
         tops = [0.0]
         for k, (name, runs) in enumerate(others):
             found = [spread(ratios(runs, first, index)) for index, _, _ in indices]
             x = np.arange(len(indices)) + (k - 0.5 * (len(others) - 1)) * share
-            height, error = _bars(axes, x, found, width=share, k=k + 1, label=plain(name))
+            height, error = _bars(axes, x, found, width=share, k=k + 1, label=style.plain(name))
             for at, top, more in zip(x, height, error, strict=True):
                 if math.isfinite(top):
-                    axes.annotate(
-                        f"{top:.3f}",
-                        (at, top + more),
-                        (0, 1.5),
-                        textcoords="offset points",
-                        ha="center",
-                        va="bottom",
-                        fontsize=6.0 if len(others) <= 3 else 5.0,
-                        rotation=0 if len(others) <= 2 else 90,
-                    )
                     tops.append(top + more)
+                    axes.annotate(f"{top:.3f}", (at, tops[-1]), (0, 1.5), ha="center", va="bottom", **text)
         axes.set_xticks(np.arange(len(indices)), [label for _, label, _ in indices])
         axes.set_xlim(-0.5, len(indices) - 0.5)
         axes.tick_params(axis="x", length=0)
         axes.set_ylim(0.0, (1.14 if len(others) <= 2 else 1.3) * (max(tops) or 1.0))
         if axes.get_ylim()[1] > 1.0:
-            axes.axhline(1.0, color=INK, linewidth=0.6, linestyle=(0, (4, 3)), zorder=0.5)
+            axes.axhline(1.0, color=style.INK, linewidth=0.6, linestyle=(0, (4, 3)), zorder=0.5)
         axes.yaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 2.5, 5, 10]))
         axes.grid(axis="y")
-    panels[0].set_ylabel(f"relative to {plain(reference)}")
-    legend_above(figure, labelled(panels[-1]), columns=3)
+    panels[0].set_ylabel(f"relative to {style.plain(reference)}")
+    style.legend_above(figure, style.labelled(panels[-1]), columns=3)
     return figure
 
 
 def _bar_metrics(cases: Sequence[CaseMetrics]) -> list[tuple[str, str, str]]:
     """Metrics that are drawn as bars: name, label and unit as matplotlib writes them; no errors of laws without any."""
     judged = any(case.has_errors for case in cases)
-    return [
-        (name, f"${metric.label}$" if len(metric.label) == 1 else plain(metric.label), metric.unit.translate(FORMULA))
-        for name, metric in known_metrics(cases).items()
-        if metric.figure and (judged or name not in ERRORS)
-    ]
+    found = []
+    for name, metric in known_metrics(cases).items():
+        if metric.figure and (judged or name not in ERRORS):
+            label = f"${metric.label}$" if len(metric.label) == 1 else style.plain(metric.label)
+            found.append((name, label, metric.unit.translate(FORMULA)))
+    return found
 
 
-@styled
-def robot_bars(cases: Sequence[CaseMetrics], width: float = WIDTH) -> Figure:
+@style.styled
+def robot_bars(cases: Sequence[CaseMetrics], width: float = style.WIDTH) -> Figure:
     """Transmission rate and errors of each robot (paper, figure 15); those that the means leave out in brackets."""
     grouped = by_case(cases)
     names = list(dict.fromkeys(robot.robot for case in cases for robot in case.robots))
     out = {name for case in cases for name in (*case.leaders, *case.died)}
     bars = [each for each in _bar_metrics(cases) if known_metrics(cases)[each[0]].per == "robot"]
-    figure = Drawing(figsize=(width, min(1.075 * len(bars), TALLEST)), layout="constrained")
+    figure = style.Drawing(figsize=(width, min(1.075 * len(bars), style.TALLEST)), layout="constrained")
     panels = figure.subplots(len(bars), 1, sharex=True, squeeze=False)[:, 0]
     share = 0.8 / max(1, len(grouped))
     for axes, (index, label, unit) in zip(panels, bars, strict=True):
@@ -179,7 +150,7 @@ def robot_bars(cases: Sequence[CaseMetrics], width: float = WIDTH) -> Figure:
             if wide:
                 _points(axes, x, found, k=k)
             else:
-                _bars(axes, x, found, width=share, k=k, label=plain(name))
+                _bars(axes, x, found, width=share, k=k, label=style.plain(name))
         axes.set_ylabel(f"{label} [{unit}]" if unit else label)
         axes.tick_params(axis="x", length=0)
         if wide:  # beside fifty messages a second two are seen on a logarithmic axis alone, which has no zero for bars
@@ -192,19 +163,20 @@ def robot_bars(cases: Sequence[CaseMetrics], width: float = WIDTH) -> Figure:
             axes.yaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
         axes.grid(axis="y")
     words = [f"({name})" if name in out else name for name in names]
-    upright, size = 90 if len(names) > MAX_COLOURED_ROBOTS else 0, 6.5 if len(names) <= 2 * MAX_COLOURED_ROBOTS else 5.0
+    crowd = len(names) / style.MAX_COLOURED_ROBOTS
+    upright, size = 90 if crowd > 1.0 else 0, 6.5 if crowd <= 2.0 else 5.0
     panels[-1].set_xticks(range(len(names)), words, rotation=upright, fontsize=size)
     panels[-1].set_xlim(-0.6, len(names) - 0.4)
     figure.align_ylabels(list(panels))
-    legend_above(figure, labelled(panels[-1]), columns=3)
+    style.legend_above(figure, style.labelled(panels[-1]), columns=3)
     return figure
 
 
-@styled
+@style.styled
 def errors(
     traces: Sequence[Trace],
     cases: Sequence[CaseMetrics] = (),
-    width: float = WIDTH,
+    width: float = style.WIDTH,
     bands: Mapping[str, Band] | None = None,
 ) -> Figure:
     """Worst link of the formation and of each robot over time, as acquisition is judged, on a logarithmic axis.
@@ -216,27 +188,27 @@ def errors(
         cases: Where acquisitions are taken from; no markers if left out.
         bands: Medians and ranges; `error_bands` of the traces if left out.
     """
-    figure = Drawing(figsize=(width, min(0.5 * width + 0.75, 3.2)), layout="constrained")
+    figure = style.Drawing(figsize=(width, min(0.5 * width + 0.75, 3.2)), layout="constrained")
     axes = figure.subplots()
     first = {trace.case: trace for trace in first_seed(traces)}
     handles: dict[str, Artist] = {}
     lowest, highest, tolerance = np.inf, 0.0, traces[0].plan.experiment.tolerance
     for k, (name, band) in enumerate((bands or error_bands(traces)).items()):
-        line = case_curve(k)
+        line = style.case_curve(k)
         if band.seeds > 1:
             axes.fill_between(band.time, band.low, band.high, color=line["color"], alpha=0.25, linewidth=0.0)
         elif name in first:
-            few = thinned(first[name], 1)
+            few = style.thinned(first[name], 1)
             for mine in _worst_links(first[name])[few].T:
                 axes.plot(band.time, mine, color=line["color"], linewidth=0.4, alpha=0.45)
         axes.plot(band.time, band.middle, **line, linewidth=1.3, zorder=3)
-        handles[plain(name)] = Line2D([], [], **line, linewidth=1.3)
+        handles[style.plain(name)] = Line2D([], [], **line, linewidth=1.3)
         known = band.middle[np.isfinite(band.middle) & (band.middle > 0.0)]
         lowest = min(lowest, float(known.min(initial=np.inf)))
         highest = max(highest, float(np.nanmax(band.high, initial=0.0)))
         at = _acquisitions([case for case in cases if case.case == name])
         size = max(2.5, 7.5 - 2.5 * k)  # those of several cases at one time are seen on each other
-        axes.plot(at, [tolerance] * len(at), "v", color=line["color"], ms=size, mec=PAPER, mew=0.5, zorder=4)
+        axes.plot(at, [tolerance] * len(at), "v", color=line["color"], ms=size, mec=style.PAPER, mew=0.5, zorder=4)
     axes.set_yscale("log")
     bottom = 10.0 ** math.floor(math.log10(min(max(lowest, LEAST_ERROR), 0.1 * tolerance)))
     axes.set_ylim(bottom, max(1.6 * highest, 4.0 * tolerance))
@@ -244,41 +216,41 @@ def errors(
     axes.axhline(tolerance, color=BAND, linewidth=0.6, zorder=0.3)
     handles[f"within {100.0 * tolerance:g} cm"] = Patch(color=BAND, alpha=0.3, linewidth=0.0)
     if any(value is not None for case in cases for value in case.acquired_s):
-        handles["acquired by all"] = Line2D([], [], color=to_rgb(INK), marker="v", linestyle="", ms=4.0)
-    mark_phases(axes, traces[0])
+        handles["acquired by all"] = Line2D([], [], color=to_rgb(style.INK), marker="v", linestyle="", ms=4.0)
+    style.mark_phases(axes, traces[0])
     axes.grid()
-    time_axis(axes, traces)
+    style.time_axis(axes, traces)
     axes.set_ylabel("error of the worst link [m]")
-    legend_above(figure, handles, columns=6)
+    style.legend_above(figure, handles, columns=6)
     return figure
 
 
-@styled
-def measures(traces: Sequence[Trace], width: float = WIDTH) -> Figure:
+@style.styled
+def measures(traces: Sequence[Trace], width: float = style.WIDTH) -> Figure:
     """Measures of laws that remember, over time: a panel each, the median of the robots thick, single ones thin."""
     names = [*dict.fromkeys(name for trace in traces for name in trace.measures)][:MOST_MEASURES]
-    height = panel_height(len(names), 1.3)
-    figure = Drawing(figsize=(width, height * len(names) + 0.7), layout="constrained")
+    height = style.panel_height(len(names), 1.3)
+    figure = style.Drawing(figsize=(width, height * len(names) + 0.7), layout="constrained")
     panels = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
     handles: dict[str, Artist] = {}
     for axes, name in zip(panels, names, strict=True):
         for k, trace in enumerate(traces):
             if name not in trace.measures:
                 continue
-            line = case_curve(k)
-            few = thinned(trace, len(names) * len(traces))
+            line = style.case_curve(k)
+            few = style.thinned(trace, len(names) * len(traces))
             values = trace.measures[name][few]
             axes.plot(trace.time[few], values, color=line["color"], linewidth=0.4, alpha=0.45)
             known = np.isfinite(values).any(axis=1)
             axes.plot(trace.time[few][known], np.nanmedian(values[known], axis=1), **line, linewidth=1.3, zorder=3)
-            handles[plain(trace.case)] = Line2D([], [], **line, linewidth=1.3)
-        mark_phases(axes, traces[0])
+            handles[style.plain(trace.case)] = Line2D([], [], **line, linewidth=1.3)
+        style.mark_phases(axes, traces[0])
         axes.grid()
-        axes.set_ylabel(plain(name))
+        axes.set_ylabel(style.plain(name))
         axes.yaxis.set_major_locator(MaxNLocator(4))
-    time_axis(panels[-1], traces)
+    style.time_axis(panels[-1], traces)
     figure.align_ylabels(list(panels))
-    legend_above(figure, handles, columns=6)
+    style.legend_above(figure, handles, columns=6)
     return figure
 
 
@@ -293,7 +265,7 @@ def error_bands(traces: Sequence[Trace]) -> dict[str, Band]:
         grouped.setdefault(trace.case, []).append(trace)
     found = {}
     for name, runs in grouped.items():
-        few = thinned(runs[0], 1)
+        few = style.thinned(runs[0], 1)
         robots = [_worst_links(trace)[few] for trace in runs[:MOST_SEEDS]]
         length = min(map(len, robots))
         worst = np.stack([_largest(each[:length]) for each in robots])
@@ -314,9 +286,7 @@ def _worst_links(trace: Trace) -> Array:
 
 def _largest(values: Array) -> Array:
     """Largest known value of each row (T, n); NaN without any."""
-    known = np.isfinite(values)
-    largest = np.where(known, values, -np.inf).max(axis=1, initial=-np.inf)
-    return np.where(known.any(axis=1), largest, np.nan)
+    return np.asarray(np.fmax.reduce(values, axis=1, initial=np.nan))
 
 
 def _acquisitions(runs: Sequence[CaseMetrics]) -> list[float]:
@@ -329,8 +299,8 @@ def _acquisitions(runs: Sequence[CaseMetrics]) -> list[float]:
     return found
 
 
-@styled
-def events(traces: Sequence[Trace], width: float = WIDTH) -> Figure:
+@style.styled
+def events(traces: Sequence[Trace], width: float = style.WIDTH) -> Figure:
     """Transmissions: one row per robot, one panel per case; marks that would touch in print are one bar.
 
     A case in which all of them touch (a periodic one) is a line of text.
@@ -340,10 +310,10 @@ def events(traces: Sequence[Trace], width: float = WIDTH) -> Figure:
     marks = [_marks(trace, columns) for trace in traces]
     solid = [_solid(trace, each) for trace, each in zip(traces, marks, strict=True)]
     drawn = [trace for trace, text in zip(traces, solid, strict=True) if not text]
-    height = panel_height(len(drawn), min(max(0.6, 0.13 * rows), 3.2))
+    height = style.panel_height(len(drawn), min(max(0.6, 0.13 * rows), 3.2))
     heights = [0.02 if text else height for text in solid]
     whole = sum(0.26 if text else height + 0.14 for text in solid) + 0.5
-    figure = Drawing(figsize=(width, max(whole, 1.1)), layout="constrained")
+    figure = style.Drawing(figsize=(width, max(whole, 1.1)), layout="constrained")
     grid = figure.subplots(len(traces), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
     for axes, trace, mark, text in zip(grid, traces, marks, solid, strict=True):
         if text:
@@ -351,59 +321,59 @@ def events(traces: Sequence[Trace], width: float = WIDTH) -> Figure:
             axes.spines[:].set_visible(False)
             axes.tick_params(left=False, bottom=False, labelleft=False, labelbottom=False)
             continue
-        colours = [line["color"] for line in robot_lines(trace)]
+        colours = [line["color"] for line in style.robot_lines(trace)]
         for i, (begin, end) in enumerate(mark):
             # no patch, for the limits are known: to ask each of a million boxes for its own takes as long as all else
-            axes.add_artist(PathPatch(boxes(begin, end, i), facecolor=colours[i], linewidth=0.0))
-        mark_phases(axes, trace)
+            axes.add_artist(PathPatch(style.boxes(begin, end, i), facecolor=colours[i], linewidth=0.0))
+        style.mark_phases(axes, trace)
         every = math.ceil(len(trace.robots) / max(1.0, height / 0.11))
         axes.set_yticks(range(0, len(trace.robots), every), trace.robots[::every], fontsize=6)
         axes.set_ylim(len(trace.robots) - 0.4, -0.6)
         axes.tick_params(axis="y", length=0)
-        axes.set_title(plain(trace.case), loc="right", pad=2.0)
+        axes.set_title(style.plain(trace.case), loc="right", pad=2.0)
         axes.grid(axis="x")
     if drawn:
         last = max(k for k, text in enumerate(solid) if not text)
-        time_axis(grid[last], traces)
+        style.time_axis(grid[last], traces)
         grid[last].tick_params(labelbottom=True)
     return figure
 
 
 def _marks(trace: Trace, columns: int) -> list[tuple[Array, Array]]:
     """Beginnings and ends [s] of the marks of each robot, in a picture of `columns` columns."""
-    pixel = max(float(trace.time[-1] - trace.time[0]), SHORTEST_S) / columns
-    pairs = [merged(np.sort(trace.sent_by(i).stamp), pixel) for i in range(len(trace.robots))]
+    pixel = max(float(trace.time[-1] - trace.time[0]), style.SHORTEST_S) / columns
+    pairs = [style.merged(np.sort(trace.sent_by(i).stamp), pixel) for i in range(len(trace.robots))]
     return [(begin, end + pixel) for begin, end in pairs]
 
 
 def _solid(trace: Trace, marks: Sequence[tuple[Array, Array]]) -> str:
     """Caption of a case if all its marks touch; otherwise empty."""
-    span = max(float(trace.time[-1] - trace.time[0]), SHORTEST_S)
+    span = max(float(trace.time[-1] - trace.time[0]), style.SHORTEST_S)
     if not marks or any((end - begin).sum() < SOLID * span for begin, end in marks):
         return ""
     rates = [len(trace.sent_by(i).stamp) / span for i in range(len(trace.robots))]
     low, high = f"{min(rates):.3g}", f"{max(rates):.3g}"
     rate = low if low == high else f"{low} to {high}"
-    return f"{plain(trace.case)}: every robot throughout, {rate} Hz"
+    return f"{style.plain(trace.case)}: every robot throughout, {rate} Hz"
 
 
-@styled
-def intervals(traces: Sequence[Trace], width: float = WIDTH) -> Figure:
+@style.styled
+def intervals(traces: Sequence[Trace], width: float = style.WIDTH) -> Figure:
     """Share of inter-event times up to a length: each robot thin, all robots but the leaders thick."""
-    figure = Drawing(figsize=(width, 2.2), layout="constrained")
+    figure = style.Drawing(figsize=(width, 2.2), layout="constrained")
     axes = figure.subplots()
     handles: dict[str, Line2D] = {}
     for k, trace in enumerate(traces):
-        colour = CASES[k % len(CASES)]
+        colour = style.CASES[k % len(style.CASES)]
         shared = Measurement(trace)
         named = zip(shared.waits, trace.robots, strict=True)
         waits = [wait for wait, name in named if name not in shared.leaders and len(wait)]
         for wait in waits if len(waits) > 1 else []:
             axes.plot(*_steps(wait), color=colour, linewidth=0.5, alpha=0.45, drawstyle="steps-post")
         if waits:
-            line: Line = {"color": colour, "linewidth": 1.5, "linestyle": ("-", "--", "-.", ":")[k % 4]}
+            line: style.Line = {"color": colour, "linewidth": 1.5, "linestyle": ("-", "--", "-.", ":")[k % 4]}
             axes.plot(*_steps(np.concatenate(waits)), drawstyle="steps-post", **line)
-            handles.setdefault(plain(trace.case), Line2D([], [], **line))
+            handles.setdefault(style.plain(trace.case), Line2D([], [], **line))
     axes.set_xscale("log")
     axes.xaxis.set_minor_formatter(NullFormatter())
     if handles:
@@ -413,7 +383,7 @@ def intervals(traces: Sequence[Trace], width: float = WIDTH) -> Figure:
     axes.set_xlabel("time between transmissions [s]")
     axes.set_ylabel("share of intervals")
     axes.grid()
-    legend_above(figure, handles, columns=3)
+    style.legend_above(figure, handles, columns=3)
     return figure
 
 
@@ -423,32 +393,33 @@ def _bars(
     """Bars of means with their confidence intervals; returns both."""
     height = [np.nan if each.mean is None else each.mean for each in found]
     error = [each.ci95 or 0.0 for each in found]
-    colour = CASES[k % len(CASES)]
+    colour = style.CASES[k % len(style.CASES)]
     light = tuple(0.45 + 0.55 * part for part in to_rgb(colour))  # hatches must show, also in grey print
-    axes.bar(
-        x,
-        height,
-        0.9 * width,
-        label=label,
-        color=colour if k == 0 else light,
-        edgecolor=colour,
-        hatch=HATCHES[k % len(HATCHES)],
-        linewidth=0.5,
-    )
+    design: style.Line = {
+        "color": colour if k == 0 else light,
+        "hatch": style.HATCHES[k % len(style.HATCHES)],
+        "linewidth": 0.5,
+    }
+    axes.bar(x, height, 0.9 * width, label=label, edgecolor=colour, **design)
     if any(error):
-        axes.errorbar(x, height, error, fmt="none", ecolor=INK, elinewidth=0.7, capsize=1.5, capthick=0.7)
+        axes.errorbar(x, height, error, fmt="none", ecolor=style.INK, elinewidth=0.7, capsize=1.5, capthick=0.7)
     return height, error
 
 
 def _points(axes: Axes, x: NDArray[np.floating], found: Sequence[Spread], *, k: int) -> None:
     """Means as points with their confidence intervals; those of zero are written at the lower edge."""
-    colour = CASES[k % len(CASES)]
+    colour = style.CASES[k % len(style.CASES)]
     for at, each in zip(x, found, strict=True):
         if each.mean:
-            style: Line = {"color": colour, "marker": MARKERS[k % len(MARKERS)], "markersize": 3.5, "linestyle": ""}
-            axes.errorbar(at, each.mean, each.ci95 or 0.0, elinewidth=0.7, capsize=1.5, capthick=0.7, **style)
+            design: style.Line = {
+                "color": colour,
+                "marker": style.MARKERS[k % len(style.MARKERS)],
+                "markersize": 3.5,
+                "linestyle": "",
+            }
+            axes.errorbar(at, each.mean, each.ci95 or 0.0, elinewidth=0.7, capsize=1.5, capthick=0.7, **design)
         elif each.mean is not None:
-            edge: Line = {"xycoords": ("data", "axes fraction"), "ha": "center", "va": "bottom"}
+            edge: style.Line = {"xycoords": ("data", "axes fraction"), "ha": "center", "va": "bottom"}
             axes.annotate("0", (at, 0.02), fontsize=6, color=colour, **edge)
 
 
@@ -457,7 +428,7 @@ def first_seed(traces: Sequence[Trace]) -> list[Trace]:
 
 
 def _steps(waits: Array) -> tuple[Array, Array]:
-    """The empirical distribution, thinned to what a column can show."""
+    """The empirical distribution, style.thinned to what a column can show."""
     x = np.sort(np.maximum(waits, 1e-4))
     share = np.arange(1, len(x) + 1) / len(x)
     few = np.unique(np.linspace(0, len(x) - 1, 300).round().astype(int))
@@ -468,30 +439,30 @@ Style = Literal["-", "--", ":"]
 
 MOST_SHADOWS: Final = 8  # robots with drawn twins: a page holds no more
 PARTS: Final[tuple[tuple[str, str, Style], ...]] = (
-    ("along", CASES[0], "-"),
-    ("to the left", CASES[1], "--"),
-    ("up", CASES[2], ":"),
+    ("along", style.CASES[0], "-"),
+    ("to the left", style.CASES[1], "--"),
+    ("up", style.CASES[2], ":"),
 )
 
 
-@styled
-def shadows(traces: Sequence[Trace], width: float = WIDTH) -> Figure:
+@style.styled
+def shadows(traces: Sequence[Trace], width: float = style.WIDTH) -> Figure:
     """Each robot with its twin: the paths from above, and the difference over time, of the first few."""
     shown = [(trace, row) for trace in traces for row in _rows(trace)][:MOST_SHADOWS]
-    height = panel_height(len(shown), 1.15)
-    figure = Drawing(figsize=(width, height * len(shown) + 0.8), layout="constrained")
+    height = style.panel_height(len(shown), 1.15)
+    figure = style.Drawing(figsize=(width, height * len(shown) + 0.8), layout="constrained")
     panels = figure.subplots(len(shown), 2, squeeze=False, width_ratios=(1.0, 1.7))
     several = len(traces) > 1
     for (above, beside), (trace, row) in zip(panels, shown, strict=True):
-        name = plain(trace.robots[row])
+        name = style.plain(trace.robots[row])
         _paths(above, trace, row, len(shown))
-        above.set_title(f"{name}, {plain(trace.case)}" if several else name, loc="left", pad=2.0)
+        above.set_title(f"{name}, {style.plain(trace.case)}" if several else name, loc="left", pad=2.0)
         _differences(beside, trace, row, len(shown))
     panels[-1, 0].set_xlabel("$x$ [m]")
     panels[-1, 1].set_xlabel("$t$ [s]")
-    lines = {"robot": Line2D([], [], color=INK), "twin": Line2D([], [], color=MAGENTA, linestyle="--")}
-    lines |= {label: Line2D([], [], color=colour, linestyle=style) for label, colour, style in PARTS}
-    legend_above(figure, lines, columns=5)
+    lines = {"robot": Line2D([], [], color=style.INK), "twin": Line2D([], [], color=style.MAGENTA, linestyle="--")}
+    lines |= {label: Line2D([], [], color=colour, linestyle=design) for label, colour, design in PARTS}
+    style.legend_above(figure, lines, columns=5)
     return figure
 
 
@@ -501,10 +472,10 @@ def _rows(trace: Trace) -> list[int]:
 
 
 def _paths(axes: Axes, trace: Trace, row: int, panels: int) -> None:
-    few = thinned(trace, panels)
+    few = style.thinned(trace, panels)
     assert trace.shadow_position is not None
-    axes.plot(*trace.position[few, row, :2].T, color=INK, linewidth=0.9)
-    axes.plot(*trace.shadow_position[few, row, :2].T, color=MAGENTA, linewidth=0.7, linestyle="--")
+    axes.plot(*trace.position[few, row, :2].T, color=style.INK, linewidth=0.9)
+    axes.plot(*trace.shadow_position[few, row, :2].T, color=style.MAGENTA, linewidth=0.7, linestyle="--")
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_ylabel("$y$ [m]")
     axes.xaxis.set_major_locator(MaxNLocator(3))
@@ -514,12 +485,12 @@ def _paths(axes: Axes, trace: Trace, row: int, panels: int) -> None:
 def _differences(axes: Axes, trace: Trace, row: int, panels: int) -> None:
     difference = differences(trace)
     along, across = in_heading(trace, difference)
-    few = thinned(trace, panels)
-    for values, (_, colour, style) in zip((along, across, difference[..., 2]), PARTS, strict=True):
-        axes.plot(trace.time[few], 100.0 * values[few, row], color=colour, linestyle=style, linewidth=0.7)
-    mark_phases(axes, trace)
+    few = style.thinned(trace, panels)
+    for values, (_, colour, design) in zip((along, across, difference[..., 2]), PARTS, strict=True):
+        axes.plot(trace.time[few], 100.0 * values[few, row], color=colour, linestyle=design, linewidth=0.7)
+    style.mark_phases(axes, trace)
     axes.set_ylabel("twin − robot [cm]")
     begin = float(trace.time[0])
-    axes.set_xlim(begin, max(float(trace.time[-1]), begin + SHORTEST_S))
+    axes.set_xlim(begin, max(float(trace.time[-1]), begin + style.SHORTEST_S))
     axes.yaxis.set_major_locator(MaxNLocator(4))
     axes.grid()

@@ -177,9 +177,9 @@ def fragment(title: str, verdict: Sequence[VerdictLine], tables: Sequence[Table]
 
 def numbered(drawn: Iterable[tuple[Figure | str, str]], first: int = 1) -> tuple[PageFigure, ...]:
     """Figures, or their SVG, and their captions, to stand in a page."""
-    from experiments.report import figures  # noqa: PLC0415 - matplotlib takes 0.6 s
+    from experiments.report import style  # noqa: PLC0415 - matplotlib takes 0.6 s
 
-    texts = ((each if isinstance(each, str) else figures.svg(each), caption) for each, caption in drawn)
+    texts = ((each if isinstance(each, str) else style.svg(each), caption) for each, caption in drawn)
     return tuple(
         PageFigure(inline(svg, f"f{number}-", caption), number, caption)
         for number, (svg, caption) in enumerate(texts, start=first)

@@ -11,7 +11,7 @@ import numpy as np
 
 from experiments.definition.formation import errors_over_time
 from experiments.recording.trace import Trace
-from experiments.report import trajectories
+from experiments.report import figures, trajectories
 from experiments.report.page import inline, template
 from experiments.report.style import svg
 from experiments.scene.models import ROUND, circle
@@ -28,7 +28,7 @@ SCRIPT: Final = Path(__file__).with_name("replay.js")
 
 def embedded(traces: Sequence[Trace]) -> str:
     """The replay as HTML: the first repetition of the first two cases, side by side; empty without a case."""
-    first = list({trace.case: trace for trace in reversed(traces)}.values())[::-1][:CASES]
+    first = figures.first_seed(traces)[:CASES]
     if not first:
         return ""
     content = _replay_data(first)

@@ -17,7 +17,7 @@ from experiments.metrics.statistics import by_case
 from experiments.recording.run_folder import RunOrigin, read_origin
 from experiments.recording.trace import Trace
 from experiments.recording.version import provenance
-from experiments.report import figures, page, replay, tables
+from experiments.report import figures, page, replay, style, tables
 from experiments.report.metrics_files import Band
 from experiments.report.verdict import findings, left_out
 
@@ -113,7 +113,7 @@ def write(
     bands = bands or figures.error_bands(traces)
     if drawings is None:
         drawn = figures.all_figures(cases, traces, bands=bands)
-        drawings = {name: figures.svg(figure) for name, figure in drawn.items()}
+        drawings = {name: style.svg(figure) for name, figure in drawn.items()}
     pictures = _pictures(cases, traces, bands, drawings)
     short, every_event = tables.events_tables(first)
     listing = text or msgspec.json.format(msgspec.json.encode(experiment), indent=2).decode()

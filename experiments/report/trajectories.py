@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Final
+from typing import Any, Final
 
 import matplotlib as mpl
 import msgspec
@@ -25,27 +25,7 @@ from experiments.check.analysis import Analysis
 from experiments.definition.formation import errors_over_time
 from experiments.definition.graph import edges
 from experiments.recording.trace import Trace
-from experiments.report import scenery
-from experiments.report.style import (
-    HALO,
-    INK,
-    MAGENTA,
-    MARKERS,
-    MAX_COLOURED_ROBOTS,
-    ROBOTS,
-    STYLE,
-    WIDTH,
-    Drawing,
-    Line,
-    case_line,
-    fitting,
-    legend_above,
-    plain,
-    robot_legend,
-    robot_lines,
-    styled,
-    thinned,
-)
+from experiments.report import scenery, style
 from experiments.scene.stage import link_colours
 from twins.arrays import Array
 
@@ -54,8 +34,8 @@ OVERLAID: Final = 3  # cases that can be distinguished upon each other, from abo
 FLAT: Final = 0.15  # of its width is how high a picture of robots on the floor is, where tall things stand there
 
 
-@styled
-def plan_view(traces: Sequence[Trace], width: float = WIDTH) -> Figure:
+@style.styled
+def plan_view(traces: Sequence[Trace], width: float = style.WIDTH) -> Figure:
     """The trajectories from above, and of the arena what is near them; start hollow, end full, links of the end.
 
     A few cases in the same arena are laid upon each other, with a colour each; their robots are named, and few of them
@@ -77,17 +57,17 @@ def plan_view(traces: Sequence[Trace], width: float = WIDTH) -> Figure:
     for axes, shown in zip(grid, panels, strict=True):
         scenery.from_above(axes, shown[0].plan)
         for k, trace in enumerate(shown):
-            _draw_from_above(axes, trace, thinned(trace, len(traces)), case_line(k) if overlaid else None)
-        axes.set_title("" if overlaid else plain(shown[0].case), pad=3.0)
+            _draw_from_above(axes, trace, style.thinned(trace, len(traces)), style.case_line(k) if overlaid else None)
+        axes.set_title("" if overlaid else style.plain(shown[0].case), pad=3.0)
         axes.spines[["left", "bottom"]].set_visible(False)
         axes.xaxis.set_major_locator(MaxNLocator(5))
         axes.yaxis.set_major_locator(MaxNLocator(5))
     if overlaid:
         grid[0].set(xlabel="$x$ [m]", ylabel="$y$ [m]")
-        legend_above(figure, _case_entries(traces) | _end_entries() | things, columns=6)
+        style.legend_above(figure, _case_entries(traces) | _end_entries() | things, columns=6)
     else:
         _label_plane(figure)
-        robot_legend(figure, traces, things)
+        style.robot_legend(figure, traces, things)
     return figure
 
 
@@ -100,7 +80,7 @@ def _plane(
     rows = math.ceil(count / columns)
     shape = float((high - low)[1] / (high - low)[0])
     panel = min((width - 0.5) / columns * shape, tallest) + 0.25
-    figure = Drawing(figsize=(width, panel * rows + more), layout="constrained")
+    figure = style.Drawing(figsize=(width, panel * rows + more), layout="constrained")
     grid = list(figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat)
     for axes in grid[count:]:
         axes.set_visible(False)
@@ -114,82 +94,73 @@ def _label_plane(figure: Figure) -> None:
     figure.supylabel("$y$ [m]", fontsize=8)
 
 
-def _draw_from_above(axes: Axes, trace: Trace, few: slice, style: Line | None) -> None:
+def _draw_from_above(axes: Axes, trace: Trace, few: slice, design: style.Line | None) -> None:
     """Paths of a case from above: in one style, robots named, or with a colour for each robot."""
     place, (first, last) = trace.true_position, _ends(trace)
-    ink = "#8a8a8a" if style is None else style["color"]
+    ink = "#8a8a8a" if design is None else design["color"]
     for pair in edges(trace.plan.links):
-        axes.plot(*last[pair, :2].T, color=ink, linewidth=0.5, alpha=1.0 if style is None else 0.6, zorder=1)
-    few_robots = len(trace.robots) <= MAX_COLOURED_ROBOTS
-    small, named = 3.0 if few_robots else 2.0, few_robots and style is not None and "alpha" in style
-    for i, line in enumerate(robot_lines(trace)):
-        colour = line["color"] if style is None else ink
-        marker = MARKERS[i] if style is not None and few_robots else "o"
-        path = {**line, "linewidth": 0.8} if style is None else style
+        axes.plot(*last[pair, :2].T, color=ink, linewidth=0.5, alpha=1.0 if design is None else 0.6, zorder=1)
+    few_robots = len(trace.robots) <= style.MAX_COLOURED_ROBOTS
+    small, named = 3.0 if few_robots else 2.0, few_robots and design is not None and "alpha" in design
+    for i, line in enumerate(style.robot_lines(trace)):
+        colour = line["color"] if design is None else ink
+        marker = style.MARKERS[i] if design is not None and few_robots else "o"
+        path = {**line, "linewidth": 0.8} if design is None else design
         axes.plot(place[few, i, 0], place[few, i, 1], **path)
         axes.plot(*last[i, :2], marker, ms=small + 0.5, mec="none", color=colour)
         axes.plot(*first[i, :2], marker, ms=small, mec=colour, mfc="none", mew=0.7)
         if named and np.isfinite(last[i, :2]).all():
-            axes.annotate(
-                trace.robots[i],
-                (float(last[i, 0]), float(last[i, 1])),
-                (0, 4),
-                textcoords="offset points",
-                fontsize=6,
-                ha="center",
-                path_effects=HALO,
-            )
+            _annotate(axes, trace.robots[i], last[i], (0, 4), fontsize=6, ha="center")
+
+
+def _annotate(axes: Axes, name: str, place: Array, offset: tuple[float, float], **design: Any) -> None:  # noqa: ANN401
+    """Writes a name `offset` [pt] from a place (x, y, ...)."""
+    at = float(place[0]), float(place[1])
+    axes.annotate(name, at, offset, textcoords="offset points", path_effects=style.HALO, **design)
 
 
 def _case_entries(traces: Sequence[Trace]) -> dict[str, Artist]:
-    return {plain(trace.case): Line2D([], [], **case_line(k)) for k, trace in enumerate(traces)}
+    return {style.plain(trace.case): Line2D([], [], **style.case_line(k)) for k, trace in enumerate(traces)}
 
 
 def _end_entries() -> dict[str, Artist]:
-    black = to_rgb(INK)
+    black = to_rgb(style.INK)
     start = Line2D([], [], color=black, marker="o", linestyle="", ms=3.0, mfc="none", mew=0.6)
     return {"start": start, "end": Line2D([], [], color=black, marker="o", linestyle="", ms=3.5)}
 
 
-@styled
+@style.styled
 def expected_motion(analyses: Mapping[str, Analysis]) -> Figure:
     """The formation of each case as `check` expects it, from above: starts hollow, ends full, and the target shape with
     its links (dashed where the shape misses their targets by more than the tolerance), laid where the leaders are.
     """
     cases = list(analyses.items())
     half = 0.53 * np.array(cases[0][1].plan.experiment.arena.size[:2])
-    figure, grid = _plane(len(cases), WIDTH, (-half, half), 3.2, 0.6)
+    figure, grid = _plane(len(cases), style.WIDTH, (-half, half), 3.2, 0.6)
     for axes, (name, known) in zip(grid, cases, strict=True):
         experiment, motion = known.plan.experiment, known.prediction.position
         scenery.from_above(axes, known.plan)
         target = motion[-1] if known.shape is None else _laid_upon(known, known.shape.position, motion[-1])
         error = np.zeros(len(known.asked)) if known.shape is None else known.shape.error
         for link, (i, j) in enumerate(zip(known.asked.receiver, known.asked.sender, strict=True)):
-            style = "-" if error[link] <= experiment.tolerance else (0, (2, 2))
-            axes.plot(*target[[i, j], :2].T, color=MAGENTA, linewidth=0.8, linestyle=style, zorder=1)
+            design = "-" if error[link] <= experiment.tolerance else (0, (2, 2))
+            axes.plot(*target[[i, j], :2].T, color=style.MAGENTA, linewidth=0.8, linestyle=design, zorder=1)
         for row, robot in enumerate(known.plan.names):
-            colour = ROBOTS[row % len(ROBOTS)]
-            if len(known.plan.names) > MAX_COLOURED_ROBOTS:
+            colour = style.ROBOTS[row % len(style.ROBOTS)]
+            if len(known.plan.names) > style.MAX_COLOURED_ROBOTS:
                 colour = KINDS[experiment.robots[robot].kind].colour
             axes.plot(motion[:, row, 0], motion[:, row, 1], color=colour, linewidth=0.6)
             axes.plot(*known.start[row, :2], "o", ms=3.0, mec=colour, mfc="none", mew=0.7)
-            axes.plot(*target[row, :2], "D", ms=4.0, mec=MAGENTA, mfc="none", mew=0.7, zorder=3)
+            axes.plot(*target[row, :2], "D", ms=4.0, mec=style.MAGENTA, mfc="none", mew=0.7, zorder=3)
             axes.plot(*motion[-1, row, :2], "o", ms=3.5, mec="none", color=colour, zorder=4)
-            axes.annotate(
-                robot,
-                (float(motion[-1, row, 0]), float(motion[-1, row, 1])),
-                (3, 3),
-                textcoords="offset points",
-                fontsize=5,
-                color=colour,
-                path_effects=HALO,
-                zorder=5,
-            )
-        axes.set_title(plain(name), pad=3.0)
+            _annotate(axes, robot, motion[-1, row], (3, 3), fontsize=5, color=colour, zorder=5)
+        axes.set_title(style.plain(name), pad=3.0)
     _label_plane(figure)
     entries = _end_entries()
-    entries["target shape"] = Line2D([], [], color=MAGENTA, linewidth=0.8, marker="D", ms=3.5, mfc="none", mew=0.7)
-    legend_above(figure, entries, columns=3)
+    entries["target shape"] = Line2D(
+        [], [], color=style.MAGENTA, linewidth=0.8, marker="D", ms=3.5, mfc="none", mew=0.7
+    )
+    style.legend_above(figure, entries, columns=3)
     return figure
 
 
@@ -215,8 +186,8 @@ def has_positions(trace: Trace) -> bool:
     return bool(np.isfinite(trace.true_position).all(axis=2).any())
 
 
-@styled
-def formation(traces: Sequence[Trace], width: float = WIDTH) -> Figure:
+@style.styled
+def formation(traces: Sequence[Trace], width: float = style.WIDTH) -> Figure:
     """The trajectories of the whole run in space, all cases in one panel: start hollow, end full, links of the end.
 
     Cases have a colour each; the robots of a single case do (paper, figures 13 and 14).
@@ -224,11 +195,11 @@ def formation(traces: Sequence[Trace], width: float = WIDTH) -> Figure:
     shown = [trace for trace in traces if has_positions(trace)]
     things = scenery.legend([trace.plan for trace in traces], space=True)
     entries = (_case_entries(traces) if len(traces) > 1 else {}) | _end_entries() | things
-    fits = fitting(width, entries, 6)
+    fits = style.fitting(width, entries, 6)
     above = 0.12 + 0.15 * math.ceil(len(entries) / fits)
     height = min(0.7 * width, 3.9)
     whole = height + above
-    figure = Drawing(figsize=(width, whole))
+    figure = style.Drawing(figsize=(width, whole))
     axes = figure.add_axes((-0.07, -0.05, 1.1, 1.1 * height / whole), projection="3d", computed_zorder=False)
     assert isinstance(axes, Axes3D)
     if not shown:
@@ -237,7 +208,7 @@ def formation(traces: Sequence[Trace], width: float = WIDTH) -> Figure:
         return figure
     for k, trace in enumerate(traces):
         if has_positions(trace):
-            _draw_in_space(axes, trace, case_line(k) if len(traces) > 1 else None)
+            _draw_in_space(axes, trace, style.case_line(k) if len(traces) > 1 else None)
     _frame(axes, shown)
     figure.legend([*entries.values()], [*entries], loc="upper center", ncols=fits, bbox_to_anchor=(0.5, 1.0))
     _crop(figure, axes, above)
@@ -272,7 +243,7 @@ def film(traces: Sequence[Trace]) -> tuple[Figure, Callable[[float], None]]:
     Links have the colours of their errors; few robots have their names.
     """
     shown = [trace for trace in traces if has_positions(trace)]
-    with mpl.rc_context(dict(STYLE) | {"savefig.transparent": False}):
+    with mpl.rc_context(dict(style.STYLE) | {"savefig.transparent": False}):
         figure = Figure(figsize=(4.0 * len(shown), 3.0))
         clock = figure.text(0.5, 0.03, "", ha="center", fontsize=9)
         parts = []
@@ -281,19 +252,19 @@ def film(traces: Sequence[Trace]) -> tuple[Figure, Callable[[float], None]]:
             axes = figure.add_axes(box, projection="3d", computed_zorder=False)
             assert isinstance(axes, Axes3D)
             _frame(axes, shown)
-            figure.text((k + 0.5) / len(shown), 0.9, plain(trace.case), ha="center", fontsize=9)
+            figure.text((k + 0.5) / len(shown), 0.9, style.plain(trace.case), ha="center", fontsize=9)
             links = axes.add_collection3d(Line3DCollection([], linewidths=1.0, zorder=1), autolim=False)
-            styles = robot_lines(trace)
-            trails = [axes.plot([], [], [], **{**style, "linewidth": 0.8, "zorder": 3})[0] for style in styles]
-            dots = [axes.plot([], [], [], "o", ms=5, mec="none", color=style["color"])[0] for style in styles]
-            few = len(trace.robots) <= MAX_COLOURED_ROBOTS
-            halo = {"path_effects": HALO, "zorder": 7}
+            designs = style.robot_lines(trace)
+            trails = [axes.plot([], [], [], **{**design, "linewidth": 0.8, "zorder": 3})[0] for design in designs]
+            dots = [axes.plot([], [], [], "o", ms=5, mec="none", color=design["color"])[0] for design in designs]
+            few = len(trace.robots) <= style.MAX_COLOURED_ROBOTS
+            halo = {"path_effects": style.HALO, "zorder": 7}
             names = [axes.text(0, 0, 0, name, fontsize=6, ha="center", **halo) for name in trace.robots if few]
             plan = trace.plan
             error = errors_over_time(plan.law, plan.formation, trace.time, trace.true_position)
             parts.append((trace, links, trails, dots, names, error))
-        if any(len(trace.robots) > MAX_COLOURED_ROBOTS for trace in shown):
-            robot_legend(figure, shown)
+        if any(len(trace.robots) > style.MAX_COLOURED_ROBOTS for trace in shown):
+            style.robot_legend(figure, shown)
 
     def show(t: float) -> None:
         clock.set_text(f"{t:.1f} s")
@@ -319,18 +290,18 @@ def _ends(trace: Trace) -> tuple[Array, Array]:
     return place[known.argmax(axis=0), rows], place[len(known) - 1 - known[::-1].argmax(axis=0), rows]
 
 
-def _draw_in_space(axes: Axes3D, trace: Trace, case: Line | None) -> None:
+def _draw_in_space(axes: Axes3D, trace: Trace, case: style.Line | None) -> None:
     """Paths of a case in space: in its style among several, or in those of its robots; the first case names them."""
     colour = None if case is None else case["color"]
     place, (starts, ends) = trace.true_position, _ends(trace)
-    few_robots = len(trace.robots) <= MAX_COLOURED_ROBOTS
+    few_robots = len(trace.robots) <= style.MAX_COLOURED_ROBOTS
     if len(pairs := edges(trace.plan.links)):
         lines = Line3DCollection(ends[pairs], colors=colour or "#8a8a8a", linewidths=0.5, alpha=0.7, zorder=1)
         axes.add_collection3d(lines)
     few = slice(None, None, max(1, len(place) // 400))
     size = 3.0 if few_robots else 2.0
     named = not axes.texts
-    for i, line in enumerate(robot_lines(trace)):
+    for i, line in enumerate(style.robot_lines(trace)):
         ink = colour or line["color"]
         axes.plot(*place[few, i].T, **{**(line if case is None else case), "zorder": 3})
         axes.plot(*starts[i, :, None], "o", ms=size, mfc="none", mec=ink, mew=0.6, zorder=5)
@@ -339,7 +310,7 @@ def _draw_in_space(axes: Axes3D, trace: Trace, case: Line | None) -> None:
         )
         if few_robots and named:
             above = ends[i] + [0.0, 0.0, 0.05]
-            axes.text(*above, trace.robots[i], fontsize=6, ha="center", va="bottom", zorder=7, path_effects=HALO)
+            axes.text(*above, trace.robots[i], fontsize=6, ha="center", va="bottom", zorder=7, path_effects=style.HALO)
 
 
 def _frame(axes: Axes3D, traces: Sequence[Trace]) -> None:

@@ -56,7 +56,7 @@ def test_motions_are_drawn_in_one_column(draw, drawn_trace):
     assert 1.0 < figure.get_figheight() <= 9.3
     assert len(figure.axes) >= (len(drawn_trace) if draw is figures.events else 1)
     assert draw(drawn_trace, width=7.16).get_figwidth() == 7.16
-    assert "<metadata" not in figures.svg(figure)
+    assert "<metadata" not in style.svg(figure)
 
 
 @pytest.mark.parametrize("draw", OF_CASES, ids=lambda draw: draw.__name__)
@@ -214,7 +214,7 @@ def drawn(traces):
     measured = [measure(each) for each in traces if len(each.time) > 1]
     made = figures.all_figures(measured, traces)
     for figure in made.values():
-        assert "<svg" in figures.svg(figure)
+        assert "<svg" in style.svg(figure)
     return list(made)
 
 
@@ -250,14 +250,14 @@ def test_whatever_is_unknown_can_be_drawn(draw):
     known = park(duration=23.0)
     silent = dataclasses.replace(known, sent=known.sent.take(np.arange(0)))
     for rows in (np.s_[:], np.s_[300:], np.s_[:1100], np.s_[1:], np.s_[50:, 6], np.s_[:, 5]):
-        assert "<svg" in figures.svg(draw([unknown(silent if isinstance(rows, tuple) else known, rows)]))
+        assert "<svg" in style.svg(draw([unknown(silent if isinstance(rows, tuple) else known, rows)]))
 
 
 def test_saved_files_are_reproducible_vectors_with_real_fonts(tmp_path):
     folder, known = tmp_path / "figures", [park(duration=3.0)]
     page, drawing = folder / "intervals.pdf", folder / "intervals.svg"
     text = style.save(figures.intervals(known), folder, "intervals", pdf=True)
-    assert text == drawing.read_text() == figures.svg(figures.intervals(known))
+    assert text == drawing.read_text() == style.svg(figures.intervals(known))
     assert "<text" not in text
     assert set(re.findall(r"https?://[^\"]*", text.split("<svg")[1])) <= {
         "http://www.w3.org/2000/svg",

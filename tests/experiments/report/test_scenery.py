@@ -13,7 +13,7 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from experiments.check.check import analyses
 from experiments.definition.experiment import Arena, StartBox
 from experiments.file import document
-from experiments.report import figures, scenery, trajectories
+from experiments.report import scenery, style, trajectories
 from experiments.report.trajectories import expected_motion
 from tests.experiments.traces import crowd, park
 from twins.scene import Obstacle
@@ -118,8 +118,8 @@ def test_space_shows_whole_arena_unless_far_larger(short):
 def test_pictures_of_full_arenas_are_drawn(draw, short):
     figure = draw([within(short, FULL), within(short, EMPTY)])
     assert figure.get_figwidth() == 3.5
-    assert "<svg" in figures.svg(figure)
-    assert "<svg" in figures.svg(draw([within(crowd(3, duration=1.0), FULL)]))
+    assert "<svg" in style.svg(figure)
+    assert "<svg" in style.svg(draw([within(crowd(3, duration=1.0), FULL)]))
 
 
 def test_robots_on_the_floor_stand_on_it(short):
