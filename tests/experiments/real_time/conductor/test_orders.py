@@ -103,10 +103,9 @@ def test_stop_is_repeated_although_a_router_hangs(monkeypatch: pytest.MonkeyPatc
         clock.now += orders.STOP_ANSWER_S
         return {"A"}
 
-    with Net().worn() as net:
+    with Net().worn():
         monkeypatch.setattr(orders, "time", clock)
         monkeypatch.setattr(orders, "alive", alive)
-        monkeypatch.setattr(network, "open_session", lambda *_, **__: net.session)
         monkeypatch.setattr(orders, "closing_cleanly", lambda session: nullcontext((session, [])))
         monkeypatch.setattr(orders, "stop_publisher", lambda *_: SimpleNamespace(put=stops.append))
         stop = orders.EmergencyStop(["tcp/127.0.0.1:1"], "park", "operator")
