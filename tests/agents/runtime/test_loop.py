@@ -9,6 +9,7 @@ import pytest
 from agents.decision.lifecycle import Phase
 from agents.decision.neighbours import Neighbours
 from agents.network import messages, pubsub
+from agents.network import session as network
 from agents.network.keys import Keys
 from agents.plugins.registry import PluginError
 from agents.plugins.triggers import Trigger
@@ -56,7 +57,7 @@ def test_standstill_skips_ticks_and_holds(stands_s, missed, holds, on_stage, cap
 
 
 @pytest.mark.parametrize(("experiment", "after_s"), [(WHEELS, [1.0, 10.0]), (DRONE, [10.0])], ids=["wheels", "drone"])
-def test_standstill_without_router_halts_then_lands(experiment, after_s, on_stage):
+def test_standstill_without_router_halts_then_lands(experiment, after_s, on_stage, monkeypatch):
     stage, woke = on_stage(experiment), []
 
     def visit(phase):
@@ -67,7 +68,7 @@ def test_standstill_without_router_halts_then_lands(experiment, after_s, on_stag
             stage.clock.sleep(0.8)
             woke.append(stage.clock.now)
             stage.orders.clear()
-            stage.net.connected = False
+            monkeypatch.setattr(network, "connected", lambda _session: False)
         return phase == Phase.DONE
 
     stage.begin()
