@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, TypeVar
 
@@ -134,6 +136,7 @@ class EmergencyStop:
     seen: set[str] = field(default_factory=set)  # robots that were alive
     moving: set[str] = field(default_factory=set)  # those of them without a report of their stop
     failure: Exception | None = None  # why the routers cannot be reached
+    run_ended: bool = False  # whether the process of the run was told to end, since no robot was there
 
     @property
     def where(self) -> str:
@@ -150,6 +153,11 @@ class EmergencyStop:
             self._send(reason)
         except Exception as error:  # noqa: BLE001 - the others are stopped whatever happens to this one
             self.failure = error
+        if self.run is not None and self.expected and not self.seen:
+            # between the cases of a mesh no member is there to hear of the stop, and the next case would begin
+            with suppress(OSError):
+                os.kill(self.run.pid, signal.SIGTERM)
+                self.run_ended = True
 
     def look(self) -> None:
         """Find the robots that the stop would reach; nothing is sent to them."""

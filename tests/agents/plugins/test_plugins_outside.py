@@ -247,7 +247,7 @@ def test_broken_robots_of_the_guide_fail_the_run(installed, four_rovers, tmp_pat
         f'title = "Rovers"\nduration_s = 5.0\n[arena]\nsize = [4.0, 4.0, 2.0]\n{robots}'
         '[formation.links]\n"RV01 > RV04" = 0.6\n"RV02 > RV04" = 0.6\n'
     )
-    flight = lab.Flight(tmp_path / "run", str(file))
+    flight = lab.Flight(tmp_path / "run", str(file), report=True)
     flight.until_said("event start|start conductor: common start")
     for name, fault in FAULTS.items():
         four_rovers[name][0].send_signal(fault)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+import subprocess
 import threading
 from contextlib import nullcontext
 from types import SimpleNamespace
@@ -17,6 +19,7 @@ from agents.network.keys import Keys
 from agents.safety.hazards import failed
 from experiments.real_time.conductor import orders
 from experiments.real_time.conductor.run_view import NetworkView, RobotView
+from experiments.real_time.hosts.run_registry import RegisteredRun, born
 from tests.conftest import RouterProcess
 from tests.experiments.recordings import START, status
 from tests.network import Net
@@ -112,6 +115,20 @@ def test_stop_is_repeated_although_a_router_hangs(monkeypatch: pytest.MonkeyPatc
         stop.send("a test")
     assert (stop.failure, stop.moving) == (None, {"A"})
     assert len(stops) > orders.STOP_ANSWER_S / orders.STOP_AGAIN_S
+
+
+def test_stop_without_robots_ends_the_run() -> None:
+    with subprocess.Popen(["sleep", "60"]) as process, Net().worn():
+        run = RegisteredRun("run", process.pid, born(process.pid) or "", 0.0, "mesh", "", ["tcp/127.0.0.1:1"])
+        stop = orders.EmergencyStop(run.endpoints, run.realm, run.identity, run)
+        stop.look()
+        assert (stop.expected, stop.run_ended, process.poll()) == (True, False, None)
+        stop.send("a test")
+        assert stop.run_ended
+        assert process.wait(10.0) == -signal.SIGTERM
+        again = orders.EmergencyStop(run.endpoints, run.realm, run.identity, run)
+        again.send("a test")
+        assert not again.run_ended
 
 
 class View(NetworkView):

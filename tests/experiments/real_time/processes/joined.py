@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from math import inf
 
 from agents.clock import uptime
 from agents.network.keys import Keys
@@ -22,7 +23,8 @@ DRONE = RobotTable(kind="crazyflie", start=[0.1, 0.2], hover=0.5, body="world")
 
 
 def joint(net: Net, ownership: OwnershipCheck | None = None) -> Network:
-    return Network(net.session, KEYS, [], [], ownership or OwnershipCheck([]))
+    """The `net` for a process; without an `ownership` a standstill of the machine asks for no check."""
+    return Network(net.session, KEYS, [], [], ownership or OwnershipCheck([], lease_s=inf))
 
 
 def world_plan(name: str = "F") -> Plan:
