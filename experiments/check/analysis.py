@@ -60,10 +60,15 @@ class Analysis:
         return isinstance(self.plan.law, Gradient)
 
     @cached_property
-    def without_neighbours(self) -> Index:
-        """Rows with neither incoming links nor an anchor."""
+    def placed(self) -> Mask:
+        """(N,) robots with incoming links or an anchor."""
         held = [row for row, _ in self.plan.anchors_by_row]
-        return np.setdiff1d(np.arange(len(self.plan.names)), [*self.plan.links.receiver.tolist(), *held])
+        return np.isin(np.arange(len(self.plan.names)), [*self.plan.links.receiver.tolist(), *held])
+
+    @property
+    def without_neighbours(self) -> Index:
+        """The other rows."""
+        return np.flatnonzero(~self.placed)
 
     @cached_property
     def parts(self) -> int:
@@ -175,10 +180,8 @@ class Analysis:
     def _shapes(self, wanted: Links, there: Mask) -> list[Shape]:
         """Shapes from the ends, the starts, the scaled distances and random places as guesses, until one is exact."""
         experiment, silent, end = self.plan.experiment, self.without_neighbours, self.prediction.position[-1].copy()
-        rows, links = len(end), wanted.take(there)
+        rows, links, moves = len(end), wanted.take(there), self.placed
         aloft = np.column_stack([self.start[:, :2], self.height])
-        moves = np.ones(rows, dtype=bool)
-        moves[silent] = False
         landed = moves & (end[:, 2] < aloft[:, 2] / 2)  # before the end: on the floor it has no place in the shape
         end[landed, 2] = aloft[landed, 2]
         rng = np.random.default_rng(experiment.seed)

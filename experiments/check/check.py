@@ -143,7 +143,6 @@ def _figures(analysis: Analysis) -> CheckNumbers:
         rank_needed=planar.needed if planar else None,
         rank_space=spatial.rank if spatial else None,
         rank_space_needed=spatial.needed if spatial else None,
-        smallest_singular=planar.smallest if planar else None,
         smallest_eigenvalue=planar.smallest**2 if planar else None,
         spare_links=int(spare.pairs.sum()) if spare else None,
         vital_links=analysis.vital_links,

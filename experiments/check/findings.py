@@ -57,8 +57,8 @@ class CheckNumbers(msgspec.Struct, frozen=True, kw_only=True):
     rank_needed: int | None  # see `rank`
     rank_space: int | None  # the same in full space
     rank_space_needed: int | None  # see `rank_space`
-    smallest_singular: float | None  # of the rigidity matrix when heights are held, rigid motions left out [m]
-    smallest_eigenvalue: float | None  # its square [m²]
+    # square of the smallest singular value of the rigidity matrix when heights are held, rigid motions left out [m²]
+    smallest_eigenvalue: float | None
     spare_links: int | None  # pairs without any one of which the formation stays rigid; None where that has no meaning
     vital_links: tuple[str, ...]  # the other pairs
     spare_robots: int | None  # robots without any one of which it stays rigid

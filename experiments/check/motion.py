@@ -188,9 +188,7 @@ def anchors(analysis: Analysis) -> Iterator[Finding]:
 def _on_the_wrong_side(analysis: Analysis) -> tuple[str, str] | None:
     """Robots that end at the mirror image of their place in the shape, and the remedy; None if it does not help."""
     names, end = analysis.plan.names, analysis.prediction.position[-1]
-    moves = np.ones(len(end), dtype=bool)
-    moves[analysis.without_neighbours] = False
-    flips = mirrored_robots(analysis.first_links, end, moves, analysis.plan.anchors_by_row)
+    flips = mirrored_robots(analysis.first_links, end, analysis.placed, analysis.plan.anchors_by_row)
     if not flips:
         return None
     sides = [

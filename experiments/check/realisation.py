@@ -16,7 +16,7 @@ from agents.formation.link import BY_BEARING, BY_DISTANCE, BY_RELATIVE
 from agents.plugins.law import Law
 from agents.plugins.laws import Mixed
 from experiments.definition.formation import Anchored, anchor_errors, law_errors
-from experiments.definition.graph import Links, edges, part_of_rows
+from experiments.definition.graph import Links, adjacency, edges, part_of_rows
 from experiments.definition.links import TARGET_KINDS
 from experiments.definition.rigidity import Redundancy, Rigidity, redundancy, rigidity
 from twins.arrays import Array, Index, Mask, norm
@@ -34,8 +34,7 @@ STILL: Final = 1e-12  # squares of singular values below this, of the largest or
 POINT: Final = 1e-6  # [m] robots that are nearer than this to each other stand in one point, which nothing turns
 
 
-@dataclass(frozen=True)
-class Residuals:
+class Residuals(NamedTuple):
     """Equations (M) of links and anchors."""
 
     value: Array  # (M,) how far each is off [m]
@@ -74,17 +73,15 @@ def residuals(links: Links, anchors: Anchored, position: Array) -> Residuals:
     apart = position[links.receiver] - position[links.sender]
     wants = np.full(len(links), BY_DISTANCE) if links.wants is None else links.wants
     parts = [_of_lengths(apart, links, np.flatnonzero(wants == BY_DISTANCE))]
-    if links.wants is not None and links.relative is not None and links.bearing is not None:
+    if links.relative is not None and links.bearing is not None:
         at = np.flatnonzero(wants == BY_RELATIVE)
-        parts.append(
-            _of_vectors(apart[at] - links.relative[at], np.broadcast_to(np.eye(3), (len(at), 3, 3)), links, at)
-        )
+        unit = np.broadcast_to(np.eye(3), (len(at), 3, 3))
+        parts.append(_of_vectors(apart[at] - links.relative[at], unit, links, at))
         at = np.flatnonzero(wants == BY_BEARING)
         parts.append(_of_vectors(*_from_ray(apart[at], links.bearing[at]), links, at))
     if anchors:
         parts.append(_of_anchors(anchors, position))
-    columns = zip(*((each.value, each.tail, each.head, each.slope) for each in parts), strict=True)
-    return Residuals(*(np.concatenate(column) for column in columns))
+    return Residuals(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def _of_lengths(apart: Array, links: Links, at: Index) -> Residuals:
@@ -94,10 +91,8 @@ def _of_lengths(apart: Array, links: Links, at: Index) -> Residuals:
 
 def _of_vectors(value: Array, slope: Array, links: Links, at: Index) -> Residuals:
     """Three equations of each link: its vector (K, 3) and the derivative of that (K, 3, 3)."""
-    return Residuals(
-        value.reshape(-1), np.repeat(links.receiver[at], 3), np.repeat(links.sender[at], 3),
-        slope.reshape(-1, 3),
-    )  # fmt: skip
+    tail, head = np.repeat(links.receiver[at], 3), np.repeat(links.sender[at], 3)
+    return Residuals(value.reshape(-1), tail, head, slope.reshape(-1, 3))
 
 
 def _from_ray(apart: Array, bearing: Array) -> tuple[Array, Array]:
@@ -120,13 +115,9 @@ def _of_anchors(anchors: Anchored, position: Array) -> Residuals:
     length = np.sqrt(norm(away[ring]) ** 2 + TINY)
     direction = np.einsum("ak,akl->al", away[ring] / length[:, None], matrix[ring])
     on = np.flatnonzero(distance == 0.0)
+    value = np.concatenate([length - distance[ring], away[on].reshape(-1)])
     tail = np.concatenate([row[ring], np.repeat(row[on], 3)])
-    return Residuals(
-        np.concatenate([length - distance[ring], away[on].reshape(-1)]),
-        tail,
-        np.full(len(tail), -1),
-        np.concatenate([direction, matrix[on].reshape(-1, 3)]),
-    )
+    return Residuals(value, tail, np.full(len(tail), -1), np.concatenate([direction, matrix[on].reshape(-1, 3)]))
 
 
 @dataclass(frozen=True)
@@ -198,7 +189,7 @@ def find_shapes(
     Returns:
         The shapes that were found, in the order of the guesses; only the last one may be good.
     """
-    found, free = list[Shape](), np.column_stack([moves, moves, np.zeros_like(moves) if climbs is None else climbs])
+    found, free = list[Shape](), _free(moves, climbs)
     for guess in guesses:
         shape = fitted_shape(links, anchors, guess, free)
         if solids is not None and shape.worst <= OFF:  # for other shapes it does not matter
@@ -207,6 +198,11 @@ def find_shapes(
         if shape.good:
             break
     return found
+
+
+def _free(moves: Mask, climbs: Mask | None = None) -> Mask:
+    """Coordinates (N, 3) that may change."""
+    return np.column_stack([moves, moves, np.zeros_like(moves) if climbs is None else climbs])
 
 
 def best_shape(shapes: Sequence[Shape]) -> Shape:
@@ -237,9 +233,7 @@ def unfold_distances(links: Links, height: Array) -> Array:
     return np.column_stack([np.zeros((rows, 2 - plane.shape[1])), plane, height])
 
 
-@np.errstate(
-    over="ignore", invalid="ignore"
-)  # too far a step, or too high a height, is no better, in spite of its result
+@np.errstate(over="ignore", invalid="ignore")  # too far a step is no better, in spite of its result
 def fitted_shape(links: Links, anchors: Anchored, guess: Array, free: Mask) -> Shape:
     """Least squares of the residuals from a guess (N, 3) [m], by Levenberg's and Marquardt's method.
 
@@ -286,8 +280,7 @@ def mirrored_robots(links: Links, end: Array, moves: Mask, anchors: Anchored = (
     """
     if len(end) > MOST_MIRRORED:
         return []
-    free = np.column_stack([moves, moves, np.zeros_like(moves)])
-    pairs = edges(links)
+    free, pairs = _free(moves), edges(links)
     neighbours = [np.setdiff1d(pairs[(pairs == row).any(axis=1)], [row]) for row in range(len(end))]
     choices = [
         (row, left, right)
@@ -302,13 +295,10 @@ def mirrored_robots(links: Links, end: Array, moves: Mask, anchors: Anchored = (
             guess = place.copy()
             guess[row] = _mirror(place[row], place[left], place[right])
             tried.append((fitted_shape(links, anchors, guess, free), row, (left, right)))
-        ranked = [
-            (round(shape.worst, 3), float(norm(shape.position - place).sum()), k)
-            for k, (shape, _, _) in enumerate(tried)
-        ]
-        if not ranked:
+        moved = [(round(shape.worst, 3), float(norm(shape.position - place).sum())) for shape, _, _ in tried]
+        if not moved:
             return []
-        shape, row, ends = tried[min(ranked)[-1]]
+        shape, row, ends = tried[moved.index(min(moved))]
         if shape.worst >= best.worst:
             return []
         best, place = shape, shape.position
@@ -341,20 +331,16 @@ def conflicts(links: Links, height: Array) -> list[Conflict]:
     wanted[links.receiver, links.sender] = links.distance
     wanted = np.where(np.isnan(wanted), wanted.T, wanted)
     rise = np.abs(height[:, None] - height[None, :])
-    found = []
-    for i, j in np.argwhere(np.triu(wanted < rise - ROUNDED)):
-        high = int(i if height[i] > height[j] else j)
-        found.append(Conflict((int(i), int(j)), float(wanted[i, j] + min(height[i], height[j])), (high,)))
-    planar = np.sqrt(np.maximum(wanted**2 - rise**2, 0.0))
-    planar[wanted < rise - ROUNDED] = np.nan
-    seen = set()
-    for i, j in edges(links):
-        for k in np.flatnonzero(planar[i, j] > planar[i] + planar[j] + ROUNDED):
-            triangle = tuple(sorted((int(i), int(j), int(k))))
-            if triangle not in seen:
-                seen.add(triangle)
-                found.append(_of_triangle(triangle, wanted, height))
-    return found
+    found, short = list[Conflict](), wanted < rise - ROUNDED
+    for i, j in np.argwhere(np.triu(short)).tolist():
+        high = i if height[i] > height[j] else j
+        found.append(Conflict((i, j), float(wanted[i, j] + min(height[i], height[j])), (high,)))
+    planar = np.where(short, np.nan, np.sqrt(np.maximum(wanted**2 - rise**2, 0.0)))
+    triangles = dict[tuple[int, ...], None]()
+    for i, j in edges(links).tolist():
+        beyond = np.flatnonzero(planar[i, j] > planar[i] + planar[j] + ROUNDED)
+        triangles |= {tuple(sorted((i, j, k))): None for k in beyond.tolist()}
+    return found + [_of_triangle(each, wanted, height) for each in triangles]
 
 
 def _of_triangle(triangle: tuple[int, ...], wanted: Array, height: Array) -> Conflict:
@@ -384,10 +370,10 @@ def contradictions(links: Links) -> list[Contradiction]:
     """Rings of links by relative position with vectors that do not add up to zero, the shortest rings first."""
     if links.wants is None or links.relative is None:
         return []
-    here = [
-        (k, int(links.receiver[k]), int(links.sender[k]), links.relative[k])
-        for k in np.flatnonzero(links.wants == BY_RELATIVE).tolist()
-    ]
+    at = np.flatnonzero(links.wants == BY_RELATIVE)
+    here = list(
+        zip(at.tolist(), links.receiver[at].tolist(), links.sender[at].tolist(), links.relative[at], strict=True)
+    )
     neighbours: dict[int, list[tuple[int, Array]]] = {}
     for _, i, j, offset in here:
         neighbours.setdefault(j, []).append((i, offset))
@@ -398,14 +384,14 @@ def contradictions(links: Links) -> list[Contradiction]:
         if root in place:
             continue
         place[root], way[root], queue = np.zeros(3), [root], [root]
-        for at in queue:
-            for to, step in neighbours[at]:
+        for row in queue:
+            for to, step in neighbours[row]:
                 if to not in place:
-                    place[to], way[to] = place[at] + step, [*way[at], to]
+                    place[to], way[to] = place[row] + step, [*way[row], to]
                     queue.append(to)
     found = []
     for k, i, j, offset in here:
-        gap = float(norm((place[i] - place[j] - offset)[None, :2])[0])
+        gap = float(norm((place[i] - place[j] - offset)[:2]))
         if gap > ROUNDED:
             fork = sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(way[i], way[j], strict=False)))
             found.append(Contradiction((*reversed(way[i][fork - 1 :]), *way[j][fork:]), k, gap))
@@ -421,13 +407,11 @@ def formation_rigidity(
     If links have targets other than distances, or robots are anchored, some translations, a rotation and a growth may
     be left free. The formation is rigid if no other motion leaves the links satisfied.
     """
-    pairs = np.array([(i, j) for i in led for j in led if i < j], dtype=np.intp).reshape(-1, 2)
+    bars = _bars(led)
     if links.wants is not None or anchors:
-        return _similar_rigidity(position, links, pairs, anchors), None
-    pairs = np.unique(np.concatenate([edges(links), pairs]), axis=0).astype(np.intp)
-    moves = np.ones_like(position, dtype=bool)
-    moves[:, 2] = False
-    return rigidity(position, pairs, moves), rigidity(position, pairs)
+        return _similar_rigidity(position, links, bars, anchors), None
+    pairs = np.unique(np.concatenate([edges(links), bars]), axis=0)
+    return rigidity(position, pairs, _free(np.ones(len(position), dtype=bool))), rigidity(position, pairs)
 
 
 def formation_redundancy(position: Array, links: Links, led: Index) -> Redundancy:
@@ -435,13 +419,15 @@ def formation_redundancy(position: Array, links: Links, led: Index) -> Redundanc
 
     Bars between leaders, rows `led`, cannot be lost as links are; they go with their robots.
     """
-    own = edges(links)
-    bars = np.array([(i, j) for i in led for j in led if i < j], dtype=np.intp).reshape(-1, 2)
+    own, bars = edges(links), _bars(led)
     pairs = np.concatenate([own, bars[~(bars[:, None] == own).all(axis=2).any(axis=1)]])
-    moves = np.ones_like(position, dtype=bool)
-    moves[:, 2] = False
-    found = redundancy(position, pairs, moves)
+    found = redundancy(position, pairs, _free(np.ones(len(position), dtype=bool)))
     return Redundancy(found.pairs[: len(own)], found.robots)
+
+
+def _bars(led: Index) -> Index:
+    """Pairs (M, 2) of leaders."""
+    return np.array([*combinations(np.sort(led), 2)], dtype=np.intp).reshape(-1, 2)
 
 
 def _similar_rigidity(position: Array, links: Links, bars: Index, anchors: Anchored) -> Rigidity:
@@ -452,9 +438,8 @@ def _similar_rigidity(position: Array, links: Links, bars: Index, anchors: Ancho
     i, j = np.repeat(bars, 2, axis=0).T  # leaders keep their places along both axes
     stiff = Residuals(np.zeros(len(i)), i, j, np.tile(np.eye(3)[:2], (len(bars), 1)))
     square += stiff.normal(np.arange(rows), rows, 2)[0]
-    x, y = (position - position.mean(axis=0))[:, :2].T
-    zero, one = np.zeros(rows), np.ones(rows)
-    alike = np.stack([np.stack(each, axis=1).ravel() for each in ((one, zero), (zero, one), (-y, x), (x, y))])
+    away = (position - position.mean(axis=0))[:, :2]
+    alike = np.stack([*whole_motions(away).T, away.ravel()])
     alike = alike[norm(alike) > POINT]
     answered = int((np.linalg.eigvalsh(alike @ square @ alike.T) > STILL).sum())
     squares = np.linalg.eigvalsh(square)[::-1]
@@ -463,10 +448,15 @@ def _similar_rigidity(position: Array, links: Links, bars: Index, anchors: Ancho
     return Rigidity(rank, needed, math.sqrt(squares[needed - 1]) if 0 < needed <= rank else 0.0)
 
 
+def whole_motions(away: Array) -> Array:
+    """Motions in the plane (2 N, 3) of all robots `away` (N, 2) from a centre: along x, along y, and turning."""
+    zero, one = np.zeros(len(away)), np.ones(len(away))
+    motions = ((one, zero), (zero, one), (-away[:, 1], away[:, 0]))
+    return np.stack([np.stack(each, axis=1).ravel() for each in motions], axis=1)
+
+
 def algebraic_connectivity(links: Links, rows: int) -> float:
     """Second smallest eigenvalue of the Laplacian of the network without directions (Fiedler); 0 for one robot."""
-    between = np.zeros((rows, rows))
-    i, j = edges(links).T
-    between[i, j] = between[j, i] = 1.0
+    between = np.maximum(adjacency(links, rows), adjacency(links, rows).T)
     values = np.linalg.eigvalsh(np.diag(between.sum(axis=1)) - between)
     return max(0.0, float(values[1])) if rows > 1 else 0.0

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from agents.formation.link import Link
 from agents.plugins.laws import Gradient
 from agents.vectors import Vector
+from experiments.check.realisation import whole_motions
 from experiments.definition.formation import Anchored, anchor_offsets, law_offsets, unlinked
 from experiments.definition.graph import Links
 from twins.arrays import Array, Index, norm
@@ -76,7 +77,9 @@ def modes(
     gain = _eigenvalues(hardest[:, None] * slope * hardest[None, :]).real.max(initial=0.0)
     turned = np.stack([-offset[receivers, 1], offset[receivers, 0]], axis=1).ravel()
     expected = np.stack([0.0 * turned, 0.0 * turned, -root * turned], axis=1)
-    taken = _remove_motions(taken, _rigid_motions(position, receivers, len(position)) / root[:, None], expected)
+    led = np.setdiff1d(np.arange(len(position)), receivers)
+    centre = position[led if len(led) else receivers].mean(axis=0)
+    taken = _remove_motions(taken, whole_motions((position[receivers] - centre)[:, :2]) / root[:, None], expected)
     values = _eigenvalues(taken)
     left = np.abs(1.0 - values)
     with np.errstate(divide="ignore"):
@@ -97,8 +100,7 @@ def _eigenvalues(matrix: Array) -> NDArray[np.complex128]:
 
 def _derivative(law: Gradient, links: Links, position: Array, anchors: Anchored, receivers: Index) -> Array:
     """∂u/∂p (2 L, 2 L) of the receivers: the sum of what each link and each anchor adds."""
-    rows, count = len(position), len(receivers)
-    column = np.full(rows, -1)
+    count, column = len(receivers), np.full(len(position), -1)
     column[receivers] = np.arange(count)
     blocks = np.zeros((count, 2, count, 2))
     apart = (position[links.receiver] - position[links.sender]).tolist()
@@ -117,20 +119,9 @@ def _derivative(law: Gradient, links: Links, position: Array, anchors: Anchored,
 def _slope(pull: Callable[..., Vector], at: Vector, *link: Link) -> Array:
     """Derivative (2, 2) of x and y of a pull by x and y of the place [m] at which it is asked for."""
     x, y, z = at
-    ahead, behind = pull((x + STEP, y, z), *link), pull((x - STEP, y, z), *link)
-    left, right = pull((x, y + STEP, z), *link), pull((x, y - STEP, z), *link)
-    changes = [[ahead[k] - behind[k], left[k] - right[k]] for k in (0, 1)]
-    return np.array(changes) / (2.0 * STEP)
-
-
-def _rigid_motions(position: Array, receivers: Index, rows: int) -> Array:
-    """Motions of the whole (2 L, 3): along x, along y, and turning, about the leaders if there are any."""
-    led = np.setdiff1d(np.arange(rows), receivers)
-    centre = position[led if len(led) else receivers].mean(axis=0)[:2]
-    way = position[receivers, :2] - centre
-    zero, one = np.zeros(len(receivers)), np.ones(len(receivers))
-    motions = ((one, zero), (zero, one), (-way[:, 1], way[:, 0]))
-    return np.stack([np.stack(each, axis=1).ravel() for each in motions], axis=1)
+    along = np.subtract(pull((x + STEP, y, z), *link), pull((x - STEP, y, z), *link))
+    across = np.subtract(pull((x, y + STEP, z), *link), pull((x, y - STEP, z), *link))
+    return np.stack([along[:2], across[:2]], axis=1) / (2.0 * STEP)
 
 
 def _remove_motions(taken: Array, whole: Array, expected: Array) -> Array:
