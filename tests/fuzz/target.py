@@ -63,6 +63,8 @@ class Renewed:
         self._left -= 1
         try:
             self._made.send(data)
+        except StopIteration:
+            self._left = 0  # it has no use for more
         except Exception:
             self._left = 0  # it has ended, half-way through something
             raise

@@ -43,13 +43,15 @@ def khepera_twin() -> Iterator[Target]:
                 data = yield
                 device = devices.get(data[:1].decode("ascii", "replace"), devices["p"])
                 wire, server = Wire(), device.servers[0]
-                server.client, server._left = wire, False
+                server.client = wire
                 wire.waiting += [data[1:256], data[256:512]] if len(data) > 256 else [data[1:]]
                 while wire.waiting:
                     device.serve(wire, 0.02 * k)
                 for t in (0.02 * k + 0.01, 0.02 * k + 0.02):
                     device.advance(t)
                 assert np.isfinite(device.truth()[0]).all()
+                if server.client is None:  # it has left, and some servers wait for no other
+                    return
 
     with closing(Renewed(make, 200)) as take:
         yield Target(examples, take)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import socket
 import struct
 import sys
 import types
@@ -111,20 +112,21 @@ def tello_twin() -> Iterator[Target]:
     examples = [b"command", *(f"command\0takeoff\0\0{word}".encode() for word in words)]
 
     def make() -> Inputs:
-        with closing(TelloDevice(DeviceRequest(request("tello", "tello-twin"), Faults()))) as device:
-            wire: Any = Wire()
-            device._drones[0].wire.close()
-            device._drones[0].wire = wire
-            t = 0.0
-            while True:
-                data = yield
-                wire.waiting += data.split(b"\0")[:20]
-                while wire.waiting:
-                    device.serve(wire, t)
-                    for _ in range(2):
-                        t += 0.01
-                        device.advance(t)
-                assert np.isfinite(device.truth()[0]).all()
+        with socket.socket(type=socket.SOCK_DGRAM) as client:
+            client.bind(("127.0.0.1", 0))
+            made = DeviceRequest(request("tello", "tello-twin"), Faults())
+            with closing(TelloDevice(made, state_port=client.getsockname()[1])) as device:
+                (wire,) = device.sockets()
+                client.connect(wire.getsockname())
+                t = 0.0
+                while True:
+                    for datagram in (yield).split(b"\0")[:20]:
+                        client.send(datagram[:1024])
+                        device.serve(wire, t)
+                        for _ in range(2):
+                            t += 0.01
+                            device.advance(t)
+                    assert np.isfinite(device.truth()[0]).all()
 
     with closing(Renewed(make, 100)) as take:
         yield Target(examples, take)

@@ -40,6 +40,28 @@ from tests.requests import request
 from tools.commands.network import members, readable
 from twins.devices.vicon import TruthSubscription, ViconTwin
 
+
+class HandDrivenRobot(Runtime):
+    def begin(self, utc: float) -> None:
+        self._utc = self._telemetry.utc = utc
+
+
+class HandDrivenWorld(WorldProcess):
+    def step(self, t: float) -> None:
+        self._tick(t)
+        if self._pace.update(t, 0.01):
+            self._report(t)
+
+
+class HandDrivenConductor(Conductor):
+    def begin(self) -> None:
+        self._join(ExitStack())
+        self._changes.begin(time.time())
+
+    def step(self) -> None:
+        self._update()
+
+
 RUBBISH = io.StringIO()  # where processes say what they would say on a terminal
 
 
@@ -74,12 +96,12 @@ def robot() -> Iterator[Target]:
         net.forget()
         body = assemble(bodies.body_request(Plan(experiment), ["KH01"], 1, ["tcp/127.0.0.1:1"]))
         setup = Setup(KEYS, [], "json", 50.0, lifeline=False, externally_measured=[True], ranging=["world"])
-        runtime = Runtime([Plan(experiment).assignment("KH01")], body, setup)
+        runtime = HandDrivenRobot([Plan(experiment).assignment("KH01")], body, setup)
         body.open()
         runtime.subscribe_to_stops(net.session)
         runtime.join(net.session)
-        runtime._utc = runtime._telemetry.utc = time.time()
-        command = body.command
+        began, command = time.time(), body.command
+        runtime.begin(began)
 
         def told(setpoints: Sequence[Setpoint]) -> None:
             for setpoint in setpoints:
@@ -87,7 +109,6 @@ def robot() -> Iterator[Target]:
             command(setpoints)
 
         body.command = told  # type: ignore[method-assign]
-        began = runtime._utc
         for k in range(1, 6):
             for name in ("KH01", "KH02", "CF01"):
                 for what in ("pose", "position"):
@@ -117,14 +138,12 @@ def world() -> Iterator[Target]:
     def make() -> Inputs:
         net.forget()
         joint = Network(net.session, KEYS, [], [], OwnershipCheck([]))  # type: ignore[arg-type]
-        process = WorldProcess(Plan(experiment), WorldBodies(Plan(experiment)), joint, Event())
+        population = WorldBodies(Plan(experiment))
+        process = HandDrivenWorld(Plan(experiment), population, joint, Event())
         process.utc = time.time()
         for k in count(1):
             net.deliver((yield))
-            process._tick(0.01 * k)
-            if process._pace.update(0.01 * k, 0.01):
-                process._report(0.01 * k)
-            population = process._population
+            process.step(0.01 * k)
             for carried, state in zip(population.carried, population.states, strict=True):
                 assert not carried or is_finite(state.position)
 
@@ -172,13 +191,12 @@ def conductor() -> Iterator[Target]:
             Plan(experiment), "only", Path(folder), source=Path(folder) / "only.json", endpoints=["tcp/127.0.0.1:1"],
             launcher=Nobody(), hosts=Hosts(Nobody(), []),  # type: ignore[arg-type]
         )  # fmt: skip
-        made = Conductor(context, lambda _: None)
-        made._join(ExitStack())
-        made._changes.begin(time.time())
+        made = HandDrivenConductor(context, lambda _: None)
+        made.begin()
         while True:
             data = yield
             net.deliver(data, gone=len(data) % 16 == 0)
-            made._update()
+            made.step()
 
     with tempfile.TemporaryDirectory() as folder, Net().worn() as net, redirect_stdout(RUBBISH):
         yield Target(everything("KH01", "KH02", "CF01"), Renewed(make, 500))

@@ -86,6 +86,12 @@ def ros() -> Iterator[Target]:
     yield Target(examples, take, (ValueError,))
 
 
+class HastyTurtleBot3(TurtleBot3):
+    def close(self) -> None:
+        """Does not wait until the robot stands."""
+        self._claims.release()
+
+
 def turtlebot_bridge() -> Iterator[Target]:
     """Odometry, scans, batteries and tokens of a robot."""
     good = ros_messages()
@@ -96,8 +102,7 @@ def turtlebot_bridge() -> Iterator[Target]:
     def make() -> Inputs:
         net.forget()
         net.first["tb3_0/odom"] = Sample("tb3_0/odom", "", good[ros2.ODOMETRY])
-        body = TurtleBot3(request("turtlebot3", "ros2dds://tb3_0"))
-        try:
+        with closing(HastyTurtleBot3(request("turtlebot3", "ros2dds://tb3_0"))) as body:
             body.open()
             for k in count(1):
                 data = yield
@@ -105,8 +110,6 @@ def turtlebot_bridge() -> Iterator[Target]:
                 (state,) = body.read(0.01 * k)
                 assert is_finite(state.position)
                 body.command([(0.1, 0.2, 0.0, 0.0)])
-        finally:
-            body._claims.release()  # `close` would wait until the robot stands
 
     with Net().worn() as net, closing(Renewed(make, 200)) as take:
         yield Target(examples, take)
