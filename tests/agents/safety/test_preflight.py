@@ -53,6 +53,7 @@ class Standing:
         return self.preflight.check(self.now, missing, self.neighbours, self.health)
 
 
+SWAPPED = "it stands where G begins: addresses or markers are swapped"
 FAILURES = {
     "no position": ({"position": UNKNOWN}, "no position of its own"),
     "no heading": ({"yaw": NAN}, "it does not know which way it looks"),
@@ -60,7 +61,7 @@ FAILURES = {
     "outside": ({"position": (2.3, 0.0, 0.0)}, "it is 0.30 m outside the arena"),
     "locked": ({"refusal": "locked: switch it off and on"}, "locked: switch it off and on"),
     "elsewhere": ({"position": (-0.3, 0.2, 0.0)}, "it is 0.40 m from its start (0.1, 0.2), more than 0.3 m"),
-    "swapped": ({"position": (0.35, 0.2, 0.0)}, "it stands where G begins: addresses or markers are swapped"),
+    "swapped": ({"position": (0.35, 0.2, 0.0)}, SWAPPED),
     "on a table": ({"position": (0.1, 0.2, 0.7)}, "it does not stand on the floor, but at z = 0.70 m"),
     "carried": ({"velocity": (0.0, 0.4, 0.3)}, "it is not at rest: 0.50 m/s"),
     "upside down": ({"attitude": (0.0, 1.0, 0.0, 0.0)}, "it is not level: it leans 180°"),
@@ -86,6 +87,9 @@ def test_reason_why_a_drone_is_not_ready(what):
     [
         ({"kind": KHEPERA4}, {"velocity": (0.5, 0.0, 0.0), "position": (*START, 0.7)}, ""),  # as on a table
         ({"start_within": math.inf, "other": START}, {"position": (1.0, 1.0, 0.0)}, ""),
+        ({"start_within": math.inf, "other": (-0.1, 0.2)}, {"position": (-0.1, 0.2, 0.0)}, SWAPPED),
+        ({"start_within": math.inf, "other": (0.1, -0.2)}, {"position": (0.1, -0.2, 0.0)}, SWAPPED),
+        ({"other": (0.22, 0.2)}, {"position": (0.22, 0.2, 0.0)}, ""),  # two that start in one another are none
         ({"kind": KHEPERA4, "other": (0.3, 0.3), "separation": 0.3}, {}, "it is 0.22 m from G, nearer than 0.3 m"),
         ({"kind": KHEPERA4, "other": (0.3, 0.3), "separation": 0.2}, {}, ""),
     ],

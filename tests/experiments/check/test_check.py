@@ -23,8 +23,8 @@ from experiments.check.analysis import Analysis
 from experiments.check.check import check, examine, figures
 from experiments.check.findings import CheckNumbers
 from experiments.check.ideal_run import Prediction
-from experiments.check.safety import batteries
-from experiments.definition.experiment import Experiment, Formation, LegTable, RobotTable
+from experiments.check.safety import batteries, safety
+from experiments.definition.experiment import Experiment, Formation, LegTable, RobotTable, Safety
 from experiments.definition.plan import Plan
 from experiments.file import catalogue, document
 from tests.cases import examples
@@ -83,6 +83,7 @@ def test_reference_is_feasible_with_a_quick_leader(examined):
     assert found.where.endswith(f"robotic-park.toml:{line}:8")
     notes = {each.code: each.message for each in examined[0] if each.severity == "note"}
     assert {"connected", "realisable", "rigid", "stable", "starts", "acquired", "inside"} <= notes.keys()
+    assert "any one" in notes["redundancy"]
     assert "rank 11 of 11" in notes["rigid"]
     assert "12 of 15, not needed" in notes["rigid"]
 
@@ -212,6 +213,7 @@ def test_remedy_for_a_users_law_names_the_law(install_plugin, law, code, message
         ("cases.periodic.trigger.period_s=0.03", ("warning", "trigger-uneven"), "every 0.04 s", "multiple of 0.02"),
         ("rates.pose_hz=5", ("warning", "decides-unheard"), "at 5 Hz at most", "pose_hz"),
         ("formation.leader=CF03", ("warning", "no-incoming-links"), "TB01 has no links", "> TB01"),
+        ('formation.links={ "TB01 - KH01" = 600 }', ("error", "too-long"), "millimetres?", "write 0.6"),
     ],
 )
 @pytest.mark.usefixtures("unflown")
@@ -363,13 +365,22 @@ def test_batteries_ending_before_the_run_are_all_named():
     def messages_after(duration_s: float, **safety: float) -> list[str]:
         made = changed(reference(), duration_s=duration_s, safety=changed(reference().safety, **safety))
         standing = Prediction(np.zeros(1), np.zeros((1, len(made.robots), 3)), 0, 0.0)
-        return [each.message for each in batteries(Analysis(Plan(made), standing))]
+        return [each.message for each in batteries(Analysis(Plan(made), standing)) if each.code == "battery-ends"]
 
     wheels, drones = messages_after(12000.0)
     assert "TB01 stops after about 8095 s of 12000 s" in wheels  # a Khepera lasts five hours
     assert "CF01, CF02, CF03 land after about 373 s" in drones
     assert not messages_after(300.0)
     assert not messages_after(12000.0, battery_low=0.0)
+
+
+def test_linked_robots_that_come_nearer_than_the_separation():
+    robots = {name: RobotTable(kind="khepera4", start=[x, 0.0]) for name, x in (("A", -0.5), ("B", 0.5))}
+    plan = Plan(small(robots, {"A - B": 1.0}, safety=Safety(separation=0.5)))
+    motion = Prediction(np.arange(2.0), np.array([[(-0.5, 0, 0), (0.5, 0, 0)], [(-0.2, 0, 0), (0.2, 0, 0)]]), 2, 1.0)
+    (found,) = safety(Analysis(plan, motion))
+    assert found.code == "separation-path"
+    assert "come within 0.40 m" in found.message
 
 
 @pytest.mark.usefixtures("unflown")

@@ -205,8 +205,8 @@ def test_robots_that_never_begin_are_reported_with_reason(monkeypatch, tmp_path)
 )
 def test_gain_of_another_law_is_named(law, changes, message):
     plan = Plan(robots_on_wheels(law=law, **changes))
-    found = [(each.message, each.where) for each in unused_gains([plan])]
-    assert found == ([(message, ("formation", next(iter(changes))))] if message else [])
+    found = [(each.code, each.message, each.where) for each in unused_gains([plan])]
+    assert found == ([("unused-gain", message, ("formation", next(iter(changes))))] if message else [])
 
 
 @pytest.mark.parametrize("name", index.titles())
@@ -239,6 +239,7 @@ def test_variants_that_do_not_work_in_flight(name, change, expected, message, re
 
 def test_late_oscillation_blames_loop_not_starts():
     found = bad(TRIANGLE, "formation.gain=10", "channel.delay_s=0.6")
+    assert "oscillates to the end: from 34 to 45 s" in found["keeps-oscillating"].message
     assert "swings between" in found["keeps-oscillating"].message
     assert "lower the gain" in found["keeps-oscillating"].remedy
     assert not {"local-minimum", "not-acquired"} & found.keys()

@@ -12,9 +12,15 @@ from hypothesis import strategies as st
 from agents.kinds.crazyflie import CRAZYFLIE
 from agents.kinds.khepera4 import KHEPERA4
 from agents.kinds.tello import TELLO
+from experiments.check.analysis import Analysis
+from experiments.check.ideal_run import Prediction
+from experiments.check.motion import formation
 from experiments.check.realisation import (
+    OFF,
+    Shape,
     Solids,
     algebraic_connectivity,
+    best_shape,
     conflicts,
     find_shapes,
     fitted_shape,
@@ -24,6 +30,7 @@ from experiments.check.realisation import (
 )
 from experiments.definition.experiment import Formation, RobotTable
 from experiments.definition.graph import Links, links
+from experiments.definition.plan import Plan
 from experiments.file import document
 from tests.cases import examples
 from tests.experiments.checked import PUBLISHED, findings
@@ -112,6 +119,13 @@ def test_robots_on_the_wrong_side_are_named():
     assert found.row == 4
     assert found.place == pytest.approx(shape[4], abs=1e-3)
     assert mirrored_robots(wanted, shape, moves) == []
+    robots = {f"K{k}": RobotTable(kind="khepera4", start=list(place[:2])) for k, place in enumerate(end.position)}
+    given = {f"K{i} - K{j}": float(np.linalg.norm(shape[i] - shape[j])) for i, j in pairs}
+    made = small(robots, formation=Formation(links=given, leader=None), duration_s=5.0)
+    motion = Prediction(np.array([0.0, 5.0]), np.stack([end.position] * 2), 10, 2.0)
+    (finding,) = formation(Analysis(Plan(made), motion))
+    assert finding.code == "local-minimum"
+    assert "K4 near (-0.14, 0.86) in the room" in finding.remedy
 
 
 def test_robots_in_one_another_are_found():
@@ -122,6 +136,20 @@ def test_robots_in_one_another_are_found():
     assert solids.overlaps(near + np.array([[0, 0, 0.1], [0, 0, 0], [0, 0, 0]])).tolist() == [[0, 1]]
     assert not len(solids.overlaps(near + np.array([[0, 0, 0.2], [0, 0, 0], [0, 0, 0]])))
     assert not len(Solids.of(kinds, links([(1, 2)]), all_of_them).overlaps(near))  # places of parts are their own
+    pair = Solids.of(kinds[:2], links([(0, 1)]), all_of_them[:2], clearance=0.5)
+    touch = CRAZYFLIE.radius + TELLO.radius
+    assert len(pair.overlaps(np.array([(0.0, 0.0, 0.5), (0.99 * touch, 0.0, 0.9)])))  # seen from above
+    assert not len(pair.overlaps(np.array([(0.0, 0.0, 0.5), (touch, 0.0, 0.5)])))
+
+
+def test_best_shape_keeps_robots_apart():
+    def shape(worst, overlaps=0):
+        return Shape(np.zeros((2, 3)), np.array([worst]), overlaps=np.zeros((overlaps, 2), dtype=np.intp))
+
+    crossed, apart, far = shape(0.1 * OFF, 1), shape(OFF), shape(2.0 * OFF)
+    assert best_shape([crossed, far, apart]) is apart
+    assert best_shape([crossed, far]) is crossed
+    assert best_shape([shape(0.5 * OFF), apart]).worst == 0.5 * OFF
 
 
 def test_shape_in_one_place_is_an_error():
