@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from agents.body.limits import Safety
 from agents.decision.position_control import REACHED
 from agents.network import messages
 from agents.plugins import registry
@@ -24,7 +25,7 @@ from experiments.check.check import check, examine, figures
 from experiments.check.findings import CheckNumbers
 from experiments.check.ideal_run import Prediction
 from experiments.check.safety import batteries, safety
-from experiments.definition.experiment import Experiment, Formation, LegTable, RobotTable, Safety
+from experiments.definition.experiment import Experiment, Formation, LegTable, RobotTable
 from experiments.definition.plan import Plan
 from experiments.file import catalogue, document
 from tests.cases import examples
