@@ -336,7 +336,7 @@ def _as_json(stop: EmergencyStop, *, dry_run: bool) -> Mapping[str, object]:
         found = {"would_be_stopped": sorted(stop.seen)}
     else:
         found = {"stopped": sorted(stop.seen - stop.moving), "not_known_to_have_stopped": sorted(stop.moving)}
-    return {"where": stop.where, **found, "failure": failure, "run_told_to_end": stop.run_ended}
+    return {"where": stop.where, **found, "failure": failure, "run_asked_to_end": stop.run_ended}
 
 
 def _print_stop(stop: EmergencyStop, *, dry_run: bool) -> None:
@@ -349,7 +349,7 @@ def _print_stop(stop: EmergencyStop, *, dry_run: bool) -> None:
         say(f"{'would be stopped' if dry_run else 'stopped'}: {listed(stopped, MOST_NAMES)} ({stop.where})")
     elif stop.expected and not stop.seen:
         done = "no robot would be stopped" if dry_run else "NOT known to have stopped"
-        ended = "; its process was told to end" if stop.run_ended else ""
+        ended = "; its process was asked to end" if stop.run_ended else ""
         say(f"{done}: {stop.where}: {why}{ended}", to=sys.stderr)
     elif not stop.seen and stop.run is None:
         say(f"also tried, {stop.where}: {why}", to=sys.stderr)

@@ -136,7 +136,7 @@ class EmergencyStop:
     seen: set[str] = field(default_factory=set)  # robots that were alive
     moving: set[str] = field(default_factory=set)  # those of them without a report of their stop
     failure: Exception | None = None  # why the routers cannot be reached
-    run_ended: bool = False  # whether the process of the run was told to end, since no robot was there
+    run_ended: bool = False  # whether the process of the run was asked to end, since no robot was there
 
     @property
     def where(self) -> str:
@@ -154,7 +154,7 @@ class EmergencyStop:
         except Exception as error:  # noqa: BLE001 - the others are stopped whatever happens to this one
             self.failure = error
         if self.run is not None and self.expected and not self.seen:
-            # between the cases of a mesh no member is there to hear of the stop, and the next case would begin
+            # between the cases of a mesh no member is there to receive the stop, and the next case would begin
             with suppress(OSError):
                 os.kill(self.run.pid, signal.SIGTERM)
                 self.run_ended = True
