@@ -70,6 +70,7 @@ def test_light_commands_import_no_libraries(words, said, heavy, tmp_path):
     assert not set(heavy.split()) & modules
 
 
+@pytest.mark.slow
 def test_an_emergency_stop_waits_for_no_numpy():
     _, modules = loaded("estop", "--connect", "tcp/127.0.0.1:9")
     assert "tools.commands.orders" in modules

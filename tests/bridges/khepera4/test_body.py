@@ -255,7 +255,7 @@ def test_link_gap_stops_robot_and_keeps_the_connection(served):
 
 
 @pytest.mark.parametrize(
-    ("speaks", "question", "comes_back"), [(ONCE, b"p", False), (PARK, b"p", True), (KTEAM, b"R", True)]
+    ("speaks", "question", "comes_back"), mostly_slow([(PARK, b"p", True), (ONCE, b"p", False), (KTEAM, b"R", True)], 3)
 )
 def test_garbled_answer_stops_the_robot(served, speaks, question, comes_back):
     """Noise on the line: the robot stands, whether or not its server accepts another client; then it goes on."""
