@@ -269,7 +269,7 @@ def estop(
 def stops_of_all_runs(
     *groups: Sequence[str], realm: str | None = None, identity: str | None = None
 ) -> list[EmergencyStop]:
-    """One stop for each run of this machine, and one for each of other `groups` of routers."""
+    """Emergency stops: of each run of this machine, and of each of other `groups` of routers."""
     from agents.network import endpoints as topology
     from experiments.real_time.conductor.orders import EmergencyStop
     from experiments.real_time.hosts import run_registry

@@ -19,7 +19,7 @@ class Motion:
     wobble: tuple[float, float]  # hover jitter of the next step, of flying robots [m]
 
     def move(self, dt: float) -> None:
-        """One step of `dt` [s] by itself; of no effect where the engine moves robots together."""
+        """Advance by a step of `dt` [s], alone; of no effect where the engine moves robots together."""
 
     def command(self, setpoint: Setpoint) -> None:
         """Set the setpoint as in `agents.body.interface.Body.command`; NaN keeps the last one."""

@@ -1,4 +1,4 @@
-"""One Crazyflie below its protocol: motion, estimator, battery, decks and on-board logic."""
+"""Vehicle of a Crazyflie, below its protocol: motion, estimator, battery, decks and on-board logic."""
 
 from __future__ import annotations
 
@@ -165,7 +165,7 @@ class Decks:
 
 
 class Vehicle:
-    """One Crazyflie; its protocol is a `twins.devices.crazyflie.drone.Drone`."""
+    """Vehicle of a Crazyflie; its protocol is a `twins.devices.crazyflie.drone.Drone`."""
 
     def __init__(self, request: BodyRequest, faults: Faults, row: int) -> None:
         """Raises BodyError for invalid settings."""
