@@ -321,7 +321,7 @@ def _joined(states: list[list[State]], plan: Plan, start: float) -> Array | None
     return np.maximum(first, 0.0)
 
 
-def _possible(message: State | SentPose | Status | LawMemory) -> bool:
+def _possible(message: State | SentPose | Status | LawMemory | CentreState) -> bool:
     """Whether robots would take the numbers of a message: metrics refuse what robots refuse."""
     match message:
         case SentPose():
@@ -330,9 +330,18 @@ def _possible(message: State | SentPose | Status | LawMemory) -> bool:
             counts = (message.sent, message.ticks, message.missed, message.decisions)
             changed = (message.interventions, message.avoided)
             by_name = (*message.lost.values(), *message.dropped.values(), *message.foreign.values())
-            return all(count == 0 or is_count(count) for count in (*counts, *changed, *by_name))
+            return _counts((*counts, *changed, *by_name))
+        case CentreState():
+            by_name = (*message.received.values(), *message.lost.values(), *message.dropped.values())
+            return math.isfinite(message.stamp) and _counts(
+                (message.decisions, message.missed, message.goals, *by_name)
+            )
         case _:
             return True
+
+
+def _counts(numbers: Iterable[int]) -> bool:
+    return all(number == 0 or is_count(number) for number in numbers)
 
 
 def _sampled(states: list[State], start: float, time: Array, hold: float) -> dict[str, Array]:
@@ -424,7 +433,7 @@ def _goals(content: Content, states: list[list[State]], robots: Sequence[str], s
     )
     acted = _table([(row, seq, stamp, at, *NOWHERE, *NOWHERE, math.nan, 0) for at, row, _, seq, stamp in receipts])
     pose = np.array([pose for _, _, pose, *_ in receipts], dtype=float).reshape(-1, 1) - start
-    reports = sorted(content[CentreState], key=lambda each: each.stamp)
+    reports = sorted(filter(_possible, content[CentreState]), key=lambda each: each.stamp)
     counts = [Counter[str](), Counter[str](), Counter[str]()]
     for life in lives(reports, lambda each: each.decisions):
         for total, what in zip(counts, ("received", "lost", "dropped"), strict=True):

@@ -12,6 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
+from subprocess import CalledProcessError
 from types import NoneType
 from typing import Any, Final, get_args, get_type_hints
 
@@ -139,10 +140,14 @@ def write_video(traces: Mapping[str, Trace], file: Path, speed: float = 4.0) -> 
         raise ExplainedError(f"{file}: no position is known in this run; there is nothing to show")
     figure, show = trajectories.film(shown)
     writer = FFMpegWriter(FRAMES_HZ, bitrate=2000) if mp4 else PillowWriter(FRAMES_HZ)  # type: ignore[arg-type]
-    with _writing(file), writer.saving(figure, str(file), 150 if mp4 else 110):
-        for t in np.arange(0.0, max(float(trace.time[-1]) for trace in shown), speed / FRAMES_HZ):
-            show(float(t))
-            writer.grab_frame()
+    try:
+        with _writing(file), writer.saving(figure, str(file), 150 if mp4 else 110):
+            for t in np.arange(0.0, max(float(trace.time[-1]) for trace in shown), speed / FRAMES_HZ):
+                show(float(t))
+                writer.grab_frame()
+    except CalledProcessError as error:  # ffmpeg has ended by itself, and said why in its last line
+        last = str(error.stderr or error.output or "").strip().rpartition("\n")[2]
+        raise ExplainedError(f"{file}: ffmpeg failed: {last or error}; a .gif needs no ffmpeg") from None
 
 
 def structure(trace: Trace, metrics: CaseMetrics) -> dict[str, Any]:

@@ -5,6 +5,7 @@ Runs in a process of its own: a slow browser, or a view that dies, touches no ro
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -160,7 +161,7 @@ class LiveView:
         self._mark = server.gui.add_html("", order=-1.0)
         self._page = Page(server, dark=dark)
         self._trailed: object = None
-        self._stages = 0
+        self._stages, self._failure = 0, ""
         if acting is not None:
             acting.build(server)
         self._begin()
@@ -170,12 +171,24 @@ class LiveView:
         while not ended():
             begun = time.monotonic()
             pages = bool(self._server.get_clients())
+            self._follow(begun, pages=pages)
+            period = heartbeat.frame_s(self._server.gate.lag(time.time()), FRAME_S) if pages else IDLE_S
+            time.sleep(max(0.001, begun + period - time.monotonic()))
+
+    def _follow(self, now: float, *, pages: bool) -> None:
+        """Draws what is new; a picture that fails leaves the page and its emergency stop."""
+        try:
             if self.observer.update():
                 self._begin()
             if pages:
-                self.draw(begun)
-            period = heartbeat.frame_s(self._server.gate.lag(time.time()), FRAME_S) if pages else IDLE_S
-            time.sleep(max(0.001, begun + period - time.monotonic()))
+                self.draw(now)
+            self._failure = ""
+        except Exception as error:  # noqa: BLE001 - of any kind: the stop stays in reach
+            words = f"the picture fails: {type(error).__name__}: {error}"
+            if words != self._failure:
+                self._failure = words
+                print(f"{words}; the emergency stop of the page works on", file=sys.stderr, flush=True)
+            self._mark.content = heartbeat.mark(self._stages, time.time(), None, words)
 
     def close(self, words: str) -> None:
         """Tells open pages, in words, why they get no more pictures."""

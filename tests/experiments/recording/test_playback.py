@@ -11,7 +11,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
 
-from agents.network.messages import Event, GoalReceipt, HostClock, PoseReceipt, State
+from agents.network.messages import CentreState, Event, GoalReceipt, HostClock, PoseReceipt, State
 from experiments.definition.experiment import Formation, Rates, RobotTable
 from experiments.recording.clocks import ClockSample, Correction, host_offset
 from experiments.recording.playback import NotStarted, read
@@ -229,6 +229,12 @@ def test_foreign_poses_count_once_for_all_receivers(path):
 def test_impossible_counts_of_foreign_poses_are_left_out(path):
     rec.write(path, *rec.whole_run()[:-2], rec.status(at=0.5), rec.status(at=0.9, foreign={"TB01": 2**60}))
     assert not read(path).trace.foreign.any()
+
+
+def test_impossible_counts_of_the_centre_are_left_out(path):
+    reports = [CentreState(rec.START + 0.5, ["CF01"], received={"TB01": count}) for count in (4, 2**60, -3)]
+    rec.write(path, *rec.whole_run(), *reports, experiment=rec.pair_with(architecture="centralised"))
+    assert read(path).trace.goals.received.tolist() == [4, 0]
 
 
 def test_only_poses_of_the_run_are_sent(path):

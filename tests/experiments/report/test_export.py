@@ -52,6 +52,15 @@ def test_a_film_needs_its_encoder_and_a_name(recorded_run, tmp_path, monkeypatch
         commands.export(str(recorded_run[0]), video=tmp_path / "film.avi")
 
 
+def test_a_failing_encoder_is_named(recorded_run, tmp_path, monkeypatch):
+    broken = tmp_path / "ffmpeg"
+    broken.write_text("#!/bin/sh\nread -r _ && echo 'Unknown encoder' >&2\nexit 8\n")
+    broken.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:/bin:/usr/bin")
+    with pytest.raises(ExplainedError, match="ffmpeg failed: Unknown encoder"):
+        commands.export(str(recorded_run[0]), video=tmp_path / "film.mp4", speed=400.0)
+
+
 @pytest.fixture(scope="module")
 def mat(recorded_run):
     """The run as it is read back from the file that the command writes."""

@@ -170,3 +170,15 @@ def test_replay_ends_when_another_process_owns_a_name(token, shown, monkeypatch)
             assert clock.t < clock.end
         else:
             assert played.run(threading.Event(), clock) > len(sent) > 20
+
+
+def test_page_outlives_a_picture_that_fails(capsys):
+    server, rounds = MagicMock(), iter((False, False, True))
+    server.gate.lag.return_value = 0.0
+    watched = WatchedRun((), "park", "observer")
+    with Net().worn() as net:
+        page = live.LiveView(server, net.session, watched, dark=False, acting=None)
+        server.atomic.side_effect = ValueError("no such mesh")
+        page.run(lambda: next(rounds))
+    assert capsys.readouterr().err.count("the picture fails: ValueError: no such mesh") == 1
+    assert "no such mesh" in server.gui.add_html.return_value.content
