@@ -18,7 +18,7 @@ import zenoh
 
 from agents.network import pubsub
 from agents.network.endpoints import EndpointError, free_endpoint
-from agents.network.messages import JSON, MSGPACK, Order, Stop
+from agents.network.messages import JSON, Order, Stop
 from agents.network.session import (
     ANSWER_S,
     ASK_EVERY_S,
@@ -57,9 +57,6 @@ def test_router_says_when_its_port_is_taken(router):
         serve_router([router.endpoint], threading.Event())
 
 
-# ---------------------------------------------------------------- poses
-
-
 @pytest.mark.mechanism("last pose for a late joiner")
 @pytest.mark.system
 def test_late_joiner_hears_the_last_pose(two, router, eventually):
@@ -87,9 +84,8 @@ def test_pose_said_while_the_router_was_down_arrives(two, router, eventually):
     eventually(lambda: not connected(sender) and not connected(receiver))
     pose.put(b"while down")
     router.start()
-    eventually(lambda: got.extend(payloads(poses.handler)) or b"while down" in got)
+    eventually(lambda: got.extend(payloads(poses.handler)) or got[-1] == b"while down")
     assert connected(sender)
-    assert got[-1] == b"while down"
 
 
 @pytest.mark.system
@@ -97,7 +93,6 @@ def test_queues_keep_the_newest(two, eventually):
     robot, other = two
     bell = pubsub.Bell()
     wanted = pubsub.CallbackQueue[zenoh.Sample](2, lambda sample: sample.payload.to_bytes() != b"9")
-    assert list(received(wanted)) == []
     other.declare_subscriber(POSE, wanted.callback)
     ringing = pubsub.RingingSubscriber(other, POSE, bell, depth=2)
     states, last = pubsub.subscriber(other, POSE, depth=3), pubsub.subscriber(other, "park/control")
@@ -108,22 +103,15 @@ def test_queues_keep_the_newest(two, eventually):
     pubsub.publisher(robot, "park/control", JSON).put(b"behind")
     eventually(lambda: payloads(last.handler))
     assert bell.wait(10.0)
-    assert payloads(states.handler) == [b"7", b"8", b"9"]
-    assert payloads(wanted) == [b"7", b"8"]
-    assert payloads(ringing) == [b"8", b"9"]
-    assert ringing.try_recv() is None
-    assert list(received(wanted)) == []
+    kept = [payloads(queue) for queue in (states.handler, wanted, ringing, ringing, wanted)]
+    assert kept == [[b"7", b"8", b"9"], [b"7", b"8"], [b"8", b"9"], [], []]
 
 
 def test_rings_before_a_wait_are_one():
     bell = pubsub.Bell()
     bell.ring()
     bell.ring()
-    assert bell.wait(0.0)
-    assert not bell.wait(0.0)
-
-
-# ---------------------------------------------------------------- queries
+    assert [bell.wait(0.0), bell.wait(0.0)] == [True, False]
 
 
 @pytest.mark.system
@@ -132,15 +120,13 @@ def test_last_value_answers_a_plain_get(two, eventually):
     asker = other.declare_querier(POSE, timeout=5.0)  # a wildcard is never told that it matches
     last = pubsub.LastValue(robot, POSE, JSON)
     eventually(lambda: asker.matching_status.matching)
-    empty = other.get("park/*/pose", timeout=5.0)
-    eventually(last.answer)
-    assert list(empty) == []
-    last.hold(b"1")
-    last.hold(b"2")
-    asked = other.get("park/*/pose", timeout=5.0)
-    eventually(last.answer)
-    (reply,) = [reply.ok for reply in asked]
-    assert (str(reply.key_expr), reply.payload.to_bytes(), str(reply.encoding)) == (POSE, b"2", JSON)
+    for value, expected in ((None, []), (b"2", [(POSE, b"2", JSON)])):
+        if value is not None:
+            last.hold(value)
+        asked = other.get("park/*/pose", timeout=5.0)
+        eventually(last.answer)
+        replies = [reply.ok for reply in asked]
+        assert [(str(each.key_expr), each.payload.to_bytes(), str(each.encoding)) for each in replies] == expected
 
 
 @pytest.mark.system
@@ -156,17 +142,6 @@ def test_orders_wait_until_they_are_polled(two, eventually):
         assert order == Order("land")
         query.reply(ORDER, b"ok")
     assert [reply.ok.payload.to_bytes() for reply in asked] == [b"ok"]
-    # a query without a payload is no order
-    for key, told in (("park/**", []), ("park/*/order", []), (ORDER, [pubsub.NO_ORDER])):
-        asked, waiting, replies = other.get(key, timeout=5.0), [], []
-        ended = threading.Thread(target=lambda asked=asked, replies=replies: replies.extend(asked))
-        ended.start()
-        eventually(lambda w=waiting, e=ended: w.extend(orders.read()) or not e.is_alive())
-        assert [reply.err.payload.to_string() for reply in replies] == told
-        assert not waiting
-
-
-# ---------------------------------------------------------------- ends of processes
 
 
 ROBOT = """
@@ -198,21 +173,13 @@ def test_interpreter_exits_although_a_session_was_left_open(router):
 def test_a_killed_robot_is_noticed(router, eventually):
     with started("-c", ROBOT, router.endpoint) as robot, open_session([router.endpoint], name="CF02") as session:
         assert robot.stdout.readline() == "ready\n"
-        own = pubsub.alive_token(session, "park/CF02/alive")
         watch, seen = pubsub.AliveWatch(session, "park/*/alive"), []
-        eventually(lambda: seen.extend(watch.changes()) or len(seen) == 2)
-        assert set(seen) == {(ALIVE, True), ("park/CF02/alive", True)}
+        eventually(lambda: seen.extend(watch.changes()) or seen == [(ALIVE, True)])
         for key in ("park/**", "park/*/alive"):  # on the keys of everybody: nobody's life, and nobody's death
             pubsub.alive_token(session, key).undeclare()
         robot.kill()
-        seen.clear()
-        eventually(lambda: seen.extend(watch.changes()) or seen)
-        assert seen == [(ALIVE, False)]
+        eventually(lambda: seen.extend(watch.changes()) or seen[1:] == [(ALIVE, False)])
         assert connected(session)
-        own.undeclare()
-
-
-# ---------------------------------------------------------------- silent routers
 
 
 class Question:
@@ -316,35 +283,9 @@ def test_silent_router_is_left_only_for_another(monkeypatch):
 
 
 @pytest.mark.system
-def test_a_frozen_router_is_silent_whatever_its_lease(patient_router, eventually):
-    with open_session([patient_router.endpoint], name="CF01") as session:
-        watch, begun = RouterWatch(session, ALIVE), time.monotonic()
-
-        def silent_since() -> float:
-            return watch.silent_since(time.monotonic() - begun)
-
-        eventually(lambda: silent_since() == inf and time.monotonic() - begun > 4 * ASK_EVERY_S)
-        for _ in range(2):
-            with patient_router.frozen():
-                stopped = time.monotonic() - begun
-                eventually(lambda: silent_since() < inf)
-                assert stopped - ANSWER_S < silent_since() < stopped + ASK_EVERY_S + 0.1
-                assert connected(session), "Zenoh notices nothing"
-                since = silent_since()
-                eventually(lambda since=since: time.monotonic() - begun > since + 10 * ASK_EVERY_S)
-                assert silent_since() == since
-            eventually(lambda: silent_since() == inf)
-        patient_router.kill()
-        eventually(lambda: silent_since() < inf)
-        patient_router.start()
-        eventually(lambda: silent_since() == inf)
-
-
-@pytest.mark.system
 def test_router_that_waits_for_another_is_not_silent(patient_router):
-    linked = zenoh.open(
-        config(settings("router", listen=[near := free_endpoint(0)], connect=[patient_router.endpoint]))
-    )
+    near = free_endpoint(0)
+    linked = zenoh.open(config(settings("router", listen=[near], connect=[patient_router.endpoint])))
     with linked, open_session([near], name="CF01") as session, patient_router.frozen():
         watch, begun = RouterWatch(session, ALIVE), time.monotonic()
         while (t := time.monotonic() - begun) < 4 * ASK_EVERY_S:
@@ -361,14 +302,6 @@ def second():
 
 @pytest.mark.mechanism("client at a second router")
 @pytest.mark.system
-def test_client_fails_over_to_the_second_router(router, second, eventually):
-    with open_session([router.endpoint, second.endpoint], name="CF01") as session:
-        first = session.info.routers_zid()
-        router.kill()
-        eventually(lambda: connected(session) and session.info.routers_zid() != first)
-
-
-@pytest.mark.system
 def test_second_router_takes_over_from_frozen_long_lease(patient_router, second, eventually):
     ends = [patient_router.endpoint, second.endpoint]
     with open_session(ends, name="CF01") as robot, open_session(ends, name="CF02") as listener:
@@ -378,78 +311,48 @@ def test_second_router_takes_over_from_frozen_long_lease(patient_router, second,
         poses, heard = pubsub.pose_publisher(robot, POSE, JSON), pubsub.pose_subscriber(listener, POSE)
         alive = pubsub.AliveWatch(listener, "park/*/alive")
 
-        def until(true) -> None:
-            """Until something is true, let both processes watch their router, and poses be sent."""
+        def exchange() -> None:
+            """Both watch their router, and poses are sent, until a new one has arrived, and the token."""
+            mark = sent[-1]
 
-            def turn():
-                for watch in watches:
-                    watch.silent_since(time.monotonic() - begun, len(got) if watch is watches[1] else 0)
+            def turn() -> bool:
+                for watch, arrived in zip(watches, (0, len(got)), strict=True):
+                    watch.silent_since(time.monotonic() - begun, arrived)
                 sent.append(sent[-1] + 1)
                 poses.put(str(sent[-1]).encode())
                 got.extend(int(payload) for payload in payloads(heard.handler))
                 here.extend(there for _, there in alive.changes())
-                return true()
+                return bool(got) and got[-1] > mark and here[-1]
 
             eventually(turn)
-
-        def arrive() -> None:
-            mark = sent[-1]
-            until(lambda: got and got[-1] > mark)
             assert got == sorted(set(got)), "each once, in order"
-            until(lambda: here[-1])
 
-        def routers() -> set[str]:
-            return {str(zid) for zid in robot.info.routers_zid()}
-
-        arrive()
-        old = routers()
+        exchange()
         with patient_router.frozen():
             os.waitpid(patient_router.process.pid, os.WUNTRACED)
-            until(lambda: routers() not in (old, set()))
-            arrive()
+            exchange()
             assert count_links(robot) == count_links(listener) == 1
-        arrive()
+        exchange()
         token.undeclare()
-        until(lambda: not here[-1])
-
-
-# ---------------------------------------------------------------- alarms
+        eventually(lambda: here.extend(there for _, there in alive.changes()) or not here[-1])
 
 
 @pytest.mark.mechanism("emergency stop before everything else that came")
 @pytest.mark.system
 def test_alarm_is_obeyed_at_once_and_keeps_orders(two, eventually):
-    whole = b'{"operator": "ana", "reason": "fire"}'
-    said = [  # by zenpark; by z_put and zenoh-cli; by `curl -X PUT -d`, with a header, with --json; by anything at all
-        (whole, JSON, "by ana: fire"),
-        (whole, "zenoh/bytes", "by ana: fire"),
-        (whole, "application/x-www-form-urlencoded", "by ana: fire"),
-        (b"stop", "application/x-www-form-urlencoded", "by an unknown sender: stop"),
-        (b"stop it", "text/plain", "by an unknown sender: stop it"),
-        (b'"stop"', JSON, "by an unknown sender: stop"),
-        (b'{"operator": "ana"}', JSON, "by ana"),
-        (b"{}", JSON, "by an unknown sender: {}"),
-        (b"", "zenoh/bytes", "by an unknown sender"),
-        (b"\x81\xa8operator\xa3ana", MSGPACK, "by ana"),
-        (b"\xff\x00\x1b[2J", "image/png", "by an unknown sender: \N{REPLACEMENT CHARACTER}  [2J"),
-    ]
     robot, other = two
-    obeyed = []
+    obeyed, kept, reasons = [], [], ["one", "two", "three", "everybody"]
     alarm = pubsub.ImmediateSubscriber(robot, "park/estop", obeyed.append, depth=2)
     speaker = pubsub.publisher(other, "park/estop", JSON)
     eventually(lambda: speaker.matching_status.matching)
     other.delete("park/estop")  # no stop
     other.delete("park/**")
-    for payload, encoding, _ in said:
-        other.put("park/estop", payload, encoding=encoding)
-    other.put("park/**", b"everybody", encoding="text/plain")
-    eventually(lambda: len(obeyed) > len(said))
-    words = [f"emergency stop {text}" for *_, text in said]
-    assert [stop.words for stop in obeyed] == [*words, "emergency stop by an unknown sender: everybody"]
-    kept = []
+    for reason in reasons:
+        other.put("park/**" if reason == "everybody" else "park/estop", reason, encoding="text/plain")
+    eventually(lambda: len(obeyed) == len(reasons))
+    assert [stop.reason for stop in obeyed] == reasons
     eventually(lambda: kept.extend(received(alarm)) or kept[-2:] == obeyed[-2:])
     assert len(kept) <= 3  # the newest two, and one that came while they were polled
-    assert alarm.try_recv() is None
 
 
 def test_stop_waits_for_loop_after_being_obeyed():
@@ -468,9 +371,6 @@ def test_stop_waits_for_loop_after_being_obeyed():
     with pytest.raises(OSError, match="cannot be told"):
         net.deliver(b"park/estop\0text/plain\0stop")
     assert alarm.try_recv() == Stop("an unknown sender", "stop")
-
-
-# ---------------------------------------------------------------- connections and threads
 
 
 def lingers(descriptor: int) -> bool:
@@ -514,10 +414,8 @@ def test_a_router_closes_no_connection_slowly(eventually):
 
 def granted() -> int:
     """The slice of this thread [ns], as the kernel says it."""
-    try:
-        found = re.search(r"se\.slice\s*:\s*(\d+)", Path("/proc/thread-self/sched").read_text())
-    except OSError:
-        found = None
+    scheduler = Path("/proc/thread-self/sched")
+    found = re.search(r"se\.slice\s*:\s*(\d+)", scheduler.read_text()) if scheduler.exists() else None
     if found is None:
         pytest.skip("this kernel does not say how long slices are")
     return int(found[1])
