@@ -13,6 +13,7 @@ from tests.cases import for_each
 from tests.network import Channel, Net, Query, Sample
 
 KEYS = Keys("park")
+ORDER = KEYS.order("A")
 
 
 def add(channel, robot, seq=1, of=None):
@@ -54,9 +55,9 @@ def test_inbox_passes_valid_messages_and_counts_the_rest():
 def orders():
     """Orders to A, and what asks them."""
     net = Net()
-    made = pubsub.Orders(net.session, KEYS.order("A"), Order)
+    made = pubsub.Orders(net.session, ORDER, Order)
 
-    def ask(payload, times=1, encoding="json", key=KEYS.order("A")):
+    def ask(payload, times=1, encoding="json", key=ORDER):
         for _ in range(times):
             query = Query(key, messages.MIME[encoding], payload)
             net.channels[0].add(query)
