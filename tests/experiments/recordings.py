@@ -9,6 +9,7 @@ import numpy as np
 from agents.network.messages import Contact, Event, ObstaclePose, Pose, PoseReceipt, State, Status, WorldState
 from experiments.definition.experiment import Experiment, Formation, Rates, RobotTable
 from experiments.definition.plan import Plan
+from experiments.recording.playback import read
 from experiments.recording.writer import Recording
 
 START = 1_760_000_000.0
@@ -51,6 +52,12 @@ def write(path, *messages, experiment=PAIR, **more):
     with recording(path, experiment, **more) as made:
         put(made, messages)
         return made
+
+
+def trace_of(path, *messages, **more):
+    """The trace of a recording of these messages."""
+    write(path, *messages, **more)
+    return read(path).trace
 
 
 def recording(path, experiment=PAIR, document=DOCUMENT, **more):

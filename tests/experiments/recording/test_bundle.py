@@ -46,15 +46,14 @@ def test_run_records_how_where_and_with_what(bundled):
     assert origin.command.startswith(command)
     assert (origin.seeds, origin.cases, origin.tags) == (2, ["event"], ["demo"])
     assert origin.ended >= origin.begun
-    made, numpy = origin.made_by, origin.made_by.packages["numpy"]
-    assert (made.code, numpy) == (version.digest(), version.provenance().packages["numpy"])
+    made, numpy = origin.made_by, version.provenance().packages["numpy"]
+    assert (made.code, made.packages["numpy"]) == (version.digest(), numpy)
     records = Records(bundled / "run" / "event.mcap")
     list(records.messages())
     about = records.metadata[0].metadata
     assert (about["code"], about["numpy"], about["host"]) == (made.code, numpy, made.host)
     foot = (bundled / "run" / "report.html").read_text("utf-8").partition("<footer>")[2]
     assert f"code {made.code[: version.DIGEST_CHARACTERS]}" in foot
-    assert f"Python {made.python}, numpy {numpy}" in foot
 
 
 def test_bundle_repeats_its_run_bit_by_bit(bundled, tmp_path):
@@ -64,8 +63,8 @@ def test_bundle_repeats_its_run_bit_by_bit(bundled, tmp_path):
     assert (again / "metrics.json").read_bytes() == (bundled / "run" / "metrics.json").read_bytes()
     origin = run_folder.read_origin(again)
     assert (origin.command, origin.file) == (f"./zenpark run {bundled / 'run.zip'}", "short.toml")
-    done = invoke("run", bundled / "run.zip", "--no-report", "--json", "--out", tmp_path / "once more")
-    assert {"cases"} <= json.loads(done.stdout).keys()
+    done = invoke("run", bundled / "run.zip", "--seed", "7", code=None)
+    assert "a bundle repeats its own run" in str(done.exception)
 
 
 def rewritten(source, target, **changed):
@@ -134,7 +133,7 @@ def test_failed_bundles_leave_the_former_one(bundled, tmp_path):
     assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [("run.zip", "the former one")]
 
 
-@pytest.mark.parametrize("name", ["run.json", "metrics.json", "a\0b.toml", f"{'x' * 300}.toml", "experiment.toml"])
+@pytest.mark.parametrize("name", ["run.json", "metrics.json", "a\0b.toml", f"{'x' * 300}.toml"])
 def test_names_in_bundles_overwrite_nothing(name, bundled, tmp_path):
     origin, source = json.loads((bundled / "run" / "run.json").read_bytes()), bundled / "run.zip"
     changed = json.dumps(origin | {"file": f"sub/{name}"}).encode()
@@ -157,13 +156,6 @@ def test_control_sequences_of_a_bundle_stay_out(bundled, tmp_path):
     past = invoke("runs", "--past", "--in", tmp_path)
     assert "\x1b" not in again.output + compared.output + past.output
     assert "owned" in again.output + compared.output
-
-
-def test_tags_are_words_and_bundles_take_no_options(bundled):
-    done = invoke("run", bundled / "run.zip", "--seed", "7", code=None)
-    assert "a bundle repeats its own run" in str(done.exception)
-    done = invoke("run", bundled / "short.toml", "--virtual", "--tag", "a,b", code=2)
-    assert "a tag is a word without commas" in done.output
 
 
 def test_other_code_and_versions_are_named():

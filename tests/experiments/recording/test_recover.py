@@ -70,15 +70,13 @@ def test_recovery_keeps_everything(path, tmp_path):
     of_robots = {f"/{robot}/{what}" for robot in ("TB01", "CF01") for what in ("state", "true_pose", "status")}
     assert {channel.topic for channel in summary.channels.values()} == {"/events", "/tf", "/TB01/pose", *of_robots}
     assert {schema.encoding for schema in summary.schemas.values()} == {"ros2msg"}
-    assert summary.statistics.message_count == 82
     with AnyReader([target]) as reader:
-        assert len(list(reader.messages())) == 82
+        assert len(list(reader.messages())) == summary.statistics.message_count == 82
 
 
 def test_a_whole_file_needs_no_recovery(path, tmp_path, capsys):
     write(path, *whole_run())
-    target = tmp_path / "whole.mcap"
-    assert recover(path, target) == Recovered(82, ("TB01", "CF01"), complete=True)
+    assert recover(path, tmp_path / "whole.mcap") == Recovered(82, ("TB01", "CF01"), complete=True)
     commands.recover(str(path), None)
     assert capsys.readouterr().out == f"{path} is whole already: 82 messages of TB01, CF01\n"
     assert sorted(tmp_path.iterdir()) == [path]
@@ -124,9 +122,6 @@ def test_what_is_no_recording(path, tmp_path, content, says):
         with pytest.raises(RecordingError, match=rf"run\.mcap: {says}"):
             act(path)
     assert not (tmp_path / "target.mcap").exists()
-
-
-def test_a_file_that_is_not_there(tmp_path):
     for wrong in (tmp_path / "none.mcap", tmp_path):
         with pytest.raises(RecordingError, match="cannot be read"):
             read(wrong)
@@ -158,8 +153,7 @@ def test_a_file_cut_anywhere(path, tmp_path, recorded):
         path.write_bytes(recorded[:size])
         found.append(survives(path, tmp_path / "target.mcap") or 0)
     assert found == sorted(found)
-    assert found[0] == 0
-    assert found[-1] == 82
+    assert (found[0], found[-1]) == (0, 82)
 
 
 @pytest.mark.slow
@@ -176,10 +170,8 @@ def test_a_file_damaged_anywhere(tmp_path_factory, recorded, data):
 
 def test_first_of_contradicting_schemas_holds(path, tmp_path, recorded):
     """The summary at the end repeats them, and may be damaged."""
-    text = b"string robot"
     content = bytearray(recorded)
-    content[recorded.rindex(text)] = 0
-    content[-1] = 0  # not finished
+    content[recorded.rindex(b"string robot")] = content[-1] = 0  # not finished
     path.write_bytes(content)
     assert survives(path, tmp_path / "target.mcap") == 82
 

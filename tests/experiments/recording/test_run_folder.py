@@ -26,11 +26,7 @@ def test_runs_of_the_same_second_have_own_folders(tmp_path, monkeypatch):
     read = document.load("triangle")
     with ThreadPoolExecutor(8) as pool:
         folders = {*pool.map(lambda _: run_folder.new_folder(read, None), range(24))}
-    assert len(folders) == 24
-    assert all(folder.is_dir() for folder in folders)
-
-
-def test_folder_that_cannot_be_looked_into_is_refused():
+    assert len([folder for folder in folders if folder.is_dir()]) == 24
     with pytest.raises(DocumentError):
         run_folder.check_folder("x" * 300)  # longer than a file system takes
 
@@ -61,7 +57,6 @@ def test_folder_without_a_run_is_removed(tmp_path):
     ("change", "says"),
     [
         ("rates.body_hz=1e9", "must be a number <= 2000"),
-        ("rates.state_hz=1e9", "must be a number <= 2000"),
         ("disturbance.all.latency_s=1e9", "must be a number <= 10"),
         ("channel.delay_s=1e9", "must be a number <= 60"),
         ("duration_s=0.001", "less than two samples"),
@@ -81,7 +76,6 @@ def test_virtual_run_must_fit_into_memory():
 @pytest.mark.parametrize(
     ("parts", "chance"),
     [
-        ({}, False),
         ({"disturbance": {"all": Disturbance(latency_s=0.1)}}, False),
         ({"disturbance": {"all": Disturbance(position_sigma=0.001)}}, True),
         ({"disturbance": {"A": Disturbance(hover_jitter=Jitter(0.01))}}, True),
@@ -95,10 +89,7 @@ def test_whether_seeds_change_anything(parts, chance):
     assert Plan(pair(**parts)).uses_chance is chance
 
 
-PERIODIC = 'title = "Two"\n[trigger]\nkind = "periodic"\n'
-
-
-def kept(folder, *, seed=1, text=PERIODIC, lost=0, **origin):
+def kept(folder, *, seed=1, text='title = "Two"\n[trigger]\nkind = "periodic"\n', lost=0, **origin):
     """The folder of a run of an hour with two seeds, without a recording that could be read."""
     folder.mkdir(parents=True)
     (folder / run_folder.SOURCE).write_text(text)
@@ -114,20 +105,20 @@ def test_past_runs_with_their_figures_sizes_and_tags(tmp_path):
     kept(tmp_path / "later", begun=2e9, tags=["paper"])
     kept(tmp_path / "earlier", virtual=True)
     (tmp_path / "no run").mkdir()
-    (tmp_path / "no run" / "notes.txt").write_text("mine")
     earlier, later = run_folder.past_runs([tmp_path])
     assert [Path(run.folder).name for run in (earlier, later)] == ["earlier", "later"]
     unknown = {1: None, 2: None}
-    both = {"f_hz": {1: 10.0, 2: 10.0}, "iae": {1: 1.5, 2: 1.5}, "rmse": unknown}
-    assert earlier.cases == {"event": both}
+    assert earlier.cases == {"event": {"f_hz": {1: 10.0, 2: 10.0}, "iae": {1: 1.5, 2: 1.5}, "rmse": unknown}}
     assert (earlier.seeds, earlier.recorded, earlier.megabytes > 0.001) == ([1, 2], True, True)
-    assert [later.matches(words) for words in (["paper"], ["EVENT", "two"], ["pape"], ["paper", "other"])] == [
-        True, True, False, False,
-    ]  # fmt: skip
+    asked = (["paper"], ["EVENT", "two"], ["pape"], ["paper", "other"])
+    assert [later.matches(words) for words in asked] == [True, True, False, False]
 
 
-def test_folder_with_damaged_files_is_listed_without_figures(tmp_path):
+def test_damaged_folders_are_listed_nevertheless(tmp_path):
     folder = kept(tmp_path / "damaged")
+    before = run_folder.past_runs([tmp_path])
+    (folder / "gone.mcap").symlink_to(tmp_path / "nowhere")
+    assert run_folder.past_runs([tmp_path]) == before
     for name in ("run.json", "metrics.json"):
         (folder / name).write_text("[1, 2")
     (run,) = run_folder.past_runs([tmp_path])
@@ -154,20 +145,15 @@ def test_how_runs_differ(tmp_path):
 
 
 def test_past_runs_on_the_command_line(tmp_path):
-    a, b = kept(tmp_path / "a", tags=["paper"]), kept(tmp_path / "b", seed=3)
-    lines = invoke("runs", "--past", "--in", tmp_path).stdout.splitlines()
-    assert [line.split()[2] for line in lines[1:3]] == [str(a), str(b)]
-    assert lines[1].endswith("paper")
-    assert len(msgspec.json.decode(invoke("runs", "paper", "--in", tmp_path, "--json").stdout)["runs"]) == 1
-
-
-def test_past_runs_tell_losses_per_hour(tmp_path):
     for k, lost in enumerate((0, 9, 0, 0)):
-        kept(tmp_path / str(k), begun=1e9 + k, lost=lost)
+        kept(tmp_path / str(k), begun=1e9 + k, lost=lost, tags=["paper"] if k == 0 else [])
     kept(tmp_path / "virtual", begun=2e9, lost=5, virtual=True)
-    *_, line, _ = invoke("runs", "--past", "--in", tmp_path).stdout.splitlines()
-    assert line == "real time: 4 h in 4 runs; 9 poses lost, 2.25 per hour; the last 2 h without loss"
+    _, first, second, *_, losses, _ = invoke("runs", "--past", "--in", tmp_path).stdout.splitlines()
+    assert [line.split()[2] for line in (first, second)] == [str(tmp_path / "0"), str(tmp_path / "1")]
+    assert first.endswith("paper")
+    assert losses == "real time: 4 h in 4 runs; 9 poses lost, 2.25 per hour; the last 2 h without loss"
     assert "real time" not in invoke("runs", "virtual", "--in", tmp_path).stdout
+    assert len(msgspec.json.decode(invoke("runs", "paper", "--in", tmp_path, "--json").stdout)["runs"]) == 1
 
 
 def test_clean_removes_the_named_but_nothing_tagged(tmp_path):
@@ -186,8 +172,8 @@ def test_clean_removes_the_named_but_nothing_tagged(tmp_path):
     assert sorted(tmp_path.iterdir()) == [tmp_path / "mine"]
 
 
-def clean(folder, *words):
-    return invoke("clean", "--older", "0", "--in", folder, *words).output
+def clean(folder, *words, code=0):
+    return invoke("clean", "--older", "0", "--in", folder, *words, code=code).output
 
 
 def test_runs_in_use_stay(tmp_path):
@@ -197,59 +183,44 @@ def test_runs_in_use_stay(tmp_path):
             assert f"{used} is in use: it stays" in clean(tmp_path, *words)
     assert (used / "event.mcap").exists()
     assert not over.exists()
+    with cleaning.locked(used, cleaning.fcntl.LOCK_EX), pytest.raises(cleaning.InUse):
+        cleaning.remove(used)
+    with cleaning.using(kept(used / "inner")):
+        clean(tmp_path, "--yes")
+    assert (used / "event.mcap").exists(), "a run inside protects it"
     clean(tmp_path, "--yes")
     assert not used.exists()
 
 
-def test_runs_inside_runs_protect_them(tmp_path):
-    outer = kept(tmp_path / "outer")
-    with cleaning.using(kept(outer / "inner")):
-        clean(tmp_path, "--yes")
-    assert (outer / "event.mcap").exists()
-
-
-def test_two_removals_do_not_meet(tmp_path):
-    folder = kept(tmp_path / "run")
-    with cleaning.locked(folder, cleaning.fcntl.LOCK_EX), pytest.raises(cleaning.InUse):
-        cleaning.remove(folder)
-
-
-def test_given_folder_itself_stays(tmp_path):
-    project = kept(tmp_path / "project")
-    assert "runs: 0" in clean(project, "--yes")
-    assert (project / run_folder.SOURCE).exists()
-
-
-def test_foreign_folders_stay(tmp_path):
+def test_foreign_folders_and_ends_of_links_stay(tmp_path):
+    thesis, project = tmp_path / "thesis", kept(tmp_path / "project")
+    thesis.mkdir()
     for name in (run_folder.SOURCE, "data.mcap"):
-        (tmp_path / "thesis").mkdir(exist_ok=True)
-        (tmp_path / "thesis" / name).touch()
-    (tmp_path / "link").symlink_to(kept(tmp_path / "elsewhere" / "run"))
-    assert "runs: 0" in clean(tmp_path, "--yes")
-    assert {path.name for path in tmp_path.iterdir()} == {"thesis", "link", "elsewhere"}
-
-
-def test_ends_of_links_stay(tmp_path):
-    archive, folder = tmp_path / "archive", kept(tmp_path / "runs" / "a", ended=2.0)
-    archive.mkdir()
-    (archive / "kept").touch()
-    (folder / "logs").symlink_to(archive)
+        (thesis / name).touch()
+    assert "runs: 0" in clean(project, "--yes"), "the given folder itself"
+    folder = kept(tmp_path / "runs" / "a", ended=2.0)
+    (tmp_path / "runs" / "link").symlink_to(project)
+    (folder / "logs").symlink_to(thesis)
     clean(tmp_path / "runs", "--yes", "--recordings")
     clean(tmp_path / "runs", "--yes")
-    assert (archive / "kept").exists()
-    assert not folder.exists()
+    assert [path.name for path in (tmp_path / "runs").iterdir()] == ["link"]
+    assert "runs: 0" in clean(thesis.parent / "runs", "--yes")
+    clean(tmp_path, "--yes")
+    assert {path.name for path in thesis.iterdir()} == {run_folder.SOURCE, "data.mcap"}
+
+
+def refusing(code):
+    def refuse(*_):
+        raise OSError(code, "Permission denied")
+
+    return refuse
 
 
 def test_half_removed_runs_are_still_runs(tmp_path, monkeypatch):
     folder = kept(tmp_path / "run", ended=2.0)
     (folder / "logs").mkdir()
-
-    def refuse(part):
-        raise OSError(errno.EACCES, "Permission denied", str(part))
-
-    monkeypatch.setattr(shutil, "rmtree", refuse)
-    done = invoke("clean", "--older", "0", "--yes", "--in", tmp_path, code=1)
-    assert "cannot be removed: Permission denied" in done.output
+    monkeypatch.setattr(shutil, "rmtree", refusing(errno.EACCES))
+    assert "cannot be removed: Permission denied" in clean(tmp_path, "--yes", code=1)
     assert {run_folder.SOURCE, run_folder.ORIGIN} <= {path.name for path in folder.iterdir()}
     monkeypatch.undo()
     clean(tmp_path, "--yes")
@@ -258,23 +229,12 @@ def test_half_removed_runs_are_still_runs(tmp_path, monkeypatch):
 
 def test_endless_runs_stay_without_locks(tmp_path, monkeypatch):
     endless, ended = kept(tmp_path / "endless"), kept(tmp_path / "ended", ended=2.0)
-
-    def refuse(*_):
-        raise OSError(errno.ENOLCK, "No locks available")
-
-    monkeypatch.setattr(cleaning.fcntl, "flock", refuse)
+    monkeypatch.setattr(cleaning.fcntl, "flock", refusing(errno.ENOLCK))
     clean(tmp_path, "--yes")
     assert (endless.exists(), ended.exists()) == (True, False)
 
 
-def test_dangling_links_count_nothing(tmp_path):
-    folder = kept(tmp_path / "run")
-    before = run_folder.past_runs([tmp_path])
-    (folder / "gone.mcap").symlink_to(tmp_path / "nowhere")
-    assert run_folder.past_runs([tmp_path]) == before
-
-
-@pytest.mark.parametrize("begun", [1e300, -1e300, 1e18, -5.0])
+@pytest.mark.parametrize("begun", [1e300, 1e18, -5.0])
 def test_absurd_times_are_no_error(begun, tmp_path):
     kept(tmp_path / "run", begun=begun)
     (run,) = run_folder.past_runs([tmp_path])

@@ -36,7 +36,8 @@ def test_what_is_attached(path):
         about = {one.name: one.metadata for one in reader.iter_metadata()}["zenpark"]
     assert attached["experiment.toml"].decode() == rec.DOCUMENT
     assert msgspec.json.decode(attached["experiment.json"], type=Experiment) == rec.PAIR
-    assert (about["case"], about["seed"], about["clock"], about["started"]) == ("only", "4", "real", repr(rec.START))
+    known = {"case": "only", "seed": "4", "clock": "real", "started": repr(rec.START)}
+    assert about.items() > known.items()
     assert about["version"]
 
 
@@ -52,27 +53,23 @@ def test_others_read_it(path):
         seen = [(c.topic, t, reader.deserialize(raw, c.msgtype)) for c, t, raw in reader.messages()]
     states = [message for topic, _, message in seen if topic == "/CF01/state"]
     assert [message.seq for message in states] == list(range(1, 12))
-    assert states[5].received[0].sender == "TB01"
-    assert states[5].received[0].position.tolist() == [0.45, 0.0, 0.0]
-    assert math.isnan(states[5].true_yaw)
-    drawn = [(t, message) for topic, t, message in seen if topic == "/TB01/true_pose"]
-    assert drawn[3][0] == round((rec.START + 0.3) * 1e9)
-    assert (drawn[3][1].header.frame_id, drawn[3][1].pose.position.z) == ("map", 0.01)
+    (receipt,) = states[5].received
+    assert (receipt.sender, receipt.position.tolist()) == ("TB01", [0.45, 0.0, 0.0])
+    t, drawn = [(t, message) for topic, t, message in seen if topic == "/TB01/true_pose"][3]
+    assert (t, drawn.header.frame_id, drawn.pose.position.z) == (round((rec.START + 0.3) * 1e9), "map", 0.01)
     measured = [message for topic, _, message in seen if topic == "/CF01/true_pose"]
     assert measured[3].pose.position.x == -0.3
 
     found = decoded(path)
     assert len(found) == len(seen)
-    sent = [one for one in found if one.channel.topic == "/TB01/pose"]
-    assert [one.decoded_message.seq for one in sent] == list(range(1, 12))
-    assert [one.message.sequence for one in sent] == list(range(1, 12))
-    assert sent[2].decoded_message.size == 150
-    assert sent[2].decoded_message.received == rec.START + 0.2 + 0.002
-    assert sent[2].message.log_time == round((rec.START + 0.2 + 0.002) * 1e9)
-    assert sent[2].message.publish_time == round((rec.START + 0.2) * 1e9)
+    sent = [(one.decoded_message, one.message) for one in found if one.channel.topic == "/TB01/pose"]
+    assert [message.sequence for _, message in sent] == list(range(1, 12))
+    content, message = sent[2]
+    assert (content.seq, content.size, content.received) == (3, 150, rec.START + 0.2 + 0.002)
+    assert message.log_time == round((rec.START + 0.2 + 0.002) * 1e9)
+    assert message.publish_time == round((rec.START + 0.2) * 1e9)
     last = [one.decoded_message for one in found if one.channel.topic == "/CF01/status"][-1]
     assert (last.lost_keys, last.lost_values, math.isnan(last.battery)) == (["TB01"], [1], True)
-    assert [one.decoded_message.kind for one in found if one.channel.topic == "/events"] == ["start"]
 
 
 def test_a_recording_is_never_overwritten(path):
@@ -84,22 +81,20 @@ def test_a_recording_is_never_overwritten(path):
         rec.write(path.parent / "none" / "run.mcap")
 
 
-def test_closed_twice_and_used_after(path):
-    made = rec.write(path, rec.begun())
-    made.close()
-    with pytest.raises(RecordingError, match="closed"):
-        made.write(rec.state())
-
-
 def test_callers_error_leaves_a_finished_file(path):
+    made = rec.recording(path)
+
     def fails():
-        with rec.recording(path) as made:
+        with made:
             rec.put(made, rec.whole_run())
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         fails()
     assert read(path).complete
+    made.close()
+    with pytest.raises(RecordingError, match="closed"):
+        made.write(rec.state())
 
 
 def test_a_full_disk_keeps_what_was_written(path):
@@ -118,32 +113,30 @@ def test_a_full_disk_keeps_what_was_written(path):
     np.testing.assert_allclose(playback.trace.position[0, 0], messages[0].position, atol=1e-3)
 
 
-def test_disk_too_full_for_record_or_recovery(path, tmp_path):
+def test_disk_too_full_for_record_or_recovery(path, tmp_path, monkeypatch):
     big = rec.broken(tmp_path / "big.mcap", rec.begun(), *rec.scattered(2000))
     with rec.small_disk():
         with pytest.raises(RecordingError, match=r"run\.mcap: cannot be written"):
             recover(big, path)
         assert not path.exists()
         with pytest.raises(RecordingError, match="cannot be written"):
-            rec.recording(path, document="#" * 50_000)
-
-
-def test_recording_without_room_for_indices_leaves_no_file(path, monkeypatch):
-    def full(**_):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(writer, "TemporaryFile", full)
+            rec.recording(tmp_path / "long.mcap", document="#" * 50_000)
+    monkeypatch.setattr(writer, "TemporaryFile", raising(OSError(errno.ENOSPC, "No space left on device")))
     with pytest.raises(RecordingError, match="No space left"):
         rec.write(path, *rec.whole_run())
     assert not path.exists()
 
 
-def test_interrupt_inside_a_write_ends_all_writing(path, monkeypatch):
-    def interrupted(_):
-        raise KeyboardInterrupt
+def raising(error):
+    def act(*_, **__):
+        raise error
 
+    return act
+
+
+def test_interrupt_inside_a_write_ends_all_writing(path, monkeypatch):
     made = rec.recording(path)
-    monkeypatch.setattr(writer.McapFile, "flush", interrupted)
+    monkeypatch.setattr(writer.McapFile, "flush", raising(KeyboardInterrupt()))
     with pytest.raises(KeyboardInterrupt):
         made.flush()
     with pytest.raises(RecordingError, match=r"interrupted while it wrote; run `\./zenpark recover`"):
@@ -209,25 +202,19 @@ def test_viewers_find_frames_and_scene_in_standard_types(path):
     links = groups["links"]
     assert (links.type, links.header.frame_id, len(links.colors)) == (5, "map", len(links.points))
     assert links.points[0].x == pytest.approx(2.99, abs=0.05)
-
-    found = decoded(path, ["/tf", "/scene"])
-    assert len(found) == len(frames) + len(scenes)
-    assert [len(one.decoded_message.markers) for one in found if one.channel.topic == "/scene"] == [
-        len(each) for each in scenes
-    ]
+    assert len(decoded(path, ["/tf", "/scene"])) == len(frames) + len(scenes)
 
 
 def test_size_of_chunks_changes_no_message(tmp_path):
-    kept = []
+    counts, found = [], []
     for size in (1_000, CHUNK_BYTES, 1_000_000):
         file = tmp_path / f"{size}.mcap"
         with rec.recording(file, chunk_bytes=size) as made:
             rec.put(made, [rec.state("CF01", k, rec.START + 0.02 * k) for k in range(200)])
         with file.open("rb") as stream:
             reader = make_reader(stream, validate_crcs=True)
-            found = [(channel.topic, message) for _, channel, message in reader.iter_messages()]
-            kept.append((len(reader.get_summary().chunk_indexes), found))
-    counts, found = zip(*kept, strict=True)
+            found.append([(channel.topic, message) for _, channel, message in reader.iter_messages()])
+            counts.append(len(reader.get_summary().chunk_indexes))
     assert counts[0] > counts[1] > counts[2] == 1
     assert found[0] == found[1] == found[2]
 
@@ -236,9 +223,9 @@ def test_chunks_are_in_order_of_time(path):
     drawn_scene(path)
     with path.open("rb") as file:
         chunks = make_reader(file).get_summary().chunk_indexes
-        events = [m for *_, m in make_reader(file).iter_messages(["/events"])]
+        first, *_ = [m for *_, m in make_reader(file).iter_messages(["/events"])]
     assert len(chunks) > 10
     for before, after in itertools.pairwise(chunks):
         assert before.message_end_time <= after.message_start_time
-    assert events[0].log_time == round(rec.START * 1e9), "logged when it came"
-    assert events[0].publish_time == round((rec.START + 5.0) * 1e9)
+    assert first.log_time == round(rec.START * 1e9), "logged when it came"
+    assert first.publish_time == round((rec.START + 5.0) * 1e9)
