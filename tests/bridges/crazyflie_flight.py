@@ -4,11 +4,18 @@ from contextlib import contextmanager
 
 import numpy as np
 
+from bridges.crazyflie import flight, telemetry, trajectory
 from bridges.crazyflie.body import MEASURING_S, CrazyflieBody
 from tests.bridges.driver import Driver
 from tests.requests import request
 from tests.twins.loopback import Served
 from twins.devices.crazyflie.device import CrazyflieTwin
+
+
+def clocked(monkeypatch, clock):
+    """Let flight control, telemetry and trajectories take their time from a clock."""
+    for module in (flight, telemetry, trajectory):
+        monkeypatch.setattr(module, "time", clock)
 
 
 class Process(Driver):
