@@ -1,7 +1,5 @@
 """The replay inside a report: it stands alone, is small, moves robots to where they were."""
 
-from __future__ import annotations
-
 import json
 import re
 
@@ -28,6 +26,8 @@ def film_of(page):
 
 def test_positions_match_the_run_within_a_millimetre(traces):
     page = replay.embedded(traces)
+    assert "http" not in page
+    assert page.count("</script>") == 1
     film = film_of(page)
     assert [case["name"] for case in film["cases"]] == CASES
     assert film["names"] == list(traces[0].robots)
@@ -45,6 +45,7 @@ def test_the_still_picture_is_that_of_the_replay(traces):
     assert f"Replay of periodic, event, at {at:g} s" in still
     assert "<text" not in still  # no letters that a reader's machine may not have
     assert len(still) < 3e5
+    assert replay.embedded([]) == ""
     figure, show = trajectories.film(traces)
     show(at)
     for axes, trace in zip(figure.axes, traces, strict=True):
@@ -52,13 +53,6 @@ def test_the_still_picture_is_that_of_the_replay(traces):
         dots = [line.get_data_3d() for line in axes.lines if line.get_marker() == "o"]
         drawn = np.hstack(dots).T
         assert drawn == pytest.approx(trace.true_position[last])
-
-
-def test_replay_needs_no_network_and_escapes_script_ends(traces):
-    page = replay.embedded(traces)
-    assert "http" not in page
-    assert page.count("</script>") == 1
-    assert replay.embedded([]) == ""
 
 
 @needs_chromium

@@ -1,0 +1,134 @@
+"""Reports of laws that remember, which have no errors of links, and of a modelled network."""
+
+import csv
+
+import numpy as np
+import pytest
+
+from experiments.definition.experiment import ChannelTable, LinkChannelTable
+from experiments.metrics.measure import measure
+from experiments.recording import playback
+from experiments.report import export, figures, metrics_files, report, verdict
+from experiments.report.page import number
+from experiments.report.tables import network_tables, proof_tables, whole_tables
+from tests.experiments.traces import pair
+from tests.runs import flown, fly
+from tests.small import changed, reference
+
+
+@pytest.fixture(scope="module")
+def traces():
+    return {case: flown("average", case, "duration_s=5").trace for case in ("periodic", "event")}
+
+
+@pytest.fixture(scope="module")
+def measured(traces):
+    return [measure(each) for each in traces.values()]
+
+
+def test_indices_of_links_are_unknown_without_errors(measured):
+    case = measured[0]
+    robot = case.robots[0]
+    assert (case.mean["j2"], case.mean["iae"], case.acquired_s) == (None, None, (None,))
+    assert (robot.settle_s, robot.coverage, robot.residual, robot.iae) == (None, None, None, None)
+    assert robot.known == 1.0
+    texts = " ".join(each.text for each in verdict.findings(measured))
+    assert "formation" not in texts
+    assert "fewer transmissions than periodic" in texts
+
+
+def test_measures_are_means_over_run_and_end(traces, measured):
+    values = traces["periodic"].measures["disagreement"]
+    found = measured[0].robots[2].measures["disagreement"]
+    assert found.mean == pytest.approx(np.nanmean(values[:, 2]))
+    assert found.end == pytest.approx(np.nanmean(values[traces["periodic"].time > 4.0 + 1e-9, 2]), rel=0.05)
+    assert measured[0].measures["disagreement"].mean == pytest.approx(np.nanmean(values))
+    (table,) = [each for each in whole_tables(measured) if each.head[0] == "Measures of the law"]
+    assert [row.cells[0] for row in table.rows] == ["disagreement, mean", "disagreement, at the end"]
+    drawn = figures.all_figures(measured, list(traces.values()))
+    assert {"measures", "robot_bars", "global_bars"} < {*drawn}
+    assert "errors" not in drawn
+    (axes,) = drawn["measures"].axes
+    assert axes.get_ylabel() == "disagreement"
+    assert len([line for line in axes.lines if line.get_linewidth() == 1.3]) == 2
+    assert len(drawn["robot_bars"].axes) == 1  # of f alone
+
+
+def rows_of(file):
+    return list(csv.DictReader(file.read_text().splitlines()))
+
+
+def test_files_have_columns_of_the_law(tmp_path, traces, measured):
+    way, metrics = tmp_path / "trajectories.csv", tmp_path / "metrics.json"
+    export.write_csv(traces, way)
+    last, known = rows_of(way)[-1], traces["event"]
+    assert float(last["memory_x"]) == known.memory["x"][-1, -1, 0]
+    assert float(last["measure_disagreement"]) == known.measures["disagreement"][-1, -1]
+    assert (last["case"], last["error"]) == ("event", "")
+    metrics_files.write_csv(tmp_path / "metrics.csv", measured)
+    first, *_, mean = rows_of(tmp_path / "metrics.csv")
+    assert float(first["measure_disagreement_end"]) == measured[0].robots[0].measures["disagreement"].end
+    assert float(mean["measure_disagreement_mean"]) == measured[1].measures["disagreement"].mean
+    metrics_files.write_json(metrics, measured)
+    assert metrics_files.read_json(metrics) == measured
+    assert "measures" in metrics_files.document("", 1, measured)["cases"]["event"]
+    export.write_csv({"periodic": flown("leader-observer", "periodic", "duration_s=3").trace}, way)
+    assert {"memory_v[0]", "memory_v[1]"} <= rows_of(way)[0].keys()  # numbers of one variable
+
+
+@pytest.fixture(scope="module")
+def dropping_run():
+    spared = {"TB01 > KH01": LinkChannelTable(loss=0.0, delay_s=0.03)}
+    bad = ChannelTable(delay_s=0.05, loss=0.2, links=spared)
+    return fly(changed(reference("periodic"), duration_s=4.0, timeline=[], channel=bad), case="bad")
+
+
+@pytest.mark.slow
+def test_dropped_differs_from_lost(dropping_run):
+    measured = dropping_run.metrics
+    assert (measured.modelled, measured.lost) == (True, 0)
+    links = {(each.sender, each.receiver): each for each in measured.link_deliveries}
+    assert len(links) == 21
+    spared = links["TB01", "KH01"]
+    assert (spared.dropped, spared.received) == (0, 200)  # that of the end is under way; one from before the start came
+    assert (spared.delay_mean, spared.delay_max) == (pytest.approx(0.03), pytest.approx(0.03))
+    for each in measured.link_deliveries:
+        if each is not spared:
+            assert each.dropped == pytest.approx(40, abs=24)
+            assert each.received + each.dropped == pytest.approx(200, abs=4)
+            assert each.delay_mean == pytest.approx(0.05)
+    assert measured.dropped == sum(each.dropped for each in measured.link_deliveries)
+    for robot in measured.robots:
+        assert robot.dropped == sum(each.dropped for ends, each in links.items() if ends[0] == robot.robot)
+
+
+@pytest.mark.slow
+def test_report_has_dropped_poses_by_link(tmp_path, dropping_run):
+    measured = dropping_run.metrics
+    said = [each.text for each in verdict.findings([measured])]
+    assert any(text.startswith("No pose was lost") for text in said)
+    (text,) = [text for text in said if text.startswith("The modelled network dropped")]
+    assert f"dropped {measured.dropped} of 4" in text
+    assert text.endswith("at most 50.0 ms.")
+    (table,) = network_tables([measured])
+    assert table.rows[-1].cells[0] == "all"
+    assert ("TB01 > KH01", "200", "0", "0", "30.0", "30.0") in [row.cells for row in table.rows]
+    assert proof_tables([measured])[0].head[-2:] == ("Lost", "Dropped")
+    dropped = ("Dropped", number(measured.dropped))
+    assert dropped in [row.cells for table in whole_tables([measured]) for row in table.rows]
+    assert "TB01 &gt; KH01" in report.write(tmp_path, [dropping_run.trace]).read_text("utf-8")
+    plain = measure(pair(np.ones(100)))
+    assert (plain.modelled, network_tables([plain])) == (False, ())
+    assert proof_tables([plain])[0].head[-1] == "Lost"
+
+
+@pytest.mark.slow
+def test_recording_keeps_dropped_poses(tmp_path, dropping_run):
+    dropping_run.recorder.record(tmp_path / "bad.mcap", "")
+    read, trace = playback.read(tmp_path / "bad.mcap").trace, dropping_run.trace
+    assert trace.dropped.sum() > 500
+    np.testing.assert_array_equal(read.dropped, trace.dropped)
+    np.testing.assert_array_equal(read.lost, 0)
+    for a, b in zip(measure(read).link_deliveries, measure(trace).link_deliveries, strict=True):
+        assert (a.received, a.dropped) == (b.received, b.dropped)
+        assert a.delay_mean == pytest.approx(b.delay_mean, abs=1e-5)
