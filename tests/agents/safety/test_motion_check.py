@@ -10,7 +10,7 @@ from agents.kinds.khepera4 import KHEPERA4
 from agents.kinds.turtlebot3 import TURTLEBOT3
 from agents.safety.motion_check import MotionCheck
 
-DT = 0.01
+DT, FINE = 0.01, (False, False)
 every_kind = pytest.mark.parametrize("kind", KINDS.values(), ids=lambda kind: kind.name)
 wheels = pytest.mark.parametrize("kind", [KHEPERA4, TURTLEBOT3], ids=lambda kind: kind.name)
 
@@ -22,19 +22,17 @@ class Told:
         self.kind, self.motion_check = kind, MotionCheck(kind)
         self.position, self.yaw, self.tick = (0.0, 0.0, 0.0), 0.0, 0
 
-    def go(self, seconds, *, told=0.0, told_turn=0.0, speed=0.0, turn=0.0, every=1, step=None):
+    def go(self, seconds, *, told=0.0, told_turn=0.0, speed=0.0, turn=0.0, every=1, step=1e-9):
         """Let time pass; it moves along its nose, and is measured every so many ticks, in whole steps [m]."""
         (x, y, z), heading = self.position, self.yaw
         for _ in range(round(seconds / DT)):
             x, y = x + DT * speed * math.cos(heading), y + DT * speed * math.sin(heading)
             heading += turn * DT
             if self.tick % every == 0:
-                self.position = (x, y, z) if step is None else (round(x / step) * step, round(y / step) * step, z)
-                self.yaw = heading
+                self.position, self.yaw = (round(x / step) * step, round(y / step) * step, z), heading
             setpoint = (told, told_turn if self.kind.takes == "twist" else 0.0, 0.0, 0.0)
             if self.kind.takes == "position":
-                here = self.position
-                setpoint = (here[0] + told / self.kind.response, here[1], here[2], 0.0)
+                setpoint = (self.position[0] + told / self.kind.response, *self.position[1:], 0.0)
             self.motion_check.update(self.tick * DT, setpoint, self.position, self.yaw, True)
             self.tick += 1
         return self.motion_check.unresponsive, self.motion_check.uncommanded
@@ -44,21 +42,25 @@ class Told:
 def test_obedient_robot(kind):
     for speed in (0.1 * kind.speed, 0.5 * kind.speed, kind.speed):
         robot = Told(kind)
-        assert robot.go(1.0) == (False, False)
+        assert robot.go(1.0) == FINE
         for _ in range(10):
-            assert robot.go(1.0, told=speed, speed=speed) == (False, False)
-        assert robot.go(0.4, speed=speed) == (False, False)  # it takes some time to stop
-        assert robot.go(5.0) == (False, False)
-    assert robot.go(60.0, told=0.05 * kind.speed) == (False, False)  # near its goal it need not move
+            assert robot.go(1.0, told=speed, speed=speed) == FINE
+        assert robot.go(0.4, speed=speed) == FINE  # it takes some time to stop
+        assert robot.go(5.0) == FINE
+    assert robot.go(60.0, told=0.05 * kind.speed) == FINE  # near its goal it need not move
 
 
 @every_kind
 def test_robot_that_does_not_move(kind):
     robot = Told(kind)
-    assert robot.go(1.5, told=kind.speed) == (False, False)
+    assert robot.go(1.5, told=kind.speed) == FINE
     assert robot.go(2.0, told=kind.speed) == (True, False)
     assert robot.motion_check.commanded == pytest.approx(3.4 * kind.speed, rel=0.05)
-    assert robot.go(1.5, told=kind.speed, speed=0.9 * kind.speed) == (False, False)  # it has begun
+    assert robot.go(1.5, told=kind.speed, speed=0.9 * kind.speed) == FINE  # it has begun
+    assert robot.go(3.4, told=kind.speed) == (True, False)
+    robot.tick += 20  # missed ticks: the count restarts
+    assert robot.go(DT, told=kind.speed) == FINE
+    assert robot.motion_check.commanded == 0.0
 
 
 @wheels
@@ -67,10 +69,10 @@ def test_robot_that_does_not_move(kind):
     [
         (8.0, {"told": 0.05}, (True, False)),  # it crawls
         (4.0, {"told_turn": 1.5}, (True, False)),
-        (4.0, {"told_turn": 1.5, "turn": 1.5}, (False, False)),
+        (4.0, {"told_turn": 1.5, "turn": 1.5}, FINE),
         (5.0, {"speed": 0.1}, (False, True)),  # as a Khepera that has lost its link
         (4.0, {"turn": 1.0}, (False, True)),
-        (4.0, {"turn": 1.0, "told_turn": 1.0}, (False, False)),
+        (4.0, {"turn": 1.0, "told_turn": 1.0}, FINE),
     ],
 )
 def test_wheels_that_ignore_or_need_no_commands(kind, seconds, given, found):
@@ -78,43 +80,24 @@ def test_wheels_that_ignore_or_need_no_commands(kind, seconds, given, found):
 
 
 @wheels
-def test_wheels_that_turn_to_and_fro_obey(kind):
-    robot = Told(kind)
+def test_small_turns_and_coarse_positions_are_no_disobedience(kind):
+    turning, coarse = Told(kind), Told(kind)
     for turn in (1.5, -1.5) * 40:
-        assert robot.go(0.1, told_turn=turn) == (False, False)
+        assert turning.go(0.1, told_turn=turn) == FINE
+    for _ in range(20):
+        assert coarse.go(1.0, told=0.05, speed=0.05, every=4, step=0.01) == FINE
 
 
 @every_kind
 def test_robot_that_moves_without_being_told(kind):
     robot = Told(kind)
-    assert robot.go(2.0) == (False, False)
+    assert robot.go(2.0) == FINE
     assert robot.go(4.0, speed=0.4 * kind.speed) == (False, True)
     assert robot.motion_check.drifted > 0.5 * kind.speed
-    assert robot.go(15.0) == (False, False)
-    opposite = Told(kind)
-    assert opposite.go(3.0, told=0.5 * kind.speed, speed=-0.5 * kind.speed) == (False, True)
-
-
-@wheels
-def test_coarse_and_rare_positions_are_no_disobedience(kind):
-    robot = Told(kind)
-    for _ in range(20):
-        assert robot.go(1.0, told=0.05, speed=0.05, every=4, step=0.01) == (False, False)
-
-
-def test_carried_robot_does_not_stray():
-    robot = Told(CRAZYFLIE)
-    robot.go(3.0)
-    robot.position = (3.0, 3.0, 3.0)
-    assert robot.go(3.0) == (False, False)
-
-
-def test_missed_ticks_begin_anew():
-    robot = Told(KHEPERA4)
-    assert robot.go(3.4, told=KHEPERA4.speed) == (True, False)
-    robot.tick += 20
-    assert robot.go(DT, told=KHEPERA4.speed) == (False, False)
-    assert robot.motion_check.commanded == 0.0
+    assert robot.go(15.0) == FINE
+    assert Told(kind).go(3.0, told=0.5 * kind.speed, speed=-0.5 * kind.speed) == (False, True)
+    robot.position = (30.0, 30.0, 30.0)  # it was carried
+    assert robot.go(3.0) == FINE
 
 
 @every_kind
@@ -128,7 +111,7 @@ def test_robot_without_commands_or_unwatched_obeys(kind, setpoint, speed, watche
     for tick in range(1000):
         yaw = math.inf if watched and tick % 2 else 0.0
         motion_check.update(tick * DT, setpoint, (speed * DT * tick, 0.0, 0.0), yaw, watched)
-        assert (motion_check.unresponsive, motion_check.uncommanded) == (False, False)
+        assert (motion_check.unresponsive, motion_check.uncommanded) == FINE
     assert (motion_check.commanded, motion_check.drifted) == (0.0, 0.0)
 
 
@@ -140,6 +123,6 @@ def test_partly_known_pose_is_no_begin(position, yaw):
     for _ in range(100):
         robot.motion_check.update(robot.tick * DT, (2.0, 0.0, 0.5, 0.0), position, yaw, False)
         robot.tick += 1
-    assert robot.go(10.0, told=0.5, speed=0.5) == (False, False)
+    assert robot.go(10.0, told=0.5, speed=0.5) == FINE
     assert robot.motion_check.drifted < 0.1
     assert robot.go(4.0, speed=0.5) == (False, True)

@@ -9,13 +9,13 @@ from agents.kinds.khepera4 import KHEPERA4
 from agents.safety.positions import FLIP, JUMP_M, PLAUSIBLE_SPEED, Continuity, ExternalPositions
 
 FAR = JUMP_M + PLAUSIBLE_SPEED * CRAZYFLIE.speed * 0.3  # [m] within a gap of 0.3 s in the measurements
+FLIPPED = FLIP + PLAUSIBLE_SPEED * KHEPERA4.turn_rate * 0.02  # [rad] within 0.02 s
 
 
 @pytest.mark.parametrize(
     ("kind", "samples", "jump"),
     [
         (CRAZYFLIE, [(0.0, 0.0), (0.01, 0.99 * JUMP_M)], nan),
-        (CRAZYFLIE, [(0.0, 0.0), (0.01, 1.0)], 1.0),
         (CRAZYFLIE, [(0.0, 0.0), (0.01, 1.0), (9.0, 1.0)], 1.0),  # time does not heal it
         (CRAZYFLIE, [(0.0, 0.0), (0.01, 1.0), (0.02, 0.0)], nan),
         (CRAZYFLIE, [(0.0, 0.0), (0.01, 1.0), (0.02, nan), (0.03, 1.0)], 1.0),
@@ -27,11 +27,10 @@ FAR = JUMP_M + PLAUSIBLE_SPEED * CRAZYFLIE.speed * 0.3  # [m] within a gap of 0.
 def test_jump_is_farther_than_a_robot_can_move(kind, samples, jump):
     """A robot in motion at x [m] at several times [s], and its last jump."""
     continuity = Continuity(kind)
-    jumps = []
     for t, x in samples:
-        jumps.append(continuity.jump(t, (x, 0.0, 0.0), 0.0, True))
-        assert continuity.jumped == (isfinite(jumps[-1]) or isnan(x))  # an unknown position ends no jump
-    assert jumps[-1] == pytest.approx(jump, nan_ok=True)
+        found = continuity.jump(t, (x, 0.0, 0.0), 0.0, True)
+        assert continuity.jumped == (isfinite(found) or isnan(x))  # an unknown position ends no jump
+    assert found == pytest.approx(jump, nan_ok=True)
 
 
 def test_robot_at_rest_or_forgotten_may_be_carried():
@@ -46,9 +45,6 @@ def test_robot_at_rest_or_forgotten_may_be_carried():
     for continuity in (carried, moved):
         assert isnan(continuity.jump(0.03, there, 0.0, True))
         assert continuity.jump(0.04, here, 0.0, True) == pytest.approx(sqrt(3.0))
-
-
-FLIPPED = FLIP + PLAUSIBLE_SPEED * KHEPERA4.turn_rate * 0.02  # [rad] within 0.02 s
 
 
 @pytest.mark.parametrize(
@@ -74,8 +70,14 @@ def test_wheels_whose_yaw_jumps_have_jumped(kind, watched, samples, jump):
     assert continuity.yaw_jump == pytest.approx(jump, nan_ok=True)
 
 
+def believed(external, places, dt=0.01, begin=0.0):
+    """Which external positions at x [m] are believed; a robot that is not watched is marked by a pair."""
+    pairs = [place if isinstance(place, tuple) else (place, True) for place in places]
+    return [external.believes(begin + dt * k, (x, 0.0, 1.0), watched=watched) for k, (x, watched) in enumerate(pairs)]
+
+
 @pytest.mark.parametrize(
-    ("dt", "samples", "believed"),
+    ("dt", "places", "expected"),
     [
         (0.01, [0.0, 0.12, 0.0, 0.15, 0.0], [True, True, True, False, True]),
         (0.01, [0.0, *[0.3] * 200, 0.12, 0.2], [True, *[False] * 200, True, True]),
@@ -83,48 +85,32 @@ def test_wheels_whose_yaw_jumps_have_jumped(kind, watched, samples, jump):
         (0.01, [0.015 * k for k in range(300)], [True] * 300),  # as fast as it can
         (0.3, [0.0, 0.4], [True, True]),  # a gap in the measurements
         (0.3, [0.0, 0.6], [True, False]),
+        (0.01, [(0.0, False), (0.5, False), (0.5, True), (0.0, True)], [True, True, True, False]),
     ],
-    ids=["to and fro", "stays", "lost", "fast", "gap", "far"],
+    ids=["to and fro", "stays", "lost", "fast", "gap", "far", "take-off"],
 )
-def test_external_position_jumps_by_more_than_a_robot(dt, samples, believed):
-    external = ExternalPositions(CRAZYFLIE)
-    assert [external.believes(dt * k, (x, 0.0, 1.0), watched=True) for k, x in enumerate(samples)] == believed
+def test_external_position_jumps_by_more_than_a_robot(dt, places, expected):
+    assert believed(ExternalPositions(CRAZYFLIE), places, dt) == expected
 
 
-def jumped():
-    """Positions of a robot that have jumped by 0.3 m."""
-    external = ExternalPositions(CRAZYFLIE)
-    for t, x in ((0.0, 0.0), (0.01, 0.3)):
-        external.believes(t, (x, 0.0, 1.0), watched=True)
-    return external
-
-
-def test_doubted_position_may_be_forgotten():
-    external = jumped()
-    assert (external.doubted, external.jump) == (True, pytest.approx(0.3))
-    external.forget()
-    assert external.believes(9.0, (5.0, 0.0, 1.0), watched=True)
-    assert not external.doubted
-
-
-def test_positions_that_led_to_landing_stay_wrong():
-    external = jumped()
-    external.disbelieve()
-    here = (0.0, 0.0, 1.0)
-    assert not external.believes(0.5, here, watched=True)  # where it was before
-    assert external.doubted
-    assert not external.believes(0.4, here, watched=False)  # older
-    assert external.believes(0.6, (3.0, 0.0, 0.0), watched=False)  # it stands, and may be carried
-    assert not external.doubted
+def test_doubted_position_is_forgotten_or_stays_wrong():
+    for lands in (False, True):
+        external = ExternalPositions(CRAZYFLIE)
+        believed(external, [0.0, 0.3])
+        assert (external.doubted, external.jump) == (True, pytest.approx(0.3))
+        if lands:
+            external.disbelieve()
+            assert believed(external, [0.0], begin=0.5) == [False]  # where it was before
+            assert believed(external, [(0.0, False)], begin=0.4) == [False]  # older
+            assert external.doubted
+            assert believed(external, [(3.0, False)], begin=0.6) == [True]  # it stands, and may be carried
+        else:
+            external.forget()
+            assert believed(external, [5.0], begin=9.0) == [True]
+        assert not external.doubted
     inside = ExternalPositions(CRAZYFLIE)
     inside.disbelieve()  # it measures its position itself
     assert not inside.doubted
-
-
-def test_jump_at_take_off_is_seen():
-    external, places = ExternalPositions(CRAZYFLIE), [(0.0, False), (0.5, False), (0.5, True), (0.0, True)]
-    found = [external.believes(0.01 * k, (x, 0.0, 0.0), watched=watched) for k, (x, watched) in enumerate(places)]
-    assert found == [True, True, True, False]
 
 
 def test_flipped_yaw_is_unknown_until_it_is_back():

@@ -16,10 +16,7 @@ from agents.safety.preflight import LOST_S, Preflight
 from agents.safety.setpoint_filter import SetpointFilter
 from agents.vectors import UNKNOWN, ZERO
 
-NAN = math.nan
-
-
-START = (0.1, 0.2)
+START, NAN = (0.1, 0.2), math.nan
 
 
 class Standing:
@@ -28,16 +25,11 @@ class Standing:
     def __init__(self, kind=CRAZYFLIE, *, start_within=0.3, other=(0.35, 0.2), **safety):
         limits = Limits(low=(-2.0, -2.0, 0.0), high=(2.0, 2.0, 2.5), **safety)
         starts = (("F", *START, kind.radius), ("G", *other, kind.radius))
-        self.preflight = Preflight(
-            SimpleNamespace(
-                name="F", kind=kind, limits=limits, predictor=HOLD, start=START, start_within=start_within,
-                starts=starts,
-            )
-        )  # fmt: skip
+        given = {"name": "F", "kind": kind, "limits": limits, "predictor": HOLD, "start": START, "starts": starts}
+        self.preflight = Preflight(SimpleNamespace(**given, start_within=start_within))
         self.filter, self.now, self.health = SetpointFilter(kind, limits), Situation(), ProcessHealth()
-        self.neighbours = Neighbours([Incoming(1, "G", kind, 0.25)], limits.neighbour_timeout_s)
+        self.neighbours, self.t = Neighbours([Incoming(1, "G", kind, 0.25)], limits.neighbour_timeout_s), 1.0
         self.neighbours.mark_alive(0)
-        self.t = 1.0
         self.hear((*other, 0.0))
 
     def hear(self, position):
@@ -101,9 +93,8 @@ def test_kind_start_and_separation_decide(given, values, reason):
 def test_failure_that_lasts_ends_readiness():
     robot = Standing()
     reason = robot.check(battery=0.1)
-    assert [robot.preflight.lost(t, reason) for t in (1.0, 1.0 + 0.9 * LOST_S)] == [False, False]
-    assert not robot.preflight.lost(1.5, "")
-    assert [robot.preflight.lost(t, reason) for t in (2.0, 2.0 + LOST_S)] == [False, True]
+    times = [(1.0, reason), (1.0 + 0.9 * LOST_S, reason), (1.5, ""), (2.0, reason), (2.0 + LOST_S, reason)]
+    assert [robot.preflight.lost(*each) for each in times] == [False, False, False, False, True]
 
 
 @pytest.mark.parametrize(("x", "z", "clear"), [(0.28, 0.6, False), (0.28, 0.05, True), (0.35, 0.6, True)])
