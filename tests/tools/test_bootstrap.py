@@ -51,7 +51,6 @@ def test_each_lock_has_all_of_the_one_before(bootstrap):
 
 @pytest.mark.slow
 def test_a_wheel_has_the_names_for_plugins(tmp_path):
-    """In the root stands the launcher `zenpark`, so the package of that name comes from a folder of its own."""
     uv = next((ROOT / ".uv").glob("*/bin/uv"), None) or shutil.which("uv")
     if uv is None:
         pytest.skip("needs uv, which ./zenpark gets")

@@ -220,7 +220,6 @@ def test_completion_is_right_and_light(tmp_path):
 @pytest.mark.parametrize("unbuffered", mostly_slow(["", "1"], 2))
 @pytest.mark.parametrize(("output", "code"), [("> /dev/full", 2), (">&-", 0)])
 def test_output_that_goes_nowhere_makes_no_traceback(output, code, unbuffered):
-    """A full disk is named; an output that the caller closed is none."""
     done = subprocess.run(
         ["sh", "-c", f'exec "$0" -m tools.guard explain rates {output}', sys.executable],
         cwd=ROOT, stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, timeout=60, check=False,

@@ -47,9 +47,6 @@ def test_page_is_named_where_no_browser_opens_it(opened, monkeypatch, capsys):
     assert ("open file:///report.html by hand" in capsys.readouterr().err) is not opened
 
 
-# progress
-
-
 class Terminal(io.StringIO):
     """A standard error that a person looks at."""
 

@@ -190,9 +190,6 @@ def test_install_leaves_alone_what_is_not_its_own(home, tmp_path, capsys, there,
     assert (home / "zenpark" / "zenpark").read_text().startswith("#!/bin/sh")
 
 
-# certificates
-
-
 @pytest.fixture
 def lab_folder(tmp_path):
     folder = tmp_path / "lab"

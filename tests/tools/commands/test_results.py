@@ -212,7 +212,6 @@ def test_interrupted_run_over_seeds_reports_what_is_kept(made, kept, first, tmp_
     ],
 )
 def test_seeds_that_never_acquire_are_counted(runs, words):
-    """By seed, when each robot acquired; None: never."""
     measured = [
         SimpleNamespace(
             mean={"acquired_s": None if None in acquired else 1.0},

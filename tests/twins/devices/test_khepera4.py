@@ -114,7 +114,6 @@ def test_only_some_servers_obey_a_speed(talk, server):
      ("fork", b"d 5 0"), ("kteam", b"D,74,74\r")], 5),
 )  # fmt: skip
 def test_no_watchdog_and_clients_that_leave(talk, server, words):
-    """Some stop when their client leaves; those of 2023 accept one client per life."""
     robot = talk(server)
     robot.say(words)
     assert robot.after(4.0).speed() > 0.03

@@ -212,7 +212,6 @@ def test_what_it_refuses_in_the_air(drone, command, answer):
 
 
 def test_a_curve_goes_through_its_points(drone):
-    """A quarter of a circle of 1 m ahead and to the left: never farther than 5 cm from it."""
     begin, centre = drone.place(), drone.place() + np.array([0.0, 1.0, 0.0])
     drone.say("curve 71 29 0 100 100 0 30")
     answers = []
@@ -234,7 +233,6 @@ def test_mission_pads_are_searched_for_when_switched_on(talk):
 
 
 def test_wifi_gap_leaves_the_sticks_as_they_are(drone):
-    """As a real one: it flies on, hears nothing, and lands 15 s after the last command if nobody comes back."""
     drone.say("rc 0 30 0 0")
     drone.wait(1.0)
     drone.state()

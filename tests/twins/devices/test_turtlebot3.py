@@ -237,9 +237,6 @@ def test_announces_itself(listen, eventually):
         eventually(lambda announced=announced, wanted=wanted: announced() == set(wanted.split()))
 
 
-# faults
-
-
 @pytest.mark.system
 def test_loss_is_a_share_of_both_directions(listen):
     listener = listen(faults=Faults(loss=0.3))

@@ -57,9 +57,6 @@ def read(port, frames=1):
     return found
 
 
-# the wire format
-
-
 finite = st.floats(-50.0, 50.0)
 bodies = st.lists(st.tuples(finite, finite, finite, st.lists(finite, min_size=9, max_size=9)), max_size=5)
 
@@ -119,9 +116,6 @@ def test_root_segment_is_subject_pose_and_names_update():
     assert decoder.frame(subject(1, "arm", [(root, 3), (3, 7)]) + subject(2, "leg", [(root, 0)])) is None
     assert decoder.frame(moved).poses == {"arm": far, "leg": None}
     assert decoder.frame(subject(1, "hand", [(7, 3), (root, 7)]) + moved).poses == {"hand": near}
-
-
-# the twin
 
 
 @pytest.mark.system
@@ -253,9 +247,6 @@ def test_noise_has_the_size_that_was_asked_for():
     assert np.abs(error.mean(axis=0)).max() < 4e-4
 
 
-# the process
-
-
 @pytest.fixture
 def process(router, request):
     """Process of the twin; a parameter is a list of more options."""
@@ -318,9 +309,6 @@ def test_user_errors_are_reported_without_a_traceback():
         ended = python(*command, option, value, code=2)
         assert words in ended.stderr
         assert "Traceback" not in ended.stderr
-
-
-# wrong frames
 
 
 def told(fault):

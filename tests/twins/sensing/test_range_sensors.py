@@ -2,13 +2,12 @@
 
 import math
 from dataclasses import replace
-from statistics import NormalDist
 
 import numpy as np
 import pytest
 
 from agents.body.interface import BodyError
-from agents.body.kinds import KINDS, Sensor
+from agents.body.kinds import KINDS
 from agents.kinds.crazyflie import CRAZYFLIE
 from agents.kinds.khepera4 import KHEPERA4
 from agents.kinds.turtlebot3 import TURTLEBOT3
@@ -17,16 +16,15 @@ from tests.requests import request
 from twins.body import TwinBody
 from twins.engines.engine import EngineInput, World
 from twins.engines.point_mass import PointMass
-from twins.scene import Obstacle, Scene
+from twins.scene import Scene
 from twins.sensing.range_sensors import RangeSensors, fan, sensors
 
 SENSORS = sensors()
 
 
-def placed(kinds, carried, *, obstacles=None, size=(6.0, 6.0, 2.5), noise=0.0, mirrored=None):
-    n = len(kinds)
-    scene = Scene.furnished(size, obstacles or {}, {}, walled=True)
-    return World(scene, PointMass(), tuple(carried), noise, mirrored or (False,) * n)
+def placed(kinds, carried, *, size=(6.0, 6.0, 2.5), noise=0.0, mirrored=None):
+    scene = Scene.furnished(size, {}, {}, walled=True)
+    return World(scene, PointMass(), tuple(carried), noise, mirrored or (False,) * len(kinds))
 
 
 def equipped(asked, world):
@@ -61,37 +59,28 @@ def facing(kind, sensor, gap, noise=0.0, times=(0.0,), *, robots=1):
 
 def test_sensors_make_sense():
     for name, sensor in SENSORS.items():
-        assert len(sensor.elevation) in {0, len(sensor.bearing)}, name
         assert 0.0 <= sensor.nearest < sensor.farthest, name
         assert fan(sensor).reach == sensor.mount + sensor.farthest, name
-        assert sensor.rate_hz > 0.0, name
     carried = [each for kind in KINDS.values() for each in {*kind.sensors, *kind.decks}]
     assert len(carried) == len(SENSORS)  # each of its own name
     assert sorted(np.degrees(SENSORS["infrared"].bearing)) == pytest.approx([-135, -90, -45, 0, 45, 90, 135, 180])
     assert sorted(np.degrees(SENSORS["ultrasonic"].bearing)) == pytest.approx([-90, -45, 0, 45, 90])
 
 
-@pytest.mark.parametrize(
-    ("kind", "sensor", "gap", "expected"),
-    [
-        (KHEPERA4, "infrared", 0.1, 0.17),
+def test_limits_count_from_sensor_readings_from_centre():
+    for kind, sensor, gap, expected in (
         (KHEPERA4, "infrared", 0.2499, 0.3199),
         (KHEPERA4, "infrared", 0.2501, math.nan),
         (KHEPERA4, "infrared", -0.01, 0.07),  # run into the wall: the rim touches
         (KHEPERA4, "ultrasonic", 0.2499, math.nan),
         (KHEPERA4, "ultrasonic", 0.2501, 0.3201),
-        (KHEPERA4, "ultrasonic", 1.9999, 2.0699),
         (KHEPERA4, "ultrasonic", 2.0001, math.nan),
         (TURTLEBOT3, "lds01", 0.1199, math.nan),
-        (TURTLEBOT3, "lds01", 0.1201, 0.1201),
         (TURTLEBOT3, "lds01", 3.4999, 3.4999),
         (TURTLEBOT3, "lds01", 3.5001, math.nan),
         (CRAZYFLIE, "multiranger", 3.9999, 3.9999),
-        (CRAZYFLIE, "multiranger", 4.0001, math.nan),
-    ],
-)
-def test_limits_count_from_sensor_readings_from_centre(kind, sensor, gap, expected):
-    np.testing.assert_allclose(facing(kind, sensor, gap), [expected], atol=1e-12)
+    ):
+        np.testing.assert_allclose(facing(kind, sensor, gap), [expected], atol=1e-12)
 
 
 def test_rays_are_in_the_order_of_sensors():
@@ -101,11 +90,9 @@ def test_rays_are_in_the_order_of_sensors():
     _, ranges = swept(asked, placed(kinds, carried))
     first, none, lidar, last = ranges.scans
     assert none is None
-    assert [len(scan.distance) for scan in (first, lidar, last)] == [13, 360, 8]
     light, sound = SENSORS["infrared"].bearing, SENSORS["ultrasonic"].bearing
     np.testing.assert_array_equal(first.bearing, np.concatenate([sound, light]))
     np.testing.assert_array_equal(last.bearing, light)
-    assert not any((*first.elevation, *lidar.elevation))
     ahead = [distance for distance, bearing in zip(first.distance, first.bearing, strict=True) if bearing == 0.0]
     # the landed Crazyflie is too near for sound, and hides what is behind it; all TurtleBots' rays pass over both
     np.testing.assert_allclose(ahead, [np.nan, 0.135], atol=1e-12)
@@ -126,81 +113,54 @@ def test_unknown_sensor_is_refused():
         RangeSensors(asked, placed([KHEPERA4] * 2, [("infrared",), ("infrared", "radar")]))
 
 
-@pytest.mark.parametrize("dt", [0.01, 0.015, 0.03])
+@pytest.mark.parametrize("dt", [0.01, 0.015])
 def test_sensors_measure_at_their_own_rates(dt):
     kinds = [TURTLEBOT3, KHEPERA4, CRAZYFLIE]
     asked = request(kinds, start=[(0.0, 0.0), (1.0, 0.0), (0.0, 1.0, 1.0)])
     world = placed(kinds, [("lds01",), ("infrared",), ("multiranger",)], noise=1.0)
     ranges, engine = equipped(asked, world)
     assert ranges.scans == [None] * 3
-    times, last = {0: [], 1: [], 2: []}, [None] * 3
+    ranges.sweep(-2.0, engine)  # measurements missed since then are not made up for
+    times = {0: set(), 1: set(), 2: set()}
     for k in range(1, round(20.0 / dt) + 1):
-        new = ranges.sweep(k * dt, engine)
+        ranges.sweep(k * dt, engine)
         for row, seen in times.items():
-            scan = ranges.scans[row]
-            if scan is not last[row]:
-                assert scan.time == k * dt
-                assert new
-                seen.append(scan.time)
-            last[row] = scan
+            seen.add(ranges.scans[row].time)
     for row, rate in ((0, 5.0), (1, 10.0), (2, 20.0)):
-        assert times[row][0] == dt
-        assert len(times[row]) == pytest.approx(20.0 * rate, abs=1)
-        assert np.diff(times[row]).max() < 1.0 / rate + dt + 1e-9
-        if dt == 0.01:
-            np.testing.assert_allclose(np.diff(times[row]), 1.0 / rate, atol=1e-9)
-
-
-def test_missed_measurements_are_not_repeated():
-    asked, world = request([CRAZYFLIE], start=[(0.0, 0.0, 1.0)]), placed([CRAZYFLIE], [("multiranger",)])
-    ranges, engine = equipped(asked, world)
-    for t in (0.1, 0.2, 0.3):
-        ranges.sweep(t, engine)
-        assert ranges.scans[0].time == t
-    measured = set()
-    for t in np.arange(5.0, 5.195, 0.01).tolist():
-        ranges.sweep(t, engine)
-        measured.add(ranges.scans[0].time)
-    assert len(measured) == 4  # 20 Hz
+        steps = np.diff(sorted(times[row]))
+        assert min(times[row]) == dt
+        assert len(steps) == pytest.approx(20.0 * rate, abs=2)
+        assert steps.max() < 1.0 / rate + dt + 1e-9
+        assert dt != 0.01 or steps == pytest.approx(1.0 / rate)
 
 
 def test_sensor_not_due_keeps_its_readings():
     kinds, carried = [TURTLEBOT3], [("lds01", "infrared")]
-    asked, world = request(kinds), placed(kinds, carried, size=(0.5, 0.5, 1.0), noise=1.0)
-    ranges, engine = equipped(asked, world)
-    ranges.sweep(0.0, engine)
-    first = distances(ranges)
-    ranges.sweep(0.1, engine)
-    second = distances(ranges)
+    world = placed(kinds, carried, size=(0.5, 0.5, 1.0), noise=1.0)
+    (first, second), _ = swept(request(kinds), world, (0.0, 0.1))
     np.testing.assert_array_equal(second[:360], first[:360])  # 5 Hz
     assert (second[360:] != first[360:]).all()  # 10 Hz
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("kind", "sensor", "gap", "sigma"),
+    ("kind", "sensor", "gap", "sigma", "scale"),
     [
-        (KHEPERA4, "infrared", 0.15, 0.005),
-        (KHEPERA4, "ultrasonic", 1.004, 0.005),
-        (TURTLEBOT3, "lds01", 0.4, 0.0075),
-        (TURTLEBOT3, "lds01", 2.0, 0.05),
-        (CRAZYFLIE, "multiranger", 3.0, 0.010),
+        (KHEPERA4, "ultrasonic", 1.004, 0.005, 1.0),
+        (TURTLEBOT3, "lds01", 0.4, 0.0075, 1.0),
+        (TURTLEBOT3, "lds01", 2.0, 0.05, 0.5),
+        (CRAZYFLIE, "multiranger", 3.0, 0.010, 0.5),
     ],
 )
-@pytest.mark.parametrize("scale", [1.0, 0.5])
 def test_noise_has_sigma_of_the_maker(kind, sensor, gap, sigma, scale):
     robots = 4 if sensor == "lds01" else 30  # each with 360 beams
     readings = facing(kind, sensor, gap, scale, np.arange(100) * 0.25, robots=robots)
     seen = readings[np.isfinite(readings)] - SENSORS[sensor].mount
-    step = SENSORS[sensor].resolution
-    expected = np.array([NormalDist(gap, sigma * scale).inv_cdf((k + 0.5) / 4000) for k in range(4000)])
-    if step:
-        expected = step * np.round(expected / step)
+    if step := SENSORS[sensor].resolution:
         np.testing.assert_allclose(seen / step, np.round(seen / step), atol=1e-9)
-    assert seen.mean() == pytest.approx(expected.mean(), abs=4.0 * sigma / math.sqrt(len(seen)))
-    assert seen.std() == pytest.approx(expected.std(), rel=0.06)
-    lost = np.isnan(readings).mean()
-    assert lost == pytest.approx(SENSORS[sensor].dropout * scale, abs=0.004)
+    assert seen.mean() == pytest.approx(gap, abs=0.5 * step + 4.0 * sigma / math.sqrt(len(seen)))
+    assert seen.std() == pytest.approx(sigma * scale, rel=0.06, abs=0.5 * step)
+    assert np.isnan(readings).mean() == pytest.approx(SENSORS[sensor].dropout * scale, abs=0.004)
 
 
 def test_dropouts_scale_with_the_noise(monkeypatch):
@@ -254,15 +214,3 @@ def test_state_of_a_twin_has_its_scan():
     assert scan.time == 0.01
     assert body.read(0.2)[0].scan is scan
     assert body.read(0.21)[0].scan.time == 0.21
-
-
-def test_added_sensor_measures(monkeypatch):
-    """As a kind adds one, here a height sensor that looks down."""
-    floor = Sensor(
-        name="floor", bearing=(0.0,), elevation=(-0.5 * np.pi,), height=0.0, farthest=2.0, rate_hz=25.0, sigma=0.0
-    )
-    monkeypatch.setitem(SENSORS, "floor", floor)
-    asked = request([CRAZYFLIE] * 2, start=[(0.0, 0.0, 0.8), (1.0, 0.0, 0.8)])
-    table = {"table": Obstacle(box=(0.5, 0.5), at=(1.0, 0.0), height=0.3)}
-    seen, _ = swept(asked, placed([CRAZYFLIE] * 2, [("floor",)] * 2, obstacles=table, noise=1.0))
-    np.testing.assert_allclose(seen, [[0.8, 0.5]], atol=1e-12)

@@ -78,54 +78,33 @@ def answered(call, *arguments):
     return said
 
 
-def logged(scf, period_ms=10, rows=1, **variables):
-    """Values of `rows` rows of a log block."""
-    block = LogConfig("test", period_ms)
+def logged(scf, **variables):
+    """First values of a log block, in a list."""
+    block = LogConfig("test", 10)
     for name, kind in variables.items():
         block.add_variable(name.replace("__", "."), kind)
     with SyncLogger(scf, block) as logger:
-        return [values for _, (_, values, _) in zip(range(rows), logger, strict=False)]
+        return [next(logger)[1]]
 
 
-# parameters
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
+def test_parameters_of_examples(cf):
+    for name, value in (
         ("led.bitmask", 255),  # sbs_swarm, lights of a swarm
-        ("ring.effect", 7),  # circling_square, LED examples, persistent_params
         ("ring.fadeTime", 0.5),  # synchronized_sequence
-        ("ring.solidRed", 100),
-        ("ring.headlightEnable", 1),
-        ("led_deck_ctrl.rgb888", 0x20FF10),
         ("colorLedBot.wrgb8888", 0x10203040),  # color_led_set
         ("pid_attitude.pitch_kd", 0.1234),  # basicparam
-        ("pid_rate.roll_kp", 240.0),
-        ("ctrlMel.kp_xy", 0.5),
-        ("commander.enHighLevel", 1),
-        ("hlCommander.vtoff", 0.6),
-        ("stabilizer.controller", 2),
-        ("kalman.robustTwr", 1),
-        ("locSrv.extQuatStdDev", 0.06),
-        ("motion.disable", 0),
         ("powerDist.idleThrust", 1200),
-        ("health.startPropTest", 1),
-        ("system.highlight", 1),
-    ],
-)
-def test_parameters_of_examples(cf, name, value):
-    said = updates(cf, name)
-    cf.param.set_value(name, value)
-    until(lambda: said and float(said[-1]) == pytest.approx(value), f"{name} confirmed")
-    assert float(cf.param.get_value(name)) == pytest.approx(value)
-
-
-@pytest.mark.parametrize("deck", ["bcFlow2", "bcZRanger2"])
-def test_deck_that_examples_wait_for(cf, deck):
-    """sbs_motion_commander and its like: 'No flow deck detected' otherwise."""
-    said = updates(cf, f"deck.{deck}")
-    cf.param.request_param_update(f"deck.{deck}")
+    ):
+        said = updates(cf, name)
+        cf.param.set_value(name, value)
+        until(lambda said=said, value=value: said and float(said[-1]) == pytest.approx(value), f"{name} confirmed")
+        assert float(cf.param.get_value(name)) == pytest.approx(value)
+    said = updates(cf, "ring.effect")
+    cf.param.set_value_raw("ring.effect", 0x08, 13)
+    cf.param.request_param_update("ring.effect")
+    until(lambda: "13" in said, "set by its name")
+    said = updates(cf, "deck.bcFlow2")  # sbs_motion_commander waits for it
+    cf.param.request_param_update("deck.bcFlow2")
     until(lambda: said == ["1"], "the deck is there")
 
 
@@ -155,52 +134,21 @@ def test_stored_parameters(cf):
     assert state() == (False, 0, None)
 
 
-def test_raw_parameter(cf):
-    said = updates(cf, "ring.effect")
-    cf.param.set_value_raw("ring.effect", 0x08, 13)
-    cf.param.request_param_update("ring.effect")
-    until(lambda: "13" in said, "set by its name")
-
-
-# logs
-
-
-def test_largest_log_block(scf):
-    """The block of the acceptance tests: 26 bytes at 100 Hz, nothing exactly level."""
-    variances = {f"gyro__{axis}Variance": "float" for axis in "xyz"}
-    angles = dict.fromkeys(("stabilizer__roll", "stabilizer__pitch", "stabilizer__yaw"), "float")
-    (values,) = logged(scf, **angles, stabilizer__thrust="uint16_t", **variances)
-    assert len(values) == 7
-    assert abs(values["stabilizer.roll"]) > 1e-4
-    assert all(values[f"gyro.{axis}Variance"] > 0.0 for axis in "xyz")
-
-
 def test_variables_of_examples(scf):
-    """autonomous_sequence, Crazyswarm2's odometry, health checks."""
     state = {f"kalman__state{axis}": "float" for axis in ("X", "Y", "Z", "PX", "PY", "PZ")}
     assert set(logged(scf, **state)[0]) == {name.replace("__", ".") for name in state}
-    sensors = {f"{group}__{axis}": "float" for group in ("gyro", "acc") for axis in "xyz"}
-    assert 0.9 < logged(scf, **sensors)[0]["acc.z"] < 1.1
+    variances = {f"gyro__{axis}Variance": "float" for axis in "xyz"}  # the largest block, 26 bytes
+    angles = dict.fromkeys(("stabilizer__roll", "stabilizer__pitch", "acc__z"), "float")
+    (values,) = logged(scf, **angles, stabilizer__thrust="uint16_t", **variances)
+    assert 0.9 < values["acc.z"] < 1.1
+    assert all(values[f"gyro.{axis}Variance"] > 0.0 for axis in "xyz")
     power = logged(scf, pm__vbat="FP16", pm__batteryLevel="uint8_t", health__batteryPass="uint8_t")[0]
     assert (3.0 < power["pm.vbat"] < 4.3, power["pm.batteryLevel"]) == (True, 90)
     supervisor = logged(scf, supervisor__info="uint16_t", sys__canfly="uint8_t", radio__isConnected="uint8_t")[0]
     assert (supervisor["supervisor.info"] & 8, supervisor["sys.canfly"], supervisor["radio.isConnected"]) == (8, 1, 1)
 
 
-# memories
-
-
-def test_memory_tester(scf, cf):
-    """As the swarm test rig: 1,000 bytes read, 1,000 written, no error counted."""
-    tester = memory(cf, MemoryElement.TYPE_MEMORY_TESTER)
-    assert answered(tester.read_data, 5, 1000) == [tester]
-    cf.param.set_value("memTst.resetW", "1")
-    assert answered(tester.write_data, 5, 1000)[0] is tester
-    assert logged(scf, memTst__errCntW="uint32_t") == [{"memTst.errCntW": 0}]
-
-
-def test_eeprom(cf):
-    """read_eeprom, write_eeprom: radio settings with a valid checksum, written and read back."""
+def test_eeprom_and_led_ring(cf):
     eeprom = memory(cf, MemoryElement.TYPE_I2C)
     answered(eeprom.update)
     assert eeprom.valid
@@ -211,9 +159,6 @@ def test_eeprom(cf):
     eeprom.elements = {}
     answered(eeprom.update)
     assert (eeprom.valid, eeprom.elements["pitch_trim"]) == (True, 1.5)
-
-
-def test_memories_of_the_led_ring(cf):
     ring = memory(cf, MemoryElement.TYPE_DRIVER_LED)
     ring.leds[3].set(r=0, g=100, b=0)
     assert answered(ring.write_data)[0] is ring
@@ -222,27 +167,25 @@ def test_memories_of_the_led_ring(cf):
     assert answered(timings.write_data)[0] is timings
 
 
-def test_memories_of_decks(cf):
-    """read_deck_mem: no deck has a memory; read_ow, and the acceptance test of memories: each says its name."""
+def test_memories_of_decks_and_tester(cf, scf):
     assert answered(memory(cf, MemoryElement.TYPE_DECK_MEMORY).query_decks) == [{}]
     deck = memory(cf, MemoryElement.TYPE_1W)
     answered(deck.update)
     assert deck.valid
     assert deck.elements["Board name"] == "bcFlow2"
     assert (deck.vid, deck.pid) == (0xBC, 0x0F)
+    tester = memory(cf, MemoryElement.TYPE_MEMORY_TESTER)
+    assert answered(tester.read_data, 5, 1000) == [tester]
+    cf.param.set_value("memTst.resetW", "1")
+    assert answered(tester.write_data, 5, 1000)[0] is tester
+    assert logged(scf, memTst__errCntW="uint32_t") == [{"memTst.errCntW": 0}]
 
 
-# the rest
-
-
-def test_console(cf):
+def test_console_and_supervisor(cf):
     said = []
     cf.console.receivedChar.add_callback(said.append)
     cf.param.set_value("system.assertInfo", 1)
     until(lambda: "No assert" in "".join(said), "text on the console")
-
-
-def test_supervisor(cf):
     assert int(cf.param.get_value("system.selftestPassed")) == 1  # all acceptance tests begin with it
     assert cf.supervisor.is_auto_armed
     assert cf.supervisor.can_fly
@@ -261,7 +204,6 @@ def test_scan():
 
 
 def test_power_cycle():
-    """As the acceptance tests restart a drone; the link of cflib itself does not notice."""
     other = Served(CrazyflieTwin, request("crazyflie", ["crazyflie-twin"]))
     with other, closing(PowerSwitch(other.addresses[0])) as switch:
         switch.stm_power_down()

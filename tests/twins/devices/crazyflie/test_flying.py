@@ -30,12 +30,9 @@ pytestmark = pytest.mark.slow  # seconds of firmware, in steps of milliseconds
 numbers = st.floats(-3.0, 3.0)
 axis = st.tuples(numbers, numbers, numbers)
 
-# the planner
-
 
 @given(axis, axis, st.floats(0.2, 5.0))
 def test_polynomial_meets_both_ends(begin, end, span):
-    """Position, velocity and acceleration as asked, no jerk, at both ends; checked by numpy's own polynomials."""
     coefficients = polynomial(span, tuple(np.array([v]) for v in begin), tuple(np.array([v]) for v in end))[0]
     path = Polynomial(coefficients)
     scale = 1.0 + np.abs(coefficients * span ** np.arange(8)).max()
@@ -49,7 +46,6 @@ def test_polynomial_meets_both_ends(begin, end, span):
 
 
 def test_chained_plans_are_smooth():
-    """A new goal in the middle of a plan: position and velocity do not jump."""
     planner = OnboardPlanner()
     planner.climb(0.0, np.zeros(4), height=1.0, yaw=0.0, span=2.0, landing=False)
     for t, goal in ((1.0, [1.0, 0.5, 1.2, 1.0]), (1.7, [-0.5, 0.2, 0.8, -2.9]), (2.1, [0.0, 0.0, 1.0, 2.9])):
@@ -61,23 +57,13 @@ def test_chained_plans_are_smooth():
     end = planner.goal(10.0)
     assert end[:3] == pytest.approx([0.0, 0.0, 1.0])
     assert math.cos(end[3] - 2.9) == pytest.approx(1.0)
-    assert planner.finished(10.0)
-
-
-def test_relative_and_linear_plans():
-    planner = OnboardPlanner()
-    planner.climb(0.0, np.zeros(4), height=1.0, yaw=0.0, span=1.0, landing=False)
-    goal, at = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(4)
-    planner.go_to(2.0, at, np.zeros(3), goal=goal, span=2.0, relative=True, linear=True)
-    assert planner.goal(2.5) == pytest.approx([0.25, 0.0, 1.0, 0.0])
-    assert planner.goal(5.0) == pytest.approx([1.0, 0.0, 1.0, 0.0])
-
-
-# high level
+    goal = np.array([1.0, 0.0, 0.0, 0.0])
+    planner.go_to(10.0, np.zeros(4), np.zeros(3), goal=goal, span=2.0, relative=True, linear=True)
+    assert planner.goal(10.5)[:3] == pytest.approx([0.25, 0.0, 1.0])
+    assert planner.goal(13.0)[:3] == pytest.approx([1.0, 0.0, 1.0])
 
 
 def test_takeoff_go_to_land():
-    """A whole flight by the planner; every command is answered, and what cannot be is refused."""
     wire = Wire()
     assert wire.takeoff(1.0, 2.0) == LogStatus.OK
     assert wire.takeoff(1.0, 2.0) == LogStatus.REFUSED
@@ -94,21 +80,7 @@ def test_takeoff_go_to_land():
     assert wire.plan(77) == LogStatus.NO_COMMAND
 
 
-def test_it_lags_behind_the_planner():
-    """No feed-forward of velocity, and no more than 1 m/s: half a second behind, as the firmware itself."""
-    wire = Wire().hovering()
-    wire.go_to(2.0, 0.0, 1.0, 0.0, 4.0)
-    seen = []
-    for _ in range(400):
-        wire.wait(0.01)
-        seen.append((wire.planned[0] - wire.position[0], wire.velocity[0]))
-    worst, fastest = np.max(seen, axis=0)
-    assert 0.35 < worst < 0.65  # 1.09 m/s at the peak, half a second
-    assert fastest <= 1.1
-
-
 def test_groups():
-    """A command to a group that it is not in is answered, and not obeyed."""
     wire = Wire()
     assert wire.takeoff(1.0, 1.0, group=2) == LogStatus.OK
     assert wire.after(2.0).position[2] == 0.0
@@ -118,7 +90,6 @@ def test_groups():
 
 
 def test_plans_begin_at_the_last_setpoint():
-    """While a plan runs, where it should be counts, not where it is: it lags half a second behind."""
     wire = Wire().hovering()
     wire.go_to(1.0, 0.0, 1.0, 0.0, 3.0)
     planned = wire.after(1.5).planned
@@ -126,9 +97,6 @@ def test_plans_begin_at_the_last_setpoint():
     wire.land(2.0)
     assert wire.planned == pytest.approx(planned)
     assert wire.after(3.0).position[0] == pytest.approx(planned[0], abs=0.02)
-
-
-# low level, and who is heard
 
 
 def test_streamed_positions():
@@ -143,40 +111,32 @@ def test_streamed_positions():
     assert wire.yaw == pytest.approx(model.yaw, abs=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("kind", "values", "velocity", "turned"),
-    [
-        (Setpoint.VELOCITY, (0.3, -0.2, 0.1, 0.0), (0.3, -0.2, 0.1), 0.0),
-        (Setpoint.VELOCITY, (0.0, 0.0, 0.0, 30.0), (0.0, 0.0, 0.0), math.pi / 2),
+def test_other_setpoints():
+    for kind, values, velocity, turned in (
+        (Setpoint.VELOCITY, (0.3, -0.2, 0.1, 30.0), (0.3, -0.2, 0.1), math.pi / 2),
         (Setpoint.HOVER, (0.3, 0.0, 0.0, 1.0), (0.0, 0.3, 0.0), 0.0),  # along its nose, which looks to +y
         (Setpoint.HEIGHT, (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0), 0.0),
-    ],
-)
-def test_other_setpoints(kind, values, velocity, turned):
-    wire = Wire(yaw=math.pi / 2).hovering()
-    wire.wait(3.0, lambda: wire.setpoint(kind, *values))
-    assert wire.velocity == pytest.approx(velocity, abs=2e-3)
-    assert math.remainder(wire.yaw - math.pi / 2 - turned, math.tau) == pytest.approx(0.0, abs=0.01)
+    ):
+        wire = Wire(yaw=math.pi / 2).hovering()
+        for _ in range(300):
+            wire.setpoint(kind, *values)
+            wire.wait(0.01)
+        assert wire.velocity == pytest.approx(velocity, abs=2e-3)
+        assert math.remainder(wire.yaw - math.pi / 2 - turned, math.tau) == pytest.approx(0.0, abs=0.01)
     state = struct.pack("<9hI3h", 300, -200, 1100, *[0] * 6, 3 << 30, 0, 0, 0)
     wire.wait(6.0, lambda: wire.put(Port.SETPOINT, 0, Setpoint.FULL_STATE, state))
     assert wire.position == pytest.approx([0.3, -0.2, 1.1], abs=0.01)
 
 
-@given(st.floats(-3.1, 3.1))
-def test_attitude_in_32_bits(yaw):
-    """Packed as the protocol says, by other means; unpacked to a third of a degree."""
-    q = np.array([0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)])
-    largest = int(np.argmax(np.abs(q)))
-    packed = largest
-    for i in range(4):
-        if i != largest:
-            flipped = (q[i] < 0) != (q[largest] < 0)
-            packed = packed << 10 | flipped << 9 | round(0x1FF * abs(q[i]) * math.sqrt(2.0))
-    assert math.cos(yaw_of(packed) - yaw) > math.cos(math.radians(0.34))
+def test_attitude_in_32_bits():
+    for yaw, largest in ((0.5, 3), (-0.5, 3), (2.0, 2), (-3.0, 2)):
+        small = math.sin(yaw / 2) if largest == 3 else math.cos(yaw / 2)
+        flipped = (small < 0.0) != (largest == 2 and yaw < 0.0)
+        packed = largest << 30 | flipped << 9 | round(0x1FF * abs(small) * math.sqrt(2.0))
+        assert math.cos(yaw_of(packed) - yaw) > math.cos(math.radians(0.34))
 
 
 def test_silence_levels_out_and_then_locks():
-    """Half a second without a setpoint: it drifts on; two seconds: motors off, for ever; in time it follows again."""
     wire = Wire().streaming()
     assert wire.after(1.5).state == SupervisorState.LEVEL
     assert wire.after(3.0, lambda: wire.goal(0.0, 0.0, 1.0)).state == SupervisorState.FLYING
@@ -193,7 +153,6 @@ def test_silence_levels_out_and_then_locks():
 
 
 def test_the_order_of_command_and_release_matters():
-    """Released first, the planner has nothing to follow, and it falls; commanded first, it does not."""
     wire = Wire().streaming()
     wire.release()
     assert not wire.after(0.2).motors
@@ -215,29 +174,22 @@ def test_after_a_setpoint_the_planner_is_not_heard():
     assert wire.after(2.0).position[2] == pytest.approx(0.5, abs=0.05)
 
 
-@pytest.mark.parametrize(("pause", "state"), [(1.6, SupervisorState.LOCKED), (5.5, SupervisorState.READY)])
-def test_closing_a_link_just_after_landing_locks(pause, state):
-    """The zero setpoint within two seconds after the motors stopped: it levels out, and locks."""
-    wire = Wire().hovering(0.5)
-    wire.land(1.0)
-    wire.wait(pause)
-    wire.zero()
-    assert wire.after(4.0).state == state
+def test_closing_a_link_just_after_landing_locks():
+    for pause, state in ((1.6, SupervisorState.LOCKED), (5.5, SupervisorState.READY)):
+        wire = Wire().hovering(0.5)
+        wire.land(1.0)
+        wire.wait(pause)
+        wire.zero()  # within two seconds after the motors stopped it levels out, and locks
+        assert wire.after(4.0).state == state
 
 
-# the supervisor
-
-
-@pytest.mark.parametrize("how", [(Port.SUPERVISOR, 1, SupervisorCommand.STOP), (Port.LOCATION, 1, Location.STOP)])
-def test_emergency_stop(how):
-    wire = Wire().hovering()
-    wire.put(*how)
-    assert wire.after(0.01).state == SupervisorState.LOCKED
-    assert not wire.motors
-    assert wire.after(1.0).position[2] == 0.0
-
-
-def test_emergency_watchdog():
+def test_emergency_stop_and_watchdog():
+    for how in ((Port.SUPERVISOR, 1, SupervisorCommand.STOP), (Port.LOCATION, 1, Location.STOP)):
+        wire = Wire().hovering()
+        wire.put(*how)
+        assert wire.after(0.01).state == SupervisorState.LOCKED
+        assert not wire.motors
+        assert wire.after(1.0).position[2] == 0.0
     wire = Wire().hovering()
     for _ in range(5):
         wire.put(Port.SUPERVISOR, 1, SupervisorCommand.WATCHDOG)
@@ -246,7 +198,6 @@ def test_emergency_watchdog():
 
 
 def test_arming():
-    """One that must be armed: not before, and not for longer than it says."""
     wire = Wire({"platform": "brushless"})
     assert wire.takeoff(0.5, 1.0) == LogStatus.BUSY
     assert wire.arm() == bytes((0x81, 1, 1))
@@ -258,7 +209,7 @@ def test_arming():
     assert Info.CAN_BE_ARMED in wire.info
     assert wire.ask(Port.PLATFORM, 0, Platform.ARM, 1) == b"\1\1\1"  # before version 12
     wire.after(0.6).hovering(0.5).land(1.0)
-    assert Info.ARMED in wire.after(1.2 + 2.0 + 2.5).info
+    assert Info.ARMED in wire.after(5.7).info
     assert Info.ARMED not in wire.after(1.5).info
     wire = brushless().hovering(0.5)
     wire.arm(on=False)
@@ -269,7 +220,6 @@ def test_arming():
 
 
 def test_battery():
-    """A battery empties in flight only, at the set rate; empty, it stops the motors."""
     wire = Wire(battery=0.5, drain=10.0)
     battery = wire.after(5.0).vehicle.battery
     assert battery.charge == 0.5
@@ -281,7 +231,6 @@ def test_battery():
 
 
 def test_battery_level_is_that_of_the_firmware():
-    """10 % from 3.00 to 3.78 V; 90 % is the most that it says; under load the voltage sags."""
     vehicle = Wire().vehicle
     levels = {1.0: 90, 0.95: 90, 0.85: 90, 0.55: 60, 0.15: 20, 0.09: 10, 0.01: 10, 0.0: 0}
     for charge, level in levels.items():
@@ -292,23 +241,13 @@ def test_battery_level_is_that_of_the_firmware():
     vehicle.model.flying = True
     assert vehicle.battery.volts == pytest.approx(3.66)
     assert vehicle.battery.level == 10
-
-
-def test_an_empty_battery_is_reported_after_five_seconds():
     wire = Wire(battery=0.05)
     wire.takeoff(0.5, 2.0)
-    battery = wire.after(4.0).vehicle.battery
-    assert battery.volts < 3.2
-    assert battery.power == Power.BATTERY
-    wire.wait(1.5)
-    assert battery.power == Power.LOW
-
-
-# the floor, and crashes
+    assert wire.after(4.0).vehicle.battery.power == Power.BATTERY
+    assert wire.after(1.5).vehicle.battery.power == Power.LOW
 
 
 def test_a_fall_ends_upside_down():
-    """Crashed, until it is put upright and recovery is asked for; then it flies again."""
     wire = Wire().hovering(1.2)
     wire.plan(HighLevel.STOP)
     assert wire.after(1.0).state == SupervisorState.CRASHED
@@ -323,7 +262,6 @@ def test_a_fall_ends_upside_down():
 
 
 def test_a_collision():
-    """A drone on its side stops its motors and falls; upright again it can be recovered."""
     wire = Wire(tumbled_from_s=19.0, tumbled_for_s=3.0).hovering()
     assert wire.after(1.5).state == SupervisorState.CRASHED
     assert wire.after(3.0).state == SupervisorState.CRASHED
@@ -331,11 +269,7 @@ def test_a_collision():
     assert wire.ask(Port.SUPERVISOR, 1, SupervisorCommand.RECOVER) == b"\x82\1\1"
 
 
-# where it believes to be
-
-
 def test_flow_deck_does_not_measure_where_it_is():
-    """The estimate begins where the drone was switched on, in the air too, until the estimator is reset elsewhere."""
     wire = Wire(start=[[0.5, 0.2, 0.0]]).hovering()
     assert wire.estimate == pytest.approx([0.0, 0.0, 1.0], abs=0.01)
     wire.go_to(0.3, 0.0, 1.0, 0.0, 2.0)
@@ -347,7 +281,6 @@ def test_flow_deck_does_not_measure_where_it_is():
 
 
 def test_position_from_outside():
-    """Before the first one it believes to stand where it was told to; after that, it flies what it is told."""
     wire = Wire(external=True, start=[[0.5, 0.2, 0.0]])
     assert wire.estimate == pytest.approx([0.0, 0.0, 0.0])
     assert wire.after(1.0).vehicle.estimator.variance >= 100.0

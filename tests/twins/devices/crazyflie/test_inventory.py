@@ -53,7 +53,6 @@ def logged(wire, *names):
 
 
 def test_size_of_the_firmware():
-    """As many parameters, storable ones and log variables as a real drone sends when a client connects."""
     tables = inventory()
     assert len(tables.parameters.variables) == 402
     assert sum(bool(variable.flags & EXTENDED) for variable in tables.parameters.variables) == 146
@@ -82,7 +81,6 @@ def test_values_of_a_drone_that_stands():
 
 
 def test_values_of_a_drone_that_flies():
-    """Nose down to accelerate; the quaternion is that of the angles."""
     wire = Wire().streaming()
     wire.wait(0.1, lambda: wire.goal(1.0, 0.0, 1.0))
     roll, pitch, qx, qy, qw = logged(wire, *(f"stateEstimate.{name}" for name in ("roll", "pitch", "qx", "qy", "qw")))
@@ -92,9 +90,6 @@ def test_values_of_a_drone_that_flies():
     assert abs(qx) < 0.01
     assert qw == pytest.approx(1.0, abs=0.02)
     assert logged(wire, "motor.m1")[0] == pytest.approx(39300.0, rel=0.01)
-
-
-# a lab's own tables
 
 
 @pytest.mark.slow
@@ -111,7 +106,6 @@ def test_tables_of_a_real_firmware(files):
 
 
 def test_built_in_tables_agree_with_a_real_firmware(files):
-    """Names and types; what is ours alone is known."""
     own, real = inventory(), inventory(tuple(files))
     for tables in ((own.parameters, real.parameters), (own.logs, real.logs)):
         mine, known = ({each.name: (each.type, each.flags) for each in table.variables} for table in tables)

@@ -48,7 +48,6 @@ def test_one_packet_down_for_each_exchange(link):
 
 
 def test_safelink_loses_and_repeats_nothing(link):
-    """With every third answer lost: all packets arrive once and in order, in both directions."""
     host = secured(link)
     for number in range(20):
         link.send(Port.LOG, 2, bytes((number,)))
@@ -93,7 +92,6 @@ def test_an_outage_empties_the_queue_and_ends(link):
 
 
 def test_losses_cost_retransmissions():
-    """Half of all transmissions are lost: three retransmissions are not always enough, no packet comes twice."""
     link = RadioLink(np.random.default_rng(1), Faults(loss=0.5), 0)
     results = [link.exchange(bytes((0x7C, number % 256)), 3) for number in range(2000)]
     share = np.mean([bool(status & ACK) for status, _, _ in results])

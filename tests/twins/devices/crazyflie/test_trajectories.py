@@ -64,7 +64,6 @@ def test_pieces_of_the_memory(corner):
 
 
 def test_relative_trajectories(corner):
-    """Shifted to where it is; with a relative yaw turned as well, as the firmware does it."""
     start = np.array([2.0, 2.0, 0.4, 0.5 * math.pi])
     assert pose(flown_pieces(corner, start), 0.0) == pytest.approx([2.0, 2.0, 0.4, 0.0])
     assert pose(flown_pieces(corner, start), 1.0) == pytest.approx([3.0, 2.0, 0.4, 0.0])
@@ -73,7 +72,6 @@ def test_relative_trajectories(corner):
 
 
 def test_compressed_pieces():
-    """Constant, linear, cubic and seventh order elements, each against its Bézier curve."""
     start = struct.pack("<4h", 500, -200, 1000, 900)  # mm, tenths of a degree
     first = struct.pack("<BH", 0 | 1 << 2 | 2 << 4 | 0 << 6, 1500) + struct.pack("<h3h", 300, 1000, 1400, 1200)
     high = [600, 700, 800, 900, 1000, 1100, 1250]
@@ -105,7 +103,6 @@ def test_what_is_not_there(corner):
 
 @pytest.mark.slow
 def test_a_trajectory_is_flown():
-    """Uploaded, defined and started by packets; afterwards it hovers at the end, and lands there."""
     wire = Wire().hovering()
     memory = Memories.kinds.index(MemoryKind.TRAJECTORY)
     data = piece(2.0, [c / 2.0**k for k, c in enumerate(RISE)], [], [1.0])
@@ -122,13 +119,9 @@ def test_a_trajectory_is_flown():
     assert wire.after(5.0).position == pytest.approx([0.0, 0.0, 1.0], abs=0.01)
 
 
-# spirals
-
-
 @pytest.mark.parametrize("clockwise", [False, True])
 @pytest.mark.parametrize("sideways", [False, True])
 def test_a_spiral_goes_round_its_centre(clockwise, sideways):
-    """A quarter of a circle that widens and climbs: distance to its centre, speed, and where the nose points."""
     planner, yaw, angle, span = OnboardPlanner(), 0.3, 0.5 * math.pi, 4.0
     start = np.array([0.2, -0.1, 1.0, yaw])
     planner.spiral(

@@ -10,8 +10,6 @@ from agents.protocols.crtp import HighLevel, Location, LogStatus, Port, Setpoint
 from tests.twins.crazyflie_wire import Wire, brushless
 from twins.devices.crazyflie.supervisor import SupervisorState
 
-# commands
-
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
@@ -109,14 +107,10 @@ def test_a_plan_that_is_no_number_locks():
     assert not wire.motors
 
 
-# the floor, motors on
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("made", [Wire, brushless])
 @pytest.mark.parametrize(("thrust", "least", "most"), [(20000, 5.0, 30.0), (5000, 0.0, 0.0)])
 def test_it_skates_with_the_least_thrust(made, thrust, least, most):
-    """By its own estimate, which drifts without motion capture; not with less than the firmware's default."""
     wire = made(external=True)
     wire.set("posCtlPid.thrustMin", "H", thrust)
     assert wire.after(1.0, wire.locate).takeoff(0.5, 1.5) == LogStatus.OK
@@ -127,9 +121,6 @@ def test_it_skates_with_the_least_thrust(made, thrust, least, most):
     assert wire.position[2] == 0.0
     assert least <= math.dist(begin, wire.position) <= most
     assert np.hypot(*wire.velocity[:2]) <= 2.0
-
-
-# what it believes
 
 
 def test_frozen_positions_shoot_it_up():
@@ -148,7 +139,6 @@ def test_frozen_positions_shoot_it_up():
 @pytest.mark.slow
 @pytest.mark.parametrize(("wrong", "far"), [(0.0, 0.02), (20.0, 0.05), (100.0, 1.0)])
 def test_a_wrong_yaw_leads_astray(wrong, far):
-    """A goal ahead is approached on a curve; beyond a right angle not at all."""
     wire = Wire(yaw=math.radians(-wrong))
     wire.vehicle.estimator.turn = math.radians(wrong)
     wire.hovering(0.5)

@@ -58,7 +58,6 @@ def test_steps_in_height(step, rise_ms, overshoot):
 @pytest.mark.slow
 @pytest.mark.parametrize("wait", [1.0, 2.5, 3.3, 6.0])
 def test_landing_from_the_overshoot_ends_on_the_floor(wait):
-    """Ordered as by the bridge; the motors stop on the floor, and it does not hit it."""
     wire = Wire()
     wire.takeoff(1.0, 2.5)
     wire.after(wait).land(1.1 / 0.22)
@@ -79,7 +78,6 @@ def test_thrust_in_hover_carries_the_weight():
 
 @pytest.mark.parametrize("waited_s", [0.2, 3.0])
 def test_raw_thrust_has_no_memory(waited_s):
-    """Thrust of 45,000 accelerates 39,300 of weight, however long too little thrust came before."""
     wire = Wire()
     wire.zero()
     wire.after(waited_s, lambda: wire.thrust(20000))
@@ -94,7 +92,6 @@ def test_raw_thrust_has_no_memory(waited_s):
 
 @pytest.mark.slow
 def test_second_flight_overshoots_as_the_first():
-    """Motors off, the loops forget."""
     wire = Wire().hovering(0.8)
     wire.land(4.0)
     assert not wire.after(9.0).motors
