@@ -52,14 +52,10 @@ def logged(wire, *names):
     return values
 
 
-def test_size_of_the_firmware():
+def test_size_of_the_firmware_and_its_numbers():
     tables = inventory()
-    assert len(tables.parameters.variables) == 402
+    assert (len(tables.parameters.variables), len(tables.logs.variables)) == (402, 637)
     assert sum(bool(variable.flags & EXTENDED) for variable in tables.parameters.variables) == 146
-    assert len(tables.logs.variables) == 637
-
-
-def test_numbers_are_packed_as_in_c():
     assert pack("u8", 257.9) == b"\1"
     assert pack("i16", -1.0) == b"\xff\xff"
     assert pack("half", 1e9) == PACKINGS["half"].pack(math.inf)
@@ -70,10 +66,7 @@ def test_values_of_a_drone_that_stands():
     assert wire.drone.value("system.selftestPassed") == 1
     assert wire.drone.value("deck.bcFlow2") == 1  # without another system of positioning it has a Flow deck
     assert wire.drone.value("pid_rate.roll_kp") == 250.0
-    roll, pitch, yaw = logged(wire, "stabilizer.roll", "stabilizer.pitch", "stateEstimate.yaw")
-    assert 0.1 < abs(roll) < 1.0
-    assert 0.1 < abs(pitch) < 1.0
-    assert yaw == 0.0
+    assert logged(wire, "stabilizer.roll", "stabilizer.pitch", "stateEstimate.yaw") == pytest.approx([0.4, -0.3, 0.0])
     assert logged(wire, "acc.x", "acc.y", "acc.z") == pytest.approx([0.0, 0.0, 1.0], abs=0.03)
     assert logged(wire, "supervisor.accNorm") == pytest.approx([1.0])
     assert logged(wire, "motor.m1", "range.front", "stabilizer.thrust") == [0, 0, 0.0]  # it has no Multi-ranger
@@ -86,13 +79,10 @@ def test_values_of_a_drone_that_flies():
     roll, pitch, qx, qy, qw = logged(wire, *(f"stateEstimate.{name}" for name in ("roll", "pitch", "qx", "qy", "qw")))
     assert pitch < -5.0
     assert abs(roll) < 1.0
-    assert qy > 0.04
-    assert abs(qx) < 0.01
-    assert qw == pytest.approx(1.0, abs=0.02)
+    assert (qx, qy, qw) == pytest.approx((0.0, math.sin(math.radians(-0.5 * pitch)), 1.0), abs=0.02)
     assert logged(wire, "motor.m1")[0] == pytest.approx(39300.0, rel=0.01)
 
 
-@pytest.mark.slow
 def test_tables_of_a_real_firmware(files):
     tables = inventory(tuple(files))
     assert (len(tables.parameters.variables), len(tables.logs.variables)) == (402, 637)
@@ -102,11 +92,7 @@ def test_tables_of_a_real_firmware(files):
     wire = Wire(device={"tables": files, "positioning": {"system": "loco"}})
     assert wire.drone.value("deck.bcLoco") == 1
     assert wire.drone.value("firmware.revision0") == 0.0  # this one has none
-    assert wire.hovering().estimate[2] == pytest.approx(1.0, abs=0.01)
-
-
-def test_built_in_tables_agree_with_a_real_firmware(files):
-    own, real = inventory(), inventory(tuple(files))
+    own, real = inventory(), tables
     for tables in ((own.parameters, real.parameters), (own.logs, real.logs)):
         mine, known = ({each.name: (each.type, each.flags) for each in table.variables} for table in tables)
         shared = known.keys() & mine.keys()
@@ -120,18 +106,17 @@ ENTRY = """{"pm": {"vbat": {"__class__": "LogTocElement", "ident": %d, "group": 
                         "ctype": "%s", "pytype": "<f", "access": 0}}}"""
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("", "no table of a Crazyflie"),
-        ("[]", "no table of a Crazyflie"),
-        ('{"pm": {"vbat": {"ident": 0}}}', "no table of a Crazyflie"),
-        (ENTRY % (3, "float"), "0, 1, 2"),
-        (ENTRY % (0, "float128"), "unknown type float128"),
-    ],
-)
-def test_other_files_are_refused(tmp_path, text, said):
-    file = tmp_path / "table.json"
-    file.write_text(text)
-    with pytest.raises(BodyError, match=said):
-        inventory((str(file),))
+def test_other_files_are_refused(tmp_path):
+    for k, (text, said) in enumerate(
+        (
+            ("", "no table of a Crazyflie"),
+            ("[]", "no table of a Crazyflie"),
+            ('{"pm": {"vbat": {"ident": 0}}}', "no table of a Crazyflie"),
+            (ENTRY % (3, "float"), "0, 1, 2"),
+            (ENTRY % (0, "float128"), "unknown type float128"),
+        )
+    ):
+        file = tmp_path / f"table{k}.json"
+        file.write_text(text)
+        with pytest.raises(BodyError, match=said):
+            inventory((str(file),))

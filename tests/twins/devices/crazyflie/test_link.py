@@ -222,15 +222,11 @@ class Client:
         self.device = CrazyflieTwin(DeviceRequest(request("crazyflie", ["x"]), Faults(**faults)))
         self.socket = self.connected()
 
-        made =
-====
     def close(self):
         self.socket.close()
         self.device.close()
 
     def connected(self):
-        made =
-====
         made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         made.connect(self.device.sockets()[0].getsockname())
         made.setblocking(False)
@@ -296,8 +292,6 @@ def test_silence():
             assert len(client.heard()) == answers
 
 
-
-
 def test_newest_client_is_served_and_told_of_locks():
     with closing(Client()) as client, client.connected() as other:
         client.send(bytes((crtp.header(Port.LINK, 0),)) + b"y", by=other)
@@ -327,5 +321,3 @@ def test_nature_is_that_of_the_other_twin():
     assert vehicle.place[:2] == pytest.approx(state.true_position[:2], abs=1e-3)
     assert abs(vehicle.place[0]) > 1e-3
     assert np.std(noise) == pytest.approx(0.01, rel=0.1)
-
-

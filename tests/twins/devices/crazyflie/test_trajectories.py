@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from numpy.polynomial import Polynomial
 
-from agents.protocols.crtp import COMPRESSED, IN_MEMORY, UNCOMPRESSED, HighLevel, LogStatus, MemoryKind, Port
-from tests.twins.crazyflie_wire import Wire
+from agents.protocols.crtp import COMPRESSED, IN_MEMORY, UNCOMPRESSED, LogStatus, MemoryKind
 from twins.devices.crazyflie.memory import Memories
 from twins.devices.crazyflie.planner import OnboardPlanner, evaluate
 from twins.devices.crazyflie.trajectories import Trajectories
@@ -99,24 +98,6 @@ def test_what_is_not_there(corner):
     for data in (piece(1.0, [1e30]), piece(math.nan), b""):
         with pytest.raises(ValueError, match="no numbers"):
             flown_pieces(uploaded(data, count=1))
-
-
-@pytest.mark.slow
-def test_a_trajectory_is_flown():
-    wire = Wire().hovering()
-    memory = Memories.kinds.index(MemoryKind.TRAJECTORY)
-    data = piece(2.0, [c / 2.0**k for k, c in enumerate(RISE)], [], [1.0])
-    for at in range(0, len(data), 24):
-        where = struct.pack("<BI", memory, at)
-        assert wire.ask(Port.MEMORY, 2, where, data[at : at + 24]) == where + b"\0"
-    assert wire.ask(Port.HIGH_LEVEL, 0, HighLevel.DEFINE, 1, struct.pack("<BBIB", 1, 0, 0, 1))[3] == LogStatus.OK
-    assert wire.plan(HighLevel.START_2, "???Bf", False, False, False, 1, 1.0) == LogStatus.OK
-    assert wire.after(1.0).planned[0] == pytest.approx(0.5)
-    assert not wire.vehicle.planner.finished(wire.t)
-    assert wire.after(4.0).position == pytest.approx([1.0, 0.0, 1.0], abs=0.01)
-    assert wire.vehicle.planner.finished(wire.t)
-    assert wire.plan(HighLevel.START, "??Bf", True, True, 1, 1.0) == LogStatus.OK  # back, protocol 9
-    assert wire.after(5.0).position == pytest.approx([0.0, 0.0, 1.0], abs=0.01)
 
 
 @pytest.mark.parametrize("clockwise", [False, True])

@@ -3,62 +3,53 @@
 import math
 import struct
 
-import numpy as np
 import pytest
 
 from agents.protocols.crtp import HighLevel, Location, LogStatus, Port, Setpoint
-from tests.twins.crazyflie_wire import Wire, brushless
+from tests.twins.crazyflie_wire import Wire
 from twins.devices.crazyflie.supervisor import SupervisorState
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("takeoff", "land"),
-    [
+def test_older_commands_are_flown():
+    up, down, fast = HighLevel.TAKEOFF_VELOCITY, HighLevel.LAND_VELOCITY, "f?f?f"
+    for takeoff, land in (
         ((HighLevel.OLD_TAKEOFF, "ff", 0.5, 1.5), (HighLevel.OLD_LAND, "ff", 0.0, 1.5)),
-        (
-            (HighLevel.TAKEOFF_VELOCITY, "f?f?f", 0.5, False, 0.0, True, 0.5),
-            (HighLevel.LAND_VELOCITY, "f?f?f", 0.0, False, 0.0, True, 0.5),
-        ),
-        (
-            (HighLevel.TAKEOFF_VELOCITY, "f?f?f", 0.5, True, 0.0, True, 0.0),
-            (HighLevel.LAND_VELOCITY, "f?f?f", 0.5, True, 0.0, True, 0.0),
-        ),
-    ],
-)
-def test_older_commands_are_flown(takeoff, land):
-    wire = Wire()
-    assert wire.plan(*takeoff) == LogStatus.OK
-    assert wire.after(3.5).position == pytest.approx([0.0, 0.0, 0.5375], abs=0.01)  # it overshoots
-    assert wire.plan(HighLevel.OLD_GO_TO, "?fffff", False, 0.3, -0.2, 0.6, 0.0, 2.0) == LogStatus.OK
-    assert wire.after(12.0).position == pytest.approx([0.3, -0.2, 0.6], abs=0.01)
-    assert wire.plan(*land) == LogStatus.OK
-    assert not wire.after(4.0).motors
-    assert wire.position[2] == 0.0
+        ((up, fast, 0.5, False, 0.0, True, 0.5), (down, fast, 0.0, False, 0.0, True, 0.5)),
+        ((up, fast, 0.5, True, 0.0, True, 0.0), (down, fast, 0.5, True, 0.0, True, 0.0)),
+    ):
+        wire = Wire()
+        assert wire.plan(*takeoff) == LogStatus.OK
+        assert wire.after(3.5).position == pytest.approx([0.0, 0.0, 0.5375], abs=0.01)  # it overshoots
+        assert wire.plan(HighLevel.OLD_GO_TO, "?fffff", False, 0.3, -0.2, 0.6, 0.0, 2.0) == LogStatus.OK
+        assert wire.after(12.0).position == pytest.approx([0.3, -0.2, 0.6], abs=0.01)
+        assert wire.plan(*land) == LogStatus.OK
+        assert not wire.after(4.0).motors
+        assert wire.position[2] == 0.0
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("old", "new", "values"),
+    ("kind", "values", "sense"),
     [
-        (Setpoint.OLD_VELOCITY, Setpoint.VELOCITY, (0.0, 0.0, 0.0, 30.0)),
-        (Setpoint.OLD_HOVER, Setpoint.HOVER, (0.0, 0.0, 30.0, 1.0)),
-        (Setpoint.OLD_HEIGHT, Setpoint.HEIGHT, (0.0, 0.0, 30.0, 1.0)),
+        (Setpoint.OLD_VELOCITY, (0.0, 0.0, 0.0, 30.0), -1.0),
+        (Setpoint.OLD_HOVER, (0.0, 0.0, 30.0, 1.0), -1.0),
+        (Setpoint.OLD_HEIGHT, (0.0, 0.0, 30.0, 1.0), -1.0),
+        (Setpoint.HOVER, (0.0, 0.0, 30.0, 1.0), 1.0),
+        (Setpoint.HEIGHT, (0.0, 0.0, 30.0, 1.0), 1.0),
     ],
 )
-def test_older_setpoints_turn_the_other_way(old, new, values):
-    yaws = []
-    for kind in (old, new):
-        wire = Wire().hovering()
-        yaws.append(wire.after(1.0, lambda: wire.setpoint(kind, *values)).yaw)  # noqa: B023
-        assert wire.position[2] == pytest.approx(1.0, abs=0.01)
-    assert yaws[0] == pytest.approx(-yaws[1])
-    assert abs(yaws[1]) == pytest.approx(math.radians(30.0), rel=0.05)
+def test_older_setpoints_turn_the_other_way(kind, values, sense):
+    wire = Wire().hovering()
+    wire.wait(1.0, lambda: wire.setpoint(kind, *values))
+    assert wire.position[2] == pytest.approx(1.0, abs=0.01)
+    assert wire.yaw == pytest.approx(sense * math.radians(30.0), rel=0.05)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("lean", "axis"), [((10.0, 0.0), 1), ((0.0, 10.0), 0)])
-@pytest.mark.parametrize("kind", [Setpoint.HEIGHT, Setpoint.OLD_HEIGHT])
+@pytest.mark.parametrize(
+    ("kind", "lean", "axis"), [(Setpoint.HEIGHT, (10.0, 0.0), 1), (Setpoint.OLD_HEIGHT, (0.0, 10.0), 0)]
+)
 def test_roll_and_pitch_are_flown(kind, lean, axis):
     """To the right, and backwards with the nose up: 1.7 m/s² at 10°, reached with the lag of tilting, 0.2 s."""
     wire = Wire().hovering()
@@ -81,19 +72,12 @@ def test_thrust_needs_a_zero_first():
     wire.zero()
     assert wire.after(1.0, lambda: wire.thrust(45000)).motors
     assert wire.position[2] > 0.1
-    wire = Wire()
-    wire.zero()
-    assert wire.after(1.0, lambda: wire.thrust(20000)).motors
-    assert wire.position.tolist() == [0.0, 0.0, 0.0]  # too little to carry it
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("height", "end"), [(0.5, lambda wire: wire.arm(on=False)), (0.8, lambda wire: wire.plan(HighLevel.STOP))]
-)
-def test_a_flat_fall_is_a_landing(height, end):
-    wire = Wire().hovering(height)
-    end(wire)
+def test_a_flat_fall_is_a_landing():
+    wire = Wire().hovering(0.8)
+    wire.plan(HighLevel.STOP)
     assert not wire.after(0.1).motors
     assert wire.after(6.0).position[2] == 0.0
     assert wire.state == SupervisorState.READY
@@ -108,10 +92,9 @@ def test_a_plan_that_is_no_number_locks():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("made", [Wire, brushless])
 @pytest.mark.parametrize(("thrust", "least", "most"), [(20000, 5.0, 30.0), (5000, 0.0, 0.0)])
-def test_it_skates_with_the_least_thrust(made, thrust, least, most):
-    wire = made(external=True)
+def test_it_skates_with_the_least_thrust(thrust, least, most):
+    wire = Wire(external=True)
     wire.set("posCtlPid.thrustMin", "H", thrust)
     assert wire.after(1.0, wire.locate).takeoff(0.5, 1.5) == LogStatus.OK
     wire.after(2.0, wire.locate).go_to(0.0, 0.0, -1.0, 0.0, 4.0)
@@ -120,7 +103,6 @@ def test_it_skates_with_the_least_thrust(made, thrust, least, most):
     assert wire.after(15.0).motors
     assert wire.position[2] == 0.0
     assert least <= math.dist(begin, wire.position) <= most
-    assert np.hypot(*wire.velocity[:2]) <= 2.0
 
 
 def test_frozen_positions_shoot_it_up():
@@ -137,16 +119,14 @@ def test_frozen_positions_shoot_it_up():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("wrong", "far"), [(0.0, 0.02), (20.0, 0.05), (100.0, 1.0)])
-def test_a_wrong_yaw_leads_astray(wrong, far):
+@pytest.mark.parametrize(("wrong", "least", "most"), [(20.0, 0.0, 0.05), (100.0, 1.0, math.inf)])
+def test_a_wrong_yaw_leads_astray(wrong, least, most):
     wire = Wire(yaw=math.radians(-wrong))
     wire.vehicle.estimator.turn = math.radians(wrong)
     wire.hovering(0.5)
     assert wire.vehicle.pose[3] == pytest.approx(0.0)
     wire.go_to(0.5, 0.0, 0.5, 0.0, 2.0)
-    away = math.dist(wire.after(8.0).position[:2], [0.5, 0.0])
-    assert wire.vehicle.yaw == pytest.approx(0.0, abs=0.01)
-    assert away < far if wrong < 90.0 else away > far
+    assert least < math.dist(wire.after(8.0).position[:2], [0.5, 0.0]) < most
 
 
 def test_an_external_attitude_corrects_the_yaw():
