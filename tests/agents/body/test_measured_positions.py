@@ -7,17 +7,14 @@ from types import SimpleNamespace
 import pytest
 
 from agents.body.external_pose import FASTEST, PATIENCE_S, External
-from agents.body.fleet import assemble
 from agents.body.interface import BodyState
 from agents.body.measured_positions import FROZEN, SECOND, MeasuredPositions
 from agents.decision.lifecycle import Phase
 from agents.network import messages
 from agents.network.keys import Keys
-from agents.runtime.loop import Runtime, Setup
 from agents.vectors import UNKNOWN, ZERO
-from experiments.definition import bodies
 from experiments.definition.experiment import RobotTable
-from experiments.definition.plan import Plan
+from tests.agents.runtime.process import process, twins
 from tests.fuzz.messages import sent
 from tests.network import Net, Sample
 from tests.small import small
@@ -59,14 +56,11 @@ def flight_events(ahead, seconds, frozen_s=inf):
 
     From `frozen_s` on they stay the same.
     """
-    plan = Plan(small({"T": RobotTable(kind="tello", start=[0.1, 0.2], hover=0.5, position="external")}))
-    said = []
-    measured, noise = (0.0, 0.0, 0.0), Random(1)
-    net = Net()
+    tello = small({"T": RobotTable(kind="tello", start=[0.1, 0.2], hover=0.5, position="external")})
+    said, measured, noise, net = [], ZERO, Random(1), Net()
     with net.worn():
-        body = assemble(bodies.body_request(plan, ("T",), 1))
-        setup = Setup(KEYS, [], "json", 50.0, lifeline=False, externally_measured=[True])
-        runtime = Runtime([plan.assignment("T")], body, setup)
+        body = twins(tello)
+        runtime = process(tello, body, externally_measured=[True])
         body.open()
         runtime.subscribe_to_stops(net.session)
         runtime.join(net.session)
@@ -102,11 +96,8 @@ def test_stamps_behind_are_reported_before_positions_expire():
     _, said = flight_events(lambda t: 0.0 if t < 2.0 else -0.4, 4.0)
     (t, text), *_ = [each for each in said if "clock" in each[1]]
     assert t == pytest.approx(2.5, abs=0.03)
-    assert text == "warn: the clock that stamps its positions is off: positions of T are stamped 0.4 s behind"
+    assert text.endswith("positions of T are stamped 0.4 s behind")
     assert not any("position is lost" in text for _, text in said)
-
-
-def test_waiting_robot_reports_positions_of_another_clock():
     runtime, _ = flight_events(lambda _: -3600.0, 0.5)
     assert runtime.robots[0].lifecycle.reason == "no position of its own: positions of T are stamped 3.6e+03 s behind"
 
@@ -165,9 +156,6 @@ def test_the_first_of_two_sources_stays_until_silent():
         assert not state.note
 
 
-# ---------------------------------------------------------------- velocities, and poses that replace the own ones
-
-
 def estimated(t, stamp, position, velocity=UNKNOWN, external=None):
     """Velocity at t [s] of a robot that was at a position at a `stamp` [s]."""
     state = BodyState(stamp, position, velocity, 0.0)
@@ -180,25 +168,25 @@ def test_velocity_follows_from_positions():
     found = [estimated(t, t, (0.2 * min(t, 1.0), 0.0, 0.0), external=external) for t in (0.01 * k for k in range(151))]
     assert found[100] == pytest.approx((0.2, 0.0, 0.0), abs=1e-3)
     assert 0.0 <= found[150][0] < 0.003  # it stands now
-
-
-def test_velocity_is_kept_if_measured_unknown_if_old():
-    assert estimated(0.0, 0.0, ZERO, (0.0, 0.7, 0.0)) == (0.0, 0.7, 0.0)
+    assert estimated(0.0, 0.0, ZERO, (0.0, 0.7, 0.0)) == (0.0, 0.7, 0.0), "it is measured"
     external = External()
     assert estimated(0.1, 0.0, ZERO, external=external) == ZERO
-    assert all(map(isnan, estimated(PATIENCE_S, 0.0, ZERO, external=external)))
-    assert all(map(isnan, estimated(0.1, 0.0, (nan, 0.0, 0.0))))
+    for unknown in (estimated(PATIENCE_S, 0.0, ZERO, external=external), estimated(0.1, 0.0, (nan, 0.0, 0.0))):
+        assert all(map(isnan, unknown))
 
 
 def test_poses_that_are_old_or_jump_are_refused():
     external = External()
-    assert external.update(1.0, (0.0, 0.0, 0.0), 0.0)
-    assert not external.update(1.0, (0.0, 0.0, 0.0), 0.0)
-    assert not external.update(1.1, (nan, 0.0, 0.0), 0.0)
-    assert not external.update(1.1, (FASTEST * 0.1 + 0.1, 0.0, 0.0), 0.0)
+    taken = [
+        external.update(1.0, ZERO, 0.0),
+        external.update(1.0, ZERO, 0.0),
+        external.update(1.1, (nan, 0.0, 0.0), 0.0),
+        external.update(1.1, (FASTEST * 0.1 + 0.1, 0.0, 0.0), 0.0),
+    ]
+    assert taken == [True, False, False, False]
     assert (external.refused, external.time) == (1, 1.0)
     assert external.update(1.0 + PATIENCE_S, (9.0, 0.0, 0.0), 0.0)
-    assert external.velocity == (0.0, 0.0, 0.0)
+    assert external.velocity == ZERO
 
 
 def test_own_yaw_continues_without_measured_yaw():
