@@ -1,31 +1,32 @@
-"""Words, output and interruption of a process."""
+"""Words, output and interruption of a process, and its lifeline."""
 
 import os
 import signal
+import threading
 
 import pytest
 
-from agents.network.endpoints import DEFAULT_ENDPOINT
+from agents.network.endpoints import DEFAULT_ENDPOINT, free_endpoint
 from agents.network.lab import LabError
 from agents.runtime.command_line import NetworkLaunch, Output, interrupts, on_termination, parse
+from agents.runtime.lifeline import Lifeline
+from tests.commands import started
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_each_signal_is_handled_while_listening(number):
     before = signal.getsignal(number)
     told = []
-    with on_termination(lambda: told.append(1)):
+
+    def end_twice():
         os.kill(os.getpid(), number)
         os.kill(os.getpid(), number)
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError), on_termination(lambda: told.append(1)):
+        end_twice()
     assert told == [1, 1]
     assert signal.getsignal(number) is before
-
-
-def test_what_was_before_comes_back_after_an_error():
-    before = signal.getsignal(signal.SIGTERM)
-    with pytest.raises(ZeroDivisionError), on_termination(print):
-        _ = 1 / 0
-    assert signal.getsignal(signal.SIGTERM) is before
 
 
 def test_the_arguments_of_the_network():
@@ -50,30 +51,65 @@ def test_output_waits_for_no_reader(pipe):
     print("nobody reads", file=out, flush=True)
 
 
-@pytest.fixture
-def hang_up():
-    """Sets what becomes of SIGHUP."""
-    before = signal.getsignal(signal.SIGHUP)
-    yield lambda handler: signal.signal(signal.SIGHUP, handler)
+@pytest.fixture(params=[signal.SIG_DFL, signal.SIG_IGN], ids=["terminal", "nohup"])
+def hang_up(request):
+    """What becomes of SIGHUP."""
+    before = signal.signal(signal.SIGHUP, request.param)
+    yield request.param
     signal.signal(signal.SIGHUP, before)
 
 
 def test_the_first_asks_and_the_second_insists(hang_up):
-    hang_up(signal.SIG_DFL)
     with interrupts() as interrupted:
         assert not interrupted()
         signal.raise_signal(signal.SIGHUP)
+        assert interrupted() == (hang_up == signal.SIG_DFL), "who was started by nohup outlives its terminal"
+        if hang_up == signal.SIG_IGN:
+            signal.raise_signal(signal.SIGINT)
         assert interrupted()
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGTERM)
-    assert signal.getsignal(signal.SIGHUP) == signal.SIG_DFL
+    assert signal.getsignal(signal.SIGHUP) == hang_up
 
 
-def test_who_was_started_by_nohup_outlives_its_terminal(hang_up):
-    hang_up(signal.SIG_IGN)
-    with interrupts() as interrupted:
-        signal.raise_signal(signal.SIGHUP)
-        assert not interrupted()
-        signal.raise_signal(signal.SIGINT)
-        assert interrupted()
-    assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+@pytest.fixture
+def lifeline_end(pipe):
+    """Runs a lifeline after `parts` were written to it, and its far end was closed; returns why it was lost."""
+
+    def lifeline_end(*parts, fd=pipe[0], timeout_s=60.0, **given):
+        lost = threading.Event()
+        for part in parts:
+            os.write(pipe[1], part)
+        if parts:
+            os.close(pipe.pop())
+        line = Lifeline(lost, timeout_s=timeout_s, fd=fd, **given)
+        line.start()
+        line.join(10.0)
+        assert lost.is_set()
+        return line.reason
+
+    return lifeline_end
+
+
+def test_each_end_of_the_lifeline_is_loss(lifeline_end, pipe):
+    assert lifeline_end(timeout_s=0.05) == "nothing from the starter for 0.05 s"
+    closed = os.dup(pipe[0])
+    os.close(closed)
+    assert lifeline_end(fd=closed) == "the lifeline broke: Bad file descriptor"
+    assert lifeline_end(b"..") == "the starter is gone"
+
+
+def test_whole_lines_pass_without_heartbeats(lifeline_end):
+    lines = []
+    lifeline_end(b"\n\nclock -0.", b"2001\n", b"\n\nclock 1\nx", b"x" * 10_000, on_line=lines.append)
+    assert lines == [b"clock -0.2001", b"clock 1"]
+
+
+@pytest.mark.mechanism("lifeline: the router ends with its starter")
+@pytest.mark.system
+def test_router_ends_with_its_starter():
+    endpoint = free_endpoint(preferred_port=0)
+    with started("-m", "agents.runtime.router", "--lifeline", "--listen", endpoint) as process:
+        assert process.stdout.readline() == f"router ready on {endpoint}\n"
+        _, errors = process.communicate(timeout=30)
+        assert (process.returncode, errors) == (0, "router: ends with its starter\n")

@@ -80,12 +80,15 @@ def test_restarted_leader_does_not_repeat_its_plan():
 
 
 def test_plan_of_a_follower_keeps_its_origin():
-    before = Life(START, 0.0, listens=True)
-    assert before.robot.origin is None  # its leg is yet to come
+    life = Life(START, 0.0, listens=True)
+    assert life.robot.origin is None  # its leg is yet to come
     first = Life(START, BEGINS_S, listens=True)
     assert first.robot.origin[:2] == START
     second = Life((START[0] + WAY, START[1]), 30.0, first.robot.origin, listens=True)
     assert second.robot.origin[:2] == START
+    life.robot.lifecycle.phase = AIRBORNE
+    start = messages.Order("start", at=UTC + life.bench.t, origin=(0.0, math.nan, 0.0, 0.0))
+    assert "origin" in life.order(start)
 
 
 class Clock(Law, frozen=True):
@@ -107,38 +110,34 @@ class Clock(Law, frozen=True):
 def test_restarted_robot_steps_before_it_runs():
     assignment = replace(Plan(pair()).assignment("B"), law=Clock(), start=None, starts=())
     bench = Bench(assignment, (0.0, 0.0, 0.0))
-    stepping = bench.robot.stepping
+    stepping, life = bench.robot.stepping, bench.life
 
-    def hear(bench):
-        bench.hear(0, (0.5, 0.0, 0.0))
+    def step(seconds):
+        bench.step(seconds, lambda bench: bench.hear(0, (0.5, 0.0, 0.0)))
 
-    bench.step(0.05, hear)
-    late, began = messages.Order("takeoff", at=UTC - 1e5), UTC + bench.t - 30.0
-    assert "not within this experiment" in carry_out(bench.robot, late, bench.t, UTC)[0]
-    assert carry_out(bench.robot, messages.Order("takeoff", at=began), bench.t, UTC)[0] == ""
-    bench.step(0.02, hear)
-    while bench.life.phase != AIRBORNE:
+    def order(name, at):
+        return carry_out(bench.robot, messages.Order(name, at=at), bench.t, UTC)[0]
+
+    step(0.05)
+    began = UTC + bench.t - 30.0
+    assert "not within this experiment" in order("takeoff", UTC - 1e5)
+    assert order("takeoff", began) == ""
+    step(0.02)
+    while life.phase != AIRBORNE:
         assert bench.robot.words == ()
-        bench.step(0.01, hear)
-    bench.step(1.0, hear)
+        step(0.01)
+    step(1.0)
     since = UTC + bench.t - began
-    assert bench.life.phase == AIRBORNE
+    assert life.phase == AIRBORNE
     assert stepping.memory["time"][0] == pytest.approx(since, abs=0.11)
     assert bench.robot.words == (("time", (pytest.approx(stepping.memory["time"][0]),)),)
     assert stepping.measures == {"moves": 0.0, "step_s": pytest.approx(0.1)}
     assert bench.robot.setpoint[:2] == (0.0, 0.0)
-    assert carry_out(bench.robot, messages.Order("start", at=began), bench.t, UTC)[0] == ""
-    bench.step(0.5, hear)
+    assert order("start", began) == ""
+    step(0.5)
     assert stepping.memory["time"][0] == pytest.approx(since + 0.5, abs=0.11)
     assert stepping.measures == {"moves": 1.0, "step_s": pytest.approx(0.1)}
     assert bench.robot.setpoint[0] > 0.0
-
-
-def test_start_with_unknown_origin_is_refused():
-    life = Life(START, 0.0)
-    life.robot.lifecycle.phase = AIRBORNE
-    start = messages.Order("start", at=UTC + life.bench.t, origin=(0.0, math.nan, 0.0, 0.0))
-    assert "origin" in life.order(start)
 
 
 def test_repeated_start_keeps_the_ticks():

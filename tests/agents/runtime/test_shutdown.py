@@ -1,12 +1,17 @@
-"""A process whose loop has ended lands, stops and closes its bodies, whatever fails on the way."""
+"""Bodies land, stop and close when their loop ends, whatever fails on the way, and when it hangs."""
 
 from __future__ import annotations
 
+import os
+import signal
 import threading
+import time
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
+import psutil
 import pytest
 
 from agents.body.interface import call_all
@@ -16,14 +21,17 @@ from agents.network.name_ownership import NameKeeper
 from agents.robot import Robot
 from agents.runtime import loop
 from agents.runtime.descent import Descent, DescentTiming
+from agents.runtime.watchdog import HUNG, Watchdog
 from agents.ticks import Ticks
 from experiments.definition.experiment import Arena
 from experiments.definition.plan import Plan
 from tests.agents.runtime.process import DRONE, QUICK, Airborne, process
 from tests.cases import mostly_slow
+from tests.commands import started
 from tests.fuzz.messages import sent
 from tests.network import Net
 from tests.small import small
+from tests.waiting import until
 
 STOP = sent("park/estop", messages.Stop("a test", "to see"))[0]
 
@@ -54,19 +62,12 @@ def test_shutdown_tries_everything_and_raises(broken):
     assert "the loop breaks" in chain
 
 
-def test_robot_is_stopped_once_it_is_down():
+@pytest.mark.parametrize("limits", [{"landing_s": 30.0}, {"landing_s": 0.05, "slowest": 2.5 / 20.0}], ids=str)
+def test_robot_is_stopped_once_it_is_down(limits):
     body = Airborne(steps=10)
-    run_and_break(body, timing=replace(QUICK, landing_s=30.0))
+    run_and_break(body, timing=replace(QUICK, **limits))  # at the slowest, it takes 20 s from the ceiling of 2.5 m
     assert body.steps <= 0
     assert body.calls == ["open", "land", "stop", "close"]
-
-
-@pytest.mark.slow
-def test_slow_descent_is_not_stopped_in_flight():
-    body = Airborne(steps=100)  # a second
-    slow = replace(QUICK, landing_s=0.05, slowest=2.5 / 20.0)  # from the ceiling of 2.5 m it takes 20 s
-    run_and_break(body, timing=slow)
-    assert body.steps <= 0
 
 
 @pytest.mark.parametrize(("height", "down_s"), [(1.0, 10.0), (6.0, 30.0)])
@@ -156,3 +157,104 @@ def test_stop_between_ticks_yields_the_processor(monkeypatch):
     body.command = command
     run_and_break(body)
     assert done == [done[0], loop.STOP_YIELD_S, done[0]]
+
+
+class Kennel:
+    """A watchdog and its body, which writes down what it is told, and hangs in what it was asked to hang in."""
+
+    def __init__(self, down_s: float = 10.0, silence_s: float = 0.1, stuck: str = "") -> None:
+        self.orders, self.alarms, self.ends = [], [], []
+        self.stuck, self.never = stuck, threading.Event()
+        self.land, self.stop = partial(self.take, "land"), partial(self.take, "stop")
+        self.dog = Watchdog(
+            self, (0, 1), alarm=self.alarms.append, silence_s=silence_s, down_s=down_s, end=self.ends.append
+        )
+
+    def take(self, what: str, rows: Sequence[int]) -> None:
+        assert rows == (0, 1)
+        self.orders.append(what)
+        if self.stuck == what:
+            self.never.wait(10.0)
+
+    def __enter__(self) -> Kennel:
+        self.dog.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.dog.end()
+        self.never.set()
+
+    def beat_for(self, seconds: float) -> None:
+        end, pause = time.monotonic() + seconds, threading.Event()
+        while time.monotonic() < end:
+            self.dog.beat()
+            pause.wait(0.01)
+
+
+@pytest.mark.slow
+def test_hanging_loop_is_landed_and_may_recover():
+    with Kennel(silence_s=0.5) as kennel:
+        kennel.beat_for(1.0)
+        assert (kennel.orders, kennel.alarms, kennel.dog.tripped) == ([], [], "")
+        until(lambda: kennel.orders and kennel.alarms)
+        assert kennel.dog.tripped == kennel.alarms[0]
+        assert kennel.dog.tripped.startswith("its control loop hangs: no tick for ")
+        assert kennel.dog.forgive() == kennel.alarms[0]
+        assert not kennel.dog.tripped
+        kennel.beat_for(1.0)
+    assert set(kennel.orders) == {"land"}
+    assert len(kennel.alarms) == 1
+    assert not kennel.ends
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stuck", ["", "land", "stop"])
+def test_endless_hang_is_cut_and_ended(stuck):
+    with Kennel(down_s=0.8, stuck=stuck) as kennel:
+        until(lambda: kennel.ends)
+    assert kennel.ends == [HUNG]
+    assert kennel.orders[-1] == "stop"
+    assert kennel.orders.count("stop") == 1
+    assert kennel.orders.count("land") == 1 if stuck == "land" else kennel.orders.count("land") >= 2
+
+
+FROZEN = """
+import select, sys, threading
+from agents.runtime.watchdog import Watchdog
+def say(text):
+    sys.stdout.write(text + "\\n")  # at once: several threads do so
+    sys.stdout.flush()
+class Body:
+    def land(self, rows): say("landed")
+    stop = land
+dog = Watchdog(Body(), None, alarm=say, silence_s=0.5, down_s=0.1)
+dog.start()
+print("runs", flush=True)
+pause, left = threading.Event(), 80
+while left:
+    dog.beat()
+    pause.wait(0.01)
+    left -= len(select.select([sys.stdin], [], [], 0.0)[0])  # from the end of its input on
+print("over", flush=True)
+threading.Event().wait()
+"""
+
+
+@pytest.mark.mechanism("watchdog: suspended process")
+@pytest.mark.system
+def test_frozen_process_is_no_hanging_loop():
+    """And one that hangs for good ends."""
+    with started("-c", FROZEN) as process:
+        assert process.stdout.readline() == "runs\n"
+        os.kill(process.pid, signal.SIGSTOP)
+        until(lambda: psutil.Process(process.pid).status() == psutil.STATUS_STOPPED, "it is frozen")
+        frozen = time.monotonic()
+        until(lambda: time.monotonic() > frozen + 1.0, "it was frozen for twice as long as the watchdog allows")
+        os.kill(process.pid, signal.SIGCONT)
+        out, _ = process.communicate(timeout=30)
+    assert process.returncode == HUNG
+    before, *rest = out.splitlines()
+    (alarm,) = [line for line in rest if line != "landed"]
+    assert before == "over"
+    assert alarm.startswith("its control loop hangs: no tick for ")
+    assert "landed" in rest

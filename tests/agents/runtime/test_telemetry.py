@@ -1,19 +1,22 @@
-"""Telemetry of robots that receive much, or do not know where they are."""
+"""Telemetry of robots that receive much, or do not know where they are; and range readings on the network."""
 
 from copy import copy
-from math import pi
+from math import nan, pi
 from types import SimpleNamespace
 
 import pytest
 
-from agents.network import messages, pubsub
+from agents.body.interface import BodyState, RangeScan
+from agents.network import messages, pubsub, validation
 from agents.network.keys import Keys
 from agents.robot import Robot
+from agents.runtime import range_inbox
 from agents.runtime.pose_inbox import MAX_UNREPORTED, PoseInbox
 from agents.runtime.telemetry import Counts, TelemetryPublisher
 from agents.vectors import UNKNOWN
 from experiments.definition.plan import Plan
 from tests.agents.runtime.process import twins
+from tests.fuzz.messages import sent
 from tests.network import Net
 from tests.small import pair
 
@@ -74,6 +77,8 @@ def test_blind_robot_reports_received_poses(a):
     (state,) = a.report(0.04, velocity=UNKNOWN)
     assert state.position is not None
     assert (state.velocity, state.received) == (None, [])
+    (state,) = a.report(0.06, yaw=2000.0 * pi + 0.5, true_yaw=-2000.0 * pi + 0.5)
+    assert (state.yaw, state.true_yaw) == pytest.approx((0.5, 0.5), abs=1e-9)
 
 
 def test_waiting_receipts_are_bounded(a):
@@ -85,6 +90,35 @@ def test_waiting_receipts_are_bounded(a):
     assert {state.seq for state in states} == {1}
 
 
-def test_reported_yaw_is_wrapped(a):
-    (state,) = a.report(0.02, yaw=2000.0 * pi + 0.5, true_yaw=-2000.0 * pi + 0.5)
-    assert (state.yaw, state.true_yaw) == pytest.approx((0.5, 0.5), abs=1e-9)
+def test_sweep_as_a_message():
+    scan = RangeScan(2.5, (0.0, 0.5, 1.0), (0.0,) * 3, (0.12345678, nan, 1.0))
+    ranges = range_inbox.message("KH01", 1000.0, scan)
+    assert ranges == messages.Ranges("KH01", 1002.5, [0.0, 0.5, 1.0], [0.0, 0.0, 0.0], [0.123457, None, 1.0])
+    validation.check_ranges(ranges, now=1002.5)
+
+
+def test_newest_sweep_is_known_until_old():
+    net = Net()
+    inbox = range_inbox.RangeInbox(net.session, KEYS, ("CF01", "KH01"), [1])
+
+    def known(at, *distance, robot="KH01", stamp=None):
+        """The sweep that is known at a time [s], after one of that time or `stamp` was received."""
+        angles = [0.0] * len(distance)
+        message = messages.Ranges(robot, UTC + (stamp or at), angles, angles, list(distance))
+        if distance:
+            net.deliver(sent(KEYS.ranges("KH01"), message)[0])
+        return inbox.read(UTC, at)[1]
+
+    assert known(10.0) is None
+    first = known(10.0, 0.5, None)
+    assert first.distance == pytest.approx((0.5, nan), nan_ok=True)
+    assert first.time == pytest.approx(10.0, abs=1e-6)
+    assert known(10.5) is first, "nothing new costs nothing"
+    states = [BodyState(), BodyState()]
+    inbox.replace_scans(states, UTC, 10.5)
+    assert [state.scan for state in states] == [None, first]
+    assert known(10.5, 0.7, 0.8, stamp=9.5) is first, "it was overtaken"
+    assert known(10.5, 0.7, 0.8, robot="CF01") is first
+    assert (inbox.malformed, inbox.trouble) == (1, "ranges of 'CF01' on the key of 'KH01'")
+    assert known(10.5, 0.9, stamp=10.2).distance == (0.9,)
+    assert known(11.3) is None, "a second later it says nothing of where things are"
