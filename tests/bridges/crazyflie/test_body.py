@@ -1,40 +1,39 @@
 """The Crazyflie bridge over the real cflib, against protocol twins: what it does is read off the twins' own state."""
 
-import math
+import os
+import signal
+import socket
 import struct
+import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
 
 from agents.body.interface import BodyError
+from agents.protocols.crazyflie import CrazyflieSettings, Outside, capacity, overload
 from agents.protocols.crtp import MemoryKind
+from bridges.crazyflie import link
 from tests.bridges.crazyflie_flight import connected, connected_twins, motors, supervised, truth
+from tests.commands import started
+from tests.requests import request
+from tests.twins.loopback import Served
+from tests.waiting import until
+from twins.devices.crazyflie.device import CrazyflieTwin
 from twins.devices.crazyflie.supervisor import SupervisorState
+from twins.devices.device import Faults
 
-pytestmark = pytest.mark.system
-
+RADIO = "radio://0/80/2M/E7E7E7E701"
+LIGHTHOUSE = {"system": "lighthouse"}
 SWEEP = {"phase": 0.1, "tilt": 0.02, "curve": 0.0, "gibmag": 0.0, "gibphase": 1.0, "ogeemag": 0.0, "ogeephase": 1.5}
 TURN = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
-BRUSHLESS = {"platform": "brushless"}
 
 
-def lighthouse_file(folder: Path, *numbers: int) -> str:
-    stations = {number: {"origin": [number + 0.25, 0.5, 2.0], "rotation": TURN} for number in numbers}
-    calibrations = {number: {"sweeps": [SWEEP, SWEEP], "uid": 1000 + number} for number in numbers}
-    kind = {"type": "lighthouse_system_configuration", "version": "1", "systemType": 2}
-    path = folder / "stations.yaml"
-    path.write_text(yaml.safe_dump(kind | {"geos": stations, "calibs": calibrations}))
-    return str(path)
-
-
+@pytest.mark.system
 def test_flight_and_next_session():
     """Take-off, a goal by streamed positions, landing; and again by another client, which the first must not hinder."""
-    begin = time.monotonic()
     with connected_twins() as (twin, process):
-        assert time.monotonic() - begin < 5.0
         process.until(lambda: process.body.inspect(0).firmware == "twin", "version of the firmware")
         assert 3.0 < process.body.inspect(0).volts < 4.3
         assert process.body.inspect(0).capacity_hz is None  # no radio carries it
@@ -58,18 +57,8 @@ def test_flight_and_next_session():
         assert supervised(twin) != SupervisorState.LOCKED
 
 
-def test_a_goal_with_a_yaw():
-    """Sent as polynomials, of which only the parts that change are written; the drone turns, and flies on at yaw 0."""
-    with connected_twins() as (twin, process):
-        process.takeoff(0.3)
-        for goal in ((0.3, -0.2, 0.5, 1.2), (0.2, -0.2, 0.4, -2.0), (0.2, 0.0, 0.4, 0.0)):
-            process.lead(goal)
-            process.until(lambda: np.abs(truth(twin) - goal[:3]).max() < 0.03, "place")  # noqa: B023
-            process.until(lambda: math.cos(twin.truth()[1][0] - goal[3]) > 0.999, "yaw")  # noqa: B023
-        process.cut()
-
-
 @pytest.mark.mechanism("Crazyflie bridge: emergency stop")
+@pytest.mark.system
 def test_emergency_stop():
     """Motors off in mid-air; the twin is locked, says so, and refuses to fly again."""
     with connected_twins() as (twin, process):
@@ -84,16 +73,7 @@ def test_emergency_stop():
         assert truth(twin)[2] == 0.0
 
 
-def test_parameters_are_set():
-    with connected_twins(device={"parameters": {"hlCommander.vtoff": 0.7, "stabilizer.controller": 2}}) as (twin, _):
-        value = twin.device.drones[0].value
-        assert (value("posCtlPid.thrustMin"), value("stabilizer.controller")) == (5000, 2)
-        assert value("hlCommander.vtoff") == pytest.approx(0.7)
-
-
-LIGHTHOUSE = {"system": "lighthouse"}
-
-
+@pytest.mark.system
 @pytest.mark.parametrize(
     ("device", "serve", "said"),
     [
@@ -113,11 +93,34 @@ def test_what_cannot_be_set_up(device, serve, said):
         pass
 
 
+@pytest.mark.system
+def test_settings_arrive():
+    """Without positioning from outside the estimator is told where the robot stands, and is not left at (0, 0)."""
+    device = {"parameters": {"hlCommander.vtoff": 0.7, "stabilizer.controller": 2}, "multiranger": True}
+    with connected_twins(device=device, start=[[0.5, 0.0, 0.0]]) as (twin, process):
+        value = twin.device.drones[0].value
+        assert (value("posCtlPid.thrustMin"), value("stabilizer.controller")) == (5000, 2)
+        assert value("hlCommander.vtoff") == pytest.approx(0.7)
+        assert [value(f"kalman.initial{axis}") for axis in "XYZ"] == [0.5, 0.0, 0.0]
+        process.until(lambda: np.abs(process.state.position - [0.5, 0.0, 0.0]).max() < 0.05, "there")
+        process.until(lambda: process.state.scan[0] is not None, "scan")
+        scan = process.state.scan[0]
+        assert scan.distance == pytest.approx([1.5, 2.5, 2.0, 2.0, 2.5], abs=2e-3)  # of the twin's room
+        assert scan.bearing == pytest.approx(np.radians([0.0, 180.0, 90.0, -90.0, 0.0]))
+        assert scan.elevation[4] == pytest.approx(np.pi / 2)
+
+
+@pytest.mark.system
 def test_lighthouse(tmp_path):
     """Geometry and calibration arrive, are stored, and only then does the estimate settle."""
 
-    def device(*stations):
-        return {"positioning": LIGHTHOUSE | {"file": lighthouse_file(tmp_path, *stations)}}
+    def device(*numbers):
+        stations = {number: {"origin": [number + 0.25, 0.5, 2.0], "rotation": TURN} for number in numbers}
+        calibrations = {number: {"sweeps": [SWEEP, SWEEP], "uid": 1000 + number} for number in numbers}
+        kind = {"type": "lighthouse_system_configuration", "version": "1", "systemType": 2}
+        path = tmp_path / "stations.yaml"
+        path.write_text(yaml.safe_dump(kind | {"geos": stations, "calibs": calibrations}))
+        return {"positioning": LIGHTHOUSE | {"file": str(path)}}
 
     with connected_twins(device=device(0, 1)) as (twin, process):
         memories = twin.device.drones[0].vehicle.decks.memories
@@ -135,14 +138,7 @@ def test_lighthouse(tmp_path):
         assert memories.stored == (0b1111, 0b1111)
 
 
-def test_flow_deck_begins_at_the_start():
-    """Without positioning from outside the estimator is told where the robot stands, and is not left at (0, 0)."""
-    start = [[0.7, -0.4, 0.0]]
-    with connected_twins(start=start) as (twin, process):
-        assert [twin.device.drones[0].value(f"kalman.initial{axis}") for axis in "XYZ"] == pytest.approx(start[0])
-        process.until(lambda: np.abs(process.state.position - start).max() < 0.05, "there")
-
-
+@pytest.mark.system
 def test_loco():
     """Anchors are told where they are, and say so; the mode is set; the estimate settles."""
     anchors = [[-2.0, -2.0, 0.0], [2.0, -2.0, 2.5], [2.0, 2.0, 0.0], [-2.0, 2.0, 2.5]]
@@ -155,6 +151,7 @@ def test_loco():
         assert twin.device.drones[0].vehicle.estimator.variance < 1e-2
 
 
+@pytest.mark.system
 def test_external_position():
     """A drone takes off only when its estimator has taken over an external position; then it flies that estimate."""
     device = {"positioning": {"system": "external", "position_sigma": 0.02}}
@@ -175,28 +172,19 @@ def test_external_position():
         process.cut()
 
 
-@pytest.mark.parametrize(("order", "after_s"), [("stop", 0.3), ("land", 0.1), ("close", 0.0)])
-def test_order_during_arming(order, after_s):
-    """The order replaces the take-off: motors stay off and disarmed; afterwards the drone arms and flies."""
-    with connected_twins(device=BRUSHLESS) as (twin, process):
+@pytest.mark.system
+def test_closing_during_arming_disarms():
+    """Motors stay off; `test_order_while_arming_disarms` has the other orders."""
+    with connected_twins(device={"platform": "brushless"}) as (twin, process):
         process.tick()
         assert supervised(twin) == SupervisorState.DISARMED
         process.body.takeoff([0], [0.5])
         process.until(lambda: supervised(twin) == SupervisorState.ARMING, "arming")
-        if order == "close":
-            process.close()
-        else:
-            process.run(after_s)
-            getattr(process.body, order)([0])
-            process.until(lambda: supervised(twin) == SupervisorState.DISARMED, "disarmed")
-            process.run(1.0)
+        process.close()
         assert (supervised(twin), truth(twin)[2]) == (SupervisorState.DISARMED, 0.0)
-        if order != "close":
-            process.takeoff(0.2)
-            assert supervised(twin) == SupervisorState.FLYING
-            process.cut()
 
 
+@pytest.mark.system
 def test_another_session_finds_it_in_the_air():
     """A process that was killed has left it there: it is landed, then set up, and nothing says that it flies."""
     with connected_twins() as (twin, process):
@@ -211,11 +199,208 @@ def test_another_session_finds_it_in_the_air():
             assert twin.device.drones[0].value("posCtlPid.thrustMin") == 5000
 
 
-def test_ranges():
-    """Distances to the walls of the twin's room, as a scan."""
-    with connected_twins(device={"multiranger": True, "ranges_hz": 20.0}, start=[[0.5, 0.0, 0.0]]) as (_, process):
-        process.until(lambda: process.state.scan[0] is not None, "scan")
-        scan = process.state.scan[0]
-        assert scan.distance == pytest.approx([1.5, 2.5, 2.0, 2.0, 2.5], abs=2e-3)
-        assert scan.bearing == pytest.approx(np.radians([0.0, 180.0, 90.0, -90.0, 0.0]))
-        assert scan.elevation[4] == pytest.approx(np.pi / 2)
+@pytest.mark.system
+def test_faulty_drones_fail_differently_while_others_fly_on():
+    """In one process: one is well, one loses 5 % of all packets; one falls silent for good, one for a moment, one's
+    battery runs empty, and one is killed. Those in reach end on the ground with their motors off; the others count
+    as flying, because nothing is seen of their motors.
+    """
+    well, lossy, mute, blinking, empty, killed = range(6)
+    with (
+        Served(CrazyflieTwin, request("crazyflie", ["crazyflie-twin"] * 5)) as twin,
+        Served(CrazyflieTwin, request("crazyflie", ["crazyflie-twin"], start=[[0.0, 5.0, 0.0]])) as other,
+        connected([*twin.addresses, *other.addresses]) as process,
+    ):
+        lines, battery = twin.device.lines, twin.device.drones[empty].vehicle.battery
+        process.until(lambda: np.isfinite(process.state.position).all(), "all are connected")
+        lines[lossy].faults = Faults(loss=0.05)  # not before: 402 parameters take long without repetitions
+        process.takeoff(0.3)
+        process.lead(*[(0.3, float(row), 0.3, 0.0) for row in range(6)]).run(0.3)
+        lines[mute].faults = Faults(silent_from_s=0.0)
+        lines[blinking].faults = Faults(silent_from_s=lines[blinking].t, silent_for_s=1.2)
+        battery.charge = 0.05
+        other.kill()
+        said = [set() for _ in range(6)]
+
+        def settled():
+            for row, note in enumerate(process.state.note):
+                said[row].add(note)
+            unseen = all("motors may be on" in process.state.note[row] for row in (mute, killed))
+            return unseen and not process.state.flying[[blinking, empty]].any()
+
+        process.until(settled, "those that fail are down")
+        assert not any(supervised(twin, row) == SupervisorState.LOCKED for row in range(5))
+        assert not any(motors(twin, row) for row in (blinking, empty))
+        assert process.state.flying[[mute, killed]].all()
+        assert truth(twin, mute)[2] == truth(twin, blinking)[2] == truth(twin, empty)[2] == 0.0
+        expected = {mute: "no pose for", blinking: "link lost", empty: "landed: battery low", killed: "link lost"}
+        for row, text in expected.items():
+            assert any(text in note for note in said[row]), (row, said[row])
+        assert process.t - process.state.received[mute] > 0.5  # the robot's loop sees that its device is silent
+        assert not any("landed" in note or "link lost" in note for note in said[well])
+        assert process.state.flying[: lossy + 1].all(), said[lossy]
+        process.until(lambda: np.abs(twin.truth()[0][:2, 0] - 0.3).max() < 0.03, "goals")
+        process.until(lambda: process.t - process.state.time[well] < 0.5, "the one that is well is heard")
+        battery.charge = 0.02  # without load its voltage has recovered
+        process.until(lambda: process.state.note[empty].endswith("; battery low"), "empty battery")
+        process.body.stop(range(6))
+        process.until(lambda: not process.state.flying[[well, lossy, blinking, empty]].any(), "motors off")
+
+
+@pytest.mark.mechanism("Crazyflie bridge: no more setpoints")
+@pytest.mark.system
+def test_loop_that_stops_commanding():
+    """A robot whose loop hangs is landed by its own thread."""
+    with connected_twins() as (twin, process):
+        process.takeoff(0.3)
+        process.lead((0.0, 0.0, 0.3, 0.0)).run(0.2)
+        until(lambda: truth(twin)[2] == 0.0, "it was landed")
+        assert supervised(twin) != SupervisorState.LOCKED
+        assert "no commands from" in process.tick().note[0]
+        process.cut()
+
+
+@pytest.mark.system
+def test_reset_in_the_air():
+    """A brown-out: nothing lifts it again, and all that was set up is set up again."""
+    with connected_twins() as (twin, process):
+        process.takeoff(0.4)
+        process.lead((0.0, 0.0, 0.4, 0.0)).run(0.3)
+        drone = twin.device.drones[0]
+        drone.vehicle.restart()
+        drone.start()
+        process.until(lambda: not process.state.flying[0], "seen")
+        process.decide = None
+        process.until(lambda: drone.value("posCtlPid.thrustMin") == 5000 and not process.state.note[0], "set up again")
+        assert (truth(twin)[2], motors(twin)) == (0.0, False)
+        process.takeoff(0.3)
+        process.cut()
+
+
+@pytest.mark.system
+def test_new_link_does_not_move_a_flow_deck():
+    """Where it has landed it stays, and is not told again to stand at its start; switched off and on, it is."""
+    with connected_twins() as (twin, process):
+        process.takeoff(0.3)
+        process.lead((0.4, 0.0, 0.3, 0.0))
+        process.until(lambda: abs(truth(twin)[0] - 0.4) < 0.02, "goal")
+        process.land()
+        pilot = process.body.pilots[0]
+        link_before = pilot.link
+        twin.device.lines[0].silence(1.5)
+        process.until(lambda: pilot.link is not link_before and not process.state.note[0], "a new link")
+        assert process.state.position[0, 0] == pytest.approx(truth(twin)[0], abs=0.02)
+        assert truth(twin)[0] > 0.3
+        twin.device.drones[0].vehicle.restart()
+        twin.device.drones[0].start()
+        process.until(lambda: abs(process.state.position[0, 0]) < 0.02 and not process.state.note[0], "at its start")
+
+
+FLYING = """
+import sys
+from tests.bridges.crazyflie_flight import connected
+
+process = connected(sys.argv[1:])
+process.takeoff(0.4)
+process.lead((0.3, 0.0, 0.4, 0.0)).run(1e9)
+"""
+
+
+@pytest.mark.system
+def test_process_woken_from_suspension_lifts_no_drone():
+    """Suspension until the drone has come down: then the loop commands as before, and the drone stays down."""
+    asked = request("crazyflie", ["crazyflie-twin"], device={"link": "radio"})
+    with Served(CrazyflieTwin, asked) as twin, started("-c", FLYING, *twin.addresses, stderr=None) as child:
+        until(lambda: abs(truth(twin)[0] - 0.3) < 0.05, "it follows setpoints")
+        os.kill(child.pid, signal.SIGSTOP)
+        until(lambda: truth(twin)[2] == 0.0, "its drone has come down")
+        assert supervised(twin) == SupervisorState.FLYING
+        os.kill(child.pid, signal.SIGCONT)
+        heights = []
+
+        def stands():
+            heights.append(truth(twin)[2])
+            return not motors(twin)
+
+        until(stands, "its motors are stopped")
+        assert max(heights) == 0.0
+        assert supervised(twin) != SupervisorState.LOCKED
+
+
+@pytest.mark.system
+def test_absent():
+    """Nobody at the address is said within five seconds, with the remedy; one of two that answers is ready."""
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as mute,
+        Served(CrazyflieTwin, request("crazyflie", ["crazyflie-twin"])) as twin,
+    ):
+        mute.bind(("127.0.0.1", 0))
+        address = f"udp://127.0.0.1:{mute.getsockname()[1]}"
+        begin = time.monotonic()
+        with pytest.raises(BodyError, match=f"R0: .*{address}: .*is the simulation running there"):
+            connected([address])
+        assert time.monotonic() - begin < 6.0
+        with connected([twin.addresses[0], "udp://127.0.0.1:1"]) as process:
+            process.tick()
+            assert process.state.note[0] == ""
+            assert "udp://127.0.0.1:1" in process.state.note[1]
+            assert np.isnan(process.state.position[1]).all()
+
+
+@pytest.mark.system
+@pytest.mark.parametrize(("address", "said"), [(RADIO, "Crazyradio"), ("usb://0", "plugged in")])
+def test_nothing_plugged_in(address, said):
+    """No dongle and no robot is plugged in here; no traceback either."""
+    with pytest.raises(BodyError, match=said):
+        connected([address])
+
+
+def test_library_is_too_old(monkeypatch):
+    """Process that flies a drone and cannot stop it."""
+    for version in ("0.1.32", "0.1.34", "0.2", "1.0.0rc1"):
+        monkeypatch.setattr(link, "version", lambda _, version=version: version)
+        link.prepare([RADIO])
+    for version in ("0.1.31", "0.1.20.1", "0.0.9"):
+        monkeypatch.setattr(link, "version", lambda _, version=version: version)
+        with pytest.raises(BodyError, match=rf"cflib {version} is too old, Crazyflies need 0\.1\.32: pip install"):
+            connected([RADIO])
+
+
+def test_library_is_missing(monkeypatch):
+    monkeypatch.setitem(sys.modules, "cflib", None)
+    monkeypatch.delitem(sys.modules, "cflib.crtp", raising=False)
+    with pytest.raises(BodyError, match=r"pip install -e '\.\[crazyflie\]'"):
+        connected([RADIO])
+
+
+@pytest.mark.parametrize(
+    ("robots", "exchanges", "device", "said", "rates"),
+    [
+        (8, 396.0, {}, "ask for 320 packets/s, up and down; it carries 277: ", {"stream_hz": 7.0}),
+        (15, 664.0, {}, "ask for 600 packets/s, up and down; it carries 465: ", {"stream_hz": 5.0}),
+        (6, 500.0, {"log_hz": 50.0}, "ask for 420 packets/s", {"log_hz": 33.0, "stream_hz": 9.0}),
+        (5, 500.0, {"log_hz": 8.0}, "would have poses that are 0.14 s old, at 500 exchanges/s: ", {"log_hz": 12.0}),
+        (
+            8, 500.0, {"positioning": Outside()}, "ask for 480 packets/s",
+            {"log_hz": 16.0, "stream_hz": 6.0, "positioning": Outside(rate_hz=13.0)},
+        ),
+    ],
+)  # fmt: skip
+def test_crowded_radio(robots, exchanges, device, said, rates):
+    """The rates that are named fit, and leave poses young."""
+    text = overload("0", [CrazyflieSettings(**device)] * robots, exchanges)
+    assert text.startswith(f"radio 0: {robots} robots {said}")
+    fitting = [CrazyflieSettings(**device | rates)] * robots
+    assert overload("0", fitting, exchanges) == ""
+    named = f"log_hz = {fitting[0].log_hz:g}, stream_hz = {fitting[0].stream_hz:g}"
+    if "positioning" in rates:
+        named += f", positioning.rate_hz = {rates['positioning'].rate_hz:g}"
+    assert text.endswith(f": in each device table write {named}, or plug in another radio")
+
+
+def test_a_radio_with_too_many_robots():
+    """Of 60 packets per second and robot, 40 come down, 20 of them nearly empty: at most 70 % of the exchanges."""
+    assert [capacity([CrazyflieSettings()] * 5, hz) for hz in (100.0, 600.0)] == pytest.approx([70.0, 420.0])
+    assert overload("0", [CrazyflieSettings()] * 6, 357.0) == ""
+    text = overload("0", [CrazyflieSettings()] * 15, 400.0)
+    assert text.endswith(": plug in another radio; this one carries 10, with log_hz = 20, stream_hz = 4")
