@@ -1,7 +1,5 @@
 """Runs that are conducted: their hardware, their emergency stop, and what serves them and is started again."""
 
-from __future__ import annotations
-
 import math
 import socket
 import threading
@@ -30,32 +28,29 @@ from experiments.real_time.hosts.launcher import ROUTER, Launcher, RouterEnded
 from tests.small import changed, pair
 
 RADIO = "radio://0/80/2M/E7E7E7E701"
-REAL = pair(
-    robots={
+
+
+def test_hardware_is_known_by_address_settings_and_host():
+    robots = {
         "CF01": RobotTable(kind="crazyflie", start=[0.0, 0.0], hover=0.5, body=RADIO),
         "TE01": RobotTable(kind="tello", start=[0.5, 0.0], hover=0.5, body="tello"),
         "KH01": RobotTable(kind="khepera4", start=[-0.5, 0.0], body="khepera4://10.0.0.7", device={"port": 344}),
         "KH02": RobotTable(kind="khepera4", start=[-0.5, 0.5]),
         "KH03": RobotTable(kind="khepera4", start=[-0.5, 0.9], body="khepera4-twin"),
-    },
-    formation=Formation(),
-)
-
-
-def registered(robots: dict[str, str], title: str = "here", born: str | None = None) -> run_registry.RegisteredRun:
-    made = run_registry.own_entry("run", title, ["tcp/127.0.0.1:7448"], folder=Path("/runs/other"), robots=robots)
-    return made if born is None else changed(made, born=born)
-
-
-def test_hardware_is_known_by_address_settings_and_host() -> None:
-    away = changed(REAL, hosts={"lab2": Host(address="ana@lab2", robots=["TE01"])})
-    assert conduct.hardware([Plan(REAL), Plan(away)]) == {
+    }
+    real = pair(robots=robots, formation=Formation())
+    away = changed(real, hosts={"lab2": Host(address="ana@lab2", robots=["TE01"])})
+    wanted = dict.fromkeys(robots, "") | {
         "CF01": RADIO,
         "TE01": "tello on lab2",
         "KH01": 'khepera4://10.0.0.7 {"port": 344}',
-        "KH02": "",
-        "KH03": "",
     }
+    assert conduct.hardware([Plan(real), Plan(away)]) == wanted
+
+
+def registered(robots, title="here", born=None):
+    made = run_registry.own_entry("run", title, ["tcp/127.0.0.1:7448"], folder=Path("/runs/other"), robots=robots)
+    return made if born is None else changed(made, born=born)
 
 
 @pytest.mark.parametrize(
@@ -69,10 +64,9 @@ def test_hardware_is_known_by_address_settings_and_host() -> None:
         ({"CF01": RADIO}, {"CF01": ""}, False),
     ],
 )
-def test_hardware_that_another_run_has_is_refused(
-    monkeypatch: pytest.MonkeyPatch, mine: dict[str, str], theirs: dict[str, str], refused: bool
-) -> None:
+def test_hardware_that_another_run_has_is_refused(monkeypatch, mine, theirs, refused):
     me, other = registered(mine), registered(theirs, "there", born="another")
+    assert conduct.check_other_runs(me, [other], "x.toml") == [], "it has died"
     monkeypatch.setattr(run_registry, "born", lambda _pid: "another")
     there = "there, /runs/other, at tcp/127.0.0.1:7448"
     if not refused:
@@ -87,16 +81,6 @@ def test_hardware_that_another_run_has_is_refused(
     assert problem.hint.endswith("or `./zenpark estop --connect tcp/127.0.0.1:7448`")
 
 
-def test_a_run_that_has_died_has_nothing() -> None:
-    assert (
-        conduct.check_other_runs(registered({"CF01": RADIO}), [registered({"CF01": RADIO}, born="long ago")], "x.toml")
-        == []
-    )
-
-
-KEYS = Keys("park")
-
-
 @pytest.fixture
 def endpoint():
     return free_endpoint(preferred_port=0)
@@ -108,7 +92,7 @@ def test_router_that_just_started_is_waited_for(endpoint):
     late = threading.Timer(0.6, serve_router, ([endpoint], over))
     late.start()
     try:
-        with Emergency().throughout([endpoint], KEYS, "operator", STARTING_S):
+        with Emergency().throughout([endpoint], Keys(), "operator", STARTING_S):
             pass
     finally:
         over.set()
@@ -116,32 +100,34 @@ def test_router_that_just_started_is_waited_for(endpoint):
 
 
 def test_one_of_somebody_else_is_not(endpoint):
-    with pytest.raises(Unreachable), Emergency().throughout([endpoint], KEYS, "operator", 0.2):
+    with pytest.raises(Unreachable), Emergency().throughout([endpoint], Keys(), "operator", 0.2):
         pass
 
 
 class Starts:
     """Stands for a launcher, and keeps what it was to start."""
 
-    def __init__(self) -> None:
-        self.told: list[tuple[str, ...]] = []
+    def __init__(self):
+        self.told = []
 
-    def start(self, *words: str) -> None:
+    def start(self, *words):
         self.told.append(words)
 
 
+def case(folder, name="only", listens=()):
+    """Context of a case of the triangle, and the launcher that it has."""
+    launcher, plan = Starts(), Plan(document.read("triangle").experiment)
+    hosts = Hosts(launcher, list(listens))
+    return CaseContext(plan, name, folder, folder / "case.toml", ["tcp/127.0.0.1:7447"], launcher, hosts), launcher
+
+
 def test_dead_router_listens_again_where_machines_expect_it(tmp_path):
-    launcher = Starts()
-    here, everywhere = "tcp/127.0.0.1:7447", "tcp/0.0.0.0:7447"
-    experiment = document.read("triangle").experiment
-    hosts = Hosts(launcher, [everywhere])
-    processes = CaseProcesses(
-        CaseContext(Plan(experiment), "only", tmp_path, tmp_path / "case.toml", [here], launcher, hosts)
-    )
+    context, launcher = case(tmp_path, listens=["tcp/0.0.0.0:7447"])
+    processes = CaseProcesses(context)
     dead = SimpleNamespace(name=ROUTER, exit="killed by SIGKILL")
     said = [processes.again(dead) for _ in range(STARTS)]
     assert [words[:2] for words in launcher.told] == [(ROUTER, "agents.runtime.router")] * (STARTS - 1)
-    assert all(words[2:4] == ("--listen", everywhere) for words in launcher.told)
+    assert all(words[2:4] == ("--listen", "tcp/0.0.0.0:7447") for words in launcher.told)
     assert said[0] == (ROUTER, "the router ended (killed by SIGKILL); started again")
     assert said[-1] == (ROUTER, "the router ended (killed by SIGKILL); given up: the robots hold, and land at the end")
     assert processes.again(SimpleNamespace(name="only-KH01", exit="exit code 2")) is None
@@ -174,12 +160,7 @@ def test_suspended_launcher_knows_when_its_robots_have_landed(tmp_path, monkeypa
 
 @pytest.mark.parametrize("word", ["experiment", "joining", "changed", "addressed"])
 def test_no_name_of_a_case_shares_a_file(tmp_path, word):
-    hosts, experiment = Hosts(Starts(), []), document.read("triangle").experiment
     names = ["rights", "run", "metrics", "x", "x-joining", "x-changed", "cases"]
-    files = [
-        CaseContext(Plan(experiment), name, tmp_path, tmp_path / "a.toml", [], Starts(), hosts).variant(word)
-        for name in names
-    ]
-    assert len(set(files)) == len(names)
-    assert all(file.relative_to(tmp_path).parts[0] == "cases" for file in files)
-    assert all(len(file.relative_to(tmp_path).parts) == 3 for file in files)
+    files = {case(tmp_path, name)[0].variant(word).relative_to(tmp_path).parts for name in names}
+    assert len(files) == len(names)
+    assert {(parts[0], len(parts)) for parts in files} == {("cases", 3)}

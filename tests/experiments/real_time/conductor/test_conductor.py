@@ -1,145 +1,116 @@
-"""The course of a case without network and processes: when it is over, and what spoils it."""
+"""The course of a case, what spoils it, what its conductor sees, and orders that reach all robots at once."""
 
-from __future__ import annotations
-
+import signal
+import subprocess
+import threading
+from contextlib import nullcontext
 from types import SimpleNamespace
-from typing import Any
+from unittest.mock import MagicMock
 
-import msgspec
 import pytest
 
+from agents.clock import Clock
+from agents.network import messages, pubsub
+from agents.network import session as network
+from agents.network.keys import Keys
+from agents.safety.hazards import failed
 from experiments.file import document
 from experiments.real_time.conductor import conductor as module
+from experiments.real_time.conductor import orders
 from experiments.real_time.conductor.case_processes import Death
 from experiments.real_time.conductor.conductor import Conductor
-from experiments.real_time.conductor.run_view import Progress, RobotView, RunFailed
+from experiments.real_time.conductor.run_view import NetworkView, Progress, RobotView, RunFailed
+from experiments.real_time.hosts.run_registry import RegisteredRun, born
 from tests.experiments.recordings import START, status
+from tests.network import Net, Reply, Sample
+from tests.small import changed
+from tests.waiting import ManualClock, until
 
-EXPERIMENT = msgspec.structs.replace(document.read("triangle").experiment, duration_s=10.0)
-STEP_S = 0.5  # of the clock, at each look at it
+KEYS = Keys()
 DEAD = Death("recorder", "conductor", "the recorder ended (killed by SIGKILL); started again")
 
 
-class Clock:
-    now = START
-
-    def utc(self) -> float:
-        self.now += STEP_S
-        return self.now
-
-
 class Course(Conductor):
-    """A conductor whose robots are in `phases`, by the time since the common start."""
+    """A conductor whose robots are in `phases`, by the time since the common start; half a second for each look."""
 
-    def __init__(self, phases: dict[float, str], deaths: dict[float, Death] | None = None) -> None:
-        self.clock = Clock()
-        self._clock: Any = self.clock
-        self._experiment = EXPERIMENT
-        self.robots = self._robots = {name: RobotView() for name in EXPERIMENT.robots}
+    def __init__(self, phases, deaths=()):
+        self._clock = ManualClock(START, step=0.5)
+        self._experiment = changed(document.read("triangle").experiment, duration_s=10.0)
+        self.robots = self._robots = {name: RobotView() for name in self._experiment.robots}
         self._progress = Progress("only", "", None, 10.0, self._robots)
-        self._phases, self._deaths = phases, deaths or {}
-        self.failures: list[str] = []
-        self._starting: set[str] = set()
-        self._landed: set[str] = set()
-        self.reasons: dict[str, str] = {}  # of robots that have landed at 3 s, before all others
-        self.killed = 0
-        nothing: Any = SimpleNamespace(
-            under_way=set(), begin=lambda _: None, advance=lambda: None, news=lambda: ((), ()), close=lambda: None
-        )
-        self._changes = self._drift = nothing
-        self._context: Any = SimpleNamespace(ended=lambda: False, emergency=None)
-        self.processes: Any = SimpleNamespace(
-            deaths=self._died, recording=True, kill_recorder=lambda: setattr(self, "killed", self.killed + 1)
-        )
-        self.view: Any = SimpleNamespace(
-            update=self._phase, report=lambda *_, **__: None, report_drift=lambda *_: None, order=lambda *_: {},
-            recorder_stands_still=False, recording_begun=True, await_recorder=lambda: None,
-            refuse_joining=lambda: None,
-        )  # fmt: skip
-        self._processes, self._view = self.processes, self.view
+        self._phases, self._deaths = phases, dict(deaths)
+        self.failures, self._starting, self._landed = [], set(), set()
+        self.reasons = {}  # of robots that have landed at 3 s, before all others
+        self._changes = self._drift = MagicMock(under_way=())
+        self._context = MagicMock(ended=lambda: False, emergency=None)
+        self.processes = self._processes = MagicMock(deaths=self._died, recording=True)
+        self.view = self._view = MagicMock(update=self._phase, recorder_stands_still=False, recording_begun=True)
         self.update, self.land = self._update, self._land
-        self._show: Any = lambda _: None
+        self._show = lambda _: None
 
-    def _show_progress(self) -> None: ...
+    def _show_progress(self): ...
 
-    def _phase(self) -> list[str]:
+    def _phase(self):
         now = self._clock.now - START
         phase = next(said for at, said in sorted(self._phases.items(), reverse=True) if now >= at)
         for name, view in self._robots.items():
             reason = self.reasons.get(name, "") if now >= 3.0 else ""
-            view.status = msgspec.structs.replace(
-                status(name, at=now), phase="landing" if reason else phase, reason=reason
-            )
+            view.status = changed(status(name, at=now), phase="landing" if reason else phase, reason=reason)
         return []
 
-    def _died(self) -> list[Death]:
+    def _died(self):
         return [self._deaths.pop(at) for at in list(self._deaths) if self._clock.now - START >= at]
+
+    def walked(self):
+        """Failures of the whole course."""
+        self.walk(START)
+        return self.failures
 
 
 @pytest.fixture(autouse=True)
-def _without_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
+def _without_pauses(monkeypatch):
     monkeypatch.setattr(module, "time", SimpleNamespace(sleep=lambda _: None, monotonic=lambda: 0.0))
 
 
-@pytest.mark.parametrize(
-    ("landing", "failures"), [(3.0, ["all robots had landed after 3.0 of 10 s"]), (9.6, []), (10.2, [])]
-)
-def test_a_run_that_ended_early_has_failed(landing: float, failures: list[str]) -> None:
-    course = Course({0.0: "running", landing: "landing"})
-    course.walk(START)
-    assert [text.replace("3.5", "3.0") for text in course.failures] == failures
+@pytest.mark.parametrize(("landing", "failures"), [(3.0, ["all robots had landed after 3.5 of 10 s"]), (9.6, [])])
+def test_a_run_that_ended_early_has_failed(landing, failures):
+    assert Course({0.0: "running", landing: "landing"}).walked() == failures
+    course = Course({0.0: "running"})
+    for view in course.robots.values():
+        view.left_because = "lost"
+    assert [text.partition(" after")[0] for text in course.walked()] == ["no robot was left"]
 
 
 @pytest.mark.parametrize(
     ("reason", "spoilt"), [("ordered to land", True), ("ordered to stop", True), ("its battery is low", False)]
 )
-def test_robot_that_was_ordered_down_spoils_the_run(reason: str, spoilt: bool) -> None:
+def test_robot_that_was_ordered_down_spoils_the_run(reason, spoilt):
     """Any other landing is a hazard of the recording."""
     course = Course({0.0: "running", 10.0: "landing"})
     name = next(iter(course.robots))
     course.reasons = {name: reason}
-    course.walk(START)
-    assert [text.split(" of ")[0].rpartition(" ")[0] for text in course.failures] == [f"{name} landed after"] * spoilt
+    assert [text.split(" of ")[0].rpartition(" ")[0] for text in course.walked()] == [f"{name} landed after"] * spoilt
 
 
-def test_a_run_without_any_robot_left_has_failed() -> None:
-    course = Course({0.0: "running"})
-    for view in course.robots.values():
-        view.left_because = "lost"
-    course.walk(START)
-    assert [text.partition(" after")[0] for text in course.failures] == ["no robot was left"]
-
-
-def test_a_recorder_that_dies_spoils_the_run() -> None:
-    course = Course({0.0: "running", 10.0: "landing"}, {4.0: DEAD})
-    course.walk(START)
-    assert course.failures == [DEAD.text]
-
-
-def test_a_recorder_is_awaited_again_before_the_start() -> None:
+def test_nothing_flies_without_a_recorder():
     course = Course({0.0: "ready"}, {0.0: DEAD})
-    assert course.await_phase("ready", 10.0, recorder=True)
+    assert course.await_phase("ready", 10.0, recorder=True), "it is awaited again before the start"
     assert course.failures == []
-
-
-def test_nothing_flies_without_a_recorder() -> None:
-    course = Course({0.0: "ready"})
     course.processes.recording = False
     with pytest.raises(RunFailed, match="nothing would be recorded"):
         course.await_phase("ready", 10.0, recorder=True)
-
-
-def test_a_recorder_that_stands_still_is_killed() -> None:
-    course = Course({0.0: "running"})
     course.view.recorder_stands_still = True
     course.update()
-    assert course.killed == 1
+    course.processes.kill_recorder.assert_called_once_with()
+
+
+def test_a_recorder_that_dies_spoils_the_run():
+    assert Course({0.0: "running", 10.0: "landing"}, {4.0: DEAD}).walked() == [DEAD.text]
 
 
 def test_order_to_land_is_repeated_until_all_obey(monkeypatch):
-    course = Course({0.0: "running", 4.0: "done"})
-    monkeypatch.setattr(module, "time", SimpleNamespace(sleep=lambda _: None, monotonic=lambda: course.clock.now))
-    asked: list[tuple[str, list[str]]] = []
+    course, asked = Course({0.0: "running", 4.0: "done"}), []
+    monkeypatch.setattr(module, "time", SimpleNamespace(sleep=lambda _: None, monotonic=lambda: course._clock.now))
     course.view.order = lambda names, order: asked.append((order.order, names)) or {}
     course.update()
     course.land()
@@ -156,3 +127,135 @@ def test_output_of_a_lost_robot_is_told_once():
     assert told.count("could not start") == 1
     assert f"last words of {late}" in told
     assert f"last words of {lost}" not in told  # the event of its end has them
+
+
+@pytest.mark.mechanism("orders to several robots at once")
+@pytest.mark.system
+def test_order_reaches_all_before_one_has_answered(router):
+    """The first answers only when the last has the order: whoever is asked one after the other waits in vain.
+
+    A storage of the network, nearer and complete, answers with what was put there by mistake.
+    """
+    names, over = ["A", "B", "C"], threading.Event()
+
+    def answer():
+        waiting = {}
+        while not over.wait(0.005):
+            waiting |= {name: query for name, queryable in told.items() for query, _ in queryable.read()}
+            if len(waiting) == len(names):
+                for name, query in waiting.items():
+                    with query:
+                        reply = messages.Reply(name, name != "B", "airborne", "" if name != "B" else "no")
+                        query.reply(KEYS.order(name), messages.encode(reply), encoding=messages.JSON)
+                waiting = {}
+
+    def recall(query):
+        with query:
+            query.reply(query.key_expr, b'{"order": "land"}', encoding=messages.JSON)
+
+    with (
+        network.open_session([router.endpoint], name="storage") as storage,
+        network.open_session([router.endpoint], name="robots") as robots,
+        network.open_session([router.endpoint], name="conductor") as conductor,
+    ):
+        storage.declare_queryable(KEYS.everything, recall, complete=True)
+        told = {name: pubsub.Orders(robots, KEYS.order(name), messages.Order) for name in names}
+        _token = pubsub.alive_token(robots, KEYS.alive("A"))
+        until(lambda: network.tokens_present(conductor, KEYS.alive("A")), "robots are there, with their keys")
+        thread = threading.Thread(target=answer)
+        thread.start()
+        try:
+            replies = orders.send_order(conductor, KEYS, [*names, "D"], messages.Order("hold"), 20.0)
+        finally:
+            over.set()
+            thread.join()
+    unread = "malformed reply: not a Reply: Object contains unknown field `order`"
+    assert [(reply.ok, reply.reason) for reply in replies.values()] == [
+        (True, ""), (False, "no"), (True, ""), (False, unread),
+    ]  # fmt: skip
+
+
+def test_replies_of_another_key_or_robot_are_none():
+    good = messages.Reply("A", ok=False, phase="ready", reason="not now")
+    said = [("A", messages.Reply("B", ok=True, phase="ready", reason=""))]
+    said += [("B", messages.Reply("A", ok=True, phase="ready", reason="")), ("A", good)]
+    net = Net()
+    for name, reply in said:
+        net.replies.append(Reply(Sample(KEYS.order(name), messages.JSON, messages.encode(reply)), good=True))
+    assert orders.send_order(net.session, KEYS, ["A"], messages.Order("hold")) == {"A": good}
+
+
+def test_stop_is_repeated_although_a_router_hangs(monkeypatch):
+    clock, stops = ManualClock(), []
+
+    def alive(*_):
+        clock.now += orders.STOP_ANSWER_S
+        return {"A"}
+
+    with Net().worn():
+        monkeypatch.setattr(orders, "time", clock)
+        monkeypatch.setattr(orders, "alive", alive)
+        monkeypatch.setattr(orders, "closing_cleanly", lambda session: nullcontext((session, [])))
+        monkeypatch.setattr(orders, "stop_publisher", lambda *_: SimpleNamespace(put=stops.append))
+        stop = orders.EmergencyStop(["tcp/127.0.0.1:1"], "park", "operator")
+        stop.send("a test")
+    assert (stop.failure, stop.moving) == (None, {"A"})
+    assert len(stops) > orders.STOP_ANSWER_S / orders.STOP_AGAIN_S
+
+
+def test_stop_without_robots_ends_the_run():
+    with subprocess.Popen(["sleep", "60"]) as process, Net().worn():
+        run = RegisteredRun("run", process.pid, born(process.pid) or "", 0.0, "mesh", "", ["tcp/127.0.0.1:1"])
+        stop, again = (orders.EmergencyStop(run.endpoints, run.realm, run.identity, run) for _ in range(2))
+        stop.look()
+        assert (stop.expected, stop.run_ended, process.poll()) == (True, False, None)
+        stop.send("a test")
+        assert stop.run_ended
+        assert process.wait(10.0) == -signal.SIGTERM
+        again.send("a test")
+        assert not again.run_ended
+
+
+class View(NetworkView):
+    """The network as a conductor sees it, without a network."""
+
+    def __init__(self):
+        self.clock, self.robots, self.said = Clock(), {"TB01": RobotView()}, []
+
+    def report(self, *said, **_):
+        self.said.append(said)
+
+
+def test_robots_beginning_is_its_first_status_within_experiment():
+    view = View()
+    for phase, at in (("airborne", -0.1), ("running", 0.28), ("running", 1.28), ("landing", 2.0)):
+        view.receive_status(changed(status(at=at), phase=phase))
+    assert view.robots["TB01"].began == START + 0.28
+    view.robots["TB01"].forget_process()
+    assert view.robots["TB01"].began is None
+
+
+@pytest.mark.parametrize(
+    ("reason", "incidents", "fault"),
+    [
+        ("its control loop hangs: no tick for 0.5 s", (), True),
+        ("its control loop hangs: no tick for 0.5 s", ("over: a neighbour is lost, after 2.00 s",), True),
+        ("the starter is gone", (), True),
+        ("its battery is low", ("land: its battery is low: 5% (limit 10%)",), False),
+        ("finished", (), False),
+        ("ordered to land", (), False),
+        ("ordered to leave", (), False),
+        ("asked to end", (), False),
+        ("lands as its file says", (), False),
+        ("emergency stop by a test", (), False),
+    ],
+)
+def test_unasked_landing_is_a_hazard_with_reason_once(reason, incidents, fault):
+    view = View()
+    told = [messages.Incident(k + 1, START, text) for k, text in enumerate(incidents)]
+    for at, phase in enumerate(("running", "landing", "landing", "done")):
+        down = {} if phase == "running" else {"reason": reason, "incidents": told}
+        view.receive_status(changed(status(at=float(at)), phase=phase, **down))
+    found = [said[2] for said in view.said if said[:2] == ("hazard", "TB01")]
+    assert found == [*incidents, *([f"land: {reason}"] if fault else [])]
+    assert any(failed(text) for text in found) == (fault or reason == "its battery is low")
