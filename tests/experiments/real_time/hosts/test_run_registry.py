@@ -9,59 +9,56 @@ import time
 from pathlib import Path
 
 import msgspec
+import psutil
 import pytest
 
 from agents.network.endpoints import free_endpoint
 from experiments.real_time.hosts import run_registry
-from experiments.real_time.hosts.run_registry import RegisteredRun, born, own_entry, registered, runs
+from experiments.real_time.hosts.run_registry import born, own_entry, registered, runs
+from tests.small import changed
 
 pytestmark = pytest.mark.usefixtures("runtime_folder")
 
 
-def nowhere() -> list[str]:
-    """A router that is not up."""
-    return [free_endpoint(preferred_port=0)]
+def entry(what="run", title="two", **more):
+    """A run of this process, with a router that is not up."""
+    return own_entry(what, title, [free_endpoint(preferred_port=0)], **more)
 
 
-def dead() -> RegisteredRun:
+def dead():
     """A run whose process has ended."""
     process = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
     started = born(process.pid)
     assert started is not None
     process.communicate(b"\n")
-    return msgspec.structs.replace(own_entry("run", "dead", nowhere()), pid=process.pid, born=started)
+    return changed(entry(), pid=process.pid, born=started)
 
 
-def test_run_is_listed_while_it_is_up(runtime_folder: Path) -> None:
-    robots = {"CF01": "radio://0", "KH01": ""}
-    run = own_entry("run", "two", nowhere(), folder=Path("here"), realm="hall", robots=robots)
+def test_run_is_listed_while_it_is_up(runtime_folder):
+    run = entry(folder=Path("here"), realm="hall", robots={"CF01": "radio://0", "KH01": ""})
     assert runs() == []
     with registered(run) as why:
-        assert why == ""
-        assert runs() == [run]
-        assert run.alive
-        with registered(own_entry("router", "a router by hand", nowhere())):
+        assert (why, runs(), run.alive) == ("", [run], True)
+        assert not changed(run, born="1").alive, "another process of its number"
+        since_boot_s = psutil.Process().create_time() - psutil.boot_time()
+        assert int(run.born) / os.sysconf("SC_CLK_TCK") == pytest.approx(since_boot_s, abs=2.0)
+        with registered(entry("router", "a router by hand")):
             assert [each.what for each in runs()] == ["run", "router"]
         assert run.words == f"two, {Path('here').absolute()}, at {run.endpoints[0]}"
-    assert runs() == []
-    assert list(runtime_folder.iterdir()) == []
+    assert runs() == list(runtime_folder.iterdir()) == []
     assert runtime_folder.stat().st_mode & 0o777 == 0o700
 
 
-def test_dead_run_is_listed_while_its_router_answers(runtime_folder: Path) -> None:
+def test_dead_run_is_listed_while_its_router_answers(runtime_folder):
     run = dead()
     with registered(run):
         assert runs() == []
         assert list(runtime_folder.iterdir()) == [], "cleaned"
     with socket.create_server(("127.0.0.1", 0)) as router:
-        left = msgspec.structs.replace(run, endpoints=[f"tcp/127.0.0.1:{router.getsockname()[1]}"])
+        left = changed(run, endpoints=[f"tcp/127.0.0.1:{router.getsockname()[1]}"])
         with registered(left):
             assert runs() == [left], "its robots may still come down"
             assert not left.alive
-
-
-def test_other_process_of_its_number_is_no_run() -> None:
-    assert not msgspec.structs.replace(own_entry("run", "two", nowhere()), born="1").alive
 
 
 ENTRY = b'{"what":"run","pid":%d,"born":"","since":0,"title":"","folder":"","endpoints":%b}'
@@ -72,8 +69,8 @@ GARBAGE = [
 
 
 @pytest.mark.parametrize("text", GARBAGE, ids=range(8))
-def test_garbage_is_left_alone_and_hides_nobody(runtime_folder: Path, text: bytes) -> None:
-    run = own_entry("run", "two", nowhere())
+def test_garbage_is_left_alone_and_hides_nobody(runtime_folder, text):
+    run = entry()
     with registered(run):
         (runtime_folder / "0.json").write_bytes(text)
         (runtime_folder / "1.json").mkdir()
@@ -82,16 +79,12 @@ def test_garbage_is_left_alone_and_hides_nobody(runtime_folder: Path, text: byte
         assert (runtime_folder / "0.json").exists()
 
 
-def test_host_that_cannot_be_asked_for_hides_nobody() -> None:
-    run = own_entry("run", "two", nowhere())
-    with registered(msgspec.structs.replace(dead(), endpoints=[f"tcp/{'a' * 70}:7447"])), registered(run):
-        assert runs() == [run]
+def test_silent_names_delay_no_emergency_stop(monkeypatch):
+    run, resolved = entry(), threading.Event()
+    with registered(changed(dead(), endpoints=[f"tcp/{'a' * 70}:7447"])), registered(run):
+        assert runs() == [run], "a name that cannot be asked for hides nobody"
 
-
-def test_silent_names_delay_no_emergency_stop(monkeypatch: pytest.MonkeyPatch) -> None:
-    run, resolved = own_entry("run", "two", nowhere()), threading.Event()
-
-    def resolve(*_: object) -> None:
+    def resolve(*_):
         resolved.wait(60.0)
         raise OSError
 
@@ -103,27 +96,27 @@ def test_silent_names_delay_no_emergency_stop(monkeypatch: pytest.MonkeyPatch) -
     resolved.set()
 
 
-def test_folder_writable_by_others_is_refused(runtime_folder: Path) -> None:
+def test_folder_writable_by_others_is_refused(runtime_folder):
     runtime_folder.mkdir(0o700)
-    (runtime_folder / "0.json").write_bytes(msgspec.json.encode(own_entry("run", "two", nowhere())))
+    (runtime_folder / "0.json").write_bytes(msgspec.json.encode(entry()))
     assert len(runs()) == 1
     runtime_folder.chmod(0o770)
     assert runs() == []
-    with registered(own_entry("run", "two", nowhere())) as why:
+    with registered(entry()) as why:
         assert "no folder of yours alone" in why
     runtime_folder.rename(runtime_folder.with_name("elsewhere"))
     runtime_folder.symlink_to(runtime_folder.with_name("elsewhere"))
     assert runs() == []
 
 
-def test_without_runtime_folder_the_users_is_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_runtime_folder_the_users_is_used(tmp_path, monkeypatch):
     monkeypatch.delenv("ZENPARK_RUNTIME_DIR")
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "missing"))
-    with registered(own_entry("run", "two", nowhere())) as why:
+    with registered(entry()) as why:
         assert why == ""
         assert [path.name for path in tmp_path.iterdir()] == [f"zenpark-{os.getuid()}"]
     (tmp_path / "session").mkdir(0o700)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "session"))
-    with registered(own_entry("run", "two", nowhere())):
+    with registered(entry()):
         assert len(list((tmp_path / "session" / "zenpark").iterdir())) == 1
