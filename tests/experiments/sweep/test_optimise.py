@@ -1,4 +1,4 @@
-"""The search for parameters: what a wish means, and that what is found keeps its limits on seeds that it never saw."""
+"""Search for parameters: objectives, their limits, and seeds that the search never saw."""
 
 import pytest
 
@@ -9,10 +9,8 @@ from experiments.sweep.pareto import by_environment, front
 from tests.experiments.sweep.cells import cell
 from tools.commands import sweep as commands
 
-SHORT = ["duration_s=4.0"]
 
-
-def test_a_wish():
+def test_an_objective_has_limits():
     objective = parse_objective("messages, iae<=1.01 ,ITAE < 1.05, acquired<=12")
     assert objective == Objective("messages", (Limit("iae", 1.01), Limit("itae", 1.05), Limit("acquired_s", 12.0)))
     assert [str(limit) for limit in objective.limits] == ["IAE ratio <= 1.01", "ITAE ratio <= 1.05", "acquired_s <= 12"]
@@ -22,16 +20,14 @@ def test_a_wish():
     ("text", "message", "hint"),
     [
         ("", "what is to be least", "messages, iae<=1.01"),
-        ("iae<=1.01", "what is to be least", "messages, iae<=1.01"),
         ("messages", "without a limit", "iae<=1.01"),
         ("messages, iea<=1.01", "no metric is called 'iea'", "'iae'?"),
         ("mesages, iae<=1.01", "no metric is called 'mesages'", "'messages'?"),
         ("messages, iae>=1.01", "'iae>=1.01' is no limit", "iae<=1.01"),
         ("messages, iae<=", "'iae<=' is no limit", "iae<=1.01"),
-        ("messages, iae<=1.0.1", "'iae<=1.0.1' is no limit", "iae<=1.01"),
     ],
 )
-def test_what_is_wrong_with_a_wish(text, message, hint):
+def test_what_is_wrong_with_an_objective(text, message, hint):
     with pytest.raises(DocumentError) as caught:
         parse_objective(text)
     (problem,) = caught.value.problems
@@ -48,15 +44,13 @@ def test_limits_precede_messages_and_count_with_their_interval():
     assert [objective.kept(cell(iae=iae)) for iae in (1.045, 1.06)] == [True, False]
 
 
-def test_cell_with_failed_runs_is_on_no_front():
+def test_fronts_are_per_environment_and_of_whole_cells():
     landed, whole = cell(messages=0.2, iae=0.5, failed=1), cell(messages=0.4)
     assert front([landed, whole]) == [whole]
-    assert parse_objective("messages, iae<=1.01").rank(landed) > parse_objective("messages, iae<=1.01").rank(whole)
+    objective = parse_objective("messages, iae<=1.01")
+    assert objective.rank(landed) > objective.rank(whole)
     (finding,) = fewest([landed, whole])
     assert "60.0 %" in finding.text
-
-
-def test_fronts_are_per_environment():
     given = [(0.2, 1.0, 0.0), (0.3, 1.1, 0.0), (0.25, 1.04, 0.1)]
     rows = [cell(messages=messages, iae=iae, environment={"loss": loss}) for messages, iae, loss in given]
     parts = by_environment(rows)
@@ -68,7 +62,7 @@ def test_fronts_are_per_environment():
 def tuned(tmp_path_factory):
     pytest.importorskip("cma")
     given = ["trigger.threshold=0.002:0.1:log", "seeds=6", "tuning=101:118"]
-    options = {"settings": SHORT, "out": tmp_path_factory.mktemp("tuned"), "processes": 1}
+    options = {"settings": ["duration_s=4.0"], "out": tmp_path_factory.mktemp("tuned"), "processes": 1}
     return tune("triangle", given, "messages, iae<=1.02", **options), given, options
 
 
@@ -92,8 +86,8 @@ def test_search_finds_fewest_messages_within_the_limit(tuned):
 @pytest.mark.nightly
 def test_the_command_tells_on_which_seeds(tuned, capsys):
     found, given, options = tuned
-    objective, folder = "messages, iae<=1.02", str(options["out"])
-    assert commands.sweep("triangle", given, settings=SHORT, out=folder, processes=1, optimise=objective) == 0
+    given_options = options | {"out": str(options["out"]), "optimise": "messages, iae<=1.02"}
+    assert commands.sweep("triangle", given, **given_options) == 0
     said = capsys.readouterr().out
     assert said.startswith("tuned on seeds 101 to 118, reported on seeds 1 to 6\n")
     assert f"{found.rows[1].label}: keeps IAE ratio <= 1.02" in said
@@ -107,7 +101,6 @@ def test_the_command_tells_on_which_seeds(tuned, capsys):
         (["trigger.threshold=0.01:0.02:log", "tuning=1:30"], "seed 1 is to be tuned and reported on"),
         (["trigger.threshold=0.01:0.02:log", "tuning=101:103"], "3 seeds are too few to tune on"),
         (["trigger.threshold=0.01,0.02"], "the search needs a range"),
-        (["trigger.threshold=0.01"], "there is nothing to change"),
         (["trigger.period_s=0.02:0.1:log"], "no case that is looked at has it"),
     ],
 )

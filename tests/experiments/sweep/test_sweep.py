@@ -37,33 +37,20 @@ SHORT = ["duration_s=4.0"]
 AXIS = "trigger.threshold=0.005,0.02"
 
 
-class Progress:
-    """Progress of a sweep: the number of runs so far."""
+def swept(folder, *given, file="triangle", **more):
+    """A sweep, and the number of runs that it took."""
+    ran = [0]
 
-    def __init__(self, end_after=None):
-        self.ran, self._end_after = 0, end_after
+    def progress(done, _of):
+        ran.append(done)
 
-    def __call__(self, done, of):
-        self.ran = done
-        if self._end_after is not None and done >= self._end_after:
-            raise KeyboardInterrupt
-
-
-def swept(folder, *given, progress=None, **more):
-    options = {"settings": SHORT, "processes": 1, "out": folder, **more}
-    return sweep("triangle", given or [AXIS, "seeds=3"], progress=progress or Progress(), **options)
-
-
-def tables(found):
-    """The files of the table, as bytes."""
-    sweep_table.write_csv(found.folder / "t.csv", found.rows)
-    sweep_table.write_json(found.folder / "t.json", sweep_table.document("T", found.seeds, found.rows))
-    return (found.folder / "t.csv").read_bytes(), (found.folder / "t.json").read_bytes()
+    options = {"settings": SHORT, "processes": 1, "out": folder, "progress": progress, **more}
+    return sweep(file, given or [AXIS, "seeds=3"], **options), ran[-1]
 
 
 @pytest.fixture(scope="module")
 def done(tmp_path_factory):
-    return swept(tmp_path_factory.mktemp("done"))
+    return swept(tmp_path_factory.mktemp("done"))[0]
 
 
 def test_the_table_has_the_figures_of_single_runs(done):
@@ -86,45 +73,42 @@ def test_the_table_has_the_figures_of_single_runs(done):
 
 
 def test_nothing_is_run_twice(done):
-    progress = Progress()
-    again = swept(done.folder, progress=progress)
-    assert (progress.ran, again.rows, again.notes) == (0, done.rows, ())
-    more = swept(done.folder, AXIS, "seeds=4", progress=progress)
-    assert (progress.ran, more.rows[0].seeds) == (3, 4)
-    progress = Progress()
-    swept(done.folder, "trigger.threshold=0.005,0.01,0.02", "seeds=2:4", progress=progress)
-    assert progress.ran == 3
+    again, ran = swept(done.folder)
+    assert (ran, again.rows, again.notes) == (0, done.rows, ())
+    more, ran = swept(done.folder, AXIS, "seeds=4")
+    assert (ran, more.rows[0].seeds) == (3, 4)
+    assert swept(done.folder, "trigger.threshold=0.005,0.01,0.02", "seeds=2:4")[1] == 3
 
 
 def test_a_sweep_that_was_interrupted_goes_on(done, tmp_path):
-    part = swept(tmp_path, progress=Progress(end_after=3), most_seeds=2)
+    def three(done, _of):
+        if done >= 3:
+            raise KeyboardInterrupt
+
+    part, _ = swept(tmp_path, progress=three, most_seeds=2)
     assert (part.missing, [row.seeds for row in part.rows]) == (5, [2, 2])  # cases take turns
     with (tmp_path / "runs.jsonl").open("ab") as file:
         file.write(b'{"cell":"cut off in mid')
-    whole = swept(tmp_path, progress=(progress := Progress()))
-    assert (progress.ran, whole.missing) == (5, 0)
-    assert tables(whole) == tables(done)
-    assert swept(tmp_path, progress=(quiet := Progress())).rows == done.rows
-    assert quiet.ran == 0
+    whole, ran = swept(tmp_path)
+    assert (ran, whole.missing, whole.rows) == (5, 0, done.rows)
+    again, ran = swept(tmp_path)
+    assert (ran, again.rows) == (0, done.rows)
 
 
-def test_changed_file_is_noticed_and_reruns_affected_runs(tmp_path):
+def test_changed_file_or_version_reruns_affected_runs(tmp_path, monkeypatch):
     file = tmp_path / "mine.toml"
     text = load("triangle").text.replace("duration_s = 15.0", "duration_s = 3.0")
     file.write_text(text)
-    folder = tmp_path / "runs"
-    sweep(file, [AXIS, "seeds=2"], out=folder, processes=1)
+    given = {"file": file, "settings": []}
+    swept(tmp_path / "runs", AXIS, "seeds=2", **given)
     file.write_text(text.replace("threshold = 0.01", "threshold = 0.01, minimum_interval_s = 0.1"))
-    found = sweep(file, [AXIS, "seeds=2"], out=folder, processes=1, progress=(progress := Progress()))
+    found, ran = swept(tmp_path / "runs", AXIS, "seeds=2", **given)
     assert found.notes == ("the experiment file has changed: affected runs are repeated",)
-    assert progress.ran == 4  # the two cells of `event`; `periodic` is as it was
+    assert ran == 4  # the two cells of `event`; `periodic` is as it was
     assert min(row.gap_min_s for row in found.rows if row.case == "event") == pytest.approx(0.1)
-
-
-def test_another_version_is_noticed(tmp_path, monkeypatch):
-    swept(tmp_path, "seeds=1")
     monkeypatch.setattr(sweeps, "version", lambda _name: "99.0")
-    assert swept(tmp_path, "seeds=1").notes == ("this is zenpark 99.0, not 0.1.0: all runs are repeated",)
+    found, _ = swept(tmp_path / "runs", AXIS, "seeds=1", **given)
+    assert found.notes == ("this is zenpark 99.0, not 0.1.0: all runs are repeated",)
 
 
 def test_runs_that_fail_are_counted_and_named(tmp_path, monkeypatch):
@@ -136,37 +120,30 @@ def test_runs_that_fail_are_counted_and_named(tmp_path, monkeypatch):
         return real(plan, seed, lean=lean)
 
     monkeypatch.setattr(runs, "simulate", stuck)
-    found = swept(tmp_path)
+    found, _ = swept(tmp_path)
     assert [(row.seeds, row.failed) for row in found.rows] == [(3, 0), (3, 0), (2, 1)]
     assert found.failures == ("event trigger.threshold=0.02, seed 2: not airborne after 60 s: CF01",)
     assert found.rows[2].ratio["iae"].n == 2
 
 
-def test_two_sweeps_do_not_share_a_folder(tmp_path):
+def test_sweeps_that_cannot_be_made_are_refused(tmp_path):
     def meanwhile(_done, _of):
         with pytest.raises(DocumentError, match="another sweep is at work in it"):
             swept(tmp_path, "seeds=1")
 
     swept(tmp_path, "seeds=1", progress=meanwhile)
-
-
-def test_origin_that_cannot_be_written_is_refused(tmp_path):
+    for given, message in (("tuning=5", "nothing to tune"), ("trigger.threshold=0.01:0.02:log", "how many values")):
+        with pytest.raises(DocumentError, match=message):
+            swept(tmp_path, given)
+    (tmp_path / ORIGIN).unlink()
     (tmp_path / ORIGIN).mkdir()
     with Store(tmp_path) as kept, pytest.raises(DocumentError):
         kept.changed_since(StoreOrigin("1", "2", "3"))
 
 
-def test_tuning_word_and_open_range_belong_to_search(tmp_path):
-    with pytest.raises(DocumentError, match="there is nothing to tune"):
-        swept(tmp_path, "tuning=5")
-    with pytest.raises(DocumentError, match="how many values"):
-        swept(tmp_path, "trigger.threshold=0.01:0.02:log")
-
-
-@pytest.mark.parametrize(("robots", "flights"), [(4, 100), (1000, 1)])
-def test_number_of_parallel_flights_depends_on_robots(robots, flights):
-    crowd = dict.fromkeys([f"R{k}" for k in range(robots)], "khepera4")
-    assert side_by_side(Plan(small(crowd, duration_s=45.0))) == flights
+def test_number_of_parallel_flights_depends_on_robots():
+    crowds = (dict.fromkeys([f"R{k}" for k in range(robots)], "khepera4") for robots in (4, 1000))
+    assert [side_by_side(Plan(small(crowd, duration_s=45.0))) for crowd in crowds] == [100, 1]
 
 
 def test_workers_of_other_code_or_nowhere_are_refused():
@@ -176,18 +153,8 @@ def test_workers_of_other_code_or_nowhere_are_refused():
         workers("nonsense", None).__enter__()
 
 
-def test_the_front_has_what_no_other_beats(done):
-    rows = [row for row in done.rows if not row.reference]
-    points = [(row.ratio["messages"].mean, row.ratio["iae"].mean) for row in rows]
-    best = front(rows)
-    for row, (messages, iae) in zip(rows, points, strict=True):
-        beaten = any(fewer <= messages and less < iae for fewer, less in points)
-        assert (row in best) != beaten
-    pareto(done.rows[:1]).canvas.draw()  # nothing but the reference
-
-
 def test_curves_go_along_the_first_parameter(tmp_path):
-    found = swept(tmp_path, "trigger.threshold=0.005,0.02", "formation.gain=2,3", "seeds=1")
+    found, _ = swept(tmp_path, "trigger.threshold=0.005,0.02", "formation.gain=2,3", "seeds=1")
     drawn = curves([row for row in found.rows if not row.reference])
     assert {name: len(rows) for name, rows in drawn.items()} == {("event", "gain = 2"): 2, ("event", "gain = 3"): 2}
     assert [row.parameters["trigger.threshold"] for row in drawn["event", "gain = 2"]] == [0.005, 0.02]
@@ -201,7 +168,8 @@ def test_curves_go_along_the_first_parameter(tmp_path):
 
 
 def test_tied_cells_share_front_and_parameter_columns(done):
-    (row, *_) = [row for row in done.rows if not row.reference]
+    reference, row, _ = done.rows
+    pareto([reference]).canvas.draw()  # nothing but the reference
     other = replace(row, case="other", parameters={"cases.other.trigger.threshold": 0.3}, units={})
     assert front([row, other]) == [row, other]
     assert parameter_columns([row, other]) == {"threshold [m]": ["0.005", "0.3"]}
@@ -209,12 +177,11 @@ def test_tied_cells_share_front_and_parameter_columns(done):
     assert list(parameter_columns([row, both])) == ["trigger.threshold [m]", "cases.other.trigger.threshold"]
 
 
-def test_search_figures_are_drawn_at_any_width(done, tmp_path):
+def test_search_of_another_version_is_refused(done, tmp_path):
     tried = [msgspec.to_builtins(row) for row in done.rows if not row.reference]
     file = tmp_path / "sweep.json"
     sweep_table.write_json(file, sweep_table.document("t", [1], done.rows[:1], tuning=[7], tried=tried))
     assert report([str(tmp_path)], width=7.16) == 0
-    assert 'width="515.52pt"' in (tmp_path / "figures" / "pareto_iae.svg").read_text()
     sweep_table.write_json(file, sweep_table.document("t", [1], done.rows[:1], tuning=[7]))
     with pytest.raises(RecordingError, match="a search of another version; make it again"):
         report([str(tmp_path)])
@@ -225,17 +192,13 @@ def test_long_folder_name_is_cut_and_stays_unique():
     axes = [Axis(f"{path}=1", path, ("1",), None) for path in paths]
     names = [folder_of(read, some, "sweep").name for some in (axes[:1], axes, axes[::-1])]
     assert names[0] == "triangle-sweep-trigger.threshold"
-    assert names[1].startswith("triangle-sweep-trigger.threshold-cases.")
     assert [len(name) for name in names[1:]] == [60, 60]
     assert len({name[-8:] for name in names}) == 3
 
 
-def typed(folder, *given, **more):
-    return commands.sweep("triangle", given, settings=SHORT, out=str(folder), processes=1, **more)
-
-
 def test_the_command_writes_table_figures_and_page(done, capsys):
-    assert typed(done.folder, AXIS, "seeds=3") == 0
+    given, options = [AXIS, "seeds=3"], {"settings": SHORT, "out": str(done.folder), "processes": 1}
+    assert commands.sweep("triangle", given, **options) == 0
     said = capsys.readouterr().out
     assert "event     threshold=0.02" in said
     assert (done.folder / "sweep.csv").read_text().startswith("case,trigger.threshold,reference,seeds,failed,f_hz,")
@@ -246,15 +209,14 @@ def test_the_command_writes_table_figures_and_page(done, capsys):
     assert "./zenpark sweep triangle trigger.threshold=0.005,0.02 seeds=3 --set duration_s=4.0" in page
     assert page.count("<svg") == 2
     assert {file.name for file in (done.folder / "figures").iterdir()} == {"pareto_iae.svg", "pareto_itae.svg"}
-    assert typed(done.folder, AXIS, "seeds=3", as_json=True) == 0
+    assert commands.sweep("triangle", given, **options, as_json=True) == 0
     assert json.loads(capsys.readouterr().out)["cells"] == table["cells"]
 
 
 def test_the_page_says_who_needs_fewest_messages(done):
     found = [finding.text for finding in sweep_page.fewest(done.rows)]
     assert all(text.startswith("Fewest messages with an IAE ratio of at most ") for text in found)
-    far = [row if row.reference else replace(row, ratio={**row.ratio, "iae": spread([1.2 + k])})
-           for k, row in enumerate(done.rows)]  # fmt: skip
-    (finding,) = sweep_page.fewest(far)
-    nearest = next(row for row in far if not row.reference)
-    assert finding.text.startswith(f"No cell has an IAE ratio of at most 1.05; the nearest: {nearest.label}: ")
+    reference, *rows = done.rows
+    far = [replace(row, ratio={**row.ratio, "iae": spread([1.2 + k])}) for k, row in enumerate(rows)]
+    (finding,) = sweep_page.fewest([reference, *far])
+    assert finding.text.startswith(f"No cell has an IAE ratio of at most 1.05; the nearest: {rows[0].label}: ")
