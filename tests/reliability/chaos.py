@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import math
+import statistics
 import sys
 from pathlib import Path
 from typing import Annotated, Final
@@ -14,14 +16,15 @@ from agents.runtime.command_line import interrupts
 from experiments.definition.plan import Plan
 from experiments.file.document import chosen, load
 from experiments.recording.run_folder import SOURCE, new_folder
-from tests.reliability.chaos_report import ChaosResult, FaultResult, RoundResult, findings, table
-from tests.reliability.chaos_round import ChaosRound
-from tests.reliability.faults import FAULTS, script
+from experiments.report.page import NONE, VerdictLine
+from tests.reliability.chaos_round import ChaosRound, FaultResult, RoundResult, line
+from tests.reliability.faults import FAULTS, Fault, script
 from tests.reliability.spoilt_run import Setting
 from tools.options import AsJson, File, Out, Settings, known_words, print_result
 from tools.progress import columns
 
 BARREN: Final = 3  # rounds without any fault, and it gives up
+BUSY: Final = 0.05  # share of the ticks that a machine may miss which is to be trusted with the rest
 
 
 # pymunk measures contacts; a busy machine is no fault; rounds are long, for starts take time
@@ -87,3 +90,45 @@ def defaults(plan: Plan) -> list[str]:
     ):
         made.append(f"rates.body_hz={BODY_HZ:g}")
     return made
+
+
+class ChaosResult(msgspec.Struct, frozen=True):
+    """Everything of a laboratory, as `chaos.json` keeps it."""
+
+    experiment: str
+    seed: int
+    script: list[Fault]
+    outcomes: list[FaultResult]
+    rounds: list[RoundResult]
+
+
+def table(result: ChaosResult) -> list[tuple[str, ...]]:
+    """A head and a row for each kind of fault; times count from the begin of the fault."""
+    rows: list[tuple[str, ...]] = [("fault", "done", "well again", "came down", "median", "longest", "violations")]
+    for kind in FAULTS:
+        mine = [each for each in result.outcomes if each.fault.kind == kind]
+        well = [each.begin_s for each in mine if each.recovered]
+        counts = len(mine), len(well), sum(each.ended for each in mine)
+        times = (f"{what(well):.1f} s" if well else NONE for what in (statistics.median, max))
+        wrong = sum(len(each.violations) for each in mine)
+        rows += [(kind, *map(str, counts), *times, str(wrong))] if mine else []
+    return rows
+
+
+def findings(result: ChaosResult) -> list[VerdictLine]:
+    """The verdict; bad findings are violations, or faults that could not be done."""
+    done, wanted, rounds = len(result.outcomes), len(result.script), result.rounds
+    nearest = min((each.nearest_m for each in rounds), default=math.inf)
+    late = max((each.gone_s for each in rounds), default=0.0)
+    found = [
+        VerdictLine("good" if done == wanted else "bad", f"{done} of {wanted} faults in {len(rounds)} rounds"),
+        VerdictLine("plain", f"robots came as near as {nearest:.3f} m to each other, surface to surface"),
+        VerdictLine("plain", f"after the end of a round all of its processes were gone within {late:.1f} s"),
+    ]
+    for each in rounds:
+        if each.missed > BUSY:
+            text = f"the machine was too busy, {100 * each.missed:.0f} % of ticks were missed"
+            found.append(VerdictLine("fair", f"round {each.round}: {text}"))
+    wrong = [line(each) for each in result.outcomes if each.violations]
+    wrong += [f"round {each.round}: {text}" for each in rounds for text in each.violations]
+    return found + ([VerdictLine("bad", text) for text in wrong] or [VerdictLine("good", "0 violations")])

@@ -8,13 +8,19 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from functools import partial
+from pathlib import Path
 from typing import Final
 
+import msgspec
+
+from agents.errors import ExplainedError
 from agents.network import session as network
-from tests.reliability.chaos_report import FaultResult, RoundResult, line, recording_faults
+from experiments.metrics.measure import measure
+from experiments.recording import playback
+from experiments.recording.reader import recover
 from tests.reliability.faults import FAULT_KINDS, NOTICE_S, ActiveFault, Check, Fault, next_fault
 from tests.reliability.observer import Observer
 from tests.reliability.spoilt_run import Setting, SpoiltRun
@@ -30,6 +36,64 @@ LEAD_S: Final = 1.0  # the start is announced not longer before
 LANDED_S: Final = 40.0  # after the launcher's death or the end everything is gone
 LAST_BREATH_S: Final = 5.0  # from when a process cannot be found any more to when its exit code is known
 END_S: Final = 60.0  # and no round takes longer than this after its time
+
+
+class FaultResult(msgspec.Struct, frozen=True):
+    """Result of one fault."""
+
+    round: int  # counted from 1
+    fault: Fault  # as in the script
+    victim: str  # a robot; empty: the whole run
+    note: str  # for the report
+    recovered: bool  # in time
+    at_s: float  # from the common start [s]
+    begin_s: float  # from its begin to the recovery [s]
+    ended: bool  # robots came down instead of going on, dead ones not counted
+    violations: list[str]  # of the invariants
+
+
+class RoundResult(msgspec.Struct, frozen=True):
+    """Result of one round."""
+
+    round: int  # counted from 1
+    violations: list[str]  # of the invariants, outside of a fault
+    nearest_m: float  # least distance between surfaces of two robots [m]
+    gone_s: float  # from its end until all of its processes were gone [s]
+    missed: float  # share of missed ticks of robots without a fault: the load of the machine
+
+
+def line(outcome: FaultResult) -> str:
+    whom = f" {outcome.victim}" if outcome.victim else ""
+    how = f"well after {outcome.begin_s:.1f} s" if outcome.recovered else "NOT WELL"
+    how += ", came down" if outcome.ended else ""
+    wrong = "".join(f"; {text}" for text in outcome.violations)
+    note = f" ({outcome.note})" if outcome.note else ""
+    return f"round {outcome.round}, {outcome.at_s:5.1f} s: {outcome.fault.kind}{whom}{note}: {how}{wrong}"
+
+
+def recording_faults(recording: Path, outcomes: Sequence[FaultResult], *, disk_full: bool) -> list[str]:
+    """Faults of the recording of a round, which must open and have the events."""
+    try:
+        if disk_full:
+            mended = recording.with_name("mended.mcap")
+            if not recover(recording, mended).complete:
+                recording = mended
+        read = playback.read(recording)
+    except (ExplainedError, OSError) as error:
+        return [f"the recording does not open: {error}"]
+    if disk_full:
+        return []
+    events = {(event.kind.rstrip("0123456789"), event.source) for event in read.trace.events}
+    kinds = {kind for kind, _ in events}
+    wrong = [] if read.complete else ["the recording has no end"]
+    for each in outcomes:
+        kind = each.fault.properties.recorded
+        if kind and not ((kind, each.victim) in events if each.victim else kind in kinds):
+            wrong.append(f"the recording has no event {kind} {each.victim}".rstrip())
+    left = [each for each in outcomes if each.ended and not each.fault.properties.ordered]
+    if left and not measure(read.trace).failures:
+        wrong.append(f"robots came down by {left[0].fault.kind}, and the run would end with 0")
+    return wrong
 
 
 class _Over(Exception):
@@ -75,8 +139,6 @@ class ChaosRound:
         for each in self._wrong:
             print(f"round {self._number}: {each}", file=sys.stderr)
         return RoundResult(self._number, self._wrong, round(nearest, 4), round(gone_s, 1), missed)
-
-    # ------------------------------------------------------------------ the run
 
     def _follow(self) -> None:
         """Inject one fault after the other, until none is left that fits into the run."""
@@ -209,8 +271,6 @@ class ChaosRound:
             return ""
         error = self._observer.invariants.formation_error(live, t)
         return f"a link is {error:.3f} off" if error > self._run.experiment.tolerance else ""
-
-    # ------------------------------------------------------------------ the end
 
     def _finish(self) -> float:
         """End the run if it has not ended; return the time until all its processes had ended [s]."""

@@ -1,8 +1,4 @@
-"""Faults: what each does to a run, why the run may not yet be well after it, and their script.
-
-A fault is a function, which its docstring defines. It is given the fault that begins, and returns the
-check that goes on until all is well: the reason why it is not, or an empty text.
-"""
+"""Faults, by kind as docs/chaos.md defines them: what each does to a run, why it may not be well after it, a script."""
 
 from __future__ import annotations
 
@@ -10,7 +6,7 @@ import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from signal import SIGKILL, SIGSTOP
+from signal import SIGKILL, SIGSTOP, Signals
 from typing import Final, Literal
 
 import msgspec
@@ -20,6 +16,7 @@ from agents.network import messages
 from tests.reliability.observer import Observer
 from tests.reliability.spoilt_run import MOCAP_CLOCK, SpoiltRun, Stage
 from twins.arrays import Array
+from twins.devices.device import CaptureFault
 
 HELD_M: Final = 0.25  # largest distance of a robot that no process steers
 NOTICE_S: Final = 1.0  # after which it must have stopped
@@ -31,7 +28,7 @@ GAP_S: Final = (0.5, 2.0)  # from when a fault has healed to the next
 LATEST_S: Final = 4.0  # before the end no fault is begun that could not heal
 LAST_S: Final = 15.0  # before the end the launcher may die, with which a round ends
 
-Check = Callable[[], str]
+Check = Callable[[], str]  # polled until it returns an empty text; before, the reason why the run is not yet well
 
 
 class Fault(msgspec.Struct, frozen=True):
@@ -74,11 +71,6 @@ class ActiveFault:
         if text not in self.violations:
             self.violations.append(text)
 
-    def shift_clock(self, name: str, shift: float, before: float = 0.0) -> None:
-        """Shift the wall clock that a switch sets, by `before` + `shift` in all [s]."""
-        self.run.switch(name).write(before + shift)
-        self.note = f"{shift:+g} s"
-
     def check_held(self) -> None:
         """Check that the body of a victim stops soon, for no process steers it."""
         if time.monotonic() < self.begun + NOTICE_S or not self.observer.connected:
@@ -88,14 +80,10 @@ class ActiveFault:
         if self.observer.moved(self.victim, self._held_at) > HELD_M:
             self.add_violation(f"{self.victim} moved although no process steered it")
 
-    def reported(self, process: str) -> Check:
-        """Check that the conductor has reported the end of a process since the fault began."""
-
-        def check() -> str:
-            ends = (each for each in self.observer.events[self._events :] if each.kind.startswith(process))
-            return "" if any("ended" in each.text for each in ends) else f"the end of the {process} is not reported"
-
-        return check
+    def reported(self, process: str) -> str:
+        """Reason why the conductor has not reported the end of a process since the fault began."""
+        ends = (each for each in self.observer.events[self._events :] if each.kind.startswith(process))
+        return "" if any("ended" in each.text for each in ends) else f"the end of the {process} is not reported"
 
     def lost(self) -> bool:
         """Whether the conductor has reported the end of the victim's process since the fault began."""
@@ -107,8 +95,14 @@ class ActiveFault:
         if observer.status_at.get(victim, 0.0) < self.lifted:
             return f"no status of {victim} yet"
         if observer.is_down(victim):
-            return f"{victim} has not come down yet" if observer.invariants.in_the_air(victim) else ""
+            return self.landed()
         return "" if victim in self.live else f"{victim} is not back"
+
+    def landed(self) -> str:
+        """Reason why the victim is not down."""
+        if not self.observer.is_down(self.victim):
+            return f"{self.victim} does not land"
+        return f"{self.victim} has not come down yet" if self.observer.invariants.in_the_air(self.victim) else ""
 
     def loss_noticed(self) -> str:
         """Reason why the loss of the victim is not known to all who receive it."""
@@ -164,78 +158,67 @@ class ActiveFault:
         awake = [name for name in asked if observer.status[name].phase != "done"]
         return f"in the air {up}, not done {awake}" if up or awake else ""
 
-    def all_unaware(self, text: str) -> Check:
-        """Check that all robots measured by motion capture notice that their positions are wrong."""
-        return lambda: self.unaware(self.run.measured, text)
-
-    def landed(self) -> str:
-        """Reason why the victim is not down after an order to land."""
-        if not self.observer.is_down(self.victim):
-            return f"{self.victim} does not land"
-        return f"{self.victim} has not come down yet" if self.observer.invariants.in_the_air(self.victim) else ""
-
     def incidents(self, name: str, what: str) -> list[messages.Incident]:
         """Incidents since the fault began that made a robot hold, land or cut its motors, and whose text has `what`."""
         new = self.observer.status[name].incidents_since(self._before.get(name))
         return [each for each in new if what in each.text and each.text.startswith(("hold", "land", "cut"))]
 
 
-# ---------------------------------------------------------------------- the faults
+Begin = Callable[[ActiveFault], Check]
+
+
+def _signal(number: Signals, why: Callable[[ActiveFault], str], role: str = "") -> Begin:
+    """A signal to a process, the victim's if no other is named; `why` the run is not yet well."""
+
+    def begin(active: ActiveFault) -> Check:
+        active.run.send(role or active.victim, number)
+        return partial(why, active)
+
+    return begin
+
+
+def _step_clock(name: str) -> Begin:
+    """A step of the wall clock that a switch sets: no robot may lose its position."""
+
+    def begin(active: ActiveFault) -> Check:
+        switch, active.note = active.run.switch(name), f"{active.fault.size:+g} s"
+        switch.write(switch.read() + active.fault.size)
+        return active.positions_kept
+
+    return begin
+
+
+def _capture(fault: CaptureFault, text: str = "position") -> Begin:
+    """Wrong poses from motion capture, of a victim if there is one: robots must hold or land by it."""
+
+    def begin(active: ActiveFault) -> Check:
+        names = active.run.measured
+        active.run.spoil_capture(fault, active.victim)
+        if active.victim:
+            first = names.index(active.victim)
+            names = [*names, names[0]][first : first + (2 if fault == "swapped" else 1)]
+            active.note = " and ".join(names[1:])
+        return partial(active.unaware, names, text)
+
+    return begin
 
 
 def _kill(active: ActiveFault) -> Check:
-    """SIGKILL to a robot's process; its body stays in the room and must come down."""
     active.run.send(active.victim, SIGKILL)
-    active.run.dead[active.victim] = active.begun
+    active.run.dead[active.victim] = active.begun  # its body stays in the room and must come down
     return active.loss_noticed
 
 
-def _freeze(active: ActiveFault) -> Check:
-    """SIGSTOP for 5 s, then SIGCONT."""
-    active.run.send(active.victim, SIGSTOP)
-    return active.back
-
-
 def _partition(active: ActiveFault) -> Check:
-    """Nothing passes between a robot and the router for 3 s; messages of that time arrive afterwards."""
     active.run.cut(active.victim)
     return active.back
 
 
-def _router(active: ActiveFault) -> Check:
-    """SIGKILL to the only router; the conductor starts it again."""
-    active.run.send("router", SIGKILL)
-    return active.reported("router")
-
-
-def _failover(active: ActiveFault) -> Check:
-    """SIGKILL to the first of two routers."""
-    return _router(active)
-
-
-def _frozen_router(active: ActiveFault) -> Check:
-    """SIGSTOP for 5 s to a router whose lease is 60 s: robots must notice by themselves, and hold."""
-    active.run.send("router", SIGSTOP)
-    return active.all_held
-
-
-def _conductor(active: ActiveFault) -> Check:
-    """SIGKILL to the launcher: robots land by themselves, and everything ends."""
-    active.run.send("conductor", SIGKILL)
-    return active.all_landed
-
-
-def _clock(active: ActiveFault) -> Check:
-    """The wall clock of all processes steps by 0.5 to 5 s, forward or back."""
-    active.shift_clock("clock", active.fault.size, active.run.switch("clock").read())
-    return active.positions_kept
-
-
 def _clock_behind(active: ActiveFault) -> Check:
-    """SIGKILL to a robot's process; it is started again with a clock 3 to 4.5 s behind, and must be received."""
     run, observer, victim = active.run, active.observer, active.victim
     run.send(victim, SIGKILL)
-    active.shift_clock(f"clock-{run.process_of(victim)}", -active.fault.size)
+    run.switch(f"clock-{run.process_of(victim)}").write(-active.fault.size)
+    active.note = f"{-active.fault.size:+g} s"
     restarted = back = None
 
     def check() -> str:
@@ -263,47 +246,12 @@ def _clock_behind(active: ActiveFault) -> Check:
     return check
 
 
-def _mocap_clock(active: ActiveFault) -> Check:
-    """The wall clock of motion capture steps by 0.5 to 4.5 s, and back after 3 s: no robot may lose its position."""
-    active.shift_clock(MOCAP_CLOCK, active.fault.size)
-    return active.positions_kept
-
-
-def _mocap_frozen(active: ActiveFault) -> Check:
-    """Motion capture tells the same poses in new frames for 5 s: no robot may move by them."""
-    active.run.spoil_capture("frozen")
-    return active.all_unaware("position")
-
-
-def _mocap_repeated(active: ActiveFault) -> Check:
-    """Motion capture sends its last frame again and again for 5 s: no robot may move by it."""
-    active.run.spoil_capture("repeated")
-    return active.all_unaware("position")
-
-
-def _mocap_swapped(active: ActiveFault) -> Check:
-    """Motion capture takes two subjects for each other for 5 s: both must hold or land."""
-    names = active.run.measured
-    active.run.spoil_capture("swapped", active.victim)
-    pair = active.victim, names[(names.index(active.victim) + 1) % len(names)]
-    active.note = f"and {pair[1]}"
-    return lambda: active.unaware(pair, "")
-
-
-def _mocap_renamed(active: ActiveFault) -> Check:
-    """A subject of motion capture has another name for 5 s: its robot must hold or land."""
-    active.run.spoil_capture("renamed", active.victim)
-    return lambda: active.unaware([active.victim], "position")
-
-
 def _refused_landing(active: ActiveFault) -> Check:
-    """A robot is ordered to land, and its body refuses for 12 s: it must be told again until it is down."""
     active.run.refuse_landing(active.victim, active.observer.session)
     return active.landed
 
 
 def _sleep(active: ActiveFault) -> Check:
-    """The computer of a robot sleeps for 8 s: on waking it must be heard, hear the others, or be down."""
     active.run.sleep(active.victim)
 
     def check() -> str:
@@ -316,7 +264,6 @@ def _sleep(active: ActiveFault) -> Check:
 
 
 def _double(active: ActiveFault) -> Check:
-    """A second process of a robot's name is started: it must be refused, and touch nothing."""
     victim, second = active.victim, active.run.start_duplicate(active.victim)
 
     def check() -> str:
@@ -333,7 +280,6 @@ def _double(active: ActiveFault) -> Check:
 
 
 def _read_error(active: ActiveFault) -> Check:
-    """Reading a robot's body raises: it must be ordered to land or to stop all the same."""
     observer, victim = active.observer, active.victim
     active.run.switch(f"read-{victim}").write(1.0)
 
@@ -351,13 +297,11 @@ def _read_error(active: ActiveFault) -> Check:
 
 
 def _disk(active: ActiveFault) -> Check:
-    """The recording can grow no more."""
     active.note = active.run.fill_disk()
-    return active.reported("recorder")
+    return partial(active.reported, "recorder")
 
 
 def _corrupt(active: ActiveFault) -> Check:
-    """Payloads of nonsense on every key that a robot believes."""
     active.note = f"{active.run.spoil(active.victim, active.observer.session)} payloads of nonsense"
     return active.back
 
@@ -366,7 +310,7 @@ def _corrupt(active: ActiveFault) -> Check:
 class FaultKind:
     """A kind of fault: how it begins, and what a script and a round must know of it."""
 
-    begin: Callable[[ActiveFault], Check]
+    begin: Begin
     lasts_s: float = 0.0  # until it is lifted [s]; 0: it cannot be
     heals_s: float = 1.5  # usual time of the recovery [s]
     victim: bool = True  # one robot; else the whole run
@@ -382,23 +326,34 @@ class FaultKind:
     recorded: Literal["", "lost", "router"] = ""  # kind of the event of which the recording must have one
 
 
-MOCAP: Final = "motion capture"
-_wrong_poses = partial(FaultKind, lasts_s=5.0, heals_s=8.0, most=1, disbands=True, stage=MOCAP, among="measured")
+_wrong_poses = partial(
+    FaultKind, lasts_s=5.0, heals_s=8.0, most=1, disbands=True, stage="motion capture", among="measured"
+)
+_router = partial(
+    FaultKind,
+    _signal(SIGKILL, partial(ActiveFault.reported, process="router"), "router"),
+    victim=False,
+    recorded="router",
+)
 FAULT_KINDS: Final = {
     "kill": FaultKind(_kill, most=2, recorded="lost"),
-    "freeze": FaultKind(_freeze, 5.0, unsteered=True),
+    "freeze": FaultKind(_signal(SIGSTOP, ActiveFault.back), 5.0, unsteered=True),
     "partition": FaultKind(_partition, 3.0, unsteered=True),
-    "router": FaultKind(_router, victim=False, most=3, never="two routers", recorded="router"),
-    "failover": FaultKind(_failover, victim=False, most=1, stage="two routers", recorded="router"),
-    "frozen-router": FaultKind(_frozen_router, 5.0, victim=False, most=2, stage="patient router"),
-    "conductor": FaultKind(_conductor, victim=False, most=1),
-    "clock": FaultKind(_clock, victim=False, size=(0.5, 5.0), signed=True),
+    "router": _router(most=3, never="two routers"),
+    "failover": _router(most=1, stage="two routers"),
+    "frozen-router": FaultKind(
+        _signal(SIGSTOP, ActiveFault.all_held, "router"), 5.0, victim=False, most=2, stage="patient router"
+    ),
+    "conductor": FaultKind(_signal(SIGKILL, ActiveFault.all_landed, "conductor"), victim=False, most=1),
+    "clock": FaultKind(_step_clock("clock"), victim=False, size=(0.5, 5.0), signed=True),
     "clock-behind": FaultKind(_clock_behind, heals_s=12.0, most=2, size=(3.0, 4.5), recorded="lost"),
-    "mocap-clock": FaultKind(_mocap_clock, 3.0, victim=False, most=3, stage=MOCAP, size=(0.5, 4.5), signed=True),
-    "mocap-frozen": _wrong_poses(_mocap_frozen, victim=False),
-    "mocap-repeated": _wrong_poses(_mocap_repeated, victim=False),
-    "mocap-swapped": _wrong_poses(_mocap_swapped),
-    "mocap-renamed": _wrong_poses(_mocap_renamed),
+    "mocap-clock": FaultKind(
+        _step_clock(MOCAP_CLOCK), 3.0, victim=False, most=3, stage="motion capture", size=(0.5, 4.5), signed=True
+    ),
+    "mocap-frozen": _wrong_poses(_capture("frozen"), victim=False),
+    "mocap-repeated": _wrong_poses(_capture("repeated"), victim=False),
+    "mocap-swapped": _wrong_poses(_capture("swapped", "")),
+    "mocap-renamed": _wrong_poses(_capture("renamed")),
     "refused-landing": FaultKind(_refused_landing, 12.0, 8.0, most=1, disbands=True, among="flying", ordered=True),
     "sleep": FaultKind(_sleep, 8.0, heals_s=6.0, most=2, unsteered=True),
     "double": FaultKind(_double, heals_s=6.0),
@@ -409,19 +364,19 @@ FAULT_KINDS: Final = {
 FAULTS: Final = tuple(FAULT_KINDS)
 
 
-# ---------------------------------------------------------------------- their script
-
-
 def script(robots: Sequence[str], count: int, seed: int, kinds: Sequence[str] = FAULTS) -> list[Fault]:
-    """`count` faults, each kind as often as any other; the same seed gives the same script.
-
-    Args:
-        robots: Possible victims.
-    """
+    """`count` faults of `robots`, each kind as often as any other; the same seed gives the same script."""
     random = np.random.default_rng(seed)
     deck = [kinds[place % len(kinds)] for place in range(count)]
     random.shuffle(deck)
     return [_fault(kind, round(float(random.uniform(*GAP_S)), 2), robots, random) for kind in deck]
+
+
+def _fault(kind: str, after_s: float, robots: Sequence[str], random: np.random.Generator) -> Fault:
+    nature = FAULT_KINDS[kind]
+    victim = str(random.choice(list(robots))) if nature.victim else ""
+    size = round(float(random.uniform(*nature.size) * random.choice([-1.0, 1.0] if nature.signed else [1.0])), 3)
+    return Fault(kind, after_s, victim, size)
 
 
 def next_fault(waiting: Sequence[Fault], stage: Stage, begun: Mapping[str, int], left_s: float) -> Fault | None:
@@ -443,10 +398,3 @@ def next_fault(waiting: Sequence[Fault], stage: Stage, begun: Mapping[str, int],
         return (fault.kind == "conductor") == (left_s > LAST_S), fault.properties.disbands
 
     return min(fits, key=urgency, default=None)
-
-
-def _fault(kind: str, after_s: float, robots: Sequence[str], random: np.random.Generator) -> Fault:
-    nature = FAULT_KINDS[kind]
-    victim = str(random.choice(list(robots))) if nature.victim else ""
-    size = round(float(random.uniform(*nature.size) * random.choice([-1.0, 1.0] if nature.signed else [1.0])), 3)
-    return Fault(kind, after_s, victim, size)

@@ -17,8 +17,8 @@ import pytest
 import zenoh
 
 from agents.network import pubsub
-from agents.network.endpoints import EndpointError, free_endpoint
-from agents.network.messages import JSON, Order, Stop
+from agents.network.endpoints import free_endpoint
+from agents.network.messages import JSON, Stop
 from agents.network.session import (
     ANSWER_S,
     ASK_EVERY_S,
@@ -37,7 +37,7 @@ from tests.commands import python, started
 from tests.conftest import RouterProcess
 from tests.network import Net
 
-POSE, ORDER, ALIVE = "park/CF01/pose", "park/CF01/order", "park/CF01/alive"
+POSE, ALIVE = "park/CF01/pose", "park/CF01/alive"
 
 
 def payloads(handler):
@@ -49,12 +49,6 @@ def two(router):
     """Sessions of a robot and of another process."""
     with open_session([router.endpoint], name="CF01") as robot, open_session([router.endpoint], name="ui") as other:
         yield robot, other
-
-
-@pytest.mark.system
-def test_router_says_when_its_port_is_taken(router):
-    with pytest.raises(EndpointError, match=rf"{router.endpoint}.*in use"):
-        serve_router([router.endpoint], threading.Event())
 
 
 @pytest.mark.mechanism("last pose for a late joiner")
@@ -88,60 +82,11 @@ def test_pose_said_while_the_router_was_down_arrives(two, router, eventually):
     assert connected(sender)
 
 
-@pytest.mark.system
-def test_queues_keep_the_newest(two, eventually):
-    robot, other = two
-    bell = pubsub.Bell()
-    wanted = pubsub.CallbackQueue[zenoh.Sample](2, lambda sample: sample.payload.to_bytes() != b"9")
-    other.declare_subscriber(POSE, wanted.callback)
-    ringing = pubsub.RingingSubscriber(other, POSE, bell, depth=2)
-    states, last = pubsub.subscriber(other, POSE, depth=3), pubsub.subscriber(other, "park/control")
-    poses = pubsub.publisher(robot, POSE, JSON)
-    eventually(lambda: poses.matching_status.matching)
-    for value in range(10):
-        poses.put(str(value))
-    pubsub.publisher(robot, "park/control", JSON).put(b"behind")
-    eventually(lambda: payloads(last.handler))
-    assert bell.wait(10.0)
-    kept = [payloads(queue) for queue in (states.handler, wanted, ringing, ringing, wanted)]
-    assert kept == [[b"7", b"8", b"9"], [b"7", b"8"], [b"8", b"9"], [], []]
-
-
 def test_rings_before_a_wait_are_one():
     bell = pubsub.Bell()
     bell.ring()
     bell.ring()
     assert [bell.wait(0.0), bell.wait(0.0)] == [True, False]
-
-
-@pytest.mark.system
-def test_last_value_answers_a_plain_get(two, eventually):
-    robot, other = two
-    asker = other.declare_querier(POSE, timeout=5.0)  # a wildcard is never told that it matches
-    last = pubsub.LastValue(robot, POSE, JSON)
-    eventually(lambda: asker.matching_status.matching)
-    for value, expected in ((None, []), (b"2", [(POSE, b"2", JSON)])):
-        if value is not None:
-            last.hold(value)
-        asked = other.get("park/*/pose", timeout=5.0)
-        eventually(last.answer)
-        replies = [reply.ok for reply in asked]
-        assert [(str(each.key_expr), each.payload.to_bytes(), str(each.encoding)) for each in replies] == expected
-
-
-@pytest.mark.system
-def test_orders_wait_until_they_are_polled(two, eventually):
-    robot, other = two
-    orders = pubsub.Orders(robot, ORDER, Order)
-    asker = other.declare_querier(ORDER)
-    eventually(lambda: asker.matching_status.matching)
-    asked, waiting = other.get("park/*/order", payload=b'{"order": "land"}', timeout=5.0), []
-    eventually(lambda: waiting.extend(orders.read()) or waiting)
-    ((query, order),) = waiting
-    with query:
-        assert order == Order("land")
-        query.reply(ORDER, b"ok")
-    assert [reply.ok.payload.to_bytes() for reply in asked] == [b"ok"]
 
 
 ROBOT = """

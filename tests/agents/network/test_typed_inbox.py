@@ -91,6 +91,19 @@ def test_flood_of_queries_displaces_no_landing(order, encoding, orders):
     assert [given.order for _, given in orders.read()] == [order] * pubsub.ORDERS
 
 
+def test_last_value_answers_a_plain_get():
+    net = Net()
+    last = pubsub.LastValue(net.session, KEYS.pose("A"), messages.JSON)
+    queries = [Query("park/*/pose", "", b""), Query(KEYS.pose("A"), "", b"")]
+    net.channels[0].add(queries[0])
+    assert (last.answer(), queries[0].answer) == (1, None)
+    last.hold(b"1")
+    last.hold(b"2")
+    net.channels[0].add(queries[1])
+    assert last.answer() == 1
+    assert queries[1].answer == (KEYS.pose("A"), b"2", messages.JSON)
+
+
 SEEN = {"now": 1000.0, "valid_box": (2.0, 2.0, 3.5)}
 GOOD = {
     "pose": Pose("KH01", 3, 1000.0, (0.1, -0.2, 0.0), (0.01, 0.0, 0.0), 1.5),

@@ -198,17 +198,6 @@ def test_superseded_session_is_received_again(a):
     assert a.found == (0.6, 2)
 
 
-@pytest.mark.parametrize("lives", [("owner", "loser"), ("loser", "owner")])
-def test_remaining_one_of_two_claims_is_received(a, lives):
-    for session in lives:
-        a.life(session)
-    a.after()
-    a.life("loser", gone=True)
-    a.add(ALIVE)
-    a.receive(1, 0.4, "owner")
-    assert a.found == (0.4, 0)
-
-
 def test_restarted_robot_leaves_the_law(a):
     a.token("one")
     a.pose(7, 0.4, "one", speed=0.3)
@@ -236,16 +225,6 @@ def test_stored_pose_before_the_first_token_is_void(a, source):
     assert a.x == (0.9 if source == "one" else None)
     a.receive(5001 if source == "one" else 1, 0.4, "one")
     assert (a.x, a.sender.lost) == (0.4, 0)
-
-
-def test_after_reconnection_tokens_may_come_in_any_order(a):
-    a.begin("one", 7)
-    a.lose("one", 0.02)
-    a.add(ALIVE)
-    a.receive(9000, 0.9, None, age=100.0)
-    a.life("one")
-    a.receive(8, 0.5, "one")
-    assert a.x == 0.5
 
 
 @pytest.mark.parametrize(("session", "early"), [("two", True), (None, False)], ids=["restarted", "other make"])
