@@ -1,4 +1,9 @@
-"""The pilot of a Tello against a drone made of lists and a clock made of numbers."""
+"""The pilot of a Tello against a drone made of lists and a clock made of numbers; several pilots; their library."""
+
+import socket
+import time
+from importlib.util import find_spec
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -6,11 +11,104 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from agents.body.interface import UNANSWERED
+from agents.kinds.tello import TELLO
 from agents.protocols import tello as protocol
-from bridges.tello.pilot import Duty
-from tests.bridges.tello.cockpit import Cockpit
+from bridges.tello import pilot
+from bridges.tello.body import TelloBody
+from bridges.tello.library import TelloLibrary
+from bridges.tello.pilot import Duty, TelloPilot
+from tests.requests import request
 
 SPEED = st.floats(-1.0, 1.0)
+NOTHING_COMES = SimpleNamespace(receive=lambda: None)
+
+
+class Cockpit:
+    """A pilot, its clock, and its drone, which notes commands and reports what the test lets it report."""
+
+    def __init__(self, **chosen):
+        self.said, self.sticks, self.state, self.responses = [], [], {}, []
+        self.now, self.stall_s = 100.0, 0.0  # a stall is a standstill of the process in the middle of a step
+        self.pilot = TelloPilot(self, TELLO, protocol.TelloSettings(**chosen), lambda: self.now + self.stall_s)
+        self.report = {"bat": 80, "yaw": 20, "h": 0, "time": 0}
+        self.speaks = self.attended = True
+        self.broken = False
+
+    def send_command_without_return(self, command):
+        if self.broken:
+            raise OSError(101, "Network is unreachable")
+        word, *numbers = command.split()
+        if word == "rc":
+            self.sticks.append(tuple(map(int, numbers)))
+        else:
+            self.said.append(command)
+
+    def get_current_state(self):
+        return self.state
+
+    def get_own_udp_object(self):
+        return {"responses": self.responses}
+
+    def end(self):
+        self.said.append("(end)")
+
+    @property
+    def duty(self):
+        return self.pilot.duty
+
+    @property
+    def flying(self):
+        return self.pilot.flying
+
+    @property
+    def note(self):
+        return self.pilot.note(self.now)
+
+    def pass_(self, seconds, **report):
+        """Step for some seconds, with a changed report from now on."""
+        self.report.update(report)
+        for _ in range(round(seconds / 0.05)):
+            self.now = round(self.now + 0.05, 6)
+            if self.speaks and round(self.now * 20) % 2 == 0:
+                self.state = dict(self.report)
+            self.pilot.step(self.now, self.now if self.attended else 100.0)
+        return self
+
+    def answer(self, *texts, **report):
+        """Hand answers of the drone to its pilot."""
+        self.responses += texts
+        return self.pass_(0.1, **report)
+
+    def forget(self):
+        """Forget what was commanded so far."""
+        self.said.clear()
+        self.sticks.clear()
+        return self
+
+    def take_off(self, height, *, at=(0.0, 0.0, 0.0), rested_s=0.2):
+        """Order a take-off to `height` [m] at a position, after a rest on the ground."""
+        self.pass_(rested_s).forget()
+        self.pilot.position = at
+        self.pilot.take_off(height, self.now)
+        return self
+
+    def land(self):
+        self.pilot.land(self.now)
+        return self
+
+    def cut(self):
+        self.pilot.cut(self.now)
+        return self
+
+    def aim(self, *setpoint):
+        """Give the pilot in flight a setpoint."""
+        self.pilot.duty, self.pilot.setpoint, self.pilot.setpoint_time = Duty.FLY, setpoint, self.now
+
+    def fly(self):
+        """In the air, at its place, its motors' clock running."""
+        self.take_off(0.6, at=(1.0, 2.0, 0.0)).pass_(3.0, h=80, time=3).answer(b"ok")
+        assert self.duty is Duty.HOLD
+        return self.forget()
 
 
 @pytest.fixture
@@ -38,7 +136,10 @@ def test_sticks_by_hand():
     assert protocol.sticks((9.0, 0.0, -9.0), 9.0, 0.0) == (0, 100, -100, -100)
 
 
-# ---------------------------------------------------------------------- take-off
+def test_addresses():
+    for address in ("tello", "tello://", "tello://192.168.10.1"):
+        assert protocol.endpoint("T", address) == ("192.168.10.1", 8889)
+    assert protocol.endpoint("T", "tello://127.0.0.2:18889") == ("127.0.0.2", 18889)
 
 
 def test_take_off_is_sent_once_and_answered_aloft(grounded):
@@ -52,16 +153,12 @@ def test_take_off_is_sent_once_and_answered_aloft(grounded):
     assert grounded.said == ["takeoff"]
 
 
-@pytest.mark.parametrize("answer", [b"error", b"out of range", b"unknown command: takeoff"])
-def test_a_drone_that_refuses_says_so(grounded, answer):
-    grounded.take_off(0.6).answer(answer)
+def test_a_drone_that_refuses_says_so(grounded):
+    grounded.take_off(0.6).answer(b"unknown command: takeoff")
     assert grounded.duty is Duty.REST
     assert "refuses to take off" in grounded.note
-
-
-def test_refused_second_take_off_means_it_flies(grounded):
     grounded.take_off(0.6).pass_(2.0, h=80).answer(b"error")
-    assert grounded.duty is Duty.HOLD
+    assert grounded.duty is Duty.HOLD, "a second order that is refused means that it flies"
 
 
 def test_lost_answers_and_lost_commands(grounded):
@@ -82,9 +179,6 @@ def test_a_drone_that_never_gets_up_is_landed(grounded):
     grounded.pass_(1.2)  # it may have obeyed the last of the orders to take off, 3 s ago
     assert not grounded.flying
     assert "did not take off in 20 s" in grounded.note
-
-
-# ---------------------------------------------------------------------- flight
 
 
 def test_tello_climbs_and_holds_until_setpoints_come(airborne):
@@ -176,13 +270,8 @@ def test_refused_sticks_are_counted(airborne):
     assert airborne.answer(b"error", b"error Not joystick").note == ""
     assert airborne.answer(b"error Not joystick").note == "refuses the sticks, 3 times: 'error Not joystick'"
     assert airborne.pass_(1.1).note == ""
-
-
-def test_a_network_that_is_down_is_named(airborne):
     airborne.broken = True
-    airborne.pass_(0.05)
-    airborne.land()
-    airborne.cut()
+    airborne.pass_(0.05).land().cut()
     assert "cannot send: Network is unreachable" in airborne.note
     airborne.broken = False
     assert airborne.pass_(0.2).note == ""
@@ -194,9 +283,6 @@ def test_yaw_counts_from_where_it_was_opened(grounded):
     grounded.pass_(0.2, yaw="garbled", bat=None, h="", time=1.5)
     assert grounded.pilot.turned == pytest.approx(np.pi / 2)
     assert grounded.pilot.battery == 0.8
-
-
-# ---------------------------------------------------------------------- landing
 
 
 def test_landing_ends_when_answered_and_low(airborne):
@@ -286,14 +372,6 @@ def test_silent_drone_is_landed_until_surely_down(airborne):
     assert not airborne.pass_(0.2).pilot.silent(airborne.now)
 
 
-def test_drone_left_aloft_lands_when_process_ends(airborne):
-    airborne.pilot.leave()
-    assert airborne.said == ["land"] * 5 + ["(end)"]
-
-
-# ---------------------------------------------------------------------- emergency stop
-
-
 def test_emergency_stop_is_repeated_until_motors_stand(airborne):
     airborne.cut()
     assert airborne.said == ["emergency"]
@@ -317,13 +395,93 @@ def test_silent_drone_is_stopped_until_surely_landed(airborne):
     assert "landed by itself" in airborne.note
 
 
-def test_standing_drone_answers_a_stop_at_once(grounded):
-    grounded.pass_(2.0).cut()
-    assert grounded.said[-1] == "emergency"
-    assert not grounded.pass_(0.05).flying
-
-
 def test_stopped_take_off_counts_as_flying_until_standing(grounded):
     grounded.take_off(0.6, rested_s=5.0).pass_(0.1).cut()  # its motors' clock has not moved yet
     assert grounded.pass_(1.4).flying
     assert not grounded.pass_(0.5).flying
+    assert grounded.pass_(2.0).forget().cut().said == ["emergency"]
+    assert not grounded.pass_(0.05).flying, "one that stands answers at once"
+
+
+def body_of(*cockpits):
+    """A body with these pilots, never opened, whose drones answer on whatever clock."""
+    body = TelloBody(request("tello", [f"tello://10.0.0.{row}" for row in range(len(cockpits))], external=True))
+    body.pilots = [cockpit.pilot for cockpit in cockpits]
+    for each in body.pilots:
+        each.state_received = each.aloft = np.inf
+    body.read(0.0)
+    return body
+
+
+@pytest.mark.parametrize("kind", [AssertionError, StopIteration])
+def test_failing_pilot_lands_and_others_fly(airborne, kind):
+    def fail():
+        raise kind("broken")
+
+    other = Cockpit().fly()
+    airborne.get_own_udp_object = fail
+    body = body_of(airborne, other)
+    for _ in range(3):
+        body.step(NOTHING_COMES)
+    assert len(other.sticks) == 3
+    assert set(airborne.said) == {"land"}
+    assert airborne.pilot.trouble == f"cannot be driven: {kind.__name__}: broken"
+
+
+def test_undrivable_drone_keeps_no_other_from_stopping(airborne):
+    other = Cockpit().fly()
+    body = body_of(airborne, other)
+    airborne.get_own_udp_object = dict
+    for what in (body.land, body.stop):
+        with pytest.raises(KeyError, match="responses"):
+            what(range(2))
+    assert other.said == ["land", "emergency"]
+
+
+def test_sleep_of_the_machine_ends_its_flight(airborne, monkeypatch):
+    """The machine's monotonic clock stands still meanwhile; its uptime goes on."""
+    body = body_of(airborne)
+    body.command([(0.5, 0.0, 0.0, 0.0)])
+    gettime = time.clock_gettime
+    monkeypatch.setattr(time, "clock_gettime", lambda which: gettime(which) + 3.0)
+    body.step(NOTHING_COMES)
+    assert (airborne.duty, airborne.sticks) == (Duty.LAND, [(0, 0, 0, 0)])
+
+
+def test_stop_counts_while_the_body_closes(airborne, monkeypatch):
+    left = Cockpit().fly()
+    left.pilot.leave()
+    assert left.said == ["land"] * 5 + ["(end)"]
+    body = body_of(airborne)
+    monkeypatch.setattr(pilot.time, "sleep", lambda _: body.stop([0]))
+    body.close()
+    assert airborne.said[:2] == ["land", "emergency"]
+    assert set(airborne.said[1:-1]) == {"emergency"}
+    body.stop([0])  # nobody is left
+    assert airborne.said[-1] == "(end)"
+
+
+@pytest.mark.skipif(find_spec("djitellopy") is None, reason="needs djitellopy")
+def test_telemetry_outlives_bytes_of_nonsense():
+    with socket.socket(type=socket.SOCK_DGRAM) as first, socket.socket(type=socket.SOCK_DGRAM) as second:
+        for free in (first, second):
+            free.bind(("", 0))
+        answers, states = (free.getsockname()[1] for free in (first, second))
+    library = TelloLibrary(answers, states)
+    drone = library.drone("127.0.0.2", 18889)
+    with socket.socket(type=socket.SOCK_DGRAM) as sender, socket.socket(type=socket.SOCK_DGRAM) as stranger:
+        sender.bind(("127.0.0.2", 0))
+        for data in (b"\xff", b"", b"ok", b"h:", b"h:x;bat:9", b"x" * 5000, b"\xffh:70;bat:9;"):
+            sender.sendto(data, ("127.0.0.1", states))
+        stranger.sendto(b"h:50;bat:1;\r\n", ("127.0.0.1", states))
+        library.receive()
+        assert drone.get_current_state() == {}
+        for height in range(150):  # more than are read at a time
+            sender.sendto(b"h:%d;bat:80;time:3;\r\n" % height, ("127.0.0.1", states))
+        sender.sendto(b"ok", ("127.0.0.1", answers))
+        library.receive()
+        assert drone.get_current_state()["h"] == 99
+        library.receive()
+    assert drone.get_current_state() == {"h": 149, "bat": 80, "time": 3}
+    assert drone.get_own_udp_object()["responses"] == [b"ok"]
+    library.close()

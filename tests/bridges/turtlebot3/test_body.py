@@ -1,29 +1,24 @@
-"""The TurtleBot3 bridge against the protocol twin, through a real router."""
+"""The TurtleBot3 bridge: numbers, a ROS that is not there, and the protocol twin through a real router."""
 
-import struct
 import threading
+import time
 from dataclasses import replace
 from math import pi
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import xxhash
 from hypothesis import given
 from hypothesis import strategies as st
-from rosbags.typesys import Stores, get_typestore
-from zenoh.handlers import RingChannel
 
-from agents.network.session import open_session
+from agents.body.interface import UNANSWERED, BodyError
 from agents.protocols import ros2, turtlebot3
-from bridges.turtlebot3.body import TurtleBot3
+from bridges.turtlebot3.body import DIAGNOSIS_S, OPEN_S, TurtleBot3
 from bridges.turtlebot3.odometry import StampAge
-from bridges.turtlebot3.robot import ranges
-from tests.bridges.turtlebots import NOWHERE, STYLES, FastClock, Stage, odometry, request
-from tests.waiting import until
+from bridges.turtlebot3.robot import TurtleBotConnection, ranges
+from tests.bridges.turtlebots import NOWHERE, STYLES, FakeRos, Stage, clock, odometry, request
+from tests.waiting import ManualClock, until
 from twins.devices.device import Faults
-
-# ---------------------------------------------------------------------- without a network
 
 
 @given(st.floats(-3.5, 3.5))
@@ -34,9 +29,8 @@ def test_the_robot_does_what_the_bridge_meant(speed):
 
 
 def test_every_whole_speed_survives_the_truncation():
-    for limit in (0.22, 2.84):
-        for steps in range(-round(100 * limit), round(100 * limit) + 1):
-            assert turtlebot3.cut(turtlebot3.whole(steps / 100.0, limit)) == steps / 100.0
+    for steps in range(-284, 285):
+        assert turtlebot3.cut(turtlebot3.whole(steps / 100.0, 2.84)) == steps / 100.0
     assert turtlebot3.cut(0.29) == 0.28  # why a speed is not sent as it is
 
 
@@ -73,7 +67,6 @@ NAN, INF = np.nan, np.inf
     [
         (-0.5, 0.1, 3.5, [1.0, INF, 0.0, 0.11, 3.5, 3.6, NAN], [1.0, NAN, NAN, NAN, 3.5, NAN, NAN]),
         (-0.5, 0.1, INF, [0.0, 1.0, INF, -INF], [NAN, 1.0, NAN, NAN]),
-        (-0.5, NAN, 3.5, [0.0, 1.0, INF, -INF], [NAN] * 4),
         (INF, 0.1, 3.5, [0.0, 1.0, INF, -INF], [NAN] * 4),
         (-0.5, 0.1, NAN, [0.0, 1.0, INF, -INF], [NAN] * 4),
     ],
@@ -105,12 +98,65 @@ def test_age_by_stamps_of_another_clock(arrivals, stamps, ages):
     assert [stamped.age(*pair) for pair in zip(arrivals, stamps, strict=True)] == pytest.approx(ages, abs=0.005)
 
 
-# ---------------------------------------------------------------------- driving
+TWO = request(NOWHERE, "rmw://a?distro=humble", "rmw://b?distro=humble", start=((0.0, 0.0), (1.0, 0.0)))
+
+
+def test_unreachable_robot_keeps_no_other_from_stopping():
+    body = TurtleBot3(TWO)
+    _, good = FakeRos(body.robots[0], OSError("its session is closed")), FakeRos(body.robots[1])
+    for what in (body.land, body.stop):
+        with pytest.raises(OSError, match="its session is closed"):
+            what(range(2))
+    assert good.sent == [0.0, 0.0]
+
+
+def test_two_robots_of_one_namespace_have_no_position():
+    robot = TurtleBotConnection(request(NOWHERE, "ros2dds://tb3_0?distro=humble"), 0)
+    ros = FakeRos(robot)
+
+    def hear(first, last, place):
+        for k in range(first, last):
+            ros.odometry.append(odometry(ros.types, place(k), stamp=100.0 + 0.05 * k))
+            robot.receive_messages(0.05 * k, 0.05 * k)
+        return robot.note(0.05 * (last - 1), linked=True)
+
+    assert "was restarted" in hear(0, 20, lambda k: 3.0 if k == 10 else 0.0)  # there and back
+    assert robot.time == pytest.approx(0.95)
+    assert "do two robots have this namespace?" in hear(20, 40, lambda k: 3.0 * (k % 2))
+    assert robot.time < 1.1
+    hear(40, 160, lambda _: 0.0)
+    assert robot.time == pytest.approx(7.95)
+
+
+def test_stale_commands_are_followed_by_zeros():
+    """Also when the loop does not run, and when another robot cannot be told."""
+    now = ManualClock(100.0)
+    body = TurtleBot3(TWO, now.monotonic)
+    _, good = FakeRos(body.robots[0], StopIteration()), FakeRos(body.robots[1])
+    for robot in body.robots:
+        robot.odometry.received = 1e9
+        robot.commanded.drive(0.1, 0.0, 100.0)
+    for _ in range(20):
+        now.sleep(0.05)
+        body.stop_stale()
+    assert set(good.sent) == {0.0}
+    assert len(good.sent) >= 4
+
+
+def test_command_from_before_suspension_becomes_zeros():
+    robot = TurtleBotConnection(request(NOWHERE, "ros2dds://tb3_0?distro=humble"), 0)
+    ros = FakeRos(robot)
+    robot.odometry.received = 103.0
+    robot.commanded.drive(0.1, 0.0, 100.0)  # decided on what was read then, commanded after the suspension
+    robot.send_command(103.0)
+    assert ros.sent == [0.0]
+    robot.commanded.drive(0.1, 0.0, 103.0)
+    robot.send_command(103.1)
+    assert ros.sent[-1] == pytest.approx(0.102)
 
 
 @pytest.mark.system
-@pytest.mark.parametrize("style", STYLES)
-@pytest.mark.parametrize("distro", ["humble", "jazzy"])
+@pytest.mark.parametrize(("style", "distro"), [("ros2dds", "humble"), ("rmw", "jazzy")])
 def test_drives_to_goals(hub, style, distro):
     start, goal = ((1.0, 0.5), (-1.0, 0.0)), np.array([[1.3, 0.3], [-1.1, 0.3]])
     asked = request(hub.endpoint, start=start, yaw=(1.0, -2.0), device={"style": style, "distro": distro})
@@ -139,55 +185,6 @@ def test_two_domains_and_another_router(hub):
     with Stage(asked) as stage:
         assert stage.twin.addresses == ("rmw://TB0?domain=30&distro=jazzy",)
         assert stage.moved(2.0, 0.2) > 0.3
-
-
-@pytest.mark.system
-def test_an_empty_namespace(hub):
-    types = ros2.types("humble")
-    raw = types.encode(odometry(types, 4.0, 5.0), ros2.ODOMETRY)
-    with open_session([hub.endpoint], name="robot") as session:
-        out = session.declare_publisher("odom")
-        body = TurtleBot3(request(hub.endpoint, "ros2dds://", device={"origin": "boot"}))
-        heard = session.declare_subscriber("cmd_vel", RingChannel(4))
-        opening = threading.Thread(target=body.open)
-        opening.start()
-        while opening.is_alive():
-            out.put(raw)
-            opening.join(0.01)
-        out.put(raw)
-        (state,) = body.read(0.0)
-        assert state.position == pytest.approx((4.0, 5.0, 0.0))
-        body.stop([0])
-        body.close()
-        assert heard.recv().payload.to_bytes()[-48:] == bytes(48)
-
-
-@pytest.mark.system
-def test_what_it_sends_is_what_rmw_zenoh_sends(hub, eventually):
-    asked = request(hub.endpoint, device={"style": "rmw"})
-    code = "RIHS01_5f0fcd4f81d5d06ad9b4c4c63e3ea51b82d6ae4d0558f1d475229b1121db6f64"
-    with open_session([hub.endpoint], name="ros") as session:
-        tokens = session.liveliness().declare_subscriber("@ros2_lv/0/**", RingChannel(64), history=True)
-        heard = session.declare_subscriber(
-            f"0/TB0/cmd_vel/geometry_msgs::msg::dds_::TwistStamped_/{code}", RingChannel(64)
-        )
-        with Stage(asked) as stage:
-            stage.run(1.0, 0.1, -0.5)
-            samples, announced = [], []
-            eventually(lambda: (s := heard.try_recv()) is None or samples.append(s))
-            eventually(lambda: (s := tokens.try_recv()) is None or announced.append(str(s.key_expr)))
-        mine = [token for token in announced if "/MP/" in token and "/zenpark_TB0/%TB0%cmd_vel/" in token]
-        assert len(mine) == 1
-        gid = xxhash.xxh3_128_intdigest(mine[0].encode()).to_bytes(16, "little")
-        attached = [struct.unpack("<qqB16s", sample.attachment.to_bytes()) for sample in samples]
-        assert [sequence for sequence, *_ in attached] == list(range(1, len(samples) + 1))
-        assert {(size, source) for _, _, size, source in attached} == {(16, gid)}
-        raw, store = samples[0].payload.to_bytes(), get_typestore(Stores.ROS2_JAZZY)
-        twist = store.deserialize_cdr(raw, "geometry_msgs/msg/TwistStamped")
-        assert (int(twist.twist.linear.x * 100), int(twist.twist.angular.z * 100)) == (10, -50)
-        assert abs(twist.header.stamp.sec - FastClock().utc()) < 10
-        assert sum(token.endswith("/NN/%/%TB0/zenpark_TB0") for token in announced) == 1
-        assert any("/MS/" in token and "%TB0%odom" in token for token in announced)
 
 
 @pytest.mark.system
@@ -277,3 +274,87 @@ def test_robot_stands_on_start_pose_whatever_its_odometry(hub):
             assert state.position[:2] == pytest.approx(place, abs=1e-3)
             assert state.yaw == pytest.approx(pi / 2, abs=1e-3)
         assert stage.place[0, 1] > 1.3
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("style", STYLES)
+def test_wrong_command_type_moves_nothing_and_is_reported(hub, style):
+    with Stage(request(hub.endpoint, device={"style": style, "stamped": False}), device={}) as stage:
+        assert stage.moved(1.0, 0.2) == 0.0
+        assert stage.twin.commands_received == [0]
+        assert stage.state.note[0] == (
+            "cmd_vel is not received: the robot expects a geometry_msgs/msg/Twist, "
+            "we send a geometry_msgs/msg/TwistStamped as on jazzy: set distro or stamped"
+        )
+
+
+@pytest.mark.system
+def test_robot_that_does_not_move_is_reported(hub):
+    with Stage(request(hub.endpoint)) as stage:
+        stage.twin.robots[0].move = lambda: None  # as with its motors off
+        assert stage.note(1.0, 0.2) == ""
+        assert stage.note(1.0, 0.2).startswith("does not move despite commands: motors on?")
+        assert stage.note(0.1, 0.0) == ""
+
+
+@pytest.mark.mechanism("TurtleBot3 bridge: silent robot")
+@pytest.mark.system
+def test_silent_robot_gets_zeros_until_it_receives_them(hub):
+    with Stage(request(hub.endpoint, device={"watchdog_s": 0.5}), silent_from_s=3.0, silent_for_s=6.0) as stage:
+        until(lambda: stage.note(0.1, 0.2), "its silence is noticed")
+        assert stage.state.note[0].startswith("odometry silent for ")
+        assert stage.t - stage.state.time[0] > 0.5
+        stage.body.stop([0])
+        assert stage.note(1.0, 0.0).startswith("odometry silent")
+        until(lambda: stage.note(0.1).startswith(f"{UNANSWERED}; odometry silent"), "it is said")
+        until(lambda: stage.moved(0.2) == 0.0, "its watchdog stops it")
+        until(lambda: not stage.note(0.1), "it is heard again")
+        until(lambda: stage.moved(0.5) == 0.0, "zeros have reached it")
+        until(lambda: stage.moved(0.5, 0.2) > 0.05, "it drives on")
+
+
+@pytest.mark.system
+def test_the_router_dies_and_comes_back(router):
+    with Stage(request(router.endpoint, device={"watchdog_s": 0.5})) as stage:
+        stage.run(0.5, 0.2)
+        router.kill()
+        until(lambda: stage.note(0.1, 0.2) == "no router")
+        stage.run(1.0, 0.2)
+        assert stage.moved(0.5, 0.2) == 0.0
+        router.start()
+        until(lambda: stage.note(0.1, 0.2) == "")
+        assert stage.moved(1.0, 0.2) > 0.1
+
+
+@pytest.mark.system
+@pytest.mark.parametrize(
+    ("device", "address", "said"),
+    [
+        ({"style": "rmw"}, "rmw://tb3_7", r"TB0: no odometry on '.*tb3_7/odom.*is the robot on.*: TB0$"),
+        (
+            {"style": "rmw", "distro": "humble", "domain": 30}, "rmw://TB0?domain=0&distro=humble",
+            r"published in domain 30: write rmw://TB0\?domain=30",
+        ),
+        (
+            {"style": "rmw", "distro": "humble", "domain": 30}, "rmw://TB0?domain=30&distro=jazzy",
+            "type hash TypeHashNotSupported: set another distro than jazzy",
+        ),
+    ],
+)  # fmt: skip
+def test_an_absent_robot_is_diagnosed_in_time(hub, device, address, said):
+    """No robot of this namespace, or one of another domain or distribution."""
+    with Stage(request(hub.endpoint, device=device)) as stage:
+        stage.body.close()
+        with pytest.raises(BodyError, match=said):
+            TurtleBot3(request(hub.endpoint, address), clock).open()
+    assert OPEN_S + DIAGNOSIS_S < 5.0
+
+
+@pytest.mark.system
+def test_no_router_is_named_in_time():
+    begin = time.monotonic()
+    with pytest.raises(BodyError, match=r"TB0: no router answers at tcp/127\.0\.0\.1:9"):
+        TurtleBot3(request(NOWHERE, "ros2dds://tb3_0"), open_timeout=0.5).open()
+    assert 0.5 < time.monotonic() - begin < 2.0
+    with pytest.raises(BodyError, match="TB0: 'nonsense' is not an endpoint"):
+        TurtleBot3(request("nonsense", "ros2dds://tb3_0")).open()

@@ -1,0 +1,157 @@
+"""Scenarios with the real djitellopy and twins, one per process: its ports and threads last as long as the process.
+
+`python -m tests.bridges.tello.test_scenarios NAME` runs one.
+"""
+
+import fcntl
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from agents.body.interface import BodyError
+from agents.kinds.tello import TELLO
+from bridges.tello.body import TelloBody
+from tests.bridges.driver import Driver, toward
+from tests.conftest import ROOT
+from tests.requests import request
+from tests.twins.loopback import Served, reached
+from twins.devices.tello import TelloDevice
+
+ONE = request("tello", ["tello-twin"], external=True)
+NOBODY = "tello://127.0.0.77:18889"
+
+
+@pytest.mark.system
+@pytest.mark.parametrize(
+    "scenario",
+    [
+        "formation",
+        pytest.param("faults", marks=pytest.mark.mechanism("Tello bridge: one of several fails")),
+        "refusals",
+    ],
+)
+def test_bridge_flies_twins_by_djitellopy(scenario):
+    """The ports of djitellopy are the host's, so scenarios take turns."""
+    command = [sys.executable, "-m", "tests.bridges.tello.test_scenarios", scenario]
+    with (Path(tempfile.gettempdir()) / "zenpark-tello.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60.0, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def piloted(rows, *twins, addresses=(), open_s=3.0):
+    """A process that flies twins, which are seen from outside, and perhaps robots at further addresses."""
+    places = [*(served.addresses[0] for served in twins), *addresses] if addresses else twins[0].addresses
+    body = TelloBody(reached(rows, places), open_s)
+    body.open()
+
+    def truth():
+        return [np.concatenate(seen) for seen in zip(*(served.truth() for served in twins), strict=True)]
+
+    return Driver(body, truth=truth)
+
+
+def formation():
+    """Two drones take off to different heights, fly to two places with another yaw, hold, and land."""
+    rows = request("tello", ["tello-twin"] * 2, external=True, yaw=0.5)
+    with Served(TelloDevice, rows) as served:
+        driver = piloted(rows, served)
+        driver.run(0.3)
+        driver.body.takeoff(range(2), [0.6, 1.1])
+        driver.until(lambda: np.allclose(served.truth()[0][:, 2], [0.6, 1.1], atol=0.03))
+        goals, yaws = [(0.8, -0.3, 0.7), (-0.4, 1.5, 1.0)], [1.2, -0.4]
+        driver.decide = toward(TELLO, goals, yaws)
+        driver.until(lambda: np.abs(served.truth()[0] - goals).max() < 0.03)
+        driver.until(lambda: np.abs(served.truth()[1] - yaws).max() < 0.05)
+        place, yaw = served.truth()
+        state, driver.decide = driver.state, None
+        assert np.abs(state.position - place).max() < 0.02
+        assert np.abs(state.velocity).max() < 0.2
+        assert np.abs(yaw - state.yaw).max() < 0.02
+        assert ((state.battery > 0.9) & (state.battery <= 1.0)).all()
+        driver.body.land(range(2))
+        driver.until(lambda: not driver.state.flying.any())
+        assert driver.state.note == ("", "")
+        assert served.truth()[0][:, 2].max() == 0.0
+        driver.body.close()
+
+
+def faults():
+    """Six drones: a good one, one that falls silent, is killed, drains, is empty, is absent; the good one flies on."""
+    changes = ({}, {"silent_from_s": 4.0}, {}, {"battery": 0.15, "drain": 12.0}, {"battery": 0.08})
+    twins = [Served(TelloDevice, ONE, **change) for change in changes]
+    good, _, killed, weak, _ = twins
+    rows = request("tello", ["-"] * 6, external=True)
+    driver = piloted(rows, *twins, addresses=["tello://127.0.0.99:18889"], open_s=1.0)
+    body = driver.body
+    driver.run(0.3)
+    assert driver.state.note[5] == "no answer"
+    assert np.isnan(driver.state.position[5, 0])
+    body.takeoff(range(6), [0.6] * 6)
+    driver.tick()
+    assert driver.state.note[4:] == ("no take-off: battery at 8%", "no answer")
+    assert driver.state.flying.tolist() == [True, True, True, True, False, False]
+    driver.until(lambda: bool((driver.truth()[0][:4, 2] > 0.5).all()))
+    goal = (0.5, 0.5, 0.6)
+    driver.decide = toward(TELLO, [goal, *[None] * 5], 0.0)
+    killed.kill()
+    for row in (2, 1):
+        driver.until(lambda row=row: driver.t - driver.state.time[row] > 0.5)
+        assert driver.state.note[row].startswith("silent for")
+        assert driver.t - driver.state.received[0] < 0.5 < driver.t - driver.state.received[row]
+        body.land([row])
+    driver.until(lambda: not driver.state.flying[3])
+    assert driver.state.note[3] == "landing: battery at 9%"
+    assert weak.truth()[0][0, 2] < 0.05
+    driver.until(lambda: np.abs(good.truth()[0][0] - goal).max() < 0.03)
+    driver.decide = None
+    body.stop([0])
+    driver.until(lambda: good.truth()[0][0, 2] <= 0.0)
+    body.close()
+    for served in twins:
+        served.kill()
+
+
+def refused_open():
+    """Why the body of an absent drone cannot be opened."""
+    with pytest.raises(BodyError) as caught:
+        TelloBody(reached(ONE, [NOBODY])).open()
+    return str(caught.value)
+
+
+def refusals():
+    """Devices that cannot be opened, and a refused take-off."""
+    with socket.socket(type=socket.SOCK_DGRAM) as other:  # another program that flies Tellos
+        other.bind(("", 8889))
+        assert refused_open().startswith("UDP port 8889 of this computer is taken")
+    begin = time.monotonic()
+    assert refused_open().startswith("R0 at 127.0.0.77:18889: no answer (switch it on, join its Wi-Fi")
+    assert time.monotonic() - begin < 5.0
+    with Served(TelloDevice, ONE) as served:
+        driver = piloted(ONE, served)
+        truth, driver.truth = driver.truth, None
+        driver.tick()
+        driver.body.takeoff([0], [0.6])
+        driver.tick()
+        assert driver.state.note[0].startswith("no take-off: no fresh external position")
+        assert not driver.state.flying[0]
+        driver.truth = truth
+        driver.tick()
+        driver.body.takeoff([0], [0.6])
+        driver.until(lambda: served.truth()[0][0, 2] > 0.5)
+        threading.Event().wait(2.3)  # the process hangs: its drone lands
+        driver.until(lambda: served.truth()[0][0, 2] < 0.5)
+        assert driver.state.note[0] == "landing: its process did nothing for 2 s"
+        driver.body.stop([0])
+        driver.body.close()
+
+
+if __name__ == "__main__":
+    {each.__name__: each for each in (formation, faults, refusals)}[sys.argv[1]]()
