@@ -28,11 +28,9 @@ def generated(what, size, **options):
     ("what", "size", "kind"),
     [
         ("polygon", "3", "khepera4"),
-        pytest.param("polygon", "9", "crazyflie", marks=pytest.mark.nightly),
         pytest.param("grid", "3x4", "turtlebot3", marks=pytest.mark.nightly),
-        ("hemisphere", "4", "crazyflie"),
-        pytest.param("hemisphere", "40", "crazyflie", marks=pytest.mark.nightly),
         ("hemisphere", "12", "tello"),
+        pytest.param("hemisphere", "40", "crazyflie", marks=pytest.mark.nightly),
     ],
 )
 def test_files_pass_the_check(what, size, kind):
@@ -42,10 +40,9 @@ def test_files_pass_the_check(what, size, kind):
     (numbers,) = figures.values()
     assert numbers.residual_mm < 0.3
     assert 0.3 < numbers.loop_gain < 1.1
-    if (what, size) == ("hemisphere", "40"):  # nothing is needed
+    if size == "40":  # nothing is needed
         assert numbers.vital_links == numbers.vital_robots == ()
         assert numbers.spare_robots == 40
-    assert {robot.kind for robot in read.experiment.robots.values()} == {kind}
 
 
 def test_every_robot_and_every_link_has_a_line():
@@ -58,6 +55,8 @@ def test_every_robot_and_every_link_has_a_line():
     heights = [robot.hover for robot in generated("hemisphere", "100").experiment.robots.values()]
     assert min(heights) == pytest.approx(0.4)
     assert len(set(heights)) > 90
+    rates = [generated("polygon", count).experiment.rates.state_hz for count in ("100", "1000")]
+    assert rates == [50.0, 5.0]
 
 
 def test_starts_do_not_overlap_whatever_the_seed():
@@ -68,17 +67,6 @@ def test_starts_do_not_overlap_whatever_the_seed():
         apart = np.linalg.norm(place[:, None] - place[None], axis=2)[np.triu_indices(40, 1)]
         assert apart.min() > 2 * 0.065
         assert np.abs(place - np.array(plan.start_poses()[0])).max() > 0.1
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize("seed", [1, 2])
-def test_hundred_drones_form_hemisphere_from_random_starts(seed):
-    plan = generated("hemisphere", "100", duration_s=25.0).plan
-    log, net = fly(plan.experiment, seed).log, plan.links
-    apart = np.linalg.norm(log.true_position[:, net.receiver] - log.true_position[:, net.sender], axis=2)
-    worst = np.abs(apart - net.distance).max(axis=1)[(log.time >= 0.0) & (log.time <= 25.0)]
-    assert worst[0] > 0.25
-    assert worst[-250:].max() < plan.experiment.tolerance
 
 
 @pytest.mark.slow
@@ -92,23 +80,13 @@ def test_offsets_are_met_from_anywhere():
     assert law_errors(read.plan.law, end, end[links.sender], links).max() < 0.07
 
 
-@pytest.mark.slow
-def test_large_formations_say_less_of_themselves():
-    assert generated("polygon", "100").experiment.rates.state_hz == 50.0
-    large = generated("polygon", "1000").experiment
-    assert large.rates.state_hz == 5.0
-    assert len(large.robots) == 1000
-
-
 @pytest.mark.parametrize(
     ("what", "size", "wanted", "said"),
     [
         ("hemisphere", "9", {"kind": "khepera4"}, "robots that fly"),
         ("polygon", "5", {"kind": "kehpera4"}, "khepera4"),
-        ("polygon", "5", {"spacing": 0.1}, "0.23 m or more"),
         ("polygon", "5", {"spacing": float("nan")}, "0.23 m or more, not nan"),
         ("polygon", "5", {"law": "bearing"}, "distance or displacement"),
-        ("grid", "5", {}, "such as 5x8"),
         ("grid", "5xx", {}, "such as 5x8"),
         ("grid", "1x9", {}, "2x2 or more"),
         ("polygon", "2", {}, "3 robots or more"),
@@ -131,9 +109,6 @@ def test_generate_writes_a_file_and_never_overwrites(tmp_path):
         generate("polygon", "9", str(tmp_path / "no" / "where.toml"), LayoutOptions())
 
 
-# ------------------------------------------------------------------ shapes
-
-
 def held(made):
     free = np.ones((len(made), 3), dtype=bool)
     free[:, 2] = False
@@ -149,7 +124,7 @@ def nearest_gap(points):
     return apart[np.triu_indices(len(points), 1)].min()
 
 
-@pytest.mark.parametrize("count", [3, 4, 5, 6, 7, 12, 40])
+@pytest.mark.parametrize("count", [3, 4, 5, 12])
 def test_polygons_are_regular_and_rigid(count):
     made = layouts.polygon(count, 0.6)
     assert held(made).rigid
@@ -159,7 +134,7 @@ def test_polygons_are_regular_and_rigid(count):
     assert len(made.pairs) == min(2 * count, count * (count - 1) // 2)
 
 
-@pytest.mark.parametrize(("rows", "columns"), [(2, 2), (2, 7), (4, 3)])
+@pytest.mark.parametrize(("rows", "columns"), [(2, 2), (4, 3)])
 def test_grids_have_all_neighbours(rows, columns):
     made = layouts.grid(rows, columns, 0.5)
     assert held(made).rigid
@@ -178,14 +153,3 @@ def test_hemispheres_are_rigid_and_keep_their_distances(count):
     assert nearest_gap(made.position[:, :2]) >= 0.25 - 1e-9
     assert made.position[:, 2].min() == pytest.approx(layouts.LOWEST)
     assert lengths(made).max() < 2.1 * 0.6  # no link bridges a bay of the rim
-
-
-def test_hemisphere_links_are_edges_of_the_convex_hull():
-    scipy_spatial = pytest.importorskip("scipy.spatial")
-    made = layouts.hemisphere(60, 0.6, 0.25)
-    hull = scipy_spatial.ConvexHull(made.position)
-    edges = {tuple(sorted((int(a), int(b)))) for t in hull.simplices for a, b in zip(t, np.roll(t, 1), strict=True)}
-    own = {(int(a), int(b)) for a, b in made.pairs}
-    assert own <= edges
-    inner = made.position[:, 2] > made.position[:, 2].min() + 0.5  # away from the rim none is missing
-    assert {edge for edge in edges if inner[list(edge)].all()} <= own

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import io
 import json
-import sys
 from importlib.metadata import EntryPoint
 
 import msgspec
@@ -32,19 +30,10 @@ from tests.cases import examples
 from tests.commands import invoke
 from tests.experiments.checked import GROUND, as_read, assert_found, bad, findings, ground
 from tests.small import changed, reference, small
-from tools.commands import check as commands
 
 pytestmark = pytest.mark.slow  # each check flies the experiment on the virtual clock
 
 PARK, TRIANGLE = "robotic-park", "triangle"
-
-
-# ------------------------------------------------------------------ experiments that work
-
-
-def test_laws_of_velocities_are_not_clamped():
-    plan = document.read(TRIANGLE, ['formation.law="consensus"']).plan
-    assert figures(plan).speed_available == min(kind.speed for kind in plan.kinds)
 
 
 @pytest.fixture(scope="module")
@@ -61,23 +50,22 @@ def test_numbers_of_the_reference(examined):
     assert (found.rank_space, found.rank_space_needed) == (12, 15)
     assert found.residual_mm == pytest.approx(0.0, abs=1e-3)
     assert found.loop_gain == pytest.approx(0.96, abs=0.02)
-    assert found.slowest_mode_s is not None
     assert 5.0 < found.slowest_mode_s < 40.0
     assert found.speed_needed == 0.15
     assert found.speed_available == pytest.approx(0.0952, abs=1e-4)
-    assert found.acquired_s is not None
     assert 13.0 <= found.acquired_s <= 16.0
     assert found.end["TB01"] == pytest.approx((0.15, 0.8, 0.0), abs=REACHED)
     assert found.end_inside
     assert 15.0 < found.messages_hz < 45.0  # 7 robots; published: 5.07 Hz for each follower
     assert examined[1]["periodic"].messages_hz == pytest.approx(350.0)
+    velocities = document.read(TRIANGLE, ['formation.law="consensus"']).plan
+    assert figures(velocities).speed_available == min(kind.speed for kind in velocities.kinds)  # not clamped
 
 
 def test_reference_is_feasible_with_a_quick_leader(examined):
     (found,) = [each for each in examined[0] if each.severity != "note"]
     assert (found.code, found.severity) == ("followers-lag", "warning")
     assert "0.095 m/s" in found.message
-    assert "0.15 m/s" in found.message
     assert "clamp" in found.remedy
     lines = catalogue.path(PARK).read_text("utf-8").splitlines()
     (line,) = (number for number, line in enumerate(lines, 1) if line.startswith("plan = "))
@@ -86,7 +74,6 @@ def test_reference_is_feasible_with_a_quick_leader(examined):
     assert {"connected", "realisable", "rigid", "stable", "starts", "acquired", "inside"} <= notes.keys()
     assert "any one" in notes["redundancy"]
     assert "rank 11 of 11" in notes["rigid"]
-    assert "12 of 15, not needed" in notes["rigid"]
 
 
 @pytest.mark.parametrize("name", ["triangle", "convoy"])
@@ -94,14 +81,10 @@ def test_other_catalogue_experiments_have_no_findings(name):
     assert bad(name) == {}
 
 
-# ------------------------------------------------------------------ experiments that do not
-
-
 @pytest.mark.usefixtures("unflown")
 def test_hover_above_the_limit_names_the_limit():
     found = bad(PARK, "robots.CF01.hover=0.81")["too-high"]
     assert found.severity == "error"
-    assert found.message.startswith("CF01 is too high at 0.81 m for")
     assert "TB01 - CF01 (0.86 m)" in found.message
     assert "lower than 0.806 m" in found.remedy
     assert found.where == "--set robots.CF01.hover=0.81"
@@ -161,26 +144,6 @@ class Listing(Steep, frozen=True):
         return abs(link.distance - sum([each * each for each in apart]) ** 0.5)
 
 
-@pytest.fixture
-def install_plugin(monkeypatch):
-    """Registers a law of this module as 'mine'."""
-
-    def installed(law):
-        before, entry = registry.registered, EntryPoint("mine", f"{__name__}:{law}", registry.LAWS)
-        mine = {registry.LAWS: {"mine": [entry]}}
-        monkeypatch.setattr(registry, "registered", lambda group: before(group) | mine.get(group, {}))
-
-    return installed
-
-
-def test_uncompiled_law_is_noted_once(install_plugin):
-    install_plugin("Listing")
-    (found,) = [each for each in check(document.read(TRIANGLE, ["formation.law=mine"])) if each.code == "uncompiled"]
-    assert found.severity == "note"
-    assert "Listing.error uses" in found.message
-    assert "test_check.py:" in found.message
-
-
 @pytest.mark.parametrize(
     ("law", "code", "message", "remedy"),
     [
@@ -188,21 +151,23 @@ def test_uncompiled_law_is_noted_once(install_plugin):
         ("Undefined", "not-finite", "the law 'mine' gives for", "a length of 0"),
         ("Comparing", "reads-unknown", 'give the law NEEDS = "relative"', "a comparison with an unknown number"),
         ("Weak", "not-acquired", "not acquired in time", "raise the law's own parameters (largest)"),
+        ("Listing", "uncompiled", "Listing.error uses", ""),
     ],
 )
-def test_remedy_for_a_users_law_names_the_law(install_plugin, law, code, message, remedy):
-    install_plugin(law)
-    found = bad(TRIANGLE, "formation.law=mine", "duration_s=1")[code]
+def test_remedy_for_a_users_law_names_the_law(monkeypatch, law, code, message, remedy):
+    before, entry = registry.registered, EntryPoint("mine", f"{__name__}:{law}", registry.LAWS)
+    mine = {registry.LAWS: {"mine": [entry]}}
+    monkeypatch.setattr(registry, "registered", lambda group: before(group) | mine.get(group, {}))
+    found = findings(document.read(TRIANGLE, ["formation.law=mine", "duration_s=1"]), ["event"])[code]
     assert message in found.message
     assert remedy in found.remedy
-    assert found.where == ("--set duration_s=1" if code == "not-acquired" else "--set formation.law=mine")
+    assert (found.severity == "note") == (code == "uncompiled")
 
 
 @pytest.mark.parametrize(
     ("change", "expected", "message", "remedy"),
     [
         ('formation.links."KH01 - KH03"=1.3', ("error", "no-triangle"), "KH01 - KH03 (1.3 m)", "shorten"),
-        ("robots.CF02.hover=0.9", ("error", "too-high"), "KH02 - CF02 (0.86 m)", "0.860 m"),
         ("timeline.0.plan.speed=0.3", ("error", "leader-too-fast"), "0.3 m/s; it has 0.22", "0.2 m/s"),
         ("safety.speed=0.1", ("error", "leader-too-fast"), "it has 0.1 m/s", "0.09 m/s"),
         ("disturbance={}", ("warning", "not-random"), "runs of other seeds are the same", "position_sigma"),
@@ -213,7 +178,6 @@ def test_remedy_for_a_users_law_names_the_law(install_plugin, law, code, message
         ("cases.periodic.trigger.period_s=0.005", ("warning", "trigger-too-fast"), "in case 'periodic'", "to 200"),
         ("cases.periodic.trigger.period_s=0.03", ("warning", "trigger-uneven"), "every 0.04 s", "multiple of 0.02"),
         ("rates.pose_hz=5", ("warning", "decides-unheard"), "at 5 Hz at most", "pose_hz"),
-        ("formation.leader=CF03", ("warning", "no-incoming-links"), "TB01 has no links", "> TB01"),
         ('formation.links={ "TB01 - KH01" = 600 }', ("error", "too-long"), "millimetres?", "write 0.6"),
     ],
 )
@@ -230,7 +194,6 @@ SQUARE = {"A - B": 1.0, "B - D": 1.0, "D - C": 1.0, "A - C": 1.0, "A - D": 1.4, 
     ("links", "leader", "code", "message"),
     [
         ({"A > B": 1.0, "C - D": 1.0}, "A", "leader-unknown", "C, D cannot be reached by the leader (A)"),
-        ({"A > B": 1.0, "C - D": 1.0}, "A", "parts", "2 parts"),
         ({"B - C": 1.0, "C - D": 1.0, "B - D": 1.0}, "A", "leader-not-received", ""),
         ({"A > B": 1.0, "A > C": 1.0, "B - C": 1.0}, "A", "no-incoming-links", ""),
         ({"A > B": 1.0, "B > C": 1.0, "C > D": 1.0}, None, "not-rigid", "rank 3 of 5"),
@@ -242,17 +205,11 @@ def test_networks_that_make_no_formation(links, leader, code, message):
 
 
 def test_no_links_are_no_formation():
-    assert ground({}) == {}
     made = small(GROUND, duration_s=5.0)
     assert figures(Plan(made)).rank is None
     assert "no-formation" in findings(made)
-
-
-@pytest.mark.usefixtures("unflown")
-def test_only_the_case_at_fault_is_named():
-    found = bad(PARK, "cases.event.formation.gain=12")["unstable"]
-    assert found.message.startswith("in case 'event': the sampled loop is unstable")
-    assert found.where == "--set cases.event.formation.gain=12"
+    circle = {"kind": "circle", "radius": 0.5, "period_s": 40.0}  # for ever, it is not cut off
+    assert ground({}, timeline=[LegTable(at_s=1.0, robot="D", plan=circle)]) == {}
 
 
 def test_only_the_cases_of_a_run_are_checked():
@@ -267,17 +224,14 @@ def test_place_is_in_the_case_that_changes_it(tmp_path):
     text = catalogue.path(PARK).read_text("utf-8")
     file = tmp_path / "mine.toml"
     file.write_text(f"{text}\n[cases.wild]\nformation = {{ gain = 12.0 }}\n", encoding="utf-8")
-    assert findings(document.read(file))["unstable"].where == f"{file}:{text.count(chr(10)) + 3}:22"
-
-
-# ------------------------------------------------------------------ the command
+    found = findings(document.read(file))["unstable"]
+    assert found.where == f"{file}:{text.count(chr(10)) + 3}:22"
+    assert found.message.startswith("in case 'wild': the sampled loop is unstable")
 
 
 @pytest.mark.usefixtures("unflown")
 def test_command_prints_a_table():
     output = invoke("check", PARK).stdout
-    assert "✓ the formation is rigid, rank 11 of 11" in output
-    assert "! KH01 follows at 0.095 m/s" in output
     assert "periodic 350.0 per second, event" in output
     assert output.endswith("no errors, 1 warning\n")
     assert "✗ the sampled loop is unstable" in invoke("check", PARK, "--set", "formation.gain=12", code=1).stdout
@@ -296,28 +250,12 @@ def test_command_prints_json():
     assert (unread["ok"], unread["findings"][0]["code"], unread["figures"]) == (False, "document", {})
 
 
-@pytest.mark.usefixtures("unflown")
-def test_terminal_without_greek(monkeypatch):
-    out = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
-    monkeypatch.setattr(sys, "stdout", out)
-    assert commands.check(TRIANGLE, settings=[], as_json=False) == 0
-    out.seek(0)
-    assert "no errors, no warnings" in out.read()
-
-
-# ------------------------------------------------------------------ whatever is in the file
-
-
 @pytest.mark.parametrize(
     "change",
     [
         'formation.links."KH01 - KH03"=1e200',
-        'formation.links."KH01 - KH03"=1e-9',
         "formation.gain=1e300",
-        "formation.clamp=1e300",
-        "formation.tracking_gain=1e300",
         "timeline.0.plan.speed=1e300",
-        "timeline.0.plan.move_by=[1e300,0]",
         "safety.speed=1e-9",
         "arena.size=[1e300,1e300,1e300]",
         "rates.coordination_hz=0.01",
@@ -357,7 +295,6 @@ def test_errors_and_warnings_have_remedies_and_places(made):
     found, numbers = examine(as_read(made))
     assert found
     for each in found:
-        assert each.message
         assert each.severity == "note" or (each.remedy and each.where)
     assert json.loads(msgspec.json.encode(numbers["default"]))["robots"] == len(made.robots)
 

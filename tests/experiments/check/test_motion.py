@@ -7,10 +7,10 @@ import pytest
 
 from agents.body.interface import Disturbance, Jitter
 from agents.kinds.crazyflie import CRAZYFLIE
-from experiments.catalogue import index
+from experiments.check.analysis import Analysis
 from experiments.check.check import figures
-from experiments.check.ideal_run import REPETITIONS, isolated, linear_step, predict, repetitions
-from experiments.check.ideal_run import fly as simulated
+from experiments.check.ideal_run import Prediction, isolated, linear_step, predict, repetitions
+from experiments.check.motion import flight
 from experiments.check.theory import unused_gains
 from experiments.definition.experiment import Arena, Experiment, Formation, LegTable, LinkTable, RobotTable
 from experiments.definition.plan import Plan
@@ -18,7 +18,7 @@ from experiments.file import document
 from experiments.sweep.runs import run_metrics
 from experiments.virtual_time import conductor, simulation, stretch
 from tests.commands import invoke
-from tests.experiments.checked import GROUND, assert_found, bad, findings, ground
+from tests.experiments.checked import GROUND, assert_found, bad, findings
 from tests.runs import fly
 from tests.small import changed, reference, small
 from twins.models.quadrotor import Quadrotor
@@ -42,19 +42,16 @@ def robots_on_wheels(duration_s: float = 120.0, **formation: float | str) -> Exp
 @pytest.mark.nightly
 def test_wheels_stop_before_weak_formation_is_acquired():
     weak = robots_on_wheels(gain=0.05)
-    claims = findings(weak)
+    claims, numbers = findings(weak), figures(Plan(weak))
     assert "acquired" not in claims
     found = claims["wheels-stop"]
     assert found.severity == "warning"
-    assert "robots on wheels stop 5 mm before their goals: links may stay e = 5 mm/(μ d²) off" in found.message
-    numbers = figures(Plan(weak))
     assert numbers.acquired_s is None
     flown = fly(weak, 7)
     assert run_metrics(flown.trace).values["acquired_s"] is None
     last = flown.log.true_position[flown.log.time <= weak.duration_s][-1]
     off = max(abs(float(np.hypot(*(last[i] - last[j])[:2])) - 1.0) for i, j in ((0, 1), (1, 2), (0, 2)))
     assert numbers.end_error_mm == pytest.approx(1e3 * off, rel=0.1)
-    assert 0.05 < off < 0.1
     gain = float(found.remedy.split()[3])
     assert 0.05 < gain < 0.15
     assert "acquired" in findings(robots_on_wheels(gain=gain))
@@ -69,16 +66,7 @@ def test_weak_link_remedy_names_the_laws_own_key():
     assert "(h·k·λ)" in found["stable"].message
 
 
-def crowd(count: int, **parts: object) -> Experiment:
-    """The reference experiment with so many Kheperas, and without a formation."""
-    park = reference()
-    formation = changed(park.formation, links={}, leader=None)
-    robots = {f"R{k}": park.robots["KH01"] for k in range(count)}
-    return changed(park, robots=robots, formation=formation, timeline=[], duration_s=600.0, **parts)
-
-
 def test_prediction_is_a_flight_without_noise():
-    assert isolated(Plan(reference())).experiment.duration_s == 45.0
     flown = predict(Plan(reference()))
     again = predict(Plan(changed(reference(), seed=8)))
     np.testing.assert_array_equal(flown.position, again.position)  # no seed matters
@@ -87,13 +75,13 @@ def test_prediction_is_a_flight_without_noise():
     assert not flown.stuck
 
 
-@pytest.mark.parametrize(("compiled", "flown_s"), [(False, 11.0), (True, 165.0)])
-def test_more_is_flown_where_it_is_compiled(monkeypatch, compiled, flown_s):
-    """Of many robots the beginning."""
+@pytest.mark.parametrize(("compiled", "flown_s", "flights"), [(False, 11.0, 2), (True, 165.0, 1)])
+def test_beginning_is_flown_of_many_robots(monkeypatch, compiled, flown_s, flights):
     monkeypatch.setattr(stretch, "possible", lambda _: compiled)
-    many = Plan(crowd(200))
-    assert isolated(many).experiment.duration_s == flown_s
-    assert isolated(many.changed(duration_s=15.0)).experiment.duration_s == 11.0  # to compile takes longer
+    many = small({f"R{k}": "khepera4" for k in range(200)}, duration_s=600.0)
+    assert isolated(Plan(many)).experiment.duration_s == flown_s
+    assert isolated(Plan(changed(many, duration_s=15.0))).experiment.duration_s == 11.0  # to compile takes longer
+    assert repetitions(isolated(Plan(many))) == flights
 
 
 def flat_strip(jitter: float = 0.01, duration_s: float = 30.0) -> Experiment:
@@ -108,9 +96,9 @@ def flat_strip(jitter: float = 0.01, duration_s: float = 30.0) -> Experiment:
     )  # fmt: skip
 
 
-def late(experiment: Experiment, seeds: list[int]) -> int:
-    """Number of runs with these seeds that acquire after 15 s, in the mean of the robots, or not at all."""
-    times = [run_metrics(fly(experiment, seed).trace).values["acquired_s"] for seed in seeds]
+def late(experiment: Experiment) -> int:
+    """Number of two runs that acquire after 15 s, in the mean of the robots, or not at all."""
+    times = [run_metrics(fly(experiment, seed).trace).values["acquired_s"] for seed in (101, 102)]
     return sum(acquired is None or acquired > 15.0 for acquired in times)
 
 
@@ -120,36 +108,18 @@ def test_soft_formation_is_found_under_hover_jitter():
     assert "after 0.0 s" in claims["acquired"].message  # without noise
     found = claims["soft"]
     assert (found.severity, found.where.startswith("made.json")) == ("warning", True)
-    assert "acquired after 0.0 s without noise" in found.message
     assert "outside the tolerance of 50 mm later, in 5 of 5 flights (seeds 1 to 5)" in found.message
-    assert late(soft, [101, 102]) == 2
+    assert late(soft) == 2
     calm = flat_strip(jitter=0.002)
     assert "soft" not in findings(calm)
-    assert late(calm, [101, 102]) == 0
+    assert late(calm) == 0
 
 
-@pytest.mark.parametrize(
-    "made",
-    [pytest.param(flat_strip(jitter=0.0), marks=pytest.mark.nightly), flat_strip(jitter=0.0005), robots_on_wheels()],
-)
+@pytest.mark.parametrize("made", [flat_strip(jitter=0.0005), robots_on_wheels()])
 def test_undisturbed_formation_is_not_called_soft(made):
     claims = findings(made)
     assert "acquired" in claims
     assert "soft" not in claims
-
-
-def test_formations_that_settle_early_skip_flights_with_noise(monkeypatch):
-    monkeypatch.setattr("experiments.check.noise.fly", lambda *_: pytest.fail("flown again"))
-    assert "acquired" in findings(document.read(TRIANGLE).cases()["event"].experiment)
-
-
-def test_flights_with_noise_are_those_of_their_seeds():
-    bare = isolated(Plan(flat_strip()).changed(duration_s=5.0, seed=7))
-    assert repetitions(bare) == REPETITIONS
-    first, second, again = (simulated(bare, seed).position for seed in (7, 8, 8))
-    np.testing.assert_array_equal(second, again)
-    assert np.abs(first - second).max() > 1e-3
-    assert repetitions(Plan(crowd(1000))) == 1
 
 
 def test_flight_with_noise_counts_messages_alone(monkeypatch):
@@ -188,10 +158,8 @@ def test_robots_that_never_begin_are_reported_with_reason(monkeypatch, tmp_path)
     assert numbers.end_error_mm is None
     (tmp_path / "wheels.json").write_bytes(document.write_json(Plan(wheels)))
     lines = invoke("check", tmp_path / "wheels.json", code=1).stdout.splitlines()
-    labels = ("formation acquired after", "worst link at the end", "all end inside the arena", "poses sent by all")
-    for label in labels:
-        (line,) = [line for line in lines if label in line]
-        assert line.split()[-1] == "-"
+    for label in ("formation acquired after", "worst link at the end", "poses sent by all"):
+        assert [line.split()[-1] for line in lines if label in line] == ["-"]
 
 
 @pytest.mark.parametrize(
@@ -207,11 +175,6 @@ def test_gain_of_another_law_is_named(law, changes, message):
     plan = Plan(robots_on_wheels(law=law, **changes))
     found = [(each.code, each.message, each.where) for each in unused_gains([plan])]
     assert found == ([("unused-gain", message, ("formation", next(iter(changes))))] if message else [])
-
-
-@pytest.mark.parametrize("name", index.titles())
-def test_catalogue_sets_no_unused_gain(name):
-    assert not [*unused_gains([*document.read(name).cases().values()])]
 
 
 def test_trigger_that_never_fires_is_named():
@@ -245,8 +208,8 @@ def test_late_oscillation_blames_loop_not_starts():
     assert not {"local-minimum", "not-acquired"} & found.keys()
 
 
-def leg(robot: str, **plan: object) -> LegTable:
-    return LegTable(at_s=1.0, robot=robot, plan={"kind": "line", **plan})
+def line_of(robot: str, x: float, y: float, speed: float) -> LegTable:
+    return LegTable(at_s=1.0, robot=robot, plan={"kind": "line", "move_by": [x, y], "speed": speed})
 
 
 def wheels(x: float, y: float) -> RobotTable:
@@ -258,8 +221,7 @@ def lone_drone(x: float, y: float, hover: float, kind: str = "crazyflie") -> Rob
 
 
 LARGE = Arena(size=(6.0, 6.0, 2.0))
-CROSSING = [leg("A", move_by=[0.6, 0.6], speed=0.1), leg("B", move_by=[-0.6, 0.6], speed=0.1)]  # they meet half-way
-OVER = [leg("CF01", move_by=[2.0, 0.0], speed=0.3)]
+CROSSING = [line_of("A", 0.6, 0.6, 0.1), line_of("B", -0.6, 0.6, 0.1)]  # they meet half-way
 
 
 def low(hover: float, top: float) -> Experiment:
@@ -269,7 +231,7 @@ def low(hover: float, top: float) -> Experiment:
 
 def crossed(height: float) -> Experiment:
     robots = {"CF01": lone_drone(-1.0, 0.0, 0.5), "TL01": lone_drone(0.0, 0.0, height, "tello")}
-    return small(robots, timeline=OVER, duration_s=15.0)
+    return small(robots, timeline=[line_of("CF01", 2.0, 0.0, 0.3)], duration_s=15.0)
 
 
 LANDING = {"G": wheels(0.0, 0.01), "H": wheels(0.5, 0.5), "F": lone_drone(0.0, 0.0, 0.8)}
@@ -288,11 +250,10 @@ BESIDE = {"G": wheels(0.0, 0.0), "F": lone_drone(0.5, 0.0, 0.8)}
         (small(BESIDE, {"G > F": 0.801}, duration_s=30.0, tolerance=0.1), None, "lands-on", "", ""),
         (small(LANDING, {"G - H": 0.7}, duration_s=30.0, arena=LARGE), "warning", "lands-on",
          "F ends above G, from which it receives no poses, and would land on it", ""),
-        (small(GROUND, timeline=[leg("A", move_by=[-2.97, 0.0], speed=0.1)], duration_s=60.0, arena=LARGE), "warning",
+        (small(GROUND, timeline=[line_of("A", -2.97, 0.0, 0.1)], duration_s=60.0, arena=LARGE), "warning",
          "near-wall", "A comes within the margin of 0.05 m of a wall at 32.", ""),
         (low(1.0, 1.05), "warning", "overshoots-arena", "to 1.11 m", "hover at 0.94 m at most"),
         (low(0.94, 1.05), None, "overshoots-arena", "", ""),
-        (low(2.4, 2.5), "warning", "overshoots-arena", "to 2.66 m", "hover at 2.25 m at most"),
     ],
 )  # fmt: skip
 def test_flights_are_judged(made, severity, code, message, remedy):
@@ -303,16 +264,10 @@ def test_flights_are_judged(made, severity, code, message, remedy):
         assert remedy in found.remedy
 
 
-def test_plan_for_ever_is_not_cut_off():
-    assert ground({}, timeline=[leg("D", kind="circle", radius=0.5, period_s=40.0)]) == {}
-
-
-@pytest.mark.nightly
-def test_long_run_is_predicted_in_part(monkeypatch):
-    monkeypatch.setattr(stretch, "possible", lambda _: False)  # what is compiled flies more
-    made = small(GROUND, duration_s=86400.0)
-    assert figures(Plan(made)).predicted_s == 550.0
-    assert "predicted-in-part" in findings(made)
+def test_part_of_a_long_run_is_noted():
+    motion = Prediction(np.array([0.0, 5.0]), np.zeros((2, 4, 3)), 0, 0.0)
+    (found,) = flight(Analysis(Plan(small(GROUND, duration_s=600.0)), motion))
+    assert found.code == "predicted-in-part"
 
 
 def test_formation_lost_again_counts_acquired_and_names_stiffness(tmp_path):
@@ -324,7 +279,6 @@ def test_formation_lost_again_counts_acquired_and_names_stiffness(tmp_path):
     )
     found = bad(str(tmp_path / "lost.toml"))["not-acquired"]
     assert found.message.startswith("the formation, acquired after ")
-    assert " s, is not acquired again after 8 s: L - F is " in found.message
     assert found.remedy.endswith("or raise the stiffness")
 
 
@@ -336,7 +290,6 @@ def test_anchors_without_links_are_checked():
     claims = findings(anchored())
     assert "CF01 is 8 mm off at the end" in claims["anchored"].message
     assert "the anchors can be met" in claims["realisable"].message
-    assert figures(Plan(anchored())).end_error_mm is None
     weak = findings(anchored(gain=1e-4))
     assert weak["anchor-missed"].severity == "warning"
     assert "anchored" not in weak
@@ -351,8 +304,6 @@ def test_noise_that_frees_robots_is_a_note():
     assert not {"local-minimum", "not-acquired"} & claims.keys()
     still = document.read(TRIANGLE, ["robots.CF01.start=[0.0,-0.5]", "disturbance={}"])
     assert "local-minimum" in findings(still, ["periodic"])
-    short = findings(document.read(TRIANGLE, ["duration_s=2"]), ["periodic"])
-    assert "nor is it with the noise of [disturbance], in any of 5 flights" in short["not-acquired"].message
 
 
 @pytest.mark.parametrize("axis", [0, 2])

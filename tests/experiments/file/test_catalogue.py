@@ -1,19 +1,13 @@
 """The catalogue: experiments that can be flown, copies of them, and the schema beside them."""
 
-import itertools
 import json
-import math
 import re
 import tomllib
-from importlib import metadata
 from pathlib import Path
 
-import msgspec
-import numpy as np
 import pytest
 
 from agents.body.kinds import KINDS
-from agents.plugins import registry
 from experiments.catalogue import index
 from experiments.file import catalogue as entries
 from experiments.file import json_schema
@@ -23,22 +17,10 @@ from experiments.file.document import DocumentError, read
 def test_names_and_titles():
     found = index.titles()
     assert list(found) == sorted(found)
-    assert {"convoy", "robotic-park", "triangle"} <= set(found)
-    park = index.FOLDER / "robotic-park.toml"
-    assert found["robotic-park"] == tomllib.loads(park.read_text("utf-8"))["title"]
-    assert entries.path("robotic-park") == park
+    assert found["robotic-park"] == tomllib.loads(entries.path("robotic-park").read_text("utf-8"))["title"]
+    assert all(entries.path(name).read_text("utf-8").startswith(f"#:schema ./{index.SCHEMA}\n") for name in found)
     with pytest.raises(DocumentError, match="did you mean 'convoy'"):
         entries.path("convoi")
-
-
-@pytest.mark.parametrize("name", index.names())
-def test_robots_of_the_catalogue_start_apart_and_inside(name):
-    experiment = read(name).experiment
-    half = np.array(experiment.arena.size[:2]) / 2 - experiment.safety.margin
-    for robot in experiment.robots.values():
-        assert (np.abs(robot.start[:2]) + KINDS[robot.kind].radius <= half).all()
-    for a, b in itertools.combinations(experiment.robots.values(), 2):
-        assert math.dist(a.start[:2], b.start[:2]) > 2 * (KINDS[a.kind].radius + KINDS[b.kind].radius)
 
 
 def test_copy_gives_a_readable_experiment_and_never_overwrites(tmp_path):
@@ -49,7 +31,6 @@ def test_copy_gives_a_readable_experiment_and_never_overwrites(tmp_path):
     for name, place, message in (
         ("convoy", target, "exists already"),
         ("convoy", tmp_path / "nowhere" / "x.toml", "cannot be written: No such file"),
-        ("convoi", tmp_path, "neither a file nor"),
     ):
         with pytest.raises(DocumentError, match=message):
             entries.copy_entry(name, place)
@@ -64,17 +45,10 @@ def test_full_disk_leaves_no_half_file(tmp_path, monkeypatch):
     assert read(entries.copy_entry("triangle", tmp_path / "mine.toml")).experiment == read("triangle").experiment
 
 
-@pytest.mark.parametrize("name", index.names())
-def test_catalogue_entry_shows_the_schema_to_editors(name):
-    assert entries.path(name).read_text("utf-8").startswith(f"#:schema ./{index.SCHEMA}\n")
-
-
 def test_schema_is_draft_7_and_knows_the_plugins():
     schema = json_schema.schema()
-    text = msgspec.json.encode(schema).decode()
     assert schema["$schema"] == "http://json-schema.org/draft-07/schema#"
-    assert "prefixItems" not in text
-    assert "$defs" not in text
+    assert not {"prefixItems", "$defs"} & {key for _, node in nodes(schema) for key in node}
     by_name, beside, *tables, table_beside = schema["properties"]["trigger"]["anyOf"]
     assert re.search(beside["pattern"], "my_trigger.py:Mine")
     assert table_beside["properties"]["kind"] == beside
@@ -105,8 +79,6 @@ start = [0.6, 0.0]
 @pytest.mark.parametrize(
     ("old", "new", "taken"),
     [
-        ("0.8", "0.8", True),
-        ("0.8", "{ offset = [0.6, 0.0] }", True),
         ("0.8", "{ gain = 1.0 }", False),
         ("0.8", "{ distance = 0.8, offset = [0.6, 0.0] }", False),
         ("0.8", '"shape"\n[formation.shape]\nA = [0.0, 0.0]\nB = [0.5, 0.0]', True),
@@ -140,29 +112,10 @@ def nodes(node, path=""):
         yield from nodes(each, f"{path}.{key}")
 
 
-def test_unlimited_numbers_have_no_default_in_the_schema():
-    found = [node for _, node in nodes(json_schema.schema()) if node.get("type") == "number"]
-    assert len(found) > 100
-    assert not [each for each in found if each.get("default", 0.0) is None]
-
-
-class Undescribed(msgspec.Struct, frozen=True):
-    """A law of a user, whose parameters have no description."""
-
-    largest: float = 0.05
-
-
-@pytest.mark.parametrize("foreign", [[], [metadata.EntryPoint("clamped", f"{__name__}:Undescribed", registry.LAWS)]])
-def test_schema_describes_every_field_of_zenpark(monkeypatch, foreign):
-    installed = registry.registered
-    more = {registry.LAWS: {entry.name: [entry] for entry in foreign}}
-    monkeypatch.setattr(registry, "registered", lambda group: installed(group) | more.get(group, {}))
-    own = {"", *(entry.name for entry in metadata.distribution("zenpark").entry_points)}  # of others: their parameters
+def test_schema_describes_every_field():
     tables = ((path, node.get("properties", {})) for path, node in nodes(json_schema.described()))
-    fields = {
-        f"{path}.{name}": field
-        for path, table in tables
-        if isinstance(table, dict) and table.get("kind", {}).get("const", "") in own
-        for name, field in table.items()
-    }
+    fields = {f"{path}.{name}": field for path, table in tables for name, field in table.items()}
     assert [name for name, field in fields.items() if not {"description", "const"} & set(field)] == []
+    numbers = [node for _, node in nodes(json_schema.schema()) if node.get("type") == "number"]
+    assert len(numbers) > 100
+    assert not [each for each in numbers if each.get("default", 0.0) is None]

@@ -15,6 +15,7 @@ from experiments.file import document
 from experiments.file.document import DocumentError, read
 from experiments.file.text import MAX_TEXT_BYTES
 from tests.experiments.traces import parse_links
+from tests.small import PERIODIC
 
 MALFORMED = Path(__file__).parent / "malformed"
 # line, column, part of the message and of the remedy, as the comments of a malformed file have them
@@ -60,40 +61,20 @@ def test_problem_shows_the_line_and_the_column(write):
         "       | \t^\n"
         "       = did you mean 'gain'?"
     )
-
-
-def test_long_line_is_cut_around_the_place(write):
-    error = refusal(write(f'title = "{"x" * 500}"\n' + MINIMAL[14:].replace("10.0", " " * 300 + '"no" # ' + "y" * 300)))
+    error = refusal(write(MINIMAL.replace("10.0", " " * 300 + '"no" # ' + "y" * 300)))
     _, source, caret, _ = str(error).split("\n")
     assert len(source) < 120
     assert source[caret.index("^") :].startswith('"no"')
 
 
-def slips(text):
-    """Table and key of every line `key = value`, its number, and the text with this key misspelt."""
-    lines, table = text.split("\n"), ""
-    for number, line in enumerate(lines, 1):
-        if line.startswith("["):
-            table = re.sub(r"\b[A-Z]{2}\d+\b", "a robot", line.partition("#")[0].strip())
-        elif known := re.match("([a-z_]+) =", line):
-            yield (table, known[1]), number, "\n".join([*lines[: number - 1], f"x{line}", *lines[number:]])
-
-
 @pytest.mark.slow
 def test_every_misspelt_key_is_found_in_its_line(write):
-    tried = set()
-    for name in index.names():
-        found = list(slips(entries.path(name).read_text("utf-8")))
-        assert len(found) > 5
-        for place, number, text in found:
-            if place not in tried:  # the same key of the same table in another file is read by the same rules
-                tried.add(place)
-                lines = [(problem.line, problem.column) for problem in refusal(write(text)).problems]
-                assert (number, 1) in lines, (name, place)
-    assert len(tried) > 30
-
-
-# Files that are not what they should be
+    lines = entries.path("robotic-park").read_text("utf-8").split("\n")
+    keys = [number for number, line in enumerate(lines) if re.match("([a-z_]+) =", line)]
+    assert len(keys) > 10
+    for number in keys:
+        text = "\n".join([*lines[:number], f"x{lines[number]}", *lines[number + 1 :]])
+        assert (number + 1, 1) in [(problem.line, problem.column) for problem in refusal(write(text)).problems]
 
 
 @pytest.mark.parametrize(
@@ -101,8 +82,6 @@ def test_every_misspelt_key_is_found_in_its_line(write):
     [
         (b"\x89PNG\0\0", (0, 0), "is binary", "name an experiment file"),
         (b'title = "Ma\xf1as"\n', (1, 12), "byte 0xf1 is not UTF-8", "save the file as UTF-8"),
-        (b"", (0, 0), "is empty", "zenpark new"),
-        (b" \n\t\n", (0, 0), "is empty", "zenpark new"),
         (b"\xef\xbb\xbf", (0, 0), "is empty", "zenpark new"),
         (b"a = " + b"1" * 5000, (0, 0), "is no TOML", "smaller number"),
         (b"a = " + b"[" * 5000 + b"]" * 5000, (0, 0), "nested too deeply", "flatten"),
@@ -123,45 +102,8 @@ def test_absent_file_names_the_nearest_of_the_catalogue(write):
     assert "did you mean 'robotic-park'?" in problem.hint
     (problem,) = refusal(write(MINIMAL).parent).problems
     assert (problem.message, problem.hint) == ("is a folder", "name a file in it: some.toml")
-
-
-VALUES = [
-    "nan", "inf", "-1", "1e400", "true", '""', '"KH01"', "[]", "{}", "[[]]", "[{}]", "1979-05-27", "9" * 30,
-    "{ kind = [] }", '{"" = 1}',
-]  # fmt: skip
-
-
-def outcome(path, flags=()):
-    """Result of a file: its cases as they are sent, or the reason of the refusal."""
-    try:
-        return [document.write_json(case) for case in read(path, flags).cases().values()]
-    except DocumentError as error:
-        return str(error).encode("utf-8")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "field", ["trigger", "robots", "cases", "timeline", "formation", "disturbance", "rates", "arena", "start"]
-)
-def test_any_value_is_read_or_refused(write, field):
-    """Whatever else is in a file: tests/fuzz."""
-    for value in VALUES:
-        for text in (f"{field} = {value}\n", f"cases.a.{field} = {value}\n"):
-            assert outcome(write(text))
-            assert outcome(write(text + MINIMAL))
-        assert outcome("robotic-park", [f"{field}={value}", f"cases.event.{field}={value}"])
-
-
-@pytest.mark.parametrize("name", ["a\0b", "x" * 5000, ""])
-def test_names_that_no_file_can_have(name):
-    assert len(refusal(name).problems) == 1
-
-
-def test_foreign_line_ends_and_byte_order_marks_work(write):
-    assert read(write("\ufeff" + MINIMAL.replace("\n", "\r\n"))).experiment.title == "One"
-
-
-# [hosts] and [network]
+    for name in ("a\0b", "x" * 5000, ""):
+        assert len(refusal(name).problems) == 1
 
 
 def test_processes_on_hosts_get_no_hosts(write):
@@ -169,24 +111,14 @@ def test_processes_on_hosts_get_no_hosts(write):
     experiment = read(write(TWO + hosts + 'tags = ["radio"]\n[hosts.board]\nrobots = ["KH02"]\n')).experiment
     assert robots_without_address(Plan(experiment)) == {"KH02": "board"}
     sent = document.case_document(Plan(experiment))
-    assert b"\n" not in sent
     there = document.received(sent.decode(), "standard input").experiment
     assert there == msgspec.structs.replace(experiment, hosts={})
 
 
-@pytest.mark.parametrize(
-    "network",
-    [
-        'routers = 2\nlisten = ["tcp/127.0.0.1:1", "tcp/127.0.0.1:2"]\n',
-        'topology = "mesh"\naddresses.KH01 = "tcp/127.0.0.1:1"\n',
-    ],
-    ids=["two routers", "mesh"],
-)
-def test_networks_that_are_accepted(write, network):
-    assert read(write(f"{TWO}[network]\n{network}"))
-
-
-# Cases
+def test_networks_that_are_accepted(write):
+    two_routers = 'routers = 2\nlisten = ["tcp/127.0.0.1:1", "tcp/127.0.0.1:2"]\n'
+    for network in (two_routers, 'topology = "mesh"\naddresses.KH01 = "tcp/127.0.0.1:1"\n'):
+        assert read(write(f"{TWO}[network]\n{network}"))
 
 
 def experiments(read):
@@ -199,7 +131,7 @@ def test_cases_are_experiments_in_the_files_order(write):
     assert cases["periodic"].trigger == {"kind": "periodic", "period_s": 0.02}
     assert cases["event"].trigger == {"kind": "send-on-delta", "threshold": 0.01}
     assert all(case.cases == {} and len(case.robots) == 7 for case in cases.values())
-    alone = read(write(MINIMAL))
+    alone = read(write("\ufeff" + MINIMAL.replace("\n", "\r\n")))
     assert alone.cases() == {"default": alone.plan}
 
 
@@ -220,12 +152,6 @@ def test_case_merges_tables_and_replaces_choices_between_kinds(write):
     assert parse_links(cases["same"]) == [("KH01", "KH02", 1.0, 3.0), ("KH02", "KH01", 1.0, 3.0)]
 
 
-# --set
-
-
-PERIODIC = {"kind": "periodic", "period_s": 0.02}
-
-
 def value(experiment, path):
     """The value at a dotted path."""
     found = msgspec.to_builtins(experiment)
@@ -239,15 +165,11 @@ def value(experiment, path):
     [
         ("robots.CF01.hover=0.7", "robots.CF01.hover", 0.7, 0.7),
         ("title=Two words", "title", "Two words", "Two words"),
-        ('title="12"', "title", "12", "12"),
+        ('title="12"; trigger.kind=periodic', "title", "12", "12"),
         ("trigger.threshold=0.02", "trigger", PERIODIC, {"kind": "send-on-delta", "threshold": 0.02}),
-        ("trigger.kind=periodic", "trigger.kind", "periodic", "periodic"),
-        ("cases.event.trigger.threshold=0.05; trigger.threshold=0.02", "trigger", PERIODIC,
-         {"kind": "send-on-delta", "threshold": 0.05}),
         ("trigger.threshold=0.02; cases.event.trigger.threshold=0.05", "trigger", PERIODIC,
          {"kind": "send-on-delta", "threshold": 0.05}),
         ("cases.event.seed=9; seed=5", "seed", 5, 9),
-        ("timeline.0.plan.speed=0.1", "timeline.0.plan.speed", 0.1, 0.1),
         ("robots.CF01.start.1=0.5", "robots.CF01.start", [-0.2, 0.5], [-0.2, 0.5]),
     ],
 )  # fmt: skip
@@ -260,7 +182,6 @@ def test_set_changes_cases(flags, path, periodic, event):
     ("flag", "distance", "gain"),
     [
         ('"TB01 > KH01"=0.5', 0.5, 3.0),
-        ("TB01 > KH01=0.5", 0.5, 3.0),
         ("'TB01>KH01'=0.5", 0.5, 3.0),
         ("TB01 > KH01.gain=9", 0.6, 9.0),
     ],
@@ -275,22 +196,13 @@ def test_set_of_a_link_however_it_is_written(flag, distance, gain):
     ("flag", "message", "hint"),
     [
         ("trigger.treshold=1", "no trigger of this experiment has a parameter 'treshold'", "did you mean 'threshold'?"),
-        ("cases.event.trigger.treshold=1", "unknown parameter 'treshold'", "did you mean 'threshold'?"),
-        ("trigger.threshold=-1", "'threshold' must be a number > 0, not -1", "[m]"),
         ("cases.evnt.seed=1", "the file has no case 'evnt'", "did you mean 'event'?"),
         ("robots.CF09.hover=1", "no robot is called 'CF09'", "did you mean 'CF0"),
-        ("robts.CF01.hover=1", "unknown key 'robts'", "did you mean 'robots'?"),
-        ("robots.CF01.hovr=1", "unknown key 'hovr' in 'CF01'", "did you mean 'hover'?"),
         ("robots.CF01.hover=high", "'hover' must be a number, not 'high'", "height"),
-        ("robots.CF01.hover=5", "'CF01' cannot hover at 5 m", "at most 2.45"),
         ("duration_s.x=1", "'duration_s' is no table", "set duration_s itself"),
         ("timeline.3.at_s=1", "there is no '3' in 'timeline'", "0 to 0"),
-        ("timeline.0.at_s=50", "this leg begins at 50 s", "longer duration_s"),
-        ("rates.pose_hz=30", "pose_hz = 30 does not divide body_hz = 100", "pose_hz = 25"),
-        ("seed=nan", "'seed' is nan", "finite"),
         ("trigger=periodc", "no 'periodc' among the triggers", "did you mean 'periodic'?"),
         ("nonsense", "not of the form path=value", "--set formation.gain=2.5"),
-        ("=1", "not of the form path=value", "--set formation.gain=2.5"),
         ("a..b=1", "not of the form path=value", "--set formation.gain=2.5"),
         ("title=\udcff", "characters that are no text", "leave them out"),
     ],
@@ -303,19 +215,12 @@ def test_wrong_set_names_the_flag(flag, message, hint):
     assert str(problem).startswith("--set ")
 
 
-def test_leg_has_a_number_and_no_name():
-    (problem,) = refusal("triangle", "timeline.first.plan.speed=1").problems
-    assert problem.message == "'timeline' must be a list, not a table"
-    assert problem.hint == "write [[timeline]], with two brackets"
-
-
-def test_set_hides_no_fault_of_the_file(write):
+def test_set_is_checked_together_with_the_file(write):
     file = write(MINIMAL + "[formation]\ngian = 2.0\n")
+    (problem,) = refusal(write(MINIMAL, "other.toml"), "timeline.first.plan.speed=1").problems
+    assert problem.message == "'timeline' must be a list, not a table"
     problems = refusal(file, "formation.gain=x").problems
     assert [(p.file, p.line) for p in problems] == [("--set formation.gain=x", 0), (str(file), 7)]
-
-
-# JSON
 
 
 @pytest.mark.parametrize("name", index.names())

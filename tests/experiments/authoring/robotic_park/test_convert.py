@@ -9,6 +9,7 @@ import pytest
 from experiments.authoring.robotic_park.convert import convert, convert_text
 from experiments.authoring.robotic_park.file import ParkTrigger, starts_from
 from experiments.check.check import check, examine, figures
+from experiments.definition.experiment import Shadow
 from experiments.definition.formation import law_errors
 from experiments.file import document
 from experiments.file.problems import DocumentError
@@ -33,7 +34,7 @@ def converted(text):
 
 def trio(relations, architecture="distributed", mode="virtual", kind="khepera", **more):
     """Robots on a triangle of 0.8 m, or near it; `relations` of each."""
-    place = [(0.01 if kind == "dron" else 0.0, 0.0, 0.0), (0.9, 0.0, 0.0), (0.4, 0.7, 0.0)]
+    place = [(0.01, 0.0, 0.0), (0.9, 0.0, 0.0), (0.4, 0.7, 0.0)]
     robots = [robot(k + 1, f"khepera0{k + 1}", place[k], relations[k], **more) for k in range(3)]
     return file(robots, mode, architecture).replace("khepera", kind)
 
@@ -47,37 +48,22 @@ def triangle_with(relation, **more):
     return trio([[*each, relation] for each in TRIANGLE], **more)
 
 
-# ------------------------------------------------------------------ files like theirs
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("count", FILES)
-def test_files_convert_pass_the_check_and_settle(count):
+@pytest.mark.parametrize(("count", "allowed"), [(5, None), (12, None), (15, 0.15)])
+def test_files_convert_pass_the_check_and_settle(count, allowed):
     read, notes = converted(FILES[count])
     plan, by_events = read.plan, read.experiment.formation.update is not None
     assert len(read.experiment.robots) == count
-    # their files have no disturbance; the gain of 8 and 20 is near or above what a real drone bears at their decisions
-    expected = {"not-random"} | ({"not-acquired"} if by_events else set())  # what a chain of thresholds leaves
-    expected |= {8: {"oscillates"}, 20: {"unstable", "keeps-oscillating", "anchor-missed"}}.get(count, set())
+    # their files have no disturbance; a chain of thresholds leaves an error
+    expected = {"not-random"} | ({"not-acquired"} if by_events else set())
     found, numbers = examine(read)
     assert {each.code for each in found if each.severity != "note"} <= expected
     assert all(each.residual_mm < 1.0 for each in numbers.values())
     assert all(note.split()[0] in read.text for note in notes.split(" | "))
     log = fly(read.experiment).log
     last = log.true_position[np.searchsorted(log.time, 19.9)]
-    allowed = {15: 0.15, 20: 0.1}.get(count, read.experiment.tolerance)  # by events; unstable
-    assert law_errors(plan.law, last, last[plan.links.sender], plan.links).max() < allowed
-
-
-def test_distance_task():
-    experiment = converted(FILES[5])[0].experiment
-    assert experiment.trigger == {"kind": "periodic", "period_s": 0.05}
-    assert (experiment.rates.pose_hz, experiment.rates.coordination_hz) == (20.0, 10.0)
-    assert experiment.formation.law == "distance"
-    assert experiment.formation.clamp == 0.1
-    assert experiment.formation.gain == 0.5  # 2 k: their simulator's driver of that time does not divide
-    assert all(" - " in link for link in experiment.formation.links)
-    assert {robot.body for robot in experiment.robots.values()} == {"twin"}
+    errors = law_errors(plan.law, last, last[plan.links.sender], plan.links)
+    assert errors.max() < (allowed or read.experiment.tolerance)
 
 
 def test_hybrid_file_keeps_addresses_and_shares_the_radio():
@@ -100,29 +86,6 @@ def test_drones_hover_at_the_heights_of_the_shape():
     assert "lifted" in notes
 
 
-def test_pose_task_with_twins_beside_robots():
-    experiment = converted(FILES[12])[0].experiment
-    assert experiment.formation.law == "displacement"
-    assert experiment.formation.stiffness == 0.25
-    first, second = experiment.robots["khepera00"], experiment.robots["khepera01"]
-    assert first.body == "khepera4://192.168.0.21:50000"
-    assert first.shadow is not None
-    assert second.body == "twin"
-    assert experiment.formation.links["khepera00 > khepera01"].offset == [0.0, 0.5]  # of khepera01 from khepera00
-    assert experiment.robots["dron11"].hover == 0.7
-
-
-def test_control_on_events_and_positions_from_outside():
-    experiment = converted(FILES[15])[0].experiment
-    assert experiment.formation.update == {"kind": "relative-control", "floor": 0.005, "share": 0.1}
-    assert experiment.trigger == {"kind": "send-on-delta", "threshold": 0.01}
-    assert {each.position for each in experiment.robots.values()} == {"external"}
-    assert experiment.positioning == "vicon-twin"
-
-
-# ------------------------------------------------------------------ single keys
-
-
 def test_one_way_links_and_those_of_two_minds():
     relations = (["khepera02_0.8"], ["khepera01_0.9", "khepera03_0.8"], ["khepera02_0.8", "khepera01_0.8"])
     read, notes = converted(trio(relations))
@@ -133,33 +96,46 @@ def test_one_way_links_and_those_of_two_minds():
         "khepera01 > khepera03": 0.8,
     }
     assert "different things" in notes
-
-
-def test_robot_with_another_gain_keeps_it():
     links = converted(trio(TRIANGLE).replace("gain: 0.25", "gain: 0.4", 1))[0].experiment.formation.links
     assert links["khepera02 > khepera01"].gain == pytest.approx(0.8)  # 2 · 0.4
-    assert links["khepera01 > khepera02"] == 0.8
-    assert links["khepera03 - khepera02"] == 0.8
+    assert (links["khepera01 > khepera02"], links["khepera03 - khepera02"]) == (0.8, 0.8)
 
 
-PERIOD = trio(TRIANGLE).replace("period: 0.1\n", "period: 0.2\n")
-FASTER = ("      T: 100\n", "      T: 50\n")
+GRADIENT_V = trio(TRIANGLE).replace("period: 0.1\n", "period: 0.2\n").replace("type: gradient", "type: gradient_v")
+DRONES = trio(TRIANGLE, kind="dron").replace("      T: 100\n", "      T: 50\n")
 
 
 @pytest.mark.parametrize(
     ("text", "path", "expected"),
     [
+        (FILES[5], "trigger", {"kind": "periodic", "period_s": 0.05}),
+        (FILES[5], "rates.pose_hz", 20.0),
+        (FILES[5], "rates.coordination_hz", 10.0),
+        (FILES[5], "formation.law", "distance"),
+        (FILES[5], "formation.clamp", 0.1),
+        (FILES[5], "formation.gain", 0.5),  # 2 k: their simulator's driver of that time does not divide
+        (FILES[12], "formation.law", "displacement"),
+        (FILES[12], "formation.stiffness", 0.25),
+        (FILES[12], "formation.links.khepera00 > khepera01.offset", [0.0, 0.5]),  # of khepera01 from khepera00
+        (FILES[12], "robots.khepera00.body", "khepera4://192.168.0.21:50000"),
+        (FILES[12], "robots.khepera00.shadow", Shadow()),
+        (FILES[12], "robots.khepera01.body", "twin"),
+        (FILES[12], "robots.dron11.hover", 0.7),
+        (FILES[15], "formation.update", {"kind": "relative-control", "floor": 0.005, "share": 0.1}),
+        (FILES[15], "trigger", {"kind": "send-on-delta", "threshold": 0.01}),
+        (FILES[15], "positioning", "vicon-twin"),
+        (FILES[15], "robots.khepera00.position", "external"),
         (trio(TRIANGLE, law="pid"), "formation.gain", pytest.approx(0.25 / 0.64, rel=1e-3)),  # pulls as the square
-        (PERIOD.replace("type: gradient", "type: gradient_v"), "formation.gain", pytest.approx(0.1)),
-        (PERIOD.replace("type: gradient", "type: gradient_v"), "formation.clamp", pytest.approx(0.02)),
+        (GRADIENT_V, "formation.gain", pytest.approx(0.1)),
+        (GRADIENT_V, "formation.clamp", pytest.approx(0.02)),
         (trio([["khepera02_-0.3/-0.3/0.2"], [], []]).replace("type: distance", "type: relative_pose"),
          "formation.links.khepera02 > khepera01.offset", [-0.3, -0.3]),
         (trio(TRIANGLE, mode="physical", place="physical").replace("agent_ip:", "ip:"), "robots.khepera02.body",
          "khepera4://192.168.0.22:50000"),
         (trio(TRIANGLE).replace("pose: 0.90, 0.00, 0.00", "pose: {y: 0.0, x: 0.9}"), "robots.khepera02.start",
          [0.9, 0.0]),
-        (trio(TRIANGLE, kind="dron", place="physical").replace(*FASTER), "rates.coordination_hz", 20.0),
-        (trio(TRIANGLE, kind="dron").replace(*FASTER), "rates.coordination_hz", 10.0),
+        (DRONES.replace("type: virtual", "type: physical"), "rates.coordination_hz", 20.0),
+        (DRONES, "rates.coordination_hz", 10.0),
     ],
 )  # fmt: skip
 def test_keys_become_those_of_zenpark(text, path, expected):
@@ -184,6 +160,9 @@ def test_relations_to_places_become_anchors(relation, anchor, note):
     assert anchor in read.text
     assert ("[formation.anchors]" in read.text) == bool(anchor)
     assert note in notes
+    read, notes = converted(triangle_with("origin_2.0"))  # it contradicts the distances
+    assert not read.experiment.formation.anchors
+    assert "no shape was found that meets them" in notes
 
 
 @pytest.mark.slow
@@ -200,23 +179,20 @@ def test_origin_of_real_crazyflies_follows_their_driver(architecture, theirs):
     assert ("the origin: lifted" in notes) != theirs  # the central controller's is at 0
 
 
-def test_origin_contradicting_distances_is_left_out():
-    read, notes = converted(triangle_with("origin_2.0"))
-    assert not read.experiment.formation.anchors
-    assert "no shape was found that meets them" in notes
-
-
 def test_everything_that_is_left_behind_is_told():
     robots = [robot(k + 1, f"khepera0{k + 1}", (0.9 * k, 0.7 * (k == 2), 0), TRIANGLE[k]) for k in range(3)]
     robots[1] = robot(2, "khepera02", (0.9, 0, 0.3), TRIANGLE[1], place="physical", threshold=0.02)
     robots[1] = robots[1].replace("agent_ip: 192.168.0.22", "agent_ip: ''").replace("role: consensus", "role: leader")
     text = file(robots, "hybrid", "centralized", "True").replace("period: 0.1\n", "period: 0.15\n")
     text = text.replace("      threshold:\n        type: Constant", "      threshold:\n        type: Adaptive", 2)
-    read, notes = converted(text)
+    tools = "  Agent00:\n    enable: False\n  Agent01:\n    enable: True\n  Reconfiguration:\n    enable: True\n"
+    read, notes = converted(text + tools)
     assert read.experiment.architecture == "centralised"
     assert read.experiment.robots["khepera02"].start == [0.9, 0.0, 0.3]  # the third number of robots on wheels: yaw
     words = ("simulator", "Data_Logging", "khepera02: real", "leader", "commonest", "6.66667 Hz become")
-    assert [word for word in ("threshold.type: Adaptive", *words) if word not in notes] == []
+    words += ("threshold.type: Adaptive", "Other.Agent01: zenpark records", "the first shape is imported")
+    assert [word for word in words if word not in notes] == []
+    assert "Agent00" not in notes
 
 
 @pytest.mark.parametrize(("spelt", "noted"), [("centralized", False), ("Centralized", True)])
@@ -226,23 +202,18 @@ def test_central_controller_reads_relations_of_disabled_tasks(spelt, noted):
     assert len(read.experiment.formation.links) == 3
     assert {anchor.gain for anchor in read.experiment.formation.anchors.values()} == {1.0}  # twice that of a link
     assert ("starts a centre" in notes) == noted
-
-
-def test_tasks_that_are_off_are_counted():
-    read, notes = converted(trio(TRIANGLE).replace(TASK, OFF))
+    read, notes = converted(trio(TRIANGLE).replace(TASK, OFF))  # without a centre
     assert not read.experiment.formation.links
     assert "khepera01, khepera02, khepera03: 6 relations are left out" in notes
-    assert converted(trio(TRIANGLE).replace(TASK, OFF.replace("100", "-5"), 1))[0].experiment.robots
 
 
-@pytest.mark.parametrize("recent", [False, True])
 @pytest.mark.parametrize(
-    ("place", "kind", "gain", "weight"),
+    ("place", "kind", "gain", "weight", "recent"),
     [
-        ("virtual", "khepera", 0.5, 4.0),
-        ("physical", "khepera", 0.5 / 0.8, 2.0),
-        ("virtual", "dron", 0.5, 4.0),
-        ("physical", "dron", 0.5, 2.0),
+        ("virtual", "khepera", 0.5, 4.0, True),
+        ("physical", "khepera", 0.5 / 0.8, 2.0, False),
+        ("virtual", "dron", 0.5, 4.0, False),
+        ("physical", "dron", 0.5, 2.0, True),
     ],
 )
 def test_gains_follow_the_driver_of_the_file(place, kind, gain, weight, recent):
@@ -258,6 +229,14 @@ def test_gains_follow_the_driver_of_the_file(place, kind, gain, weight, recent):
         assert gains == pytest.approx([0.5 * weight] * 3, rel=1e-3)
 
 
+def test_threshold_of_communication_is_positive():
+    given = ({"co": 0.02, "threshold": 0.5}, {"threshold": 0.5}, {})
+    made = [msgspec.convert({"protocol": "EventBased", "threshold": each}, ParkTrigger).event for each in given]
+    assert made == [(0.02, 0.0), (0.5, 0.0), (0.01, 0.0)]
+    with pytest.raises(ValueError, match="crossed always"):
+        _ = msgspec.convert({"protocol": "EventBased", "threshold": {"threshold": 0}}, ParkTrigger).event
+
+
 def test_pyramid_is_not_folded():
     """Four drones on a square and one above it, from one height: folded, two opposite corners are in one place."""
     place = np.array([[1.2, 0, 0], [0, 1.2, 0], [-1.2, 0, 0], [0, -1.2, 0], [0, 0, 1.0]])
@@ -271,68 +250,26 @@ def test_pyramid_is_not_folded():
     assert np.linalg.norm(end[:, None] - end[None, :], axis=2)[np.triu_indices(5, 1)].min() > 1.0
 
 
-@pytest.mark.slow
-@pytest.mark.usefixtures("unflown")
-def test_flat_formation_stays_flat_whatever_the_origin():
-    place = np.array([(0.8, 0.0, 0.0), (0.25, 0.76, 0.0), (-0.65, 0.47, 0.0), (-0.65, -0.47, 0.0), (0.25, -0.76, 0.0)])
-    links = np.stack(np.triu_indices(5, 1), axis=1).tolist()
-    text = drones(place, [(1.2 * x, 1.1 * y, 0.7) for x, y, _ in place], links, extra=["origin_0.5"])
-    read, notes = converted(text)
-    assert [each.hover for each in read.experiment.robots.values()] == [0.7] * 5
-    assert not read.experiment.formation.anchors
-    assert figures(read.plan).residual_mm < 0.2
-    assert "climb" not in notes
-
-
-def test_enabled_tools_are_reported_and_no_others():
-    off = "  Agent00:\n    enable: False\n  Agent01:\n    enable: True\n  Reconfiguration:\n    enable: True\n"
-    notes = converted(trio(TRIANGLE) + off)[1]
-    assert "Agent00" not in notes
-    assert "Other.Agent01: zenpark records" in notes
-    assert "the first shape is imported" in notes
-
-
-def test_zero_threshold_is_refused_and_co_precedes_threshold():
-    def event(**threshold):
-        return msgspec.convert({"protocol": "EventBased", "threshold": threshold}, ParkTrigger).event
-
-    assert event(co=0.02, threshold=0.5) == (0.02, 0.0)
-    assert event(threshold=0.5) == (0.5, 0.0)
-    assert event() == (0.01, 0.0)
-    with pytest.raises(ValueError, match="crossed always"):
-        event(threshold=0)
-
-
-# ------------------------------------------------------------------ what is refused
-
-
 @pytest.mark.parametrize(
     ("old", "new", "said", "line"),
     [
         ("mode: virtual ", "mode: virtuel ", "Operation.mode: Invalid enum value 'virtuel'", 0),
         ("name: khepera02", "name: rover02", "Robots.Robot02: no kind of robot is in the name 'rover02'", 0),
-        ("name: khepera02", "name: rover02", "use letters, digits and _, and in it one of", 0),
         ("name: khepera02", "name: khepera01", "Robot01: two robots are called 'khepera01'", 0),
-        ("type: virtual\n    name: khepera02", "type: imagined\n    name: khepera02", "type: Invalid enum value", 0),
         ("pose: 0.90, 0.00, 0.00", "pose: 0.90; 0.00", "Robots.Robot02.pose[0]: Expected `float`", 0),
         ("pose: 0.90, 0.00, 0.00", "pose: 0.90", "Robots.Robot02.pose: Expected", 0),
-        ("pose: 0.90, 0.00, 0.00", "pose: 0.90", "give x, y and, if wanted, z or the yaw", 0),
         ("pose: 0.90, 0.00, 0.00", "pose: {}", "Robots.Robot02.pose: Expected `object` of length >= 2", 0),
         ("    pose: 0.90, 0.00, 0.00\n", "", "Robots.Robot02: pose is missing", 0),
-        ("    pose: 0.90, 0.00, 0.00\n", "", "write pose: 0.5, 0.5, 0.0", 0),
         ("khepera03_0.8", "khepera04_0.8", "no other robot is called 'khepera04'", 0),
         ("khepera03_0.8", "khepera03_x", "task: 'khepera03_x' is no relation of a distance task", 0),
         ("khepera03_0.8", "khepera03_-0.8", "not positive", 0),
         ("khepera03_0.8", "khepera01_0.8", "no other robot is called 'khepera01'", 0),
-        ("gain: 0.25", "gain: strong", "Robot01.task.controller.gain: Expected `float`, got `str`", 0),
         ("gain: 0.25", "gain: .inf", "controller.gain: Expected `float` <= ", 0),
         ("gain: 0.25", "gain: -1", "Expected `float` > 0.0", 0),
-        ("enable: True\n      T: 100", "enable: perhaps\n      T: 100", "Robot01.task.enable: Expected `bool`", 0),
         ("      type: distance\n", "", "Robots.Robot01.task: type or relationship is missing", 0),
         ("type: distance", "type: bearing", "Robot01.task: the type 'bearing' is unknown", 0),
         ("upperLimit: 0.1", "upperLimit: -0.2", "no step lies between", 0),
         ("Robots:\n", "Robots: none\nElse:\n", "Robots: Expected `object`, got `str`", 0),
-        ("Architecture:\n", "Architecture: none\nElse:\n", "Architecture: Expected `object`, got `str`", 0),
         ("Robots:\n", "Robotss:\n", "'Robots' is missing", 0),
         ("  mode: virtual ", " \tmode: virtual ", "", 3),
         ("tool: Webots", "tool: 'Webots", "", None),
@@ -354,15 +291,11 @@ def test_error_names_the_key_or_the_line(old, new, said, line):
 
 @pytest.mark.parametrize(
     "text",
-    ["- 1\n- 2\n", "just text\n", "a: [1, 2\n", "a: b: c\n", "{" * 1200, "a: \x01\n", "&a [*a]\n",
-     "Robots: &r\n  Robot01: *r\n"],
-)  # fmt: skip
+    ["- 1\n- 2\n", "just text\n", "a: [1, 2\n", "{" * 1200, "a: \x01\n", "&a [*a]\n", "Robots: &r\n  Robot01: *r\n"],
+)
 def test_other_files_are_refused(text):
     with pytest.raises(DocumentError):
         convert_text(text, "park.yaml", 20.0)
-
-
-def test_files_for_other_commands_name_them():
     with pytest.raises(DocumentError, match=r"is no file of Robotic Park's authors(.|\n)*zenpark check park.toml"):
         convert_text('title = "park"\n', "park.toml", 20.0)
     with pytest.raises(DocumentError, match="import the file that lists all robots"):
@@ -384,9 +317,6 @@ def test_conversion_writes_a_new_file(tmp_path):
         convert(str(source), None, 20.0)
 
 
-# ------------------------------------------------------------------ files of 2023
-
-
 def test_flat_2023_file_starts_from_an_index(tmp_path):
     marker = "dron09:\n  name: khepera01\n  control_mode: None\n  task:\n    enable: False\n    relationship: Null\n"
     poses = tmp_path / "poses.yaml"
@@ -403,7 +333,6 @@ def test_flat_2023_file_starts_from_an_index(tmp_path):
     }  # fmt: skip
     assert (formation.gain, formation.clamp) == (0.5, 0.08)
     assert experiment.rates.coordination_hz == 5.0
-    assert experiment.trigger == {"kind": "send-on-delta", "threshold": 0.02}
     told = " | ".join(notes)
     assert "khepera01 192.168.0.1:50000, khepera02 192.168.0.2:50000" in told
     assert "dron09: the marker" in told
@@ -440,9 +369,7 @@ def test_index_of_2023_follows_the_files_it_names(index):
     first = experiment.robots["khepera01"]
     assert (first.body, first.start) == ("khepera4://192.168.0.1:50000", [-0.4, 0.0, -1.5])
     assert first.shadow is not None
-    assert experiment.robots["khepera02"].body == "twin"
     links = experiment.formation.links
-    assert links["khepera02 - dron01"] == 0.9
     driven = 0.5 / 0.8667  # the real Khepera's driver divides
     assert links["dron01 > khepera01"].gain == pytest.approx(driven, rel=1e-3)
     assert starts_from(str(index))["khepera02"] == (0.5, 0.1, 0.0)
@@ -457,7 +384,6 @@ def test_index_of_2023_follows_the_files_it_names(index):
         (flat("dron01", speaks="Loud"), "'Loud'", "AC_dron01.yaml"),
         (flat("dron01", relations="dron07_1.0"), "dron07", ""),
     ],
-    ids=["absent", "list", "empty", "unknown word", "unknown robot"],
 )
 def test_faults_of_an_index_name_their_file(index, text, said, where):
     broken = index.with_name("AC_dron01.yaml")
@@ -468,16 +394,11 @@ def test_faults_of_an_index_name_their_file(index, text, said, where):
         from_index(index)
     assert said in str(raised.value)
     assert raised.value.problems[0].file.endswith(where)
-
-
-def test_missing_files_of_robots_are_counted_once(index):
     for each in index.parent.glob("AC_*.yaml"):
         each.unlink()
-    with pytest.raises(DocumentError) as raised:
+    with pytest.raises(DocumentError, match=r"3 files of robots that are not beside it: AC_dron01\.yaml") as raised:
         from_index(index)
-    (problem,) = raised.value.problems
-    assert problem.file == str(index)
-    assert "3 files of robots that are not beside it: AC_dron01.yaml" in problem.message
+    assert [problem.file for problem in raised.value.problems] == [str(index)]
 
 
 WORLD = """#VRML_SIM R2023a utf8
@@ -507,7 +428,6 @@ def test_starts_from_a_webots_world(tmp_path):
     ("name", "text", "said"),
     [
         ("poses.txt", "dron01: 0.1\n", "tells the start of no robot"),
-        ("park.wbt", "Robot {", "tells the start of no robot"),
         ("park.wbt", 'Robot { name "dron01" translation 1 x 2 }', r"dron01.translation\[1\]: Expected `float`"),
         ("park.wbt", 'Robot { name "dron01" translation }', r"dron01.translation: Expected `array` of length 3"),
         ("park.wbt", "Robot { name", "tells the start of no robot"),

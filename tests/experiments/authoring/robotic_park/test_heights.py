@@ -38,15 +38,8 @@ def test_a_shape_is_found_again_from_nearby(seed, rows, relative):
     assert found.worst < ENOUGH
 
 
-def test_coplanar_drones_find_their_dome_above_ground_robots():
-    ring = np.array([(np.cos(a), np.sin(a), 0.0) for a in 2.0 * np.pi * np.arange(5) / 5])
-    shape = np.concatenate([ring, [[0.0, 0.0, 1.0]]])
-    climbs = np.arange(6) == 5
-    flat = shape * [1.2, 1.2, 0.1]
-    found = find_shape(asked(shape), (), flat, climbs)
-    assert found.worst < 1e-4
-    assert found.position[:5, 2] == pytest.approx(np.zeros(5))
-    assert found.position[5, 2] == pytest.approx(1.0, abs=1e-3)
+def ring(count, height=0.0):
+    return np.array([(np.cos(a), np.sin(a), height) for a in 2.0 * np.pi * np.arange(count) / count])
 
 
 def test_what_contradicts_itself_is_measured():
@@ -57,13 +50,13 @@ def test_what_contradicts_itself_is_measured():
 
 
 def test_shape_met_at_start_heights_is_not_folded():
-    ring = np.array([(np.cos(a), np.sin(a), 0.7) for a in 2.0 * np.pi * np.arange(6) / 6])
-    found = find_shape(asked(ring).take(np.arange(0, 15, 2)), (), ring * [1.3, 0.8, 1.0], np.ones(6, dtype=bool))
+    shape = ring(6, 0.7)
+    found = find_shape(asked(shape).take(np.arange(0, 15, 2)), (), shape * [1.3, 0.8, 1.0], np.ones(6, dtype=bool))
     assert found.worst < ENOUGH
     assert found.position[:, 2] == pytest.approx(0.7)
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(4))
 def test_space_shapes_are_found_from_coplanar_starts(seed):
     """Twelve drones on a hemisphere, linked to their nearest: a single beginning misses most of them."""
     made = layouts.hemisphere(12, 0.6, 0.25)
@@ -78,8 +71,7 @@ def solids(flies):
 
 
 def test_a_shape_below_the_floor_is_mirrored():
-    ring = np.array([(np.cos(a), np.sin(a), 0.0) for a in 2.0 * np.pi * np.arange(5) / 5])
-    shape = np.concatenate([ring, [[0.1, 0.0, 0.9], [-0.3, 0.2, 0.8]]])
+    shape = np.concatenate([ring(5), [[0.1, 0.0, 0.9], [-0.3, 0.2, 0.8]]])
     climbs = np.arange(7) >= 5
     start = shape * [1.2, 1.0, -0.2]  # nearer to the mirror image
     below = find_shape(asked(shape), (), start, climbs)
@@ -87,6 +79,7 @@ def test_a_shape_below_the_floor_is_mirrored():
     assert below.position[climbs, 2].max() < 0.0
     above = find_shape(asked(shape), (), start, climbs, solids(climbs))
     assert above.worst < ENOUGH
+    assert above.position[:5, 2] == pytest.approx(np.zeros(5))
     assert above.position[climbs, 2] == pytest.approx([0.9, 0.8], abs=1e-3)
 
 
