@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import re
 import shlex
+import shutil
+import subprocess
+import sys
 
 import pytest
 import typer.main
@@ -12,8 +15,9 @@ from experiments.check.check import check
 from experiments.file import document
 from tests.__main__ import MEASUREMENTS
 from tests.__main__ import command as measurement
-from tests.commands import ROOT
-from tests.docs.test_references import PAGES, TOPS
+from tests.cases import for_each
+from tests.commands import ROOT, zenpark
+from tests.docs.test_references import PAGES
 from tools.main import app
 
 COMMAND = re.compile(r"^ {4,}\./zenpark (?P<words>[^#\n]*)", re.MULTILINE)
@@ -39,21 +43,14 @@ def parse(words: list[str]) -> None:
     command.make_context(name, words)
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+@for_each("page", PAGES)
 def test_command_line_knows_every_command_of_a_page(page):
     for text in commands(page):
         words = shlex.split(text)
         if words and "--help" not in words:
             parse(words)
-
-
-SOURCES = [path for top in (*TOPS, "docs") for path in (ROOT / top).rglob("*") if path.suffix in {".py", ".md"}]
-BARE = re.compile(rf"(?:^ +|`)zenpark (?:{'|'.join(COMMAND_LINE.commands)})\b.*", re.MULTILINE)
-
-
-def test_commands_are_written_as_they_can_be_copied():
-    texts = {path: path.read_text("utf-8") for path in [*SOURCES, ROOT / "README.md"]}
-    assert [f"{path}: {found[0]}" for path, text in texts.items() for found in BARE.finditer(text)] == []
+    bare = re.compile(rf"(?:^ +|`)zenpark (?:{'|'.join(COMMAND_LINE.commands)})\b.*", re.MULTILINE)
+    assert bare.search(page.read_text("utf-8")) is None  # it cannot be copied
 
 
 def _leaves(command, path=()):
@@ -69,7 +66,7 @@ def _leaves(command, path=()):
 LEAVES = dict(_leaves(COMMAND_LINE)) | {("test", option): command for option, command in MEASURING.items()}
 
 
-@pytest.mark.parametrize(("path", "command"), LEAVES.items(), ids=map(" ".join, LEAVES))
+@for_each("path, command", LEAVES.items())
 def test_help_of_commands_ends_with_valid_examples(path, command):
     lines = [line.strip() for line in (command.epilog or "").splitlines() if "./zenpark" in line]
     assert lines
@@ -81,10 +78,33 @@ def test_help_of_commands_ends_with_valid_examples(path, command):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("flown", [False, pytest.param(True, marks=pytest.mark.nightly)])
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_experiments_of_a_page_are_sound(page, flown, request):
-    if not flown:
-        request.getfixturevalue("unflown")
+@pytest.mark.usefixtures("unflown")
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_experiments_of_a_page_are_sound(page):
     for text in BLOCK.findall(page.read_text("utf-8")):
         assert [str(found) for found in check(document.loads(text)) if found.severity == "error"] == []
+
+
+UNIT = re.search(r"```ini\n(\[Unit\].*?)```", (ROOT / "docs" / "hosts.md").read_text("utf-8"), re.DOTALL)[1]
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="needs systemd-analyze: apt-get install systemd")
+def test_systemd_takes_the_unit_of_hosts(tmp_path):
+    text = re.sub(r"ExecStart=\S+", f"ExecStart={sys.executable}", UNIT).replace("User=pi", "User=root")
+    file = tmp_path / "zenpark@CF01.service"
+    file.write_text(text)
+    command = ["systemd-analyze", "verify", "--man=no", str(file)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert file.name not in done.stderr
+
+
+@pytest.mark.slow
+def test_command_of_the_unit_is_understood(tmp_path):
+    (line,) = re.findall(r"^ExecStart=\S+ (.*)$", UNIT, re.MULTILINE)
+    words = shlex.split(line.replace("%i", "CF01"))
+    assert words[:3] == ["agent", "join", "CF01"]
+    words[words.index("--lab") + 1] = str(tmp_path)  # where there is no certificate
+    done = zenpark(*words, code=2)
+    assert "is missing" in done.stderr
+    assert "Traceback" not in done.stderr

@@ -15,11 +15,9 @@ from tests.commands import ROOT, zenpark
 from tools.main import main
 
 DOCS = ROOT / "docs"
-GUIDES = (
-    *("first-hour", "from-a-paper", "mixed-reality", "shadow-twin", "teaching"),
-    *("two-crazyflies", "vicon", "three-machines", "lab-certificates", "course/solutions/README"),
-)
+SHORT = ("shadow-twin", "two-crazyflies", "vicon", "three-machines", "lab-certificates")
 LONG = ("first-hour", "from-a-paper", "mixed-reality", "teaching", "course/solutions/README")  # 10 to 30 s each
+GUIDES = (*SHORT, *LONG)
 STEP = re.compile(
     r"^```(?P<language>toml|python)\n(?P<block>(?s:.*?))^```|^ {4,}\./zenpark (?P<command>[^#\n]*)(?P<said>.*)",
     re.MULTILINE,
@@ -73,12 +71,8 @@ def call(words: list[str], monkeypatch: pytest.MonkeyPatch) -> object:
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
-@pytest.mark.parametrize(
-    "guide", [pytest.param(guide, marks=pytest.mark.nightly) if guide in LONG else guide for guide in GUIDES]
-)
-def test_a_guide_can_be_followed(
-    guide: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.mark.parametrize("guide", [*SHORT, *(pytest.param(guide, marks=pytest.mark.nightly) for guide in LONG)])
+def test_a_guide_can_be_followed(guide: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("ZENPARK_RUNTIME_DIR", str(tmp_path / "runs"))
     Path("docs").symlink_to(DOCS)
@@ -89,7 +83,7 @@ def test_a_guide_can_be_followed(
         elif step.kind == "python" and "reopen" not in step.text:
             exec(compile(step.text, guide, "exec"), {})
         elif step.kind == "command" and computes(words := shlex.split(step.text)):
-            assert call(words, monkeypatch) == step.code, (step.text, capsys.readouterr())
+            assert call(words, monkeypatch) == step.code, step.text
         else:
             continue
         done += 1

@@ -12,39 +12,21 @@ import pytest
 
 import zenpark
 from experiments import api
+from tests.cases import for_each
 from tests.commands import ROOT, environment, python
 from tests.docs.test_references import PAGES
 
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 PAGE = (ROOT / "docs" / "python.md").read_text("utf-8")
-CODE = {
-    **{str(page.relative_to(ROOT)): BLOCK.findall(page.read_text("utf-8")) for page in PAGES},
-    **{
-        str(file.relative_to(ROOT)): [file.read_text("utf-8")]
-        for folder in ("tutorials", "course")
-        for file in (ROOT / "docs" / folder).rglob("*.py")
-    },
-}
+PROGRAMS = [*(ROOT / "docs" / "tutorials").rglob("*.py"), *(ROOT / "docs" / "course").rglob("*.py")]
+CODE = {page: BLOCK.findall(page.read_text("utf-8")) for page in PAGES}
+CODE |= {file: [file.read_text("utf-8")] for file in PROGRAMS}
 # what a plug-in that flies may import: nothing of it needs numpy or anything of `experiments`
-FLYING = (
-    *(
-        "Law",
-        "Gradient",
-        "Control",
-        "Memory",
-        "Said",
-        "View",
-        "RobotFacts",
-        "Link",
-        "PluginError",
-        "Trigger",
-        "Predictor",
-        "Planner",
-    ),
-    *("Avoidance", "measure_gap", "Kind", "KINDS", "Ground", "Body", "BodyRequest", "BodyState", "BodyError"),
-    *("Wheels", "Steered", "Holonomic", "Flight"),
-    *("call_all", "Vector", "norm", "distance", "clamp", "wrap"),
-)
+FLYING = """
+Law, Gradient, Control, Memory, Said, View, RobotFacts, Link, PluginError, Trigger, Predictor, Planner,
+Avoidance, measure_gap, Kind, KINDS, Ground, Body, BodyRequest, BodyState, BodyError,
+Wheels, Steered, Holonomic, Flight, call_all, Vector, norm, distance, clamp, wrap
+""".replace("\n", "")
 
 
 def imported(tree: ast.AST) -> dict[str, str]:
@@ -63,11 +45,7 @@ def test_every_name_has_a_type_and_a_home():
     (typed,) = [node for node in tree.body if isinstance(node, ast.If)]
     assert imported(typed) == api.homes()
     assert sorted(zenpark.__all__) == sorted(api.homes()) == dir(zenpark)
-    for name in zenpark.__all__:
-        assert getattr(zenpark, name) is not None
-
-
-def test_fifteen_names_come_first_and_on_the_page():
+    assert None not in [getattr(zenpark, name) for name in zenpark.__all__]
     rows = re.search(r"^Fifteen names.*\n\n((?:\|.*\n)+)", PAGE, re.MULTILINE)[1]
     assert re.findall(r"`(\w+)`", rows) == zenpark.__all__[:15]
 
@@ -98,16 +76,12 @@ def test_every_name_has_an_example():
     assert used == {*zenpark.__all__}
 
 
-@pytest.mark.parametrize("place", [place for place, blocks in CODE.items() if blocks])
+@for_each("place", [place for place, blocks in CODE.items() if blocks])
 def test_guides_import_from_nowhere_else(place):
     ours = re.compile(r"(agents|bridges|twins|experiments|tools)\b")
-    found = [
-        f"{name} of {home}"
-        for each in CODE[place]
-        for name, home in imported(ast.parse(each)).items()
-        if ours.match(home)
-    ]
-    assert not found, "import it from zenpark (experiments/api.py, docs/python.md)"
+    for each in CODE[place]:
+        elsewhere = {name: home for name, home in imported(ast.parse(each)).items() if ours.match(home)}
+        assert not elsewhere, "import it from zenpark (experiments/api.py, docs/python.md)"
 
 
 @pytest.mark.slow
@@ -130,6 +104,6 @@ def loaded(program: str) -> set[str]:
 def test_robot_plugins_load_only_what_they_name():
     own = {"zenpark", "experiments", "experiments.api"}
     assert loaded("import zenpark") == loaded("import __future__, functools, importlib, typing") | own
-    modules = loaded(f"from zenpark import {', '.join(FLYING)}")
+    modules = loaded(f"from zenpark import {FLYING}")
     assert "numpy" not in modules
     assert {name for name in modules if name.startswith("experiments")} == {"experiments", "experiments.api"}

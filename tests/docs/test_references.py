@@ -8,8 +8,7 @@ import runpy
 from functools import cache
 from pathlib import Path
 
-import pytest
-
+from tests.cases import for_each
 from tests.commands import ROOT
 
 TOPS = ("agents", "bridges", "twins", "experiments", "tools")
@@ -64,7 +63,7 @@ def expanded(path: str) -> list[str]:
     return [path[: braces.start()] + each + path[braces.end() :] for each in braces[1].split(",")]
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+@for_each("page", PAGES)
 def test_what_a_page_refers_to_exists(page):
     text = page.read_text("utf-8")
     dotted = {found[0] for found in DOTTED.finditer(text) if not found[0].endswith((".py", ".toml", ".md"))}

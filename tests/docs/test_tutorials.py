@@ -26,8 +26,6 @@ def cells(lesson):
 
 def test_every_lesson_is_known():
     assert sorted(FIGURES) == sorted(path.stem for path in FOLDER.glob("*.py"))
-    readme = (FOLDER / "README.md").read_text("utf-8")
-    assert all(f"[{lesson}.py]({lesson}.py)" in readme for lesson in FIGURES)
 
 
 @pytest.mark.parametrize("lesson", FIGURES)
@@ -42,14 +40,9 @@ def test_a_lesson_is_a_notebook(lesson):
     assert "__file__" not in named  # notebooks have none
     assert sum(isinstance(node, ast.Assert) for tree in trees for node in ast.walk(tree)) >= LEAST[lesson]
     assert "# ## Exercises" in words[-1]
-    assert len(re.findall(r"^# [1-9]\. ", words[-1], re.MULTILINE)) in (2, 3)
-
-
-@pytest.mark.parametrize("lesson", FIGURES)
-def test_what_a_lesson_imports_is_there(lesson):
-    tree = ast.parse("".join(body for is_text, body in cells(lesson) if not is_text))
-    imports = [node for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom)]
-    exec(compile(ast.Module(imports, []), lesson, "exec"), {})
+    for tree in trees:
+        imports = [node for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom)]
+        exec(compile(ast.Module(imports, []), lesson, "exec"), {})
 
 
 @pytest.mark.nightly

@@ -6,9 +6,7 @@ from types import SimpleNamespace
 import pytest
 
 from experiments.check import kept
-from experiments.check.check import examine
 from experiments.check.kept import KeptVerdict, Verdict
-from experiments.file import document
 from tests.cases import mostly_slow
 from tests.commands import zenpark
 from tests.tools.test_cli import loaded
@@ -47,7 +45,6 @@ CHANGES = {
     "arena file that hides one of the catalogue": lambda root: append(root, "lab/gate.arena.toml"),
     "file of a law": lambda root: append(root, "lab/mine.onnx"),
     "code of a plug-in": lambda root: append(root, "site/mine/__init__.py"),
-    "new body in a plug-in": lambda root: append(root, "site/mine/body.py"),
     "version of a plug-in": lambda root: (root / "site/mine-1.0.dist-info").rename(root / "site/mine-1.1.dist-info"),
     "another plug-in": lambda root: append(root, "site/mine-1.0.dist-info/entry_points.txt", "other = mine:Other\n"),
     "installed library": lambda root: (root / "site/numpy-9.9.dist-info").mkdir(),
@@ -61,6 +58,22 @@ def test_verdict_is_read_again(park, tmp_path):
     assert KeptVerdict(str(park)).read() == GOOD
     (tmp_path / "site" / "runs").mkdir()
     assert KeptVerdict(str(park)).read() == GOOD
+    for name in ("nowhere.toml", "a\0b", ".", "x" * 5000):  # no file
+        KeptVerdict(name).keep(GOOD)
+        assert KeptVerdict(name).read() is None
+
+
+def test_verdicts_of_changes_or_too_old_go(park, tmp_path):
+    for changed in ("site/mine/__init__.py", "lab/park.toml"):  # during the check
+        begun = KeptVerdict(str(park))
+        append(tmp_path, changed)
+        begun.keep(GOOD)
+    assert begun.read() is None
+    assert not (tmp_path / "cache").exists()
+    for seed in range(4):
+        KeptVerdict(str(park), [f"seed={seed}"]).keep(GOOD, most=3)
+    assert len(list((tmp_path / "cache" / "check").iterdir())) == 3
+    assert KeptVerdict(str(park), ["seed=2"]).read() == GOOD
 
 
 @pytest.mark.parametrize("what", mostly_slow(CHANGES, 4))
@@ -79,15 +92,6 @@ def test_options_and_code_have_verdicts_of_their_own(park, monkeypatch):
     assert KeptVerdict(str(park), ["seed=2"], ["event"]).read() is None
 
 
-def test_change_during_a_check_keeps_nothing(park, tmp_path):
-    for changed in ("site/mine/__init__.py", "lab/park.toml"):
-        begun = KeptVerdict(str(park))
-        append(tmp_path, changed)
-        begun.keep(GOOD)
-    assert begun.read() is None
-    assert not (tmp_path / "cache").exists()
-
-
 def test_uncovered_code_keeps_nothing(tmp_path, monkeypatch):
     monkeypatch.setenv("ZENPARK_CACHE_DIR", str(tmp_path))
     KeptVerdict("triangle").keep(GOOD)  # these tests are such code
@@ -100,7 +104,6 @@ def test_uncovered_code_keeps_nothing(tmp_path, monkeypatch):
         lambda file: file.write_bytes(file.read_bytes()[:-3]),
         lambda file: file.write_bytes(file.read_bytes().replace(b"A park", b"A bark")),
         lambda file: file.write_bytes(b"\xff" * 100),
-        lambda file: file.write_bytes(b""),
         lambda file: (file.unlink(), file.mkdir()),
         lambda file: file.parent.chmod(0o777),
     ],
@@ -122,27 +125,6 @@ def test_cache_that_cannot_be_written_is_none(park, tmp_path, monkeypatch):
     monkeypatch.setattr(Path, "home", lambda: (_ for _ in ()).throw(RuntimeError))
     KeptVerdict(str(park)).keep(GOOD)
     assert KeptVerdict(str(park)).read() is None
-
-
-@pytest.mark.parametrize("name", ["nowhere.toml", "a\0b", ".", "x" * 5000])
-def test_what_is_no_file_has_no_verdict(park, name):
-    KeptVerdict(name).keep(GOOD)
-    assert KeptVerdict(name).read() is None
-
-
-def test_old_verdicts_go(park, tmp_path):
-    for seed in range(4):
-        KeptVerdict(str(park), [f"seed={seed}"]).keep(GOOD, most=3)
-    assert len(list((tmp_path / "cache" / "check").iterdir())) == 3
-    assert KeptVerdict(str(park), ["seed=2"]).read() == GOOD
-
-
-@pytest.mark.slow
-def test_findings_and_figures_come_back_as_they_were(park):
-    given = document.read("triangle", ["duration_s=5.0"])
-    new = Verdict(str(given.path), given.experiment.title, *examine(given))
-    KeptVerdict(str(park)).keep(new)
-    assert KeptVerdict(str(park)).read() == new
 
 
 @pytest.mark.slow

@@ -33,6 +33,7 @@ from experiments.definition.graph import Links, links
 from experiments.definition.plan import Plan
 from experiments.file import document
 from tests.cases import examples
+from tests.experiments.check.test_stability import linked
 from tests.experiments.checked import PUBLISHED, findings
 from tests.experiments.traces import link_errors
 from tests.small import small
@@ -52,36 +53,25 @@ def test_published_shape_meets_the_published_distances(reference):
     assert np.abs(found[0].position - PUBLISHED).max() < 1e-4
 
 
-def test_two_leaders_stand_in_for_a_bar():
-    net = links([(2, 0), (2, 1)], [1.0, 1.0], [1.0, 1.0])
-    position = np.array([(0, 0, 0), (1, 0, 0), (0.5, math.sqrt(0.75), 0)])
-    assert formation_rigidity(position, net, np.array([0, 1]))[0].rigid
-    assert formation_rigidity(position, net, np.array([0]))[0].rank == 2
-
-
-def test_height_at_which_the_reference_closes(reference):
+def test_heights_and_lengths_that_make_no_triangle(reference):
     height = np.where(np.arange(7) < 4, 0.0, 0.81)
     found = conflicts(reference, height)
     assert [each.high for each in found] == [(4,), (5,)]
     assert [each.ceiling for each in found] == pytest.approx([math.sqrt(0.86**2 - 0.3**2)] * 2)
     assert conflicts(reference, np.where(np.arange(7) < 4, 0.0, 0.805)) == []
-
-
-def test_height_that_exceeds_the_distance():
-    net = links([(1, 0)], [0.5], [1.0])
-    (found,) = conflicts(net, np.array([0.2, 0.9]))
+    (found,) = conflicts(links([(1, 0)], [0.5], [1.0]), np.array([0.2, 0.9]))
     assert (found.rows, found.high) == ((0, 1), (1,))
     assert found.ceiling == pytest.approx(0.7)
-
-
-def test_three_distances_that_make_no_triangle():
-    net = links([(1, 0), (2, 1), (2, 0)], [1.0, 1.0, 2.5], [1.0] * 3)
-    (found,) = conflicts(net, np.zeros(3))
+    (found,) = conflicts(links([(1, 0), (2, 1), (2, 0)], [1.0, 1.0, 2.5], [1.0] * 3), np.zeros(3))
     assert found.rows == (0, 1, 2)
     assert math.isnan(found.ceiling)
 
 
-def test_connectivity_of_known_graphs():
+def test_rigidity_and_connectivity_of_known_graphs():
+    position = np.array([(0, 0, 0), (1, 0, 0), (0.5, math.sqrt(0.75), 0)])
+    net = links([(2, 0), (2, 1)], [1.0, 1.0], [1.0, 1.0])
+    assert formation_rigidity(position, net, np.array([0, 1]))[0].rigid  # two leaders stand in for a bar
+    assert formation_rigidity(position, net, np.array([0]))[0].rank == 2
     ring = links([(0, 1), (1, 2), (2, 3), (3, 0)], [1.0] * 4, [1.0] * 4)
     assert algebraic_connectivity(ring, 4) == pytest.approx(2.0)
     assert algebraic_connectivity(ring, 5) == pytest.approx(0.0)
@@ -94,9 +84,7 @@ def test_distances_of_a_drawing_are_met_again(seed, rows):
     rng = np.random.default_rng(seed)
     height = rng.choice([0.0, 0.5], rows)
     drawn = np.column_stack([rng.uniform(-1.0, 1.0, (rows, 2)), height])
-    pairs = [(i, j) for i in range(rows) for j in range(rows) if i != j]
-    distance = [float(np.linalg.norm(drawn[i] - drawn[j])) for i, j in pairs]
-    net = links(pairs, distance, [1.0] * len(pairs))
+    net = linked(drawn, [(i, j) for i in range(rows) for j in range(rows) if i != j])
     found = find_shapes(net, [unfold_distances(net, height)], np.ones(rows, dtype=bool))
     assert found[-1].worst < 1e-6
     assert conflicts(net, height) == []
@@ -106,7 +94,7 @@ def test_robots_on_the_wrong_side_are_named():
     rng = np.random.default_rng(0)
     shape = np.column_stack([rng.uniform(-1.0, 1.0, (5, 2)), np.zeros(5)])
     pairs = [(i, j) for i in range(5) for j in range(i)]
-    wanted = links(pairs, [float(np.linalg.norm(shape[i] - shape[j])) for i, j in pairs])
+    wanted = linked(shape, pairs)
     moves, held = np.arange(5) > 1, np.ones((5, 3), dtype=bool)
     held[:2], held[:, 2] = False, False
     turned = shape.copy()
@@ -120,7 +108,7 @@ def test_robots_on_the_wrong_side_are_named():
     assert found.place == pytest.approx(shape[4], abs=1e-3)
     assert mirrored_robots(wanted, shape, moves) == []
     robots = {f"K{k}": RobotTable(kind="khepera4", start=list(place[:2])) for k, place in enumerate(end.position)}
-    given = {f"K{i} - K{j}": float(np.linalg.norm(shape[i] - shape[j])) for i, j in pairs}
+    given = {f"K{i} - K{j}": d for (i, j), d in zip(pairs, wanted.distance.tolist(), strict=True)}
     made = small(robots, formation=Formation(links=given, leader=None), duration_s=5.0)
     motion = Prediction(np.array([0.0, 5.0]), np.stack([end.position] * 2), 10, 2.0)
     (finding,) = formation(Analysis(Plan(made), motion))

@@ -8,8 +8,6 @@ import pytest
 
 from agents.body.interface import Disturbance, Jitter
 from agents.body.limits import Safety
-from agents.kinds.crazyflie import CRAZYFLIE
-from agents.kinds.khepera4 import KHEPERA4
 from agents.kinds.turtlebot3 import TURTLEBOT3
 from agents.plugins.laws import Distance
 from agents.plugins.planners import Line
@@ -37,15 +35,9 @@ def test_part_of_the_leader(reference_plan):
     assert (made.clamp, made.tracking_gain, made.duration) == (0.1, 3.0, 45.0)
     assert (made.body_hz, made.pose_every, made.decide_every) == (100.0, 2, 10)
     assert made.patience_s is None
+    assert [reference_plan.assignment(name).ground for name in NAMES] == [0.0] * 4 + [0.8] * 3
     (leg,) = made.legs
     assert (leg.at, leg.planner) == (21.0, Line(move_by=[0.75, 0.0], speed_=0.15))
-
-
-def test_kinds_and_heights_of_all(reference_plan):
-    parts = [reference_plan.assignment(name) for name in NAMES]
-    assert [part.kind for part in parts] == [TURTLEBOT3] + [KHEPERA4] * 3 + [CRAZYFLIE] * 3
-    assert [part.ground for part in parts] == [0.0] * 4 + [0.8] * 3
-    assert [bool(part.legs) for part in parts] == [True] + [False] * 6
 
 
 def test_links_of_the_paper(reference_plan):
@@ -67,26 +59,11 @@ def test_links_of_the_paper(reference_plan):
     drones = {4, 5, 6}
     by_drone = [bool({i, j} & drones) for i, j in zip(net.receiver.tolist(), net.sender.tolist(), strict=True)]
     np.testing.assert_array_equal(net.gain, np.where(by_drone, 1.0, 3.0))
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_robot_knows_its_own_links(reference_plan, name):
-    whole, row = reference_plan.links, NAMES.index(name)
-    wanted = zip(whole.receiver.tolist(), whole.sender.tolist(), whole.distance.tolist(), strict=True)
-    made = reference_plan.assignment(name).neighbours
-    assert [(link.sender, link.distance) for link in made] == [(j, d) for i, j, d in wanted if i == row]
-    assert all(link.name == NAMES[link.sender] and link.in_law for link in made)
-
-
-def test_bodies_of_other_seeds_are_alike(reference_plan):
-    made, other = bodies.body_request(reference_plan, NAMES, 5), bodies.body_request(reference_plan, NAMES, 6)
-    assert made.names == NAMES
-    assert (made.seeds, other.seeds) == ((5,) * 7, (6,) * 7)
-    assert made.addresses == ("twin",) * 7
-    assert made.rate_hz == 100.0
-    assert made.start == other.start
-    assert (made.start[0], made.start[4]) == ((-0.6, 0.8, 0.0), (-0.2, 0.4, 0.0))
-    assert made.disturbance == other.disturbance
+    for row, name in enumerate(NAMES):
+        known = reference_plan.assignment(name).neighbours
+        assert [link.sender for link in known] == net.sender[net.receiver == row].tolist()
+        assert [link.distance for link in known] == net.distance[net.receiver == row].tolist()
+        assert all(link.name == NAMES[link.sender] and link.in_law for link in known)
 
 
 def three(**parts):
@@ -98,10 +75,12 @@ def three(**parts):
     return Plan(small(robots, **parts))
 
 
-def test_starts_are_on_the_floor_with_a_yaw():
-    positions, yaws = three().start_poses()
-    assert positions == [(0.5, -0.5, 0.0), (0.0, 0.25, 0.0), (-0.5, 0.0, 0.0)]
-    assert yaws == [1.5, 0.0, 0.0]
+def test_bodies_start_on_the_floor_with_a_yaw(reference_plan):
+    made = bodies.body_request(reference_plan, NAMES, 5)
+    assert (made.names, made.seeds, made.addresses) == (NAMES, (5,) * 7, ("twin",) * 7)
+    assert made.rate_hz == 100.0
+    assert (made.start[0], made.start[4]) == ((-0.6, 0.8, 0.0), (-0.2, 0.4, 0.0))
+    assert three().start_poses() == ([(0.5, -0.5, 0.0), (0.0, 0.25, 0.0), (-0.5, 0.0, 0.0)], [1.5, 0.0, 0.0])
 
 
 def test_limits_are_arena_and_safety_of_the_file():

@@ -50,14 +50,6 @@ def test_graph_is_that_of_networkx(made, data):
     assert set(np.flatnonzero(found).tolist()) == told
 
 
-def test_reference_network():
-    assert (len(REFERENCE), len(edges(REFERENCE))) == (21, 12)
-    assert components(REFERENCE, 7) == 1
-    np.testing.assert_array_equal(np.diag(degree(REFERENCE, 7)), [0, 4, 3, 4, 4, 4, 2])
-    assert reachable(REFERENCE, 7, np.array([0])).all()
-    assert np.flatnonzero(~reachable(REFERENCE, 7, np.array([6]))).tolist() == [0]
-
-
 def test_links_take_pairs_with_or_without_targets():
     path = links([(1, 0), (0, 1), (2, 1), (1, 2)])
     assert laplacian(path, 3).tolist() == [[1, -1, 0], [-1, 2, -1], [0, -1, 1]]
@@ -68,9 +60,6 @@ def test_links_take_pairs_with_or_without_targets():
     assert (len(nothing), len(edges(nothing)), components(nothing, 4)) == (0, 0, 4)
 
 
-# ---------------------------------------------------------------- rigidity
-
-
 def held_heights(rows):
     moves = np.ones((rows, 3), dtype=bool)
     moves[:, 2] = False
@@ -79,6 +68,8 @@ def held_heights(rows):
 
 def test_reference_formation_is_rigid_only_with_heights_held():
     pairs = edges(REFERENCE)
+    assert (len(REFERENCE), len(pairs)) == (21, 12)
+    assert np.flatnonzero(~reachable(REFERENCE, 7, np.array([6]))).tolist() == [0]
     held, free = rigidity(PUBLISHED, pairs, held_heights(7)), rigidity(PUBLISHED, pairs)
     assert (held.rank, held.needed, held.rigid) == (2 * 7 - 3, 11, True)
     assert (free.rank, free.needed, free.rigid) == (12, 3 * 7 - 6, False)
@@ -96,36 +87,6 @@ def test_rigidity_rows_are_half_gradients_of_squared_lengths():
 
     slope = (squared(1e-6) - squared(-1e-6)) / 2e-6
     np.testing.assert_allclose(rigidity_matrix(PUBLISHED, pairs) @ motion.ravel(), 0.5 * slope, atol=1e-9)
-
-
-def triangulation(rng, rows, dimension):
-    """A triangle (tetrahedron), then each further point joined to `dimension` points known already: 2n − 3 (3n − 6)."""
-    pairs = list(combinations(range(dimension + 1), 2))
-    for new in range(dimension + 1, rows):
-        pairs += [(int(old), new) for old in rng.choice(new, dimension, replace=False)]
-    return np.array(pairs, dtype=np.intp)
-
-
-@examples(30)
-@given(st.integers(0, 2**32 - 1), st.integers(4, 12), st.sampled_from([2, 3]))
-def test_triangulation_is_rigid_only_with_all_edges(seed, rows, dimension):
-    rng = np.random.default_rng(seed)
-    position = rng.uniform(-1, 1, (rows, 3))
-    moves = None
-    if dimension == 2:
-        position[:, 2] = rng.choice([0.0, 0.8], rows)  # at heights that are held: plane rigidity all the same
-        moves = held_heights(rows)
-    pairs = triangulation(rng, rows, dimension)
-    whole = rigidity(position, pairs, moves)
-    wanted = 2 * rows - 3 if dimension == 2 else 3 * rows - 6
-    assert len(pairs) == wanted == whole.needed
-    if whole.smallest < 1e-6:
-        return  # four points that lie in a plane but for the rounding
-    assert whole.rigid
-    assert whole.rank == wanted
-    missing = rigidity(position, np.delete(pairs, rng.integers(len(pairs)), axis=0), moves)
-    assert not missing.rigid
-    assert (missing.rank, missing.smallest) == (wanted - 1, 0.0)
 
 
 def rigid_motions(position, free):
@@ -201,7 +162,6 @@ def test_redundancy_is_that_of_leaving_each_out(seed, rows, share, in_space):
 @pytest.mark.parametrize(
     ("rows", "linked", "links_spare", "robots_spare"),
     [
-        (1, [], [], None),
         (2, [(0, 1)], [False], None),
         (3, [(0, 1), (0, 2), (1, 2)], [False] * 3, [True] * 3),  # two that are linked are rigid
         (4, list(combinations(range(4), 2)), [True] * 6, [True] * 4),

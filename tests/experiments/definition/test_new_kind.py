@@ -16,16 +16,11 @@ from experiments.file.problems import DocumentError
 from experiments.report import style, trajectories
 
 KIND = "alphabot"
-ROVERS = (
-    'title = "Rovers"\nduration_s = 2.0\n[arena]\nsize = [12.0, 4.0, 2.0]\n'
-    + "".join(
-        f'[robots.R{k}]\nkind = "{KIND}"\nstart = [{k - 5}.0, 0.0]\n' for k in range(style.MAX_COLOURED_ROBOTS + 1)
-    )
-    + "[formation.links]\n"
-    + "".join(f'"R{k} > R{k + 1}" = 1.0\n' for k in range(style.MAX_COLOURED_ROBOTS))
-)
-
-
+COUNT = style.MAX_COLOURED_ROBOTS
+ROBOTS = [f'[robots.R{k}]\nkind = "{KIND}"\nstart = [{k - 5}.0, 0.0]\n' for k in range(COUNT + 1)]
+LINKS = [f'"R{k} > R{k + 1}" = 1.0\n' for k in range(COUNT)]
+HEAD = 'title = "Rovers"\nduration_s = 2.0\n[arena]\nsize = [12.0, 4.0, 2.0]\n'
+ROVERS = "".join([HEAD, *ROBOTS, "[formation.links]\n", *LINKS])
 ALPHABOT = Kind(
     KIND, "twist", flies=False, radius=0.11, height=0.08, mass=0.8, endurance_s=3600.0, speed=0.3, turn_rate=2.0,
     response=1.0, turn_response=1.5,
@@ -33,30 +28,14 @@ ALPHABOT = Kind(
 MOVING = replace(ALPHABOT, motion=KINDS["khepera4"].motion)
 
 
-@pytest.fixture(autouse=True)
-def new_kind(monkeypatch):
-    monkeypatch.setitem(KINDS.loaded, KIND, ALPHABOT)
-
-
-def test_kind_without_twin_is_refused_at_its_place():
+@pytest.mark.parametrize(("motion", "takes"), [(None, "twist"), (KINDS["khepera4"].motion, "velocity")])
+def test_kind_without_twin_is_refused_at_its_place(monkeypatch, motion, takes):
+    """Without a motion model, or on the floor with velocities: an omnidirectional robot."""
+    monkeypatch.setitem(KINDS.loaded, KIND, replace(ALPHABOT, motion=motion, takes=takes))
     with pytest.raises(DocumentError) as caught:
         loads(ROVERS)
     first = caught.value.problems[0]
     assert (first.line, first.message) == (6, f"no twin of '{KIND}'")
-    assert "give the kind a `motion`" in first.hint
-
-
-def test_kind_without_motion_model_is_refused_too(monkeypatch):
-    """On the floor with velocities, not with a twist: an omnidirectional robot."""
-    monkeypatch.setitem(KINDS.loaded, KIND, MOVING)
-    assert loads(ROVERS)
-    monkeypatch.setitem(KINDS.loaded, KIND, replace(MOVING, takes="velocity"))
-    with pytest.raises(DocumentError) as caught:
-        loads(ROVERS)
-    assert caught.value.problems[0].line == 6
-
-
-def test_unknown_setpoint_is_refused_with_the_known_ones():
     with pytest.raises(ValueError, match="it must be one of position, velocity, twist"):
         replace(MOVING, takes="wheels")
 
