@@ -1,9 +1,6 @@
 """Drives a target: counts what is refused, keeps what escapes, and what takes too long or too much memory."""
 
-from __future__ import annotations
-
 import hashlib
-import mmap
 import resource
 import time
 import traceback
@@ -13,7 +10,6 @@ from pathlib import Path
 
 from tests.fuzz import targets_devices, targets_drones, targets_files, targets_network, targets_ros
 from tests.fuzz.mutate import Mutator
-from tests.fuzz.target import Place, Target
 
 SLOW_S = 1.0  # CPU time that no input of 64 kB may take
 HUGE_KB = 100 * 1024  # by which no input may make the process larger
@@ -41,19 +37,19 @@ class Tally:
     slowest: tuple[float, int] = (0.0, 0)
     taken: float = 0.0
 
-    def keep(self, way: str, data: bytes, text: str) -> None:
+    def keep(self, way, data, text):
         """Add a failure."""
         self.escaped[way] += 1
         self.kept.setdefault(way, (data, text))
 
-    def add(self, other: Tally) -> None:
+    def add(self, other):
         """Add the results of further inputs."""
         self.inputs, self.refused = self.inputs + other.inputs, self.refused + other.refused
         self.escaped, self.kept = self.escaped + other.escaped, other.kept | self.kept
         self.slowest, self.taken = max(self.slowest, other.slowest), self.taken + other.taken
 
 
-def drive(target: Target, inputs: int, seed: object, *, slot: mmap.mmap | None = None, bombs: bool = False) -> Tally:
+def drive(target, inputs, seed, *, slot=None, bombs=False):
     """Results of spoilt inputs.
 
     Args:
@@ -88,7 +84,7 @@ def drive(target: Target, inputs: int, seed: object, *, slot: mmap.mmap | None =
     return tally
 
 
-def way_of(error: Exception) -> str:
+def way_of(error):
     """Where and how it failed: the last line of ours, not of the tests."""
     frames = traceback.extract_tb(error.__traceback__)
     ours = [frame for frame in frames if "site-packages" not in frame.filename and "/lib/python" not in frame.filename]
@@ -96,7 +92,7 @@ def way_of(error: Exception) -> str:
     return f"{type(error).__name__} in {Path(inner[-1].filename).name}:{inner[-1].lineno}"
 
 
-def save(folder: Path, name: str, data: bytes, text: str) -> Path:
+def save(folder, name, data, text):
     """Keeps an input, and what it ended in beside it."""
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / f"{name}--{hashlib.sha256(data + text.encode('utf-8', 'replace')[-200:]).hexdigest()[:12]}.bin"
@@ -105,7 +101,7 @@ def save(folder: Path, name: str, data: bytes, text: str) -> Path:
     return file
 
 
-def replay(place: Place, data: bytes) -> str:
+def replay(place, data):
     """Result of one input: "read", or the reason of the refusal; raises any other error."""
     with place.open() as target:
         try:

@@ -1,7 +1,5 @@
 """Good messages of every kind, in both encodings, for the mutator to spoil."""
 
-from __future__ import annotations
-
 import time
 
 from agents.network import messages
@@ -10,7 +8,7 @@ from agents.network.keys import Keys
 KEYS = Keys()
 
 
-def good(robot: str, seq: int = 1, ahead: float = 0.0) -> dict[str, list[object]]:
+def good(robot, seq=1, ahead=0.0):
     """By the name of its key what a robot says, with stamps so far ahead of now [s]."""
     now = time.time() + ahead
     place, rest = (-0.5, -0.4, 0.0), (0.0, 0.0, 0.0)
@@ -54,7 +52,7 @@ def good(robot: str, seq: int = 1, ahead: float = 0.0) -> dict[str, list[object]
     }  # fmt: skip
 
 
-def of_all() -> dict[str, list[object]]:
+def of_all():
     """By key what is nobody's."""
     now = time.time()
     world = messages.WorldState(
@@ -88,15 +86,15 @@ def of_all() -> dict[str, list[object]]:
     }
 
 
-def sent(key: str, message: object) -> list[bytes]:
+def sent(key, message):
     """A message as `network.Net.deliver` takes it, in both encodings."""
     return [
-        b"\0".join([key.encode(), messages.MIME[encoding].encode(), messages.encode(message, encoding)])  # type: ignore[arg-type]
+        b"\0".join([key.encode(), messages.MIME[encoding].encode(), messages.encode(message, encoding)])
         for encoding in ("json", "msgpack")
     ]
 
 
-def everything(*robots: str, only: tuple[str, ...] = ()) -> list[bytes]:
+def everything(*robots, only=()):
     """All messages of these robots, and those that are nobody's; or only those of some kinds."""
     found = []
     for number, robot in enumerate(robots):

@@ -1,13 +1,9 @@
 """Spoils good examples: pieces of their bytes, and values of what they hold. Fast, and the same for a seed."""
 
-from __future__ import annotations
-
 import json
 import re
 import struct
-from collections.abc import Sequence
 from random import Random
-from typing import Any
 
 import msgspec
 
@@ -24,7 +20,7 @@ TOKENS = [
     *(b"\xf0\x9f\xa4\x96", b"\xe2\x80\xa8", b"\xef\xbb\xbf", b"\0", b"\n", b"\r\n", b" "),
 ]
 LONG = [*b'[ { {"a": ( \x91 \xdd\xff\xff\xff\xff a. A 9 \x00 \xff \xc3\xa9 / a,'.split(b" "), b"- ", b"  "]
-VALUES: list[Any] = [
+VALUES = [
     *(None, True, False, 0, 1, -1, 2**31, 2**53, 2**53 + 1, 2**63 - 1, -(2**63), 2**64 - 1, 0.0, -0.0, 0.5, 1e-320),
     *(1e6, 1e16, 1e300, -1e300, float("nan"), float("inf"), float("-inf"), "", "x", "\0", "KH01", "KH02", "/", "*"),
     *("é", "a" * 300, "\x1b[31m", [], [[]], {}, {"": None}, [0.0] * 2, [0.0] * 3, [1e300] * 3, [float("nan")] * 3),
@@ -39,14 +35,14 @@ FRACTIONS = [0.0, -0.0, 1e-320, 1e30, -1e30, float("nan"), float("inf"), float("
 class Mutator:
     """Spoilt inputs, made from good ones."""
 
-    def __init__(self, examples: Sequence[bytes], seed: object) -> None:
+    def __init__(self, examples, seed):
         self._random = Random(str(seed))
         self._examples = list(examples)
         printed = sum(byte in range(32, 127) or byte in b"\n\r\t" for example in examples for byte in example[:400])
         self._binary = printed < 0.9 * sum(len(example[:400]) for example in examples)
         self._trees = [tree for example in examples if (tree := parsed(example)) is not None]
 
-    def spoilt(self) -> bytes:
+    def spoilt(self):
         """The next input: now and then a good example as it is."""
         roll = self._random.randrange(64)
         if roll < 2:
@@ -62,13 +58,13 @@ class Mutator:
             made *= LARGEST // len(made) + 1
         return made[:LARGEST]
 
-    def _one(self, among: Sequence[Any]) -> Any:
+    def _one(self, among):
         return among[int(self._random.random() * len(among))]
 
-    def _noise(self, most: int) -> bytes:
+    def _noise(self, most):
         return self._random.randbytes(self._random.randrange(most))
 
-    def _edited(self, data: bytes) -> bytes:
+    def _edited(self, data):
         """Another piece where one was; numbers as machines write them are for binary examples above all."""
         begin, end = self._span(data)
         match self._random.choice((*range(10), *[6] * 4 * self._binary)):
@@ -97,13 +93,13 @@ class Mutator:
                 piece = other[slice(*self._span(other))]
         return data[:begin] + piece + data[end:]
 
-    def _span(self, data: bytes) -> tuple[int, int]:
+    def _span(self, data):
         """Begin and end of a number, a word, a line, or any few bytes."""
         begin = self._random.randrange(len(data) + 1)
         found = None if self._binary or self._random.randrange(2) else self._one(PLACES).search(data, begin)
         return found.span() if found else (begin, begin + self._random.randrange(self._one([1, 2, 9, 65])))
 
-    def _regrown(self) -> bytes:
+    def _regrown(self):
         """A well-formed message in which some values are other ones, or belong elsewhere."""
         head, packed, tree = self._one(self._trees)
         for _ in range(self._random.randint(1, 3)):
@@ -113,7 +109,7 @@ class Mutator:
         except (OverflowError, msgspec.MsgspecError, ValueError):
             return head + b"{}"
 
-    def _changed(self, tree: Any) -> Any:
+    def _changed(self, tree):
         """The tree with one value changed, somewhere in it."""
         if isinstance(tree, dict | list) and tree and self._random.randrange(10):
             items = dict(tree) if isinstance(tree, dict) else dict(enumerate(tree))
@@ -133,7 +129,7 @@ class Mutator:
         return self._one(VALUES)
 
 
-def parsed(example: bytes) -> tuple[bytes, bool, Any] | None:
+def parsed(example):
     """Head, whether MessagePack, and tree of an example with JSON or MessagePack behind its last, or a, zero byte."""
     heads = [example.rfind(b"\0") + 1, *(k + 1 for k, byte in enumerate(example[:60]) if byte == 0), 0]
     for at, packed in [(heads[0], False), (0, False), *((at, True) for at in heads[1:])]:
@@ -146,6 +142,6 @@ def parsed(example: bytes) -> tuple[bytes, bool, Any] | None:
     return None
 
 
-def text(tree: object) -> bytes:
+def text(tree):
     """JSON, with NaN and Infinity, which msgspec does not write."""
     return json.dumps(tree, ensure_ascii=False, default=str).encode("utf-8", "surrogatepass")

@@ -4,8 +4,6 @@ Each target runs in a process of its own, so that a crash, a hang or a thirst fo
 last is then known all the same. `--replay FILE` tries one kept input again.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import faulthandler
@@ -16,8 +14,6 @@ import sys
 import tempfile
 import time
 import warnings
-from collections.abc import Sequence
-from multiprocessing.connection import Connection
 from pathlib import Path
 
 from tests.fuzz.fuzz import PLACES, Tally, drive, replay, save
@@ -29,7 +25,7 @@ HANG_S = 60.0  # without news of a block a target hangs
 ROOM = 4 << 30  # [bytes] a target may map
 
 
-def run(name: str, inputs: int, seed: int, slot_file: str, news: Connection) -> None:
+def run(name, inputs, seed, slot_file, news):
     """The process of one target."""
     faulthandler.enable()
     warnings.simplefilter("error")
@@ -45,7 +41,7 @@ def run(name: str, inputs: int, seed: int, slot_file: str, news: Connection) -> 
             news.send(drive(target, block, (seed, name, begin), slot=slot, bombs=begin > 0))
 
 
-def fuzz(name: str, inputs: int, seed: int) -> Tally:
+def fuzz(name, inputs, seed):
     """Drives one target in a process of its own."""
     whole, begun = Tally(), time.monotonic()
     context = multiprocessing.get_context("spawn")
@@ -74,7 +70,7 @@ def fuzz(name: str, inputs: int, seed: int) -> Tally:
     return whole
 
 
-def line(name: str, tally: Tally, inputs: int) -> str:
+def line(name, tally, inputs):
     each = 1e6 * tally.taken / max(1, tally.inputs)
     return (
         f"{name:<18} {tally.inputs:>7} of {inputs:>7} inputs, {tally.refused:>7} refused, "
@@ -82,7 +78,7 @@ def line(name: str, tally: Tally, inputs: int) -> str:
     )
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(arguments=None):
     """The command line."""
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
     parser.add_argument("--inputs", type=int, default=MILLION, metavar="N", help="in all, shared out by the table")

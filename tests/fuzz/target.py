@@ -1,7 +1,5 @@
 """Targets: places where bytes from outside are read, made ready, with sockets for those that need one."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
@@ -50,16 +48,15 @@ class Renewed:
     It is a generator that is sent an input at each `yield`; its end, by an error too, is its `finally`.
     """
 
-    def __init__(self, make: Callable[[], Inputs], every: int) -> None:
+    def __init__(self, make, every):
         self._make, self._every, self._left = make, every, 0
-        self._made: Inputs | None = None
+        self._made = None
 
-    def __call__(self, data: bytes) -> None:
+    def __call__(self, data):
         if not self._left:
             self.close()
             self._made, self._left = self._make(), self._every
             next(self._made)
-        assert self._made is not None
         self._left -= 1
         try:
             self._made.send(data)
@@ -69,7 +66,7 @@ class Renewed:
             self._left = 0  # it has ended, half-way through something
             raise
 
-    def close(self) -> None:
+    def close(self):
         if self._made is not None:
             self._made.close()
 
@@ -77,30 +74,30 @@ class Renewed:
 class Wire:
     """A socket without a network, fed by hand."""
 
-    def __init__(self) -> None:
-        self.waiting: deque[bytes] = deque()
+    def __init__(self):
+        self.waiting = deque()
 
-    def recvfrom(self, most: int) -> tuple[bytes, tuple[str, int]]:
+    def recvfrom(self, most):
         if not self.waiting:
             raise BlockingIOError
         return self.waiting.popleft()[:most], ("127.0.0.1", 9)
 
-    def recv(self, most: int) -> bytes:
+    def recv(self, most):
         return self.recvfrom(most)[0]
 
-    def sendto(self, packet: bytes, _to: object = None) -> int:
+    def sendto(self, packet, _to=None):
         assert isinstance(packet, bytes | bytearray)
         return len(packet)
 
     send = sendto
 
-    def close(self) -> None:
+    def close(self):
         pass
 
-    def setsockopt(self, *_: object) -> None:
+    def setsockopt(self, *_):
         pass
 
     setblocking = setsockopt
 
-    def getsockname(self) -> tuple[str, int]:
+    def getsockname(self):
         return "127.0.0.1", 1

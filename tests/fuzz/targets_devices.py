@@ -1,12 +1,8 @@
 """Bytes from and to Khepera IV robots and a Vicon."""
 
-from __future__ import annotations
-
 from collections import deque
-from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from itertools import count
-from typing import Any
 
 import numpy as np
 
@@ -16,16 +12,14 @@ from bridges.khepera4.drivers import KTeam, RoboticParkServer, identify
 from bridges.khepera4.odometry import Odometer
 from bridges.vicon.client import Decoder
 from bridges.vicon.publisher import PoseFilter
-from tests.fuzz.target import Inputs, Place, Renewed, Target, Wire
+from tests.fuzz.target import Place, Renewed, Target, Wire
 from tests.requests import request
 from twins.devices.device import DeviceRequest, Faults
 from twins.devices.khepera4 import KheperaDevice
 from twins.devices.vicon import ViconTwin, _Client
 
-# ---------------------------------------------------------------------- the Khepera IV
 
-
-def khepera_twin() -> Iterator[Target]:
+def khepera_twin():
     """Every server: the first byte says which."""
     park = ["d 10.0 0.5", "stop", "p", "t", "get_data", "g 1.0 0.5", "i 0.1 0.2 0.3", "d -81.0 -7"]
     kteam = ["B", "D,100,-100", "R", "G", "N", "O", "V,5", "U,31", "I", "E", "S", "T", "M,1,2", "K", "H", "J"]
@@ -33,9 +27,9 @@ def khepera_twin() -> Iterator[Target]:
     examples = [letter.encode() + word.encode() for word in park for letter in "pqrst"]
     examples += [b"k" + "\r".join([word, "R", ""]).encode() for word in kteam]
 
-    def make() -> Inputs:
+    def make():
         with ExitStack() as stack:
-            devices: dict[str, Any] = {}
+            devices = {}
             for letter, server in letters.items():
                 made = DeviceRequest(request("khepera4", "khepera4-twin", device={"server": server}), Faults())
                 devices[letter] = stack.enter_context(closing(KheperaDevice(made)))
@@ -57,20 +51,20 @@ def khepera_twin() -> Iterator[Target]:
         yield Target(examples, take)
 
 
-def khepera_bridge() -> Iterator[Target]:
+def khepera_bridge():
     """Answers of all servers to everything that the link asks, apart by zero bytes."""
 
     class Line:
-        def __init__(self, parts: list[bytes]) -> None:
+        def __init__(self, parts):
             self.parts = deque(parts)
 
-        def send(self, data: bytes) -> None:
+        def send(self, data):
             assert data
 
-        def pending(self) -> bytes:
+        def pending(self):
             return b""
 
-        def receive(self, _until: float) -> bytes:
+        def receive(self, _until):
             if not self.parts:
                 raise TimeoutError
             return self.parts.popleft()[:1024]
@@ -84,15 +78,15 @@ def khepera_bridge() -> Iterator[Target]:
     )]  # fmt: skip
     named = {b"p": "2023-01-07", b"q": "2023-01-15", b"t": "fork"}
 
-    def take(data: bytes) -> None:
+    def take(data):
         which, *parts = data.split(b"\0")
-        line: Any = Line(parts)
+        line = Line(parts)
         odometer = Odometer(0.0, 0.0, 0.0)
         driver: RoboticParkServer | KTeam
         if which[:1] == b"k":
             driver = KTeam(line, khepera4.Khepera4Settings())
         else:
-            gap, khepera4.GAP_S = khepera4.GAP_S, 0.0  # type: ignore[misc]  # without the pauses
+            gap, khepera4.GAP_S = khepera4.GAP_S, 0.0  # without the pauses
             try:
                 driver = identify(line, khepera4.Khepera4Settings(), named.get(which[:1]))
                 driver.begin()
@@ -100,7 +94,7 @@ def khepera_bridge() -> Iterator[Target]:
                 driver.move(odometer)
                 driver.drive(-0.1, 0.2)
             finally:
-                khepera4.GAP_S = gap  # type: ignore[misc]
+                khepera4.GAP_S = gap
         if isinstance(driver, KTeam):
             driver.begin()
             driver.drive(0.1, 0.2)
@@ -113,10 +107,7 @@ def khepera_bridge() -> Iterator[Target]:
     yield Target(examples, take, (OSError,))
 
 
-# ---------------------------------------------------------------------- the Vicon
-
-
-def _vicon_stream() -> list[bytes]:
+def _vicon_stream():
     names = b"".join([vicon_datastream.pack_stream_info(100.0), vicon_datastream.pack_axes(), *(
         vicon_datastream.pack_subject(k, name) for k, name in enumerate(("cf1", "kh1")))])  # fmt: skip
     eye = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
@@ -137,10 +128,10 @@ def _vicon_stream() -> list[bytes]:
     ]  # fmt: skip
 
 
-def vicon_bridge() -> Iterator[Target]:
+def vicon_bridge():
     """Output of a DataStream server, in chunks."""
 
-    def make() -> Inputs:
+    def make():
         decoder, pose_filter = Decoder(), PoseFilter({"CF01": "cf1", "KH01": "kh1"}, lambda _: None)
         for k in count(1):
             data = yield
@@ -158,17 +149,17 @@ def vicon_bridge() -> Iterator[Target]:
     yield Target(_vicon_stream(), Renewed(make, 300), (vicon_datastream.MalformedBlock,))
 
 
-def vicon_twin() -> Iterator[Target]:
+def vicon_twin():
     """Requests of a client to the server."""
     ask = vicon_datastream.packet(vicon_datastream.block(BlockKind.REQUEST_FRAME, b"\1"))
     one = vicon_datastream.packet(vicon_datastream.block(BlockKind.REQUEST_NEXT_FRAME))
     vicon = ViconTwin(["cf1", "kh1"])
     t = 0.0
 
-    def take(data: bytes) -> None:
+    def take(data):
         nonlocal t
         t += 0.01
-        wire: Any = Wire()
+        wire = Wire()
         vicon.clients = {wire: _Client()}
         wire.waiting += [data[:3000], data[3000:]] if len(data) > 3000 else [data]
         while wire.waiting and wire in vicon.clients:

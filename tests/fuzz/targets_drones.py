@@ -1,16 +1,12 @@
 """Bytes from and to Crazyflies and Tellos."""
 
-from __future__ import annotations
-
 import importlib.util
 import socket
 import struct
 import sys
 import types
-from collections.abc import Iterator
 from contextlib import closing
 from itertools import count
-from typing import Any
 
 import numpy as np
 
@@ -19,19 +15,17 @@ from agents.protocols import crtp
 from agents.protocols.crtp import HighLevel, Log, Misc, Port, Setpoint, SupervisorCommand
 from agents.protocols.tello import TelloSettings
 from bridges.tello.pilot import TelloPilot
-from tests.fuzz.target import Inputs, Place, Renewed, Target, Wire
+from tests.fuzz.target import Place, Renewed, Target, Wire
 from tests.requests import request
 from twins.devices.crazyflie.device import CrazyflieTwin
 from twins.devices.device import DeviceRequest, Faults
 from twins.devices.tello import TelloDevice
 
-# ---------------------------------------------------------------------- the Crazyflie
 
-
-def crazyflie_twin() -> Iterator[Target]:
+def crazyflie_twin():
     """CRTP packets, one or more behind each other (length, bytes), in the air and on the ground."""
 
-    def packet(port: Port, channel: int, data: bytes) -> bytes:
+    def packet(port, channel, data):
         return bytes((1 + len(data), crtp.header(port, channel))) + data
 
     climb = crtp.CLIMB.pack(0.5, 0.0, True, 1.0)
@@ -76,13 +70,13 @@ def crazyflie_twin() -> Iterator[Target]:
         packet(Port.SUPERVISOR, 0, b"\x0c"),
     ]  # fmt: skip
 
-    def make() -> Inputs:
+    def make():
         asked = DeviceRequest(request("crazyflie", "crazyflie-twin"), Faults())
         with closing(CrazyflieTwin(asked)) as device:
             line, wire = device.lines[0], Wire()
             own = line.socket
             line.socket.close()
-            line.socket = wire  # type: ignore[assignment]
+            line.socket = wire
             for k in count():
                 data, at = (yield), 0
                 while at < len(data) and len(wire.waiting) < 40:
@@ -98,10 +92,7 @@ def crazyflie_twin() -> Iterator[Target]:
         yield Target(examples, take)
 
 
-# ---------------------------------------------------------------------- the Tello
-
-
-def tello_twin() -> Iterator[Target]:
+def tello_twin():
     """Words over UDP, datagrams apart by zero bytes."""
     words = [
         "command", "takeoff", "land", "emergency", "stop", "rc 10 -20 30 40", "rc 100 100 100 100", "up 50", "back 100",
@@ -111,7 +102,7 @@ def tello_twin() -> Iterator[Target]:
     ]  # fmt: skip
     examples = [b"command", *(f"command\0takeoff\0\0{word}".encode() for word in words)]
 
-    def make() -> Inputs:
+    def make():
         with socket.socket(type=socket.SOCK_DGRAM) as client:
             client.bind(("127.0.0.1", 0))
             made = DeviceRequest(request("tello", "tello-twin"), Faults())
@@ -135,25 +126,25 @@ def tello_twin() -> Iterator[Target]:
 class Drone:
     """State of a drone, parsed by djitellopy itself."""
 
-    def __init__(self) -> None:
-        self.state: dict[str, Any] = {}
-        self.responses: list[bytes] = []
+    def __init__(self):
+        self.state = {}
+        self.responses = []
 
-    def send_command_without_return(self, command: str) -> None:
+    def send_command_without_return(self, command):
         word, *sticks = command.split()
         assert word != "rc" or [-100 <= int(stick) <= 100 for stick in sticks] == [True] * 4
 
-    def get_current_state(self) -> dict[str, Any]:
+    def get_current_state(self):
         return self.state
 
-    def get_own_udp_object(self) -> dict[str, Any]:
+    def get_own_udp_object(self):
         return {"responses": self.responses, "state": self.state}
 
-    def end(self) -> None:
+    def end(self):
         pass
 
 
-def tello_pilot() -> Iterator[Target]:
+def tello_pilot():
     """A drone's state lines and answers: state and answer with a zero byte between them."""
     if "av" not in sys.modules and importlib.util.find_spec("av") is None:
         sys.modules["av"] = types.ModuleType("av")  # only its video would need it, see `bridges.tello.library`
@@ -170,7 +161,7 @@ def tello_pilot() -> Iterator[Target]:
         for answer in (b"ok", b"error", b"out of range", b"unknown command: x", b"error Auto land")
     ]
 
-    def make() -> Inputs:
+    def make():
         drone = Drone()
         pilot = TelloPilot(drone, KINDS["tello"], TelloSettings())
         pilot.position = (0.0, 0.0, 0.5)

@@ -1,7 +1,5 @@
 """Files and what stands on command lines: experiments, their changes, imports, recordings, sweeps, addresses."""
 
-from __future__ import annotations
-
 import argparse
 import hashlib
 import io
@@ -12,11 +10,9 @@ import tempfile
 import time
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import msgspec
 from mcap.writer import CompressionType, Writer
@@ -57,17 +53,17 @@ MALFORMED = Path(__file__).parents[1] / "experiments" / "file" / "malformed"
 
 
 @contextmanager
-def place_for(name: str) -> Iterator[Path]:
+def place_for(name):
     """A file of that name in a folder of its own, in memory where there is such a place."""
     memory = Path("/dev/shm")
     with tempfile.TemporaryDirectory(dir=memory if memory.is_dir() else None) as folder:
         yield Path(folder) / name
 
 
-def refusing_well(take: Callable[[bytes], None]) -> Callable[[bytes], None]:
+def refusing_well(take):
     """A refusal has a text that can be printed."""
 
-    def checked(data: bytes) -> None:
+    def checked(data):
         try:
             take(data)
         except DocumentError as error:
@@ -79,21 +75,21 @@ def refusing_well(take: Callable[[bytes], None]) -> Callable[[bytes], None]:
     return checked
 
 
-def experiment(suffix: str, examples: list[bytes]) -> Iterator[Target]:
+def experiment(suffix, examples):
     """An experiment file; what is read can be written and read again."""
     with place_for(f"some{suffix}") as file:
         for arena in index.FOLDER.glob("*.arena.toml"):
             (file.parent / arena.name).write_bytes(arena.read_bytes())
 
         @refusing_well
-        def take(data: bytes) -> None:
+        def take(data):
             file.write_bytes(data)
             assert all(write_json(case) for case in document.read(file).cases().values())
 
         yield Target(examples, take, (DocumentError,))
 
 
-def toml() -> Iterator[Target]:
+def toml():
     """The catalogue, and every malformed file of the tests."""
     files = [*sorted(index.FOLDER.glob("*.toml")), *sorted(MALFORMED.glob("*.toml"))]
     small = (
@@ -103,20 +99,20 @@ def toml() -> Iterator[Target]:
     yield from experiment(".toml", [small] * max(1, len(files) // 5) + [file.read_bytes() for file in files])
 
 
-def resolved() -> Iterator[Target]:
+def resolved():
     """Cases as the processes are told them."""
     names = ("triangle", "convoy", "obstacle-course")
     yield from experiment(".json", [write_json(document.read(name).plan) for name in names])
 
 
-def arena() -> Iterator[Target]:
+def arena():
     """An arena file beside an experiment."""
     text = '[robots.K]\nkind = "khepera4"\nstart = [0, 0]\n[arena]\nfile = "a.arena.toml"\n'
     with place_for("some.toml") as file:
         file.write_text(f'title = "x"\nduration_s = 1.0\n{text}')
 
         @refusing_well
-        def take(data: bytes) -> None:
+        def take(data):
             (file.parent / "a.arena.toml").write_bytes(data)
             document.read(file)
 
@@ -124,7 +120,7 @@ def arena() -> Iterator[Target]:
         yield Target([*examples, b"[arena]\nsize = [4, 4, 2]\n"], take, (DocumentError,))
 
 
-def overrides() -> Iterator[Target]:
+def overrides():
     """Arguments of `--set`, one a line."""
     flags = [
         "robots.KH01.start=[0.1, 0.2]", "formation.gain=2.5", "trigger.threshold=0.02", "trigger.kind=mixed",
@@ -135,21 +131,21 @@ def overrides() -> Iterator[Target]:
     examples = [flag.encode() for flag in flags] + ["\n".join(flags[k : k + 3]).encode() for k in range(10)]
 
     @refusing_well
-    def take(data: bytes) -> None:
+    def take(data):
         name = "robotic-park" if len(data) % 4 == 0 else "triangle"
         assert document.read(name, data.decode("utf-8", "surrogateescape").split("\n")[:8]).cases()
 
     yield Target(examples, take, (DocumentError,))
 
 
-def park_yaml() -> Iterator[Target]:
+def park_yaml():
     """Files of Robotic Park's authors; what becomes of them is read."""
     texts = [theirs.dome(4), theirs.column(3, 1), theirs.dome(5, origin=True, real=(0,))]
     examples = [text.encode() for text in (*texts, "".join(map(theirs.flat, theirs.OTHERS)))]
     with place_for("some.toml") as file:
 
         @refusing_well
-        def take(data: bytes) -> None:
+        def take(data):
             text, _ = convert_text(decoded(data, "some.yaml"), "some.yaml", 20.0)
             file.write_text(text, encoding="utf-8")
             with suppress(DocumentError):  # robots that stand in each other are for its user to see
@@ -158,10 +154,7 @@ def park_yaml() -> Iterator[Target]:
         yield Target(examples, take, (DocumentError,))
 
 
-# ---------------------------------------------------------------------- recordings
-
-
-def recording_bytes(*, plain: bool) -> list[bytes]:
+def recording_bytes(*, plain):
     """Recordings of a second: as they are made, or neither compressed nor guarded by checksums."""
     what = document.read("triangle", ["duration_s=1.0", "timeline=[]"]).experiment
     made = []
@@ -172,14 +165,14 @@ def recording_bytes(*, plain: bool) -> list[bytes]:
             for k in range(12):
                 at = began + 0.1 * k
                 for name in ("KH01", "CF01"):
-                    said: Any = good(name, k + 1)
+                    said = good(name, k + 1)
                     writer.write(msgspec.structs.replace(said["state"][0], stamp=at))
                     writer.write(msgspec.structs.replace(said["pose"][0], stamp=at), at, 150)
                     if k % 5 == 0:
                         writer.write(msgspec.structs.replace(said["status"][0], stamp=at, started=began))
             writer.write(wire.Event(began, "start", "conductor", "go"))
             writer.write(wire.Contact(began + 0.5, "KH01", "CF01", 0.1, 0.01))
-            world: Any = of_all()[KEYS.world][0]
+            world = of_all()[KEYS.world][0]
             writer.write(msgspec.structs.replace(world, stamp=began))
             for stamp, lies in ((began, 0.2), (began + 1.0, 0.21)):
                 writer.write(wire.HostClock("lab1", stamp, lies, 0.001, ["KH01"]))
@@ -208,7 +201,7 @@ def recording_bytes(*, plain: bool) -> list[bytes]:
         return [target.read_bytes()]
 
 
-def resealed(data: bytes) -> bytes:
+def resealed(data):
     """The checksums of attachments made good again, so that what was changed in them is looked at."""
     made, at = bytearray(data), 8
     while at + 9 <= len(made):
@@ -222,12 +215,12 @@ def resealed(data: bytes) -> bytes:
     return bytes(made)
 
 
-def recording_of(*, plain: bool) -> Iterator[Target]:
+def recording_of(*, plain):
     """A recording is read, analysed as `./zenpark report` begins, and recovered."""
     with place_for("some.mcap") as file:
         target = file.with_name("other.mcap")
 
-        def take(data: bytes) -> None:
+        def take(data):
             file.write_bytes(resealed(data) if plain else data)
             if len(data) % 4 == 0:
                 target.unlink(missing_ok=True)
@@ -239,22 +232,22 @@ def recording_of(*, plain: bool) -> Iterator[Target]:
         yield Target(recording_bytes(plain=plain), take, (RecordingError,))
 
 
-def damaged() -> Iterator[Target]:
+def damaged():
     """Recordings as the disk may leave them."""
     yield from recording_of(plain=False)
 
 
-def forged() -> Iterator[Target]:
+def forged():
     """Recordings whose checksums fit, and whose content somebody made up."""
     yield from recording_of(plain=True)
 
 
-def cdr() -> Iterator[Target]:
+def cdr():
     """Every recorded struct: name and CDR with a zero byte between them; what is decoded can be encoded."""
     said = good("KH01")
-    pose: Any = said["pose"][0]
+    pose = said["pose"][0]
     fields = [getattr(pose, name) for name in ("robot", "seq", "stamp", "position", "velocity", "yaw")]
-    made: list[Any] = [
+    made = [
         said["state"][0], said["state"][1], said["status"][0], SentPose(*fields, received=1.0, size=150),
         *(of_all()[key][0] for key in (KEYS.event, KEYS.contact, KEYS.world, KEYS.centre, KEYS.clock)),
         SentGoal("KH01", 1, 1.0, (0.0, 0.0, 0.0), None, 0.9, received=1.0, size=150),
@@ -263,7 +256,7 @@ def cdr() -> Iterator[Target]:
     examples = [type(each).__name__.encode() + b"\0" + codecs[type(each).__name__].encode(each) for each in made]
     names = list(codecs)
 
-    def take(data: bytes) -> None:
+    def take(data):
         head, _, payload = data.partition(b"\0")
         chosen = codecs.get(head.decode("utf-8", "replace")) or codecs[names[len(data) % len(names)]]
         chosen.encode(chosen.decode(payload))
@@ -271,10 +264,7 @@ def cdr() -> Iterator[Target]:
     yield Target(examples, take, (Undecodable, Unencodable))
 
 
-# ---------------------------------------------------------------------- runs
-
-
-def run_files() -> Iterator[Target]:
+def run_files():
     """`run.json`, `metrics.json` and the experiment file of a past run: what cannot be read is not known."""
     origin = {"command": "zenpark run a.toml", "file": "a.toml", "begun": 1e9, "tags": ["a"], "changes": ["seed=3"]}
     figures = [{"case": "a", "seed": 1, "mean": {"f_hz": 2.5, "iae": None}}]
@@ -284,7 +274,7 @@ def run_files() -> Iterator[Target]:
         (file.parent / "good" / SOURCE).write_text("title = 'B'")
         (file.parent / "good" / ORIGIN).write_text(json.dumps(origin))
 
-        def take(data: bytes) -> None:
+        def take(data):
             for name, part in zip((ORIGIN, METRICS, SOURCE), (*data.split(b"\0", 2), b"", b""), strict=False):
                 (file.parent / name).write_bytes(part)
             found = past_runs([file.parent])
@@ -295,7 +285,7 @@ def run_files() -> Iterator[Target]:
         yield Target([example], take)
 
 
-def bundles() -> Iterator[Target]:
+def bundles():
     """Archives of runs: damaged and forged ones are refused, and nothing is written outside of their folder."""
     parts = {ORIGIN: b'{"file": "a.toml"}', SOURCE: b"title = 'A'\n"}
     sums = "".join(f"{hashlib.sha256(data).hexdigest()}  {name}\n" for name, data in parts.items())
@@ -305,7 +295,7 @@ def bundles() -> Iterator[Target]:
             archive.writestr(name, data)
     with place_for("bundle.zip") as file:
 
-        def take(data: bytes) -> None:
+        def take(data):
             file.write_bytes(data)
             into = file.parent / "into"
             try:
@@ -317,10 +307,7 @@ def bundles() -> Iterator[Target]:
         yield Target([packed.getvalue()], take, (RecordingError,))
 
 
-# ---------------------------------------------------------------------- sweeps
-
-
-def sweep_runs() -> Iterator[Target]:
+def sweep_runs():
     """`runs.jsonl` and `origin.json` of a sweep: lines that cannot be read are counted, not fatal."""
     kinds = {int: 1, float: 0.5, bool: True, str: "x"}
     blank = {
@@ -331,7 +318,7 @@ def sweep_runs() -> Iterator[Target]:
     line = json.dumps({"cell": "c", "code": "d", "runs": [blank], "failed": {"3": "why"}}).encode() + b"\n"
     with place_for(RUNS) as file:
 
-        def take(data: bytes) -> None:
+        def take(data):
             runs, _, origin = data.partition(b"\0")
             file.write_bytes(runs)
             (file.parent / store.ORIGIN).write_bytes(origin)
@@ -342,7 +329,7 @@ def sweep_runs() -> Iterator[Target]:
         yield Target([line * 2 + b'\0{"version":"1","code":"2","file":"3"}', line + line[:30]], take, (DocumentError,))
 
 
-def sweep_arguments() -> Iterator[Target]:
+def sweep_arguments():
     """Axes and seeds, one a line."""
     read = document.read("triangle")
     lines = [
@@ -352,7 +339,7 @@ def sweep_arguments() -> Iterator[Target]:
     examples = [line.encode() for line in lines] + [b"\n".join([lines[1].encode(), lines[3].encode()])]
 
     @refusing_well
-    def take(data: bytes) -> None:
+    def take(data):
         axes, words = arguments(data.decode("utf-8", "surrogateescape").split("\n")[:4])
         seeds_of(words.get("seeds"), 1)
         seeds_of(words.get("tuning"), 1001)
@@ -362,14 +349,11 @@ def sweep_arguments() -> Iterator[Target]:
     yield Target(examples, take, (DocumentError,))
 
 
-# ---------------------------------------------------------------------- words
-
-
-def words() -> Iterator[Target]:
+def words():
     """Addresses, endpoints, settings of devices, faults, key expressions: kind and text with a zero byte between."""
     kinds = (crazyflie.CrazyflieSettings, khepera4.Khepera4Settings, tello.TelloSettings, turtlebot3.TurtleBot3Settings)
 
-    def device(text: str) -> None:
+    def device(text):
         table = msgspec.json.decode(text) if text.count("[") + text.count("{") < 500 else {}
         for kind in kinds:
             with suppress(BodyError):
@@ -377,11 +361,11 @@ def words() -> Iterator[Target]:
 
     with place_for("stations.yaml") as file:
 
-        def lighthouse(text: str) -> None:
+        def lighthouse(text):
             file.write_bytes(text.encode("utf-8", "surrogatepass"))
             stations(str(file), 4)
 
-        read: dict[str, Callable[[str], object]] = {
+        read = {
             "endpoint": lambda text: sessions.config(sessions.settings("client", connect=[text], listen=[text])),
             "crazyflie": lambda text: crazyflie.address("R1", text),
             "khepera": lambda text: KheperaAddress.parse("R1", text),
@@ -416,7 +400,7 @@ def words() -> Iterator[Target]:
         examples = [f"{kind}\0{text}".encode() for kind, texts in good_words.items() for text in texts]
         names = list(read)
 
-        def take(data: bytes) -> None:
+        def take(data):
             head, _, rest = data.partition(b"\0")
             name = head.decode("utf-8", "replace")
             text = rest.decode("utf-8", "surrogateescape")

@@ -1,11 +1,8 @@
 """Whatever arrives on the network: the messages themselves, and every process that polls it."""
 
-from __future__ import annotations
-
 import io
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, redirect_stdout, suppress
 from itertools import count
 from math import isnan
@@ -19,7 +16,7 @@ from agents.body.fleet import assemble
 from agents.network import messages as wire
 from agents.network.name_ownership import OwnershipCheck
 from agents.runtime.loop import Runtime, Setup
-from agents.vectors import Setpoint, is_finite
+from agents.vectors import is_finite
 from bridges.external import ExternalBody
 from experiments.definition import bodies
 from experiments.definition.plan import Plan
@@ -34,7 +31,7 @@ from experiments.real_time.processes.world import WorldProcess
 from experiments.real_time.processes.world_population import WorldBodies
 from experiments.recording.writer import Recording
 from tests.fuzz.messages import KEYS, everything, good, of_all, sent
-from tests.fuzz.target import Inputs, Place, Renewed, Target
+from tests.fuzz.target import Place, Renewed, Target
 from tests.network import Net, Reply, Sample
 from tests.requests import request
 from tools.commands.network import members, readable
@@ -42,30 +39,30 @@ from twins.devices.vicon import TruthSubscription, ViconTwin
 
 
 class HandDrivenRobot(Runtime):
-    def begin(self, utc: float) -> None:
+    def begin(self, utc):
         self._utc = self._telemetry.utc = utc
 
 
 class HandDrivenWorld(WorldProcess):
-    def step(self, t: float) -> None:
+    def step(self, t):
         self._tick(t)
         if self._pace.update(t, 0.01):
             self._report(t)
 
 
 class HandDrivenConductor(Conductor):
-    def begin(self) -> None:
+    def begin(self):
         self._join(ExitStack())
         self._changes.begin(time.time())
 
-    def step(self) -> None:
+    def step(self):
         self._update()
 
 
 RUBBISH = io.StringIO()  # where processes say what they would say on a terminal
 
 
-def messages() -> Iterator[Target]:
+def messages():
     """Every struct, both encodings: what is decoded can be encoded again."""
     kinds = {kind.__name__: kind for kind in wire.Message.__subclasses__()}
     examples = []
@@ -76,7 +73,7 @@ def messages() -> Iterator[Target]:
         examples += sent(type(kind).__name__, kind)
     names = list(kinds.values())
 
-    def take(data: bytes) -> None:
+    def take(data):
         name, _, rest = data.partition(b"\0")
         mime, _, payload = rest.partition(b"\0")
         kind = kinds.get(name.decode("utf-8", "replace")) or names[len(data) % len(names)]
@@ -88,11 +85,11 @@ def messages() -> Iterator[Target]:
     yield Target(examples, take, (wire.Malformed,))
 
 
-def robot() -> Iterator[Target]:
+def robot():
     """A robot's process: poses, tokens, orders, stops, positions, ranges; its body is never told nonsense."""
     experiment = document.read("triangle", ["robots.KH01.position=external", "avoidance=barrier"]).experiment
 
-    def make() -> Inputs:
+    def make():
         net.forget()
         body = assemble(bodies.body_request(Plan(experiment), ["KH01"], 1, ["tcp/127.0.0.1:1"]))
         setup = Setup(KEYS, [], "json", 50.0, lifeline=False, externally_measured=[True], ranging=["world"])
@@ -103,12 +100,12 @@ def robot() -> Iterator[Target]:
         began, command = time.time(), body.command
         runtime.begin(began)
 
-        def told(setpoints: Sequence[Setpoint]) -> None:
+        def told(setpoints):
             for setpoint in setpoints:
                 assert all(isnan(number) or abs(number) < 10.0 for number in setpoint), setpoint
             command(setpoints)
 
-        body.command = told  # type: ignore[method-assign]
+        body.command = told
         for k in range(1, 6):
             for name in ("KH01", "KH02", "CF01"):
                 for what in ("pose", "position"):
@@ -130,14 +127,14 @@ def robot() -> Iterator[Target]:
         yield Target(everything("KH01", "KH02", "CF01"), Renewed(make, 200))
 
 
-def world() -> Iterator[Target]:
+def world():
     """The twin service: commands, states of those elsewhere, statuses, and orders to put things in and out."""
     changes = ["robots.KH01.body=world", "robots.KH02.body=world", "world.engine=pymunk"]
     experiment = document.read("triangle", changes).experiment
 
-    def make() -> Inputs:
+    def make():
         net.forget()
-        joint = Network(net.session, KEYS, [], [], OwnershipCheck([]))  # type: ignore[arg-type]
+        joint = Network(net.session, KEYS, [], [], OwnershipCheck([]))
         population = WorldBodies(Plan(experiment))
         process = HandDrivenWorld(Plan(experiment), population, joint, Event())
         process.utc = time.time()
@@ -151,15 +148,15 @@ def world() -> Iterator[Target]:
         yield Target(everything("KH01", "KH02", "CF01"), Renewed(make, 200))
 
 
-def recorder() -> Iterator[Target]:
+def recorder():
     """The recorder writes what is honest and counts the rest; what it wrote can be read."""
     experiment = document.read("triangle").experiment
 
-    def make() -> Inputs:
+    def make():
         net.forget()
         path = Path(folder) / f"{time.monotonic_ns()}.mcap"
         with Recording(path, Plan(experiment), case="only", seed=1, clock="real") as recording:
-            made = Recorder(net.session, KEYS, recording)  # type: ignore[arg-type]
+            made = Recorder(net.session, KEYS, recording)
             while True:
                 net.deliver((yield))
                 made.receive()
@@ -168,28 +165,28 @@ def recorder() -> Iterator[Target]:
         yield Target(everything("KH01", "KH02"), take)
 
 
-def conductor() -> Iterator[Target]:
+def conductor():
     """The conductor follows the robots' statuses, states and tokens, and changes robots when it is asked."""
     experiment = document.read("triangle").experiment
 
     class Nobody:
         last_silence = -np.inf
 
-        def died(self) -> list[object]:
+        def died(self):
             return []
 
-        def running(self, _name: str) -> bool:
+        def running(self, _name):
             return False
 
-        def start(self, *_: str, forked: bool = False) -> None: ...
+        def start(self, *_, forked=False): ...
 
         release = kill = start
 
-    def make() -> Inputs:
+    def make():
         net.forget()
         context = CaseContext(
             Plan(experiment), "only", Path(folder), source=Path(folder) / "only.json", endpoints=["tcp/127.0.0.1:1"],
-            launcher=Nobody(), hosts=Hosts(Nobody(), []),  # type: ignore[arg-type]
+            launcher=Nobody(), hosts=Hosts(Nobody(), []),
         )  # fmt: skip
         made = HandDrivenConductor(context, lambda _: None)
         made.begin()
@@ -202,10 +199,10 @@ def conductor() -> Iterator[Target]:
         yield Target(everything("KH01", "KH02", "CF01"), Renewed(make, 500))
 
 
-def external_body() -> Iterator[Target]:
+def external_body():
     """A body elsewhere says where it is and what it sees."""
 
-    def make() -> Inputs:
+    def make():
         net.forget()
         for name in ("KH01", "KH02"):
             key = KEYS.position(name)
@@ -224,13 +221,13 @@ def external_body() -> Iterator[Target]:
         yield Target(everything("KH01", "KH02", only=("position", "ranges", "state")), Renewed(make, 200))
 
 
-def vicon_truths() -> Iterator[Target]:
+def vicon_truths():
     """The simulated Vicon hears where twins are."""
 
-    def make() -> Inputs:
+    def make():
         net.forget()
         with closing(ViconTwin(["KH01", "KH02"])) as vicon:
-            truths = TruthSubscription(net.session, KEYS, ["KH01", "KH02"])  # type: ignore[arg-type]
+            truths = TruthSubscription(net.session, KEYS, ["KH01", "KH02"])
             for k in count(1):
                 net.deliver((yield))
                 truths.update(vicon, time.time())
@@ -240,7 +237,7 @@ def vicon_truths() -> Iterator[Target]:
         yield Target(everything("KH01", "KH02", only=("truth",)), take)
 
 
-def answers() -> Iterator[Target]:
+def answers():
     """Answers to orders, and the admin space that network tools read."""
     examples = []
     for message in (wire.Reply("KH01", True, "ready", "", 0.1), wire.WorldReply(True, False, 1.0, "")):
@@ -253,15 +250,15 @@ def answers() -> Iterator[Target]:
     }
     examples += [b"\0".join([key.encode(), b"application/json", text]) for key, text in admin.items()]
 
-    def take(data: bytes) -> None:
+    def take(data):
         key, _, rest = data.partition(b"\0")
         mime, _, payload = rest.partition(b"\0")
         kind = mime.decode("utf-8", "replace")
         net.replies = [Reply(Sample(key.decode("utf-8", "replace"), kind, payload), good=len(data) % 8 > 0)]
-        assert isinstance(orders.send_order(net.session, KEYS, ["KH01"], wire.Order("hold"))["KH01"], wire.Reply)  # type: ignore[arg-type]
-        assert isinstance(orders.send_world_order(net.session, KEYS, wire.WorldOrder("pause")), wire.WorldReply)  # type: ignore[arg-type]
+        assert isinstance(orders.send_order(net.session, KEYS, ["KH01"], wire.Order("hold"))["KH01"], wire.Reply)
+        assert isinstance(orders.send_world_order(net.session, KEYS, wire.WorldOrder("pause")), wire.WorldReply)
         assert readable(payload, kind).isprintable()
-        for member in members(net.session):  # type: ignore[arg-type]
+        for member in members(net.session):
             msgspec.json.encode(member)
 
     net = Net()

@@ -1,8 +1,5 @@
 """Bytes from and to ROS 2 and TurtleBots."""
 
-from __future__ import annotations
-
-from collections.abc import Iterator
 from contextlib import closing
 from itertools import count
 
@@ -15,16 +12,14 @@ from agents.vectors import is_finite
 from bridges.ros2 import Graph
 from bridges.turtlebot3.body import TurtleBot3
 from tests.fuzz.messages import everything
-from tests.fuzz.target import Inputs, Place, Renewed, Target
+from tests.fuzz.target import Place, Renewed, Target
 from tests.network import Net, Sample
 from tests.requests import request
 from twins.devices.device import DeviceRequest, Faults
 from twins.devices.turtlebot3 import TurtleBot3Twin
 
-# ---------------------------------------------------------------------- ROS 2
 
-
-def ros_messages() -> dict[str, bytes]:
+def ros_messages():
     """A good message of each type that is read, as CDR."""
     types = ros2.types("jazzy")
     make = types.make
@@ -60,7 +55,7 @@ def ros_messages() -> dict[str, bytes]:
     return {kind: types.encode(message, kind) for kind, message in found.items()}
 
 
-def ros() -> Iterator[Target]:
+def ros():
     """CDR of every type, tokens and attachments: kind and payload with a zero byte between them."""
     types = ros2.types("jazzy")
     good = ros_messages()
@@ -72,12 +67,12 @@ def ros() -> Iterator[Target]:
     examples = [kind.encode() + b"\0" + payload for kind, payload in good.items()]
     examples += [b"token\0" + token.encode() for token in tokens] + [b"attached\0" + ros2.attachment(1, 2, bytes(16))]
 
-    def take(data: bytes) -> None:
+    def take(data):
         head, _, rest = data.partition(b"\0")
         kind = head.decode("utf-8", "replace")
         if kind == "token":
             for style in ("rmw", "ros2dds"):
-                ros2.announced(style, rest.decode("utf-8", "replace"))  # type: ignore[arg-type]
+                ros2.announced(style, rest.decode("utf-8", "replace"))
         elif kind == "attached":
             ros2.attached(rest)
         elif kind in good:
@@ -87,19 +82,19 @@ def ros() -> Iterator[Target]:
 
 
 class HastyTurtleBot3(TurtleBot3):
-    def close(self) -> None:
+    def close(self):
         """Does not wait until the robot stands."""
         self._claims.release()
 
 
-def turtlebot_bridge() -> Iterator[Target]:
+def turtlebot_bridge():
     """Odometry, scans, batteries and tokens of a robot."""
     good = ros_messages()
     topics = {"odom": ros2.ODOMETRY, "scan": ros2.LASER_SCAN, "battery_state": ros2.BATTERY_STATE}
     examples = [f"tb3_0/{topic}\0\0".encode() + good[kind] for topic, kind in topics.items()]
     examples += [ros2.dds_token("f00d", "MS", "/tb3_0/cmd_vel", ros2.TWIST_STAMPED).encode() + b"\0\0"]
 
-    def make() -> Inputs:
+    def make():
         net.forget()
         net.first["tb3_0/odom"] = Sample("tb3_0/odom", "", good[ros2.ODOMETRY])
         with closing(HastyTurtleBot3(request("turtlebot3", "ros2dds://tb3_0"))) as body:
@@ -115,11 +110,11 @@ def turtlebot_bridge() -> Iterator[Target]:
         yield Target(examples, take)
 
 
-def turtlebot_twin() -> Iterator[Target]:
+def turtlebot_twin():
     """Commands to the twin of a robot."""
     good = ros_messages()
 
-    def make() -> Inputs:
+    def make():
         net.forget()
         device = TurtleBot3Twin(DeviceRequest(request("turtlebot3", "turtlebot3-twin"), Faults()))
         for k in count(1):
@@ -131,15 +126,15 @@ def turtlebot_twin() -> Iterator[Target]:
         yield Target([b"KH01/cmd_vel\0\0" + good[ros2.TWIST_STAMPED]], Renewed(make, 300))
 
 
-def ros_graph() -> Iterator[Target]:
+def ros_graph():
     """The bridge to ROS 2: states and statuses of robots, goals from ROS."""
     good = ros_messages()
     examples = everything("KH01", "KH02", only=("state", "ranges", "status"))
 
-    def make() -> Inputs:
+    def make():
         net.forget()
-        participant = Participant(net.session, ros2.types("jazzy"), style="rmw")  # type: ignore[arg-type]
-        graph = Graph(net.session, participant, Keys())  # type: ignore[arg-type]
+        participant = Participant(net.session, ros2.types("jazzy"), style="rmw")
+        graph = Graph(net.session, participant, Keys())
         net.deliver(b"park/KH01/alive\0\0")
         graph.poll()
         while True:

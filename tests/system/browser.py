@@ -1,13 +1,9 @@
 """Chromium as a test drives it: a page of the view, the requests that it makes, and the scene that arrives in it."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import time
-from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -53,26 +49,26 @@ needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="needs chromium: ap
 class Page:
     """A page that is open."""
 
-    def __init__(self, page: Any) -> None:
+    def __init__(self, page):
         self.page = page
-        self.hosts: set[str] = set()  # of all its requests, `host:port`
-        self.nodes: dict[str, dict[str, Any]] = {}  # properties of the scene's nodes, as they arrived last
-        self.texts: list[str] = []  # of messages that carry text: notifications
-        self.camera: dict[str, Any] = {}  # of the page, as it said last
+        self.hosts = set()  # of all its requests, `host:port`
+        self.nodes = {}  # properties of the scene's nodes, as they arrived last
+        self.texts = []  # of messages that carry text: notifications
+        self.camera = {}  # of the page, as it said last
         page.on("request", lambda request: self.hosts.add(request.url.split("/")[2] if "//" in request.url else ""))
         page.on("websocket", self._listen)
 
-    def _listen(self, socket: Any) -> None:
+    def _listen(self, socket):
         self.hosts.add(socket.url.split("/")[2])
         socket.on("framereceived", lambda data: self._receive(data) if isinstance(data, bytes) else None)
         socket.on("framesent", lambda data: self._answer(data) if isinstance(data, bytes) else None)
 
-    def _answer(self, data: bytes) -> None:
+    def _answer(self, data):
         message = msgspec.msgpack.decode(data)
         if message["type"] == "ViewerCameraMessage":
             self.camera = message
 
-    def _receive(self, data: bytes) -> None:
+    def _receive(self, data):
         """Messages as viser packs them: sizes, compressed msgpack, then the arrays, each aligned to eight bytes."""
         size, packed = (int.from_bytes(data[k : k + 8], "little") for k in (0, 8))
         inner = msgspec.msgpack.decode(
@@ -85,7 +81,7 @@ class Page:
         for message in inner["messages"]:
             self._take(message, arrays)
 
-    def _take(self, message: dict[str, Any], arrays: list[bytes]) -> None:
+    def _take(self, message, arrays):
         kind, name = message.get("type", ""), message.get("name", "")
         if kind == "NotificationMessage":
             self.texts.append(str(message))
@@ -98,11 +94,11 @@ class Page:
         for key, value in given.items():
             node[key] = _array(value, arrays)
 
-    def positions(self, name: str) -> np.ndarray:
+    def positions(self, name):
         """Positions (N, 3) of the copies of a batched mesh [m]."""
         return np.frombuffer(self.nodes[name]["batched_positions"], dtype="<f4").reshape(-1, 3)
 
-    def pixel(self, point: Sequence[float]) -> tuple[float, float]:
+    def pixel(self, point):
         """Where the page draws a point of the scene [m]."""
         wide, tall = self.camera["image_width"], self.camera["image_height"]
         w, x, y, z = self.camera["wxyz"]
@@ -115,7 +111,7 @@ class Page:
         scale = 0.5 * tall / np.tan(0.5 * self.camera["fov"]) / ahead
         return 0.5 * wide + scale * right, 0.5 * tall + scale * down
 
-    def drag(self, begin: Sequence[float], end: Sequence[float]) -> None:
+    def drag(self, begin, end):
         """Drags what is drawn at one point of the scene to another [m], with the mouse."""
         mouse = self.page.mouse
         self.page.evaluate(  # what has arrived is drawn some frames later
@@ -130,7 +126,7 @@ class Page:
         mouse.move(*self.pixel(end), steps=5)
         mouse.up()
 
-    def until(self, true: Any, what: str, limit_s: float = PATIENCE_S) -> None:
+    def until(self, true, what, limit_s=PATIENCE_S):
         """Waits, and lets the page's messages in meanwhile."""
         left = limit_s
         while not true():
@@ -138,7 +134,7 @@ class Page:
             self.page.wait_for_timeout(50)
             left -= 0.05
 
-    def frames_per_second(self, seconds: float = 2.0) -> float:
+    def frames_per_second(self, seconds=2.0):
         """Frames that the page draws."""
         script = """seconds => new Promise(resolve => {
             let count = 0; const begun = performance.now();
@@ -150,7 +146,7 @@ class Page:
         })"""
         return float(self.page.evaluate(script, seconds))
 
-    def frames_alone(self) -> float:
+    def frames_alone(self):
         """Frames a second that the page draws where nothing else needs the processors: more than it draws here.
 
         Without a graphics card all of the drawing is done by the processors, as many at once as there are.
@@ -160,11 +156,11 @@ class Page:
         worked = (_processor_s() - before) / (time.monotonic() - begun)  # processors
         return rate * max(1.0, (os.cpu_count() or 1) / worked)
 
-    def button(self, text: str) -> Any:
+    def button(self, text):
         return self.page.get_by_role("button", name=text)
 
 
-def _processor_s() -> float:
+def _processor_s():
     """Processor time of the browser of this process [s]."""
     total = 0.0
     for child in psutil.Process().children(recursive=True):
@@ -174,7 +170,7 @@ def _processor_s() -> float:
     return total
 
 
-def _array(value: Any, arrays: list[bytes]) -> Any:
+def _array(value, arrays):
     """A property, an array as its bytes."""
     if isinstance(value, dict) and any("inary" in key for key in value):
         (index,) = (each for key, each in value.items() if isinstance(each, int))
@@ -183,9 +179,7 @@ def _array(value: Any, arrays: list[bytes]) -> Any:
 
 
 @contextmanager
-def opened(
-    address: str | Callable[[], str], width: int = 900, height: int = 600, *, drawn: bool = False
-) -> Iterator[Page]:
+def opened(address, width=900, height=600, *, drawn=False):
     """A page in a browser of its own; its scene is `drawn` as often as the browser can, or has no pixels at all.
 
     An address may be waited for while the browser starts.

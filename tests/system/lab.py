@@ -1,7 +1,5 @@
 """A run as a test sees it: real processes, a real router, and a session of the test's own to look and to order."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import re
@@ -9,9 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Self
 
 import numpy as np
 import psutil
@@ -24,7 +20,6 @@ from agents.network import session as network
 from agents.network.keys import Keys
 from experiments.file import catalogue
 from experiments.real_time.conductor import orders
-from experiments.recording.trace import Trace
 from experiments.run import reopen
 from tests import commands
 from tests.commands import GUARD, ROOT, environment
@@ -46,16 +41,16 @@ NEAR_TRIANGLE = [
 ]  # fmt: skip
 
 
-def options(*words: object) -> list[str]:
+def options(*words):
     """Words of a command; those like `duration_s=4` are settings."""
-    made: list[str] = []
+    made = []
     for word in map(str, words):
         is_setting = "=" in word and word[0] != "-" and made[-1:] not in (["--set"], ["--connect"])
         made += ["--set", word] if is_setting else [word]
     return made
 
 
-def in_lab(folder: Path) -> Path:
+def in_lab(folder):
     """The triangle as a file beside its lab."""
     file = folder / "triangle.toml"
     file.write_text(catalogue.path("triangle").read_text("utf-8") + '\n[network]\nlab = "lab"\n', "utf-8")
@@ -63,7 +58,7 @@ def in_lab(folder: Path) -> Path:
     return file
 
 
-def typed(file: Path, topic: str) -> list[Any]:
+def typed(file, topic):
     """Messages of a topic, as another library decodes them from the schema in the file."""
     with file.open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
@@ -73,14 +68,14 @@ def typed(file: Path, topic: str) -> list[Any]:
 class Looking:
     """Something that takes in what is said whenever it looks."""
 
-    def look(self) -> None:
+    def look(self):
         """Takes in what came since the last look."""
         raise NotImplementedError
 
-    def until(self, true: Callable[[], object], what: str, limit_s: float = PATIENCE_S) -> None:
+    def until(self, true, what, limit_s=PATIENCE_S):
         """Looks until something is true; while it asks for a robot that has said nothing yet, it is not."""
 
-        def seen() -> object:
+        def seen():
             self.look()
             with contextlib.suppress(KeyError):
                 return true()
@@ -92,17 +87,17 @@ class Looking:
 class Watcher(Looking):
     """Everything that robots say, from a session of the test's own; poll with `look`."""
 
-    def __init__(self, *endpoints: str) -> None:
+    def __init__(self, *endpoints):
         self.keys = Keys()
         self.session = network.open_session(endpoints, name="test", identity="operator")
         self._statuses = pubsub.pose_subscriber(self.session, self.keys.status("*"), 4096)
         self._states = pubsub.subscriber(self.session, self.keys.state("*"), 8192)
         self._alive = pubsub.AliveWatch(self.session, self.keys.alive("*"))
-        self.status: dict[str, messages.Status] = {}
-        self.state: dict[str, messages.State] = {}
-        self.alive: set[str] = set()
+        self.status = {}
+        self.state = {}
+        self.alive = set()
 
-    def look(self) -> None:
+    def look(self):
         for sample in network.received(self._statuses.handler):
             status = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Status)
             self.status[status.robot] = status
@@ -114,37 +109,37 @@ class Watcher(Looking):
             robot = self.keys.whose(str(sample.key_expr)) or ""  # a test may hold a token on any key
             (self.alive.discard if sample.kind == zenoh.SampleKind.DELETE else self.alive.add)(robot)
 
-    def phase(self, robot: str) -> str:
+    def phase(self, robot):
         return self.status[robot].phase if robot in self.status else ""
 
-    def until_all(self, phase: str, *names: str) -> None:
+    def until_all(self, phase, *names):
         self.until(lambda: all(self.phase(name) == phase for name in names), f"{', '.join(names)}: {phase}")
 
-    def order(self, robot: str, order: messages.Order) -> messages.Reply:
+    def order(self, robot, order):
         return orders.send_order(self.session, self.keys, [robot], order, PATIENCE_S)[robot]
 
-    def give(self, order: messages.Order, *names: str) -> None:
+    def give(self, order, *names):
         """Order that all of them carry out."""
         for name in names:
             reply = self.order(name, order)
             assert reply.ok, reply
 
-    def take_off(self, *names: str) -> None:
+    def take_off(self, *names):
         self.until_all("ready", *names)
         self.give(messages.Order("takeoff"), *names)
         self.until_all("airborne", *names)
 
-    def start(self, *names: str) -> None:
+    def start(self, *names):
         self.give(messages.Order("start", at=time.time() + 0.3), *names)
         self.until_all("running", *names)
 
-    def __enter__(self) -> Self:
+    def __enter__(self):
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, *_):
         self.close()
 
-    def close(self) -> None:
+    def close(self):
         self.session.close()
 
 
@@ -153,7 +148,7 @@ class Started:
 
     patience_s = 40.0  # for its end
 
-    def __init__(self, module: str, *arguments: str) -> None:
+    def __init__(self, module, *arguments):
         self.process = subprocess.Popen(
             [sys.executable, "-m", module, *arguments],
             cwd=ROOT,
@@ -164,40 +159,38 @@ class Started:
             text=True,
         )
 
-    def __enter__(self) -> Self:
+    def __enter__(self):
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, *_):
         """Ends it, unless it has ended, even if it is frozen."""
         if self.process.poll() is None:
             self.thaw()
             self.process.terminate()
         self.wait()
 
-    def freeze(self) -> None:
+    def freeze(self):
         self.process.send_signal(signal.SIGSTOP)
 
-    def thaw(self) -> None:
+    def thaw(self):
         self.process.send_signal(signal.SIGCONT)
 
-    def said(self) -> str:
+    def said(self):
         """The rest of its output, after its end."""
-        assert self.process.stdout is not None
         return self.process.stdout.read()
 
-    def end(self) -> int:
+    def end(self):
         """SIGTERM: robots land and a world's are waited for, then it ends."""
         self.process.terminate()
         return self.wait()
 
-    def kill(self) -> None:
+    def kill(self):
         self.process.kill()
         self.wait()
 
-    def wait(self, limit_s: float | None = None) -> int:
+    def wait(self, limit_s=None):
         code = self.process.wait(self.patience_s if limit_s is None else limit_s)
         for stream in (self.process.stdin, self.process.stdout):
-            assert stream is not None
             stream.close()
         return code
 
@@ -205,7 +198,7 @@ class Started:
 class RobotProcess(Started):
     """`./zenpark agent`."""
 
-    def __init__(self, endpoint: str, file: str | Path, *names: str, lifeline: bool = False) -> None:
+    def __init__(self, endpoint, file, *names, lifeline=False):
         more = ["--lifeline"] if lifeline else []
         super().__init__("experiments.real_time.processes.robot", str(file), *names, "--connect", endpoint, *more)
 
@@ -215,9 +208,8 @@ class WorldProcess(Started):
 
     patience_s = 40.0
 
-    def __init__(self, endpoint: str, file: str | Path, *arguments: str) -> None:
+    def __init__(self, endpoint, file, *arguments):
         super().__init__("experiments.real_time.processes.world", str(file), "--connect", endpoint, *arguments)
-        assert self.process.stdout is not None
         self.ready = self.process.stdout.readline().strip()
 
 
@@ -235,7 +227,7 @@ ROLES = {
 class Flight:
     """`./zenpark run` in a process of its own; words like `duration_s=4` are settings."""
 
-    def __init__(self, folder: Path, file: str | Path, *words: str, report: bool = False) -> None:
+    def __init__(self, folder, file, *words, report=False):
         self.folder = folder
         words = words if report else (*words, "--no-report")
         self._errors = (folder.parent / f"{folder.name}.stderr").open("w+")
@@ -250,7 +242,7 @@ class Flight:
             start_new_session=True,
         )
 
-    def children(self) -> dict[str, psutil.Process]:
+    def children(self):
         """The processes that it started, by robot name, "zygote", "router", "recorder", "world", "centre"."""
         found = {}
         for child in psutil.Process(self.process.pid).children(recursive=True):
@@ -265,54 +257,53 @@ class Flight:
                 found |= {role: child for module, role in ROLES.items() if module in line}
         return found
 
-    def endpoint(self) -> str:
+    def endpoint(self):
         """The router's."""
         line = self.children()["router"].cmdline()
         return line[line.index("--listen") + 1]
 
-    def said(self) -> str:
+    def said(self):
         return Path(self._errors.name).read_text()
 
-    def until_flown(self) -> None:
+    def until_flown(self):
         self.until_said("phase conductor: formation")
 
-    def until_said(self, pattern: str, limit_s: float = 2.0 * PATIENCE_S) -> None:
-        def said_or_over() -> bool:
+    def until_said(self, pattern, limit_s=2.0 * PATIENCE_S):
+        def said_or_over():
             return bool(re.search(pattern, self.said())) or self.process.poll() is not None
 
         with contextlib.suppress(AssertionError):
             until(said_or_over, pattern, limit_s)
         assert re.search(pattern, self.said()), f"{pattern!r} not said, but:\n{self.said()}\n{self.logs()}"
 
-    def logs(self) -> str:
+    def logs(self):
         """Output of the processes."""
         files = sorted((self.folder / "logs").glob("*.log"))
         return "\n".join(f"{file.name}: {file.read_text()[-500:]}" for file in files)
 
-    def signal(self, number: signal.Signals) -> None:
+    def signal(self, number):
         self.process.send_signal(number)
 
-    def interrupt(self) -> str:
+    def interrupt(self):
         """Ctrl-C: all land; standard output."""
         self.signal(signal.SIGINT)
         code, out = self.finish()
         assert code == 130, self.logs()
         return out
 
-    def finish(self, limit_s: float = 60.0) -> tuple[int, str]:
+    def finish(self, limit_s=60.0):
         """Exit code and standard output; a machine that was busy spoils figures, and nothing that is tested here."""
-        assert self.process.stdout is not None
         out, _ = self.process.communicate(timeout=limit_s)
         self._errors.close()
         return 0 if self.process.returncode == SPOILED else self.process.returncode, out
 
 
-def gone(processes: Sequence[psutil.Process]) -> bool:
+def gone(processes):
     """Whether none of them runs any more; a zombie that nobody reaps counts as gone."""
     return not any(p.is_running() and p.status() != psutil.STATUS_ZOMBIE for p in processes)
 
 
-def assert_formed(trace: Trace, within_m: float, since_s: float) -> None:
+def assert_formed(trace, within_m, since_s):
     """Mean error of each link of a distance since a time of the run [s]."""
     late = trace.time > since_s
     rows = {name: row for row, name in enumerate(trace.robots)}
@@ -322,7 +313,7 @@ def assert_formed(trace: Trace, within_m: float, since_s: float) -> None:
         assert np.abs(apart - (link if isinstance(link, float) else link.distance)).mean() < within_m, text
 
 
-def transmits_at_50_hz(trace: Trace) -> None:
+def transmits_at_50_hz(trace):
     """Robots transmit 50 times a second, except at ticks that they counted as missed."""
     wanted = 50.0 * trace.plan.experiment.duration_s
     sent = np.bincount(trace.sent.link, minlength=len(trace.robots))
@@ -330,7 +321,7 @@ def transmits_at_50_hz(trace: Trace) -> None:
     assert (sent >= wanted - trace.missed_deadlines - 3).all()
 
 
-def assert_held_in_time(flight: Flight, case: str, stopped: float) -> None:
+def assert_held_in_time(flight, case, stopped):
     """Robots of a finished run held once because the router froze at `stopped` [s, UTC], as each recorded it itself."""
     run = reopen(flight.folder)
     trace = run.traces[case]

@@ -3,8 +3,6 @@
 Nothing leaves the namespaces: they have addresses of their own, and no way out. Needs root, `ip` and `sshd`.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import secrets
@@ -15,7 +13,6 @@ import subprocess
 import sys
 import textwrap
 import time
-from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import psutil
@@ -27,7 +24,7 @@ NET = "10.77.0"
 PORT = 22
 
 
-def why_not() -> str:
+def why_not():
     """What these tests lack here; empty if nothing."""
     if os.geteuid() != 0:
         return "needs root, for network namespaces"
@@ -42,22 +39,22 @@ def why_not() -> str:
     return ""
 
 
-def ip(*words: str) -> None:
+def ip(*words):
     subprocess.run(["ip", *words], check=True, capture_output=True)
 
 
 class Machine:
     """One namespace with its address, its host key, and an sshd that takes the lab's key."""
 
-    def __init__(self, lab: Machines, name: str, number: int) -> None:
+    def __init__(self, lab, name, number):
         self.lab, self.name = lab, name
         self.address = f"{NET}.{number}"
         self.namespace = f"{lab.prefix}{name}"
         self.folder = lab.folder / name
         self.folder.mkdir()
-        self._sshd: subprocess.Popen[bytes] | None = None
+        self._sshd = None
 
-    def plug_in(self) -> None:
+    def plug_in(self):
         inner, outer = f"{self.lab.prefix}i{self.name[-1]}", f"{self.lab.prefix}o{self.name[-1]}"
         ip("netns", "add", self.namespace)
         ip("link", "add", outer, "type", "veth", "peer", "name", inner)
@@ -69,13 +66,13 @@ class Machine:
             ip("-n", self.namespace, "link", "set", link, "up")
         self.outer = outer
 
-    def unplug(self) -> None:
+    def unplug(self):
         ip("-n", self.lab.switch, "link", "set", self.outer, "down")
 
-    def plug_in_again(self) -> None:
+    def plug_in_again(self):
         ip("-n", self.lab.switch, "link", "set", self.outer, "up")
 
-    def serve(self) -> None:
+    def serve(self):
         key = self.folder / "host_key"
         subprocess.run(["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", str(key)], check=True)
         config = self.folder / "sshd_config"
@@ -106,7 +103,7 @@ class Machine:
             file.write(f"{self.address} {known[0]} {known[1]}\n")
         until((self.folder / "sshd.pid").exists, f"sshd of {self.name} runs", 10.0)
 
-    def zenpark_file(self, *, offset_s: float = 0.0, drift: float = 0.0) -> Path:
+    def zenpark_file(self, *, offset_s=0.0, drift=0.0):
         """The zenpark of this machine, as a command; its clock may be wrong."""
         command = self.folder / "zenpark"
         fake = self.folder / "site"
@@ -129,11 +126,11 @@ class Machine:
         command.chmod(command.stat().st_mode | stat.S_IXUSR)
         return command
 
-    def command(self, *words: str) -> list[str]:
+    def command(self, *words):
         """A command line that runs here."""
         return ["ip", "netns", "exec", self.namespace, *words]
 
-    def processes(self) -> list[psutil.Process]:
+    def processes(self):
         """What runs in this namespace, but for its sshd and that one's children that serve connections."""
         pids = subprocess.run(["ip", "netns", "pids", self.namespace], capture_output=True, text=True, check=False)
         found = []
@@ -144,7 +141,7 @@ class Machine:
                     found.append(process)
         return found
 
-    def close(self) -> None:
+    def close(self):
         if self._sshd is not None:
             self._sshd.terminate()
             self._sshd.wait(30)
@@ -159,17 +156,17 @@ class Machine:
 class Machines:
     """The lab: a switch and machines on it; the first has no sshd and is the one in front of which one sits."""
 
-    def __init__(self, folder: Path, names: Sequence[str]) -> None:
+    def __init__(self, folder, names):
         folder.mkdir(parents=True, exist_ok=True)
         self.folder, self.prefix = folder, f"zp{secrets.token_hex(2)}"
         self.switch = f"{self.prefix}sw"
         self.key, self.known_hosts = folder / "key", folder / "known_hosts"
         self.machines = {name: Machine(self, name, 10 + number) for number, name in enumerate(names)}
 
-    def __getitem__(self, name: str) -> Machine:
+    def __getitem__(self, name):
         return self.machines[name]
 
-    def __enter__(self) -> Machines:
+    def __enter__(self):
         subprocess.run(["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", str(self.key)], check=True)
         self.known_hosts.touch()
         ip("netns", "add", self.switch)
@@ -182,12 +179,12 @@ class Machines:
         self._wrap_ssh()
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, *_):
         for machine in self.machines.values():
             machine.close()
         subprocess.run(["ip", "netns", "del", self.switch], check=False, capture_output=True)
 
-    def _wrap_ssh(self) -> None:
+    def _wrap_ssh(self):
         """The user's own configuration, which ssh looks for in the home folder of the password file only."""
         (self.folder / "bin").mkdir()
         config = self.folder / "ssh_config"
@@ -201,13 +198,13 @@ class Machines:
         wrapper.chmod(0o755)
 
     @property
-    def environment(self) -> dict[str, str]:
+    def environment(self):
         path = f"{self.folder / 'bin'}:{os.environ['PATH']}"
         return {**os.environ, "PATH": path, "PYTHONPATH": str(ROOT)}
 
 
 @contextlib.contextmanager
-def machines(folder: Path, names: Sequence[str]) -> Iterator[Machines]:
+def machines(folder, names):
     """A lab that is taken down whatever happens."""
     lab = Machines(folder, names)
     try:

@@ -4,32 +4,29 @@
 --all` does so before its tests of processes. Wheels are for Linux and CPython 3.10 to 3.13; none has rmw_zenoh or tf2.
 """
 
-from __future__ import annotations
-
 import fcntl
 import os
 import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import Final
 
-MESSAGES: Final = ("geometry", "sensor", "nav", "diagnostic")
-WHEELS: Final = (  # ROS 2 Kilted
+MESSAGES = ("geometry", "sensor", "nav", "diagnostic")
+WHEELS = (  # ROS 2 Kilted
     "ros-rclpy==9.1.2",
     "ros-rmw-fastrtps-cpp==9.3.3",
     *(f"ros-{name}-msgs==5.5.1" for name in MESSAGES),
 )
-NAME: Final = f"rclpy-9.1.2-cp{sys.version_info.major}{sys.version_info.minor}"
-CACHE: Final = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "zenpark" / NAME
-PYTHON: Final = CACHE / "ros" / "bin" / "python"
-REASON: Final = CACHE / "reason.txt"  # why there is none; empty: it is complete
+NAME = f"rclpy-9.1.2-cp{sys.version_info.major}{sys.version_info.minor}"
+CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "zenpark" / NAME
+PYTHON = CACHE / "ros" / "bin" / "python"
+REASON = CACHE / "reason.txt"  # why there is none; empty: it is complete
 # no network but a loopback of its own, and an end for all its processes with the first
-APART: Final = ("unshare", "--map-root-user", "--net", "--pid", "--fork", "--kill-child")
-LOOPBACK: Final = ("sh", "-c", 'ip link set lo up && exec "$@"', "sh")
+APART = ("unshare", "--map-root-user", "--net", "--pid", "--fork", "--kill-child")
+LOOPBACK = ("sh", "-c", 'ip link set lo up && exec "$@"', "sh")
 
 
-def missing() -> str:
+def missing():
     """Why there is no ROS 2 for tests; empty if there is one."""
     if not REASON.exists():
         return f"no rclpy in {CACHE}: `./zenpark test --all` installs one"
@@ -41,7 +38,7 @@ def missing() -> str:
     return f"no network namespace for ROS: {tried.stderr.strip()}" if tried.returncode else ""
 
 
-def install() -> str:
+def install():
     """Installs it unless it is there, one process at a time; why there is none, or an empty text."""
     CACHE.mkdir(parents=True, exist_ok=True)
     with (CACHE / "lock").open("w") as lock:
@@ -53,7 +50,7 @@ def install() -> str:
     return missing()
 
 
-def _install() -> str:
+def _install():
     pip = ["-m", "pip", "install", "--quiet", "--prefer-binary", "--retries", "1", "--timeout", "20", *WHEELS]
     for command in ([sys.executable, "-m", "venv", str(CACHE / "ros")], [str(PYTHON), *pip]):
         done = subprocess.run(

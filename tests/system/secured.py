@@ -1,21 +1,15 @@
 """A laboratory as an intruder finds it: a router that knows who may do what, robots in flight, and certificates."""
 
-from __future__ import annotations
-
-import contextlib
 import shutil
 import threading
 import time
-from collections.abc import Iterator
 from contextlib import ExitStack
-from pathlib import Path
-from typing import Self
 
 import msgspec
 import pytest
 import zenoh
 
-from agents.network import lab, messages
+from agents.network import lab
 from agents.network.endpoints import free_endpoint
 from agents.network.zenoh_config import config, settings
 from experiments.definition import access_rights
@@ -28,7 +22,7 @@ FILE = ROOT / "tests" / "system" / "secured.toml"
 FLOWN = ("KH01", "KH02", "CF01")
 
 
-def refused() -> contextlib.AbstractContextManager[object]:
+def refused():
     """Reaction of a router to a session that it does not let in."""
     return pytest.raises(zenoh.ZError, match="Unable to connect")
 
@@ -36,7 +30,7 @@ def refused() -> contextlib.AbstractContextManager[object]:
 class Laboratory:
     """Three robots in flight on a router that asks for certificates; `KH03`, who hears `KH01`, has not been started."""
 
-    def __init__(self, folder: Path, protocol: str = "tls", *, linked: bool = False) -> None:
+    def __init__(self, folder, protocol="tls", *, linked=False):
         self.folder = folder / "lab"
         cases = load(FILE).cases()
         robots = dict.fromkeys(next(iter(cases.values())).names, "robot")
@@ -46,18 +40,17 @@ class Laboratory:
         self.rights.write_bytes(msgspec.json.encode(rights))
         self.plain = free_endpoint(preferred_port=0, protocol=protocol)
         (self.endpoint,) = lab.secured([self.plain], self.folder)
-        self.last: dict[str, messages.Status] = {}
+        self.last = {}
         self._stack = ExitStack()
         self.serve(self.endpoint)
 
-    def serve(self, endpoint: str, *more: str) -> None:
+    def serve(self, endpoint, *more):
         """Starts a router."""
         words = ("--listen", endpoint, "--rights", str(self.rights), *more)
         router = self._stack.enter_context(Started("agents.runtime.router", *words))
-        assert router.process.stdout is not None
         assert router.process.stdout.readline() == f"router ready on {endpoint}\n"
 
-    def fly(self) -> None:
+    def fly(self):
         """Starts the robots and brings them to where they run."""
         for name in FLOWN:
             self._stack.enter_context(RobotProcess(self.endpoint, FILE, name))
@@ -65,7 +58,7 @@ class Laboratory:
         self.watcher.take_off(*FLOWN)
         self.watcher.start(*FLOWN)
 
-    def statuses(self) -> dict[str, messages.Status]:
+    def statuses(self):
         """Fresh ones, of every robot."""
         since = time.time()
         watcher = self.watcher
@@ -73,31 +66,31 @@ class Laboratory:
         self.last = {name: watcher.status[name] for name in FLOWN}
         return self.last
 
-    def session(self, identity: str, folder: Path | None = None) -> zenoh.Session:
+    def session(self, identity, folder=None):
         """A session of whoever has these certificates; at once, or zenoh.ZError."""
         (endpoint,) = lab.secured([self.plain], folder or self.folder)
         return zenoh.open(config(settings("client", connect=[endpoint], name="intruder", identity=identity)))
 
-    def __enter__(self) -> Self:
+    def __enter__(self):
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, *_):
         self._stack.close()
 
 
-def elsewhere(folder: Path, days: float = 90.0) -> Path:
+def elsewhere(folder, days=90.0):
     """Another lab with the same names, whose authority nobody here knows."""
     authority.create(folder, {**{role: role for role in authority.SERVICES}, "KH01": "robot"}, days=days)
     return folder
 
 
-def copy(folder: Path, target: Path) -> Path:
+def copy(folder, target):
     """What a thief has of a lab."""
     shutil.copytree(folder, target)
     return target
 
 
-def steady(rate_hz: float, seconds: float) -> Iterator[int]:
+def steady(rate_hz, seconds):
     """Counts up, so many times a second."""
     begin, done = time.monotonic(), 0
     pause = threading.Event()

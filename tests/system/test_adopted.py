@@ -1,29 +1,24 @@
 """Robots that were started by hand or at boot: a run takes them as they are, and starts only the others."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import signal
-from pathlib import Path
 
 import pytest
 
 from agents.network import messages
 from agents.network.endpoints import free_endpoint
-from agents.network.lab import Role
 from experiments.file import catalogue
 from experiments.real_time.hosts import authority
 from experiments.recording import playback
-from tests.conftest import RouterProcess
-from tests.system.lab import PATIENCE_S, Flight, RobotProcess, Started, Watcher
+from tests.system.lab import PATIENCE_S, Flight, RobotProcess, Started
 
 pytestmark = pytest.mark.system
 
 SHORT = ("--case", "event", "--json", "duration_s=2")
 
 
-def file_with_board(folder: Path, endpoint: str) -> str:
+def file_with_board(folder, endpoint):
     file = folder / "x.toml"
     text = catalogue.path("triangle").read_text("utf-8")
     text += f'\n[network]\nconnect = ["{endpoint}"]\n[hosts.board]\nrobots = ["KH02"]\n'
@@ -31,7 +26,7 @@ def file_with_board(folder: Path, endpoint: str) -> str:
     return str(file)
 
 
-def test_present_robot_is_adopted_unless_it_has_flown(router: RouterProcess, watcher: Watcher, tmp_path: Path) -> None:
+def test_present_robot_is_adopted_unless_it_has_flown(router, watcher, tmp_path):
     file = file_with_board(tmp_path, router.endpoint)
     with (
         RobotProcess(router.endpoint, "join", "KH02", "--once") as at_boot,
@@ -59,9 +54,9 @@ def test_present_robot_is_adopted_unless_it_has_flown(router: RouterProcess, wat
         assert by_hand.end() == 0
 
 
-def test_lab_member_needs_only_its_own_files(tmp_path: Path) -> None:
+def test_lab_member_needs_only_its_own_files(tmp_path):
     lab, own = tmp_path / "lab", tmp_path / "robot" / "zenpark-lab"
-    robots: dict[str, Role] = dict.fromkeys(("KH01", "KH02", "CF01"), "robot")
+    robots = dict.fromkeys(("KH01", "KH02", "CF01"), "robot")
     authority.create(lab, {**{role: role for role in authority.SERVICES}, **robots})
     own.mkdir(parents=True)
     for name in ("ca.pem", "KH02.pem", "KH02.key"):
@@ -73,7 +68,6 @@ def test_lab_member_needs_only_its_own_files(tmp_path: Path) -> None:
         Started("tools.guard", "router", file, "--lab", str(lab), "--listen", endpoint) as router,
         Started("tools.guard", "agent", "join", "KH02", *reach, "--once") as joined,
     ):
-        assert router.process.stdout is not None
         assert router.process.stdout.readline().startswith("router ready on tls/")
         flight = Flight(tmp_path / "run", file, "--lab", str(lab), *SHORT)
         flight.until_said("adopted KH02: is ")
@@ -83,7 +77,7 @@ def test_lab_member_needs_only_its_own_files(tmp_path: Path) -> None:
     assert not trace.lost.any()
 
 
-def test_who_joined_lands_when_the_conductor_is_dead(router: RouterProcess, watcher: Watcher, tmp_path: Path) -> None:
+def test_who_joined_lands_when_the_conductor_is_dead(router, watcher, tmp_path):
     with RobotProcess(router.endpoint, "join", "KH02", "--once") as joined:
         flight = Flight(tmp_path / "run", file_with_board(tmp_path, router.endpoint), "--case", "event")
         watcher.until_all("running", "KH02")

@@ -1,11 +1,8 @@
 """The centre in real processes: a run that it decides, its death, and goals that nobody should believe."""
 
-from __future__ import annotations
-
 import json
 import time
 from contextlib import ExitStack
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,7 +15,6 @@ from experiments.real_time.hosts import authority
 from experiments.recording import playback
 from experiments.run import reopen
 from tests.commands import python
-from tests.conftest import RouterProcess
 from tests.system.lab import Flight, RobotProcess, Started, Watcher, gone, until
 
 pytestmark = pytest.mark.system
@@ -47,7 +43,7 @@ HYBRID = '{ kind = "hybrid", robots = ["TB01", "KH01"] }'
 
 @pytest.mark.mechanism("central controller: killed")
 @pytest.mark.timeout(120)
-def test_robots_hold_while_the_centre_is_dead(tmp_path: Path) -> None:
+def test_robots_hold_while_the_centre_is_dead(tmp_path):
     file, folder = tmp_path / "three.toml", tmp_path / "run"
     file.write_text(FAST.format(duration=12.0, architecture=HYBRID))
     flight = Flight(folder, file, "--json")
@@ -99,7 +95,7 @@ def test_robots_hold_while_the_centre_is_dead(tmp_path: Path) -> None:
     assert case.lost == 0
 
 
-def test_by_hand_and_what_nobody_should_believe(router: RouterProcess, watcher: Watcher, tmp_path: Path) -> None:
+def test_by_hand_and_what_nobody_should_believe(router, watcher, tmp_path):
     file, names = tmp_path / "three.toml", ("TB01", "KH01", "KH02")
     file.write_text(FAST.format(duration=60.0, architecture='"centralised"'))
     command = ("experiments.real_time.processes.centre", str(file), "--connect", router.endpoint)
@@ -108,7 +104,6 @@ def test_by_hand_and_what_nobody_should_believe(router: RouterProcess, watcher: 
         watcher.until(lambda: "never received centre" in watcher.status["KH01"].reason, "they wait for the centre")
         assert watcher.status["KH01"].missing == ["centre"]
         centre = stack.enter_context(Started(*command))
-        assert centre.process.stdout is not None
         ready = "centre ready: guides TB01, KH01, KH02 at 10 Hz; realm park at"
         assert centre.process.stdout.readline().startswith(ready)
         watcher.until_all("ready", *names)
@@ -136,9 +131,9 @@ def test_by_hand_and_what_nobody_should_believe(router: RouterProcess, watcher: 
         assert abs(watcher.state["KH01"].goal[0]) < 3.0
 
         inbox = pubsub.Inbox(pubsub.pose_subscriber(watcher.session, KEYS.centre), messages.CentreState)
-        reports: list[messages.CentreState] = []
+        reports = []
 
-        def reported() -> object:
+        def reported():
             reports.extend(inbox.read())
             return reports and reports[-1].received["KH01"] > 0  # the first may be from before the run
 
@@ -152,7 +147,7 @@ def test_by_hand_and_what_nobody_should_believe(router: RouterProcess, watcher: 
 
 
 @pytest.mark.timeout(120)
-def test_lab_lets_only_the_centre_decide(tmp_path: Path) -> None:
+def test_lab_lets_only_the_centre_decide(tmp_path):
     """The centre's certificate is its right: a robot's gives none over others; a restarted router enforces it again."""
     file, folder = tmp_path / "three.toml", tmp_path / "run"
     file.write_text(FAST.format(duration=8.0, architecture=HYBRID) + '[network]\nlab = "lab"\n')
@@ -171,7 +166,7 @@ def test_lab_lets_only_the_centre_decide(tmp_path: Path) -> None:
         with network.open_session([flight.endpoint()], name="KH02") as session:
             before = watcher.status["KH01"].malformed
 
-            def arrives() -> bool:
+            def arrives():
                 session.put(KEYS.goal("KH01"), b"of another robot", encoding=messages.JSON)
                 session.put(KEYS.ranges("KH02"), b"its own", encoding=messages.JSON)
                 return any(network.received(own.handler))

@@ -1,10 +1,7 @@
 """Faults and long runs in real processes."""
 
-from __future__ import annotations
-
 import csv
 import json
-from pathlib import Path
 
 import pytest
 
@@ -23,7 +20,7 @@ pytestmark = pytest.mark.system
         ["sleep"],
     ],
 )
-def test_faults_are_made_and_recovered_from(tmp_path: Path, kinds: list[str]) -> None:
+def test_faults_are_made_and_recovered_from(tmp_path, kinds):
     folder = tmp_path / "chaos"
     of = ("--faults", len(kinds), "--seed", "1", "--kinds", ",".join(kinds), *NEAR_TRIANGLE, "duration_s=40")
     words = options("-m", "tests", "--chaos", "triangle", *of, "--json", "--out", folder)
@@ -37,13 +34,13 @@ def test_faults_are_made_and_recovered_from(tmp_path: Path, kinds: list[str]) ->
     assert json.loads((folder / "chaos.json").read_text()) == result
 
 
-def test_a_fault_that_nobody_knows_is_refused(tmp_path: Path) -> None:
+def test_a_fault_that_nobody_knows_is_refused(tmp_path):
     done = python("-m", "tests", "--chaos", "triangle", "--kinds", "kil", code=2)
     assert "--kinds kil: is not known" in done.stderr
     assert done.stderr.count("\n") <= 2
 
 
-def test_three_robots_for_a_few_seconds(tmp_path: Path) -> None:
+def test_three_robots_for_a_few_seconds(tmp_path):
     asked = ("triangle", "--minutes", "0.1", "--json", "--out", str(tmp_path / "soak"))
     done = python("-m", "tests", "--soak", *asked, code=None, timeout_s=120.0)
     assert done.stdout, done.stderr

@@ -1,9 +1,6 @@
 """An emergency stop ends a run for good: who was stopped does not take off again for the next case."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
 
 import pytest
 
@@ -34,16 +31,14 @@ trigger = { kind = "send-on-delta", threshold = 0.01 }
 
 
 @pytest.fixture
-def two_cases_file(tmp_path: Path) -> Path:
+def two_cases_file(tmp_path):
     made = tmp_path / "two.toml"
     made.write_text(TWO_CASES)
     return made
 
 
 @pytest.mark.timeout(120)
-def test_every_run_of_the_machine_ends_with_reason(
-    two_cases_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_every_run_of_the_machine_ends_with_reason(two_cases_file, tmp_path, capsys):
     flight = Flight(tmp_path / "run", two_cases_file)
     flight.until_flown()
     other = Flight(tmp_path / "other", two_cases_file)
@@ -75,7 +70,7 @@ def test_every_run_of_the_machine_ends_with_reason(
 
 @pytest.mark.mechanism("emergency stop of a run")
 @pytest.mark.timeout(120)
-def test_before_the_common_start_too(two_cases_file: Path, tmp_path: Path) -> None:
+def test_before_the_common_start_too(two_cases_file, tmp_path):
     flight = Flight(tmp_path / "run", two_cases_file, "robots.CF01.hover=2.0", 'formation.links={"CF01 - KH01" = 2.2}')
     flight.until_said(r"ready conductor: 2 robots", 60.0)
     # not by a process: on a busy machine its start takes as long as a climb, after which comes the common start

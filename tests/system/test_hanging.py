@@ -1,13 +1,9 @@
 """Robots whose loop hangs, or whose whole process is frozen, come down, and do not act on what they knew before."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal
 import time
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 import zenoh
@@ -15,7 +11,6 @@ import zenoh
 from agents.network import messages, pubsub
 from agents.network import session as network
 from tests.commands import ROOT
-from tests.conftest import RouterProcess
 from tests.system.lab import ENVIRONMENT, Flight, RobotProcess, Watcher, WorldProcess
 
 pytestmark = pytest.mark.system
@@ -37,30 +32,30 @@ class Hangs(Trigger, frozen=True):
 class Truth(Watcher):
     """Where the world has its robots as well."""
 
-    def __init__(self, endpoint: str) -> None:
+    def __init__(self, endpoint):
         super().__init__(endpoint)
         self._truths = pubsub.subscriber(self.session, self.keys.truth("*"), 4096)
-        self.place: dict[str, messages.Position] = {}
-        self.heights: list[tuple[float, float]] = []  # of any robot: when [s, UTC] and how high [m] it was
+        self.place = {}
+        self.heights = []  # of any robot: when [s, UTC] and how high [m] it was
 
-    def look(self) -> None:
+    def look(self):
         super().look()
         for sample in network.received(self._truths.handler):
             truth = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Position)
             self.place[truth.robot] = truth
             self.heights.append((truth.stamp, truth.position[2]))
 
-    def height(self, robot: str) -> float:
+    def height(self, robot):
         return self.place[robot].position[2] if robot in self.place else 0.0
 
 
 @pytest.fixture
-def watcher(router: RouterProcess) -> Iterator[Truth]:
+def watcher(router):
     with Truth(router.endpoint) as made:
         yield made
 
 
-def lonely(folder: Path, trigger: str = "") -> Path:
+def lonely(folder, trigger=""):
     """One Tello in a world."""
     lonely_file = folder / "lonely.toml"
     lonely_file.write_text(
@@ -71,14 +66,12 @@ def lonely(folder: Path, trigger: str = "") -> Path:
 
 
 @pytest.fixture
-def lonely_file(tmp_path: Path) -> Path:
+def lonely_file(tmp_path):
     return lonely(tmp_path)
 
 
 @pytest.mark.mechanism("watchdog: control loop hangs")
-def test_a_loop_that_hangs_is_landed_and_said(
-    router: RouterProcess, watcher: Truth, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_loop_that_hangs_is_landed_and_said(router, watcher, tmp_path, monkeypatch):
     (tmp_path / "hangs.py").write_text(HANGS)
     about = tmp_path / "hangs-1.dist-info"
     about.mkdir()
@@ -102,7 +95,7 @@ def test_a_loop_that_hangs_is_landed_and_said(
         world.kill()
 
 
-def test_process_frozen_aloft_is_landed_and_notices(router: RouterProcess, watcher: Truth, lonely_file: Path) -> None:
+def test_process_frozen_aloft_is_landed_and_notices(router, watcher, lonely_file):
     with WorldProcess(router.endpoint, lonely_file), RobotProcess(router.endpoint, lonely_file, "TE01") as robot:
         watcher.take_off("TE01")
         high, stopped = watcher.height("TE01"), time.time()
@@ -120,9 +113,7 @@ def test_process_frozen_aloft_is_landed_and_notices(router: RouterProcess, watch
         watcher.until_all("done", "TE01")
 
 
-def test_frozen_process_leaves_body_to_its_replacement(
-    router: RouterProcess, watcher: Truth, lonely_file: Path
-) -> None:
+def test_frozen_process_leaves_body_to_its_replacement(router, watcher, lonely_file):
     with WorldProcess(router.endpoint, lonely_file), RobotProcess(router.endpoint, lonely_file, "TE01") as old:
         watcher.take_off("TE01")
         old.freeze()
@@ -134,7 +125,7 @@ def test_frozen_process_leaves_body_to_its_replacement(
             heights = [watcher.height("TE01")]
             old.thaw()
 
-            def left() -> bool:
+            def left():
                 heights.append(watcher.height("TE01"))
                 return old.process.poll() is not None
 
@@ -145,7 +136,7 @@ def test_frozen_process_leaves_body_to_its_replacement(
             assert watcher.phase("TE01") == "airborne"
 
 
-def test_stop_behind_a_flood_of_deletions_is_obeyed(router: RouterProcess, watcher: Truth, lonely_file: Path) -> None:
+def test_stop_behind_a_flood_of_deletions_is_obeyed(router, watcher, lonely_file):
     with WorldProcess(router.endpoint, lonely_file), RobotProcess(router.endpoint, lonely_file, "TE01"):
         watcher.take_off("TE01")
         for _ in range(2000):
@@ -158,7 +149,7 @@ def test_stop_behind_a_flood_of_deletions_is_obeyed(router: RouterProcess, watch
         assert watcher.status["TE01"].reason == "emergency stop by a test: now"
 
 
-def test_process_hanging_in_final_landing_fails_the_run(tmp_path: Path) -> None:
+def test_process_hanging_in_final_landing_fails_the_run(tmp_path):
     lonely_file = tmp_path / "short.toml"
     lonely_file.write_text(
         'title = "short"\nduration_s = 1.5\ntrigger = { kind = "periodic" }\n'

@@ -1,16 +1,12 @@
 """Hazards of real processes: what robots notice lands them, and becomes events of the run."""
 
-from __future__ import annotations
-
 import re
-from pathlib import Path
 
 import pytest
 
 from agents.network import pubsub
 from experiments.recording import playback
-from tests.conftest import RouterProcess
-from tests.system.lab import NEAR_TRIANGLE, Flight, RobotProcess, Watcher, typed
+from tests.system.lab import NEAR_TRIANGLE, Flight, RobotProcess, typed
 
 pytestmark = pytest.mark.system
 
@@ -28,13 +24,13 @@ links = {{ "A - B" = 0.3 }}
 """
 
 
-def pair_file(folder: Path, safety: str) -> Path:
+def pair_file(folder, safety):
     file = folder / "pair.toml"
     file.write_text(PAIR.format(safety=safety))
     return file
 
 
-def test_robot_too_near_holds_and_is_reported(tmp_path: Path) -> None:
+def test_robot_too_near_holds_and_is_reported(tmp_path):
     folder = tmp_path / "run"
     flight = Flight(folder, pair_file(tmp_path, "separation = 0.5"))
     flight.until_said(r"hazard [AB]: hold: minimum separation: 0\.\d\d m from [AB] \(limit 0\.5 m\)")
@@ -51,7 +47,7 @@ def test_robot_too_near_holds_and_is_reported(tmp_path: Path) -> None:
     assert [incident.text.partition(":")[0] for incident in status.incidents] == ["hold", "unresolved at the end"]
 
 
-def test_drone_with_low_battery_lands_and_others_continue(tmp_path: Path) -> None:
+def test_drone_with_low_battery_lands_and_others_continue(tmp_path):
     folder = tmp_path / "run"
     low = "safety.battery_low=0.985"  # it flies for 7 minutes on a charge
     flight = Flight(folder, "triangle", "--case", "event", low, "duration_s=8")
@@ -69,7 +65,7 @@ def test_drone_with_low_battery_lands_and_others_continue(tmp_path: Path) -> Non
     assert ends["KH01"] == "done: finished"
 
 
-def test_run_with_a_scripted_landing_succeeds(tmp_path: Path) -> None:
+def test_run_with_a_scripted_landing_succeeds(tmp_path):
     folder = tmp_path / "run"
     flight = Flight(folder, "triangle", "--case", "event", *NEAR_TRIANGLE, "robots.CF01.lands_at_s=2", "duration_s=5")
     code, _ = flight.finish()
@@ -81,7 +77,7 @@ def test_run_with_a_scripted_landing_succeeds(tmp_path: Path) -> None:
 
 
 @pytest.mark.mechanism("hazard: conductor lost")
-def test_robots_without_conductor_end_if_file_says_so(router: RouterProcess, watcher: Watcher, tmp_path: Path) -> None:
+def test_robots_without_conductor_end_if_file_says_so(router, watcher, tmp_path):
     token = pubsub.alive_token(watcher.session, watcher.keys.conductor)
     with RobotProcess(router.endpoint, pair_file(tmp_path, 'lost_conductor = "land"'), "A", "B"):
         watcher.take_off("A", "B")
@@ -90,6 +86,5 @@ def test_robots_without_conductor_end_if_file_says_so(router: RouterProcess, wat
         status = watcher.status["A"]
         assert status.reason == "the conductor is gone"
         silent = re.fullmatch(r"land: the conductor is gone: for (\d+\.\d+) s.*", status.hazard)
-        assert silent is not None
         assert float(silent[1]) >= 2.0
         assert [incident.text for incident in status.incidents] == [status.hazard]

@@ -1,13 +1,8 @@
 """Robots that hold, are removed, restarted, replaced and added while the others fly on."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal
-import subprocess
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -18,7 +13,6 @@ from experiments.recording import playback
 from experiments.report import report
 from experiments.run import reopen
 from tests.commands import zenpark
-from tests.conftest import RouterProcess
 from tests.system.lab import TRIANGLE, Flight, RobotProcess, Watcher
 
 pytestmark = pytest.mark.system
@@ -43,13 +37,13 @@ LOW = ("robots.CF01.hover=0.3", "spares.S1.hover=0.3", "formation.gain=1.4")  # 
 class Lab:
     """The triangle with a robot on standby and two spares, and an operator."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder):
         self.folder, self.file = folder, folder / "x.toml"
         text = catalogue.path("triangle").read_text("utf-8").replace("[formation]", SPARES, 1)
         text = text.replace('"KH01 - KH02"', '"KH01 > KH03" = 0.60\n"KH03 > KH01" = 0.60\n"KH01 - KH02"', 1)
         self.file.write_text(text)
 
-    def fly(self, *more: str, endpoint: str | None = None) -> Watcher:
+    def fly(self, *more, endpoint=None):
         settings = ("duration_s=60", "rates.body_hz=50", *LOW, *more)
         self.flight = Flight(self.folder / "run", self.file, "--case", "event", "--json", *settings)
         self.flight.until_flown()
@@ -58,23 +52,23 @@ class Lab:
         self.watcher.until_all("running", *TRIANGLE)
         return self.watcher
 
-    def running(self, *names: str) -> bool:
+    def running(self, *names):
         return all(self.watcher.phase(name) == "running" for name in names)
 
-    def change(self, what: messages.ChangeKind, *names: str, **more: object) -> messages.RunReply:
-        order = messages.RunOrder(what, list(names), **more)  # type: ignore[arg-type]
+    def change(self, what, *names, **more):
+        order = messages.RunOrder(what, list(names), **more)
         return orders.send_run_order(self.watcher.session, self.watcher.keys, order)
 
-    def zenpark(self, *words: str, code: int | None = None) -> subprocess.CompletedProcess[str]:
+    def zenpark(self, *words, code=None):
         return zenpark("robot", *words, "--connect", self.endpoint, code=code)
 
-    def end(self) -> None:
+    def end(self):
         """Ctrl-C: all land."""
         if self.flight.process.poll() is None:
             self.flight.signal(signal.SIGINT)
         assert self.flight.finish()[0] in (0, 130)
 
-    def close(self) -> None:
+    def close(self):
         if hasattr(self, "watcher"):
             self.watcher.close()
         if hasattr(self, "flight") and self.flight.process.returncode is None:
@@ -82,13 +76,13 @@ class Lab:
 
 
 @pytest.fixture
-def hot_lab(tmp_path: Path) -> Iterator[Lab]:
+def hot_lab(tmp_path):
     made = Lab(tmp_path)
     yield made
     made.close()
 
 
-def test_killed_robot_is_restarted_and_takes_part(hot_lab: Lab) -> None:
+def test_killed_robot_is_restarted_and_takes_part(hot_lab):
     watcher = hot_lab.fly()
     status = watcher.status
     first = status["CF01"].pid
@@ -116,7 +110,7 @@ def test_killed_robot_is_restarted_and_takes_part(hot_lab: Lab) -> None:
 
 
 @pytest.mark.mechanism("hot change: hold, remove, add")
-def test_robots_hold_leave_and_come_while_others_continue(hot_lab: Lab) -> None:
+def test_robots_hold_leave_and_come_while_others_continue(hot_lab):
     watcher = hot_lab.fly()
     assert hot_lab.zenpark("hold", "CF01", code=0).stdout == "CF01: holds where it is\n"
     watcher.until(lambda: watcher.status["CF01"].reason == "ordered to hold", "its status says so")
@@ -143,7 +137,7 @@ def test_robots_hold_leave_and_come_while_others_continue(hot_lab: Lab) -> None:
     assert " lost " not in hot_lab.flight.said()
 
 
-def test_a_spare_takes_over_a_name(hot_lab: Lab) -> None:
+def test_a_spare_takes_over_a_name(hot_lab):
     watcher = hot_lab.fly()
     unknown = hot_lab.zenpark("restart", "CF02", code=2)
     assert "no robot 'CF02' in this run; did you mean 'CF01'" in unknown.stderr
@@ -166,7 +160,7 @@ def test_a_spare_takes_over_a_name(hot_lab: Lab) -> None:
     assert re.search("no router answers|this run is not there", orphan.stderr)  # its port may be somebody else's by now
 
 
-def test_robots_of_one_process_come_together(hot_lab: Lab) -> None:
+def test_robots_of_one_process_come_together(hot_lab):
     text = hot_lab.file.read_text()
     for name in ("KH01", "KH02"):
         text = text.replace(f"[robots.{name}]", f'[robots.{name}]\nprocess = "pair"', 1)
@@ -187,7 +181,7 @@ def test_robots_of_one_process_come_together(hot_lab: Lab) -> None:
     hot_lab.end()
 
 
-def test_hand_started_robot_leaves_and_is_readmitted(router: RouterProcess, hot_lab: Lab) -> None:
+def test_hand_started_robot_leaves_and_is_readmitted(router, hot_lab):
     hot_lab.file.write_text(hot_lab.file.read_text() + f'\n[network]\nconnect = ["{router.endpoint}"]\n')
     with RobotProcess(router.endpoint, hot_lab.file, "CF01", "--case", "event") as by_hand:
         watcher = hot_lab.fly(endpoint=router.endpoint)

@@ -1,15 +1,11 @@
 """What intruders get from a secured network: nothing. Real processes, real certificates, robots in flight."""
 
-from __future__ import annotations
-
 import json
 import os
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import pytest
 import zenoh
@@ -30,7 +26,7 @@ STOP = messages.encode(messages.Stop("mallory", "because"))
 
 
 @pytest.fixture(scope="module")
-def laboratory(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Laboratory]:
+def laboratory(tmp_path_factory):
     with Laboratory(tmp_path_factory.mktemp("secured")) as made:
         made.fly()
         yield made
@@ -45,7 +41,7 @@ class Flight:
 
 
 @pytest.fixture(autouse=True)
-def flight(laboratory: Laboratory) -> Iterator[Flight]:
+def flight(laboratory):
     """Whatever a test does: the robots run on, have believed and refused nothing, and have lost nobody."""
     made = Flight(laboratory.last or laboratory.statuses())
     yield made
@@ -61,16 +57,16 @@ def flight(laboratory: Laboratory) -> Iterator[Flight]:
         assert made.mad or after[name].malformed == made.before[name].malformed
 
 
-def say(session: zenoh.Session, key: str, payload: bytes) -> None:
+def say(session, key, payload):
     session.put(key, payload, encoding=messages.JSON)
 
 
-def forged(robot: str) -> bytes:
+def forged(robot):
     """A pose that every check would believe."""
     return messages.encode(messages.pose(robot, 10**9, time.time(), [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], yaw=0.0))
 
 
-def settled(laboratory: Laboratory, seconds: float = 0.5) -> None:
+def settled(laboratory, seconds=0.5):
     """Time for what was said to arrive, if it does."""
     threading.Event().wait(seconds)
     laboratory.watcher.look()
@@ -79,7 +75,7 @@ def settled(laboratory: Laboratory, seconds: float = 0.5) -> None:
 @pytest.mark.parametrize(
     "protocol", ["tcp", pytest.param("tls", marks=pytest.mark.mechanism("intruder without a certificate")), "quic"]
 )
-def test_without_a_certificate_nobody_gets_in(laboratory: Laboratory, protocol: str) -> None:
+def test_without_a_certificate_nobody_gets_in(laboratory, protocol):
     address = laboratory.plain.partition("/")[2]
     chosen = config(settings("client", connect=[f"{protocol}/{address}"], name="intruder"))
     chosen.insert_json5("transport/unicast/open_timeout", "1000")
@@ -90,32 +86,30 @@ def test_without_a_certificate_nobody_gets_in(laboratory: Laboratory, protocol: 
         zenoh.open(chosen)
 
 
-def other_authority(folder: Path, target: Path) -> Path:
+def other_authority(folder, target):
     return elsewhere(target)
 
 
-def ended(folder: Path, target: Path) -> Path:
+def ended(folder, target):
     authority.renew(copy(folder, target), ["operator", "KH01", "router"], days=-0.01)
     return target
 
 
-def same_name(folder: Path, target: Path) -> Path:
+def same_name(folder, target):
     authority.renew(copy(folder, target), authority=True)
     return target
 
 
 @pytest.mark.parametrize("forge", [other_authority, ended, same_name])
 @pytest.mark.parametrize("identity", ["operator", "KH01", "router"])
-def test_certificate_that_does_not_count_is_refused(
-    laboratory: Laboratory, tmp_path: Path, forge: Callable[[Path, Path], Path], identity: str
-) -> None:
+def test_certificate_that_does_not_count_is_refused(laboratory, tmp_path, forge, identity):
     forged = forge(laboratory.folder, tmp_path / "forged")
     (forged / "ca.pem").write_bytes((laboratory.folder / "ca.pem").read_bytes())  # it does trust the router
     with refused():
         laboratory.session(identity, forged)
 
 
-def test_a_robots_certificate_does_not_make_a_router(laboratory: Laboratory, tmp_path: Path) -> None:
+def test_a_robots_certificate_does_not_make_a_router(laboratory, tmp_path):
     """A stolen robot cannot pose as the router to the others."""
     thief = copy(laboratory.folder, tmp_path / "thief")
     for part in ("key", "pem"):
@@ -130,7 +124,7 @@ def test_a_robots_certificate_does_not_make_a_router(laboratory: Laboratory, tmp
         zenoh.open(config(settings("client", connect=[honest], name="KH01")))
 
 
-def test_router_outside_its_certificates_addresses_is_refused(laboratory: Laboratory) -> None:
+def test_router_outside_its_certificates_addresses_is_refused(laboratory):
     address = laboratory.plain.rpartition(":")[2]
     (endpoint,) = lab.secured([f"tls/127.0.0.2:{address}"], laboratory.folder)
     with refused():
@@ -144,7 +138,7 @@ def test_router_outside_its_certificates_addresses_is_refused(laboratory: Labora
         *["observer", "recorder", "world", "positioning", "twin", "router"],
     ],
 )
-def test_nobody_speaks_for_a_robot_or_stops_everybody(laboratory: Laboratory, who: str) -> None:
+def test_nobody_speaks_for_a_robot_or_stops_everybody(laboratory, who):
     heard = pubsub.subscriber(laboratory.watcher.session, "park/**", 20_000)
     with laboratory.session(who) as session:
         threading.Event().wait(0.1)
@@ -167,7 +161,7 @@ def test_nobody_speaks_for_a_robot_or_stops_everybody(laboratory: Laboratory, wh
         *["KH03", "recorder", "world", "centre", "ros2"],
     ],
 )
-def test_orders_are_the_operators(laboratory: Laboratory, who: str) -> None:
+def test_orders_are_the_operators(laboratory, who):
     land = {"payload": messages.encode(messages.Order("land")), "encoding": messages.JSON}
     with laboratory.session(who) as session:
         reply = orders.send_order(session, KEYS, ["CF01"], messages.Order("land"))["CF01"]
@@ -179,7 +173,7 @@ def test_orders_are_the_operators(laboratory: Laboratory, who: str) -> None:
 
 
 @pytest.mark.parametrize(("who", "part"), [("observer", "pose"), ("operator", "pose"), ("operator", "order")])
-def test_queryable_wildcard_is_answered_by_all(laboratory: Laboratory, who: str, part: str) -> None:
+def test_queryable_wildcard_is_answered_by_all(laboratory, who, part):
     asked = {"payload": messages.encode(messages.Order("get", name="clamp")), "encoding": messages.JSON}
     with laboratory.session(who) as session:
         replies = list(session.get(f"park/*/{part}", timeout=5.0, **(asked if part == "order" else {})))
@@ -188,7 +182,7 @@ def test_queryable_wildcard_is_answered_by_all(laboratory: Laboratory, who: str,
 
 
 @pytest.mark.parametrize("who", ["KH03", "observer", "recorder", "world"])
-def test_robots_are_changed_by_operators_only(laboratory: Laboratory, who: str) -> None:
+def test_robots_are_changed_by_operators_only(laboratory, who):
     """Somebody else neither asks the conductor for a change, nor answers in its place."""
     order = messages.RunOrder("remove", ["CF01"], operator="operator")
     with laboratory.session(who) as session:
@@ -205,7 +199,7 @@ def test_robots_are_changed_by_operators_only(laboratory: Laboratory, who: str) 
         asked.close()
 
 
-def test_a_robot_hears_its_neighbours_and_nobody_else(laboratory: Laboratory) -> None:
+def test_a_robot_hears_its_neighbours_and_nobody_else(laboratory):
     with laboratory.session("KH03") as session:
         neighbour = pubsub.pose_subscriber(session, KEYS.pose("KH01"))
         others = [
@@ -222,7 +216,7 @@ def test_a_robot_hears_its_neighbours_and_nobody_else(laboratory: Laboratory) ->
         assert not list(session.get("@/*/router/**", timeout=1.0))
 
 
-def test_no_one_takes_anothers_place(laboratory: Laboratory) -> None:
+def test_no_one_takes_anothers_place(laboratory):
     """Neither its orders, nor its token, nor the memory of its last value."""
     with laboratory.session("KH03") as session:
         order = pubsub.Orders(session, KEYS.order("KH02"), messages.Order)
@@ -244,7 +238,7 @@ def test_no_one_takes_anothers_place(laboratory: Laboratory) -> None:
         token.undeclare()
 
 
-def test_replayed_samples_are_not_believed_again(laboratory: Laboratory, flight: Flight) -> None:
+def test_replayed_samples_are_not_believed_again(laboratory, flight):
     """With the very key of KH01, its own poses of a moment ago, twenty times each."""
     with pubsub.pose_subscriber(laboratory.watcher.session, KEYS.pose("KH01"), 500) as ear:
         settled(laboratory)
@@ -261,7 +255,7 @@ def test_replayed_samples_are_not_believed_again(laboratory: Laboratory, flight:
         assert twice < 120 < 20 * len(taken), "each once, give or take the age of a status"
 
 
-def test_nonsense_at_ten_thousand_hertz_is_counted(laboratory: Laboratory, flight: Flight) -> None:
+def test_nonsense_at_ten_thousand_hertz_is_counted(laboratory, flight):
     """From a robot that has gone mad, on its own key: KH01's, in a thief's hands."""
     flight.mad = "KH01"
     nonsense = [b"", b"{", b"[" * 1000, os.urandom(200), b'{"robot":"KH01","seq":NaN}', forged("KH02"), b"null"]
@@ -277,7 +271,7 @@ def test_nonsense_at_ten_thousand_hertz_is_counted(laboratory: Laboratory, fligh
         assert after[name].malformed > flight.before[name].malformed, "it is counted"
 
 
-def test_what_is_too_large_does_not_arrive(laboratory: Laboratory) -> None:
+def test_what_is_too_large_does_not_arrive(laboratory):
     with laboratory.session("KH01") as thief:
         for size in (65_537, 300_000, 3_000_000):
             for _ in range(20):
@@ -285,7 +279,7 @@ def test_what_is_too_large_does_not_arrive(laboratory: Laboratory) -> None:
         settled(laboratory)
 
 
-def test_denied_samples_at_ten_thousand_hertz_arrive_nowhere(laboratory: Laboratory) -> None:
+def test_denied_samples_at_ten_thousand_hertz_arrive_nowhere(laboratory):
     with laboratory.session("observer") as session:
         for count in steady(10_000, 1.5):
             say(session, (KEYS.estop, KEYS.pose("KH01"), "park/**")[count % 3], STOP)
@@ -293,7 +287,7 @@ def test_denied_samples_at_ten_thousand_hertz_arrive_nowhere(laboratory: Laborat
 
 
 @pytest.mark.timeout(90)
-def test_half_open_connections_are_dropped_and_disturb_nobody(laboratory: Laboratory) -> None:
+def test_half_open_connections_are_dropped_and_disturb_nobody(laboratory):
     """Slowloris: handshakes that begin and never end. Those who are in stay in; the router drops the others."""
     host, _, port = laboratory.plain.partition("/")[2].rpartition(":")
     half = []
@@ -305,7 +299,7 @@ def test_half_open_connections_are_dropped_and_disturb_nobody(laboratory: Labora
             half.append(one)
         assert laboratory.watcher.order("CF01", messages.Order("get", name="clamp")).ok
 
-        def dropped() -> bool:
+        def dropped():
             laboratory.watcher.look()
             return all(_closed(one) for one in half)
 
@@ -317,7 +311,7 @@ def test_half_open_connections_are_dropped_and_disturb_nobody(laboratory: Labora
         assert list(session.liveliness().get("park/*/alive", timeout=1.0))
 
 
-def _closed(one: socket.socket) -> bool:
+def _closed(one):
     try:
         return one.recv(64) == b""
     except BlockingIOError:

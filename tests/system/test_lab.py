@@ -1,9 +1,6 @@
 """A lab in use: one command runs an experiment, certificates are revoked and renewed while routers run."""
 
-from __future__ import annotations
-
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -22,7 +19,7 @@ pytestmark = pytest.mark.system
 KEYS = Keys()
 
 
-def test_one_command_runs_while_others_watch_and_stop(tmp_path: Path) -> None:
+def test_one_command_runs_while_others_watch_and_stop(tmp_path):
     flight = Flight(tmp_path / "run", in_lab(tmp_path), "--case", "event", "duration_s=90")
     flight.until_flown()
     endpoint, _, lab = flight.endpoint().partition("#lab=")
@@ -45,7 +42,7 @@ def test_one_command_runs_while_others_watch_and_stop(tmp_path: Path) -> None:
     assert flight.logs().count("done (emergency stop by operator: zenpark estop)") == 3
 
 
-def test_what_is_missing_is_said_before_anything_starts(tmp_path: Path) -> None:
+def test_what_is_missing_is_said_before_anything_starts(tmp_path):
     lab = tmp_path / "lab"
     authority.create(lab, {"router": "router", "operator": "operator", "recorder": "recorder", "KH01": "robot"})
     for arguments, said in (
@@ -64,17 +61,16 @@ def test_what_is_missing_is_said_before_anything_starts(tmp_path: Path) -> None:
         assert "Traceback" not in done.stderr
 
 
-def test_lab_router_listens_on_every_interface(tmp_path: Path) -> None:
+def test_lab_router_listens_on_every_interface(tmp_path):
     authority.create(tmp_path / "lab", {"router": "router"})
     everywhere = ("--listen", "tls/0.0.0.0:0", "--listen", "quic/[::]:0")
     with Started("tools.guard", "router", str(FILE), "--lab", str(tmp_path / "lab"), *everywhere) as router:
-        assert router.process.stdout is not None
         assert router.process.stdout.readline().startswith("router ready on tls/0.0.0.0:0")
         assert router.end() == 0
 
 
 @pytest.fixture(params=["tls", "quic"])
-def laboratory(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Laboratory]:
+def laboratory(tmp_path, request):
     with Laboratory(tmp_path, request.param) as made:
         yield made
 
@@ -82,11 +78,11 @@ def laboratory(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Labor
 class Ear:
     """What the operator hears on a key."""
 
-    def __init__(self, session: zenoh.Session, key: str) -> None:
+    def __init__(self, session, key):
         self._samples = pubsub.subscriber(session, key)
-        self._seen: set[str] = set()
+        self._seen = set()
 
-    def heard(self, speaker: zenoh.Session, key: str, word: str) -> bool:
+    def heard(self, speaker, key, word):
         """Whether a word that is said now is heard."""
         speaker.put(key, word)
         self._seen |= {sample.payload.to_string() for sample in network.received(self._samples.handler)}
@@ -96,7 +92,7 @@ class Ear:
 @pytest.mark.parametrize(
     "laboratory", [pytest.param("tls", marks=pytest.mark.mechanism("revocation")), "quic"], indirect=True
 )
-def test_revoked_key_is_refused_by_a_running_router(laboratory: Laboratory, tmp_path: Path) -> None:
+def test_revoked_key_is_refused_by_a_running_router(laboratory, tmp_path):
     stolen = copy(laboratory.folder, tmp_path / "stolen")
     key = KEYS.pose("KH01")
     with laboratory.session("operator") as operator, laboratory.session("KH01", stolen) as thief:
@@ -114,13 +110,13 @@ def test_revoked_key_is_refused_by_a_running_router(laboratory: Laboratory, tmp_
                 threading.Event().wait(0.02)
 
 
-def test_a_new_authority_refuses_every_earlier_file(laboratory: Laboratory, tmp_path: Path) -> None:
+def test_a_new_authority_refuses_every_earlier_file(laboratory, tmp_path):
     stolen = copy(laboratory.folder, tmp_path / "stolen")
     with laboratory.session("operator", stolen) as before:
         assert network.connected(before)
         authority.renew(laboratory.folder, authority=True)
 
-        def lets_in() -> bool:
+        def lets_in():
             try:
                 laboratory.session("operator").close()
             except zenoh.ZError:
@@ -134,7 +130,7 @@ def test_a_new_authority_refuses_every_earlier_file(laboratory: Laboratory, tmp_
         until(lambda: not network.connected(before), "who was connected is out")
 
 
-def test_robots_continue_with_new_files_where_installed(laboratory: Laboratory) -> None:
+def test_robots_continue_with_new_files_where_installed(laboratory):
     """A revocation costs a moment of the network; whoever finds new files in its folder is back by itself."""
     laboratory.fly()
     authority.revoke(laboratory.folder, ["KH01", "KH03"])

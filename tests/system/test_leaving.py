@@ -1,13 +1,10 @@
 """Whoever ends does so in time: when the router does not answer, and when a robot is frozen and the launcher dies."""
 
-from __future__ import annotations
-
 import contextlib
 import signal
 import threading
 import time
 from functools import partial
-from pathlib import Path
 
 import psutil
 import pytest
@@ -19,14 +16,14 @@ from agents.network.shutdown import leave
 from experiments.recording import playback
 from tests.commands import zenpark
 from tests.conftest import RouterProcess
-from tests.system.lab import TRIANGLE, Flight, RobotProcess, Watcher, gone, until
+from tests.system.lab import TRIANGLE, Flight, RobotProcess, gone, until
 
 pytestmark = pytest.mark.system
 
 CUT_OFF_S = 3.0  # until the loss of the router is noticed: before that good-byes are still taken
 
 
-def test_robot_leaves_a_router_that_does_not_answer(router: RouterProcess, watcher: Watcher) -> None:
+def test_robot_leaves_a_router_that_does_not_answer(router, watcher):
     with RobotProcess(router.endpoint, "triangle", "KH01") as robot:
         watcher.until_all("idle", "KH01")
         with router.frozen():
@@ -36,11 +33,11 @@ def test_robot_leaves_a_router_that_does_not_answer(router: RouterProcess, watch
             assert time.monotonic() - began < 10.0  # Zenoh alone takes 13 s
 
 
-def stopped(pid: int) -> bool:
+def stopped(pid):
     return bool(psutil.Process(pid).status() == psutil.STATUS_STOPPED)
 
 
-def test_router_that_was_frozen_ends_when_ordered() -> None:
+def test_router_that_was_frozen_ends_when_ordered():
     """The kernel then gives the signal to any of its threads, at every second time to one that does not heed it."""
     for _ in range(4):
         router = RouterProcess()
@@ -50,7 +47,7 @@ def test_router_that_was_frozen_ends_when_ordered() -> None:
         assert router.stop() == 0
 
 
-def test_session_closes_in_time_and_live_ones_immediately(router: RouterProcess) -> None:
+def test_session_closes_in_time_and_live_ones_immediately(router):
     sessions = [network.open_session([router.endpoint], name="test", lease_s=1.0) for _ in range(2)]
     declared = [pubsub.pose_subscriber(sessions[1], Keys().status("*"))]
     assert leave(sessions[0])
@@ -65,7 +62,7 @@ def test_session_closes_in_time_and_live_ones_immediately(router: RouterProcess)
 
 
 @pytest.mark.mechanism("emergency stop: frozen router")
-def test_an_estop_that_nobody_answers_ends(router: RouterProcess) -> None:
+def test_an_estop_that_nobody_answers_ends(router):
     with router.frozen():
         done = zenpark("estop", "--connect", router.endpoint, code=None, timeout_s=30)
     assert done.returncode in {1, 2}
@@ -73,7 +70,7 @@ def test_an_estop_that_nobody_answers_ends(router: RouterProcess) -> None:
 
 
 @pytest.mark.parametrize("bodies", ["twin", "world"])
-def test_frozen_robot_delays_nobody_when_launcher_is_killed(tmp_path: Path, bodies: str) -> None:
+def test_frozen_robot_delays_nobody_when_launcher_is_killed(tmp_path, bodies):
     flight = Flight(tmp_path / "run", "triangle", "--case", "event", "--bodies", bodies, "duration_s=60")
     flight.until_flown()
     children = flight.children()
@@ -95,7 +92,7 @@ def test_frozen_robot_delays_nobody_when_launcher_is_killed(tmp_path: Path, bodi
                 process.kill()
 
 
-def test_suspended_conductor_gives_no_further_order(tmp_path: Path) -> None:
+def test_suspended_conductor_gives_no_further_order(tmp_path):
     flight = Flight(tmp_path / "run", "triangle", "--case", "event")
     flight.until_flown()
     robots = [process for name, process in flight.children().items() if name in TRIANGLE]

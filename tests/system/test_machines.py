@@ -1,7 +1,5 @@
 """The reference experiment on three machines, started from a fourth: network namespaces with a real sshd in each."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -10,8 +8,6 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,7 +16,7 @@ from experiments.file import catalogue
 from experiments.recording import playback
 from experiments.recording.topics import CHUNK_BYTES
 from tests.system.lab import NEAR_TRIANGLE, ROOT, TRIANGLE, options, typed, until
-from tests.system.machines import Machines, machines, why_not
+from tests.system.machines import machines, why_not
 from tools.commands.run import SPOILED
 
 LACKING = why_not()
@@ -32,25 +28,25 @@ OFFSET_S, DRIFT = 0.2, 50e-6  # of the second machine
 
 
 @pytest.fixture(scope="module")
-def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machines]:
+def lab(tmp_path_factory):
     with machines(tmp_path_factory.mktemp("machines"), ["desk", *ROBOTS]) as made:
         yield made
 
 
-def park_file(lab: Machines, folder: Path, duration_s: float) -> Path:
+def park_file(lab, folder, duration_s):
     """The reference experiment, its robots on the lab's machines."""
     text = catalogue.path("robotic-park").read_text("utf-8")
     text = text.replace("duration_s = 45.0", f"duration_s = {duration_s}").replace("at_s = 21.0", "at_s = 1.0")
     return on_hosts(lab, folder, text, ROBOTS)
 
 
-def triangle_file(lab: Machines, folder: Path, duration_s: float) -> Path:
+def triangle_file(lab, folder, duration_s):
     """The first experiment, one robot on each machine: enough for what does not depend on their number."""
     text = catalogue.path("triangle").read_text("utf-8").replace("duration_s = 15.0", f"duration_s = {duration_s}")
     return on_hosts(lab, folder, text, dict(zip(ROBOTS, (["KH01"], ["KH02"], ["CF01"]), strict=True)))
 
 
-def on_hosts(lab: Machines, folder: Path, text: str, robots: dict[str, list[str]]) -> Path:
+def on_hosts(lab, folder, text, robots):
     for host, names in robots.items():
         wrong = {"offset_s": OFFSET_S, "drift": DRIFT} if host == "lab2" else {}
         zenpark = lab[host].zenpark_file(**wrong)
@@ -60,7 +56,7 @@ def on_hosts(lab: Machines, folder: Path, text: str, robots: dict[str, list[str]
     return file
 
 
-def begin_at_desk(lab: Machines, *arguments: str) -> subprocess.Popen[str]:
+def begin_at_desk(lab, *arguments):
     return subprocess.Popen(
         lab["desk"].command(sys.executable, "-m", "tools.guard", *arguments),
         cwd=ROOT,
@@ -72,7 +68,7 @@ def begin_at_desk(lab: Machines, *arguments: str) -> subprocess.Popen[str]:
     )
 
 
-def output_of_success(flight: subprocess.Popen[str], lab: Machines) -> str:
+def output_of_success(flight, lab):
     """What a run said that went well; nothing of it is left on any machine."""
     out, _ = flight.communicate(timeout=100)
     assert flight.returncode in {0, SPOILED}, out
@@ -80,12 +76,12 @@ def output_of_success(flight: subprocess.Popen[str], lab: Machines) -> str:
     return out
 
 
-def busy(lab: Machines) -> list[str]:
+def busy(lab):
     """What still runs on any machine."""
     return [f"{name}: {process}" for name, each in lab.machines.items() for process in each.processes()]
 
 
-def test_one_command_flies_reference_and_fetches_all_files(lab: Machines, tmp_path: Path) -> None:
+def test_one_command_flies_reference_and_fetches_all_files(lab, tmp_path):
     file, folder = park_file(lab, tmp_path, 4.0), tmp_path / "run"
     flight = begin_at_desk(lab, "run", str(file), "--case", "periodic", "--out", str(folder), "--anyway", "--json")
     assert "lab2/CF01| CF01: running" in output_of_success(flight, lab), "output is streamed, with where it comes from"
@@ -126,13 +122,12 @@ def test_one_command_flies_reference_and_fetches_all_files(lab: Machines, tmp_pa
     assert re.search(r"\+20\d\.\d{3}", report)
 
 
-def test_centre_here_guides_remote_robots_by_one_clock(lab: Machines, tmp_path: Path) -> None:
+def test_centre_here_guides_remote_robots_by_one_clock(lab, tmp_path):
     file, folder = triangle_file(lab, tmp_path, 3.0), tmp_path / "run"
     options = ["--case", "periodic", "--set", "architecture=centralised", "--anyway", "--no-report"]
     flight = begin_at_desk(lab, "run", str(file), *options, "--out", str(folder))
     output_of_success(flight, lab)
     trace = playback.read(folder / "periodic.mcap").trace
-    assert trace.goals is not None
     sent = np.bincount(trace.goals.sent.link, minlength=len(trace.robots))
     assert (sent >= 25).all()
     assert (trace.goals.reached >= sent - 2).all(), "none is refused, neither as old nor as of tomorrow"
@@ -143,7 +138,7 @@ def test_centre_here_guides_remote_robots_by_one_clock(lab: Machines, tmp_path: 
 
 
 @pytest.mark.mechanism("hosts: way out")
-def test_launchers_death_lands_everybody_and_clears_all(lab: Machines, tmp_path: Path) -> None:
+def test_launchers_death_lands_everybody_and_clears_all(lab, tmp_path):
     file, folder = triangle_file(lab, tmp_path, 20.0), tmp_path / "run"
     words = options("--case", "periodic", "--out", folder, "--anyway", *NEAR_TRIANGLE)
     flight = begin_at_desk(lab, "run", str(file), *words)
@@ -164,7 +159,7 @@ def test_launchers_death_lands_everybody_and_clears_all(lab: Machines, tmp_path:
     assert playback.read(recording).complete
 
 
-def begun(lab: Machines, file: Path, folder: Path) -> subprocess.Popen[str]:
+def begun(lab, file, folder):
     """A run of the triangle in which CF01 runs."""
     words = ("--case", "event", "--out", str(folder), "--anyway", "--no-report")
     flight = begin_at_desk(lab, "run", str(file), *words)
@@ -172,12 +167,12 @@ def begun(lab: Machines, file: Path, folder: Path) -> subprocess.Popen[str]:
     return flight
 
 
-def said(logs: Path, robot: str, case: str = "event") -> str:
+def said(logs, robot, case="event"):
     file = logs / f"{case}-{robot}.log"
     return file.read_text() if file.exists() else ""
 
 
-def test_machine_cut_off_lands_its_robots_only(lab: Machines, tmp_path: Path) -> None:
+def test_machine_cut_off_lands_its_robots_only(lab, tmp_path):
     file, folder = triangle_file(lab, tmp_path, 8.0), tmp_path / "run"
     flight = begun(lab, file, folder)
     try:
@@ -194,7 +189,7 @@ def test_machine_cut_off_lands_its_robots_only(lab: Machines, tmp_path: Path) ->
     until(lambda: not busy(lab), "nothing is left")
 
 
-def test_a_short_cut_of_the_cable_lands_nobody(lab: Machines, tmp_path: Path) -> None:
+def test_a_short_cut_of_the_cable_lands_nobody(lab, tmp_path):
     """TCP sends what was lost again 3 s after the cut, although the cable is back after 2 s."""
     file, folder = triangle_file(lab, tmp_path, 10.0), tmp_path / "run"
     flight = begun(lab, file, folder)
@@ -207,7 +202,7 @@ def test_a_short_cut_of_the_cable_lands_nobody(lab: Machines, tmp_path: Path) ->
     until(lambda: not busy(lab), "nothing is left")
 
 
-def test_dead_robot_on_a_machine_is_restarted_there(lab: Machines, tmp_path: Path) -> None:
+def test_dead_robot_on_a_machine_is_restarted_there(lab, tmp_path):
     file, folder = tmp_path / "x.toml", tmp_path / "run"
     text = catalogue.path("triangle").read_text("utf-8").replace("duration_s = 15.0", "duration_s = 12.0")
     text = text.replace("seed = 1 ", 'on_loss = "restart"\nseed = 1 ')
@@ -226,7 +221,7 @@ def test_dead_robot_on_a_machine_is_restarted_there(lab: Machines, tmp_path: Pat
     until(lambda: not busy(lab), "nothing is left")
 
 
-def test_a_preflight_starts_robots_on_their_machines(lab: Machines, tmp_path: Path) -> None:
+def test_a_preflight_starts_robots_on_their_machines(lab, tmp_path):
     file = triangle_file(lab, tmp_path, 5.0)
     preflight = begin_at_desk(lab, "preflight", str(file), "--hop", "--out", str(tmp_path / "out"), "--json")
     out, _ = preflight.communicate(timeout=120)
@@ -237,7 +232,7 @@ def test_a_preflight_starts_robots_on_their_machines(lab: Machines, tmp_path: Pa
     assert busy(lab) == []
 
 
-def test_faults_of_machines_are_reported_with_remedy(lab: Machines, tmp_path: Path) -> None:
+def test_faults_of_machines_are_reported_with_remedy(lab, tmp_path):
     file = park_file(lab, tmp_path, 4.0)
     text = file.read_text()
     text = text.replace(str(lab["lab1"].folder / "zenpark"), "nowhere/zenpark")

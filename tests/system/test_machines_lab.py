@@ -1,15 +1,11 @@
 """A lab on several machines: three robots on two of them, over mutual TLS, started from a third with one command."""
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import json
 import shutil
 import stat
 import subprocess
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -17,7 +13,7 @@ from experiments.file import catalogue
 from experiments.real_time.hosts import authority
 from experiments.recording import playback
 from tests.system.lab import options, typed, until
-from tests.system.machines import Machines, machines, why_not
+from tests.system.machines import machines, why_not
 from tests.system.test_machines import begin_at_desk, busy
 from tools.commands.run import SPOILED
 
@@ -28,7 +24,7 @@ ROBOTS = {"lab1": ["KH01", "CF01"], "lab2": ["KH02"]}
 
 
 @pytest.fixture(scope="module")
-def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machines]:
+def lab(tmp_path_factory):
     with machines(tmp_path_factory.mktemp("machines"), ["desk", *ROBOTS]) as made:
         yield made
 
@@ -36,7 +32,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machines]:
 class Laboratory:
     """The file of an experiment with hosts, its lab beside it, and what each host was sent."""
 
-    def __init__(self, lab: Machines, folder: Path, network: str = "", *, drift: float = 0.0) -> None:
+    def __init__(self, lab, folder, network="", *, drift=0.0):
         self.lab, self.keys, self.file, self.out = lab, folder / "lab", folder / "triangle.toml", folder / "run"
         text = catalogue.path("triangle").read_text("utf-8")
         text += f'\n[network]\nlab = "lab"\n{network}\n'
@@ -48,7 +44,7 @@ class Laboratory:
         robots = [robot for each in ROBOTS.values() for robot in each]
         authority.create(self.keys, {**{role: role for role in authority.SERVICES}, **dict.fromkeys(robots, "robot")})
 
-    def finish_command(self, *arguments: str, limit_s: float = 60.0) -> tuple[int, str]:
+    def finish_command(self, *arguments, limit_s=60.0):
         """Exit code and all that it said."""
         command, *rest = arguments
         process = begin_at_desk(self.lab, command, *rest[: command != "run"], str(self.file), *rest[command != "run" :])
@@ -59,11 +55,11 @@ class Laboratory:
             out, _ = process.communicate()
         return 0 if process.returncode == SPOILED else process.returncode, out
 
-    def fly(self, duration_s: float = 2.0) -> tuple[int, str]:
+    def fly(self, duration_s=2.0):
         more = ("--case", "event", f"duration_s={duration_s}", "--anyway", "--no-report", "--out", self.out)
         return self.finish_command("run", *options(*more))
 
-    def flew(self, duration_s: float = 2.0) -> None:
+    def flew(self, duration_s=2.0):
         code, out = self.fly(duration_s)
         assert code == 0, out
         until(lambda: not busy(self.lab), "nothing is left")
@@ -74,7 +70,7 @@ class Laboratory:
             assert f"{robot}: done (finished)" in log, log
 
 
-def test_machines_get_own_keys_and_fly_through_ssh(lab: Machines, tmp_path: Path) -> None:
+def test_machines_get_own_keys_and_fly_through_ssh(lab, tmp_path):
     made = Laboratory(lab, tmp_path)
     code, out = made.finish_command("hosts", "check")
     assert code == 1, out
@@ -108,7 +104,7 @@ def test_machines_get_own_keys_and_fly_through_ssh(lab: Machines, tmp_path: Path
 
 
 @pytest.mark.parametrize("protocol", ["tls", "quic"])
-def test_remote_robots_reach_a_router_listening_for_them(lab: Machines, tmp_path: Path, protocol: str) -> None:
+def test_remote_robots_reach_a_router_listening_for_them(lab, tmp_path, protocol):
     made = Laboratory(lab, tmp_path, f'listen = ["{protocol}/0.0.0.0:7447"]')
     assert made.finish_command("hosts", "install")[0] == 0
     code, out = made.fly()
@@ -120,7 +116,7 @@ def test_remote_robots_reach_a_router_listening_for_them(lab: Machines, tmp_path
     made.flew()
 
 
-def test_robots_follow_a_clock_that_drifts_meanwhile(lab: Machines, tmp_path: Path) -> None:
+def test_robots_follow_a_clock_that_drifts_meanwhile(lab, tmp_path):
     drift = 2e-3  # forty times what is bad, so that seconds show it
     made = Laboratory(lab, tmp_path, drift=drift)
     assert made.finish_command("hosts", "install")[0] == 0

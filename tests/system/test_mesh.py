@@ -1,13 +1,9 @@
 """A mesh: the reference experiment without any router; each robot is linked with exactly its neighbours."""
 
-from __future__ import annotations
-
 import math
 import time
 from contextlib import ExitStack
-from pathlib import Path
 
-import psutil
 import pytest
 import zenoh
 
@@ -15,7 +11,6 @@ from agents.network import endpoints as topology
 from agents.network import messages
 from agents.network import session as network
 from agents.network.endpoints import free_endpoint
-from agents.network.lab import Role
 from agents.network.zenoh_config import config, settings
 from experiments.definition import access_rights, mesh
 from experiments.file.document import load
@@ -30,7 +25,7 @@ pytestmark = pytest.mark.system
 MESH = "network.topology=mesh"
 
 
-def peers(process: psutil.Process, ports: dict[int, str]) -> set[str]:
+def peers(process, ports):
     """Members that a process is linked with by a connection of its own, by the ports at which they listen."""
     return {
         ports[each.raddr.port]
@@ -39,7 +34,7 @@ def peers(process: psutil.Process, ports: dict[int, str]) -> set[str]:
     }
 
 
-def test_the_reference_experiment_without_a_router(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_reference_experiment_without_a_router(tmp_path, capsys):
     flight = Flight(tmp_path / "run", "robotic-park", "--case", "event", MESH)
     flight.until_flown()
     endpoints = (flight.folder / "network.txt").read_text().split()
@@ -49,7 +44,7 @@ def test_the_reference_experiment_without_a_router(tmp_path: Path, capsys: pytes
 
     hears = access_rights.senders_by_receiver(load("robotic-park").plan)
     robots = list(hears)
-    linked: dict[str, set[str]] = {name: set() for name in robots}
+    linked = {name: set() for name in robots}
     for name in robots:
         for other in peers(children[name], ports):
             linked[name].add(other)
@@ -77,7 +72,7 @@ def test_the_reference_experiment_without_a_router(tmp_path: Path, capsys: pytes
     assert run.notes == ("event: lost CF02",) or "event" in run.traces
 
 
-def test_robot_cut_off_from_everybody_holds(tmp_path: Path) -> None:
+def test_robot_cut_off_from_everybody_holds(tmp_path):
     flight = Flight(tmp_path / "run", "triangle", "--case", "periodic", MESH, "duration_s=60")
     flight.until_flown()
     endpoints = (flight.folder / "network.txt").read_text().split()
@@ -91,7 +86,7 @@ def test_robot_cut_off_from_everybody_holds(tmp_path: Path) -> None:
     flight.interrupt()
 
 
-def test_an_endpoint_that_somebody_else_has_is_named(tmp_path: Path) -> None:
+def test_an_endpoint_that_somebody_else_has_is_named(tmp_path):
     taken = free_endpoint(0)
     with zenoh.open(config(settings("router", listen=[taken], name="stranger"))):
         where = f'network.addresses={{KH01 = "{taken}"}}'
@@ -103,7 +98,7 @@ def test_an_endpoint_that_somebody_else_has_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.mechanism("mesh")
-def test_a_silent_missing_link_is_named() -> None:
+def test_a_silent_missing_link_is_named():
     right = [topology.owned(endpoint, name) for endpoint, name in zip(free(3), TRIANGLE, strict=True)]
     wrong = [topology.owned(free_endpoint(0), "KH01"), *right[1:]]  # where KH02 seeks it
     with ExitStack() as stack:
@@ -117,21 +112,21 @@ def test_a_silent_missing_link_is_named() -> None:
         assert not watcher.order("KH02", messages.Order("takeoff")).ok
 
 
-def free(count: int) -> list[str]:
+def free(count):
     """So many endpoints at which nobody listens."""
-    found: set[str] = set()
+    found = set()
     while len(found) < count:
         found.add(free_endpoint(0))
     return sorted(found)
 
 
-def test_lab_members_let_nobody_exceed_its_rights(tmp_path: Path) -> None:
+def test_lab_members_let_nobody_exceed_its_rights(tmp_path):
     """No router could refuse anything in a mesh: the receiver of an order does."""
     file = tmp_path / "mesh.toml"
     file.write_text(load("triangle").path.read_text() + '\n[network]\ntopology = "mesh"\nlab = "lab"\n')
     case = load(file).plan
     listening = mesh.listening_hosts(case)
-    identities: dict[str, Role] = {role: role for role in authority.SERVICES}
+    identities = {role: role for role in authority.SERVICES}
     authority.create(
         tmp_path / "lab", {**identities, **dict.fromkeys((*case.names, "KH09"), "robot")}, listening=listening
     )

@@ -1,15 +1,11 @@
 """Robots of another process, behind real bridges, in the world: twins see them, and keep clear of them."""
 
-from __future__ import annotations
-
 import math
 import time
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import pytest
-import zenoh
 
 from agents.body.kinds import KINDS
 from agents.network import messages, pubsub
@@ -17,7 +13,6 @@ from agents.network import session as network
 from agents.network.keys import Keys
 from experiments.file.document import load
 from experiments.recording import playback
-from tests.conftest import RouterProcess
 from tests.system.lab import Flight, until
 
 pytestmark = pytest.mark.system
@@ -66,14 +61,14 @@ class Way(NamedTuple):
     begins: float
 
 
-def ahead(scan: messages.Ranges) -> float:
+def ahead(scan):
     """Reading of the rays along the nose [m]; NaN without any."""
     along = np.abs(np.array(scan.bearing)) + np.abs(np.array(scan.elevation)) < 1e-6
     readings = [reading for reading, ray in zip(scan.distance, along, strict=True) if ray and reading is not None]
     return min(readings, default=math.nan)
 
 
-def kill_positioning(flight: Flight, session: zenoh.Session, robot: str) -> None:
+def kill_positioning(flight, session, robot):
     """Ends the processes of motion capture: one is started again, the end of the other is told."""
     positions = pubsub.Inbox(pubsub.subscriber(session, Keys().position(robot)), messages.Position)
     flight.children()["vicon"].kill()
@@ -95,7 +90,7 @@ def kill_positioning(flight: Flight, session: zenoh.Session, robot: str) -> None
         Way("all", IN_THE_AIR, "CF02", "CF01", 12.0),
     ],
 )
-def test_twin_sees_and_avoids_a_real_robot(tmp_path: Path, router: RouterProcess, way: Way) -> None:
+def test_twin_sees_and_avoids_a_real_robot(tmp_path, router, way):
     twin, real = way.twin, way.real
     file, folder = tmp_path / "mixed.toml", tmp_path / "run"
     file.write_text(WORLD.format(hears=way.hears, twin=twin, real=real, begins=way.begins) + way.robots)
@@ -103,10 +98,10 @@ def test_twin_sees_and_avoids_a_real_robot(tmp_path: Path, router: RouterProcess
     with network.open_session([router.endpoint], name="observer") as session:
         ranges = pubsub.Inbox(pubsub.subscriber(session, Keys().ranges(twin), 4096), messages.Ranges)
         truths = pubsub.Inbox(pubsub.subscriber(session, Keys().truth(twin), 4096), messages.Position)
-        scans: list[messages.Ranges] = []
+        scans = []
         near_since = math.inf
 
-        def arrived() -> bool:
+        def arrived():
             nonlocal near_since
             assert flight.process.poll() is None, flight.logs()
             scans.extend(ranges.read())

@@ -1,19 +1,14 @@
 """A bad network in real time: the listeners lose and delay what the same file loses and delays in virtual time."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from experiments.recording import playback
-from experiments.recording.trace import Trace
 from experiments.run import reopen
 from tests.runs import flown
 from tests.system.lab import Flight, transmits_at_50_hz
-from twins.arrays import Index
 
 pytestmark = pytest.mark.system
 
@@ -21,7 +16,7 @@ BAD = ("channel.loss=0.3", "channel.delay_s=0.05")
 MARGIN_S = 0.2  # what was said so shortly before the end may still be under way
 
 
-def sent_and_heard(trace: Trace, listener: int, speaker: int, end: float) -> tuple[Index, Index]:
+def sent_and_heard(trace, listener, speaker, end):
     """Running numbers of the run that a robot said, and those of them that another one heard."""
     said = trace.sent.seq[(trace.sent.link == speaker) & (trace.sent.stamp < end - MARGIN_S)]
     net = trace.plan.pose_links
@@ -29,13 +24,13 @@ def sent_and_heard(trace: Trace, listener: int, speaker: int, end: float) -> tup
     return said, np.intersect1d(said, trace.received.seq[mine])
 
 
-def virtual(duration_s: float) -> Trace:
+def virtual(duration_s):
     """The same in virtual time, longer: robots start sooner there, and their numbers must overlap."""
     return flown("triangle", "periodic", *BAD, "formation.gain=1.4", f"duration_s={duration_s}").trace
 
 
 @pytest.mark.mechanism("modelled channel in real time")
-def test_receivers_lose_what_the_virtual_network_loses(tmp_path: Path) -> None:
+def test_receivers_lose_what_the_virtual_network_loses(tmp_path):
     folder = tmp_path / "run"
     changes = (*BAD, "duration_s=3", "robots.CF01.hover=0.3", "formation.gain=1.4")
     flight = Flight(folder, "triangle", "--case", "periodic", "--json", *changes)
@@ -62,22 +57,19 @@ def test_receivers_lose_what_the_virtual_network_loses(tmp_path: Path) -> None:
 
     delay = real.received.arrival - real.received.stamp
     assert delay.min() >= 0.05 - 1e-5
-    assert real.dropped is not None
     assert real.dropped.sum() == pytest.approx(0.3 * sent, rel=0.15)
 
 
-def test_centre_communicates_over_the_same_network(tmp_path: Path) -> None:
+def test_centre_communicates_over_the_same_network(tmp_path):
     folder = tmp_path / "run"
     flight = Flight(folder, "triangle", "--case", "periodic", *BAD, "duration_s=4", "architecture=centralised")
     code, _ = flight.finish()
     assert code == 0, flight.said
     case = reopen(folder).metrics["periodic"]
     centre = case.guidance
-    assert centre is not None
     assert case.lost == 0, "of the real network nothing is lost"
     sent = sum(robot.messages for robot in case.robots)
     assert centre.poses_lost / sent == pytest.approx(0.3, abs=0.07)
     assert centre.goals_lost / centre.goals == pytest.approx(0.3, abs=0.15)
     goals = playback.read(folder / "periodic.mcap").trace.goals
-    assert goals is not None
     assert goals.delay.min() >= 0.1 - 1e-5, "both ways"

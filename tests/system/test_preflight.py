@@ -1,12 +1,9 @@
 """`./zenpark preflight`: robots checked one by one, by the processes of a run."""
 
-from __future__ import annotations
-
 import json
 import signal
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -27,7 +24,7 @@ KH01 = { kind = "khepera4", start = [0.3, 0.0], body = "BODY" }
 """
 
 
-def preflight(file: Path, text: str, *words: str) -> subprocess.Popen[str]:
+def preflight(file, text, *words):
     file.write_text(text)
     command = [sys.executable, *GUARD, "preflight", str(file), "--json", "--out", str(file.parent / "out"), *words]
     return subprocess.Popen(
@@ -35,7 +32,7 @@ def preflight(file: Path, text: str, *words: str) -> subprocess.Popen[str]:
     )
 
 
-def checked(process: subprocess.Popen[str], *codes: int) -> list[dict[str, dict[str, str]]]:
+def checked(process, *codes):
     """Checks of each robot, by name."""
     out, err = process.communicate(timeout=140)
     assert process.returncode in codes, out + err
@@ -45,7 +42,7 @@ def checked(process: subprocess.Popen[str], *codes: int) -> list[dict[str, dict[
 
 
 @pytest.mark.timeout(90)
-def test_one_hops_and_stops_while_another_is_red(tmp_path: Path) -> None:
+def test_one_hops_and_stops_while_another_is_red(tmp_path):
     text = TWO.replace("BODY", "khepera4://127.0.0.1:9")
     drone, wheels = checked(preflight(tmp_path / "two.toml", text, "--hop", "--stop"), 1)
     names = ("ready", "stop, motors off", "hop", "stop, motors on")
@@ -56,7 +53,7 @@ def test_one_hops_and_stops_while_another_is_red(tmp_path: Path) -> None:
 
 @pytest.mark.mechanism("preflight: a hop that is interrupted")
 @pytest.mark.timeout(90)
-def test_ctrl_c_lands_the_robot_that_hops(tmp_path: Path) -> None:
+def test_ctrl_c_lands_the_robot_that_hops(tmp_path):
     process = preflight(tmp_path / "two.toml", TWO.replace("BODY", "twin"), "--hop")
     log = tmp_path / "out" / "logs" / "preflight-CF01.log"
     until(lambda: log.exists() and "airborne" in log.read_text(), "it is in the air", 60.0)
@@ -78,7 +75,7 @@ T01 = { kind = "tello", start = [0.0, 0.6, 0.0], hover = 0.8 }
 
 
 @pytest.mark.timeout(150)
-def test_drones_hop_through_their_bridges_under_motion_capture(tmp_path: Path) -> None:
+def test_drones_hop_through_their_bridges_under_motion_capture(tmp_path):
     process = preflight(tmp_path / "drones.toml", DRONES, "--hop", "--bodies", "protocol")
     drone, tello = checked(process, 0)
     assert {drone[name]["verdict"] for name in ("address", "firmware", "battery", "position", "radio", "hop")} == {"ok"}
@@ -102,7 +99,7 @@ device = { twin_stick_speed = 0.6, stick_speed = SPEED }
 
 @pytest.mark.timeout(120)
 @pytest.mark.parametrize(("believed", "verdict"), [(1.0, "bad"), (0.6, "ok")])
-def test_sticks_of_a_tello_are_measured(tmp_path: Path, believed: float, verdict: str) -> None:
+def test_sticks_of_a_tello_are_measured(tmp_path, believed, verdict):
     """Under simulated motion capture, at a fifth of its sticks, before any loop is closed."""
     text = TELLO.replace("SPEED", str(believed))
     (robot,) = checked(preflight(tmp_path / "tello.toml", text, "--sticks", "--bodies", "protocol"), 0, 1)

@@ -1,9 +1,6 @@
 """Every robot behind its real bridge and a protocol twin, in one command."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,7 +19,7 @@ pytestmark = pytest.mark.system
 
 
 @pytest.mark.timeout(180)
-def test_the_reference_experiment_flies_behind_real_bridges(tmp_path: Path) -> None:
+def test_the_reference_experiment_flies_behind_real_bridges(tmp_path):
     folder = tmp_path / "run"
     words = ("--bodies", "protocol", "--case", "event", "--json", "duration_s=10", "timeline=[]")
     flight = Flight(folder, "robotic-park", *words, *NEAR)
@@ -49,12 +46,11 @@ def test_the_reference_experiment_flies_behind_real_bridges(tmp_path: Path) -> N
     assert_formed(trace, 0.05, since_s=trace.time[-1] - 1.0)
 
 
-def heard_of(folder: Path) -> dict[str, object]:
+def heard_of(folder):
     """What the neighbours of a run hear: keys, structs, how often; and nothing of what the robots are."""
     with (folder / "periodic.mcap").open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
         summary = reader.get_summary()
-        assert summary is not None
         topics = {c.topic: summary.schemas[c.schema_id].data for c in summary.channels.values()}
         poses = [message for *_, message in reader.iter_decoded_messages([t for t in topics if t.endswith("/pose")])]
     trace = playback.read(folder / "periodic.mcap").trace
@@ -62,7 +58,7 @@ def heard_of(folder: Path) -> dict[str, object]:
     return {"topics": topics, "fields": {tuple(pose.__slots__) for pose in poses}}
 
 
-def test_swap_is_one_word_without_difference_to_neighbours(tmp_path: Path) -> None:
+def test_swap_is_one_word_without_difference_to_neighbours(tmp_path):
     twins, protocol = tmp_path / "twins", tmp_path / "protocol"
     short = ("--case", "periodic", "duration_s=4")
     assert Flight(twins, "triangle", *short).finish()[0] == 0
@@ -77,7 +73,7 @@ def test_swap_is_one_word_without_difference_to_neighbours(tmp_path: Path) -> No
     assert heard_of(twins) == heard_of(protocol)
 
 
-def test_robot_that_does_not_move_fails_the_run(tmp_path: Path) -> None:
+def test_robot_that_does_not_move_fails_the_run(tmp_path):
     """A Khepera whose server ignores `d`, and answers as one that obeys it."""
     twin = Served(khepera4.KheperaDevice, request("khepera4", ["khepera4-twin"], device={"server": "2023-01-15"}))
     file = tmp_path / "pair.toml"
@@ -102,7 +98,7 @@ trigger = {{ kind = "periodic", period_s = 0.05 }}
     assert "error [m] KH01 0." in flight.said()
 
 
-def test_twins_shadow_a_crazyflie_and_a_khepera(tmp_path: Path) -> None:
+def test_twins_shadow_a_crazyflie_and_a_khepera(tmp_path):
     folder = tmp_path / "run"
     flight = Flight(
         folder, "triangle", "--case", "periodic", "--json", "duration_s=4",
@@ -113,13 +109,10 @@ def test_twins_shadow_a_crazyflie_and_a_khepera(tmp_path: Path) -> None:
     assert code == 0, flight.said()
     assert json.loads(out)["cases"]["periodic"]["collisions"] == 0
     trace = playback.read(folder / "periodic.mcap").trace
-    assert trace.shadow_position is not None
     known = np.isfinite(trace.shadow_position).all(axis=2).mean(axis=0)
     assert known.tolist() == [pytest.approx(1.0, abs=0.05), 0.0, pytest.approx(1.0, abs=0.05)]
     khepera, none, crazyflie = (robot.shadow for robot in measure(trace).robots)
     assert none is None
-    assert khepera is not None
-    assert crazyflie is not None
     assert (khepera.horizon_s, crazyflie.horizon_s) == (5.0, 1.5)
     moved = np.ptp(trace.position[:, [0, 2], :2], axis=0)
     assert (moved.max(axis=1) > 0.1).all()
@@ -129,5 +122,4 @@ def test_twins_shadow_a_crazyflie_and_a_khepera(tmp_path: Path) -> None:
     for shadow, far in ((khepera, moved[0]), (crazyflie, moved[1])):
         axis = int(far.argmax())
         correlation = shadow.correlation[axis]
-        assert correlation is not None
         assert correlation > 0.98

@@ -3,14 +3,11 @@
 `tests/system/rclpy_wheels.py` installs it; where there is none, these tests are skipped and say why.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -29,7 +26,7 @@ PADDED = {ros2.ODOMETRY, ros2.DIAGNOSTIC_ARRAY}  # Fast CDR leaves padding undef
 WITHOUT_WHEEL = {ros2.TF_MESSAGE}  # a list of TransformStamped; its hash is tested against the published one
 
 
-def ask(folder: Path, *words: str, given: object = None) -> Any:
+def ask(folder, *words, given=None):
     """The answer of `rclpy_side.py`, in a network of its own."""
     own = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_DOMAIN_ID": "30", "ROS_LOG_DIR": str(folder)}
     own |= {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}  # shared memory stays behind when a process is killed
@@ -42,7 +39,7 @@ def ask(folder: Path, *words: str, given: object = None) -> Any:
     return json.loads(done.stdout)
 
 
-def payloads() -> dict[str, bytes]:
+def payloads():
     """A message of each type that this project uses, as its own CDR."""
     types = ros2.types("kilted")
     state = messages.State("tb3", 1, 1.7e9, "running", (1.0, 2.0, 0.5), None, 0.3, None, None, 0.0)
@@ -60,7 +57,7 @@ def payloads() -> dict[str, bytes]:
     return ros_messages() | {kind: types.encode(message, kind) for kind, message in made.items()}
 
 
-def test_types_and_cdr_are_those_of_rclpy(tmp_path: Path) -> None:
+def test_types_and_cdr_are_those_of_rclpy(tmp_path):
     ours, types = payloads(), ros2.types("kilted")
     assert set(ours) == KINDS
     theirs = ask(tmp_path, "types", given={kind: payload.hex() for kind, payload in ours.items()})
@@ -78,7 +75,7 @@ def test_types_and_cdr_are_those_of_rclpy(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", [ros2.TWIST, ros2.TWIST_STAMPED])
-def test_watchdog_stops_robot_of_killed_commander(tmp_path: Path, kind: str) -> None:
+def test_watchdog_stops_robot_of_killed_commander(tmp_path, kind):
     printed = subprocess.run(
         [sys.executable, "-m", "tools.guard", "turtlebot", "watchdog"], capture_output=True, check=True
     )

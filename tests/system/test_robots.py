@@ -1,13 +1,10 @@
 """Robot processes started by hand: whom they hear, what they notice and survive, how they are stopped."""
 
-from __future__ import annotations
-
 import json
 import math
 import os
 import time
 from contextlib import ExitStack
-from pathlib import Path
 
 import msgspec
 import pytest
@@ -15,30 +12,29 @@ import zenoh
 
 from agents.network import messages
 from experiments.file import catalogue, document
-from tests.conftest import RouterProcess
 from tests.experiments.traces import parse_links
-from tests.system.lab import TRIANGLE, RobotProcess, Watcher
+from tests.system.lab import TRIANGLE, RobotProcess
 
 pytestmark = pytest.mark.system
 
 BLOCK = zenoh.CongestionControl.BLOCK  # a stop must not be dropped where a hundred kilobytes go before it
 
 
-def robots_flying(stack: ExitStack, router: RouterProcess, file: str, *names: str) -> RobotProcess:
+def robots_flying(stack, router, file, *names):
     return stack.enter_context(RobotProcess(router.endpoint, file, *names))
 
 
 @pytest.fixture
-def low_file(tmp_path: Path) -> str:
+def low_file(tmp_path):
     """The triangle, whose drone is soon up and soon down."""
     file = tmp_path / "low.toml"
     file.write_text(catalogue.path("triangle").read_text("utf-8").replace("hover = 0.6", "hover = 0.3"), "utf-8")
     return str(file)
 
 
-def subscriptions(session: zenoh.Session) -> dict[str, set[str]]:
+def subscriptions(session):
     """What each session subscribes to, by the names that it goes by in the router's admin space."""
-    found: dict[str, set[str]] = {}
+    found = {}
     for reply in session.get("@/*/router/subscriber/**", timeout=2.0):
         assert reply.ok is not None
         key = str(reply.ok.key_expr).partition("/subscriber/")[2]
@@ -48,7 +44,7 @@ def subscriptions(session: zenoh.Session) -> dict[str, set[str]]:
     return found
 
 
-def zids(session: zenoh.Session) -> dict[str, str]:
+def zids(session):
     """Name of a session -> its id, from each session's own admin space."""
     named = {}
     for reply in session.get("@/*/client", timeout=2.0):
@@ -61,7 +57,7 @@ def zids(session: zenoh.Session) -> dict[str, str]:
 @pytest.mark.parametrize(
     "file", ["robotic-park", pytest.param("convoy", marks=pytest.mark.mechanism("subscriptions of neighbours only"))]
 )  # nobody listens to the last robot of a convoy
-def test_each_robot_hears_exactly_its_neighbours(router: RouterProcess, watcher: Watcher, file: str) -> None:
+def test_each_robot_hears_exactly_its_neighbours(router, watcher, file):
     experiment = document.read(file).experiment
     wanted = {
         name: {s for listener, s, _, _ in parse_links(experiment) if listener == name} for name in experiment.robots
@@ -80,7 +76,7 @@ def test_each_robot_hears_exactly_its_neighbours(router: RouterProcess, watcher:
             assert all("estop" in key or "@adv" in key for key in beyond), beyond
 
 
-def test_late_joiner_and_restarted_robot_receive_last_poses(router: RouterProcess, watcher: Watcher) -> None:
+def test_late_joiner_and_restarted_robot_receive_last_poses(router, watcher):
     with ExitStack() as stack:
         robots_flying(stack, router, "triangle", "KH01")
         robots_flying(stack, router, "triangle", "KH02")
@@ -102,7 +98,7 @@ def test_late_joiner_and_restarted_robot_receive_last_poses(router: RouterProces
 
 
 @pytest.mark.mechanism("orders")
-def test_orders_are_answered_and_refused_with_a_reason(router: RouterProcess, watcher: Watcher, low_file: str) -> None:
+def test_orders_are_answered_and_refused_with_a_reason(router, watcher, low_file):
     with ExitStack() as stack:
         robots_flying(stack, router, low_file, *TRIANGLE)
         watcher.until_all("ready", *TRIANGLE)
@@ -133,9 +129,9 @@ def test_orders_are_answered_and_refused_with_a_reason(router: RouterProcess, wa
         watcher.until_all("done", *TRIANGLE)
 
 
-def nonsense() -> list[tuple[bytes, str]]:
+def nonsense():
     honest = messages.Pose("KH02", 10**6, time.time(), (0.1, 0.1, 0.0), (0.0, 0.0, 0.0), 0.0)
-    wrong: list[dict[str, object]] = [
+    wrong = [
         *({"position": (x, 0.0, 0.0)} for x in (math.nan, math.inf, 1e6)),
         *({"velocity": (x, 0.0, 0.0)} for x in (math.nan, 1e9)),
         *({"stamp": stamp} for stamp in (math.nan, 1e300, time.time() + 3600.0)),
@@ -158,7 +154,7 @@ def nonsense() -> list[tuple[bytes, str]]:
 
 
 @pytest.mark.mechanism("malformed messages")
-def test_nonsense_on_every_key_is_counted_moving_nobody(router: RouterProcess, watcher: Watcher, low_file: str) -> None:
+def test_nonsense_on_every_key_is_counted_moving_nobody(router, watcher, low_file):
     with ExitStack() as stack:
         robots_flying(stack, router, low_file, *TRIANGLE)
         watcher.take_off(*TRIANGLE)
@@ -174,7 +170,7 @@ def test_nonsense_on_every_key_is_counted_moving_nobody(router: RouterProcess, w
         watcher.session.delete(watcher.keys.pose("KH02"))
         watcher.session.delete(watcher.keys.estop)
 
-        def counted() -> int:
+        def counted():
             """Refused payloads, and poses that were well formed and came from another source than the robot."""
             status = watcher.status["CF01"]
             return status.malformed + status.foreign.get("KH02", 0)
@@ -187,12 +183,11 @@ def test_nonsense_on_every_key_is_counted_moving_nobody(router: RouterProcess, w
 
 
 @pytest.mark.mechanism("lifeline: a robot lands with its starter")
-def test_a_robot_whose_starter_falls_silent_lands(router: RouterProcess, watcher: Watcher, low_file: str) -> None:
+def test_a_robot_whose_starter_falls_silent_lands(router, watcher, low_file):
     with RobotProcess(router.endpoint, low_file, *TRIANGLE, lifeline=True) as robot:
         stdin = robot.process.stdin
-        assert stdin is not None
 
-        def starter_is_heard_and_all_are_ready() -> bool:
+        def starter_is_heard_and_all_are_ready():
             stdin.write("\n")
             stdin.flush()
             return all(watcher.phase(name) == "ready" for name in TRIANGLE)
@@ -208,7 +203,7 @@ def test_a_robot_whose_starter_falls_silent_lands(router: RouterProcess, watcher
 
 
 @pytest.mark.mechanism("frozen neighbour")
-def test_a_killed_and_a_frozen_neighbour_are_noticed(router: RouterProcess, watcher: Watcher) -> None:
+def test_a_killed_and_a_frozen_neighbour_are_noticed(router, watcher):
     with ExitStack() as stack:
         robots = {name: robots_flying(stack, router, "triangle", name) for name in TRIANGLE}
         watcher.until_all("ready", *TRIANGLE)
@@ -227,7 +222,7 @@ def test_a_killed_and_a_frozen_neighbour_are_noticed(router: RouterProcess, watc
 
 
 @pytest.mark.mechanism("emergency stop from any Zenoh client")
-def test_an_emergency_stop_reaches_every_process(router: RouterProcess, watcher: Watcher) -> None:
+def test_an_emergency_stop_reaches_every_process(router, watcher):
     key = watcher.keys.estop
     with ExitStack() as stack:
         robots = [robots_flying(stack, router, "triangle", name) for name in TRIANGLE]
@@ -241,7 +236,7 @@ def test_an_emergency_stop_reaches_every_process(router: RouterProcess, watcher:
         assert all(robot.process.poll() is None for robot in robots)
 
 
-def test_user_errors_are_reported_without_a_traceback(router: RouterProcess) -> None:
+def test_user_errors_are_reported_without_a_traceback(router):
     for arguments, words in (
         (("triangle", "KH9"), "no robot 'KH9' in this experiment"),
         (("trangle", "KH01"), "did you mean 'triangle'"),

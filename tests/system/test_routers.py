@@ -1,10 +1,6 @@
 """Two routers: who loses one goes on at the other, the first comes back, and a newcomer sees everybody at either."""
 
-from __future__ import annotations
-
 import time
-from collections.abc import Iterator
-from pathlib import Path
 
 import msgspec
 import psutil
@@ -24,7 +20,7 @@ from tests.system.secured import FLOWN, Laboratory, refused
 pytestmark = pytest.mark.system
 
 
-def routers(flight: Flight) -> list[tuple[psutil.Process, str]]:
+def routers(flight):
     """Routers of a run, with their endpoints."""
     found = []
     for child in psutil.Process(flight.process.pid).children():
@@ -35,7 +31,7 @@ def routers(flight: Flight) -> list[tuple[psutil.Process, str]]:
     return sorted(found, key=lambda pair: endpoints.index(pair[1]))
 
 
-def test_a_killed_router_holds_nobody_up(tmp_path: Path) -> None:
+def test_a_killed_router_holds_nobody_up(tmp_path):
     flight = Flight(tmp_path / "run", "triangle", "--case", "periodic", "network.routers=2", "duration_s=8")
     flight.until_flown()
     (first, one), (_, other) = routers(flight)
@@ -58,7 +54,7 @@ def test_a_killed_router_holds_nobody_up(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def router_lab(tmp_path: Path) -> Iterator[tuple[Laboratory, str]]:
+def router_lab(tmp_path):
     """Robots in flight at one router of a lab, and the endpoint of another that is linked with it."""
     with Laboratory(tmp_path, linked=True) as made:
         (other,) = lab.secured([free_endpoint(preferred_port=0, protocol="tls")], made.folder)
@@ -67,7 +63,7 @@ def router_lab(tmp_path: Path) -> Iterator[tuple[Laboratory, str]]:
         yield made, other
 
 
-def test_intruder_gets_nothing_at_the_other_router_either(router_lab: tuple[Laboratory, str]) -> None:
+def test_intruder_gets_nothing_at_the_other_router_either(router_lab):
     made, other = router_lab
     keys = made.watcher.keys
     assert msgspec.json.decode(made.rights.read_bytes(), type=Rights).linked
@@ -100,7 +96,7 @@ def test_intruder_gets_nothing_at_the_other_router_either(router_lab: tuple[Labo
 
 
 @pytest.mark.mechanism("router frozen")
-def test_robots_hold_while_a_long_lease_router_freezes(patient_router: RouterProcess, tmp_path: Path) -> None:
+def test_robots_hold_while_a_long_lease_router_freezes(patient_router, tmp_path):
     changes = (f'network.connect=["{patient_router.endpoint}"]', "safety.neighbour_timeout_s=0.6")
     flight = Flight(tmp_path / "run", "triangle", "--case", "periodic", *NEAR_TRIANGLE, *changes)
     flight.until_flown()
@@ -114,7 +110,7 @@ def test_robots_hold_while_a_long_lease_router_freezes(patient_router: RouterPro
     assert_held_in_time(flight, "periodic", stopped)
 
 
-def test_run_continues_at_second_router_while_first_freezes(patient_router: RouterProcess, tmp_path: Path) -> None:
+def test_run_continues_at_second_router_while_first_freezes(patient_router, tmp_path):
     second = RouterProcess(lease_s=60.0)
     try:
         both = f'network.connect=["{patient_router.endpoint}", "{second.endpoint}"]'

@@ -1,7 +1,5 @@
 """A whole run in real time, through the command line."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import re
@@ -35,7 +33,7 @@ class Whole(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Whole:
+def whole(tmp_path_factory):
     folder = tmp_path_factory.mktemp("whole") / "run"
     flight = Flight(folder, "triangle", *EVENT, *NEAR_TRIANGLE, "duration_s=2", report=True)
     code, out = flight.finish(90.0)
@@ -43,7 +41,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Whole:
 
 
 @pytest.mark.mechanism("run")
-def test_a_run_forms_up_loses_nothing_and_reports(whole: Whole) -> None:
+def test_a_run_forms_up_loses_nothing_and_reports(whole):
     folder = whole.folder
     assert whole.code == 0, whole.said
     document = json.loads(whole.out)
@@ -63,7 +61,7 @@ def test_a_run_forms_up_loses_nothing_and_reports(whole: Whole) -> None:
     assert np.isfinite(read.trace.true_position).all(axis=(1, 2)).mean() > 0.99
 
 
-def test_a_recording_opens_elsewhere_with_typed_messages(whole: Whole) -> None:
+def test_a_recording_opens_elsewhere_with_typed_messages(whole):
     file = whole.folder / "event.mcap"
     with AnyReader([file]) as bag:
         types = {connection.topic: connection.msgtype for connection in bag.connections}
@@ -85,12 +83,12 @@ def test_a_recording_opens_elsewhere_with_typed_messages(whole: Whole) -> None:
 class Begun:
     """A run of the triangle, in flight."""
 
-    def __init__(self, folder: Path, *words: str) -> None:
+    def __init__(self, folder, *words):
         self.flight, self.file = Flight(folder / "run", "triangle", *EVENT, *words), folder / "run" / "event.mcap"
         self.flight.until_flown()
         self.children = self.flight.children()
 
-    def finish(self, code: int) -> dict[str, dict[str, float]]:
+    def finish(self, code):
         """Results of the robots; no process is left."""
         ended, out = self.flight.finish()
         assert ended == code, self.flight.said()
@@ -98,7 +96,7 @@ class Begun:
         return json.loads(out)["cases"]["event"]["robots"]
 
 
-def test_killed_follower_is_missed_and_others_go_on(tmp_path: Path) -> None:
+def test_killed_follower_is_missed_and_others_go_on(tmp_path):
     begun = Begun(tmp_path, "duration_s=4")
     begun.children["KH02"].kill()
     begun.flight.until_said(r"lost KH02: its process ended \(killed by SIGKILL\)")
@@ -112,7 +110,7 @@ def test_killed_follower_is_missed_and_others_go_on(tmp_path: Path) -> None:
     assert list(typed(begun.file, "/KH01/status")[-1].missing) == ["KH02"]
 
 
-def test_formation_holds_without_zygote_and_router(tmp_path: Path) -> None:
+def test_formation_holds_without_zygote_and_router(tmp_path):
     """The router comes back."""
     begun = Begun(tmp_path, "duration_s=8")
     for name in ("zygote", "router"):
@@ -126,10 +124,10 @@ def test_formation_holds_without_zygote_and_router(tmp_path: Path) -> None:
     assert_formed(read.trace, 0.05, since_s=7.0)
 
 
-def test_killed_recorder_is_replaced_and_fails_the_run(tmp_path: Path) -> None:
+def test_killed_recorder_is_replaced_and_fails_the_run(tmp_path):
     begun = Begun(tmp_path, "duration_s=4")
 
-    def recorded() -> bool:
+    def recorded():
         """Poses of the last robot in the run are in the file."""
         with contextlib.suppress(RecordingError):
             return len(playback.read(begun.file).trace.sent_by(2)) > 0
@@ -145,7 +143,7 @@ def test_killed_recorder_is_replaced_and_fails_the_run(tmp_path: Path) -> None:
     assert list(begun.flight.folder.glob("cases/event/*.mcap")) == []
 
 
-def test_unstartable_robot_ends_run_as_the_file_says(tmp_path: Path) -> None:
+def test_unstartable_robot_ends_run_as_the_file_says(tmp_path):
     absent = (*EVENT, "robots.CF01.body=udp://127.0.0.1:9", "duration_s=4")
     flight = Flight(tmp_path / "abort", "triangle", *absent)
     flight.until_said(r"CF01: could not start; nothing has moved")
@@ -165,7 +163,7 @@ def test_unstartable_robot_ends_run_as_the_file_says(tmp_path: Path) -> None:
 
 @pytest.mark.timeout(150)
 @pytest.mark.parametrize(("changes", "passed"), [((), False), ((LAW, "criteria.0.at_most=0.6"), True)])
-def test_a_run_in_real_time_is_judged(changes: tuple[str, ...], passed: bool, tmp_path: Path) -> None:
+def test_a_run_in_real_time_is_judged(changes, passed, tmp_path):
     """By criteria, with a law and metrics in files beside the experiment."""
     file, out = str(COURSE / "01-rendezvous.toml"), tmp_path / "run"
     flight = Flight(out, file, *changes, "duration_s=6", "--json", report=True)

@@ -1,7 +1,5 @@
 """The same small experiment over each transport, and robots that join from another machine with their certificates."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path
@@ -20,7 +18,7 @@ pytestmark = pytest.mark.system
 SHORT = ("--case", "periodic", "--no-report", "--set", "duration_s=3", "--set", "rates.body_hz=50")
 
 
-def found(folder: Path, *hosts: str) -> Path:
+def found(folder, *hosts):
     """A lab for the triangle."""
     robots = dict.fromkeys(load("triangle").experiment.robots, "robot")
     authority.create(folder, {**{role: role for role in authority.SERVICES}, **robots}, hosts=hosts)
@@ -28,7 +26,7 @@ def found(folder: Path, *hosts: str) -> Path:
 
 
 @pytest.mark.parametrize("protocol", ["unixsock-stream", "tls", "quic"])
-def test_an_experiment_over_each_transport(tmp_path: Path, protocol: str) -> None:
+def test_an_experiment_over_each_transport(tmp_path, protocol):
     secure = protocol in ("tls", "quic")
     listen = free_endpoint(0, protocol) if secure else f"{protocol}/{tmp_path}/router.sock"
     lab = ("--lab", str(found(tmp_path / "lab"))) if secure else ()
@@ -42,7 +40,7 @@ def test_an_experiment_over_each_transport(tmp_path: Path, protocol: str) -> Non
 
 
 @pytest.mark.skipif(bool(machines.why_not()), reason=machines.why_not() or "-")
-def test_robots_join_from_another_machine_with_their_certificates(tmp_path: Path) -> None:
+def test_robots_join_from_another_machine_with_their_certificates(tmp_path):
     """The router listens beyond loopback; two robots come from another network namespace, one is started here."""
     with machines.machines(tmp_path / "net", ("front", "board")) as there:
         front, board = there["front"], there["board"]

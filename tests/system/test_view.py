@@ -1,15 +1,11 @@
 """The view in a browser: robots that move in the page, the emergency stop, an observer's page, replay, many robots."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import threading
 import time
-from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,11 +20,10 @@ from experiments.run import simulate
 from experiments.scene.stage import Condition, SceneModel
 from experiments.view import acting
 from tests.commands import zenpark
-from tests.conftest import RouterProcess
 from tests.experiments import moments
 from tests.small import small
-from tests.system.browser import Page, needs_chromium, opened
-from tests.system.lab import NEAR, Flight, RobotProcess, Started, Watcher, in_lab, typed
+from tests.system.browser import needs_chromium, opened
+from tests.system.lab import NEAR, Flight, RobotProcess, Started, in_lab, typed
 
 pytest.importorskip("viser", reason="needs viser")
 pytestmark = [pytest.mark.system, needs_chromium]
@@ -37,20 +32,19 @@ pytestmark = [pytest.mark.system, needs_chromium]
 class ViewProcess(Started):
     """`./zenpark view`."""
 
-    def __init__(self, *arguments: object) -> None:
+    def __init__(self, *arguments):
         self.port = int(free_endpoint(preferred_port=0).rpartition(":")[2])
         super().__init__("tools.guard", "view", *map(str, arguments), "--port", str(self.port))
 
-    def address(self) -> str:
+    def address(self):
         """Of the page, when it is there."""
-        assert self.process.stdout is not None
         line = self.process.stdout.readline()
         assert line.startswith(f"http://127.0.0.1:{self.port}"), line + self.process.stdout.read()
         return line.split()[0]
 
 
 @contextmanager
-def viewed(*arguments: object) -> Iterator[ViewProcess]:
+def viewed(*arguments):
     """A page, while its process runs."""
     with ViewProcess(*arguments) as process:
         yield process
@@ -60,7 +54,7 @@ def viewed(*arguments: object) -> Iterator[ViewProcess]:
 KINDS = ("turtlebot3", "khepera4", "crazyflie")  # of the reference experiment
 
 
-def drawn_places(page: Page, what: str = "robots/{}/body", root: str = "/case") -> np.ndarray:
+def drawn_places(page, what="robots/{}/body", root="/case"):
     """Positions (7, 3) of the robots of the reference experiment in the page [m], or of what else it draws of them."""
     names = [f"{root}/{what.format(kind)}" for kind in KINDS]
     page.until(lambda: all(name in page.nodes for name in names), "drawn")
@@ -68,7 +62,7 @@ def drawn_places(page: Page, what: str = "robots/{}/body", root: str = "/case") 
 
 
 @contextmanager
-def announced(watcher: Watcher, endpoint: str, plan: Plan, folder: Path) -> Iterator[tuple[str, ...]]:
+def announced(watcher, endpoint, plan, folder):
     """Names of the robots of a case, which are there, and a conductor has announced it."""
     file = folder / "event.json"
     file.write_bytes(document.write_json(plan))
@@ -83,11 +77,11 @@ def announced(watcher: Watcher, endpoint: str, plan: Plan, folder: Path) -> Iter
 
 
 @pytest.mark.mechanism("view")
-def test_page_shows_seven_robots_and_stops_all(router: RouterProcess, watcher: Watcher, tmp_path: Path) -> None:
+def test_page_shows_seven_robots_and_stops_all(router, watcher, tmp_path):
     low = (f"robots.{name}.hover=0.2" for name in ("CF01", "CF02", "CF03"))  # soon airborne
     park = document.load("robotic-park", *NEAR, *low, "duration_s=60").cases()["event"]
 
-    def taken_off(view: ViewProcess) -> str:
+    def taken_off(view):
         watcher.until_all("ready", *names)
         watcher.give(messages.Order("takeoff"), *names)
         return view.address()
@@ -113,18 +107,18 @@ def test_page_shows_seven_robots_and_stops_all(router: RouterProcess, watcher: W
         assert page.hosts == {f"127.0.0.1:{view.port}"}
 
 
-def test_page_orders_reach_robots_and_become_events(router: RouterProcess, watcher: Watcher, tmp_path: Path) -> None:
+def test_page_orders_reach_robots_and_become_events(router, watcher, tmp_path):
     convoy = document.load("convoy", "timeline=[]").cases()["event"]
     heard = pubsub.Inbox(
         pubsub.pose_subscriber(watcher.session, watcher.keys.event, 256, pubsub.EVENTS), messages.Event
     )
-    events: list[str] = []
+    events = []
 
-    def recorded(text: str) -> bool:
+    def recorded(text):
         events.extend(f"{event.kind} {event.source} {event.text}" for event in heard.read())
         return any(event.startswith(f"order operator {text}") for event in events)
 
-    def everywhere(true: Callable[[messages.Status], bool]) -> bool:
+    def everywhere(true):
         watcher.look()
         return all(true(watcher.status[name]) for name in names)
 
@@ -144,7 +138,7 @@ def test_page_orders_reach_robots_and_become_events(router: RouterProcess, watch
         square = np.array([*start + 0.255 * acting.HANDLE * 3.0 / 2.5, 0.0])  # by which it is dragged in the plane
         place = page.nodes["/targets/TB01"]
 
-        def dragged(by: tuple[float, float], answer: str) -> None:
+        def dragged(by, answer):
             page.until(
                 lambda: np.allclose(place.get("position", (np.inf,) * 3)[:2], start, atol=0.01), "it is at its goal"
             )
@@ -175,7 +169,7 @@ def test_page_orders_reach_robots_and_become_events(router: RouterProcess, watch
 
 
 @pytest.mark.timeout(240)
-def test_lab_observer_watches_and_shift_s_stops_run(tmp_path: Path) -> None:
+def test_lab_observer_watches_and_shift_s_stops_run(tmp_path):
     file = in_lab(tmp_path)
     flight = Flight(tmp_path / "run", file, "--case", "event", "duration_s=90")
     flight.until_flown()
@@ -211,7 +205,7 @@ def test_lab_observer_watches_and_shift_s_stops_run(tmp_path: Path) -> None:
     assert said == ["trigger.threshold = 0.0102: 3 of 3 robots", "emergency stop: stopped: CF01, KH01, KH02"]
 
 
-def test_slider_moves_robots_to_recorded_places(tmp_path: Path) -> None:
+def test_slider_moves_robots_to_recorded_places(tmp_path):
     run = simulate(document.load("robotic-park", "duration_s=6", "timeline=[]"), cases=["event"], folder=tmp_path)
     trace = run.traces["event"]
     with viewed(tmp_path) as view, opened(view.address, 640, 480) as page:
@@ -231,7 +225,7 @@ def test_slider_moves_robots_to_recorded_places(tmp_path: Path) -> None:
         assert page.hosts == {f"127.0.0.1:{view.port}"}
 
 
-def test_hundred_robots_are_drawn_at_twenty_frames() -> None:
+def test_hundred_robots_are_drawn_at_twenty_frames():
     from experiments.view.live import Page  # noqa: PLC0415 - viser may be missing
     from experiments.view.serving import served  # noqa: PLC0415
 
@@ -244,7 +238,7 @@ def test_hundred_robots_are_drawn_at_twenty_frames() -> None:
     grid = np.array([[k % 10 - 4.5, k // 10 - 4.5, 0.6 * (k % 2)] for k in range(100)])
     moment.condition[:], moment.yaw[:] = Condition.ACTIVE, 0.0
 
-    def move() -> None:
+    def move():
         step = 0
         while not over.wait(1.0 / 30.0):
             step += 1

@@ -1,15 +1,10 @@
 """A run as it is watched from another shell: its table, attached to a router; its recording, played onto a network."""
 
-from __future__ import annotations
-
 import threading
-from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import msgspec
 import pytest
-import zenoh
 
 from agents.clock import Clock
 from agents.network import messages, pubsub
@@ -17,21 +12,20 @@ from agents.network.keys import Keys
 from experiments.file.document import load
 from experiments.run import simulate
 from tests.commands import zenpark
-from tests.conftest import RouterProcess
-from tests.system.lab import Watcher, typed
+from tests.system.lab import typed
 from tests.tools.commands.test_live_table import STATUS
 
 pytestmark = pytest.mark.system
 
 
 @contextmanager
-def reporting(session: zenoh.Session, names: list[str], hazard: str) -> Iterator[None]:
+def reporting(session, names, hazard):
     """Robots that report ten times a second; the last one has a hazard, and uses half a core."""
     keys, over, begin = Keys(), threading.Event(), Clock().utc()
     tokens = [pubsub.alive_token(session, keys.alive(name)) for name in names]
     publishers = {name: pubsub.publisher(session, keys.status(name), messages.JSON) for name in names}
 
-    def report() -> None:
+    def report():
         while not over.wait(0.1):
             now = Clock().utc()
             for name in names:
@@ -52,7 +46,7 @@ def reporting(session: zenoh.Session, names: list[str], hazard: str) -> Iterator
 
 
 @pytest.mark.mechanism("table of a run from another shell")
-def test_top_shows_a_routers_robots_worst_first(router: RouterProcess, watcher: Watcher) -> None:
+def test_top_shows_a_routers_robots_worst_first(router, watcher):
     with reporting(watcher.session, ["alpha", "beta", "gamma"], "hold: link silence"):
         done = zenpark("top", "--connect", router.endpoint, timeout_s=30.0)
     title, heads, first, *others = done.stdout.splitlines()
@@ -65,13 +59,11 @@ def test_top_shows_a_routers_robots_worst_first(router: RouterProcess, watcher: 
 
 
 @pytest.mark.mechanism("recording played onto a network")
-def test_recording_plays_with_keys_and_payloads_as_flown(
-    router: RouterProcess, watcher: Watcher, tmp_path: Path
-) -> None:
+def test_recording_plays_with_keys_and_payloads_as_flown(router, watcher, tmp_path):
     simulate(load("triangle", "duration_s=3.0", "timeline=[]"), cases=["event"], folder=tmp_path)
-    seen: dict[str, list[bytes]] = {}
+    seen = {}
 
-    def keep(sample: zenoh.Sample) -> None:
+    def keep(sample):
         seen.setdefault(str(sample.key_expr), []).append(sample.payload.to_bytes())
 
     listening = watcher.session.declare_subscriber("park/**", keep)

@@ -1,12 +1,8 @@
 """The twin service in real processes: a run in one world, its orders, its death, robots of other processes in it."""
 
-from __future__ import annotations
-
 import json
 import time
-from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,7 +13,6 @@ from agents.network import session as network
 from agents.network.keys import Keys
 from experiments.real_time.conductor import orders
 from experiments.recording import playback
-from tests.conftest import RouterProcess
 from tests.system.lab import (
     NEAR,
     NEAR_TRIANGLE,
@@ -51,7 +46,7 @@ TE01 = { kind = "tello", body = "world", start = [-1.0, 1.0], hover = 0.6 }
 
 
 @pytest.fixture
-def three_file(tmp_path: Path) -> Path:
+def three_file(tmp_path):
     made = tmp_path / "three.toml"
     made.write_text(THREE)
     return made
@@ -60,40 +55,40 @@ def three_file(tmp_path: Path) -> Path:
 class Desk(Looking):
     """The world as an operator, and a robot's process, see it."""
 
-    def __init__(self, endpoint: str) -> None:
+    def __init__(self, endpoint):
         self.session = session = network.open_session([endpoint], name="desk")
         self._positions = pubsub.Inbox(pubsub.subscriber(session, KEYS.position("*"), 4096), messages.Position)
         self._worlds = pubsub.Inbox(pubsub.pose_subscriber(session, KEYS.world), messages.WorldState)
         self._events = pubsub.Inbox(pubsub.subscriber(session, KEYS.event), messages.Event)
         self._ranges = pubsub.Inbox(pubsub.subscriber(session, KEYS.ranges("*")), messages.Ranges)
-        self.at: dict[str, messages.Position] = {}
-        self.ranges: dict[str, messages.Ranges] = {}
-        self.events: list[messages.Event] = []
-        self.world: messages.WorldState | None = None
+        self.at = {}
+        self.ranges = {}
+        self.events = []
+        self.world = None
         self._seq = round(time.time() * 1e3)
 
-    def look(self) -> None:
+    def look(self):
         self.at |= {position.robot: position for position in self._positions.read()}
         self.ranges |= {ranges.robot: ranges for ranges in self._ranges.read()}
         self.events += self._events.read()
         for world in self._worlds.read():
             self.world = world
 
-    def x(self, name: str) -> list[float]:
+    def x(self, name):
         return list(self.at[name].position)
 
-    def give(self, order: str, **fields: object) -> messages.WorldReply:
-        return orders.send_world_order(self.session, KEYS, messages.WorldOrder(order, **fields))  # type: ignore[arg-type]
+    def give(self, order, **fields):
+        return orders.send_world_order(self.session, KEYS, messages.WorldOrder(order, **fields))
 
-    def tell(self, name: str, action: str, **fields: object) -> None:
+    def tell(self, name, action, **fields):
         self._seq += 1
-        command = messages.Command(name, self._seq, time.time(), action, **fields)  # type: ignore[arg-type]
+        command = messages.Command(name, self._seq, time.time(), action, **fields)
         self.session.put(KEYS.setpoint(name), messages.encode(command), encoding=messages.JSON)
 
-    def drive_until(self, name: str, setpoint: tuple[float, ...], true: Callable[[], object], what: str) -> None:
+    def drive_until(self, name, setpoint, true, what):
         due = [0.0]
 
-        def seen() -> object:
+        def seen():
             if time.monotonic() > due[0]:
                 due[0] = time.monotonic() + 0.02
                 self.tell(name, "drive", setpoint=setpoint)
@@ -103,14 +98,14 @@ class Desk(Looking):
 
 
 @pytest.fixture
-def desk(router: RouterProcess) -> Iterator[Desk]:
+def desk(router):
     made = Desk(router.endpoint)
     yield made
     made.session.close()
 
 
 @pytest.fixture
-def world(router: RouterProcess, desk: Desk, three_file: Path) -> Iterator[WorldProcess]:
+def world(router, desk, three_file):
     carries = "world ready: point-mass at 100 Hz carries KH01, CF01, TE01; mirrors none"
     with WorldProcess(router.endpoint, three_file) as made:
         assert made.ready == f"{carries}; realm park at {router.endpoint}"
@@ -119,7 +114,7 @@ def world(router: RouterProcess, desk: Desk, three_file: Path) -> Iterator[World
 
 
 @pytest.mark.timeout(180)
-def test_the_reference_experiment_forms_up_in_one_world(tmp_path: Path) -> None:
+def test_the_reference_experiment_forms_up_in_one_world(tmp_path):
     folder = tmp_path / "run"
     words = ("--bodies", "world", "--case", "event", "--json", "duration_s=12", "timeline=[]")
     flight = Flight(folder, "robotic-park", *words, *NEAR)
@@ -138,7 +133,7 @@ def test_the_reference_experiment_forms_up_in_one_world(tmp_path: Path) -> None:
 
 
 @pytest.mark.mechanism("world: killed", "way out: Ctrl-C")
-def test_killed_world_is_restarted_and_robots_continue(tmp_path: Path) -> None:
+def test_killed_world_is_restarted_and_robots_continue(tmp_path):
     """Until Ctrl-C, which lands everybody and leaves a valid recording."""
     folder = tmp_path / "run"
     flight = Flight(folder, "triangle", "--bodies", "world", "--case", "event", *NEAR_TRIANGLE)
@@ -175,15 +170,13 @@ def test_killed_world_is_restarted_and_robots_continue(tmp_path: Path) -> None:
     assert not [event for event in trace.events if event.kind == "robot" and "lost" in event.text]
 
 
-def test_climbs_and_landings_continue_in_the_next_world(
-    router: RouterProcess, watcher: Watcher, three_file: Path
-) -> None:
+def test_climbs_and_landings_continue_in_the_next_world(router, watcher, three_file):
     both = ("CF01", "TE01")
 
-    def height(name: str) -> float:
+    def height(name):
         return watcher.state[name].position[2] if name in watcher.state else 0.0
 
-    def again(killed: WorldProcess) -> WorldProcess:
+    def again(killed):
         killed.kill()
         made = worlds.enter_context(WorldProcess(router.endpoint, three_file))
         assert "CF01" in made.ready.rpartition(";")[2], "it asks them where they were"
@@ -205,14 +198,14 @@ def test_climbs_and_landings_continue_in_the_next_world(
             assert max(map(height, both)) < 0.06
 
 
-def test_pause_resume_and_reset(world: WorldProcess, desk: Desk) -> None:
-    assert desk.give("pause") == messages.WorldReply(True, True, pytest.approx(0.0, abs=60.0))  # type: ignore[arg-type]
+def test_pause_resume_and_reset(world, desk):
+    assert desk.give("pause") == messages.WorldReply(True, True, pytest.approx(0.0, abs=60.0))
     paused = desk.give("pause").time
     stamp = desk.at["KH01"].stamp
     desk.until(lambda: desk.world and desk.world.paused, "it says so")
     desk.drive_until("KH01", (0.2, 0.0, 0.0, 0.0), lambda: desk.at["KH01"].stamp > stamp + 0.5, "stamps stay fresh")
     assert desk.x("KH01") == [0.0, 0.0, 0.0]
-    assert desk.give("resume") == messages.WorldReply(True, False, pytest.approx(paused, abs=0.05))  # type: ignore[arg-type]
+    assert desk.give("resume") == messages.WorldReply(True, False, pytest.approx(paused, abs=0.05))
     desk.drive_until("KH01", (0.2, 0.0, 0.0, 0.0), lambda: desk.x("KH01")[0] > 0.1, "it goes on")
     assert desk.give("reset", name="KH01").ok
     desk.until(lambda: np.abs(desk.x("KH01")).max() < 0.03, "it is back, but for commands that were on their way")
@@ -221,7 +214,7 @@ def test_pause_resume_and_reset(world: WorldProcess, desk: Desk) -> None:
     assert desk.give("reset").ok
 
 
-def test_what_a_world_cannot_use_is_counted(world: WorldProcess, desk: Desk) -> None:
+def test_what_a_world_cannot_use_is_counted(world, desk):
     for _ in range(2):
         desk.tell("CF09", "takeoff", height=0.5)
     desk.until(lambda: desk.world and desk.world.refused == 2, "both are counted")
@@ -233,7 +226,7 @@ def test_what_a_world_cannot_use_is_counted(world: WorldProcess, desk: Desk) -> 
     desk.until(lambda: desk.world and desk.world.malformed == 2, "nonsense is counted")
 
 
-def test_robots_without_commands_hold_and_then_land(world: WorldProcess, desk: Desk) -> None:
+def test_robots_without_commands_hold_and_then_land(world, desk):
     for name in ("CF01", "TE01"):
         desk.tell(name, "takeoff", height=0.6)
     desk.until(lambda: min(desk.x("CF01")[2], desk.x("TE01")[2]) > 0.59, "they are up")
@@ -247,7 +240,7 @@ def test_robots_without_commands_hold_and_then_land(world: WorldProcess, desk: D
 
 
 @pytest.mark.usefixtures("world")
-def test_second_world_and_useless_world_are_refused(router: RouterProcess, three_file: Path) -> None:
+def test_second_world_and_useless_world_are_refused(router, three_file):
     for arguments, reason in (
         ((three_file,), "zenpark: a world runs in the realm 'park' already: end it first, choose another"),
         (("triangle",), "no robot of this experiment lives in a world"),
@@ -258,9 +251,7 @@ def test_second_world_and_useless_world_are_refused(router: RouterProcess, three
         assert reason in refused.ready
 
 
-def test_world_ordered_to_end_waits_for_robots(
-    world: WorldProcess, router: RouterProcess, watcher: Watcher, three_file: Path
-) -> None:
+def test_world_ordered_to_end_waits_for_robots(world, router, watcher, three_file):
     with RobotProcess(router.endpoint, three_file, "CF01") as robot:
         watcher.take_off("CF01")
         world.process.terminate()
@@ -269,7 +260,7 @@ def test_world_ordered_to_end_waits_for_robots(
         assert world.wait(30) == 0
 
 
-def test_a_robot_of_another_process_is_seen(router: RouterProcess, desk: Desk, tmp_path: Path) -> None:
+def test_a_robot_of_another_process_is_seen(router, desk, tmp_path):
     three_file = tmp_path / "mixed.toml"
     three_file.write_text(
         'title = "mixed"\nduration_s = 30.0\nworld.sensor_noise = 0.0\n[robots]\n'
@@ -277,7 +268,7 @@ def test_a_robot_of_another_process_is_seen(router: RouterProcess, desk: Desk, t
         'TB02 = { kind = "turtlebot3", start = [1.0, 0.0, 3.141592653589793], ranges = "world" }\n'
     )
 
-    def ahead(robot: str, wanted: float) -> bool:
+    def ahead(robot, wanted):
         return desk.ranges[robot].distance[0] == pytest.approx(wanted, abs=1e-3)
 
     with WorldProcess(router.endpoint, three_file) as world:

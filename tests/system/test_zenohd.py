@@ -3,18 +3,15 @@
 `tests/system/zenohd.py` builds a zenohd; where there is none, these tests are skipped and say why.
 """
 
-from __future__ import annotations
-
 import json
 import signal
 import socket
 import subprocess
 import time
 import urllib.request
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import Any
 
 import pytest
 import zenoh
@@ -35,21 +32,21 @@ Router = Callable[[Path], AbstractContextManager[None]]
 
 
 @contextmanager
-def ours(file: Path) -> Iterator[None]:
+def ours(file):
     """The library that the wheel brings, from the very file."""
     with zenoh.open(zenoh.Config.from_file(str(file))):
         yield
 
 
 @contextmanager
-def theirs(file: Path) -> Iterator[None]:
+def theirs(file):
     """A zenohd, from the same file."""
     with started(json.loads(file.read_text())["listen"]["endpoints"][0], "--config", str(file)):
         yield
 
 
 @contextmanager
-def started(endpoint: str, *arguments: str) -> Iterator[subprocess.Popen[bytes]]:
+def started(endpoint, *arguments):
     """A zenohd that listens."""
     process = subprocess.Popen([zenohd.folder() / "zenohd", *arguments], stdin=subprocess.DEVNULL)
     try:
@@ -61,14 +58,14 @@ def started(endpoint: str, *arguments: str) -> Iterator[subprocess.Popen[bytes]]
         process.wait(30)
 
 
-def answers(endpoint: str, process: subprocess.Popen[bytes]) -> bool:
+def answers(endpoint, process):
     assert process.poll() is None
     host, _, port = endpoint.partition("/")[2].rpartition(":")
     with socket.socket() as probe:
         return probe.connect_ex((host, int(port))) == 0
 
 
-def missing() -> str:
+def missing():
     """Why there is no zenohd; empty if there is one."""
     try:
         zenohd.folder()
@@ -83,10 +80,10 @@ WITH = [ours, pytest.param(theirs, marks=NEEDED)]
 
 @pytest.mark.parametrize("start", WITH)
 @pytest.mark.parametrize("secure", [False, True])
-def test_an_experiment_at_a_router_of_somebody_else(tmp_path: Path, start: Router, secure: bool) -> None:
+def test_an_experiment_at_a_router_of_somebody_else(tmp_path, start, secure):
     plain = free_endpoint(0, "tls" if secure else "tcp")
     rights, endpoint = None, plain
-    options: tuple[str, ...] = ()
+    options = ()
     if secure:
         folder = found(tmp_path / "lab")
         rights = access_rights.rights(load("triangle").cases().values())
@@ -107,11 +104,11 @@ def test_an_experiment_at_a_router_of_somebody_else(tmp_path: Path, start: Route
 
 @NEEDED
 @pytest.mark.parametrize("freezes", [pytest.param(False, marks=pytest.mark.mechanism("zenohd")), True])
-def test_plain_zenohd_is_read_by_rest_and_freezes(tmp_path: Path, freezes: bool) -> None:
+def test_plain_zenohd_is_read_by_rest_and_freezes(tmp_path, freezes):
     """No file: a lease of 10 s. What the README says of REST."""
     endpoint, rest = free_endpoint(0), free_endpoint(0).partition("/")[2]
 
-    def read(path: str, post: object = None) -> Any:
+    def read(path, post=None):
         body = None if post is None else json.dumps(post).encode()
         asked = urllib.request.Request(f"http://{rest}/{path}", body, {"content-type": "application/json"})
         with urllib.request.urlopen(asked, timeout=10.0) as answer:

@@ -5,8 +5,6 @@ the folder; `./zenpark test --all` does so before its tests of processes. Neithe
 one the tests that need it are skipped and say why.
 """
 
-from __future__ import annotations
-
 import fcntl
 import json
 import os
@@ -16,18 +14,17 @@ import sys
 from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
-from typing import Final
 
-VERSION: Final = version("eclipse-zenoh")  # the same as the library of the robots
-CRATES: Final = ("zenohd", "zenoh-plugin-rest", "zenoh-plugin-storage-manager")
-CACHE: Final = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "zenpark" / f"zenohd-{VERSION}"
-BUILT: Final = CACHE / "bin"
-REASON: Final = CACHE / "reason.txt"  # why the last build failed
-NO_CARGO: Final = "no zenohd on PATH, and no cargo to build one"
-ONLINE: Final = {"CARGO_NET_RETRY": "1", "CARGO_HTTP_TIMEOUT": "20"}  # without crates.io: no minutes of waiting
+VERSION = version("eclipse-zenoh")  # the same as the library of the robots
+CRATES = ("zenohd", "zenoh-plugin-rest", "zenoh-plugin-storage-manager")
+CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "zenpark" / f"zenohd-{VERSION}"
+BUILT = CACHE / "bin"
+REASON = CACHE / "reason.txt"  # why the last build failed
+NO_CARGO = "no zenohd on PATH, and no cargo to build one"
+ONLINE = {"CARGO_NET_RETRY": "1", "CARGO_HTTP_TIMEOUT": "20"}  # without crates.io: no minutes of waiting
 
 # `cargo metadata` fetches the sources of dependencies; that zenohd has no library is a warning
-_FETCH: Final = """
+_FETCH = """
 [package]
 name = "sources"
 version = "0.0.0"
@@ -39,7 +36,7 @@ path = "sources.rs"
 """
 # One workspace: a plugin is loaded only by a zenohd with the same compiler and the same features of its libraries.
 # A release with link-time optimisation would take three times as long.
-_WORKSPACE: Final = """
+_WORKSPACE = """
 [workspace]
 resolver = "2"
 members = {members}
@@ -55,7 +52,7 @@ class NotBuilt(Exception):
     """No zenohd, and why."""
 
 
-def folder() -> Path:
+def folder():
     """The folder with `zenohd` and its plugins: on PATH, or built before.
 
     Raises:
@@ -71,7 +68,7 @@ def folder() -> Path:
     raise NotBuilt(f"no zenohd on PATH or in {BUILT}: {why}")
 
 
-def build(jobs: int) -> Path:
+def build(jobs):
     """Builds zenohd unless there is one; one process at a time, others wait for it.
 
     Raises:
@@ -95,7 +92,7 @@ def build(jobs: int) -> Path:
     return folder()
 
 
-def _build(work: Path, jobs: int) -> None:
+def _build(work, jobs):
     sources = work / "sources"
     sources.mkdir(parents=True, exist_ok=True)
     dependencies = "\n".join(f'{name} = "={VERSION}"' for name in CRATES)
@@ -124,7 +121,7 @@ def _build(work: Path, jobs: int) -> None:
     shutil.rmtree(work)
 
 
-def _cargo(*arguments: str, where: Path) -> str:
+def _cargo(*arguments, where):
     """Standard output of cargo."""
     done = subprocess.run(
         ["cargo", *arguments],
@@ -141,7 +138,7 @@ def _cargo(*arguments: str, where: Path) -> str:
     return done.stdout
 
 
-def main() -> int:
+def main():
     """Builds it and prints its folder."""
     try:
         print(build(jobs=os.cpu_count() or 1))
