@@ -24,7 +24,6 @@ from tests.reliability.spoilt_process import CONDUCTOR, OTHER, role_of
 
 SAMPLE_S: Final = 5.0
 SAMPLES: Final = 60  # at least so many, however short it is
-TABLE: Final = "soak.csv"
 PRINT_S: Final = 60.0
 PAGE: Final = resource.getpagesize()
 
@@ -60,7 +59,6 @@ class SoakSample(msgspec.Struct, frozen=True):
     threads: int
     files: int  # open file descriptors
     cpu_s: float  # CPU time since its begin [s]
-    recording_mb: float | None = None  # size of the recording, of the recorder
     lost: int | None = None  # poses of its neighbours that never arrived; None but for robots
     missed: int | None = None  # ticks that it missed, of `ticks`
     ticks: int | None = None
@@ -71,14 +69,10 @@ class SoakSample(msgspec.Struct, frozen=True):
     longest_s: float | None = None  # the largest delay [s]
 
 
-COLUMNS: Final = tuple(each.name for each in msgspec.structs.fields(SoakSample))
-
-
 @dataclass(frozen=True)
 class Soaked:
     """Samples of a soak."""
 
-    title: str  # of the experiment
     robots: tuple[str, ...]  # by process
     duration_s: float  # planned, from the common start [s]
     rows: Sequence[SoakSample]  # in order of time
@@ -89,10 +83,10 @@ class Soaked:
 class Sampler(ExitStack):
     """Follows a run: writes a row for each of its processes every few seconds, and prints a line a minute."""
 
-    def __init__(self, plan: Plan, folder: Path, case: str) -> None:
+    def __init__(self, plan: Plan, folder: Path) -> None:
         super().__init__()
         self._experiment = experiment = plan.experiment
-        self._recording, self._table = folder / f"{case}.mcap", folder / TABLE
+        self._table = folder / "soak.csv"
         self._delays: dict[str, list[float]] = {name: [] for name in experiment.robots}  # since the last sample [s]
         self._failed: dict[str, str] = {}
         self._news = EventFeed()
@@ -101,7 +95,7 @@ class Sampler(ExitStack):
         os.environ[RUN] = self._tag = secrets.token_hex(8)  # processes of the run inherit it
         self._file = self.enter_context(self._table.open("w", newline="", encoding="utf-8"))
         self._writer = csv.writer(self._file)
-        self._writer.writerow(COLUMNS)
+        self._writer.writerow(SoakSample.__struct_fields__)
 
     def __call__(self, progress: Progress) -> None:
         """Take in the last update of the run, and sample its processes if it is time."""
@@ -136,7 +130,6 @@ class Sampler(ExitStack):
         with self._table.open(newline="", encoding="utf-8") as file:
             known = [{name: text for name, text in row.items() if text} for row in csv.DictReader(file)]
         return Soaked(
-            self._experiment.title,
             tuple(map("+".join, self._experiment.processes.values())),
             self._experiment.duration_s,
             msgspec.convert(known, list[SoakSample], strict=False),
@@ -151,8 +144,6 @@ class Sampler(ExitStack):
             if process == OTHER or (usage := usage_of(pid)) is None:
                 continue
             row = SoakSample(t, process, *usage)
-            if process == "recorder" and self._recording.exists():
-                row = msgspec.structs.replace(row, recording_mb=round(self._recording.stat().st_size / 1e6, 3))
             names = [name for name in process.split("+") if name in robots]
             statuses = [status for name in names if (status := robots[name].status) is not None]
             if statuses:
