@@ -1,8 +1,6 @@
-"""A cable between robots and their routers: `python -m tests.reliability.cable NEAR FAR [NEAR FAR...]`.
+"""Cable between robots and routers, which SIGSTOP cuts: `python -m tests.reliability.cable NEAR FAR [NEAR FAR...]`.
 
-A TCP relay between ports on loopback: it needs neither root nor a kernel with a network emulator, works wherever
-zenpark does, and does to a TCP connection what a bad cable does. It is cut by suspending its process. Nothing is lost
-inside such a connection: what was sent waits until the process goes on. It ends with its standard input.
+A TCP relay between ports on loopback: what was sent waits until the process goes on. It ends with its standard input.
 """
 
 from __future__ import annotations

@@ -25,8 +25,6 @@ from tools.progress import columns
 
 BARREN: Final = 3  # rounds without any fault, and it gives up
 BUSY: Final = 0.05  # share of the ticks that a machine may miss which is to be trusted with the rest
-
-
 # pymunk measures contacts; a busy machine is no fault; rounds are long, for starts take time
 ALWAYS: Final = ('world.engine="pymunk"', "world.wheel_watchdog_s=0.5", "start.deadline_s=60", "duration_s=90")
 # without one, robots cannot keep clear of a dead one that stands in their way, nor of one that lands below them

@@ -65,10 +65,9 @@ class RoundResult(msgspec.Struct, frozen=True):
 def line(outcome: FaultResult) -> str:
     whom = f" {outcome.victim}" if outcome.victim else ""
     how = f"well after {outcome.begin_s:.1f} s" if outcome.recovered else "NOT WELL"
-    how += ", came down" if outcome.ended else ""
-    wrong = "".join(f"; {text}" for text in outcome.violations)
     note = f" ({outcome.note})" if outcome.note else ""
-    return f"round {outcome.round}, {outcome.at_s:5.1f} s: {outcome.fault.kind}{whom}{note}: {how}{wrong}"
+    ends = "; ".join([how + ", came down" * outcome.ended, *outcome.violations])
+    return f"round {outcome.round}, {outcome.at_s:5.1f} s: {outcome.fault.kind}{whom}{note}: {ends}"
 
 
 def recording_faults(recording: Path, outcomes: Sequence[FaultResult], *, disk_full: bool) -> list[str]:
@@ -149,7 +148,7 @@ class ChaosRound:
             if time.monotonic() > began + BEGIN_S:
                 self._wrong.append(f"no common start within {BEGIN_S:g} s")
                 return
-        well, why = self._settle(self._not_formed, FORM_S)
+        well, why = self._settle(self._not_in_formation, FORM_S)
         if why:
             self._wrong.append(f"not in formation {FORM_S:g} s after the start ({why}): no fault was done")
         while not (why or self._begun["conductor"] or self._setting.interrupted()):
@@ -251,14 +250,12 @@ class ChaosRound:
         away = {name for name in away if observer.invariants.in_the_air(name) or not observer.is_down(name)}
         if away:
             return f"{', '.join(sorted(away))}: not back"
-        return self._not_in_formation(observer.running() - dead, max(active.lifted, time.monotonic() - FRESH_S), t)
+        return self._not_in_formation(t, active.lifted)
 
-    def _not_formed(self, t: float) -> str:
-        """Reason why running robots are not in formation."""
-        return self._not_in_formation(self._observer.running(), time.monotonic() - FRESH_S, t)
-
-    def _not_in_formation(self, live: set[str], since: float, t: float) -> str:
-        """Reason why living robots are not in formation: silent since then, missing each other, or elsewhere."""
+    def _not_in_formation(self, t: float, lifted: float = 0.0) -> str:
+        """Reason why living robots are not in formation: silent since a fault, missing each other, or elsewhere."""
+        live = self._observer.running() - self._run.dead.keys()
+        since = max(lifted, time.monotonic() - FRESH_S)
         if not live and not self._run.dead:
             return "no robot is running"
         for name in live:

@@ -78,11 +78,7 @@ class Invariants:
         return list(zip(first[both].tolist(), second[both].tolist(), strict=True))
 
     def formation_error(self, live: Collection[str], t: float) -> float:
-        """The largest error [m] of links between robots that live, as their law measures it; 0 without any.
-
-        Args:
-            t: Since the common start [s].
-        """
+        """The largest error [m] of links between robots that live, `t` [s] after the common start, by their law."""
         here = np.array([name in live for name in self.names])
         links = self._formation.links
         counted = here[links.receiver] & here[links.sender] & self._lasting  # links by range may end at any time
@@ -98,15 +94,13 @@ class Invariants:
             return ""
         setpoint = np.array(command.setpoint or (np.nan,) * 4)
         kind = self._kinds[command.robot]
-        if not np.isfinite(setpoint).all():
-            return f"{command.robot} gets the command {command.setpoint}"
         if kind.takes == "position":
-            low, high = self._low - STEP_M, self._high + STEP_M
-            bad = ((setpoint[:3] < low) | (setpoint[:3] > high)).any()
+            good = (setpoint[:3] >= self._low - STEP_M) & (setpoint[:3] <= self._high + STEP_M)
         else:
-            axes = slice(0, 3) if kind.takes == "velocity" else slice(0, 1)
-            bad = (np.abs(setpoint[axes]) > SLACK * kind.speed).any()
-        return f"{command.robot} gets the command {command.setpoint}" if bad else ""
+            good = np.abs(setpoint[: 3 if kind.takes == "velocity" else 1]) <= SLACK * kind.speed
+        if good.all() and np.isfinite(setpoint).all():
+            return ""
+        return f"{command.robot} gets the command {command.setpoint}"
 
 
 class Observer:

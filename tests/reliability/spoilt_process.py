@@ -1,8 +1,6 @@
-"""A process of a run that a fault laboratory can spoil: `python -m tests.reliability.spoilt_process FOLDER MODULE
-ARGUMENT...`.
+"""Run `python -m tests.reliability.spoilt_process FOLDER MODULE ARGUMENT...` as MODULE, but for switches in FOLDER.
 
-Runs MODULE as it runs by itself, but for the switches in FOLDER: numbers in files of eight bytes, which the laboratory
-writes and the processes of the run map into memory. Stamps of the network library itself are not reached.
+Switches are numbers in files, which the laboratory writes and the processes of a run map into memory.
 
     clock, clock-ROLE   how much more the wall clock of all processes, or of those with that role, reads [s]
     lease               lease that a router announces [s]; 0: its own
@@ -19,18 +17,17 @@ from __future__ import annotations
 import mmap
 import os
 import runpy
-import struct
 import sys
 import time
 from collections.abc import Sequence
 from functools import partial
+from itertools import takewhile
 from pathlib import Path
 from typing import Final
 
 from agents.clock import READING
 
 MODULE: Final = "tests.reliability.spoilt_process"
-_NUMBER: Final = struct.Struct("d")
 CONDUCTOR: Final = "conductor"
 ROLES: Final = {  # by the module that a process runs
     "agents.runtime.router": "router",
@@ -50,11 +47,9 @@ def role_of(words: Sequence[str]) -> str:
     for module, name in ROLES.items():
         if module in words:
             return name
-    if ROBOT in words:
-        names = words[words.index(ROBOT) + 2 :]
-        end = next((place for place, word in enumerate(names) if word.startswith("--") or not word), len(names))
-        return "+".join(names[:end])
-    return OTHER
+    if ROBOT not in words:
+        return OTHER
+    return "+".join(takewhile(lambda word: word and not word.startswith("--"), words[words.index(ROBOT) + 2 :]))
 
 
 class Switch:
@@ -63,17 +58,14 @@ class Switch:
     def __init__(self, file: Path) -> None:
         with file.open("a+b") as opened:
             if not opened.tell():
-                opened.write(bytes(_NUMBER.size))
-                opened.flush()
-            self._shared = mmap.mmap(opened.fileno(), _NUMBER.size)
+                opened.truncate(8)
+            self._shared = memoryview(mmap.mmap(opened.fileno(), 8)).cast("d")
 
     def read(self) -> float:
-        """Its present value."""
-        (value,) = _NUMBER.unpack_from(self._shared)
-        return float(value)
+        return float(self._shared[0])
 
     def write(self, value: float) -> None:
-        _NUMBER.pack_into(self._shared, 0, value)
+        self._shared[0] = value
 
 
 def spoil(folder: Path, words: Sequence[str]) -> None:

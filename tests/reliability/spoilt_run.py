@@ -1,10 +1,4 @@
-"""A run to which faults are done: its start, the levers by which they are done, and its end.
-
-It is a process of its own, which may be killed: `python -m tests.reliability.spoilt_run REQUEST`, a struct as JSON; its
-standard input is the lifeline, without which all robots land. Its robots reach their routers through cables
-(`tests.reliability.cable`), and live in one world, so that the body of a robot whose process is dead, frozen or cut
-off stays in the room.
-"""
+"""A run to which faults are done, in a process of its own, with one world for all: its start, levers, and end."""
 
 from __future__ import annotations
 
@@ -131,13 +125,13 @@ class SpoiltRun:
             changes += [f'robots.{name}.position="external"' for name in self.measured]
             # robots land as they do without a world, in which they would wait for it
             changes += ['positioning="vicon-twin"', f"world.patience_s={experiment.safety.land_without_position_s}"]
-        near = {
+        cables = {
             role: {end: free_endpoint(preferred_port=0) for end in self.routers} for role in self._process_of.values()
         }
-        request = Request(str(setting.file), str(folder), setting.case, changes, near, str(self._switches))
+        request = Request(str(setting.file), str(folder), setting.case, changes, cables, str(self._switches))
         self._tag = f"{RUN}={secrets.token_hex(8)}"  # in the environment of all its processes
         self._launcher = stack.enter_context(Launcher(folder / "logs"))
-        for role, ends in near.items():
+        for role, ends in cables.items():
             ports = [end.rpartition(":")[2] for way in ends.items() for end in reversed(way)]
             self._launcher.start(f"{CABLE}-{role}", "tests.reliability.cable", *ports)
         words = [MODULE, msgspec.json.encode(request).decode()]
@@ -170,8 +164,6 @@ class SpoiltRun:
         for pid in self.processes():
             self._signal(pid, signal.SIGKILL)
 
-    # ---------------------------------------------------------------------- levers
-
     def switch(self, name: str) -> Switch:
         """A switch between a process and its clock, body or lease (`tests.reliability.spoilt_process`)."""
         return Switch(self._switches / name)
@@ -202,12 +194,10 @@ class SpoiltRun:
 
     def refuse_landing(self, robot: str, session: zenoh.Session) -> None:
         """Order a robot to land, whose body does not obey until `release`."""
-        switch = self.switch(f"refuse-{robot}")
-        switch.write(1.0)
-        self._refusing.append(switch)
-        threading.Thread(
-            target=orders.send_order, args=(session, self._keys, [robot], messages.Order("land")), daemon=True
-        ).start()
+        self._refusing.append(self.switch(f"refuse-{robot}"))
+        self._refusing[-1].write(1.0)
+        order = session, self._keys, [robot], messages.Order("land")
+        threading.Thread(target=orders.send_order, args=order, daemon=True).start()
 
     def release(self) -> None:
         """Undo what can be undone: continue stopped processes, cables too, obey landings, and mend motion capture."""
@@ -250,8 +240,7 @@ class SpoiltRun:
 
     def spoil(self, robot: str, session: zenoh.Session) -> int:
         """Send nonsense on every key that a robot and its body read, but the stop's; return the number of payloads."""
-        keys, absurd = self._keys, messages.pose(robot, 1, 0.0, [9e9, 0.0, 0.0], [0.0, 0.0, 0.0], yaw=0.0)
-        whole = messages.encode(absurd)
+        keys, whole = self._keys, messages.encode(messages.pose(robot, 1, 0.0, [9e9, 0.0, 0.0], [0.0] * 3, yaw=0.0))
         read = (keys.pose, keys.position, keys.setpoint, keys.state, keys.status, keys.goal, keys.ranges)
         for key in read * GARBAGE:
             payloads = (
@@ -272,9 +261,6 @@ class SpoiltRun:
         self._stopped += [pid] if number == signal.SIGSTOP else []
         with contextlib.suppress(ProcessLookupError):
             os.kill(pid, number)
-
-
-# ---------------------------------------------------------------------- in the process of the run
 
 
 def main() -> int:
