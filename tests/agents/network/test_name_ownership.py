@@ -39,26 +39,24 @@ class Table(ManualClock):
         self.tokens: list[str] = []
         self.answers: Iterator[set[str] | None] = iter(())  # in place of the tokens; None: no answer
         self.links: Iterator[bool] = iter(())  # whether a session is linked, as long as that is given
-        self._chance = random.Random(seed)
+        self._seed = seed
         self._turn = threading.Condition()
         self._waiting: set[str] = set()
         self._running: set[str] = set()
-        self._next: str | None = None
 
     def await_turn(self, name: str) -> None:
         """Wait for the turn of a session."""
         with self._turn:
             self._waiting.add(name)
-            self._draw()
-            self._turn.wait_for(lambda: self._next == name, 10.0)
-            self._next = None
+            self._turn.notify_all()
+            assert self._turn.wait_for(lambda: self._drawn() == name, 10.0)
             self._waiting.discard(name)
             self.now += 0.02
 
-    def _draw(self) -> None:
-        if self._next is None and self._waiting == self._running and self._waiting:
-            self._next = self._chance.choice(sorted(self._waiting))
-            self._turn.notify_all()
+    def _drawn(self) -> str:
+        """Session whose turn it is, once all wait for theirs."""
+        together = self._waiting == self._running
+        return random.Random(f"{self._seed} {self.now}").choice(sorted(self._waiting)) if together else ""
 
     def together(self, **works: Callable[[Session], object]) -> dict[str, object]:
         """The outcome of what some sessions do at the same time."""
@@ -72,7 +70,7 @@ class Table(ManualClock):
             finally:
                 with self._turn:
                     self._running.discard(name)
-                    self._draw()
+                    self._turn.notify_all()
 
         with ThreadPoolExecutor(len(works)) as pool:
             return dict(zip(works, pool.map(work, works, works.values()), strict=True))

@@ -14,7 +14,6 @@ from typing import Any
 import psutil
 import pytest
 
-from agents.body.interface import call_all
 from agents.network import messages
 from agents.network.keys import Keys
 from agents.network.name_ownership import NameKeeper
@@ -120,20 +119,6 @@ def test_hanging_read_is_landed_by_the_watchdog():
     run_and_break(body, silence_s=0.1)
     assert landed.is_set()
     assert body.order == ["open", "land", "stop", "close"]
-
-
-def test_call_all_raises_the_last_error():
-    made = []
-
-    def call(what: str, *, fails: bool = False) -> None:
-        made.append(what)
-        if fails:
-            raise OSError(what)
-
-    with pytest.raises(OSError, match="three") as error:
-        call_all([lambda: call("one", fails=True), lambda: call("two"), lambda: call("three", fails=True)])
-    assert made == ["one", "two", "three"]
-    assert str(error.value.__context__) == "one"
 
 
 def test_stop_between_ticks_yields_the_processor(monkeypatch):
