@@ -53,12 +53,9 @@ def loaded(*words, program=LOADED, cwd=ROOT, **more):
     mostly_slow(
         [
             ("--help", "Usage: zenpark ", "numpy zenoh matplotlib msgspec pymunk rich asyncio jinja2 mcap pydantic"),
-            ("list", "", "numpy matplotlib zenoh pydantic"),
             ("list --json", "{", "numpy matplotlib zenoh pydantic"),
             ("check --help", "Usage: zenpark check ", "numpy matplotlib zenoh pydantic"),
-            ("explain --help", "Usage: zenpark explain ", "numpy matplotlib zenoh pydantic"),
             ("runs", "no run is up on this machine\n", "numpy matplotlib mcap"),
-            ("hosts check none.toml --lab lab --json", '{\n  "ok": false,\n  "error": "none.toml: ', "pydantic"),
         ],
         3,
     ),
@@ -66,7 +63,6 @@ def loaded(*words, program=LOADED, cwd=ROOT, **more):
 def test_light_commands_import_no_libraries(words, said, heavy, tmp_path):
     out, modules = loaded(*words.split(), cwd=tmp_path)
     assert out.startswith(said)
-    assert out
     assert not set(heavy.split()) & modules
 
 
@@ -81,10 +77,7 @@ def test_help_shows_commands_with_their_whole_description():
     shown = typer.main.get_command(app).commands
     panels = [name for names in PANELS.values() for name in names.split()]
     assert sorted(panels) == sorted(name for name, command in shown.items() if not command.hidden)
-    said = invoke("--help").stdout
-    assert [line for line in said.splitlines()[1:] if "..." in line or len(line) > 80] == []
-    assert [line[:-1] for line in said.splitlines() if line[:-1] in PANELS] == list(PANELS)
-    words = " ".join(said.split())
+    words = " ".join(invoke("--help").stdout.split())
     for name in panels:
         assert " ".join(f"{name} {shown[name].help.partition(chr(10))[0]}".split()) in words
 
@@ -109,35 +102,29 @@ def test_call_builds_only_its_own_commands_parameters():
         assert CliRunner().invoke(part_for([word]), [word]).stdout == invoke(word, code=None).stdout
 
 
-@pytest.mark.parametrize(
-    ("arguments", "why"),
-    [("run robotic-prk", "robotic-prk: neither a file nor an experiment"), ("run", "Missing argument 'FILE'.")],
-)
-def test_errors_are_json_where_it_is_asked_for(arguments, why, monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["zenpark", *arguments.split(), "--json"])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    printed = capsys.readouterr()
-    said = json.loads(printed.out)
-    assert (ended.value.code, said["ok"]) == (2, False)
-    assert said["error"].startswith(why)
-    assert printed.err.startswith(f"zenpark: {why}")
-
-
-def test_plugin_of_two_places_has_parameters_once():
-    lines = invoke("explain", "send-on-delta").stdout.splitlines()
-    assert lines[:2] == ["trigger(send-on-delta)", "formation.update(send-on-delta) "]
-    (threshold,) = [line for line in lines if ".threshold" in line]
-    assert threshold.startswith("trigger(send-on-delta).threshold δ: ")
-    assert threshold.endswith(" [m] [> 0, default: 0.01]")
+def test_errors_are_json_where_it_is_asked_for(monkeypatch, capsys):
+    for arguments, why in (
+        ("run robotic-prk", "robotic-prk: neither a file nor an experiment"),
+        ("run", "Missing argument 'FILE'."),
+    ):
+        monkeypatch.setattr(sys, "argv", ["zenpark", *arguments.split(), "--json"])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        printed = capsys.readouterr()
+        said = json.loads(printed.out)
+        assert (ended.value.code, said["ok"]) == (2, False)
+        assert said["error"].startswith(why)
+        assert printed.err.startswith(f"zenpark: {why}")
 
 
 def test_tables_are_json_where_it_is_asked_for():
     shown = json.loads(invoke("list", "--json").stdout)
-    assert "event" not in shown
     assert shown["experiments"][-1]["name"] == "triangle"
     said = invoke("explain", "disturbance.hover_jitter", "--json").stdout
     assert json.loads(said)[0]["key"].startswith("disturbance.")
+    lines = invoke("explain", "send-on-delta").stdout.splitlines()
+    assert lines[:2] == ["trigger(send-on-delta)", "formation.update(send-on-delta) "]
+    assert len([line for line in lines if ".threshold" in line]) == 1  # parameters of both places once
 
 
 def test_results_of_actions_are_json_on_request(tmp_path, monkeypatch):
@@ -167,27 +154,20 @@ def test_routers_come_from_environment_option_or_file(monkeypatch, tmp_path):
 
 
 def test_a_configuration_for_zenohd_is_printed():
-    made = json.loads(
-        invoke("router", "--print-config", "--listen", "tcp/127.0.0.1:7999", "--connect", "tcp/lab:1").stdout
-    )
+    words = ("router", "--print-config", "--listen")
+    made = json.loads(invoke(*words, "tcp/127.0.0.1:7999", "--connect", "tcp/lab:1").stdout)
     assert made["listen"] == {"endpoints": ["tcp/127.0.0.1:7999"]}
     assert made["connect"]["endpoints"] == ["tcp/lab:1"]
     assert made["scouting"]["multicast"] == {"enabled": False}
-    assert "will not listen" in str(
-        invoke("router", "--print-config", "--listen", "tcp/0.0.0.0:1", code=None).exception
-    )
+    assert "will not listen" in str(invoke(*words, "tcp/0.0.0.0:1", code=None).exception)
 
 
 COMPLETED = {
     "run tri": ["triangle"],
     "run robotic-park --case pe": ["periodic"],
-    "run triangle --set dur": ["duration_s="],
     "run triangle --set robots.KH01.ki": ["robots.KH01.kind="],
-    "run triangle --set safety.sep": ["safety.separation="],
-    "run triangle --set robots.CF01.ho": ["robots.CF01.hover="],
     "run triangle --set trigger.thr": ["trigger.threshold="],
     "run triangle --set cases.event.rates.bo": ["cases.event.rates.body_hz="],
-    "run triangle --set formation.t": ["formation.tracking_gain="],
     "agent triangle CF": ["CF01"],
     "report runs/f": ["runs/first"],
     "new mix": ["mixed-reality"],
@@ -217,8 +197,7 @@ def test_completion_is_right_and_light(tmp_path):
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux has a device that is always full")
-@pytest.mark.parametrize("unbuffered", mostly_slow(["", "1"], 2))
-@pytest.mark.parametrize(("output", "code"), [("> /dev/full", 2), (">&-", 0)])
+@pytest.mark.parametrize(("output", "code", "unbuffered"), [("> /dev/full", 2, ""), (">&-", 0, "1")])
 def test_output_that_goes_nowhere_makes_no_traceback(output, code, unbuffered):
     done = subprocess.run(
         ["sh", "-c", f'exec "$0" -m tools.guard explain rates {output}', sys.executable],

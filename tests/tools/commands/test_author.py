@@ -18,34 +18,26 @@ def parsed_options(tmp_path, monkeypatch):
     return invoke
 
 
-@pytest.mark.parametrize(
-    ("words", "file", "robots"),
-    [
+def test_formations(parsed_options):
+    for words, file, robots in (
         ("--hemisphere 40", "hemisphere-40.toml", 40),
-        ("--polygon 5 --kind khepera4 mine.toml", "mine.toml", 5),
         ("--grid 2x3 --spacing 0.8", "grid-2x3.toml", 6),
-        ("--polygon 9 --scatter 0 --duration 12", "polygon-9.toml", 9),
         ("triangle", "triangle.toml", 3),
-    ],
-)
-def test_formations(parsed_options, words, file, robots):
-    assert f"zenpark check {file}" in parsed_options("new", *words.split()).output
-    experiment = document.read(file).experiment
-    assert len(experiment.robots) == robots
-    if "--duration" in words:
-        assert (experiment.duration_s, experiment.start.scatter) == (12.0, 0.0)
+        ("--polygon 5 --kind khepera4 --scatter 0 --duration 12 mine.toml", "mine.toml", 5),
+    ):
+        assert f"zenpark check {file}" in parsed_options("new", *words.split()).output
+        experiment = document.read(file).experiment
+        assert len(experiment.robots) == robots
+    assert (experiment.duration_s, experiment.start.scatter) == (12.0, 0.0)
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
+def test_one_formation_at_a_time(parsed_options, tmp_path):
+    for words, said in (
         ("", "--hemisphere 40"),
         ("--polygon 5 --grid 2x2", "--grid is too much"),
         ("--polygon 5 a.toml b.toml", "'b.toml' is too much"),
-    ],
-)
-def test_one_formation_at_a_time(parsed_options, tmp_path, words, said):
-    assert said in parsed_options("new", *words.split(), code=2).output
+    ):
+        assert said in parsed_options("new", *words.split(), code=2).output
     assert list(tmp_path.iterdir()) == []
 
 

@@ -65,10 +65,9 @@ def test_a_wide_table_has_all_columns_and_totals():
     for figure in ("0.099", "1250.0", "300", "400 %", "80 %", "90000"):
         assert figure in text[-1]
     assert text[2].startswith("robot-99"), "where rows do not fit, the largest error comes first"
-
-
-def test_a_table_without_robots_has_its_heads():
     assert lines("realm park", [], EVENTS, 80, 24)[:2] == ["realm park", "  ".join(HEADS).rstrip()]
+    text = lines("t", [LiveRow("a\x1b[2J", "x\ny", note="\x1b]0;z\x07")], [Event(0.0, "k", "s", "\x1b[31m")], 100, 20)
+    assert all(line.isprintable() for line in text)
 
 
 def test_rows_that_fit_stay_in_their_order():
@@ -92,9 +91,8 @@ def test_cpu_is_a_share_and_growing_counters_coloured():
     assert seen["2"] == seen["5"] == seen["20 %"] == "yellow"
     flat = trends.row("robot-01", msgspec.structs.replace(later, battery=0.05), now=12.0, error=0.01)
     held = trends.row("held-one", msgspec.structs.replace(later, hazard="hold: x"), now=12.0, error=0.01)
-    gone = trends.row("gone-one", STATUS, now=12.0, error=None, gone="lost", lost=True)
-    seen = styles(flat, held, gone)
-    assert (seen["5 %"], seen["held-one"], seen["gone-one"]) == ("bold red", "yellow", "bold red")
+    seen = styles(flat, held)
+    assert (seen["5 %"], seen["held-one"]) == ("bold red", "yellow")
     repeated = msgspec.structs.replace(later, stamp=20.0)
     calm = trends.row("robot-01", repeated, now=20.0, error=0.01)
     assert (calm.growing, calm.cpu) == (frozenset(), 0.0)
@@ -102,22 +100,14 @@ def test_cpu_is_a_share_and_growing_counters_coloured():
     assert trends.row("robot-01", restarted, now=21.0, error=None).cpu is None
 
 
-@pytest.mark.parametrize(
-    ("changed", "now", "gone", "rank", "phase"),
-    [
-        ({}, 10.5, "", Rank.FINE, "running"),
-        ({}, 20.0, "", Rank.SILENT, "silent"),
-        ({"hazard": "hold: link silence"}, 10.5, "", Rank.HELD, "held"),
-        ({}, 10.5, "lost", Rank.GONE, "lost"),
-        ({}, 20.0, "removed", Rank.FINE, "removed"),
-    ],
-)
-def test_what_a_robot_needs(changed, now, gone, rank, phase):
-    status = msgspec.structs.replace(STATUS, **changed)
-    row = Trends().row("robot-01", status, now=now, error=None, gone=gone, lost=gone == "lost")
-    assert (row.rank, row.phase) == (rank, phase)
-
-
-def test_text_of_others_cannot_steer_the_terminal():
-    text = lines("t", [LiveRow("a\x1b[2J", "x\ny", note="\x1b]0;z\x07")], [Event(0.0, "k", "s", "\x1b[31m")], 100, 20)
-    assert all(line.isprintable() for line in text)
+def test_what_a_robot_needs():
+    for hazard, now, gone, rank, phase in (
+        ("", 10.5, "", Rank.FINE, "running"),
+        ("", 20.0, "", Rank.SILENT, "silent"),
+        ("hold: link silence", 10.5, "", Rank.HELD, "held"),
+        ("", 10.5, "lost", Rank.GONE, "lost"),
+        ("", 20.0, "removed", Rank.FINE, "removed"),
+    ):
+        status = msgspec.structs.replace(STATUS, hazard=hazard)
+        row = Trends().row("robot-01", status, now=now, error=None, gone=gone, lost=gone == "lost")
+        assert (row.rank, row.phase) == (rank, phase)

@@ -73,21 +73,10 @@ def test_new_report_keeps_seeds_without_recordings(first, again):
     assert (again / "figures/errors.csv").read_bytes() == (first / "figures/errors.csv").read_bytes()
 
 
-def test_figures_are_pdf_on_demand(first, again):
-    assert not list(again.glob("figures/*.pdf"))
-    for text in ((again / "report.html").read_text(), stdout_of("run", "--help")):
-        assert "./zenpark report FOLDER --pdf" in " ".join(text.split())
-    stdout_of("report", again, "--pdf")
-    assert {file.stem for file in again.glob("figures/*.pdf")} == {file.stem for file in again.glob("figures/*.svg")}
-    assert refused_command("report", again, "--latex", "--pdf")
-    assert refused_command("report", again, first, "--pdf")
-
-
 def test_figure_of_errors_stays_without_all_seeds_errors(first, again):
-    (again / "figures" / "errors.csv").unlink()
+    (again / "figures/errors.csv").unlink()
     stdout_of("report", again)
     assert (again / "figures/errors.svg").read_bytes() == (first / "figures/errors.svg").read_bytes()
-    assert "Recordings of the others are not kept." in (again / "report.html").read_text()
 
 
 def test_metrics_of_another_version_are_not_overwritten(again):
@@ -98,11 +87,10 @@ def test_metrics_of_another_version_are_not_overwritten(again):
 
 
 def test_paper_tables_are_over_seeds_with_chosen_metrics(first, tmp_path):
-    for form in ("--latex", "--markdown"):
+    for form, sign in (("--latex", r"\pm"), ("--markdown", "±")):
         text = stdout_of("report", first, form)
         assert "3 seeds" in text
-        assert text.count("±") + text.count(r"\pm") > 10
-        assert "3 seeds" in stdout_of("report", first, first, form)
+        assert text.count(sign) > 10
     file = tmp_path / "paper" / "t.tex"
     assert stdout_of("report", first, "--latex", "--out", file, "--metrics", "f,iae").strip() == str(file)
     rows = [line for line in file.read_text().splitlines() if line.startswith(("f ", "IAE", "ITAE", "RMSE"))]
@@ -118,8 +106,6 @@ def test_console_gives_the_digits_an_interval_supports(three_seeds):
     assert len(half[1]) == len(half[2])
     assert re.search(r"\(ratios: f \d\.\d+ ± \d\.\d+, IAE \d\.\d+ ± \d\.\d+\)", lines[1])
     assert ratio_words(spread([0.0610, 0.0611, 0.0612])) == "0.0611 ± 0.0002"
-    assert ratio_words(spread([1.0784])) == "1.078"
-    assert lines[-1] == f"replay in the browser: ./zenpark view {three_seeds[0]}"
 
 
 def test_sweep_has_figures_and_a_paper_table(first, tmp_path):
@@ -127,18 +113,12 @@ def test_sweep_has_figures_and_a_paper_table(first, tmp_path):
     said = stdout_of("sweep", first.parent / "short.toml", "trigger.threshold=0.01,0.05", "seeds=2", "--out", folder)
     assert f"figures: {figures}" in said
     narrow = (figures / "pareto_iae.svg").read_text()
-    assert stdout_of("report", folder, "--width", "7.16").strip() == str(figures)
+    assert stdout_of("report", folder, "--width", "7.16", "--pdf").strip() == str(figures)
     assert (figures / "pareto_iae.svg").read_text() != narrow
-    assert not list(figures.glob("*.pdf"))
-    stdout_of("report", folder, "--pdf")
     assert {file.stem for file in figures.glob("*.pdf")} == {"pareto_iae", "pareto_itae"}
-    text = stdout_of("report", folder, "--latex")
-    assert r"\caption{Cases, Two, for three seconds." in text
-    assert "event & 0.05 & " in text
+    assert "event & 0.05 & " in stdout_of("report", folder, "--latex")
     chosen = stdout_of("report", folder, "--latex", "--metrics", "messages,iae").splitlines()
     assert r"Case & threshold [m] & Messages ratio & IAE ratio \\" in chosen
-    assert "--metrics speed: is not known" in refused_command("report", folder, "--latex", "--metrics", "speed")
-    assert f"a sweep: `./zenpark report {folder}`" in stdout_of("runs", "--past", "--in", tmp_path)
     (known,) = json.loads(stdout_of("runs", "--past", "--in", tmp_path, "--json"))["sweeps"]
     assert (known["folder"], known["cells"], known["seeds"]) == (str(folder), 3, [1, 2])
 
@@ -146,9 +126,8 @@ def test_sweep_has_figures_and_a_paper_table(first, tmp_path):
 def test_hazards_of_a_virtual_run_are_printed(three_seeds, another):
     _, printed = another("--set", "safety.separation=0.7", "--anyway")
     lines = [line for line in printed.splitlines() if ": hazard " in line]
-    assert len(lines) == 6
+    assert len(lines) == 6  # and more in the recording
     assert all("minimum separation" in line for line in lines)
-    assert "more, in the recording and the report" in printed
     assert "hazard" not in three_seeds[1]
 
 
@@ -158,7 +137,6 @@ def test_runs_of_several_seeds_are_pooled_to_one(first, another, tmp_path):
     assert tables == stdout_of("report", first, "--latex", "--metrics", "f,iae")
     page = tmp_path / "seed1-pooled" / "report.html"
     assert stdout_of("report", *runs, "--pool").strip() == str(page)
-    assert f"Of 3 runs together: {', '.join(map(str, runs))}." in page.read_text()
     assert "median and range of 3 seeds" in page.read_text()
     assert "seed 1 is there twice" in refused_command("report", runs[0], runs[0], "--pool")
     other, _ = another("--set", "duration_s=2.5")
@@ -177,9 +155,7 @@ def test_a_comparison_has_the_intervals_of_the_report(three_seeds, again, tmp_pa
     assert rate in event
     assert error in event
     assert re.search(r" × 0\.\d+ ± 0\.\d+", event)
-    assert "Means over 3 seeds ± half-width" in lines[-2]
     assert lines[-1] == str(page)
-    assert "Comparison of runs" in page.read_text()
     found = json.loads(stdout_of("report", first, again, "--out", page, "--json"))
     assert found["differences"] == {str(again): []}
     figures = found["runs"][0]["cases"]["event"]["iae"]
@@ -187,49 +163,38 @@ def test_a_comparison_has_the_intervals_of_the_report(three_seeds, again, tmp_pa
     assert figures["ci95"] > 0.0
 
 
-@pytest.mark.parametrize(("made", "kept"), [([], "nothing is kept"), (["event"], "kept is seed 1 of event")])
-def test_interrupted_run_over_seeds_reports_what_is_kept(made, kept, first, tmp_path, monkeypatch):
+def test_interrupted_run_over_seeds_reports_what_is_kept(first, tmp_path, monkeypatch):
     def interrupted(*_, folder, **__):
-        for case in made:
-            (folder / f"{case}.mcap").touch()
+        (folder / "event.mcap").touch()
         raise KeyboardInterrupt
 
     monkeypatch.setattr("experiments.run.simulate_seeds", interrupted)
     options = ["--virtual", "--seeds", "60", "--out", tmp_path / "run"]
     done = invoke("run", first.parent / "short.toml", *options, code=None)
     assert done.exit_code != 0
-    assert f"interrupted: {kept}" in done.stderr
-    assert "`./zenpark sweep` keeps every seed" in done.stderr
+    assert "interrupted: kept is seed 1 of event" in done.stderr
 
 
-@pytest.mark.parametrize(
-    ("runs", "words"),
-    [
-        ([(5.4, 5.5)] * 2, "acquired after 7.8 s (mean)"),
-        ([(5.4, 5.5), (5.4, None)], "acquired after 7.8 s (mean of 1 of 2 seeds, the others never)"),
-        ([(5.4, None)], "not acquired by all (1 of 2 robots were there)"),
-        ([(5.4, None)] * 2, "not acquired by all in any of 2 seeds (2 of 4 robots were there)"),
-    ],
-)
-def test_seeds_that_never_acquire_are_counted(runs, words):
-    measured = [
-        SimpleNamespace(
-            mean={"acquired_s": None if None in acquired else 1.0},
-            robots=[SimpleNamespace(robot=f"R{k}", acquired_s=when) for k, when in enumerate(acquired)],
-            leaders=(),
-            died=(),
-        )
-        for acquired in runs
-    ]
-    assert _acquired("7.8", measured) == words
+def test_seeds_that_never_acquire_are_counted():
+    def measured(*acquired):
+        robots = [SimpleNamespace(robot=f"R{k}", acquired_s=when) for k, when in enumerate(acquired)]
+        mean = {"acquired_s": None if None in acquired else 1.0}
+        return SimpleNamespace(mean=mean, robots=robots, leaders=(), died=())
+
+    some, never = measured(5.4, 5.5), measured(5.4, None)
+    for runs, words in (
+        ([some, some], "acquired after 7.8 s (mean)"),
+        ([some, never], "acquired after 7.8 s (mean of 1 of 2 seeds, the others never)"),
+        ([never], "not acquired by all (1 of 2 robots were there)"),
+        ([never, never], "not acquired by all in any of 2 seeds (2 of 4 robots were there)"),
+    ):
+        assert _acquired("7.8", runs) == words
 
 
 def test_a_spoiled_run_is_not_compared(first, another, tmp_path):
     out, printed = another("--set", "cases.event.safety.battery_low=0.999999", "--anyway", code=1)
     assert "✗ Spoiled, and compared with nothing: event: robots failed." in printed
-    assert "ratios" not in printed
     compared = stdout_of("report", first, out, "--out", tmp_path / "comparison.html")
     assert "×" not in next(line for line in compared.splitlines() if line.startswith("B · event "))
-    assert "Spoiled, and compared with nothing: B · event: " in compared
     assert "robots failed" in stdout_of("runs", "--past", "--in", out)
     assert "is no whole run that nothing spoiled" in refused_command("report", out, first, "--pool")

@@ -96,22 +96,26 @@ def drone(talk):
     return made
 
 
-def test_tello_is_silent_until_in_sdk_mode(talk):
+def test_tello_reports_in_sdk_mode(talk):
     drone = talk()
     assert drone.ask("battery?") is None
     drone.wait(1.0)
     assert drone.state()[1] == 0
-    assert drone.ask("command") == "ok"
-    assert drone.ask("battery?") == "100\r\n"
-    assert drone.ask("sdk?") == "20\r\n"
+    assert [drone.ask(text) for text in ("command", "battery?", "sdk?")] == ["ok", "100\r\n", "20\r\n"]
     drone.wait(1.0)
     state, count = drone.state()
     assert count == 10
     assert (state["bat"], state["h"], state["time"], state["tof"], state["yaw"]) == ("100", "0", "0", "10", "0")
+    assert (state["mid"], state["x"]) == ("-2", "-200")
+    for command, said in (("mon", ("-1", "-100")), ("moff", ("-2", "-200"))):
+        drone.ask(command)
+        drone.wait(0.2)
+        state, _ = drone.state()
+        assert (state["mid"], state["x"]) == said
 
 
 def test_take_off_and_landing_are_answered_when_over(talk):
-    drone = talk()
+    drone = talk(faults={"refuse_landing_s": 8.0})
     drone.ask("command")
     drone.say("takeoff")
     drone.wait(1.0)
@@ -120,6 +124,10 @@ def test_take_off_and_landing_are_answered_when_over(talk):
     assert answer == "ok"  # of the take-off
     assert 2.0 < when < 6.0
     assert drone.place()[2] == pytest.approx(0.8, abs=0.01)
+    assert drone.ask("land") == "error"
+    drone.wait(0.9)
+    assert drone.ask("land") == "error"
+    drone.wait(0.2)
     drone.say("land")
     begun = drone.tick * DT
     [(answer, when)] = drone.wait(8.0)
@@ -127,18 +135,6 @@ def test_take_off_and_landing_are_answered_when_over(talk):
     assert when - begun > 1.0
     assert drone.place()[2] == 0.0
     assert drone.ask("land") == "error"
-
-
-def test_landing_is_refused_for_some_time(talk):
-    drone = talk(faults={"refuse_landing_s": 2.0})
-    drone.up()
-    assert drone.ask("land") == "error"
-    drone.wait(1.9)
-    assert drone.ask("land") == "error"
-    drone.wait(0.2)
-    assert drone.ask("land") is None
-    assert drone.answers(8.0) == ["ok"]
-    assert drone.place()[2] == 0.0
 
 
 def test_sticks_are_body_velocities_until_they_change(talk):
@@ -149,9 +145,7 @@ def test_sticks_are_body_velocities_until_they_change(talk):
     # 0.5 m/s, reached with a time constant of 1/3 s: 4 s less that
     assert drone.after(4.0) - before == pytest.approx([0.0, 0.5 * (4.0 - 1.0 / 3.0), 0.0], abs=0.02)
     drone.say("rc 40 0 -10 0")
-    drone.wait(2.0)
-    drone.state()
-    drone.wait(0.1)
+    drone.wait(2.1)
     state, _ = drone.state()
     assert (int(state["vgx"]), int(state["vgy"]), int(state["vgz"])) == (0, 4, 1)
     drone.say("rc 0 0 0 50")  # clockwise
@@ -166,8 +160,7 @@ def test_moves_end_where_they_should(drone):
     drone.say("go 50 -40 30 100")
     assert drone.answers(5.0) == ["ok"]
     assert drone.place() - begin == pytest.approx([0.5, -0.4, 0.3], abs=0.035)
-    assert drone.ask("speed 20") == "ok"
-    assert drone.ask("speed?") == "20.0\r\n"
+    assert (drone.ask("speed 20"), drone.ask("speed?")) == ("ok", "20.0\r\n")
     drone.say("ccw 90")
     assert drone.answers(3.0) == ["ok"]
     assert drone.device.truth()[1][0] == pytest.approx(np.pi / 2, abs=0.02)
@@ -177,15 +170,18 @@ def test_moves_end_where_they_should(drone):
     assert drone.place() - begin == pytest.approx([-0.6, 0.0, 0.0], abs=0.04)
 
 
-@pytest.mark.parametrize(
-    ("command", "answer"),
-    [
+def test_what_it_refuses(talk):
+    drone = talk()
+    drone.ask("command")
+    for command, answer in (("forward 50", "error Motor stop"), ("stop", "error Motor stop"), (" ", None)):
+        assert drone.ask(command) == answer
+    drone.up()
+    for command, answer in (
         ("forward 10", "out of range"),
         ("forward", "out of range"),
         ("go 10 10 10 50", "error"),
         ("go 501 0 0 50", "out of range"),
         ("cw 361", "out of range"),
-        ("speed 5", "out of range"),
         ("takeoff", "error"),
         ("rc 0 0", "error"),
         ("rc a b c d", "error"),
@@ -196,40 +192,24 @@ def test_moves_end_where_they_should(drone):
         ("curve 100 0 0 200 0 0 30", "error"),
         ("curve 20 10 0 40 0 0 30", "error"),
         ("curve 100 100 0 200 0 0 90", "out of range"),
-        ("motoron", "unknown command: motoron"),
-        ("keepalive", "unknown command: keepalive"),
         ("EXT led 1 2 3", "unknown command: EXT"),
-        ("wifi name word", "ok"),
-        ("ap name word", "ok,drone will reboot in 3s"),
-        ("dance", "unknown command: dance"),
+        ("\xff", "unknown command: ??"),
         ("why?", "unknown command: why?"),
-        ("speed 50", "ok"),
+        ("ap name word", "ok,drone will reboot in 3s"),
         ("stop", "ok"),
-    ],
-)
-def test_what_it_refuses_in_the_air(drone, command, answer):
-    assert drone.ask(command) == answer
+    ):
+        assert (command, drone.ask(command)) == (command, answer)
 
 
 def test_a_curve_goes_through_its_points(drone):
     begin, centre = drone.place(), drone.place() + np.array([0.0, 1.0, 0.0])
-    drone.say("curve 71 29 0 100 100 0 30")
+    drone.say("curve 71 29 0 100 100 0 30")  # a quarter of a circle of 1 m, ahead and to the left
     answers = []
     for _ in range(80):
         answers += drone.answers(0.1)
         assert np.linalg.norm((drone.place() - centre)[:2]) == pytest.approx(1.0, abs=0.05)
     assert answers == ["ok"]
     assert drone.place() - begin == pytest.approx([1.0, 1.0, 0.0], abs=0.05)
-
-
-def test_mission_pads_are_searched_for_when_switched_on(talk):
-    drone = talk()
-    drone.ask("command")
-    for command, said in (("battery?", ("-2", "-200")), ("mon", ("-1", "-100")), ("moff", ("-2", "-200"))):
-        drone.ask(command)
-        drone.wait(0.2)
-        state, _ = drone.state()
-        assert (state["mid"], state["x"]) == said
 
 
 def test_wifi_gap_leaves_the_sticks_as_they_are(drone):
@@ -241,22 +221,12 @@ def test_wifi_gap_leaves_the_sticks_as_they_are(drone):
     drone.say("rc 0 0 0 0")
     assert drone.after(0.95)[0] - before[0] == pytest.approx(0.285, abs=0.02)
     assert drone.state()[1] == 0
-    drone.say("rc 0 0 0 0")
     drone.wait(0.1)
     drone.say("rc 0 0 0 0")
     drone.wait(1.0)
     assert drone.state()[1] > 0
     at = drone.place()
     assert drone.after(0.5) == pytest.approx(at, abs=0.01)
-
-
-def test_what_it_refuses_on_the_ground(talk):
-    drone = talk()
-    drone.ask("command")
-    assert drone.ask("forward 50") == "error Motor stop"
-    assert drone.ask("stop") == "error Motor stop"
-    assert drone.ask(" ") is None
-    assert drone.ask("\xff") == "unknown command: ??"
 
 
 def test_tello_lands_after_fifteen_seconds_without_a_command(drone):
@@ -278,14 +248,12 @@ def test_a_battery_that_ends_brings_it_down(talk):
     drained.up()
     assert drained.after(6.0)[2] == 0.0
     assert 0 <= int(drained.ask("battery?")) < 5
-    assert drained.ask("takeoff") == "error"
 
 
 def test_silence_loss_and_delay(talk):
     drone = talk(faults={"silent_from_s": 1.0, "silent_for_s": 1.0, "delay_s": 0.2})
     drone.say("command")
-    [(answer, when)] = drone.wait(0.5)
-    assert (answer, when) == ("ok", pytest.approx(0.2))
+    assert drone.wait(0.5) == [("ok", pytest.approx(0.2))]
     drone.wait(0.55)
     drone.state()
     assert drone.ask("battery?") is None
@@ -311,7 +279,6 @@ def test_disturbance_and_settings_show_in_the_truth(talk):
 def test_drones_have_addresses_of_their_own(talk):
     pair = talk(rows=2)
     assert len(set(pair.device.addresses)) == 2
-    assert all(address.startswith("tello://127.0.0.") for address in pair.device.addresses)
     assert pair.ask("command", row=1) == "ok"
     pair.say("takeoff", row=1)
     pair.wait(3.0)
@@ -320,10 +287,7 @@ def test_drones_have_addresses_of_their_own(talk):
     assert pair.ask("emergency", row=1) == "ok"  # it falls
     pair.wait(0.5)
     assert pair.place(1)[2] == 0.0
-
-
-def test_addresses_that_cannot_be_had(talk):
-    held = talk().device.addresses[0].removeprefix("tello://")
+    held = pair.device.addresses[0].removeprefix("tello://")
     for address, device, why in (
         (f"tello-twin://{held}", {}, "in use"),
         ("tello-twin://192.168.10.1", {}, "loopback"),

@@ -10,7 +10,7 @@ import zenoh
 from rosbags.typesys import Stores, get_typestore
 from zenoh.handlers import RingChannel
 
-from agents.body.interface import BodyError, Disturbance
+from agents.body.interface import BodyError
 from agents.network.session import open_session
 from tests.bridges.turtlebots import request
 from twins.devices.device import DeviceRequest, Faults
@@ -73,7 +73,7 @@ class Listener:
                 self.inbox[topic].append((message, sample.attachment))
 
     def count(self, seconds, topic="odom"):
-        """How many messages of a topic so many seconds of the twin bring, when all have arrived."""
+        """Number of messages that arrive in these seconds of the twin."""
         self.settle()
         before = len(self.inbox[topic])
         self.after(seconds)
@@ -95,10 +95,9 @@ class Listener:
             quiet = quiet + 1 if before == [len(box) for box in self.inbox.values()] else 0
 
     def tell(self, v, w, kind=None):
-        made = STORE.types
-        vector = lambda x, z: made["geometry_msgs/msg/Vector3"](x=x, y=0.0, z=z)  # noqa: E731
-        kind = kind or self.kind
-        message = made["geometry_msgs/msg/Twist"](linear=vector(v, 0.0), angular=vector(0.0, w))
+        made, kind = STORE.types, kind or self.kind
+        linear, angular = (made["geometry_msgs/msg/Vector3"](x=x, y=0.0, z=z) for x, z in ((v, 0.0), (0.0, w)))
+        message = made["geometry_msgs/msg/Twist"](linear=linear, angular=angular)
         if kind.endswith("Stamped"):
             stamp = made["builtin_interfaces/msg/Time"](sec=1, nanosec=2)
             message = made[kind](header=made["std_msgs/msg/Header"](stamp=stamp, frame_id=""), twist=message)
@@ -143,10 +142,8 @@ def test_says_what_turtlebot3_node_says(listen, style, distro):
     assert listener.count(4.0, "battery_state") == 4
     odometry, attachment = listener.inbox["odom"][-1]
     assert (odometry.header.frame_id, odometry.child_frame_id) == ("odom", "base_footprint")
-    assert (odometry.pose.pose.position.x, odometry.pose.pose.orientation.w) == (0.0, 1.0)
     scan = listener.inbox["scan"][-1][0]
-    assert len(scan.ranges) == 360
-    assert np.isinf(scan.ranges).all()
+    assert np.isinf(scan.ranges).tolist() == [True] * 360
     assert scan.angle_increment == pytest.approx(pi / 180.0)
     assert scan.angle_max == pytest.approx(scan.angle_min + 359 * scan.angle_increment)
     battery = listener.inbox["battery_state"][-1][0]
@@ -203,22 +200,10 @@ def test_odometry_counts_from_where_it_starts(listen):
     odometry = listener.after(3.0).pose.pose
     (position,), (yaw,) = listener.twin.truth()
     turned = 2.0 * np.arctan2(odometry.orientation.z, odometry.orientation.w)
-    c, s = np.cos(2.0), np.sin(2.0)
-    x, y = odometry.position.x, odometry.position.y
-    placed = np.array([1.0 + c * x - s * y, -2.0 + s * x + c * y])
-    assert np.linalg.norm(placed - position[:2]) < 0.012  # at most 50 ms old
+    placed = complex(1.0, -2.0) + complex(odometry.position.x, odometry.position.y) * np.exp(2.0j)
+    assert abs(placed - complex(*position[:2])) < 0.012  # at most 50 ms old
     assert abs(turned - (yaw - 2.0)) < 0.03
     assert np.linalg.norm(position[:2] - [1.0, -2.0]) > 0.3
-
-
-@pytest.mark.system
-def test_odometry_drifts_and_truth_does_not(listen):
-    listener = listen(disturbance=Disturbance(odometry_drift=0.05))
-    listener.obey(0.2, 0.0)
-    place = listener.after(10.0).pose.pose.position
-    (position,), _ = listener.twin.truth()
-    assert abs(position[1]) < 1e-9
-    assert 0.005 < np.hypot(place.x - position[0], place.y) < 0.3
 
 
 @pytest.mark.system
@@ -238,22 +223,12 @@ def test_announces_itself(listen, eventually):
 
 
 @pytest.mark.system
-def test_loss_is_a_share_of_both_directions(listen):
-    listener = listen(faults=Faults(loss=0.3))
-    assert 0.6 < listener.count(20.0) / 400 < 0.8
-    for _ in range(20):
-        for _ in range(10):
-            listener.tell(0.0, 0.0)
-        listener.settle()
-        listener.advance(0.01)
-    assert 0.55 < listener.twin.commands_received[0] / 200 < 0.85
-
-
-@pytest.mark.system
-def test_delay_is_of_what_it_says(listen):
+def test_loss_and_delay(listen):
     listener = listen(faults=Faults(delay_s=0.5), ready=False)
     assert listener.count(0.5) == 0
     assert listener.count(0.5) == 10
+    listener = listen(faults=Faults(loss=0.3))
+    assert 0.6 < listener.count(20.0) / 400 < 0.8
 
 
 @pytest.mark.system
@@ -276,18 +251,14 @@ def test_an_empty_battery(listen):
     listener = listen(faults=Faults(battery=0.5, drain=900.0))
     listener.after(4.0)
     charges = [battery.percentage for battery, _ in listener.inbox["battery_state"]]
-    assert np.diff(charges) == pytest.approx([-10.0] * (len(charges) - 1), abs=0.2)
+    assert set(np.round(np.diff(charges))) == {-10.0}
     assert listener.after(6.0, "battery_state").percentage == 0.0
 
 
 @pytest.mark.system
-def test_wrong_settings_are_named(hub):
+def test_the_session_is_gone_when_it_is_closed(hub, eventually):
     with pytest.raises(BodyError, match=r"TB0: device: .*`colour`"):
         TurtleBot3Twin(DeviceRequest(request(hub.endpoint, device={"colour": 1}), Faults()))
-
-
-@pytest.mark.system
-def test_the_session_is_gone_when_it_is_closed(hub, eventually):
     twin = TurtleBot3Twin(DeviceRequest(request(hub.endpoint), Faults()))
     with open_session([hub.endpoint], name="listener") as session:
         seen = session.liveliness().declare_subscriber("@/*/@ros2_lv/**", RingChannel(64), history=True)
