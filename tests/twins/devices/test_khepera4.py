@@ -138,7 +138,7 @@ def test_what_servers_do_with_speeds_and_polls(talk, server, obeys, drives, answ
     assert (robot.after(0.5).speed() > 0.04) == obeys
 
 
-def test_park_2023_loses_what_is_glued_to_a_command(talk):
+def test_park_loses_what_is_glued_to_a_command(talk):
     robot = talk("2023-01-07")
     robot.say(b"d 5.0 0.1")
     robot.after(1.0)
