@@ -1,17 +1,14 @@
 """A zygote: what it forks is as good as spawned, and lives without it."""
 
-from __future__ import annotations
-
 import os
 import signal
 import textwrap
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import psutil
 import pytest
 
-from experiments.real_time.hosts.launcher import ZYGOTE, Launcher, Process
+from experiments.real_time.hosts.launcher import ZYGOTE, Launcher
 from experiments.real_time.processes import zygote
 from tests.waiting import until
 
@@ -34,7 +31,7 @@ FORKED = """
 
 
 @pytest.fixture
-def launcher(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Launcher]:
+def launcher(tmp_path, monkeypatch):
     """A launcher with a zygote, to which the module `forked` is known."""
     code = tmp_path / "code"
     code.mkdir()
@@ -45,14 +42,14 @@ def launcher(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Launch
         yield made
 
 
-def begin(launcher: Launcher, name: str, *arguments: str) -> Process:
+def begin(launcher, name, *arguments):
     process = launcher.start(name, "forked", *arguments, forked=True)
     until(lambda: "begun" in process.output or not process.alive, f"{name} has begun")
     return process
 
 
 @pytest.mark.parametrize(("end", "words"), [("0", "exit code 0"), ("3", "exit code 3"), ("raise", "exit code 1")])
-def test_exit_codes_are_passed_on(launcher: Launcher, end: str, words: str) -> None:
+def test_exit_codes_are_passed_on(launcher, end, words):
     process = begin(launcher, "a", end)
     assert isinstance(process.handle, zygote.Forked)
     assert process.handle.wait(30.0) == process.handle.poll()
@@ -62,7 +59,7 @@ def test_exit_codes_are_passed_on(launcher: Launcher, end: str, words: str) -> N
 
 
 @pytest.mark.mechanism("zygote")
-def test_a_forked_process_shares_nothing_open_with_others(launcher: Launcher) -> None:
+def test_a_forked_process_shares_nothing_open_with_others(launcher):
     processes = [begin(launcher, name, "stay", name) for name in ("case-KH01", "case-CF01", "case-CF02")]
     launcher.release("case-CF01")
     assert processes[1].handle.wait(30.0) == 5, "no other process holds its lifeline"
@@ -81,7 +78,7 @@ def test_a_forked_process_shares_nothing_open_with_others(launcher: Launcher) ->
         assert Path(f"/proc/{seen.pid}/fd/1").resolve() == process.log
 
 
-def test_a_killed_process_is_seen(launcher: Launcher) -> None:
+def test_a_killed_process_is_seen(launcher):
     killed, ended = begin(launcher, "a", "stay"), begin(launcher, "b", "stay")
     launcher.kill("a")
     until(lambda: launcher.died() == [killed], "its end is seen")
@@ -92,7 +89,7 @@ def test_a_killed_process_is_seen(launcher: Launcher) -> None:
 
 
 @pytest.mark.parametrize("end", [Launcher.kill, Launcher.release])
-def test_an_ended_zygote_takes_no_process_along(launcher: Launcher, end: Callable[[Launcher, str], None]) -> None:
+def test_an_ended_zygote_takes_no_process_along(launcher, end):
     process = begin(launcher, "a", "stay")
     end(launcher, ZYGOTE)
     until(lambda: [each.name for each in launcher.died()] == [ZYGOTE], "its end is seen")
@@ -106,7 +103,7 @@ def test_an_ended_zygote_takes_no_process_along(launcher: Launcher, end: Callabl
     assert process.exit == "exit code unknown"
 
 
-def test_a_zygote_that_stands_still_is_done_without(launcher: Launcher) -> None:
+def test_a_zygote_that_stands_still_is_done_without(launcher):
     process = begin(launcher, "a", "3")
     os.kill(launcher.get(ZYGOTE).handle.pid, signal.SIGSTOP)
     assert not isinstance(begin(launcher, "b", "stay").handle, zygote.Forked)
@@ -115,7 +112,7 @@ def test_a_zygote_that_stands_still_is_done_without(launcher: Launcher) -> None:
     until(lambda: not psutil.Process(launcher.get(ZYGOTE).handle.pid).children(), "what is late ends at once")
 
 
-def test_a_zygote_with_two_threads_forks_nothing(launcher: Launcher, tmp_path: Path) -> None:
+def test_a_zygote_with_two_threads_forks_nothing(launcher, tmp_path):
     threaded = "import threading; threading.Thread(target=threading.Event().wait, daemon=True).start()"
     (tmp_path / "code" / "sitecustomize.py").write_text(threaded)
     launcher.end([ZYGOTE], 1.0)
@@ -124,7 +121,7 @@ def test_a_zygote_with_two_threads_forks_nothing(launcher: Launcher, tmp_path: P
     assert "nothing was forked: 2 threads" in launcher.get(ZYGOTE).output
 
 
-def test_without_a_zygote_all_are_spawned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_zygote_all_are_spawned(tmp_path, monkeypatch):
     monkeypatch.setenv(zygote.SWITCH, "0")
     with Launcher(tmp_path / "logs") as launcher:
         launcher.preload()

@@ -1,0 +1,389 @@
+"""World, central controller and recorder: their pace, whom they obey, and when they end."""
+
+import math
+import os
+import signal
+import subprocess
+import sys
+import threading
+import types
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+from agents.clock import uptime
+from agents.decision.centralised import CentreGoal
+from agents.network import messages, name_ownership, pubsub, shutdown
+from agents.network import session as network
+from agents.network.keys import Keys
+from agents.network.name_ownership import NameTaken, OwnershipCheck, OwnershipTiming
+from agents.network.shutdown import FAREWELL_S, STOPPED_S
+from agents.robot import Robot
+from agents.runtime.goal_inbox import GoalInbox
+from experiments.definition.experiment import Formation, RobotTable
+from experiments.definition.plan import Plan
+from experiments.real_time.processes import joining, world_network
+from experiments.real_time.processes import world as world_module
+from experiments.real_time.processes.centre import CentreProcess
+from experiments.real_time.processes.recorder import AFTER_S, Recorder, with_truth
+from experiments.real_time.processes.world import WorldProcess
+from experiments.real_time.processes.world_population import WorldBodies
+from tests.experiments.recordings import START, state, touched, world_state
+from tests.fuzz.messages import sent
+from tests.network import Attentive, Mute, Net, Reply, Sample
+from tests.small import changed, pair
+from tests.system.lab import Started
+from tests.waiting import until
+
+KEYS = Keys()
+BEGIN, WORLD_HZ = 1000.0, 100.0
+DRONE = RobotTable(kind="crazyflie", start=[0.1, 0.2], hover=0.5, body="world")
+GUIDED = Plan(pair(architecture="centralised"))
+
+
+def joint(net, ownership):
+    """The `net` for a process; without an `ownership` a standstill of the machine asks for no check."""
+    return joining.Network(net.session, KEYS, [], [], ownership or OwnershipCheck([], lease_s=math.inf))
+
+
+def joined_world(net, bodies=None, ownership=None, clock=uptime, name="F"):
+    """World of one drone."""
+    plan = Plan(pair(robots={name: DRONE}, formation=Formation()))
+    return WorldProcess(plan, bodies or WorldBodies(plan), joint(net, ownership), threading.Event(), clock)
+
+
+def centre(net, ownership=None, clock=uptime):
+    """Central controller of two wheeled robots."""
+    return CentreProcess(GUIDED, joint(net, ownership), clock=clock)
+
+
+class Over:
+    """Event whose waits advance a simulated clock, the sixth by `more` [s] than asked; set after so many."""
+
+    def __init__(self, waits, more=0.0):
+        self.now, self._left, self._sixth, self._more = BEGIN, waits, waits - 6, more
+
+    def is_set(self):
+        return self._left < 0
+
+    def wait(self, seconds):
+        self._left -= 1
+        self.now += seconds + (self._more if self._left == self._sixth else 0.0)
+        return self.is_set()
+
+
+def decisions(monkeypatch, over, decide):
+    """The central controller after a run in which `decide` gets it, time of the decision [s] and starts of robots."""
+    with Net().worn() as net:
+        process = centre(net, clock=lambda: over.now)
+        monkeypatch.setattr(process.centre, "decide", lambda t, _, start: decide(process, t, start) or [])
+        process.run(over)
+    return process
+
+
+def test_decisions_follow_start_and_skip_standstill(monkeypatch):
+    over, decided = Over(12), []
+
+    def decide(process, t, start):
+        decided.append((t / process.ticks.period, (over.now - BEGIN) / process.ticks.period))
+        if len(decided) == 3:
+            for row in process.guided:
+                start[row] = 4.25 * process.ticks.period  # robots began there
+        over.now += (3.9 if len(decided) == 8 else 0.1) * process.ticks.period
+
+    process = decisions(monkeypatch, over, decide)
+    late = 0.05  # of a period of 0.1 s: half a tick of a body at 100 Hz
+    times = [0, 1, 2, 3, 3.25, 4.25, 5.25, 6.25, 9.25, 10.25, 11.25, 12.25]
+    assert [t for t, _ in decided] == pytest.approx(times)
+    delays = [at - t for t, at in decided]
+    assert delays == pytest.approx([late if t != 9.25 else 6.25 + late + 3.9 - 9.25 for t in times])
+    assert process.missed == 2
+    assert process.ticks.next == pytest.approx(13.25 * process.ticks.period)
+
+
+def test_long_wait_decides_for_no_past_instant(monkeypatch):
+    over, ages, late = Over(12, more=0.73), [], []
+
+    def decide(process, t, _start):
+        ages.append(over.now - BEGIN - t)
+        late.append(process.late_s)
+
+    process = decisions(monkeypatch, over, decide)
+    assert len(ages) == 12
+    assert max(ages) < process.ticks.period + process.patience_s
+    assert process.missed == int(0.73 / process.ticks.period)
+    assert max(late) == pytest.approx(0.73, abs=1e-9)
+
+
+@pytest.mark.parametrize("asleep", [False, True])
+@pytest.mark.parametrize(("stands_s", "lost", "forgiven"), [(0.05, 0, False), (0.255, 19, False), (2.0, 194, True)])
+def test_lateness_is_caught_up_and_standstill_lost(stands_s, lost, forgiven, asleep, monkeypatch):
+    now, simulated, slept, over = [BEGIN], [], [], threading.Event()
+    lost += asleep and lost > 0  # it begins when a tick is due, not after one
+
+    def sleep(seconds):
+        now[0] += seconds + (stands_s if asleep and len(simulated) == 20 else 0.0)
+
+    bodies = WorldBodies(Plan(pair(robots={"F": DRONE}, formation=Formation())))
+    advance = bodies.advance
+
+    def stand():
+        advance()
+        simulated.append(bodies.time)
+        now[0] += stands_s if len(simulated) == 20 and not asleep else 0.001
+        if len(simulated) == 150:
+            over.set()
+
+    monkeypatch.setattr(world_module, "time", types.SimpleNamespace(sleep=sleep))
+    monkeypatch.setattr(bodies, "advance", stand)
+    with Net().worn() as net:
+        process = joined_world(net, bodies, clock=lambda: now[0])
+        monkeypatch.setattr(process.commands, "forgive", lambda seconds, t: slept.append((seconds, t)))
+        process.run(over)
+    assert bodies.time == pytest.approx(150 / WORLD_HZ), "each tick simulates its period"
+    assert now[0] - BEGIN == pytest.approx((149 + lost) / WORLD_HZ + 0.001), "in time again"
+    assert slept == ([(pytest.approx(lost / WORLD_HZ), pytest.approx((20 + lost) / WORLD_HZ))] if lost else [])
+    assert any(seconds > world_network.HANG_S for seconds, _ in slept) == forgiven
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("way", ["still", "cut off"])
+@pytest.mark.parametrize("what", ["world", "centre"])
+def test_replaced_process_sends_nothing(what, way, monkeypatch):
+    sent, now, silent, over = [], [0.0], [math.inf], threading.Event()
+    token = KEYS.world_alive if what == "world" else KEYS.centre_alive
+
+    class Counted(Mute):
+        def put(self, payload, **_):
+            sent.append(payload)
+            if len(sent) == 10 and way == "cut off":
+                silent[0] = 0.0
+            if len(sent) == 20:
+                net.replies = [Reply(Sample(Keys.life(token, "beef"), "", b""), good=True)]
+                now[0] += 60.0 if way == "still" else 0.0
+                silent[0] = math.inf
+            if len(sent) == 40:
+                over.set()
+
+    monkeypatch.setattr(name_ownership, "uptime", lambda: now[0])
+    monkeypatch.setattr(Attentive, "silent_since", lambda *_: silent[0])
+    ownership = OwnershipCheck([token], timing=OwnershipTiming(vanish_s=0.0))
+    with Net().worn() as net:
+        monkeypatch.setattr(pubsub, "publisher", lambda *_, **__: Counted())
+        process = (joined_world if what == "world" else centre)(net, ownership=ownership)
+        if what == "centre":
+            monkeypatch.setattr(process.centre, "decide", lambda *_: [CentreGoal(0, (0.0, 0.0, 0.0), 0.0, 0.0)])
+        with pytest.raises(NameTaken):
+            process.run(over)
+    assert 20 <= len(sent) <= 21  # a tick of the world has up to two
+
+
+WORLD = """
+title = "two"
+duration_s = 60.0
+architecture = "centralised"
+[robots]
+KH01 = { kind = "khepera4", body = "world", start = [0.0, 0.0] }
+KH02 = { kind = "khepera4", body = "world", start = [0.0, 0.5] }
+"""
+
+
+@pytest.mark.system
+@pytest.mark.parametrize(
+    "what", [pytest.param("world", marks=pytest.mark.mechanism("name ownership: world replaced")), "centre"]
+)
+def test_frozen_and_replaced(what, router, tmp_path):
+    file = tmp_path / "two.toml"
+    file.write_text(WORLD)
+    token = KEYS.world_alive if what == "world" else KEYS.centre_alive
+    with network.open_session([router.endpoint], name="test") as session, ExitStack() as up:
+
+        def start():
+            module = f"experiments.real_time.processes.{what}"
+            made = up.enter_context(Started(module, str(file), "--connect", router.endpoint))
+            assert made.process.stdout.readline().startswith(f"{what} ready")
+            return made
+
+        def owners():
+            tokens = network.tokens_present(session, Keys.lives(token)) or set()
+            return sum(Keys.life_of(each) is not None for each in tokens)
+
+        old = start()
+        old.freeze()
+        until(lambda: not owners(), "its lease is over")
+        new = start()
+        old.thaw()
+        assert old.process.wait(30.0) == 2
+        assert f"another process has taken the name '{what}' in the realm 'park'" in old.said()
+        assert new.process.poll() is None
+
+
+@pytest.mark.system
+def test_full_disk_of_a_log_ends_no_world(router, tmp_path):
+    file = tmp_path / "two.toml"
+    file.write_text(WORLD.replace('architecture = "centralised"', ""))
+    module = "experiments.real_time.processes.world"
+    command = [sys.executable, "-m", module, str(file), "--connect", router.endpoint, "--lifeline"]
+    with (
+        Path("/dev/full").open("w") as full,
+        subprocess.Popen(command, stdin=subprocess.PIPE, stdout=full, stderr=full, bufsize=0) as process,
+        network.open_session([router.endpoint], name="test") as session,
+    ):
+
+        def there():
+            assert process.poll() is None
+            process.stdin.write(b"\n")
+            return network.tokens_present(session, KEYS.world_alive)
+
+        until(there, "the world is up")
+        process.terminate()
+        process.stdin.close()
+        assert process.wait(20.0) == 0
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_robots_land_although_nobody_reads_their_output(monkeypatch):
+    def unread(*_, **__):
+        raise BrokenPipeError
+
+    signals, gone = [], [[("", False)]]
+    watch = types.SimpleNamespace(changes=lambda: gone.pop() if gone else [])
+    monkeypatch.setattr(joining.pubsub, "AliveWatch", lambda *_: watch)
+    monkeypatch.setattr("builtins.print", unread)
+    monkeypatch.setattr(os, "kill", lambda _, number: signals.append(number))
+    with Net().worn() as net:
+        watch = joining.ConductorWatch(net.session, KEYS, 0.0)
+        until(lambda: signals, "it ends its process")
+        watch.close()
+    assert signals == [signal.SIGTERM]
+
+
+UTC = 1.7e9
+NOW, BEHIND = 1_700_000_000_000, 1_600_000_000_000  # milliseconds, at which numbers begin
+
+
+def own(net, alive, session, *, gone=False):
+    net.deliver(f"{Keys.life(alive, session)}\0\0".encode(), gone=gone)
+
+
+def test_world_obeys_sender_with_clock_behind():
+    with Net().worn() as net:
+        process = joined_world(net)
+
+        def order(seq, action, **more):
+            """Whether it is carried out."""
+            before = process.commands.done.get("F", 0)
+            net.deliver(sent(KEYS.setpoint("F"), messages.Command("F", seq, UTC, action, **more))[0])
+            process.commands.receive(0.0)
+            return process.commands.done.get("F", 0) != before
+
+        own(net, KEYS.alive("F"), "one")
+        assert order(NOW, "takeoff", height=0.5)
+        assert not order(BEHIND, "stop")  # of the same process: said again, or overtaken
+        own(net, KEYS.alive("F"), "one")  # it was cut off, and is the same
+        assert not order(BEHIND, "stop")
+        own(net, KEYS.alive("F"), "one", gone=True)
+        own(net, KEYS.alive("F"), "two")
+        assert order(BEHIND, "stop")
+
+
+def test_world_of_many_robots_knows_name_owners():
+    names = [f"F{row:03}" for row in range(120)]  # each with a token, a claim and the token of an owner
+    with Net().worn() as net:
+        process = joined_world(net, name="F000")
+        for alive in map(KEYS.alive, names):
+            for token in (alive, Keys.life(alive, "one"), Keys.claim(alive, Keys.rank(1.0, "one"))):
+                net.deliver(f"{token}\0\0".encode())
+        process.commands.receive(0.0)
+    assert process.commands.lives == dict.fromkeys(names, "one")
+
+
+def test_centre_with_clock_behind_is_followed():
+    robot = Robot(GUIDED.assignment("A"))
+    with Net().worn() as net:
+        goals = GoalInbox(net.session, KEYS, [robot], valid_box=(5.0, 5.0, 5.0))
+
+        def tell(seq, t, x):
+            """The goal that is pursued."""
+            goal = messages.Goal("A", seq, UTC + t, (x, 0.0, 0.0), None, UTC + t)
+            net.deliver(sent(KEYS.goal("A"), goal)[0])
+            goals.receive(t, UTC)
+            return robot.guidance.goal[0]
+
+        own(net, KEYS.centre_alive, "one")
+        assert tell(NOW, 1.0, 0.1) == 0.1
+        assert tell(BEHIND, 1.1, 0.2) == 0.1
+        assert goals.malformed == 1
+        own(net, KEYS.centre_alive, "two")
+        assert tell(BEHIND, 0.9, 0.3) == 0.3  # its clock lags by a little
+        assert goals.malformed == 1
+
+
+def test_late_goal_revives_no_dead_centre():
+    guidance, goal = Robot(GUIDED.assignment("A")).guidance, (0.0, 0.0, 0.0)
+    guidance.receive(goal, 0.0, 1.0)
+    guidance.mark_lost(2.0)
+    guidance.receive(goal, 0.0, 1.9)
+    assert guidance.unguided(2.1)
+    guidance.receive(goal, 0.0, 2.2)  # of another one, such as a tool of ROS
+    assert not guidance.unguided(2.3)
+
+
+class Taken(list):
+    """In the place of a recording: what would be in it."""
+
+    write = list.append
+
+
+@pytest.mark.system
+def test_recorder_keeps_plausible_messages_of_the_world(router):
+    lost = messages.ObstaclePose("box", (0.0, math.nan, 0.0))
+    said = [
+        (KEYS.contact, changed(touched(0.1), impulse=math.nan)),
+        (KEYS.contact, changed(touched(0.1), stamp=math.inf)),
+        (KEYS.contact, world_state(0.1)),
+        (KEYS.world, changed(world_state(0.1), obstacles=[lost])),
+        (KEYS.world, touched(0.1)),
+        (KEYS.world, world_state(0.2)),
+        (KEYS.contact, touched(0.3)),
+    ]
+    taken = Taken()
+    with (
+        network.open_session([router.endpoint], name="recorder") as session,
+        network.open_session([router.endpoint], name="world") as other,
+    ):
+        recorder = Recorder(session, KEYS, taken)
+
+        def heard():
+            for key, message in said:
+                # MessagePack keeps what is not finite; JSON would say null
+                other.put(key, messages.encode(message, "msgpack"), encoding=messages.MSGPACK)
+            recorder.receive()
+            return {type(message) for message in taken} >= {messages.Contact, messages.WorldState}
+
+        until(heard)
+    assert set(map(str, taken)) == {str(touched(0.3)), str(world_state(0.2))}
+    assert sum(count for count, _ in recorder.unread.values()) >= 5
+    taken.clear()
+    for last in (False, False, True):  # each once
+        recorder.report_malformed(last=last)
+    told = [(event.kind, event.source, event.text.split(" on ")[1].split(": ")[0]) for event in taken]
+    assert sorted(told) == [("unread", "recorder", key) for key in sorted((KEYS.contact, KEYS.world))]
+
+
+def test_truth_at_a_state_is_interpolated_between_neighbours():
+    """At 0.5 m/s the newest of 50 truths a second is up to 1 cm away."""
+    turned = [messages.heading(math.pi - 0.05 + 0.02 * k) for k in range(10)]
+    truths = [messages.Position("TB01", START + 0.02 * k, (0.01 * k, 0.0, 0.0), turned[k]) for k in range(10)]
+    for at in (0.0, 0.013, 0.0975, 0.18):
+        found = with_truth(state(at=at), truths)
+        assert found.true_position == pytest.approx((0.5 * at, 0.0, 0.0), abs=1e-6)
+        assert math.remainder(found.true_yaw - (math.pi - 0.05 + at), math.tau) == pytest.approx(0.0, abs=1e-6)
+    assert with_truth(state(at=0.2), truths).true_position == truths[-1].position
+    for at, known in ((-0.06, truths), (0.24, truths), (0.0, [])):
+        assert with_truth(state(at=at), known).true_position is None
+
+
+def test_servers_and_recorders_wait_for_the_longest_descent():
+    assert shutdown.AFTER_S == AFTER_S > 2.0 * FAREWELL_S + STOPPED_S
