@@ -1,7 +1,5 @@
 """Gate of the view's page: which requests reach it, and whose orders count."""
 
-from __future__ import annotations
-
 import threading
 import time
 from math import inf
@@ -13,7 +11,7 @@ import pytest
 pytest.importorskip("viser", reason="needs viser")
 
 from websockets.datastructures import Headers
-from websockets.http11 import Request, Response
+from websockets.http11 import Request
 
 from agents.network import messages
 from experiments.file.document import load
@@ -26,30 +24,24 @@ HOST = "127.0.0.1:8080"
 HANDSHAKE = ("Upgrade", "websocket")
 
 
-def answered(gate: Gate, path: str, *headers: tuple[str, str]) -> int | str:
+def answered(gate, path, *headers):
     """Status of the answer to a request, or the path that the page's server is asked for."""
-    asked = []
-
-    def inner(_: object, request: Request) -> Response | None:
-        asked.append(request.path)
-        return None
-
-    given = Headers()
+    asked, given = [], Headers()
     for name, value in headers:
         given[name] = value
-    response = gate.answer(inner, None, Request(path, given))
+    response = gate.answer(lambda _, request: asked.append(request.path), None, Request(path, given))
     return asked[0] if asked else response.status_code
-
-
-@pytest.mark.parametrize("host", ["127.0.0.1:8080", "localhost:8080", "localhost", "[::1]:9000"])
-def test_own_page_opens_its_websocket(host):
-    gate = Gate("secret")
-    assert answered(gate, "/secret", ("Host", host), ("Origin", f"http://{host}"), HANDSHAKE) == "/secret"
-    assert answered(gate, "/secret/", ("Host", host)) == "/"
 
 
 OWN, EVIL = ("Origin", f"http://{HOST}"), ("Origin", "http://evil.example")
 HERE, THERE = ("Host", HOST), ("Host", "evil.example:8080")
+
+
+def test_own_page_opens_its_websocket():
+    gate = Gate("secret")
+    for host in (HOST, "localhost:8080", "localhost", "[::1]:9000"):
+        assert answered(gate, "/secret", ("Host", host), ("Origin", f"http://{host}"), HANDSHAKE) == "/secret"
+        assert answered(gate, "/secret/", ("Host", host)) == "/"
 
 
 @pytest.mark.parametrize(
@@ -79,14 +71,10 @@ def test_others_are_refused(path, headers):
 
 
 def test_address_for_once_leads_in_once():
-    gate = Gate("secret")
-    path = f"/{gate.ticket()}"
-    assert answered(gate, path, ("Host", "evil.example")) == 403
-    assert [answered(gate, path, ("Host", HOST)) for _ in range(2)] == [303, 403]
-
-
-def test_secrets_differ_and_are_not_shown():
     gate = Gate()
+    path = f"/{gate.ticket()}"
+    assert answered(gate, path, THERE) == 403
+    assert [answered(gate, path, HERE) for _ in range(2)] == [303, 403]
     assert gate.secret != Gate().secret
     assert gate.secret not in repr(gate)
 
@@ -94,25 +82,19 @@ def test_secrets_differ_and_are_not_shown():
 def test_page_reports_what_it_shows():
     gate, now = Gate("secret"), time.time()
     gate.open(1)
-    for query in ("page=1&drawn=x&stage=1", "page=9&drawn=1&stage=1", f"page=1&drawn={now + 3600}&stage=1", "&" * 99):
-        assert answered(gate, f"/secret/clock?{query}", ("Host", HOST)) == 200
-        assert gate.seen[1].drawn == -inf
-    answered(gate, f"/secret/clock?page=1&drawn={now - 7.0:.3f}&stage=4&hidden=0", ("Host", HOST))
-    assert gate.seen[1].stage == 4
-    assert gate.lag(now) == pytest.approx(7.0, abs=1e-3)
-    answered(gate, f"/secret/clock?page=1&drawn={now - 7.0:.3f}&stage=4&hidden=1", ("Host", HOST))
-    assert gate.lag(now) == 0.0, "a page that nobody sees slows nothing"
-    assert gate.lag(now + 3600.0) == 0.0
-    gate.close(1)
-    assert gate.seen == {}
-
-
-def test_page_without_reports_slows_for_a_while():
-    gate = Gate("secret")
-    gate.open(1)
     opened = gate.seen[1].opened
     assert gate.lag(opened + 3.0) == pytest.approx(3.0)
-    assert gate.lag(opened + 3600.0) == 0.0
+    assert gate.lag(opened + 3600.0) == 0.0, "a page without reports slows for a while"
+    for query in ("page=1&drawn=x&stage=1", "page=9&drawn=1&stage=1", f"page=1&drawn={now + 3600}&stage=1", "&" * 99):
+        assert answered(gate, f"/secret/clock?{query}", HERE) == 200
+        assert gate.seen[1].drawn == -inf
+    drawn = f"/secret/clock?page=1&drawn={now - 7.0:.3f}&stage=4"
+    answered(gate, f"{drawn}&hidden=0", HERE)
+    assert (gate.seen[1].stage, gate.lag(now)) == (4, pytest.approx(7.0, abs=1e-3))
+    answered(gate, f"{drawn}&hidden=1", HERE)
+    assert gate.lag(now) == 0.0, "a page that nobody sees slows nothing"
+    gate.close(1)
+    assert gate.seen == {}
 
 
 @pytest.fixture
@@ -170,18 +152,14 @@ def test_emergency_stop_tells_its_result_without_session(blocked, operator, monk
     assert "stopped: KH01" in page.add_notification.call_args.args[1]
 
 
-@pytest.mark.parametrize("sent", [-1.0, 0.0, 1e9, inf, float("nan")])
-def test_slider_values_are_limited_here(sent):
+def test_slider_orders_what_is_limited(operator):
     threshold = orders.parameters(SceneModel.of_plan(load("robotic-park").cases()["event"]))[0]
     assert threshold.label == "trigger.threshold [m]"
-    assert 0.0 < threshold.limited(sent) <= 0.04
-
-
-def test_slider_orders_what_is_limited(operator):
+    for sent in (-1.0, 0.0, 1e9, inf, float("nan")):
+        assert 0.0 < threshold.limited(sent) <= 0.04
     acting, gate, given = operator
     gate.seen[7] = Seen(time.time(), 2)
     parameter = orders.Parameter("clamp", 0.1, "m")
     acting.slide(parameter, SimpleNamespace(client=object(), client_id=7, target=SimpleNamespace(value=1e6)))
-    _, order = acting.due["clamp"]
-    order()
+    acting.due["clamp"][1]()
     assert [(each.name, each.value) for each in given] == [("clamp", 0.4)]

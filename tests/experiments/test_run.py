@@ -1,0 +1,150 @@
+"""A run: of robots without links, from the file to the report, and as a notebook shows it."""
+
+import os
+import re
+import sys
+from types import SimpleNamespace
+
+import pytest
+
+from experiments.check.check import check
+from experiments.file.document import load, read
+from experiments.metrics.measure import measure
+from experiments.recording.reader import RecordingError
+from experiments.run import CHECKOUT, FigureSet, Run, reopen, show, simulate
+from tests.experiments.traces import crowd
+from tools.commands import run as commands
+
+DUEL = """
+title = "duel"
+duration_s = 9.0
+arena = { size = [3.0, 3.0, 2.0] }
+world = { engine = "pymunk" }
+[robots]
+TB01 = { kind = "turtlebot3", start = [-1.0, 0.0] }
+TB02 = { kind = "turtlebot3", start = [1.0, 0.0, 3.14159] }
+[[timeline]]
+at_s = 0.0
+robot = "TB01"
+plan = { kind = "waypoints", points = [[1.0, 0.0]], speed = 0.2 }
+[[timeline]]
+at_s = 0.0
+robot = "TB02"
+plan = { kind = "waypoints", points = [[-1.0, 0.0]], speed = 0.2 }
+"""
+
+
+@pytest.fixture
+def file(tmp_path):
+    path = tmp_path / "duel.toml"
+    path.write_text(DUEL)
+    return path
+
+
+@pytest.mark.slow
+def test_it_runs_and_reports_without_links(file, tmp_path, capsys):
+    assert commands.run(str(file), virtual=True, out=str(tmp_path / "run")) == 1
+    printed = capsys.readouterr()
+    assert "TB01 at 7.5 s: it does not obey commands to move" in printed.err + printed.out  # they push each other
+    assert "no link was measured" in printed.out
+    assert "One collision in default: TB01–TB02" in printed.out
+    page = re.sub(r"<[^>]+>", " ", (tmp_path / "run" / "report.html").read_text("utf-8"))
+    assert "TB01–TB02" in page
+    assert "Not where the plan wanted them at the end of default: TB01 by" in page
+    assert "never stayed" not in page
+
+
+@pytest.mark.slow
+def test_they_push_each_other_and_neither_arrives(file):
+    run = simulate(load(str(file)))
+    (blow,) = [each for each in run.traces["default"].contacts if {each.first, each.second} == {"TB01", "TB02"}]
+    assert blow.stamp == pytest.approx(5.5, abs=0.1)  # 0.895 m at 0.2 m/s, behind a plan by 1 s
+    assert 0.05 < blow.impulse < 0.4  # reduced mass 0.5 kg, closing at 0.4 m/s
+    assert 0.0 <= blow.overlap < 0.001
+    assert all(robot.short > 0.5 for robot in run.metrics["default"].robots)
+
+
+@pytest.mark.slow
+def test_unlinked_robot_goes_its_way_beside_a_formation(file):
+    third = '[robots.KH01]\nkind = "khepera4"\nstart = [-1.0, 0.6]\n[formation.links]\n"TB01 > KH01" = 0.6\n'
+    file.write_text(DUEL + third)
+    errors = [finding for finding in check(read(file)) if finding.severity == "error"]
+    assert not [error for error in errors if "falls into" in error.message], errors
+
+
+@pytest.fixture(scope="module")
+def crowded():
+    trace = crowd(3, duration=1.0)
+    return Run("Three <robots>", 1, {trace.case: trace}, {trace.case: measure(trace)})
+
+
+def test_a_run_shows_its_verdict_and_table(crowded):
+    html = crowded._repr_html_()
+    assert "<b>Three &lt;robots&gt;</b>" in html
+    assert "✓ No pose was lost" in html
+    assert html.count("<table>") == 1
+    assert len(repr(crowded)) < 200
+    with pytest.raises(RecordingError, match="holds no recording"):
+        reopen("tests")
+
+
+@pytest.mark.slow
+def test_figures_show_themselves_and_are_kept(crowded, tmp_path):
+    figures = crowded.figures(width=7.16)
+    assert isinstance(figures, FigureSet)
+    assert figures._repr_html_().count("<svg") == len(figures)
+    assert figures["errors"].get_figwidth() == 7.16
+    assert "<svg" in show(figures["errors"], tmp_path / "figures" / "errors")._repr_svg_()
+    assert sorted(path.name for path in (tmp_path / "figures").iterdir()) == ["errors.pdf", "errors.svg"]
+
+
+def without(monkeypatch, *libraries):
+    for library in libraries:
+        monkeypatch.setitem(sys.modules, library, None)  # its import fails
+
+
+@pytest.mark.parametrize("installed", ["pandas", "polars"])
+def test_frames_are_of_the_library_that_is_there(crowded, monkeypatch, installed):
+    without(monkeypatch, "pandas", "polars")
+    with pytest.raises(ImportError, match="neither pandas nor polars"):
+        crowded.to_frame()
+    monkeypatch.setitem(sys.modules, installed, SimpleNamespace(DataFrame=lambda columns: columns))
+    columns = crowded.to_frame()
+    assert columns["robot"] == ["CF01", "CF02", "CF03"]
+    assert {"seed", "case", "f_hz", "iae", "near_gap"} <= columns.keys()
+
+
+@pytest.mark.parametrize(("library", "other"), [("pandas", "polars"), ("polars", "pandas")])
+def test_a_frame_has_numbers_where_some_are_unknown(crowded, monkeypatch, library, other):
+    pytest.importorskip(library)
+    without(monkeypatch, other)
+    frame = crowded.to_frame()
+    assert type(frame).__module__.startswith(library)
+    assert frame.shape[0] == 3
+    assert frame["robot"].to_list() == ["CF01", "CF02", "CF03"]
+    assert str(frame["acquired_s"].dtype).lower() == "float64", "none has acquired: NaN"
+    assert str(frame["messages"].dtype).lower() == "int64"
+
+
+CELLS = (
+    "from zenpark import load, reopen, simulate\n"
+    'run = simulate(load("triangle", "duration_s=2.0"), folder="kept")\nrun',
+    'run.figures()["errors"]',
+    "run.figures()",
+    'reopen("kept")',
+)
+
+
+@pytest.mark.system
+@pytest.mark.timeout(200)
+def test_jupyter_shows_run_figures_and_the_reread_run(tmp_path, monkeypatch):
+    nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(CHECKOUT), str(CHECKOUT / "face")]))
+    book = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(cell) for cell in CELLS])
+    nbclient.NotebookClient(book, timeout=150, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    shown = [cell.outputs[-1].data for cell in book.cells]
+    assert "<table>" in shown[0]["text/html"]
+    assert "<svg" in shown[1]["image/svg+xml"]
+    assert shown[2]["text/html"].count("<svg") >= 4
+    assert shown[3]["text/html"] == shown[0]["text/html"]
+    assert all(len(each["text/plain"]) < 2000 for each in shown)
