@@ -26,8 +26,7 @@ class Group:
     """Robots of one process: their decisions, and the body that they share."""
 
     def __init__(self, plan: Plan, names: Sequence[str]) -> None:
-        self.names = tuple(names)
-        health = ProcessHealth()
+        self.names, health = tuple(names), ProcessHealth()
         self.robots = [Robot(plan.assignment(name), health) for name in names]
         self.body = TwinBody(bodies.body_request(plan, self.names, plan.experiment.seed))
         self.states: list[BodyState] = []
@@ -65,7 +64,7 @@ class Swarm:
     """All robots of an experiment, in any number of processes."""
 
     def __init__(self, experiment: Experiment, groups: Iterable[Sequence[str]] | None = None) -> None:
-        self.experiment, plan = experiment, Plan(experiment)
+        plan = Plan(experiment)
         self.groups = [Group(plan, group) for group in (groups or [[name] for name in experiment.robots])]
         self.where = {name: (group, row) for group in self.groups for row, name in enumerate(group.names)}
         self.names = tuple(name for name in experiment.robots if name in self.where)
@@ -79,11 +78,6 @@ class Swarm:
     def t(self) -> float:
         return self.tick * self.dt
 
-    @property
-    def since(self) -> float:
-        """Time of the experiment [s]."""
-        return self.t - self.start_at
-
     def robot(self, name: str) -> Robot:
         group, row = self.where[name]
         return group.robots[row]
@@ -91,30 +85,22 @@ class Swarm:
     def phase(self, name: str) -> int:
         return self.robot(name).lifecycle.phase
 
-    def spoil(self, name: str, change: Callable[[BodyState], None] | None) -> None:
+    def spoil(self, name: str, change: Callable[[BodyState], object] | None) -> None:
         """Change each measurement of a robot from now on; None: no longer."""
-        spoilers = self.where[name][0].spoil
-        spoilers.pop(name, None)
-        if change is not None:
-            spoilers[name] = change
+        self.where[name][0].spoil[name] = change or (lambda _state: None)
 
     def link(self, receiver: str, sender: str) -> int:
         return [each.name for each in self.robot(receiver).neighbours.all].index(sender)
 
-    def lose(self, sender: str, *receivers: str, since: float = 0.0) -> None:
-        """Receivers lose the token of a sender, `since` [s] ago, and receive it no more."""
-        for receiver in receivers or self.receivers(sender):
-            self.robot(receiver).neighbours.mark_lost(self.link(receiver, sender), self.t - since)
-            self.muted.add((sender, receiver))
+    def lose(self, sender: str, receiver: str, since: float = 0.0) -> None:
+        """The receiver loses the token of a sender, `since` [s] ago, and receives it no more."""
+        self.robot(receiver).neighbours.mark_lost(self.link(receiver, sender), self.t - since)
+        self.muted.add((sender, receiver))
 
-    def find(self, sender: str, *receivers: str) -> None:
-        """Receivers see the token of a sender again, and receive it."""
-        for receiver in receivers or self.receivers(sender):
-            self.robot(receiver).neighbours.mark_alive(self.link(receiver, sender))
-            self.muted.discard((sender, receiver))
-
-    def receivers(self, sender: str) -> list[str]:
-        return [name for name in self.names if sender in (each.name for each in self.robot(name).neighbours.all)]
+    def find(self, sender: str, receiver: str) -> None:
+        """The receiver sees the token of a sender again, and receives it."""
+        self.robot(receiver).neighbours.mark_alive(self.link(receiver, sender))
+        self.muted.discard((sender, receiver))
 
     def last(self, name: str, what: str) -> Any:
         """A value of one robot on the last tick."""

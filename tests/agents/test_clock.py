@@ -1,4 +1,4 @@
-"""One clock for everybody: read once, shared by the processes of a machine, and slewed."""
+"""One clock for everybody: read once, shared by the processes of a machine, and slewed; and the ticks of a loop."""
 
 import time
 
@@ -8,59 +8,39 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from agents.clock import SLEW, STEP_S, Clock, correction_line, uptime
+from agents.ticks import Ticks
 from experiments.real_time.hosts.launcher import Launcher
 from tests.commands import ROOT
 
 
-class Machine:
-    """Clocks of a machine: the wall clock, and those that go on or stand while it sleeps [s]."""
-
-    def __init__(self, monkeypatch):
-        self.wall, self.up = 1000.0, {time.CLOCK_BOOTTIME: 50.0, time.CLOCK_MONOTONIC: 5.0}
-        monkeypatch.setattr(time, "time", lambda: self.wall)
-        monkeypatch.setattr(time, "clock_gettime", lambda clock: self.up[clock])
-
-
-def test_step_of_the_wall_clock_moves_nothing(monkeypatch):
-    machine = Machine(monkeypatch)
+def test_steps_of_the_wall_clock_and_sleep_move_nothing(monkeypatch):
+    wall, up = [1000.0], {time.CLOCK_BOOTTIME: 50.0, time.CLOCK_MONOTONIC: 5.0}
+    monkeypatch.setattr(time, "time", lambda: wall[0])
+    monkeypatch.setattr(time, "clock_gettime", lambda clock: up[clock])
     clock = Clock(0.5)
-    machine.wall -= 3600.0
-    machine.up[time.CLOCK_BOOTTIME] = 52.0
+    wall[0] -= 3600.0
+    up[time.CLOCK_BOOTTIME] = 52.0
     assert clock.utc() == clock.at(52.0) == 1002.5
     assert clock.at(49.0) == 999.5
-
-
-def test_clock_goes_on_while_machine_sleeps(monkeypatch):
-    machine = Machine(monkeypatch)
-    clock = Clock()
-    machine.up[time.CLOCK_BOOTTIME] += 3600.0
-    assert clock.utc() == 1000.0 + 3600.0
+    up[time.CLOCK_BOOTTIME] += 3600.0  # the machine slept
+    assert clock.utc() == 1002.5 + 3600.0
 
 
 # of reports, figures and the live view: no robot moves by them
-DATES = {
-    "experiments/report/report.py",
-    "experiments/run.py",
-    "experiments/sweep/page.py",
-    "experiments/view/acting.py",
-    "experiments/view/gate.py",
-    "experiments/view/live.py",
-}
+DATES = {"report/report.py", "run.py", "sweep/page.py", "view/acting.py", "view/gate.py", "view/live.py"}
 
 
 def test_no_process_reads_the_wall_clock_itself():
+    files = {file for folder in ("agents", "bridges", "twins", "experiments") for file in (ROOT / folder).rglob("*.py")}
     found = []
-    for folder in ("agents", "bridges", "twins", "experiments"):
-        for file in (ROOT / folder).rglob("*.py"):
-            if file.relative_to(ROOT).as_posix() not in DATES:
-                found += [line for line in file.read_text().splitlines() if "time.time" in line]
+    for file in files - {ROOT / "experiments" / name for name in DATES}:
+        found += [line for line in file.read_text().splitlines() if "time.time" in line]
     assert [line for line in found if "= time.time() - " not in line] == []
 
 
 def test_later_process_reads_the_same_clock(tmp_path, monkeypatch):
-    launcher = Launcher(tmp_path)
+    launcher, environments = Launcher(tmp_path), []
     launcher.clock = first = Clock()
-    environments = []
     monkeypatch.setattr(launcher, "spawn", lambda name, command, environment: environments.append(environment))
     launcher.start("CF01", "experiments.real_time.processes.robot")
     wall = time.time
@@ -74,12 +54,11 @@ def test_later_process_reads_the_same_clock(tmp_path, monkeypatch):
 
 
 def test_clock_follows_smoothly_and_never_back():
-    clock, now, stamps = Clock(-0.2), 0.0, []
+    clock, stamps = Clock(-0.2), []
     clock.follow(correction_line(-0.23).strip())
-    for _ in range(1000):
-        now += 0.01
+    for k in range(1, 1001):
         clock.slew(0.01)
-        stamps.append(now + clock.correction_s)
+        stamps.append(0.01 * k + clock.correction_s)
     steps = np.diff(stamps)
     assert clock.correction_s == -0.23
     assert steps.min() == pytest.approx(0.01 * (1 - SLEW))
@@ -91,7 +70,7 @@ def test_clock_follows_smoothly_and_never_back():
 @pytest.mark.parametrize(
     "line", [b"clock", b"clock nan", b"clock inf", b"clock 0.8", b"0.1", b"clock 0.1 0.2", b"\xff" * 80]
 )
-def test_nonsense_and_jumps_are_not_followed(line, capsys):
+def test_absurd_corrections_and_jumps_are_not_followed(line, capsys):
     clock = Clock(0.1)
     clock.follow(line)
     assert clock.slew(1.0) == 0.0
@@ -106,3 +85,87 @@ def test_slew_is_bounded_by_drift(line):
     for _ in range(200):
         clock.slew(1.0)
     assert abs(clock.correction_s - 0.1) <= STEP_S
+
+
+PERIOD, BEGIN = 0.125, 1000.0  # [s] all multiples of which are exact; [s]
+
+
+class Loop:
+    """Loop whose waits last as long as they shall, plus `oversleeps`, and whose ticks take `works`, in periods."""
+
+    def __init__(self, **chosen):
+        self.now = BEGIN
+        self.ticks = Ticks(1.0 / PERIOD, clock=lambda: self.now, **chosen)
+        self.times, self.skipped, self.begun = [], [], []  # in periods
+
+    def turn(self, works=0.0, oversleeps=0.0):
+        wait = self.ticks.until_next()
+        self.now += wait + (oversleeps * PERIOD if wait else 0.0)
+        self.skipped.append(self.ticks.begin())
+        self.times.append(self.ticks.t / PERIOD)
+        self.begun.append(self.ticks.elapsed() / PERIOD)
+        self.now += works * PERIOD
+        return self
+
+
+@pytest.mark.parametrize(
+    ("works", "skipped", "late"), [(0.75, 0, 0.0), (1.75, 0, 0.75), (2.0, 1, 0.0), (4.25, 3, 0.25)]
+)
+def test_late_loop_skips_ticks_that_are_over(works, skipped, late):
+    loop = Loop().turn(works=works).turn()
+    assert loop.skipped == [0, skipped]
+    assert loop.times == [0.0, 1 + skipped]
+    assert loop.ticks.late_s == late * PERIOD
+    assert loop.turn().begun[-1] == 2 + skipped, "in time again"
+
+
+def test_few_ticks_are_made_up_for():
+    loop = Loop(catch_up=3).turn(works=6.0)
+    for _ in range(5):
+        loop.turn()
+    assert loop.skipped == [0, 2, 0, 0, 0, 0]
+    assert loop.times == [0, 3, 4, 5, 6, 7]
+    assert loop.begun == [0, 6, 6, 6, 6, 7]
+
+
+def test_long_wait_skips_none_unless_asked_twice():
+    loop = Loop().turn().turn(oversleeps=1.5).turn().turn()
+    assert loop.skipped == [0, 0, 0, 0]
+    assert loop.begun == [0, 2.5, 2.5, 3]
+    twice = Loop().turn()
+    twice.now += 2.5 * PERIOD
+    assert twice.ticks.until_next() == 0.0
+    twice.now += 8.0 * PERIOD  # such as for the ownership of a name
+    twice.turn()
+    assert (twice.skipped[-1], twice.times[-1]) == (9, 10)
+
+
+def test_time_follows_a_slewed_clock():
+    loop = Loop()
+    loop.now += 60.0
+    assert loop.ticks.start() == BEGIN + 60.0
+    loop.turn().turn()
+    loop.ticks.zero -= 0.25 * PERIOD
+    assert loop.ticks.elapsed() == 1.25 * PERIOD
+    assert loop.turn().begun[-1] == 2
+    assert loop.now == BEGIN + 60.0 + 1.75 * PERIOD
+
+
+@pytest.mark.parametrize(("at", "following"), [(5.4, 1.4), (5.0, 2.0), (1.01, 1.01), (0.3, 1.3)])
+def test_aligned_ticks_fall_on_a_time(at, following):
+    loop = Loop().turn().turn()  # at 0 and 1
+    loop.ticks.align(at * PERIOD)
+    assert loop.ticks.next == pytest.approx(following * PERIOD)
+    assert loop.turn().begun[-1] == pytest.approx(following)
+
+
+@given(st.lists(st.tuples(st.floats(0.0, 5.0), st.floats(0.0, 5.0)), max_size=40), st.integers(0, 4))
+def test_each_tick_is_begun_or_skipped_once(delays, catch_up):
+    loop = Loop(catch_up=catch_up)
+    for works, oversleeps in delays:
+        before = loop.ticks.next / PERIOD
+        late = (loop.now - BEGIN) / PERIOD - before
+        loop.turn(works, oversleeps)
+        assert loop.times[-1] == before + loop.skipped[-1]
+        assert loop.begun[-1] >= loop.times[-1]
+        assert late - loop.skipped[-1] < catch_up + 1

@@ -1,6 +1,5 @@
 """Whatever a body, a network or an operator says: a robot's tick raises nothing, and its setpoint keeps the limits."""
 
-import math
 import random
 from functools import partial
 from math import inf, isfinite, nan
@@ -26,9 +25,7 @@ class Nonsense:
         self._share = self.random.choice((0.0, 0.02, 0.3))
 
     def number(self, size: float = 1.0) -> float:
-        if self.random.random() < self._share:
-            return self.random.choice(ODD)
-        return self.random.uniform(-size, size)
+        return self.random.choice(ODD) if self.happens(self._share) else self.random.uniform(-size, size)
 
     def numbers(self, count: int, size: float = 1.0) -> tuple[float, ...]:
         return tuple(self.number(size) for _ in range(count))
@@ -52,10 +49,12 @@ def disturb(robot: Robot, t: float, some: Nonsense) -> None:
     neighbours = robot.neighbours
     for k in range(len(neighbours.all)):
         if some.happens(0.3):
-            place, velocity = ([some.random.uniform(-2.0, 2.0) for _ in range(3)] for _ in range(2))
-            neighbours.receive(k, tuple(place), tuple(velocity), t - some.random.uniform(0.0, 0.1), t)
-        if some.happens(0.01):
-            (neighbours.mark_alive if some.happens(0.6) else lambda k: neighbours.mark_lost(k, t))(k)
+            place, velocity = (tuple(some.random.uniform(-2.0, 2.0) for _ in range(3)) for _ in range(2))
+            neighbours.receive(k, place, velocity, t - some.random.uniform(0.0, 0.1), t)
+        if some.happens(0.006):
+            neighbours.mark_alive(k)
+        if some.happens(0.004):
+            neighbours.mark_lost(k, t)
     for share, order in (
         (0.02, robot.lifecycle.takeoff), (0.03, lambda: robot.start(t + 0.05, t)), (0.005, robot.hold),
         (0.005, robot.resume), (0.01, lambda: robot.go(some.numbers(2), t)),
@@ -70,13 +69,14 @@ def disturb(robot: Robot, t: float, some: Nonsense) -> None:
 
 def keeps_limits(robot: Robot) -> bool:
     """Whether the setpoint is whole or none, and within what the kind can and the arena allows."""
-    kind, limits, known = robot.assignment.kind, robot.assignment.limits, list(map(isfinite, robot.setpoint))
-    if not any(known):
+    kind, limits, setpoint = robot.assignment.kind, robot.assignment.limits, robot.setpoint
+    if not any(map(isfinite, setpoint)):
         return True
+    fits = abs(setpoint[0]) <= kind.speed + 1e-9
     if kind.takes == "position":
-        inside = [low <= x <= high for low, x, high in zip(limits.low, robot.setpoint, limits.high, strict=False)]
-        return all(known) and (all(inside) or not robot.now.sound)
-    return all(known) and math.hypot(*robot.setpoint[:1]) <= kind.speed + 1e-9
+        inside = [low <= x <= high for low, x, high in zip(limits.low, setpoint, limits.high, strict=False)]
+        fits = all(inside) or not robot.now.sound
+    return fits and all(map(isfinite, setpoint))
 
 
 @pytest.mark.parametrize("name", ["robotic-park", *map(SLOW, ["obstacle-course", "convoy", "architectures"])])

@@ -1,7 +1,10 @@
-"""Quiet functions stay within the subset of Python that sweeps compile; plug-ins of others may leave it."""
+"""Quiet functions stay within the subset of Python that sweeps compile, and a tick calls few of them."""
 
 import ast
 import inspect
+import sys
+from collections import Counter
+from pathlib import Path
 from textwrap import dedent
 
 import pytest
@@ -10,7 +13,9 @@ from agents.plugins import registry
 from agents.plugins.laws import Gradient
 from agents.plugins.registry import AVOIDANCES, LAWS, PREDICTORS, TRIGGERS
 from experiments.virtual_time.source import faults
+from tests.agents.swarm import Swarm, drone
 from tests.commands import ROOT
+from tests.small import NOISY, pair
 
 QUIET = (
     "decision/control_updates", "decision/position_control", "plugins/barrier", "plugins/laws", "plugins/predictors",
@@ -39,19 +44,15 @@ def functions(tree: ast.AST, prefix=""):
 
 
 def outside(source: str, rare=frozenset(), first=1):
-    return [
-        (line + first - 1, name, fault)
-        for name, function in functions(ast.parse(source))
-        if name not in rare
-        for line, fault in faults(function)
-    ]
+    """Line, function and fault of all that the subset has not."""
+    quiet = [(name, function) for name, function in functions(ast.parse(source)) if name not in rare]
+    return [(line + first - 1, name, fault) for name, function in quiet for line, fault in faults(function)]
 
 
 @pytest.mark.parametrize("file", RARE)
 def test_quiet_functions_stay_in_the_subset(file):
     source = (ROOT / file).read_text(encoding="utf-8")
-    found = outside(source, RARE[file])
-    assert not found, "\n".join(f"{file}:{line}: {name} uses {fault}" for line, name, fault in found)
+    assert outside(source, RARE[file]) == []
     assert RARE[file] <= {name for name, _ in functions(ast.parse(source))}, "it is there"
 
 
@@ -67,9 +68,7 @@ COMPILED = [
 def test_plugins_of_zenpark_stay_in_the_subset(kind):
     """Plug-ins of others may leave the subset and run as plain Python, as do laws that remember."""
     source, first = inspect.getsourcelines(kind)
-    found = outside(dedent("".join(source)), first=first)
-    file = inspect.getsourcefile(kind)
-    assert not found, "\n".join(f"{file}:{line}: {name} uses {fault}" for line, name, fault in found)
+    assert outside(dedent("".join(source)), first=first) == []
 
 
 SAMPLE = '''
@@ -95,3 +94,29 @@ def test_faults_are_found_with_their_lines():
         (5, "try"), (6, "a call of any"), (6, "a generator"), (6, "None"), (8, "an f-string"), (10, "*args"),
         (11, "a dictionary"), (11, "the text 'x'"),
     }  # fmt: skip
+
+
+TICKS = 20  # two decisions
+
+
+@pytest.mark.parametrize(("name", "different", "calls"), [("F", 45, 46), ("A", 49, 50)])
+def test_tick_calls_few_functions(name, different, calls):
+    """With cold caches, each different function of the project costs a robot 2 µs (docs/results/cost.md)."""
+    swarm = (drone(disturbance=NOISY) if name == "F" else Swarm(pair(disturbance=NOISY))).running().run(1.0)
+    (group, row), counted, before = swarm.where[name], Counter(), sys.getprofile()
+
+    def count(frame, event, _):
+        file = Path(frame.f_code.co_filename)
+        if event == "call" and not {"agents", "twins"}.isdisjoint(file.parts[:-1]):
+            counted[f"{file.stem}:{frame.f_code.co_qualname}"] += 1
+
+    for _ in range(TICKS):
+        sys.setprofile(count)
+        (state,) = group.body.read(swarm.t)
+        group.robots[row].transmit(swarm.t, state)
+        group.robots[row].act(swarm.t)
+        group.body.command([group.robots[row].setpoint])
+        sys.setprofile(before)
+        swarm.tick += 1
+    assert len([each for each, number in counted.items() if number >= TICKS / 2]) <= different, counted
+    assert counted.total() / TICKS <= calls, counted
