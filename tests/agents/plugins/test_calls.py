@@ -62,12 +62,11 @@ def test_failure_names_plug_in_and_line():
     line = 1 + next(k for k, text in enumerate(lines) if "return half(apart)" in text)
     assert isinstance(error, PluginError)
     assert str(error) == f"the law Spring failed: ZeroDivisionError: float division by zero ({__file__}:{line})"
-
-
-def test_result_of_no_use_names_the_method():
-    error = explained(lambda: unpack(NOTHING))
-    assert isinstance(error, PluginError)
-    assert re.search("`pull` of the law Spring gives what cannot be used.*is a `return` missing?", str(error))
+    useless = explained(lambda: unpack(NOTHING))
+    assert isinstance(useless, PluginError)
+    assert re.search("`pull` of the law Spring gives what cannot be used.*is a `return` missing?", str(useless))
+    shown = wrong("law", NOTHING, "pull", (1.0, 2.0), "three numbers")
+    assert str(shown) == f"`pull` of the law Spring must give three numbers, not (1.0, 2.0) ({__file__})"
 
 
 def test_other_errors_stay_what_they_are():
@@ -81,10 +80,17 @@ def test_other_errors_stay_what_they_are():
     assert explained(again) is told
 
 
-@pytest.mark.parametrize(("result", "text"), [(None, "nothing: is a `return` missing?"), ((1.0, 2.0), "(1.0, 2.0)")])
-def test_wrong_result_is_shown(result, text):
-    error = wrong("law", NOTHING, "pull", result, "three numbers")
-    assert str(error) == f"`pull` of the law Spring must give three numbers, not {text} ({__file__})"
+NEEDS = 'unknown with NEEDS = "nothing": give the law NEEDS = '
+READS = {  # what a law reads of its view: field and remedy
+    "distance": (lambda view: [each.link.distance for each in view.neighbours], f'link.distance, {NEEDS}"distance"'),
+    "bearing": (lambda view: [each.link.bearing for each in view.known()], f'link.bearing, {NEEDS}"bearing"'),
+    "said": (
+        lambda view: [each.said["x"] for each in view.neighbours],
+        "said['x'] of neighbours that have not said it yet: ask view.known for them",
+    ),
+    "target": (lambda view: view.target, "view.target of a robot without a plan: ask math.isfinite before"),
+    "position": (lambda view: [each.position for each in view.neighbours], ""),
+}
 
 
 class Reader(Law):
@@ -94,37 +100,15 @@ class Reader(Law):
     reads: str
 
     def step(self, view, memory):
-        found = {
-            "distance": lambda: [each.link.distance for each in view.neighbours],
-            "bearing": lambda: [each.link.bearing for each in view.known()],
-            "said": lambda: [each.said["x"] for each in view.neighbours],
-            "target": lambda: view.target,
-            "position": lambda: [each.position for each in view.neighbours],
-        }[self.reads]()
-        return Control(velocity=(nan * len(found), 0.0, nan))
+        return Control(velocity=(nan * len(READS[self.reads][0](view)), 0.0, nan))
 
 
-@pytest.mark.parametrize(
-    ("reads", "words"),
-    [
-        ("distance", 'link.distance, unknown with NEEDS = "nothing": give the law NEEDS = "distance"'),
-        ("bearing", 'link.bearing, unknown with NEEDS = "nothing": give the law NEEDS = "bearing"'),
-        ("said", "said['x'] of neighbours that have not said it yet: ask view.known for them"),
-        ("target", "view.target of a robot without a plan: ask math.isfinite before"),
-        ("position", ""),
-    ],
-)
-def test_unknown_reads_name_field_and_remedy(reads, words):
-    link = Link(nan, wants=BY_NOTHING)
-    view = View(
-        RobotFacts("A", 0, 2, False, 1.0, 0.1), {"x": (0.0,)},
-        [NeighbourView(1, "B", ZERO, ZERO, 0.0, 0.0, {"x": (nan,)}, link)],
-    )  # fmt: skip
-    law = Reader(reads)
+@pytest.mark.parametrize("reads", READS)
+def test_unknown_reads_name_field_and_remedy(reads):
+    neighbour = NeighbourView(1, "B", ZERO, ZERO, 0.0, 0.0, {"x": (nan,)}, Link(nan, wants=BY_NOTHING))
+    view = View(RobotFacts("A", 0, 2, False, 1.0, 0.1), {"x": (0.0,)}, [neighbour])
+    law, words = Reader(reads), READS[reads][1]
     assert unknown_reads(law, lambda watched: law.step(watched(view), {})) == (words and f": Reader reads {words}")
-
-
-# ---------------------------------------------------------------- before take-off
 
 
 class Endless(Avoidance, frozen=True):
@@ -160,31 +144,28 @@ def test_trigger_must_give_a_bool(place, answer, told):
     with pytest.raises(PluginError, match=rf"`fires` of the trigger Foreign must give True or False, not {told}"):
         bench.step()
     assert bench.life.takeoff()
-
-
-@pytest.mark.parametrize("answer", [True, False, np.True_])
-def test_bools_of_numpy_are_bools(answer):
-    assert idle(trigger=giving(Trigger, "fires", answer)).step().life.phase == READY
+    for good in (True, False, np.True_):
+        assert idle(trigger=giving(Trigger, "fires", good)).step().life.phase == READY
 
 
 @pytest.mark.parametrize("answer", [None, (1.0, 2.0), "abc", ("a", "b", "c")])
 @pytest.mark.parametrize(
     ("part", "base", "method", "wanted"),
     [
-        ("law", Distance, "pull", "of the law Foreign must give three numbers"),
-        ("law", Distance, "error", "of the law Foreign must give a number"),
-        ("predictor", Predictor, "position", "of the predictor Foreign must give three numbers"),
-        ("legs", Planner, "target", "of the planner Foreign must give four numbers"),
+        ("law", Distance, "pull", "three numbers"),
+        ("law", Distance, "error", "a number"),
+        ("predictor", Predictor, "position", "three numbers"),
+        ("planner", Planner, "target", "four numbers"),
     ],
 )
 def test_results_must_be_numbers(part, base, method, wanted, answer):
     made = giving(base, method, answer)
-    bench = idle(**{part: (Leg(30.0, made),) if part == "legs" else made})
-    with pytest.raises(PluginError, match=f"`{method}` {wanted}"):
+    bench = idle(**({"legs": (Leg(30.0, made),)} if part == "planner" else {part: made}))
+    with pytest.raises(PluginError, match=f"`{method}` of the {part} Foreign must give {wanted}"):
         bench.step()
 
 
-FAILED = "the avoidance Foreign failed: "
+FAILED, GIVES = "the avoidance Foreign failed: ", "`{}` of the avoidance Foreign must give {}"
 PLACE = r" \(.*test_calls\.py:\d+\)$"
 
 
@@ -193,14 +174,14 @@ PLACE = r" \(.*test_calls\.py:\d+\)$"
     [
         ("deviate", KeyError("goal"), f"{FAILED}KeyError: 'goal'{PLACE}"),
         ("deviate", AssertionError(), f"{FAILED}AssertionError"),
-        ("deviate", (0.0,), r"`deviate` of the avoidance Foreign must give three numbers, not \(0.0,\)"),
+        ("deviate", (0.0,), GIVES.format("deviate", r"three numbers, not \(0.0,\)")),
         ("restrain", TypeError(), f"{FAILED}TypeError.*{PLACE}"),
-        ("restrain", None, "`restrain` of the avoidance Foreign must give four numbers, not nothing: is a `return` "),
-        ("restrain", ("here",) * 4, "`restrain` of the avoidance Foreign must give four numbers"),
-        ("restrain", (0.0, 0.0), "`restrain` of the avoidance Foreign must give four numbers"),
+        ("restrain", None, GIVES.format("restrain", "four numbers, not nothing: is a `return` ")),
+        ("restrain", ("here",) * 4, GIVES.format("restrain", "four numbers")),
+        ("restrain", (0.0, 0.0), GIVES.format("restrain", "four numbers")),
         ("horizon", KeyError("own"), f"{FAILED}KeyError: 'own'{PLACE}"),
-        ("horizon", nan, "`horizon` of the avoidance Foreign must give a distance of 0 m or more, not nan"),
-        ("horizon", None, "`horizon` of the avoidance Foreign must give a distance"),
+        ("horizon", nan, GIVES.format("horizon", "a distance of 0 m or more, not nan")),
+        ("horizon", None, GIVES.format("horizon", "a distance")),
     ],
 )
 def test_mistake_in_an_avoidance_is_named(method, answer, says):

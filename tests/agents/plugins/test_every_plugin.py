@@ -27,6 +27,7 @@ from tests.small import triangle
 
 GROUPS = (LAWS, TRIGGERS, PREDICTORS, PLANNERS, AVOIDANCES)
 EVERY = [(group, name) for group in GROUPS for name in registry.names(group)]
+REMEMBERING = [name for name in registry.names(LAWS) if not issubclass(registry.struct(LAWS, name), Gradient)]
 PLACES = {"A": (-0.4, 0.0, 0.0), "B": (0.4, 0.1, 0.0), "C": (0.0, -0.5, 0.0)}
 WANTS = {"distance": BY_DISTANCE, "any": BY_DISTANCE, "relative": BY_RELATIVE, "bearing": BY_BEARING}
 SAMPLES = (0.3, [0.3, 0.2], [[0.3, 0.2], [-0.2, 0.4]])
@@ -94,26 +95,22 @@ def follow_setpoint(bench):
         bench.values["scan"] = RangeScan(bench.t, (0.0, 1.0), (0.0, 0.0), (0.35, 0.5))
 
 
-def tick(bench):
-    hear(bench)
+def tick(bench, order=1, *, silent=True):
+    hear(bench, order, silent=silent)
     follow_setpoint(bench)
 
 
 def lives(given, company):
     """Traces of a robot over 2 s, while `company` robots of the same plug-ins are asked in between."""
-    first, trace = Bench(given, PLACES["A"]), []
-    others = [Bench(given, (0.1 * k, -0.1 * k, 0.0)) for k in range(company)]
+    trace, others = [], [Bench(given, (0.1 * k, -0.1 * k, 0.0)) for k in range(company)]
 
     def recorded(bench):
         tick(bench)
         trace.append(repr((bench.robot.goal, bench.robot.setpoint, bench.robot.error, bench.said[-1:])))
 
-    first.step(0.05, recorded)
+    first = Bench(given, PLACES["A"]).running(recorded)
     for other in others:
         other.life.phase, other.life.start_at = RUNNING, 0.0
-    assert first.life.takeoff() == "", first.life.reason
-    first.step(0.02, recorded)
-    assert first.robot.start(first.t) == ""
     for _ in range(200):
         first.step(0.01, recorded)
         for other in others:
@@ -128,86 +125,68 @@ def test_same_alone_and_in_company(group, name):
     assert lives(given, 0) == lives(given, 2)
 
 
-@pytest.mark.parametrize(("group", "name"), EVERY)
-def test_losses_restarts_and_unknown_positions(group, name):
-    bench, setpoints = Bench(assignment(group, name), PLACES["A"]), []
-
-    def watched(bench):
-        tick(bench)
-        setpoints.append(bench.robot.setpoint)
-
-    bench.running(watched).step(0.5, watched)
-    bench.neighbours.mark_lost(0, bench.t)
-    bench.step(1.5, watched)
-    bench.neighbours.mark_alive(0)
-    bench.step(0.3, watched)
-    bench.neighbours.discard_pose(1)  # a new process, without a pose at first
-    bench.step(0.3, follow_setpoint).step(0.3, watched)
-    place = bench.position
-    for unknown in (UNKNOWN, (nan, 0.0, 0.0)):
-        bench.position = unknown
-        bench.step(0.2, watched)
-        assert bench.robot.setpoint == (0.0, 0.0, 0.0, 0.0)
-        bench.position = place
-        bench.step(0.2, watched)
-    for velocity in (UNKNOWN, (1e9, -1e9, 0.0)):
-        bench.velocity = velocity
-        bench.step(0.2, watched)
-    bench.velocity, bench.yaw = (0.0, 0.0, 0.0), nan
-    bench.step(0.2, watched)
-    for link in range(len(bench.neighbours.all)):
-        bench.hear(link, place)  # in its own place
-    bench.step(0.3, watched)
-    assert len(setpoints) > 300
-    assert all(isfinite(number) for setpoint in setpoints[1:] for number in setpoint)
-
-
-REMEMBERING = [name for name in registry.names(LAWS) if not issubclass(registry.struct(LAWS, name), Gradient)]
-
-
-def follow_talking(bench, order=1):
-    hear(bench, order, silent=False)
-    follow_setpoint(bench)
-
-
-def known(memory):
+def known(bench):
+    """Variables in the memory of a law that are known."""
+    memory = {} if bench.robot.stepping is None else bench.robot.stepping.memory
     return {name for name, values in memory.items() if all(map(isfinite, values))}
 
 
-@pytest.mark.parametrize("name", REMEMBERING)
-def test_laws_that_remember_keep_what_they_know(name):
-    """Whatever is lost: what was known stays known, and setpoints stay finite."""
-    bench = Bench(assignment(LAWS, name), PLACES["A"])
-    bench.running(follow_talking).step(0.5, follow_talking)
-    stepping = bench.robot.stepping
-    at_first = known(stepping.memory)
+@pytest.mark.parametrize(("group", "name"), EVERY)
+def test_losses_restarts_and_unknown_positions(group, name):
+    """Whatever is lost: setpoints stay finite, and what a law knew stays known."""
+    bench, silent = Bench(assignment(group, name), PLACES["A"]), group != LAWS or name not in REMEMBERING
+    talking = partial(tick, silent=silent)
+    bench.running(talking).step(0.5, talking)
+    at_first = known(bench)
 
-    def bear(seconds, every_tick):
-        bench.step(seconds, every_tick)
-        assert at_first <= known(stepping.memory)
-        assert all(map(isfinite, bench.robot.setpoint))
+    def bear(seconds, every_tick=talking):
+        def watched(bench):
+            every_tick(bench)
+            assert all(map(isfinite, bench.robot.setpoint))
+
+        bench.step(seconds, watched)
+        assert at_first <= known(bench)
 
     for link in (0, 1):  # one, then all
         bench.neighbours.mark_lost(link, bench.t)
-        bear(1.5, follow_setpoint)
+        bear(1.5, follow_setpoint if link else talking)
     for link in (0, 1):
         bench.neighbours.mark_alive(link)
-        bear(0.5, follow_talking)
-    bench.neighbours.discard_pose(1)
-    bear(0.5, follow_setpoint)
-    bear(0.5, hear)  # poses without words
-    place, bench.position = bench.position, UNKNOWN
-    bear(0.3, follow_talking)
-    bench.position = place
-    bear(0.5, follow_talking)
+        bear(0.5)
+    bench.neighbours.discard_pose(1)  # a new process, without a pose at first
+    bear(0.3, follow_setpoint)
+    bear(0.3, tick)  # poses without words
+    place = bench.position
+    for unknown in (UNKNOWN, (nan, 0.0, 0.0)):
+        bench.position = unknown
+        bear(0.2)
+        assert bench.robot.setpoint == (0.0, 0.0, 0.0, 0.0)
+        bench.position = place
+        bear(0.2)
+    for velocity in (UNKNOWN, (1e9, -1e9, 0.0)):
+        bench.velocity = velocity
+        bear(0.2)
+    bench.velocity, bench.yaw = ZERO, nan
+    bear(0.2)
+    for link in (0, 1):
+        bench.hear(link, place)  # in its own place
+    bear(0.3)
+
+
+@pytest.mark.parametrize("name", REMEMBERING)
+def test_laws_that_remember_ignore_late_and_unknown_words(name):
+    talking = partial(tick, silent=False)
+    bench = Bench(assignment(LAWS, name), PLACES["A"]).running(talking).step(0.5, talking)
+    at_first, says = known(bench), bench.robot.stepping.says
 
     def say(number, age):
-        said = {name: (number,) * size for name, size in stepping.says.items()}
+        said = {name: (number,) * size for name, size in says.items()}
         bench.neighbours.receive(0, (0.5, 0.5, 0.0), ZERO, bench.t - age, bench.t, yaw=nan, said=said)
         return bench.neighbours.all[0].said
 
     unknown = say(nan, 0.0)
-    bear(0.5, follow_setpoint)
+    bench.step(0.5, follow_setpoint)
+    assert at_first <= known(bench)
     assert say(9.0, 1.0) is unknown  # late words are left out
 
 
@@ -215,7 +194,7 @@ def test_laws_that_remember_keep_what_they_know(name):
 def test_remembering_laws_ignore_the_order_of_arrival(name):
     ends = []
     for order in (1, -1):
-        bench, said = Bench(assignment(LAWS, name), PLACES["A"]), partial(follow_talking, order=order)
+        bench, said = Bench(assignment(LAWS, name), PLACES["A"]), partial(tick, order=order, silent=False)
         bench.running(said).step(2.0, said)
         ends.append(repr((bench.robot.stepping.memory, bench.robot.stepping.measures, bench.robot.setpoint)))
     assert ends[0] == ends[1]
@@ -223,11 +202,11 @@ def test_remembering_laws_ignore_the_order_of_arrival(name):
 
 @pytest.mark.parametrize("name", REMEMBERING)
 def test_remembering_laws_bear_a_period_three_times_longer(name):
-    given = assignment(LAWS, name)
+    given, talking = assignment(LAWS, name), partial(tick, silent=False)
     bench = Bench(replace(given, decide_every=3 * given.decide_every), PLACES["A"])
-    bench.running(follow_talking).step(6.0, follow_talking)
-    stepping = bench.robot.stepping
-    assert all(abs(number) < 1e6 for values in stepping.memory.values() for number in values if isfinite(number))
+    bench.running(talking).step(6.0, talking)
+    memory = bench.robot.stepping.memory
+    assert all(abs(number) < 1e6 for values in memory.values() for number in values if isfinite(number))
     assert all(map(isfinite, bench.robot.setpoint))
     assert bench.life.phase == RUNNING, bench.life.reason
 
@@ -251,9 +230,10 @@ def test_range_readings_beyond_the_horizon_change_nothing(name, kind):
         far = [at(horizon * random.uniform(1.0 + 1e-9, 1.2)) for _ in range(30)]
         goal = (*any_of(1.0), 0.5)
         setpoint = (*any_of(kind.speed / kind.response if kind.takes == "position" else kind.speed), 0.0, 0.0)
-        alone, together = near(*close), near(*close, *far)
-        deviated, restrained = avoidance.deviate(goal, here, alone, 0.01), avoidance.restrain(setpoint, here, alone)
-        assert avoidance.deviate(goal, here, together, 0.01) == deviated
-        assert avoidance.restrain(setpoint, here, together) == restrained
-        acted += restrained != setpoint or deviated != goal
+        alone, together = (
+            (avoidance.deviate(goal, here, things, 0.01), avoidance.restrain(setpoint, here, things))
+            for things in (near(*close), near(*close, *far))
+        )
+        assert alone == together
+        acted += alone != (goal, setpoint)
     assert acted > 10

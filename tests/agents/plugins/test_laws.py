@@ -12,8 +12,7 @@ from agents.plugins.laws import Bearing, Displacement, Distance, Mixed, goal_pos
 from agents.vectors import difference, is_finite, norm
 from tests.cases import examples
 
-FEW = examples(25)
-NUMBER = st.floats(-1.5, 1.5)
+FEW, NUMBER = examples(25), st.floats(-1.5, 1.5)
 VECTOR = st.tuples(NUMBER, NUMBER, NUMBER)
 GAIN, LENGTH = st.floats(0.5, 5.0), st.floats(0.3, 1.5)
 
@@ -80,15 +79,10 @@ def test_pulls_that_are_known(law, apart, link, pull, error):
 
 @FEW
 @given(VECTOR, LINK)
-def test_mixed_does_what_each_law_does(apart, link):
-    law = {BY_DISTANCE: Distance(), BY_RELATIVE: Displacement(), BY_BEARING: Bearing()}[link.wants]
-    assert Mixed().pull(apart, link) == law.pull(apart, link)
-    assert Mixed().error(apart, link) == law.error(apart, link)
-
-
-@FEW
-@given(VECTOR, LINK)
-def test_bearing_ignores_growth_and_flat_ones_heights(apart, link):
+def test_mixed_is_each_and_bearing_ignores_growth(apart, link):
+    same = {BY_DISTANCE: Distance(), BY_RELATIVE: Displacement(), BY_BEARING: Bearing()}[link.wants]
+    assert Mixed().pull(apart, link) == same.pull(apart, link)
+    assert Mixed().error(apart, link) == same.error(apart, link)
     law, (x, y, z) = Bearing(), apart
     assert law.error((2 * x, 2 * y, 2 * z), link) == pytest.approx(2 * law.error(apart, link), abs=1e-12)
     if link.bearing[2] != link.bearing[2]:
@@ -104,17 +98,12 @@ def test_dead_zone_narrows_every_error(length, as_if):
 
 
 @FEW
-@given(VECTOR, VECTOR, GAIN)
-def test_tracking_is_a_cubic_pull(position, target, gain):
-    away = difference(position, target)
+@given(VECTOR, VECTOR, GAIN, st.floats(0.01, 0.5))
+def test_tracking_is_cubic_and_goals_are_clamped(position, other, gain, limit):
+    away = difference(position, other)
     pull = -0.5 * gain * norm(away) ** 2
-    assert tracking_offset(position, target, gain) == pytest.approx([pull * each for each in away], abs=1e-12)
+    assert tracking_offset(position, other, gain) == pytest.approx([pull * each for each in away], abs=1e-12)
     assert tracking_offset(position, (nan, nan, nan), gain) == (0.0, 0.0, 0.0)
-
-
-@FEW
-@given(VECTOR, VECTOR, st.floats(0.01, 0.5))
-def test_goal_is_within_the_clamp(position, offset, limit):
-    step = difference(goal_position(position, offset, limit), position)
-    assert step == pytest.approx([min(max(each, -limit), limit) for each in offset], abs=1e-12)
+    step = difference(goal_position(position, other, limit), position)
+    assert step == pytest.approx([min(max(each, -limit), limit) for each in other], abs=1e-12)
     assert not is_finite(goal_position(position, (nan, 0.0, 0.0), limit))

@@ -1,10 +1,9 @@
 """Every registered trigger keeps intervals and silences; each family fires exactly when its inequality says."""
 
 import re
-from dataclasses import dataclass
 from math import dist, exp, hypot, inf, nan, sqrt
 from pathlib import Path
-from typing import get_type_hints
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -27,7 +26,7 @@ from agents.plugins.trigger_families import (
     RelativeControl,
     SelfTriggered,
 )
-from agents.plugins.triggers import LastEvent, Periodic, SendOnDelta, Trigger, TriggerState, TriggerView
+from agents.plugins.triggers import LastEvent, Periodic, SendOnDelta, Trigger, TriggerState
 from tests.agents import signals
 from tests.agents.signals import DT, Play, standing, wander
 from tests.cases import examples
@@ -37,8 +36,7 @@ FAMILIES = {
     "periodic", "send-on-delta", "relative", "mixed", "decaying", "dynamic", "integral", "predictive",
     "self-triggered", "lyapunov", "relative-control",
 }  # fmt: skip
-SEEDS = st.integers(0, 2**32 - 1)
-FEW = examples(10)
+SEEDS, FEW, SOME = st.integers(0, 2**32 - 1), examples(10), examples(15)
 
 
 def made(name, **parameters):
@@ -50,27 +48,17 @@ def made(name, **parameters):
 
 @pytest.mark.parametrize("name", NAMES)
 @FEW
-@given(seed=SEEDS)
-def test_first_question_is_an_event(name, seed):
+@given(seed=SEEDS, ticks=st.integers(1, 15))
+def test_intervals_and_silences_are_kept(name, seed, ticks):
     for options in ({}, {"minimum_interval_s": 0.5}, {"maximum_silence_s": 1.0}, {"evaluate_every_s": 0.5}):
         assert Play(made(name, **options), wander(seed, 1)).fired == [True]
-
-
-@pytest.mark.parametrize("name", NAMES)
-@FEW
-@given(seed=SEEDS, ticks=st.integers(1, 15))
-def test_minimum_interval_is_kept(name, seed, ticks):
-    play = Play(made(name, minimum_interval_s=ticks * DT), wander(seed, 150))
-    assert min(play.intervals, default=ticks) >= ticks
-
-
-@pytest.mark.parametrize("name", NAMES)
-@FEW
-@given(ticks=st.integers(1, 15))
-def test_maximum_silence_is_kept(name, ticks):
-    play = Play(made(name, maximum_silence_s=ticks * DT), standing(60))
-    assert len(play.intervals) >= 60 // ticks - 1
-    assert max(play.intervals) <= ticks
+    seldom = Play(made(name, minimum_interval_s=ticks * DT), wander(seed, 150))
+    assert min(seldom.intervals, default=ticks) >= ticks
+    often = Play(made(name, maximum_silence_s=ticks * DT), standing(60))
+    assert len(often.intervals) >= 60 // ticks - 1
+    assert max(often.intervals) <= ticks
+    lost = Play(made(name), standing(1) + standing(20, (nan, nan, nan)))
+    assert lost.fired == [True] + [False] * 20  # an unknown position is no event
 
 
 @pytest.mark.parametrize("name", sorted(FAMILIES - {"periodic"}))
@@ -81,21 +69,6 @@ def test_periodic_evaluation_is_asking_seldom(name, seed, ticks):
     seldom = Play(made(name, evaluate_every_s=ticks * DT), signal).fired
     assert seldom[::ticks] == Play(made(name), signal[::ticks], dt=ticks * DT).fired
     assert sum(seldom) == sum(seldom[::ticks])
-
-
-@pytest.mark.parametrize("name", sorted(FAMILIES))
-def test_descriptions_of_parameters_have_units(name):
-    kind = registry.struct(registry.TRIGGERS, name)
-    hints = get_type_hints(kind, include_extras=True)
-    assert kind.__struct_fields__
-    for field in kind.__struct_fields__:
-        assert any("[" in str(note) for note in getattr(hints[field], "__metadata__", ())), field
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_unknown_position_is_no_event(name):
-    play = Play(made(name), standing(1) + standing(20, (nan, nan, nan)))
-    assert play.fired == [True] + [False] * 20
 
 
 @pytest.mark.parametrize(("deviation", "fires"), [(0.25, False), (0.2500001, True), (0.3, True), (nan, False)])
@@ -124,12 +97,6 @@ def test_periodic_counts_stay_exact(period, hz, begin_s, length_s, expected):
     assert sent == expected
 
 
-def test_trigger_must_define_fires():
-    with pytest.raises(TypeError, match="Trigger must define `fires`"):
-        Trigger().fires(TriggerView({}))
-    assert TriggerView({}).deviation == TriggerView({}).since_event == inf
-
-
 def test_docs_table_has_families_and_defaults():
     text = (Path(__file__).parents[3] / "docs" / "triggers.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| `([a-z-]+)` \| .* \| (.*) \|$", text, re.MULTILINE)
@@ -143,15 +110,10 @@ def test_docs_table_has_families_and_defaults():
         assert said == {field: defaults[field] for field in own}, name
 
 
-# ---------------------------------------------------------------- families
-
-SOME = examples(15)
-LENGTH, SHARE = st.floats(0.002, 0.1), st.floats(0.01, 0.9)
-TICKS = 150
+LENGTH, SHARE, TICKS = st.floats(0.002, 0.1), st.floats(0.01, 0.9), 150
 
 
-@dataclass
-class Question:
+class Question(NamedTuple):
     """Knowledge at one question; `then` is the moment of the last event."""
 
     t: float
@@ -226,7 +188,7 @@ def test_fires_by_its_inequality(name, data, seed):
 
 @SOME
 @given(SEEDS, SHARE, LENGTH, st.floats(0.1, 50.0), st.floats(0.0, 2.0))
-def test_dynamic(seed, share, floor, decay, weight):
+def test_dynamic_fires_when_its_variable_is_spent(seed, share, floor, decay, weight):
     eta, before = 0.0, 0.0  # at the first question ε was infinite, and nothing was added
 
     def margin(q):
@@ -241,7 +203,7 @@ def test_dynamic(seed, share, floor, decay, weight):
 
 @SOME
 @given(SEEDS, st.floats(1e-4, 5e-2))
-def test_integral(seed, area):
+def test_integral_fires_beyond_its_area(seed, area):
     so_far = 0.0
 
     def margin(q):
@@ -259,16 +221,12 @@ def test_self_triggered_bounds_bounded_accelerations(seed, bound):
     push = rng.normal(size=(400, 3))
     push *= bound / np.maximum(np.linalg.norm(push, axis=1), 1e-9)[:, None]
     speed = np.cumsum(push * dt, axis=0)
-    place = np.cumsum(speed * dt - 0.5 * push * dt**2, axis=0)
-    poses = zip(place.tolist(), speed.tolist(), strict=True)
+    poses = zip(np.cumsum(speed * dt - 0.5 * push * dt**2, axis=0).tolist(), speed.tolist(), strict=True)
     signal = [signals.Moment(tuple(p), tuple(v), (0.0, 0.0, 0.0), 0.0, 0.0) for p, v in poses]
     play = Play(SelfTriggered(threshold=0.01, acceleration=bound), signal, dt=dt)
     for k in range(1, 400):  # it may be late by one question
         assert play.gap_before[k] <= 0.01 + dt * hypot(*signal[k].velocity) + 1e-9
     assert 2 <= sum(play.fired) <= 200
-
-
-# ---------------------------------------------------------------- what is believed between two events
 
 
 @pytest.mark.parametrize(("age", "seconds"), [(-0.5, 0.0), (0.0, 0.0), (1.0, 1.0), (2.0, 2.0), (9.0, 2.0)])
