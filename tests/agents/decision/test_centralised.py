@@ -2,7 +2,6 @@
 
 from math import inf, isnan, nan
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -17,16 +16,15 @@ from tests.agents.bench import Bench
 from tests.small import changed, reference, small
 
 ALL = list(range(7))  # TB01, the leader, then KH01 to KH03 and CF01 to CF03
-
-
 PARK = reference("event")
 
 
 class Desk:
     """A central controller, and poses to tell it."""
 
-    def __init__(self, experiment):
-        plan = Plan(experiment)
+    def __init__(self, update=None, **parts):
+        formation = changed(PARK.formation, update=update)
+        plan = Plan(changed(PARK, formation=formation, **{"architecture": "centralised", **parts}))
         self.names = plan.names
         self.centre = Centre([plan.assignment(name, centrally=True) for name in plan.names])
         for row in self.centre.needed:
@@ -52,15 +50,11 @@ class Desk:
         return {goal.row: goal for goal in self.centre.decide(t, self.phase, self.start)}
 
 
-def central(**parts):
-    return Desk(changed(PARK, architecture="centralised", **parts))
-
-
 @pytest.mark.parametrize("update", [None, {"kind": "send-on-delta", "threshold": 0.08}])
 def test_decides_what_robots_would(update):
-    formation = msgspec.structs.replace(PARK.formation, update=update)
-    parts = {"formation": formation, "duration_s": 5.0, "timeline": []}
-    desk, plan, rng = central(**parts), Plan(changed(PARK, **parts)), np.random.default_rng(1)
+    parts = {"duration_s": 5.0, "timeline": []}
+    desk, rng = Desk(update, **parts), np.random.default_rng(1)
+    plan = Plan(changed(PARK, formation=changed(PARK.formation, update=update), **parts))
     robots = [Robot(plan.assignment(name)) for name in plan.names]
     places, sent = [(x, y, desk.ground(row)) for row, (x, y, _) in enumerate(desk.places)], 0
     for robot in robots:
@@ -89,8 +83,7 @@ def test_decides_what_robots_would(update):
 
 
 def test_goals_that_stay_are_repeated():
-    formation = msgspec.structs.replace(PARK.formation, update={"kind": "periodic", "period_s": 60.0})
-    desk = central(formation=formation)
+    desk = Desk({"kind": "periodic", "period_s": 60.0})
     desk.hear(ALL, 0.0)
     goals = [desk.decide(0.1 * tick) for tick in range(13)]
     followers = [len(each.keys() - {0}) for each in goals]
@@ -99,16 +92,15 @@ def test_goals_that_stay_are_repeated():
 
 
 def test_late_older_poses_are_left_out():
-    desk = central()
+    desk = Desk()
     for x, stamp in ((0.3, 0.9), (0.1, 0.8), (0.7, 0.85)):
         desk.hear([1], 1.0, {1: (x, 0.0, 0.0)}, stamp)
     assert desk.centre.robots[1].position == (0.3, 0.0, 0.0)
-    found = {(sender.position, sender.stamp) for sender in desk.seen_as(1)}
-    assert found == {((0.3, 0.0, 0.0), 0.9)}
+    assert {(sender.position, sender.stamp) for sender in desk.seen_as(1)} == {((0.3, 0.0, 0.0), 0.9)}
 
 
 def test_waiting_robot_stays_once_neighbours_are_known():
-    desk = central()
+    desk = Desk()
     desk.phase, desk.start = [IDLE] * 7, [inf] * 7
     assert desk.decide(0.0) == {}
     assert desk.centre.missing_robots() == ALL
@@ -124,35 +116,28 @@ def test_waiting_robot_stays_once_neighbours_are_known():
     assert desk.centre.decisions == 1  # it begins with the robots, though none has said yet that it runs
 
 
-def test_lost_robot_gets_no_goals():
-    desk = central()
+def test_lost_robot_gets_no_goals_and_alone_it_stays():
+    desk = Desk()
     desk.hear(ALL, 0.0)
     assert list(desk.decide(0.0)) == ALL
-    desk.centre.mark_lost(6, 0.1)
-    assert list(desk.decide(0.1)) == ALL[:6]
-
-    assert any(sender.active for sender in desk.seen_as(6))
+    desk.centre.mark_lost(5, 0.1)
+    assert list(desk.decide(0.1)) == [0, 1, 2, 3, 4, 6]
+    assert any(sender.active for sender in desk.seen_as(5))
     desk.decide(1.2)
-    assert not any(sender.active for sender in desk.seen_as(6))  # its neighbours go on without it
-    assert desk.centre.missing_robots() == [6]
-    desk.centre.mark_alive(6)
-    assert list(desk.decide(1.3)) == ALL
-
-
-def test_robot_without_neighbours_stays():
-    desk = central()
-    desk.hear(ALL, 0.0)
-    desk.decide(0.0)
-    for row in (4, 5):  # CF03 receives nobody else
-        desk.centre.mark_lost(row, 0.0)
-    x, y, z = desk.places[6]
-    assert desk.decide(1.1)[6].goal == (x, y, 0.8)
-    desk.hear([6], 1.15, {6: (x + 0.05, y + 0.05, z)})
-    assert desk.decide(1.2)[6].goal == (x, y, 0.8)
+    assert not any(sender.active for sender in desk.seen_as(5))  # its neighbours go on without it
+    assert desk.centre.missing_robots() == [5]
+    desk.centre.mark_lost(4, 0.1)
+    x, y, z = desk.places[6]  # CF03 receives nobody else
+    assert desk.decide(1.3)[6].goal == (x, y, 0.8)
+    desk.hear([6], 1.35, {6: (x + 0.05, y + 0.05, z)})
+    assert desk.decide(1.4)[6].goal == (x, y, 0.8)
+    desk.centre.mark_alive(4)
+    desk.centre.mark_alive(5)
+    assert list(desk.decide(1.5)) == ALL
 
 
 def test_hybrid_guides_its_robots_alone():
-    desk = Desk(changed(PARK, architecture=Hybrid(kind="hybrid", robots=["CF03", "KH02"])))
+    desk = Desk(architecture=Hybrid(kind="hybrid", robots=["CF03", "KH02"]))
     needed = [desk.names[row] for row in desk.centre.needed]
     assert needed == ["KH01", "KH02", "KH03", "CF01", "CF02", "CF03"]  # not the leader
     desk.hear(desk.centre.needed, 0.0)
@@ -162,10 +147,10 @@ def test_hybrid_guides_its_robots_alone():
 
 
 def test_plans_begin_where_the_robots_did():
-    first, second = central(), central()  # the leader drives 0.75 m from 21 s on, at 0.15 m/s
+    first, second = Desk(), Desk()  # the leader drives 0.75 m from 21 s on, at 0.15 m/s
     (x, y, z) = first.places[0]
     first.hear(ALL, 0.0)
-    first.decide(0.0)
+    assert isnan(first.decide(0.0)[0].yaw)
     second.centre.begin_plan(0, (x, y, 0.0, 0.0))  # this one came later
     second.hear(ALL[1:], 23.0)
     assert 0 not in second.decide(22.9)  # nothing is known of its place
@@ -173,23 +158,11 @@ def test_plans_begin_where_the_robots_did():
         desk.hear([0], 23.0, {0: (x + 0.2, y, z)})
         goal = desk.decide(23.0)[0].goal
         assert (goal[0] - x, goal[1] - y) == pytest.approx((0.3, 0.0), abs=1e-12)
+    second.centre.discard_pose(1)  # restarted: it waits for a pose
+    assert 1 not in second.decide(23.1)
+    second.hear([1], 23.2, stamp=-50.0)  # its clock may be behind that of its former process
+    assert 1 in second.decide(23.2)
 
-
-def test_late_robot_begins_its_plan_then():
-    desk = central()
-    desk.hear(ALL[1:], 0.0)
-    assert 0 not in desk.decide(0.0)
-    desk.hear([0], 0.1)
-    goal = desk.decide(0.1)[0]
-    assert goal.goal[:2] == desk.places[0][:2]
-    assert isnan(goal.yaw)
-    desk.centre.discard_pose(1)  # restarted: it waits for a pose
-    assert 1 not in desk.decide(0.2)
-    desk.hear([1], 0.3, stamp=-50.0)  # its clock may be behind that of its former process
-    assert 1 in desk.decide(0.3)
-
-
-# ---------------------------------------------------------------- guided robots
 
 PLACES = {"A": (-0.4, 0.0, 0.0), "B": (0.4, 0.1, 0.8)}
 
@@ -197,8 +170,8 @@ PLACES = {"A": (-0.4, 0.0, 0.0), "B": (0.4, 0.1, 0.8)}
 def led(**parts):
     """A Khepera and a Crazyflie that receive each other, guided by a central controller; `parts` changes that."""
     robots = {
-        "A": RobotTable(kind="khepera4", start=[-0.4, 0.0]),
-        "B": RobotTable(kind="crazyflie", start=[0.4, 0.1], hover=0.8),
+        name: RobotTable(kind=kind, start=[*PLACES[name][:2]], hover=hover)
+        for name, kind, hover in (("A", "khepera4", None), ("B", "crazyflie", 0.8))
     }
     return Plan(small(robots, {"A - B": 0.9}, **{"duration_s": 60.0, "architecture": "centralised", **parts}))
 
@@ -207,10 +180,9 @@ def guided(name="A", **parts):
     return Bench(led(**parts).assignment(name), PLACES[name])
 
 
-def guide(bench, goal=None, yaw=nan, *, stamp=None):
+def guide(bench, goal=None, yaw=nan):
     """Receive a goal; returns whether it is new."""
-    stamp = bench.t if stamp is None else stamp
-    return bench.robot.guidance.receive(goal or bench.position, yaw, stamp)
+    return bench.robot.guidance.receive(goal or bench.position, yaw, bench.t)
 
 
 def running(name="A", **parts):
@@ -235,10 +207,8 @@ def test_nothing_is_pursued_before_the_start(name):
     guide(bench, (1.0, 0.0, 0.8))
     bench.step()
     assert bench.life.takeoff() == ""
-    bench.step(2.0)
-    assert bench.life.phase == AIRBORNE
-    assert bench.robot.goal == PLACES[name]
-    assert bench.robot.updates == 0
+    assert bench.step(2.0).life.phase == AIRBORNE
+    assert (bench.robot.goal, bench.robot.updates) == (PLACES[name], 0)
 
 
 @pytest.mark.parametrize(("name", "height"), [("A", 0.0), ("B", 0.7)])  # on wheels there is none
@@ -255,20 +225,25 @@ def test_goal_is_pursued_on_its_tick(name, height):
 
 
 def test_older_and_unknown_goals_are_left_out():
-    bench = running()
-    assert guide(bench, (0.1, 0.0, 0.0))
-    assert not guide(bench, (nan, 0.0, 0.0), stamp=bench.t + 1.0)
-    assert not guide(bench, (0.2, 0.0, 0.0), stamp=bench.t - 0.1)
-    assert not guide(bench, (0.2, 0.0, 0.0))  # the same instant once more
-    assert bench.step().robot.goal == (0.1, 0.0, 0.0)
+    guidance, here = ReceivedGoals(flies=True, silence_s=1.0), (0.1, 0.0, 0.5)
+    assert guidance.missing
+    assert guidance.receive(here, nan, 4.0)
+    for goal, stamp in (((nan, 0.0, 0.0), 5.0), (ZERO, 3.9), (ZERO, 4.0)):  # unknown, older, once more
+        assert not guidance.receive(goal, nan, stamp)
+    assert guidance.goal == here
+    guidance.mark_lost(4.5)
+    assert guidance.unguided(4.6)
+    assert guidance.receive(ZERO, nan, 4.7)
+    assert guidance.lost_since == inf
+    guidance.begin_anew()  # another controller
+    assert guidance.receive(ZERO, nan, -3.0)  # its clock is behind
 
 
 def test_old_goal_makes_it_stay():
     bench = running()
     at = bench.t
     guide(bench, (-0.3, 0.1, 0.0), 0.3)
-    bench.step(0.5)
-    bench.position = (-0.35, 0.0, 0.0)
+    bench.step(0.5).position = (-0.35, 0.0, 0.0)
     while bench.t <= at + 1.0 + 1e-9:
         assert bench.robot.goal == (-0.3, 0.1, 0.0)
         bench.step()
@@ -287,8 +262,7 @@ def test_dead_centre_stops_at_once(name):
     x, y, z = bench.position
     goal = (x + 0.1, y + 0.1, z)
     guide(bench, goal)
-    bench.step()
-    bench.robot.guidance.mark_lost(bench.t)
+    bench.step().robot.guidance.mark_lost(bench.t)
     assert bench.step().robot.goal == bench.position
     assert bench.robot.missing_neighbours() == ["centre"]
     assert bench.life.phase == RUNNING
@@ -300,55 +274,34 @@ def test_dead_centre_stops_at_once(name):
     assert bench.step().robot.goal == (x + 0.05, y + 0.1, z)
 
 
-def test_orders_come_before_goals():
+def test_orders_and_a_lost_network_come_before_goals():
     bench = running()
     assert bench.robot.hold() == ""
     guide(bench, (-0.3, 0.1, 0.0))
     assert bench.step().robot.goal == (-0.4, 0.0, 0.0)
     assert bench.robot.start(0.0) == ""
     assert bench.step().robot.goal == (-0.3, 0.1, 0.0)
+    bench.robot.health.offline_since = bench.t
+    bench.step(0.5)
+    guide(bench, (-0.3, 0.2, 0.0))  # the last that came through
+    assert bench.step(0.5).robot.goal == (-0.3, 0.2, 0.0)
+    assert bench.step(0.02).robot.goal == bench.position
     drone = running("B")
     drone.life.land("told to")
     guide(drone, (0.6, 0.2, 0.8))
-    drone.step()
-    assert drone.life.phase == LANDING
+    assert drone.step().life.phase == LANDING
     assert isnan(drone.robot.setpoint[0])
 
 
-def test_cut_off_from_the_network_it_holds():
-    bench = running()
-    bench.robot.health.offline_since = bench.t
-    bench.step(0.5)
-    guide(bench, (-0.3, 0.1, 0.0))  # the last that came through
-    assert bench.step(0.5).robot.goal == (-0.3, 0.1, 0.0)
-    assert bench.step(0.02).robot.goal == bench.position
-
-
-def test_guided_robot_receives_for_avoidance_alone():
-    assert led().assignment("A").neighbours == ()
+def test_guided_robots_leave_the_law_to_others():
     avoids = led(avoidance={"kind": "barrier", "hears": "neighbours"}).assignment("A")
     assert [(each.name, each.in_law) for each in avoids.neighbours] == [("B", False)]
-
-
-def test_hybrid_leaves_the_law_to_others():
     plan = led(architecture=Hybrid(kind="hybrid", robots=["B"]))
     alone, follower = plan.assignment("A"), plan.assignment("B")
     assert (alone.guided, follower.guided) == (False, True)
     assert [each.name for each in alone.neighbours] == ["B"]
     assert follower.neighbours == ()
     assert Robot(alone).guidance is None  # a robot that decides for itself takes no goals
-
-
-def test_goals_of_another_controller_begin_anew():
-    guidance = ReceivedGoals(flies=True, silence_s=1.0)
-    assert guidance.missing
-    assert guidance.receive(ZERO, nan, 4.0)
-    guidance.mark_lost(4.5)
-    assert guidance.unguided(4.6)
-    assert guidance.receive(ZERO, nan, 4.7)
-    assert guidance.lost_since == inf
-    guidance.begin_anew()
-    assert guidance.receive(ZERO, nan, -3.0)  # its clock is behind
 
 
 @pytest.mark.parametrize("name", PLACES)
@@ -368,5 +321,4 @@ def test_velocity_of_the_centre_ends_with_its_goals(name):
     assert not robot.hazards.held
     bench.step(0.8)
     assert robot.hazards.held
-    assert robot.stepping is None
-    assert robot.words == ()
+    assert (robot.stepping, robot.words) == (None, ())

@@ -25,7 +25,7 @@ from experiments.definition.plan import Plan
 from tests.agents.bench import Bench
 from tests.small import triangle
 
-DT = 0.02
+REMEMBERED = {"count": (1.0,), "secret": (0.0, 0.0)}
 
 
 class Counting(Law, frozen=True):
@@ -45,12 +45,12 @@ class Counting(Law, frozen=True):
 
 
 class Odd(Counting, frozen=True):
-    """Decides what it is given."""
+    """Decides what is made of the view."""
 
-    decides: object = None
+    decides: Callable[[object], object]
 
     def step(self, view, memory):
-        return self.decides
+        return self.decides(view)
 
 
 class Beginning(Counting, frozen=True):
@@ -66,8 +66,8 @@ def saying(says):
     return msgspec.defstruct("Saying", [], bases=(Counting,), namespace={"SAYS": says}, frozen=True)()
 
 
-def given(law):
-    return replace(Plan(triangle()).assignment("A"), law=law, start=None, starts=())
+def given(law, **parts):
+    return replace(Plan(triangle()).assignment("A"), law=law, start=None, starts=(), **parts)
 
 
 def hear(bench, *words):
@@ -76,40 +76,30 @@ def hear(bench, *words):
         bench.neighbours.receive(link, (0.5, 0.5 * link, 0.0), ZERO, bench.t, bench.t, yaw=0.3, said=said)
 
 
-def running(law):
-    return Bench(given(law), ZERO).running(hear)
+def running(law, **parts):
+    return Bench(given(law, **parts), ZERO).running(hear)
 
 
 def test_memory_is_kept_where_a_robot_was_due():
     bench = Bench(given(Counting()), ZERO).step(0.2, hear)
     stepping = bench.robot.stepping
     assert stepping.memory["count"] == (0.0,)  # the rehearsal is not kept
-    bench.running(hear).step(0.99, hear)
+    bench.running(hear)
+    for _ in range(99):
+        before = len(bench.said)
+        bench.step(0.01, hear)
+        if len(bench.said) > before:  # it says what its last step decided
+            assert bench.robot.words == (("count", stepping.memory["count"]),)
     assert stepping.memory == {"count": (10.0,), "secret": (1.0, 2.0)}
     assert stepping.measures == {"heard": 0.0}
     assert bench.robot.setpoint[0] == pytest.approx(0.05, rel=0.2)
     assert isnan(bench.robot.error)
-
-
-def test_neighbours_are_heard_and_forgotten():
-    bench, odd = running(Counting()), {"count": (3.0, 4.0), "other": (1.0,)}  # of another size
+    odd = {"count": (3.0, 4.0), "other": (1.0,)}  # of another size
     bench.step(0.3, lambda bench: hear(bench, odd, {"count": (3.0,)}))
-    assert bench.robot.stepping.measures == {"heard": 1.0}
+    assert stepping.measures == {"heard": 1.0}
     bench.neighbours.discard_pose(1)
     bench.step(0.3, lambda bench: hear(bench, {}))
-    assert bench.robot.stepping.measures == {"heard": 0.0}
-
-
-def test_a_robot_says_what_its_last_step_decided():
-    bench = running(Counting())
-    for _ in range(40):
-        before = len(bench.said)
-        bench.step(0.01, hear)
-        if len(bench.said) > before:
-            assert bench.robot.words == (("count", bench.robot.stepping.memory["count"]),)
-
-
-REMEMBERED = {"count": (1.0,), "secret": (0.0, 0.0)}
+    assert stepping.measures == {"heard": 0.0}
 
 
 @pytest.mark.parametrize(
@@ -125,7 +115,7 @@ REMEMBERED = {"count": (1.0,), "secret": (0.0, 0.0)}
     ],
 )
 def test_what_cannot_be_used_names_the_law(decides):
-    stepping = Stepping(given(Odd(decides=decides)))
+    stepping = Stepping(given(Odd(lambda _: decides)))
     with pytest.raises(PluginError, match="`step` of the law Odd must give"):
         stepping.step(stepping.view())
 
@@ -146,32 +136,27 @@ def test_a_law_that_cannot_begin_is_named(law, message):
 
 
 def test_velocity_that_is_not_finite_holds_and_lands():
-    class Lost(Counting, frozen=True):
-        def step(self, view, memory):
-            way = (nan if view.time > 1.0 else 0.0, 0.0, nan)
-            return Control(memory={"count": (0.0,), "secret": (nan, nan)}, velocity=way)
+    def late(view):
+        return Control(memory=REMEMBERED, velocity=(nan if view.time > 1.0 else 0.0, 0.0, nan))
 
-    bench = running(Lost()).step(0.9, hear)
+    bench = running(Odd(late)).step(0.9, hear)
     assert bench.life.phase == RUNNING
     bench.step(0.5, hear)
     assert bench.robot.setpoint == (0.0, 0.0, 0.0, 0.0)
-    assert any("the law Lost decides what is not finite" in each.text for each in bench.robot.hazards.incidents)
-    bench.step(30.0, hear)
-    assert bench.life.phase >= LANDING
+    assert any("the law Odd decides what is not finite" in each.text for each in bench.robot.hazards.incidents)
+    assert bench.step(30.0, hear).life.phase >= LANDING
 
 
 def test_words_on_unknown_reads_change_nothing():
-    class Aiming(Counting, frozen=True):
-        def step(self, view, memory):
-            return Control(memory=memory, velocity=(*view.target_velocity[:2], view.neighbours[0].link.bearing[0]))
+    def aim(view):
+        return Control(memory=REMEMBERED, velocity=(*view.target_velocity[:2], view.neighbours[0].link.bearing[0]))
 
-    line = Leg(0.0, Line(move_by=[1.0, 0.0], speed_=0.1))
     speeds = []
     for asks in (False, True):
-        bench = Bench(replace(given(Aiming()), legs=(line,)), ZERO).running(hear).step(0.9, hear)
+        bench = running(Odd(aim), legs=(Leg(0.0, Line(move_by=[1.0, 0.0], speed_=0.1)),)).step(0.9, hear)
         goals = bench.robot.goals
         words = goals.unknown_reads(99.0, (5.0, 5.0, 0.0)) if asks else ""
-        assert words.startswith(": Aiming reads link.bearing") == asks
+        assert words.startswith(": Odd reads link.bearing") == asks
         assert "view.target" not in words
         bench.step(0.2, hear)
         speeds.append(goals.stepping.control.velocity[:2])
@@ -218,16 +203,14 @@ def test_impossible_words_are_refused(shared):
 
 
 def test_reference_moves_with_the_velocity_and_stays_near():
-    follower = VelocityFollower(CRAZYFLIE, 0.8)
+    follower, here, ahead = VelocityFollower(CRAZYFLIE, 0.8), (0.0, 0.0, 0.8), 1.0 / CRAZYFLIE.response
     for _ in range(100):
-        goal = follower.goal((0.1, 0.0, nan), (0.0, 0.0, 0.7), DT)  # a robot that is held back
+        goal = follower.goal((0.1, 0.0, nan), (0.0, 0.0, 0.7), 0.02)  # a robot that is held back
     assert follower.reference == pytest.approx((LEASH, 0.0, 0.8))
-    assert goal == pytest.approx((LEASH + 0.1 / CRAZYFLIE.response, 0.0, 0.8))
-    x, y, z = VelocityFollower(CRAZYFLIE, 0.8).goal((30.0, 40.0, nan), (0.0, 0.0, 0.8), DT)
-    assert (x, y, z) == pytest.approx(
-        (0.6 * CRAZYFLIE.speed / CRAZYFLIE.response, 0.8 * CRAZYFLIE.speed / CRAZYFLIE.response, 0.8)
-    )
+    assert goal == pytest.approx((LEASH + 0.1 * ahead, 0.0, 0.8))
+    fast = VelocityFollower(CRAZYFLIE, 0.8).goal((30.0, 40.0, nan), here, 0.02)
+    assert fast == pytest.approx((0.6 * CRAZYFLIE.speed * ahead, 0.8 * CRAZYFLIE.speed * ahead, 0.8))
     resting = VelocityFollower(CRAZYFLIE, 0.8)
-    places = [resting.goal((0.0, 0.0, nan), (0.01 * (k % 3 - 1), 0.0, 0.8), DT) for k in range(50)]
+    places = [resting.goal((0.0, 0.0, nan), (0.01 * (k % 3 - 1), 0.0, 0.8), 0.02) for k in range(50)]
     assert dist(places[0], places[-1]) == 0.0
-    assert VelocityFollower(KHEPERA4, 0.0).goal((0.0, 0.0, 0.3), (0.2, 0.1, 0.0), DT) == (0.2, 0.1, 0.0)
+    assert VelocityFollower(KHEPERA4, 0.0).goal((0.0, 0.0, 0.3), (0.2, 0.1, 0.0), 0.02) == (0.2, 0.1, 0.0)

@@ -1,6 +1,6 @@
 """Transmitted poses: smoothed without lag, and none of a robot that does not know where it is."""
 
-from math import exp, floor, inf, isnan, log, nan
+from math import exp, floor, inf, isnan, log
 
 import numpy as np
 import pytest
@@ -13,15 +13,14 @@ from agents.kinds.khepera4 import KHEPERA4
 from agents.kinds.tello import TELLO
 from agents.plugins.predictors import HOLD, ConstantVelocity
 from agents.plugins.triggers import SendOnDelta
-from agents.vectors import NO_SETPOINT
+from agents.vectors import NO_SETPOINT, UNKNOWN, ZERO
 from tests.cases import examples
 
 DT = 0.02
-STILL, LOST = (0.0, 0.0, 0.0), (nan, nan, nan)
 
 
-def say(transmitter, t, position, velocity=STILL):
-    return transmitter.transmits(t, position, velocity, 0.0, 0.0, t, STILL, NO_SETPOINT)
+def say(transmitter, t, position, velocity=ZERO):
+    return transmitter.transmits(t, position, velocity, 0.0, 0.0, t, ZERO, NO_SETPOINT)
 
 
 @examples(25)
@@ -36,9 +35,8 @@ def test_low_pass_does_not_lag(constant, speed):
 
 def test_low_pass_has_its_time_constant():
     smooth, step = LowPass(KHEPERA4), (1.0, 0.0, 0.0)
-    smooth.smooth(0.0, STILL, STILL, 0.5, NO_SETPOINT)
-    for k in range(1, 51):
-        smooth.smooth(k * 0.01, step, step, 0.5, NO_SETPOINT)
+    for k in range(51):
+        smooth.smooth(k * 0.01, step if k else ZERO, step if k else ZERO, 0.5, NO_SETPOINT)
     # the speed carries it on as well, by 1 m/s · τ · (1 − 1/e)
     assert smooth.velocity[0] == pytest.approx(1.0 - exp(-1.0), rel=1e-9)
     assert smooth.position[0] == pytest.approx((1.0 - exp(-1.0)) * 1.5, rel=0.01)
@@ -57,27 +55,24 @@ def test_drones_are_carried_by_their_setpoints(kind):
         x += DT * speed
     assert np.abs(np.mean(off[2000:], axis=0)).max() < 0.003
     assert np.std(off[2000:], axis=0).max() < 0.009  # of a wobble of 0.01 m; its velocity would be 0.1 m/s and more
-
-
-def test_drone_without_setpoints_is_believed():
-    smooth, velocity = LowPass(CRAZYFLIE), (0.3, 0.3, 0.3)
+    free, velocity = LowPass(kind), (0.3, 0.3, 0.3)
     for k in range(200):
-        smooth.smooth(k * DT, STILL, velocity, 0.4, NO_SETPOINT)
-    assert smooth.velocity == pytest.approx(velocity, abs=1e-3)
+        free.smooth(k * DT, ZERO, velocity, 0.4, NO_SETPOINT)
+    assert free.velocity == pytest.approx(velocity, abs=1e-3)  # without setpoints it is believed
 
 
 def test_low_pass_begins_anew_after_a_loss():
     smooth, found = LowPass(KHEPERA4), []
-    for k, place in enumerate((STILL, LOST, (1.0, 1.0, 1.0), (2.0, 1.0, 1.0))):
-        smooth.smooth(k * DT, place, STILL, 1.0, NO_SETPOINT)
+    for k, place in enumerate((ZERO, UNKNOWN, (1.0, 1.0, 1.0), (2.0, 1.0, 1.0))):
+        smooth.smooth(k * DT, place, ZERO, 1.0, NO_SETPOINT)
         found.append(smooth.position)
-    assert found[:3] == [STILL, pytest.approx(LOST, nan_ok=True), (1.0, 1.0, 1.0)]
+    assert found[:3] == [ZERO, pytest.approx(UNKNOWN, nan_ok=True), (1.0, 1.0, 1.0)]
     assert 1.0 < found[3][0] < 1.1
 
 
 def test_smoothed_pose_is_judged_and_transmitted():
     transmitter = Transmitter(SendOnDelta(threshold=0.01, smoothing_s=0.5), HOLD, KHEPERA4)
-    assert say(transmitter, 0.0, STILL)
+    assert say(transmitter, 0.0, ZERO)
     quiet = 0
     while not say(transmitter, (quiet + 1) * DT, (0.1, 0.0, 0.0)):
         quiet += 1
@@ -88,19 +83,19 @@ def test_smoothed_pose_is_judged_and_transmitted():
 
 def test_neither_unknown_places_nor_believed_motion_are_transmitted():
     transmitter = Transmitter(SendOnDelta(threshold=0.01), ConstantVelocity(), KHEPERA4)
-    assert not say(transmitter, 0.0, LOST)
+    assert not say(transmitter, 0.0, UNKNOWN)
     assert transmitter.asking.last.time == -inf
-    assert say(transmitter, DT, STILL, (0.1, 0.0, 0.0))
+    assert say(transmitter, DT, ZERO, (0.1, 0.0, 0.0))
     assert transmitter.velocity == (0.1, 0.0, 0.0)
     assert not say(transmitter, 2 * DT, (0.1 * DT, 0.0, 0.0), (0.1, 0.0, 0.0))
     assert transmitter.position == (0.1 * DT, 0.0, 0.0)
 
 
 @pytest.mark.parametrize("smoothing_s", [0.0, 0.5])
-@pytest.mark.parametrize("velocity", [LOST, (60.0, 0.0, 0.0), (inf, 0.0, 0.0)])
+@pytest.mark.parametrize("velocity", [UNKNOWN, (60.0, 0.0, 0.0), (inf, 0.0, 0.0)])
 def test_unknown_velocity_counts_as_standing(smoothing_s, velocity):
     transmitter = Transmitter(SendOnDelta(threshold=0.01, smoothing_s=smoothing_s), ConstantVelocity(), KHEPERA4)
-    assert say(transmitter, 0.0, STILL, velocity)
+    assert say(transmitter, 0.0, ZERO, velocity)
     assert all(map(isnan, transmitter.velocity))
-    assert transmitter.asking.last.velocity == STILL
+    assert transmitter.asking.last.velocity == ZERO
     assert say(transmitter, 4.0, (1.0, 0.0, 0.0), velocity)
