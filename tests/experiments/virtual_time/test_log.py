@@ -83,7 +83,7 @@ def test_logged_and_played_back_runs_are_the_same(log, tmp_path):
     assert np.isfinite(trace.shadow_position).all(axis=(0, 2)).tolist() == [True, False]
 
 
-def test_a_trace_has_the_contacts_of_the_run(log):
+def test_a_trace_has_contacts_and_moving_things(log):
     trace = recorder(log).trace()
     assert [(c.stamp, c.first, c.second, c.impulse, c.overlap) for c in trace.contacts] == [
         (pytest.approx(0.503), "KH", "CF", 0.2, 0.002),
@@ -91,10 +91,7 @@ def test_a_trace_has_the_contacts_of_the_run(log):
         (pytest.approx(2.5), "CF", "wall", 0.4, 0.004),
     ]
     assert (trace.interventions.tolist(), trace.avoided.tolist()) == ([4, 3], [2, 1])
-
-
-def test_world_is_logged_each_second_with_moving_things(log):
-    world = recorder(log).trace().world
+    world = trace.world
     assert [round(said.stamp, 6) for said in world] == [0.0, 1.0, 2.0, 3.0]
     assert [[standing.name for standing in said.obstacles] for said in world] == [["post", "cart"]] * 4
     assert [said.obstacles[1].pose[0] for said in world] == pytest.approx([-0.8, -0.7, -0.6, -0.5])
@@ -103,11 +100,8 @@ def test_world_is_logged_each_second_with_moving_things(log):
     assert {(said.engine, said.factor, said.paused) for said in world} == {("point-mass", 1.0, False)}
 
 
-@pytest.mark.parametrize(("engine", "contacts"), [("point-mass", None), ("pymunk", ())])
-def test_engine_without_contacts_found_reports_none(log, engine, contacts):
-    assert recorder(replace(log, touches=()), engine).trace().contacts == contacts
-
-
-def test_nothing_is_said_of_an_empty_place(log):
-    trace = recorder(replace(log, touches=(), obstacles=log.obstacles[:, :, :0]), arena=Arena()).trace()
+def test_engine_without_contacts_found_reports_none(log):
+    quiet = replace(log, touches=())
+    assert [recorder(quiet, engine).trace().contacts for engine in ("point-mass", "pymunk")] == [None, ()]
+    trace = recorder(replace(quiet, obstacles=log.obstacles[:, :, :0]), arena=Arena()).trace()
     assert (trace.world, trace.contacts) == ((), None)

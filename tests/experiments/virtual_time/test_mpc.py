@@ -53,17 +53,12 @@ def crowded(number):
     return random(number, 0.75, 0.4)
 
 
-def traded(starts, goals, *changes, case="periodic"):
-    """Trace of robots that fly from places to goals."""
-    words = [f"robots.{name}.start=[{x:.4f}, {y:.4f}]" for name, (x, y) in zip(NAMES, starts, strict=True)]
-    table = ", ".join(f"{name} = [{x:.4f}, {y:.4f}]" for name, (x, y) in zip(NAMES, goals, strict=True))
-    return flown("mpc", case, *words, f"formation.law.goal={{ {table} }}", *changes).trace
-
-
-def swapped(swap, number, case="periodic"):
+def swapped(swap, number, *changes, case="periodic"):
     """Trace of robots that change places, and their goals [m]."""
     starts, goals = swap(number)
-    return traded(starts, goals, case=case), goals
+    words = [f"robots.{name}.start=[{x:.4f}, {y:.4f}]" for name, (x, y) in zip(NAMES, starts, strict=True)]
+    table = ", ".join(f"{name} = [{x:.4f}, {y:.4f}]" for name, (x, y) in zip(NAMES, goals, strict=True))
+    return flown("mpc", case, *words, f"formation.law.goal={{ {table} }}", *changes).trace, goals
 
 
 def nearest(trace):
@@ -102,7 +97,7 @@ def test_eight_robots_swap_places_without_contact(swap, number):
 )
 def test_contacts_and_deadlocks_are_those_of_the_page(swap, changes, touching, waiting):
     """Counts of 20 cases, as docs/mpc.md has them."""
-    ends = [(traded(starts, goals, *changes), goals) for starts, goals in map(swap, range(20))]
+    ends = [swapped(swap, number, *changes) for number in range(20)]
     assert sum(nearest(trace) < CONTACT for trace, _ in ends) == touching
     assert sum(farthest(trace, goals) > 0.05 for trace, goals in ends) == waiting
 
@@ -110,14 +105,14 @@ def test_contacts_and_deadlocks_are_those_of_the_page(swap, changes, touching, w
 @pytest.mark.slow
 @pytest.mark.parametrize("case", [pytest.param("event", marks=pytest.mark.nightly), "event-loss"])
 def test_swap_by_events_and_with_losses(case):
-    trace, goals = swapped(opposite, 0, case)
+    trace, goals = swapped(opposite, 0, case=case)
     assert nearest(trace) > CONTACT
-    assert trace.true_position[-1, :, :2] == pytest.approx(np.array(goals), abs=0.05)
+    assert farthest(trace, goals) < 0.05
     assert len(trace.sent) < 0.7 * len(swapped(opposite, 0)[0].sent)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["crazyflie", "khepera4", "omni", "double-integrator"])
+@pytest.mark.parametrize("kind", ["crazyflie", "khepera4", "double-integrator"])
 def test_one_robot_reaches_its_goal_within_its_limits(kind):
     law = {"kind": "mpc", "goal": {"A": [1.0, 0.6]}}
     robot = RobotTable(kind=kind, start=[-1.0, -0.5], hover=0.8 if kind == "crazyflie" else None)
@@ -136,42 +131,32 @@ def come(bench):
         bench.neighbours.receive(link, place, ZERO, bench.t, bench.t, yaw=0.0, said=words)
 
 
-@pytest.fixture
-def meeting():
-    """A on its way to a goal beyond B."""
+def test_a_robot_plans_around_what_another_says():
+    """A is on its way to a goal beyond B; what a lost B said is no longer avoided."""
+
+    def plan_of(bench):
+        stepping = bench.robot.stepping
+        return stepping.measures["conflicts"], min(stepping.memory["path"][1::2])
+
     law = Mpc(goal={"A": (1.4, 0.0)}, speed=0.2)
     bench = Bench(replace(Plan(triangle()).assignment("A"), law=law, start=None, starts=()), (-0.4, 0.0, 0.0))
-    return bench.running(come).step(0.5, come)
-
-
-def plan_of(bench):
-    """Conflicts, and y of the path [m]."""
-    stepping = bench.robot.stepping
-    return stepping.measures["conflicts"], np.array(stepping.memory["path"])[1::2]
-
-
-def test_a_robot_plans_around_what_another_says(meeting):
-    conflicts, y = plan_of(meeting)
+    conflicts, right = plan_of(bench.running(come).step(0.5, come))
     assert conflicts == 1.0
-    assert y.min() < -0.2  # to its right: the other does so as well
-
-
-def test_lost_robots_transmitted_path_is_no_longer_avoided(meeting):
-    meeting.step(0.8)
-    assert plan_of(meeting)[0] == 1.0  # what was said is old, and still counts
-    meeting.neighbours.mark_lost(0, meeting.t)
-    meeting.step(1.3)
-    conflicts, y = plan_of(meeting)
+    assert right < -0.2  # to its right: the other does so as well
+    bench.step(0.8)
+    assert plan_of(bench)[0] == 1.0  # what was said is old, and still counts
+    bench.neighbours.mark_lost(0, bench.t)
+    bench.step(1.3)
+    conflicts, right = plan_of(bench)
     assert conflicts == 0.0
-    assert y.min() > -0.1
+    assert right > -0.1
 
 
 def test_constraints_hold_where_they_can():
     """Of a plan beside one other: n·p ≥ b at its step, and limits."""
     ahead = horizon(15, 0.2, 0.1)
-    (found,) = ahead.conflicts(
-        ahead.positions((0.0, 0.0), (0.3, 0.0), ahead.rest), [still_neighbour((0.6, 0.0))], 0.35, 0.0
-    )
+    still = NeighbourView(1, "B", (0.6, 0.0, 0.0), ZERO, 0.0, 0.0, {"path": (nan,) * 32}, None)
+    (found,) = ahead.conflicts(ahead.positions((0.0, 0.0), (0.3, 0.0), ahead.rest), [still], 0.35, 0.0)
     step, normal, bound = found
     assert (step, normal, bound) == (4, (-1.0, 0.0), pytest.approx(-0.25))
     a, slack = ahead.plan((0.0, 0.0), (0.3, 0.0), (2.0, 0.5), [found], (0.5, 1.0, 100.0))
@@ -180,10 +165,6 @@ def test_constraints_hold_where_they_can():
     assert places[step, 0] <= 0.25 + 1e-6
     assert np.abs(a).max() <= 1.0 + 1e-6
     assert np.abs(0.3 * np.array([1.0, 0.0]) + 0.2 * np.cumsum(a, axis=0)).max() <= 0.5 + 1e-6
-
-
-def still_neighbour(place):
-    return NeighbourView(1, "B", (*place, 0.0), ZERO, 0.0, 0.0, {"path": (nan,) * 32}, None)
 
 
 def test_path_is_read_at_its_readers_time():
@@ -201,13 +182,7 @@ def test_a_missing_library_is_named_with_its_remedy(monkeypatch):
         Stepping(replace(Plan(triangle()).assignment("A"), law=Mpc()))
 
 
-@pytest.mark.parametrize(
-    ("goal", "severities"),
-    [
-        ({"A": (0.0, 0.0), "B": (0.0, 1.0)}, []),
-        ({"A": (0.0, 0.0), "B": (0.0, 0.3)}, ["warning"]),
-        ({"A": (0.0, 0.0), "X": (0.0, 1.0)}, ["error"]),
-    ],
-)
-def test_check_warns_of_goals_that_exclude_each_other(goal, severities):
-    assert [severity for severity, *_ in Mpc(goal=goal).analyse(Plan(triangle()))] == severities
+@pytest.mark.parametrize(("name", "y", "severities"), [("B", 1.0, []), ("B", 0.3, ["warning"]), ("X", 1.0, ["error"])])
+def test_check_warns_of_goals_that_exclude_each_other(name, y, severities):
+    found = Mpc(goal={"A": (0.0, 0.0), name: (0.0, y)}).analyse(Plan(triangle()))
+    assert [severity for severity, *_ in found] == severities

@@ -62,7 +62,7 @@ def test_each_receiver_gets_what_is_sent():
     assert (len(silent.received.link), silent.lost) == (0, [])
 
 
-@pytest.mark.parametrize(("delay", "ticks"), [(0.0, 1), (0.001, 1), (0.01, 1), (0.02, 2), (0.07, 7), (0.071, 8)])
+@pytest.mark.parametrize(("delay", "ticks"), [(0.0, 1), (0.01, 1), (0.07, 7), (0.071, 8)])
 def test_delay_is_a_number_of_ticks(delay, ticks):
     talk, newest = Talk(ChannelTable(delay_s=delay)), []
     for _ in range(100):
@@ -77,14 +77,10 @@ def test_order_of_arrival_is_logged():
     assert (np.diff(got.seq[got.link == A_TO_B]) < 0).any()  # some overtook others
 
 
-@pytest.mark.parametrize(("loss", "lost"), [(0.0, [0, 0, 0, 0]), (1.0, [50, 50, 50, 50])])
-def test_everything_or_nothing_is_lost(loss, lost):
-    talk = Talk(ChannelTable(loss=loss)).run(50, [0, 1, 2]).run(1)
-    assert talk.lost == lost
-    assert len(talk.received.link) == 200 - sum(lost)
-
-
-def test_seed_decides_which_samples_are_lost():
+def test_all_nothing_or_the_seeds_samples_are_lost():
+    for loss, lost in ((0.0, 0), (1.0, 50)):
+        talk = Talk(ChannelTable(loss=loss)).run(50, [0, 1, 2]).run(1)
+        assert (talk.lost, len(talk.received.link)) == ([lost] * 4, 200 - 4 * lost)
     talks = [Talk(ChannelTable(loss=0.5), seed=seed).run(100, [0, 1]).run(1) for seed in (1, 1, 2)]
     first, again, other = (talk.received.seq.tolist() for talk in talks)
     assert first == again != other
@@ -106,7 +102,7 @@ def test_samples_have_their_size_on_the_wire(encoding):
     bandwidth = 10_000.0
     channel = ChannelTable(delay_s=0.0, bandwidth=bandwidth)
     got = Talk(channel, network=NetworkTable(encoding=encoding)).run(1, [0, 1]).run(40).received
-    for link, row in ((A_TO_B, 0), (A_TO_C, 0), (B_TO_A, 1), (B_TO_C, 1)):
+    for link, row in ((A_TO_C, 0), (B_TO_A, 1)):
         pose = messages.pose("AB"[row], 1, EPOCH, [float(row), 0.0, 1.0], [-float(row), -0.0, -1.0], yaw=0.0)
         size = len(messages.encode(pose, encoding))
         assert size > 60
@@ -124,18 +120,11 @@ def test_links_differ_by_name():
     assert talk.lost == [20, 20, 0, 0]
 
 
-@pytest.mark.parametrize(
-    ("channel", "instant"),
-    [
-        (ChannelTable(), False),
-        (ChannelTable(delay_s=0.0), True),
-        (ChannelTable(delay_s=0.0, loss=0.5), True),
-        (ChannelTable(delay_s=0.0, jitter_s=0.1), False),
-        (ChannelTable(delay_s=0.0, bandwidth=1e6), False),
-    ],
-)
-def test_instant_network(channel, instant):
-    assert Talk(channel).network.instant == instant
+def test_instant_network():
+    instant = ({"delay_s": 0.0}, {"delay_s": 0.0, "loss": 0.5})
+    not_instant = ({}, {"delay_s": 0.0, "jitter_s": 0.1}, {"delay_s": 0.0, "bandwidth": 1e6})
+    assert all(Talk(ChannelTable(**channel)).network.instant for channel in instant)
+    assert not any(Talk(ChannelTable(**channel)).network.instant for channel in not_instant)
 
 
 def test_poses_to_the_centre_are_lost_alike():

@@ -56,24 +56,16 @@ def test_a_policy_acts_in_flight_as_offline(case, most, monkeypatch):
     assert apart[-1].max() < most
 
 
-TRAINING = runpy.run_path(str(Path(__file__).parents[3] / "docs" / "policy_training.py"))
-SITUATIONS = TRAINING["situations"](np.random.default_rng(3), 5000)
-
-
-def off_expert(actions):
-    """Root mean square of the difference from what the expert does."""
-    return np.sqrt(((actions - TRAINING["expert"](SITUATIONS)) ** 2).sum(axis=1).mean())
-
-
-def test_the_policy_of_the_catalogue_imitates_its_expert():
-    assert off_expert(offline(SITUATIONS)) < 0.015
-
-
-@pytest.mark.nightly
-def test_training_anew_gives_such_a_policy(tmp_path):
-    TRAINING["write"](TRAINING["train"](), tmp_path / "new.onnx")
-    _, act = policy.load(b64encode((tmp_path / "new.onnx").read_bytes()).decode())
-    assert off_expert(np.array([act(each) for each in SITUATIONS])) < 0.015
+@pytest.mark.parametrize("trained", [False, pytest.param(True, marks=pytest.mark.nightly)])
+def test_the_policy_imitates_its_expert(tmp_path, trained):
+    training = runpy.run_path(str(Path(__file__).parents[3] / "docs" / "policy_training.py"))
+    situations = training["situations"](np.random.default_rng(3), 5000)
+    actions = offline(situations)
+    if trained:
+        training["write"](training["train"](), tmp_path / "new.onnx")
+        _, act = policy.load(b64encode((tmp_path / "new.onnx").read_bytes()).decode())
+        actions = np.array([act(each) for each in situations])
+    assert np.sqrt(((actions - training["expert"](situations)) ** 2).sum(axis=1).mean()) < 0.015
 
 
 def test_observations():
@@ -106,21 +98,16 @@ def own_policy(folder, name="own.onnx"):
     return document.read(folder / "own.toml", [])
 
 
-def begin(given):
-    return Stepping(given.cases()["periodic"].assignment("CF01"))
-
-
-@pytest.mark.parametrize(("inputs", "outputs", "kind"), [(15, 2, 1), (16, 3, 1), (16, 2, 11), (3, 2, 1)])
-def test_a_model_of_other_sizes_is_refused(tmp_path, inputs, outputs, kind):
-    model(tmp_path, inputs, outputs, kind)
-    with pytest.raises(PluginError, match="one float input of 4 \\+ 4n numbers"):
-        begin(own_policy(tmp_path))
-
-
-def test_what_is_no_model_is_refused(tmp_path):
+def test_a_model_of_other_sizes_is_refused(tmp_path):
+    for sizes in ((15, 2), (16, 3), (16, 2, 11), (3, 2)):
+        model(tmp_path, *sizes)
+        given = own_policy(tmp_path).cases()["periodic"].assignment("CF01")
+        with pytest.raises(PluginError, match="one float input of 4 \\+ 4n numbers"):
+            Stepping(given)
     (tmp_path / "own.onnx").write_bytes(b"nothing")
+    given = own_policy(tmp_path).cases()["periodic"].assignment("CF01")
     with pytest.raises(PluginError, match="cannot use its file"):
-        begin(own_policy(tmp_path))
+        Stepping(given)
     with pytest.raises(PluginError, match="give `file`"):
         policy.load("")
 

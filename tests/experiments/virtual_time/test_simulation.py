@@ -1,4 +1,4 @@
-"""The virtual clock: the same bits from the same seed, alone or beside other seeds, and names when it gets stuck."""
+"""The virtual clock: the same bits from the same seed, names when it gets stuck, faults in trace and recording."""
 
 from dataclasses import fields
 
@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 
 from agents.body.interface import Disturbance
+from agents.body.limits import Safety
 from agents.decision.lifecycle import AIRBORNE, DONE, IDLE, LANDING, READY, RUNNING
-from experiments.definition.experiment import ChannelTable, LegTable, RobotTable, Start
+from experiments.definition.experiment import ChannelTable, Formation, LegTable, RobotTable, Start
 from experiments.definition.plan import Plan
+from experiments.recording import playback
 from experiments.virtual_time.conductor import LEAD_S, Stuck
 from experiments.virtual_time.simulation import VirtualRunLog, simulate
+from tests.experiments.checked import findings
 from tests.experiments.virtual_time.evaluators import alike
 from tests.runs import fly
 from tests.small import changed, pair, reference, small
@@ -34,16 +37,11 @@ def ground(**parts):
     return fly(pair(**{"duration_s": 2.0, "trigger": "periodic", **parts})).log
 
 
-def assert_same(first, second):
-    """To the last bit, NaN included."""
-    for field in fields(VirtualRunLog):
-        assert alike(getattr(first, field.name), getattr(second, field.name)), field.name
-
-
 @pytest.mark.slow
 def test_same_seed_gives_same_bits_and_another_others(random_park):
     first, again, other = (simulate(Plan(random_park), seed) for seed in (7, 7, 8))
-    assert_same(first, again)
+    for field in fields(VirtualRunLog):
+        assert alike(getattr(first, field.name), getattr(again, field.name)), field.name
     assert not np.array_equal(first.position[-1], other.position[-1])
 
 
@@ -52,13 +50,11 @@ def test_the_common_start_is_time_zero():
     k = int(np.argmin(np.abs(log.time)))
     assert log.time[k] == pytest.approx(0.0, abs=1e-9)
     np.testing.assert_allclose(np.diff(log.time), 0.02, atol=1e-9)  # state_hz
-    assert log.phase[k].tolist() == [RUNNING, RUNNING]
-    assert log.phase[k - 1].tolist() == [AIRBORNE, AIRBORNE]
-    assert log.phase[0].tolist() == [IDLE, IDLE]
-    assert log.airborne == pytest.approx(-LEAD_S)
     end = int(np.flatnonzero(log.time < 2.0 - 1e-9)[-1])
-    assert log.phase[end].tolist() == [RUNNING, RUNNING]
+    phases = [log.phase[row].tolist() for row in (0, k - 1, k, end)]
+    assert phases == [[IDLE] * 2, [AIRBORNE] * 2, [RUNNING] * 2, [RUNNING] * 2]
     assert (log.phase[end + 1] >= LANDING).all()
+    assert log.airborne == pytest.approx(-LEAD_S)
     assert log.ended - log.time[-1] <= 0.02 + 1e-9
     assert (log.decisions, log.ticks) == (20, 200)
 
@@ -77,22 +73,27 @@ def test_periodic_poses_are_all_sent_and_all_heard():
     run = (sent.stamp >= -1e-9) & (sent.stamp < 2.0 - 1e-9)
     assert np.bincount(sent.link[run]).tolist() == [20, 20]
     np.testing.assert_allclose(got.arrival - got.stamp, 0.001, atol=1e-9)
-    for link, speaker in ((0, 1), (1, 0)):
-        theirs, mine = sent.take(sent.link == speaker), got.take(got.link == link)
-        count = len(mine)
+    for link, sender in ((0, 1), (1, 0)):
+        theirs, ours = sent.take(sent.link == sender), got.take(got.link == link)
         assert theirs.seq.tolist() == [*range(1, len(theirs) + 1)]
-        np.testing.assert_array_equal(mine.seq, theirs.seq[:count])
-        np.testing.assert_array_equal(mine.position, theirs.position[:count])
-        assert count >= len(theirs) - 1
+        np.testing.assert_array_equal(ours.seq, theirs.seq[: len(ours)])
+        np.testing.assert_array_equal(ours.position, theirs.position[: len(ours)])
+        assert len(ours) >= len(theirs) - 1
     assert not log.lost.any()
 
 
 def test_losses_are_counted_from_start_to_landing():
     log = ground(channel=ChannelTable(loss=0.25), duration_s=10.0)
     sent, heard = (each.take((each.stamp >= -1e-9) & (each.stamp < 10.0 - 1e-9)) for each in (log.sent, log.received))
-    for link, speaker in enumerate((1, 0)):
-        assert log.lost[link] == (sent.link == speaker).sum() - (heard.link == link).sum()
+    for link, sender in enumerate((1, 0)):
+        assert log.lost[link] == (sent.link == sender).sum() - (heard.link == link).sum()
     assert log.lost.sum() / len(sent) == pytest.approx(0.25, abs=0.05)
+    log = ground(channel=ChannelTable(loss=1.0))
+    stamp = log.received.stamp
+    assert not ((stamp > -1e-9) & (stamp < 2.0 - 1e-9)).any()
+    assert stamp.max() >= 2.0 - 1e-9
+    assert len(stamp) > 50
+    assert log.lost.tolist() == [100, 100]
 
 
 def test_one_robot_alone():
@@ -108,21 +109,6 @@ def test_one_robot_alone():
     np.testing.assert_allclose(path[-1, :2], [0.2, -0.1], atol=0.1)
 
 
-@pytest.mark.slow
-def test_three_robots_find_their_triangle():
-    robots = {
-        "A": RobotTable(kind="khepera4", start=[-0.6, -0.5]),
-        "B": RobotTable(kind="khepera4", start=[0.6, -0.5]),
-        "F": RobotTable(kind="crazyflie", start=[0.1, 0.6], hover=0.6),
-    }
-    links = {"A - B": 0.6, "A - F": 0.8, "B - F": 0.8}
-    run = fly(small(robots, links, duration_s=25.0, disturbance={"all": Disturbance(position_sigma=0.0003)}))
-    a, b, f = run.log.true_position[np.flatnonzero(run.log.time <= 25.0)[-1]]
-    lengths = [np.linalg.norm(one - other) for one, other in ((a, b), (a, f), (b, f))]
-    assert lengths == pytest.approx([0.6, 0.8, 0.8], abs=0.012)
-    assert not run.log.interventions.any()
-
-
 def test_the_reference_formation_is_acquired():
     log = fly(changed(reference(), duration_s=18.0, timeline=[])).log
     links_each = np.array([0, 4, 3, 4, 4, 4, 2])
@@ -132,18 +118,16 @@ def test_the_reference_formation_is_acquired():
     assert sent[0] < 0.5  # the leader stands
     assert sent.max() < 20.0
     assert sent[4:].mean() > sent[1:4].mean() > 3.0
+    assert log.incidents == ()
 
 
-def test_who_hears_nobody_is_named():
+def test_who_keeps_a_run_from_starting_is_named():
     deaf = pair(duration_s=2.0, channel=ChannelTable(delay_s=100.0))
     with pytest.raises(Stuck, match=r"not ready after 5 s: A, B \(never received B\)"):
         simulate(Plan(deaf), 1, patience_s=5.0)
-
-
-def test_who_cannot_get_up_is_named():
-    stuck = small({"A": "khepera4", "F": "crazyflie", "G": "crazyflie"})
+    grounded = small({"A": "khepera4", "F": "crazyflie", "G": "crazyflie"})
     with pytest.raises(Stuck, match=r"not airborne after 0.5 s: F, G"):
-        simulate(Plan(stuck), 1, patience_s=0.5)
+        simulate(Plan(grounded), 1, patience_s=0.5)
 
 
 def test_robot_goes_on_without_a_never_received_neighbour():
@@ -154,10 +138,72 @@ def test_robot_goes_on_without_a_never_received_neighbour():
     assert log.time[0] == pytest.approx(-1.5 - 0.5 - LEAD_S)  # ready after 1 s, sent off at 1.5 s, up, started at 2 s
 
 
-def test_all_is_lost_inside_run_and_nothing_outside():
-    log = ground(channel=ChannelTable(loss=1.0))
-    stamp = log.received.stamp
-    assert not ((stamp > -1e-9) & (stamp < 2.0 - 1e-9)).any()
-    assert stamp.max() >= 2.0 - 1e-9
-    assert len(log.received) > 50
-    assert log.lost.tolist() == [100, 100]
+def hazards(trace):
+    return [(event.source, event.text) for event in trace.events if event.kind == "hazard"]
+
+
+def test_robots_that_come_too_near_hold(tmp_path):
+    run = fly(pair(formation=Formation(links={"A - B": 0.3}), safety=Safety(separation=0.6), duration_s=8.0))
+    first, second = run.log.true_position[-1]
+    assert np.linalg.norm(first - second) > 0.55
+    found = hazards(run.trace)
+    assert {source for source, _ in found} == {"A", "B"}
+    assert ("A", "hold: minimum separation: 0.60 m from B (limit 0.6 m)") in found
+    run.recorder.record(tmp_path / "case.mcap", 'title = "A pair"')
+    read = playback.read(tmp_path / "case.mcap").trace
+    assert {*hazards(read)} == {*found}
+    assert all(0.0 < event.stamp <= 8.0 for event in read.events if event.kind == "hazard")  # unresolved at the end
+
+
+def with_drone(architecture, low=0.1, **of_drone):
+    """Run of a drone that one of two ground robots follows, which has the other one beside it."""
+    robots = {
+        "F": RobotTable(kind="crazyflie", start=[0.0, 0.0], hover=0.3, **of_drone),
+        "G": RobotTable(kind="khepera4", start=[1.3, 0.1]),
+        "H": RobotTable(kind="khepera4", start=[0.0, 0.9]),
+    }
+    parts = {"architecture": architecture, "duration_s": 12.0, "safety": Safety(battery_low=low)}
+    return fly(small(robots, {"F > G": 0.8, "G - H": 0.9}, **parts))
+
+
+@pytest.mark.parametrize("architecture", ["distributed", "centralised"])
+@pytest.mark.parametrize(
+    ("low", "planar"),
+    [(0.1, np.sqrt(0.8**2 - 0.3**2)), (0.99, 0.89)],  # G stops on its way to a drone that is gone
+)
+def test_drone_that_lands_is_lost_to_the_formation(architecture, low, planar):
+    run = with_drone(architecture, low)
+    end = run.log.true_position[np.searchsorted(run.log.time, 11.9), :, :2]
+    assert np.linalg.norm(end[1] - end[[0, 2]], axis=1) == pytest.approx([planar, 0.9], abs=0.02)
+    landed = low > 0.9
+    assert (run.log.phase[np.searchsorted(run.log.time, 11.9)] == DONE).tolist() == [landed, False, False]
+    assert not landed or hazards(run.trace)[0] == ("F", "land: its battery is low: 99% (limit 99%)")
+    reason = next(iter(run.recorder.statuses())).reason
+    assert reason.startswith("land: its battery is low") == landed
+
+
+@pytest.mark.parametrize("architecture", ["distributed", "centralised"])
+def test_scripted_landing_silences_and_loses_a_robot(architecture):
+    run = with_drone(architecture, lands_at_s=4.0)
+    log = run.log
+    assert log.time[np.argmax(log.phase[:, 0] == LANDING)] == pytest.approx(4.0, abs=0.03)
+    assert log.phase[np.searchsorted(log.time, 9.0)].tolist() == [DONE, RUNNING, RUNNING]
+    assert log.sent.stamp[log.sent.link == 0].max() < 4.03
+    assert architecture == "centralised" or ("G", "warn: a neighbour is lost: F") in hazards(run.trace)
+    reasons = [status.reason for status in run.recorder.statuses()]
+    assert reasons[:3] == ["lands as its file says", "finished", "finished"]
+    assert not run.metrics.failures
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("settings", "code"),
+    [
+        ({"battery_low": 0.5}, "battery"),
+        ({"cut_beyond_m": 0.2}, "cut-outside"),
+        ({"separation": 0.9}, "separation-start"),
+        ({"separation": 0.6}, "separation-link"),
+    ],
+)
+def test_check_finds_settings_that_make_no_sense(settings, code):
+    assert code in findings(pair(safety=Safety(**settings), duration_s=20.0))

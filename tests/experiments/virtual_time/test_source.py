@@ -12,7 +12,7 @@ from experiments.virtual_time.source import specialised
 
 
 class Thing:
-    def __init__(self, part, steps):
+    def __init__(self, part, steps=()):
         self.part, self.steps, self.lean = part, steps, False
 
     def without_part(self):
@@ -63,8 +63,8 @@ def built(function, fixed):
     [
         (Thing.without_part, {"part": None}, (), (None,), 1),
         (Thing.without_part, {}, ("part", "value"), None, None),
-        (Thing.branches, {"lean": False, "part": None}, (), (None, 1), Thing(None, []).branches(1)),
-        (Thing.branches, {"lean": True}, None, (Thing(5, []), -1), 4),
+        (Thing.branches, {"lean": False, "part": None}, (), (None, 1), Thing(None).branches(1)),
+        (Thing.branches, {"lean": True}, None, (Thing(5), -1), 4),
         (Thing.branches, {"lean": True}, None, (None, 1), 1),
         (Thing.counted, {"steps": []}, None, (None,), 0),
         (Thing.counted, {}, None, (Thing(None, [1, 2, 4]),), 7),
@@ -85,22 +85,20 @@ def test_powers_of_others_are_calls():
     assert source.POWER in names
 
 
-@pytest.mark.parametrize(
-    ("method", "fault"),
-    [(Thing.asks, "a call of isinstance"), (Thing.rounds, "round to digits"), (Thing.far, "math.hypot"),
-     (Thing.words, "an f-string")],
-)  # fmt: skip
-def test_faults_of_others_have_file_and_line(method, fault):
-    line = method.__code__.co_firstlineno + 1
-    with pytest.raises(SyntaxError, match=fault) as caught:
+FAULTS = {"asks": "a call of isinstance", "rounds": "round to digits", "far": "math.hypot", "words": "an f-string"}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_faults_of_others_have_file_and_line(name):
+    method = getattr(Thing, name)
+    with pytest.raises(SyntaxError, match=FAULTS[name]) as caught:
         specialised(method, {})
-    assert f"{Path(__file__).name}:{line}:" in str(caught.value)
-
-
-@pytest.mark.parametrize("function", [lambda thing: thing, len], ids=["lambda", "builtin"])
-def test_what_is_no_function_of_its_own(function):
-    with pytest.raises((SyntaxError, OSError, TypeError)):
-        specialised(function, {})
+    assert f"{Path(__file__).name}:{method.__code__.co_firstlineno + 1}:" in str(caught.value)
+    for function in (lambda thing: thing, len):
+        with pytest.raises((SyntaxError, OSError, TypeError)):
+            specialised(function, {})
+    assert [text.rpartition(" uses ")[2] for text in source.outside(Thing)].count("math.hypot") == 1
+    assert source.outside(Distance) == ()
 
 
 NUMBERS = (-inf, -1e300, -2.5, -1.0, -0.5, -0.0, 0.0, 0.5, 1.0, 2.5, 710.0, 1e300, inf, nan)
@@ -119,8 +117,3 @@ def test_strict_functions_are_those_of_python(name):
         if abs(x) > 2.0**62 and name in {"floor", "ceil", "int", "trunc", "round"}:
             continue  # it has no place in a word
         assert ours(x) == expected or (isnan(ours(x)) and isnan(expected))
-
-
-def test_faults_of_a_plugin_of_others():
-    assert [text.rpartition(" uses ")[2] for text in source.outside(Thing)].count("math.hypot") == 1
-    assert source.outside(Distance) == ()

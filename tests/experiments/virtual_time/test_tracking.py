@@ -73,11 +73,16 @@ def test_tracking_by_directions():
     assert own < 0.06**2
 
 
+def without_lines(*begins):
+    """Text of the file without lines that begin so."""
+    text = index.find_file("tracking").read_text("utf-8")
+    return "\n".join(line for line in text.splitlines() if not line.startswith(begins))
+
+
 @pytest.mark.slow
 def test_robots_without_sight_know_target_from_others():
-    text = index.find_file("tracking").read_text("utf-8")
-    bare = "\n".join(line for line in text.splitlines() if not line.startswith(('"TB01 > KH01"', '"TB01 > KH04"')))
-    known = fly(document.loads(bare).cases()["event"].experiment).trace
+    bare = document.loads(without_lines('"TB01 > KH01"', '"TB01 > KH04"'))
+    known = fly(bare.cases()["event"].experiment).trace
     late = known.time > 5.0
     assert np.isnan(known.measures["reading"][late][:, [1, 4]]).all()
     apart = known.memory["x"][late][:, 1:, :2] - known.true_position[late, :1, :2]
@@ -85,16 +90,10 @@ def test_robots_without_sight_know_target_from_others():
 
 
 @pytest.mark.parametrize(
-    ("target", "unseen", "found"),
-    [
-        ("KH99", "", "the target 'KH99' is no robot of the experiment"),
-        ("KH02", "", None),
-        ("TB01", "TB01 > ", "no robot sees TB01"),
-    ],
-)
-def test_a_target_is_a_robot_that_others_see(target, unseen, found):
-    lines = index.find_file("tracking").read_text("utf-8").splitlines()
-    text = "\n".join(line for line in lines if not unseen or unseen not in line)
-    plan = document.loads(text, f"formation.law.target={target}").plan
-    faults = [(severity, message) for severity, message, _ in plan.law.analyse(plan)]
-    assert faults == ([("error", found)] if found else [])
+    ("target", "unseen", "faults"),
+    [("KH99", "-", ["the target 'KH99' is no robot of the experiment"]), ("KH02", "-", []),
+     ("TB01", "TB01 > ", ["no robot sees TB01"])],
+)  # fmt: skip
+def test_a_target_is_a_robot_that_others_see(target, unseen, faults):
+    plan = document.loads(without_lines(f'"{unseen}'), f"formation.law.target={target}").plan
+    assert [each[:2] for each in plan.law.analyse(plan)] == [("error", fault) for fault in faults]
