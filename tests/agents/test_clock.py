@@ -13,7 +13,7 @@ from experiments.real_time.hosts.launcher import Launcher
 from tests.commands import ROOT
 
 
-def test_steps_of_the_wall_clock_and_sleep_move_nothing(monkeypatch):
+def test_steps_of_the_wall_clock_move_nothing(monkeypatch):
     wall, up = [1000.0], {time.CLOCK_BOOTTIME: 50.0, time.CLOCK_MONOTONIC: 5.0}
     monkeypatch.setattr(time, "time", lambda: wall[0])
     monkeypatch.setattr(time, "clock_gettime", lambda clock: up[clock])

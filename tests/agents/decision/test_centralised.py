@@ -116,7 +116,7 @@ def test_waiting_robot_stays_once_neighbours_are_known():
     assert desk.centre.decisions == 1  # it begins with the robots, though none has said yet that it runs
 
 
-def test_lost_robot_gets_no_goals_and_alone_it_stays():
+def test_lost_robot_gets_no_goals_others_stay():
     desk = Desk()
     desk.hear(ALL, 0.0)
     assert list(desk.decide(0.0)) == ALL
