@@ -1,7 +1,8 @@
-"""The exercises of the course: a blank does not pass, its solution does; both can be run."""
+"""Exercises of the course pass with their solutions alone; lessons are notebooks whose claims are true."""
 
 from __future__ import annotations
 
+import ast
 import re
 import shlex
 from pathlib import Path
@@ -12,10 +13,16 @@ from experiments.check.check import check
 from experiments.file.document import load
 from experiments.metrics.criteria import has_passed, judge
 from experiments.run import simulate
-from tests.commands import ROOT
-from tests.docs.test_commands import commands
+from tests.commands import ROOT, python
+from tests.docs.test_pages import commands
 
 COURSE = ROOT / "docs" / "course"
+LESSONS = ROOT / "docs" / "tutorials"
+FIGURES = {
+    "consensus": ["consensus-motions", "consensus-rates", "consensus-spectra", "consensus-steps"],
+    "rigidity": ["rigidity-frameworks", "rigidity-heights", "rigidity-squares"],
+    "events": ["events-intervals", "events-pareto", "events-raster"],
+}
 EXERCISES = sorted(COURSE.glob("*.toml"))
 
 
@@ -55,3 +62,42 @@ def test_exercise_passes_with_its_solution_alone(exercise, seed):
     solution = SOLUTIONS[exercise.name]
     assert missed(exercise, *solution, seed=seed) == []
     assert not [found for found in check(load(exercise, *solution)) if found.severity == "error"]
+
+
+def cells(lesson):
+    """Markdown and code cells, in order."""
+    text = (LESSONS / f"{lesson}.py").read_text("utf-8")
+    assert text.startswith("# %%")
+    parts = re.split(r"^# %%( \[markdown\])?\n", text, flags=re.MULTILINE)[1:]
+    return [(bool(mark), body) for mark, body in zip(parts[::2], parts[1::2], strict=True)]
+
+
+def test_every_lesson_is_known():
+    assert sorted(FIGURES) == sorted(path.stem for path in LESSONS.glob("*.py"))
+
+
+@pytest.mark.parametrize("lesson", FIGURES)
+def test_a_lesson_is_a_notebook(lesson):
+    found = cells(lesson)
+    words = [body for is_text, body in found if is_text]
+    code = [body for is_text, body in found if not is_text]
+    assert all(line.startswith("#") for body in words for line in body.strip().splitlines())
+    assert words[0].startswith("# # ")
+    trees = [ast.parse(body) for body in code]  # each cell stands alone
+    named = {node.id for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Name)}
+    assert "__file__" not in named  # notebooks have none
+    assert sum(isinstance(node, ast.Assert) for tree in trees for node in ast.walk(tree)) >= 20
+    for tree in trees:
+        imports = [node for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom)]
+        exec(compile(ast.Module(imports, []), lesson, "exec"), {})
+
+
+@pytest.mark.nightly
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("lesson", FIGURES)
+def test_what_a_lesson_claims_is_true(lesson, tmp_path):
+    done = python("-W", "error", LESSONS / f"{lesson}.py", tmp_path / "figures", cwd=tmp_path, timeout_s=280.0)
+    assert done.stderr == ""
+    drawn = sorted(path.stem for path in (tmp_path / "figures").glob("*.svg"))
+    assert drawn == FIGURES[lesson]
+    assert not [file for file in (tmp_path / "figures").glob("*.svg") if "NaN" in file.read_text("utf-8")]

@@ -105,12 +105,3 @@ def test_a_guide_flies_in_real_time(command: str, tmp_path: Path, monkeypatch: p
     for step in found:
         if step.kind == "python" and f'reopen("runs/{out.name}")' in step.text:
             exec(compile(step.text, command, "exec"), {})
-
-
-@pytest.mark.system
-@pytest.mark.timeout(150)
-def test_the_lab_of_the_guide_flies(tmp_path: Path) -> None:
-    lab = tmp_path / "lab"
-    zenpark("lab", "init", lab, "triangle")
-    short = ("--set", "duration_s=2", "--no-report", "--out", tmp_path / "run")
-    zenpark("run", "triangle", "--lab", lab, *short, timeout_s=120.0)

@@ -15,11 +15,8 @@ from experiments.check.theory import unused_gains
 from experiments.definition.experiment import Arena, Experiment, Formation, LegTable, LinkTable, RobotTable
 from experiments.definition.plan import Plan
 from experiments.file import document
-from experiments.sweep.runs import run_metrics
 from experiments.virtual_time import conductor, simulation, stretch
-from tests.commands import invoke
 from tests.experiments.checked import GROUND, assert_found, bad, findings
-from tests.runs import fly
 from tests.small import changed, reference, small
 from twins.models.quadrotor import Quadrotor
 
@@ -39,24 +36,6 @@ def robots_on_wheels(duration_s: float = 120.0, **formation: float | str) -> Exp
     )  # fmt: skip
 
 
-@pytest.mark.nightly
-def test_wheels_stop_before_weak_formation_is_acquired():
-    weak = robots_on_wheels(gain=0.05)
-    claims, numbers = findings(weak), figures(Plan(weak))
-    assert "acquired" not in claims
-    found = claims["wheels-stop"]
-    assert found.severity == "warning"
-    assert numbers.acquired_s is None
-    flown = fly(weak, 7)
-    assert run_metrics(flown.trace).values["acquired_s"] is None
-    last = flown.log.true_position[flown.log.time <= weak.duration_s][-1]
-    off = max(abs(float(np.hypot(*(last[i] - last[j])[:2])) - 1.0) for i, j in ((0, 1), (1, 2), (0, 2)))
-    assert numbers.end_error_mm == pytest.approx(1e3 * off, rel=0.1)
-    gain = float(found.remedy.split()[3])
-    assert 0.05 < gain < 0.15
-    assert "acquired" in findings(robots_on_wheels(gain=gain))
-
-
 def test_weak_link_remedy_names_the_laws_own_key():
     offsets = {"KH01 - KH02": [1.0, 0.0], "KH02 - KH03": [-0.5, 0.866], "KH01 - KH03": [0.5, 0.866]}
     links = {pair: LinkTable(offset=offset) for pair, offset in offsets.items()}
@@ -66,12 +45,13 @@ def test_weak_link_remedy_names_the_laws_own_key():
 
 
 def test_prediction_is_a_flight_without_noise():
-    flown = predict(Plan(reference()))
-    again = predict(Plan(changed(reference(), seed=8)))
-    np.testing.assert_array_equal(flown.position, again.position)  # no seed matters
-    np.testing.assert_allclose(flown.time, np.arange(451) / 10.0, atol=1e-9)
-    assert not flown.incidents
-    assert not flown.stuck
+    short = changed(reference(), duration_s=5.0)
+    flown, still = predict(Plan(short)), predict(Plan(changed(short, seed=8, disturbance={})))
+    np.testing.assert_array_equal(flown.position, still.position)  # no seed matters
+    np.testing.assert_allclose(flown.time, np.arange(51) / 10.0, atol=1e-9)
+    assert (flown.incidents, flown.stuck) == (still.incidents, still.stuck)
+    assert flown.transmissions == still.transmissions == round(5.0 * still.messages_hz)
+    assert flown.messages_hz > still.messages_hz  # noise counts here alone
 
 
 @pytest.mark.parametrize(("compiled", "flown_s", "flights"), [(False, 11.0, 2), (True, 165.0, 1)])
@@ -95,12 +75,6 @@ def flat_strip(jitter: float = 0.01, duration_s: float = 30.0) -> Experiment:
     )  # fmt: skip
 
 
-def late(experiment: Experiment) -> int:
-    """Number of two runs that acquire after 15 s, in the mean of the robots, or not at all."""
-    times = [run_metrics(fly(experiment, seed).trace).values["acquired_s"] for seed in (101, 102)]
-    return sum(acquired is None or acquired > 15.0 for acquired in times)
-
-
 def test_soft_formation_is_found_under_hover_jitter():
     soft = flat_strip(duration_s=60.0)
     claims = findings(soft)
@@ -108,41 +82,11 @@ def test_soft_formation_is_found_under_hover_jitter():
     found = claims["soft"]
     assert (found.severity, found.where.startswith("made.json")) == ("warning", True)
     assert "outside the tolerance of 50 mm later, in 5 of 5 flights (seeds 1 to 5)" in found.message
-    assert late(soft) == 2
-    calm = flat_strip(jitter=0.002)
-    assert "soft" not in findings(calm)
-    assert late(calm) == 0
+    assert "soft" not in findings(flat_strip(jitter=0.002))
+    assert "soft" not in findings(robots_on_wheels())
 
 
-@pytest.mark.parametrize("made", [flat_strip(jitter=0.0005), robots_on_wheels()])
-def test_undisturbed_formation_is_not_called_soft(made):
-    claims = findings(made)
-    assert "acquired" in claims
-    assert "soft" not in claims
-
-
-def test_flight_with_noise_counts_messages_alone(monkeypatch):
-    noisy = changed(reference(), duration_s=5.0)
-    still = changed(noisy, disturbance={})
-    ideal, alone = predict(Plan(noisy)), predict(Plan(still))
-    np.testing.assert_array_equal(ideal.position, alone.position)
-    assert ideal.transmissions == alone.transmissions
-    assert alone.messages_hz == alone.transmissions / 5.0
-    assert ideal.messages_hz > alone.messages_hz
-
-    flown = simulation.simulate
-
-    def stuck_by_noise(plan, seed, *, quiet, **how):
-        if not quiet:
-            raise conductor.Stuck("not ready after 60 s: R0")
-        return flown(plan, seed, quiet=quiet, **how)
-
-    monkeypatch.setattr(simulation, "simulate", stuck_by_noise)
-    np.testing.assert_array_equal(predict(Plan(noisy)).position, ideal.position)
-    assert predict(Plan(noisy)).messages_hz == ideal.transmissions / 5.0
-
-
-def test_robots_that_never_begin_are_reported_with_reason(monkeypatch, tmp_path):
+def test_robots_that_never_begin_are_reported_with_reason(monkeypatch):
     def stuck(*_, **__):
         raise conductor.Stuck("not ready after 60 s: KH01 (its law wants something that is not finite)")
 
@@ -152,13 +96,7 @@ def test_robots_that_never_begin_are_reported_with_reason(monkeypatch, tmp_path)
     assert found["not-begun"].severity == "error"
     assert "not ready after 60 s: KH01" in found["not-begun"].message
     assert not {"acquired", "not-acquired", "wheels-stop"} & found.keys()
-    numbers = figures(Plan(wheels))
-    assert numbers.acquired_s is None
-    assert numbers.end_error_mm is None
-    (tmp_path / "wheels.json").write_bytes(document.write_json(Plan(wheels)))
-    lines = invoke("check", tmp_path / "wheels.json", code=1).stdout.splitlines()
-    for label in ("formation acquired after", "worst link at the end", "poses sent by all"):
-        assert [line.split()[-1] for line in lines if label in line] == ["-"]
+    assert (figures(Plan(wheels)).acquired_s, figures(Plan(wheels)).end_error_mm) == (None, None)
 
 
 @pytest.mark.parametrize(

@@ -6,13 +6,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agents.formation.anchors import Anchor
 from agents.formation.link import BY_RELATIVE
 from agents.plugins.laws import Displacement, Distance
 from experiments.authoring import layouts
 from experiments.check.realisation import find_shapes
 from experiments.check.stability import modes
-from experiments.definition.formation import anchor_offsets, law_offsets
+from experiments.definition.formation import law_offsets
 from experiments.definition.graph import Links, links
 from experiments.definition.plan import Plan
 from tests.cases import examples
@@ -35,10 +34,10 @@ def rounded(net, digits=4):
     return Links(net.receiver, net.sender, np.round(net.distance, digits), net.gain)
 
 
-def by_hand(law, net, position, share, anchors=()):
+def by_hand(law, net, position, share):
     """Eigenvalues by moving one coordinate of one robot at a time; all receive it."""
     step = 1e-4
-    listeners = np.unique(np.concatenate([net.receiver, [row for row, _ in anchors]])).astype(int)
+    listeners = np.unique(net.receiver)
     columns = []
     for row in listeners:
         for axis in (0, 1):
@@ -46,7 +45,7 @@ def by_hand(law, net, position, share, anchors=()):
             for sign in (1.0, -1.0):
                 moved = position.copy()
                 moved[row, axis] += sign * step
-                offset = law_offsets(law, moved, moved[net.sender], net) + anchor_offsets(anchors, moved)
+                offset = law_offsets(law, moved, moved[net.sender], net)
                 answers.append(offset[listeners, :2].ravel())
             columns.append((answers[0] - answers[1]) / (2.0 * step))
     taken = -np.repeat(share[listeners], 2)[:, None] * np.stack(columns, axis=1)
@@ -105,23 +104,6 @@ def test_modes_slower_than_the_run_are_free():
     assert (few.gain, few.radius, few.slowest_s) == (every.gain, every.radius, every.slowest_s)
 
 
-@examples(30)
-@given(st.integers(0, 2**32 - 1), st.integers(3, 8), st.booleans())
-def test_derivative_by_links_is_that_by_robots(seed, rows, anchored):
-    rng = np.random.default_rng(seed)
-    position = rng.uniform(-1.0, 1.0, (rows, 3))
-    pairs = [(i, j) for i in range(rows) for j in range(rows) if i != j and rng.random() < 0.6] or [(1, 0)]
-    net = linked(position, pairs, rng.uniform(0.2, 0.6, len(pairs)).tolist())
-    anchors = []
-    if anchored:
-        reach = float(np.linalg.norm(position[0]))
-        anchors = [(0, Anchor((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0, 0.0, reach, 0.5))]
-    share = rng.uniform(0.05, 0.2, rows)
-    values = by_hand(Distance(), net, position, share, anchors)
-    found = modes(Distance(), net, position, share, 10.0, anchors=anchors)
-    assert found.gain == pytest.approx(max(values.real.max(), 0.0), abs=1e-5)
-
-
 def test_relative_positions_leave_no_turn_free():
     relative = np.array([(1.0, 0.0, 0.0), (-1.0, 0.0, 0.0)])
     net = links([(0, 1), (1, 0)], 1.0, 0.5)
@@ -129,3 +111,15 @@ def test_relative_positions_leave_no_turn_free():
     found = modes(Displacement(), net, np.array([(1.0, 0, 0), (0, 0, 0)]), np.full(2, 0.2), 10.0)
     assert found.gain == pytest.approx(0.2)  # twice the stiffness, by the share
     assert found.slowest_s == pytest.approx(-0.1 / np.log(0.8))
+
+
+@examples(30)
+@given(st.integers(0, 2**32 - 1), st.integers(3, 8))
+def test_derivative_by_links_is_that_by_robots(seed, rows):
+    rng = np.random.default_rng(seed)
+    position = rng.uniform(-1.0, 1.0, (rows, 3))
+    pairs = [(i, j) for i in range(rows) for j in range(rows) if i != j and rng.random() < 0.6] or [(1, 0)]
+    net = linked(position, pairs, rng.uniform(0.2, 0.6, len(pairs)).tolist())
+    share = rng.uniform(0.05, 0.2, rows)
+    found = modes(Distance(), net, position, share, 10.0)
+    assert found.gain == pytest.approx(max(by_hand(Distance(), net, position, share).real.max(), 0.0), abs=1e-5)

@@ -5,12 +5,9 @@ import pytest
 
 from experiments.check import check
 from experiments.check.realisation import contradictions
-from experiments.definition.experiment import Formation, RobotTable, Start
 from experiments.definition.formation import compile_anchors, errors_over_time
 from experiments.file import document
-from experiments.metrics.signals import net_rotation
 from tests.runs import fly
-from tests.small import small
 
 pytestmark = pytest.mark.slow  # runs and reports, whole
 
@@ -144,57 +141,6 @@ def test_links_by_range_and_by_the_clock():
     time, _, error = errors_in_flight(four_with(PARTED).plan)
     there = ~np.isnan(error)
     assert (there.sum(axis=1) == np.where((time >= 8.0 - 1e-6) & (time < 20.0 - 1e-6), 6, 4)).all()
-
-
-@pytest.mark.usefixtures("unflown")  # it is flown beside the check
-def test_dominant_leader_that_receives_holds_its_plan():
-    """Dominance: the leader hears the others; heavier links from it draw them along (paper, section III)."""
-    text = """[formation]
-gain = 1.3
-leader = "A"
-tracking_gain = 24.0
-[formation.links]
-"A > B" = { distance = 0.6, gain = 4.0 }
-"B > A" = { distance = 0.6, gain = 0.4 }
-"A > C" = 0.9
-"B - C" = 0.9
-"C - D" = 0.5
-"B > D" = 0.9
-[[timeline]]
-at_s = 0.0
-robot = "A"
-plan = { kind = "hold", at = [-0.5, -0.5] }
-[[timeline]]
-at_s = 15.0
-robot = "A"
-plan = { kind = "line", move_by = [0.5, 0.3], speed = 0.05 }
-"""
-    given = four_with(text, 45.0)
-    assert not [each for each in check.check(given) if each.severity == "error"]
-    _, position, error = errors_in_flight(given.plan)
-    np.testing.assert_allclose(position[-1, 0, :2], [0.0, -0.2], atol=0.08)
-    assert error[-1].max() < 0.05
-
-
-def test_calm_event_triggered_ring_does_not_turn():
-    """Five drones with half the gain that they bear, send-on-delta at 1 cm, nothing that disturbs them."""
-    angle = 2 * np.pi * np.arange(5) / 5
-    place = 0.5104 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    robots = {f"R{i}": RobotTable(kind="crazyflie", start=(1.2 * place[i]).tolist(), hover=0.8) for i in range(5)}
-    links = {f"R{i} - R{j}": float(np.linalg.norm(place[i] - place[j])) for i in range(5) for j in range(i)}
-    rates, sent = [], []
-    for gain in (0.5, 3.0):
-        given = small(
-            robots, duration_s=60.0, formation=Formation(links=links, gain=gain), start=Start(scatter=0.1),
-            trigger={"kind": "send-on-delta", "threshold": 0.01},
-        )  # fmt: skip
-        logs = [fly(given, seed).log for seed in (200, 201)]
-        late = (logs[0].time > 30.0) & (logs[0].time < 60.0)
-        rates.append(max(abs(net_rotation(log.true_position[late], log.time[late])) for log in logs))
-        sent.append(sum(len(log.sent) for log in logs))
-    assert rates[0] < 1e-9
-    assert rates[1] > 1e-5
-    assert sent[0] < sent[1] / 5
 
 
 LOOSE = BEARINGS.replace('"D - B" = { bearing = [1.0, -1.0] }\n', "").replace("B = 0.9", "A = 0.8")

@@ -1,7 +1,5 @@
 """Graphs against networkx; rigidity against known frameworks, and redundancy against leaving each link out."""
 
-from itertools import combinations
-
 import networkx as nx
 import numpy as np
 import pytest
@@ -89,31 +87,6 @@ def test_rigidity_rows_are_half_gradients_of_squared_lengths():
     np.testing.assert_allclose(rigidity_matrix(PUBLISHED, pairs) @ motion.ravel(), 0.5 * slope, atol=1e-9)
 
 
-def rigid_motions(position, free):
-    """How many rigid motions move only what is free, by fitting: the rank of what a motion does to free coordinates."""
-    rows = len(position)
-    spins = [np.cross(axis, position) for axis in np.eye(3)]
-    slides = [np.tile(axis, (rows, 1)) for axis in np.eye(3)]
-    motions = np.array([motion.ravel() for motion in slides + spins]).T  # (3N, 6)
-    held = ~free.ravel()
-    values, vectors = np.linalg.eigh(motions[held].T @ motions[held])
-    allowed = vectors[:, values < 1e-12]
-    return np.linalg.matrix_rank(motions @ allowed, tol=1e-8) if allowed.size else 0
-
-
-@examples(40)
-@given(st.integers(0, 2**32 - 1), st.integers(1, 7), st.booleans())
-def test_rank_needed_is_what_rigid_motions_leave(seed, rows, flat):
-    rng = np.random.default_rng(seed)
-    position = rng.uniform(-1, 1, (rows, 3))
-    if flat:
-        position[:, rng.integers(3)] = 0.5
-    free = rng.random((rows, 3)) < rng.choice([0.2, 0.7, 1.0])
-    found = rigidity(position, np.zeros((0, 2), dtype=np.intp), free)
-    assert found.needed == free.sum() - rigid_motions(position, free)
-    assert found.rank == 0
-
-
 @pytest.mark.parametrize(
     ("position", "free", "motions"),
     [
@@ -157,19 +130,3 @@ def test_redundancy_is_that_of_leaving_each_out(seed, rows, share, in_space):
     else:
         assert not found.pairs.any()
         assert not found.robots.any()
-
-
-@pytest.mark.parametrize(
-    ("rows", "linked", "links_spare", "robots_spare"),
-    [
-        (2, [(0, 1)], [False], None),
-        (3, [(0, 1), (0, 2), (1, 2)], [False] * 3, [True] * 3),  # two that are linked are rigid
-        (4, list(combinations(range(4), 2)), [True] * 6, [True] * 4),
-        (4, list(combinations(range(4), 2))[1:], [False] * 5, None),
-    ],
-)
-def test_redundancy_of_small_frameworks(rows, linked, links_spare, robots_spare):
-    position = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])[:rows]
-    found = redundancy(position, np.array(linked, dtype=np.intp).reshape(-1, 2), held_heights(rows))
-    assert found.pairs.tolist() == links_spare
-    assert robots_spare in (None, found.robots.tolist())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -10,6 +11,7 @@ from agents.body.interface import BodyState
 from agents.errors import Refusal
 from agents.network import messages
 from agents.robot import Robot
+from experiments import run
 from experiments.definition import standby as reserves
 from experiments.definition.experiment import (
     ChannelTable,
@@ -21,6 +23,7 @@ from experiments.definition.experiment import (
     RobotTable,
 )
 from experiments.definition.plan import Plan
+from experiments.file import document
 from experiments.file.consistency.whole import consistency_faults
 from experiments.real_time.conductor.hot_changes import Spares
 from tests.small import changed, small
@@ -54,6 +57,13 @@ def test_without_those_on_standby_nothing_names_them() -> None:
     assert not list(consistency_faults(plan))
     assert not list(consistency_faults(Plan(with_standby(spares={"S": FLY, "T": BOT}, on_loss="replace"))))
     assert reserves.without_standby(plan) is plan
+
+
+def test_virtual_time_flies_without_those_on_standby(tmp_path: Path) -> None:
+    file = tmp_path / "x.json"
+    file.write_bytes(document.write_json(Plan(with_standby())))
+    (trace,) = run.simulate(document.read(file)).traces.values()
+    assert trace.robots == ("A", "B")
 
 
 @pytest.mark.parametrize("standby", [True, False])

@@ -66,15 +66,6 @@ def test_files_convert_pass_the_check_and_settle(count, allowed):
     assert errors.max() < (allowed or read.experiment.tolerance)
 
 
-def test_hybrid_file_keeps_addresses_and_shares_the_radio():
-    read, notes = converted(FILES[8])
-    robots = read.experiment.robots
-    assert [name for name, each in robots.items() if each.body != "twin"] == ["dron02", "dron03", "dron06"]
-    assert robots["dron02"].body == "radio://0/80/2M/E7E7E7E702"
-    assert {each.process for each in robots.values()} == {None, "radio0"}
-    assert "--bodies twin" in notes
-
-
 def test_drones_hover_at_the_heights_of_the_shape():
     read, notes = converted(FILES[20])
     heights = np.array([robot.hover for robot in read.experiment.robots.values()])
@@ -114,6 +105,9 @@ DRONES = trio(TRIANGLE, kind="dron").replace("      T: 100\n", "      T: 50\n")
         (FILES[5], "formation.law", "distance"),
         (FILES[5], "formation.clamp", 0.1),
         (FILES[5], "formation.gain", 0.5),  # 2 k: their simulator's driver of that time does not divide
+        (FILES[8], "robots.dron02.body", "radio://0/80/2M/E7E7E7E702"),
+        (FILES[8], "robots.dron02.process", "radio0"),
+        (FILES[8], "robots.dron01.process", None),
         (FILES[12], "formation.law", "displacement"),
         (FILES[12], "formation.stiffness", 0.25),
         (FILES[12], "formation.links.khepera00 > khepera01.offset", [0.0, 0.5]),  # of khepera01 from khepera00

@@ -1,8 +1,11 @@
-"""Commands and experiment files that stand in README and docs: the command line knows each, the files are valid."""
+"""What README and docs refer to exists: modules, files, links, commands, experiments and the unit of systemd."""
 
 from __future__ import annotations
 
+import ast
+import pkgutil
 import re
+import runpy
 import shlex
 import shutil
 import subprocess
@@ -17,9 +20,15 @@ from tests.__main__ import MEASUREMENTS
 from tests.__main__ import command as measurement
 from tests.cases import for_each
 from tests.commands import ROOT, zenpark
-from tests.docs.test_references import PAGES
 from tools.main import app
 
+TOPS = ("agents", "bridges", "twins", "experiments", "tools")
+PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md"), *(ROOT / "bridges").rglob("*.md")])
+DOTTED = re.compile(rf"(?<![\w./-])(?:{'|'.join(TOPS)})(?:\.\w+)+")
+PATH = re.compile(rf"(?<![\w./-])(?:{'|'.join((*TOPS, 'docs', 'tests'))})/[\w./{{}},*-]*")
+MADE = {"docs/tutorials/out"}  # by the lessons
+SITE = {f"reference/{name}.md" for name in runpy.run_path(str(ROOT / "docs" / "site.py"))["PAGES"]}  # made with it
+LINK = re.compile(r"\]\(([^)#\s]+)(?:#[^)]*)?\)")
 COMMAND = re.compile(r"^ {4,}\./zenpark (?P<words>[^#\n]*)", re.MULTILINE)
 BLOCK = re.compile(r"^```toml\n(title = .*?)^```", re.MULTILINE | re.DOTALL)
 COMMAND_LINE = typer.main.get_command(app)
@@ -108,3 +117,52 @@ def test_command_of_the_unit_is_understood(tmp_path):
     done = zenpark(*words, code=2)
     assert "is missing" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def exists(dotted: str) -> bool:
+    """Whether a dotted name is a package, a module, or a name in one."""
+    try:
+        pkgutil.resolve_name(dotted)
+    except (ImportError, AttributeError):
+        return False
+    return True
+
+
+def expanded(path: str) -> list[str]:
+    """Paths of one with alternatives in braces: a/{b,c}.py."""
+    braces = re.search(r"\{([^}]*)\}", path)
+    if braces is None:
+        return [path]
+    return [path[: braces.start()] + each + path[braces.end() :] for each in braces[1].split(",")]
+
+
+@for_each("page", PAGES)
+def test_what_a_page_refers_to_exists(page):
+    text = page.read_text("utf-8")
+    dotted = {found[0] for found in DOTTED.finditer(text) if not found[0].endswith((".py", ".toml", ".md"))}
+    paths = {each for found in PATH.finditer(text) for each in expanded(found[0].rstrip(".,"))} - MADE
+    links = {found[1] for found in LINK.finditer(text) if "://" not in found[1]}
+    lost = [name for name in dotted if not exists(name)]
+    lost += [path for path in paths if not any(ROOT.glob(path.rstrip("/")))]
+    lost += [link for link in links - SITE if not (page.parent / link).exists()]
+    assert not sorted(lost)
+
+
+NAMED = {"not-random", "centralised", "hybrid"}  # by a name in place of a literal
+
+
+def codes_of_findings():
+    for file in (ROOT / "experiments" / "check").glob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text("utf-8"))):
+            if isinstance(node, ast.Call) and ast.unparse(node.func) == "Finding":
+                code = node.args[1]
+                assert isinstance(code, ast.Constant) or ast.unparse(code) in {"what", "NOT_RANDOM"}, file
+                yield from {code.value} if isinstance(code, ast.Constant) else NAMED
+
+
+def test_codes_stand_in_docs_and_tests():
+    codes = {*codes_of_findings()}
+    rows = re.findall(r"^\| (`.*?) \|", (ROOT / "docs" / "check.md").read_text("utf-8"), re.MULTILINE)
+    assert codes == {code for row in rows for code in re.findall(r"`([\w-]+)`", row)}
+    tests = "".join(file.read_text("utf-8") for file in (ROOT / "tests").rglob("test_*.py"))
+    assert {code for code in codes if f'"{code}"' not in tests} == set()
