@@ -13,9 +13,9 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from experiments.check.check import analyses
 from experiments.definition.experiment import Arena, StartBox
 from experiments.file import document
-from experiments.report import scenery, style, trajectories
+from experiments.report import scenery, trajectories
 from experiments.report.trajectories import expected_motion
-from tests.experiments.traces import crowd, park
+from tests.experiments.traces import park
 from twins.scene import Obstacle
 
 FULL = Arena(
@@ -104,15 +104,6 @@ def test_space_shows_whole_arena_unless_far_larger():
     flat = dataclasses.replace(trace, true_position=trace.true_position * [1.0, 1.0, 0.0])
     for arena, top in ((EMPTY, 0.216), (FULL, 0.15 * 1.08 * 3.0)):
         assert in_space(arena, flat).get_zlim() == pytest.approx((0.0, top))  # robots on the floor stand on it
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("draw", [trajectories.formation, trajectories.plan_view])
-def test_pictures_of_full_arenas_are_drawn(draw):
-    figure = draw([within(FULL), within(EMPTY)])
-    assert figure.get_figwidth() == 3.5
-    assert "<svg" in style.svg(figure)
-    assert "<svg" in style.svg(draw([within(FULL, crowd(3, duration=1.0))]))
 
 
 @pytest.mark.slow

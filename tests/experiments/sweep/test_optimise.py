@@ -51,6 +51,10 @@ def test_fronts_are_per_environment_and_of_whole_cells():
     assert objective.rank(landed) > objective.rank(whole)
     (finding,) = fewest([landed, whole])
     assert "60.0 %" in finding.text
+    (finding,) = fewest([cell(iae=1.2), cell(iae=2.2)])
+    assert finding.text.startswith("No cell has an IAE ratio of at most 1.05; the nearest: ")
+    tied = cell(messages=0.4)
+    assert front([whole, tied]) == [whole, tied]
     given = [(0.2, 1.0, 0.0), (0.3, 1.1, 0.0), (0.25, 1.04, 0.1)]
     rows = [cell(messages=messages, iae=iae, environment={"loss": loss}) for messages, iae, loss in given]
     parts = by_environment(rows)

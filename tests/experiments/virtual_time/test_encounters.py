@@ -34,12 +34,11 @@ ANGLES = (math.pi, 0.5 * math.pi)  # head-on, and across
 WOBBLE = Disturbance(hover_jitter=Jitter(0.01))
 
 
-def encounter(kinds, avoidance, *, between=math.pi, stubborn=0, sensors=(), duration_s=None):
+def encounter(kinds, avoidance, *, between=math.pi, sensors=(), duration_s=None):
     """Robots that want to change sides of a circle, all at the same time.
 
     Args:
         between: Angle between the starts of one robot and the next [rad]; more than two are spread evenly.
-        stubborn: Number of those, from the last, that avoid no robot.
         duration_s: Of the run [s]; `PATIENCE` times the slowest's way if left out.
     """
     low = [KINDS[kind].height for kind in kinds if not KINDS[kind].flies]
@@ -50,8 +49,7 @@ def encounter(kinds, avoidance, *, between=math.pi, stubborn=0, sensors=(), dura
         angle = number * (between if len(kinds) == 2 else 2.0 * math.pi / len(kinds))
         x, y = CIRCLE * math.cos(angle), CIRCLE * math.sin(angle)
         name, hover = f"R{number}", height if KINDS[kind].flies else None
-        avoids, start = number < len(kinds) - stubborn, [x, y, angle + math.pi]
-        robots[name] = RobotTable(kind=kind, start=start, hover=hover, sensors=list(sensors), avoids=avoids)
+        robots[name] = RobotTable(kind=kind, start=[x, y, angle + math.pi], hover=hover, sensors=list(sensors))
         plan = {"kind": "waypoints", "points": [[-x, -y]], "speed": speeds[number]}
         timeline.append(LegTable(at_s=0.0, robot=name, plan=plan))
     return small(
@@ -121,14 +119,6 @@ def test_thousand_random_encounters_without_collision():
         whole += meet(encounter(kinds, BARRIER, between=angle), seeds[angle])
     assert len(whole) == 1000
     assert_clear(whole, 0.02, arrived=0.995)  # arrival is not guaranteed
-
-
-@pytest.mark.timeout(300)
-@pytest.mark.nightly
-@pytest.mark.parametrize(("avoidance", "stubborn"), [(POTENTIAL, 0), (BARRIER, 1)])
-def test_potential_and_one_sided_barrier_keep_pairs_apart(avoidance, stubborn):
-    for kinds in (("khepera4", "turtlebot3"), ("tello", "tello")):
-        assert_clear(met(kinds, avoidance, 10, stubborn=stubborn))
 
 
 @pytest.mark.parametrize("kinds", [("tello", "turtlebot3"), ("crazyflie", "crazyflie")])
