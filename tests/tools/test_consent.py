@@ -28,26 +28,23 @@ robots = ["B"]
 def asking(monkeypatch, answer):
     """A terminal in which the user answers; None: no terminal."""
     stdin = SimpleNamespace(isatty=lambda: answer is not None, readline=lambda: f"{answer}\n")
-    monkeypatch.setattr(consent.sys, "stdin", stdin)
-    monkeypatch.setattr(consent.sys.stderr, "isatty", lambda: True, raising=False)
+    monkeypatch.setattr("sys.stdin", stdin)
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
 
 
-def test_devices_and_machines_are_named():
-    device, machine, cameras = consent.touched(loads(REACHING).cases().values())
+def test_others_files_run_when_agreed(monkeypatch):
+    cases = loads(REACHING).cases()
+    device, machine, cameras = consent.touched(cases.values())
     assert "A: radio://0/80/2M/E7E7E7E701" in device
     assert "ssh pi@192.0.2.7" in machine
     assert cameras == "motion capture: vicon://192.0.2.9:801"
-
-
-@pytest.mark.parametrize(("answer", "runs"), [("y", True), ("YES", True), ("n", False), ("", False), (None, False)])
-def test_others_files_run_when_agreed(answer, runs, monkeypatch):
-    asking(monkeypatch, answer)
-    consent.require("a.zip", load("robotic-park").cases(), given=False)  # it is simulated
-    cases = loads(REACHING).cases()
-    consent.require("a.zip", cases, given=True)
-    if runs:
+    for answer in ("y", "YES"):
+        asking(monkeypatch, answer)
         consent.require("a.zip", cases, given=False)
-    else:
+    for answer in ("n", "", None):
+        asking(monkeypatch, answer)
+        consent.require("a.zip", load("robotic-park").cases(), given=False)  # it is simulated
+        consent.require("a.zip", cases, given=True)
         with pytest.raises(DocumentError, match="--yes" if answer is None else "--here"):
             consent.require("a.zip", cases, given=False)
 

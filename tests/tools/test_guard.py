@@ -14,27 +14,21 @@ def start(folder, *path):
     return python("-c", "from tools.guard import main; main()", "--version", cwd=folder, env=environment, code=None)
 
 
-def test_everything_that_is_elsewhere_is_an_intruder(tmp_path):
+def test_passes_when_the_packages_are_ours(tmp_path):
     assert intruders(ROOT) == {}
     assert intruders(tmp_path) == {name: ROOT / name for name in PACKAGES}
-
-
-def test_passes_when_the_packages_are_ours(tmp_path):
     done = start(tmp_path, ROOT)
     assert (done.returncode, done.stdout, done.stderr) == (0, f"{provenance().words[0]}\n", "")
     assert done.stdout.startswith(f"zenpark 0.1.0, code {digest()[:DIGEST_CHARACTERS]}")
 
 
-def test_ctrl_c_while_python_starts_prints_no_traceback():
+def test_ctrl_c_while_it_starts_prints_no_traceback():
     def interrupted():
         signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
         os.kill(os.getpid(), signal.SIGINT)
 
     done = zenpark("--version", code=130, preexec_fn=interrupted)
     assert (done.stdout, done.stderr) == ("", "")
-
-
-def test_ctrl_c_while_script_imports_prints_no_traceback():
     program = (
         "import runpy, sys\n"
         "class Interrupted:\n"
@@ -54,8 +48,7 @@ def test_guard_names_obstructing_package_and_remedy(tmp_path):
     (tmp_path / "elsewhere").mkdir()
     done = start(tmp_path / "elsewhere", tmp_path, ROOT)
     assert (done.returncode, done.stdout) == (2, "")
-    first, agents, twins, remedy = done.stderr.splitlines()
-    assert first == "zenpark: another package is in the way of ours"
+    _, agents, twins, remedy = done.stderr.splitlines()
     assert f"'agents' comes from {tmp_path / 'agents'}" in agents
     assert f"not from {ROOT / 'twins'}" in twins
     assert str(ROOT / "zenpark") in remedy
@@ -68,14 +61,13 @@ def test_imports_nothing_of_ours_and_nothing_heavy():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("words", "code"), [(["station"], 0), (["agent", "-", "KH01", "--clock-correction=-0.5", "--lifeline"], 2)]
-)
-def test_run_needs_no_typer_on_its_hosts(words, code):
-    done = python("-X", "importtime", "-m", "tools.guard", *words, code=code)
-    loaded = {line.rpartition("|")[2].strip() for line in done.stderr.splitlines()}
-    assert "experiments.real_time.hosts.station" in loaded or "experiments.real_time.processes.robot" in loaded
-    assert not loaded & {"typer", "pydantic", "tools.main"}
+def test_run_needs_no_typer_on_its_hosts():
+    robot = ("agent", "-", "KH01", "--clock-correction=-0.5", "--lifeline")
+    for words, code, module in ((["station"], 0, "hosts.station"), (robot, 2, "processes.robot")):
+        done = python("-X", "importtime", "-m", "tools.guard", *words, code=code)
+        loaded = {line.rpartition("|")[2].strip() for line in done.stderr.splitlines()}
+        assert f"experiments.real_time.{module}" in loaded
+        assert not loaded & {"typer", "pydantic", "tools.main"}
 
 
 @pytest.mark.slow

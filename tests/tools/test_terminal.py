@@ -28,13 +28,11 @@ def test_no_escape_reaches_the_terminal(capsys):
     assert printable("Böhm 1 234 → δ [m²]\u202f–") == "Böhm 1 234 → δ [m²]\u202f–"
 
 
-@pytest.mark.parametrize("opened", [True, False])
-def test_page_is_named_where_no_browser_opens_it(opened, monkeypatch, capsys):
-    asked = []
-    monkeypatch.setattr(webbrowser, "open", lambda address: asked.append(address) or opened)
-    open_in_browser("file:///report.html")
-    assert asked == ["file:///report.html"]
-    assert ("open file:///report.html by hand" in capsys.readouterr().err) is not opened
+def test_page_is_named_where_no_browser_opens_it(monkeypatch, capsys):
+    for opened in (True, False):
+        monkeypatch.setattr(webbrowser, "open", lambda address, opened=opened: opened)
+        open_in_browser("file:///report.html")
+        assert ("open file:///report.html by hand" in capsys.readouterr().err) is not opened
 
 
 class Terminal(io.StringIO):
@@ -52,20 +50,6 @@ def clock(monkeypatch):
     return made
 
 
-@pytest.fixture
-def terminal(monkeypatch):
-    """Makes one; called by the test, because pytest puts its own in place before that."""
-
-    def make():
-        made = Terminal()
-        monkeypatch.setattr("sys.stderr", made)
-        monkeypatch.setenv("TERM", "xterm")
-        monkeypatch.setenv("COLUMNS", "100")
-        return made
-
-    return make
-
-
 def test_lines_without_a_terminal(capsys, clock):
     with Bar(passing=True) as bar:
         bar.show("event", 0, 60)
@@ -81,14 +65,17 @@ def test_lines_without_a_terminal(capsys, clock):
     assert capsys.readouterr().err == "runs 0 of 4\nruns 2 of 4\nruns 4 of 4\n"
 
 
-def test_passing_bar_appears_late_and_counts_from_beginning(terminal, clock):
-    screen = terminal()
+def test_passing_bar_appears_late_and_counts_from_beginning(monkeypatch, clock):
+    screen = Terminal()
+    monkeypatch.setattr("sys.stderr", screen)
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "100")
     with Bar() as bar:
         bar.show("runs", 0, 4)
         bar.show("runs", 4, 4)
     assert "runs" in screen.getvalue()
     assert "4/4" in screen.getvalue()
-    screen = terminal()
+    screen.truncate(0)
     with Bar(passing=True) as bar:
         bar.show("event", 0, 60)
         clock.now += 1.9

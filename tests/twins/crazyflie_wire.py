@@ -96,7 +96,6 @@ class Wire:
         return packets
 
     def after(self, seconds, each=None):
-        """The twin, that much later."""
         self.wait(seconds, each)
         return self
 
@@ -136,8 +135,7 @@ class Wire:
     def thrust(self, thrust):
         self.put(Port.COMMANDER, 0, struct.pack("<fffH", 0.0, 0.0, 0.0, thrust))
 
-    def zero(self):
-        """What cflib sends when it closes a link."""
+    def zero(self):  # as cflib does when it closes a link
         self.thrust(0)
 
     def release(self):
@@ -146,11 +144,6 @@ class Wire:
 
     def arm(self, on=True):
         return self.ask(Port.SUPERVISOR, 1, SupervisorCommand.ARM, int(on))
-
-    def armed(self):
-        """With motors that have spun up."""
-        self.arm()
-        return self.after(0.6)
 
     def locate(self, position=None):
         """A measured position, by default the true one."""
@@ -176,5 +169,7 @@ class Wire:
 
 
 def brushless(**parts):
-    """A twin that must be armed, and is."""
-    return Wire({"platform": "brushless"}, **parts).armed()
+    """A twin that must be armed, and is, with motors that have spun up."""
+    wire = Wire({"platform": "brushless"}, **parts)
+    wire.arm()
+    return wire.after(0.6)

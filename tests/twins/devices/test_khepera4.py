@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from agents.body.interface import BodyError, Disturbance
 from agents.protocols import khepera4 as protocol
-from tests.cases import mostly_slow
 from tests.requests import request
 from twins.devices import khepera4
 from twins.devices.device import DeviceRequest, Faults
@@ -61,7 +60,6 @@ class Conversation:
         return self.heard()
 
     def values(self, data=b"p"):
-        """Numbers of an answer."""
         return [float(word) for word in self.ask(data).split(",") if not word.isalpha()]
 
     def after(self, seconds):
@@ -97,15 +95,9 @@ def test_server_of_2025_drives_and_reports_in_centimetres(talk):
     assert robot.after(1.0).values()[2] == pytest.approx(0.5, abs=0.04)  # wheels turn in whole units
     robot.say(b"stop")
     assert robot.after(0.2).speed() == 0.0
-    assert robot.ask(b"get_data") is None
-    assert robot.speed() == 0.0
 
 
-@pytest.mark.parametrize(
-    ("server", "words"),
-    mostly_slow([("2023-01-07", b"d 5 0"), ("2023-01-15", b"g 5 0"), ("2023-04-10", b"g 0 5"), ("2025-05", b"d 5 0"),
-     ("fork", b"d 5 0"), ("kteam", b"D,74,74\r")], 5),
-)  # fmt: skip
+@pytest.mark.parametrize(("server", "words"), [("2023-01-07", b"d 5 0"), ("fork", b"d 5 0"), ("kteam", b"D,74,74\r")])
 def test_no_watchdog_and_clients_that_leave(talk, server, words):
     robot = talk(server)
     robot.say(words)
@@ -199,9 +191,7 @@ def test_kteam_speaks_in_lines_units_and_pulses(talk):
     assert robot.truth[0] == pytest.approx(0.1994, abs=0.004)
     left, right = robot.values(b"R\r")
     assert left == right == pytest.approx(robot.truth[0] / 6.781e-6, abs=1.0)
-    assert robot.ask(b"I\r") == "i\r\n"
-    assert robot.ask(b"R\r") == "r,0,0\r\n"
-    assert robot.ask(b"D,-50,50\r") == "d\r\n"
+    assert [robot.ask(word) for word in (b"I\r", b"R\r", b"D,-50,50\r")] == ["i\r\n", "r,0,0\r\n", "d\r\n"]
     assert robot.after(1.0).truth[2] == pytest.approx(100 * 0.6781e-3 / 0.1054, abs=0.025)
     assert robot.ask(b"G\r") == "g,1000,1000,1000,1000,1000\r\n"
     assert robot.ask(b"U,4\r") == "u\r\n"
@@ -232,11 +222,9 @@ def test_silence_and_delay(talk):
 
 def test_a_battery_that_ends_stops_and_silences_it(talk):
     robot = talk("kteam", faults={"battery": 0.5, "drain": 1800.0})
-    assert robot.ask(b"D,100,100\r") == "d\r\n"
-    assert robot.after(4.0).ask(b"V,5\r") == "v,10\r\n"
-    robot.after(2.0)
-    before = robot.truth
-    assert robot.after(1.0).truth == before
+    robot.say(b"D,100,100\r")
+    assert robot.after(4.0).ask(b"V,5\r") == "d\r\nv,10\r\n"
+    assert robot.after(2.0).speed() == 0.0
     assert robot.ask(b"V,5\r") is None
 
 
@@ -255,7 +243,6 @@ def test_addresses_that_cannot_be_had(talk):
         (f"khepera4-twin://{held}", {}, "name another address"),
         ("khepera4-twin://192.168.0.21", {}, "loopback"),
         ("khepera4-twin://127.0.0.1:99999", {}, "name another address"),
-        ("khepera4-twin://127.0.0.1:port", {}, "loopback"),
         ("khepera4-twin", {"server": "morse"}, r"R0: device: .*server"),
     ):
         with pytest.raises(BodyError, match=why):

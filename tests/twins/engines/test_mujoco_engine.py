@@ -167,16 +167,6 @@ def test_drone_on_its_back_is_switched_off():
 
 
 @pytest.mark.slow
-def test_tello_follows_velocities():
-    engine = hovering(TELLO)
-    path = path_of(engine, [[0.5, 0.0, 0.0, 0.3]], 3.0)[:, 0]
-    assert engine.motions[0].velocity == pytest.approx((0.5, 0.0, 0.0), abs=0.03)  # in the room, while it turns
-    assert path[-1, 3] == pytest.approx(0.9, abs=0.1)
-    path_of(engine, [[9.0, 0.0, 0.0, 0.0]], 5.0)
-    assert engine.motions[0].velocity[0] == pytest.approx(1.0, abs=0.03)
-
-
-@pytest.mark.slow
 def test_drones_are_the_same_alone():
     kinds = (CRAZYFLIE, KHEPERA4, TELLO, CRAZYFLIE)
     start = [[0.0, 0.0, 0.0], [0.5, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]  # in each other: they do not touch

@@ -65,6 +65,8 @@ def test_sensors_make_sense():
     assert len(carried) == len(SENSORS)  # each of its own name
     assert sorted(np.degrees(SENSORS["infrared"].bearing)) == pytest.approx([-135, -90, -45, 0, 45, 90, 135, 180])
     assert sorted(np.degrees(SENSORS["ultrasonic"].bearing)) == pytest.approx([-90, -45, 0, 45, 90])
+    with pytest.raises(BodyError, match=r"R1: there is no sensor radar; there are multiranger, infrared, ultra"):
+        RangeSensors(request([KHEPERA4] * 2), placed([KHEPERA4] * 2, [("infrared",), ("infrared", "radar")]))
 
 
 def test_limits_count_from_sensor_readings_from_centre():
@@ -105,12 +107,6 @@ def test_multiranger_looks_ahead_and_up():
     seen, _ = swept(asked, placed([CRAZYFLIE] * 2, [("multiranger",)] * 2))
     np.testing.assert_allclose(seen[0, :5], [2.5, 3.5, 4.0, 2.0, 0.5 - 0.0145], atol=1e-12)
     np.testing.assert_allclose(seen[0, 5:], [2.0, 4.0, 2.48, 3.52, 1.0 - 0.0145], atol=1e-12)
-
-
-def test_unknown_sensor_is_refused():
-    asked = request([KHEPERA4] * 2, names=("KH01", "KH02"))
-    with pytest.raises(BodyError, match=r"KH02: there is no sensor radar; there are multiranger, infrared, ultra"):
-        RangeSensors(asked, placed([KHEPERA4] * 2, [("infrared",), ("infrared", "radar")]))
 
 
 @pytest.mark.parametrize("dt", [0.01, 0.015])
@@ -184,9 +180,7 @@ def test_readings_do_not_depend_on_other_sensors():
         alone, _ = swept(asked, placed(kinds, only, noise=1.0), times)
         np.testing.assert_array_equal(together[:, row_of_ray == row], alone)
     other, _ = swept(replace(asked, seeds=(1, 9, 3, 4)), world, times)
-    lidar = row_of_ray == 1
-    np.testing.assert_array_equal(other[:, ~lidar], together[:, ~lidar])
-    assert (other[:, lidar] != together[:, lidar]).mean() > 0.9
+    assert (other != together).mean(axis=0)[row_of_ray == 1].min() > 0.5
 
 
 def test_mirrored_robots_are_seen_and_see():

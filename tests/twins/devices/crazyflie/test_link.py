@@ -1,9 +1,11 @@
 """What a Crazyflie twin answers: tables, parameters, logs, memories, and what a bad link does to that."""
 
+import json
 import math
 import socket
 import struct
 from contextlib import closing
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,13 +14,15 @@ from hypothesis import strategies as st
 
 from agents.body.interface import BodyError, Disturbance, Jitter
 from agents.protocols import crtp
+from agents.protocols.crazyradio import ACK, QUEUE
 from agents.protocols.crtp import NRF, Log, LogStatus, MemoryKind, Misc, Port, PowerSwitch, SupervisorCommand, Toc
 from tests.requests import request
 from tests.twins.crazyflie_wire import Wire
 from twins.body import TwinBody
 from twins.devices.crazyflie.device import CrazyflieTwin
 from twins.devices.crazyflie.memory import ANCHOR_PAGES, CALIBRATION, Memories
-from twins.devices.crazyflie.tables import LOG_CODES, PACKINGS, inventory
+from twins.devices.crazyflie.radio import NOTHING, RadioLink
+from twins.devices.crazyflie.tables import EXTENDED, LOG_CODES, PACKINGS, READ_ONLY, inventory, pack
 from twins.devices.crazyflie.vehicle import Vehicle
 from twins.devices.device import DeviceRequest, Faults
 
@@ -153,19 +157,6 @@ def test_every_variable_packs():
         wire.log(Log.START, 0, 1)
         (value,) = PACKINGS[one.type].unpack(wire.wait(0.02)[0][2][4:])
         assert math.isfinite(value)
-
-
-@pytest.mark.slow
-def test_power_switch():
-    wire = Wire().hovering()
-    wire.put(Port.LINK, 3, NRF, PowerSwitch.OFF)
-    assert wire.after(1.0).position[2] == 0.0
-    assert wire.put(Port.LINK, 0, b"echo") == []
-    wire.vehicle.supervisor.tumbled = False
-    assert wire.ask(Port.LINK, 3, NRF, PowerSwitch.RESET_BEGIN) == b"\xfe\xff\xe7\xe7\xe7\xe7"
-    wire.put(Port.LINK, 3, NRF, PowerSwitch.ON)
-    assert wire.ask(Port.LINK, 0, b"echo") == b"echo"
-    wire.hovering(0.5)
 
 
 def test_memories_are_listed():
@@ -321,3 +312,197 @@ def test_nature_is_that_of_the_other_twin():
     assert vehicle.place[:2] == pytest.approx(state.true_position[:2], abs=1e-3)
     assert abs(vehicle.place[0]) > 1e-3
     assert np.std(noise) == pytest.approx(0.01, rel=0.1)
+
+
+REQUEST = b"\xff\x05\x01"
+
+
+class Host:
+    """The counters of a client, as cflib keeps them, over exchanges of which the given ones lose their answer."""
+
+    def __init__(self, link):
+        self.link, self.up, self.down = link, 0, 0
+
+    def poll(self, packet=b"\xff", *, answered=True):
+        """Answer of the drone, or None if it was lost; and the packet that the drone was given."""
+        first = packet[0] & 0xF3 | self.up << 3 | self.down << 2
+        status, answer, forwarded = self.link.exchange(bytes((first,)) + packet[1:], 3)
+        assert status & ACK
+        if not answered:
+            return None, forwarded
+        if (answer[0] & 4) == self.down << 2:
+            self.down = 1 - self.down
+        self.up = 1 - self.up
+        return answer, forwarded
+
+
+@pytest.fixture
+def radio():
+    return RadioLink(np.random.default_rng(1), Faults(), 0)
+
+
+def secured(radio):
+    assert radio.exchange(REQUEST, 3)[1] == REQUEST
+    return Host(radio)
+
+
+def test_safelink_loses_and_repeats_nothing(radio):
+    host = secured(radio)
+    for number in range(20):
+        radio.send(Port.LOG, 2, bytes((number,)))
+    up, down, sent = [], [], 0
+    for attempt in range(60):
+        answer, forwarded = host.poll(bytes((0x7C, sent)), answered=attempt % 3 != 0)
+        up += [] if forwarded is None else [forwarded[1]]
+        sent += answer is not None
+        if answer is not None and answer[1:] != NOTHING[1:] and answer[1] not in down:
+            down.append(answer[1])
+    assert up == list(range(max(up) + 1))
+    assert down == list(range(20))
+
+
+def test_a_client_without_safelink_is_heard_once(radio):
+    """A drone that still has safelink on drops every packet of a client that has it off as a repetition."""
+    secured(radio)
+    given = [radio.exchange(bytes((0x7C, number)), 3)[2] for number in range(5)]
+    assert sum(packet is not None for packet in given) <= 1
+    assert radio.safelink, "it outlives the session"
+
+
+def test_answers_wait_behind_logs(radio):
+    host = secured(radio)
+    for number in range(QUEUE + 30):
+        radio.send(Port.LOG, 2, bytes((number % 256,)))
+    radio.send(Port.HIGH_LEVEL, 0, b"answer")
+    assert radio.dropped == 30
+    answers = [host.poll()[0][1:] for _ in range(QUEUE + 1)]
+    assert answers.index(b"answer") == QUEUE
+
+
+def test_an_outage_empties_the_queue_and_ends(radio):
+    secured(radio)
+    radio.silence(1.5)
+    radio.send(Port.LOG, 2, b"\0")
+    for t, waiting, answered in ((0.9, 1, False), (1.1, 0, False), (1.6, 0, True)):
+        radio.t = t
+        radio.send_due()
+        assert len(radio.queue) == waiting
+        assert bool(radio.exchange(REQUEST, 3)[0] & ACK) == answered
+
+
+def test_losses_cost_retransmissions():
+    radio = RadioLink(np.random.default_rng(1), Faults(loss=0.5), 0)
+    results = [radio.exchange(bytes((0x7C, number % 256)), 3) for number in range(2000)]
+    share = np.mean([bool(status & ACK) for status, _, _ in results])
+    assert share == pytest.approx(1.0 - 0.75**4, abs=0.05)
+    assert sum(packet is not None for _, _, packet in results) == pytest.approx(2000 * (1.0 - 0.5**4), rel=0.05)
+
+
+# parameters and log variables of a real firmware, where this machine has them: names and types only
+PLACES = [folder / "shared" / "prototypes" / "crazyflie-toc.json" for folder in Path(__file__).parents[5:]]
+FIRMWARE = next(filter(Path.exists, PLACES), PLACES[0])
+CTYPES = {"u8": "uint8_t", "u16": "uint16_t", "u32": "uint32_t", "i8": "int8_t", "i16": "int16_t", "i32": "int32_t"}
+
+
+@pytest.fixture
+def files(tmp_path):
+    """Tables of parameters and logs of that firmware, as cflib writes them to its cache."""
+    if not FIRMWARE.exists():
+        pytest.skip(f"{FIRMWARE} with the firmware's tables is not there")
+    parameters, logs = json.loads(FIRMWARE.read_text())
+    tables = {
+        "ParamTocElement": {name: (kind, {"access": int(fixed), "extended": kept})
+                            for name, (kind, fixed, kept) in parameters.items()},
+        "LogTocElement": {name: (kind, {"access": 0}) for name, kind in logs.items()},
+    }  # fmt: skip
+    for element, entries in tables.items():
+        table = {}
+        for ident, (name, (kind, rest)) in enumerate(entries.items()):
+            group, own = name.split(".")
+            entry = {"__class__": element, "ident": ident, "group": group, "name": own, "pytype": ""}
+            table.setdefault(group, {})[own] = entry | {"ctype": CTYPES.get(kind, kind)} | rest
+        (tmp_path / f"{element}.json").write_text(json.dumps(table))
+    return [str(tmp_path / f"{element}.json") for element in tables]
+
+
+def logged(wire, *names):
+    """Values of log variables, in the type that they have on board."""
+    table, values = wire.drone.log_table, []
+    for name in names:
+        number = table.number[name]
+        kind = table.variables[number].type
+        wire.put(Port.LOG, 1, Log.RESET)
+        wire.log(Log.CREATE, 0, struct.pack("<BH", LOG_CODES[kind], number))
+        wire.log(Log.START, 0, 1)
+        values.append(PACKINGS[kind].unpack(wire.wait(0.01)[0][2][4:])[0])
+    return values
+
+
+def test_size_of_the_firmware_and_its_numbers():
+    tables = inventory()
+    assert (len(tables.parameters.variables), len(tables.logs.variables)) == (402, 637)
+    assert sum(bool(variable.flags & EXTENDED) for variable in tables.parameters.variables) == 146
+    assert pack("u8", 257.9) == b"\1"
+    assert pack("i16", -1.0) == b"\xff\xff"
+    assert pack("half", 1e9) == PACKINGS["half"].pack(math.inf)
+
+
+def test_values_of_a_drone_that_stands():
+    wire = Wire()
+    assert wire.drone.value("system.selftestPassed") == 1
+    assert wire.drone.value("deck.bcFlow2") == 1  # without another system of positioning it has a Flow deck
+    assert wire.drone.value("pid_rate.roll_kp") == 250.0
+    assert logged(wire, "stabilizer.roll", "stabilizer.pitch", "stateEstimate.yaw") == pytest.approx([0.4, -0.3, 0.0])
+    assert logged(wire, "acc.x", "acc.y", "acc.z") == pytest.approx([0.0, 0.0, 1.0], abs=0.03)
+    assert logged(wire, "supervisor.accNorm") == pytest.approx([1.0])
+    assert logged(wire, "motor.m1", "range.front", "stabilizer.thrust") == [0, 0, 0.0]  # it has no Multi-ranger
+    assert 0.0 < logged(wire, "gyro.xVariance")[0] < 0.1
+
+
+def test_values_of_a_drone_that_flies():
+    wire = Wire().streaming()
+    wire.wait(0.1, lambda: wire.goal(1.0, 0.0, 1.0))
+    roll, pitch, qx, qy, qw = logged(wire, *(f"stateEstimate.{name}" for name in ("roll", "pitch", "qx", "qy", "qw")))
+    assert pitch < -5.0
+    assert abs(roll) < 1.0
+    assert (qx, qy, qw) == pytest.approx((0.0, math.sin(math.radians(-0.5 * pitch)), 1.0), abs=0.02)
+    assert logged(wire, "motor.m1")[0] == pytest.approx(39300.0, rel=0.01)
+
+
+def test_tables_of_a_real_firmware(files):
+    tables = inventory(tuple(files))
+    assert (len(tables.parameters.variables), len(tables.logs.variables)) == (402, 637)
+    number = tables.parameters.number
+    assert tables.parameters.variables[number["deck.bcFlow2"]].flags == READ_ONLY
+    assert tables.parameters.variables[number["pid_rate.roll_kp"]].value == 250.0
+    wire = Wire(device={"tables": files, "positioning": {"system": "loco"}})
+    assert wire.drone.value("deck.bcLoco") == 1
+    assert wire.drone.value("firmware.revision0") == 0.0  # this one has none
+    own, real = inventory(), tables
+    for tables in ((own.parameters, real.parameters), (own.logs, real.logs)):
+        mine, known = ({each.name: (each.type, each.flags) for each in table.variables} for table in tables)
+        shared = known.keys() & mine.keys()
+        assert {name: mine[name] for name in shared} == {name: known[name] for name in shared}
+        assert {name.split(".")[0] for name in mine.keys() - shared} <= {"spare", "firmware", "loco"}
+    with pytest.raises(BodyError, match="second table"):
+        inventory((files[0], files[0]))
+
+
+ENTRY = """{"pm": {"vbat": {"__class__": "LogTocElement", "ident": %d, "group": "pm", "name": "vbat",
+                        "ctype": "%s", "pytype": "<f", "access": 0}}}"""
+
+
+def test_other_files_are_refused(tmp_path):
+    for k, (text, said) in enumerate(
+        (
+            ("", "no table of a Crazyflie"),
+            ("[]", "no table of a Crazyflie"),
+            ('{"pm": {"vbat": {"ident": 0}}}', "no table of a Crazyflie"),
+            (ENTRY % (3, "float"), "0, 1, 2"),
+            (ENTRY % (0, "float128"), "unknown type float128"),
+        )
+    ):
+        file = tmp_path / f"table{k}.json"
+        file.write_text(text)
+        with pytest.raises(BodyError, match=said):
+            inventory((str(file),))
