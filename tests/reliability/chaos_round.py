@@ -122,7 +122,7 @@ class ChaosRound:
             run = self._run = SpoiltRun(stack, self._setting, self._stage, self._number)
             try:
                 with network.open_session(run.routers, name="chaos", wait_s=BEGIN_S) as session:  # routers wait for it
-                    self._observer = Observer(session, run.plan)
+                    run.session, self._observer = session, Observer(session, run.plan)
                     with contextlib.suppress(_Over):
                         self._follow()
                     nearest, missed = self._observer.invariants.nearest, self._missed_share()

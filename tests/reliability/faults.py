@@ -117,6 +117,13 @@ class ActiveFault:
         blind = [name for name in sorted(self.live.intersection(names)) if not self.incidents(name, text)]
         return f"{', '.join(blind)}: not noticed that its position is wrong" if blind else ""
 
+    def awake(self) -> str:
+        """Reason why a victim that slept is neither back, and receives the others, nor down."""
+        if (why := self.back()) or self.observer.is_down(self.victim):
+            return why
+        deaf = self.deaf_to()
+        return f"{self.victim} receives no pose of {', '.join(deaf)}" if deaf else ""
+
     def deaf_to(self) -> list[str]:
         """Living robots that have transmitted since the fault was lifted, and the victim received none of their poses.
 
@@ -167,14 +174,19 @@ class ActiveFault:
 Begin = Callable[[ActiveFault], Check]
 
 
-def _signal(number: Signals, why: Callable[[ActiveFault], str], role: str = "") -> Begin:
-    """A signal to a process, the victim's if no other is named; `why` the run is not yet well."""
+def _lever(act: Callable[[SpoiltRun, str], str | None], why: Callable[[ActiveFault], str]) -> Begin:
+    """A lever of the run for the victim, if there is one, which returns a note; `why` the run is not yet well."""
 
     def begin(active: ActiveFault) -> Check:
-        active.run.send(role or active.victim, number)
+        active.note = act(active.run, active.victim) or ""
         return partial(why, active)
 
     return begin
+
+
+def _signal(number: Signals, why: Callable[[ActiveFault], str], role: str = "") -> Begin:
+    """A signal to a process, the victim's if no other is named."""
+    return _lever(lambda run, victim: run.send(role or victim, number), why)
 
 
 def _step_clock(name: str) -> Begin:
@@ -203,17 +215,6 @@ def _capture(fault: CaptureFault, text: str = "position") -> Begin:
     return begin
 
 
-def _kill(active: ActiveFault) -> Check:
-    active.run.send(active.victim, SIGKILL)
-    active.run.dead[active.victim] = active.begun  # its body stays in the room and must come down
-    return active.loss_noticed
-
-
-def _partition(active: ActiveFault) -> Check:
-    active.run.cut(active.victim)
-    return active.back
-
-
 def _clock_behind(active: ActiveFault) -> Check:
     run, observer, victim = active.run, active.observer, active.victim
     run.send(victim, SIGKILL)
@@ -228,7 +229,7 @@ def _clock_behind(active: ActiveFault) -> Check:
                 return f"the loss of {victim} is not reported"
             run.shifted.add(victim)
             restarted = time.monotonic()
-            run.restart(victim, observer.session)
+            run.restart(victim)
         if (why := run.answer.reason or run.answer.refused.get(victim)) and not run.over:
             active.add_violation(f"{victim} is not let in again: {why}")
             return ""
@@ -242,23 +243,6 @@ def _clock_behind(active: ActiveFault) -> Check:
         if deaf or victim not in active.live:
             return f"{victim} does not take part yet, or its poses do not reach {names or 'any robot'}"
         return ""
-
-    return check
-
-
-def _refused_landing(active: ActiveFault) -> Check:
-    active.run.refuse_landing(active.victim, active.observer.session)
-    return active.landed
-
-
-def _sleep(active: ActiveFault) -> Check:
-    active.run.sleep(active.victim)
-
-    def check() -> str:
-        if (why := active.back()) or active.observer.is_down(active.victim):
-            return why
-        deaf = active.deaf_to()
-        return f"{active.victim} receives no pose of {', '.join(deaf)}" if deaf else ""
 
     return check
 
@@ -296,16 +280,6 @@ def _read_error(active: ActiveFault) -> Check:
     return check
 
 
-def _disk(active: ActiveFault) -> Check:
-    active.note = active.run.fill_disk()
-    return partial(active.reported, "recorder")
-
-
-def _corrupt(active: ActiveFault) -> Check:
-    active.note = f"{active.run.spoil(active.victim, active.observer.session)} payloads of nonsense"
-    return active.back
-
-
 @dataclass(frozen=True)
 class FaultKind:
     """A kind of fault: how it begins, and what a script and a round must know of it."""
@@ -336,9 +310,9 @@ _router = partial(
     recorded="router",
 )
 FAULT_KINDS: Final = {
-    "kill": FaultKind(_kill, most=2, recorded="lost"),
+    "kill": FaultKind(_lever(SpoiltRun.kill, ActiveFault.loss_noticed), most=2, recorded="lost"),
     "freeze": FaultKind(_signal(SIGSTOP, ActiveFault.back), 5.0, unsteered=True),
-    "partition": FaultKind(_partition, 3.0, unsteered=True),
+    "partition": FaultKind(_lever(SpoiltRun.cut, ActiveFault.back), 3.0, unsteered=True),
     "router": _router(most=3, never="two routers"),
     "failover": _router(most=1, stage="two routers"),
     "frozen-router": FaultKind(
@@ -354,12 +328,22 @@ FAULT_KINDS: Final = {
     "mocap-repeated": _wrong_poses(_capture("repeated"), victim=False),
     "mocap-swapped": _wrong_poses(_capture("swapped", "")),
     "mocap-renamed": _wrong_poses(_capture("renamed")),
-    "refused-landing": FaultKind(_refused_landing, 12.0, 8.0, most=1, disbands=True, among="flying", ordered=True),
-    "sleep": FaultKind(_sleep, 8.0, heals_s=6.0, most=2, unsteered=True),
+    "refused-landing": FaultKind(
+        _lever(SpoiltRun.refuse_landing, ActiveFault.landed),
+        12.0,
+        8.0,
+        most=1,
+        disbands=True,
+        among="flying",
+        ordered=True,
+    ),
+    "sleep": FaultKind(_lever(SpoiltRun.sleep, ActiveFault.awake), 8.0, heals_s=6.0, most=2, unsteered=True),
     "double": FaultKind(_double, heals_s=6.0),
     "read-error": FaultKind(_read_error, heals_s=12.0, most=1, recorded="lost"),
-    "disk": FaultKind(_disk, victim=False, most=1),
-    "corrupt": FaultKind(_corrupt, 1.0),
+    "disk": FaultKind(
+        _lever(SpoiltRun.fill_disk, partial(ActiveFault.reported, process="recorder")), victim=False, most=1
+    ),
+    "corrupt": FaultKind(_lever(SpoiltRun.spoil, ActiveFault.back), 1.0),
 }
 FAULTS: Final = tuple(FAULT_KINDS)
 

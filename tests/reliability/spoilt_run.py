@@ -95,7 +95,10 @@ class SpoiltRun:
         shifted: Robots whose clock is not that of the others.
         started: Common start [monotonic s].
         answer: Of the conductor, to the last restart.
+        session: On its network; set from outside.
     """
+
+    session: zenoh.Session
 
     def __init__(self, stack: ExitStack, setting: Setting, stage: Stage, number: int) -> None:
         """Start it; `stack` ends it."""
@@ -177,6 +180,11 @@ class SpoiltRun:
         for pid in self._running(role)[:1]:
             self._signal(pid, number)
 
+    def kill(self, robot: str) -> None:
+        """Kill a robot's process for good; its body stays in the room and must come down."""
+        self.send(robot, signal.SIGKILL)
+        self.dead[robot] = time.monotonic()
+
     def cut(self, robot: str) -> None:
         """Let nothing pass between a robot and its routers."""
         self._signal(self._launcher.get(f"{CABLE}-{self.process_of(robot)}").handle.pid, signal.SIGSTOP)
@@ -192,11 +200,11 @@ class SpoiltRun:
         self.switch("capture-subject").write(self.measured.index(subject) if subject else 0)
         self.switch("capture").write(CAPTURE_FAULTS.index(fault))
 
-    def refuse_landing(self, robot: str, session: zenoh.Session) -> None:
+    def refuse_landing(self, robot: str) -> None:
         """Order a robot to land, whose body does not obey until `release`."""
         self._refusing.append(self.switch(f"refuse-{robot}"))
         self._refusing[-1].write(1.0)
-        order = session, self._keys, [robot], messages.Order("land")
+        order = self.session, self._keys, [robot], messages.Order("land")
         threading.Thread(target=orders.send_order, args=order, daemon=True).start()
 
     def release(self) -> None:
@@ -213,12 +221,12 @@ class SpoiltRun:
         self._stopped.clear()
         self.switch(MOCAP_CLOCK).write(0.0)
 
-    def restart(self, robot: str, session: zenoh.Session) -> None:
+    def restart(self, robot: str) -> None:
         """Have the conductor start a robot again; do not wait for that."""
         order = messages.RunOrder("restart", [robot], operator="chaos")
 
         def ask() -> None:
-            self.answer = orders.send_run_order(session, self._keys, order)
+            self.answer = orders.send_run_order(self.session, self._keys, order)
 
         self.answer = messages.RunReply()
         threading.Thread(target=ask, name="restart", daemon=True).start()
@@ -229,7 +237,7 @@ class SpoiltRun:
         words = dict(tagged(self._tag))[pid]
         return self._spawn(f"double-{robot}-{pid}-{time.monotonic_ns()}", words)
 
-    def fill_disk(self) -> str:
+    def fill_disk(self, _robot: str) -> str:
         """Limit the recording to its present size: the recorder gets the error of a disk that is full."""
         full = self.recording.stat().st_size
         for pid in self._running("recorder"):
@@ -238,8 +246,8 @@ class SpoiltRun:
             return f"at {full} bytes"
         return "no recorder"
 
-    def spoil(self, robot: str, session: zenoh.Session) -> int:
-        """Send nonsense on every key that a robot and its body read, but the stop's; return the number of payloads."""
+    def spoil(self, robot: str) -> str:
+        """Send nonsense on every key that a robot and its body read, but the stop's; return how much."""
         keys, whole = self._keys, messages.encode(messages.pose(robot, 1, 0.0, [9e9, 0.0, 0.0], [0.0] * 3, yaw=0.0))
         read = (keys.pose, keys.position, keys.setpoint, keys.state, keys.status, keys.goal, keys.ranges)
         for key in read * GARBAGE:
@@ -250,8 +258,8 @@ class SpoiltRun:
                 b"x" * 100_000,
                 whole[: random.randrange(len(whole))],
             )
-            session.put(key(robot), random.choice(payloads), encoding=messages.JSON)
-        return GARBAGE * len(read)
+            self.session.put(key(robot), random.choice(payloads), encoding=messages.JSON)
+        return f"{GARBAGE * len(read)} payloads of nonsense"
 
     def _running(self, role: str) -> list[int]:
         """The processes of a role, or of a robot."""

@@ -214,7 +214,9 @@ def test_sleeper_must_hear_its_senders(it):
     it.observer.sent_at = {"KH01": 7.0}
     assert it.deaf_to() == []  # that may have been sent before
     it.observer.sent_at["KH01"] = 8.0
-    assert it.deaf_to() == ["KH01"]
+    assert it.awake() == "CF01 is not back"
+    it.live.add("CF01")
+    assert it.awake() == "CF01 receives no pose of KH01"
     it.observer.received_at["CF01", "KH01"] = 6.5
     assert it.deaf_to() == []
 
