@@ -4,7 +4,6 @@ import os
 import re
 import signal
 import socket
-import socketserver
 import threading
 from collections import Counter
 from contextlib import suppress
@@ -94,12 +93,6 @@ def test_defaults_keep_robots_apart_and_fit_files_rates():
     assert defaults(Plan(avoiding)) == list(ALWAYS)
 
 
-class Echo(socketserver.BaseRequestHandler):
-    def handle(self):
-        while data := self.request.recv(65536):
-            self.request.sendall(data)
-
-
 def test_cut_cable_holds_everything_back_and_loses_nothing():
     near, ends = int(free_endpoint(0).rpartition(":")[2]), []
 
@@ -109,31 +102,32 @@ def test_cut_cable_holds_everything_back_and_loses_nothing():
         return ends
 
     with (
-        socketserver.ThreadingTCPServer(("127.0.0.1", 0), Echo) as far,
-        started("-m", "tests.reliability.cable", near, far.server_address[1]) as cable,
+        socket.create_server(("127.0.0.1", 0)) as server,
+        started("-m", "tests.reliability.cable", near, server.getsockname()[1]) as cable,
     ):
-        threading.Thread(target=far.serve_forever, args=(0.01,), daemon=True).start()
         until(reached, "it listens")
-        with ends[0] as end, end.makefile("rb") as answers:
+        far, _ = server.accept()
+        with ends[0] as end, far, far.makefile("rb") as arrived:
             data = bytes(range(256)) * 4096
             sender = threading.Thread(target=end.sendall, args=(data,))
             sender.start()
-            assert answers.read(len(data)) == data
+            assert arrived.read(len(data)) == data
             sender.join()
+            far.sendall(b"back")
+            assert end.recv(10) == b"back"
             os.kill(cable.pid, signal.SIGSTOP)
             os.waitid(os.P_PID, cable.pid, os.WSTOPPED)
             end.sendall(b"late")
-            end.settimeout(0.3)
+            far.settimeout(0.3)
             with pytest.raises(TimeoutError):
-                end.recv(10)
+                far.recv(10)
             os.kill(cable.pid, signal.SIGCONT)
-            end.settimeout(30.0)
-            assert end.recv(10) == b"late"
+            far.settimeout(30.0)
+            assert far.recv(10) == b"late"
             end.shutdown(socket.SHUT_WR)
-            assert end.recv(10) == b"", "the end of a connection passes"
+            assert far.recv(10) == b"", "the end of a connection passes"
         cable.stdin.close()
         assert cable.wait(30.0) == 0, "it ends with its standard input"
-        far.shutdown()
 
 
 def status(phase="running", *, missing=(), incidents=()):

@@ -123,13 +123,18 @@ def test_pose_without_a_token_is_not_believed(a):
     assert a.x == 0.4
 
 
-def test_late_sample_revives_nobody(a):
+def test_late_sample_revives_nobody_but_its_token(a):
     a.begin("one")
-    a.lose("one", 4.0)
+    a.lose("one")
+    assert a.neighbour.active  # known so far to be gone for no time at all
+    a.after()
     a.receive(2, 0.5, "one", age=2.5, then=500.0)
     assert a.x is None
     a.after()
     assert a.x is None
+    a.token("one")
+    a.after()
+    assert a.x == 0.5
 
 
 @pytest.mark.parametrize("behind_s", [1.0, 60.0, -3.0])
@@ -145,17 +150,6 @@ def test_restarted_neighbour_is_received_at_once(a, behind_s):
     assert (a.x, a.sender.lost) == (-0.4, 0)
     a.receive(100, 0.4, "one")  # held back by the network since the first life
     assert a.found == (-0.4, 1)
-
-
-def test_reconnected_neighbour_is_where_it_was(a):
-    a.begin("one", 7)
-    a.lose("one")
-    assert a.neighbour.active  # known so far to be gone for no time at all
-    a.after()
-    assert a.x is None
-    a.token("one")
-    a.after()
-    assert a.x == 0.4
 
 
 def test_other_make_begins_anew_with_its_token(a):
