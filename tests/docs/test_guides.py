@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import re
 import shlex
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import pytest
 
-from tests.commands import ROOT, zenpark
-from tools.main import main
+from tests.commands import ROOT, invoke, zenpark
 
 DOCS = ROOT / "docs"
 SHORT = ("shadow-twin", "two-crazyflies", "vicon", "three-machines", "lab-certificates")
@@ -24,11 +22,8 @@ STEP = re.compile(
 )
 COMPUTING = {"lab", "check", "clean", "explain", "export", "import", "new", "report", "sweep"}
 REAL = (
-    "run way.toml",
-    "run shadow.toml --out runs/shadow --open",
-    "run two.toml --bodies protocol",
-    "run measured.toml",
-    "run three.toml --here",
+    *("run way.toml", "run shadow.toml --out runs/shadow --open", "run measured.toml"),
+    *("run two.toml --bodies protocol", "run three.toml --here"),
 )
 
 
@@ -52,27 +47,23 @@ def steps(guide: str) -> Iterator[Step]:
 
 def computes(words: list[str]) -> bool:
     """Whether a command ends by itself, without robots in real time, a browser or a film."""
-    if "--view" in words or "--open" in words or "--video" in words:
+    if {"--view", "--open", "--video"} & set(words):
         return False
     return words[0] in COMPUTING or (words[0] == "run" and ("--virtual" in words or words[1].endswith(".zip")))
 
 
-def call(words: list[str], monkeypatch: pytest.MonkeyPatch) -> object:
-    """Exit code of a command; of many seeds or values two are run, and reports are made only by `report`."""
+def shortened(words: list[str]) -> list[str]:
+    """A command with two seeds or values instead of many; reports are made only by `report`."""
     few = [re.sub(r"^(seeds=|.*:(?:log|lin))\d+$", r"\g<1>2", each) for each in words]
     if "--seeds" in few:
         few[few.index("--seeds") + 1] = "2"
-    more = {"sweep": ["--processes", "1"], "run": ["--no-report"]}.get(few[0], [])
-    monkeypatch.setattr(sys, "argv", ["zenpark", *few, *more])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    return ended.value.code
+    return few + {"sweep": ["--processes", "1"], "run": ["--no-report"]}.get(few[0], [])
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("guide", [*SHORT, *(pytest.param(guide, marks=pytest.mark.nightly) for guide in LONG)])
-def test_a_guide_can_be_followed(guide: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_guide_can_be_followed(guide, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("ZENPARK_RUNTIME_DIR", str(tmp_path / "runs"))
     Path("docs").symlink_to(DOCS)
@@ -83,7 +74,7 @@ def test_a_guide_can_be_followed(guide: str, tmp_path: Path, monkeypatch: pytest
         elif step.kind == "python" and "reopen" not in step.text:
             exec(compile(step.text, guide, "exec"), {})
         elif step.kind == "command" and computes(words := shlex.split(step.text)):
-            assert call(words, monkeypatch) == step.code, step.text
+            invoke(*shortened(words), code=step.code)
         else:
             continue
         done += 1
@@ -93,7 +84,7 @@ def test_a_guide_can_be_followed(guide: str, tmp_path: Path, monkeypatch: pytest
 @pytest.mark.system
 @pytest.mark.timeout(150)
 @pytest.mark.parametrize("command", REAL)
-def test_a_guide_flies_in_real_time(command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_guide_flies_in_real_time(command, tmp_path, monkeypatch):
     found = [step for guide in GUIDES for step in steps(guide)]
     assert Step("command", command) in found
     _, name, *options = (word for word in shlex.split(command.partition("--out")[0]))

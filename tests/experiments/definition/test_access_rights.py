@@ -93,8 +93,8 @@ def test_every_right_is_the_wanted_one(links, groups, guided):
             assert found == right, (who, robot, links, groups, guided)
 
 
-@pytest.mark.parametrize(
-    ("who", "action", "keys"),
+@for_each(
+    "who, action, keys",
     [
         ("operator", "put", [KEYS.estop]),
         ("operator", "keep", [KEYS.event, KEYS.experiment]),
@@ -111,19 +111,16 @@ def test_every_right_is_the_wanted_one(links, groups, guided):
         ("world", "watch", ["park/*/alive"]),
         ("world", "hear", ["park/*/setpoint"]),
         ("R0", "hear", [KEYS.estop]),
+        ("centre", "keep", [KEYS.centre]),
+        ("centre", "be", [KEYS.centre_alive]),
+        ("ros2", "watch", [KEYS.centre_alive]),
+        ("R0", "watch", [KEYS.centre_alive]),
+        ("recorder", "last", [KEYS.centre]),
     ],
 )
 def test_what_keeps_an_experiment_going_is_allowed(who, action, keys):
-    made = control(four_robots({(0, 1)}))
-    assert [key for key in keys if not may(made, who, action, key)] == []
-
-
-def test_what_a_centre_needs_is_allowed():
     made = control(four_robots({(0, 1)}, architecture="centralised"))
-    assert may(made, "centre", "keep", KEYS.centre)
-    assert may(made, "centre", "be", KEYS.centre_alive)
-    assert all(may(made, who, "watch", KEYS.centre_alive) for who in ("centre", "R0", "ros2"))
-    assert may(made, "recorder", "last", KEYS.centre)
+    assert [key for key in keys if not may(made, who, action, key)] == []
 
 
 def test_robot_holds_its_own_tokens_alone():

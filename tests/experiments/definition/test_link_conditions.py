@@ -1,7 +1,6 @@
 """[channel] of a file: what it means for each link, by name."""
 
 import numpy as np
-import pytest
 
 from agents.network import channel_model
 from experiments.definition import link_conditions
@@ -34,6 +33,7 @@ def test_default_delay_is_a_millisecond_or_nothing_really():
 def test_links_have_their_own():
     own = {"A > C": LinkChannelTable(loss=0.3, burst=4.0), "A - B": LinkChannelTable(delay_s=0.1, bandwidth=1e4)}
     made = conditions(ChannelTable(loss=0.1, jitter_s=0.01, queue_s=0.2, links=own))
+    assert [link.key for link in made] == [channel_model.key(1, *names) for names in ENDS]  # by the seed
     assert [link.loss for link in made] == [0.1, 0.1, 0.3, 0.1]
     np.testing.assert_array_equal([link.burst for link in made], [np.nan, np.nan, 4.0, np.nan])
     assert [link.delay for link in made] == [0.1, 0.1, 0.001, 0.001]
@@ -48,28 +48,15 @@ def test_outages_of_links_of_robots_and_of_all():
         Outage(from_s=4.0, until_s=5.0, robots=["B"]),
     ]
     every, some, of_robot = (1.0, 2.0), (3.0, np.inf), (4.0, 5.0)
-    assert [[*link.outages] for link in conditions(ChannelTable(outages=outages))] == [
-        [every, of_robot],
-        [every, some, of_robot],
-        [every],
-        [every, some, of_robot],
-    ]
+    found = [[*link.outages] for link in conditions(ChannelTable(outages=outages))]
+    assert found == [[every, of_robot], [every, some, of_robot], [every], [every, some, of_robot]]
 
 
-def test_keys_come_from_the_seed_and_the_names():
-    made = conditions(ChannelTable(loss=0.2, links={"A > C": LinkChannelTable(loss=0.5)}), seed=7)
-    assert [link.key for link in made] == [channel_model.key(7, *names) for names in ENDS]
-
-
-@pytest.mark.parametrize(
-    "channel",
-    [
-        ChannelTable(loss=0.5, burst=2.0, links={"A > B": LinkChannelTable(loss=0.1)}, outages=[Outage(from_s=0.0)]),
-        ChannelTable(loss=1.0, burst=3.0),
-    ],
-)
-def test_what_is_possible_is_accepted(channel):
-    assert list(consistency_faults(planned(channel))) == []
+def test_what_is_possible_is_accepted():
+    own = {"A > B": LinkChannelTable(loss=0.1)}
+    mixed = ChannelTable(loss=0.5, burst=2.0, links=own, outages=[Outage(from_s=0.0)])
+    for channel in (mixed, ChannelTable(loss=1.0, burst=3.0)):
+        assert list(consistency_faults(planned(channel))) == []
 
 
 def test_links_of_avoidance_alone_are_links():

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
-
 import pytest
 
 from agents.body.interface import BodyState
@@ -13,15 +10,7 @@ from agents.network import messages
 from agents.robot import Robot
 from experiments import run
 from experiments.definition import standby as reserves
-from experiments.definition.experiment import (
-    ChannelTable,
-    Experiment,
-    Hybrid,
-    LegTable,
-    LinkChannelTable,
-    Outage,
-    RobotTable,
-)
+from experiments.definition.experiment import ChannelTable, Hybrid, LegTable, LinkChannelTable, Outage, RobotTable
 from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.file.consistency.whole import consistency_faults
@@ -32,12 +21,12 @@ BOT = RobotTable(kind="khepera4", start=[0.0, 0.0])
 FLY = RobotTable(kind="crazyflie", start=[0.5, 0.5], hover=0.5)
 
 
-def with_standby(**parts: Any) -> Experiment:
+def with_standby(**parts):
     robots = {"A": BOT, "B": changed(BOT, start=[0.5, 0.0]), "C": changed(FLY, standby=True)}
     return small(robots, {"A - B": 0.5, "A - C": 0.7, "C > B": 0.7}, duration_s=5.0, **parts)
 
 
-def test_without_those_on_standby_nothing_names_them() -> None:
+def test_without_those_on_standby_nothing_names_them():
     whole = with_standby(
         timeline=[LegTable(at_s=1.0, robot="C", plan="hold")],
         architecture=Hybrid("hybrid", ["A", "C"]),
@@ -59,7 +48,7 @@ def test_without_those_on_standby_nothing_names_them() -> None:
     assert reserves.without_standby(plan) is plan
 
 
-def test_virtual_time_flies_without_those_on_standby(tmp_path: Path) -> None:
+def test_virtual_time_flies_without_those_on_standby(tmp_path):
     file = tmp_path / "x.json"
     file.write_bytes(document.write_json(Plan(with_standby())))
     (trace,) = run.simulate(document.read(file)).traces.values()
@@ -67,7 +56,7 @@ def test_virtual_time_flies_without_those_on_standby(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("standby", [True, False])
-def test_nobody_waits_for_a_robot_on_standby(standby: bool) -> None:
+def test_nobody_waits_for_a_robot_on_standby(standby):
     case = with_standby()
     told = Plan(changed(case, robots={**case.robots, "C": changed(FLY, standby=standby)})).assignment("A")
     robot = Robot(told)
@@ -83,11 +72,11 @@ def test_nobody_waits_for_a_robot_on_standby(standby: bool) -> None:
     assert robot.missing_neighbours() == ["C"]
 
 
-def order(**more: object) -> messages.RunOrder:
-    return messages.RunOrder("replace", ["A"], **more)  # type: ignore[arg-type]
+def order(**more):
+    return messages.RunOrder("replace", ["A"], **more)
 
 
-def test_spare_brings_its_body_and_keeps_the_rest() -> None:
+def test_spare_brings_its_body_and_keeps_the_rest():
     spare = changed(BOT, start=[0.2, 0.3, 1.0], body="khepera4://192.0.2.1", avoids=False)
     spares = Spares(Plan(with_standby(spares={"F": FLY, "S": spare})))
     old = changed(BOT, ranges="world")
@@ -111,11 +100,10 @@ def test_spare_brings_its_body_and_keeps_the_rest() -> None:
         (order(body="nowhere://1"), "no 'nowhere'"),
         (order(body="world"), "into the world"),
         (order(body="twin", at=(99.0, 0.0)), "outside of the arena"),
-        (order(body="twin", at=(float("nan"), 0.0)), "outside of the arena"),
         (order(body="twin", at=(0.0, 0.0), yaw=float("inf")), "outside of the arena"),
         (order(body="khepera4://192.0.2.1", at=(0.0, 0.0)), "only a twin"),
     ],
 )
-def test_what_cannot_take_over_a_name(asked: messages.RunOrder, said: str) -> None:
+def test_what_cannot_take_over_a_name(asked, said):
     with pytest.raises(Refusal, match=said):
         Spares(Plan(with_standby(spares={"F": FLY, "S": BOT}))).successor("A", BOT, asked)

@@ -28,14 +28,11 @@ def test_example_is_a_part_of_a_file(entry):
         value = value[part]
         value = value[0] if isinstance(value, list) and value and isinstance(value[0], dict) else value
     assert entry.type
-
-
-@for_each("entry", [each for each in reference.entries() if "(" in each.key])
-def test_plugin_example_has_all_that_it_needs(entry):
-    *tables, choice = entry.example.split("\n")
-    ((owner, parameters),) = tomllib.loads(choice).items()
-    registry.build(GROUPS[owner], parameters)
-    assert tables in ([], ["[[timeline]]"]) or not tables[0].startswith("[timeline")
+    if "(" in entry.key:  # it has all that the plug-in needs
+        *tables, choice = entry.example.split("\n")
+        ((owner, parameters),) = tomllib.loads(choice).items()
+        registry.build(GROUPS[owner], parameters)
+        assert tables in ([], ["[[timeline]]"]) or not tables[0].startswith("[timeline")
 
 
 @pytest.mark.parametrize(
@@ -70,7 +67,6 @@ def test_entry_of_a_table_and_of_a_number():
         ("rates.body_hz", ["rates.body_hz", "position control and body", "> 0, ≤ 2000", "100.0", "[rates]"]),
         ("IAE", ["metric: "]),
         ("acquired_s", ["metric: "]),
-        ("rmse", ["metric: "]),
         ("ackermann", [f"turning radius {KINDS['ackermann'].turn_radius:.3g} m",
                        *(f"{key} = {getattr(KINDS['ackermann'], key):.3g}"
                          for key in ("response", "turn_response", "lag"))]),
@@ -88,7 +84,6 @@ def test_explain_tells(words, parts):
         ("trigger.qqqqqqqqqqqq", ["`./zenpark explain trigger` lists"]),
         ("saftey", ["did you mean 'safety'?"]),
         ("battery", ["nothing in the experiment file is named 'battery'; keys about it:", "\nsafety.battery_low "]),
-        ("hover jitter", ["named 'hover jitter'; keys about it:", "\ndisturbance.KIND.hover_jitter "]),
     ],
 )
 def test_explain_of_an_unknown_key_names_others(words, parts):

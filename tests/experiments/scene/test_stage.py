@@ -60,9 +60,8 @@ def test_bodies_and_links_are_told_apart():
     assert [stage.place_of(body).name for body in bodies] == ["TWIN", "TWIN", "WORLD", "REAL"]
     assert len({tuple(colour) for colour in stage.CHASSIS.values()}) == len(BodyLocation)
     colours = stage.link_colours(np.array([0.024, 0.026, 0.049, 0.051, np.nan]))
-    assert [tuple(each) for each in colours.tolist()] == [
-        stage.GOOD, stage.FAIR, stage.FAIR, stage.BAD, stage.UNKNOWN
-    ]  # fmt: skip
+    wanted = [stage.GOOD, stage.FAIR, stage.FAIR, stage.BAD, stage.UNKNOWN]
+    assert [tuple(each) for each in colours.tolist()] == wanted
     made = stage.dashes(np.array([[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]]))
     assert np.linalg.norm(made[:, 1] - made[:, 0], axis=1).sum() == pytest.approx(0.5)
     assert made[..., 0].min() >= 0.0
@@ -92,13 +91,6 @@ def test_absent_links_plugins_or_experiments_have_no_error(park_scene):
     assert LinkTracker(SceneModel.of_robots(("A", "B"))).errors(None, np.zeros((2, 3))).shape == (0,)
 
 
-def test_link_is_lit_after_its_sender_transmits(park_scene):
-    moment = at_start(park_scene)
-    moment.silent_for[park_scene.names.index("TB01")] = 0.05
-    senders = {park_scene.names[row] for row in park_scene.links.sender[stage.lit(park_scene, moment)]}
-    assert senders == {"TB01"}
-
-
 def test_unknown_robots_are_out_of_sight(park_scene):
     moment = moments.unknown(park_scene)
     assert (stage.shown(moment.position)[:, 2] < -100.0).all()
@@ -107,7 +99,7 @@ def test_unknown_robots_are_out_of_sight(park_scene):
     assert len(stage.dashes(ends)) == 0
 
 
-def test_robots_needing_attention_have_ring_and_word(park_scene):
+def test_attention_has_ring_word_and_lit_links(park_scene):
     moment = at_start(park_scene)
     row = park_scene.names.index("CF02")
     moment.condition[:] = Condition.ACTIVE
@@ -117,6 +109,9 @@ def test_robots_needing_attention_have_ring_and_word(park_scene):
     assert stage.label(park_scene, row, Condition.DEAD) == "CF02 · DEAD"
     assert stage.label(park_scene, row, Condition.ACTIVE) == "CF02"
     assert (stage.accents(park_scene, moment)[row] != park_scene.colours[row]).any()
+    moment.silent_for[park_scene.names.index("TB01")] = 0.05
+    senders = {park_scene.names[row] for row in park_scene.links.sender[stage.lit(park_scene, moment)]}
+    assert senders == {"TB01"}  # it transmitted
 
 
 def test_trail_has_five_fading_points_a_second(park_scene):
@@ -144,18 +139,12 @@ def test_ranges_reach_from_robot_to_what_it_sees(park_scene, bearing):
 def test_every_kind_has_a_model_of_its_size(kind, own):
     kind = kind if own else replace(kind, name="my-kind")
     model = models.model(kind).whole
+    a, b, c = (model.vertices[model.faces[:, k].astype(int)] for k in range(3))
+    assert np.einsum("ij,ij->i", a, np.cross(b, c)).sum() > 0.0  # six times the volume: faces look outward
     low, high = model.vertices.min(axis=0), model.vertices.max(axis=0)
     assert low[2] == pytest.approx(0.0, abs=1e-9)
     assert high[2] == pytest.approx(kind.height)
     assert np.hypot(*model.vertices[:, :2].T).max() == pytest.approx(kind.radius, rel=0.35)
-
-
-@pytest.mark.parametrize(
-    "mesh", [models.box(1.0, 2.0, 0.0, 0.5), models.cylinder(0.3, 0.1, 0.4), models.model(KINDS["khepera4"]).whole]
-)
-def test_faces_look_outward(mesh):
-    a, b, c = (mesh.vertices[mesh.faces[:, k].astype(int)] for k in range(3))
-    assert np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6.0 > 0.0  # the volume, positive
 
 
 def test_obstacles_stand_where_the_file_says():

@@ -72,20 +72,15 @@ def test_drones_hover_at_the_heights_of_the_shape():
     assert heights.min() == pytest.approx(0.7, abs=1e-3)  # where all of them start
     assert np.ptp(heights) > 0.8
     anchors = read.experiment.formation.anchors
-    assert len(anchors) == 20
-    assert len({tuple(anchor.to) for anchor in anchors.values()}) == 1
+    assert (len(anchors), len({tuple(anchor.to) for anchor in anchors.values()})) == (20, 1)
     assert "lifted" in notes
 
 
 def test_one_way_links_and_those_of_two_minds():
     relations = (["khepera02_0.8"], ["khepera01_0.9", "khepera03_0.8"], ["khepera02_0.8", "khepera01_0.8"])
     read, notes = converted(trio(relations))
-    assert dict(read.experiment.formation.links) == {
-        "khepera02 > khepera01": 0.8,
-        "khepera01 > khepera02": 0.9,
-        "khepera03 - khepera02": 0.8,
-        "khepera01 > khepera03": 0.8,
-    }
+    lengths = {"02 > khepera01": 0.8, "01 > khepera02": 0.9, "03 - khepera02": 0.8, "01 > khepera03": 0.8}
+    assert read.experiment.formation.links == {f"khepera{pair}": length for pair, length in lengths.items()}
     assert "different things" in notes
     links = converted(trio(TRIANGLE).replace("gain: 0.25", "gain: 0.4", 1))[0].experiment.formation.links
     assert links["khepera02 > khepera01"].gain == pytest.approx(0.8)  # 2 · 0.4
@@ -100,9 +95,7 @@ DRONES = trio(TRIANGLE, kind="dron").replace("      T: 100\n", "      T: 50\n")
     ("text", "path", "expected"),
     [
         (FILES[5], "trigger", {"kind": "periodic", "period_s": 0.05}),
-        (FILES[5], "rates.pose_hz", 20.0),
         (FILES[5], "rates.coordination_hz", 10.0),
-        (FILES[5], "formation.law", "distance"),
         (FILES[5], "formation.clamp", 0.1),
         (FILES[5], "formation.gain", 0.5),  # 2 k: their simulator's driver of that time does not divide
         (FILES[8], "robots.dron02.body", "radio://0/80/2M/E7E7E7E702"),
@@ -113,10 +106,7 @@ DRONES = trio(TRIANGLE, kind="dron").replace("      T: 100\n", "      T: 50\n")
         (FILES[12], "formation.links.khepera00 > khepera01.offset", [0.0, 0.5]),  # of khepera01 from khepera00
         (FILES[12], "robots.khepera00.body", "khepera4://192.168.0.21:50000"),
         (FILES[12], "robots.khepera00.shadow", Shadow()),
-        (FILES[12], "robots.khepera01.body", "twin"),
-        (FILES[12], "robots.dron11.hover", 0.7),
         (FILES[15], "formation.update", {"kind": "relative-control", "floor": 0.005, "share": 0.1}),
-        (FILES[15], "trigger", {"kind": "send-on-delta", "threshold": 0.01}),
         (FILES[15], "positioning", "vicon-twin"),
         (FILES[15], "robots.khepera00.position", "external"),
         (trio(TRIANGLE, law="pid"), "formation.gain", pytest.approx(0.25 / 0.64, rel=1e-3)),  # pulls as the square
@@ -247,10 +237,8 @@ def test_pyramid_is_not_folded():
 @pytest.mark.parametrize(
     ("old", "new", "said", "line"),
     [
-        ("mode: virtual ", "mode: virtuel ", "Operation.mode: Invalid enum value 'virtuel'", 0),
         ("name: khepera02", "name: rover02", "Robots.Robot02: no kind of robot is in the name 'rover02'", 0),
         ("name: khepera02", "name: khepera01", "Robot01: two robots are called 'khepera01'", 0),
-        ("pose: 0.90, 0.00, 0.00", "pose: 0.90; 0.00", "Robots.Robot02.pose[0]: Expected `float`", 0),
         ("pose: 0.90, 0.00, 0.00", "pose: 0.90", "Robots.Robot02.pose: Expected", 0),
         ("pose: 0.90, 0.00, 0.00", "pose: {}", "Robots.Robot02.pose: Expected `object` of length >= 2", 0),
         ("    pose: 0.90, 0.00, 0.00\n", "", "Robots.Robot02: pose is missing", 0),
@@ -259,14 +247,12 @@ def test_pyramid_is_not_folded():
         ("khepera03_0.8", "khepera03_-0.8", "not positive", 0),
         ("khepera03_0.8", "khepera01_0.8", "no other robot is called 'khepera01'", 0),
         ("gain: 0.25", "gain: .inf", "controller.gain: Expected `float` <= ", 0),
-        ("gain: 0.25", "gain: -1", "Expected `float` > 0.0", 0),
         ("      type: distance\n", "", "Robots.Robot01.task: type or relationship is missing", 0),
         ("type: distance", "type: bearing", "Robot01.task: the type 'bearing' is unknown", 0),
         ("upperLimit: 0.1", "upperLimit: -0.2", "no step lies between", 0),
         ("Robots:\n", "Robots: none\nElse:\n", "Robots: Expected `object`, got `str`", 0),
         ("Robots:\n", "Robotss:\n", "'Robots' is missing", 0),
         ("  mode: virtual ", " \tmode: virtual ", "", 3),
-        ("tool: Webots", "tool: 'Webots", "", None),
         ("tool: Webots", "tool: !!python/object/apply:os.system ['true']", "the tag", 4),
         ("tool: Webots", "tool: *nothing", "the alias '*nothing' is not read", 4),
         ("  tool: Webots\n", "  tool: Webots\n  tool: Gazebo\n", "stands twice", 5),
@@ -279,13 +265,12 @@ def test_error_names_the_key_or_the_line(old, new, said, line):
         convert_text(text.replace(old, new), "park.yaml", 20.0)
     assert said in str(raised.value)
     problem = raised.value.problems[0]
-    assert problem.file == "park.yaml"
-    assert line in (None, problem.line)
+    assert (problem.file, problem.line) == ("park.yaml", line)
 
 
 @pytest.mark.parametrize(
     "text",
-    ["- 1\n- 2\n", "just text\n", "a: [1, 2\n", "{" * 1200, "a: \x01\n", "&a [*a]\n", "Robots: &r\n  Robot01: *r\n"],
+    ["- 1\n- 2\n", "just text\n", "a: [1, 2\n", "{" * 1200, "a: \x01\n", "Robots: &r\n  Robot01: *r\n"],
 )
 def test_other_files_are_refused(text):
     with pytest.raises(DocumentError):
@@ -317,15 +302,12 @@ def test_flat_2023_file_starts_from_an_index(tmp_path):
     poses.write_text("dron01:\n  pose: 0.1 0.5\nkhepera01:\n  pose: -0.4, 0.0\nkhepera02:\n  pose: 0.5 0.1 3.1\n")
     made, notes = convert_text("".join(map(flat, OTHERS)) + marker, "AA.yaml", 20.0, str(poses))
     experiment = document.loads(made).experiment
-    assert {name: each.start for name, each in experiment.robots.items()} == {
-        "dron01": [0.1, 0.5], "khepera01": [-0.4, 0.0], "khepera02": [0.5, 0.1, 3.1]
-    }  # fmt: skip
+    starts = {"dron01": [0.1, 0.5], "khepera01": [-0.4, 0.0], "khepera02": [0.5, 0.1, 3.1]}
+    assert {name: each.start for name, each in experiment.robots.items()} == starts
     assert {each.body for each in experiment.robots.values()} == {"twin"}
     formation = experiment.formation
-    assert formation.links == {
-        "khepera01 - dron01": 0.9, "khepera02 - dron01": 0.9, "khepera02 - khepera01": 0.8
-    }  # fmt: skip
-    assert (formation.gain, formation.clamp) == (0.5, 0.08)
+    wanted = {"khepera01 - dron01": 0.9, "khepera02 - dron01": 0.9, "khepera02 - khepera01": 0.8}
+    assert (formation.links, formation.gain, formation.clamp) == (wanted, 0.5, 0.08)
     assert experiment.rates.coordination_hz == 5.0
     told = " | ".join(notes)
     assert "khepera01 192.168.0.1:50000, khepera02 192.168.0.2:50000" in told
@@ -424,7 +406,6 @@ def test_starts_from_a_webots_world(tmp_path):
         ("poses.txt", "dron01: 0.1\n", "tells the start of no robot"),
         ("park.wbt", 'Robot { name "dron01" translation 1 x 2 }', r"dron01.translation\[1\]: Expected `float`"),
         ("park.wbt", 'Robot { name "dron01" translation }', r"dron01.translation: Expected `array` of length 3"),
-        ("park.wbt", "Robot { name", "tells the start of no robot"),
     ],
 )
 def test_starts_that_cannot_be_read(tmp_path, name, text, said):
