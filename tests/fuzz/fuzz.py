@@ -19,23 +19,14 @@ PLACES = {name: place for module in MODULES for name, place in module.PLACES.ite
 
 @dataclass
 class Tally:
-    """Results of the inputs of a target.
-
-    Attributes:
-        inputs: Number of inputs tried.
-        refused: Number of inputs refused as they should be.
-        escaped: Number of times of each way to fail.
-        kept: First input of each way to fail, and what it ended in.
-        slowest: Largest CPU time of an input [s], and its length.
-        taken: CPU time of all [s].
-    """
+    """Results of the inputs of a target."""
 
     inputs: int = 0
-    refused: int = 0
-    escaped: Counter[str] = field(default_factory=Counter)
-    kept: dict[str, tuple[bytes, str]] = field(default_factory=dict)
-    slowest: tuple[float, int] = (0.0, 0)
-    taken: float = 0.0
+    refused: int = 0  # as they should be
+    escaped: Counter = field(default_factory=Counter)  # number of times of each way to fail
+    kept: dict = field(default_factory=dict)  # first input of each way to fail, and what it ended in
+    slowest: tuple = (0.0, 0)  # largest CPU time of an input [s], and its length
+    taken: float = 0.0  # CPU time of all [s]
 
     def keep(self, way, data, text):
         """Add a failure."""
@@ -44,17 +35,15 @@ class Tally:
 
     def add(self, other):
         """Add the results of further inputs."""
-        self.inputs, self.refused = self.inputs + other.inputs, self.refused + other.refused
-        self.escaped, self.kept = self.escaped + other.escaped, other.kept | self.kept
-        self.slowest, self.taken = max(self.slowest, other.slowest), self.taken + other.taken
+        for name in ("inputs", "refused", "escaped", "taken"):
+            setattr(self, name, getattr(self, name) + getattr(other, name))
+        self.kept, self.slowest = other.kept | self.kept, max(self.slowest, other.slowest)
 
 
 def drive(target, inputs, seed, *, slot=None, bombs=False):
     """Results of spoilt inputs.
 
     Args:
-        target: To be driven.
-        inputs: Number of inputs.
         seed: Inputs are the same for the same seed.
         slot: Where each input is written before it is tried, for whoever looks after a crash.
         bombs: Whether time and memory count as well.
@@ -101,11 +90,11 @@ def save(folder, name, data, text):
     return file
 
 
-def replay(place, data):
-    """Result of one input: "read", or the reason of the refusal; raises any other error."""
-    with place.open() as target:
+def replay(file, size=None):
+    """Result of a kept input, or of its first bytes: "read", or the reason of the refusal; raises any other error."""
+    with PLACES[file.name.partition("--")[0]].open() as target:
         try:
-            target.take(data)
+            target.take(file.read_bytes()[:size])
         except target.refusals as error:
             return f"refused: {type(error).__name__}: {error}"
     return "read"

@@ -6,80 +6,63 @@ from agents.network import messages
 from agents.network.keys import Keys
 
 KEYS = Keys()
+PLACE, REST = (-0.5, -0.4, 0.0), (0.0, 0.0, 0.0)
 
 
-def good(robot, seq=1, ahead=0.0):
-    """By the name of its key what a robot says, with stamps so far ahead of now [s]."""
-    now = time.time() + ahead
-    place, rest = (-0.5, -0.4, 0.0), (0.0, 0.0, 0.0)
-    heard = messages.PoseReceipt("KH02", seq, now, now, place, rest)
+def good(robot, seq=1):
+    """By the name of its key what a robot says."""
+    now = time.time()
     status = messages.Status(
-        robot=robot, stamp=now, phase="running", reason="", body="", battery=0.5, sent=seq, received=2,
-        lost={"KH01": 1}, dropped={"KH02": 1}, malformed=0, refused=0, ticks=5, missed=1,
-        decisions=2, interventions=0, avoided=0, late_s=0.001, started=now - 1.0, missing=["KH02"],
-        pid=1, cpu_s=0.1, rss_mb=60.0, hazard="hold: ordered to hold",
+        robot, now, "running", "", battery=0.5, sent=seq, received=2, lost={"KH01": 1}, dropped={"KH02": 1}, ticks=5,
+        started=now - 1.0, missing=["KH02"], pid=1, hazard="hold: ordered to hold",
         incidents=[messages.Incident(seq, now, "hold: ordered to hold")],
     )  # fmt: skip
-    commands = [
-        messages.Command(robot, seq + 10, now, "drive", (0.1, 0.2, 0.0, 0.0)),
-        messages.Command(robot, seq + 20, now, "takeoff", height=0.5),
-        messages.Command(robot, seq + 30, now, "land"),
-        messages.Command(robot, seq + 40, now, "stop"),
-    ]
+    state = messages.State(
+        robot, seq, now, "running", PLACE, REST, 0.1, PLACE, (0.1, 0.2, 0.0, 0.0), 0.1, PLACE, 0.1,
+        [messages.PoseReceipt("KH02", seq, now, now, PLACE, REST)], attitude=(1.0, 0.0, 0.0, 0.0),
+        goal_receipts=[messages.GoalReceipt(seq, now, now, now)],
+    )  # fmt: skip
+    command = messages.Command(robot, seq + 10, now, "drive", (0.1, 0.2, 0.0, 0.0))
     return {
-        "pose": [messages.Pose(robot, seq + k, now + 0.01 * k, place, rest, 0.1) for k in range(2)],
-        "state": [
-            messages.State(robot, seq, now, "running", place, rest, 0.1, place, (0.1, 0.2, 0.0, 0.0), 0.1, place,
-            0.1, [heard], goal_receipts=[messages.GoalReceipt(seq, now, now, now)]),
-            messages.State(robot, seq, now, "idle", place, rest, 0.1, None, None, 0.1, attitude=(1.0, 0.0, 0.0, 0.0)),
-        ],
+        "pose": [messages.Pose(robot, seq + k, now + 0.01 * k, PLACE, REST, 0.1) for k in range(2)],
+        "state": [state, messages.State(robot, seq, now, "idle", PLACE, REST, 0.1)],
         "status": [status],
-        "position": [messages.Position(robot, now, place, 0.1), messages.Position(robot, now, place)],
-        "truth": [messages.Position(robot, now, place, 0.1)],
-        "setpoint": list(commands),
+        "position": [messages.Position(robot, now, PLACE, 0.1), messages.Position(robot, now, PLACE)],
+        "truth": [messages.Position(robot, now, PLACE, 0.1)],
+        "setpoint": [
+            command,
+            messages.Command(robot, seq + 20, now, "takeoff", height=0.5),
+            *(messages.Command(robot, seq + 30, now, action) for action in ("land", "stop")),
+        ],
         "ranges": [messages.Ranges(robot, now, [0.0, 0.1], [0.0, 0.0], [1.0, None])],
         "order": [
-            messages.Order("takeoff"), messages.Order("start", at=now + 0.5), messages.Order("hold"),
-            messages.Order("resume"),
-            messages.Order("leave"), messages.Order("land"),
-            messages.Order("stop"), messages.Order("get", name="clamp"), messages.Order("set", name="clamp", value=0.2),
+            *map(messages.Order, ("takeoff", "hold", "resume", "leave", "land", "stop")),
+            messages.Order("start", at=now + 0.5),
+            messages.Order("get", name="clamp"),
             messages.Order("set", name="trigger.period_s", value=0.05),
         ],
         "goal": [
-            messages.Goal(robot, seq + k, now, place, 0.1 if k else None, now - 0.01, [0.1, 0.0] if k else None)
-            for k in range(2)
+            messages.Goal(robot, seq, now, PLACE, None, now - 0.01),
+            messages.Goal(robot, seq + 1, now, PLACE, 0.1, now - 0.01, [0.1, 0.0]),
         ],
-    }  # fmt: skip
+    }
 
 
 def of_all():
     """By key what is nobody's."""
     now = time.time()
-    world = messages.WorldState(
-        now, "pymunk", 1.0, 1.0, 0.1, False, ["KH01"], ["CF01"],
-        [messages.ObstaclePose("box", (0.1, 0.2, 0.3))], 1, 0, 0, "",
-    )  # fmt: skip
-    centre = messages.CentreState(
-        stamp=now, robots=["KH01"], missing=["KH02"], load=0.1, late_s=0.001, decisions=5, missed=1, goals=5,
-        received={"KH01": 2}, lost={"KH01": 1}, dropped={"KH01": 0}, malformed=0, pid=1, cpu_s=0.1, rss_mb=60.0,
-    )  # fmt: skip
-    orders = [
-        messages.WorldOrder("pause"), messages.WorldOrder("resume"),
-        messages.WorldOrder("reset"), messages.WorldOrder("reset", name="KH01"),
-    ]  # fmt: skip
+    box = messages.ObstaclePose("box", (0.1, 0.2, 0.3))
+    changes = [("remove", "KH01"), ("restart", "CF01"), ("add", "nobody")]
     return {
         KEYS.estop: [messages.Stop("a test", "to see")],
         KEYS.event: [messages.Event(now, "phase", "conductor", "landing")],
         KEYS.contact: [messages.Contact(now, "KH01", "wall", 0.1, 0.001)],
-        KEYS.world: [world],
-        KEYS.centre: [centre],
+        KEYS.world: [messages.WorldState(now, "pymunk", 1.0, 1.0, 0.1, False, ["KH01"], ["CF01"], [box])],
+        KEYS.centre: [messages.CentreState(now, ["KH01"], ["KH02"], received={"KH01": 2}, lost={"KH01": 1})],
         KEYS.clock: [messages.HostClock("lab1", now, 0.2, 0.001, ["KH01"], 0.2)],
-        KEYS.world_order: list(orders),
+        KEYS.world_order: [*map(messages.WorldOrder, ("pause", "resume")), messages.WorldOrder("reset", name="KH01")],
         KEYS.run_order: [
-            messages.RunOrder("remove", ["KH01"], operator="ana"),
-            messages.RunOrder("remove", ["KH01", "KH02"]),
-            messages.RunOrder("restart", ["CF01"]),
-            messages.RunOrder("add", ["nobody"]),
+            *(messages.RunOrder(order, [robot], operator="ana") for order, robot in changes),
             messages.RunOrder("replace", ["KH01"], spare="S1"),
             messages.RunOrder("replace", ["KH01"], body="twin", at=(0.1, 0.2), yaw=1.0),
         ],
@@ -88,25 +71,19 @@ def of_all():
 
 def sent(key, message):
     """A message as `network.Net.deliver` takes it, in both encodings."""
-    return [
-        b"\0".join([key.encode(), messages.MIME[encoding].encode(), messages.encode(message, encoding)])
-        for encoding in ("json", "msgpack")
-    ]
+    heads = {encoding: f"{key}\0{messages.MIME[encoding]}\0".encode() for encoding in ("json", "msgpack")}
+    return [head + messages.encode(message, encoding) for encoding, head in heads.items()]
 
 
 def everything(*robots, only=()):
     """All messages of these robots, and those that are nobody's; or only those of some kinds."""
-    found = []
+    said = of_all()
+    for what, (first, *_) in good(robots[0], 900).items():  # a message on a wildcard reaches all keys
+        said |= {f"park/*/{what}": [first], "park/**": [first], "**": [first]}
     for number, robot in enumerate(robots):
-        for what, said in good(robot, 1 + 100 * number).items():
-            if not only or what in only:
-                found += [part for message in said for part in sent(f"park/{robot}/{what}", message)]
-        found.append(b"park/" + robot.encode() + b"/alive\0text/plain\0")
-    many = {key: said[0] for what, said in good(robots[0], 900).items() for key in (f"park/*/{what}", "park/**", "**")}
-    for key, message in many.items():  # whoever puts on a wildcard reaches everybody
+        said |= {f"park/{robot}/{what}": several for what, several in good(robot, 1 + 100 * number).items()}
+    found = [f"park/{robot}/alive\0text/plain\0".encode() for robot in robots]
+    for key, several in said.items():
         if not only or key.rpartition("/")[2] in (*only, "**"):
-            found += sent(key, message)
-    for key, said in of_all().items():
-        if not only or key.rpartition("/")[2] in only:
-            found += [part for message in said for part in sent(key, message)]
+            found += [part for message in several for part in sent(key, message)]
     return found

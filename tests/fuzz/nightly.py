@@ -1,7 +1,7 @@
 """A million spoilt inputs: `python -m tests.fuzz`, a part of `./zenpark test --all`.
 
-Each target runs in a process of its own, so that a crash, a hang or a thirst for memory ends that alone; what was tried
-last is then known all the same. `--replay FILE` tries one kept input again.
+Each target runs in a process of its own: a crash, a hang or a thirst for memory ends that alone; the last input is
+known. `--replay FILE` tries one kept input again.
 """
 
 import argparse
@@ -31,11 +31,7 @@ def run(name, inputs, seed, slot_file, news):
     warnings.simplefilter("error")
     with contextlib.suppress(ValueError, OSError):
         resource.setrlimit(resource.RLIMIT_AS, (ROOM, resource.RLIM_INFINITY))
-    with (
-        Path(slot_file).open("r+b") as file,
-        mmap.mmap(file.fileno(), LARGEST + 8) as slot,
-        PLACES[name].open() as target,
-    ):
+    with Path(slot_file).open("r+b") as file, mmap.mmap(file.fileno(), 0) as slot, PLACES[name].open() as target:
         for begin in range(0, inputs, BLOCK):
             block = min(BLOCK, inputs - begin)
             news.send(drive(target, block, (seed, name, begin), slot=slot, bombs=begin > 0))
@@ -71,11 +67,9 @@ def fuzz(name, inputs, seed):
 
 
 def line(name, tally, inputs):
-    each = 1e6 * tally.taken / max(1, tally.inputs)
-    return (
-        f"{name:<18} {tally.inputs:>7} of {inputs:>7} inputs, {tally.refused:>7} refused, "
-        f"{tally.escaped.total():>4} escaped, {each:6.0f} µs each, slowest {tally.slowest[0]:.3f} s"
-    )
+    each = f"{1e6 * tally.taken / max(1, tally.inputs):6.0f} µs each, slowest {tally.slowest[0]:.3f} s"
+    counts = f"{tally.refused:>7} refused, {tally.escaped.total():>4} escaped"
+    return f"{name:<18} {tally.inputs:>7} of {inputs:>7} inputs, {counts}, {each}"
 
 
 def main(arguments=None):
@@ -88,8 +82,7 @@ def main(arguments=None):
     parser.add_argument("--replay", metavar="FILE", help="try a kept input again")
     chosen = parser.parse_args(arguments)
     if chosen.replay:
-        file = Path(chosen.replay)
-        print(replay(PLACES[file.name.partition("--")[0]], file.read_bytes()))
+        print(replay(Path(chosen.replay)))
         return 0
     seed = chosen.seed or int(time.time()) // 86400
     names = chosen.target or list(PLACES)

@@ -12,70 +12,68 @@ from bridges.khepera4.drivers import KTeam, RoboticParkServer, identify
 from bridges.khepera4.odometry import Odometer
 from bridges.vicon.client import Decoder
 from bridges.vicon.publisher import PoseFilter
-from tests.fuzz.target import Place, Renewed, Target, Wire
+from tests.fuzz.target import Place, Target, Wire, renewed
 from tests.requests import request
 from twins.devices.device import DeviceRequest, Faults
 from twins.devices.khepera4 import KheperaDevice
 from twins.devices.vicon import ViconTwin, _Client
 
+LETTERS = dict(zip("pqrstk", (*khepera4.PARK, "kteam"), strict=True))  # the first byte says which server
 
-def khepera_twin():
-    """Every server: the first byte says which."""
+
+def khepera_orders():
     park = ["d 10.0 0.5", "stop", "p", "t", "get_data", "g 1.0 0.5", "i 0.1 0.2 0.3", "d -81.0 -7"]
     kteam = ["B", "D,100,-100", "R", "G", "N", "O", "V,5", "U,31", "I", "E", "S", "T", "M,1,2", "K", "H", "J"]
-    letters = dict(zip("pqrstk", (*khepera4.PARK, "kteam"), strict=True))
     examples = [letter.encode() + word.encode() for word in park for letter in "pqrst"]
-    examples += [b"k" + "\r".join([word, "R", ""]).encode() for word in kteam]
+    return examples + [f"k{word}\rR\r".encode() for word in kteam]
 
-    def make():
-        with ExitStack() as stack:
-            devices = {}
-            for letter, server in letters.items():
-                made = DeviceRequest(request("khepera4", "khepera4-twin", device={"server": server}), Faults())
-                devices[letter] = stack.enter_context(closing(KheperaDevice(made)))
-            for k in count():
-                data = yield
-                device = devices.get(data[:1].decode("ascii", "replace"), devices["p"])
-                wire, server = Wire(), device.servers[0]
-                server.client = wire
-                wire.waiting += [data[1:256], data[256:512]] if len(data) > 256 else [data[1:]]
-                while wire.waiting:
-                    device.serve(wire, 0.02 * k)
-                for t in (0.02 * k + 0.01, 0.02 * k + 0.02):
-                    device.advance(t)
-                assert np.isfinite(device.truth()[0]).all()
-                if server.client is None:  # it has left, and some servers wait for no other
-                    return
 
-    with closing(Renewed(make, 200)) as take:
-        yield Target(examples, take)
+@renewed(200, khepera_orders)
+def khepera_twin():
+    with ExitStack() as stack:
+        devices = {}
+        for letter, server in LETTERS.items():
+            made = DeviceRequest(request("khepera4", "khepera4-twin", device={"server": server}), Faults())
+            devices[letter] = stack.enter_context(closing(KheperaDevice(made)))
+        for k in count():
+            data = yield
+            device = devices.get(data[:1].decode("ascii", "replace"), devices["p"])
+            wire, server = Wire(), device.servers[0]
+            server.client = wire
+            wire.waiting += [data[1:256], data[256:512]] if len(data) > 256 else [data[1:]]
+            while wire.waiting:
+                device.serve(wire, 0.02 * k)
+            for t in (0.02 * k + 0.01, 0.02 * k + 0.02):
+                device.advance(t)
+            assert np.isfinite(device.truth()[0]).all()
+            if server.client is None:  # it has left, and some servers wait for no other
+                return
+
+
+class Line:
+    def __init__(self, parts):
+        self.parts = deque(parts)
+
+    def send(self, data):
+        assert data
+
+    def pending(self):
+        return b""
+
+    def receive(self, _until):
+        if not self.parts:
+            raise TimeoutError
+        return self.parts.popleft()[:1024]
 
 
 def khepera_bridge():
     """Answers of all servers to everything that the link asks, apart by zero bytes."""
 
-    class Line:
-        def __init__(self, parts):
-            self.parts = deque(parts)
-
-        def send(self, data):
-            assert data
-
-        def pending(self):
-            return b""
-
-        def receive(self, _until):
-            if not self.parts:
-                raise TimeoutError
-            return self.parts.popleft()[:1024]
-
-    whole = [b"0.10,0.20,0.30"] * 3 + [b"1000,1000,50,1000,1000"]
-    posed, pairs = [b"0.1000,0.2000,0.3000"] * 3, [b"0.1000,0.2000"] * 3
-    kteam = [b"b,C,4\r\n", b"u\r\n", b"d\r\n", b"r,100,-100\r\n", b"g,1000,1000,50,1000,2000\r\n",
-        b"n,40,40,40,40,40,40,40,900,1,1,1,1\r\n", b"v,80\r\n"]  # fmt: skip
-    examples = [letter + b"\0".join([b"", *parts]) for letter, parts in (
-        (b"n", whole), (b"n", posed), (b"p", pairs), (b"q", pairs), (b"t", pairs), (b"n", [whole[0][:7]]), (b"k", kteam)
-    )]  # fmt: skip
+    whole, posed = [b"0.10,0.20,0.30"] * 3 + [b"1000,1000,50,1000,1000"], [b"0.1000,0.2000,0.3000"] * 3
+    kteam = b"b,C,4 u d r,100,-100 g,1000,1000,50,1000,2000 n,40,40,40,40,40,40,40,900,1,1,1,1 v,80".split()
+    answers = [(b"n", whole), (b"n", posed), (b"n", [whole[0][:7]]), (b"k", [word + b"\r\n" for word in kteam])]
+    answers += [(letter, [b"0.1000,0.2000"] * 3) for letter in (b"p", b"q", b"t")]
+    examples = [letter + b"\0".join([b"", *parts]) for letter, parts in answers]
     named = {b"p": "2023-01-07", b"q": "2023-01-15", b"t": "fork"}
 
     def take(data):
@@ -111,14 +109,11 @@ def _vicon_stream():
     names = b"".join([vicon_datastream.pack_stream_info(100.0), vicon_datastream.pack_axes(), *(
         vicon_datastream.pack_subject(k, name) for k, name in enumerate(("cf1", "kh1")))])  # fmt: skip
     eye = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+    latency = vicon_datastream.pack_latency([("a", 0.002), ("b", 0.001)])
     frames = []
     for number in range(3):
-        parts = [
-            vicon_datastream.pack_frame_number(number),
-            vicon_datastream.pack_latency([("a", 0.002), ("b", 0.001)]),
-        ]
-        parts += [vicon_datastream.pack_segments(k, [Segment(0, (0.1 * number, 0.2, 0.3), eye)]) for k in range(2)]
-        frames.append(b"".join(parts))
+        parts = [vicon_datastream.pack_segments(k, [Segment(0, (0.1 * number, 0.2, 0.3), eye)]) for k in range(2)]
+        frames.append(vicon_datastream.pack_frame_number(number) + latency + b"".join(parts))
     return [
         vicon_datastream.packet(names, frames[0]),
         vicon_datastream.packet(names, frames[0]) + vicon_datastream.packet(frames[1]),
@@ -128,25 +123,22 @@ def _vicon_stream():
     ]  # fmt: skip
 
 
+@renewed(300, _vicon_stream, (vicon_datastream.MalformedBlock,))
 def vicon_bridge():
     """Output of a DataStream server, in chunks."""
-
-    def make():
-        decoder, pose_filter = Decoder(), PoseFilter({"CF01": "cf1", "KH01": "kh1"}, lambda _: None)
-        for k in count(1):
-            data = yield
-            framer = vicon_datastream.Framer()  # the connection is made anew after every error
-            for begin in range(0, len(data), 4000):
-                for body in framer.feed(data[begin : begin + 4000]):
-                    for kind, payload in vicon_datastream.blocks(body):
-                        if kind == BlockKind.OBJECT_ENUMS:
-                            vicon_datastream.unpack_kinds(payload)
-                    frame = decoder.frame(body)
-                    if frame is not None:
-                        for _, measured, segment, yaw in pose_filter.filter_poses(frame, 0.01 * k):
-                            assert np.isfinite((measured, yaw, *segment.position)).all()
-
-    yield Target(_vicon_stream(), Renewed(make, 300), (vicon_datastream.MalformedBlock,))
+    decoder, pose_filter = Decoder(), PoseFilter({"CF01": "cf1", "KH01": "kh1"}, lambda _: None)
+    for k in count(1):
+        data = yield
+        framer = vicon_datastream.Framer()  # the connection is made anew after every error
+        for begin in range(0, len(data), 4000):
+            for body in framer.feed(data[begin : begin + 4000]):
+                for kind, payload in vicon_datastream.blocks(body):
+                    if kind == BlockKind.OBJECT_ENUMS:
+                        vicon_datastream.unpack_kinds(payload)
+                frame = decoder.frame(body)
+                if frame is not None:
+                    for _, measured, segment, yaw in pose_filter.filter_poses(frame, 0.01 * k):
+                        assert np.isfinite((measured, yaw, *segment.position)).all()
 
 
 def vicon_twin():

@@ -2,10 +2,9 @@
 
 import importlib.util
 import socket
-import struct
 import sys
 import types
-from contextlib import closing
+from contextlib import closing, suppress
 from itertools import count
 
 import numpy as np
@@ -15,112 +14,101 @@ from agents.protocols import crtp
 from agents.protocols.crtp import HighLevel, Log, Misc, Port, Setpoint, SupervisorCommand
 from agents.protocols.tello import TelloSettings
 from bridges.tello.pilot import TelloPilot
-from tests.fuzz.target import Place, Renewed, Target, Wire
+from tests.fuzz.target import Place, Wire, renewed
 from tests.requests import request
 from twins.devices.crazyflie.device import CrazyflieTwin
 from twins.devices.device import DeviceRequest, Faults
 from twins.devices.tello import TelloDevice
 
 
-def crazyflie_twin():
-    """CRTP packets, one or more behind each other (length, bytes), in the air and on the ground."""
+def packet(port, channel, data):
+    return bytes((1 + len(data), crtp.header(port, channel))) + data
 
-    def packet(port, channel, data):
-        return bytes((1 + len(data), crtp.header(port, channel))) + data
 
+def crtp_packets():
     climb = crtp.CLIMB.pack(0.5, 0.0, True, 1.0)
     pose = crtp.POSE.pack(0.1, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0)
     full = crtp.FULL_STATE.pack(100, 200, 300, 0, 0, 0, 0, 0, 0, 0xC0000000, 0, 0, 0)
     arm = packet(Port.SUPERVISOR, 1, bytes((SupervisorCommand.ARM, 1)))
-    up = arm + packet(Port.HIGH_LEVEL, 0, bytes((HighLevel.TAKEOFF, 0)) + climb)
-    examples = [
-        packet(Port.LINK, 1, b"hello"), b"\1\xff", packet(Port.PLATFORM, 1, b"\0"), packet(Port.LINK, 0, b"echo"),
-        *(packet(port, 0, bytes((toc,)) + b"\1\0") for port in (Port.PARAM, Port.LOG) for toc in (2, 3)),
-        packet(Port.PARAM, 1, b"\3\0"), packet(Port.PARAM, 2, b"\3\0" + struct.pack("<f", 1.0)),
+
+    def high(command, data=b""):
+        return packet(Port.HIGH_LEVEL, 0, bytes((command, 0)) + data)
+
+    def trajectory(at, points, number, define, start):
+        written = packet(Port.MEMORY, 2, crtp.MEMORY.pack(4, at) + points)
+        defined = packet(Port.HIGH_LEVEL, 0, bytes((HighLevel.DEFINE, number)) + crtp.DEFINE.pack(*define))
+        return written + up + defined + start
+
+    up = arm + high(HighLevel.TAKEOFF, climb)
+    log = ((Log.RESET,), (Log.CREATE, 1, 7, 0, 0, 7, 1, 0), (Log.START, 1, 1), (Log.APPEND, 1, 3, 9, 0), (Log.STOP, 1))
+    start, start_2 = crtp.START.pack(1, 1, 2, 0.5), crtp.START_2.pack(1, 1, 0, 1, 1.0)
+    flights = [
+        up,
+        up + high(HighLevel.GO_TO, crtp.GO_TO.pack(True, False, 0.1, 0.2, 0.3, 1.0, 1.0)),
+        up + high(HighLevel.LAND, climb),
+        up + high(HighLevel.SPIRAL, crtp.SPIRAL.pack(0, 1, 1.0, 0.5, 0.6, 0.1, 1.0)),
+        trajectory(0, bytes((1, 0, 2, 0, 3, 0, 4, 0, 9, 100, 0)), 1, (1, 1, 0, 1), high(HighLevel.START_2, start_2)),
+        trajectory(128, b"\0\0\x80\x3f", 2, (1, 0, 0, 1), high(HighLevel.START, start)),
+        *(arm + packet(Port.SETPOINT, 0, bytes((kind,)) + crtp.FOUR.pack(0.1, 0.1, 0.1, 0.5)) for kind in Setpoint),
+        arm + packet(Port.SETPOINT, 0, bytes((Setpoint.FULL_STATE,)) + full),
+        arm + packet(Port.COMMANDER, 0, crtp.THRUST.pack(0.0, 0.0, 10.0, 40000)),
+        packet(Port.LOCATION, 0, crtp.VECTOR.pack(0.1, 0.2, 0.3)),
+        packet(Port.LOCATION, 1, b"\x08" + pose),
+        packet(Port.LOCATION, 1, b"\2\1\1" + crtp.VECTOR.pack(0.1, 0.2, 0.3)),
+        packet(Port.LINK, 1, b"hello") + b"\1\xff",
+        b"".join(packet(Port.LOG, 1, bytes(words)) for words in log),
         packet(Port.PARAM, 3, bytes((Misc.SET_BY_NAME,)) + b"stabilizer\0estimator\0\x08\2"),
         packet(Port.PARAM, 3, bytes((Misc.SET_BY_NAME,)) + b"kalman\0resetEstimation\0\x08\1"),
-        *(packet(Port.PARAM, 3, bytes((kind,)) + b"\5\0") for kind in Misc),
-        packet(Port.LOG, 1, bytes((Log.RESET,))) + packet(Port.LOG, 1, bytes((Log.CREATE, 1, 7, 0, 0, 7, 1, 0)))
-        + packet(Port.LOG, 1, bytes((Log.START, 1, 1))),
-        packet(Port.LOG, 1, bytes((Log.APPEND, 1, 3, 9, 0))), packet(Port.LOG, 1, bytes((Log.STOP, 1))),
-        packet(Port.MEMORY, 0, b"\1"), packet(Port.MEMORY, 0, b"\2\1"),
-        *(packet(Port.MEMORY, 1, crtp.MEMORY.pack(k, 0) + b"\x10") for k in range(9)),
-        *(packet(Port.MEMORY, 2, crtp.MEMORY.pack(k, 0) + bytes(16)) for k in range(9)),
-        packet(Port.MEMORY, 2, crtp.MEMORY.pack(4, 0) + bytes((1, 0, 2, 0, 3, 0, 4, 0, 9, 100, 0, 9, 9, 9, 9)))
-        + up + packet(Port.HIGH_LEVEL, 0, bytes((HighLevel.DEFINE, 1)) + crtp.DEFINE.pack(1, 1, 0, 1))
-        + packet(Port.HIGH_LEVEL, 0, bytes((HighLevel.START_2, 0)) + crtp.START_2.pack(1, 1, 0, 1, 1.0)),
-        packet(Port.MEMORY, 2, crtp.MEMORY.pack(4, 128) + b"\0\0\x80\x3f")
-        + up + packet(Port.HIGH_LEVEL, 0, bytes((HighLevel.DEFINE, 2)) + crtp.DEFINE.pack(1, 0, 0, 1))
-        + packet(Port.HIGH_LEVEL, 0, bytes((HighLevel.START, 0)) + crtp.START.pack(1, 1, 2, 0.5)),
-        up + packet(Port.HIGH_LEVEL, 0, bytes((HighLevel.SPIRAL, 0)) + crtp.SPIRAL.pack(0, 1, 1.0, 0.5, 0.6, 0.1, 1.0)),
-        packet(Port.PLATFORM, 0, b"\1\1"), packet(Port.PLATFORM, 0, b"\2"),
         *(packet(Port.LINK, 3, bytes((crtp.NRF, command))) for command in crtp.PowerSwitch),
-        up, up + packet(Port.HIGH_LEVEL, 0, bytes((HighLevel.GO_TO, 0)) + crtp.GO_TO.pack(True, False, 0.1,
-        0.2, 0.3, 1.0, 1.0)),
-        up + packet(Port.HIGH_LEVEL, 0, bytes((HighLevel.LAND, 0)) + climb), packet(Port.HIGH_LEVEL, 0, b"\3\0"),
-        arm + packet(Port.SETPOINT, 0, bytes((Setpoint.POSITION,)) + crtp.FOUR.pack(0.1, 0.2, 0.5, 90.0)),
-        *(arm + packet(Port.SETPOINT, 0, bytes((kind,)) + crtp.FOUR.pack(0.1, 0.1, 0.1, 0.5)) for kind in Setpoint),
-        arm + packet(Port.SETPOINT, 0, bytes((Setpoint.FULL_STATE,)) + full), packet(Port.SETPOINT, 1, b"\0\0\0\0\0"),
-        arm + packet(Port.COMMANDER, 0, crtp.THRUST.pack(0.0, 0.0, 10.0, 40000)),
-        packet(Port.LOCATION, 0, crtp.VECTOR.pack(0.1, 0.2, 0.3)), packet(Port.LOCATION, 1, b"\x08" + pose),
-        packet(Port.LOCATION, 1, b"\2\1\1" + crtp.VECTOR.pack(0.1, 0.2, 0.3)), packet(Port.LOCATION, 1,
-        b"\x0b\3\0\3\0"),
-        packet(Port.LOCATION, 1, b"\3"), packet(Port.LOCATION, 1, b"\4"),
-        *(packet(Port.SUPERVISOR, 1, bytes((kind, 1))) for kind in SupervisorCommand),
-        packet(Port.SUPERVISOR, 0, b"\x0c"),
-    ]  # fmt: skip
-
-    def make():
-        asked = DeviceRequest(request("crazyflie", "crazyflie-twin"), Faults())
-        with closing(CrazyflieTwin(asked)) as device:
-            line, wire = device.lines[0], Wire()
-            own = line.socket
-            line.socket.close()
-            line.socket = wire
-            for k in count():
-                data, at = (yield), 0
-                while at < len(data) and len(wire.waiting) < 40:
-                    wire.waiting.append(data[at + 1 : at + 1 + data[at]] or b"\0")
-                    at += 1 + data[at]
-                while wire.waiting:
-                    device.serve(own, 0.03 * k)
-                for step in (1, 2, 3):
-                    device.advance(0.03 * k + 0.01 * step)
-                assert np.isfinite(device.truth()[0]).all()
-
-    with closing(Renewed(make, 100)) as take:
-        yield Target(examples, take)
+        *(packet(Port.MEMORY, channel, crtp.MEMORY.pack(k, 0) + bytes(16)) for channel in (1, 2) for k in range(9)),
+    ]
+    heads = [(port, channel, first) for port in Port for channel in range(4) for first in range(10)]
+    return flights * 5 + [packet(port, channel, bytes((first, 1, 0))) for port, channel, first in heads]
 
 
+@renewed(100, crtp_packets)
+def crazyflie_twin():
+    """CRTP packets, one or more behind each other (length, bytes), in the air and on the ground."""
+    with closing(CrazyflieTwin(DeviceRequest(request("crazyflie", "crazyflie-twin"), Faults()))) as device:
+        line, wire = device.lines[0], Wire()
+        own = line.socket
+        line.socket.close()
+        line.socket = wire
+        for k in count():
+            data, at = (yield), 0
+            while at < len(data) and len(wire.waiting) < 40:
+                wire.waiting.append(data[at + 1 : at + 1 + data[at]] or b"\0")
+                at += 1 + data[at]
+            while wire.waiting:
+                device.serve(own, 0.03 * k)
+            for step in (1, 2, 3):
+                device.advance(0.03 * k + 0.01 * step)
+            assert np.isfinite(device.truth()[0]).all()
+
+
+WORDS = """command,takeoff,land,emergency,stop,rc 10 -20 30 40,rc 100 100 100 100,up 50,back 100,cw 90,ccw 360,
+go 50 60 70 50,speed 20,battery?,attitude?,tof?,sn?,wifi?,streamon,flip l,curve 1 2 3 4 5 6 20,
+curve 71 29 0 100 100 0 30,go 50 0 0 30 m1,wifi a b,keepalive,jump 1 2 3 4 5 m1 m2,mon,time?,speed?,baro?,sdk?"""
+
+
+@renewed(100, lambda: [b"command", *(f"command\0takeoff\0\0{word.strip()}".encode() for word in WORDS.split(","))])
 def tello_twin():
     """Words over UDP, datagrams apart by zero bytes."""
-    words = [
-        "command", "takeoff", "land", "emergency", "stop", "rc 10 -20 30 40", "rc 100 100 100 100", "up 50", "back 100",
-        "cw 90", "ccw 360", "go 50 60 70 50", "speed 20", "battery?", "attitude?", "tof?", "sn?", "wifi?", "streamon",
-        "flip l", "curve 1 2 3 4 5 6 20", "curve 71 29 0 100 100 0 30", "go 50 0 0 30 m1", "wifi a b", "keepalive",
-        "jump 1 2 3 4 5 m1 m2", "mon", "time?", "speed?", "height?", "baro?", "sdk?",
-    ]  # fmt: skip
-    examples = [b"command", *(f"command\0takeoff\0\0{word}".encode() for word in words)]
-
-    def make():
-        with socket.socket(type=socket.SOCK_DGRAM) as client:
-            client.bind(("127.0.0.1", 0))
-            made = DeviceRequest(request("tello", "tello-twin"), Faults())
-            with closing(TelloDevice(made, state_port=client.getsockname()[1])) as device:
-                (wire,) = device.sockets()
-                client.connect(wire.getsockname())
-                t = 0.0
-                while True:
-                    for datagram in (yield).split(b"\0")[:20]:
-                        client.send(datagram[:1024])
-                        device.serve(wire, t)
-                        for _ in range(2):
-                            t += 0.01
-                            device.advance(t)
-                    assert np.isfinite(device.truth()[0]).all()
-
-    with closing(Renewed(make, 100)) as take:
-        yield Target(examples, take)
+    with socket.socket(type=socket.SOCK_DGRAM) as client:
+        client.bind(("127.0.0.1", 0))
+        made = DeviceRequest(request("tello", "tello-twin"), Faults())
+        with closing(TelloDevice(made, state_port=client.getsockname()[1])) as device:
+            (wire,) = device.sockets()
+            client.connect(wire.getsockname())
+            t = 0.0
+            while True:
+                for datagram in (yield).split(b"\0")[:20]:
+                    client.send(datagram[:1024])
+                    device.serve(wire, t)
+                    for _ in range(2):
+                        t += 0.01
+                        device.advance(t)
+                assert np.isfinite(device.truth()[0]).all()
 
 
 class Drone:
@@ -144,6 +132,14 @@ class Drone:
         pass
 
 
+LINE = (
+    b"mid:-1;x:-100;y:-100;z:-100;mpry:0,0,0;pitch:0;roll:0;yaw:12;vgx:0;vgy:0;vgz:0;templ:63;temph:66;tof:50;"
+    b"h:40;bat:80;baro:170.80;time:12;agx:-6.00;agy:1.00;agz:-999.00;\r\n\0"
+)
+ANSWERS = (b"ok", b"error", b"out of range", b"unknown command: x", b"error Auto land")
+
+
+@renewed(200, lambda: [LINE + answer for answer in ANSWERS])
 def tello_pilot():
     """A drone's state lines and answers: state and answer with a zero byte between them."""
     if "av" not in sys.modules and importlib.util.find_spec("av") is None:
@@ -151,35 +147,19 @@ def tello_pilot():
     import djitellopy.tello  # noqa: PLC0415
 
     djitellopy.tello.Tello.LOGGER.setLevel("CRITICAL")  # it says every line that it cannot read
-    parse = djitellopy.tello.Tello.parse_state
-    line = (
-        b"mid:-1;x:-100;y:-100;z:-100;mpry:0,0,0;pitch:0;roll:0;yaw:12;vgx:0;vgy:0;vgz:0;templ:63;temph:66;tof:50;"
-        b"h:40;bat:80;baro:170.80;time:12;agx:-6.00;agy:1.00;agz:-999.00;\r\n"
-    )
-    examples = [
-        line + b"\0" + answer
-        for answer in (b"ok", b"error", b"out of range", b"unknown command: x", b"error Auto land")
-    ]
-
-    def make():
-        drone = Drone()
-        pilot = TelloPilot(drone, KINDS["tello"], TelloSettings())
-        pilot.position = (0.0, 0.0, 0.5)
-        for k in count(1):
-            data, now = (yield), 100.0 + 0.05 * k
-            state, _, answer = data.partition(b"\0")
-            try:
-                parsed = parse(state.decode("ascii"))
-            except (UnicodeDecodeError, ValueError, IndexError, KeyError, TypeError):
-                parsed = drone.state  # dropped, see `bridges.tello.library`
-            drone.state = parsed
-            drone.responses.append(answer)
-            if len(data) % 8 == 0:
-                pilot.take_off(0.5, now)
-            pilot.step(now, now)
-            assert isinstance(pilot.note(now), str)
-
-    yield Target(examples, Renewed(make, 200))
+    drone = Drone()
+    pilot = TelloPilot(drone, KINDS["tello"], TelloSettings())
+    pilot.position = (0.0, 0.0, 0.5)
+    for k in count(1):
+        data, now = (yield), 100.0 + 0.05 * k
+        state, _, answer = data.partition(b"\0")
+        with suppress(UnicodeDecodeError, ValueError, IndexError, KeyError, TypeError):  # dropped, see `library`
+            drone.state = djitellopy.tello.Tello.parse_state(state.decode("ascii"))
+        drone.responses.append(answer)
+        if len(data) % 8 == 0:
+            pilot.take_off(0.5, now)
+        pilot.step(now, now)
+        assert isinstance(pilot.note(now), str)
 
 
 PLACES = {

@@ -12,6 +12,7 @@ import zipfile
 import zlib
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -92,17 +93,15 @@ def experiment(suffix, examples):
 def toml():
     """The catalogue, and every malformed file of the tests."""
     files = [*sorted(index.FOLDER.glob("*.toml")), *sorted(MALFORMED.glob("*.toml"))]
-    small = (
-        b'title = "x"\nduration_s = 1.0\n[robots.K]\nkind = "khepera4"\nstart = [0, 0]\n[formation.links]\n[cases.a]\n'
-    )
+    small = b'title = "x"\nduration_s = 1.0\n[robots]\nK = { kind = "khepera4", start = [0, 0] }\n[cases.a]\n'
     # as often as a fifth of the malformed ones: some of the few inputs of a quick run are read
-    yield from experiment(".toml", [small] * max(1, len(files) // 5) + [file.read_bytes() for file in files])
+    return experiment(".toml", [small] * max(1, len(files) // 5) + [file.read_bytes() for file in files])
 
 
 def resolved():
     """Cases as the processes are told them."""
     names = ("triangle", "convoy", "obstacle-course")
-    yield from experiment(".json", [write_json(document.read(name).plan) for name in names])
+    return experiment(".json", [write_json(document.read(name).plan) for name in names])
 
 
 def arena():
@@ -157,32 +156,26 @@ def park_yaml():
 def recording_bytes(*, plain):
     """Recordings of a second: as they are made, or neither compressed nor guarded by checksums."""
     what = document.read("triangle", ["duration_s=1.0", "timeline=[]"]).experiment
-    made = []
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "good.mcap"
         began = time.time()
         with recording.Recording(path, Plan(what), "x", case="only", seed=1, clock="real", started=began) as writer:
             for k in range(12):
                 at = began + 0.1 * k
-                for name in ("KH01", "CF01"):
-                    said = good(name, k + 1)
+                for said in (good("KH01", k + 1), good("CF01", k + 1)):
                     writer.write(msgspec.structs.replace(said["state"][0], stamp=at))
                     writer.write(msgspec.structs.replace(said["pose"][0], stamp=at), at, 150)
-                    if k % 5 == 0:
-                        writer.write(msgspec.structs.replace(said["status"][0], stamp=at, started=began))
+                    writer.write(msgspec.structs.replace(said["status"][0], stamp=at, started=began))
             writer.write(wire.Event(began, "start", "conductor", "go"))
             writer.write(wire.Contact(began + 0.5, "KH01", "CF01", 0.1, 0.01))
-            world = of_all()[KEYS.world][0]
-            writer.write(msgspec.structs.replace(world, stamp=began))
+            writer.write(msgspec.structs.replace(of_all()[KEYS.world][0], stamp=began))
             for stamp, lies in ((began, 0.2), (began + 1.0, 0.21)):
                 writer.write(wire.HostClock("lab1", stamp, lies, 0.001, ["KH01"]))
             writer.write(wire.Event(began + 1.0, "phase", "conductor", "landing"))
-        made.append(path.read_bytes())
         if not plain:
-            return [made[0], made[0][: len(made[0]) // 2]]
-        records = Records(path)
-        messages = list(records.messages())
-        target = Path(folder) / "plain.mcap"
+            return [path.read_bytes(), path.read_bytes()[: path.stat().st_size // 2]]
+        records, target = Records(path), Path(folder) / "plain.mcap"
+        messages = list(records.messages())  # the records are known afterwards
         with target.open("wb") as file:
             copy = Writer(file, compression=CompressionType.NONE, use_chunking=False, enable_crcs=False)
             copy.start("ros2", "zenpark")
@@ -216,7 +209,7 @@ def resealed(data):
 
 
 def recording_of(*, plain):
-    """A recording is read, analysed as `./zenpark report` begins, and recovered."""
+    """A recording is read, analysed and recovered: as the disk may leave it, or forged, its checksums made good."""
     with place_for("some.mcap") as file:
         target = file.with_name("other.mcap")
 
@@ -230,16 +223,6 @@ def recording_of(*, plain):
             assert len(trace.time) <= 100_000
 
         yield Target(recording_bytes(plain=plain), take, (RecordingError,))
-
-
-def damaged():
-    """Recordings as the disk may leave them."""
-    yield from recording_of(plain=False)
-
-
-def forged():
-    """Recordings whose checksums fit, and whose content somebody made up."""
-    yield from recording_of(plain=True)
 
 
 def cdr():
@@ -349,6 +332,29 @@ def sweep_arguments():
     yield Target(examples, take, (DocumentError,))
 
 
+WORDS = """
+endpoint tcp/127.0.0.1:7447
+endpoint tls/[::1]:7447?a=b#c
+endpoint unixsock-stream//tmp/x
+crazyflie radio://0/80/2M/E7E7E7E701
+crazyflie udp://127.0.0.1:19850
+khepera khepera4://10.0.0.1:50000?server=fork
+khepera kteam:///dev/ttyS0
+tello tello://192.168.10.1:8889
+turtlebot ros2dds://tb3_0?distro=humble
+turtlebot rmw://tb3_0?domain=0&distro=jazzy
+vicon 10.0.0.2:801
+faults {"occluded_from_s": 5, "loss": 0.1}
+device {"server":"2025-05","poll_hz":10}
+device {"positioning":{"system":"loco","anchors":[[0,0,1]]}}
+device {"control":"position","log_hz":50,"parameters":{"a.b":1}}
+key park/*/pose
+plugin mixed
+link A > B
+park d 10.0 0.5
+"""
+
+
 def words():
     """Addresses, endpoints, settings of devices, faults, key expressions: kind and text with a zero byte between."""
     kinds = (crazyflie.CrazyflieSettings, khepera4.Khepera4Settings, tello.TelloSettings, turtlebot3.TurtleBot3Settings)
@@ -367,37 +373,22 @@ def words():
 
         read = {
             "endpoint": lambda text: sessions.config(sessions.settings("client", connect=[text], listen=[text])),
-            "crazyflie": lambda text: crazyflie.address("R1", text),
-            "khepera": lambda text: KheperaAddress.parse("R1", text),
-            "tello": lambda text: tello.endpoint("R1", text),
+            "crazyflie": partial(crazyflie.address, "R1"),
+            "khepera": partial(KheperaAddress.parse, "R1"),
+            "tello": partial(tello.endpoint, "R1"),
             "turtlebot": lambda text: turtlebot3.address("R1", text, turtlebot3.TurtleBot3Settings()),
             "vicon": parse_server,
-            "faults": lambda text: msgspec.json.decode(text, type=Faults),
+            "faults": partial(msgspec.json.decode, type=Faults),
             "device": device,
             "key": key_expression,
-            "plugin": lambda text: registry.struct(registry.TRIGGERS, text),
+            "plugin": partial(registry.struct, registry.TRIGGERS),
             "link": link_pairs,
             "park": lambda text: khepera4.scanned(text) + khepera4.numbers(text),
             "stations": lighthouse,
         }
-        good_words = {
-            "endpoint": ["tcp/127.0.0.1:7447", "tls/[::1]:7447?a=b#c", "unixsock-stream//tmp/x", "udp/localhost:1"],
-            "crazyflie": ["radio://0/80/2M/E7E7E7E701", "udp://127.0.0.1:19850", "usb://0"],
-            "khepera": ["khepera4://10.0.0.1:50000?server=fork", "kteam://host:9", "kteam:///dev/ttyS0"],
-            "tello": ["tello://192.168.10.1", "tello://127.0.0.2:8889"],
-            "turtlebot": ["ros2dds://tb3_0?distro=humble", "rmw://tb3_0?domain=0&distro=jazzy"],
-            "vicon": ["10.0.0.2:801", "host"],
-            "faults": ['{"occluded_from_s": 5, "loss": 0.1}'],
-            "device": ['{"server":"2025-05","poll_hz":10}', '{"positioning":{"system":"loco","anchors":[[0,0,1]]}}',
-                       '{"control":"position","log_hz":50,"parameters":{"a.b":1}}',
-                           '{"distro":"humble","watchdog_s":1}'],
-            "key": ["park/*/pose", "park/**"], "plugin": ["periodic", "mixed"], "link": ["A > B", "A - B"],
-            "park": ["0.1,0.2,0.3", "d 10.0 0.5"],
-            "stations": [
-                "type: lighthouse_system_configuration\nversion: '1'\nsystemType: 2\ngeos:\n  0:\n"
-                "    origin: [0, 0, 1]\n    rotation: [[1,0,0],[0,1,0],[0,0,1]]\ncalibs: {}\n"],
-        }  # fmt: skip
-        examples = [f"{kind}\0{text}".encode() for kind, texts in good_words.items() for text in texts]
+        examples = [line.replace(" ", "\0", 1).encode() for line in WORDS.strip().splitlines()]
+        examples.append(b"stations\0type: lighthouse_system_configuration\nversion: '1'\nsystemType: 2\ngeos:\n  0:\n"
+                        b"    origin: [0, 0, 1]\n    rotation: [[1,0,0],[0,1,0],[0,0,1]]\ncalibs: {}\n")  # fmt: skip
         names = list(read)
 
         def take(data):
@@ -416,8 +407,8 @@ PLACES = {
     "arena": Place(arena, 8_000, 40),
     "overrides": Place(overrides, 12_000, 60),
     "park-yaml": Place(park_yaml, 4_000, 25),
-    "damaged-recording": Place(damaged, 10_000, 60),
-    "forged-recording": Place(forged, 10_000, 60),
+    "damaged-recording": Place(partial(recording_of, plain=False), 10_000, 60),
+    "forged-recording": Place(partial(recording_of, plain=True), 10_000, 60),
     "cdr": Place(cdr, 50_000, 500),
     "sweep-runs": Place(sweep_runs, 30_000),
     "run-files": Place(run_files, 10_000),

@@ -1,9 +1,9 @@
 """Whatever arrives on the network: the messages themselves, and every process that polls it."""
 
-import io
 import tempfile
 import time
-from contextlib import ExitStack, closing, redirect_stdout, suppress
+from contextlib import ExitStack, closing, suppress
+from functools import cache, partial
 from itertools import count
 from math import isnan
 from pathlib import Path
@@ -19,7 +19,6 @@ from agents.runtime.loop import Runtime, Setup
 from agents.vectors import is_finite
 from bridges.external import ExternalBody
 from experiments.definition import bodies
-from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.real_time.conductor import orders
 from experiments.real_time.conductor.case_processes import CaseContext
@@ -31,7 +30,7 @@ from experiments.real_time.processes.world import WorldProcess
 from experiments.real_time.processes.world_population import WorldBodies
 from experiments.recording.writer import Recording
 from tests.fuzz.messages import KEYS, everything, good, of_all, sent
-from tests.fuzz.target import Place, Renewed, Target
+from tests.fuzz.target import Place, Target, networked
 from tests.network import Net, Reply, Sample
 from tests.requests import request
 from tools.commands.network import members, readable
@@ -59,18 +58,19 @@ class HandDrivenConductor(Conductor):
         self._update()
 
 
-RUBBISH = io.StringIO()  # where processes say what they would say on a terminal
+@cache
+def triangle(*changes):
+    return document.read("triangle", changes).plan
+
+
+REPLIES = (wire.Reply("KH01", True, "ready", "", 0.1), wire.WorldReply(True, False, 0.1, ""))
 
 
 def messages():
     """Every struct, both encodings: what is decoded can be encoded again."""
     kinds = {kind.__name__: kind for kind in wire.Message.__subclasses__()}
-    examples = []
-    for said in [*good("KH01").values(), *of_all().values()]:
-        for message in said:
-            examples += sent(type(message).__name__, message)
-    for kind in (wire.Reply("KH01", True, "ready", "", 0.1), wire.WorldReply(True, False, 0.1, "")):
-        examples += sent(type(kind).__name__, kind)
+    several = [*good("KH01").values(), *of_all().values(), REPLIES]
+    examples = [part for said in several for each in said for part in sent(type(each).__name__, each)]
     names = list(kinds.values())
 
     def take(data):
@@ -85,109 +85,91 @@ def messages():
     yield Target(examples, take, (wire.Malformed,))
 
 
-def robot():
+THREE = partial(everything, "KH01", "KH02", "CF01")
+
+
+@networked(200, THREE)
+def robot(net):
     """A robot's process: poses, tokens, orders, stops, positions, ranges; its body is never told nonsense."""
-    experiment = document.read("triangle", ["robots.KH01.position=external", "avoidance=barrier"]).experiment
+    plan = triangle("robots.KH01.position=external", "avoidance=barrier")
+    body = assemble(bodies.body_request(plan, ["KH01"], 1, ["tcp/127.0.0.1:1"]))
+    setup = Setup(KEYS, [], "json", 50.0, lifeline=False, externally_measured=[True], ranging=["world"])
+    runtime = HandDrivenRobot([plan.assignment("KH01")], body, setup)
+    body.open()
+    runtime.subscribe_to_stops(net.session)
+    runtime.join(net.session)
+    began, command = time.time(), body.command
+    runtime.begin(began)
 
-    def make():
-        net.forget()
-        body = assemble(bodies.body_request(Plan(experiment), ["KH01"], 1, ["tcp/127.0.0.1:1"]))
-        setup = Setup(KEYS, [], "json", 50.0, lifeline=False, externally_measured=[True], ranging=["world"])
-        runtime = HandDrivenRobot([Plan(experiment).assignment("KH01")], body, setup)
-        body.open()
-        runtime.subscribe_to_stops(net.session)
-        runtime.join(net.session)
-        began, command = time.time(), body.command
-        runtime.begin(began)
+    def told(setpoints):
+        assert all(isnan(number) or abs(number) < 10.0 for setpoint in setpoints for number in setpoint), setpoints
+        command(setpoints)
 
-        def told(setpoints):
-            for setpoint in setpoints:
-                assert all(isnan(number) or abs(number) < 10.0 for number in setpoint), setpoint
-            command(setpoints)
-
-        body.command = told
-        for k in range(1, 6):
-            for name in ("KH01", "KH02", "CF01"):
-                for what in ("pose", "position"):
-                    message = msgspec.structs.replace(good(name)[what][0], stamp=began + 0.01 * k)
-                    if what == "pose":
-                        message = msgspec.structs.replace(message, seq=k)
-                    net.deliver(sent(f"park/{name}/{what}", message)[0])
-                net.deliver(f"park/{name}/alive\0\0".encode())
-            if k > 2:
-                order = wire.Order("takeoff") if k == 3 else wire.Order("start", at=began + 0.01 * k)
-                net.deliver(sent("park/KH01/order", order)[0])
-            runtime.tick(0.01 * k)
-        for k in count(6):
-            data = yield
-            net.deliver(data, gone=len(data) % 16 == 0)
-            runtime.tick(0.01 * k)
-
-    with Net().worn() as net, redirect_stdout(RUBBISH):
-        yield Target(everything("KH01", "KH02", "CF01"), Renewed(make, 200))
+    body.command = told
+    for k in range(1, 6):
+        for name in ("KH01", "KH02", "CF01"):
+            for what, counted in (("pose", {"seq": k}), ("position", {})):
+                message = msgspec.structs.replace(good(name)[what][0], stamp=began + 0.01 * k, **counted)
+                net.deliver(sent(f"park/{name}/{what}", message)[0])
+            net.deliver(f"park/{name}/alive\0\0".encode())
+        if k > 2:
+            order = wire.Order("takeoff") if k == 3 else wire.Order("start", at=began + 0.01 * k)
+            net.deliver(sent("park/KH01/order", order)[0])
+        runtime.tick(0.01 * k)
+    for k in count(6):
+        data = yield
+        net.deliver(data, gone=len(data) % 16 == 0)
+        runtime.tick(0.01 * k)
 
 
-def world():
+@networked(200, THREE)
+def world(net):
     """The twin service: commands, states of those elsewhere, statuses, and orders to put things in and out."""
-    changes = ["robots.KH01.body=world", "robots.KH02.body=world", "world.engine=pymunk"]
-    experiment = document.read("triangle", changes).experiment
-
-    def make():
-        net.forget()
-        joint = Network(net.session, KEYS, [], [], OwnershipCheck([]))
-        population = WorldBodies(Plan(experiment))
-        process = HandDrivenWorld(Plan(experiment), population, joint, Event())
-        process.utc = time.time()
-        for k in count(1):
-            net.deliver((yield))
-            process.step(0.01 * k)
-            for carried, state in zip(population.carried, population.states, strict=True):
-                assert not carried or is_finite(state.position)
-
-    with Net().worn() as net, redirect_stdout(RUBBISH):
-        yield Target(everything("KH01", "KH02", "CF01"), Renewed(make, 200))
+    plan = triangle("robots.KH01.body=world", "robots.KH02.body=world", "world.engine=pymunk")
+    population = WorldBodies(plan)
+    process = HandDrivenWorld(plan, population, Network(net.session, KEYS, [], [], OwnershipCheck([])), Event())
+    process.utc = time.time()
+    for k in count(1):
+        net.deliver((yield))
+        process.step(0.01 * k)
+        for carried, state in zip(population.carried, population.states, strict=True):
+            assert not carried or is_finite(state.position)
 
 
-def recorder():
+@networked(1000, partial(everything, "KH01", "KH02"))
+def recorder(net):
     """The recorder writes what is honest and counts the rest; what it wrote can be read."""
-    experiment = document.read("triangle").experiment
-
-    def make():
-        net.forget()
-        path = Path(folder) / f"{time.monotonic_ns()}.mcap"
-        with Recording(path, Plan(experiment), case="only", seed=1, clock="real") as recording:
-            made = Recorder(net.session, KEYS, recording)
-            while True:
-                net.deliver((yield))
-                made.receive()
-
-    with tempfile.TemporaryDirectory() as folder, Net().worn() as net, closing(Renewed(make, 1000)) as take:
-        yield Target(everything("KH01", "KH02"), take)
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        Recording(Path(folder) / "x.mcap", triangle(), case="only", seed=1, clock="real") as recording,
+    ):
+        made = Recorder(net.session, KEYS, recording)
+        while True:
+            net.deliver((yield))
+            made.receive()
 
 
-def conductor():
+class NoLauncher:
+    last_silence = -np.inf
+
+    def died(self):
+        return []
+
+    def running(self, _name):
+        return False
+
+    def start(self, *_, forked=False): ...
+
+    release = kill = start
+
+
+@networked(500, THREE)
+def conductor(net):
     """The conductor follows the robots' statuses, states and tokens, and changes robots when it is asked."""
-    experiment = document.read("triangle").experiment
-
-    class Nobody:
-        last_silence = -np.inf
-
-        def died(self):
-            return []
-
-        def running(self, _name):
-            return False
-
-        def start(self, *_, forked=False): ...
-
-        release = kill = start
-
-    def make():
-        net.forget()
-        context = CaseContext(
-            Plan(experiment), "only", Path(folder), source=Path(folder) / "only.json", endpoints=["tcp/127.0.0.1:1"],
-            launcher=Nobody(), hosts=Hosts(Nobody(), []),
-        )  # fmt: skip
+    launcher = NoLauncher()
+    with tempfile.TemporaryDirectory() as name:
+        folder, hosts = Path(name), Hosts(launcher, [])
+        context = CaseContext(triangle(), "only", folder, folder / "x", ["tcp/127.0.0.1:1"], launcher, hosts)
         made = HandDrivenConductor(context, lambda _: None)
         made.begin()
         while True:
@@ -195,53 +177,36 @@ def conductor():
             net.deliver(data, gone=len(data) % 16 == 0)
             made.step()
 
-    with tempfile.TemporaryDirectory() as folder, Net().worn() as net, redirect_stdout(RUBBISH):
-        yield Target(everything("KH01", "KH02", "CF01"), Renewed(make, 500))
 
-
-def external_body():
+@networked(200, partial(everything, "KH01", "KH02", only=("position", "ranges", "state")))
+def external_body(net):
     """A body elsewhere says where it is and what it sees."""
+    names = ["KH01", "KH02"]
+    for name in names:
+        place = wire.Position(name, time.time(), (0.0, 0.0, 0.0), 0.1)
+        net.first[KEYS.position(name)] = Sample(KEYS.position(name), wire.JSON, wire.encode(place))
+    body = ExternalBody(request("khepera4", ["external"] * 2, names=names, endpoints=["tcp/127.0.0.1:1"]))
+    body.open()
+    for k in count(1):
+        net.deliver((yield))
+        assert all(is_finite(state.position) for state in body.read(0.01 * k))
+        body.command([(0.0, 0.0, 0.0, 0.0)] * 2)
 
-    def make():
-        net.forget()
-        for name in ("KH01", "KH02"):
-            key = KEYS.position(name)
-            place = wire.Position(name, time.time(), (0.0, 0.0, 0.0), 0.1)
-            net.first[key] = Sample(key, wire.JSON, wire.encode(place))
-        body = ExternalBody(
-            request("khepera4", ["external"] * 2, names=["KH01", "KH02"], endpoints=["tcp/127.0.0.1:1"])
-        )
-        body.open()
+
+@networked(10_000, partial(everything, "KH01", "KH02", only=("truth",)))
+def vicon_truths(net):
+    """The simulated Vicon hears where twins are."""
+    with closing(ViconTwin(["KH01", "KH02"])) as vicon:
+        truths = TruthSubscription(net.session, KEYS, ["KH01", "KH02"])
         for k in count(1):
             net.deliver((yield))
-            assert all(is_finite(state.position) for state in body.read(0.01 * k))
-            body.command([(0.0, 0.0, 0.0, 0.0)] * 2)
-
-    with Net().worn() as net:
-        yield Target(everything("KH01", "KH02", only=("position", "ranges", "state")), Renewed(make, 200))
-
-
-def vicon_truths():
-    """The simulated Vicon hears where twins are."""
-
-    def make():
-        net.forget()
-        with closing(ViconTwin(["KH01", "KH02"])) as vicon:
-            truths = TruthSubscription(net.session, KEYS, ["KH01", "KH02"])
-            for k in count(1):
-                net.deliver((yield))
-                truths.update(vicon, time.time())
-                vicon.advance(0.01 * k)
-
-    with Net().worn() as net, closing(Renewed(make, 10_000)) as take:
-        yield Target(everything("KH01", "KH02", only=("truth",)), take)
+            truths.update(vicon, time.time())
+            vicon.advance(0.01 * k)
 
 
 def answers():
     """Answers to orders, and the admin space that network tools read."""
-    examples = []
-    for message in (wire.Reply("KH01", True, "ready", "", 0.1), wire.WorldReply(True, False, 1.0, "")):
-        examples += sent("park/KH01/order", message)
+    examples = [part for message in REPLIES for part in sent("park/KH01/order", message)]
     admin = {
         "@/f00d/router/token/park/KH01/alive": b'{"clients":["aa","bb"],"peers":[]}',
         "@/f00d/router/publisher/park/KH01/pose": b'{"clients":["aa"]}',

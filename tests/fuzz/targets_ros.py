@@ -12,8 +12,8 @@ from agents.vectors import is_finite
 from bridges.ros2 import Graph
 from bridges.turtlebot3.body import TurtleBot3
 from tests.fuzz.messages import everything
-from tests.fuzz.target import Place, Renewed, Target
-from tests.network import Net, Sample
+from tests.fuzz.target import Place, Target, networked
+from tests.network import Sample
 from tests.requests import request
 from twins.devices.device import DeviceRequest, Faults
 from twins.devices.turtlebot3 import TurtleBot3Twin
@@ -59,11 +59,11 @@ def ros():
     """CDR of every type, tokens and attachments: kind and payload with a zero byte between them."""
     types = ros2.types("jazzy")
     good = ros_messages()
+    topic = ros2.endpoint_topic("/tb3_0/odom", ros2.ODOMETRY, ros2.RELIABLE, types)
     tokens = [
-        ros2.endpoint_token(0, "f00d", 0, 1, "MP", "tb3_0", "node", ros2.endpoint_topic("/tb3_0/odom",
-        ros2.ODOMETRY, ros2.RELIABLE, types)),
+        ros2.endpoint_token(0, "f00d", 0, 1, "MP", "tb3_0", "node", topic),
         ros2.dds_token("f00d", "MS", "/tb3_0/cmd_vel", ros2.TWIST),
-    ]  # fmt: skip
+    ]
     examples = [kind.encode() + b"\0" + payload for kind, payload in good.items()]
     examples += [b"token\0" + token.encode() for token in tokens] + [b"attached\0" + ros2.attachment(1, 2, bytes(16))]
 
@@ -87,66 +87,54 @@ class HastyTurtleBot3(TurtleBot3):
         self._claims.release()
 
 
-def turtlebot_bridge():
-    """Odometry, scans, batteries and tokens of a robot."""
+def turtlebot_messages():
     good = ros_messages()
     topics = {"odom": ros2.ODOMETRY, "scan": ros2.LASER_SCAN, "battery_state": ros2.BATTERY_STATE}
-    examples = [f"tb3_0/{topic}\0\0".encode() + good[kind] for topic, kind in topics.items()]
-    examples += [ros2.dds_token("f00d", "MS", "/tb3_0/cmd_vel", ros2.TWIST_STAMPED).encode() + b"\0\0"]
-
-    def make():
-        net.forget()
-        net.first["tb3_0/odom"] = Sample("tb3_0/odom", "", good[ros2.ODOMETRY])
-        with closing(HastyTurtleBot3(request("turtlebot3", "ros2dds://tb3_0"))) as body:
-            body.open()
-            for k in count(1):
-                data = yield
-                net.deliver(data, gone=len(data) % 16 == 0)
-                (state,) = body.read(0.01 * k)
-                assert is_finite(state.position)
-                body.command([(0.1, 0.2, 0.0, 0.0)])
-
-    with Net().worn() as net, closing(Renewed(make, 200)) as take:
-        yield Target(examples, take)
+    token = ros2.dds_token("f00d", "MS", "/tb3_0/cmd_vel", ros2.TWIST_STAMPED).encode() + b"\0\0"
+    return [*(f"tb3_0/{topic}\0\0".encode() + good[kind] for topic, kind in topics.items()), token]
 
 
-def turtlebot_twin():
-    """Commands to the twin of a robot."""
-    good = ros_messages()
-
-    def make():
-        net.forget()
-        device = TurtleBot3Twin(DeviceRequest(request("turtlebot3", "turtlebot3-twin"), Faults()))
+@networked(200, turtlebot_messages)
+def turtlebot_bridge(net):
+    """Odometry, scans, batteries and tokens of a robot."""
+    net.first["tb3_0/odom"] = Sample("tb3_0/odom", "", ros_messages()[ros2.ODOMETRY])
+    with closing(HastyTurtleBot3(request("turtlebot3", "ros2dds://tb3_0"))) as body:
+        body.open()
         for k in count(1):
-            net.deliver((yield))
-            device.advance(0.01 * k)
-            assert np.isfinite(device.truth()[0]).all()
-
-    with Net().worn() as net:
-        yield Target([b"KH01/cmd_vel\0\0" + good[ros2.TWIST_STAMPED]], Renewed(make, 300))
-
-
-def ros_graph():
-    """The bridge to ROS 2: states and statuses of robots, goals from ROS."""
-    good = ros_messages()
-    examples = everything("KH01", "KH02", only=("state", "ranges", "status"))
-
-    def make():
-        net.forget()
-        participant = Participant(net.session, ros2.types("jazzy"), style="rmw")
-        graph = Graph(net.session, participant, Keys())
-        net.deliver(b"park/KH01/alive\0\0")
-        graph.poll()
-        while True:
             data = yield
             net.deliver(data, gone=len(data) % 16 == 0)
-            graph.poll()
+            (state,) = body.read(0.01 * k)
+            assert is_finite(state.position)
+            body.command([(0.1, 0.2, 0.0, 0.0)])
 
-    with Net().worn() as net:
-        next(make())
-        goals = [channel.key for channel in net.channels if "/goal" in channel.key]
-        examples += [key.encode() + b"\0\0" + good[ros2.POSE_STAMPED] for key in goals]
-        yield Target(examples, Renewed(make, 200))
+
+@networked(300, lambda: [b"KH01/cmd_vel\0\0" + ros_messages()[ros2.TWIST_STAMPED]])
+def turtlebot_twin(net):
+    """Commands to the twin of a robot."""
+    device = TurtleBot3Twin(DeviceRequest(request("turtlebot3", "turtlebot3-twin"), Faults()))
+    for k in count(1):
+        net.deliver((yield))
+        device.advance(0.01 * k)
+        assert np.isfinite(device.truth()[0]).all()
+
+
+def park_and_goal():
+    key = ros2.topic_key("rmw", "/KH01/goal", ros2.POSE_STAMPED, domain=0, types=ros2.types("jazzy"))
+    goal = key.encode() + b"\0\0" + ros_messages()[ros2.POSE_STAMPED]
+    return [*everything("KH01", "KH02", only=("state", "ranges", "status")), *[goal] * 10]
+
+
+@networked(200, park_and_goal)
+def ros_graph(net):
+    """The bridge to ROS 2: states and statuses of robots, goals from ROS."""
+    participant = Participant(net.session, ros2.types("jazzy"), style="rmw")
+    graph = Graph(net.session, participant, Keys())
+    net.deliver(b"park/KH01/alive\0\0")
+    graph.poll()
+    while True:
+        data = yield
+        net.deliver(data, gone=len(data) % 16 == 0)
+        graph.poll()
 
 
 PLACES = {

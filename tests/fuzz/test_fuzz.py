@@ -1,7 +1,4 @@
-"""Nothing that arrives from outside escapes as a traceback: a few hundred spoilt inputs each, and those that once did.
-
-`./zenpark test --all` tries a million; what it finds is added to the folder `once`.
-"""
+"""No traceback escapes from spoilt inputs, a few hundred each, nor from those in `once`, which did so once."""
 
 from pathlib import Path
 
@@ -30,20 +27,14 @@ def test_nothing_escapes(name):
 def once():
     """Inputs that escaped once, with the number of bytes to try."""
     for file in ONCE:
-        size = file.stat().st_size
-        yield pytest.param(file, size, id=file.stem, marks=[pytest.mark.nightly] * (size > HUGE))
-        if size > HUGE:
+        if file.stat().st_size > HUGE:
             yield pytest.param(file, SHORT, id=f"{file.stem}-begins")
+        yield pytest.param(file, None, id=file.stem, marks=[pytest.mark.nightly] * (file.stat().st_size > HUGE))
 
 
 @pytest.mark.parametrize(("file", "size"), list(once()))
 def test_what_escaped_once_does_not_again(file, size):
-    assert replay(PLACES[file.name.partition("--")[0]], file.read_bytes()[:size])
-
-
-def test_every_example_is_found_by_name():
-    assert {file.name.partition("--")[0] for file in ONCE} <= set(PLACES)
-    assert sum(place.inputs for place in PLACES.values()) >= 1_000_000
+    assert replay(file, size)
 
 
 def test_inputs_repeat_with_the_seed_and_stay_short():
@@ -60,8 +51,5 @@ def test_what_escapes_is_told_with_its_place():
         return data[3] if len(data) < 10 else int(data)
 
     tally = drive(Target([b"123456"], careless, (ValueError,)), 300, 1, bombs=True)
-    assert tally.inputs == 300
-    assert tally.refused > 0
-    (way,) = tally.escaped
-    assert way.startswith("IndexError in test_fuzz.py")
-    assert len(tally.kept) == 1
+    assert 0 < tally.refused < tally.inputs == 300
+    assert [way.rpartition(":")[0] for way in tally.kept] == ["IndexError in test_fuzz.py"]
