@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
-from dataclasses import dataclass
-from math import dist, inf, nan
+from math import dist, inf
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,13 +12,12 @@ from agents.decision.transmission import Transmitter
 from agents.kinds.khepera4 import KHEPERA4
 from agents.plugins.predictors import HOLD, Predictor
 from agents.plugins.triggers import Trigger
-from agents.vectors import NO_SETPOINT, Vector
+from agents.vectors import NO_SETPOINT, UNKNOWN, ZERO, Vector
 
 DT = 0.02
 
 
-@dataclass(frozen=True)
-class Moment:
+class Moment(NamedTuple):
     """Quantities of a robot at one question."""
 
     position: Vector
@@ -43,7 +41,7 @@ def wander(seed: int, ticks: int) -> list[Moment]:
 
 def standing(ticks: int, position: Vector = (0.0, 0.0, 0.0)) -> list[Moment]:
     """A robot that stays, without errors."""
-    return [Moment(position, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0, 0.0)] * ticks
+    return [Moment(position, ZERO, ZERO, 0.0, 0.0)] * ticks
 
 
 class Play:
@@ -51,33 +49,22 @@ class Play:
 
     Attributes:
         fired: Whether there was an event, at each question.
-        gap_before: ‖ε‖ when it was asked [m], infinite at first; `gap_after`: what was left then.
+        gaps: ‖ε‖ when it was asked [m], infinite at first.
+        intervals: Questions from each event to the next.
     """
 
     def __init__(self, trigger: Trigger, signal: list[Moment], *, predictor: Predictor = HOLD, dt: float = DT) -> None:
-        self.transmitter = Transmitter(trigger, predictor, KHEPERA4)
+        transmitter = Transmitter(trigger, predictor, KHEPERA4)
         self.fired: list[bool] = []
-        self.gap_before: list[float] = []
-        self.gap_after: list[float] = []
-        last = self.transmitter.asking.last
+        self.gaps: list[float] = []
+        last = transmitter.asking.last
         for k, moment in enumerate(signal):
             t = k * dt
-            held = predictor.position(last, t - last.time) if last.time > -inf else (nan, nan, nan)
-            fired = self.transmitter.transmits(
+            held = predictor.position(last, t - last.time) if last.time > -inf else UNKNOWN
+            fired = transmitter.transmits(
                 t, moment.position, moment.velocity, moment.error, moment.energy, t, moment.offset, NO_SETPOINT
             )
-            gap = dist(self.transmitter.position, held) if k else inf
             self.fired.append(fired)
-            self.gap_before.append(gap)
-            self.gap_after.append(0.0 if fired else gap)
-
-    @property
-    def events(self) -> Iterator[int]:
-        """Numbers of the questions that had an event."""
-        return (k for k, fired in enumerate(self.fired) if fired)
-
-    @property
-    def intervals(self) -> list[int]:
-        """Questions from each event to the next."""
-        events = list(self.events)
-        return [later - earlier for earlier, later in itertools.pairwise(events)]
+            self.gaps.append(dist(transmitter.position, held) if k else inf)
+        events = [k for k, fired in enumerate(self.fired) if fired]
+        self.intervals = [later - earlier for earlier, later in itertools.pairwise(events)]

@@ -90,36 +90,29 @@ def test_unreceived_neighbour_hides_no_lost_one():
     assert bench.robot.goal == HERE  # alone: it holds
 
 
-@pytest.mark.parametrize("what", ["neighbour", "router"])
-def test_robot_alone_or_offline_holds_and_goes_on(what):
-    swarm = Swarm(pair()).running().run(0.5)
-    health = swarm.robot("A").health
+@pytest.mark.parametrize("what", ["neighbour", "router", "order"])
+def test_robot_holds_and_goes_on(what):
+    swarm = Swarm(pair())
+    swarm.step()
+    robot = swarm.robot("A")
+    assert robot.hold() == "cannot hold while idle"
+    swarm.running().run(0.5)
     if what == "neighbour":
         swarm.lose("B", "A")
-    else:
-        health.offline_since = swarm.t
+    elif what == "router":
+        robot.health.offline_since = swarm.t
     busy = swarm.run(0.9).last("A", "goal")
+    if what == "order":
+        assert robot.hold() == ""
     held = swarm.run(0.3).last("A", "goal")
     assert held != busy
     assert swarm.run(1.0).last("A", "goal") == held
     assert dist(swarm.last("A", "truth"), held) < 0.02
+    assert swarm.phase("A") == RUNNING
     if what == "neighbour":
         swarm.find("B", "A")
-    health.offline_since = inf
-    assert swarm.run(0.2).last("A", "goal") != held
-
-
-def test_hold_and_start_again():
-    swarm = Swarm(pair())
-    robot = swarm.robot("A")
-    swarm.step()
-    assert robot.hold() == "cannot hold while idle"
-    swarm.running().run(0.3)
-    assert robot.hold() == ""
-    held = swarm.run(0.2).last("A", "goal")
-    assert swarm.run(0.5).last("A", "goal") == held
-    assert swarm.phase("A") == RUNNING
-    assert robot.start(0.0) == ""
+    robot.health.offline_since = inf
+    assert what != "order" or robot.start(0.0) == ""
     assert swarm.run(0.2).last("A", "goal") != held
     assert robot.lifecycle.start_at == swarm.start_at
 

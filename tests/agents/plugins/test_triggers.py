@@ -225,7 +225,7 @@ def test_self_triggered_bounds_bounded_accelerations(seed, bound):
     signal = [signals.Moment(tuple(p), tuple(v), (0.0, 0.0, 0.0), 0.0, 0.0) for p, v in poses]
     play = Play(SelfTriggered(threshold=0.01, acceleration=bound), signal, dt=dt)
     for k in range(1, 400):  # it may be late by one question
-        assert play.gap_before[k] <= 0.01 + dt * hypot(*signal[k].velocity) + 1e-9
+        assert play.gaps[k] <= 0.01 + dt * hypot(*signal[k].velocity) + 1e-9
     assert 2 <= sum(play.fired) <= 200
 
 

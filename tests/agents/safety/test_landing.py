@@ -10,7 +10,7 @@ import pytest
 from agents.body.interface import BodyState, Disturbance
 from agents.body.kinds import KINDS
 from agents.body.limits import Limits
-from agents.decision.lifecycle import DONE, LANDING, RUNNING
+from agents.decision.lifecycle import DONE, RUNNING
 from agents.decision.neighbours import Incoming, Neighbours
 from agents.decision.situation import ProcessHealth, Situation
 from agents.kinds.crazyflie import CRAZYFLIE
@@ -196,28 +196,6 @@ def test_landing_drones_touch_no_robot(seed):
             bench.until_down()
 
 
-def test_run_ends_beside_a_robot_below():
-    """The links put the drone over the robot on wheels."""
-    robots = {
-        name: RobotTable(kind=kind, start=[x, 0.0], hover=hover)
-        for name, kind, x, hover in (
-            ("G", "khepera4", 0.0, None),
-            ("F", "crazyflie", 0.3, 0.8),
-            ("H", "crazyflie", -0.4, 0.8),
-        )
-    }
-    swarm = Swarm(small(robots, {"G > F": 0.8, "H > F": 0.4}, duration_s=3.0)).until(LANDING)
-    robot, waited = swarm.robot("F"), False
-    while swarm.phase("F") != DONE:
-        assert swarm.t - swarm.start_at < 15.0
-        swarm.step()
-        waited |= robot.landing.aside
-    assert waited
-    assert dist(swarm.last("F", "truth")[:2], swarm.last("G", "truth")[:2]) > 0.09
-    told = [each.text for each in robot.hazards.incidents if each.cause == Cause.BELOW]
-    assert told[0] == "warn: a robot is below it: G; it goes aside first"
-
-
 @pytest.mark.parametrize("trigger", ["send-on-delta", "predictive"])
 def test_drone_lands_beside_robot_that_died_moving(trigger):
     drone = RobotTable(kind="crazyflie", start=[0.0, 0.0], hover=1.0)
@@ -234,6 +212,8 @@ def test_drone_lands_beside_robot_that_died_moving(trigger):
     swarm.run(3.0)
     robot.lifecycle.land("ordered to land")
     swarm.until(DONE)
+    told = [each.text for each in robot.hazards.incidents if each.cause == Cause.BELOW]
+    assert told[0] == "warn: a robot is below it: K; it goes aside first"
     assert dist(swarm.last("F", "truth")[:2], place) - CRAZYFLIE.radius - KHEPERA4.radius > NEAR
 
 
