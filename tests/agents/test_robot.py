@@ -137,14 +137,6 @@ def test_leader_goes_where_it_is_sent():
     assert dist(swarm.run(8.0).last("L", "truth"), (0.0, 0.1, 0.0)) < 0.01
 
 
-def test_pair_comes_to_its_distance():
-    swarm = Swarm(pair()).running().run(25.0)
-    apart = dist(swarm.last("A", "truth"), swarm.last("B", "truth"))
-    assert apart == pytest.approx(0.5, abs=0.012)  # both stand within 5 mm of their goals
-    assert swarm.last("A", "error") == pytest.approx(abs(apart - 0.5), abs=1e-9)
-    assert swarm.robot("A").decisions == 251  # at 0 and at 25 s
-
-
 def test_decisions_and_questions_keep_their_rates():
     swarm = Swarm(pair(formation=Formation(links={"A - B": 0.5}, gain=50.0, clamp=0.07))).running()
     begin = swarm.tick

@@ -202,5 +202,4 @@ class Counting(Trigger, frozen=True):
 
 
 def test_rehearsal_leaves_no_trace():
-    bench = idle(trigger=Counting()).step()
-    assert bench.robot.transmitter.asking.view.memory.asked == 1
+    assert idle(trigger=Counting()).step().robot.transmitter.asking.view.memory.asked == 1

@@ -71,10 +71,7 @@ def law_findings(name, *changes):
 
 @pytest.mark.parametrize(
     ("name", "link", "found", "mends"),
-    [
-        ("auction", " - CF", "do not reach", ""),
-        ("average", "KH06 - KH01", "KH01 receives KH06", '"KH06 - KH01"'),
-    ],
+    [("auction", " - CF", "do not reach", ""), ("average", "KH06 - KH01", "KH01 receives KH06", '"KH06 - KH01"')],
 )
 def test_links_of_one_way_are_found(name, link, found, mends):
     """Bids that do not come back, and averages that are none."""
