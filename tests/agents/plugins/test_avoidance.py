@@ -202,12 +202,15 @@ def test_things_all_around_are_obeyed(around, wanted):
 
 
 def test_nearest_velocities_that_are_known():
-    for wanted, planes, found in (
-        ((0.1, 1 / 3), [(0.0, 0.3), (2.0, 0.4)], (0.1, 1 / 3)),
-        ((1.0, 1.0), [(0.0, 0.1), (0.5 * pi, 0.2)], (0.1, 0.2)),  # a corner
-        ((0.0, 0.0), [(0.0, -0.1), (pi, -0.3)], (0.1, 0.0)),  # the least violation of both
+    for wanted, speed, planes, found in (
+        ((0.1, 1 / 3), inf, [(0.0, 0.3), (2.0, 0.4)], (0.1, 1 / 3)),
+        ((1.0, 1.0), inf, [(0.0, 0.1), (0.5 * pi, 0.2)], (0.1, 0.2)),  # a corner
+        ((1.0, 1.0), 0.5, [(0.0, 0.3)], (0.3, 0.4)),  # on the border at full speed
+        ((0.0, 0.0), inf, [(0.0, -0.1), (pi, -0.3)], (0.1, 0.0)),  # the least violation of both
+        ((0.0, 1.0), inf, [(0.0, -0.4), (pi, 0.3), (pi, 0.2)], (-0.2, 1.0)),  # a bound above 0 does not give way
+        ((1.0, 1.0), inf, [(k * pi / 1.5, -0.2) for k in range(3)], (0.0, 0.0)),
     ):
-        assert nearest(wanted, planes) == pytest.approx(found, abs=1e-6)
+        assert nearest(wanted, planes, speed) == pytest.approx(found, abs=1e-6)
     free = nearest((1.0, 1.0), [(0.7, -2.0)])  # too fast to flee from: the direction is kept at full speed
     share = 0.5 / hypot(*free)
     assert nearest((1.0, 1.0), [(0.7, -2.0)], 0.5) == pytest.approx((share * free[0], share * free[1]), abs=1e-7)
