@@ -127,7 +127,7 @@ def test_lost_drone_may_have_come_down(height, before, after):
     assert reaches_of(sight.sense(9.0, (0.0, 0.0, height))) == [(0.0, 1.0 + CRAZYFLIE.height)] * after
 
 
-def test_far_robots_and_those_of_a_lost_one_are_ignored():
+def test_far_robots_and_lost_positions_are_ignored():
     assert Sight().hear((SIGHT_M + 0.01, 0.0, 0.0), stamp=9.0).sense(9.0) == []
     assert Sight().sense(9.0) == []  # never received
     for how in ({"position": (nan, 0.0, 0.0)}, {"yaw": nan}, {"time": 8.4}):
