@@ -1,4 +1,4 @@
-"""A recording is read back as what was written: what is between, what is missing, begin, end, clocks set right."""
+"""A recording is read back as what was written: gaps, begin, end, clocks set right; odd messages change nothing."""
 
 import math
 
@@ -9,12 +9,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import Writer
+from msgspec.structs import replace
 
-from agents.network.messages import CentreState, Event, GoalReceipt, HostClock, PoseReceipt, State
+from agents.network.messages import CentreState, Event, GoalReceipt, HostClock, Pose, PoseReceipt, State
 from experiments.definition.experiment import Formation, Rates, RobotTable
+from experiments.metrics.measure import measure
 from experiments.recording.clocks import ClockSample, Correction, host_offset
+from experiments.recording.losses import count_in_run
 from experiments.recording.playback import NotStarted, read
 from experiments.recording.reader import RecordingError, recover
+from experiments.run import reopen
 from experiments.scene import tracks
 from tests.experiments import recordings as rec
 
@@ -71,21 +75,25 @@ def test_no_contacts_differ_from_no_contact_detection(path, engine, contacts):
 def test_attitude_interpolates_the_short_way_on_recorded_side(path):
     half, sign = 0.1 * np.arange(12), np.array([-1.0 if k in {3, 4, 5} else 1.0 for k in range(12)])
     turned = (sign * [np.cos(half), 0.0 * half, np.sin(half), 0.0 * half]).T.tolist()
-    trace = rec.trace_of(
-        path, rec.begun(), *[rec.state(at=k / 10 - 0.05, attitude=tuple(turned[k])) for k in range(12)]
-    )
-    half = half[:11] + 0.05
+    said = [
+        rec.state(at=at, x=at, attitude=tuple(turned[k]), shadow_position=(at, 0.1, 0.0), shadow_yaw=3.0 + at)
+        for k, at in enumerate((np.arange(12) / 10 - 0.05).tolist())
+    ]
+    trace, half = rec.trace_of(path, rec.begun(), *said), half[:11] + 0.05
     wanted = (sign[:11] * [np.cos(half), 0.0 * half, np.sin(half), 0.0 * half]).T
     np.testing.assert_allclose(trace.attitude[:, 0], wanted, atol=1e-6)
-    assert np.isnan(trace.attitude[:, 1]).all()
-
-
-def test_where_the_twin_beside_a_robot_was(path):
-    beside = [rec.state(at=at, x=at, shadow_position=(at, 0.1, 0.0), shadow_yaw=3.0 + at) for at in GRID.tolist()]
-    trace = rec.trace_of(path, rec.begun(), *beside)
     np.testing.assert_allclose(trace.shadow_position[:, 0] - trace.position[:, 0], np.tile([0.0, 0.1, 0.0], (11, 1)))
     np.testing.assert_allclose(trace.shadow_yaw[:, 0], 3.0 + GRID, atol=1e-6)
-    assert np.isnan(trace.shadow_position[:, 1]).all()
+    for array in (trace.attitude, trace.shadow_position):
+        assert np.isnan(array[:, 1]).all()
+
+
+@pytest.mark.parametrize("yaw", [[math.remainder(0.9 * k, math.tau) for k in range(11)], [None] * 5 + [0.3] * 6])
+def test_yaw_keeps_the_branch_it_was_recorded_on(path, yaw):
+    trace = rec.trace_of(path, rec.begun(), *[rec.state(at=k / 10, yaw=value) for k, value in enumerate(yaw)])
+    found, known = trace.yaw[:, 0], yaw.count(None)
+    np.testing.assert_allclose(found[known:], yaw[known:], atol=1e-5)
+    assert np.isnan(found[: max(known - 2, 0)]).all()
 
 
 def test_samples_between_the_grid_are_interpolated(path):
@@ -97,36 +105,20 @@ def test_samples_between_the_grid_are_interpolated(path):
     np.testing.assert_allclose(turned, [math.remainder(k - 0.5, math.tau) for k in range(11)], atol=1e-4)
 
 
-@pytest.mark.parametrize("yaw", [[math.remainder(0.9 * k, math.tau) for k in range(11)], [None] * 5 + [0.3] * 6])
-def test_yaw_keeps_the_branch_it_was_recorded_on(path, yaw):
-    trace = rec.trace_of(path, rec.begun(), *[rec.state(at=k / 10, yaw=value) for k, value in enumerate(yaw)])
-    found, known = trace.yaw[:, 0], yaw.count(None)
-    np.testing.assert_allclose(found[known:], yaw[known:], atol=1e-5)
-    assert np.isnan(found[: max(known - 2, 0)]).all()
-
-
-def test_silence_is_nan_and_never_extrapolated(path):
-    trace = rec.trace_of(path, rec.begun(), rec.landed(), *[rec.state(at=k / 10, x=k / 10) for k in range(6)])
+def test_silence_is_nan_and_never_extrapolated(path, tmp_path):
+    unknown = {"goal": None, "setpoint": None, "yaw": math.nan, "position": (math.nan, 0.0, 0.0)}
+    said = [rec.state(at=k / 10, x=k / 10, **(unknown if k == 3 else {})) for k in range(6)]
+    trace = rec.trace_of(path, rec.begun(), rec.landed(), *said)
     np.testing.assert_allclose(trace.position[:8, 0, 0], [0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.5, 0.5], atol=1e-6)
     for array in (trace.position, trace.yaw, trace.true_position, trace.goal, trace.setpoint):
         assert np.isnan(array[8:, 0]).all()
         assert np.isnan(array[:, 1]).all()  # never reported
-        assert np.isfinite(array[:8, 0]).all()
-
-
-def test_a_long_hole_is_not_interpolated_over(path):
-    states = [rec.state(at=at, x=at) for at in (0.0, 0.1, 0.6, 0.7, 2.0, 2.1)]
-    x = rec.trace_of(path, rec.begun(), *states, experiment=rec.pair_with(duration_s=2.0)).position[:, 0, 0]
+    assert np.isfinite(np.delete(trace.goal[:8, 0], 3, axis=0)).all()
+    assert np.isnan(trace.goal[3, 0]).all()
+    states, two = [rec.state(at=at, x=at) for at in (0.0, 0.1, 0.6, 0.7, 2.0, 2.1)], rec.pair_with(duration_s=2.0)
+    x = rec.trace_of(tmp_path / "hole.mcap", rec.begun(), *states, experiment=two).position[:, 0, 0]
     np.testing.assert_allclose(x[:8], np.arange(8) / 10, atol=1e-6)
-    assert np.flatnonzero(np.isnan(x)).tolist() == list(range(10, 18))
-
-
-def test_numbers_that_nobody_knows(path):
-    places, unknown = [math.nan if k == 5 else k / 10 for k in range(11)], {"goal": None, "setpoint": None}
-    states = [rec.state(at=k / 10, x=x, yaw=math.nan, **unknown) for k, x in enumerate(places)]
-    trace = rec.trace_of(path, rec.begun(), *states)
-    np.testing.assert_allclose(trace.position[:, 0, 0], GRID, atol=1e-6)
-    assert all(np.isnan(array).all() for array in (trace.goal, trace.setpoint, trace.yaw))
+    assert np.flatnonzero(np.isnan(x)).tolist() == list(range(10, 18)), "a long hole is not drawn over"
 
 
 def poses(*numbered):
@@ -166,9 +158,12 @@ def test_lost(path, messages, lost):
 
 def test_counters_of_statuses_count_in_the_run(path, tmp_path):
     said = [rec.status(at=k - 0.5, interventions=5 * k, avoided=2 * k) for k in range(4)]
-    trace = rec.trace_of(path, *rec.whole_run()[:-2], *said, rec.status(at=0.9, foreign={"TB01": 2**60}))
+    said += [*[rec.pose(seq=k + 5, at=k / 2) for k in range(-2, 5)], rec.pose("XX99", at=0.5)]
+    trace = rec.trace_of(path, rec.begun(), *said, rec.status(at=0.9, foreign={"TB01": 2**60}))
     assert (trace.interventions.tolist(), trace.avoided.tolist()) == ([8, 0], [3, 0])
     assert not trace.foreign.any(), "no robot can have counted that"
+    assert trace.sent.stamp.tolist() == [0.0, 0.5]  # the pose at the end, 1.0, belongs to the landing
+    assert trace.sent.seq.tolist() == [5, 6]
 
     said = [rec.status("CF01", at=at, dropped={"TB01": count}) for at, count in ((-0.5, 0), (0.4, 3), (1.0, 7))]
     linked = rec.pair_with(formation=Formation(links={"TB01 - CF01": 0.5}))
@@ -190,13 +185,6 @@ def test_impossible_counts_of_the_centre_are_left_out(path):
     reports = [CentreState(rec.START + 0.5, ["CF01"], received={"TB01": count}) for count in (4, 2**60, -3)]
     rec.write(path, *rec.whole_run(), *reports, experiment=rec.pair_with(architecture="centralised"))
     assert read(path).trace.goals.received.tolist() == [4, 0]
-
-
-def test_only_poses_of_the_run_are_sent(path):
-    said = [*[rec.pose(seq=k + 5, at=k / 2) for k in range(-2, 5)], rec.pose("XX99", at=0.5)]
-    sent = rec.trace_of(path, rec.begun(), *said).sent
-    assert sent.stamp.tolist() == [0.0, 0.5]  # the pose at the end, 1.0, belongs to the landing
-    assert sent.seq.tolist() == [5, 6]
 
 
 def test_what_a_drifting_clock_stamped_is_set_right(path):
@@ -227,12 +215,9 @@ def test_trace_of_an_interrupted_run_ends_there(path):
     sends = [rec.pose(seq=k + 1, at=k / 10, x=k / 10) for k in range(11)]
     said = [rec.status(at=0.6, sent=7, ticks=60, decisions=6), rec.status(at=2.5, sent=11, ticks=250, decisions=25)]
     trace = rec.trace_of(path, rec.begun(), *rec.seconds(11), *sends, *said, rec.landed(0.75, "landing (interrupted)"))
-    assert trace.time[-1] == pytest.approx(0.7)
-    assert trace.position.shape == (8, 2, 3)
-    assert np.isfinite(trace.position).all()
-    assert trace.sent.seq.tolist() == list(range(1, 9))
-    assert trace.lost.tolist() == [0, 0]
-    assert trace.events[-1].stamp == pytest.approx(0.75)
+    assert (trace.time[-1], trace.events[-1].stamp) == pytest.approx((0.7, 0.75))
+    assert (trace.position.shape, np.isfinite(trace.position).all()) == ((8, 2, 3), True)
+    assert (trace.sent.seq.tolist(), trace.lost.tolist()) == (list(range(1, 9)), [0, 0])
 
 
 def follow(begin, end, phase="running"):
@@ -307,16 +292,14 @@ ABOUT, ATTACHED = {"case": "only", "seed": "4", "clock": "real"}, msgspec.json.e
 def test_channels_of_others_are_passed_over(path, tmp_path):
     channels = [("/image", "sensor_msgs/msg/Image", b"uint8 data", b"junk"), ("/raw", "", b"", b"more")]
     foreign(path, *channels, metadata=ABOUT | {"started": repr(rec.START)}, attachment=ATTACHED)
-    playback = read(path)
-    assert playback.messages == 2
-    assert np.isnan(playback.trace.position).all()
+    playback, target = read(path), tmp_path / "target.mcap"
+    assert (playback.messages, np.isnan(playback.trace.position).all()) == (2, True)
     path.write_bytes(path.read_bytes()[:-1])
-    assert recover(path, tmp_path / "target.mcap").messages == 2
-    with (tmp_path / "target.mcap").open("rb") as file:
-        kept = [
-            (schema and schema.name, channel.topic, m.data) for schema, channel, m in make_reader(file).iter_messages()
-        ]
-    assert kept == [("sensor_msgs/msg/Image", "/image", b"junk"), (None, "/raw", b"more")]
+    assert recover(path, target).messages == 2
+    with target.open("rb") as file:
+        kept = [(schema, channel.topic, m.data) for schema, channel, m in make_reader(file).iter_messages()]
+    assert [part[1:] for part in kept] == [("/image", b"junk"), ("/raw", b"more")]
+    assert (kept[0][0].name, kept[1][0]) == ("sensor_msgs/msg/Image", None)
 
 
 @pytest.mark.parametrize(
@@ -382,3 +365,119 @@ def test_goals_in_transit_keep_their_delay():
     goal = right.state(said).goal_receipts[0]
     assert goal.stamp == 300.05, "the centre runs where the conductor does"
     assert (goal.pose, goal.acted) == pytest.approx((true, true + 0.1), abs=1e-5)
+
+
+def life(pid, *counts):
+    """Statuses of a process: at each time [s] ticks, and a tenth of that in decisions."""
+    return [rec.status(at=at, pid=pid, ticks=ticks, decisions=ticks // 10) for at, ticks in counts]
+
+
+EVERY_SECOND = [(float(k), 100 * k) for k in range(1, 21)]
+BETWEEN = [(k + 0.5, 10 * k) for k in range(1, 20)]
+
+
+@pytest.mark.parametrize(
+    ("said", "ticks"),
+    [
+        ([*life(7, (1.0, 100), (9.0, 900)), *life(8, (12.0, 50), (20.0, 850))], 900 + 850),
+        ([*life(1, (1.0, 100), (9.0, 900)), *life(1, (12.0, 50), (20.0, 850))], 900 + 850),  # number given again
+        (life(7, (19.5, 1950), (20.5, 2050)), 2000),  # beyond the end
+        (life(7, (19.5, 1950)), 1950),
+        (life(7, (-0.5, 4000), (0.5, 50), (20.5, 2050)), 2000),  # before the start
+        ([*life(7, *EVERY_SECOND), *life(8, *BETWEEN)], 2000 + 190),  # in turn
+        (life(7, (8.0, 800), (9.0, 900), (8.5, 1000), (9.5, 1100), (20.0, 2150)), 2150),  # clock set back
+    ],
+)
+def test_counters_of_all_lives_in_the_run(said, ticks):
+    ordered = sorted(said, key=lambda each: each.stamp)
+    assert count_in_run(ordered, "ticks", rec.START, rec.START + 20.0) == ticks
+
+
+@pytest.mark.parametrize("seq", [2**63 - 1, 2**53, 0, -5])
+def test_forged_running_numbers_count_nowhere(path, seq):
+    receipt = PoseReceipt("TB01", seq, rec.START + 0.5, rec.START + 0.51, (9.0, 9.0, 0.0), (0.0, 0.0, 0.0))
+    forged = [rec.pose("TB01", seq, 0.5501), rec.state("CF01", 99, 0.555, -0.555, received=[receipt])]
+    trace = rec.trace_of(path, *rec.whole_run(), *forged)
+    assert trace.sent.seq.tolist() == list(range(1, 11))
+    assert measure(trace).robots[0].messages == 10
+    assert 9.0 not in trace.received.position
+
+
+def test_forged_counters_count_nowhere(path, tmp_path):
+    forged = rec.status("CF01", at=0.9, ticks=2**60, missed=2**61, lost={"TB01": 2**62}, pid=66)
+    whole = rec.trace_of(path, *rec.whole_run(), forged)
+    assert (whole.ticks.tolist(), whole.missed_deadlines.tolist(), whole.lost.tolist()) == ([100, 99], [3, 0], [1, 0])
+    most = rec.trace_of(tmp_path / "missed.mcap", *rec.whole_run()[:-2], rec.status(ticks=100, missed=300))
+    assert measure(most).robots[0].missed_share == pytest.approx(0.75), "below one"
+
+
+STANDBY = {"KH01": replace(rec.PAIR.robots["TB01"], standby=True)}
+LINKED = rec.pair_with(
+    duration_s=4.0, robots=rec.PAIR.robots | STANDBY,
+    formation=Formation(links={"TB01 - CF01": 1.0, "TB01 - KH01": 1.0}),
+)  # fmt: skip
+
+
+def test_reserve_is_judged_since_it_came(path, tmp_path):
+    never = rec.trace_of(tmp_path / "never.mcap", rec.begun(), *rec.seconds(41), rec.landed(4.0), experiment=LINKED)
+    assert (never.robots, measure(never).failures) == (("TB01", "CF01"), ())
+    came = [rec.state("KH01", k, k / 10, 1.0, phase="running" if k >= 15 else "ready") for k in range(10, 41)]
+    came += [rec.pose("KH01", k, k / 10) for k in range(13, 40)]  # two before it took part
+    trace = rec.trace_of(path, rec.begun(), *rec.seconds(41), *came, rec.landed(4.0), experiment=LINKED)
+    np.testing.assert_allclose(trace.joined, [0.0, 0.0, 1.5], atol=1e-6)
+    measured = measure(trace)
+    first, _, added = measured.robots
+    assert (added.known, added.coverage, measured.died, measured.failures) == (1.0, 1.0, (), ())
+    assert (added.f_hz, first.coverage) == (pytest.approx(25 / 2.5), 1.0)
+
+
+def figures(path, *messages):
+    case = measure(rec.trace_of(path, *messages))
+    of_robots = [(robot.iae, robot.messages, robot.received, robot.known) for robot in case.robots]
+    return of_robots, case.deliveries, case.lost
+
+
+@pytest.fixture
+def whole(tmp_path):
+    return figures(tmp_path / "whole.mcap", *RUN)
+
+
+RUN = rec.whole_run()
+DOUBLED = {
+    "all twice": [each for each in RUN for _ in range(2)],
+    "receipts thrice": [replace(each, received=each.received * 3) if isinstance(each, State) else each for each in RUN],
+    "robots of no experiment": [*RUN, *[replace(each, robot="XX99") for each in RUN if isinstance(each, State | Pose)]],
+    "second start": [*RUN, rec.begun(0.5)],
+}
+
+
+@pytest.mark.parametrize("messages", DOUBLED.values(), ids=DOUBLED)
+def test_repeated_and_foreign_messages_change_no_figure(path, whole, messages):
+    assert figures(path, *messages) == whole
+
+
+@pytest.mark.parametrize("place", [(1e300, 0.0, 0.0), (float("nan"),) * 3])
+def test_impossible_places_are_unknown(path, whole, place):
+    odd = next(k for k, each in enumerate(RUN) if isinstance(each, State) and each.stamp > rec.START + 0.45)
+    assert RUN[odd].robot == "TB01"
+    found = figures(path, *RUN[:odd], replace(RUN[odd], position=place, true_position=place), *RUN[odd + 1 :])
+    assert found[0][0][0] == pytest.approx(whole[0][0][0])  # a hole of less than a second is drawn over
+    assert found[1:] == whole[1:]
+
+
+def test_recording_that_broke_off_late_is_interrupted(path, tmp_path):
+    """0.4 s before its end, without a word of a landing; robots that landed by themselves are whole."""
+    broken = measure(rec.trace_of(path, rec.begun(), *rec.seconds(7)))
+    assert (broken.interrupted, broken.duration_s) == (True, pytest.approx(0.6, abs=0.11))
+    landing = rec.state("TB01", 9, 1.5, phase="landing")
+    landed = rec.trace_of(tmp_path / "landed.mcap", rec.begun(), *rec.seconds(7), landing)
+    assert not measure(landed).interrupted
+
+
+def test_two_recordings_of_one_case_are_told(tmp_path):
+    for name in ("only", "only-recovered"):
+        rec.write(tmp_path / f"{name}.mcap", *rec.whole_run())
+    rec.write(tmp_path / "other.mcap", rec.begun(), *rec.seconds(11), rec.landed(), case="other", seed=9)
+    notes = " ".join(reopen(tmp_path).notes)
+    assert "only: several recordings are of this case; shown is only-recovered.mcap" in notes
+    assert "different seeds: only 4, other 9" in notes

@@ -1,44 +1,62 @@
-"""Others read a recording; nothing is written over, and a full disk or a mistake leaves a file that can be read."""
+"""Others read a recording; a full disk, a mistake or a kill leaves one that can be read, and be made whole."""
 
 import errno
 import io
 import itertools
 import math
+import subprocess
+import sys
+from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import Writer
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
-from agents.network.messages import Event
+from agents.network.messages import Event, Pose
 from bridges import ros2 as bridge
 from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
 from experiments.recording import writer
 from experiments.recording.playback import read
-from experiments.recording.reader import RecordingError, recover
+from experiments.recording.reader import RecordingError, Recovered, recover
 from experiments.recording.ros2 import viewers
 from experiments.recording.topics import CHUNK_BYTES
 from experiments.scene import markers
+from tests.cases import examples
 from tests.experiments import recordings as rec
 from tests.waiting import ManualClock
+from tools.commands import results as commands
 
 
-def test_what_is_attached(path):
-    rec.write(path, rec.begun(), started=rec.START)
-    with path.open("rb") as file:
-        reader = make_reader(file, validate_crcs=True)
-        assert reader.get_header().profile == "ros2"
-        attached = {one.name: one.data for one in reader.iter_attachments()}
-        about = {one.name: one.metadata for one in reader.iter_metadata()}["zenpark"]
-    assert attached["experiment.toml"].decode() == rec.DOCUMENT
-    assert msgspec.json.decode(attached["experiment.json"], type=Experiment) == rec.PAIR
-    known = {"case": "only", "seed": "4", "clock": "real", "started": repr(rec.START)}
-    assert about.items() > known.items()
-    assert about["version"]
+def test_what_is_attached_stays_in_a_recovered_recording(path, tmp_path):
+    made = tmp_path / "made.mcap"
+    rec.write(made, *rec.whole_run(), started=rec.START)
+    path.write_bytes(made.read_bytes()[:-1])
+    target = tmp_path / "whole.mcap"
+    assert recover(path, target) == Recovered(82, ("TB01", "CF01"), complete=False)
+    for each in (made, target):
+        with each.open("rb") as file:
+            reader = make_reader(file, validate_crcs=True)
+            assert (reader.get_header().profile, reader.get_header().library) == ("ros2", "zenpark")
+            attached = {one.name: one.data for one in reader.iter_attachments()}
+            (about,) = (one.metadata for one in reader.iter_metadata() if one.name == "zenpark")
+            summary = reader.get_summary()
+        assert attached["experiment.toml"].decode() == rec.DOCUMENT
+        assert msgspec.json.decode(attached["experiment.json"], type=Experiment) == rec.PAIR
+        known = {"case": "only", "seed": "4", "clock": "real", "started": repr(rec.START)}
+        assert about.items() > known.items()
+        assert about["version"]
+        of_robots = {f"/{robot}/{what}" for robot in ("TB01", "CF01") for what in ("state", "true_pose", "status")}
+        assert {channel.topic for channel in summary.channels.values()} == {"/events", "/tf", "/TB01/pose", *of_robots}
+        assert {schema.encoding for schema in summary.schemas.values()} == {"ros2msg"}
+        with AnyReader([each]) as reader:
+            assert len(list(reader.messages())) == summary.statistics.message_count == 82
 
 
 def decoded(path, topics=None):
@@ -170,8 +188,9 @@ def test_file_equals_the_librarys_own(tmp_path):
     own.close()
 
 
-def drawn_scene(path):
-    """Write the pair's recording with a scene, states out of order by 0.15 s, and an event from the future."""
+@pytest.fixture
+def drawn(path):
+    """The pair's recording with a scene, states out of order by 0.15 s, and an event from the future."""
     clock = ManualClock(rec.START)
     with rec.recording(path, draw=markers.drawing(Plan(rec.PAIR)), utc=clock.utc) as made:
         made.write(Event(rec.START + 5.0, "start", "conductor", "common start"))
@@ -181,11 +200,11 @@ def drawn_scene(path):
                 made.write(rec.state(robot, seq=k + 1, at=0.05 * k + 0.2 - late, x=0.01 * k))
             if k % 20 == 7:
                 made.write(Event(clock.now - 0.5, "robot", "CF01", "said late"))
+    return path
 
 
-def test_viewers_find_frames_and_scene_in_standard_types(path):
-    drawn_scene(path)
-    with AnyReader([path]) as reader:
+def test_viewers_find_frames_and_scene_in_standard_types(drawn):
+    with AnyReader([drawn]) as reader:
         types = {c.topic: c.msgtype for c in reader.connections}
         seen = [(c.topic, reader.deserialize(raw, c.msgtype)) for c, t, raw in reader.messages()]
     assert (types["/tf"], types["/scene"]) == ("tf2_msgs/msg/TFMessage", "visualization_msgs/msg/MarkerArray")
@@ -202,30 +221,169 @@ def test_viewers_find_frames_and_scene_in_standard_types(path):
     links = groups["links"]
     assert (links.type, links.header.frame_id, len(links.colors)) == (5, "map", len(links.points))
     assert links.points[0].x == pytest.approx(2.99, abs=0.05)
-    assert len(decoded(path, ["/tf", "/scene"])) == len(frames) + len(scenes)
+    assert len(decoded(drawn, ["/tf", "/scene"])) == len(frames) + len(scenes)
 
 
-def test_size_of_chunks_changes_no_message(tmp_path):
-    counts, found = [], []
-    for size in (1_000, CHUNK_BYTES, 1_000_000):
-        file = tmp_path / f"{size}.mcap"
-        with rec.recording(file, chunk_bytes=size) as made:
-            rec.put(made, [rec.state("CF01", k, rec.START + 0.02 * k) for k in range(200)])
-        with file.open("rb") as stream:
-            reader = make_reader(stream, validate_crcs=True)
-            found.append([(channel.topic, message) for _, channel, message in reader.iter_messages()])
-            counts.append(len(reader.get_summary().chunk_indexes))
-    assert counts[0] > counts[1] > counts[2] == 1
-    assert found[0] == found[1] == found[2]
-
-
-def test_chunks_are_in_order_of_time(path):
-    drawn_scene(path)
-    with path.open("rb") as file:
+def test_chunks_are_in_order_of_time(drawn):
+    with drawn.open("rb") as file:
         chunks = make_reader(file).get_summary().chunk_indexes
         first, *_ = [m for *_, m in make_reader(file).iter_messages(["/events"])]
     assert len(chunks) > 10
-    for before, after in itertools.pairwise(chunks):
-        assert before.message_end_time <= after.message_start_time
+    assert all(a.message_end_time <= b.message_start_time for a, b in itertools.pairwise(chunks))
     assert first.log_time == round(rec.START * 1e9), "logged when it came"
     assert first.publish_time == round((rec.START + 5.0) * 1e9)
+
+
+KILLED = """
+import itertools
+from pathlib import Path
+from tests.experiments.recordings import *
+made = recording(Path({path!r}))
+put(made, whole_run())
+made.flush()
+print("flushed", flush=True)
+for k in itertools.count(1):
+    made.write(state("CF01", 100 + k, 5.0 + k / 1000, k * 0.37))
+"""
+
+
+@pytest.mark.mechanism("recovery of an unfinished recording")
+@pytest.mark.system
+def test_a_killed_recorder_leaves_a_recording(path, tmp_path, recorded):
+    root = Path(__file__).parents[3]
+    command = [sys.executable, "-c", KILLED.format(path=str(path))]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=root) as process:
+        assert process.stdout.readline() == "flushed\n"
+        process.kill()
+    before, playback = path.read_bytes(), read(path)
+    assert not playback.complete
+    assert playback.messages >= 60
+    target, whole = tmp_path / "whole.mcap", tmp_path / "finished.mcap"
+    assert recover(path, target) == Recovered(playback.messages, ("TB01", "CF01"), complete=False)
+    assert path.read_bytes() == before
+    again = read(target)
+    assert (again.complete, again.messages) == (True, playback.messages)
+    whole.write_bytes(recorded)
+    for trace in (playback.trace, again.trace):
+        assert_same(trace, read(whole).trace, robots=1)
+
+
+def assert_same(trace, wanted, robots=None):
+    np.testing.assert_array_equal(trace.position[:, :robots], wanted.position[:, :robots])
+    np.testing.assert_array_equal(trace.sent.stamp, wanted.sent.stamp)
+    assert trace.lost.tolist() == wanted.lost.tolist()
+
+
+def test_a_whole_file_needs_no_recovery(path, tmp_path, capsys):
+    rec.write(path, *rec.whole_run())
+    assert recover(path, tmp_path / "whole.mcap") == Recovered(82, ("TB01", "CF01"), complete=True)
+    commands.recover(str(path), None)
+    assert capsys.readouterr().out == f"{path} is whole already: 82 messages of TB01, CF01\n"
+    assert sorted(tmp_path.iterdir()) == [path]
+
+
+def test_recovery_overwrites_nothing(path, tmp_path):
+    target = tmp_path / "precious"
+    target.write_text("mine")
+    for into in (target, rec.broken(path)):
+        with pytest.raises(RecordingError, match=f"{into.name}: exists already"):
+            recover(path, into)
+    assert target.read_text() == "mine"
+    assert not read(path).complete
+
+
+def test_a_recorder_that_took_over_completes_the_recording(path, tmp_path, capsys):
+    """The first messages of the second recorder are the last values and the events that publishers repeat."""
+    run = sorted(rec.whole_run(), key=lambda message: message.stamp)
+    first, rest = run[:50], run[50:]
+    events, poses = ([each for each in first if isinstance(each, kind)] for kind in (Event, Pose))
+    assert events
+    rec.broken(path, *first)
+    later = path.parent / "cases" / path.stem / "part2.mcap"
+    later.parent.mkdir(parents=True)
+    rec.write(later, *events, poses[-1], *rest)
+    (later.parent / "part3.mcap").touch()  # killed before its first record
+    commands.recover(str(path), None)
+    rec.write(whole := tmp_path / "whole.mcap", *run)
+    target = path.with_name("run-recovered.mcap")
+    made, wanted = read(target), read(whole)
+    assert (made.complete, made.messages) == (True, wanted.messages)
+    assert capsys.readouterr().out == f"{target}: {82 + len(events) + 1} messages of TB01, CF01\n"
+    assert_same(made.trace, wanted.trace)
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [(b"", "nothing was recorded"), (b"\x89MCAP", "nothing was recorded"), (b"title = 'pair'", "not an MCAP file")],
+)
+def test_what_is_no_recording(path, tmp_path, content, says):
+    path.write_bytes(content)
+    for act in (read, lambda source: recover(source, tmp_path / "target.mcap")):
+        with pytest.raises(RecordingError, match=rf"run\.mcap: {says}"):
+            act(path)
+    assert not (tmp_path / "target.mcap").exists()
+    for wrong in (tmp_path / "none.mcap", tmp_path):
+        with pytest.raises(RecordingError, match="cannot be read"):
+            read(wrong)
+
+
+def survives(path, target):
+    """Reads and recovers; whatever the damage, the only error is the named one."""
+    target.unlink(missing_ok=True)
+    try:
+        found = recover(path, target)
+    except RecordingError:
+        return None
+    if not found.complete:
+        assert read_or_refuse(target) == read_or_refuse(path)
+    return read_or_refuse(path)
+
+
+def read_or_refuse(path):
+    try:
+        return read(path).messages
+    except RecordingError:
+        return None
+
+
+@pytest.mark.slow
+def test_a_file_cut_anywhere(path, tmp_path, recorded):
+    found = []
+    for size in range(0, len(recorded), 61):
+        path.write_bytes(recorded[:size])
+        found.append(survives(path, tmp_path / "target.mcap") or 0)
+    assert found == sorted(found)
+    assert (found[0], found[-1]) == (0, 82)
+
+
+@pytest.mark.slow
+@examples(60)
+@given(data=st.data())
+def test_a_file_damaged_anywhere(tmp_path_factory, recorded, data):
+    folder = tmp_path_factory.mktemp("damaged")
+    damaged = bytearray(recorded)
+    for _ in range(data.draw(st.integers(1, 3))):
+        damaged[data.draw(st.integers(0, len(recorded) - 1))] = data.draw(st.integers(0, 255))
+    (folder / "run.mcap").write_bytes(damaged)
+    survives(folder / "run.mcap", folder / "target.mcap")
+
+
+def test_first_of_contradicting_schemas_holds(path, tmp_path, recorded):
+    """The summary at the end repeats them, and may be damaged."""
+    content = bytearray(recorded)
+    content[recorded.rindex(b"string robot")] = content[-1] = 0  # not finished
+    path.write_bytes(content)
+    assert survives(path, tmp_path / "target.mcap") == 82
+
+
+def test_a_damaged_chunk_costs_only_itself(path):
+    rec.write(path, rec.begun(), *rec.scattered(2000))
+    whole = read(path)
+    with path.open("rb") as file:
+        chunks = make_reader(file).get_summary().chunk_indexes
+    content = bytearray(path.read_bytes())
+    content[chunks[2].chunk_start_offset + chunks[2].chunk_length // 2] ^= 0xFF
+    path.write_bytes(content)
+    playback = read(path)
+    assert not playback.complete
+    assert whole.messages - 200 < playback.messages < whole.messages
