@@ -98,32 +98,17 @@ def test_figures_show_themselves_and_are_kept(crowded, tmp_path):
     assert sorted(path.name for path in (tmp_path / "figures").iterdir()) == ["errors.pdf", "errors.svg"]
 
 
-def without(monkeypatch, *libraries):
-    for library in libraries:
-        monkeypatch.setitem(sys.modules, library, None)  # its import fails
-
-
 @pytest.mark.parametrize("installed", ["pandas", "polars"])
 def test_frames_are_of_the_library_that_is_there(crowded, monkeypatch, installed):
-    without(monkeypatch, "pandas", "polars")
+    for library in ("pandas", "polars"):
+        monkeypatch.setitem(sys.modules, library, None)  # its import fails
     with pytest.raises(ImportError, match="neither pandas nor polars"):
         crowded.to_frame()
     monkeypatch.setitem(sys.modules, installed, SimpleNamespace(DataFrame=lambda columns: columns))
     columns = crowded.to_frame()
     assert columns["robot"] == ["CF01", "CF02", "CF03"]
     assert {"seed", "case", "f_hz", "iae", "near_gap"} <= columns.keys()
-
-
-@pytest.mark.parametrize(("library", "other"), [("pandas", "polars"), ("polars", "pandas")])
-def test_a_frame_has_numbers_where_some_are_unknown(crowded, monkeypatch, library, other):
-    pytest.importorskip(library)
-    without(monkeypatch, other)
-    frame = crowded.to_frame()
-    assert type(frame).__module__.startswith(library)
-    assert frame.shape[0] == 3
-    assert frame["robot"].to_list() == ["CF01", "CF02", "CF03"]
-    assert str(frame["acquired_s"].dtype).lower() == "float64", "none has acquired: NaN"
-    assert str(frame["messages"].dtype).lower() == "int64"
+    assert [type(each) for each in columns["acquired_s"]] == [float] * 3, "none has acquired: NaN"
 
 
 CELLS = (

@@ -153,10 +153,12 @@ def test_emergency_stop_tells_its_result_without_session(blocked, operator, monk
 
 
 def test_slider_orders_what_is_limited(operator):
-    threshold = orders.parameters(SceneModel.of_plan(load("robotic-park").cases()["event"]))[0]
-    assert threshold.label == "trigger.threshold [m]"
+    found = orders.parameters(SceneModel.of_plan(load("robotic-park").cases()["event"]))
+    threshold, *rest = [(each.label, each.value) for each in found]
+    assert threshold == ("trigger.threshold [m]", 0.01)
+    assert rest == [("clamp [m]", 0.1), ("tracking_gain [1/(m²·decision)]", 3.0)]
     for sent in (-1.0, 0.0, 1e9, inf, float("nan")):
-        assert 0.0 < threshold.limited(sent) <= 0.04
+        assert 0.0 < found[0].limited(sent) <= 0.04
     acting, gate, given = operator
     gate.seen[7] = Seen(time.time(), 2)
     parameter = orders.Parameter("clamp", 0.1, "m")

@@ -1,7 +1,9 @@
-"""A view of a run that goes on: what it shows, what it may do, and its sign of life; a replay gives way to robots."""
+"""A view of a run that goes on, and of a recording: what it shows, what it may do, and its sign of life."""
 
 import threading
+from dataclasses import replace
 from itertools import product
+from math import isfinite
 from unittest.mock import MagicMock
 
 import msgspec
@@ -13,13 +15,16 @@ from agents.network import lab, pubsub
 from agents.network.endpoints import free_endpoint
 from agents.network.keys import Keys
 from experiments.file.document import load
+from experiments.recording.reader import RecordingError
 from experiments.run import simulate, simulate_seeds
-from experiments.scene.stage import SceneModel
+from experiments.scene import models, tracks
+from experiments.scene.stage import BAD, FAIR, Condition, SceneModel
 from experiments.view import live
-from experiments.view.acting import WatchedRun, may_act, parameters
+from experiments.view.acting import WatchedRun, may_act
 from experiments.view.broadcast import Broadcast
 from experiments.view.heartbeat import SLOWEST_S, DataAge, frame_s, mark
-from experiments.view.replay import ReplayClock
+from experiments.view.panel import History, RobotRow, css, event_list, link_table, table
+from experiments.view.replay import Film, ReplayClock, marks
 from tests.cases import mostly_slow
 from tests.network import Mute, Net
 from tests.runs import recorded
@@ -95,13 +100,6 @@ def test_only_an_operator_of_a_lab_gives_orders(tmp_path):
     assert (acts("operator"), acts("observer"), acts("operator", tmp_path / "no")) == (True, False, False)
 
 
-def test_trigger_and_law_numbers_have_sliders():
-    park = SceneModel.of_plan(load("robotic-park").cases()["event"])
-    assert [(each.label, each.value) for each in parameters(park)] == [
-        ("trigger.threshold [m]", 0.01), ("clamp [m]", 0.1), ("tracking_gain [1/(m²·decision)]", 3.0),
-    ]  # fmt: skip
-
-
 @pytest.mark.slow
 def test_watched_virtual_run_is_unchanged_bit_by_bit():
     pytest.importorskip("viser", reason="needs viser")
@@ -166,3 +164,166 @@ def test_page_outlives_a_picture_that_fails(capsys):
         page.run(lambda: next(rounds))
     assert capsys.readouterr().err.count("the picture fails: ValueError: no such mesh") == 1
     assert "no such mesh" in server.gui.add_html.return_value.content
+
+
+GUIDED = ("architecture=centralised",)
+
+
+@pytest.fixture(scope="module", params=[(), GUIDED], ids=["distributed", "centralised"])
+def recorded_case(request):
+    """A recorded run, as the trace in memory and as a file."""
+    run = recorded("robotic-park", "duration_s=3.0", "timeline=[]", *request.param, cases=("event",))
+    return run.traces["event"], run.folder / "event.mcap"
+
+
+@pytest.fixture
+def film(recorded_case):
+    return Film(tracks.read(recorded_case[1]))
+
+
+@pytest.mark.slow
+def test_positions_are_those_of_the_recording(recorded_case, film):
+    trace, _ = recorded_case
+    assert film.tracks.robots == trace.robots
+    for k in range(0, len(trace.time), 17):
+        moment = film.moment(float(trace.time[k]))
+        assert moment.position == pytest.approx(trace.true_position[k], abs=1e-6)
+        assert np.cos(moment.yaw - trace.yaw[k]) == pytest.approx(1.0, abs=1e-3)
+        assert moment.goal == pytest.approx(trace.goal[k], abs=1e-6)
+    between = float(trace.time[20] + trace.time[21]) / 2
+    middle = (trace.true_position[20] + trace.true_position[21]) / 2
+    assert film.moment(between).position == pytest.approx(middle, abs=1e-6)
+    for row, track in enumerate(film.tracks.tracks):
+        sent = track.sent[(track.sent >= -1e-6) & (track.sent < 3.0 - 1e-6)]
+        assert sent == pytest.approx(np.sort(trace.sent_by(row).stamp), abs=1e-5)
+
+
+def test_truncated_recording_is_replayed_to_its_end(recorded_case, tmp_path):
+    _, file = recorded_case
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(file.read_bytes()[: int(0.7 * file.stat().st_size)])
+    assert 0.0 < tracks.read(cut).end < tracks.read(file).end
+    cut.write_bytes(b"nothing")
+    with pytest.raises(RecordingError, match="not an MCAP file"):
+        tracks.read(cut)
+
+
+def test_conditions_and_errors_follow_the_phases(film):
+    assert (film.moment(1.0).condition == Condition.ACTIVE).all()
+    assert (film.moment(film.tracks.begin - 1.0).condition == Condition.WAITING).all()
+    assert set(film.moment(film.tracks.end).condition.tolist()) <= {Condition.LANDING, Condition.DONE}
+    assert "landing" in [mark[1] for mark in marks([film]) if isinstance(mark, tuple)]
+    history = film.history()
+    k = int(np.searchsorted(history.time, 2.0))
+    moment = film.moment(history.time[k])
+    assert history.error[k] == pytest.approx(film.links.of_robots(moment.error), abs=1e-6, nan_ok=True)
+    assert sum(rate.sum() for rate in history.rate) > 0
+
+
+def test_the_clock_plays_pauses_and_ends():
+    clock = ReplayClock(-2.0, 10.0)
+    clock.advance(1.0)
+    assert clock.t == 0.0
+    clock.toggle()
+    clock.speed = 5.0
+    clock.advance(1.0)
+    assert (clock.t, clock.playing) == (5.0, True)
+    clock.advance(3.0)
+    assert (clock.t, clock.playing) == (10.0, False)
+    clock.toggle()
+    assert (clock.t, clock.playing) == (-2.0, True)
+    clock.loop = True
+    clock.seek(99.0)
+    clock.advance(1.0)
+    assert (clock.t, clock.playing) == (-2.0, True)
+
+
+def test_table_has_recorded_content_and_no_empty_columns(film):
+    read = film.tracks
+    assert {(row.battery, row.missed) for t in (0.0, read.end) for row in film.rows(t)} == {(None, None)}
+    text = table(film.rows(read.end), film.stage)
+    assert "f [Hz]" in text
+    assert not {word for word in ("battery", "missed", "delay", "nan", "None") if word in text}
+    status = msgspec.structs.replace(read.tracks[0].statuses[0], stamp=1.0, battery=0.8, missed=3)
+    told = (replace(read.tracks[0], statuses=(status,)), *read.tracks[1:])
+    real = Film(replace(read, clock="real", tracks=told))
+    assert [(row.battery, row.missed) for row in real.rows(1.5)[:2]] == [(0.8, 3), (None, None)]
+    assert real.rows(0.5)[0].battery is None
+    text = table(real.rows(1.5), real.stage)
+    assert "battery" in text
+    assert ">80 %<" in text
+
+
+def test_curves_of_many_robots_are_three():
+    history = History(40)
+    for t in range(60):
+        history.add(float(t), np.arange(40.0), np.zeros(40))
+    time, most, median, least = history.curves(history.error)
+    assert (time[0], time[-1], len(time)) == (-30.0, 0.0, 31)
+    assert (most[0], median[0], least[0]) == (39.0, 19.5, 0.0)
+
+
+def test_table_shows_the_worst_first_and_escapes_names(film):
+    stage = film.stage
+    rows = [RobotRow(f"R{k}", Condition.ACTIVE, error=0.001 * k) for k in range(30)]
+    rows[3] = RobotRow("<b>", Condition.DEAD, note="<script>", measures={"<i>": 0.12345})
+    text = table(rows, stage)
+    assert text.index("&lt;b&gt;") < text.index("R29") < text.index("R28")
+    assert "&lt;i&gt;" in text
+    assert "<script>" not in text
+    assert "and 10 more" in text
+    assert " R10<" not in text
+    assert "none yet" in event_list([], None)
+    error = np.linspace(0.0, 0.1, len(stage.links))
+    links = link_table(stage, error, [0.0123] * len(error))
+    assert links.index("10.0 cm") < links.index("0.0 cm")
+    assert "12.3 ms" in links
+
+
+def test_warnings_misses_and_leaders_look_so(film):
+    stage = film.stage
+    leader = next(name for row, name in enumerate(stage.names) if row not in stage.links.receiver)
+    follower = next(name for name in stage.names if name != leader)
+    rows = [
+        RobotRow(leader, Condition.ACTIVE, missed=0, delay=-1e-6),
+        RobotRow(follower, Condition.ACTIVE, error=0.01, missed=7, missed_share=0.5, note="warn: a neighbour is lost"),
+    ]
+    text = table(rows, stage)
+    assert "-0.0" not in text
+    for part in (">–<", f"color:{css(BAD)}'>7<", f"color:{css(FAIR)};padding-left:1.2em'>warn", ">0<"):
+        assert part in text
+
+
+def test_said_places_are_those_of_the_memory():
+    run = recorded("aggregative", "duration_s=3.0", cases=("event",))
+    trace, film = run.traces["event"], Film(tracks.read(run.folder / "event.mcap"))
+    assert dict(film.stage.place_variables) == {"s": 0}
+    for k in range(5, len(trace.time), 31):
+        moment = film.moment(float(trace.time[k]))
+        assert moment.places.shape == (len(trace.robots), 1, 3)
+        assert moment.places[:, 0, :2] == pytest.approx(trace.memory["s"][k], abs=1e-6)
+        assert moment.places[:, 0, 2] == pytest.approx(moment.position[:, 2])  # it says no z
+    rows = film.rows(2.0)
+    assert all(isfinite(each) for row in rows for each in row.measures.values())
+    assert all(name in table(rows, film.stage) for name in list(trace.measures)[:3])
+
+
+def test_places_with_z_and_unknown_ones():
+    stage = SceneModel.of_plan(load("aggregative", "duration_s=3.0").cases()["event"])
+    position = np.full((len(stage.names), 3), 0.7)
+    memories = [{"s": (1.0, 2.0, 3.0)}, {"s": (1.0, 2.0)}, {"s": (1.0, 2.0, 3.0, 4.0)}, {"s": (1.0,)}, {}]
+    places = stage.said_places(memories, position)[:, 0]
+    assert places[:3].tolist() == [[1.0, 2.0, 3.0], [1.0, 2.0, 0.7], [1.0, 2.0, 0.7]]
+    assert np.isnan(places[3:]).all()
+    assert not SceneModel.of_robots(("A",)).place_variables
+    planned = SceneModel.of_plan(load("mpc", "duration_s=3.0").cases()["event"])
+    path = tuple(float(number) for number in range(32))
+    assert planned.said_places([{"path": path}], position)[0].tolist() == [[30.0, 31.0, 0.7]]
+
+
+def test_a_mark_is_closed_and_looks_outward():
+    mesh = models.diamond(0.03)
+    corners = mesh.vertices[mesh.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert (np.einsum("ij,ij->i", normals, corners.mean(axis=1)) > 0.0).all()
+    assert np.abs(normals.sum(axis=0)).max() < 1e-12
