@@ -180,9 +180,7 @@ def test_a_place_is_free_or_not(stage):
     stage.end("KH01")
     twin = stage.bodies["KH01"]
     stage.bodies["KH01"] = changed(twin, body="khepera4://192.0.2.1")
-    assert "from KH01" in stage.after(stage.ask("restart", "CF01"), 2.0).refused["CF01"], (
-        "its body lies there"
-    )
+    assert "from KH01" in stage.after(stage.ask("restart", "CF01"), 2.0).refused["CF01"], "its body lies there"
     stage.bodies["KH01"] = twin
     assert stage.after(stage.ask("restart", "CF01"), 5.0).done
 

@@ -162,8 +162,11 @@ def test_the_commands(tmp_path):
     assert '"ana.2"' in invoke("lab", "show", lab, "--json").stdout
     for wrong in (("init", tmp_path / "b", "router"), ("issue", lab, "bob", "--role", "operater")):
         assert isinstance(invoke("lab", *wrong, code=None).exception, LabError)
-    authority.create(tmp_path / "ended", {"CF01": "robot"}, days=-0.01)
-    assert "ENDED" in invoke("lab", "show", tmp_path / "ended", code=1).stdout
+
+
+def test_an_ended_certificate_is_shown(tmp_path):
+    authority.create(tmp_path / "lab", {"CF01": "robot"}, days=-0.01)
+    assert "ENDED" in invoke("lab", "show", tmp_path / "lab", code=1).stdout
 
 
 @pytest.fixture
