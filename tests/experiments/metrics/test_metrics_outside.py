@@ -46,13 +46,8 @@ def installed(tmp_path_factory):
     ((name, made),) = re.findall(r'`(\w+) = "([\w:]+)"` under `\[project\.entry-points\."zenpark\.metrics"\]`', GUIDE)
     given = {name: made, "gap_m": "my_metrics:Gap", "broken": "my_metrics:Broken", "gone": "no_such_module:Way"}
     install(folder, "my-metrics", "0.1", {"zenpark.metrics": given})
-    return folder
-
-
-@pytest.fixture(scope="module")
-def shelled(installed):
-    with shell(installed) as command:
-        yield command
+    with shell(folder) as command:
+        yield folder, command
 
 
 def test_fields_of_the_page_have_their_shapes(short_trace):
@@ -73,7 +68,8 @@ def rows_of(file):
 
 
 @pytest.mark.slow
-def test_installed_metric_is_everywhere(installed, shelled):
+def test_installed_metric_is_everywhere(installed):
+    folder, shelled = installed
     listed = shelled("list")
     assert re.search(r"^Added metrics: broken, gap_m, gone, way_m$", listed.stdout, re.MULTILINE)
     assert "metric gone is left out: plug-in 'gone' (no_such_module:Way) of my-metrics fails to import" in listed.stderr
@@ -83,22 +79,22 @@ def test_installed_metric_is_everywhere(installed, shelled):
     assert run.returncode == 0, run.stderr
     assert re.search(r"event: f .*, Way \d.* m, .*\(ratios: f .*, Way \d", run.stdout)
     assert "metric broken failed: ZeroDivisionError: division by zero (my_metrics.py:" in run.stdout
-    rows = rows_of(installed / "run" / "metrics.csv")
+    rows = rows_of(folder / "run" / "metrics.csv")
     assert all(float(row["way_m"]) > 0.1 for row in rows)
     assert [(row["broken"], bool(row["gap_m"])) for row in rows] == [("", row["robot"] == "mean") for row in rows]
-    page = (installed / "run" / "report.html").read_text("utf-8")
+    page = (folder / "run" / "report.html").read_text("utf-8")
     assert all(text in page for text in ("Way [m]", "Length of the path", "Gap [m] of the case", "broken failed"))
     assert "Way [m]" in shelled("report", "run", "--markdown").stdout
-    made = json.loads((installed / "run" / "run.json").read_text())["made_by"]
+    made = json.loads((folder / "run" / "run.json").read_text())["made_by"]
     assert made["plugins"] == {"my-metrics": "0.1"}
 
 
 @pytest.mark.slow
-def test_installed_metric_is_a_limit_of_a_search(shelled):
+def test_installed_metric_is_a_limit_of_a_search(installed):
     (line,) = re.findall(r"^    \./zenpark (sweep .*--optimise.*)$", GUIDE, re.MULTILINE)
     words = [word for word in shlex.split(line) if not word.startswith(("seeds=", "tuning="))]
     short = ["seeds=1:2", "tuning=1001:1006", "--set", "duration_s=1", "--processes", "1", "--anyway", "--no-report"]
-    done = shelled(*words, *short, "--out", "tuned")
+    done = installed[1](*words, *short, "--out", "tuned")
     assert done.returncode == 0, done.stderr
     assert re.search(r"^event threshold=.*: keeps Way ratio <= 1.02$", done.stdout, re.MULTILINE)
     assert "note: metric broken failed: ZeroDivisionError" in done.stdout

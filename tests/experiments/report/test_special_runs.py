@@ -7,7 +7,6 @@ import pytest
 
 from experiments.definition.experiment import ChannelTable, LinkChannelTable
 from experiments.metrics.measure import measure
-from experiments.recording import playback
 from experiments.report import export, figures, metrics_files, report, verdict
 from experiments.report.page import number
 from experiments.report.tables import network_tables, proof_tables, whole_tables
@@ -120,15 +119,3 @@ def test_report_has_dropped_poses_by_link(tmp_path, dropping_run):
     plain = measure(pair(np.ones(100)))
     assert (plain.modelled, network_tables([plain])) == (False, ())
     assert proof_tables([plain])[0].head[-1] == "Lost"
-
-
-@pytest.mark.slow
-def test_recording_keeps_dropped_poses(tmp_path, dropping_run):
-    dropping_run.recorder.record(tmp_path / "bad.mcap", "")
-    read, trace = playback.read(tmp_path / "bad.mcap").trace, dropping_run.trace
-    assert trace.dropped.sum() > 500
-    np.testing.assert_array_equal(read.dropped, trace.dropped)
-    np.testing.assert_array_equal(read.lost, 0)
-    for a, b in zip(measure(read).link_deliveries, measure(trace).link_deliveries, strict=True):
-        assert (a.received, a.dropped) == (b.received, b.dropped)
-        assert a.delay_mean == pytest.approx(b.delay_mean, abs=1e-5)

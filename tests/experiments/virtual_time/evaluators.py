@@ -38,9 +38,16 @@ def same(experiment, **options):
     return plain, ticks
 
 
-def alike(one, other):
+def alike(one, other, within=0.0):
+    """Whether two values are the same, numbers to a tolerance; unknown ones are the same."""
     if isinstance(one, msgspec.Struct):
-        return all(map(alike, msgspec.structs.astuple(one), msgspec.structs.astuple(other)))
+        one, other = msgspec.structs.astuple(one), msgspec.structs.astuple(other)
+    if isinstance(one, tuple):
+        return len(one) == len(other) and all(alike(*each, within) for each in zip(one, other, strict=True))
+    if isinstance(one, np.ndarray) and one.dtype.kind == "f":
+        return one.dtype == other.dtype and np.allclose(one, other, rtol=0.0, atol=within, equal_nan=True)
     if isinstance(one, np.ndarray):
-        return one.dtype == other.dtype and np.array_equal(one, other, equal_nan=one.dtype.kind == "f")
-    return one == other or (isinstance(one, float) and isnan(one) and isnan(other))
+        return one.dtype == other.dtype and np.array_equal(one, other)
+    if isinstance(one, float):
+        return abs(one - other) <= within or one == other or (isnan(one) and isnan(other))
+    return one == other

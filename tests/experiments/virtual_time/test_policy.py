@@ -98,7 +98,7 @@ def own_policy(folder, name="own.onnx"):
     return document.read(folder / "own.toml", [])
 
 
-def test_a_model_of_other_sizes_is_refused(tmp_path):
+def test_what_is_no_policy_is_refused(tmp_path, monkeypatch):
     for sizes in ((15, 2), (16, 3), (16, 2, 11), (3, 2)):
         model(tmp_path, *sizes)
         given = own_policy(tmp_path).cases()["periodic"].assignment("CF01")
@@ -110,6 +110,9 @@ def test_a_model_of_other_sizes_is_refused(tmp_path):
         Stepping(given)
     with pytest.raises(PluginError, match="give `file`"):
         policy.load("")
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    with pytest.raises(PluginError, match=r"\./zenpark install onnxruntime"):
+        policy.load("not cached")
 
 
 def test_absent_file_is_a_fault_of_its_line(tmp_path):
@@ -142,9 +145,3 @@ def test_more_neighbours_than_places_are_a_warning(tmp_path):
     plan = own_policy(tmp_path).cases()["periodic"]
     severity, message, _ = next(iter(plan.law.analyse(plan)))
     assert (severity, message.partition(",")[0]) == ("warning", "CF01 has 3 neighbours")
-
-
-def test_without_the_library_the_error_names_the_remedy(monkeypatch):
-    monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    with pytest.raises(PluginError, match=r"\./zenpark install onnxruntime"):
-        policy.load("not cached")

@@ -74,19 +74,6 @@ def test_losses_are_counted_from_start_to_landing():
     assert log.lost.tolist() == [100, 100]
 
 
-def test_one_robot_alone():
-    robot = RobotTable(kind="crazyflie", start=[0.2, -0.1], hover=0.6)
-    leg = LegTable(at_s=0.0, robot="F", plan={"kind": "circle", "radius": 0.2, "period_s": 8.0})
-    log = fly(small({"F": robot}, duration_s=8.0, timeline=[leg])).log
-    path = log.true_position[(log.time >= 0.0) & (log.time <= 8.0), 0]
-    assert len(log.received) == 0
-    assert np.abs(path[:, 2] - 0.6).max() < 0.05
-    # a position controller lags behind a circle and cuts it
-    assert np.linalg.norm(path[100:, :2] - [0.2, 0.1], axis=1).max() < 0.21
-    assert np.ptp(path[:, 0]) > 0.3
-    np.testing.assert_allclose(path[-1, :2], [0.2, -0.1], atol=0.1)
-
-
 def test_the_reference_formation_is_acquired():
     log = fly(changed(reference(), duration_s=18.0, timeline=[])).log
     links_each = np.array([0, 4, 3, 4, 4, 4, 2])
