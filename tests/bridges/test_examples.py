@@ -1,7 +1,6 @@
 """The example simulators, with Zenoh and the simulator's own modules faked: what they do with commands."""
 
 import json
-from collections import deque
 from types import SimpleNamespace
 from unittest.mock import MagicMock
 
@@ -20,31 +19,17 @@ class Ended(Exception):
     """End of the commands."""
 
 
-class Session:
-    """A session whose subscriber gets one command in each turn of the example."""
+def ring(commands):
+    """A subscriber's handler that has one command in each turn of an example."""
+    looks = [each for command in commands for each in (command, None)]
 
-    def __init__(self, commands):
-        self.handler, self._commands, self._looks = self, deque(commands), 0
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        pass
-
-    def declare_subscriber(self, *_):
-        return self
-
-    def declare_publisher(self, *_, **__):
-        return MagicMock()
-
-    def try_recv(self):
-        self._looks += 1
-        if self._looks % 2 == 0:  # the queue is empty for the rest of this turn
-            return None
-        if not self._commands:
+    def try_recv():
+        if not looks:
             raise Ended
-        return SimpleNamespace(payload=SimpleNamespace(to_string=self._commands.popleft))
+        text = looks.pop(0)
+        return text and SimpleNamespace(payload=SimpleNamespace(to_string=lambda: text))
+
+    return SimpleNamespace(try_recv=try_recv)
 
 
 @pytest.fixture
@@ -84,7 +69,8 @@ def speeds_in_gazebo(modules):
 def test_stop_with_lower_number_is_the_last_word(modules, speeds):
     """Of repeated and overtaken commands none is obeyed after it."""
     commands = [encoded(7, "drive"), encoded(5, "stop"), encoded(6, "drive"), encoded(7, "drive")]
-    modules["zenoh"].open.return_value = Session(commands)
+    session = modules["zenoh"].open.return_value.__enter__.return_value
+    session.declare_subscriber.return_value.handler = ring(commands)
     moving, *stopped = speeds(modules)
     assert moving > 0.0
     assert stopped[0] == 0.0

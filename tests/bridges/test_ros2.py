@@ -19,7 +19,7 @@ from zenoh.handlers import RingChannel
 
 from agents.network import messages
 from agents.network.keys import Keys
-from agents.network.pubsub import alive_token, pose_publisher, publisher
+from agents.network.pubsub import alive_token, pose_publisher
 from agents.network.session import open_session, received
 from agents.protocols import ros2
 from bridges.ros2 import GoalHeight, main, ros_name, scan, transform
@@ -225,49 +225,43 @@ class Realm:
         self.session, self.keys, self.tokens, self.out = session, Keys("park"), {}, {}
 
     def enter(self, name):
-        self.out[name] = {
-            "state": publisher(self.session, self.keys.state(name), JSON),
-            "status": pose_publisher(self.session, self.keys.status(name), JSON),
-            "ranges": publisher(self.session, self.keys.ranges(name), JSON),
-        }
+        self.out[name] = pose_publisher(self.session, self.keys.status(name), JSON)
         self.tokens[name] = alive_token(self.session, self.keys.alive(name))
 
     def leave(self, name):
         self.tokens.pop(name).undeclare()
 
+    def put(self, key, message):
+        self.session.put(key, messages.encode(message), encoding=JSON)
+
     def state(self, name, position=(0.0, 0.0, 0.5), velocity=(0.0, 0.0, 0.0), yaw=0.0):
         state = messages.State(name, 1, 1700000000.5, "running", position, velocity, yaw, None, None, 0.0)
-        self.out[name]["state"].put(messages.encode(state))
+        self.put(self.keys.state(name), state)
 
     def ranges(self, name):
         sweep = messages.Ranges(name, 1700000000.5, [0.0, round(math.pi / 2, 6)], [0.0, 0.0], [1.5, None])
-        self.out[name]["ranges"].put(messages.encode(sweep))
+        self.put(self.keys.ranges(name), sweep)
 
     def status(self, name, body=""):
         status = messages.Status(
             name, time.time(), "running", "", body, battery=0.75, sent=10, received=20, lost={"CF02": 1}, ticks=100,
             missed=2, decisions=50, interventions=3, late_s=0.01, pid=1, cpu_s=0.5, rss_mb=30.0,
         )  # fmt: skip
-        self.out[name]["status"].put(messages.encode(status))
+        self.out[name].put(messages.encode(status))
 
 
 @pytest.fixture
-def bridge(router):
-    with started("-m", "bridges.ros2", "--connect", router.endpoint, "--domain", "7", stderr=None) as process:
-        assert process.stdout.readline() == "ros2 ready: node /zenpark, domain 7, jazzy\n"
-        yield process
-        process.send_signal(signal.SIGTERM)
-        assert process.wait(30) == 0
-
-
-@pytest.fixture
-def sides(router, bridge):
+def sides(router):
     """A ROS node and a realm with the bridge between them."""
     with (
+        started("-m", "bridges.ros2", "--connect", router.endpoint, "--domain", "7", stderr=None) as process,
         open_session([router.endpoint], name="realm") as inside,
         open_session([router.endpoint], name="ros") as outside,
     ):
+        assert process.stdout.readline() == "ros2 ready: node /zenpark, domain 7, jazzy\n"
         yield RosNode(outside), Realm(inside)
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(30) == 0
 
 
 def endpoints(*names, scan=False):
@@ -279,9 +273,7 @@ def endpoints(*names, scan=False):
         found.append(("MS", f"/{name}/goal", ros2.POSE_STAMPED))
     if scan:
         found.append(("MP", f"/{names[0]}/scan", ros2.LASER_SCAN))
-    return {
-        (role, topic, kind.replace("/", "::").replace("::msg::", "::msg::dds_::") + "_") for role, topic, kind in found
-    }
+    return {(role, topic, kind.replace("/msg/", "::msg::dds_::") + "_") for role, topic, kind in found}
 
 
 @pytest.mark.mechanism("ROS 2 bridge")

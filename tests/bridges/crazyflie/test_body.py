@@ -1,22 +1,21 @@
-"""The Crazyflie bridge over the real cflib, against protocol twins: what it does is read off the twins' own state."""
+"""The Crazyflie bridge over the real cflib and its driver, against twins: what it does is read off the twins."""
 
-import os
-import signal
 import socket
 import struct
 import sys
+import threading
 import time
 
 import numpy as np
 import pytest
 import yaml
+from cflib.drivers import crazyradio
 
 from agents.body.interface import BodyError
 from agents.protocols.crazyflie import CrazyflieSettings, Outside, capacity, overload
 from agents.protocols.crtp import MemoryKind
 from bridges.crazyflie import link
 from tests.bridges.crazyflie_flight import connected, connected_twins, motors, supervised, truth
-from tests.commands import started
 from tests.requests import request
 from tests.twins.loopback import Served
 from tests.waiting import until
@@ -25,6 +24,8 @@ from twins.devices.crazyflie.supervisor import SupervisorState
 from twins.devices.device import Faults
 
 RADIO = "radio://0/80/2M/E7E7E7E701"
+DONGLE = {"link": "radio"}
+HEIGHT = 0.35
 LIGHTHOUSE = {"system": "lighthouse"}
 SWEEP = {"phase": 0.1, "tilt": 0.02, "curve": 0.0, "gibmag": 0.0, "gibphase": 1.0, "ogeemag": 0.0, "ogeephase": 1.5}
 TURN = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
@@ -296,35 +297,114 @@ def test_new_link_does_not_move_a_flow_deck():
         process.until(lambda: abs(process.state.position[0, 0]) < 0.02 and not process.state.note[0], "at its start")
 
 
-FLYING = """
-import sys
-from tests.bridges.crazyflie_flight import connected
+@pytest.fixture
+def known_tables(toc_cache):
+    """Over UDP a thousand entries are read in no time."""
+    if not link.KNOWN_TABLES:
+        with Served(CrazyflieTwin, request("crazyflie", ["x"])) as twin:
+            link.prepare(twin.addresses)
+            reader = link.CrazyflieLink(twin.addresses[0])
+            reader.open(time.monotonic() + 30.0, threading.Event())
+            reader.close()
 
-process = connected(sys.argv[1:])
-process.takeoff(0.4)
-process.lead((0.3, 0.0, 0.4, 0.0)).run(1e9)
-"""
+
+def hovering(process, rows=1, x=0.0):
+    return process.lead(*[(x, float(row), HEIGHT, 0.0) for row in range(rows)])
+
+
+@pytest.mark.mechanism("Crazyflie bridge: radio gap")
+@pytest.mark.system
+@pytest.mark.usefixtures("known_tables")
+def test_a_long_gap_lands_that_drone_alone():
+    with connected_twins(rows=3, device=DONGLE) as (twin, process):
+        process.takeoff(HEIGHT)
+        hovering(process, rows=3, x=0.2).run(0.2)
+        before = process.body.pilots[0].link
+        twin.device.lines[0].silence(0.7)
+        process.run(0.9)
+        assert process.state.flying.all(), "a short gap is flown through"
+        twin.device.lines[0].silence(1.2)
+        vehicle, sinks = twin.device.drones[0].vehicle, []
+        process.until(lambda: sinks.append(-vehicle.model.velocity[2]) or not process.state.flying[0], "landed")
+        assert process.body.pilots[0].link is before
+        assert truth(twin)[2] == pytest.approx(0.0, abs=0.02)
+        assert process.state.flying[1:].all()
+        assert np.abs(twin.truth()[0][1:] - [[0.2, 1.0, HEIGHT], [0.2, 2.0, HEIGHT]]).max() < 0.05
+        assert supervised(twin) != SupervisorState.LOCKED
+        assert max(sinks) < 0.5  # [m/s] a fall from this height is six times as fast
+        process.until(lambda: process.t - process.state.time[0] < 0.3, "logs again: the firmware removed its blocks")
+        process.cut()
 
 
 @pytest.mark.system
-def test_process_woken_from_suspension_lifts_no_drone():
-    """Suspension until the drone has come down: then the loop commands as before, and the drone stays down."""
-    asked = request("crazyflie", ["crazyflie-twin"], device={"link": "radio"})
-    with Served(CrazyflieTwin, asked) as twin, started("-c", FLYING, *twin.addresses, stderr=None) as child:
-        until(lambda: abs(truth(twin)[0] - 0.3) < 0.05, "it follows setpoints")
-        os.kill(child.pid, signal.SIGSTOP)
-        until(lambda: truth(twin)[2] == 0.0, "its drone has come down")
-        assert supervised(twin) == SupervisorState.FLYING
-        os.kill(child.pid, signal.SIGCONT)
-        heights = []
+@pytest.mark.usefixtures("known_tables")
+def test_setpoints_go_on_beside_external_positions():
+    """Two packets in each period, and room for one in the queue of the driver: neither starves the other."""
+    with connected_twins(rows=2, device=DONGLE, external=True) as (twin, process):
+        process.truth = twin.truth
+        vehicles = [drone.vehicle for drone in twin.device.drones]
+        process.until(lambda: np.isfinite(process.state.position).all(), "settled")
+        process.takeoff(HEIGHT)
+        hovering(process, rows=2).run(0.5)
+        received = [vehicle.estimator.received for vehicle in vehicles]
+        ages, end = [], process.t + 4.0
+        while process.t < end:
+            process.tick()
+            ages += [each.t - each.commander.received for each in vehicles]
+        assert max(ages) < 0.4, "the firmware levels out after 0.5 s"
+        assert min(np.subtract([vehicle.estimator.received for vehicle in vehicles], received)) > 30
+        process.land()
 
-        def stands():
-            heights.append(truth(twin)[2])
-            return not motors(twin)
 
-        until(stands, "its motors are stopped")
-        assert max(heights) == 0.0
+@pytest.mark.system
+@pytest.mark.usefixtures("known_tables")
+def test_a_radio_that_becomes_slow_gets_fewer_logs():
+    """Fewer exchanges than logs: their rates are halved until poses are young again, and the drone flies on.
+
+    On the ground, over a radio that is fast again, they are restored.
+    """
+    with connected_twins(device=DONGLE) as (twin, process):
+        process.takeoff(HEIGHT)
+        hovering(process).run(0.2)
+        (dongle,) = crazyradio._find_devices()
+        dongle.air = dongle.air._replace(hz=22.0)
+        process.noted("fewer logs")
+        process.until(lambda: process.t - process.state.time[0] < 0.3, "young poses")
+        dongle.air = dongle.air._replace(hz=500.0)
+        assert "fewer logs" in process.state.note[0]
+        process.land()
         assert supervised(twin) != SupervisorState.LOCKED
+        process.until(lambda: "fewer logs" not in process.state.note[0], "the rates that were chosen")
+        assert process.body.pilots[0].link.blocks["state"].period == 5
+
+
+@pytest.mark.system
+@pytest.mark.usefixtures("known_tables")
+def test_recovery_from_a_crash_is_asked_for():
+    """In another session: safelink is still on from this one, which ends without a word, and the air is gone."""
+    with connected_twins(device=DONGLE) as (twin, process):
+        twin.device.drones[0].vehicle.supervisor.state = SupervisorState.CRASHED
+        process.noted("crashed: put it upright")
+        process.body.takeoff([0], [HEIGHT])
+        process.until(lambda: "no take-off: crashed" in process.state.note[0] and not process.state.flying[0], "no")
+        assert supervised(twin) == SupervisorState.CRASHED
+        process.close()
+        assert twin.device.lines[0].safelink
+        twin.device.lines[0].silence(0.5)
+        with connected(twin.addresses, device={"recover": True}) as again:
+            again.takeoff(HEIGHT)
+            again.cut()
+
+
+@pytest.mark.system
+@pytest.mark.usefixtures("known_tables")
+def test_a_radio_that_carries_too_little_is_refused():
+    device = DONGLE | {"log_hz": 50.0, "stream_hz": 100.0, "positioning": {"system": "external", "rate_hz": 100.0}}
+    with (
+        pytest.raises(RuntimeError, match=r"radio 0: 2 robots ask for 700 packets/s.*write log_hz = .*stream_hz"),
+        connected_twins(rows=2, device=device, external=True, exchanges_hz=300.0, measuring_s=0.5),
+    ):
+        pass
 
 
 @pytest.mark.system

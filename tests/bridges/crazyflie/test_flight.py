@@ -32,7 +32,7 @@ class Air(ManualClock):
     def __init__(self, monkeypatch):
         super().__init__(100.0)
         clocked(monkeypatch, self)
-        self.sent, self.replies, self.written = [], {}, 0
+        self.sent, self.replies, self.written, self.confirms = [], {}, 0, True
         self.target = lambda: PLACE  # of the robot's loop; None: it does not command
         self.telemetry = Telemetry(lighthouse=False)
         self.flight = FlightControl(CrazyflieSettings(), self.telemetry, lambda seconds: self.sleep(seconds))  # noqa: PLW0108
@@ -56,7 +56,8 @@ class Air(ManualClock):
         trajectories = self.flight.link.trajectories
         if port == Port.MEMORY:
             self.written += 1
-            trajectories.note_answer(crtp.MEMORY.unpack_from(data)[1], 0)
+            if self.confirms:
+                trajectories.note_answer(crtp.MEMORY.unpack_from(data)[1], 0)
         elif data[0] == HighLevel.START_2:
             self.sent.append((self.now, "climb" if data[5] in TAKEOFFS else "setpoint"))
 
@@ -232,6 +233,17 @@ def test_stalled_process_sends_no_stale_setpoint(air):
     assert air.sent == []
     air.flight.send_due(air.now)
     assert {what for _, what in air.sent} == {"land", "send_notify_setpoint_stop"}
+
+
+def test_setpoints_that_are_not_confirmed_end_in_landing(air):
+    """The drone descends by itself, and would stand with its motors on; the radio is not flooded."""
+    air.pass_(1.0)
+    air.confirms, air.written = False, 0
+    air.target = sweep(*np.linspace(0.2, 0.8, 1000))
+    assert air.pass_(1.0).phase is FlightPhase.FLYING
+    assert air.written < 10
+    assert air.pass_(2.5).phase is FlightPhase.LANDING
+    assert air.flight.trouble == "landed: its setpoints are not confirmed"
 
 
 def test_setpoints_of_old_poses_are_ignored(air):

@@ -436,18 +436,16 @@ def test_another_client_in_flight_is_ended(circling, packet):
     assert circling.supervised == SupervisorState.FLYING
 
 
-def test_memory_that_takes_no_setpoint(circling):
-    """The drone descends by itself, and would stand with its motors on: it is landed. The radio is not flooded."""
-    drone, twin, written = circling.twin.drones[0], circling.twin, []
-    send, deliver = drone.send, twin.deliver
-    drone.send = lambda port, *rest: None if port == Port.MEMORY else send(port, *rest)
-    twin.deliver = lambda row, packet: (written.append(packet[0] >> 4 == Port.MEMORY), deliver(row, packet))
-    circling.run(1.0, speed=0.3)
-    assert sum(written) < 10
-    assert circling.landed()
-    assert circling.troubles == {"landed: its setpoints are not confirmed"}
-    circling.run(4.0)
-    assert circling.phases == {FlightPhase.GROUND}
+@pytest.mark.parametrize("gap", [2.5, 5.0, math.inf])
+def test_nothing_is_received_any_more(circling, gap):
+    """Down within what lies on board, never a fall or a hover without command, and never lifted again."""
+    circling.twin.lines[0].silence(gap)
+    heights = np.array([circling.run(0.05, speed=0.3).heights[0] for _ in range(180)])
+    assert heights[60:].max() < HEIGHT - 0.1
+    assert heights[np.argmax(heights < 1e-3) :].max() < 0.02
+    assert circling.soft
+    assert circling.supervised != SupervisorState.LOCKED
+    assert circling.vehicles[0].model.flying == (gap == math.inf), "nobody can stop its motors"
 
 
 def test_short_gaps_one_after_the_other(circling):

@@ -291,39 +291,15 @@ def test_landing_ends_when_answered_and_low(airborne):
     assert airborne.pass_(0.5, h=0).answer(b"ok").duty is Duty.REST
 
 
-class Climber(Cockpit):
-    """Rises to 0.8 m in 4 s and answers `land` with "error" meanwhile; then obeys."""
-
-    up_at = landed_at = np.inf
-
-    def send_command_without_return(self, command):
-        super().send_command_without_return(command)
-        if command == "takeoff":
-            self.up_at = min(self.up_at, self.now)
-        elif command == "land" and self.now - self.up_at < 4.0:
-            self.responses.append(b"error")
-        elif command == "land":
-            self.landed_at = min(self.landed_at, self.now)
-
-    def fly_on(self, seconds):
-        for _ in range(round(seconds / 0.05)):
-            aloft = self.up_at < self.now < self.landed_at
-            risen = max(0.0, min(80.0, 30.0 * (self.now - self.up_at - 1.0))) if aloft else 0.0
-            ran = max(0.0, min(self.now, self.landed_at) - self.up_at)
-            self.pass_(0.05, h=10 * int(risen / 10.0), time=int(ran))
-
-
-def test_refused_landing_is_repeated_until_down():
-    climber = Climber().take_off(0.8, rested_s=5.0)
-    climber.fly_on(0.7)
-    climber.land()
-    climber.fly_on(0.3)
-    assert (climber.duty, climber.report["h"]) == (Duty.LAND, 0)
-    climber.fly_on(4.0)
-    assert climber.said.count("land") == 5
-    assert climber.landed_at < climber.now
-    climber.fly_on(4.0)
-    assert not climber.flying
+def test_refused_landing_is_repeated_until_down(grounded):
+    """A drone that answers `land` with "error" while it rises."""
+    grounded.take_off(0.8, rested_s=5.0).pass_(0.7).land()
+    for second in range(1, 5):
+        grounded.answer(b"error", time=second, h=20 * (second - 1)).pass_(0.9)
+        assert grounded.duty is Duty.LAND
+    assert grounded.said.count("land") == 5
+    grounded.answer(b"ok", h=0).pass_(4.0)
+    assert not grounded.flying
 
 
 def test_landing_before_the_motors_start_is_repeated(grounded):

@@ -18,7 +18,6 @@ from bridges.turtlebot3.odometry import StampAge
 from bridges.turtlebot3.robot import TurtleBotConnection, ranges
 from tests.bridges.turtlebots import NOWHERE, STYLES, FakeRos, Stage, clock, odometry, request
 from tests.waiting import ManualClock, until
-from twins.devices.device import Faults
 
 
 @given(st.floats(-3.5, 3.5))
@@ -208,15 +207,6 @@ def test_nobody_commands_and_it_stands(hub):
         until(lambda: stage.twin.robots[0].twist == (0.0, 0.0), "it stands")
         assert np.linalg.norm(stage.place - before) < 0.5
         until(lambda: stage.moved(0.5, 0.2) > 0.05, "and drives on when it is told to")
-
-
-@pytest.mark.system
-def test_odometry_held_back_is_old(hub):
-    with Stage(request(hub.endpoint)) as stage:
-        stage.run(1.0, 0.2)
-        stage.twin.link.faults = Faults(delay_s=2.0)
-        until(lambda: "old by its stamps" in stage.note(0.1, 0.2), "it is noticed")
-        assert stage.t - stage.state.time[0] == pytest.approx(2.0, abs=0.5)
 
 
 @pytest.mark.system

@@ -1,16 +1,9 @@
-"""The watchdog on a TurtleBot3: when it stops the robot, with a ROS of our own, and installed over a real sshd."""
+"""The watchdog on a TurtleBot3: when it stops the robot, with a ROS of our own, and its installation."""
 
-from __future__ import annotations
-
-import getpass
 import math
 import os
-import shutil
 import signal
-import socket
-import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace as Thing
 from unittest.mock import MagicMock
@@ -24,18 +17,18 @@ from experiments.real_time.hosts.hosts import HostError
 from tests.waiting import ManualClock, until
 
 
-def twist(v: float = 0.0, w: float = 0.0) -> Thing:
+def twist(v=0.0, w=0.0):
     return Thing(linear=Thing(x=v, y=0.0, z=0.0), angular=Thing(x=0.0, y=0.0, z=w))
 
 
-def zeros(dog: StopTimer, begin: float, end: float) -> list[float]:
+def zeros(dog, begin, end):
     """Times of the zeros that are sent from `begin` to `end` [s]."""
     ticks = [begin + 0.02 * k for k in range(round((end - begin) / 0.02))]
     return [t for t in ticks if dog.zero_due(t)]
 
 
 @pytest.mark.parametrize("heard", [True, False])
-def test_moving_robot_stops_after_half_a_second_silence(heard: bool) -> None:
+def test_moving_robot_stops_after_half_a_second_silence(heard):
     """Also at its start, by a command from before, of a sender that is gone."""
     dog = StopTimer(0.5, 0.0 if heard else 10.0)
     if heard:
@@ -48,7 +41,7 @@ def test_moving_robot_stops_after_half_a_second_silence(heard: bool) -> None:
     assert dog.stops == 1
 
 
-def test_commanded_or_standing_robot_is_left_alone() -> None:
+def test_commanded_or_standing_robot_is_left_alone():
     dog = StopTimer(0.5, 0.0)
     dog.hear(0.0, moves=False)
     assert zeros(dog, 0.0, 5.0) == []
@@ -59,7 +52,7 @@ def test_commanded_or_standing_robot_is_left_alone() -> None:
     assert zeros(dog, 25.0, 40.0) == []
 
 
-def test_its_own_zeros_are_heard_and_end_nothing() -> None:
+def test_its_own_zeros_are_heard_and_end_nothing():
     dog = StopTimer(0.5, 0.0)
     dog.hear(0.0, moves=True)
     first = zeros(dog, 0.0, 0.6)
@@ -72,7 +65,7 @@ def test_its_own_zeros_are_heard_and_end_nothing() -> None:
 
 
 @pytest.mark.parametrize("kind", ["twist", "stamped"])
-def test_node_sends_zeros_of_the_robots_type(monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
+def test_node_sends_zeros_of_the_robots_type(monkeypatch, kind):
     messages = Thing(Twist=twist, TwistStamped=lambda: Thing(header=Thing(stamp=None), twist=twist()))
     monkeypatch.setitem(sys.modules, "geometry_msgs", messages)
     monkeypatch.setitem(sys.modules, "geometry_msgs.msg", messages)
@@ -91,16 +84,15 @@ def test_node_sends_zeros_of_the_robots_type(monkeypatch: pytest.MonkeyPatch, ki
     assert sent[0] == (twist() if kind == "twist" else Thing(header=Thing(stamp=stamp), twist=twist()))
 
 
-def test_type_is_the_robots_not_the_watchdogs() -> None:
+def test_type_is_the_robots_not_the_watchdogs():
     node = MagicMock(get_name=lambda: "cmd_vel_watchdog", get_subscriptions_info_by_topic=lambda _: found)
-    found: list[Thing] = []
+    found = []
     assert type_of_robot(node, "cmd_vel") == ""
     for name, kind in {"cmd_vel_watchdog": "twist", "turtlebot3_node": "stamped"}.items():
         found.append(Thing(node_name=name, topic_type=TYPES[kind]))
     assert type_of_robot(node, "cmd_vel") == TYPES["stamped"]
 
 
-SSHD = shutil.which("sshd") or "/usr/sbin/sshd"
 ROS = {
     "rclpy/__init__.py": '''"""A ROS that does nothing, for the watchdog on a robot that is not there."""
 import sys, time
@@ -120,59 +112,31 @@ spin = lambda node: time.sleep(600)
 }
 
 
-def new_file(path: Path, text: str) -> Path:
-    """A file in a folder that may be new, which may run."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text)
-    path.chmod(0o700)
-    return path
-
-
 @pytest.fixture
-def robot_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """The home folder of a robot with a real sshd on loopback, a ROS of ours, and no cron; ssh finds it as `robot`."""
-    if not Path(SSHD).exists() or shutil.which("ssh-keygen") is None:
-        pytest.skip("needs openssh-server")
-    home, site, bin_ = tmp_path / "home", tmp_path / "site", tmp_path / "bin"
-    home.mkdir()
-    for name, text in ROS.items():
-        new_file(site / name, text)
-    new_file(site / "setup.sh", f"export PYTHONPATH={site}\n")
-    table = f'#!/bin/sh\n[ "$1" = -l ] && exec cat {home}/crontab\nexec cat > {home}/crontab\n'
-    new_file(bin_ / "crontab", table)
-    for name in ("host_key", "key"):
-        subprocess.run(["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", str(tmp_path / name)], check=True)
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    config = new_file(
-        tmp_path / "sshd_config",
-        f"Port {port}\nListenAddress 127.0.0.1\nHostKey {tmp_path}/host_key\nAuthorizedKeysFile {tmp_path}/key.pub\n"
-        f"PidFile {tmp_path}/sshd.pid\nPasswordAuthentication no\nUsePAM no\nStrictModes no\n"
-        f"SetEnv HOME={home} PATH={bin_}:{Path(sys.executable).parent}:/usr/bin:/bin ROS_SETUP={site}/setup.sh\n",
-    )
-    Path("/run/sshd").mkdir(exist_ok=True)
-    with (tmp_path / "sshd.log").open("wb") as log:
-        sshd = subprocess.Popen([SSHD, "-D", "-e", "-f", str(config)], stdin=subprocess.DEVNULL, stdout=log, stderr=log)
-    ours = new_file(
-        tmp_path / "ssh_config",
-        f"Host robot\n HostName 127.0.0.1\n Port {port}\n User {getpass.getuser()}\n IdentityFile {tmp_path}/key\n"
-        f" StrictHostKeyChecking no\n UserKnownHostsFile {tmp_path}/known\n",
-    )
-    ssh = new_file(tmp_path / "ours" / "ssh", f'#!/bin/sh\nexec {shutil.which("ssh")} -F {ours} "$@"\n')
-    monkeypatch.setenv("PATH", f"{ssh.parent}:{os.environ['PATH']}")
-    until((tmp_path / "sshd.pid").exists, "its sshd runs")
+def robot_home(tmp_path, monkeypatch):
+    """The home folder of a robot whose sshd is a shell on this machine, with a ROS of ours, and no cron."""
+    home, site, programs = tmp_path / "home", tmp_path / "site", tmp_path / "bin"
+    table = f'[ "$1" = -l ] && exec cat {home}/crontab\nexec cat > {home}/crontab\n'
+    there = f"HOME={home} PATH={programs}:{Path(sys.executable).parent}:/usr/bin:/bin ROS_SETUP={site}/setup.sh"
+    files = {site / name: text for name, text in ROS.items()}
+    files[home / "crontab"] = ""
+    files[site / "setup.sh"] = f"export PYTHONPATH={site}\n"
+    files[programs / "crontab"] = f"#!/bin/sh\n{table}"
+    files[tmp_path / "ssh" / "ssh"] = f'#!/bin/sh\nfor command; do :; done\nexec env -i {there} sh -c "$command"\n'
+    for path, text in files.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+        path.chmod(0o700)
+    monkeypatch.setenv("PATH", f"{tmp_path / 'ssh'}:{os.environ['PATH']}")
     yield home
-    (home / "zenpark-watchdog" / "stop").touch() if (home / "zenpark-watchdog").exists() else None
     for pid in (home / "zenpark-watchdog").glob("pid"):
+        (pid.parent / "stop").touch()
         os.kill(int(pid.read_text()), signal.SIGTERM)
-    sshd.terminate()
-    sshd.wait(30)
 
 
 @pytest.mark.mechanism("TurtleBot3: watchdog on the robot")
 @pytest.mark.system
-def test_watchdog_is_installed_kept_and_removed_over_ssh(robot_home: Path) -> None:
+def test_watchdog_is_installed_kept_and_removed(robot_home):
     for attempt in range(2):  # a second time replaces the first
         said = installation.put_watchdog("robot", namespace="tb3_0", domain=30, silence_s=0.5)
         assert "it is started at each boot (crontab -l)" in said
@@ -191,11 +155,9 @@ def test_watchdog_is_installed_kept_and_removed_over_ssh(robot_home: Path) -> No
 
 
 @pytest.mark.system
-def test_a_robot_without_ros_is_named(robot_home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        installation, "PUT_WATCHDOG", installation.PUT_WATCHDOG.replace("${ROS_SETUP:-$setup}", "$setup")
-    )
+@pytest.mark.usefixtures("robot_home")
+def test_a_robot_without_ros_is_named(monkeypatch):
+    without = installation.PUT_WATCHDOG.replace("${ROS_SETUP:-$setup}", "$setup")
+    monkeypatch.setattr(installation, "PUT_WATCHDOG", without)
     with pytest.raises(HostError, match=r"(?s)^robot: .*there is no ROS 2 under /opt/ros$"):
         installation.put_watchdog("robot", namespace="", domain=30, silence_s=0.5)
-    with pytest.raises(HostError, match=r"^nowhere: .*no machine of that name"):
-        installation.put_watchdog("nowhere", namespace="", domain=30, silence_s=0.5)
