@@ -24,18 +24,12 @@ def digraphs(draw, most=9):
     return rows, pairs
 
 
-def as_networkx(rows, pairs):
-    """An arrow from listener to speaker, as in the adjacency matrix."""
-    graph = nx.DiGraph(pairs)
-    graph.add_nodes_from(range(rows))
-    return graph
-
-
 @examples(40)
 @given(digraphs(), st.data())
 def test_graph_is_that_of_networkx(made, data):
     rows, pairs = made
-    net, graph = links(pairs), as_networkx(rows, pairs)
+    net, graph = links(pairs), nx.DiGraph(pairs)  # an arrow from receiver to sender, as in the adjacency matrix
+    graph.add_nodes_from(range(rows))
     a = nx.to_numpy_array(graph, nodelist=range(rows))
     np.testing.assert_array_equal(adjacency(net, rows), a)
     np.testing.assert_array_equal(np.diag(degree(net, rows)), a.sum(axis=1))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 
 from experiments.catalogue import index
-from experiments.check.check import check
 from experiments.file import catalogue as entries
 from experiments.file import document
 from experiments.file.document import DocumentError, read
@@ -39,17 +38,11 @@ start = [-1.5, 0.0]
 """
 
 
-@pytest.fixture
-def write_files(tmp_path):
-    """Writes an experiment and its arena file; gives the path of the experiment."""
-
-    def written(experiment=ONE, arena=LAB):
-        (tmp_path / "lab.toml").write_text(arena)
-        file = tmp_path / "one.toml"
-        file.write_text(experiment)
-        return file
-
-    return written
+def write_files(folder, experiment=ONE, arena=LAB):
+    """Path of an experiment that is written with its arena file."""
+    (folder / "lab.toml").write_text(arena)
+    (folder / "one.toml").write_text(experiment)
+    return folder / "one.toml"
 
 
 def refused(file, *changes):
@@ -58,8 +51,8 @@ def refused(file, *changes):
     return caught.value.problems
 
 
-def test_arena_is_that_of_the_file(write_files, tmp_path):
-    given = read(write_files())
+def test_arena_is_that_of_the_file(tmp_path):
+    given = read(write_files(tmp_path))
     arena = given.experiment.arena
     assert arena.size == (4.0, 3.0, 2.0)
     assert not arena.walls
@@ -77,10 +70,10 @@ def test_arena_is_that_of_the_file(write_files, tmp_path):
     assert read(file).experiment == given.experiment
 
 
-def test_own_keys_win_and_obstacles_merge_by_name(write_files):
+def test_own_keys_win_and_obstacles_merge_by_name(tmp_path):
     own = "walls = true\n[arena.obstacles.post]\nheight = 0.5\n[arena.obstacles.cart]\nradius = 0.2\n"
     own += "[arena.starts.east]\nat = [1.5, 0.0]\nsize = [0.5, 0.5]\n"
-    arena = read(write_files(ONE.replace('"lab.toml"\n', f'"lab.toml"\n{own}'))).experiment.arena
+    arena = read(write_files(tmp_path, ONE.replace('"lab.toml"\n', f'"lab.toml"\n{own}'))).experiment.arena
     assert arena.walls
     assert arena.size == (4.0, 3.0, 2.0)
     assert arena.obstacles["post"] == Obstacle(radius=0.1, at=(1.0, 0.0), height=0.5)
@@ -89,10 +82,10 @@ def test_own_keys_win_and_obstacles_merge_by_name(write_files):
     assert list(arena.starts) == ["west", "east"]
 
 
-def test_case_changes_the_arena_or_takes_another_file(write_files, tmp_path):
+def test_case_changes_the_arena_or_takes_another_file(tmp_path):
     (tmp_path / "hall.toml").write_text("[arena]\nsize = [9.0, 9.0, 3.0]\n[arena.obstacles.pillar]\nradius = 0.4\n")
     cases = '[cases.lab.arena.obstacles.post]\nradius = 0.2\n[cases.hall.arena]\nfile = "hall.toml"\n'
-    given = read(write_files(ONE + cases))
+    given = read(write_files(tmp_path, ONE + cases))
     found = {name: plan.experiment.arena for name, plan in given.cases().items()}
     assert found["lab"].obstacles["post"].radius == 0.2
     assert list(found["hall"].obstacles) == ["pillar"]
@@ -102,8 +95,8 @@ def test_case_changes_the_arena_or_takes_another_file(write_files, tmp_path):
     assert files == {"": "lab.toml", "lab": "lab.toml", "hall": "hall.toml"}
 
 
-def test_command_line_changes_find_what_the_file_holds(write_files, tmp_path):
-    file = write_files()
+def test_command_line_changes_find_what_the_file_holds(tmp_path):
+    file = write_files(tmp_path)
     found = read(file, ["arena.obstacles.cart.plan.speed=0.2", "arena.obstacles.post.at=[0.5, 0.5]"]).experiment.arena
     assert found.obstacles["cart"].plan == {"kind": "line", "move_by": [1.0, 0.0], "speed": 0.2}
     assert found.obstacles["post"].at == (0.5, 0.5)
@@ -128,8 +121,8 @@ def test_command_line_changes_find_what_the_file_holds(write_files, tmp_path):
         ("# nothing\n", (0, 0), "holds nothing but comments", ""),
     ],
 )
-def test_wrong_arena_file_is_refused_where_wrong(write_files, arena, place, message, hint):
-    file = write_files(arena=arena)
+def test_wrong_arena_file_is_refused_where_wrong(tmp_path, arena, place, message, hint):
+    file = write_files(tmp_path, arena=arena)
     problem = refused(file)[0]
     assert problem.file == str(file.parent / "lab.toml")
     assert (problem.line, problem.column) == place
@@ -137,23 +130,14 @@ def test_wrong_arena_file_is_refused_where_wrong(write_files, arena, place, mess
     assert hint in problem.hint
 
 
-def test_conflicts_with_the_arena_point_into_both_files(write_files):
+def test_conflicts_with_the_arena_point_into_both_files(tmp_path):
     small = ONE.replace('"lab.toml"\n', '"lab.toml"\nsize = [2.0, 3.0, 2.0]\n')
-    robot, box = refused(write_files(small))
+    robot, box = refused(write_files(tmp_path, small))
     assert (robot.file.rpartition("/")[2], robot.line) == ("one.toml", 8)
     assert (box.file.rpartition("/")[2], box.line) == ("lab.toml", 16)
-    problem = refused(write_files(ONE + "[cases.small.arena]\nsize = [3.9, 1.0, 2.0]\n"))[0]
+    problem = refused(write_files(tmp_path, ONE + "[cases.small.arena]\nsize = [3.9, 1.0, 2.0]\n"))[0]
     assert (problem.file.rpartition("/")[2], problem.line) == ("one.toml", 8)
     assert problem.message.startswith("in case 'small', arena.obstacles.cart.at: 'cart' stands outside")
-
-
-@pytest.mark.slow
-def test_check_findings_point_into_the_arena_file(write_files):
-    plan = '[[timeline]]\nat_s = 2.0\nrobot = "KH01"\nplan = { kind = "line", move_by = [2.6, 0.0], speed = 0.2 }\n'
-    file = write_files(ONE + plan)
-    (found,) = [each for each in check(read(file)) if each.code == "hits-obstacle"]
-    assert found.where == f"{file.parent / 'lab.toml'}:6:1"
-    assert "KH01 would run into 'post' at 14.7 s" in found.message
 
 
 def test_catalogue_arena_files_are_no_experiments(tmp_path):
@@ -167,10 +151,10 @@ def test_catalogue_arena_files_are_no_experiments(tmp_path):
     assert not (tmp_path / "again.toml").exists()
 
 
-def test_arena_file_is_of_the_catalogue_or_beside(write_files, tmp_path):
-    arena = read(write_files(ONE.replace("lab.toml", "gate.arena.toml"))).experiment.arena
+def test_arena_file_is_of_the_catalogue_or_beside(tmp_path):
+    arena = read(write_files(tmp_path, ONE.replace("lab.toml", "gate.arena.toml"))).experiment.arena
     assert list(arena.obstacles) == ["left", "right"]
     for name in ("experiment.toml", "Experiment.TOML", "run.json", "event.mcap"):  # files of a run
         (tmp_path / name).write_text(LAB)
         with pytest.raises(DocumentError, match="call it otherwise"):
-            read(write_files(ONE.replace("lab.toml", name)))
+            read(write_files(tmp_path, ONE.replace("lab.toml", name)))

@@ -78,22 +78,25 @@ def test_every_misspelt_key_is_found_in_its_line(write):
 
 
 @pytest.mark.parametrize(
-    ("content", "place", "message", "hint"),
+    ("name", "content", "place", "message"),
     [
-        (b"\x89PNG\0\0", (0, 0), "is binary", "name an experiment file"),
-        (b'title = "Ma\xf1as"\n', (1, 12), "byte 0xf1 is not UTF-8", "save the file as UTF-8"),
-        (b"\xef\xbb\xbf", (0, 0), "is empty", "zenpark new"),
-        (b"a = " + b"1" * 5000, (0, 0), "is no TOML", "smaller number"),
-        (b"a = " + b"[" * 5000 + b"]" * 5000, (0, 0), "nested too deeply", "flatten"),
-        (b"a." * 50 + b"a = 1", (0, 0), "more than 50 parts", "shorten"),
-        (b"#" * (MAX_TEXT_BYTES + 1), (0, 0), "is longer than 4 MB", "not a recording"),
+        ("some.toml", b"\x89PNG\0\0", (0, 0), "is binary"),
+        ("some.toml", b'title = "Ma\xf1as"\n', (1, 12), "byte 0xf1 is not UTF-8"),
+        ("some.toml", b"\xef\xbb\xbf", (0, 0), "is empty"),
+        ("some.toml", b"a = " + b"1" * 5000, (0, 0), "is no TOML"),
+        ("some.toml", b"a = " + b"[" * 5000 + b"]" * 5000, (0, 0), "nested too deeply"),
+        ("some.toml", b"a." * 50 + b"a = 1", (0, 0), "more than 50 parts"),
+        ("some.toml", b"#" * (MAX_TEXT_BYTES + 1), (0, 0), "is longer than 4 MB"),
+        ("some.json", b'{\n  "title": "x",\n  "duration_s": oops\n}', (3, 17), "invalid character"),
+        ("some.json", b"[1, 2]", (0, 0), "its top must be a table"),
+        ("some.json", b"[" * 100_000, (0, 0), "nested too deeply"),
     ],
 )
-def test_file_that_is_no_experiment(write, content, place, message, hint):
-    (problem,) = refusal(write(content)).problems
+def test_file_that_is_no_experiment(write, name, content, place, message):
+    (problem,) = refusal(write(content, name)).problems
     assert (problem.line, problem.column) == place
     assert message in problem.message
-    assert hint in problem.hint
+    assert problem.hint
 
 
 def test_absent_file_names_the_nearest_of_the_catalogue(write):
@@ -144,8 +147,7 @@ def test_case_merges_tables_and_replaces_choices_between_kinds(write):
     cases = experiments(read(write(text)))
     assert cases["same"].trigger == {"kind": "send-on-delta", "threshold": 0.05, "maximum_silence_s": 2.0}
     assert cases["other"].trigger == {"kind": "periodic", "period_s": 0.1}
-    assert cases["wide"].robots["KH02"].start == [1.5, 0.0]
-    assert cases["wide"].robots["KH02"].kind == "khepera4"
+    assert (cases["wide"].robots["KH02"].start, cases["wide"].robots["KH02"].kind) == ([1.5, 0.0], "khepera4")
     assert parse_links(cases["wide"]) == [("KH01", "KH02", 1.5, 2.0), ("KH02", "KH01", 1.5, 2.0)]
     assert parse_links(cases["same"]) == [("KH01", "KH02", 1.0, 3.0), ("KH02", "KH01", 1.0, 3.0)]
 
@@ -196,7 +198,6 @@ def test_wrong_set_names_the_flag(flag, message, hint):
     assert problem.file == f"--set {flag}"
     assert message in problem.message
     assert hint in problem.hint
-    assert str(problem).startswith("--set ")
 
 
 def test_set_is_checked_together_with_the_file(write):
@@ -215,20 +216,6 @@ def test_json_says_the_same(name, write):
     assert again.cases() == found.cases()
     for case in found.cases().values():
         assert read(write(document.write_json(case), "case.json")).plan == case
-
-
-@pytest.mark.parametrize(
-    ("content", "line", "column", "message"),
-    [
-        (b'{\n  "title": "x",\n  "duration_s": oops\n}', 3, 17, "invalid character"),
-        (b"[1, 2]", 0, 0, "its top must be a table"),
-        (b"[" * 100_000, 0, 0, "nested too deeply"),
-    ],
-)
-def test_json_that_is_none(write, content, line, column, message):
-    (problem,) = refusal(write(content, "some.json")).problems
-    assert (problem.line, problem.column) == (line, column)
-    assert message in problem.message
 
 
 def test_fault_in_json_is_located(write):

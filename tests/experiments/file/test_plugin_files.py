@@ -17,7 +17,8 @@ from experiments.recording.reader import RecordingError
 from experiments.report.tables import summary_table
 from experiments.run import reopen, simulate
 from experiments.sweep import runs
-from tests.commands import invoke
+from tests.commands import ROOT, invoke
+from tests.docs.test_python import BLOCK, PAGE
 
 TASK = """
 title = "Two robots meet"
@@ -187,111 +188,63 @@ def test_bundle_runs_code_by_agreement_alone(task, tmp_path, monkeypatch):
     invoke("run", archive, "--no-report", "--yes")
 
 
-SPREAD = """
-import numpy as np
-
-from zenpark import Metric
-
-class Spread(Metric, frozen=True):
-    label = "Spread"
-    unit = "m"
-    per = "case"
-
-    def of(self, trace, shared):
-        return np.ptp(trace.true_position[-1], axis=0).max()
-
-class Last(Metric, frozen=True):
-    label = "x in the end"
-    unit = "m"
-
-    def of(self, trace, shared):
-        return trace.true_position[-1, :, 0]
-
-class Broken(Metric, frozen=True):
-    unit = "m"
-"""
-
-
 def with_criterion(task, metric, **criterion):
-    (task.parent / "spread.py").write_text(SPREAD, "utf-8")
+    shutil.copy(ROOT / "docs" / "course" / "measures.py", task.parent)
     lines = [f"{key} = {value!r}" for key, value in {"metric": metric, **criterion}.items()]
     task.write_text("\n".join([TASK, "[[criteria]]", *lines]), "utf-8")
     return task
 
 
 def judged(task, metric, **criterion):
-    return judge([*simulate(load(with_criterion(task, metric, **criterion)), cases=["fast"]).metrics.values()])
+    uneven = 'formation.links={ "A > B" = { offset = [0.4, 0.0] }, "B > A" = { offset = [-0.8, 0.0] } }'
+    read = load(with_criterion(task, metric, **criterion), uneven)
+    return judge([*simulate(read, cases=["fast"]).metrics.values()])
 
 
 @pytest.mark.parametrize(
-    ("metric", "of", "high"),
+    ("metric", "of", "about"),
     [
-        ("spread.py:Spread", {}, 1.0),
-        ("spread.py:Last", {"of": "B"}, 0.5),
-        ("spread.py:Last", {"of": "worst"}, 0.5),
-        ("spread.py:Broken", {}, None),
+        ("measures.py:Spread", {}, 0.83),
+        ("measures.py:Way", {"of": "A"}, 0.028),
+        ("measures.py:Way", {"of": "mean"}, 0.103),
+        ("measures.py:Way", {"of": "worst"}, 0.177),
+        ("measures.py:Unserved", {}, None),  # it fails: the law has no tasks
     ],
 )
-def test_criterion_names_a_metric_in_a_file(task, metric, of, high):
-    (only,) = judged(task, metric, **of, at_most=high or 1.0)
-    assert only.passed == (high is not None)
-    assert high is None or 0.0 < only.values[1] < high
+def test_criterion_names_a_metric_in_a_file(task, metric, of, about):
+    (only,) = judged(task, metric, **of, at_most=1.0)
+    assert only.passed == (about is not None)
+    assert about is None or only.values[1] == pytest.approx(about, abs=0.01)
     assert "@" not in only.what
 
 
 def test_run_keeps_the_metrics_of_its_criteria(task, tmp_path):
-    with_criterion(task, "spread.py:Spread", at_most=1.0)
+    with_criterion(task, "measures.py:Spread", at_most=1.0)
     out = tmp_path / "run"
     out.mkdir()  # an empty folder is taken
     output = invoke("run", task, "--virtual", "--no-report", "--out", out).stdout
     (shown,) = re.findall(r"^ +fast: f .*, Spread (0\.\d+) m, .*$", output, re.MULTILINE)
-    assert (out / "spread.py").is_file()
-    assert "spread.py:Spread" in (out / "metrics.csv").read_text("utf-8").partition("\n")[0]
+    assert (out / "measures.py").is_file()
+    assert "measures.py:Spread" in (out / "metrics.csv").read_text("utf-8").partition("\n")[0]
     for case in msgspec.json.decode((out / "metrics.json").read_bytes()):
         (judged,) = case["judged"]
         assert (judged["what"], judged["passed"]) == (f"Spread [m] in {case['case']}", True)
-        assert judged["value"] == case["mean"]["spread.py:Spread"]
+        assert judged["value"] == case["mean"]["measures.py:Spread"]
     again = reopen(out)
     assert again.summary()["passed"] is True
     (row,) = [row for row in summary_table([again.metrics["fast"]]).rows if row.cells[0] == "Spread [m] of the case"]
     assert float(row.cells[1]) == pytest.approx(float(shown), rel=1e-2)
 
 
-OTHERS = """
-from math import nan
-
-from zenpark import Planner, Predictor, Trigger, distance
-
-class Every(Trigger, frozen=True):
-    metres: float = 0.1
-
-    def fires(self, view):
-        return distance(view.position, view.last.position) > self.metres
-
-class Still(Predictor, frozen=True):
-    def position(self, pose, age):
-        return pose.position
-
-    def velocity(self, pose, age):
-        return 0.0, 0.0, 0.0
-
-class Aside(Planner, frozen=True):
-    def target(self, elapsed, anchor, heading):
-        return anchor[0], anchor[1] + 0.05 * elapsed, anchor[2], nan
-
-    def speed(self):
-        return 0.05
-"""
-
-
 def test_all_other_choices_may_be_files(task):
-    (task.parent / "others.py").write_text(OTHERS, "utf-8")
-    top = 'trigger = { kind = "others.py:Every", metres = 0.05 }\nprediction = "others.py:Still"\n'
-    leader = '[robots.L]\nkind = "khepera4"\nstart = [1.2, 0.0]\n'
-    leg = '[[timeline]]\nat_s = 0.0\nrobot = "L"\nplan = "others.py:Aside"\n'
-    text = f"{top}{TASK}{leader}{leg}"
+    blocks = [each for each in BLOCK.findall(PAGE) if re.search(r"\((Trigger|Predictor|Planner), frozen", each)]
+    (task.parent / "others.py").write_text("\n".join(blocks), "utf-8")
+    top = 'trigger = { kind = "others.py:SendEvery", metres = 0.05 }\nprediction = "others.py:Still"\n'
+    leader = '[robots.L]\nkind = "crazyflie"\nstart = [1.2, 0.0]\nhover = 0.5\n'
+    leg = '[[timeline]]\nat_s = 0.0\nrobot = "L"\nplan = "others.py:Lift"\n'
+    text = f'{top}avoidance = "others.py:SlowDown"\n{TASK}{leader}{leg}'
     task.write_text(text.replace("[formation.links]", '[formation.links]\n"L > A" = { offset = [-1.7, 0.0] }'), "utf-8")
     run = simulate(load(task), cases=["fast"])
     (leading,) = [robot for robot in run.metrics["fast"].robots if robot.robot == "L"]
-    assert run.traces["fast"].true_position[-1, 2, 1] > 0.02
+    assert run.traces["fast"].true_position[-1, 2, 2] > 0.6
     assert 0 < leading.messages < 10

@@ -14,24 +14,23 @@ from experiments.definition.experiment import Arena, LinkTable
 from experiments.definition.plan import Plan
 from experiments.file.document import load
 from experiments.scene import markers, models, stage
-from experiments.scene.stage import BodyLocation, Condition, LinkTracker, Moment, SceneModel, Trail
+from experiments.scene.stage import BodyLocation, Condition, LinkTracker, SceneModel, Trail
 from tests.experiments import moments
 from tests.small import small
 from twins.scene import Obstacle
 
 
-def status(phase: str = "running", **fields: object) -> messages.Status:
+def status(phase="running", **fields):
     return messages.Status(**{"robot": "CF01", "stamp": 0.0, "phase": phase, "reason": "", **fields})
 
 
 @pytest.fixture(scope="module")
-def park_scene() -> SceneModel:
+def park_scene():
     return SceneModel.of_plan(load("robotic-park").cases()["event"])
 
 
-def at_start(park_scene: SceneModel) -> Moment:
+def at_start(park_scene):
     moment = moments.unknown(park_scene)
-    assert park_scene.plan is not None
     for row, robot in enumerate(park_scene.plan.experiment.robots.values()):
         moment.position[row] = (*robot.start[:2], robot.hover or 0.0)
     return moment
@@ -148,7 +147,7 @@ def test_every_kind_has_a_model_of_its_size(kind, own):
 
 
 def test_obstacles_stand_where_the_file_says():
-    course = SceneModel.of_plan(next(iter(load("obstacle-course").cases().values())))
+    course = SceneModel.of_plan(load("obstacle-course").plan)
     scene = course.scene
     for k in range(len(scene.names)):
         mesh = models.obstacle(scene, k)
