@@ -28,6 +28,7 @@ from tests.small import triangle
 GROUPS = (LAWS, TRIGGERS, PREDICTORS, PLANNERS, AVOIDANCES)
 EVERY = [(group, name) for group in GROUPS for name in registry.names(group)]
 REMEMBERING = [name for name in registry.names(LAWS) if not issubclass(registry.struct(LAWS, name), Gradient)]
+TALKING = {(LAWS, name) for name in REMEMBERING}
 PLACES = {"A": (-0.4, 0.0, 0.0), "B": (0.4, 0.1, 0.0), "C": (0.0, -0.5, 0.0)}
 WANTS = {"distance": BY_DISTANCE, "any": BY_DISTANCE, "relative": BY_RELATIVE, "bearing": BY_BEARING}
 SAMPLES = (0.3, [0.3, 0.2], [[0.3, 0.2], [-0.2, 0.4]])
@@ -131,11 +132,12 @@ def known(bench):
     return {name for name, values in memory.items() if all(map(isfinite, values))}
 
 
-@pytest.mark.parametrize(("group", "name"), EVERY)
-def test_losses_restarts_and_unknown_positions(group, name):
-    """Whatever is lost: setpoints stay finite, and what a law knew stays known."""
-    bench, silent = Bench(assignment(group, name), PLACES["A"]), group != LAWS or name not in REMEMBERING
-    talking = partial(tick, silent=silent)
+def started(group, name):
+    """A robot that runs with a plug-in, and how it bears some time.
+
+    Setpoints stay finite then, and what a law that remembers knew at first stays known.
+    """
+    bench, talking = Bench(assignment(group, name), PLACES["A"]), partial(tick, silent=(group, name) not in TALKING)
     bench.running(talking).step(0.5, talking)
     at_first = known(bench)
 
@@ -147,15 +149,32 @@ def test_losses_restarts_and_unknown_positions(group, name):
         bench.step(seconds, watched)
         assert at_first <= known(bench)
 
-    for link in (0, 1):  # one, then all
+    return bench, bear
+
+
+@pytest.mark.parametrize(("group", "name"), EVERY)
+def test_losses_and_restarts_are_borne(group, name):
+    bench, bear = started(group, name)
+    for link, every_tick in ((0, tick), (1, follow_setpoint)):  # one, then all
         bench.neighbours.mark_lost(link, bench.t)
-        bear(1.5, follow_setpoint if link else talking)
+        bear(1.5, every_tick)
     for link in (0, 1):
         bench.neighbours.mark_alive(link)
         bear(0.5)
     bench.neighbours.discard_pose(1)  # a new process, without a pose at first
     bear(0.3, follow_setpoint)
     bear(0.3, tick)  # poses without words
+    for number, age in ((nan, 0.0), (9.0, 1.0)):  # unknown words, and late ones, which are left out
+        says = bench.robot.stepping.says if (group, name) in TALKING else {}
+        said = {each: (number,) * size for each, size in says.items()}
+        bench.neighbours.receive(0, (0.5, 0.5, 0.0), ZERO, bench.t - age, bench.t, yaw=nan, said=said)
+        assert not any(9.0 in each for each in bench.neighbours.all[0].said.values())
+        bear(0.3, follow_setpoint)
+
+
+@pytest.mark.parametrize(("group", "name"), EVERY)
+def test_unknown_positions_and_velocities_are_borne(group, name):
+    bench, bear = started(group, name)
     place = bench.position
     for unknown in (UNKNOWN, (nan, 0.0, 0.0)):
         bench.position = unknown
@@ -166,18 +185,11 @@ def test_losses_restarts_and_unknown_positions(group, name):
     for velocity in (UNKNOWN, (1e9, -1e9, 0.0)):
         bench.velocity = velocity
         bear(0.2)
-    yaw, bench.yaw = bench.yaw, nan
-    bench.velocity = ZERO
+    bench.velocity, bench.yaw = ZERO, nan
     bear(0.2)
-    bench.yaw = yaw
     for link in (0, 1):
         bench.hear(link, place)  # in its own place
     bear(0.3)
-    for number, age in () if silent else ((nan, 0.0), (9.0, 1.0)):  # unknown words, and late ones, which are left out
-        said = {each: (number,) * size for each, size in bench.robot.stepping.says.items()}
-        bench.neighbours.receive(0, (0.5, 0.5, 0.0), ZERO, bench.t - age, bench.t, yaw=nan, said=said)
-        assert not any(9.0 in each for each in bench.neighbours.all[0].said.values())
-        bear(0.3, follow_setpoint)
 
 
 @pytest.mark.parametrize("name", REMEMBERING)

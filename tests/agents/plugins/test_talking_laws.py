@@ -159,18 +159,6 @@ def test_auction_total_is_within_bound_of_optimum(loss):
     assert 0.01 < max(gaps) <= 1.0  # some are not the least
 
 
-def test_all_bid_anew_when_a_task_appears():
-    places, tasks, pairs = drawn(3)
-    law = Auction(tasks=tasks[:-1], later=[(*tasks[-1], 20.0)], epsilon=EPSILON, calm_s=0.5)
-    talking = Talking(law, places, pairs)
-    while talking.rounds * talking.step_s < 19.95:
-        talking.round()
-    begin = [place[:2] for place in talking.places]
-    assert sorted(dist(place, tasks[k]) < 0.01 for place, k in zip(begin, won(talking), strict=True) if k >= 0)
-    settled(talking)
-    assert total(begin, tasks, won(talking)) <= least(begin, tasks) + EPSILON * len(places)
-
-
 @pytest.mark.slow
 def test_robots_that_begin_anew_take_no_task_twice():
     for seed in range(40):
