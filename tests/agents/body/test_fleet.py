@@ -1,5 +1,6 @@
 """Several bodies in one process look like one, and lock their devices; a twin beside a robot is never in its way."""
 
+from functools import partial
 from math import inf, isfinite, isnan, nan
 
 import pytest
@@ -7,7 +8,7 @@ import pytest
 from agents.body import fleet
 from agents.body.device_locks import Claims, numeric
 from agents.body.fleet import Fleet, assemble
-from agents.body.interface import Body, BodyError, BodyState, Disturbance
+from agents.body.interface import BodyError, BodyState, Disturbance
 from agents.body.shadow_twin import Shadowed, shadowed
 from agents.network.messages import Inspection
 from agents.plugins import registry
@@ -19,7 +20,7 @@ from tests.requests import request
 from twins.body import TwinBody
 
 
-class Recorded(Body):
+class Recorded:
     """Robots that move along x as told, at a `share` of the speed, measured off by a constant [m].
 
     Attributes:
@@ -45,8 +46,9 @@ class Recorded(Body):
         if self.broken == what:
             raise self.failure("no engine")
 
-    def open(self):
-        self._tell("open")
+    def __getattr__(self, what):
+        """A call that is written down: open, takeoff, land, stop, locate, close."""
+        return partial(self._tell, what)
 
     def read(self, t):
         self._fail("read")
@@ -61,23 +63,8 @@ class Recorded(Body):
         self._tell("command", [setpoint[0] for setpoint in setpoints])
         self.speed = [new[0] if isfinite(new[0]) else old for new, old in zip(setpoints, self.speed, strict=True)]
 
-    def takeoff(self, rows, heights):
-        self._tell("takeoff", rows, heights)
-
-    def land(self, rows):
-        self._tell("land", rows)
-
-    def stop(self, rows):
-        self._tell("stop", rows)
-
-    def locate(self, row, t, position, yaw):
-        self._tell("locate", row, t, position, yaw)
-
     def inspect(self, row):
         return Inspection(firmware=f"7.{row}")
-
-    def close(self):
-        self._tell("close")
 
     def place(self, rows, positions, yaws, flying, velocities=None):
         self._fail("place")

@@ -141,9 +141,7 @@ class Asked:
     def __init__(self) -> None:
         self.routers, self.peers, self.questions = ["router"], [], []
         self.info = SimpleNamespace(routers_zid=lambda: self.routers, peers_zid=lambda: self.peers)
-
-    def liveliness(self) -> SimpleNamespace:
-        return SimpleNamespace(get=self.ask)
+        self.liveliness = lambda: SimpleNamespace(get=self.ask)
 
     def ask(self, *_: object, **__: object) -> Question:
         self.questions.append(Question())
