@@ -108,16 +108,9 @@ def test_emergency_stop_during_a_descent():
 
 
 def test_hanging_read_is_landed_by_the_watchdog():
-    body, landed = Airborne(), threading.Event()
-    land = body.land
-
-    def told(rows: Sequence[int]) -> None:
-        land(rows)
-        landed.set()
-
-    body.land, body.looks = told, lambda: landed.wait(10.0)
+    body = Airborne()
+    body.looks = lambda: until(lambda: body.landing)
     run_and_break(body, silence_s=0.1)
-    assert landed.is_set()
     assert body.order == ["open", "land", "stop", "close"]
 
 
@@ -170,10 +163,8 @@ class Kennel:
         self.never.set()
 
     def beat_for(self, seconds: float) -> None:
-        end, pause = time.monotonic() + seconds, threading.Event()
-        while time.monotonic() < end:
-            self.dog.beat()
-            pause.wait(0.01)
+        end = time.monotonic() + seconds
+        until(lambda: self.dog.beat() or time.monotonic() > end)
 
 
 @pytest.mark.slow
