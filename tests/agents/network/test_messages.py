@@ -315,9 +315,10 @@ def test_impossible_messages_are_refused(what, field, values):
             check(what, **{field: value})
 
 
-def test_sweep_has_at_most_720_rays():
+def test_sweep_has_1_to_720_rays():
     rays = [0.0] * 721
-    check("ranges", distance=rays[1:], bearing=rays[1:], elevation=rays[1:])
+    for some in (rays[:1], rays[:720]):
+        check("ranges", distance=some, bearing=some, elevation=some)
     with pytest.raises(Malformed, match="721 rays"):
         check("ranges", distance=rays, bearing=rays, elevation=rays)
 
