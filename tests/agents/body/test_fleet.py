@@ -21,7 +21,7 @@ from twins.body import TwinBody
 
 
 class Recorded:
-    """Robots that move along x as told, at a `share` of the speed, measured off by a constant [m].
+    """Robots that move along x as told, at a `share` of the speed.
 
     Attributes:
         told: Calls with their arguments, one after the other.
@@ -29,12 +29,11 @@ class Recorded:
         broken: The method that raises `failure`.
     """
 
-    def __init__(self, rows, *, share=1.0, off=0.0, start=0.0):
+    def __init__(self, rows, *, share=1.0, start=0.0):
         self.x, self.yaw = [start + row for row in range(rows)], [0.0] * rows
         self.speed, self.flying = [0.0] * rows, [False] * rows
-        self.share, self.off = share, off
+        self.share, self.t = share, 0.0
         self.told, self.placed = [], []
-        self.t = self.stale = 0.0
         self.note = self.broken = ""
         self.failure = BodyError
 
@@ -55,7 +54,7 @@ class Recorded:
         self.x = [x + (t - self.t) * self.share * speed for x, speed in zip(self.x, self.speed, strict=True)]
         self.t = t
         return [
-            BodyState(t - self.stale, (x + self.off, 0.0, 0.0), (speed, 0.0, 0.0), yaw, flying=flying, note=self.note)
+            BodyState(t, (x, 0.0, 0.0), (speed, 0.0, 0.0), yaw, flying=flying, note=self.note)
             for x, speed, yaw, flying in zip(self.x, self.speed, self.yaw, self.flying, strict=True)
         ]
 
@@ -68,7 +67,7 @@ class Recorded:
 
     def place(self, rows, positions, yaws, flying, velocities=None):
         self._fail("place")
-        self.placed.append((round(self.t, 6), [x for x, _, _ in positions], flying, velocities))
+        self.placed.append((round(self.t, 6), flying))
         for row, (x, _, _), yaw in zip(rows, positions, yaws, strict=True):
             self.x[row], self.yaw[row] = x, yaw
 
@@ -144,9 +143,9 @@ def test_addresses_choose_the_bodies(monkeypatch):
 DT = 0.1
 
 
-def beside(rows=1, shadows=(0,), restart=inf, *, share=1.0, off=0.0):
-    """A robot and its twin, which is faster by `share` and measured `off` [m]."""
-    robot, twin = Recorded(rows, off=off), Recorded(len(shadows), share=share)
+def beside(rows=1, shadows=(0,), restart=inf, *, share=1.0):
+    """A robot and its twin, which is faster by `share`."""
+    robot, twin = Recorded(rows), Recorded(len(shadows), share=share)
     return Shadowed(robot, twin, shadows, [restart] * len(shadows)), robot, twin
 
 
@@ -163,20 +162,9 @@ def test_faster_twin_runs_ahead_until_put_back(restart, placed):
         (state,) = body.read(k * DT)
         ahead.append(state.shadow_position[0] - state.position[0])
         body.command(speeds(0.5))
-    assert [at for at, *_ in twin.placed] == placed  # driven at 0, seen to be driven at 0.1
+    assert [at for at, _ in twin.placed] == placed  # driven at 0, seen to be driven at 0.1
     since = [k * DT - max((at for at in placed if at < k * DT + 1e-9), default=0.0) for k in range(31)]
     assert ahead == pytest.approx([0.05 * max(seconds, 0.0) for seconds in since], abs=1e-12)
-
-
-def test_twin_takes_measured_place_and_speed():
-    body, robot, twin = beside(off=0.25)
-    body.read(0.0)
-    assert twin.placed[0][1] == [0.25]
-    robot.speed[0] = 0.3
-    body.command(speeds(0.4))
-    (state,) = body.read(0.1)
-    assert twin.placed[1][3] == [(0.4, 0.0, 0.0)]
-    assert state.shadow_position == pytest.approx(state.position)
 
 
 def test_orders_reach_twins_by_their_own_rows():
@@ -208,24 +196,13 @@ def test_restarts_wait_while_standing_or_landing():
     for k in range(10):
         body.read(k * DT)
         body.command([NO_SETPOINT] if k % 2 else speeds(0.0))
-    assert [at for at, *_ in twin.placed] == [0.0]
+    assert [at for at, _ in twin.placed] == [0.0]
     body.command(speeds(0.2))
     body.read(1.0)
     body.land([0])
     for k in range(11, 30):
         body.read(k * DT)
-    assert [(at, flying) for at, _, flying, _ in twin.placed] == [(0.0, [True]), (1.0, [True])]
-
-
-def test_it_waits_for_a_pose_that_is_fresh():
-    body, robot, twin = beside()
-    robot.stale = 1.0
-    assert body.read(0.0)[0].shadow_position is UNKNOWN
-    robot.stale, robot.x[0] = 0.0, nan
-    assert body.read(0.1)[0].shadow_position is UNKNOWN
-    robot.x[0] = 2.0
-    assert body.read(0.2)[0].shadow_position[0] == 2.0
-    assert len(twin.placed) == 1
+    assert twin.placed == [(0.0, [True]), (1.0, [True])]
 
 
 METHODS = ("open", "read", "place", "command", "takeoff", "land", "stop", "close")

@@ -102,18 +102,6 @@ def test_stamps_behind_are_reported_before_positions_expire():
     assert runtime.robots[0].lifecycle.reason == "no position of its own: positions of T are stamped 3.6e+03 s behind"
 
 
-@pytest.mark.parametrize(("exact", "expected"), [([], [8.3]), ([1], [8.0, 8.1, 8.2, 8.3, 8.4])])
-def test_a_pose_that_repeats_itself_is_none(exact, expected):
-    net, taken = Net(), []
-    with net.worn():
-        heard = listening(net, exact=exact)
-        for tick in range(5):
-            t = 8.0 + 0.1 * tick
-            net.deliver(position(UTC + t, (0.1, 0.2, 0.0 if tick < 3 else 0.001)))
-            taken += [when for _, when, *_ in heard.receive(UTC, t)]
-    assert taken == pytest.approx(expected, abs=1e-6)
-
-
 @pytest.mark.parametrize(("frozen_s", "phase"), [(0.0, "idle"), (1.2, "done"), (4.0, "done")])
 def test_frozen_motion_capture_lands_what_flies(frozen_s, phase):
     runtime, said = flight_events(lambda _: 0.0, frozen_s + 7.0, frozen_s)
