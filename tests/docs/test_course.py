@@ -1,7 +1,5 @@
 """Exercises of the course pass with their solutions alone; lessons are notebooks whose claims are true."""
 
-from __future__ import annotations
-
 import ast
 import re
 import shlex

@@ -1,7 +1,5 @@
 """Guides do what they say: their files, commands and snippets are run in the order in which they stand."""
 
-from __future__ import annotations
-
 import re
 import shlex
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """What README and docs refer to exists: modules, files, links, commands, experiments and the unit of systemd."""
 
-from __future__ import annotations
-
 import ast
 import pkgutil
 import re

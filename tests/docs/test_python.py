@@ -1,7 +1,5 @@
 """The names of `zenpark`: each has an example on its page, which runs; guides import from there alone."""
 
-from __future__ import annotations
-
 import ast
 import os
 import re

@@ -1,7 +1,5 @@
 """`./zenpark check`: the reference experiment, its neighbours, and experiments that cannot work, each with its code."""
 
-from __future__ import annotations
-
 import json
 from importlib.metadata import EntryPoint
 

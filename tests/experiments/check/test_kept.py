@@ -42,12 +42,8 @@ def append(root, name):
 
 
 CHANGED = ("lab/park.toml", "lab/hall.toml", "lab/mine.onnx", "site/mine/__init__.py", f"{SITE}/entry_points.txt")
-NEW = (
-    "lab/gate.arena.toml",
-    "site/mine-1.1.dist-info/METADATA",
-    "site/numpy-9.9.dist-info/METADATA",
-    "site/cflib/x.py",
-)
+INSTALLED = (f"site/{name}.dist-info/METADATA" for name in ("mine-1.1", "numpy-9.9"))
+NEW = ("lab/gate.arena.toml", "site/cflib/x.py", *INSTALLED)
 
 
 def test_verdict_is_read_again(park, tmp_path):

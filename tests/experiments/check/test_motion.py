@@ -1,7 +1,5 @@
 """Findings of `check` in the ideal run: acquisition, soft formations, encounters, walls and plans."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Findings of `./zenpark check` about obstacles, range sensors, worlds, mirrors and shadows."""
 
-from __future__ import annotations
-
 import pytest
 
 from experiments.file.document import loads
@@ -81,7 +79,6 @@ BLIND = khepera("sensors = []")
         (OPEN + khepera('body = "khepera4-twin"\nranges = "world"'), "warning", "ranges-of-nothing",
          "without obstacles and robots", ""),
         (OPEN + khepera('body = "world"\nshadow = {}'), "warning", "shadow-of-twin", "one twin with another", ""),
-        (OPEN + khepera("shadow = { restart_s = 2.0 }"), "warning", "shadow-of-twin", "one twin with another", ""),
         (LOW + khepera('body = "khepera4-twin"\nranges = "world"\nshadow = {}'), "warning", "hits-obstacle", "",
          "ranges-twice ranges-of-nothing shadow-of-twin"),
     ],

@@ -1,7 +1,5 @@
 """The numbers of the reference experiment (IEEE Access 2023, section IV), and shapes that do not exist."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -17,7 +15,7 @@ from experiments.check.analysis import Analysis
 from experiments.check.ideal_run import Prediction
 from experiments.check.motion import formation
 from experiments.definition.experiment import Formation, RobotTable
-from experiments.definition.graph import Links, links
+from experiments.definition.graph import links
 from experiments.definition.plan import Plan
 from experiments.file import document
 from tests.cases import examples
@@ -27,12 +25,8 @@ from tests.experiments.traces import link_errors
 from tests.small import small
 
 
-@pytest.fixture(scope="module")
-def reference() -> Links:
-    return document.read("robotic-park").plan.links
-
-
-def test_heights_and_lengths_that_make_no_triangle(reference):
+def test_heights_and_lengths_that_make_no_triangle():
+    reference = document.read("robotic-park").plan.links
     height = np.where(np.arange(7) < 4, 0.0, 0.81)
     found = realisation.conflicts(reference, height)
     assert [each.high for each in found] == [(4,), (5,)]
@@ -103,9 +97,8 @@ def test_robots_in_one_another_are_found():
     assert solids.overlaps(near).tolist() == [[0, 1]]
     assert solids.overlaps(near + np.array([[0, 0, 0.1], [0, 0, 0], [0, 0, 0]])).tolist() == [[0, 1]]
     assert not len(solids.overlaps(near + np.array([[0, 0, 0.2], [0, 0, 0], [0, 0, 0]])))
-    assert not len(
-        realisation.Solids.of(kinds, links([(1, 2)]), all_of_them).overlaps(near)
-    )  # places of parts are their own
+    parts = realisation.Solids.of(kinds, links([(1, 2)]), all_of_them)
+    assert not len(parts.overlaps(near))  # places of parts are their own
     pair = realisation.Solids.of(kinds[:2], links([(0, 1)]), all_of_them[:2], clearance=0.5)
     touch = CRAZYFLIE.radius + TELLO.radius
     assert len(pair.overlaps(np.array([(0.0, 0.0, 0.5), (0.99 * touch, 0.0, 0.9)])))  # seen from above

@@ -63,19 +63,6 @@ def test_stiffest_and_slowest_mode_of_the_reference():
     assert found.radius < 1.0
 
 
-def test_rounded_shape_without_leader_has_no_hour_modes():
-    made = layouts.hemisphere(8, 0.6, 0.25)
-    net = both_ways(made, 1.5)
-    shape = find_shapes(rounded(net), [made.position], np.ones(8, dtype=bool))[0]
-    share = np.full(8, 0.18)
-    found = modes(Distance(), rounded(net), shape.position, share, 10.0)
-    values = np.sort(by_hand(Distance(), rounded(net), shape.position, share).real)
-    assert np.abs(values[:3]).max() < 1e-5  # two translations and a turn, rounded
-    assert found.slowest_s == pytest.approx(-0.1 / np.log(1.0 - values[3]), rel=1e-3)
-    assert found.gain == pytest.approx(values[-1])
-    assert found.radius < 1.0
-
-
 MIXED = np.array([(0, 0, 0), (0.9, 0.1, 0), (0.4, 0.8, 0), (0.3, 0.2, 0.7), (0.6, 0.5, 0.9)])  # two above three
 LINKED = ((0, 1), (0, 2), (1, 2), (0, 3), (1, 3), (2, 3), (0, 4), (3, 4))  # one more than it needs
 

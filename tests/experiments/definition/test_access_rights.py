@@ -1,7 +1,5 @@
 """The rights that follow from an experiment, row by row: who, which key, what."""
 
-from __future__ import annotations
-
 from itertools import product
 
 import pytest

@@ -1,7 +1,5 @@
 """A kind of robot that has only its sizes yet: refused in the file where it needs a twin, and drawn like others."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

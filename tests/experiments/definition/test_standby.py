@@ -1,7 +1,5 @@
 """Robots on standby and spares: what the file may say, what runs without them, and who takes over a name."""
 
-from __future__ import annotations
-
 import pytest
 
 from agents.body.interface import BodyState

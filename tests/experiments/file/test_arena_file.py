@@ -1,7 +1,5 @@
 """Arena files: what they say, what the experiment changes, and where they are wrong."""
 
-from __future__ import annotations
-
 import pytest
 
 from experiments.catalogue import index

@@ -23,7 +23,7 @@ def test_names_and_titles():
         entries.path("convoi")
 
 
-def test_copy_gives_a_readable_experiment_and_never_overwrites(tmp_path):
+def test_copy_is_readable_whole_and_never_overwrites(tmp_path, monkeypatch):
     target = entries.copy_entry("triangle", tmp_path / "mine.toml")
     assert read(target).experiment == read("triangle").experiment
     assert json.loads((tmp_path / index.SCHEMA).read_bytes()) == json_schema.schema()
@@ -35,14 +35,11 @@ def test_copy_gives_a_readable_experiment_and_never_overwrites(tmp_path):
         with pytest.raises(DocumentError, match=message):
             entries.copy_entry(name, place)
     assert read(target).experiment == read("triangle").experiment
-
-
-def test_full_disk_leaves_no_half_file(tmp_path, monkeypatch):
     monkeypatch.setattr(entries, "write_schema", lambda _: Path("/dev/full").write_text("{}"))
+    (tmp_path / "full").mkdir()
     with pytest.raises(DocumentError, match="cannot be written: No space left"):
-        entries.copy_entry("triangle", tmp_path / "mine.toml")
-    monkeypatch.undo()
-    assert read(entries.copy_entry("triangle", tmp_path / "mine.toml")).experiment == read("triangle").experiment
+        entries.copy_entry("triangle", tmp_path / "full")
+    assert not [*(tmp_path / "full").iterdir()]
 
 
 def test_schema_is_draft_7_and_knows_the_plugins():

@@ -1,7 +1,5 @@
 """The scene of a case at one moment: what is drawn where, in which colour and condition. No browser."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import msgspec
