@@ -57,7 +57,6 @@ def test_a_wheel_has_the_names_for_plugins(tmp_path):
 
 
 def stamp(bootstrap, level):
-    """What an installation of a level leaves."""
     bootstrap.STAMP.write_text(f"{bootstrap.fingerprint()} {level}\n")
 
 

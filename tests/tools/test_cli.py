@@ -83,7 +83,6 @@ def test_help_shows_commands_with_their_whole_description():
 
 
 def with_parameters(built, above=()):
-    """Commands that have parameters, by their words."""
     for name, command in built.commands.items():
         if hasattr(command, "commands"):
             yield from with_parameters(command, (*above, name))

@@ -36,8 +36,6 @@ def test_page_is_named_where_no_browser_opens_it(monkeypatch, capsys):
 
 
 class Terminal(io.StringIO):
-    """A standard error that a person looks at."""
-
     def isatty(self):
         return True
 

@@ -24,11 +24,9 @@ class Camera:
         self._thread = threading.Thread(target=self._run, name="camera")
         self._zero = time.monotonic()
 
-    def place(self, subject, position, yaw=0.0, rotation=None):
+    def place(self, subject, position, yaw=0.0):
         with self._lock:
-            self.twin.place(
-                self._rows[subject], np.array(position, dtype=float), upright(yaw) if rotation is None else rotation
-            )
+            self.twin.place(self._rows[subject], np.array(position, dtype=float), upright(yaw))
 
     def hide(self, subject):
         with self._lock:
@@ -40,7 +38,6 @@ class Camera:
             self.twin.link.faults = Faults(occluded_from_s=time.monotonic() - self._zero, occluded_for_s=seconds)
 
     def kill(self):
-        """The end of the server."""
         self._end.set()
         if self._thread.is_alive():
             self._thread.join()

@@ -17,8 +17,6 @@ HOVERING: dict[bytes, bytes] = {}  # twins in the air, by what they were before 
 
 
 class Wire:
-    """A twin in virtual time."""
-
     def __init__(self, device=None, start=None, yaw=0.0, external=False, **faults):
         asked = request("crazyflie", ["x"], device=device, start=start, yaw=yaw, external=external)
         self.vehicle = Vehicle(asked, Faults(**faults), 0)
@@ -48,12 +46,10 @@ class Wire:
 
     @property
     def estimate(self):
-        """Position as the drone believes it."""
         return np.array(self.vehicle.estimate)
 
     @property
     def planned(self):
-        """Pose that the planner asks for now."""
         goal = self.vehicle.planner.goal(self.t)
         return np.full(4, np.nan) if goal is None else goal
 
@@ -70,7 +66,6 @@ class Wire:
         return self.vehicle.model.flying
 
     def put(self, port, channel, *data):
-        """Sends a packet; returns the answers."""
         self.sent.clear()
         self.drone.receive(port, channel, b"".join(bytes((d,)) if isinstance(d, int) else d for d in data))
         return list(self.sent)
@@ -100,7 +95,6 @@ class Wire:
         return self
 
     def key(self, name):
-        """A parameter, as packets name it."""
         return struct.pack("<H", self.drone.parameters.number[name])
 
     def set(self, name, packing, value):
@@ -139,7 +133,6 @@ class Wire:
         self.thrust(0)
 
     def release(self):
-        """The client says that it streams no more."""
         self.put(Port.SETPOINT, 1, 0, struct.pack("<I", 0))
 
     def arm(self, on=True):

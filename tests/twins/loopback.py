@@ -39,7 +39,6 @@ class Served:
             return self.device.truth()
 
     def kill(self):
-        """The end of the device, as when its battery is pulled."""
         if not self._ending.is_set():
             self._ending.set()
             self._thread.join()

@@ -11,7 +11,6 @@ DT = 0.01
 
 
 def stage(kinds, start, yaw=None, *, mirrored=None, scene=None, dt=DT):
-    """Robots on the floor at x, y, in endless room unless a scene is given."""
     n = len(kinds)
     return EngineInput(
         tuple(kinds),
@@ -34,7 +33,6 @@ def command(engine, setpoints):
 
 
 def columns(engine, name):
-    """Values of all robots as an array."""
     return np.array([getattr(motion, name) for motion in engine.motions])
 
 
@@ -60,7 +58,6 @@ class Drive:
 
     @property
     def obstacles(self):
-        """(M, 3)"""
         return np.array(self.engine.obstacles)
 
     def go(self, seconds, setpoint=None):

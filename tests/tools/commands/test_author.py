@@ -13,7 +13,6 @@ from tests.experiments.robotic_park_files import dome
 
 @pytest.fixture
 def parsed_options(tmp_path, monkeypatch):
-    """Result of a command in an empty folder."""
     monkeypatch.chdir(tmp_path)
     return invoke
 

@@ -23,7 +23,6 @@ def rows(count):
 
 
 def segments(title, rows, events, width, height):
-    """The table, line by line."""
     return Console(width=width, height=height).render_lines(drawn(title, rows, events, width, height), pad=False)
 
 

@@ -25,7 +25,6 @@ def stdout_of(*words, code=0):
 
 
 def refused_command(*words):
-    """Why a command is refused."""
     error = invoke(*words, code=None).exception
     assert isinstance(error, ExplainedError)
     return str(error)
@@ -46,7 +45,6 @@ def first(three_seeds):
 
 @pytest.fixture
 def again(first, tmp_path):
-    """A copy of that run."""
     return shutil.copytree(first, tmp_path / "run")
 
 
@@ -121,14 +119,6 @@ def test_sweep_has_figures_and_a_paper_table(first, tmp_path):
     assert r"Case & threshold [m] & Messages ratio & IAE ratio \\" in chosen
     (known,) = json.loads(stdout_of("runs", "--past", "--in", tmp_path, "--json"))["sweeps"]
     assert (known["folder"], known["cells"], known["seeds"]) == (str(folder), 3, [1, 2])
-
-
-def test_hazards_of_a_virtual_run_are_printed(three_seeds, another):
-    _, printed = another("--set", "safety.separation=0.7", "--anyway")
-    lines = [line for line in printed.splitlines() if ": hazard " in line]
-    assert len(lines) == 6  # and more in the recording
-    assert all("minimum separation" in line for line in lines)
-    assert "hazard" not in three_seeds[1]
 
 
 def test_runs_of_several_seeds_are_pooled_to_one(first, another, tmp_path):

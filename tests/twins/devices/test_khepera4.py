@@ -43,7 +43,6 @@ class Conversation:
         self.device.close()
 
     def serve(self):
-        """Lets the device see what has come."""
         for wire in select.select(self.device.sockets(), [], [], 0.05)[0]:
             self.device.serve(wire, self.tick * DT)
 
@@ -63,7 +62,6 @@ class Conversation:
         return [float(word) for word in self.ask(data).split(",") if not word.isalpha()]
 
     def after(self, seconds):
-        """The robot, that much later."""
         for _ in range(round(seconds / DT)):
             self.tick += 1
             self.device.advance(self.tick * DT)
@@ -224,7 +222,8 @@ def test_a_battery_that_ends_stops_and_silences_it(talk):
     robot = talk("kteam", faults={"battery": 0.5, "drain": 1800.0})
     robot.say(b"D,100,100\r")
     assert robot.after(4.0).ask(b"V,5\r") == "d\r\nv,10\r\n"
-    assert robot.after(2.0).speed() == 0.0
+    before = robot.after(2.0).truth
+    assert robot.after(1.0).truth == before
     assert robot.ask(b"V,5\r") is None
 
 

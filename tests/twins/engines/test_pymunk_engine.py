@@ -277,5 +277,6 @@ def test_absent_mirrored_robot_disturbs_nobody():
         each.go(3.0, [*flown, [0.1, 0.2, 0, 0]])
     np.testing.assert_array_equal(drive.position[[0, 2]], alone.position)
     assert drive.position[0, 2] > 0.3
-    drive.engine.advance(3.0, [(0.01, 0.0), (math.nan, math.nan), (0.0, 0.0)])
-    assert drive.position[0, 0] == pytest.approx(0.01, abs=1e-3)  # it wobbles
+    for _ in range(200):
+        drive.engine.advance(3.0, [(0.01, 0.0), (math.nan, math.nan), (0.0, 0.0)])
+    assert drive.position[0, 0] == pytest.approx(0.01, abs=1e-3)  # wobble, which the controller does not remove

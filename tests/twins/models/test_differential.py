@@ -16,7 +16,6 @@ def robot(kind=KHEPERA4, yaw=0.0):
 
 
 def drive(twin, twist, seconds):
-    """(T, 3) positions and (T,) yaws."""
     path, yaws = [], []
     for _ in range(round(seconds / DT)):
         twin.command((*twist, 0.0, 0.0))

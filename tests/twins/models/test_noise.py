@@ -14,7 +14,6 @@ from twins.models.noise import BLOCK, Noise, refill
 
 
 def numbers(noise, draws):
-    """(draws, width)"""
     width, drawn = noise.end // BLOCK, []
     for _ in range(draws):
         drawn.append(noise.ahead[noise.next : noise.next + width])

@@ -16,7 +16,6 @@ DT = 0.01
 
 
 def flying(kind=CRAZYFLIE, height=0.8, yaw=0.0):
-    """In the air, at rest."""
     made = Quadrotor(kind, ZERO, 0.0)
     made.place((0.0, 0.0, height), yaw, flying=True)
     return made

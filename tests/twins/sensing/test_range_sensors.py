@@ -34,7 +34,6 @@ def equipped(asked, world):
 
 
 def distances(ranges):
-    """(R,) of all robots."""
     return np.concatenate([scan.distance for scan in ranges.scans if scan is not None])
 
 

@@ -49,7 +49,6 @@ THINGS = {
 
 
 def by_pymunk(position, angles, reach, scene, pose):
-    """What pymunk sees, (n, m), along rays at (n, m) [rad]."""
     space = pymunk.Space()
     for row, (place, kind) in enumerate(zip(position, CROWD, strict=True)):
         shape = pymunk.Circle(space.static_body, kind.radius, tuple(place[:2]))
@@ -137,12 +136,6 @@ def test_a_level_ray_sees_what_spans_its_height(height, expected):
     position = [[0.0, 0.0, 0.0], [0.5, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 1.01]]
     seen = look(position, [fan([0.0], 4.0, height)], kinds=kinds, scene=scene, row=[0])
     np.testing.assert_allclose(seen, [[expected]], atol=1e-12)
-
-
-def test_a_flying_robot_looks_from_its_own_height():
-    scene = furnished({"low": Obstacle(box=(0.4, 0.4), at=(1.0, 0.0), height=0.5)})
-    for height, expected in ((0.3, 0.8), (0.8, np.nan)):
-        np.testing.assert_allclose(look([[0.0, 0.0, height]], [fan([0.0])], scene=scene), [[expected]], atol=1e-12)
 
 
 def test_vertical_rays_see_nearest_things_above_and_below():

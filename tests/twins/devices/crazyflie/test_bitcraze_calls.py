@@ -79,7 +79,6 @@ def answered(call, *arguments):
 
 
 def logged(scf, **variables):
-    """First values of a log block, in a list."""
     block = LogConfig("test", 10)
     for name, kind in variables.items():
         block.add_variable(name.replace("__", "."), kind)
@@ -106,21 +105,6 @@ def test_parameters_of_examples(cf):
     said = updates(cf, "deck.bcFlow2")  # sbs_motion_commander waits for it
     cf.param.request_param_update("deck.bcFlow2")
     until(lambda: said == ["1"], "the deck is there")
-
-
-def test_stored_parameters(cf):
-    name = "sound.effect"
-
-    def state():
-        _, kept = answered(cf.param.persistent_get_state, name)
-        return kept.is_stored, kept.default_value, kept.stored_value
-
-    assert state() == (False, 0, None)
-    cf.param.set_value(name, 11)
-    assert answered(cf.param.persistent_store, name) == [name, True]
-    assert state() == (True, 0, 11)
-    assert answered(cf.param.persistent_clear, name) == [name, True]
-    assert state() == (False, 0, None)
 
 
 def test_variables_of_examples(scf):

@@ -1,11 +1,9 @@
 """What a Crazyflie twin answers: tables, parameters, logs, memories, and what a bad link does to that."""
 
-import json
 import math
 import socket
 import struct
 from contextlib import closing
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -34,21 +32,16 @@ def variable(kind, name):
 
 
 def at(kind, address):
-    """A place in a memory, as packets name it."""
     return struct.pack("<BI", Memories.kinds.index(kind), address)
 
 
-def test_greeting_and_version():
+def test_greeting_version_and_tables():
     wire = Wire()
     assert wire.ask(Port.LINK, 1, 0) == b"Bitcraze Crazyflie".ljust(30, b"\0")
     assert wire.ask(Port.PLATFORM, 1, 0) == b"\0" + struct.pack("<I", 12)
     assert wire.ask(Port.LINK, 0, b"anything") == b"anything"
     assert wire.ask(Port.SUPERVISOR, 0, SupervisorCommand.ASK)[0] == 0x8C
     assert wire.ask(Port.SUPERVISOR, 1, SupervisorCommand.RECOVER) == b"\x82\1\1"
-
-
-def test_tables():
-    wire = Wire()
     for port, table in ((Port.PARAM, PARAMETER_TABLE), (Port.LOG, LOG_TABLE)):
         assert struct.unpack("<BHI", wire.ask(port, 0, Toc.INFO)[:7]) == (Toc.INFO, len(table.items), table.crc)
         for i, name in enumerate(table.number):
@@ -398,33 +391,6 @@ def test_losses_cost_retransmissions():
     assert sum(packet is not None for _, _, packet in results) == pytest.approx(2000 * (1.0 - 0.5**4), rel=0.05)
 
 
-# parameters and log variables of a real firmware, where this machine has them: names and types only
-PLACES = [folder / "shared" / "prototypes" / "crazyflie-toc.json" for folder in Path(__file__).parents[5:]]
-FIRMWARE = next(filter(Path.exists, PLACES), PLACES[0])
-CTYPES = {"u8": "uint8_t", "u16": "uint16_t", "u32": "uint32_t", "i8": "int8_t", "i16": "int16_t", "i32": "int32_t"}
-
-
-@pytest.fixture
-def files(tmp_path):
-    """Tables of parameters and logs of that firmware, as cflib writes them to its cache."""
-    if not FIRMWARE.exists():
-        pytest.skip(f"{FIRMWARE} with the firmware's tables is not there")
-    parameters, logs = json.loads(FIRMWARE.read_text())
-    tables = {
-        "ParamTocElement": {name: (kind, {"access": int(fixed), "extended": kept})
-                            for name, (kind, fixed, kept) in parameters.items()},
-        "LogTocElement": {name: (kind, {"access": 0}) for name, kind in logs.items()},
-    }  # fmt: skip
-    for element, entries in tables.items():
-        table = {}
-        for ident, (name, (kind, rest)) in enumerate(entries.items()):
-            group, own = name.split(".")
-            entry = {"__class__": element, "ident": ident, "group": group, "name": own, "pytype": ""}
-            table.setdefault(group, {})[own] = entry | {"ctype": CTYPES.get(kind, kind)} | rest
-        (tmp_path / f"{element}.json").write_text(json.dumps(table))
-    return [str(tmp_path / f"{element}.json") for element in tables]
-
-
 def logged(wire, *names):
     """Values of log variables, in the type that they have on board."""
     table, values = wire.drone.log_table, []
@@ -469,30 +435,21 @@ def test_values_of_a_drone_that_flies():
     assert logged(wire, "motor.m1")[0] == pytest.approx(39300.0, rel=0.01)
 
 
-def test_tables_of_a_real_firmware(files):
-    tables = inventory(tuple(files))
-    assert (len(tables.parameters.variables), len(tables.logs.variables)) == (402, 637)
-    number = tables.parameters.number
-    assert tables.parameters.variables[number["deck.bcFlow2"]].flags == READ_ONLY
-    assert tables.parameters.variables[number["pid_rate.roll_kp"]].value == 250.0
-    wire = Wire(device={"tables": files, "positioning": {"system": "loco"}})
-    assert wire.drone.value("deck.bcLoco") == 1
-    assert wire.drone.value("firmware.revision0") == 0.0  # this one has none
-    own, real = inventory(), tables
-    for tables in ((own.parameters, real.parameters), (own.logs, real.logs)):
-        mine, known = ({each.name: (each.type, each.flags) for each in table.variables} for table in tables)
-        shared = known.keys() & mine.keys()
-        assert {name: mine[name] for name in shared} == {name: known[name] for name in shared}
-        assert {name.split(".")[0] for name in mine.keys() - shared} <= {"spare", "firmware", "loco"}
-    with pytest.raises(BodyError, match="second table"):
-        inventory((files[0], files[0]))
-
-
+PARAMETERS = """{"deck": {"bcFlow2": {"__class__": "ParamTocElement", "ident": 0, "group": "deck", "name": "bcFlow2",
+                              "ctype": "uint8_t", "pytype": "", "access": 1, "extended": false}}}"""
 ENTRY = """{"pm": {"vbat": {"__class__": "LogTocElement", "ident": %d, "group": "pm", "name": "vbat",
                         "ctype": "%s", "pytype": "<f", "access": 0}}}"""
 
 
-def test_other_files_are_refused(tmp_path):
+def test_tables_of_files_are_read_or_refused(tmp_path):
+    texts = (ENTRY % (0, "float"), PARAMETERS)
+    for file, text in zip(files := [tmp_path / "logs.json", tmp_path / "parameters.json"], texts, strict=True):
+        file.write_text(text)
+    tables = inventory(tuple(map(str, files)))
+    (log,), (parameter,) = tables.logs.variables, tables.parameters.variables
+    assert (log.name, log.type, parameter.name, parameter.flags) == ("pm.vbat", "float", "deck.bcFlow2", READ_ONLY)
+    with pytest.raises(BodyError, match="second table"):
+        inventory((str(files[0]), str(files[0])))
     for k, (text, said) in enumerate(
         (
             ("", "no table of a Crazyflie"),
