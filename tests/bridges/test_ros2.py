@@ -303,9 +303,9 @@ def test_robots_are_in_the_graph_of_ros(sides):
     assert [sequence for _, sequence, _ in got] == list(range(1, len(got) + 1))
     token = next(token for token in node.graph() if "/MP/" in token and "%CF01%pose" in token)
     assert gid == xxhash.xxh3_128_intdigest(token.encode()).to_bytes(16, "little")
-    speed = node.take(speeds)[0][0].twist.linear
+    speed = node.taken(speeds)[0][0].twist.linear
     assert (speed.x, speed.y, speed.z) == (0.1, 0.2, -0.3)
-    frame = node.take(frames)[0][0].transforms[0]
+    frame = node.taken(frames)[0][0].transforms[0]
     assert (frame.header.frame_id, frame.child_frame_id, frame.header.stamp.sec) == ("map", "CF01", 1700000000)
     assert (frame.transform.translation.x, frame.transform.rotation) == (1.0, turn)
 
@@ -382,14 +382,3 @@ def test_goals_come_in(sides):
     until(lambda: not passed_on())
     token.undeclare()
     until(passed_on)
-
-
-@pytest.mark.system
-def test_the_graph_survives_its_router(sides, router):
-    node, realm = sides
-    realm.enter("CF01")
-    until(lambda: len(node.topics()) == 5)
-    router.kill()
-    until(lambda: not [token for token in node.graph() if "zenpark" in token])
-    router.start()
-    until(lambda: len(node.topics()) == 5)

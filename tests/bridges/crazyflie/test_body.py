@@ -186,21 +186,6 @@ def test_closing_during_arming_disarms():
 
 
 @pytest.mark.system
-def test_another_session_finds_it_in_the_air():
-    """A process that was killed has left it there: it is landed, then set up, and nothing says that it flies."""
-    with connected_twins() as (twin, process):
-        process.takeoff(0.4)
-        process.lead((0.0, 0.0, 0.4, 0.0)).run(0.2)
-        process.body.close(land=False)
-        with connected(twin.addresses) as again:
-            assert again.tick().note == ("",)
-            assert not again.state.flying[0]
-            assert truth(twin)[2] == 0.0
-            assert supervised(twin) != SupervisorState.LOCKED
-            assert twin.device.drones[0].value("posCtlPid.thrustMin") == 5000
-
-
-@pytest.mark.system
 def test_faulty_drones_fail_differently_while_others_fly_on():
     """In one process: one is well, one loses 5 % of all packets; one falls silent for good, one for a moment, one's
     battery runs empty, and one is killed. Those in reach end on the ground with their motors off; the others count

@@ -5,6 +5,7 @@ import threading
 import types
 from collections import Counter
 from itertools import count
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -390,25 +391,14 @@ def test_firmware_without_lock_flag_stops_once_not_flying(air):
     assert air.sent == [], "one that stands is not locked"
 
 
-class NoRoom:
-    """A link that cannot be made, such as with a full disk, where cflib keeps its tables."""
-
-    made = 0
-
-    def __init__(self, _address):
-        NoRoom.made += 1
-        raise OSError(28, "No space left on device")
-
-
 def test_link_that_cannot_be_made_is_tried_again(monkeypatch):
-    """The thread lives on: it alone can send a stop."""
-    monkeypatch.setattr(pilot, "CrazyflieLink", NoRoom)
-    flown = pilot.CrazyfliePilot(
-        "CF01", "udp://127.0.0.1:1", CrazyflieSettings(), Telemetry(lighthouse=False), place=(ZERO, 0.0),
-        turn=threading.Lock(),
-    )  # fmt: skip
+    """With a full disk, where cflib keeps its tables: the thread lives on, which alone can send a stop."""
+    made = MagicMock(side_effect=OSError(28, "No space left on device"))
+    monkeypatch.setattr(pilot, "CrazyflieLink", made)
+    place, turn, telemetry = (ZERO, 0.0), threading.Lock(), Telemetry(lighthouse=False)
+    flown = pilot.CrazyfliePilot("CF01", "udp://[::1]:1", CrazyflieSettings(), telemetry, place=place, turn=turn)
     flown.start()
-    until(lambda: NoRoom.made >= 2, "it is tried again")
+    until(lambda: made.call_count >= 2, "it is tried again")
     assert "No space left" in str(flown.failure)
     assert "No space left" in flown.note
     flown.close()

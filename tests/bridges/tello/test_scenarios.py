@@ -24,7 +24,7 @@ from tests.requests import request
 from tests.twins.loopback import Served, reached
 from twins.devices.tello import TelloDevice
 
-ONE = request("tello", ["tello-twin"], external=True)
+ONE = request("tello", ["tello-twin"], external=True, yaw=0.5)
 NOBODY = "tello://127.0.0.77:18889"
 
 
@@ -32,7 +32,6 @@ NOBODY = "tello://127.0.0.77:18889"
 @pytest.mark.parametrize(
     "scenario",
     [
-        "formation",
         pytest.param("faults", marks=pytest.mark.mechanism("Tello bridge: one of several fails")),
         "refusals",
     ],
@@ -58,37 +57,12 @@ def piloted(rows, *twins, addresses=(), open_s=3.0):
     return Driver(body, truth=truth)
 
 
-def formation():
-    """Two drones take off to different heights, fly to two places with another yaw, hold, and land."""
-    rows = request("tello", ["tello-twin"] * 2, external=True, yaw=0.5)
-    with Served(TelloDevice, rows) as served:
-        driver = piloted(rows, served)
-        driver.run(0.3)
-        driver.body.takeoff(range(2), [0.6, 1.1])
-        driver.until(lambda: np.allclose(served.truth()[0][:, 2], [0.6, 1.1], atol=0.03))
-        goals, yaws = [(0.8, -0.3, 0.7), (-0.4, 1.5, 1.0)], [1.2, -0.4]
-        driver.decide = toward(TELLO, goals, yaws)
-        driver.until(lambda: np.abs(served.truth()[0] - goals).max() < 0.03)
-        driver.until(lambda: np.abs(served.truth()[1] - yaws).max() < 0.05)
-        place, yaw = served.truth()
-        state, driver.decide = driver.state, None
-        assert np.abs(state.position - place).max() < 0.02
-        assert np.abs(state.velocity).max() < 0.2
-        assert np.abs(yaw - state.yaw).max() < 0.02
-        assert ((state.battery > 0.9) & (state.battery <= 1.0)).all()
-        driver.body.land(range(2))
-        driver.until(lambda: not driver.state.flying.any())
-        assert driver.state.note == ("", "")
-        assert served.truth()[0][:, 2].max() == 0.0
-        driver.body.close()
-
-
 def faults():
     """Six drones: a good one, one that falls silent, is killed, drains, is empty, is absent; the good one flies on."""
     changes = ({}, {"silent_from_s": 4.0}, {}, {"battery": 0.15, "drain": 12.0}, {"battery": 0.08})
     twins = [Served(TelloDevice, ONE, **change) for change in changes]
     good, _, killed, weak, _ = twins
-    rows = request("tello", ["-"] * 6, external=True)
+    rows = request("tello", ["-"] * 6, external=True, yaw=0.5)
     driver = piloted(rows, *twins, addresses=["tello://127.0.0.99:18889"], open_s=1.0)
     body = driver.body
     driver.run(0.3)
@@ -100,7 +74,7 @@ def faults():
     assert driver.state.flying.tolist() == [True, True, True, True, False, False]
     driver.until(lambda: bool((driver.truth()[0][:4, 2] > 0.5).all()))
     goal = (0.5, 0.5, 0.6)
-    driver.decide = toward(TELLO, [goal, *[None] * 5], 0.0)
+    driver.decide = toward(TELLO, [goal, *[None] * 5], 1.2)
     killed.kill()
     for row in (2, 1):
         driver.until(lambda row=row: driver.t - driver.state.time[row] > 0.5)
@@ -111,9 +85,14 @@ def faults():
     assert driver.state.note[3] == "landing: battery at 9%"
     assert weak.truth()[0][0, 2] < 0.05
     driver.until(lambda: np.abs(good.truth()[0][0] - goal).max() < 0.03)
+    driver.until(lambda: abs(good.truth()[1][0] - 1.2) < 0.05)
+    assert np.abs(driver.state.position[0] - good.truth()[0][0]).max() < 0.02
+    assert abs(driver.state.yaw[0] - good.truth()[1][0]) < 0.02
+    assert 0.9 < driver.state.battery[0] <= 1.0
     driver.decide = None
-    body.stop([0])
-    driver.until(lambda: good.truth()[0][0, 2] <= 0.0)
+    body.land([0])
+    driver.until(lambda: not driver.state.flying[0])
+    assert (driver.state.note[0], good.truth()[0][0, 2]) == ("", 0.0)
     body.close()
     for served in twins:
         served.kill()
@@ -154,4 +133,4 @@ def refusals():
 
 
 if __name__ == "__main__":
-    {each.__name__: each for each in (formation, faults, refusals)}[sys.argv[1]]()
+    {each.__name__: each for each in (faults, refusals)}[sys.argv[1]]()
