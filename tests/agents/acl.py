@@ -7,6 +7,21 @@ from typing import Any
 
 import zenoh
 
+TAKES = {  # messages that an action takes: the flow, the kind, and whether on its key, its cache or its history
+    "put": "ingress put key",
+    "delete": "ingress delete key",
+    "keep": "ingress put key, ingress put cache, ingress declare_queryable cache, ingress liveliness_token cache, "
+    "egress query history, ingress reply key",
+    "hear": "ingress declare_subscriber key, egress put key",
+    "last": "ingress declare_subscriber history, ingress query history, "
+    "ingress declare_liveliness_subscriber history, egress reply key, egress liveliness_token cache",
+    "ask": "ingress query key, egress reply key",
+    "answer": "ingress declare_queryable key, egress query key, ingress reply key",
+    "be": "ingress liveliness_token key",
+    "watch": "ingress liveliness_query key, ingress declare_liveliness_subscriber key, egress liveliness_token key",
+}
+ACTIONS = tuple(TAKES)
+
 
 @cache
 def includes(each: str, key: str) -> bool:
@@ -26,45 +41,13 @@ def held(control: dict[str, Any], common_name: str) -> list[dict[str, Any]]:
 
 def permitted(rules: list[dict[str, Any]], flow: str, message: str, key: str) -> bool:
     """Whether a message passes: one of the sender's rules includes its key."""
-    return any(
-        flow in rule["flows"] and message in rule["messages"] and any(includes(each, key) for each in rule["key_exprs"])
-        for rule in rules
-    )
+    fitting = [rule for rule in rules if flow in rule["flows"] and message in rule["messages"]]
+    return any(includes(each, key) for rule in fitting for each in rule["key_exprs"])
 
 
 def may(control: dict[str, Any], common_name: str, action: str, key: str) -> bool:
     """Whether an action is possible: all the messages that it takes pass."""
-    adv = f"{key}/@adv/pub/1/1/_"
-    takes = {
-        "put": [("ingress", "put", key)],
-        "delete": [("ingress", "delete", key)],
-        "keep": [
-            ("ingress", "put", key),
-            ("ingress", "put", adv),
-            ("ingress", "declare_queryable", adv),
-            ("ingress", "liveliness_token", adv),
-            ("egress", "query", f"{key}/@adv/pub/**"),
-            ("ingress", "reply", key),
-        ],
-        "hear": [("ingress", "declare_subscriber", key), ("egress", "put", key)],
-        "last": [
-            ("ingress", "declare_subscriber", f"{key}/@adv/pub/**"),
-            ("ingress", "query", f"{key}/@adv/pub/**"),
-            ("ingress", "declare_liveliness_subscriber", f"{key}/@adv/pub/**"),
-            ("egress", "reply", key),
-            ("egress", "liveliness_token", adv),
-        ],
-        "ask": [("ingress", "query", key), ("egress", "reply", key)],
-        "answer": [("ingress", "declare_queryable", key), ("egress", "query", key), ("ingress", "reply", key)],
-        "be": [("ingress", "liveliness_token", key)],
-        "watch": [
-            ("ingress", "liveliness_query", key),
-            ("ingress", "declare_liveliness_subscriber", key),
-            ("egress", "liveliness_token", key),
-        ],
-    }
-    rules = held(control, common_name)
-    return all(permitted(rules, *message) for message in takes[action])
-
-
-ACTIONS = ("put", "delete", "keep", "hear", "last", "ask", "answer", "be", "watch")
+    rules, keys = held(control, common_name), {"key": key, "cache": f"{key}/@adv/pub/1/1/_"}
+    keys["history"] = f"{key}/@adv/pub/**"
+    messages = [text.split() for text in TAKES[action].split(", ")]
+    return all(permitted(rules, flow, message, keys[where]) for flow, message, where in messages)
