@@ -9,22 +9,15 @@ Operation:
   mode: {mode}     # physical, virtual, hybrid
   tool: Webots
   world: empty.wbt
-
-Experience:
-  type: formation
-
+Experience: {{type: formation}}
 Architecture:
   mode: {architecture}
   node: {{executable: none, name: none, pkg: none}}
-
 CPU_Monitoring: {{enable: False}}
-
 Interface: {{enable: False}}
-
 Data_Logging:
   enable: {logging}
   topics: /dron01/local_pose
-
 Robots:
 """
 ROBOT = """  Robot{number:02d}:
@@ -34,22 +27,14 @@ ROBOT = """  Robot{number:02d}:
     positioning: {positioning}
     pose: {pose}
     {address}
-    controller:
-      type: pid
-      enable: True
-      protocol: Continuous
-      period: 0.01
-      threshold: {{type: Constant, co: 0.01, ai: 0.0}}
+    controller: {{type: pid, enable: True, protocol: Continuous, period: 0.01, threshold: {{type: Constant, co: 0.01}}}}
     communication:
       type: {speaks}
       threshold:
         type: Constant
         co: {threshold}
         ai: 0.0
-    local_pose:
-      enable: True
-      path: False
-      T: {pose_ms}
+    local_pose: {{enable: True, path: False, T: {pose_ms}}}
     task:
       enable: {task}
       T: 100
@@ -67,9 +52,7 @@ ROBOT = """  Robot{number:02d}:
       relationship: {relationship}
 
 """
-TAIL = """Supervisor:
-  enable: False
-
+TAIL = """Supervisor: {enable: False}
 Other:
 """
 USUAL = {

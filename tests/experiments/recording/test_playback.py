@@ -354,17 +354,12 @@ def test_drift_is_removed_after_the_initial_offset():
     lab2, lab1 = right.offsets()
     assert (lab2.host, lab2.robots, lab2.over) == ("lab2", ("CF01",), 600.0)
     assert (lab2.drift, lab1.drift) == (pytest.approx(drift), None)
-
-
-def test_goals_in_transit_keep_their_delay():
-    drift, true = 50e-6, 300.0
-    right = Correction([clock_of("lab2", 0.0, 0.2), clock_of("lab2", 600.0, 0.23)])
-    posed, acted = true * (1 + drift), (true + 0.1) * (1 + drift)
-    followed, rest = [GoalReceipt(7, 300.05, posed, acted)], (0.0, 0.0, 0.0)
-    said = State("CF01", 1, acted, "running", rest, rest, 0.0, None, None, 0.0, goal_receipts=followed)
-    goal = right.state(said).goal_receipts[0]
-    assert goal.stamp == 300.05, "the centre runs where the conductor does"
-    assert (goal.pose, goal.acted) == pytest.approx((true, true + 0.1), abs=1e-5)
+    acted = stamped[2] + 0.1 * (1 + drift)
+    followed, rest = [GoalReceipt(7, begin + 300.05, stamped[2], acted)], (0.0, 0.0, 0.0)
+    state = State("CF01", 1, acted, "running", rest, rest, 0.0, None, None, 0.0, goal_receipts=followed)
+    goal = right.state(state).goal_receipts[0]
+    assert goal.stamp == begin + 300.05, "the centre runs where the conductor does"
+    assert (goal.pose, goal.acted) == pytest.approx((begin + 300.0, begin + 300.1), rel=0, abs=1e-5)
 
 
 def life(pid, *counts):

@@ -14,7 +14,7 @@ from experiments.definition.experiment import ChannelTable, LinkChannelTable, St
 from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.file.problems import DocumentError
-from experiments.recording import cleaning, run_folder, version
+from experiments.recording import cleaning, run_folder
 from experiments.recording.run_folder import RunOrigin
 from experiments.recording.version import provenance
 from tests.commands import invoke
@@ -29,14 +29,6 @@ def test_runs_of_the_same_second_have_own_folders(tmp_path, monkeypatch):
     assert len([folder for folder in folders if folder.is_dir()]) == 24
     with pytest.raises(DocumentError):
         run_folder.check_folder("x" * 300)  # longer than a file system takes
-
-
-def test_machine_that_tells_no_memory_has_a_provenance(monkeypatch):
-    def unknown(_):
-        raise ValueError("unrecognized configuration name")
-
-    monkeypatch.setattr(version.os, "sysconf", unknown)
-    assert provenance().memory_gb == 0.0
 
 
 def test_folder_without_a_run_is_removed(tmp_path):

@@ -90,13 +90,18 @@ def test_others_read_it(path):
     assert (last.lost_keys, last.lost_values, math.isnan(last.battery)) == (["TB01"], [1], True)
 
 
-def test_a_recording_is_never_overwritten(path):
-    path.write_text("precious")
-    with pytest.raises(RecordingError, match=r"run\.mcap: exists already; move it away"):
-        rec.write(path)
-    assert path.read_text() == "precious"
+def test_a_recording_is_never_overwritten(path, tmp_path):
+    target = tmp_path / "precious"
+    target.write_text("mine")
+    with pytest.raises(RecordingError, match="precious: exists already; move it away"):
+        rec.write(target)
     with pytest.raises(RecordingError, match="cannot be created: No such file"):
-        rec.write(path.parent / "none" / "run.mcap")
+        rec.write(tmp_path / "none" / "run.mcap")
+    for into in (target, rec.broken(path)):
+        with pytest.raises(RecordingError, match=f"{into.name}: exists already"):
+            recover(path, into)
+    assert target.read_text() == "mine"
+    assert not read(path).complete
 
 
 def test_callers_error_leaves_a_finished_file(path):
@@ -280,16 +285,6 @@ def test_a_whole_file_needs_no_recovery(path, tmp_path, capsys):
     commands.recover(str(path), None)
     assert capsys.readouterr().out == f"{path} is whole already: 82 messages of TB01, CF01\n"
     assert sorted(tmp_path.iterdir()) == [path]
-
-
-def test_recovery_overwrites_nothing(path, tmp_path):
-    target = tmp_path / "precious"
-    target.write_text("mine")
-    for into in (target, rec.broken(path)):
-        with pytest.raises(RecordingError, match=f"{into.name}: exists already"):
-            recover(path, into)
-    assert target.read_text() == "mine"
-    assert not read(path).complete
 
 
 def test_a_recorder_that_took_over_completes_the_recording(path, tmp_path, capsys):

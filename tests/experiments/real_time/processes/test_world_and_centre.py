@@ -475,27 +475,21 @@ def test_reset_that_cannot_be_is_refused():
 
 
 def test_reset_puts_back_pushed_obstacles():
-    world = World({"KH01": carried(-1.0, -1.0, math.pi)}, {"crate": OBSTACLES["crate"]}, engine="pymunk")
+    belt = Obstacle(box=(0.2, 0.2), at=(0.0, -1.0), plan={"kind": "line", "move_by": [1.0, 0.0], "speed": 0.5})
+    world = World({"KH01": carried(-1.0, -1.0, math.pi)}, {"crate": OBSTACLES["crate"], "belt": belt}, engine="pymunk")
     world.go(400, KH01=FORWARD)
     assert world.obstacles()["crate"][0] < -1.55
-    world.reset(None)
-    assert world.obstacles()["crate"] == (-1.5, -1.0, pytest.approx(math.pi / 2, abs=1e-6))
-    assert world.at("KH01") == [-1.0, -1.0, 0.0]
-    assert world.time == pytest.approx(4.0)
-
-
-def test_planned_obstacles_move_from_the_start():
-    belt = Obstacle(box=(0.2, 0.2), at=(0.0, -1.0), plan={"kind": "line", "move_by": [1.0, 0.0], "speed": 0.5})
-    world = World(obstacles={"belt": belt})
-    world.go(100)
     assert world.obstacles()["belt"] == (0.0, -1.0, 0.0)
     world.begin(world.time + 0.5)
     world.go(150)
     moved = world.obstacles()["belt"][0]
-    assert moved == pytest.approx(0.5, abs=0.05)
+    assert moved == pytest.approx(0.5, abs=0.05), "a planned one moves from the start on"
     world.reset(None)
+    assert world.obstacles()["crate"] == (-1.5, -1.0, pytest.approx(math.pi / 2, abs=1e-6))
+    assert world.at("KH01") == [-1.0, -1.0, 0.0]
     world.go(20)
-    assert world.obstacles()["belt"][0] == pytest.approx(moved + 0.1, abs=0.03)
+    assert world.obstacles()["belt"][0] == pytest.approx(moved + 0.1, abs=0.03), "and goes on"
+    assert world.time == pytest.approx(5.7)
 
 
 def test_contacts_have_names():
