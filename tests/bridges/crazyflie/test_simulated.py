@@ -309,22 +309,23 @@ def nightly(*values):
 
 
 @pytest.mark.parametrize(
-    ("rows", "exchanges", "rates"),
+    ("rows", "exchanges", "rates", "yaw"),
     [
-        nightly(1, 400.0, {}),
-        (4, 400.0, {}),
-        nightly(8, 400.0, {"stream_hz": 7.0}),
-        nightly(15, 664.0, {"stream_hz": 5.0}),
-        nightly(5, 250.0, {"stream_hz": 7.0}),
+        nightly(1, 400.0, {}, 0.0),
+        (4, 400.0, {}, 0.0),
+        nightly(8, 400.0, {"stream_hz": 7.0}, 0.0),
+        nightly(15, 664.0, {"stream_hz": 5.0}, 0.0),
+        nightly(5, 250.0, {"stream_hz": 7.0}, 0.0),
+        (8, 400.0, {"stream_hz": 4.0}, 0.5),  # seventeen parts of polynomials for a take-off, one at a time
     ],
 )
-def test_rates_that_a_radio_carries_leave_poses_young(monkeypatch, rows, exchanges, rates):
-    """Take off, follow a circle at 0.3 m/s, land; some with a yaw: seventeen parts of polynomials, one at a time."""
+def test_rates_that_a_radio_carries_leave_poses_young(monkeypatch, rows, exchanges, rates, yaw):
+    """Take off, follow a circle at 0.3 m/s, land."""
     settings = [CrazyflieSettings(**rates)] * rows
     assert overload("0", settings, exchanges) == ""
     with Fleet(monkeypatch, rows, exchanges, **rates) as fleet:
-        for vehicle in fleet.vehicles[1::2]:
-            vehicle.model.yaw = 0.5
+        for vehicle in fleet.vehicles:
+            vehicle.model.yaw = yaw
         fleet.run(1.0)
         fleet.ages.clear()
         fleet.order(lambda flight: flight.takeoff(HEIGHT))
