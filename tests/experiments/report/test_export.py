@@ -6,8 +6,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from PIL import Image
 
 from agents.errors import ExplainedError
@@ -15,10 +13,9 @@ from experiments.definition.experiment import Formation, LinkTable
 from experiments.definition.graph import laplacian
 from experiments.metrics.signals import Measurement
 from experiments.report import export
-from experiments.report.export import KEYWORDS, UNITS, matlab_names, structure
+from experiments.report.export import UNITS, matlab_names, structure
 from experiments.report.page import Table, TableRow
 from experiments.report.typeset import latex, markdown
-from tests.cases import examples
 from tests.runs import fly, recorded
 from tests.small import small
 from tools.commands import results as commands
@@ -137,21 +134,10 @@ def test_table_has_a_line_per_robot_and_time(recorded_run, tmp_path):
     assert not any("nan" in row.values() for row in rows)
 
 
-@examples(30)
-@given(st.lists(st.from_regex(r"[A-Za-z0-9][A-Za-z0-9_.-]*", fullmatch=True), unique=True, max_size=20))
-def test_names_are_valid_in_matlab(names):
-    found = matlab_names(names)
-    assert list(found) == names
-    assert len(set(found.values())) == len(names)
-    for name in found.values():
-        assert re.fullmatch("[A-Za-z][A-Za-z0-9_]{0,62}", name)
-        assert name not in KEYWORDS
-
-
-def test_names_that_are_valid_stay():
-    given_names = ["periodic", "5mm", "a.b", "a-b", "end", "x" * 70, "x" * 71]
-    found = ["periodic", "case_5mm", "a_b", "a_b_2", "case_end", "x" * 63, "x" * 61 + "_2"]
-    assert list(matlab_names(given_names).values()) == found
+def test_names_are_valid_in_matlab():
+    given = ["periodic", "5mm", "a.b", "a-b", "a_b_2", "a_b", "end", "case_end", "x" * 70, "x" * 71]
+    found = ["periodic", "case_5mm", "a_b", "a_b_2", "a_b_2_2", "a_b_3", "case_end", "case_end_2"]
+    assert list(matlab_names(given).values()) == [*found, "x" * 63, "x" * 61 + "_2"]
 
 
 def test_what_cannot_be_exported_is_explained(recorded_run, tmp_path, monkeypatch):

@@ -35,10 +35,6 @@ def limits(periodic, event, event_loss):
     return pytest.mark.parametrize(("case", "most"), rows)
 
 
-def trace_from(name, case, *changes):
-    return flown(name, case, *changes).trace
-
-
 def text_of(name):
     return index.find_file(name).read_text("utf-8")
 
@@ -51,6 +47,12 @@ def apart(known, shape):
     """Distance of each robot (T, N) from where the mean of all and a shape have it [m]."""
     place = known.true_position[..., :2] - shape
     return np.linalg.norm(place - place.mean(axis=1, keepdims=True), axis=2)
+
+
+def behind_first(known, shape):
+    """Offset of each robot (T, N, 2) from its place behind the first one [m]."""
+    place = known.true_position[..., :2] - shape
+    return place - place[:, :1]
 
 
 def rate_of(values, known, begin, end):
@@ -82,7 +84,7 @@ AVERAGES = ("periodic", 1e-4, ()), ("event", 0.015, ()), ("event-loss", 0.02, ()
 
 @pytest.mark.parametrize(("case", "most", "changes"), mostly_slow(AVERAGES, len(AVERAGES)))
 def test_average_of_constant_signals_has_no_error(case, most, changes):
-    known = trace_from("average", case, *changes)
+    known = flown("average", case, *changes).trace
     assert np.abs(known.memory["x"][-1] - 3.0).max() < most
     assert np.abs(known.memory["x"][0] - 3.0).max() > 1.0
     assert known.measures["disagreement"].shape == (len(known.time), 6)
@@ -90,7 +92,7 @@ def test_average_of_constant_signals_has_no_error(case, most, changes):
 
 @pytest.mark.slow
 def test_average_of_ramps_has_a_bounded_error():
-    known = trace_from("average", "periodic", "formation.law.ramp={ KH01 = 0.3, KH04 = -0.1 }", "duration_s=60")
+    known = flown("average", "periodic", "formation.law.ramp={ KH01 = 0.3, KH04 = -0.1 }", "duration_s=60").trace
     error = known.memory["x"][..., 0] - 3.0 - known.time[:, None] * 0.2 / 6
     later = np.abs(error[known.time > 30.0])
     assert later.max() < 0.3
@@ -101,7 +103,7 @@ def test_average_of_ramps_has_a_bounded_error():
 @limits(1e-3, 3e-3, 0.01)
 def test_aggregative_team_descends_linearly_to_its_optimum(case, most):
     """A lost message lets the two ends believe different values, of some thresholds of 1 cm, until the next one."""
-    known = trace_from("aggregative", case)
+    known = flown("aggregative", case).trace
     law, names = known.plan.law, known.robots
     targets, places = np.array([law.targets[name] for name in names]), np.array([*law.places.values()])
     share = law.team * len(places) / len(names)
@@ -119,7 +121,7 @@ def test_aggregative_team_descends_linearly_to_its_optimum(case, most):
 @pytest.mark.slow
 @pytest.mark.parametrize("case", EVERY_CASE)
 def test_robots_fly_to_the_tasks_that_they_won(case):
-    known = trace_from("auction", case)
+    known = flown("auction", case).trace
     law, place = known.plan.experiment.formation.law, known.true_position[..., :2]
     tasks = np.array([*law["tasks"], *(each[:2] for each in law["later"])])
     chosen = np.where(known.measures["calm"] >= law.get("calm_s", 1.0), known.measures["task"], -1.0)
@@ -143,7 +145,7 @@ MEETINGS = ("periodic", (CENTRALISED,)), ("periodic", ()), ("event-loss", ()), (
 
 @pytest.mark.parametrize(("case", "changes"), mostly_slow(MEETINGS, len(MEETINGS)))
 def test_consensus_meets_mean_at_the_graphs_rate(case, changes):
-    known = trace_from("consensus", case, *changes)
+    known = flown("consensus", case, *changes).trace
     mean = (known.true_position[..., :2] - OFFSETS).mean(axis=1)
     assert np.abs(mean - mean[0]).max() < (0.02 if HYBRID in changes else 0.01)
     off = np.linalg.norm(apart(known, OFFSETS), axis=1)
@@ -161,7 +163,7 @@ NOISELESS = "disturbance.all.position_sigma=0.0"
 )
 def test_event_consensus_stays_bounded_and_keeps_events_apart(case, floor, extra):
     """Seyboth, Dimarogonas, Johansson, Automatica 49(1), 2013: thresholds c₀ + c₁ exp(−α t), α below k λ₂."""
-    known = trace_from("consensus", case, NOISELESS)
+    known = flown("consensus", case, NOISELESS).trace
     spectrum, alpha, root = np.linalg.eigvalsh(RING), 0.25, np.sqrt(5.0)
     rate, norm = 0.3 * spectrum[1], 0.3 * spectrum[-1]
     moving = known.time >= 2.0  # the bodies follow
@@ -220,7 +222,7 @@ def test_followers_go_into_the_hull_of_their_leaders():
 @pytest.mark.parametrize("share", [0.6, 1.0, 1.2])
 def test_pursuit_meets_circles_or_leaves_by_its_angle(case, share):
     angle, gain, half = share * np.pi / 6.0, 0.3, np.pi / 6.0
-    known = trace_from("cyclic-pursuit", case, f"formation.law.angle={angle:.5f}", "duration_s=10")
+    known = flown("cyclic-pursuit", case, f"formation.law.angle={angle:.5f}", "duration_s=10").trace
     place = known.true_position[..., 0] + 1j * known.true_position[..., 1]
     mean = place.mean(axis=1)
     assert np.abs(mean - mean[0]).max() < 0.01
@@ -235,26 +237,21 @@ def test_pursuit_meets_circles_or_leaves_by_its_angle(case, share):
 LAG_SHAPE = np.array([[0.0, 0.0], [-0.5, 0.5], [-0.5, -0.5], [-1.0, 0.0], [-1.0, -0.7]])
 
 
-def lag(known):
-    """Distance of each robot from its place behind the leader [m], with a row for each time."""
-    place = known.true_position[..., :2] - LAG_SHAPE
-    return np.linalg.norm(place - place[:, :1], axis=2)
-
-
 @pytest.mark.slow
 @limits(0.001, 0.005, 0.008)
 def test_followers_of_a_constant_leader_do_not_lag(case, most):
-    known = trace_from("leader-observer", case)
+    known = flown("leader-observer", case).trace
     window = (known.time > 20.0) & (known.time < 38.0)
     assert np.abs(known.memory["v"][window] - [0.12, 0.0]).max() < 1e-3
-    assert lag(known)[window].max() < most
-    assert lag(known)[0].max() > 0.2
+    lag = np.linalg.norm(behind_first(known, LAG_SHAPE), axis=2)
+    assert lag[window].max() < most
+    assert lag[0].max() > 0.2
 
 
 @pytest.mark.slow
 def test_followers_without_velocity_lag_by_speed_over_gain():
-    known = trace_from("leader-observer", "periodic", "formation.law.observer=1e-9", "duration_s=20")
-    assert lag(known)[-1, 1:3] == pytest.approx(0.12 / 0.5, rel=0.05)
+    known = flown("leader-observer", "periodic", "formation.law.observer=1e-9", "duration_s=20").trace
+    assert np.linalg.norm(behind_first(known, LAG_SHAPE)[-1, 1:3], axis=1) == pytest.approx(0.12 / 0.5, rel=0.05)
 
 
 EDGE = np.linspace(-1.78, 1.78, 90)
@@ -283,7 +280,7 @@ def off_centroid(places):
 @pytest.mark.slow
 @pytest.mark.parametrize("case", EVERY_CASE)
 def test_coverage_lowers_its_cost_and_ends_at_centroids(case):
-    known = trace_from("coverage", case)
+    known = flown("coverage", case).trace
     ways = known.true_position[::25, :, :2]
     found = costs(ways)
     assert np.diff(found).max() < 0.005
@@ -304,7 +301,7 @@ def five_alone():
 def test_coverage_makes_up_for_a_robot_landing_midflight(case, five_alone):
     """The battery of CF06, a Crazyflie among Tellos, is low first."""
     others = tuple(f'robots.CF0{number}.kind="tello"' for number in range(1, 6))
-    known = trace_from("coverage", case, *others, "safety.battery_low=0.975", "duration_s=16")
+    known = flown("coverage", case, *others, "safety.battery_low=0.975", "duration_s=16").trace
     ((lost, name),) = {(event.stamp, event.source) for event in known.events if event.text.startswith("land: its batt")}
     assert name == "CF06"
     assert 7.0 < lost < 9.0
@@ -341,7 +338,7 @@ def test_followers_without_any_leader_stop():
 @pytest.mark.slow
 @limits(0.04, 0.05, 0.08)
 def test_flock_keeps_spacing_velocity_and_rendezvous_of_mean(case, most):
-    known = trace_from("flocking", case)
+    known = flown("flocking", case).trace
     place = known.true_position[..., :2]
     apart = np.linalg.norm(place[:, :, None] - place[:, None], axis=3)[:, *np.triu_indices(7, 1)]
     assert apart.min() > 0.5
@@ -373,20 +370,15 @@ def test_a_recording_has_memory_measures_and_words(tmp_path):
 
 
 WIND = {"CF02": (-0.8, 0.3), "CF03": (-0.8, 0.3), "CF04": (-0.3, 0.1), "CF05": (-0.8, 0.3)}  # [m/s²]
+WIND_SHAPE = np.array([[1.0, 0.0], [0.3, 0.6], [0.3, -0.6], [-0.6, 0.6], [-0.6, -0.6]])
 SHELTER = 1.0 / (2.0 * 5.0)  # [s²] of a Crazyflie: error of its place in a wind, by gains of its loop
-
-
-def out_of_place(known):
-    """Offset of each follower from its place behind the leader [m]."""
-    place = known.true_position[..., :2] - [[1.0, 0.0], [0.3, 0.6], [0.3, -0.6], [-0.6, 0.6], [-0.6, -0.6]]
-    return place[:, 1:] - place[:, :1]
 
 
 @pytest.mark.slow
 @limits(0.002, 0.005, 0.008)
 def test_integral_action_leaves_no_error_in_a_wind(case, most):
-    known = trace_from("integral", case)
-    assert np.linalg.norm(out_of_place(known)[known.time > 37.0], axis=2).max() < most
+    known = flown("integral", case).trace
+    assert np.linalg.norm(behind_first(known, WIND_SHAPE)[known.time > 37.0], axis=2).max() < most
     for wind, z in zip(np.array([*WIND.values()]), known.memory["z"][-1, 1:], strict=True):
         beyond = max(SHELTER - LEASH / np.linalg.norm(wind), 0.0)  # what the reference of its place does not hold off
         assert z == pytest.approx(CRAZYFLIE.response * beyond * wind, abs=0.003)
@@ -398,7 +390,7 @@ def test_integral_action_needs_no_leader_for_the_shape(case):
     text = text_of("integral").replace('leader = "CF01"', "").replace('"CF01 > ', '"CF01 - ')
     known = fly_text(text.replace("[5.0, 4.0, 2.5]", "[20.0, 20.0, 2.5]"), case)
     late = known.time > 37.0
-    assert np.linalg.norm(out_of_place(known)[late], axis=2).max() < 0.012
+    assert np.linalg.norm(behind_first(known, WIND_SHAPE)[late], axis=2).max() < 0.012
     drift = known.true_position[-1, 0, :2] - known.true_position[known.time > 10.0][0, 0, :2]
     assert np.linalg.norm(drift) > 0.5  # with the wind
 
@@ -406,12 +398,12 @@ def test_integral_action_needs_no_leader_for_the_shape(case):
 @pytest.mark.slow
 @pytest.mark.parametrize("case", EVERY_CASE)
 def test_displacement_keeps_an_error_in_a_wind(case):
-    known = trace_from("integral", case, 'formation.law={ kind = "displacement" }')
+    known = flown("integral", case, 'formation.law={ kind = "displacement" }').trace
     links = np.array([[2, 0, -1, 0], [0, 2, 0, -1], [-1, 0, 3, -1], [0, -1, -1, 2]])
     expected = np.linalg.solve(known.plan.experiment.formation.stiffness * links, SHELTER * np.array([*WIND.values()]))
     assert np.linalg.norm(expected, axis=1).min() > 0.15
     late = known.time > 37.0
-    assert out_of_place(known)[late].mean(axis=0) == pytest.approx(expected, abs=0.01)
+    assert behind_first(known, WIND_SHAPE)[late, 1:].mean(axis=0) == pytest.approx(expected, abs=0.01)
 
 
 def test_integral_stops_at_limit_and_for_held_robots():
@@ -431,7 +423,7 @@ def test_integral_stops_at_limit_and_for_held_robots():
 @pytest.mark.slow
 @pytest.mark.parametrize("case", EVERY_CASE)
 def test_robots_enclose_a_target_that_two_see(case):
-    known = trace_from("enclosing", case)
+    known = flown("enclosing", case).trace
     place = known.true_position[..., :2]
     assert known.memory["links"][-1, :, 0].tolist() == [0.0, 1.0, 2.0, 1.0, 2.0, 2.0]
     from_target = place[:, 1:] - place[:, :1]
