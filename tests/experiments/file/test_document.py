@@ -8,14 +8,13 @@ import msgspec
 import pytest
 
 from experiments.catalogue import index
-from experiments.definition.plan import Plan
 from experiments.definition.standby import robots_without_address
 from experiments.file import catalogue as entries
 from experiments.file import document
 from experiments.file.document import DocumentError, read
 from experiments.file.text import MAX_TEXT_BYTES
 from tests.experiments.traces import parse_links
-from tests.small import PERIODIC
+from tests.small import PERIODIC, changed
 
 MALFORMED = Path(__file__).parent / "malformed"
 # line, column, part of the message and of the remedy, as the comments of a malformed file have them
@@ -107,15 +106,6 @@ def test_absent_file_names_the_nearest_of_the_catalogue(write):
     assert (problem.message, problem.hint) == ("is a folder", "name a file in it: some.toml")
     for name in ("a\0b", "x" * 5000, ""):
         assert len(refusal(name).problems) == 1
-
-
-def test_processes_on_hosts_get_no_hosts(write):
-    hosts = '[hosts.lab1]\naddress = "pi@192.0.2.7"\nrobots = ["KH01"]\nzenpark = "~/lab/zenpark"\nlab = "~/keys"\n'
-    experiment = read(write(TWO + hosts + 'tags = ["radio"]\n[hosts.board]\nrobots = ["KH02"]\n')).experiment
-    assert robots_without_address(Plan(experiment)) == {"KH02": "board"}
-    sent = document.case_document(Plan(experiment))
-    there = document.received(sent.decode(), "standard input").experiment
-    assert there == msgspec.structs.replace(experiment, hosts={})
 
 
 def test_networks_that_are_accepted(write):
@@ -231,6 +221,14 @@ def test_case_crosses_the_network_with_its_name():
         sent = document.case_document(cases[name], name).decode()
         assert document.received(sent, "network").cases() == {name: cases[name]}
         assert document.chosen_case(document.received(sent, "network"), None) == cases[name]
+
+
+def test_processes_on_hosts_get_no_hosts(write):
+    hosts = '[hosts.lab1]\naddress = "pi@192.0.2.7"\nrobots = ["KH01"]\ntags = ["radio"]\n'
+    plan = read(write(f'{TWO}{hosts}[hosts.board]\nrobots = ["KH02"]\n')).plan
+    assert robots_without_address(plan) == {"KH02": "board"}
+    there = document.received(document.case_document(plan).decode(), "standard input").experiment
+    assert there == changed(plan.experiment, hosts={})
 
 
 @pytest.mark.parametrize("flag", ['"TB01 > KH01"=0.5', "'TB01>KH01'=0.5", "TB01 > KH01.distance=0.5"])
