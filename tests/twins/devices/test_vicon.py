@@ -259,15 +259,12 @@ def told(fault):
     return frames[:3], frames[3:]
 
 
-def test_frozen_capture_counts_its_frames_repeated_does_not():
+def test_frozen_repeated_swapped_and_renamed_captures():
     before, during = told("frozen")
     assert [frame.number for frame in during] == [4, 5, 6]
     assert all(frame.poses == before[-1].poses for frame in during)
     before, during = told("repeated")
     assert during == [before[-1]] * 3
-
-
-def test_swapped_and_renamed_subjects():
     before, during = told("swapped")
     for frames, expected in ((before, [0.0, 1.0]), (during, [1.0, 0.0])):
         for frame in frames:

@@ -52,7 +52,7 @@ def corner():
     return uploaded(east + north, count=2)
 
 
-def test_pieces_of_the_memory(corner):
+def test_pieces_of_the_memory_and_relative_ones(corner):
     pieces = flown_pieces(corner)
     assert [span for span, _ in pieces] == [1.0, 2.0]
     assert pose(pieces, 0.5) == pytest.approx([0.5, 0.5, 1.0, 0.0])
@@ -60,9 +60,6 @@ def test_pieces_of_the_memory(corner):
     assert pose(flown_pieces(corner, scale=2.0), 4.0) == pytest.approx([1.0, 0.75, 1.0, 0.3])  # slower
     assert pose(flown_pieces(corner, reverse=True), 1.0) == pytest.approx([1.0, 0.75, 1.0, 0.3])
     assert pose(flown_pieces(corner, reverse=True), 2.75) == pytest.approx([Polynomial(RISE)(0.25), 0.5, 1.0, 0.0])
-
-
-def test_relative_trajectories(corner):
     start = np.array([2.0, 2.0, 0.4, 0.5 * math.pi])
     assert pose(flown_pieces(corner, start), 0.0) == pytest.approx([2.0, 2.0, 0.4, 0.0])
     assert pose(flown_pieces(corner, start), 1.0) == pytest.approx([3.0, 2.0, 0.4, 0.0])
