@@ -34,7 +34,6 @@ SOLUTIONS = settings()
 
 
 def missed(exercise: Path, *changes: str, seed: int) -> list[str]:
-    """Criteria that are not met."""
     judged = judge([*simulate(load(exercise, *changes), seed=seed).metrics.values()])
     assert has_passed(judged) is not None
     return [each.what for each in judged if not each.passed]

@@ -113,7 +113,6 @@ def test_command_line_knows_the_unit_of_hosts():
 
 
 def exists(dotted: str) -> bool:
-    """Whether a dotted name is a package, a module, or a name in one."""
     try:
         pkgutil.resolve_name(dotted)
     except (ImportError, AttributeError):

@@ -32,7 +32,6 @@ PARK, TRIANGLE = "robotic-park", "triangle"
 
 @pytest.fixture(scope="module")
 def examined():
-    """Findings on the reference experiment and figures of both cases."""
     return examine(document.read(PARK))
 
 
@@ -76,8 +75,6 @@ def test_other_catalogue_experiments_have_no_findings(name):
 
 
 class Steep(Gradient, frozen=True):
-    """A law with a gain of its own."""
-
     largest: float = 30.0
 
     def pull(self, apart, link):
@@ -90,28 +87,20 @@ class Steep(Gradient, frozen=True):
 
 
 class Weak(Steep, frozen=True):
-    """A law that hardly pulls."""
-
     largest: float = 0.01
 
 
 class Undefined(Steep, frozen=True):
-    """A law that gives no number where the formation is met."""
-
     def pull(self, apart, link):
         return ZERO if self.error(apart, link) > 1e-3 else UNKNOWN
 
 
 class Comparing(Law, frozen=True):
-    """A law that compares what it did not ask for."""
-
     def step(self, view, memory):
         return Control(velocity=(0.1 * sum(each.link.relative[0] > 0.0 for each in view.neighbours), 0.0, 0.0))
 
 
 class Listing(Steep, frozen=True):
-    """A law that is not compiled."""
-
     def error(self, apart, link):
         return abs(link.distance - sum([each * each for each in apart]) ** 0.5)
 

@@ -223,14 +223,14 @@ def test_noise_that_frees_robots_is_a_note():
 
 
 @pytest.mark.parametrize("axis", [0, 2])
-def test_linear_step_is_model(axis: int) -> None:
+def test_linear_step_is_model(axis):
     dt, setpoint = 0.01, [0.0, 0.0, 0.0, 0.0]
     setpoint[axis] = 0.1
     quadrotor = Quadrotor(CRAZYFLIE, (0.0, 0.0, 0.0), 0.0)
     quadrotor.place((0.0, 0.0, 0.0), 0.0, flying=True)
     state = np.array([0.0, 0.0, 0.0, 0.1])
     for _ in range(200):
-        quadrotor.command((setpoint[0], setpoint[1], setpoint[2], 0.0))
+        quadrotor.command(tuple(setpoint))
         quadrotor.move(dt)
         state = linear_step(CRAZYFLIE.motion, axis, dt) @ state
         assert quadrotor.position[axis] == pytest.approx(state[0], abs=1e-12)

@@ -39,7 +39,6 @@ APART = (
 
 
 def khepera(keys):
-    """The robots, with more keys of KH01."""
     return ROBOTS.replace('kind = "khepera4"\n', f'kind = "khepera4"\n{keys}\n')
 
 

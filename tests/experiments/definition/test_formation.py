@@ -60,7 +60,6 @@ PARTED = '[formation.links]\n"A - B" = 0.5\n"C - D" = 0.5\n"B - C" = { distance 
 
 
 def four_with(text, duration=40.0):
-    """Four robots with this formation."""
     return document.loads(ROBOTS.format(duration=duration) + text)
 
 

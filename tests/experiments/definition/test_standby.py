@@ -98,6 +98,7 @@ def test_spare_brings_its_body_and_keeps_the_rest():
         (order(body="nowhere://1"), "no 'nowhere'"),
         (order(body="world"), "into the world"),
         (order(body="twin", at=(99.0, 0.0)), "outside of the arena"),
+        (order(body="twin", at=(float("nan"), 0.0)), "outside of the arena"),
         (order(body="twin", at=(0.0, 0.0), yaw=float("inf")), "outside of the arena"),
         (order(body="khepera4://192.0.2.1", at=(0.0, 0.0)), "only a twin"),
     ],

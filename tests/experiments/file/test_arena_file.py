@@ -37,7 +37,6 @@ start = [-1.5, 0.0]
 
 
 def write_files(folder, experiment=ONE, arena=LAB):
-    """Path of an experiment that is written with its arena file."""
     (folder / "lab.toml").write_text(arena)
     (folder / "one.toml").write_text(experiment)
     return folder / "one.toml"

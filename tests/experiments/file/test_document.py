@@ -31,8 +31,6 @@ def refusal(path, *overrides):
 
 @pytest.fixture
 def write(tmp_path):
-    """Writes a file and gives its path."""
-
     def written(content, name="some.toml"):
         file = tmp_path / name
         file.write_bytes(content if isinstance(content, bytes) else content.encode())
@@ -143,7 +141,6 @@ def test_case_merges_tables_and_replaces_choices_between_kinds(write):
 
 
 def value(experiment, path):
-    """The value at a dotted path."""
     found = msgspec.to_builtins(experiment)
     for key in path.split("."):
         found = found[int(key)] if isinstance(found, list) else found[key]

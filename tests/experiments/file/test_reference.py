@@ -104,7 +104,6 @@ def test_tables_are_explained_on_one_screen():
 
 @pytest.fixture
 def broken(monkeypatch):
-    """A registered law without its module."""
     entry, listed = EntryPoint("broken", "no_such_module_anywhere:Law", registry.LAWS), registry.registered
 
     def with_it(group):
