@@ -201,18 +201,14 @@ def test_ready_once_the_centre_is_known():
     assert patient.step(0.02).life.phase == READY
 
 
-@pytest.mark.parametrize("name", PLACES)
-def test_nothing_is_pursued_before_the_start(name):
-    bench = guided(name)
-    guide(bench, (1.0, 0.0, 0.8))
-    bench.step()
-    assert bench.life.takeoff() == ""
-    assert bench.step(2.0).life.phase == AIRBORNE
-    assert (bench.robot.goal, bench.robot.updates) == (PLACES[name], 0)
-
-
 @pytest.mark.parametrize(("name", "height"), [("A", 0.0), ("B", 0.7)])  # on wheels there is none
 def test_goal_is_pursued_on_its_tick(name, height):
+    early = guided(name)
+    guide(early, (1.0, 0.0, 0.8))
+    early.step()
+    assert early.life.takeoff() == ""
+    assert early.step(2.0).life.phase == AIRBORNE
+    assert (early.robot.goal, early.robot.updates) == (PLACES[name], 0)  # nothing is pursued before the start
     bench = running(name).step(0.03)  # no decision falls on the next tick
     robot, before = bench.robot, bench.robot.updates
     x, y, _ = bench.position

@@ -55,20 +55,14 @@ def test_end_that_drives_ahead_is_chosen_once(kind, late):
             assert len({v > 0.0 for v, *_ in setpoints if v}) <= 1
 
 
-@pytest.mark.parametrize(
-    ("x", "y", "twist"),
-    [
+def test_setpoints_toward_a_goal():
+    unit = Agility(response=1.0, turn_response=1.5, speed=1.0, turn_rate=9.0)
+    for x, y, twist in (
         (0.2, 0.0, (0.2, 0.0)),
         (-0.2, 0.0, (-0.2, 0.0)),  # backward to what lies behind
         (0.3 * cos(0.7), 0.3 * sin(0.7), (0.3 * (pi - 0.7) / pi, 1.5 * sin(0.7))),  # the law of Farias
-    ],
-)
-def test_twists_toward_a_goal(x, y, twist):
-    unit = Agility(response=1.0, turn_response=1.5, speed=1.0, turn_rate=9.0)
-    assert TwoWheels().twist(x, y, 0.0, nan, unit) == pytest.approx(twist)
-
-
-def test_position_and_velocity_robots():
+    ):
+        assert TwoWheels().twist(x, y, 0.0, nan, unit) == pytest.approx(twist)
     hover, crazyflie, tello = (0.0, 0.0, 0.8), PositionController(CRAZYFLIE), PositionController(TELLO)
     assert crazyflie.setpoint((1.0, 2.0, 0.8), 0.4, hover, 0.0) == (1.0, 2.0, 0.8, 0.4)
     assert crazyflie.setpoint((1.0, 2.0, 0.8), nan, hover, 0.0) == (1.0, 2.0, 0.8, 0.0)

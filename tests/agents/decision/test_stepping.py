@@ -102,9 +102,8 @@ def test_memory_is_kept_where_a_robot_was_due():
     assert stepping.measures == {"heard": 0.0}
 
 
-@pytest.mark.parametrize(
-    "decides",
-    [
+def test_what_cannot_be_used_names_the_law():
+    for decides in (
         None,
         Control(),
         Control(memory={**REMEMBERED, "count": (1.0, 2.0)}),
@@ -112,27 +111,22 @@ def test_memory_is_kept_where_a_robot_was_due():
         Control(memory=REMEMBERED, velocity=(1.0, 2.0)),
         Control(memory=REMEMBERED, velocity=(0.0, 0.0, nan), goal=(0.0, 0.0, nan)),
         Control(memory=REMEMBERED, measures={"x": "much"}),
-    ],
-)
-def test_what_cannot_be_used_names_the_law(decides):
-    stepping = Stepping(given(Odd(lambda _: decides)))
-    with pytest.raises(PluginError, match="`step` of the law Odd must give"):
-        stepping.step(stepping.view())
+    ):
+        stepping = Stepping(given(Odd(lambda _: decides)))
+        with pytest.raises(PluginError, match="`step` of the law Odd must give"):
+            stepping.step(stepping.view())
 
 
-@pytest.mark.parametrize(
-    ("law", "message"),
-    [
+def test_a_law_that_cannot_begin_is_named():
+    for law, message in (
         (Beginning(lambda robot: 1.0 / robot.number), "the law Beginning failed: ZeroDivisionError"),
         (Beginning(lambda _: 0.0), "`begin` of the law Beginning must give a tuple of numbers for each variable"),
         (Beginning(lambda _: (0.0,) * 65), "the law Beginning says 65 numbers; a pose carries 64"),
         (saying(("count",)), "SAYS of the law Saying must name a Said for each variable"),
         (saying({"count": Said(metre=0.0)}), r"the law Saying: the metre of count is 0\.0, not a positive number"),
-    ],
-)
-def test_a_law_that_cannot_begin_is_named(law, message):
-    with pytest.raises(PluginError, match=message):
-        Stepping(given(law))
+    ):
+        with pytest.raises(PluginError, match=message):
+            Stepping(given(law))
 
 
 def test_velocity_that_is_not_finite_holds_and_lands():

@@ -47,19 +47,16 @@ def test_goal_is_shifted_along_the_force():
         assert shifted == pytest.approx((-0.02 * share, 0.0, 1.0), abs=2e-7)
 
 
-@pytest.mark.parametrize(
-    ("goal", "aside"),
-    [
+def test_goal_behind_a_thing_pulls_aside():
+    for goal, aside in (
         ((0.5, 0.0), -0.05),  # straight ahead: to the right, by a tenth of the pull
         ((0.5, 0.02), -0.05),  # nearly so
         ((0.5, 0.03), 0.05),  # to the left is nearer
         ((0.5, -0.2), -0.05),
         ((-0.5, 0.1), 0.0),  # away from the thing
-    ],
-)
-def test_goal_behind_a_thing_pulls_aside(goal, aside):
-    x, y, _ = QUICK.deviate((*goal, 1.0), HERE, near((0.2, 0.0)), 0.01)
-    assert (x, y) == pytest.approx((goal[0] - 0.02, goal[1] + aside), abs=1e-12)
+    ):
+        x, y, _ = QUICK.deviate((*goal, 1.0), HERE, near((0.2, 0.0)), 0.01)
+        assert (x, y) == pytest.approx((goal[0] - 0.02, goal[1] + aside), abs=1e-12)
 
 
 @pytest.mark.parametrize("kind", [KHEPERA4, TURTLEBOT3, CRAZYFLIE, TELLO])

@@ -37,10 +37,6 @@ def places(planner, times, anchor=ORIGIN, heading=0.0):
     return [planner.target(t, anchor, heading)[:3] for t in times]
 
 
-def test_every_registered_planner_is_tried():
-    assert {plan["kind"] for plan in PLANS} == set(registry.names(registry.PLANNERS))
-
-
 @pytest.mark.parametrize("plan", PLANS, ids=str)
 @FEW
 @given(anchor=ANCHOR, heading=HEADING, begin=st.floats(0, 60))
@@ -102,7 +98,8 @@ def test_circle_and_lemniscate_leave_along_the_heading(radius, side):
 
 
 @pytest.mark.parametrize("radius", [None, 0.0, nan, inf])
-def test_parameters_are_checked(radius):
+def test_every_planner_is_tried_and_checks_parameters(radius):
+    assert {plan["kind"] for plan in PLANS} == set(registry.names(registry.PLANNERS))
     wrong = {"kind": "line", "move_by": [1.0], "speed": 1.0}
     with pytest.raises(msgspec.ValidationError):
         built(wrong if radius is None else {"kind": "circle", "radius": radius, "period_s": 1.0})

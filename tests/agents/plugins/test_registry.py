@@ -73,20 +73,17 @@ def test_choice_is_built_and_left_alone(monkeypatch):
     assert registry.build(TRIGGERS, "periodic").period_s == 0.02
 
 
-@pytest.mark.parametrize(
-    ("choice", "message"),
-    [
+def test_bad_choice_keeps_its_path(foreign):
+    for choice, message in (
         ({}, "required field `kind`"),
         ({"kind": 3}, r"at `\$\.kind`"),
         ({"kind": "pulse", "width": "wide"}, r"Expected `float`, got `str` - at `\$\.width`"),
         ({"kind": "pulse", "width": -1.0}, "width must be positive"),
         ({"kind": "pulse", "width": 1.0, "nonsense": 1}, "unknown field `nonsense`"),
         ("pulse", "missing required field `width`"),
-    ],
-)
-def test_bad_choice_keeps_its_path(foreign, choice, message):
-    with pytest.raises(msgspec.ValidationError, match=message):
-        registry.build(foreign, choice)
+    ):
+        with pytest.raises(msgspec.ValidationError, match=message):
+            registry.build(foreign, choice)
 
 
 def test_unknown_name_gets_the_nearest():

@@ -198,9 +198,8 @@ def test_poses_of_neighbours():
 WANTS_NOTHING = {"ordered": True, "unguided": True, "not_finite": True}
 
 
-@pytest.mark.parametrize(
-    ("given", "causes", "words"),
-    [
+def test_causes_of_orders_and_of_the_process():
+    for given, causes, words in (
         ({"ordered": True}, {Cause.ORDERED}, "by an operator"),
         (WANTS_NOTHING, {Cause.ORDERED, Cause.SETPOINT, Cause.CENTRE}, None),
         ({**WANTS_NOTHING, "cruising": False}, {Cause.ORDERED, Cause.CENTRE}, None),
@@ -209,14 +208,12 @@ WANTS_NOTHING = {"ordered": True, "unguided": True, "not_finite": True}
         ({"missed_share": 0.95}, {Cause.LATE}, "95% of the last second's"),
         ({"aside": True, "landing": True, "cruising": False}, {Cause.BELOW}, None),
         ({"aside": True, "landing": False, "cruising": False}, set(), None),
-    ],
-)
-def test_causes_of_orders_and_of_the_process(given, causes, words):
-    robot = Watched()
-    for name, value in given.items():
-        setattr(robot.health if hasattr(robot.health, name) else robot.status, name, value)
-    assert robot.step().found == causes
-    assert words is None or robot.words(*causes) == words
+    ):
+        robot = Watched()
+        for name, value in given.items():
+            setattr(robot.health if hasattr(robot.health, name) else robot.status, name, value)
+        assert robot.step().found == causes
+        assert words is None or robot.words(*causes) == words
 
 
 def test_unstarted_drone_lands():
@@ -325,19 +322,15 @@ def lands(**measured):
     return robot
 
 
-@pytest.mark.parametrize(
-    ("measured", "seconds"),
-    [
+def test_landing_that_does_no_good_is_cut():
+    for measured, seconds in (
         ({"position": (0.0, 0.0, 0.02)}, 2.0),
         ({"velocity": (0.0, 0.0, 0.5)}, 2.5),
         ({"position": (0.0, 0.0, NAN), "flags": {"invalid": True}}, 2.5 / LOWEST_DESCENT_M_S),  # of its room
-    ],
-    ids=["on the floor", "climbs", "blind"],
-)
-def test_landing_that_does_no_good_is_cut(measured, seconds):
-    robot = lands(**measured).step(seconds + 1.9)
-    assert robot.acts == []
-    assert robot.step(0.2).acts == ["cut: its landing takes too long: more than 2 s without a descent"]
+    ):
+        robot = lands(**measured).step(seconds + 1.9)
+        assert robot.acts == []
+        assert robot.step(0.2).acts == ["cut: its landing takes too long: more than 2 s without a descent"]
 
 
 def test_hovering_or_slow_drone_is_never_cut():
@@ -354,15 +347,12 @@ def test_hovering_or_slow_drone_is_never_cut():
 NO_ROTATIONS = ((1.0, 0.7, 0.0, 0.0), (10.0, 0.8, 0.0, 0.0), (1e200,) * 4, (0.0,) * 4, (NAN,) * 4)
 
 
-@pytest.mark.parametrize(
-    ("attitude", "angle"),
-    [
+def test_tilt_is_an_angle_to_the_vertical():
+    for attitude, angle in (
         (leant(0.5), 0.5),
         ((math.cos(0.6), 0.0, 0.0, math.sin(0.6)), 0.0),  # turned
         ((0.0, 1.0, 0.0, 0.0), math.pi),
         *((no_rotation, None) for no_rotation in NO_ROTATIONS),
-    ],
-)
-def test_tilt_is_an_angle_to_the_vertical(attitude, angle):
-    assert tilted(attitude, 0.49) == (angle is not None and angle > 0.49)
-    assert angle is None or tilt_angle(attitude) == pytest.approx(angle)
+    ):
+        assert tilted(attitude, 0.49) == (angle is not None and angle > 0.49)
+        assert angle is None or tilt_angle(attitude) == pytest.approx(angle)

@@ -75,9 +75,8 @@ def test_outcomes_of_a_lasting_cause(cause):
     assert [each.outcome.name for each in bench.acts] == [last][: last in ("LAND", "CUT")]
 
 
-@pytest.mark.parametrize(
-    ("kind", "chosen", "cause", "changes"),
-    [
+def test_choices_of_kind_and_experiment():
+    for kind, chosen, cause, changes in (
         (KHEPERA4, {}, Cause.POSITION, [(0, "HOLD")]),
         (KHEPERA4, {}, Cause.UNRESPONSIVE, [(0, "WARN"), (200, "LAND")]),
         (KHEPERA4, {"hold_s": 10.0}, Cause.UNRESPONSIVE, [(0, "WARN")]),  # its world may pause
@@ -90,10 +89,8 @@ def test_outcomes_of_a_lasting_cause(cause):
         (CRAZYFLIE, {"lost_conductor": "land"}, Cause.CONDUCTOR, [(200, "LAND")]),
         (CRAZYFLIE, {"offline_s": 3.0, "neighbour_timeout_s": 0.5}, Cause.ROUTER, [(50, "HOLD"), (300, "LAND")]),
         (CRAZYFLIE, {"landing_s": 5.0}, Cause.LANDING, [(500, "CUT")]),
-    ],
-)
-def test_choices_of_kind_and_experiment(kind, chosen, cause, changes):
-    assert Bench(kind, **chosen).see(12.0, cause).changes == changes
+    ):
+        assert Bench(kind, **chosen).see(12.0, cause).changes == changes
 
 
 @pytest.mark.parametrize("cause", [cause for cause in Cause if EXPECTED[cause][0][1] == "HOLD"])
@@ -120,21 +117,18 @@ def test_hazard_of_a_robot_that_ends():
         assert bench.hazards.worst() == ""
 
 
-@pytest.mark.parametrize(
-    ("cause", "present_s", "absent_s", "changes"),
-    [
+def test_cause_that_comes_and_goes():
+    for cause, present_s, absent_s, changes in (
         (Cause.SEPARATION, 0.05, 0.3, [(0, "HOLD")]),  # reported once
         (Cause.SETPOINT, 0.02, 0.08, [(0, "HOLD"), (50, "LAND")]),
         (Cause.POSITION, 0.02, 0.08, [(0, "HOLD")]),
         (Cause.TILT, 0.05, 0.02, []),
-    ],
-)
-def test_cause_that_comes_and_goes(cause, present_s, absent_s, changes):
-    bench = Bench()
-    for _ in range(20):
-        assert bench.see(present_s, cause).hazards.under_way
-        assert bench.see(absent_s).hazards.under_way == bool(changes)
-    assert bench.changes == changes
+    ):
+        bench = Bench()
+        for _ in range(20):
+            assert bench.see(present_s, cause).hazards.under_way
+            assert bench.see(absent_s).hazards.under_way == bool(changes)
+        assert bench.changes == changes
 
 
 def test_worst_hazard_is_shown_and_acted_on():

@@ -64,24 +64,17 @@ def test_robot_that_does_not_move(kind):
 
 
 @wheels
-@pytest.mark.parametrize(
-    ("seconds", "given", "found"),
-    [
+def test_wheels_that_ignore_or_need_no_commands(kind):
+    for seconds, given, found in (
         (8.0, {"told": 0.05}, (True, False)),  # it crawls
         (4.0, {"told_turn": 1.5}, (True, False)),
         (4.0, {"told_turn": 1.5, "turn": 1.5}, FINE),
         (5.0, {"speed": 0.1}, (False, True)),  # as a Khepera that has lost its link
         (4.0, {"turn": 1.0}, (False, True)),
         (4.0, {"turn": 1.0, "told_turn": 1.0}, FINE),
-    ],
-)
-def test_wheels_that_ignore_or_need_no_commands(kind, seconds, given, found):
-    assert Told(kind).go(seconds, **given) == found
-
-
-@wheels
-def test_small_turns_and_coarse_positions_are_no_disobedience(kind):
-    turning, coarse = Told(kind), Told(kind)
+    ):
+        assert Told(kind).go(seconds, **given) == found
+    turning, coarse = Told(kind), Told(kind)  # small turns and coarse positions are no disobedience
     for turn in (1.5, -1.5) * 40:
         assert turning.go(0.1, told_turn=turn) == FINE
     for _ in range(20):

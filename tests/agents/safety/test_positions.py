@@ -12,9 +12,9 @@ FAR = JUMP_M + PLAUSIBLE_SPEED * CRAZYFLIE.speed * 0.3  # [m] within a gap of 0.
 FLIPPED = FLIP + PLAUSIBLE_SPEED * KHEPERA4.turn_rate * 0.02  # [rad] within 0.02 s
 
 
-@pytest.mark.parametrize(
-    ("kind", "samples", "jump"),
-    [
+def test_jump_is_farther_than_a_robot_can_move():
+    """A robot in motion at x [m] at several times [s], and its last jump."""
+    for kind, samples, jump in (
         (CRAZYFLIE, [(0.0, 0.0), (0.01, 0.99 * JUMP_M)], nan),
         (CRAZYFLIE, [(0.0, 0.0), (0.01, 1.0), (9.0, 1.0)], 1.0),  # time does not heal it
         (CRAZYFLIE, [(0.0, 0.0), (0.01, 1.0), (0.02, 0.0)], nan),
@@ -22,15 +22,12 @@ FLIPPED = FLIP + PLAUSIBLE_SPEED * KHEPERA4.turn_rate * 0.02  # [rad] within 0.0
         (CRAZYFLIE, [(0.0, 0.0), (0.3, FAR - 0.01)], nan),
         (KHEPERA4, [(0.0, 0.0), (0.3, FAR - 0.01)], FAR - 0.01),
         (CRAZYFLIE, [(0.0, 0.0), (9.0, 5.0)], 5.0),
-    ],
-)
-def test_jump_is_farther_than_a_robot_can_move(kind, samples, jump):
-    """A robot in motion at x [m] at several times [s], and its last jump."""
-    continuity = Continuity(kind)
-    for t, x in samples:
-        found = continuity.jump(t, (x, 0.0, 0.0), 0.0, True)
-        assert continuity.jumped == (isfinite(found) or isnan(x))  # an unknown position ends no jump
-    assert found == pytest.approx(jump, nan_ok=True)
+    ):
+        continuity = Continuity(kind)
+        for t, x in samples:
+            found = continuity.jump(t, (x, 0.0, 0.0), 0.0, True)
+            assert continuity.jumped == (isfinite(found) or isnan(x))  # an unknown position ends no jump
+        assert found == pytest.approx(jump, nan_ok=True)
 
 
 def test_robot_at_rest_or_forgotten_may_be_carried():
@@ -47,9 +44,9 @@ def test_robot_at_rest_or_forgotten_may_be_carried():
         assert continuity.jump(0.04, here, 0.0, True) == pytest.approx(sqrt(3.0))
 
 
-@pytest.mark.parametrize(
-    ("kind", "watched", "samples", "jump"),
-    [
+def test_wheels_whose_yaw_jumps_have_jumped():
+    """Yaws [rad] at several times [s], and the last jump."""
+    for kind, watched, samples, jump in (
         (KHEPERA4, True, [(0.0, 0.0), (0.02, FLIPPED - 0.001)], nan),
         (KHEPERA4, True, [(0.0, 0.0), (0.02, FLIPPED + 0.001)], FLIPPED + 0.001),
         (KHEPERA4, True, [(0.0, 3.1), (0.02, -3.1)], nan),
@@ -59,15 +56,12 @@ def test_robot_at_rest_or_forgotten_may_be_carried():
         (KHEPERA4, True, [(0.0, nan), (0.02, inf), (0.04, 1.2)], nan),
         (CRAZYFLIE, True, [(0.0, 0.0), (0.02, 1.2)], nan),
         (KHEPERA4, False, [(0.0, 0.0), (0.02, 1.2)], nan),
-    ],
-)
-def test_wheels_whose_yaw_jumps_have_jumped(kind, watched, samples, jump):
-    """Yaws [rad] at several times [s], and the last jump."""
-    continuity = Continuity(kind)
-    for t, yaw in samples:
-        found = continuity.jump(t, (0.0, 0.0, 0.0), yaw, watched)
-    assert isnan(found) == isnan(continuity.yaw_jump)
-    assert continuity.yaw_jump == pytest.approx(jump, nan_ok=True)
+    ):
+        continuity = Continuity(kind)
+        for t, yaw in samples:
+            found = continuity.jump(t, (0.0, 0.0, 0.0), yaw, watched)
+        assert isnan(found) == isnan(continuity.yaw_jump)
+        assert continuity.yaw_jump == pytest.approx(jump, nan_ok=True)
 
 
 def believed(external, places, dt=0.01, begin=0.0):
@@ -76,9 +70,8 @@ def believed(external, places, dt=0.01, begin=0.0):
     return [external.believes(begin + dt * k, (x, 0.0, 1.0), watched=watched) for k, (x, watched) in enumerate(pairs)]
 
 
-@pytest.mark.parametrize(
-    ("dt", "places", "expected"),
-    [
+def test_external_position_jumps_by_more_than_a_robot():
+    for dt, places, expected in (
         (0.01, [0.0, 0.12, 0.0, 0.15, 0.0], [True, True, True, False, True]),
         (0.01, [0.0, *[0.3] * 200, 0.12, 0.2], [True, *[False] * 200, True, True]),
         (0.01, [0.0, 0.3, nan, 0.0], [True, False, False, True]),
@@ -86,11 +79,8 @@ def believed(external, places, dt=0.01, begin=0.0):
         (0.3, [0.0, 0.4], [True, True]),  # a gap in the measurements
         (0.3, [0.0, 0.6], [True, False]),
         (0.01, [(0.0, False), (0.5, False), (0.5, True), (0.0, True)], [True, True, True, False]),
-    ],
-    ids=["to and fro", "stays", "lost", "fast", "gap", "far", "take-off"],
-)
-def test_external_position_jumps_by_more_than_a_robot(dt, places, expected):
-    assert believed(ExternalPositions(CRAZYFLIE), places, dt) == expected
+    ):
+        assert believed(ExternalPositions(CRAZYFLIE), places, dt) == expected
 
 
 def test_doubted_position_is_forgotten_or_stays_wrong():

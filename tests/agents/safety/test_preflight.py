@@ -74,9 +74,8 @@ def test_reason_why_a_drone_is_not_ready(what):
     assert robot.check() == "no connection to a router"
 
 
-@pytest.mark.parametrize(
-    ("given", "values", "reason"),
-    [
+def test_kind_start_and_separation_decide():
+    for given, values, reason in (
         ({"kind": KHEPERA4}, {"velocity": (0.5, 0.0, 0.0), "position": (*START, 0.7)}, ""),  # as on a table
         ({"start_within": math.inf, "other": START}, {"position": (1.0, 1.0, 0.0)}, ""),
         ({"start_within": math.inf, "other": (-0.1, 0.2)}, {"position": (-0.1, 0.2, 0.0)}, SWAPPED),
@@ -84,10 +83,8 @@ def test_reason_why_a_drone_is_not_ready(what):
         ({"other": (0.22, 0.2)}, {"position": (0.22, 0.2, 0.0)}, ""),  # two that start in one another are none
         ({"kind": KHEPERA4, "other": (0.3, 0.3), "separation": 0.3}, {}, "it is 0.22 m from G, nearer than 0.3 m"),
         ({"kind": KHEPERA4, "other": (0.3, 0.3), "separation": 0.2}, {}, ""),
-    ],
-)
-def test_kind_start_and_separation_decide(given, values, reason):
-    assert Standing(**given).check(**values) == reason
+    ):
+        assert Standing(**given).check(**values) == reason
 
 
 def test_failure_that_lasts_ends_readiness():

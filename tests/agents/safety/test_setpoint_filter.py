@@ -153,9 +153,8 @@ def test_sound_pose_clears_what_was_judged_before():
         assert (now.outside_wall, now.outside, now.flyaway, now.excess) == (False, False, False, 0.0)
 
 
-@pytest.mark.parametrize(
-    ("age", "setpoint", "avoids", "safe", "avoided"),
-    [
+def test_avoidance_is_held_to_the_limits():
+    for age, setpoint, avoids, safe, avoided in (
         (0.0, AHEAD, SLOW, SLOW, True),
         (0.0, AHEAD, (0.0, 9.0, 0.0, 0.0), (0.0, 0.5, 0.0, 0.0), True),
         (0.0, AHEAD, AHEAD, AHEAD, False),
@@ -163,10 +162,8 @@ def test_sound_pose_clears_what_was_judged_before():
         (0.5, AHEAD, SLOW, SLOW, True),
         *((age, AHEAD, SLOW, STOP, False) for age in (0.51, inf, nan)),  # without a pose
         (0.0, (nan, 0.0, 0.0, 0.0), SLOW, STOP, False),
-    ],
-)
-def test_avoidance_is_held_to_the_limits(age, setpoint, avoids, safe, avoided):
-    made, now = filtered(TELLO, (0.0, 0.0, 1.0), age=age)
-    assert made.check(setpoint, now, SimpleNamespace(restrain=lambda *_: avoids), None, None) == safe
-    assert (made.avoided, made.not_finite) == (avoided, isnan(setpoint[0]))
-    assert made.changed == (avoided or made.not_finite)
+    ):
+        made, now = filtered(TELLO, (0.0, 0.0, 1.0), age=age)
+        assert made.check(setpoint, now, SimpleNamespace(restrain=lambda *_, avoids=avoids: avoids), None, None) == safe
+        assert (made.avoided, made.not_finite) == (avoided, isnan(setpoint[0]))
+        assert made.changed == (avoided or made.not_finite)
