@@ -112,7 +112,7 @@ def test_what_cannot_be_used_names_the_law():
         Control(memory=REMEMBERED, velocity=(0.0, 0.0, nan), goal=(0.0, 0.0, nan)),
         Control(memory=REMEMBERED, measures={"x": "much"}),
     ):
-        stepping = Stepping(given(Odd(lambda _: decides)))
+        stepping = Stepping(given(Odd(lambda _, decides=decides: decides)))
         with pytest.raises(PluginError, match="`step` of the law Odd must give"):
             stepping.step(stepping.view())
 
