@@ -1,6 +1,5 @@
 """A laboratory as an intruder finds it: a router that knows who may do what, robots in flight, and certificates."""
 
-import shutil
 import threading
 import time
 from contextlib import ExitStack
@@ -9,22 +8,33 @@ import msgspec
 import pytest
 import zenoh
 
-from agents.network import lab
+from agents.network import lab, messages
 from agents.network.endpoints import free_endpoint
 from agents.network.zenoh_config import config, settings
 from experiments.definition import access_rights
 from experiments.file.document import load
 from experiments.real_time.hosts import authority
 from tests.commands import ROOT
-from tests.system.lab import RobotProcess, Started, Watcher
+from tests.system.lab import TRIANGLE, RobotProcess, Started, Watcher
 
 FILE = ROOT / "tests" / "system" / "secured.toml"
-FLOWN = ("KH01", "KH02", "CF01")
+
+
+def forged(robot):
+    """A pose that every check would believe."""
+    return messages.encode(messages.pose(robot, 10**9, time.time(), [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], yaw=0.0))
 
 
 def refused():
     """Reaction of a router to a session that it does not let in."""
     return pytest.raises(zenoh.ZError, match="Unable to connect")
+
+
+def new_lab(folder, *robots, **options):
+    """A lab of all services and these robots, or those of the triangle."""
+    members = {**{role: role for role in authority.SERVICES}, **dict.fromkeys(robots or TRIANGLE, "robot")}
+    authority.create(folder, members, **options)
+    return folder
 
 
 class Laboratory:
@@ -33,8 +43,7 @@ class Laboratory:
     def __init__(self, folder, protocol="tls", *, linked=False):
         self.folder = folder / "lab"
         cases = load(FILE).cases()
-        robots = dict.fromkeys(next(iter(cases.values())).names, "robot")
-        authority.create(self.folder, {**{role: role for role in authority.SERVICES}, **robots})
+        new_lab(self.folder, *next(iter(cases.values())).names)
         self.rights = folder / "rights.json"
         rights = msgspec.structs.replace(access_rights.rights(cases.values()), linked=linked)
         self.rights.write_bytes(msgspec.json.encode(rights))
@@ -52,18 +61,18 @@ class Laboratory:
 
     def fly(self):
         """Starts the robots and brings them to where they run."""
-        for name in FLOWN:
+        for name in TRIANGLE:
             self._stack.enter_context(RobotProcess(self.endpoint, FILE, name))
         self.watcher = self._stack.enter_context(Watcher(self.endpoint))
-        self.watcher.take_off(*FLOWN)
-        self.watcher.start(*FLOWN)
+        self.watcher.take_off(*TRIANGLE)
+        self.watcher.start(*TRIANGLE)
 
     def statuses(self):
         """Fresh ones, of every robot."""
         since = time.time()
         watcher = self.watcher
-        watcher.until(lambda: all(watcher.status[name].stamp > since for name in FLOWN), "fresh statuses", 5.0)
-        self.last = {name: watcher.status[name] for name in FLOWN}
+        watcher.until(lambda: all(watcher.status[name].stamp > since for name in TRIANGLE), "fresh statuses", 5.0)
+        self.last = {name: watcher.status[name] for name in TRIANGLE}
         return self.last
 
     def session(self, identity, folder=None):
@@ -76,18 +85,6 @@ class Laboratory:
 
     def __exit__(self, *_):
         self._stack.close()
-
-
-def elsewhere(folder, days=90.0):
-    """Another lab with the same names, whose authority nobody here knows."""
-    authority.create(folder, {**{role: role for role in authority.SERVICES}, "KH01": "robot"}, days=days)
-    return folder
-
-
-def copy(folder, target):
-    """What a thief has of a lab."""
-    shutil.copytree(folder, target)
-    return target
 
 
 def steady(rate_hz, seconds):

@@ -8,10 +8,7 @@ import numpy as np
 import pytest
 
 from agents.network import messages, pubsub
-from agents.network import session as network
 from agents.network.keys import Keys
-from experiments.file.document import load
-from experiments.real_time.hosts import authority
 from experiments.recording import playback
 from experiments.run import reopen
 from tests.commands import python
@@ -144,40 +141,3 @@ def test_by_hand_and_what_nobody_should_believe(router, watcher, tmp_path):
         for robot in robots:
             robot.process.terminate()
         assert [robot.wait() for robot in robots] == [0, 0, 0]
-
-
-@pytest.mark.timeout(120)
-def test_lab_lets_only_the_centre_decide(tmp_path):
-    """The centre's certificate is its right: a robot's gives none over others; a restarted router enforces it again."""
-    file, folder = tmp_path / "three.toml", tmp_path / "run"
-    file.write_text(FAST.format(duration=8.0, architecture=HYBRID) + '[network]\nlab = "lab"\n')
-    robots = dict.fromkeys(load(file).experiment.robots, "robot")
-    authority.create(tmp_path / "lab", {**{role: role for role in authority.SERVICES}, **robots})
-    (tmp_path / "lab" / "ca.key").unlink()  # no run needs it
-    flight = Flight(folder, file, "--json")
-    flight.until_said(r"phase conductor: TB01 under way")
-    with Watcher(flight.endpoint()) as watcher:
-        watcher.until(lambda: {"TB01", "KH01", "KH02"} <= {*watcher.state}, "telemetry")
-        goal, own = (pubsub.subscriber(watcher.session, key) for key in (KEYS.goal("KH01"), KEYS.ranges("KH02")))
-        flight.children()["router"].kill()
-        flight.until_said(r"router conductor: the router ended \(killed by SIGKILL\); started again")
-        again, state = time.time(), watcher.state
-        watcher.until(lambda: state["KH01"].goal_receipts and state["KH01"].stamp > again, "it is guided again")
-        with network.open_session([flight.endpoint()], name="KH02") as session:
-            before = watcher.status["KH01"].malformed
-
-            def arrives():
-                session.put(KEYS.goal("KH01"), b"of another robot", encoding=messages.JSON)
-                session.put(KEYS.ranges("KH02"), b"its own", encoding=messages.JSON)
-                return any(network.received(own.handler))
-
-            watcher.until(arrives, "what it says on its own key is heard")
-        watcher.until(lambda: watcher.state["TB01"].position[0] < -0.7, "the leader goes on")
-        heard = [sample.payload.to_bytes() for sample in network.received(goal.handler)]
-        assert b"of another robot" not in heard
-        assert max(messages.decode(each, messages.JSON, messages.Goal).stamp for each in heard) > again
-        assert watcher.status["KH01"].malformed == before
-    code, out = flight.finish()
-    assert code == 0
-    assert json.loads(out)["cases"]["default"]["guidance"]["goals"] > 60
-    assert set(reopen(folder).metrics["default"].guidance.guided) == {"TB01", "KH01"}

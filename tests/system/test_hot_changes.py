@@ -1,5 +1,6 @@
-"""Robots that hold, are removed, restarted, replaced and added while the others fly on."""
+"""Robots that are adopted, hold, are removed, restarted, replaced and added while the others fly on."""
 
+import json
 import os
 import re
 import signal
@@ -13,9 +14,10 @@ from experiments.recording import playback
 from experiments.report import report
 from experiments.run import reopen
 from tests.commands import zenpark
-from tests.system.lab import TRIANGLE, Flight, RobotProcess, Watcher
+from tests.system.lab import PATIENCE_S, TRIANGLE, Flight, RobotProcess, Watcher
 
 pytestmark = pytest.mark.system
+
 
 SPARES = """
 [robots.KH03]
@@ -160,27 +162,6 @@ def test_a_spare_takes_over_a_name(hot_lab):
     assert re.search("no router answers|this run is not there", orphan.stderr)  # its port may be somebody else's by now
 
 
-def test_robots_of_one_process_come_together(hot_lab):
-    text = hot_lab.file.read_text()
-    for name in ("KH01", "KH02"):
-        text = text.replace(f"[robots.{name}]", f'[robots.{name}]\nprocess = "pair"', 1)
-    hot_lab.file.write_text(text)
-    watcher = hot_lab.fly()
-    pid = watcher.status["KH01"].pid
-    assert pid == watcher.status["KH02"].pid
-    assert set(hot_lab.change("remove", "KH01").done) == {"KH01"}
-    watcher.until(lambda: "KH01" not in watcher.alive, "it has left")
-    watcher.until(lambda: "KH01" in watcher.status["CF01"].missing, "its neighbours know")
-    assert hot_lab.running("KH02", "CF01")
-    reply = hot_lab.change("add", "KH01")
-    assert "`./zenpark robot restart KH01 KH02`" in reply.refused["KH01"], reply
-    assert "shares its process" in hot_lab.change("replace", "KH02", body="twin").refused["KH02"]
-    assert set(hot_lab.change("restart", "KH01", "KH02").done) == {"KH01", "KH02"}
-    watcher.until(lambda: watcher.status["KH01"].pid != pid and hot_lab.running("KH01", "KH02"), "both run")
-    assert watcher.status["KH01"].pid == watcher.status["KH02"].pid
-    hot_lab.end()
-
-
 def test_hand_started_robot_leaves_and_is_readmitted(router, hot_lab):
     hot_lab.file.write_text(hot_lab.file.read_text() + f'\n[network]\nconnect = ["{router.endpoint}"]\n')
     with RobotProcess(router.endpoint, hot_lab.file, "CF01", "--case", "event") as by_hand:
@@ -193,3 +174,54 @@ def test_hand_started_robot_leaves_and_is_readmitted(router, hot_lab):
         assert set(hot_lab.change("add", "CF01").done) == {"CF01"}
         watcher.until_all("running", "CF01")
         hot_lab.end()
+
+
+SHORT = ("--case", "event", "--json", "duration_s=2")
+
+
+def file_with_board(folder, endpoint):
+    file = folder / "x.toml"
+    text = catalogue.path("triangle").read_text("utf-8")
+    text += f'\n[network]\nconnect = ["{endpoint}"]\n[hosts.board]\nrobots = ["KH02"]\n'
+    file.write_text(text)
+    return str(file)
+
+
+def test_present_robot_is_adopted_unless_it_has_flown(router, watcher, tmp_path):
+    file = file_with_board(tmp_path, router.endpoint)
+    with (
+        RobotProcess(router.endpoint, "join", "KH02", "--once") as at_boot,
+        RobotProcess(router.endpoint, "triangle", "CF01", "--case", "event") as by_hand,
+    ):
+        watcher.until(lambda: "CF01" in watcher.alive, "it is there")
+        flight = Flight(tmp_path / "run", file, *SHORT)
+        flight.until_said("adopted CF01: is there already, idle")
+        flight.until_said("adopted KH02: is ")
+        watcher.until_all("running", "KH02")
+        assert at_boot.wait() == 0, "with --once it ends when it is down, so that its service starts it anew"
+        watcher.until(lambda: watcher.status["KH02"].reason == "finished", "it knew what --set had changed")
+        watcher.give(messages.Order("land"), "CF01")  # its own file has twenty seconds
+        code, out = flight.finish()
+        assert code == 0
+        assert by_hand.process.poll() is None
+        logs = sorted(file.stem for file in (tmp_path / "run" / "logs").glob("event-*"))
+        assert logs == ["event-KH01", "event-recorder"]
+        assert set(json.loads(out)["cases"]["event"]["robots"]) == {"KH01", "KH02", "CF01"}
+        assert playback.read(tmp_path / "run" / "event.mcap").complete
+
+        again = Flight(tmp_path / "again", file, *SHORT)
+        again.until_said("CF01: on the network already, and done; a robot that was started by hand flies once")
+        assert again.finish()[0] == 2
+        assert by_hand.end() == 0
+
+
+def test_who_joined_lands_when_the_conductor_is_dead(router, watcher, tmp_path):
+    with RobotProcess(router.endpoint, "join", "KH02", "--once") as joined:
+        flight = Flight(tmp_path / "run", file_with_board(tmp_path, router.endpoint), "--case", "event")
+        watcher.until_all("running", "KH02")
+        flight.signal(signal.SIGKILL)
+        flight.finish()
+        assert joined.wait(PATIENCE_S) == 0
+        watcher.look()
+        assert (watcher.phase("KH02"), watcher.status["KH02"].reason) == ("done", "asked to end")
+        watcher.until(lambda: not watcher.alive, "so do the others")

@@ -4,8 +4,8 @@ import json
 import os
 import socket
 import threading
-import time
 from dataclasses import dataclass
+from shutil import copytree
 
 import pytest
 import zenoh
@@ -17,7 +17,7 @@ from agents.network.keys import Keys
 from agents.network.zenoh_config import config, settings
 from experiments.real_time.conductor import orders
 from experiments.real_time.hosts import authority
-from tests.system.secured import FLOWN, Laboratory, copy, elsewhere, refused, steady
+from tests.system.secured import TRIANGLE, Laboratory, forged, new_lab, refused, steady
 
 pytestmark = pytest.mark.system
 
@@ -46,7 +46,7 @@ def flight(laboratory):
     made = Flight(laboratory.last or laboratory.statuses())
     yield made
     after = laboratory.statuses()
-    for name in FLOWN:
+    for name in TRIANGLE:
         assert after[name].phase == "running"
         assert after[name].pid == made.before[name].pid
         assert not after[name].missing
@@ -61,13 +61,8 @@ def say(session, key, payload):
     session.put(key, payload, encoding=messages.JSON)
 
 
-def forged(robot):
-    """A pose that every check would believe."""
-    return messages.encode(messages.pose(robot, 10**9, time.time(), [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], yaw=0.0))
-
-
 def settled(laboratory, seconds=0.5):
-    """Time for what was said to arrive, if it does."""
+    """Time for messages to arrive."""
     threading.Event().wait(seconds)
     laboratory.watcher.look()
 
@@ -86,32 +81,31 @@ def test_without_a_certificate_nobody_gets_in(laboratory, protocol):
         zenoh.open(chosen)
 
 
-def other_authority(folder, target):
-    return elsewhere(target)
+def other_authority(_folder, target):
+    new_lab(target)
 
 
 def ended(folder, target):
-    authority.renew(copy(folder, target), ["operator", "KH01", "router"], days=-0.01)
-    return target
+    authority.renew(copytree(folder, target), ["operator", "KH01", "router"], days=-0.01)
 
 
 def same_name(folder, target):
-    authority.renew(copy(folder, target), authority=True)
-    return target
+    authority.renew(copytree(folder, target), authority=True)
 
 
 @pytest.mark.parametrize("forge", [other_authority, ended, same_name])
 @pytest.mark.parametrize("identity", ["operator", "KH01", "router"])
 def test_certificate_that_does_not_count_is_refused(laboratory, tmp_path, forge, identity):
-    forged = forge(laboratory.folder, tmp_path / "forged")
-    (forged / "ca.pem").write_bytes((laboratory.folder / "ca.pem").read_bytes())  # it does trust the router
+    folder = tmp_path / "forged"
+    forge(laboratory.folder, folder)
+    (folder / "ca.pem").write_bytes((laboratory.folder / "ca.pem").read_bytes())  # it does trust the router
     with refused():
-        laboratory.session(identity, forged)
+        laboratory.session(identity, folder)
 
 
 def test_a_robots_certificate_does_not_make_a_router(laboratory, tmp_path):
     """A stolen robot cannot pose as the router to the others."""
-    thief = copy(laboratory.folder, tmp_path / "thief")
+    thief = copytree(laboratory.folder, tmp_path / "thief")
     for part in ("key", "pem"):
         (thief / f"router.{part}").write_bytes((thief / f"KH03.{part}").read_bytes())
     plain = free_endpoint(preferred_port=0, protocol="tls")
@@ -142,7 +136,16 @@ def test_nobody_speaks_for_a_robot_or_stops_everybody(laboratory, who):
     heard = pubsub.subscriber(laboratory.watcher.session, "park/**", 20_000)
     with laboratory.session(who) as session:
         threading.Event().wait(0.1)
-        for key in ("park/KH01/pose", "park/*/pose", "park/**", "park/*/*", "**", "park/$*1/pose", "park/KH01/**"):
+        for key in (
+            "park/KH01/pose",
+            "park/KH01/goal",
+            "park/*/pose",
+            "park/**",
+            "park/*/*",
+            "**",
+            "park/$*1/pose",
+            "park/KH01/**",
+        ):
             say(session, key, forged("KH01"))
             session.delete(key)
         for key in (KEYS.estop, "park/*", "park/est$*", "*/estop"):
@@ -177,7 +180,7 @@ def test_queryable_wildcard_is_answered_by_all(laboratory, who, part):
     asked = {"payload": messages.encode(messages.Order("get", name="clamp")), "encoding": messages.JSON}
     with laboratory.session(who) as session:
         replies = list(session.get(f"park/*/{part}", timeout=5.0, **(asked if part == "order" else {})))
-        assert {str(reply.ok.key_expr) for reply in replies if reply.ok} == {f"park/{name}/{part}" for name in FLOWN}
+        assert {str(reply.ok.key_expr) for reply in replies if reply.ok} == {f"park/{name}/{part}" for name in TRIANGLE}
         assert not list(session.get("park/**", timeout=1.0))
 
 
@@ -250,7 +253,7 @@ def test_replayed_samples_are_not_believed_again(laboratory, flight):
         settled(laboratory)
     after = laboratory.statuses()
     for name in ("KH02", "CF01"):
-        said = sum(after[other].sent - flight.before[other].sent for other in FLOWN if other != name)
+        said = sum(after[other].sent - flight.before[other].sent for other in TRIANGLE if other != name)
         twice = after[name].received - flight.before[name].received - said
         assert twice < 120 < 20 * len(taken), "each once, give or take the age of a status"
 

@@ -2,6 +2,7 @@
 
 import threading
 from pathlib import Path
+from shutil import copytree
 
 import pytest
 import zenoh
@@ -11,8 +12,8 @@ from agents.network import session as network
 from agents.network.keys import Keys
 from experiments.real_time.hosts import authority
 from tests.commands import zenpark
-from tests.system.lab import Flight, Started, in_lab, until
-from tests.system.secured import FILE, Laboratory, copy, refused
+from tests.system.lab import Flight, in_lab, until
+from tests.system.secured import Laboratory, refused
 
 pytestmark = pytest.mark.system
 
@@ -42,33 +43,6 @@ def test_one_command_runs_while_others_watch_and_stop(tmp_path):
     assert flight.logs().count("done (emergency stop by operator: zenpark estop)") == 3
 
 
-def test_what_is_missing_is_said_before_anything_starts(tmp_path):
-    lab = tmp_path / "lab"
-    authority.create(lab, {"router": "router", "operator": "operator", "recorder": "recorder", "KH01": "robot"})
-    for arguments, said in (
-        (("run", "triangle", "--lab", lab, "--out", tmp_path / "a"), f"`./zenpark lab issue {lab} KH02 CF01`"),
-        (("run", "triangle", "--lab", tmp_path / "no", "--out", tmp_path / "b"), "zenpark lab init"),
-        (("router", "--listen", "tls/0.0.0.0:0"), "zenpark lab init LAB FILE"),
-        (("router", "--listen", "tcp/0.0.0.0:0"), "zenpark lab init LAB FILE"),
-        (("router", "--lab", lab), "name the experiment too"),
-        (("router", "triangle", "--lab", lab, "--listen", "tcp/127.0.0.1:0"), "write tls/127.0.0.1:0"),
-        (("agent", "triangle", "CF01", "--lab", lab), "CF01.pem is missing"),
-        (("echo", "park/**", "--lab", lab), "observer.pem is missing"),
-        (("lab", "init", lab, "triangle"), "is a lab already"),
-    ):
-        done = zenpark(*arguments, code=2)
-        assert said in done.stderr
-        assert "Traceback" not in done.stderr
-
-
-def test_lab_router_listens_on_every_interface(tmp_path):
-    authority.create(tmp_path / "lab", {"router": "router"})
-    everywhere = ("--listen", "tls/0.0.0.0:0", "--listen", "quic/[::]:0")
-    with Started("tools.guard", "router", str(FILE), "--lab", str(tmp_path / "lab"), *everywhere) as router:
-        assert router.process.stdout.readline().startswith("router ready on tls/0.0.0.0:0")
-        assert router.end() == 0
-
-
 @pytest.fixture(params=["tls", "quic"])
 def laboratory(tmp_path, request):
     with Laboratory(tmp_path, request.param) as made:
@@ -93,7 +67,7 @@ class Ear:
     "laboratory", [pytest.param("tls", marks=pytest.mark.mechanism("revocation")), "quic"], indirect=True
 )
 def test_revoked_key_is_refused_by_a_running_router(laboratory, tmp_path):
-    stolen = copy(laboratory.folder, tmp_path / "stolen")
+    stolen = copytree(laboratory.folder, tmp_path / "stolen")
     key = KEYS.pose("KH01")
     with laboratory.session("operator") as operator, laboratory.session("KH01", stolen) as thief:
         ear = Ear(operator, key)
@@ -111,7 +85,7 @@ def test_revoked_key_is_refused_by_a_running_router(laboratory, tmp_path):
 
 
 def test_a_new_authority_refuses_every_earlier_file(laboratory, tmp_path):
-    stolen = copy(laboratory.folder, tmp_path / "stolen")
+    stolen = copytree(laboratory.folder, tmp_path / "stolen")
     with laboratory.session("operator", stolen) as before:
         assert network.connected(before)
         authority.renew(laboratory.folder, authority=True)

@@ -1,21 +1,38 @@
-"""Robot processes started by hand: whom they hear, what they notice and survive, how they are stopped."""
+"""Robot processes started by hand: whom they hear, what they notice and survive, how they end, are watched."""
 
+import contextlib
 import json
 import math
 import os
+import signal
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
+from functools import partial
 
 import msgspec
+import psutil
 import pytest
 import zenoh
 
-from agents.network import messages
+from agents.clock import Clock
+from agents.network import messages, pubsub
+from agents.network import session as network
+from agents.network.keys import Keys
+from agents.network.shutdown import leave
 from experiments.file import catalogue, document
+from experiments.file.document import load
+from experiments.recording import playback
+from experiments.run import simulate
+from tests.commands import zenpark
+from tests.conftest import RouterProcess
 from tests.experiments.traces import parse_links
-from tests.system.lab import TRIANGLE, RobotProcess
+from tests.system.lab import TRIANGLE, Flight, RobotProcess, gone, typed, until
+from tests.tools.commands.test_live_table import STATUS
 
 pytestmark = pytest.mark.system
+
 
 BLOCK = zenoh.CongestionControl.BLOCK  # a stop must not be dropped where a hundred kilobytes go before it
 
@@ -236,14 +253,140 @@ def test_an_emergency_stop_reaches_every_process(router, watcher):
         assert all(robot.process.poll() is None for robot in robots)
 
 
-def test_user_errors_are_reported_without_a_traceback(router):
-    for arguments, words in (
-        (("triangle", "KH9"), "no robot 'KH9' in this experiment"),
-        (("trangle", "KH01"), "did you mean 'triangle'"),
-        (("triangle", "KH01", "--case", "evnt"), "no case 'evnt'"),
-    ):
-        robot = RobotProcess(router.endpoint, *arguments)
-        out, _ = robot.process.communicate(timeout=30)
-        assert robot.process.returncode == 2
-        assert words in out
-        assert "Traceback" not in out
+CUT_OFF_S = 3.0  # until the loss of the router is noticed: before that good-byes are still taken
+
+
+def test_robot_leaves_a_router_that_does_not_answer(router, watcher):
+    with RobotProcess(router.endpoint, "triangle", "KH01") as robot:
+        watcher.until_all("idle", "KH01")
+        with router.frozen():
+            threading.Event().wait(CUT_OFF_S)
+            began = time.monotonic()
+            assert robot.end() == 0
+            assert time.monotonic() - began < 10.0  # Zenoh alone takes 13 s
+
+
+def stopped(pid):
+    return bool(psutil.Process(pid).status() == psutil.STATUS_STOPPED)
+
+
+def test_router_that_was_frozen_ends_when_ordered():
+    """The kernel then gives the signal to any of its threads, at every second time to one that does not heed it."""
+    for _ in range(4):
+        router = RouterProcess()
+        router.process.send_signal(signal.SIGSTOP)
+        until(partial(stopped, router.process.pid), "it is frozen")
+        router.process.send_signal(signal.SIGCONT)
+        assert router.stop() == 0
+
+
+def test_session_closes_in_time_and_live_ones_immediately(router):
+    sessions = [network.open_session([router.endpoint], name="test", lease_s=1.0) for _ in range(2)]
+    declared = [pubsub.pose_subscriber(sessions[1], Keys().status("*"))]
+    assert leave(sessions[0])
+    with router.frozen():
+        threading.Event().wait(CUT_OFF_S)
+        began = time.monotonic()
+        assert not leave(sessions[1], declared, limit_s=0.5)
+        assert time.monotonic() - began < 1.5
+    for thread in threading.enumerate():
+        if thread.name == "leaving the network":
+            thread.join(15.0)
+
+
+@pytest.mark.mechanism("emergency stop: frozen router")
+def test_an_estop_that_nobody_answers_ends(router):
+    with router.frozen():
+        done = zenpark("estop", "--connect", router.endpoint, code=None, timeout_s=30)
+    assert done.returncode in {1, 2}
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("bodies", ["twin", "world"])
+def test_frozen_robot_delays_nobody_when_launcher_is_killed(tmp_path, bodies):
+    flight = Flight(tmp_path / "run", "triangle", "--case", "event", "--bodies", bodies, "duration_s=60")
+    flight.until_flown()
+    children = flight.children()
+    frozen = children.pop("KH01")
+    frozen.suspend()
+    try:
+        threading.Event().wait(0.5)
+        flight.process.kill()
+        until(lambda: gone([children["CF01"], children["KH02"]]), "the robots have landed")
+        until(lambda: gone(list(children.values())), "everybody else is gone")
+        assert playback.read(flight.folder / "event.mcap").complete
+        assert flight.logs().count("done (the starter is gone)") == 2
+        frozen.resume()
+        until(lambda: gone([frozen]), "the frozen one too")
+    finally:
+        flight.finish()
+        for process in (frozen, *children.values()):
+            with contextlib.suppress(psutil.NoSuchProcess):
+                process.kill()
+
+
+def test_suspended_conductor_gives_no_further_order(tmp_path):
+    flight = Flight(tmp_path / "run", "triangle", "--case", "event")
+    flight.until_flown()
+    robots = [process for name, process in flight.children().items() if name in TRIANGLE]
+    flight.signal(signal.SIGSTOP)
+    until(lambda: gone(robots), "the robots land and end", 40.0)
+    flight.signal(signal.SIGCONT)
+    code, _ = flight.finish()
+    assert code == 2
+    assert "this process stood still for more than 3 s; its robots have landed without it" in flight.said()
+    assert "landing" not in [line.rpartition("phase conductor: ")[2] for line in flight.said().splitlines()]
+
+
+@pytest.mark.mechanism("table of a run from another shell")
+def test_top_shows_a_routers_robots_worst_first(router, watcher):
+    session, keys, over, begin = watcher.session, watcher.keys, threading.Event(), Clock().utc()
+    tokens = [pubsub.alive_token(session, keys.alive(name)) for name in ("alpha", "beta", "gamma")]
+
+    def report():
+        """Ten times a second; the last one has a hazard, and uses half a core."""
+        while not over.wait(0.1):
+            now = Clock().utc()
+            held = {"hazard": "hold: link silence", "cpu_s": 0.5 * (now - begin)}
+            for name, more in (("alpha", {}), ("beta", {}), ("gamma", held)):
+                status = msgspec.structs.replace(STATUS, robot=name, stamp=now, **more)
+                session.put(keys.status(name), messages.encode(status), encoding=messages.JSON)
+
+    with ThreadPoolExecutor() as pool:
+        pool.submit(report)
+        done = zenpark("top", "--connect", router.endpoint, timeout_s=30.0)
+        over.set()
+    del tokens
+    title, heads, first, *others = done.stdout.splitlines()
+    assert "held 1" in title
+    assert "running 2" in title
+    assert heads.split()[:2] == ["robot", "phase"]
+    assert first.split()[:2] == ["gamma", "held"]
+    assert "50 %" in first
+    assert [line.split()[0] for line in others[:2]] == ["alpha", "beta"]
+
+
+@pytest.mark.mechanism("recording played onto a network")
+def test_recording_plays_with_keys_and_payloads_as_flown(router, watcher, tmp_path):
+    simulate(load("triangle", "duration_s=3.0", "timeline=[]"), cases=["event"], folder=tmp_path)
+    seen = {}
+
+    def keep(sample):
+        seen.setdefault(str(sample.key_expr), []).append(sample.payload.to_bytes())
+
+    listening = watcher.session.declare_subscriber("park/**", keep)
+    zenpark("replay", tmp_path, "--rate", "8", "--connect", router.endpoint)
+    sent = [messages.decode(each, messages.JSON, messages.Pose) for each in seen["park/CF01/pose"]]
+    assert [(p.seq, p.stamp, p.position) for p in sent] == [
+        (p.seq, p.stamp, tuple(p.position)) for p in typed(tmp_path / "event.mcap", "/CF01/pose")
+    ]
+    assert {"park/run/event", "park/run/experiment", "park/CF01/state", "park/CF01/status"} <= seen.keys()
+    for robot in ("park/KH01/state", "park/KH02/state"):
+        assert len(seen[robot]) == len(typed(tmp_path / "event.mcap", robot.removeprefix("park")))
+    seen.clear()
+    token = pubsub.alive_token(watcher.session, Keys().conductor)
+    refused = zenpark("replay", tmp_path, "--connect", router.endpoint, code=2)
+    assert seen == {}
+    assert "a run is up (park/run/conductor)" in refused.stderr
+    token.undeclare()
+    listening.undeclare()

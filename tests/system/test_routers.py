@@ -1,42 +1,47 @@
-"""Two routers: who loses one goes on at the other, the first comes back, and a newcomer sees everybody at either."""
+"""Routers: several, none (a mesh), over each transport, and a zenohd, with our configuration or with none."""
 
+import json
+import signal
+import socket
+import subprocess
+import sys
 import time
+import urllib.request
+from contextlib import ExitStack, contextmanager
+from functools import partial
+from pathlib import Path
 
-import msgspec
 import psutil
 import pytest
 import zenoh
 
+from agents.network import endpoints as topology
 from agents.network import lab, messages, pubsub
 from agents.network import session as network
-from agents.network.access_control import Rights
 from agents.network.endpoints import free_endpoint
 from agents.network.zenoh_config import config, settings
+from experiments.definition import access_rights, mesh
+from experiments.file.document import load
 from experiments.run import reopen
 from tests.conftest import RouterProcess
-from tests.system.lab import NEAR_TRIANGLE, TRIANGLE, Flight, Watcher, assert_held_in_time, until
-from tests.system.secured import FLOWN, Laboratory, refused
+from tests.system import machines, zenohd
+from tests.system.lab import NEAR_TRIANGLE, TRIANGLE, Flight, Started, Watcher, assert_held_in_time, typed, until
+from tests.system.secured import Laboratory, forged, new_lab, refused
+from tools.commands import orders
+from tools.commands.network import members
+from tools.commands.processes import of_zenohd
 
 pytestmark = pytest.mark.system
-
-
-def routers(flight):
-    """Routers of a run, with their endpoints."""
-    found = []
-    for child in psutil.Process(flight.process.pid).children():
-        line = child.cmdline()
-        if "agents.runtime.router" in line:
-            found.append((child, line[line.index("--listen") + 1]))
-    endpoints = (flight.folder / "network.txt").read_text().split()
-    return sorted(found, key=lambda pair: endpoints.index(pair[1]))
 
 
 def test_a_killed_router_holds_nobody_up(tmp_path):
     flight = Flight(tmp_path / "run", "triangle", "--case", "periodic", "network.routers=2", "duration_s=8")
     flight.until_flown()
-    (first, one), (_, other) = routers(flight)
+    one, other = (flight.folder / "network.txt").read_text().split()
     with Watcher(other) as watcher:
         watcher.until(lambda: len(watcher.state) == 3 == len(watcher.alive), "robots at one are seen at the other")
+        children = psutil.Process(flight.process.pid).children()
+        (first,) = (each for each in children if "agents.runtime.router" in (line := each.cmdline()) and one in line)
         first.kill()
         told = {name: state.seq for name, state in watcher.state.items()}
         watcher.until(lambda: all(watcher.state[name].seq > told[name] + 10 for name in told), "all go on")
@@ -44,55 +49,47 @@ def test_a_killed_router_holds_nobody_up(tmp_path):
         with Watcher(one) as late:
             late.until(lambda: len(late.state) == 3 == len(late.alive), "a newcomer at the first sees all")
         watcher.until(lambda: all(not status.missing for status in watcher.status.values()), "nobody is missed")
-    code, _ = flight.finish()
-    assert code == 0, flight.logs()
+    assert flight.finish()[0] == 0, flight.logs()
     run = reopen(flight.folder)
     assert not run.notes, "nobody was held for lost, and the recording is whole"
-    trace = run.traces["periodic"]
-    holds = [event.text for event in trace.events if event.kind in ("hazard", "robot") and "hold" in event.text]
-    assert not holds
+    assert not [event for event in run.traces["periodic"].events if event.kind == "hazard" and "hold" in event.text]
 
 
-@pytest.fixture
-def router_lab(tmp_path):
-    """Robots in flight at one router of a lab, and the endpoint of another that is linked with it."""
+def intrude(session):
+    """Forged stops, poses, and an order behind them on the same way, which nobody answers."""
+    stop = messages.encode(messages.Stop("mallory", "because"))
+    for _ in range(20):
+        for key in ("park/estop", "park/**"):
+            session.put(key, stop, encoding=messages.JSON)
+        session.put("park/KH01/pose", forged("KH01"), encoding=messages.JSON)
+    order = messages.encode(messages.Order("land"))
+    for robot in ("KH01", "CF01"):
+        assert not [reply for reply in session.get(f"park/{robot}/order", payload=order, timeout=0.5) if reply.ok]
+
+
+def test_intruder_gets_nothing_at_the_other_router_either(tmp_path):
     with Laboratory(tmp_path, linked=True) as made:
         (other,) = lab.secured([free_endpoint(preferred_port=0, protocol="tls")], made.folder)
         made.serve(other, "--connect", made.endpoint)
         made.fly()
-        yield made, other
-
-
-def test_intruder_gets_nothing_at_the_other_router_either(router_lab):
-    made, other = router_lab
-    keys = made.watcher.keys
-    assert msgspec.json.decode(made.rights.read_bytes(), type=Rights).linked
-    with Watcher(other) as looker:  # as operator: through the link everything is seen, and orders are carried
-        looker.until_all("running", *FLOWN)
-        assert looker.order("KH01", messages.Order("get", name="speed")).robot == "KH01"
-    before = made.statuses()
-    forged = messages.encode(messages.pose("KH01", 10**9, time.time(), [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], yaw=0.0))
-    stop = messages.encode(messages.Stop("mallory", "because"))
-    for mode in ("client", "router"):  # the latter would be a link, were it a router's certificate
-        chosen = config(settings("client", connect=[other], name="intruder", identity="KH03"))
-        chosen.insert_json5("mode", f'"{mode}"')
-        with zenoh.open(chosen) as intruder:
-            states = pubsub.subscriber(intruder, keys.state("*"))
-            for _ in range(20):
-                intruder.put(keys.pose("KH01"), forged, encoding=messages.JSON)
-                intruder.put(keys.estop, stop, encoding=messages.JSON)
-                intruder.put("park/**", stop, encoding=messages.JSON)
-            order = messages.encode(messages.Order("land"))  # behind all others on the same way
-            assert not [reply for reply in intruder.get(keys.order("KH01"), payload=order, timeout=1.0) if reply.ok]
-            heard = {str(sample.key_expr) for sample in network.received(states.handler)}
-            assert heard <= {"park/**"}, "its own words, and nobody else's"
-    with refused():
-        zenoh.open(config(settings("client", connect=[other.partition("#")[0]], name="intruder")))
-    after = made.statuses()
-    for name in FLOWN:
-        assert after[name].phase == "running"
-        assert (after[name].malformed, after[name].refused) == (before[name].malformed, before[name].refused)
-        assert after[name].lost == before[name].lost
+        with Watcher(other) as looker:  # as operator: through the link everything is seen, and orders are carried
+            looker.until_all("running", *TRIANGLE)
+            assert looker.order("KH01", messages.Order("get", name="speed")).robot == "KH01"
+        before = made.statuses()
+        for mode in ("client", "router"):  # the latter would be a link, were it a router's certificate
+            chosen = config(settings("client", connect=[other], name="intruder", identity="KH03"))
+            chosen.insert_json5("mode", f'"{mode}"')
+            with zenoh.open(chosen) as intruder:
+                states = pubsub.subscriber(intruder, made.watcher.keys.state("*"))
+                intrude(intruder)
+                heard = {str(sample.key_expr) for sample in network.received(states.handler)}
+                assert heard <= {"park/**"}, "its own words, and nobody else's"
+        with refused():
+            zenoh.open(config(settings("client", connect=[other.partition("#")[0]], name="intruder")))
+        for name, after in made.statuses().items():
+            assert after.phase == "running"
+            for what in ("malformed", "refused", "lost"):
+                assert getattr(after, what) == getattr(before[name], what)
 
 
 @pytest.mark.mechanism("router frozen")
@@ -123,3 +120,246 @@ def test_run_continues_at_second_router_while_first_freezes(patient_router, tmp_
         assert_held_in_time(flight, "periodic", stopped)
     finally:
         second.stop()
+
+
+MESH = "network.topology=mesh"
+
+
+def linked_members(children, ports):
+    """Robots -> members that their processes are linked with by a connection, by the ports at which these listen."""
+    linked = {name: set() for name in ports.values()}
+    for name, near in linked.items():
+        for each in children[name].net_connections("inet"):
+            if each.status == "ESTABLISHED" and each.raddr and each.raddr.port in ports:
+                near.add(ports[each.raddr.port])
+                linked[ports[each.raddr.port]].add(name)
+    return linked
+
+
+def test_the_reference_experiment_without_a_router(tmp_path, capsys):
+    flight = Flight(tmp_path / "run", "robotic-park", "--case", "event", MESH)
+    flight.until_flown()
+    endpoints = (flight.folder / "network.txt").read_text().split()
+    ports = {int(topology.bare([each])[0].rpartition(":")[2]): topology.owner(each) for each in endpoints}
+    children = flight.children()
+    assert "router" not in children
+    hears = access_rights.senders_by_receiver(load("robotic-park").plan)
+    linked = linked_members(children, ports)
+    for name, heard in hears.items():
+        assert linked[name] == heard | {other for other in hears if name in hears[other]}, name
+
+    with Watcher(*endpoints) as watcher:
+        status, near = watcher.status, linked["CF02"]
+        watcher.until(lambda: len(watcher.alive) == len(hears) == len(watcher.state), "everybody is seen")
+        assert {"conductor", "recorder", *hears} <= {member.name for member in members(watcher.session)}
+        children["CF02"].kill()
+        missing = {name: ["CF02"] * ("CF02" in hears[name]) for name in near}
+        watcher.until(lambda: all(status[name].missing == missing[name] for name in near), "its neighbours miss it")
+        begun = {name: status[name].decisions for name in hears if name != "CF02"}
+        watcher.until(lambda: all(status[name].decisions > count for name, count in begun.items()), "the others go on")
+        assert all(not status[name].missing for name in begun if "CF02" not in hears[name])
+    assert orders.estop(connect=endpoints, realm="park", identity="operator") == 0
+    assert capsys.readouterr().out == f"stopped: {', '.join(sorted(begun))} (at a mesh)\n"
+    flight.finish()
+    run = reopen(flight.folder)
+    assert run.notes == ("event: lost CF02",) or "event" in run.traces
+
+
+def test_an_endpoint_that_somebody_else_has_is_named(tmp_path):
+    taken = free_endpoint(0)
+    with zenoh.open(config(settings("router", listen=[taken], name="stranger"))):
+        where = f'network.addresses={{KH01 = "{taken}"}}'
+        flight = Flight(tmp_path / "run", "triangle", "--case", "periodic", MESH, where)
+        assert flight.finish()[0] == 2
+    assert "KH01 cannot listen on" in flight.said()
+
+
+@pytest.mark.mechanism("mesh")
+def test_a_silent_missing_link_is_named():
+    free = {free_endpoint(0) for _ in range(20)}
+    right = [topology.owned(endpoint, name) for endpoint, name in zip(free, TRIANGLE, strict=False)]
+    wrong = [topology.owned(free_endpoint(0), "KH01"), *right[1:]]  # where KH02 seeks it
+    with ExitStack() as stack:
+        for name in TRIANGLE:
+            connect = [part for each in (wrong if name == "KH02" else right) for part in ("--connect", each)]
+            stack.enter_context(Started("experiments.real_time.processes.robot", "triangle", name, *connect))
+        watcher = stack.enter_context(Watcher(*right))
+        watcher.until(lambda: watcher.phase("CF01") == "ready", "it hears both")
+        watcher.until(lambda: watcher.status["KH02"].reason == "never received KH01", "and KH02 says whom it does not")
+        assert watcher.phase("KH02") == watcher.phase("KH01") == "idle"
+        assert not watcher.order("KH02", messages.Order("takeoff")).ok
+
+
+def test_lab_members_let_nobody_exceed_its_rights(tmp_path):
+    """No router could refuse anything in a mesh: the receiver of an order does."""
+    file = tmp_path / "mesh.toml"
+    file.write_text(load("triangle").path.read_text() + '\n[network]\ntopology = "mesh"\nlab = "lab"\n')
+    listening = mesh.listening_hosts(load(file).plan)
+    new_lab(tmp_path / "lab", *TRIANGLE, "KH09", listening=listening)
+    flight = Flight(tmp_path / "run", file, "--case", "periodic", "duration_s=6")
+    flight.until_flown()
+    endpoints = (flight.folder / "network.txt").read_text().split()
+    for who in ("KH09", "KH02", "observer", "recorder"):
+        with network.open_session(endpoints, name="intruder", identity=who) as intruder:
+            intrude(intruder)
+    code, _ = flight.finish()
+    assert code == 0, flight.logs()
+    run = reopen(flight.folder)
+    assert not run.notes
+    for name in TRIANGLE:
+        assert "emergency stop" not in (flight.folder / "logs" / f"periodic-{name}.log").read_text()
+    assert run.metrics["periodic"].lost == 0, "a pose with a higher number would have made all after it old"
+
+
+SHORT = ("--case", "periodic", "--no-report", "--set", "duration_s=3", "--set", "rates.body_hz=50")
+
+
+@pytest.mark.parametrize("protocol", ["unixsock-stream", "tls", "quic"])
+def test_an_experiment_over_each_transport(tmp_path, protocol):
+    secure = protocol in ("tls", "quic")
+    listen = free_endpoint(0, protocol) if secure else f"{protocol}/{tmp_path}/router.sock"
+    lab = ("--lab", str(new_lab(tmp_path / "lab"))) if secure else ()
+    flight = Flight(tmp_path / "run", "triangle", *SHORT, *lab, f'network.listen=["{listen}"]')
+    code, _ = flight.finish()
+    assert code == 0, flight.logs()
+    assert f"router ready on {listen}" in (flight.folder / "logs" / "router.log").read_text()
+    case = reopen(flight.folder).metrics["periodic"]
+    assert case.lost == 0
+    assert all(robot.messages > 100 for robot in case.robots)
+
+
+@pytest.mark.skipif(bool(machines.why_not()), reason=machines.why_not() or "-")
+def test_robots_join_from_another_machine_with_their_certificates(tmp_path):
+    """The router listens beyond loopback; two robots come from another network namespace, one is started here."""
+    with machines.machines(tmp_path / "net", ("front", "board")) as there:
+        front, board = there["front"], there["board"]
+        endpoint = f"tls/{front.address}:7447"
+        new_lab(tmp_path / "lab", hosts=[front.address])
+        file = tmp_path / "away.toml"
+        hosts = '[hosts.board]\nrobots = ["KH01", "KH02"]'
+        text = Path(load("triangle").path).read_text()
+        file.write_text(f'{text}\n{hosts}\n[network]\nlisten = ["{endpoint}"]\nlab = "lab"\n')
+        command = [sys.executable, "-m", "tools.guard"]
+        with (tmp_path / "run.log").open("w") as log:
+            started = partial(subprocess.Popen, env=there.environment, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
+            run = started(front.command(*command, "run", str(file), *SHORT, "--out", str(tmp_path / "run")))
+            until((tmp_path / "run" / "logs" / "router.log").exists, "the router starts")
+            words = ("--case", "periodic", "--connect", endpoint, "--once")
+            robots = [started(board.command(*command, "agent", str(file), name, *words)) for name in ("KH01", "KH02")]
+            try:
+                assert run.wait(60) == 0, (tmp_path / "run.log").read_text()
+                assert [robot.wait(20) for robot in robots] == [0, 0]
+            finally:
+                for process in (run, *robots):
+                    process.kill()
+                    process.wait()
+    case = reopen(tmp_path / "run").metrics["periodic"]
+    assert case.lost == 0
+    assert all(robot.messages > 100 for robot in case.robots)
+
+
+@contextmanager
+def ours(file):
+    """The library that the wheel brings, from the very file."""
+    with zenoh.open(zenoh.Config.from_file(str(file))):
+        yield
+
+
+def theirs(file):
+    """A zenohd, from the same file."""
+    return started(json.loads(file.read_text())["listen"]["endpoints"][0], "--config", str(file))
+
+
+@contextmanager
+def started(endpoint, *arguments):
+    """A zenohd that listens."""
+    process = subprocess.Popen([zenohd.folder() / "zenohd", *arguments], stdin=subprocess.DEVNULL)
+    try:
+        until(lambda: answers(endpoint, process), "zenohd answers")
+        yield process
+    finally:
+        process.send_signal(signal.SIGCONT)
+        process.terminate()
+        process.wait(30)
+
+
+def answers(endpoint, process):
+    assert process.poll() is None
+    host, _, port = endpoint.partition("/")[2].rpartition(":")
+    with socket.socket() as probe:
+        return probe.connect_ex((host, int(port))) == 0
+
+
+def missing():
+    """Why there is no zenohd; empty if there is one."""
+    try:
+        zenohd.folder()
+    except zenohd.NotBuilt as error:
+        return str(error)
+    return ""
+
+
+NEEDED = pytest.mark.skipif(bool(missing()), reason=missing())
+WITH = [ours, pytest.param(theirs, marks=NEEDED)]
+
+
+@pytest.mark.parametrize("start", WITH)
+@pytest.mark.parametrize("secure", [False, True])
+def test_an_experiment_at_a_router_of_somebody_else(tmp_path, start, secure):
+    plain = free_endpoint(0, "tls" if secure else "tcp")
+    rights, endpoint = None, plain
+    options = ()
+    if secure:
+        folder = new_lab(tmp_path / "lab")
+        rights = access_rights.rights(load("triangle").cases().values())
+        (endpoint,) = lab.secured([plain], folder)
+        options = ("--lab", str(folder))
+    file = tmp_path / "zenohd.json5"
+    file.write_text(json.dumps(of_zenohd([endpoint], rights=rights)))
+    with start(file):
+        flight = Flight(tmp_path / "run", "triangle", *SHORT, *options, f'network.connect=["{plain}"]')
+        code, _ = flight.finish()
+        assert code == 0, flight.logs()
+        if secure:
+            with zenoh.open(config(settings("client", connect=[endpoint], name="x", identity="observer"))) as session:
+                assert not [r for r in session.get("park/KH01/order", payload=b"{}", timeout=0.5) if r.ok]
+    assert reopen(flight.folder).metrics["periodic"].lost == 0
+
+
+@NEEDED
+@pytest.mark.parametrize("freezes", [pytest.param(False, marks=pytest.mark.mechanism("zenohd")), True])
+def test_plain_zenohd_is_read_by_rest_and_freezes(tmp_path, freezes):
+    """No file: a lease of 10 s. What the README says of REST."""
+    endpoint, rest = free_endpoint(0), free_endpoint(0).partition("/")[2]
+
+    def read(path, post=None):
+        body = None if post is None else json.dumps(post).encode()
+        asked = urllib.request.Request(f"http://{rest}/{path}", body, {"content-type": "application/json"})
+        with urllib.request.urlopen(asked, timeout=10.0) as answer:
+            return json.load(answer)
+
+    with started(endpoint, "-l", endpoint, "--no-multicast-scouting", "--rest-http-port", rest) as process:
+        changes = (*NEAR_TRIANGLE, f'network.connect=["{endpoint}"]')
+        flight = Flight(tmp_path / "run", "triangle", "--case", "periodic", *changes)
+        flight.until_flown()
+        (last,) = read("park/CF01/pose")
+        assert (last["key"], last["encoding"]) == ("park/CF01/pose", "application/json")
+        assert len(last["value"]["position"]) == 3
+        for every in ("park/*/pose", "park/**"):  # and no errors
+            assert {each["key"] for each in read(every)} == {f"park/{name}/pose" for name in TRIANGLE}
+        replies = read("park/*/order", {"order": "get", "name": "clamp"})
+        # the conductor has an order key too, and says that this is none of its orders
+        told = [each["value"] for each in replies if each["key"] != "ERROR"]
+        assert {each["robot"] for each in told if each["ok"]} == set(TRIANGLE)
+        if freezes:
+            process.send_signal(signal.SIGSTOP)
+            stopped = time.time()
+            flight.until_said(r"router conductor: no router answers for \d+\.\d s")
+            until(lambda: time.time() > stopped + 3.0, "every robot has had the time to hold")
+            process.send_signal(signal.SIGCONT)
+            flight.until_said(r"router conductor: a router answers again, after \d+\.\d s")
+        flight.interrupt()
+    if freezes:
+        assert_held_in_time(flight, "periodic", stopped)
+    for name in TRIANGLE:
+        assert typed(flight.folder / "periodic.mcap", f"/{name}/status")[-1].malformed == 0

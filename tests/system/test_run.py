@@ -1,6 +1,7 @@
-"""A whole run in real time, through the command line."""
+"""Whole runs in real time: undisturbed, with killed processes, a bad network, laws that talk, faults on purpose."""
 
 import contextlib
+import csv
 import json
 import re
 from pathlib import Path
@@ -8,15 +9,27 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
-from rosbags.highlevel import AnyReader
 
 from experiments.recording import playback
 from experiments.recording.reader import RecordingError
 from experiments.run import reopen
-from tests.system.lab import NEAR_TRIANGLE, ROOT, Flight, assert_formed, gone, typed, until
+from tests.commands import python
+from tests.runs import flown
+from tests.system.lab import (
+    NEAR_TRIANGLE,
+    ROOT,
+    Flight,
+    Watcher,
+    assert_formed,
+    gone,
+    options,
+    transmits_at_50_hz,
+    typed,
+    until,
+)
 
 pytestmark = pytest.mark.system
+
 
 EVENT = ("--case", "event", "--json")
 COURSE = ROOT / "docs" / "course"
@@ -59,25 +72,6 @@ def test_a_run_forms_up_loses_nothing_and_reports(whole):
     assert read.complete
     assert not read.trace.lost.any()
     assert np.isfinite(read.trace.true_position).all(axis=(1, 2)).mean() > 0.99
-
-
-def test_a_recording_opens_elsewhere_with_typed_messages(whole):
-    file = whole.folder / "event.mcap"
-    with AnyReader([file]) as bag:
-        types = {connection.topic: connection.msgtype for connection in bag.connections}
-        assert types["/CF01/true_pose"] == "geometry_msgs/msg/PoseStamped"
-        connection = next(c for c in bag.connections if c.topic == "/CF01/state")
-        heights = [
-            bag.deserialize(raw, connection.msgtype).true_position[2] for _, _, raw in bag.messages([connection])
-        ]
-    assert max(heights) == pytest.approx(0.3, abs=0.05)
-    poses = typed(file, "/KH01/true_pose")
-    assert poses[0].header.frame_id == "map"
-    assert abs(poses[-1].pose.position.x) < 2.0
-    with file.open("rb") as stream:
-        reader = make_reader(stream)
-        names = [attachment.name for attachment in reader.iter_attachments()]
-    assert {"experiment.toml", "experiment.json"} <= set(names)
 
 
 class Begun:
@@ -175,3 +169,146 @@ def test_a_run_in_real_time_is_judged(changes, passed, tmp_path):
     assert (out / "measures.py").is_file()
     assert (out / LAW.partition("=")[2].partition(":")[0]).is_file() is passed
     assert reopen(out).summary()["passed"] is passed
+
+
+BAD = ("channel.loss=0.3", "channel.delay_s=0.05")
+MARGIN_S = 0.2  # what was said so shortly before the end may still be under way
+
+
+def sent_and_heard(trace, listener, speaker, end):
+    """Running numbers of the run that a robot said, and those of them that another one heard."""
+    said = trace.sent.seq[(trace.sent.link == speaker) & (trace.sent.stamp < end - MARGIN_S)]
+    net = trace.plan.pose_links
+    mine = trace.received.link == np.flatnonzero((net.receiver == listener) & (net.sender == speaker))
+    return said, np.intersect1d(said, trace.received.seq[mine])
+
+
+def virtual(duration_s):
+    """The same in virtual time, longer: robots start sooner there, and their numbers must overlap."""
+    return flown("triangle", "periodic", *BAD, "formation.gain=1.4", f"duration_s={duration_s}").trace
+
+
+@pytest.mark.mechanism("modelled channel in real time")
+def test_receivers_lose_what_the_virtual_network_loses(tmp_path):
+    folder = tmp_path / "run"
+    changes = (*BAD, "duration_s=3", "robots.CF01.hover=0.3", "formation.gain=1.4")
+    flight = Flight(folder, "triangle", "--case", "periodic", "--json", *changes)
+    code, out = flight.finish()
+    assert code == 0, flight.said
+    robots = json.loads(out)["cases"]["periodic"]["robots"]
+    assert [robot["lost"] for robot in robots.values()] == [0, 0, 0], "of the real network nothing is lost"
+
+    real, other = playback.read(folder / "periodic.mcap").trace, virtual(15.0)
+    transmits_at_50_hz(real)
+    shares, sent = [], 0
+    net = real.plan.pose_links
+    pairs = sorted({(int(net.receiver[link]), int(net.sender[link])) for link in real.received.link})
+    assert len(pairs) == len(real.dropped if real.dropped is not None else ())
+    for listener, speaker in pairs:
+        said, heard = sent_and_heard(real, listener, speaker, 3.0)
+        said_there, heard_there = sent_and_heard(other, listener, speaker, 15.0)
+        both = np.intersect1d(said, said_there)
+        assert len(both) > 50
+        np.testing.assert_array_equal(np.intersect1d(heard, both), np.intersect1d(heard_there, both))
+        shares.append(1.0 - len(heard) / len(said))
+        sent += int((real.sent.link == speaker).sum())
+    assert np.mean(shares) == pytest.approx(0.3, abs=0.06)
+
+    delay = real.received.arrival - real.received.stamp
+    assert delay.min() >= 0.05 - 1e-5
+    assert real.dropped.sum() == pytest.approx(0.3 * sent, rel=0.15)
+
+
+def test_centre_communicates_over_the_same_network(tmp_path):
+    folder = tmp_path / "run"
+    flight = Flight(folder, "triangle", "--case", "periodic", *BAD, "duration_s=4", "architecture=centralised")
+    code, _ = flight.finish()
+    assert code == 0, flight.said
+    case = reopen(folder).metrics["periodic"]
+    centre = case.guidance
+    assert case.lost == 0, "of the real network nothing is lost"
+    sent = sum(robot.messages for robot in case.robots)
+    assert centre.poses_lost / sent == pytest.approx(0.3, abs=0.07)
+    assert centre.goals_lost / centre.goals == pytest.approx(0.3, abs=0.15)
+    goals = playback.read(folder / "periodic.mcap").trace.goals
+    assert goals.delay.min() >= 0.1 - 1e-5, "both ways"
+
+
+RUN_S = 20.0
+
+
+@pytest.mark.mechanism("words")
+def test_robots_agree_on_an_average_in_real_time(tmp_path):
+    """With a fifth of the messages lost, in two processes of three robots."""
+    groups = [f"robots.KH0{number}.process={'odd' if number % 2 else 'even'}" for number in range(1, 7)]
+    flight = Flight(tmp_path / "run", "average", "--case", "event-loss", *groups, "duration_s=9")
+    code, _ = flight.finish(120.0)
+    assert code == 0, flight.said()
+    file = tmp_path / "run" / "event-loss.mcap"
+    trace = playback.read(file).trace
+    end = trace.memory["x"][-5, :, 0]
+    assert np.abs(end - 3.0).max() < 0.06, end
+    assert np.abs(trace.memory["x"][0] - 3.0).max() > 1.0
+    assert trace.measures["disagreement"].shape == (len(trace.time), 6)
+    assert trace.dropped.sum() > 0
+    spoken = typed(file, "/KH01/spoken_pose")
+    assert [each.name for each in spoken[-1].shared] == ["x", "q", "n"]
+    assert len(typed(file, "/KH01/pose")) < len(spoken) / 3  # those before its first step
+
+
+@pytest.mark.mechanism("words: restart")
+def test_a_restarted_robot_joins_without_drawing_the_others(tmp_path):
+    """The first words of a restarted robot are a step old; the others keep to their average meanwhile."""
+    words = ("--case", "periodic", 'on_loss="restart"', f"duration_s={RUN_S}")
+    flight = Flight(tmp_path / "run", "average", *words)
+    flight.until_flown()
+    agreed = RUN_S / 2.0  # they have agreed by then
+    with Watcher(flight.endpoint()) as watcher:
+        state, status = watcher.state, watcher.status
+        watcher.until(lambda: state["KH03"].stamp > status["KH03"].started + agreed > agreed, "half of it is over")
+        flight.children()["KH03"].kill()
+        code, _ = flight.finish(120.0)
+    assert code in (0, 1), flight.said()  # a robot was lost
+    file = tmp_path / "run" / "periodic.mcap"
+    trace = playback.read(file).trace
+    x, late = trace.memory["x"][..., 0], trace.time > agreed
+    others = np.delete(x[late], 2, axis=1)
+    assert np.nanmax(np.abs(others - 3.0)) < 0.45, np.nanmax(np.abs(others - 3.0))
+    assert np.abs(x[-5] - 3.0).max() < 0.06, x[-5]
+
+
+@pytest.mark.parametrize(
+    "kinds",
+    [
+        pytest.param(["conductor"], marks=pytest.mark.mechanism("chaos")),
+        ["router", "clock", "double", "conductor"],
+        ["mocap-frozen"],
+        ["sleep"],
+    ],
+)
+def test_faults_are_made_and_recovered_from(tmp_path, kinds):
+    folder = tmp_path / "chaos"
+    of = ("--faults", len(kinds), "--seed", "1", "--kinds", ",".join(kinds), *NEAR_TRIANGLE, "duration_s=40")
+    words = options("-m", "tests", "--chaos", "triangle", *of, "--json", "--out", folder)
+    done = python(*words, code=None, timeout_s=150.0)
+    assert done.stdout, done.stderr
+    result = json.loads(done.stdout)
+    assert sorted(each["fault"]["kind"] for each in result["outcomes"]) == sorted(kinds), done.stderr
+    assert all(each["recovered"] for each in result["outcomes"]), done.stderr
+    assert not [each for each in result["outcomes"] if each["fault"]["kind"] == "double" and each["violations"]]
+    assert not any("left behind" in text for each in result["rounds"] for text in each["violations"])
+    assert json.loads((folder / "chaos.json").read_text()) == result
+
+
+def test_three_robots_for_a_few_seconds(tmp_path):
+    asked = ("triangle", "--minutes", "0.1", "--json", "--out", str(tmp_path / "soak"))
+    done = python("-m", "tests", "--soak", *asked, code=None, timeout_s=120.0)
+    assert done.stdout, done.stderr
+    said = json.loads(done.stdout)
+    texts = [finding["text"] for finding in said["findings"]]
+    assert texts[0].startswith("all 3 robots lived"), texts
+    assert any(text.startswith("0 of ") and text.endswith("poses were lost") for text in texts), texts
+    with (tmp_path / "soak" / "soak.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert {row["process"] for row in rows} == {"KH01", "KH02", "CF01", "router", "recorder", "conductor"}
+    assert all(float(row["rss_mb"]) > 5.0 and int(row["threads"]) > 0 for row in rows)

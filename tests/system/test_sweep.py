@@ -126,22 +126,3 @@ def test_cluster_with_a_killed_worker_gives_same_table(tmp_path, whole_table):
     done = seeds_done(folder)
     assert len(done) == len(set(done)) == RUNS
     assert tables(folder) == whole_table
-
-
-SCRIPT = """
-from experiments.sweep.sweep import sweep
-from experiments.sweep.table import write_csv
-
-if __name__ == "__main__":
-    found = sweep("triangle", {given}, settings={settings}, out={folder!r}, processes=2)
-    write_csv(found.folder / "sweep.csv", found.rows)
-"""
-
-
-def test_the_same_from_a_script(tmp_path, whole_table):
-    script = tmp_path / "script.py"
-    script.write_text(SCRIPT.format(given=GIVEN, settings=SETTINGS, folder=str(tmp_path)))
-    with started(str(script)) as process:
-        _, said = process.communicate()
-    assert (process.returncode, said) == (0, "")
-    assert (tmp_path / "sweep.csv").read_bytes() == whole_table[0]
