@@ -3,8 +3,6 @@
 python -m tests.bench            # an hour, and 7 GB in the user's cache
 """
 
-from __future__ import annotations
-
 import re
 import time
 from pathlib import Path
@@ -15,7 +13,7 @@ from tests.bench import growth, peers
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "results" / "peers.md"
 
 
-def renewed(page: str, tables: dict[str, str]) -> str:
+def renewed(page, tables):
     """A page with other text between `<!-- NAME -->` and `<!-- end -->`, by name.
 
     Raises ValueError if it has no such place.
@@ -28,7 +26,7 @@ def renewed(page: str, tables: dict[str, str]) -> str:
     return page
 
 
-def circumstances() -> str:
+def circumstances():
     """Commit, day and machine."""
     here = provenance()
     memory = f"{here.cores} cores, {here.memory_gb:.0f} GB, other work on them: load {here.load}"
@@ -36,7 +34,7 @@ def circumstances() -> str:
     return f"Commit {here.commit[:DIGEST_CHARACTERS]}, {day}; {here.cpu}, {memory}; Python {here.python}."
 
 
-def main() -> None:
+def main():
     where = circumstances()
     tables = {"peers": peers.report([*peers.OTHERS, peers.ZENOH]), "growth": growth.report()}
     page = renewed(PAGE.read_text("utf-8"), {"circumstances": where, **tables})

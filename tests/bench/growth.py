@@ -7,13 +7,10 @@ Each number has two processes of its own, plain and compiled, measured in turns 
 medians, and those that are no agent-steps of the compiled flights.
 """
 
-from __future__ import annotations
-
 import argparse
 import statistics
 import sys
-from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 
 from tests.bench.drivers.peer_zenpark import DURATION_S
 from tests.bench.measuring import markdown
@@ -34,7 +31,7 @@ COLUMNS = {  # figure of the driver: heading, format
 }
 
 
-def report(sizes: Sequence[int] = tuple(DURATIONS), rounds: int = ROUNDS, settings: Sequence[str] = SETTINGS) -> str:
+def report(sizes=tuple(DURATIONS), rounds=ROUNDS, settings=SETTINGS):
     """The table, in Markdown."""
     headings = ["robots", "simulated [s]"]
     for name in settings:
@@ -43,19 +40,16 @@ def report(sizes: Sequence[int] = tuple(DURATIONS), rounds: int = ROUNDS, settin
     return markdown([headings, *(line(robots, rounds, settings) for robots in sizes)])
 
 
-def line(robots: int, rounds: int, settings: Sequence[str]) -> list[str]:
+def line(robots, rounds, settings):
     """Cells of the line of a number of robots."""
     simulated_s, complete = DURATIONS.get(robots, DURATION_S), robots <= COMPLETE
-    found: dict[str, list[dict[str, float]]] = {name: [] for name in settings}
-    ratios: dict[str, list[float]] = {name: [] for name in settings}
+    found = {name: [] for name in settings}
+    ratios = {name: [] for name in settings}
     with ExitStack() as stack:
         pairs = {}
         for name in settings:
-            one = Driver(name, robots, f"{simulated_s:g}", "all" if complete else "loop")
-            stack.callback(one.close)
-            seven = Driver(name, 7, f"{DURATIONS[7]:g}")
-            stack.callback(seven.close)
-            pairs[name] = one, seven
+            one = stack.enter_context(closing(Driver(name, robots, f"{simulated_s:g}", "all" if complete else "loop")))
+            pairs[name] = one, stack.enter_context(closing(Driver(name, 7, f"{DURATIONS[7]:g}")))
         for _ in range(rounds if robots < MANY else 1):
             for name, pair in pairs.items():
                 one, seven = (driver.measure() for driver in pair)
@@ -72,7 +66,7 @@ def line(robots: int, rounds: int, settings: Sequence[str]) -> list[str]:
     return cells
 
 
-def main() -> int:
+def main():
     parser = argparse.ArgumentParser(prog="python -m tests.bench.growth", description=__doc__.splitlines()[0])
     parser.add_argument("--robots", type=int, nargs="+", default=tuple(DURATIONS))
     parser.add_argument("--rounds", type=int, default=ROUNDS)

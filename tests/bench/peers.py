@@ -9,8 +9,6 @@ flies `tests/bench/drivers/ring.py`: the same ring, starts and law. All processe
 and warmed up, and then measured in turns; speeds are medians, ratios medians of the ratios of each turn.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os
@@ -18,11 +16,9 @@ import statistics
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from agents.user_folder import cache_folder
 from experiments.file import document
@@ -54,55 +50,45 @@ class Failed(Exception):
 class Peer:
     """A simulator, or a setting of zenpark, which flies the ring."""
 
-    packages: tuple[str, ...]
-    beside: tuple[str, ...]  # settings of zenpark to compare it with
     bodies: str
     limit: str  # of its speed
+    beside: tuple[str, ...] = ()  # settings of zenpark to compare it with
+    packages: tuple[str, ...] = ()
     most: int = max(ROBOTS)  # robots that it takes
     heavy: bool = False  # installed by name alone
 
 
 PEERS = {
-    WHEELS: Peer((), (), "two wheels", "calls of Python: some 130 for an agent-step, none above a tenth of it"),
-    COMPILED_WHEELS: Peer((), (WHEELS,), "two wheels", "tables of the poses sent and received; the ticks are a tenth"),
-    DRONES: Peer((), (), "third order on each axis", "the same as plain wheels"),
-    COMPILED_DRONES: Peer((), (DRONES,), "third order on each axis", "the same as compiled wheels"),
-    RIGID: Peer(
-        (), (), "rigid, 1 kHz, firmware's cascade", "the cascade in numpy, ten times a step, and MuJoCo", most=100
-    ),
+    WHEELS: Peer("two wheels", "calls of Python: some 130 for an agent-step, none above a tenth of it"),
+    COMPILED_WHEELS: Peer("two wheels", "tables of the poses sent and received; the ticks are a tenth", (WHEELS,)),
+    DRONES: Peer("third order on each axis", "the same as plain wheels"),
+    COMPILED_DRONES: Peer("third order on each axis", "the same as compiled wheels", (DRONES,)),
+    RIGID: Peer("rigid, 1 kHz, firmware's cascade", "the cascade in numpy, ten times a step, and MuJoCo", most=100),
     "robotarium": Peer(
-        ("robotarium-python-simulator",),
-        (WHEELS, COMPILED_WHEELS),
-        "unicycles",
-        "asks every pair of robots for a collision, in Python; takes 50 robots at most",
-        most=50,
+        "unicycles", "asks every pair of robots for a collision, in Python; takes 50 robots at most",
+        (WHEELS, COMPILED_WHEELS), ("robotarium-python-simulator",), most=50,
     ),
     "irsim": Peer(
-        ("ir-sim",),
-        (WHEELS, COMPILED_WHEELS),
         "two wheels; collisions found and ignored",
         "each robot is a Python object, whose shape is moved and entered into a tree",
+        (WHEELS, COMPILED_WHEELS), ("ir-sim",),
     ),
-    "gym-pybullet-drones": Peer(("gym-pybullet-drones",), (RIGID,), "rigid, 240 Hz", ""),
+    "gym-pybullet-drones": Peer("rigid, 240 Hz", "", (RIGID,), ("gym-pybullet-drones",)),
     "vmas": Peer(
-        ("vmas", "torchrl"),
-        (WHEELS, COMPILED_WHEELS),
         "point masses moved by forces; no collisions",
         "small torch operations for each robot; TorchRL's wrapper; made for thousands of worlds in a batch, has one",
-        heavy=True,
+        (WHEELS, COMPILED_WHEELS), ("vmas", "torchrl"), heavy=True,
     ),
     "crazyflow": Peer(
-        ("crazyflow",),
-        (RIGID, DRONES, COMPILED_DRONES),
         "rigid, 500 Hz, model of the firmware's controller",
         "calls of JAX while robots are few; made for thousands of worlds in a batch, has one",
-        heavy=True,
+        (RIGID, DRONES, COMPILED_DRONES), ("crazyflow",), heavy=True,
     ),
-}
+}  # fmt: skip
 OTHERS = [name for name, peer in PEERS.items() if peer.packages]
 
 
-def duration_s(name: str, robots: int) -> float:
+def duration_s(name, robots):
     """Simulated time of a flight of a setting of zenpark [s]."""
     if name in {COMPILED_WHEELS, COMPILED_DRONES}:
         return max(peer_zenpark.DURATION_S, COMPILED_ROBOT_S / robots)
@@ -121,7 +107,7 @@ class Row:
     ratios: dict[str, float]  # to settings of zenpark
 
 
-def python_of(name: str) -> Path:
+def python_of(name):
     """Interpreter with a simulator, which is installed if it is not.
 
     Raises Failed with the first error of pip, or if it takes more than `INSTALL_S`.
@@ -134,10 +120,9 @@ def python_of(name: str) -> Path:
     base = getattr(sys, "_base_executable", None) or sys.executable  # not our environment, which has other packages
     subprocess.run([base, "-m", "venv", "--clear", str(folder)], check=True)
     command = [python, "-m", "pip", "install", "--no-input", "--quiet", *packages]
+    options = {"capture_output": True, "text": True, "env": environment()}
     try:
-        done = subprocess.run(
-            command, check=False, capture_output=True, text=True, env=environment(), timeout=INSTALL_S
-        )
+        done = subprocess.run(command, check=False, timeout=INSTALL_S, **options)
     except subprocess.TimeoutExpired:
         raise Failed(f"{name} cannot be installed within {INSTALL_S:g} s") from None
     if done.returncode != 0:
@@ -147,7 +132,7 @@ def python_of(name: str) -> Path:
     return python
 
 
-def environment() -> dict[str, str]:
+def environment():
     """The user's environment without packages of elsewhere."""
     kept = {name: value for name, value in os.environ.items() if name not in {"PYTHONPATH", "PYTHONHOME"}}
     return {**kept, **ONE_THREAD}
@@ -156,26 +141,24 @@ def environment() -> dict[str, str]:
 class Driver:
     """A process that measures one simulator, once for each line that it gets."""
 
-    def __init__(self, name: str, robots: int, *arguments: str) -> None:
+    def __init__(self, name, robots, *arguments):
         self.name, self.robots = name, robots
         if PEERS[name].packages:
             command = [python_of(name), "-m", f"{DRIVERS}.peer_{name}", str(robots)]
         else:
             command = [sys.executable, "-m", f"{DRIVERS}.peer_zenpark", str(robots), *name.split(), *arguments]
-        self.errors = tempfile.TemporaryFile(  # noqa: SIM115 - closed by `close`
-            "w+", encoding="utf-8", errors="replace"
-        )
+        self.errors = tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace")  # noqa: SIM115 - see `close`
         streams = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": self.errors}
         self.process = subprocess.Popen(command, cwd=ROOT, env=environment(), text=True, **streams)
         self.about = self._line()
 
-    def measure(self) -> dict[str, Any]:
+    def measure(self):
         """Raises Failed if the process ends instead."""
         with suppress(BrokenPipeError):
             print(file=self.process.stdin, flush=True)
         return self._line()
 
-    def close(self) -> None:
+    def close(self):
         """End the process."""
         self.process.kill()
         self.process.wait()
@@ -183,7 +166,7 @@ class Driver:
             with suppress(BrokenPipeError):
                 stream.close()
 
-    def _line(self) -> dict[str, Any]:
+    def _line(self):
         for line in self.process.stdout:
             if line.startswith("{"):  # libraries print as well
                 return json.loads(line)
@@ -193,58 +176,58 @@ class Driver:
         raise Failed(f"{self.name}, {self.robots} robots: {said[-1]}")
 
 
-def in_turns(drivers: Sequence[Driver], rounds: int, troubles: list[str]) -> Iterator[Row]:
-    """Rows of processes that have been warmed up; of those that fail, the reason goes to `troubles` instead."""
-    speeds: dict[str, list[float]] = {driver.name: [] for driver in drivers}
-    running = list(drivers)
+@contextmanager
+def noting(troubles):
+    """What fails in the block is added to `troubles`."""
+    try:
+        yield
+    except Failed as why:
+        troubles.append(str(why))
+
+
+def in_turns(drivers, rounds, troubles):
+    """Rows of processes that have been warmed up, but those that fail."""
+    speeds = {driver.name: [] for driver in drivers}
     for _ in range(rounds):
-        for driver in running.copy():
-            try:
-                found = driver.measure()
-            except Failed as why:
-                troubles.append(str(why))
-                running.remove(driver)
-                continue
-            speeds[driver.name].append(found["agent_steps"] / found["cpu_s"])
-    for driver in running:
+        for driver in drivers:
+            with noting(troubles):
+                if driver.process.poll() is None:
+                    found = driver.measure()
+                    speeds[driver.name].append(found["agent_steps"] / found["cpu_s"])
+    for driver in drivers:
         taken = speeds[driver.name]
-        ratios = {
-            other: statistics.median(one / two for one, two in zip(taken, speeds[other], strict=True))
-            for other in PEERS[driver.name].beside
-            if len(speeds.get(other, ())) == len(taken)
-        }
-        about = driver.about
-        yield Row(driver.robots, driver.name, about["version"], about["step_s"], statistics.median(taken), ratios)
+        if len(taken) == rounds:
+            ratios = {
+                other: statistics.median(one / two for one, two in zip(taken, speeds[other], strict=True))
+                for other in PEERS[driver.name].beside
+                if len(speeds.get(other, ())) == rounds
+            }
+            about = driver.about
+            yield Row(driver.robots, driver.name, about["version"], about["step_s"], statistics.median(taken), ratios)
 
 
-def measure(names: Sequence[str], sizes: Sequence[int], rounds: int, troubles: list[str]) -> Iterator[Row]:
+def measure(names, sizes, rounds, troubles):
     """Rows of some simulators and of the settings of zenpark beside them, by number of robots."""
-    able = []
+    numbers = {}
     for name in names:
-        try:
+        with noting(troubles):
             python_of(name)
-            able.append(name)
-        except Failed as why:
-            troubles.append(str(why))
-    numbers = {name: {min(size, PEERS[name].most) for size in sizes} for name in able}
+            numbers[name] = {min(size, PEERS[name].most) for size in sizes}
     for robots in sorted(set().union(*numbers.values())):
-        others = [name for name in able if robots in numbers[name]]
-        beside = [
-            own for own in PEERS if robots <= PEERS[own].most and any(own in PEERS[name].beside for name in others)
-        ]
+        others = [name for name in numbers if robots in numbers[name]]
+        compared = {own for name in others for own in PEERS[name].beside}
+        beside = [own for own in PEERS if own in compared and robots <= PEERS[own].most]
         with ExitStack() as stack:
             drivers = []
             for name in [*beside, *others]:
-                try:
+                with noting(troubles):
                     duration = () if PEERS[name].packages else (f"{duration_s(name, robots):g}",)
                     drivers.append(driver := Driver(name, robots, *duration))
                     stack.callback(driver.close)
-                except Failed as why:
-                    troubles.append(str(why))
             yield from in_turns(drivers, rounds, troubles)
 
 
-def network() -> Iterator[Row]:
+def network():
     """Robot processes on the ring in real time, each beside a bare Zenoh process that exchanges the same poses.
 
     Medians of seven pairs of the same seconds; an agent-step is a pose that is sent.
@@ -257,12 +240,12 @@ def network() -> Iterator[Row]:
     yield Row(robots, "bare Zenoh process", "", ring.STEP_S, speed, {"robot process, real time": own.ratio})
 
 
-def title(name: str) -> str:
+def title(name):
     """Name of a simulator, or of a setting of zenpark, for people."""
     return f"zenpark, {name}" if name in PEERS and name not in OTHERS else name
 
 
-def table(rows: Sequence[Row]) -> str:
+def table(rows):
     """Markdown."""
     lines = [["robots", "simulator", "step [ms]", "agent-steps per CPU second", "ratio"]]
     for row in rows:
@@ -273,15 +256,13 @@ def table(rows: Sequence[Row]) -> str:
     return markdown(lines)
 
 
-def limits(names: Sequence[str]) -> str:
+def limits(names):
     """Markdown: bodies and limits of simulators; nothing without any."""
-    if not names:
-        return ""
     rows = [[title(name), PEERS[name].bodies, PEERS[name].limit] for name in names]
-    return markdown([["simulator", "bodies", "what limits it"], *rows])
+    return markdown([["simulator", "bodies", "what limits it"], *rows]) if rows else ""
 
 
-def main() -> int:
+def main():
     parser = argparse.ArgumentParser(prog="python -m tests.bench.peers", description=__doc__.splitlines()[0])
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"of: {', '.join([*OTHERS, ZENOH])}")
     parser.add_argument("--all", action="store_true", help="the ones with large downloads as well")
@@ -295,9 +276,9 @@ def main() -> int:
     return 0
 
 
-def report(names: Sequence[str], sizes: Sequence[int] = ROBOTS, rounds: int = ROUNDS) -> str:
+def report(names, sizes=ROBOTS, rounds=ROUNDS):
     """Both tables, and what could not be measured, in Markdown."""
-    troubles: list[str] = []
+    troubles = []
     rows = list(measure([name for name in names if name != ZENOH], sizes, rounds, troubles))
     found = {row.name for row in rows}
     if ZENOH in names:

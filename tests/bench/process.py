@@ -90,28 +90,27 @@ def process(read: Document | None = None) -> Iterator[Figure]:
             for robot in experiment.robots:
                 senders = [link.name for link in plan.assignment(robot).neighbours]
                 rate = f"{experiment.rates.pose_hz:g}"
-                started = launcher.start(
-                    f"bare-{robot}", "tests.bench.bare_process", endpoints[0], robot, rate, *senders
-                )
-                beside[robot] = started.handle.pid
+                words = ("tests.bench.bare_process", endpoints[0], robot, rate, *senders)
+                beside[robot] = launcher.start(f"bare-{robot}", *words).handle.pid
             source, hosts = folder / SOURCE, Hosts(launcher, endpoints)
             source.write_text(read.text, encoding="utf-8")
             context = CaseContext(plan, case, folder, source, endpoints, launcher, hosts)
             result = Conductor(context, look).run()
     assert result.ready_s is not None
     pose_hz, body_hz = experiment.rates.pose_hz, experiment.rates.body_hz
-    yield Figure(
-        "process", f"{len(experiment.robots)} robots ready after", result.ready_s, "s", result.ready_s / 3.0, "× 3 s"
-    )
-    of_robots, of_bare = robots.shares(), bare.shares()
-    cpu = statistics.median(of_bare.values())
-    yield Figure("process", f"CPU of a bare process ({pose_hz:g} Hz pose)", cpu, "% of a core", 1.0, "yardstick")
+    ready, of_robots, of_bare = result.ready_s, robots.shares(), bare.shares()
     rates = {name: (last[name].sent - first[name].sent) / (last[name].stamp - first[name].stamp) for name in of_robots}
     ratio = statistics.median(of_robots[name] / rates[name] * pose_hz / of_bare[name] for name in rates)
-    cpu, of = statistics.median(of_robots.values()), "× bare process, each pose"
-    yield Figure("process", f"CPU of a robot ({pose_hz:g} Hz pose, {body_hz:g} Hz body)", cpu, "% of a core", ratio, of)
+    cpu_bare, cpu = (statistics.median(shares.values()) for shares in (of_bare, of_robots))
     memory, of_robot = (statistics.median(meter.pss_mb.values()) for meter in (bare, robots))
-    yield Figure("process", "memory of a bare process (PSS)", memory, "MB", 1.0, "yardstick")
-    yield Figure("process", "memory of a robot (PSS)", of_robot, "MB", of_robot / memory, "× bare process")
     missed = 100.0 * sum(s.missed for s in last.values()) / sum(s.ticks for s in last.values())
-    yield Figure("process", "missed deadlines", missed, "%", missed, "× 1 %")
+    robot = f"CPU of a robot ({pose_hz:g} Hz pose, {body_hz:g} Hz body)"
+    for figure in (
+        (f"{len(experiment.robots)} robots ready after", ready, "s", ready / 3.0, "× 3 s"),
+        (f"CPU of a bare process ({pose_hz:g} Hz pose)", cpu_bare, "% of a core", 1.0, "yardstick"),
+        (robot, cpu, "% of a core", ratio, "× bare process, each pose"),
+        ("memory of a bare process (PSS)", memory, "MB", 1.0, "yardstick"),
+        ("memory of a robot (PSS)", of_robot, "MB", of_robot / memory, "× bare process"),
+        ("missed deadlines", missed, "%", missed, "× 1 %"),
+    ):
+        yield Figure("process", *figure)

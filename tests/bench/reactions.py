@@ -1,12 +1,8 @@
 """Reaction times of robots: to an emergency stop, to a neighbour that was killed, to one that hangs.
 
 Twenty robots run as processes of their own. The command to cut the motors is stamped where the body obeys it, by the
-monotonic clock by which the stop was sent: for twins in the robot's own process (`tests.reliability.spoilt_process`),
-as for a device that is driven from there; for external bodies here, for the bench is their far end. The knowledge of a
-death is stamped when a status, which names the missing neighbours, arrives here: one way over the router more than the
-robot itself needs.
-
-Messages are stamped in callbacks of Zenoh's own threads, not in a loop.
+clock by which the stop was sent: for twins in the robot's process, for external bodies here. The knowledge of a death
+is stamped when a status arrives here: one way over the router more than the robot needs. Callbacks of Zenoh stamp.
 """
 
 from __future__ import annotations
@@ -65,18 +61,15 @@ def safety() -> Iterator[Figure]:
     pings: list[float] = []
     taken: dict[str, list[float]] = {what: [] for what in LIMITS_S}
     wrong = 0
-    for body in BODIES * STOPS:
+    deaths = [("killed", signal.SIGKILL)] * KILLED + [("frozen", signal.SIGSTOP)] * FROZEN
+    for number, body in enumerate((*BODIES * STOPS, *BODIES[:1] * DEATHS)):
         with _running(body) as park:
             pings += park.pings()
-            taken[f"emergency stop until motors off, {body}"] += park.stop()
-            wrong += park.wrong()
-    for _ in range(DEATHS):
-        with _running() as park:
-            pings += park.pings()
-            # every second robot at most: both neighbours of each dead robot must live to notice
-            for number, row in enumerate(range(0, 2 * (KILLED + FROZEN), 2)):
-                what, cause = ("killed", signal.SIGKILL) if number < KILLED else ("frozen", signal.SIGSTOP)
-                taken[f"neighbour {what} until known"] += park.lose(row, cause)
+            if number < len(BODIES) * STOPS:
+                taken[f"emergency stop until motors off, {body}"] += park.stop()
+            else:  # of every second robot at most: both neighbours of each must live to notice
+                for row, (what, cause) in enumerate(deaths):
+                    taken[f"neighbour {what} until known"] += park.lose(2 * row, cause)
             wrong += park.wrong()
     empty = statistics.median(pings)
     yield from _figures("an empty way over the router", pings, empty, empty, "yardstick")
@@ -103,20 +96,20 @@ def _figures(what: str, taken: Sequence[float], empty: float, wanted: float, of:
 
 def ring(count: int, body: str) -> Plan:
     """Robots on wheels in a ring, each listening to the one before and the one behind, all with such a body."""
-    names = [f"R{k:03}" for k in range(count)]
     radius = 0.5 * SPACING / sin(pi / count)
-    turns = [2.0 * pi * k / count for k in range(count)]
     size = 2.0 * radius + 2.0
+    robots = {}
+    for k in range(count):
+        place = [radius * cos(2.0 * pi * k / count), radius * sin(2.0 * pi * k / count)]
+        robots[f"R{k:03}"] = RobotTable(kind="khepera4", start=place, body=body, sensors=[])
+    pairs = zip(robots, [*list(robots)[1:], "R000"], strict=True)
     return Plan.made(
         title="a ring",
-        robots={
-            name: RobotTable(kind="khepera4", start=[radius * cos(turn), radius * sin(turn)], body=body, sensors=[])
-            for name, turn in zip(names, turns, strict=True)
-        },
+        robots=robots,
         duration_s=600.0,
         arena=Arena(size=(size, size, 2.0)),
         rates=Rates(state_hz=10.0),
-        formation=Formation(links={f"{a} - {b}": SPACING for a, b in zip(names, [*names[1:], names[0]], strict=True)}),
+        formation=Formation(links={f"{a} - {b}": SPACING for a, b in pairs}),
         trigger={"kind": "periodic", "period_s": 0.1},
     )
 
@@ -133,7 +126,7 @@ def places(endpoint: str, realm: str, starts: Mapping[str, Sequence[float]]) -> 
 
 
 @contextmanager
-def _running(body: str = BODIES[0]) -> Iterator[_Park]:
+def _running(body: str) -> Iterator[_Park]:
     """A run of the ring, all robots running."""
     with ExitStack() as stack:
         park = _Park(stack, body)

@@ -1,7 +1,5 @@
 """The parts of the benchmarks that are no timings: the law, the dialogue with a simulator, the tables, processes."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -47,20 +45,6 @@ def test_zenpark_counts_its_agent_steps():
     assert found["cpu_s"] > 0.0
 
 
-def test_compiled_flights_are_longer():
-    assert peers.duration_s(peers.WHEELS, 7) == 10.0
-    assert peers.duration_s(peers.COMPILED_WHEELS, 7) == 300.0
-    assert peers.duration_s(peers.COMPILED_WHEELS, 1000) == 10.0
-
-
-@pytest.mark.nightly
-def test_failed_install_names_the_first_error(monkeypatch):
-    monkeypatch.setenv("PIP_NO_INDEX", "1")
-    monkeypatch.delenv("PIP_FIND_LINKS", raising=False)
-    text = peers.report(["gym-pybullet-drones"], sizes=[3], rounds=1)
-    assert "gym-pybullet-drones cannot be installed: ERROR" in text
-
-
 def test_ended_process_gives_its_last_words(monkeypatch):
     monkeypatch.setattr(peers, "DRIVERS", "tests.bench.missing")
     with pytest.raises(peers.Failed, match=r"7 robots: .*tests\.bench\.missing"):
@@ -91,14 +75,7 @@ def test_page_has_places_for_the_tables():
         renewal.renewed(page, {"other": ""})
 
 
-def test_simulators_are_run_by_drivers_of_their_own():
-    folder = renewal.PAGE.parents[2] / "tests" / "bench" / "drivers"
-    drivers = {file.stem.removeprefix("peer_") for file in folder.glob("peer_*.py")}
-    assert drivers == {*peers.OTHERS, "zenpark"} - {"gym-pybullet-drones"}
-    assert subprocess.run(["grep", "-rlE", r"^\s*(from|import) vmas", folder], check=False).returncode == 1
-
-
-def test_what_another_process_spends_is_read_exactly() -> None:
+def test_what_another_process_spends_is_read_exactly():
     before = usage_of(os.getpid())
     begun = time.process_time()
     while time.process_time() < begun + 0.05:
@@ -110,7 +87,7 @@ def test_what_another_process_spends_is_read_exactly() -> None:
     assert after.rss_mb > 1.0
 
 
-def test_a_process_that_has_ended_is_left_out() -> None:
+def test_a_process_that_has_ended_is_left_out():
     over = subprocess.Popen([sys.executable, "-c", "pass"])
     over.wait()
     meter = Meter()

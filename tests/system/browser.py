@@ -1,13 +1,10 @@
 """Chromium as a test drives it: a page of the view, the requests that it makes, and the scene that arrives in it."""
 
-import os
 import shutil
-import time
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 
 import msgspec
 import numpy as np
-import psutil
 import pytest
 import zstandard
 
@@ -134,40 +131,8 @@ class Page:
             self.page.wait_for_timeout(50)
             left -= 0.05
 
-    def frames_per_second(self, seconds=2.0):
-        """Frames that the page draws."""
-        script = """seconds => new Promise(resolve => {
-            let count = 0; const begun = performance.now();
-            const frame = now => {
-                count += 1;
-                now - begun > 1000 * seconds ? resolve(count / (now - begun) * 1000) : requestAnimationFrame(frame);
-            };
-            requestAnimationFrame(frame);
-        })"""
-        return float(self.page.evaluate(script, seconds))
-
-    def frames_alone(self):
-        """Frames a second that the page draws where nothing else needs the processors: more than it draws here.
-
-        Without a graphics card all of the drawing is done by the processors, as many at once as there are.
-        """
-        before, begun = _processor_s(), time.monotonic()
-        rate = self.frames_per_second()
-        worked = (_processor_s() - before) / (time.monotonic() - begun)  # processors
-        return rate * max(1.0, (os.cpu_count() or 1) / worked)
-
     def button(self, text):
         return self.page.get_by_role("button", name=text)
-
-
-def _processor_s():
-    """Processor time of the browser of this process [s]."""
-    total = 0.0
-    for child in psutil.Process().children(recursive=True):
-        with suppress(psutil.NoSuchProcess):
-            if "chrom" in child.name():
-                total += sum(child.cpu_times()[:2])
-    return total
 
 
 def _array(value, arrays):
@@ -179,18 +144,14 @@ def _array(value, arrays):
 
 
 @contextmanager
-def opened(address, width=900, height=600, *, drawn=False):
-    """A page in a browser of its own; its scene is `drawn` as often as the browser can, or has no pixels at all.
-
-    An address may be waited for while the browser starts.
-    """
+def opened(address, width=900, height=600):
+    """A page in a browser of its own, whose scene has no pixels; an address may be waited for while it starts."""
     playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright")
     with playwright.sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=CHROMIUM, headless=True, args=list(FLAGS))
         try:
             page = Page(browser.new_page(viewport={"width": width, "height": height}))
-            if not drawn:
-                page.page.add_init_script(BLIND)
+            page.page.add_init_script(BLIND)
             page.page.goto(address if isinstance(address, str) else address(), wait_until="commit")
             yield page
         finally:

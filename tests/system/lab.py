@@ -20,7 +20,7 @@ from agents.network import session as network
 from agents.network.keys import Keys
 from experiments.file import catalogue
 from experiments.real_time.conductor import orders
-from experiments.run import reopen
+from experiments.recording import playback
 from tests import commands
 from tests.commands import GUARD, ROOT, environment
 from tests.waiting import PATIENCE_S, until
@@ -28,10 +28,8 @@ from tools.commands.run import SPOILED
 
 ENVIRONMENT = environment()
 # Robots of the reference experiment begin within some 0.3 m of where the formation ends up, which takes half the time.
-NEAR = [
-    "robots.KH01.start=[-0.6, 0.0]", "robots.KH02.start=[0.2, 0.0]", "robots.KH03.start=[0.2, 0.8]",
-    "robots.CF01.start=[-0.5, 0.2]", "robots.CF02.start=[0.2, 0.2]",
-]  # fmt: skip
+PLACES = {"KH01": [-0.6, 0.0], "KH02": [0.2, 0.0], "KH03": [0.2, 0.8], "CF01": [-0.5, 0.2], "CF02": [0.2, 0.2]}
+NEAR = [f"robots.{name}.start={place}" for name, place in PLACES.items()]
 TRIANGLE = ("KH01", "KH02", "CF01")
 # The same of the triangle, whose drone is also soon up and down.
 NEAR_TRIANGLE = [
@@ -68,10 +66,6 @@ def typed(file, topic):
 class Looking:
     """Something that takes in what is said whenever it looks."""
 
-    def look(self):
-        """Takes in what came since the last look."""
-        raise NotImplementedError
-
     def until(self, true, what, limit_s=PATIENCE_S):
         """Looks until something is true; while it asks for a robot that has said nothing yet, it is not."""
 
@@ -90,21 +84,18 @@ class Watcher(Looking):
     def __init__(self, *endpoints):
         self.keys = Keys()
         self.session = network.open_session(endpoints, name="test", identity="operator")
-        self._statuses = pubsub.pose_subscriber(self.session, self.keys.status("*"), 4096)
-        self._states = pubsub.subscriber(self.session, self.keys.state("*"), 8192)
+        statuses = pubsub.pose_subscriber(self.session, self.keys.status("*"), 4096)
+        states = pubsub.subscriber(self.session, self.keys.state("*"), 8192)
+        self._statuses = pubsub.Inbox(statuses, messages.Status)
+        self._states = pubsub.Inbox(states, messages.State)
         self._alive = pubsub.AliveWatch(self.session, self.keys.alive("*"))
         self.status = {}
         self.state = {}
         self.alive = set()
 
     def look(self):
-        for sample in network.received(self._statuses.handler):
-            status = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Status)
-            self.status[status.robot] = status
-        for sample in network.received(self._states.handler):
-            with contextlib.suppress(messages.Malformed):  # a test may say nonsense on any key
-                state = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.State)
-                self.state[state.robot] = state
+        self.status |= {status.robot: status for status in self._statuses.read()}
+        self.state |= {state.robot: state for state in self._states.read()}
         for sample in network.received(self._alive.handler):
             robot = self.keys.whose(str(sample.key_expr)) or ""  # a test may hold a token on any key
             (self.alive.discard if sample.kind == zenoh.SampleKind.DELETE else self.alive.add)(robot)
@@ -149,15 +140,9 @@ class Started:
     patience_s = 40.0  # for its end
 
     def __init__(self, module, *arguments):
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", module, *arguments],
-            cwd=ROOT,
-            env=ENVIRONMENT,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-        )
+        streams = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+        command = [sys.executable, "-m", module, *map(str, arguments)]
+        self.process = subprocess.Popen(command, cwd=ROOT, env=ENVIRONMENT, text=True, **streams)
 
     def __enter__(self):
         return self
@@ -200,19 +185,18 @@ class RobotProcess(Started):
 
     def __init__(self, endpoint, file, *names, lifeline=False):
         more = ["--lifeline"] if lifeline else []
-        super().__init__("experiments.real_time.processes.robot", str(file), *names, "--connect", endpoint, *more)
+        super().__init__(ROBOT, str(file), *names, "--connect", endpoint, *more)
 
 
 class WorldProcess(Started):
     """`./zenpark world serve`, whose first line is `ready`."""
-
-    patience_s = 40.0
 
     def __init__(self, endpoint, file, *arguments):
         super().__init__("experiments.real_time.processes.world", str(file), "--connect", endpoint, *arguments)
         self.ready = self.process.stdout.readline().strip()
 
 
+ROBOT = "experiments.real_time.processes.robot"
 ROLES = {
     "experiments.real_time.processes.zygote": "zygote",
     "agents.runtime.router": "router",
@@ -231,16 +215,10 @@ class Flight:
         self.folder = folder
         words = words if report else (*words, "--no-report")
         self._errors = (folder.parent / f"{folder.name}.stderr").open("w+")
-        self.process = subprocess.Popen(
-            [sys.executable, *GUARD, "run", str(file), "--out", str(folder), *options(*words)],
-            cwd=ROOT,
-            env={**ENVIRONMENT, "PATH": os.environ["PATH"]},  # a test may put an ssh of its own there
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=self._errors,
-            text=True,
-            start_new_session=True,
-        )
+        command = [sys.executable, *GUARD, "run", str(file), "--out", str(folder), *options(*words)]
+        streams = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": self._errors}
+        variables = {**ENVIRONMENT, "PATH": os.environ["PATH"]}  # a test may put an ssh of its own there
+        self.process = subprocess.Popen(command, cwd=ROOT, env=variables, text=True, start_new_session=True, **streams)
 
     def children(self):
         """The processes that it started, by robot name, "zygote", "router", "recorder", "world", "centre"."""
@@ -250,11 +228,10 @@ class Flight:
                 line = child.cmdline()
             except (psutil.NoSuchProcess, psutil.ZombieProcess):
                 continue
-            if "experiments.real_time.processes.robot" in line:
-                for name in line[line.index("experiments.real_time.processes.robot") + 2 : line.index("--connect")]:
-                    found[name] = child
-            else:
-                found |= {role: child for module, role in ROLES.items() if module in line}
+            names = [role for module, role in ROLES.items() if module in line]
+            if ROBOT in line:
+                names = line[line.index(ROBOT) + 2 : line.index("--connect")]
+            found |= dict.fromkeys(names, child)
         return found
 
     def endpoint(self):
@@ -275,6 +252,10 @@ class Flight:
         with contextlib.suppress(AssertionError):
             until(said_or_over, pattern, limit_s)
         assert re.search(pattern, self.said()), f"{pattern!r} not said, but:\n{self.said()}\n{self.logs()}"
+
+    def read(self, case="event"):
+        """The recording of a case."""
+        return playback.read(self.folder / f"{case}.mcap")
 
     def logs(self):
         """Output of the processes."""
@@ -323,8 +304,7 @@ def transmits_at_50_hz(trace):
 
 def assert_held_in_time(flight, case, stopped):
     """Robots of a finished run held once because the router froze at `stopped` [s, UTC], as each recorded it itself."""
-    run = reopen(flight.folder)
-    trace = run.traces[case]
+    trace = flight.read(case).trace
     said = [event.text for event in trace.events if event.source == "conductor"]
     assert sum("no router answers" in text for text in said) == 1
     for name in trace.plan.experiment.robots:

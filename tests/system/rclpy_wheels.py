@@ -12,11 +12,7 @@ import sys
 from pathlib import Path
 
 MESSAGES = ("geometry", "sensor", "nav", "diagnostic")
-WHEELS = (  # ROS 2 Kilted
-    "ros-rclpy==9.1.2",
-    "ros-rmw-fastrtps-cpp==9.3.3",
-    *(f"ros-{name}-msgs==5.5.1" for name in MESSAGES),
-)
+WHEELS = ("ros-rclpy==9.1.2", "ros-rmw-fastrtps-cpp==9.3.3", *(f"ros-{name}-msgs==5.5.1" for name in MESSAGES))
 NAME = f"rclpy-9.1.2-cp{sys.version_info.major}{sys.version_info.minor}"
 CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "zenpark" / NAME
 PYTHON = CACHE / "ros" / "bin" / "python"
@@ -53,9 +49,8 @@ def install():
 def _install():
     pip = ["-m", "pip", "install", "--quiet", "--prefer-binary", "--retries", "1", "--timeout", "20", *WHEELS]
     for command in ([sys.executable, "-m", "venv", str(CACHE / "ros")], [str(PYTHON), *pip]):
-        done = subprocess.run(
-            command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False, errors="replace"
-        )
+        streams = {"stdin": subprocess.DEVNULL, "capture_output": True, "text": True, "errors": "replace"}
+        done = subprocess.run(command, check=False, **streams)
         if done.returncode:
             return " | ".join((done.stderr or done.stdout).strip().splitlines()[-2:]) or "the installation failed"
     return ""

@@ -9,7 +9,6 @@ import pytest
 
 from agents.network import messages, pubsub
 from agents.network.keys import Keys
-from experiments.recording import playback
 from experiments.run import reopen
 from tests.commands import python
 from tests.system.lab import Flight, RobotProcess, Started, Watcher, gone, until
@@ -60,10 +59,10 @@ def test_robots_hold_while_the_centre_is_dead(tmp_path):
     out = flight.interrupt()
     until(lambda: gone(everyone), "nothing is left")
 
-    trace = playback.read(folder / "default.mcap").trace
+    trace = flight.read("default").trace
     run = reopen(folder)
     case = run.metrics["default"]
-    died = killed - playback.read(folder / "default.mcap").started
+    died = killed - flight.read("default").started
     back = trace.goals.sent.stamp[trace.goals.sent.stamp > died + 0.15].min()  # of the centre that was started again
     assert back - died > 0.2
     # they hold at the decision after they noticed it: a moment later, or many where the machine is loaded

@@ -66,7 +66,7 @@ def test_drone_with_low_battery_lands_and_others_continue(tmp_path):
     flight.until_said(r"hazard CF01: land: its battery is low: 98% \(limit 98%\)")
     assert flight.finish()[0] == 1
     assert "zenpark: Failed in event: CF01 at " in flight.said()
-    played = playback.read(folder / "event.mcap")
+    played = flight.read()
     trace = played.trace
     said = [pose.position[2] for pose in typed(folder / "event.mcap", "/CF01/pose") if pose.stamp > played.started]
     hover = trace.plan.experiment.robots["CF01"].hover
@@ -140,7 +140,7 @@ def test_every_run_of_the_machine_ends_with_reason(two_cases_file, tmp_path, cap
         assert "second: " not in each.said()
         assert [recording.name for recording in each.folder.glob("*.mcap")] == ["first.mcap"]
     assert run_registry.runs() == []
-    trace = playback.read(flight.folder / "first.mcap").trace
+    trace = flight.read("first").trace
     assert ("stop", "conductor") in {(event.kind, event.source) for event in trace.events}
     ends = {event.source: event.text for event in trace.events if event.kind == "robot" and "done" in event.text}
     assert ends["CF01"] == "done: emergency stop by operator: zenpark estop"

@@ -10,7 +10,6 @@ import pytest
 
 from experiments.metrics.measure import measure
 from experiments.real_time.hosts.launcher import LAND_S
-from experiments.recording import playback
 from tests.commands import GUARD, ROOT, environment
 from tests.requests import request
 from tests.system.lab import NEAR, Flight, assert_formed, gone, until
@@ -41,7 +40,7 @@ def test_the_reference_experiment_flies_behind_real_bridges(tmp_path):
     assert all(robot["lost"] == 0 for robot in robots.values())
     followers = {name: robot for name, robot in robots.items() if name != "TB01"}
     assert all(robot["acquired_s"] is not None for robot in followers.values()), followers
-    trace = playback.read(folder / "event.mcap").trace
+    trace = flight.read().trace
     assert np.isfinite(trace.true_position).all(axis=(1, 2)).mean() > 0.98, "the truth is known"
     heights = trace.true_position[trace.time > 5.0][:, 4:, 2]
     assert np.abs(heights - 0.8).max() < 0.1
@@ -83,7 +82,7 @@ def test_twins_shadow_a_crazyflie_and_a_khepera(tmp_path):
     code, out = flight.finish()
     assert code == 0, flight.said()
     assert json.loads(out)["cases"]["periodic"]["collisions"] == 0
-    trace = playback.read(folder / "periodic.mcap").trace
+    trace = flight.read("periodic").trace
     known = np.isfinite(trace.shadow_position).all(axis=2).mean(axis=0)
     assert known.tolist() == [pytest.approx(1.0, abs=0.05), 0.0, pytest.approx(1.0, abs=0.05)]
     khepera, none, crazyflie = (robot.shadow for robot in measure(trace).robots)

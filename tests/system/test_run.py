@@ -198,7 +198,7 @@ def test_receivers_lose_what_the_virtual_network_loses(tmp_path):
     robots = json.loads(out)["cases"]["periodic"]["robots"]
     assert [robot["lost"] for robot in robots.values()] == [0, 0, 0], "of the real network nothing is lost"
 
-    real, other = playback.read(folder / "periodic.mcap").trace, virtual(15.0)
+    real, other = flight.read("periodic").trace, virtual(15.0)
     transmits_at_50_hz(real)
     shares, sent = [], 0
     net = real.plan.pose_links
@@ -222,15 +222,14 @@ def test_receivers_lose_what_the_virtual_network_loses(tmp_path):
 def test_centre_communicates_over_the_same_network(tmp_path):
     folder = tmp_path / "run"
     flight = Flight(folder, "triangle", "--case", "periodic", *BAD, "duration_s=4", "architecture=centralised")
-    code, _ = flight.finish()
-    assert code == 0, flight.said
+    assert flight.finish()[0] == 0, flight.said
     case = reopen(folder).metrics["periodic"]
     centre = case.guidance
     assert case.lost == 0, "of the real network nothing is lost"
     sent = sum(robot.messages for robot in case.robots)
     assert centre.poses_lost / sent == pytest.approx(0.3, abs=0.07)
     assert centre.goals_lost / centre.goals == pytest.approx(0.3, abs=0.15)
-    goals = playback.read(folder / "periodic.mcap").trace.goals
+    goals = flight.read("periodic").trace.goals
     assert goals.delay.min() >= 0.1 - 1e-5, "both ways"
 
 
@@ -242,8 +241,7 @@ def test_robots_agree_on_an_average_in_real_time(tmp_path):
     """With a fifth of the messages lost, in two processes of three robots."""
     groups = [f"robots.KH0{number}.process={'odd' if number % 2 else 'even'}" for number in range(1, 7)]
     flight = Flight(tmp_path / "run", "average", "--case", "event-loss", *groups, "duration_s=9")
-    code, _ = flight.finish(120.0)
-    assert code == 0, flight.said()
+    assert flight.finish(120.0)[0] == 0, flight.said()
     file = tmp_path / "run" / "event-loss.mcap"
     trace = playback.read(file).trace
     end = trace.memory["x"][-5, :, 0]

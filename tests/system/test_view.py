@@ -1,10 +1,8 @@
 """The view in a browser: robots that move in the page, the emergency stop, an observer's page, replay, many robots."""
 
-import itertools
 import json
-import threading
 import time
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from functools import partial
 
 import numpy as np
@@ -13,15 +11,10 @@ import pytest
 from agents.decision.lifecycle import PAUSED
 from agents.network import messages, pubsub
 from agents.network.endpoints import free_endpoint
-from experiments.definition.experiment import Arena
-from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.run import simulate
-from experiments.scene.stage import Condition, SceneModel
 from experiments.view import acting
 from tests.commands import zenpark
-from tests.experiments import moments
-from tests.small import small
 from tests.system.browser import needs_chromium, opened
 from tests.system.lab import NEAR, Flight, RobotProcess, Started, in_lab, typed
 
@@ -223,43 +216,3 @@ def test_slider_moves_robots_to_recorded_places(tmp_path):
         before = drawn_places(page, root="/case0")
         page.until(lambda: np.any(drawn_places(page, root="/case0") != before), "it plays")
         assert page.hosts == {f"127.0.0.1:{view.port}"}
-
-
-def test_hundred_robots_are_drawn_at_twenty_frames():
-    from experiments.view.live import Page  # noqa: PLC0415 - viser may be missing
-    from experiments.view.serving import served  # noqa: PLC0415
-
-    names = [f"R{k}" for k in range(100)]
-    links = {f"{one} > {other}": 1.0 for one, other in itertools.pairwise(names)}
-    crowd = small({name: ("khepera4", "crazyflie")[k % 2] for k, name in enumerate(names)}, links,
-                  arena=Arena(size=(12.0, 12.0, 3.0)))  # fmt: skip
-    stage = SceneModel.of_plan(Plan(crowd))
-    over, moment = threading.Event(), moments.unknown(stage)
-    grid = np.array([[k % 10 - 4.5, k // 10 - 4.5, 0.6 * (k % 2)] for k in range(100)])
-    moment.condition[:], moment.yaw[:] = Condition.ACTIVE, 0.0
-
-    def move():
-        step = 0
-        while not over.wait(1.0 / 30.0):
-            step += 1
-            moment.position = grid + 0.2 * np.sin(0.1 * step)
-            moment.goal, moment.error = grid, np.full(len(stage.links), 0.03)
-            ages = 0.1 * (step - 3.0 * np.arange(30))
-            moment.trail = grid[:, None] + 0.2 * np.sin(ages)[None, :, None]
-            with server.atomic():
-                shown.drawing.draw(moment, trails=step % 6 == 0)
-
-    moving = threading.Thread(target=move)
-    with served(int(free_endpoint(preferred_port=0).rpartition(":")[2]), dark=False) as server, ExitStack() as stack:
-        shown = Page(server, dark=False)
-        shown.begin(stage)
-        moving.start()
-        stack.callback(moving.join)
-        stack.callback(over.set)
-        page = stack.enter_context(opened(server.address, 480, 320, drawn=True))
-        page.until(lambda: "/case/robots/crazyflie/body" in page.nodes, "drawn")
-        page.until(lambda: np.all(page.positions("/case/robots/crazyflie/body")[:, 2] > -1.0), "seen")
-        rates = []
-        while len(rates) < 8 and max(rates, default=0.0) < 20.0:
-            rates.append(page.frames_alone())
-        assert max(rates) >= 20.0, rates

@@ -53,11 +53,7 @@ class NotBuilt(Exception):
 
 
 def folder():
-    """The folder with `zenohd` and its plugins: on PATH, or built before.
-
-    Raises:
-        NotBuilt: If there is none.
-    """
+    """The folder with `zenohd` and its plugins: on PATH, or built before."""
     if (found := shutil.which("zenohd")) is not None:
         return Path(found).resolve().parent
     if (BUILT / "zenohd").exists():
@@ -69,11 +65,7 @@ def folder():
 
 
 def build(jobs):
-    """Builds zenohd unless there is one; one process at a time, others wait for it.
-
-    Raises:
-        NotBuilt: If cargo is missing, crates.io is out of reach, or the build fails.
-    """
+    """Builds zenohd unless there is one; one process at a time, others wait for it."""
     with suppress(NotBuilt):
         return folder()
     if shutil.which("cargo") is None:
@@ -123,15 +115,9 @@ def _build(work, jobs):
 
 def _cargo(*arguments, where):
     """Standard output of cargo."""
+    options = {"cwd": where, "env": {**ONLINE, **os.environ}, "stdin": subprocess.DEVNULL}
     done = subprocess.run(
-        ["cargo", *arguments],
-        cwd=where,
-        env={**ONLINE, **os.environ},
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        errors="replace",
-        check=False,
+        ["cargo", *arguments], capture_output=True, text=True, errors="replace", check=False, **options
     )
     if done.returncode != 0:
         raise NotBuilt(f"cargo {arguments[0]} failed: {' | '.join(done.stderr.strip().splitlines()[-4:])}")

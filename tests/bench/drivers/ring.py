@@ -4,13 +4,10 @@ Robots stand on a circle, 0.6 m apart; each knows the offsets to the robot befor
 the consensus on offsets of Oh, Park and Ahn (Automatica 53, 2015), one numpy expression for all robots.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import sys
 import time
-from collections.abc import Callable
 
 import numpy as np
 
@@ -69,7 +66,7 @@ def link_error(position):
     return float(np.linalg.norm(lacking - np.roll(lacking, 1, axis=0), axis=1).mean())
 
 
-def serve(start: Callable, version: str, step_s: float = STEP_S) -> None:
+def serve(start, version, step_s=STEP_S):
     """Measure a loop of steps each time a line arrives on standard input, until that ends.
 
     Args:
@@ -104,7 +101,7 @@ def serve(start: Callable, version: str, step_s: float = STEP_S) -> None:
     answer(measure, version, step_s)
 
 
-def answer(measure: Callable, version: str, step_s: float) -> None:
+def answer(measure, version, step_s):
     """Write what is measured as a line of JSON, once ready and then for each line read."""
     out = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # what libraries print goes elsewhere
