@@ -41,7 +41,8 @@ def test_a_killed_router_holds_nobody_up(tmp_path):
     with Watcher(other) as watcher:
         watcher.until(lambda: len(watcher.state) == 3 == len(watcher.alive), "robots at one are seen at the other")
         children = psutil.Process(flight.process.pid).children()
-        (first,) = (each for each in children if "agents.runtime.router" in (line := each.cmdline()) and one in line)
+        lines = {tuple(each.cmdline()): each for each in children}
+        (first,) = (each for line, each in lines.items() if f"--listen {one}" in " ".join(line))
         first.kill()
         told = {name: state.seq for name, state in watcher.state.items()}
         watcher.until(lambda: all(watcher.state[name].seq > told[name] + 10 for name in told), "all go on")
@@ -124,7 +125,7 @@ def test_run_continues_at_second_router_while_first_freezes(patient_router, tmp_
 MESH = "network.topology=mesh"
 
 
-def linked_members(children, ports):
+def linked_members(children, {port: name for port, name in ports.items() if name in hears}):
     """Robots -> members that their processes are linked with by a connection, by the ports at which these listen."""
     linked = {name: set() for name in ports.values()}
     for name, near in linked.items():
