@@ -125,7 +125,7 @@ def test_run_continues_at_second_router_while_first_freezes(patient_router, tmp_
 MESH = "network.topology=mesh"
 
 
-def linked_members(children, {port: name for port, name in ports.items() if name in hears}):
+def linked_members(children, ports):
     """Robots -> members that their processes are linked with by a connection, by the ports at which these listen."""
     linked = {name: set() for name in ports.values()}
     for name, near in linked.items():
@@ -144,7 +144,7 @@ def test_the_reference_experiment_without_a_router(tmp_path, capsys):
     children = flight.children()
     assert "router" not in children
     hears = access_rights.senders_by_receiver(load("robotic-park").plan)
-    linked = linked_members(children, ports)
+    linked = linked_members(children, {port: name for port, name in ports.items() if name in hears})
     for name, heard in hears.items():
         assert linked[name] == heard | {other for other in hears if name in hears[other]}, name
 
