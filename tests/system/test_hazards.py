@@ -1,6 +1,5 @@
 """Hazards of real processes: robots notice them, hang, are stopped; all come down, and the run says why."""
 
-import json
 import os
 import re
 import signal
@@ -10,14 +9,11 @@ import pytest
 import zenoh
 
 from agents.network import messages, pubsub
-from agents.network import session as network
 from experiments.real_time.conductor.orders import EmergencyStop
 from experiments.real_time.hosts import run_registry
-from experiments.recording import playback
 from tests.commands import ROOT
 from tests.system.lab import ENVIRONMENT, Flight, RobotProcess, Watcher, WorldProcess, typed
 from tools.commands import orders as order_commands
-from tools.commands import results
 
 pytestmark = pytest.mark.system
 
@@ -27,28 +23,21 @@ title = "Two that want to be nearer than they may"
 duration_s = 6.0
 trigger = "periodic"
 [robots]
-A = {{ kind = "khepera4", start = [-0.3, 0.0] }}
-B = {{ kind = "khepera4", start = [0.3, 0.0] }}
+A = { kind = "khepera4", start = [-0.3, 0.0] }
+B = { kind = "khepera4", start = [0.3, 0.0] }
 [formation]
-links = {{ "A - B" = 0.3 }}
+links = { "A - B" = 0.3 }
 [safety]
-{safety}
 """
-
-
-def pair_file(folder, safety):
-    file = folder / "pair.toml"
-    file.write_text(PAIR.format(safety=safety))
-    return file
 
 
 def test_robot_too_near_holds_and_is_reported(tmp_path):
     folder = tmp_path / "run"
-    flight = Flight(folder, pair_file(tmp_path, "separation = 0.5"))
+    flight = Flight(folder, written(tmp_path, PAIR + "separation = 0.5"))
     flight.until_said(r"hazard [AB]: hold: minimum separation: 0\.\d\d m from [AB] \(limit 0\.5 m\)")
     assert flight.finish()[0] == 0
     (file,) = folder.glob("*.mcap")
-    trace = playback.read(file).trace
+    trace = flight.read(file.stem).trace
     for name in ("A", "B"):
         begins, ends = [event.text for event in trace.events if (event.kind, event.source) == ("hazard", name)]
         assert begins.startswith("hold: minimum separation: ")
@@ -80,7 +69,7 @@ def test_drone_with_low_battery_lands_and_others_continue(tmp_path):
 @pytest.mark.mechanism("hazard: conductor lost")
 def test_robots_without_conductor_end_if_file_says_so(router, watcher, tmp_path):
     token = pubsub.alive_token(watcher.session, watcher.keys.conductor)
-    with RobotProcess(router.endpoint, pair_file(tmp_path, 'lost_conductor = "land"'), "A", "B"):
+    with RobotProcess(router.endpoint, written(tmp_path, PAIR + 'lost_conductor = "land"'), "A", "B"):
         watcher.take_off("A", "B")
         token.undeclare()
         watcher.until_all("done", "A", "B")
@@ -97,36 +86,31 @@ duration_s = 90.0
 [robots]
 CF01 = { kind = "crazyflie", start = [-0.3, 0.0], hover = 0.5 }
 KH01 = { kind = "khepera4", start = [0.3, 0.0] }
-[formation]
-gain = 1.0
 [formation.links]
 "CF01 - KH01" = 0.8
-[cases.first]
-trigger = { kind = "periodic", period_s = 0.02 }
-[cases.second]
-trigger = { kind = "send-on-delta", threshold = 0.01 }
+[cases]
+first.trigger = { kind = "periodic", period_s = 0.02 }
+second.trigger = { kind = "send-on-delta", threshold = 0.01 }
 """
 
 
-@pytest.fixture
-def two_cases_file(tmp_path):
-    made = tmp_path / "two.toml"
-    made.write_text(TWO_CASES)
-    return made
+def written(folder, text):
+    file = folder / "x.toml"
+    file.write_text(text)
+    return file
 
 
 @pytest.mark.timeout(120)
-def test_every_run_of_the_machine_ends_with_reason(two_cases_file, tmp_path, capsys):
-    flight = Flight(tmp_path / "run", two_cases_file)
+def test_every_run_of_the_machine_ends_with_reason(tmp_path, capsys):
+    file = written(tmp_path, TWO_CASES)
+    flight = Flight(tmp_path / "run", file)
     flight.until_flown()
-    other = Flight(tmp_path / "other", two_cases_file)
+    other = Flight(tmp_path / "other", file)
     other.until_flown()
     there = f"two that stay together, {flight.folder}"
     assert f"another run is up with robots of these names (CF01, KH01): {there}" in other.said()
     up = [[flight.endpoint()], [other.endpoint()]]
     assert [run.endpoints for run in run_registry.runs()] == up
-    assert results.runs(as_json=True) is None
-    assert [run["robots"] for run in json.loads(capsys.readouterr().out)] == [{"CF01": "", "KH01": ""}] * 2
     # without the default router: whoever else uses this machine has a run there
     assert order_commands.stop_all(order_commands.stops_of_all_runs(), dry_run=False, as_json=False) == 0
     assert capsys.readouterr().out.splitlines() == [
@@ -148,8 +132,9 @@ def test_every_run_of_the_machine_ends_with_reason(two_cases_file, tmp_path, cap
 
 @pytest.mark.mechanism("emergency stop of a run")
 @pytest.mark.timeout(120)
-def test_before_the_common_start_too(two_cases_file, tmp_path):
-    flight = Flight(tmp_path / "run", two_cases_file, "robots.CF01.hover=2.0", 'formation.links={"CF01 - KH01" = 2.2}')
+def test_before_the_common_start_too(tmp_path):
+    high = ("robots.CF01.hover=2.0", 'formation.links={"CF01 - KH01" = 2.2}')
+    flight = Flight(tmp_path / "run", written(tmp_path, TWO_CASES), *high)
     flight.until_said(r"ready conductor: 2 robots", 60.0)
     # not by a process: on a busy machine its start takes as long as a climb, after which comes the common start
     stop = EmergencyStop([flight.endpoint()], "park", "operator")
@@ -182,14 +167,13 @@ class Truth(Watcher):
 
     def __init__(self, endpoint):
         super().__init__(endpoint)
-        self._truths = pubsub.subscriber(self.session, self.keys.truth("*"), 4096)
+        self._truths = pubsub.Inbox(pubsub.subscriber(self.session, self.keys.truth("*"), 4096), messages.Position)
         self.place = {}
         self.heights = []  # of any robot: when [s, UTC] and how high [m] it was
 
     def look(self):
         super().look()
-        for sample in network.received(self._truths.handler):
-            truth = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Position)
+        for truth in self._truths.read():
             self.place[truth.robot] = truth
             self.heights.append((truth.stamp, truth.position[2]))
 
@@ -203,19 +187,17 @@ def watcher(router):
         yield made
 
 
-def lonely(folder, trigger=""):
-    """One Tello in a world."""
-    lonely_file = folder / "lonely.toml"
-    lonely_file.write_text(
-        f'title = "lonely"\nduration_s = 60.0\n{trigger}\n[arena]\nsize = [2.0, 2.0, 2.0]\n'
-        '[robots.TE01]\nkind = "tello"\nbody = "world"\nstart = [0.0, 0.0]\nhover = 0.6\n'
-    )
-    return lonely_file
+LONELY = """
+title = "one Tello in a world"
+duration_s = 60.0
+arena.size = [2.0, 2.0, 2.0]
+robots.TE01 = { kind = "tello", body = "world", start = [0.0, 0.0], hover = 0.6 }
+"""
 
 
 @pytest.fixture
 def lonely_file(tmp_path):
-    return lonely(tmp_path)
+    return written(tmp_path, LONELY)
 
 
 @pytest.mark.mechanism("watchdog: control loop hangs")
@@ -226,7 +208,7 @@ def test_a_loop_that_hangs_is_landed_and_said(router, watcher, tmp_path, monkeyp
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: hangs\nVersion: 1\n")
     (about / "entry_points.txt").write_text("[zenpark.triggers]\nhangs = hangs:Hangs\n")
     flag = tmp_path / "now"
-    lonely_file = lonely(tmp_path, f'trigger = {{ kind = "hangs", file = "{flag}" }}')
+    lonely_file = written(tmp_path, f'{LONELY}trigger = {{ kind = "hangs", file = "{flag}" }}')
     monkeypatch.setitem(ENVIRONMENT, "PYTHONPATH", os.pathsep.join([str(tmp_path), str(ROOT)]))
     with (
         WorldProcess(router.endpoint, lonely_file) as world,
@@ -298,20 +280,17 @@ def test_stop_behind_a_flood_of_deletions_is_obeyed(router, watcher, lonely_file
 
 
 def test_process_hanging_in_final_landing_fails_the_run(tmp_path):
-    lonely_file = tmp_path / "short.toml"
-    lonely_file.write_text(
-        'title = "short"\nduration_s = 1.5\ntrigger = { kind = "periodic" }\n'
-        '[robots.TE01]\nkind = "tello"\nstart = [0.0, 0.0]\nhover = 0.6\n'
-        '[robots.KH01]\nkind = "khepera4"\nstart = [0.5, 0.5]\n'
+    robots = (
+        'TE01 = { kind = "tello", start = [0.0, 0.0], hover = 0.6 }\nKH01 = { kind = "khepera4", start = [0.5, 0.5] }'
     )
-    flight = Flight(tmp_path / "out", lonely_file, report=True)
+    file = written(tmp_path, f'title = "short"\nduration_s = 1.5\ntrigger = "periodic"\n[robots]\n{robots}\n')
+    flight = Flight(tmp_path / "out", file, report=True)
     try:
         flight.until_said("phase conductor: landing")
         flight.children()["TE01"].suspend()
-        code, _ = flight.finish(90.0)
+        assert flight.finish(90.0)[0] == 1
     finally:
         flight.signal(signal.SIGKILL)
-    assert code == 1
     assert re.search(r"lost TE01: did not end its landing within 15 s: \w+", flight.said())
     assert "zenpark: Failed in default: TE01 at " in flight.said()
     report = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")

@@ -24,13 +24,9 @@ SPARES = """
 kind = "khepera4"
 start = [-0.7, 0.7]
 standby = true
-[spares.S1]
-kind = "crazyflie"
-start = [0.6, 0.3]
-hover = 0.6
-[spares.S2]
-kind = "khepera4"
-start = [-0.6, -0.2]
+[spares]
+S1 = { kind = "crazyflie", start = [0.6, 0.3], hover = 0.6 }
+S2 = { kind = "khepera4", start = [-0.6, -0.2] }
 
 [formation]"""
 LOW = ("robots.CF01.hover=0.3", "spares.S1.hover=0.3", "formation.gain=1.4")  # soon up, and down
@@ -70,18 +66,14 @@ class Lab:
             self.flight.signal(signal.SIGINT)
         assert self.flight.finish()[0] in (0, 130)
 
-    def close(self):
-        if hasattr(self, "watcher"):
-            self.watcher.close()
-        if hasattr(self, "flight") and self.flight.process.returncode is None:
-            self.end()
-
 
 @pytest.fixture
 def hot_lab(tmp_path):
     made = Lab(tmp_path)
     yield made
-    made.close()
+    made.watcher.close()
+    if made.flight.process.returncode is None:
+        made.end()
 
 
 def test_killed_robot_is_restarted_and_takes_part(hot_lab):

@@ -205,10 +205,8 @@ def test_robots_are_changed_by_operators_only(laboratory, who):
 def test_a_robot_hears_its_neighbours_and_nobody_else(laboratory):
     with laboratory.session("KH03") as session:
         neighbour = pubsub.pose_subscriber(session, KEYS.pose("KH01"))
-        others = [
-            pubsub.pose_subscriber(session, key)
-            for key in (KEYS.pose("KH02"), KEYS.state("KH01"), "park/*/pose", "park/**", "**", KEYS.event)
-        ]
+        keys = (KEYS.pose("KH02"), KEYS.state("KH01"), "park/*/pose", "park/**", "**", KEYS.event)
+        others = [pubsub.pose_subscriber(session, key) for key in keys]
         watches = [pubsub.AliveWatch(session, key) for key in ("park/KH02/alive", "park/*/alive", "park/**")]
         settled(laboratory)
         assert len(list(network.received(neighbour.handler))) > 10

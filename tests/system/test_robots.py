@@ -1,6 +1,7 @@
 """Robot processes started by hand: whom they hear, what they notice and survive, how they end, are watched."""
 
 import contextlib
+import itertools
 import json
 import math
 import os
@@ -18,9 +19,7 @@ import zenoh
 
 from agents.clock import Clock
 from agents.network import messages, pubsub
-from agents.network import session as network
 from agents.network.keys import Keys
-from agents.network.shutdown import leave
 from experiments.file import catalogue, document
 from experiments.file.document import load
 from experiments.run import simulate
@@ -36,10 +35,6 @@ pytestmark = pytest.mark.system
 BLOCK = zenoh.CongestionControl.BLOCK  # a stop must not be dropped where a hundred kilobytes go before it
 
 
-def robots_flying(stack, router, file, *names):
-    return stack.enter_context(RobotProcess(router.endpoint, file, *names))
-
-
 @pytest.fixture
 def low_file(tmp_path):
     """The triangle, whose drone is soon up and soon down."""
@@ -49,25 +44,14 @@ def low_file(tmp_path):
 
 
 def subscriptions(session):
-    """What each session subscribes to, by the names that it goes by in the router's admin space."""
+    """Keys that each session subscribes to, by its name: from the admin space of sessions and router."""
     found = {}
     for reply in session.get("@/*/router/subscriber/**", timeout=2.0):
-        assert reply.ok is not None
         key = str(reply.ok.key_expr).partition("/subscriber/")[2]
-        sources = json.loads(reply.ok.payload.to_string())
-        for zid in {z for group in sources.values() for z in group}:
+        for zid in itertools.chain(*json.loads(reply.ok.payload.to_string()).values()):
             found.setdefault(zid, set()).add(key)
-    return found
-
-
-def zids(session):
-    """Name of a session -> its id, from each session's own admin space."""
-    named = {}
-    for reply in session.get("@/*/client", timeout=2.0):
-        if reply.ok is not None:
-            about = json.loads(reply.ok.payload.to_string())
-            named[about["metadata"]["name"]] = about["zid"]
-    return named
+    clients = [reply.ok.payload.to_string() for reply in session.get("@/*/client", timeout=2.0) if reply.ok is not None]
+    return {about["metadata"]["name"]: found.get(about["zid"], set()) for about in map(json.loads, clients)}
 
 
 @pytest.mark.parametrize(
@@ -80,34 +64,34 @@ def test_each_robot_hears_exactly_its_neighbours(router, watcher, file):
     }
     with ExitStack() as stack:
         for name in experiment.robots:
-            robots_flying(stack, router, file, name)
+            stack.enter_context(RobotProcess(router.endpoint, file, name))
         watcher.until_all("ready", *experiment.robots)
-        known = zids(watcher.session)
         keys = subscriptions(watcher.session)
         for name, neighbours in wanted.items():
-            poses = {key for key in keys.get(known[name], set()) if key.endswith("/pose") or "/pose/" in key}
+            poses = {key for key in keys[name] if key.endswith("/pose") or "/pose/" in key}
             plain = {key for key in poses if "@adv" not in key}
             assert plain == {f"park/{neighbour}/pose" for neighbour in neighbours}, name
-            beyond = keys.get(known[name], set()) - poses
-            assert all("estop" in key or "@adv" in key for key in beyond), beyond
+            assert all("estop" in key or "@adv" in key for key in keys[name] - poses), keys[name]
 
 
 def test_late_joiner_and_restarted_robot_receive_last_poses(router, watcher):
+    def robot(name):
+        return stack.enter_context(RobotProcess(router.endpoint, "triangle", name))
+
     with ExitStack() as stack:
-        robots_flying(stack, router, "triangle", "KH01")
-        robots_flying(stack, router, "triangle", "KH02")
         for name in ("KH01", "KH02"):
-            watcher.until(lambda name=name: name in watcher.status, "it says something")
+            robot(name)
+        for name in ("KH01", "KH02"):
             watcher.until(lambda name=name: watcher.status[name].missing == ["CF01"], "two hear each other")
             assert (watcher.phase(name), watcher.status[name].reason) == ("idle", "never received CF01")
-        late = robots_flying(stack, router, "triangle", "CF01")
+        late = robot("CF01")
         watcher.until_all("ready", *TRIANGLE)
         late.kill()
         watcher.until(lambda: "CF01" not in watcher.alive, "the token is gone")
         watcher.until(lambda: watcher.status["KH01"].missing == ["CF01"], "its death is known")
         before = watcher.status["CF01"].pid
-        again = robots_flying(stack, router, "triangle", "CF01")
-        watcher.until(lambda: watcher.status["CF01"].pid not in (before,) and watcher.phase("CF01") == "ready", "back")
+        again = robot("CF01")
+        watcher.until(lambda: watcher.status["CF01"].pid != before and watcher.phase("CF01") == "ready", "back")
         assert watcher.status["CF01"].received >= 2
         watcher.until(lambda: not watcher.status["KH01"].missing, "it is heard again")
         assert again.process.poll() is None
@@ -115,8 +99,7 @@ def test_late_joiner_and_restarted_robot_receive_last_poses(router, watcher):
 
 @pytest.mark.mechanism("orders")
 def test_orders_are_answered_and_refused_with_a_reason(router, watcher, low_file):
-    with ExitStack() as stack:
-        robots_flying(stack, router, low_file, *TRIANGLE)
+    with RobotProcess(router.endpoint, low_file, *TRIANGLE):
         watcher.until_all("ready", *TRIANGLE)
         reply = watcher.order("CF01", messages.Order("start", at=time.time()))
         assert not reply.ok
@@ -151,19 +134,12 @@ def nonsense():
         *({"position": (x, 0.0, 0.0)} for x in (math.nan, math.inf, 1e6)),
         *({"velocity": (x, 0.0, 0.0)} for x in (math.nan, 1e9)),
         *({"stamp": stamp} for stamp in (math.nan, 1e300, time.time() + 3600.0)),
-        {"yaw": math.nan},
-        {"seq": -1},
-        {"robot": "CF01"},
+        *({"yaw": math.nan}, {"seq": -1}, {"robot": "CF01"}),
     ]
+    texts = (b"", os.urandom(200), b"[" * 50_000, b'{"robot": 7}', b'{"order": "dance"}', b'"text"', b"x" * 100_000)
     return [
-        (b"", messages.JSON),
-        (os.urandom(200), messages.JSON),
+        *((text, messages.JSON) for text in texts),
         (os.urandom(200), messages.MSGPACK),
-        (b"[" * 50_000, messages.JSON),
-        (b'{"robot": 7}', messages.JSON),
-        (b'{"order": "dance"}', messages.JSON),
-        (b'"text"', messages.JSON),
-        (b"x" * 100_000, messages.JSON),
         (b"\xff\xfe", "text/plain"),
         *((messages.encode(msgspec.structs.replace(honest, **each), "msgpack"), messages.MSGPACK) for each in wrong),
     ]
@@ -171,8 +147,7 @@ def nonsense():
 
 @pytest.mark.mechanism("malformed messages")
 def test_nonsense_on_every_key_is_counted_moving_nobody(router, watcher, low_file):
-    with ExitStack() as stack:
-        robots_flying(stack, router, low_file, *TRIANGLE)
+    with RobotProcess(router.endpoint, low_file, *TRIANGLE):
         watcher.take_off(*TRIANGLE)
         given = nonsense()
         expected = 2 * len(given)  # a pose and an order each
@@ -221,7 +196,7 @@ def test_a_robot_whose_starter_falls_silent_lands(router, watcher, low_file):
 @pytest.mark.mechanism("frozen neighbour")
 def test_a_killed_and_a_frozen_neighbour_are_noticed(router, watcher):
     with ExitStack() as stack:
-        robots = {name: robots_flying(stack, router, "triangle", name) for name in TRIANGLE}
+        robots = {name: stack.enter_context(RobotProcess(router.endpoint, "triangle", name)) for name in TRIANGLE}
         watcher.until_all("ready", *TRIANGLE)
         with watcher.session.liveliness().declare_token("park/**"):  # somebody who says that everybody lives ...
             watcher.until(lambda: "KH01" in watcher.state, "they go on")
@@ -241,7 +216,7 @@ def test_a_killed_and_a_frozen_neighbour_are_noticed(router, watcher):
 def test_an_emergency_stop_reaches_every_process(router, watcher):
     key = watcher.keys.estop
     with ExitStack() as stack:
-        robots = [robots_flying(stack, router, "triangle", name) for name in TRIANGLE]
+        robots = [stack.enter_context(RobotProcess(router.endpoint, "triangle", name)) for name in TRIANGLE]
         watcher.until_all("ready", *TRIANGLE)
         watcher.session.delete(key)  # no stop
         watcher.until(lambda: not any(watcher.phase(name) == "done" for name in TRIANGLE), "nobody was stopped")
@@ -277,20 +252,6 @@ def test_router_that_was_frozen_ends_when_ordered():
         until(partial(stopped, router.process.pid), "it is frozen")
         router.process.send_signal(signal.SIGCONT)
         assert router.stop() == 0
-
-
-def test_session_closes_in_time_and_live_ones_immediately(router):
-    sessions = [network.open_session([router.endpoint], name="test", lease_s=1.0) for _ in range(2)]
-    declared = [pubsub.pose_subscriber(sessions[1], Keys().status("*"))]
-    assert leave(sessions[0])
-    with router.frozen():
-        threading.Event().wait(CUT_OFF_S)
-        began = time.monotonic()
-        assert not leave(sessions[1], declared, limit_s=0.5)
-        assert time.monotonic() - began < 1.5
-    for thread in threading.enumerate():
-        if thread.name == "leaving the network":
-            thread.join(15.0)
 
 
 @pytest.mark.mechanism("emergency stop: frozen router")
