@@ -31,23 +31,6 @@ links = { "A - B" = 0.3 }
 """
 
 
-def test_robot_too_near_holds_and_is_reported(tmp_path):
-    folder = tmp_path / "run"
-    flight = Flight(folder, written(tmp_path, PAIR + "separation = 0.5"))
-    flight.until_said(r"hazard [AB]: hold: minimum separation: 0\.\d\d m from [AB] \(limit 0\.5 m\)")
-    assert flight.finish()[0] == 0
-    (file,) = folder.glob("*.mcap")
-    trace = flight.read(file.stem).trace
-    for name in ("A", "B"):
-        begins, ends = [event.text for event in trace.events if (event.kind, event.source) == ("hazard", name)]
-        assert begins.startswith("hold: minimum separation: ")
-        assert ends.startswith("unresolved at the end: minimum separation, for ")
-    last = trace.true_position[-1]
-    assert 0.4 < abs(last[0, 0] - last[1, 0]) < 0.51
-    status = typed(file, "/A/status")[-1]
-    assert [incident.text.partition(":")[0] for incident in status.incidents] == ["hold", "unresolved at the end"]
-
-
 def test_drone_with_low_battery_lands_and_others_continue(tmp_path):
     folder = tmp_path / "run"
     low = "safety.battery_low=0.985"  # it flies for 7 minutes on a charge

@@ -154,20 +154,6 @@ def test_a_spare_takes_over_a_name(hot_lab):
     assert re.search("no router answers|this run is not there", orphan.stderr)  # its port may be somebody else's by now
 
 
-def test_hand_started_robot_leaves_and_is_readmitted(router, hot_lab):
-    hot_lab.file.write_text(hot_lab.file.read_text() + f'\n[network]\nconnect = ["{router.endpoint}"]\n')
-    with RobotProcess(router.endpoint, hot_lab.file, "CF01", "--case", "event") as by_hand:
-        watcher = hot_lab.fly(endpoint=router.endpoint)
-        assert set(hot_lab.change("remove", "CF01").done) == {"CF01"}
-        assert by_hand.wait() == 0
-        assert "started from here" in hot_lab.change("restart", "CF01").refused["CF01"]
-    with RobotProcess(router.endpoint, hot_lab.file, "CF01", "--case", "event"):
-        watcher.until(lambda: "CF01" in watcher.alive and watcher.phase("CF01") == "ready", "it is back")
-        assert set(hot_lab.change("add", "CF01").done) == {"CF01"}
-        watcher.until_all("running", "CF01")
-        hot_lab.end()
-
-
 SHORT = ("--case", "event", "--json", "duration_s=2")
 
 

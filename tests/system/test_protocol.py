@@ -11,10 +11,7 @@ import pytest
 from experiments.metrics.measure import measure
 from experiments.real_time.hosts.launcher import LAND_S
 from tests.commands import GUARD, ROOT, environment
-from tests.requests import request
 from tests.system.lab import NEAR, Flight, assert_formed, gone, until
-from tests.twins.loopback import Served
-from twins.devices import khepera4
 
 pytestmark = pytest.mark.system
 
@@ -41,31 +38,6 @@ def test_the_reference_experiment_flies_behind_real_bridges(tmp_path):
     heights = trace.true_position[trace.time > 5.0][:, 4:, 2]
     assert np.abs(heights - 0.8).max() < 0.1
     assert_formed(trace, 0.05, since_s=trace.time[-1] - 1.0)
-
-
-def test_robot_that_does_not_move_fails_the_run(tmp_path):
-    """A Khepera whose server ignores `d`, and answers as one that obeys it."""
-    twin = Served(khepera4.KheperaDevice, request("khepera4", ["khepera4-twin"], device={"server": "2023-01-15"}))
-    file = tmp_path / "pair.toml"
-    with twin:
-        body = f"{twin.addresses[0]}?server=fork"
-        file.write_text(
-            f"""
-title = "A pair of which one does not move"
-duration_s = 6.0
-robots.KH01 = {{ kind = "khepera4", start = [0.8, 0.0, 0.0], body = "{body}" }}
-robots.KH02 = {{ kind = "khepera4", start = [-0.8, 0.0, 0.0] }}
-formation.links = {{ "KH01 - KH02" = 0.4 }}
-trigger = {{ kind = "periodic", period_s = 0.05 }}
-"""
-        )
-        flight = Flight(tmp_path / "run", file)
-        code, out = flight.finish()
-        assert abs(twin.truth()[0][0, 0]) < 0.001
-    assert code == 1, out + flight.said()
-    assert "hazard KH01: warn: it does not obey commands to move: 0." in flight.said()
-    assert "zenpark: Failed in default: KH01 at " in flight.said()
-    assert "error [m] KH01 0." in flight.said()
 
 
 def test_twins_shadow_a_crazyflie_and_a_khepera(tmp_path):
@@ -161,28 +133,3 @@ def test_drones_hop_through_their_bridges_under_motion_capture(tmp_path):
     assert " V under load" in drone["hop"]["found"]
     assert tello["hop"]["verdict"] == "ok"
     assert "of 0.8 m high" in tello["hop"]["found"]
-
-
-TELLO = """
-title = "a Tello whose sticks give less than it is told"
-duration_s = 20.0
-[robots.T1]
-kind = "tello"
-start = [0.0, 0.0, 0.0]
-hover = 0.8
-body = "tello-twin"
-position = "external"
-device = { twin_stick_speed = 0.6, stick_speed = SPEED }
-"""
-
-
-@pytest.mark.timeout(120)
-@pytest.mark.parametrize(("believed", "verdict"), [(1.0, "bad"), (0.6, "ok")])
-def test_sticks_of_a_tello_are_measured(tmp_path, believed, verdict):
-    """Under simulated motion capture, at a fifth of its sticks, before any loop is closed."""
-    text = TELLO.replace("SPEED", str(believed))
-    (robot,) = checked(preflight(tmp_path / "tello.toml", text, "--sticks", "--bodies", "protocol"), 0, 1)
-    sticks = robot["sticks"]
-    assert sticks["verdict"] == verdict
-    assert float(sticks["found"].split()[0]) == pytest.approx(0.6, rel=0.05)
-    assert ("stick_speed = 0." in sticks["remedy"]) == (verdict == "bad")

@@ -1,12 +1,8 @@
-"""A real ROS 2, rclpy with Fast DDS: types and CDR as it has them, and the watchdog of a TurtleBot3 under it.
-
-`tests/system/rclpy_wheels.py` installs it; where there is none, these tests are skipped and say why.
-"""
+"""A real ROS 2, rclpy with Fast DDS: types and CDR as it has them, and the watchdog of a TurtleBot3 under it."""
 
 import json
 import os
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +11,7 @@ import pytest
 from agents.network import messages
 from agents.protocols import ros2
 from bridges.ros2 import diagnostic, scan, transform
+from tests.commands import zenpark
 from tests.fuzz.targets_ros import ros_messages
 from tests.system.rclpy_wheels import APART, LOOPBACK, PYTHON, missing
 
@@ -31,10 +28,9 @@ def ask(folder, *words, given=None):
     own = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_DOMAIN_ID": "30", "ROS_LOG_DIR": str(folder)}
     own |= {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}  # shared memory stays behind when a process is killed
     path = {name: value for name, value in os.environ.items() if not name.startswith(("ROS_", "RMW_", "PYTHON"))}
-    done = subprocess.run(
-        [*APART, *LOOPBACK, str(PYTHON), str(SIDE), *words],
-        input=json.dumps(given), capture_output=True, text=True, timeout=110, env={**path, **own}, check=False,
-    )  # fmt: skip
+    command = [*APART, *LOOPBACK, str(PYTHON), str(SIDE), *words]
+    options = {"capture_output": True, "text": True, "timeout": 110, "env": {**path, **own}}
+    done = subprocess.run(command, input=json.dumps(given), check=False, **options)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
 
@@ -76,11 +72,8 @@ def test_types_and_cdr_are_those_of_rclpy(tmp_path):
 
 @pytest.mark.parametrize("kind", [ros2.TWIST, ros2.TWIST_STAMPED])
 def test_watchdog_stops_robot_of_killed_commander(tmp_path, kind):
-    printed = subprocess.run(
-        [sys.executable, "-m", "tools.guard", "turtlebot", "watchdog"], capture_output=True, check=True
-    )
     watchdog = tmp_path / "watchdog.py"
-    watchdog.write_bytes(printed.stdout)
+    watchdog.write_text(zenpark("turtlebot", "watchdog").stdout)
     answer = ask(tmp_path, "drive", kind, str(watchdog))
     speeds = answer["killed"]
     last = len(speeds) - 1 - speeds[::-1].index(0.1)
