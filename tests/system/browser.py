@@ -50,7 +50,6 @@ class Page:
         self.page = page
         self.hosts = set()  # of all its requests, `host:port`
         self.nodes = {}  # properties of the scene's nodes, as they arrived last
-        self.texts = []  # of messages that carry text: notifications
         self.camera = {}  # of the page, as it said last
         page.on("request", lambda request: self.hosts.add(request.url.split("/")[2] if "//" in request.url else ""))
         page.on("websocket", self._listen)
@@ -68,9 +67,8 @@ class Page:
     def _receive(self, data):
         """Messages as viser packs them: sizes, compressed msgpack, then the arrays, each aligned to eight bytes."""
         size, packed = (int.from_bytes(data[k : k + 8], "little") for k in (0, 8))
-        inner = msgspec.msgpack.decode(
-            zstandard.ZstdDecompressor().decompress(data[16 : 16 + packed], max_output_size=size)
-        )
+        plain = zstandard.ZstdDecompressor().decompress(data[16 : 16 + packed], max_output_size=size)
+        inner = msgspec.msgpack.decode(plain)
         at, arrays = -(-(16 + packed) // 8) * 8, []
         for length in inner["binaryBufferLengths"]:
             arrays.append(data[at : at + length])
@@ -79,17 +77,11 @@ class Page:
             self._take(message, arrays)
 
     def _take(self, message, arrays):
-        kind, name = message.get("type", ""), message.get("name", "")
-        if kind == "NotificationMessage":
-            self.texts.append(str(message))
-        if not name:
-            return
-        node = self.nodes.setdefault(name, {})
-        given = message.get("updates") or message.get("props") or {}
-        if kind == "SetPositionMessage":
-            given = {"position": message["position"]}
-        for key, value in given.items():
-            node[key] = _array(value, arrays)
+        if name := message.get("name"):
+            given = message.get("updates") or message.get("props") or {}
+            if message.get("type") == "SetPositionMessage":
+                given = {"position": message["position"]}
+            self.nodes.setdefault(name, {}).update({key: _array(value, arrays) for key, value in given.items()})
 
     def positions(self, name):
         """Positions (N, 3) of the copies of a batched mesh [m]."""
