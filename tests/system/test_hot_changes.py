@@ -10,7 +10,6 @@ import pytest
 from agents.network import messages
 from experiments.file import catalogue
 from experiments.real_time.conductor import orders
-from experiments.recording import playback
 from experiments.report import report
 from experiments.run import reopen
 from tests.commands import zenpark
@@ -91,7 +90,7 @@ def test_killed_robot_is_restarted_and_takes_part(hot_lab):
     assert abs(status["CF01"].started - status["KH01"].started) < 0.1, "its time is that of the others"
     watcher.until(lambda: status["CF01"].decisions >= 10, "it has taken part for a while")
     hot_lab.end()
-    read = playback.read(hot_lab.folder / "run" / "event.mcap")
+    read = hot_lab.flight.read()
     assert read.complete
     told = {event.kind for event in read.trace.events if event.source == "CF01"}
     assert told >= {"lost", "restart", "changed"}
@@ -126,7 +125,7 @@ def test_robots_hold_leave_and_come_while_others_continue(hot_lab):
     assert set(hot_lab.change("add", "KH03").done) == {"KH03"}, "who was on standby joins"
     watcher.until(lambda: hot_lab.running("KH03") and not watcher.status["KH01"].missing, "it is a neighbour")
     hot_lab.end()
-    events = playback.read(hot_lab.folder / "run" / "event.mcap").trace.events
+    events = hot_lab.flight.read().trace.events
     assert ("order", "operator", "hold: CF01") in [(event.kind, event.source, event.text) for event in events]
     assert " lost " not in hot_lab.flight.said()
 
@@ -185,7 +184,7 @@ def test_present_robot_is_adopted_unless_it_has_flown(router, watcher, tmp_path)
         logs = sorted(file.stem for file in (tmp_path / "run" / "logs").glob("event-*"))
         assert logs == ["event-KH01", "event-recorder"]
         assert set(json.loads(out)["cases"]["event"]["robots"]) == {"KH01", "KH02", "CF01"}
-        assert playback.read(tmp_path / "run" / "event.mcap").complete
+        assert flight.read().complete
 
         again = Flight(tmp_path / "again", file, *SHORT)
         again.until_said("CF01: on the network already, and done; a robot that was started by hand flies once")

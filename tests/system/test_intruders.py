@@ -4,8 +4,8 @@ import json
 import os
 import socket
 import threading
-from dataclasses import dataclass
 from shutil import copytree
+from types import SimpleNamespace
 
 import pytest
 import zenoh
@@ -32,29 +32,22 @@ def laboratory(tmp_path_factory):
         yield made
 
 
-@dataclass
-class Flight:
-    """The robots before a test, and whose key is used to say nonsense where that robot may speak."""
-
-    before: dict[str, messages.Status]
-    mad: str = ""
-
-
 @pytest.fixture(autouse=True)
 def flight(laboratory):
-    """Whatever a test does: the robots run on, have believed and refused nothing, and have lost nobody."""
-    made = Flight(laboratory.last or laboratory.statuses())
+    """Whatever a test does: the robots run on, have believed and refused nothing, and have lost nobody.
+
+    `mad` is whose key is used to say nonsense where that robot may speak.
+    """
+    made = SimpleNamespace(before=laboratory.last or laboratory.statuses(), mad="")
     yield made
     after = laboratory.statuses()
-    for name in TRIANGLE:
-        assert after[name].phase == "running"
-        assert after[name].pid == made.before[name].pid
-        assert not after[name].missing
-        lost = {other: count - made.before[name].lost[other] for other, count in after[name].lost.items()}
-        assert {other for other, count in lost.items() if count} <= {made.mad}, "nonsense crowds out whom it imitates"
-        assert after[name].refused == made.before[name].refused
-        assert after[name].decisions > made.before[name].decisions
-        assert made.mad or after[name].malformed == made.before[name].malformed
+    for name, before in made.before.items():
+        now = after[name]
+        assert (now.phase, now.pid, now.refused, now.missing) == ("running", before.pid, before.refused, [])
+        lost = {other for other, count in now.lost.items() if count > before.lost[other]}
+        assert lost <= {made.mad}, "nonsense crowds out whom it imitates"
+        assert now.decisions > before.decisions
+        assert made.mad or now.malformed == before.malformed
 
 
 def say(session, key, payload):
