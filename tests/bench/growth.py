@@ -1,15 +1,10 @@
 """Growth of a run in virtual time with the number of robots: CPU time of an agent-step and of all around it, memory.
 
-    python -m tests.bench.growth
-    python -m tests.bench.growth --robots 7 1000
-
-Each number has two processes of its own, plain and compiled, measured in turns with two of seven robots; figures are
-medians, and those that are no agent-steps of the compiled flights.
+`python -m tests.bench.growth`: each number has two processes of its own, plain and compiled, measured in turns with two
+of seven robots; figures are medians, and those that are no agent-steps of the compiled flights.
 """
 
-import argparse
 import statistics
-import sys
 from contextlib import ExitStack, closing
 
 from tests.bench.drivers.peer_zenpark import DURATION_S
@@ -66,14 +61,5 @@ def line(robots, rounds, settings):
     return cells
 
 
-def main():
-    parser = argparse.ArgumentParser(prog="python -m tests.bench.growth", description=__doc__.splitlines()[0])
-    parser.add_argument("--robots", type=int, nargs="+", default=tuple(DURATIONS))
-    parser.add_argument("--rounds", type=int, default=ROUNDS)
-    wanted = parser.parse_args()
-    print(report(wanted.robots, wanted.rounds))
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    print(report())

@@ -284,7 +284,7 @@ def report(names, sizes=ROBOTS, rounds=ROUNDS):
     if ZENOH in names:
         rows += network()
     missing = "\n".join(f"- {trouble}" for trouble in troubles)
-    return "\n\n".join(filter(None, [table(rows), limits([name for name in PEERS if name in found]), missing]))
+    return "\n\n".join(filter(None, [table(rows), limits(name for name in PEERS if name in found), missing]))
 
 
 if __name__ == "__main__":

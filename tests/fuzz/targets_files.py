@@ -293,10 +293,7 @@ def bundles():
 def sweep_runs():
     """`runs.jsonl` and `origin.json` of a sweep: lines that cannot be read are counted, not fatal."""
     kinds = {int: 1, float: 0.5, bool: True, str: "x"}
-    blank = {
-        field.name: next((value for kind, value in kinds.items() if field.type is kind), None)
-        for field in msgspec.structs.fields(RunMetrics)
-    }
+    blank = {field.name: kinds.get(field.type) for field in msgspec.structs.fields(RunMetrics)}
     blank |= {"values": {"iae": 0.5}, "metric_faults": []}
     line = json.dumps({"cell": "c", "code": "d", "runs": [blank], "failed": {"3": "why"}}).encode() + b"\n"
     with place_for(RUNS) as file:

@@ -37,27 +37,6 @@ from tools.commands.network import members, readable
 from twins.devices.vicon import TruthSubscription, ViconTwin
 
 
-class HandDrivenRobot(Runtime):
-    def begin(self, utc):
-        self._utc = self._telemetry.utc = utc
-
-
-class HandDrivenWorld(WorldProcess):
-    def step(self, t):
-        self._tick(t)
-        if self._pace.update(t, 0.01):
-            self._report(t)
-
-
-class HandDrivenConductor(Conductor):
-    def begin(self):
-        self._join(ExitStack())
-        self._changes.begin(time.time())
-
-    def step(self):
-        self._update()
-
-
 @cache
 def triangle(*changes):
     return document.read("triangle", changes).plan
@@ -94,12 +73,12 @@ def robot(net):
     plan = triangle("robots.KH01.position=external", "avoidance=barrier")
     body = assemble(bodies.body_request(plan, ["KH01"], 1, ["tcp/127.0.0.1:1"]))
     setup = Setup(KEYS, [], "json", 50.0, lifeline=False, externally_measured=[True], ranging=["world"])
-    runtime = HandDrivenRobot([plan.assignment("KH01")], body, setup)
+    runtime = Runtime([plan.assignment("KH01")], body, setup)
     body.open()
     runtime.subscribe_to_stops(net.session)
     runtime.join(net.session)
     began, command = time.time(), body.command
-    runtime.begin(began)
+    runtime._utc = runtime._telemetry.utc = began
 
     def told(setpoints):
         assert all(isnan(number) or abs(number) < 10.0 for setpoint in setpoints for number in setpoint), setpoints
@@ -127,11 +106,13 @@ def world(net):
     """The twin service: commands, states of those elsewhere, statuses, and orders to put things in and out."""
     plan = triangle("robots.KH01.body=world", "robots.KH02.body=world", "world.engine=pymunk")
     population = WorldBodies(plan)
-    process = HandDrivenWorld(plan, population, Network(net.session, KEYS, [], [], OwnershipCheck([])), Event())
+    process = WorldProcess(plan, population, Network(net.session, KEYS, [], [], OwnershipCheck([])), Event())
     process.utc = time.time()
     for k in count(1):
         net.deliver((yield))
-        process.step(0.01 * k)
+        process._tick(0.01 * k)
+        if process._pace.update(0.01 * k, 0.01):
+            process._report(0.01 * k)
         for carried, state in zip(population.carried, population.states, strict=True):
             assert not carried or is_finite(state.position)
 
@@ -170,12 +151,13 @@ def conductor(net):
     with tempfile.TemporaryDirectory() as name:
         folder, hosts = Path(name), Hosts(launcher, [])
         context = CaseContext(triangle(), "only", folder, folder / "x", ["tcp/127.0.0.1:1"], launcher, hosts)
-        made = HandDrivenConductor(context, lambda _: None)
-        made.begin()
+        made = Conductor(context, lambda _: None)
+        made._join(ExitStack())
+        made._changes.begin(time.time())
         while True:
             data = yield
             net.deliver(data, gone=len(data) % 16 == 0)
-            made.step()
+            made._update()
 
 
 @networked(200, partial(everything, "KH01", "KH02", only=("position", "ranges", "state")))

@@ -24,10 +24,8 @@ def ros_messages():
     types = ros2.types("jazzy")
     make = types.make
     header = types.header(1.7e9, "map")
-    point, turn = (
-        make("geometry_msgs/msg/Point", x=0.1, y=0.2, z=0.0),
-        make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.1, w=1.0),
-    )
+    point = make("geometry_msgs/msg/Point", x=0.1, y=0.2, z=0.0)
+    turn = make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.1, w=1.0)
     pose = make("geometry_msgs/msg/Pose", position=point, orientation=turn)
     twist = types.twist((0.1, 0.0, 0.0), (0.0, 0.0, 0.2))
     sides = np.zeros(36)
