@@ -69,8 +69,9 @@ duration_s = 90.0
 [robots]
 CF01 = { kind = "crazyflie", start = [-0.3, 0.0], hover = 0.5 }
 KH01 = { kind = "khepera4", start = [0.3, 0.0] }
-[formation.links]
-"CF01 - KH01" = 0.8
+[formation]
+gain = 1.0
+links = { "CF01 - KH01" = 0.8 }
 [cases]
 first.trigger = { kind = "periodic", period_s = 0.02 }
 second.trigger = { kind = "send-on-delta", threshold = 0.01 }
