@@ -63,7 +63,11 @@ def crtp_packets():
         *(packet(Port.MEMORY, channel, crtp.MEMORY.pack(k, 0) + bytes(16)) for channel in (1, 2) for k in range(9)),
     ]
     heads = [(port, channel, first) for port in Port for channel in range(4) for first in range(10)]
-    return flights * 20 + [packet(port, channel, bytes((first, 1, 0))) for port, channel, first in heads]
+    return (
+        flights * 20
+        + flights[:6] * 60
+        + [packet(port, channel, bytes((first, 1, 0))) for port, channel, first in heads]
+    )
 
 
 @renewed(100, crtp_packets)
