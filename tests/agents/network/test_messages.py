@@ -1,26 +1,21 @@
 """Messages, and inboxes that decode, check, count and pass them on: any other payload is refused, and no worse."""
 
 import math
-from contextlib import suppress
 from functools import partial
 from itertools import chain
 from math import inf, nan
 
 import msgspec
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from agents.network import messages as wire
 from agents.network import pubsub, validation
 from agents.network.keys import Keys
 from agents.network.messages import JSON, MSGPACK, Malformed, Order, Pose, PoseReceipt, State, Stop
-from tests.cases import examples, for_each
+from tests.cases import for_each
 from tests.fuzz.messages import good
 from tests.network import Channel, Net, Query, Sample
 
-FEW = examples(60)
-KINDS = (Pose, State, wire.Status, Order, wire.Reply, Stop, wire.Event, wire.Goal, wire.CentreState)
 POSE = Pose("KH01", 3, 1000.0, (0.1, -0.2, 0.0), (0.01, 0.0, 0.0), 1.5)
 VALID_BOX = (2.0, 2.0, 3.5)
 encodings = pytest.mark.parametrize("encoding", ["json", "msgpack"])
@@ -34,34 +29,6 @@ def test_round_trip(encoding, message):
     payload = wire.encode(message, encoding)
     for mime in (wire.MIME[encoding], wire.MIME[encoding] + ";v=1"):
         assert wire.decode(payload, mime, type(message)) == message
-
-
-@encodings
-@FEW
-@given(st.sampled_from(SAMPLES), st.binary(max_size=200), st.data())
-def test_damaged_message_is_decoded_or_malformed(encoding, message, noise, data):
-    payload = bytearray(wire.encode(message, encoding))
-    for _ in range(data.draw(st.integers(1, 4))):
-        payload[data.draw(st.integers(0, len(payload) - 1))] = data.draw(st.integers(0, 255))
-    cut = bytes(payload[: data.draw(st.integers(0, len(payload)))])
-    for kind in KINDS:
-        with suppress(Malformed):
-            assert isinstance(wire.decode(cut, wire.MIME[encoding], kind), kind)
-        with pytest.raises(Malformed):
-            wire.decode(noise, wire.MIME[encoding], kind)
-
-
-LARGE = [b"[" * 50_000, b"\x91" * 50_000, b"x" * 1_000_000, wire.encode(Stop("w" * 9999, "\n\x1b[2J\u202e"))]
-
-
-@FEW
-@given(st.binary(max_size=200), st.sampled_from([JSON, MSGPACK, "zenoh/bytes", ""]))
-def test_any_payload_is_a_stop_with_printable_text(payload, mime):
-    for each in (payload, *LARGE):
-        stop = wire.read_stop(each, mime)
-        assert stop.operator
-        assert stop.words.isprintable()
-        assert 0 < len(stop.words) < 3 * wire.MAX_WORDS
 
 
 WHOLE = b'{"operator": "ana", "reason": "fire"}'
@@ -83,6 +50,14 @@ WHOLE = b'{"operator": "ana", "reason": "fire"}'
 )
 def test_stop_in_any_form_names_its_sender(payload, mime, words):
     assert wire.read_stop(payload, mime).words == wire.EMERGENCY + words
+
+
+@for_each("payload", [b"[" * 50_000, b"\x91" * 50_000, b"x" * 1_000_000, wire.encode(Stop("w" * 9999, "\n\u202e"))])
+def test_stop_of_any_size_is_shown_shortly(payload):
+    for mime in (JSON, MSGPACK, "zenoh/bytes", ""):
+        words = wire.read_stop(payload, mime).words
+        assert words.isprintable()
+        assert 0 < len(words) < 3 * wire.MAX_WORDS
 
 
 @pytest.mark.parametrize("mime", ["zenoh/bytes", "application/x-www-form-urlencoded", "text/plain", ""])

@@ -183,21 +183,6 @@ def test_other_sessions_do_not_replace_the_robot(a):
     assert a.hazards == []
 
 
-def test_superseded_session_is_received_again(a):
-    a.begin("one", 7)
-    a.lose("one")  # it stands still
-    a.begin("two")  # a second process of its name comes,
-    a.lose("two")  # and goes
-    a.token("one")
-    a.receive(8, 0.5, "one")
-    assert a.found == (0.5, 0)
-    a.receive(2, 0.9, "two")  # held back by the network
-    a.life("two")  # it was cut off, and will give way
-    a.pose(900, 0.9, "two")
-    a.receive(9, 0.6, "one")
-    assert a.found == (0.6, 2)
-
-
 def test_restarted_robot_leaves_the_law(a):
     a.token("one")
     a.pose(7, 0.4, "one", speed=0.3)
