@@ -146,7 +146,7 @@ def waking(tokens: list[str]) -> Callable[[Session], object]:
     return work
 
 
-@for_each("seed", range(120))
+@for_each("seed", range(250))
 def test_exactly_one_of_several_claims_succeeds(seed, table):
     starts = {"a": 1.0, "b": 2.0, "c": 2.0}
     results = table(seed).together(**{name: claiming(starts[name]) for name in ("a", "b", "c")[: 2 + seed % 2]})

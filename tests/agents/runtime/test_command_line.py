@@ -78,12 +78,12 @@ def lifeline_end(pipe):
 
     def lifeline_end(*parts, fd=pipe[0], timeout_s=60.0, **given):
         lost = threading.Event()
+        line = Lifeline(lost, timeout_s=timeout_s, fd=fd, **given)
+        line.start()
         for part in parts:
             os.write(pipe[1], part)
         if parts:
             os.close(pipe.pop())
-        line = Lifeline(lost, timeout_s=timeout_s, fd=fd, **given)
-        line.start()
         line.join(10.0)
         assert lost.is_set()
         return line.reason
