@@ -76,6 +76,8 @@ def test_send_on_delta_fires_beyond_its_threshold(deviation, fires):
     state = TriggerState(SendOnDelta(threshold=0.25))
     state.view.t, state.view.since_event, state.view.deviation, state.last.time = 9.0, 9.0, deviation, 0.0
     assert state.due() == fires
+    with pytest.raises(TypeError, match="Trigger must define `fires`"):
+        Trigger().fires(state.view)
 
 
 @pytest.mark.parametrize(
