@@ -6,8 +6,6 @@ The least that a robot can do: a session with the settings of every robot, its o
 of the same neighbours received, JSON encoded and decoded. No body, no law, no safety.
 """
 
-from __future__ import annotations
-
 import sys
 import threading
 import time

@@ -3,8 +3,6 @@
 Machines are noisy and differ: a figure alone says little. CPU times are medians.
 """
 
-from __future__ import annotations
-
 from typing import Annotated, Final
 
 import typer

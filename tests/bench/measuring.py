@@ -1,7 +1,5 @@
 """Measured figures, the way to measure them, and the figures of a command's start and of virtual time."""
 
-from __future__ import annotations
-
 import statistics
 import subprocess
 import sys

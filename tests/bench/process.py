@@ -5,8 +5,6 @@ of the same neighbours, in the same seconds through the same router. The ratio o
 busy machine as well; it is taken for each pose sent, because a robot that misses ticks sends fewer.
 """
 
-from __future__ import annotations
-
 import statistics
 import tempfile
 import time
