@@ -323,6 +323,24 @@ def test_a_long_gap_lands_that_drone_alone():
 
 @pytest.mark.system
 @pytest.mark.usefixtures("known_tables")
+def test_radio_gap_with_motion_capture_ends_in_landing():
+    """The estimator is blind, and drifts: it is down before it is far away, and stays there."""
+    with connected_twins(device=DONGLE, external=True) as (twin, process):
+        process.truth, sinks = twin.truth, []
+        process.until(lambda: np.isfinite(process.state.position).all(), "settled")
+        process.takeoff(0.6)
+        process.lead((0.0, 0.0, 0.6, 0.0)).run(1.0)
+        twin.device.lines[0].silence(1e6)
+        vehicle = twin.device.drones[0].vehicle
+        process.until(lambda: sinks.append(-vehicle.model.velocity[2]) or truth(twin)[2] == 0.0, "down")
+        process.run(2.0)
+        assert np.abs(truth(twin)).max() < 0.3
+        assert max(sinks) < 0.8
+        assert process.state.flying[0], "its motors may be on"
+
+
+@pytest.mark.system
+@pytest.mark.usefixtures("known_tables")
 def test_setpoints_go_on_beside_external_positions():
     """Two packets in each period, and room for one in the queue of the driver: neither starves the other."""
     with connected_twins(rows=2, device=DONGLE, external=True) as (twin, process):
