@@ -149,7 +149,7 @@ class Kind:
     height: float  # vertical size [m]; a position is that of the lowest point, so a body reaches from z to z + height
     mass: float  # ready to fly, with battery and decks [kg]
     endurance_s: float  # with a full battery, maker's figure
-    speed: float  # largest speed [m/s]; per axis for robots that take velocities or fly
+    speed: float  # largest speed [m/s]; per axis for robots that fly
     turn_rate: float  # largest yaw rate [rad/s]
     response: float  # rate at which its position controller closes a position error [1/s]
     turn_response: float  # rate at which it closes a yaw error [1/s]

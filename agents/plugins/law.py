@@ -51,7 +51,7 @@ class RobotFacts:
         """Value of this robot in a table by names; raises ValueError if it has none and there is no default."""
         value = table.get(self.name, default)
         if value is None:
-            raise ValueError(f"a table of the law has no value for {self.name}")
+            raise ValueError(f"a table of the law has no value for {self.name}: give it one there, or `of` a default")
         return value
 
 

@@ -45,7 +45,7 @@ class Rule:
     first: Outcome  # outcome when the cause lasted for `after_s` without a break
     after_s: float = 0.0  # [s]
     then: Outcome = Outcome.NONE  # outcome after `then_s`
-    then_s: float = NEVER  # [s] since the cause began
+    then_s: float = NEVER  # [s] since the cause began, as `after_s`
     clears_s: float = 0.0  # absence of the cause that ends a hold [s]
     repeats: bool = False  # a cause that returns within `QUIET_S` counts as lasting
     place: bool = True  # a hold keeps the place where it began; else only setpoints stop
@@ -55,7 +55,7 @@ class Rule:
 
 
 class Cause(IntEnum):
-    """Cause of a hazard with its rule; the numbers, in this order, are places in its lists and bits."""
+    """Cause of a hazard with its rule; numbers, in this order, are places in its lists and bits: append at the end."""
 
     rule: Rule
 

@@ -33,6 +33,7 @@ class SetpointFilter:
         # the body takes positions, or twists; one that takes neither takes velocities
         self._flies_to, self._drives = kind.takes == "position", kind.takes == "twist"
         self._speed, self._turn_rate = min(kind.speed, limits.top_speed), kind.turn_rate  # [m/s], [rad/s]
+        self._fastest = inf if kind.flies else self._speed  # in any direction [m/s]; what flies is limited per axis
         self._turn_radius = kind.turn_radius  # smallest [m]; 0: it turns on the spot
         # time in which the body closes a position error [s]: it goes as fast as its goal is far
         self._closes_s = 1.0 / kind.response
@@ -124,6 +125,7 @@ class SetpointFilter:
         seconds = self._closes_s + max(now.t - now.state.time, 0.0)
         return (
             -speed <= a <= speed and -speed <= b <= speed and -speed <= c <= speed and -turn <= d <= turn
+            and a * a + b * b <= self._fastest * self._fastest
             and low_x - x < seconds * a < high_x - x
             and low_y - y < seconds * b < high_y - y
             and low_z - z < seconds * c < high_z - z
@@ -157,12 +159,13 @@ class SetpointFilter:
         """
         (x, y, z), low, high, speed, turn = now.position, self._low, self._high, self._speed, self._turn_rate
         seconds = self._closes_s + max(now.t - now.state.time, 0.0)
-        return (
-            clamp(clamp(velocity[0], (low[0] - x) / seconds, (high[0] - x) / seconds), -speed, speed),
-            clamp(clamp(velocity[1], (low[1] - y) / seconds, (high[1] - y) / seconds), -speed, speed),
-            clamp(clamp(velocity[2], (low[2] - z) / seconds, (high[2] - z) / seconds), -speed, speed),
-            clamp(velocity[3], -turn, turn),
-        )
+        v_x = clamp(clamp(velocity[0], (low[0] - x) / seconds, (high[0] - x) / seconds), -speed, speed)
+        v_y = clamp(clamp(velocity[1], (low[1] - y) / seconds, (high[1] - y) / seconds), -speed, speed)
+        v_z = clamp(clamp(velocity[2], (low[2] - z) / seconds, (high[2] - z) / seconds), -speed, speed)
+        size = sqrt(v_x * v_x + v_y * v_y)
+        if size > self._fastest:
+            v_x, v_y = v_x * self._fastest / size, v_y * self._fastest / size
+        return v_x, v_y, v_z, clamp(velocity[3], -turn, turn)
 
     def _drive(self, twist: Setpoint, now: Situation) -> Setpoint:
         """Twist within the limits, and not out of the arena, as `_slow`; one that can may always turn on the spot."""

@@ -31,7 +31,7 @@ TERMS: Final = (
     ("±", "Half-width of the 95 % confidence interval of the mean over seeds (Student's t)."),
 )  # fmt: skip
 CAPTION: Final = (
-    "Messages against IAE; towards the lower left is better. Full: no other of the same environment has fewer messages "
+    "Messages against {}; towards the lower left is better. Full: no other of the same environment has fewer messages "
     "and no more error (grey line); hollow: another has, or runs failed. Along a curve the named parameter changes, "
     "markers tell the others; more than 7 curves or markers are not joined. Whiskers: 95 % confidence."
 )
@@ -131,15 +131,26 @@ def table(rows: Sequence[CellRow], title: str = "", chosen: Sequence[str] = ()) 
 def pictures(
     folder: Path, rows: Sequence[CellRow], *, joined: bool = True, width: float = style.WIDTH, pdf: bool = False
 ) -> tuple[page.PageFigure, ...]:
-    """Messages against IAE, ITAE and other metrics with a figure, so wide [in]; also as files, see `style.save`."""
-    against = {name: metric for name, metric in relative_metrics().items() if metric.figure and metric.shown}
+    """Messages against IAE, ITAE and other known metrics with a figure, so wide [in]; also as files, see `style.save`.
+
+    Pictures of an earlier page that are not drawn any more are removed.
+    """
+    against = {
+        name: metric
+        for name, metric in relative_metrics().items()
+        if metric.figure and metric.shown and any(row.ratio[name].mean is not None for row in rows)
+    }
+    for file in (folder / "figures").glob("pareto_*.*"):
+        if file.stem.removeprefix("pareto_") not in against:
+            file.unlink(missing_ok=True)
     drawn = {name: pareto(rows, name, joined=joined, width=width) for name in against}
     saved = [style.save(each, folder / "figures", f"pareto_{name}", pdf=pdf) for name, each in drawn.items()]
-    others = [
-        f"Messages against {metric.label}, likewise{'; more is better' * (metric.better == 'more')}."
-        for metric in [*against.values()][1:]
+    more = ["; more is better" * (metric.better == "more") for metric in against.values()]
+    captions = [
+        f"Messages against {metric.label}, likewise{which}." if k else CAPTION.format(metric.label + which)
+        for k, (metric, which) in enumerate(zip(against.values(), more, strict=True))
     ]
-    return page.numbered(zip(saved, [CAPTION, *others], strict=True))
+    return page.numbered(zip(saved, captions, strict=True))
 
 
 def fewest(rows: Sequence[CellRow]) -> list[page.VerdictLine]:

@@ -83,7 +83,7 @@ class Store:
         if before.version != now.version:
             found.append(f"this is zenpark {now.version}, not {before.version}: all runs are repeated")
         elif before.code != now.code:
-            found.append("the code of zenpark or of a plug-in has changed: its runs are repeated")
+            found.append("the code of zenpark or of a plug-in has changed: the runs with that code are repeated")
         if before.file != now.file:
             found.append("the experiment file has changed: affected runs are repeated")
         return found

@@ -8,6 +8,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+from functools import cache
 
 import pytest
 import typer.main
@@ -128,6 +129,14 @@ def expanded(path: str) -> list[str]:
     return [path[: braces.start()] + each + path[braces.end() :] for each in braces[1].split(",")]
 
 
+@cache
+def names_of_tests() -> set[str]:
+    found = {"test_"}
+    for file in (ROOT / "tests").rglob("test_*.py"):
+        found |= {file.stem, *re.findall(r"^def (test_\w+)", file.read_text("utf-8"), re.MULTILINE)}
+    return found
+
+
 @for_each("page", PAGES)
 def test_what_a_page_refers_to_exists(page):
     text = page.read_text("utf-8")
@@ -137,6 +146,7 @@ def test_what_a_page_refers_to_exists(page):
     lost = [name for name in dotted if not exists(name)]
     lost += [path for path in paths if not any(ROOT.glob(path.rstrip("/")))]
     lost += [link for link in links - SITE if not (page.parent / link).exists()]
+    lost += {*re.findall(r"`(test_\w+)\W", text)} - names_of_tests()
     assert not sorted(lost)
 
 

@@ -1,6 +1,6 @@
 """The last word: whatever comes in, what goes out is a setpoint that the robot may have."""
 
-from math import cos, dist, inf, isfinite, isnan, nan, pi, sin
+from math import cos, dist, hypot, inf, isfinite, isnan, nan, pi, sin
 from types import SimpleNamespace
 
 import pytest
@@ -69,6 +69,7 @@ def test_lawful_setpoint_for_whatever_comes(kind, setpoint, position, yaw, age):
     if kind.takes != "position":
         turn = 1 if kind.takes == "twist" else 3
         assert max(map(abs, safe[:turn])) <= speed
+        assert kind.flies or hypot(*safe[: min(turn, 2)]) <= speed * (1.0 + 1e-12), "in any direction"
         assert abs(safe[turn]) <= kind.turn_rate
     else:
         reach, far = min(LIMITS.max_goal_distance, speed / kind.response), max(map(abs, position))
