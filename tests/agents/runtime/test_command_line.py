@@ -80,6 +80,8 @@ def lifeline_end(pipe):
         lost = threading.Event()
         line = Lifeline(lost, timeout_s=timeout_s, fd=fd, **given)
         line.start()
+        if parts:
+            line.join(0.05)  # it waits for what comes later
         for part in parts:
             os.write(pipe[1], part)
         if parts:
