@@ -29,6 +29,8 @@ def environment(**more: str) -> dict[str, str]:
 def invoke(*words: object, code: int | None = 0) -> Result:
     """Result of a command in this process: `exit_code`, `stdout`, `output` with errors, `exception`.
 
+    Errors that `tools.main.main` explains, with exit code 2, end here in `exception`; `zenpark` below shows their text.
+
     Args:
         words: What is typed after `./zenpark`.
         code: Exit code that is asserted; None: any.

@@ -98,7 +98,8 @@ def _findings(given: Document, analyses: Mapping[str, Analysis]) -> list[Finding
         for subject in SUBJECTS:
             for finding in first_of_each_code(subject(analysis)):
                 holders.setdefault(finding, []).append(name)
-    for finding in theory.unused_gains([*given.cases().values()]):
+    plans = [*given.cases().values()]
+    for finding in (*theory.unused_gains(plans), *theory.unknown_robots(plans)):
         holders[finding] = [*analyses]
     found = []
     for finding, names in holders.items():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Final
 
 import msgspec
@@ -15,6 +15,7 @@ from agents.formation.link import BY_BEARING, BY_DISTANCE, BY_RELATIVE
 from agents.network import messages
 from agents.plugins.calls import unknown_reads
 from agents.plugins.laws import Gradient
+from agents.plugins.registry import did_you_mean
 from agents.vectors import ZERO
 from experiments.check.analysis import FAR_OFF, Analysis
 from experiments.check.findings import FORGIVEN, Finding, Severity, join_names
@@ -318,6 +319,20 @@ def unused_gains(plans: Sequence[Plan]) -> Iterator[Finding]:
             laws = join_names(sorted({f"'{plan.law_name}'" for plan in plans}))
             message = f"{key} is not used by the law {laws}, which pulls by {other}"
             yield Finding("warning", "unused-gain", message, f"write {other} instead", ("formation", key))
+
+
+def unknown_robots(plans: Sequence[Plan]) -> Iterator[Finding]:
+    """Warn of a table of a law with values by robot, in which a name is that of no robot of any case."""
+    robots = {name for plan in plans for name in plan.experiment.robots}
+    found: dict[tuple[str, str], str] = {}
+    for plan in plans:
+        for key, table in msgspec.structs.asdict(plan.law).items():
+            if isinstance(table, Mapping) and robots & table.keys():
+                found |= {(key, name): plan.law_name for name in table if name not in robots}
+    for (key, name), law_name in found.items():
+        message = f"{key} of the law '{law_name}' has a value for '{name}', and no robot is called so"
+        remedy = did_you_mean(name, robots)
+        yield Finding("warning", "unknown-robot", message, remedy, ("formation", "law", key, name))
 
 
 def _unknown_reads(analysis: Analysis) -> str:

@@ -9,7 +9,7 @@ from experiments.check.analysis import Analysis
 from experiments.check.check import figures
 from experiments.check.ideal_run import Prediction, isolated, linear_step, predict, repetitions
 from experiments.check.motion import flight
-from experiments.check.theory import unused_gains
+from experiments.check.theory import unknown_robots, unused_gains
 from experiments.definition.experiment import Arena, Experiment, Formation, LegTable, LinkTable, RobotTable
 from experiments.definition.plan import Plan
 from experiments.file import document
@@ -103,6 +103,17 @@ def test_gain_of_another_law_is_named():
         assert (found.code, found.where) == ("unused-gain", ("formation", key))
         assert found.message == f"{key} is not used by the law '{law}', which pulls by {used}"
     assert not [*unused_gains([Plan(robots_on_wheels(law="mixed", stiffness=0.4, gain=1.0))])]
+
+
+def test_law_value_for_no_robot_is_reported():
+    def unknown(**signal: float):
+        law = {"kind": "average", "signal": signal}
+        return [(found.code, found.where, found.remedy) for found in unknown_robots([Plan(robots_on_wheels(law=law))])]
+
+    assert unknown(KH01=1.0, KH22=2.0) == [
+        ("unknown-robot", ("formation", "law", "signal", "KH22"), "did you mean 'KH02'?")
+    ]
+    assert unknown(KH01=1.0, KH03=2.0) == []
 
 
 @pytest.mark.parametrize(
