@@ -135,7 +135,7 @@ def list_(as_json: AsJson = False) -> None:
         | {title.lower().replace(" ", "_"): names for title, names in found.items()},
         "Experiments (./zenpark run NAME, ./zenpark new NAME):",
         *(f"  {name:<{width}}  {title}" for name, title in experiments.items()),
-        *(f"{title}: {', '.join(names)}" for title, names in found.items()),
+        *(f"{title}: {', '.join(names) or 'none'}" for title, names in found.items()),
         as_json=as_json,
     )
 
