@@ -59,7 +59,10 @@ class CrazyflieBody(Body):
         self._capacity: dict[str, float] = {}  # [1/s] measured, by radio
         self._dongles, self._settings = dongles, settings
         turns = {one: threading.Lock() for one in self._radios}
-        self._telemetry = [Telemetry(lighthouse=isinstance(each.positioning, Lighthouse)) for each in settings]
+        self._telemetry = [
+            Telemetry(lighthouse=isinstance(each.positioning, Lighthouse), absolute=each.positioning is not None)
+            for each in settings
+        ]
         in_turn = max((len(on_it) for on_it in self._radios.values()), default=1)
         self._open_timeout = max(each.connect_s + each.converge_s for each in settings) + 5.0 * in_turn
         self.pilots = [
@@ -127,16 +130,16 @@ class CrazyflieBody(Body):
 
     def _state(self, row: int, now: float) -> BodyState:
         telemetry, pilot = self._telemetry[row], self.pilots[row]
-        settled, received = telemetry.settled, telemetry.pose_time - self._zero
+        settled, measured = telemetry.settled, telemetry.pose_time - self._zero
         x, y, z, vx, vy, vz, yaw = telemetry.pose
         state = BodyState(
-            received,
+            measured,
             (x, y, z) if settled else UNKNOWN,
             (vx, vy, vz) if settled else UNKNOWN,
             yaw,
             battery=telemetry.battery,
             flying=telemetry.airborne,
-            received=received,
+            received=telemetry.status_time - self._zero,
             note=self._note(row, now),
             refusal=pilot.refusal,
             scan=self._scan(telemetry) if self._settings[row].multiranger else None,
@@ -145,7 +148,7 @@ class CrazyflieBody(Body):
             self._external[row].fill(state)
             if not settled:
                 state.position = UNKNOWN  # no flight before the estimator on board has settled
-            state.time = min(state.time, received)  # a drone without telemetry is lost as well
+            state.time = min(state.time, measured)  # a drone without telemetry is lost as well
         return state
 
     def command(self, setpoints: Sequence[Setpoint]) -> None:

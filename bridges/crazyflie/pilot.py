@@ -396,7 +396,7 @@ class CrazyfliePilot:
         if gap > LOGS_S or (silent > LOGLESS_S + 3.0 / self._settings.log_hz and link.gap < LOGLESS_S):
             self._logs_at = now
             link.restart_logs()
-        late = self._telemetry.pose_age - (now - self._telemetry.arrival)  # [s] time in queues
+        late = self._telemetry.arrival - self._telemetry.status_time  # [s] time in queues
         if not late > QUEUE_S:
             self._late_since = inf
         else:

@@ -13,15 +13,18 @@ from typing import Final
 
 from agents.protocols.crtp import MM, Info, Power
 from bridges.crazyflie.link import CrazyflieLink
+from bridges.crazyflie.positioning import SETTLED_BELOW
 
 # for firmwares without a supervisor
 OLD_INFO: Final = {"sys.canfly": Info.ARMED | Info.CAN_FLY, "sys.isFlying": Info.FLYING, "sys.isTumbled": Info.TUMBLED}
 PLACE: Final = tuple(f"stateEstimateZ.{name}" for name in ("x", "y", "z", "vx", "vy", "vz"))  # [mm], [mm/s]
 YAW: Final = "stateEstimate.yaw"  # [degrees]
+VARIANCE: Final = "kalman.varPX"  # [m²]
 STATE: Final = (
     dict.fromkeys(PLACE, "int16_t")
-    | {  # 23 bytes of 26: pose and status are one packet
+    | {  # 25 bytes of 26: pose and status are one packet
         YAW: "FP16",
+        VARIANCE: "FP16",
         "supervisor.info": "uint16_t",
         "pm.vbat": "FP16",
         "pm.state": "int8_t",
@@ -47,6 +50,7 @@ INFO_TEXT: Final = {
     Info.TUMBLED: "upside down",
 }
 STATION_TEXT: Final = ("receives no base station", "misses geometry or calibration of its base stations", "")
+MEASURING: Final = len(STATION_TEXT) - 1  # lighthouse.status of a deck that measures
 
 
 class PacketAge:
@@ -81,12 +85,12 @@ class PacketAge:
 class Telemetry:
     """Newest telemetry of one Crazyflie; times on the monotonic clock [s], -inf before the first."""
 
-    def __init__(self, *, lighthouse: bool) -> None:
-        """`lighthouse`: report the state of the base stations."""
+    def __init__(self, *, lighthouse: bool, absolute: bool = False) -> None:
+        """`lighthouse`: has base stations; `absolute`: positions are measured, see `Convergence`."""
         self.stamps = PacketAge()
         self.arrival = -inf  # of the last packet of a log
         self.status_time = -inf  # of the last status over this connection
-        self.pose_time = self.ranges_time = -inf
+        self.pose_time = self.ranges_time = -inf  # of the last pose that was measured
         self.pose: tuple[float, ...] = (nan,) * 7  # x, y, z [m], their rates [m/s], yaw [rad]
         self.settled = False  # position estimate has settled and may be used
         self.info = Info(0)  # flags of the supervisor
@@ -97,7 +101,7 @@ class Telemetry:
         self.stations = -1  # lighthouse.status, or -1
         self.ranges = (nan,) * len(RANGES)  # front, back, left, right, up [m]; NaN: nothing in reach
         self.airborne = False  # motors on, as far as the bridge knows
-        self._lighthouse = lighthouse
+        self._lighthouse, self._absolute = lighthouse, absolute
 
     @property
     def battery_low(self) -> bool:
@@ -128,7 +132,7 @@ class Telemetry:
         if self.battery_low:
             faults.append("battery low")
         if self._lighthouse and self.stations >= 0:
-            faults.append(STATION_TEXT[min(self.stations, len(STATION_TEXT) - 1)])
+            faults.append(STATION_TEXT[min(self.stations, MEASURING)])
         return "; ".join(text for text in faults if text)
 
     def _stamped(self, t: float, stamp: int) -> float:
@@ -140,7 +144,6 @@ class Telemetry:
         measured = self._stamped(t, stamp)
         place = (MM * values.get(name, nan) for name in PLACE)
         self.pose = *place, radians(values.get(YAW, nan))
-        self.pose_time = measured
         old = sum(flags for name, flags in OLD_INFO.items() if values.get(name))
         self.info = Info(int(values.get("supervisor.info", old)))
         self.reports_plans = self.reports_plans or Info.PLANNER_ACTIVE in self.info
@@ -148,6 +151,13 @@ class Telemetry:
         self._add_volts(values.get("pm.vbat", nan), measured - self.status_time)
         self.stations = int(values.get("lighthouse.status", -1))
         self.status_time = measured
+        if self._measures(values.get(VARIANCE, 0.0)) or not self.settled:
+            self.pose_time = measured
+
+    def _measures(self, variance: float) -> bool:
+        """Whether the pose is measured; else the estimator goes on by its accelerometers, and drifts away."""
+        blind = self._lighthouse and 0 <= self.stations < MEASURING
+        return not blind and (variance < SETTLED_BELOW or not self._absolute)
 
     def _add_volts(self, volts: float, since: float) -> None:
         """Filter the voltage `since` [s] after the last one, and estimate the charge, with the motors on or off."""

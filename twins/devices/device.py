@@ -43,7 +43,8 @@ class Faults(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     exchanges_hz: float = 500.0  # [1/s] exchanges of a software radio, 300 to 1000 by dongle and computer
     tumbled_from_s: float | None = None  # [s] begin of lying on its side, as after a collision
     tumbled_for_s: float = 1e9  # [s] until it is put upright
-    occluded_from_s: float | None = None  # [s] begin of an occlusion of all robots from motion capture
+    # [s] begin of an occlusion of all robots from motion capture, base stations and anchors
+    occluded_from_s: float | None = None
     occluded_for_s: float = 1e9  # [s] duration of the occlusion
     capture: CaptureFault = ""  # fault of motion capture
     capture_subject: int = 0  # number of its subject, which is exchanged with the next
@@ -59,7 +60,7 @@ class Faults(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         return _during(t, self.tumbled_from_s, self.tumbled_for_s)
 
     def occluded(self, t: float) -> bool:
-        """Whether motion capture sees nothing at time `t` [s]."""
+        """Whether nothing measures the positions at time `t` [s]."""
         return _during(t, self.occluded_from_s, self.occluded_for_s)
 
     def captured(self, t: float) -> tuple[CaptureFault, int]:

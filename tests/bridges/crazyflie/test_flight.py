@@ -445,7 +445,7 @@ def test_a_drone_that_was_switched_off_and_on(before, arrival, stamp, anew, rest
 
 @pytest.fixture
 def telemetry():
-    return Telemetry(lighthouse=False)
+    return Telemetry(lighthouse=True, absolute=True)
 
 
 @pytest.fixture
@@ -463,6 +463,16 @@ def test_poses_carry_the_time_of_their_measurement(telemetry, log_state):
     log_state(13.0, 5020, state)
     assert [telemetry.pose[k] for k in (0, 4, 6)] == pytest.approx([1.5, -0.02, np.pi / 2])
     assert telemetry.pose_time == pytest.approx(10.02, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("stations", "variance", "age"), [(2, 0.01, 0), (0, 0.01, 1), (1, 0.01, 1), (2, 0.2, 1), (2, math.nan, 1)]
+)
+def test_pose_without_measurements_becomes_old(telemetry, log_state, stations, variance, age):
+    telemetry.settled = True
+    log_state(10.0, 0, {})
+    log_state(11.0, 1000, {"lighthouse.status": stations, "kalman.varPX": variance})
+    assert (telemetry.status_time, telemetry.pose_time) == (11.0, 11.0 - age)
 
 
 def test_charge_by_the_voltage_under_load(telemetry, log_state):

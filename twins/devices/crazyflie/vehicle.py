@@ -145,6 +145,7 @@ class Decks:
         self.lighthouse = isinstance(settings.positioning, Lighthouse)
         self.loco = isinstance(settings.positioning, Loco)
         self.multiranger, self.flow = settings.multiranger, settings.positioning is None
+        self.occluded = False  # no positioning system on board receives anything
         boards = {
             "bcLighthouse4": self.lighthouse, "bcDWM1000": self.loco, "bcMultiranger": self.multiranger,
             "bcFlow2": self.flow,
@@ -154,14 +155,15 @@ class Decks:
     @property
     def station_status(self) -> int:
         """Log variable lighthouse.status: 0 nothing received, 1 geometry or calibration missing, 2 measuring."""
-        if not self.lighthouse:
+        if not self.lighthouse or self.occluded:
             return 0
         return 2 if self.memories.geometries & self.memories.calibrations else 1
 
     @property
     def ready(self) -> bool:
         """Whether a positioning system on board works."""
-        return self.station_status == 2 or (self.loco and len(self.memories.anchors()) >= ENOUGH_ANCHORS)
+        anchored = self.loco and len(self.memories.anchors()) >= ENOUGH_ANCHORS
+        return self.station_status == 2 or (anchored and not self.occluded)
 
 
 class Vehicle:
@@ -252,6 +254,7 @@ class Vehicle:
         model, commander, supervisor, dt = self.model, self.commander, self.supervisor, self.dt
         if self._faults.tumbled(t) != self._fault_tumbled:
             supervisor.tumbled = self._fault_tumbled = not self._fault_tumbled
+        self.decks.occluded = self._faults.occluded(t)
         commander.take_planned(t, self.planner.goal(t))
         locked = supervisor.advance(t, t - commander.received, spinning=model.flying)
         if locked:
