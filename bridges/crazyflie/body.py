@@ -11,6 +11,7 @@ from typing import Final
 from agents.body.device_locks import Claims
 from agents.body.external_pose import External
 from agents.body.interface import Body, BodyError, BodyRequest, BodyState, RangeScan
+from agents.clock import uptime
 from agents.network.messages import Inspection, number
 from agents.protocols.crazyflie import (
     Lighthouse,
@@ -78,7 +79,7 @@ class CrazyflieBody(Body):
         ]
         self._outside = request.external
         self._external = [External() for _ in addresses]
-        self._zero = time.monotonic()  # zero of the process's clock on the monotonic clock [s]
+        self._zero = uptime()  # zero of the process's clock on the clock `uptime` [s]
 
     def open(self) -> None:
         """See `Body.open`. Unreachable drones are left out, retried in the background, and named in the notes.
@@ -90,9 +91,9 @@ class CrazyflieBody(Body):
         self._claims.take()
         for pilot in self.pilots:
             pilot.start()
-        deadline = time.monotonic() + self._open_timeout
+        deadline = uptime() + self._open_timeout
         waiting = list(self.pilots)
-        while waiting and time.monotonic() < deadline:
+        while waiting and uptime() < deadline:
             time.sleep(POLL_S)
             waiting = [pilot for pilot in waiting if not pilot.opened.is_set() and pilot.failure is None]
         if not any(pilot.opened.is_set() for pilot in self.pilots):
@@ -108,11 +109,11 @@ class CrazyflieBody(Body):
         """Measure what a radio carries while its drones log; returns why it is too little, or an empty text."""
         settings = [self._settings[row] for row in rows]
         refusal, best = "", 0.0
-        end = time.monotonic() + self._measuring_s
-        while time.monotonic() < end:
-            before, begin = self.exchanges(rows), time.monotonic()
+        end = uptime() + self._measuring_s
+        while uptime() < end:
+            before, begin = self.exchanges(rows), uptime()
             time.sleep(WINDOW_S)
-            best = max(best, (self.exchanges(rows) - before) / (time.monotonic() - begin))
+            best = max(best, (self.exchanges(rows) - before) / (uptime() - begin))
             self._capacity[radio] = capacity(settings, best)
             refusal = overload(radio, settings, best)
             if not refusal:
@@ -124,7 +125,7 @@ class CrazyflieBody(Body):
 
     def read(self, t: float) -> Sequence[BodyState]:
         """See `Body.read`."""
-        now = time.monotonic()
+        now = uptime()
         self._zero = now - t
         return [self._state(row, now) for row in range(len(self.pilots))]
 
@@ -153,7 +154,7 @@ class CrazyflieBody(Body):
 
     def command(self, setpoints: Sequence[Setpoint]) -> None:
         """See `Body.command`."""
-        now = time.monotonic()
+        now = uptime()
         for pilot, setpoint in zip(self.pilots, setpoints, strict=True):
             pilot.set_target(now, setpoint if isfinite(sum(setpoint)) else None)
 

@@ -9,13 +9,13 @@ Flags of the supervisor, not answers to commands, tell whether a drone flies: an
 from __future__ import annotations
 
 import math
-import time
 from collections import deque
 from collections.abc import Callable
 from enum import Enum
 from typing import Final
 
 from agents.body.interface import UNANSWERED
+from agents.clock import uptime
 from agents.protocols.crazyflie import SETPOINT_PACKETS, CrazyflieSettings
 from agents.protocols.crtp import HighLevel, Info, LogStatus
 from bridges.crazyflie.link import CrazyflieLink
@@ -116,7 +116,7 @@ class FlightControl:
         return not self.airborne and self._disarm_at == math.inf
 
     def set_target(self, now: float, target: Target | None) -> None:
-        """Store the setpoint of the robot's loop at `now` [s, monotonic]; None keeps the last one. From any thread."""
+        """Store the setpoint of the robot's loop at `now` [s, `uptime`]; None keeps the last one. From any thread."""
         self._commanded_at = now
         if target is not None and self._telemetry.pose_age < HOLD_AGE_S:
             self._target = target
@@ -184,7 +184,7 @@ class FlightControl:
         )
         replies, _ = self.link.planner_reply(trajectories.start_command)
         self._start_replies = replies + (answer is None)  # an answer that is not here yet may come
-        self._plan_end(time.monotonic() + self.span_s, height)
+        self._plan_end(uptime() + self.span_s, height)
         if answer is None or answer == LogStatus.OK:
             return  # a lost answer is no refusal: `update_phase` sees whether it flies
         self.enter(FlightPhase.GROUND)
@@ -256,7 +256,7 @@ class FlightControl:
 
         Not sent to a drone on the ground: an emergency stop locks it until it is switched off and on.
         """
-        fresh = time.monotonic() - self._telemetry.status_time < FRESH_S
+        fresh = uptime() - self._telemetry.status_time < FRESH_S
         if not self.airborne and fresh and not self._flying:
             self._disarm_at = -math.inf
             return
@@ -267,7 +267,7 @@ class FlightControl:
     # ------------------------------------------------------------------ in the air
 
     def send_due(self, now: float) -> None:
-        """Send the packets that are due at `now` on the monotonic clock [s]."""
+        """Send the packets that are due at `now` on the clock `uptime` [s]."""
         if self.phase is FlightPhase.STOPPING:
             if now - self.phase_since > ANSWER_S:
                 self.trouble = UNANSWERED
@@ -297,7 +297,7 @@ class FlightControl:
             target = self._top
         if target is None or now < self._due or self.link.busy:
             return
-        if time.monotonic() - self._commanded_at > LOOP_SILENCE_S:  # the process stood still until a moment ago
+        if uptime() - self._commanded_at > LOOP_SILENCE_S:  # the process stood still until a moment ago
             return
         if self._target is not None and self.phase is FlightPhase.CLIMBING:
             self.enter(FlightPhase.FLYING)
@@ -319,14 +319,14 @@ class FlightControl:
 
     def _release(self) -> None:
         """End the setpoints of other clients, which mute the planner: 2 s after the last one the drone would lock."""
-        self._released_at = time.monotonic()
+        self._released_at = uptime()
         self.link.cf.commander.send_notify_setpoint_stop()
 
     def _release_others(self) -> None:
         """End the setpoints of other clients in flight, at once where the drone reports that it follows no plan."""
         telemetry = self._telemetry
         stopped = telemetry.reports_plans and Info.PLANNER_ACTIVE not in telemetry.info
-        if stopped or time.monotonic() - self._released_at > RELEASE_S:
+        if stopped or uptime() - self._released_at > RELEASE_S:
             self._release()
 
     def land_after_gap(self, gap: float) -> None:
@@ -336,7 +336,7 @@ class FlightControl:
             self.land()
 
     def update_phase(self, now: float) -> None:
-        """Update the phase from the drone's status at `now` on the monotonic clock [s]."""
+        """Update the phase from the drone's status at `now` on the clock `uptime` [s]."""
         telemetry = self._telemetry
         if now - telemetry.arrival > FRESH_S:
             return
@@ -371,7 +371,7 @@ class FlightControl:
 
         The drone counts as flying until it is seen: its motors may be on.
         """
-        down = time.monotonic() > self._down_at
+        down = uptime() > self._down_at
         if self.airborne and self.phase is not FlightPhase.STOPPING:  # a stop is sent when the drone is in reach again
             self.trouble = "out of reach: " + ("motors may be on: switch it off" if down else "it lands by itself")
         return down
@@ -397,13 +397,13 @@ class FlightControl:
         return Info.FLYING in self._telemetry.info
 
     def enter(self, phase: FlightPhase) -> None:
-        self.phase, self.phase_since = phase, time.monotonic()
+        self.phase, self.phase_since = phase, uptime()
         self.publish_airborne()
 
     def takeoff_refusal(self) -> str:
         """Reason against a take-off; empty if none."""
         telemetry = self._telemetry
-        age = time.monotonic() - telemetry.status_time
+        age = uptime() - telemetry.status_time
         if age > FRESH_S:
             return f"no take-off: its last status is {age:.1f} s old; is its radio too full, or gone?"
         if telemetry.battery_low:
@@ -418,9 +418,9 @@ class FlightControl:
 
     def _write_climb(self, place: Target, climb: tuple[float, float]) -> int | None:
         """Write the climb; returns its number, or None, with `trouble`."""
-        begin = time.monotonic()
+        begin = uptime()
         while (number := self.link.trajectories.write_climb(place, climb, self.hold_s)) is None:
-            if time.monotonic() > begin + UPLOAD_S:
+            if uptime() > begin + UPLOAD_S:
                 self.trouble = "no take-off: its trajectory is not confirmed; is its radio too full, or gone?"
                 break
             self._pause(0.25 * POLL_S)
@@ -428,9 +428,9 @@ class FlightControl:
 
     def _arm(self) -> str:
         """Arm the motors if necessary, until they may turn; returns the reason of a failure, or an empty text."""
-        begin, asked = time.monotonic(), -math.inf
+        begin, asked = uptime(), -math.inf
         while Info.CAN_FLY not in self._telemetry.info:
-            armed, now = Info.ARMED in self._telemetry.info, time.monotonic()
+            armed, now = Info.ARMED in self._telemetry.info, uptime()
             if not self._settings.arm and not armed:
                 return "not armed, and arm = false"
             if now > begin + ARMING_S:
@@ -443,7 +443,7 @@ class FlightControl:
 
     def _disarm(self) -> None:
         """Disarm a drone on the ground that was armed for a take-off; repeated until its status confirms it."""
-        now, info = time.monotonic(), self._telemetry.info
+        now, info = uptime(), self._telemetry.info
         armed = Info.ARMED in info and Info.AUTO_ARM not in info and self._settings.arm
         asked = self._armed_at > -math.inf and now - self._armed_at < FRESH_S  # its status may not show it yet
         self._disarm_at = math.inf
@@ -457,11 +457,11 @@ class FlightControl:
         `flag`: of the status, which stands for a reply.
         """
         before, _ = self.link.planner_reply(command)
-        begin = time.monotonic()
+        begin = uptime()
         for _ in range(TRIES):
             send()
-            deadline = time.monotonic() + REPLY_S
-            while time.monotonic() < deadline:
+            deadline = uptime() + REPLY_S
+            while uptime() < deadline:
                 self._pause(0.25 * POLL_S)
                 count, code = self.link.planner_reply(command)
                 if count > before:

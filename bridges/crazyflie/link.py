@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Final, Protocol
 
 from agents.body.interface import BodyError
+from agents.clock import uptime
 from agents.protocols import crtp
 from agents.protocols.crazyflie import dongle_of
 from agents.protocols.crazyradio import software
@@ -128,7 +129,7 @@ class CrazyflieLink:
         from cflib.crazyflie import Crazyflie  # noqa: PLC0415
 
         self.address = address
-        self.last_packet = time.monotonic()  # [s] of any kind, also one without content, which only a radio sends
+        self.last_packet = uptime()  # [s] of any kind, also one without content, which only a radio sends
         self.exchanges = 0  # packets received
         self._longest_gap = 0.0  # [s] between two of them, see `take_gap`
         self.firmware: str | None = None  # version, as the drone says it
@@ -160,7 +161,7 @@ class CrazyflieLink:
     @property
     def gap(self) -> float:
         """Time since the last packet [s]; over a radio there is one for every answered poll."""
-        return time.monotonic() - self.last_packet
+        return uptime() - self.last_packet
 
     def take_gap(self) -> float:
         """Longest gap between two packets since the last call that has ended [s]."""
@@ -173,19 +174,19 @@ class CrazyflieLink:
         return self.is_radio and max(self.gap, self._longest_gap) > BUSY_S
 
     def open(self, deadline: float, end: threading.Event) -> None:
-        """Connect; give up at `deadline` on the monotonic clock [s], or at `end`.
+        """Connect; give up at `deadline` on the clock `uptime` [s], or at `end`.
 
         Raises:
             SilentError: If no answer comes, answers cease, or safelink is missing.
             LinkError: If the driver fails, or at the deadline.
         """
-        self.last_packet = self._last_answer = time.monotonic()
+        self.last_packet = self._last_answer = uptime()
         self.cf.open_link(self.address)
         if self.cf.link is not None and self.is_radio:
             self.cf.link.link_error_callback = None  # a packet that finds no room for 2 s would end the link
             self.cf.link._thread._radio = PromptRadio(self.cf.link._thread._radio)
         while not self._connected.wait(0.02):
-            now = time.monotonic()
+            now = uptime()
             if self.error is not None:
                 raise LinkError(self.error)
             if self._unsafe:
@@ -205,7 +206,7 @@ class CrazyflieLink:
             name: Name of the block.
             rate_hz: Rounded to the nearest possible period.
             variables: Names and types on the wire; variables that the firmware lacks are left out.
-            logged: Called on cflib's thread with the time of arrival on the monotonic clock [s], the stamp of the drone
+            logged: Called on cflib's thread with the time of arrival on the clock `uptime` [s], the stamp of the drone
                 [ms, 24 bits] and the values.
         """
         from cflib.crazyflie.log import LogConfig  # noqa: PLC0415
@@ -216,7 +217,7 @@ class CrazyflieLink:
                 block.add_variable(variable, type_)
         if not block.variables:
             return
-        block.data_received_cb.add_callback(lambda stamp, values, _block: logged(time.monotonic(), stamp, values))
+        block.data_received_cb.add_callback(lambda stamp, values, _block: logged(uptime(), stamp, values))
         try:
             self.cf.log.add_config(block)
             block.start()
@@ -292,10 +293,10 @@ class CrazyflieLink:
 
     def _repeat(self, ask: Callable[[], None], answer: Callable[[], float | None], about: str) -> float:
         """Answer to a question, which is repeated, since a drone may lose its answers in a gap."""
-        deadline = time.monotonic() + ANSWER_S
+        deadline = uptime() + ANSWER_S
         again = 0.0
         while again == 0.0 or (answered := answer()) is None:
-            now = time.monotonic()
+            now = uptime()
             if now > deadline or self.error is not None:
                 raise LinkError(f"no answer about {about}")
             if now >= again:
@@ -366,7 +367,7 @@ class CrazyflieLink:
         return self.address.startswith("radio://")
 
     def _note_packet(self, packet: Packet) -> None:
-        now = time.monotonic()
+        now = uptime()
         self._longest_gap = max(self._longest_gap, now - self.last_packet)
         self.last_packet = now
         self.exchanges += 1

@@ -8,6 +8,7 @@ from math import cos, inf, isfinite, sin
 from typing import Final
 
 from agents.body.interface import BodyError
+from agents.clock import uptime
 from agents.protocols.crazyflie import CrazyflieSettings, Outside
 from agents.protocols.crtp import Info
 from agents.ticks import Ticks
@@ -71,7 +72,7 @@ class CrazyfliePilot:
         self._connection_note = "connecting"
         self._order: Order | None = None
         self._executing = ""  # order
-        self._end_by = inf  # the thread ends then, even if the drone flies [s, monotonic]
+        self._end_by = inf  # the thread ends then, even if the drone flies [s, `uptime`]
         self._lock = threading.Lock()
         self._wake = threading.Event()
         self._ending = threading.Event()
@@ -100,7 +101,7 @@ class CrazyfliePilot:
         """Queue an order; it replaces a waiting one, except a stop, which nothing replaces."""
         with self._lock:
             if self._order is None or self._order[0] != "stop":
-                self._order = what, height, time.monotonic()
+                self._order = what, height, uptime()
         self._wake.set()
 
     def set_target(self, now: float, target: Target | None) -> None:
@@ -144,19 +145,19 @@ class CrazyfliePilot:
 
     def close(self, *, land: bool = True) -> None:
         """Land the drone if it flies, unless it is to be left as it is, then end the thread."""
-        self._end_by = time.monotonic() + (max(LANDING_S, self._flight.landing_s) if land else 0.0)
+        self._end_by = uptime() + (max(LANDING_S, self._flight.landing_s) if land else 0.0)
         self._ending.set()
         self._wake.set()
 
     def join(self) -> None:
         """Wait for the end of the thread."""
         if self._thread.ident is not None:
-            self._thread.join(self._end_by - time.monotonic() + JOIN_S)
+            self._thread.join(self._end_by - uptime() + JOIN_S)
 
     # ------------------------------------------------------------------ the thread
 
     def _run(self) -> None:
-        while not self._ending.is_set() or (self._flight.airborne and time.monotonic() < self._end_by):
+        while not self._ending.is_set() or (self._flight.airborne and uptime() < self._end_by):
             try:
                 link = self._connect_in_turn()
             except Exception as error:  # noqa: BLE001 - of any kind: the robot must stay in reach of a stop
@@ -209,7 +210,7 @@ class CrazyfliePilot:
 
     def _connect(self) -> CrazyflieLink:
         """Open a new link, in as many attempts as the time allows; raises LinkError if all attempts fail."""
-        begin = time.monotonic()
+        begin = uptime()
         answered = False
         while True:
             link = CrazyflieLink(self._address)
@@ -218,7 +219,7 @@ class CrazyfliePilot:
             except SilentError as error:
                 answered = answered or link.answered
                 self._discard(link)
-                waited = time.monotonic() - begin
+                waited = uptime() - begin
                 if self._ending.is_set() or waited > (self._settings.connect_s if answered else NO_ANSWER_S):
                     raise LinkError(f"{error} at {self._address}: {self._remedy()}") from None
             except Exception as error:
@@ -257,10 +258,10 @@ class CrazyfliePilot:
         ranges_hz = settings.ranges_hz if settings.multiranger else None
         telemetry.start_logging(link, log_hz=settings.log_hz, ranges_hz=ranges_hz)
         link.ask_firmware()
-        deadline = time.monotonic() + STATUS_S
+        deadline = uptime() + STATUS_S
         while telemetry.status_time == -inf:
             self._check_link(link)
-            if time.monotonic() > deadline:
+            if uptime() > deadline:
                 raise LinkError("no status received")
             time.sleep(0.01)
         if telemetry.stamps.restarted:
@@ -312,12 +313,12 @@ class CrazyfliePilot:
 
     def _converge(self, link: CrazyflieLink) -> None:
         self._connection_note = "position estimate is settling"
-        deadline = time.monotonic() + self._settings.converge_s
+        deadline = uptime() + self._settings.converge_s
         absolute = self._settings.positioning is not None  # a Flow deck measures velocities
         convergence = Convergence(link, *self._start_pose, absolute=absolute)
-        while not convergence.advance(time.monotonic()):
+        while not convergence.advance(uptime()):
             self._check(link)
-            if time.monotonic() > deadline or self._ending.is_set():
+            if uptime() > deadline or self._ending.is_set():
                 cause = self._telemetry.status_text() or "does its positioning system work where it stands?"
                 raise BodyError(f"its position has not settled after {self._settings.converge_s:g} s: {cause}")
             time.sleep(0.02)
@@ -334,7 +335,7 @@ class CrazyfliePilot:
         landing = False
         link.take_gap()
         while True:
-            begin, wait = time.monotonic(), ticks.until_next()
+            begin, wait = uptime(), ticks.until_next()
             self._wake.wait(wait)
             self._wake.clear()
             now = self._note_standstill(begin + wait)
@@ -370,7 +371,7 @@ class CrazyfliePilot:
                 self._flight.stop()
             elif what == "land":
                 self._flight.land()
-            elif time.monotonic() - given < TAKEOFF_EXPIRY_S:
+            elif uptime() - given < TAKEOFF_EXPIRY_S:
                 self._flight.takeoff(height)
         finally:
             self._executing = ""
@@ -419,14 +420,14 @@ class CrazyfliePilot:
         A stop replaces all; a landing, and the end of the process, replace a take-off.
         """
         link = self._flight.link
-        until = time.monotonic() + seconds
+        until = uptime() + seconds
         while True:
             self._check(link)
             waiting = "" if self._order is None else self._order[0]
             coming_down = waiting == "land" or self._ending.is_set()
             if waiting == "stop" or (coming_down and self._executing == "takeoff"):
                 raise OrderReplaced
-            now = time.monotonic()
+            now = uptime()
             self._forward_external_pose(link, now)
             if now >= until:
                 return
@@ -437,7 +438,7 @@ class CrazyfliePilot:
 
     def _note_standstill(self, due: float) -> float:
         """Note whether a wait until `due` [s] took far longer, as in a suspended process; returns now."""
-        now = time.monotonic()
+        now = uptime()
         late = now - due
         if late > LANDING_GAP_S:
             self._stood_still = late
@@ -452,7 +453,7 @@ class CrazyfliePilot:
         if pose is not None and now - self._forwarded_at >= 0.9 / system.rate_hz and not link.busy:
             self._external_pose, self._forwarded_at = None, now
             measured, position, yaw = pose
-            if time.monotonic() - measured > EXTERNAL_AGE_S:
+            if uptime() - measured > EXTERNAL_AGE_S:
                 return
             x, y, z = position
             if system.attitude and isfinite(yaw):

@@ -14,6 +14,7 @@ import msgspec
 from msgspec import Meta
 
 from agents.body.interface import BodyError
+from agents.clock import uptime
 from agents.protocols import crtp
 from agents.protocols.crazyflie import CrazyflieSettings, Lighthouse, Loco, Outside
 from agents.vectors import Vector
@@ -123,7 +124,7 @@ class Convergence:
         self._sent_at: float | None = None  # time of the last question about the first of these
 
     def advance(self, now: float) -> bool:
-        """Continue at `now` on the monotonic clock [s]; True once the estimate has settled."""
+        """Continue at `now` on the clock `uptime` [s]; True once the estimate has settled."""
         while self._to_set and not self._set(now, *self._to_set[0]):
             return False
         if not self.done and len(self._variances) == SAMPLES:
@@ -226,7 +227,7 @@ def _prepare_loco(link: CrazyflieLink, system: Loco) -> None:
         raise BodyError("no Loco positioning deck found: is the deck there, the right way round?")
     link.set_parameter("loco.mode", LOCO_MODES[system.mode])
     wanted = dict(enumerate(system.anchors))
-    deadline = time.monotonic() + ANCHORS_S
+    deadline = uptime() + ANCHORS_S
     missing = wanted
     while missing:
         for anchor, place in missing.items():
@@ -236,7 +237,7 @@ def _prepare_loco(link: CrazyflieLink, system: Loco) -> None:
         missing = {
             anchor: place for anchor, place in wanted.items() if anchor not in known or not _agree(known[anchor], place)
         }
-        if missing and time.monotonic() > deadline:
+        if missing and uptime() > deadline:
             raise BodyError(f"anchor {min(missing)} did not store its position: is it on, in mode {system.mode}?")
     if not wanted and len(_anchors(link, memories[0])) == 0:
         raise BodyError("no anchor knows its position: write positioning.anchors = [[x, y, z], ...]")
@@ -261,8 +262,8 @@ def _await_answer(link: CrazyflieLink, ask: Callable[[Callable[[Any], None]], ob
         received.set()
 
     ask(receive)
-    deadline = time.monotonic() + UPLOAD_S
+    deadline = uptime() + UPLOAD_S
     while not received.wait(0.02):
-        if link.error is not None or time.monotonic() > deadline:
+        if link.error is not None or uptime() > deadline:
             raise LinkError(f"no answer: {what}")
     return answers[0]

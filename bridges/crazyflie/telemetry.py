@@ -6,11 +6,11 @@ this computer hold packets back for seconds without losing one.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from math import exp, inf, isfinite, nan, radians
 from typing import Final
 
+from agents.clock import uptime
 from agents.protocols.crtp import MM, Info, Power
 from bridges.crazyflie.link import CrazyflieLink
 from bridges.crazyflie.positioning import SETTLED_BELOW
@@ -83,7 +83,7 @@ class PacketAge:
 
 
 class Telemetry:
-    """Newest telemetry of one Crazyflie; times on the monotonic clock [s], -inf before the first."""
+    """Newest telemetry of one Crazyflie; times on the clock `uptime` [s], -inf before the first."""
 
     def __init__(self, *, lighthouse: bool, absolute: bool = False) -> None:
         """`lighthouse`: has base stations; `absolute`: positions are measured, see `Convergence`."""
@@ -111,7 +111,7 @@ class Telemetry:
     @property
     def pose_age(self) -> float:
         """Age of the last pose [s]; infinity before the first."""
-        return time.monotonic() - self.pose_time
+        return uptime() - self.pose_time
 
     def reset_status(self) -> None:
         """Clear the status at a new connection; whether the drone was switched off and on, its next packet tells."""

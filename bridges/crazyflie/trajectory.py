@@ -13,10 +13,10 @@ from __future__ import annotations
 
 import math
 import struct
-import time
 from collections.abc import Callable, Sequence
 from typing import Any, Final
 
+from agents.clock import uptime
 from agents.protocols import crtp
 from agents.protocols.crazyradio import COUNTERS, NULL
 from agents.protocols.crtp import HighLevel, Port
@@ -36,7 +36,7 @@ TAKEOFFS: Final = (4, 5)
 PLACES: Final = ((0x000, 0), (0x040, 0), (0x100, 2), (0x300, 2), (0x080, 0), (0x500, 3))
 REPEAT_S: Final = 0.3  # a part that is not confirmed is written again after this
 START_EXPIRY_S: Final = 0.5  # a radio does not deliver a start that has waited for longer
-STAMP: Final = struct.Struct("<d")  # time of a start [s, monotonic], behind what the firmware reads of it
+STAMP: Final = struct.Struct("<d")  # time of a start [s, `uptime`], behind what the firmware reads of it
 
 STARTS: Final = crtp.header(Port.HIGH_LEVEL, 0) & ~COUNTERS
 
@@ -95,7 +95,7 @@ class TrajectoryMemory:
         self._send = send
         self._written: dict[int, bytes] = {}  # confirmed parts, by address
         self._sent: tuple[int, bytes] | None = None  # address and content of the part that is not confirmed yet,
-        self._sent_at = -math.inf  # [s, monotonic]
+        self._sent_at = -math.inf  # [s, `uptime`]
         self._upcoming: tuple[int, bytes] | None = None  # number and content of the setpoint that is being written
         self._started = -1  # number of the last trajectory that was started
         self._packets = 0  # sent since then
@@ -121,7 +121,7 @@ class TrajectoryMemory:
         `before_start` is called just before it is started.
         Returns the number of packets that it has taken if it was started, else 0.
         """
-        if self._upcoming is None or time.monotonic() - self._sent_at > START_EXPIRY_S:
+        if self._upcoming is None or uptime() - self._sent_at > START_EXPIRY_S:
             short = _fits(target)
             data = compressed(target, seconds) if short else polynomials(target, seconds)
             one, other = COMPRESSED if short else POLYNOMIALS
@@ -148,7 +148,7 @@ class TrajectoryMemory:
             if self.start_command == HighLevel.START_2
             else crtp.START.pack(False, False, number, 1.0)
         )
-        self._send(Port.HIGH_LEVEL, 0, bytes((self.start_command, 0)) + packed + STAMP.pack(time.monotonic()))
+        self._send(Port.HIGH_LEVEL, 0, bytes((self.start_command, 0)) + packed + STAMP.pack(uptime()))
         packets, self._packets = self._packets + 1, 0
         self._started, self._upcoming = number, None
         return packets
@@ -156,7 +156,7 @@ class TrajectoryMemory:
     def _write(self, number: int, data: bytes) -> bool:
         """Write the next part of a trajectory, unless one is not confirmed yet; True when all of it is."""
         missing = self._missing(number, data)
-        now = time.monotonic()
+        now = uptime()
         if missing and (self._sent is None or now - self._sent_at > REPEAT_S):
             address, part = self._sent = missing[0]
             self._written.pop(address, None)
@@ -185,7 +185,7 @@ class PromptRadio:
         """See cflib's Crazyradio."""
         if data[0] & ~COUNTERS == STARTS and data[1] in (HighLevel.START, HighLevel.START_2):
             (born,) = STAMP.unpack(bytes(data[-STAMP.size :]))
-            if time.monotonic() - born > START_EXPIRY_S:
+            if uptime() - born > START_EXPIRY_S:
                 data[0] |= NULL  # the counters of safelink stay
                 del data[1:]
         return self._radio.send_packet(data)

@@ -15,7 +15,7 @@ from twins.devices.crazyflie.device import CrazyflieTwin
 def clocked(monkeypatch, clock):
     """Let flight control, telemetry and trajectories take their time from a clock."""
     for module in (flight, telemetry, trajectory):
-        monkeypatch.setattr(module, "time", clock)
+        monkeypatch.setattr(module, "uptime", clock.monotonic)
 
 
 class Process(Driver):

@@ -490,3 +490,15 @@ def test_a_radio_with_too_many_robots():
     assert overload("0", [CrazyflieSettings()] * 6, 357.0) == ""
     text = overload("0", [CrazyflieSettings()] * 15, 400.0)
     assert text.endswith(": plug in another radio; this one carries 10, with log_hz = 20, stream_hz = 4")
+
+
+@pytest.mark.system
+def test_computer_that_slept_lands_its_drone(monkeypatch):
+    """It has sunk to the floor meanwhile: the next setpoint would lift it."""
+    slept, clock = [0.0], time.clock_gettime
+    monkeypatch.setattr(time, "clock_gettime", lambda which: clock(which) + slept[0] * (which == time.CLOCK_BOOTTIME))
+    with connected_twins(device=DONGLE) as (twin, process):
+        process.takeoff(HEIGHT)
+        slept[0] = 2.0
+        process.noted("landed: nothing received for 2.0 s")
+        process.until(lambda: not motors(twin), "motors off")
