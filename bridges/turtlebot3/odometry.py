@@ -52,7 +52,8 @@ class Odometry:
         self.age = 0.0  # of the last odometry when it arrived, by its stamp [s]
         self.restarted = False
         self._start, self._stamps = start, StampAge()
-        self._raw_pose: Planar = (nan, nan, nan)  # in odometry's own frame
+        self._raw_pose: Planar = (nan, nan, nan)  # in odometry's own frame,
+        self._stamp = inf  # and when, on the clock of the robot [s]
         self._frame: Planar | None = start if boot else None  # origin of odometry in the arena
         self._resets: deque[float] = deque(maxlen=RESETS[0])  # times of the last
 
@@ -66,24 +67,27 @@ class Odometry:
             return False
         if self._frame is None:
             self._frame = _frame(self._start, (x, y, yaw))
-        pose = _to_arena(self._frame, (x, y, yaw))
-        if self.received > -inf and self._was_reset((x, y, yaw), pose, now):
+        pose, stamp = _to_arena(self._frame, (x, y, yaw)), ros2.stamp_of(message.header)
+        if self.received > -inf and self._was_reset((x, y, yaw), pose, now, stamp):
             # odometry counts from zero again: assume that the robot stands at its last known pose
             self._frame, self.restarted = _frame(self.pose, (x, y, yaw)), True
             self._resets.append(now)
             pose = self.pose
-        self._raw_pose = (x, y, yaw)
+        self._raw_pose, self._stamp = (x, y, yaw), stamp
         self.pose, self.speed = pose, (v, w)
-        self.age = self._stamps.age(now, ros2.stamp_of(message.header))
+        self.age = self._stamps.age(now, stamp)
         self.received = now
         return True
 
-    def _was_reset(self, counted: Planar, pose: Planar, now: float) -> bool:
-        """Whether odometry was reset: a jump faster than any robot, or back at the origin after a silence."""
+    def _was_reset(self, counted: Planar, pose: Planar, now: float, stamp: float) -> bool:
+        """Whether odometry was reset: a jump faster than any robot, or back at the origin after a silence.
+
+        Messages that a link has held back come at once, and some of them are skipped: their stamps are apart.
+        """
         silence = now - self.received
         jump = hypot(pose[0] - self.pose[0], pose[1] - self.pose[1])
         back = silence > SILENCE_S and _at_origin(counted) and not _at_origin(self._raw_pose)
-        return back or jump > FASTEST * silence + 0.1
+        return back or jump > FASTEST * max(silence, stamp - self._stamp) + 0.1
 
     def silent(self, now: float) -> bool:
         return now - self.received > SILENCE_S

@@ -93,6 +93,16 @@ def test_age_by_stamps_of_another_clock(arrivals, stamps, ages):
     assert [stamped.age(*pair) for pair in zip(arrivals, stamps, strict=True)] == pytest.approx(ages, abs=0.005)
 
 
+def test_messages_held_back_are_no_restart():
+    """Of a burst over two ticks the newest four of each are read."""
+    robot = TurtleBotConnection(request(NOWHERE, "ros2dds://tb3_0?distro=humble"), 0)
+    ros = FakeRos(robot)
+    for k, arrival in [(0, 0.0), (10, 0.5), *((k, 2.0) for k in range(11, 15)), *((k, 2.02) for k in range(36, 40))]:
+        ros.odometry.append(odometry(ros.types, 0.011 * k, stamp=100.0 + 0.05 * k))
+        robot.receive_messages(arrival, arrival)
+    assert robot.odometry.pose[0] == pytest.approx(0.011 * 39)
+
+
 TWO = request(NOWHERE, "rmw://a?distro=humble", "rmw://b?distro=humble", start=((0.0, 0.0), (1.0, 0.0)))
 
 
