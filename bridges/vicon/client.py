@@ -16,7 +16,6 @@ from agents.protocols import vicon_datastream
 from agents.protocols.vicon_datastream import BlockKind, Framer, MalformedBlock, Segment, Subject
 
 CHUNK: Final = 1 << 18  # [bytes] read at once: about ten frames of twenty bodies
-OLDEST_S: Final = 1.0  # a larger latency in a frame is invalid
 
 
 @dataclass(frozen=True)
@@ -62,7 +61,7 @@ class Decoder:
             known.name: next((s for s in seen.get(known.number, ()) if s.number == known.root), None)
             for known in self._subjects.values()
         }
-        return Frame(number, latency if 0.0 <= latency <= OLDEST_S else 0.0, poses, self._z_up)
+        return Frame(number, latency if latency > 0.0 else 0.0, poses, self._z_up)
 
 
 class Reader:

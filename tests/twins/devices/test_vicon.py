@@ -62,7 +62,7 @@ def test_packed_frames_are_unpacked_however_they_are_cut(bodies, number, cut):
         vicon_datastream.pack_axes(),
         *(vicon_datastream.pack_subject(row, f"körper {row}") for row in range(len(sent))),
         vicon_datastream.pack_frame_number(number),
-        vicon_datastream.pack_latency([("a", 0.25), ("b", 0.125)]),
+        vicon_datastream.pack_latency([("a", 0.25), ("b", 1.125)]),
         *(vicon_datastream.pack_segments(row, [segment]) for row, segment in enumerate(sent)),
     )
     framer, decoder = Framer(), Decoder()
@@ -70,7 +70,7 @@ def test_packed_frames_are_unpacked_however_they_are_cut(bodies, number, cut):
     assert len(packets) == 2
     for body in packets:
         frame = decoder.frame(body)
-        assert (frame.number, frame.latency_s, frame.z_up) == (number, 0.375, True)
+        assert (frame.number, frame.latency_s, frame.z_up) == (number, 1.375, True)
         assert list(frame.poses) == [f"körper {row}" for row in range(len(sent))]
         for seen, placed in zip(frame.poses.values(), sent, strict=True):
             assert seen.position == pytest.approx(placed.position, abs=1e-12)
