@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import math
+from typing import Final
 
 from agents.body.external_pose import velocity_after
 from agents.protocols import khepera4 as protocol
+
+ORIGIN: Final = 0.01  # [m, rad] counters closer to zero are at zero: who switched it on has touched its wheels
 
 
 class Odometer:
@@ -34,7 +37,7 @@ class Odometer:
 
     def wheels(self, left: float, right: float, stamp: float) -> None:
         """Add readings of the wheel encoders [pulses]."""
-        last = self._last_count((left, right))
+        last = self._last_count((left, right), protocol.PULSE)
         if last is not None:
             self._arc(*protocol.rolled(left - last[0], right - last[1]), stamp)
 
@@ -49,9 +52,9 @@ class Odometer:
         if last is not None:
             self._arc(way, math.remainder(theta - last[1], 2.0 * math.pi), stamp)
 
-    def _last_count(self, counted: tuple[float, ...]) -> tuple[float, ...] | None:
+    def _last_count(self, counted: tuple[float, ...], unit: float = 1.0) -> tuple[float, ...] | None:
         last, self._last = self._last, counted
-        reset, self._maybe_reset = self._maybe_reset and not any(counted), False
+        reset, self._maybe_reset = self._maybe_reset and unit * max(map(abs, counted)) < ORIGIN, False
         return None if reset else last
 
     def _arc(self, way: float, turn: float, stamp: float) -> None:
