@@ -140,7 +140,7 @@ class CrazyflieBody(Body):
             yaw,
             battery=telemetry.battery,
             flying=telemetry.airborne,
-            received=telemetry.status_time - self._zero,
+            received=max(telemetry.pose_time, telemetry.status_time) - self._zero,
             note=self._note(row, now),
             refusal=pilot.refusal,
             scan=self._scan(telemetry) if self._settings[row].multiranger else None,
