@@ -2,11 +2,14 @@
 
 from collections import deque
 from collections.abc import Callable, Sequence
-from contextlib import closing, contextmanager, redirect_stdout
+from contextlib import ExitStack, contextmanager, redirect_stdout, suppress
 from dataclasses import dataclass
+from inspect import signature
 from io import StringIO
 
 from tests.network import Net
+
+PLACES = {}  # by name
 
 
 @dataclass(frozen=True)
@@ -22,69 +25,65 @@ class Target:
 class Place:
     """A target that has yet to be made."""
 
-    make: Callable  # makes it ready, as a context manager
+    open: Callable  # makes it ready, as a context manager
     inputs: int  # its share of a million: more for what is fast, and for what the whole network may reach
-    quick: int = 200  # inputs in the ordinary tests
-
-    def open(self):
-        """The target, ready, in a `with`."""
-        return contextmanager(self.make)()
+    quick: int  # inputs in the ordinary tests
 
 
-class Renewed:
-    """Something with a memory, made anew after a number of inputs: one that was told too much refuses all the rest.
+def place(inputs, quick=200, name=None):
+    """Decorator of a generator that yields a target, whose name it gives to a place."""
 
-    It is a generator that is sent an input at each `yield`; its end, by an error too, is its `finally`.
+    def decorate(make):
+        PLACES[name or make.__name__.replace("_", "-")] = Place(contextmanager(make), inputs, quick)
+        return make
+
+    return decorate
+
+
+def renewed(every, examples, inputs, quick=200, refusals=()):
+    """Decorator of a generator that is sent inputs: a place of a target that reads them.
+
+    It is made anew after its end, which is its `finally`, and after a number of inputs, for what was told too much
+    refuses all the rest. If it has a parameter, that is a network without channels.
     """
 
-    def __init__(self, make, every):
-        self._make, self._every, self._left, self._made = make, every, 0, None
-
-    def __call__(self, data):
-        if not self._left:
-            self.close()
-            self._made, self._left = self._make(), self._every
-            next(self._made)
-        left, self._left = self._left, 0  # after an end or an error it has no use for more
-        try:
-            self._made.send(data)
-        except StopIteration:
-            return
-        self._left = left - 1
-
-    def close(self):
-        if self._made is not None:
-            self._made.close()
-
-
-def renewed(every, examples, refusals=()):
-    """Decorator of a generator that is sent inputs: a target with these examples, a function, made anew each time."""
-
     def decorate(make):
         def target():
-            with closing(Renewed(make, every)) as take:
+            made, left, nets = None, 0, []
+
+            def close():
+                if made is not None:
+                    made.close()
+
+            def take(data):
+                nonlocal made, left
+                if not left:
+                    close()
+                    for net in nets:
+                        net.forget()
+                    made, left = make(*nets), every
+                    next(made)
+                rest, left = left - 1, 0  # after an end or an error it has no use for more
+                with suppress(StopIteration):
+                    made.send(data)
+                    left = rest
+
+            with ExitStack() as stack:
+                if signature(make).parameters:
+                    nets.append(stack.enter_context(Net().worn()))
+                    stack.enter_context(redirect_stdout(StringIO()))
+                stack.callback(close)
                 yield Target(examples(), take, refusals)
 
-        return target
+        return place(inputs, quick, make.__name__.replace("_", "-"))(target)
 
     return decorate
 
 
-def networked(every, examples):
-    """As `renewed`, of a generator that gets a network without channels."""
-
-    def decorate(make):
-        def target():
-            def begin():
-                net.forget()
-                return make(net)
-
-            with Net().worn() as net, redirect_stdout(StringIO()), closing(Renewed(begin, every)) as take:
-                yield Target(examples(), take)
-
-        return target
-
-    return decorate
+def split(data):
+    """Text before the first zero byte, and bytes behind it."""
+    head, _, rest = data.partition(b"\0")
+    return head.decode("utf-8", "replace"), rest
 
 
 class Wire:

@@ -1,18 +1,20 @@
 """Bytes from and to Khepera IV robots and a Vicon."""
 
-from collections import deque
 from contextlib import ExitStack, closing
 from itertools import count
+from types import SimpleNamespace
+from unittest import mock
 
 import numpy as np
 
-from agents.protocols import khepera4, vicon_datastream
+from agents.protocols import khepera4
+from agents.protocols import vicon_datastream as vicon
 from agents.protocols.vicon_datastream import BlockKind, Segment
-from bridges.khepera4.drivers import KTeam, RoboticParkServer, identify
+from bridges.khepera4.drivers import KTeam, identify
 from bridges.khepera4.odometry import Odometer
 from bridges.vicon.client import Decoder
 from bridges.vicon.publisher import PoseFilter
-from tests.fuzz.target import Place, Target, Wire, renewed
+from tests.fuzz.target import Target, Wire, place, renewed
 from tests.requests import request
 from twins.devices.device import DeviceRequest, Faults
 from twins.devices.khepera4 import KheperaDevice
@@ -28,7 +30,7 @@ def khepera_orders():
     return examples + [f"k{word}\rR\r".encode() for word in kteam]
 
 
-@renewed(200, khepera_orders)
+@renewed(200, khepera_orders, 20_000, 100)
 def khepera_twin():
     with ExitStack() as stack:
         devices = {}
@@ -50,22 +52,7 @@ def khepera_twin():
                 return
 
 
-class Line:
-    def __init__(self, parts):
-        self.parts = deque(parts)
-
-    def send(self, data):
-        assert data
-
-    def pending(self):
-        return b""
-
-    def receive(self, _until):
-        if not self.parts:
-            raise TimeoutError
-        return self.parts.popleft()[:1024]
-
-
+@place(30_000)
 def khepera_bridge():
     """Answers of all servers to everything that the link asks, apart by zero bytes."""
 
@@ -78,25 +65,26 @@ def khepera_bridge():
 
     def take(data):
         which, *parts = data.split(b"\0")
-        line = Line(parts)
+
+        def receive(_until):
+            if not parts:
+                raise TimeoutError
+            return parts.pop(0)[:1024]
+
+        def send(request):
+            assert request
+
+        line = SimpleNamespace(send=send, pending=bytes, receive=receive)
         odometer = Odometer(0.0, 0.0, 0.0)
-        driver: RoboticParkServer | KTeam
-        if which[:1] == b"k":
-            driver = KTeam(line, khepera4.Khepera4Settings())
-        else:
-            gap, khepera4.GAP_S = khepera4.GAP_S, 0.0  # without the pauses
-            try:
-                driver = identify(line, khepera4.Khepera4Settings(), named.get(which[:1]))
-                driver.begin()
-                driver.drive(0.1, 0.2)
-                driver.move(odometer)
-                driver.drive(-0.1, 0.2)
-            finally:
-                khepera4.GAP_S = gap
-        if isinstance(driver, KTeam):
+        with mock.patch.object(khepera4, "GAP_S", 0.0):  # without the pauses
+            if which[:1] == b"k":
+                driver, speeds = KTeam(line, khepera4.Khepera4Settings()), [0.1]
+            else:
+                driver, speeds = identify(line, khepera4.Khepera4Settings(), named.get(which[:1])), [0.1, -0.1]
             driver.begin()
-            driver.drive(0.1, 0.2)
-        driver.move(odometer)
+            for speed in speeds:
+                driver.drive(speed, 0.2)
+                driver.move(odometer)
         assert np.isfinite((odometer.x, odometer.y, odometer.yaw)).all()
         _, distance = driver.ranges()
         assert not np.isinf(distance).any()
@@ -106,69 +94,57 @@ def khepera_bridge():
 
 
 def _vicon_stream():
-    names = b"".join([vicon_datastream.pack_stream_info(100.0), vicon_datastream.pack_axes(), *(
-        vicon_datastream.pack_subject(k, name) for k, name in enumerate(("cf1", "kh1")))])  # fmt: skip
+    subjects = [vicon.pack_subject(k, name) for k, name in enumerate(("cf1", "kh1"))]
+    names = b"".join([vicon.pack_stream_info(100.0), vicon.pack_axes(), *subjects])
     eye = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
-    latency = vicon_datastream.pack_latency([("a", 0.002), ("b", 0.001)])
+    latency = vicon.pack_latency([("a", 0.002), ("b", 0.001)])
     frames = []
     for number in range(3):
-        parts = [vicon_datastream.pack_segments(k, [Segment(0, (0.1 * number, 0.2, 0.3), eye)]) for k in range(2)]
-        frames.append(vicon_datastream.pack_frame_number(number) + latency + b"".join(parts))
+        parts = [vicon.pack_segments(k, [Segment(0, (0.1 * number, 0.2, 0.3), eye)]) for k in range(2)]
+        frames.append(vicon.pack_frame_number(number) + latency + b"".join(parts))
     return [
-        vicon_datastream.packet(names, frames[0]),
-        vicon_datastream.packet(names, frames[0]) + vicon_datastream.packet(frames[1]),
-        vicon_datastream.packet(frames[1]), vicon_datastream.packet(names), vicon_datastream.packet(names,
-        vicon_datastream.pack_axes(1), frames[2]),
-        vicon_datastream.pack_kinds(vicon_datastream.POSES),
-    ]  # fmt: skip
+        vicon.packet(names, frames[0]),
+        vicon.packet(names, frames[0]) + vicon.packet(frames[1]),
+        vicon.packet(frames[1]),
+        vicon.packet(names),
+        vicon.packet(names, vicon.pack_axes(1), frames[2]),
+        vicon.pack_kinds(vicon.POSES),
+    ]
 
 
-@renewed(300, _vicon_stream, (vicon_datastream.MalformedBlock,))
+@renewed(300, _vicon_stream, 50_000, refusals=(vicon.MalformedBlock,))
 def vicon_bridge():
     """Output of a DataStream server, in chunks."""
     decoder, pose_filter = Decoder(), PoseFilter({"CF01": "cf1", "KH01": "kh1"}, lambda _: None)
     for k in count(1):
         data = yield
-        framer = vicon_datastream.Framer()  # the connection is made anew after every error
+        framer = vicon.Framer()  # the connection is made anew after every error
         for begin in range(0, len(data), 4000):
             for body in framer.feed(data[begin : begin + 4000]):
-                for kind, payload in vicon_datastream.blocks(body):
+                for kind, payload in vicon.blocks(body):
                     if kind == BlockKind.OBJECT_ENUMS:
-                        vicon_datastream.unpack_kinds(payload)
+                        vicon.unpack_kinds(payload)
                 frame = decoder.frame(body)
                 if frame is not None:
                     for _, measured, segment, yaw in pose_filter.filter_poses(frame, 0.01 * k):
                         assert np.isfinite((measured, yaw, *segment.position)).all()
 
 
+@place(20_000)
 def vicon_twin():
     """Requests of a client to the server."""
-    ask = vicon_datastream.packet(vicon_datastream.block(BlockKind.REQUEST_FRAME, b"\1"))
-    one = vicon_datastream.packet(vicon_datastream.block(BlockKind.REQUEST_NEXT_FRAME))
-    vicon = ViconTwin(["cf1", "kh1"])
-    t = 0.0
+    ask = vicon.packet(vicon.block(BlockKind.REQUEST_FRAME, b"\1"))
+    one = vicon.packet(vicon.block(BlockKind.REQUEST_NEXT_FRAME))
+    ticks = count(1)
 
     def take(data):
-        nonlocal t
-        t += 0.01
-        wire = Wire()
-        vicon.clients = {wire: _Client()}
+        t, wire = 0.01 * next(ticks), Wire()
+        twin.clients = {wire: _Client()}
         wire.waiting += [data[:3000], data[3000:]] if len(data) > 3000 else [data]
-        while wire.waiting and wire in vicon.clients:
-            vicon.serve(wire, t)
-        vicon.advance(t)
+        while wire.waiting and wire in twin.clients:
+            twin.serve(wire, t)
+        twin.advance(t)
 
-    yield Target(
-        [vicon_datastream.pack_kinds(vicon_datastream.POSES) + ask, ask, one, vicon_datastream.packet() + one + one],
-        take,
-    )
-    vicon.clients.clear()
-    vicon.close()
-
-
-PLACES = {
-    "khepera-twin": Place(khepera_twin, 20_000, 100),
-    "khepera-bridge": Place(khepera_bridge, 30_000),
-    "vicon-bridge": Place(vicon_bridge, 50_000),
-    "vicon-twin": Place(vicon_twin, 20_000),
-}
+    with closing(ViconTwin(["cf1", "kh1"])) as twin:
+        yield Target([vicon.pack_kinds(vicon.POSES) + ask, ask, one, vicon.packet() + one + one], take)
+        twin.clients.clear()

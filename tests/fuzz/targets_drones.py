@@ -3,9 +3,9 @@
 import importlib.util
 import socket
 import sys
-import types
 from contextlib import closing, suppress
 from itertools import count
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from agents.protocols import crtp
 from agents.protocols.crtp import HighLevel, Log, Misc, Port, Setpoint, SupervisorCommand
 from agents.protocols.tello import TelloSettings
 from bridges.tello.pilot import TelloPilot
-from tests.fuzz.target import Place, Wire, renewed
+from tests.fuzz.target import Wire, renewed
 from tests.requests import request
 from twins.devices.crazyflie.device import CrazyflieTwin
 from twins.devices.device import DeviceRequest, Faults
@@ -70,7 +70,7 @@ def crtp_packets():
     )
 
 
-@renewed(100, crtp_packets)
+@renewed(100, crtp_packets, 40_000, 150)
 def crazyflie_twin():
     """CRTP packets, one or more behind each other (length, bytes), in the air and on the ground."""
     with closing(CrazyflieTwin(DeviceRequest(request("crazyflie", "crazyflie-twin"), Faults()))) as device:
@@ -95,7 +95,11 @@ go 50 60 70 50,speed 20,battery?,attitude?,tof?,sn?,wifi?,streamon,flip l,curve 
 curve 71 29 0 100 100 0 30,go 50 0 0 30 m1,wifi a b,keepalive,jump 1 2 3 4 5 m1 m2,mon,time?,speed?,baro?,sdk?"""
 
 
-@renewed(100, lambda: [b"command", *(f"command\0takeoff\0\0{word.strip()}".encode() for word in WORDS.split(","))])
+def tello_words():
+    return [b"command", *(f"command\0takeoff\0\0{word.strip()}".encode() for word in WORDS.split(","))]
+
+
+@renewed(100, tello_words, 20_000, 100)
 def tello_twin():
     """Words over UDP, datagrams apart by zero bytes."""
     with socket.socket(type=socket.SOCK_DGRAM) as client:
@@ -115,27 +119,6 @@ def tello_twin():
                 assert np.isfinite(device.truth()[0]).all()
 
 
-class Drone:
-    """State of a drone, parsed by djitellopy itself."""
-
-    def __init__(self):
-        self.state = {}
-        self.responses = []
-
-    def send_command_without_return(self, command):
-        word, *sticks = command.split()
-        assert word != "rc" or [-100 <= int(stick) <= 100 for stick in sticks] == [True] * 4
-
-    def get_current_state(self):
-        return self.state
-
-    def get_own_udp_object(self):
-        return {"responses": self.responses, "state": self.state}
-
-    def end(self):
-        pass
-
-
 LINE = (
     b"mid:-1;x:-100;y:-100;z:-100;mpry:0,0,0;pitch:0;roll:0;yaw:12;vgx:0;vgy:0;vgz:0;templ:63;temph:66;tof:50;"
     b"h:40;bat:80;baro:170.80;time:12;agx:-6.00;agy:1.00;agz:-999.00;\r\n\0"
@@ -143,15 +126,22 @@ LINE = (
 ANSWERS = (b"ok", b"error", b"out of range", b"unknown command: x", b"error Auto land")
 
 
-@renewed(200, lambda: [LINE + answer for answer in ANSWERS])
+def check_sticks(command):
+    word, *sticks = command.split()
+    assert word != "rc" or [-100 <= int(stick) <= 100 for stick in sticks] == [True] * 4
+
+
+@renewed(200, lambda: [LINE + answer for answer in ANSWERS], 20_000)
 def tello_pilot():
-    """A drone's state lines and answers: state and answer with a zero byte between them."""
+    """A drone's state lines, parsed by djitellopy itself, and answers, with a zero byte between them."""
     if "av" not in sys.modules and importlib.util.find_spec("av") is None:
-        sys.modules["av"] = types.ModuleType("av")  # only its video would need it, see `bridges.tello.library`
+        sys.modules["av"] = ModuleType("av")  # only its video would need it, see `bridges.tello.library`
     import djitellopy.tello  # noqa: PLC0415
 
     djitellopy.tello.Tello.LOGGER.setLevel("CRITICAL")  # it says every line that it cannot read
-    drone = Drone()
+    drone = SimpleNamespace(state={}, responses=[], end=lambda: None, get_current_state=lambda: drone.state)
+    drone.get_own_udp_object = lambda: {"responses": drone.responses, "state": drone.state}
+    drone.send_command_without_return = check_sticks
     pilot = TelloPilot(drone, KINDS["tello"], TelloSettings())
     pilot.position = (0.0, 0.0, 0.5)
     for k in count(1):
@@ -164,10 +154,3 @@ def tello_pilot():
             pilot.take_off(0.5, now)
         pilot.step(now, now)
         assert isinstance(pilot.note(now), str)
-
-
-PLACES = {
-    "crazyflie-twin": Place(crazyflie_twin, 40_000, 150),
-    "tello-twin": Place(tello_twin, 20_000, 100),
-    "tello-pilot": Place(tello_pilot, 20_000),
-}

@@ -16,7 +16,9 @@ from functools import partial
 from pathlib import Path
 
 import msgspec
-from mcap.writer import CompressionType, Writer
+from mcap.data_stream import RecordBuilder
+from mcap.stream_reader import StreamReader
+from mcap.writer import MCAP0_MAGIC
 
 from agents.body.interface import BodyError, settings
 from agents.errors import ExplainedError
@@ -36,7 +38,7 @@ from experiments.file.document import DocumentError, write_json
 from experiments.file.text import decoded
 from experiments.recording import bundle, playback
 from experiments.recording import writer as recording
-from experiments.recording.reader import RecordingError, Records, recover
+from experiments.recording.reader import RecordingError, recover
 from experiments.recording.ros2.cdr import Undecodable, Unencodable, codec
 from experiments.recording.run_folder import METRICS, ORIGIN, SOURCE, differences, past_runs
 from experiments.recording.topics import SentGoal, SentPose
@@ -46,7 +48,7 @@ from experiments.sweep.runs import RunMetrics
 from experiments.sweep.store import RUNS, Store, StoreOrigin
 from tests.experiments import robotic_park_files as theirs
 from tests.fuzz.messages import KEYS, good, of_all
-from tests.fuzz.target import Place, Target
+from tests.fuzz.target import Target, place, split
 from tools.commands.network import key_expression
 from twins.devices.device import Faults
 
@@ -90,6 +92,7 @@ def experiment(suffix, examples):
         yield Target(examples, take, (DocumentError,))
 
 
+@place(12_000, 120)
 def toml():
     """The catalogue, and every malformed file of the tests."""
     files = [*sorted(index.FOLDER.glob("*.toml")), *sorted(MALFORMED.glob("*.toml"))]
@@ -98,12 +101,14 @@ def toml():
     return experiment(".toml", [small] * max(1, len(files) // 5) + [file.read_bytes() for file in files])
 
 
+@place(8_000, 40)
 def resolved():
     """Cases as the processes are told them."""
     names = ("triangle", "convoy", "obstacle-course")
     return experiment(".json", [write_json(document.read(name).plan) for name in names])
 
 
+@place(8_000, 40)
 def arena():
     """An arena file beside an experiment."""
     text = '[robots.K]\nkind = "khepera4"\nstart = [0, 0]\n[arena]\nfile = "a.arena.toml"\n'
@@ -119,6 +124,7 @@ def arena():
         yield Target([*examples, b"[arena]\nsize = [4, 4, 2]\n"], take, (DocumentError,))
 
 
+@place(12_000, 60)
 def overrides():
     """Arguments of `--set`, one a line."""
     flags = [
@@ -137,6 +143,7 @@ def overrides():
     yield Target(examples, take, (DocumentError,))
 
 
+@place(4_000, 25)
 def park_yaml():
     """Files of Robotic Park's authors; what becomes of them is read."""
     texts = [theirs.dome(4), theirs.column(3, 1), theirs.dome(5, origin=True, real=(0,))]
@@ -153,11 +160,10 @@ def park_yaml():
         yield Target(examples, take, (DocumentError,))
 
 
-def recording_bytes(*, plain):
-    """Recordings of a second: as they are made, or neither compressed nor guarded by checksums."""
+def recording_of_a_second():
+    """A recording with every topic."""
     what = document.read("triangle", ["duration_s=1.0", "timeline=[]"]).experiment
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "good.mcap"
+    with place_for("good.mcap") as path:
         began = time.time()
         with recording.Recording(path, Plan(what), "x", case="only", seed=1, clock="real", started=began) as writer:
             for k in range(12):
@@ -172,26 +178,15 @@ def recording_bytes(*, plain):
             for stamp, lies in ((began, 0.2), (began + 1.0, 0.21)):
                 writer.write(wire.HostClock("lab1", stamp, lies, 0.001, ["KH01"]))
             writer.write(wire.Event(began + 1.0, "phase", "conductor", "landing"))
-        if not plain:
-            return [path.read_bytes(), path.read_bytes()[: path.stat().st_size // 2]]
-        records, target = Records(path), Path(folder) / "plain.mcap"
-        messages = list(records.messages())  # the records are known afterwards
-        with target.open("wb") as file:
-            copy = Writer(file, compression=CompressionType.NONE, use_chunking=False, enable_crcs=False)
-            copy.start("ros2", "zenpark")
-            for attached in records.attachments:
-                copy.add_attachment(0, 0, attached.name, attached.media_type, attached.data)
-            for about in records.metadata:
-                copy.add_metadata(about.name, about.metadata)
-            schemas = {k: copy.register_schema(s.name, s.encoding, s.data) for k, s in records.schemas.items()}
-            channels = {
-                k: copy.register_channel(c.topic, c.message_encoding, schemas[c.schema_id], c.metadata)
-                for k, c in records.channels.items()
-            }
-            for message in messages:
-                copy.add_message(channels[message.channel], message.logged, message.data, message.published)
-            copy.finish()
-        return [target.read_bytes()]
+        return path.read_bytes()
+
+
+def unpacked(data):
+    """The same recording, neither compressed nor guarded by checksums."""
+    plain = RecordBuilder()
+    for record in StreamReader(io.BytesIO(data)).records:
+        record.write(plain)
+    return MCAP0_MAGIC + plain.end() + MCAP0_MAGIC
 
 
 def resealed(data):
@@ -208,23 +203,36 @@ def resealed(data):
     return bytes(made)
 
 
-def recording_of(*, plain):
-    """A recording is read, analysed and recovered: as the disk may leave it, or forged, its checksums made good."""
+def recordings(examples, as_read):
+    """A recording is read, analysed and recovered."""
     with place_for("some.mcap") as file:
         target = file.with_name("other.mcap")
 
         def take(data):
-            file.write_bytes(resealed(data) if plain else data)
+            file.write_bytes(as_read(data))
             if len(data) % 4 == 0:
                 target.unlink(missing_ok=True)
                 with suppress(RecordingError):
                     recover(file, target)
-            trace = playback.read(file).trace
-            assert len(trace.time) <= 100_000
+            assert len(playback.read(file).trace.time) <= 100_000
 
-        yield Target(recording_bytes(plain=plain), take, (RecordingError,))
+        yield Target(examples, take, (RecordingError,))
 
 
+@place(10_000, 60)
+def damaged_recording():
+    """As the disk may leave it."""
+    data = recording_of_a_second()
+    return recordings([data, data[: len(data) // 2]], bytes)
+
+
+@place(10_000, 60)
+def forged_recording():
+    """Its checksums made good."""
+    return recordings([unpacked(recording_of_a_second())], resealed)
+
+
+@place(50_000, 500)
 def cdr():
     """Every recorded struct: name and CDR with a zero byte between them; what is decoded can be encoded."""
     said = good("KH01")
@@ -236,17 +244,18 @@ def cdr():
         SentGoal("KH01", 1, 1.0, (0.0, 0.0, 0.0), None, 0.9, received=1.0, size=150),
     ]  # fmt: skip
     codecs = {type(each).__name__: codec(type(each)) for each in made}
-    examples = [type(each).__name__.encode() + b"\0" + codecs[type(each).__name__].encode(each) for each in made]
     names = list(codecs)
+    examples = [type(each).__name__.encode() + b"\0" + codec(type(each)).encode(each) for each in made]
 
     def take(data):
-        head, _, payload = data.partition(b"\0")
-        chosen = codecs.get(head.decode("utf-8", "replace")) or codecs[names[len(data) % len(names)]]
+        name, payload = split(data)
+        chosen = codecs.get(name) or codecs[names[len(data) % len(names)]]
         chosen.encode(chosen.decode(payload))
 
     yield Target(examples, take, (Undecodable, Unencodable))
 
 
+@place(10_000)
 def run_files():
     """`run.json`, `metrics.json` and the experiment file of a past run: what cannot be read is not known."""
     origin = {"command": "zenpark run a.toml", "file": "a.toml", "begun": 1e9, "tags": ["a"], "changes": ["seed=3"]}
@@ -268,6 +277,7 @@ def run_files():
         yield Target([example], take)
 
 
+@place(10_000)
 def bundles():
     """Archives of runs: damaged and forged ones are refused, and nothing is written outside of their folder."""
     parts = {ORIGIN: b'{"file": "a.toml"}', SOURCE: b"title = 'A'\n"}
@@ -290,6 +300,7 @@ def bundles():
         yield Target([packed.getvalue()], take, (RecordingError,))
 
 
+@place(30_000)
 def sweep_runs():
     """`runs.jsonl` and `origin.json` of a sweep: lines that cannot be read are counted, not fatal."""
     kinds = {int: 1, float: 0.5, bool: True, str: "x"}
@@ -309,6 +320,7 @@ def sweep_runs():
         yield Target([line * 2 + b'\0{"version":"1","code":"2","file":"3"}', line + line[:30]], take, (DocumentError,))
 
 
+@place(6_000, 30)
 def sweep_arguments():
     """Axes and seeds, one a line."""
     read = document.read("triangle")
@@ -352,6 +364,7 @@ park d 10.0 0.5
 """
 
 
+@place(60_000, 400)
 def words():
     """Addresses, endpoints, settings of devices, faults, key expressions: kind and text with a zero byte between."""
     kinds = (crazyflie.CrazyflieSettings, khepera4.Khepera4Settings, tello.TelloSettings, turtlebot3.TurtleBot3Settings)
@@ -389,27 +402,7 @@ def words():
         names = list(read)
 
         def take(data):
-            head, _, rest = data.partition(b"\0")
-            name = head.decode("utf-8", "replace")
-            text = rest.decode("utf-8", "surrogateescape")
-            read[name if name in read else names[len(data) % len(names)]](text)
+            name, rest = split(data)
+            read[name if name in read else names[len(data) % len(names)]](rest.decode("utf-8", "surrogateescape"))
 
-        refusals = (ExplainedError, argparse.ArgumentTypeError, msgspec.MsgspecError, ValueError)
-        yield Target(examples, take, refusals)
-
-
-PLACES = {
-    "toml": Place(toml, 12_000, 120),
-    "resolved": Place(resolved, 8_000, 40),
-    "arena": Place(arena, 8_000, 40),
-    "overrides": Place(overrides, 12_000, 60),
-    "park-yaml": Place(park_yaml, 4_000, 25),
-    "damaged-recording": Place(partial(recording_of, plain=False), 10_000, 60),
-    "forged-recording": Place(partial(recording_of, plain=True), 10_000, 60),
-    "cdr": Place(cdr, 50_000, 500),
-    "sweep-runs": Place(sweep_runs, 30_000),
-    "run-files": Place(run_files, 10_000),
-    "bundles": Place(bundles, 10_000),
-    "sweep-arguments": Place(sweep_arguments, 6_000, 30),
-    "words": Place(words, 60_000, 400),
-}
+        yield Target(examples, take, (ExplainedError, argparse.ArgumentTypeError, msgspec.MsgspecError, ValueError))

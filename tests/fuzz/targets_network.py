@@ -8,6 +8,7 @@ from itertools import count
 from math import isnan
 from pathlib import Path
 from threading import Event
+from types import SimpleNamespace
 
 import msgspec
 import numpy as np
@@ -30,7 +31,7 @@ from experiments.real_time.processes.world import WorldProcess
 from experiments.real_time.processes.world_population import WorldBodies
 from experiments.recording.writer import Recording
 from tests.fuzz.messages import KEYS, everything, good, of_all, sent
-from tests.fuzz.target import Place, Target, networked
+from tests.fuzz.target import Target, place, renewed, split
 from tests.network import Net, Reply, Sample
 from tests.requests import request
 from tools.commands.network import members, readable
@@ -45,6 +46,7 @@ def triangle(*changes):
 REPLIES = (wire.Reply("KH01", True, "ready", "", 0.1), wire.WorldReply(True, False, 0.1, ""))
 
 
+@place(300_000, 1000)
 def messages():
     """Every struct, both encodings: what is decoded can be encoded again."""
     kinds = {kind.__name__: kind for kind in wire.Message.__subclasses__()}
@@ -53,10 +55,9 @@ def messages():
     names = list(kinds.values())
 
     def take(data):
-        name, _, rest = data.partition(b"\0")
-        mime, _, payload = rest.partition(b"\0")
-        kind = kinds.get(name.decode("utf-8", "replace")) or names[len(data) % len(names)]
-        message = wire.decode(payload, mime.decode("utf-8", "replace"), kind)
+        name, rest = split(data)
+        mime, payload = split(rest)
+        message = wire.decode(payload, mime, kinds.get(name) or names[len(data) % len(names)])
         wire.encode(message)
         with suppress(OverflowError):  # JSON holds whole numbers of any length
             wire.encode(message, "msgpack")
@@ -67,7 +68,7 @@ def messages():
 THREE = partial(everything, "KH01", "KH02", "CF01")
 
 
-@networked(200, THREE)
+@renewed(200, THREE, 100_000, 600)
 def robot(net):
     """A robot's process: poses, tokens, orders, stops, positions, ranges; its body is never told nonsense."""
     plan = triangle("robots.KH01.position=external", "avoidance=barrier")
@@ -101,7 +102,7 @@ def robot(net):
         runtime.tick(0.01 * k)
 
 
-@networked(200, THREE)
+@renewed(200, THREE, 50_000, 300)
 def world(net):
     """The twin service: commands, states of those elsewhere, statuses, and orders to put things in and out."""
     plan = triangle("robots.KH01.body=world", "robots.KH02.body=world", "world.engine=pymunk")
@@ -117,7 +118,7 @@ def world(net):
             assert not carried or is_finite(state.position)
 
 
-@networked(1000, partial(everything, "KH01", "KH02"))
+@renewed(1000, partial(everything, "KH01", "KH02"), 60_000)
 def recorder(net):
     """The recorder writes what is honest and counts the rest; what it wrote can be read."""
     with (
@@ -130,24 +131,11 @@ def recorder(net):
             made.receive()
 
 
-class NoLauncher:
-    last_silence = -np.inf
-
-    def died(self):
-        return []
-
-    def running(self, _name):
-        return False
-
-    def start(self, *_, forked=False): ...
-
-    release = kill = start
-
-
-@networked(500, THREE)
+@renewed(500, THREE, 60_000)
 def conductor(net):
     """The conductor follows the robots' statuses, states and tokens, and changes robots when it is asked."""
-    launcher = NoLauncher()
+    changes = dict.fromkeys(("start", "release", "kill"), lambda *_, **__: None)
+    launcher = SimpleNamespace(last_silence=-np.inf, died=list, running=lambda _name: False, **changes)
     with tempfile.TemporaryDirectory() as name:
         folder, hosts = Path(name), Hosts(launcher, [])
         context = CaseContext(triangle(), "only", folder, folder / "x", ["tcp/127.0.0.1:1"], launcher, hosts)
@@ -160,7 +148,7 @@ def conductor(net):
             made._update()
 
 
-@networked(200, partial(everything, "KH01", "KH02", only=("position", "ranges", "state")))
+@renewed(200, partial(everything, "KH01", "KH02", only=("position", "ranges", "state")), 30_000)
 def external_body(net):
     """A body elsewhere says where it is and what it sees."""
     names = ["KH01", "KH02"]
@@ -175,7 +163,7 @@ def external_body(net):
         body.command([(0.0, 0.0, 0.0, 0.0)] * 2)
 
 
-@networked(10_000, partial(everything, "KH01", "KH02", only=("truth",)))
+@renewed(10_000, partial(everything, "KH01", "KH02", only=("truth",)), 20_000)
 def vicon_truths(net):
     """The simulated Vicon hears where twins are."""
     with closing(ViconTwin(["KH01", "KH02"])) as vicon:
@@ -186,6 +174,7 @@ def vicon_truths(net):
             vicon.advance(0.01 * k)
 
 
+@place(40_000)
 def answers():
     """Answers to orders, and the admin space that network tools read."""
     examples = [part for message in REPLIES for part in sent("park/KH01/order", message)]
@@ -198,10 +187,9 @@ def answers():
     examples += [b"\0".join([key.encode(), b"application/json", text]) for key, text in admin.items()]
 
     def take(data):
-        key, _, rest = data.partition(b"\0")
-        mime, _, payload = rest.partition(b"\0")
-        kind = mime.decode("utf-8", "replace")
-        net.replies = [Reply(Sample(key.decode("utf-8", "replace"), kind, payload), good=len(data) % 8 > 0)]
+        key, rest = split(data)
+        kind, payload = split(rest)
+        net.replies = [Reply(Sample(key, kind, payload), good=len(data) % 8 > 0)]
         assert isinstance(orders.send_order(net.session, KEYS, ["KH01"], wire.Order("hold"))["KH01"], wire.Reply)
         assert isinstance(orders.send_world_order(net.session, KEYS, wire.WorldOrder("pause")), wire.WorldReply)
         assert readable(payload, kind).isprintable()
@@ -210,15 +198,3 @@ def answers():
 
     net = Net()
     yield Target(examples, take)
-
-
-PLACES = {
-    "messages": Place(messages, 300_000, 1000),
-    "robot": Place(robot, 100_000, 600),
-    "world": Place(world, 50_000, 300),
-    "recorder": Place(recorder, 60_000),
-    "conductor": Place(conductor, 60_000),
-    "external-body": Place(external_body, 30_000),
-    "vicon-truths": Place(vicon_truths, 20_000),
-    "answers": Place(answers, 40_000),
-}

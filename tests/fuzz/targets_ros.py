@@ -1,6 +1,6 @@
 """Bytes from and to ROS 2 and TurtleBots."""
 
-from contextlib import closing
+from contextlib import ExitStack
 from itertools import count
 
 import numpy as np
@@ -12,7 +12,7 @@ from agents.vectors import is_finite
 from bridges.ros2 import Graph
 from bridges.turtlebot3.body import TurtleBot3
 from tests.fuzz.messages import everything
-from tests.fuzz.target import Place, Target, networked
+from tests.fuzz.target import Target, place, renewed, split
 from tests.network import Sample
 from tests.requests import request
 from twins.devices.device import DeviceRequest, Faults
@@ -53,6 +53,7 @@ def ros_messages():
     return {kind: types.encode(message, kind) for kind, message in found.items()}
 
 
+@place(40_000)
 def ros():
     """CDR of every type, tokens and attachments: kind and payload with a zero byte between them."""
     types = ros2.types("jazzy")
@@ -66,8 +67,7 @@ def ros():
     examples += [b"token\0" + token.encode() for token in tokens] + [b"attached\0" + ros2.attachment(1, 2, bytes(16))]
 
     def take(data):
-        head, _, rest = data.partition(b"\0")
-        kind = head.decode("utf-8", "replace")
+        kind, rest = split(data)
         if kind == "token":
             for style in ("rmw", "ros2dds"):
                 ros2.announced(style, rest.decode("utf-8", "replace"))
@@ -79,12 +79,6 @@ def ros():
     yield Target(examples, take, (ValueError,))
 
 
-class HastyTurtleBot3(TurtleBot3):
-    def close(self):
-        """Does not wait until the robot stands."""
-        self._claims.release()
-
-
 def turtlebot_messages():
     good = ros_messages()
     topics = {"odom": ros2.ODOMETRY, "scan": ros2.LASER_SCAN, "battery_state": ros2.BATTERY_STATE}
@@ -92,12 +86,14 @@ def turtlebot_messages():
     return [*(f"tb3_0/{topic}\0\0".encode() + good[kind] for topic, kind in topics.items()), token]
 
 
-@networked(200, turtlebot_messages)
+@renewed(200, turtlebot_messages, 20_000)
 def turtlebot_bridge(net):
     """Odometry, scans, batteries and tokens of a robot."""
     net.first["tb3_0/odom"] = Sample("tb3_0/odom", "", ros_messages()[ros2.ODOMETRY])
-    with closing(HastyTurtleBot3(request("turtlebot3", "ros2dds://tb3_0"))) as body:
-        body.open()
+    body = TurtleBot3(request("turtlebot3", "ros2dds://tb3_0"))
+    body.open()
+    with ExitStack() as stack:
+        stack.callback(body._claims.release)  # it does not wait until the robot stands
         for k in count(1):
             data = yield
             net.deliver(data, gone=len(data) % 16 == 0)
@@ -106,7 +102,7 @@ def turtlebot_bridge(net):
             body.command([(0.1, 0.2, 0.0, 0.0)])
 
 
-@networked(300, lambda: [b"KH01/cmd_vel\0\0" + ros_messages()[ros2.TWIST_STAMPED]])
+@renewed(300, lambda: [b"KH01/cmd_vel\0\0" + ros_messages()[ros2.TWIST_STAMPED]], 10_000, 100)
 def turtlebot_twin(net):
     """Commands to the twin of a robot."""
     device = TurtleBot3Twin(DeviceRequest(request("turtlebot3", "turtlebot3-twin"), Faults()))
@@ -122,7 +118,7 @@ def park_and_goal():
     return [*everything("KH01", "KH02", only=("state", "ranges", "status")), *[goal] * 10]
 
 
-@networked(200, park_and_goal)
+@renewed(200, park_and_goal, 20_000)
 def ros_graph(net):
     """The bridge to ROS 2: states and statuses of robots, goals from ROS."""
     participant = Participant(net.session, ros2.types("jazzy"), style="rmw")
@@ -133,11 +129,3 @@ def ros_graph(net):
         data = yield
         net.deliver(data, gone=len(data) % 16 == 0)
         graph.poll()
-
-
-PLACES = {
-    "ros": Place(ros, 40_000),
-    "turtlebot-bridge": Place(turtlebot_bridge, 20_000),
-    "turtlebot-twin": Place(turtlebot_twin, 10_000, 100),
-    "ros-graph": Place(ros_graph, 20_000),
-}
