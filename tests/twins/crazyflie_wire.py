@@ -51,7 +51,7 @@ class Wire:
     @property
     def planned(self):
         goal = self.vehicle.planner.goal(self.t)
-        return np.full(4, np.nan) if goal is None else goal
+        return np.full(4, np.nan) if goal is None else np.array(goal)
 
     @property
     def info(self):

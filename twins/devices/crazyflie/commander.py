@@ -6,8 +6,7 @@ from math import cos, inf, isnan, nan, radians, remainder, sin, tan, tau
 from typing import Final
 
 from agents.body.kinds import Flight
-from agents.vectors import UNKNOWN, Setpoint, Vector, clamp
-from twins.arrays import Array
+from agents.vectors import UNKNOWN, Pose, Setpoint, Vector, clamp
 from twins.models.quadrotor import GRAVITY
 
 STEEPEST: Final = radians(20.0)  # the firmware's default limit of roll and pitch
@@ -66,14 +65,14 @@ class Commander:
         """End the client's setpoints: the planner's setpoints count again."""
         self._low_level = False
 
-    def take_planned(self, t: float, goal: Array | None) -> None:
-        """Use the planner's setpoint (4,), None without a plan, unless there is a low-level setpoint."""
+    def take_planned(self, t: float, goal: Pose | None) -> None:
+        """Use the planner's setpoint, None without a plan, unless there is a low-level setpoint."""
         if self._low_level:
             return
         if goal is None:
             self.command(t, on=False)
         else:
-            x, y, z, yaw = goal.tolist()
+            x, y, z, yaw = goal
             self.command(t, target=(x, y, z), heading=yaw)
         self._low_level = False
 

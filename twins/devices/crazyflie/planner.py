@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 
 from agents.protocols.crtp import LogStatus
-from agents.vectors import Vector, clamp
+from agents.vectors import Pose, Vector, clamp
 from twins.arrays import Array
 
 SHORTEST: Final = 0.01  # [s]
@@ -69,6 +69,7 @@ class OnboardPlanner:
         self.plan = PlannerState.IDLE
         self._begin, self._span = 0.0, 1.0  # of the current piece [s]
         self._coefficients = np.zeros((4, ORDER + 1))
+        self._powers: list[list[float]] = []  # the same, of the four axes, highest power first
         self._rest: list[Piece] = []  # pieces after the current one
 
     def climb(self, t: float, pose: Array, *, height: float, yaw: float, span: float, landing: bool) -> LogStatus:
@@ -168,25 +169,35 @@ class OnboardPlanner:
         """Whether the plan is at its end, or there is none."""
         return self.plan == PlannerState.IDLE or (not self._rest and t - self._begin >= self._span)
 
-    def goal(self, t: float) -> Array | None:
-        """Current planned pose (4,), None without a plan; after a landing there is none."""
+    def goal(self, t: float) -> Pose | None:
+        """Current planned pose, None without a plan; after a landing there is none. Quiet: called on every tick."""
         if self.plan == PlannerState.LANDING and self.finished(t):
             self.plan = PlannerState.IDLE
-        return None if self.plan == PlannerState.IDLE else self.state(t)[0]
+        if self.plan == PlannerState.IDLE:
+            return None
+        elapsed = self._elapsed(t)
+        x = y = z = yaw = 0.0
+        for a, b, c, d in self._powers:
+            x, y, z, yaw = x * elapsed + a, y * elapsed + b, z * elapsed + c, yaw * elapsed + d
+        return x, y, z, yaw
 
     def state(self, t: float) -> tuple[Array, Array, Array]:
         """Pose, speed and acceleration (4,) on the plan; at rest after the end of the plan."""
-        while self._rest and t - self._begin >= self._span:
-            self._start(self._begin + self._span, self._rest)
-        elapsed = t - self._begin
-        pose, speed, acceleration = evaluate(self._coefficients, clamp(elapsed, 0.0, self._span))
+        elapsed = self._elapsed(t)
+        pose, speed, acceleration = evaluate(self._coefficients, elapsed)
         if elapsed >= self._span:
             speed, acceleration = np.zeros(4), np.zeros(4)
         return pose, speed, acceleration
 
+    def _elapsed(self, t: float) -> float:
+        """Time since the begin of the piece that is flown at `t`, or until its end [s]."""
+        while self._rest and t - self._begin >= self._span:
+            self._start(self._begin + self._span, self._rest)
+        return clamp(t - self._begin, 0.0, self._span)
+
     def _start(self, t: float, pieces: Sequence[Piece]) -> None:
         (self._span, self._coefficients), *self._rest = pieces
-        self._begin = t
+        self._begin, self._powers = t, self._coefficients.T[::-1].tolist()
 
     @staticmethod
     def _shorter_turn(pose: Array, goal: Array) -> Array:

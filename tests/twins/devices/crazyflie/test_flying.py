@@ -41,9 +41,10 @@ def test_chained_plans_are_smooth():
     planner = OnboardPlanner()
     planner.climb(0.0, np.zeros(4), height=1.0, yaw=0.0, span=2.0, landing=False)
     for t, goal in ((1.0, [1.0, 0.5, 1.2, 1.0]), (1.7, [-0.5, 0.2, 0.8, -2.9]), (2.1, [0.0, 0.0, 1.0, 2.9])):
-        before = [planner.goal(t - h) for h in (2e-4, 1e-4)]
+        before = np.array([planner.goal(t - h) for h in (2e-4, 1e-4)])
         planner.go_to(t, np.zeros(4), np.zeros(3), goal=np.array(goal), span=1.5, relative=False, linear=False)
-        after = [planner.goal(t + h) for h in (0.0, 1e-4)]
+        after = np.array([planner.goal(t + h) for h in (0.0, 1e-4)])
+        assert (after[1] == planner.state(t + 1e-4)[0]).all(), "to the last bit"
         assert after[0] == pytest.approx(before[1], abs=1e-3)
         assert (after[1] - after[0]) / 1e-4 == pytest.approx((before[1] - before[0]) / 1e-4, abs=2e-2)
     end = planner.goal(10.0)
