@@ -1,4 +1,7 @@
-"""Odometry of a TurtleBot3: a pose in the arena from counts that begin anywhere, and may restart."""
+"""Odometry of a TurtleBot3: a pose in the arena from counts that begin anywhere, and may restart.
+
+Its speed is that of its poses: the twist of turtlebot3_node was zero until December 2024 (its pull request 1001).
+"""
 
 from __future__ import annotations
 
@@ -6,15 +9,18 @@ from collections import deque
 from math import cos, hypot, inf, isfinite, nan, pi, sin
 from typing import Final
 
+from agents.body.external_pose import velocity_after
 from agents.protocols import ros2
 from agents.protocols.ros2 import Message
+from agents.vectors import wrap
 
 SILENCE_S: Final = 0.5  # with older odometry the robot is out of reach and gets zeros
-STANDING: Final = (0.005, 0.02)  # [m/s, rad/s] slower robots stand
+STANDING: Final = (0.015, 0.06)  # [m/s, rad/s] slower robots stand
 FASTEST: Final = 0.5  # [m/s] odometry that jumps faster was restarted
 RESETS: Final = (3, 5.0)  # as many within as many seconds are no restarts: two robots send odometry, or it is broken
 DRIFT: Final = 1e-3  # [s/s] largest difference between the robot's clock, which may be slewed, and ours
-ORIGIN: Final = (0.01, 0.02)  # [m, rad] odometry closer to zero is at its origin
+ORIGIN: Final = 0.01  # [m] odometry closer to zero is at its origin
+SETTLING_S: Final = 0.12  # after the first message of a node, to the second of which it adds the yaw of its IMU
 
 Planar = tuple[float, float, float]  # x, y [m], yaw [rad]
 
@@ -54,37 +60,51 @@ class Odometry:
         self._start, self._stamps = start, StampAge()
         self._raw_pose: Planar = (nan, nan, nan)  # in odometry's own frame,
         self._stamp = inf  # and when, on the clock of the robot [s]
-        self._frame: Planar | None = start if boot else None  # origin of odometry in the arena
+        self._frame: Planar | None = start if boot else None  # origin of odometry in the arena,
+        self._settled_at = -inf  # which is not certain until then [s]
         self._resets: deque[float] = deque(maxlen=RESETS[0])  # times of the last
 
     def update(self, message: Message, now: float) -> bool:
         """Take a message; False if a number in it is not finite."""
         place, q = message.pose.pose.position, message.pose.pose.orientation
-        twist = message.twist.twist
-        x, y, v, w = place.x, place.y, twist.linear.x, twist.angular.z
-        yaw = ros2.yaw_of(q)
-        if not all(map(isfinite, (x, y, yaw, v, w))):
+        counted, stamp = (place.x, place.y, ros2.yaw_of(q)), ros2.stamp_of(message.header)
+        if not all(map(isfinite, counted)):
             return False
-        if self._frame is None:
-            self._frame = _frame(self._start, (x, y, yaw))
-        pose, stamp = _to_arena(self._frame, (x, y, yaw)), ros2.stamp_of(message.header)
-        if self.received > -inf and self._was_reset((x, y, yaw), pose, now, stamp):
-            # odometry counts from zero again: assume that the robot stands at its last known pose
-            self._frame, self.restarted = _frame(self.pose, (x, y, yaw)), True
+        before = self._start if self.received == -inf else self.pose
+        reset = self.received > -inf and self._was_reset(counted, now, stamp)
+        if reset:
+            self.restarted = True
             self._resets.append(now)
-            pose = self.pose
-        self._raw_pose, self._stamp = (x, y, yaw), stamp
-        self.pose, self.speed = pose, (v, w)
+        if reset or self._frame is None:
+            self._settled_at = now + SETTLING_S
+        if self._frame is None or now <= self._settled_at:
+            # it counts from elsewhere: assume that the robot stands at its last known pose
+            self._frame = _frame(before, counted)
+        self.pose = _to_arena(self._frame, counted)
+        since = stamp - self._stamp if stamp > self._stamp else now - self.received
+        if 0.0 < since < inf:
+            self._update_speed(before, since)
+        self._raw_pose, self._stamp = counted, stamp
         self.age = self._stamps.age(now, stamp)
         self.received = now
         return True
 
-    def _was_reset(self, counted: Planar, pose: Planar, now: float, stamp: float) -> bool:
+    def _update_speed(self, before: Planar, since: float) -> None:
+        """Filter the speed, after a motion from a pose `before` in `since` [s]."""
+        (x, y, yaw), (x0, y0, yaw0) = self.pose, before
+        turn = wrap(yaw - yaw0)
+        middle = yaw0 + 0.5 * turn
+        along = cos(middle) * (x - x0) + sin(middle) * (y - y0)
+        v, w, _ = velocity_after((*self.speed, 0.0), (along, turn, 0.0), since)
+        self.speed = v, w
+
+    def _was_reset(self, counted: Planar, now: float, stamp: float) -> bool:
         """Whether odometry was reset: a jump faster than any robot, or back at the origin after a silence.
 
         Messages that a link has held back come at once, and some of them are skipped: their stamps are apart.
         """
         silence = now - self.received
+        pose = _to_arena(self._frame or self._start, counted)
         jump = hypot(pose[0] - self.pose[0], pose[1] - self.pose[1])
         back = silence > SILENCE_S and _at_origin(counted) and not _at_origin(self._raw_pose)
         return back or jump > FASTEST * max(silence, stamp - self._stamp) + 0.1
@@ -113,7 +133,7 @@ class Odometry:
 
 
 def _at_origin(pose: Planar) -> bool:
-    return hypot(pose[0], pose[1]) < ORIGIN[0] and abs(pose[2]) < ORIGIN[1]
+    return hypot(pose[0], pose[1]) < ORIGIN
 
 
 def _to_arena(frame: Planar, pose: Planar) -> Planar:

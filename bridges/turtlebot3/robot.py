@@ -17,7 +17,7 @@ from agents.network import session as network
 from agents.protocols import ros2, turtlebot3
 from agents.protocols.ros2 import Message
 from agents.protocols.ros2_node import Participant
-from bridges.turtlebot3.odometry import Odometry, StampAge
+from bridges.turtlebot3.odometry import STANDING, Odometry, StampAge
 
 REPEAT_S: Final = 0.05  # longest time between commands while the robot shall move,
 BETWEEN_S: Final = 0.02  # shortest time between commands that change
@@ -87,7 +87,8 @@ class RepeatedVelocity:
 
     def blocked(self, now: float, *, standing: bool) -> bool:
         """Whether a robot stands for long although it shall move; asked repeatedly."""
-        if not standing or self.velocity == REST:
+        v, w = self.velocity
+        if not standing or (abs(v) < 2.0 * STANDING[0] and abs(w) < 2.0 * STANDING[1]):
             self._still_since = now
         return now - self._still_since > BLOCKED_S
 

@@ -124,14 +124,14 @@ class FakeRos:
         self.sent.append(message.linear.x)
 
 
-def odometry(types, x, y=0.0, stamp=1.0):
-    """Odometry of a robot that stands at a place [m]."""
+def odometry(types, x, y=0.0, yaw=0.0, stamp=1.0):
+    """Odometry at a place [m], with the twist of turtlebot3_node until 2024."""
     zeros = np.zeros(36)
     return types.make(
         ros2.ODOMETRY,
         header=types.header(stamp, ""),
         child_frame_id="",
-        pose=types.make("geometry_msgs/msg/PoseWithCovariance", pose=types.pose(x, y, 0.0, 0.0), covariance=zeros),
+        pose=types.make("geometry_msgs/msg/PoseWithCovariance", pose=types.pose(x, y, 0.0, yaw), covariance=zeros),
         twist=types.make("geometry_msgs/msg/TwistWithCovariance", twist=types.twist(ZERO, ZERO), covariance=zeros),
     )
 
