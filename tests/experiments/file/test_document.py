@@ -1,13 +1,18 @@
-"""Experiment files: what is refused, where and with which remedy; cases, `--set` and JSON."""
+"""Experiment files: what is refused, where and with which remedy; cases, `--set`, JSON, arenas, targets of links."""
 
 import json
+import math
 import re
 from pathlib import Path
 
 import msgspec
 import pytest
 
+from agents.formation.link import BY_NOTHING
+from agents.plugins import registry
 from experiments.catalogue import index
+from experiments.check.check import check
+from experiments.definition.experiment import LinkTable
 from experiments.definition.standby import robots_without_address
 from experiments.file import catalogue as entries
 from experiments.file import document
@@ -15,6 +20,7 @@ from experiments.file.document import DocumentError, read
 from experiments.file.text import MAX_TEXT_BYTES
 from tests.experiments.traces import parse_links
 from tests.small import PERIODIC, changed
+from twins.scene import Obstacle
 
 MALFORMED = Path(__file__).parent / "malformed"
 # line, column, part of the message and of the remedy, as the comments of a malformed file have them
@@ -62,16 +68,6 @@ def test_problem_shows_the_line_and_the_column(write):
     _, source, caret, _ = str(error).split("\n")
     assert len(source) < 120
     assert source[caret.index("^") :].startswith('"no"')
-
-
-@pytest.mark.slow
-def test_every_misspelt_key_is_found_in_its_line(write):
-    lines = entries.path("robotic-park").read_text("utf-8").split("\n")
-    keys = [number for number, line in enumerate(lines) if re.match("([a-z_]+) =", line)]
-    assert len(keys) > 10
-    for number in keys:
-        text = "\n".join([*lines[:number], f"x{lines[number]}", *lines[number + 1 :]])
-        assert (number + 1, 1) in [(problem.line, problem.column) for problem in refusal(write(text)).problems]
 
 
 @pytest.mark.parametrize(
@@ -233,3 +229,228 @@ def test_set_of_a_link_however_it_is_written(flag):
     (experiment, _) = experiments(read("robotic-park", [f"formation.links.{flag}"])).values()
     assert ("KH01", "TB01", 0.5, 3.0) in parse_links(experiment)
     assert len(experiment.formation.links) == 12
+
+
+LAB = """# A lab
+[arena]
+size = [4.0, 3.0, 2.0]
+walls = false
+
+[arena.obstacles.post]
+radius = 0.1
+at = [1.0, 0.0]
+
+[arena.obstacles.cart]
+box = [0.3, 0.2]
+at = [0.0, 1.0]
+plan = { kind = "line", move_by = [1.0, 0.0], speed = 0.1 }
+
+[arena.starts.west]
+at = [-1.5, 0.0]
+size = [0.9, 1.0]
+"""
+ONE = """title = "One"
+duration_s = 20.0
+[arena]
+file = "lab.toml"
+[robots.KH01]
+kind = "khepera4"
+start = [-1.5, 0.0]
+"""
+
+
+def write_files(folder, experiment=ONE, arena=LAB):
+    (folder / "lab.toml").write_text(arena)
+    (folder / "one.toml").write_text(experiment)
+    return folder / "one.toml"
+
+
+def test_arena_is_that_of_the_file(tmp_path):
+    given = read(write_files(tmp_path))
+    arena = given.experiment.arena
+    assert arena.size == (4.0, 3.0, 2.0)
+    assert not arena.walls
+    assert arena.obstacles["post"] == Obstacle(radius=0.1, at=(1.0, 0.0))
+    assert arena.starts["west"].size == (0.9, 1.0)
+    assert arena.file is None
+    assert given.listing.startswith(ONE)
+    assert LAB in given.listing
+    kept = tmp_path / "run"
+    kept.mkdir()
+    given.keep(kept / "experiment.toml")
+    assert read(kept / "experiment.toml").experiment == given.experiment
+    file = kept / "case.json"  # what processes read: there is no lab.toml
+    file.write_bytes(document.write_json(given.plan))
+    assert read(file).experiment == given.experiment
+
+
+def test_own_keys_win_and_obstacles_merge_by_name(tmp_path):
+    own = "walls = true\n[arena.obstacles.post]\nheight = 0.5\n[arena.obstacles.cart]\nradius = 0.2\n"
+    own += "[arena.starts.east]\nat = [1.5, 0.0]\nsize = [0.5, 0.5]\n"
+    arena = read(write_files(tmp_path, ONE.replace('"lab.toml"\n', f'"lab.toml"\n{own}'))).experiment.arena
+    assert arena.walls
+    assert arena.size == (4.0, 3.0, 2.0)
+    assert arena.obstacles["post"] == Obstacle(radius=0.1, at=(1.0, 0.0), height=0.5)
+    cart = arena.obstacles["cart"]  # another shape in place of the old one; the rest stays
+    assert (cart.box, cart.radius, cart.at) == (None, 0.2, (0.0, 1.0))
+    assert list(arena.starts) == ["west", "east"]
+
+
+def test_case_changes_the_arena_or_takes_another_file(tmp_path):
+    (tmp_path / "hall.toml").write_text("[arena]\nsize = [9.0, 9.0, 3.0]\n[arena.obstacles.pillar]\nradius = 0.4\n")
+    cases = '[cases.lab.arena.obstacles.post]\nradius = 0.2\n[cases.hall.arena]\nfile = "hall.toml"\n'
+    given = read(write_files(tmp_path, ONE + cases))
+    found = {name: plan.experiment.arena for name, plan in given.cases().items()}
+    assert found["lab"].obstacles["post"].radius == 0.2
+    assert list(found["hall"].obstacles) == ["pillar"]
+    assert found["hall"].size == (9.0, 9.0, 3.0)
+    assert given.experiment.arena.obstacles["post"].radius == 0.1
+    files = {name: file.name for name, file in given.source.arenas.items()}
+    assert files == {"": "lab.toml", "lab": "lab.toml", "hall": "hall.toml"}
+
+
+def test_command_line_changes_find_what_the_file_holds(tmp_path):
+    file = write_files(tmp_path)
+    found = read(file, ["arena.obstacles.cart.plan.speed=0.2", "arena.obstacles.post.at=[0.5, 0.5]"]).experiment.arena
+    assert found.obstacles["cart"].plan == {"kind": "line", "move_by": [1.0, 0.0], "speed": 0.2}
+    assert found.obstacles["post"].at == (0.5, 0.5)
+    (tmp_path / "hall.toml").write_text("[arena]\nsize = [9.0, 9.0, 3.0]\n")
+    assert read(file, ["arena.file=hall.toml", "arena.walls=false"]).experiment.arena.obstacles == {}
+    assert refusal(file, "arena.file=hal.toml").problems[0].file == "--set arena.file=hal.toml"
+    (problem,) = refusal(file, "arena.obstacles.cart.plan.radius=0.2").problems
+    assert "no plan of this experiment has a parameter 'radius'" in problem.message
+
+
+@pytest.mark.parametrize(
+    ("arena", "place", "message", "hint"),
+    [
+        ("[arena]\nsize = [4.0, 3.0]\n", (2, 8), "'size' must be a list of length 3", ""),
+        ("[arena]\nsiez = [4.0, 3.0, 2.0]\n", (2, 1), "unknown key 'siez' in 'arena'", "'size'"),
+        ("size = [4.0, 3.0, 2.0]\n", (1, 1), "unknown key 'size'", ""),
+        ("[arena]\n[robots.KH01]\nstart = [0.0, 0.0]\n", (2, 2), "unknown key 'robots'", "in the experiment file"),
+        ("[arena]\nseed = 3\n", (2, 1), "unknown key 'seed' in 'arena'", "'seed' belongs in the experiment file"),
+        ('[arena]\nfile = "hall.toml"\n', (2, 1), "an arena file cannot name another", ""),
+        ("[arena]\n[arena.obstacles.a]\nradius = 0.1\nat = [9.0, 0.0]\n", (4, 6), "'a' stands outside", ""),
+        ("", (0, 0), "is empty", ""),
+        ("# nothing\n", (0, 0), "holds nothing but comments", ""),
+    ],
+)
+def test_wrong_arena_file_is_refused_where_wrong(tmp_path, arena, place, message, hint):
+    file = write_files(tmp_path, arena=arena)
+    problem = refusal(file).problems[0]
+    assert problem.file == str(file.parent / "lab.toml")
+    assert (problem.line, problem.column) == place
+    assert message in problem.message
+    assert hint in problem.hint
+
+
+def test_conflicts_with_the_arena_point_into_both_files(tmp_path):
+    small = ONE.replace('"lab.toml"\n', '"lab.toml"\nsize = [2.0, 3.0, 2.0]\n')
+    robot, box = refusal(write_files(tmp_path, small)).problems
+    assert (robot.file.rpartition("/")[2], robot.line) == ("one.toml", 8)
+    assert (box.file.rpartition("/")[2], box.line) == ("lab.toml", 16)
+    problem = refusal(write_files(tmp_path, ONE + "[cases.small.arena]\nsize = [3.9, 1.0, 2.0]\n")).problems[0]
+    assert (problem.file.rpartition("/")[2], problem.line) == ("one.toml", 8)
+    assert problem.message.startswith("in case 'small', arena.obstacles.cart.at: 'cart' stands outside")
+
+
+def test_catalogue_arena_files_are_no_experiments(tmp_path):
+    assert not any("arena" in name for name in index.names())
+    made = entries.copy_entry("obstacle-course", tmp_path)
+    assert read(made).experiment == read("obstacle-course").experiment
+    assert {file.name for file in tmp_path.iterdir()} == {made.name, "gate.arena.toml", index.SCHEMA}
+    (tmp_path / "gate.arena.toml").write_text("[arena]\n")
+    with pytest.raises(DocumentError, match="is another arena"):
+        entries.copy_entry("obstacle-course", tmp_path / "again.toml")
+    assert not (tmp_path / "again.toml").exists()
+
+
+def test_arena_file_is_of_the_catalogue_or_beside(tmp_path):
+    arena = read(write_files(tmp_path, ONE.replace("lab.toml", "gate.arena.toml"))).experiment.arena
+    assert list(arena.obstacles) == ["left", "right"]
+    for name in ("experiment.toml", "Experiment.TOML", "run.json", "event.mcap"):  # files of a run
+        (tmp_path / name).write_text(LAB)
+        with pytest.raises(DocumentError, match="call it otherwise"):
+            read(write_files(tmp_path, ONE.replace("lab.toml", name)))
+
+
+AVERAGE = index.find_file("average")
+SHAPE = """
+title = "Shape"
+duration_s = 10.0
+[robots.TB01]
+kind = "turtlebot3"
+start = [0.0, 0.0]
+[robots.KH01]
+kind = "khepera4"
+start = [-0.5, 0.4]
+[robots.CF01]
+kind = "crazyflie"
+start = [0.5, 0.4]
+hover = 0.6
+[formation.shape]
+TB01 = [1.0, 1.0]
+KH01 = [0.7, 1.4]
+CF01 = [1.0, 1.8]
+[formation.links]
+"TB01 > KH01" = "shape"
+"KH01 - CF01" = { gain = 2.0 }
+"TB01 > CF01" = 0.7
+"""
+
+
+def links_of(text, *changes, case="default"):
+    return document.loads(text, *changes).cases()[case].experiment.formation.links
+
+
+def test_lengths_hold_between_places_at_robots_heights():
+    found = links_of(SHAPE)
+    assert found["TB01 > KH01"] == LinkTable(distance=pytest.approx(0.5))
+    assert found["KH01 - CF01"] == LinkTable(distance=pytest.approx(math.hypot(0.3, 0.4, 0.6)), gain=2.0)
+    assert found["TB01 > CF01"] == 0.7
+
+
+@pytest.mark.parametrize("law", registry.names(registry.LAWS))
+def test_law_has_the_target_that_it_needs(law):
+    found = links_of(SHAPE.replace(" = 0.7", ' = "shape"'), f'formation.law="{law}"')
+    assert len(found) == 3
+    target = {"displacement": "offset", "bearing": "bearing"}.get(law)
+    assert target is None or getattr(found["TB01 > KH01"], target) == pytest.approx([-0.3, 0.4])
+
+
+def test_case_command_line_and_change_move_places():
+    text = SHAPE + "[cases.near]\nformation.shape.KH01 = [0.7, 1.0]\n[cases.far]\nformation.shape.KH01 = [0.0, 1.0]\n"
+    assert links_of(text, case="near")["TB01 > KH01"].distance == pytest.approx(0.3)
+    assert links_of(text, case="far")["TB01 > KH01"].distance == pytest.approx(1.0)
+    assert links_of(SHAPE, "formation.shape.KH01=[1.0, 3.0]")["TB01 > KH01"].distance == pytest.approx(2.0)
+    text = SHAPE + "[[formation.changes]]\nat_s = 5.0\nshape = { TB01 = [0, 0], KH01 = [0, 2], CF01 = [0, 1] }\n"
+    (change,) = document.loads(text).experiment.formation.changes
+    assert change.links["TB01 > KH01"].distance == pytest.approx(2.0)
+    assert set(change.links) == {"TB01 > KH01", "KH01 - CF01"}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("formation.update=send-on-delta", "no function of its input alone"),
+        ('architecture={ kind = "hybrid", robots = ["KH01"] }', "guided robots transmit no variables"),
+        ("formation.anchors={ KH01 = 0.5 }", "'average' does not know them"),
+        ("cases.event.trigger=relative", "'relative' judges errors of links"),
+        ("cases.event.trigger=self-triggered", "does not see the variables"),
+        ("formation.law=distance", "needs a target of every link"),
+        ("formation.law=mixed", "give a distance, an offset or a bearing"),
+    ],
+)
+def test_averaging_law_needs_no_targets(change, message):
+    with pytest.raises(DocumentError, match=message):
+        document.read(AVERAGE, [change])
+    plan = document.read(AVERAGE, ['formation.links={ "KH01 > KH04" = { from_s = 2.0 } }']).cases()["event"]
+    (link,) = plan.one_way_links
+    assert (link.sender, link.receiver, link.since, link.target.wants) == ("KH01", "KH04", 2.0, BY_NOTHING)
+
+
+@pytest.mark.slow
+def test_check_warns_of_words_that_are_lost():
+    text = AVERAGE.read_text("utf-8").replace("duration_s = 30.0", "duration_s = 2.0")
+    for given, warned in ((text, False), (text.replace(", maximum_silence_s = 1.0", ""), True)):
+        assert ("lost-words" in {each.code for each in check(document.loads(given))}) is warned

@@ -195,12 +195,6 @@ def with_criterion(task, metric, **criterion):
     return task
 
 
-def judged(task, metric, **criterion):
-    uneven = 'formation.links={ "A > B" = { offset = [0.4, 0.0] }, "B > A" = { offset = [-0.8, 0.0] } }'
-    read = load(with_criterion(task, metric, **criterion), uneven)
-    return judge([*simulate(read, cases=["fast"]).metrics.values()])
-
-
 @pytest.mark.parametrize(
     ("metric", "of", "about"),
     [
@@ -212,7 +206,9 @@ def judged(task, metric, **criterion):
     ],
 )
 def test_criterion_names_a_metric_in_a_file(task, metric, of, about):
-    (only,) = judged(task, metric, **of, at_most=1.0)
+    uneven = 'formation.links={ "A > B" = { offset = [0.4, 0.0] }, "B > A" = { offset = [-0.8, 0.0] } }'
+    read = load(with_criterion(task, metric, **of, at_most=1.0), uneven)
+    (only,) = judge([*simulate(read, cases=["fast"]).metrics.values()])
     assert only.passed == (about is not None)
     assert about is None or only.values[1] == pytest.approx(about, abs=0.01)
     assert "@" not in only.what

@@ -1,15 +1,19 @@
-"""Reference of the experiment file: every key has a type and an example that is TOML and holds the key."""
+"""Reference, schema and catalogue of experiment files."""
 
+import json
+import re
 import tomllib
 from importlib.metadata import EntryPoint
+from pathlib import Path
 
 import pytest
 
 from agents.body.kinds import KINDS
 from agents.plugins import registry
-from experiments.file import reference
-from experiments.file.document import loads
-from experiments.file.problems import DocumentError
+from experiments.catalogue import index
+from experiments.file import catalogue as files
+from experiments.file import json_schema, reference
+from experiments.file.document import DocumentError, loads, read
 from tests.cases import for_each
 from tests.commands import invoke
 
@@ -45,50 +49,34 @@ def test_example_is_a_part_of_a_file(entry):
         ("plan.circle", "timeline.plan(circle)"),
         ("send-on-delta", "trigger(send-on-delta)"),
         ("tello", 'robots.ROBOT.kind = "tello"'),
+        ("safety", "safety"),
+        ("formation.law", "formation.law"),
     ],
 )
 def test_key_is_found_as_users_write_it(asked, first):
-    assert reference.matching(asked)[0].key == first
-
-
-def test_entry_of_a_table_and_of_a_number():
-    (entry,) = reference.matching("rates.body_hz")
-    assert (entry.type, entry.limits, entry.default) == ("a number", "> 0, ≤ 2000", "100.0")
-    keys = [entry.key for entry in reference.matching("safety")]
-    assert keys[0] == "safety"
-    assert {"safety.speed", "safety.separation"} < set(keys)
-    keys = [entry.key for entry in reference.matching("formation.law")]
-    assert len(keys) == len(set(keys)) > 4
+    keys = [entry.key for entry in reference.matching(asked)]
+    assert keys[0] == first
+    assert len(keys) == len(set(keys))
 
 
 @pytest.mark.parametrize(
-    ("words", "parts"),
+    ("words", "code", "parts"),
     [
-        ("rates.body_hz", ["rates.body_hz", "position control and body", "> 0, ≤ 2000", "100.0", "[rates]"]),
-        ("IAE", ["metric: "]),
-        ("acquired_s", ["metric: "]),
-        ("ackermann", [f"turning radius {KINDS['ackermann'].turn_radius:.3g} m",
-                       *(f"{key} = {getattr(KINDS['ackermann'], key):.3g}"
-                         for key in ("response", "turn_response", "lag"))]),
+        ("rates.body_hz", 0, ["rates.body_hz", "position control", "a number", "> 0, ≤ 2000", "100.0", "[rates]"]),
+        ("IAE", 0, ["metric: "]),
+        ("acquired_s", 0, ["metric: "]),
+        ("ackermann", 0, [f"turning radius {KINDS['ackermann'].turn_radius:.3g} m",
+                          *(f"{key} = {getattr(KINDS['ackermann'], key):.3g}"
+                            for key in ("response", "turn_response", "lag"))]),
+        ("qqqq.zzzz", 2, ["`./zenpark explain` lists what there is"]),
+        ("trigger.qqqqqqqqqqqq", 2, ["`./zenpark explain trigger` lists"]),
+        ("saftey", 2, ["did you mean 'safety'?"]),
+        ("battery", 2, ["nothing in the experiment file is named 'battery'; keys about it:", " safety.battery_low "]),
     ],
 )  # fmt: skip
-def test_explain_tells(words, parts):
-    text = " ".join(invoke("explain", words).output.split())
-    assert all(part in text for part in parts)
-
-
-@pytest.mark.parametrize(
-    ("words", "parts"),
-    [
-        ("qqqq.zzzz", ["`./zenpark explain` lists what there is"]),
-        ("trigger.qqqqqqqqqqqq", ["`./zenpark explain trigger` lists"]),
-        ("saftey", ["did you mean 'safety'?"]),
-        ("battery", ["nothing in the experiment file is named 'battery'; keys about it:", "\nsafety.battery_low "]),
-    ],
-)
-def test_explain_of_an_unknown_key_names_others(words, parts):
-    text = invoke("explain", words, code=2).output
-    assert all(part in text for part in parts)
+def test_explain_tells_or_names_others(words, code, parts):
+    text = " ".join(invoke("explain", words, code=code).output.split())
+    assert [part for part in parts if part not in text] == []
 
 
 def test_tables_are_explained_on_one_screen():
@@ -133,3 +121,107 @@ def test_file_with_a_broken_plugin_is_refused_there(broken):
     (problem,) = caught.value.problems
     assert problem.line == 7
     assert "fails to import: ModuleNotFoundError" in problem.message
+
+
+def test_names_and_titles():
+    found = index.titles()
+    assert list(found) == sorted(found)
+    assert found["robotic-park"] == tomllib.loads(files.path("robotic-park").read_text("utf-8"))["title"]
+    assert all(files.path(name).read_text("utf-8").startswith(f"#:schema ./{index.SCHEMA}\n") for name in found)
+    with pytest.raises(DocumentError, match="did you mean 'convoy'"):
+        files.path("convoi")
+
+
+def test_copy_is_readable_whole_and_never_overwrites(tmp_path, monkeypatch):
+    target = files.copy_entry("triangle", tmp_path / "mine.toml")
+    assert read(target).experiment == read("triangle").experiment
+    assert json.loads((tmp_path / index.SCHEMA).read_bytes()) == json_schema.schema()
+    assert files.copy_entry("convoy", tmp_path) == tmp_path / "convoy.toml"
+    for name, place, message in (
+        ("convoy", target, "exists already"),
+        ("convoy", tmp_path / "nowhere" / "x.toml", "cannot be written: No such file"),
+    ):
+        with pytest.raises(DocumentError, match=message):
+            files.copy_entry(name, place)
+    assert read(target).experiment == read("triangle").experiment
+    monkeypatch.setattr(files, "write_schema", lambda _: Path("/dev/full").write_text("{}"))
+    (tmp_path / "full").mkdir()
+    with pytest.raises(DocumentError, match="cannot be written: No space left"):
+        files.copy_entry("triangle", tmp_path / "full")
+    assert not [*(tmp_path / "full").iterdir()]
+
+
+def test_schema_is_draft_7_and_knows_the_plugins():
+    schema = json_schema.schema()
+    assert schema["$schema"] == "http://json-schema.org/draft-07/schema#"
+    assert not {"prefixItems", "$defs"} & {key for _, node in nodes(schema) for key in node}
+    by_name, beside, *tables, table_beside = schema["properties"]["trigger"]["anyOf"]
+    assert re.search(beside["pattern"], "my_trigger.py:Mine")
+    assert table_beside["properties"]["kind"] == beside
+    assert {"periodic", "send-on-delta"} <= set(by_name["enum"])
+    kinds = {table["properties"]["kind"]["const"]: table for table in tables}
+    assert kinds["send-on-delta"]["properties"]["threshold"]["exclusiveMinimum"] == 0
+    plans = schema["definitions"]["LegTable"]["properties"]["plan"]["anyOf"]
+    assert "line" not in plans[0]["enum"]  # it cannot do without its parameters
+    assert schema["definitions"]["RobotTable"]["properties"]["kind"]["enum"] == list(KINDS)
+    case = schema["properties"]["cases"]["additionalProperties"]["$ref"].rpartition("/")[2]
+    assert "required" not in schema["definitions"][case]
+    assert "cases" not in schema["definitions"][case]["properties"]
+
+
+SMALL = """title = "t"
+duration_s = 10
+[robots.A]
+kind = "khepera4"
+start = [0.0, 0.0]
+[robots.B]
+kind = "khepera4"
+start = [0.6, 0.0]
+[formation.links]
+"A - B" = 0.8
+"""
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "taken"),
+    [
+        ("0.8", "{ gain = 1.0 }", False),
+        ("0.8", "{ distance = 0.8, offset = [0.6, 0.0] }", False),
+        ("0.8", '"shape"\n[formation.shape]\nA = [0.0, 0.0]\nB = [0.5, 0.0]', True),
+        ("0.8", "0.8\n[arena.obstacles.o]\nat = [1.0, 1.0]\nradius = 0.1", True),
+        ("0.8", "0.8\n[arena.obstacles.o]\nat = [1.0, 1.0]", False),
+        ("0.8", "0.8\n[arena.obstacles.o]\nradius = 0.1\nbox = [0.1, 0.1]", False),
+        ("0.8", "0.8\n[cases.e.formation.links]\n'A - B' = { gain = 2.0 }", True),
+        ("0.8", '0.8\n[cases."e\\n"]', False),
+        ("10", "10\ntolerance = 1e13", False),
+        ("10", "10\nseed = -1", False),
+    ],
+)
+def test_schema_takes_what_the_parser_takes(old, new, taken, tmp_path):
+    jsonschema = pytest.importorskip("jsonschema", reason="needs jsonschema")
+    text = SMALL.replace(old, new, 1)
+    (tmp_path / "small.toml").write_text(text)
+    try:
+        read(tmp_path / "small.toml")
+    except DocumentError:
+        assert not taken
+    else:
+        assert taken
+    assert jsonschema.Draft7Validator(json_schema.schema()).is_valid(tomllib.loads(text)) == taken
+
+
+def nodes(node, path=""):
+    """Every table of the schema with its path."""
+    if isinstance(node, dict):
+        yield path, node
+    for key, each in node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ():
+        yield from nodes(each, f"{path}.{key}")
+
+
+def test_schema_describes_every_field():
+    tables = ((path, node.get("properties", {})) for path, node in nodes(json_schema.described()))
+    fields = {f"{path}.{name}": field for path, table in tables for name, field in table.items()}
+    assert [name for name, field in fields.items() if not {"description", "const"} & set(field)] == []
+    numbers = [node for _, node in nodes(json_schema.schema()) if node.get("type") == "number"]
+    assert len(numbers) > 100
+    assert not [each for each in numbers if each.get("default", 0.0) is None]

@@ -6,11 +6,19 @@ import msgspec
 import numpy as np
 import pytest
 
+from agents.formation.anchors import Anchor
+from agents.formation.link import BY_DISTANCE, BY_RELATIVE
+from agents.kinds.crazyflie import CRAZYFLIE
+from agents.kinds.khepera4 import KHEPERA4
+from experiments.authoring import layouts
 from experiments.authoring.robotic_park.convert import convert, convert_text
 from experiments.authoring.robotic_park.file import ParkTrigger, starts_from
+from experiments.authoring.robotic_park.heights import Room, find_shape
 from experiments.check.check import examine, figures
+from experiments.check.realisation import ENOUGH, Solids
 from experiments.definition.experiment import Shadow
 from experiments.definition.formation import law_errors
+from experiments.definition.graph import Links, links
 from experiments.file import document
 from experiments.file.problems import DocumentError
 from tests.experiments.robotic_park_files import OTHERS, column, dome, drones, file, flat, robot
@@ -82,9 +90,9 @@ def test_one_way_links_and_those_of_two_minds():
     lengths = {"02 > khepera01": 0.8, "01 > khepera02": 0.9, "03 - khepera02": 0.8, "01 > khepera03": 0.8}
     assert read.experiment.formation.links == {f"khepera{pair}": length for pair, length in lengths.items()}
     assert "different things" in notes
-    links = converted(trio(TRIANGLE).replace("gain: 0.25", "gain: 0.4", 1))[0].experiment.formation.links
-    assert links["khepera02 > khepera01"].gain == pytest.approx(0.8)  # 2 · 0.4
-    assert (links["khepera01 > khepera02"], links["khepera03 - khepera02"]) == (0.8, 0.8)
+    made = converted(trio(TRIANGLE).replace("gain: 0.25", "gain: 0.4", 1))[0].experiment.formation.links
+    assert made["khepera02 > khepera01"].gain == pytest.approx(0.8)  # 2 · 0.4
+    assert (made["khepera01 > khepera02"], made["khepera03 - khepera02"]) == (0.8, 0.8)
 
 
 GRADIENT_V = trio(TRIANGLE).replace("period: 0.1\n", "period: 0.2\n").replace("type: gradient", "type: gradient_v")
@@ -224,8 +232,8 @@ def test_threshold_of_communication_is_positive():
 def test_pyramid_is_not_folded():
     """Four drones on a square and one above it, from one height: folded, two opposite corners are in one place."""
     place = np.array([[1.2, 0, 0], [0, 1.2, 0], [-1.2, 0, 0], [0, -1.2, 0], [0, 0, 1.0]])
-    links = [(0, 1), (1, 2), (2, 3), (3, 0), (0, 4), (1, 4), (2, 4), (3, 4)]
-    plan = converted(drones(place, [(1.1 * x, 0.9 * y, 0.7) for x, y, _ in place], links))[0].plan
+    pairs = [(0, 1), (1, 2), (2, 3), (3, 0), (0, 4), (1, 4), (2, 4), (3, 4)]
+    plan = converted(drones(place, [(1.1 * x, 0.9 * y, 0.7) for x, y, _ in place], pairs))[0].plan
     hover = [each.hover for each in plan.experiment.robots.values()]
     assert hover[4] > max(hover[:4]) + 0.7
     predicted = figures(plan)
@@ -337,8 +345,8 @@ def test_index_of_2023_follows_the_files_it_names(index):
     first = experiment.robots["khepera01"]
     assert (first.body, first.start) == ("khepera4://192.168.0.1:50000", [-0.4, 0.0, -1.5])
     assert first.shadow is not None
-    links = experiment.formation.links
-    assert links["dron01 > khepera01"].gain == pytest.approx(0.5 / 0.8667, rel=1e-3)  # the real one's driver divides
+    made = experiment.formation.links
+    assert made["dron01 > khepera01"].gain == pytest.approx(0.5 / 0.8667, rel=1e-3)  # the real one's driver divides
     assert starts_from(str(index))["khepera02"] == (0.5, 0.1, 0.0)
 
 
@@ -393,3 +401,84 @@ def test_starts_from_a_webots_world(tmp_path):
     (tmp_path / "poses.txt").write_text("dron01: 0.1\n")
     with pytest.raises(DocumentError, match="tells the start of no robot"):
         starts_from(str(tmp_path / "poses.txt"))
+
+
+def asked(position, pairs=None, *, relative=False):
+    pairs = np.stack(np.triu_indices(len(position), 1), axis=1) if pairs is None else pairs
+    i, j = pairs.T
+    apart = position[i] - position[j]
+    distance, blank = np.linalg.norm(apart, axis=1), np.full_like(apart, np.nan)
+    wants = np.full(len(pairs), BY_RELATIVE if relative else BY_DISTANCE)
+    return Links(i, j, distance, np.ones(len(pairs)), apart, blank, wants)
+
+
+def to_origin(position, *rows):
+    zero = (0.0, 0.0, 0.0)
+    return [(row, Anchor(zero, zero, 1.0, 0.0, float(np.linalg.norm(position[row])), 1.0)) for row in rows]
+
+
+@pytest.mark.parametrize("relative", [False, True])
+@pytest.mark.parametrize("rows", [4, 5, 7, 9])
+def test_a_shape_is_found_again_from_nearby(rows, relative):
+    rng = np.random.default_rng(rows)
+    shape = rng.uniform(-1.0, 1.0, (rows, 3))
+    start = shape + rng.uniform(-0.02, 0.02, shape.shape)
+    found = find_shape(asked(shape, relative=relative), to_origin(shape, 0, 1), start, np.ones(rows, dtype=bool))
+    assert found.worst < ENOUGH
+
+
+def ring(count, height=0.0):
+    return np.array([(np.cos(a), np.sin(a), height) for a in 2.0 * np.pi * np.arange(count) / count])
+
+
+def test_what_contradicts_itself_is_measured():
+    wanted = links([(0, 1), (1, 2), (0, 2)], [1.0, 1.0, 2.3])
+    start = np.array([(0.0, 0, 0), (1.0, 0.1, 0), (2.0, 0, 0)])
+    found = find_shape(wanted, (), start, np.zeros(3, dtype=bool))
+    assert found.worst == pytest.approx(0.1, abs=1e-3)  # 0.3 m, shared by three
+
+
+def test_shape_met_at_start_heights_is_not_folded():
+    shape = ring(6, 0.7)
+    found = find_shape(asked(shape).take(np.arange(0, 15, 2)), (), shape * [1.3, 0.8, 1.0], np.ones(6, dtype=bool))
+    assert found.worst < ENOUGH
+    assert found.position[:, 2] == pytest.approx(0.7)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_space_shapes_are_found_from_coplanar_starts(seed):
+    """Twelve drones on a hemisphere, linked to their nearest: a single beginning misses most of them."""
+    made = layouts.hemisphere(12, 0.6, 0.25)
+    shape = made.position
+    start = shape * [1.2, 1.2, 0.0] + np.random.default_rng(seed).normal(0.0, [0.25, 0.25, 0.0], shape.shape)
+    assert find_shape(asked(shape, made.pairs), (), start, np.ones(12, dtype=bool)).worst < ENOUGH
+
+
+def solids(flies):
+    kinds = [CRAZYFLIE if each else KHEPERA4 for each in flies]
+    return Room(Solids.of(kinds, links([(0, k) for k in range(1, len(flies))]), flies, 0.1), flies, 0.3)
+
+
+def test_a_shape_below_the_floor_is_mirrored():
+    shape = np.concatenate([ring(5), [[0.1, 0.0, 0.9], [-0.3, 0.2, 0.8]]])
+    climbs = np.arange(7) >= 5
+    start = shape * [1.2, 1.0, -0.2]  # nearer to the mirror image
+    below = find_shape(asked(shape), (), start, climbs)
+    assert below.worst < ENOUGH
+    assert below.position[climbs, 2].max() < 0.0
+    above = find_shape(asked(shape), (), start, climbs, solids(climbs))
+    assert above.worst < ENOUGH
+    assert above.position[:5, 2] == pytest.approx(np.zeros(5))
+    assert above.position[climbs, 2] == pytest.approx([0.9, 0.8], abs=1e-3)
+
+
+def test_robots_in_one_place_are_no_shape():
+    """A square without diagonals may fold: two corners then are in one place."""
+    square = np.array([(0.0, 0, 0.7), (1.0, 0, 0.7), (1.0, 1.0, 0.7), (0.0, 1.0, 0.7)])
+    pairs = np.array([(0, 1), (1, 2), (2, 3), (0, 3)])
+    flies = np.ones(4, dtype=bool)
+    start = np.array([(0.0, 0, 0.7), (1.0, 0, 0.7), (0.01, 0.1, 0.7), (1.0, 0.01, 0.7)])
+    assert np.ptp(find_shape(asked(square, pairs), (), start, flies).position, axis=0)[2] < 0.01
+    found = find_shape(asked(square, pairs), (), start, flies, solids(flies))
+    assert found.worst < ENOUGH
+    assert not len(solids(flies).solids.overlaps(found.position))

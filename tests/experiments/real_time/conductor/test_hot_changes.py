@@ -1,5 +1,7 @@
 """Changes in mid-run, step by step: who is asked for what, in which order, what is refused. No process, no network."""
 
+from unittest.mock import Mock
+
 import numpy as np
 import pytest
 
@@ -45,8 +47,6 @@ class Stage:
         self.changes = HotChanges(Plan(experiment), self, self, KEYS)
         self.changes.begin(START)
 
-    # as a view
-
     def report(self, *said):
         self.said.append(said)
 
@@ -61,10 +61,8 @@ class Stage:
             self.end(name)
         elif order.order in PHASES:
             assert order.at == START
-            self._enter(name, PHASES[order.order])
+            self.appear(name, PHASES[order.order])
         return messages.Reply(name, ok=True, phase=self.robots[name].phase)
-
-    # as processes
 
     def companions(self, name):
         return list(self.together) if name in self.together else [name]
@@ -90,16 +88,11 @@ class Stage:
         self.bodies |= bodies or {}
         for name in names:
             self.running.add(name)
+            self._pid += 1
             self.appear(name)
 
-    # as the test
-
     def appear(self, name, phase="ready"):
-        self._pid += 1
         self.robots[name].alive = True
-        self._enter(name, phase)
-
-    def _enter(self, name, phase):
         self.robots[name].status = messages.Status(name, self.clock.utc(), phase, "", pid=self._pid)
 
     def end(self, name):
@@ -109,12 +102,9 @@ class Stage:
         if not self.changes.expects(name, "its process ended"):
             self.changes.mark_lost(name)
 
-    def ask(self, what, *names, **more):
-        return self.put(messages.encode(messages.RunOrder(what, list(names), **more)))
-
-    def put(self, payload):
-        query = Query(KEYS.run_order, messages.JSON, payload)
-        self._add(query)
+    def ask(self, what, *names, payload=None, **more):
+        order = payload or messages.encode(messages.RunOrder(what, list(names), **more))
+        self._add(query := Query(KEYS.run_order, messages.JSON, order))
         return query
 
     def go_on(self, seconds=1.0):
@@ -139,8 +129,7 @@ def stage(monkeypatch):
 
 
 def test_restart_lands_starts_and_joins_by_common_clock(stage):
-    reply = stage.after(stage.ask("restart", "CF01"), 5.0)
-    assert set(reply.done) == {"CF01"}
+    assert set(stage.after(stage.ask("restart", "CF01"), 5.0).done) == {"CF01"}
     assert stage.given == [("CF01", "leave"), ("CF01", "takeoff"), ("CF01", "start")]
     assert stage.did == [("start", "CF01")]
     assert (stage.robots["CF01"].phase, stage.robots["CF01"].left_because) == ("running", "")
@@ -150,10 +139,8 @@ def test_order_for_several_is_answered_when_all_finish(stage):
     stage.hung.add("KH02")
     query = stage.ask("remove", "KH01", "KH02", "KH01")
     stage.go_on(2.0)
-    assert query.answer is None
-    assert stage.robots["KH01"].left_because == "removed"
-    reply = stage.after(query, 4.0)
-    assert set(reply.done) == {"KH01", "KH02"}
+    assert (query.answer, stage.robots["KH01"].left_because) == (None, "removed")
+    assert set(stage.after(query, 4.0).done) == {"KH01", "KH02"}
     assert stage.did == [("release", "KH02"), ("kill", "KH02")], "who hangs lands if it can, and is ended else"
 
 
@@ -164,15 +151,13 @@ def test_process_of_a_flying_companion_is_never_ended(stage, answers):
     stage.end = lambda name: None  # it lands, and goes on landing
     reply = stage.after(stage.ask("remove", "KH01"), 20.0)
     assert "shares its process with KH02: name them all" in reply.refused["KH01"]
-    assert stage.did == []
-    assert stage.robots["KH02"].phase == "running"
+    assert (stage.did, stage.robots["KH02"].phase) == ([], "running")
 
 
 def test_a_place_is_free_or_not(stage):
     x, y = stage.bodies["CF01"].start[:2]
     stage.robots["KH01"].place = (x + 0.1, y, 0.0)
-    refused = stage.after(stage.ask("restart", "CF01"), 5.0).refused["CF01"]
-    assert "m from KH01: it needs 0.1 m around it" in refused
+    assert "m from KH01: it needs 0.1 m around it" in stage.after(stage.ask("restart", "CF01"), 5.0).refused["CF01"]
     assert not stage.given, "who is refused is left alone"
     stage.robots["KH01"].place = (x + 0.3, y, 0.0)
     assert stage.after(stage.ask("restart", "CF01"), 5.0).done
@@ -194,7 +179,7 @@ def test_whole_orders_that_are_refused(stage):
         (stage.ask("replace", "KH01", "KH02", body="twin"), "one robot at a time"),
     ):
         assert said in stage.after(query).reason
-    mad = stage.put(b'{"order": "explode", "robots": []}')
+    mad = stage.ask("", payload=b'{"order": "explode", "robots": []}')
     stage.go_on()
     assert b"not a RunOrder" in mad.error
     assert not stage.given
@@ -228,24 +213,17 @@ def test_a_spare_takes_over_once(monkeypatch):
     assert (stage.bodies["CF01"].start, stage.robots["CF01"].phase) == ([0.8, 0.8], "running")
     stage.end("CF01")
     stage.go_on(5.0)
-    kind, source, text = stage.said[-1]
-    assert (kind, source) == ("refused", "CF01")
-    assert "no spare crazyflie left" in text
+    assert stage.said[-1][:2] == ("refused", "CF01")
+    assert "no spare crazyflie left" in stage.said[-1][2]
 
 
 def test_process_that_cannot_join_is_reported(stage):
     stage.start_again = lambda names, bodies=None: stage.end("KH01")
-    reply = stage.after(stage.ask("restart", "KH01"), 5.0)
-    assert reply.refused == {"KH01": "KH01: its process ended"}
-    assert stage.robots["KH01"].left_because == "removed"
+    assert stage.after(stage.ask("restart", "KH01"), 5.0).refused == {"KH01": "KH01: its process ended"}
     assert stage.changes.under_way == set()
-
-    def full(_names, _bodies=None):
-        raise OSError(28, "No space left on device")
-
-    stage.start_again = full
+    stage.start_again = Mock(side_effect=OSError(28, "No space left on device"))
     assert "No space left on device" in stage.after(stage.ask("restart", "KH02"), 5.0).refused["KH02"]
-    assert stage.robots["KH02"].left_because == "removed"
+    assert [stage.robots[name].left_because for name in ("KH01", "KH02")] == ["removed"] * 2
     assert stage.after(stage.ask("remove", "CF01")).done
 
 
@@ -257,6 +235,5 @@ def test_lost_orders_are_repeated_within_limited_time(stage):
         stage.hung.add("KH01")
 
     stage.start_again = hanging
-    reply = stage.after(stage.ask("restart", "KH01"), 10.0)
-    assert reply.refused == {"KH01": "KH01, takeoff: no answer"}
+    assert stage.after(stage.ask("restart", "KH01"), 10.0).refused == {"KH01": "KH01, takeoff: no answer"}
     assert stage.given.count(("KH01", "takeoff")) > 3

@@ -26,6 +26,7 @@ LIGHTHOUSE = {"positioning": {"system": "lighthouse"}}
 DRONE = RobotTable(kind="crazyflie", start=[0.0, 0.5, 0.0], hover=0.2, body=f"{RADIO}1", device=LIGHTHOUSE)
 OTHER = RobotTable(kind="crazyflie", start=[0.0, -0.5, 0.0], hover=0.8, body=f"{RADIO}2", device=LIGHTHOUSE)
 WHEELS = RobotTable(kind="khepera4", start=[1.0, 0.0], body="khepera4://192.0.2.1")
+TELLO_TABLE = RobotTable(kind="tello", start=[0.0, 0.0], hover=0.8)
 
 
 def states(*places, yaw=0.0):
@@ -42,19 +43,15 @@ def observed_still(robot=DRONE, *, place=(0.0, 0.5, 0.0), noise=0.0, yaw=0.0, sa
 
 
 def checked(each, **others):
-    return checks.at_rest({"CF01": each, **others}, Safety(), date(2026, 3, 1))["CF01"]
-
-
-def found(each, check, **others):
-    return next(one for one in checked(each, **others) if one.check == check)
+    """What is found of CF01, by check."""
+    found = checks.at_rest({"CF01": each, **others}, Safety(), date(2026, 3, 1))["CF01"]
+    return {one.check: one for one in found}
 
 
 def test_a_robot_that_is_in_order_is_green():
     made = checked(observed_still(packets_hz=180.0, capacity_hz=250.0))
-    assert {each.check: each.verdict for each in made} == dict.fromkeys(
-        ["address", "firmware", "battery", "position", "start pose", "radio", "clock", "ready"], "ok"
-    )
-    assert not any(each.remedy for each in made)
+    assert [*made] == ["address", "firmware", "battery", "position", "start pose", "radio", "clock", "ready"]
+    assert {(each.verdict, each.remedy) for each in made.values()} == {("ok", "")}
 
 
 LEANS = "it is not level: it leans 40°"
@@ -84,17 +81,16 @@ LEANS = "it is not level: it leans 40°"
     ],
 )
 def test_what_is_measured_at_rest(changed, check, verdict, text):
-    made = found(observed_still(**changed), check)
+    made = checked(observed_still(**changed))[check]
     assert (made.verdict, bool(made.remedy), made.found) == (verdict, verdict in ("warn", "bad"), text)
 
 
 @pytest.mark.parametrize(("other_y", "here_y", "there_y"), [(-0.5, -0.5, 0.5), (0.3, 0.38, 0.42)])
 def test_swapped_robots_are_named(other_y, here_y, there_y):
     there = observed_still(changed(OTHER, start=[0.0, other_y, 0.0]), place=(0.0, there_y, 0.0))
-    assert found(observed_still(place=(0.0, here_y, 0.0)), "start pose", CF02=there).remedy == (
-        "it stands where CF02 begins: addresses, markers or robots are swapped"
-    )
-    assert found(observed_still(place=(0.0, 0.41, 0.0)), "start pose", CF02=there).verdict == "ok"
+    here, near = (checked(observed_still(place=(0.0, y, 0.0)), CF02=there)["start pose"] for y in (here_y, 0.41))
+    assert here.remedy == "it stands where CF02 begins: addresses, markers or robots are swapped"
+    assert near.verdict == "ok"
 
 
 @pytest.mark.parametrize(
@@ -108,9 +104,9 @@ def test_swapped_robots_are_named(other_y, here_y, there_y):
     ],
 )
 def test_robots_that_count_from_start_are_unknown(robot, verdict):
-    x, y = robot.start[:2]
-    assert found(observed_still(robot, place=(x, y, 0.0), noise=0.0005), "start pose").verdict == verdict
-    assert found(observed_still(robot, place=(5.0, 5.0, 0.0)), "start pose").verdict == "bad"
+    there = observed_still(robot, place=(*robot.start[:2], 0.0), noise=0.0005)
+    away = observed_still(robot, place=(5.0, 5.0, 0.0))
+    assert [checked(each)["start pose"].verdict for each in (there, away)] == [verdict, "bad"]
 
 
 @pytest.mark.parametrize(
@@ -119,43 +115,45 @@ def test_robots_that_count_from_start_are_unknown(robot, verdict):
 )
 def test_captured_positions_that_never_change_are_red(body, position, verdict):
     robot = changed(DRONE, body=body, position=position)
-    assert found(observed_still(robot), "position").verdict == verdict
+    assert checked(observed_still(robot))["position"].verdict == verdict
     each = observed_still(robot, said={"body": f"{FROZEN}; connected"})
     each.states = []
-    assert (found(each, "position").verdict, found(each, "position").found) == ("bad", FROZEN)
+    made = checked(each)["position"]
+    assert (made.verdict, made.found) == ("bad", FROZEN)
 
 
 def test_robots_of_a_kind_have_the_same_firmware():
-    made = found(observed_still(), "firmware", CF02=observed_still(OTHER, firmware="2025.09"))
+    made = checked(observed_still(), CF02=observed_still(OTHER, firmware="2025.09"))["firmware"]
     assert (made.verdict, made.remedy) == ("warn", "CF02 has 2025.09: flash the same to all of a kind")
 
 
 def test_unresponsive_robot_has_one_red_line():
     for body, remedy in ((DRONE.body, "switch it on"), ("quad://127.0.0.1:6001", "is it switched on, and its")):
-        (made,) = checked(Observed(changed(DRONE, body=body), ended="no answer"))
+        (made,) = checked(Observed(changed(DRONE, body=body), ended="no answer")).values()
         assert (made.check, made.verdict, made.found) == ("address", "bad", "no answer")
         assert made.remedy.startswith(remedy)
     each = observed_still(said={"battery": None, "phase": "idle", "body": "no answer at radio://0/80/..."})
     each.states, each.inspections = states(None), [Inspection()]  # one drone of a process with several
-    verdicts = {check: found(each, check).verdict for check in ("address", "ready", "position", "start pose")}
-    assert verdicts == {"address": "bad", "ready": "bad", "position": "bad", "start pose": "unknown"}
+    made = checked(each)
+    verdicts = [made[check].verdict for check in ("address", "ready", "position", "start pose")]
+    assert verdicts == ["bad", "bad", "bad", "unknown"]
+
+
+TRIED = Tried(stopped_s=0.1)
+ROLLED = states((0.0, 0.0, 0.0), (0.1, 0.0, 0.0))
 
 
 def test_a_stop_at_rest_tries_no_crazyflie():
-    tried = Tried(stopped_s=0.1)
-    assert checks.stop_at_rest(DRONE, tried) == Check("stop, motors off", "unknown", "not tried: --stop tries it")
-    for robot in (WHEELS, changed(DRONE, body="twin")):
-        assert checks.stop_at_rest(robot, tried).verdict == "ok"
+    unknown, *known = (checks.stop_at_rest(each, TRIED) for each in (DRONE, WHEELS, changed(DRONE, body="twin")))
+    assert unknown == Check("stop, motors off", "unknown", "not tried: --stop tries it")
+    assert [each.verdict for each in known] == ["ok", "ok"]
     assert checks.stop_at_rest(DRONE, Tried(failure="refused: no answer")).verdict == "bad"
-
-
-ROLLED = states((0.0, 0.0, 0.0), (0.1, 0.0, 0.0))
 
 
 @pytest.mark.parametrize(
     ("robot", "tried", "verdict"),
     [
-        (DRONE, Tried(stopped_s=0.1), "ok"),
+        (DRONE, TRIED, "ok"),
         (DRONE, Tried(stopped_s=1.5), "bad"),
         (DRONE, Tried(stopped_s=math.nan, note="the emergency stop is not answered"), "bad"),
         (DRONE, Tried(failure="refused: no answer"), "bad"),
@@ -183,8 +181,7 @@ def test_stops(robot, tried, verdict):
 def test_hops_and_drives(robot, end, verdict, remedy):
     tried = Tried(states=states((0.0, 0.5, 0.0), end, end), volts=3.7, charge=0.6)
     made = checks.hop(observed_still(robot), tried, Safety())
-    assert made.verdict == verdict
-    assert made.remedy.startswith(remedy)
+    assert (made.verdict, made.remedy.startswith(remedy)) == (verdict, True)
     assert made.found.endswith("; battery 60%, 3.70 V under load")
     assert checks.hop(observed_still(robot), Tried(states=tried.states, charge=0.05), Safety()).verdict == "bad"
 
@@ -195,7 +192,7 @@ def test_robots_are_checked_without_formation_and_low():
     assert len(plan.links) == 0
     assert {case.robots[leg.robot].kind for leg in case.timeline} == {"khepera4", "turtlebot3"}
     assert {robot.hover for robot in case.robots.values()} == {None, checks.HOP_M}
-    robots = {"T1": RobotTable(kind="tello", start=[0.0, 0.0], hover=0.8), "CF01": OTHER}
+    robots = {"T1": TELLO_TABLE, "CF01": OTHER}
     case = alone(Plan(small(robots))).experiment
     assert {name: robot.hover for name, robot in case.robots.items()} == {"T1": 0.8, "CF01": checks.HOP_M}
 
@@ -214,8 +211,7 @@ def pushed(forward, back, yaw=0.5):
 
 
 def tried_sticks(believed=1.0, **tried):
-    device = {"stick_speed": believed}
-    each = Observed(RobotTable(kind="tello", start=[0.0, 0.0], hover=0.8, device=device))
+    each = Observed(changed(TELLO_TABLE, device={"stick_speed": believed}))
     return checks.trial(TELLO.trial, each, Tried(**tried))
 
 

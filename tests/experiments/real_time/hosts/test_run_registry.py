@@ -27,11 +27,8 @@ def entry(what="run", title="two", **more):
 
 def dead():
     """A run whose process has ended."""
-    process = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
-    started = born(process.pid)
-    assert started is not None
-    process.communicate(b"\n")
-    return changed(entry(), pid=process.pid, born=started)
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
+        return changed(entry(), pid=process.pid, born=born(process.pid))
 
 
 def test_run_is_listed_while_it_is_up(runtime_folder):
@@ -68,15 +65,15 @@ GARBAGE = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("text", GARBAGE, ids=range(8))
-def test_garbage_is_left_alone_and_hides_nobody(runtime_folder, text):
+def test_garbage_is_left_alone_and_hides_nobody(runtime_folder):
     run = entry()
     with registered(run):
-        (runtime_folder / "0.json").write_bytes(text)
-        (runtime_folder / "1.json").mkdir()
-        (runtime_folder / "2.json").symlink_to("/dev/zero")
-        assert runs() == [run]
-        assert (runtime_folder / "0.json").exists()
+        (runtime_folder / "folder.json").mkdir()
+        (runtime_folder / "endless.json").symlink_to("/dev/zero")
+        for number, text in enumerate(GARBAGE):
+            (runtime_folder / f"{number}.json").write_bytes(text)
+            assert runs() == [run], text[:80]
+        assert len(list(runtime_folder.iterdir())) == 3 + len(GARBAGE)
 
 
 def test_silent_names_delay_no_emergency_stop(monkeypatch):

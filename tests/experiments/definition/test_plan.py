@@ -1,0 +1,308 @@
+"""What follows from an experiment: the assignment of each robot, the channel of each link, standby and spares."""
+
+import math
+
+import msgspec
+import numpy as np
+import pytest
+
+from agents.body.interface import BodyState, Disturbance, Jitter
+from agents.body.limits import Safety
+from agents.errors import Refusal
+from agents.kinds.turtlebot3 import TURTLEBOT3
+from agents.network import channel_model, messages
+from agents.plugins.laws import Distance
+from agents.plugins.planners import Line
+from agents.plugins.triggers import Periodic, SendOnDelta
+from agents.robot import Robot
+from experiments import run
+from experiments.definition import bodies, link_conditions
+from experiments.definition import standby as reserves
+from experiments.definition.experiment import (
+    Arena,
+    ChannelTable,
+    Formation,
+    Hybrid,
+    LegTable,
+    LinkChannelTable,
+    LinkTable,
+    Outage,
+    Rates,
+    RobotTable,
+    Start,
+)
+from experiments.definition.plan import Plan
+from experiments.file import document
+from experiments.file.consistency.whole import consistency_faults
+from experiments.real_time.conductor.hot_changes import Spares
+from tests.experiments.definition.test_graph import HEARS
+from tests.small import changed, reference, small
+from twins.scene import Obstacle
+
+NAMES = ("TB01", "KH01", "KH02", "KH03", "CF01", "CF02", "CF03")
+
+
+@pytest.fixture(scope="module")
+def reference_plan():
+    return Plan(reference("periodic"))
+
+
+def test_part_of_the_leader(reference_plan):
+    made = reference_plan.assignment("TB01")
+    assert (made.name, made.kind, made.neighbours, made.guided) == ("TB01", TURTLEBOT3, (), False)
+    assert math.isnan(made.hover)
+    assert made.law == Distance()
+    assert made.trigger == Periodic(period_s=0.02)
+    assert (made.clamp, made.tracking_gain, made.duration) == (0.1, 3.0, 45.0)
+    assert (made.body_hz, made.pose_every, made.decide_every) == (100.0, 2, 10)
+    assert made.patience_s is None
+    assert [reference_plan.assignment(name).ground for name in NAMES] == [0.0] * 4 + [0.8] * 3
+    (leg,) = made.legs
+    assert (leg.at, leg.planner) == (21.0, Line(move_by=[0.75, 0.0], speed_=0.15))
+
+
+def test_links_of_the_paper(reference_plan):
+    """Eq. (11) and figure 11: 12 edges, three of them from the leader only."""
+    net = reference_plan.links
+    assert {i: tuple(net.sender[net.receiver == i].tolist()) for i in range(1, 7)} == HEARS
+    assert 0 not in net.receiver
+    distance = {(NAMES[i], NAMES[j]): d for i, j, d in zip(net.receiver, net.sender, net.distance, strict=True)}
+    assert distance["KH01", "KH03"] == distance["KH03", "KH01"] == pytest.approx(0.6 * math.sqrt(2))
+    assert distance["CF01", "TB01"] == distance["KH02", "CF02"] == 0.86
+    drones = {4, 5, 6}
+    by_drone = [bool({i, j} & drones) for i, j in zip(net.receiver.tolist(), net.sender.tolist(), strict=True)]
+    np.testing.assert_array_equal(net.gain, np.where(by_drone, 1.0, 3.0))
+    for row, name in enumerate(NAMES):
+        known = reference_plan.assignment(name).neighbours
+        assert [link.sender for link in known] == net.sender[net.receiver == row].tolist()
+        assert [link.distance for link in known] == net.distance[net.receiver == row].tolist()
+        assert all(link.name == NAMES[link.sender] and link.in_law for link in known)
+
+
+def three(**parts):
+    robots = {
+        "A": RobotTable(kind="khepera4", start=[0.5, -0.5, 1.5]),
+        "B": RobotTable(kind="crazyflie", start=[0.0, 0.25], hover=0.7),
+        "C": RobotTable(kind="turtlebot3", start=[-0.5, 0.0]),
+    }
+    return Plan(small(robots, **parts))
+
+
+def test_bodies_start_on_the_floor_with_a_yaw(reference_plan):
+    made = bodies.body_request(reference_plan, NAMES, 5)
+    assert (made.names, made.seeds, made.addresses) == (NAMES, (5,) * 7, ("twin",) * 7)
+    assert made.rate_hz == 100.0
+    assert (made.start[0], made.start[4]) == ((-0.6, 0.8, 0.0), (-0.2, 0.4, 0.0))
+    assert three().start_poses() == ([(0.5, -0.5, 0.0), (0.0, 0.25, 0.0), (-0.5, 0.0, 0.0)], [1.5, 0.0, 0.0])
+
+
+def test_limits_are_arena_and_safety_of_the_file():
+    safety = Safety(speed=0.3, max_goal_distance=0.2, margin=0.1)
+    made = three(arena=Arena(size=(2.0, 3.0, 4.0)), safety=safety).limits("A")
+    assert (made.low, made.high) == ((-1.0, -1.5, 0.0), (1.0, 1.5, 4.0))
+    assert (made.speed, made.max_goal_distance, made.margin) == (0.3, 0.2, 0.1)
+    assert (made.position_timeout_s, made.neighbour_timeout_s) == (0.5, 1.0)
+    assert three().limits("A").top_speed == np.inf
+
+
+def test_links_may_have_gains_of_their_own():
+    given = {"A > B": LinkTable(distance=0.5, gain=7.0), "B - C": 0.6, "C > A": LinkTable(distance=1.0)}
+    net = three(formation=Formation(gain=2.0, links=given)).links
+    table = zip(*(column.tolist() for column in (net.receiver, net.sender, net.distance, net.gain)), strict=True)
+    assert list(table) == [(0, 2, 1.0, 2.0), (1, 0, 0.5, 7.0), (1, 2, 0.6, 2.0), (2, 1, 0.6, 2.0)]
+
+
+def test_who_leads():
+    def leaders(*links, leader=None):
+        return list(three(formation=Formation(links=dict.fromkeys(links, 1.0), leader=leader)).leaders)
+
+    assert leaders() == []  # no robot receives
+    assert leaders("A > B", "A > C") == ["A"]
+    assert leaders("A > B") == ["A", "C"]
+    assert leaders("A - B", "B > C") == []
+    assert leaders("A - B", leader="B") == ["B"]
+
+
+def test_disturbances_merge_field_by_field_the_narrower_wins():
+    given = {
+        "all": Disturbance(position_sigma=0.001, yaw_sigma=0.01, latency_s=0.1),
+        "crazyflie": Disturbance(hover_jitter=Jitter(0.01), latency_s=0.2),
+        "B": Disturbance(position_sigma=0.0),
+    }
+    made = three(disturbance=given)
+    assert made.disturbance("A") == given["all"]
+    assert made.disturbance("B") == Disturbance(Jitter(0.01), 0.0, 0.01, 0.2)
+    assert three().disturbance("A") == Disturbance()
+
+
+def test_rates_patience_and_triggers():
+    rates = Rates(body_hz=200.0, pose_hz=40.0, coordination_hz=20.0)
+    trigger = {"kind": "send-on-delta", "threshold": 0.02, "maximum_silence_s": 1.0}
+    made = three(rates=rates, start=Start(deadline_s=7.0, missing="go-on"), trigger=trigger).assignment("A")
+    assert (made.body_hz, made.pose_every, made.decide_every, made.patience_s) == (200.0, 5, 10, 7.0)
+    assert made.trigger == SendOnDelta(threshold=0.02, maximum_silence_s=1.0)
+    with pytest.raises(msgspec.ValidationError, match="threshold"):
+        three(trigger={**trigger, "threshold": -1.0}).assignment("A")
+
+
+def test_robots_are_not_scattered_into_obstacles():
+    robots = {name: RobotTable(kind="khepera4", start=[-0.5, y]) for name, y in (("A", -0.5), ("B", 0.5))}
+    arena = Arena(obstacles={"post": Obstacle(radius=0.3, at=(0.0, 0.0))})
+    plan = Plan(small(robots, arena=arena, start=Start(scatter=0.6)))
+    place = np.array([bodies.scattered_poses(plan, ("A", "B"), seed)[0] for seed in range(100)])
+    gap = np.hypot(place[..., 0], place[..., 1]) - 0.3 - 0.07
+    assert gap.min() > bodies.CLEAR
+    assert gap.min() < 0.1  # it is near enough to be in the way
+
+
+CONNECTED = ("A", "B", "C")
+CHANNELS = {"A - B": 0.5, "A > C": 0.5, "B > C": 0.5}
+ENDS = (("B", "A"), ("A", "B"), ("A", "C"), ("B", "C"))  # sender and receiver of each link
+
+
+def planned(channel=None, **parts):
+    return Plan(small(dict.fromkeys(CONNECTED, "khepera4"), CHANNELS, channel=channel or ChannelTable(), **parts))
+
+
+def conditions(channel, seed=1, **how):
+    return link_conditions.conditions_of(planned(channel), ENDS, seed, **how)
+
+
+def test_default_delay_is_a_millisecond_or_nothing_really():
+    assert [link.delay for link in conditions(ChannelTable())] == [0.001] * 4
+    assert [link.delay for link in conditions(ChannelTable(), real=True)] == [0.0] * 4
+    assert [link.delay for link in conditions(ChannelTable(delay_s=0.02), real=True)] == [0.02] * 4
+    assert not link_conditions.models_network(planned())
+    assert link_conditions.models_network(planned(ChannelTable(loss=0.1)))
+
+
+def test_links_have_their_own():
+    own = {"A > C": LinkChannelTable(loss=0.3, burst=4.0), "A - B": LinkChannelTable(delay_s=0.1, bandwidth=1e4)}
+    made = conditions(ChannelTable(loss=0.1, jitter_s=0.01, queue_s=0.2, links=own))
+    assert [link.key for link in made] == [channel_model.key(1, *names) for names in ENDS]  # by the seed
+    assert [link.loss for link in made] == [0.1, 0.1, 0.3, 0.1]
+    np.testing.assert_array_equal([link.burst for link in made], [np.nan, np.nan, 4.0, np.nan])
+    assert [link.delay for link in made] == [0.1, 0.1, 0.001, 0.001]
+    assert [link.bandwidth for link in made] == [1e4, 1e4, np.inf, np.inf]
+    assert {(link.jitter, link.queue) for link in made} == {(0.01, 0.2)}
+
+
+def test_outages_of_links_of_robots_and_of_all():
+    outages = [
+        Outage(from_s=1.0, until_s=2.0),
+        Outage(from_s=3.0, links=["A > B", "B > C"]),
+        Outage(from_s=4.0, until_s=5.0, robots=["B"]),
+    ]
+    every, some, of_robot = (1.0, 2.0), (3.0, np.inf), (4.0, 5.0)
+    found = [[*link.outages] for link in conditions(ChannelTable(outages=outages))]
+    assert found == [[every, of_robot], [every, some, of_robot], [every], [every, some, of_robot]]
+
+
+def test_what_is_possible_is_accepted():
+    own = {"A > B": LinkChannelTable(loss=0.1)}
+    mixed = ChannelTable(loss=0.5, burst=2.0, links=own, outages=[Outage(from_s=0.0)])
+    for channel in (mixed, ChannelTable(loss=1.0, burst=3.0)):
+        assert list(consistency_faults(planned(channel))) == []
+
+
+def test_links_of_avoidance_alone_are_links():
+    channel = ChannelTable(links={"C > A": LinkChannelTable(loss=0.5)})
+    plan = planned(channel, avoidance={"kind": "potential", "hears": "all"})
+    assert list(consistency_faults(plan)) == []
+    links = plan.pose_links
+    ends = [(CONNECTED[j], CONNECTED[i]) for i, j in zip(links.receiver, links.sender, strict=True)]
+    made = link_conditions.conditions_of(plan, ends, 1)
+    assert [pair for pair, link in zip(ends, made, strict=True) if link.loss] == [("C", "A")]
+
+
+BOT = RobotTable(kind="khepera4", start=[0.0, 0.0])
+FLY = RobotTable(kind="crazyflie", start=[0.5, 0.5], hover=0.5)
+
+
+def with_standby(**parts):
+    robots = {"A": BOT, "B": changed(BOT, start=[0.5, 0.0]), "C": changed(FLY, standby=True)}
+    return small(robots, {"A - B": 0.5, "A - C": 0.7, "C > B": 0.7}, duration_s=5.0, **parts)
+
+
+def test_without_those_on_standby_nothing_names_them():
+    whole = with_standby(
+        timeline=[LegTable(at_s=1.0, robot="C", plan="hold")],
+        architecture=Hybrid("hybrid", ["A", "C"]),
+        channel=ChannelTable(
+            links={"A > C": LinkChannelTable(loss=0.5), "A > B": LinkChannelTable(loss=0.1)},
+            outages=[Outage(from_s=1.0, links=["A - C"]), Outage(from_s=2.0, robots=["B", "C"]), Outage(from_s=3.0)],
+        ),
+    )
+    plan = reserves.without_standby(Plan(whole))
+    made = plan.experiment
+    assert list(made.robots) == ["A", "B"]
+    assert made.formation.links == {"A - B": 0.5}
+    assert not made.timeline
+    assert list(made.channel.links) == ["A > B"]
+    assert [(outage.from_s, outage.robots) for outage in made.channel.outages] == [(2.0, ["B"]), (3.0, [])]
+    assert made.architecture == Hybrid("hybrid", ["A"])
+    assert not list(consistency_faults(plan))
+    assert not list(consistency_faults(Plan(with_standby(spares={"S": FLY, "T": BOT}, on_loss="replace"))))
+    assert reserves.without_standby(plan) is plan
+
+
+def test_virtual_time_flies_without_those_on_standby(tmp_path):
+    file = tmp_path / "x.json"
+    file.write_bytes(document.write_json(Plan(with_standby())))
+    (trace,) = run.simulate(document.read(file)).traces.values()
+    assert trace.robots == ("A", "B")
+
+
+@pytest.mark.parametrize("standby", [True, False])
+def test_nobody_waits_for_a_robot_on_standby(standby):
+    case = with_standby()
+    told = Plan(changed(case, robots={**case.robots, "C": changed(FLY, standby=standby)})).assignment("A")
+    robot = Robot(told)
+    assert robot.missing_neighbours() == ["B", "C"]
+    place = next(place for place, link in enumerate(told.neighbours) if link.name == "B")
+    robot.neighbours.mark_alive(place)
+    robot.neighbours.receive(place, (0.5, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0, 0.0)
+    state = BodyState(time=0.0, position=(0.0, 0.0, 0.0), yaw=0.0, velocity=(0.0, 0.0, 0.0), flying=False, battery=1.0)
+    for tick in range(3):
+        robot.transmit(0.01 * tick, state)
+        robot.act(0.01 * tick)
+    assert (robot.lifecycle.phase > 0) == standby
+    assert robot.missing_neighbours() == ["C"]
+
+
+def order(**more):
+    return messages.RunOrder("replace", ["A"], **more)
+
+
+def test_spare_brings_its_body_and_keeps_the_rest():
+    spare = changed(BOT, start=[0.2, 0.3, 1.0], body="khepera4://192.0.2.1", avoids=False)
+    spares = Spares(Plan(with_standby(spares={"F": FLY, "S": spare})))
+    old = changed(BOT, ranges="world")
+    robot, whose = spares.successor("A", old, order())
+    assert whose == "S", "the first of its kind"
+    assert (robot.body, robot.start, robot.avoids, robot.ranges) == (spare.body, spare.start, True, "body")
+    spares.used["S"] = "A"
+    with pytest.raises(Refusal, match="no spare khepera4 left"):
+        spares.successor("A", old, order())
+    robot, whose = spares.successor("A", old, order(body="twin", at=(0.5, 0.25), yaw=1.0))
+    assert (robot.body, robot.start, whose) == ("twin", [0.5, 0.25, 1.0], None)
+
+
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [
+        (order(spare="F"), "is a crazyflie and cannot be A"),
+        (order(spare="G"), "no spare 'G'"),
+        (order(spare="S", body="twin"), "leave --body or --with out"),
+        (order(body="tello-twin"), "before the run only"),
+        (order(body="nowhere://1"), "no 'nowhere'"),
+        (order(body="world"), "into the world"),
+        (order(body="twin", at=(99.0, 0.0)), "outside of the arena"),
+        (order(body="twin", at=(float("nan"), 0.0)), "outside of the arena"),
+        (order(body="twin", at=(0.0, 0.0), yaw=float("inf")), "outside of the arena"),
+        (order(body="khepera4://192.0.2.1", at=(0.0, 0.0)), "only a twin"),
+    ],
+)
+def test_what_cannot_take_over_a_name(asked, said):
+    with pytest.raises(Refusal, match=said):
+        Spares(Plan(with_standby(spares={"F": FLY, "S": BOT}))).successor("A", BOT, asked)
