@@ -1,5 +1,8 @@
 """Layouts, and the experiment files that are generated from them."""
 
+import math
+from itertools import combinations
+
 import numpy as np
 import pytest
 
@@ -26,8 +29,7 @@ def test_files_pass_the_check(what, size, kind, vital):
     found, figures = examine(generated(what, size, kind=kind))
     assert [each for each in found if each.severity != "note"] == []
     (numbers,) = figures.values()
-    assert numbers.residual_mm < 0.3
-    assert 0.3 < numbers.loop_gain < 1.1
+    assert numbers.residual_mm < 0.3 < numbers.loop_gain < 1.1
     assert vital is None or (numbers.vital_links, numbers.vital_robots, numbers.spare_robots) == ((), vital, 11)
 
 
@@ -38,9 +40,8 @@ def test_every_robot_and_every_link_has_a_line():
     assert sum(line.startswith("CF") for line in lines) == 100
     assert sum(line.startswith('"CF') for line in lines) == len(made.pairs)
     assert max(map(len, lines)) < 100
-    heights = [robot.hover for robot in generated("hemisphere", "100").experiment.robots.values()]
-    assert min(heights) == pytest.approx(0.4)
-    assert len(set(heights)) > 90
+    heights = {robot.hover for robot in generated("hemisphere", "100").experiment.robots.values()}
+    assert (min(heights), len(heights) > 90) == (pytest.approx(0.4), True)
     rates = [generated("polygon", count).experiment.rates.state_hz for count in ("100", "1000")]
     assert rates == [50.0, 5.0]
 
@@ -48,11 +49,9 @@ def test_every_robot_and_every_link_has_a_line():
 def test_starts_do_not_overlap_whatever_the_seed():
     plan = generated("hemisphere", "40").plan
     for seed in range(5):
-        scattered, _ = bodies.scattered_poses(plan, tuple(plan.experiment.robots), seed)
-        place = np.array(scattered)
-        apart = np.linalg.norm(place[:, None] - place[None], axis=2)[np.triu_indices(40, 1)]
-        assert apart.min() > 2 * 0.065
-        assert np.abs(place - np.array(plan.start_poses()[0])).max() > 0.1
+        place, _ = bodies.scattered_poses(plan, tuple(plan.experiment.robots), seed)
+        assert nearest_gap(place) > 2 * 0.065
+        assert np.abs(np.subtract(place, plan.start_poses()[0])).max() > 0.1
 
 
 @pytest.mark.parametrize(
@@ -76,18 +75,15 @@ def test_what_cannot_be_had(what, size, wanted, said):
 def test_generate_writes_a_file_and_never_overwrites(tmp_path):
     target = tmp_path / "nine.toml"
     path, made = generate("polygon", "9", str(target), LayoutOptions())
-    assert (path, len(made.pairs)) == (target, 18)
-    assert (tmp_path / "zenpark.schema.json").exists()
-    with pytest.raises(DocumentError, match="exists already"):
-        generate("polygon", "9", str(target), LayoutOptions())
-    with pytest.raises(DocumentError, match="cannot be written"):
-        generate("polygon", "9", str(tmp_path / "no" / "where.toml"), LayoutOptions())
+    assert (path, len(made.pairs), (tmp_path / "zenpark.schema.json").exists()) == (target, 18, True)
+    for place, said in ((target, "exists already"), (tmp_path / "no" / "where.toml", "cannot be written")):
+        with pytest.raises(DocumentError, match=said):
+            generate("polygon", "9", str(place), LayoutOptions())
 
 
-def held(made):
-    free = np.ones((len(made), 3), dtype=bool)
-    free[:, 2] = False
-    return rigidity(made.position, made.pairs, free)
+def rigid(made):
+    """With the heights held."""
+    return rigidity(made.position, made.pairs, np.tile([True, True, False], (len(made), 1))).rigid
 
 
 def lengths(made):
@@ -95,14 +91,13 @@ def lengths(made):
 
 
 def nearest_gap(points):
-    apart = np.linalg.norm(points[:, None] - points[None], axis=2)
-    return apart[np.triu_indices(len(points), 1)].min()
+    return min(math.dist(a, b) for a, b in combinations(np.asarray(points).tolist(), 2))
 
 
 @pytest.mark.parametrize("count", [3, 4, 5, 12])
 def test_polygons_are_regular_and_rigid(count):
     made = layouts.polygon(count, 0.6)
-    assert held(made).rigid
+    assert rigid(made)
     assert nearest_gap(made.position) == pytest.approx(0.6)
     assert np.linalg.norm(made.position, axis=1) == pytest.approx(np.full(count, 0.3 / np.sin(np.pi / count)))
     assert len(made.pairs) == min(2 * count, count * (count - 1) // 2)
@@ -110,7 +105,7 @@ def test_polygons_are_regular_and_rigid(count):
 
 def test_grids_have_all_neighbours():
     made = layouts.grid(4, 3, 0.5)
-    assert held(made).rigid
+    assert rigid(made)
     assert set(np.round(lengths(made), 6)) == {0.5, round(0.5 * np.sqrt(2.0), 6)}
     assert len(made.pairs) == 4 * 2 + 3 * 3 + 2 * 3 * 2
     assert made.position.mean(axis=0) == pytest.approx(np.zeros(3))
@@ -119,7 +114,7 @@ def test_grids_have_all_neighbours():
 @pytest.mark.parametrize("count", [4, 12, 80])
 def test_hemispheres_are_rigid_and_keep_their_distances(count):
     made = layouts.hemisphere(count, 0.6, 0.25)
-    assert held(made).rigid
+    assert rigid(made)
     assert nearest_gap(made.position) >= 0.6 - 1e-9
     assert nearest_gap(made.position[:, :2]) >= 0.25 - 1e-9
     assert made.position[:, 2].min() == pytest.approx(layouts.LOWEST)

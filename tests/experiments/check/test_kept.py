@@ -2,6 +2,7 @@
 
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 
@@ -112,13 +113,12 @@ def test_spoilt_cache_is_none(park, tmp_path, spoil):
 
 def test_cache_that_cannot_be_written_is_none(park, tmp_path, monkeypatch):
     (tmp_path / "cache").write_text("a file")
-    KeptVerdict(str(park)).keep(GOOD)
-    assert KeptVerdict(str(park)).read() is None
-    monkeypatch.delenv("ZENPARK_CACHE_DIR")
-    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
-    monkeypatch.setattr(Path, "home", lambda: (_ for _ in ()).throw(RuntimeError))
-    KeptVerdict(str(park)).keep(GOOD)
-    assert KeptVerdict(str(park)).read() is None
+    for _ in range(2):
+        KeptVerdict(str(park)).keep(GOOD)
+        assert KeptVerdict(str(park)).read() is None
+        monkeypatch.delenv("ZENPARK_CACHE_DIR", raising=False)
+        monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+        monkeypatch.setattr(Path, "home", Mock(side_effect=RuntimeError))
 
 
 @pytest.mark.slow
@@ -126,13 +126,11 @@ def test_second_check_says_the_same_without_numpy(tmp_path):
     file = tmp_path / "mine.toml"
     zenpark("new", "triangle", file)
     words = ["check", str(file), "--set", "duration_s=2.0"]
+    heavy = {"numpy", "matplotlib", "zenoh", "pydantic"}
     first, modules = loaded(*words, ZENPARK_CACHE_DIR=str(tmp_path))
-    assert "numpy" in modules
-    assert not {"matplotlib", "zenoh", "pydantic"} & modules
+    assert heavy & modules == {"numpy"}
     second, modules = loaded(*words, ZENPARK_CACHE_DIR=str(tmp_path))
-    assert second == first
-    assert not {"numpy", "matplotlib", "zenoh", "pydantic"} & modules
+    assert (second, heavy & modules) == (first, set())
     file.write_text(file.read_text().replace('title = "', 'title = "Another '))
     third, modules = loaded(*words, ZENPARK_CACHE_DIR=str(tmp_path))
-    assert "Another " in third
-    assert "numpy" in modules
+    assert ("Another " in third, "numpy" in modules) == (True, True)

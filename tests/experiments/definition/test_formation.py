@@ -154,8 +154,7 @@ def test_offsets_that_do_not_add_up():
     (first, *_) = contradictions(four_with(CROOKED).plan.formation.links)
     assert sorted(first.rows) == [0, 1, 2, 3]
     assert contradictions(four_with(SQUARE).plan.formation.links) == []
-    observed = SQUARE.replace("displacement", "leader-observer")
-    assert "offsets-contradict" not in findings(four_with(observed))
+    assert "offsets-contradict" not in findings(four_with(SQUARE.replace("displacement", "leader-observer")))
 
 
 @pytest.mark.usefixtures("unflown")

@@ -50,15 +50,11 @@ def reference_plan():
 def test_part_of_the_leader(reference_plan):
     made = reference_plan.assignment("TB01")
     assert (made.name, made.kind, made.neighbours, made.guided) == ("TB01", TURTLEBOT3, (), False)
-    assert math.isnan(made.hover)
-    assert made.law == Distance()
-    assert made.trigger == Periodic(period_s=0.02)
-    assert (made.clamp, made.tracking_gain, made.duration) == (0.1, 3.0, 45.0)
+    assert (made.law, made.trigger, math.isnan(made.hover)) == (Distance(), Periodic(period_s=0.02), True)
+    assert (made.clamp, made.tracking_gain, made.duration, made.patience_s) == (0.1, 3.0, 45.0, None)
     assert (made.body_hz, made.pose_every, made.decide_every) == (100.0, 2, 10)
-    assert made.patience_s is None
+    assert [(leg.at, leg.planner) for leg in made.legs] == [(21.0, Line(move_by=[0.75, 0.0], speed_=0.15))]
     assert [reference_plan.assignment(name).ground for name in NAMES] == [0.0] * 4 + [0.8] * 3
-    (leg,) = made.legs
-    assert (leg.at, leg.planner) == (21.0, Line(move_by=[0.75, 0.0], speed_=0.15))
 
 
 def test_links_of_the_paper(reference_plan):
@@ -90,8 +86,7 @@ def three(**parts):
 
 def test_bodies_start_on_the_floor_with_a_yaw(reference_plan):
     made = bodies.body_request(reference_plan, NAMES, 5)
-    assert (made.names, made.seeds, made.addresses) == (NAMES, (5,) * 7, ("twin",) * 7)
-    assert made.rate_hz == 100.0
+    assert (made.names, made.seeds, made.addresses, made.rate_hz) == (NAMES, (5,) * 7, ("twin",) * 7, 100.0)
     assert (made.start[0], made.start[4]) == ((-0.6, 0.8, 0.0), (-0.2, 0.4, 0.0))
     assert three().start_poses() == ([(0.5, -0.5, 0.0), (0.0, 0.25, 0.0), (-0.5, 0.0, 0.0)], [1.5, 0.0, 0.0])
 
@@ -116,10 +111,8 @@ def test_who_leads():
     def leaders(*links, leader=None):
         return list(three(formation=Formation(links=dict.fromkeys(links, 1.0), leader=leader)).leaders)
 
-    assert leaders() == []  # no robot receives
-    assert leaders("A > B", "A > C") == ["A"]
-    assert leaders("A > B") == ["A", "C"]
-    assert leaders("A - B", "B > C") == []
+    assert leaders() == leaders("A - B", "B > C") == []  # no robot receives, or all
+    assert (leaders("A > B", "A > C"), leaders("A > B")) == (["A"], ["A", "C"])
     assert leaders("A - B", leader="B") == ["B"]
 
 
@@ -151,8 +144,7 @@ def test_robots_are_not_scattered_into_obstacles():
     plan = Plan(small(robots, arena=arena, start=Start(scatter=0.6)))
     place = np.array([bodies.scattered_poses(plan, ("A", "B"), seed)[0] for seed in range(100)])
     gap = np.hypot(place[..., 0], place[..., 1]) - 0.3 - 0.07
-    assert gap.min() > bodies.CLEAR
-    assert gap.min() < 0.1  # it is near enough to be in the way
+    assert bodies.CLEAR < gap.min() < 0.1  # it is near enough to be in the way
 
 
 CONNECTED = ("A", "B", "C")
@@ -169,9 +161,9 @@ def conditions(channel, seed=1, **how):
 
 
 def test_default_delay_is_a_millisecond_or_nothing_really():
-    assert [link.delay for link in conditions(ChannelTable())] == [0.001] * 4
-    assert [link.delay for link in conditions(ChannelTable(), real=True)] == [0.0] * 4
-    assert [link.delay for link in conditions(ChannelTable(delay_s=0.02), real=True)] == [0.02] * 4
+    late = ChannelTable(delay_s=0.02)
+    for given, real, delay in ((ChannelTable(), False, 0.001), (ChannelTable(), True, 0.0), (late, True, 0.02)):
+        assert [link.delay for link in conditions(given, real=real)] == [delay] * 4
     assert not link_conditions.models_network(planned())
     assert link_conditions.models_network(planned(ChannelTable(loss=0.1)))
 
@@ -180,11 +172,9 @@ def test_links_have_their_own():
     own = {"A > C": LinkChannelTable(loss=0.3, burst=4.0), "A - B": LinkChannelTable(delay_s=0.1, bandwidth=1e4)}
     made = conditions(ChannelTable(loss=0.1, jitter_s=0.01, queue_s=0.2, links=own))
     assert [link.key for link in made] == [channel_model.key(1, *names) for names in ENDS]  # by the seed
-    assert [link.loss for link in made] == [0.1, 0.1, 0.3, 0.1]
-    np.testing.assert_array_equal([link.burst for link in made], [np.nan, np.nan, 4.0, np.nan])
-    assert [link.delay for link in made] == [0.1, 0.1, 0.001, 0.001]
-    assert [link.bandwidth for link in made] == [1e4, 1e4, np.inf, np.inf]
-    assert {(link.jitter, link.queue) for link in made} == {(0.01, 0.2)}
+    found = [(link.loss, link.burst, link.delay, link.bandwidth, link.jitter, link.queue) for link in made]
+    both, of_c, usual = (0.1, np.nan, 0.1, 1e4), (0.3, 4.0, 0.001, np.inf), (0.1, np.nan, 0.001, np.inf)
+    np.testing.assert_array_equal(found, [(*each, 0.01, 0.2) for each in (both, both, of_c, usual)])
 
 
 def test_outages_of_links_of_robots_and_of_all():
@@ -235,9 +225,7 @@ def test_without_those_on_standby_nothing_names_them():
     )
     plan = reserves.without_standby(Plan(whole))
     made = plan.experiment
-    assert list(made.robots) == ["A", "B"]
-    assert made.formation.links == {"A - B": 0.5}
-    assert not made.timeline
+    assert ([*made.robots], made.formation.links, made.timeline) == (["A", "B"], {"A - B": 0.5}, [])
     assert list(made.channel.links) == ["A > B"]
     assert [(outage.from_s, outage.robots) for outage in made.channel.outages] == [(2.0, ["B"]), (3.0, [])]
     assert made.architecture == Hybrid("hybrid", ["A"])
@@ -256,10 +244,9 @@ def test_virtual_time_flies_without_those_on_standby(tmp_path):
 @pytest.mark.parametrize("standby", [True, False])
 def test_nobody_waits_for_a_robot_on_standby(standby):
     case = with_standby()
-    told = Plan(changed(case, robots={**case.robots, "C": changed(FLY, standby=standby)})).assignment("A")
-    robot = Robot(told)
+    robot = Robot(Plan(changed(case, robots={**case.robots, "C": changed(FLY, standby=standby)})).assignment("A"))
     assert robot.missing_neighbours() == ["B", "C"]
-    place = next(place for place, link in enumerate(told.neighbours) if link.name == "B")
+    place = [link.name for link in robot.assignment.neighbours].index("B")
     robot.neighbours.mark_alive(place)
     robot.neighbours.receive(place, (0.5, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0, 0.0)
     state = BodyState(time=0.0, position=(0.0, 0.0, 0.0), yaw=0.0, velocity=(0.0, 0.0, 0.0), flying=False, battery=1.0)
@@ -278,9 +265,8 @@ def test_spare_brings_its_body_and_keeps_the_rest():
     spare = changed(BOT, start=[0.2, 0.3, 1.0], body="khepera4://192.0.2.1", avoids=False)
     spares = Spares(Plan(with_standby(spares={"F": FLY, "S": spare})))
     old = changed(BOT, ranges="world")
-    robot, whose = spares.successor("A", old, order())
-    assert whose == "S", "the first of its kind"
-    assert (robot.body, robot.start, robot.avoids, robot.ranges) == (spare.body, spare.start, True, "body")
+    robot, whose = spares.successor("A", old, order())  # the first of its kind
+    assert (whose, robot) == ("S", changed(spare, avoids=True))
     spares.used["S"] = "A"
     with pytest.raises(Refusal, match="no spare khepera4 left"):
         spares.successor("A", old, order())

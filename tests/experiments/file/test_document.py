@@ -211,9 +211,8 @@ def test_fault_in_json_is_located(write):
 
 def test_case_crosses_the_network_with_its_name():
     for name, cases in (("event", read("triangle").cases()), ("default", read("convoy", ["cases={}"]).cases())):
-        sent = document.case_document(cases[name], name).decode()
-        assert document.received(sent, "network").cases() == {name: cases[name]}
-        assert document.chosen_case(document.received(sent, "network"), None) == cases[name]
+        there = document.received(document.case_document(cases[name], name).decode(), "network")
+        assert (there.cases(), document.chosen_case(there, None)) == ({name: cases[name]}, cases[name])
 
 
 def test_processes_on_hosts_get_no_hosts(write):
@@ -268,32 +267,27 @@ def write_files(folder, experiment=ONE, arena=LAB):
 def test_arena_is_that_of_the_file(tmp_path):
     given = read(write_files(tmp_path))
     arena = given.experiment.arena
-    assert arena.size == (4.0, 3.0, 2.0)
-    assert not arena.walls
+    assert (arena.size, arena.walls, arena.file) == ((4.0, 3.0, 2.0), False, None)
     assert arena.obstacles["post"] == Obstacle(radius=0.1, at=(1.0, 0.0))
     assert arena.starts["west"].size == (0.9, 1.0)
-    assert arena.file is None
     assert given.listing.startswith(ONE)
     assert LAB in given.listing
     kept = tmp_path / "run"
     kept.mkdir()
     given.keep(kept / "experiment.toml")
-    assert read(kept / "experiment.toml").experiment == given.experiment
-    file = kept / "case.json"  # what processes read: there is no lab.toml
-    file.write_bytes(document.write_json(given.plan))
-    assert read(file).experiment == given.experiment
+    # what processes read: there is no lab.toml
+    (kept / "case.json").write_bytes(document.write_json(given.plan))
+    assert [read(kept / name).experiment for name in ("experiment.toml", "case.json")] == [given.experiment] * 2
 
 
 def test_own_keys_win_and_obstacles_merge_by_name(tmp_path):
     own = "walls = true\n[arena.obstacles.post]\nheight = 0.5\n[arena.obstacles.cart]\nradius = 0.2\n"
     own += "[arena.starts.east]\nat = [1.5, 0.0]\nsize = [0.5, 0.5]\n"
     arena = read(write_files(tmp_path, ONE.replace('"lab.toml"\n', f'"lab.toml"\n{own}'))).experiment.arena
-    assert arena.walls
-    assert arena.size == (4.0, 3.0, 2.0)
+    assert (arena.walls, arena.size, [*arena.starts]) == (True, (4.0, 3.0, 2.0), ["west", "east"])
     assert arena.obstacles["post"] == Obstacle(radius=0.1, at=(1.0, 0.0), height=0.5)
     cart = arena.obstacles["cart"]  # another shape in place of the old one; the rest stays
     assert (cart.box, cart.radius, cart.at) == (None, 0.2, (0.0, 1.0))
-    assert list(arena.starts) == ["west", "east"]
 
 
 def test_case_changes_the_arena_or_takes_another_file(tmp_path):
@@ -301,10 +295,8 @@ def test_case_changes_the_arena_or_takes_another_file(tmp_path):
     cases = '[cases.lab.arena.obstacles.post]\nradius = 0.2\n[cases.hall.arena]\nfile = "hall.toml"\n'
     given = read(write_files(tmp_path, ONE + cases))
     found = {name: plan.experiment.arena for name, plan in given.cases().items()}
-    assert found["lab"].obstacles["post"].radius == 0.2
-    assert list(found["hall"].obstacles) == ["pillar"]
-    assert found["hall"].size == (9.0, 9.0, 3.0)
-    assert given.experiment.arena.obstacles["post"].radius == 0.1
+    assert [each.obstacles["post"].radius for each in (found["lab"], given.experiment.arena)] == [0.2, 0.1]
+    assert ([*found["hall"].obstacles], found["hall"].size) == (["pillar"], (9.0, 9.0, 3.0))
     files = {name: file.name for name, file in given.source.arenas.items()}
     assert files == {"": "lab.toml", "lab": "lab.toml", "hall": "hall.toml"}
 
@@ -336,21 +328,18 @@ def test_command_line_changes_find_what_the_file_holds(tmp_path):
     ],
 )
 def test_wrong_arena_file_is_refused_where_wrong(tmp_path, arena, place, message, hint):
-    file = write_files(tmp_path, arena=arena)
-    problem = refusal(file).problems[0]
-    assert problem.file == str(file.parent / "lab.toml")
-    assert (problem.line, problem.column) == place
+    problem = refusal(write_files(tmp_path, arena=arena)).problems[0]
+    assert (problem.file, problem.line, problem.column) == (str(tmp_path / "lab.toml"), *place)
     assert message in problem.message
     assert hint in problem.hint
 
 
 def test_conflicts_with_the_arena_point_into_both_files(tmp_path):
     small = ONE.replace('"lab.toml"\n', '"lab.toml"\nsize = [2.0, 3.0, 2.0]\n')
-    robot, box = refusal(write_files(tmp_path, small)).problems
-    assert (robot.file.rpartition("/")[2], robot.line) == ("one.toml", 8)
-    assert (box.file.rpartition("/")[2], box.line) == ("lab.toml", 16)
-    problem = refusal(write_files(tmp_path, ONE + "[cases.small.arena]\nsize = [3.9, 1.0, 2.0]\n")).problems[0]
-    assert (problem.file.rpartition("/")[2], problem.line) == ("one.toml", 8)
+    problems = refusal(write_files(tmp_path, small)).problems
+    problem, *_ = refusal(write_files(tmp_path, ONE + "[cases.small.arena]\nsize = [3.9, 1.0, 2.0]\n")).problems
+    found = [(Path(each.file).name, each.line) for each in (*problems, problem)]
+    assert found == [("one.toml", 8), ("lab.toml", 16), ("one.toml", 8)]
     assert problem.message.startswith("in case 'small', arena.obstacles.cart.at: 'cart' stands outside")
 
 
@@ -420,9 +409,12 @@ def test_law_has_the_target_that_it_needs(law):
 
 def test_case_command_line_and_change_move_places():
     text = SHAPE + "[cases.near]\nformation.shape.KH01 = [0.7, 1.0]\n[cases.far]\nformation.shape.KH01 = [0.0, 1.0]\n"
-    assert links_of(text, case="near")["TB01 > KH01"].distance == pytest.approx(0.3)
-    assert links_of(text, case="far")["TB01 > KH01"].distance == pytest.approx(1.0)
-    assert links_of(SHAPE, "formation.shape.KH01=[1.0, 3.0]")["TB01 > KH01"].distance == pytest.approx(2.0)
+    found = [
+        links_of(text, case="near"),
+        links_of(text, case="far"),
+        links_of(SHAPE, "formation.shape.KH01=[1.0, 3.0]"),
+    ]
+    assert [links["TB01 > KH01"].distance for links in found] == pytest.approx([0.3, 1.0, 2.0])
     text = SHAPE + "[[formation.changes]]\nat_s = 5.0\nshape = { TB01 = [0, 0], KH01 = [0, 2], CF01 = [0, 1] }\n"
     (change,) = document.loads(text).experiment.formation.changes
     assert change.links["TB01 > KH01"].distance == pytest.approx(2.0)

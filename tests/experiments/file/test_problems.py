@@ -63,8 +63,7 @@ def test_document_paths_and_no_others_have_a_place(text):
 )
 def test_places(path, key, value):
     place = places(FORMS)[path]
-    assert line_column(FORMS, place.key) == key
-    assert line_column(FORMS, place.value) == value
+    assert (line_column(FORMS, place.key), line_column(FORMS, place.value)) == (key, value)
 
 
 def test_places_in_json_and_of_absent_paths():

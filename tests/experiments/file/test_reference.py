@@ -3,6 +3,7 @@
 import json
 import re
 import tomllib
+from contextlib import nullcontext
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
@@ -81,10 +82,9 @@ def test_explain_tells_or_names_others(words, code, parts):
 
 def test_tables_are_explained_on_one_screen():
     lines = invoke("explain", "formation").output.splitlines()
-    assert len(lines) < 24
     keys = [line.partition(" ")[0] for line in lines]
     assert {"formation.law", "formation.gain", "formation.links"} <= {*keys}
-    assert not any("(" in key for key in keys)
+    assert (len(lines) < 24, any("(" in key for key in keys)) == (True, False)
     assert "`./zenpark explain formation.law`" in lines[-1]
     lines = invoke("explain").output.splitlines()
     assert [line.partition(" ")[0] for line in lines] == list(reference.described()["properties"])
@@ -110,17 +110,12 @@ def test_broken_plugin_stops_no_command_that_needs_none(broken, words, tmp_path,
     monkeypatch.chdir(tmp_path)
     done = invoke(*words)
     assert "left out: plug-in 'broken' (no_such_module_anywhere:Law)" in done.stderr
-    assert done.stderr.count("\n") == 1
-    assert "broken" not in done.stdout
+    assert (done.stderr.count("\n"), "broken" in done.stdout) == (1, False)
 
 
 def test_file_with_a_broken_plugin_is_refused_there(broken):
-    robot = 'title = "A"\nduration_s = 5.0\n[robots.A]\nkind = "khepera4"\nstart = [0.0, 0.0]\n'
-    with pytest.raises(DocumentError) as caught:
-        loads(f'{robot}[formation]\nlaw = "broken"\n')
-    (problem,) = caught.value.problems
-    assert problem.line == 7
-    assert "fails to import: ModuleNotFoundError" in problem.message
+    with pytest.raises(DocumentError, match=r":10:7: .*fails to import: ModuleNotFoundError"):
+        loads(SMALL.replace("[formation.links]", '[formation]\nlaw = "broken"\n[formation.links]'))
 
 
 def test_names_and_titles():
@@ -137,12 +132,10 @@ def test_copy_is_readable_whole_and_never_overwrites(tmp_path, monkeypatch):
     assert read(target).experiment == read("triangle").experiment
     assert json.loads((tmp_path / index.SCHEMA).read_bytes()) == json_schema.schema()
     assert files.copy_entry("convoy", tmp_path) == tmp_path / "convoy.toml"
-    for name, place, message in (
-        ("convoy", target, "exists already"),
-        ("convoy", tmp_path / "nowhere" / "x.toml", "cannot be written: No such file"),
-    ):
+    nowhere = tmp_path / "nowhere" / "x.toml"
+    for place, message in ((target, "exists already"), (nowhere, "cannot be written: No such file")):
         with pytest.raises(DocumentError, match=message):
-            files.copy_entry(name, place)
+            files.copy_entry("convoy", place)
     assert read(target).experiment == read("triangle").experiment
     monkeypatch.setattr(files, "write_schema", lambda _: Path("/dev/full").write_text("{}"))
     (tmp_path / "full").mkdir()
@@ -164,9 +157,8 @@ def test_schema_is_draft_7_and_knows_the_plugins():
     plans = schema["definitions"]["LegTable"]["properties"]["plan"]["anyOf"]
     assert "line" not in plans[0]["enum"]  # it cannot do without its parameters
     assert schema["definitions"]["RobotTable"]["properties"]["kind"]["enum"] == list(KINDS)
-    case = schema["properties"]["cases"]["additionalProperties"]["$ref"].rpartition("/")[2]
-    assert "required" not in schema["definitions"][case]
-    assert "cases" not in schema["definitions"][case]["properties"]
+    case = schema["definitions"][schema["properties"]["cases"]["additionalProperties"]["$ref"].rpartition("/")[2]]
+    assert ("required" in case, "cases" in case["properties"]) == (False, False)
 
 
 SMALL = """title = "t"
@@ -201,12 +193,8 @@ def test_schema_takes_what_the_parser_takes(old, new, taken, tmp_path):
     jsonschema = pytest.importorskip("jsonschema", reason="needs jsonschema")
     text = SMALL.replace(old, new, 1)
     (tmp_path / "small.toml").write_text(text)
-    try:
+    with nullcontext() if taken else pytest.raises(DocumentError):
         read(tmp_path / "small.toml")
-    except DocumentError:
-        assert not taken
-    else:
-        assert taken
     assert jsonschema.Draft7Validator(json_schema.schema()).is_valid(tomllib.loads(text)) == taken
 
 

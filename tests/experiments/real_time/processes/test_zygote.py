@@ -53,8 +53,7 @@ def test_exit_codes_are_passed_on(launcher, end, words):
     process = begin(launcher, "a", end)
     assert isinstance(process.handle, zygote.Forked)
     assert process.handle.wait(30.0) == process.handle.poll()
-    assert process.exit == words
-    assert (process.because == ": ValueError: a crash") == (end == "raise")
+    assert (process.exit, process.because == ": ValueError: a crash") == (words, end == "raise")
     assert launcher.died() == [process]
 
 
