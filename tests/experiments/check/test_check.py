@@ -269,13 +269,9 @@ def test_landed_drone_keeps_its_height_in_the_shape():
 
 
 HEAD = 'title = "One"\nduration_s = 20.0\n'
-ROBOTS = """[robots.KH01]
-kind = "khepera4"
-start = [-1.5, 0.0]
-[robots.CF01]
-kind = "crazyflie"
-start = [-1.5, 0.6]
-hover = 0.8
+ROBOTS = """[robots]
+KH01 = { kind = "khepera4", start = [-1.5, 0.0] }
+CF01 = { kind = "crazyflie", start = [-1.5, 0.6], hover = 0.8 }
 [formation.links]
 "KH01 > CF01" = 1.0
 [[timeline]]
@@ -291,15 +287,18 @@ ALL = AVOIDS + 'hears = "all"\n'
 PYMUNK = '[world]\nengine = "pymunk"\n'
 OPEN = "[arena]\nwalls = false\n"
 NEAR_WALL = ROBOTS.replace("[-1.5, 0.0]", "[-1.95, 0.0]")
-SEEING = ROBOTS.replace("hover", 'sensors = ["multiranger"]\nhover')
-APART = (
-    ROBOTS.replace('CF01" = 1.0\n', 'CF01" = 1.0\n"A > B" = 0.5\n')
-    + '[robots.A]\nkind = "khepera4"\nstart = [-1.0, -1.0]\n[robots.B]\nkind = "khepera4"\nstart = [-1.0, -1.5]\n'
+SEEING = ROBOTS.replace("hover", 'sensors = ["multiranger"], hover')
+APART = ROBOTS.replace(
+    "[formation.links]",
+    """A = { kind = "khepera4", start = [-1.0, -1.0] }
+B = { kind = "khepera4", start = [-1.0, -1.5] }
+[formation.links]
+"A > B" = 0.5""",
 )
 
 
 def khepera(keys):
-    return ROBOTS.replace('kind = "khepera4"\n', f'kind = "khepera4"\n{keys}\n')
+    return ROBOTS.replace('"khepera4"', f'"khepera4", {keys}')
 
 
 BLIND = khepera("sensors = []")
@@ -332,13 +331,13 @@ BLIND = khepera("sensors = []")
         (ALL + BLIND, "note", "connected", "the network is whole; every robot is reached by KH01", "sees-nothing"),
         (APART, "error", "parts", "", ""),
         (AVOIDS + APART, "note", "parts", "", ""),
-        (OPEN + khepera('body = "world"\nranges = "world"'), "warning", "ranges-twice", "adds nothing", ""),
-        (OPEN + khepera('body = "khepera4-twin"\nsensors = []\nranges = "world"'), "warning", "ranges-of-nothing",
+        (OPEN + khepera('body = "world", ranges = "world"'), "warning", "ranges-twice", "adds nothing", ""),
+        (OPEN + khepera('body = "khepera4-twin", sensors = [], ranges = "world"'), "warning", "ranges-of-nothing",
          "no range sensors", ""),
-        (OPEN + khepera('body = "khepera4-twin"\nranges = "world"'), "warning", "ranges-of-nothing",
+        (OPEN + khepera('body = "khepera4-twin", ranges = "world"'), "warning", "ranges-of-nothing",
          "without obstacles and robots", ""),
-        (OPEN + khepera('body = "world"\nshadow = {}'), "warning", "shadow-of-twin", "one twin with another", ""),
-        (LOW + khepera('body = "khepera4-twin"\nranges = "world"\nshadow = {}'), "warning", "hits-obstacle", "",
+        (OPEN + khepera('body = "world", shadow = {}'), "warning", "shadow-of-twin", "one twin with another", ""),
+        (LOW + khepera('body = "khepera4-twin", ranges = "world", shadow = {}'), "warning", "hits-obstacle", "",
          "ranges-twice ranges-of-nothing shadow-of-twin"),
     ],
 )  # fmt: skip

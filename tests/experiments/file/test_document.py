@@ -367,16 +367,10 @@ AVERAGE = index.find_file("average")
 SHAPE = """
 title = "Shape"
 duration_s = 10.0
-[robots.TB01]
-kind = "turtlebot3"
-start = [0.0, 0.0]
-[robots.KH01]
-kind = "khepera4"
-start = [-0.5, 0.4]
-[robots.CF01]
-kind = "crazyflie"
-start = [0.5, 0.4]
-hover = 0.6
+[robots]
+TB01 = { kind = "turtlebot3", start = [0.0, 0.0] }
+KH01 = { kind = "khepera4", start = [-0.5, 0.4] }
+CF01 = { kind = "crazyflie", start = [0.5, 0.4], hover = 0.6 }
 [formation.shape]
 TB01 = [1.0, 1.0]
 KH01 = [0.7, 1.4]

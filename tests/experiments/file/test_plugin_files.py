@@ -23,12 +23,9 @@ from tests.docs.test_python import BLOCK, PAGE
 TASK = """
 title = "Two robots meet"
 duration_s = 2.0
-[robots.A]
-kind = "khepera4"
-start = [-0.5, 0.0]
-[robots.B]
-kind = "khepera4"
-start = [0.5, 0.0]
+[robots]
+A = { kind = "khepera4", start = [-0.5, 0.0] }
+B = { kind = "khepera4", start = [0.5, 0.0] }
 [formation]
 law = "meet.py:Meet"
 [formation.links]
@@ -95,13 +92,13 @@ HOSTS = '[hosts.lab1]\naddress = "lab1"\nrobots = ["A"]\n'
 @pytest.mark.parametrize(
     ("old", "new", "place", "parts"),
     [
-        (LAW, 'law = "met.py:Meet"', "11:7", ["cannot be read (No such file", "files beside the experiment: meet.py"]),
-        (LAW, 'law = "../lesson/meet.py:Meet"', "11:7", ["leads out of the folder", "beside the experiment file"]),
-        (LAW, 'law = "meet.py:Met"', "11:7", ["it has no Met, only Meet", "mend that file"]),
-        (LAW, 'law = "/etc/meet.py:Meet"', "11:7", ["no '/etc/meet.py:Meet' among the laws"]),
-        (LAW, 'law = "pipe.py:Meet"', "11:7", ["pipe.py is no file"]),
-        (KIND, 'kind = "none.py:BARROW"', "5:8", ["cannot be named by its file", "plugins.md#a-kind-of-robot"]),
-        ("gain = 0.2", "gian = 0.2", "16:", ["unknown parameter 'gian' of 'meet.py:Meet'"]),
+        (LAW, 'law = "met.py:Meet"', "8:7", ["cannot be read (No such file", "files beside the experiment: meet.py"]),
+        (LAW, 'law = "../lesson/meet.py:Meet"', "8:7", ["leads out of the folder", "beside the experiment file"]),
+        (LAW, 'law = "meet.py:Met"', "8:7", ["it has no Met, only Meet", "mend that file"]),
+        (LAW, 'law = "/etc/meet.py:Meet"', "8:7", ["no '/etc/meet.py:Meet' among the laws"]),
+        (LAW, 'law = "pipe.py:Meet"', "8:7", ["pipe.py is no file"]),
+        (KIND, 'kind = "none.py:BARROW"', "5:14", ["cannot be named by its file", "plugins.md#a-kind-of-robot"]),
+        ("gain = 0.2", "gian = 0.2", "13:", ["unknown parameter 'gian' of 'meet.py:Meet'"]),
         ("[cases.slow]\n", f"{HOSTS}[cases.slow]\n", "", ["is a file of this machine"]),
     ],
 )

@@ -114,7 +114,7 @@ def test_broken_plugin_stops_no_command_that_needs_none(broken, words, tmp_path,
 
 
 def test_file_with_a_broken_plugin_is_refused_there(broken):
-    with pytest.raises(DocumentError, match=r":10:7: .*fails to import: ModuleNotFoundError"):
+    with pytest.raises(DocumentError, match=r":7:7: .*fails to import: ModuleNotFoundError"):
         loads(SMALL.replace("[formation.links]", '[formation]\nlaw = "broken"\n[formation.links]'))
 
 
@@ -163,12 +163,9 @@ def test_schema_is_draft_7_and_knows_the_plugins():
 
 SMALL = """title = "t"
 duration_s = 10
-[robots.A]
-kind = "khepera4"
-start = [0.0, 0.0]
-[robots.B]
-kind = "khepera4"
-start = [0.6, 0.0]
+[robots]
+A = { kind = "khepera4", start = [0.0, 0.0] }
+B = { kind = "khepera4", start = [0.6, 0.0] }
 [formation.links]
 "A - B" = 0.8
 """
