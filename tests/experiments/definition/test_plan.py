@@ -1,12 +1,17 @@
-"""What follows from an experiment: the assignment of each robot, the channel of each link, standby and spares."""
+"""What follows from an experiment: graph, rigidity, assignments, channels of links, standby, spares, new kinds."""
 
 import math
+from dataclasses import replace
 
 import msgspec
+import networkx as nx
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from agents.body.interface import BodyState, Disturbance, Jitter
+from agents.body.interface import BodyError, BodyState, Disturbance, Jitter
+from agents.body.kinds import KINDS, Kind
 from agents.body.limits import Safety
 from agents.errors import Refusal
 from agents.kinds.turtlebot3 import TURTLEBOT3
@@ -16,6 +21,8 @@ from agents.plugins.planners import Line
 from agents.plugins.triggers import Periodic, SendOnDelta
 from agents.robot import Robot
 from experiments import run
+from experiments.check.analysis import Analysis
+from experiments.check.ideal_run import predict
 from experiments.definition import bodies, link_conditions
 from experiments.definition import standby as reserves
 from experiments.definition.experiment import (
@@ -31,13 +38,118 @@ from experiments.definition.experiment import (
     RobotTable,
     Start,
 )
+from experiments.definition.graph import adjacency, components, degree, edges, laplacian, links, reachable
 from experiments.definition.plan import Plan
+from experiments.definition.rigidity import redundancy, rigidity
 from experiments.file import document
 from experiments.file.consistency.whole import consistency_faults
+from experiments.file.document import load, loads
+from experiments.file.problems import DocumentError
 from experiments.real_time.conductor.hot_changes import Spares
-from tests.experiments.definition.test_graph import HEARS
+from experiments.report import style, trajectories
+from tests.cases import examples
+from tests.experiments.checked import PUBLISHED
 from tests.small import changed, reference, small
 from twins.scene import Obstacle
+
+# paper, eq. (11): rows from which each robot receives
+HEARS = {1: (0, 2, 3, 4), 2: (1, 3, 5), 3: (0, 1, 2, 5), 4: (0, 1, 5, 6), 5: (2, 3, 4, 6), 6: (4, 5)}
+REFERENCE = links([(listener, speaker) for listener, heard in HEARS.items() for speaker in heard])
+
+
+@st.composite
+def digraphs(draw, most=9):
+    rows = draw(st.integers(1, most))
+    possible = [(i, j) for i in range(rows) for j in range(rows) if i != j]
+    pairs = draw(st.lists(st.sampled_from(possible), unique=True, max_size=30)) if possible else []
+    return rows, pairs
+
+
+@examples(40)
+@given(digraphs(), st.data())
+def test_graph_is_that_of_networkx(made, data):
+    rows, pairs = made
+    net, graph = links(pairs), nx.DiGraph(pairs)  # an arrow from receiver to sender, as in the adjacency matrix
+    graph.add_nodes_from(range(rows))
+    a = nx.to_numpy_array(graph, nodelist=range(rows))
+    np.testing.assert_array_equal(adjacency(net, rows), a)
+    np.testing.assert_array_equal(np.diag(degree(net, rows)), a.sum(axis=1))
+    np.testing.assert_array_equal(laplacian(net, rows), np.diag(a.sum(axis=1)) - a)
+    assert components(net, rows) == nx.number_weakly_connected_components(graph)
+    assert {tuple(edge) for edge in edges(net).tolist()} == {tuple(sorted(pair)) for pair in pairs}
+    sources = data.draw(st.lists(st.integers(0, rows - 1), unique=True, max_size=3))
+    told = set(sources).union(*(nx.ancestors(graph, source) for source in sources))  # arrows point at the speaker
+    found = reachable(net, rows, np.array(sources, dtype=np.intp))
+    assert set(np.flatnonzero(found).tolist()) == told
+
+
+def test_links_take_pairs_with_or_without_targets():
+    path = links([(1, 0), (0, 1), (2, 1), (1, 2)])
+    assert laplacian(path, 3).tolist() == [[1, -1, 0], [-1, 2, -1], [0, -1, 1]]
+    assert np.isnan(path.distance).all()
+    assert links([(1, 0), (2, 0)], 0.6, 3.0).distance.tolist() == [0.6, 0.6]
+    assert links([(1, 0), (2, 0)], 0.6, [3.0, 4.0]).gain.tolist() == [3.0, 4.0]
+    nothing = links([], [], [])
+    assert (len(nothing), len(edges(nothing)), components(nothing, 4)) == (0, 0, 4)
+
+
+def held_heights(rows):
+    moves = np.ones((rows, 3), dtype=bool)
+    moves[:, 2] = False
+    return moves
+
+
+def test_reference_formation_is_rigid_only_with_heights_held():
+    pairs = edges(REFERENCE)
+    assert (len(REFERENCE), len(pairs)) == (21, 12)
+    assert np.flatnonzero(~reachable(REFERENCE, 7, np.array([6]))).tolist() == [0]
+    held, free = rigidity(PUBLISHED, pairs, held_heights(7)), rigidity(PUBLISHED, pairs)
+    assert (held.rank, held.needed, held.rigid, held.smallest > 0.1) == (11, 2 * 7 - 3, True, True)
+    assert (free.rank, free.needed, free.rigid, free.smallest) == (12, 3 * 7 - 6, False, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("position", "free", "motions"),
+    [
+        ([[0, 0, 0]], "xyz", 3),  # one point: it cannot be seen to turn
+        ([[0, 0, 0], [1, 0, 0]], "xyz", 5),
+        ([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "xyz", 6),
+        ([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "xy", 3),
+        ([[0, 0, 0], [1, 0, 0.8], [2, 0, 0.3]], "xy", 4),  # in a vertical plane: it may also lean out of it
+        ([[0, 0, 0], [1, 0, 0.8], [2, 1, 0.3]], "z", 1),
+        ([[0, 0, 0], [1, 0, 0.8]], "", 0),
+    ],
+)
+def test_rigid_motions_that_held_coordinates_allow(position, free, motions):
+    position = np.array(position, dtype=float)
+    moves = np.tile([axis in free for axis in "xyz"], (len(position), 1))
+    assert rigidity(position, np.array([[0, len(position) - 1]]), moves).needed == moves.sum() - motions
+
+
+def one_by_one(position, pairs, free):
+    """Whether the rest is rigid without each link, and without each robot."""
+    without_link = [rigidity(position, np.delete(pairs, k, axis=0), free).rigid for k in range(len(pairs))]
+    without_robot = []
+    for row in range(len(position)):
+        keeps = np.arange(len(position)) != row
+        rest = pairs[(pairs != row).all(axis=1)]
+        without_robot.append(rigidity(position[keeps], rest - (rest > row), free[keeps]).rigid)
+    return without_link, without_robot
+
+
+@examples(60)
+@given(st.integers(0, 2**32 - 1), st.integers(3, 9), st.sampled_from([0.5, 0.7, 0.9]), st.booleans())
+def test_redundancy_is_that_of_leaving_each_out(seed, rows, share, in_space):
+    rng = np.random.default_rng(seed)
+    position = rng.uniform(-1.0, 1.0, (rows, 3))
+    free = np.ones((rows, 3), dtype=bool) if in_space else held_heights(rows)
+    every = np.stack(np.triu_indices(rows, 1), axis=1)
+    pairs = every[rng.random(len(every)) < share].reshape(-1, 2)
+    found = redundancy(position, pairs, free)
+    rigid = rigidity(position, pairs, free).rigid
+    wanted = one_by_one(position, pairs, free) if rigid else ([False] * len(pairs), [False] * rows)
+    assert (found.pairs.tolist(), found.robots.tolist()) == wanted
+
 
 NAMES = ("TB01", "KH01", "KH02", "KH03", "CF01", "CF02", "CF03")
 
@@ -162,8 +274,8 @@ def conditions(channel, seed=1, **how):
 
 def test_default_delay_is_a_millisecond_or_nothing_really():
     late = ChannelTable(delay_s=0.02)
-    for given, real, delay in ((ChannelTable(), False, 0.001), (ChannelTable(), True, 0.0), (late, True, 0.02)):
-        assert [link.delay for link in conditions(given, real=real)] == [delay] * 4
+    for channel, real, delay in ((ChannelTable(), False, 0.001), (ChannelTable(), True, 0.0), (late, True, 0.02)):
+        assert [link.delay for link in conditions(channel, real=real)] == [delay] * 4
     assert not link_conditions.models_network(planned())
     assert link_conditions.models_network(planned(ChannelTable(loss=0.1)))
 
@@ -292,3 +404,42 @@ def test_spare_brings_its_body_and_keeps_the_rest():
 def test_what_cannot_take_over_a_name(asked, said):
     with pytest.raises(Refusal, match=said):
         Spares(Plan(with_standby(spares={"F": FLY, "S": BOT}))).successor("A", BOT, asked)
+
+
+KIND = "alphabot"
+COUNT = style.MAX_COLOURED_ROBOTS
+ROBOTS = [f'[robots.R{k}]\nkind = "{KIND}"\nstart = [{k - 5}.0, 0.0]\n' for k in range(COUNT + 1)]
+LINKS = [f'"R{k} > R{k + 1}" = 1.0\n' for k in range(COUNT)]
+HALL = 'title = "Rovers"\nduration_s = 2.0\n[arena]\nsize = [12.0, 4.0, 2.0]\n'
+ROVERS = "".join([HALL, *ROBOTS, "[formation.links]\n", *LINKS])
+ALPHABOT = Kind(
+    KIND, "twist", flies=False, radius=0.11, height=0.08, mass=0.8, endurance_s=3600.0, speed=0.3, turn_rate=2.0,
+    response=1.0, turn_response=1.5,
+)  # fmt: skip
+MOVING = replace(ALPHABOT, motion=KINDS["khepera4"].motion)
+
+
+@pytest.mark.parametrize(("motion", "takes"), [(None, "twist"), (KINDS["khepera4"].motion, "velocity")])
+def test_kind_without_twin_is_refused_at_its_place(monkeypatch, motion, takes):
+    """Without a motion model, or on the floor with velocities: an omnidirectional robot."""
+    monkeypatch.setitem(KINDS.loaded, KIND, replace(ALPHABOT, motion=motion, takes=takes))
+    with pytest.raises(DocumentError) as caught:
+        loads(ROVERS)
+    first = caught.value.problems[0]
+    assert (first.line, first.message) == (6, f"no twin of '{KIND}'")
+    with pytest.raises(ValueError, match="it must be one of position, velocity, twist"):
+        replace(MOVING, takes="wheels")
+
+
+def test_kind_without_protocol_twin_is_refused_by_name(monkeypatch):
+    monkeypatch.setitem(KINDS.loaded, KIND, MOVING)
+    with pytest.raises(BodyError, match=f"--bodies protocol: no protocol twin of '{KIND}', only of crazyflie"):
+        bodies.choose_bodies(loads(ROVERS).plan, "protocol")
+    assert bodies.choose_bodies(load("triangle").plan, "protocol")
+
+
+def test_many_robots_of_an_uncoloured_kind_are_drawn(monkeypatch):
+    monkeypatch.setitem(KINDS.loaded, KIND, MOVING)
+    cases = loads(ROVERS).cases()
+    figure = trajectories.expected_motion({name: Analysis(case, predict(case)) for name, case in cases.items()})
+    assert ALPHABOT.colour in {line.get_color() for line in figure.axes[0].lines}

@@ -152,14 +152,12 @@ def test_order_reaches_all_before_one_has_answered(router):
 
     def answer():
         waiting = {}
-        while not over.wait(0.005):
+        while len(waiting) < len(names) and not over.wait(0.005):
             waiting |= {name: query for name, queryable in told.items() for query, _ in queryable.read()}
-            if len(waiting) == len(names):
-                for name, query in waiting.items():
-                    with query:
-                        reply = messages.Reply(name, name != "B", "airborne", "" if name != "B" else "no")
-                        query.reply(KEYS.order(name), messages.encode(reply), encoding=messages.JSON)
-                waiting = {}
+        for name, query in waiting.items():
+            with query:
+                reply = messages.Reply(name, name != "B", "airborne", "" if name != "B" else "no")
+                query.reply(KEYS.order(name), messages.encode(reply), encoding=messages.JSON)
 
     def recall(query):
         with query:
