@@ -13,7 +13,7 @@ from agents.plugins import registry
 from agents.plugins.laws import Gradient
 from agents.plugins.registry import AVOIDANCES, LAWS, PREDICTORS, TRIGGERS
 from experiments.virtual_time.source import faults
-from tests.agents.swarm import Swarm, drone
+from tests.agents.bench import Swarm, drone
 from tests.commands import ROOT
 from tests.small import NOISY, pair
 

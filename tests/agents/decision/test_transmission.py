@@ -17,7 +17,7 @@ from agents.plugins.predictors import HOLD, ConstantVelocity
 from agents.plugins.triggers import SendOnDelta
 from agents.vectors import NO_SETPOINT, UNKNOWN, ZERO
 from experiments.definition.experiment import Formation, LegTable
-from tests.agents.swarm import Swarm
+from tests.agents.bench import Swarm
 from tests.cases import examples
 from tests.small import changed, triangle
 

@@ -20,8 +20,7 @@ from agents.plugins.barrier import Barrier, closest
 from agents.plugins.registry import AVOIDANCES, build
 from agents.vectors import ZERO
 from experiments.definition.plan import Plan
-from tests.agents.bench import Bench
-from tests.agents.things import NOTHING, near, own
+from tests.agents.bench import NOTHING, Bench, near, own
 from tests.cases import examples, for_each
 from tests.small import pair
 

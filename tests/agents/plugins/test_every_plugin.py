@@ -21,8 +21,7 @@ from agents.vectors import UNKNOWN, ZERO
 from experiments.catalogue import index
 from experiments.definition.plan import Plan
 from experiments.file import document
-from tests.agents.bench import Bench
-from tests.agents.things import near, own
+from tests.agents.bench import Bench, near, own
 from tests.small import triangle
 
 GROUPS = (LAWS, TRIGGERS, PREDICTORS, PLANNERS, AVOIDANCES)

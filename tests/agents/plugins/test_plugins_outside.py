@@ -19,9 +19,8 @@ from agents.kinds.khepera4 import KHEPERA4
 from agents.plugins import registry
 from agents.vectors import ZERO
 from experiments.definition.plan import Plan
-from tests.agents.bench import Bench
-from tests.agents.signals import Play, standing
-from tests.agents.things import near, own
+from tests.agents.bench import Bench, near, own
+from tests.agents.plugins.test_triggers import Play, standing
 from tests.commands import ROOT, environment, python, shell
 from tests.requests import request
 from tests.small import triangle

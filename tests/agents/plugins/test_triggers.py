@@ -1,5 +1,8 @@
 """Every registered trigger keeps intervals and silences; each family fires exactly when its inequality says."""
 
+from __future__ import annotations
+
+import itertools
 import re
 from math import dist, exp, hypot, inf, nan, sqrt
 from pathlib import Path
@@ -12,9 +15,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from agents.decision.neighbours import Incoming, Neighbours
+from agents.decision.transmission import Transmitter
 from agents.kinds.khepera4 import KHEPERA4
 from agents.plugins import registry
-from agents.plugins.predictors import HOLD, ConstantVelocity
+from agents.plugins.predictors import HOLD, ConstantVelocity, Predictor
 from agents.plugins.trigger_families import (
     Decaying,
     Dynamic,
@@ -27,9 +31,64 @@ from agents.plugins.trigger_families import (
     SelfTriggered,
 )
 from agents.plugins.triggers import LastEvent, Periodic, SendOnDelta, Trigger, TriggerState
-from tests.agents import signals
-from tests.agents.signals import DT, Play, standing, wander
+from agents.vectors import NO_SETPOINT, UNKNOWN, ZERO, Vector
 from tests.cases import examples
+
+DT = 0.02
+
+
+class Moment(NamedTuple):
+    """Quantities of a robot at one question."""
+
+    position: Vector
+    velocity: Vector
+    offset: Vector
+    error: float
+    energy: float
+
+
+def wander(seed: int, ticks: int) -> list[Moment]:
+    """Random walk with rests."""
+    rng = np.random.default_rng(seed)
+    speed = rng.choice([0.0, 0.05, 0.5], (ticks, 1)) * rng.normal(size=(ticks, 3))
+    place = np.cumsum(speed * DT, axis=0) + rng.normal(size=3)
+    offset = np.cumsum(0.005 * rng.normal(size=(ticks, 3)), axis=0)
+    error, energy = rng.uniform(0, 0.3, ticks), np.exp(rng.uniform(-9, -2, ticks))
+    columns = (place, speed, offset, error, energy)
+    vectors = [[tuple(row) if isinstance(row, list) else row for row in column.tolist()] for column in columns]
+    return [Moment(*values) for values in zip(*vectors, strict=True)]
+
+
+def standing(ticks: int, position: Vector = (0.0, 0.0, 0.0)) -> list[Moment]:
+    """A robot that stays, without errors."""
+    return [Moment(position, ZERO, ZERO, 0.0, 0.0)] * ticks
+
+
+class Play:
+    """Asks a trigger on every tick, as a robot does from the start of its experiment on.
+
+    Attributes:
+        fired: Whether there was an event, at each question.
+        gaps: ‖ε‖ when it was asked [m], infinite at first.
+        intervals: Questions from each event to the next.
+    """
+
+    def __init__(self, trigger: Trigger, signal: list[Moment], *, predictor: Predictor = HOLD, dt: float = DT) -> None:
+        transmitter = Transmitter(trigger, predictor, KHEPERA4)
+        self.fired: list[bool] = []
+        self.gaps: list[float] = []
+        last = transmitter.asking.last
+        for k, moment in enumerate(signal):
+            t = k * dt
+            held = predictor.position(last, t - last.time) if last.time > -inf else UNKNOWN
+            fired = transmitter.transmits(
+                t, moment.position, moment.velocity, moment.error, moment.energy, t, moment.offset, NO_SETPOINT
+            )
+            self.fired.append(fired)
+            self.gaps.append(dist(transmitter.position, held) if k else inf)
+        events = [k for k, fired in enumerate(self.fired) if fired]
+        self.intervals = [later - earlier for earlier, later in itertools.pairwise(events)]
+
 
 NAMES = registry.names(registry.TRIGGERS)
 FAMILIES = {
@@ -121,8 +180,8 @@ class Question(NamedTuple):
     t: float
     t_k: float
     gap: float
-    now: signals.Moment
-    then: signals.Moment
+    now: Moment
+    then: Moment
 
 
 def fires_when(trigger, seed, margin, predictor=HOLD):
@@ -224,7 +283,7 @@ def test_self_triggered_bounds_bounded_accelerations(seed, bound):
     push *= bound / np.maximum(np.linalg.norm(push, axis=1), 1e-9)[:, None]
     speed = np.cumsum(push * dt, axis=0)
     poses = zip(np.cumsum(speed * dt - 0.5 * push * dt**2, axis=0).tolist(), speed.tolist(), strict=True)
-    signal = [signals.Moment(tuple(p), tuple(v), (0.0, 0.0, 0.0), 0.0, 0.0) for p, v in poses]
+    signal = [Moment(tuple(p), tuple(v), (0.0, 0.0, 0.0), 0.0, 0.0) for p, v in poses]
     play = Play(SelfTriggered(threshold=0.01, acceleration=bound), signal, dt=dt)
     for k in range(1, 400):  # it may be late by one question
         assert play.gaps[k] <= 0.01 + dt * hypot(*signal[k].velocity) + 1e-9

@@ -93,11 +93,6 @@ class Receiver:
         return self.neighbour.position[0] if self.neighbour.active else None
 
     @property
-    def found(self) -> tuple[float | None, int]:
-        """Where B takes part, and how many poses of others were dropped."""
-        return self.x, self.sender.foreign
-
-    @property
     def believed(self) -> float:
         """Where B is believed to be now by a predictor without a horizon, x [m]."""
         return self.neighbour.place(ConstantVelocity(), self.t)[0]
@@ -119,16 +114,6 @@ class Receiver:
 def a():
     with network.Net().worn() as net:
         yield Receiver(net)
-
-
-def test_pose_without_a_token_is_not_believed(a):
-    a.receive(1, 0.4, "one", then=5.0)  # the last value of a robot that has landed, and has taken its token back
-    a.after()
-    assert a.x is None
-    assert a.robot.neighbours.unreceived()
-    a.token("one")
-    a.after()
-    assert a.x == 0.4
 
 
 def test_late_sample_revives_nobody_but_its_token(a):
@@ -157,7 +142,7 @@ def test_restarted_neighbour_is_received_at_once(a, behind_s):
     a.receive(1, -0.4, "two", age=max(0.0, behind_s))
     assert (a.x, a.sender.lost) == (-0.4, 0)
     a.receive(100, 0.4, "one")  # held back by the network since the first life
-    assert a.found == (-0.4, 1)
+    assert (a.x, a.sender.foreign) == (-0.4, 1)
 
 
 def test_other_make_begins_anew_with_its_token(a):
@@ -177,7 +162,7 @@ def test_other_sessions_do_not_replace_the_robot(a):
     for source in ("other", None):  # another process, or a tool that puts old poses again
         a.pose(9, 3.0, source)
         a.receive(9000, 3.0, source, age=100.0)
-    assert a.found == (0.4, 4)
+    assert (a.x, a.sender.foreign) == (0.4, 4)
     assert a.hazards == ["4 foreign"]
     a.t += 1.0
     assert a.hazards == []
@@ -205,6 +190,9 @@ def test_restarted_robot_leaves_the_law(a):
 @pytest.mark.parametrize("source", [None, "storage", "one"])
 def test_stored_pose_before_the_first_token_is_void(a, source):
     a.receive(5000, 0.9, source, age=600.0)  # the answer of a storage to the first query, or of the robot's cache
+    a.after()
+    assert a.x is None
+    assert a.robot.neighbours.unreceived()
     a.token("one")
     a.after()
     assert a.x == (0.9 if source == "one" else None)
@@ -212,17 +200,12 @@ def test_stored_pose_before_the_first_token_is_void(a, source):
     assert (a.x, a.sender.lost) == (0.4, 0)
 
 
-@pytest.mark.parametrize(("session", "early"), [("two", True), (None, False)], ids=["restarted", "other make"])
-def test_new_process_takes_the_name(a, session, early):
+def test_first_pose_may_precede_its_token(a):
     a.begin("one", 7)
     a.lose("one", 3.0)  # the router dies; meanwhile B is restarted
-    if early:  # before its token
-        a.receive(1, 0.6, session)
-        a.token(session)
-        a.after()
-    else:
-        a.token(session)
-        a.receive(1, 0.6, session)
+    a.receive(1, 0.6, "two")
+    a.token("two")
+    a.after()
     assert a.x == 0.6
 
 

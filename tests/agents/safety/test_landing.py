@@ -23,7 +23,7 @@ from agents.safety.landing import NEAR, PATIENCE_S, ROOM, Landing
 from agents.safety.setpoint_filter import SetpointFilter
 from agents.vectors import clamp
 from experiments.definition.experiment import LegTable, RobotTable
-from tests.agents.swarm import Swarm
+from tests.agents.bench import Swarm
 from tests.cases import mostly_slow
 from tests.small import small
 
