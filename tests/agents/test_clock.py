@@ -113,9 +113,7 @@ class Loop:
 )
 def test_late_loop_skips_ticks_that_are_over(works, skipped, late):
     loop = Loop().turn(works=works).turn()
-    assert loop.skipped == [0, skipped]
-    assert loop.times == [0.0, 1 + skipped]
-    assert loop.ticks.late_s == late * PERIOD
+    assert (loop.skipped, loop.times, loop.ticks.late_s) == ([0, skipped], [0.0, 1 + skipped], late * PERIOD)
     assert loop.turn().begun[-1] == 2 + skipped, "in time again"
 
 
@@ -123,15 +121,13 @@ def test_few_ticks_are_made_up_for():
     loop = Loop(catch_up=3).turn(works=6.0)
     for _ in range(5):
         loop.turn()
-    assert loop.skipped == [0, 2, 0, 0, 0, 0]
-    assert loop.times == [0, 3, 4, 5, 6, 7]
+    assert (loop.skipped, loop.times) == ([0, 2, 0, 0, 0, 0], [0, 3, 4, 5, 6, 7])
     assert loop.begun == [0, 6, 6, 6, 6, 7]
 
 
 def test_long_wait_skips_none_unless_asked_twice():
     loop = Loop().turn().turn(oversleeps=1.5).turn().turn()
-    assert loop.skipped == [0, 0, 0, 0]
-    assert loop.begun == [0, 2.5, 2.5, 3]
+    assert (loop.skipped, loop.begun) == ([0, 0, 0, 0], [0, 2.5, 2.5, 3])
     twice = Loop().turn()
     twice.now += 2.5 * PERIOD
     assert twice.ticks.until_next() == 0.0
@@ -147,8 +143,7 @@ def test_time_follows_a_slewed_clock():
     loop.turn().turn()
     loop.ticks.zero -= 0.25 * PERIOD
     assert loop.ticks.elapsed() == 1.25 * PERIOD
-    assert loop.turn().begun[-1] == 2
-    assert loop.now == BEGIN + 60.0 + 1.75 * PERIOD
+    assert (loop.turn().begun[-1], loop.now) == (2, BEGIN + 60.0 + 1.75 * PERIOD)
 
 
 @pytest.mark.parametrize(("at", "following"), [(5.4, 1.4), (5.0, 2.0), (1.01, 1.01), (0.3, 1.3)])

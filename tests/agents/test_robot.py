@@ -21,16 +21,6 @@ def lone_robot(experiment=None):
     return Bench(Plan(experiment or pair()).assignment("A"), HERE)
 
 
-def test_older_samples_are_left_out():
-    bench = lone_robot()
-    (sender,) = bench.neighbours.all
-    for x, stamp in ((1.0, 2.0), (9.0, 1.0), (9.0, 2.0)):
-        bench.hear(0, (x, 0.0, 0.0), stamp=stamp)
-    assert (sender.position, sender.stamp) == ((1.0, 0.0, 0.0), 2.0)
-    bench.hear(0, (0.5, 0.0, 0.0), stamp=2.5)
-    assert (sender.position, sender.stamp) == ((0.5, 0.0, 0.0), 2.5)
-
-
 def test_missing_neighbour_is_named():
     bench = lone_robot().step()
     assert (bench.life.phase, bench.life.reason) == (IDLE, "never received B")

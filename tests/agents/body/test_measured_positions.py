@@ -47,8 +47,7 @@ def test_stamps_ahead_count_as_now_and_are_reported():
         net.deliver(position(UTC, robot="A"))
         assert not list(heard.receive(UTC, 8.0))
         assert heard.sources[1].ahead == pytest.approx(-7.0, abs=1e-6), "of another robot"
-        assert heard.malformed == 2
-        assert heard.sources[1].inbox.trouble == "position of 'A' on the key of 'T'"
+        assert (heard.malformed, heard.sources[1].inbox.trouble) == (2, "position of 'A' on the key of 'T'")
 
 
 def flight_events(ahead, seconds, frozen_s=inf):
@@ -133,8 +132,7 @@ def test_the_first_of_two_sources_stays_until_silent():
         assert heard.malformed == 4
         state = BodyState(note="locked")
         heard.annotate([state], 8.4)
-        assert state.note == f"{SECOND}; locked"
-        assert state.ahead == pytest.approx(0.0, abs=1e-6)
+        assert (state.note, state.ahead) == (f"{SECOND}; locked", pytest.approx(0.0, abs=1e-6))
         taken = [tell(8.4 + 0.1 * tick, ("b", 2.0)) for tick in range(8)]
         assert taken == [[]] * 5 + [[2]] * 3
         assert tell(9.2, *both) == [2], "the first one is the second now"

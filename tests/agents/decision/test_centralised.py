@@ -260,8 +260,7 @@ def test_dead_centre_stops_at_once(name):
     guide(bench, goal)
     bench.step().robot.guidance.mark_lost(bench.t)
     assert bench.step().robot.goal == bench.position
-    assert bench.robot.missing_neighbours() == ["centre"]
-    assert bench.life.phase == RUNNING
+    assert (bench.robot.missing_neighbours(), bench.life.phase) == (["centre"], RUNNING)
     bench.robot.guidance.mark_alive()
     assert bench.step().robot.goal == goal  # back in time: the last goal is still young
     bench.robot.guidance.mark_lost(bench.t)

@@ -90,8 +90,7 @@ def test_memory_is_kept_where_a_robot_was_due():
         bench.step(0.01, hear)
         if len(bench.said) > before:  # it says what its last step decided
             assert bench.robot.words == (("count", stepping.memory["count"]),)
-    assert stepping.memory == {"count": (10.0,), "secret": (1.0, 2.0)}
-    assert stepping.measures == {"heard": 0.0}
+    assert (stepping.memory, stepping.measures) == ({"count": (10.0,), "secret": (1.0, 2.0)}, {"heard": 0.0})
     assert bench.robot.setpoint[0] == pytest.approx(0.05, rel=0.2)
     assert isnan(bench.robot.error)
     odd = {"count": (3.0, 4.0), "other": (1.0,)}  # of another size

@@ -72,21 +72,13 @@ def test_directions_stay_directions(before, to, t):
         assert after(14.0, bearing=before, to=Target(bearing=to)).bearing == pytest.approx(to, abs=1e-12, nan_ok=True)
 
 
-def test_links_by_the_clock():
+def test_links_by_clock_and_range():
     times = (0.0, 4.9, 5.0, 7.9, 8.0, 20.0)
     assert [exists(5.0, 8.0, inf, t, nan) for t in times] == [False, False, True, True, False, False]
+    assert [exists(0.0, inf, 1.2, 0.0, apart) for apart in (1.19, 1.2, 1.21, nan)] == [True, True, False, False]
     assert planned_at(0.0, inf, inf, 0.0)
     assert not planned_at(5.0, 8.0, inf, 0.0)
     assert not planned_at(0.0, inf, 1.0, 0.0)
-
-
-def test_links_by_range_do_not_flicker():
-    present, seen = False, []
-    for apart in (1.5, 1.1, 0.9, 1.1, 1.19, 1.21, 1.1, 1.0):
-        present = exists(0.0, inf, 1.2 if present else 1.0, 0.0, apart)
-        seen.append(present)
-    assert seen == [False, False, True, True, True, False, False, True]
-    assert not exists(0.0, inf, 1.2, 0.0, nan)  # an unknown robot is not near
 
 
 # ---------------------------------------------------------------- anchors

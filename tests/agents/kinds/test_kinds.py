@@ -22,8 +22,6 @@ from experiments.check.ideal_run import predict
 from experiments.check.motion import turning_circle
 from experiments.file.document import loads
 from experiments.file.problems import DocumentError
-from experiments.run import simulate
-from tests.cases import mostly_slow
 from twins.engines.point_mass import has_model, model
 
 NEW = (OMNI, ACKERMANN, POINT, DOUBLE_INTEGRATOR, UNICYCLE)
@@ -81,14 +79,6 @@ plan = { kind = "circle", radius = 1.0, period_s = 120.0 }
 
 def following(kind, extra=""):
     return loads(extra + FOLLOW.replace("KIND", kind))
-
-
-@pytest.mark.parametrize("kind", mostly_slow(NEW, 3), ids=lambda kind: kind.name)
-def test_a_formation_follows_without_hazards(kind):
-    run = simulate(following(kind.name))
-    (trace,), (metrics,) = run.traces.values(), run.metrics.values()
-    assert not [event for event in trace.events if event.kind == "hazard"]
-    assert max(robot.rmse for robot in metrics.robots if robot.robot != "A") < 0.3
 
 
 def test_check_says_what_cannot_turn_on_the_spot():

@@ -24,17 +24,14 @@ from tests.cases import for_each
 MESH = ["tcp/127.0.0.1:1#of=A", "tcp/127.0.0.1:2#of=B+C", "tcp/127.0.0.1:3#of=D", "tcp/127.0.0.1:4#of=recorder"]
 
 
-@for_each(
-    "text, parts",
-    [
-        ("tls/[::1]:7447#x=1", ("tls", "::1", 7447, "#x=1")),
-        ("quic/lab-1.example.org:65535?a=1", ("quic", "lab-1.example.org", 65535, "?a=1")),
-        ("unixsock-stream//tmp/x.sock", ("unixsock-stream", "/tmp/x.sock", 0)),
-    ],
-)
-def test_parts_are_read_and_written(text, parts):
-    assert Endpoint.parse(text) == Endpoint(*parts)
-    assert str(Endpoint(*parts)) == text
+def test_parts_are_read_and_written():
+    parts = {
+        "tls/[::1]:7447#x=1": Endpoint("tls", "::1", 7447, "#x=1"),
+        "quic/lab-1.example.org:65535?a=1": Endpoint("quic", "lab-1.example.org", 65535, "?a=1"),
+        "unixsock-stream//tmp/x.sock": Endpoint("unixsock-stream", "/tmp/x.sock", 0),
+    }
+    assert {text: Endpoint.parse(text) for text in parts} == parts
+    assert [str(endpoint) for endpoint in parts.values()] == list(parts)
 
 
 @for_each(
@@ -45,22 +42,12 @@ def test_what_is_no_endpoint_is_refused(text):
         Endpoint.parse(text)
 
 
-@for_each(
-    "text, loopback, wildcard",
-    [
-        ("tcp/127.0.0.1:1", True, False),
-        ("tcp/localhost:1", True, False),
-        ("tcp/[::1]:1", True, False),
-        ("unixsock-stream//x", True, False),
-        ("tcp/0.0.0.0:1", False, True),
-        ("tcp/[::]:1", False, True),
-        ("tls/192.0.2.7:1", False, False),
-        ("tls/lab:1", False, False),
-    ],
-)
-def test_who_reaches_it(text, loopback, wildcard):
-    endpoint = Endpoint.parse(text)
-    assert (endpoint.is_loopback, endpoint.is_wildcard) == (loopback, wildcard)
+def test_who_reaches_it():
+    here = ["tcp/127.0.0.1:1", "tcp/localhost:1", "tcp/[::1]:1", "unixsock-stream//x"]
+    everywhere, elsewhere = ["tcp/0.0.0.0:1", "tcp/[::]:1"], ["tls/192.0.2.7:1", "tls/lab:1"]
+    made = [Endpoint.parse(text) for text in here + everywhere + elsewhere]
+    assert [str(endpoint) for endpoint in made if endpoint.is_loopback] == here
+    assert [str(endpoint) for endpoint in made if endpoint.is_wildcard] == everywhere
 
 
 @for_each(
@@ -98,21 +85,13 @@ def test_free_endpoints_avoid_taken_ports():
     assert len(set(free_endpoints(3))) == 3
 
 
-@for_each(
-    "name, listens, connects",
-    [
-        ("A", [1], []),
-        ("B+C", [2], [1]),
-        ("B", [2], [1]),
-        ("recorder", [4], [1, 2, 3]),
-        ("zenpark echo", [], [1, 2, 3, 4]),  # a visitor
-    ],
-)
-def test_the_later_of_two_members_connects(name, listens, connects):
-    ends = endpoints.ends(MESH, name)
-    assert (ends.mode, ends.visits) == ("peer", not listens)
-    assert ends.listen == [f"tcp/127.0.0.1:{port}" for port in listens]
-    assert ends.connect == [f"tcp/127.0.0.1:{port}" for port in connects]
+def test_the_later_of_two_members_connects():
+    members = {"A": ([1], []), "B+C": ([2], [1]), "B": ([2], [1]), "recorder": ([4], [1, 2, 3])}
+    visitors = {"zenpark echo": ([], [1, 2, 3, 4])}
+    for name, (listens, connects) in (members | visitors).items():
+        expected = ([f"tcp/127.0.0.1:{port}" for port in ports] for ports in (listens, connects))
+        ends = endpoints.ends(MESH, name)
+        assert (name, ends.mode, ends.visits, ends.listen, ends.connect) == (name, "peer", not listens, *expected)
 
 
 def test_marks_stand_in_either_order_of_making():

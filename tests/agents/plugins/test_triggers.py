@@ -14,7 +14,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agents.decision.neighbours import Incoming, Neighbours
 from agents.decision.transmission import Transmitter
 from agents.kinds.khepera4 import KHEPERA4
 from agents.plugins import registry
@@ -31,7 +30,7 @@ from agents.plugins.trigger_families import (
     SelfTriggered,
 )
 from agents.plugins.triggers import LastEvent, Periodic, SendOnDelta, Trigger, TriggerState
-from agents.vectors import NO_SETPOINT, UNKNOWN, ZERO, Vector
+from agents.vectors import NO_SETPOINT, ZERO, Vector
 from tests.cases import examples
 
 DT = 0.02
@@ -69,23 +68,18 @@ class Play:
 
     Attributes:
         fired: Whether there was an event, at each question.
-        gaps: ‖ε‖ when it was asked [m], infinite at first.
         intervals: Questions from each event to the next.
     """
 
     def __init__(self, trigger: Trigger, signal: list[Moment], *, predictor: Predictor = HOLD, dt: float = DT) -> None:
         transmitter = Transmitter(trigger, predictor, KHEPERA4)
         self.fired: list[bool] = []
-        self.gaps: list[float] = []
-        last = transmitter.asking.last
         for k, moment in enumerate(signal):
             t = k * dt
-            held = predictor.position(last, t - last.time) if last.time > -inf else UNKNOWN
             fired = transmitter.transmits(
                 t, moment.position, moment.velocity, moment.error, moment.energy, t, moment.offset, NO_SETPOINT
             )
             self.fired.append(fired)
-            self.gaps.append(dist(transmitter.position, held) if k else inf)
         events = [k for k, fired in enumerate(self.fired) if fired]
         self.intervals = [later - earlier for earlier, later in itertools.pairwise(events)]
 
@@ -275,21 +269,6 @@ def test_integral_fires_beyond_its_area(seed, area):
     fires_when(IntegralTrigger(area=area), seed, margin)
 
 
-@SOME
-@given(SEEDS, st.floats(0.02, 0.5))
-def test_self_triggered_bounds_bounded_accelerations(seed, bound):
-    dt, rng = 0.005, np.random.default_rng(seed)
-    push = rng.normal(size=(400, 3))
-    push *= bound / np.maximum(np.linalg.norm(push, axis=1), 1e-9)[:, None]
-    speed = np.cumsum(push * dt, axis=0)
-    poses = zip(np.cumsum(speed * dt - 0.5 * push * dt**2, axis=0).tolist(), speed.tolist(), strict=True)
-    signal = [Moment(tuple(p), tuple(v), (0.0, 0.0, 0.0), 0.0, 0.0) for p, v in poses]
-    play = Play(SelfTriggered(threshold=0.01, acceleration=bound), signal, dt=dt)
-    for k in range(1, 400):  # it may be late by one question
-        assert play.gaps[k] <= 0.01 + dt * hypot(*signal[k].velocity) + 1e-9
-    assert 2 <= sum(play.fired) <= 200
-
-
 @pytest.mark.parametrize(("age", "seconds"), [(-0.5, 0.0), (0.0, 0.0), (1.0, 1.0), (2.0, 2.0), (9.0, 2.0)])
 def test_constant_velocity_goes_on_until_its_horizon(age, seconds):
     sent = LastEvent()
@@ -299,14 +278,3 @@ def test_constant_velocity_goes_on_until_its_horizon(age, seconds):
     assert predictor.velocity(sent, age) == (sent.velocity if age < 2.0 else (0.0, 0.0, 0.0))
     assert (predictor.reach(), ConstantVelocity().reach()) == (2.0, inf)
     assert ConstantVelocity().position(sent, 9.0) == pytest.approx((10.0, -16.0, 7.5))
-
-
-def test_received_pose_counts_from_its_stamp():
-    neighbours = Neighbours([Incoming(0, "B", KHEPERA4, 1.0)], 1.0)
-    (sender,) = neighbours.all
-    neighbours.receive(0, (1.0, 0.0, 0.0), (0.1, 0.0, 0.0), 4.0, 4.4)  # the delay of the network is made up for
-    neighbours.mark_alive(0)
-    assert sender.place(ConstantVelocity(), 5.0) == pytest.approx((1.1, 0.0, 0.0))
-    assert sender.place(HOLD, 5.0) == (1.0, 0.0, 0.0)
-    neighbours.mark_lost(0, 4.5)
-    assert sender.place(ConstantVelocity(), 9.0) == pytest.approx((1.05, 0.0, 0.0))

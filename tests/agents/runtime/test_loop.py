@@ -61,8 +61,7 @@ def test_standstill_skips_ticks_and_holds(stands_s, missed, holds, on_stage, cap
 
     stage.run(visit)
     assert stage.ticks == pytest.approx([0.01 * (k if k < 5 else k + missed) for k in range(12)])
-    assert stage.runtime.counts.missed == missed
-    assert stage.robot.tick == 12 + missed
+    assert (stage.runtime.counts.missed, stage.robot.tick) == (missed, 12 + missed)
     assert (f"stood still for {stands_s:.1f} s; holding" in capsys.readouterr().out) == holds
     assert (stage.runtime.health.resumed_at == pytest.approx(0.01 * (5 + missed))) == holds
 

@@ -255,8 +255,7 @@ def test_neighbour_whose_poses_are_all_refused_is_lost(a, sends):
         if sends:
             a.pose(seq, 0.4, "one", age=-8.0)  # this process, or that one, has a wrong clock
         a.receive(seq, 0.4, "other", age=-8.0)  # which says nothing about B
-    assert a.robot.missing_neighbours() == ["B"] * sends
-    assert a.hazards == ["refused"] * sends + ["70 foreign"]
+    assert (a.robot.missing_neighbours(), a.hazards) == (["B"] * sends, ["refused"] * sends + ["70 foreign"])
     assert a.inbox.malformed == 70 * sends
     a.receive(90, 0.4, "one")
     a.after(1.0)
@@ -317,8 +316,7 @@ def test_old_pose_is_extrapolated_unless_clock_is_slow(a, poses, carried_s):
             a.token("two")
         a.pose(seq if session == "one" else 1, 0.4, session, age=age, speed=0.1)
         a.after(then)
-    assert a.believed == pytest.approx(0.4 + 0.1 * carried_s, abs=1e-5)
-    assert a.hazards == []
+    assert (a.believed, a.hazards) == (pytest.approx(0.4 + 0.1 * carried_s, abs=1e-5), [])
 
 
 @pytest.mark.parametrize("ahead", [0.2, 4.0])

@@ -33,7 +33,7 @@ class Watched:
             name="A", kind=kind, hover=hover, limits=limits, predictor=HOLD, avoidance="potential", avoids=avoids
         )
         incoming = [Incoming(number, name, kind, 0.5) for number, name in enumerate(neighbours)]
-        self.detector, self.hazards = Detector(assignment), Hazards(kind, limits)
+        self.detector, self.hazards, self.limits = Detector(assignment), Hazards(kind, limits), limits
         self.neighbours, self.health = Neighbours(incoming, limits.neighbour_timeout_s), ProcessHealth()
         self.now, self.status = Situation(), RobotStatus()
         self.status.cruising, self.status.goal_height = True, hover
@@ -167,8 +167,7 @@ def test_lost_neighbours():
     robot = Watched(KHEPERA4, "BC").step()
     robot.neighbours.mark_lost(0, robot.t)
     assert robot.step(1.0).found == set()
-    assert robot.step(0.03).found == {Cause.NEIGHBOUR}
-    assert robot.texts == ["warn: a neighbour is lost: B"]
+    assert (robot.step(0.03).found, robot.texts) == ({Cause.NEIGHBOUR}, ["warn: a neighbour is lost: B"])
     robot.neighbours.mark_lost(1, robot.t - 2.0)
     robot.status.alone = True
     assert robot.step().found == {Cause.NEIGHBOUR, Cause.ALONE}
@@ -363,22 +362,20 @@ def test_tilt_is_an_angle_to_the_vertical():
 START = (0.1, 0.2)
 
 
-class Standing:
+class Standing(Watched):
     """A robot that stands at its start, beside one robot that it receives."""
 
     def __init__(self, kind=CRAZYFLIE, *, start_within=0.3, other=(0.35, 0.2), **safety):
-        limits = Limits(low=(-2.0, -2.0, 0.0), high=(2.0, 2.0, 2.5), **safety)
+        super().__init__(kind, "G", **safety)
         starts = (("F", *START, kind.radius), ("G", *other, kind.radius))
-        given = {"name": "F", "kind": kind, "limits": limits, "predictor": HOLD, "start": START, "starts": starts}
+        given = {"name": "F", "kind": kind, "limits": self.limits, "predictor": HOLD, "start": START, "starts": starts}
         self.preflight = Preflight(SimpleNamespace(**given, start_within=start_within))
-        self.filter, self.now, self.health = SetpointFilter(kind, limits), Situation(), ProcessHealth()
-        self.neighbours, self.t = Neighbours([Incoming(1, "G", kind, 0.25)], limits.neighbour_timeout_s), 1.0
-        self.neighbours.mark_alive(0)
-        self.hear((*other, 0.0))
+        self.filter = SetpointFilter(kind, self.limits)
+        self.move_other((*other, 0.0))
 
-    def hear(self, position):
-        self.t += 0.01
-        self.neighbours.receive(0, position, ZERO, self.t, self.t)
+    def move_other(self, position):
+        self.t += DT
+        self.hear(0, position)
 
     def check(self, missing=(), **values):
         """First reason why it must not take off."""
@@ -441,7 +438,7 @@ def test_failure_that_lasts_ends_readiness():
 @pytest.mark.parametrize(("x", "z", "clear"), [(0.28, 0.6, False), (0.28, 0.05, True), (0.35, 0.6, True)])
 def test_drone_does_not_take_off_below_another(x, z, clear):
     robot = Standing()
-    robot.hear((x, 0.2, z))
+    robot.move_other((x, 0.2, z))
     reason = robot.check()
     assert reason == ("" if clear else f"G is {z:.2f} m above it")
     assert robot.preflight.lost(robot.t, reason) != clear  # at once: the take-off would pass it

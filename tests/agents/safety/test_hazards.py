@@ -70,8 +70,7 @@ def test_outcomes_of_a_lasting_cause(cause):
     first = bench.hazards.incidents[0]
     assert first.text == f"{first.outcome.name.lower()}: {cause.rule.words}: number {cause:d}"
     last = EXPECTED[cause][-1][1]
-    assert bench.hazards.outcome().name == last
-    assert bench.hazards.held == (cause.rule.place and last == "HOLD")
+    assert (bench.hazards.outcome().name, bench.hazards.held) == (last, cause.rule.place and last == "HOLD")
     assert [each.outcome.name for each in bench.acts] == [last][: last in ("LAND", "CUT")]
 
 

@@ -59,8 +59,7 @@ def test_robot_that_does_not_move(kind):
     assert robot.go(1.5, told=kind.speed, speed=0.9 * kind.speed) == FINE  # it has begun
     assert robot.go(3.4, told=kind.speed) == (True, False)
     robot.tick += 20  # missed ticks: the count restarts
-    assert robot.go(DT, told=kind.speed) == FINE
-    assert robot.motion_check.commanded == 0.0
+    assert (robot.go(DT, told=kind.speed), robot.motion_check.commanded) == (FINE, 0.0)
 
 
 @wheels
