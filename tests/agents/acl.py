@@ -1,7 +1,5 @@
 """Model of a Zenoh router's `access_control`: enough to ask for the rights of an identity."""
 
-from __future__ import annotations
-
 from functools import cache
 from typing import Any
 

@@ -68,7 +68,6 @@ class Bench:
         return self
 
     def running(self, every_tick: Callable[[Bench], object] | None = None) -> Bench:
-        """Until the experiment begins."""
         self.step(DT, every_tick)
         assert self.life.takeoff() == ""
         while self.life.phase != AIRBORNE:
@@ -196,7 +195,6 @@ class Swarm:
         return [moment[name][what] for moment in self.log[since:]]
 
     def conduct(self) -> None:
-        """Give the orders that a conductor gives."""
         phases = [self.phase(name) for name in self.names]
         if min(phases) == READY:
             for name in self.names:
@@ -231,7 +229,6 @@ class Swarm:
         return dict(zip(LOGGED, values, strict=True))
 
     def until(self, phase: int, most_s: float = 60.0) -> Swarm:
-        """Until all are there."""
         deadline = self.t + most_s
         while min(self.phase(name) for name in self.names) < phase:
             assert self.t < deadline, {name: self.phase(name) for name in self.names}
@@ -245,7 +242,6 @@ class Swarm:
         return self
 
     def running(self) -> Swarm:
-        """Until the experiment begins."""
         return self.until(RUNNING)
 
 

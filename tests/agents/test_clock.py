@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from agents.clock import SLEW, STEP_S, Clock, correction_line, uptime
 from agents.ticks import Ticks
 from experiments.real_time.hosts.launcher import Launcher
+from tests.cases import for_each
 from tests.commands import ROOT
 
 
@@ -108,9 +109,7 @@ class Loop:
         return self
 
 
-@pytest.mark.parametrize(
-    ("works", "skipped", "late"), [(0.75, 0, 0.0), (1.75, 0, 0.75), (2.0, 1, 0.0), (4.25, 3, 0.25)]
-)
+@for_each("works, skipped, late", [(0.75, 0, 0.0), (1.75, 0, 0.75), (2.0, 1, 0.0), (4.25, 3, 0.25)])
 def test_late_loop_skips_ticks_that_are_over(works, skipped, late):
     loop = Loop().turn(works=works).turn()
     assert (loop.skipped, loop.times, loop.ticks.late_s) == ([0, skipped], [0.0, 1 + skipped], late * PERIOD)

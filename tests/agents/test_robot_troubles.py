@@ -45,12 +45,10 @@ LOST = {
 
 
 def causes(swarm, name):
-    """Causes of the incidents of a robot so far."""
     return {incident.cause for incident in swarm.robot(name).hazards.incidents}
 
 
 def ended(swarm, name):
-    """Phase of a robot, and why it is in it."""
     return swarm.phase(name), swarm.robot(name).lifecycle.reason
 
 
@@ -260,7 +258,6 @@ def test_robots_go_through_their_phases():
 
 
 def trouble(rng, swarm, name):
-    """One thing that goes wrong with a robot."""
     robot = swarm.robot(name)
     x, y, z = (rng.uniform(-3.0, 3.0) for _ in range(3))
     return rng.choice([
@@ -310,8 +307,6 @@ SLOW = partial(pytest.param, marks=pytest.mark.slow)
 
 
 class Nonsense:
-    """Numbers, some of which are odd."""
-
     def __init__(self, seed: int) -> None:
         self.random = random.Random(seed)
         self._share = self.random.choice((0.0, 0.02, 0.3))
@@ -337,7 +332,6 @@ class Nonsense:
 
 
 def disturb(robot: Robot, t: float, some: Nonsense) -> None:
-    """Poses, losses, orders, goals of a centre and external positions."""
     neighbours = robot.neighbours
     for k in range(len(neighbours.all)):
         if some.happens(0.3):

@@ -30,7 +30,6 @@ def position(stamp, place=PLACE, robot="T"):
 
 
 def listening(net, names=("A", "T"), silence_s=0.5, **given):
-    """Positions of the last robot."""
     rows = [len(names) - 1]
     return MeasuredPositions(net.session, KEYS, names, rows, (9.0, 9.0, 9.0), silence_s=silence_s, **given)
 

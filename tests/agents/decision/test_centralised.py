@@ -20,8 +20,6 @@ PARK = reference("event")
 
 
 class Desk:
-    """A central controller, and poses to tell it."""
-
     def __init__(self, update=None, **parts):
         formation = changed(PARK.formation, update=update)
         plan = Plan(changed(PARK, formation=formation, **{"architecture": "centralised", **parts}))

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from agents.decision.lifecycle import AIRBORNE, DONE, IDLE, LANDING, READY, RUNNING, Lifecycle, Phase
 from agents.kinds.crazyflie import CRAZYFLIE
 from agents.kinds.khepera4 import KHEPERA4
-from tests.cases import examples
+from tests.cases import examples, for_each
 
 DT, HOVER = 0.1, 0.8
 ORDERS = ("takeoff", "start", "start late", "land", "stop", "nothing", "nothing")
@@ -154,9 +154,7 @@ def test_orders_in_one_tick():
         assert (robot.told, robot.flying, robot.life.reason) == (told, False, reason)
 
 
-@pytest.mark.parametrize(
-    ("speeds", "phases"), [((nan, nan), (LANDING, DONE)), ((0.2, 0.2, 0.05), (LANDING, LANDING, DONE))]
-)
+@for_each("speeds, phases", [((nan, nan), (LANDING, DONE)), ((0.2, 0.2, 0.05), (LANDING, LANDING, DONE))])
 def test_wheels_are_done_when_they_stand(speeds, phases):
     robot = life_aloft(flies=False)
     robot.life.land("told to")

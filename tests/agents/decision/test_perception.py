@@ -35,7 +35,6 @@ class Sight:
         return self
 
     def sense(self, t, position=ZERO, *, yaw=0.0, velocity=ZERO, time=None, scan=None):
-        """Things seen at `t` [s]."""
         now = Situation()
         now.state = BodyState(t if time is None else time, position, velocity, yaw, scan=scan)
         now.begin(t)

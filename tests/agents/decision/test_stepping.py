@@ -1,7 +1,5 @@
 """Laws that remember and say something, at work for one robot."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from math import dist, inf, isnan, nan
@@ -45,8 +43,6 @@ class Counting(Law, frozen=True):
 
 
 class Odd(Counting, frozen=True):
-    """Decides what is made of the view."""
-
     decides: Callable[[object], object]
 
     def step(self, view, memory):
@@ -54,8 +50,6 @@ class Odd(Counting, frozen=True):
 
 
 class Beginning(Counting, frozen=True):
-    """Begins with what it is given."""
-
     count: Callable[[RobotFacts], object]
 
     def begin(self, robot):

@@ -110,7 +110,6 @@ LINKS = {"A - B": 0.5, "C > A": 0.5, "C > B": 0.5}
 
 
 def updating(update, **parts):
-    """Three ground robots that run; C receives nobody and stands."""
     return Swarm(changed(triangle(), formation=Formation(links=LINKS, update=update), **parts)).running()
 
 

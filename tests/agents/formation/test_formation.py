@@ -42,12 +42,9 @@ def test_target_changes_on_the_way():
     kept = after(12.0, distance=0.8)
     assert kept.distance == 0.8
     assert isnan(kept.relative[0])
-
-
-def test_change_is_told_once():
     link, given_, changes, targets = Link(0.8), Link(0.8), [Change(10.0, 4.0, 1.0, 0.0)], [Target(distance=0.2)]
     told = [change_target(link, given_, changes, targets, t) for t in (9.0, 12.0, 12.0, 14.0, 20.0)]
-    assert told == [False, True, False, True, False]
+    assert told == [False, True, False, True, False], "once"
 
 
 @FEW

@@ -1,7 +1,5 @@
 """The kinds that come along: each reaches goals and keeps a formation, and nothing takes it for disobedient."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from math import hypot, inf, nan
 

@@ -16,8 +16,6 @@ MANY = 40_000
 
 
 class Got(NamedTuple):
-    """A sample that got through."""
-
     link: int
     arrival: float
     seq: int

@@ -179,7 +179,6 @@ def test_inbox_passes_valid_messages_and_counts_the_rest():
 
 @pytest.fixture
 def orders():
-    """Orders to A, and what asks them."""
     net = Net()
     made = pubsub.Orders(net.session, ORDER, Order)
 

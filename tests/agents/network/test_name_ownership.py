@@ -45,7 +45,6 @@ class Table(ManualClock):
         self._running: set[str] = set()
 
     def await_turn(self, name: str) -> None:
-        """Wait for the turn of a session."""
         with self._turn:
             self._waiting.add(name)
             self._turn.notify_all()
@@ -226,8 +225,6 @@ def test_a_process_without_its_name_touches_no_body(reply, error):
 
 
 class Commanded(Airborne):
-    """A body that flies for ever, and counts its commands."""
-
     def __init__(self, rows: int = 1) -> None:
         super().__init__(steps=10**9, rows=rows)
         self.commands = 0

@@ -1,7 +1,5 @@
 """Sessions on a real router; and what they do about one that is silent, alarms, and connections."""
 
-from __future__ import annotations
-
 import os
 import re
 import socket
@@ -46,7 +44,6 @@ def payloads(handler):
 
 @pytest.fixture
 def two(router):
-    """Sessions of a robot and of another process."""
     with open_session([router.endpoint], name="CF01") as robot, open_session([router.endpoint], name="ui") as other:
         yield robot, other
 
@@ -156,7 +153,6 @@ def looks(watch: RouterWatch, begin: float, end: float) -> float:
 
 @pytest.fixture
 def asked():
-    """A session, and the watch of its router."""
     session = Asked()
     return session, RouterWatch(session, ALIVE)
 
@@ -356,7 +352,6 @@ def test_a_router_closes_no_connection_slowly(eventually):
 
 
 def granted() -> int:
-    """The slice of this thread [ns], as the kernel says it."""
     scheduler = Path("/proc/thread-self/sched")
     found = re.search(r"se\.slice\s*:\s*(\d+)", scheduler.read_text()) if scheduler.exists() else None
     if found is None:

@@ -71,9 +71,7 @@ def test_push_is_strongest_near_and_none_far(kind):
     assert all(map(isfinite, deviate(ZERO, -kind.radius)))  # in the same place
 
 
-@pytest.mark.parametrize(
-    ("kind", "gap", "acts"), [("potential", 1.0, False), ("potential", 0.01, True), (None, 0.01, False)]
-)
+@for_each("kind, gap, acts", [("potential", 1.0, False), ("potential", 0.01, True), (None, 0.01, False)])
 def test_avoidance_acts_near_others_alone(kind, gap, acts):
     """A Khepera with its neighbour beside it, where both want to be."""
     far = 0.14 + gap

@@ -31,8 +31,6 @@ def half(number):
 
 
 class Spring(Distance, frozen=True):
-    """A law that goes wrong in a way."""
-
     way: str = ""
 
     def pull(self, apart, link):
@@ -94,8 +92,6 @@ READS = {  # what a law reads of its view: field and remedy
 
 
 class Reader(Law):
-    """A law that reads one thing of what it sees."""
-
     SAYS: ClassVar = {"x": Said()}
     reads: str
 

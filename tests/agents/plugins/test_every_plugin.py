@@ -126,7 +126,6 @@ def test_same_alone_and_in_company(group, name):
 
 
 def known(bench):
-    """Variables in the memory of a law that are known."""
     memory = {} if bench.robot.stepping is None else bench.robot.stepping.memory
     return {name for name, values in memory.items() if all(map(isfinite, values))}
 

@@ -41,7 +41,6 @@ def source_of(name):
 
 
 def made_in_guide(name):
-    """Object that the guide defines by this name."""
     names = {"__name__": "guide"}
     exec(source_of(name), names)
     return names[name]
@@ -64,7 +63,6 @@ def installed(tmp_path_factory):
 
 
 def install(folder, name, version, groups):
-    """Leaves in a folder what an installer leaves of a distribution with these entry points."""
     written = folder / f"{name.replace('-', '_')}-{version}.dist-info"
     written.mkdir()
     (written / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
@@ -173,7 +171,6 @@ class Rover(threading.Thread):
 
 @pytest.fixture
 def rover():
-    """A robot of the guide."""
     robot = Rover()
     robot.start()
     yield robot

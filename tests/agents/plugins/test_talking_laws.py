@@ -120,7 +120,6 @@ def joined(pairs, count):
 
 
 def least(places, tasks):
-    """Least sum of ways [m]."""
     ways = np.array([[dist(place, task) for task in tasks] for place in places])
     return ways[linear_sum_assignment(ways)].sum()
 

@@ -1,7 +1,5 @@
 """Every registered trigger keeps intervals and silences; each family fires exactly when its inequality says."""
 
-from __future__ import annotations
-
 import itertools
 import re
 from math import dist, exp, hypot, inf, nan, sqrt
@@ -37,8 +35,6 @@ DT = 0.02
 
 
 class Moment(NamedTuple):
-    """Quantities of a robot at one question."""
-
     position: Vector
     velocity: Vector
     offset: Vector
@@ -47,7 +43,6 @@ class Moment(NamedTuple):
 
 
 def wander(seed: int, ticks: int) -> list[Moment]:
-    """Random walk with rests."""
     rng = np.random.default_rng(seed)
     speed = rng.choice([0.0, 0.05, 0.5], (ticks, 1)) * rng.normal(size=(ticks, 3))
     place = np.cumsum(speed * DT, axis=0) + rng.normal(size=3)
@@ -59,7 +54,6 @@ def wander(seed: int, ticks: int) -> list[Moment]:
 
 
 def standing(ticks: int, position: Vector = (0.0, 0.0, 0.0)) -> list[Moment]:
-    """A robot that stays, without errors."""
     return [Moment(position, ZERO, ZERO, 0.0, 0.0)] * ticks
 
 

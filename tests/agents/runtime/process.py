@@ -1,7 +1,5 @@
 """A robot process on the network in memory: with a body that writes down its orders, or on a simulated clock."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import partial
 from math import inf
@@ -31,13 +29,11 @@ QUICK = DescentTiming(landing_s=0.3, stop_s=0.1, slowest=inf)
 
 
 def twins(experiment: Experiment, names: Sequence[str] = ()) -> Body:
-    """The twins of robots in one body."""
     plan = Plan(experiment)
     return assemble(bodies.body_request(plan, tuple(names or plan.names), 1))
 
 
 def setup(rows: int = 1, **changes: Any) -> Setup:
-    """Settings of a process of some robots."""
     given = {"keys": Keys(), "endpoints": [], "encoding": "json", "state_hz": 50.0, "lifeline": False}
     return Setup(**{**given, "externally_measured": [False] * rows, **changes})
 
@@ -152,13 +148,12 @@ class Stage:
     def robot(self):
         return self.runtime.robots[0]
 
-    def begin(self) -> None:
-        self.runtime.subscribe_to_stops(self.net.session)
-        self.body.open()
-        self.runtime.join(self.net.session)
-
-    def run(self, visit: Callable[[Phase], object]) -> None:
-        """Tick until `visit`, called after each tick with the phase, is true."""
+    def run(self, visit: Callable[[Phase], object], *, joined: bool = False) -> None:
+        """Join, and tick until `visit`, called after each tick with the phase, is true."""
+        if not joined:
+            self.runtime.subscribe_to_stops(self.net.session)
+            self.body.open()
+            self.runtime.join(self.net.session)
         life, tick = self.robot.lifecycle, self.runtime.tick
 
         def ticked(t: float) -> None:

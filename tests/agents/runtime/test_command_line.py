@@ -53,7 +53,6 @@ def test_output_waits_for_no_reader(pipe):
 
 @pytest.fixture(params=[signal.SIG_DFL, signal.SIG_IGN], ids=["terminal", "nohup"])
 def hang_up(request):
-    """What becomes of SIGHUP."""
     before = signal.signal(signal.SIGHUP, request.param)
     yield request.param
     signal.signal(signal.SIGHUP, before)

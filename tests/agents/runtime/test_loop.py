@@ -1,7 +1,5 @@
 """The loop of a robot process: skipped ticks, standstills, stops, poses that wake it, and robots that come back."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import replace
@@ -44,7 +42,6 @@ def net():
 
 @pytest.fixture
 def on_stage(monkeypatch, net):
-    """Puts a process on a stage."""
     return partial(Stage, monkeypatch, net)
 
 
@@ -53,7 +50,6 @@ def on_stage(monkeypatch, net):
 )
 def test_standstill_skips_ticks_and_holds(stands_s, missed, holds, on_stage, capsys):
     stage = on_stage(pair(), "A", asks_for_owners=False)
-    stage.begin()
 
     def visit(_phase):
         stage.clock.sleep(stands_s if len(stage.ticks) == 5 else 0.001)
@@ -81,7 +77,6 @@ def test_standstill_without_router_halts_then_lands(experiment, after_s, on_stag
             monkeypatch.setattr(network, "connected", lambda _session: False)
         return phase == Phase.DONE
 
-    stage.begin()
     stage.run(visit)
     stage.runtime.keeper.ownership.end()
     landed = [at - woke[0] for at, order in stage.orders if order == "land"]
@@ -103,7 +98,6 @@ def test_standstill_before_takeoff_keeps_it_down(on_stage, monkeypatch):
         return phase == Phase.DONE
 
     monkeypatch.setattr(Robot, "act", stands)
-    stage.begin()
     stage.run(visit)
     assert "takeoff" not in [order for _, order in stage.orders]
 
@@ -123,7 +117,6 @@ def test_stop_during_command_has_last_word(during, on_stage):
             stage.robot.lifecycle.takeoff()
         return phase == Phase.DONE
 
-    stage.begin()
     stage.run(visit)
     assert len(stops) == 1
     assert [order for at, order in stage.orders if at >= stops[0]][-2:] == ["stop", "stop"]
@@ -142,7 +135,7 @@ def test_stop_while_body_opens_keeps_it_down(on_stage, net):
     assert stage.orders == [], "a closed body is left alone"
     stage.body.open()
     stage.runtime.join(net.session)
-    stage.run(visit)
+    stage.run(visit, joined=True)
     assert [order for _, order in stage.orders] == ["stop"]
     assert stage.robot.lifecycle.reason.startswith(messages.EMERGENCY)
 
@@ -206,7 +199,6 @@ def test_pose_between_ticks_wakes_loop(wake, stop_at, known, on_stage, monkeypat
         received.append(pose[-1])
 
     monkeypatch.setattr(Neighbours, "receive", noted)
-    stage.begin()
     stage.run(lambda _phase: len(stage.ticks) == 10)
     assert received == pytest.approx(known)
     assert stage.ticks == pytest.approx([0.01 * k for k in ((0, 1, *range(7, 15)) if stop_at < inf else range(10))])
@@ -215,8 +207,6 @@ def test_pose_between_ticks_wakes_loop(wake, stop_at, known, on_stage, monkeypat
 
 
 class Faulty(Trigger, frozen=True):
-    """Fails at any question."""
-
     def fires(self, view):
         return view.nothing
 
@@ -301,8 +291,6 @@ def test_plan_of_a_follower_keeps_its_origin():
 
 
 class Clock(Law, frozen=True):
-    """Says the time, and wants to move."""
-
     SAYS: ClassVar[Mapping[str, Said]] = {"time": Said()}
 
     def begin(self, robot):

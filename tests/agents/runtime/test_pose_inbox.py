@@ -1,7 +1,5 @@
 """A neighbour is alive by its token alone, a new process of it is a new life; what telemetry reports; ranges."""
 
-from __future__ import annotations
-
 import random
 from copy import copy
 from math import nan, pi
@@ -42,7 +40,6 @@ class Receiver:
         (self.sender,) = self.inbox.senders
 
     def add(self, key: str, payload: bytes = b"", *, gone: bool = False, session: str | None = None) -> None:
-        """A sample of a token, or of a pose from a session."""
         sample = network.Sample(key, messages.JSON, payload, gone=gone)
         if session is not None:
             sample.source_info = SimpleNamespace(source_id=SimpleNamespace(zid=session))
@@ -61,7 +58,6 @@ class Receiver:
         self.after(then)
 
     def life(self, session: str, *, gone: bool = False) -> None:
-        """The token of a process of B, which may not take part yet."""
         self.add(Keys.life(ALIVE, session), gone=gone)
 
     def token(self, session: str | None, *, gone: bool = False) -> None:
@@ -71,7 +67,6 @@ class Receiver:
         self.add(ALIVE, gone=gone)
 
     def begin(self, session: str | None, seq: int = 1) -> None:
-        """A process of B takes the name and sends its first pose."""
         self.token(session)
         self.receive(seq, 0.4, session)
 
@@ -81,7 +76,6 @@ class Receiver:
         self.after(then)
 
     def after(self, seconds: float = 0.02) -> None:
-        """Receive, and let time go by."""
         self.inbox.deliver(self.t, UTC)
         self.robot.goals.update_links(self.t)
         self.t += seconds
@@ -352,7 +346,6 @@ class Reporter:
             self.inbox.unreported[0].append(messages.PoseReceipt("B", seq, at, at, (0.4, 0.1, 0.0), (0.123456, 0, 0)))
 
     def report(self, t, **changed):
-        """One sample of telemetry, some values of the body's state `changed`."""
         state = copy(self.body.read(t)[0])
         for name, value in changed.items():
             setattr(state, name, value)

@@ -1,7 +1,5 @@
 """Bodies land, stop and close when their loop ends, whatever fails on the way, and when it hangs."""
 
-from __future__ import annotations
-
 import os
 import signal
 import threading
@@ -42,7 +40,6 @@ def run_to_end(body: Airborne, silence_s: float = 5.0, timing: DescentTiming = Q
 
 
 def run_and_break(body: Airborne, **given: Any) -> None:
-    """Run a robot to the error of its loop."""
     with pytest.raises(OSError, match="the loop breaks"):
         run_to_end(body, **given)
 
@@ -154,7 +151,7 @@ class Kennel:
         if self.stuck == what:
             self.never.wait(10.0)
 
-    def __enter__(self) -> Kennel:
+    def __enter__(self):
         self.dog.start()
         return self
 
@@ -217,7 +214,6 @@ threading.Event().wait()
 @pytest.mark.mechanism("watchdog: suspended process")
 @pytest.mark.system
 def test_frozen_process_is_no_hanging_loop():
-    """And one that hangs for good ends."""
     with started("-c", FROZEN) as process:
         assert process.stdout.readline() == "runs\n"
         os.kill(process.pid, signal.SIGSTOP)

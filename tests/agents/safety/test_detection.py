@@ -79,7 +79,6 @@ class Watched:
 
     @property
     def found(self):
-        """Causes of the last tick."""
         return {cause for cause in Cause if self.causes >> cause & 1}
 
     @property
@@ -251,7 +250,6 @@ def test_range_sensors_that_fall_silent(avoids):
 
 
 def woken(slept=0.6, neighbours="B"):
-    """A robot the process of which has just resumed."""
     robot = Watched(KHEPERA4, neighbours).step(1.0)
     robot.health.mark_resumed(robot.t, slept)
     return robot
@@ -317,7 +315,6 @@ def test_climb_without_measured_height(kind, patience_s):
 
 
 def lands(**measured):
-    """A drone that begins to land."""
     robot = Watched(landing_s=2.0).measure(**measured)
     robot.status.cruising, robot.status.landing = False, True
     return robot

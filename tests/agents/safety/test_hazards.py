@@ -25,7 +25,6 @@ class Bench:
         self.hazards = Hazards(kind, limits(**chosen))
 
     def see(self, seconds, *causes, active=True, landing=False):
-        """Let time pass with these causes."""
         present = sum(1 << cause for cause in causes)
         for _ in range(round(seconds / self.dt)):
             if present or self.hazards.under_way:

@@ -24,7 +24,7 @@ from agents.safety.setpoint_filter import SetpointFilter
 from agents.vectors import clamp
 from experiments.definition.experiment import LegTable, RobotTable
 from tests.agents.bench import Swarm
-from tests.cases import mostly_slow
+from tests.cases import for_each, mostly_slow
 from tests.small import small
 
 DT, SINKS = 0.01, 0.4  # [s], [m/s]
@@ -47,7 +47,6 @@ class Lander:
         self.sinks_at = inf
 
     def decide(self, t, lag):
-        """Ask where to land."""
         self.now.state = BodyState(t - lag, self.position, self.velocity, 0.0, flying=self.kind.flies and self.lands)
         self.now.begin(t)
         self.filter.judge(self.now)
@@ -139,9 +138,7 @@ EVENTS = {
 }
 
 
-@pytest.mark.parametrize(
-    ("event", "given"), [("blind", {}), ("late", {}), ("fallen", {}), (None, {"x": 3.05}), (None, {"z": 0.15})]
-)
+@for_each("event, given", [("blind", {}), ("late", {}), ("fallen", {}), (None, {"x": 3.05}), (None, {"z": 0.15})])
 def test_drone_that_cannot_go_aside_lands_in_place(event, given):
     bench, drone = above(**given)
     if event:

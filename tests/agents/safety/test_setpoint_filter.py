@@ -28,7 +28,6 @@ STOP, AHEAD, SLOW = (0.0, 0.0, 0.0, 0.0), (0.3, 0.0, 0.0, 0.0), (0.1, 0.0, 0.0, 
 
 
 def filtered(kind, position, *, yaw=0.0, age=0.0, limits=LIMITS):
-    """A filter, and a situation that it judged."""
     made, now = SetpointFilter(kind, limits), Situation()
     now.state = BodyState(-age, position, (0.0, 0.0, 0.0), yaw)
     now.begin(0.0)
