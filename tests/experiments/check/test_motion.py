@@ -37,9 +37,9 @@ def robots_on_wheels(duration_s: float = 120.0, **formation: float | str) -> Exp
 def test_weak_link_remedy_names_the_laws_own_key():
     offsets = {"KH01 - KH02": [1.0, 0.0], "KH02 - KH03": [-0.5, 0.866], "KH01 - KH03": [0.5, 0.866]}
     links = {pair: LinkTable(offset=offset) for pair, offset in offsets.items()}
-    found = findings(robots_on_wheels(40.0, law="displacement", links=links, stiffness=0.05))
-    assert "links may stay e = 5 mm/k off" in found["wheels-stop"].message
-    assert found["wheels-stop"].remedy.startswith("raise stiffness to 0.0")
+    found = findings(robots_on_wheels(40.0, law="displacement", links=links, stiffness=0.05))["wheels-stop"]
+    assert "links may stay e = 5 mm/k off" in found.message
+    assert found.remedy.startswith("raise stiffness to 0.0")
 
 
 def test_prediction_is_a_flight_without_noise():
@@ -135,12 +135,9 @@ def line_of(robot: str, x: float, y: float, speed: float) -> LegTable:
     return LegTable(at_s=1.0, robot=robot, plan={"kind": "line", "move_by": [x, y], "speed": speed})
 
 
-def wheels(x: float, y: float) -> RobotTable:
-    return RobotTable(kind="khepera4", start=[x, y])
-
-
-def drone(x: float, y: float, hover: float, kind: str = "crazyflie") -> RobotTable:
-    return RobotTable(kind=kind, start=[x, y], hover=hover)
+def robot(x: float, y: float, hover: float | None = None, kind: str = "crazyflie") -> RobotTable:
+    """A drone that hovers, or a Khepera."""
+    return RobotTable(kind=kind if hover else "khepera4", start=[x, y], hover=hover)
 
 
 LARGE = Arena(size=(6.0, 6.0, 2.0))
@@ -149,16 +146,16 @@ CROSSING = [line_of("A", 0.6, 0.6, 0.1), line_of("B", -0.6, 0.6, 0.1)]  # they m
 
 def low(hover: float, top: float) -> Experiment:
     """A Crazyflie overshoots its take-off by up to 11 %."""
-    return small({"F": drone(0.0, 0.0, hover)}, arena=Arena(size=(4.0, 4.0, top)), duration_s=5.0)
+    return small({"F": robot(0.0, 0.0, hover)}, arena=Arena(size=(4.0, 4.0, top)), duration_s=5.0)
 
 
 def crossed(height: float) -> Experiment:
-    robots = {"CF01": drone(-1.0, 0.0, 0.5), "TL01": drone(0.0, 0.0, height, "tello")}
+    robots = {"CF01": robot(-1.0, 0.0, 0.5), "TL01": robot(0.0, 0.0, height, "tello")}
     return small(robots, timeline=[line_of("CF01", 2.0, 0.0, 0.3)], duration_s=15.0)
 
 
-LANDING = {"G": wheels(0.0, 0.01), "H": wheels(0.5, 0.5), "F": drone(0.0, 0.0, 0.8)}
-BESIDE = small({"G": wheels(0.0, 0.0), "F": drone(0.5, 0.0, 0.8)}, {"G > F": 0.801}, duration_s=30.0, tolerance=0.1)
+LANDING = {"G": robot(0.0, 0.01), "H": robot(0.5, 0.5), "F": robot(0.0, 0.0, 0.8)}
+BESIDE = small({"G": robot(0.0, 0.0), "F": robot(0.5, 0.0, 0.8)}, {"G > F": 0.801}, duration_s=30.0, tolerance=0.1)
 
 
 @pytest.mark.parametrize(
@@ -207,7 +204,7 @@ def test_formation_lost_again_counts_acquired_and_names_stiffness(tmp_path):
 def test_anchors_without_links_are_checked():
     held = Formation(anchors={"CF01": 1.0})
     claims, weak = (
-        findings(small({"CF01": drone(0.0, 0.3, 0.7)}, formation=each, duration_s=20.0))
+        findings(small({"CF01": robot(0.0, 0.3, 0.7)}, formation=each, duration_s=20.0))
         for each in (held, changed(held, gain=1e-4))
     )
     assert "CF01 is 8 mm off at the end" in claims["anchored"].message

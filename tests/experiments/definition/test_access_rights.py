@@ -44,13 +44,7 @@ READ, WRITE = ("hear", "last"), ("put", "keep")
 
 
 def wanted(who, *, own, heard, guided):
-    """Rights of `who` on `park/<robot>/<what>`: pairs of an action and `what`.
-
-    Args:
-        own: It is this robot, or shares a process with it.
-        heard: It has a link from this robot.
-        guided: This robot gets its goals from a centre.
-    """
+    """Actions and `what` that `who` may on `park/<robot>/<what>`; `own`: of its process, `heard`: by a link."""
     goal = {*product(WRITE, ["goal"])} if guided else set()
     match who:
         case "observer" | "recorder" | "operator":

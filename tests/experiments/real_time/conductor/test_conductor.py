@@ -144,10 +144,7 @@ def test_output_of_a_lost_robot_is_told_once():
 @pytest.mark.mechanism("orders to several robots at once")
 @pytest.mark.system
 def test_order_reaches_all_before_one_has_answered(router):
-    """The first answers only when the last has the order: whoever is asked one after the other waits in vain.
-
-    A storage of the network, nearer and complete, answers with what was put there by mistake.
-    """
+    """The first answers only when the last has the order; a storage, nearer and complete, answers by mistake."""
     names, over = ["A", "B", "C"], threading.Event()
 
     def answer():

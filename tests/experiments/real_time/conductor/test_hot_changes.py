@@ -23,10 +23,7 @@ PHASES = {"takeoff": "airborne", "start": "running"}
 
 
 class Stage:
-    """The triangle in flight, a spare beside it, as the view and the processes of a run.
-
-    Processes start and end at once; robots do at once what they are told, unless they hang.
-    """
+    """The triangle in flight, with a spare, as view and processes of a run; all obey at once, unless they hang."""
 
     def __init__(self, monkeypatch, **more):
         self.clock = ManualClock(START)

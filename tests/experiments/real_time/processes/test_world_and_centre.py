@@ -320,12 +320,6 @@ def test_centre_with_clock_behind_is_followed():
     assert not guidance.unguided(2.3)
 
 
-class Taken(list):
-    """In the place of a recording: what would be in it."""
-
-    write = list.append
-
-
 def test_recorder_keeps_plausible_messages_of_the_world():
     lost = messages.ObstaclePose("box", (0.0, math.nan, 0.0))
     said = [
@@ -337,9 +331,9 @@ def test_recorder_keeps_plausible_messages_of_the_world():
         (KEYS.world, world_state(0.2)),
         (KEYS.contact, touched(0.3)),
     ]
-    taken = Taken()
+    taken = []
     with Net().worn() as net:
-        recorder = Recorder(net.session, KEYS, taken)
+        recorder = Recorder(net.session, KEYS, types.SimpleNamespace(write=taken.append))
         for key, message in said:  # MessagePack keeps what is not finite; JSON would say null
             net.deliver(sent(key, message)[1])
         recorder.receive()
