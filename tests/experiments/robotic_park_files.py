@@ -10,14 +10,10 @@ Operation:
   tool: Webots
   world: empty.wbt
 Experience: {{type: formation}}
-Architecture:
-  mode: {architecture}
-  node: {{executable: none, name: none, pkg: none}}
+Architecture: {{mode: {architecture}, node: {{executable: none, name: none, pkg: none}}}}
 CPU_Monitoring: {{enable: False}}
 Interface: {{enable: False}}
-Data_Logging:
-  enable: {logging}
-  topics: /dron01/local_pose
+Data_Logging: {{enable: {logging}, topics: /dron01/local_pose}}
 Robots:
 """
 ROBOT = """  Robot{number:02d}:
@@ -52,9 +48,7 @@ ROBOT = """  Robot{number:02d}:
       relationship: {relationship}
 
 """
-TAIL = """Supervisor: {enable: False}
-Other:
-"""
+TAIL = "Supervisor: {enable: False}\nOther:\n"
 USUAL = {
     "place": "virtual", "kind": "distance", "positioning": "Intern", "speaks": "EventBased", "threshold": 0.01,
     "pose_ms": 20, "law": "gradient", "protocol": "Continuous", "gain": 0.25,
@@ -127,16 +121,8 @@ FLAT = """{name}:
   {naming}: {name}
   {address}
   controller_type: PID_Continuous
-  communication:
-    type: {speaks}
-    threshold: {{type: Constant, co: 0.02, ai: Null}}
-  task:
-    enable: True
-    T: 200
-    Onboard: False
-    role: consensus
-    type: distance
-    relationship: '{relations}'
+  communication: {{type: {speaks}, threshold: {{type: Constant, co: 0.02, ai: Null}}}}
+  task: {{enable: True, T: 200, Onboard: False, role: consensus, type: distance, relationship: '{relations}'}}
 """
 OTHERS = {
     "dron01": ("khepera01", "khepera02"),

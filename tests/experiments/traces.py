@@ -58,20 +58,15 @@ def trace(what, position, *, step=STEP, sent=None, delay=0.0, case="only", seed=
         robots=names,
         clock="virtual",
         time=np.arange(count) * step,
-        position=position,
+        **dict.fromkeys(("position", "true_position", "goal"), position),
         yaw=np.zeros((count, rows)),
-        true_position=position,
-        goal=position,
         setpoint=np.zeros((count, rows, 4)),
         sent=PoseTable(who, number, when, when, place, still, np.zeros(len(when)), np.full(len(when), 100)),
         received=PoseTable(link, number[take], when[take], when[take] + delay, place[take], still[take]),
-        lost=none,
-        missed_deadlines=none,
+        **dict.fromkeys(("lost", "missed_deadlines", "interventions", "avoided"), none),
         ticks=np.full(rows, count),
         decisions=np.full(rows, count // 5),
         events=tuple(events),
-        interventions=none,
-        avoided=none,
     )
 
 

@@ -41,9 +41,8 @@ def alone(way, arena, kind="khepera4"):
 
 def test_closest_approach_of_surfaces_has_time_and_names():
     found = Clearance.of_trace(passing(along_x(0.3 + 0.2 * np.cos(T))))
-    closest = pytest.approx(0.1 - 2.0 * R, abs=1e-5)
-    at = pytest.approx(math.pi, abs=STEP)
-    assert found.robots == (Approach(("A", "B"), closest, at), Approach(("B", "A"), closest, at))
+    how = pytest.approx(0.1 - 2.0 * R, abs=1e-5), pytest.approx(math.pi, abs=STEP)
+    assert found.robots == (Approach(("A", "B"), *how), Approach(("B", "A"), *how))
     assert found.arena == (None, None)
 
 
@@ -57,13 +56,12 @@ def test_each_contact_is_one_collision_with_greatest_depth():
 
 def test_drone_over_ground_robot_is_its_height_away():
     kinds, gap = ("turtlebot3", "crazyflie"), 0.5 - TURTLEBOT3.height
-    level = 0.5 - CRAZYFLIE.radius - TURTLEBOT3.radius
+    away = pytest.approx(math.hypot(0.5 - CRAZYFLIE.radius - TURTLEBOT3.radius, gap))
     above, beside, into = (
         Clearance.of_trace(passing(along_x(np.full(50, x), z), kinds))
         for x, z in ((0.02, 0.5), (0.5, 0.5), (0.02, TURTLEBOT3.height - 0.5 * CRAZYFLIE.height))
     )
-    assert (above.robots[0].gap, above.overlaps) == (pytest.approx(gap), ())
-    assert beside.robots[0].gap == pytest.approx(math.hypot(level, gap))
+    assert (above.robots[0].gap, above.overlaps, beside.robots[0].gap) == (pytest.approx(gap), (), away)
     assert into.overlaps == (Collision(0.0, "A", "B", None, pytest.approx(0.5 * CRAZYFLIE.height)),)
 
 
@@ -98,16 +96,15 @@ def test_what_moves_is_where_it_is_then():
     plan = {"kind": "line", "move_by": [-2.0, 0.0], "speed": 0.5}
     arena = obstacles(cart=msgspec.structs.replace(POST, plan=plan), stone=Obstacle(radius=0.1, at=(0.0, 2.0)))
     found = Clearance.of_trace(alone(np.zeros((len(T), 3)), arena))
-    assert [(each.second, each.time_s) for each in found.overlaps] == [("cart", pytest.approx(1.46, abs=1.01 * STEP))]
-    assert found.overlaps[0].overlap == pytest.approx(0.2 + R)
+    at = pytest.approx(1.46, abs=1.01 * STEP)
+    assert found.overlaps == (Collision(at, "A", "cart", None, pytest.approx(0.2 + R)),)
     assert found.arena[0] == Approach(("A", "cart"), pytest.approx(-0.2 - R), pytest.approx(2.0))
 
 
 @pytest.mark.parametrize(("x", "y", "gap"), [(1.5, 0.3, 1.0), (-2.4, 0.0, 0.1), (0.0, -1.1, 0.4), (0.2, 1.6, -0.1)])
 def test_distance_to_the_walls(x, y, gap):
     found = Clearance.of_trace(alone([(x, y, 0.0)] * 2, Arena(size=(5.0, 3.0, 2.0), walls=True)))
-    assert found.arena == (Approach(("A", "wall"), pytest.approx(gap - R), 0.0),)
-    assert len(found.overlaps) == (gap < R)
+    assert (found.arena, len(found.overlaps)) == ((Approach(("A", "wall"), pytest.approx(gap - R), 0.0),), gap < R)
 
 
 def test_what_is_unknown_touches_nothing():
@@ -120,27 +117,20 @@ def test_what_is_unknown_touches_nothing():
 
 
 def with_contacts(known, *contacts, clock="virtual", **bodies):
-    robots = known.plan.experiment.robots
-    made = {name: msgspec.structs.replace(robots[name], body=bodies.get(name, "twin")) for name in robots}
+    robots = known.plan.experiment.robots.items()
+    made = {name: msgspec.structs.replace(robot, body=bodies.get(name, "twin")) for name, robot in robots}
     return dataclasses.replace(known, plan=known.plan.changed(robots=made), contacts=contacts, clock=clock)
 
 
 def test_what_an_engine_saw_stands_for_what_overlaps():
     known = passing(along_x(np.full_like(T, 0.1)))
     seen = with_contacts(known, Contact(1.5, "B", "wall", 0.2, 0.001), Contact(0.5, "A", "B", 0.1, 0.0005))
-    assert [each.time_s for each in collisions(known, Clearance.of_trace(known))] == [0.0]
-    assert collisions(seen, Clearance.of_trace(seen)) == (
-        Collision(0.5, "A", "B", 0.1, 0.0005),
-        Collision(1.5, "B", "wall", 0.2, 0.001),
-    )
-    quiet = with_contacts(known)
-    assert collisions(quiet, Clearance.of_trace(quiet)) == ()
-
-
-@pytest.mark.parametrize(("bodies", "count"), [({}, 1), ({"A": "world"}, 0)])
-def test_robots_without_a_world_are_watched_by_position(bodies, count):
-    known = with_contacts(passing(along_x(np.full_like(T, 0.1))), clock="real", **bodies)
-    assert len(collisions(known, Clearance.of_trace(known))) == count
+    in_world = with_contacts(known, clock="real", A="world")
+    by_position = with_contacts(known, clock="real")  # without a world nothing sees contacts
+    found = [collisions(each, Clearance.of_trace(each)) for each in (seen, with_contacts(known), in_world)]
+    assert found == [(Collision(0.5, "A", "B", 0.1, 0.0005), Collision(1.5, "B", "wall", 0.2, 0.001)), (), ()]
+    for each in (known, by_position):
+        assert [blow.time_s for blow in collisions(each, Clearance.of_trace(each))] == [0.0]
 
 
 def test_pushed_obstacle_is_no_longer_where_it_stood():

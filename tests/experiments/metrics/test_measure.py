@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from agents.network.messages import Event
-from experiments.definition.experiment import AnchorTable
+from experiments.definition.experiment import AnchorTable, Shadow
 from experiments.metrics import statistics
 from experiments.metrics.measure import measure
 from experiments.metrics.metric import OURS
+from experiments.metrics.shadow import agreement
 from experiments.metrics.signals import Measurement, belief_errors, net_rotation
-from experiments.report import metrics_files, verdict
+from experiments.report import figures, metrics_files, verdict
 from tests.experiments.traces import STEP, at_origin, cut, pair, park, trace
 
 T = np.arange(0.0, 20.0 + STEP / 2, STEP)
@@ -33,8 +34,7 @@ def test_integrals_of_a_decaying_error():
     measured = measure(DECAY)
     end = math.exp(-20.0)
     for robot in measured.robots:  # the leader listens to nobody: it has the error of the link that listens to it
-        assert robot.iae == pytest.approx(1.0 - end, rel=1e-4)
-        assert robot.itae == pytest.approx(1.0 - 21.0 * end, rel=1e-4)
+        assert (robot.iae, robot.itae) == pytest.approx((1.0 - end, 1.0 - 21.0 * end), rel=1e-4)
         assert robot.rmse == pytest.approx(math.sqrt((1.0 - end**2) / 40.0), rel=1e-2)
     assert measured.robots[1].settle_s == pytest.approx(round(math.log(50.0) / STEP + 0.5) * STEP)  # 2 % of the largest
     assert (measured.leaders, measured.duration_s) == (("L",), pytest.approx(20.0))
@@ -51,8 +51,8 @@ def test_acquired_when_the_one_second_mean_stays_inside():
     assert measured.acquired_s == (measured.robots[1].acquired_s,)
     for off, residual in ((0.06, 0.06), (0.08 * np.where(np.arange(len(T)) % 2, 1.0, -1.0), 0.08)):
         never = measure(pair(np.ones_like(T) + off))
-        assert (never.robots[1].acquired_s, never.mean["acquired_s"]) == (None, None)
-        assert never.robots[1].residual == pytest.approx(residual)
+        found = never.robots[1].acquired_s, never.mean["acquired_s"], never.robots[1].residual
+        assert found == (None, None, pytest.approx(residual))
 
 
 def test_belief_before_the_first_pose_is_no_error():
@@ -69,13 +69,11 @@ def test_belief_before_the_first_pose_is_no_error():
 def test_each_phase_is_measured_from_its_leg():
     off = np.where((T >= 10.0) & (T < 13.0), 0.5, 0.0) + np.where(T < 1e-9, 0.04, 0.0)
     measured = measure(pair(1.0 + off, legs=[9.99, 10.0]))
-    assert measured.starts_s == (0.0, 9.99)  # legs that begin within one sample are one phase
     robot = measured.robots[1]
-    assert robot.acquired_s == 0.0
+    assert (measured.starts_s, robot.acquired_s) == ((0.0, 9.99), 0.0)  # legs within one sample are one phase
     (phase,) = robot.phases
     assert phase.acquired_s == pytest.approx(3.9, abs=2 * STEP)  # nine tenths of the window must be inside
-    assert phase.residual == pytest.approx(0.0, abs=1e-9)
-    assert robot.by_the_end == (phase.residual, "L")
+    assert robot.by_the_end == (phase.residual, "L") == (pytest.approx(0.0, abs=1e-9), "L")
     assert measure(pair(np.ones_like(T), legs=[0.0, 20.0, 30.0])).starts_s == (0.0,)  # at the start, after the end
 
 
@@ -85,8 +83,7 @@ def test_residual_is_worst_link_in_phases_last_second():
     place[:, 0, 0] = np.select([T < 9.0, T < 10.0], [-3.0, -1.02], -1.3)
     place[:, 1, 0] = 1.1
     robot = measure(trace(what, place)).robots[2]
-    assert (robot.residual, robot.worst) == (pytest.approx(0.1), "B")
-    assert robot.by_the_end == (pytest.approx(0.3), "A")
+    assert (robot.residual, robot.worst, *robot.by_the_end) == (pytest.approx(0.1), "B", pytest.approx(0.3), "A")
 
 
 @pytest.mark.parametrize(("rate", "drift"), [(0.5, -0.3), (-0.2, 0.1), (0.0, 0.3)])
@@ -121,9 +118,8 @@ def moving():
 
 def test_belief_error_of_pose_held_for_a_second(moving):
     belief = measure(moving).belief[0]
-    assert (belief.receiver, belief.sender) == ("F", "L")
-    assert belief.rms == pytest.approx(0.1 / math.sqrt(3.0), rel=0.03)
-    assert belief.max == pytest.approx(0.1, abs=0.1 * STEP + 1e-9)
+    rms, most = pytest.approx(0.1 / math.sqrt(3.0), rel=0.03), pytest.approx(0.1, abs=0.1 * STEP + 1e-9)
+    assert (belief.receiver, belief.sender, belief.rms, belief.max) == ("F", "L", rms, most)
     order = np.arange(20)
     order[[4, 5]] = 5, 4  # the sixth pose arrives first, at the time of the fifth
     overtaken = msgspec.structs.replace(moving.received.take(order), arrival=moving.received.arrival)
@@ -136,8 +132,7 @@ def test_transmissions_rates_and_gaps(moving):
     leader, other = measured.robots
     assert (measured.network_messages, measured.deliveries) == (20, 20)
     assert (leader.messages, leader.bytes, leader.receivers, leader.received) == (20, 2000, 1, 20)
-    assert leader.f_hz == pytest.approx(1.0)
-    assert (leader.gap_min_s, leader.gap_median_s, leader.gap_max_s) == pytest.approx((1.0, 1.0, 1.0))
+    assert (leader.f_hz, leader.gap_min_s, leader.gap_median_s, leader.gap_max_s) == pytest.approx([1.0] * 4)
     assert (other.messages, other.gap_median_s) == (0, None)
     kept = moving.sent.take(np.arange(20) % 3 == 0)  # what the recorder lost is counted by sequence numbers
     leader = measure(replace(moving, sent=kept)).robots[0]
@@ -179,9 +174,8 @@ def test_benchmark_cost_by_hand(anchored):
 def test_closest_approach_and_excursion():
     gap = 1.0 + 0.5 * np.cos(0.5 * T)  # closest at 2 π, farthest at the start
     outside, inside = measure(pair(gap + 1.0)), measure(pair(gap))
-    assert outside.mean["closest"] == pytest.approx(1.5, abs=1e-4)
-    assert (outside.excursion, outside.excursion_robot) == (pytest.approx(0.5), "F")
-    assert (inside.excursion, inside.excursion_robot) == (0.0, "")
+    assert (outside.mean["closest"], outside.excursion) == pytest.approx((1.5, 0.5), abs=1e-4)
+    assert (outside.excursion_robot, inside.excursion, inside.excursion_robot) == ("F", 0.0, "")
 
 
 def test_dead_robot_does_not_poison_the_others():
@@ -190,12 +184,11 @@ def test_dead_robot_does_not_poison_the_others():
     before, after = measure(whole), measure(unseen(whole, (10.0 - STEP / 2, 20.1, row["CF03"])))
     dead, neighbour = after.robots[row["CF03"]], after.robots[row["CF01"]]
     assert (after.died, dead.acquired_s) == (("CF03",), None)
-    assert dead.coverage == pytest.approx(0.5, abs=0.01)
+    assert (dead.coverage, neighbour.coverage) == pytest.approx((0.5, 1.0 - 0.5 / 4.0), abs=0.01)
     assert after.robots[:4] == before.robots[:4]  # those that have no link with it
     assert after.mean["iae"] == pytest.approx(np.mean([robot.iae for robot in after.robots[1:6]]))
     assert None not in (after.acquired_s[0], after.rotation_rad_s[0])
-    assert neighbour.coverage == pytest.approx(1.0 - 0.5 / 4.0, abs=0.01)
-    assert msgspec.json.encode(after).find(b"NaN") == -1
+    assert b"NaN" not in msgspec.json.encode(after)
 
 
 def test_unseen_and_unlinked_robots_have_no_errors():
@@ -224,9 +217,8 @@ def test_document_has_the_shape_for_scripts():
     assert set(b) == {"robots", "mean", "ratio", "collisions", "network", "near_m"}
     assert set(b["mean"]) == set(b["ratio"]) == set(OURS)
     assert set(b["robots"]["TB01"]) == {name for name, metric in OURS.items() if metric.per == "robot"}
-    followers = [b["robots"][name]["iae"] for name in b["robots"] if name != "TB01"]
-    assert b["mean"]["iae"] == pytest.approx(np.mean(followers))
-    assert b["ratio"]["f_hz"] == pytest.approx(b["mean"]["f_hz"] / 50.0)
+    followers = np.mean([b["robots"][name]["iae"] for name in b["robots"] if name != "TB01"])
+    assert (b["mean"]["iae"], b["ratio"]["f_hz"]) == pytest.approx((followers, b["mean"]["f_hz"] / 50.0))
     assert (a["ratio"]["iae"], b["ratio"]["lost"]) == (1.0, None)  # the reference lost nothing
     assert msgspec.json.decode(msgspec.json.encode(found)) == found
     short = msgspec.structs.replace(short, spoiled=("robots failed",))
@@ -242,12 +234,11 @@ def test_spread_over_seeds():
         for k, value in enumerate([1.0, 2.0, None, 3.0])
     ]
     found = statistics.across_seeds(documents)
-    assert found["seeds"] == [0, 1, 2, 3]
-    assert "flawed" not in found
+    assert (found["seeds"], "flawed" in found) == ([0, 1, 2, 3], False)
     half = pytest.approx(4.302653 / math.sqrt(3.0))
     assert found["cases"]["a"]["mean"]["iae"] == {"mean": 2.0, "std": 1.0, "ci95": half, "n": 3}
-    assert statistics.spread([None]) == statistics.Spread(None, None, None, 0)
-    assert statistics.spread([5.0]) == statistics.Spread(5.0, None, None, 1)
+    few = [statistics.spread(values) for values in ([None], [5.0])]
+    assert few == [statistics.Spread(None, None, None, 0), statistics.Spread(5.0, None, None, 1)]
     printed = {1: 12.7062, 2: 4.30265, 3: 3.18245, 4: 2.77645, 5: 2.57058, 9: 2.26216, 19: 2.09302, 99: 1.98422}
     assert [statistics.student_95(k) for k in printed] == pytest.approx([*printed.values()], rel=1.5e-3)
 
@@ -263,8 +254,8 @@ def test_csv_has_a_row_per_robot_and_mean(tmp_path):
     measured = measure(park())
     metrics_files.write_csv(tmp_path / "metrics.csv", [measured])
     rows = list(csv.DictReader((tmp_path / "metrics.csv").read_text("utf-8").splitlines()))
-    assert float(rows[2]["phase2_acquired_s"]) == measured.robots[2].phases[0].acquired_s
-    assert float(rows[-1]["iae"]) == measured.mean["iae"]
+    found = float(rows[2]["phase2_acquired_s"]), float(rows[-1]["iae"])
+    assert found == (measured.robots[2].phases[0].acquired_s, measured.mean["iae"])
     assert [row["in_mean"] for row in rows] == ["0", *["1"] * 6, ""]
 
 
@@ -272,9 +263,9 @@ def test_time_without_a_network_is_nobodys_death():
     """A router was away for 2 s: all robots are unknown then, and come back one after the other."""
     measured, whole = measure(unseen(DECAY, (4.0, 6.0), (4.0, 6.4, 1))), measure(DECAY)
     assert measured.away_s == pytest.approx(2.0, abs=2 * STEP)
-    assert (measured.died, measured.acquired_s) == ((), whole.acquired_s)
-    assert [robot.known for robot in measured.robots] == [1.0, 1.0]
-    assert (measured.robots[1].coverage, measured.robots[1].settle_s) == (1.0, whole.robots[1].settle_s)
+    follower = measured.robots[1]
+    assert (measured.died, measured.acquired_s, follower.settle_s) == ((), whole.acquired_s, whole.robots[1].settle_s)
+    assert (follower.coverage, *(robot.known for robot in measured.robots)) == (1.0, 1.0, 1.0)
     assert measured.mean["iae"] is not None
     assert any("away for 2.0 s" in finding.text for finding in verdict.interruptions([measured]))
     for gone in ([0, 1], [1]):  # and do not come back
@@ -333,22 +324,94 @@ BLIND = f"hold: {LOST}: the last is 0.51 s old"
 def test_body_that_repeats_an_old_position_has_none(events, known, failed):
     measured = measure(replace(DECAY, events=tuple(Event(at, "hazard", "F", text) for at, text in events.items())))
     robot = measured.robots[1]
-    assert (robot.known, robot.coverage) == pytest.approx((known, known), abs=0.002)
-    assert measured.away_s == 0.0
-    assert ("F" in measured.died) == (known < 0.95)
-    assert bool(measured.failures) == bool(failed)
+    assert (robot.known, robot.coverage, measured.away_s) == pytest.approx((known, known, 0.0), abs=0.002)
+    assert ("F" in measured.died, bool(measured.failures)) == (known < 0.95, bool(failed))
     assert failed in "".join(measured.failures)
 
 
 def test_time_without_position_is_neither_inside_nor_outside():
     """The process of one robot stood still for 0.6 s, after it had acquired, or before it was inside."""
     measured = measure(unseen(DECAY, (6.0, 6.6, 1)))
-    assert measured.acquired_s == measure(DECAY).acquired_s
-    (gap,) = measured.gaps
-    assert gap == "F from 6.0 to 6.6 s"
-    assert any(gap in each.text and each.mark == "fair" for each in verdict.findings([measured]))
+    gap = "F from 6.0 to 6.6 s"
+    assert (measured.acquired_s, measured.gaps) == (measure(DECAY).acquired_s, (gap,))
+    assert [each.mark for each in verdict.findings([measured]) if gap in each.text] == ["fair"]
     early = measure(unseen(DECAY, (2.9, 3.7, 1))).acquired_s[0]
     assert early == pytest.approx(3.7, abs=0.1)  # inside for certain only when it is seen again
     blind = unseen(DECAY, (15.0, 21.0, 1))
     failed = measure(replace(blind, position=blind.true_position)).failures
     assert failed == ("F: its position was known for 75% of the time only",)
+
+
+def shadowed(way, twin, *, yaw=0.0, twin_yaw=None, restart=5.0):
+    """A robot with a twin beside it, and one without; the paths (T, 3) of robot and twin."""
+    what = at_origin({"A": "crazyflie", "B": "crazyflie"}, {"A - B": 1.0})
+    robots = {**what.robots, "A": msgspec.structs.replace(what.robots["A"], shadow=Shadow(restart_s=restart))}
+    place = np.stack([way, np.full_like(way, 1.0)], axis=1)
+    known = trace(msgspec.structs.replace(what, robots=robots), place)
+    place, turn = (twin, np.full_like(twin, np.nan)), [yaw if twin_yaw is None else twin_yaw, np.nan]
+    of_twin = {"shadow_position": np.stack(place, axis=1), "shadow_yaw": np.tile(turn, (len(T), 1))}
+    return replace(known, yaw=np.full((len(T), 2), yaw), **of_twin)
+
+
+def winding(t):
+    return np.column_stack([np.sin(t), np.cos(0.7 * t), 0.5 + 0.1 * np.sin(0.3 * t)])
+
+
+def test_a_constant_difference_is_bias_and_rmse():
+    off = np.array([0.03, -0.04, 0.12])
+    mine, none = agreement(shadowed(winding(T), winding(T) + off, yaw=math.pi / 2, twin_yaw=math.pi / 2 - 0.1))
+    assert none is None
+    assert (*mine.bias, mine.along, mine.across) == pytest.approx((0.03, -0.04, 0.12, -0.04, -0.03))
+    assert (mine.rmse, mine.largest, mine.bias_yaw, mine.rmse_yaw) == pytest.approx((0.13, 0.13, -0.1, 0.1))
+    assert (*mine.correlation, mine.correlation_speed) == pytest.approx([1.0] * 4)
+    assert (mine.horizon_s, mine.known) == (5.0, 1.0)
+    (mine, _) = agreement(shadowed(winding(T), winding(T), yaw=math.pi - 0.01, twin_yaw=-math.pi + 0.02))
+    assert mine.bias_yaw == pytest.approx(0.03)  # the short way round
+
+
+def test_a_lag_is_a_bias_along_the_way():
+    heading, speed, lag = 0.6, 0.2, 0.15
+    along = speed * np.array([math.cos(heading), math.sin(heading), 0.0])
+    (mine, _) = agreement(shadowed(T[:, None] * along, (T - lag)[:, None] * along, yaw=heading))
+    assert (mine.along, mine.across, mine.rmse) == pytest.approx((-speed * lag, 0.0, speed * lag))
+    one = pytest.approx(1.0)
+    assert (*mine.correlation, mine.correlation_speed) == (one, one, None, None)  # neither climbs, or is ever faster
+
+
+def test_lag_behind_a_swing_shows_in_correlation():
+    frequency, lag = math.pi, 0.1  # whole periods
+    swing, late = (np.outer(0.2 * np.sin(frequency * at), [1.0, 0.0, 0.0]) for at in (T, T - lag))
+    (mine, _) = agreement(shadowed(swing, late, restart=None))
+    rmse = 0.2 * math.sqrt(2.0) * math.sin(0.5 * frequency * lag)
+    assert (mine.correlation[0], mine.rmse) == pytest.approx((math.cos(frequency * lag), rmse), rel=1e-3)
+    assert (mine.bias, mine.horizon_s) == (pytest.approx((0.0, 0.0, 0.0), abs=1e-4), None)
+
+
+def test_reset_twin_has_its_horizons_error_and_speed():
+    speed, forward = 0.1 + 0.05 * np.sin(T), [1.0, 0.0, 0.0]
+    line = np.outer(np.concatenate([[0.0], np.cumsum(speed[:-1]) * STEP]), forward)
+    ahead = np.outer(0.01 * np.mod(T + 1e-9, 5.0), forward)  # 1 cm/s too fast
+    (mine, _) = agreement(shadowed(line, line + ahead))
+    assert (mine.along, mine.rmse, mine.largest) == pytest.approx((0.025, 0.05 / math.sqrt(3.0), 0.05), rel=7e-3)
+    assert mine.correlation_speed == pytest.approx(1.0)  # the jumps back are no speed of the twin's
+
+
+def test_what_is_unknown_is_left_out():
+    twin, way = winding(T) + np.array([0.01, 0.0, 0.0]), winding(T)
+    twin[T < 5.0], way[T > 15.0] = np.nan, np.nan
+    (mine, _) = agreement(shadowed(way, twin))
+    assert (*mine.bias, mine.correlation_speed) == pytest.approx((0.01, 0.0, 0.0, 1.0))
+    assert mine.known == pytest.approx(0.5, abs=2e-3)
+    plain = trace(at_origin({"A": "crazyflie"}, {}), winding(T)[:, None])
+    assert (agreement(shadowed(way, np.full_like(way, np.nan))), agreement(plain)) == ([None, None], [None])
+    assert measure(plain).robots[0].shadow is None
+    assert "shadows" not in figures.all_figures([], [plain])
+
+
+def test_figure_has_a_row_for_each_shadowed_robot():
+    known = shadowed(winding(T), winding(T) + np.array([0.02, 0.0, 0.0]))
+    figure = figures.all_figures([], [known, replace(known, case="other")])["shadows"]
+    assert len(figure.axes) == 4
+    above, beside = figure.axes[:2]
+    np.testing.assert_allclose(above.lines[1].get_xdata() - above.lines[0].get_xdata(), 0.02)
+    assert [line.get_ydata().mean().round(9) for line in beside.lines] == [2.0, 0.0, 0.0]  # cm along, left, up

@@ -11,7 +11,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from msgspec.structs import replace
 
-from agents.network.messages import CentreState, Event, GoalReceipt, HostClock, Pose, PoseReceipt, State
+from agents.network.messages import CentreState, Contact, Event, GoalReceipt, HostClock, Pose, PoseReceipt, State
 from experiments.definition.experiment import Formation, Rates, RobotTable
 from experiments.metrics.measure import measure
 from experiments.recording.clocks import ClockSample, Correction, host_offset
@@ -33,37 +33,38 @@ def test_a_run_is_read_back(path):
     assert (trace.case, trace.seed, trace.clock, trace.robots) == ("only", 4, "real", ("TB01", "CF01"))
     assert trace.plan.experiment == rec.PAIR
     assert (trace.attitude, trace.shadow_position, trace.shadow_yaw) == (None, None, None)
-    np.testing.assert_allclose(trace.time, GRID, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(trace.position[..., 0], np.column_stack([GRID, -GRID]), atol=1e-6)
-    np.testing.assert_allclose(trace.true_position[:, 0, 2], 0.01)
-    np.testing.assert_allclose(trace.true_position[:, 1], trace.position[:, 1])
-    np.testing.assert_allclose(trace.goal[:, 0], np.column_stack([GRID + 1, GRID * 0 + 2, GRID * 0 + 3]))
-    np.testing.assert_allclose(trace.setpoint[5, 1], [-0.5, 0.0, 0.5, 0.25])
     sent, received, net = trace.sent, trace.received, trace.plan.pose_links
-    np.testing.assert_allclose(sent.stamp, GRID[:-1], atol=1e-6)
-    np.testing.assert_allclose(sent.position[:, :2], np.column_stack([GRID[:-1], GRID[:-1] * 0 + 0.5]))
-    np.testing.assert_allclose(sent.velocity, np.tile([0.1, 0.2, 0.3], (10, 1)))
-    assert (sent.bytes.tolist(), sent.yaw.tolist()) == ([150] * 10, pytest.approx([0.4] * 10))
-    np.testing.assert_allclose(received.arrival, GRID[1:] - 0.04, atol=1e-6)
-    np.testing.assert_allclose(received.stamp, GRID[1:] - 0.05, atol=1e-6)
-    np.testing.assert_allclose(received.position[:, 0], GRID[1:] - 0.05)
-    np.testing.assert_array_equal(received.velocity, np.tile([1.0, 0.0, 0.0], (10, 1)))
+    for found, wanted in (
+        (trace.time, GRID),
+        (trace.position[..., 0], np.column_stack([GRID, -GRID])),
+        (trace.true_position[:, 0, 2], np.full(11, 0.01)),
+        (trace.true_position[:, 1], trace.position[:, 1]),
+        (trace.goal[:, 0], np.column_stack([GRID + 1, GRID * 0 + 2, GRID * 0 + 3])),
+        (trace.setpoint[5, 1], [-0.5, 0.0, 0.5, 0.25]),
+        (sent.stamp, GRID[:-1]),
+        (sent.position[:, :2], np.column_stack([GRID[:-1], GRID[:-1] * 0 + 0.5])),
+        (sent.velocity, np.tile([0.1, 0.2, 0.3], (10, 1))),
+        (sent.yaw, [0.4] * 10),
+        (received.arrival, GRID[1:] - 0.04),
+        (received.stamp, GRID[1:] - 0.05),
+        (received.position[:, 0], GRID[1:] - 0.05),
+        (received.velocity, np.tile([1.0, 0.0, 0.0], (10, 1))),
+    ):
+        np.testing.assert_allclose(found, wanted, rtol=0.0, atol=1e-6)
     assert {(net.receiver[link], net.sender[link]) for link in received.link} == {(1, 0)}
-    assert sent.seq.tolist() == received.seq.tolist() == list(range(1, 11))
-    assert (trace.lost.tolist(), trace.ticks.tolist()) == ([1, 0], [100, 99])
-    assert (trace.missed_deadlines.tolist(), trace.decisions.tolist()) == ([3, 0], [10, 9])
-    assert trace.events == (Event(0.0, "start", "conductor", "go"),)
+    assert (sent.bytes.tolist(), sent.seq.tolist(), received.seq.tolist()) == ([150] * 10, *[[*range(1, 11)]] * 2)
+    counts = [each.tolist() for each in (trace.lost, trace.ticks, trace.missed_deadlines, trace.decisions)]
+    assert (counts, trace.events) == ([[1, 0], [100, 99], [3, 0], [10, 9]], (Event(0.0, "start", "conductor", "go"),))
 
 
 def test_what_the_world_said_is_read_back(path):
     touches = [rec.touched(0.7), rec.touched(-0.1), rec.touched(0.2, second="wall"), rec.touched(1.2)]
-    rec.broken(path, *rec.whole_run(), rec.world_state(-0.5), rec.world_state(0.5), rec.world_state(1.5), *touches)
+    rec.broken(path, *rec.whole_run(), *map(rec.world_state, (-0.5, 0.5, 1.5)), *touches)
     trace = read(path).trace
-    wall, robot = trace.contacts
-    assert (wall.first, wall.second, wall.stamp) == ("TB01", "wall", pytest.approx(0.2))
-    assert (robot.second, robot.stamp, robot.impulse, robot.overlap) == ("CF01", pytest.approx(0.7), 0.25, 0.001)
-    assert [msgspec.structs.replace(each, stamp=rec.START + 0.5) for each in trace.world] == [rec.world_state(0.5)]
-    assert trace.world[0].stamp == pytest.approx(0.5)
+    second = [("wall", 0.2), ("CF01", 0.7)]
+    wanted = [Contact(pytest.approx(at, abs=1e-6), "TB01", name, 0.25, 0.001) for name, at in second]
+    assert [*trace.contacts] == wanted
+    assert [*trace.world] == [replace(rec.world_state(0.5), stamp=pytest.approx(0.5, abs=1e-6))]
 
 
 @pytest.mark.parametrize(("engine", "contacts"), [(None, None), ("point-mass", None), ("other", None), ("pymunk", ())])
@@ -84,8 +85,7 @@ def test_attitude_interpolates_the_short_way_on_recorded_side(path):
     np.testing.assert_allclose(trace.attitude[:, 0], wanted, atol=1e-6)
     np.testing.assert_allclose(trace.shadow_position[:, 0] - trace.position[:, 0], np.tile([0.0, 0.1, 0.0], (11, 1)))
     np.testing.assert_allclose(trace.shadow_yaw[:, 0], 3.0 + GRID, atol=1e-6)
-    for array in (trace.attitude, trace.shadow_position):
-        assert np.isnan(array[:, 1]).all()
+    assert all(np.isnan(array[:, 1]).all() for array in (trace.attitude, trace.shadow_position))
 
 
 @pytest.mark.parametrize("yaw", [[math.remainder(0.9 * k, math.tau) for k in range(11)], [None] * 5 + [0.3] * 6])
@@ -183,8 +183,8 @@ def test_foreign_poses_count_once_for_all_receivers(path):
 
 def test_impossible_counts_of_the_centre_are_left_out(path):
     reports = [CentreState(rec.START + 0.5, ["CF01"], received={"TB01": count}) for count in (4, 2**60, -3)]
-    rec.write(path, *rec.whole_run(), *reports, experiment=rec.pair_with(architecture="centralised"))
-    assert read(path).trace.goals.received.tolist() == [4, 0]
+    trace = rec.trace_of(path, *rec.whole_run(), *reports, experiment=rec.pair_with(architecture="centralised"))
+    assert trace.goals.received.tolist() == [4, 0]
 
 
 def test_what_a_drifting_clock_stamped_is_set_right(path):
@@ -198,9 +198,8 @@ def test_what_a_drifting_clock_stamped_is_set_right(path):
     hour = rec.pair_with(duration_s=3600.0, rates=Rates(state_hz=1.0))
     trace = rec.trace_of(path, *messages, experiment=hour)
     np.testing.assert_allclose(trace.position[[600, 1800, 3600], :, 0], [[x, x] for x in (0.6, 1.8, 3.6)], atol=1e-6)
-    assert trace.sent.stamp[0] == pytest.approx(1800.0, abs=1e-4)
-    assert trace.received.stamp[0] == pytest.approx(1800.0, abs=1e-4), "on the speaker's clock"
-    assert trace.received.arrival[0] == pytest.approx(1800.01, abs=1e-4), "on the listener's"
+    said = trace.sent.stamp[0], trace.received.stamp[0], trace.received.arrival[0]  # the last on the listener's clock
+    assert said == pytest.approx((1800.0, 1800.0, 1800.01), abs=1e-4)
 
 
 def test_the_start_is_the_conductors_else_the_robots(path, tmp_path):
@@ -242,10 +241,15 @@ def test_end_of_a_run(path, duration_s, messages, end, silent):
     assert np.isfinite(trace.position[-1]).all(axis=1).tolist() == [True, not silent]
 
 
-@pytest.mark.parametrize("end", [-0.5, 0.05, None])
-def test_a_run_that_never_started(path, end):
-    began = [rec.status(started=0.0)] if end is None else [rec.begun(), rec.landed(end, "landing (interrupted)")]
-    says = "no robot had started" if end is None else "ended before the common start"
+INTERRUPTED = [[rec.begun(), rec.landed(end, "landing (interrupted)")] for end in (-0.5, 0.05)]
+
+
+@pytest.mark.parametrize(
+    ("began", "says"),
+    [*[(began, "ended before the common start") for began in INTERRUPTED],
+     ([rec.status(started=0.0)], "no robot had started")],
+)  # fmt: skip
+def test_a_run_that_never_started(path, began, says):
     with pytest.raises(NotStarted, match=says):
         rec.trace_of(path, rec.state(), *began)
 
@@ -263,11 +267,11 @@ def test_impossible_messages_are_counted_and_left_out(path):
 
 @pytest.mark.parametrize("stamp", [math.nan, math.inf, -1.0, 1e19])
 def test_broken_clock_does_not_stretch_the_timeline(path, stamp):
-    rec.write(path, rec.begun(), rec.landed(), msgspec.structs.replace(rec.state(), stamp=stamp))
+    rec.write(path, rec.begun(), rec.landed(), replace(rec.state(), stamp=stamp))
     with path.open("rb") as file:
-        statistics = make_reader(file).get_summary().statistics
-    assert statistics.message_start_time == round(rec.START * 1e9)
-    assert statistics.message_end_time == round((rec.START + 1.0) * 1e9)
+        found = make_reader(file).get_summary().statistics
+    wanted = [round((rec.START + at) * 1e9) for at in (0.0, 1.0)]
+    assert [found.message_start_time, found.message_end_time] == wanted
     assert np.isnan(read(path).trace.position).all()
 
 
@@ -297,9 +301,10 @@ def test_channels_of_others_are_passed_over(path, tmp_path):
     path.write_bytes(path.read_bytes()[:-1])
     assert recover(path, target).messages == 2
     with target.open("rb") as file:
-        kept = [(schema, channel.topic, m.data) for schema, channel, m in make_reader(file).iter_messages()]
-    assert [part[1:] for part in kept] == [("/image", b"junk"), ("/raw", b"more")]
-    assert (kept[0][0].name, kept[1][0]) == ("sensor_msgs/msg/Image", None)
+        kept = [
+            (schema and schema.name, channel.topic, m.data) for schema, channel, m in make_reader(file).iter_messages()
+        ]
+    assert kept == [("sensor_msgs/msg/Image", "/image", b"junk"), (None, "/raw", b"more")]
 
 
 @pytest.mark.parametrize(
@@ -349,11 +354,11 @@ def test_drift_is_removed_after_the_initial_offset():
     true = begin + np.array([0.0, 10.0, 300.0, 600.0])
     stamped = true + drift * (true - begin)  # its offset of 0.2 s was taken off when it stamped
     assert [right("CF01", float(stamp)) for stamp in stamped] == pytest.approx(list(true), abs=1e-5)
-    assert right("KH01", begin + 5.0) == begin + 5.0, "measured once"
-    assert right("TB01", begin + 5.0) == begin + 5.0, "it ran here"
+    once_and_here = [right(robot, begin + 5.0) for robot in ("KH01", "TB01")]
+    assert once_and_here == [begin + 5.0] * 2
     lab2, lab1 = right.offsets()
-    assert (lab2.host, lab2.robots, lab2.over) == ("lab2", ("CF01",), 600.0)
-    assert (lab2.drift, lab1.drift) == (pytest.approx(drift), None)
+    assert (lab2.host, lab2.robots, lab2.over, lab2.drift) == ("lab2", ("CF01",), 600.0, pytest.approx(drift))
+    assert lab1.drift is None
     acted = stamped[2] + 0.1 * (1 + drift)
     followed, rest = [GoalReceipt(7, begin + 300.05, stamped[2], acted)], (0.0, 0.0, 0.0)
     state = State("CF01", 1, acted, "running", rest, rest, 0.0, None, None, 0.0, goal_receipts=followed)
@@ -406,35 +411,26 @@ def test_forged_counters_count_nowhere(path, tmp_path):
     assert measure(most).robots[0].missed_share == pytest.approx(0.75), "below one"
 
 
-STANDBY = {"KH01": replace(rec.PAIR.robots["TB01"], standby=True)}
-LINKED = rec.pair_with(
-    duration_s=4.0, robots=rec.PAIR.robots | STANDBY,
-    formation=Formation(links={"TB01 - CF01": 1.0, "TB01 - KH01": 1.0}),
-)  # fmt: skip
-
-
 def test_reserve_is_judged_since_it_came(path, tmp_path):
-    never = rec.trace_of(tmp_path / "never.mcap", rec.begun(), *rec.seconds(41), rec.landed(4.0), experiment=LINKED)
+    robots = rec.PAIR.robots | {"KH01": replace(rec.PAIR.robots["TB01"], standby=True)}
+    links = Formation(links={"TB01 - CF01": 1.0, "TB01 - KH01": 1.0})
+    linked = rec.pair_with(duration_s=4.0, robots=robots, formation=links)
+    never = rec.trace_of(tmp_path / "never.mcap", rec.begun(), *rec.seconds(41), rec.landed(4.0), experiment=linked)
     assert (never.robots, measure(never).failures) == (("TB01", "CF01"), ())
     came = [rec.state("KH01", k, k / 10, 1.0, phase="running" if k >= 15 else "ready") for k in range(10, 41)]
     came += [rec.pose("KH01", k, k / 10) for k in range(13, 40)]  # two before it took part
-    trace = rec.trace_of(path, rec.begun(), *rec.seconds(41), *came, rec.landed(4.0), experiment=LINKED)
+    trace = rec.trace_of(path, rec.begun(), *rec.seconds(41), *came, rec.landed(4.0), experiment=linked)
     np.testing.assert_allclose(trace.joined, [0.0, 0.0, 1.5], atol=1e-6)
     measured = measure(trace)
     first, _, added = measured.robots
-    assert (added.known, added.coverage, measured.died, measured.failures) == (1.0, 1.0, (), ())
-    assert (added.f_hz, first.coverage) == (pytest.approx(25 / 2.5), 1.0)
+    assert (added.known, added.coverage, first.coverage, added.f_hz) == pytest.approx((1.0, 1.0, 1.0, 25 / 2.5))
+    assert (measured.died, measured.failures) == ((), ())
 
 
 def figures(path, *messages):
     case = measure(rec.trace_of(path, *messages))
     of_robots = [(robot.iae, robot.messages, robot.received, robot.known) for robot in case.robots]
     return of_robots, case.deliveries, case.lost
-
-
-@pytest.fixture
-def whole(tmp_path):
-    return figures(tmp_path / "whole.mcap", *RUN)
 
 
 RUN = rec.whole_run()
@@ -447,26 +443,28 @@ DOUBLED = {
 
 
 @pytest.mark.parametrize("messages", DOUBLED.values(), ids=DOUBLED)
-def test_repeated_and_foreign_messages_change_no_figure(path, whole, messages):
-    assert figures(path, *messages) == whole
+def test_repeated_and_foreign_messages_change_no_figure(path, tmp_path, messages):
+    assert figures(path, *messages) == figures(tmp_path / "whole.mcap", *RUN)
 
 
 @pytest.mark.parametrize("place", [(1e300, 0.0, 0.0), (float("nan"),) * 3])
-def test_impossible_places_are_unknown(path, whole, place):
+def test_impossible_places_are_unknown(path, tmp_path, place):
     odd = next(k for k, each in enumerate(RUN) if isinstance(each, State) and each.stamp > rec.START + 0.45)
     assert RUN[odd].robot == "TB01"
     found = figures(path, *RUN[:odd], replace(RUN[odd], position=place, true_position=place), *RUN[odd + 1 :])
+    whole = figures(tmp_path / "whole.mcap", *RUN)
     assert found[0][0][0] == pytest.approx(whole[0][0][0])  # a hole of less than a second is drawn over
     assert found[1:] == whole[1:]
 
 
 def test_recording_that_broke_off_late_is_interrupted(path, tmp_path):
     """0.4 s before its end, without a word of a landing; robots that landed by themselves are whole."""
-    broken = measure(rec.trace_of(path, rec.begun(), *rec.seconds(7)))
-    assert (broken.interrupted, broken.duration_s) == (True, pytest.approx(0.6, abs=0.11))
     landing = rec.state("TB01", 9, 1.5, phase="landing")
-    landed = rec.trace_of(tmp_path / "landed.mcap", rec.begun(), *rec.seconds(7), landing)
-    assert not measure(landed).interrupted
+    files, ends = (path, tmp_path / "landed.mcap"), ([], [landing])
+    broken, landed = (
+        measure(rec.trace_of(file, rec.begun(), *rec.seconds(7), *end)) for file, end in zip(files, ends, strict=True)
+    )
+    assert (broken.interrupted, broken.duration_s, landed.interrupted) == (True, pytest.approx(0.6, abs=0.11), False)
 
 
 def test_two_recordings_of_one_case_are_told(tmp_path):

@@ -33,7 +33,7 @@ def test_runs_of_the_same_second_have_own_folders(tmp_path, monkeypatch):
 
 def test_folder_without_a_run_is_removed(tmp_path):
     read = document.load("triangle")
-    empty, failed, flown = folders = [run_folder.new_folder(read, str(tmp_path / name)) for name in "abc"]
+    _, failed, flown = folders = [run_folder.new_folder(read, str(tmp_path / name)) for name in "abc"]
     for folder in folders:
         read.keep(folder / run_folder.SOURCE)
     (failed / "logs").mkdir()
@@ -42,23 +42,20 @@ def test_folder_without_a_run_is_removed(tmp_path):
     for folder in folders:
         run_folder.remove_unused(folder)
     assert sorted(tmp_path.iterdir()) == [failed, flown]
-    assert not empty.exists()
 
 
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ("rates.body_hz=1e9", "must be a number <= 2000"),
         ("channel.delay_s=1e9", "must be a number <= 60"),
         ("duration_s=0.001", "less than two samples"),
         ("rates.state_hz=0.01", "less than two samples"),
+        ("seed=1", "fit into memory"),
     ],
 )
 def test_numbers_that_no_run_can_have(change, says):
     with pytest.raises(DocumentError, match=says):
-        document.load("triangle", change)
-    with pytest.raises(DocumentError, match="fit into memory"):
-        run.simulate_seeds(document.load("triangle"), range(100_000))
+        run.simulate_seeds(document.load("triangle", change), range(100_000))
 
 
 @pytest.mark.parametrize(
@@ -94,10 +91,10 @@ def test_past_runs_with_their_figures_sizes_and_tags(tmp_path):
     kept(tmp_path / "earlier", virtual=True)
     (tmp_path / "no run").mkdir()
     earlier, later = run_folder.past_runs([tmp_path])
-    assert [Path(run.folder).name for run in (earlier, later)] == ["earlier", "later"]
+    found = (*(Path(run.folder).name for run in (earlier, later)), earlier.seeds, earlier.recorded)
+    assert (*found, earlier.megabytes > 0.001) == ("earlier", "later", [1, 2], True, True)
     unknown = {1: None, 2: None}
     assert earlier.cases == {"event": {"f_hz": {1: 10.0, 2: 10.0}, "iae": {1: 1.5, 2: 1.5}, "rmse": unknown}}
-    assert (earlier.seeds, earlier.recorded, earlier.megabytes > 0.001) == ([1, 2], True, True)
     asked = (["paper"], ["EVENT", "two"], ["pape"], ["paper", "other"])
     assert [later.matches(words) for words in asked] == [True, True, False, False]
 
@@ -141,16 +138,18 @@ def test_past_runs_on_the_command_line(tmp_path):
     for k, lost in enumerate((0, 9, 0, 0)):
         kept(tmp_path / str(k), begun=1e9 + k, lost=lost, tags=["paper"] if k == 0 else [])
     kept(tmp_path / "virtual", begun=2e9, lost=5, virtual=True)
-    _, first, second, *_, losses, _ = invoke("runs", "--past", "--in", tmp_path).stdout.splitlines()
+    past, virtual, paper = (
+        invoke("runs", *words, "--in", tmp_path).stdout for words in (["--past"], ["virtual"], ["paper", "--json"])
+    )
+    _, first, second, *_, losses, _ = past.splitlines()
     assert [line.split()[2] for line in (first, second)] == [str(tmp_path / "0"), str(tmp_path / "1")]
     assert first.endswith("paper")
     assert losses == "real time: 4 h in 4 runs; 9 poses lost, 2.25 per hour; the last 2 h without loss"
-    assert "real time" not in invoke("runs", "virtual", "--in", tmp_path).stdout
-    assert len(msgspec.json.decode(invoke("runs", "paper", "--in", tmp_path, "--json").stdout)["runs"]) == 1
+    assert ("real time" in virtual, len(msgspec.json.decode(paper)["runs"])) == (False, 1)
 
 
 def test_clean_removes_the_named_but_nothing_tagged(tmp_path):
-    a, b, c = kept(tmp_path / "a", tags=["paper"]), kept(tmp_path / "b"), kept(tmp_path / "c")
+    a, b, _ = kept(tmp_path / "a", tags=["paper"]), kept(tmp_path / "b"), kept(tmp_path / "c")
     (tmp_path / "mine").mkdir()
     where = ["--in", tmp_path]
     invoke("clean", *where, code=2)
@@ -160,7 +159,6 @@ def test_clean_removes_the_named_but_nothing_tagged(tmp_path):
     assert sorted(file.name for file in b.iterdir()) == ["experiment.toml", "metrics.json", "run.json"]
     invoke("clean", "--older", "1", "--yes", *where)
     assert sorted(tmp_path.iterdir()) == [a, tmp_path / "mine"]
-    assert not c.exists()
     invoke("clean", "paper", "--tagged", "--yes", *where)
     assert sorted(tmp_path.iterdir()) == [tmp_path / "mine"]
 
@@ -174,8 +172,7 @@ def test_runs_in_use_stay(tmp_path):
     with cleaning.using(used):
         for words in ([], ["--yes"], ["--yes", "--recordings"]):
             assert f"{used} is in use: it stays" in clean(tmp_path, *words)
-    assert (used / "event.mcap").exists()
-    assert not over.exists()
+    assert ((used / "event.mcap").exists(), over.exists()) == (True, False)
     with cleaning.locked(used, cleaning.fcntl.LOCK_EX), pytest.raises(cleaning.InUse):
         cleaning.remove(used)
     with cleaning.using(kept(used / "inner")):
@@ -209,19 +206,14 @@ def refusing(code):
     return refuse
 
 
-def test_half_removed_runs_are_still_runs(tmp_path, monkeypatch):
+def test_half_removed_and_endless_runs_are_runs(tmp_path, monkeypatch):
     folder = kept(tmp_path / "run", ended=2.0)
     (folder / "logs").mkdir()
     monkeypatch.setattr(shutil, "rmtree", refusing(errno.EACCES))
     assert "cannot be removed: Permission denied" in clean(tmp_path, "--yes", code=1)
     assert {run_folder.SOURCE, run_folder.ORIGIN} <= {path.name for path in folder.iterdir()}
     monkeypatch.undo()
-    clean(tmp_path, "--yes")
-    assert not folder.exists()
-
-
-def test_endless_runs_stay_without_locks(tmp_path, monkeypatch):
-    endless, ended = kept(tmp_path / "endless"), kept(tmp_path / "ended", ended=2.0)
+    endless = kept(tmp_path / "endless")
     monkeypatch.setattr(cleaning.fcntl, "flock", refusing(errno.ENOLCK))
     clean(tmp_path, "--yes")
-    assert (endless.exists(), ended.exists()) == (True, False)
+    assert [*tmp_path.iterdir()] == [endless], "without locks it may be in use"

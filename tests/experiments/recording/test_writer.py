@@ -6,7 +6,6 @@ import itertools
 import math
 import subprocess
 import sys
-from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -29,16 +28,16 @@ from experiments.recording.ros2 import viewers
 from experiments.recording.topics import CHUNK_BYTES
 from experiments.scene import markers
 from tests.cases import examples
+from tests.commands import ROOT
 from tests.experiments import recordings as rec
 from tests.waiting import ManualClock
 from tools.commands import results as commands
 
 
 def test_what_is_attached_stays_in_a_recovered_recording(path, tmp_path):
-    made = tmp_path / "made.mcap"
+    made, target = tmp_path / "made.mcap", tmp_path / "whole.mcap"
     rec.write(made, *rec.whole_run(), started=rec.START)
     path.write_bytes(made.read_bytes()[:-1])
-    target = tmp_path / "whole.mcap"
     assert recover(path, target) == Recovered(82, ("TB01", "CF01"), complete=False)
     for each in (made, target):
         with each.open("rb") as file:
@@ -49,20 +48,13 @@ def test_what_is_attached_stays_in_a_recovered_recording(path, tmp_path):
             summary = reader.get_summary()
         assert attached["experiment.toml"].decode() == rec.DOCUMENT
         assert msgspec.json.decode(attached["experiment.json"], type=Experiment) == rec.PAIR
-        known = {"case": "only", "seed": "4", "clock": "real", "started": repr(rec.START)}
-        assert about.items() > known.items()
+        assert about.items() > {"case": "only", "seed": "4", "clock": "real", "started": repr(rec.START)}.items()
         assert about["version"]
         of_robots = {f"/{robot}/{what}" for robot in ("TB01", "CF01") for what in ("state", "true_pose", "status")}
         assert {channel.topic for channel in summary.channels.values()} == {"/events", "/tf", "/TB01/pose", *of_robots}
         assert {schema.encoding for schema in summary.schemas.values()} == {"ros2msg"}
         with AnyReader([each]) as reader:
             assert len(list(reader.messages())) == summary.statistics.message_count == 82
-
-
-def decoded(path, topics=None):
-    """Messages of a recording, as another library reads them."""
-    with path.open("rb") as file:
-        return list(make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages(topics))
 
 
 def test_others_read_it(path):
@@ -78,14 +70,15 @@ def test_others_read_it(path):
     measured = [message for topic, _, message in seen if topic == "/CF01/true_pose"]
     assert measured[3].pose.position.x == -0.3
 
-    found = decoded(path)
+    with path.open("rb") as file:
+        found = list(make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages())
     assert len(found) == len(seen)
     sent = [(one.decoded_message, one.message) for one in found if one.channel.topic == "/TB01/pose"]
     assert [message.sequence for _, message in sent] == list(range(1, 12))
     content, message = sent[2]
     assert (content.seq, content.size, content.received) == (3, 150, rec.START + 0.2 + 0.002)
-    assert message.log_time == round((rec.START + 0.2 + 0.002) * 1e9)
-    assert message.publish_time == round((rec.START + 0.2) * 1e9)
+    sent_at = rec.START + 0.2
+    assert (message.log_time, message.publish_time) == (round((sent_at + 0.002) * 1e9), round(sent_at * 1e9))
     last = [one.decoded_message for one in found if one.channel.topic == "/CF01/status"][-1]
     assert (last.lost_keys, last.lost_values, math.isnan(last.battery)) == (["TB01"], [1], True)
 
@@ -106,14 +99,8 @@ def test_a_recording_is_never_overwritten(path, tmp_path):
 
 def test_callers_error_leaves_a_finished_file(path):
     made = rec.recording(path)
-
-    def fails():
-        with made:
-            rec.put(made, rec.whole_run())
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        fails()
+    rec.put(made, rec.whole_run())
+    assert not made.__exit__(KeyboardInterrupt, KeyboardInterrupt(), None)
     assert read(path).complete
     made.close()
     with pytest.raises(RecordingError, match="closed"):
@@ -129,10 +116,8 @@ def test_a_full_disk_keeps_what_was_written(path):
         with pytest.raises(RecordingError, match="make room"):
             made.write(messages[0])
         made.close()
-    assert path.stat().st_size == 40_000
     playback = read(path)
-    assert not playback.complete
-    assert playback.messages > 200
+    assert (path.stat().st_size, playback.complete, playback.messages > 200) == (40_000, False, True)
     np.testing.assert_allclose(playback.trace.position[0, 0], messages[0].position, atol=1e-3)
 
 
@@ -193,8 +178,7 @@ def test_file_equals_the_librarys_own(tmp_path):
     own.close()
 
 
-@pytest.fixture
-def drawn(path):
+def test_viewers_find_frames_and_scene_in_order(path):
     """The pair's recording with a scene, states out of order by 0.15 s, and an event from the future."""
     clock = ManualClock(rec.START)
     with rec.recording(path, draw=markers.drawing(Plan(rec.PAIR)), utc=clock.utc) as made:
@@ -205,11 +189,7 @@ def drawn(path):
                 made.write(rec.state(robot, seq=k + 1, at=0.05 * k + 0.2 - late, x=0.01 * k))
             if k % 20 == 7:
                 made.write(Event(clock.now - 0.5, "robot", "CF01", "said late"))
-    return path
-
-
-def test_viewers_find_frames_and_scene_in_standard_types(drawn):
-    with AnyReader([drawn]) as reader:
+    with AnyReader([path]) as reader:
         types = {c.topic: c.msgtype for c in reader.connections}
         seen = [(c.topic, reader.deserialize(raw, c.msgtype)) for c, t, raw in reader.messages()]
     assert (types["/tf"], types["/scene"]) == ("tf2_msgs/msg/TFMessage", "visualization_msgs/msg/MarkerArray")
@@ -226,17 +206,13 @@ def test_viewers_find_frames_and_scene_in_standard_types(drawn):
     links = groups["links"]
     assert (links.type, links.header.frame_id, len(links.colors)) == (5, "map", len(links.points))
     assert links.points[0].x == pytest.approx(2.99, abs=0.05)
-    assert len(decoded(drawn, ["/tf", "/scene"])) == len(frames) + len(scenes)
-
-
-def test_chunks_are_in_order_of_time(drawn):
-    with drawn.open("rb") as file:
+    with path.open("rb") as file:
         chunks = make_reader(file).get_summary().chunk_indexes
         first, *_ = [m for *_, m in make_reader(file).iter_messages(["/events"])]
     assert len(chunks) > 10
     assert all(a.message_end_time <= b.message_start_time for a, b in itertools.pairwise(chunks))
-    assert first.log_time == round(rec.START * 1e9), "logged when it came"
-    assert first.publish_time == round((rec.START + 5.0) * 1e9)
+    times = first.log_time, first.publish_time  # logged when it came
+    assert times == (round(rec.START * 1e9), round((rec.START + 5.0) * 1e9))
 
 
 KILLED = """
@@ -255,14 +231,12 @@ for k in itertools.count(1):
 @pytest.mark.mechanism("recovery of an unfinished recording")
 @pytest.mark.system
 def test_a_killed_recorder_leaves_a_recording(path, tmp_path, recorded):
-    root = Path(__file__).parents[3]
     command = [sys.executable, "-c", KILLED.format(path=str(path))]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=root) as process:
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT) as process:
         assert process.stdout.readline() == "flushed\n"
         process.kill()
     before, playback = path.read_bytes(), read(path)
-    assert not playback.complete
-    assert playback.messages >= 60
+    assert (playback.complete, playback.messages >= 60) == (False, True)
     target, whole = tmp_path / "whole.mcap", tmp_path / "finished.mcap"
     assert recover(path, target) == Recovered(playback.messages, ("TB01", "CF01"), complete=False)
     assert path.read_bytes() == before
@@ -347,8 +321,7 @@ def test_a_file_cut_anywhere(path, tmp_path, recorded):
     for size in range(0, len(recorded), 61):
         path.write_bytes(recorded[:size])
         found.append(survives(path, tmp_path / "target.mcap") or 0)
-    assert found == sorted(found)
-    assert (found[0], found[-1]) == (0, 82)
+    assert (found, found[0], found[-1]) == (sorted(found), 0, 82)
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import json
 import re
 
 import numpy as np
@@ -10,8 +11,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from experiments.definition.experiment import Arena
 from experiments.metrics.measure import measure
-from experiments.report import figures, style
+from experiments.report import figures, replay, style, trajectories
 from tests.experiments.traces import crowd, cut, pair, park
+from tests.runs import flown
+from tests.system.browser import CHROMIUM, needs_chromium
 
 pytestmark = pytest.mark.slow  # runs and reports, whole
 
@@ -35,10 +38,9 @@ def test_figures_fit_in_one_column(few, two_cases):
     traces = two_cases if few else [crowd(40, f"case{k}", 0.01 * k, duration=2.0) for k in range(5)]
     for draw in OF_TRACES:
         figure = draw(traces)
-        assert figure.get_figwidth() == 3.5
+        assert (figure.get_figwidth(), draw(traces, width=7.16).get_figwidth()) == (3.5, 7.16)
         assert 1.0 < figure.get_figheight() <= 9.3
         assert len(figure.axes) >= (len(traces) if draw is figures.events else 1)
-        assert draw(traces, width=7.16).get_figwidth() == 7.16
         assert "<metadata" not in style.svg(figure)
     for draw in OF_CASES:
         figure = draw([measure(trace) for trace in traces])
@@ -84,9 +86,8 @@ def test_seeds_become_one_bar_or_a_band():
     axes = figures.global_bars(cases).axes[1]
     ratio = [b.mean["iae"] / a.mean["iae"] for a, b in zip(cases[:3], cases[3:], strict=True)]
     assert axes.patches[0].get_height() == pytest.approx(np.mean(ratio))
-    segments = axes.collections[-1].get_segments()
     half = 4.302653 * np.std(ratio, ddof=1) / np.sqrt(3.0)
-    assert np.ptp(segments[0][:, 1]) == pytest.approx(2.0 * half, rel=1e-4)
+    assert np.ptp(axes.collections[-1].get_segments()[0][:, 1]) == pytest.approx(2.0 * half, rel=1e-4)
     (axes,) = figures.errors(traces[:3]).axes
     assert (len(thick(axes)), len(axes.collections)) == (1, 1)
     assert not [line for line in axes.lines if line.get_linewidth() == 0.4], "curves of single robots"
@@ -166,12 +167,11 @@ def test_short_and_unknown_cases_are_drawn():
     assert figures.all_figures([], []) == figures.all_figures([], [cut(park(), -1.0)]) == {}
 
 
-@pytest.mark.parametrize("draw", OF_TRACES, ids=lambda draw: draw.__name__)
-def test_whatever_is_unknown_can_be_drawn(draw):
+@pytest.mark.parametrize("rows", [np.s_[300:], np.s_[:1100], np.s_[50:, 6], np.s_[:, 5]])
+def test_whatever_is_unknown_can_be_drawn(rows):
     known = park(duration=23.0)
     silent = dataclasses.replace(known, sent=known.sent.take(np.arange(0)))
-    for rows in (np.s_[300:], np.s_[:1100], np.s_[50:, 6], np.s_[:, 5]):
-        assert "<svg" in style.svg(draw([unknown(silent if isinstance(rows, tuple) else known, rows)]))
+    assert "plan_view" in drawn([unknown(silent if isinstance(rows, tuple) else known, rows)])
 
 
 def test_saved_files_are_reproducible_vectors_with_real_fonts(tmp_path):
@@ -184,8 +184,61 @@ def test_saved_files_are_reproducible_vectors_with_real_fonts(tmp_path):
     assert not page.exists()
     style.save(figures.intervals(known), tmp_path, "intervals", pdf=True)
     content = page.read_bytes()
-    assert content.startswith(b"%PDF")
-    assert b"/Type3" not in content
-    assert b"/CreationDate" not in content
+    assert [content.find(part) for part in (b"%PDF", b"/Type3", b"/CreationDate")] == [0, -1, -1]
     style.save(figures.intervals(known, 7.16), tmp_path, "intervals")
     assert page.read_bytes() != content, "a file that is there is kept current"
+
+
+@pytest.fixture(scope="module")
+def traces():
+    return [flown("robotic-park", case, "duration_s=3.0", "timeline=[]").trace for case in ("periodic", "event")]
+
+
+def test_replay_moves_robots_to_where_they_were(traces):
+    """It stands alone, to a millimetre; the still picture is that of its film."""
+    page = replay.embedded(traces)
+    assert ("http" in page, page.count("</script>"), replay.embedded([])) == (False, 1, "")
+    film = json.loads(re.search(r'getElementById\("film"\), (\{.*\})\);', page)[1])
+    assert [case["name"] for case in film["cases"]] == ["periodic", "event"]
+    assert film["names"] == list(traces[0].robots)
+    assert len(page) < 3e6
+    for trace, case in zip(traces, film["cases"], strict=True):
+        for k, sample in enumerate(case["p"]):
+            at = int(np.argmin(np.abs(trace.time - k * case["step"])))
+            assert np.array(sample).reshape(-1, 4)[:, :3] / 1e3 == pytest.approx(trace.true_position[at], abs=1e-3)
+    at, still = film["still"], page[page.index("<svg") : page.index("</svg>")]
+    assert f"Replay of periodic, event, at {at:g} s" in still
+    assert "<text" not in still  # no letters that a reader's machine may not have
+    assert len(still) < 3e5
+    figure, show = trajectories.film(traces)
+    show(at)
+    for axes, trace in zip(figure.axes, traces, strict=True):
+        last = int(np.searchsorted(trace.time, at + 1e-9)) - 1
+        dots = [line.get_data_3d() for line in axes.lines if line.get_marker() == "o"]
+        np.testing.assert_allclose(np.hstack(dots).T, trace.true_position[last])
+
+
+@needs_chromium
+@pytest.mark.system
+def test_slider_moves_robots_and_still_picture_is_printed(traces, tmp_path):
+    api = pytest.importorskip("playwright.sync_api")
+    file = tmp_path / "page.html"
+    file.write_text(f"<!doctype html><meta charset=utf-8>{replay.embedded(traces)}", "utf-8")
+    with api.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu"])
+        page, faults, asked = browser.new_page(), [], []
+        page.on("pageerror", lambda error: faults.append(str(error)))
+        page.on("request", lambda request: asked.append(request.url))
+        page.goto(file.as_uri())
+        page.locator("#film input").fill("2")
+        places = page.evaluate("document.getElementById('film').replay.places()")
+        plain, seen = browser.new_context(java_script_enabled=False).new_page(), []
+        plain.goto(file.as_uri())
+        for shown, media in ((page, "screen"), (page, "print"), (plain, "screen")):
+            shown.emulate_media(media=media)
+            seen.append([shown.locator(part).is_visible() for part in ("#film", ".still svg")])
+        browser.close()
+    assert (seen, faults, asked) == ([[True, False], [False, True], [False, True]], [], [file.as_uri()])
+    for trace, robots in zip(traces, places, strict=True):
+        at = int(np.argmin(np.abs(trace.time - 2.0)))
+        assert np.array(robots)[:, :3] == pytest.approx(trace.true_position[at], abs=1e-3)

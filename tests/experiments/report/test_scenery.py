@@ -1,7 +1,5 @@
 """Obstacles and expected motions in figures."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np
@@ -33,20 +31,18 @@ EMPTY = Arena(size=(2.2, 2.0, 2.5))
 HALL = Arena(size=(30.0, 30.0, 3.0))
 
 
-def within(arena, trace=None):
-    """A short run, or another trace, in an arena."""
-    trace = park(duration=3.0) if trace is None else trace
-    return dataclasses.replace(trace, plan=trace.plan.changed(arena=arena))
+RUN = park(duration=3.0)
 
 
 def from_above(arena):
     axes = Figure().subplots()
-    scenery.from_above(axes, within(arena).plan)
+    scenery.from_above(axes, RUN.plan.changed(arena=arena))
     return axes
 
 
-def in_space(arena, trace=None):
-    return trajectories.formation([within(arena, trace)]).axes[0]
+def in_space(arena, scale=1.0):
+    moved = dataclasses.replace(RUN, plan=RUN.plan.changed(arena=arena), true_position=RUN.true_position * scale)
+    return trajectories.formation([moved]).axes[0]
 
 
 def test_everything_stands_in_the_plan_where_it_stands():
@@ -65,31 +61,24 @@ def test_everything_stands_in_the_plan_where_it_stands():
     assert [text.get_text() for text in axes.texts] == list(FULL.obstacles)
     post, crate, cart, arrived, lamp = polygons  # told apart without colour
     assert (bool(crate.get_hatch()), bool(post.get_hatch())) == (True, False)
-    assert lamp.get_linestyle() != post.get_linestyle()
-    assert arrived.get_linestyle() != cart.get_linestyle()
-
-
-def test_a_border_without_walls_is_dashed():
-    solid, dashed = (from_above(Arena(walls=walls)).patches[0].get_linestyle() for walls in (True, False))
-    assert solid != dashed
+    borders = [from_above(Arena(walls=walls)).patches[0] for walls in (True, False)]
+    for solid, dashed in ((post, lamp), (cart, arrived), borders):
+        assert solid.get_linestyle() != dashed.get_linestyle()
 
 
 def test_the_legend_names_what_there_is():
-    assert scenery.legend([park(duration=3.0).plan]) == {}
-    full = within(FULL).plan
-    said = [*scenery.legend([full, full])]
-    assert said == ["obstacle", "can be pushed", "obstacle's path", "wall", "above the floor", "start box"]
+    full = RUN.plan.changed(arena=FULL)
+    said = [[*scenery.legend(plans)] for plans in ([RUN.plan], [full, full])]
+    assert said == [[], ["obstacle", "can be pushed", "obstacle's path", "wall", "above the floor", "start box"]]
     assert "above the floor" not in scenery.legend([full], space=True)
 
 
 def test_spatial_obstacles_reach_over_the_shown_height():
     axes = in_space(FULL)
-    low, high = axes.get_zlim()
-    assert low == 0.0
     solids = [each for each in axes.collections if isinstance(each, Poly3DCollection)]
     assert len(solids) == 2 * 3 + 1  # sides and ends of what is closed, the fence; the lamp hangs above it all
     heights = [np.array(each._faces)[..., 2] for each in solids]
-    assert max(height.max() for height in heights) == pytest.approx(high)
+    assert axes.get_zlim() == (0.0, pytest.approx(max(height.max() for height in heights)))
     assert (heights[-1].min(), heights[-1].max()) == pytest.approx((0.0, 0.2))
 
 
@@ -98,12 +87,9 @@ def test_space_shows_whole_arena_unless_far_larger():
     assert np.ptp(in_space(HALL).get_xlim()) < 3.0
     pillar = {"pillar": Obstacle(radius=0.2, at=(-4.0, 3.0))}
     axes = in_space(Arena(size=HALL.size, obstacles=pillar))
-    assert axes.get_xlim()[0] < -4.2
-    assert axes.get_ylim()[1] > 3.2
-    trace = park(duration=3.0)
-    flat = dataclasses.replace(trace, true_position=trace.true_position * [1.0, 1.0, 0.0])
-    for arena, top in ((EMPTY, 0.216), (FULL, 0.15 * 1.08 * 3.0)):
-        assert in_space(arena, flat).get_zlim() == pytest.approx((0.0, top))  # robots on the floor stand on it
+    assert (axes.get_xlim()[0] < -4.2, axes.get_ylim()[1] > 3.2) == (True, True)
+    for arena, top in ((EMPTY, 0.216), (FULL, 0.15 * 1.08 * 3.0)):  # robots on the floor stand on it
+        assert in_space(arena, [1.0, 1.0, 0.0]).get_zlim() == pytest.approx((0.0, top))
 
 
 @pytest.mark.slow

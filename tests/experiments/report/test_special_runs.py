@@ -29,11 +29,9 @@ def test_indices_of_links_are_unknown_without_errors(measured):
     case = measured[0]
     robot = case.robots[0]
     assert (case.mean["j2"], case.mean["iae"], case.acquired_s) == (None, None, (None,))
-    assert (robot.settle_s, robot.coverage, robot.residual, robot.iae) == (None, None, None, None)
-    assert robot.known == 1.0
+    assert (robot.settle_s, robot.coverage, robot.residual, robot.iae, robot.known) == (None, None, None, None, 1.0)
     texts = " ".join(each.text for each in verdict.findings(measured))
-    assert "formation" not in texts
-    assert "fewer transmissions than periodic" in texts
+    assert [part in texts for part in ("formation", "fewer transmissions than periodic")] == [False, True]
 
 
 def test_measures_are_means_over_run_and_end(traces, measured):
@@ -48,9 +46,8 @@ def test_measures_are_means_over_run_and_end(traces, measured):
     assert {"measures", "robot_bars", "global_bars"} < {*drawn}
     assert "errors" not in drawn
     (axes,) = drawn["measures"].axes
-    assert axes.get_ylabel() == "disagreement"
-    assert len([line for line in axes.lines if line.get_linewidth() == 1.3]) == 2
-    assert len(drawn["robot_bars"].axes) == 1  # of f alone
+    thick = [line for line in axes.lines if line.get_linewidth() == 1.3]
+    assert (axes.get_ylabel(), len(thick), len(drawn["robot_bars"].axes)) == ("disagreement", 2, 1)  # the last of f
 
 
 def rows_of(file):
@@ -61,13 +58,13 @@ def test_files_have_columns_of_the_law(tmp_path, traces, measured):
     way, metrics = tmp_path / "trajectories.csv", tmp_path / "metrics.json"
     export.write_csv(traces, way)
     last, known = rows_of(way)[-1], traces["event"]
-    assert float(last["memory_x"]) == known.memory["x"][-1, -1, 0]
-    assert float(last["measure_disagreement"]) == known.measures["disagreement"][-1, -1]
-    assert (last["case"], last["error"]) == ("event", "")
+    found = float(last["memory_x"]), float(last["measure_disagreement"]), last["case"], last["error"]
+    assert found == (known.memory["x"][-1, -1, 0], known.measures["disagreement"][-1, -1], "event", "")
     metrics_files.write_csv(tmp_path / "metrics.csv", measured)
     first, *_, mean = rows_of(tmp_path / "metrics.csv")
-    assert float(first["measure_disagreement_end"]) == measured[0].robots[0].measures["disagreement"].end
-    assert float(mean["measure_disagreement_mean"]) == measured[1].measures["disagreement"].mean
+    found = float(first["measure_disagreement_end"]), float(mean["measure_disagreement_mean"])
+    ends = measured[0].robots[0].measures["disagreement"].end, measured[1].measures["disagreement"].mean
+    assert found == ends
     metrics_files.write_json(metrics, measured)
     assert metrics_files.read_json(metrics) == measured
     assert "measures" in metrics_files.document("", 1, measured)["cases"]["event"]
@@ -90,12 +87,11 @@ def test_dropped_differs_from_lost(dropping_run):
     assert len(links) == 21
     spared = links["TB01", "KH01"]
     assert (spared.dropped, spared.received) == (0, 200)  # that of the end is under way; one from before the start came
-    assert (spared.delay_mean, spared.delay_max) == (pytest.approx(0.03), pytest.approx(0.03))
+    assert (spared.delay_mean, spared.delay_max) == pytest.approx((0.03, 0.03))
     for each in measured.link_deliveries:
         if each is not spared:
-            assert each.dropped == pytest.approx(40, abs=24)
-            assert each.received + each.dropped == pytest.approx(200, abs=4)
-            assert each.delay_mean == pytest.approx(0.05)
+            found = each.dropped, each.received + each.dropped, each.delay_mean
+            assert found == (pytest.approx(40, abs=24), pytest.approx(200, abs=4), pytest.approx(0.05))
     assert measured.dropped == sum(each.dropped for each in measured.link_deliveries)
     for robot in measured.robots:
         assert robot.dropped == sum(each.dropped for ends, each in links.items() if ends[0] == robot.robot)
@@ -106,8 +102,7 @@ def test_report_has_dropped_poses_by_link(tmp_path, dropping_run):
     measured = dropping_run.metrics
     said = [each.text for each in verdict.findings([measured])]
     assert any(text.startswith("No pose was lost") for text in said)
-    (text,) = [text for text in said if text.startswith("The modelled network dropped")]
-    assert f"dropped {measured.dropped} of 4" in text
+    (text,) = [text for text in said if text.startswith(f"The modelled network dropped {measured.dropped} of 4")]
     assert text.endswith("at most 50.0 ms.")
     (table,) = network_tables([measured])
     assert table.rows[-1].cells[0] == "all"

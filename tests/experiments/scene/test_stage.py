@@ -1,6 +1,7 @@
 """The scene of a case at one moment: what is drawn where, in which colour and condition. No browser."""
 
 from dataclasses import replace
+from math import inf
 
 import msgspec
 import numpy as np
@@ -12,8 +13,8 @@ from experiments.definition.experiment import Arena, LinkTable
 from experiments.definition.plan import Plan
 from experiments.file.document import load
 from experiments.scene import markers, models, stage
-from experiments.scene.stage import BodyLocation, Condition, LinkTracker, SceneModel, Trail
-from tests.experiments import moments
+from experiments.scene.stage import BodyLocation, Condition, LinkTracker, Moment, SceneModel, Trail
+from tests.experiments.traces import link_errors
 from tests.small import small
 from twins.scene import Obstacle
 
@@ -27,8 +28,18 @@ def park_scene():
     return SceneModel.of_plan(load("robotic-park").cases()["event"])
 
 
+def unknown(scene):
+    """A moment at which nothing is known yet."""
+    rows, net = len(scene.names), len(scene.links)
+    blank = np.full((rows, 3), np.nan)
+    return Moment(
+        blank, np.full(rows, np.nan), blank.copy(), np.full(rows, int(Condition.WAITING)), np.full(rows, inf),
+        np.full(net, np.nan), np.zeros(net, dtype=bool), scene.scene.pose.copy(), np.zeros((rows, 0, 3)),
+    )  # fmt: skip
+
+
 def at_start(park_scene):
-    moment = moments.unknown(park_scene)
+    moment = unknown(park_scene)
     for row, robot in enumerate(park_scene.plan.experiment.robots.values()):
         moment.position[row] = (*robot.start[:2], robot.hover or 0.0)
     return moment
@@ -57,20 +68,16 @@ def test_bodies_and_links_are_told_apart():
     assert [stage.place_of(body).name for body in bodies] == ["TWIN", "TWIN", "WORLD", "REAL"]
     assert len({tuple(colour) for colour in stage.CHASSIS.values()}) == len(BodyLocation)
     colours = stage.link_colours(np.array([0.024, 0.026, 0.049, 0.051, np.nan]))
-    wanted = [stage.GOOD, stage.FAIR, stage.FAIR, stage.BAD, stage.UNKNOWN]
-    assert [tuple(each) for each in colours.tolist()] == wanted
+    assert [*map(tuple, colours.tolist())] == [stage.GOOD, stage.FAIR, stage.FAIR, stage.BAD, stage.UNKNOWN]
     made = stage.dashes(np.array([[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]]))
     assert np.linalg.norm(made[:, 1] - made[:, 0], axis=1).sum() == pytest.approx(0.5)
-    assert made[..., 0].min() >= 0.0
-    assert made[..., 0].max() <= 1.0
+    assert 0.0 <= made[..., 0].min() <= made[..., 0].max() <= 1.0
 
 
 def test_errors_are_those_of_the_law(park_scene):
     moment = at_start(park_scene)
-    error = LinkTracker(park_scene).errors(None, moment.position)
-    net = park_scene.links
-    apart = np.linalg.norm(moment.position[net.receiver] - moment.position[net.sender], axis=1)
-    assert error == pytest.approx(np.abs(apart - net.distance))
+    error, net = LinkTracker(park_scene).errors(None, moment.position), park_scene.links
+    assert error == pytest.approx(link_errors(net, moment.position))
     of_robots = LinkTracker(park_scene).of_robots(error)
     assert [park_scene.names[k] for k in np.flatnonzero(np.isnan(of_robots))] == ["TB01"], "it receives on no link"
     assert of_robots[1] == pytest.approx(error[net.receiver == 1].sum())
@@ -89,7 +96,7 @@ def test_absent_links_plugins_or_experiments_have_no_error(park_scene):
 
 
 def test_unknown_robots_are_out_of_sight(park_scene):
-    moment = moments.unknown(park_scene)
+    moment = unknown(park_scene)
     assert (stage.shown(moment.position)[:, 2] < -100.0).all()
     ends = stage.segments(park_scene, moment.position)
     assert (stage.visible(ends, np.ones(len(ends), dtype=bool))[..., 2] < -100.0).all()
@@ -103,8 +110,8 @@ def test_attention_has_ring_word_and_lit_links(park_scene):
     moment.condition[row] = Condition.DEAD
     places, _ = stage.rings(moment)
     assert np.flatnonzero(places[:, 2] > -100.0).tolist() == [row]
-    assert stage.label(park_scene, row, Condition.DEAD) == "CF02 · DEAD"
-    assert stage.label(park_scene, row, Condition.ACTIVE) == "CF02"
+    said = [stage.label(park_scene, row, condition) for condition in (Condition.DEAD, Condition.ACTIVE)]
+    assert said == ["CF02 · DEAD", "CF02"]
     assert (stage.accents(park_scene, moment)[row] != park_scene.colours[row]).any()
     moment.silent_for[park_scene.names.index("TB01")] = 0.05
     senders = {park_scene.names[row] for row in park_scene.links.sender[stage.lit(park_scene, moment)]}
@@ -114,7 +121,7 @@ def test_attention_has_ring_word_and_lit_links(park_scene):
 def test_trail_has_five_fading_points_a_second(park_scene):
     trail = Trail(2)
     kept = [trail.add(0.1 * k, np.full((2, 3), 0.1 * k)) for k in range(9)]
-    assert kept == [True, False, True, False, True, False, True, False, True]
+    assert kept == [k % 2 == 0 for k in range(9)]
     assert trail.points[0, :5, 0] == pytest.approx([0.8, 0.6, 0.4, 0.2, 0.0])
     ends = stage.trail_segments(trail.points)
     assert (ends[:, 0, 2] > -100.0).sum() == 2 * 4
@@ -139,19 +146,15 @@ def test_every_kind_has_a_model_of_its_size(kind, own):
     a, b, c = (model.vertices[model.faces[:, k].astype(int)] for k in range(3))
     assert np.einsum("ij,ij->i", a, np.cross(b, c)).sum() > 0.0  # six times the volume: faces look outward
     low, high = model.vertices.min(axis=0), model.vertices.max(axis=0)
-    assert low[2] == pytest.approx(0.0, abs=1e-9)
-    assert high[2] == pytest.approx(kind.height)
+    assert (low[2], high[2]) == pytest.approx((0.0, kind.height), abs=1e-9)
     assert np.hypot(*model.vertices[:, :2].T).max() == pytest.approx(kind.radius, rel=0.35)
 
 
 def test_obstacles_stand_where_the_file_says():
-    course = SceneModel.of_plan(load("obstacle-course").plan)
-    scene = course.scene
+    scene = SceneModel.of_plan(load("obstacle-course").plan).scene
     for k in range(len(scene.names)):
-        mesh = models.obstacle(scene, k)
-        assert mesh.vertices[:, 2].min() == pytest.approx(scene.bottom[k])
-        assert mesh.vertices[:, 2].max() == pytest.approx(scene.top[k])
-    assert moments.unknown(course).obstacles == pytest.approx(scene.pose)
+        height = models.obstacle(scene, k).vertices[:, 2]
+        assert (height.min(), height.max()) == pytest.approx((scene.bottom[k], scene.top[k]))
     lamp = Obstacle(radius=0.2, at=(0.5, 0.0), bottom=1.4, height=0.3)
     drawn = markers.drawing(Plan(small({"A": "khepera4"}, arena=Arena(obstacles={"lamp": lamp}))))(0.0, {})
     (marker,) = [each for each in drawn if each.group == "obstacles"]

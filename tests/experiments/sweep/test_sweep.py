@@ -58,13 +58,11 @@ def test_the_table_has_the_figures_of_single_runs(done):
     assert (event.case, event.parameters, event.reference) == ("event", {"trigger.threshold": 0.02}, False)
     read = load("triangle", *SHORT, "cases.event.trigger.threshold=0.02")
     single = [simulate(read, seed=seed) for seed in (1, 2, 3)]
-    mine = [run.metrics["event"].mean["iae"] for run in single]
-    theirs = [run.metrics["periodic"].mean["iae"] for run in single]
-    ratios = np.array(mine) / np.array(theirs)
-    assert event.mean["iae"].mean == pytest.approx(np.mean(mine), rel=1e-12)
-    assert event.ratio["iae"].mean == pytest.approx(ratios.mean(), rel=1e-12)
+    mine, theirs = (np.array([run.metrics[case].mean["iae"] for run in single]) for case in ("event", "periodic"))
+    found, ratios = event.ratio["iae"], mine / theirs
     half = student_95(2) * ratios.std(ddof=1) / np.sqrt(3)
-    assert event.ratio["iae"].ci95 == pytest.approx(half, rel=1e-9)
+    wanted = [mine.mean(), ratios.mean(), half]
+    assert [event.mean["iae"].mean, found.mean, found.ci95] == pytest.approx(wanted, rel=1e-11)
     assert event.mean["messages"].mean == np.mean([run.metrics["event"].mean["messages"] for run in single])
     assert periodic.ratio["messages"].mean == 1.0
     gaps = [robot.gap_min_s for run in single for robot in measure(run.traces["event"]).robots]
@@ -88,10 +86,9 @@ def test_a_sweep_that_was_interrupted_goes_on(done, tmp_path):
     assert (part.missing, [row.seeds for row in part.rows]) == (5, [2, 2])  # cases take turns
     with (tmp_path / "runs.jsonl").open("ab") as file:
         file.write(b'{"cell":"cut off in mid')
-    whole, ran = swept(tmp_path)
-    assert (ran, whole.missing, whole.rows) == (5, 0, done.rows)
-    again, ran = swept(tmp_path)
-    assert (ran, again.rows) == (0, done.rows)
+    for runs_left in (5, 0):
+        whole, ran = swept(tmp_path)
+        assert (ran, whole.missing, whole.rows) == (runs_left, 0, done.rows)
 
 
 def test_changed_file_or_version_reruns_affected_runs(tmp_path, monkeypatch):
@@ -154,9 +151,9 @@ def test_workers_of_other_code_or_nowhere_are_refused():
 
 def test_curves_go_along_the_first_parameter(tmp_path):
     found, _ = swept(tmp_path, "trigger.threshold=0.005,0.02", "formation.gain=2,3", "seeds=1")
-    drawn = curves([row for row in found.rows if not row.reference])
-    assert {name: len(rows) for name, rows in drawn.items()} == {("event", "gain = 2"): 2, ("event", "gain = 3"): 2}
-    assert [row.parameters["trigger.threshold"] for row in drawn["event", "gain = 2"]] == [0.005, 0.02]
+    drawn = curves([row for row in found.rows if not row.reference]).items()
+    along = {name: [row.parameters["trigger.threshold"] for row in rows] for name, rows in drawn}
+    assert along == {("event", f"gain = {gain}"): [0.005, 0.02] for gain in (2, 3)}
     axes = pareto(found.rows).axes[0]
     assert [text.get_text() for text in axes.texts] == ["threshold = 0.005 m", "0.02"]
     assert axes.get_legend_handles_labels()[1][1:] == ["event", "gain = 2", "gain = 3", "periodic (reference)"]
@@ -173,17 +170,15 @@ def test_curves_go_along_the_first_parameter(tmp_path):
 def test_long_folder_name_is_cut_and_stays_unique():
     read, paths = load("triangle"), ["trigger.threshold", "cases.event.trigger.minimum_interval_s"]
     axes = [Axis(f"{path}=1", path, ("1",), None) for path in paths]
-    names = [folder_of(read, some, "sweep").name for some in (axes[:1], axes, axes[::-1])]
-    assert names[0] == "triangle-sweep-trigger.threshold"
-    assert [len(name) for name in names[1:]] == [60, 60]
-    assert len({name[-8:] for name in names}) == 3
+    short, *cut = [folder_of(read, some, "sweep").name for some in (axes[:1], axes, axes[::-1])]
+    assert (short, [len(name) for name in cut]) == ("triangle-sweep-trigger.threshold", [60, 60])
+    assert len({name[-8:] for name in cut}) == 2
 
 
 def test_the_command_writes_table_figures_and_page(done, capsys):
     given, options = [AXIS, "seeds=3"], {"settings": SHORT, "out": str(done.folder), "processes": 1}
     assert commands.sweep("triangle", given, **options) == 0
-    said = capsys.readouterr().out
-    assert "event     threshold=0.02" in said
+    assert "event     threshold=0.02" in capsys.readouterr().out
     assert (done.folder / "sweep.csv").read_text().startswith("case,trigger.threshold,reference,seeds,failed,f_hz,")
     table = json.loads((done.folder / "sweep.json").read_text())
     assert (table["reference"], table["seeds"], len(table["cells"])) == ("periodic", [1, 2, 3], 3)

@@ -73,18 +73,15 @@ def test_others_are_refused(path, headers):
 def test_address_for_once_leads_in_once():
     gate = Gate()
     path = f"/{gate.ticket()}"
-    assert answered(gate, path, THERE) == 403
-    assert [answered(gate, path, HERE) for _ in range(2)] == [303, 403]
-    assert gate.secret != Gate().secret
-    assert gate.secret not in repr(gate)
+    assert [answered(gate, path, host) for host in (THERE, HERE, HERE)] == [403, 303, 403]
+    assert gate.secret not in (Gate().secret, repr(gate))
 
 
 def test_page_reports_what_it_shows():
     gate, now = Gate("secret"), time.time()
     gate.open(1)
-    opened = gate.seen[1].opened
-    assert gate.lag(opened + 3.0) == pytest.approx(3.0)
-    assert gate.lag(opened + 3600.0) == 0.0, "a page without reports slows for a while"
+    lags = [gate.lag(gate.seen[1].opened + late) for late in (3.0, 3600.0)]
+    assert lags == pytest.approx([3.0, 0.0]), "a page without reports slows for a while"
     for query in ("page=1&drawn=x&stage=1", "page=9&drawn=1&stage=1", f"page=1&drawn={now + 3600}&stage=1", "&" * 99):
         assert answered(gate, f"/secret/clock?{query}", HERE) == 200
         assert gate.seen[1].drawn == -inf
@@ -110,24 +107,18 @@ def operator(monkeypatch):
     return made, gate, given
 
 
-@pytest.mark.parametrize(
-    ("seen", "ordered"),
-    [
-        (Seen(1000.0, 2), ["hold", "land", "resume"]),
-        (Seen(1000.0 - heartbeat.STALE_S - 1.0, 2), ["hold", "land"]),
-        (Seen(1000.0, 1), ["hold", "land"]),
-        (Seen(-inf, 2), ["hold", "land"]),
-        (None, ["hold", "land"]),
-    ],
-)
-def test_old_pictures_order_no_motion(seen, ordered, operator, monkeypatch):
+OLD = Seen(1000.0 - heartbeat.STALE_S - 1.0, 2), Seen(1000.0, 1), Seen(-inf, 2), None
+
+
+@pytest.mark.parametrize("seen", [Seen(1000.0, 2), *OLD])
+def test_old_pictures_order_no_motion(seen, operator, monkeypatch):
     monkeypatch.setattr(orders.time, "time", lambda: 1001.0)
     acting, gate, given = operator
     if seen is not None:
         gate.seen[7] = seen
     for what in ("hold", "land", "resume"):
         acting.press(messages.Order(what), what, SimpleNamespace(client_id=7))
-    assert [order.order for order in given] == ordered
+    assert [order.order for order in given] == ["hold", "land", *([] if seen in OLD else ["resume"])]
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
@@ -154,14 +145,13 @@ def test_emergency_stop_tells_its_result_without_session(blocked, operator, monk
 
 def test_slider_orders_what_is_limited(operator):
     found = orders.parameters(SceneModel.of_plan(load("robotic-park").cases()["event"]))
-    threshold, *rest = [(each.label, each.value) for each in found]
-    assert threshold == ("trigger.threshold [m]", 0.01)
-    assert rest == [("clamp [m]", 0.1), ("tracking_gain [1/(m²·decision)]", 3.0)]
+    known = {"trigger.threshold [m]": 0.01, "clamp [m]": 0.1, "tracking_gain [1/(m²·decision)]": 3.0}
+    assert [(each.label, each.value) for each in found] == [*known.items()]
     for sent in (-1.0, 0.0, 1e9, inf, float("nan")):
         assert 0.0 < found[0].limited(sent) <= 0.04
     acting, gate, given = operator
     gate.seen[7] = Seen(time.time(), 2)
-    parameter = orders.Parameter("clamp", 0.1, "m")
-    acting.slide(parameter, SimpleNamespace(client=object(), client_id=7, target=SimpleNamespace(value=1e6)))
+    event = SimpleNamespace(client=object(), client_id=7, target=SimpleNamespace(value=1e6))
+    acting.slide(orders.Parameter("clamp", 0.1, "m"), event)
     acting.due["clamp"][1]()
     assert [(each.name, each.value) for each in given] == [("clamp", 0.4)]

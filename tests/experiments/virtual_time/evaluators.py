@@ -1,4 +1,4 @@
-"""Runs flown in plain Python and by compiled functions, which must be the same in every bit."""
+"""Runs flown in plain Python, by compiled functions, or read back from their recordings, which must be the same."""
 
 from dataclasses import fields
 from math import isnan
@@ -7,6 +7,7 @@ import msgspec
 import numpy as np
 
 from experiments.definition.plan import Plan
+from experiments.recording import playback
 from experiments.virtual_time import stretch
 from experiments.virtual_time.simulation import VirtualRun
 
@@ -38,10 +39,23 @@ def same(experiment, **options):
     return plain, ticks
 
 
+def played_back(recorder, folder):
+    """The trace of a run, the same as the one that is read back from its recording, and the latter."""
+    recorder.record(folder / "run.mcap", "")
+    played, trace = playback.read(folder / "run.mcap"), recorder.trace()
+    assert (played.complete, played.trace.goals is None) == (True, trace.goals is None)
+    for field in fields(trace):
+        if field.name != "goals":  # a recording has less of them
+            assert alike(getattr(trace, field.name), getattr(played.trace, field.name), 3e-6), field.name
+    return trace, played.trace
+
+
 def alike(one, other, within=0.0):
     """Whether two values are the same, numbers to a tolerance; unknown ones are the same."""
     if isinstance(one, msgspec.Struct):
         one, other = msgspec.structs.astuple(one), msgspec.structs.astuple(other)
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(alike(one[name], other[name], within) for name in one)
     if isinstance(one, tuple):
         return len(one) == len(other) and all(alike(*each, within) for each in zip(one, other, strict=True))
     if isinstance(one, np.ndarray) and one.dtype.kind == "f":

@@ -14,11 +14,11 @@ from agents.body.kinds import KINDS
 from agents.decision.lifecycle import RUNNING
 from experiments.definition.experiment import Arena, ChannelTable, LegTable, Rates, RobotTable, Start
 from experiments.definition.plan import Plan
+from experiments.metrics.clearance import Clearance
 from experiments.virtual_time.simulation import simulate
 from tests.experiments.traces import link_errors
 from tests.runs import flown
 from tests.small import changed, small
-from twins import scene as outlines
 from twins.arrays import norm
 
 pytestmark = pytest.mark.slow
@@ -80,83 +80,71 @@ def outcome(experiment, log):
     return gap, missed, log.avoided.max() / log.ticks
 
 
-def meet(experiment, seeds):
-    """Outcomes of encounters, one for each seed."""
-    return [outcome(experiment, simulate(Plan(experiment), seed)) for seed in seeds]
+def head_on_and_across(kinds, avoidance, **settings):
+    return [encounter(kinds, avoidance, between=angle, **settings) for angle in ANGLES]
 
 
-def met(kinds, avoidance, each, **settings):
-    """Outcomes of robots head-on and across, `each` of either."""
-    head_on, across = (encounter(kinds, avoidance, between=angle, **settings) for angle in ANGLES)
-    return meet(head_on, range(1, each + 1)) + meet(across, range(1, each + 1))
-
-
-def assert_clear(found, least=0.0, arrived=1.0):
+def meet(experiments, seeds):
+    """Gaps, and shares of avoidance, of encounters: of each experiment with each seed; and who arrived."""
+    found = [outcome(each, simulate(Plan(each), seed)) for each in experiments for seed in seeds]
     gap, missed, avoided = np.array(found).T
-    assert gap.min() > least
-    assert (missed <= ARRIVED).mean() >= arrived
-    return gap, avoided
+    return gap, avoided, (missed <= ARRIVED).mean()
 
 
 def test_without_avoidance_robots_collide():
-    gap, avoided = assert_clear(met(("turtlebot3", "turtlebot3"), None, 3, duration_s=12.0), -np.inf)
-    assert (gap < 0.0).sum() >= 3
-    assert gap.min() < -0.1
-    assert not avoided.any()
+    gap, avoided, _ = meet(head_on_and_across(("turtlebot3", "turtlebot3"), None, duration_s=12.0), (1, 2, 3))
+    assert ((gap < 0.0).sum() >= 3, gap.min() < -0.1, avoided.any()) == (True, True, False)
 
 
-def test_barrier_keeps_robots_apart_until_arrival():
-    _, avoided = assert_clear(met(("khepera4", "tello"), BARRIER, 3, duration_s=20.0), 0.01)
-    assert (avoided > 0.0).any()
+WHEELS = head_on_and_across(("turtlebot3", "turtlebot3"), POTENTIAL)  # a push that jumps to its full size stops these
+SENSING = head_on_and_across(("khepera4", "khepera4"), {"kind": "barrier"}, sensors=["infrared", "ultrasonic"])
+FOUR = [encounter(("khepera4", "turtlebot3", "crazyflie", "tello"), BARRIER)]
+BAD = ChannelTable(delay_s=0.02, jitter_s=0.02, loss=0.2)
+
+
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize(
+    ("experiments", "seeds", "least", "arrived"),
+    [
+        pytest.param(head_on_and_across(("khepera4", "tello"), BARRIER, duration_s=20.0), 3, 0.01, 1.0, id="barrier"),
+        pytest.param(WHEELS[:1], [7], 0.1, 1.0, id="edge of the potential, head-on"),
+        pytest.param(WHEELS[1:], [23], 0.1, 1.0, id="edge of the potential, across"),
+        pytest.param(FOUR, 3, 0.0, 0.95, id="four kinds"),
+        pytest.param(FOUR, 20, 0.0, 0.95, id="four kinds, often", marks=pytest.mark.nightly),
+        pytest.param(SENSING, 2, 0.0, 1.0, id="sensors alone"),
+        *[
+            pytest.param([changed(encounter(kinds, BARRIER), channel=BAD)], 20, 0.0, 1.0, marks=pytest.mark.nightly)
+            for kinds in (("tello", "tello"), ("crazyflie", "turtlebot3"))
+        ],
+    ],
+)
+def test_robots_keep_apart_until_they_arrive(experiments, seeds, least, arrived):
+    gap, avoided, share = meet(experiments, range(1, 1 + seeds) if isinstance(seeds, int) else seeds)
+    assert gap.min() > least
+    assert share >= arrived
+    assert avoided.any()
 
 
 @pytest.mark.timeout(600)
 @pytest.mark.nightly
 def test_thousand_random_encounters_without_collision():
-    seeds = {math.pi: range(1, 51), 0.5 * math.pi: range(51, 101)}
-    whole = []
-    for kinds, angle in itertools.product(PAIRS, ANGLES):
-        whole += meet(encounter(kinds, BARRIER, between=angle), seeds[angle])
-    assert len(whole) == 1000
-    assert_clear(whole, 0.02, arrived=0.995)  # arrival is not guaranteed
-
-
-def test_wheels_pass_edge_of_the_potential():
-    """A push that jumps to its full size at the edge stops these."""
-    for angle, seed in zip(ANGLES, (7, 23), strict=True):
-        assert_clear(meet(encounter(("turtlebot3", "turtlebot3"), POTENTIAL, between=angle), [seed]), 0.1)
-
-
-@pytest.mark.parametrize("seeds", [3, pytest.param(20, marks=pytest.mark.nightly)])
-def test_four_kinds_change_sides(seeds):
-    kinds = ("khepera4", "turtlebot3", "crazyflie", "tello")
-    assert_clear(meet(encounter(kinds, BARRIER), range(1, 1 + seeds)), arrived=0.95)
-
-
-def test_robots_with_sensors_alone_keep_clear():
-    sensors = ["infrared", "ultrasonic"]
-    assert_clear(met(("khepera4", "khepera4"), {"kind": "barrier"}, 2, sensors=sensors))
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize("kinds", [("tello", "tello"), ("crazyflie", "turtlebot3")])
-def test_bad_network_causes_no_collision(kinds):
-    bad = ChannelTable(delay_s=0.02, jitter_s=0.02, loss=0.2)
-    assert_clear(meet(changed(encounter(kinds, BARRIER), channel=bad), range(1, 21)))
+    found = [
+        meet([encounter(kinds, BARRIER, between=angle)], range(first, first + 50))
+        for kinds, (angle, first) in itertools.product(PAIRS, zip(ANGLES, (1, 51), strict=True))
+    ]
+    gaps = np.concatenate([gap for gap, *_ in found])
+    assert (len(gaps), gaps.min() > 0.02) == (1000, True)
+    assert np.mean([share for *_, share in found]) >= 0.995  # arrival is not guaranteed
 
 
 @pytest.mark.parametrize("case", [pytest.param("periodic", marks=pytest.mark.nightly), "event"])
 def test_it_passes_without_contact_and_recovers(case):
     flight = flown("obstacle-course", case)
-    plan, log, scene, radius = flight.plan, flight.log, flight.plan.scene, KINDS["turtlebot3"].radius
-    run = (log.time >= 0.0) & (log.time <= plan.experiment.duration_s)
-    time, place = log.time[run], log.true_position[run]
-    assert log.touches == ()
-    for k in range(len(scene.names)):
-        assert (outlines.distance(scene, k, scene.pose[k], place[..., :2]) > radius + 0.04).all()
-    i, j = np.triu_indices(place.shape[1], 1)
-    assert (norm(place[:, i, :2] - place[:, j, :2]) > 2.0 * radius + 0.04).all()
+    clearance = Clearance.of_trace(flight.trace)
+    assert (clearance.overlaps, flight.log.touches) == ((), ())
+    assert min(approach.gap for approach in (*clearance.robots, *clearance.arena)) > 0.04
+    time, place = flight.trace.time, flight.trace.true_position
     assert (place[-1, :, 0] > 0.5).all()  # all are through
-    error = link_errors(plan.links, place).max(axis=1)
+    error = link_errors(flight.plan.links, place).max(axis=1)
     assert error.max() > 0.3  # it had to fold
     assert error[time > 75.0].max() < 0.025

@@ -73,13 +73,17 @@ def farthest(trace, goals):
     return np.linalg.norm(trace.true_position[-1, :, :2] - goals, axis=1).max()
 
 
+def assert_swapped(trace, goals):
+    assert nearest(trace) > CONTACT
+    assert farthest(trace, goals) < 0.05
+    return trace
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("number", CASES)
 @pytest.mark.parametrize("swap", [opposite, random])
 def test_eight_robots_swap_places_without_contact(swap, number):
-    trace, goals = swapped(swap, number)
-    assert nearest(trace) > CONTACT
-    assert farthest(trace, goals) < 0.05
+    assert_swapped(*swapped(swap, number))
 
 
 @pytest.mark.slow
@@ -105,9 +109,7 @@ def test_contacts_and_deadlocks_are_those_of_the_page(swap, changes, touching, w
 @pytest.mark.slow
 @pytest.mark.parametrize("case", [pytest.param("event", marks=pytest.mark.nightly), "event-loss"])
 def test_swap_by_events_and_with_losses(case):
-    trace, goals = swapped(opposite, 0, case=case)
-    assert nearest(trace) > CONTACT
-    assert farthest(trace, goals) < 0.05
+    trace = assert_swapped(*swapped(opposite, 0, case=case))
     assert len(trace.sent) < 0.7 * len(swapped(opposite, 0)[0].sent)
 
 
@@ -141,15 +143,11 @@ def test_a_robot_plans_around_what_another_says():
     law = Mpc(goal={"A": (1.4, 0.0)}, speed=0.2)
     bench = Bench(replace(Plan(triangle()).assignment("A"), law=law, start=None, starts=()), (-0.4, 0.0, 0.0))
     conflicts, right = plan_of(bench.running(come).step(0.5, come))
-    assert conflicts == 1.0
-    assert right < -0.2  # to its right: the other does so as well
-    bench.step(0.8)
-    assert plan_of(bench)[0] == 1.0  # what was said is old, and still counts
+    assert (conflicts, right < -0.2) == (1.0, True)  # to its right: the other does so as well
+    assert plan_of(bench.step(0.8))[0] == 1.0  # what was said is old, and still counts
     bench.neighbours.mark_lost(0, bench.t)
-    bench.step(1.3)
-    conflicts, right = plan_of(bench)
-    assert conflicts == 0.0
-    assert right > -0.1
+    conflicts, right = plan_of(bench.step(1.3))
+    assert (conflicts, right > -0.1) == (0.0, True)
 
 
 def test_constraints_hold_where_they_can():
@@ -157,22 +155,19 @@ def test_constraints_hold_where_they_can():
     ahead = horizon(15, 0.2, 0.1)
     still = NeighbourView(1, "B", (0.6, 0.0, 0.0), ZERO, 0.0, 0.0, {"path": (nan,) * 32}, None)
     (found,) = ahead.conflicts(ahead.positions((0.0, 0.0), (0.3, 0.0), ahead.rest), [still], 0.35, 0.0)
-    step, normal, bound = found
-    assert (step, normal, bound) == (4, (-1.0, 0.0), pytest.approx(-0.25))
+    assert found == (4, (-1.0, 0.0), pytest.approx(-0.25))
     a, slack = ahead.plan((0.0, 0.0), (0.3, 0.0), (2.0, 0.5), [found], (0.5, 1.0, 100.0))
     places = ahead.positions((0.0, 0.0), (0.3, 0.0), a)
-    assert slack < 1e-6
-    assert places[step, 0] <= 0.25 + 1e-6
-    assert np.abs(a).max() <= 1.0 + 1e-6
-    assert np.abs(0.3 * np.array([1.0, 0.0]) + 0.2 * np.cumsum(a, axis=0)).max() <= 0.5 + 1e-6
+    speed = 0.3 * np.array([1.0, 0.0]) + 0.2 * np.cumsum(a, axis=0)
+    for value, most in ((slack, 0.0), (places[4, 0], 0.25), (np.abs(a).max(), 1.0), (np.abs(speed).max(), 0.5)):
+        assert value <= most + 1e-6
 
 
 def test_path_is_read_at_its_readers_time():
     path = tuple(number for k in range(16) for number in (0.1 * k, 1.0))
-    later = horizon(15, 0.2, 0.1).later(path, 0.3)
+    later, last = (horizon(15, 0.2, 0.1).later(path, late) for late in (0.3, 1e6))
     assert later[:3, 0] == pytest.approx([0.25, 0.35, 0.45])
-    assert later[-1] == pytest.approx([1.5, 1.0])  # it stays at the end
-    assert horizon(15, 0.2, 0.1).later(path, 1e6)[0] == pytest.approx([1.5, 1.0])
+    assert [*later[-1], *last[0]] == pytest.approx([1.5, 1.0] * 2)  # it stays at the end
 
 
 def test_a_missing_library_is_named_with_its_remedy(monkeypatch):

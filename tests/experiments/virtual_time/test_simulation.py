@@ -1,6 +1,6 @@
 """The virtual clock: the same bits from the same seed, names when it gets stuck, faults in trace and recording."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -8,15 +8,28 @@ import pytest
 from agents.body.interface import Disturbance
 from agents.body.limits import Safety
 from agents.decision.lifecycle import AIRBORNE, DONE, IDLE, LANDING, READY, RUNNING
-from experiments.definition.experiment import ChannelTable, Formation, LegTable, RobotTable, Start
+from agents.network.messages import Contact
+from experiments.definition.experiment import (
+    Arena,
+    ChannelTable,
+    Formation,
+    LegTable,
+    Rates,
+    RobotTable,
+    Shadow,
+    Start,
+    WorldTable,
+)
 from experiments.definition.plan import Plan
-from experiments.recording import playback
 from experiments.virtual_time.conductor import LEAD_S, Stuck
+from experiments.virtual_time.log import RunRecorder
 from experiments.virtual_time.simulation import VirtualRunLog, simulate
 from tests.experiments.checked import findings
-from tests.experiments.virtual_time.evaluators import alike
+from tests.experiments.virtual_time.evaluators import alike, played_back
 from tests.runs import fly
 from tests.small import changed, pair, reference, small
+from twins.engines.engine import Touch
+from twins.scene import Obstacle
 
 
 @pytest.mark.slow
@@ -52,12 +65,10 @@ def test_the_common_start_is_time_zero():
     assert log.time[k] == pytest.approx(0.0, abs=1e-9)
     np.testing.assert_allclose(np.diff(log.time), 0.02, atol=1e-9)  # state_hz
     end = int(np.flatnonzero(log.time < 2.0 - 1e-9)[-1])
-    phases = [log.phase[row].tolist() for row in (0, k - 1, k, end)]
-    assert phases == [[IDLE] * 2, [AIRBORNE] * 2, [RUNNING] * 2, [RUNNING] * 2]
+    assert log.phase[[0, k - 1, k, end]].tolist() == [[IDLE] * 2, [AIRBORNE] * 2, [RUNNING] * 2, [RUNNING] * 2]
     assert (log.phase[end + 1] >= LANDING).all()
-    assert log.airborne == pytest.approx(-LEAD_S)
+    assert (log.airborne, log.decisions, log.ticks) == (pytest.approx(-LEAD_S), 20, 200)
     assert log.ended - log.time[-1] <= 0.02 + 1e-9
-    assert (log.decisions, log.ticks) == (20, 200)
 
 
 def test_losses_are_counted_from_start_to_landing():
@@ -69,30 +80,23 @@ def test_losses_are_counted_from_start_to_landing():
     log = ground(channel=ChannelTable(loss=1.0))
     stamp = log.received.stamp
     assert not ((stamp > -1e-9) & (stamp < 2.0 - 1e-9)).any()
-    assert stamp.max() >= 2.0 - 1e-9
-    assert len(stamp) > 50
-    assert log.lost.tolist() == [100, 100]
+    assert (stamp.max() >= 2.0 - 1e-9, len(stamp) > 50, log.lost.tolist()) == (True, True, [100, 100])
 
 
 def test_the_reference_formation_is_acquired():
-    log = fly(changed(reference(), duration_s=18.0, timeline=[])).log
-    links_each = np.array([0, 4, 3, 4, 4, 4, 2])
-    assert (log.error[np.flatnonzero(log.time <= 18.0)[-1]] <= 0.03 * links_each + 1e-9).all()
-    assert np.abs(log.true_position[..., :2]).max() < 1.0
-    sent = np.bincount(log.sent.link[(log.sent.stamp >= 0) & (log.sent.stamp < 18)], minlength=7) / 18.0
-    assert sent[0] < 0.5  # the leader stands
-    assert sent.max() < 20.0
-    assert sent[4:].mean() > sent[1:4].mean() > 3.0
-    assert log.incidents == ()
+    run = fly(changed(reference(), duration_s=18.0, timeline=[]))
+    leader, *others = [robot.f_hz for robot in run.metrics.robots]
+    assert (run.log.incidents, None in run.metrics.acquired_s) == ((), False)
+    assert leader < 0.5, "it stands"
+    assert 3.0 < np.mean(others[:3]) < np.mean(others[3:]) < max(others) < 20.0
 
 
 def test_who_keeps_a_run_from_starting_is_named():
-    deaf = pair(duration_s=2.0, channel=ChannelTable(delay_s=100.0))
-    with pytest.raises(Stuck, match=r"not ready after 5 s: A, B \(never received B\)"):
-        simulate(Plan(deaf), 1, patience_s=5.0)
-    grounded = small({"A": "khepera4", "F": "crazyflie", "G": "crazyflie"})
-    with pytest.raises(Stuck, match=r"not airborne after 0.5 s: F, G"):
-        simulate(Plan(grounded), 1, patience_s=0.5)
+    deaf = pair(duration_s=2.0, channel=ChannelTable(delay_s=100.0)), r"not ready after 5 s: A, B \(never received B\)"
+    grounded = small({"A": "khepera4", "F": "crazyflie", "G": "crazyflie"}), r"not airborne after 0.5 s: F, G"
+    for (experiment, says), patience_s in ((deaf, 5.0), (grounded, 0.5)):
+        with pytest.raises(Stuck, match=says):
+            simulate(Plan(experiment), 1, patience_s=patience_s)
 
 
 def test_robot_goes_on_without_a_never_received_neighbour():
@@ -114,10 +118,8 @@ def test_robots_that_come_too_near_hold(tmp_path):
     found = hazards(run.trace)
     assert {source for source, _ in found} == {"A", "B"}
     assert ("A", "hold: minimum separation: 0.60 m from B (limit 0.6 m)") in found
-    run.recorder.record(tmp_path / "case.mcap", 'title = "A pair"')
-    read = playback.read(tmp_path / "case.mcap").trace
-    assert {*hazards(read)} == {*found}
-    assert all(0.0 < event.stamp <= 8.0 for event in read.events if event.kind == "hazard")  # unresolved at the end
+    trace, _ = played_back(run.recorder, tmp_path)
+    assert all(0.0 < event.stamp <= 8.0 for event in trace.events if event.kind == "hazard")  # unresolved at the end
 
 
 def with_drone(architecture, low=0.1, **of_drone):
@@ -172,3 +174,66 @@ def test_scripted_landing_silences_and_loses_a_robot(architecture):
 )
 def test_check_finds_settings_that_make_no_sense(settings, code):
     assert code in findings(pair(safety=Safety(**settings), duration_s=20.0))
+
+
+CART = Obstacle(box=(0.2, 0.2), at=(-0.8, 0.8), plan={"kind": "line", "move_by": [0.5, 0.0], "speed": 0.1})
+
+
+def mixed_pair(engine="point-mass", **parts):
+    robots = {
+        "KH": RobotTable(kind="khepera4", start=[-0.4, 0.0], shadow=Shadow(restart_s=1.0)),
+        "CF": RobotTable(kind="crazyflie", start=[0.4, 0.1], hover=0.5),
+    }
+    given = {
+        "duration_s": 3.0,
+        "arena": Arena(obstacles={"post": Obstacle(radius=0.1, at=(1.0, 1.0)), "cart": CART}),
+        "disturbance": {"all": Disturbance(position_sigma=0.001, yaw_sigma=0.002)},
+        "channel": ChannelTable(delay_s=0.02, loss=0.2),
+        "rates": Rates(state_hz=50.0),
+        "timeline": [LegTable(at_s=1.0, robot="CF", plan={"kind": "line", "move_by": [0.2, 0.0], "speed": 0.2})],
+        "world": WorldTable(engine=engine),
+    }
+    return small(robots, {"KH - CF": 0.7}, **given | parts)
+
+
+def recorder(log, engine="point-mass", **parts):
+    return RunRecorder(log, Plan(mixed_pair(engine, **parts)), "only")
+
+
+@pytest.fixture(scope="module")
+def log():
+    """Log of a run, with attitudes and contacts of the test, which this engine does not compute."""
+    plain = simulate(Plan(mixed_pair()), 3)
+    half = np.linspace(0.0, 2.0, len(plain.time))[:, None] * [1.0, 0.5]
+    attitude = np.stack([np.cos(half), np.sin(half), 0.0 * half, 0.0 * half], axis=-1)
+    ends = (-0.4, 1, -1), (0.503, 0, 1), (1.25, 0, -2), (2.5, 1, -3), (3.2, 1, 0)  # the first and last out of the run
+    touches = tuple(Touch(*end, 0.1 * k, 0.001 * k) for k, end in enumerate(ends, start=1))
+    counts = np.array([4, 3])
+    return replace(plain, attitude=attitude, touches=touches, interventions=counts, avoided=counts // 2)
+
+
+def test_logged_and_played_back_runs_are_the_same(log, tmp_path):
+    trace, _ = played_back(recorder(log), tmp_path)
+    assert trace.dropped.sum() > 50
+    assert np.isfinite(trace.shadow_position).all(axis=(0, 2)).tolist() == [True, False]
+
+
+def test_a_trace_has_contacts_and_moving_things(log):
+    trace = recorder(log).trace()
+    touched = (0.503, "KH", "CF"), (1.25, "KH", "cart"), (2.5, "CF", "wall")
+    wanted = [Contact(pytest.approx(at), *ends, 0.1 * k, 0.001 * k) for k, (at, *ends) in enumerate(touched, start=2)]
+    assert [*trace.contacts] == pytest.approx(wanted)
+    assert (trace.interventions.tolist(), trace.avoided.tolist()) == ([4, 3], [2, 1])
+    world = trace.world
+    assert [(round(said.stamp, 6), said.contacts) for said in world] == [(0.0, 1), (1.0, 2), (2.0, 3), (3.0, 4)]
+    assert [[standing.name for standing in said.obstacles] for said in world] == [["post", "cart"]] * 4
+    assert [said.obstacles[1].pose[0] for said in world] == pytest.approx([-0.8, -0.7, -0.6, -0.5])
+    known = {(said.obstacles[0].pose, said.engine, said.factor, said.paused) for said in world}
+    assert known == {((1.0, 1.0, 0.0), "point-mass", 1.0, False)}
+
+
+def test_engine_without_contacts_found_reports_none(log):
+    quiet = replace(log, touches=())
+    assert [recorder(quiet, engine).trace().contacts for engine in ("point-mass", "pymunk")] == [None, ()]
+    trace = recorder(replace(quiet, obstacles=log.obstacles[:, :, :0]), arena=Arena()).trace()
+    assert (trace.world, trace.contacts) == ((), None)

@@ -21,16 +21,10 @@ PARK = reference("periodic")
 BAD = ChannelTable(delay_s=0.05, loss=0.1)
 
 
-@pytest.mark.parametrize(
-    ("parts", "predictor"),
-    [
-        ({}, HOLD),
-        ({"trigger": CHOSEN}, ConstantVelocity()),
-        ({"prediction": {"kind": "constant-velocity", "horizon_s": 0.5}}, ConstantVelocity(horizon_s=0.5)),
-    ],
-)
-def test_prediction_defaults_to_what_the_trigger_needs(parts, predictor):
-    assert Plan(changed(PARK, **parts)).predictor == predictor
+def test_prediction_defaults_to_what_the_trigger_needs():
+    own = {"prediction": {"kind": "constant-velocity", "horizon_s": 0.5}}
+    found = [Plan(changed(PARK, **parts)).predictor for parts in ({}, {"trigger": CHOSEN}, own)]
+    assert found == [HOLD, ConstantVelocity(), ConstantVelocity(horizon_s=0.5)]
 
 
 def updating(update=None, **parts):
@@ -48,8 +42,7 @@ def updating(update=None, **parts):
 )
 def test_triggers_where_they_make_no_sense_are_refused(change, path, hint):
     (fault,) = consistency_faults(Plan(updating(**change)))
-    assert ".".join(fault.path) == path
-    assert hint in fault.hint
+    assert (".".join(fault.path), hint in fault.hint) == (path, True)
 
 
 def test_belief_error_is_that_of_the_prediction():
@@ -76,11 +69,10 @@ def test_belief_error_is_that_of_the_prediction():
 
 def test_updates_are_counted_for_each_robot():
     run = fly(updating({"kind": "send-on-delta", "threshold": 0.02}, duration_s=12.0, timeline=[]))
-    assert run.log.updates[0] == run.log.decisions == 120
-    np.testing.assert_array_equal(run.trace.decisions, run.log.updates)
-    assert (run.trace.decisions[1:] < 120).all()
-    assert (run.trace.decisions[1:] > 10).all()
-    assert [robot.updates for robot in run.metrics.robots] == run.trace.decisions.tolist()
+    updates = run.log.updates.tolist()
+    assert updates == run.trace.decisions.tolist() == [robot.updates for robot in run.metrics.robots]
+    assert updates[0] == run.log.decisions == 120
+    assert 10 < min(updates[1:]) <= max(updates[1:]) < 120
     alone = small({"KH01": "khepera4"}, formation=Formation(update="send-on-delta"), duration_s=2.0)
     assert fly(alone).log.updates.tolist() == [20]  # without links there is no law to gate
 
