@@ -23,25 +23,18 @@ from twins.arrays import norm
 pytestmark = pytest.mark.slow  # runs and reports, whole
 
 HYBRID = Hybrid(kind="hybrid", robots=["KH02", "CF02", "CF03"])
-LINE = {"kind": "line", "move_by": [0.3, 0.0], "speed": 0.15}
 PERIODIC, EVENT = reference("periodic"), reference("event")
 BOTH, ALL = ("distributed", "centralised"), ("distributed", "centralised", HYBRID)
 
 
 def short(experiment, **parts):
     """Five seconds of it, with a leader that drives."""
-    legs = [LegTable(at_s=3.0, robot="TB01", plan=LINE)]
-    return changed(experiment, **{"duration_s": 5.0, "timeline": legs, **parts})
+    leg = LegTable(at_s=3.0, robot="TB01", plan={"kind": "line", "move_by": [0.3, 0.0], "speed": 0.15})
+    return changed(experiment, **{"duration_s": 5.0, "timeline": [leg], **parts})
 
 
 def with_delay(experiment, delay_s, architecture="distributed", **more):
     return changed(experiment, channel=ChannelTable(delay_s=delay_s, **more), architecture=architecture)
-
-
-def assert_same_motion(first, second):
-    for what in ("true_position", "true_yaw", "goal"):
-        wanted, found = (getattr(log, what)[log.time > -1e-9] for log in (first, second))
-        np.testing.assert_allclose(found, wanted, rtol=0.0, atol=1e-9, err_msg=what)
 
 
 ALONE = small(
@@ -67,7 +60,9 @@ def test_architectures_without_delay_move_the_same(park, seed):
     assert first.time[-1] >= park.duration_s
     for architecture in ALL[1:] if park is not ALONE else BOTH[1:]:
         second = fly(with_delay(park, 0.0, architecture), seed).log
-        assert_same_motion(first, second)
+        for what in ("true_position", "true_yaw", "goal"):
+            wanted, found = (getattr(log, what)[log.time > -1e-9] for log in (first, second))
+            np.testing.assert_allclose(found, wanted, rtol=0.0, atol=1e-9, err_msg=what)
         assert (second.updates >= first.updates).all()  # goals are said again now and then
 
 

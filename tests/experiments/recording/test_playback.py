@@ -241,14 +241,14 @@ def test_end_of_a_run(path, duration_s, messages, end, silent):
     assert np.isfinite(trace.position[-1]).all(axis=1).tolist() == [True, not silent]
 
 
-INTERRUPTED = [[rec.begun(), rec.landed(end, "landing (interrupted)")] for end in (-0.5, 0.05)]
-
-
 @pytest.mark.parametrize(
     ("began", "says"),
-    [*[(began, "ended before the common start") for began in INTERRUPTED],
-     ([rec.status(started=0.0)], "no robot had started")],
-)  # fmt: skip
+    [
+        ([rec.begun(), rec.landed(-0.5, "landing (interrupted)")], "ended before the common start"),
+        ([rec.begun(), rec.landed(0.05, "landing (interrupted)")], "ended before the common start"),
+        ([rec.status(started=0.0)], "no robot had started"),
+    ],
+)
 def test_a_run_that_never_started(path, began, says):
     with pytest.raises(NotStarted, match=says):
         rec.trace_of(path, rec.state(), *began)

@@ -4,6 +4,7 @@ import errno
 import shutil
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from unittest.mock import Mock
 
 import msgspec
 import pytest
@@ -199,21 +200,14 @@ def test_foreign_folders_and_ends_of_links_stay(tmp_path):
     assert {path.name for path in thesis.iterdir()} == {run_folder.SOURCE, "data.mcap"}
 
 
-def refusing(code):
-    def refuse(*_):
-        raise OSError(code, "Permission denied")
-
-    return refuse
-
-
 def test_half_removed_and_endless_runs_are_runs(tmp_path, monkeypatch):
     folder = kept(tmp_path / "run", ended=2.0)
     (folder / "logs").mkdir()
-    monkeypatch.setattr(shutil, "rmtree", refusing(errno.EACCES))
+    monkeypatch.setattr(shutil, "rmtree", Mock(side_effect=OSError(errno.EACCES, "Permission denied")))
     assert "cannot be removed: Permission denied" in clean(tmp_path, "--yes", code=1)
     assert {run_folder.SOURCE, run_folder.ORIGIN} <= {path.name for path in folder.iterdir()}
     monkeypatch.undo()
     endless = kept(tmp_path / "endless")
-    monkeypatch.setattr(cleaning.fcntl, "flock", refusing(errno.ENOLCK))
+    monkeypatch.setattr(cleaning.fcntl, "flock", Mock(side_effect=OSError(errno.ENOLCK, "No locks available")))
     clean(tmp_path, "--yes")
     assert [*tmp_path.iterdir()] == [endless], "without locks it may be in use"

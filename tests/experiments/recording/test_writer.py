@@ -6,6 +6,7 @@ import itertools
 import math
 import subprocess
 import sys
+from unittest.mock import Mock
 
 import msgspec
 import numpy as np
@@ -129,22 +130,15 @@ def test_disk_too_full_for_record_or_recovery(path, tmp_path, monkeypatch):
         assert not path.exists()
         with pytest.raises(RecordingError, match="cannot be written"):
             rec.recording(tmp_path / "long.mcap", document="#" * 50_000)
-    monkeypatch.setattr(writer, "TemporaryFile", raising(OSError(errno.ENOSPC, "No space left on device")))
+    monkeypatch.setattr(writer, "TemporaryFile", Mock(side_effect=OSError(errno.ENOSPC, "No space left on device")))
     with pytest.raises(RecordingError, match="No space left"):
         rec.write(path, *rec.whole_run())
     assert not path.exists()
 
 
-def raising(error):
-    def act(*_, **__):
-        raise error
-
-    return act
-
-
 def test_interrupt_inside_a_write_ends_all_writing(path, monkeypatch):
     made = rec.recording(path)
-    monkeypatch.setattr(writer.McapFile, "flush", raising(KeyboardInterrupt()))
+    monkeypatch.setattr(writer.McapFile, "flush", Mock(side_effect=KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         made.flush()
     with pytest.raises(RecordingError, match=r"interrupted while it wrote; run `\./zenpark recover`"):

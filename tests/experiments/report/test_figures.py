@@ -18,8 +18,6 @@ from tests.system.browser import CHROMIUM, needs_chromium
 
 pytestmark = pytest.mark.slow  # runs and reports, whole
 
-OF_TRACES = (figures.formation, figures.errors, figures.events, figures.intervals, figures.plan_view)
-OF_CASES = (figures.global_bars, figures.robot_bars)
 WITHOUT_SPACE = ["errors", "robot_bars", "events", "intervals"]
 
 
@@ -36,13 +34,13 @@ def two_cases():
 @pytest.mark.parametrize("few", [True, pytest.param(False, marks=pytest.mark.nightly)])
 def test_figures_fit_in_one_column(few, two_cases):
     traces = two_cases if few else [crowd(40, f"case{k}", 0.01 * k, duration=2.0) for k in range(5)]
-    for draw in OF_TRACES:
+    for draw in (figures.formation, figures.errors, figures.events, figures.intervals, figures.plan_view):
         figure = draw(traces)
         assert (figure.get_figwidth(), draw(traces, width=7.16).get_figwidth()) == (3.5, 7.16)
         assert 1.0 < figure.get_figheight() <= 9.3
         assert len(figure.axes) >= (len(traces) if draw is figures.events else 1)
         assert "<metadata" not in style.svg(figure)
-    for draw in OF_CASES:
+    for draw in (figures.global_bars, figures.robot_bars):
         figure = draw([measure(trace) for trace in traces])
         assert figure.get_figwidth() == 3.5
         canvas = FigureCanvasAgg(figure)

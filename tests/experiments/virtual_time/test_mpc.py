@@ -2,6 +2,7 @@
 
 import sys
 from dataclasses import replace
+from functools import partial
 from math import cos, dist, nan, pi, sin
 from random import Random
 
@@ -25,7 +26,7 @@ pytest.importorskip("daqp", reason="the law mpc is the extra [mpc]: ./zenpark in
 NAMES = [f"CF{number:02}" for number in range(1, 9)]
 CONTACT = 0.13  # m, between the axes of two Crazyflies
 WITHOUT = tuple(f"robots.{name}.avoids=false" for name in NAMES)  # the plans alone
-CASES = [pytest.param(number, marks=[] if number < 1 else pytest.mark.nightly) for number in range(20)]
+CASES = [0, *(pytest.param(number, marks=pytest.mark.nightly) for number in range(1, 20))]
 
 
 def opposite(number):
@@ -48,9 +49,7 @@ def random(number, half=1.5, apart=0.55):
     return places, goals
 
 
-def crowded(number):
-    """As `random`, in a quarter of the area."""
-    return random(number, 0.75, 0.4)
+crowded = partial(random, half=0.75, apart=0.4)  # in a quarter of the area
 
 
 def swapped(swap, number, *changes, case="periodic"):
@@ -86,7 +85,6 @@ def test_eight_robots_swap_places_without_contact(swap, number):
     assert_swapped(*swapped(swap, number))
 
 
-@pytest.mark.slow
 @pytest.mark.nightly
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize(
