@@ -97,20 +97,20 @@ def own_policy(folder, name="own.onnx"):
 
 
 def test_what_is_no_policy_is_refused(tmp_path, monkeypatch):
-    for sizes in ((15, 2), (16, 3), (16, 2, 11), (3, 2), None):
-        if sizes is None:
-            (tmp_path / "own.onnx").write_bytes(b"nothing")
-        else:
-            model(tmp_path, *sizes)
+    for sizes in ((15, 2), (16, 3), (16, 2, 11), (3, 2)):
+        model(tmp_path, *sizes)
         given = own_policy(tmp_path).cases()["periodic"].assignment("CF01")
-        with pytest.raises(
-            PluginError, match=r"one float input of 4 \+ 4n numbers" if sizes else "cannot use its file"
-        ):
+        with pytest.raises(PluginError, match="one float input of 4 \\+ 4n numbers"):
             Stepping(given)
+    (tmp_path / "own.onnx").write_bytes(b"nothing")
+    given = own_policy(tmp_path).cases()["periodic"].assignment("CF01")
+    with pytest.raises(PluginError, match="cannot use its file"):
+        Stepping(given)
+    with pytest.raises(PluginError, match="give `file`"):
+        policy.load("")
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    for text, says in (("", "give `file`"), ("not cached", r"\./zenpark install onnxruntime")):
-        with pytest.raises(PluginError, match=says):
-            policy.load(text)
+    with pytest.raises(PluginError, match=r"\./zenpark install onnxruntime"):
+        policy.load("not cached")
 
 
 def test_absent_file_is_a_fault_of_its_line(tmp_path):
