@@ -35,10 +35,7 @@ def at_origin(robots, formation, *, legs=(), **rest):
 
 
 def trace(what, position, *, step=STEP, sent=None, delay=0.0, case="only", seed=1, events=(), planned=None):
-    """A trace of given positions (T, N, 3); robots in `sent` send their pose at those times, heard by all listeners.
-
-    It is as long as the run was to be, unless another length was `planned` [s].
-    """
+    """A trace of given positions (T, N, 3), of a run of this or the `planned` length [s]; who `sent` when is heard."""
     names, count = tuple(what.robots), len(position)
     rows, none = len(names), np.zeros(len(names), dtype=np.intp)
     plan = Plan(changed(what, duration_s=max(count - 1, 1) * step if planned is None else planned))

@@ -64,8 +64,8 @@ def test_condition_of_a_robot(said, seen, is_):
 
 
 def test_bodies_and_links_are_told_apart():
-    bodies = ("twin", "crazyflie-twin", "world", "radio://0/80/2M/E7E7E7E701")
-    assert [stage.place_of(body).name for body in bodies] == ["TWIN", "TWIN", "WORLD", "REAL"]
+    bodies = {"twin": "TWIN", "crazyflie-twin": "TWIN", "world": "WORLD", "radio://0/80/2M/E7E7E7E701": "REAL"}
+    assert {body: stage.place_of(body).name for body in bodies} == bodies
     assert len({tuple(colour) for colour in stage.CHASSIS.values()}) == len(BodyLocation)
     colours = stage.link_colours(np.array([0.024, 0.026, 0.049, 0.051, np.nan]))
     assert [*map(tuple, colours.tolist())] == [stage.GOOD, stage.FAIR, stage.FAIR, stage.BAD, stage.UNKNOWN]
@@ -84,9 +84,8 @@ def test_errors_are_those_of_the_law(park_scene):
 
 
 def test_absent_links_plugins_or_experiments_have_no_error(park_scene):
-    link = LinkTable(distance=0.5, from_s=3.0)
-    pair = SceneModel.of_plan(Plan(small({"A": "khepera4", "B": "khepera4"}, {"A > B": link})))
-    tracker, place = LinkTracker(pair), np.array([[0.0, 0.0, 0.0], [0.6, 0.0, 0.0]])
+    link, place = LinkTable(distance=0.5, from_s=3.0), np.array([[0.0, 0.0, 0.0], [0.6, 0.0, 0.0]])
+    tracker = LinkTracker(SceneModel.of_plan(Plan(small({"A": "khepera4", "B": "khepera4"}, {"A > B": link}))))
     assert np.isnan(tracker.errors(1.0, place)).all()
     assert tracker.errors(4.0, place) == pytest.approx([0.1])
     formation = msgspec.structs.replace(park_scene.plan.experiment.formation, law="not-here")

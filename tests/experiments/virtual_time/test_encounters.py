@@ -35,12 +35,7 @@ WOBBLE = Disturbance(hover_jitter=Jitter(0.01))
 
 
 def encounter(kinds, avoidance, *, between=math.pi, sensors=(), duration_s=None):
-    """Robots that want to change sides of a circle, all at the same time.
-
-    Args:
-        between: Angle between the starts of one robot and the next [rad]; more than two are spread evenly.
-        duration_s: Of the run [s]; `PATIENCE` times the slowest's way if left out.
-    """
+    """Robots that change sides of a circle at once, two of them `between` apart [rad]; the slowest needs patience."""
     low = [KINDS[kind].height for kind in kinds if not KINDS[kind].flies]
     height = 0.5 * min(low) if low else 0.5  # beside what drives [m]
     speeds = [SPEED[KINDS[kind].takes] for kind in kinds]
