@@ -108,15 +108,13 @@ class Robot:
         return ""
 
     def resume(self) -> None:
-        """Order to go on after a hold, from where the robot is now."""
-        self._end_hold()
-        self._continuity.forget()
-        self._external.forget()
-
-    def _end_hold(self) -> None:
+        """Order to go on after a hold, from where the robot is now: no order confirms one that jumped in the air."""
         self._ordered = False
         if self.lifecycle.reason == PAUSED:
             self.lifecycle.reason = ""
+        if not self._flies:
+            self._continuity.forget()
+            self._external.forget()
 
     def believes(self, t: float, position: Vector) -> bool:
         """Whether a `position` [m] that was measured from outside at `t` [s] may be used; ask for each one.
@@ -165,10 +163,7 @@ class Robot:
         waits = self.lifecycle.phase == AIRBORNE
         refusal = self.lifecycle.start(at)
         if not refusal:
-            if waits and self.assignment.kind.flies:  # the common start confirms no position that jumped in the air
-                self._end_hold()
-            else:
-                self.resume()
+            self.resume()
             if origin is not None and waits:
                 self._begin_plan(origin, t - at)
         return refusal

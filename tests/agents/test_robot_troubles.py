@@ -155,11 +155,13 @@ def test_drone_that_jumped_lands_unless_back(lasts_s, lands):
     assert dist(swarm.last("F", "truth")[:2], place[:2]) < 0.1
 
 
+@pytest.mark.parametrize("off", [4.0, 1e5])
 @pytest.mark.parametrize("begins", ["climbing", "running", "landing"])
-def test_refused_far_position_cuts_no_motors(begins):
+def test_refused_far_position_cuts_no_motors(begins, off):
     swarm = flying(begins)
-    jump(swarm, "F", inf, off=1e5)
+    jump(swarm, "F", inf, off)
     while swarm.phase("F") != DONE:
+        swarm.robot("F").resume()  # an operator who sees it stand
         swarm.step()
         assert isnan(swarm.robot("F").now.position[0])
         assert Cause.FAR_OUTSIDE not in causes(swarm, "F")
@@ -179,11 +181,12 @@ def test_start_order_confirms_no_jump_in_the_air():
     assert isnan(robot.now.position[0])
 
 
-@pytest.mark.parametrize("moment", ["climbing", "running"])
+@pytest.mark.parametrize("moment", ["waiting", "running"])
 def test_robots_outside_the_arena_land_or_roll_out(moment):
     swarm = flying(moment)
-    swarm.spoil("F", put((2.2, 0.0, 0.5)))  # the arena ends at 2 m
-    swarm.robot("F").resume()  # it is put there: no jump
+    for x in (0.4, 0.8, 1.2, 1.6, 2.0, 2.2):  # no jump; the arena ends at 2 m
+        swarm.spoil("F", put((x, 0.0, 0.5)))
+        swarm.step()
     assert swarm.run(0.1).phase("F") < LANDING
     swarm.spoil("F", put((2.3, 0.0, 0.5)))
     swarm.step()
