@@ -396,8 +396,9 @@ class HostClock(Message, frozen=True):
 
 M = TypeVar("M", bound=Message)
 
-_json = msgspec.json.Encoder()
-_msgpack = msgspec.msgpack.Encoder()
+# plug-ins may give numbers of numpy, which are no floats to msgspec
+_json = msgspec.json.Encoder(enc_hook=float)
+_msgpack = msgspec.msgpack.Encoder(enc_hook=float)
 _decoders: dict[tuple[type, bool], msgspec.json.Decoder[object] | msgspec.msgpack.Decoder[object]] = {}
 
 

@@ -6,6 +6,7 @@ from itertools import chain
 from math import inf, nan
 
 import msgspec
+import numpy as np
 import pytest
 
 from agents.network import messages as wire
@@ -29,6 +30,14 @@ def test_round_trip(encoding, message):
     payload = wire.encode(message, encoding)
     for mime in (wire.MIME[encoding], wire.MIME[encoding] + ";v=1"):
         assert wire.decode(payload, mime, type(message)) == message
+
+
+@encodings
+@pytest.mark.parametrize("number", [np.float32, np.float64])
+def test_numbers_of_numpy_are_sent(encoding, number):
+    state = State("CF01", 1, 1000.0, "running", goal=(number(0.5), number(-1.0), 0.0), error=number(0.25))
+    plain = State("CF01", 1, 1000.0, "running", goal=(0.5, -1.0, 0.0), error=0.25)
+    assert wire.encode(state, encoding) == wire.encode(plain, encoding)
 
 
 WHOLE = b'{"operator": "ana", "reason": "fire"}'
