@@ -19,8 +19,8 @@ SIGHT_M: Final = 3.0  # [m] between axes; farther things are ignored
 AHEAD_S: Final = 0.1  # received positions are extrapolated for this long: a silent robot may have stopped
 BELIEVED_S: Final = 0.5  # and received velocities are used for this long
 SCAN_S: Final = 1.0  # readings older than this are dropped
-DESCENT: Final = 0.1  # [m/s] a robot that sinks faster may be landing,
-DESCENT_S: Final = 2.0  # and is in the way wherever it can be within this time
+CLIMB: Final = 0.1  # [m/s] a robot that sinks or rises faster may be landing or taking off,
+CLIMB_S: Final = 2.0  # and is in the way wherever it can be within this time
 OUTLINE: Final = 0.05  # [m] a reading that ends this near to a received robot has hit that robot,
 OUTLINE_SHARE: Final = 0.05  # and this share of its length, as long ones are measured worse
 INSIDE: Final = 0.5  # share of its radius: a shorter reading of a robot is none
@@ -110,16 +110,17 @@ class Perception:
         # a lost drone still hovers, has landed, or falls: it is in the way from the floor up
         lost = t - sender.lost_since > self._neighbour_timeout_s or sender.stamp == -inf
         believed = age <= BELIEVED_S
-        low = z + DESCENT_S * vz if vz < -DESCENT and believed else z
+        rise = CLIMB_S * vz if abs(vz) > CLIMB and believed else 0.0
+        low, high = z + min(rise, 0.0), z + max(rise, 0.0) + sender.height
         # its lower end under the own upper one, and the other way round; `up` is the own height above it
         beside = here[2] + self._height + self._clearance > low or lost
-        if not (beside and up - sender.height - self._clearance < 0.0):
+        if not (beside and up - max(rise, 0.0) - sender.height - self._clearance < 0.0):
             return
         thing = self.near.add()
         thing.x, thing.y = x, y
         thing.velocity_x, thing.velocity_y = (vx, vy) if believed else (0.0, 0.0)
         thing.radius, thing.lag, thing.is_robot = sender.radius, sender.lag, True
-        thing.low, thing.high = min(z, 0.0) if lost else low, z + sender.height
+        thing.low, thing.high = min(z, 0.0) if lost else low, high
 
     def _update_points(self, scan: RangeScan | None, now: Situation, neighbours: Neighbours) -> None:
         """Update the end points of new range readings, by the pose of the robot at their measurement."""

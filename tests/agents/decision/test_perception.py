@@ -8,7 +8,7 @@ import pytest
 from agents.body.interface import BodyState, RangeScan
 from agents.body.limits import Limits
 from agents.decision.neighbours import Incoming, Neighbours
-from agents.decision.perception import AHEAD_S, DESCENT_S, SCAN_S, SIGHT_M, Perception
+from agents.decision.perception import AHEAD_S, CLIMB_S, SCAN_S, SIGHT_M, Perception
 from agents.decision.situation import Situation
 from agents.kinds.crazyflie import CRAZYFLIE
 from agents.kinds.khepera4 import KHEPERA4
@@ -106,11 +106,14 @@ def test_drone_is_in_the_way_below_too():
     for height, speed, stamp, reach in (
         (0.9, -0.05, 9.0, []),
         (0.9, -0.4, 8.0, []),  # silent since
-        (0.9, -0.4, 9.0, [(0.9 - 0.4 * DESCENT_S, 0.9 + CRAZYFLIE.height)]),
+        (0.9, -0.4, 9.0, [(0.9 - 0.4 * CLIMB_S, 0.9 + CRAZYFLIE.height)]),
         (0.05, 0.0, 9.0, [(0.05, 0.05 + CRAZYFLIE.height)]),
     ):
         sight = Sight(TURTLEBOT3, CRAZYFLIE).hear((0.1, 0.0, height), (0.0, 0.0, speed), stamp)
         assert reaches_of(sight.sense(9.0)) == reach
+    climbing = Sight(CRAZYFLIE, CRAZYFLIE).hear((0.1, 0.0, 0.1), (0.0, 0.0, 0.4), 9.0)
+    reach = [(0.1, 0.1 + 0.4 * CLIMB_S + CRAZYFLIE.height)]
+    assert reaches_of(climbing.sense(9.0, (0.0, 0.0, 0.8))) == reach
 
 
 @pytest.mark.parametrize(("height", "before", "after"), [(0.0, 0, 1), (0.9, 1, 1), (1.3, 0, 0)])
