@@ -1,15 +1,14 @@
 """Growth of a run in virtual time with the number of robots: CPU time of an agent-step and of all around it, memory.
 
-`python -m tests.bench.growth`: each number has two processes of its own, plain and compiled, measured in turns with two
+`python -m tests.bench.growth`: each number has processes of its own, plain and compiled, measured in turns with those
 of seven robots; figures are medians, and those that are no agent-steps of the compiled flights.
 """
 
 import statistics
-from contextlib import ExitStack, closing
 
 from tests.bench.drivers.peer_zenpark import DURATION_S
 from tests.bench.measuring import markdown
-from tests.bench.peers import COMPILED_WHEELS, WHEELS, Driver
+from tests.bench.peers import COMPILED_WHEELS, WHEELS, measured
 
 # simulated time [s] by number of robots: a compiled flight of seven takes milliseconds for ten seconds
 DURATIONS = {7: 300.0, 30: 70.0, 100: 21.0, 300: 10.0, 1000: 5.0, 3000: 3.0, 10_000: 3.0}
@@ -37,24 +36,17 @@ def report(sizes=tuple(DURATIONS), rounds=ROUNDS, settings=SETTINGS):
 
 def line(robots, rounds, settings):
     """Cells of the line of a number of robots."""
-    simulated_s, complete = DURATIONS.get(robots, DURATION_S), robots <= COMPLETE
+    simulated_s = DURATIONS.get(robots, DURATION_S)
+    span = f"{simulated_s:g}", "all" if robots <= COMPLETE else "loop"
     found = {name: [] for name in settings}
-    ratios = {name: [] for name in settings}
-    with ExitStack() as stack:
-        pairs = {}
-        for name in settings:
-            one = stack.enter_context(closing(Driver(name, robots, f"{simulated_s:g}", "all" if complete else "loop")))
-            pairs[name] = one, stack.enter_context(closing(Driver(name, 7, f"{DURATIONS[7]:g}")))
-        for _ in range(rounds if robots < MANY else 1):
-            for name, pair in pairs.items():
-                one, seven = (driver.measure() for driver in pair)
-                step_us, of_seven_us = (1e6 * each["cpu_s"] / each["agent_steps"] for each in (one, seven))
-                found[name].append({**one, "step_us": step_us})
-                ratios[name].append(step_us / of_seven_us)
+    for _ in range(rounds if robots < MANY else 1):
+        for name, figures in found.items():
+            one, seven = measured(name, robots, *span), measured(name, 7, f"{DURATIONS[7]:g}", "loop")
+            step_us, of_seven_us = (1e6 * each["cpu_s"] / each["agent_steps"] for each in (one, seven))
+            figures.append({**one, "step_us": step_us, "ratio": step_us / of_seven_us})
     cells = [f"{robots:,}", f"{simulated_s:g}"]
-    for name in settings:
-        step_us = statistics.median(each["step_us"] for each in found[name])
-        cells += [f"{step_us:.2g}", f"{statistics.median(ratios[name]):.2g}"]
+    for figures in found.values():
+        cells += [f"{statistics.median(each[what] for each in figures):.2g}" for what in ("step_us", "ratio")]
     for figure, (_, form) in COLUMNS.items():
         values = [each[figure] for each in found[settings[-1]] if figure in each]
         cells.append(f"{statistics.median(values):{form}}" if values else "")

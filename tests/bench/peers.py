@@ -5,8 +5,8 @@
     python -m tests.bench.peers --all
 
 Each simulator gets an environment of its own below `~/.cache/zenpark/peers` (remove its folder for newer versions) and
-flies `tests/bench/drivers/ring.py`: the same ring, starts and law. All processes of one number of robots are started
-and warmed up, and then measured in turns; speeds are medians, ratios medians of the ratios of each turn.
+flies `tests/bench/drivers/ring.py`: the same ring, starts and law. All simulators fly one number of robots in turns,
+each in a process that is warmed up; speeds are medians, ratios medians of the ratios of each turn.
 """
 
 import argparse
@@ -15,9 +15,10 @@ import os
 import statistics
 import subprocess
 import sys
-import tempfile
-from contextlib import ExitStack, contextmanager, suppress
+from collections import defaultdict
+from contextlib import contextmanager
 from dataclasses import dataclass
+from operator import truediv
 from pathlib import Path
 
 from agents.user_folder import cache_folder
@@ -43,7 +44,7 @@ ZENOH = "zenoh"  # the bare network, in real time
 
 
 class Failed(Exception):
-    """A simulator that cannot be installed, or whose process ended."""
+    """A simulator that cannot be installed, or with a process that ended."""
 
 
 @dataclass(frozen=True)
@@ -120,9 +121,10 @@ def python_of(name):
     base = getattr(sys, "_base_executable", None) or sys.executable  # not our environment, which has other packages
     subprocess.run([base, "-m", "venv", "--clear", str(folder)], check=True)
     command = [python, "-m", "pip", "install", "--no-input", "--quiet", *packages]
-    options = {"capture_output": True, "text": True, "env": environment()}
     try:
-        done = subprocess.run(command, check=False, timeout=INSTALL_S, **options)
+        done = subprocess.run(
+            command, check=False, timeout=INSTALL_S, capture_output=True, text=True, env=environment()
+        )
     except subprocess.TimeoutExpired:
         raise Failed(f"{name} cannot be installed within {INSTALL_S:g} s") from None
     if done.returncode != 0:
@@ -138,42 +140,19 @@ def environment():
     return {**kept, **ONE_THREAD}
 
 
-class Driver:
-    """A process that measures one simulator, once for each line that it gets."""
-
-    def __init__(self, name, robots, *arguments):
-        self.name, self.robots = name, robots
-        if PEERS[name].packages:
-            command = [python_of(name), "-m", f"{DRIVERS}.peer_{name}", str(robots)]
-        else:
-            command = [sys.executable, "-m", f"{DRIVERS}.peer_zenpark", str(robots), *name.split(), *arguments]
-        self.errors = tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace")  # noqa: SIM115 - see `close`
-        streams = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": self.errors}
-        self.process = subprocess.Popen(command, cwd=ROOT, env=environment(), text=True, **streams)
-        self.about = self._line()
-
-    def measure(self):
-        """Raises Failed if the process ends instead."""
-        with suppress(BrokenPipeError):
-            print(file=self.process.stdin, flush=True)
-        return self._line()
-
-    def close(self):
-        """End the process."""
-        self.process.kill()
-        self.process.wait()
-        for stream in (self.process.stdin, self.process.stdout, self.errors):
-            with suppress(BrokenPipeError):
-                stream.close()
-
-    def _line(self):
-        for line in self.process.stdout:
-            if line.startswith("{"):  # libraries print as well
-                return json.loads(line)
-        self.errors.seek(0)
-        said = self.errors.read().strip().splitlines() or ["no message"]
-        self.close()
-        raise Failed(f"{self.name}, {self.robots} robots: {said[-1]}")
+def measured(name, robots, *arguments):
+    """What a process of a simulator measures, after its warm-up; raises Failed if it ends with an error."""
+    if PEERS[name].packages:
+        command = [python_of(name), "-m", f"{DRIVERS}.peer_{name}", str(robots)]
+    else:
+        command = [sys.executable, "-m", f"{DRIVERS}.peer_zenpark", str(robots), *name.split(), *arguments]
+    done = subprocess.run(command, cwd=ROOT, env=environment(), capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        said = done.stderr.strip().splitlines() or ["no message"]
+        raise Failed(f"{name}, {robots} robots: {said[-1]}")
+    return json.loads(
+        [line for line in done.stdout.splitlines() if line.startswith("{")][-1]
+    )  # libraries print as well
 
 
 @contextmanager
@@ -185,46 +164,31 @@ def noting(troubles):
         troubles.append(str(why))
 
 
-def in_turns(drivers, rounds, troubles):
-    """Rows of processes that have been warmed up, but those that fail."""
-    speeds = {driver.name: [] for driver in drivers}
-    for _ in range(rounds):
-        for driver in drivers:
-            with noting(troubles):
-                if driver.process.poll() is None:
-                    found = driver.measure()
-                    speeds[driver.name].append(found["agent_steps"] / found["cpu_s"])
-    for driver in drivers:
-        taken = speeds[driver.name]
-        if len(taken) == rounds:
-            ratios = {
-                other: statistics.median(one / two for one, two in zip(taken, speeds[other], strict=True))
-                for other in PEERS[driver.name].beside
-                if len(speeds.get(other, ())) == rounds
-            }
-            about = driver.about
-            yield Row(driver.robots, driver.name, about["version"], about["step_s"], statistics.median(taken), ratios)
-
-
 def measure(names, sizes, rounds, troubles):
-    """Rows of some simulators and of the settings of zenpark beside them, by number of robots."""
-    numbers = {}
+    """Rows of some simulators and of the settings of zenpark beside them, by number of robots, but those that fail."""
+    by_robots = defaultdict(list)
     for name in names:
         with noting(troubles):
             python_of(name)
-            numbers[name] = {min(size, PEERS[name].most) for size in sizes}
-    for robots in sorted(set().union(*numbers.values())):
-        others = [name for name in numbers if robots in numbers[name]]
+            for robots in {min(size, PEERS[name].most) for size in sizes}:
+                by_robots[robots].append(name)
+    for robots, others in sorted(by_robots.items()):
         compared = {own for name in others for own in PEERS[name].beside}
         beside = [own for own in PEERS if own in compared and robots <= PEERS[own].most]
-        with ExitStack() as stack:
-            drivers = []
-            for name in [*beside, *others]:
+        speeds = {name: [] for name in [*beside, *others]}
+        about = {}
+        for turn in range(rounds):
+            for name, taken in speeds.items():
                 with noting(troubles):
-                    duration = () if PEERS[name].packages else (f"{duration_s(name, robots):g}",)
-                    drivers.append(driver := Driver(name, robots, *duration))
-                    stack.callback(driver.close)
-            yield from in_turns(drivers, rounds, troubles)
+                    if len(taken) == turn:
+                        about[name] = found = measured(name, robots, f"{duration_s(name, robots):g}", "loop")
+                        taken.append(found["agent_steps"] / found["cpu_s"])
+        complete = {name: taken for name, taken in speeds.items() if len(taken) == rounds}
+        for name, taken in complete.items():
+            theirs = {other: complete[other] for other in PEERS[name].beside if other in complete}
+            ratios = {other: statistics.median(map(truediv, taken, speed)) for other, speed in theirs.items()}
+            version, step_s = about[name]["version"], about[name]["step_s"]
+            yield Row(robots, name, version, step_s, statistics.median(taken), ratios)
 
 
 def network():
@@ -256,10 +220,18 @@ def table(rows):
     return markdown(lines)
 
 
-def limits(names):
-    """Markdown: bodies and limits of simulators; nothing without any."""
-    rows = [[title(name), PEERS[name].bodies, PEERS[name].limit] for name in names]
-    return markdown([["simulator", "bodies", "what limits it"], *rows]) if rows else ""
+def report(names, sizes=ROBOTS, rounds=ROUNDS):
+    """The rows, the bodies and limits of their simulators, and what could not be measured, in Markdown."""
+    troubles = []
+    rows = list(measure([name for name in names if name != ZENOH], sizes, rounds, troubles))
+    found = {row.name for row in rows}
+    limits = [[title(name), peer.bodies, peer.limit] for name, peer in PEERS.items() if name in found]
+    if ZENOH in names:
+        rows += network()
+    parts = [table(rows), "\n".join(f"- {trouble}" for trouble in troubles)]
+    if limits:
+        parts.insert(1, markdown([["simulator", "bodies", "what limits it"], *limits]))
+    return "\n\n".join(filter(None, parts))
 
 
 def main():
@@ -273,19 +245,7 @@ def main():
         parser.error(f"unknown: {', '.join(sorted(unknown))}")
     names = wanted.names or [name for name in [*OTHERS, ZENOH] if name == ZENOH or wanted.all or not PEERS[name].heavy]
     print(report(names, wanted.robots, wanted.rounds))
-    return 0
-
-
-def report(names, sizes=ROBOTS, rounds=ROUNDS):
-    """Both tables, and what could not be measured, in Markdown."""
-    troubles = []
-    rows = list(measure([name for name in names if name != ZENOH], sizes, rounds, troubles))
-    found = {row.name for row in rows}
-    if ZENOH in names:
-        rows += network()
-    missing = "\n".join(f"- {trouble}" for trouble in troubles)
-    return "\n\n".join(filter(None, [table(rows), limits(name for name in PEERS if name in found), missing]))
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -22,7 +22,7 @@ from experiments.real_time.hosts.hosts import Hosts
 from experiments.real_time.hosts.launcher import ROUTER, Launcher, Router
 from experiments.recording.run_folder import SOURCE
 from tests.bench.measuring import Figure
-from tests.reliability.soak_sampler import Usage, usage_of
+from tests.reliability.soak import Usage, usage_of
 
 FLIGHT_S: Final = 20.0
 

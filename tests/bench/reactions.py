@@ -14,7 +14,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from math import cos, inf, pi, sin
 from multiprocessing import get_context
 from pathlib import Path
@@ -45,7 +45,6 @@ SETTLE_S: Final = 2.0  # robots run for so long before anything happens
 PATIENCE_S: Final = 60.0
 MISSED_S: Final = 10.0  # a reaction that has not come by then never will
 SPACING: Final = 0.8  # [m] around the ring
-POSITION_HZ: Final = 50.0
 PINGS: Final = 20  # round trips of nothing, before each measurement
 
 LIMITS_S: Final = {
@@ -63,7 +62,8 @@ def safety() -> Iterator[Figure]:
     wrong = 0
     deaths = [("killed", signal.SIGKILL)] * KILLED + [("frozen", signal.SIGSTOP)] * FROZEN
     for number, body in enumerate((*BODIES * STOPS, *BODIES[:1] * DEATHS)):
-        with _running(body) as park:
+        with ExitStack() as stack:
+            park = _Park(stack, body)
             pings += park.pings()
             if number < len(BODIES) * STOPS:
                 taken[f"emergency stop until motors off, {body}"] += park.stop()
@@ -76,8 +76,8 @@ def safety() -> Iterator[Figure]:
     for what, limit_s in LIMITS_S.items():
         yield from _figures(what, taken[what], empty, limit_s, f"of {limit_s:g} s")
     missed = sum(time == inf for times in taken.values() for time in times)
-    yield Figure("safety", "reactions that did not come", float(missed), "", float(missed), "wanted: 0")
-    yield Figure("safety", "robots held for dead that were not", float(wrong), "", float(wrong), "wanted: 0")
+    for what, count in (("reactions that did not come", missed), ("robots held for dead that were not", wrong)):
+        yield Figure("safety", what, float(count), "", float(count), "wanted: 0")
     load = os.getloadavg()[0]
     yield Figure("safety", "load of the machine", load, "", load / (os.cpu_count() or 1), "× its cores")
 
@@ -96,20 +96,20 @@ def _figures(what: str, taken: Sequence[float], empty: float, wanted: float, of:
 
 def ring(count: int, body: str) -> Plan:
     """Robots on wheels in a ring, each listening to the one before and the one behind, all with such a body."""
-    radius = 0.5 * SPACING / sin(pi / count)
+    radius, names = 0.5 * SPACING / sin(pi / count), [f"R{k:03}" for k in range(count)]
     size = 2.0 * radius + 2.0
     robots = {}
-    for k in range(count):
-        place = [radius * cos(2.0 * pi * k / count), radius * sin(2.0 * pi * k / count)]
-        robots[f"R{k:03}"] = RobotTable(kind="khepera4", start=place, body=body, sensors=[])
-    pairs = zip(robots, [*list(robots)[1:], "R000"], strict=True)
+    for k, name in enumerate(names):
+        angle = 2.0 * pi * k / count
+        start = [radius * cos(angle), radius * sin(angle)]
+        robots[name] = RobotTable(kind="khepera4", start=start, body=body, sensors=[])
     return Plan.made(
         title="a ring",
         robots=robots,
         duration_s=600.0,
         arena=Arena(size=(size, size, 2.0)),
         rates=Rates(state_hz=10.0),
-        formation=Formation(links={f"{a} - {b}": SPACING for a, b in pairs}),
+        formation=Formation(links={f"{names[k - 1]} - {name}": SPACING for k, name in enumerate(names)}),
         trigger={"kind": "periodic", "period_s": 0.1},
     )
 
@@ -119,25 +119,10 @@ def places(endpoint: str, realm: str, starts: Mapping[str, Sequence[float]]) -> 
     keys, pause = Keys(realm), threading.Event()
     with network.open_session([endpoint], name="places") as session:
         publishers = {name: pubsub.publisher(session, keys.position(name), messages.JSON) for name in starts}
-        while not pause.wait(1.0 / POSITION_HZ):
+        while not pause.wait(0.02):
             now = time.time()
             for name, (x, y) in starts.items():
                 publishers[name].put(messages.encode(messages.Position(name, now, (x, y, 0.0), 0.0)))
-
-
-@contextmanager
-def _running(body: str) -> Iterator[_Park]:
-    """A run of the ring, all robots running."""
-    with ExitStack() as stack:
-        park = _Park(stack, body)
-        park.await_phase("ready")
-        park.order(messages.Order("takeoff"))
-        park.await_phase("airborne")
-        park.order(messages.Order("start", at=time.time() + 0.5))
-        park.await_phase("running")
-        time.sleep(SETTLE_S)
-        park.missing.clear()  # at the begin of the run no pose had been received
-        yield park
 
 
 class _Park:
@@ -148,7 +133,7 @@ class _Park:
     """
 
     def __init__(self, stack: ExitStack, body: str) -> None:
-        """Start the processes; `stack` ends them."""
+        """Start the processes, and wait until all robots are running; `stack` ends them."""
         plan = ring(ROBOTS, body)
         self._names, self._keys = list(plan.names), Keys(plan.experiment.network.realm)
         self._ended: set[str] = set()
@@ -189,12 +174,19 @@ class _Park:
             start = [spoilt_process.MODULE, str(folder), ROBOT]
         for name in self._names:
             self._launcher.start(name, *start, str(file), name, "--connect", endpoints[0], "--lifeline")
+        self._await_phase("ready")
+        self._order(messages.Order("takeoff"))
+        self._await_phase("airborne")
+        self._order(messages.Order("start", at=time.time() + 0.5))
+        self._await_phase("running")
+        time.sleep(SETTLE_S)
+        self.missing.clear()  # at the begin of the run no pose had been received
 
-    def await_phase(self, phase: str) -> None:
+    def _await_phase(self, phase: str) -> None:
         if not _wait(lambda: all(self._phase.get(name) == phase for name in self._names), PATIENCE_S):
             raise RuntimeError(f"after {PATIENCE_S:g} s not all robots were {phase}: {self._phase}")
 
-    def order(self, order: messages.Order) -> None:
+    def _order(self, order: messages.Order) -> None:
         for name, reply in orders.send_order(self._session, self._keys, self._names, order).items():
             if not reply.ok:
                 raise RuntimeError(f"{name} refuses {order.order}: {reply.reason}")

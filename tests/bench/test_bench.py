@@ -4,7 +4,6 @@ import os
 import subprocess
 import sys
 import time
-from contextlib import closing
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from tests.bench import __main__ as renewal
 from tests.bench import growth, peers
 from tests.bench.drivers import ring
 from tests.bench.process import Meter
-from tests.reliability.soak_sampler import usage_of
+from tests.reliability.soak import usage_of
 
 
 @pytest.fixture(autouse=True)
@@ -39,8 +38,7 @@ def test_wheels_move_the_point_ahead():
 
 
 def test_zenpark_counts_its_agent_steps():
-    with closing(peers.Driver(peers.WHEELS, 3, "2", "loop")) as driver:
-        found = driver.measure()
+    found = peers.measured(peers.WHEELS, 3, "2", "loop")
     assert found["agent_steps"] == round(3 * 50 * 0.5)
     assert found["cpu_s"] > 0.0
 
@@ -48,7 +46,7 @@ def test_zenpark_counts_its_agent_steps():
 def test_ended_process_gives_its_last_words(monkeypatch):
     monkeypatch.setattr(peers, "DRIVERS", "tests.bench.missing")
     with pytest.raises(peers.Failed, match=r"7 robots: .*tests\.bench\.missing"):
-        peers.Driver(peers.WHEELS, 7)
+        peers.measured(peers.WHEELS, 7, "10", "loop")
 
 
 def test_table_gives_ratios_to_zenpark():

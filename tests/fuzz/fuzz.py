@@ -20,7 +20,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from tests.fuzz import targets_devices, targets_drones, targets_files, targets_network, targets_ros  # noqa: F401
+from tests.fuzz import targets_devices, targets_files, targets_network, targets_ros  # noqa: F401
 from tests.fuzz.mutate import LARGEST, Mutator
 from tests.fuzz.target import PLACES
 

@@ -1,23 +1,32 @@
-"""Bytes from and to Khepera IV robots and a Vicon."""
+"""Bytes from and to Crazyflies, Tellos, Khepera IV robots and a Vicon."""
 
-from contextlib import ExitStack, closing
+import importlib.util
+import socket
+import sys
+from contextlib import ExitStack, closing, suppress
 from itertools import count
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 from unittest import mock
 
 import numpy as np
 
-from agents.protocols import khepera4
+from agents.body.kinds import KINDS
+from agents.protocols import crtp, khepera4
 from agents.protocols import vicon_datastream as vicon
+from agents.protocols.crtp import HighLevel, Log, Misc, Port, Setpoint, SupervisorCommand
+from agents.protocols.tello import TelloSettings
 from agents.protocols.vicon_datastream import BlockKind, Segment
 from bridges.khepera4.drivers import KTeam, identify
 from bridges.khepera4.odometry import Odometer
+from bridges.tello.pilot import TelloPilot
 from bridges.vicon.client import Decoder
 from bridges.vicon.publisher import PoseFilter
 from tests.fuzz.target import Target, Wire, place, renewed
 from tests.requests import request
+from twins.devices.crazyflie.device import CrazyflieTwin
 from twins.devices.device import DeviceRequest, Faults
 from twins.devices.khepera4 import KheperaDevice
+from twins.devices.tello import TelloDevice
 from twins.devices.vicon import ViconTwin, _Client
 
 LETTERS = dict(zip("pqrstk", (*khepera4.PARK, "kteam"), strict=True))  # the first byte says which server
@@ -148,3 +157,138 @@ def vicon_twin():
     with closing(ViconTwin(["cf1", "kh1"])) as twin:
         yield Target([vicon.pack_kinds(vicon.POSES) + ask, ask, one, vicon.packet() + one + one], take)
         twin.clients.clear()
+
+
+def packet(port, channel, data):
+    return bytes((1 + len(data), crtp.header(port, channel))) + data
+
+
+def crtp_packets():
+    climb = crtp.CLIMB.pack(0.5, 0.0, True, 1.0)
+    pose = crtp.POSE.pack(0.1, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0)
+    full = crtp.FULL_STATE.pack(100, 200, 300, 0, 0, 0, 0, 0, 0, 0xC0000000, 0, 0, 0)
+    arm = packet(Port.SUPERVISOR, 1, bytes((SupervisorCommand.ARM, 1)))
+
+    def high(command, data=b""):
+        return packet(Port.HIGH_LEVEL, 0, bytes((command, 0)) + data)
+
+    def trajectory(at, points, number, define, start):
+        written = packet(Port.MEMORY, 2, crtp.MEMORY.pack(4, at) + points)
+        defined = packet(Port.HIGH_LEVEL, 0, bytes((HighLevel.DEFINE, number)) + crtp.DEFINE.pack(*define))
+        return written + up + defined + start
+
+    up = arm + high(HighLevel.TAKEOFF, climb)
+    log = ((Log.RESET,), (Log.CREATE, 1, 7, 0, 0, 7, 1, 0), (Log.START, 1, 1), (Log.APPEND, 1, 3, 9, 0), (Log.STOP, 1))
+    start, start_2 = crtp.START.pack(1, 1, 2, 0.5), crtp.START_2.pack(1, 1, 0, 1, 1.0)
+    flights = [
+        up,
+        up + high(HighLevel.GO_TO, crtp.GO_TO.pack(True, False, 0.1, 0.2, 0.3, 1.0, 1.0)),
+        up + high(HighLevel.LAND, climb),
+        up + high(HighLevel.SPIRAL, crtp.SPIRAL.pack(0, 1, 1.0, 0.5, 0.6, 0.1, 1.0)),
+        trajectory(0, bytes((1, 0, 2, 0, 3, 0, 4, 0, 9, 100, 0)), 1, (1, 1, 0, 1), high(HighLevel.START_2, start_2)),
+        trajectory(128, b"\0\0\x80\x3f", 2, (1, 0, 0, 1), high(HighLevel.START, start)),
+        *(arm + packet(Port.SETPOINT, 0, bytes((kind,)) + crtp.FOUR.pack(0.1, 0.1, 0.1, 0.5)) for kind in Setpoint),
+        arm + packet(Port.SETPOINT, 0, bytes((Setpoint.FULL_STATE,)) + full),
+        arm + packet(Port.COMMANDER, 0, crtp.THRUST.pack(0.0, 0.0, 10.0, 40000)),
+        packet(Port.LOCATION, 0, crtp.VECTOR.pack(0.1, 0.2, 0.3)),
+        packet(Port.LOCATION, 1, b"\x08" + pose),
+        packet(Port.LOCATION, 1, b"\2\1\1" + crtp.VECTOR.pack(0.1, 0.2, 0.3)),
+        packet(Port.LINK, 1, b"hello") + b"\1\xff",
+        b"".join(packet(Port.LOG, 1, bytes(words)) for words in log),
+        packet(Port.PARAM, 3, bytes((Misc.SET_BY_NAME,)) + b"stabilizer\0estimator\0\x08\2"),
+        packet(Port.PARAM, 3, bytes((Misc.SET_BY_NAME,)) + b"kalman\0resetEstimation\0\x08\1"),
+        *(packet(Port.LINK, 3, bytes((crtp.NRF, command))) for command in crtp.PowerSwitch),
+        *(packet(Port.MEMORY, channel, crtp.MEMORY.pack(k, 0) + bytes(16)) for channel in (1, 2) for k in range(9)),
+    ]
+    heads = [(port, channel, first) for port in Port for channel in range(4) for first in range(10)]
+    return (
+        flights * 20
+        + flights[:6] * 60
+        + [packet(port, channel, bytes((first, 1, 0))) for port, channel, first in heads]
+    )
+
+
+@renewed(100, crtp_packets, 40_000, 150)
+def crazyflie_twin():
+    """CRTP packets, one or more behind each other (length, bytes), in the air and on the ground."""
+    with closing(CrazyflieTwin(DeviceRequest(request("crazyflie", "crazyflie-twin"), Faults()))) as device:
+        line, wire = device.lines[0], Wire()
+        own = line.socket
+        line.socket.close()
+        line.socket = wire
+        for k in count():
+            data, at = (yield), 0
+            while at < len(data) and len(wire.waiting) < 40:
+                wire.waiting.append(data[at + 1 : at + 1 + data[at]] or b"\0")
+                at += 1 + data[at]
+            while wire.waiting:
+                device.serve(own, 0.03 * k)
+            for step in (1, 2, 3):
+                device.advance(0.03 * k + 0.01 * step)
+            assert np.isfinite(device.truth()[0]).all()
+
+
+WORDS = """command,takeoff,land,emergency,stop,rc 10 -20 30 40,rc 100 100 100 100,up 50,back 100,cw 90,ccw 360,
+go 50 60 70 50,speed 20,battery?,attitude?,tof?,sn?,wifi?,streamon,flip l,curve 1 2 3 4 5 6 20,
+curve 71 29 0 100 100 0 30,go 50 0 0 30 m1,wifi a b,keepalive,jump 1 2 3 4 5 m1 m2,mon,time?,speed?,baro?,sdk?"""
+
+
+def tello_words():
+    return [b"command", *(f"command\0takeoff\0\0{word.strip()}".encode() for word in WORDS.split(","))]
+
+
+@renewed(100, tello_words, 20_000, 100)
+def tello_twin():
+    """Words over UDP, datagrams apart by zero bytes."""
+    with socket.socket(type=socket.SOCK_DGRAM) as client:
+        client.bind(("127.0.0.1", 0))
+        made = DeviceRequest(request("tello", "tello-twin"), Faults())
+        with closing(TelloDevice(made, state_port=client.getsockname()[1])) as device:
+            (wire,) = device.sockets()
+            client.connect(wire.getsockname())
+            t = 0.0
+            while True:
+                for datagram in (yield).split(b"\0")[:20]:
+                    client.send(datagram[:1024])
+                    device.serve(wire, t)
+                    for _ in range(2):
+                        t += 0.01
+                        device.advance(t)
+                assert np.isfinite(device.truth()[0]).all()
+
+
+LINE = (
+    b"mid:-1;x:-100;y:-100;z:-100;mpry:0,0,0;pitch:0;roll:0;yaw:12;vgx:0;vgy:0;vgz:0;templ:63;temph:66;tof:50;"
+    b"h:40;bat:80;baro:170.80;time:12;agx:-6.00;agy:1.00;agz:-999.00;\r\n\0"
+)
+ANSWERS = (b"ok", b"error", b"out of range", b"unknown command: x", b"error Auto land")
+
+
+def check_sticks(command):
+    word, *sticks = command.split()
+    assert word != "rc" or [-100 <= int(stick) <= 100 for stick in sticks] == [True] * 4
+
+
+@renewed(200, lambda: [LINE + answer for answer in ANSWERS], 20_000)
+def tello_pilot():
+    """A drone's state lines, parsed by djitellopy itself, and answers, with a zero byte between them."""
+    if "av" not in sys.modules and importlib.util.find_spec("av") is None:
+        sys.modules["av"] = ModuleType("av")  # only its video would need it, see `bridges.tello.library`
+    import djitellopy.tello  # noqa: PLC0415
+
+    djitellopy.tello.Tello.LOGGER.setLevel("CRITICAL")  # it says every line that it cannot read
+    drone = SimpleNamespace(state={}, responses=[], end=lambda: None, get_current_state=lambda: drone.state)
+    drone.get_own_udp_object = lambda: {"responses": drone.responses, "state": drone.state}
+    drone.send_command_without_return = check_sticks
+    pilot = TelloPilot(drone, KINDS["tello"], TelloSettings())
+    pilot.position = (0.0, 0.0, 0.5)
+    for k in count(1):
+        data, now = (yield), 100.0 + 0.05 * k
+        state, _, answer = data.partition(b"\0")
+        with suppress(UnicodeDecodeError, ValueError, IndexError, KeyError, TypeError):  # dropped, see `library`
+            drone.state = djitellopy.tello.Tello.parse_state(state.decode("ascii"))
+        drone.responses.append(answer)
+        if len(data) % 8 == 0:
+            pilot.take_off(0.5, now)
+        pilot.step(now, now)
+        assert isinstance(pilot.note(now), str)

@@ -218,7 +218,7 @@ def _capture(fault: CaptureFault, text: str = "position") -> Begin:
 def _clock_behind(active: ActiveFault) -> Check:
     run, observer, victim = active.run, active.observer, active.victim
     run.send(victim, SIGKILL)
-    run.switch(f"clock-{run.process_of(victim)}").write(-active.fault.size)
+    run.switch(f"clock-{run.process_of[victim]}").write(-active.fault.size)
     active.note = f"{-active.fault.size:+g} s"
     restarted = back = None
 

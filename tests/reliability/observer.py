@@ -32,10 +32,10 @@ class Invariants:
         """No position is known yet."""
         self.names, kinds = plan.names, plan.kinds
         self._row = {name: number for number, name in enumerate(self.names)}
-        self._kinds = dict(zip(self.names, kinds, strict=True))
-        self._radius = np.array([kind.radius for kind in kinds])
-        self._height = np.array([kind.height for kind in kinds])
-        self.flies = np.array([kind.flies for kind in kinds])
+        self._kinds = kinds
+        self._radius, self._height = (
+            np.array([getattr(kind, what) for kind in kinds]) for what in ("radius", "height")
+        )
         x, y, z = plan.experiment.arena.size
         self._low = np.array([-0.5 * x - OUT_M, -0.5 * y - OUT_M, -BELOW_M])
         self._high = np.array([0.5 * x + OUT_M, 0.5 * y + OUT_M, z + OUT_M])
@@ -55,7 +55,7 @@ class Invariants:
 
     def in_the_air(self, name: str) -> bool:
         row = self._row[name]
-        return bool(self.flies[row] and self.position[row, 2] > DOWN_M)
+        return bool(self._kinds[row].flies and self.position[row, 2] > DOWN_M)
 
     def violations(self) -> list[str]:
         """Violations that have begun since the last call."""
@@ -93,7 +93,7 @@ class Invariants:
         if command.action != "drive":
             return ""
         setpoint = np.array(command.setpoint or (np.nan,) * 4)
-        kind = self._kinds[command.robot]
+        kind = self._kinds[self._row[command.robot]]
         if kind.takes == "position":
             good = (setpoint[:3] >= self._low - STEP_M) & (setpoint[:3] <= self._high + STEP_M)
         else:

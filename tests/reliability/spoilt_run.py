@@ -91,14 +91,9 @@ class SpoiltRun:
 
     Attributes:
         process: The launcher's.
-        dead: Robots that were killed for good, and when [monotonic s].
-        shifted: Robots whose clock is not that of the others.
-        started: Common start [monotonic s].
-        answer: Of the conductor, to the last restart.
-        session: On its network; set from outside.
     """
 
-    session: zenoh.Session
+    session: zenoh.Session  # on its network; set from outside
 
     def __init__(self, stack: ExitStack, setting: Setting, stage: Stage, number: int) -> None:
         """Start it; `stack` ends it."""
@@ -107,12 +102,12 @@ class SpoiltRun:
         folder = setting.folder / f"round-{number:03}"
         self._switches = folder / "switches"
         self._switches.mkdir(parents=True)
-        self.routers = [free_endpoint(preferred_port=0) for _ in range(2 if stage == "two routers" else 1)]
+        self.routers = [free_endpoint(0) for _ in range(2 if stage == "two routers" else 1)]
         self.recording = folder / f"{setting.case}.mcap"
-        self.dead: dict[str, float] = {}
-        self.shifted: set[str] = set()
-        self.started: float | None = None
-        self.answer = messages.RunReply()
+        self.dead: dict[str, float] = {}  # robots that were killed for good, and when [monotonic s]
+        self.shifted: set[str] = set()  # robots with another clock than the others
+        self.started: float | None = None  # common start [monotonic s]
+        self.answer = messages.RunReply()  # of the conductor, to the last restart
         self._keys = Keys(experiment.network.realm)
         self.flying = [name for name, robot in experiment.robots.items() if KINDS[robot.kind].flies]
         # by motion capture, on its stage; the exchange of two subjects needs two
@@ -120,7 +115,7 @@ class SpoiltRun:
         self._stopped: list[int] = []
         self._refusing: list[Switch] = []
         self._asleep: dict[str, float] = {}  # processes of sleeping robots, and since when [monotonic s]
-        self._process_of = {name: "+".join(names) for names in experiment.processes.values() for name in names}
+        self.process_of = {name: "+".join(names) for names in experiment.processes.values() for name in names}
         self.switch("lease").write(LEASE_S if stage == "patient router" else 0.0)
         changes = [*setting.changes, f"network.listen={json.dumps(self.routers)}"]
         changes.append(f"network.routers={len(self.routers)}")
@@ -128,18 +123,16 @@ class SpoiltRun:
             changes += [f'robots.{name}.position="external"' for name in self.measured]
             # robots land as they do without a world, in which they would wait for it
             changes += ['positioning="vicon-twin"', f"world.patience_s={experiment.safety.land_without_position_s}"]
-        cables = {
-            role: {end: free_endpoint(preferred_port=0) for end in self.routers} for role in self._process_of.values()
-        }
+        cables = {role: {end: free_endpoint(0) for end in self.routers} for role in self.process_of.values()}
         request = Request(str(setting.file), str(folder), setting.case, changes, cables, str(self._switches))
         self._tag = f"{RUN}={secrets.token_hex(8)}"  # in the environment of all its processes
         self._launcher = stack.enter_context(Launcher(folder / "logs"))
         for role, ends in cables.items():
             ports = [end.rpartition(":")[2] for way in ends.items() for end in reversed(way)]
             self._launcher.start(f"{CABLE}-{role}", "tests.reliability.cable", *ports)
-        words = [MODULE, msgspec.json.encode(request).decode()]
-        self.process = self._spawn(CONDUCTOR, [sys.executable, "-m", spoilt_process.MODULE, request.switches, *words])
-        stack.callback(self._kill)
+        command = [sys.executable, "-m", spoilt_process.MODULE, request.switches, MODULE]
+        self.process = self._spawn(CONDUCTOR, [*command, msgspec.json.encode(request).decode()])
+        stack.callback(lambda: [self._signal(pid, signal.SIGKILL) for pid in self.processes()])
 
     @property
     def over(self) -> bool:
@@ -162,18 +155,9 @@ class SpoiltRun:
     def _spawn(self, name: str, words: Sequence[str]) -> Process:
         return self._launcher.spawn(name, ["env", self._tag, *words])
 
-    def _kill(self) -> None:
-        """Kill what is left of the run, whatever happened."""
-        for pid in self.processes():
-            self._signal(pid, signal.SIGKILL)
-
     def switch(self, name: str) -> Switch:
         """A switch between a process and its clock, body or lease (`tests.reliability.spoilt_process`)."""
         return Switch(self._switches / name)
-
-    def process_of(self, robot: str) -> str:
-        """Role of the process that runs a robot."""
-        return self._process_of[robot]
 
     def send(self, role: str, number: signal.Signals) -> None:
         """Send a signal to the first process of a role, or of a robot."""
@@ -187,13 +171,13 @@ class SpoiltRun:
 
     def cut(self, robot: str) -> None:
         """Let nothing pass between a robot and its routers."""
-        self._signal(self._launcher.get(f"{CABLE}-{self.process_of(robot)}").handle.pid, signal.SIGSTOP)
+        self._signal(self._launcher.get(f"{CABLE}-{self.process_of[robot]}").handle.pid, signal.SIGSTOP)
 
     def sleep(self, robot: str) -> None:
         """Let the computer of a robot sleep: its process stands still, and its monotonic clock leaves that out."""
         self.cut(robot)
         self.send(robot, signal.SIGSTOP)
-        self._asleep[self.process_of(robot)] = time.monotonic()
+        self._asleep[self.process_of[robot]] = time.monotonic()
 
     def spoil_capture(self, fault: CaptureFault, subject: str = "") -> None:
         """Let motion capture tell wrong poses, of a subject, if not of all; `release` ends that."""
@@ -234,17 +218,16 @@ class SpoiltRun:
     def start_duplicate(self, robot: str) -> Process:
         """Start a second process of a robot's name: the same command again."""
         pid = self._running(robot)[0]
-        words = dict(tagged(self._tag))[pid]
-        return self._spawn(f"double-{robot}-{pid}-{time.monotonic_ns()}", words)
+        return self._spawn(f"double-{robot}-{pid}-{time.monotonic_ns()}", dict(tagged(self._tag))[pid])
 
     def fill_disk(self, _robot: str) -> str:
         """Limit the recording to its present size: the recorder gets the error of a disk that is full."""
         full = self.recording.stat().st_size
-        for pid in self._running("recorder"):
+        recorders = self._running("recorder")[:1]
+        for pid in recorders:
             with contextlib.suppress(ProcessLookupError):
                 resource.prlimit(pid, resource.RLIMIT_FSIZE, (full, resource.RLIM_INFINITY))
-            return f"at {full} bytes"
-        return "no recorder"
+        return f"at {full} bytes" if recorders else "no recorder"
 
     def spoil(self, robot: str) -> str:
         """Send nonsense on every key that a robot and its body read, but the stop's; return how much."""

@@ -10,8 +10,7 @@ from experiments.file.document import load
 from experiments.real_time.conductor.run_view import Progress, RobotView, RunFailed
 from tests.__main__ import command
 from tests.cases import for_each
-from tests.reliability.soak import judge, table
-from tests.reliability.soak_sampler import Sampler, Soaked, SoakSample
+from tests.reliability.soak import Sampler, Soaked, SoakSample, judge, table
 
 ROBOTS = ("TB01", "CF02")
 SPAN = 3600.0

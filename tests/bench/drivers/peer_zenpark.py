@@ -1,6 +1,6 @@
 """zenpark in virtual time: the agents with all their safety, their messages on the modelled network, and the bodies.
 
-python -m tests.bench.drivers.peer_zenpark ROBOTS KIND ENGINE plain|compiled [SECONDS [all]]
+python -m tests.bench.drivers.peer_zenpark ROBOTS KIND ENGINE plain|compiled SECONDS loop|all
 """
 
 import math
@@ -86,12 +86,7 @@ def measure(robots, kind, engine, evaluator, duration_s, *, complete=False):
     return {**found, "memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0}
 
 
-def main(robots, kind, engine, evaluator, *optional):
-    """Measure once for each line of the standard input; "all" includes the metrics of the run."""
-    measure(7, kind, engine, evaluator, DURATION_S, complete=True)  # warm-up
-    size, span, complete = int(robots), float(optional[0]) if optional else DURATION_S, "all" in optional
-    ring.answer(lambda: measure(size, kind, engine, evaluator, span, complete=complete), "", ring.STEP_S)
-
-
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    robots, *setting, duration_s, what = sys.argv[1:]
+    measure(7, *setting, DURATION_S, complete=True)  # warm-up
+    ring.answer(measure(int(robots), *setting, float(duration_s), complete=what == "all"), "", ring.STEP_S)

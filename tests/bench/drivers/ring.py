@@ -1,11 +1,10 @@
-"""The formation that all simulators fly, and the dialogue of a measuring process with the command that started it.
+"""The formation that all simulators fly, and what a measuring process writes.
 
 Robots stand on a circle, 0.6 m apart; each knows the offsets to the robot before and the robot behind it. The law is
 the consensus on offsets of Oh, Park and Ahn (Automatica 53, 2015), one numpy expression for all robots.
 """
 
 import json
-import os
 import sys
 import time
 
@@ -67,7 +66,7 @@ def link_error(position):
 
 
 def serve(start, version, step_s=STEP_S):
-    """Measure a loop of steps each time a line arrives on standard input, until that ends.
+    """Measure a loop of steps.
 
     Args:
         start: Takes the number of robots, and gives a function that does one step, law included, and returns the
@@ -77,34 +76,23 @@ def serve(start, version, step_s=STEP_S):
     robots = int(sys.argv[1])
     step = start(robots)
     before = link_error(starts(robots))
-    for _ in range(WARM_UP):
-        step()
-    begin = time.process_time()
-    for _ in range(FEWEST_STEPS):
-        step()
-    cost = max((time.process_time() - begin) / FEWEST_STEPS, 1e-6)
-    steps = int(min(MOST_STEPS, max(FEWEST_STEPS, ENOUGH_S / cost)))
-    total = WARM_UP + FEWEST_STEPS
 
-    def measure():
-        nonlocal total
+    def cpu_s(steps):
         begin = time.process_time()
         for _ in range(steps):
             position = step()
-        cpu = time.process_time() - begin
-        total += steps
-        after = link_error(position)
-        if total * step_s >= SETTLED_S and not after < 0.6 * before:  # not a number is no less either
-            raise SystemExit(f"links are off by {after:.3f} m after {total} steps, by {before:.3f} m at the start")
-        return {"cpu_s": cpu, "agent_steps": steps * robots}
+        return time.process_time() - begin, position
 
-    answer(measure, version, step_s)
+    cpu_s(WARM_UP)
+    cost = max(cpu_s(FEWEST_STEPS)[0] / FEWEST_STEPS, 1e-6)
+    steps = int(min(MOST_STEPS, max(FEWEST_STEPS, ENOUGH_S / cost)))
+    taken, position = cpu_s(steps)
+    total, after = WARM_UP + FEWEST_STEPS + steps, link_error(position)
+    if total * step_s >= SETTLED_S and not after < 0.6 * before:  # not a number is no less either
+        raise SystemExit(f"links are off by {after:.3f} m after {total} steps, by {before:.3f} m at the start")
+    answer({"cpu_s": taken, "agent_steps": steps * robots}, version, step_s)
 
 
-def answer(measure, version, step_s):
-    """Write what is measured as a line of JSON, once ready and then for each line read."""
-    out = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)  # what libraries print goes elsewhere
-    print(json.dumps({"version": version, "step_s": step_s}), file=out, flush=True)
-    for _ in sys.stdin:
-        print(json.dumps(measure()), file=out, flush=True)
+def answer(figures, version, step_s):
+    """Write what was measured, as the last line of the output."""
+    print(json.dumps({"version": version, "step_s": step_s, **figures}), flush=True)
