@@ -26,20 +26,14 @@ def renewed(page, tables):
     return page
 
 
-def circumstances():
-    """Commit, day and machine."""
-    here = provenance()
-    memory = f"{here.cores} cores, {here.memory_gb:.0f} GB, other work on them: load {here.load}"
-    day = time.strftime("%Y-%m-%d")
-    return f"Commit {here.commit[:DIGEST_CHARACTERS]}, {day}; {here.cpu}, {memory}; Python {here.python}."
-
-
 def main():
-    where = circumstances()
+    here, day = provenance(), time.strftime("%Y-%m-%d")
+    memory = f"{here.cores} cores, {here.memory_gb:.0f} GB, other work on them: load {here.load}"
+    where = f"Commit {here.commit[:DIGEST_CHARACTERS]}, {day}; {here.cpu}, {memory}; Python {here.python}."
     tables = {"peers": peers.report([*peers.OTHERS, peers.ZENOH]), "growth": growth.report()}
     page = renewed(PAGE.read_text("utf-8"), {"circumstances": where, **tables})
     PAGE.write_text(page, encoding="utf-8")
-    print(PAGE.read_text("utf-8"))
+    print(page)
 
 
 if __name__ == "__main__":

@@ -82,8 +82,9 @@ class ActiveFault:
 
     def reported(self, process: str) -> str:
         """Reason why the conductor has not reported the end of a process since the fault began."""
-        ends = (each for each in self.observer.events[self._events :] if each.kind.startswith(process))
-        return "" if any("ended" in each.text for each in ends) else f"the end of the {process} is not reported"
+        events = self.observer.events[self._events :]
+        ended = any(each.kind.startswith(process) and "ended" in each.text for each in events)
+        return "" if ended else f"the end of the {process} is not reported"
 
     def lost(self) -> bool:
         """Whether the conductor has reported the end of the victim's process since the fault began."""
@@ -236,12 +237,12 @@ def _clock_behind(active: ActiveFault) -> Check:
         if victim not in observer.alive:
             return f"{victim} is not back"
         back = back or time.monotonic()
-        deaf = [name for name in active.receivers() if observer.received_at.get((name, victim), 0.0) < restarted]
-        names = ", ".join(deaf)
+        received = observer.received_at
+        deaf = ", ".join(name for name in active.receivers() if received.get((name, victim), 0.0) < restarted)
         if deaf and time.monotonic() - back > DEAF_S:
-            active.add_violation(f"{names}: no pose of {victim} received in the first {DEAF_S:g} s after its restart")
+            active.add_violation(f"{deaf}: no pose of {victim} received in the first {DEAF_S:g} s after its restart")
         if deaf or victim not in active.live:
-            return f"{victim} does not take part yet, or its poses do not reach {names or 'any robot'}"
+            return f"{victim} does not take part yet, or its poses do not reach {deaf or 'any robot'}"
         return ""
 
     return check
@@ -300,15 +301,11 @@ class FaultKind:
     recorded: Literal["", "lost", "router"] = ""  # kind of the event of which the recording must have one
 
 
-_wrong_poses = partial(
-    FaultKind, lasts_s=5.0, heals_s=8.0, most=1, disbands=True, stage="motion capture", among="measured"
-)
-_router = partial(
-    FaultKind,
-    _signal(SIGKILL, partial(ActiveFault.reported, process="router"), "router"),
-    victim=False,
-    recorded="router",
-)
+_landing = partial(FaultKind, heals_s=8.0, most=1, disbands=True)
+_wrong_poses = partial(_landing, lasts_s=5.0, stage="motion capture", among="measured")
+_router_dies = _signal(SIGKILL, partial(ActiveFault.reported, process="router"), "router")
+_router = partial(FaultKind, _router_dies, victim=False, recorded="router")
+_recorder_ends = partial(ActiveFault.reported, process="recorder")
 FAULT_KINDS: Final = {
     "kill": FaultKind(_lever(SpoiltRun.kill, ActiveFault.loss_noticed), most=2, recorded="lost"),
     "freeze": FaultKind(_signal(SIGSTOP, ActiveFault.back), 5.0, unsteered=True),
@@ -328,21 +325,13 @@ FAULT_KINDS: Final = {
     "mocap-repeated": _wrong_poses(_capture("repeated"), victim=False),
     "mocap-swapped": _wrong_poses(_capture("swapped", "")),
     "mocap-renamed": _wrong_poses(_capture("renamed")),
-    "refused-landing": FaultKind(
-        _lever(SpoiltRun.refuse_landing, ActiveFault.landed),
-        12.0,
-        8.0,
-        most=1,
-        disbands=True,
-        among="flying",
-        ordered=True,
+    "refused-landing": _landing(
+        _lever(SpoiltRun.refuse_landing, ActiveFault.landed), 12.0, among="flying", ordered=True
     ),
     "sleep": FaultKind(_lever(SpoiltRun.sleep, ActiveFault.awake), 8.0, heals_s=6.0, most=2, unsteered=True),
     "double": FaultKind(_double, heals_s=6.0),
     "read-error": FaultKind(_read_error, heals_s=12.0, most=1, recorded="lost"),
-    "disk": FaultKind(
-        _lever(SpoiltRun.fill_disk, partial(ActiveFault.reported, process="recorder")), victim=False, most=1
-    ),
+    "disk": FaultKind(_lever(SpoiltRun.fill_disk, _recorder_ends), victim=False, most=1),
     "corrupt": FaultKind(_lever(SpoiltRun.spoil, ActiveFault.back), 1.0),
 }
 FAULTS: Final = tuple(FAULT_KINDS)
@@ -353,14 +342,13 @@ def script(robots: Sequence[str], count: int, seed: int, kinds: Sequence[str] = 
     random = np.random.default_rng(seed)
     deck = [kinds[place % len(kinds)] for place in range(count)]
     random.shuffle(deck)
-    return [_fault(kind, round(float(random.uniform(*GAP_S)), 2), robots, random) for kind in deck]
-
-
-def _fault(kind: str, after_s: float, robots: Sequence[str], random: np.random.Generator) -> Fault:
-    nature = FAULT_KINDS[kind]
-    victim = str(random.choice(list(robots))) if nature.victim else ""
-    size = round(float(random.uniform(*nature.size) * random.choice([-1.0, 1.0] if nature.signed else [1.0])), 3)
-    return Fault(kind, after_s, victim, size)
+    faults = []
+    for kind in deck:
+        nature, after_s = FAULT_KINDS[kind], round(float(random.uniform(*GAP_S)), 2)
+        victim = str(random.choice(list(robots))) if nature.victim else ""
+        size = random.uniform(*nature.size) * random.choice([-1.0, 1.0] if nature.signed else [1.0])
+        faults.append(Fault(kind, after_s, victim, round(float(size), 3)))
+    return faults
 
 
 def next_fault(waiting: Sequence[Fault], stage: Stage, begun: Mapping[str, int], left_s: float) -> Fault | None:

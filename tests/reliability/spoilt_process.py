@@ -16,14 +16,15 @@ from __future__ import annotations
 
 import mmap
 import os
+import pkgutil
 import runpy
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import takewhile
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from agents.clock import READING
 
@@ -77,77 +78,49 @@ def spoil(folder: Path, words: Sequence[str]) -> None:
         time.time = lambda: utc() + own.read()
         os.environ.pop(READING, None)
     if role == "router":
-        _announce(Switch(folder / "lease").read())
+        if lease_s := Switch(folder / "lease").read():
+            zenoh_config = pkgutil.resolve_name("agents.network.zenoh_config")
+            zenoh_config.settings = partial(zenoh_config.settings, lease_s=lease_s)
     elif role == "world":
-        _refuse_landings(folder)
+        _replace("experiments.real_time.processes.world_network:Commands", "_obey", partial(_obey, folder))
     elif role == "capture":
-        _spoil_capture(Switch(folder / "capture"), Switch(folder / "capture-subject"))
+        number, row = Switch(folder / "capture"), Switch(folder / "capture-subject")
+        faults = pkgutil.resolve_name("twins.devices.device:CAPTURE_FAULTS")
+        _replace("twins.devices.device:Faults", "captured", lambda *_: (faults[int(number.read())], int(row.read())))
     elif ROBOT in words:
         monotonic, slept = time.monotonic, Switch(folder / f"sleep-{role}")
         time.monotonic = lambda: monotonic() - slept.read()
-        _break_body([Switch(folder / f"read-{name}") for name in role.split("+")])
+        broken = [Switch(folder / f"read-{name}") for name in role.split("+")]
+        _replace("bridges.external:ExternalBody", "read", partial(_read, broken))
         if (file := folder / f"cut-{role}").exists():
-            _stamp_stops(Switch(file))
+            _replace("twins.body:TwinBody", "stop", partial(_stop, Switch(file)))
 
 
-def _announce(lease_s: float) -> None:
-    from agents.network import zenoh_config  # not in every process
-
-    if lease_s > 0.0:
-        zenoh_config.settings = partial(zenoh_config.settings, lease_s=lease_s)
-
-
-def _break_body(broken: Sequence[Switch]) -> None:
-    from agents.body.interface import BodyState  # not in every process
-    from bridges.external import ExternalBody
-
-    read = ExternalBody.read
-
-    def failing(body: ExternalBody, t: float) -> Sequence[BodyState]:
-        if any(switch.read() for switch in broken):
-            raise OSError("read fails, as the laboratory wants")
-        return read(body, t)
-
-    ExternalBody.read = failing  # type: ignore[assignment, method-assign]
+def _replace(owner: str, name: str, other: Callable[..., object]) -> None:
+    """Put another function in the place of a class or module's, which it gets before the arguments."""
+    place = pkgutil.resolve_name(owner)  # not imported in every process
+    there = getattr(place, name)
+    setattr(place, name, lambda *arguments, **named: other(there, *arguments, **named))
 
 
-def _spoil_capture(number: Switch, subject: Switch) -> None:
-    from twins.devices.device import CAPTURE_FAULTS, CaptureFault, Faults  # not in every process
-
-    def captured(_faults: Faults, _t: float) -> tuple[CaptureFault, int]:
-        return CAPTURE_FAULTS[int(number.read())], int(subject.read())
-
-    Faults.captured = captured  # type: ignore[method-assign, assignment]
+def _read(broken: Sequence[Switch], read: Callable[..., object], *arguments: object) -> object:
+    if any(switch.read() for switch in broken):
+        raise OSError("read fails, as the laboratory wants")
+    return read(*arguments)
 
 
-def _refuse_landings(folder: Path) -> None:
-    from agents.network.messages import Command  # not in every process
-    from experiments.real_time.processes.world_network import Commands
-
-    obey, switches = Commands._obey, dict[str, Switch]()
-
-    def refusing(commands: Commands, row: int, command: Command, t: float) -> None:
-        name = command.robot
-        if name not in switches:
-            switches[name] = Switch(folder / f"refuse-{name}")
-        if command.action == "land" and switches[name].read():
-            commands.done[name], commands.quiet[row] = command.seq - 1, t  # it is repeated, and the robot hovers
-        else:
-            obey(commands, row, command, t)
-
-    Commands._obey = refusing  # type: ignore[method-assign, assignment]
+def _obey(folder: Path, obey: Callable[..., object], commands: Any, *arguments: Any) -> None:
+    row, command, t = arguments
+    if command.action == "land" and Switch(folder / f"refuse-{command.robot}").read():
+        # it is repeated, and the robot hovers
+        commands.done[command.robot], commands.quiet[row] = command.seq - 1, t
+    else:
+        obey(commands, *arguments)
 
 
-def _stamp_stops(stamp: Switch) -> None:
-    from twins.body import TwinBody  # not in every process
-
-    cut = TwinBody.stop
-
-    def stop(body: TwinBody, rows: Sequence[int]) -> None:
-        cut(body, rows)
-        stamp.write(stamp.read() or time.monotonic())
-
-    TwinBody.stop = stop  # type: ignore[method-assign, assignment]
+def _stop(stamp: Switch, stop: Callable[..., object], *arguments: object) -> None:
+    stop(*arguments)
+    stamp.write(stamp.read() or time.monotonic())
 
 
 if __name__ == "__main__":

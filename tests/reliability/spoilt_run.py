@@ -19,7 +19,6 @@ from functools import partial
 from pathlib import Path
 from typing import Final, Literal
 
-import msgspec
 import zenoh
 
 from agents.body.kinds import KINDS
@@ -61,28 +60,17 @@ class Setting:
     interrupted: Callable[[], bool]  # by the user
 
 
-class Request(msgspec.Struct):
-    """A run in real time on this machine, its bodies in one world."""
-
-    file: str  # experiment file
-    folder: str  # for recordings and logs; it exists
-    case: str
-    changes: list[str]  # as behind `--set`
-    cables: dict[str, dict[str, str]]  # for each process of robots, by its role, an endpoint in place of each router's
-    switches: str  # folder, with which `tests.reliability.spoilt_process` spoils processes
-
-
 class SpoiltLauncher(Launcher):
     """Starts processes that can be spoiled, and whose robots find their routers at the ends of cables of their own."""
 
-    def __init__(self, request: Request, logs: Path) -> None:
+    def __init__(self, cables: dict[str, dict[str, str]], switches: str, logs: Path) -> None:
+        """Cables are endpoints in place of each router's, by the role of a process of robots; switches, a folder."""
         super().__init__(logs)
-        self._request = request
+        self._cables, self._switches = cables, switches
 
     def start(self, name: str, module: str, *arguments: str, forked: bool = False) -> Process:
-        own = self._request.cables.get(spoilt_process.role_of([module, *arguments]), {})
-        words = (own.get(word, word) for word in arguments)
-        spoilt = self._request.switches, module, *words
+        own = self._cables.get(spoilt_process.role_of([module, *arguments]), {})
+        spoilt = self._switches, module, *(own.get(word, word) for word in arguments)
         return super().start(name, spoilt_process.MODULE, *spoilt, forked=forked)
 
 
@@ -124,15 +112,15 @@ class SpoiltRun:
             # robots land as they do without a world, in which they would wait for it
             changes += ['positioning="vicon-twin"', f"world.patience_s={experiment.safety.land_without_position_s}"]
         cables = {role: {end: free_endpoint(0) for end in self.routers} for role in self.process_of.values()}
-        request = Request(str(setting.file), str(folder), setting.case, changes, cables, str(self._switches))
+        request = [*map(str, (setting.file, folder, setting.case, self._switches)), changes, cables]
         self._tag = f"{RUN}={secrets.token_hex(8)}"  # in the environment of all its processes
         self._launcher = stack.enter_context(Launcher(folder / "logs"))
         for role, ends in cables.items():
             ports = [end.rpartition(":")[2] for way in ends.items() for end in reversed(way)]
             self._launcher.start(f"{CABLE}-{role}", "tests.reliability.cable", *ports)
-        command = [sys.executable, "-m", spoilt_process.MODULE, request.switches, MODULE]
-        self.process = self._spawn(CONDUCTOR, [*command, msgspec.json.encode(request).decode()])
-        stack.callback(lambda: [self._signal(pid, signal.SIGKILL) for pid in self.processes()])
+        command = [sys.executable, "-m", spoilt_process.MODULE, str(self._switches), MODULE]
+        self.process = self._spawn(CONDUCTOR, [*command, json.dumps(request)])
+        stack.callback(self._kill)
 
     @property
     def over(self) -> bool:
@@ -154,6 +142,11 @@ class SpoiltRun:
 
     def _spawn(self, name: str, words: Sequence[str]) -> Process:
         return self._launcher.spawn(name, ["env", self._tag, *words])
+
+    def _kill(self) -> None:
+        """Kill what is left of the run, whatever happened."""
+        for pid in self.processes():
+            self._signal(pid, signal.SIGKILL)
 
     def switch(self, name: str) -> Switch:
         """A switch between a process and its clock, body or lease (`tests.reliability.spoilt_process`)."""
@@ -255,15 +248,14 @@ class SpoiltRun:
 
 
 def main() -> int:
-    """Run the request of the command line."""
-    request = msgspec.json.decode(sys.argv[1], type=Request)
+    """Run the request of the command line: a run in real time on this machine, its bodies in one world."""
+    file, folder, case, switches, changes, cables = json.loads(sys.argv[1])
     over = threading.Event()
     Lifeline(over).start()
-    user = Supervision(Lines(), over.is_set, launching=partial(SpoiltLauncher, request))
+    user = Supervision(Lines(), over.is_set, launching=partial(SpoiltLauncher, cables, switches))
     try:
         with on_termination(over.set):
-            options = RunOptions([request.case], "world", here=True)
-            conduct(load(request.file, *request.changes), Path(request.folder), options, user)
+            conduct(load(file, *changes), Path(folder), RunOptions([case], "world", here=True), user)
     except ExplainedError as error:
         print(f"zenpark: {error}", file=sys.stderr)
         return 2
