@@ -276,11 +276,12 @@ def stops_of_all_runs(
 
     up = run_registry.runs()
     stops = [EmergencyStop(run.endpoints, realm or run.realm, identity or run.identity, run) for run in up]
-    known = {endpoint for stop in stops for endpoint in topology.bare(stop.endpoints)}
+    known = {(endpoint, stop.realm) for stop in stops for endpoint in topology.bare(stop.endpoints)}
     for others in groups:
-        if others and known.isdisjoint(topology.bare(others)):
+        found = {(endpoint, realm or "park") for endpoint in topology.bare(others)}
+        if found and known.isdisjoint(found):
             stops.append(EmergencyStop(others, realm or "park", identity or IDENTITY))
-            known |= {*topology.bare(others)}
+            known |= found
     return stops
 
 

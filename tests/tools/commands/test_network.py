@@ -14,6 +14,7 @@ from agents.network.messages import Order
 from agents.network.pubsub import Orders, alive_token, pose_publisher, publisher, subscriber
 from agents.network.session import open_session
 from experiments.real_time.conductor.orders import EmergencyStop
+from experiments.real_time.hosts.run_registry import own_entry
 from tests.commands import GUARD, started, zenpark
 from tests.waiting import until
 from tools.commands import orders
@@ -175,6 +176,13 @@ def test_estop_names_both_kinds_of_robots(capsys):
     ]
     assert orders.estop(as_json=True) == 1
     assert json.loads(capsys.readouterr().out)["routers"][0]["not_known_to_have_stopped"] == NAMES[:30]
+
+
+@pytest.mark.usefixtures("stop")
+def test_estop_reaches_each_realm_of_a_router(monkeypatch):
+    hall = own_entry("run", "two", [DEFAULT], realm="hall")
+    monkeypatch.setattr("experiments.real_time.hosts.run_registry.runs", lambda: [hall])
+    assert [each.realm for each in orders.stops_of_all_runs([DEFAULT])] == ["hall", "park"]
 
 
 @pytest.mark.usefixtures("stop")
