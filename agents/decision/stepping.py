@@ -153,7 +153,7 @@ class Stepping:
     def rehearse(self, view: View) -> Control:
         """Step of the law, of which nothing is kept. Raises PluginError where a result is not what it must be."""
         law, memory = self._law, self.memory
-        control = law.step(view, memory)
+        control = law.step(view, dict(memory))  # one that writes into it must not count rehearsals
         if not isinstance(control, Control):
             raise wrong("law", law, "step", control, "a Control")
         sizes = {name: len(values) for name, values in memory.items()}

@@ -27,7 +27,7 @@ REMEMBERED = {"count": (1.0,), "secret": (0.0, 0.0)}
 
 
 class Counting(Law, frozen=True):
-    """Counts its steps, and drives along x."""
+    """Counts its steps, in the memory that it gets, and drives along x."""
 
     SAYS: ClassVar[Mapping[str, Said]] = {"count": Said(metre=100.0)}
 
@@ -35,8 +35,9 @@ class Counting(Law, frozen=True):
         return {"count": (0.0,), "secret": (nan, nan)}
 
     def step(self, view, memory):
+        memory.update(count=(memory["count"][0] + 1.0,), secret=(1.0, 2.0))
         return Control(
-            memory={"count": (memory["count"][0] + 1.0,), "secret": (1.0, 2.0)},
+            memory=memory,
             velocity=(0.05, 0.0, nan),
             measures={"heard": float(len(view.known("count")))},
         )
