@@ -63,8 +63,7 @@ def test_cdr_is_identical_to_rosbags(distro):
         assert raw[kind] == bytes(store.serialize_cdr(store.deserialize_cdr(raw[kind], kind), kind))
     numbers = struct.pack("<6d", 0.22, 0.0, 0.0, 0.0, 0.0, -2.84)
     head = struct.pack("<iI", 1700000000, 250000000) + struct.pack("<I", 4) + b"map\0"
-    assert raw[ros2.TWIST] == b"\0\1\0\0" + numbers
-    assert raw[ros2.TWIST_STAMPED] == b"\0\1\0\0" + head + numbers
+    assert (raw[ros2.TWIST], raw[ros2.TWIST_STAMPED]) == (b"\0\1\0\0" + numbers, b"\0\1\0\0" + head + numbers)
     for kind, other in ((ros2.TWIST, ros2.TWIST_STAMPED), (ros2.TWIST_STAMPED, ros2.TWIST)):
         with pytest.raises(ros2.UnknownMessage, match=other.rpartition("/")[2]):
             types.decode(raw[kind], other)

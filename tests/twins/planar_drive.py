@@ -12,14 +12,9 @@ DT = 0.01
 
 def stage(kinds, start, yaw=None, *, mirrored=None, scene=None, dt=DT):
     n = len(kinds)
-    return EngineInput(
-        tuple(kinds),
-        [(float(x), float(y), 0.0) for x, y, *_ in start],
-        [0.0] * n if yaw is None else [float(each) for each in yaw],
-        dt,
-        (False,) * n if mirrored is None else tuple(mirrored),
-        Scene.empty() if scene is None else scene,
-    )
+    places = [(float(x), float(y), 0.0) for x, y, *_ in start]
+    yaws = [float(each) for each in (yaw if yaw is not None else [0.0] * n)]
+    return EngineInput(tuple(kinds), places, yaws, dt, tuple(mirrored or (False,) * n), scene or Scene.empty())
 
 
 def furnished(obstacles, plans=None, size=(4.0, 4.0, 3.0), walled=False):
@@ -42,8 +37,7 @@ class Drive:
     def __init__(self, kinds, start, yaw=None, *, mirrored=None, scene=None, **choice):
         self.engine = Planar(**choice).build(stage(kinds, start, yaw, mirrored=mirrored, scene=scene))
         self.kinds, self.rows = kinds, len(kinds)
-        self.t = 0.0
-        self.path, self.touches = [], []
+        self.t, self.path, self.touches = 0.0, [], []
         for row, place in enumerate(start):
             if len(place) == 3:
                 self.put(row, place, flying=True)
@@ -79,6 +73,11 @@ class Drive:
         """Who touched whom, in order; -1: an obstacle, -2: a wall."""
         return [(touch.first, touch.second) for touch in self.touches]
 
+    @property
+    def x(self):
+        """x of the first robot [m]."""
+        return self.position[0, 0]
+
     def mirror(self, row, position, yaw=0.0, velocity=ZERO):
         self.engine.mirror([row], [tuple(position)], [yaw], [velocity])
 
@@ -87,7 +86,3 @@ class Drive:
         path = np.array(self.path)
         apart = np.linalg.norm(path[:, a, :2] - path[:, b, :2], axis=1)
         return (self.kinds[a].radius + self.kinds[b].radius - apart).max()
-
-
-def still(rows):
-    return np.zeros((rows, 4))

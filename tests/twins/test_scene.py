@@ -35,8 +35,7 @@ def test_distances_of_many_points_are_negative_inside():
     point = np.zeros((5, 2, 2))
     point[:, 1, 1] = 1.0
     found = outlines.distance(there, 0, pose, point)
-    assert found[:, 0] == pytest.approx([-0.1, 0.8, 1.8, 2.8, 3.8])
-    assert found[0, 1] == pytest.approx(0.9)
+    assert (found[:, 0], found[0, 1]) == (pytest.approx([-0.1, 0.8, 1.8, 2.8, 3.8]), pytest.approx(0.9))
 
 
 def test_planned_poses_over_time():

@@ -494,7 +494,6 @@ def test_charge_by_the_voltage_under_load(telemetry, log_state):
 def test_firmware_without_supervisor(telemetry, log_state):
     """Telemetry of older firmwares is enough to take off and to land."""
     log_state(1.0, 0, {"pm.vbat": 3.55, "pm.state": 3, "sys.canfly": 1, "sys.isFlying": 1, "sys.isTumbled": 0})
-    assert telemetry.info == Info.ARMED | Info.CAN_FLY | Info.FLYING
-    assert telemetry.battery == pytest.approx(0.5)
+    assert (telemetry.info, telemetry.battery) == (Info.ARMED | Info.CAN_FLY | Info.FLYING, pytest.approx(0.5))
     assert telemetry.battery_low
     assert telemetry.status_text() == "battery low"

@@ -432,8 +432,7 @@ def test_another_client_in_flight_is_ended(circling, packet):
     circling.run(2.0, speed=0.3)
     circling.twin.deliver(0, packet)
     assert min(circling.run(0.05, speed=0.3).heights[0] for _ in range(80)) > HEIGHT - 0.2
-    assert circling.heights[0] == pytest.approx(HEIGHT, abs=0.03)
-    assert circling.phases == {FlightPhase.FLYING}
+    assert (circling.heights[0], circling.phases) == (pytest.approx(HEIGHT, abs=0.03), {FlightPhase.FLYING})
     assert circling.supervised == SupervisorState.FLYING
 
 

@@ -54,9 +54,9 @@ def refusal(*addresses, **device):
     return str(caught.value)
 
 
-def link_of(address="khepera4://127.0.0.1"):
+def link_of(where=None):
     """The link of one robot, not begun."""
-    where = KheperaAddress.parse("K", address) if isinstance(address, str) else address
+    where = where or KheperaAddress.parse("K", "khepera4://127.0.0.1")
     return Khepera4Link("K", where, protocol.Khepera4Settings(), (0.0, 0.0, 0.0))
 
 
@@ -83,10 +83,10 @@ def test_all_odometries_of_a_robot_agree(steps, yaw):
 
 def test_odometry_begins_where_the_experiment_says():
     odometer = Odometer(0.5, 0.0, np.pi / 2)
-    odometer.pose(7.0, 8.0, 1.0, 0.0)
-    assert (odometer.x, odometer.y, odometer.yaw) == (0.5, 0.0, np.pi / 2)
-    odometer.pose(7.0 + np.cos(1.0), 8.0 + np.sin(1.0), 1.0, 1.0)  # one metre along its nose
-    assert (odometer.x, odometer.y) == pytest.approx((0.5, 1.0))
+    for x, y in ((7.0, 8.0), (7.0 + np.cos(1.0), 8.0 + np.sin(1.0))):  # one metre along its nose
+        begin = (odometer.x, odometer.y, odometer.yaw)
+        odometer.pose(x, y, 1.0, 0.0 if x == 7.0 else 1.0)
+    assert (begin, (odometer.x, odometer.y)) == ((0.5, 0.0, np.pi / 2), pytest.approx((0.5, 1.0)))
     driven = Odometer(0.0, 0.0, np.pi / 2)
     for step in range(26):
         driven.steps(0.008, 0.0, 0.04 * step)
@@ -155,20 +155,19 @@ def test_command_is_as_old_as_its_state():
 def test_a_stop_that_is_not_answered_is_said():
     link = link_of()
 
-    def drives_at(t, v):
-        link.odometry = KheperaOdometry(t, 0.0, 0.0, 0.0, (v, 0.0))
+    def unanswered(t, v=None):
+        """Whether it is now; the robot drives at this speed [m/s]."""
+        if v is not None:
+            link.odometry = KheperaOdometry(t, 0.0, 0.0, 0.0, (v, 0.0))
+        return link.unanswered(t)
 
     link.drive(0.2, 0.0, 0.0)
-    drives_at(100.0, 0.2)
+    unanswered(100.0, 0.2)
     link.halt(100.0)
     link.halt(101.0)  # again, by the watchdog
-    assert not link.unanswered(102.0)
-    assert link.unanswered(103.0)
-    drives_at(103.0, 0.0)
-    assert not link.unanswered(103.0)
+    assert [unanswered(102.0), unanswered(103.0), unanswered(103.0, 0.0)] == [False, True, False]
     link.drive(0.2, 0.0, 0.0)
-    drives_at(110.0, 0.2)
-    assert not link.unanswered(110.0)
+    assert not unanswered(110.0, 0.2)
 
 
 @pytest.mark.system
@@ -184,12 +183,10 @@ def test_robots_drive_to_their_goals(served, speaks, bearings):
         state, (position, yaw) = driver.state, twins.truth()
         assert [driver.body.inspect(row).firmware for row in (0, 1)] == [f"server {each['server']}" for each in speaks]
         driver.until(lambda: driver.state.scan[0] is not None)
-        assert len(driver.state.scan[0].bearing) == bearings
-        assert np.isnan(driver.state.scan[0].distance).all()
-    assert state.position == pytest.approx(position, abs=0.01)
-    assert state.yaw == pytest.approx(yaw, abs=0.03)
-    assert not state.flying.any()
-    assert state.note == ("", "")
+        scan = driver.state.scan[0]
+    assert (len(scan.bearing), np.isnan(scan.distance).all()) == (bearings, True)
+    assert (state.position, state.yaw) == (pytest.approx(position, abs=0.01), pytest.approx(yaw, abs=0.03))
+    assert (state.note, state.flying.any()) == (("", ""), False)
     assert (state.battery > 0.98).all() if speaks[0] == KTEAM else np.isnan(state.battery).all()
     assert (np.abs(twins.truth()[0] - position) < 1e-3).all()
 
@@ -199,10 +196,9 @@ def test_robots_drive_to_their_goals(served, speaks, bearings):
 )
 def test_garbled_answer_stops_the_robot(served, speaks, question, comes_back):
     """Noise on the line: the robot stands, whether or not its server accepts another client; then it goes on."""
-    rows = replace(ONE, device=(speaks,))
-    twins = served(rows)
+    twins = served(rows := replace(ONE, device=(speaks,)))
     (server,) = twins.device.servers
-    answered = server._answer
+    answered, model = server._answer, server.robot.model
 
     def garbled(received, t):
         if not received.startswith(question):
@@ -214,12 +210,12 @@ def test_garbled_answer_stops_the_robot(served, speaks, question, comes_back):
     body.open()
     with closing(body):
         driver = Driver(body, constant(0.1))
-        driver.until(lambda: server.robot.model.velocity[0] > 0.05)
+        driver.until(lambda: model.velocity[0] > 0.05)
         server._answer = garbled
         driver.until(lambda: driver.state.note[0], "the fault is noted")
         driver.until(lambda: server.robot.twist == (0.0, 0.0), "it stands")
         if comes_back:
-            driver.until(lambda: not driver.state.note[0] and server.robot.model.velocity[0] > 0.05, "it goes on")
+            driver.until(lambda: not driver.state.note[0] and model.velocity[0] > 0.05, "it goes on")
 
 
 @pytest.mark.system
@@ -250,8 +246,7 @@ def test_fault_of_one_robot_leaves_others_driving(served):
         assert driver.slowest < 0.5
     assert re.match("silent for .*(Connection refused|closed the connection|reset by peer)", notes[1])
     assert "no answer to" in notes[2]
-    assert notes[3] == "battery at 3%: too low to drive"
-    assert empty.truth()[0][0, 0] == 0.0
+    assert (notes[3], empty.truth()[0][0, 0]) == ("battery at 3%: too low to drive", 0.0)
     assert "Connection refused; start the server" in notes[4]
     assert np.isnan(driver.state.position[4]).all()
 
@@ -346,7 +341,6 @@ def serial_twin(heard):
     """Address of a pseudo terminal, with the twin's side of the protocol at its other end."""
     ours, theirs = os.openpty()
     tty.setraw(theirs)
-    device = KheperaDevice(DeviceRequest(replace(ONE, device=(KTEAM,)), Faults()))
     ending = threading.Event()
 
     def serve():
@@ -359,11 +353,11 @@ def serial_twin(heard):
                     os.write(ours, f"{answer_kteam(device.servers[0].robot, text)}\r\n".encode())
 
     server = threading.Thread(target=serve, daemon=True)
-    server.start()
-    yield f"kteam://{os.ttyname(theirs)}"
-    ending.set()
-    server.join()
-    device.close()
+    with closing(KheperaDevice(DeviceRequest(replace(ONE, device=(KTEAM,)), Faults()))) as device:
+        server.start()
+        yield f"kteam://{os.ttyname(theirs)}"
+        ending.set()
+        server.join()
     os.close(ours)
     os.close(theirs)
 
@@ -377,7 +371,5 @@ def test_kteam_over_a_serial_line():
             driver.tick()
             driver.body.command([(0.1, 0.5, 0.0, 0.0)])
             driver.until(lambda: "D,109,186" in heard)
-            assert driver.state.note == ("",)
-            assert driver.state.battery[0] == 1.0
-        assert heard[:3] == ["D,0,0", "B", "U,31"]
-        assert heard[-4:] == ["D,0,0"] * 3 + ["R"]
+            assert (driver.state.note, driver.state.battery[0]) == (("",), 1.0)
+        assert (heard[:3], heard[-4:]) == (["D,0,0", "B", "U,31"], ["D,0,0"] * 3 + ["R"])

@@ -281,8 +281,7 @@ def test_yaw_counts_from_where_it_was_opened(grounded):
     assert grounded.pass_(0.2).pilot.turned == 0.0
     assert grounded.pass_(0.2, yaw=-70).pilot.turned == pytest.approx(np.pi / 2), "clockwise is positive to the drone"
     grounded.pass_(0.2, yaw="garbled", bat=None, h="", time=1.5)
-    assert grounded.pilot.turned == pytest.approx(np.pi / 2)
-    assert grounded.pilot.battery == 0.8
+    assert (grounded.pilot.turned, grounded.pilot.battery) == (pytest.approx(np.pi / 2), 0.8)
 
 
 def test_landing_ends_when_answered_and_low(airborne):

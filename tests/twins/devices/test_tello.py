@@ -9,29 +9,26 @@ import pytest
 
 from agents.body.interface import BodyError, Disturbance, Jitter
 from tests.requests import request
-from twins.devices import tello
 from twins.devices.device import DeviceRequest, Faults
+from twins.devices.tello import TelloDevice
 
-DT = 0.01
+DT, NO_FAULTS = 0.01, Faults()
 
 
 class Conversation:
     """A client of one or more drones that lets their time pass tick by tick."""
 
-    def __init__(self, rows=1, **parts):
-        self.states = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self.states.bind(("127.0.0.1", 0))
-        faults = Faults(**parts.pop("faults", {}))
+    def __init__(self, rows=1, faults=NO_FAULTS, **parts):
+        self.states, self.wire = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
+        for each in (self.states, self.wire):
+            each.bind(("127.0.0.1", 0))
         asked = DeviceRequest(request("tello", ["tello-twin"] * rows, **parts), faults)
-        self.device = tello.TelloDevice(asked, state_port=self.states.getsockname()[1])
-        self.wire = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self.wire.bind(("127.0.0.1", 0))
+        self.device = TelloDevice(asked, state_port=self.states.getsockname()[1])
         self.tick = 0
 
     def close(self):
-        for wire in (self.wire, self.states):
-            wire.close()
-        self.device.close()
+        for each in (self.wire, self.states, self.device):
+            each.close()
 
     def say(self, text, row=0):
         drone = self.device.sockets()[row]
@@ -63,12 +60,13 @@ class Conversation:
         self.wait(seconds)
         return self.place()
 
-    def state(self):
-        """The newest state line, as a table, and how many came."""
+    def state(self, *fields):
+        """The newest state line, as a table, and how many came; or some of its fields."""
         last, count = "", 0
         while select.select([self.states], [], [], 0.0)[0]:
             last, count = self.states.recv(1024).decode(), count + 1
-        return dict(field.split(":") for field in last.strip().strip(";").split(";") if field), count
+        table = dict(field.split(":") for field in last.strip().strip(";").split(";") if field)
+        return [table[field] for field in fields] if fields else (table, count)
 
     def place(self, row=0):
         return self.device.truth()[0][row]
@@ -76,7 +74,8 @@ class Conversation:
     def up(self):
         assert self.ask("command") == "ok"
         self.say("takeoff")
-        return self.wait(8.0)
+        self.wait(8.0)
+        return self
 
 
 @pytest.fixture
@@ -87,9 +86,7 @@ def talk():
 
 @pytest.fixture
 def drone(talk):
-    made = talk()
-    made.up()
-    return made
+    return talk().up()
 
 
 def test_tello_reports_in_sdk_mode(talk):
@@ -101,24 +98,21 @@ def test_tello_reports_in_sdk_mode(talk):
     drone.wait(1.0)
     state, count = drone.state()
     assert count == 10
-    assert (state["bat"], state["h"], state["time"], state["tof"], state["yaw"]) == ("100", "0", "0", "10", "0")
-    assert (state["mid"], state["x"]) == ("-2", "-200")
-    for command, said in (("mon", ("-1", "-100")), ("moff", ("-2", "-200"))):
+    assert state | {"bat": "100", "h": "0", "time": "0", "tof": "10", "yaw": "0", "mid": "-2", "x": "-200"} == state
+    for command, said in (("mon", ["-1", "-100"]), ("moff", ["-2", "-200"])):
         drone.ask(command)
         drone.wait(0.2)
-        state, _ = drone.state()
-        assert (state["mid"], state["x"]) == said
+        assert drone.state("mid", "x") == said
 
 
 def test_take_off_and_landing_are_answered_when_over(talk):
-    drone = talk(faults={"refuse_landing_s": 8.0})
+    drone = talk(faults=Faults(refuse_landing_s=8.0))
     drone.ask("command")
     drone.say("takeoff")
     drone.wait(1.0)
     assert drone.ask("land") == "error"
     [(answer, when)] = drone.wait(7.0)
-    assert answer == "ok"  # of the take-off
-    assert 2.0 < when < 6.0
+    assert (answer, 2.0 < when < 6.0) == ("ok", True)  # of the take-off
     assert drone.place()[2] == pytest.approx(0.8, abs=0.01)
     assert drone.ask("land") == "error"
     drone.wait(0.9)
@@ -127,43 +121,34 @@ def test_take_off_and_landing_are_answered_when_over(talk):
     drone.say("land")
     begun = drone.tick * DT
     [(answer, when)] = drone.wait(8.0)
-    assert answer == "ok"
-    assert when - begun > 1.0
-    assert drone.place()[2] == 0.0
-    assert drone.ask("land") == "error"
+    assert (answer, when - begun > 1.0) == ("ok", True)
+    assert (drone.place()[2], drone.ask("land")) == (0.0, "error")
 
 
 def test_sticks_are_body_velocities_until_they_change(talk):
-    drone = talk(yaw=np.pi / 2)  # its nose points along y
-    drone.up()
+    drone = talk(yaw=np.pi / 2).up()  # its nose points along y
     before = drone.place()
     assert drone.ask("rc 0 50 0 0") is None
     # 0.5 m/s, reached with a time constant of 1/3 s: 4 s less that
     assert drone.after(4.0) - before == pytest.approx([0.0, 0.5 * (4.0 - 1.0 / 3.0), 0.0], abs=0.02)
     drone.say("rc 40 0 -10 0")
     drone.wait(2.1)
-    state, _ = drone.state()
-    assert (int(state["vgx"]), int(state["vgy"]), int(state["vgz"])) == (0, 4, 1)
+    assert drone.state("vgx", "vgy", "vgz") == ["0", "4", "1"]
     drone.say("rc 0 0 0 50")  # clockwise
     drone.wait(1.0)
     assert drone.device.truth()[1][0] == pytest.approx(np.pi / 2 - np.radians(50.0), abs=1e-9)
     drone.wait(0.05)
-    assert int(drone.state()[0]["yaw"]) == pytest.approx(52, abs=3)
+    assert int(*drone.state("yaw")) == pytest.approx(52, abs=3)
 
 
 def test_moves_end_where_they_should(drone):
-    begin = drone.place()
-    drone.say("go 50 -40 30 100")
-    assert drone.answers(5.0) == ["ok"]
-    assert drone.place() - begin == pytest.approx([0.5, -0.4, 0.3], abs=0.035)
     assert (drone.ask("speed 20"), drone.ask("speed?")) == ("ok", "20.0\r\n")
-    drone.say("ccw 90")
-    assert drone.answers(3.0) == ["ok"]
+    for command, way in (("go 50 -40 30 100", (0.5, -0.4, 0.3)), ("ccw 90", (0, 0, 0)), ("left 60", (-0.6, 0, 0))):
+        begin = drone.place()
+        drone.say(command)
+        assert (command, drone.answers(5.0)) == (command, ["ok"])
+        assert drone.place() - begin == pytest.approx(way, abs=0.04)
     assert drone.device.truth()[1][0] == pytest.approx(np.pi / 2, abs=0.02)
-    begin = drone.place()
-    drone.say("left 60")
-    assert drone.answers(5.0) == ["ok"]
-    assert drone.place() - begin == pytest.approx([-0.6, 0.0, 0.0], abs=0.04)
 
 
 def test_what_it_refuses(talk):
@@ -229,39 +214,35 @@ def test_silence_leaves_the_sticks_then_lands(drone):
 
 def test_a_battery_that_ends_brings_it_down(talk):
     for charge, answer in ((1.0, "ok"), (0.4, "error")):  # a flip needs half of it
-        flier = talk(faults={"battery": charge})
-        flier.up()
+        flier = talk(faults=Faults(battery=charge)).up()
         flier.say("flip f")
         assert flier.answers(3.0) == [answer]
-    weak = talk(faults={"battery": 0.08})
-    weak.ask("command")
-    assert weak.ask("takeoff") == "error"
-    drained = talk(faults={"battery": 0.12, "drain": 10.0})
-    drained.up()
+    weak = talk(faults=Faults(battery=0.08))
+    assert [weak.ask("command"), weak.ask("takeoff")] == ["ok", "error"]
+    drained = talk(faults=Faults(battery=0.12, drain=10.0)).up()
     assert drained.after(6.0)[2] == 0.0
     assert 0 <= int(drained.ask("battery?")) < 5
 
 
 def test_silence_loss_and_delay(talk):
-    drone = talk(faults={"silent_from_s": 1.0, "silent_for_s": 1.0, "delay_s": 0.2})
+    drone = talk(faults=Faults(silent_from_s=1.0, silent_for_s=1.0, delay_s=0.2))
     drone.say("command")
     assert drone.wait(0.5) == [("ok", pytest.approx(0.2))]
     drone.wait(0.55)
     drone.state()
-    assert drone.ask("battery?") is None
-    assert drone.wait(0.9) == []
+    assert (drone.ask("battery?"), drone.wait(0.9)) == (None, [])
     assert drone.state()[1] == 1  # what had left before the silence
     drone.wait(0.1)
     drone.say("battery?")
     assert len(drone.wait(0.5)) == 1
-    lossy = talk(faults={"loss": 0.5})
+    lossy = talk(faults=Faults(loss=0.5))
     answers = [lossy.ask("command") for _ in range(200)]
     assert 30 < answers.count("ok") < 70  # a quarter comes through both ways
 
 
 def test_disturbance_and_settings_show_in_the_truth(talk):
-    drone = talk(disturbance=Disturbance(hover_jitter=Jitter(0.02), latency_s=0.1), device={"twin_stick_speed": 0.6})
-    drone.up()
+    jitter = Disturbance(hover_jitter=Jitter(0.02), latency_s=0.1)
+    drone = talk(disturbance=jitter, device={"twin_stick_speed": 0.6}).up()
     assert 0.002 < np.std([drone.after(DT)[0] for _ in range(300)]) < 0.06
     drone.say("rc 0 50 0 0")
     before = drone.after(2.0)
@@ -274,8 +255,7 @@ def test_drones_have_addresses_of_their_own(talk):
     assert pair.ask("command", row=1) == "ok"
     pair.say("takeoff", row=1)
     pair.wait(3.0)
-    assert pair.place(0)[2] == 0.0
-    assert pair.place(1)[2] > 0.5
+    assert (pair.place(0)[2], pair.place(1)[2] > 0.5) == (0.0, True)
     assert pair.ask("emergency", row=1) == "ok"  # it falls
     pair.wait(0.5)
     assert pair.place(1)[2] == 0.0
@@ -288,4 +268,4 @@ def test_drones_have_addresses_of_their_own(talk):
         ("tello-twin", {"silence": 1}, r"R0: device: .*silence"),
     ):
         with pytest.raises(BodyError, match=why):
-            tello.TelloDevice(DeviceRequest(request("tello", [address], device=device), Faults()))
+            TelloDevice(DeviceRequest(request("tello", [address], device=device), NO_FAULTS))

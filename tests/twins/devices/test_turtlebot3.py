@@ -6,12 +6,12 @@ from math import pi
 
 import numpy as np
 import pytest
-import zenoh
 from rosbags.typesys import Stores, get_typestore
 from zenoh.handlers import RingChannel
 
 from agents.body.interface import BodyError
 from agents.network.session import open_session
+from tests.bridges.test_ros2 import HASHES
 from tests.bridges.turtlebots import request
 from twins.devices.device import DeviceRequest, Faults
 from twins.devices.turtlebot3 import TurtleBot3Twin
@@ -23,11 +23,11 @@ KINDS = {
     "battery_state": "sensor_msgs/msg/BatteryState",
 }
 COMMANDS = {"humble": "geometry_msgs/msg/Twist", "jazzy": "geometry_msgs/msg/TwistStamped"}
-HASHES = {
-    "nav_msgs/msg/Odometry": "RIHS01_3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0",
-    "sensor_msgs/msg/LaserScan": "RIHS01_64c191398013af96509d518dac71d5164f9382553fce5c1f8cca5be7924bd828",
-    "sensor_msgs/msg/BatteryState": "RIHS01_4bee5dfce981c98faa6828b868307a0a73f992ed0789f374ee96c8f840e69741",
-    "geometry_msgs/msg/TwistStamped": "RIHS01_5f0fcd4f81d5d06ad9b4c4c63e3ea51b82d6ae4d0558f1d475229b1121db6f64",
+
+
+ANNOUNCED = {
+    "rmw": ("@ros2_lv/0/**", 5, 9, "NN MS%TB0%cmd_vel MP%TB0%odom MP%TB0%scan MP%TB0%battery_state"),
+    "ros2dds": ("@/*/@ros2_lv/**", 3, 4, "MSTB0§cmd_vel MPTB0§odom MPTB0§scan MPTB0§battery_state"),
 }
 
 
@@ -35,7 +35,7 @@ def key_of(style, distro, topic, kind):
     if style == "ros2dds":
         return f"TB0/{topic}"
     package, _, name = kind.split("/")
-    code = "TypeHashNotSupported" if distro == "humble" else HASHES[kind]
+    code = "TypeHashNotSupported" if distro == "humble" else f"RIHS01_{HASHES[kind]}"
     return f"0/TB0/{topic}/{package}::msg::dds_::{name}_/{code}"
 
 
@@ -43,7 +43,7 @@ class Listener:
     """A ROS application without ROS; it moves the twin's clock by hand."""
 
     def __init__(self, session, twin, style="ros2dds", distro="jazzy", wait=None):
-        self.session, self.twin, self.style, self.wait = session, twin, style, wait
+        self.session, self.twin, self.wait = session, twin, wait
         self.t, self.inbox = 0.0, {topic: [] for topic in KINDS}
         self.subscribers = {
             topic: session.declare_subscriber(key_of(style, distro, topic, kind), RingChannel(1000))
@@ -51,7 +51,6 @@ class Listener:
         }
         self.kind = COMMANDS[distro]
         self.publisher = session.declare_publisher(key_of(style, distro, "cmd_vel", self.kind))
-        self.sent = 0
 
     def ready(self):
         self.wait(lambda: self.publisher.matching_status.matching)
@@ -101,8 +100,8 @@ class Listener:
         self.put(bytes(STORE.serialize_cdr(message, kind)))
 
     def put(self, raw):
-        self.sent += 1
-        self.publisher.put(raw, attachment=struct.pack("<qqB16s", self.sent, time.time_ns(), 16, bytes(range(16))))
+        sequence = struct.pack("<qqB16s", 1, time.time_ns(), 16, bytes(range(16)))
+        self.publisher.put(raw, attachment=sequence)
 
     def obey(self, v, w):
         count = self.twin.commands_received[0] + 1
@@ -190,27 +189,10 @@ def test_a_watchdog_stops_it(listen):
 
 
 @pytest.mark.system
-def test_announces_itself(listen, eventually):
-    for style, pattern, role, topic, wanted in (
-        ("rmw", "@ros2_lv/0/**", 5, 9, "NN MS%TB0%cmd_vel MP%TB0%odom MP%TB0%scan MP%TB0%battery_state"),
-        ("ros2dds", "@/*/@ros2_lv/**", 3, 4, "MSTB0§cmd_vel MPTB0§odom MPTB0§scan MPTB0§battery_state"),
-    ):
-        session = listen(style=style).session
-
-        def announced(session=session, pattern=pattern, role=role, topic=topic):
-            replies = session.liveliness().get(pattern, timeout=1.0)
-            tokens = [str(reply.ok.key_expr).split("/") for reply in replies]
-            return {parts[role] + "".join(parts[topic : topic + 1]) for parts in tokens}
-
-        eventually(lambda announced=announced, wanted=wanted: announced() == set(wanted.split()))
-
-
-@pytest.mark.system
 def test_loss_delay_and_an_empty_battery(listen):
     listener = listen(faults=Faults(delay_s=0.5), ready=False)
     assert [listener.count(0.5), listener.count(0.5)] == [0, 10]
-    listener = listen(faults=Faults(loss=0.3))
-    assert 0.6 < listener.count(20.0) / 400 < 0.8
+    assert 0.6 < listen(faults=Faults(loss=0.3)).count(20.0) / 400 < 0.8
     listener = listen(faults=Faults(battery=0.5, drain=900.0))
     listener.after(4.0)
     charges = [battery.percentage for battery, _ in listener.inbox["battery_state"]]
@@ -219,20 +201,19 @@ def test_loss_delay_and_an_empty_battery(listen):
 
 
 @pytest.mark.system
-def test_the_session_is_gone_when_it_is_closed(hub, eventually):
+@pytest.mark.parametrize("style", ANNOUNCED)
+def test_is_announced_until_it_is_closed(hub, eventually, style):
+    pattern, role, topic, wanted = ANNOUNCED[style]
     with pytest.raises(BodyError, match=r"TB0: device: .*`colour`"):
         TurtleBot3Twin(DeviceRequest(request(hub.endpoint, device={"colour": 1}), Faults()))
-    twin = TurtleBot3Twin(DeviceRequest(request(hub.endpoint), Faults()))
+    twin = TurtleBot3Twin(DeviceRequest(request(hub.endpoint, device={"style": style}), Faults()))
     with open_session([hub.endpoint], name="listener") as session:
-        seen = session.liveliness().declare_subscriber("@/*/@ros2_lv/**", RingChannel(64), history=True)
-        alive = set()
 
-        def tokens():
-            while (sample := seen.try_recv()) is not None:
-                (alive.add if sample.kind == zenoh.SampleKind.PUT else alive.discard)(str(sample.key_expr))
-            return len(alive)
+        def announced():
+            tokens = [str(reply.ok.key_expr).split("/") for reply in session.liveliness().get(pattern, timeout=1.0)]
+            return {parts[role] + "".join(parts[topic : topic + 1]) for parts in tokens}
 
-        eventually(lambda: tokens() == 4)
+        eventually(lambda: announced() == set(wanted.split()))
         assert twin.sockets() == ()
         twin.close()
-        eventually(lambda: tokens() == 0)
+        eventually(lambda: announced() == set())

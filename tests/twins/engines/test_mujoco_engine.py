@@ -96,8 +96,7 @@ def test_steps_beside_the_fitted_law(axis, step, rise, overshoot):
     mine, fitted = rise_and_overshoot(path, step), rise_and_overshoot(np.array(fitted) - before[axis], step)
     assert fitted[0] == pytest.approx(mine[0], rel=0.10)
     assert abs(mine[1] - fitted[1]) < 0.04
-    assert mine[0] == pytest.approx(rise, rel=0.02)
-    assert mine[1] == pytest.approx(overshoot, abs=0.01)
+    assert (mine[0], mine[1]) == (pytest.approx(rise, rel=0.02), pytest.approx(overshoot, abs=0.01))
     assert path[-1] == pytest.approx(step, abs=0.06 * step)  # the vertical integrals need some ten seconds
 
 

@@ -53,24 +53,18 @@ def test_hover_jitter_has_sigma_and_correlation_time(dt):
         correlation = (settled[lag:] * settled[:-lag]).mean() / sigma**2
         assert correlation == pytest.approx(math.exp(-lag_s / tau), abs=0.05)
     assert seen[0].std() == pytest.approx(sigma * math.sqrt(2 * dt / tau), rel=0.2)  # it begins at rest
-
-
-def test_hover_jitter_grows_with_height():
-    full, half = jittered(0.01, 1, 20), jittered(0.01, 1, 20, height=0.1)
-    np.testing.assert_allclose(half, 0.5 * full, rtol=1e-12)
-    assert not jittered(0.01, 1, 20, height=0.0).any()
+    full, low, landed = (jittered(0.01, 1, 20, height) for height in (1.0, 0.1, 0.0))
+    np.testing.assert_allclose([low, landed], [0.5 * full, 0.0 * full], rtol=1e-12)
     assert not (jittered(0.01, 2, 20) == full).any()
 
 
 def test_no_disturbance_needs_no_noise():
     none = Disturbance()
-    jitter, drift = HoverJitter(none, "A", 1, 0.01), OdometryDrift(none, "A", 1)
-    measurement = MeasurementNoise(none, "A", 1, spatial=True)
     assert not Latency(none, 0.01).present
-    for disturbed in (jitter, drift, measurement):
-        assert not disturbed.present
+    measurement = MeasurementNoise(none, "A", 1, spatial=True)
+    for disturbed in (HoverJitter(none, "A", 1, 0.01), OdometryDrift(none, "A", 1), measurement):
         refill(disturbed.noise)
-        assert len(disturbed.noise.ahead) == 0
+        assert (disturbed.present, len(disturbed.noise.ahead)) == (False, 0)
 
 
 def test_measurement_noise_has_sigma_on_measured_axes():

@@ -1,5 +1,7 @@
 """Range sensors: the makers' figures, their rates, and noise that belongs to its robot."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import replace
 
@@ -33,18 +35,14 @@ def equipped(asked, world):
     return RangeSensors(asked, world), PointMass().build(place)
 
 
-def distances(ranges):
-    return np.concatenate([scan.distance for scan in ranges.scans if scan is not None])
-
-
 def swept(asked, world, times=(0.0,)):
-    """Readings (len(times), R) of robots that stand, and the sensors."""
+    """Readings (len(times), R) of robots that stand, and the last scans."""
     ranges, engine = equipped(asked, world)
     seen = []
     for t in times:
         ranges.sweep(t, engine)
-        seen.append(distances(ranges))
-    return np.array(seen), ranges
+        seen.append(np.concatenate([scan.distance for scan in ranges.scans if scan is not None]))
+    return np.array(seen), ranges.scans
 
 
 def facing(kind, sensor, gap, noise=0.0, times=(0.0,), *, robots=1):
@@ -88,17 +86,14 @@ def test_rays_are_in_the_order_of_sensors():
     kinds = [KHEPERA4, CRAZYFLIE, TURTLEBOT3, KHEPERA4]
     carried = [("ultrasonic", "infrared", "ultrasonic"), (), ("lds01",), ("infrared",)]
     asked = request(kinds, start=[(0.0, 0.0), (0.2, 0.0), (1.0, 0.0), (-2.9, 0.0)])
-    _, ranges = swept(asked, placed(kinds, carried))
-    first, none, lidar, last = ranges.scans
+    _, (first, none, lidar, last) = swept(asked, placed(kinds, carried))
     assert none is None
     light, sound = SENSORS["infrared"].bearing, SENSORS["ultrasonic"].bearing
-    np.testing.assert_array_equal(first.bearing, np.concatenate([sound, light]))
-    np.testing.assert_array_equal(last.bearing, light)
+    assert ([*first.bearing], [*last.bearing]) == ([*sound, *light], [*light])
     ahead = [distance for distance, bearing in zip(first.distance, first.bearing, strict=True) if bearing == 0.0]
     # the landed Crazyflie is too near for sound, and hides what is behind it; all TurtleBots' rays pass over both
-    np.testing.assert_allclose(ahead, [np.nan, 0.135], atol=1e-12)
-    assert last.distance[light.index(np.pi)] == pytest.approx(0.1, abs=1e-12)
-    assert np.isnan(lidar.distance[180])
+    seen = [*ahead, last.distance[light.index(np.pi)], lidar.distance[180]]
+    np.testing.assert_allclose(seen, [np.nan, 0.135, 0.1, np.nan], atol=1e-12)
 
 
 def test_multiranger_looks_ahead_and_up():
@@ -116,15 +111,13 @@ def test_sensors_measure_at_their_own_rates(dt):
     ranges, engine = equipped(asked, world)
     assert ranges.scans == [None] * 3
     ranges.sweep(-2.0, engine)  # measurements missed since then are not made up for
-    times = {0: set(), 1: set(), 2: set()}
+    seen = []
     for k in range(1, round(20.0 / dt) + 1):
         ranges.sweep(k * dt, engine)
-        for row, seen in times.items():
-            seen.add(ranges.scans[row].time)
-    for row, rate in ((0, 5.0), (1, 10.0), (2, 20.0)):
-        steps = np.diff(sorted(times[row]))
-        assert min(times[row]) == dt
-        assert len(steps) == pytest.approx(20.0 * rate, abs=2)
+        seen.append([scan.time for scan in ranges.scans])
+    for times, rate in zip(np.transpose(seen), (5.0, 10.0, 20.0), strict=True):
+        steps = np.diff(np.unique(times))
+        assert (times[0], len(steps)) == (dt, pytest.approx(20.0 * rate, abs=2))
         assert steps.max() < 1.0 / rate + dt + 1e-9
         assert dt != 0.01 or steps == pytest.approx(1.0 / rate)
 
@@ -188,22 +181,17 @@ def test_mirrored_robots_are_seen_and_see():
     world = placed(kinds, [("infrared",), ("infrared",), ()], mirrored=[False, True, False])
     ranges, engine = equipped(asked, world)
     ranges.sweep(0.0, engine)
-    assert np.isnan(distances(ranges)).all()  # it is not there yet
+    assert np.isnan([scan.distance for scan in ranges.scans[:2]]).all()  # it is not there yet
     engine.mirror([1], [(0.3, 0.0, 0.0)], [math.pi], [ZERO])
     engine.advance(0.01, [(0.0, 0.0)] * 3)
     ranges.sweep(0.1, engine)
     ahead = SENSORS["infrared"].bearing.index(0.0)
-    for row in (0, 1):
-        seen = np.array(ranges.scans[row].distance)
-        assert seen[ahead] == pytest.approx(0.23, abs=1e-12)
-        assert np.isfinite(seen).sum() == 1
+    for scan in ranges.scans[:2]:
+        assert (np.isfinite(scan.distance).sum(), scan.distance[ahead]) == (1, pytest.approx(0.23, abs=1e-12))
 
 
 def test_state_of_a_twin_has_its_scan():
     body = TwinBody(request([TURTLEBOT3]), placed([TURTLEBOT3], [("lds01",)]))
-    assert body.read(0.0)[0].scan is None
-    scan = body.read(0.01)[0].scan
+    none, scan, kept, later = (body.read(t)[0].scan for t in (0.0, 0.01, 0.2, 0.21))
+    assert (none, scan.time, kept is scan, later.time) == (None, 0.01, True, 0.21)
     assert scan.distance[0] == pytest.approx(3.0, abs=1e-12)
-    assert scan.time == 0.01
-    assert body.read(0.2)[0].scan is scan
-    assert body.read(0.21)[0].scan.time == 0.21

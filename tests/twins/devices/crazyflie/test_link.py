@@ -4,6 +4,7 @@ import math
 import socket
 import struct
 from contextlib import closing
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,6 +28,18 @@ PARAMETER_TABLE, LOG_TABLE = inventory().parameters, inventory().logs
 
 def variable(kind, name):
     return struct.pack("<BH", kind, LOG_TABLE.number[name])
+
+
+def logged(wire, *names):
+    """Values of log variables, in the type that they have on board."""
+    values = []
+    for name in names:
+        kind = wire.drone.log_table.variables[LOG_TABLE.number[name]].type
+        wire.put(Port.LOG, 1, Log.RESET)
+        wire.log(Log.CREATE, 0, variable(LOG_CODES[kind], name))
+        wire.log(Log.START, 0, 1)
+        values.append(PACKINGS[kind].unpack(wire.wait(0.01)[0][2][4:])[0])
+    return values
 
 
 def at(kind, address):
@@ -54,17 +67,14 @@ def test_greeting_version_and_tables():
 
 def test_parameters():
     wire = Wire(device={"positioning": {"system": "loco"}})
-    key = wire.key("kalman.initialX")
+    key, value = wire.key("kalman.initialX"), wire.drone.value
     assert wire.ask(Port.PARAM, 1, key) == key + b"\0" + struct.pack("<f", 0.0)
     assert wire.set("kalman.initialX", "f", 0.5) == [(Port.PARAM, 2, key + struct.pack("<f", 0.5))]
-    assert wire.drone.value("kalman.initialX") == 0.5
-    assert wire.ask(Port.PARAM, 1, key)[3:] == struct.pack("<f", 0.5)
+    assert (value("kalman.initialX"), wire.ask(Port.PARAM, 1, key)[3:]) == (0.5, struct.pack("<f", 0.5))
     assert wire.ask(Port.PARAM, 1, b"\xff\xff") == b"\xff\xff" + bytes((LogStatus.UNKNOWN,))
-    assert wire.set("deck.bcLoco", "B", 0) == []  # a constant
-    assert wire.drone.value("deck.bcLoco") == 1
+    assert (wire.set("deck.bcLoco", "B", 0), value("deck.bcLoco")) == ([], 1)  # a constant
     name = b"stabilizer\0controller\0"
-    assert wire.ask(Port.PARAM, 3, 0, name, 0x08, 2) == b"\0" + name + b"\0"
-    assert wire.drone.value("stabilizer.controller") == 2
+    assert (wire.ask(Port.PARAM, 3, 0, name, 0x08, 2), value("stabilizer.controller")) == (b"\0" + name + b"\0", 2)
     assert wire.ask(Port.PARAM, 3, 0, b"no\0such\0", 0x08, 2)[-1] == LogStatus.UNKNOWN
 
 
@@ -92,9 +102,8 @@ def test_stored_parameters():
 
 def test_log_block():
     wire = Wire(start=[[1.5, -0.25, 0.0]])
-    wire.set("kalman.initialX", "f", 1.5)
-    wire.set("kalman.initialY", "f", -0.25)
-    wire.set("kalman.resetEstimation", "B", 1)
+    for name, packing, value in (("initialX", "f", 1.5), ("initialY", "f", -0.25), ("resetEstimation", "B", 1)):
+        wire.set(f"kalman.{name}", packing, value)
     items = variable(0x77, "stateEstimate.x") + variable(0x55, "stateEstimateZ.y") + variable(0x88, "pm.vbat")
     assert wire.ask(Port.LOG, 1, Log.CREATE, 3, items) == bytes((Log.CREATE, 3, 0))
     assert wire.wait(0.1) == []
@@ -104,40 +113,27 @@ def test_log_block():
     assert {(port, channel, data[0]) for port, channel, data in packets} == {(Port.LOG, 2, 3)}
     stamps = [int.from_bytes(data[1:4], "little") for _, _, data in packets]
     assert set(np.diff(stamps)) <= {19, 20, 21}
-    x, y, volts = struct.unpack("<fhe", packets[-1][2][4:])
-    assert (x, y) == (1.5, -250)
-    assert volts == pytest.approx(4.2, abs=0.01)
+    assert struct.unpack("<fhe", packets[-1][2][4:]) == (1.5, -250, pytest.approx(4.2, abs=0.01))
     wire.put(Port.LOG, 1, Log.STOP, 3)
     assert wire.wait(0.1) == []
-    assert wire.log(Log.DELETE, 3) == LogStatus.OK
-    assert wire.log(Log.START, 3, 2) == LogStatus.UNKNOWN
+    assert [wire.log(Log.DELETE, 3), wire.log(Log.START, 3, 2)] == [LogStatus.OK, LogStatus.UNKNOWN]
 
 
 def test_log_limits():
     wire = Wire()
     wide, narrow = variable(0x77, "stateEstimate.x"), variable(0x11, "pm.batteryLevel")
-    assert wire.log(Log.CREATE, 0, wide * 6) == LogStatus.OK
-    assert wire.log(Log.APPEND, 0, wide) == LogStatus.TOO_LARGE
-    assert wire.log(Log.APPEND, 0, narrow * 2) == LogStatus.OK
-    assert wire.log(Log.CREATE, 0, wide) == LogStatus.EXISTS
-    assert wire.log(Log.CREATE, 1, b"\x11\xff\xff") == LogStatus.UNKNOWN
-    wire.put(Port.LOG, 1, Log.RESET)
-    assert {wire.log(Log.CREATE, block, narrow * 8) for block in range(16)} == {LogStatus.OK}
-    assert wire.log(Log.APPEND, 0, narrow) == LogStatus.NO_ROOM
-    assert wire.log(Log.CREATE, 16, narrow) == LogStatus.NO_ROOM
-    assert wire.log(99, 0) == LogStatus.NO_COMMAND
+    for command, block, items, status in (
+        (Log.CREATE, 0, wide * 6, LogStatus.OK),
+        (Log.APPEND, 0, wide, LogStatus.TOO_LARGE),
+        (Log.APPEND, 0, narrow * 2, LogStatus.OK),
+        (Log.CREATE, 0, wide, LogStatus.EXISTS),
+        (Log.CREATE, 1, b"\x11\xff\xff", LogStatus.UNKNOWN),
+        (99, 0, b"", LogStatus.NO_COMMAND),
+    ):
+        assert (items, wire.log(command, block, items)) == (items, status)
     assert wire.ask(Port.LOG, 1, Log.RESET) == bytes((Log.RESET, 0, 0))  # three bytes, or cflib stumbles
-
-
-@pytest.mark.slow
-def test_every_variable_packs():
-    wire = Wire(device={"multiranger": True}).hovering()
-    for i, one in enumerate(LOG_TABLE.variables):
-        wire.put(Port.LOG, 1, Log.RESET)
-        wire.log(Log.CREATE, 0, struct.pack("<BH", LOG_CODES[one.type], i))
-        wire.log(Log.START, 0, 1)
-        (value,) = PACKINGS[one.type].unpack(wire.wait(0.02)[0][2][4:])
-        assert math.isfinite(value)
+    assert {wire.log(Log.CREATE, block, narrow * 8) for block in range(16)} == {LogStatus.OK}
+    assert [wire.log(Log.APPEND, 0, narrow), wire.log(Log.CREATE, 16, narrow)] == [LogStatus.NO_ROOM] * 2
 
 
 def test_memories_are_listed():
@@ -146,13 +142,14 @@ def test_memories_are_listed():
     assert [wire.ask(Port.MEMORY, 0, 2, i)[2] for i in range(count + 1)] == [*Memories.kinds, MemoryKind.DECK]
     assert wire.put(Port.MEMORY, 0, 2, count + 1) == []
     eeprom = wire.ask(Port.MEMORY, 1, at(MemoryKind.EEPROM, 0), 21)[6:]
-    assert eeprom[:7] == b"0xBC\1P\2"
-    assert sum(eeprom[:20]) % 256 == eeprom[20]
+    assert (eeprom[:7], sum(eeprom[:20]) % 256) == (b"0xBC\1P\2", eeprom[20])
     wire.put(Port.MEMORY, 2, at(MemoryKind.TESTER, 5), bytes((5, 6, 7, 99)))
-    assert wire.vehicle.decks.memories.write_errors == 1
-    for value in (0, 1):
-        wire.set("memTst.resetW", "B", value)
-        assert wire.vehicle.decks.memories.write_errors == 1 - value
+    memories, errors = wire.vehicle.decks.memories, []
+    for reset in (None, 0, 1):
+        if reset is not None:
+            wire.set("memTst.resetW", "B", reset)
+        errors.append(memories.write_errors)
+    assert errors == [1, 1, 0]
     assert Wire(external=True).ask(Port.MEMORY, 0, 1) == bytes((1, count))  # without a deck
 
 
@@ -165,13 +162,11 @@ def test_lighthouse_memory():
         for offset in range(0, size, 24):
             where = at(MemoryKind.LIGHTHOUSE, begin + 0x100 + offset)
             assert wire.ask(Port.MEMORY, 2, where, page[offset : offset + 24]) == where + b"\0"
-    assert memory.geometries == memory.calibrations == 0b10
-    assert decks.station_status == 2
+    assert (memory.geometries, memory.calibrations, decks.station_status) == (0b10, 0b10, 2)
     beyond = at(MemoryKind.LIGHTHOUSE, 0x400)
     assert wire.ask(Port.MEMORY, 2, beyond, b"\1")[-1] == LogStatus.IO
     assert wire.ask(Port.MEMORY, 1, beyond, 4) == beyond + bytes((LogStatus.IO,))
-    assert wire.ask(Port.LOCATION, 1, 11, struct.pack("<HH", 2, 2)) == b"\x0b\1"
-    assert memory.stored == (2, 2)
+    assert (wire.ask(Port.LOCATION, 1, 11, struct.pack("<HH", 2, 2)), memory.stored) == (b"\x0b\1", (2, 2))
     wire.set("lighthouse.systemType", "B", 1)
     assert memory.geometries == 0
 
@@ -208,14 +203,14 @@ class Client:
         (by or self.socket).send(packet)
         self.device.serve(self.device.sockets()[0], t)
 
-    def ping(self, t, tag=b"x"):
-        self.send(bytes((crtp.header(Port.LINK, 0),)) + tag, t)
+    def ping(self, t, tag=b"x", by=None):
+        self.send(bytes((crtp.header(Port.LINK, 0),)) + tag, t, by)
 
-    def heard(self):
+    def heard(self, at=None):
         packets = []
         while True:
             try:
-                packets.append(self.socket.recv(64))
+                packets.append((at or self.socket).recv(64))
             except BlockingIOError:
                 return packets
 
@@ -266,15 +261,13 @@ def test_silence():
 
 def test_newest_client_is_served_and_told_of_locks():
     with closing(Client()) as client, client.connected() as other:
-        client.send(bytes((crtp.header(Port.LINK, 0),)) + b"y", by=other)
-        assert other.recv(64)[1:] == b"y"
+        client.ping(0.0, b"y", by=other)
         client.ping(0.1)
-        assert len(client.heard()) == 1
+        assert ([packet[1:] for packet in client.heard(other)], len(client.heard())) == ([b"y"], 1)
         client.device.drones[0].vehicle.supervisor.stop()
         client.device.advance(0.2)
         assert b"Locked" in b"".join(packet[1:] for packet in client.heard() if packet[0] >> 4 == Port.CONSOLE)
-        with pytest.raises(BlockingIOError):
-            other.recv(64)
+        assert client.heard(other) == []
         assert [each.shape for each in client.device.truth()] == [(1, 3), (1,)]
 
 
@@ -338,8 +331,7 @@ def test_safelink_loses_and_repeats_nothing(radio):
         sent += answer is not None
         if answer is not None and answer[1:] != NOTHING[1:] and answer[1] not in down:
             down.append(answer[1])
-    assert up == list(range(max(up) + 1))
-    assert down == list(range(20))
+    assert (up, down) == (list(range(max(up) + 1)), list(range(20)))
 
 
 def test_a_client_without_safelink_is_heard_once(radio):
@@ -379,19 +371,6 @@ def test_losses_cost_retransmissions():
     assert sum(packet is not None for _, _, packet in results) == pytest.approx(2000 * (1.0 - 0.5**4), rel=0.05)
 
 
-def logged(wire, *names):
-    """Values of log variables, in the type that they have on board."""
-    table, values = wire.drone.log_table, []
-    for name in names:
-        number = table.number[name]
-        kind = table.variables[number].type
-        wire.put(Port.LOG, 1, Log.RESET)
-        wire.log(Log.CREATE, 0, struct.pack("<BH", LOG_CODES[kind], number))
-        wire.log(Log.START, 0, 1)
-        values.append(PACKINGS[kind].unpack(wire.wait(0.01)[0][2][4:])[0])
-    return values
-
-
 def test_size_of_the_firmware_and_its_numbers():
     tables = inventory()
     assert (len(tables.parameters.variables), len(tables.logs.variables)) == (402, 637)
@@ -413,14 +392,15 @@ def test_values_of_a_drone_that_stands():
     assert 0.0 < logged(wire, "gyro.xVariance")[0] < 0.1
 
 
+@pytest.mark.slow
 def test_values_of_a_drone_that_flies():
-    wire = Wire().streaming()
+    wire = Wire(device={"multiranger": True}).streaming()
     wire.wait(0.1, lambda: wire.goal(1.0, 0.0, 1.0))
     roll, pitch, qx, qy, qw = logged(wire, *(f"stateEstimate.{name}" for name in ("roll", "pitch", "qx", "qy", "qw")))
-    assert pitch < -5.0
-    assert abs(roll) < 1.0
+    assert (pitch < -5.0, abs(roll) < 1.0) == (True, True)
     assert (qx, qy, qw) == pytest.approx((0.0, math.sin(math.radians(-0.5 * pitch)), 1.0), abs=0.02)
     assert logged(wire, "motor.m1")[0] == pytest.approx(39300.0, rel=0.01)
+    assert np.isfinite(logged(wire, *LOG_TABLE.number)).all()
 
 
 PARAMETERS = """{"deck": {"bcFlow2": {"__class__": "ParamTocElement", "ident": 0, "group": "deck", "name": "bcFlow2",
@@ -430,24 +410,22 @@ ENTRY = """{"pm": {"vbat": {"__class__": "LogTocElement", "ident": %d, "group": 
 
 
 def test_tables_of_files_are_read_or_refused(tmp_path):
-    texts = (ENTRY % (0, "float"), PARAMETERS)
-    for file, text in zip(files := [tmp_path / "logs.json", tmp_path / "parameters.json"], texts, strict=True):
-        file.write_text(text)
-    tables = inventory(tuple(map(str, files)))
+    def read(*texts):
+        files = [str(tmp_path / f"table{hash(text)}.json") for text in texts]
+        for file, text in zip(files, texts, strict=True):
+            Path(file).write_text(text)
+        return inventory(tuple(files))
+
+    tables = read(ENTRY % (0, "float"), PARAMETERS)
     (log,), (parameter,) = tables.logs.variables, tables.parameters.variables
     assert (log.name, log.type, parameter.name, parameter.flags) == ("pm.vbat", "float", "deck.bcFlow2", READ_ONLY)
-    with pytest.raises(BodyError, match="second table"):
-        inventory((str(files[0]), str(files[0])))
-    for k, (text, said) in enumerate(
-        (
-            ("", "no table of a Crazyflie"),
-            ("[]", "no table of a Crazyflie"),
-            ('{"pm": {"vbat": {"ident": 0}}}', "no table of a Crazyflie"),
-            (ENTRY % (3, "float"), "0, 1, 2"),
-            (ENTRY % (0, "float128"), "unknown type float128"),
-        )
+    for texts, said in (
+        ([ENTRY % (0, "float")] * 2, "second table"),
+        ([""], "no table of a Crazyflie"),
+        (["[]"], "no table of a Crazyflie"),
+        (['{"pm": {"vbat": {"ident": 0}}}'], "no table of a Crazyflie"),
+        ([ENTRY % (3, "float")], "0, 1, 2"),
+        ([ENTRY % (0, "float128")], "unknown type float128"),
     ):
-        file = tmp_path / f"table{k}.json"
-        file.write_text(text)
         with pytest.raises(BodyError, match=said):
-            inventory((str(file),))
+            read(*texts)
