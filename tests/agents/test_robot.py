@@ -4,13 +4,13 @@ from math import dist, inf, nan
 
 import pytest
 
-from agents.decision.lifecycle import AIRBORNE, DONE, IDLE, READY, RUNNING
+from agents.decision.lifecycle import DONE, IDLE, READY, RUNNING
 from agents.network.messages import Order
 from agents.runtime.orders import carry_out
 from experiments.definition.experiment import Formation, LegTable, Start
 from experiments.definition.plan import Plan
 from tests.agents.bench import LOGGED, Bench, Swarm, followed
-from tests.small import NOISY, changed, pair, reference, small, triangle
+from tests.small import NOISY, changed, pair, reference, triangle
 
 HERE = (-0.4, 0.0, 0.0)
 LINE = {"kind": "line", "move_by": [0.3, 0.0], "speed": 0.1}
@@ -126,19 +126,6 @@ def test_leader_goes_where_it_is_sent():
     assert dist(swarm.run(8.0).last("L", "truth"), (0.0, 0.1, 0.0)) < 0.01
 
 
-def test_decisions_and_questions_keep_their_rates():
-    swarm = Swarm(pair(formation=Formation(links={"A - B": 0.5}, gain=50.0, clamp=0.07))).running()
-    begin = swarm.tick
-    goals = swarm.run(2.0).column("A", "goal", begin - 1)
-    changes = [k for k in range(1, len(goals)) if goals[k] != goals[k - 1]]
-    assert all(k % 10 == 0 for k in changes)
-    assert len(changes) >= 15
-    asked = [tick - begin + 1 for tick, name in swarm.sent if tick >= begin and name == "A"]
-    assert asked == list(range(2, 201, 2))
-    goal, place = goals[1], swarm.log[begin]["A"]["position"]
-    assert max(abs(a - b) for a, b in zip(goal, place, strict=True)) == pytest.approx(0.07, abs=0.005)  # the clamp
-
-
 @pytest.mark.parametrize(("kind", "height"), [("khepera4", 0.0), ("crazyflie", 0.5), ("tello", 0.5)])
 def test_leader_follows_its_plan(kind, height):
     swarm = followed(kind, 0.8, timeline=[LegTable(at_s=1.0, robot="L", plan=LINE)]).running()
@@ -155,20 +142,6 @@ def test_follower_with_a_plan_is_pulled_by_both():
     place = swarm.running().run(40.0).last("F", "truth")
     assert dist(place, (0.0, 0.5, 0.0)) < 0.2  # the pull ends with the third power of what is left
     assert dist(place, (0.0, 0.0, 0.0)) == pytest.approx(0.5, abs=0.02)
-
-
-def test_late_robot_joins_its_plan():
-    swarm = Swarm(small({"L": "khepera4"}, timeline=[LegTable(at_s=1.0, robot="L", plan=LINE)]))
-    robot = swarm.run(0.05).robot("L")
-    robot.lifecycle.takeoff()
-    assert swarm.run(0.05).phase("L") == AIRBORNE
-    assert robot.start(swarm.t - 3.0) == ""
-    swarm.step()
-    assert (swarm.phase("L"), robot.tick, robot.decisions) == (RUNNING, 301, 1)
-    assert swarm.last("L", "goal") == pytest.approx((0.2, 0.0, 0.0), abs=1e-9)
-    robot.tick += 12  # skipped ticks skip no decision
-    swarm.step()
-    assert robot.decisions == 2
 
 
 ALONE = [[name] for name in reference().robots]

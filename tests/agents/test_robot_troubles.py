@@ -18,7 +18,7 @@ from agents.vectors import NO_SETPOINT, UNKNOWN
 from experiments.definition.experiment import Formation, RobotTable
 from experiments.definition.plan import Plan
 from experiments.file.document import load
-from tests.agents.bench import Swarm, drone, followed
+from tests.agents.bench import Swarm, drone
 from tests.cases import mostly_slow
 from tests.small import pair, small
 
@@ -94,18 +94,6 @@ def test_blind_wheels_stop_and_go_on(what):
     assert (swarm.phase("A"), swarm.last("A", "setpoint")) == (RUNNING, STILL)
     swarm.spoil("A", None)
     assert any(swarm.run(0.3).last("A", "setpoint"))
-
-
-@pytest.mark.parametrize("what", LOST)
-def test_leader_drives_on_when_positioning_returns(what):
-    swarm = followed().running()
-    assert swarm.robot("L").go((0.3, 0.1), swarm.t) == ""
-    swarm.run(1.0).spoil("L", LOST[what])
-    stood = swarm.run(1.0).last("L", "truth")
-    assert dist(swarm.run(1.0).last("L", "truth"), stood) < 1e-6
-    assert dist(stood, (0.3, 0.1, 0.0)) > 0.1
-    swarm.spoil("L", None)
-    assert dist(swarm.run(8.0).last("L", "truth"), (0.3, 0.1, 0.0)) < 0.01
 
 
 def test_followers_of_blind_wheels_stop():

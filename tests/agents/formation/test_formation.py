@@ -78,8 +78,6 @@ def test_links_by_clock_and_range():
     assert not planned_at(0.0, inf, 1.0, 0.0)
 
 
-# ---------------------------------------------------------------- anchors
-
 SORTS = {"point": (1.0, 0.0), "line": (1.0, -1.0), "plane": (0.0, 1.0)}  # `whole` and `along`
 
 

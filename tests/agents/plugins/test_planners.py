@@ -105,19 +105,6 @@ def test_every_planner_is_tried_and_checks_parameters(radius):
         built(wrong if radius is None else {"kind": "circle", "radius": radius, "period_s": 1.0})
 
 
-@FEW
-@given(st.lists(st.sampled_from(range(len(PLANS))), min_size=1, max_size=4), ANCHOR, HEADING)
-def test_legs_follow_without_a_jump(chosen, start, yaw):
-    legs = [Leg(1.0 + 2.3 * k, built(PLANS[plan])) for k, plan in enumerate(chosen)]
-    itinerary, times = Itinerary(legs, holds_before=True), [0.02 * k for k in range(650)]
-    fastest = max(leg.planner.speed() for leg in legs)
-    path = places(itinerary, times, start, yaw)
-    assert path[0] == start
-    assert max(map(dist, path, path[1:])) <= fastest * 0.02 + 1e-9
-    late = Itinerary(legs, holds_before=True).target(times[-1], start, yaw)  # does not begin from the beginning
-    assert late[:3] == pytest.approx(path[-1], abs=1e-12)
-
-
 def test_before_its_first_leg_a_robot_holds():
     start, legs = (0.1, 0.2, 0.3), [Leg(5.0, Line(move_by=[1.0, 0.0], speed_=0.5))]
     found = places(Itinerary(legs, holds_before=True), (-inf, 0.0, 4.9, 6.0), start, 0.4)

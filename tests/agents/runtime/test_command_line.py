@@ -40,6 +40,14 @@ def test_the_arguments_of_the_network():
         parse("twin", NetworkLaunch, ["--connect", "tcp/a:1", "--lab", "folder"]).endpoints()
 
 
+@pytest.fixture
+def pipe():
+    ends = list(os.pipe())
+    yield ends
+    for end in ends:
+        os.close(end)
+
+
 def test_output_waits_for_no_reader(pipe):
     out = Output(pipe[1])
     print("über", 1, file=out, flush=True)

@@ -151,17 +151,6 @@ def test_other_make_begins_anew_with_its_token(a):
     assert (a.x, a.sender.stale) == (0.2, 1)
 
 
-def test_other_sessions_do_not_replace_the_robot(a):
-    a.begin("one")
-    for source in ("other", None):  # another process, or a tool that puts old poses again
-        a.pose(9, 3.0, source)
-        a.receive(9000, 3.0, source, age=100.0)
-    assert (a.x, a.sender.foreign) == (0.4, 4)
-    assert a.hazards == ["4 foreign"]
-    a.t += 1.0
-    assert a.hazards == []
-
-
 def test_restarted_robot_leaves_the_law(a):
     a.token("one")
     a.pose(7, 0.4, "one", speed=0.3)
@@ -296,11 +285,10 @@ def test_slow_clock_carries_no_pose_far(delay):
 @pytest.mark.parametrize(
     ("poses", "carried_s"),
     [
-        ([("one", 0.1, 60.0), ("one", 0.0, 60.0)], LATE_S),  # a slow clock is noticed at the second pose,
-        ([("one", 0.1, 0.0), ("two", 0.0, 60.0)], LATE_S),  # and at once after a restart
+        ([("one", 0.1, 0.0), ("two", 0.0, 60.0)], LATE_S),  # a slow clock is noticed at once after a restart
         ([("one", 30.1, 0.0), ("one", 0.0, 20.0)], 20.0),  # the last value while it was cut off, or silent
     ],
-    ids=["slow", "restarted", "cut off"],
+    ids=["restarted", "cut off"],
 )
 def test_old_pose_is_extrapolated_unless_clock_is_slow(a, poses, carried_s):
     a.token("one")
