@@ -21,11 +21,11 @@ from bridges.vicon.publisher import Bridge, PoseFilter, heading, parse_maps, par
 from experiments.file import document
 from tests.commands import python, started
 from tests.system.lab import RobotProcess, Watcher
-from tests.twins import camera as cameras
+from tests.twins import loopback
 from tests.waiting import ManualClock, until
 from twins.devices.vicon import upright
 
-Camera = partial(cameras.Camera, sigma=1e-9)  # what repeats itself is not believed
+Camera = partial(loopback.Camera, sigma=1e-9)  # what repeats itself is not believed
 UPRIGHT = tuple(upright(0.3).ravel().tolist())
 
 
