@@ -24,7 +24,8 @@ def count_unrecorded(poses: Iterable[tuple[float, int]], rate: float) -> int:
 
     A robot transmits at most `rate` poses in a second [1/s]; see `agents.network.validation.missed`.
     """
-    return sum(missed(last, seq, then - before, rate) for (before, last), (then, seq) in pairwise(poses))
+    gaps = ((before, last, then, seq) for (before, last), (then, seq) in pairwise(poses) if seq != last + 1)
+    return sum(missed(last, seq, then - before, rate) for before, last, then, seq in gaps)
 
 
 def count_lost(

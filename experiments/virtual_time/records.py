@@ -10,6 +10,7 @@ import hashlib
 import struct
 from array import array
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
 from functools import cache
 from itertools import chain
 from typing import Any, Final, NamedTuple, cast
@@ -28,10 +29,17 @@ class Floats(NamedTuple):
     size: int
 
 
-class Items(NamedTuple):
+@dataclass(frozen=True)
+class Items:
     """List, tuple or array of values of one kind."""
 
     item: Any
+    words: int = field(init=False, repr=False, compare=False)  # of an item
+    code: str = field(init=False, repr=False, compare=False)  # of `struct`, of a word
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "words", width(self.item))
+        object.__setattr__(self, "code", _code(self.item))
 
 
 class RecordLayout:
@@ -42,8 +50,8 @@ class RecordLayout:
         self.owner, self.fields, self.fixed, self.name = owner, fields, fixed, name
         self.frozen = is_frozen(owner)
         self.offset, words = dict[str, int](), 0
-        for field, kind in fields.items():
-            self.offset[field], words = words, words + width(kind)
+        for attribute, kind in fields.items():
+            self.offset[attribute], words = words, words + width(kind)
         self.words = max(words, 1)
         self.store, self.load = _storing(self), _loading(self)
 
@@ -181,7 +189,7 @@ class Image:
         return [number for thing, kind in self._roots for number in (self.address(thing), _count(thing, kind))]
 
     def address(self, thing: Any) -> int:
-        return self._known[id(thing)]
+        return self.known[id(thing)]
 
     def load(self) -> None:
         """Read the values of all objects that can change back."""
@@ -195,9 +203,9 @@ class Image:
         """Write the values of all objects; returns whether there is room for them."""
         self.words = np.zeros(self._size, dtype=np.int64)
         self.memory, self._base = self.words.data.cast("B"), self.words.ctypes.data
-        self._known: dict[int, int] = {}  # address by identity
+        self.known: dict[int, int] = {}  # address by identity
         self._things: list[tuple[Any, RecordLayout, int]] = []
-        self._lists: list[tuple[list[Any], Any, int]] = []
+        self._lists: list[tuple[list[Any], Items, int]] = []
         self.used = 0
         try:
             for thing, kind in self._roots:
@@ -211,12 +219,12 @@ class Image:
         at, self.used = WORD * self.used, self.used + words
         if self.used > self._size:
             raise _FullError
-        self._known[id(thing)] = self._base + at
+        self.known[id(thing)] = self._base + at
         return at
 
     def put(self, thing: Any, layout: RecordLayout) -> int:
         """Store an object, and what it leads to, unless it is there already; returns its address."""
-        found = self._known.get(id(thing))
+        found = self.known.get(id(thing))
         if found is not None:
             return found
         at = self.take(thing, layout.words)
@@ -233,9 +241,9 @@ class Image:
         count, item = len(items), kind.item
         if isinstance(items, array):
             return items.buffer_info()[0], count
-        found = self._known.get(id(items))
+        found = self.known.get(id(items))
         if found is None:
-            at = self.take(items, count * width(item))
+            at = self.take(items, count * kind.words)
             found = self._base + at
             values: Iterable[Any] = items
             if isinstance(item, RecordLayout):
@@ -246,8 +254,8 @@ class Image:
                 if isinstance(item, Floats):
                     values = chain.from_iterable(items)
                 if isinstance(items, list):
-                    self._lists.append((items, item, at))
-            struct.pack_into(_format(item, count), self.memory, at, *values)
+                    self._lists.append((items, kind, at))
+            struct.pack_into(f"{count * kind.words}{kind.code}", self.memory, at, *values)
         return found, count
 
 
@@ -259,18 +267,22 @@ class _FullError(Exception):
     """Lack of room for an object."""
 
 
-def _format(kind: Any, count: int = 1) -> str:
-    """Format of `struct` of `count` values of a kind."""
-    code = "d" if kind == FLOAT or isinstance(kind, Floats) else "q"
-    return f"{count * width(kind)}{code}"
+def _code(kind: Any) -> str:
+    """Code of `struct` of the words of a kind."""
+    return "d" if kind == FLOAT or isinstance(kind, Floats) else "q"
 
 
-def _items(memory: memoryview, at: int, count: int, kind: Any) -> list[Any]:
+def _format(kind: Any) -> str:
+    """Format of `struct` of a value of a kind."""
+    return f"{width(kind)}{_code(kind)}"
+
+
+def _items(memory: memoryview, at: int, count: int, kind: Items) -> list[Any]:
     """Numbers, truths or tuples of numbers of a list."""
-    values = struct.unpack_from(_format(kind, count), memory, at)
-    if isinstance(kind, Floats):
-        return list(zip(*[iter(values)] * kind.size, strict=True))
-    return [value != 0 for value in values] if kind == BOOL else list(values)
+    values, item = struct.unpack_from(f"{count * kind.words}{kind.code}", memory, at), kind.item
+    if isinstance(item, Floats):
+        return list(zip(*[iter(values)] * item.size, strict=True))
+    return [value != 0 for value in values] if item == BOOL else list(values)
 
 
 def _storing(layout: RecordLayout) -> Callable[[Image, Any, int], None]:
@@ -279,7 +291,7 @@ def _storing(layout: RecordLayout) -> Callable[[Image, Any, int], None]:
     for name, kind in layout.fields.items():
         space[f"kind_{name}"] = kind
         if isinstance(kind, RecordLayout):
-            values.append(f"image.put(thing.{name}, kind_{name})")
+            values.append(f"(known.get(id(thing.{name})) or image.put(thing.{name}, kind_{name}))")
         elif isinstance(kind, Items):
             values.append(f"*image.put_items(thing.{name}, kind_{name})")
         else:
@@ -292,6 +304,7 @@ def _storing(layout: RecordLayout) -> Callable[[Image, Any, int], None]:
 def store(image, thing, at):
     if not ({" and ".join(conditions)}):
         raise TypeError(f"{{type(thing).__name__}} is not as before")
+    known = image.known
     pack({", ".join(["image.memory", "at", *values])})
 """
     return cast("Callable[[Image, Any, int], None]", _made(source, "store", pack=pack, **space))

@@ -140,7 +140,7 @@ class Prepared:
     kinds: tuple[Items, ...]  # of each of those
     of_ledger: RecordLayout
     run: Any
-    words: int = 1 << 12  # that all objects take
+    words: int = 1 << 12  # that all objects take, at most, so far
 
 
 class Stretches:
@@ -170,8 +170,9 @@ class Stretches:
         flight = self._flight
         longest = max(min(LONGEST, ROBOT_TICKS // len(flight.robots)), LEAST)
         end = min(end, k + longest, self._next_leg())
-        waits = any(robot.lifecycle.phase <= READY and not robot.lifecycle.climbing for robot in flight.robots)
-        if self._refused or k < max(self._paused_until, 1) or end - k < LEAST or waits:  # the first tick moves nothing
+        if self._refused or k < max(self._paused_until, 1) or end - k < LEAST:  # the first tick moves nothing
+            return k, AT_END
+        if not all(_goes_on(robot, k * flight.dt) for robot in flight.robots):
             return k, AT_END
         ticks, rows, rates = end - k, len(self._members), flight.plan.experiment.rates
         questions = ticks // round(rates.body_hz / rates.pose_hz) + ROOM
@@ -231,7 +232,7 @@ class Stretches:
         except TypeError as error:
             self._misfit = str(error)
             return None
-        prepared.words = image.used
+        prepared.words = max(prepared.words, image.used)
         return image
 
     def _prepared(self, ledger: Ledger) -> Prepared | None:
@@ -286,6 +287,11 @@ class Stretches:
         finally:
             for row, itinerary in kept.items():
                 flight.robots[row].goals.itinerary = itinerary
+
+
+def _goes_on(robot: Robot, t: float) -> bool:
+    """Whether the phase of a robot probably does not move on at `t` [s]: by its last state."""
+    return (robot.lifecycle.phase > READY or robot.lifecycle.climbing) and robot.is_steady(t)
 
 
 def driver(kinds: tuple[Items, ...], of_ledger: RecordLayout) -> Any:
