@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Iterable, Iterator
+from collections import Counter
+from collections.abc import Iterable
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -69,27 +70,40 @@ def modules() -> dict[str, Path]:
 
 
 @cache
-def imports() -> dict[str, set[str]]:
-    """Imports of each module, wherever they stand: late ones as well."""
-    return {name: set(imported(file)) - {name} for name, file in modules().items()}
+def texts() -> dict[str, str]:
+    return {name: file.read_text("utf-8") for name, file in modules().items()}
 
 
 @cache
-def statements(file: Path) -> tuple[list[ast.Import | ast.ImportFrom], list[str]]:
-    """Statements of a file that import, and names of its classes, wherever they stand."""
-    nodes = list(ast.walk(ast.parse(file.read_text("utf-8"))))
+def statements(name: str) -> tuple[list[ast.Import | ast.ImportFrom], list[str]]:
+    """Statements of a module that import, and names of its classes, wherever they stand."""
+    nodes = list(ast.walk(ast.parse(texts()[name])))
     imports = [node for node in nodes if isinstance(node, ast.Import | ast.ImportFrom)]
     return imports, [node.name for node in nodes if isinstance(node, ast.ClassDef)]
 
 
-def imported(file: Path) -> Iterator[str]:
-    for node in statements(file)[0]:
+def imported(nodes: Iterable[ast.AST]) -> set[str]:
+    """Dotted names that statements import: modules, and what is imported from them."""
+    found: set[str] = set()
+    for node in nodes:
         if isinstance(node, ast.ImportFrom) and node.module:
-            for alias in node.names:
-                inner = f"{node.module}.{alias.name}"
-                yield from (name for name in (inner, node.module) if name in modules())
+            found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
         elif isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names if alias.name in modules())
+            found |= {alias.name for alias in node.names}
+    return found
+
+
+@cache
+def imports() -> dict[str, set[str]]:
+    """Imports of each module, wherever they stand: late ones as well."""
+    return {name: imported(statements(name)[0]) & modules().keys() - {name} for name in modules()}
+
+
+def importing(*packages: str) -> set[str]:
+    """Modules that import one of these packages, wherever that stands."""
+    return {
+        name for name in modules() if {each.partition(".")[0] for each in imported(statements(name)[0])} & {*packages}
+    }
 
 
 def room(name: str) -> str:
@@ -104,11 +118,8 @@ def floor_of(entry: str) -> int:
 
 
 def test_names_of_classes_stand_once():
-    places: dict[str, list[str]] = {}
-    for module, file in modules().items():
-        for name in statements(file)[1]:
-            places.setdefault(name, []).append(module)
-    assert {name: where for name, where in places.items() if len(where) > 1} == {}
+    count = Counter(name for module in modules() for name in statements(module)[1])
+    assert [name for name, times in count.items() if times > 1] == []
 
 
 def test_imports_go_one_way():
@@ -128,37 +139,19 @@ def test_no_circle():
         pytest.fail(" imports ".join(reversed(error.args[1])))
 
 
-def outside(file: Path) -> set[str]:
-    """Packages that a module imports, wherever that stands."""
-    return packages(statements(file)[0])
-
-
-def packages(nodes: Iterable[ast.AST]) -> set[str]:
-    found: set[str] = set()
-    for node in nodes:
-        names = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
-        names += [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
-        found |= {name.partition(".")[0] for name in names}
-    return found
-
-
 def test_robots_compute_without_arrays():
-    pure = [name for name in modules() if f"{name}.".startswith(("agents.", "twins.models."))]
-    assert {name for name in pure if "numpy" in outside(modules()[name])} <= {"twins.models.noise", *EXTRAS}
-    for name in EXTRAS:
-        assert "numpy" not in packages(ast.parse(modules()[name].read_text("utf-8")).body)
+    with_arrays = {name for name in importing("numpy") if name.startswith(("agents.", "twins.models."))}
+    assert with_arrays <= {"twins.models.noise", *EXTRAS}
+    assert not [name for name in EXTRAS if "numpy" in imported(ast.parse(texts()[name]).body)]
 
 
 def test_one_module_knows_the_compiler():
-    knowing = {name for name in modules() if outside(modules()[name]) & {"numba", "llvmlite"}}
-    assert knowing == {"experiments.virtual_time.compiler"}
+    assert importing("numba", "llvmlite") == {"experiments.virtual_time.compiler"}
 
 
 def test_no_folder_is_too_full():
-    folders: dict[Path, list[str]] = {}
-    for name, file in modules().items():
-        folders.setdefault(file.parent, []).append(name)
-    assert not {str(folder.relative_to(ROOT)): len(inside) for folder, inside in folders.items() if len(inside) > MOST}
+    count = Counter(file.parent for file in modules().values())
+    assert [str(folder) for folder, inside in count.items() if inside > MOST] == []
 
 
 def test_no_module_is_a_mere_part_of_another():
@@ -166,30 +159,19 @@ def test_no_module_is_a_mere_part_of_another():
     for name, others in imports().items():
         for other in others:
             importers[other].add(name)
-    entries = entry_modules() | plugged_in() | commands()
+    # what `python -m` starts, what holds commands, and what entry points name stands alone
+    entries = {
+        name
+        for name, text in texts().items()
+        if re.search(r'^if __name__ == "__main__":|= typer\.Typer\(\)', text, re.M)
+    }
+    entries |= set(re.findall(rf'= "((?:{"|".join(TOPS)})[\w.]*):', (ROOT / "pyproject.toml").read_text("utf-8")))
     small = [
         f"{name} belongs into {next(iter(users))}"
         for name, users in importers.items()
-        if len(users) == 1 and len(modules()[name].read_text("utf-8").splitlines()) < LEAST
-        if name not in entries
+        if len(users) == 1 and len(texts()[name].splitlines()) < LEAST and name not in entries
     ]
     assert not small
-
-
-def entry_modules() -> set[str]:
-    """Modules that run as processes: what `python -m` can start."""
-    return {name for name, file in modules().items() if 'if __name__ == "__main__":' in file.read_text("utf-8")}
-
-
-def commands() -> set[str]:
-    """Modules that hold commands of `zenpark`."""
-    return {name for name, file in modules().items() if "= typer.Typer()" in file.read_text("utf-8")}
-
-
-def plugged_in() -> set[str]:
-    """Modules that the entry points of zenpark name."""
-    text = (ROOT / "pyproject.toml").read_text("utf-8")
-    return set(re.findall(r'= "((?:agents|bridges|twins|experiments|tools)[\w.]*):', text))
 
 
 def test_folders_describe_themselves_and_import_what_they_say():
@@ -223,17 +205,11 @@ CHOOSES_PLUGINS = {
 def calling(call: str) -> set[str]:
     """Modules that call one of these functions, by their dotted names."""
     called = re.compile(rf"(?<![\w.])(?<!class )(?:{call})\(")
-    return {name for name, file in modules().items() if called.search(file.read_text("utf-8"))}
-
-
-def sees_experiments(name: str) -> bool:
-    froms = [node for node in statements(modules()[name])[0] if isinstance(node, ast.ImportFrom)]
-    words = {alias.name for node in froms if node.module == "experiments.definition.experiment" for alias in node.names}
-    return "Experiment" in words
+    return {name for name, text in texts().items() if called.search(text)}
 
 
 def test_experiments_are_compiled_once():
-    seen = {name for name in modules() if sees_experiments(name)}
+    seen = {n for n in modules() if "experiments.definition.experiment.Experiment" in imported(statements(n)[0])}
     assert not {name for name in seen if not name.startswith(SEES_EXPERIMENTS)}, "take a Plan"
     assert calling("Plan") == COMPILES
 
@@ -242,18 +218,12 @@ def test_plug_ins_are_chosen_in_one_place():
     assert calling(r"registry\.(?:build|split|struct)") == CHOOSES_PLUGINS
 
 
-def names_of_tests() -> dict[str, list[str]]:
-    """Names of tests without `test_`, by file."""
-    files = {str(file.relative_to(ROOT)): file for file in (ROOT / "tests").rglob("test_*.py")}
-    definition = re.compile(r"^ *(?:async )?def test_(\w+)", re.MULTILINE)
-    return {name: definition.findall(file.read_text("utf-8")) for name, file in files.items()}
-
-
 def test_test_names_are_short_and_unique():
-    long = [name for names in names_of_tests().values() for name in names if name.count("_") >= MOST_WORDS]
+    definition = re.compile(r"^ *(?:async )?def test_(\w+)", re.MULTILINE)
+    names_of = {file: definition.findall(file.read_text("utf-8")) for file in (ROOT / "tests").rglob("test_*.py")}
+    long = [name for names in names_of.values() for name in names if name.count("_") >= MOST_WORDS]
     assert not long, f"at most {MOST_WORDS} words: the subject first, then what happens"
-    twice = [file for file, names in names_of_tests().items() if len(set(names)) < len(names)]
-    assert not twice
+    assert not [file for file, names in names_of.items() if len(set(names)) < len(names)], "names stand twice"
 
 
 # what names a kind outside of its own files, and why; all others ask its `Kind`
@@ -278,9 +248,9 @@ def test_kinds_stand_in_their_own_files():
     word = re.compile(r"\b(?:crazyflie|khepera4|tello|turtlebot3)\b", re.IGNORECASE)
     naming = {
         name
-        for name, file in modules().items()
-        if not name.startswith(OWN_OF_KINDS) and word.search(file.read_text("utf-8"))
-        for node in ast.walk(ast.parse(file.read_text("utf-8")))
+        for name, text in texts().items()
+        if not name.startswith(OWN_OF_KINDS) and word.search(text)
+        for node in ast.walk(ast.parse(text))
         if (isinstance(node, ast.Name | ast.alias) and word.search(ast.unparse(node)))
         or (isinstance(node, ast.ImportFrom) and word.search(node.module or ""))
         or (isinstance(node, ast.FunctionDef) and word.search(node.name))

@@ -7,6 +7,5 @@ from tests.system.lab import Watcher
 
 @pytest.fixture
 def watcher(router):
-    made = Watcher(router.endpoint)
-    yield made
-    made.close()
+    with Watcher(router.endpoint) as made:
+        yield made

@@ -69,15 +69,14 @@ class Laboratory:
 
     def statuses(self):
         """Fresh ones, of every robot."""
-        since = time.time()
-        watcher = self.watcher
-        watcher.until(lambda: all(watcher.status[name].stamp > since for name in TRIANGLE), "fresh statuses", 5.0)
-        self.last = {name: watcher.status[name] for name in TRIANGLE}
+        since, status = time.time(), self.watcher.status
+        self.watcher.until(lambda: all(status[name].stamp > since for name in TRIANGLE), "fresh statuses", 5.0)
+        self.last = {name: status[name] for name in TRIANGLE}
         return self.last
 
-    def session(self, identity, folder=None):
+    def session(self, identity, folder=None, plain=None):
         """A session of whoever has these certificates; at once, or zenoh.ZError."""
-        (endpoint,) = lab.secured([self.plain], folder or self.folder)
+        (endpoint,) = lab.secured([plain or self.plain], folder or self.folder)
         return zenoh.open(config(settings("client", connect=[endpoint], name="intruder", identity=identity)))
 
     def __enter__(self):

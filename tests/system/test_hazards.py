@@ -2,8 +2,8 @@
 
 import os
 import re
-import signal
 import time
+from types import SimpleNamespace
 
 import pytest
 import zenoh
@@ -12,11 +12,10 @@ from agents.network import messages, pubsub
 from experiments.real_time.conductor.orders import EmergencyStop
 from experiments.real_time.hosts import run_registry
 from tests.commands import ROOT
-from tests.system.lab import ENVIRONMENT, Flight, RobotProcess, Watcher, WorldProcess, typed
+from tests.system.lab import ENVIRONMENT, Flight, RobotProcess, WorldProcess, typed
 from tools.commands import orders as order_commands
 
 pytestmark = pytest.mark.system
-
 
 PAIR = """
 title = "Two that want to be nearer than they may"
@@ -39,14 +38,10 @@ def test_drone_with_low_battery_lands_and_others_continue(tmp_path):
     assert flight.finish()[0] == 1
     assert "zenpark: Failed in event: CF01 at " in flight.said()
     played = flight.read()
-    trace = played.trace
     said = [pose.position[2] for pose in typed(folder / "event.mcap", "/CF01/pose") if pose.stamp > played.started]
-    hover = trace.plan.experiment.robots["CF01"].hover
-    assert said, "it has flown"
-    assert min(said) > hover - 0.1  # nobody follows it to the floor
-    ends = {event.source: event.text for event in trace.events if event.kind == "robot"}
-    assert ends["CF01"] == "done: its battery is low"
-    assert ends["KH01"] == "done: finished"
+    assert min(said) > 0.6 - 0.1, "it has flown, and nobody follows it to the floor"
+    ends = {event.source: event.text for event in played.trace.events if event.kind == "robot"}
+    assert (ends["CF01"], ends["KH01"]) == ("done: its battery is low", "done: finished")
 
 
 @pytest.mark.mechanism("hazard: conductor lost")
@@ -108,10 +103,9 @@ def test_every_run_of_the_machine_ends_with_reason(tmp_path, capsys):
         assert "second: " not in each.said()
         assert [recording.name for recording in each.folder.glob("*.mcap")] == ["first.mcap"]
     assert run_registry.runs() == []
-    trace = flight.read("first").trace
-    assert ("stop", "conductor") in {(event.kind, event.source) for event in trace.events}
-    ends = {event.source: event.text for event in trace.events if event.kind == "robot" and "done" in event.text}
-    assert ends["CF01"] == "done: emergency stop by operator: zenpark estop"
+    events = [(event.kind, event.source, event.text) for event in flight.read("first").trace.events]
+    assert ("stop", "conductor") in {(kind, source) for kind, source, _ in events}
+    assert ("robot", "CF01", "done: emergency stop by operator: zenpark estop") in events
 
 
 @pytest.mark.mechanism("emergency stop of a run")
@@ -146,31 +140,6 @@ class Hangs(Trigger, frozen=True):
 """
 
 
-class Truth(Watcher):
-    """Where the world has its robots as well."""
-
-    def __init__(self, endpoint):
-        super().__init__(endpoint)
-        self._truths = pubsub.Inbox(pubsub.subscriber(self.session, self.keys.truth("*"), 4096), messages.Position)
-        self.place = {}
-        self.heights = []  # of any robot: when [s, UTC] and how high [m] it was
-
-    def look(self):
-        super().look()
-        for truth in self._truths.read():
-            self.place[truth.robot] = truth
-            self.heights.append((truth.stamp, truth.position[2]))
-
-    def height(self, robot):
-        return self.place[robot].position[2] if robot in self.place else 0.0
-
-
-@pytest.fixture
-def watcher(router):
-    with Truth(router.endpoint) as made:
-        yield made
-
-
 LONELY = """
 title = "one Tello in a world"
 duration_s = 60.0
@@ -180,103 +149,100 @@ robots.TE01 = { kind = "tello", body = "world", start = [0.0, 0.0], hover = 0.6 
 
 
 @pytest.fixture
-def lonely_file(tmp_path):
-    return written(tmp_path, LONELY)
+def lonely(router, watcher, tmp_path):
+    """A Tello in the air, in a world of its own; its process, and whatever watches it."""
+    file = tmp_path / "x.toml"
+    if not file.exists():
+        written(tmp_path, LONELY)
+    truths = watcher.every(watcher.keys.truth("TE01"), messages.Position)
+    with WorldProcess(router.endpoint, file) as world, RobotProcess(router.endpoint, file, "TE01") as robot:
+        watcher.take_off("TE01")
+
+        def until_down():
+            watcher.until(lambda: truths[-1].position[2] < 0.02, "it is down")
+
+        yield SimpleNamespace(world=world, robot=robot, truths=truths, file=file, until_down=until_down)
 
 
-@pytest.mark.mechanism("watchdog: control loop hangs")
-def test_a_loop_that_hangs_is_landed_and_said(router, watcher, tmp_path, monkeypatch):
+@pytest.fixture
+def hanging(tmp_path, monkeypatch):
+    """File that makes the control loop hang."""
+    flag, about = tmp_path / "now", tmp_path / "hangs-1.dist-info"
     (tmp_path / "hangs.py").write_text(HANGS)
-    about = tmp_path / "hangs-1.dist-info"
     about.mkdir()
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: hangs\nVersion: 1\n")
     (about / "entry_points.txt").write_text("[zenpark.triggers]\nhangs = hangs:Hangs\n")
-    flag = tmp_path / "now"
-    lonely_file = written(tmp_path, f'{LONELY}trigger = {{ kind = "hangs", file = "{flag}" }}')
+    written(tmp_path, f'{LONELY}trigger = {{ kind = "hangs", file = "{flag}" }}')
     monkeypatch.setitem(ENVIRONMENT, "PYTHONPATH", os.pathsep.join([str(tmp_path), str(ROOT)]))
-    with (
-        WorldProcess(router.endpoint, lonely_file) as world,
-        RobotProcess(router.endpoint, lonely_file, "TE01") as robot,
-    ):
+    return flag
+
+
+@pytest.mark.mechanism("watchdog: control loop hangs")
+def test_a_loop_that_hangs_is_landed_and_said(hanging, lonely, watcher):
+    hanging.touch()
+    watcher.until(lambda: watcher.status["TE01"].reason.startswith("its control loop hangs"), "it is said")
+    assert watcher.phase("TE01") == "landing"
+    watcher.until(lambda: "TE01" not in watcher.alive, "nobody counts on it")
+    lonely.until_down()
+    assert lonely.robot.process.poll() is None  # landed, not fallen
+    lonely.robot.kill()
+    lonely.world.kill()
+
+
+def test_process_frozen_aloft_is_landed_and_notices(lonely, watcher):
+    high, stopped = lonely.truths[-1].position[2], time.time()
+    lonely.robot.freeze()
+    lonely.until_down()
+    held = [truth.position[2] for truth in lonely.truths if stopped < truth.stamp < stopped + 1.5]
+    assert len(held) > 10
+    assert min(held) > high - 0.1  # and holds it first
+    again = messages.encode(messages.Order("takeoff"))
+    asked = watcher.session.get(watcher.keys.order("TE01"), payload=again, timeout=0.1)
+    assert not [reply for reply in asked if reply.ok is not None]
+    lonely.robot.thaw()
+    watcher.until(lambda: watcher.status["TE01"].reason == "it came down by itself", "it knows")
+    assert lonely.truths[-1].position[2] < 0.02
+    watcher.until_all("done", "TE01")
+
+
+def test_frozen_process_leaves_body_to_its_replacement(lonely, router, watcher):
+    lonely.robot.freeze()
+    lonely.until_down()
+    watcher.until(lambda: "TE01" not in watcher.alive, "its lease is over")
+    watcher.status.clear()
+    with RobotProcess(router.endpoint, lonely.file, "TE01"):
         watcher.take_off("TE01")
-        flag.touch()
-        watcher.until(lambda: watcher.status["TE01"].reason.startswith("its control loop hangs"), "it is said")
-        assert watcher.phase("TE01") == "landing"
-        watcher.until(lambda: "TE01" not in watcher.alive, "nobody counts on it")
-        watcher.until(lambda: watcher.height("TE01") < 0.02, "it is down")
-        assert robot.process.poll() is None  # landed, not fallen
-        robot.kill()
-        world.kill()
+        high, before = lonely.truths[-1].position[2], len(lonely.truths)
+        lonely.robot.thaw()
+        watcher.until(lambda: lonely.robot.process.poll() is not None, "the old one leaves")
+        assert lonely.robot.process.returncode == 2
+        assert "TE01: another process has taken this name" in lonely.robot.said()
+        assert min(truth.position[2] for truth in lonely.truths[before:]) > high - 0.05
+        assert watcher.phase("TE01") == "airborne"
 
 
-def test_process_frozen_aloft_is_landed_and_notices(router, watcher, lonely_file):
-    with WorldProcess(router.endpoint, lonely_file), RobotProcess(router.endpoint, lonely_file, "TE01") as robot:
-        watcher.take_off("TE01")
-        high, stopped = watcher.height("TE01"), time.time()
-        robot.freeze()
-        watcher.until(lambda: watcher.height("TE01") < 0.02, "the world lands it")
-        held = [height for stamp, height in watcher.heights if stopped < stamp < stopped + 1.5]
-        assert len(held) > 10
-        assert min(held) > high - 0.1  # and holds it first
-        again = messages.encode(messages.Order("takeoff"))
-        asked = watcher.session.get(watcher.keys.order("TE01"), payload=again, timeout=0.1)
-        assert not [reply for reply in asked if reply.ok is not None]
-        robot.thaw()
-        watcher.until(lambda: watcher.status["TE01"].reason == "it came down by itself", "it knows")
-        assert watcher.height("TE01") < 0.02
-        watcher.until_all("done", "TE01")
-
-
-def test_frozen_process_leaves_body_to_its_replacement(router, watcher, lonely_file):
-    with WorldProcess(router.endpoint, lonely_file), RobotProcess(router.endpoint, lonely_file, "TE01") as old:
-        watcher.take_off("TE01")
-        old.freeze()
-        watcher.until(lambda: watcher.height("TE01") < 0.02, "the world lands it")
-        watcher.until(lambda: "TE01" not in watcher.alive, "its lease is over")
-        watcher.status.clear()
-        with RobotProcess(router.endpoint, lonely_file, "TE01"):
-            watcher.take_off("TE01")
-            heights = [watcher.height("TE01")]
-            old.thaw()
-
-            def left():
-                heights.append(watcher.height("TE01"))
-                return old.process.poll() is not None
-
-            watcher.until(left, "the old one leaves")
-            assert old.process.returncode == 2
-            assert "TE01: another process has taken this name" in old.said()
-            assert min(heights) > heights[0] - 0.05
-            assert watcher.phase("TE01") == "airborne"
-
-
-def test_stop_behind_a_flood_of_deletions_is_obeyed(router, watcher, lonely_file):
-    with WorldProcess(router.endpoint, lonely_file), RobotProcess(router.endpoint, lonely_file, "TE01"):
-        watcher.take_off("TE01")
-        for _ in range(2000):
-            watcher.session.delete(watcher.keys.estop)
-        said = messages.encode(messages.Stop("a test", "now"))
-        block = zenoh.CongestionControl.BLOCK
-        watcher.session.put(watcher.keys.estop, said, encoding=messages.JSON, congestion_control=block)
-        watcher.until_all("done", "TE01")
-        watcher.until(lambda: watcher.height("TE01") < 0.02, "it fell")
-        assert watcher.status["TE01"].reason == "emergency stop by a test: now"
+def test_stop_behind_a_flood_of_deletions_is_obeyed(lonely, watcher):
+    for _ in range(2000):
+        watcher.session.delete(watcher.keys.estop)
+    said = messages.encode(messages.Stop("a test", "now"))
+    block = zenoh.CongestionControl.BLOCK
+    watcher.session.put(watcher.keys.estop, said, encoding=messages.JSON, congestion_control=block)
+    watcher.until_all("done", "TE01")
+    lonely.until_down()
+    assert watcher.status["TE01"].reason == "emergency stop by a test: now"
 
 
 def test_process_hanging_in_final_landing_fails_the_run(tmp_path):
-    robots = (
-        'TE01 = { kind = "tello", start = [0.0, 0.0], hover = 0.6 }\nKH01 = { kind = "khepera4", start = [0.5, 0.5] }'
-    )
-    file = written(tmp_path, f'title = "short"\nduration_s = 1.5\ntrigger = "periodic"\n[robots]\n{robots}\n')
-    flight = Flight(tmp_path / "out", file, report=True)
+    short = ("duration_s=1.5", "robots.CF01.hover=0.3")
+    flight = Flight(tmp_path / "out", written(tmp_path, TWO_CASES), "--case", "first", *short, report=True)
     try:
         flight.until_said("phase conductor: landing")
-        flight.children()["TE01"].suspend()
+        flight.children()["CF01"].suspend()
         assert flight.finish(90.0)[0] == 1
     finally:
-        flight.signal(signal.SIGKILL)
-    assert re.search(r"lost TE01: did not end its landing within 15 s: \w+", flight.said())
-    assert "zenpark: Failed in default: TE01 at " in flight.said()
+        flight.process.kill()
+    assert re.search(r"lost CF01: did not end its landing within 15 s: \w+", flight.said())
+    assert "zenpark: Failed in first: CF01 at " in flight.said()
     report = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     verdict = report[report.index("In short") :]
-    assert verdict.index("TE01 at") < verdict.index("No pose was lost")
+    assert verdict.index("CF01 at") < verdict.index("No pose was lost")

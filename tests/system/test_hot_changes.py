@@ -17,7 +17,6 @@ from tests.system.lab import PATIENCE_S, TRIANGLE, Flight, RobotProcess, Watcher
 
 pytestmark = pytest.mark.system
 
-
 SPARES = """
 [robots.KH03]
 kind = "khepera4"
@@ -31,124 +30,114 @@ S2 = { kind = "khepera4", start = [-0.6, -0.2] }
 LOW = ("robots.CF01.hover=0.3", "spares.S1.hover=0.3", "formation.gain=1.4")  # soon up, and down
 
 
-class Lab:
-    """The triangle with a robot on standby and two spares, and an operator."""
+class HotFlight(Flight):
+    """The triangle with a robot on standby and two spares, in flight, and an operator."""
 
     def __init__(self, folder):
-        self.folder, self.file = folder, folder / "x.toml"
-        text = catalogue.path("triangle").read_text("utf-8").replace("[formation]", SPARES, 1)
-        text = text.replace('"KH01 - KH02"', '"KH01 > KH03" = 0.60\n"KH03 > KH01" = 0.60\n"KH01 - KH02"', 1)
-        self.file.write_text(text)
-
-    def fly(self, *more, endpoint=None):
-        settings = ("duration_s=60", "rates.body_hz=50", *LOW, *more)
-        self.flight = Flight(self.folder / "run", self.file, "--case", "event", "--json", *settings)
-        self.flight.until_flown()
-        self.endpoint = endpoint or self.flight.endpoint()
-        self.watcher = Watcher(self.endpoint)
+        file, text = folder / "x.toml", catalogue.path("triangle").read_text("utf-8")
+        text = text.replace("[formation]", SPARES, 1)
+        file.write_text(text.replace('"KH01 - KH02"', '"KH01 - KH03" = 0.60\n"KH01 - KH02"', 1))
+        settings = ("duration_s=60", "rates.body_hz=50", *LOW)
+        super().__init__(folder / "run", file, "--case", "event", "--json", *settings)
+        self.until_flown()
+        self.router = self.endpoint()
+        self.watcher = Watcher(self.router)
         self.watcher.until_all("running", *TRIANGLE)
-        return self.watcher
-
-    def running(self, *names):
-        return all(self.watcher.phase(name) == "running" for name in names)
 
     def change(self, what, *names, **more):
         order = messages.RunOrder(what, list(names), **more)
         return orders.send_run_order(self.watcher.session, self.watcher.keys, order)
 
     def zenpark(self, *words, code=None):
-        return zenpark("robot", *words, "--connect", self.endpoint, code=code)
+        return zenpark("robot", *words, "--connect", self.router, code=code)
 
     def end(self):
         """Ctrl-C: all land."""
-        if self.flight.process.poll() is None:
-            self.flight.signal(signal.SIGINT)
-        assert self.flight.finish()[0] in (0, 130)
+        self.process.send_signal(signal.SIGINT)
+        assert self.finish()[0] in (0, 130)
 
 
 @pytest.fixture
-def hot_lab(tmp_path):
-    made = Lab(tmp_path)
-    yield made
-    made.watcher.close()
-    if made.flight.process.returncode is None:
+def hot(tmp_path):
+    made = HotFlight(tmp_path)
+    with made.watcher:
+        yield made
+    if made.process.returncode is None:
         made.end()
 
 
-def test_killed_robot_is_restarted_and_takes_part(hot_lab):
-    watcher = hot_lab.fly()
-    status = watcher.status
+def test_killed_robot_is_restarted_and_takes_part(hot):
+    watcher, status = hot.watcher, hot.watcher.status
     first = status["CF01"].pid
     os.kill(first, signal.SIGKILL)
-    hot_lab.flight.until_said("lost CF01: its process ended")
+    hot.until_said("lost CF01: its process ended")
     died = status["KH01"].stamp
     watcher.until(lambda: status["KH01"].stamp > died + 1.5, "a gap of telemetry that is not bridged")
-    reply = hot_lab.change("restart", "CF01")
+    reply = hot.change("restart", "CF01")
     assert set(reply.done) == {"CF01"}, reply
-    watcher.until(lambda: status["CF01"].pid != first and hot_lab.running("CF01"), "it runs")
+    watcher.until(lambda: status["CF01"].pid != first and watcher.all("running", "CF01"), "it runs")
     watcher.until(lambda: set(status["KH01"].missing) <= {"KH03"}, "it is heard again")
     assert abs(status["CF01"].started - status["KH01"].started) < 0.1, "its time is that of the others"
     watcher.until(lambda: status["CF01"].decisions >= 10, "it has taken part for a while")
-    hot_lab.end()
-    read = hot_lab.flight.read()
-    assert read.complete
-    told = {event.kind for event in read.trace.events if event.source == "CF01"}
+    hot.end()
+    assert hot.read().complete
+    run = reopen(hot.folder)
+    told = {event.kind for event in run.traces["event"].events if event.source == "CF01"}
     assert told >= {"lost", "restart", "changed"}
-    run = reopen(hot_lab.folder / "run")
-    of = {robot.robot: robot for robot in run.metrics["event"].robots}
-    assert 0.0 < of["CF01"].known < of["KH01"].known
-    assert "KH03" not in of  # on standby, never added
-    page = report.write(hot_lab.folder / "report", list(run.traces.values()), notes=run.notes).read_text("utf-8")
+    known = {robot.robot: robot.known for robot in run.metrics["event"].robots}
+    assert 0.0 < known["CF01"] < known["KH01"]
+    assert "KH03" not in known  # on standby, never added
+    page = report.write(hot.folder / "report", list(run.traces.values()), notes=run.notes).read_text("utf-8")
     assert "takes part again after" in page
 
 
 @pytest.mark.mechanism("hot change: hold, remove, add")
-def test_robots_hold_leave_and_come_while_others_continue(hot_lab):
-    watcher = hot_lab.fly()
-    assert hot_lab.zenpark("hold", "CF01", code=0).stdout == "CF01: holds where it is\n"
-    watcher.until(lambda: watcher.status["CF01"].reason == "ordered to hold", "its status says so")
-    assert hot_lab.running("KH01", "KH02", "CF01")
-    assert hot_lab.zenpark("resume").stdout.splitlines() == ["CF01: goes on", "KH01: goes on", "KH02: goes on"]
-    watcher.until(lambda: watcher.status["CF01"].reason == "", "it goes on")
+def test_robots_hold_leave_and_come_while_others_continue(hot):
+    watcher, status = hot.watcher, hot.watcher.status
+    assert hot.zenpark("hold", "CF01", code=0).stdout == "CF01: holds where it is\n"
+    watcher.until(lambda: status["CF01"].reason == "ordered to hold", "its status says so")
+    assert watcher.all("running", "KH01", "KH02", "CF01")
+    assert hot.zenpark("resume").stdout.splitlines() == ["CF01: goes on", "KH01: goes on", "KH02: goes on"]
+    watcher.until(lambda: status["CF01"].reason == "", "it goes on")
 
-    before = watcher.status["KH02"].pid
-    assert "removed" in hot_lab.change("remove", "KH02").done["KH02"]
+    before = status["KH02"].pid
+    assert "removed" in hot.change("remove", "KH02").done["KH02"]
     watcher.until(lambda: "KH02" not in watcher.alive, "its process is over")
-    watcher.until(lambda: "KH02" in watcher.status["CF01"].missing, "its neighbours know")
-    assert (watcher.status["KH02"].phase, watcher.status["KH02"].reason) == ("done", "ordered to leave")
-    assert hot_lab.running("KH01", "CF01"), "the others go on"
-    assert hot_lab.zenpark("hold", "KH02").stderr.startswith("KH02: no: no answer\n")
-    assert "takes part" in hot_lab.change("add", "KH02").done["KH02"], "who was removed may come back"
-    watcher.until(lambda: watcher.status["KH02"].pid != before and hot_lab.running("KH02"), "it runs")
-    assert "already" in hot_lab.change("add", "KH02").refused["KH02"]
+    watcher.until(lambda: "KH02" in status["CF01"].missing, "its neighbours know")
+    assert (status["KH02"].phase, status["KH02"].reason) == ("done", "ordered to leave")
+    assert watcher.all("running", "KH01", "CF01"), "the others go on"
+    assert hot.zenpark("hold", "KH02").stderr.startswith("KH02: no: no answer\n")
+    assert "takes part" in hot.change("add", "KH02").done["KH02"], "who was removed may come back"
+    watcher.until(lambda: status["KH02"].pid != before and watcher.all("running", "KH02"), "it runs")
+    assert "already" in hot.change("add", "KH02").refused["KH02"]
 
-    assert set(hot_lab.change("add", "KH03").done) == {"KH03"}, "who was on standby joins"
-    watcher.until(lambda: hot_lab.running("KH03") and not watcher.status["KH01"].missing, "it is a neighbour")
-    hot_lab.end()
-    events = hot_lab.flight.read().trace.events
-    assert ("order", "operator", "hold: CF01") in [(event.kind, event.source, event.text) for event in events]
-    assert " lost " not in hot_lab.flight.said()
+    assert set(hot.change("add", "KH03").done) == {"KH03"}, "who was on standby joins"
+    watcher.until(lambda: watcher.all("running", "KH03") and not status["KH01"].missing, "it is a neighbour")
+    hot.end()
+    events = [(event.kind, event.source, event.text) for event in hot.read().trace.events]
+    assert ("order", "operator", "hold: CF01") in events
+    assert " lost " not in hot.said()
 
 
-def test_a_spare_takes_over_a_name(hot_lab):
-    watcher = hot_lab.fly()
-    unknown = hot_lab.zenpark("restart", "CF02", code=2)
+def test_a_spare_takes_over_a_name(hot):
+    watcher, status = hot.watcher, hot.watcher.status
+    unknown = hot.zenpark("restart", "CF02", code=2)
     assert "no robot 'CF02' in this run; did you mean 'CF01'" in unknown.stderr
-    wrong = hot_lab.zenpark("replace", "CF01", "--with", "S2", code=1)
+    wrong = hot.zenpark("replace", "CF01", "--with", "S2", code=1)
     assert wrong.stderr == "CF01: no: S2 is a khepera4 and cannot be CF01, a crazyflie\n"
     watcher.look()
     x, y, _ = watcher.state["KH02"].position
-    near = hot_lab.change("replace", "KH01", body="twin", at=(round(x, 3), round(y + 0.1, 3)))
+    near = hot.change("replace", "KH01", body="twin", at=(round(x, 3), round(y + 0.1, 3)))
     assert "needs 0.1 m around it" in near.refused["KH01"]
-    before, began = watcher.status["CF01"].pid, watcher.status["CF01"].origin
+    before, began = status["CF01"].pid, status["CF01"].origin
     os.kill(before, signal.SIGSTOP)  # it hangs: its process is ended for it
-    reply = hot_lab.change("replace", "CF01", spare="S1")
+    reply = hot.change("replace", "CF01", spare="S1")
     assert "S1 has its name" in reply.done["CF01"], reply
-    watcher.until(lambda: watcher.status["CF01"].pid != before and hot_lab.running("CF01"), "it runs")
-    assert watcher.status["CF01"].origin == began  # plans of the name begin where they began
-    assert "S1 has taken over CF01 already" in hot_lab.change("replace", "CF01", spare="S1").refused["CF01"]
-    hot_lab.end()
-    orphan = hot_lab.zenpark("restart", "CF01", code=2)
+    watcher.until(lambda: status["CF01"].pid != before and watcher.all("running", "CF01"), "it runs")
+    assert status["CF01"].origin == began  # plans of the name begin where they began
+    assert "S1 has taken over CF01 already" in hot.change("replace", "CF01", spare="S1").refused["CF01"]
+    hot.end()
+    orphan = hot.zenpark("restart", "CF01", code=2)
     assert orphan.stdout == ""
     assert re.search("no router answers|this run is not there", orphan.stderr)  # its port may be somebody else's by now
 
@@ -196,7 +185,7 @@ def test_who_joined_lands_when_the_conductor_is_dead(router, watcher, tmp_path):
     with RobotProcess(router.endpoint, "join", "KH02", "--once") as joined:
         flight = Flight(tmp_path / "run", file_with_board(tmp_path, router.endpoint), "--case", "event")
         watcher.until_all("running", "KH02")
-        flight.signal(signal.SIGKILL)
+        flight.process.kill()
         flight.finish()
         assert joined.wait(PATIENCE_S) == 0
         watcher.look()

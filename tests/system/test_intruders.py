@@ -4,6 +4,7 @@ import json
 import os
 import socket
 import threading
+from contextlib import ExitStack
 from shutil import copytree
 from types import SimpleNamespace
 
@@ -74,26 +75,22 @@ def test_without_a_certificate_nobody_gets_in(laboratory, protocol):
         zenoh.open(chosen)
 
 
-def other_authority(_folder, target):
-    new_lab(target)
+WHO = ("operator", "KH01", "router")
+FORGED = {
+    "other authority": lambda folder, target: new_lab(target),
+    "ended": lambda folder, target: authority.renew(copytree(folder, target), WHO, days=-0.01),
+    "same name": lambda folder, target: authority.renew(copytree(folder, target), authority=True),
+}
 
 
-def ended(folder, target):
-    authority.renew(copytree(folder, target), ["operator", "KH01", "router"], days=-0.01)
-
-
-def same_name(folder, target):
-    authority.renew(copytree(folder, target), authority=True)
-
-
-@pytest.mark.parametrize("forge", [other_authority, ended, same_name])
-@pytest.mark.parametrize("identity", ["operator", "KH01", "router"])
-def test_certificate_that_does_not_count_is_refused(laboratory, tmp_path, forge, identity):
+@pytest.mark.parametrize("forge", FORGED.values(), ids=FORGED)
+def test_certificate_that_does_not_count_is_refused(laboratory, tmp_path, forge):
     folder = tmp_path / "forged"
     forge(laboratory.folder, folder)
     (folder / "ca.pem").write_bytes((laboratory.folder / "ca.pem").read_bytes())  # it does trust the router
-    with refused():
-        laboratory.session(identity, folder)
+    for identity in WHO:
+        with refused():
+            laboratory.session(identity, folder)
 
 
 def test_a_robots_certificate_does_not_make_a_router(laboratory, tmp_path):
@@ -106,25 +103,24 @@ def test_a_robots_certificate_does_not_make_a_router(laboratory, tmp_path):
     own = {"mode": "peer", "listen/endpoints": [plain], "scouting/multicast/enabled": False}
     for key, value in {**own, **lab.settings(thief, "router", listens=True)}.items():
         chosen.insert_json5(key, json.dumps(value))
-    (honest,) = lab.secured([plain], laboratory.folder)
     with zenoh.open(chosen), refused():
-        zenoh.open(config(settings("client", connect=[honest], name="KH01")))
+        laboratory.session("KH01", plain=plain)
 
 
 def test_router_outside_its_certificates_addresses_is_refused(laboratory):
-    address = laboratory.plain.rpartition(":")[2]
-    (endpoint,) = lab.secured([f"tls/127.0.0.2:{address}"], laboratory.folder)
     with refused():
-        zenoh.open(config(settings("client", connect=[endpoint], name="KH01")))
+        laboratory.session("KH01", plain=laboratory.plain.replace("127.0.0.1", "127.0.0.2"))
 
 
-@pytest.mark.parametrize(
-    "who",
-    [
-        pytest.param("KH03", marks=pytest.mark.mechanism("intruder with the certificate of another robot")),
-        *["observer", "recorder", "world", "positioning", "twin", "router"],
-    ],
-)
+def first_shows(mechanism, first, *others):
+    """Parameters of which the first one shows a mechanism."""
+    return [pytest.param(first, marks=pytest.mark.mechanism(mechanism)), *others]
+
+
+SPEAKERS = ("KH03", "observer", "recorder", "world", "positioning", "twin", "router")
+
+
+@pytest.mark.parametrize("who", first_shows("intruder with the certificate of another robot", *SPEAKERS))
 def test_nobody_speaks_for_a_robot_or_stops_everybody(laboratory, who):
     heard = pubsub.subscriber(laboratory.watcher.session, "park/**", 20_000)
     with laboratory.session(who) as session:
@@ -141,13 +137,10 @@ def test_nobody_speaks_for_a_robot_or_stops_everybody(laboratory, who):
     assert not keys
 
 
-@pytest.mark.parametrize(
-    "who",
-    [
-        pytest.param("observer", marks=pytest.mark.mechanism("orders from others than the operator")),
-        *["KH03", "recorder", "world", "centre", "ros2"],
-    ],
-)
+OTHERS = ("observer", "KH03", "recorder", "world", "centre", "ros2")
+
+
+@pytest.mark.parametrize("who", first_shows("orders from others than the operator", *OTHERS))
 def test_orders_are_the_operators(laboratory, who):
     land = {"payload": messages.encode(messages.Order("land")), "encoding": messages.JSON}
     with laboratory.session(who) as session:
@@ -258,9 +251,8 @@ def test_nonsense_at_ten_thousand_hertz_is_counted(laboratory, flight):
 
 def test_what_is_too_large_does_not_arrive(laboratory):
     with laboratory.session("KH01") as thief:
-        for size in (65_537, 300_000, 3_000_000):
-            for _ in range(20):
-                say(thief, KEYS.pose("KH01"), b" " * size)
+        for size in (65_537, 300_000, 3_000_000) * 20:
+            say(thief, KEYS.pose("KH01"), b" " * size)
         settled(laboratory)
 
 
@@ -275,23 +267,13 @@ def test_denied_samples_at_ten_thousand_hertz_arrive_nowhere(laboratory):
 def test_half_open_connections_are_dropped_and_disturb_nobody(laboratory):
     """Slowloris: handshakes that begin and never end. Those who are in stay in; the router drops the others."""
     host, _, port = laboratory.plain.partition("/")[2].rpartition(":")
-    half = []
-    try:
-        for _ in range(60):
-            one = socket.create_connection((host, int(port)))
+    with ExitStack() as stack:
+        half = [stack.enter_context(socket.create_connection((host, int(port)))) for _ in range(60)]
+        for one in half:
             one.sendall(b"\x16\x03\x01")  # the beginning of a ClientHello
             one.setblocking(False)
-            half.append(one)
         assert laboratory.watcher.order("CF01", messages.Order("get", name="clamp")).ok
-
-        def dropped():
-            laboratory.watcher.look()
-            return all(_closed(one) for one in half)
-
-        laboratory.watcher.until(dropped, "the router drops them all", 40.0)
-    finally:
-        for one in half:
-            one.close()
+        laboratory.watcher.until(lambda: all(map(_closed, half)), "the router drops them all", 40.0)
     with laboratory.session("observer") as session:
         assert list(session.liveliness().get("park/*/alive", timeout=1.0))
 

@@ -2,31 +2,32 @@
 
 import json
 import signal
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 
 from experiments.metrics.measure import measure
 from experiments.real_time.hosts.launcher import LAND_S
-from tests.commands import GUARD, ROOT, environment
+from tests.commands import GUARD, started
 from tests.system.lab import NEAR, Flight, assert_formed, gone, until
 
 pytestmark = pytest.mark.system
 
 
 @pytest.mark.timeout(180)
-def test_the_reference_experiment_flies_behind_real_bridges(tmp_path):
-    words = ("--bodies", "protocol", "--case", "event", "--json", "duration_s=10", "timeline=[]")
+@pytest.mark.parametrize(("bodies", "within_m"), [("protocol", 0.05), ("world", 0.03)])
+def test_the_reference_experiment_flies_in_other_bodies(tmp_path, bodies, within_m):
+    words = ("--bodies", bodies, "--case", "event", "--json", "duration_s=12", "timeline=[]")
     flight = Flight(tmp_path / "run", "robotic-park", *words, *NEAR)
     flight.until_flown()
     children = flight.children()
-    assert children["CF01"] == children["CF02"] == children["CF03"], "one radio, one process"
-    addressed = json.loads((flight.folder / "cases" / "event" / "addressed.json").read_text())["robots"]
-    assert addressed["CF01"]["body"].startswith("radio://0/80/2M/E7E7E7E701?software=127.0.0.1:")
-    assert addressed["KH01"]["body"].startswith("khepera4://127.0.0.1:")
-    assert addressed["TB01"]["body"].startswith(("ros2dds://", "rmw://"))
+    assert ("world" in children) == (bodies == "world")
+    if bodies == "protocol":
+        assert children["CF01"] == children["CF02"] == children["CF03"], "one radio, one process"
+        addressed = json.loads((flight.folder / "cases" / "event" / "addressed.json").read_text())["robots"]
+        assert addressed["CF01"]["body"].startswith("radio://0/80/2M/E7E7E7E701?software=127.0.0.1:")
+        assert addressed["KH01"]["body"].startswith("khepera4://127.0.0.1:")
+        assert addressed["TB01"]["body"].startswith(("ros2dds://", "rmw://"))
     code, out = flight.finish(90.0)
     assert code == 0, flight.said()
     until(lambda: gone(list(children.values())), "nothing is left", LAND_S)
@@ -37,7 +38,7 @@ def test_the_reference_experiment_flies_behind_real_bridges(tmp_path):
     assert np.isfinite(trace.true_position).all(axis=(1, 2)).mean() > 0.98, "the truth is known"
     heights = trace.true_position[trace.time > 5.0][:, 4:, 2]
     assert np.abs(heights - 0.8).max() < 0.1
-    assert_formed(trace, 0.05, since_s=trace.time[-1] - 1.0)
+    assert_formed(trace, within_m, since_s=trace.time[-1] - 1.0)
 
 
 def test_twins_shadow_a_crazyflie_and_a_khepera(tmp_path):
@@ -52,7 +53,7 @@ def test_twins_shadow_a_crazyflie_and_a_khepera(tmp_path):
     assert json.loads(out)["cases"]["periodic"]["collisions"] == 0
     trace = flight.read("periodic").trace
     known = np.isfinite(trace.shadow_position).all(axis=2).mean(axis=0)
-    assert known.tolist() == [pytest.approx(1.0, abs=0.05), 0.0, pytest.approx(1.0, abs=0.05)]
+    assert known == pytest.approx([1.0, 0.0, 1.0], abs=0.05)
     khepera, _, crazyflie = (robot.shadow for robot in measure(trace).robots)
     assert (khepera.horizon_s, crazyflie.horizon_s) == (5.0, 1.5)
     moved = np.ptp(trace.position[:, [0, 2], :2], axis=0)
@@ -76,26 +77,27 @@ KH01 = { kind = "khepera4", start = [0.3, 0.0], body = "BODY" }
 """
 
 
-def preflight(file, text, *words):
-    file.write_text(text)
-    command = [sys.executable, *GUARD, "preflight", str(file), "--json", "--out", str(file.parent / "out"), *words]
-    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    return subprocess.Popen(command, cwd=ROOT, env=environment(), text=True, **streams)
+@pytest.fixture
+def preflight(tmp_path):
+    """A preflight of a file: starts, `meanwhile(process)` is called, and the checks of each robot are returned."""
 
+    def check(text, *words, code=0, meanwhile=lambda _: None):
+        (tmp_path / "x.toml").write_text(text)
+        given = (*GUARD, "preflight", tmp_path / "x.toml", "--json", "--out", tmp_path / "out", *words)
+        with started(*given) as process:
+            meanwhile(process)
+            out, err = process.communicate(timeout=140)
+        assert process.returncode == code, out + err
+        said = json.loads(out)
+        assert said["ok"] == (code == 0)
+        return [{each["check"]: each for each in robot["checks"]} for robot in said["robots"]]
 
-def checked(process, *codes):
-    """Checks of each robot, by name."""
-    out, err = process.communicate(timeout=140)
-    assert process.returncode in codes, out + err
-    said = json.loads(out)
-    assert said["ok"] == (process.returncode == 0)
-    return [{check["check"]: check for check in robot["checks"]} for robot in said["robots"]]
+    return check
 
 
 @pytest.mark.timeout(90)
-def test_one_hops_and_stops_while_another_is_red(tmp_path):
-    text = TWO.replace("BODY", "khepera4://127.0.0.1:9")
-    drone, wheels = checked(preflight(tmp_path / "two.toml", text, "--hop", "--stop"), 1)
+def test_one_hops_and_stops_while_another_is_red(preflight):
+    drone, wheels = preflight(TWO.replace("BODY", "khepera4://127.0.0.1:9"), "--hop", "--stop", code=1)
     names = ("ready", "stop, motors off", "hop", "stop, motors on")
     assert {name: drone[name]["verdict"] for name in names} == dict.fromkeys(names, "ok")
     assert "Connection refused" in wheels["address"]["found"]
@@ -104,12 +106,14 @@ def test_one_hops_and_stops_while_another_is_red(tmp_path):
 
 @pytest.mark.mechanism("preflight: a hop that is interrupted")
 @pytest.mark.timeout(90)
-def test_ctrl_c_lands_the_robot_that_hops(tmp_path):
-    process = preflight(tmp_path / "two.toml", TWO.replace("BODY", "twin"), "--hop")
+def test_ctrl_c_lands_the_robot_that_hops(preflight, tmp_path):
     log = tmp_path / "out" / "logs" / "preflight-CF01.log"
-    until(lambda: log.exists() and "airborne" in log.read_text(), "it is in the air", 60.0)
-    process.send_signal(signal.SIGINT)
-    hop = checked(process, 130)[0]["hop"]
+
+    def interrupt(process):
+        until(lambda: log.exists() and "airborne" in log.read_text(), "it is in the air", 60.0)
+        process.send_signal(signal.SIGINT)
+
+    hop = preflight(TWO.replace("BODY", "twin"), "--hop", code=130, meanwhile=interrupt)[0]["hop"]
     assert (hop["verdict"], hop["found"]) == ("unknown", "interrupted; it is down")
     assert log.read_text().rstrip().splitlines()[-1].startswith("CF01: done")
 
@@ -126,9 +130,8 @@ T01 = { kind = "tello", start = [0.0, 0.6, 0.0], hover = 0.8 }
 
 
 @pytest.mark.timeout(150)
-def test_drones_hop_through_their_bridges_under_motion_capture(tmp_path):
-    process = preflight(tmp_path / "drones.toml", DRONES, "--hop", "--bodies", "protocol")
-    drone, tello = checked(process, 0)
+def test_drones_hop_through_their_bridges_under_motion_capture(preflight):
+    drone, tello = preflight(DRONES, "--hop", "--bodies", "protocol")
     assert {drone[name]["verdict"] for name in ("address", "firmware", "battery", "position", "radio", "hop")} == {"ok"}
     assert " V under load" in drone["hop"]["found"]
     assert tello["hop"]["verdict"] == "ok"

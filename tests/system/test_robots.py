@@ -8,9 +8,9 @@ import os
 import signal
 import threading
 import time
+from collections import defaultdict
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
-from functools import partial
 
 import msgspec
 import psutil
@@ -20,17 +20,16 @@ import zenoh
 from agents.clock import Clock
 from agents.network import messages, pubsub
 from agents.network.keys import Keys
-from experiments.file import catalogue, document
+from experiments.definition import access_rights
+from experiments.file import catalogue
 from experiments.file.document import load
 from experiments.run import simulate
 from tests.commands import zenpark
 from tests.conftest import RouterProcess
-from tests.experiments.traces import parse_links
 from tests.system.lab import TRIANGLE, Flight, RobotProcess, gone, typed, until
 from tests.tools.commands.test_live_table import STATUS
 
 pytestmark = pytest.mark.system
-
 
 BLOCK = zenoh.CongestionControl.BLOCK  # a stop must not be dropped where a hundred kilobytes go before it
 
@@ -41,6 +40,13 @@ def low_file(tmp_path):
     file = tmp_path / "low.toml"
     file.write_text(catalogue.path("triangle").read_text("utf-8").replace("hover = 0.6", "hover = 0.3"), "utf-8")
     return str(file)
+
+
+@pytest.fixture
+def robots(router):
+    """The processes of a triangle, by name."""
+    with ExitStack() as stack:
+        yield {name: stack.enter_context(RobotProcess(router.endpoint, "triangle", name)) for name in TRIANGLE}
 
 
 def subscriptions(session):
@@ -58,14 +64,11 @@ def subscriptions(session):
     "file", ["robotic-park", pytest.param("convoy", marks=pytest.mark.mechanism("subscriptions of neighbours only"))]
 )  # nobody listens to the last robot of a convoy
 def test_each_robot_hears_exactly_its_neighbours(router, watcher, file):
-    experiment = document.read(file).experiment
-    wanted = {
-        name: {s for listener, s, _, _ in parse_links(experiment) if listener == name} for name in experiment.robots
-    }
+    wanted = access_rights.senders_by_receiver(load(file).plan)
     with ExitStack() as stack:
-        for name in experiment.robots:
+        for name in wanted:
             stack.enter_context(RobotProcess(router.endpoint, file, name))
-        watcher.until_all("ready", *experiment.robots)
+        watcher.until_all("ready", *wanted)
         keys = subscriptions(watcher.session)
         for name, neighbours in wanted.items():
             poses = {key for key in keys[name] if key.endswith("/pose") or "/pose/" in key}
@@ -74,41 +77,20 @@ def test_each_robot_hears_exactly_its_neighbours(router, watcher, file):
             assert all("estop" in key or "@adv" in key for key in keys[name] - poses), keys[name]
 
 
-def test_late_joiner_and_restarted_robot_receive_last_poses(router, watcher):
-    def robot(name):
-        return stack.enter_context(RobotProcess(router.endpoint, "triangle", name))
-
-    with ExitStack() as stack:
-        for name in ("KH01", "KH02"):
-            robot(name)
-        for name in ("KH01", "KH02"):
-            watcher.until(lambda name=name: watcher.status[name].missing == ["CF01"], "two hear each other")
-            assert (watcher.phase(name), watcher.status[name].reason) == ("idle", "never received CF01")
-        late = robot("CF01")
-        watcher.until_all("ready", *TRIANGLE)
-        late.kill()
-        watcher.until(lambda: "CF01" not in watcher.alive, "the token is gone")
-        watcher.until(lambda: watcher.status["KH01"].missing == ["CF01"], "its death is known")
-        before = watcher.status["CF01"].pid
-        again = robot("CF01")
-        watcher.until(lambda: watcher.status["CF01"].pid != before and watcher.phase("CF01") == "ready", "back")
-        assert watcher.status["CF01"].received >= 2
-        watcher.until(lambda: not watcher.status["KH01"].missing, "it is heard again")
-        assert again.process.poll() is None
-
-
 @pytest.mark.mechanism("orders")
 def test_orders_are_answered_and_refused_with_a_reason(router, watcher, low_file):
     with RobotProcess(router.endpoint, low_file, *TRIANGLE):
         watcher.until_all("ready", *TRIANGLE)
-        reply = watcher.order("CF01", messages.Order("start", at=time.time()))
-        assert not reply.ok
-        assert not watcher.order("CF01", messages.Order("hold")).ok
-        assert "needs `at`" in watcher.order("CF01", messages.Order("start")).reason
-        assert watcher.order("CF01", messages.Order("get", name="clamp")).value == pytest.approx(0.1)
-        assert watcher.order("CF01", messages.Order("set", name="clamp", value=0.05)).value == pytest.approx(0.05)
-        assert "known: clamp" in watcher.order("CF01", messages.Order("set", name="clmp", value=1.0)).reason
-        assert not watcher.order("CF01", messages.Order("set", name="trigger.period_s", value=0.0)).ok
+
+        def order(word, **fields):
+            return watcher.order("CF01", messages.Order(word, **fields))
+
+        for reply in (order("start", at=time.time()), order("hold"), order("set", name="trigger.period_s", value=0.0)):
+            assert not reply.ok
+        assert "needs `at`" in order("start").reason
+        assert order("get", name="clamp").value == pytest.approx(0.1)
+        assert order("set", name="clamp", value=0.05).value == pytest.approx(0.05)
+        assert "known: clamp" in order("set", name="clmp", value=1.0).reason
         assert watcher.order("nobody", messages.Order("land")).reason == "no answer"
         bare = [b'{"order": "get", "name": "clamp"}', b'{"order": "hold"}']  # as z_get sends them: without an encoding
         answers = [
@@ -194,37 +176,35 @@ def test_a_robot_whose_starter_falls_silent_lands(router, watcher, low_file):
 
 
 @pytest.mark.mechanism("frozen neighbour")
-def test_a_killed_and_a_frozen_neighbour_are_noticed(router, watcher):
-    with ExitStack() as stack:
-        robots = {name: stack.enter_context(RobotProcess(router.endpoint, "triangle", name)) for name in TRIANGLE}
-        watcher.until_all("ready", *TRIANGLE)
-        with watcher.session.liveliness().declare_token("park/**"):  # somebody who says that everybody lives ...
-            watcher.until(lambda: "KH01" in watcher.state, "they go on")
-        told = watcher.state["KH01"].seq  # ... and then that everybody is dead
-        watcher.until(lambda: watcher.state["KH01"].seq > told + 10, "they still go on")
-        assert not any(watcher.status[name].missing for name in TRIANGLE)
-        robots["KH02"].freeze()
-        watcher.until(lambda: watcher.status["KH01"].missing == ["KH02"], "it hangs")
-        robots["KH02"].thaw()
-        watcher.until(lambda: not watcher.status["KH01"].missing, "it is back")
-        watcher.until(lambda: "KH02" in watcher.alive, "its token too")
-        robots["CF01"].kill()
-        watcher.until(lambda: watcher.status["KH01"].missing == ["CF01"], "it is dead")
+def test_a_killed_and_a_frozen_neighbour_are_noticed(watcher, robots, router):
+    watcher.until_all("ready", *TRIANGLE)
+    with watcher.session.liveliness().declare_token("park/**"):  # somebody who says that everybody lives ...
+        watcher.until(lambda: "KH01" in watcher.state, "they go on")
+    told = watcher.state["KH01"].seq  # ... and then that everybody is dead
+    watcher.until(lambda: watcher.state["KH01"].seq > told + 10, "they still go on")
+    assert not any(watcher.status[name].missing for name in TRIANGLE)
+    robots["KH02"].freeze()
+    watcher.until(lambda: watcher.status["KH01"].missing == ["KH02"], "it hangs")
+    robots["KH02"].thaw()
+    watcher.until(lambda: not watcher.status["KH01"].missing, "it is back")
+    watcher.until(lambda: "KH02" in watcher.alive, "its token too")
+    robots["CF01"].kill()
+    watcher.until(lambda: watcher.status["KH01"].missing == ["CF01"], "it is dead")
+    with RobotProcess(router.endpoint, "triangle", "CF01"):
+        watcher.until(lambda: watcher.status["CF01"].received >= 2 and watcher.all("ready", "CF01"), "another is there")
+        watcher.until(lambda: not watcher.status["KH01"].missing, "it is heard again")
 
 
 @pytest.mark.mechanism("emergency stop from any Zenoh client")
-def test_an_emergency_stop_reaches_every_process(router, watcher):
-    key = watcher.keys.estop
-    with ExitStack() as stack:
-        robots = [stack.enter_context(RobotProcess(router.endpoint, "triangle", name)) for name in TRIANGLE]
-        watcher.until_all("ready", *TRIANGLE)
-        watcher.session.delete(key)  # no stop
-        watcher.until(lambda: not any(watcher.phase(name) == "done" for name in TRIANGLE), "nobody was stopped")
-        watcher.session.put(key, b"all of you", congestion_control=BLOCK)  # as zenoh-cli puts: without an encoding
-        watcher.until_all("done", *TRIANGLE)
-        assert {watcher.status[name].reason for name in TRIANGLE} == {"emergency stop by an unknown sender: all of you"}
-        assert all(watcher.status[name].malformed == 0 for name in TRIANGLE)
-        assert all(robot.process.poll() is None for robot in robots)
+def test_an_emergency_stop_reaches_every_process(watcher, robots):
+    watcher.until_all("ready", *TRIANGLE)
+    watcher.session.delete(watcher.keys.estop)  # no stop
+    watcher.until(lambda: not any(watcher.phase(name) == "done" for name in TRIANGLE), "nobody was stopped")
+    watcher.session.put(watcher.keys.estop, b"all of you", congestion_control=BLOCK)  # as zenoh-cli, without encoding
+    watcher.until_all("done", *TRIANGLE)
+    assert {watcher.status[name].reason for name in TRIANGLE} == {"emergency stop by an unknown sender: all of you"}
+    assert all(watcher.status[name].malformed == 0 for name in TRIANGLE)
+    assert all(robot.process.poll() is None for robot in robots.values())
 
 
 CUT_OFF_S = 3.0  # until the loss of the router is noticed: before that good-byes are still taken
@@ -240,17 +220,13 @@ def test_robot_leaves_a_router_that_does_not_answer(router, watcher):
             assert time.monotonic() - began < 10.0  # Zenoh alone takes 13 s
 
 
-def stopped(pid):
-    return bool(psutil.Process(pid).status() == psutil.STATUS_STOPPED)
-
-
 def test_router_that_was_frozen_ends_when_ordered():
     """The kernel then gives the signal to any of its threads, at every second time to one that does not heed it."""
     for _ in range(4):
         router = RouterProcess()
-        router.process.send_signal(signal.SIGSTOP)
-        until(partial(stopped, router.process.pid), "it is frozen")
-        router.process.send_signal(signal.SIGCONT)
+        with router.frozen():
+            process = psutil.Process(router.process.pid)
+            until(lambda process=process: process.status() == psutil.STATUS_STOPPED, "it is frozen")
         assert router.stop() == 0
 
 
@@ -289,9 +265,9 @@ def test_suspended_conductor_gives_no_further_order(tmp_path):
     flight = Flight(tmp_path / "run", "triangle", "--case", "event")
     flight.until_flown()
     robots = [process for name, process in flight.children().items() if name in TRIANGLE]
-    flight.signal(signal.SIGSTOP)
+    flight.process.send_signal(signal.SIGSTOP)
     until(lambda: gone(robots), "the robots land and end", 40.0)
-    flight.signal(signal.SIGCONT)
+    flight.process.send_signal(signal.SIGCONT)
     assert flight.finish()[0] == 2
     assert "this process stood still for more than 3 s; its robots have landed without it" in flight.said()
     assert "landing" not in [line.rpartition("phase conductor: ")[2] for line in flight.said().splitlines()]
@@ -316,24 +292,21 @@ def test_top_shows_a_routers_robots_worst_first(router, watcher):
         done = zenpark("top", "--connect", router.endpoint, timeout_s=30.0)
         over.set()
     del tokens
-    title, heads, first, *others = done.stdout.splitlines()
+    title, *rows = done.stdout.splitlines()
     assert "held 1" in title
     assert "running 2" in title
-    assert heads.split()[:2] == ["robot", "phase"]
-    assert first.split()[:2] == ["gamma", "held"]
-    assert "50 %" in first
-    assert [line.split()[0] for line in others[:2]] == ["alpha", "beta"]
+    assert [row.split()[0] for row in rows[:4]] == ["robot", "gamma", "alpha", "beta"]
+    assert rows[1].split()[1] == "held"
+    assert "50 %" in rows[1]
 
 
 @pytest.mark.mechanism("recording played onto a network")
 def test_recording_plays_with_keys_and_payloads_as_flown(router, watcher, tmp_path):
     simulate(load("triangle", "duration_s=3.0", "timeline=[]"), cases=["event"], folder=tmp_path)
-    seen = {}
-
-    def keep(sample):
-        seen.setdefault(str(sample.key_expr), []).append(sample.payload.to_bytes())
-
-    listening = watcher.session.declare_subscriber("park/**", keep)
+    seen = defaultdict(list)
+    listening = watcher.session.declare_subscriber(
+        "park/**", lambda sample: seen[str(sample.key_expr)].append(sample.payload.to_bytes())
+    )
     zenpark("replay", tmp_path, "--rate", "8", "--connect", router.endpoint)
     sent = [messages.decode(each, messages.JSON, messages.Pose) for each in seen["park/CF01/pose"]]
     assert [(p.seq, p.stamp, p.position) for p in sent] == [

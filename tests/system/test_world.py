@@ -1,6 +1,5 @@
 """The twin service in real processes: its orders, its death, robots of other processes in it."""
 
-import json
 import math
 import time
 from contextlib import ExitStack
@@ -10,25 +9,11 @@ import pytest
 
 from agents.body.kinds import KINDS
 from agents.network import messages, pubsub
-from agents.network import session as network
 from agents.network.keys import Keys
 from experiments.real_time.conductor import orders
-from tests.system.lab import (
-    NEAR,
-    NEAR_TRIANGLE,
-    Flight,
-    Looking,
-    RobotProcess,
-    Watcher,
-    WorldProcess,
-    assert_formed,
-    gone,
-    typed,
-    until,
-)
+from tests.system.lab import NEAR_TRIANGLE, Flight, RobotProcess, Watcher, WorldProcess, gone, typed
 
 pytestmark = pytest.mark.system
-
 
 KEYS = Keys()
 THREE = """
@@ -48,32 +33,25 @@ def three_file(tmp_path):
     return made
 
 
-class Desk(Looking):
+class Desk(Watcher):
     """The world as an operator, and a robot's process, see it."""
 
     def __init__(self, endpoint):
-        self.session = session = network.open_session([endpoint], name="desk")
-        self._positions = pubsub.Inbox(pubsub.subscriber(session, KEYS.position("*"), 4096), messages.Position)
-        self._worlds = pubsub.Inbox(pubsub.pose_subscriber(session, KEYS.world), messages.WorldState)
-        self._events = pubsub.Inbox(pubsub.subscriber(session, KEYS.event), messages.Event)
-        self._ranges = pubsub.Inbox(pubsub.subscriber(session, KEYS.ranges("*")), messages.Ranges)
-        self.at = {}
-        self.ranges = {}
-        self.events = []
-        self.world = None
+        super().__init__(endpoint)
+        self.at = self.newest(KEYS.position("*"), messages.Position)
+        self.ranges = self.newest(KEYS.ranges("*"), messages.Ranges)
+        self.events = self.every(KEYS.event, messages.Event)
+        self.worlds = self.every(KEYS.world, messages.WorldState, pubsub.pose_subscriber)
         self._seq = round(time.time() * 1e3)
 
-    def look(self):
-        self.at |= {position.robot: position for position in self._positions.read()}
-        self.ranges |= {ranges.robot: ranges for ranges in self._ranges.read()}
-        self.events += self._events.read()
-        for world in self._worlds.read():
-            self.world = world
+    @property
+    def world(self):
+        return self.worlds[-1] if self.worlds else None
 
     def x(self, name):
         return list(self.at[name].position)
 
-    def give(self, order, **fields):
+    def order_world(self, order, **fields):
         return orders.send_world_order(self.session, KEYS, messages.WorldOrder(order, **fields))
 
     def tell(self, name, action, **fields):
@@ -95,9 +73,8 @@ class Desk(Looking):
 
 @pytest.fixture
 def desk(router):
-    made = Desk(router.endpoint)
-    yield made
-    made.session.close()
+    with Desk(router.endpoint) as made:
+        yield made
 
 
 @pytest.fixture
@@ -109,52 +86,31 @@ def world(router, desk, three_file):
         yield made
 
 
-@pytest.mark.timeout(180)
-def test_the_reference_experiment_forms_up_in_one_world(tmp_path):
-    words = ("--bodies", "world", "--case", "event", "--json", "duration_s=12", "timeline=[]")
-    flight = Flight(tmp_path / "run", "robotic-park", *words, *NEAR)
-    flight.until_flown()
-    everyone = flight.children()
-    assert "world" in everyone
-    code, out = flight.finish(90.0)
-    assert code == 0, flight.said()
-    until(lambda: gone(everyone.values()), "nothing is left")
-    for name, robot in json.loads(out)["cases"]["event"]["robots"].items():
-        assert name == "TB01" or (robot["acquired_s"] is not None and robot["lost"] == 0), name
-    trace = flight.read().trace
-    assert np.isfinite(trace.true_position).all(axis=(1, 2)).mean() > 0.98, "the truth is known"
-    assert_formed(trace, 0.03, since_s=trace.time[-1] - 1.0)
-
-
 @pytest.mark.mechanism("world: killed", "way out: Ctrl-C")
 def test_killed_world_is_restarted_and_robots_continue(tmp_path):
     """Until Ctrl-C, which lands everybody and leaves a valid recording."""
     flight = Flight(tmp_path / "run", "triangle", "--bodies", "world", "--case", "event", *NEAR_TRIANGLE)
     flight.until_flown()
     everyone = list(flight.children().values())
-    desk = Desk(flight.endpoint())
-    with Watcher(flight.endpoint()) as watcher:
-        watcher.until(lambda: len(watcher.state) == 3, "they are there")
-        begun = watcher.state["CF01"].stamp
-        watcher.until(lambda: watcher.state["CF01"].stamp > begun + 0.5, "they are on their way")
-        before = dict(watcher.state)
+    with Desk(flight.endpoint()) as desk:
+        desk.until(lambda: len(desk.state) == 3, "they are there")
+        begun = desk.state["CF01"].stamp
+        desk.until(lambda: desk.state["CF01"].stamp > begun + 0.5, "they are on their way")
+        assert {state.phase for state in desk.state.values()} == {"running"}
         flight.children()["world"].kill()
         flight.until_said(r"world conductor: the world ended \(killed by SIGKILL\); started again")
         again = time.time()
-        assert {state.phase for state in before.values()} == {"running"}
-        desk.until(lambda: all(desk.at[name].stamp > again + 0.5 for name in before), "they are in the next world")
+        desk.until(lambda: all(desk.at[name].stamp > again + 0.5 for name in desk.state), "they are in the next world")
         everyone += list(flight.children().values())
-        desk.session.close()
-        flight.interrupt()
-        assert gone(everyone)
+    flight.interrupt()
+    assert gone(everyone)
     read = flight.read()
     assert read.complete
     assert typed(flight.folder / "event.mcap", "/CF01/status")[-1].phase == "done"
     trace, truth, when = read.trace, read.trace.true_position, read.trace.time
     known = np.isfinite(truth).all(axis=(1, 2))
     assert known[when > again + 0.2 - read.started].any()
-    step = np.linalg.norm(np.diff(truth[known], axis=0), axis=2)
-    assert step.max() < 0.05, "nobody jumps"
+    assert np.linalg.norm(np.diff(truth[known], axis=0), axis=2).max() < 0.05, "nobody jumps"
     middle = (when > 0.5) & (when < again + 0.4 - read.started) & known
     assert truth[middle][:, list(trace.robots).index("CF01"), 2].min() > 0.25, "it holds in the air"
     assert not [event for event in trace.events if event.kind == "robot" and "lost" in event.text]
@@ -163,8 +119,8 @@ def test_killed_world_is_restarted_and_robots_continue(tmp_path):
 def test_climbs_and_landings_continue_in_the_next_world(router, watcher, three_file):
     both = ("CF01", "TE01")
 
-    def height(name):
-        return watcher.state[name].position[2] if name in watcher.state else 0.0
+    def heights():
+        return [watcher.state[name].position[2] for name in both]
 
     def again(killed):
         killed.kill()
@@ -177,41 +133,41 @@ def test_climbs_and_landings_continue_in_the_next_world(router, watcher, three_f
         with RobotProcess(router.endpoint, three_file, *both):
             watcher.until_all("ready", *both)
             watcher.give(messages.Order("takeoff"), *both)
-            watcher.until(lambda: min(map(height, both)) > 0.25, "they climb")
+            watcher.until(lambda: min(heights()) > 0.25, "they climb")
             world = again(world)
             watcher.until_all("airborne", *both)
-            assert min(map(height, both)) > 0.54
+            assert min(heights()) > 0.54
             watcher.give(messages.Order("land"), *both)
-            watcher.until(lambda: max(map(height, both)) < 0.4, "they sink")
+            watcher.until(lambda: max(heights()) < 0.4, "they sink")
             again(world)
             watcher.until_all("done", *both)
-            assert max(map(height, both)) < 0.06
+            assert max(heights()) < 0.06
 
 
 def test_pause_resume_and_reset(world, desk):
-    assert desk.give("pause") == messages.WorldReply(True, True, pytest.approx(0.0, abs=60.0))
-    paused = desk.give("pause").time
+    assert desk.order_world("pause") == messages.WorldReply(True, True, pytest.approx(0.0, abs=60.0))
+    paused = desk.order_world("pause").time
     stamp = desk.at["KH01"].stamp
-    desk.until(lambda: desk.world and desk.world.paused, "it says so")
+    desk.until(lambda: desk.world.paused, "it says so")
     desk.drive_until("KH01", (0.2, 0.0, 0.0, 0.0), lambda: desk.at["KH01"].stamp > stamp + 0.5, "stamps stay fresh")
     assert desk.x("KH01") == [0.0, 0.0, 0.0]
-    assert desk.give("resume") == messages.WorldReply(True, False, pytest.approx(paused, abs=0.05))
+    assert desk.order_world("resume") == messages.WorldReply(True, False, pytest.approx(paused, abs=0.05))
     desk.drive_until("KH01", (0.2, 0.0, 0.0, 0.0), lambda: desk.x("KH01")[0] > 0.1, "it goes on")
-    assert desk.give("reset", name="KH01").ok
+    assert desk.order_world("reset", name="KH01").ok
     desk.until(lambda: np.abs(desk.x("KH01")).max() < 0.03, "it is back, but for commands that were on their way")
-    refused = desk.give("reset", name="KH1")
+    refused = desk.order_world("reset", name="KH1")
     assert (refused.ok, refused.reason) == (False, "there is no 'KH1' in this world; did you mean 'KH01'?")
-    assert desk.give("reset").ok
+    assert desk.order_world("reset").ok
 
 
 def test_what_a_world_cannot_use_is_counted(world, desk):
     for _ in range(2):
         desk.tell("CF09", "takeoff", height=0.5)
-    desk.until(lambda: desk.world and desk.world.refused == 2, "both are counted")
+    desk.until(lambda: desk.world.refused == 2, "both are counted")
     assert sum("CF09 gets commands" in event.text for event in desk.events) == 1
     for nonsense in (b"{", messages.encode(messages.Command("KH02", 1, 1.0, "stop"))):
         desk.session.put(KEYS.setpoint("KH01"), nonsense, encoding=messages.JSON)
-    desk.until(lambda: desk.world and desk.world.malformed == 2, "nonsense is counted")
+    desk.until(lambda: desk.world.malformed == 2, "nonsense is counted")
 
 
 def test_robots_without_commands_hold_and_then_land(world, desk):
@@ -239,37 +195,35 @@ def test_second_world_and_useless_world_are_refused(router, three_file):
         assert reason in refused.ready
 
 
-def test_world_ordered_to_end_waits_for_robots(world, router, watcher, three_file):
+def test_world_ordered_to_end_waits_for_robots(world, router, desk, three_file):
     with RobotProcess(router.endpoint, three_file, "CF01") as robot:
-        watcher.take_off("CF01")
+        desk.take_off("CF01")
         world.process.terminate()
         assert robot.end() == 0
-        watcher.until(lambda: watcher.phase("CF01") == "done", "it landed in the world that was asked to end")
+        desk.until_all("done", "CF01")  # it landed in the world that was asked to end
         assert world.wait(30) == 0
 
 
 def test_a_robot_of_another_process_is_seen(router, desk, tmp_path):
-    three_file = tmp_path / "mixed.toml"
-    three_file.write_text(
+    file = tmp_path / "mixed.toml"
+    file.write_text(
         'title = "mixed"\nduration_s = 30.0\nworld.sensor_noise = 0.0\n[robots]\n'
         'TB01 = { kind = "turtlebot3", body = "world", start = [0.0, 0.0] }\n'
         'TB02 = { kind = "turtlebot3", start = [1.0, 0.0, 3.141592653589793], ranges = "world" }\n'
     )
 
-    def ahead(robot, wanted):
-        return desk.ranges[robot].distance[0] == pytest.approx(wanted, abs=1e-3)
+    def seen(wanted, *robots):
+        return all(desk.ranges[robot].distance[0] == pytest.approx(wanted, abs=1e-3) for robot in robots)
 
-    with WorldProcess(router.endpoint, three_file) as world:
+    with WorldProcess(router.endpoint, file) as world:
         assert "carries TB01; mirrors TB02" in world.ready
         desk.until(lambda: "TB01" in desk.ranges and desk.world, "it looks ahead")
-        assert ahead("TB01", 2.0), "the wall"
-        with RobotProcess(router.endpoint, three_file, "TB02") as robot:
-            desk.until(lambda: desk.world and desk.world.mirrored == ["TB02"], "the other is there")
-            for name in ("TB01", "TB02"):
-                desk.until(lambda name=name: ahead(name, 1.0 - 0.105), "it is seen, and sees")
+        assert seen(2.0, "TB01"), "the wall"
+        with RobotProcess(router.endpoint, file, "TB02") as robot:
+            desk.until(lambda: desk.world.mirrored == ["TB02"], "the other is there")
+            desk.until(lambda: seen(1.0 - 0.105, "TB01", "TB02"), "it is seen, and sees")
             robot.kill()
-        desk.until(lambda: ahead("TB01", 2.0), "gone, it is no obstacle")
-        desk.until(lambda: desk.world and desk.world.mirrored == [], "and is said to be")
+        desk.until(lambda: seen(2.0, "TB01") and desk.world.mirrored == [], "gone, it is no obstacle, and said to be")
 
 
 MIXED = """
@@ -302,35 +256,23 @@ def test_twin_sees_and_avoids_a_real_robot(tmp_path, router):
     file = tmp_path / "mixed.toml"
     file.write_text(MIXED)
     flight = Flight(tmp_path / "run", file, "--json", f'network.connect=["{router.endpoint}"]')
-    with network.open_session([router.endpoint], name="observer") as session:
-        inbox = {
-            name: pubsub.Inbox(pubsub.subscriber(session, key, 4096), kind)
-            for name, key, kind in (
-                ("ranges", KEYS.ranges("KH01"), messages.Ranges),
-                ("truths", KEYS.truth("KH01"), messages.Position),
-                ("measured", KEYS.position("TB01"), messages.Position),
-            )
-        }
-        scans, near_since = [], math.inf
+    with Desk(router.endpoint) as desk:
+        scans = desk.every(KEYS.ranges("KH01"), messages.Ranges)
+        truths = desk.every(KEYS.truth("KH01"), messages.Position)
 
         def arrived():
-            nonlocal near_since
+            """It has been near its goal for a while."""
             assert flight.process.poll() is None, flight.logs()
-            scans.extend(inbox["ranges"].read())
-            for truth in inbox["truths"].read():
-                near = math.dist(truth.position[:2], GOAL) < NEAR_M
-                near_since = min(near_since, truth.stamp) if near else math.inf
-                if truth.stamp > near_since + STAYS_S:
-                    return True
-            return False
+            lately = [each for each in truths if each.stamp > truths[-1].stamp - STAYS_S]
+            return lately and all(math.dist(each.position[:2], GOAL) < NEAR_M for each in lately)
 
-        until(arrived, "the twin went around the robot and stays at its goal", 90.0)
+        desk.until(arrived, "the twin went around the robot and stays at its goal", 90.0)
         flight.children()["vicon"].kill()
         flight.until_said(
             r"vicon conductor: the vicon ended \(killed by SIGKILL\); started again: robots without a pos"
         )
         again = time.time()
-        until(lambda: any(position.stamp > again for position in inbox["measured"].read()), "it is measured again")
+        desk.until(lambda: desk.at["TB01"].stamp > again, "it is measured again")
         flight.children()["vicon-twin"].kill()
         flight.until_said(r"device conductor: the vicon-twin ended \(killed by SIGKILL\); robots that need it hold")
         flight.interrupt()

@@ -4,44 +4,34 @@ import subprocess
 import sys
 import tomllib
 import zipfile
-from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-LEVELS = {
-    "core": "requirements.lock",
-    "view": "requirements-view.lock",
-    "fast": "requirements-fast.lock",
-    "hardware": "requirements-hardware.lock",
-    "dev": "requirements-dev.lock",
+LEVELS = {"core": "requirements.lock"} | {
+    name: f"requirements-{name}.lock" for name in ("view", "fast", "hardware", "dev")
 }
-LOCKS = tuple(LEVELS.values())
 SWEEP = ["sweep", "triangle", "seeds=5"]
 
 
-def locked(name):
-    return dict(re.findall(r"^([a-z0-9.-]+)==(\S+)", (ROOT / name).read_text(), re.MULTILINE))
-
-
-def test_locks_have_hashes_and_no_address():
-    for name in LOCKS:
+def test_locks_hold_every_requirement_by_hash(bootstrap):
+    assert {level: path.name for level, path in bootstrap.LOCKS.items()} == LEVELS
+    locked = {}
+    for level, name in LEVELS.items():
         text = (ROOT / name).read_text()
         assert not re.search(r"https?:|--index|--extra-index|--find-links", text)
         lines = re.sub(r"\\\n", "", text).splitlines()
         assert all("--hash=sha256:" in line for line in lines if not line.startswith("#"))
-
-
-def test_locks_hold_every_requirement(bootstrap):
+        locked[level] = dict(re.findall(r"^([a-z0-9.-]+)==(\S+)", text, re.MULTILINE))
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
     core, dev = project["project"]["dependencies"], project["dependency-groups"]["dev"]
-    for lock, lines in (("requirements.lock", core), ("requirements-dev.lock", dev)):
-        assert {re.match(r"[a-z0-9-]+", line)[0] for line in lines} <= locked(lock).keys()
-    assert {level: path.name for level, path in bootstrap.LOCKS.items()} == LEVELS
-    for less, more in (*pairwise(LOCKS[:-1]), ("requirements-fast.lock", "requirements-dev.lock")):
-        assert locked(less).items() < locked(more).items()
-    assert [name for name in LOCKS if "numba" in locked(name)] == list(LOCKS[2:])
+    for level, lines in (("core", core), ("dev", dev)):
+        assert {re.match(r"[a-z0-9-]+", line)[0] for line in lines} <= locked[level].keys()
+    for less, more in (("core", "view"), ("view", "fast"), ("fast", "hardware"), ("fast", "dev")):
+        assert locked[less].items() < locked[more].items()
+    assert [level for level in LEVELS if "numba" in locked[level]] == ["fast", "hardware", "dev"]
 
 
 @pytest.mark.slow
@@ -80,11 +70,8 @@ def installed_levels(bootstrap, replaced, monkeypatch):
 @pytest.mark.parametrize(
     ("words", "levels"),
     [
-        ("sweep", ["core"]),
-        ("sweep triangle --help", ["core"]),
-        ("run triangle --seeds 5", ["core"]),
-        ("run triangle --virtual --seeds 1", ["core"]),
-        ("run triangle --virtual --seeds x", ["core"]),
+        *((words, ["core"]) for words in ("sweep", "sweep triangle --help", "run triangle --seeds 5")),
+        *((f"run triangle --virtual --seeds {seeds}", ["core"]) for seeds in ("1", "x")),
         ("run triangle --virtual --seeds 20", ["core", "fast"]),
         ("run --seeds=2 triangle --virtual", ["core", "fast"]),
         ("run triangle --virtual --view", ["view"]),
@@ -106,40 +93,39 @@ def test_many_runs_without_numba_say_so(bootstrap, installed_levels, capsys):
 
 
 @pytest.fixture
-def failing_commands(bootstrap, monkeypatch):
-    """The core is there and works; commands of an installation are kept and those that get packages fail."""
-    kept = []
+def installing(bootstrap, monkeypatch):
+    """The core is there and works; commands that get packages, with their environments, and whether they fail."""
+    made = SimpleNamespace(commands=[], offline=False)
 
-    def call(command, environment, what, remedy):
-        kept.append((command, environment))
-        raise bootstrap.Trouble("offline")
+    def call(command, environment, _what, _remedy):
+        made.commands.append((command, environment))
+        if made.offline:
+            raise bootstrap.Trouble("offline")
 
     stamp(bootstrap, "core")
-    monkeypatch.setattr(bootstrap, "call", call)
-    monkeypatch.setattr(bootstrap, "works", lambda python: True)
-    monkeypatch.setattr(bootstrap, "get_uv", lambda base: "uv")
-    monkeypatch.setattr(bootstrap, "uv_environment", lambda base: {})
-    return kept
+    there = {"call": call, "works": lambda _: True, "get_uv": lambda _: "uv", "uv_environment": lambda _: {}}
+    for name, instead in there.items():
+        monkeypatch.setattr(bootstrap, name, instead)
+    return made
 
 
-def test_offline_the_core_is_kept(bootstrap, failing_commands, replaced, capsys):
+def test_offline_the_core_is_kept(bootstrap, installing, replaced, capsys):
+    installing.offline = True
     bootstrap.main(SWEEP)
     assert [command[2:] for command, _ in replaced] == [SWEEP]
     assert bootstrap.ready("core")
-    assert [environment["UV_HTTP_RETRIES"] for _, environment in failing_commands] == ["0"]
+    assert [environment["UV_HTTP_RETRIES"] for _, environment in installing.commands] == ["0"]
     assert capsys.readouterr().err.splitlines()[-1].startswith("zenpark: no numba (offline")
     assert bootstrap.main(["hardware"]) == 2
     assert capsys.readouterr().err.endswith("zenpark: offline\n")
     assert bootstrap.ready("core")
-    assert "UV_HTTP_RETRIES" not in failing_commands[1][1]
+    assert "UV_HTTP_RETRIES" not in installing.commands[1][1]
 
 
-def test_higher_level_only_adds_packages(bootstrap, failing_commands, monkeypatch):
-    done = []
-    monkeypatch.setattr(bootstrap, "call", lambda command, *_: done.append(command))
+def test_higher_level_only_adds_packages(bootstrap, installing):
     bootstrap.prepare("view")
     assert bootstrap.ready("view")
-    assert [command[-1] for command in done] == [str(bootstrap.LOCKS["view"])]
+    assert [command[-1] for command, _ in installing.commands] == [str(bootstrap.LOCKS["view"])]
 
 
 def test_ready_only_for_what_was_installed(bootstrap):
@@ -150,7 +136,7 @@ def test_ready_only_for_what_was_installed(bootstrap):
     for text in ("", "core", "a b c", "0000 core"):
         bootstrap.STAMP.write_text(text)
         assert not bootstrap.ready("core")
-    for changed in ("pyproject.toml", *LOCKS):
+    for changed in ("pyproject.toml", *LEVELS.values()):
         stamp(bootstrap, "dev")
         with (bootstrap.ROOT / changed).open("a") as file:
             file.write("\n")
@@ -177,16 +163,13 @@ def test_settings_for_other_projects_are_left_out(bootstrap, monkeypatch):
     assert made["PIP_USER"] == "0"
 
 
-def test_ctrl_c_waits_until_the_command_line_answers(bootstrap, monkeypatch):
-    masks = []
-    now = bootstrap.signal.pthread_sigmask
+def test_ctrl_c_waits_until_the_command_line_answers(bootstrap, replaced, monkeypatch):
+    masked = []
     monkeypatch.setattr(bootstrap, "prepare", lambda level: None)
-    monkeypatch.setattr(bootstrap.os, "execve", lambda *_: masks.append(now(bootstrap.signal.SIG_BLOCK, [])))
-    try:
-        bootstrap.main(["--version"])
-    finally:
-        now(bootstrap.signal.SIG_UNBLOCK, [bootstrap.signal.SIGINT])
-    assert bootstrap.signal.SIGINT in masks[0]
+    monkeypatch.setattr(bootstrap.signal, "pthread_sigmask", lambda *mask: masked.append((*mask, [*replaced])))
+    bootstrap.main(["--version"])
+    assert masked == [(bootstrap.signal.SIG_BLOCK, [bootstrap.signal.SIGINT], [])]
+    assert replaced
 
 
 def test_root_alone_installs_what_tests_need_besides(bootstrap, monkeypatch):
@@ -227,18 +210,17 @@ def started_modules(bootstrap, monkeypatch):
 
 
 def test_tests_run_in_three_parts_or_as_given(bootstrap, started_modules):
-    assert bootstrap.test([]) == 1
-    assert [module[0] for module in started_modules] == ["ruff", "ruff", "mypy", "pytest", "pytest", "pytest"]
-    computing, devices, runs = started_modules[3:]
-    assert computing[2] == "not system and not nightly"
-    assert [part[2:5] for part in (devices, runs)] == [["mechanism", "-n", "2"], ["mechanism", "-n", "1"]]
-    for whole_runs, part in enumerate((devices, runs)):
-        places = {file.startswith("tests/system/") for file in part if file.startswith("tests/")}
-        assert places == {bool(whole_runs)}
-    started_modules.clear()
-    bootstrap.test(["--quick", "tests/agents", "-x"])
-    assert started_modules[3:] == [["pytest", "-m", bootstrap.QUICK, "tests/agents", "-x"]]
-    started_modules.clear()
-    bootstrap.test(["--all"])
-    modules = [module[0] for module in started_modules[3:]]
+    def started(*words):
+        started_modules.clear()
+        assert bootstrap.test([*words]) == 1
+        assert [module[0] for module in started_modules[:3]] == ["ruff", "ruff", "mypy"]
+        return started_modules[3:]
+
+    computing, devices, runs = started()
+    assert computing[:3] == ["pytest", "-m", "not system and not nightly"]
+    for part, workers, whole_runs in ((devices, "2", False), (runs, "1", True)):
+        assert part[2:5] == ["mechanism", "-n", workers]
+        assert {file.startswith("tests/system/") for file in part if file.startswith("tests/")} == {whole_runs}
+    assert started("--quick", "tests/agents", "-x") == [["pytest", "-m", bootstrap.QUICK, "tests/agents", "-x"]]
+    modules = [module[0] for module in started("--all")]
     assert modules == ["pytest", "tests.fuzz", "tests.system.zenohd", "tests.system.rclpy_wheels", "pytest"]

@@ -1,15 +1,20 @@
-"""What a terminal shows: text that cannot steer it; progress as a bar, and as lines elsewhere."""
+"""What a terminal shows: text that cannot steer it, progress, the consent before files of others touch machines."""
 
 import io
+import os
 import sys
 import time
 import webbrowser
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
 from agents.network import messages
+from experiments.file.document import load, loads
+from experiments.file.problems import DocumentError
 from experiments.real_time.conductor.run_view import Progress, RobotView
+from tools import consent
 from tools.options import open_in_browser, print_result, warn
 from tools.progress import Bar, Lines, ProgressTable
 from tools.terminal import printable, say
@@ -33,11 +38,6 @@ def test_page_is_named_where_no_browser_opens_it(monkeypatch, capsys):
         monkeypatch.setattr(webbrowser, "open", lambda address, opened=opened: opened)
         open_in_browser("file:///report.html")
         assert ("open file:///report.html by hand" in capsys.readouterr().err) is not opened
-
-
-class Terminal(io.StringIO):
-    def isatty(self):
-        return True
 
 
 @pytest.fixture
@@ -64,7 +64,8 @@ def test_lines_without_a_terminal(capsys, clock):
 
 
 def test_passing_bar_appears_late_and_counts_from_beginning(monkeypatch, clock):
-    screen = Terminal()
+    screen = io.StringIO()
+    monkeypatch.setattr(screen, "isatty", lambda: True, raising=False)
     monkeypatch.setattr("sys.stderr", screen)
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("COLUMNS", "100")
@@ -111,3 +112,56 @@ def test_hazard_is_printed_with_its_beginning(capsys):
     hazard, phase, *_ = capsys.readouterr().err.splitlines()
     assert hazard == "event: hazard Q1: hold: its own position is lost (at 8.5 s)"
     assert phase == "event: phase conductor: formation"
+
+
+REACHING = """
+title = "two"
+duration_s = 5.0
+positioning = "vicon://192.0.2.9:801"
+[robots]
+A = { kind = "crazyflie", start = [-0.4, 0.0], hover = 0.5, body = "radio://0/80/2M/E7E7E7E701" }
+B = { kind = "khepera4", start = [0.4, 0.0] }
+[formation.links]
+"A - B" = 0.8
+[hosts.pi]
+address = "pi@192.0.2.7"
+robots = ["B"]
+"""
+
+
+def asking(monkeypatch, answer):
+    """A terminal in which the user answers; None: no terminal."""
+    stdin = SimpleNamespace(isatty=lambda: answer is not None, readline=lambda: f"{answer}\n")
+    monkeypatch.setattr("sys.stdin", stdin)
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
+
+
+def test_others_files_run_when_agreed(monkeypatch):
+    cases = loads(REACHING).cases()
+    device, machine, cameras = consent.touched(cases.values())
+    assert "A: radio://0/80/2M/E7E7E7E701" in device
+    assert "ssh pi@192.0.2.7" in machine
+    assert cameras == "motion capture: vicon://192.0.2.9:801"
+    for answer in ("y", "YES"):
+        asking(monkeypatch, answer)
+        consent.require("a.zip", cases, given=False)
+    for answer in ("n", "", None):
+        asking(monkeypatch, answer)
+        consent.require("a.zip", load("robotic-park").cases(), given=False)  # it is simulated
+        consent.require("a.zip", cases, given=True)
+        with pytest.raises(DocumentError, match="--yes" if answer is None else "--here"):
+            consent.require("a.zip", cases, given=False)
+
+
+def test_own_files_are_no_strangers(tmp_path, monkeypatch):
+    file = tmp_path / "own.toml"
+    file.touch()
+    assert not consent.belongs_to_another(file)
+    assert not consent.belongs_to_another(tmp_path / "missing.toml")
+    owner = SimpleNamespace(st_uid=os.geteuid() + 4321)
+    monkeypatch.setattr(Path, "stat", lambda self, **_: owner if self == file else SimpleNamespace(st_uid=0))
+    monkeypatch.setattr(Path, "exists", lambda *_: True)
+    monkeypatch.delenv("SUDO_UID", raising=False)
+    assert consent.belongs_to_another(file)
+    monkeypatch.setenv("SUDO_UID", str(owner.st_uid))
+    assert not consent.belongs_to_another(file)
