@@ -13,11 +13,24 @@ from experiments.file.problems import DocumentError
 from experiments.metrics.statistics import spread
 from experiments.report.tables import ratio_words
 from tests.commands import invoke
-from tests.experiments.recording.test_bundle import SHORT
 from tools.commands.run import _acquired
 from tools.options import known_words
 
 pytestmark = pytest.mark.slow  # whole runs and their reports
+
+SHORT = """
+title = "Two, for three seconds"
+duration_s = 3.0
+disturbance = { all = { position_sigma = 0.001 } }
+[robots]
+A = { kind = "khepera4", start = [-0.4, 0.0] }
+B = { kind = "khepera4", start = [0.4, 0.1] }
+[formation.links]
+"A - B" = 0.5
+[cases.periodic]
+[cases.event]
+trigger = { kind = "send-on-delta", threshold = 0.01 }
+"""
 
 
 def stdout_of(*words, code=0):
