@@ -8,7 +8,7 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import Annotated, Any, TypeVar, get_args, get_origin
 
@@ -106,10 +106,14 @@ class Output(io.TextIOBase):
     """
 
     def __init__(self, fd: int) -> None:
-        """Makes the descriptor `fd` non-blocking."""
+        """Write to the descriptor `fd`. A terminal is opened again: its flags are shared with the shell."""
         super().__init__()
         self._fd = fd
-        os.set_blocking(fd, False)
+        if not os.isatty(fd):
+            os.set_blocking(fd, False)
+            return
+        with suppress(OSError):  # a terminal of another container has no name here
+            self._fd = os.open(os.ttyname(fd), os.O_WRONLY | os.O_NOCTTY | os.O_NONBLOCK)
 
     def write(self, text: str) -> int:
         """Writes the part that fits without waiting."""
@@ -117,7 +121,7 @@ class Output(io.TextIOBase):
         try:
             while rest:
                 rest = rest[os.write(self._fd, rest) :]
-        except OSError:  # no reader, or the pipe is full
+        except OSError:  # no reader, a full pipe or disk, or a terminal that Ctrl-S has stopped
             pass
         return len(text)
 

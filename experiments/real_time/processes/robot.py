@@ -66,8 +66,7 @@ class RobotLaunch(Launch, frozen=True, kw_only=True, rename="kebab"):
 def fly(launch: RobotLaunch) -> int:
     """Runs robots of an experiment in this process; returns its exit code."""
     file, names = launch.file, launch.names
-    if launch.lifeline:
-        command_line.detach()
+    command_line.detach()
     with ExitStack() as stack:
         endpoints: Sequence[str] = launch.connect
         if file == JOIN:

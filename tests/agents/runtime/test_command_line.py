@@ -1,6 +1,7 @@
 """Words, output and interruption of a process, and its lifeline."""
 
 import os
+import pty
 import signal
 import threading
 
@@ -57,6 +58,18 @@ def test_output_waits_for_no_reader(pipe):
     assert len(os.read(pipe[0], 1 << 20)) >= 4096
     os.close(pipe.pop(0))
     print("nobody reads", file=out, flush=True)
+
+
+def test_terminal_and_full_disk_end_no_print():
+    ends = pty.openpty()
+    with Path("/dev/full").open("w") as full:
+        for fd in (ends[1], full.fileno()):
+            out = Output(fd)
+            for _ in range(100):
+                print("x" * 4000, file=out, flush=True)  # nobody reads the terminal
+    assert os.get_blocking(ends[1]), "as the shell has it"
+    for end in ends:
+        os.close(end)
 
 
 @pytest.fixture(params=[signal.SIG_DFL, signal.SIG_IGN], ids=["terminal", "nohup"])
