@@ -4,6 +4,7 @@ import os
 import pty
 import signal
 import threading
+from pathlib import Path
 
 import pytest
 
