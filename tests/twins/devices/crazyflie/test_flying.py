@@ -20,8 +20,6 @@ from twins.devices.crazyflie.supervisor import SupervisorState
 from twins.devices.crazyflie.vehicle import Vehicle
 from twins.devices.device import Faults
 
-pytestmark = pytest.mark.slow  # seconds of firmware, in steps of milliseconds
-
 
 @pytest.mark.parametrize("span", [0.2, 1.0, 5.0])
 def test_polynomial_meets_both_ends(span):
@@ -53,6 +51,7 @@ def test_chained_plans_are_smooth():
     assert planner.goal(13.0)[:3] == pytest.approx([1.0, 0.0, 1.0])
 
 
+@pytest.mark.slow
 def test_takeoff_go_to_land():
     wire = Wire()
     assert [wire.takeoff(1.0, 2.0), wire.takeoff(1.0, 2.0)] == [LogStatus.OK, LogStatus.REFUSED]
@@ -70,6 +69,7 @@ def test_takeoff_go_to_land():
         wire.put(Port.HIGH_LEVEL, 0, HighLevel.GROUP, group)
 
 
+@pytest.mark.slow
 def test_plans_begin_at_the_last_setpoint():
     wire = Wire().hovering()
     wire.go_to(1.0, 0.0, 1.0, 0.0, 3.0)
@@ -92,6 +92,7 @@ def test_streamed_positions():
     assert wire.yaw == pytest.approx(model.yaw, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_other_setpoints():
     for kind, values, velocity, turned in (
         (Setpoint.VELOCITY, (0.3, -0.2, 0.1, 30.0), (0.3, -0.2, 0.1), math.pi / 2),
@@ -140,6 +141,7 @@ def test_the_order_of_command_and_release_matters():
     assert (wire.after(2.0).motors, wire.position[2]) == (True, pytest.approx(1.0, abs=0.01))
 
 
+@pytest.mark.slow
 def test_closing_a_link_silences_the_planner_or_locks():
     wire = Wire()
     wire.zero()  # as cflib does it on the ground
@@ -168,6 +170,7 @@ def test_emergency_stop_and_watchdog():
     assert wire.after(0.2).state == SupervisorState.LOCKED
 
 
+@pytest.mark.slow
 def test_arming():
     wire = Wire({"platform": "brushless"})
     assert (wire.takeoff(0.5, 1.0), wire.arm()) == (LogStatus.BUSY, bytes((0x81, 1, 1)))
@@ -184,6 +187,7 @@ def test_arming():
     assert Wire(refuse_arming=True).arm() == bytes((0x81, 0, 0))
 
 
+@pytest.mark.slow
 def test_battery_empties_in_flight_and_stops_the_motors():
     wire = Wire(battery=0.5, drain=10.0)
     battery = wire.after(5.0).vehicle.battery
@@ -211,6 +215,7 @@ def test_battery_level_is_that_of_the_firmware():
     assert powers == [crtp.Power.BATTERY, crtp.Power.LOW]
 
 
+@pytest.mark.slow
 def test_a_fall_ends_upside_down():
     wire = Wire().hovering(1.2)
     wire.plan(HighLevel.STOP)
@@ -226,6 +231,7 @@ def test_a_fall_ends_upside_down():
     assert wire.ask(Port.SUPERVISOR, 1, SupervisorCommand.RECOVER) == b"\x82\1\1"
 
 
+@pytest.mark.slow
 def test_flow_deck_does_not_measure_where_it_is():
     wire = Wire(start=[[0.5, 0.2, 0.0]]).hovering()
     assert wire.estimate == pytest.approx([0.0, 0.0, 1.0], abs=0.01)
@@ -237,6 +243,7 @@ def test_flow_deck_does_not_measure_where_it_is():
     assert wire.after(0.1).estimate == pytest.approx(wire.position, abs=0.01)
 
 
+@pytest.mark.slow
 def test_position_from_outside():
     wire = Wire(external=True, start=[[0.5, 0.2, 0.0]])
     assert wire.estimate == pytest.approx([0.0, 0.0, 0.0])
@@ -253,6 +260,7 @@ def test_position_from_outside():
     assert wire.after(1.5).vehicle.estimator.variance > 0.5  # nobody tells it any more
 
 
+@pytest.mark.slow
 def test_older_commands_are_flown():
     up, down, fast = HighLevel.TAKEOFF_VELOCITY, HighLevel.LAND_VELOCITY, "f?f?f"
     for takeoff, land in (
@@ -321,6 +329,7 @@ def test_thrust_needs_a_zero_first():
     assert wire.position.tolist() == [0.0, 0.0, 0.0]
 
 
+@pytest.mark.slow
 def test_a_flat_fall_is_a_landing():
     wire = Wire().hovering(0.8)
     wire.plan(HighLevel.STOP)
@@ -329,6 +338,7 @@ def test_a_flat_fall_is_a_landing():
     assert wire.takeoff(0.5, 1.0) == LogStatus.OK
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("thrust", "least", "most"), [(20000, 5.0, 30.0), (5000, 0.0, 0.0)])
 def test_it_skates_with_the_least_thrust(thrust, least, most):
     wire = Wire(external=True)
@@ -354,6 +364,7 @@ def test_frozen_positions_shoot_it_up():
     assert wire.after(2.5, located).position[2] > 2.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("wrong", "least", "most"), [(20.0, 0.0, 0.05), (100.0, 1.0, math.inf)])
 def test_a_wrong_yaw_leads_astray(wrong, least, most):
     wire = Wire(yaw=math.radians(-wrong))
@@ -377,6 +388,7 @@ def advance(vehicles, t):
     return [vehicle.model.held[2] for vehicle in vehicles]
 
 
+@pytest.mark.slow
 def test_take_off_overshoots_and_returns():
     """By 7 to 11 %, for 10 to 15 s: the integral of the height was charged on the floor and on the way."""
     climbs = [(0.5, 1.5), (0.8, 2.0), (1.0, 2.5), (1.0, 2.0), (2.0, 5.0)]
