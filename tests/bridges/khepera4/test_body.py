@@ -201,19 +201,15 @@ def test_garbled_answer_stops_the_robot(served, speaks, question, comes_back):
     answered, model = server._answer, server.robot.model
 
     def garbled(received, t):
-        if not received.startswith(question):
-            return answered(received, t)
-        server._answer = answered
-        return b"?\r\n"
+        return b"?\r\n" if received.startswith(question) else answered(received, t)
 
-    body = KheperaBody(reached(rows, twins.addresses), first_answer_s=0.5)
-    body.open()
-    with closing(body):
-        driver = Driver(body, constant(0.1))
+    with opened(reached(rows, twins.addresses)) as driver:
+        driver.decide = constant(0.1)
         driver.until(lambda: model.velocity[0] > 0.05)
         server._answer = garbled
         driver.until(lambda: driver.state.note[0], "the fault is noted")
         driver.until(lambda: server.robot.twist == (0.0, 0.0), "it stands")
+        server._answer = answered
         if comes_back:
             driver.until(lambda: not driver.state.note[0] and model.velocity[0] > 0.05, "it goes on")
 
@@ -272,15 +268,10 @@ def test_lost_link_comes_back_and_goes_on(served):
 def test_wheels_stop_without_setpoints_and_at_closing(served):
     twins = served(ONE)
     with opened(reached(ONE, twins.addresses)) as driver:
-        driver.tick()
-        driver.body.command([(0.2, 0.0, 0.0, 0.0)])
-        driver.until(lambda: driver.state.velocity[0, 0] > 0.1)
-        driver.until(lambda: driver.state.velocity[0, 0] < 0.005)  # the setpoint is not given again
-        went = twins.truth()[0][0, 0]
-        assert 0.09 < went < 0.5  # half a second, the time to be heard, the time to stop
-        driver.body.command([(np.nan, 0.0, 0.0, 0.0)])
-        driver.body.command([(0.2, 0.0, 0.0, 0.0)])
-        driver.until(lambda: twins.truth()[0][0, 0] > went + 0.02)
+        for v, come in ((0.2, 0.1), (None, 0.005), (0.2, 0.1)):
+            driver.decide = constant(v) if v else None  # no setpoint: all are NaN
+            driver.until(lambda v=v, come=come: (driver.state.velocity[0, 0] > come) == bool(v))
+    assert twins.device.servers[0].robot.twist == (0.0, 0.0)
 
 
 @pytest.mark.system
