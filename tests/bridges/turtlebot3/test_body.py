@@ -266,7 +266,7 @@ def test_external_positions_with_the_speed_of_odometry(hub):
         assert np.isnan(stage.run(0.1).position[0, :2]).all()
         stage.truth = truth
         state = stage.run(2.0, 0.2)
-        np.testing.assert_allclose(state.position[0], truth()[0][0], atol=0.01)
+        until(lambda: stage.run(0.1, 0.2).position[0] == pytest.approx(truth()[0][0], abs=0.01), "its place")
         until(lambda: stage.run(0.2, 0.2).velocity[0] == pytest.approx([0.0, 0.2, 0.0], abs=0.01), "its speed")
         assert state.yaw[0] == pytest.approx(pi / 2)
         until(lambda: "odometry silent" in stage.note(0.1, 0.2), "seen from outside, but it does not answer")
