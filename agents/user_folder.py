@@ -25,7 +25,7 @@ def runtime_folder() -> Path:
         folder.mkdir(OWN)
     about = folder.lstat()
     if not stat.S_ISDIR(about.st_mode) or about.st_uid != os.getuid() or stat.S_IMODE(about.st_mode) & ~OWN:
-        raise PermissionError(f"{folder} is no folder of yours alone (mode 0700)")
+        raise PermissionError(f"{folder} is no folder of yours alone: `chmod 700` it, or name another")
     return folder
 
 

@@ -21,6 +21,8 @@ from experiments.check.theory import strength
 from experiments.definition.formation import anchor_offsets, law_offsets
 from experiments.definition.graph import adjacency
 from experiments.definition.links import gain_key
+from experiments.definition.plan import Plan
+from experiments.file.problems import Path
 from experiments.metrics.signals import WINDOW_S
 from twins.arrays import Array, Index, Mask, norm
 
@@ -259,12 +261,17 @@ def encounters(analysis: Analysis) -> Iterator[Finding]:
     near = [each for each in approaches(analysis.prediction, kinds, CLEARANCE) if not overlap[each.first, each.second]]
     for each in sorted(near, key=lambda each: (each.gap >= 0.0, each.distance)):
         first, second = names[each.first], names[each.second]
+        path: Path = ("robots", second, "start")
         how, remedy = f"they touch at {each.touch:.2f} m", "move the start of one of them"
         if each.gap >= 0.0:
             how = f"one is above the other then, with {each.gap:.2f} m between them, less than {CLEARANCE:g} m"
             remedy = "hold heights that are farther apart"
+        elif begun := [start for start in _manoeuvres(analysis.plan) if start[0] < each.time]:
+            _, path = max(begun, key=lambda start: start[0])
+            remedy = (
+                "give robots other ways or places from here on, or add an avoidance (`./zenpark explain avoidance`)"
+            )
         message = f"{first} and {second} come within {each.distance:.2f} m at {each.time:.1f} s; {how}"
-        path = ("robots", second, "start")
         if experiment.avoidance is None or not (experiment.robots[first].avoids or experiment.robots[second].avoids):
             yield Finding("warning", "too-close", message, remedy, path)
         else:
@@ -283,6 +290,13 @@ def encounters(analysis: Analysis) -> Iterator[Finding]:
             message = f"{ends}, from which it receives no poses, and would land on it"
             remedy = "change their distances, link them, or end the timeline elsewhere"
             yield Finding("warning", "lands-on", message, remedy, targets)
+
+
+def _manoeuvres(plan: Plan) -> list[tuple[float, Path]]:
+    """Begin [s] and place of every leg and every change of the shape."""
+    legs: list[tuple[float, Path]] = [(each.at_s, ("timeline", k)) for k, each in enumerate(plan.experiment.timeline)]
+    changes = enumerate(plan.experiment.formation.changes)
+    return [*legs, *((each.at_s, ("formation", "changes", k)) for k, each in changes)]
 
 
 def ceiling(analysis: Analysis) -> Iterator[Finding]:

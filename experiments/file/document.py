@@ -181,6 +181,7 @@ def chosen(read: Document, names: Sequence[str] = ()) -> dict[str, Plan]:
     Raises DocumentError if it has no case of that name.
     """
     cases = read.cases()
+    names = [names] if isinstance(names, str) else names  # a text is a sequence of letters
     for name in names:
         if name not in cases:
             raise refusal(str(read.path), f"no case '{name}' in this experiment", did_you_mean(name, cases))

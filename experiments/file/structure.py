@@ -131,7 +131,8 @@ def _choice(value: str | dict[str, Any], group: str, path: Path) -> list[Fault]:
     kind, where = (value, path) if isinstance(value, str) else (value["kind"], (*path, "kind"))
     given = {} if isinstance(value, str) else {key: each for key, each in value.items() if key != "kind"}
     if kind not in known and not files.is_choice(kind):
-        return [Fault(where, f"no {shown(kind)} among the {what}", did_you_mean(kind, known))]
+        hint = f"write '{kind}:CLASS' for a class of that file" if kind.endswith(".py") else did_you_mean(kind, known)
+        return [Fault(where, f"no {shown(kind)} among the {what}", hint)]
     try:
         struct = struct_of(group, kind)
     except registry.PluginError as error:

@@ -268,7 +268,7 @@ def _details(cases: Sequence[CaseMetrics]) -> list[page.Section]:
 def _pictures(
     cases: Sequence[CaseMetrics], traces: Sequence[Trace], bands: Mapping[str, Band], drawings: Mapping[str, str]
 ) -> tuple[page.PageFigure, ...]:
-    legs = "; legs of the timeline dashed" if any(len(case.starts_s) > 1 for case in cases) else ""
+    legs = "; phases begin at dashed lines" if any(len(case.starts_s) > 1 for case in cases) else ""
     seeds = len({case.seed for case in cases})
     seed = f" Seed {traces[0].seed}." if seeds > 1 else ""
     of_cases = "all cases, the first one's robots named" if len({trace.case for trace in traces}) > 1 else "by robot"

@@ -83,6 +83,8 @@ def _table_by_case(head: str, cases: Sequence[CaseMetrics], lines: Iterable[Line
 
 def _over_seeds(values: Sequence[float | None], scale: float = 1.0) -> str:
     """Mean and interval over the seeds, and the number of seeds with a known value."""
+    if len(values) == 1 and isinstance(values[0], int):
+        return number(values[0], scale)
     found = spread(values)
     return interval(found, scale) + (f" ({found.n} of {len(values)})" if 0 < found.n < len(values) else "")
 
@@ -157,7 +159,7 @@ def whole_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
             ("Changed by avoidance", _value("avoided_share"), 100.0),
             ("Missed deadlines", _value("missed_share"), 100.0),
         ],
-        "Collisions": [("Number", lambda case: float(len(case.collisions)), 1.0)],
+        "Collisions": [("Number", lambda case: len(case.collisions), 1.0)],
         "Hardest impulse [mN s]": [
             ("of a collision", lambda case: _known(max, (each.impulse for each in case.collisions)), 1000.0)
         ],

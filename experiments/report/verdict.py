@@ -269,7 +269,7 @@ def _acquired(cases: Sequence[CaseMetrics]) -> Lines:
             if when.n < len(runs):
                 short = cut if any(run.interrupted for run in runs) else missing
                 short.append(name if len(runs) == 1 else f"{name} ({len(runs) - when.n} of {len(runs)} seeds)")
-        formation = "The formation" if k == 0 else f"After the leg at {start:g} s it"
+        formation = "The formation" if k == 0 else f"In the phase from {start:g} s on it"
         if reached:
             text = f"{formation} was acquired by all {'again' if k else f'to {tolerance}'} after {_list(reached)}."
             yield VerdictLine("fair" if missing else "good", text)

@@ -82,6 +82,7 @@ COMMANDS = (
     ("keys --connect tcp/127.0.0.1:9", "no router answers at tcp/127.0.0.1:9", "--connect names another"),
     ("echo park//x", "'park//x' is not a key expression", "Write it like park/*/pose"),
     ("keys --connect @nope", "nope: cannot be read", "network.txt"),
+    ("sweep triangle.toml seeds=5:1", "these are 0 seeds", "give 1 to"),
 )
 
 

@@ -249,8 +249,8 @@ def _formatted(of: CheckNumbers) -> dict[str, str]:
         "obstacles": join_names([f"{name} ({what})" for name, what in of.obstacles.items()]) or "none",
         "links": f"{of.links} one-way, {of.edges} pairs",
         "algebraic connectivity": number(of.algebraic_connectivity, ".3f"),
-        "rigidity rank, heights held": f"{number(of.rank, 'd')} of {number(of.rank_needed, 'd')}",
-        "rigidity rank in space": f"{number(of.rank_space, 'd')} of {number(of.rank_space_needed, 'd')}",
+        "rigidity rank, heights held": _rank_text(of.rank, of.rank_needed),
+        "rigidity rank in space": _rank_text(of.rank_space, of.rank_space_needed),
         "smallest rigidity eigenvalue": number(of.smallest_eigenvalue, ".2g", " m²"),
         "single links it can lose": _redundancy_text(of.spare_links, len(of.vital_links)),
         "single robots it can lose": _redundancy_text(of.spare_robots, len(of.vital_robots)),
@@ -276,6 +276,10 @@ def _differs(ideal: float | None, noisy: float | None) -> bool:
     from experiments.check.findings import DELAYED
 
     return noisy is not None and (ideal is None or noisy > max(DELAYED * ideal, ideal + 1.0))
+
+
+def _rank_text(rank: int | None, needed: int | None) -> str:
+    return "-" if rank is None or needed is None else f"{rank} of {needed}"
 
 
 def _redundancy_text(spare: int | None, vital: int) -> str:

@@ -25,6 +25,7 @@ from tools.options import (
 )
 
 if TYPE_CHECKING:
+    from experiments.file.document import Document
     from experiments.sweep.optimise import TuningResult
     from experiments.sweep.sweep import SweepResult
 
@@ -80,8 +81,9 @@ def sweep(
     from tools.commands.run import sound
 
     changes = settings or []
-    kept = KeptVerdict(file, changes)
-    if not sound(load(file, *changes), kept, seeds=2, as_json=as_json, anyway=anyway):
+    kept, read = KeptVerdict(file, changes), load(file, *changes)
+    _parse_axes(read, file, changes, given or [], case or [])
+    if not sound(read, kept, seeds=2, as_json=as_json, anyway=anyway):
         return 2
     options = {"settings": changes, "cases": case or [], "out": out, "scheduler": scheduler, "processes": processes}
     if optimise is None:
@@ -110,6 +112,17 @@ def sweep(
     if open_report and page is not None and code != INTERRUPTED:
         open_in_browser(page.resolve().as_uri())
     return code
+
+
+def _parse_axes(read: Document, file: str, changes: list[str], given: list[str], cases: list[str]) -> None:
+    """Refuse bad axes, seeds and cases before the check, which may take long; of each axis its first value is tried."""
+    from dataclasses import replace
+
+    from experiments.sweep.plan import arguments, cells, seeds_of
+
+    axes, words = arguments(given)
+    seeds_of(words.get("seeds"), read.experiment.seed)
+    cells(read, file, changes, [replace(axis, values=axis.values[:1]) for axis in axes if axis.values], cases)
 
 
 def _sweep(file: str, given: Sequence[str], options: dict[str, Any]) -> Outcome:

@@ -161,7 +161,7 @@ BESIDE = small({"G": robot(0.0, 0.0), "F": robot(0.5, 0.0, 0.8)}, {"G > F": 0.80
 @pytest.mark.parametrize(
     ("made", "severity", "code", "message", "remedy"),
     [
-        (small(GROUND, timeline=CROSSING, arena=LARGE), "warning", "too-close", "A and B come within", ""),
+        (small(GROUND, timeline=CROSSING, arena=LARGE), "warning", "too-close", "A and B come within", "other ways"),
         (crossed(0.52), "warning", "too-close", "they touch at 0.17 m", ""),
         (crossed(0.6), "warning", "too-close", "one is above the other then, with 0.07 m between them", ""),
         (crossed(0.65), None, "too-close", "", ""),

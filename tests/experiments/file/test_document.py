@@ -174,6 +174,7 @@ def test_set_changes_cases(flags, path, periodic, event):
         ("robots.CF01.hover=high", "'hover' must be a number, not 'high'", "height"),
         ("duration_s.x=1", "'duration_s' is no table", "set duration_s itself"),
         ("timeline.3.at_s=1", "there is no '3' in 'timeline'", "0 to 0"),
+        ("trigger=my.py", "no 'my.py' among the triggers", "write 'my.py:CLASS'"),
         ("trigger=periodc", "no 'periodc' among the triggers", "did you mean 'periodic'?"),
         ("nonsense", "not of the form path=value", "--set formation.gain=2.5"),
         ("a..b=1", "not of the form path=value", "--set formation.gain=2.5"),
@@ -532,3 +533,7 @@ def test_wrong_json_behind_a_flag_has_a_remedy(text, messages, hint):
     assert all(problem.file.startswith("--faults ") for problem in refused.value.problems)
     for struct in (None, Faults):
         assert parse_object("--faults", '{"loss": 0.05}', struct) == {"loss": 0.05}
+
+
+def test_one_case_may_be_named_as_text():
+    assert list(document.chosen(document.load("triangle"), "event")) == ["event"]

@@ -160,7 +160,7 @@ def test_one_of_two_cases_interrupted(tmp_path):
     assert "b was interrupted after 10.0 s of 45 s" in page.split("In short")[2]
     said = "\n".join(marks_of(*traces))
     assert said.startswith("b was interrupted after 10.0 s of 45 s: all its figures are up to there.\n")
-    again = "\nAfter the leg at 21 s it was acquired by all again after"
+    again = "\nIn the phase from 21 s on it was acquired by all again after"
     known = ("\nRuns of different length of b and a are not compared.\n", again, "never")
     assert [part in said for part in known] == [True, True, False]
     said = marks_of(cut(park(), 1.0))
@@ -200,7 +200,7 @@ def test_verdict_says_what_was_measured(two_cases):
         rf"event needs {fewer:.1f} % fewer transmissions than periodic: f 4\..*"
         rf" Hz; leaders included, {100.0 * (1.0 - again / sent):.1f} % fewer\.$",
         rf".*acquired by all to 5 cm after {first:.2f} s \(periodic\)",
-        rf".*After the leg at 21 s it was acquired by all again after {after:.2f} s \(periodic\)",
+        rf".*In the phase from 21 s on it was acquired by all again after {after:.2f} s \(periodic\)",
         r"No robot touched .* cm between robots \(\w+–\w+ at [\d.]+ s, \w+\) and [\d.]+ cm between robot and arena ",
     ):
         assert any(re.match(words, text) for text in said), words
