@@ -87,7 +87,7 @@ COMMANDS = (
 
 
 @pytest.fixture
-def refuse(tmp_path, monkeypatch, capsys):
+def refuse(tmp_path, monkeypatch, capfd):
     """A call of a command that is refused, which returns what is printed; in a folder with some files."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "full").mkdir()
@@ -100,7 +100,7 @@ def refuse(tmp_path, monkeypatch, capsys):
         monkeypatch.setattr(sys, "argv", ["zenpark", *words])
         with pytest.raises(SystemExit) as ended:
             main()
-        printed = capsys.readouterr()
+        printed = capfd.readouterr()
         assert ended.value.code == 2, printed
         assert "Traceback" not in printed.err
         return printed.err
