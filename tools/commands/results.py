@@ -356,6 +356,7 @@ def runs(
     """Show which runs are up on this machine; with --past those that left their folders, with key figures."""
     import msgspec
 
+    from agents.user_folder import runtime_folder
     from experiments.real_time.hosts import run_registry
 
     if past or words or below:
@@ -369,7 +370,12 @@ def runs(
         robots = ", ".join(f"{name} ({body})" if body else name for name, body in run.robots.items())
         lines += [f"  {each}" for each in (run.folder, robots) if each]
     shown = [{**msgspec.to_builtins(run), "alive": run.alive} for run in found]
-    print_result(shown, *(lines or ["no run is up on this machine"]), as_json=as_json)
+    nothing = "no run is up on this machine"
+    try:
+        runtime_folder()
+    except OSError as error:
+        nothing = f"runs of this machine are not listed: {error}"
+    print_result(shown, *(lines or [nothing]), as_json=as_json)
     return None
 
 

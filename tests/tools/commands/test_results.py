@@ -13,6 +13,7 @@ from experiments.file.problems import DocumentError
 from experiments.metrics.statistics import spread
 from experiments.report.tables import ratio_words
 from tests.commands import invoke
+from tools.commands import results
 from tools.commands.run import _acquired
 from tools.options import known_words
 
@@ -201,3 +202,11 @@ def test_a_spoiled_run_is_not_compared(first, another, tmp_path):
     assert "×" not in next(line for line in compared.splitlines() if line.startswith("B · event "))
     assert "robots failed" in stdout_of("runs", "--past", "--in", out)
     assert "is no whole run that nothing spoiled" in refused_command("report", out, first, "--pool")
+
+
+def test_runs_say_where_none_can_be_listed(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("ZENPARK_RUNTIME_DIR", str(tmp_path))
+    for mode, words in ((0o755, "are not listed: "), (0o700, "no run is up")):
+        tmp_path.chmod(mode)
+        results.runs()
+        assert words in capsys.readouterr().out
