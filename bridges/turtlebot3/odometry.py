@@ -77,7 +77,7 @@ class Odometry:
             self._resets.append(now)
         if reset or self._frame is None:
             self._settled_at = now + SETTLING_S
-        if self._frame is None or now <= self._settled_at:
+        if self._frame is None or self.settles(now):
             # it counts from elsewhere: assume that the robot stands at its last known pose
             self._frame = _frame(before, counted)
         self.pose = _to_arena(self._frame, counted)
@@ -111,6 +111,10 @@ class Odometry:
 
     def silent(self, now: float) -> bool:
         return now - self.received > SILENCE_S
+
+    def settles(self, now: float) -> bool:
+        """Whether its frame is not certain yet: the robot has to stand."""
+        return now <= self._settled_at
 
     def unsteady(self, now: float) -> bool:
         """Whether odometry was reset too often to tell a position."""

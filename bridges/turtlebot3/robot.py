@@ -67,8 +67,11 @@ class RepeatedVelocity:
         self.velocity = velocity
 
     def due(self, now: float, odometry: Odometry) -> Velocity | None:
-        """The velocity to send now, which counts as sent then; None: not yet. A robot out of reach gets zeros."""
-        if self.velocity != REST and (self.stale(now) or odometry.silent(now)):
+        """The velocity to send now, which counts as sent then; None: not yet.
+
+        A robot out of reach gets zeros, and one of which the frame of odometry is not certain.
+        """
+        if self.velocity != REST and (self.stale(now) or odometry.silent(now) or odometry.settles(now)):
             self._change(REST, now)
         velocity = self.velocity
         moving = velocity != REST

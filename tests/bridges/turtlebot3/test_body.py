@@ -122,6 +122,9 @@ def test_restarted_node_turns_nothing():
     for t, way, yaw in [(0.0, 0.0, 0.8), (2.0, 0.4, 0.8), (7.0, 0.0, 0.0), (7.05, 0.0, 0.8), (7.5, 0.1, 0.8)]:
         ros.odometry.append(odometry(ros.types, way * np.cos(yaw), way * np.sin(yaw), yaw, 100.0 + t))
         robot.receive_messages(t, t)
+        robot.commanded.drive(0.1, 0.0, t)
+        robot.send_command(t)
+    assert ros.sent == [0.0, 0.102, 0.0, 0.102], "what it drove before its frame is certain would be lost"
     assert robot.odometry.pose == pytest.approx((0.5, 0.0, 0.0))
 
 
