@@ -29,7 +29,7 @@ class Lab(ManualClock):
         asked = robots("khepera4", ["khepera4-twin"], device={"server": server})
         self.device = KheperaDevice(DeviceRequest(asked, Faults()))
         self.program = self.device.servers[0].program
-        self.due, self.gap_until = DT, -math.inf
+        self.due, self.gap_until, self.sent_at = DT, -math.inf, -math.inf
         self.queue, self.answers, self.heard = b"", b"", []
         monkeypatch.setattr(drivers, "time", self)
         monkeypatch.setattr(drivers, "uptime", self.monotonic)
@@ -58,7 +58,8 @@ class Lab(ManualClock):
         self._deliver()
 
     def send(self, data):
-        self.queue += data
+        assert data != b"p" or self.now >= self.sent_at + protocol.GAP_S - 1e-9, "glued to what was sent before"
+        self.queue, self.sent_at = self.queue + data, self.now
         self._deliver()
 
     def pending(self):
