@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import re
 import sys
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial, wraps
-from typing import TYPE_CHECKING, Annotated, Any, Final, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Final, TypeVar, get_type_hints
 
 import typer
 from typer import Argument, Option
@@ -19,6 +20,8 @@ from tools.terminal import say
 
 if TYPE_CHECKING:
     import zenoh
+
+Given = TypeVar("Given", str | None, list[str], list[str] | None)
 
 WIDEST: Final = 110  # columns of print
 CONNECT: Final = "ZENPARK_CONNECT"  # environment: default of --connect, endpoints with spaces between them
@@ -125,7 +128,20 @@ Settings = Annotated[
 AsJson = Annotated[bool, Option("--json", help="Print the result as JSON.")]
 KeyExpression = Annotated[str, Argument(metavar="KEY", help="Key expression, such as park/*/pose.")]
 Seconds = Annotated[float | None, Option(min=0.0, help="End after this time [s].")]
-Realm = Annotated[str, Option(metavar="NAME", help="First chunk of the keys.")]
+
+
+def plain(given: Given) -> Given:
+    """Names on the command line, which become parts of keys; raises typer.BadParameter for one that is none, as `*`."""
+    for name in [given] if isinstance(given, str) else given or ():
+        if not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):
+            raise typer.BadParameter(f"'{name}' cannot be a name; use letters, digits and _")
+    return given
+
+
+Realm = Annotated[str, Option(metavar="NAME", help="First chunk of the keys.", callback=plain)]
+RealmOfRun = Annotated[
+    str | None, Option("--realm", metavar="NAME", help="First chunk of the keys. [the run's]", callback=plain)
+]
 Case = Annotated[
     str | None, Option(metavar="NAME", help="A case of the file. [the first]", autocompletion=completion.cases)
 ]

@@ -21,8 +21,10 @@ from tools.options import (
     Connect,
     Lab,
     Realm,
+    RealmOfRun,
     example,
     group,
+    plain,
     print_json,
     routers,
     session,
@@ -42,9 +44,12 @@ robot_app: Final = group("Give orders to robots: those of a run that is under wa
 world_app: Final = group("Run a world by hand, and give orders to the one that is running.")
 
 Place = tuple[float, float]
-Names = Annotated[list[str], Argument(metavar="NAME...", help="Robots.", autocompletion=completion.robots)]
+Names = Annotated[
+    list[str], Argument(metavar="NAME...", help="Robots.", autocompletion=completion.robots, callback=plain)
+]
 NamesOrAll = Annotated[
-    list[str] | None, Argument(metavar="[NAME...]", help="Robots. [all]", autocompletion=completion.robots)
+    list[str] | None,
+    Argument(metavar="[NAME...]", help="Robots. [all]", autocompletion=completion.robots, callback=plain),
 ]
 
 IDENTITY: Final = "operator"
@@ -247,7 +252,7 @@ def estop(
         ),
     ] = None,
     dry_run: Annotated[bool, Option("--dry-run", help="Print which robots would be stopped; send nothing.")] = False,
-    realm: Annotated[str | None, Option(metavar="NAME", help="First chunk of the keys. [the run's]")] = None,
+    realm: RealmOfRun = None,
     lab: Lab = None,
     identity: Annotated[
         str | None, Option("--as", metavar="NAME", help="Name of the certificate, in a lab. [the run's operator]")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
@@ -16,7 +15,21 @@ from typer import Argument, Option
 
 from tools import completion
 from tools.commands.orders import world_app
-from tools.options import CONNECT, As, Bodies, Case, Connect, File, Lab, Lifeline, Realm, example, routers, with_options
+from tools.options import (
+    CONNECT,
+    As,
+    Bodies,
+    Case,
+    Connect,
+    File,
+    Lab,
+    Lifeline,
+    Realm,
+    example,
+    plain,
+    routers,
+    with_options,
+)
 
 if TYPE_CHECKING:
     from agents.network.access_control import Rights
@@ -46,7 +59,10 @@ class Started:
 def agent(
     file: File,
     names: Annotated[
-        list[str], Argument(metavar="NAME...", help="The robots of this process.", autocompletion=completion.members)
+        list[str],
+        Argument(
+            metavar="NAME...", help="The robots of this process.", autocompletion=completion.members, callback=plain
+        ),
     ],
     *,
     clock_correction: Annotated[
@@ -63,8 +79,6 @@ def agent(
     """
     from experiments.real_time.processes.robot import RobotLaunch, fly
 
-    if file == "join" and (wrong := [name for name in names if not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII)]):
-        raise typer.BadParameter(f"'{wrong[0]}' cannot be a name; use letters, digits and _", param_hint="NAME")
     given = {"names": names, "clock_correction": clock_correction, "once": once, "realm": realm}
     return fly(started.launch(RobotLaunch, file, **given))
 

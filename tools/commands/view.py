@@ -14,7 +14,19 @@ from typer import Argument, Option
 
 from agents.errors import ExplainedError
 from tools import completion
-from tools.options import As, AsJson, Case, Connect, Lab, Realm, example, open_in_browser, print_json, routers
+from tools.options import (
+    As,
+    AsJson,
+    Case,
+    Connect,
+    Lab,
+    Realm,
+    RealmOfRun,
+    example,
+    open_in_browser,
+    print_json,
+    routers,
+)
 
 if TYPE_CHECKING:
     import zenoh
@@ -181,7 +193,7 @@ def replay(
     rate: Annotated[float, Option(min=0.01, max=100.0, help="Speed, as a multiple of real time.")] = 1.0,
     loop: Annotated[bool, Option("--loop", help="Restart at the end.")] = False,
     connect: Connect = None,
-    realm: Annotated[str | None, Option(metavar="NAME", help="First chunk of the keys. [the run's]")] = None,
+    realm: RealmOfRun = None,
     lab: Lab = None,
     identity: As = "operator",
 ) -> None:
