@@ -493,7 +493,7 @@ def decode(payload: bytes, mime: str, kind: type[M]) -> M:
     try:
         message = decoder.decode(payload)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise Malformed(f"not a {kind.__name__}: {error}") from None
+        raise Malformed(f"no valid {kind.__name__}: {error}") from None
     assert isinstance(message, kind)
     return message
 

@@ -116,7 +116,7 @@ def far(monkeypatch):
         (("external", "KH01"), lambda far: far.say("KH01", stamp=time.time() - 7.0), "7.0 s ago by its stamp"),
         (("external", "KH01"), lambda far: far.say("KH01", yaw=None), "no yaw, without which a robot on wheels cannot"),
         (("external", "CF01"), lambda far: far.put("park/CF01/position", b'{"x": 1.0}'), "samples on "
-         "park/CF01/position are not positions: not a Position"),
+         "park/CF01/position are not positions: no valid Position"),
     ],
 )  # fmt: skip
 def test_missing_positions_are_named_with_reasons(far, robots, say, words):

@@ -176,7 +176,7 @@ def test_order_reaches_all_before_one_has_answered(router):
         finally:
             over.set()
             thread.join()
-    unread = "malformed reply: not a Reply: Object contains unknown field `order`"
+    unread = "malformed reply: no valid Reply: Object contains unknown field `order`"
     assert [(reply.ok, reply.reason) for reply in replies.values()] == [
         (True, ""), (False, "no"), (True, ""), (False, unread),
     ]  # fmt: skip

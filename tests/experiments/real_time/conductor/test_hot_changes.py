@@ -178,7 +178,7 @@ def test_whole_orders_that_are_refused(stage):
         assert said in stage.after(query).reason
     mad = stage.ask("", payload=b'{"order": "explode", "robots": []}')
     stage.go_on()
-    assert b"not a RunOrder" in mad.error
+    assert b"no valid RunOrder" in mad.error
     assert not stage.given
 
 
