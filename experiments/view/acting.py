@@ -115,6 +115,8 @@ class Acting:
     def set_stage(self, stage: SceneModel, number: int) -> None:
         """Another case: its parameters, and the number by which pages report that they show it."""
         self._stage, self._number = stage, number
+        with self._lock:
+            self.due.clear()  # meant for the robots of the case before
         for part in (*self._parts, *self._targets.values()):
             part.remove()
         self._parts, self._targets = [], {}
@@ -141,8 +143,11 @@ class Acting:
                     target.position = goal
         with self._lock:
             due = [name for name, (at, _) in self.due.items() if now >= at]
-            ready = [self.due.pop(name)[1] for name in due]
-        for order in ready:
+            ready = [(name, *self.due.pop(name)) for name in due]
+        for name, at, order in ready:
+            if now > at + STALE_S:  # no page was open meanwhile, and whoever opens one now has ordered nothing
+                self._note(name, "not ordered: its page was closed. Look, then order again.", bad=True)
+                continue
             threading.Thread(target=order, daemon=True).start()
 
     # ------------------------------------------------------------------ orders

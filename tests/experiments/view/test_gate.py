@@ -121,6 +121,16 @@ def test_old_pictures_order_no_motion(seen, operator, monkeypatch):
     assert [order.order for order in given] == ["hold", "land", *([] if seen in OLD else ["resume"])]
 
 
+def test_late_orders_of_closed_pages_are_dropped(operator):
+    acting, given, now = operator[0], threading.Event(), time.monotonic()
+    acting.due["A"] = now - heartbeat.STALE_S - 1.0, given.set
+    acting.follow(MagicMock(), ["A"])
+    assert not given.wait(0.2)
+    acting.due["A"] = now, given.set
+    acting.set_stage(SceneModel.of_robots(()), 3)
+    assert acting.due == {}, "an order is not for the next case"
+
+
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
 @pytest.mark.parametrize("blocked", [False, True])
 def test_emergency_stop_tells_its_result_without_session(blocked, operator, monkeypatch):
