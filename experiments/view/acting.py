@@ -116,7 +116,7 @@ class Acting:
         """Another case: its parameters, and the number by which pages report that they show it."""
         self._stage, self._number = stage, number
         with self._lock:
-            self.due.clear()  # meant for the robots of the case before
+            self.due.clear()  # orders for the case before
         for part in (*self._parts, *self._targets.values()):
             part.remove()
         self._parts, self._targets = [], {}
@@ -145,7 +145,7 @@ class Acting:
             due = [name for name, (at, _) in self.due.items() if now >= at]
             ready = [(name, *self.due.pop(name)) for name in due]
         for name, at, order in ready:
-            if now > at + STALE_S:  # no page was open meanwhile, and whoever opens one now has ordered nothing
+            if now > at + STALE_S:  # no page was open meanwhile, or nothing was drawn
                 self._note(name, "not ordered: its page was closed. Look, then order again.", bad=True)
                 continue
             threading.Thread(target=order, daemon=True).start()
