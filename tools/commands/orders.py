@@ -315,7 +315,7 @@ def stop_all(stops: Sequence[EmergencyStop], *, dry_run: bool, as_json: bool) ->
         thread.start()
     for thread in threads:
         thread.join()
-    missed = any(stop.moving or (stop.expected and not stop.seen) for stop in stops)
+    missed = any(stop.missed for stop in stops)
     seen = any(stop.seen for stop in stops)
     if as_json:
         print_json({"ok": seen and not missed, "routers": [_as_json(stop, dry_run=dry_run) for stop in stops]})
@@ -353,7 +353,7 @@ def _print_stop(stop: EmergencyStop, *, dry_run: bool) -> None:
         say(f"NOT known to have stopped: {listed(stop.moving, MOST_NAMES)} ({of_all})", to=sys.stderr)
     if stopped := stop.seen - stop.moving:
         say(f"{'would be stopped' if dry_run else 'stopped'}: {listed(stopped, MOST_NAMES)} ({stop.where})")
-    elif stop.expected and not stop.seen:
+    elif stop.missed and not stop.seen:
         done = "no robot would be stopped" if dry_run else "NOT known to have stopped"
         ended = "; its process was asked to end" if stop.run_ended else ""
         say(f"{done}: {stop.where}: {why}{ended}", to=sys.stderr)

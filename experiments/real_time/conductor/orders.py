@@ -147,6 +147,12 @@ class EmergencyStop:
         """Whether robots must be alive: the process of a run on this machine is."""
         return self.run is not None and self.run.what == "run" and self.run.alive
 
+    @property
+    def missed(self) -> bool:
+        """Whether robots may go on: some have not reported, or the stop did not reach a run that is up."""
+        silent = self.expected or (self.run is not None and self.failure is not None)
+        return bool(self.moving) or (silent and not self.seen)
+
     def send(self, reason: str) -> None:
         """Send the stop until every robot that is alive reports that it has stopped."""
         try:

@@ -179,6 +179,14 @@ def test_estop_reaches_each_realm_of_a_router(monkeypatch):
 
 
 @pytest.mark.usefixtures("stop")
+def test_estop_names_what_it_cannot_reach(monkeypatch, capsys):
+    frozen = own_entry("router", "frozen", [DEFAULT])
+    monkeypatch.setattr("experiments.real_time.hosts.run_registry.runs", lambda: [frozen])
+    assert orders.estop(dry_run=True) == 1
+    assert capsys.readouterr().err == f"no robot would be stopped: frozen, at {DEFAULT}: no router answers\n"
+
+
+@pytest.mark.usefixtures("stop")
 def test_dry_run_names_robots_and_sends_no_stop(monkeypatch, capsys):
     monkeypatch.delattr(EmergencyStop, "send")
     assert orders.estop(dry_run=True, connect=["tcp/127.0.0.1:1"]) == 0
