@@ -141,7 +141,7 @@ def environment():
 
 
 def measured(name, robots, *arguments):
-    """What a process of a simulator measures, after its warm-up; raises Failed if it ends with an error."""
+    """Measurement by a process of a simulator, after its warm-up; raises Failed if it ends with an error."""
     if PEERS[name].packages:
         command = [python_of(name), "-m", f"{DRIVERS}.peer_{name}", str(robots)]
     else:

@@ -494,7 +494,7 @@ def test_a_radio_with_too_many_robots():
 
 @pytest.mark.system
 def test_computer_that_slept_lands_its_drone(monkeypatch):
-    """It has sunk to the floor meanwhile: the next setpoint would lift it."""
+    """The drone has sunk to the floor meanwhile: the next setpoint would lift it."""
     slept, clock = [0.0], time.clock_gettime
     monkeypatch.setattr(time, "clock_gettime", lambda which: clock(which) + slept[0] * (which == time.CLOCK_BOOTTIME))
     with connected_twins(device=DONGLE) as (twin, process):

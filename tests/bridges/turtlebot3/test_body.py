@@ -116,7 +116,7 @@ def test_robot_that_drives_on_gets_zeros():
 
 
 def test_restarted_node_turns_nothing():
-    """It adds the yaw of its IMU to its second message."""
+    """turtlebot3_node adds the yaw of its IMU to its second message."""
     robot = TurtleBotConnection(request(NOWHERE, "ros2dds://tb3_0?distro=humble"), 0)
     ros = FakeRos(robot)
     for t, way, yaw in [(0.0, 0.0, 0.8), (2.0, 0.4, 0.8), (7.0, 0.0, 0.0), (7.05, 0.0, 0.8), (7.5, 0.1, 0.8)]:

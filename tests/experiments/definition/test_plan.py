@@ -1,4 +1,4 @@
-"""What follows from an experiment: graph, rigidity, assignments, channels of links, standby, spares, new kinds."""
+"""Consequences of an experiment: graph, rigidity, assignments, channels of links, standby, spares, new kinds."""
 
 import math
 from dataclasses import replace

@@ -43,7 +43,7 @@ def observed_still(robot=DRONE, *, place=(0.0, 0.5, 0.0), noise=0.0, yaw=0.0, sa
 
 
 def checked(each, **others):
-    """What is found of CF01, by check."""
+    """Findings on CF01, by check."""
     found = checks.at_rest({"CF01": each, **others}, Safety(), date(2026, 3, 1))["CF01"]
     return {one.check: one for one in found}
 
