@@ -126,9 +126,10 @@ def write_video(traces: Mapping[str, Trace], file: Path, speed: float = 4.0) -> 
 
     Raises ExplainedError if there is no ffmpeg for an .mp4, or the file cannot be written.
     """
+    from matplotlib import rc_context  # noqa: PLC0415
     from matplotlib.animation import FFMpegWriter, PillowWriter  # noqa: PLC0415
 
-    from experiments.report import trajectories  # noqa: PLC0415
+    from experiments.report import style, trajectories  # noqa: PLC0415
 
     mp4 = file.suffix.lower() == ".mp4"
     if mp4 and not FFMpegWriter.isAvailable():
@@ -139,12 +140,13 @@ def write_video(traces: Mapping[str, Trace], file: Path, speed: float = 4.0) -> 
     if not any(trajectories.has_positions(trace) for trace in shown):
         raise ExplainedError(f"{file}: no position is known in this run; there is nothing to show")
     figure, show = trajectories.film(shown)
-    writer = FFMpegWriter(FRAMES_HZ, bitrate=2000) if mp4 else PillowWriter(FRAMES_HZ)  # type: ignore[arg-type]
     try:
-        with _writing(file), writer.saving(figure, str(file), 150 if mp4 else 110):
-            for t in np.arange(0.0, max(float(trace.time[-1]) for trace in shown), speed / FRAMES_HZ):
-                show(float(t))
-                writer.grab_frame()
+        with _writing(file), rc_context(dict(style.STYLE)):
+            writer = FFMpegWriter(FRAMES_HZ, bitrate=2000) if mp4 else PillowWriter(FRAMES_HZ)  # type: ignore[arg-type]
+            with writer.saving(figure, str(file), 150 if mp4 else 110):
+                for t in np.arange(0.0, max(float(trace.time[-1]) for trace in shown), speed / FRAMES_HZ):
+                    show(float(t))
+                    writer.grab_frame(transparent=False)
     except CalledProcessError as error:  # ffmpeg has ended by itself, and said why in its last line
         last = str(error.stderr or error.output or "").strip().rpartition("\n")[2]
         raise ExplainedError(f"{file}: ffmpeg failed: {last or error}; a .gif needs no ffmpeg") from None

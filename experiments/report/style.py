@@ -1,6 +1,7 @@
 """Style of the figures and their files: one column of 3.5 in, 8 pt, colours for colour-blind readers too.
 
-`Figure` is used without pyplot, so that nothing is global; the style is set around drawing and around saving.
+`Figure` is used without pyplot, so that nothing is global; the style is set around drawing and around saving. It begins
+with matplotlib's own defaults, because a process has the style of any `matplotlibrc` in its folder or in its home.
 """
 
 from __future__ import annotations
@@ -52,7 +53,13 @@ CORNERS: Final = ((3.0, 3.0), (-3.0, 3.0), (3.0, -3.0), (-3.0, -3.0))  # [pt] of
 MAX_COLOURED_ROBOTS: Final = 8  # robots that have a colour each; more are coloured by kind
 MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X", "*")  # of cases, parameters, or `MAX_COLOURED_ROBOTS` robots
 
-STYLE: Final[Mapping[Any, Any]] = {
+# neither the window system nor the places of programs are style: both stay as the process has them
+_DEFAULTS: Final = {
+    name: value
+    for name, value in mpl.rcParamsDefault.items()
+    if not name.startswith("backend") and not name.endswith("_path")
+}
+STYLE: Final[Mapping[Any, Any]] = _DEFAULTS | {
     "font.family": "serif",
     "font.serif": ["STIXGeneral", "DejaVu Serif"],  # both come with matplotlib: the same picture on every machine
     "mathtext.fontset": "stix",
@@ -95,6 +102,11 @@ class Drawing(Figure):
 
     def _repr_svg_(self) -> str:
         return svg(self)
+
+    def savefig(self, fname: Any, *, transparent: bool | None = None, **how: Any) -> None:  # noqa: ANN401 - matplotlib's
+        """Saves in the style of this project: fonts and their type in the file are chosen only now."""
+        with mpl.rc_context(dict(STYLE)):
+            super().savefig(fname, transparent=transparent, **how)
 
 
 def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:

@@ -243,8 +243,8 @@ def film(traces: Sequence[Trace]) -> tuple[Figure, Callable[[float], None]]:
     Links have the colours of their errors; few robots have their names.
     """
     shown = [trace for trace in traces if has_positions(trace)]
-    with mpl.rc_context(dict(style.STYLE) | {"savefig.transparent": False}):
-        figure = Figure(figsize=(4.0 * len(shown), 3.0))
+    with mpl.rc_context(dict(style.STYLE)):
+        figure = style.Drawing(figsize=(4.0 * len(shown), 3.0))
         clock = figure.text(0.5, 0.03, "", ha="center", fontsize=9)
         parts = []
         for k, trace in enumerate(shown):
