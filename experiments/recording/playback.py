@@ -48,7 +48,6 @@ from experiments.recording.resample import HOLE_S, attitude, line, step, turn
 from experiments.recording.ros2.cdr import Undecodable, codec
 from experiments.recording.topics import JSON, KINDS_JSON, METADATA, TOPICS, SentGoal, SentPose, SpokenPose, Topic
 from experiments.recording.trace import (
-    ROUNDING_S,
     Goals,
     Trace,
     poses_in_run,
@@ -175,11 +174,12 @@ def read(path: Path) -> Playback:
     plan = without_standby(about.plan, {state.robot for state in content[State]})
     about, experiment = dataclasses.replace(about, plan=plan), plan.experiment
     start = about.start(content[Event], content[Status], path)
-    length = content.length(start, experiment.duration_s)
-    if length * experiment.rates.state_hz < 1.0 - ROUNDING_S:
+    length, rate = content.length(start, experiment.duration_s), experiment.rates.state_hz
+    time = np.arange(math.floor(length * rate + 1e-9) + 1) / rate
+    if len(time) < 2:  # nothing can be integrated
         raise NotStarted(f"{path}: the run ended before the common start; there is nothing to show")
     with np.errstate(all="ignore"):  # numbers that no robot can have are in the file, not of our making
-        trace = _trace(content, about, (start, length))
+        trace = _trace(content, about, (start, length), time)
     return Playback(trace, start, records.complete, messages)
 
 
@@ -247,11 +247,10 @@ class Content:
         return lambda data: append(decode(data))
 
 
-def _trace(content: Content, about: AboutRun, run: tuple[float, float]) -> Trace:
-    """The trace of a run by its common start, UTC, and its length [s]."""
+def _trace(content: Content, about: AboutRun, run: tuple[float, float], time: Array) -> Trace:
+    """The trace of a run by its common start, UTC, and its length [s], on the grid `time` (T,)."""
     plan, experiment, robots = about.plan, about.plan.experiment, about.plan.names
     rate, (start, duration) = experiment.rates.state_hz, run
-    time = np.arange(math.floor(duration * rate + 1e-9) + 1) / rate
     states = by_robot(content[State], robots)
     poses = [
         list({(pose.stamp, pose.seq): pose for pose in own}.values()) for own in by_robot(content[SentPose], robots)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
@@ -165,22 +164,25 @@ def recover(source: Path, target: Path, later: Sequence[Path] = ()) -> Recovered
     """Writes every whole record of an unfinished recording into a new, finished one. The sources stay as they are.
 
     Args:
-        later: Further parts of the same recording, by recorders that took over. What they repeat is left out, and those
-            without a record as well.
+        later: Further parts of the same recording, by recorders that took over. What they repeat is left out.
 
     Raises:
-        RecordingError: If the source is no recording, or the target exists or cannot be written.
+        RecordingError: If no part is a recording, or the target exists or cannot be written.
     """
-    parts = [Records(source)]
-    messages = sum(1 for _ in parts[0].messages())
-    for path in later:
+    counts, refusals = list[tuple[Records, int]](), list[RecordingError]()
+    for path in (source, *later):
         part = Records(path)
-        with suppress(RecordingError):  # killed before its first record
-            messages += sum(1 for _ in part.messages())
-            parts.append(part)
+        try:
+            counts.append((part, sum(1 for _ in part.messages())))
+        except RecordingError as error:  # its recorder was killed before the file was there, or before its first record
+            refusals.append(error)
+    if not counts:
+        raise refusals[0]
+    messages = sum(count for _, count in counts)
+    parts = [part for part, count in counts if count] or [counts[0][0]]
     channels = [channel for part in parts for channel in part.channels.values()]
     robots = tuple(dict.fromkeys(filter(None, map(_robot, channels))))
-    complete = parts[0].complete and len(parts) == 1
+    complete = parts[0].complete and parts[0].path == source and len(parts) == 1
     if not complete:
         _write(parts, target)
     return Recovered(messages, robots, complete)

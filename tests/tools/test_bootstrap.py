@@ -200,6 +200,13 @@ def test_measurements_run_in_the_folder_of_the_user(bootstrap, replaced, monkeyp
         assert environment["PYTHONSAFEPATH"] == "1"
 
 
+def test_python_in_a_path_with_blanks_is_found(bootstrap, monkeypatch):
+    said = "warning: of uv\n/home/me/my tools/bin/python3.12\n"
+    monkeypatch.setattr(bootstrap.sys, "version_info", (3, 9))
+    monkeypatch.setattr(bootstrap, "silently", lambda *_: subprocess.CompletedProcess([], 0, said))
+    assert bootstrap.interpreter("uv", "python3", {}) == "/home/me/my tools/bin/python3.12"
+
+
 @pytest.fixture
 def started_modules(bootstrap, monkeypatch):
     """The modules that `./zenpark test` starts; those of tests fail."""

@@ -221,7 +221,10 @@ class CaseProcesses:
         self._launcher.kill(self._context.process("recorder"))
 
     def join_parts(self) -> str:
-        """Join the files of all recorders of the case, which have ended; return why that failed, else an empty text."""
+        """Join the files of all recorders of the case, which have ended; return why that failed, else an empty text.
+
+        A recorder that was killed early may have left no file, or one without a record.
+        """
         if len(self._parts) < 2:
             return ""
         first, *later = self._parts

@@ -99,7 +99,8 @@ def conduct(read: Document, folder: Path, options: RunOptions, user: Supervision
     unflown = ", ".join(name for name in embodied if name not in results)
     stopped = [emergency.words + (f"; not run: {unflown}" if unflown else "")] if emergency else []
     failures = [f"{case}: {why}" for case, result in results.items() for why in result.failures]
-    begun = {case: result.recording for case, result in results.items() if result.start is not None}
+    # a failure says why the recording of a case is not there
+    begun = {case: end.recording for case, end in results.items() if end.start is not None and end.recording.is_file()}
     return Conducted(begun, [*stopped, *failures, *left], failures)
 
 

@@ -114,7 +114,7 @@ class Station:
         self._starting: list[Process] = []
         self._robots: list[Process] = []
         self._launcher = launcher
-        self._silent = False
+        self._silent = ""  # reason; empty while it answers
         self.reset_clock()
 
     def reset_clock(self) -> None:
@@ -148,11 +148,13 @@ class Station:
     def ask(self, question: Question, limit_s: float = ANSWER_S) -> tuple[Answer, float, float]:
         """The answer, when the question left, and when the answer was here, UTC [s]."""
         if self._silent or self._out.closed or self._in.closed:
-            raise HostError(self._broken())  # its end was noticed before
+            raise HostError(self._silent or self._broken())  # its end was noticed before
         deadline = time.monotonic() + limit_s
         text = msgspec.json.encode(question) + b"\n"
         left = self._ours.utc()
-        with suppress(BrokenPipeError):  # the output of ssh tells the reason
+        with suppress(
+            BrokenPipeError, BlockingIOError
+        ):  # the output of ssh tells the reason; a full pipe: it is silent
             os.write(self._out.fileno(), text)
         while self._waiting.poll(max(0.0, deadline - time.monotonic()) * 1e3):
             data = os.read(self._in.fileno(), 65536)
@@ -163,11 +165,12 @@ class Station:
             for line in lines:
                 with suppress(msgspec.MsgspecError):  # a greeting of the shell
                     return msgspec.json.decode(line, type=Answer), left, back
-        self._silent = True  # a late answer would be taken for that to the next question
-        raise HostError(f"{self.name}: its station says nothing for {limit_s:g} s; is that machine overloaded?")
+        # no further question: a late answer would be taken for that to the next one
+        self._silent = f"{self.name}: its station says nothing for {limit_s:g} s; is that machine overloaded?"
+        raise HostError(self._silent)
 
     def _broken(self) -> str:
-        with suppress(TimeoutError):
+        with suppress(subprocess.TimeoutExpired):
             self.process.handle.wait(ANSWER_S)
         output = self.process.output
         return f"{self.name}: {ssh.explained(self.address, self.host.zenpark, output)}"
@@ -283,13 +286,16 @@ class Hosts:
         return list(dict.fromkeys(self.by_robot.values()))
 
     def sweep(self) -> list[str]:
-        """Kill remaining processes of the run on every host, and name them."""
-        killed = []
+        """Kill remaining processes of the run on every host, and name them; of a silent host the reason."""
+        left = []
         for station in self._stations.values():
-            with suppress(HostError):  # its station does that by itself as soon as the lifeline is lost
+            try:
                 found = station.ask(Question("sweep"))[0].found
-                killed += [f"{station.name}: process {each.what} {each.text}" for each in found]
-        return killed
+                left += [f"{station.name}: process {each.what} {each.text}" for each in found]
+            except HostError as error:  # its station does that by itself as soon as the lifeline is lost
+                left.append(f"{error}; whether processes are left there is unknown")
+                self._launcher.end([station.process.name], grace_s=0.0)
+        return left
 
 
 def applied(now: HostClock, before: float) -> float:

@@ -254,6 +254,17 @@ def test_a_run_that_never_started(path, began, says):
         rec.trace_of(path, rec.state(), *began)
 
 
+@pytest.mark.parametrize("off_s", [-1e-3, -1e-6, -2e-8, 0.0, 2e-7, 1e-6])
+def test_run_of_one_period_is_measured_or_none(path, off_s):
+    """Whose recorder broke off there: UTC stamps have a grain of 0.24 microseconds."""
+    try:
+        trace = rec.trace_of(path, rec.begun(), rec.state(at=0.0), rec.state(seq=2, at=0.1 + off_s, phase="running"))
+    except NotStarted:
+        assert off_s <= 0.0
+    else:
+        assert measure(trace).duration_s == pytest.approx(0.1)
+
+
 def test_impossible_messages_are_counted_and_left_out(path):
     odd = [rec.state(seq=2**63), rec.state(position="here"), rec.state(phase="\ud800")]
     odd += [rec.pose(seq=2**70), rec.status(sent=2**64), Event(None, "k", "s", "t")]

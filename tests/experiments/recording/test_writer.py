@@ -275,6 +275,18 @@ def test_a_recorder_that_took_over_completes_the_recording(path, tmp_path, capsy
     assert_same(made.trace, wanted.trace)
 
 
+@pytest.mark.parametrize("killed", ["before its file", "before its first record", "before its attachments"])
+def test_first_recorder_may_have_recorded_nothing(path, tmp_path, killed):
+    rec.write(later := tmp_path / "part2.mcap", *rec.whole_run())
+    if killed != "before its file":
+        path.write_bytes(later.read_bytes()[: 40 if killed == "before its attachments" else 0])
+    target = tmp_path / "whole.mcap"
+    assert recover(path, target, [later]).messages == 82
+    made, wanted = read(target), read(later)
+    assert (made.complete, made.messages) == (True, wanted.messages)
+    assert_same(made.trace, wanted.trace)
+
+
 @pytest.mark.parametrize(
     ("content", "says"),
     [(b"", "nothing was recorded"), (b"\x89MCAP", "nothing was recorded"), (b"title = 'pair'", "not an MCAP file")],

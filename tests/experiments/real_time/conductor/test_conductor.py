@@ -37,6 +37,8 @@ from experiments.real_time.hosts import run_registry
 from experiments.real_time.hosts.hosts import Hosts
 from experiments.real_time.hosts.launcher import ROUTER, Launcher, RouterEnded
 from experiments.real_time.hosts.run_registry import RegisteredRun, born
+from experiments.recording.playback import read
+from tests.experiments import recordings as rec
 from tests.experiments.recordings import START, status
 from tests.network import Net, Reply, Sample
 from tests.small import changed, pair
@@ -346,6 +348,24 @@ def test_dead_router_listens_again_where_machines_expect_it(tmp_path):
     assert said[0] == (ROUTER, "the router ended (killed by SIGKILL); started again")
     assert said[-1] == (ROUTER, "the router ended (killed by SIGKILL); given up: the robots hold, and land at the end")
     assert processes.again(SimpleNamespace(name="only-KH01", exit="exit code 2")) is None
+
+
+def test_second_recorder_alone_makes_the_recording(tmp_path):
+    """The first one was killed before its file was there."""
+    context, started = case(tmp_path)
+    context.file.parent.mkdir(parents=True)
+    recorder = SimpleNamespace(name="only-recorder", exit="killed by SIGKILL", because="")
+    context.launcher.start.return_value = recorder
+    processes = CaseProcesses(context)
+    processes.prepare()
+    kind, _ = processes.again(recorder)
+    assert kind == "recorder"
+    later = Path(started[-1].args[3])
+    assert "cannot be read" in processes.join_parts(), "no recorder has made a file"
+    rec.write(later, *rec.whole_run())
+    assert processes.join_parts() == ""
+    assert read(context.recording).complete
+    assert not later.exists()
 
 
 @pytest.mark.system

@@ -1,5 +1,6 @@
 """A host: errors of ssh with remedies, its station, which leaves nobody behind, and its clock, which drifts."""
 
+import os
 import shlex
 import signal
 import threading
@@ -18,9 +19,10 @@ from agents.clock import STEP_S, Clock, correction_line
 from agents.network.endpoints import Endpoint
 from agents.network.messages import HostClock
 from agents.runtime.lifeline import BEAT_S, FAR_SILENCE_S
+from experiments.definition.experiment import Host as HostTable
 from experiments.real_time.hosts import hosts, ssh
 from experiments.real_time.hosts.hosts import HostError
-from experiments.real_time.hosts.launcher import RUN
+from experiments.real_time.hosts.launcher import RUN, Launcher
 from experiments.real_time.hosts.station import Answer, Question, answer, devices
 from experiments.real_time.processes import zygote
 from experiments.recording import version
@@ -111,6 +113,25 @@ def test_absent_router_is_not_reached():
 def test_serial_ports_are_looked_at():
     (found,) = devices(["kteam:///dev/no-such-port", "twin", "world"])
     assert (found.what, found.well) == ("/dev/no-such-port", False)
+
+
+@pytest.mark.parametrize("script", ["exec sleep 60", "exec sleep 60 >&-"])
+def test_silent_station_is_noted_and_its_ssh_ended(tmp_path, monkeypatch, script):
+    """A station that stood still for some seconds; or whose connection has closed and lingers."""
+    ssh_file = tmp_path / "ssh"
+    ssh_file.write_text(f"#!/bin/sh\n{script}\n")
+    ssh_file.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    monkeypatch.setattr(hosts, "ANSWER_S", 0.1)
+    with Launcher(tmp_path / "logs") as launcher:
+        used = hosts.Hosts(launcher, [])
+        station = hosts.Station("lab2", HostTable(address="lab2"), launcher=launcher, routers=[], run="run")
+        used._stations["lab2"] = station
+        with pytest.raises(HostError, match="lab2: "):
+            station.ask(Question("clock"), 0.1)
+        (note,) = used.sweep()
+        assert note.startswith("lab2: ")
+        assert not station.process.alive
 
 
 SERVE = "from experiments.real_time.hosts.station import serve; serve(patience_s=0.5)"
