@@ -9,6 +9,7 @@ Switches are numbers in files, which the laboratory writes and the processes of 
     refuse-ROBOT        not 0: the body of that robot does not obey orders to land
     capture             number of the fault of motion capture in `CAPTURE_FAULTS`
     capture-subject     row of its subject
+    capture-by          its size, see `capture_by` of `Faults`
     cut-ROBOT           when its twin cut the motors, by the machine's monotonic clock [s]; only if the file is there
 """
 
@@ -84,9 +85,13 @@ def spoil(folder: Path, words: Sequence[str]) -> None:
     elif role == "world":
         _replace("experiments.real_time.processes.world_network:Commands", "_obey", partial(_obey, folder))
     elif role == "capture":
-        number, row = Switch(folder / "capture"), Switch(folder / "capture-subject")
+        number, row, size = (Switch(folder / f"capture{part}") for part in ("", "-subject", "-by"))
         faults = pkgutil.resolve_name("twins.devices.device:CAPTURE_FAULTS")
-        _replace("twins.devices.device:Faults", "captured", lambda *_: (faults[int(number.read())], int(row.read())))
+
+        def captured(*_: object) -> tuple[str, int, float]:
+            return faults[int(number.read())], int(row.read()), size.read()
+
+        _replace("twins.devices.device:Faults", "captured", captured)
     elif ROBOT in words:
         monotonic, slept = time.monotonic, Switch(folder / f"sleep-{role}")
         time.monotonic = lambda: monotonic() - slept.read()

@@ -172,8 +172,12 @@ class SpoiltRun:
         self.send(robot, signal.SIGSTOP)
         self._asleep[self.process_of[robot]] = time.monotonic()
 
-    def spoil_capture(self, fault: CaptureFault, subject: str = "") -> None:
-        """Let motion capture tell wrong poses, of a subject, if not of all; `release` ends that."""
+    def spoil_capture(self, fault: CaptureFault, subject: str = "", size: float = 0.0) -> None:
+        """Let motion capture tell wrong poses, of a subject, if not of all; `release` ends that.
+
+        `size`: how wrong, see `capture_by` of `Faults`.
+        """
+        self.switch("capture-by").write(size)
         self.switch("capture-subject").write(self.measured.index(subject) if subject else 0)
         self.switch("capture").write(CAPTURE_FAULTS.index(fault))
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from twins.devices.device import DeviceRequest, Faults
+from twins.devices.device import Capture, DeviceRequest, Faults
 from twins.devices.vicon import ViconTwin, upright
 
 
@@ -43,6 +43,16 @@ class Served:
     def truth(self):
         with self.lock:
             return self.device.truth()
+
+    def captured(self, **faults):
+        """What motion capture tells of the truth, with these faults, for `Driver.truth`."""
+        capture, wrong = Capture(), Faults(**faults)
+
+        def told():
+            position, yaw, turn = capture.told(wrong, time.monotonic() - self.zero, *self.truth())
+            return position, yaw + turn
+
+        return told
 
     def kill(self):
         if not self._ending.is_set():

@@ -23,10 +23,11 @@ from agents.ticks import Ticks
 from twins.arrays import Array
 from twins.models.motion import Motion
 
-# what motion capture tells wrongly: the same poses in new frames, the same frame again, two subjects exchanged, and one
-# under another name
-CaptureFault = Literal["", "frozen", "repeated", "swapped", "renamed"]
+# what motion capture tells wrongly: the same poses in new frames, the same frame again, two subjects exchanged, one
+# under another name; all poses as they were before, the frame of an object turned, an object that stands still
+CaptureFault = Literal["", "frozen", "repeated", "swapped", "renamed", "late", "turned", "stuck"]
 CAPTURE_FAULTS: Final[tuple[CaptureFault, ...]] = get_args(CaptureFault)
+LATEST_S: Final = 2.0  # largest delay of motion capture
 
 
 class Faults(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -39,6 +40,7 @@ class Faults(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     battery: float = 1.0  # charge at the start, 0 to 1
     drain: float = 1.0  # battery drain as a multiple of the maker's figure
     refuse_arming: bool = False
+    accelerometer_mg: float = 0.0  # constant vertical error of a Crazyflie's accelerometer [mg]
     refuse_landing_s: float = 0.0  # [s] for which a Tello answers `land` with "error", from the first one
     exchanges_hz: float = 500.0  # [1/s] exchanges of a software radio, 300 to 1000 by dongle and computer
     tumbled_from_s: float | None = None  # [s] begin of lying on its side, as after a collision
@@ -48,6 +50,7 @@ class Faults(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     occluded_for_s: float = 1e9  # [s] duration of the occlusion
     capture: CaptureFault = ""  # fault of motion capture
     capture_subject: int = 0  # number of its subject, which is exchanged with the next
+    capture_by: float = 0.0  # how late [s], by which yaw turned [rad], with which noise stuck, per axis [m]
     capture_from_s: float = 0.0  # [s] begin of that
     capture_for_s: float = 1e9  # [s] duration of that
 
@@ -63,13 +66,48 @@ class Faults(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         """Whether nothing measures the positions at time `t` [s]."""
         return _during(t, self.occluded_from_s, self.occluded_for_s)
 
-    def captured(self, t: float) -> tuple[CaptureFault, int]:
-        """Fault of motion capture at time `t` [s], empty if none, and the number of its subject."""
-        return self.capture if _during(t, self.capture_from_s, self.capture_for_s) else "", self.capture_subject
+    def captured(self, t: float) -> tuple[CaptureFault, int, float]:
+        """Fault of motion capture at time `t` [s], empty if none, the number of its subject, and its size."""
+        fault = self.capture if _during(t, self.capture_from_s, self.capture_for_s) else ""
+        return fault, self.capture_subject, self.capture_by
 
 
 def _during(t: float, begin: float | None, duration: float) -> bool:
     return begin is not None and begin <= t < begin + duration
+
+
+class Capture:
+    """Poses as motion capture tells them: late, turned, or stuck, see `CaptureFault`."""
+
+    def __init__(self, random: np.random.Generator | None = None) -> None:
+        """`random`: noise of objects that are stuck."""
+        self._random = random or np.random.default_rng(0)
+        self._past: deque[tuple[float, Array, Array]] = deque()  # time [s], positions, attitudes
+        self._stuck: Array | None = None  # position (3,) [m]
+
+    def told(self, faults: Faults, t: float, position: Array, attitude: Array) -> tuple[Array, Array, Array]:
+        """Positions (n, 3) [m], attitudes (n, ...), and yaws (n,) [rad] by which these are turned, at time `t` [s].
+
+        Called for each frame, also without a fault, with arrays that are not changed afterwards.
+        """
+        fault, subject, size = faults.captured(t)
+        yaw = np.zeros(len(position))
+        subject %= len(position)
+        self._past.append((t, position, attitude))
+        while len(self._past) > 1 and self._past[1][0] <= t - LATEST_S:
+            self._past.popleft()
+        if fault == "late":
+            ages = (pose for pose in reversed(self._past) if pose[0] <= t - size + 1e-6)
+            _, position, attitude = next(ages, self._past[0])
+        elif fault == "turned":
+            yaw[subject] = size
+        if fault != "stuck":
+            self._stuck = None
+        else:
+            self._stuck = position[subject].copy() if self._stuck is None else self._stuck
+            position = position.copy()
+            position[subject] = self._stuck + size * self._random.standard_normal(3)
+        return position, attitude, yaw
 
 
 Item = TypeVar("Item")

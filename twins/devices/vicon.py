@@ -29,7 +29,7 @@ from agents.runtime.command_line import NetworkLaunch, on_termination
 from agents.runtime.lifeline import Lifeline
 from agents.ticks import Ticks
 from twins.arrays import Array
-from twins.devices.device import CaptureFault, Faults, FaultyLink, Server, serve_until_next
+from twins.devices.device import Capture, CaptureFault, Faults, FaultyLink, Server, serve_until_next
 
 BACKLOG: Final = 1 << 18  # [bytes] largest queue of a client; a slower client misses frames
 VALID_BOX: Final = (1e3, 1e3, 1e3)  # [m] bounds of valid positions: any room
@@ -86,7 +86,8 @@ class ViconTwin(Server):
         self._rotation = np.repeat(np.eye(3)[None], len(self._subjects), axis=0)
         self._visible = np.zeros(len(self._subjects), dtype=bool)
         self.latency_s = 0.0
-        self._told: tuple[CaptureFault, int] = "", 0  # fault of the last frame, and its subject
+        self._told: tuple[CaptureFault, int, float] = "", 0, 0.0  # fault of the last frame, its subject and its size
+        self._capture = Capture(self._rng)
         self._last = b"", b""  # the last frame without a fault: its number, its poses
         self.frames_sent = 0
         self._listener = socket.create_server((host, port))
@@ -166,7 +167,7 @@ class ViconTwin(Server):
     def _names(self) -> bytes:
         """Blocks that describe the subjects."""
         names = list(self._subjects)
-        fault, subject = self._told
+        fault, subject, _ = self._told
         if fault == "renamed":
             names[subject % len(names)] += "-renamed"
         return b"".join(
@@ -177,7 +178,7 @@ class ViconTwin(Server):
     def _frame(self, t: float) -> bytes:
         """Blocks of the current frame."""
         before, self._told = self._told, self.link.faults.captured(t)
-        fault, subject = self._told
+        fault, subject, _ = self._told
         if before != self._told and "renamed" in (before[0], fault):
             for client in self.clients.values():
                 client.named = False
@@ -190,7 +191,7 @@ class ViconTwin(Server):
 
     def _poses(self, t: float, swapped: Sequence[int]) -> bytes:
         """Blocks of the poses of all subjects, of which two may be swapped."""
-        position = self._position
+        position, rotation, turn = self._capture.told(self.link.faults, t, self._position.copy(), self._rotation.copy())
         if self._sigma > 0.0:
             position = position + self._rng.normal(0.0, self._sigma, position.shape)
         rows = list(range(len(self._subjects)))
@@ -200,7 +201,7 @@ class ViconTwin(Server):
         frame = b""
         for number, row in enumerate(rows):
             x, y, z = position[row].tolist()
-            turned = tuple(self._rotation[row].reshape(9).tolist())
+            turned = tuple((rotation[row] @ upright(turn[row])).reshape(9).tolist())
             frame += vicon_datastream.pack_segments(number, [Segment(0, (x, y, z), turned)] if seen[row] else [])
         return frame
 

@@ -246,11 +246,11 @@ def test_user_errors_are_reported_without_a_traceback(option, value, words):
     assert "Traceback" not in ended.stderr
 
 
-def told(fault):
+def told(fault, size=0.0):
     frames = []
     with viewer(["CF01", "CF02"], sigma=0.001) as made:
         for k in range(1, 7):
-            made.twin.link.faults = Faults(capture=fault if k > 3 else "")
+            made.twin.link.faults = Faults(capture=fault if k > 3 else "", capture_by=size)
             for row in range(2):
                 made.twin.place(row, np.array([0.1 * k, float(row), 0.5]), upright(0.0))
             frames += made.frames(0.01 * k)
@@ -270,3 +270,17 @@ def test_frozen_repeated_swapped_and_renamed_captures():
     assert {tuple(frame.poses) for frame in during} == {("CF01-renamed", "CF02")}  # names are sent once more
     faults = Faults(capture="swapped", capture_from_s=2.0, capture_for_s=1.0)
     assert [faults.captured(t)[0] for t in (1.9, 2.0, 2.9, 3.0)] == ["", "swapped", "swapped", ""]
+
+
+def test_late_turned_and_stuck_captures():
+    before, during = told("late", 0.02)
+    found = [frame.poses["CF01"].position[0] for frame in before + during]
+    assert found == pytest.approx([0.1, 0.2, 0.3, 0.2, 0.3, 0.4], abs=0.01)
+    before, during = told("turned", 0.5)
+    sines = [frame.poses[name].rotation[3] for frame in (before[-1], during[-1]) for name in ("CF01", "CF02")]
+    assert sines == pytest.approx([0.0, 0.0, np.sin(0.5), 0.0])
+    before, during = told("stuck", 0.02)
+    found = np.array([[frame.poses[name].position[0] for name in ("CF01", "CF02")] for frame in during])
+    assert found[:, 1] == pytest.approx([0.4, 0.5, 0.6], abs=0.01)
+    assert found[:, 0] == pytest.approx([0.4] * 3, abs=0.1)
+    assert np.ptp(found[:, 0]) > 1e-3

@@ -66,8 +66,11 @@ class Commander:
         self._low_level = False
 
     def take_planned(self, t: float, goal: Pose | None) -> None:
-        """Use the planner's setpoint, None without a plan, unless there is a low-level setpoint."""
-        if self._low_level:
+        """Use the planner's setpoint, None without a plan, unless there is a low-level setpoint.
+
+        One that is not a number is none: the last one becomes old.
+        """
+        if self._low_level or (goal is not None and isnan(sum(goal))):
             return
         if goal is None:
             self.command(t, on=False)

@@ -48,6 +48,7 @@ CONSOLE_TEXTS: Final = {  # parameters that make a Crazyflie write to its consol
 }
 Send = Callable[[Port, int, bytes], None]
 LEAST: Final = "posCtlPid.thrustMin"
+SIGMA: Final = "locSrv.extPosStdDev"  # of external positions [m]
 MAX_WHOLE_PARAMETER: Final = 2.0**32  # upper bound of whole parameters, far above any length, angle or speed
 LEAST_THRUST, MOST_THRUST = 1000, 60000
 TAKEOFFS: Final = (HighLevel.TAKEOFF, HighLevel.OLD_TAKEOFF, HighLevel.TAKEOFF_VELOCITY)
@@ -254,7 +255,7 @@ class Drone:
         if name == "kalman.resetEstimation" and value:
             place = self.value("kalman.initialX"), self.value("kalman.initialY"), self.value("kalman.initialZ")
             yaw = self.value("kalman.initialYaw") - vehicle.model.yaw
-            vehicle.estimator.reset(difference(place, vehicle.place), yaw)
+            vehicle.estimator.reset(difference(place, vehicle.place), yaw, vehicle.model.velocity)
         elif name == LEAST:
             vehicle.vertical.least = value
         elif name == "lighthouse.systemType" and value != before:
@@ -410,12 +411,12 @@ class Drone:
     def _location(self, channel: int, data: bytes) -> bytes | None:
         vehicle, decks = self.vehicle, self.vehicle.decks
         if channel == 0:
-            vehicle.estimator.add_external(vehicle.t, _numbers(crtp.VECTOR, data), vehicle.place)
+            vehicle.locate(_numbers(crtp.VECTOR, data), self.value(SIGMA))
             return None
         kind, rest = data[0], data[1:]
         if kind == Location.POSE:
             x, y, z, qx, qy, qz, qw = _numbers(crtp.POSE, rest)
-            vehicle.estimator.add_external(vehicle.t, (x, y, z), vehicle.place)
+            vehicle.locate((x, y, z), self.value(SIGMA))
             yaw = math.atan2(2.0 * (qw * qz + qx * qy), 1.0 - 2.0 * (qy * qy + qz * qz))
             vehicle.estimator.turn = math.remainder(yaw - vehicle.model.yaw, math.tau)
         elif kind == Location.LPP and decks.loco:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from enum import IntEnum
-from math import cos, pi, sin
+from math import cos, isnan, pi, sin
 from typing import Final
 
 import numpy as np
@@ -71,6 +71,7 @@ class OnboardPlanner:
         self._coefficients = np.zeros((4, ORDER + 1))
         self._powers: list[list[float]] = []  # the same, of the four axes, highest power first
         self._rest: list[Piece] = []  # pieces after the current one
+        self._valid: Pose = (0.0, 0.0, 0.0, 0.0)  # last planned pose
 
     def climb(self, t: float, pose: Array, *, height: float, yaw: float, span: float, landing: bool) -> LogStatus:
         """Plan a vertical motion to `height` [m]: a landing with motors off at its end, or a take-off.
@@ -170,7 +171,10 @@ class OnboardPlanner:
         return self.plan == PlannerState.IDLE or (not self._rest and t - self._begin >= self._span)
 
     def goal(self, t: float) -> Pose | None:
-        """Current planned pose, None without a plan; after a landing there is none. Quiet: called on every tick."""
+        """Current planned pose, None without a plan; after a landing there is none. Quiet: called on every tick.
+
+        NaN in a piece that is not a number: the firmware's planner gives up, and makes no setpoint any more.
+        """
         if self.plan == PlannerState.LANDING and self.finished(t):
             self.plan = PlannerState.IDLE
         if self.plan == PlannerState.IDLE:
@@ -179,13 +183,19 @@ class OnboardPlanner:
         x = y = z = yaw = 0.0
         for a, b, c, d in self._powers:
             x, y, z, yaw = x * elapsed + a, y * elapsed + b, z * elapsed + c, yaw * elapsed + d
-        return x, y, z, yaw
+        pose = x, y, z, yaw
+        if not isnan(x + y + z + yaw):
+            self._valid = pose
+        return pose
 
     def state(self, t: float) -> tuple[Array, Array, Array]:
-        """Pose, speed and acceleration (4,) on the plan; at rest after the end of the plan."""
+        """Pose, speed and acceleration (4,) on the plan; at rest after its end, and where the planner gave up."""
         elapsed = self._elapsed(t)
         pose, speed, acceleration = evaluate(self._coefficients, elapsed)
-        if elapsed >= self._span:
+        lost = bool(np.isnan(pose).any())
+        if lost:
+            pose = np.array(self._valid)
+        if lost or elapsed >= self._span:
             speed, acceleration = np.zeros(4), np.zeros(4)
         return pose, speed, acceleration
 

@@ -78,7 +78,7 @@ class Trajectories:
 
 def _uncompressed(memory: bytes, number: int, scale: float) -> Piece:
     *values, span = crtp.PIECE.unpack_from(memory, crtp.PIECE.size * number)
-    if not np.abs(values).max() <= MAX_COEFFICIENT or not 0.0 < span <= MAX_COEFFICIENT:  # NaN fails too
+    if (np.abs(values) > MAX_COEFFICIENT).any() or not 0.0 < span <= MAX_COEFFICIENT:  # NaN: the planner gives up
         raise ValueError("no numbers of a trajectory")
     return span * scale, np.array(values).reshape(4, ORDER + 1) / scale ** np.arange(ORDER + 1)
 

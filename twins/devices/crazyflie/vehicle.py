@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from math import atan2, cos, exp, inf, isnan, radians, sin
+from math import atan2, cos, exp, inf, isnan, radians, sin, tan
 from typing import Final
 
 import numpy as np
@@ -14,10 +14,10 @@ from agents.body.kinds import Flight
 from agents.kinds.crazyflie import CRAZYFLIE
 from agents.protocols.crazyflie import CrazyflieSettings, Lighthouse, Loco, chosen
 from agents.protocols.crtp import Info, Power
-from agents.vectors import ZERO, Setpoint, Vector, clamp, difference
+from agents.vectors import ZERO, Setpoint, Vector, clamp, difference, norm
 from twins.arrays import Array
 from twins.body import instants
-from twins.devices.crazyflie.commander import Commander
+from twins.devices.crazyflie.commander import STEEPEST, Commander
 from twins.devices.crazyflie.memory import Memories
 from twins.devices.crazyflie.planner import OnboardPlanner, PlannerState
 from twins.devices.crazyflie.supervisor import Supervisor
@@ -32,58 +32,108 @@ PRECISE: Final = 1e-5  # [m²] final variance
 LOST: Final = 100.0  # [m²] variance after a reset
 GROWTH: Final = 1.0  # [m²/s] of the variance without measurements
 DRIFT: Final = (0.05, -0.05)  # [m/s²] along x, y: 0.3° of error in the attitude, twice
-FRESH_S: Final = 0.5  # older external positions are ignored
+FRESH_S: Final = 0.5  # age of external positions from which the attitude drifts
+# [m²/s³] noise of the acceleration, horizontal and vertical: the firmware's 0.5 and 1 m/s², drawn every millisecond
+HORIZONTAL_NOISE, VERTICAL_NOISE = 2.5e-4, 1e-3
+SLOW: Final = 1e-4  # [m²/s²] variance of the velocity after a reset
+THROWN: Final = 1.5  # [m] a position farther from the estimate throws it in flight,
+THROWN_TURN: Final = 2.0  # by this yaw [rad]
+SEEN_TURN: Final = 0.5  # share of a wrong yaw in the estimate: roll and pitch are corrected for the rest
+
+
+class KalmanGains:
+    """Gains of a Kalman filter of position and velocity along one axis."""
+
+    def __init__(self, noise: float) -> None:
+        """`noise`: spectral density of the acceleration [m²/s³]."""
+        self._noise = noise
+        self.reset()
+
+    def reset(self) -> None:
+        """Covariance of an unknown position, at rest."""
+        self._place, self._mixed, self._speed = LOST, 0.0, SLOW  # [m²], [m²/s], [m²/s²]
+
+    def predict(self, dt: float) -> None:
+        """Let the covariance grow for dt [s] without a position."""
+        self._place = min(self._place + dt * (2.0 * self._mixed + dt * self._speed), LOST)
+        self._mixed += dt * self._speed
+        self._speed += dt * self._noise
+
+    def correct(self, sigma: float) -> tuple[float, float]:
+        """Gains of position and of velocity [1/s] for a position of the standard deviation `sigma` [m]."""
+        whole = self._place + sigma * sigma
+        gain, speed_gain = self._place / whole, self._mixed / whole
+        self._speed -= speed_gain * self._mixed
+        self._place, self._mixed = (1.0 - gain) * self._place, (1.0 - gain) * self._mixed
+        return gain, speed_gain
 
 
 class Estimator:
-    """Estimator of position and yaw, by its errors."""
+    """Estimator of position and yaw, by its errors: estimate minus truth.
 
-    def __init__(self, error: Vector, turn: float) -> None:
-        """See `reset`."""
+    Positions from outside enter a Kalman filter with the firmware's noise, which an accelerometer drives. Late ones
+    make it ring, the same one again holds it, and without any it integrates the errors of accelerometer and attitude.
+    The other systems measure the truth without delay.
+    """
+
+    def __init__(self, error: Vector, turn: float, accelerometer: float) -> None:
+        """See `reset`; `accelerometer`: constant error of its vertical axis [m/s²]."""
         self.external = ZERO  # last external position [m]
         self.received = 0  # number of external positions
-        self.rate = ZERO  # of the error [m/s]: the estimate of the velocity is wrong by as much
-        self._external_error = ZERO  # of the last external position [m]
+        self._accelerometer = accelerometer
         self._external_time = -inf
-        self._drift = (0.0, 0.0)  # rate of the error without measurements [m/s]
+        self._horizontal, self._vertical = KalmanGains(HORIZONTAL_NOISE), KalmanGains(VERTICAL_NOISE)
         self.reset(error, turn)
 
-    def reset(self, error: Vector, turn: float) -> None:
-        """Restart with an error of the position [m] and of the yaw [rad]: estimate minus truth."""
+    def reset(self, error: Vector, turn: float, velocity: Vector = ZERO) -> None:
+        """Restart at rest with an error of the position [m] and of the yaw [rad]; true `velocity` [m/s]."""
         self.error, self.variance, self.turn = error, LOST, turn  # variance per axis [m²]
+        self.rate = difference(ZERO, velocity)  # error of the velocity [m/s]
+        self._horizontal.reset()
+        self._vertical.reset()
 
-    def add_external(self, t: float, position: Vector, truth: Vector) -> None:
-        """Add an external position [m] of a drone at `truth` [m]; accelerometers measure how it moves on."""
+    def add_external(self, t: float, position: Vector, truth: Vector, sigma: float) -> float:
+        """Add an external position [m] of a drone at `truth` [m]; returns its distance from the estimate [m].
+
+        `sigma`: standard deviation that the estimator assumes [m].
+        """
         self.external, self._external_time = position, t
-        self._external_error = difference(position, truth)
         self.received += 1
+        (x, y, z), (u, v, w) = self.error, self.rate
+        off_x, off_y, off_z = off = difference(difference(position, truth), self.error)
+        gain, speed_gain = self._horizontal.correct(sigma)
+        gain_z, speed_gain_z = self._vertical.correct(sigma)
+        self.error = x + gain * off_x, y + gain * off_y, z + gain_z * off_z
+        self.rate = u + speed_gain * off_x, v + speed_gain * off_y, w + speed_gain_z * off_z
+        return norm(off)
 
-    def advance(self, t: float, dt: float, *, ready: bool, flow: bool, flying: bool) -> None:
+    def advance(self, t: float, dt: float, moved: Vector, *, ready: bool, flow: bool, flying: bool) -> None:
         """Advance one step of dt [s].
 
         Args:
             t: Current time [s].
             dt: [s].
+            moved: True acceleration [m/s²].
             ready: A positioning system on board works.
             flow: A Flow deck measures velocity and height, so an error of the place stays.
             flying: In the air, without measurements, the error of the attitude is integrated.
         """
         measured = ready or t - self._external_time <= FRESH_S
         share = 1.0 - exp(-dt / SETTLING_S)
-        before = x, y, z = self.error
-        to_x, to_y, to_z = ZERO if ready or flow else self._external_error
-        if measured:
-            x, y = x + share * (to_x - x), y + share * (to_y - y)
-        if measured or flow:
-            z += share * (to_z - z)
-            self._drift = (0.0, 0.0)
-        elif flying:
-            self._drift = self._drift[0] + dt * DRIFT[0], self._drift[1] + dt * DRIFT[1]
-            x, y = x + dt * self._drift[0], y + dt * self._drift[1]
+        x, y, z = self.error
+        if ready or flow:
+            to_x, to_y, to_z = (-share * x, -share * y, -share * z) if ready else (0.0, 0.0, -share * z)
+            self.error, self.rate = (x + to_x, y + to_y, z + to_z), (to_x / dt, to_y / dt, to_z / dt)
         else:
-            self._drift = (0.0, 0.0)
-        self.error = x, y, z
-        self.rate = (x - before[0]) / dt, (y - before[1]) / dt, (z - before[2]) / dt
+            u, v, w = self.rate
+            drift_x, drift_y = DRIFT if flying and not measured else (0.0, 0.0)
+            if self.turn != 0.0:  # accelerations are turned by a wrong yaw
+                c, s, (a, b, _) = cos(SEEN_TURN * self.turn), sin(SEEN_TURN * self.turn), moved
+                drift_x, drift_y = drift_x + c * a - s * b - a, drift_y + s * a + c * b - b
+            self.rate = u, v, w = u + dt * drift_x, v + dt * drift_y, w + dt * self._accelerometer
+            self.error = x + dt * u, y + dt * v, z + dt * w
+            self._horizontal.predict(dt)
+            self._vertical.predict(dt)
         if measured:
             self.variance += share * (PRECISE - self.variance)
         elif not flow:
@@ -98,6 +148,7 @@ LOW_S: Final = 5.0  # from the first voltage below it to the state "low"
 IMPACT: Final = 4.2  # [m/s] a robot that hits the floor faster (a fall of 0.9 m) ends on its side
 SKATING: Final = 2.0  # [m/s] largest speed of that
 TRIM: Final = (radians(0.4), radians(-0.3))  # roll, pitch of a robot at rest [rad]: none is exactly level
+STEEPEST_ACCELERATION: Final = GRAVITY * tan(STEEPEST)  # [m/s²] horizontal
 LEANING_S: Final = 0.05  # time constant of the attitude
 ENOUGH_ANCHORS: Final = 4  # for three dimensions and a common clock
 
@@ -188,10 +239,11 @@ class Vehicle:
         self.vertical = VerticalLoops(settings.platform, self.dt)
         flight = CRAZYFLIE.motion
         assert isinstance(flight, Flight)
-        self._gain, self._speed_gain = flight.position, flight.velocity[0]
+        self._gain, self._speed_gain, self._limit = flight.position, flight.velocity[0], flight.speed[0]
         self.planner, self.commander = OnboardPlanner(), Commander(flight, kind.turn_response)
         # it believes to be where it was switched on, and to look along x
-        self.estimator = Estimator(difference(ZERO, self.model.held), -yaw)
+        accelerometer = 1e-3 * GRAVITY * faults.accelerometer_mg
+        self.estimator = Estimator(difference(ZERO, self.model.held), -yaw, accelerometer)
         self.place = self._last_measured = self.model.held  # true position [m]
         self.estimate = ZERO  # reported position [m]
         self.velocity = ZERO  # reported, from measured positions [m/s]
@@ -234,6 +286,16 @@ class Vehicle:
             self.commander.stop()
         return done
 
+    def locate(self, position: Vector, sigma: float) -> None:
+        """Take an external position [m] of the standard deviation `sigma` [m].
+
+        In flight one that is far from the estimate throws its attitude: it turns the drone over.
+        """
+        far = self.estimator.add_external(self.t, position, self.place, sigma) > THROWN
+        if far and self.model.flying and self.place[2] > 0.0:
+            self.estimator.turn += THROWN_TURN
+            self.supervisor.tumbled = True
+
     def restart(self) -> None:
         """Switch off and on: motors off, estimator at its start."""
         self.planner.stop()
@@ -267,7 +329,7 @@ class Vehicle:
         before, place = model.velocity, model.held
         model.move(dt)
         if model.flying:
-            self._climb(before[2], place[2], delayed[2])
+            self._steer(before, place, delayed)
         else:
             self.vertical.reset()
         self._touch_floor(before, place, setpoint)
@@ -278,7 +340,9 @@ class Vehicle:
             x, y = x + dx, y + dy
         self.place = x, y, z
         self.battery.advance(t)
-        self.estimator.advance(t, dt, ready=self.decks.ready, flow=self.decks.flow, flying=model.flying)
+        self.estimator.advance(
+            t, dt, self.acceleration, ready=self.decks.ready, flow=self.decks.flow, flying=model.flying
+        )
         if self._measurement.present:
             dx, dy, dz, _ = self._measurement.draw()
             x, y, z = x + dx, y + dy, z + dz
@@ -289,29 +353,35 @@ class Vehicle:
         self._last_measured = x, y, z
         return locked
 
-    def _climb(self, before: float, height: float, target: float) -> None:
-        """Move vertically, from a speed `before` [m/s] and a height toward a target [m]; NaN: stay.
+    def _steer(self, before: Vector, place: Vector, target: Setpoint) -> None:
+        """Move vertically, from a velocity [m/s] and place [m] before the step toward a target [m]; NaN: stay.
 
-        The controller takes what the estimate does not see of the horizontal velocity for none.
+        The controller takes what the estimate does not see of the horizontal velocity for none, and turns its
+        accelerations by a wrong yaw.
         """
-        model, (rate_x, rate_y, rate_z) = self.model, self.estimator.rate
-        offset = 0.0 if isnan(target) else target - height
+        model, estimator = self.model, self.estimator
+        u, v, w = estimator.rate
+        offset = 0.0 if isnan(target[2]) else target[2] - place[2]
         wanted = self._gain[2] * offset if isnan(self.commander.target[2]) else None
-        acceleration = self.vertical.advance(offset, before + rate_z, wanted, self.commander.thrust)
-        (x, y, _), (v_x, v_y, _), speed = model.held, model.velocity, before + self.dt * acceleration
-        model.held = x, y, height + self.dt * speed
-        lag = self.dt * self._speed_gain
-        model.velocity = v_x - lag * rate_x, v_y - lag * rate_y, speed
+        acceleration = self.vertical.advance(offset, before[2] + w, wanted, self.commander.thrust)
+        (x, y, _), (v_x, v_y, _), speed = model.held, model.velocity, before[2] + self.dt * acceleration
+        model.held = x, y, place[2] + self.dt * speed
+        share = self.dt * self._speed_gain
+        more_x, more_y = -u, -v
+        if estimator.turn != 0.0 and not isnan(target[0]):
+            c, s = cos(estimator.turn), sin(estimator.turn)
+            a = clamp(self._gain[0] * (target[0] - place[0]), -self._limit, self._limit) - before[0]
+            b = clamp(self._gain[1] * (target[1] - place[1]), -self._limit, self._limit) - before[1]
+            more_x, more_y = c * (a - u) + s * (b - v) - a, c * (b - v) - s * (a - u) - b
+        most = self.dt * STEEPEST_ACCELERATION
+        more_x = clamp(v_x + share * more_x - before[0], -most, most)
+        more_y = clamp(v_y + share * more_y - before[1], -most, most)
+        model.velocity = before[0] + more_x, before[1] + more_y, speed
 
     def _true_setpoint(self, setpoint: Setpoint) -> Setpoint:
         """Setpoint of position and yaw as it is flown: the controller uses the estimate, not the truth."""
-        estimator, (x, y, z, yaw) = self.estimator, setpoint
-        wrong_x, wrong_y, wrong_z = estimator.error
-        x, y = x - wrong_x, y - wrong_y
-        if estimator.turn != 0.0:  # it turns its accelerations by a wrong yaw
-            (x0, y0, _), c, s = self.model.held, cos(estimator.turn), sin(estimator.turn)
-            x, y = x0 + c * (x - x0) + s * (y - y0), y0 + c * (y - y0) - s * (x - x0)
-        return x, y, z - wrong_z, yaw - estimator.turn
+        (wrong_x, wrong_y, wrong_z), (x, y, z, yaw) = self.estimator.error, setpoint
+        return x - wrong_x, y - wrong_y, z - wrong_z, yaw - self.estimator.turn
 
     def _touch_floor(self, before: Vector, place: Vector, setpoint: Setpoint) -> None:
         """Stop at the floor; a drone that hits it hard, with `before` [m/s], ends on its side.

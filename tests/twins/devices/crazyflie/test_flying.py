@@ -12,7 +12,7 @@ import pytest
 from numpy.polynomial import Polynomial
 
 from agents.protocols import crtp
-from agents.protocols.crtp import HighLevel, Info, Location, LogStatus, Port, Setpoint, SupervisorCommand
+from agents.protocols.crtp import HighLevel, Info, Location, LogStatus, MemoryKind, Port, Setpoint, SupervisorCommand
 from tests.requests import request
 from tests.twins.crazyflie_wire import DT, Wire, brushless
 from twins.devices.crazyflie.planner import OnboardPlanner, evaluate, polynomial
@@ -319,6 +319,26 @@ def test_what_is_no_setpoint_cuts_or_locks():
     assert (wire.after(0.1).state, wire.motors) == (SupervisorState.LOCKED, False)
 
 
+@pytest.mark.parametrize("ordered", [False, True])
+def test_piece_that_is_no_number_ends_the_plan(ordered):
+    """The planner gives up; 2 s after its last setpoint the motors stop, unless it is ordered to land before."""
+    wire, nothing = Wire().hovering(0.5), [math.nan] * 32
+    hold = [0.0] * 16 + [0.5] + [0.0] * 15
+    for k, values in enumerate((hold, nothing)):
+        data = crtp.PIECE.pack(*values, 1.0)
+        assert wire.drone.memories.write(MemoryKind.TRAJECTORY, k * len(data), data)
+    wire.drone.trajectories.define(0, crtp.IN_MEMORY, crtp.UNCOMPRESSED, 0, 2)
+    assert wire.plan(HighLevel.START_2, "BBBBf", 0, 0, 0, 0, 1.0) == LogStatus.OK
+    assert wire.after(1.0 + 0.4).state == SupervisorState.FLYING
+    assert wire.after(0.3).state == SupervisorState.LEVEL
+    if ordered:
+        assert wire.land(2.0) == LogStatus.OK
+    assert wire.after(1.2).motors
+    assert wire.after(2.0).state == (SupervisorState.FLYING if ordered else SupervisorState.LOCKED)
+    assert not wire.motors
+    assert wire.position[2] == 0.0
+
+
 def test_thrust_needs_a_zero_first():
     for zeroed, thrust in ((False, 45000), (True, 45000), (True, 20000)):  # the last is too little to carry it
         wire = Wire()
@@ -362,6 +382,44 @@ def test_frozen_positions_shoot_it_up():
     assert wire.after(1.0, located).takeoff(0.2, 1.5) == LogStatus.OK
     assert (wire.after(1.5, located).estimate[2] < 0.1, wire.velocity[2] > 0.4) == (True, True)
     assert wire.after(2.5, located).position[2] > 2.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("late", "sigma", "sways"),
+    [(0.1, 0.01, (0.0, 0.05)), (0.2, 0.01, (1.0, 2.0)), (0.3, 0.01, (1.5, 3.0)), (0.3, 0.1, (0.0, 0.05))],
+)
+def test_late_positions_make_it_sway(late, sigma, sways):
+    """As measured on the firmware: hover at 0.8 m, a step of 0.6 m; the largest sway of the last 3 s."""
+    wire, places = Wire(external=True), []
+
+    def located():
+        places.append(wire.position)
+        if wire.ticks % 5 == 0:
+            wire.locate(places[max(-len(places), -1 - round(late / DT))])
+
+    wire.set("locSrv.extPosStdDev", "f", sigma)
+    assert wire.after(1.0, located).takeoff(0.8, 2.0) == LogStatus.OK
+    wire.after(6.0, located).go_to(0.6, 0.0, 0.8, 0.0, 0.01)
+    wire.wait(10.0, located)
+    least, most = sways
+    assert least <= np.ptp(places[-300:], axis=0).max() <= most
+
+
+@pytest.mark.slow
+def test_blind_drone_rises_by_its_accelerometer():
+    """By half the error times the square of the time, up to the next position, which throws a far estimate."""
+    wire = Wire(external=True, accelerometer_mg=-4.0)
+    assert wire.after(1.0, wire.locate).takeoff(0.8, 2.0) == LogStatus.OK
+    assert wire.after(15.0, wire.locate).position[2] == pytest.approx(0.8, abs=0.02)
+    assert wire.after(4.0).position[2] - 0.8 == pytest.approx(0.5 * 4e-3 * 9.81 * 4.0**2, rel=0.3)
+    assert wire.estimate[2] == pytest.approx(0.8, abs=0.1)
+    wire.after(0.1, wire.locate)
+    assert wire.state == SupervisorState.FLYING
+    assert wire.after(10.0).position[2] > 2.0
+    wire.after(0.1, wire.locate)
+    assert (wire.state, wire.motors) == (SupervisorState.CRASHED, False)
+    assert abs(wire.yaw - wire.vehicle.pose[3]) > 1.0
 
 
 @pytest.mark.slow
