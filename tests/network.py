@@ -192,7 +192,7 @@ class Net:
         declared: dict[str, Any] = {
             "declare_advanced_publisher": lambda *_, **__: Mute(),
             "declare_advanced_subscriber": lambda _session, key, handler, **_: self.listen(key, handler),
-            "source_of": lambda _publisher: None,
+            "NumberedPublisher": lambda *_: Mute(),
             "LastValue": lambda *_: Mute(),
         }
         opened: dict[str, Any] = {

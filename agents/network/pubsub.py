@@ -6,13 +6,12 @@ import threading
 from collections import deque
 from collections.abc import Callable, Container, Iterable, Iterator
 from contextlib import suppress
-from itertools import chain
-from typing import Final, Generic, Protocol, TypeVar
+from itertools import chain, count
+from typing import Any, Final, Generic, Protocol, TypeVar
 
 import zenoh
 from zenoh.ext import (
     AdvancedPublisher,
-    AdvancedSubscriber,
     CacheConfig,
     HistoryConfig,
     MissDetectionConfig,
@@ -20,7 +19,7 @@ from zenoh.ext import (
     declare_advanced_publisher,
     declare_advanced_subscriber,
 )
-from zenoh.handlers import Callback, Handler, RingChannel
+from zenoh.handlers import Callback, FifoChannel, Handler, RingChannel
 
 from agents.network import messages
 from agents.network.keys import Keys
@@ -30,6 +29,7 @@ from agents.network.session import Polled, received
 HEARTBEAT_S: Final = 0.5  # delay until the loss of the last pose before a silence is noticed
 POSES: Final = 16  # queued poses of one robot
 EVENTS: Final = 64  # of a run, repeated to a subscriber that was cut off: without a router much happens at once
+SOURCES: Final = 4096  # publishers with known numbers, and answers to a question for last values
 ORDERS: Final = 8  # queued
 LONGEST_ORDER: Final = 4096  # [bytes] an order to land or to stop is shorter
 TOKEN_CHANGES: Final = 256  # queued
@@ -61,21 +61,6 @@ def pose_publisher(session: zenoh.Session, key: str, mime: str, kept: int = 1) -
     )
 
 
-def pose_subscriber(
-    session: zenoh.Session, key: str, depth: int = POSES, kept: int = 1
-) -> AdvancedSubscriber[Handler[zenoh.Sample]]:
-    """The other end of `pose_publisher`: the newest `depth` samples wait in `.handler`.
-
-    The history is limited to the `kept` of the publisher: without a limit a single frozen publisher stalls a wildcard
-    for 10 s.
-    """
-    return declare_advanced_subscriber(session, key, RingChannel(depth), history=_history(kept), recovery=_RECOVERY)
-
-
-def _history(kept: int = 1) -> HistoryConfig:
-    return HistoryConfig(max_samples=kept, detect_late_publishers=True)
-
-
 class Bell:
     """Ends the wait of one thread early; a ring before the wait counts, several are one."""
 
@@ -92,33 +77,82 @@ class Bell:
         return self._lock.acquire(timeout=timeout_s)
 
 
-class RingingSubscriber:
-    """As `pose_subscriber`, and rings a bell for each sample.
+def pose_subscriber(
+    session: zenoh.Session, key: str, depth: int = POSES, kept: int = 1, bell: Bell | None = None
+) -> PoseSubscriber:
+    """The other end of `pose_publisher`, and of plain publishers: the newest `depth` samples wait in `.handler`.
 
-    Each costs the receiving thread a wait for the interpreter's lock, and the loop a wake-up: 57 µs in all. The
-    callback may only append and ring: Zenoh calls it under a lock of the subscriber.
+    The history is limited to the `kept` of the publisher: without a limit a single frozen publisher stalls a wildcard
+    for 10 s. A sample with a new number rings the `bell`, if there is one. A ring costs the receiving thread a wait for
+    the interpreter's lock, and the loop a wake-up: 57 µs in all.
+    """
+    return PoseSubscriber(session, key, depth, kept, bell)
+
+
+class PoseSubscriber:
+    """Samples of advanced and of plain publishers.
+
+    Zenoh's advanced subscriber drops a sample with a source number that does not grow, such as each of a plain
+    publisher that names itself with a constant one. A plain subscriber brings these; it costs 2 µs for each sample.
     """
 
-    def __init__(self, session: zenoh.Session, key: str, bell: Bell, depth: int) -> None:
-        self._waiting: deque[zenoh.Sample] = deque(maxlen=depth)
-        self._bell = bell
-        self._subscriber = declare_advanced_subscriber(
-            session, key, Callback(self._append, indirect=False), history=_history(), recovery=_RECOVERY
-        )
+    def __init__(self, session: zenoh.Session, key: str, depth: int, kept: int, bell: Bell | None) -> None:
+        """Subscribes; see `pose_subscriber`."""
+        self._waiting = deque[zenoh.Sample](maxlen=depth)
+        self._numbers: dict[str, int] = {}  # last source number, by source
+        history = HistoryConfig(max_samples=kept, detect_late_publishers=True)
+
+        def append(sample: zenoh.Sample) -> None:  # under a lock of the subscriber: it may only append and ring
+            self._waiting.append(sample)
+            if bell is not None:
+                bell.ring()
+
+        handler: Any = RingChannel(depth) if bell is None else Callback(append, indirect=False)
+        self._advanced = declare_advanced_subscriber(session, key, handler, history=history, recovery=_RECOVERY)
+        self._plain = session.declare_subscriber(key, RingChannel(depth))
+        self._numbered = self._pop if bell is not None else self._advanced.handler.try_recv
+        self._all = self._plain.handler.try_recv
 
     @property
     def handler(self) -> Polled[zenoh.Sample]:
         return self
 
     def try_recv(self) -> zenoh.Sample | None:
-        return self._waiting.popleft() if self._waiting else None
+        if (sample := self._numbered()) is not None:
+            return sample
+        while (sample := self._all()) is not None:
+            if self._repeats_its_number(sample):
+                return sample
+        return None
 
     def undeclare(self) -> None:
-        self._subscriber.undeclare()
+        self._advanced.undeclare()
+        self._plain.undeclare()
 
-    def _append(self, sample: zenoh.Sample) -> None:
-        self._waiting.append(sample)
-        self._bell.ring()
+    def _pop(self) -> zenoh.Sample | None:
+        return self._waiting.popleft() if self._waiting else None
+
+    def _repeats_its_number(self, sample: zenoh.Sample) -> bool:
+        """Whether the number of a sample is not greater than the last one of its source."""
+        if (source := sample.source_info) is None:
+            return False
+        name, number = str(source.source_id), source.source_sn
+        last = self._numbers.get(name)
+        if last is None and len(self._numbers) >= SOURCES:
+            self._numbers.clear()
+        self._numbers[name] = number
+        return last is not None and number <= last
+
+
+def last_values(session: zenoh.Session, keyexpr: str, limit_s: float) -> list[zenoh.Sample]:
+    """Last value of each `pose_publisher`; those that have not answered after `limit_s` [s] are missing."""
+    asked = session.get(
+        f"{keyexpr}/@adv/pub/**?_max=1;_anyke",
+        FifoChannel(SOURCES),
+        consolidation=zenoh.ConsolidationMode.NONE,
+        timeout=limit_s,
+    )
+    return [reply.ok for reply in asked if reply.ok is not None]
 
 
 def publisher(
@@ -135,9 +169,17 @@ def publisher(
     )
 
 
-def source_of(publisher: zenoh.Publisher) -> zenoh.SourceInfo:
-    """Source that a plain publisher names in its samples; `session_of` reads it."""
-    return zenoh.SourceInfo(publisher.id, 0)
+class NumberedPublisher:
+    """A plain publisher that names and numbers its samples: `session_of` reads the source.
+
+    The number grows by one, or advanced subscribers of others drop all samples but the first.
+    """
+
+    def __init__(self, session: zenoh.Session, key: str, mime: str) -> None:
+        self._publisher, self._numbers = publisher(session, key, mime), count()
+
+    def put(self, payload: bytes) -> None:
+        self._publisher.put(payload, source_info=zenoh.SourceInfo(self._publisher.id, next(self._numbers)))
 
 
 def session_of(sample: zenoh.Sample) -> str | None:

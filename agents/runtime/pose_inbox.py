@@ -60,11 +60,7 @@ class NeighbourSubscription:
         """
         self.name, self.links, self._valid_box, self._rate = name, links, valid_box, rate
         key = keys.pose(name)
-        subscription: pubsub.Subscription = (
-            pubsub.pose_subscriber(session, key, depth)
-            if bell is None
-            else pubsub.RingingSubscriber(session, key, bell, depth)
-        )
+        subscription = pubsub.pose_subscriber(session, key, depth, bell=bell)
         self._poses = pubsub.Inbox(subscription, messages.Pose, keys=keys)
         self.take = self._poses.take  # the next queued sample, or None
         self._token = keys.alive(name)

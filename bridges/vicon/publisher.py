@@ -220,11 +220,10 @@ def serve(launch: ViconLaunch) -> int:
         keys, robots = Keys(launch.realm), list(subjects)
         farewell = Farewell(session, keys, robots, lost)
         mime = messages.MIME["json"]
-        publishers = {robot: pubsub.publisher(session, keys.position(robot), mime) for robot in robots}
+        publishers = {robot: pubsub.NumberedPublisher(session, keys.position(robot), mime) for robot in robots}
 
         def publish(position: messages.Position) -> None:
-            publisher = publishers[position.robot]
-            publisher.put(messages.encode(position), source_info=pubsub.source_of(publisher))
+            publishers[position.robot].put(messages.encode(position))
 
         made = Bridge(host, port, PoseFilter(subjects, print_line), publish, print_line)
         declared += [farewell, made]

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 import time
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import islice
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 app: Final = typer.Typer()
 
 POLL_S: Final = 0.02
+LAST_S: Final = 0.5  # limit for the answers with last poses: a frozen robot gives none
 WINDOW_S: Final = 1.0
 DEPTH: Final = 8192  # samples between two polls
 
@@ -166,27 +168,43 @@ def echo(
     """Print the samples of a key, the last poses first."""
     import zenoh
 
-    from agents.network.pubsub import pose_subscriber
-    from agents.network.session import received
-
     expression = key_expression(key)
     deadline = math.inf if seconds is None else time.monotonic() + seconds
-    left = math.inf if count is None else count
-    with session("echo", connect, lab, identity) as opened, pose_subscriber(opened, expression, DEPTH) as samples:
-        while left > 0 and time.monotonic() < deadline:
-            for sample in received(samples.handler):
-                deleted = sample.kind == zenoh.SampleKind.DELETE
-                text = "(deleted)" if deleted else readable(sample.payload.to_bytes(), str(sample.encoding))
-                print(f"{printable(str(sample.key_expr))} {text}", flush=True)
-                left -= 1
-                if left <= 0:
-                    return
+    with session("echo", connect, lab, identity) as opened:
+        for sample in islice(_samples(opened, expression, deadline), count):
+            deleted = sample.kind == zenoh.SampleKind.DELETE
+            text = "(deleted)" if deleted else readable(sample.payload.to_bytes(), str(sample.encoding))
+            print(f"{printable(str(sample.key_expr))} {text}", flush=True)
+
+
+def _samples(session: zenoh.Session, expression: str, deadline: float) -> Iterator[zenoh.Sample]:
+    """Samples of a key until `deadline` [monotonic s], first the last value of each publisher that keeps one.
+
+    The subscriber is plain: an advanced one drops samples with a source number or a stamp that does not grow.
+    """
+    from agents.network.pubsub import last_values, subscriber
+    from agents.network.session import received
+
+    with subscriber(session, expression, DEPTH) as live:
+        kept = last_values(session, expression, LAST_S)
+        yield from kept
+        known = set(map(_identity, kept))
+        while time.monotonic() < deadline:
+            yield from (sample for sample in received(live.handler) if _identity(sample) not in known)
             time.sleep(POLL_S)
+
+
+def _identity(sample: zenoh.Sample) -> tuple[str, ...]:
+    """Words by which a kept sample is recognised: a cache keeps numbered samples, or stamped ones."""
+    source = sample.source_info
+    if source is None:
+        return str(sample.key_expr), str(sample.timestamp)
+    return str(sample.key_expr), str(source.source_id), str(source.source_sn)
 
 
 @dataclass
 class Rate:
-    """Rate of a key in a window: [1/s], [bytes/s], and its intervals [s] (NaN when there are none)."""
+    """Rate of a key in a window: [1/s], [bytes/s], its intervals [s] (NaN when there are none), and its silence [s]."""
 
     key: str
     hz: float
@@ -195,11 +213,13 @@ class Rate:
     sigma: float
     shortest: float
     longest: float
+    silence: float  # since the last sample
 
     def __str__(self) -> str:
         times = (self.mean, self.sigma, self.shortest, self.longest)
         shown = " ".join(f"{'-' if math.isnan(value) else f'{value * 1e3:.2f}':>9}" for value in times)
-        return f"{self.hz:8.2f} {self.bytes_per_s:10.0f} {shown}  {self.key}"
+        silent = "" if self.hz else f"  silent for {self.silence:.0f} s"
+        return f"{self.hz:8.2f} {self.bytes_per_s:10.0f} {shown}  {self.key}{silent}"
 
 
 HEADING: Final = "      Hz    bytes/s   mean ms      σ ms    min ms    max ms  key"
@@ -212,21 +232,27 @@ class Cadence:
     _last: dict[str, float] = field(default_factory=dict)
     _samples: defaultdict[str, list[tuple[float, int]]] = field(default_factory=lambda: defaultdict(list))
 
-    def add(self, key: str, stamp: float, size: int) -> None:
-        """A sample of `size` bytes, stamped [s]."""
-        self._samples[key].append((stamp - self._last.get(key, math.nan), size))
-        self._last[key] = stamp
+    def add(self, key: str, arrived: float, size: int) -> None:
+        """A sample of `size` bytes, which arrived at `arrived` [s]."""
+        self._samples[key].append((arrived - self._last.get(key, math.nan), size))
+        self._last[key] = arrived
 
-    def window(self, length_s: float) -> list[Rate]:
-        """The rates of the window of this length that ends now, by key; the next window begins."""
+    def window(self, length_s: float, now: float) -> list[Rate]:
+        """The rates of the window of this length that ends at `now` [s], by key; the next window begins.
+
+        A key that has fallen silent keeps its row.
+        """
         import statistics
 
         rates = []
         for key in sorted(self._last):
             samples = self._samples.pop(key, [])
             gaps = [gap for gap, _ in samples if not math.isnan(gap)]
-            times = [of(gaps) if gaps else math.nan for of in (statistics.fmean, statistics.pstdev, min, max)]
-            rates.append(Rate(key, len(samples) / length_s, sum(size for _, size in samples) / length_s, *times))
+            mean, sigma, shortest, longest = (
+                of(gaps) if gaps else math.nan for of in (statistics.fmean, statistics.pstdev, min, max)
+            )
+            size, silence = sum(size for _, size in samples), max(0.0, now - self._last[key])
+            rates.append(Rate(key, len(samples) / length_s, size / length_s, mean, sigma, shortest, longest, silence))
         return rates
 
 
@@ -242,26 +268,28 @@ def hz(
 ) -> None:
     """Print the rate, bytes and intervals of each key, second by second."""
     import msgspec
-
-    from agents.network.pubsub import subscriber
-    from agents.network.session import received
+    from zenoh.handlers import Callback
 
     expression = key_expression(key)
     cadence = Cadence()
-    with session("hz", connect, lab, identity) as opened, subscriber(opened, expression, DEPTH) as samples:
+    arrived = deque[tuple[str, float, int]](maxlen=DEPTH)
+
+    def note(sample: zenoh.Sample) -> None:  # in the receiving thread: this process's poll is no arrival
+        arrived.append((str(sample.key_expr), time.monotonic(), len(sample.payload)))
+
+    with session("hz", connect, lab, identity) as opened:
+        subscriber = opened.declare_subscriber(expression, Callback(note, indirect=False))
         if not as_json:
             print(HEADING, flush=True)
         began = printed = time.monotonic()
         end = math.inf if seconds is None else began + seconds
         while printed < end:
+            time.sleep(POLL_S)
             now = time.monotonic()
-            for sample in received(samples.handler):
-                stamp = sample.timestamp
-                # the router's stamp, which this process cannot delay
-                at = now if stamp is None else stamp.get_time_as_ntp64().as_nanos() / 1e9
-                cadence.add(str(sample.key_expr), at, len(sample.payload))
+            while arrived:
+                cadence.add(*arrived.popleft())
             if now - printed >= WINDOW_S or now >= end:
-                for rate in cadence.window(now - printed):
+                for rate in cadence.window(now - printed, now):
                     print(msgspec.json.encode(rate).decode() if as_json else printable(str(rate)), flush=True)
                 printed = now
-            time.sleep(POLL_S)
+        subscriber.undeclare()

@@ -14,7 +14,6 @@ from math import inf, isfinite
 from typing import Final
 
 import msgspec
-import zenoh
 
 from agents.clock import Clock
 from agents.network import messages, pubsub, validation
@@ -287,8 +286,8 @@ class Publications:
         mime, measured = messages.MIME[self._encoding], frozenset(plan.externally_measured)
         carried = [row for row, here in enumerate(population.carried) if here]
 
-        def publishers(key: Callable[[str], str], rows: Iterable[int]) -> dict[int, zenoh.Publisher]:
-            return {row: pubsub.publisher(session, key(names[row]), mime) for row in rows}
+        def publishers(key: Callable[[str], str], rows: Iterable[int]) -> dict[int, pubsub.NumberedPublisher]:
+            return {row: pubsub.NumberedPublisher(session, key(names[row]), mime) for row in rows}
 
         self._positions = publishers(keys.position, (row for row in carried if names[row] not in measured))
         self._truths = publishers(keys.truth, carried)
@@ -303,11 +302,12 @@ class Publications:
         states, names, encoding = self._population.states, self._names, self._encoding
         for row, publisher in self._positions.items():
             state = states[row]
-            _publish(publisher, messages.position(names[row], stamp, *_rounded(state.position, state.yaw)), encoding)
+            position = messages.position(names[row], stamp, *_rounded(state.position, state.yaw))
+            publisher.put(messages.encode(position, encoding))
         if self._ticks % self._truth_every == 0:
             for row, publisher in self._truths.items():
-                truth = _rounded(states[row].true_position, states[row].true_yaw)
-                _publish(publisher, messages.position(names[row], stamp, *truth), encoding)
+                truth = messages.position(names[row], stamp, *_rounded(states[row].true_position, states[row].true_yaw))
+                publisher.put(messages.encode(truth, encoding))
         self._ticks += 1
         for row, publisher in self._ranges.items():
             scan = states[row].scan
@@ -339,7 +339,3 @@ class _Mirror:
 def _rounded(position: Vector, yaw: float) -> tuple[Vector, float]:
     """A pose in micrometres and microradians, still in metres and radians."""
     return (round(position[0], 6), round(position[1], 6), round(position[2], 6)), round(yaw, 6)
-
-
-def _publish(publisher: zenoh.Publisher, message: messages.Position, encoding: messages.Encoding) -> None:
-    publisher.put(messages.encode(message, encoding), source_info=pubsub.source_of(publisher))

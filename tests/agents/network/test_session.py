@@ -79,6 +79,37 @@ def test_pose_said_while_the_router_was_down_arrives(two, router, eventually):
     assert connected(sender)
 
 
+@pytest.mark.parametrize("bell", [None, pubsub.Bell()])
+def test_a_constant_source_number_loses_no_sample(bell, eventually):
+    with zenoh.open(config(settings("peer"))) as session:
+        poses, got = pubsub.pose_subscriber(session, "park/*/pose", bell=bell), []
+        plain, numbered = session.declare_publisher(POSE), pubsub.pose_publisher(session, "park/CF02/pose", JSON)
+        source = zenoh.SourceInfo(plain.id, 0)  # as another program may number its samples
+        for value in (b"1", b"2", b"3"):
+            plain.put(value, source_info=source)
+            numbered.put(b"numbered " + value)
+            plain.put(b"unnumbered " + value)
+        eventually(lambda: got.extend(payloads(poses.handler)) or len(got) == 9)
+        assert set(got) == {
+            b"1",
+            b"2",
+            b"3",
+            *(word + b" %d" % k for word in (b"numbered", b"unnumbered") for k in (1, 2, 3)),
+        }
+        poses.undeclare()
+
+
+def test_numbers_of_a_plain_publisher_grow(eventually):
+    with zenoh.open(config(settings("peer"))) as session:
+        samples = pubsub.subscriber(session, POSE)
+        named = pubsub.NumberedPublisher(session, POSE, JSON)
+        for value in (b"1", b"2", b"3"):
+            named.put(value)
+        got = list(received(samples.handler))
+        assert [sample.source_info.source_sn for sample in got] == [0, 1, 2]
+        assert {pubsub.session_of(sample) for sample in got} == {str(session.zid())}
+
+
 def test_rings_before_a_wait_are_one():
     bell = pubsub.Bell()
     bell.ring()

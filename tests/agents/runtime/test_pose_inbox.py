@@ -2,6 +2,7 @@
 
 import random
 from copy import copy
+from itertools import count
 from math import nan, pi
 from types import SimpleNamespace
 
@@ -34,6 +35,7 @@ class Receiver:
 
     def __init__(self, net: network.Net, delay_s: float = 0.0) -> None:
         self.net, self.robot, self.t = net, Robot(Plan(pair()).assignment("A")), 0.0
+        self._numbers = count()
         conditions = [[Conditions(delay=delay_s)]] if delay_s else ()
         self.inbox = PoseInbox(net.session, KEYS, [self.robot], valid_box=(5.0, 5.0, 5.0), conditions=conditions)
         (self.neighbour,) = self.robot.neighbours.all
@@ -42,7 +44,8 @@ class Receiver:
     def add(self, key: str, payload: bytes = b"", *, gone: bool = False, session: str | None = None) -> None:
         sample = network.Sample(key, messages.JSON, payload, gone=gone)
         if session is not None:
-            sample.source_info = SimpleNamespace(source_id=SimpleNamespace(zid=session))
+            source = SimpleNamespace(zid=session)
+            sample.source_info = SimpleNamespace(source_id=source, source_sn=next(self._numbers))
         for channel in self.net.channels:
             if channel.expression.intersects(zenoh.KeyExpr(key)):
                 channel.add(sample)

@@ -4,6 +4,7 @@ import subprocess
 
 import msgspec
 import pytest
+from zenoh import SourceInfo
 
 from agents.errors import ExplainedError
 from agents.network.messages import Order
@@ -46,19 +47,19 @@ def test_payloads_become_one_harmless_line(payload, mime, line):
     assert readable(payload, mime) == line
 
 
-def test_cadence_counts_per_window_and_keeps_last_stamp():
+def test_cadence_counts_per_window_and_keeps_silent_keys():
     cadence = Cadence()
-    for stamp in (10.0, 10.1, 10.3):
-        cadence.add("b", stamp, 50)
+    for arrived in (10.0, 10.1, 10.3):
+        cadence.add("b", arrived, 50)
     cadence.add("a", 10.0, 7)
-    a, b = map(str, cadence.window(0.5))
+    a, b = map(str, cadence.window(0.5, 10.4))
     assert a.split() == ["2.00", "14", "-", "-", "-", "-", "a"]
     assert b.split() == ["6.00", "300", "150.00", "50.00", "100.00", "200.00", "b"]
     cadence.add("b", 11.3, 50)
-    a, b = map(str, cadence.window(0.5))
+    a, b = map(str, cadence.window(0.5, 12.0))
     assert b == "    2.00        100   1000.00      0.00   1000.00   1000.00  b"
     assert len(b) == len(HEADING) - 2
-    assert a.split() == ["0.00", "0", "-", "-", "-", "-", "a"]
+    assert a.split() == ["0.00", "0", "-", "-", "-", "-", "a", "silent", "for", "2", "s"]
 
 
 @pytest.fixture
@@ -93,13 +94,19 @@ def test_keys_shows_who_holds_what(router, robot, pose):
         del held
 
 
+@pytest.mark.mechanism("echo")
 @pytest.mark.system
-def test_echo_prints_last_pose_and_then_new_ones(router, pose):
+def test_echo_prints_every_sample_of_every_publisher(router, robot, pose):
     pose.put(b'{"x": 1}')
-    with started(*GUARD, *LISTEN, router.endpoint, "-n", "2") as listening:
+    plain = robot.declare_publisher("park/KH01/pose")
+    with started(*GUARD, *LISTEN, router.endpoint, "-n", "5") as listening:
         assert listening.stdout.readline() == 'park/CF01/pose {"x":1}\n'
         pose.put(msgspec.msgpack.encode({"x": 2.5}), encoding=MSGPACK)
         assert listening.stdout.readline() == 'park/CF01/pose {"x":2.5}\n'
+        for number in (0, 0, None):  # as other programs may number their samples
+            source = None if number is None else SourceInfo(plain.id, number)
+            plain.put(b"3", source_info=source)
+            assert listening.stdout.readline() == 'park/KH01/pose "3"\n'
         assert listening.stdout.read() == ""
         assert listening.wait(30) == 0
 
@@ -123,13 +130,16 @@ def test_hz_measures_a_live_publisher(router, robot, capsys):
         assert measuring.stdout.readline() == HEADING + "\n"
         while measuring.poll() is None:
             state.put(b"x" * 100)
+            robot.delete("park/CF01/pose")
             subprocess.run(["true"], check=True)  # paces the loop
         lines = measuring.stdout.read().splitlines()
     assert measuring.returncode == 0
-    assert {line.split()[-1] for line in lines} == {"park/CF01/state"}
-    rate, speed, mean, _, shortest, longest = map(float, lines[0].split()[:-1])
+    assert {line.split()[-1] for line in lines} == {"park/CF01/state", "park/CF01/pose"}
+    rate, speed = map(float, lines[1].split()[:2])
     assert speed / rate == pytest.approx(100.0, rel=0.01)
-    assert shortest <= mean <= longest
+    for line in lines:
+        _, _, mean, _, shortest, longest = map(float, line.split()[:-1])
+        assert 0.0 <= shortest <= mean <= longest <= 1500.0
 
 
 NAMES = [f"CF{number:03}" for number in range(1, 51)]
