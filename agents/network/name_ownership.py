@@ -153,6 +153,7 @@ class OwnershipCheck:
         """Begin when the names are owned: liveliness keys `alive`, in a session with the lease `lease_s` [s]."""
         self._alive, self._stood_s, self._timing = alive, 0.5 * lease_s, timing
         self.awake_at = uptime()  # last run of the process [s]
+        self.linked = True  # whether the session had a router, or a neighbour in a mesh, at the last look
         self._taken = ""
         self._asking: threading.Thread | None = None
         self._anew = False
@@ -180,13 +181,19 @@ class OwnershipCheck:
         last, self.awake_at = self.awake_at, uptime()
         return self.awake_at - last >= self._stood_s
 
-    def wait_while_checking(self, session: zenoh.Session, ended: Callable[[], bool]) -> bool:
-        """Wait while a check runs, or for one if the process stood still since the last call; returns whether it did.
+    def check_return(self, session: zenoh.Session) -> bool:
+        """Whether the session is linked again after a look at which it was not: the names may be lost since."""
+        before, self.linked = self.linked, network.connected(session)
+        return self.linked and not before
 
-        For processes without a body, before they send anything: another process may send the same meanwhile. Raises
-        NameTaken as `finished`.
+    def wait_while_checking(self, session: zenoh.Session, ended: Callable[[], bool]) -> bool:
+        """Wait while a check runs; one begins if the process stood still since the last call, or was cut off until now.
+
+        For processes without a body, before they send anything: another process may send the same meanwhile. Returns
+        whether it waited. Raises NameTaken as `finished`.
         """
-        if self.check_standstill():
+        stood, back = self.check_standstill(), self.check_return(session)
+        if stood or back:
             self.begin(session)
         waited = False
         while not self.finished() and not ended():

@@ -13,6 +13,7 @@ import zenoh
 
 from agents.body.interface import Body
 from agents.decision.lifecycle import Phase
+from agents.network import session as network
 from agents.network.name_ownership import ANSWER_S, NameKeeper
 from agents.network.shutdown import FAREWELL_S, STOPPED_S
 from agents.robot import Robot
@@ -53,6 +54,7 @@ class Descent:
     ) -> None:
         self.begun = False  # the loop is over
         self.airborne = False  # a row flew at the last reading of its body, or took off since
+        self.asked_at = -inf  # end of the last wait for the owner of the names, on the clock `uptime` [s]
         self.reason_to_end: Callable[[], str | None] = lambda: None
         kinds = [robot.assignment.kind for robot in robots]
         self._robots, self._body, self._keeper, self._ticks = robots, body, keeper, ticks
@@ -67,22 +69,28 @@ class Descent:
         self.watchdog = Watchdog(body, self._everyone, alarm=alarm, silence_s=silence_s, down_s=down_s)
 
     def await_ownership(self) -> bool:
-        """Whether the process was suspended since the last call; if so, it has waited until the ownership was certain.
+        """Whether the process was suspended or cut off until now; if so, it has waited until its names were certain.
 
         While it waits it must not command its bodies, since another process may drive them. Without an answer those on
         wheels halt after `neighbour_timeout_s`. After `offline_s`, or `ANSWER_S` if the process is asked to end, all
-        land. The process then drives its bodies again, until it learns that they belong to another one.
+        land. The process then drives its bodies again, until it learns that they belong to another one. One that is cut
+        off again holds and lands by its decisions.
         """
-        ownership = self._keeper.ownership
-        if not ownership.check_standstill() or self.watchdog.tripped:  # the watchdog handles a loop that hangs
+        ownership, session = self._keeper.ownership, self.session
+        stood = ownership.check_standstill()
+        if self.watchdog.tripped:  # the watchdog handles a loop that hangs
+            return False
+        if ownership.check_return(session) or stood:
+            ownership.begin(session)
+        elif self._keeper.is_owner() or not ownership.linked:
             return False
         limits, drives = self._limits, self._on_wheels
-        woke, self._keeper.hands_off = self._ticks.elapsed(), True
-        ownership.begin(self.session)
-        while not self._keeper.is_owner():
-            waited = self._ticks.elapsed() - woke
+        began, self._keeper.hands_off = self._ticks.elapsed(), True
+        while not self._keeper.is_owner() and (stood or network.connected(session)):
+            waited = self._ticks.elapsed() - began
             if waited > limits.offline_s or (waited > ANSWER_S and self.reason_to_end() is not None):
-                self._recover(f"it stood still, and for {waited:.0f} s no router answers about the owner of its name")
+                what = "stood still" if stood else "was cut off"
+                self._recover(f"it {what}, and for {waited:.0f} s no router answers about the owner of its name")
                 break
             if drives and waited > limits.neighbour_timeout_s:
                 self._body.land(drives)
@@ -91,7 +99,17 @@ class Descent:
             time.sleep(self._ticks.period)
         ownership.check_standstill()
         self._keeper.hands_off = False
+        over = self._ticks.elapsed()
+        self.asked_at = self._ticks.zero + over
+        if not stood:  # the machine missed no deadline
+            self.leave_out(int((over - began) / self._ticks.period))
         return True
+
+    def leave_out(self, ticks: int) -> None:
+        """Leave out the next `ticks` on purpose: they do not count as missed."""
+        self._ticks.next += ticks * self._ticks.period
+        for robot in self._robots:
+            robot.tick += ticks
 
     def register(self, steps: ExitStack) -> None:
         """Register the steps of the end: land what still flies, stop it, end the watchdog, close the body."""

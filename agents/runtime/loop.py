@@ -356,7 +356,7 @@ class Runtime:
         rises = [row for row, robot in enumerate(robots) if robot.takes_off]
         if stale:  # the order is old now
             for row in rises:
-                robots[row].lifecycle.land("its process stood still at its take-off")
+                robots[row].lifecycle.land("its process stood still or was cut off at its take-off")
         elif rises and not overruled:
             self._descent.airborne = True
             body.takeoff(rises, [robots[row].assignment.hover for row in rises])
@@ -418,10 +418,7 @@ class Runtime:
 
     def _yield_after_stop(self) -> None:
         """Sleeps, so that other processes get the CPU to stop their motors."""
-        ticks = ceil(STOP_YIELD_S / self._dt)
-        self.ticks.next += ticks * self._dt
-        for robot in self.robots:
-            robot.tick += ticks
+        self._descent.leave_out(ceil(STOP_YIELD_S / self._dt))
         time.sleep(STOP_YIELD_S)
 
     def _skip_ticks(self, ticks: int) -> None:
@@ -439,9 +436,8 @@ class Runtime:
         """Time [s] since which no router answers; infinity while one does."""
         self._router_due = t + ROUTER_S
         silent_since = self._router.silent_since(t, self._neighbours.arrived)
-        if self.health.offline_since < inf and silent_since == inf:
-            self.keeper.ownership.begin(self._session)  # it was cut off
-        self.keeper.is_owner()
+        if self._descent.asked_at - self.ticks.zero < self.health.offline_since < inf == silent_since:
+            self.keeper.ownership.begin(self._session)  # the router is back
         return silent_since
 
     def _leave_formation(self, why: str) -> None:

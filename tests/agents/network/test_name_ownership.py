@@ -22,7 +22,7 @@ from tests.agents.runtime.process import DRONE, QUICK, Airborne, process
 from tests.cases import for_each
 from tests.conftest import RouterProcess
 from tests.fuzz.messages import sent
-from tests.network import Attentive, Net, Reply, Sample
+from tests.network import Attentive, Mute, Net, Reply, Sample
 from tests.small import pair
 from tests.waiting import ManualClock, until
 
@@ -256,6 +256,38 @@ def test_displaced_owner_leaves_the_body_alone(way, monkeypatch):
     assert (told[0] > 0) == (way != "opening")
     if way != "cut off":
         assert body.commands == told[0]
+
+
+@pytest.mark.parametrize("taken", [True, False], ids=["taken", "free"])
+def test_link_that_is_back_waits_for_owner(taken, monkeypatch):
+    body, keys = Commanded(), Keys()
+    marks: list[tuple[int, int]] = []  # commands and puts so far: at the loss of the link, and at its return
+    puts: list[bytes] = []
+
+    def linked(_session: object) -> bool:
+        away = bool(marks) and body.reads < 20
+        if not away and len(marks) == 1:
+            marks.append((body.commands, len(puts)))
+            net.replies = [Reply(Sample(Keys.life(keys.alive("F"), "beef"), "", b""), good=True)] * taken
+        return not away
+
+    def looks() -> None:
+        if not marks:
+            marks.append((body.commands, len(puts)))
+        elif (len(marks) == 2 and body.commands > marks[1][0]) or body.reads > 200:
+            raise OSError("it commands again")
+
+    body.looks = looks
+    monkeypatch.setattr(Mute, "put", lambda _, payload, **__: puts.append(payload))
+    with Net().worn() as net:
+        monkeypatch.setattr(network, "connected", linked)
+        runtime = process(DRONE, body, ownership=OwnershipTiming(vanish_s=0.0), descent=QUICK)
+        with pytest.raises(NameTaken if taken else OSError, match="has taken" if taken else "commands again"):
+            runtime.run()
+    lost, back = marks
+    assert lost[0] < back[0], "it holds by its decisions while it is cut off"
+    if taken:
+        assert (body.calls, body.commands, len(puts)) == (["open"], *back)
 
 
 def test_late_alarm_leaves_the_tokens(monkeypatch):
