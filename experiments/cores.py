@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
@@ -21,13 +22,26 @@ def cores() -> int:
 
 
 @contextmanager
-def pool(count: int) -> Iterator[ProcessPoolExecutor]:
-    """Pool of `count` processes, started as the work comes in; the end of the block ends them, and their work."""
+def pool(count: int) -> Iterator[ProcessPoolExecutor | None]:
+    """Pool of `count` processes, started as the work comes in; the end of the block ends them, and their work.
+
+    None for a single process, and with a note where the system has no semaphores: the work is then done in this one.
+    """
     others = frozenset(multiprocessing.active_children())
     context = multiprocessing.get_context("spawn")  # a fork would take our threads' locks along
+    try:
+        made = ProcessPoolExecutor(count, context, initializer=_prepare) if count > 1 else None
+    except (OSError, ImportError, NotImplementedError) as error:  # a container without /dev/shm, or with a full one
+        text = (
+            f"no processes can share work here ({error}; is there a /dev/shm?): all is done in one, which takes longer"
+        )
+        print(f"zenpark: {text}", file=sys.stderr)
+        made = None
+    if made is None:
+        yield None
+        return
     before = {name: os.environ[name] for name in ONE_THREAD if name in os.environ}
     os.environ.update(dict.fromkeys(ONE_THREAD, "1"))  # for the processes
-    made = ProcessPoolExecutor(count, context, initializer=_prepare)
     try:
         yield made
     finally:

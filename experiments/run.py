@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import nullcontext, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import product
@@ -30,8 +30,9 @@ from experiments.file.problems import refusal
 from experiments.metrics import comparable, measure
 from experiments.metrics.results import CaseMetrics
 from experiments.recording import playback
+from experiments.recording.cleaning import in_use
 from experiments.recording.reader import RecordingError
-from experiments.recording.run_folder import METRICS, SOURCE, case_figures, differences_from_first, read_origin
+from experiments.recording.run_folder import METRICS, SOURCE, SWEEP, case_figures, differences_from_first, read_origin
 from experiments.recording.trace import Trace
 from experiments.report import metrics_files
 from experiments.virtual_time import simulation
@@ -153,6 +154,14 @@ def simulate(
     return simulate_seeds(read, [read.experiment.seed if seed is None else seed], cases=cases, folder=folder)[0]
 
 
+class Unrecorded(RecordingError):
+    """Recordings that the disk did not take; `runs` have all figures."""
+
+    def __init__(self, why: str, runs: list[Run]) -> None:
+        super().__init__(why)
+        self.runs = runs
+
+
 def simulate_seeds(
     read: Document,
     seeds: Sequence[int],
@@ -167,10 +176,11 @@ def simulate_seeds(
 
     Many seeds are shared between processes (as many as this machine has cores), which import the script: there under
     `if __name__ == "__main__"`. `progress` is called repeatedly. `watch` gives for each case what the simulation of the
-    first seed calls, see `simulation.simulate`.
+    first seed calls, see `simulation.simulate`. Raises Unrecorded, at the end, for recordings that a disk did not take.
     """
+    unrecorded = ""
     _refuse_too_much(read.plan, len(seeds))
-    folder = None if folder is None else Path(folder)
+    folder = None if folder is None else Path(folder).expanduser()
     if folder is not None:
         with suppress(OSError):  # the recording says so
             folder.mkdir(parents=True, exist_ok=True)
@@ -178,7 +188,7 @@ def simulate_seeds(
     runs = [Run(read.experiment.title, seed, {}, {}, folder, read.listing) for seed in seeds]
     first, *others = runs
     count = min(_profitable_processes(works, len(others)) if processes is None else processes, len(works) * len(others))
-    with pool(count) if count > 1 else nullcontext() as workers:
+    with pool(count) as workers:
         shared = dict[tuple[str, int], Future[Flown]]()
         if workers is not None:
             for name, run in product(works, others):
@@ -191,13 +201,22 @@ def simulate_seeds(
             first.traces[name] = logbook.trace()
             first.metrics[name] = measure.measure(first.traces[name])
             if folder is not None:
-                logbook.record(folder / f"{name}.mcap", read.text)
+                file = folder / f"{name}.mcap"
+                try:
+                    logbook.record(file, read.text)
+                except RecordingError as error:
+                    if not isinstance(error.__cause__, OSError):
+                        raise
+                    file.unlink(missing_ok=True)  # a part of it is of no use, and figures may need the room
+                    unrecorded = unrecorded or f"{file}: cannot be written: {error.__cause__.strerror}"
             for number, run in enumerate(others, 2):
                 future = shared.get((name, run.seed))
                 found = _flown(name, plan, run.seed, passing) if future is None else _result(future)
                 run.traces[name], run.metrics[name] = found
                 passing(duration_s * number / len(seeds))
             passing(math.inf)
+    if unrecorded:
+        raise Unrecorded(f"{unrecorded}; make room there, or choose another place", runs)
     return runs
 
 
@@ -246,15 +265,21 @@ def reopen(folder: str | Path) -> Run:
 
     Raises RecordingError if there is no recording, or one cannot be read.
     """
-    folder = Path(folder)
+    folder = Path(folder).expanduser()
     if not folder.is_dir():
         raise RecordingError(f"{folder}: is no folder of a run; `./zenpark run` prints the folder that it makes")
+    if in_use(folder):
+        raise RecordingError(
+            f"{folder}: this run is still up, and has its report at its end; `./zenpark view {folder}` shows it now"
+        )
     figures = case_figures(folder / METRICS)
     order = [each.case for each in figures]  # a copy's files have other times
     files = sorted(folder.glob("*.mcap"), key=lambda file: file.stat().st_mtime_ns)
     files.sort(key=lambda file: order.index(file.stem) if file.stem in order else len(order))
     if not files:
-        raise RecordingError(f"{folder}: holds no recording (.mcap); name the folder of a run")
+        of_sweep = f"is that of a sweep, which keeps no recordings; `./zenpark report {folder}` draws its figures"
+        what = of_sweep if (folder / SWEEP).is_file() else "holds no recording (.mcap); name the folder of a run"
+        raise RecordingError(f"{folder}: {what}")
     told = origin.failures if (origin := read_origin(folder)) else []
     found = read_back(folder, {file.stem: file for file in files}, [], told)
     seeds = {each.seed for each in figures}

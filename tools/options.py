@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import os
 import re
 import sys
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -150,7 +151,14 @@ Cases = Annotated[
     Option("--case", metavar="NAME", help="Only this case; may be repeated.", autocompletion=completion.cases),
 ]
 Lifeline = Annotated[bool, Option("--lifeline", help="End when standard input ends or falls silent.")]
-Out = Annotated[str | None, Option(metavar="FOLDER", help="Folder for the results. [runs/...]")]
+
+
+def at_home(path: str | None) -> str | None:
+    """A path on the command line with its `~`, which a shell leaves in quotes and behind `=`."""
+    return path and os.path.expanduser(path)  # noqa: PTH111 - a name of no user stays
+
+
+Out = Annotated[str | None, Option(metavar="FOLDER", help="Folder for the results. [runs/...]", callback=at_home)]
 Bodies = Annotated[
     str | None, Option(metavar="twin|world|protocol", help="Bodies: a twin per robot, one world, or protocol twins.")
 ]

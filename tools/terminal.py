@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from typing import TextIO
+import os
+import sys
+from collections.abc import Collection, Iterator
+from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout, suppress
+from typing import Any, TextIO, cast
 from unicodedata import category
 
 
@@ -25,3 +28,41 @@ def listed(names: Collection[str], most: int) -> str:
     """Names in order with commas between them; of more than `most` the first `most`, and the number of the others."""
     first = ", ".join(sorted(names)[:most])
     return first if len(names) <= most else f"{first} and {len(names) - most} more (--json names all)"
+
+
+class _Lasting:
+    """Stream that drops what cannot be written: its reader has gone, or its disk is full."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def __getattr__(self, name: str) -> Any:  # noqa: ANN401 - whatever the stream has
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        """Write a text, or drop it."""
+        with self._dropping():
+            self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        """Flush, or drop what is left."""
+        with self._dropping():
+            self._stream.flush()
+
+    @contextmanager
+    def _dropping(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError:
+            with suppress(OSError, ValueError):  # what is buffered would fail again, at the end of the process too
+                os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
+
+
+@contextmanager
+def lasting_console() -> Iterator[None]:
+    """Inside, whatever is printed cannot end the process: robots fly on without a console."""
+    with ExitStack() as both:
+        both.enter_context(redirect_stdout(cast(TextIO, _Lasting(sys.stdout))))
+        both.enter_context(redirect_stderr(cast(TextIO, _Lasting(sys.stderr))))
+        yield

@@ -46,6 +46,15 @@ def locked(folder: Path, how: int) -> Iterator[bool]:
         os.close(descriptor)
 
 
+def in_use(folder: Path) -> bool:
+    """Whether a run is at work in a folder, as far as its file system has locks."""
+    try:
+        with locked(folder, fcntl.LOCK_EX | fcntl.LOCK_NB):
+            return False
+    except InUse:
+        return True
+
+
 def removable(folder: Path) -> bool:
     """Whether a folder is that of a run that zenpark made: what else holds an experiment file is a user's own."""
     origin = read_origin(folder)

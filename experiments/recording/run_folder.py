@@ -6,7 +6,7 @@ import itertools
 import shutil
 import tomllib
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -22,6 +22,7 @@ RUNS: Final = Path("runs")
 SOURCE: Final = KEPT
 ORIGIN: Final = "run.json"
 METRICS: Final = "metrics.json"
+SWEEP: Final = "sweep.json"  # in the folder of a sweep instead
 LATEST: Final = 1e11  # [s] UTC that a date can be made of
 
 
@@ -56,10 +57,24 @@ def read_origin(folder: Path) -> RunOrigin | None:
 
 
 def keep_origin(folder: Path, origin: RunOrigin) -> None:
-    """Write the origin of a run into its folder."""
+    """Write the origin of a run into its folder; the former stays if there is no room."""
     fresh = folder / f"{ORIGIN}.new"
-    fresh.write_bytes(msgspec.json.format(msgspec.json.encode(origin), indent=2) + b"\n")
-    fresh.replace(folder / ORIGIN)
+    try:
+        fresh.write_bytes(msgspec.json.format(msgspec.json.encode(origin), indent=2) + b"\n")
+        fresh.replace(folder / ORIGIN)
+    except OSError:
+        fresh.unlink(missing_ok=True)
+        raise
+
+
+@contextmanager
+def naming(folder: Path) -> Iterator[None]:
+    """Inside, errors of writing name a place: the system names none where a disk is full."""
+    try:
+        yield
+    except OSError as error:
+        error.filename = error.filename or str(folder)
+        raise
 
 
 def check_folder(out: str | None) -> None:
@@ -109,8 +124,8 @@ def _folder_of_now(runs: Path, name: str) -> Path:
 
 
 def remove_unused(folder: Path) -> None:
-    """Removes the folder of a run without a recording and without a process's log."""
-    if not any(folder.glob("*.mcap")) and not any(folder.glob("logs/*")):
+    """Removes the folder of a run without a recording, without figures and without a process's log."""
+    if not any(any(folder.glob(kept)) for kept in ("*.mcap", "logs/*", METRICS)):
         shutil.rmtree(folder, ignore_errors=True)
 
 
@@ -128,6 +143,7 @@ class PastRun(msgspec.Struct, frozen=True):
     remarks: dict[str, dict[int, str]] = {}
     lengths: dict[str, dict[int, float]] = {}  # of each case by seed [s]; those of another version are not known
     lost: int = 0  # poses that were sent and never received, of all cases
+    fault: str = ""  # why figures are missing, and the remedy
 
     def matches(self, words: Sequence[str]) -> bool:
         """Whether each word is one of its tags, or stands in its folder's name, its title or a case, in any case."""
@@ -177,7 +193,9 @@ def _past_run(folder: Path) -> PastRun | None:
     except OSError:  # removed meanwhile
         return None
     megabytes, lost = 1e-6 * _size(folder), sum(each.lost for each in cases)
-    return PastRun(str(folder), origin, made, megabytes, recorded, seeds, figures, remarks, lengths, lost)
+    damaged = not cases and (folder / METRICS).is_file()
+    fault = f"{METRICS} cannot be read: `./zenpark report {folder}` makes it again" if damaged else ""
+    return PastRun(str(folder), origin, made, megabytes, recorded, seeds, figures, remarks, lengths, lost, fault)
 
 
 def _size(folder: Path) -> int:

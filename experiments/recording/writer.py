@@ -6,6 +6,7 @@ import struct
 import zlib
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from io import FileIO
@@ -160,7 +161,8 @@ class McapFile:
 
     def close(self) -> None:
         """Close the file of the indices, which is then deleted, and the file itself."""
-        self._indices.close()
+        with suppress(OSError):  # on a full disk; it is not read any more
+            self._indices.close()
         self._file.close()
 
     def _put(self, record: McapRecord) -> tuple[int, int]:

@@ -25,6 +25,7 @@ from agents.plugins.registry import did_you_mean
 from experiments.file.document import Document, chosen, load
 from experiments.file.problems import refusal
 from experiments.metrics.metric import short_name, swept_metrics
+from experiments.recording.run_folder import naming
 from experiments.sweep.plan import FIRST_TUNING, Axis, Cell, arguments, combination, compared, seeds_of
 from experiments.sweep.store import Store
 from experiments.sweep.sweep import SweepRunner, folder_of, origin
@@ -193,7 +194,7 @@ def tune(
     tried: list[CellRow] = []
     selected: list[CellRow] = []
     plan: dict[tuple[str, str], Cell] = {}
-    with Store(folder) as store:
+    with naming(folder), Store(folder) as store:
         notes = store.changed_since(origin(read, [read.cases()[name] for name in (reference, *ranges)]))
         with workers(scheduler, processes) as working:
             runner = SweepRunner(store, working)

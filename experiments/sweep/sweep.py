@@ -29,7 +29,7 @@ from experiments.file import document
 from experiments.file.document import Document, load
 from experiments.file.problems import refusal
 from experiments.metrics.metric import unusable_metrics
-from experiments.recording.run_folder import RUNS
+from experiments.recording.run_folder import RUNS, naming
 from experiments.sweep import table
 from experiments.sweep.plan import Axis, Cell, arguments, cells, seeds_of
 from experiments.sweep.runs import RunMetrics, code_of, lean_enough
@@ -113,7 +113,7 @@ def sweep(
     seeds = seeds_of(words.get("seeds"), read.experiment.seed)
     plan = cells(read, str(file), settings, axes, cases)
     folder = Path(out) if out is not None else folder_of(read, axes, "sweep")
-    with Store(folder) as store:
+    with naming(folder), Store(folder) as store:
         notes = store.changed_since(origin(read, [cell.plan for cell in plan]))
         with workers(scheduler, processes) as working:
             runner = SweepRunner(store, working, most_seeds)

@@ -85,12 +85,10 @@ def workers(scheduler: str | None, processes: int | None) -> AbstractContextMana
 def _local(processes: int | None) -> Iterator[Workers]:
     """Processes on this machine, one for each core if no number is given; with 1 the work is done in this one."""
     count = cores() if processes is None else processes
-    if count == 1:
-        yield Workers(None, lambda: 1, "this machine")
-        return
     with pool(count) as made:
+        at_once = 1 if made is None else count
         words = f"a process of the sweep {KILLED} (then: fewer --processes)"
-        yield Workers(made, lambda: count, "this machine", (BrokenProcessPool,), lambda _: words)
+        yield Workers(made, lambda: at_once, "this machine", (BrokenProcessPool,), lambda _: words)
 
 
 @contextmanager

@@ -4,14 +4,17 @@ import os
 import re
 import sys
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 
+from experiments import cores
 from experiments.check.check import check
-from experiments.file.document import read
+from experiments.file.document import loads, read
 from experiments.metrics.measure import measure
 from experiments.recording.reader import RecordingError
-from experiments.run import CHECKOUT, FigureSet, Run, reopen, show
+from experiments.run import CHECKOUT, FigureSet, Run, reopen, show, simulate_seeds
+from experiments.sweep.workers import workers
 from tests.experiments.traces import crowd
 from tools.commands import run as commands
 
@@ -128,3 +131,14 @@ def test_jupyter_shows_run_figures_and_the_reread_run(tmp_path, monkeypatch):
     assert shown[2]["text/html"].count("<svg") >= 4
     assert shown[3]["text/html"] == shown[0]["text/html"]
     assert all(len(each["text/plain"]) < 2000 for each in shown)
+
+
+def test_without_shared_memory_one_process_does_all(monkeypatch, capsys):
+    """As in a container without /dev/shm."""
+    monkeypatch.setattr(cores, "ProcessPoolExecutor", Mock(side_effect=FileNotFoundError(2, "No such file")))
+    with workers(None, 4) as working:
+        assert (working.executor, working.count()) == (None, 1)
+    assert "all is done in one" in capsys.readouterr().err
+    runs = simulate_seeds(loads(DUEL, "duration_s=0.2"), [1, 2, 3], processes=3)
+    assert [run.seed for run in runs] == [1, 2, 3]
+    assert all(run.metrics for run in runs)

@@ -17,7 +17,7 @@ from experiments.real_time.conductor.run_view import Progress, RobotView
 from tools import consent
 from tools.options import open_in_browser, print_result, warn
 from tools.progress import Bar, Lines, ProgressTable
-from tools.terminal import printable, say
+from tools.terminal import lasting_console, printable, say
 
 ESCAPES = "\x1b]0;owned\x07\x1b[2J\r\x9b2J\u202e"
 
@@ -84,6 +84,25 @@ def test_passing_bar_appears_late_and_counts_from_beginning(monkeypatch, clock):
         bar.show("event", 40, 60)
     assert "40/60" in screen.getvalue()
     assert "0:00:03" in screen.getvalue()
+
+
+@pytest.mark.parametrize("kind", [Lines, ProgressTable])
+def test_console_that_goes_away_ends_nothing(kind, monkeypatch):
+    read, write = os.pipe()
+    os.close(read)
+    with os.fdopen(write, "w", buffering=1) as gone, monkeypatch.context() as patched:
+        for name in ("stdout", "stderr"):
+            patched.setattr(sys, name, gone)
+        with pytest.raises(BrokenPipeError):
+            print("x", flush=True)
+        progress = Progress("event", "formation", 4.0, 15.0, {"KH01": RobotView(error=0.123)})
+        progress.events.append(messages.Event(progress.clock.utc(), "output", "lab1/CF01", "airborne"))
+        with lasting_console(), kind() as show:
+            show(progress)
+            warn(["one"])
+            print_result({}, "two", as_json=False)
+        assert sys.stderr is gone
+        print("at the end", flush=True)  # of the process, which must not change the exit code
 
 
 @pytest.mark.parametrize("kind", [Lines, ProgressTable])

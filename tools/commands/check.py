@@ -144,6 +144,7 @@ def preflight(
     from experiments.real_time.conductor.preflight import Trials, check_robots
     from experiments.recording.run_folder import new_folder, remove_unused
     from tools.progress import shown
+    from tools.terminal import lasting_console
 
     options = RunOptions(case or [], bodies, here, lab, identity)
     read = load(file, *(settings or []))
@@ -151,7 +152,7 @@ def preflight(
     chosen(read, options.cases)
     folder, emergency = new_folder(read, out, "preflight"), Emergency()
     try:
-        with interrupts() as interrupted:
+        with lasting_console(), interrupts() as interrupted:
             user = Supervision(shown(quiet=as_json), interrupted, emergency, tell=warn)
             found = check_robots(read, folder, options, Trials(hop=hop, stop=stop, own=sticks), user)
             ended = interrupted()

@@ -14,7 +14,7 @@ from typer import Argument, Option
 
 from agents.errors import ExplainedError
 from tools import completion
-from tools.options import AsJson, example, known_words, print_json, print_result, warn
+from tools.options import AsJson, at_home, example, known_words, print_json, print_result, warn
 from tools.terminal import say
 
 if TYPE_CHECKING:
@@ -34,7 +34,14 @@ def report(
             metavar="RUN...", help="Folders of runs, full of runs, or of a sweep.", autocompletion=completion.folders
         ),
     ],
-    out: Annotated[str | None, Option(metavar="FILE", help="Folder for report or tables. [the run's folder]")] = None,
+    out: Annotated[
+        str | None,
+        Option(
+            metavar="PLACE",
+            help="Folder of the report; FILE.html of a comparison, FILE of tables. [the run's folder]",
+            callback=at_home,
+        ),
+    ] = None,
     *,
     label: Annotated[list[str] | None, Option(metavar="NAME", help="Name of each run, in order. [A, B, ...]")] = None,
     pool: Annotated[bool, Option("--pool", help="Pool runs that differ in seed only: means and intervals.")] = False,
@@ -53,6 +60,7 @@ def report(
     from experiments.file.problems import refusal
     from experiments.metrics.metric import short_name
     from experiments.recording.reader import RecordingError
+    from experiments.recording.run_folder import SWEEP
     from experiments.report import report as pages  # matplotlib takes 0.6 s
     from experiments.report import typeset
     from experiments.report.tables import summary_metrics
@@ -71,6 +79,9 @@ def report(
         message = f"{len(labels)} labels for {len(folders)} runs"
         raise refusal("--label", message, "give one for each run, in their order")
     several = len(folders) > 1 and not pool
+    if out and form is None and not several and Path(out).suffix.lower() in (".html", ".pdf", ".tex", ".md"):
+        hint = "name a folder; FILE.html names the page of a comparison of several runs"
+        raise refusal(f"--out {out}", "the report of one run is a folder with its figures", hint)
     if pdf and several:
         raise refusal("--pdf", "writes the figures of one run", "report each run by itself, or pool them (--pool)")
     read = [] if several else [reopen_seeds(folder) for folder in folders]
@@ -94,6 +105,7 @@ def report(
         write_metrics(seeds, target)
         page = write_report(seeds, target, width, pdf=pdf)
     found = [{"folder": seeds[0].folder, **summary(seeds)}] if as_json else []
+    warn([note for run in seeds for note in run.notes])
     print_result({"report": page, "runs": found}, str(page), as_json=as_json)
     return 0
 
@@ -162,9 +174,6 @@ def _put(text: str, out: str | None) -> None:
     print(out)
 
 
-SWEEP: Final = "sweep.json"
-
-
 def _report_sweep(
     folder: Path,
     out: str | None,
@@ -179,6 +188,7 @@ def _report_sweep(
     import msgspec
 
     from experiments.recording.reader import RecordingError
+    from experiments.recording.run_folder import SWEEP
     from experiments.sweep import page as pages
     from experiments.sweep import table
 
@@ -388,6 +398,7 @@ def _past_runs(words: Sequence[str], below: list[str] | None) -> list[PastRun]:
 
 def _show_past(words: Sequence[str], below: list[str] | None, *, as_json: bool) -> None:
     from experiments.metrics.statistics import spread
+    from experiments.recording.run_folder import SWEEP
     from experiments.report.page import NONE, interval
     from tools.progress import columns
 
@@ -412,7 +423,7 @@ def _show_past(words: Sequence[str], below: list[str] | None, *, as_json: bool) 
         for k, (case, figures) in enumerate((run.cases or {"-": {}}).items()):
             values = [interval(spread([*figures[name].values()])) if name in figures else NONE for name in shown]
             last = [f"{run.megabytes:.1f}", ", ".join(run.origin.tags)] if k == 0 else ["", ""]
-            known = dict.fromkeys(run.remarks.get(case, {}).values())
+            known = dict.fromkeys([*run.remarks.get(case, {}).values(), *([run.fault] if run.fault and k == 0 else [])])
             rows.append([*(first if k == 0 else ["", ""]), case, *values, *last, " | ".join(known)])
     say(*(columns([head, *rows]) if rows else ["no run"]))
     for folder in sweeps:
@@ -446,6 +457,8 @@ def _minute(at: float) -> str:
 def _sweep_as_json(folder: Path) -> dict[str, Any]:
     """A sweep for scripts: its table is in its folder."""
     import msgspec
+
+    from experiments.recording.run_folder import SWEEP
 
     try:
         table = msgspec.json.decode((folder / SWEEP).read_bytes(), type=dict[str, Any])

@@ -35,7 +35,7 @@ from tools.options import (
     warn,
     with_options,
 )
-from tools.terminal import say
+from tools.terminal import lasting_console, say
 
 if TYPE_CHECKING:
     from experiments.check.kept import KeptVerdict
@@ -102,12 +102,12 @@ def run(
         file=file, virtual=virtual, cases=case or [], changes=changes, seeds=seeds, bodies=bodies, here=here,
         anyway=anyway, tags=tag or [],
     )  # fmt: skip
-    if not file.lower().endswith(bundle.SUFFIX):
-        return _run(origin, handling)
-    if origin != RunOrigin(file=file, virtual=virtual, tags=origin.tags):
+    of_bundle = file.lower().endswith(bundle.SUFFIX)
+    if of_bundle and origin != RunOrigin(file=file, virtual=virtual, tags=origin.tags):
         hint = "unpack it, and run its experiment file with other options"
         raise refusal(file, "a bundle repeats its own run, and takes no options of it", hint)
-    return _repeat(origin, handling)
+    with lasting_console():
+        return _repeat(origin, handling) if of_bundle else _run(origin, handling)
 
 
 def _run(origin: RunOrigin, handling: Handling, *, former: Path | None = None, bundle: str = "") -> int:
@@ -134,30 +134,30 @@ def _run(origin: RunOrigin, handling: Handling, *, former: Path | None = None, b
         if bundle or consent.belongs_to_another(read.path):
             consent.require(bundle or str(read.path), with_bodies(read, options), given=handling.yes)
     folder = new_folder(read, handling.out)
+    unwritten: list[str] = []  # what the disk did not take
     try:
         read.keep(folder / SOURCE)
-        with using(folder), _kept_origin(folder, origin, read, options):
+        with using(folder), _kept_origin(folder, origin, read, options, unwritten):
             if origin.virtual:
                 with viewing.paced(handling.pace or 1.0) if handling.view else nullcontext(lambda *_: None) as watch:
-                    runs, stopped, code = _simulate(read, folder, options, origin.seeds, watch), "", 0
+                    runs, stopped, code = _simulate(read, folder, options, origin.seeds, watch, unwritten), "", 0
             else:
                 with viewing.following(folder, options.identity) if handling.view else nullcontext():
-                    runs, stopped, code = _conduct(read, folder, options, quiet=handling.as_json)
+                    runs, stopped, code = _conduct(read, folder, options, unwritten, quiet=handling.as_json)
         if not runs:
             return code
         if not runs[0].traces:
-            why = stopped or "interrupted"
-            why += f", before the common start: there is nothing to report; logs: {folder / 'logs'}"
+            why = stopped or "interrupted, before the common start"
+            why += f": there is nothing to report; logs: {folder / 'logs'}"
             print_result({"ok": False, "error": why}, why, as_json=handling.as_json)
             return code or (FAILED if stopped else 130)
-        _write(runs, folder, handling)
-        if stopped:
-            warn([stopped])
+        _write(runs, folder, handling, unwritten)
+        warn([*([stopped] if stopped else []), *unwritten])
         if not code:
             cases = [case for each in runs for case in each.metrics.values()]
             failures = verdict.failures(cases)
             warn([finding.text for finding in failures])
-            code = FAILED if failures or stopped or has_passed(judge(cases)) is False else 0
+            code = FAILED if failures or stopped or unwritten or has_passed(judge(cases)) is False else 0
             if not code and any(case.spoiled for case in cases):
                 code = SPOILED
         return code if former is None else max(code, _print_differences(folder, former, quiet=handling.as_json))
@@ -166,7 +166,20 @@ def _run(origin: RunOrigin, handling: Handling, *, former: Path | None = None, b
 
 
 @contextmanager
-def _kept_origin(folder: Path, origin: RunOrigin, read: Document, options: RunOptions) -> Iterator[None]:
+def _noting(folder: Path, unwritten: list[str]) -> Iterator[None]:
+    """Note that the disk takes no more, instead of an end: the figures of a run are printed in any case."""
+    try:
+        yield
+    except OSError as error:
+        if not unwritten:
+            remedy = f"make room there, then `./zenpark report {folder}`"
+            unwritten.append(f"{folder}: cannot be written: {error.strerror}; {remedy}")
+
+
+@contextmanager
+def _kept_origin(
+    folder: Path, origin: RunOrigin, read: Document, options: RunOptions, unwritten: list[str]
+) -> Iterator[None]:
     """Keep how a run is made in its folder, from the beginning on; its end as well."""
     import time
 
@@ -191,7 +204,9 @@ def _kept_origin(folder: Path, origin: RunOrigin, read: Document, options: RunOp
     try:
         yield
     finally:
-        keep_origin(folder, msgspec.structs.replace(read_origin(folder) or made, ended=time.time(), load_after=load()))
+        end = msgspec.structs.replace(read_origin(folder) or made, ended=time.time(), load_after=load())
+        with _noting(folder, unwritten):
+            keep_origin(folder, end)
 
 
 def _repeat(asked: RunOrigin, handling: Handling) -> int:
@@ -241,9 +256,11 @@ def _print_differences(folder: Path, former: Path, *, quiet: bool) -> int:
     return int(bool(found))
 
 
-def _simulate(read: Document, folder: Path, options: RunOptions, seeds: int, watch: Watch) -> list[Run]:
+def _simulate(  # noqa: PLR0917 - as `_conduct`
+    read: Document, folder: Path, options: RunOptions, seeds: int, watch: Watch, unwritten: list[str]
+) -> list[Run]:
     """Run in virtual time, one run for each seed from the file's on."""
-    from experiments.run import simulate_seeds
+    from experiments.run import Unrecorded, simulate_seeds
     from tools.progress import Bar
 
     first = read.experiment.seed
@@ -257,6 +274,9 @@ def _simulate(read: Document, folder: Path, options: RunOptions, seeds: int, wat
                 progress=lambda case, done, of: bar.show(f"{case}, simulated s", done, of),
                 watch=watch,
             )
+    except Unrecorded as error:
+        unwritten.append(str(error))
+        return error.runs
     except KeyboardInterrupt:
         cases = ", ".join(sorted(file.stem for file in folder.glob("*.mcap")))
         kept = f"kept is seed {first} of {cases}, in {folder}" if cases else "nothing is kept"
@@ -265,7 +285,9 @@ def _simulate(read: Document, folder: Path, options: RunOptions, seeds: int, wat
         raise
 
 
-def _conduct(read: Document, folder: Path, options: RunOptions, *, quiet: bool) -> tuple[list[Run], str, int]:
+def _conduct(
+    read: Document, folder: Path, options: RunOptions, unwritten: list[str], *, quiet: bool
+) -> tuple[list[Run], str, int]:
     """Run in real time.
 
     Returns the run, none if it was ended at once; why it was stopped or failed, else an empty text; the exit code.
@@ -285,7 +307,8 @@ def _conduct(read: Document, folder: Path, options: RunOptions, *, quiet: bool) 
             user = Supervision(shown(quiet=quiet), interrupted, emergency, tell=warn)
             ended = conduct(read, folder, options, user)
             if ended.failures and (made := read_origin(folder)) is not None:
-                keep_origin(folder, msgspec.structs.replace(made, failures=ended.failures))
+                with _noting(folder, unwritten):
+                    keep_origin(folder, msgspec.structs.replace(made, failures=ended.failures))
             runs = [read_back(folder, ended.recordings, ended.notes, ended.failures)]
         except KeyboardInterrupt:
             print(f"\nended at once; `./zenpark report {folder}` shows what was recorded", file=sys.stderr)
@@ -294,10 +317,12 @@ def _conduct(read: Document, folder: Path, options: RunOptions, *, quiet: bool) 
     return runs, emergency.words or failed, STOPPED if emergency else 130 if interrupted() else 0
 
 
-def _write(runs: Sequence[Run], folder: Path, handling: Handling) -> None:
+def _write(runs: Sequence[Run], folder: Path, handling: Handling, unwritten: list[str]) -> None:
     """Write and print the results."""
-    write_metrics(runs, folder)
-    page = write_report(runs, folder) if handling.report else None
+    page = None
+    with _noting(folder, unwritten):
+        write_metrics(runs, folder)
+        page = write_report(runs, folder) if handling.report else None
     found = summary(runs)
     print_result(found, *_lines(runs, found, page), as_json=handling.as_json)
     if handling.open_report and page is not None:

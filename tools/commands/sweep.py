@@ -77,6 +77,7 @@ def sweep(
     """Run cases x values x seeds in virtual time on all cores; finished runs are never repeated."""
     from experiments.check.kept import KeptVerdict
     from experiments.file.document import load
+    from experiments.recording.run_folder import SWEEP, naming
     from experiments.sweep import table as tables
     from tools.commands.run import sound
 
@@ -95,10 +96,11 @@ def sweep(
             print("interrupted: all that was tried is kept; the same command goes on from there", file=sys.stderr)
             return 130
     table = tables.document(found.read.experiment.title, found.seeds, found.rows, **more)
-    tables.write_csv(found.folder / "sweep.csv", found.rows)
-    tables.write_json(found.folder / "sweep.json", table)
+    with naming(found.folder):
+        tables.write_csv(found.folder / "sweep.csv", found.rows)
+        tables.write_json(found.folder / SWEEP, table)
     lines += [f"note: {note}" for note in found.notes]
-    lines.append(f"table: {found.folder / 'sweep.csv'}, {found.folder / 'sweep.json'}")
+    lines.append(f"table: {found.folder / 'sweep.csv'}, {found.folder / SWEEP}")
     page = None
     if report and found.rows:
         from experiments.sweep import page as pages  # matplotlib takes 0.6 s
@@ -106,7 +108,8 @@ def sweep(
         words = ["./zenpark", "sweep", file, *(given or [])]
         words += [part for name in case or [] for part in ("--case", name)]
         words += [part for setting in changes for part in ("--set", setting)]
-        page = pages.write(found, shlex.join([*words, *(["--optimise", optimise] if optimise else [])]))
+        with naming(found.folder):
+            page = pages.write(found, shlex.join([*words, *(["--optimise", optimise] if optimise else [])]))
         lines += [f"figures: {found.folder / 'figures'}", f"page: {page}"]
     print_result(table, *lines, as_json=as_json)
     if open_report and page is not None and code != INTERRUPTED:

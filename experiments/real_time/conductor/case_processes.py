@@ -200,7 +200,10 @@ class CaseProcesses:
         more = supervised.starts < STARTS
         if more:
             supervised.starts += 1
-            supervised.start()
+            try:
+                supervised.start()
+            except OSError:  # a disk that takes no more: nothing of that ends the run
+                more = False
         what = f"started again{supervised.meanwhile}" if more else f"given up{supervised.given_up}"
         return kind, f"the {kind} ended ({process.exit}); {what}{'' if is_router(process.name) else process.because}"
 

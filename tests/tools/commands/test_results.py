@@ -4,6 +4,7 @@ import json
 import os
 import re
 import shutil
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -11,8 +12,10 @@ import pytest
 from agents.errors import ExplainedError
 from experiments.file.problems import DocumentError
 from experiments.metrics.statistics import spread
+from experiments.recording.cleaning import using
 from experiments.report.tables import ratio_words
 from tests.commands import invoke
+from tests.experiments.recordings import small_disk
 from tools.commands import results
 from tools.commands.run import _acquired
 from tools.options import known_words
@@ -210,3 +213,40 @@ def test_runs_say_where_none_can_be_listed(tmp_path, monkeypatch, capsys):
         tmp_path.chmod(mode)
         results.runs()
         assert words in capsys.readouterr().out
+
+
+def test_figures_are_printed_though_the_disk_is_full(first, tmp_path):
+    words = ["run", first.parent / "short.toml", "--virtual", "--out", tmp_path / "run"]
+    with small_disk():
+        done = invoke(*words, code=1)
+    assert done.stdout.count(" Hz per robot, IAE ") == 2
+    assert f"{tmp_path / 'run' / 'periodic.mcap'}: cannot be written: File too large; make room there" in done.stderr
+    assert (tmp_path / "run" / "metrics.json").is_file()
+    with small_disk(100):
+        error = invoke(
+            "sweep", first.parent / "short.toml", "seeds=1", "--out", tmp_path / "swept", code=None
+        ).exception
+    assert error.filename == str(tmp_path / "swept")
+
+
+def test_run_that_is_up_is_not_reported(again, tmp_path):
+    with using(again):
+        assert "this run is still up" in refused_command("report", again)
+        assert "this run is still up" in refused_command("export", again, "--csv")
+    (again / "event.mcap").write_bytes((again / "event.mcap").read_bytes()[:-1])
+    assert "event: the recording was cut off" in invoke("report", again).stderr
+
+
+def test_place_of_a_report_has_one_meaning(again, tmp_path, monkeypatch):
+    assert "is a folder with its figures" in refused_command("report", again, "--out", tmp_path / "x.html")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    invoke("report", again, "--out", "~/made")
+    assert (tmp_path / "made" / "report.html").is_file()
+    assert not Path("~").exists()
+
+
+def test_missing_figures_are_remarked_and_sweeps_named(first, again, tmp_path):
+    (again / "metrics.json").write_text("[1, 2")
+    assert f"metrics.json cannot be read: `./zenpark report {again}`" in stdout_of("runs", "--past", "--in", again)
+    (tmp_path / "sweep.json").write_text("{}")
+    assert "is that of a sweep, which keeps no recordings" in refused_command("export", tmp_path, "--bundle")

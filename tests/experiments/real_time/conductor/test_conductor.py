@@ -350,6 +350,13 @@ def test_dead_router_listens_again_where_machines_expect_it(tmp_path):
     assert processes.again(SimpleNamespace(name="only-KH01", exit="exit code 2")) is None
 
 
+def test_full_disk_gives_up_a_process_alone(tmp_path):
+    context, _ = case(tmp_path, listens=["tcp/0.0.0.0:7447"])
+    context.launcher.start.side_effect = OSError(28, "No space left on device")
+    _, said = CaseProcesses(context).again(SimpleNamespace(name=ROUTER, exit="killed by SIGKILL"))
+    assert "given up" in said
+
+
 def test_second_recorder_alone_makes_the_recording(tmp_path):
     """The first one was killed before its file was there."""
     context, started = case(tmp_path)
