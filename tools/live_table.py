@@ -36,15 +36,18 @@ class Rank(IntEnum):
     """Needs of a robot, the most urgent first."""
 
     GONE = 0  # lost, dead, or stopped by an emergency stop
-    SILENT = 1
-    HELD = 2  # a hazard is present
-    LOW = 3  # battery
-    LATE = 4  # ticks were skipped in the last seconds
-    LOST = 5  # samples were lost in the last seconds
-    FINE = 6
+    TOUCHING = 1  # overlaps another robot, an obstacle or a wall
+    SILENT = 2
+    HELD = 3  # a hazard is present
+    LOW = 4  # battery
+    LATE = 5  # ticks were skipped in the last seconds
+    LOST = 6  # samples were lost in the last seconds
+    FINE = 7
 
 
-COLOURS: Final = {Rank.GONE: "bold red", Rank.SILENT: "magenta", Rank.HELD: "yellow"}
+COLOURS: Final = {
+    Rank.GONE: "bold red", Rank.TOUCHING: "bold red", Rank.SILENT: "magenta", Rank.HELD: "yellow",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -102,8 +105,9 @@ class Trends:
         return known
 
     def row(
-        self, name: str, status: Status | None, *, now: float, error: float | None, gone: str = "", lost: bool = False
-    ) -> LiveRow:
+        self, name: str, status: Status | None, *, now: float, error: float | None, gone: str = "", lost: bool = False,
+        touches: str = "",
+    ) -> LiveRow:  # fmt: skip
         """The row of a robot.
 
         Args:
@@ -111,6 +115,7 @@ class Trends:
             error: [m]
             gone: Why the run goes on without it; empty while it takes part.
             lost: It should take part: process or token have vanished.
+            touches: Its contacts in words, if any.
         """
         if status is None:
             return LiveRow(name, gone or "starting", Rank.GONE if lost else Rank.FINE)
@@ -119,12 +124,19 @@ class Trends:
         phase, rank = gone or status.phase, Rank.FINE
         if lost:
             rank = Rank.GONE
+        elif touches:
+            phase, rank = "touches", Rank.TOUCHING
         elif not gone and now - status.stamp > FROZEN_S:
             phase, rank = "silent", Rank.SILENT
         elif not gone:
             rank = _rank(status, growing)
             phase = "held" if status.hazard.startswith("hold") else phase
-        note = status.hazard or status.reason or ("misses " + ", ".join(status.missing) if status.missing else "")
+        note = (
+            touches
+            or status.hazard
+            or status.reason
+            or ("misses " + ", ".join(status.missing) if status.missing else "")
+        )
         if status.malformed:
             note += f" {status.malformed} malformed"
         if foreign := sum(status.foreign.values()):

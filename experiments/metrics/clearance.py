@@ -1,24 +1,26 @@
-"""Clearance between robots, obstacles and walls, surface to surface, and contacts.
+"""Clearance between robots, obstacles and walls, surface to surface, and contacts: in a trace, and at one moment.
 
-Robots are upright cylinders of the radius and height of their kind; a position is that of the lowest point. Everything
-is taken on true positions, at the samples of the trace; unknown ones touch nothing.
+Robots are upright cylinders of the radius and height of their kind; a position is that of the lowest point. In a trace
+everything is taken on true positions, at its samples; unknown ones touch nothing.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from agents.body.kinds import KINDS
+from agents.body.kinds import KINDS, Kind
 from agents.plugins import registry
 from experiments.definition.experiment import WORLD
 from experiments.metrics.results import Approach, Collision
 from experiments.recording.trace import WALL, Trace
 from twins import scene as outlines
-from twins.arrays import Array, Mask, norm
+from twins.arrays import Array, Index, Mask, norm
+from twins.scene import Scene
 
 TOUCH_M = 1e-6  # [m] less overlap than this is rounding
 
@@ -35,17 +37,18 @@ class Clearance:
     @classmethod
     def of_trace(cls, trace: Trace) -> Clearance:
         """Clearance in a whole trace; obstacles that can be pushed count only where no world watched for contacts."""
-        names, solid = trace.robots, _Cylinders.of_trace(trace)
+        names, scene, robots_of = trace.robots, trace.plan.scene, trace.plan.experiment.robots
+        solid = Cylinders.of([KINDS[robots_of[name].kind] for name in names], trace.true_position)
         robots: list[Approach | None] = [None] * len(names)
         arena: list[Approach | None] = [None] * len(names)
         overlaps: list[Collision] = []
         for i, name in enumerate(names[:-1]):
-            gap = solid.between(i)
+            gap = solid.between(slice(i, i + 1), slice(i + 1, None))
             for j, other in enumerate(names[i + 1 :]):
                 robots[i] = _closer(robots[i], trace.time, gap[:, j], (name, other))
                 robots[i + 1 + j] = _closer(robots[i + 1 + j], trace.time, gap[:, j], (other, name))
                 overlaps += _overlaps(trace.time, gap[:, j], (name, other))
-        for thing, gap in _to_things(trace, solid):
+        for thing, gap in _to_things(scene, scene.along(trace.time), solid, watched=trace.contacts is not None):
             for i, name in enumerate(names):
                 arena[i] = _closer(arena[i], trace.time, gap[:, i], (name, thing))
                 overlaps += _overlaps(trace.time, gap[:, i], (name, thing))
@@ -72,8 +75,36 @@ def collisions(trace: Trace, clearance: Clearance) -> tuple[Collision, ...]:
     return tuple(sorted([*reported, *computed], key=lambda each: each.time_s))
 
 
+class Overlap(NamedTuple):
+    """A robot, and another one, an obstacle or a wall, that overlap at one moment."""
+
+    first: str
+    second: str
+    depth: float  # [m]
+
+
+def present_overlaps(
+    names: Sequence[str], kinds: Sequence[Kind], position: Array, scene: Scene, obstacles: Array, *, watched: bool
+) -> Iterator[Overlap]:
+    """Overlaps at one moment.
+
+    Args:
+        position: (N, 3) [m] of the robots.
+        obstacles: (M, 3) x, y [m], yaw [rad].
+        watched: A world watches for contacts with obstacles that can be pushed.
+    """
+    solid = Cylinders.of(kinds, position[None])
+    first, second = np.triu_indices(len(names), 1)
+    gap = solid.between(first, second)[0]
+    for k in np.flatnonzero(gap < -TOUCH_M).tolist():
+        yield Overlap(names[first[k]], names[second[k]], -float(gap[k]))
+    for thing, gaps in _to_things(scene, obstacles[None], solid, watched=watched):
+        for row in np.flatnonzero(gaps[0] < -TOUCH_M).tolist():
+            yield Overlap(names[row], thing, -float(gaps[0, row]))
+
+
 @dataclass(frozen=True)
-class _Cylinders:
+class Cylinders:
     """The robots as solids: where their axes are (T, N, 2), their bottoms and tops (T, N), NaN where unknown."""
 
     axis: Array
@@ -83,19 +114,18 @@ class _Cylinders:
     flies: Mask
 
     @classmethod
-    def of_trace(cls, trace: Trace) -> _Cylinders:
-        kinds = [KINDS[trace.plan.experiment.robots[name].kind] for name in trace.robots]
+    def of(cls, kinds: Sequence[Kind], position: Array) -> Cylinders:
+        """Robots (N) at positions (T, N, 3) [m]."""
         height = np.array([kind.height for kind in kinds])
-        radius, flies = np.array([kind.radius for kind in kinds]), np.array([kind.flies for kind in kinds])
-        bottom = trace.true_position[..., 2]
-        return cls(trace.true_position[..., :2], radius, bottom, bottom + height, flies)
+        radius, flies = np.array([kind.radius for kind in kinds]), np.array([kind.flies for kind in kinds], dtype=bool)
+        bottom = position[..., 2]
+        return cls(position[..., :2], radius, bottom, bottom + height, flies)
 
-    def between(self, i: int) -> Array:
-        """Gaps (T, N − i − 1) of robot i to all that come after it."""
-        rest = slice(i + 1, None)
-        level = norm(self.axis[:, rest] - self.axis[:, i, None]) - (self.radius[rest] + self.radius[i])
-        upright = np.maximum(self.bottom[:, i, None] - self.top[:, rest], self.bottom[:, rest] - self.top[:, i, None])
-        return _gap(level, upright, self.flies[rest] | self.flies[i])
+    def between(self, first: Index | slice, second: Index | slice) -> Array:
+        """Gaps (T, k) of pairs of rows."""
+        level = norm(self.axis[:, second] - self.axis[:, first]) - (self.radius[second] + self.radius[first])
+        upright = np.maximum(self.bottom[:, first] - self.top[:, second], self.bottom[:, second] - self.top[:, first])
+        return _gap(level, upright, self.flies[second] | self.flies[first])
 
 
 def _gap(level: Array, upright: Array, free: Mask) -> Array:
@@ -122,12 +152,10 @@ def _overlaps(time: Array, gap: Array, between: tuple[str, str]) -> list[Collisi
     return [Collision(float(time[begin]), *between, None, -float(gap[begin:end].min())) for begin, end in spans]
 
 
-def _to_things(trace: Trace, solid: _Cylinders) -> Iterator[tuple[str, Array]]:
-    """Each obstacle, and the arena's walls, with the gaps (T, N) of all robots to it."""
-    scene = trace.plan.scene
-    poses = scene.along(trace.time)
+def _to_things(scene: Scene, poses: Array, solid: Cylinders, *, watched: bool) -> Iterator[tuple[str, Array]]:
+    """Each obstacle, at its `poses` (T, M, 3), and the arena's walls, with the gaps (T, N) of all robots to it."""
     for k, name in enumerate(scene.names):
-        if trace.contacts is not None and math.isfinite(scene.mass[k]):
+        if watched and math.isfinite(scene.mass[k]):
             continue
         level = outlines.distance(scene, k, poses[:, k, None], solid.axis) - solid.radius
         upright = np.maximum(scene.bottom[k] - solid.top, solid.bottom - scene.top[k])

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.body.kinds import Kind
-from agents.decision.lifecycle import Phase
+from agents.decision.lifecycle import FINISHED, SCRIPTED, TOLD_TO_END, Phase
 from agents.kinds.theory import POINT
 from agents.network.messages import EMERGENCY, Ranges, State, Status, WorldState
 from agents.plugins import registry
@@ -26,7 +26,8 @@ from agents.plugins.laws import Gradient
 from experiments.arrays import known_rows
 from experiments.definition.experiment import WORLD
 from experiments.definition.graph import Links, links
-from experiments.definition.plan import Plan
+from experiments.definition.plan import Plan, finds_contacts
+from experiments.metrics.clearance import Overlap, present_overlaps
 from twins.arrays import Array, Index, Mask, norm
 from twins.scene import Scene
 
@@ -36,6 +37,8 @@ Colour = tuple[int, int, int]
 GOOD_M: Final = 0.025  # error of a link that counts as kept
 FAIR_M: Final = 0.05
 SILENT_S: Final = 3.0  # time without a status after which a robot counts as silent
+WAY_POINTS: Final = 40  # points of a straight way at which it is looked for bodies
+TOUCH_S: Final = 1.0  # time for which a contact is shown after its end, or after a world has reported it
 FLASH_S: Final = 0.12  # time for which a link is lit after its sender transmits
 TRAIL: Final = 60  # points of a trail
 TRAIL_S: Final = 0.2  # between two of them
@@ -75,9 +78,11 @@ class Condition(IntEnum):
     DONE = 2
     LANDING = 3
     HELD = 4
-    SILENT = 5  # its last status is old
-    STOPPED = 6  # by an emergency stop
-    DEAD = 7  # its liveliness token is gone
+    OUT = 5  # landed before the end of its plan
+    SILENT = 6  # its last status is old
+    TOUCHING = 7  # overlaps another robot, an obstacle or a wall
+    STOPPED = 8  # by an emergency stop
+    DEAD = 9  # its liveliness token is gone
 
 
 CONDITIONS: Final[dict[Condition, tuple[str, Colour]]] = {
@@ -86,17 +91,20 @@ CONDITIONS: Final[dict[Condition, tuple[str, Colour]]] = {
     Condition.DONE: ("done", (120, 140, 170)),
     Condition.LANDING: ("landing", (86, 180, 233)),
     Condition.HELD: ("held", (230, 159, 0)),
+    Condition.OUT: ("out of the run", (213, 94, 0)),
     Condition.SILENT: ("silent", (160, 110, 200)),
+    Condition.TOUCHING: ("touches", (213, 50, 30)),
     Condition.STOPPED: ("stopped", (213, 50, 30)),
     Condition.DEAD: ("dead", (213, 50, 30)),
 }
-RINGED: Final = (Condition.LANDING, Condition.HELD, Condition.SILENT, Condition.STOPPED, Condition.DEAD)
-AT_REST: Final = (Condition.WAITING, Condition.DONE)  # their goals are not drawn
-PALED: Final = (Condition.SILENT, Condition.STOPPED, Condition.DEAD)
+RINGED: Final = (Condition.LANDING, *(each for each in Condition if each >= Condition.HELD))
+AT_REST: Final = (Condition.WAITING, Condition.DONE, Condition.OUT)  # their goals are not drawn
+PALED: Final = (Condition.OUT, Condition.SILENT, Condition.STOPPED, Condition.DEAD)
+IN_TIME: Final = (FINISHED, SCRIPTED, TOLD_TO_END, "")  # reasons of a robot that has done all of its plan
 
 
 def condition(
-    status: Status | None, phase: str | None = None, *, alive: bool = True, silent: bool = False, held: bool = False
+    status: Status | None, phase: str | None = None, *, alive: bool = True, silent: bool = False, touches: bool = False
 ) -> Condition:
     """Condition of a robot.
 
@@ -105,17 +113,20 @@ def condition(
         phase: Word of its phase; None: that of the status.
         alive: Its liveliness token stands.
         silent: Its last message is old.
-        held: A hazard holds it, also without a status.
+        touches: It overlaps another robot, an obstacle or a wall.
     """
     phase = status.phase if phase is None and status is not None else phase
+    done, reason = phase == Phase.DONE.word, "" if status is None else status.reason
     for case, applies in (
-        (Condition.STOPPED, status is not None and status.reason.startswith(EMERGENCY)),
-        (Condition.DONE, phase == Phase.DONE.word),
-        (Condition.DEAD, not alive),
+        (Condition.STOPPED, reason.startswith(EMERGENCY)),
+        (Condition.DEAD, not (alive or done)),
+        (Condition.TOUCHING, touches),
+        (Condition.OUT, done and reason not in IN_TIME),
+        (Condition.DONE, done),
         (Condition.SILENT, silent),
         (Condition.LANDING, phase == Phase.LANDING.word),
         (Condition.WAITING, phase in (None, Phase.IDLE.word, Phase.READY.word)),
-        (Condition.HELD, held or (status is not None and status.hazard.startswith("hold"))),
+        (Condition.HELD, status is not None and status.hazard.startswith("hold")),
     ):
         if applies:
             return case
@@ -242,6 +253,30 @@ class SceneModel:
                 pose[k] = each.pose
         return pose
 
+    def overlaps(self, position: Array, obstacles: Array, world: WorldState | None) -> list[Overlap]:
+        """Bodies that overlap at `position` (N, 3) [m], among `obstacles` (M, 3), of robots of a known experiment.
+
+        Those that a world with contacts carries are left out: it reports what they touch.
+        """
+        if self.plan is None or not self.names:
+            return []
+        carried = {*world.robots} if world is not None and finds_contacts(world.engine) else set()
+        found = present_overlaps(self.names, self.kinds, position, self.scene, obstacles, watched=bool(carried))
+        return [each for each in found if not carried & {each.first, each.second}]
+
+    def in_the_way(self, moment: Moment, name: str, goal: tuple[float, float]) -> tuple[list[str], list[str]]:
+        """Bodies that a robot would touch at a goal x, y [m], and on the straight way there, as all stand now."""
+        row, place = self.names.index(name), moment.position.copy()
+        found: list[list[str]] = []
+        begin = place[row, :2].copy()
+        for step in np.linspace(1.0, 0.0, 1 + WAY_POINTS)[:-1]:
+            place[row, :2] = begin + step * (np.array(goal) - begin)
+            touching = (each for each in self.overlaps(place, moment.obstacles, None) if name in each[:2])
+            found.append([each.second if each.first == name else each.first for each in touching])
+        there = found[0]
+        between = dict.fromkeys(other for others in found[1:] for other in others if other not in there)
+        return there, list(between)
+
     @cached_property
     def flies(self) -> Mask:
         """Robots that fly (N,)."""
@@ -267,6 +302,16 @@ class Moment:
     time: float | None = None  # [s] since the common start; None before it
     places: Array | None = None  # (N, P, 3) [m] that the robots say, see `SceneModel.said_places`
     measures: Sequence[Mapping[str, float]] = ()  # of the law, by robot; none known if empty
+    overlaps: Sequence[Overlap] = ()  # robots that touch one another, an obstacle or a wall
+
+
+def touched(name: str, overlaps: Sequence[Overlap]) -> str:
+    """Contacts of a robot in words, with their depth; empty without any."""
+    return ", ".join(
+        f"touches {each.second if each.first == name else each.first}, {100 * each.depth:.1f} cm deep"
+        for each in overlaps
+        if name in (each.first, each.second)
+    )
 
 
 NO_STATE: Final = State("", 0, math.nan, "")

@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 
 from agents.decision.lifecycle import Phase
-from agents.network.messages import Event, LawMemory, State, Status, WorldState
+from agents.network.messages import Contact, Event, LawMemory, State, Status, WorldState
 from experiments.definition.plan import Plan
 from experiments.recording.playback import AboutRun, Content, by_robot
 from experiments.recording.reader import Records
@@ -23,7 +23,7 @@ from experiments.recording.trace import ROUNDING_S
 from experiments.scene.stage import drawn_columns
 from twins.arrays import Array, Index
 
-M = TypeVar("M", Event, Status, LawMemory, WorldState)
+M = TypeVar("M", Contact, Event, Status, LawMemory, WorldState)
 LOST_S: Final = 1.0  # time without a sample after which a robot is silent
 WORDS: Final = {phase.word: int(phase) for phase in Phase}
 
@@ -91,6 +91,7 @@ class Tracks:
     tracks: tuple[Track, ...]  # in the order of `robots`
     events: tuple[Event, ...]  # incidents of robots included, in order of time; stamps since the common start
     world: tuple[WorldState, ...]
+    contacts: tuple[Contact, ...]  # that the world reported
     begin: float  # [s] first sample, since the common start: not later than 0
     end: float  # [s] last sample
 
@@ -119,6 +120,7 @@ def read(path: Path) -> Tracks:
         run.case, run.plan, run.clock, robots, tracks,
         events=tuple(sorted(events, key=lambda event: event.stamp)),
         world=_since(start, content[WorldState]),
+        contacts=_since(start, content[Contact]),
         begin=min([0.0, *(float(time[0]) for time in there)]),
         end=max([0.0, *(float(time[-1]) for time in there)]),
     )  # fmt: skip

@@ -134,7 +134,7 @@ class Acting:
 
     def follow(self, moment: Moment, alive: Sequence[str]) -> None:
         """Takes in the present state, and gives orders that waited for a control to rest."""
-        self._alive = alive
+        self._alive, self._moment = alive, moment
         now = time.monotonic()
         if now > self._held_until:
             for name, target in list(self._targets.items()):
@@ -190,13 +190,19 @@ class Acting:
         if event.phase != "end":
             self._held_until = inf
             return
-        x, y = (float(each) for each in event.target.position[:2])
+        x, y = (round(float(each), 2) for each in event.target.position[:2])
         self._held_until = time.monotonic() + SETTLED_S + HELD_S
         what = f"{name} to x = {x:.2f} m, y = {y:.2f} m"
         if not (isfinite(x) and isfinite(y)) or self._refuse(event.client_id, what):
             return
-        order = messages.Order("go", goal=(x, y))
-        self._order_in_thread(name, lambda: self._order_all(order, what, [name]))
+        there, between = self._stage.in_the_way(self._moment, name, (x, y))
+        if there:
+            self._note(what, f"not ordered: it would touch {', '.join(there)} there.", bad=True)
+            return
+        order, warning = messages.Order("go", goal=(x, y)), ""
+        if between and self._stage.margin <= 0.0:
+            warning = f"{', '.join(between)} is on the straight way there, and nothing avoids: hold in time"
+        self._order_in_thread(name, lambda: self._order_all(order, what, [name], warning))
 
     def slide(self, parameter: Parameter, event: viser.GuiEvent[Any]) -> None:
         if event.client is None:  # moved by this program, not by a hand
@@ -231,7 +237,9 @@ class Acting:
         with self._lock:
             self.due[name] = (time.monotonic() + SETTLED_S, order)
 
-    def _order_all(self, order: messages.Order, what: str, robots: Sequence[str] | None = None) -> None:
+    def _order_all(
+        self, order: messages.Order, what: str, robots: Sequence[str] | None = None, warning: str = ""
+    ) -> None:
         """Gives an order to robots, to all that are there if none is named, and says what they answered."""
         replies = orders.send_order(self._session, self._keys, robots or sorted(self._alive), order)
         refused = {name: reply.reason for name, reply in replies.items() if not reply.ok}
@@ -239,7 +247,7 @@ class Acting:
         said = f"{len(done)} of {len(replies)} robots"
         if refused:
             said += "; " + "; ".join(f"{name}: {reason}" for name, reason in list(refused.items())[:5])
-        self._note(what, said, bad=bool(refused) or not replies)
+        self._note(what, f"{said}; {warning}" if warning else said, bad=bool(refused or warning) or not replies)
         self._record(what, said)
 
     def _record(self, what: str, said: str) -> None:

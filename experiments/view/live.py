@@ -19,7 +19,7 @@ import zenoh
 from agents.network.keys import Keys
 from agents.network.session import connected
 from experiments.scene.drawing import DARK, LIGHT, SceneDrawing, VisibleParts
-from experiments.scene.stage import MANY_GOALS, Condition, LinkTracker, Moment, SceneModel
+from experiments.scene.stage import MANY_GOALS, Condition, LinkTracker, Moment, SceneModel, touched
 from experiments.view import heartbeat
 from experiments.view.acting import Acting, WatchedRun
 from experiments.view.observer import Observer
@@ -237,7 +237,8 @@ class LiveView:
         for k, name in enumerate(stage.names):
             report, condition = observer.robots[name], Condition(int(moment.condition[k]))
             delay = max(report.delay.values(), default=None)
-            row = robot_row(name, condition, report.status, known(errors[k]), report.rate, delay=delay)
+            touches = touched(name, moment.overlaps)
+            row = robot_row(name, condition, report.status, known(errors[k]), report.rate, delay=delay, touches=touches)
             rows.append(row.measured(moment.measures, k))
         elapsed = observer.elapsed
         start = None if elapsed is None else time.time() - elapsed

@@ -19,7 +19,19 @@ from agents.network.keys import Keys
 from agents.network.session import received
 from experiments.file import document
 from experiments.file.problems import DocumentError
-from experiments.scene.stage import AT_REST, SILENT_S, LinkTracker, Moment, SceneModel, Trail, condition, drawn_columns
+from experiments.metrics.clearance import Overlap
+from experiments.scene.stage import (
+    AT_REST,
+    SILENT_S,
+    TOUCH_S,
+    Condition,
+    LinkTracker,
+    Moment,
+    SceneModel,
+    Trail,
+    condition,
+    drawn_columns,
+)
 from experiments.view.heartbeat import DataAge
 
 UNKNOWN_S: Final = 2.0  # time without an experiment after which robots are drawn that are known by name only
@@ -68,6 +80,7 @@ class Observer:
         )
         self._told = pubsub.Inbox(pubsub.pose_subscriber(session, keys.event, 256, pubsub.EVENTS), messages.Event)
         self._worlds = pubsub.Inbox(pubsub.subscriber(session, keys.world, 8), messages.WorldState)
+        self._contacts = pubsub.Inbox(pubsub.subscriber(session, keys.contact, 256), messages.Contact)
         self._watch = pubsub.AliveWatch(session, keys.alive("*"))
         self._conductor = pubsub.AliveWatch(session, keys.conductor)
         self._ranges: zenoh.Subscriber[Handler] | None = None
@@ -75,6 +88,7 @@ class Observer:
         self.robots, self.scans = {}, {}
         self.events = deque(maxlen=EVENTS)
         self.world, self.conducted = None, False
+        self._touching: dict[tuple[str, str], tuple[float, Overlap]] = {}  # last time [s, monotonic] of each contact
         self._begin(SceneModel.of_robots(()))
 
     # ------------------------------------------------------------------ reception
@@ -92,7 +106,7 @@ class Observer:
             self.conducted = there
         for status in self._statuses.read():
             self._receive_status(status, now)
-        self._read_states()
+        self._read_states(now)
         for sample in received(self._poses.handler):
             name = self._keys.whose(str(sample.key_expr))
             if name is not None:
@@ -136,6 +150,7 @@ class Observer:
         for name, report in before.items():
             self.robots.setdefault(name, report)
         self._tracker, self._trail = LinkTracker(stage), Trail(len(stage.names))
+        self._touching = {}
         self.age = DataAge()
 
     def _report(self, name: str) -> RobotReport:
@@ -148,10 +163,10 @@ class Observer:
                 self.events.append(messages.Event(incident.stamp, "hazard", status.robot, incident.text))
         report.status, report.heard_at, report.known = status, now, True
 
-    def _read_states(self) -> None:
+    def _read_states(self, now: float) -> None:
         states = list(self._newest(self._states, messages.State))
         if states:
-            self.age.add(max(state.stamp for state in states), self._clock.utc(), time.monotonic())
+            self.age.add(max(state.stamp for state in states), self._clock.utc(), now)
         for memory in self._newest(self._memories, messages.LawMemory):
             self._report(memory.robot).memory = memory
         for state in states:
@@ -159,6 +174,21 @@ class Observer:
             report.state, report.known = state, True
             for each in state.received:
                 report.delay[each.sender] = each.arrived - each.stamp
+        if states:
+            self._find_contacts(now)
+
+    def _find_contacts(self, now: float) -> None:
+        """Contacts that the world reports, and those that the last positions show."""
+        touching = self._touching
+        for each in self._contacts.read():
+            touching[each.first, each.second] = now, Overlap(each.first, each.second, each.overlap)
+        position = drawn_columns(self.robots[name].state for name in self.stage.names)["position"]
+        obstacles = self.stage.obstacles_at(self.elapsed or 0.0, self.world)
+        for overlap in self.stage.overlaps(position, obstacles, self.world):
+            if (overlap.first, overlap.second) not in touching:
+                self.events.append(messages.Event(self.now(), "contact", overlap.first, f"touches {overlap.second}"))
+            touching[overlap.first, overlap.second] = now, overlap
+        self._touching = {pair: each for pair, each in touching.items() if now - each[0] < TOUCH_S}
 
     def _newest(self, subscriber: zenoh.Subscriber[Handler], kind: type[R]) -> Iterator[R]:
         """The last message of each robot."""
@@ -201,6 +231,17 @@ class Observer:
             return self._clock.utc()
         return heard.status.stamp + time.monotonic() - heard.heard_at
 
+    @property
+    def overlaps(self) -> list[Overlap]:
+        """Robots that touch one another, an obstacle or a wall, or did a moment ago."""
+        return [overlap for _, overlap in self._touching.values()]
+
+    def condition(self, name: str) -> Condition:
+        """Condition of a robot."""
+        report, touches = self.robots[name], any(name in pair for pair in self._touching)
+        silent = time.monotonic() - report.heard_at > SILENT_S
+        return condition(report.status, alive=report.alive, silent=silent, touches=touches)
+
     def moment(self) -> Moment:
         now, stage = time.monotonic(), self.stage
         reports = [self.robots[name] for name in stage.names]
@@ -209,8 +250,7 @@ class Observer:
         elapsed = self.elapsed
         error = self._tracker.errors(elapsed, position)
         self._trail.add(now, position)
-        silent = [now - report.heard_at > SILENT_S for report in reports]
-        conditions = [condition(r.status, alive=r.alive, silent=s) for r, s in zip(reports, silent, strict=True)]
+        conditions = [self.condition(name) for name in stage.names]
         columns["goal"][np.isin(conditions, AT_REST)] = np.nan
         return Moment(
             **columns,
@@ -223,4 +263,5 @@ class Observer:
             time=elapsed,
             places=stage.said_places([report.memory.variables for report in reports], position),
             measures=[report.memory.numbers for report in reports],
+            overlaps=self.overlaps,
         )

@@ -13,11 +13,11 @@ import numpy as np
 
 from agents.body.interface import BodyState
 from agents.decision.lifecycle import RUNNING, Phase
-from agents.network.messages import Event
+from agents.network.messages import Event, Status
 from experiments.definition.plan import Plan
-from experiments.scene.stage import Condition, LinkTracker, Moment, SceneModel, Trail, condition
+from experiments.scene.stage import Condition, LinkTracker, Moment, SceneModel, Trail, condition, touched
 from experiments.view.live import FRAME_S, Page
-from experiments.view.panel import PLOT_S, RobotRow, known
+from experiments.view.panel import PLOT_S, known, robot_row
 from experiments.view.replay import ReplayClock, add_transport
 from experiments.virtual_time.simulation import Snapshot
 from twins.arrays import Array
@@ -98,8 +98,10 @@ class PacedView:
         true_yaw, yaw = _column(states, "true_yaw"), _column(states, "yaw")
         attitude, shadow = _column(states, "attitude"), _column(states, "shadow_position")
         running = np.array([robot.lifecycle.phase == RUNNING for robot in robots])
-        elapsed = None if isnan(instant.time) else instant.time
-        conditions = [condition(None, Phase(robot.lifecycle.phase).word, held=robot.hazards.held) for robot in robots]
+        elapsed, obstacles = None if isnan(instant.time) else instant.time, np.array(instant.engine.obstacles)
+        overlaps = self._stage.overlaps(position, obstacles, None)
+        touching = {name for each in overlaps for name in (each.first, each.second)}
+        conditions = [condition(status, touches=status.robot in touching) for status in self._statuses(instant)]
         self._trail.add(instant.now, position)
         laws = [robot.stepping for robot in robots]  # of guided robots nothing is known here
         return Moment(
@@ -110,7 +112,7 @@ class PacedView:
             silent_for=instant.now - np.array(self._sent_at),
             error=self._tracker.errors(elapsed, position),
             broken=np.zeros(len(self._stage.links), dtype=bool),
-            obstacles=np.array(instant.engine.obstacles),
+            obstacles=obstacles,
             trail=self._trail.points,
             attitude=None if np.isnan(attitude).all() else attitude,
             shadow=None if np.isnan(shadow).all() else shadow,
@@ -118,7 +120,18 @@ class PacedView:
             time=elapsed,
             places=self._stage.said_places([{} if law is None else law.memory for law in laws], position),
             measures=[{} if law is None else law.measures for law in laws],
+            overlaps=overlaps,
         )
+
+    def _statuses(self, instant: Snapshot) -> list[Status]:
+        """Statuses as robots of a run in real time send them, as far as they are shown."""
+        return [
+            Status(
+                name, instant.now, Phase(robot.lifecycle.phase).word, robot.lifecycle.reason,
+                battery=known(state.battery), hazard=robot.hazards.worst(),
+            )
+            for name, robot, state in zip(self._stage.names, instant.robots, instant.states, strict=True)
+        ]  # fmt: skip
 
     def _draw(self, instant: Snapshot, now: float) -> None:
         moment = self._moment(instant)
@@ -135,11 +148,11 @@ class PacedView:
         errors = self._tracker.of_robots(moment.error)
         panel = self._page.panel
         rows = [
-            RobotRow(
-                name, Condition(int(moment.condition[k])), known(errors[k]), float(len(self._sent[k])),
-                known(instant.states[k].battery), note=instant.robots[k].hazards.worst(),
+            robot_row(
+                status.robot, Condition(int(moment.condition[k])), status, known(errors[k]), float(len(self._sent[k])),
+                ticks=False, touches=touched(status.robot, moment.overlaps),
             ).measured(moment.measures, k)
-            for k, name in enumerate(self._stage.names)
+            for k, status in enumerate(self._statuses(instant))
         ]  # fmt: skip
         phase = "running" if moment.time is not None and moment.time >= 0.0 else "taking off"
         where = f"virtual time, {self.clock.speed:g} times as fast" + ("" if self.clock.playing else ", paused")

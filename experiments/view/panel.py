@@ -73,13 +73,15 @@ def robot_row(
     *,
     delay: float | None = None,
     ticks: bool = True,  # whether they can be missed
+    touches: str = "",  # contacts in words
 ) -> RobotRow:
     """The row of a robot by its last status."""
     if status is None:
-        return RobotRow(name, condition, error, rate, delay=delay)
+        return RobotRow(name, condition, error, rate, delay=delay, note=touches)
     note = status.hazard or (status.reason if condition > Condition.DONE else "")
     if not note and status.missing:
         note = "misses " + ", ".join(status.missing)
+    note = "; ".join(filter(None, (touches, note)))
     missed, share = status.missed if ticks else None, status.missed / max(1, status.ticks + status.missed)
     return RobotRow(name, condition, error, rate, status.battery, missed, share, delay, note)
 
@@ -233,8 +235,9 @@ def _coloured_error(error: float) -> str:
 
 
 def _coloured_missed(missed: int, share: float) -> str:
-    """Missed ticks in the colour of their share; in none without any."""
-    return f"<span style='color:{css(FAIR if share <= FEW_MISSED else BAD)}'>{missed}</span>" if share else f"{missed}"
+    """Share of missed ticks in its colour; in none without any."""
+    text = f"{100 * share:.1f} %"
+    return f"<span style='color:{css(FAIR if share <= FEW_MISSED else BAD)}'>{text}</span>" if missed else text
 
 
 def _milliseconds(seconds: float) -> str:
@@ -305,7 +308,7 @@ def event_list(events: Sequence[Event], start: float | None) -> str:
     lines = []
     for event in [event for event in events if event.kind not in QUIET][: -EVENTS - 1 : -1]:
         at = "" if start is None else f"{event.stamp - start:.1f} s"
-        grave = event.kind in ("hazard", "lost", "stop", "failed", "killed")
+        grave = event.kind in ("hazard", "contact", "lost", "stop", "failed", "killed")
         colour = f"color:{css(BAD)};" if grave else ""
         lines.append(
             f"<div style='{colour}overflow-wrap:anywhere'><span style='opacity:0.6'>{at}</span> "

@@ -12,11 +12,23 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 import numpy as np
 
 from agents.decision.lifecycle import Phase
-from agents.network.messages import LawMemory, Status, WorldState
+from agents.network.messages import Contact, LawMemory, Status, WorldState
 from experiments.definition.formation import errors_over_time
+from experiments.metrics.clearance import Overlap
 from experiments.recording.trace import ROUNDING_S
 from experiments.scene.drawing import SceneDrawing
-from experiments.scene.stage import AT_REST, TRAIL, TRAIL_S, Condition, LinkTracker, Moment, SceneModel, condition
+from experiments.scene.stage import (
+    AT_REST,
+    TOUCH_S,
+    TRAIL,
+    TRAIL_S,
+    Condition,
+    LinkTracker,
+    Moment,
+    SceneModel,
+    condition,
+    touched,
+)
 from experiments.scene.tracks import LOST_S, Track, Tracks
 from experiments.view.live import FRAME_S, IDLE_S, TABLE_S, Page
 from experiments.view.panel import HISTORY_S, PLOT_S, History, RobotRow, known, robot_row
@@ -25,7 +37,7 @@ from twins.arrays import Array
 if TYPE_CHECKING:
     import viser
 
-M = TypeVar("M", Status, WorldState, LawMemory)
+M = TypeVar("M", Contact, Status, WorldState, LawMemory)
 NOTHING: Final = LawMemory("", 0, 0.0)
 SPEEDS: Final = ("0.1", "0.25", "0.5", "1", "2", "5", "10", "20")
 STEP_S: Final = 0.02  # of a single step: a sample at 50 Hz
@@ -44,10 +56,19 @@ class Film:
     def moment(self, t: float) -> Moment:
         """The case at `t` [s] since the common start: between two samples, positions are interpolated."""
         tracks = self.tracks.tracks
-        at = [track.at(t) for track in tracks]
+        at, world = [track.at(t) for track in tracks], _last_status(self.tracks.world, t)
         trail = np.stack([track.positions(t - self._ages) for track in tracks])
         position = trail[:, 0]
-        conditions = np.array([_condition(track, k, t) for track, k in zip(tracks, at, strict=True)], dtype=np.intp)
+        obstacles = self.stage.obstacles_at(t, world)
+        overlaps = [
+            *self.stage.overlaps(position, obstacles, world),
+            *(Overlap(each.first, each.second, each.overlap) for each in _lately(self.tracks.contacts, t, TOUCH_S)),
+        ]
+        touching = {name for each in overlaps for name in (each.first, each.second)}
+        each_at = zip(self.tracks.robots, tracks, at, strict=True)
+        conditions = np.array(
+            [_condition(track, k, t, touches=name in touching) for name, track, k in each_at], dtype=np.intp
+        )
         goal = _taken(tracks, at, "goal", 3)
         memories = [_last_status(track.memories, t) or NOTHING for track in tracks]
         goal[np.isin(conditions, AT_REST)] = nan
@@ -59,7 +80,7 @@ class Film:
             silent_for=np.array([_time_since(track.sent, t) for track in tracks]),
             error=self.links.errors(t, position),
             broken=self.stage.broken_links(conditions, [_last_status(track.statuses, t) for track in tracks]),
-            obstacles=self.stage.obstacles_at(t, _last_status(self.tracks.world, t)),
+            obstacles=obstacles,
             trail=trail,
             attitude=_taken(tracks, at, "attitude", 4),
             shadow=_taken(tracks, at, "shadow", 3),
@@ -67,6 +88,7 @@ class Film:
             time=t,
             places=self.stage.said_places([each.variables for each in memories], position),
             measures=[each.numbers for each in memories],
+            overlaps=overlaps,
         )
 
     def rows(self, t: float) -> list[RobotRow]:
@@ -78,7 +100,8 @@ class Film:
         for k, (name, track) in enumerate(zip(self.tracks.robots, self.tracks.tracks, strict=True)):
             condition, status = Condition(int(moment.condition[k])), _last_status(track.statuses, t)
             rate = float(np.subtract(*np.searchsorted(track.sent, (t, t - 1.0), side="right")))
-            row = robot_row(name, condition, status, known(errors[k]), rate, ticks=ticks)
+            touches = touched(name, moment.overlaps)
+            row = robot_row(name, condition, status, known(errors[k]), rate, ticks=ticks, touches=touches)
             rows.append(row.measured(moment.measures, k))
         return rows
 
@@ -98,19 +121,25 @@ class Film:
         return history
 
 
-def _condition(track: Track, sample: int, t: float) -> Condition:
+def _condition(track: Track, sample: int, t: float, *, touches: bool) -> Condition:
     """Condition of a robot by its sample and its last status."""
     if sample < 0:
         return Condition.WAITING
     silent, last = t - track.time[sample] > LOST_S, sample == len(track.time) - 1
     phase, status = Phase(int(track.phase[sample])).word, _last_status(track.statuses, t)
-    return condition(status, phase, alive=not (silent and last), silent=silent)
+    return condition(status, phase, alive=not (silent and last), silent=silent, touches=touches)
 
 
 def _last_status(messages: Sequence[M], t: float) -> M | None:
     """The last message at or before `t` [s]."""
     count = bisect_right(messages, t, key=attrgetter("stamp"))
     return messages[count - 1] if count else None
+
+
+def _lately(messages: Sequence[M], t: float, span: float) -> Sequence[M]:
+    """Messages of the last `span` before `t` [s]."""
+    first, last = (bisect_right(messages, at, key=attrgetter("stamp")) for at in (t - span, t))
+    return messages[first:last]
 
 
 def _time_since(sent: Array, t: float) -> float:

@@ -153,7 +153,7 @@ class _Top:
         )
 
     def _rows(self) -> list[LiveRow]:
-        from experiments.scene.stage import Condition, condition
+        from experiments.scene.stage import Condition, condition, touched
 
         observer, now, rows = self._observer, self._observer.now(), []
         stage = observer.stage
@@ -167,7 +167,7 @@ class _Top:
                 self._trends.row(
                     name, status, now=now,
                     error=report.state.error if report.state is not None and (name in linked or not linked) else None,
-                    gone=gone, lost=bool(gone),
+                    gone=gone, lost=bool(gone), touches=touched(name, observer.overlaps),
                 )
             )  # fmt: skip
         return rows

@@ -19,6 +19,7 @@ from experiments.scene.stage import SceneModel
 from experiments.view import acting as orders
 from experiments.view import heartbeat
 from experiments.view.gate import Gate, Seen
+from tests.experiments.scene.test_stage import at_start
 
 HOST = "127.0.0.1:8080"
 HANDSHAKE = ("Upgrade", "websocket")
@@ -129,6 +130,31 @@ def test_late_orders_of_closed_pages_are_dropped(operator):
     acting.due["A"] = now, given.set
     acting.set_stage(SceneModel.of_robots(()), 3)
     assert acting.due == {}, "an order is not for the next case"
+
+
+@pytest.mark.parametrize(
+    ("apart", "said", "count"),
+    [(0.1, "not ordered: it would touch KH02 there.", 0), (-0.6, "0 of 0 robots; KH02 is on the straight way", 1)],
+)
+def test_leader_is_not_sent_into_a_robot(apart, said, count, operator):
+    acting, gate, given = operator
+    scene = SceneModel.of_plan(load("robotic-park").cases()["event"])
+    page = MagicMock()
+    acting._server.get_clients = lambda: {7: page}
+    acting.set_stage(scene, 2)
+    moment = at_start(scene)
+    moment.position[:, 1] += 100.0
+    leader, other = (scene.names.index(name) for name in ("TB01", "KH02"))
+    moment.position[leader], moment.position[other] = (0.6, 0.0, 0.0), (0.0, 0.0, 0.0)
+    acting.follow(moment, scene.names)
+    gate.seen[7] = Seen(time.time(), 2)
+    target = SimpleNamespace(position=(apart, 0.004, 0.0))
+    acting._drag("TB01", SimpleNamespace(client=object(), client_id=7, phase="end", target=target))
+    for _, order in acting.due.values():
+        order()
+    assert [order.goal for order in given] == [(apart, 0.0)] * count
+    title, text = page.add_notification.call_args.args
+    assert (title, text[: len(said)]) == (f"TB01 to x = {apart:.2f} m, y = 0.00 m", said)
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")

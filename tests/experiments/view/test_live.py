@@ -10,20 +10,23 @@ import msgspec
 import numpy as np
 import pytest
 
+from agents.body.kinds import KINDS
 from agents.errors import ExplainedError
-from agents.network import lab, pubsub
+from agents.network import lab, messages, pubsub
 from agents.network.endpoints import free_endpoint
 from agents.network.keys import Keys
+from experiments.file import document
 from experiments.file.document import load
 from experiments.recording.reader import RecordingError
 from experiments.run import simulate, simulate_seeds
 from experiments.scene import models, tracks
-from experiments.scene.stage import BAD, FAIR, Condition, SceneModel
+from experiments.scene.stage import BAD, FAIR, PALED, RINGED, Condition, SceneModel, condition, touched
 from experiments.view import live
 from experiments.view.acting import WatchedRun, may_act
 from experiments.view.broadcast import Broadcast
 from experiments.view.heartbeat import SLOWEST_S, DataAge, frame_s, mark
-from experiments.view.panel import History, RobotRow, css, event_list, link_table, table
+from experiments.view.observer import Observer
+from experiments.view.panel import History, RobotRow, css, event_list, link_table, robot_row, table
 from experiments.view.replay import Film, ReplayClock, marks
 from tests.cases import mostly_slow
 from tests.network import Mute, Net
@@ -165,6 +168,59 @@ def test_page_outlives_a_picture_that_fails(capsys):
     assert "no such mesh" in server.gui.add_html.return_value.content
 
 
+@pytest.fixture
+def observed():
+    """An observer of the reference experiment, and a function by which it receives messages."""
+    with Net().worn() as net:
+        observer = Observer(net.session, KEYS)
+
+        def send(key, message):
+            net.deliver(f"{key}\0{messages.JSON}\0".encode() + messages.encode(message))
+            observer.update()
+
+        plan = load("robotic-park").cases()["event"]
+        told = document.case_document(plan, "event")
+        net.deliver(f"{KEYS.experiment}\0{messages.JSON}\0".encode() + told)
+        for name in plan.names:
+            net.deliver(f"{KEYS.alive(name)}\0\0".encode())
+        observer.update()
+        yield observer, send
+
+
+def seen(robot, x):
+    """State of a robot of the reference experiment."""
+    return KEYS.state(robot), messages.State(robot, 0, 10.0, "running", position=(x, 0.0, 0.0))
+
+
+def test_contact_is_seen_while_it_happens(observed):
+    observer, send = observed
+    send(*seen("KH01", 0.0))
+    send(*seen("KH02", 0.6))
+    assert (observer.overlaps, list(observer.events)) == ([], [])
+    for x in (0.1, 0.04, 0.05):
+        send(*seen("KH02", x))
+    (found,), radius = observer.overlaps, KINDS["khepera4"].radius
+    assert found == ("KH01", "KH02", pytest.approx(2.0 * radius - 0.05))
+    assert [(each.kind, each.source, each.text) for each in observer.events] == [("contact", "KH01", "touches KH02")]
+    names, moment = observer.stage.names, observer.moment()
+    touching = [name for name, each in zip(names, moment.condition, strict=True) if each == Condition.TOUCHING]
+    assert touching == ["KH01", "KH02"]
+    row = robot_row("KH02", Condition.TOUCHING, None, 0.0, 0.0, touches=touched("KH02", moment.overlaps))
+    assert f"color:{css(BAD)};padding-left:1.2em'>touches KH01, 9.0 cm deep" in table([row], observer.stage)
+
+
+def test_contacts_of_a_world_are_its_own(observed):
+    observer, send = observed
+    world = messages.WorldState(0.0, "pymunk", 1.0, 1.0, 0.0, paused=False, robots=["KH01", "KH02"])
+    send(KEYS.world, world)
+    send(*seen("KH01", 0.0))
+    send(*seen("KH02", 0.1))
+    assert observer.overlaps == []
+    send(KEYS.contact, messages.Contact(10.0, "KH01", "KH02", 0.1, 0.001))
+    send(*seen("KH02", 0.1))
+    assert observer.overlaps == [("KH01", "KH02", 0.001)]
+
+
 @pytest.fixture(scope="module", params=["distributed", "centralised"])
 def recorded_case(request):
     """A recorded run, as the trace in memory and as a file."""
@@ -176,6 +232,24 @@ def recorded_case(request):
 @pytest.fixture
 def film(recorded_case):
     return Film(tracks.read(recorded_case[1]))
+
+
+def test_replay_shows_contacts_that_a_world_reported(film):
+    contact = messages.Contact(1.0, "KH01", "box", 0.1, 0.002)
+    touched = Film(replace(film.tracks, contacts=(contact,)))
+    for t, note in ((0.9, ""), (1.5, "touches box, 0.2 cm deep"), (2.1, "")):
+        assert next(row.note for row in touched.rows(t) if row.name == "KH01") == note
+
+
+def test_reason_of_an_early_end_stays(film):
+    status = messages.Status("KH02", 0.0, "done", "its control loop hangs: no tick for 0.5 s")
+    rows = [
+        robot_row("KH02", condition(each), each, 0.0, 0.0)
+        for each in (status, msgspec.structs.replace(status, reason="finished"))
+    ]
+    assert [row.note for row in rows] == [status.reason, ""]
+    assert status.reason in table(rows, film.stage)
+    assert Condition.OUT in (set(RINGED) & set(PALED))
 
 
 @pytest.mark.slow
@@ -276,7 +350,7 @@ def test_warnings_misses_and_leaders_look_so(film):
     rows = [RobotRow(leader, Condition.ACTIVE, missed=0, delay=-1e-6), RobotRow(follower, Condition.ACTIVE, **late)]
     text = table(rows, film.stage)
     assert "-0.0" not in text
-    for part in (">–<", f"color:{css(BAD)}'>7<", f"color:{css(FAIR)};padding-left:1.2em'>warn", ">0<"):
+    for part in (">–<", f"color:{css(BAD)}'>50.0 %<", f"color:{css(FAIR)};padding-left:1.2em'>warn", ">0.0 %<"):
         assert part in text
 
 
