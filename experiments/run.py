@@ -383,7 +383,11 @@ def read_back(folder: Path, recordings: Mapping[str, Path], notes: Sequence[str]
             remarks.append(f"{name}: several recordings are of this case; shown is {file.name}")
         traces[name] = played.trace
         made.append(played.started if played.trace.clock == "real" else file.stat().st_mtime)
-        if not played.complete:
+        if played.damaged:
+            remarks.append(
+                f"{case}: {played.damaged} bytes of the recording are damaged, and what was in them is missing"
+            )
+        elif not played.complete:
             remarks.append(f"{case}: the recording was cut off; `./zenpark recover {file}` mends it")
     if len({trace.seed for trace in traces.values()}) > 1:
         seeds = ", ".join(f"{case} {trace.seed}" for case, trace in traces.items())

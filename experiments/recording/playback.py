@@ -137,6 +137,7 @@ class Playback:
     started: float  # [s] UTC of the common start; of a virtual run `trace.EPOCH`
     complete: bool  # the recorder finished the file and nothing in it is damaged
     messages: int  # in the file, those of other programs included
+    damaged: int  # what could not be read of the file [bytes]
 
 
 def read(path: Path) -> Playback:
@@ -180,7 +181,7 @@ def read(path: Path) -> Playback:
         raise NotStarted(f"{path}: the run ended before the common start; there is nothing to show")
     with np.errstate(all="ignore"):  # numbers that no robot can have are in the file, not of our making
         trace = _trace(content, about, (start, length), time)
-    return Playback(trace, start, records.complete, messages)
+    return Playback(trace, start, records.complete, messages, records.damaged)
 
 
 class Content:

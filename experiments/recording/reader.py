@@ -1,14 +1,16 @@
 """Reads and recovers MCAP files, finished or not: what a killed recorder or a full disk left behind counts.
 
 Readers that seek need the summary that only a finished file has. This one goes through the file from its beginning, and
-checks each record before using it. Damage costs only the records it hit and those that depend on them.
+checks each record before using it. Behind damage it goes on at the next record with a length and a checksum that fit.
+Damage costs only the records it hit and those that depend on them, and is counted.
 """
 
 from __future__ import annotations
 
+import re
 import struct
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
@@ -24,14 +26,21 @@ from mcap.stream_reader import get_chunk_data_stream
 from mcap.writer import MCAP0_MAGIC, Writer
 
 from agents.errors import ExplainedError
-from agents.network.messages import Event
 from experiments.recording.topics import CHUNK_BYTES, TOPICS
 
 _RECORD: Final = struct.Struct("<BQ")  # operation code, length of what follows
+_FOOTER: Final = struct.Struct("<QQI")  # begin of the summary and of its offsets, checksum of both
 _MESSAGE: Final = struct.Struct("<BQHIQQ")  # the same, and channel, sequence, log time, publish time of a message
-EVENTS: Final = next(topic.name for topic in TOPICS if topic.message is Event)
+# last words of topics with messages that hold their time of arrival: a repeat of one has the same running number alone
+ARRIVALS: Final = {topic.name.rpartition("/")[2] for topic in TOPICS if topic.recorded is not topic.message}
+LAST: Final = 2**64  # [ns] later than any stamp
 PARTS: Final = "cases"  # folder beside a recording: in that of its case are its later parts
 HEAD: Final = np.dtype([("", "u1"), ("length", "<u8"), ("channel", "<u2"), ("", "<u4, <u8"), ("published", "<u8")])
+FOOTER_BYTES: Final = _RECORD.size + _FOOTER.size
+PRIVATE: Final = 0x80  # first operation code that MCAP leaves to programs
+CHECKED: Final = (Opcode.CHUNK, Opcode.ATTACHMENT)  # records with a checksum
+START: Final = re.compile(rb"[\x06\x09\x0c](?=.{4}\x00{4})", re.DOTALL)  # of these or of metadata, below 4 GB
+BLOCK_BYTES: Final = 1 << 20
 _DAMAGE: Final = (McapError, struct.error, zstandard.ZstdError, ValueError, RuntimeError, OverflowError, MemoryError)
 
 
@@ -60,6 +69,7 @@ class Records:
     attachments: list[Attachment] = field(default_factory=list)  # in the order of the file
     metadata: list[Metadata] = field(default_factory=list)  # in the order of the file
     complete: bool = False  # the file was finished by its recorder and nothing in it is damaged; known at the end
+    damaged: int = 0  # what cannot be read [bytes], without a last record that was being written; known at the end
 
     def messages(self) -> Iterator[RecordedMessage]:
         """All messages with a known channel, in the order of writing; raises as `pieces` does."""
@@ -90,27 +100,48 @@ class Records:
             ) from error
 
     def _walk(self, file: BinaryIO, size: int) -> Iterator[tuple[bytes, list[int]]]:
-        damaged = False
-        while len(head := file.read(_RECORD.size)) == _RECORD.size:
-            opcode, length = _RECORD.unpack(head)
-            if opcode == 0 or length > size - file.tell():
-                return
-            body = file.read(length)
+        self._read_summary(file, size)
+        at = checked = len(MCAP0_MAGIC)  # `checked`: where the last record with a checksum ended
+        unread = 0  # [bytes] records since then with a content that is damaged
+        while at < size:
+            opcode, body, end = _record(file, at, size)
             if opcode == Opcode.FOOTER:
-                self.complete = file.read() == MCAP0_MAGIC and not damaged
+                self.damaged += unread
+                self.complete = file.read() == MCAP0_MAGIC and not self.damaged
                 return
+            if opcode is None:
+                found = _next(file, checked, size)
+                if found == size and end > size:  # a last record that was being written
+                    break
+                self.damaged += found - at + unread if found > at else found - checked
+                at, checked, unread = found, found + 1, 0
+                continue
+            places: list[int] = []
             try:
-                if opcode == Opcode.CHUNK:
-                    stream, length = get_chunk_data_stream(Chunk.read(ReadDataStream(BytesIO(body))), validate_crc=True)
-                    data = stream.read(length)
-                else:
-                    data = head + body
+                data = _unpacked(body) if opcode == Opcode.CHUNK else _RECORD.pack(opcode, len(body)) + body
                 places = self._places(data)
             except _DAMAGE:
-                damaged = True
-                continue
+                unread += end - at
+            else:
+                if opcode in CHECKED:
+                    self.damaged, checked, unread = self.damaged + unread, end, 0
             if places:
                 yield data, places
+            at = end
+        self.damaged += unread
+
+    def _read_summary(self, file: BinaryIO, size: int) -> None:
+        """Takes schemas and channels from the summary of a finished file: where they first stood may be damaged."""
+        opcode, body, end = _record(file, size - FOOTER_BYTES - len(MCAP0_MAGIC), size)
+        begin, _, checksum = _FOOTER.unpack(body) if opcode == Opcode.FOOTER else (0, 0, 0)
+        if not 0 < begin < end:
+            return
+        file.seek(begin)
+        content = file.read(end - begin)
+        if zlib.crc32(content[:-4]) == checksum:
+            summary = Records(self.path)
+            summary._places(content[:-FOOTER_BYTES])
+            self.schemas, self.channels = summary.schemas, summary.channels
 
     def _places(self, data: bytes) -> list[int]:
         """Places where the records of messages begin, among records that follow each other; other records are kept."""
@@ -145,6 +176,52 @@ class Records:
             self.metadata.append(Metadata.read(stream))
 
 
+def _record(file: BinaryIO, at: int, size: int) -> tuple[int | None, bytes, int]:
+    """Operation code, body and end of the record at a place; no code if it is not whole, and then 0 if it is none."""
+    file.seek(max(0, at))
+    head = file.read(_RECORD.size)
+    if len(head) < _RECORD.size:
+        return None, b"", size + 1
+    opcode, length = _RECORD.unpack(head)
+    if not (0 < opcode <= max(Opcode) or opcode >= PRIVATE) or (opcode == Opcode.FOOTER) != (length == _FOOTER.size):
+        return None, b"", 0
+    end = at + _RECORD.size + length
+    return (None, b"", end) if end > size else (opcode, file.read(length), end)
+
+
+def _unpacked(body: bytes) -> bytes:
+    """Records in a chunk; raises one of _DAMAGE if its checksum does not fit."""
+    stream, length = get_chunk_data_stream(Chunk.read(ReadDataStream(BytesIO(body))), validate_crc=True)
+    return stream.read(length)
+
+
+def _next(file: BinaryIO, at: int, size: int) -> int:
+    """Place of the next record from a place on with a content that fits; the size of the file if there is none."""
+    while at < size:
+        file.seek(at)
+        block = file.read(BLOCK_BYTES)
+        for found in START.finditer(block):
+            if _fits(*_record(file, at + found.start(), size)):
+                return at + found.start()
+        at += max(len(block) - _RECORD.size + 1, 1)
+    return size
+
+
+def _fits(opcode: int | None, body: bytes, _: int) -> bool:
+    """Whether the checksum of a chunk or of an attachment fits; of metadata, which have none, the length."""
+    try:
+        if opcode == Opcode.CHUNK:
+            return bool(_unpacked(body))
+        if opcode == Opcode.ATTACHMENT:
+            return zlib.crc32(body[:-4]) == int.from_bytes(body[-4:], "little")
+        if opcode == Opcode.METADATA:
+            stream = ReadDataStream(BytesIO(body))
+            return bool(Metadata.read(stream).name) and stream.count == len(body)
+    except _DAMAGE:
+        pass
+    return False
+
+
 @dataclass(frozen=True)
 class Recovered:
     """Result of `recover`."""
@@ -152,6 +229,7 @@ class Recovered:
     messages: int
     robots: tuple[str, ...]  # in the order in which they appear
     complete: bool  # the source was whole already, and no target was written
+    damaged: int = 0  # what could not be read of the sources [bytes]
 
 
 def later_parts(recording: Path) -> list[Path]:
@@ -169,30 +247,54 @@ def recover(source: Path, target: Path, later: Sequence[Path] = ()) -> Recovered
     Raises:
         RecordingError: If no part is a recording, or the target exists or cannot be written.
     """
-    counts, refusals = list[tuple[Records, int]](), list[RecordingError]()
+    parts, refusals = list[_Part](), list[RecordingError]()
     for path in (source, *later):
-        part = Records(path)
         try:
-            counts.append((part, sum(1 for _ in part.messages())))
+            parts.append(_Part.of(Records(path)))
         except RecordingError as error:  # its recorder was killed before the file was there, or before its first record
             refusals.append(error)
-    if not counts:
+    if not parts:
         raise refusals[0]
-    messages = sum(count for _, count in counts)
-    parts = [part for part, count in counts if count] or [counts[0][0]]
-    channels = [channel for part in parts for channel in part.channels.values()]
+    parts = [part for part in parts if part.messages] or parts[:1]
+    first = parts[0]
+    channels = [channel for part in parts for channel in part.records.channels.values()]
     robots = tuple(dict.fromkeys(filter(None, map(_robot, channels))))
-    complete = parts[0].complete and parts[0].path == source and len(parts) == 1
-    if not complete:
-        _write(parts, target)
-    return Recovered(messages, robots, complete)
+    if first.records.complete and first.records.path == source and len(parts) == 1:
+        return Recovered(first.messages, robots, complete=True)
+    damaged = sum(part.records.damaged for part in parts)
+    return Recovered(_write(parts, target), robots, complete=False, damaged=damaged)
 
 
-def _write(parts: Sequence[Records], target: Path) -> None:
-    """Write all that was read."""
+@dataclass(frozen=True)
+class _Part:
+    """A file of a recording that was read once."""
+
+    records: Records
+    messages: int
+    begins: dict[str, int]  # [ns] earliest stamp by topic
+
+    @classmethod
+    def of(cls, records: Records) -> _Part:
+        count, begins = 0, dict[int, int]()
+        for message in records.messages():
+            count += 1
+            begins[message.channel] = min(message.published, begins.get(message.channel, message.published))
+        return cls(records, count, _earliest((records.channels[each].topic, at) for each, at in begins.items()))
+
+
+def _earliest(stamps: Iterable[tuple[str, int]]) -> dict[str, int]:
+    """Earliest of the stamps of each topic."""
+    found: dict[str, int] = {}
+    for topic, stamp in stamps:
+        found[topic] = min(stamp, found.get(topic, stamp))
+    return found
+
+
+def _write(parts: Sequence[_Part], target: Path) -> int:
+    """Write all that was read; return the number of messages."""
     try:
         with target.open("xb") as file:
-            _copy(parts, Writer(file, chunk_size=CHUNK_BYTES))
+            return _copy(parts, Writer(file, chunk_size=CHUNK_BYTES))
     except FileExistsError:
         raise RecordingError(f"{target}: exists already; recover under another name") from None
     except RecordingError:
@@ -203,30 +305,43 @@ def _write(parts: Sequence[Records], target: Path) -> None:
         raise RecordingError(f"{target}: cannot be written: {error.strerror}; recover to somewhere else") from error
 
 
-def _copy(parts: Sequence[Records], writer: Writer) -> None:
-    first = parts[0]
+def _copy(parts: Sequence[_Part], writer: Writer) -> int:
+    """Write the messages of all parts, without those of a part that are in an earlier one; return their number.
+
+    Publishers repeat their last values to a recorder that took over. Messages of one part are never compared with each
+    other: several of one topic may have the same stamp.
+    """
+    first = parts[0].records
     header = first.header
     writer.start(header.profile if header else "", header.library if header else "zenpark")
     schemas: dict[tuple[str, str, bytes], int] = {}
     channels: dict[tuple[str, int], int] = {}
-    repeats = _Repeats()
-    for part in parts:
+    earlier: set[tuple[int, int, int | bytes]] = set()  # messages that a later part may repeat
+    written = 0
+    for number, part in enumerate(parts, 1):
+        begins = _earliest(each for later in parts[number:] for each in later.begins.items())
         made = {0: 0}  # MCAP's own mark for: none
-        for old, schema in part.schemas.items():
+        for old, schema in part.records.schemas.items():
             about = (schema.name, schema.encoding, schema.data)
             made[old] = schemas.get(about) or schemas.setdefault(about, writer.register_schema(*about))
         places: dict[int, int] = {}
-        for old, each in part.channels.items():
+        for old, each in part.records.channels.items():
             named = (each.topic, made.get(each.schema_id, 0))
             if named not in channels:
                 channels[named] = writer.register_channel(each.topic, each.message_encoding, named[1], each.metadata)
             places[old] = channels[named]
-        for message in Records(part.path).messages():
-            channel = places[message.channel]
-            if part is first or not repeats.has(channel, message):
-                writer.add_message(channel, message.logged, message.data, message.published, message.sequence)
-            if len(parts) > 1:
-                repeats.keep(channel, message, part.channels[message.channel].topic)
+        fresh: list[tuple[int, int, int | bytes]] = []
+        for message in Records(part.records.path).messages():
+            channel, topic = places[message.channel], part.records.channels[message.channel].topic
+            content = message.sequence if topic.rpartition("/")[2] in ARRIVALS else message.data
+            key = (channel, message.published, content)
+            if key in earlier:
+                continue
+            writer.add_message(channel, message.logged, message.data, message.published, message.sequence)
+            written += 1
+            if message.published >= begins.get(topic, LAST):
+                fresh.append(key)
+        earlier.update(fresh)
     for attachment in first.attachments:
         writer.add_attachment(
             attachment.create_time, attachment.log_time, attachment.name, attachment.media_type, attachment.data
@@ -234,27 +349,7 @@ def _copy(parts: Sequence[Records], writer: Writer) -> None:
     for metadata in first.metadata:
         writer.add_metadata(metadata.name, metadata.metadata)
     writer.finish()
-
-
-class _Repeats:
-    """Last values that publishers repeat to a recorder that took over."""
-
-    def __init__(self) -> None:
-        self._events: set[tuple[int, bytes]] = set()  # few, and not in the order of their stamps
-        self._latest: dict[int, int] = {}  # [ns] stamp of all other messages, by channel
-        self._unordered: set[int] = set()
-
-    def has(self, channel: int, message: RecordedMessage) -> bool:
-        if channel in self._unordered:
-            return (message.published, message.data) in self._events
-        return message.published <= self._latest.get(channel, -1)
-
-    def keep(self, channel: int, message: RecordedMessage, topic: str) -> None:
-        if topic == EVENTS:
-            self._unordered.add(channel)
-            self._events.add((message.published, message.data))
-        else:
-            self._latest[channel] = max(self._latest.get(channel, -1), message.published)
+    return written
 
 
 def _robot(channel: Channel) -> str:

@@ -217,7 +217,7 @@ class Recording:
         """
         self.path = path
         self.refused = 0  # messages left out, because they hold what their type excludes
-        self._channels: dict[tuple[str, str], int] = {}  # by topic and robot
+        self._channels: dict[tuple[str, str], int] = {}  # by topic and robot, if the topic is of one
         self._schemas: dict[str, int] = {}
         self._stamp = -inf  # [s, UTC] the last good one
         self._latest = 0  # [ns] the same
@@ -346,7 +346,8 @@ class Recording:
         except Unencodable:
             self.refused += 1
             return False
-        robot = getattr(message, "robot", "")
+        # one channel for each topic: readers that look a topic up take the first of its channels alone
+        robot = getattr(message, "robot", "") if "{robot}" in topic.name else ""
         channel = self._channels.get((topic.name, robot)) or self._register(topic, robot)
         begun = self._nanoseconds(logged)
         stamp = begun if message.stamp == logged else self._nanoseconds(message.stamp)

@@ -285,9 +285,10 @@ def recover(
     found = repair(source, chosen, later_parts(source))
     made = f"{source} is whole already" if found.complete else str(chosen)
     shown = {"file": source if found.complete else chosen, "was_whole": found.complete}
+    lost = f"; {found.damaged} bytes were damaged, and what was in them is missing" if found.damaged else ""
     print_result(
-        shown | {"messages": found.messages, "robots": found.robots},
-        f"{made}: {found.messages} messages of {', '.join(found.robots) or 'no robot'}",
+        shown | {"messages": found.messages, "robots": found.robots, "damaged_bytes": found.damaged},
+        f"{made}: {found.messages} messages of {', '.join(found.robots) or 'no robot'}{lost}",
         as_json=as_json,
     )
 
