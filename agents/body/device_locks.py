@@ -1,7 +1,8 @@
 """Exclusive use of a device on this machine: a lock on its address, held while a body is open.
 
-The locks are files of the user's runtime folder (`agents.user_folder`) and end with their process. Other
-machines and other users are not excluded.
+The locks are files of all runtime folders of the user (`agents.user_folder`): a process with another environment has
+another one first. They end with their process. Other machines and other users are not excluded; root finds the
+locks of all users.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from pathlib import Path
 from typing import Final
 
 from agents.body.interface import BodyError
-from agents.user_folder import runtime_folder
+from agents.user_folder import foreign_folders, runtime_folders
 
 LONGEST: Final = 200  # [bytes] of the description of a holder
 
@@ -41,8 +42,10 @@ class Claims:
         """Locks all devices, or none, before the first byte goes to one; raises BodyError with the holder."""
         try:
             for name, address in self._wanted:
-                path = runtime_folder() / f"device-{hashlib.sha256(address.encode()).hexdigest()[:32]}.lock"
-                self._locks[path] = _lock(path, name, address)
+                file = f"device-{hashlib.sha256(address.encode()).hexdigest()[:32]}.lock"
+                there = [each / file for each in foreign_folders() if (each / file).is_file()]
+                for path in [*(each / file for each in runtime_folders()), *there]:
+                    self._locks[path] = _lock(path, name, address)
         except OSError as error:
             self.release()
             raise BodyError(

@@ -52,7 +52,7 @@ def loaded(*words, program=LOADED, cwd=ROOT, **more):
             ("--help", "Usage: zenpark ", "numpy zenoh matplotlib msgspec pymunk rich asyncio jinja2 mcap pydantic"),
             ("list --json", "{", "numpy matplotlib zenoh pydantic"),
             ("check --help", "Usage: zenpark check ", "numpy matplotlib zenoh pydantic"),
-            ("runs", "no run is up on this machine\n", "numpy matplotlib mcap"),
+            ("runs", "no run is listed in ", "numpy matplotlib mcap"),
             ("estop --connect tcp/127.0.0.1:9 --json", "{", "numpy matplotlib mcap"),
         ],
         3,

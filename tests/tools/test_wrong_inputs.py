@@ -80,7 +80,7 @@ COMMANDS = (
     ("install --editable ../mine", "by the script ./zenpark", "in its folder: ./zenpark install --editable ../mine"),
     ("view nope", "nope: holds no recording (.mcap)", "name the folder of a run"),
     ("hz park/** --seconds soon", "--seconds: must be a valid number", "`./zenpark hz --help`"),
-    ("view", "no run is up on this machine", "name its router (--connect)"),
+    ("view", "no run is listed in", "name its router (--connect)"),
     ("keys --connect tcp/127.0.0.1:9", "no router answers at tcp/127.0.0.1:9", "--connect names another"),
     ("echo park//x", "'park//x' is not a key expression", "Write it like park/*/pose"),
     ("keys --connect @nope", "nope: cannot be read", "network.txt"),

@@ -367,27 +367,21 @@ def runs(
     """Show which runs are up on this machine; with --past those that left their folders, with key figures."""
     import msgspec
 
-    from agents.user_folder import runtime_folder
     from experiments.real_time.hosts import run_registry
 
     if past or words or below:
-        return _show_past(words or [], below, as_json=as_json)
-    found = run_registry.runs()
+        _show_past(words or [], below, as_json=as_json)
+        return
+    found = run_registry.look()
     lines = []
-    for run in found:
+    for run in found.runs:
         since = time.strftime("%H:%M:%S", time.localtime(run.since))
         died = "" if run.alive else "; its process has died"
         lines.append(f"{run.title}  since {since}, pid {run.pid}, at {run.where}, realm {run.realm}{died}")
         robots = ", ".join(f"{name} ({body})" if body else name for name, body in run.robots.items())
         lines += [f"  {each}" for each in (run.folder, robots) if each]
-    shown = [{**msgspec.to_builtins(run), "alive": run.alive} for run in found]
-    nothing = "no run is up on this machine"
-    try:
-        runtime_folder()
-    except OSError as error:
-        nothing = f"runs of this machine are not listed: {error}"
-    print_result(shown, *(lines or [nothing]), as_json=as_json)
-    return None
+    shown = [{**msgspec.to_builtins(run), "alive": run.alive} for run in found.runs]
+    print_result(shown, *(lines or [found.words]), as_json=as_json)
 
 
 def _past_runs(words: Sequence[str], below: list[str] | None) -> list[PastRun]:

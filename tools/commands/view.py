@@ -322,11 +322,12 @@ def _watched(connect: list[str] | None, realm: str, lab: str | None, identity: s
 
     if given := routers(connect, lab):
         return WatchedRun(given, realm, identity or _default_identity(given))
-    up = [run for run in run_registry.runs() if run.what == "run" and run.alive]
+    found = run_registry.look()
+    up = [run for run in found.runs if run.what == "run" and run.alive]
     if not up:
         raise ExplainedError(
-            "no run is up on this machine: start one (`./zenpark run robotic-park`), name its router (--connect), or "
-            "the folder of a recording"
+            f"{found.words}: start one (`./zenpark run robotic-park`), name its router (--connect), or the folder of a "
+            "recording"
         )
     if len(up) > 1:
         print(f"zenpark: {len(up)} runs are up; this is the newest one", file=sys.stderr)

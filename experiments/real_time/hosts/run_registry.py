@@ -1,7 +1,7 @@
 """Registry of the runs on this machine: one small file each, so that an emergency stop finds all of them.
 
-The files lie in a folder that belongs to the user alone: `$ZENPARK_RUNTIME_DIR`, else `$XDG_RUNTIME_DIR/zenpark`, else
-`zenpark-UID` in the folder for temporary files. Runs of other users are not listed.
+The files lie in each folder that belongs to the user alone (`agents.user_folder`), so that a shell with another
+environment finds them, and still does when one of them was deleted. Runs of other users are listed for root only.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final, Literal, NamedTuple
 
 import msgspec
 
@@ -22,7 +22,7 @@ from agents.clock import Clock
 from agents.network import endpoints as topology
 from agents.network import lab
 from agents.network.endpoints import UNIX, Endpoint
-from agents.user_folder import runtime_folder
+from agents.user_folder import readable_folders, runtime_folders
 
 MAX_ENTRY_BYTES: Final = 1 << 20  # [bytes] of a file
 KNOCK_S: Final = 0.3  # longest time of a local router to accept a connection
@@ -41,11 +41,19 @@ class RegisteredRun(msgspec.Struct, frozen=True):
     realm: str = "park"  # first chunk of the keys
     identity: str = "operator"  # name in the certificate that may stop it, in a lab
     robots: dict[str, str] = {}  # name and address of hardware of each robot; the address is empty for a twin
+    user: int = -1  # to whom its file belongs; set by who reads it
 
     @property
     def alive(self) -> bool:
         """Whether its process runs; processes that it started may outlive it for a while."""
-        return born(self.pid) == self.born
+        return born(self.pid) == self.born and self._is_of_user()
+
+    def _is_of_user(self) -> bool:
+        """Whether the process is one of the user who wrote the file: root must not end another's for it."""
+        try:
+            return self.user in (-1, Path(f"/proc/{self.pid}").stat().st_uid)
+        except OSError:
+            return not Path("/proc/self").exists()
 
     @property
     def where(self) -> str:
@@ -87,38 +95,59 @@ def own_entry(
     pid = os.getpid()
     place = "" if folder is None else str(folder.absolute())
     return RegisteredRun(
-        what, pid, born(pid) or "", Clock().utc(), title, place, list(endpoints), realm, identity, robots or {}
+        what, pid, born(pid) or "", Clock().utc(), title, place, list(endpoints), realm, identity, robots or {},
+        os.getuid(),
     )  # fmt: skip
 
 
 @contextmanager
 def registered(run: RegisteredRun) -> Iterator[str]:
     """Inside, a run is registered; yields the reason if that failed, else an empty text."""
-    file, why = None, ""
+    files: list[Path] = []
+    why = ""
     try:
-        file = runtime_folder() / f"{run.pid}-{run.born or 'x'}-{time.monotonic_ns()}.json"
-        draft = file.with_suffix(".draft")
-        draft.write_bytes(msgspec.json.encode(run))
-        draft.replace(file)
+        for folder in runtime_folders():
+            file = folder / f"{run.pid}-{run.born or 'x'}-{time.monotonic_ns()}.json"
+            files.append(file)
+            draft = file.with_suffix(".draft")
+            draft.write_bytes(msgspec.json.encode(run))
+            draft.replace(file)
     except OSError as error:
         why = f"not listed among the runs of this machine ({error}): stop it with --connect"
     try:
         yield why
     finally:
-        if file is not None:
+        for file in files:
             with suppress(OSError):
                 file.unlink()
 
 
+class Listing(NamedTuple):
+    """Result of a look for runs."""
+
+    runs: list[RegisteredRun]
+    folders: list[Path]  # that were looked at
+    trouble: list[str]  # why a folder could not be looked at
+
+    @property
+    def words(self) -> str:
+        """Where no run was found, for people."""
+        found = [f"no run is listed in {', '.join(map(str, self.folders))}"] if self.folders else []
+        return "; ".join([*found, *(f"runs may be up that are not listed: {each}" for each in self.trouble)])
+
+
 def runs() -> list[RegisteredRun]:
-    """All runs that are up, oldest first; and those that died while a router of theirs, or their robots, may be up.
+    """All runs that are up, oldest first; and those that died while a router of theirs, or their robots, may be up."""
+    return look().runs
+
+
+def look() -> Listing:
+    """Look for `runs` in each folder that may have some.
 
     Files of runs that are gone are removed; what is none of ours, or cannot be read, is left alone.
     """
-    try:
-        files = sorted(runtime_folder().glob("*.json"))
-    except OSError:
-        return []
+    folders, trouble = readable_folders()
+    files = [file for folder in folders for file in folder.glob("*.json")]
     found = {file: run for file in files if (run := _read(file)) is not None}
     dead = {file: topology.bare(run.endpoints) for file, run in found.items() if not run.alive}
     silent = _silent({endpoint for endpoints in dead.values() for endpoint in endpoints})
@@ -127,7 +156,8 @@ def runs() -> list[RegisteredRun]:
             del found[file]
             with suppress(OSError):
                 file.unlink()
-    return sorted(found.values(), key=lambda run: run.since)
+    up = {(run.user, run.pid, run.born, run.since, *run.endpoints): run for run in found.values()}  # each once
+    return Listing(sorted(up.values(), key=lambda run: run.since), folders, list(map(str, trouble)))
 
 
 def _silent(endpoints: Iterable[str]) -> set[str]:
@@ -148,10 +178,10 @@ def _silent(endpoints: Iterable[str]) -> set[str]:
 
 
 def _read(file: Path) -> RegisteredRun | None:
-    """A run's file, if it is one of this user's."""
+    """A run's file, if it is one of the user to whom the folder belongs."""
     try:
-        about = file.lstat()
-        if not stat.S_ISREG(about.st_mode) or about.st_uid != os.getuid() or about.st_size > MAX_ENTRY_BYTES:
+        about, user = file.lstat(), file.parent.lstat().st_uid
+        if not stat.S_ISREG(about.st_mode) or about.st_uid != user or about.st_size > MAX_ENTRY_BYTES:
             return None
         run = msgspec.json.decode(file.read_bytes(), type=RegisteredRun)
         for endpoint in topology.bare(run.endpoints):
@@ -159,6 +189,7 @@ def _read(file: Path) -> RegisteredRun | None:
         lab.lab_of(run.endpoints)
     except (OSError, ValueError, msgspec.MsgspecError, RecursionError):
         return None
+    run = msgspec.structs.replace(run, user=user)  # whatever the file says
     return run if run.pid > 0 and run.endpoints and run.realm else None
 
 

@@ -1,6 +1,7 @@
 """The list of runs: what is up is found, what died is cleaned away, and what is none of ours harms nobody."""
 
 import os
+import shutil
 import socket
 import subprocess
 import sys
@@ -12,6 +13,8 @@ import msgspec
 import psutil
 import pytest
 
+from agents.body.device_locks import Claims
+from agents.body.interface import BodyError
 from agents.network.endpoints import free_endpoint
 from experiments.real_time.hosts import run_registry
 from experiments.real_time.hosts.run_registry import born, own_entry, registered, runs
@@ -106,14 +109,63 @@ def test_folder_writable_by_others_is_refused(runtime_folder):
     assert runs() == []
 
 
-def test_without_runtime_folder_the_users_is_used(tmp_path, monkeypatch):
+@pytest.fixture
+def shells(tmp_path, monkeypatch):
+    """Environments of one user, by what XDG_RUNTIME_DIR names, if anything: nothing is found but below `tmp_path`."""
     monkeypatch.delenv("ZENPARK_RUNTIME_DIR")
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "missing"))
-    with registered(entry()) as why:
-        assert why == ""
-        assert [path.name for path in tmp_path.iterdir()] == [f"zenpark-{os.getuid()}"]
-    (tmp_path / "session").mkdir(0o700)
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "session"))
-    with registered(entry()):
-        assert len(list((tmp_path / "session" / "zenpark").iterdir())) == 1
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "tmp"))
+    monkeypatch.setattr("agents.user_folder.SESSIONS", tmp_path / "sessions")
+    monkeypatch.setattr("agents.user_folder.TEMPORARY", tmp_path / "tmp")
+    for each in ("tmp", "session", f"sessions/{os.getuid()}"):
+        (tmp_path / each).mkdir(0o700, parents=True)
+
+    def enter(session=None):
+        if session is None:
+            monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
+        else:
+            monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / session))
+
+    return enter
+
+
+def test_shells_of_one_user_list_same_runs(shells, tmp_path):
+    run = entry()
+    for begun in ("session", "missing", None):
+        shells(begun)
+        with registered(run) as why:
+            assert why == ""
+            for other in (None, "session", "missing"):
+                shells(other)
+                assert runs() == [run], (begun, other)
+            shutil.rmtree(tmp_path / "sessions" / str(os.getuid()) / "zenpark")  # as at the end of the last session
+            assert runs() == [run]
+        assert runs() == []
+
+
+def test_shells_of_one_user_share_locks(shells):
+    shells("session")
+    driver = Claims(["A"], ["radio 80"])
+    driver.take()
+    shells()
+    with pytest.raises(BodyError, match="radio 80 is in use"):
+        Claims(["B"], ["radio 80"]).take()
+    driver.release()
+    Claims(["B"], ["radio 80"]).take()
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="looks into the folders of others as root")
+def test_root_lists_runs_of_all_users(shells, tmp_path):
+    shells()
+    theirs = tmp_path / "sessions" / "1234" / "zenpark"
+    theirs.mkdir(0o700, parents=True)
+    file = theirs / "0.json"
+    with socket.create_server(("127.0.0.1", 0)) as router:
+        left = changed(entry(), endpoints=[f"tcp/127.0.0.1:{router.getsockname()[1]}"])
+        file.write_bytes(msgspec.json.encode(left))
+        for each in (theirs, file):
+            os.chown(each, 1234, 1234)
+        (found,) = runs()
+        assert (found.user, found.endpoints) == (1234, left.endpoints)
+        assert not found.alive, "its process is another user's: root does not end it"
+        theirs.chmod(0o777)
+        assert runs() == []
