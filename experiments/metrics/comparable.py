@@ -13,7 +13,8 @@ from experiments.metrics.results import CaseMetrics
 MISSED: Final = 0.01  # share of missed deadlines from which on a run is spoiled
 LOST: Final = 0.01  # share of lost poses from which on a run is spoiled
 SLOW: Final = 0.9  # real-time factor of a world below which a run is spoiled
-SPOILING: Final = ("began", "could not read")  # what troubles that spoil a run say
+BY_OPERATOR: Final = "by an operator"
+SPOILING: Final = ("began", "could not read", BY_OPERATOR)  # what troubles that spoil a run say
 SAME_LENGTH: Final = 0.005  # share of the longest by which lengths of runs may differ
 SAME_COVERAGE: Final = 0.01  # by which known shares of errors may differ where integrals are compared
 
@@ -30,8 +31,10 @@ def reasons(case: CaseMetrics) -> tuple[str, ...]:
         found.append(f"{100.0 * missed:.2g} % of the deadlines were missed")
     if lost >= LOST:
         found.append(f"{100.0 * lost:.2g} % of the poses were lost")
-    if any(spoils(each) for each in case.troubles):
-        found.append("robots began late, or messages could not be read")
+    by_operators = [each for each in case.troubles if BY_OPERATOR in each]
+    if any(spoils(each) for each in case.troubles if each not in by_operators):
+        found.append("robots did not begin together, or messages could not be read")
+    found += by_operators
     if factor is not None and factor < SLOW:
         found.append(f"the world ran at {factor:.2f} of real time")
     return tuple(found)

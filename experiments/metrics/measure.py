@@ -15,12 +15,12 @@ import msgspec
 import numpy as np
 
 from agents.network.messages import Event
-from agents.safety.hazards import UNRESOLVED, failed, is_blind
+from agents.safety.hazards import UNRESOLVED, Cause, failed, is_blind
 from experiments.definition import link_conditions
 from experiments.definition.graph import Links
 from experiments.metrics import centralised
 from experiments.metrics.clearance import collisions
-from experiments.metrics.comparable import reasons
+from experiments.metrics.comparable import BY_OPERATOR, reasons
 from experiments.metrics.metric import case_values, known_metrics, metrics_of_criteria, unusable_metrics, values_of
 from experiments.metrics.results import Approach, Belief, CaseMetrics, Collision, LawMeasure, RobotMetrics
 from experiments.metrics.shadow import agreement
@@ -31,6 +31,9 @@ from twins.arrays import Array, norm
 TROUBLES: Final = ("late", "unread")  # kinds of events of the run itself, not of a robot
 PRESENT: Final = 0.8  # least share of known positions of a robot: below it the robot was out of reach
 GAP_S: Final = 0.5  # [s] shorter times without a position are not named
+HELD: Final = 0.2  # share of the time for which an operator may hold a robot
+CHANGES: Final = {"remove": "removed", "restart": "restarted", "replace": "replaced"}  # orders to the conductor
+LEAVING: Final = "ordered to leave"  # reason of a robot that lands for one of them
 
 
 def measure(trace: Trace) -> CaseMetrics:
@@ -92,7 +95,11 @@ def measure(trace: Trace) -> CaseMetrics:
         world_factor=_slowest(trace),
         away_s=errors.away_s,
         gaps=tuple(f"{names[row]} from {begin:.1f} to {end:.1f} s" for row, begin, end in gaps if end - begin > GAP_S),
-        troubles=tuple(f"{event.source} {event.text}" for event in trace.events if event.kind in TROUBLES),
+        troubles=(
+            *(f"{event.source} {event.text}" for event in trace.events if event.kind in TROUBLES),
+            *_taken_out(trace).values(),
+            *_held(trace),
+        ),
         failures=failures(trace, shared.known.tolist()),
         network_messages=sum(robot.messages + robot.goals for robot in robots),
         network_bytes=sum(robot.bytes + robot.goal_bytes for robot in robots),
@@ -157,7 +164,7 @@ def failures(trace: Trace, known: Sequence[float]) -> tuple[str, ...]:
     found: dict[str, str] = {}
     blind: dict[str, Event] = {}  # begin of the last loss of its own position
     for event in trace.events:
-        lost = event.kind == "lost" or (event.kind == "hazard" and failed(event.text))
+        lost = event.kind in {"lost", "failed"} or (event.kind == "hazard" and failed(event.text))
         if event.kind == "hazard" and event.text.startswith("hold: ") and is_blind(event.text):
             blind[event.source] = event
         if lost and event.source in trace.robots and event.source not in found:
@@ -169,10 +176,41 @@ def failures(trace: Trace, known: Sequence[float]) -> tuple[str, ...]:
             found[event.source] = f"{event.source} at {max(begin.stamp, 0.0):.1f} s: {what}"
         elif event.text.startswith("cut: ") and "cut: " not in found.get(event.source, "cut: "):
             found[event.source] += f"; at {max(event.stamp, 0.0):.1f} s {event.text}"
+    taken_out = _taken_out(trace)
     for name, share in zip(trace.robots, known, strict=True):
-        if share < PRESENT:
+        if share < PRESENT and name not in taken_out:
             found.setdefault(name, f"{name}: its position was known for {share:.0%} of the time only")
     return tuple(found.values())
+
+
+def _taken_out(trace: Trace) -> dict[str, str]:
+    """Robots that an operator has removed, restarted or replaced in the run, each with a sentence about the first."""
+    asked: dict[str, str] = {}
+    found: dict[str, str] = {}
+    for event in trace.events:
+        name = event.source
+        leaves = event.kind == "killed" or (event.kind == "robot" and LEAVING in event.text)
+        if event.kind in CHANGES and "on_loss" not in event.text:
+            asked[name] = CHANGES[event.kind]
+        elif leaves and name in asked and event.stamp <= trace.time[-1]:
+            found.setdefault(name, f"{name} was {asked[name]} {BY_OPERATOR} at {event.stamp:.1f} s")
+    return found
+
+
+def _held(trace: Trace) -> list[str]:
+    """Robots that operators have held for more than a share of the run, one sentence each."""
+    end, held, since = float(trace.time[-1]), dict.fromkeys(trace.robots, 0.0), dict[str, float]()
+    last = [Event(end, "hazard", name, f"{UNRESOLVED}: {Cause.ORDERED.rule.words}") for name in trace.robots]
+    for event in (*trace.events, *last):
+        outcome, _, words = event.text.partition(": ")
+        if event.kind == "hazard" and event.source in held and words.startswith(Cause.ORDERED.rule.words):
+            at = min(max(event.stamp, 0.0), end)
+            if outcome == "hold":
+                since.setdefault(event.source, at)
+            else:
+                held[event.source] += at - since.pop(event.source, at)
+    long = {name: total for name, total in held.items() if total > HELD * end}
+    return [f"{name} was held {BY_OPERATOR} for {total:.1f} of {end:g} s" for name, total in long.items()]
 
 
 def ended_early(trace: Trace) -> bool:

@@ -213,7 +213,8 @@ class CaseMetrics(msgspec.Struct, frozen=True):
     away_s: float = 0.0
     # times without a robot's position that ended, one phrase each: errors leave them out, acquisition bridges them
     gaps: tuple[str, ...] = ()
-    # found by conductor and recorder: robots that began late, messages that could not be read
+    # found by conductor and recorder: robots that began late or early, that an operator held long or took out, messages
+    # that could not be read
     troubles: tuple[str, ...] = ()
     # robots that did not do their part: out of reach, lost, did not move, fell, landed or were cut; one sentence each
     failures: tuple[str, ...] = ()

@@ -95,7 +95,7 @@ def test_killed_recorder_is_replaced_and_fails_the_run(tmp_path):
     until(recorded, "poses are recorded")
     flight.children()["recorder"].kill()
     trace = trace_of(flight, processes, 1)  # the parts are joined
-    assert "zenpark: failed: event: the recorder ended (killed by SIGKILL); started again" in flight.said()
+    assert "zenpark: Failed in event: the recorder ended (killed by SIGKILL); started again" in flight.said()
     assert not np.isnan(trace.position[[0, -1]]).any(), "both recorders have recorded"
     assert list(flight.folder.glob("cases/event/*.mcap")) == []
 

@@ -313,7 +313,9 @@ def _conduct(
         except KeyboardInterrupt:
             print(f"\nended at once; `./zenpark report {folder}` shows what was recorded", file=sys.stderr)
             return [], "", 130
-    failed = f"failed: {'; '.join(ended.failures)}" if ended.failures and not interrupted() else ""
+    # of a case with figures they stand beside these
+    untold = [why for why in ended.failures if why.partition(": ")[0] not in runs[0].metrics]
+    failed = f"failed: {'; '.join(untold)}" if untold and not interrupted() else ""
     return runs, emergency.words or failed, STOPPED if emergency else 130 if interrupted() else 0
 
 

@@ -28,11 +28,14 @@ from experiments.real_time.hosts.launcher import LAND_S
 from experiments.recording.playback import EARLY_S
 
 POLL_S: Final = 0.05
-TARDY_S: Final = 0.05  # robots that begin later than this after the common start are reported
+TARDY_S: Final = 0.05  # robots that begin farther than this from the common start are reported
 GO_ON_S: Final = 5.0  # robots start later than the conductor, and count the deadline from then
+MARGIN_S: Final = 0.5  # a robot that is not ready this long after its own deadline is not awaited any more
 
 ADOPT_S: Final = 0.5
-LATE_S: Final = 1.0  # a robot that still waits this long after the common start has missed the order [s]
+# a robot that still waits this long after the common start has missed the order, and one that still runs this long
+# after the planned end is ordered to land [s]
+LATE_S: Final = 1.0
 LEAVE_S: Final = 8.0  # limit for robots of the previous case to end [s]
 
 
@@ -91,16 +94,15 @@ class Conductor(CaseRun):
         clocks = self._context.hosts.join(self._plan)
         start = ready = None
         self.failures: list[str] = []
-        self._landed: set[str] = set()  # robots that were seen to land early
+        # robots that an operator has landed or stopped before the end, by reason and time in words
+        self._landed: dict[tuple[str, str], list[str]] = {}
         try:
             self._processes.prepare()
             with ExitStack() as stack:
                 self._join(stack)
                 self._adopt()
                 self._processes.start()
-                begin = self._experiment.start  # robots that go on without a neighbour report it after the deadline
-                limit_s = begin.deadline_s + (GO_ON_S if begin.missing == "go-on" else 0.0)
-                if self.await_phase("ready", limit_s, recorder=True):
+                if self._await_ready():
                     ready = time.monotonic() - began
                     self._view.report_clocks(clocks)
                     self._drift = stack.enter_context(Drift(self._context.hosts.in_use()))
@@ -109,6 +111,7 @@ class Conductor(CaseRun):
                     if self._take_off():
                         start = self._start()
                         self.walk(start)
+                        self._report_unbegun()
                 self._land()
                 if start is not None:
                     self._drift.close()
@@ -153,10 +156,37 @@ class Conductor(CaseRun):
         """Robots that are there and have flown, or do."""
         return [name for name, view in self._robots.items() if view.alive and view.reached("airborne")]
 
+    def _await_ready(self) -> bool:
+        """Wait until all are ready, or leave those out that are not, if the file says so; False if interrupted."""
+        begin = self._experiment.start  # robots that go on without a neighbour report it after the deadline
+        if begin.missing == "abort":
+            return self.await_phase("ready", begin.deadline_s, recorder=True)
+        limit_s = begin.deadline_s + GO_ON_S
+        on = self.await_phase("ready", limit_s, recorder=True, own_limit_s=begin.deadline_s + MARGIN_S)
+        late = [name for name, view in self._robots.items() if not (view.reached("ready") or view.gone)] if on else []
+        if late and not any(view.reached("ready") for view in self._robots.values()):
+            raise run_view.RunFailed(self.start_failure(late, f"not ready after {limit_s:g} s"))
+        for name in late:
+            self._robots[name].left_because = "late"
+            self._view.report("failed", name, f"takes no part: it is not ready: {self._reason(name)}")
+        return on
+
     def await_phase(
-        self, phase: str, limit_s: float, *, recorder: bool = False, meanwhile: Callable[[], None] = lambda: None
+        self,
+        phase: str,
+        limit_s: float,
+        *,
+        recorder: bool = False,
+        own_limit_s: float = inf,
+        meanwhile: Callable[[], None] = lambda: None,
     ) -> bool:
-        """Wait until every robot that is left has reached a phase; False if the user interrupted."""
+        """Wait until every robot that is left has reached a phase; False if the user interrupted.
+
+        Args:
+            recorder: Whether a recorder is awaited too.
+            own_limit_s: Time after its first status from which a robot is not awaited any more [s].
+            meanwhile: Called at each look.
+        """
         self._progress.phase = f"waiting until all are {phase}"
         deadline = time.monotonic() + limit_s
         while True:
@@ -170,9 +200,11 @@ class Conductor(CaseRun):
                 raise run_view.RunFailed(self.start_failure(lost, "could not start"))
             if recorder and not self._processes.recording:
                 raise run_view.RunFailed("nothing would be recorded: the recorder ended each time; its log says why")
-            if not late and (not recorder or self._view.recording_begun):
+            now = time.monotonic()
+            awaited = [name for name in late if now - self._robots[name].seen <= own_limit_s]
+            if not awaited and (not recorder or self._view.recording_begun):
                 return True
-            if time.monotonic() > deadline:
+            if now > deadline:
                 if late and self._experiment.start.missing == "abort":
                     raise run_view.RunFailed(self.start_failure(late, f"not {phase} after {limit_s:g} s"))
                 for name in late:
@@ -194,14 +226,14 @@ class Conductor(CaseRun):
     def _start(self) -> float:
         """Order the common start; returns its time [s, UTC]."""
         for name, view in self._robots.items():
-            if not (view.gone or run_view.AHEAD_S < view.behind < run_view.BEHIND_S):
-                off = f"its clock is {-view.behind:+.2f} s off and it will start so"
+            if not view.gone and view.clock_off:
+                off = f"its clock is {-view.clock_off:+.2f} s off and it will start so"
                 self._view.report("clock", name, f"{off}; set it (NTP), or let zenpark start the robot: [hosts]")
         there = [name for name, view in self._robots.items() if view.reached("airborne") and not view.gone]
         at = self._clock.utc() + start_lead_s(len(there))
         self._view.report("start", "conductor", "common start", stamp=at)
         self._order(messages.Order("start", at=at), there)
-        self._starting = {*there}
+        self._starting = {name for name, view in self._robots.items() if not view.gone}
         return at
 
     def walk(self, start: float) -> None:
@@ -211,7 +243,7 @@ class Conductor(CaseRun):
         self._changes.begin(start)
         self._repeat_at = start
         self._progress.phase = "starting together"
-        while (now := self._clock.utc()) < end + LAND_S and not self._context.ended():
+        while (now := self._clock.utc()) < end + LATE_S and not self._context.ended():
             self._update()
             self._view.report_drift(*self._drift.news())
             self._progress.elapsed = now - start
@@ -223,24 +255,26 @@ class Conductor(CaseRun):
             busy = self._changes.under_way
             left = [view for name, view in self._robots.items() if not view.gone and name not in busy]
             ended = all(view.reached("landing") for view in left) and (left or not busy)
-            if now < end - EARLY_S and not ended:
+            if now < end - EARLY_S:
                 self._note_landings(now - start, busy)
-            if ended:
-                if now < end - EARLY_S:
+                if ended and not self._landed:
                     what = "all robots had landed" if left else "no robot was left"
                     self.failures.append(f"{what} after {now - start:.1f} of {self._experiment.duration_s:g} s")
-                return
+            if ended:
+                break
             time.sleep(POLL_S)
+        for (reason, when), names in self._landed.items():
+            self.failures.append(f"{', '.join(names)} landed {when}: {reason} by an operator")
 
     def _note_landings(self, elapsed: float, busy: Container[str]) -> None:
         """Note robots that others have ordered to land or to stop before the end: the run is spoilt without a fault."""
+        known = {name for names in self._landed.values() for name in names}
         for name, view in self._robots.items():
-            if view.gone or name in busy or name in self._landed or not view.reached("landing"):
+            if view.gone or name in busy or name in known or not view.reached("landing"):
                 continue
-            self._landed.add(name)
             if (reason := self._reason(name)).startswith((LAND, STOP)):
-                text = f"{name} landed after {elapsed:.1f} of {self._experiment.duration_s:g} s: {reason}"
-                self.failures.append(text)
+                when = f"after {elapsed:.1f} of {self._experiment.duration_s:g} s"
+                self._landed.setdefault((reason, when), []).append(name)
 
     def _start_late(self, start: float) -> None:
         """Repeat the start to robots that still wait: a busy machine may have lost the order, or its answer."""
@@ -258,13 +292,23 @@ class Conductor(CaseRun):
             self._view.order(late, messages.Order("start", at=start))
 
     def _report_tardy(self, start: float) -> None:
+        """Report robots that began earlier or later than all, also by a wrong clock: it spoils or fails the run."""
         for name in list(self._starting):
             view = self._robots[name]
             if view.began is None and not view.gone and name not in self._changes.under_way:
                 continue
             self._starting.remove(name)
-            if view.began is not None and (tardy := view.began - start) > TARDY_S:
-                self._view.report("late", name, f"began {tardy:.2f} s after the common start")
+            off = 0.0 if view.began is None else view.began + view.clock_off - start
+            if abs(off) > TARDY_S:
+                kind, when = "late" if abs(off) <= LATE_S else "failed", "before" if off < 0.0 else "after"
+                self._view.report(kind, name, f"began {abs(off):.2f} s {when} the common start")
+
+    def _report_unbegun(self) -> None:
+        """Report robots that did not begin at all, at the end of a run that went on to there."""
+        for name in [] if self._context.ended() else self._starting:
+            view = self._robots[name]
+            if view.began is None and not view.gone and not (view.status is not None and view.status.started):
+                self._view.report("failed", name, f"took no part: it did not begin: {self._reason(name)}")
 
     def _land(self) -> None:
         self._view.refuse_joining()
@@ -287,6 +331,9 @@ class Conductor(CaseRun):
             time.sleep(POLL_S)
         for name in late:
             self._leave_behind(name, f"did not end its landing within {LAND_S:g} s: {self._reason(name)}")
+            status = self._robots[name].status
+            if status is not None and self._clock.utc() - status.stamp > LAND_S:  # a process that stands still
+                self._processes.kill(name)
         self._progress.phase = "done"
         self._show(self._progress)
 

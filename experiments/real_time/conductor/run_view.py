@@ -27,7 +27,7 @@ from experiments.real_time.conductor.case_processes import CaseContext
 
 ORDER: Final = tuple(phase.word for phase in Phase)
 AHEAD_S: Final = -0.02  # what comes before it was said is from a clock that is ahead [s],
-BEHIND_S: Final = 0.5  # and what always takes this long, from one that is behind
+BEHIND_S: Final = 0.1  # and what always takes this long, from one that is behind
 FROZEN_S: Final = 3.0  # age of a status from which on a robot is shown as silent
 ROUTER_S: Final = 10.0  # limit for a router that was just started to answer
 MISSED_S: Final = 1.0  # a robot that changes from one router to another is back sooner
@@ -45,9 +45,10 @@ class RobotView:
     error: float | None = None  # [m] formation error by its own knowledge; None until it reports one
     linked: bool = True  # it has an error: it is not guided, and has links
     alive: bool = False  # its liveliness token stands
-    # why the run goes on without it: process ended or token vanished, taken out, or not asked for yet
-    left_because: Literal["", "lost", "removed", "standby"] = ""
+    # why the run goes on without it: not ready in time, process ended or token vanished, taken out, not asked for yet
+    left_because: Literal["", "late", "lost", "removed", "standby"] = ""
     vanished: float = inf  # [s, monotonic] loss of its token; infinity while it stands, and once that was reported
+    seen: float = inf  # [s, monotonic] first status of its process
     behind: float = inf  # [s] least time from a stamp to its arrival: small, if its clock is right
     note: str = ""  # last reported note of its body, without numbers
     place: messages.Vector | None = None  # [m] last known
@@ -61,6 +62,11 @@ class RobotView:
         return bool(self.left_because)
 
     @property
+    def clock_off(self) -> float:
+        """Time by which its clock is behind [s]; 0 if it is right, as far as its messages show."""
+        return 0.0 if AHEAD_S < self.behind < BEHIND_S or self.behind == inf else self.behind
+
+    @property
     def phase(self) -> str:
         return self.status.phase if self.status is not None else "starting"
 
@@ -70,7 +76,7 @@ class RobotView:
     def forget_process(self) -> None:
         """Forget the process that has ended, except its last place and its origin."""
         self.former = self.status.pid if self.status is not None else self.former
-        self.status, self.alive, self.vanished = None, False, inf
+        self.status, self.alive, self.vanished, self.seen = None, False, inf, inf
         self.behind, self.began = inf, None
 
 
@@ -178,8 +184,10 @@ class NetworkView:
         for status in self._statuses.read():
             self.receive_status(status)
         self._progress.states = list(self._states.read())
+        arrived = self.clock.utc()
         for state in self._progress.states:
             view = self.robots[state.robot]
+            view.behind = min(view.behind, arrived - state.stamp)
             view.error = state.error if view.linked else None
             view.place = state.true_position or state.position or view.place
         for token, there in self._watch.changes():
@@ -234,6 +242,7 @@ class NetworkView:
         view = self.robots[status.robot]
         if status.phase not in ORDER or status.pid == view.former:
             return
+        view.seen = min(view.seen, time.monotonic())
         if view.status is not None and (view.status.phase, view.status.reason) != (status.phase, status.reason):
             self.report("robot", status.robot, status.phase + (f": {status.reason}" if status.reason else ""))
         for incident in status.incidents_since(view.status):

@@ -146,6 +146,7 @@ def texts(*cases):
         ({}, Event(1.0, "late", "CF01", "still waits for the start; ordered again"), None),
         ({}, Event(1.0, "unread", "CF01", "could not read 3 messages on park/A/pose"), ""),
         ({}, Event(2.0, "lost", "CF01", "its process ended"), "robots failed"),
+        ({}, Event(-3.0, "failed", "CF01", "takes no part: it is not ready: it is idle"), "robots failed"),
     ],
 )
 def test_what_spoils_a_run(live_trace, columns, event, reason):
@@ -153,6 +154,41 @@ def test_what_spoils_a_run(live_trace, columns, event, reason):
     found = measured_with(dataclasses.replace(live_trace, events=events), **columns)
     assert reasons(found) == found.spoiled
     assert reason in found.spoiled[0] if reason is not None else not found.spoiled
+
+
+def held(*ends):
+    words = ("hold: ordered to hold: by an operator", "over: ordered to hold, after 1 s")
+    return [Event(at, "hazard", "CF01", words[k % 2]) for k, at in enumerate(ends)]
+
+
+def changed_by(who, word="remove"):
+    return [Event(2.0, word, "CF01", f"asked by {who}"), Event(2.1, "robot", "CF01", "landing: ordered to leave")]
+
+
+@pytest.mark.parametrize(
+    ("events", "spoiled"),
+    [
+        (held(1.0, 1.7), None),
+        (held(1.0, 1.5, 2.0, 2.5), "CF01 was held by an operator for 1.0 of 4 s"),
+        (held(3.0), "CF01 was held by an operator for 1.0 of 4 s"),
+        (held(3.5), None),
+        (held(-3.0, -0.5), None),
+        (changed_by("ann"), "CF01 was removed by an operator at 2.1 s"),
+        (changed_by("an operator", "replace"), "CF01 was replaced by an operator at 2.1 s"),
+        (changed_by("on_loss", "restart"), None),
+        (changed_by("ann")[:1], None),
+    ],
+)
+def test_run_that_an_operator_changed_is_spoiled(live_trace, events, spoiled):
+    """And fails by nothing of that: a robot that was taken out is known for a while only."""
+    place = live_trace.true_position.copy()
+    if spoiled and "at 2.1 s" in spoiled:
+        place[live_trace.time > 2.1, live_trace.robots.index("CF01")] = np.nan
+    every = tuple(sorted((*live_trace.events, *events), key=lambda event: event.stamp))
+    found = measure(dataclasses.replace(live_trace, events=every, true_position=place, position=place))
+    assert found.failures == ()
+    assert (spoiled in found.spoiled) if spoiled else not found.spoiled
+    assert spoiled is None or spoiled in texts(found)
 
 
 def test_losses_that_no_recorder_saw_spoil(live_trace):

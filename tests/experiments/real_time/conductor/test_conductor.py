@@ -22,7 +22,7 @@ from agents.network.keys import Keys
 from agents.network.session import Unreachable
 from agents.runtime.router import serve_router
 from agents.safety.hazards import failed
-from experiments.definition.experiment import Formation, Host, RobotTable
+from experiments.definition.experiment import Formation, Host, RobotTable, Start
 from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.file.problems import DocumentError
@@ -30,12 +30,12 @@ from experiments.real_time.conductor import conduct, orders
 from experiments.real_time.conductor import conductor as module
 from experiments.real_time.conductor.case_processes import STARTS, CaseContext, CaseProcesses, Death
 from experiments.real_time.conductor.conduct import PORT_CHOICES, RunOptions, Supervision, run_setup, with_bodies
-from experiments.real_time.conductor.conductor import Conductor
+from experiments.real_time.conductor.conductor import GO_ON_S, Conductor
 from experiments.real_time.conductor.orders import STARTING_S, Emergency
 from experiments.real_time.conductor.run_view import NetworkView, Progress, RobotView, RunFailed
 from experiments.real_time.hosts import run_registry
 from experiments.real_time.hosts.hosts import Hosts
-from experiments.real_time.hosts.launcher import ROUTER, Launcher, RouterEnded
+from experiments.real_time.hosts.launcher import LAND_S, ROUTER, Launcher, RouterEnded
 from experiments.real_time.hosts.run_registry import RegisteredRun, born
 from experiments.recording.playback import read
 from tests.experiments import recordings as rec
@@ -49,15 +49,18 @@ DEAD = Death("recorder", "conductor", "the recorder ended (killed by SIGKILL); s
 
 
 class Course(Conductor):
-    """A conductor whose robots are in `phases`, by the time since the common start; half a second for each look."""
+    """A conductor whose robots are in `phases`, by the time since the common start; half a second for each look.
 
-    def __init__(self, phases, deaths=()):
+    Those of `frozen` stay in the phase that is named there, and say nothing any more.
+    """
+
+    def __init__(self, phases, deaths=(), frozen=()):
         self._clock = ManualClock(START, step=0.5)
         self._experiment = changed(document.read("triangle").experiment, duration_s=10.0)
         self.robots = self._robots = {name: RobotView() for name in self._experiment.robots}
         self._progress = Progress("only", "", None, 10.0, self._robots)
-        self._phases, self._deaths = phases, dict(deaths)
-        self.failures, self._starting, self._landed = [], set(), set()
+        self._phases, self._deaths, self._frozen = phases, dict(deaths), dict(frozen)
+        self.failures, self._starting, self._landed = [], set(), {}
         self.reasons = {}  # of robots that have landed at 3 s, before all others
         self._changes = self._drift = MagicMock(under_way=())
         self._context = MagicMock(ended=lambda: False, emergency=None)
@@ -72,12 +75,20 @@ class Course(Conductor):
         now = self._clock.now - START
         phase = next(said for at, said in sorted(self._phases.items(), reverse=True) if now >= at)
         for name, view in self._robots.items():
+            if name in self._frozen:
+                view.status = changed(status(name, at=0.0, started=0.0), phase=self._frozen[name])
+                view.seen = START
+                continue
             reason = self.reasons.get(name, "") if now >= 3.0 else ""
             view.status = changed(status(name, at=now), phase="landing" if reason else phase, reason=reason)
         return []
 
     def _died(self):
         return [self._deaths.pop(at) for at in list(self._deaths) if self._clock.now - START >= at]
+
+    def said(self, kind):
+        """Events of a kind, without the kind."""
+        return [call.args[1:] for call in self.view.report.call_args_list if call.args[0] == kind]
 
     def walked(self):
         """Failures of the whole course."""
@@ -107,7 +118,84 @@ def test_robot_that_was_ordered_down_spoils_the_run(reason, spoilt):
     course = Course({0.0: "running", 10.0: "landing"})
     name = next(iter(course.robots))
     course.reasons = {name: reason}
-    assert [text.split(" of ")[0].rpartition(" ")[0] for text in course.walked()] == [f"{name} landed after"] * spoilt
+    said = course.walked()
+    assert [text.split(" of ")[0].rpartition(" ")[0] for text in said] == [f"{name} landed after"] * spoilt
+    course = Course({0.0: "running", 10.0: "landing"})
+    course.reasons = dict.fromkeys(course.robots, "ordered to land")
+    (text,) = course.walked()
+    assert re.fullmatch(r"KH01, KH02, CF01 landed after \d\.\d of 10 s: ordered to land by an operator", text)
+
+
+@pytest.fixture
+def passing(monkeypatch):
+    """Time of the module that passes with the clock of a course."""
+
+    def pass_with(course):
+        now = SimpleNamespace(sleep=lambda _: None, monotonic=lambda: course._clock.now)
+        monkeypatch.setattr(module, "time", now)
+        return course
+
+    return pass_with
+
+
+def test_robot_that_is_not_ready_is_left_out(passing):
+    course = passing(Course({0.0: "ready"}, frozen={"KH02": "idle"}))
+    course._experiment = changed(course._experiment, start=Start(missing="go-on", deadline_s=3.0))
+    assert course._await_ready()
+    assert course._clock.now - START < 3.0 + GO_ON_S, "it has had its time, as all others"
+    assert course.robots["KH02"].gone
+    assert course.said("failed") == [("KH02", "takes no part: it is not ready: it is idle")]
+    begun, course._phases = course._clock.now, {0.0: "airborne"}
+    assert course._take_off()
+    assert course._clock.now - begun < 2.0
+    course._phases = {0.0: "running", course._clock.now - START + 10.0: "landing"}
+    begun = course._clock.now
+    course.walk(begun)
+    assert course._clock.now - begun < 10.0 + 5.0
+    assert course._not_down() == ["KH01", "CF01"]
+    alone = passing(Course({0.0: "idle"}, frozen={"KH02": "idle"}))
+    alone._experiment = course._experiment
+    with pytest.raises(RunFailed, match="not ready"):
+        alone._await_ready()
+
+
+@pytest.mark.parametrize(
+    ("began", "behind", "kind", "said"),
+    [
+        (-1.556, 0.001, "failed", "began 1.56 s before the common start"),
+        (0.0, 4.5, "failed", "began 4.50 s after the common start"),
+        (0.0, -4.5, "failed", "began 4.50 s before the common start"),
+        (-0.06, 0.001, "late", "began 0.06 s before the common start"),
+        (0.3, 0.05, "late", "began 0.30 s after the common start"),
+        (0.04, 0.05, None, None),
+        (-0.04, -0.001, None, None),
+    ],
+)
+def test_start_apart_from_all_others_is_told(began, behind, kind, said):
+    course = Course({})
+    view = course.robots["KH01"]
+    view.began, view.behind, course._starting = START + began, behind, {"KH01"}
+    course._report_tardy(START)
+    assert [call.args for call in course.view.report.call_args_list] == ([(kind, "KH01", said)] if kind else [])
+    assert not course._starting
+
+
+def test_robot_that_never_began_fails_the_run():
+    course = Course({0.0: "running", 10.0: "landing"}, frozen={"KH02": "airborne"})
+    course._starting = {"KH01", "KH02"}
+    course.walk(START)
+    course._report_unbegun()
+    assert course.said("failed") == [("KH02", "took no part: it did not begin: it is airborne")]
+
+
+def test_frozen_robot_is_given_up_and_killed_soon(passing):
+    course = passing(Course({0.0: "running", 10.0: "landing", 12.0: "done"}, frozen={"KH02": "running"}))
+    course.walk(START)
+    assert course._clock.now - START < 12.0, "the order to land waits for it no longer"
+    course.land()
+    assert course._clock.now - START < 12.0 + 1.5 * LAND_S
+    assert course.robots["KH02"].left_because == "lost"
+    course.processes.kill.assert_called_once_with("KH02")
 
 
 def test_nothing_flies_without_a_recorder():
