@@ -1,3 +1,4 @@
+import pwd
 import re
 import shutil
 import subprocess
@@ -6,6 +7,7 @@ import tomllib
 import zipfile
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 
@@ -198,6 +200,21 @@ def test_measurements_run_in_the_folder_of_the_user(bootstrap, replaced, monkeyp
         command, environment = replaced.pop()
         assert command[1:] == ["-m", "tests", *words]
         assert environment["PYTHONSAFEPATH"] == "1"
+
+
+def test_other_users_are_told_whom_to_ask(bootstrap, monkeypatch, capsys):
+    """Of a checkout that is shared: its Python lies in its owner's home, or its packages are behind."""
+    bootstrap.STAMP.write_text("old core")
+    monkeypatch.setattr(bootstrap.Path, "mkdir", Mock(side_effect=PermissionError(13, "Permission denied")))
+    monkeypatch.setattr(bootstrap.os, "geteuid", lambda: 4711)
+    owner = pwd.getpwuid(bootstrap.ROOT.stat().st_uid).pw_name
+    for reached, words in ((True, "view --help once"), (False, f"which only {owner} may start")):
+        with monkeypatch.context() as patched:
+            patched.setattr(bootstrap.os, "access", lambda *_, reached=reached: reached)
+            assert bootstrap.main(["view", "runs/a"]) == 2
+        said = capsys.readouterr().err
+        assert words in said
+        assert f"ask {owner} to " in said
 
 
 def test_python_in_a_path_with_blanks_is_found(bootstrap, monkeypatch):

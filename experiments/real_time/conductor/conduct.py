@@ -101,7 +101,8 @@ def conduct(read: Document, folder: Path, options: RunOptions, user: Supervision
     failures = [f"{case}: {why}" for case, result in results.items() for why in result.failures]
     # a failure says why the recording of a case is not there
     begun = {case: end.recording for case, end in results.items() if end.start is not None and end.recording.is_file()}
-    return Conducted(begun, [*stopped, *failures, *left], failures)
+    untold = [f"{case}: {why}" for case, end in results.items() if case not in begun for why in end.failures]
+    return Conducted(begun, [*stopped, *untold, *left], failures)
 
 
 def with_bodies(read: Document, options: RunOptions) -> dict[str, Plan]:
