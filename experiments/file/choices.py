@@ -6,6 +6,7 @@ import importlib
 import pathlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from inspect import getfile
 from typing import Any, Final
 
@@ -98,6 +99,48 @@ def parameters(group: str, kind: str) -> list[str]:
         return list(struct_of(group, kind).__struct_encode_fields__)
     except registry.PluginError:
         return []
+
+
+def tables(value: Any, path: Path = (), *, uniform: bool = False) -> Any:  # noqa: ANN401 - a part of an experiment
+    """An experiment, or the part of it at `path`, as plain tables and lists; what equals its default is left out.
+
+    Args:
+        uniform: Whether choices of plug-ins that mean the same are written the same, as for a digest.
+    """
+    if uniform and isinstance(value, str | dict) and (group := group_of(path)) is not None:
+        kind, given = registry.split(value)
+        defaults = {name: _of_default(field) for name, field in fields_of(struct_of(group, kind)).items()}
+        return [kind, {key: _numbers(each) for key, each in given.items() if each != defaults[key]}]
+    if isinstance(value, msgspec.Struct):
+        found = {}
+        for name, field_ in fields_of(type(value)).items():
+            inside = (*path, name)
+            each = tables(getattr(value, field_.name), inside, uniform=uniform)
+            if field_.required or each != tables(_of_default(field_), inside, uniform=uniform):
+                found[name] = each
+        return found
+    if isinstance(value, dict):
+        return {key: tables(each, (*path, key), uniform=uniform) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [tables(each, (*path, number), uniform=uniform) for number, each in enumerate(value)]
+    return value
+
+
+@cache
+def fields_of(struct: type[msgspec.Struct]) -> Mapping[str, msgspec.structs.FieldInfo]:
+    """Fields by their names in a file. Cached: resolving annotations takes longer than checking a table."""
+    return {field.encode_name: field for field in msgspec.structs.fields(struct)}
+
+
+def _of_default(field: msgspec.structs.FieldInfo) -> Any:  # noqa: ANN401 - any value of a file
+    return field.default if field.default_factory is msgspec.NODEFAULT else field.default_factory()
+
+
+def _numbers(value: Any) -> Any:  # noqa: ANN401 - a parameter of a plug-in
+    """A parameter with floats for all whole numbers, as which a parameter is read."""
+    if isinstance(value, list):
+        return [_numbers(each) for each in value]
+    return float(value) if type(value) is int else value
 
 
 def chosen(experiment: Experiment) -> list[tuple[str, str]]:

@@ -21,7 +21,7 @@ from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
 from experiments.file import catalogue, structure
 from experiments.file.cases import Source, each_once, resolve
-from experiments.file.choices import Adopted
+from experiments.file.choices import Adopted, tables
 from experiments.file.completion import fill_from_files, fill_from_shape, law_files
 from experiments.file.consistency.whole import consistency_faults, criteria_faults
 from experiments.file.overrides import parse_all
@@ -151,8 +151,8 @@ def join_texts(texts: Sequence[str]) -> str:
 
 
 def write_json(plan: Plan) -> bytes:
-    """The experiment as JSON that `read` takes; what has its default is left out."""
-    return msgspec.json.format(msgspec.json.encode(plan.experiment), indent=2) + b"\n"
+    """The experiment as JSON that `read` takes; what equals its default is left out, parameters of plug-ins aside."""
+    return msgspec.json.format(msgspec.json.encode(tables(plan.experiment)), indent=2) + b"\n"
 
 
 def case_document(plan: Plan, case: str = UNNAMED) -> bytes:

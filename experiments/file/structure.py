@@ -9,7 +9,6 @@ from __future__ import annotations
 import re
 import types
 from collections.abc import Mapping, Sequence
-from functools import cache
 from typing import Annotated, Any, Final, Literal, Union, get_args, get_origin
 
 import msgspec
@@ -17,7 +16,7 @@ import msgspec
 from agents.plugins import files, registry
 from agents.plugins.registry import did_you_mean
 from experiments.definition.experiment import Experiment
-from experiments.file.choices import group_of, parameters, struct_of
+from experiments.file.choices import fields_of, group_of, parameters, struct_of
 from experiments.file.problems import DocumentError, Fault, Path, Problem, key_name, refusal, shown
 
 _REMEDY: Final = {  # of a missing key
@@ -82,7 +81,7 @@ def _table(
     Args:
         plugin: Group and kind, if these are a plug-in's parameters.
     """
-    fields = _fields_of(struct)
+    fields = fields_of(struct)
     found, meant = [], set()
     for key in value:
         if key not in fields:
@@ -97,12 +96,6 @@ def _table(
             hint = _REMEDY.get(name) or f"add {name} = ... ({note})"
             found.append(Fault(path, f"'{name}' is missing{_place_in_file(path)}", hint))
     return found or _own_checks(value, struct, path)
-
-
-@cache
-def _fields_of(struct: type[msgspec.Struct]) -> Mapping[str, msgspec.structs.FieldInfo]:
-    """Fields by their names in a file. Cached: resolving annotations takes longer than checking a table."""
-    return {field.encode_name: field for field in msgspec.structs.fields(struct)}
 
 
 def _unknown(key: str, hint: str, path: Path, plugin: tuple[str, str] | None) -> Fault:
@@ -152,7 +145,7 @@ def _own_checks(value: Mapping[str, Any], struct: type[msgspec.Struct], path: Pa
         msgspec.convert(value, struct)
     except msgspec.ValidationError as error:
         text, _, hint = str(error).partition(" - at `")[0].partition("; ")
-        named = [name for name in _fields_of(struct) if name in value and re.search(rf"\b{re.escape(name)}\b", text)]
+        named = [name for name in fields_of(struct) if name in value and re.search(rf"\b{re.escape(name)}\b", text)]
         return [Fault((*path, *named[:1]), text, hint)]
     return []
 

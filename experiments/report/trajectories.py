@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
 import matplotlib as mpl
-import msgspec
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
@@ -41,8 +40,8 @@ def plan_view(traces: Sequence[Trace], width: float = style.WIDTH) -> Figure:
     A few cases in the same arena are laid upon each other, with a colour each; their robots are named, and few of them
     have a marker each. More cases are side by side, and their robots have a colour each.
     """
-    arenas = {msgspec.json.encode(trace.plan.experiment.arena) for trace in traces}
-    overlaid = 1 < len(traces) <= OVERLAID and len(arenas) == 1
+    first, *others = (trace.plan.experiment.arena for trace in traces)
+    overlaid = 1 < len(traces) <= OVERLAID and all(arena == first for arena in others)
     panels = [list(traces)] if overlaid else [[trace] for trace in traces]
     place = np.concatenate([trace.true_position.reshape(-1, 3)[:, :2] for trace in traces])
     place = place[np.isfinite(place).all(axis=1)]

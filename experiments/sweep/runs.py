@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Sequence
+from functools import cache
 from inspect import getfile
 from pathlib import Path
 from typing import Final
@@ -15,19 +17,21 @@ from agents.body.interface import BodyError
 from agents.plugins import registry
 from experiments.definition.plan import Plan
 from experiments.definition.standby import without_standby
-from experiments.file.choices import plugin_files
+from experiments.file.choices import plugin_files, tables
 from experiments.metrics.measure import ended_early, failures
 from experiments.metrics.metric import LEAN, case_values, foreign_metrics, swept_metrics, values_of
 from experiments.metrics.signals import Measurement
 from experiments.recording.trace import Trace
 from experiments.recording.version import ROOT, engine_versions, file_digest
-from experiments.recording.version import digest as digest_of_code
 from experiments.virtual_time import stretch
 from experiments.virtual_time.conductor import Stuck
 from experiments.virtual_time.log import RunRecorder
 from experiments.virtual_time.simulation import simulate
 
-PACKAGES: Final = ("agents", "twins", "experiments")  # packages with code that determines results
+PACKAGES: Final = ("agents", "twins")  # packages with plug-ins, which no line imports: all of them counts
+WORK: Final = "experiments/sweep/runs.py"  # this module: with what it imports, all other code that determines results
+_IMPORT: Final = re.compile(r"^\s*(?:from\s+([\w.]+)\s+)?import\s+(\([^)]*\)|.*)", re.MULTILINE)
+_COMMENT: Final = re.compile(r"\n?[^\S\n]*#[^\"'\n]*$|\n(?=\n)", re.MULTILINE)  # without quotes; and blank lines
 FAILED: Final = (Stuck, BodyError, registry.PluginError)  # what a run may end with that other runs do not
 
 
@@ -79,12 +83,12 @@ def fly(case: bytes, seeds: Sequence[int], code: str, plain_s: float = 0.0) -> b
 
 
 def digest(plan: Plan) -> str:
-    """Digest of an experiment without title, source, cases, criteria and seed.
+    """Digest of an experiment without title, source, cases, criteria and seed; the same if a file spells out a default.
 
     Robots and links keep the order of the file, which decides random starts and sums.
     """
     bare = plan.changed(title="", source="", cases={}, criteria=[], seed=0)
-    return hashlib.sha256(msgspec.json.encode(bare.experiment)).hexdigest()[:20]
+    return hashlib.sha256(msgspec.json.encode(tables(bare.experiment, uniform=True))).hexdigest()[:20]
 
 
 def code_of(plan: Plan) -> str:
@@ -98,9 +102,35 @@ def code_of(plan: Plan) -> str:
     libraries = [engine, *engine_versions(engine), *(engine_versions(library) if library else [])]
     others = sorted(file_digest(file) for file in files if file.parent.parent != ROOT)
     others += [f"{name} {file_digest(Path(getfile(type(each))))}" for name, each in foreign_metrics().items()]
-    return hashlib.sha256(
-        ":".join((digest_of_code(packages=PACKAGES), np.__version__, *libraries, *others)).encode()
-    ).hexdigest()[:20]
+    return hashlib.sha256(":".join((digest_of_code(), np.__version__, *libraries, *others)).encode()).hexdigest()[:20]
+
+
+@cache
+def digest_of_code(root: Path = ROOT) -> str:
+    """Digest of our modules that determine results, without their comments; those of reports are not among them."""
+    total, seen = hashlib.sha256(), set[Path]()
+    left = [root / WORK, *(file for name in PACKAGES for file in (root / name).rglob("*.py"))]
+    texts = dict[str, str]()
+    while left:
+        file = left.pop()
+        if file in seen or not file.is_file():
+            continue
+        seen.add(file)
+        texts[file.relative_to(root).as_posix()] = text = without_comments(file.read_text("utf-8"))
+        for package, names in _IMPORT.findall(text):
+            for name in (package, *(f"{package}.{each}".strip(".") for each in re.findall(r"[\w.]+", names))):
+                place = root / name.replace(".", "/")
+                left += [place.with_suffix(".py"), place / "__init__.py"]
+    for name, text in sorted(texts.items()):
+        total.update(f"{name}\0{len(text)}\0{text}".encode())
+    return total.hexdigest()
+
+
+def without_comments(text: str) -> str:
+    """A module without its comments, except those with quotes, and without blank lines."""
+    parts = text.split('"""')
+    parts[::2] = [_COMMENT.sub("", part) for part in parts[::2]]  # between them stand docstrings and other texts
+    return '"""'.join(parts)
 
 
 def lean_enough() -> bool:

@@ -74,8 +74,9 @@ class Workers:
 
 
 def workers(scheduler: str | None, processes: int | None) -> AbstractContextManager[Workers]:
-    """The workers of a scheduler, if one is named, else of this machine; the end of the block ends their work.
+    """The workers of a scheduler, if one is named, else of this machine.
 
+    The end of the block takes back what no worker has begun; those of a scheduler finish the batch that they are at.
     Raises ExplainedError at the beginning of the block, if a scheduler is not there, or has no worker.
     """
     return _local(processes) if scheduler is None else _cluster(scheduler)

@@ -76,6 +76,9 @@ def test_plan_shows_surroundings_with_few_cases_overlaid():
     paths = [line for line in axes.lines if len(line.get_xdata()) > 2]
     assert len({(line.get_color(), line.get_linewidth()) for line in paths}) == 3
     assert len(figures.plan_view(wide).axes) == 4
+    equal = Arena(), Arena(size=(*Arena().size[:2], 2.5))  # its size spelled out
+    plain, spelled = (dataclasses.replace(wide[0], plan=hall.changed(arena=arena)) for arena in equal)
+    assert len(figures.plan_view([plain, spelled]).axes) == 1
 
 
 def test_seeds_become_one_bar_or_a_band():

@@ -1,5 +1,8 @@
 """Figures of a run in a sweep: those of the report to the bit; and what outdates them."""
 
+import ast
+import shutil
+
 import msgspec
 import numpy as np
 import pytest
@@ -7,7 +10,7 @@ import pytest
 from experiments import run
 from experiments.definition.experiment import ChannelTable, Start, WorldTable
 from experiments.definition.plan import Plan
-from experiments.file import choices
+from experiments.file import choices, document
 from experiments.file.document import load
 from experiments.metrics import measure
 from experiments.metrics.metric import swept_metrics
@@ -15,9 +18,19 @@ from experiments.metrics.statistics import Spread
 from experiments.recording import version
 from experiments.sweep import runs, table
 from experiments.sweep.plan import arguments, cells
-from experiments.sweep.runs import RunMetrics, WorkResult, code_of, digest, fly, run_metrics
+from experiments.sweep.runs import (
+    RunMetrics,
+    WorkResult,
+    code_of,
+    digest,
+    digest_of_code,
+    fly,
+    run_metrics,
+    without_comments,
+)
 from experiments.virtual_time.log import RunRecorder
 from experiments.virtual_time.simulation import simulate
+from tests.commands import ROOT
 from tests.small import changed, reference
 
 
@@ -85,6 +98,31 @@ def test_digest_knows_what_changes_a_run(short_park, parts, same):
     assert (digest(Plan(changed(short_park, **parts))) == digest(Plan(short_park))) is same
 
 
+SPELLED = "arena.walls=true", "rates.pose_hz=50.0", "safety.neighbour_timeout_s=1.0", "formation.law.kind='distance'"
+
+
+@pytest.mark.parametrize("change", SPELLED)
+def test_digest_is_the_same_with_defaults_spelled_out(change):
+    plan, spelled = load("triangle").plan, load("triangle", change).plan
+    assert digest(spelled) == digest(plan)
+    assert document.write_json(spelled) == document.write_json(plan) or "law" in change
+
+
+@pytest.mark.parametrize(
+    ("changes", "same"),
+    [
+        (("trigger={kind='send-on-delta'}", "trigger={kind='send-on-delta', threshold=0.01}"), True),
+        (("trigger={kind='send-on-delta', threshold=1}", "trigger={kind='send-on-delta', threshold=1.0}"), True),
+        (("trigger={kind='send-on-delta', threshold=0.01}", "trigger={kind='send-on-delta', threshold=0.02}"), False),
+        (("trigger='send-on-delta'", "trigger='periodic'"), False),
+        (("arena.walls=true", "arena.walls=false"), False),
+    ],
+)
+def test_digest_knows_parameters_of_plug_ins(changes, same):
+    first, other = (digest(load("triangle", change).plan) for change in changes)
+    assert (first == other) is same
+
+
 @pytest.mark.parametrize(
     ("parts", "library"),
     [
@@ -112,6 +150,47 @@ def test_a_plug_in_that_changes_changes_the_code(short_park, tmp_path, monkeypat
     file.write_text("two")
     assert len({before, foreign, code_of(Plan(short_park))}) == 3
     runs.file_digest.cache_clear()
+
+
+REPORT, LAW, COUNTS = "experiments/report/figures.py", "agents/plugins/laws.py", "experiments/metrics/signals.py"
+
+
+@pytest.fixture(scope="module")
+def copied(tmp_path_factory):
+    """A copy of all code of which sweeps and reports are made."""
+    root = tmp_path_factory.mktemp("code")
+    for package in ("agents", "twins", "experiments"):
+        shutil.copytree(ROOT / package, root / package, ignore=shutil.ignore_patterns("__pycache__"))
+    return root
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "same"),
+    [
+        (REPORT, "WIDE: Final = 8.0", "WIDE: Final = 9.0", True),
+        ("experiments/check/motion.py", "import", "import antigravity\nimport", True),
+        (LAW, "from __future__", "# a remark\n\nfrom __future__", True),
+        (LAW, "return", "return  -", False),
+        (COUNTS, "return", "return  -", False),
+        ("experiments/definition/formation.py", "return", "return  -", False),
+        ("experiments/virtual_time/network.py", "return", "return  -", False),
+        ("twins/body.py", "return", "return  -", False),
+    ],
+)
+def test_only_code_that_determines_results_counts(copied, file, old, new, same):
+    before, text = digest_of_code.__wrapped__(copied), (copied / file).read_text()
+    (copied / file).write_text(text.replace(old, new, 1))
+    after = digest_of_code.__wrapped__(copied)
+    (copied / file).write_text(text)
+    assert text.count(old)
+    assert (after == before) is same
+
+
+@pytest.mark.slow
+def test_comments_are_all_that_is_left_out():
+    for file in sorted((ROOT / "experiments").rglob("*.py")):
+        text = file.read_text("utf-8")
+        assert ast.dump(ast.parse(without_comments(text))) == ast.dump(ast.parse(text)), file
 
 
 @pytest.mark.slow
