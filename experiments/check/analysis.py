@@ -20,6 +20,7 @@ from experiments.check.realisation import (
     Solids,
     best_shape,
     find_shapes,
+    formation_bend,
     formation_redundancy,
     formation_rigidity,
     targets_of_law,
@@ -31,12 +32,14 @@ from experiments.definition.formation import anchor_errors, errors_over_time
 from experiments.definition.graph import Links, components, edges
 from experiments.definition.links import held_height, link_pairs
 from experiments.definition.plan import Plan
-from experiments.definition.rigidity import Redundancy, Rigidity
+from experiments.definition.rigidity import Bend, Redundancy, Rigidity
 from experiments.file.problems import Path
 from experiments.metrics.signals import WINDOW_S, after_last, moving_mean
 from twins.arrays import Array, Index, Mask, norm
 
 MOST_ROBOTS: Final = 500  # of which it is asked what can be lost: the time grows with their third power
+MOST_BENT: Final = 100  # likewise, robots of which it is asked how far noise bends them
+NOISE: Final = 1e-3  # [m] errors of positions that real robots have, where the file gives none
 FITTING: Final = 1e-4  # [m] between a target and that of the best shape
 FAR_OFF: Final = 0.01  # [m] a shape that misses a distance by more is another shape
 GUESSES: Final = 400  # random places of robots from which a shape is sought: each costs time with their number
@@ -139,6 +142,21 @@ class Analysis:
             return None, None
         anchors = self.plan.anchors_by_row
         return formation_rigidity(self.shape.position, self.first_links, self.without_neighbours, anchors)
+
+    @cached_property
+    def sigma(self) -> float:
+        """Largest noise of a position [m]."""
+        return max(self.plan.disturbance(name).position_sigma or 0.0 for name in self.plan.names) or NOISE
+
+    @cached_property
+    def bend(self) -> Bend | None:
+        """Bend of a formation by distances under that noise; None of others, and of very many robots."""
+        shape, (planar, spatial) = self.met_shape, self.rigidity
+        if shape is None or planar is None or spatial is None or planar.needed < 1:
+            return None
+        if len(self.plan.names) > MOST_BENT:
+            return None
+        return formation_bend(shape.position, self.first_links, self.without_neighbours, self.sigma)
 
     @cached_property
     def spare(self) -> Redundancy | None:

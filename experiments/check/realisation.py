@@ -18,7 +18,7 @@ from agents.plugins.laws import Mixed
 from experiments.definition.formation import Anchored, anchor_errors, law_errors
 from experiments.definition.graph import Links, adjacency, edges, part_of_rows
 from experiments.definition.links import TARGET_KINDS
-from experiments.definition.rigidity import Redundancy, Rigidity, redundancy, rigidity
+from experiments.definition.rigidity import CERTAIN, Bend, Redundancy, Rigidity, bend, redundancy, rigidity
 from twins.arrays import Array, Index, Mask, norm
 
 TINY: Final = 1e-18  # [m²] no length is zero
@@ -30,7 +30,6 @@ ROUNDED: Final = 1e-3  # [m] distances written with three decimals contradict on
 MIRRORS: Final = 3  # robots on the wrong side that are sought
 MOST_MIRRORED: Final = 40  # robots of a formation in which they are sought: the time grows with the third power
 MOST_SIDES: Final = 4  # neighbours of a robot through which the lines are sought
-STILL: Final = 1e-12  # squares of singular values below this, of the largest or of 1 m², are arithmetic
 POINT: Final = 1e-6  # [m] robots that are nearer than this to each other stand in one point, which nothing turns
 
 
@@ -206,8 +205,8 @@ def _free(moves: Mask, climbs: Mask | None = None) -> Mask:
 
 
 def best_shape(shapes: Sequence[Shape]) -> Shape:
-    """The shape that misses least; one in which robots stand in each other only if no other one meets all targets."""
-    return min(shapes, key=lambda each: (each.worst > OFF or len(each.overlaps) > 0, each.worst))
+    """The shape that misses least; of those that meet all targets one in which the fewest robots are in the way."""
+    return min(shapes, key=lambda each: (each.worst > OFF, len(each.overlaps), each.worst))
 
 
 def unfold_distances(links: Links, height: Array) -> Array:
@@ -414,6 +413,12 @@ def formation_rigidity(
     return rigidity(position, pairs, _free(np.ones(len(position), dtype=bool))), rigidity(position, pairs)
 
 
+def formation_bend(position: Array, links: Links, led: Index, sigma: float) -> Bend:
+    """Bend of a formation by distances under errors of positions of `sigma` [m], see `bend`; leaders as bars."""
+    pairs = np.unique(np.concatenate([edges(links), _bars(led)]), axis=0)
+    return bend(position, pairs, sigma, _free(np.ones(len(position), dtype=bool)))
+
+
 def formation_redundancy(position: Array, links: Links, led: Index) -> Redundancy:
     """Links and robots without which a formation by distances stays rigid while heights are held.
 
@@ -441,9 +446,9 @@ def _similar_rigidity(position: Array, links: Links, bars: Index, anchors: Ancho
     away = (position - position.mean(axis=0))[:, :2]
     alike = np.stack([*whole_motions(away).T, away.ravel()])
     alike = alike[norm(alike) > POINT]
-    answered = int((np.linalg.eigvalsh(alike @ square @ alike.T) > STILL).sum())
+    answered = int((np.linalg.eigvalsh(alike @ square @ alike.T) > CERTAIN).sum())
     squares = np.linalg.eigvalsh(square)[::-1]
-    rank = int((squares > STILL * max(1.0, float(squares.max(initial=0.0)))).sum())
+    rank = int((squares > CERTAIN * float(squares.max(initial=0.0))).sum())
     needed = 2 * rows - len(alike) + answered
     return Rigidity(rank, needed, math.sqrt(squares[needed - 1]) if 0 < needed <= rank else 0.0)
 

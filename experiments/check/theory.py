@@ -22,12 +22,13 @@ from experiments.check.findings import FORGIVEN, Finding, Severity, join_names
 from experiments.check.realisation import OFF, Conflict, Shape, best_shape, conflicts, contradictions
 from experiments.definition.experiment import Formation
 from experiments.definition.formation import law_offsets, unlinked
-from experiments.definition.graph import components, reachable
+from experiments.definition.graph import components, edges, reachable
 from experiments.definition.links import gain_key
 from experiments.definition.plan import Plan
 from experiments.file.problems import Path
 from twins.arrays import Index, Mask, norm
 
+BENT: Final = 8.0  # times the noise: formations that no straight line or circle weakens move by 1 to 5 times
 FEW: Final = 6  # names that are listed
 GAIN: Final = {"gain": "the gain", "stiffness": "the stiffness", "by link": "the gain or the stiffness"}  # of the file
 UNSTABLE_GAIN: Final = 2.0  # share of an error that one decision corrects
@@ -231,21 +232,36 @@ def _too_high(analysis: Analysis, conflict: Conflict, off: str) -> Finding:
 
 
 def rigidity(analysis: Analysis) -> Iterator[Finding]:
-    """Check rigidity in the motions that the robots have."""
+    """Check rigidity in the motions that the robots have, and how far noise bends the formation."""
     planar, spatial = analysis.rigidity
     if planar is None or not analysis.standing.any() or analysis.parts > 1:
         return
-    rank = f"rank {planar.rank} of {planar.needed} in the motions that the robots have"
-    if not planar.rigid:
-        more = planar.needed - planar.rank
+    rank, path = f"rank {planar.rank} of {planar.needed} in the motions that the robots have", ("formation", "links")
+    bent = analysis.bend
+    if bent is not None and BENT * analysis.sigma < bent.way < math.inf:
+        first = "to first order no link resists" if not planar.rigid else "hardly a link resists"
+        message = (
+            f"the formation bends, {rank}: {first}; noise of {1e3 * analysis.sigma:g} mm moves "
+            f"{analysis.plan.names[bent.row]} by some {1e3 * bent.way:.0f} mm"
+        )
+        yield Finding("warning", "bends", message, _stiffer(analysis, planar.needed - planar.rank), path)
+    elif not planar.rigid:
         asked = {"the distances": "every distance"}.get(_asked(analysis), _asked(analysis))
         message = f"the formation is not rigid, {rank}: it can change its shape and still meet {asked}"
-        remedy = f"add {more} link{'s' * (more > 1)} at least, between robots that are not linked yet"
-        yield Finding("warning", "not-rigid", message, remedy, ("formation", "links"))
+        yield Finding("warning", "not-rigid", message, _stiffer(analysis, planar.needed - planar.rank), path)
     else:
         if spatial is not None and not spatial.rigid:
             rank += f"; in space {spatial.rank} of {spatial.needed}, not needed while heights are held"
         yield Finding("note", "rigid", f"the formation is rigid, {rank}")
+
+
+def _stiffer(analysis: Analysis, missing: int) -> str:
+    """Remedy for a formation that bends."""
+    count = len(analysis.plan.names)
+    if len(edges(analysis.first_links)) == count * (count - 1) // 2:
+        return "all robots are linked: change targets that put them in one line or on one circle"
+    more = max(missing, 1)
+    return f"add {more} link{'s' * (more > 1)} at least, between robots that are not linked yet"
 
 
 def presence(analysis: Analysis) -> Iterator[Finding]:

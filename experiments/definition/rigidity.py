@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
-from twins.arrays import Array, Index, Mask
+from twins.arrays import Array, Index, Mask, norm
+
+# of the largest singular value: smaller ones are zero. A shape that bends to first order is solved to the root of the
+# solver's accuracy only, some 1e-6 m, and the singular value that is zero at the exact shape is as large as that
+SINGULAR: Final = 1e-5
+STIFF: Final = 0.05  # of the largest singular value: motions with larger ones are not soft
+CERTAIN: Final = SINGULAR**2  # a link bears all of its own load alone if it bears all but this: shares are squares
 
 
 def rigidity_matrix(position: Array, pairs: Index, moves: Mask | None = None) -> Array:
@@ -49,11 +56,50 @@ def rigidity(position: Array, pairs: Index, moves: Mask | None = None) -> Rigidi
     """
     free = np.ones_like(position, dtype=bool) if moves is None else moves
     singular = np.linalg.svd(rigidity_matrix(position, pairs, free), compute_uv=False)
-    tolerance = 1e-9 * max(1.0, float(singular[0]) if len(singular) else 1.0)
-    rank = int((singular > tolerance).sum())
+    rank = int((singular > SINGULAR * singular.max(initial=0.0)).sum())
     needed = int(free.sum()) - rigid_motions(position, free)
     smallest = float(singular[needed - 1]) if 0 < needed <= len(singular) else 0.0
     return Rigidity(rank, needed, smallest)
+
+
+class Bend(NamedTuple):
+    """The robot that moves most against its neighbours in the motion that links resist least."""
+
+    row: int
+    way: float  # [m]; infinity where nothing resists
+
+
+def bend(position: Array, pairs: Index, sigma: float, moves: Mask | None = None) -> Bend:
+    """Bend of a framework under errors of positions of `sigma` [m], estimated.
+
+    Moving by t along the right singular vector v of a small singular value s changes half the squares of the lengths
+    by s t + κ t² in the direction w of a stress, with κ = wᵀq and q_ij = |v_i − v_j|²/2. So a framework that bends to
+    first order (s = 0: robots in line, a V, a hexagon with its long diagonals) resists with the square only: an error
+    of 2 mm moves a robot by centimetres. For the other arguments see `rigidity_matrix`.
+    """
+    free = np.ones_like(position, dtype=bool) if moves is None else moves
+    needed = int(free.sum()) - rigid_motions(position, free)
+    stress, singular, motion = np.linalg.svd(rigidity_matrix(position, pairs, free))
+    slope = np.zeros(needed)
+    slope[: len(singular)] = singular[:needed]
+    stiff = min(int((slope > STIFF * singular[0]).sum()), needed - 1)
+    length, found = norm(position[pairs[:, 0]] - position[pairs[:, 1]]), Bend(0, 0.0)
+    error = sigma * math.sqrt(2.0 * float((length**2).mean()))  # of half the square of a length, noise at both ends
+    count = np.bincount(pairs.ravel(), minlength=len(position))[:, None]
+    for k in range(stiff, needed):
+        velocity = np.zeros(position.shape)
+        velocity[free] = motion[k]
+        against = velocity[pairs[:, 0]] - velocity[pairs[:, 1]]
+        curvature = float(norm(stress[:, stiff:].T @ (0.5 * (against**2).sum(axis=1))))
+        # s t + κ t² = error; both small: a mechanism
+        root = math.sqrt(float(slope[k]) ** 2 + 4.0 * curvature * error)
+        way = 2.0 * error / (float(slope[k]) + root) if root > SINGULAR * singular[0] else math.inf
+        total = np.zeros(position.shape)
+        np.add.at(total, pairs[:, 0], against)
+        np.add.at(total, pairs[:, 1], -against)
+        moved = norm(total / np.maximum(count, 1))
+        found = max(found, Bend(int(moved.argmax()), way * float(moved.max())), key=lambda each: each.way)
+    return found
 
 
 def rigid_motions(position: Array, free: Mask) -> int:
@@ -76,10 +122,6 @@ def _null_space(matrix: Array) -> Array:
     _, singular, right = np.linalg.svd(matrix)
     rank = int((singular > 1e-9 * max(1.0, float(singular[0]))).sum())
     return np.asarray(right[rank:].T)
-
-
-SINGULAR: Final = 1e-9  # relative to the largest: smaller singular values are arithmetic
-CERTAIN: Final = 1e-12  # a link that bears all but this share of its own load alone bears all of it: shares are squares
 
 
 @dataclass(frozen=True)

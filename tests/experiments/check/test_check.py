@@ -164,6 +164,7 @@ SQUARE = {"A - B": 1.0, "B - D": 1.0, "D - C": 1.0, "A - C": 1.0, "A - D": 1.4, 
         ({"A > B": 1.0, "A > C": 1.0, "B - C": 1.0}, "A", "no-incoming-links", ""),
         ({"A > B": 1.0, "B > C": 1.0, "C > D": 1.0}, None, "not-rigid", "rank 3 of 5"),
         (SQUARE, None, "not-realisable", "A - D"),
+        ({"A - B": 0.5, "B - C": 0.5, "A - C": 1.0, "A - D": 0.5, "B - D": 0.6}, None, "bends", "rank 4 of 5"),
     ],
 )
 def test_networks_that_make_no_formation(links, leader, code, message):

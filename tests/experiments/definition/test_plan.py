@@ -41,7 +41,7 @@ from experiments.definition.experiment import (
 )
 from experiments.definition.graph import adjacency, components, degree, edges, laplacian, links, reachable
 from experiments.definition.plan import Plan
-from experiments.definition.rigidity import redundancy, rigidity
+from experiments.definition.rigidity import bend, redundancy, rigidity
 from experiments.file import document
 from experiments.file.consistency.whole import consistency_faults
 from experiments.file.document import load, loads
@@ -115,6 +115,31 @@ def test_rigid_motions_that_held_coordinates_allow(position, free, motions):
     position = np.array(position, dtype=float)
     moves = np.tile([axis in free for axis in "xyz"], (len(position), 1))
     assert rigidity(position, np.array([[0, len(position) - 1]]), moves).needed == moves.sum() - motions
+
+
+HEXAGON = [[math.cos(k * math.pi / 3), math.sin(k * math.pi / 3), 0.0] for k in range(6)]
+RING = [(k, (k + 1) % 6) for k in range(6)]
+VEE = [[0, 0, 0], [-0.3, -0.4, 0], [0.3, -0.4, 0], [-0.6, -0.8, 0], [0.6, -0.8, 0]]
+ARMS = [(0, 1), (0, 2), (1, 2), (1, 3), (2, 4)]
+
+
+@pytest.mark.parametrize(
+    ("position", "pairs", "rank", "low", "high"),
+    [
+        ([[0, 0, 0], [0.5, 0, 0], [1, 0, 0]], [(0, 1), (1, 2), (0, 2)], 2, 0.04, 0.07),
+        (HEXAGON, [*RING, (0, 3), (1, 4), (2, 5)], 8, 0.02, 0.05),
+        (HEXAGON, [*RING, (0, 2), (2, 4), (4, 0)], 9, 0.001, 0.006),
+        (VEE, [*ARMS, (0, 3), (0, 4)], 5, 0.03, 0.15),
+        (VEE, [*ARMS, (2, 3), (1, 4)], 7, 0.001, 0.01),
+        (HEXAGON[:4], RING[:3], 3, math.inf, math.inf),  # a chain that nothing holds
+    ],
+)
+def test_frameworks_that_bend_to_first_order(position, pairs, rank, low, high):
+    """A solver ends some micrometres from such a shape; noise of 2 mm moves a robot by centimetres."""
+    solved = np.array(position) + 2e-6 * np.random.default_rng(1).normal(size=(len(position), 3)) * [1, 1, 0]
+    held = held_heights(len(position))
+    assert rigidity(solved, np.array(pairs), held).rank == rank
+    assert low <= bend(solved, np.array(pairs), 0.002, held).way <= high
 
 
 def one_by_one(position, pairs, free):
