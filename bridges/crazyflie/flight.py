@@ -16,16 +16,22 @@ from typing import Final
 
 from agents.body.interface import UNANSWERED
 from agents.clock import uptime
-from agents.protocols.crazyflie import SETPOINT_PACKETS, CrazyflieSettings
+from agents.protocols.crazyflie import SETPOINT_PACKETS, CrazyflieSettings, Outside
 from agents.protocols.crtp import HighLevel, Info, LogStatus
 from bridges.crazyflie.link import CrazyflieLink
 from bridges.crazyflie.telemetry import Telemetry
-from bridges.crazyflie.trajectory import HOLD_S, SINK, Target
+from bridges.crazyflie.trajectory import HOLD_S, SINK, STOP_S, Target, stop_descent_s
 
 CLIMB: Final = 0.4  # [m/s] mean speed of take-offs
 DESCENT: Final = 0.22  # [m/s] mean speed of landings: never 0.5 m/s
 UNKNOWN: Final = 3.0  # [m] height from which a drone that has reported none is landed
 FLOOR: Final = -0.1  # [m] where they end: the motors stop there, and the drone lags behind
+# without positions from outside, where the estimate of the height is wrong by half the error of the accelerometer times
+# the square of the time: quick, and deep enough to end on the floor
+BLIND_DESCENT: Final = 0.45  # [m/s]
+BLIND_FLOOR: Final = -1.0  # [m]
+EXTERNAL_AGE_S: Final = 0.15  # older positions from outside make the estimator ring: they are not passed on
+BLIND_S: Final = 0.5  # without a young position from outside a drone is blind
 SHORTEST_S: Final = 1.5  # duration of a take-off or landing
 UPLOAD_S: Final = 3.0  # limit for writing a climb, part by part
 REPLY_S: Final = 0.15  # deadline of the reply to a high-level command; then the command is repeated
@@ -54,6 +60,9 @@ LATE_LANDINGS: Final = 3  # number of attempts
 UNSTARTED_S: Final = 1.0  # a drone that has descended by itself for longer, because no setpoint was started, is landed
 STARTS: Final = 8  # trajectories that may be on board
 TURNED: Final = 0.35  # [rad] largest difference of the yaw on board from that of the external positions
+MUTED: Final = 2  # landings that another client has ended before the note says so
+OUT_OF_REACH: Final = "out of reach: "
+FALLEN: Final = "landed without positions: it may have fallen"
 
 ANSWERS: Final[dict[int, str]] = {LogStatus.BUSY: "not armed, or locked", LogStatus.REFUSED: "its planner is busy"}
 
@@ -94,7 +103,13 @@ class FlightControl:
         self._down_at = -math.inf  # by then the drone is down, if nothing more reaches it [s]
         self._top: Target | None = None  # end of the climb, held until the first setpoint
         self._external = (math.nan, math.nan)  # height [m] and yaw [rad] that were measured from outside
-        self._ordered_span = SHORTEST_S  # duration of the last landing that was ordered [s]
+        self._external_at = -math.inf  # arrival of the newest [s]
+        self._located_at = -math.inf  # arrival of the newest that was young [s]
+        self.outside = isinstance(settings.positioning, Outside)  # positions from outside correct its estimate
+        self._blind_landing = False  # the landing began without positions
+        self._ended_landings = 0  # that another client has ended
+        self._refused = False  # `trouble` is a reason against a take-off
+        self._ordered = SHORTEST_S, False  # duration of the last landing that was ordered [s], without positions
         self._late_landings = 0  # that were ordered and begun after their end
         self._land_replies = 0  # of the planner to orders to land
         self._armed_at = -math.inf  # last order to arm [s]
@@ -121,9 +136,30 @@ class FlightControl:
         if target is not None and self._telemetry.pose_age < HOLD_AGE_S:
             self._target = target
 
-    def note_external(self, height: float, yaw: float) -> None:
-        """Store the height [m] and yaw [rad], or NaN, that were measured from outside. From any thread."""
-        self._external = height, yaw
+    def note_external(self, height: float, yaw: float, age: float) -> None:
+        """Store the height [m] and yaw [rad], or NaN, as measured from outside `age` [s] ago. From any thread."""
+        self._external, self._external_at = (height, yaw), uptime()
+        if age <= EXTERNAL_AGE_S:
+            self._located_at = self._external_at
+
+    @property
+    def _blind(self) -> bool:
+        """Whether the estimate drifts, because no young position comes from outside."""
+        return self.outside and uptime() - self._located_at > BLIND_S
+
+    @property
+    def late(self) -> str:
+        """Fault of positions from outside that come too late, for users; empty if none."""
+        if not self._blind or uptime() - self._external_at > BLIND_S:
+            return ""
+        return f"its positions from outside are older than {EXTERNAL_AGE_S:g} s, and are not used"
+
+    @property
+    def muted(self) -> str:
+        """Fault of a landing that another client ends again and again, for users; empty if none."""
+        if self.phase is not FlightPhase.LANDING or self._ended_landings < MUTED:
+            return ""
+        return "its landing is ended by setpoints of another client, and ordered again: end that client"
 
     @property
     def turned(self) -> str:
@@ -163,6 +199,7 @@ class FlightControl:
         place = x, y, z, yaw if abs(yaw) > STRAIGHT else 0.0
         span = max(height / CLIMB, SHORTEST_S)
         self.trouble, self._disarm_at = self.takeoff_refusal(), math.inf
+        self._refused = bool(self.trouble)
         trajectory = None if self.trouble else self._write_climb(place, (height, span))
         if trajectory is None:
             return
@@ -202,7 +239,7 @@ class FlightControl:
 
     def _land(self) -> None:
         self._command_planner(HighLevel.LAND, self._order_landing)
-        self._late_landings = 0
+        self._late_landings = self._ended_landings = 0
         self._begin_landing()
 
     def _order_landing(self) -> None:
@@ -210,26 +247,39 @@ class FlightControl:
 
         In this order: one that comes in between mutes the landing, else it would end it, and the motors stopped.
         """
-        self._ordered_span = max((self._highest - FLOOR) / DESCENT, SHORTEST_S)
+        floor, descent = (BLIND_FLOOR, BLIND_DESCENT) if self._blind else (FLOOR, DESCENT)
+        span = max((self._highest - floor) / descent, SHORTEST_S)
+        self._ordered = span, self._blind
         self._release()
-        self.link.cf.high_level_commander.land(FLOOR, self._ordered_span, yaw=None)
+        self.link.cf.high_level_commander.land(floor, span, yaw=None)
 
     def _begin_landing(self) -> None:
         self.enter(FlightPhase.LANDING)
-        self.span_s = self._ordered_span
+        self.span_s, self._blind_landing = self._ordered
         self._down_at = self.phase_since + self.span_s + MARGIN_S
         self._land_replies, _ = self.link.planner_reply(HighLevel.LAND)
 
     def _repeat_landing(self, now: float) -> None:
-        """Order a landing again that a gap or another client has ended; a planner that lands refuses the order."""
+        """Order a landing again that a gap or another client has ended; a planner that lands refuses the order.
+
+        One that has become blind is held, and then landed as such.
+        """
         telemetry = self._telemetry
         near = now - self.phase_since > self.span_s - NEAR_S
         replies, answer = self.link.planner_reply(HighLevel.LAND)
         if replies > self._land_replies and answer == LogStatus.OK:
             self._late_landings += near
+            self._ended_landings += not near
             self._begin_landing()
+        elif replies > self._land_replies:
+            self._land_replies, self._ended_landings = replies, 0
+        if self._blind and not self._blind_landing and not near and not self.link.busy:
+            self.link.cf.high_level_commander.go_to(0.0, 0.0, 0.0, 0.0, POLL_S, relative=True)
+            self._land()
+            return
         ended = telemetry.pose_time - self.phase_since > self.span_s  # what waits in queues tells of before
-        high = ended and telemetry.pose[2] > LOW and self._late_landings < LATE_LANDINGS
+        # the height of a blind drone says nothing
+        high = ended and not self._blind and telemetry.pose[2] > LOW and self._late_landings < LATE_LANDINGS
         if telemetry.status_time - self.phase_since > self.span_s + AGAIN_S:
             self._land()
         elif (high or not near) and not self.link.busy and now - self._released_at > LAND_S:
@@ -278,6 +328,10 @@ class FlightControl:
             self._repeat_landing(now)
         if self.phase not in (FlightPhase.CLIMBING, FlightPhase.FLYING):
             return
+        if self.late:
+            self.trouble = f"landed: {self.late}"
+            self.land()
+            return
         self._confirm_starts()
         begun = self.phase_since + (self.span_s if self.phase is FlightPhase.CLIMBING else 0.0)
         if now - max(self._sent_at, begun) > self.hold_s + UNSTARTED_S and not self.link.busy:
@@ -314,8 +368,9 @@ class FlightControl:
         self._plan_end(now, target[2])
 
     def _plan_end(self, since: float, height: float) -> None:
-        """Note when a trajectory that holds a height [m] since a time [s] has reached the floor."""
-        self._down_at = since + self.hold_s + max(height, 0.0) / SINK + MARGIN_S
+        """Note when a trajectory from a height [m] since a time [s] has reached the floor, or stopped the motors."""
+        down = stop_descent_s(height) + STOP_S if self.outside else self.hold_s + max(height, 0.0) / SINK
+        self._down_at = since + down + MARGIN_S
 
     def _release(self) -> None:
         """End the setpoints of other clients, which mute the planner: 2 s after the last one the drone would lock."""
@@ -358,6 +413,8 @@ class FlightControl:
             self.trouble = ""
         elif self.phase is FlightPhase.LANDING and not flying and since > SHORTEST_S:
             self.enter(FlightPhase.GROUND)
+            if self._blind_landing and self._blind:
+                self.trouble = "; ".join(filter(None, (self.trouble, FALLEN)))
         elif self.airborne and not flying and since > FLYING_FLAG_S:
             self.enter(FlightPhase.GROUND)
             self._disarm_at = -math.inf
@@ -365,6 +422,8 @@ class FlightControl:
         elif telemetry.battery_low and self.phase in (FlightPhase.CLIMBING, FlightPhase.FLYING):
             self.trouble = "landed: battery low"
             self.land()
+        elif self._refused and not self.takeoff_refusal():
+            self._refused, self.trouble = False, ""
 
     def mark_out_of_reach(self) -> bool:
         """Note a lost link; True if what lies on board has ended on the floor.
@@ -373,11 +432,14 @@ class FlightControl:
         """
         down = uptime() > self._down_at
         if self.airborne and self.phase is not FlightPhase.STOPPING:  # a stop is sent when the drone is in reach again
-            self.trouble = "out of reach: " + ("motors may be on: switch it off" if down else "it lands by itself")
+            ended = "approach it only when its motors stand" if self.outside else "motors may be on: switch it off"
+            self.trouble = OUT_OF_REACH + (ended if down else "it lands by itself")
         return down
 
     def resume(self) -> bool:
         """Continue on a new link after a loss; True if the drone is in the air."""
+        if self.trouble.startswith(OUT_OF_REACH):
+            self.trouble = ""
         if self.phase is FlightPhase.STOPPING:
             return True
         if self._flying and self.phase is not FlightPhase.STOPPED:
@@ -414,7 +476,8 @@ class FlightControl:
             return f"no take-off: {telemetry.status_text()}"
         if not telemetry.settled:
             return "no take-off: its position estimate has not settled"
-        return f"no take-off: {self.turned}" if self.turned else ""
+        fault = self.turned or self.late or ("no position comes from outside" if self._blind else "")
+        return f"no take-off: {fault}" if fault else ""
 
     def _write_climb(self, place: Target, climb: tuple[float, float]) -> int | None:
         """Write the climb; returns its number, or None, with `trouble`."""

@@ -143,7 +143,7 @@ class CrazyflieLink:
         self._parameters: dict[int, tuple[str, str]] = {}  # asked for, by number: name, format
         self._values: dict[str, float] = {}  # answers about parameters
         self.trajectories = TrajectoryMemory(self._send)
-        self.confirmed: Callable[[], None] = lambda: None  # called when the drone has confirmed a part of them
+        self.confirmed: Callable[[], None] = lambda: None  # called when a part of them, or a parameter, is confirmed
         cf = self.cf = Crazyflie()
         cf._toc_cache = _tables()
         cf.link_statistics.start = lambda: None  # its pings cost ten packets a second, and its thread can join itself
@@ -313,12 +313,15 @@ class CrazyflieLink:
         """Ask for the version of the firmware; `firmware` has it when the answer has come."""
         self._send(Port.PLATFORM, crtp.VERSIONS, bytes((crtp.FIRMWARE,)))
 
-    def define_trajectories(self) -> None:
-        """Tell the drone where its trajectories will be; raises BodyError if it refuses, LinkError if silent."""
+    def define_trajectories(self, *, stops: bool) -> None:
+        """Tell the drone where its trajectories will be, which end in a stop of the motors or on the floor.
+
+        Raises BodyError if it refuses, LinkError if it is silent.
+        """
         memories = [memory.id for memory in self.cf.mem.mems if memory.type == MemoryKind.TRAJECTORY]
         if not memories:
             raise BodyError("the firmware has no memory for trajectories: update it")
-        self.trajectories.memory = memories[0]
+        self.trajectories.memory, self.trajectories.stops = memories[0], stops
         if self.cf.platform.get_protocol_version() < crtp.RELATIVE_YAW:
             self.trajectories.start_command = HighLevel.START
 
@@ -385,6 +388,7 @@ class CrazyflieLink:
         name, packing = self._parameters.get(crtp.IDENT.unpack_from(data)[0], ("", ""))
         if name and len(data) >= begin + struct.calcsize(packing):
             self._values[name] = float(struct.unpack_from(packing, data, begin)[0])
+            self.confirmed()
 
     def _note_memory(self, packet: Packet) -> None:
         if packet.channel == crtp.MEMORY_WRITE:

@@ -12,8 +12,15 @@ from agents.clock import uptime
 from agents.protocols.crazyflie import CrazyflieSettings, Outside
 from agents.protocols.crtp import Info
 from agents.ticks import Ticks
-from agents.vectors import Vector
-from bridges.crazyflie.flight import LANDING_GAP_S, FlightControl, FlightPhase
+from agents.vectors import Vector, distance
+from bridges.crazyflie.flight import (
+    BLIND_S,
+    EXTERNAL_AGE_S,
+    HOLD_AGE_S,
+    LANDING_GAP_S,
+    FlightControl,
+    FlightPhase,
+)
 from bridges.crazyflie.link import CrazyflieLink, LinkError, SilentError
 from bridges.crazyflie.positioning import Convergence, configure
 from bridges.crazyflie.telemetry import Telemetry
@@ -32,7 +39,7 @@ CALM_S: Final = 5.0  # without a queue on the ground, and the rates are those ch
 LEAST_SHARE: Final = 0.1
 SLOWING_S: Final = 2.0  # more before that is done again: a queue drains meanwhile
 LOOP_HZ: Final = 20.0  # at least, for gaps and phases, however few setpoints are streamed
-EXTERNAL_AGE_S: Final = 0.5  # older external poses are not passed on
+FAR: Final = 0.5  # [m] an estimate farther from the first external position after a gap is reset there
 LANDING_S: Final = 12.0  # least time that `close` waits for a landing
 JOIN_S: Final = 5.0
 
@@ -111,7 +118,7 @@ class CrazyfliePilot:
     def locate(self, now: float, position: Vector, yaw: float) -> None:
         """Store an external position [m] and yaw [rad], or NaN, for the estimator on board."""
         self._external_pose = now, position, yaw
-        self._flight.note_external(float(position[2]), yaw)
+        self._flight.note_external(float(position[2]), yaw, uptime() - now)
 
     @property
     def note(self) -> str:
@@ -122,6 +129,8 @@ class CrazyfliePilot:
                 self._connection_note,
                 self._flight.trouble,
                 self._flight.turned if self._flight.airborne else "",
+                "" if self._flight.airborne else self._flight.late,
+                self._flight.muted,
                 self._telemetry.status_text(),
                 "its radio carries less than was measured: fewer logs" if self._share < 1.0 else "",
             )
@@ -254,7 +263,7 @@ class CrazyfliePilot:
         telemetry.reset_status()
         self._share = 1.0
         self._flight.scale_setpoints(1.0)
-        link.define_trajectories()  # before answers wait behind logs
+        link.define_trajectories(stops=self._flight.outside)  # before answers wait behind logs
         ranges_hz = settings.ranges_hz if settings.multiranger else None
         telemetry.start_logging(link, log_hz=settings.log_hz, ranges_hz=ranges_hz)
         link.ask_firmware()
@@ -267,7 +276,7 @@ class CrazyfliePilot:
         if telemetry.stamps.restarted:
             telemetry.settled = telemetry.stamps.restarted = False
         if self._flight.resume():
-            self._connection_note = IN_THE_AIR
+            self._connection_note, self._convergence = IN_THE_AIR, None
             for parameter, value in self._safe_parameters(link).items():
                 link.send_parameter(parameter, value)
             if self._order is None:
@@ -445,31 +454,52 @@ class CrazyfliePilot:
         return now
 
     def _forward_external_pose(self, link: CrazyflieLink, now: float) -> None:
-        """Send external poses to the estimator on board at the rate set; start and end its convergence."""
+        """Send external poses to the estimator on board at the rate set; end its convergence."""
         system = self._settings.positioning
         if not isinstance(system, Outside):
             return
         pose = self._external_pose
         if pose is not None and now - self._forwarded_at >= 0.9 / system.rate_hz and not link.busy:
-            self._external_pose, self._forwarded_at = None, now
+            self._external_pose = None
             measured, position, yaw = pose
-            if uptime() - measured > EXTERNAL_AGE_S:
+            if uptime() - measured > EXTERNAL_AGE_S or not self._is_near(link, now, position, yaw):
                 return
+            self._forwarded_at = now
             x, y, z = position
             if system.attitude and isfinite(yaw):
                 link.cf.extpos.send_extpose(x, y, z, 0.0, 0.0, sin(0.5 * yaw), cos(0.5 * yaw))
             else:
                 link.cf.extpos.send_extpos(x, y, z)
-            if self._convergence is None and self._flight.phase is FlightPhase.GROUND:
-                self._connection_note = "position estimate is settling"
-                start_yaw = yaw if isfinite(yaw) else self._start_pose[1]
-                self._convergence = Convergence(link, position, start_yaw, absolute=True)
-                self._settle_deadline = now + self._settings.converge_s
-        if self._convergence is not None and not self._telemetry.settled:
+        if self._convergence is not None and self._convergence.reset and not self._convergence.done:
             if self._convergence.advance(now):
-                self._arrive()
-            elif now > self._settle_deadline:
+                if self._connection_note != IN_THE_AIR:
+                    self._arrive()
+            elif now > self._settle_deadline and not self._flight.airborne:
                 self._connection_note = "its position has not settled: are the external positions those of this robot?"
+
+    def _is_near(self, link: CrazyflieLink, now: float, position: Vector, yaw: float) -> bool:
+        """Whether the estimate is near an external pose; if not, after setup or a gap, reset it there.
+
+        The firmware's filter is thrown by a position far from its estimate: in the air the yaw turns, and it falls.
+        """
+        telemetry, convergence = self._telemetry, self._convergence
+        if convergence is not None and not convergence.reset:
+            convergence.advance(now)
+            return convergence.reset
+        far = convergence is None and self._flight.phase is FlightPhase.GROUND
+        if now - self._forwarded_at > BLIND_S and not far:
+            if now - telemetry.status_time > HOLD_AGE_S:
+                return False  # its pose is that of before the gap
+            far = distance((telemetry.pose[0], telemetry.pose[1], telemetry.pose[2]), position) > FAR
+        if not far:
+            return True
+        if self._flight.phase is FlightPhase.GROUND:
+            telemetry.settled = False
+            self._connection_note = "position estimate is settling"
+        here = telemetry.pose[6] if telemetry.settled else self._start_pose[1]
+        self._convergence = Convergence(link, position, yaw if isfinite(yaw) else here, absolute=True)
+        self._settle_deadline = now + self._settings.converge_s
+        return False
 
 
 def _text(error: Exception) -> str:

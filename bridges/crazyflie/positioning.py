@@ -123,6 +123,11 @@ class Convergence:
         self._to_set.append(("kalman.resetEstimation", 0.0))
         self._sent_at: float | None = None  # time of the last question about the first of these
 
+    @property
+    def reset(self) -> bool:
+        """Whether the estimator has been reset."""
+        return not self._to_set
+
     def advance(self, now: float) -> bool:
         """Continue at `now` on the clock `uptime` [s]; True once the estimate has settled."""
         while self._to_set and not self._set(now, *self._to_set[0]):
@@ -143,6 +148,7 @@ class Convergence:
             self._to_set.popleft()
             self._sent_at = None
             if not self._to_set:
+                self._link.stop_log("variance")
                 self._link.start_log("variance", VARIANCE_HZ, VARIANCES, self._store_variances)
             return True
         if self._sent_at is None or now > self._sent_at + REPEAT_S:

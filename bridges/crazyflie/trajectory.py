@@ -5,6 +5,11 @@ one replaces it, so the descent begins only when none comes. A streamed low-leve
 makes the firmware forget the planner's trajectory, and 2 s after the last one the motors are cut (commander.c,
 supervisor.c). The firmware's default controller uses the position of a trajectory only, as of a streamed setpoint.
 
+The estimate of a drone with positions from outside drifts while nothing is received, by half the error of its
+accelerometer times the square of the time: standing on the floor it would believe to sink, and take off again. Its
+descent is therefore accelerated by more than that error, and ends in a piece that is not a number. The planner gives
+up, and 2 s later the firmware stops the motors and locks them. Only polynomials can say that.
+
 Compressed trajectories take one packet, but releases until 2026 misread a yaw in them (firmware issue 1659): they are
 used for yaw 0, and polynomials in several packets for others. Formats: Bitcraze's page on trajectories.
 """
@@ -24,6 +29,9 @@ from agents.protocols.crtp import HighLevel, Port
 HOLD_S: Final = 1.0  # at least, before the descent
 SINK: Final = 0.3  # [m/s] of the descent
 BELOW: Final = -1.0  # [m] height at its end: below any floor, because only an order to land stops the motors
+STOP_SINK: Final = 0.15  # [m/s²] of a descent that ends in a stop: accelerometers are wrong by less than 15 mg
+STOP_STEP: Final = 0.5  # [m] heights between which its duration is the same, and is not written again
+STOP_S: Final = 2.0  # from its end until the firmware stops and locks the motors
 FARTHEST: Final = 32.0  # [m] from the origin in a compressed trajectory
 CHUNK: Final = 24  # [bytes] written by one packet
 LONGEST_MS: Final = 0xFFFF
@@ -38,10 +46,18 @@ REPEAT_S: Final = 0.3  # a part that is not confirmed is written again after thi
 START_EXPIRY_S: Final = 0.5  # a radio does not deliver a start that has waited for longer
 STAMP: Final = struct.Struct("<d")  # time of a start [s, `uptime`], behind what the firmware reads of it
 
+NO_NUMBERS: Final = crtp.PIECE.pack(*[math.nan] * 32, 1.0)  # last piece of a descent that ends in a stop
+
 STARTS: Final = crtp.header(Port.HIGH_LEVEL, 0) & ~COUNTERS
 
 Target = tuple[float, float, float, float]  # x, y, z [m], yaw [rad]
 Send = Callable[[Port, int, bytes], None]
+
+
+def stop_descent_s(height: float) -> float:
+    """Duration [s] of a descent that ends in a stop from a height [m], as deep below the floor as it was above."""
+    top = STOP_STEP * math.ceil(height / STOP_STEP)
+    return math.sqrt(2.0 * (max(top, SHORTEST_S) + max(top, -BELOW)) / STOP_SINK)
 
 
 def rest_to_rest(begin: float, end: float, span: float) -> list[float]:
@@ -63,17 +79,24 @@ def compressed(place: Sequence[float], hold: float, climb: tuple[float, float] |
     return b"".join((*pieces, struct.pack("<BH", 0, 0)))
 
 
-def polynomials(place: Target, hold: float, climb: tuple[float, float] | None = None) -> bytes:
-    """Hold a place for `hold` [s], then sink to `BELOW`; before that `climb` from there to a height [m] in some [s]."""
+def polynomials(place: Target, hold: float, climb: tuple[float, float] | None = None, *, stops: bool = False) -> bytes:
+    """Hold a place for `hold` [s], then sink to `BELOW`; before that `climb` from there to a height [m] in some [s].
+
+    `stops`: without holding, a descent that ends in a stop of the motors.
+    """
     x, y, z, yaw = place
     pieces = [] if climb is None else [(rest_to_rest(z, *climb), climb[1])]
     top = z if climb is None else climb[0]
-    pieces += [([top], hold), ([top, -SINK], max((top - BELOW) / SINK, SHORTEST_S))]
+    if stops:
+        pieces.append(([top, 0.0, -0.5 * STOP_SINK], stop_descent_s(top)))
+    else:
+        pieces += [([top], hold), ([top, -SINK], max((top - BELOW) / SINK, SHORTEST_S))]
     axes = (((x,), (y,), vertical, (yaw,), seconds) for vertical, seconds in pieces)
-    return b"".join(
+    packed = [
         crtp.PIECE.pack(*(c for axis in four for c in (*axis, *[0.0] * (8 - len(axis)))), seconds)
         for *four, seconds in axes
-    )
+    ]
+    return b"".join((*packed, NO_NUMBERS if stops else b""))
 
 
 def _fits(target: Target) -> bool:
@@ -91,6 +114,7 @@ class TrajectoryMemory:
 
     def __init__(self, send: Send) -> None:
         self.memory = 0  # number of the trajectory memory
+        self.stops = False  # descents end in a stop of the motors
         self.start_command = HighLevel.START_2
         self._send = send
         self._written: dict[int, bytes] = {}  # confirmed parts, by address
@@ -122,8 +146,8 @@ class TrajectoryMemory:
         Returns the number of packets that it has taken if it was started, else 0.
         """
         if self._upcoming is None or uptime() - self._sent_at > START_EXPIRY_S:
-            short = _fits(target)
-            data = compressed(target, seconds) if short else polynomials(target, seconds)
+            short = not self.stops and _fits(target)
+            data = compressed(target, seconds) if short else polynomials(target, seconds, stops=self.stops)
             one, other = COMPRESSED if short else POLYNOMIALS
             again = self._started in (one, other) and not self._missing(self._started, data)
             self._upcoming = self._started if again else other if self._started == one else one, data
@@ -136,10 +160,10 @@ class TrajectoryMemory:
     def write_climb(self, place: Target, climb: tuple[float, float], seconds: float) -> int | None:
         """Write the next part of a climb, see `polynomials`; returns its number when all of it is confirmed."""
         self._upcoming = None  # of an earlier flight
-        short = _fits((*place[:2], climb[0], place[3]))
+        short = not self.stops and _fits((*place[:2], climb[0], place[3]))
+        data = compressed(place, seconds, climb) if short else polynomials(place, seconds, climb, stops=self.stops)
         number = TAKEOFFS[0 if short else 1]
-        write = compressed if short else polynomials
-        return number if self._write(number, write(place, seconds, climb)) else None
+        return number if self._write(number, data) else None
 
     def start(self, number: int) -> int:
         """Start a trajectory; returns the number of packets since the last start."""

@@ -326,8 +326,8 @@ def test_a_long_gap_lands_that_drone_alone():
 
 @pytest.mark.system
 @pytest.mark.usefixtures("known_tables")
-def test_radio_gap_with_motion_capture_ends_in_landing():
-    """The estimator is blind, and drifts: it is down before it is far away, and stays there."""
+def test_radio_gap_with_motion_capture_ends_in_stop():
+    """The estimator is blind, and drifts: it is down before it is far away, and its motors stop for good."""
     with connected_twins(device=DONGLE, external=True) as (twin, process):
         process.truth, sinks = twin.truth, []
         process.until(lambda: np.isfinite(process.state.position).all(), "settled")
@@ -336,10 +336,53 @@ def test_radio_gap_with_motion_capture_ends_in_landing():
         twin.device.lines[0].silence(1e6)
         vehicle = twin.device.drones[0].vehicle
         process.until(lambda: sinks.append(-vehicle.model.velocity[2]) or truth(twin)[2] == 0.0, "down")
-        process.run(2.0)
         assert np.abs(truth(twin)).max() < 0.3
         assert max(sinks) < 0.8
-        assert process.state.flying[0], "its motors may be on"
+        process.until(lambda: supervised(twin) == SupervisorState.LOCKED, "locked")
+        process.noted("approach it only when its motors stand")
+        assert (truth(twin)[2], motors(twin), process.state.flying[0]) == (0.0, False, True)
+
+
+def external(process, twin):
+    """In the air by positions from outside."""
+    process.truth = twin.truth
+    process.until(lambda: np.isfinite(process.state.position).all(), "settled")
+    process.takeoff(0.6)
+    return process.lead((0.3, 0.0, 0.6, 0.0)).run(1.0)
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("late", [0.2, 0.3])
+def test_late_positions_are_not_used(late):
+    """They would make the estimator ring: it is landed without them."""
+    with connected_twins(external=True) as (twin, process):
+        external(process, twin)
+        process.truth, locate = twin.captured(capture="late", capture_by=late), process.body.locate
+        process.body.locate = lambda row, t, *pose: locate(row, t - late, *pose)
+        process.noted("landed: its positions from outside are older than 0.15 s")
+        process.until(lambda: not process.state.flying[0], "landed")
+        assert np.abs(truth(twin)).max() < 0.8
+        assert truth(twin)[2] == 0.0
+        process.until(lambda: "older than" in process.state.refusal[0], "no take-off")
+        assert "it may have fallen" in process.state.note[0]
+
+
+@pytest.mark.system
+def test_far_estimate_is_reset_after_a_gap():
+    """Before the first position, which would turn the drone over."""
+    with connected_twins(external=True) as (twin, process):
+        external(process, twin)
+        vehicle = twin.device.drones[0].vehicle
+        process.truth = None
+        process.run(0.7)
+        with twin.lock:
+            vehicle.estimator.error = (0.0, 0.0, -2.0)
+        process.run(0.2)
+        process.truth = twin.truth
+        process.until(lambda: abs(vehicle.estimator.error[2]) < 0.3, "reset")
+        assert supervised(twin) == SupervisorState.FLYING
+        process.land()
+        assert supervised(twin) != SupervisorState.CRASHED
 
 
 @pytest.mark.system

@@ -148,11 +148,19 @@ def test_end_of_climb_is_held_until_first_setpoint(grounded):
 def test_crashed_turned_or_late_drone_stays_down(monkeypatch, info, yaw, old_s, refusal):
     """A crash is not recovered by a take-off; the decision turns by the yaw from outside, the firmware by its own."""
     air = Air(monkeypatch).stand(info=Info.ARMED | info)
-    air.flight.note_external(0.0, yaw)
+    air.flight.note_external(0.0, yaw, 0.0)
     air.now += old_s
     air.flight.takeoff(0.5)
     assert (air.phase, air.sent) == (FlightPhase.GROUND, [])
     assert refusal in air.flight.trouble
+
+
+def test_refusal_is_noted_until_its_cause_goes(monkeypatch):
+    air = Air(monkeypatch).stand(info=Info.ARMED | Info.TUMBLED)
+    air.flight.takeoff(0.5)
+    assert "upside down" in air.pass_(1.0).flight.trouble
+    air.info = Info.ARMED | Info.CAN_FLY
+    assert air.pass_(0.1).flight.trouble == ""
 
 
 def test_armed_is_not_yet_able_to_fly(monkeypatch):
@@ -291,7 +299,7 @@ def test_a_drone_out_of_reach_counts_as_flying(air):
     assert "motors may be on" in air.flight.trouble
     air.telemetry.info = air.info
     assert not air.flight.resume()
-    assert air.phase is FlightPhase.GROUND
+    assert (air.phase, air.flight.trouble) == (FlightPhase.GROUND, "")
 
 
 def test_unanswered_landing_is_ordered_again(air):
@@ -335,7 +343,7 @@ def test_landing_lasts_from_the_highest_place(grounded, pose, seen_from):
         grounded.flight.set_target(grounded.now, (0.0, 0.0, 2.0, 0.0))
         grounded.flight.stream(grounded.now + 1.0)
     elif seen_from == "outside":
-        grounded.flight.note_external(2.0, math.nan)
+        grounded.flight.note_external(2.0, math.nan, 0.0)
     grounded.telemetry.pose = (0.0, 0.0, pose, *(0.0,) * 4)
     grounded.flight.land_after_gap(0.9)
     assert grounded.flight.span_s == pytest.approx(2.1 / module.DESCENT)

@@ -16,7 +16,7 @@ import pytest
 from agents.decision.lifecycle import AIRBORNE, RUNNING, Lifecycle
 from agents.kinds.crazyflie import CRAZYFLIE
 from agents.protocols import crtp
-from agents.protocols.crazyflie import YOUNG_S, CrazyflieSettings, chosen, oldest_pose, overload
+from agents.protocols.crazyflie import YOUNG_S, CrazyflieSettings, Outside, chosen, oldest_pose, overload
 from agents.protocols.crtp import HighLevel, Log, Port, Setpoint
 from agents.safety.detection import Ascent
 from agents.safety.motion_check import MotionCheck
@@ -24,9 +24,9 @@ from agents.safety.setpoint_filter import OUTSIDE_M
 from agents.ticks import Ticks
 from agents.vectors import ZERO
 from bridges.crazyflie import trajectory
-from bridges.crazyflie.flight import DESCENT, FlightControl, FlightPhase
+from bridges.crazyflie.flight import CLIMB, DESCENT, FALLEN, FlightControl, FlightPhase
 from bridges.crazyflie.link import BUSY_S
-from bridges.crazyflie.pilot import LOGS_S, LOOP_HZ
+from bridges.crazyflie.pilot import LOGS_S, LOOP_HZ, SAFE_PARAMETERS
 from bridges.crazyflie.telemetry import Telemetry
 from experiments.real_time.conductor.hot_changes import CLIMB_S
 from tests.bridges.crazyflie_flight import clocked
@@ -95,6 +95,7 @@ class Drone:
         )
         self.transmit = self._send_at_once
         self.trajectories = trajectory.TrajectoryMemory(lambda *packet: self.transmit(*packet))  # noqa: PLW0108
+        self.trajectories.stops = self.flight.outside
         self.trajectories.memory = fleet.twin.drones[row].memories.kinds.index(crtp.MemoryKind.TRAJECTORY)
         self.trajectories.define()
         self.telemetry.start_logging(self, log_hz=fleet.settings.log_hz, ranges_hz=None)
@@ -123,6 +124,9 @@ class Drone:
 
     def send_notify_setpoint_stop(self):
         self._send(Port.SETPOINT, 1, bytes(5))
+
+    def go_to(self, *place, relative):
+        self._send(Port.HIGH_LEVEL, 0, bytes((HighLevel.GO_TO, 0)) + crtp.GO_TO.pack(relative, False, *place))
 
     def land(self, height, span, **_yaw):
         self._send(Port.HIGH_LEVEL, 0, bytes((HighLevel.LAND, 0)) + crtp.CLIMB.pack(height, 0.0, True, span))
@@ -177,18 +181,23 @@ class Drone:
 
 
 class Fleet(ManualClock):
-    """Crazyflies on a radio with `hz` exchanges per second; closed at the end of a `with` statement."""
+    """Crazyflies on a radio with `hz` exchanges per second; closed at the end of a `with` statement.
 
-    def __init__(self, monkeypatch, rows, hz, **device):
+    Those with `external` positions get them, as far as the radio carries and motion capture `sees` them.
+    """
+
+    def __init__(self, monkeypatch, rows, hz, *, external=False, accelerometer_mg=0.0, **device):
         super().__init__(100.0)
         self.hz, self.random = hz, random.Random(rows)
         clocked(monkeypatch, self)
-        asked = request("crazyflie", ["crazyflie-twin"] * rows, device={"link": "radio"} | device)
-        self.settings = chosen("", device, external=False)
-        self.twin = CrazyflieTwin(DeviceRequest(body=asked, faults=Faults()))
+        asked = request("crazyflie", ["crazyflie-twin"] * rows, device={"link": "radio"} | device, external=external)
+        self.settings, self.sees = chosen("", device, external=external), external
+        faults = Faults(accelerometer_mg=accelerometer_mg)
+        self.twin = CrazyflieTwin(DeviceRequest(body=asked, faults=faults))
         self.vehicles = [drone.vehicle for drone in self.twin.drones]
         for vehicle in self.vehicles:
-            vehicle.estimator.error, vehicle.estimator.turn = ZERO, 0.0  # set up
+            vehicle.estimator.reset(ZERO, 0.0)  # set up
+            vehicle.vertical.least = SAFE_PARAMETERS["posCtlPid.thrustMin"]
         self.drones = [Drone(self, row) for row in range(rows)]
         self.ages = []  # (k, rows) ages of poses [s]
         self.fastest = self.touch = 0.0  # fastest descent, and fastest near the floor [m/s]
@@ -269,6 +278,8 @@ class Fleet(ManualClock):
         """Step of the twins; then the robots' loop reads and commands."""
         self.client()
         self.twin.advance(self.now - self._begin)
+        if self.sees:
+            self._locate()
         self.ages.append(self.now - np.array([drone.telemetry.pose_time for drone in self.drones]))
         sinks = -np.array([vehicle.model.velocity[2] for vehicle in self.vehicles])
         self.fastest = max(self.fastest, sinks.max())
@@ -277,6 +288,13 @@ class Fleet(ManualClock):
             angle = speed / 0.3 * self.now + row
             target = (0.3 * math.cos(angle), row + 0.3 * math.sin(angle), HEIGHT, 0.0)
             drone.flight.set_target(self.now, target if speed > 0.0 else None)
+
+    def _locate(self):
+        """Motion capture, 20 times a second."""
+        for line, vehicle, drone in zip(self.twin.lines, self.vehicles, self.drones, strict=True):
+            drone.flight.note_external(vehicle.place[2], math.nan, 0.0)
+            if not line.silent(line.t) and round(vehicle.t / TICK) % 5 == 0:
+                vehicle.locate(vehicle.place, Outside().position_sigma)
 
     def _exchange(self, row):
         line, drone = self.twin.lines[row], self.drones[row]
@@ -414,11 +432,12 @@ def test_flight_by_another_client_is_landed(fleet, stays_s):
     while fleet.phases != {FlightPhase.LANDING}:
         fleet.run(0.02)
     fleet.run(stays_s)
+    assert ("another client" in fleet.drones[0].flight.muted) == (stays_s > 0.0)
     fleet.client = lambda: None
     fleet.run(0.8 / DESCENT + 5.0)
     assert fleet.phases == {FlightPhase.GROUND}
     assert fleet.soft
-    assert fleet.troubles == {"landed: it flew without an order"}
+    assert (fleet.troubles, fleet.drones[0].flight.muted) == ({"landed: it flew without an order"}, "")
     assert fleet.supervised != SupervisorState.LOCKED
 
 
@@ -455,3 +474,49 @@ def test_short_gaps_one_after_the_other(circling):
             circling.twin.lines[0].silence(gap)
             assert circling.run(gap + between, speed=0.3).heights[0] > HEIGHT - 0.1
     assert circling.phases == {FlightPhase.FLYING}
+
+
+@pytest.fixture(
+    params=[(0.8, -4.0), (0.8, 4.0), (1.5, -4.0), (1.5, 4.0)], ids=lambda case: f"{case[0]} m, {case[1]:+g} mg"
+)
+def measured(request, monkeypatch):
+    """In the air by positions from outside, with an accelerometer that is wrong."""
+    height, error = request.param
+    with Fleet(monkeypatch, 1, 500.0, external=True, accelerometer_mg=error) as flown:
+        flown.climb(height, 0.95 * height)
+        flown.run(height / CLIMB + 3.0)
+        assert flown.phases == {FlightPhase.CLIMBING}, flown.troubles
+        yield flown
+
+
+def came_down(fleet, seconds):
+    """Fly on for some seconds: never cut above 0.3 m, on the floor below 1.3 m/s, and never up again."""
+    fleet.touch, heights, cut = 0.0, [], 0.0
+    for _ in range(round(seconds / 0.05)):
+        heights.append(fleet.run(0.05).heights[0])
+        cut = max(cut, 0.0 if fleet.vehicles[0].model.flying else heights[-1])
+    down = next((k for k, height in enumerate(heights) if height < 1e-3), len(heights))
+    return (cut < 0.3, fleet.touch < 1.3, max(heights[down:], default=math.inf) < 0.02) == (True, True, True)
+
+
+def test_blind_drone_without_radio_stops_its_motors(measured):
+    """Its accelerometer would lift it again from the floor; locked, it does not."""
+    measured.twin.lines[0].silence(math.inf)
+    assert came_down(measured, 20.0)
+    assert measured.supervised == SupervisorState.LOCKED
+    measured.drones[0].flight.mark_out_of_reach()
+    assert measured.troubles == {"out of reach: approach it only when its motors stand"}
+
+
+@pytest.mark.parametrize("in_landing", [False, True])
+def test_blind_landing_ends_on_the_floor(measured, in_landing):
+    if in_landing:
+        measured.order(FlightControl.land)
+        measured.run(0.3)
+    measured.sees = False
+    measured.run(0.8)
+    measured.order(FlightControl.land)
+    assert came_down(measured, 12.0)
+    assert measured.phases == {FlightPhase.GROUND}
+    assert measured.troubles == {FALLEN}
+    assert measured.supervised != SupervisorState.LOCKED
