@@ -10,13 +10,14 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from math import inf, isfinite
-from typing import Final, Literal
+from typing import Annotated, Final, Literal
 
 import msgspec
 import zenoh
+from msgspec import Meta
 
 from agents.body.external_pose import External
-from agents.body.interface import UNANSWERED, Body, BodyError, BodyRequest, BodyState
+from agents.body.interface import UNANSWERED, Body, BodyError, BodyRequest, BodyState, settings
 from agents.body.measured_positions import MeasuredPositions
 from agents.clock import uptime
 from agents.errors import ExplainedError
@@ -80,20 +81,27 @@ class _ExternalRobot:
         return self.stopped and (self.flight.flying or norm(self.velocity(now)) > SETTLED)
 
 
+class ExternalSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The `device` table of a robot in another process: nothing but what the world reads of it."""
+
+    watchdog_s: Annotated[float, Meta(gt=0)] | None = None  # see `WorldTable.wheel_watchdog_s` [s]
+
+
 class ExternalBody(Body):
     """Robots of another process.
 
     Its own clock is `uptime` and starts at creation; `read` measures the offset of the caller's clock.
     """
 
+    SETTINGS = ExternalSettings
+
     def __init__(self, request: BodyRequest, open_timeout: float = OPEN_S) -> None:
-        """Create the body, still closed; raises BodyError if a row has settings: there are none.
+        """Create the body, still closed; raises BodyError if a row has other settings than `SETTINGS`.
 
         `open_timeout` is the limit for the router and for the first position of every row [s].
         """
         for name, device in zip(request.names, request.device, strict=True):
-            if device:
-                raise BodyError(f"{name}: device: `{next(iter(device))}` is unknown; an external body has no settings")
+            settings(ExternalSettings, name, device)
         self._names, self._keys, self._endpoints = request.names, request.keys, request.endpoints
         self._zero, self._open_timeout = uptime(), open_timeout
         self._clock, self._corrected = request.clock, request.clock.correction_s

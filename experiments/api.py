@@ -10,7 +10,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from agents.body.interface import Body, BodyError, BodyRequest, BodyState, call_all
+    from agents.body.interface import Body, BodyEntry, BodyError, BodyFault, BodyRequest, BodyState, call_all
     from agents.body.kinds import KINDS, Flight, Holonomic, Kind, Steered, Wheels
     from agents.formation.link import Link
     from agents.network.keys import Keys
@@ -53,7 +53,7 @@ __all__ = [  # noqa: RUF022 - by subject, as in docs/python.md
     "Predictor", "Avoidance", "measure_gap", "EngineFactory", "PointMassEngine", "moving_models",
     # kinds and bodies
     "Kind", "KINDS", "Wheels", "Steered", "Holonomic", "Flight", "Ground",
-    "Body", "BodyRequest", "BodyState", "BodyError", "call_all",
+    "Body", "BodyRequest", "BodyState", "BodyError", "BodyEntry", "BodyFault", "call_all",
     # vectors
     "Vector", "norm", "distance", "clamp", "wrap",
     # orders to a run in real time

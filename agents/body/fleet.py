@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import partial
 
-from agents.body.interface import Body, BodyRequest, BodyState, call_all
+from agents.body.interface import Body, BodyRequest, BodyState, call_all, refuse
 from agents.network.messages import Inspection
 from agents.plugins import registry
 from agents.vectors import Setpoint, Vector
@@ -79,5 +79,7 @@ def assemble(request: BodyRequest) -> Body:
     parts: list[tuple[list[int], Body]] = []
     for name in dict.fromkeys(names):
         group = [row for row, other in enumerate(names) if other == name]
-        parts.append((group, registry.load(registry.BODIES, name)(request.select(group))))
+        body, its = registry.load(registry.BODIES, name), request.select(group)
+        refuse(body, its)
+        parts.append((group, body(its)))
     return Fleet(parts) if len(parts) > 1 else parts[0][1]

@@ -7,10 +7,10 @@ The runtime finds bodies by the entry-point group `zenpark.bodies`: the word bef
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from math import nan
-from typing import Annotated, Any, Final, TypeVar
+from typing import Annotated, Any, ClassVar, Final, Literal, TypeVar
 
 import msgspec
 from msgspec import Meta
@@ -84,6 +84,34 @@ class BodyRequest:
         return replace(self, **columns)
 
 
+@dataclass(frozen=True)
+class BodyEntry:
+    """Robot of an experiment file, as the class of its body judges it."""
+
+    name: str
+    kind: Kind
+    address: str  # the `body` of the file
+    device: Mapping[str, Any]  # right by the `SETTINGS` of the body
+    external: bool  # position from outside
+    process: str  # name of its process; that of the robot where it is alone
+    host: str = ""  # its machine, as [hosts] names it; empty: this one
+
+
+@dataclass(frozen=True)
+class BodyFault:
+    """Fault that the class of a body finds in a file; `severity` and remedy as of a finding of `./zenpark check`."""
+
+    robot: str
+    key: tuple[str | int, ...]  # place below the robot's table: ("body",), ("device", "positioning", "file")
+    message: str
+    remedy: str = ""
+    severity: Literal["error", "warning", "note"] = "error"
+    here: bool = False  # an error on this machine, where a file is missing for example: twins run all the same
+
+    def __str__(self) -> str:
+        return f"{self.robot}: {self.message}" + (f"; {self.remedy}" if self.remedy else "")
+
+
 class RangeScan(msgspec.Struct, frozen=True):
     """Sweep of a robot's range sensors; all sequences have an entry for each ray."""
 
@@ -123,6 +151,16 @@ class Body(ABC):
     another call runs or hangs (`agents.runtime.watchdog`, emergency stops). They must neither block nor need the loop
     to go on. A body of several rows commands all of them, even if one of them fails (`call_all`).
     """
+
+    SETTINGS: ClassVar[type[msgspec.Struct] | None] = None  # struct of the `device` table; None: any table is right
+
+    @classmethod
+    def faults(cls, robots: Sequence[BodyEntry]) -> Iterator[BodyFault]:
+        """Faults of all robots of a file that have this body: of their addresses and tables, and of one beside another.
+
+        Asked when a file is read, and again before the body is made; its library may be missing, and nothing is sent.
+        """
+        yield from shared_devices(robots, _plain_address, "warning")
 
     @abstractmethod
     def open(self) -> None:
@@ -189,6 +227,43 @@ def call_all(calls: Iterable[Callable[[], object]]) -> None:
             call()
         finally:
             call_all(left)
+
+
+def _plain_address(robot: BodyEntry) -> str | None:
+    return robot.address.rstrip("/").lower() if "://" in robot.address else None
+
+
+def shared_devices(
+    robots: Iterable[BodyEntry],
+    device: Callable[[BodyEntry], Hashable | None],
+    severity: Literal["error", "warning"] = "error",
+) -> Iterator[BodyFault]:
+    """The faults of robots with one `device` on one machine; None: a robot without one."""
+    owners: dict[Hashable, str] = {}
+    for each in robots:
+        if (its := device(each)) is None:
+            continue
+        owner = owners.setdefault((each.host, its), each.name)
+        if owner != each.name:
+            message = f"{owner} has the same body, {each.address}: one device gets the setpoints of both"
+            yield BodyFault(each.name, ("body",), message, "give each its own address", severity)
+
+
+def judged(robot: BodyEntry, key: tuple[str | int, ...], parse: Callable[[], object]) -> Iterator[BodyFault]:
+    """The fault of a robot's `key` if `parse` raises BodyError; the remedy stands behind the first `; `."""
+    try:
+        parse()
+    except BodyError as error:
+        message, _, remedy = str(error).removeprefix(f"{robot.name}: ").partition("; ")
+        yield BodyFault(robot.name, key, message, remedy)
+
+
+def refuse(body: type[Body], request: BodyRequest) -> None:
+    """Raises BodyError for errors of the rows of a body, before it is made."""
+    rows = zip(request.names, request.kinds, request.addresses, request.device, request.external, strict=True)
+    entries = [BodyEntry(*row, process=request.names[0]) for row in rows]
+    if errors := [str(fault) for fault in body.faults(entries) if fault.severity == "error"]:
+        raise BodyError("; ".join(errors))
 
 
 SettingsT = TypeVar("SettingsT", bound=msgspec.Struct)

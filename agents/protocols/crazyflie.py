@@ -26,6 +26,7 @@ YOUNG_S: Final = 0.1  # 99 % of poses are younger, or the rates are refused
 TURNS: Final = 2  # of a radio through its robots, for which a pose waits at most, behind answers
 PERIOD_S: Final = 0.01  # periods of logs are multiples of this
 SETPOINT_PACKETS: Final = 2  # of one setpoint, each of which is answered: its trajectory, and the start of that
+LAST_CHANNEL: Final = 125  # of a Crazyradio
 DEFAULT_ADDRESS: Final = "E7E7E7E7E7"  # of a Crazyflie as it is sold, and of cflib
 ADDRESSES: Final = (
     re.compile(r"radio://[0-9A-Za-z]+/([0-9]|[1-9][0-9]|1[01][0-9]|12[0-5])/(250K|1M|2M)(/[0-9A-Fa-f]{1,10})?(\?.*)?"),
@@ -117,10 +118,15 @@ class CrazyflieSettings(DeviceTable, frozen=True):
 def address(name: str, given: str) -> str:
     """The address of the robot `name`, if cflib accepts it; raises BodyError if not."""
     if not any(pattern.fullmatch(given) for pattern in ADDRESSES):
-        raise BodyError(
-            f"{name}: '{given}' is no Crazyflie's address; "
-            "write radio://0/80/2M/E7E7E7E701, usb://0 or udp://127.0.0.1:19850"
-        )
+        form = "write radio://0/80/2M/E7E7E7E701, usb://0 or udp://127.0.0.1:19850"
+        radio, *parts = given.removeprefix("radio://").split("/")
+        if not radio.isalnum() and given.startswith("radio://"):
+            form = f"{form}: the radio has a number or a serial number"
+        elif parts and parts[0].isdecimal() and int(parts[0]) > LAST_CHANNEL:
+            form = f"{form}: channels are 0 to {LAST_CHANNEL}"
+        elif parts and parts[-1].lower().startswith("0x"):
+            form = f"{form}: the address stands without 0x"
+        raise BodyError(f"{name}: '{given}' is no Crazyflie's address; {form}")
     return given
 
 
@@ -138,16 +144,20 @@ def device_of(address: str) -> str:
     return f"{scheme}://{int(rest)}"
 
 
+def air_of(address: str) -> tuple[int, str]:
+    """Channel and data rate of a radio's address."""
+    _, channel, rate, *_ = address.partition("?")[0].removeprefix("radio://").split("/")
+    return int(channel), rate
+
+
 def dongle_of(address: str) -> str:
     """Number or serial of the radio of an address; empty if there is none."""
     return address.split("/")[2] if address.startswith("radio://") else ""
 
 
 def chosen(name: str, device: Mapping[str, Any], *, external: bool) -> CrazyflieSettings:
-    """The settings of the robot `name`; raises BodyError if `external`, a position from outside, contradicts them."""
+    """The settings of the robot `name`; `external` positions go to its estimator where no other system is named."""
     read = settings(CrazyflieSettings, name, device)
-    if isinstance(read.positioning, Outside) and not external:
-        raise BodyError(f'{name}: positioning system "external" needs position = "external" in the robot\'s table')
     if external and read.positioning is None:
         return msgspec.structs.replace(read, positioning=Outside())
     return read

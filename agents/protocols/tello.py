@@ -62,11 +62,11 @@ def endpoint(robot: str, address: str) -> tuple[str, int]:
         parts = urlsplit(address)
         host, port = parts.hostname or HOST, parts.port or CONTROL_PORT
     except ValueError as error:
-        raise BodyError(f"{robot}: {address}: {error}; write tello://{HOST}") from error
+        raise BodyError(f"{robot}: '{address}': {error}; write tello://{HOST}") from error
     numbers = host.split(".")
     if len(numbers) != 4 or not all(n.isdecimal() and int(n) < 256 for n in numbers):
         # djitellopy tells drones apart by the address that their answers come from
-        raise BodyError(f"{robot}: {address}: give the drone's IPv4 address, as in tello://{HOST}")
+        raise BodyError(f"{robot}: '{address}' is no Tello's address; give its IPv4 address, as in tello://{HOST}")
     return host, port
 
 

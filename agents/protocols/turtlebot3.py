@@ -79,15 +79,15 @@ def address(name: str, text: str, chosen: TurtleBot3Settings) -> TurtleBotAddres
     namespace = path.strip("/")
     form = "write it like ros2dds://tb3_0 or rmw://tb3_0?domain=0&distro=jazzy"
     if style not in get_args(Style):
-        raise BodyError(f"{name}: '{text}' is no TurtleBot3: {form}")
+        raise BodyError(f"{name}: '{text}' is no TurtleBot3; {form}")
     if namespace and not _NAMESPACE.fullmatch(namespace):
-        raise BodyError(f"{name}: '{namespace}' is no ROS namespace (letters, digits and _): {form}")
+        raise BodyError(f"{name}: '{namespace}' is no ROS namespace (letters, digits and _); {form}")
     asked = dict(parse_qsl(query, keep_blank_values=True))
     distro, domain = asked.pop("distro", chosen.distro), asked.pop("domain", str(chosen.domain))
     if asked:
-        raise BodyError(f"{name}: '{next(iter(asked))}' is no part of '{text}': {form}")
+        raise BodyError(f"{name}: '{next(iter(asked))}' is no part of '{text}'; {form}")
     if distro not in get_args(Distro):
-        raise BodyError(f"{name}: distro '{distro}' is not known; one of {', '.join(get_args(Distro))}")
+        raise BodyError(f"{name}: distro '{distro}' is not known; write one of {', '.join(get_args(Distro))}")
     if not (domain.isascii() and domain.isdigit() and int(domain) <= ros2.MAX_DOMAIN):
         raise BodyError(f"{name}: domain '{domain}' is no number from 0 to {ros2.MAX_DOMAIN}")
     return TurtleBotAddress(style, namespace, distro, int(domain))  # type: ignore[arg-type]

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from math import inf, isfinite
 from typing import Final
 
 from agents.body.device_locks import Claims
 from agents.body.external_pose import External
-from agents.body.interface import Body, BodyError, BodyRequest, BodyState, RangeScan
+from agents.body.interface import Body, BodyEntry, BodyError, BodyFault, BodyRequest, BodyState, RangeScan
 from agents.clock import uptime
 from agents.network.messages import Inspection, number
 from agents.protocols.crazyflie import (
+    CrazyflieSettings,
     Lighthouse,
     address,
     capacity,
@@ -24,6 +25,7 @@ from agents.protocols.crazyflie import (
     radio_loads,
 )
 from agents.vectors import UNKNOWN, Setpoint, Vector
+from bridges.crazyflie.file_faults import file_faults
 from bridges.crazyflie.link import prepare
 from bridges.crazyflie.pilot import CrazyfliePilot
 from bridges.crazyflie.telemetry import BEARING, ELEVATION, Telemetry
@@ -41,14 +43,17 @@ class CrazyflieBody(Body):
         measuring_s: A radio that carries too little in each window of this time is refused [s].
     """
 
+    SETTINGS = CrazyflieSettings
+
+    @classmethod
+    def faults(cls, robots: Sequence[BodyEntry]) -> Iterator[BodyFault]:
+        """See `Body.faults`."""
+        return file_faults(robots)
+
     def __init__(self, request: BodyRequest, measuring_s: float = MEASURING_S) -> None:
         self._names, self._measuring_s = request.names, measuring_s
         self._addresses = addresses = [address(*pair) for pair in zip(request.names, request.addresses, strict=True)]
-        devices = [device_of(each) for each in addresses]
-        shared = {each for each, device in zip(addresses, devices, strict=True) if devices.count(device) > 1}
-        if shared:
-            raise BodyError(f"several robots have the address {', '.join(sorted(shared))}: give each its own")
-        self._claims = Claims(request.names, devices)
+        self._claims = Claims(request.names, [device_of(each) for each in addresses])
         settings = [
             chosen(name, device, external=outside)
             for name, device, outside in zip(request.names, request.device, request.external, strict=True)

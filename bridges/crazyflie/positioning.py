@@ -7,17 +7,16 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from math import inf
-from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Any, Final
 
 import msgspec
-from msgspec import Meta
 
 from agents.body.interface import BodyError
 from agents.clock import uptime
 from agents.protocols import crtp
 from agents.protocols.crazyflie import CrazyflieSettings, Lighthouse, Loco, Outside
 from agents.vectors import Vector
+from bridges.crazyflie.geometry import StationFile, Sweep, check_anchors, stations
 from bridges.crazyflie.link import REPEAT_S, CrazyflieLink, LinkError
 
 ESTIMATORS: Final = {"auto": 0, "complementary": 1, "kalman": 2, "ukf": 3}
@@ -35,71 +34,24 @@ VARIANCES: Final = {f"kalman.varP{axis}": "float" for axis in "XYZ"}
 
 GEOMETRY: Final = "geometry of the base stations"
 
-Three = Annotated[list[float], Meta(min_length=3, max_length=3)]
-
-
-class Geometry(msgspec.Struct, frozen=True):
-    """Position and orientation of a base station."""
-
-    origin: Three
-    rotation: Annotated[list[Three], Meta(min_length=3, max_length=3)]
-
-
-class Sweep(msgspec.Struct, frozen=True):
-    """Calibration of one of the two light planes of a base station."""
-
-    phase: float
-    tilt: float
-    curve: float
-    gibmag: float
-    gibphase: float
-    ogeemag: float
-    ogeephase: float
-
-
-class Calibration(msgspec.Struct, frozen=True):
-    """Calibration of a base station."""
-
-    sweeps: Annotated[list[Sweep], Meta(min_length=2, max_length=2)]
-    uid: int
-
-
-class StationFile(msgspec.Struct, frozen=True, kw_only=True, rename={"system_type": "systemType"}):
-    """A Lighthouse configuration as the Crazyflie client saves it."""
-
-    type: str
-    version: str
-    system_type: Annotated[int, Meta(ge=1, le=2)] = 2
-    geos: dict[int, Geometry] = {}
-    calibs: dict[int, Calibration] = {}
-
-
-def stations(path: str, count: int) -> StationFile:
-    """The Lighthouse configuration in a file, for `count` base stations at most; raises BodyError if there is none."""
-    try:
-        read = msgspec.yaml.decode(Path(path).read_bytes(), type=StationFile)
-    except OSError as error:
-        raise BodyError(f"{path}: {error.strerror}; save it in the Crazyflie client, tab Lighthouse") from error
-    except msgspec.DecodeError as error:
-        raise BodyError(f"{path} is no Lighthouse configuration: {error}") from error
-    if (read.type, read.version) != ("lighthouse_system_configuration", "1"):
-        raise BodyError(f"{path} is no Lighthouse configuration of version 1; save it again in the Crazyflie client")
-    beyond = sorted(number for number in read.geos.keys() | read.calibs.keys() if number >= count)
-    if beyond:
-        raise BodyError(f"{path} has base station {beyond[0] + 1}, the firmware knows {count} by base_stations")
-    return read
-
 
 def configure(link: CrazyflieLink, settings: CrazyflieSettings) -> None:
-    """Set up estimator and positioning; raises BodyError if the Crazyflie cannot, LinkError if no answer comes."""
-    system = settings.positioning
+    """Set up estimator and positioning; raises BodyError if the Crazyflie cannot, LinkError if no answer comes.
+
+    A geometry is checked before anything is sent.
+    """
+    system, geometry = settings.positioning, None
+    if isinstance(system, Loco):
+        check_anchors(system.anchors)
+    elif isinstance(system, Lighthouse) and system.file is not None:
+        geometry = stations(system.file, system.base_stations)
     estimator = settings.estimator or (None if system is None else "kalman")
     if estimator is not None:
         link.set_parameter("stabilizer.estimator", ESTIMATORS[estimator])
     if settings.multiranger and not link.parameter_value("deck.bcMultiranger"):
         raise BodyError("no Multi-ranger deck found: without it all ranges are 0; is it on top, the right way round?")
     if isinstance(system, Lighthouse):
-        _lighthouse(link, system)
+        _lighthouse(link, system, geometry)
     elif isinstance(system, Loco):
         _prepare_loco(link, system)
     elif isinstance(system, Outside):
@@ -160,15 +112,14 @@ class Convergence:
         self._variances.append(tuple(values.values()))
 
 
-def _lighthouse(link: CrazyflieLink, system: Lighthouse) -> None:
+def _lighthouse(link: CrazyflieLink, system: Lighthouse, wanted: StationFile | None) -> None:
     from cflib.crazyflie import mem  # noqa: PLC0415 - an optional extra
     from cflib.localization.lighthouse_config_manager import LighthouseConfigWriter  # noqa: PLC0415
 
     if not link.parameter_value("deck.bcLighthouse4"):
         raise BodyError("no Lighthouse deck found: is the deck on top of the drone, the right way round?")
-    if system.file is None:
+    if wanted is None:
         return
-    wanted = stations(system.file, system.base_stations)
     geometries, calibrations = {}, {}
     for number, geometry in wanted.geos.items():
         geometries[number] = mem.LighthouseBsGeometry.from_file_object(msgspec.to_builtins(geometry))

@@ -4,12 +4,25 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import Final
 
 from agents.body.device_locks import Claims
 from agents.body.external_pose import External
-from agents.body.interface import UNANSWERED, Body, BodyError, BodyRequest, BodyState, RangeScan, settings
+from agents.body.interface import (
+    UNANSWERED,
+    Body,
+    BodyEntry,
+    BodyError,
+    BodyFault,
+    BodyRequest,
+    BodyState,
+    RangeScan,
+    judged,
+    settings,
+    shared_devices,
+)
 from agents.clock import uptime
 from agents.network.messages import Inspection
 from agents.protocols import khepera4 as protocol
@@ -22,6 +35,22 @@ OPEN_S: Final = 4.5  # deadline of the first odometry: that of a connection and 
 
 class KheperaBody(Body):
     """Khepera IV robots."""
+
+    SETTINGS = protocol.Khepera4Settings
+
+    @classmethod
+    def faults(cls, robots: Sequence[BodyEntry]) -> Iterator[BodyFault]:
+        """See `Body.faults`."""
+        places: dict[str, str] = {}  # addresses by robot
+        for each in robots:
+            wrong = list(judged(each, ("body",), partial(KheperaAddress.parse, each.name, each.address)))
+            yield from wrong
+            if not wrong:
+                address = KheperaAddress.parse(each.name, each.address)
+                chosen = settings(protocol.Khepera4Settings, each.name, each.device)
+                places[each.name] = str(address)
+                yield from judged(each, ("device", "server"), partial(address.server_of, each.name, chosen))
+        yield from shared_devices(robots, lambda each: places.get(each.name))
 
     def __init__(self, request: BodyRequest, open_s: float = OPEN_S, first_answer_s: float = FIRST_ANSWER_S) -> None:
         """Deadlines [s] of the first odometry, and of a server's first answer."""

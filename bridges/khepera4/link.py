@@ -35,6 +35,9 @@ STANDING: Final = 0.02  # [m/s] slower robots stand
 AGAIN_S: Final = 0.2  # period of stops to a silent robot, which obeys as soon as it receives again
 KEEP_S: Final = 20.0  # time of stops to a silent robot over the same connection: most servers accept no other
 TCP_THIN_LINEAR_TIMEOUTS: Final = 16  # of Linux: the first repetitions of lost bytes do not wait longer and longer
+FORM: Final = (
+    "write khepera4://HOST for Robotic Park's server, kteam://HOST:PORT or kteam:///dev/ttyS0 for K-Team's kh4server"
+)
 ANSWER_S: Final = 2.5  # time after a halt at which the note reports a robot that is not known to stand still
 
 
@@ -57,20 +60,18 @@ class KheperaAddress:
             parts = urlsplit(address)
             host, port = parts.hostname or "", parts.port
         except ValueError as error:
-            raise BodyError(f"{robot}: {address}: {error}") from error
+            raise BodyError(f"{robot}: '{address}': {error}; {FORM}") from error
         kteam = parts.scheme == "kteam"
         if kteam and not host and parts.path:
             return cls(kteam, "", 0, parts.path, None)
         if parts.scheme not in ("khepera4", "kteam") or not host or (kteam and not port):
-            raise BodyError(
-                f"{robot}: {address}: write khepera4://HOST for Robotic Park's server, kteam://HOST:PORT or "
-                "kteam:///dev/ttyS0 for K-Team's kh4server"
-            )
+            raise BodyError(f"{robot}: '{address}' is no Khepera's address; {FORM}")
         asked = dict(parse_qsl(parts.query, keep_blank_values=True))
         server = asked.pop("server", None)
         if asked or (server is not None and (kteam or server not in protocol.PARK)):
             raise BodyError(
-                f"{robot}: {address}: after '?' comes server=, for Robotic Park's: {', '.join(protocol.PARK)}"
+                f"{robot}: '{address}' asks for something else; after '?' comes server=, for Robotic Park's: "
+                f"{', '.join(protocol.PARK)}"
             )
         return cls(kteam, host, port or protocol.PARK_PORT, "", server)
 
@@ -79,8 +80,8 @@ class KheperaAddress:
         named = chosen.server or self.server
         if named is not None and ((named == "kteam") != self.kteam or (self.server or named) != named):
             raise BodyError(
-                f"{robot}: {self}: device.server is '{chosen.server}', but its address is that of "
-                f"{self.server or ('K-Team' if self.kteam else 'Robotic Park')}'s server"
+                f"{robot}: device.server is '{chosen.server}', but {self} is the address of "
+                f"{self.server or ('K-Team' if self.kteam else 'Robotic Park')}'s server; leave server out"
             )
         return named
 

@@ -9,13 +9,25 @@ from __future__ import annotations
 import contextlib
 import math
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import Final
 
 from agents.body.device_locks import Claims
 from agents.body.external_pose import External
-from agents.body.interface import FRESH_S, Body, BodyError, BodyRequest, BodyState, call_all, settings
+from agents.body.interface import (
+    FRESH_S,
+    Body,
+    BodyEntry,
+    BodyError,
+    BodyFault,
+    BodyRequest,
+    BodyState,
+    call_all,
+    judged,
+    settings,
+    shared_devices,
+)
 from agents.clock import uptime
 from agents.protocols import tello as protocol
 from agents.vectors import UNKNOWN, ZERO, Setpoint, Vector
@@ -25,8 +37,33 @@ from bridges.tello.pilot import Duty, TelloPilot
 OPEN_S: Final = 3.0  # deadline of a drone's first state line
 
 
+BODY: Final = ("body",)
+
+
 class TelloBody(Body):
     """Tellos. One process flies all Tellos of a computer."""
+
+    SETTINGS = protocol.TelloSettings
+
+    @classmethod
+    def faults(cls, robots: Sequence[BodyEntry]) -> Iterator[BodyFault]:
+        """See `Body.faults`."""
+        places: dict[str, str] = {}  # IPv4 addresses by robot
+        first: dict[str, BodyEntry] = {}  # by machine
+        for each in robots:
+            wrong = list(judged(each, BODY, partial(protocol.endpoint, each.name, each.address)))
+            yield from wrong
+            if not wrong:
+                places[each.name], _ = protocol.endpoint(each.name, each.address)
+            if not each.external:
+                message, remedy = "a Tello does not measure its position", 'write position = "external"'
+                yield BodyFault(each.name, ("position",), message, remedy)
+            other = first.setdefault(each.host, each)
+            if other.process != each.process:
+                message = f"{other.name} and {each.name} are Tellos of one computer, all of which one process drives"
+                process = "tellos" if other.process == other.name else other.process
+                yield BodyFault(each.name, BODY, message, f'give each process = "{process}"')
+        yield from shared_devices(robots, lambda each: places.get(each.name))
 
     def __init__(self, request: BodyRequest, open_s: float = OPEN_S) -> None:
         """`open_s`: deadline of the first state line [s]."""
@@ -36,11 +73,6 @@ class TelloBody(Body):
         self._settings = [
             settings(protocol.TelloSettings, *row) for row in zip(request.names, request.device, strict=True)
         ]
-        for row, name in enumerate(self._names):
-            if not request.external[row]:
-                raise BodyError(f'{name}: a Tello does not measure its position: write position = "external"')
-            if self._endpoints[row][0] in [host for host, _ in self._endpoints[:row]]:
-                raise BodyError(f"{name}: another Tello of this process has the address {self._endpoints[row][0]}")
         self._claims = Claims(self._names, [f"tello://{host}" for host, _ in self._endpoints])
         self._start_yaw = request.yaw
         self._external = [External() for _ in self._names]

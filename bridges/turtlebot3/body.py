@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from math import cos, inf, isfinite, sin
 from typing import Final
@@ -16,7 +16,18 @@ import zenoh
 
 from agents.body.device_locks import Claims
 from agents.body.external_pose import External
-from agents.body.interface import Body, BodyError, BodyRequest, BodyState, call_all
+from agents.body.interface import (
+    Body,
+    BodyEntry,
+    BodyError,
+    BodyFault,
+    BodyRequest,
+    BodyState,
+    call_all,
+    judged,
+    settings,
+    shared_devices,
+)
 from agents.clock import uptime
 from agents.errors import ExplainedError
 from agents.network import session as network
@@ -46,6 +57,21 @@ class TurtleBot3(Body):
     Raises:
         BodyError: If an address or a setting is wrong.
     """
+
+    SETTINGS = turtlebot3.TurtleBot3Settings
+
+    @classmethod
+    def faults(cls, robots: Sequence[BodyEntry]) -> Iterator[BodyFault]:
+        """See `Body.faults`."""
+        places: dict[str, tuple[object, ...]] = {}  # endpoint and topics by robot
+        for each in robots:
+            chosen = settings(turtlebot3.TurtleBot3Settings, each.name, each.device)
+            wrong = list(judged(each, ("body",), partial(turtlebot3.address, each.name, each.address, chosen)))
+            yield from wrong
+            if not wrong:
+                where = turtlebot3.address(each.name, each.address, chosen)
+                places[each.name] = chosen.endpoint, where.style, where.namespace, where.domain
+        yield from shared_devices(robots, lambda each: places.get(each.name))
 
     def __init__(self, request: BodyRequest, clock: Clock = uptime, open_timeout: float = OPEN_S) -> None:
         self._clock, self._open_timeout = clock, open_timeout

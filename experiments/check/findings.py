@@ -14,6 +14,7 @@ Severity = Literal["error", "warning", "note"]
 
 SHOWN_FINDINGS: Final = 5  # findings of one sort; the others are counted
 NOT_RANDOM: Final = "not-random"  # code of the warning that no seed changes anything
+DEVICE: Final = "device"  # code of what bodies say of the devices of their robots
 FORGIVEN: Final = 1e-6  # of rounding
 DELAYED: Final = 1.2  # times the acquisition without noise, from which on the one with noise is given as well
 MARK: Final[dict[Severity, str]] = {"error": "✗", "warning": "!", "note": "✓"}

@@ -23,7 +23,7 @@ import msgspec
 
 from agents.user_folder import cache_folder
 from experiments.catalogue import index
-from experiments.check.findings import CheckNumbers, Finding
+from experiments.check.findings import DEVICE, CheckNumbers, Finding
 from experiments.recording import version
 
 MAX_VERDICTS: Final = 200  # verdicts that are kept
@@ -72,6 +72,8 @@ class KeptVerdict:
         place = self._place()
         if place is None or _code() != self._code or any(uncovered_modules()):
             return
+        if any((each.code, each.severity) == (DEVICE, "error") for each in verdict.findings):
+            return  # of a file that may lie anywhere
         with suppress(OSError, ValueError):
             content = msgspec.json.encode(verdict, enc_hook=_plain)
             place.parent.mkdir(mode=stat.S_IRWXU, parents=True, exist_ok=True)

@@ -11,7 +11,7 @@ from agents.body.kinds import KINDS
 from agents.plugins import registry
 from agents.safety.setpoint_filter import OUTSIDE_M
 from experiments.check.analysis import Analysis
-from experiments.check.findings import FORGIVEN, Finding, join_names
+from experiments.check.findings import DEVICE, FORGIVEN, Finding, join_names
 from experiments.definition import bodies
 from twins.arrays import norm
 
@@ -91,23 +91,23 @@ def libraries(analysis: Analysis) -> Iterator[Finding]:
     experiment = analysis.plan.experiment
     elsewhere = {name for host in experiment.hosts.values() for name in host.robots}
     for name, robot in experiment.robots.items():
-        if name not in elsewhere and (library := bodies.missing_library(registry.body_name(robot.body))):
+        body, remedy = registry.body_name(robot.body), "`./zenpark hardware` adds it"
+        if name in elsewhere:
+            continue
+        if library := bodies.missing_library(body):
             message = f"the body of {name} needs {library}, which is not installed here"
-            yield Finding("warning", "library", message, "`./zenpark hardware` adds it", ("robots", name, "body"))
+            yield Finding("warning", "library", message, remedy, ("robots", name, "body"))
+        elif body in registry.names(registry.BODIES) and bodies.body_class(body) is None:
+            message = f"the body '{body}' of {name} cannot be loaded here"
+            yield Finding("warning", "library", message, "install what it imports", ("robots", name, "body"))
 
 
 def devices(analysis: Analysis) -> Iterator[Finding]:
-    """Report robots with the same address of a device, on one machine."""
-    experiment = analysis.plan.experiment
-    host_of = {name: place for place, host in experiment.hosts.items() for name in host.robots}
-    drivers: dict[tuple[str, str], str] = {}
-    for name, robot in experiment.robots.items():
-        if "://" in robot.body:
-            device = host_of.get(name, ""), robot.body.rstrip("/").lower()
-            other = drivers.setdefault(device, name)
-            if other != name:
-                message = f"{other} and {name} have the same body, {robot.body}: one device gets the setpoints of both"
-                yield Finding("warning", "same-device", message, "give each its own address", ("robots", name, "body"))
+    """Report what bodies say of the devices of their robots, beside the errors of the file."""
+    for fault in bodies.body_faults(analysis.plan.experiment):
+        if fault.severity != "error" or fault.here:
+            path = ("robots", fault.robot, *fault.key)
+            yield Finding(fault.severity, DEVICE, f"{fault.robot}: {fault.message}", fault.remedy, path)
 
 
 def architecture(analysis: Analysis) -> Iterator[Finding]:

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from math import hypot, inf, nan
-from typing import Final
+from typing import Any, Final
 
 import msgspec
 import numpy as np
 
-from agents.body.interface import BodyError, BodyRequest
+from agents.body.interface import Body, BodyEntry, BodyError, BodyFault, BodyRequest
 from agents.body.kinds import KINDS, Kind
 from agents.network.keys import Keys
+from agents.plugins import registry
 from agents.vectors import Vector, clamp
-from experiments.definition.experiment import VICON_TWIN, WORLD, RobotTable
+from experiments.definition.experiment import VICON_TWIN, WORLD, Experiment, RobotTable
 from experiments.definition.plan import Plan
 from twins import scene as outlines
 from twins.engines.engine import World
@@ -39,6 +40,54 @@ def own_bodies(kind: Kind) -> tuple[str, ...]:
 def driven_kind(body: str) -> Kind | None:
     """The kind that a body drives; None of those that drive any, as simulators do."""
     return next((kind for kind in KINDS.usable() if body in own_bodies(kind)), None)
+
+
+def body_class(address: str) -> type[Body] | None:
+    """Class of the body at an address; None if it is not installed or cannot be loaded here."""
+    name = registry.body_name(address)
+    if name not in registry.names(registry.BODIES):
+        return None
+    try:
+        body: type[Body] = registry.load(registry.BODIES, name)
+    except registry.PluginError:
+        return None
+    return body
+
+
+def device_struct(address: str) -> type[msgspec.Struct] | None:
+    """Struct of the `device` table of robots with a body; a protocol twin has that of the body behind which it stands.
+
+    None where any table is right, as for twins.
+    """
+    name = registry.body_name(address)
+    if name in registry.names(registry.DEVICES):
+        kind = driven_kind(name)
+        address = next(iter(kind.bodies), "") if kind is not None else ""
+    body = body_class(address)
+    return None if body is None else body.SETTINGS
+
+
+def body_faults(experiment: Experiment) -> Iterator[BodyFault]:
+    """What the classes of bodies say of an experiment; robots with a wrong `device` table are left out."""
+    hosts = {name: host for host, table in experiment.hosts.items() for name in table.robots}
+    kinds = {kind.name: kind for kind in KINDS.usable()}
+    entries: dict[type[Body], list[BodyEntry]] = {}
+    for name, robot in {**experiment.robots, **experiment.spares}.items():
+        body, kind = body_class(robot.body), kinds.get(robot.kind)
+        if body is None or kind is None or not _fits(robot.device, body.SETTINGS):
+            continue
+        external, process = robot.position == "external", robot.process or name
+        entry = BodyEntry(name, kind, robot.body, robot.device, external, process, hosts.get(name, ""))
+        entries.setdefault(body, []).append(entry)
+    for body, its in entries.items():
+        yield from body.faults(its)
+
+
+def _fits(device: Mapping[str, Any], struct: type[msgspec.Struct] | None) -> bool:
+    try:
+        return struct is None or bool(msgspec.convert(dict(device), struct) is not None)
+    except msgspec.ValidationError:
+        return False
 
 
 def scattered_poses(plan: Plan, names: Sequence[str], seed: int) -> tuple[list[Vector], list[float]]:

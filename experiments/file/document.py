@@ -23,6 +23,7 @@ from experiments.file import catalogue, structure
 from experiments.file.cases import Source, each_once, resolve
 from experiments.file.choices import Adopted, tables
 from experiments.file.completion import fill_from_files, fill_from_shape, law_files
+from experiments.file.consistency.robots import device_faults
 from experiments.file.consistency.whole import consistency_faults, criteria_faults
 from experiments.file.overrides import parse_all
 from experiments.file.problems import DocumentError, Fault, Problem, Text, refusal
@@ -111,11 +112,11 @@ def loads(text: str, *overrides: str) -> Document:
 
 def received(text: str, label: str) -> Document:
     """As `read`, of an experiment that came as JSON over a pipe; its arena is in it."""
-    return _document(Path(label), label, text, (), is_json=True)
+    return _document(Path(label), label, text, (), received=True)
 
 
-def _document(file: Path, label: str, text: str, flags: Sequence[str], *, is_json: bool | None = None) -> Document:
-    is_json = file.suffix.lower() == ".json" if is_json is None else is_json
+def _document(file: Path, label: str, text: str, flags: Sequence[str], *, received: bool = False) -> Document:
+    is_json = received or file.suffix.lower() == ".json"
     try:
         content = parsed(text, label, json=is_json)
         numbers, adopted = list(number_faults(content)), Adopted(file.parent)
@@ -138,6 +139,9 @@ def _document(file: Path, label: str, text: str, flags: Sequence[str], *, is_jso
         whole = tables or not is_json  # a case that was written as JSON names cases that are not in it
         criteria = list(criteria_faults(plans[None].experiment, tables or [UNNAMED])) if whole else []
         found = {name: list(consistency_faults(plan)) for name, plan in plans.items()}
+        if not received:  # where it was read its devices were looked at; a robot needs none of the others' bodies
+            for name, plan in plans.items():
+                found[name] += device_faults(plan.experiment)
         source.refuse([*criteria, *each_once(found, tables)])
     except RecursionError:
         raise refusal(label, "tables or lists are nested too deeply", "flatten them") from None

@@ -44,6 +44,11 @@ def faults(document: Mapping[str, Any], struct: type[msgspec.Struct] = Experimen
     return [fault for fault in found if fault.path or fault.message not in strayed]
 
 
+def table_faults(table: Mapping[str, Any], struct: type[msgspec.Struct], path: Path) -> list[Fault]:
+    """As `faults`, of a table at a path of the document."""
+    return _table(table, struct, path)
+
+
 def _value(value: object, annotation: object, path: Path, note: str) -> list[Fault]:
     group = group_of(path)
     if group is not None and isinstance(value, str | dict):
@@ -68,8 +73,8 @@ def _value(value: object, annotation: object, path: Path, note: str) -> list[Fau
             inner += _value(each, get_args(plain)[0], (*path, number), note)
     elif get_origin(plain) in _UNIONS and isinstance(value, dict):
         tables = [each for each in get_args(plain) if _is_struct(each)]
-        if len(tables) == 1:
-            return _table(value, tables[0], path)
+        if len(tables) == 1 or (tables and tables[0].__struct_config__.tag_field is not None):
+            return _one_table(value, tables, path)
     return inner or _judged(value, annotation, path, note)
 
 
@@ -90,12 +95,31 @@ def _table(
             found.append(_unknown(key, hint, path, plugin))
     for name, field in fields.items():
         if name in value:
-            found += _value(value[name], field.type, (*path, name), "")
+            plain = isinstance(field.default, bool | int | float | str)
+            found += _value(
+                value[name], field.type, (*path, name), f"left out: {shown(field.default)}" if plain else ""
+            )
         elif field.required and name not in meant:
             _, note = _plain(field.type, "")
             hint = _REMEDY.get(name) or f"add {name} = ... ({note})"
             found.append(Fault(path, f"'{name}' is missing{_place_in_file(path)}", hint))
     return found or _own_checks(value, struct, path)
+
+
+def _one_table(value: Mapping[str, Any], tables: Sequence[type[msgspec.Struct]], path: Path) -> list[Fault]:
+    """A table against a struct, of several the one that its tag names."""
+    field = tables[0].__struct_config__.tag_field
+    if field is None:
+        return _table(value, tables[0], path)
+    by_tag = {str(table.__struct_config__.tag): table for table in tables}
+    tag = value.get(field)
+    if tag not in by_tag:
+        known = ", ".join(by_tag)
+        if tag is None:
+            return [Fault(path, f"'{field}' is missing{_place_in_file(path)}", f"add {field} = ...; known: {known}")]
+        return [Fault((*path, field), f"'{field}' cannot be {shown(tag)}", did_you_mean(str(tag), by_tag))]
+    fields = {key: each for key, each in value.items() if key != field}
+    return _table(fields, by_tag[str(tag)], path)
 
 
 def _unknown(key: str, hint: str, path: Path, plugin: tuple[str, str] | None) -> Fault:

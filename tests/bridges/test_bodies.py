@@ -6,7 +6,7 @@ import socket
 import pytest
 
 from agents.body.device_locks import Claims
-from agents.body.interface import BodyError
+from agents.body.interface import BodyError, refuse
 from agents.protocols.crazyflie import device_of
 from bridges.crazyflie.body import CrazyflieBody
 from bridges.khepera4.body import KheperaBody
@@ -28,6 +28,11 @@ GPS, OUTSIDE = ({"positioning": {"system": system}} for system in ("gps", "exter
 NO_RANGE = {"server": "2023-04-10", "ranges": True}
 
 
+def made(body, asked):
+    refuse(body, asked)
+    return body(asked)
+
+
 @pytest.mark.parametrize(
     ("kind", "addresses", "device", "external", "said"),
     [
@@ -35,12 +40,18 @@ NO_RANGE = {"server": "2023-04-10", "ranges": True}
         ("crazyflie", "udp://127.0.0.1", {}, False, NO_CRAZYFLIE),
         ("crazyflie", "usb://", {}, False, NO_CRAZYFLIE),
         ("crazyflie", "", {}, False, NO_CRAZYFLIE),
-        ("khepera4", "khepera4", {}, False, "^R0: khepera4: "),
-        ("khepera4", "khepera4://", {}, False, "^R0: khepera4://: "),
-        ("khepera4", "kteam://10.0.0.3", {}, False, r"^R0: kteam://10\.0\.0\.3: "),
-        ("khepera4", "khepera4://h:port", {}, False, "^R0: khepera4://h:port: "),
-        ("khepera4", "khepera4://h?server=2024", {}, False, r"^R0: khepera4://h\?server=2024: "),
-        ("khepera4", "khepera4://h?year=2023", {}, False, r"^R0: khepera4://h\?year=2023: "),
+        ("khepera4", "khepera4", {}, False, "^R0: 'khepera4'"),
+        ("khepera4", "khepera4://", {}, False, "^R0: 'khepera4://'"),
+        (
+            "khepera4",
+            "kteam://10.0.0.3",
+            {},
+            False,
+            r"^R0: 'kteam://10\.0\.0\.3' is no Khepera's address; write khepera4://HOST ",
+        ),
+        ("khepera4", "khepera4://h:port", {}, False, "^R0: 'khepera4://h:port'"),
+        ("khepera4", "khepera4://h?server=2024", {}, False, r"^R0: 'khepera4://h\?server=2024' .*2025-05"),
+        ("khepera4", "khepera4://h?year=2023", {}, False, r"^R0: 'khepera4://h\?year=2023' "),
         ("tello", "tello://kitchen", {}, True, NO_TELLO),
         ("tello", "tello://1.2.3.256", {}, True, NO_TELLO),
         ("tello", "tello://1.2.3.4:x", {}, True, NO_TELLO),
@@ -48,7 +59,7 @@ NO_RANGE = {"server": "2023-04-10", "ranges": True}
         ("turtlebot3", "rmw://tb3_0?domain=500", {}, False, "domain '500' is no number from 0 to 232"),
         ("turtlebot3", "rmw://tb3_0?distro=foxy", {}, False, "distro 'foxy' is not known"),
         ("turtlebot3", "rmw://tb3_0?colour=red", {}, False, "'colour' is no part"),
-        ("turtlebot3", "radio://0", {}, False, "is no TurtleBot3: write it like ros2dds://tb3_0"),
+        ("turtlebot3", "radio://0", {}, False, "is no TurtleBot3; write it like ros2dds://tb3_0"),
         ("crazyflie", RADIO, {"contrl": "position"}, False, "^R0: device: .*contrl"),
         ("crazyflie", RADIO, {"log_hz": 500.0}, False, "^R0: device: .*log_hz"),
         ("crazyflie", RADIO, GPS, False, "^R0: device: .*positioning"),
@@ -61,15 +72,16 @@ NO_RANGE = {"server": "2023-04-10", "ranges": True}
         ("tello", TELLO, {"silence_s": 0.01}, True, "^R0: device: .*silence_s must be 0.3 to 10 s"),
         ("turtlebot3", ROS, {"speed": 1.0}, False, "^R0: device: .*Object contains unknown field `speed`"),
         ("turtlebot3", ROS, {"distro": "foxy"}, False, r"^R0: device: .*at `\$.distro`"),
-        ("crazyflie", [RADIO] * 2, {}, False, "several robots have the address"),
+        ("crazyflie", [RADIO] * 2, {}, False, "R1: R0 has the same body, radio://.*; give each its own address"),
         ("crazyflie", RADIO, OUTSIDE, False, "needs position = "),
-        ("tello", "tello", {}, False, 'a Tello does not measure its position: write position = "external"'),
-        ("tello", [TELLO, f"{TELLO}:1"], {}, True, "R1: another Tello .* has the address 10"),
+        ("tello", "tello", {}, False, 'a Tello does not measure its position; write position = "external"'),
+        ("tello", [TELLO, f"{TELLO}:1"], {}, True, "R1: R0 has the same body, tello://10"),
     ],
 )
 def test_wrong_addresses_and_settings_are_named(kind, addresses, device, external, said):
+    asked = request(kind, addresses, device=device, external=external)
     with pytest.raises(BodyError, match=said):
-        BODIES[kind](request(kind, addresses, device=device, external=external))
+        made(BODIES[kind], asked)
 
 
 def crazyflie(port):

@@ -124,7 +124,7 @@ def test_missing_positions_are_named_with_reasons(far, robots, say, words):
     say(far)
     with pytest.raises(BodyError, match=rf"\A.*{re.escape(words)}.*\Z"):  # one line
         body_of("tcp/127.0.0.1:1", *names, address=address).open()
-    with pytest.raises(BodyError, match=r"CF01: device: .*`rate`.*has no settings"):
+    with pytest.raises(BodyError, match=r"CF01: device: .*`rate`; its fields are watchdog_s"):
         body_of("tcp/127.0.0.1:1", "CF01", rate=5)
 
 

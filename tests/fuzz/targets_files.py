@@ -26,7 +26,7 @@ from agents.network import messages as wire
 from agents.network import zenoh_config as sessions
 from agents.plugins import registry
 from agents.protocols import crazyflie, khepera4, tello, turtlebot3
-from bridges.crazyflie.positioning import stations
+from bridges.crazyflie.geometry import stations
 from bridges.khepera4.link import KheperaAddress
 from bridges.vicon.publisher import parse_server
 from experiments.authoring.robotic_park.convert import convert_text

@@ -6,12 +6,14 @@ from types import SimpleNamespace
 
 import pytest
 
-from experiments.check.safety import devices, libraries
-from experiments.definition.experiment import RobotTable
+from agents.body.interface import BodyEntry
+from agents.kinds.khepera4 import KHEPERA4
+from experiments.check.safety import libraries
 from experiments.definition.plan import Plan
 from experiments.file.document import loads
 from tests.cases import mostly_slow
 from tools.main import main
+from twins.body import TwinBody
 
 TRIANGLE = (Path(__file__).parents[2] / "experiments" / "catalogue" / "triangle.toml").read_text("utf-8")
 RADIO = 'body = "radio://0/80/2M/E7E7E7E701"\n'
@@ -137,13 +139,13 @@ def test_a_missing_library_is_a_finding(monkeypatch):
 
 @pytest.mark.parametrize(("second", "same"), [("ROVER://192.0.2.7:5005/", True), ("rover://192.0.2.7:5006", False)])
 def test_two_robots_with_one_devices_address_are_found(second, same):
-    bodies = {"RV01": "rover://192.0.2.7:5005", "RV02": "world", "RV03": second, "RV04": "world"}
-    robots = {name: RobotTable(kind="khepera4", start=[0.0, 0.0], body=body) for name, body in bodies.items()}
+    def found(host):
+        rows = [("RV01", "rover://192.0.2.7:5005", ""), ("RV02", "world", ""), ("RV03", second, host)]
+        entries = [
+            BodyEntry(name, KHEPERA4, body, {}, external=False, process=name, host=at) for name, body, at in rows
+        ]
+        return [(each.severity, each.robot, each.key, each.message) for each in TwinBody.faults(entries)]
 
-    def found(**hosts):
-        plan = SimpleNamespace(experiment=SimpleNamespace(robots=robots, hosts=hosts))
-        return [(each.code, each.message, each.where) for each in devices(SimpleNamespace(plan=plan))]
-
-    message = f"RV01 and RV03 have the same body, {second}: one device gets the setpoints of both"
-    assert found() == ([("same-device", message, ("robots", "RV03", "body"))] if same else [])
-    assert found(lab=SimpleNamespace(robots=["RV03"])) == []
+    message = f"RV01 has the same body, {second}: one device gets the setpoints of both"
+    assert found("") == ([("warning", "RV03", ("body",), message)] if same else [])
+    assert found("lab") == []

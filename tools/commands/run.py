@@ -125,7 +125,10 @@ def _run(origin: RunOrigin, handling: Handling, *, former: Path | None = None, b
     read = load(origin.file, *origin.changes)
     check_folder(handling.out)
     _refuse(origin, handling)
-    if not sound(read, kept, origin.cases, seeds=origin.seeds, as_json=handling.as_json, anyway=origin.anyway):
+    real = not origin.virtual and origin.bodies is None
+    if not sound(
+        read, kept, origin.cases, real=real, seeds=origin.seeds, as_json=handling.as_json, anyway=origin.anyway
+    ):
         return 2
     if not origin.virtual:
         from experiments.real_time.conductor.conduct import with_bodies
@@ -351,13 +354,15 @@ def _refuse(origin: RunOrigin, handling: Handling) -> None:
 
 
 def sound(
-    read: Document, kept: KeptVerdict, cases: Sequence[str] = (), *, seeds: int, as_json: bool, anyway: bool
+    read: Document, kept: KeptVerdict, cases: Sequence[str] = (), *, real: bool, seeds: int, as_json: bool, anyway: bool
 ) -> bool:
     """Print the warnings and errors of the check of a run, errors that prevent it as JSON too; False if there are such.
 
+    Of the devices of robots only those of a run with `real` bodies.
+
     Raises DocumentError if there is no such case.
     """
-    from experiments.check.findings import NOT_RANDOM
+    from experiments.check.findings import DEVICE, NOT_RANDOM
     from experiments.check.kept import Verdict
 
     verdict = kept.read()
@@ -367,6 +372,8 @@ def sound(
         verdict = Verdict(str(read.path), read.experiment.title, check(read, cases), None)
         kept.keep(verdict)
     found = [finding for finding in verdict.findings if finding.severity != "note"]
+    if not real:
+        found = [finding for finding in found if finding.code != DEVICE]
     if seeds == 1:
         found = [finding for finding in found if finding.code != NOT_RANDOM]
     say(*map(str, found), to=sys.stderr)

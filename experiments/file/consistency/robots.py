@@ -10,9 +10,10 @@ from agents.body.interface import BodyError
 from agents.body.kinds import KINDS, Kind
 from agents.plugins import files, registry
 from agents.plugins.registry import did_you_mean
-from experiments.definition.bodies import driven_kind, own_bodies
+from experiments.definition.bodies import body_faults, device_struct, driven_kind, own_bodies
 from experiments.definition.experiment import MEAN, WORLD, WORST, Experiment, RobotTable
 from experiments.file.problems import Fault
+from experiments.file.structure import table_faults
 from twins.engines.engine import EngineFactory, require_carried
 from twins.engines.point_mass import TWINLESS, has_model
 from twins.sensing.range_sensors import sensors
@@ -41,6 +42,19 @@ def robot_faults(experiment: Experiment, engine: EngineFactory) -> Iterator[Faul
         else:
             yield from _hover(experiment, path, robot, kind)
         yield from _body(engine, path, robot, kind)
+
+
+def device_faults(experiment: Experiment) -> Iterator[Fault]:
+    """Errors of addresses and `device` tables on any machine, by the classes of bodies."""
+    robots = [(("robots", name), robot) for name, robot in experiment.robots.items()]
+    spares = [(("spares", name), robot) for name, robot in experiment.spares.items()]
+    for path, robot in [*robots, *spares]:
+        if (struct := device_struct(robot.body)) is not None:
+            yield from table_faults(robot.device, struct, (*path, "device"))
+    for fault in body_faults(experiment):
+        if fault.severity == "error" and not fault.here:
+            table = "robots" if fault.robot in experiment.robots else "spares"
+            yield Fault((table, fault.robot, *fault.key), fault.message, fault.remedy)
 
 
 def _standby(experiment: Experiment) -> Iterator[Fault]:

@@ -8,7 +8,7 @@ import pytest
 from agents.body import fleet
 from agents.body.device_locks import Claims, numeric
 from agents.body.fleet import Fleet, assemble
-from agents.body.interface import BodyError, BodyState, Disturbance
+from agents.body.interface import Body, BodyError, BodyState, Disturbance
 from agents.body.shadow_twin import Shadowed, shadowed
 from agents.network.messages import Inspection
 from agents.plugins import registry
@@ -125,11 +125,14 @@ def test_addresses_choose_the_bodies(monkeypatch):
     asked = []
 
     def load(group, name):
-        def opened(part):
-            asked.append((group, name, part.names, part.addresses, [y for _, y, _ in part.start]))
-            return Recorded(len(part.names))
+        class Asked(Recorded):
+            faults = staticmethod(Body.faults)
 
-        return opened
+            def __init__(self, part):
+                asked.append((group, name, part.names, part.addresses, [y for _, y, _ in part.start]))
+                super().__init__(len(part.names))
+
+        return Asked
 
     assert isinstance(assemble(request(["tello", "khepera4"])), TwinBody), "twins share one body"
     monkeypatch.setattr(fleet.registry, "load", load)

@@ -13,7 +13,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from agents.body.interface import BodyError
+from agents.body.interface import BodyError, refuse
 from agents.formation.link import Link
 from agents.kinds.khepera4 import KHEPERA4
 from agents.plugins import registry
@@ -202,8 +202,8 @@ def test_body_of_the_docs_drives_over_udp(rover):
 
 @pytest.mark.slow
 def test_body_of_the_docs_refuses_wrong_addresses():
-    with pytest.raises(BodyError, match="no address"):
-        rovers("rover://nowhere")
+    with pytest.raises(BodyError, match=r"R0: 'rover://nowhere' is no rover; write rover://192"):
+        refuse(made_in_guide("Rovers"), request("khepera4", "rover://nowhere"))
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as silent:
         silent.bind(("127.0.0.1", 0))
         with pytest.raises(BodyError, match="no pose within 3 s"):

@@ -358,3 +358,37 @@ def test_summary_names_the_obstacles(tmp_path):
     (tmp_path / "one.toml").write_text(HEAD + cart + crate + fence + ROBOTS)
     printed = invoke("check", tmp_path / "one.toml").stdout
     assert "cart (box 0.2 × 0.3 m, moves), crate (cylinder of radius 0.1 m, 2 kg), fence (wall, 1 m above" in printed
+
+
+REAL = """
+title = "Real drones"
+duration_s = 5.0
+formation = { gain = 0.5, links = { "CF01 - CF02" = 1.0 } }
+[robots.CF01]
+kind = "crazyflie"
+start = [0.0, 0.0]
+hover = 0.5
+body = "radio://0/80/2M/E7E7E7E701"
+device = { positioning = { system = "lighthouse", file = "nowhere.yaml" } }
+[robots.CF02]
+kind = "crazyflie"
+start = [1.0, 0.0]
+hover = 0.5
+body = "radio://1/80/2M/E7E7E7E702"
+position = "external"
+"""
+
+
+def test_devices_of_robots_are_judged(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "real.toml").write_text(REAL, "utf-8")
+    found = [(each.severity, each.message, each.where) for each in check(document.read("real.toml"))
+             if each.code == "device"]  # fmt: skip
+    assert [(severity, where) for severity, _, where in found] == [
+        ("error", "real.toml:10:58"), ("warning", "real.toml:15:8"), ("note", "real.toml:11:1")
+    ]  # fmt: skip
+    assert "CF01: nowhere.yaml: No such file" in found[0][1]
+    assert "radios 0 and 1 are on channels 80 and 80" in found[1][1]
+    assert "go to the estimators of CF02, at most 20 a second" in found[2][1]
+    assert "nowhere.yaml" in invoke("run", "real.toml", code=2).stderr  # and no process has started
+    assert "nowhere.yaml" not in invoke("run", "real.toml", "--virtual", "--no-report").stderr
