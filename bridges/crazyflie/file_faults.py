@@ -58,7 +58,7 @@ def _positioning(robot: BodyEntry) -> Iterator[BodyFault]:
 
 
 def _forwarded(robots: Iterable[BodyEntry]) -> Iterator[BodyFault]:
-    """A note on drones with markers whose table names no positioning system."""
+    """A note on drones with markers and without a positioning system in their table."""
     tables = {each.name: settings(CrazyflieSettings, each.name, each.device) for each in robots if each.external}
     if names := [name for name, table in tables.items() if table.positioning is None]:
         message = (

@@ -95,7 +95,7 @@ def stations(path: str, count: int) -> StationFile:
 
 
 def _impossible(geometry: Geometry) -> str:
-    """Why no base station can stand so, with the remedy; empty if one can."""
+    """Reason that no base station can stand so, with the remedy; empty if one can."""
     again = "estimate the geometry again in the Crazyflie client"
     origin, rotation = np.array(geometry.origin), np.array(geometry.rotation)
     if not (np.isfinite(origin).all() and np.isfinite(rotation).all()):

@@ -68,7 +68,7 @@ def device_struct(address: str) -> type[msgspec.Struct] | None:
 
 
 def body_faults(experiment: Experiment) -> Iterator[BodyFault]:
-    """What the classes of bodies say of an experiment; robots with a wrong `device` table are left out."""
+    """Faults of an experiment by the classes of its bodies; robots with a wrong `device` table are left out."""
     hosts = {name: host for host, table in experiment.hosts.items() for name in table.robots}
     kinds = {kind.name: kind for kind in KINDS.usable()}
     entries: dict[type[Body], list[BodyEntry]] = {}
