@@ -338,9 +338,11 @@ class ImmediateSubscriber:
         self._subscriber.undeclare()
 
     def receive(self, sample: zenoh.Sample) -> None:
-        if sample.kind == zenoh.SampleKind.DELETE:
-            return
-        stop = messages.read_stop(sample.payload.to_bytes(), str(sample.encoding))
+        if sample.kind != zenoh.SampleKind.DELETE:
+            self.obey(messages.read_stop(sample.payload.to_bytes(), str(sample.encoding)))
+
+    def obey(self, stop: messages.Stop) -> None:
+        """Obey a stop, whichever way it came."""
         try:
             self._obey(stop)
         finally:  # not before: a loop that polls in between would take it for obeyed already

@@ -2,15 +2,20 @@
 
 End of file means that the launcher is gone, silence that it hangs or that the network to it is cut. This works equally
 for a local process and through ssh, on every operating system.
+
+The heartbeat is an empty line. The emergency stop is a line as well: its second way, which needs no router.
 """
 
 from __future__ import annotations
 
 import os
 import select
+import sys
 import threading
 from collections.abc import Callable
 from typing import Final
+
+from agents.network import messages
 
 BEAT_S: Final = 0.5  # period of the heartbeat
 SILENCE_S: Final = 3.0
@@ -21,6 +26,18 @@ LONGEST: Final = 4096  # of a line [bytes]
 
 
 GONE: Final = "the starter is gone"  # or has ended
+_STOP: Final = b"stop "
+
+
+def stop_line(stop: messages.Stop) -> bytes:
+    """Line with an emergency stop."""
+    words = messages.Stop(stop.operator[: messages.MAX_WORDS], stop.reason[: messages.MAX_WORDS])
+    return _STOP + messages.encode(words) + b"\n"
+
+
+def stop_in(line: bytes) -> messages.Stop | None:
+    """The emergency stop in a line; None if it has none."""
+    return messages.read_stop(line.removeprefix(_STOP), messages.JSON) if line.startswith(_STOP) else None
 
 
 class Lifeline:
@@ -68,4 +85,7 @@ class Lifeline:
         self._rest = rest[-LONGEST:]
         for line in lines:
             if line:
-                on_line(line)
+                try:
+                    on_line(line)
+                except Exception as error:  # noqa: BLE001 - it must go on to watch
+                    print(f"lifeline: {type(error).__name__}: {error}", file=sys.stderr, flush=True)

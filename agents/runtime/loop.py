@@ -39,7 +39,7 @@ from agents.runtime.command_line import on_termination
 from agents.runtime.descent import Descent, DescentTiming
 from agents.runtime.goal_inbox import GoalInbox
 from agents.runtime.lifeline import SILENCE_S as LIFELINE_S
-from agents.runtime.lifeline import Lifeline
+from agents.runtime.lifeline import Lifeline, stop_in
 from agents.runtime.orders import LAND, STOP, OrderDesk
 from agents.runtime.pose_inbox import PoseInbox
 from agents.runtime.range_inbox import RangeInbox
@@ -101,6 +101,7 @@ class Runtime:
         self._stopping: str | None = None
         self._retired: set[int] = set()  # rows that land, or have landed, while the run goes on
         self._cut_off = False  # motors were cut by a stop that the loop has not polled yet
+        self._early_stop: messages.Stop | None = None  # on the lifeline, maybe before there is a network
         self._estimators = [External() for _ in self._names]
         self.states: Sequence[BodyState] = ()  # last reading of the body
         self._opened = self._joined = False
@@ -125,7 +126,7 @@ class Runtime:
         belongs to that process and is left as it is.
         """
         lost = threading.Event()
-        lifeline = Lifeline(lost, self._setup.lifeline_s, on_line=self._setup.clock.follow)
+        lifeline = Lifeline(lost, self._setup.lifeline_s, on_line=self.follow_line)
         if self._setup.lifeline:
             lifeline.start()
         asked = threading.Event()
@@ -158,6 +159,17 @@ class Runtime:
     def subscribe_to_stops(self, session: zenoh.Session) -> None:
         """Subscribes to emergency stops before the body is opened, which may take a minute."""
         self.estop = pubsub.ImmediateSubscriber(session, self._setup.keys.estop, self._cut)
+        if self._early_stop is not None:
+            self.estop.obey(self._early_stop)
+
+    def follow_line(self, line: bytes) -> None:
+        """Follows a line of the lifeline, in its thread: an emergency stop, or a correction of the clock."""
+        if (stop := stop_in(line)) is None:
+            self._setup.clock.follow(line)
+            return
+        self._early_stop = stop
+        if hasattr(self, "estop"):  # else it is obeyed as soon as there is something to stop
+            self.estop.obey(stop)
 
     def join(self, session: zenoh.Session) -> None:
         self._opened = True

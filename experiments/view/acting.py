@@ -162,11 +162,12 @@ class Acting:
         # the session here may be blocked or closed, which must not keep the result from the page, nor later clicks
         threading.Thread(target=self._urgent.put, args=(stop,), daemon=True).start()
         sending.join()
-        doubtful = sent.failure or ", ".join(sorted(sent.moving))
-        said = f"stopped: {', '.join(sorted(sent.seen))}" if sent.seen else f"no robot is seen. {LAST}"
+        seen, moving = sent.seen | sent.strangers, sent.moving | sent.moving_strangers
+        doubtful = ", ".join(sorted(moving)) or ("" if seen else sent.failure)
+        said = f"stopped: {', '.join(sorted(seen))}" if seen else f"no robot is seen. {LAST}"
         if doubtful:
             said = f"NOT known to have stopped: {doubtful}. {LAST}"
-        self._note("Emergency stop", f"{sent.where}: {said}", bad=bool(doubtful) or not sent.seen, stays=True)
+        self._note("Emergency stop", f"{sent.where}: {said}", bad=bool(doubtful) or not seen, stays=True)
         threading.Thread(target=self._record, args=("emergency stop", said), daemon=True).start()
 
     def _show_targets(self, *, shown: bool) -> None:

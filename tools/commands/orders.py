@@ -309,14 +309,20 @@ def stop_all(stops: Sequence[EmergencyStop], *, dry_run: bool, as_json: bool) ->
     Returns:
         The exit code: 0, or 1 if a robot has not stopped in time, or if no robot was seen.
     """
+    from experiments.real_time.hosts import run_registry
+
     todo = [(stop.look, ()) if dry_run else (stop.send, ("zenpark estop",)) for stop in stops]
     threads = [threading.Thread(target=act, args=given, daemon=True) for act, given in todo]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
+    for stop in stops:
+        known = {name for other in stops if _same_network(stop, other) for name in other.seen}
+        stop.strangers -= known
+        stop.moving_strangers -= known
     missed = any(stop.missed for stop in stops)
-    seen = any(stop.seen for stop in stops)
+    seen = any(stop.seen or stop.strangers or stop.answered for stop in stops)
     if as_json:
         print_json({"ok": seen and not missed, "routers": [_as_json(stop, dry_run=dry_run) for stop in stops]})
         return int(missed or not seen)
@@ -325,37 +331,57 @@ def stop_all(stops: Sequence[EmergencyStop], *, dry_run: bool, as_json: bool) ->
             _print_stop(stop, dry_run=dry_run)
         return int(missed)
     failures = [stop.failure for stop in stops if stop.failure is not None]
-    if len(failures) == len(stops):
-        raise failures[-1]
     where = "; ".join(f"in the realm '{stop.realm}', {stop.where}" for stop in stops if stop.failure is None)
+    nobody = f"no robot is seen {where}" if where else str(failures[-1])
     print(
-        f"{'no robot' if dry_run else 'NOTHING WAS STOPPED: no robot'} is seen {where}. Name the router of the run: "
-        "--connect, which `./zenpark run` prints when it starts, or --connect @FOLDER/network.txt of its folder",
+        f"{'' if dry_run else 'NOTHING WAS STOPPED: '}{nobody}; {run_registry.look().words}. Name the router of the "
+        "run: --connect, which `./zenpark run` prints when it starts, or --connect @FOLDER/network.txt of its folder",
         file=sys.stderr,
     )
-    return 1
+    return 2 if len(failures) == len(stops) else 1
+
+
+def _same_network(one: EmergencyStop, other: EmergencyStop) -> bool:
+    from agents.network import endpoints as topology
+
+    places = topology.bare(one.endpoints)
+    return one is not other and one.realm == other.realm and not set(places).isdisjoint(topology.bare(other.endpoints))
 
 
 def _as_json(stop: EmergencyStop, *, dry_run: bool) -> Mapping[str, object]:
     failure = None if stop.failure is None else str(stop.failure)
+    seen, moving = stop.seen | stop.strangers, stop.moving | stop.moving_strangers
     if dry_run:
-        found = {"would_be_stopped": sorted(stop.seen)}
+        found = {"would_be_stopped": sorted(seen)}
     else:
-        found = {"stopped": sorted(stop.seen - stop.moving), "not_known_to_have_stopped": sorted(stop.moving)}
-    return {"where": stop.where, **found, "failure": failure, "run_asked_to_end": stop.run_ended}
+        found = {"stopped": sorted(seen - moving), "not_known_to_have_stopped": sorted(moving)}
+    return {"where": stop.where, **found, "failure": failure, "run_asked_to_end": stop.run_ended or stop.answered}
 
 
 def _print_stop(stop: EmergencyStop, *, dry_run: bool) -> None:
     """Print the result of one stop, with title, folder and routers of its run where they are known."""
+    from agents.network import endpoints as topology
+
+    _print_robots(stop.seen, stop.moving, stop.where, dry_run=dry_run)
+    at = f"at {topology.describe(stop.endpoints)}"
+    _print_robots(stop.strangers, stop.moving_strangers, f"{at}, of no run here", dry_run=dry_run)
     why = "no robot is there" if stop.failure is None else str(stop.failure)
-    if stop.moving:
-        of_all = f"{len(stop.moving)} of {len(stop.seen)} robots; {stop.where}"
-        say(f"NOT known to have stopped: {listed(stop.moving, MOST_NAMES)} ({of_all})", to=sys.stderr)
-    if stopped := stop.seen - stop.moving:
-        say(f"{'would be stopped' if dry_run else 'stopped'}: {listed(stopped, MOST_NAMES)} ({stop.where})")
+    if stop.answered and not stop.seen:
+        say(f"ended, without a robot that was up: {stop.where}")
     elif stop.missed and not stop.seen:
         done = "no robot would be stopped" if dry_run else "NOT known to have stopped"
-        ended = "; its process was asked to end" if stop.run_ended else ""
-        say(f"{done}: {stop.where}: {why}{ended}", to=sys.stderr)
+        say(f"{done}: {stop.where}: {why}", to=sys.stderr)
     elif not stop.seen and stop.run is None:
         say(f"also tried, {stop.where}: {why}", to=sys.stderr)
+    elif stop.failure is not None:
+        say(f"its routers were not reached: {why}", to=sys.stderr)
+    if stop.run_ended:
+        say(f"its process was asked to end: {stop.where}", to=sys.stderr)
+
+
+def _print_robots(seen: set[str], moving: set[str], where: str, *, dry_run: bool) -> None:
+    if moving:
+        of_all = f"{len(moving)} of {len(seen)} robots; {where}"
+        say(f"NOT known to have stopped: {listed(moving, MOST_NAMES)} ({of_all})", to=sys.stderr)
+    if stopped := seen - moving:
+        say(f"{'would be stopped' if dry_run else 'stopped'}: {listed(stopped, MOST_NAMES)} ({where})")

@@ -290,7 +290,8 @@ class CaseProcesses:
             case = case_document(plan)
             self._abroad[f"{station.name}/{group}"] = station.start(self._process(names[0]), names, case)
         else:
-            self._context.start(group, "experiments.real_time.processes.robot", str(file), *names)
+            process = self._context.start(group, "experiments.real_time.processes.robot", str(file), *names)
+            process.robots = tuple(names)
 
     def robot(self, name: str) -> RobotTable:
         """The robot of a name now: it may be another one, at an address that the file does not know."""

@@ -165,8 +165,9 @@ def _run_setup(
         folder=folder, realm=network.realm, identity=options.identity, robots=hardware(embodied.values()),
     )  # fmt: skip
     with ExitStack() as up:
-        unlisted = up.enter_context(run_registry.registered(me))
+        unlisted = up.enter_context(run_registry.registered(me, user.emergency.obey))
         launcher = up.enter_context(user.launching(folder / "logs"))
+        user.emergency.guard(launcher)
         user.tell([*([unlisted] if unlisted else []), *check_other_runs(me, run_registry.runs(), str(read.path))])
         launcher.preload()
         routers = make_routers(listening, network.routers) if own_router else []

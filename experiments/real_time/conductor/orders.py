@@ -6,6 +6,7 @@ import os
 import signal
 import time
 from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, TypeVar
@@ -17,8 +18,10 @@ from agents.network import messages, pubsub
 from agents.network import session as network
 from agents.network.keys import Keys
 from agents.network.shutdown import closing_cleanly
+from experiments.real_time.hosts import run_registry
 
 if TYPE_CHECKING:
+    from experiments.real_time.hosts.launcher import Launcher
     from experiments.real_time.hosts.run_registry import RegisteredRun
 
 REPLY_S: Final = 1.0
@@ -127,16 +130,20 @@ def alive(session: zenoh.Session, keys: Keys) -> set[str]:
 
 @dataclass
 class EmergencyStop:
-    """An emergency stop at the routers of one run."""
+    """An emergency stop of one run, or at some routers: over the network, and by the process of the run."""
 
     endpoints: Sequence[str]
     realm: str
     identity: str  # identity to show, in a lab
     run: RegisteredRun | None = None  # None: only the routers are known
-    seen: set[str] = field(default_factory=set)  # robots that were alive
+    seen: set[str] = field(default_factory=set)  # robots of the run, or at the routers, that had to stop
     moving: set[str] = field(default_factory=set)  # those of them without a report of their stop
+    # robots at the routers that are none of the run's, and those of them without a report
+    strangers: set[str] = field(default_factory=set)
+    moving_strangers: set[str] = field(default_factory=set)
     failure: Exception | None = None  # why the routers cannot be reached
-    run_ended: bool = False  # whether the process of the run was asked to end, since no robot was there
+    answered: bool = False  # whether the process of the run has taken the stop, which ends the run
+    run_ended: bool = False  # whether it was asked to end, since neither it nor a robot has answered
 
     @property
     def where(self) -> str:
@@ -151,15 +158,22 @@ class EmergencyStop:
     def missed(self) -> bool:
         """Whether robots may go on: some have not reported, or the stop did not reach a run that is up."""
         silent = self.expected or (self.run is not None and self.failure is not None)
-        return bool(self.moving) or (silent and not self.seen)
+        return bool(self.moving or self.moving_strangers) or (silent and not (self.seen or self.answered))
 
     def send(self, reason: str) -> None:
-        """Send the stop until every robot that is alive reports that it has stopped."""
-        try:
-            self._send(reason)
-        except Exception as error:  # noqa: BLE001 - the others are stopped whatever happens to this one
-            self.failure = error
-        if self.run is not None and self.expected and not self.seen:
+        """Send the stop both ways until every robot that is alive reports that it has stopped."""
+        stop = messages.Stop(self.identity, reason)
+        with ThreadPoolExecutor(1) as pool:  # neither way waits for the other
+            asked = None if self.run is None else pool.submit(run_registry.tell, self.run, stop)
+            try:
+                self._send(stop)
+            except Exception as error:  # noqa: BLE001 - the others are stopped whatever happens to this one
+                self.failure = error
+            report = None if asked is None else asked.result()
+        self._set_strangers_apart()
+        unseen = not self.seen
+        self._count_robots_of_run(report)
+        if self.run is not None and self.expected and unseen and not self.answered:
             # between the cases of a mesh no member is there to receive the stop, and the next case would begin
             with suppress(OSError):
                 os.kill(self.run.pid, signal.SIGTERM)
@@ -173,15 +187,37 @@ class EmergencyStop:
                 self.seen = alive(session, Keys(self.realm))
         except Exception as error:  # noqa: BLE001 - as for the stop itself
             self.failure = error
+        self._set_strangers_apart()
 
-    def _send(self, reason: str) -> None:
+    def _set_strangers_apart(self) -> None:
+        """Set robots apart that are none of the run's: another run may have its router's address by now."""
+        if self.run is not None and self.run.what == "run" and self.run.robots:
+            robots = self.run.robots.keys()
+            self.strangers, self.moving_strangers = self.seen - robots, self.moving - robots
+            self.seen, self.moving = self.seen & robots, self.moving & robots
+
+    def _count_robots_of_run(self, report: run_registry.StopReport | None) -> None:
+        """Add what the process of the run has reported; without a router, robots that it did not start count as well.
+
+        Without any answer all robots of a run that is up may go on.
+        """
+        self.answered = report is not None
+        down = self.seen - self.moving
+        if report is not None:
+            self.seen |= {*report.robots}
+            down |= {*report.stopped}
+        if self.run is not None and self.expected and (self.failure is not None or not (self.seen or self.answered)):
+            self.seen |= self.run.robots.keys()
+        self.moving = self.seen - down
+
+    def _send(self, stop: messages.Stop) -> None:
         keys = Keys(self.realm)
         # a robot that does not answer must not delay the others' stop
         opened = network.open_session(self.endpoints, name="estop", wait_s=2.0, identity=self.identity, gather_s=0.0)
         with closing_cleanly(opened) as (session, declared):
-            stop = messages.encode(messages.Stop(self.identity, reason))
+            payload = messages.encode(stop)
             urgent = stop_publisher(session, keys)
-            urgent.put(stop)
+            urgent.put(payload)
             statuses = pubsub.pose_subscriber(session, keys.status("*"), 4096)
             inbox = pubsub.Inbox(statuses, messages.Status, keys=keys)
             declared += [urgent, statuses]
@@ -190,7 +226,7 @@ class EmergencyStop:
             begun = time.monotonic()  # after the question who is there, which may take as long
             watch = pubsub.AliveWatch(session, keys.alive("*"))
             while (self.moving or self._awaited(session, begun)) and time.monotonic() < begun + STOP_ANSWER_S:
-                urgent.put(stop)
+                urgent.put(payload)
                 time.sleep(STOP_AGAIN_S)
                 for token, there in watch.changes():
                     robot = keys.whose(token)
@@ -212,6 +248,7 @@ class Emergency:
 
     def __init__(self) -> None:
         self.stop: messages.Stop | None = None  # the first one received
+        self.launcher: Launcher | None = None  # of the run's processes, while there is one
 
     def __bool__(self) -> bool:
         return self.stop is not None
@@ -223,11 +260,29 @@ class Emergency:
 
     def listen(self, session: zenoh.Session, keys: Keys) -> pubsub.ImmediateSubscriber:
         """Receive stops in a realm until the subscriber is closed."""
+        return pubsub.ImmediateSubscriber(session, keys.estop, self.receive)
 
-        def receive(stop: messages.Stop) -> None:
-            self.stop = self.stop or stop
+    def guard(self, launcher: Launcher) -> None:
+        """Pass stops on to the processes of a launcher from now on, with one that was received before."""
+        self.launcher = launcher
+        if self.stop is not None:
+            launcher.stop(self.stop)
 
-        return pubsub.ImmediateSubscriber(session, keys.estop, receive)
+    def receive(self, stop: messages.Stop) -> None:
+        """End the run, and pass the stop on to its processes by their lifelines: a router may keep it from robots."""
+        self.stop = self.stop or stop
+        if self.launcher is not None:
+            self.launcher.stop(stop)
+
+    def obey(self, stop: messages.Stop) -> run_registry.StopReport:
+        """Receive a stop that needed no router; returns when all robots have stopped, or their time is over."""
+        deadline = time.monotonic() + STOP_ANSWER_S
+        self.receive(stop)
+        while True:
+            robots = {} if self.launcher is None else self.launcher.stopped()
+            if all(robots.values()) or time.monotonic() > deadline:
+                return run_registry.StopReport(sorted(robots), sorted(name for name, down in robots.items() if down))
+            time.sleep(STOP_AGAIN_S)
 
     @contextmanager
     def throughout(self, endpoints: Sequence[str], keys: Keys, identity: str, wait_s: float) -> Iterator[None]:

@@ -223,6 +223,7 @@ class Station:
         correction = f"{-self.applied:.6f}"
         words = self.command("agent", "-", *robots, *connect, f"--clock-correction={correction}", "--lifeline")
         process = self._launcher.spawn(name, ssh.command(self.address, words), first_input=document + b"\n")
+        process.robots = tuple(robots)
         self._starting.append(process)
         self._robots.append(process)
         return process

@@ -4,7 +4,8 @@ A process on another machine is an `ssh` here, which hands input, output and exi
 (`experiments.real_time.hosts.hosts`).
 
 Each process holds its standard input as a lifeline (`agents.runtime.lifeline`): the launcher writes a byte to it now
-and then, and closing it is the order to end. A killed launcher closes it too.
+and then, and closing it is the order to end. A killed launcher closes it too. An emergency stop is written there as
+well, also to robots on other machines.
 """
 
 from __future__ import annotations
@@ -26,8 +27,9 @@ from typing import IO, Final, Self
 
 from agents.clock import Clock
 from agents.errors import ExplainedError
+from agents.network import messages
 from agents.network.endpoints import from_here
-from agents.runtime.lifeline import BEAT_S, SILENCE_S
+from agents.runtime.lifeline import BEAT_S, SILENCE_S, stop_line
 from experiments.real_time.processes import zygote
 from experiments.real_time.processes.zygote import Forked, NoZygote
 
@@ -37,6 +39,7 @@ LAND_S: Final = 15.0  # for robots to come down after their lifeline was cut
 LINGER_S: Final = 15.0  # the router outlives a killed conductor, so that the landing is recorded
 READY_S: Final = 15.0  # limit for a process to say that it is ready
 POLL_S: Final = 0.02
+STOP_PATIENCE_S: Final = 0.1  # for the lock of the list of processes
 TAIL: Final = 12  # lines of a dead process's output that are worth showing
 
 Handle = subprocess.Popen[bytes] | Forked
@@ -53,6 +56,7 @@ class Process:
     begins: int  # [bytes] where its own output begins there
     shown: int  # [bytes] end of what `news` has returned
     unsent: bytearray = field(default_factory=bytearray)  # input that its pipe has not taken yet
+    robots: Sequence[str] = ()  # that it drives
 
     @property
     def alive(self) -> bool:
@@ -81,6 +85,12 @@ class Process:
             return []
         self.shown += len(lines) + len(ended)
         return lines.decode(errors="replace").splitlines()
+
+    def says(self, robot: str, phase: str) -> bool:
+        """Whether its output reports this phase of a robot."""
+        with contextlib.suppress(OSError):
+            return re.search(rf"^{robot}: {phase}\b", self.output, re.MULTILINE) is not None
+        return False
 
     def tail(self) -> str:
         try:
@@ -142,6 +152,7 @@ class Launcher:
         self._lock = threading.Lock()
         self._over = threading.Event()
         self._silence_at, self._beat_at = -inf, time.monotonic()
+        self._line = b"\n"  # of each heartbeat
         self._beat = threading.Thread(target=self._beats, name="heartbeat", daemon=True)
 
     def __enter__(self) -> Self:
@@ -232,6 +243,27 @@ class Launcher:
                 process.unsent += line
                 process.write()
 
+    def stop(self, stop: messages.Stop) -> None:
+        """Write an emergency stop to all processes at once, and instead of each heartbeat from now on.
+
+        So it is read by processes that start later, too. Those that are no robots skip it.
+        """
+        self._line = stop_line(stop)
+        patient = self._lock.acquire(timeout=STOP_PATIENCE_S)  # its holder may wait for a frozen zygote
+        try:
+            for process in list(self._processes.values()):
+                if process.handle.stdout is None:  # else it expects questions
+                    process.unsent += self._line
+                    process.write()
+        finally:
+            if patient:
+                self._lock.release()
+
+    def stopped(self) -> dict[str, bool]:
+        """Robots with a running process, and whether its output says that they are down with motors off."""
+        running = [process for process in list(self._processes.values()) if process.robots and process.alive]
+        return {robot: process.says(robot, "done") for process in running for robot in process.robots}
+
     def get(self, name: str) -> Process:
         return self._processes[name]
 
@@ -302,7 +334,8 @@ class Launcher:
             self._silence_at, self._beat_at = self.last_silence, time.monotonic()
             with self._lock:
                 for process in self._processes.values():
-                    process.unsent += b"" if process.unsent else b"\n"
+                    line = self._line if process.handle.stdout is None else b"\n"
+                    process.unsent += b"" if process.unsent else line
                     process.write()
 
 

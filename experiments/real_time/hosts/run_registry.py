@@ -9,10 +9,11 @@ from __future__ import annotations
 import os
 import socket
 import stat
+import sys
 import threading
 import time
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Final, Literal, NamedTuple
 
@@ -20,12 +21,15 @@ import msgspec
 
 from agents.clock import Clock
 from agents.network import endpoints as topology
-from agents.network import lab
+from agents.network import lab, messages
 from agents.network.endpoints import UNIX, Endpoint
 from agents.user_folder import readable_folders, runtime_folders
 
 MAX_ENTRY_BYTES: Final = 1 << 20  # [bytes] of a file
 KNOCK_S: Final = 0.3  # longest time of a local router to accept a connection
+TELL_S: Final = 3.0  # limit for a run to answer a stop: it waits for its robots meanwhile
+TURN_S: Final = 0.5  # between two looks whether a run has ended
+SOCKET: Final = ".stop"  # suffix of the socket of a run, beside its file
 
 
 class RegisteredRun(msgspec.Struct, frozen=True):
@@ -41,7 +45,9 @@ class RegisteredRun(msgspec.Struct, frozen=True):
     realm: str = "park"  # first chunk of the keys
     identity: str = "operator"  # name in the certificate that may stop it, in a lab
     robots: dict[str, str] = {}  # name and address of hardware of each robot; the address is empty for a twin
-    user: int = -1  # to whom its file belongs; set by who reads it
+    # set by who reads its file, whatever it says: the user to whom the file belongs, and the socket beside it, if any
+    user: int = -1
+    socket: str = ""
 
     @property
     def alive(self) -> bool:
@@ -100,26 +106,106 @@ def own_entry(
     )  # fmt: skip
 
 
+class StopReport(msgspec.Struct, frozen=True):
+    """Answer of a run to an emergency stop that needed no router."""
+
+    robots: list[str]  # that have a running process
+    stopped: list[str]  # those of them that have reported motors off
+
+
+Obey = Callable[[messages.Stop], StopReport]
+
+
 @contextmanager
-def registered(run: RegisteredRun) -> Iterator[str]:
-    """Inside, a run is registered; yields the reason if that failed, else an empty text."""
+def registered(run: RegisteredRun, obey: Obey | None = None) -> Iterator[str]:
+    """Inside, a run is registered; yields the reason if that failed, else an empty text.
+
+    Emergency stops of this machine are given to `obey`, each in a thread of its own, at a socket beside the file.
+    """
     files: list[Path] = []
     why = ""
-    try:
-        for folder in runtime_folders():
+    with ExitStack() as listening:
+        try:
+            folders = runtime_folders()
+        except OSError as error:
+            folders, why = [], str(error)
+        for folder in folders:
             file = folder / f"{run.pid}-{run.born or 'x'}-{time.monotonic_ns()}.json"
-            files.append(file)
             draft = file.with_suffix(".draft")
-            draft.write_bytes(msgspec.json.encode(run))
-            draft.replace(file)
-    except OSError as error:
-        why = f"not listed among the runs of this machine ({error}): stop it with --connect"
-    try:
-        yield why
-    finally:
-        for file in files:
-            with suppress(OSError):
-                file.unlink()
+            try:
+                draft.write_bytes(msgspec.json.encode(run))
+                if obey is not None:
+                    listening.enter_context(_listening(file.with_suffix(SOCKET), obey))
+                draft.replace(file)
+                files.append(file)
+            except OSError as error:
+                why = why or str(error)
+        if files:
+            why = ""
+        elif why:
+            why = f"not listed among the runs of this machine ({why}): stop it with --connect"
+        try:
+            yield why
+        finally:
+            for file in files:
+                with suppress(OSError):
+                    file.unlink()
+
+
+@contextmanager
+def _listening(path: Path, obey: Obey) -> Iterator[None]:
+    """Inside, emergency stops are taken at a socket; without one, where its path is too long, say, routers are left."""
+    over = threading.Event()
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
+        try:
+            listener.bind(str(path))
+        except OSError as error:
+            print(f"zenpark: emergency stops need a router: {path}: {error}", file=sys.stderr)
+            yield
+            return
+        listener.listen()
+        listener.settimeout(TURN_S)
+        thread = threading.Thread(target=_take_stops, args=(listener, obey, over), name="stops", daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            over.set()
+            with suppress(OSError):  # wakes the thread at once, on Linux
+                listener.shutdown(socket.SHUT_RDWR)
+            thread.join()
+            path.unlink(missing_ok=True)
+
+
+def _take_stops(listener: socket.socket, obey: Obey, over: threading.Event) -> None:
+    while not over.is_set():
+        try:
+            asker, _ = listener.accept()
+        except TimeoutError:
+            continue
+        except OSError:
+            over.wait(TURN_S)  # closed, or without a free descriptor
+            continue
+        threading.Thread(target=_answer, args=(asker, obey), name="a stop", daemon=True).start()
+
+
+def _answer(asker: socket.socket, obey: Obey) -> None:
+    with asker, suppress(OSError):  # who asked is gone
+        asker.settimeout(TELL_S)
+        if text := asker.makefile("rb").readline(messages.MAX_PAYLOAD):
+            asker.sendall(msgspec.json.encode(obey(messages.read_stop(text, messages.JSON))))
+
+
+def tell(run: RegisteredRun, stop: messages.Stop) -> StopReport | None:
+    """Give an emergency stop to the process of a run; None without an answer."""
+    if not run.socket:
+        return None
+    with suppress(OSError, msgspec.MsgspecError), socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as asking:
+        asking.settimeout(TELL_S)
+        asking.connect(run.socket)
+        asking.sendall(messages.encode(stop) + b"\n")
+        return msgspec.json.decode(asking.makefile("rb").read(MAX_ENTRY_BYTES), type=StopReport)
+    return None
 
 
 class Listing(NamedTuple):
@@ -154,10 +240,12 @@ def look() -> Listing:
     for file, endpoints in dead.items():
         if silent.issuperset(endpoints):
             del found[file]
-            with suppress(OSError):
-                file.unlink()
-    up = {(run.user, run.pid, run.born, run.since, *run.endpoints): run for run in found.values()}  # each once
-    return Listing(sorted(up.values(), key=lambda run: run.since), folders, list(map(str, trouble)))
+            for each in (file, file.with_suffix(SOCKET)):
+                with suppress(OSError):
+                    each.unlink()
+    # each once, by a file that has a socket if there is one
+    same = {(run.user, run.pid, run.born, run.since): run for run in sorted(found.values(), key=lambda run: run.socket)}
+    return Listing(sorted(same.values(), key=lambda run: run.since), folders, list(map(str, trouble)))
 
 
 def _silent(endpoints: Iterable[str]) -> set[str]:
@@ -189,8 +277,17 @@ def _read(file: Path) -> RegisteredRun | None:
         lab.lab_of(run.endpoints)
     except (OSError, ValueError, msgspec.MsgspecError, RecursionError):
         return None
-    run = msgspec.structs.replace(run, user=user)  # whatever the file says
+    run = msgspec.structs.replace(run, user=user, socket=_socket_of(file, user))
     return run if run.pid > 0 and run.endpoints and run.realm else None
+
+
+def _socket_of(file: Path, user: int) -> str:
+    """Path of the socket beside a run's file, if it is one of the same user."""
+    path = file.with_suffix(SOCKET)
+    with suppress(OSError):
+        about = path.lstat()
+        return str(path) if stat.S_ISSOCK(about.st_mode) and about.st_uid == user else ""
+    return ""
 
 
 def _answers(endpoint: str) -> bool:

@@ -10,8 +10,9 @@ import pytest
 
 from agents.network.endpoints import DEFAULT_ENDPOINT, free_endpoint
 from agents.network.lab import LabError
+from agents.network.messages import MAX_WORDS, UNKNOWN, Stop
 from agents.runtime.command_line import NetworkLaunch, Output, interrupts, on_termination, parse
-from agents.runtime.lifeline import Lifeline
+from agents.runtime.lifeline import LONGEST, Lifeline, stop_in, stop_line
 from tests.commands import started
 
 
@@ -126,6 +127,28 @@ def test_whole_lines_pass_without_heartbeats(lifeline_end):
     lines = []
     lifeline_end(b"\n\nclock -0.", b"2001\n", b"\n\nclock 1\nx", b"x" * 10_000, on_line=lines.append)
     assert lines == [b"clock -0.2001", b"clock 1"]
+
+
+def test_lifeline_outlives_a_line_that_fails(lifeline_end, capsys):
+    lines = []
+
+    def fails(line):
+        lines.append(line)
+        raise OSError("no radio")
+
+    assert lifeline_end(b"a\nb\n", on_line=fails) == "the starter is gone"
+    assert lines == [b"a", b"b"]
+    assert "lifeline: OSError: no radio" in capsys.readouterr().err
+
+
+def test_stop_passes_the_lifeline_as_a_line():
+    stop = Stop("a\nb", "x" * 10_000)
+    line = stop_line(stop)
+    assert (line.count(b"\n"), line[-1:]) == (1, b"\n")
+    assert len(line) < LONGEST
+    assert stop_in(line[:-1]) == Stop("a b", "x" * MAX_WORDS)
+    assert stop_in(b"stop {") == Stop(UNKNOWN, "{"), "a stop, whatever follows"
+    assert stop_in(b"clock 1") is None
 
 
 @pytest.mark.mechanism("lifeline: the router ends with its starter")

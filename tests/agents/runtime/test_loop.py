@@ -19,6 +19,7 @@ from agents.plugins.law import Control, Law, Said
 from agents.plugins.registry import PluginError
 from agents.plugins.triggers import Trigger
 from agents.robot import Robot
+from agents.runtime.lifeline import stop_line
 from agents.runtime.loop import Runtime
 from agents.runtime.orders import carry_out
 from experiments.definition.experiment import Formation, LegTable, RobotTable
@@ -123,15 +124,42 @@ def test_stop_during_command_has_last_word(during, on_stage):
     assert not stage.body.read(stage.runtime.ticks.t + 0.01)[0].flying
 
 
-def test_stop_while_body_opens_keeps_it_down(on_stage, net):
+def test_stop_on_the_lifeline_needs_no_router(on_stage, monkeypatch):
+    stage, stops = on_stage(DRONE), []
+    line = stop_line(messages.Stop("operator", "without a router")).strip()
+
+    def stop():
+        if not stops and stage.robot.lifecycle.phase == Phase.AIRBORNE:
+            stops.append(stage.clock.now)
+            stage.runtime.follow_line(line)
+            assert stage.orders[-1] == (stage.clock.now, "stop"), "at once, in the thread of the lifeline"
+
+    def visit(phase):
+        if phase == Phase.READY:
+            monkeypatch.setattr(network, "connected", lambda _session: False)
+            stage.in_between = stop
+            stage.robot.lifecycle.takeoff()
+        return phase == Phase.DONE
+
+    stage.run(visit)
+    assert len(stops) == 1
+    assert not stage.body.read(stage.runtime.ticks.t + 0.01)[0].flying
+    assert stage.robot.lifecycle.reason == "emergency stop by operator: without a router"
+
+
+@pytest.mark.parametrize("way", ["network", "lifeline"])
+def test_stop_while_body_opens_keeps_it_down(way, on_stage, net):
     stage = on_stage(DRONE)
 
     def visit(phase):
         assert stage.robot.lifecycle.takeoff() != ""
         return phase == Phase.DONE
 
+    if way == "lifeline":  # before the network is joined
+        stage.runtime.follow_line(stop_line(messages.Stop("operator", "early")).strip())
     stage.runtime.subscribe_to_stops(net.session)
-    stage.runtime.estop.receive(STOP)
+    if way == "network":
+        stage.runtime.estop.receive(STOP)
     assert stage.orders == [], "a closed body is left alone"
     stage.body.open()
     stage.runtime.join(net.session)

@@ -5,6 +5,7 @@ import re
 import signal
 import socket
 import subprocess
+import sys
 import threading
 import time
 from contextlib import ExitStack, nullcontext
@@ -36,7 +37,7 @@ from experiments.real_time.conductor.run_view import NetworkView, Progress, Robo
 from experiments.real_time.hosts import run_registry
 from experiments.real_time.hosts.hosts import Hosts
 from experiments.real_time.hosts.launcher import LAND_S, ROUTER, Launcher, RouterEnded
-from experiments.real_time.hosts.run_registry import RegisteredRun, born
+from experiments.real_time.hosts.run_registry import RegisteredRun, StopReport, born
 from experiments.recording.playback import read
 from tests.experiments import recordings as rec
 from tests.experiments.recordings import START, status
@@ -308,6 +309,73 @@ def test_stop_without_robots_ends_the_run():
         assert process.wait(10.0) == -signal.SIGTERM
         again.send("a test")
         assert not again.run_ended
+
+
+@pytest.fixture
+def stopped(monkeypatch):
+    """A stop of a run with the robots A and B: what its process answers, and which robots are seen at its router."""
+
+    def send(report, seen, *, moving=()):
+        run = changed(run_registry.own_entry("run", "two", ["tcp/127.0.0.1:1"]), robots={"A": "", "B": ""})
+        stop = orders.EmergencyStop(run.endpoints, run.realm, run.identity, run)
+
+        def by_network(_stop):
+            if isinstance(seen, Exception):
+                raise seen
+            stop.seen, stop.moving = set(seen), set(moving)
+
+        monkeypatch.setattr(run_registry, "tell", lambda *_: report)
+        monkeypatch.setattr(stop, "_send", by_network)
+        monkeypatch.setattr(orders.os, "kill", lambda *_: None)
+        stop.send("a test")
+        return stop
+
+    return send
+
+
+DEAF = Unreachable("no router answers")
+
+
+@pytest.mark.parametrize(
+    ("report", "seen", "result"),  # of the process of the run; at its router; down, moving, strangers
+    [
+        (StopReport(["A", "B"], ["A", "B"]), "AB", ("AB", "", "")),
+        (StopReport(["A", "B"], ["A", "B"]), DEAF, ("AB", "", "")),
+        (StopReport(["A"], ["A"]), DEAF, ("A", "B", "")),  # B may be there, started by others
+        (StopReport(["A", "B"], ["A"]), "CD", ("A", "B", "CD")),  # another run has its router's address
+        (None, "CD", ("", "AB", "CD")),  # likewise, and its process stands still
+        (None, "AB", ("AB", "", "")),
+        (None, DEAF, ("", "AB", "")),
+        (StopReport([], []), "", ("", "", "")),  # between two cases
+    ],
+)
+def test_stopped_are_robots_of_that_run(report, seen, result, stopped):
+    stop = stopped(report, seen)
+    assert (stop.seen - stop.moving, stop.moving, stop.strangers) == tuple(map(set, result))
+    assert stop.missed == bool(result[1])
+
+
+def test_late_report_is_made_up_by_run(stopped):
+    stop = stopped(StopReport(["A", "B"], ["A"]), "AB", moving="AB")
+    assert (stop.seen, stop.moving, stop.missed) == ({"A", "B"}, {"B"}, True)
+
+
+def test_launcher_passes_stops_on_by_lifelines(tmp_path):
+    emergency = Emergency()
+    echo = "import sys\nfor line in sys.stdin:\n    if line.strip(): print('A: done', line, flush=True)"
+    with Launcher(tmp_path / "logs") as launcher:
+        emergency.guard(launcher)
+        robot, station = (launcher.spawn(name, [sys.executable, "-c", echo], answers=name == "s") for name in "As")
+        robot.robots = ("A", "B")
+        assert launcher.stopped() == {"A": False, "B": False}
+        report = emergency.obey(messages.Stop("operator", "a test"))
+        assert report == StopReport(["A", "B"], ["A"])
+        later = launcher.spawn("later", [sys.executable, "-c", echo])
+        until(lambda: "stop" in later.output, "a process that starts later gets it too")
+        launcher.end(["A", "later"], grace_s=5.0)
+        station.close()
+        assert station.handle.stdout.read() == b"", "a station gets questions only"
+    assert emergency.words == "emergency stop by operator: a test"
 
 
 class View(NetworkView):

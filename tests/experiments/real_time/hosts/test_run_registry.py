@@ -16,8 +16,9 @@ import pytest
 from agents.body.device_locks import Claims
 from agents.body.interface import BodyError
 from agents.network.endpoints import free_endpoint
+from agents.network.messages import Stop
 from experiments.real_time.hosts import run_registry
-from experiments.real_time.hosts.run_registry import born, own_entry, registered, runs
+from experiments.real_time.hosts.run_registry import StopReport, born, own_entry, registered, runs, tell
 from tests.small import changed
 
 pytestmark = pytest.mark.usefixtures("runtime_folder")
@@ -94,6 +95,37 @@ def test_silent_names_delay_no_emergency_stop(monkeypatch):
         assert run in runs()
         assert time.monotonic() - began < 5.0
     resolved.set()
+
+
+def test_stop_reaches_a_run_without_routers(runtime_folder):
+    stops, report = [], StopReport(["A", "B"], ["B"])
+
+    def obey(stop):
+        stops.append(stop)
+        return report
+
+    with registered(entry(), obey) as why:
+        assert why == ""
+        (run,) = runs()
+        for _ in range(3):
+            assert tell(run, Stop("operator", "a test")) == report
+        with socket.socket(socket.AF_UNIX) as curious:
+            curious.connect(run.socket)  # says nothing
+        assert tell(run, Stop("operator", "again")) == report
+    assert stops == [Stop("operator", "a test")] * 3 + [Stop("operator", "again")]
+    assert list(runtime_folder.iterdir()) == []
+    assert tell(run, Stop("operator", "late")) is None
+
+
+def test_frozen_run_delays_a_stop_no_longer(monkeypatch, runtime_folder):
+    monkeypatch.setattr(run_registry, "TELL_S", 0.05)
+    with registered(entry()), socket.socket(socket.AF_UNIX) as frozen:
+        (file,) = runtime_folder.glob("*.json")
+        frozen.bind(str(file.with_suffix(run_registry.SOCKET)))
+        frozen.listen(1)
+        (found,) = runs()
+        assert found.socket
+        assert tell(found, Stop("operator", "a test")) is None
 
 
 def test_folder_writable_by_others_is_refused(runtime_folder):
