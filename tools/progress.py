@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 REFRESH_S: Final = 0.25
 LINE_S: Final = 5.0
 QUIET: Final = ("robot",)  # kinds of events that the table shows better
+ORDERED: Final = ("landing: ordered to ", "done: ordered to stop")  # by an operator,
+LANDING: Final = ("landing", "stopped", "done")  # except in these phases, by the conductor
 
 
 class Lines:
@@ -32,15 +34,18 @@ class Lines:
         return None
 
     def __call__(self, progress: Progress) -> None:
-        """Print what is new."""
+        """Print what is new; what happens to several robots at once on one line."""
+        together: dict[tuple[str, str], list[str]] = {}
         for event in self._news.new_events(progress):
             if event.kind == OUTPUT:
                 say(f"{event.source}| {event.text}", to=sys.stderr)
-            elif event.kind not in QUIET:
+            elif event.kind not in QUIET or (event.text.startswith(ORDERED) and progress.phase not in LANDING):
                 when = ""
                 if event.kind in {"hazard", "lost"} and progress.elapsed is not None:
                     when = f" (at {progress.elapsed - progress.clock.utc() + event.stamp:.1f} s)"
-                say(f"{progress.case}: {event.kind} {event.source}: {event.text}{when}", to=sys.stderr)
+                together.setdefault((event.kind, f"{event.text}{when}"), []).append(event.source)
+        for (kind, text), sources in together.items():
+            say(f"{progress.case}: {kind} {', '.join(dict.fromkeys(sources))}: {text}", to=sys.stderr)
         now = time.monotonic()
         if now >= self._next and progress.elapsed is not None:
             self._next = now + LINE_S

@@ -133,6 +133,24 @@ def test_hazard_is_printed_with_its_beginning(capsys):
     assert phase == "event: phase conductor: formation"
 
 
+def test_orders_to_several_robots_are_one_line(capsys):
+    progress = Progress("event", "formation", 9.0, 15.0, {})
+    names = ("A", "B", "C")
+    for kind, text in (("hazard", "hold: ordered to hold: by an operator"), ("robot", "landing: ordered to land")):
+        progress.events += [messages.Event(progress.clock.utc() - 0.55, kind, name, text) for name in names]
+    for text in ("done: finished", "running: ordered to hold", "done: ordered to land"):
+        progress.events.append(messages.Event(progress.clock.utc(), "robot", "A", text))
+    with Lines() as show:
+        show(progress)
+    hold, land, _ = capsys.readouterr().err.splitlines()
+    assert hold.startswith("event: hazard A, B, C: hold: ordered to hold: by an operator (at 8.")
+    assert land == "event: robot A, B, C: landing: ordered to land"
+    progress.phase = "landing"
+    with Lines() as show:
+        show(progress)
+    assert "ordered to land" not in capsys.readouterr().err
+
+
 REACHING = """
 title = "two"
 duration_s = 5.0
