@@ -74,6 +74,10 @@ def decoded(content: bytes, label: str) -> str:
         message = f"byte 0x{error.object[error.start]:02x} is not UTF-8"
         found = at_offset(label, readable, readable.index("\ufffd"), message, "save the file as UTF-8")
         raise DocumentError([found]) from None
+    if text.lstrip().startswith("<"):
+        raise refusal(
+            label, "is a page, no experiment", "name an experiment file, such as experiment.toml in a run's folder"
+        )
     if not text.strip():
         raise refusal(label, "is empty", BEGIN)
     return text

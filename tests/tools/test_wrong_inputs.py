@@ -57,6 +57,7 @@ COMMANDS = (
     ("check empty.toml", "empty.toml: is empty", "./zenpark new copies an experiment"),
     ("check utf16.toml", "utf16.toml: is binary, no text", "name an experiment file"),
     ("check triangle.toml --plot x.doc", "--plot: x.doc", "must end in .svg, .pdf or .png"),
+    ("check page.html", "page.html: is a page, no experiment", "such as experiment.toml"),
     ("explain disturbance.hover", "'disturbance.hover'", "did you mean 'disturbance.hover_jitter'?"),
     ("new triangle triangle.toml", "triangle.toml: exists already", "choose another name"),
     ("new --grid 5", "--grid 5: ", "such as 5x8"),
@@ -98,6 +99,7 @@ def refuse(tmp_path, monkeypatch, capfd):
     for name in ("triangle.toml", "full/triangle.toml"):
         (tmp_path / name).write_text(TRIANGLE, "utf-8")
     (tmp_path / "empty.toml").touch()
+    (tmp_path / "page.html").write_text("\n<!DOCTYPE html>\n")
     (tmp_path / "utf16.toml").write_text(TRIANGLE, "utf-16")
 
     def call(*words):

@@ -17,7 +17,10 @@ mkdir -p "$folder"
 chmod 700 "$folder"
 rm -rf "$folder/.incoming"
 mkdir "$folder/.incoming"
-tar -xzf - -C "$folder/.incoming"
+if ! errors=$(tar -xzf - -C "$folder/.incoming" 2>&1); then
+    rm -rf "$folder/.incoming"
+    echo "$folder cannot be written: $(echo "$errors" | head -n 1); make room there, or choose another place" >&2; exit 3
+fi
 cd "$folder"
 for each in *.pem *.key; do
     if [ -e "$each" ] && [ ! -e ".incoming/$each" ]; then

@@ -11,7 +11,10 @@ fi
 mkdir -p "$folder"
 rm -rf "$folder/.incoming"
 mkdir "$folder/.incoming"
-tar -xzf - -C "$folder/.incoming"
+if ! errors=$(tar -xzf - -C "$folder/.incoming" 2>&1); then
+    rm -rf "$folder/.incoming"
+    echo "$folder cannot be written: $(echo "$errors" | head -n 1); make room there, or choose another place" >&2; exit 3
+fi
 for each in "$@"; do
     rm -rf "$folder/$each"
     mv "$folder/.incoming/$each" "$folder/$each"

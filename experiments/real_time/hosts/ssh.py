@@ -47,6 +47,8 @@ _TROUBLE: Final = (
     (r"not found|no such file", "there is no zenpark at '{zenpark}'",
      "`./zenpark hosts install FILE` puts it there; or say where it is: zenpark = \"...\""),
 )  # fmt: skip
+# words of ./zenpark, which may repeat those of pip about a network
+_NOT_STARTED: Final = re.compile(r"^zenpark: (cannot prepare .*|zenpark needs .*|\w+ing .* failed:)(?:\n +(.*))?", re.M)
 
 
 def command(address: str, words: Sequence[str], options: Sequence[str] = ()) -> list[str]:
@@ -57,6 +59,9 @@ def command(address: str, words: Sequence[str], options: Sequence[str] = ()) -> 
 
 def explained(address: str, zenpark: str, output: str) -> str:
     """Cause and remedy of a failed ssh, by its output."""
+    if (found := _NOT_STARTED.search(output)) is not None:
+        why = " ".join(filter(None, found.groups()))
+        return f"zenpark does not start there: {why}; mend that, then start it there by hand: {zenpark} --version"
     for pattern, cause, remedy in _TROUBLE:
         if re.search(pattern, output, re.IGNORECASE | re.MULTILINE):
             return f"{cause}; {remedy}".format(address=address, zenpark=zenpark)

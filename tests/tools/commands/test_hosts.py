@@ -5,6 +5,7 @@ import json
 import os
 import shutil
 import stat
+import subprocess
 import sys
 import tarfile
 
@@ -15,7 +16,7 @@ from experiments.file import catalogue
 from experiments.file.problems import DocumentError
 from experiments.real_time.hosts import authority
 from experiments.real_time.hosts.hosts import HostError
-from experiments.real_time.hosts.installation import packed, put, send
+from experiments.real_time.hosts.installation import PUT_CERTIFICATES, PUT_ZENPARK, packed, put, send
 from experiments.recording import playback, version
 from tests.system.lab import ROOT, Flight
 from tools.commands import hosts as tool
@@ -169,6 +170,20 @@ def test_install_leaves_alone_what_is_not_its_own(home, tmp_path, capsys):
         assert message in capsys.readouterr().err
         assert (home / "zenpark" / "zenpark").read_text().startswith("#!/bin/sh")
         (home / "zenpark" / there).rmdir()
+
+
+@pytest.mark.parametrize("script", [PUT_ZENPARK, PUT_CERTIFICATES])
+def test_host_with_a_full_disk_says_one_sentence(tmp_path, monkeypatch, script):
+    full = "#!/bin/sh\nfor each in a b; do echo tar: $each: Cannot write: No space left on device >&2; done; exit 2\n"
+    program(tmp_path / "bin" / "tar", full)
+    monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}:{os.environ['PATH']}")
+    words = ["sh", "-c", script, str(tmp_path / "zp"), "a"]
+    done = subprocess.run(words, stdin=subprocess.DEVNULL, capture_output=True, check=False, text=True)
+    (line,) = done.stderr.splitlines()
+    assert line.startswith(
+        f"{tmp_path / 'zp'} cannot be written: tar: a: Cannot write: No space left on device; make room"
+    )
+    assert not (tmp_path / "zp" / ".incoming").exists()
 
 
 @pytest.fixture

@@ -50,6 +50,8 @@ from tests.waiting import PATIENCE_S, until
         ("/usr/bin/env: 'python3': No such file or directory", "no Python", "apt install python3"),
         ("Usage: zenpark [OPTIONS]\nError: No such command 'station'.", "too old", "hosts install"),
         ("Timeout, server lab1 not responding.", "connection to it broke", "still on"),
+        ("zenpark: preparing .venv\nzenpark: getting the packages failed:\n  No space left on device\n"
+         "Is this machine online? Behind a proxy set HTTPS_PROXY", "No space left", "by hand: zenpark/zenpark -"),
         ("something new\nthat nobody knows", "ssh failed: that nobody knows", "must ask nothing: ssh pi@lab1"),
         ("", "it said nothing", ""),
     ],
