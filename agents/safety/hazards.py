@@ -64,7 +64,7 @@ class Cause(IntEnum):
         cause._value_, cause.rule = len(cls.__members__), rule
         return cause
 
-    ORDERED = Rule("ordered to hold", Outcome.HOLD)
+    ORDERED = Rule("ordered", Outcome.HOLD)
     POSITION = Rule("its own position is lost", Outcome.HOLD, then=Outcome.LAND, place=False, grounded=Outcome.HOLD)
     MARGIN = Rule("it is beyond a wall of the arena", Outcome.WARN)
     OUTSIDE = Rule("it left the arena", Outcome.LAND)

@@ -57,6 +57,11 @@ class WatchedRun:
         """Run and routers, for people."""
         return f"at {', '.join(topology.bare(self.endpoints))}" if self.run is None else self.run.words
 
+    @property
+    def over(self) -> bool:
+        """Whether the run is known to have ended: its process has, on this machine."""
+        return self.run is not None and not self.run.alive
+
 
 def may_act(watched: WatchedRun) -> bool:
     """Whether the page may give orders: with an operator's certificate in a lab, elsewhere unless as an observer."""
@@ -83,7 +88,7 @@ class Acting:
         self._parts: list[Any] = []  # of the present stage
         self._targets: dict[str, Any] = {}  # by leader
         self._held_until = -inf  # [s, monotonic] targets stay where they were dragged
-        self._dragged = False
+        self._dragged = self._ended = False
         self.due: dict[str, tuple[float, Callable[[], object]]] = {}  # orders that wait until a control is at rest
         self._lock = threading.Lock()
         self._number = 0  # of the present stage
@@ -132,9 +137,12 @@ class Acting:
                 slider.on_update(partial(self.slide, parameter))
                 self._parts.append(slider)
 
-    def follow(self, moment: Moment, alive: Sequence[str]) -> None:
-        """Takes in the present state, and gives orders that waited for a control to rest."""
-        self._alive, self._moment = alive, moment
+    def follow(self, moment: Moment, alive: Sequence[str], *, ended: bool = False) -> None:
+        """Takes in the present state, and gives orders that waited for a control to rest.
+
+        `ended`: All robots have reported their end.
+        """
+        self._alive, self._moment, self._ended = alive, moment, ended
         now = time.monotonic()
         if now > self._held_until:
             for name, target in list(self._targets.items()):
@@ -155,6 +163,7 @@ class Acting:
     def emergency_stop(self) -> None:
         """Cuts the motors of all robots of the run, and says which run it was and what answered."""
         watched = self._watched
+        self._server.gate.stops += 1
         stop = messages.encode(messages.Stop(watched.identity, REASON))
         sent = orders.EmergencyStop(watched.endpoints, watched.realm, watched.identity, watched.run)
         sending = threading.Thread(target=sent.send, args=(REASON,), daemon=True)
@@ -165,7 +174,9 @@ class Acting:
         seen, moving = sent.seen | sent.strangers, sent.moving | sent.moving_strangers
         doubtful = ", ".join(sorted(moving)) or ("" if seen else sent.failure)
         said = f"stopped: {', '.join(sorted(seen))}" if seen else f"no robot is seen. {LAST}"
-        if doubtful:
+        if (watched.over and not seen) or (self._ended and sent.failure is not None):
+            said = "the run is over, and no robot of it answers. If one moves, cut its power."
+        elif doubtful:
             said = f"NOT known to have stopped: {doubtful}. {LAST}"
         self._note("Emergency stop", f"{sent.where}: {said}", bad=bool(doubtful) or not seen, stays=True)
         threading.Thread(target=self._record, args=("emergency stop", said), daemon=True).start()
@@ -242,13 +253,18 @@ class Acting:
         self, order: messages.Order, what: str, robots: Sequence[str] | None = None, warning: str = ""
     ) -> None:
         """Gives an order to robots, to all that are there if none is named, and says what they answered."""
-        replies = orders.send_order(self._session, self._keys, robots or sorted(self._alive), order)
+        names = robots or sorted(self._alive)
+        if not names:
+            over = "the run is over" if self._watched.over or self._ended else "no robot is there"
+            self._note(what, f"not ordered: {over}.", bad=True)
+            return
+        replies = orders.send_order(self._session, self._keys, names, order)
         refused = {name: reply.reason for name, reply in replies.items() if not reply.ok}
         done = [name for name in replies if name not in refused]
         said = f"{len(done)} of {len(replies)} robots"
         if refused:
             said += "; " + "; ".join(f"{name}: {reason}" for name, reason in list(refused.items())[:5])
-        self._note(what, f"{said}; {warning}" if warning else said, bad=bool(refused or warning) or not replies)
+        self._note(what, f"{said}; {warning}" if warning else said, bad=bool(refused or warning))
         self._record(what, said)
 
     def _record(self, what: str, said: str) -> None:

@@ -52,6 +52,7 @@ class Gate:
 
     secret: str = field(default_factory=lambda: secrets.token_urlsafe(24), repr=False)
     seen: dict[int, Seen] = field(default_factory=dict)  # by page that is open
+    stops: int = 0  # emergency stops that pages have sent, which a page looks for after its own
     _tickets: set[str] = field(default_factory=set, repr=False)
 
     def ticket(self) -> str:
@@ -76,7 +77,7 @@ class Gate:
             return _text(HTTPStatus.SEE_OTHER, "", Location=f"/{self.secret}/")
         if rest == CLOCK:
             self._note(target.query)
-            return _text(HTTPStatus.OK, f"{time.time():.4f}")
+            return _text(HTTPStatus.OK, f"{time.time():.4f} {self.stops}")
         return _page(inner, connection, request, rest)
 
     def _note(self, query: str) -> None:

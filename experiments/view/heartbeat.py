@@ -7,7 +7,7 @@ from math import inf
 from pathlib import Path
 from typing import Final
 
-CLOCK: Final = "clock"  # path that answers with the time of this machine
+CLOCK: Final = "clock"  # path that answers with the time of this machine and the number of emergency stops
 SCRIPT: Final = b"<script>%s</script>" % Path(__file__).with_name("heartbeat.js").read_bytes()
 STALE_S: Final = 5.0  # a page with an older picture gives no order that sets robots in motion
 RECORDED_S: Final = 60.0  # messages that were never younger than this are of a recording that is played

@@ -161,7 +161,8 @@ class LiveView:
         self._mark = server.gui.add_html("", order=-1.0)
         self._page = Page(server, dark=dark)
         self._trailed: object = None
-        self._stages, self._failure = 0, ""
+        self._stages, self._failure, self._over = 0, "", False
+        self._elapsed: float | None = None  # [s] since the common start; stands still with the last picture
         if acting is not None:
             acting.build(server)
         self._begin()
@@ -214,7 +215,8 @@ class LiveView:
         with self._server.atomic():
             page.drawing.draw(moment, trails=moved, scans=observer.scans)
         if self._acting is not None:
-            self._acting.follow(moment, [name for name, report in observer.robots.items() if report.alive])
+            alive = [name for name, report in observer.robots.items() if report.alive]
+            self._acting.follow(moment, alive, ended=observer.ended)
         page.refresh(now, partial(self._plot, now, moment), partial(self._tabulate, moment))
 
     def _plot(self, now: float, moment: Moment) -> None:
@@ -223,12 +225,15 @@ class LiveView:
         panel.history.add(now, self._errors.of_robots(moment.error), rates)
         panel.show_plots()
         utc, observer = time.time(), self.observer
-        age, over = observer.age.seconds(utc, now), False
+        age = observer.age.seconds(utc, now)
         words = "of a recording" if observer.age.recorded else "" if age is not None else "no pose of a robot yet"
         run, here = self._watched.run, any(report.alive for report in observer.robots.values())
-        if age is not None and (not run.alive if run is not None else connected(self._session) and not here):
-            words, over = f"the run is over; this was its last picture, {age:.0f} s ago", True
-        self._mark.content = heartbeat.mark(self._stages, utc, age, words, over=over)
+        linked = connected(self._session)
+        ended = self._watched.over or (observer.ended if not linked else run is None and not here)
+        self._over = ended and age is not None
+        if self._over:
+            words = f"the run is over, {age:.0f} s ago; robots may have come down or moved since"
+        self._mark.content = heartbeat.mark(self._stages, utc, age, words, over=self._over)
 
     def _tabulate(self, moment: Moment) -> None:
         observer, stage, panel = self.observer, self.observer.stage, self._page.panel
@@ -240,16 +245,17 @@ class LiveView:
             touches = touched(name, moment.overlaps)
             row = robot_row(name, condition, report.status, known(errors[k]), report.rate, delay=delay, touches=touches)
             rows.append(row.measured(moment.measures, k))
-        elapsed = observer.elapsed
-        start = None if elapsed is None else time.time() - elapsed
+        if self._elapsed is None or not (self._over or observer.ended):
+            self._elapsed = observer.elapsed
         phase = observer.phase
         if not connected(self._session):
             phase = "no router answers"
         elif not phase:
             phase = "waiting for robots" if not stage.names else "not started"
+        where = self._watched.words.removeprefix(f"{stage.title}, ")
         duration = stage.plan.experiment.duration_s if stage.plan is not None else 0.0
-        panel.show_head(observer.case, phase, elapsed, duration, self._watched.words)
+        panel.show_head(observer.case, phase, self._elapsed, duration, where)
         net, names = stage.links, stage.names
         ends = zip(net.receiver.tolist(), net.sender.tolist(), strict=True)
         delays = [observer.robots[names[i]].delay.get(names[j]) for i, j in ends]
-        panel.show_tables(rows, moment.error, list(observer.events), start, delays)
+        panel.show_tables(rows, moment.error, list(observer.events), observer.started, delays)

@@ -14,6 +14,7 @@ import numpy as np
 import zenoh
 
 from agents.clock import Clock
+from agents.decision.lifecycle import Phase
 from agents.network import messages, pubsub
 from agents.network.keys import Keys
 from agents.network.session import received
@@ -210,10 +211,21 @@ class Observer:
     # ------------------------------------------------------------------ what is drawn
 
     @property
+    def started(self) -> float | None:
+        """Common start [s, UTC]; None before it is known."""
+        statuses = [report.status for report in self.robots.values() if report.status is not None]
+        return min((status.started for status in statuses if status.started > 0.0), default=None)
+
+    @property
     def elapsed(self) -> float | None:
         """Time since the common start [s]; None before it is known."""
-        started = [r.status.started for r in self.robots.values() if r.status is not None and r.status.started > 0.0]
-        return self.now() - min(started) if started else None
+        return None if (started := self.started) is None else self.now() - started
+
+    @property
+    def ended(self) -> bool:
+        """Whether all robots have reported their end."""
+        statuses = [self.robots[name].status for name in self.stage.names]
+        return bool(statuses) and all(each is not None and each.phase == Phase.DONE.word for each in statuses)
 
     @property
     def phase(self) -> str:

@@ -14,8 +14,8 @@ def good(robot, seq=1):
     now = time.time()
     status = messages.Status(
         robot, now, "running", "", battery=0.5, sent=seq, received=2, lost={"KH01": 1}, dropped={"KH02": 1}, ticks=5,
-        started=now - 1.0, missing=["KH02"], pid=1, hazard="hold: ordered to hold",
-        incidents=[messages.Incident(seq, now, "hold: ordered to hold")],
+        started=now - 1.0, missing=["KH02"], pid=1, hazard="hold: ordered: by an operator",
+        incidents=[messages.Incident(seq, now, "hold: ordered: by an operator")],
     )  # fmt: skip
     state = messages.State(
         robot, seq, now, "running", PLACE, REST, 0.1, PLACE, (0.1, 0.2, 0.0, 0.0), 0.1, PLACE, 0.1,

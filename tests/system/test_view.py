@@ -23,8 +23,8 @@ pytestmark = [pytest.mark.system, needs_chromium]
 class ViewProcess(Started):
     """`./zenpark view`."""
 
-    def __init__(self, *arguments):
-        self.port = int(free_endpoint(preferred_port=0).rpartition(":")[2])
+    def __init__(self, *arguments, port=None):
+        self.port = port or int(free_endpoint(preferred_port=0).rpartition(":")[2])
         super().__init__("tools.guard", "view", *map(str, arguments), "--port", str(self.port))
 
     def address(self):
@@ -96,6 +96,28 @@ def test_page_shows_seven_robots_and_stops_all(router, watcher, tmp_path):
         stopped = "emergency stop by operator"
         watcher.until(lambda: all(watcher.status[name].reason.startswith(stopped) for name in names), "they say so")
         assert page.hosts == {f"127.0.0.1:{view.port}"}
+
+
+def test_cut_off_page_says_stop_not_sent(router):
+    with ViewProcess("--connect", router.endpoint) as view, opened(view.address, 640, 480) as page:
+        stop, alarm = page.button("EMERGENCY STOP"), page.page.get_by_text("EMERGENCY STOP NOT SENT")
+        page.until(stop.count, "the page is there")
+        place = stop.bounding_box()
+        page.page.keyboard.press("Shift+S")
+        page.until(page.page.get_by_text("no robot is seen").count, "answered")
+        assert not alarm.count()
+        view.process.kill()
+        view.process.wait()
+        page.page.keyboard.press("Shift+S")
+        page.until(alarm.count, "the key has an answer")
+        alarm.click()
+        assert not alarm.count()
+        page.page.mouse.click(place["x"] + 0.5 * place["width"], place["y"] + 0.5 * place["height"])
+        page.until(alarm.count, "the button has an answer")
+        page.until(page.page.get_by_text("CUT OFF", exact=False).count, "the page says why")
+        with ViewProcess("--connect", router.endpoint, port=view.port) as other:
+            other.address()
+            page.until(page.page.get_by_text("of a former ./zenpark view").count, "it needs the new address")
 
 
 def test_page_orders_reach_robots_and_become_events(router, watcher, tmp_path):

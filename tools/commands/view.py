@@ -71,12 +71,18 @@ def view(
     """Show a run in the browser, in three dimensions: a live one, or a recording."""
     require_viser()
     from agents.runtime.command_line import on_termination
+    from experiments.recording.reader import RecordingError
 
     ended = threading.Event()
     with on_termination(ended.set):
         up = None if run is None else _running_run(Path(run), wait_s=START_S if with_run else 0.0, ended=ended)
         if run is not None and up is None:
-            return _replay(Path(run), ended, port=port, dark=dark, open_page=open_page)
+            try:
+                return _replay(Path(run), ended, port=port, dark=dark, open_page=open_page)
+            except RecordingError:
+                up = _starting_run(Path(run), ended)
+                if up is None:
+                    raise
         watched = _watched(connect, realm, lab, identity) if up is None else _of_run(up, identity)
         _live(watched, ended, port=port, dark=dark, open_page=open_page, with_run=with_run)
     return 0
@@ -293,6 +299,19 @@ def _running_run(folder: Path, *, wait_s: float, ended: threading.Event) -> Regi
         found = next((run for run in run_registry.runs() if run.folder == here and run.alive), None)
         if found is not None or time.monotonic() >= deadline or ended.wait(POLL_S):
             return found
+
+
+def _starting_run(folder: Path, ended: threading.Event) -> RegisteredRun | None:
+    """The run that begins in a folder, if its experiment file was written just now."""
+    import time
+
+    from experiments.recording.run_folder import SOURCE
+
+    file = folder / SOURCE
+    if not file.is_file() or time.time() - file.stat().st_mtime > START_S:
+        return None
+    print(f"zenpark: {folder}: nothing to show yet; the run may be starting, and is waited for", file=sys.stderr)
+    return _running_run(folder, wait_s=START_S, ended=ended)
 
 
 def _of_run(run: RegisteredRun, identity: str | None) -> WatchedRun:

@@ -1,5 +1,6 @@
 """Gate of the view's page: which requests reach it, and whose orders count."""
 
+import os
 import threading
 import time
 from math import inf
@@ -13,8 +14,10 @@ pytest.importorskip("viser", reason="needs viser")
 from websockets.datastructures import Headers
 from websockets.http11 import Request
 
+from agents.errors import ExplainedError
 from agents.network import messages
 from experiments.file.document import load
+from experiments.real_time.hosts.run_registry import RegisteredRun
 from experiments.scene.stage import SceneModel
 from experiments.view import acting as orders
 from experiments.view import heartbeat
@@ -105,6 +108,7 @@ def operator(monkeypatch):
     made, gate = orders.Acting(None, orders.WatchedRun(["tcp/127.0.0.1:7447"], "park", "operator")), Gate()
     made.build(MagicMock(gate=gate))
     made.set_stage(SceneModel.of_robots(()), 2)
+    made.follow(MagicMock(), ["CF01"])
     return made, gate, given
 
 
@@ -177,6 +181,23 @@ def test_emergency_stop_tells_its_result_without_session(blocked, operator, monk
     stopping.join(2.0)
     free.set()
     assert "stopped: KH01" in page.add_notification.call_args.args[1]
+
+
+@pytest.mark.parametrize("ended", [True, False])
+def test_orders_after_the_end_say_so(ended, operator, monkeypatch):
+    acting, gate, given = operator
+    page, over = MagicMock(), RegisteredRun("run", os.getpid(), "of another process", 0.0, "a run", "", [])
+    acting._watched = orders.WatchedRun(["tcp/127.0.0.1:7447"], "park", "operator", None if ended else over)
+    acting.follow(MagicMock(), [], ended=ended)
+    acting._server.get_clients = lambda: {7: page}
+    acting._urgent = acting._events = SimpleNamespace(put=lambda _: None)
+    gone = ExplainedError("no router answers: is one running, --connect")
+    monkeypatch.setattr(orders.orders.EmergencyStop, "send", lambda self, _: setattr(self, "failure", gone))
+    for order in (acting.emergency_stop, lambda: acting.press(messages.Order("land"), "land", None)):
+        order()
+        said = page.add_notification.call_args.args[1]
+        assert ("the run is over" in said, "--connect" in said) == (True, False)
+    assert (given, gate.stops) == ([], 1)
 
 
 def test_slider_orders_what_is_limited(operator):

@@ -1,6 +1,8 @@
 """A view of a run that goes on, and of a recording: what it shows, what it may do, and its sign of life."""
 
+import os
 import threading
+import time
 from dataclasses import replace
 from itertools import product
 from math import isfinite
@@ -17,6 +19,7 @@ from agents.network.endpoints import free_endpoint
 from agents.network.keys import Keys
 from experiments.file import document
 from experiments.file.document import load
+from experiments.real_time.hosts.run_registry import RegisteredRun
 from experiments.recording.reader import RecordingError
 from experiments.run import simulate, simulate_seeds
 from experiments.scene import models, tracks
@@ -25,7 +28,7 @@ from experiments.view import live
 from experiments.view.acting import WatchedRun, may_act
 from experiments.view.broadcast import Broadcast
 from experiments.view.heartbeat import SLOWEST_S, DataAge, frame_s, mark
-from experiments.view.observer import Observer
+from experiments.view.observer import Observer, RobotReport
 from experiments.view.panel import History, RobotRow, css, event_list, link_table, robot_row, table
 from experiments.view.replay import Film, ReplayClock, marks
 from tests.cases import mostly_slow
@@ -207,6 +210,24 @@ def test_contact_is_seen_while_it_happens(observed):
     assert touching == ["KH01", "KH02"]
     row = robot_row("KH02", Condition.TOUCHING, None, 0.0, 0.0, touches=touched("KH02", moment.overlaps))
     assert f"color:{css(BAD)};padding-left:1.2em'>touches KH01, 9.0 cm deep" in table([row], observer.stage)
+
+
+def test_clock_stands_still_in_last_picture(monkeypatch):
+    over = RegisteredRun("run", os.getpid(), "of another process", 0.0, "a run", "", [])
+    server, times, status = MagicMock(), [], messages.Status("A", 100.0, "running", "", started=95.0)
+    with Net().worn() as net:
+        page = live.LiveView(server, net.session, WatchedRun((), "park", "observer"), dark=False, acting=None)
+        monkeypatch.setattr(live, "connected", lambda _: True)
+        monkeypatch.setattr(page._page.panel, "show_head", lambda _case, _phase, elapsed, *_: times.append(elapsed))
+        observer, now = page.observer, time.monotonic()
+        observer.robots["A"] = RobotReport(status=status, heard_at=now, alive=True)
+        observer.age.add(now, now, now)
+        for late in (0.0, 5.0, 10.0):
+            monkeypatch.setattr(live.time, "monotonic", lambda late=late: now + late)
+            page._plot(now + late, observer.moment())
+            page._tabulate(observer.moment())
+            page._watched = WatchedRun((), "park", "observer", over)
+    assert times == [5.0, 5.0, 5.0]
 
 
 def test_contacts_of_a_world_are_its_own(observed):
