@@ -76,10 +76,13 @@ class Channel:
         self.waiting.append(sample)
         self.obey(sample)
 
-    def undeclare(self) -> None:
+    def undeclare(self, *_: object) -> None:
         self.waiting.clear()
 
-    close = undeclare
+    def __enter__(self) -> Self:
+        return self
+
+    close = __exit__ = undeclare
 
 
 class _Closing:

@@ -9,6 +9,7 @@ import re
 import sys
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import partial, wraps
 from typing import TYPE_CHECKING, Annotated, Any, Final, TypeVar, get_type_hints
 
@@ -16,6 +17,7 @@ import typer
 from typer import Argument, Option
 from typer.core import TyperCommand, TyperGroup
 
+from agents.errors import ExplainedError
 from tools import completion
 from tools.terminal import say
 
@@ -230,20 +232,57 @@ def routers(connect: list[str] | None, lab: str | None) -> list[str]:
     return secured(read_endpoints(connect or []), lab)
 
 
+@dataclass(frozen=True)
+class Place:
+    """Routers at which a command looks or acts."""
+
+    endpoints: list[str]
+    realm: str = "park"
+    strange: bool = False  # True if no run or router of this user is known there
+
+
+def place(connect: list[str] | None, lab: str | None, *, acting: bool = False) -> Place:
+    """The place of the command line, else of the newest run or router of this user on this machine.
+
+    Without any, the usual router of this machine. It is another one's: who is `acting` has to name it, and to choose
+    where several are up. Raises ExplainedError then, and errors as `routers`.
+    """
+    from agents.network.endpoints import DEFAULT_ENDPOINT
+    from agents.network.lab import options
+    from experiments.real_time.hosts import run_registry
+
+    if given := routers(connect, lab):
+        return Place(given)
+    up = [run for run in run_registry.runs() if run.alive]
+    if len(up) > 1:
+        shown = "".join(f"\n  {run.words}: {options(run.endpoints[0])}" for run in reversed(up))
+        if acting:
+            raise ExplainedError(f"{len(up)} runs and routers are up: choose one{shown}")
+        warn([f"{len(up)} runs and routers are up; this is the newest one{shown}"])
+    if up:
+        return Place(up[-1].endpoints, up[-1].realm)
+    if acting:
+        raise ExplainedError(
+            "no run or router of yours is up on this machine: start one (`./zenpark run robotic-park`), or name "
+            f"the router of another user (--connect {DEFAULT_ENDPOINT})"
+        )
+    return Place([DEFAULT_ENDPOINT], strange=True)
+
+
 @contextmanager
 def session(
     name: str,
-    connect: list[str] | None,
-    lab: str | None,
+    where: Place,
     identity: str,
     wait_s: float = 1.0,  # a router of this machine answers at once
 ) -> Iterator[zenoh.Session]:
-    """A session of a command, at the routers of the command line or at that of this machine."""
-    from agents.network.endpoints import DEFAULT_ENDPOINT
+    """A session of a command at a place; a note says when it is a stranger's."""
+    from agents.network.endpoints import describe
     from agents.network.session import open_session
 
-    endpoints = routers(connect, lab) or [DEFAULT_ENDPOINT]
-    with open_session(endpoints, name=f"zenpark {name}", wait_s=wait_s, identity=identity) as opened:
+    with open_session(where.endpoints, name=f"zenpark {name}", wait_s=wait_s, identity=identity) as opened:
+        if where.strange:
+            warn([f"no run or router of yours is up: this one, at {describe(where.endpoints)}, is none of yours"])
         yield opened
 
 

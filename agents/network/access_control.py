@@ -19,8 +19,6 @@ from agents.network.lab import LabError, Register
 Flow = Literal["ingress", "egress"]
 
 MOST_BYTES: Final = 64 * 1024  # of a message below the name of a robot, as readers accept
-ADMIN: Final = "@/**"  # keys of Zenoh itself: the connections of a router
-OWN_ADMIN: Final = "@/*/client/**"
 PASSED: Final = (
     "put", "query", "reply", "declare_subscriber", "declare_queryable",
     "liveliness_token", "liveliness_query", "declare_liveliness_subscriber",
@@ -87,8 +85,6 @@ def _messages(grant: Grant, realm: str) -> Iterator[tuple[Flow, tuple[str, ...],
     # a publisher that knows of no subscriber sends nothing: all learn the subscriptions, not the values
     everything = [f"{realm}/**", *_cache_keys([f"{realm}/**"]), *grant.publish, *kept, *grant.query]
     yield "egress", ("declare_subscriber", "declare_queryable"), everything
-    yield "ingress", ("declare_queryable", "reply"), [OWN_ADMIN]
-    yield "egress", ("query",), [ADMIN]
 
 
 def _cache_keys(keys: Iterable[str]) -> list[str]:
@@ -142,14 +138,14 @@ def _passed(name: str, rights: Rights) -> Iterator[dict[str, Any]]:
     """The rules of a router that is linked with another: messages that either has let in pass, on keys of any right."""
     union = reduce(Grant.joined, (*rights.robots.values(), *rights.roles.values()), Grant())
     granted = {key for verb in Grant.__struct_fields__ for key in getattr(union, verb)}
-    foreign = sorted(key for key in granted if not key.startswith((f"{rights.realm}/", "@/**")))
+    foreign = sorted(key for key in granted if not key.startswith(f"{rights.realm}/"))
     keys = [f"{rights.realm}/**", *foreign]
     yield {
         "id": f"{name}-linked",
         "permission": "allow",
         "flows": ["ingress", "egress"],
         "messages": list(PASSED),
-        "key_exprs": [*keys, *_cache_keys(keys), ADMIN],
+        "key_exprs": [*keys, *_cache_keys(keys)],
     }
 
 

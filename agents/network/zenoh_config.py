@@ -19,6 +19,13 @@ LEASE_S: Final = 2.0  # a peer silent for this long is considered dead
 ASK_S: Final = 2.0  # limit for a reply to a query
 OPEN_S: Final = 3.0  # limit of a handshake,
 NEXT_S: Final = 1.0  # and where there is another router
+# Longest wait for a member that does not read: it is then disconnected, or in the second case not sent the message. Who
+# waits holds up all others meanwhile. Zenoh's own limits are 5 s and 50 ms.
+BLOCKED_S: Final = 0.02
+_WAITS: Final = (
+    "transport/link/tx/queue/congestion_control/block/wait_before_close",
+    "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments",
+)
 MOST_BYTES: Final = 4 * 1024 * 1024  # of a message that a router of a lab puts together; the largest is an experiment
 
 # 4 threads instead of 7 in each client and a sixth less CPU at 50 Hz. Zenoh reads it once, at the first open.
@@ -87,8 +94,10 @@ def settings(
         "transport/unicast/open_timeout": round((NEXT_S if mode == "client" and len(connect) > 1 else OPEN_S) * 1000),
         "transport/unicast/accept_timeout": round(OPEN_S * 1000),
         "transport/shared_memory/enabled": False,
+        **dict.fromkeys(_WAITS, round(BLOCKED_S * 1e6)),
         "queries_default_timeout": round(ASK_S * 1000),
-        "adminspace/enabled": True,  # read-only; the source of `./zenpark keys`
+        # Questions to it are read-only, but a router that is asked for its tables may stand still for good.
+        "adminspace/enabled": folder is None,
     }
     if name is not None:
         made["metadata"] = {"name": name}

@@ -5,6 +5,7 @@ Light to start, since every run on one machine starts one.
 
 from __future__ import annotations
 
+import os
 import sys
 import threading
 import time
@@ -16,7 +17,7 @@ from typing import Annotated, Final
 import msgspec
 import zenoh
 from msgspec import Meta
-from zenoh.handlers import Callback, FifoChannel
+from zenoh.handlers import Callback
 
 from agents.clock import Clock
 from agents.errors import ExplainedError
@@ -24,7 +25,7 @@ from agents.network import lab, messages
 from agents.network.access_control import Rights
 from agents.network.endpoints import DEFAULT_ENDPOINT, EndpointError
 from agents.network.keys import Keys
-from agents.network.session import deserted, forbid_lingering, hang_up_on, prompt_threads
+from agents.network.session import deserted, forbid_lingering, hang_up_on, prompt_threads, tokens_present
 from agents.network.shutdown import closing_cleanly, end
 from agents.network.zenoh_config import config, reason, settings
 from agents.runtime import command_line
@@ -35,8 +36,9 @@ EMPTY_S: Final = 1.0  # no client for this long: a client that lost its connecti
 LOOK_S: Final = 0.1
 PORT_FREE_S: Final = 10.0  # limit for the port of a router that restarts to become free
 AGAIN_S: Final = 0.1
-MOST_TOKENS: Final = 1000  # of a session: they cost the router 40 ms, three times as many 0.3 s, ten times 4.6 s
-MOST_REPLIES: Final = 1 << 16  # queued
+MOST_TOKENS: Final = 1000  # of a robot: they cost the router 40 ms, three times as many 0.3 s, ten times 4.6 s
+MOST_SESSIONS: Final = 16  # of a certificate: each that does not read delays the others once by `BLOCKED_S`
+STUCK_S: Final = 2.0  # limit for an answer of the router to itself
 # Period of the checks for new connections, tokens, revoked certificates and signals: a signal that the kernel delivers
 # to another thread, as after a SIGCONT, does not wake the waiting one.
 LOOK_AGAIN_S: Final = 0.5
@@ -76,6 +78,7 @@ def serve(
         if begun:
             return
         print(f"router ready on {', '.join(endpoints)}", flush=True)
+        StuckCheck(lambda: _answers(open_now[0]))
         if lifeline:
             rope.start()
             threading.Thread(target=leave, args=(open_now,), name="linger", daemon=True).start()
@@ -110,14 +113,14 @@ def serve_router(
         with closing_cleanly(_routing(chosen, endpoints, patience_s, stop)) as (session, declared):
             guard = None
             if register is not None and rights is not None:
-                guard = Guard(session, lab.register(register.parent), rights.realm)
+                guard = Guard(session, lab.register(register.parent), rights)
                 declared.append(guard)
             ready(session)
             patience_s = PORT_FREE_S
             while not stop.wait(LOOK_AGAIN_S):
                 forbid_lingering()
                 if guard is not None:
-                    guard.check_tokens()
+                    guard.report()
                 if (now := _stamp(register)) == read:
                     continue
                 read = now
@@ -133,54 +136,68 @@ def serve_router(
 
 
 class Guard:
-    """Disconnects sessions of a lab's router that pass for others, or hold more tokens than the router can bear.
+    """Disconnects sessions of a lab's router that pass for others, or that are more than the router can bear.
 
     Zenoh compares ids with no certificates: who connects first with the id of a robot (`lab.session_id`), as after a
-    restart of the router, keeps that robot out. Samples of tokens do not tell their session, the tables of the router
-    do. Each is reported on standard error and as a hazard of the run.
+    restart of the router, keeps that robot out. A member that does not read delays all others for a moment, and each of
+    many does. Tokens cost the router more than in proportion to their number. Each is reported on standard error and as
+    a hazard of the run.
+
+    The guard follows events of links and of liveliness. It never asks for the tables of the router: questions to the
+    admin space made it stand still for good.
     """
 
-    def __init__(self, session: zenoh.Session, known: lab.Register, realm: str) -> None:
-        self._session, self._known, self._keys = session, known, Keys(realm)
+    def __init__(self, session: zenoh.Session, known: lab.Register, rights: Rights) -> None:
+        self._session, self._known, self._rights, self._keys = session, known, rights, Keys(rights.realm)
         self._told: set[str] = set()
         self._clock = Clock()
         self._hazards: deque[str] = deque()  # not published yet
-        self._banned: set[str] = set()  # ids of sessions, which a client keeps when it connects again
+        self._links: dict[str, list[zenoh.Link]] = {}  # by certificate
+        self._tokens = Counter[str]()  # by the first chunk below the realm
         # in the receiving thread: each moment that a thief stays is one in which the robot is refused
-        callback = Callback(self._check, indirect=False)
+        callback = Callback(self._check_link, indirect=False)
         self._listener = session.info.declare_link_events_listener(callback, history=True)
+        self._watch = session.liveliness().declare_subscriber(
+            self._keys.everything, Callback(self._check_token, indirect=False), history=True
+        )
 
-    def check_tokens(self) -> None:
-        """Compare the tokens in the tables of the router with the sessions that declared them; poll it."""
-        # another router declares the tokens of its own clients, which it compares itself
-        links = {str(link.zid): link for link in self._session.info.links() if not self._is_router(link)}
-        connections = Counter[str]()
-        for key, declarers in declared_tokens(self._session):
-            named = Keys.session_of(key)
-            for zid in declarers & links.keys():
-                connections[zid] += 1
-                if named not in (None, zid):
-                    self._ban(links[zid], f"holds a token of {self._keys.whose(key)} in the name of another session")
-        for zid, count in connections.items():
-            if count > MOST_TOKENS:
-                self._ban(links[zid], f"holds more than {MOST_TOKENS} liveliness tokens")
+    def report(self) -> None:
+        """Publish what was done since the last call."""
         while self._hazards:
             event = messages.Event(self._clock.utc(), "hazard", "router", self._hazards.popleft())
             self._session.put(self._keys.event, messages.encode(event), encoding=messages.JSON)
 
-    def _check(self, event: zenoh.LinkEvent) -> None:
+    def _check_link(self, event: zenoh.LinkEvent) -> None:
         link = event.link
+        same = self._links.setdefault(link.auth_identifier or "", [])
         if event.kind == zenoh.SampleKind.DELETE:
+            same[:] = [each for each in same if (each.zid, each.dst) != (link.zid, link.dst)]
             return
+        same.append(link)
         if (victim := lab.robbed(self._known, str(link.zid), link.auth_identifier)) is not None:
             self._disconnect(link, f"came with the id of {victim}")
-        elif str(link.zid) in self._banned:
-            hang_up_on(link)
+        elif len(same) > MOST_SESSIONS and not self._is_router(link):
+            self._disconnect(link, f"is one of more than {MOST_SESSIONS}")
 
-    def _ban(self, link: zenoh.Link, what: str) -> None:
-        if str(link.zid) not in self._banned:
-            self._banned.add(str(link.zid))
-            self._disconnect(link, what)
+    def _check_token(self, sample: zenoh.Sample) -> None:
+        key = str(sample.key_expr)
+        owner = self._keys.whose(key) or ""
+        if sample.kind == zenoh.SampleKind.DELETE:
+            self._tokens[owner] -= 1
+            return
+        self._tokens[owner] += 1
+        if self._tokens[owner] > MOST_TOKENS:  # a token does not tell its session
+            for certificate in self._holders(zenoh.KeyExpr(key)):
+                for link in self._links.pop(certificate, ()):
+                    self._disconnect(link, f"may hold some of more than {MOST_TOKENS} liveliness tokens")
+
+    def _holders(self, token: zenoh.KeyExpr) -> Iterator[str]:
+        """Certificates with the right to hold a token."""
+        for name, identity in self._known.identities.items():
+            grants = self._rights.robots if identity.role == "robot" else self._rights.roles
+            grant = grants.get(name if identity.role == "robot" else identity.role)
+            if grant is not None and any(zenoh.KeyExpr(key).includes(token) for key in grant.tokens):
+                yield identity.common_name
 
     def _disconnect(self, link: zenoh.Link, what: str) -> None:
         done = "is disconnected" if hang_up_on(link) else "cannot be disconnected, only TLS can: revoke the certificate"
@@ -197,16 +214,43 @@ class Guard:
         )
 
 
-def declared_tokens(session: zenoh.Session) -> Iterator[tuple[str, set[str]]]:
-    """Keys of the liveliness tokens in the tables of a router, each with the ids of the sessions that declared it.
+class StuckCheck:
+    """Ends the process when its router answers no question: it would live on, and answer no client.
 
-    The tables show neither denied tokens nor keys with a chunk that begins with @, such as those of caches.
+    Who started the router starts it again. A process that was suspended is not ended: `LOOK_AGAIN_S` counts at most
+    once for each turn of the thread.
     """
-    tables = f"@/{session.zid()}/router/token/"
-    for reply in session.get(f"{tables}**", FifoChannel(MOST_REPLIES)):
-        if reply.ok is not None:
-            sources = msgspec.json.decode(reply.ok.payload.to_bytes(), type=dict[str, set[str]])
-            yield str(reply.ok.key_expr).removeprefix(tables), set().union(*sources.values())
+
+    def __init__(self, ask: Callable[[], bool], end: Callable[[int], object] = os._exit) -> None:
+        """Begins to `ask`, which returns whether there was an answer; `end` is called with the code of the process."""
+        self._ask, self._end = ask, end
+        self._asked = self._answered = 0  # number of questions
+        for each in (self._question, self._watch):
+            threading.Thread(target=each, name="stuck", daemon=True).start()
+
+    def _question(self) -> None:
+        while True:
+            self._asked += 1
+            if self._ask():
+                self._answered = self._asked
+                time.sleep(LOOK_AGAIN_S)
+
+    def _watch(self) -> None:
+        turns = seen = 0
+        while turns * LOOK_AGAIN_S < STUCK_S:
+            time.sleep(LOOK_AGAIN_S)
+            turns = turns + 1 if self._answered == seen else 0
+            seen = self._answered
+        print(f"router: it has not answered itself for {STUCK_S:g} s, and ends", file=sys.stderr, flush=True)
+        self._end(1)
+
+
+def _answers(session: zenoh.Session) -> bool:
+    """Whether a router answers itself; true of one that is closed, since its rules change or it ends."""
+    try:
+        return tokens_present(session, Keys().conductor) is not None
+    except zenoh.ZError:
+        return True
 
 
 def _routing(chosen: zenoh.Config, endpoints: Sequence[str], wait_s: float, stop: threading.Event) -> zenoh.Session:

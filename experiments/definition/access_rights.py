@@ -11,7 +11,7 @@ from functools import reduce
 from typing import Any, Final
 
 from agents.body.kinds import KINDS
-from agents.network.access_control import ADMIN, Grant, Rights
+from agents.network.access_control import Grant, Rights
 from agents.network.keys import Keys
 from agents.plugins import registry
 from experiments.definition.experiment import VICON_TWIN, WORLD, RobotTable
@@ -89,7 +89,7 @@ def _roles(plan: Plan, keys: Keys) -> dict[str, Grant]:
     goals = _key_per_name(plan.guided, keys.goal)
     foreign, tokens = _ros_keys(names, plan)
     everything = [keys.everything]
-    observer = Grant(subscribe=everything, query=[keys.pose("*"), ADMIN], watch=everything)
+    observer = Grant(subscribe=everything, query=[keys.pose("*")], watch=everything)
     return {
         "observer": observer,
         "recorder": Grant(subscribe=everything, watch=everything, tokens=[keys.recorder]),

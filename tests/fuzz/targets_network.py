@@ -176,15 +176,11 @@ def vicon_truths(net):
 
 @place(40_000)
 def answers():
-    """Answers to orders, and the admin space that network tools read."""
+    """Answers to orders, and to the questions of network tools."""
     examples = [part for message in REPLIES for part in sent("park/KH01/order", message)]
-    admin = {
-        "@/f00d/router/token/park/KH01/alive": b'{"clients":["aa","bb"],"peers":[]}',
-        "@/f00d/router/publisher/park/KH01/pose": b'{"clients":["aa"]}',
-        "@/aa/client": b'{"zid":"aa","metadata":{"name":"KH01"}}',
-        "@/f00d/router": b'{"zid":"f00d","metadata":null}',
-    }
-    examples += [b"\0".join([key.encode(), b"application/json", text]) for key, text in admin.items()]
+    examples += [part for message in good("KH01", 1)["status"] for part in sent(KEYS.status("KH01"), message)]
+    tokens = (KEYS.alive("KH01"), KEYS.life(KEYS.alive("KH01"), "f00d"), "park/KH01/pose/@adv/pub/f00d/1/_")
+    examples += [b"\0".join([key.encode(), b"application/json", b""]) for key in tokens]
 
     def take(data):
         key, rest = split(data)
@@ -193,7 +189,7 @@ def answers():
         assert isinstance(orders.send_order(net.session, KEYS, ["KH01"], wire.Order("hold"))["KH01"], wire.Reply)
         assert isinstance(orders.send_world_order(net.session, KEYS, wire.WorldOrder("pause")), wire.WorldReply)
         assert readable(payload, kind).isprintable()
-        for member in members(net.session):
+        for member in members(net.session, listen_s=0.0):
             msgspec.json.encode(member)
 
     net = Net()

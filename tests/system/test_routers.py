@@ -21,7 +21,7 @@ from experiments.definition import access_rights, mesh
 from experiments.file.document import load
 from experiments.run import reopen
 from tests.system import zenohd
-from tests.system.lab import NEAR_TRIANGLE, TRIANGLE, Flight, Started, Watcher, assert_held_in_time, typed, until
+from tests.system.lab import NEAR_TRIANGLE, TRIANGLE, Flight, Started, Watcher, assert_held_in_time, gone, typed, until
 from tests.system.secured import Laboratory, forged, new_lab, refused
 from tools.commands import orders
 from tools.commands.network import members
@@ -50,6 +50,22 @@ def test_a_killed_router_holds_nobody_up(tmp_path):
     run = reopen(flight.folder)
     assert not run.notes, "nobody was held for lost, and the recording is whole"
     assert not [event for event in run.traces["periodic"].events if event.kind == "hazard" and "hold" in event.text]
+
+
+@pytest.mark.mechanism("router of a run frozen")
+def test_a_frozen_router_is_replaced_in_flight(tmp_path):
+    flight = Flight(tmp_path / "run", "triangle", "--case", "periodic", *NEAR_TRIANGLE, "duration_s=9")
+    flight.until_flown()
+    frozen = flight.children()["router"]
+    frozen.suspend()
+    flight.until_said(r"the router ended \(killed, since it gave no answer for \d\.\d s\); started again")
+    for name in TRIANGLE:
+        flight.until_said(rf"hazard {name}: over: no connection to a router")
+    assert flight.finish()[0] == 0, flight.logs()
+    assert gone([frozen])
+    (trace,) = reopen(flight.folder).traces.values()
+    assert not [event for event in trace.events if event.kind == "hazard" and "land" in event.text]
+    assert {event.text for event in trace.events if event.kind == "phase"} >= {"formation", "landing"}
 
 
 def intrude(session):
@@ -133,7 +149,9 @@ def test_the_reference_experiment_without_a_router(tmp_path, capsys):
     with Watcher(*endpoints) as watcher:
         status, near = watcher.status, linked["CF02"]
         watcher.until(lambda: len(watcher.alive) == len(hears) == len(watcher.state), "everybody is seen")
-        assert {"conductor", "recorder", *hears} <= {member.name for member in members(watcher.session)}
+        seen = {member.name: member for member in members(watcher.session)}
+        assert {"run", *hears} <= seen.keys()
+        assert {watcher.keys.conductor, watcher.keys.recorder} <= {*seen["run"].alive}
         children["CF02"].kill()
         missing = {name: ["CF02"] * ("CF02" in hears[name]) for name in near}
         watcher.until(lambda: all(status[name].missing == missing[name] for name in near), "its neighbours miss it")

@@ -6,6 +6,7 @@ import math
 import time
 from collections import defaultdict, deque
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import islice
 from typing import TYPE_CHECKING, Annotated, Final
@@ -14,7 +15,7 @@ import typer
 from typer import Option
 
 from agents.errors import ExplainedError
-from tools.options import As, AsJson, Connect, KeyExpression, Lab, Seconds, example, print_json, session
+from tools.options import As, AsJson, Connect, KeyExpression, Lab, Seconds, example, place, print_json, session
 from tools.terminal import printable
 
 if TYPE_CHECKING:
@@ -30,17 +31,13 @@ DEPTH: Final = 8192  # samples between two polls
 
 @dataclass
 class NetworkMember:
-    """A session on the network: its name, its Zenoh id, and the keys that it holds."""
+    """Robot or process, by the chunk of its keys behind the realm."""
 
     name: str
-    id: str
-    alive: list[str] = field(default_factory=list)
-    publishers: list[str] = field(default_factory=list)
-    subscribers: list[str] = field(default_factory=list)
-    queryables: list[str] = field(default_factory=list)
-
-
-_KINDS: Final = {"token": "alive", "publisher": "publishers", "subscriber": "subscribers", "queryable": "queryables"}
+    phase: str = ""  # of a robot
+    sessions: list[str] = field(default_factory=list)  # Zenoh ids that its tokens tell
+    alive: list[str] = field(default_factory=list)  # liveliness tokens
+    publishes: list[str] = field(default_factory=list)
 
 
 def key_expression(text: str) -> str:
@@ -54,82 +51,60 @@ def key_expression(text: str) -> str:
         raise ExplainedError(f"'{text}' is not a key expression: {why}. Write it like park/*/pose") from None
 
 
-def members(session: zenoh.Session, timeout_s: float = 2.0) -> list[NetworkMember]:
-    """Members of the network, by name, from the admin space of routers and members of a mesh, without `session` itself.
+def members(session: zenoh.Session, below: str = "**", listen_s: float = WINDOW_S) -> list[NetworkMember]:
+    """Members of the network below some keys, by name.
 
-    A frozen process is still listed, for its router knows it; only its name is then unknown.
+    They are known by their liveliness tokens, their last statuses, and what is sent within `listen_s` [s]. The tables
+    of routers are not asked: a router that is asked for them may stand still for good. So a session that only listens
+    is not seen.
     """
-    held: dict[str, dict[str, list[str]]] = {}
-    places = [*_admin(session, "@/*/router/**", timeout_s), *_admin(session, "@/*/peer/**", timeout_s)]
-    for place, value in places:
-        _, _, mode, kind, key = (*place.split("/", 4), *[""] * 4)[:5]
-        if kind not in _KINDS or not isinstance(value, dict):
-            continue
-        # a member of a mesh tells of its neighbours too, but not all of it; its own it calls those of a client
-        of_peers = _strings(value.get("peers")) if mode == "router" else []
-        for owner in {*_strings(value.get("clients")), *of_peers}:
-            held.setdefault(owner, {}).setdefault(_KINDS[kind], []).append(key)
-    names = {
-        place.split("/")[1]: _name(value)
-        for place, value in _admin(session, "@/*/*", timeout_s)
-        if isinstance(value, dict) and "/" in place
-    }
-    mine = str(session.zid())
-    everyone = (held.keys() | names.keys()) - {mine}
-    found = [
-        NetworkMember(
-            names.get(owner) or "?", owner, **{kind: sorted(keys) for kind, keys in held.get(owner, {}).items()}
-        )
-        for owner in everyone
-    ]
-    return sorted(found, key=lambda member: (member.name, member.id))
+    from agents.network.keys import Keys
+    from agents.network.messages import Malformed, Status, decode
+    from agents.network.pubsub import last_values, subscriber
+    from agents.network.session import received, tokens_present
 
+    found: dict[str, NetworkMember] = {}
 
-def _strings(value: object) -> list[str]:
-    """The words of a list, if it is one: what stands in the admin space is another program's."""
-    return [word for word in value if isinstance(word, str)] if isinstance(value, list) else []
+    def member(key: str) -> NetworkMember:
+        name = key.split("/")[1] if "/" in key else key
+        return found.setdefault(name, NetworkMember(name))
 
-
-def _name(value: dict[str, object]) -> str | None:
-    """The name that a session gave itself."""
-    about = value.get("metadata")
-    name = about.get("name") if isinstance(about, dict) else None
-    return name if isinstance(name, str) else None
-
-
-def _admin(session: zenoh.Session, selector: str, timeout_s: float) -> Iterator[tuple[str, object]]:
-    """Keys and JSON values in the admin space."""
-    import msgspec
-
-    from agents.network.messages import JSON
-
-    for reply in session.get(selector, timeout=timeout_s):
-        sample = reply.ok
-        if sample is not None and str(sample.encoding) == JSON:
-            try:
-                yield str(sample.key_expr), msgspec.json.decode(sample.payload.to_bytes())
-            except (msgspec.MsgspecError, ValueError, RecursionError):
-                continue  # not of this project
+    with subscriber(session, below, DEPTH) as heard:
+        time.sleep(listen_s)
+        keys = {str(sample.key_expr) for sample in received(heard.handler)}
+    for token in sorted(tokens_present(session, below) or ()):
+        owner = member(token)
+        owner.alive.append(token)
+        if (zid := Keys.session_of(token)) is not None and zid not in owner.sessions:
+            owner.sessions.append(zid)
+    for token in tokens_present(session, f"{below}/@adv/pub/**") or ():
+        keys.add(token.partition("/@adv/")[0])
+    for key in sorted(keys):
+        member(key).publishes.append(key)
+    for sample in last_values(session, f"{below}/status", LAST_S):
+        with suppress(Malformed):
+            status = decode(sample.payload.to_bytes(), str(sample.encoding), Status)
+            member(str(sample.key_expr)).phase = status.phase
+    return sorted(found.values(), key=lambda each: each.name)
 
 
 @app.command(epilog=example("keys", "keys --connect tcp/192.168.0.10:7447 --json"))
 def keys(connect: Connect = None, as_json: AsJson = False, lab: Lab = None, identity: As = "observer") -> None:
-    """Show the members of the network and the keys that they hold."""
-    with session("keys", connect, lab, identity) as opened:
-        found = members(opened)
+    """Show the members of the network: their phase, their liveliness tokens, and what they publish."""
+    from agents.network.lab import lab_of
+
+    where = place(connect, lab)
+    with session("keys", where, identity) as opened:
+        # in a lab no member may look beyond the keys of the experiment
+        found = members(opened, "**" if lab_of(where.endpoints) is None else f"{where.realm}/**")
     if as_json:
         print_json(found)
         return
     for member in found:
-        print(f"{printable(member.name)}  ({member.id})")
-        for title, held in (
-            ("alive", member.alive),
-            ("publishes", member.publishers),
-            ("answers", member.queryables),
-            ("listens to", member.subscribers),
-        ):
-            for place, key in enumerate(held):
-                print(f"  {'' if place else title:10}  {printable(key)}")
+        print("  ".join(map(printable, filter(None, (member.name, member.phase, *member.sessions)))))
+        for title, held in (("alive", member.alive), ("publishes", member.publishes)):
+            for number, key in enumerate(held):
+                print(f"  {'' if number else title:10}  {printable(key)}")
 
 
 def readable(payload: bytes, mime: str) -> str:
@@ -170,7 +145,7 @@ def echo(
 
     expression = key_expression(key)
     deadline = math.inf if seconds is None else time.monotonic() + seconds
-    with session("echo", connect, lab, identity) as opened:
+    with session("echo", place(connect, lab), identity) as opened:
         for sample in islice(_samples(opened, expression, deadline), count):
             deleted = sample.kind == zenoh.SampleKind.DELETE
             text = "(deleted)" if deleted else readable(sample.payload.to_bytes(), str(sample.encoding))
@@ -277,7 +252,7 @@ def hz(
     def note(sample: zenoh.Sample) -> None:  # in the receiving thread: this process's poll is no arrival
         arrived.append((str(sample.key_expr), time.monotonic(), len(sample.payload)))
 
-    with session("hz", connect, lab, identity) as opened:
+    with session("hz", place(connect, lab), identity) as opened:
         subscriber = opened.declare_subscriber(expression, Callback(note, indirect=False))
         if not as_json:
             print(HEADING, flush=True)

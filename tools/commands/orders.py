@@ -24,6 +24,7 @@ from tools.options import (
     RealmOfRun,
     example,
     group,
+    place,
     plain,
     print_json,
     routers,
@@ -86,7 +87,7 @@ class Operator:
         """A session at the routers, and the keys of the realm."""
         from agents.network.keys import Keys
 
-        with session("robot", self.connect, self.lab, self.identity, WAIT_S) as opened:
+        with session("robot", place(self.connect, self.lab, acting=True), self.identity, WAIT_S) as opened:
             yield opened, Keys(self.realm)
 
     def print_results(self, done: Mapping[str, str], refused: Mapping[str, str]) -> int:

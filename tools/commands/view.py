@@ -24,6 +24,7 @@ from tools.options import (
     RealmOfRun,
     example,
     open_in_browser,
+    place,
     print_json,
     routers,
 )
@@ -204,7 +205,6 @@ def replay(
     identity: As = "operator",
 ) -> None:
     """Play a recording onto the network, for view, top, echo and other tools; in a terminal Enter pauses it."""
-    from agents.network.endpoints import DEFAULT_ENDPOINT
     from agents.network.session import open_session
     from agents.network.shutdown import closing_cleanly
     from agents.runtime.command_line import on_termination
@@ -214,7 +214,7 @@ def replay(
     file = _recordings(Path(run), case)[0]
     ended = threading.Event()
     with on_termination(ended.set):
-        endpoints = routers(connect, lab) or [DEFAULT_ENDPOINT]
+        endpoints = place(connect, lab, acting=True).endpoints
         opened = open_session(endpoints, name="replay", wait_s=5.0, identity=identity)
         with closing_cleanly(opened) as (session, declared):
             played = Broadcast(session, file, realm)

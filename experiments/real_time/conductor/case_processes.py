@@ -107,7 +107,7 @@ class CaseProcesses:
         count = context.plan.experiment.network.routers
         self._supervised = {
             each.name: _Supervised(
-                partial(each.start, context.launcher, context.rights),
+                partial(each.start, context.launcher, context.rights, forked=True),
                 ": all go on at another meanwhile" if count > 1 else "",
                 ": no other takes its place" if count > 1 else ": the robots hold, and land at the end",
             )

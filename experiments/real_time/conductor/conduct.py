@@ -6,6 +6,8 @@ See also `experiments.virtual_time.simulation`.
 from __future__ import annotations
 
 import json
+import threading
+import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
@@ -14,12 +16,14 @@ from typing import Final
 
 import msgspec
 
+from agents.network import session as network_session
 from agents.network.access_control import rules
 from agents.network.endpoints import free_endpoints, from_here
 from agents.network.keys import Keys
 from agents.network.lab import LabError, lab_of, register, require, secured
 from agents.network.lab import options as lab_options
-from agents.network.zenoh_config import ASK_S, check_loopback
+from agents.network.shutdown import closing_cleanly
+from agents.network.zenoh_config import ASK_S, LEASE_S, check_loopback
 from agents.plugins import registry as plugins
 from experiments.definition import access_rights, mesh
 from experiments.definition import endpoints as endpoint_choice
@@ -34,10 +38,12 @@ from experiments.real_time.conductor.orders import STARTING_S, Emergency
 from experiments.real_time.conductor.run_view import ProgressDisplay
 from experiments.real_time.hosts import run_registry
 from experiments.real_time.hosts.hosts import Hosts
-from experiments.real_time.hosts.launcher import Launcher, RouterEnded, make_routers, start_routers
+from experiments.real_time.hosts.launcher import Launcher, Router, RouterEnded, make_routers, start_routers
 from experiments.real_time.hosts.run_registry import RegisteredRun
 from experiments.recording.run_folder import SOURCE
 
+SILENT_S: Final = LEASE_S  # limit for a router to answer
+LOOK_S: Final = 0.05
 PORT_CHOICES: Final = 3  # of a run with no `network.listen`: a free port may be taken before its router listens there
 
 
@@ -177,12 +183,48 @@ def _run_setup(
         if not meshed:
             wait_s = STARTING_S if own_router else ASK_S
             up.enter_context(user.emergency.throughout(endpoints, Keys(network.realm), options.identity, wait_s))
+            up.enter_context(watched(launcher, routers, Keys(network.realm), options.identity))
         left: list[str] = []
         rest = (launcher, hosts, user.interrupted, rights, options.identity, user.emergency)
         source = folder / SOURCE
         contexts = {name: CaseContext(plan, name, folder, source, endpoints, *rest) for name, plan in embodied.items()}
         yield contexts, left
         left += hosts.sweep()
+
+
+@contextmanager
+def watched(launcher: Launcher, routers: Sequence[Router], keys: Keys, identity: str) -> Iterator[None]:
+    """Inside, each router is asked all the time, by a session of its own; a silent one is killed.
+
+    The case that is run starts it again (`CaseProcesses.again`). `identity` is a name in a certificate, in a lab.
+    """
+    over = threading.Event()
+
+    def watch(router: Router) -> None:
+        endpoints = [from_here(router.listen[0])]
+        try:
+            opened = network_session.open_session(
+                endpoints, name="watchdog", wait_s=STARTING_S, identity=identity, stop=over
+            )
+        except network_session.Unreachable:
+            return
+        with closing_cleanly(opened) as (session, _):
+            answers = network_session.RouterWatch(session, keys.conductor)
+            while not over.wait(LOOK_S):
+                now = time.monotonic()
+                silent_s, age_s = now - answers.silent_since(now), launcher.age(router.name)
+                if silent_s > SILENT_S and (age_s > silent_s or age_s > STARTING_S):
+                    launcher.kill(router.name, f"killed, since it gave no answer for {silent_s:.1f} s")
+
+    threads = [threading.Thread(target=watch, args=(router,), name="watchdog", daemon=True) for router in routers]
+    for thread in threads:
+        thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        for thread in threads:
+            thread.join()
 
 
 def hardware(cases: Iterable[Plan]) -> dict[str, str]:

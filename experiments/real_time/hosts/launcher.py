@@ -57,6 +57,8 @@ class Process:
     shown: int  # [bytes] end of what `news` has returned
     unsent: bytearray = field(default_factory=bytearray)  # input that its pipe has not taken yet
     robots: Sequence[str] = ()  # that it drives
+    begun: float = field(default_factory=time.monotonic)  # [s]
+    fault: str = ""  # reason why it was killed
 
     @property
     def alive(self) -> bool:
@@ -67,6 +69,8 @@ class Process:
         code = self.handle.poll()
         if code is None:
             return "still running"
+        if self.fault:
+            return self.fault
         if code == zygote.UNKNOWN:
             return "exit code unknown"
         return f"exit code {code}" if code >= 0 else f"killed by {signal.Signals(-code).name}"
@@ -277,11 +281,18 @@ class Launcher:
             if name in self._processes:
                 self._processes[name].close()
 
-    def kill(self, name: str) -> None:
-        """End a process that ignores its lifeline, at once; `died` reports its end."""
+    def kill(self, name: str, fault: str = "") -> None:
+        """End a process that ignores its lifeline, at once; `died` reports its end, with its `fault` if one is said."""
         with self._lock:
             if name in self._processes:
+                self._processes[name].fault = fault
                 self._processes[name].signal(signal.SIGKILL)
+
+    def age(self, name: str) -> float:
+        """Time since the start of a process [s]; 0 if none of this name runs."""
+        with self._lock:
+            process = self._processes.get(name)
+        return time.monotonic() - process.begun if process is not None and process.alive else 0.0
 
     def died(self) -> list[Process]:
         """Processes that have ended by themselves since the last call; they are forgotten."""
@@ -367,13 +378,16 @@ class Router:
     # routers before it, which it connects to for as long as it lives, so that any two are linked once
     link: Sequence[str] = ()
 
-    def start(self, launcher: Launcher, rights: Path | None = None) -> Process:
-        """Start the router; it outlives a killed launcher until robots have landed. In a lab it enforces `rights`."""
+    def start(self, launcher: Launcher, rights: Path | None = None, *, forked: bool = False) -> Process:
+        """Start the router; it outlives a killed launcher until robots have landed. In a lab it enforces `rights`.
+
+        `forked` as of `Launcher.start`: for robots that wait.
+        """
         listen = [part for endpoint in self.listen for part in ("--listen", endpoint)]
         link = [part for endpoint in self.link for part in ("--connect", endpoint)]
         enforced = [] if rights is None else ["--rights", str(rights)]
         linger = ["--lifeline", "--linger", str(LINGER_S)]
-        return launcher.start(self.name, "agents.runtime.router", *listen, *link, *enforced, *linger)
+        return launcher.start(self.name, "agents.runtime.router", *listen, *link, *enforced, *linger, forked=forked)
 
 
 def make_routers(endpoints: Sequence[str], count: int) -> list[Router]:

@@ -7,16 +7,18 @@ import pytest
 from zenoh import SourceInfo
 
 from agents.errors import ExplainedError
-from agents.network.messages import Order
-from agents.network.pubsub import ImmediateSubscriber, Orders, alive_token, pose_publisher, publisher, subscriber
+from agents.network.messages import encode
+from agents.network.pubsub import ImmediateSubscriber, alive_token, pose_publisher, publisher
 from agents.network.session import open_session, tokens_present
 from experiments.real_time.conductor.orders import EmergencyStop
-from experiments.real_time.hosts.run_registry import own_entry
+from experiments.real_time.hosts.run_registry import own_entry, registered
 from tests.cases import for_each
 from tests.commands import GUARD, started, zenpark
+from tests.fuzz.messages import good
 from tests.waiting import until
 from tools.commands import orders
-from tools.commands.network import HEADING, Cadence, echo, key_expression, members, readable
+from tools.commands.network import HEADING, Cadence, echo, key_expression, readable
+from tools.options import Place, place
 
 JSON, MSGPACK = "application/json", "application/msgpack"
 LISTEN = ("echo", "park/*/pose", "--seconds", "30", "--connect")
@@ -76,22 +78,42 @@ def pose(robot):
 
 @pytest.mark.mechanism("keys")
 @pytest.mark.system
-def test_keys_shows_who_holds_what(router, robot, pose):
-    with open_session([router.endpoint], name="recorder") as recorder:
-        held = [
-            Orders(robot, "park/CF01/order", Order),
-            alive_token(robot, "park/CF01/alive"),
-            subscriber(recorder, "park/**"),
-        ]
-        until(lambda: sum(len(m.alive) + len(m.subscribers) for m in members(recorder)) == 1)
-        shown = zenpark("keys", "--connect", router.endpoint, "--json")
+def test_keys_shows_members_and_what_they_publish(router, robot, pose, runtime_folder):
+    status = pose_publisher(robot, "park/CF01/status", JSON)
+    status.put(encode(msgspec.structs.replace(good("CF01", 1)["status"][0], phase="running")))
+    life = f"park/CF01/alive/life/{robot.zid()}"
+    held = [alive_token(robot, key) for key in ("park/CF01/alive", life, "park/run/conductor")]
+    listed = own_entry("router", "of this test", [router.endpoint])
+    with registered(listed):  # a run of this machine needs no --connect
+        shown = zenpark("keys", "--json")
         assert shown.stderr == ""
-        first, second, third = json.loads(shown.stdout)
-        lists = {"alive": ["park/CF01/alive"], "publishers": ["park/CF01/pose"], "queryables": ["park/CF01/order"]}
-        assert first == {"name": "CF01", "id": str(robot.zid()), "subscribers": [], **lists}
-        assert (second["name"], second["subscribers"], third["name"]) == ("recorder", ["park/**"], "router")
-        assert "  answers     park/CF01/order\n" in zenpark("keys", "--connect", router.endpoint).stdout
-        del held
+        first, second = json.loads(shown.stdout)
+        assert first == {
+            "name": "CF01", "phase": "running", "sessions": [str(robot.zid())],
+            "alive": ["park/CF01/alive", life], "publishes": ["park/CF01/pose", "park/CF01/status"],
+        }  # fmt: skip
+        assert (second["name"], second["alive"]) == ("run", ["park/run/conductor"])
+    assert "  publishes   park/CF01/pose\n" in zenpark("keys", "--connect", router.endpoint).stdout
+    del held
+
+
+def test_place_is_named_or_the_newest_here(monkeypatch, capsys):
+    def up(*runs):
+        monkeypatch.setattr("experiments.real_time.hosts.run_registry.runs", lambda: [*runs])
+
+    first, second = own_entry("run", "one", ["tcp/127.0.0.1:1"]), own_entry("run", "two", [DEFAULT], realm="hall")
+    assert place(["tcp/127.0.0.1:9"], None, acting=True) == Place(["tcp/127.0.0.1:9"])
+    up(first)
+    assert place(None, None, acting=True) == Place(["tcp/127.0.0.1:1"])
+    up(first, second)
+    assert place(None, None) == Place([DEFAULT], "hall")
+    assert "2 runs and routers are up; this is the newest one" in capsys.readouterr().err
+    with pytest.raises(ExplainedError, match=r"choose one\n.*two.*: --connect tcp/127.0.0.1:7447\n.*one"):
+        place(None, None, acting=True)
+    up()
+    assert place(None, None) == Place([DEFAULT], strange=True)
+    with pytest.raises(ExplainedError, match="no run or router of yours is up"):
+        place(None, None, acting=True)
 
 
 @pytest.mark.mechanism("echo")
