@@ -459,7 +459,7 @@ class FlightControl:
         return Info.FLYING in self._telemetry.info
 
     def enter(self, phase: FlightPhase) -> None:
-        self.phase, self.phase_since = phase, uptime()
+        self.phase, self.phase_since, self._refused = phase, uptime(), False
         self.publish_airborne()
 
     def takeoff_refusal(self) -> str:

@@ -32,6 +32,7 @@ LANDED_ALONE_S: Final = 20.0  # silent for this long: landed by itself
 LOW: Final = 30  # [cm] the reported height is rounded and drifts
 TOO_HIGH_M: Final = 1.0  # [m] above the end of its climb, by its own height: its positions are those of something else
 UNORDERED: Final = 3  # seconds on the motors' clock of a high drone that rests: it flies without an order
+REFUSED: Final = "no take-off: "
 REFUSALS: Final = 3  # answers in a row that refuse the sticks: the note says so
 REFUSED_S: Final = 1.0  # time after the last of them for which it does
 
@@ -108,7 +109,8 @@ class TelloPilot:
             if self._refusals >= REFUSALS and now - self._refused_at < REFUSED_S
             else ""
         )
-        return "; ".join(part for part in (unanswered, self._send_error, silence, refused, self.trouble) if part)
+        trouble = "" if self.trouble.startswith(REFUSED) and not self._takeoff_refusal(now) else self.trouble
+        return "; ".join(part for part in (unanswered, self._send_error, silence, refused, trouble) if part)
 
     # ------------------------------------------------------------------ orders
 
@@ -116,17 +118,20 @@ class TelloPilot:
         """Take off, then climb to `height` [m] above this place; on refusal, `trouble` gives the reason."""
         if self.duty is not Duty.REST:
             return
-        if self.silent(now):
-            self.trouble = "no take-off: no state received"
-        elif not math.isfinite(self.position[0]):
-            self.trouble = "no take-off: no fresh external position; is the positioning system running?"
-        elif self.battery < self._settings.low_battery:
-            self.trouble = f"no take-off: battery at {self.battery:.0%}"
-        else:
+        self.trouble = self._takeoff_refusal(now)
+        if not self.trouble:
             self.hold_position = (self.position[0], self.position[1], height)
-            self._floor, self.trouble = self.position[2], ""
-            self._refusals = 0
+            self._floor, self._refusals = self.position[2], 0
             self._begin(Duty.RISE, "takeoff", now)
+
+    def _takeoff_refusal(self, now: float) -> str:
+        """Reason against a take-off; empty if none."""
+        if self.silent(now):
+            return f"{REFUSED}no state received"
+        if not math.isfinite(self.position[0]):
+            return f"{REFUSED}no fresh external position; is the positioning system running?"
+        low = self.battery < self._settings.low_battery
+        return f"{REFUSED}battery at {self.battery:.0%}" if low else ""
 
     def land(self, now: float, reason: str = "") -> None:
         """Land at the current place; `reason` is for users."""

@@ -87,6 +87,8 @@ class CaseRun:
 
 
 class Conductor(CaseRun):
+    _lifted = False  # True if a take-off was ordered
+
     def run(self) -> CaseResult:
         """Run the case to its end, or until the user interrupts it; the robots are down in any case."""
         began = time.monotonic()
@@ -214,6 +216,7 @@ class Conductor(CaseRun):
 
     def _take_off(self) -> bool:
         """Order all robots to climb, those that were not ready again when they are; False if interrupted."""
+        self._lifted = True
         refused = self._order(messages.Order("takeoff"))
 
         def again() -> None:
@@ -258,7 +261,7 @@ class Conductor(CaseRun):
             if now < end - EARLY_S:
                 self._note_landings(now - start, busy)
                 if ended and not self._landed:
-                    what = "all robots had landed" if left else "no robot was left"
+                    what = "all robots were down" if left else "no robot was left"
                     self.failures.append(f"{what} after {now - start:.1f} of {self._experiment.duration_s:g} s")
             if ended:
                 break
@@ -405,7 +408,8 @@ class Conductor(CaseRun):
         return status.reason or f"it is {status.phase}"
 
     def start_failure(self, names: Sequence[str], what: str) -> str:
-        lines = [f"{', '.join(names)}: {what}; nothing has moved or all have landed"]
+        moved = "a take-off was ordered: robots may have moved, all are landed" if self._lifted else "nothing has moved"
+        lines = [f"{', '.join(names)}: {what}; {moved}"]
         for name in names:
             gone = self._robots[name].gone  # then the event of its end has shown the last line of its output
             if not gone or self._robots[name].status is not None:

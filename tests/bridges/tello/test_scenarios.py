@@ -123,6 +123,7 @@ def refusals():
         assert not driver.state.flying[0]
         driver.truth = truth
         driver.tick()
+        driver.until(lambda: driver.state.note[0] == "")
         driver.body.takeoff([0], [0.6])
         driver.until(lambda: served.truth()[0][0, 2] > 0.5)
         threading.Event().wait(2.3)  # the process hangs: its drone lands

@@ -102,7 +102,7 @@ def _without_pauses(monkeypatch):
     monkeypatch.setattr(module, "time", SimpleNamespace(sleep=lambda _: None, monotonic=lambda: 0.0))
 
 
-@pytest.mark.parametrize(("landing", "failures"), [(3.0, ["all robots had landed after 3.5 of 10 s"]), (9.6, [])])
+@pytest.mark.parametrize(("landing", "failures"), [(3.0, ["all robots were down after 3.5 of 10 s"]), (9.6, [])])
 def test_a_run_that_ended_early_has_failed(landing, failures):
     assert Course({0.0: "running", landing: "landing"}).walked() == failures
     course = Course({0.0: "running"})
@@ -230,6 +230,15 @@ def test_output_of_a_lost_robot_is_told_once():
     told = course.start_failure([lost, late], "could not start")
     counts = [told.count(text) for text in ("could not start", f"last words of {late}", f"last words of {lost}")]
     assert counts == [1, 1, 0]  # the event of its end has them
+
+
+def test_failure_after_takeoff_tells_of_motion(passing):
+    """A drone that bounced for 15 s was told as "nothing has moved"."""
+    course = passing(Course({0.0: "ready"}))
+    course.view.order = lambda *_: {}
+    assert "; nothing has moved\n" in course.start_failure(["CF01"], "not ready after 3 s")
+    with pytest.raises(RunFailed, match=r"not airborne after \d+ s; a take-off was ordered: robots may have moved"):
+        course._take_off()
 
 
 @pytest.mark.mechanism("orders to several robots at once")
