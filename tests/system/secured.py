@@ -70,7 +70,7 @@ class Laboratory:
     def statuses(self):
         """Fresh ones, of every robot."""
         since, status = time.time(), self.watcher.status
-        self.watcher.until(lambda: all(status[name].stamp > since for name in TRIANGLE), "fresh statuses", 5.0)
+        self.watcher.until(lambda: all(status[name].stamp > since for name in TRIANGLE), "fresh statuses")
         self.last = {name: status[name] for name in TRIANGLE}
         return self.last
 

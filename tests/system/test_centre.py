@@ -105,7 +105,7 @@ def test_by_hand_and_what_nobody_should_believe(router, watcher, tmp_path):
 
         refused = watcher.status["KH01"].malformed
         late = watcher.state["KH01"].goal_receipts[-1]
-        assert 0.0 < late.acted - late.pose < 0.5
+        assert late.acted > late.pose
         now = time.time()
         goals = (
             messages.Goal("KH02", 2**52, now, (0.0, 0.0, 0.0), None, now),

@@ -217,7 +217,7 @@ def test_robot_leaves_a_router_that_does_not_answer(router, watcher):
             threading.Event().wait(CUT_OFF_S)
             began = time.monotonic()
             assert robot.end() == 0
-            assert time.monotonic() - began < 10.0  # Zenoh alone takes 13 s
+            assert time.monotonic() - began < 13.0, "Zenoh alone takes longer, however quick the machine"
 
 
 def test_router_that_was_frozen_ends_when_ordered():

@@ -8,11 +8,12 @@ import re
 import numpy as np
 import pytest
 
+from agents.network import messages
 from experiments.recording.reader import RecordingError
 from experiments.run import reopen
 from tests.commands import python
 from tests.runs import flown
-from tests.system.lab import NEAR_TRIANGLE, ROOT, Flight, Watcher, assert_formed, gone, options, typed, until
+from tests.system.lab import NEAR_TRIANGLE, ROOT, TRIANGLE, Flight, Watcher, assert_formed, gone, options, typed, until
 
 pytestmark = pytest.mark.system
 
@@ -73,14 +74,20 @@ def test_killed_follower_is_missed_and_others_go_on(tmp_path):
 
 def test_formation_holds_without_zygote_and_router(tmp_path):
     """The router comes back."""
-    flight, processes = begun(tmp_path, "duration_s=8")
+    flight, processes = begun(tmp_path, "duration_s=120", "timeline=[]")
     for name in ("zygote", "router"):
         processes[name].kill()
         flight.until_said(rf"the {name} ended \(killed by SIGKILL\)")
     flight.until_said(r"the router ended \(killed by SIGKILL\); started again")
-    trace = trace_of(flight, processes, 0)
-    assert "lost" not in flight.said()
-    assert_formed(trace, 0.05, since_s=7.0)
+    with Watcher(flight.endpoint()) as watcher:
+        watcher.until(
+            lambda: all((watcher.state[name].error or 1.0) < 0.03 for name in TRIANGLE), "they form up", FORMED_S
+        )
+    flight.interrupt()
+    assert gone(list(processes.values()))
+    assert ": lost " not in flight.said()
+    trace = flight.read().trace
+    assert_formed(trace, 0.05, since_s=trace.time[-1] - 0.5)
 
 
 def test_killed_recorder_is_replaced_and_fails_the_run(tmp_path):
@@ -188,15 +195,34 @@ def test_centre_communicates_over_the_same_network(tmp_path):
     assert goals.delay.min() >= 0.1 - 1e-5, "both ways"
 
 
+FORMED_S = 100.0  # limit for robots to agree or to form up: a busy machine computes fewer steps in a second
+
+
+class Averages(Watcher):
+    """The numbers of six robots, and whether all are near their average."""
+
+    def __init__(self, endpoint):
+        super().__init__(endpoint)
+        self.told = self.newest(self.keys.memory("*"), messages.LawMemory)
+
+    def until_agreed(self):
+        def agreed():
+            return len(self.told) == 6 and all(abs(each.variables["x"][0] - 3.0) < 0.06 for each in self.told.values())
+
+        self.until(agreed, "they agree", FORMED_S)
+
+
+@pytest.mark.timeout(200)
 @pytest.mark.mechanism("words")
 def test_robots_agree_on_an_average_in_real_time(tmp_path):
     """With a fifth of the messages lost, in two processes of three robots."""
     groups = [f"robots.KH0{number}.process={'odd' if number % 2 else 'even'}" for number in range(1, 7)]
-    flight = Flight(tmp_path / "run", "average", "--case", "event-loss", *groups, "duration_s=9")
-    assert flight.finish(120.0)[0] == 0, flight.said()
+    flight = Flight(tmp_path / "run", "average", "--case", "event-loss", *groups, "duration_s=120")
+    flight.until_flown()
+    with Averages(flight.endpoint()) as watcher:
+        watcher.until_agreed()
+    flight.interrupt()
     file, trace = flight.folder / "event-loss.mcap", flight.read("event-loss").trace
-    end = trace.memory["x"][-5, :, 0]
-    assert np.abs(end - 3.0).max() < 0.06, end
     assert np.abs(trace.memory["x"][0] - 3.0).max() > 1.0
     assert trace.measures["disagreement"].shape == (len(trace.time), 6)
     assert trace.dropped.sum() > 0
@@ -205,22 +231,24 @@ def test_robots_agree_on_an_average_in_real_time(tmp_path):
     assert len(typed(file, "/KH01/pose")) < len(spoken) / 3  # those before its first step
 
 
+@pytest.mark.timeout(350)
 @pytest.mark.mechanism("words: restart")
 def test_a_restarted_robot_joins_without_drawing_the_others(tmp_path):
-    """The first words of a restarted robot are a step old; the others keep to their average meanwhile."""
-    flight = Flight(tmp_path / "run", "average", "--case", "periodic", 'on_loss="restart"', "duration_s=20")
+    """The first words of a restarted robot are a step old, and its number is 1 from the average, which all keep."""
+    flight = Flight(tmp_path / "run", "average", "--case", "periodic", 'on_loss="restart"', "duration_s=180")
     flight.until_flown()
-    agreed = 10.0  # they have agreed by then
-    with Watcher(flight.endpoint()) as watcher:
-        state, status = watcher.state, watcher.status
-        watcher.until(lambda: state["KH03"].stamp > status["KH03"].started + agreed > agreed, "half of it is over")
-    flight.children()["KH03"].kill()
-    assert flight.finish(120.0)[0] in (0, 1), flight.said()  # a robot was lost
+    with Averages(flight.endpoint()) as watcher:
+        watcher.until_agreed()
+        first = watcher.status["KH03"].pid
+        flight.children()["KH03"].kill()
+        watcher.until(lambda: watcher.status["KH03"].pid != first, "it is restarted", FORMED_S)
+        watcher.told.clear()
+        watcher.until_agreed()
+    flight.interrupt()
     trace = flight.read("periodic").trace
-    x = trace.memory["x"][..., 0]
-    others = np.delete(x[trace.time > agreed], 2, axis=1)
-    assert np.nanmax(np.abs(others - 3.0)) < 0.45
-    assert np.abs(x[-5] - 3.0).max() < 0.06, x[-5]
+    apart = np.abs(trace.memory["x"][..., 0] - 3.0)
+    agreed = np.flatnonzero(apart.max(axis=1) < 0.06)[0]
+    assert np.nanmax(np.delete(apart[agreed:], 2, axis=1)) < 1.0
 
 
 @pytest.mark.parametrize(

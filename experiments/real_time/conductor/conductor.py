@@ -33,9 +33,8 @@ GO_ON_S: Final = 5.0  # robots start later than the conductor, and count the dea
 MARGIN_S: Final = 0.5  # a robot that is not ready this long after its own deadline is not awaited any more
 
 ADOPT_S: Final = 0.5
-# a robot that still waits this long after the common start has missed the order, and one that still runs this long
-# after the planned end is ordered to land [s]
-LATE_S: Final = 1.0
+LATE_S: Final = 1.0  # a robot that still waits this long after the common start has missed the order [s]
+OVER_S: Final = 3.0  # a robot that still runs this long after the planned end is ordered to land [s]
 LEAVE_S: Final = 8.0  # limit for robots of the previous case to end [s]
 
 
@@ -246,7 +245,7 @@ class Conductor(CaseRun):
         self._changes.begin(start)
         self._repeat_at = start
         self._progress.phase = "starting together"
-        while (now := self._clock.utc()) < end + LATE_S and not self._context.ended():
+        while (now := self._clock.utc()) < end + OVER_S and not self._context.ended():
             self._update()
             self._view.report_drift(*self._drift.news())
             self._progress.elapsed = now - start

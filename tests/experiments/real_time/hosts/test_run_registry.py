@@ -6,7 +6,6 @@ import socket
 import subprocess
 import sys
 import threading
-import time
 from pathlib import Path
 
 import msgspec
@@ -86,14 +85,12 @@ def test_silent_names_delay_no_emergency_stop(monkeypatch):
         assert runs() == [run], "a name that cannot be asked for hides nobody"
 
     def resolve(*_):
-        resolved.wait(60.0)
+        resolved.wait()
         raise OSError
 
     monkeypatch.setattr(run_registry.socket, "create_connection", resolve)
     with registered(dead()), registered(dead()), registered(dead()), registered(run):
-        began = time.monotonic()
-        assert run in runs()
-        assert time.monotonic() - began < 5.0
+        assert run in runs(), "although no name is ever resolved"
     resolved.set()
 
 
