@@ -16,7 +16,9 @@ class Safety(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     speed: Annotated[Positive | None, Meta(description="speed limit [m/s], if lower than that of the kind")] = None
     max_goal_distance: Annotated[Positive, Meta(description="largest distance of a goal from the robot [m]")] = 0.5
-    margin: Annotated[NotNegative, Meta(description="distance of goals from the walls of the arena [m]")] = 0.05
+    margin: Annotated[
+        NotNegative, Meta(description="gap between the surface of a robot at its goal and the walls [m]")
+    ] = 0.05
     position_timeout_s: Annotated[
         Positive, Meta(description="a position older than this counts as unknown; the robot holds [s]")
     ] = 0.5

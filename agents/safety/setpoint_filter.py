@@ -41,10 +41,11 @@ class SetpointFilter:
         self._far = self._speed * (self._closes_s + limits.position_timeout_s)
         self._step = min(limits.max_goal_distance, self._speed * self._closes_s)  # longest way to a goal [m]
         self._walls_low, self._walls_high, margin = limits.low, limits.high, limits.margin  # of the arena [m]
+        beside = margin + kind.radius  # its surface, not its centre, keeps the margin
         # a goal on the floor would be flown into it; heights do not limit ground robots
         (x, y, z), (far_x, far_y, far_z) = limits.low, limits.high
         bottom, top = (z + max(kind.height, FLOOR_M), far_z - margin) if kind.flies else (-inf, inf)
-        self._low, self._high = (x + margin, y + margin, bottom), (far_x - margin, far_y - margin, top)  # of goals [m]
+        self._low, self._high = (x + beside, y + beside, bottom), (far_x - beside, far_y - beside, top)  # of goals [m]
         self._cut_beyond_m, self._position_timeout_s = limits.cut_beyond_m, limits.position_timeout_s
 
     def judge(self, now: Situation) -> None:

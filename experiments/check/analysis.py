@@ -183,6 +183,14 @@ class Analysis:
         """Robots without which the formation is not rigid any more."""
         return () if self.spare is None else tuple(self.plan.names[row] for row in np.flatnonzero(~self.spare.robots))
 
+    def grows_at(self, position: Array) -> bool:
+        """Whether an error grows where the robots stand, (N, 3) [m]: a saddle, which the loop leaves when touched."""
+        kinds, hz = self.plan.kinds, self.plan.experiment.rates.coordination_hz
+        loop = modes(
+            self.law, self.first_links, position, closed_shares(kinds, hz), hz, anchors=self.plan.anchors_by_row
+        )
+        return loop.radius > 1.0 + FORGIVEN
+
     @cached_property
     def modes(self) -> Modes | None:
         """Modes of the sampled loop at the shape."""

@@ -40,11 +40,11 @@ def compilation(analysis: Analysis) -> Iterator[Finding]:
     for plugin in ticking_plugins(analysis.plan):
         if not analysis.is_gradient and plugin is type(analysis.plan.law):
             if is_foreign(plugin):
-                yield Finding("note", "uncompiled", f"laws that remember are not compiled: {cost}")
+                yield Finding("remark", "uncompiled", f"laws that remember are not compiled: {cost}")
             continue
         for text in outside(plugin)[:1]:
             message = f"{plain(text)}, which is not compiled: {cost} (docs/plugins.md, the subset)"
-            yield Finding("note", "uncompiled", message)
+            yield Finding("remark", "uncompiled", message)
 
 
 SUBJECTS: Final = (

@@ -10,14 +10,14 @@ import msgspec
 
 from experiments.file.problems import Path
 
-Severity = Literal["error", "warning", "note"]
+Severity = Literal["error", "warning", "remark", "note"]
 
 SHOWN_FINDINGS: Final = 5  # findings of one sort; the others are counted
 NOT_RANDOM: Final = "not-random"  # code of the warning that no seed changes anything
 DEVICE: Final = "device"  # code of what bodies say of the devices of their robots
 FORGIVEN: Final = 1e-6  # of rounding
 DELAYED: Final = 1.2  # times the acquisition without noise, from which on the one with noise is given as well
-MARK: Final[dict[Severity, str]] = {"error": "✗", "warning": "!", "note": "✓"}
+MARK: Final[dict[Severity, str]] = {"error": "✗", "warning": "!", "remark": "·", "note": "✓"}
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Finding:
     """Finding on an experiment.
 
     Attributes:
-        severity: Error: it cannot work; warning: it may not do what was meant; note: good news, or a reason.
+        severity: Error: it cannot work; warning: it may not do what was meant; remark: what it costs; note: good news.
         code: One word for programs (docs/check.md).
         message: What it is, with numbers.
         remedy: What to change; empty for notes.

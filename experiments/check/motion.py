@@ -30,16 +30,17 @@ CLEARANCE: Final = 0.1  # [m] between one robot's top and another's bottom
 NEARLY: Final = 0.9  # of its speed: the rest is needed to catch up
 LATE: Final = 0.25  # share of a run, at its end, in which a formation must be at rest
 SWINGS: Final = 6.0  # ways of an error there, as multiples of its range, that make it an oscillation
+WIDE: Final = 0.01  # [m] smaller swings of a law that has no tolerance are its trigger's
 SETTLED: Final = 1e-3  # [m] travel per decision below which robots are at rest, and in `WINDOW_S` one on wheels stands
 
 
 def starts(analysis: Analysis) -> Iterator[Finding]:
     """Check that robots start inside the arena and clear of one another; flying ones too start on the floor."""
     names, limits, start = analysis.plan.names, analysis.limits, analysis.start[:, :2]
-    inside = np.minimum(start - limits.low[:2], np.array(limits.high[:2]) - start).min(axis=1)
+    inside = np.minimum(start - limits.low[:2], np.array(limits.high[:2]) - start).min(axis=1) - _radii(analysis)
     problems = []
     for row in np.flatnonzero(inside < limits.margin - FORGIVEN):
-        wall = f"{max(0.0, inside[row]):.2f} m from a wall"
+        wall = f"{inside[row]:.2f} m from a wall" if inside[row] >= 0.0 else "in a wall"
         message = f"{names[row]} starts {wall}, inside the margin of {limits.margin:g} m"
         remedy = "start it farther inside, or reduce margin in [safety]"
         problems.append(Finding("warning", "start-margin", message, remedy, ("robots", names[row], "start")))
@@ -56,9 +57,14 @@ def starts(analysis: Analysis) -> Iterator[Finding]:
 
 def _overlap_at_start(analysis: Analysis) -> Mask:
     """(N, N) whether two robots are too near to stand side by side at the start."""
-    start, radius = analysis.start, np.array([kind.radius for kind in analysis.plan.kinds])
+    start, radius = analysis.start, _radii(analysis)
     near: Mask = norm(start[:, None] - start) < radius[:, None] + radius - FORGIVEN
     return near & ~np.eye(len(start), dtype=bool)
+
+
+def _radii(analysis: Analysis) -> Array:
+    """(N,) [m]."""
+    return np.array([kind.radius for kind in analysis.plan.kinds])
 
 
 def flight(analysis: Analysis) -> Iterator[Finding]:
@@ -87,7 +93,8 @@ def _cut(analysis: Analysis) -> bool:
 
 def formation(analysis: Analysis) -> Iterator[Finding]:
     """Check that the formation is acquired, and kept at the end, without noise or with it."""
-    for finding in _formation(analysis):
+    found = _formation(analysis) if analysis.is_gradient else _swings(analysis)
+    for finding in found:
         yield noise.with_noise(analysis, finding)
 
 
@@ -130,11 +137,7 @@ def _formation(analysis: Analysis) -> Iterator[Finding]:
     elif (stopped := _stopped(analysis, -1, f"{left} {allowed}")) is not None:
         yield stopped
     elif analysis.stages[-1][0].worst > OFF:
-        message = f"from these starts the robots end in another shape, a local minimum: {left} {allowed}"
-        remedy = "start them nearer to the shape, in the order in which they stand in it"
-        if turned := _on_the_wrong_side(analysis):
-            message, remedy = f"{message}; {turned[0]}", turned[1]
-        yield Finding("warning", "local-minimum", message, remedy, ("formation", "links"))
+        yield _another_shape(analysis, f"{left} {allowed}")
     elif np.ptp(prediction.position[-2:, analysis.without_neighbours], axis=0).max(initial=0.0) > SETTLED:
         message = f"the formation lags behind its leader: {left} {allowed}"
         remedy = f"lead more slowly, or raise {strength(analysis)[0]} or the clamp"
@@ -150,15 +153,54 @@ def _formation(analysis: Analysis) -> Iterator[Finding]:
         yield Finding("warning", "not-acquired", message, remedy, ("duration_s",))
 
 
+def _another_shape(analysis: Analysis, left: str) -> Finding:
+    """Finding that the robots end in a shape that does not meet their targets, stable or not."""
+    message = f"from these starts the robots end in another shape, a local minimum: {left}"
+    remedy = "start them nearer to the shape, in the order in which they stand in it"
+    if analysis.grows_at(analysis.prediction.position[-1]):
+        message = f"from these starts the robots balance in another shape, which a touch ends: {left}"
+        remedy = "move the start of one of them off the line on which they stand; noise does it in time"
+    elif turned := _on_the_wrong_side(analysis):
+        message, remedy = f"{message}; {turned[0]}", turned[1]
+    return Finding("warning", "local-minimum", message, remedy, ("formation", "links"))
+
+
+def _swings(analysis: Analysis) -> Iterator[Finding]:
+    """Check that no law that remembers, or gives velocities, swings to the end: its links have no error to look at."""
+    links, position = analysis.plan.links, analysis.prediction.position
+    if analysis.prediction.stuck or not len(links):
+        return
+    begin, swinging, ranges = _late_swings(analysis, norm(position[:, links.receiver] - position[:, links.sender]))
+    swinging &= ranges > WIDE
+    if swinging.any():
+        time, link = analysis.prediction.time, int(np.where(swinging, ranges, 0.0).argmax())
+        message = (
+            f"the robots oscillate to the end: from {time[begin]:.0f} to {time[-1]:.0f} s the distance of "
+            f"{analysis.link(link)} swings by {1e3 * ranges[link]:.0f} mm"
+        )
+        remedy = f"let the law '{analysis.plan.law_name}' ask for less, decide more often, or let bodies lag less"
+        yield Finding("warning", "keeps-oscillating", message, remedy, ("formation", "law"))
+
+
+def _late_swings(analysis: Analysis, lengths: Array) -> tuple[int, Mask, Array]:
+    """First of the last samples, mask of the lengths (T, E) that change to and fro from there on, and ranges (E,) [m].
+
+    None of them while leaders move.
+    """
+    time = analysis.prediction.time
+    begin = int(np.argmax(time >= (1.0 - LATE) * time[-1]))
+    late, led = lengths[begin:], analysis.prediction.position[begin:, analysis.without_neighbours]
+    ways, ranges = np.abs(np.diff(late, axis=0)).sum(axis=0), np.ptp(late, axis=0)
+    still = np.ptp(led, axis=0).max(initial=0.0) <= SETTLED
+    return begin, (ways > SWINGS * ranges) & still, ranges
+
+
 def _oscillation(analysis: Analysis) -> Finding | None:
     """Finding that a link is longer and shorter in turn to the end, by more than the tolerance; leaders stand then."""
     time, tolerance = analysis.prediction.time, analysis.plan.experiment.tolerance
-    begin = int(np.argmax(time >= (1.0 - LATE) * time[-1]))
-    late, led = analysis.error[begin:], analysis.prediction.position[begin:, analysis.without_neighbours]
-    if np.ptp(led, axis=0).max(initial=0.0) > SETTLED:
-        return None
-    ways, ranges = np.abs(np.diff(late, axis=0)).sum(axis=0), np.ptp(late, axis=0)
-    swinging = (ways > SWINGS * ranges) & (ranges > tolerance / 2) & (late.max(axis=0) > tolerance)
+    begin, swinging, ranges = _late_swings(analysis, analysis.error)
+    late = analysis.error[begin:]
+    swinging &= (ranges > tolerance / 2) & (late.max(axis=0) > tolerance)
     if not swinging.any():
         return None
     link = int(np.where(swinging, ranges, 0.0).argmax())
@@ -241,7 +283,8 @@ def walls(analysis: Analysis) -> Iterator[Finding]:
     names, limits, track = analysis.plan.names, analysis.limits, analysis.prediction.position
     beyond = np.maximum(track - limits.high, limits.low - track)  # (T, N, 3), positive outside
     outside = beyond.max(axis=2) > FORGIVEN
-    tight = beyond[..., :2].max(axis=2) > FORGIVEN - limits.margin
+    beside = beyond[..., :2].max(axis=2) + _radii(analysis)  # (T, N), surfaces
+    tight = beside > FORGIVEN - limits.margin
     tight &= ~tight[0]  # a start there is a finding of `starts`
     problems = [_left_arena(analysis, int(row), outside[:, row]) for row in np.flatnonzero(outside.any(axis=0))]
     for row in np.flatnonzero(tight.any(axis=0) & ~outside.any(axis=0)):
@@ -278,7 +321,7 @@ def encounters(analysis: Analysis) -> Iterator[Finding]:
             yield Finding("note", "avoidance-acts", f"{message}: avoidance will have to act", "", path)
     if _cut(analysis) or analysis.prediction.stuck:
         return
-    final, radius = analysis.prediction.position[-1], np.array([kind.radius for kind in kinds])
+    final, radius = analysis.prediction.position[-1], _radii(analysis)
     heard = adjacency(analysis.plan.links, len(names)) > 0
     for row in np.flatnonzero([kind.flies for kind in kinds]):
         below = (final[:, 2] < final[row, 2] - FORGIVEN) & (norm(final[:, :2] - final[row, :2]) < radius + radius[row])

@@ -313,6 +313,9 @@ def law(analysis: Analysis) -> Iterator[Finding]:
     plan, path = analysis.plan, ("formation", "law")
     channel = plan.experiment.channel
     losses = [channel.loss, *(each.loss or 0.0 for each in channel.links.values())]
+    if channel.loss >= 1.0 and len(plan.links):
+        message, remedy = "no message ever arrives: all of them are lost", "give a loss below 1, such as 0.2"
+        yield Finding("error", "all-lost", message, remedy, ("channel", "loss"))
     if plan.law.SAYS and max(losses) > 0.0 and math.isinf(plan.trigger.maximum_silence_s) and not plan.trigger.TIMED:
         message = "messages are lost, and the trigger may stay silent for ever: what was said last is not repeated"
         remedy = "give the trigger maximum_silence_s, such as 1.0"

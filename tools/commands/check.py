@@ -211,7 +211,7 @@ def _print_table(verdict: Verdict) -> None:
     lines = [f"{verdict.path}: {verdict.title}", ""]
     for each in verdict.findings:
         lines += textwrap.wrap(each.message, width, initial_indent=f"{MARK[each.severity]} ", subsequent_indent="  ")
-        if each.severity != "note":
+        if each.severity in {"error", "warning"}:
             remedy = f"{each.where}: {each.remedy}" if each.where else each.remedy
             lines += textwrap.wrap(
                 remedy, width, initial_indent="    ", subsequent_indent="    ", break_on_hyphens=False
@@ -232,6 +232,8 @@ def _rows(numbers: Mapping[str, CheckNumbers]) -> list[str]:
     lines = []
     for label in next(iter(worded.values())):
         values = {name: words[label] for name, words in worded.items()}
+        if set(values.values()) == {"-"}:  # it has no meaning for this law
+            continue
         same = len(set(values.values())) == 1
         shown = next(iter(values.values())) if same else ", ".join(f"{name} {word}" for name, word in values.items())
         lines.append(f"  {label:<36}{shown}")

@@ -371,7 +371,7 @@ def sound(
 
         verdict = Verdict(str(read.path), read.experiment.title, check(read, cases), None)
         kept.keep(verdict)
-    found = [finding for finding in verdict.findings if finding.severity != "note"]
+    found = [finding for finding in verdict.findings if finding.severity in {"error", "warning"}]
     if not real:
         found = [finding for finding in found if finding.code != DEVICE]
     if seeds == 1:

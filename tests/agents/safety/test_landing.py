@@ -242,6 +242,6 @@ def test_no_robot_gets_beyond_a_wall(kind, axis, side, latency_s):
         if robot.lifecycle.start_at == inf:
             robot.start(swarm.t + 0.1)
         if swarm.phase("R") == RUNNING:
-            beyond.append(side * (swarm.last("R", "truth")[axis] - wall))
+            beyond.append(side * (swarm.last("R", "truth")[axis] - wall) + (axis < 2) * KINDS[kind].radius)
     assert swarm.phase("R") == RUNNING, robot.lifecycle.reason
     assert -0.1 < max(beyond) < 0.001

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from agents.body.interface import BodyState
 from agents.body.kinds import KINDS
@@ -28,7 +29,10 @@ STOP, AHEAD, SLOW = (0.0, 0.0, 0.0, 0.0), (0.3, 0.0, 0.0, 0.0), (0.1, 0.0, 0.0, 
 
 
 def filtered(kind, position, *, yaw=0.0, age=0.0, limits=LIMITS):
-    made, now = SetpointFilter(kind, limits), Situation()
+    """Walls of an arena that is wider by the radius of this kind: what is left of it is there for its centre."""
+    (x, y, z), (far_x, far_y, top), r = limits.low, limits.high, kind.radius
+    wide = replace(limits, low=(x - r, y - r, z), high=(far_x + r, far_y + r, top))
+    made, now = SetpointFilter(kind, wide), Situation()
     now.state = BodyState(-age, position, (0.0, 0.0, 0.0), yaw)
     now.begin(0.0)
     made.judge(now)
@@ -122,6 +126,7 @@ def test_far_outside_is_outside_for_sure(axis, side):
     for beyond, escaped in ((OUTSIDE_M - 0.01, False), (OUTSIDE_M + 0.01, True)):
         place = [0.0, 0.0, 1.25]
         place[axis] = (LIMITS.high[axis] if side > 0 else LIMITS.low[axis]) + side * beyond
+        place[axis] += side * CRAZYFLIE.radius if axis < 2 else 0.0
         _, now = filtered(CRAZYFLIE, tuple(place))
         assert (now.outside, now.invalid, now.sound, now.flyaway) == (escaped, False, False, False)
         assert now.excess == pytest.approx(beyond)
@@ -129,8 +134,8 @@ def test_far_outside_is_outside_for_sure(axis, side):
 
 
 def test_sound_pose_clears_what_was_judged_before():
-    made, now = filtered(CRAZYFLIE, (3.0, 0.0, 1.0))
-    assert (now.outside_wall, now.outside, now.flyaway, now.excess) == (True, True, True, 2.0)
+    made, now = filtered(CRAZYFLIE, (3.0 + CRAZYFLIE.radius, 0.0, 1.0))
+    assert (now.outside_wall, now.outside, now.flyaway, now.excess) == (True, True, True, pytest.approx(2.0))
     for position, sound in (((nan, 0.0, 1.0), False), ((0.0, 0.0, 1.0), True)):
         now.position = position
         made.judge(now)

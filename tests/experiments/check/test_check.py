@@ -118,7 +118,7 @@ def test_remedy_for_a_users_law_names_the_law(monkeypatch, law, code, message, r
     found = findings(document.read(TRIANGLE, ["formation.law=mine", "duration_s=1"]), ["event"])[code]
     assert message in found.message
     assert remedy in found.remedy
-    assert (found.severity == "note") == (code == "uncompiled")
+    assert (found.severity == "remark") == (code == "uncompiled")
 
 
 @pytest.mark.parametrize(
@@ -138,6 +138,7 @@ def test_remedy_for_a_users_law_names_the_law(monkeypatch, law, code, message, r
         ("formation.gain=8", ("warning", "oscillates"), "", "below 6.8"),  # of links without drones
         ("formation.gain=12", ("error", "unstable"), "", "below 6.8"),
         ("rates.pose_hz=5", ("warning", "decides-unheard"), "at 5 Hz at most", "pose_hz"),
+        ("channel.loss=1", ("error", "all-lost"), "no message ever arrives", "below 1"),
         ('formation.links={ "TB01 - KH01" = 600 }', ("error", "too-long"), "millimetres?", "write 0.6"),
     ],
 )

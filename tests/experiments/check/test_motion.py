@@ -144,6 +144,16 @@ LARGE = Arena(size=(6.0, 6.0, 2.0))
 CROSSING = [line_of("A", 0.6, 0.6, 0.1), line_of("B", -0.6, 0.6, 0.1)]  # they meet half-way
 
 
+LINE = {name: RobotTable(kind="point", start=[x, 0.0]) for name, x in (("A", -0.7), ("B", 0.0), ("C", 0.7))}
+TRIPLE = {"A - B": 1.0, "B - C": 1.0, "A - C": 1.0}
+RING = {f"R{k}": robot(0.6 * x, 0.6 * y, 0.8) for k, (x, y) in enumerate(((1, 0.1), (-1, 0.1), (0.1, 1), (0.1, -1)))}
+PLACES = {"R0": [0.5, 0.0], "R1": [-0.5, 0.0], "R2": [0.0, 0.5], "R3": [0.0, -0.5]}
+FAST = Formation(
+    law={"kind": "consensus", "gain": 0.65, "offset": PLACES},
+    links={f"R{i} - R{j}": LinkTable() for i, j in ((0, 1), (0, 2), (0, 3), (1, 2), (2, 3))},
+)
+
+
 def low(hover: float, top: float) -> Experiment:
     """A Crazyflie overshoots its take-off by up to 11 %."""
     return small({"F": robot(0.0, 0.0, hover)}, arena=Arena(size=(4.0, 4.0, top)), duration_s=5.0)
@@ -170,7 +180,13 @@ BESIDE = small({"G": robot(0.0, 0.0), "F": robot(0.5, 0.0, 0.8)}, {"G > F": 0.80
         (small(LANDING, {"G - H": 0.7}, duration_s=30.0, arena=LARGE), "warning", "lands-on",
          "F ends above G, from which it receives no poses, and would land on it", ""),
         (small(GROUND, timeline=[line_of("A", -2.97, 0.0, 0.1)], duration_s=60.0, arena=LARGE), "warning",
-         "near-wall", "A comes within the margin of 0.05 m of a wall at 32.", ""),
+         "near-wall", "A comes within the margin of 0.05 m of a wall at 30.", ""),
+        (small({"A": robot(0.0, 0.0, 0.8, "tello")}, timeline=[line_of("A", 2.9, 0.0, 0.2)], arena=LARGE,
+               duration_s=25.0), "warning", "near-wall", "A comes within the margin of 0.05 m", "held back"),
+        (small(LINE, TRIPLE, duration_s=5.0, tolerance=0.01), "warning", "local-minimum",
+         "the robots balance in another shape", "off the line"),
+        (small(RING, formation=FAST, duration_s=20.0), "warning", "keeps-oscillating",
+         "the robots oscillate to the end: from 15 to 20 s", "the law 'consensus'"),
         (low(1.0, 1.05), "warning", "overshoots-arena", "to 1.11 m", "hover at 0.94 m at most"),
         (low(0.94, 1.05), None, "overshoots-arena", "", ""),
     ],
