@@ -30,6 +30,7 @@ class Keys:
     realm: str = "park"
 
     # of each robot, by its name
+
     pose = _robot_key("pose")  # for the neighbours, sent when the trigger says so
     state = _robot_key("state")  # telemetry for recorder and viewers
     memory = _robot_key("memory")  # likewise, of laws that remember
@@ -44,16 +45,19 @@ class Keys:
     below = _robot_key("**")  # all keys of a robot, or of `world`, `run` or `centre`
 
     # of the world and the central controller; `state` and `alive` belong to robots only
-    world = _RealmKey("world/report")  # pace, pauses, contacts
+
+    world = _RealmKey("world/report")  # pace, pauses and contacts of the world
     world_order = _RealmKey("world/order")  # queryable: pause, resume, reset
     contact = _RealmKey("world/contact")  # every contact in the world, when it begins
+    world_event = _RealmKey("world/event")  # contacts, refused commands, and robots that the world lands
     world_alive = _RealmKey("world/here")  # liveliness token
     centre = _RealmKey("centre/report")  # guided robots, load, counters
     centre_alive = _RealmKey("centre/here")  # liveliness token
 
     # of the run
+
     estop = _RealmKey("estop")  # emergency stop for all robots
-    event = _RealmKey("run/event")  # phases, losses, orders
+    event = _RealmKey("run/event")  # phases, losses, orders: the operator's, as all below `run`
     experiment = _RealmKey("run/experiment")  # as it runs, late joiners included
     conductor = _RealmKey("run/conductor")  # liveliness token
     run_order = _RealmKey("run/order")  # queryable: remove, restart, replace, add robots

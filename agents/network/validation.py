@@ -9,7 +9,19 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from agents.network.messages import STILL, Command, Goal, Malformed, Pose, Position, Ranges, State, Variable, Vector
+from agents.network.messages import (
+    STILL,
+    Command,
+    Event,
+    Goal,
+    Malformed,
+    Pose,
+    Position,
+    Ranges,
+    State,
+    Variable,
+    Vector,
+)
 
 FUTURE_S: Final = 5.0  # a stamp further ahead comes from a wrong clock or a forgery, and would suppress correct samples
 MAX_SPEED: Final = 50.0  # [m/s]; nothing here moves faster
@@ -18,6 +30,7 @@ MAX_NUMBERS: Final = 64  # that a robot says beside its pose
 ENORMOUS: Final = 1e12  # no variable of a law is that large, whatever its unit
 MAX_RAYS: Final = 720  # of one sweep; the finest scanner here has 360
 MAX_RANGE: Final = 100.0  # [m]; no range sensor here sees farther
+WORLD: Final = "world"  # source of all events of the world
 REACH_M: Final = 1.0  # a position farther outside the arena is refused
 MAX_YAW: Final = 1e3  # [rad]; ours is within ±π, other programs may count on over full turns
 
@@ -52,6 +65,12 @@ def check_state(state: State, *, now: float, valid_box: Vector) -> None:
     if state.position is not None:
         _refuse_place(state.position, valid_box)
     _refuse_motion(state.velocity, state.yaw)
+
+
+def check_world_event(event: Event) -> None:
+    """Refuses an event of the world in the name of another."""
+    if event.source != WORLD:
+        raise Malformed(f"event of '{event.source}' on the key of the world")
 
 
 def check_position(measured: Position, *, now: float, valid_box: Vector) -> None:

@@ -102,7 +102,7 @@ def _roles(plan: Plan, keys: Keys) -> dict[str, Grant]:
             watch=everything,
         ),
         "world": Grant(
-            publish=[keys.below("world"), keys.event, *_key_per_name(far, keys.position, keys.truth), *ranges],
+            publish=[keys.below("world"), *_key_per_name(far, keys.position, keys.truth), *ranges],
             subscribe=[keys.setpoint("*"), keys.status("*"), keys.state("*"), keys.estop],
             answer=[keys.world_order],
             tokens=[keys.below("world")],

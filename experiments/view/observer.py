@@ -15,7 +15,7 @@ import zenoh
 
 from agents.clock import Clock
 from agents.decision.lifecycle import Phase
-from agents.network import messages, pubsub
+from agents.network import messages, pubsub, validation
 from agents.network.keys import Keys
 from agents.network.session import received
 from experiments.file import document
@@ -80,6 +80,7 @@ class Observer:
             pubsub.pose_subscriber(session, keys.status("*"), 1024), messages.Status, keys=keys
         )
         self._told = pubsub.Inbox(pubsub.pose_subscriber(session, keys.event, 256, pubsub.EVENTS), messages.Event)
+        self._of_world = pubsub.Inbox(pubsub.subscriber(session, keys.world_event, 256), messages.Event)
         self._worlds = pubsub.Inbox(pubsub.subscriber(session, keys.world, 8), messages.WorldState)
         self._contacts = pubsub.Inbox(pubsub.subscriber(session, keys.contact, 256), messages.Contact)
         self._watch = pubsub.AliveWatch(session, keys.alive("*"))
@@ -114,6 +115,7 @@ class Observer:
                 report = self._report(name)
                 report.sent_at, report.sent = now, report.sent + 1
         self.events.extend(self._told.read())
+        self.events.extend(self._of_world.read(validation.check_world_event))
         for world in self._worlds.read():
             self.world = world
         if self._ranges is not None:

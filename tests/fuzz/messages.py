@@ -56,6 +56,7 @@ def of_all():
     return {
         KEYS.estop: [messages.Stop("a test", "to see")],
         KEYS.event: [messages.Event(now, "phase", "conductor", "landing")],
+        KEYS.world_event: [messages.Event(now, "contact", "world", "KH01 touches KH02 (0.1 N s)")],
         KEYS.contact: [messages.Contact(now, "KH01", "wall", 0.1, 0.001)],
         KEYS.world: [messages.WorldState(now, "pymunk", 1.0, 1.0, 0.1, False, ["KH01"], ["CF01"], [box])],
         KEYS.centre: [messages.CentreState(now, ["KH01"], ["KH02"], received={"KH01": 2}, lost={"KH01": 1})],

@@ -40,7 +40,7 @@ class Desk(Watcher):
         super().__init__(endpoint)
         self.at = self.newest(KEYS.position("*"), messages.Position)
         self.ranges = self.newest(KEYS.ranges("*"), messages.Ranges)
-        self.events = self.every(KEYS.event, messages.Event)
+        self.events = self.every(KEYS.world_event, messages.Event)
         self.worlds = self.every(KEYS.world, messages.WorldState, pubsub.pose_subscriber)
         self._seq = round(time.time() * 1e3)
 
@@ -180,7 +180,8 @@ def test_robots_without_commands_hold_and_then_land(world, desk):
     desk.until(lambda: desk.x("TE01")[2] == 0.0 and desk.x("CF01")[2] == 0.0, "they land")
     assert -0.95 < desk.x("TE01")[0] < -0.55, "half a second at 0.4 m/s, and what it takes to stop"
     assert 0.2 < desk.x("CF01")[0] < 0.6, "where it was when it had not been told anything for half a second"
-    assert {event.source for event in desk.events if event.kind == "silent"} == {"CF01", "TE01"}
+    assert {event.source for event in desk.events} == {"world"}
+    assert {event.text.split()[0] for event in desk.events if event.kind == "silent"} == {"CF01", "TE01"}
 
 
 @pytest.mark.usefixtures("world")

@@ -17,14 +17,14 @@ import msgspec
 import zenoh
 
 from agents.clock import Clock
-from agents.network import messages, pubsub
+from agents.network import messages, pubsub, validation
 from agents.network import session as network
 from agents.network.keys import Keys
 from agents.network.messages import M
 from agents.network.shutdown import AFTER_S, end
 from agents.runtime import command_line
 from experiments.real_time.processes.joining import Launch, joined
-from experiments.recording.topics import DEPTH, SPOKEN, TOPICS, Message, Topic
+from experiments.recording.topics import DEPTH, RARE, SPOKEN, TOPICS, Message, Topic
 from experiments.recording.writer import Recording
 from experiments.scene import markers
 
@@ -46,6 +46,7 @@ class Recorder:
         self.alive: set[str] = set()  # tokens of the robots that are left
         topics = [topic for topic in TOPICS if topic is not SPOKEN]
         self._inboxes = [(topic, self._inbox(self._subscribe(topic), topic.message)) for topic in topics]
+        self._world_events = self._inbox(pubsub.subscriber(session, keys.world_event, RARE), messages.Event)
         self._truths = self._inbox(pubsub.subscriber(session, keys.truth("*"), DEPTH), messages.Position)
         self._truth: dict[str, deque[messages.Position]] = {}
         self._waiting: dict[str, deque[tuple[float, messages.State]]] = {}  # for truth, since when
@@ -61,6 +62,8 @@ class Recorder:
         for topic, inbox in self._inboxes:
             for message, sample in inbox.read_samples(_require_finite if topic.finite else None):
                 self._store(topic, message, len(sample.payload))
+        for event in self._world_events.read(validation.check_world_event):
+            self._recording.write(event)
         now = time.monotonic()
         for robot, waiting in self._waiting.items():
             truths = self._truth[robot]

@@ -145,7 +145,7 @@ class WorldProcess:
                     self.paused = order.order == "pause"
             except Refusal as refusal:
                 reason = str(refusal)
-                self.events.refuse("world", f"{order.order}: {reason}")
+                self.events.refuse(f"{order.order}: {reason}")
             reply = messages.WorldReply(not reason, self.paused, round(self._population.time, 6), reason)
             query.reply(self._keys.world_order, messages.encode(reply), encoding=messages.JSON)
             return not reason

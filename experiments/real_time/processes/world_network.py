@@ -47,16 +47,16 @@ class Events:
         self.malformed = 0  # refused payloads
         self.trouble = ""  # last refusal; empty if there was none
         self._clock = clock
-        self._publisher = pubsub.publisher(joint.session, joint.keys.event, messages.JSON)
+        self._publisher = pubsub.publisher(joint.session, joint.keys.world_event, messages.JSON)
 
-    def publish(self, kind: str, source: str, text: str) -> None:
-        print(f"{kind} {source}: {text}", flush=True)
-        self._publisher.put(messages.encode(messages.Event(self._clock.utc(), kind, source, text)))
+    def publish(self, kind: str, text: str) -> None:
+        print(f"{kind}: {text}", flush=True)
+        self._publisher.put(messages.encode(messages.Event(self._clock.utc(), kind, validation.WORLD, text)))
 
-    def refuse(self, source: str, reason: str) -> None:
+    def refuse(self, reason: str) -> None:
         self.refused += 1
         self.trouble = reason
-        self.publish("refused", source, reason)
+        self.publish("refused", reason)
 
     def count_malformed(self, _key: str, reason: str) -> None:
         self.malformed += 1
@@ -135,7 +135,7 @@ class Commands:
         if tired:
             body.land(tired)
             for row in tired:
-                self._events.publish("silent", population.names[row], f"lands: no command for {LAND_S:g} s")
+                self._events.publish("silent", f"{population.names[row]} lands: no command for {LAND_S:g} s")
         if any(isfinite(setpoint[0]) for setpoint in self._given):
             body.command(self._given)
             self._given = [NO_SETPOINT] * len(population.names)
@@ -175,7 +175,7 @@ class Commands:
         if name not in self._strangers and len(self._strangers) < STRANGERS:
             self._strangers.add(name)
             text = f"{name} gets commands, but is not in this world: start the world with the experiment that has it"
-            self._events.publish("refused", "world", text)
+            self._events.publish("refused", text)
         return False
 
 
@@ -321,7 +321,8 @@ class Publications:
             pair = frozenset((contact.first, contact.second))
             if pair not in self._met:
                 self._met.add(pair)
-                self._events.publish("contact", contact.first, f"touches {contact.second} ({contact.impulse:.3g} N s)")
+                who = f"{contact.first} touches {contact.second}"
+                self._events.publish("contact", f"{who} ({contact.impulse:.3g} N s)")
 
 
 @dataclass(slots=True)

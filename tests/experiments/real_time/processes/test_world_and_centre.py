@@ -33,6 +33,7 @@ from experiments.real_time.processes.centre import CentreProcess
 from experiments.real_time.processes.recorder import AFTER_S, Recorder, with_truth
 from experiments.real_time.processes.world import WorldProcess
 from experiments.real_time.processes.world_population import WorldBodies
+from experiments.view.observer import Observer
 from tests.experiments.recordings import START, state, touched, world_state
 from tests.fuzz.messages import sent
 from tests.network import Attentive, Mute, Net, Reply, Sample
@@ -344,6 +345,27 @@ def test_recorder_keeps_plausible_messages_of_the_world():
             recorder.report_malformed(last=last)
     told = [(event.kind, event.source, event.text.split(" on ")[1].split(": ")[0]) for event in taken]
     assert sorted(told) == [("unread", "recorder", key) for key in sorted((KEYS.contact, KEYS.world))]
+
+
+def test_world_speaks_for_itself_alone():
+    forged = messages.Event(START, "lost", "KH01", "is not on the network any more")
+    told = messages.Event(START, "contact", "world", "KH01 touches KH02 (0.1 N s)")
+    for reader in ("recorder", "view"):
+        with Net().worn() as net:
+            taken = []
+            made = (
+                Recorder(net.session, KEYS, types.SimpleNamespace(write=taken.append))
+                if reader == "recorder"
+                else Observer(net.session, KEYS)
+            )
+            for event in (forged, changed(forged, source="conductor"), told):
+                net.deliver(sent(KEYS.world_event, event)[0])
+            if isinstance(made, Observer):
+                made.update()
+                taken = [*made.events]
+            else:
+                made.receive()
+            assert taken == [told], reader
 
 
 def test_truth_at_a_state_is_interpolated_between_neighbours():
