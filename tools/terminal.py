@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
+import select
 import sys
 from collections.abc import Collection, Iterator
 from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout, suppress
-from typing import Any, TextIO, cast
+from typing import Any, Final, TextIO, cast
 from unicodedata import category
 
 
@@ -30,11 +31,15 @@ def listed(names: Collection[str], most: int) -> str:
     return first if len(names) <= most else f"{first} and {len(names) - most} more (--json names all)"
 
 
+STALL_S: Final = 0.2  # wait for a reader of progress that stands still
+
+
 class _Lasting:
     """Stream that drops what cannot be written: its reader has gone, or its disk is full."""
 
-    def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
+    def __init__(self, stream: TextIO, *, waits: bool) -> None:
+        """`waits`: for a reader that stands still, however long; else what comes meanwhile is dropped."""
+        self._stream, self._waits = stream, waits
 
     def __getattr__(self, name: str) -> Any:  # noqa: ANN401 - whatever the stream has
         return getattr(self._stream, name)
@@ -42,13 +47,23 @@ class _Lasting:
     def write(self, text: str) -> int:
         """Write a text, or drop it."""
         with self._dropping():
-            self._stream.write(text)
+            if self._waits or self._is_read():
+                self._stream.write(text)
         return len(text)
 
     def flush(self) -> None:
         """Flush, or drop what is left."""
         with self._dropping():
             self._stream.flush()
+
+    def _is_read(self) -> bool:
+        """Whether the reader takes more: a terminal may be stopped, and a pipe full."""
+        try:
+            waiting = select.poll()
+            waiting.register(self._stream.fileno(), select.POLLOUT)
+        except (OSError, ValueError):  # no file
+            return True
+        return bool(waiting.poll(1e3 * STALL_S))
 
     @contextmanager
     def _dropping(self) -> Iterator[None]:
@@ -61,8 +76,8 @@ class _Lasting:
 
 @contextmanager
 def lasting_console() -> Iterator[None]:
-    """Inside, whatever is printed cannot end the process: robots fly on without a console."""
+    """Inside, whatever is printed cannot end the process, and no progress stops it: robots fly on without a console."""
     with ExitStack() as both:
-        both.enter_context(redirect_stdout(cast(TextIO, _Lasting(sys.stdout))))
-        both.enter_context(redirect_stderr(cast(TextIO, _Lasting(sys.stderr))))
+        both.enter_context(redirect_stdout(cast(TextIO, _Lasting(sys.stdout, waits=True))))
+        both.enter_context(redirect_stderr(cast(TextIO, _Lasting(sys.stderr, waits=False))))
         yield

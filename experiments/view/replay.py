@@ -311,7 +311,7 @@ def marks(films: Sequence[Film]) -> tuple[Any, ...]:
     found: dict[float, Any] = {}
     for film in films:
         for event in film.tracks.events:
-            if event.kind in ("hazard", "lost", "stop", "order", "contact") and begin <= event.stamp <= end:
+            if event.kind in ("hazard", "lost", "failed", "stop", "order", "contact") and begin <= event.stamp <= end:
                 found[round(event.stamp, 1)] = round(event.stamp, 2)
     last = -inf
     for stamp, text in worded:

@@ -1,5 +1,6 @@
 """What a terminal shows: text that cannot steer it, progress, the consent before files of others touch machines."""
 
+import contextlib
 import io
 import os
 import sys
@@ -103,6 +104,20 @@ def test_console_that_goes_away_ends_nothing(kind, monkeypatch):
             print_result({}, "two", as_json=False)
         assert sys.stderr is gone
         print("at the end", flush=True)  # of the process, which must not change the exit code
+
+
+def test_console_that_stands_still_stops_no_run(monkeypatch):
+    """As `less` that nobody scrolls, or a stopped terminal: Ctrl-C would not land the robots."""
+    read, write = os.pipe()
+    os.set_blocking(write, False)
+    with contextlib.suppress(BlockingIOError):
+        while True:
+            os.write(write, b"x" * 4096)
+    os.set_blocking(write, True)
+    with os.fdopen(read, "rb"), os.fdopen(write, "w", buffering=1) as full, monkeypatch.context() as patched:
+        patched.setattr(sys, "stderr", full)
+        with lasting_console():
+            say("dropped", to=sys.stderr)  # without that it waits for ever
 
 
 @pytest.mark.parametrize("kind", [Lines, ProgressTable])
