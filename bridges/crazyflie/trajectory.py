@@ -29,7 +29,8 @@ from agents.protocols.crtp import HighLevel, Port
 HOLD_S: Final = 1.0  # at least, before the descent
 SINK: Final = 0.3  # [m/s] of the descent
 BELOW: Final = -1.0  # [m] height at its end: below any floor, because only an order to land stops the motors
-STOP_SINK: Final = 0.15  # [m/s²] of a descent that ends in a stop: accelerometers are wrong by less than 15 mg
+STOP_SINK: Final = 0.15  # [m/s²] of a descent that ends in a stop
+WRONG: Final = 0.05  # [m/s²] error of an accelerometer with which it still ends on the floor: 5 mg
 STOP_STEP: Final = 0.5  # [m] heights between which its duration is the same, and is not written again
 STOP_S: Final = 2.0  # from its end until the firmware stops and locks the motors
 FARTHEST: Final = 32.0  # [m] from the origin in a compressed trajectory
@@ -54,10 +55,14 @@ Target = tuple[float, float, float, float]  # x, y, z [m], yaw [rad]
 Send = Callable[[Port, int, bytes], None]
 
 
-def stop_descent_s(height: float) -> float:
-    """Duration [s] of a descent that ends in a stop from a height [m], as deep below the floor as it was above."""
-    top = STOP_STEP * math.ceil(height / STOP_STEP)
-    return math.sqrt(2.0 * (max(top, SHORTEST_S) + max(top, -BELOW)) / STOP_SINK)
+def stop_descent_s(height: float, before: float = 0.0) -> float:
+    """Duration [s] of a descent that ends in a stop from a height [m], `before` [s] after the last position.
+
+    STOP_SINK T² / 2 = height + WRONG (before + T + STOP_S)² / 2: at the stop a wrong accelerometer has not lifted it.
+    """
+    top, since = max(STOP_STEP * math.ceil(height / STOP_STEP), STOP_STEP), before + STOP_S
+    speed, rest = WRONG * since, STOP_SINK - WRONG
+    return (speed + math.sqrt(speed * speed + rest * (2.0 * top + speed * since))) / rest
 
 
 def rest_to_rest(begin: float, end: float, span: float) -> list[float]:
@@ -88,7 +93,7 @@ def polynomials(place: Target, hold: float, climb: tuple[float, float] | None = 
     pieces = [] if climb is None else [(rest_to_rest(z, *climb), climb[1])]
     top = z if climb is None else climb[0]
     if stops:
-        pieces.append(([top, 0.0, -0.5 * STOP_SINK], stop_descent_s(top)))
+        pieces.append(([top, 0.0, -0.5 * STOP_SINK], stop_descent_s(top, 0.0 if climb is None else climb[1])))
     else:
         pieces += [([top], hold), ([top, -SINK], max((top - BELOW) / SINK, SHORTEST_S))]
     axes = (((x,), (y,), vertical, (yaw,), seconds) for vertical, seconds in pieces)

@@ -24,7 +24,7 @@ from agents.safety.setpoint_filter import OUTSIDE_M
 from agents.ticks import Ticks
 from agents.vectors import ZERO
 from bridges.crazyflie import trajectory
-from bridges.crazyflie.flight import CLIMB, DESCENT, FALLEN, FlightControl, FlightPhase
+from bridges.crazyflie.flight import DESCENT, FALLEN, FlightControl, FlightPhase
 from bridges.crazyflie.link import BUSY_S
 from bridges.crazyflie.pilot import LOGS_S, LOOP_HZ, SAFE_PARAMETERS
 from bridges.crazyflie.telemetry import Telemetry
@@ -480,13 +480,16 @@ def test_short_gaps_one_after_the_other(circling):
     params=[(0.8, -4.0), (0.8, 4.0), (1.5, -4.0), (1.5, 4.0)], ids=lambda case: f"{case[0]} m, {case[1]:+g} mg"
 )
 def measured(request, monkeypatch):
-    """In the air by positions from outside, with an accelerometer that is wrong."""
+    """On its way up by positions from outside, with an accelerometer that is wrong."""
     height, error = request.param
     with Fleet(monkeypatch, 1, 500.0, external=True, accelerometer_mg=error) as flown:
-        flown.climb(height, 0.95 * height)
-        flown.run(height / CLIMB + 3.0)
-        assert flown.phases == {FlightPhase.CLIMBING}, flown.troubles
-        yield flown
+        yield flown.climb(height, 0.1)
+
+
+def hover(fleet):
+    """At the end of the climb."""
+    fleet.run(6.0)
+    assert fleet.phases == {FlightPhase.CLIMBING}, fleet.troubles
 
 
 def came_down(fleet, seconds):
@@ -499,8 +502,11 @@ def came_down(fleet, seconds):
     return (cut < 0.3, fleet.touch < 1.3, max(heights[down:], default=math.inf) < 0.02) == (True, True, True)
 
 
-def test_blind_drone_without_radio_stops_its_motors(measured):
+@pytest.mark.parametrize("climbs", [False, True])
+def test_blind_drone_without_radio_stops_its_motors(measured, climbs):
     """Its accelerometer would lift it again from the floor; locked, it does not."""
+    if not climbs:
+        hover(measured)
     measured.twin.lines[0].silence(math.inf)
     assert came_down(measured, 20.0)
     assert measured.supervised == SupervisorState.LOCKED
@@ -510,6 +516,7 @@ def test_blind_drone_without_radio_stops_its_motors(measured):
 
 @pytest.mark.parametrize("in_landing", [False, True])
 def test_blind_landing_ends_on_the_floor(measured, in_landing):
+    hover(measured)
     if in_landing:
         measured.order(FlightControl.land)
         measured.run(0.3)

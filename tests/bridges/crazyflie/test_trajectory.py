@@ -93,9 +93,9 @@ def test_descent_that_ends_in_a_stop(board):
     """Without holding, quicker and quicker, until the planner gives up."""
     board.client.stops = True
     board.climb((0.1, 0.2, 0.02, 0.0), (0.8, 2.0))
-    poses = board.sampled(2.0 + module.stop_descent_s(0.8) + 1.0)
+    poses = board.sampled(2.0 + module.stop_descent_s(0.8, 2.0) + 1.0)
     flown = np.count_nonzero(~np.isnan(poses).any(axis=1))
-    assert flown * DT == pytest.approx(2.0 + module.stop_descent_s(0.8), abs=2 * DT)
+    assert flown * DT == pytest.approx(2.0 + module.stop_descent_s(0.8, 2.0), abs=2 * DT)
     assert poses[:200, 2].max() == pytest.approx(0.8, abs=1e-3)
     assert np.diff(poses[200:flown, 2], 2) / DT**2 == pytest.approx(-module.STOP_SINK)
     assert poses[flown - 1, 2] < module.BELOW

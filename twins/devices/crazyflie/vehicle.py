@@ -36,6 +36,7 @@ FRESH_S: Final = 0.5  # age of external positions from which the attitude drifts
 # [m²/s³] noise of the acceleration, horizontal and vertical: the firmware's 0.5 and 1 m/s², drawn every millisecond
 HORIZONTAL_NOISE, VERTICAL_NOISE = 2.5e-4, 1e-3
 SLOW: Final = 1e-4  # [m²/s²] variance of the velocity after a reset
+SHARPEST: Final = 1e-4  # [m] least standard deviation of external positions
 THROWN: Final = 1.5  # [m] a position farther from the estimate throws it in flight,
 THROWN_TURN: Final = 2.0  # by this yaw [rad]
 SEEN_TURN: Final = 0.5  # share of a wrong yaw in the estimate: roll and pitch are corrected for the rest
@@ -291,7 +292,7 @@ class Vehicle:
 
         In flight one that is far from the estimate throws its attitude: it turns the drone over.
         """
-        far = self.estimator.add_external(self.t, position, self.place, sigma) > THROWN
+        far = self.estimator.add_external(self.t, position, self.place, max(sigma, SHARPEST)) > THROWN
         if far and self.model.flying and self.place[2] > 0.0:
             self.estimator.turn += THROWN_TURN
             self.supervisor.tumbled = True
