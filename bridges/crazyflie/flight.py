@@ -31,6 +31,9 @@ FLOOR: Final = -0.1  # [m] where they end: the motors stop there, and the drone 
 BLIND_DESCENT: Final = 0.45  # [m/s]
 BLIND_FLOOR: Final = -1.0  # [m]
 EXTERNAL_AGE_S: Final = 0.15  # older positions from outside make the estimator ring: they are not passed on
+# with positions from outside a landing is led down: when the radio is lost on the way, the descent on board goes on
+LED: Final = 0.3  # [m/s]
+LED_TO: Final = 0.3  # [m] height from which the planner's own landing is too short to become wrong
 BLIND_S: Final = 0.5  # without a young position from outside a drone is blind
 SHORTEST_S: Final = 1.5  # duration of a take-off or landing
 UPLOAD_S: Final = 3.0  # limit for writing a climb, part by part
@@ -108,6 +111,8 @@ class FlightControl:
         self.outside = isinstance(settings.positioning, Outside)  # positions from outside correct its estimate
         self._blind_landing = False  # the landing began without positions
         self._ended_landings = 0  # that another client has ended
+        self._led = False  # the landing is led down
+        self._led_from: tuple[Target, float] | None = None  # its begin: place, and time [s]; None: not known yet
         self._refused = False  # `trouble` is a reason against a take-off
         self._ordered = SHORTEST_S, False  # duration of the last landing that was ordered [s], without positions
         self._late_landings = 0  # that were ordered and begun after their end
@@ -221,7 +226,7 @@ class FlightControl:
         )
         replies, _ = self.link.planner_reply(trajectories.start_command)
         self._start_replies = replies + (answer is None)  # an answer that is not here yet may come
-        self._plan_end(uptime() + self.span_s, height)
+        self._plan_end(uptime() + span, height, span)
         if answer is None or answer == LogStatus.OK:
             return  # a lost answer is no refusal: `update_phase` sees whether it flies
         self.enter(FlightPhase.GROUND)
@@ -233,9 +238,28 @@ class FlightControl:
         if self.phase is FlightPhase.GROUND and self._flying:
             self.enter(FlightPhase.FLYING)
         if self.phase in (FlightPhase.CLIMBING, FlightPhase.FLYING):
-            self._land()
+            if self.outside and not self._blind:
+                self.enter(FlightPhase.LANDING)
+                self.span_s, self._led = self._highest / LED + SHORTEST_S, True
+            else:
+                self._land()
         elif self.phase is FlightPhase.GROUND:
             self._disarm_at = -math.inf
+
+    def _lead_down(self, now: float) -> None:
+        """Lead a landing down to `LED_TO` at `now` [s]; the planner lands it from there, or where it is blind."""
+        telemetry, (place, begin) = self._telemetry, self._led_from or (None, now)
+        if self.link.busy:
+            return
+        if place is None and telemetry.pose_age < HOLD_AGE_S:
+            x, y, z, *_, yaw = telemetry.pose
+            self._led_from = place, begin = (x, y, z, yaw), now
+        unconfirmed = now - max(self._sent_at, self.phase_since) > self.hold_s
+        height = LED_TO if place is None else place[2] - LED * (now - begin)
+        if self._blind or unconfirmed or (place is not None and not height > LED_TO):
+            self._land()
+        elif place is not None and now >= self._due:
+            self._send_target((*place[:2], height, place[3]), now)
 
     def _land(self) -> None:
         self._command_planner(HighLevel.LAND, self._order_landing)
@@ -260,10 +284,7 @@ class FlightControl:
         self._land_replies, _ = self.link.planner_reply(HighLevel.LAND)
 
     def _repeat_landing(self, now: float) -> None:
-        """Order a landing again that a gap or another client has ended; a planner that lands refuses the order.
-
-        One that has become blind is held, and then landed as such.
-        """
+        """Order a landing again that a gap or another client has ended; a planner that lands refuses the order."""
         telemetry = self._telemetry
         near = now - self.phase_since > self.span_s - NEAR_S
         replies, answer = self.link.planner_reply(HighLevel.LAND)
@@ -273,10 +294,6 @@ class FlightControl:
             self._begin_landing()
         elif replies > self._land_replies:
             self._land_replies, self._ended_landings = replies, 0
-        if self._blind and not self._blind_landing and not near and not self.link.busy:
-            self.link.cf.high_level_commander.go_to(0.0, 0.0, 0.0, 0.0, POLL_S, relative=True)
-            self._land()
-            return
         ended = telemetry.pose_time - self.phase_since > self.span_s  # what waits in queues tells of before
         # the height of a blind drone says nothing
         high = ended and not self._blind and telemetry.pose[2] > LOW and self._late_landings < LATE_LANDINGS
@@ -324,7 +341,9 @@ class FlightControl:
             self.link.cf.supervisor.send_emergency_stop()
         if now > self._disarm_at:
             self._disarm()
-        if self.phase is FlightPhase.LANDING and self._flying:
+        if self.phase is FlightPhase.LANDING and self._led:
+            self._lead_down(now)
+        elif self.phase is FlightPhase.LANDING and self._flying:
             self._repeat_landing(now)
         if self.phase not in (FlightPhase.CLIMBING, FlightPhase.FLYING):
             return
@@ -357,6 +376,10 @@ class FlightControl:
             self.enter(FlightPhase.FLYING)
         if _same(target, self._sent) and now - self._sent_at < REFRESH_S:
             return
+        self._send_target(target, now)
+
+    def _send_target(self, target: Target, now: float) -> None:
+        """Send the next part of a setpoint."""
         self._begun = min(self._begun, now)
         packets = self.link.trajectories.hold(target, self.hold_s, self._release_others)
         if packets == 0:
@@ -367,9 +390,12 @@ class FlightControl:
         self._begun = math.inf
         self._plan_end(now, target[2])
 
-    def _plan_end(self, since: float, height: float) -> None:
-        """Note when a trajectory from a height [m] since a time [s] has reached the floor, or stopped the motors."""
-        down = stop_descent_s(height) + STOP_S if self.outside else self.hold_s + max(height, 0.0) / SINK
+    def _plan_end(self, since: float, height: float, climb: float = 0.0) -> None:
+        """Note when a trajectory from a height [m] since a time [s] has reached the floor, or stopped the motors.
+
+        `climb`: time since the last position until then [s].
+        """
+        down = stop_descent_s(height, climb) + STOP_S if self.outside else self.hold_s + max(height, 0.0) / SINK
         self._down_at = since + down + MARGIN_S
 
     def _release(self) -> None:
@@ -460,6 +486,7 @@ class FlightControl:
 
     def enter(self, phase: FlightPhase) -> None:
         self.phase, self.phase_since, self._refused = phase, uptime(), False
+        self._led, self._led_from = False, None
         self.publish_airborne()
 
     def takeoff_refusal(self) -> str:

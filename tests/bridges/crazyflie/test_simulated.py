@@ -125,9 +125,6 @@ class Drone:
     def send_notify_setpoint_stop(self):
         self._send(Port.SETPOINT, 1, bytes(5))
 
-    def go_to(self, *place, relative):
-        self._send(Port.HIGH_LEVEL, 0, bytes((HighLevel.GO_TO, 0)) + crtp.GO_TO.pack(relative, False, *place))
-
     def land(self, height, span, **_yaw):
         self._send(Port.HIGH_LEVEL, 0, bytes((HighLevel.LAND, 0)) + crtp.CLIMB.pack(height, 0.0, True, span))
 
@@ -527,3 +524,16 @@ def test_blind_landing_ends_on_the_floor(measured, in_landing):
     assert measured.phases == {FlightPhase.GROUND}
     assert measured.troubles == {FALLEN}
     assert measured.supervised != SupervisorState.LOCKED
+
+
+@pytest.mark.parametrize("gap", [1.5, math.inf])
+def test_measured_landing_is_led_down(measured, gap):
+    """Softly; where the radio is lost on the way the descent on board goes on."""
+    hover(measured)
+    measured.order(FlightControl.land)
+    measured.run(0.5)
+    measured.twin.lines[0].silence(gap)
+    assert came_down(measured, 14.0)
+    assert measured.touch < (1.3 if gap == math.inf else 0.7)
+    assert measured.phases == {FlightPhase.LANDING if gap == math.inf else FlightPhase.GROUND}
+    assert (measured.supervised == SupervisorState.LOCKED) == (gap == math.inf)
