@@ -23,6 +23,7 @@ from experiments.file.document import Document, chosen
 from experiments.file.problems import Fault, Path, Problem, TextPosition, nearest
 from experiments.virtual_time.source import is_foreign, outside
 
+MOST_NAMED: Final = 5  # cases that a finding names
 QUIET: Final = np.errstate(all="ignore")  # absurd numbers overflow on their way to a finding that says so
 
 
@@ -105,7 +106,8 @@ def _findings(given: Document, analyses: Mapping[str, Analysis]) -> list[Finding
     for finding, names in holders.items():
         message = finding.message
         if len(names) < len(analyses):
-            words = ", ".join(f"'{name}'" for name in names)
+            words = ", ".join(f"'{name}'" for name in names[:MOST_NAMED])
+            words += f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
             message = f"in case{'s' * (len(names) > 1)} {words}: {message}"
         where = finding.where if isinstance(finding.where, str) else _place(given.source, finding.where, names)
         found.append(replace(finding, message=message, where=where))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Mapping, Sequence
+from functools import cache
 from typing import Any
 
 import msgspec
@@ -102,12 +103,18 @@ def spread(values: Sequence[float | None]) -> Spread:
     )
 
 
+@cache
 def student_95(freedom: int) -> float:
-    """Two-sided 95 % quantile of Student's t: exact for 1 and 2, else Fisher's expansion (0.1 % at 3, then better)."""
-    if freedom == 1:
-        return math.tan(0.475 * math.pi)
-    if freedom == 2:
-        return 0.95 * math.sqrt(2.0 / (1.0 - 0.95**2))
+    """Two-sided 95 % quantile of Student's t, exact to rounding; from 100 on by Fisher's expansion (1e-9).
+
+    The share inside of ±√n tan θ is a finite sum (Abramowitz, Stegun, "Handbook of Mathematical Functions", 26.7.3, 4).
+    """
+    if freedom < 100:
+        low, high = 0.0, 0.5 * math.pi
+        for _ in range(60):  # halved until only rounding is left
+            angle = 0.5 * (low + high)
+            low, high = (low, angle) if _share_inside(angle, freedom) > 0.95 else (angle, high)
+        return math.sqrt(freedom) * math.tan(low)
     z = statistics.NormalDist().inv_cdf(0.975)
     terms = (
         z,
@@ -117,3 +124,14 @@ def student_95(freedom: int) -> float:
         (79 * z**9 + 776 * z**7 + 1482 * z**5 - 1920 * z**3 - 945 * z) / 92160,
     )
     return math.fsum(term / float(freedom) ** k for k, term in enumerate(terms))
+
+
+def _share_inside(angle: float, freedom: int) -> float:
+    """Share of Student's t inside of ±√n tan θ."""
+    odd, cosine, total = freedom % 2, math.cos(angle), 0.0
+    term = cosine if odd else 1.0
+    for power in range(odd, freedom - 1, 2):
+        total += term
+        term *= cosine * cosine * (power + 1) / (power + 2)
+    share = math.sin(angle) * total
+    return 2.0 / math.pi * (angle + share) if odd else share

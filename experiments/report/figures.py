@@ -17,7 +17,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, PathPatch
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 from numpy.typing import NDArray
 
 from agents.plugins.laws import Gradient
@@ -35,6 +35,11 @@ from twins.arrays import Array
 BAND: Final = "#009E73"  # the tolerance
 LEAST_ERROR: Final = 1e-5  # [m] below this an error axis does not go
 WIDE: Final = 8.0  # rates farther apart are drawn on a logarithmic axis
+SHORT: Final = 10  # letters of a name that stands behind other words on an axis
+LONGEST: Final = 20  # letters of a name on an axis
+LONGEST_TITLE: Final = 50  # letters of a name above a panel
+MOST_VALUES: Final = 12  # cases that have their values above their bars
+MOST_PANELS: Final = 16  # cases of a page, each with a panel
 MOST_SEEDS: Final = 50  # of a case, for the range of its errors
 MOST_MEASURES: Final = 6  # of a law, each with a panel
 SOLID: Final = 0.95  # share of the time that marks cover where there is nothing to see between them
@@ -69,7 +74,7 @@ def all_figures(
         figures["errors"] = errors(judged, cases, width, bands)
     if any(trace.measures for trace in first):
         figures["measures"] = measures(first, width)
-    if len(by_case(cases)) > 1:
+    if (len(by_case(cases)) - 1) * len(_bar_metrics(cases)) > 1:  # a single bar says no more than its number
         figures["global_bars"] = global_bars(cases, width)
     if cases:
         figures["robot_bars"] = robot_bars(cases, width)
@@ -105,6 +110,7 @@ def global_bars(cases: Sequence[CaseMetrics], width: float = style.WIDTH) -> Fig
             for at, top, more in zip(x, height, error, strict=True):
                 if math.isfinite(top):
                     tops.append(top + more)
+                if math.isfinite(top) and len(others) <= MOST_VALUES:
                     axes.annotate(f"{top:.3f}", (at, tops[-1]), (0, 1.5), ha="center", va="bottom", **text)
         axes.set_xticks(np.arange(len(indices)), [label for _, label, _ in indices])
         axes.set_xlim(-0.5, len(indices) - 0.5)
@@ -114,7 +120,8 @@ def global_bars(cases: Sequence[CaseMetrics], width: float = style.WIDTH) -> Fig
             axes.axhline(1.0, color=style.INK, linewidth=0.6, linestyle=(0, (4, 3)), zorder=0.5)
         axes.yaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 2.5, 5, 10]))
         axes.grid(axis="y")
-    panels[0].set_ylabel(f"relative to {style.plain(reference)}")
+    between = "\n" if len(reference) > SHORT else " "
+    panels[0].set_ylabel(f"relative to{between}{style.shortened(reference, LONGEST)}")
     style.legend_above(figure, style.labelled(panels[-1]), columns=3)
     return figure
 
@@ -157,7 +164,7 @@ def robot_bars(cases: Sequence[CaseMetrics], width: float = style.WIDTH) -> Figu
             axes.set_yscale("log")
             axes.set_ylim(0.5 * min(known), 1.3 * max(known))
             axes.yaxis.set_major_locator(LogLocator(10.0, (1.0, 2.0, 5.0)))
-            axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+            axes.yaxis.set_major_formatter(style.in_full())
             axes.yaxis.set_minor_formatter(NullFormatter())
         else:
             axes.yaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
@@ -210,6 +217,8 @@ def errors(
         size = max(2.5, 7.5 - 2.5 * k)  # those of several cases at one time are seen on each other
         axes.plot(at, [tolerance] * len(at), "v", color=line["color"], ms=size, mec=style.PAPER, mew=0.5, zorder=4)
     axes.set_yscale("log")
+    axes.yaxis.set_major_formatter(style.in_full())
+    axes.yaxis.set_minor_formatter(NullFormatter())
     bottom = 10.0 ** math.floor(math.log10(min(max(lowest, LEAST_ERROR), 0.1 * tolerance)))
     axes.set_ylim(bottom, max(1.6 * highest, 4.0 * tolerance))
     axes.axhspan(bottom, tolerance, color=BAND, alpha=0.16, linewidth=0.0, zorder=0.2)
@@ -303,14 +312,16 @@ def _acquisitions(runs: Sequence[CaseMetrics]) -> list[float]:
 def events(traces: Sequence[Trace], width: float = style.WIDTH) -> Figure:
     """Transmissions: one row per robot, one panel per case; marks that would touch in print are one bar.
 
-    A case in which all of them touch (a periodic one) is a line of text.
+    A case in which all of them touch (a periodic one) is a line of text. Cases beyond a page are left out.
     """
     rows = max((len(trace.robots) for trace in traces), default=0)
     columns = 900 if rows * len(traces) <= 40 else 450  # a printed column shows no more
     marks = [_marks(trace, columns) for trace in traces]
     solid = [_solid(trace, each) for trace, each in zip(traces, marks, strict=True)]
+    hidden = max(0, len(traces) - MOST_PANELS)
+    traces, marks, solid = traces[:MOST_PANELS], marks[:MOST_PANELS], solid[:MOST_PANELS]
     drawn = [trace for trace, text in zip(traces, solid, strict=True) if not text]
-    height = style.panel_height(len(drawn), min(max(0.6, 0.13 * rows), 3.2))
+    height = min(max(0.6, 0.13 * rows), style.panel_height(len(drawn), 3.34) - 0.14)
     heights = [0.02 if text else height for text in solid]
     whole = sum(0.26 if text else height + 0.14 for text in solid) + 0.5
     figure = style.Drawing(figsize=(width, max(whole, 1.1)), layout="constrained")
@@ -330,8 +341,10 @@ def events(traces: Sequence[Trace], width: float = style.WIDTH) -> Figure:
         axes.set_yticks(range(0, len(trace.robots), every), trace.robots[::every], fontsize=6)
         axes.set_ylim(len(trace.robots) - 0.4, -0.6)
         axes.tick_params(axis="y", length=0)
-        axes.set_title(style.plain(trace.case), loc="right", pad=2.0)
+        axes.set_title(style.shortened(trace.case, LONGEST_TITLE), loc="right", pad=2.0)
         axes.grid(axis="x")
+    if hidden:
+        figure.supxlabel(style.beyond(hidden), fontsize=7)
     if drawn:
         last = max(k for k, text in enumerate(solid) if not text)
         style.time_axis(grid[last], traces)
@@ -354,7 +367,7 @@ def _solid(trace: Trace, marks: Sequence[tuple[Array, Array]]) -> str:
     rates = [len(trace.sent_by(i).stamp) / span for i in range(len(trace.robots))]
     low, high = f"{min(rates):.3g}", f"{max(rates):.3g}"
     rate = low if low == high else f"{low} to {high}"
-    return f"{style.plain(trace.case)}: every robot throughout, {rate} Hz"
+    return f"{style.shortened(trace.case, LONGEST)}: every robot throughout, {rate} Hz"
 
 
 @style.styled
@@ -375,6 +388,7 @@ def intervals(traces: Sequence[Trace], width: float = style.WIDTH) -> Figure:
             axes.plot(*_steps(np.concatenate(waits)), drawstyle="steps-post", **line)
             handles.setdefault(style.plain(trace.case), Line2D([], [], **line))
     axes.set_xscale("log")
+    axes.xaxis.set_major_formatter(style.in_full())
     axes.xaxis.set_minor_formatter(NullFormatter())
     if handles:
         low, high = (math.log10(limit) for limit in axes.dataLim.intervalx)

@@ -25,6 +25,7 @@ from matplotlib.lines import Line2D
 from matplotlib.path import Path as Outline
 from matplotlib.patheffects import withStroke
 from matplotlib.text import Annotation
+from matplotlib.ticker import FuncFormatter
 from matplotlib.transforms import Bbox
 
 from agents.body.kinds import KINDS
@@ -51,6 +52,10 @@ HATCHES: Final = ("", "////", "....", "xxxx", "\\\\\\\\", "----", "++++")
 ROBOTS: Final = ("#000000", "#CC6677", "#44AA99", "#999933", "#6FB7DC", "#AA4499", "#C9A227")
 CORNERS: Final = ((3.0, 3.0), (-3.0, 3.0), (3.0, -3.0), (-3.0, -3.0))  # [pt] of a text from its point
 MAX_COLOURED_ROBOTS: Final = 8  # robots that have a colour each; more are coloured by kind
+MOST_ENTRIES: Final = 16  # of a legend
+LEGEND_LINE: Final = 0.14  # [in]
+LEGEND_PT: Final = 31.0  # [pt] of a line and its distances in a legend
+LETTER_PT: Final = 3.2  # [pt] of a letter in a legend, on average
 MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X", "*")  # of cases, parameters, or `MAX_COLOURED_ROBOTS` robots
 
 # neither the window system nor the places of programs are style: both stay as the process has them
@@ -228,22 +233,65 @@ def spread_texts(axes: Axes) -> None:
             text.remove()
 
 
+def in_full() -> FuncFormatter:
+    """Numbers of a logarithmic axis in full: an exponent would be too small for print."""
+    return FuncFormatter(lambda value, _: np.format_float_positional(value, trim="-"))
+
+
+def cut(name: str, most: int) -> str:
+    """A name without its middle if it has more than `most` letters."""
+    kept = most - 1
+    return name if len(name) <= most else f"{name[: kept - kept // 2]}…{name[len(name) - kept // 2 :]}"
+
+
+def shortened(name: str, most: int) -> str:
+    """A name that is cut, as matplotlib shows it."""
+    return plain(cut(name, most))
+
+
+def fewer(entries: Mapping[str, Any]) -> dict[str, Any]:
+    """Entries of a legend; of many the first and the last two, with the number of the others between them."""
+    names = [*entries]
+    hidden = len(names) - MOST_ENTRIES
+    if hidden <= 0:
+        return dict(entries)
+    first, last = names[: MOST_ENTRIES - 3], names[-2:]
+    return {
+        **{name: entries[name] for name in first},
+        f"and {hidden + 1} more": Line2D([], [], linestyle=""),
+        **{name: entries[name] for name in last},
+    }
+
+
+def beyond(hidden: int) -> str:
+    """Line that says how many cases a figure leaves out; empty if it shows all."""
+    return f"and {hidden} more cases" if hidden else ""
+
+
 def labelled(axes: Axes) -> dict[str, Any]:
     """Labelled artists of a panel, for its legend."""
     handles, labels = axes.get_legend_handles_labels()
     return dict(zip(labels, handles, strict=True))
 
 
-def legend_above(figure: Figure, entries: Mapping[str, Any], columns: int) -> None:
-    """A legend above all panels, with as many columns as fit between the edges; none without entries."""
-    if entries:
-        fits = fitting(figure.get_figwidth(), entries, columns)
-        figure.legend([*entries.values()], [*entries], loc="outside upper center", ncols=fits)
+def legend_above(figure: Figure, entries: Mapping[str, Any], columns: int, room: int = 3) -> None:
+    """A legend above all panels, with as many columns as fit between the edges; none without entries.
+
+    More lines than the figure has room for make it higher. Of very many entries some are left out.
+    """
+    shown = fewer(entries)
+    if shown:
+        width = figure.get_figwidth()
+        labels = [cut(label, math.floor((72.0 * width - LEGEND_PT) / LETTER_PT)) for label in shown]
+        fits = fitting(width, labels, columns)
+        lines = math.ceil(len(labels) / fits)
+        figure.set_figheight(figure.get_figheight() + LEGEND_LINE * max(0, lines - room))
+        figure.legend([*shown.values()], labels, loc="outside upper center", ncols=fits)
 
 
 def fitting(width: float, labels: Collection[str], columns: int) -> int:
     """Columns of a legend, at most `columns`, that fit into a width [in]; labels fill one column after the other."""
-    wide = [31.0 + 3.2 * len(label) for label in labels]  # [pt]
+    wide = [LEGEND_PT + LETTER_PT * len(label) for label in labels]  # [pt]
     for count in range(min(columns, len(labels)), 1, -1):
         rows = [len(part) for part in np.array_split(np.arange(len(labels)), count)]
         ends = np.cumsum(rows)

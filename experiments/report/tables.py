@@ -96,7 +96,10 @@ def summary_metrics(cases: Sequence[CaseMetrics] = ()) -> dict[str, Metric]:
 
 
 def summary_table(cases: Sequence[CaseMetrics], chosen: Sequence[str] = ()) -> Table:
-    """The metrics of each case, averaged over the followers, and their ratios to the first case; some, if `chosen`."""
+    """The metrics of each case, averaged over the followers, and their ratios to the first case; some, if `chosen`.
+
+    Metrics that are unknown in every case are left out, unless they are chosen.
+    """
     grouped = by_case(cases)
     first = next(iter(grouped.values()))
 
@@ -106,15 +109,21 @@ def summary_table(cases: Sequence[CaseMetrics], chosen: Sequence[str] = ()) -> T
             return text
         return text, f"× {ratio_words(share)}"
 
-    shown = {name: metric for name, metric in summary_metrics(cases).items() if not chosen or name in chosen}
     rows = []
-    for name, metric in shown.items():
+    for name, metric in summary_metrics(cases).items():
+        if name not in chosen and (chosen or not _known_at_all(cases, name)):
+            continue
         head = metric.head + " of the case" * (metric.per == "case")
         rows.append(TableRow((head, *(cell(runs, name) for runs in grouped.values()))))
     seeds = max(len(runs) for runs in grouped.values())
     note = f"× is relative to {next(iter(grouped))}." if len(grouped) > 1 else ""
     note += f" {over_seeds(seeds)}" if seeds > 1 else ""
     return Table(("Mean per robot", *grouped), tuple(rows), note=note.strip())
+
+
+def _known_at_all(cases: Sequence[CaseMetrics], name: str) -> bool:
+    """Whether a metric is known of any case; a formation that is never acquired is a result, too."""
+    return any(case.mean.get(name) is not None or (name == "acquired_s" and case.has_errors) for case in cases)
 
 
 def ratio_words(share: Spread) -> str:
@@ -303,12 +312,18 @@ def _robot_table(case: str, runs: Sequence[CaseMetrics]) -> Table:
     columns: list[Column] = [
         (metric.head, _measured(name))
         for name, metric in known_metrics(runs).items()
-        if metric.per == "robot" and (metric.shown or metric.figure) and (metric.mean != "sum" or _total(runs, name))
+        if metric.per == "robot"
+        and (metric.shown or metric.figure)
+        and (metric.mean != "sum" or _total(runs, name))
+        and (_known_at_all(runs, name) or any(robot.value(name) is not None for run in runs for robot in run.robots))
     ]
     later = range(1, max(len(run.starts_s) for run in runs))
     columns += [(f"{_phase(runs, k).strip()} [s]", partial(_acquired_again, k=k)) for k in later]
     worst = "Worst link at the end" + (", mean" if len(runs) > 1 else "")
-    columns.append((f"{worst} [cm]", lambda robots: number(_known(_mean, (r.by_the_end[0] for r in robots)), 100.0)))
+    if any(robot.by_the_end[0] is not None for run in runs for robot in run.robots):
+        columns.append(
+            (f"{worst} [cm]", lambda robots: number(_known(_mean, (r.by_the_end[0] for r in robots)), 100.0))
+        )
     if any(robot.coverage is not None and robot.coverage < 1.0 for run in runs for robot in run.robots):
         columns.append(("Known [%]", _cell(_mean, "coverage", 100.0)))
     kept = [robot for run in runs for robot in run.robots if robot.robot not in left_out]

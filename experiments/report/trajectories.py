@@ -29,6 +29,7 @@ from experiments.scene.stage import link_colours
 from twins.arrays import Array
 
 LOW: Final = 0.2  # [m] robots below that are as well seen from above
+LONGEST: Final = 22  # letters of a name above one of two panels
 OVERLAID: Final = 3  # cases that can be distinguished upon each other, from above
 FLAT: Final = 0.15  # of its width is how high a picture of robots on the floor is, where tall things stand there
 
@@ -53,11 +54,11 @@ def plan_view(traces: Sequence[Trace], width: float = style.WIDTH) -> Figure:
     things = scenery.legend([trace.plan for trace in traces])
     tallest = min(0.62 * width, 3.6) if overlaid else 3.2
     figure, grid = _plane(len(panels), width, (low, high), tallest, 0.7 + 0.17 * bool(things))
-    for axes, shown in zip(grid, panels, strict=True):
+    for axes, shown in zip(grid, panels, strict=False):
         scenery.from_above(axes, shown[0].plan)
         for k, trace in enumerate(shown):
             _draw_from_above(axes, trace, style.thinned(trace, len(traces)), style.case_line(k) if overlaid else None)
-        axes.set_title("" if overlaid else style.plain(shown[0].case), pad=3.0)
+        axes.set_title("" if overlaid else style.shortened(shown[0].case, LONGEST), pad=3.0)
         axes.spines[["left", "bottom"]].set_visible(False)
         axes.xaxis.set_major_locator(MaxNLocator(5))
         axes.yaxis.set_major_locator(MaxNLocator(5))
@@ -65,7 +66,7 @@ def plan_view(traces: Sequence[Trace], width: float = style.WIDTH) -> Figure:
         grid[0].set(xlabel="$x$ [m]", ylabel="$y$ [m]")
         style.legend_above(figure, _case_entries(traces) | _end_entries() | things, columns=6)
     else:
-        _label_plane(figure)
+        _label_plane(figure, len(panels) - len(grid))
         style.robot_legend(figure, traces, things)
     return figure
 
@@ -73,12 +74,17 @@ def plan_view(traces: Sequence[Trace], width: float = style.WIDTH) -> Figure:
 def _plane(
     count: int, width: float, limits: tuple[Array, Array], tallest: float, more: float
 ) -> tuple[Figure, list[Axes]]:
-    """A figure of views from above within `limits` [m], side by side, none higher than `tallest` and `more` around."""
+    """A figure of views from above within `limits` [m], side by side, none higher than `tallest` and `more` around.
+
+    There are as many views as a page has room for.
+    """
     low, high = limits
     columns = min(2, count)
     rows = math.ceil(count / columns)
     shape = float((high - low)[1] / (high - low)[0])
     panel = min((width - 0.5) / columns * shape, tallest) + 0.25
+    rows = min(rows, max(1, math.floor((style.TALLEST - more) / panel)))
+    count = min(count, rows * columns)
     figure = style.Drawing(figsize=(width, panel * rows + more), layout="constrained")
     grid = list(figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat)
     for axes in grid[count:]:
@@ -88,8 +94,9 @@ def _plane(
     return figure, grid[:count]
 
 
-def _label_plane(figure: Figure) -> None:
-    figure.supxlabel("$x$ [m]", fontsize=8)
+def _label_plane(figure: Figure, hidden: int) -> None:
+    """Labels of both axes, and the number of cases that the figure leaves out."""
+    figure.supxlabel(f"$x$ [m]\n{style.beyond(hidden)}".strip(), fontsize=8)
     figure.supylabel("$y$ [m]", fontsize=8)
 
 
@@ -136,7 +143,7 @@ def expected_motion(analyses: Mapping[str, Analysis]) -> Figure:
     cases = list(analyses.items())
     half = 0.53 * np.array(cases[0][1].plan.experiment.arena.size[:2])
     figure, grid = _plane(len(cases), style.WIDTH, (-half, half), 3.2, 0.6)
-    for axes, (name, known) in zip(grid, cases, strict=True):
+    for axes, (name, known) in zip(grid, cases, strict=False):
         experiment, motion = known.plan.experiment, known.prediction.position
         scenery.from_above(axes, known.plan)
         target = motion[-1] if known.shape is None else _laid_upon(known, known.shape.position, motion[-1])
@@ -153,8 +160,8 @@ def expected_motion(analyses: Mapping[str, Analysis]) -> Figure:
             axes.plot(*target[row, :2], "D", ms=4.0, mec=style.MAGENTA, mfc="none", mew=0.7, zorder=3)
             axes.plot(*motion[-1, row, :2], "o", ms=3.5, mec="none", color=colour, zorder=4)
             _annotate(axes, robot, motion[-1, row], (3, 3), fontsize=5, color=colour, zorder=5)
-        axes.set_title(style.plain(name), pad=3.0)
-    _label_plane(figure)
+        axes.set_title(style.shortened(name, LONGEST), pad=3.0)
+    _label_plane(figure, len(cases) - len(grid))
     entries = _end_entries()
     entries["target shape"] = Line2D(
         [], [], color=style.MAGENTA, linewidth=0.8, marker="D", ms=3.5, mfc="none", mew=0.7
@@ -194,6 +201,7 @@ def formation(traces: Sequence[Trace], width: float = style.WIDTH) -> Figure:
     shown = [trace for trace in traces if has_positions(trace)]
     things = scenery.legend([trace.plan for trace in traces], space=True)
     entries = (_case_entries(traces) if len(traces) > 1 else {}) | _end_entries() | things
+    entries = style.fewer(entries)
     fits = style.fitting(width, entries, 6)
     above = 0.12 + 0.15 * math.ceil(len(entries) / fits)
     height = min(0.7 * width, 3.9)
@@ -333,7 +341,7 @@ def _frame(axes: Axes3D, traces: Sequence[Trace]) -> None:
     wide, tall = 0.87 * x + 0.5 * y, 0.44 * (0.5 * x + 0.87 * y) + 0.9 * z  # from 26° above and 60° aside
     axes.set_box_aspect((x, y, z), zoom=min(0.94 / wide, 0.82 / tall))
     axes.view_init(26, -60)
-    pad = -8 if z > FLAT else -5
+    pad = -6 if z > FLAT else -3
     axes.set_xlabel("$x$ [m]", labelpad=pad, fontsize=8)
     axes.set_ylabel("$y$ [m]", labelpad=pad, fontsize=8)
     axes.set_zlabel("$z$ [m]", labelpad=pad - 1, fontsize=8)

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from experiments.metrics.metric import known_metrics
 from experiments.report.style import (
@@ -21,10 +21,11 @@ from experiments.report.style import (
     PAPER,
     WIDTH,
     Drawing,
-    fitting,
+    in_full,
     labelled,
     legend_above,
     plain,
+    shortened,
     spread_texts,
     styled,
 )
@@ -32,7 +33,7 @@ from experiments.sweep.table import UNKNOWN, CellRow, short, words_of
 from twins.arrays import Array
 
 MOST_CURVES: Final = 7  # colours of cases, and markers; more could not be distinguished, and are drawn as clouds
-LEGEND_LINE: Final = 0.14  # [in]
+LONGEST: Final = 24  # letters of a name on an axis
 GREY: Final = "#7a7a7a"
 THIN: Final[dict[str, Any]] = {"linewidth": 0.8, "markersize": 3.6, "markeredgewidth": 0.8, "zorder": 3}
 NAMED: Final = 12  # points of a curve that all have their value beside them, if it is the first one
@@ -91,13 +92,10 @@ def pareto(rows: Sequence[CellRow], index: str = "iae", *, joined: bool = True, 
     if low < 1.0 / SPAN:
         axes.set_xscale("log")
         axes.xaxis.set_major_locator(LogLocator(10.0, (1.0, 2.0, 5.0)))
-        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axes.xaxis.set_major_formatter(in_full())
         axes.xaxis.set_minor_formatter(NullFormatter())
     axes.grid()
-    entries = labelled(axes)
-    lines = math.ceil(len(entries) / fitting(width, entries, 4))
-    figure.set_figheight(figure.get_figheight() + LEGEND_LINE * max(0, lines - 1))
-    legend_above(figure, entries, columns=4)
+    legend_above(figure, labelled(axes), columns=4, room=1)
     spread_texts(axes)
     return figure
 
@@ -156,7 +154,7 @@ def _point_of(row: CellRow, index: str) -> tuple[float, float] | None:
 
 
 def _reference(rows: Sequence[CellRow]) -> str:
-    return plain(next((row.case for row in rows if row.reference), "the reference"))
+    return shortened(next((row.case for row in rows if row.reference), "the reference"), LONGEST)
 
 
 def _points(rows: Sequence[CellRow], index: str) -> Array:

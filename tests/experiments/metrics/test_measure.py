@@ -240,7 +240,7 @@ def test_spread_over_seeds():
     few = [statistics.spread(values) for values in ([None], [5.0])]
     assert few == [statistics.Spread(None, None, None, 0), statistics.Spread(5.0, None, None, 1)]
     printed = {1: 12.7062, 2: 4.30265, 3: 3.18245, 4: 2.77645, 5: 2.57058, 9: 2.26216, 19: 2.09302, 99: 1.98422}
-    assert [statistics.student_95(k) for k in printed] == pytest.approx([*printed.values()], rel=1.5e-3)
+    assert [statistics.student_95(k) for k in printed] == pytest.approx([*printed.values()], rel=2e-6)
 
 
 def test_ratios_pair_seeds_or_divide_by_the_mean():

@@ -5,6 +5,7 @@ import itertools
 import json
 import re
 
+import msgspec
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -52,6 +53,37 @@ def test_figures_fit_in_one_column(few, two_cases):
         for axes in figure.axes:
             boxes = [label.get_window_extent(renderer) for label in axes.get_xticklabels() if label.get_text()]
             assert not any(a.x1 > b.x0 for a, b in itertools.pairwise(boxes))
+
+
+def test_many_cases_with_long_names_fit_a_page():
+    """Legends have few entries and lie above the curves; labels of axes lie on the page; the rest is counted."""
+    few = [park(*case, duration=2.0) for case in (("periodic",), ("event", 0.01))]
+    names = [f"send_on_delta_with_threshold_{k:02d}_millimetres_and_hold" for k in range(40)]
+    traces = [dataclasses.replace(few[k % 2], case=name) for k, name in enumerate(names)]
+    known = [measure(trace) for trace in few]
+    cases = [msgspec.structs.replace(known[k % 2], case=name) for k, name in enumerate(names)]
+    words = {}
+    for name, figure in figures.all_figures(cases, traces).items():
+        assert figure.get_figheight() <= style.TALLEST, name
+        canvas = FigureCanvasAgg(figure)
+        canvas.draw()
+        renderer = canvas.get_renderer()
+        for axes in figure.axes:
+            assert name == "formation" or not axes.get_visible() or axes.get_position().height > 0.02
+            label = axes.yaxis.label.get_window_extent(renderer)
+            assert label.y0 >= -1.0, name
+            assert label.y1 <= figure.bbox.y1 + 1.0
+        for legend in figure.legends:
+            box = legend.get_window_extent(renderer)
+            assert 0.0 <= box.x0 < box.x1 <= figure.bbox.x1 + 1.0
+            assert (
+                all(box.y0 > axes.get_window_extent(renderer).y1 - 1.0 for axes in figure.axes) or name == "formation"
+            )
+            words[name] = [text.get_text() for text in legend.get_texts()]
+            assert len(words[name]) <= 16
+        words.setdefault(name, []).append(figure.get_supxlabel())
+    assert ("and 26 more" in words["errors"], words["errors"][-2]) == (True, "within 5 cm")
+    assert {name for name, texts in words.items() if "more cases" in texts[-1]} == {"plan_view", "events"}
 
 
 def test_global_bars_are_ratios_to_the_first_case(two_cases):

@@ -7,9 +7,9 @@ import pytest
 
 from experiments.definition.experiment import ChannelTable, LinkChannelTable
 from experiments.metrics.measure import measure
-from experiments.report import export, figures, metrics_files, report, verdict
-from experiments.report.page import number
-from experiments.report.tables import network_tables, proof_tables, whole_tables
+from experiments.report import export, figures, metrics_files, report, typeset, verdict
+from experiments.report.page import NONE, number
+from experiments.report.tables import network_tables, proof_tables, robot_tables, summary_table, whole_tables
 from tests.experiments.traces import pair
 from tests.runs import flown, fly
 from tests.small import changed, reference
@@ -34,6 +34,20 @@ def test_indices_of_links_are_unknown_without_errors(measured):
     assert [part in texts for part in ("formation", "fewer transmissions than periodic")] == [False, True]
 
 
+def test_metrics_unknown_in_all_cases_are_left_out(measured):
+    """A paper has no row of dashes; chosen metrics stay."""
+    summary, (robots, _) = summary_table(measured), robot_tables(measured)
+    assert [row.cells[0] for row in summary.rows if {*row.cells[1:]} == {NONE}] == []
+    assert {"f [Hz]", "IAE [m s]"} & {row.cells[0] for row in summary.rows} == {"f [Hz]"}
+    assert [head for head, *cells in zip(robots.head, *(row.cells for row in robots.rows), strict=True)
+            if {*cells} == {NONE}] == []  # fmt: skip
+    assert "--" not in typeset.latex([summary, robots])
+    (row,) = summary_table(measured, ["iae"]).rows
+    assert row.cells[1:] == (NONE, NONE)
+    never = measure(pair(np.full(200, 2.0)))
+    assert NONE in [row.cells[1] for row in summary_table([never]).rows if row.cells[0].startswith("Acquired")]
+
+
 def test_measures_are_means_over_run_and_end(traces, measured):
     values = traces["periodic"].measures["disagreement"]
     found = measured[0].robots[2].measures["disagreement"]
@@ -43,8 +57,8 @@ def test_measures_are_means_over_run_and_end(traces, measured):
     (table,) = [each for each in whole_tables(measured) if each.head[0] == "Measures of the law"]
     assert [row.cells[0] for row in table.rows] == ["disagreement, mean", "disagreement, at the end"]
     drawn = figures.all_figures(measured, list(traces.values()))
-    assert {"measures", "robot_bars", "global_bars"} < {*drawn}
-    assert "errors" not in drawn
+    assert {"measures", "robot_bars"} < {*drawn}
+    assert not {"errors", "global_bars"} & {*drawn}  # without errors there would be one bar
     (axes,) = drawn["measures"].axes
     thick = [line for line in axes.lines if line.get_linewidth() == 1.3]
     assert (axes.get_ylabel(), len(thick), len(drawn["robot_bars"].axes)) == ("disagreement", 2, 1)  # the last of f
