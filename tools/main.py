@@ -141,7 +141,7 @@ def call(command: typer.Typer, name: str = "zenpark") -> None:
     """
     try:
         try:
-            sys.exit(command(prog_name=name, standalone_mode=False))
+            code = command(prog_name=name, standalone_mode=False)
         finally:
             with suppress(BrokenPipeError):
                 sys.stdout.flush()  # a full disk shows here at the latest
@@ -166,9 +166,12 @@ def call(command: typer.Typer, name: str = "zenpark") -> None:
         place = f"{error.filename}: " if error.filename else ""
         _report(f"{place}cannot be written: {error.strerror}", "\n  make room there, or choose another place")
         sys.exit(2)
-    except Exception as error:
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # SystemExit of a plug-in is no success
         registry = sys.modules.get("agents.plugins.registry")  # not loaded: no plug-in is
         if registry is None or (place := registry.culprit(error)) is None:
             raise
         _report(f"{place}: {type(error).__name__}: {error}")
         sys.exit(2)
+    sys.exit(code)

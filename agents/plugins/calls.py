@@ -1,28 +1,37 @@
 """Errors of plug-ins, in words that name them.
 
 Ticks call plug-ins directly. One `try` stands around the tick of a robot; `explain` finds the plug-in to blame for what
-it catches.
+it catches. `supervised` stands around a command: a plug-in in it neither ends the process nor keeps it for ever.
 """
 
 from __future__ import annotations
 
 import linecache
+import os
 import re
+import signal
 import sys
-from collections.abc import Callable, Iterable
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from math import isnan
-from traceback import extract_tb, walk_tb
-from typing import Any, Final
+from traceback import extract_tb, walk_stack, walk_tb
+from types import FrameType
+from typing import Any, Final, NoReturn
 
 from agents.formation.link import Link
 from agents.plugins.files import plain
 from agents.plugins.law import Law, NeighbourView, View
-from agents.plugins.registry import FAILURES, PluginError
+from agents.plugins.registry import FAILURES, PluginError, owner_of
 
 LONGEST: Final = 60  # characters of a result that is shown
+LIMIT_S: Final = 5.0  # [s] within which a call of a plug-in must return; it is noticed after twice that at the latest
+PREPARING: Final = {"<module>", "begin", "build", "analyse", "of"}  # calls that may load libraries or read a whole run
+PATIENCE: Final = 12  # times `LIMIT_S` that such calls may take
 
 
-def explain(error: Exception, plugins: Iterable[tuple[str, object]]) -> Exception:
+def explain(error: BaseException, plugins: Iterable[tuple[str, object]]) -> BaseException:
     """Error that names the one of `plugins` that is to blame for an exception of a tick; else the exception itself.
 
     Each plug-in comes with its sort, a law for example. A plug-in is to blame if its method was running, or if the
@@ -47,7 +56,7 @@ def explain(error: Exception, plugins: Iterable[tuple[str, object]]) -> Exceptio
     return error
 
 
-def failure(what: str, plugin: object, error: Exception) -> PluginError:
+def failure(what: str, plugin: object, error: BaseException) -> PluginError:
     """Error that names a plug-in which failed, with the last line of its file that was at work."""
     file = _file(plugin)
     lines = [frame.lineno for frame in extract_tb(error.__traceback__) if frame.filename == file]
@@ -60,6 +69,72 @@ def wrong(what: str, plugin: object, method: str, result: object, wanted: str) -
     got = "nothing: is a `return` missing?" if result is None else repr(result)[:LONGEST]
     name, file = type(plugin).__name__, _file(plugin)
     return PluginError(f"`{method}` of the {what} {name} must give {wanted}, not {got} ({plain(file)})")
+
+
+def _calls_of_plugins(frame: FrameType | None) -> list[tuple[FrameType, int]]:
+    """Frames of plug-ins of others below a frame, the innermost first, with their lines."""
+    return [(each, line) for each, line in walk_stack(frame) if owner_of(each) is not None]
+
+
+def _place(frame: FrameType, line: int) -> str:
+    return plain(f"{frame.f_code.co_filename}:{line}")
+
+
+class _Alarm:
+    """Handler of the alarm that rings every `LIMIT_S`; raises PluginError in a call that it meets too often."""
+
+    def __init__(self, limit_s: float) -> None:
+        self._limit_s = limit_s
+        self._call: FrameType | None = None  # outermost call of a plug-in when it rang last
+        self._rung = 0  # times that it rang in that call, without the first
+
+    def __call__(self, _signal: int, frame: FrameType | None) -> None:
+        calls = _calls_of_plugins(frame)
+        call = calls[-1][0] if calls else None
+        self._rung = self._rung + 1 if call is not None and call is self._call else 0
+        self._call = call
+        if call is None or self._rung < (PATIENCE if call.f_code.co_name in PREPARING else 1):
+            return
+        name, place = call.f_code.co_name, _place(*calls[0])
+        what = "the import" if name == "<module>" else f"`{name}`"
+        raise PluginError(
+            f"{what} of the {owner_of(call)} took more than {self._rung * self._limit_s:g} s ({place}); does a loop "
+            "there never end?"
+        )
+
+
+@contextmanager
+def supervised(limit_s: float = LIMIT_S) -> Iterator[None]:
+    """Block in which a plug-in of others that does not return, or that ends the process, raises PluginError.
+
+    A call is interrupted between two lines of Python in the main thread alone; a library that never returns is not.
+    Of the ways that end a process without an exception, `os._exit` is caught.
+    """
+    if threading.current_thread() is not threading.main_thread() or not hasattr(signal, "setitimer"):
+        yield
+        return
+    if isinstance(signal.getsignal(signal.SIGALRM), _Alarm):  # the block of a caller
+        yield
+        return
+    end = os._exit
+
+    def refused(status: int) -> NoReturn:
+        frame = sys._getframe(1)
+        if (owner := owner_of(frame)) is None:
+            end(status)
+        raise PluginError(f"the {owner} ends the process: os._exit({status}) ({_place(frame, frame.f_lineno)})")
+
+    former, begun = signal.signal(signal.SIGALRM, _Alarm(limit_s)), time.monotonic()
+    left, period = signal.setitimer(signal.ITIMER_REAL, limit_s, limit_s)
+    os._exit = refused
+    try:
+        yield
+    finally:
+        os._exit = end
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, former)
+        if left:  # of a clock that a caller has set
+            signal.setitimer(signal.ITIMER_REAL, max(left - (time.monotonic() - begun), 1e-3), period)
 
 
 class Watched:

@@ -16,6 +16,7 @@ from functools import cache
 from importlib.metadata import Distribution, EntryPoint, EntryPoints, entry_points
 from pathlib import Path
 from traceback import walk_tb
+from types import FrameType
 from typing import Any, ClassVar, Final, Literal, Protocol, get_args, get_origin, get_type_hints
 
 import msgspec
@@ -199,14 +200,19 @@ def split(choice: str | Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
 
 def culprit(error: BaseException) -> str | None:
     """The line of another distribution's plug-in in which an error came about; None if there is none."""
-    owners = {entry.module: distribution_name(dist) for entry, dist in _foreign()}
     for frame, line in reversed(list(walk_tb(error.__traceback__))):
-        module = frame.f_globals.get("__name__", "")
-        if module.startswith(files.PREFIX):
-            return f"plug-in in {Path(frame.f_code.co_filename).name} failed in line {line}"
-        if module in owners:
-            return f"plug-in {module} of {owners[module]} failed at {frame.f_code.co_filename}:{line}"
+        if (owner := owner_of(frame)) is not None:
+            return f"{owner} failed at {files.plain(frame.f_code.co_filename)}:{line}"
     return None
+
+
+def owner_of(frame: FrameType) -> str | None:
+    """The plug-in of another distribution, or of a file, with the module that a frame runs; None if it is none."""
+    module = frame.f_globals.get("__name__", "")
+    if module.startswith(files.PREFIX):
+        return f"plug-in in {Path(frame.f_code.co_filename).name}"
+    owner = _owners().get(module)
+    return None if owner is None else f"plug-in {module} of {owner}"
 
 
 def body_name(address: str) -> str:
@@ -233,6 +239,12 @@ def _foreign() -> list[tuple[EntryPoint, Distribution]]:
         for entry in entries
         if entry.dist is not None and distribution_name(entry.dist) != "zenpark"
     ]
+
+
+@cache
+def _owners() -> dict[str, str]:
+    """Distributions of others by the modules of their plug-ins."""
+    return {entry.module: distribution_name(dist) for entry, dist in _foreign()}
 
 
 @cache
@@ -271,6 +283,8 @@ def _reason(error: BaseException) -> str:
     asked = re.search(r"import name '(\w+)'", str(error))
     if asked and isinstance(error, ImportError) and error.name == FACE:
         return f"{FACE} has no {asked[1]!r}; {did_you_mean(asked[1], dir(sys.modules[FACE]))}"
+    if isinstance(error, ModuleNotFoundError) and error.name and error.name.partition(".")[0] not in sys.modules:
+        return f"{error}: `./zenpark install {error.name.partition('.')[0]}` adds a package of that name"
     return f"{type(error).__name__}: {error}"
 
 
@@ -283,10 +297,10 @@ def _origin(entry: EntryPoint) -> str:
     return f"plug-in {entry.name!r} ({entry.value}) of {distribution}"
 
 
-# Exceptions from mistakes in a plug-in.
+# Exceptions from mistakes in a plug-in, and of one that ends the process. Ctrl-C is none of them.
 FAILURES: Final = (
     AttributeError, TypeError, ValueError, NameError, LookupError, ArithmeticError, AssertionError, RuntimeError,
-    StopIteration, MemoryError,
+    StopIteration, MemoryError, SystemExit, GeneratorExit,
 )  # fmt: skip
 # Exceptions from the import of a foreign module.
 _IMPORT_FAILURES: Final = (*FAILURES, ImportError, SyntaxError, OSError)

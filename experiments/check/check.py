@@ -8,6 +8,7 @@ from typing import Final
 
 import numpy as np
 
+from agents.plugins.calls import supervised
 from agents.plugins.files import plain
 from experiments.check import motion, noise, safety, theory
 from experiments.check import obstacles as surroundings
@@ -69,6 +70,7 @@ def check(given: Document, cases: Sequence[str] = ()) -> list[Finding]:
 
 
 @QUIET
+@supervised()
 def analyses(cases: Mapping[str, Plan]) -> dict[str, Analysis]:
     """Analysis of each case, by its name."""
     bare = {name: standby.without_standby(case) for name, case in cases.items()}
@@ -92,6 +94,7 @@ def figures(plan: Plan) -> CheckNumbers:
 
 
 @QUIET
+@supervised()
 def _findings(given: Document, analyses: Mapping[str, Analysis]) -> list[Finding]:
     """Findings, each once; those of only some cases name these cases."""
     holders: dict[Finding, list[str]] = {}
@@ -127,6 +130,7 @@ def _finite(value: float) -> float | None:
 
 
 @QUIET
+@supervised()
 def _figures(analysis: Analysis) -> CheckNumbers:
     plan, links, limits, prediction = analysis.plan, analysis.plan.links, analysis.limits, analysis.prediction
     arena, end, fastest, follower = plan.experiment.arena, prediction.position[-1], analysis.fastest, analysis.follower

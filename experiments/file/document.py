@@ -15,6 +15,7 @@ from typing import Any, Final
 import msgspec
 
 from agents.plugins import files
+from agents.plugins.calls import supervised
 from agents.plugins.registry import did_you_mean
 from experiments.catalogue import index
 from experiments.definition.experiment import Experiment
@@ -115,6 +116,7 @@ def received(text: str, label: str) -> Document:
     return _document(Path(label), label, text, (), received=True)
 
 
+@supervised()
 def _document(file: Path, label: str, text: str, flags: Sequence[str], *, received: bool = False) -> Document:
     is_json = received or file.suffix.lower() == ".json"
     try:

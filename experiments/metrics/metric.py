@@ -21,6 +21,7 @@ import msgspec
 import numpy as np
 
 from agents.plugins import files, registry
+from agents.plugins.calls import supervised
 from experiments.definition.experiment import Criterion
 from experiments.metrics.results import CaseMetrics, RobotMetrics
 from experiments.metrics.signals import Measurement, closest_distance, mean_known
@@ -260,6 +261,7 @@ class _LeanTrace(Trace):
         return super().__getattribute__(name)
 
 
+@supervised()
 def values_of(
     metrics: Mapping[str, Metric], shared: Measurement, *, lean: bool = False
 ) -> tuple[dict[str, list[Number]], tuple[str, ...]]:

@@ -14,7 +14,7 @@ import numpy as np
 
 from agents.body.interface import BodyState
 from agents.body.shadow_twin import shadowed
-from agents.plugins.calls import explain
+from agents.plugins.calls import explain, supervised
 from agents.plugins.law import Memory
 from agents.plugins.registry import FAILURES
 from agents.robot import Robot
@@ -87,6 +87,7 @@ class Snapshot:
     engine: Engine  # of the bodies
 
 
+@supervised()
 def simulate(
     plan: Plan,
     seed: int,

@@ -156,6 +156,7 @@ def test_sound_plug_ins_are_one_and_frozen(foreign):
 def test_foreign_culprit_is_named_with_its_line(owner, named, monkeypatch):
     entry = SimpleNamespace(module=__name__, dist=type("Distributed", (), {"name": owner}))
     monkeypatch.setattr(registry, "installed", lambda: SimpleNamespace(select=lambda group: [entry]))
+    monkeypatch.setattr(registry, "_owners", registry._owners.__wrapped__)
     with pytest.raises(ValueError, match="width must") as caught:
         Pulse(width=0.0)
     assert str(registry.culprit(caught.value)).startswith(named)

@@ -114,7 +114,7 @@ def test_broken_plugin_stops_no_command_that_needs_none(broken, words, tmp_path,
 
 
 def test_file_with_a_broken_plugin_is_refused_there(broken):
-    with pytest.raises(DocumentError, match=r":7:7: .*fails to import: ModuleNotFoundError"):
+    with pytest.raises(DocumentError, match=r":7:7: .*fails to import: No module .*`./zenpark install no_such"):
         loads(SMALL.replace("[formation.links]", '[formation]\nlaw = "broken"\n[formation.links]'))
 
 
