@@ -98,7 +98,8 @@ class Machine:
             time.time = lambda: utc() + {offset_s!r} + {drift!r} * (utc() - {time.time()!r})
             """
         (fake / "sitecustomize.py").write_text(textwrap.dedent(wrong) if offset_s or drift else "")
-        command.write_text(f'#!/bin/sh\nPYTHONPATH={fake}:{ROOT} exec {sys.executable} -m tools.guard "$@"\n')
+        own = f"PYTHONPATH={fake}:{ROOT} ZENPARK_RUNTIME_DIR={self.folder / 'runtime'}"
+        command.write_text(f'#!/bin/sh\n{own} exec {sys.executable} -m tools.guard "$@"\n')
         command.chmod(0o755)
         return command
 

@@ -161,6 +161,26 @@ def test_machine_cut_off_lands_its_robots_only(lab, tmp_path):
     assert "done (finished)" in desk.said("KH01")
 
 
+@pytest.mark.parametrize("keys", [False, True], ids=["open", "lab"])
+def test_estop_typed_on_a_machine_stops_all(lab, tmp_path, keys):
+    desk = AtDesk(lab, tmp_path, EACH, keys=keys)
+    if keys:
+        desk.end(desk.begin("hosts install"))
+    process = desk.run("duration_s=60", "--no-report")
+    desk.until_running(*TRIANGLE)
+    typed_there = [*lab["lab2"].command(str(lab["lab2"].folder / "zenpark")), "estop"]
+    done = subprocess.run(typed_there, env=lab.environment, capture_output=True, text=True, check=False)
+    if keys:  # only an operator may stop, who has no certificate there; the run at the desk gets it all the same
+        assert (done.returncode, done.stdout) == (1, "")
+        assert "NOT known to have stopped: CF01, KH01, KH02 (3 of 3 robots; " in done.stderr
+    else:
+        assert done.returncode == 0, done.stderr
+        assert done.stdout.startswith("stopped: CF01, KH01, KH02 (")
+    assert "emergency stop by operator: zenpark estop" in desk.end(process, code=1)
+    for robot in TRIANGLE:
+        assert f"{robot}: done (emergency stop by operator: zenpark estop)" in desk.said(robot)
+
+
 def test_a_short_cut_of_the_cable_lands_nobody(lab, tmp_path):
     """TCP sends what was lost again 3 s after the cut, although the cable is back after 2 s."""
     desk = AtDesk(lab, tmp_path, EACH)

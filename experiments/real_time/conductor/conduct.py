@@ -179,6 +179,7 @@ def _run_setup(
         routers = make_routers(listening, network.routers) if own_router else []
         start_routers(launcher, routers, rights)
         hosts = Hosts(launcher, endpoints if meshed else listening)
+        hosts.obey = user.emergency.receive
         # a mesh has no members yet: only the session of each case receives stops there
         if not meshed:
             wait_s = STARTING_S if own_router else ASK_S

@@ -18,7 +18,7 @@ import shutil
 import subprocess
 import threading
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from typing import Final, Self
 
@@ -27,13 +27,15 @@ import msgspec
 from agents import clock
 from agents.clock import STEP_S, Clock
 from agents.errors import ExplainedError
-from agents.network import lab
+from agents.network import lab, messages
 from agents.network.endpoints import Endpoint
 from agents.network.messages import HostClock
+from agents.runtime.lifeline import stop_in
 from experiments.definition.experiment import Host
 from experiments.definition.plan import Plan
 from experiments.real_time.hosts import certificates, ssh
 from experiments.real_time.hosts.launcher import RUN, Launcher, Process
+from experiments.real_time.hosts.run_registry import own_entry
 from experiments.real_time.hosts.station import Answer, Question
 from experiments.recording import clocks, version
 
@@ -80,7 +82,16 @@ def run_script(
 class Station:
     """The connection to a host's station."""
 
-    def __init__(self, name: str, host: Host, *, launcher: Launcher, routers: Sequence[str], run: str) -> None:
+    def __init__(
+        self,
+        name: str,
+        host: Host,
+        *,
+        launcher: Launcher,
+        routers: Sequence[str],
+        run: str,
+        obey: Callable[[messages.Stop], object] = lambda _: None,
+    ) -> None:
         """Begin to connect; `greet` waits for the station.
 
         Args:
@@ -88,6 +99,7 @@ class Station:
             launcher: Starts the ssh, and keeps its lifeline.
             routers: As this machine reaches them; those on loopback go through this connection. Of a lab, if any is.
             run: By which the station finds the run's processes.
+            obey: Gets the emergency stops that were ordered on the host.
         """
         assert host.address is not None
         self.name, self.host, self.address = name, host, host.address
@@ -113,7 +125,7 @@ class Station:
         self._rest = b""
         self._starting: list[Process] = []
         self._robots: list[Process] = []
-        self._launcher = launcher
+        self._launcher, self._obey = launcher, obey
         self._silent = ""  # reason; empty while it answers
         self.reset_clock()
 
@@ -162,9 +174,14 @@ class Station:
             if not data:
                 raise HostError(self._broken())
             *lines, self._rest = (self._rest + data).split(b"\n")
+            found = None
             for line in lines:
+                if (stop := stop_in(line)) is not None:
+                    self._obey(stop)
                 with suppress(msgspec.MsgspecError):  # a greeting of the shell
-                    return msgspec.json.decode(line, type=Answer), left, back
+                    found = msgspec.json.decode(line, type=Answer)
+            if found is not None:
+                return found, left, back
         # no further question: a late answer would be taken for that to the next one
         self._silent = f"{self.name}: its station says nothing for {limit_s:g} s; is that machine overloaded?"
         raise HostError(self._silent)
@@ -214,6 +231,13 @@ class Station:
         """Folder of certificates on the host."""
         return self.host.lab.removeprefix("~/")
 
+    def list_run(self, plan: Plan) -> None:
+        """Have the run listed on the host, with its robots on all machines, for an `estop` that is typed there."""
+        experiment, robots = plan.experiment, dict.fromkeys(plan.names, "")
+        realm = experiment.network.realm
+        run = own_entry("run", experiment.title or "a run over hosts", self.endpoints, realm=realm, robots=robots)
+        self.ask(Question("register", lab=None if self.lab is None else self.folder, run=run))
+
     def start(self, name: str, robots: Sequence[str], document: bytes) -> Process:
         deadline = time.monotonic() + HELLO_S
         while self._connecting() >= HANDSHAKES and time.monotonic() < deadline:
@@ -240,6 +264,7 @@ class Hosts:
     def __init__(self, launcher: Launcher, routers: Sequence[str]) -> None:
         """Connect no host yet; `routers` as this machine reaches them, or as they listen if that is everywhere."""
         self._launcher, self.routers = launcher, list(routers)
+        self.obey: Callable[[messages.Stop], object] = launcher.stop  # gets emergency stops that came from a host
         self._run = secrets.token_hex(8)
         self._stations: dict[str, Station] = {}
         self.by_robot: dict[str, Station] = {}  # of the case
@@ -253,8 +278,9 @@ class Hosts:
             known = self._stations.get(name)
             if known is None or (known.address, known.host.zenpark) != (host.address, host.zenpark):
                 self._launcher.end([f"{STATION}{name}"], grace_s=0.0)
-                routers = self.routers
-                self._stations[name] = Station(name, host, launcher=self._launcher, routers=routers, run=self._run)
+                self._stations[name] = Station(
+                    name, host, launcher=self._launcher, routers=self.routers, run=self._run, obey=self.obey
+                )
                 fresh.append(self._stations[name])
         trouble = []
         for station in fresh:
@@ -269,6 +295,7 @@ class Hosts:
                     trouble += station.distrusted(station.host.robots)
                     if len(station.host.robots) > 1:
                         station.ask(Question("preload"))
+                    station.list_run(plan)
             except HostError as error:
                 trouble.append(str(error))
         if trouble:

@@ -25,13 +25,14 @@ import msgspec
 
 from agents.clock import Clock
 from agents.errors import ExplainedError
-from agents.network import lab
+from agents.network import lab, messages
 from agents.network import session as network
 from agents.plugins import registry
-from agents.runtime.lifeline import FAR_SILENCE_S
+from agents.runtime.lifeline import FAR_SILENCE_S, stop_line
 from experiments.definition.bodies import missing_library
-from experiments.real_time.hosts import certificates
+from experiments.real_time.hosts import certificates, run_registry
 from experiments.real_time.hosts.launcher import LAND_S, RUN, tagged
+from experiments.real_time.hosts.run_registry import RegisteredRun, StopReport
 from experiments.real_time.processes import zygote
 from experiments.real_time.processes.zygote import NoZygote
 from experiments.recording import version
@@ -45,11 +46,12 @@ UDEV: Final = "add a udev rule for it and plug it in again (docs/crazyflie.md)"
 
 
 class Question(msgspec.Struct, frozen=True, omit_defaults=True):
-    ask: Literal["hello", "clock", "reach", "devices", "certificates", "sweep", "preload"]
+    ask: Literal["hello", "clock", "reach", "devices", "certificates", "sweep", "preload", "register"]
     endpoints: list[str] = []  # routers to reach
     bodies: list[str] = []  # robots with devices in question
     lab: str | None = None  # folder of certificates
     names: list[str] = []  # certificates that are asked for, or shown to routers
+    run: RegisteredRun | None = None  # to be listed on this machine
 
 
 class HostCheck(msgspec.Struct, frozen=True):
@@ -171,6 +173,28 @@ def _preloaded() -> Iterator[None]:
             started.kill()
 
 
+@contextlib.contextmanager
+def _listed(run: RegisteredRun, folder: str | None) -> Iterator[None]:
+    """Inside, the run is listed here with its routers as this machine reaches them, for `estop` typed here.
+
+    What that gives to this process goes on to the starter, which passes it on to all robots: it needs no router, and in
+    a lab no certificate of an operator.
+    """
+
+    def obey(stop: messages.Stop) -> StopReport:
+        os.write(1, stop_line(stop))
+        return StopReport([], [])
+
+    endpoints = lab.secured(run.endpoints, folder)
+    with run_registry.registered(
+        run_registry.own_entry("run", run.title, endpoints, realm=run.realm, identity=run.identity, robots=run.robots),
+        obey,
+    ) as why:
+        if why:
+            print(f"station: {why}", file=sys.stderr)
+        yield
+
+
 def _frozen(pid: int) -> bool:
     """Whether a process was stopped (SIGSTOP): it will not come down by itself."""
     try:
@@ -213,6 +237,8 @@ def serve(fd: int = 0, patience_s: float = LAND_S) -> int:
                     continue
                 if question.ask == "preload":
                     until_lost.enter_context(_preloaded())
+                if question.run is not None:
+                    until_lost.enter_context(_listed(question.run, question.lab))
                 os.write(1, msgspec.json.encode(answer(question, clock)) + b"\n")
     lost = time.monotonic()
     while (left := _other_processes()) and time.monotonic() < lost + patience_s:

@@ -16,13 +16,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from agents.clock import STEP_S, Clock, correction_line
-from agents.network.endpoints import Endpoint
+from agents.network import messages
+from agents.network.endpoints import Endpoint, free_endpoint
 from agents.network.messages import HostClock
-from agents.runtime.lifeline import BEAT_S, FAR_SILENCE_S
+from agents.runtime.lifeline import BEAT_S, FAR_SILENCE_S, stop_in, stop_line
 from experiments.definition.experiment import Host as HostTable
-from experiments.real_time.hosts import hosts, ssh
+from experiments.real_time.conductor.orders import EmergencyStop
+from experiments.real_time.hosts import hosts, run_registry, ssh
 from experiments.real_time.hosts.hosts import HostError
 from experiments.real_time.hosts.launcher import RUN, Launcher
+from experiments.real_time.hosts.run_registry import own_entry
 from experiments.real_time.hosts.station import Answer, Question, answer, devices
 from experiments.real_time.processes import zygote
 from experiments.recording import version
@@ -139,19 +142,19 @@ def test_silent_station_is_noted_and_its_ssh_ended(tmp_path, monkeypatch, script
 SERVE = "from experiments.real_time.hosts.station import serve; serve(patience_s=0.5)"
 
 
-def process_of(run, code="input()", **options):
-    return started("-c", code, env=environment(**{RUN: run}), **options)
+def process_of(run, code="input()", env=None, **options):
+    return started("-c", code, env=environment(**{RUN: run}, **(env or {})), **options)
 
 
 @contextmanager
-def station(run):
+def station(run, **options):
     """A station process of a run, of which one can `ask` a question."""
 
     def ask(*question):
         print("\n" + msgspec.json.encode(Question(*question)).decode(), file=process.stdin, flush=True)
         return msgspec.json.decode(process.stdout.readline(), type=Answer)
 
-    with process_of(run, SERVE, stderr=None) as process:
+    with process_of(run, SERVE, stderr=None, **options) as process:
         yield ask, process
         process.stdin.close()
         assert process.wait(30) == 0
@@ -171,6 +174,40 @@ def test_it_sweeps_up_its_own_run_only():
             assert [each.what for each in found] == [str(mine.pid)]
             assert mine.wait(30) == -9
         assert other.poll() is None
+
+
+@pytest.mark.system
+def test_station_lists_run_for_a_stop(runtime_folder):
+    endpoint = free_endpoint(preferred_port=0)  # as the host reaches it
+    desk = changed(own_entry("run", "two", [endpoint], realm="hall", robots={"A": "", "B": ""}), pid=1, born="x")
+    with station("run.lab1", env={"ZENPARK_RUNTIME_DIR": str(runtime_folder)}) as (ask, process):
+        ask("clock")
+        print(msgspec.json.encode(Question("register", run=desk)).decode(), file=process.stdin, flush=True)
+        process.stdout.readline()
+        (found,) = run_registry.runs()
+        assert (found.pid, found.realm, found.endpoints) == (process.pid, "hall", [endpoint])
+        stop = EmergencyStop(found.endpoints, found.realm, found.identity, found)
+        stop.send("a person is there")
+        line = process.stdout.readline().encode()
+        assert stop_in(line.strip()) == messages.Stop("operator", "a person is there"), "the starter gets it"
+        assert stop.answered
+        assert stop.moving == {"A", "B"}, "no router answers"
+    assert run_registry.runs() == []
+
+
+def test_starter_obeys_stops_between_answers(tmp_path, monkeypatch):
+    said = stop_line(messages.Stop("operator", "typed there")).decode() + '{"zenpark": "x", "clock": 1.0}\n'
+    ssh_file = tmp_path / "ssh"
+    ssh_file.write_text(f"#!/bin/sh\nread line\nprintf '%s' '{said}{said}'\nexec sleep 60\n")
+    ssh_file.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    stops = []
+    with Launcher(tmp_path / "logs") as launcher:
+        host = HostTable(address="lab2")
+        station = hosts.Station("lab2", host, launcher=launcher, routers=[], run="run", obey=stops.append)
+        assert station.ask(Question("clock"))[0].clock == 1.0
+        launcher.end([station.process.name], grace_s=0.0)
+    assert set(stops) == {messages.Stop("operator", "typed there")}
 
 
 @pytest.mark.mechanism("station: way out on a host")
