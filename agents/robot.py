@@ -158,12 +158,14 @@ class Robot:
     def start(self, at: float, t: float = -inf, origin: Pose | None = None) -> str:
         """Order to begin at `at` [s], or to continue after a hold; returns as `hold`.
 
+        A robot that was ordered to hold before goes on to hold: the order to begin comes by itself in a run.
         `origin`: x, y, z [m] and yaw [rad] at which the plan of a restarted robot began; None: the plan restarts.
         """
         waits = self.lifecycle.phase == AIRBORNE
         refusal = self.lifecycle.start(at)
         if not refusal:
-            self.resume()
+            if not (waits and self._ordered):
+                self.resume()
             if origin is not None and waits:
                 self._begin_plan(origin, t - at)
         return refusal

@@ -8,6 +8,7 @@ messages: JSON has no NaN.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from math import inf, isfinite, remainder, tau
@@ -30,6 +31,7 @@ UNKNOWN: Final = "an unknown sender"
 MAX_WORDS: Final = 200  # characters of a stop that are shown
 MAX_PAYLOAD: Final = 64 * 1024  # [bytes]; `payloads` splits what is longer
 STILL: Final[Vector] = (0.0, 0.0, 0.0)
+_NUMBER: Final = re.compile(r"(?<![\w.])[-+−]?\d[\d.]*")
 
 
 class Malformed(ValueError):
@@ -496,6 +498,11 @@ def decode(payload: bytes, mime: str, kind: type[M]) -> M:
         raise Malformed(f"no valid {kind.__name__}: {error}") from None
     assert isinstance(message, kind)
     return message
+
+
+def without_numbers(text: str) -> str:
+    """A text without its numbers, except those in names: one that counts seconds is news once."""
+    return _NUMBER.sub("", text)
 
 
 def read_stop(payload: bytes, mime: str) -> Stop:

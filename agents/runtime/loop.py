@@ -466,6 +466,7 @@ class Runtime:
             if robot.lifecycle.active:
                 robot.lifecycle.land(why)
             robot.landing.aside = False  # the body lands by other means
+        self._retire(self.ticks.t)
         self._declare_tokens()
 
     def _malformed(self) -> int:

@@ -158,11 +158,14 @@ class TelemetryPublisher:
             self.due = t + STATUS_S
         for row, robot in enumerate(self._robots):
             life, missing = robot.lifecycle, robot.missing_neighbours()
-            news = (life.phase, life.reason, tuple(missing), self._numbers[row])
+            news = (life.phase, messages.without_numbers(life.reason), tuple(missing), self._numbers[row])
             if not everything and news == self._reported[row]:
                 continue
             if news[:2] != self._reported[row][:2]:
-                print(f"{self._names[row]}: {WORDS[life.phase]}" + (f" ({news[1]})" if news[1] else ""), flush=True)
+                print(
+                    f"{self._names[row]}: {WORDS[life.phase]}" + (f" ({life.reason})" if life.reason else ""),
+                    flush=True,
+                )
             self._reported[row] = news
             self._last[row] = status = self._status(row, t, missing, states[row] if states else None)
             self._statuses[row].put(messages.encode(status, self._encoding))

@@ -4,7 +4,7 @@ from math import dist, inf, nan
 
 import pytest
 
-from agents.decision.lifecycle import DONE, IDLE, READY, RUNNING
+from agents.decision.lifecycle import AIRBORNE, DONE, IDLE, PAUSED, READY, RUNNING
 from agents.network.messages import Order
 from agents.runtime.orders import carry_out
 from experiments.definition.experiment import Formation, LegTable, Start
@@ -104,6 +104,21 @@ def test_robot_holds_and_goes_on(what):
     assert what != "order" or robot.start(0.0) == ""
     assert swarm.run(0.2).last("A", "goal") != held
     assert robot.lifecycle.start_at == swarm.start_at
+
+
+def test_hold_before_common_start_outlasts_it():
+    swarm = Swarm(pair())
+    while swarm.phase("A") != AIRBORNE:
+        swarm.step()
+        swarm.robot("A").lifecycle.takeoff()
+    robot = swarm.robot("A")
+    assert robot.hold() == ""
+    assert robot.start(swarm.t + 0.1, swarm.t) == "", "the order of the conductor"
+    held = swarm.run(0.5).last("A", "goal")
+    assert (swarm.phase("A"), robot.lifecycle.reason) == (RUNNING, PAUSED)
+    assert swarm.run(1.0).last("A", "goal") == held
+    assert robot.start(swarm.t, swarm.t) == "", "an order to a robot that runs ends the hold"
+    assert robot.lifecycle.reason == ""
 
 
 def test_leader_goes_where_it_is_sent():

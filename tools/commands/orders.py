@@ -64,6 +64,11 @@ ORDERS: Final[Mapping[messages.OrderKind, tuple[str, str]]] = {
     "resume": ("Let robots continue after a hold.", "goes on"),
     "land": ("Land robots where they are.", "lands"),
 }
+# phases in which an order changes nothing, but that a start ends a hold of a running robot
+UNDER_WAY: Final[Mapping[messages.OrderKind, Sequence[str]]] = {
+    "takeoff": ("airborne", "running"),
+    "start": ("running",),
+}
 # changes of a run, which its conductor makes
 CHANGES: Final[Mapping[messages.ChangeKind, str]] = {
     "remove": "Land robots and end their processes; the others go on without them.",
@@ -123,7 +128,12 @@ def _order_robots(what: messages.OrderKind, robots: Sequence[str], by: Operator)
         at = time.time() + orders.start_lead_s(len(receivers)) if what == "start" else None
         replies = orders.send_order(opened, keys, receivers, messages.Order(what, at=at))
         _, does = ORDERS.get(what, ("", "stops"))
-        done = {name: reply.reason or does for name, reply in replies.items() if reply.ok}
+        already = UNDER_WAY.get(what, ())
+        done = {
+            name: reply.reason or (f"is {reply.phase} already" if reply.phase in already else does)
+            for name, reply in replies.items()
+            if reply.ok
+        }
         refused = {name: reply.reason or reply.phase for name, reply in replies.items() if not reply.ok}
         text = f"{what}: {', '.join(done) or 'no robot'}"
         if refused:

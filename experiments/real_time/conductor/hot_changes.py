@@ -175,8 +175,9 @@ class HotChanges:
 
     def _answer(self, change: _Change, *, done: str = "", refused: str = "") -> None:
         for name in change.names:
-            self._leaving.discard(name)
-            self._ended.pop(name, None)
+            if change in self._changes:  # else it was refused, and another one is changing the robot
+                self._leaving.discard(name)
+                self._ended.pop(name, None)
             if refused:
                 change.asked.refused[name] = refused
                 self._view.report("refused", name, f"{change.asked.order.order}: {refused}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager, ExitStack
@@ -243,13 +242,13 @@ class NetworkView:
         if status.phase not in ORDER or status.pid == view.former:
             return
         view.seen = min(view.seen, time.monotonic())
-        if view.status is not None and (view.status.phase, view.status.reason) != (status.phase, status.reason):
+        if view.status is not None and _plain(view.status) != _plain(status):
             self.report("robot", status.robot, status.phase + (f": {status.reason}" if status.reason else ""))
         for incident in status.incidents_since(view.status):
             self.report("hazard", status.robot, incident.text)
         if _fell_out(view.status, status):
             self.report("hazard", status.robot, f"land: {status.reason}")
-        note = re.sub(r"[\d.]+", "", status.body)  # a silence with its counted seconds is reported once
+        note = messages.without_numbers(status.body)
         if note != view.note:
             view.note = note
             self.report("body", status.robot, status.body or "no trouble any more")
@@ -258,6 +257,10 @@ class NetworkView:
         view.status = status
         view.origin = status.origin or view.origin
         view.behind = min(view.behind, self.clock.utc() - status.stamp)
+
+
+def _plain(status: messages.Status) -> tuple[str, str]:
+    return status.phase, messages.without_numbers(status.reason)
 
 
 def _fell_out(before: messages.Status | None, now: messages.Status) -> bool:

@@ -177,8 +177,8 @@ def _preloaded() -> Iterator[None]:
 def _listed(run: RegisteredRun, folder: str | None) -> Iterator[None]:
     """Inside, the run is listed here with its routers as this machine reaches them, for `estop` typed here.
 
-    What that gives to this process goes on to the starter, which passes it on to all robots: it needs no router, and in
-    a lab no certificate of an operator.
+    The stop goes on to the starter as well, which passes it on to all robots. That way needs no router, and in a lab no
+    certificate of an operator.
     """
 
     def obey(stop: messages.Stop) -> StopReport:

@@ -124,6 +124,28 @@ def test_stop_during_command_has_last_word(during, on_stage):
     assert not stage.body.read(stage.runtime.ticks.t + 0.01)[0].flying
 
 
+def test_hang_that_ends_stays_out_of_formation(on_stage, monkeypatch):
+    stage, declared, sent = on_stage(DRONE), [], []
+    monkeypatch.setattr(stage.runtime.keeper, "declare", lambda _, rows: declared.append(list(rows)))
+    monkeypatch.setattr(stage.runtime, "_send_pose", lambda *_: sent.append(stage.clock.now))
+
+    def visit(phase):
+        life = stage.robot.lifecycle
+        if phase == Phase.READY:
+            life.takeoff()
+        elif phase == Phase.AIRBORNE:
+            life.start(stage.runtime.ticks.t)
+        elif phase == Phase.RUNNING and sent:
+            sent.clear()
+            stage.runtime.watchdog.tripped = "it hangs"
+        return phase == Phase.DONE or len(stage.ticks) > 5000
+
+    stage.run(visit)
+    assert stage.robot.lifecycle.reason == "it hangs"
+    assert declared == [[0], []], "its token is not declared again"
+    assert sent == [], "nor is a pose sent"
+
+
 def test_stop_on_the_lifeline_needs_no_router(on_stage, monkeypatch):
     stage, stops = on_stage(DRONE), []
     line = stop_line(messages.Stop("operator", "without a router")).strip()

@@ -406,6 +406,16 @@ def test_robots_beginning_is_its_first_status_within_experiment():
     assert view.robots["TB01"].began is None
 
 
+def test_reason_that_counts_is_reported_once():
+    view = View()
+    for at, behind in enumerate(("2", "2.01", "2", "-0.5")):
+        reason = f"positions of CF01 are stamped {behind} s behind"
+        view.receive_status(changed(status(at=float(at)), phase="idle", reason=reason, body=f"silent for {at}.5 s"))
+    view.receive_status(changed(status(at=5.0), phase="idle", reason=reason.replace("CF01", "CF02"), body="silent"))
+    assert [said[2] for said in view.said if said[0] == "robot"] == [f"idle: {reason.replace('CF01', 'CF02')}"]
+    assert [said[2] for said in view.said if said[0] == "body"] == ["silent for 0.5 s", "silent"]
+
+
 @pytest.mark.parametrize(
     ("reason", "incidents", "fault"),
     [

@@ -182,6 +182,16 @@ def test_whole_orders_that_are_refused(stage):
     assert not stage.given
 
 
+def test_refused_change_leaves_the_one_under_way(stage, monkeypatch):
+    leaves = stage.end
+    monkeypatch.setattr(stage, "end", lambda _name: None)  # it takes a while to land
+    first = stage.ask("replace", "CF01")
+    stage.go_on(1.0)
+    assert "is being changed already" in stage.after(stage.ask("remove", "CF01")).refused["CF01"]
+    leaves("CF01")
+    assert "takes part after" in stage.after(first, 5.0).done["CF01"]
+
+
 def test_the_end_of_the_run_answers_everybody(stage):
     stage.hung.add("CF01")
     query, second = stage.ask("remove", "CF01"), stage.ask("restart", "CF01")
