@@ -235,6 +235,8 @@ class Robot:
         if now.jump == now.jump:
             now.position = UNKNOWN
         self._filter.judge(now)
+        if self._external.doubted:
+            self._filter.judge_far(now, self._external.place)
 
     def _doubt(self) -> None:
         """Note that the external positions jumped, or deceive."""

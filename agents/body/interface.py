@@ -133,6 +133,7 @@ class BodyState:
     true_yaw: float = nan  # the truth of a twin [rad]
     battery: float = nan  # charge, 0 to 1
     flying: bool = False  # motors on, off the ground or about to be
+    spinning: bool = True  # the motors of a flying robot turn, as far as its device tells: one that arms waits first
     attitude: Attitude = NO_ATTITUDE  # of bodies that measure more than yaw
     shadow_position: Vector = UNKNOWN  # of the twin that runs beside the robot [m] (`agents.body.shadow_twin`)
     shadow_yaw: float = nan  # of that twin [rad]

@@ -156,6 +156,9 @@ class Kind:
     # time constant with which its velocity follows what is commanded [s]
     lag: float = 0.1  # of a robot on wheels at 2 m/s², from 0.3 m/s, and a tick or two
     overshoot: float = 0.0  # of a take-off of the real robot, share of its height, at most
+    late_s: float = inf  # largest delay of positions from outside by which its controller on board flies well [s]
+    # time from its motors to the first 5 cm of a climb to a height h by such positions, at most: a + b h + c / h [s]
+    lift_s: Vector = (inf, 0.0, 0.0)
     turn_radius: float = 0.0  # smallest, of one that cannot turn on the spot [m]
     steering: Steering | None = None  # of one that takes twists; None: as two wheels turn
     # of its twin, or a `module:class`, see `twins.models.ground.Ground`; None: it has no twin
@@ -181,6 +184,11 @@ class Kind:
     connect: str = ""  # remedy for a robot that does not answer
     charge: str = "charge it"  # remedy for an empty battery
     locks: bool = False  # an emergency stop locks it until it is switched off and on
+
+    @property
+    def own_bodies(self) -> tuple[str, ...]:
+        """Bodies that drive robots of this kind only, its protocol twin included."""
+        return self.bodies if self.twin is None else (*self.bodies, self.twin.body)
 
     def __post_init__(self) -> None:
         """Raises ValueError for a number that no robot has, or an unknown setpoint."""

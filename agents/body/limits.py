@@ -77,8 +77,20 @@ class Limits(Safety, frozen=True):
     low: Vector  # smallest x, y, z of the arena [m]
     high: Vector  # largest x, y, z of the arena [m]
     hold_s: float | None = None  # `land_without_position_s` of this robot, where it differs [s]
+    # largest delay of a position from outside [s], by which it is flown on board; infinity: it is not
+    late_s: float = inf
+
+    @property
+    def behind_s(self) -> float:
+        """Stamps of positions that are further behind their arrival give a warning [s]."""
+        return behind_limit_s(self, self.late_s)
 
     @property
     def top_speed(self) -> float:
         """Speed that no setpoint exceeds [m/s]; infinity: the kind's own limit is the only one."""
         return inf if self.speed is None else self.speed
+
+
+def behind_limit_s(safety: Safety, late_s: float) -> float:
+    """As `Limits.behind_s`, of a robot with positions that may be `late_s` [s] late."""
+    return min(0.5 * safety.position_timeout_s, late_s / 1.5)

@@ -17,21 +17,31 @@ from agents.vectors import Vector
 REPEATED_S: Final = 0.3  # time without a new pose that makes the note [s]
 SECOND_S: Final = 1.0  # time after the last sample of a second source for which the note stays [s]
 SECOND: Final = "a second source sends its position, and is refused"  # note of such a robot
-FROZEN: Final = "its measured position repeats itself to the last bit"  # note of such a robot
+# note of a robot with a frozen or rounded position
+FROZEN: Final = "its measured position repeats itself to the last bit (frozen, or rounded? pass on all digits)"
+LATE: Final = "its measured positions are too late, and are refused: {:.2f} s from their stamps to here (limit {:g} s)"
+
+
+NOTHING_S: Final = 3.0  # time without any sample that makes the note [s]
+NOTHING: Final = "nothing has come on {0}: does anything publish there? `./zenpark echo {0}` at its router shows it"
+UNUSED: Final = "what comes on {} is refused: {}"
 
 
 @dataclass(eq=False)
 class PositionSource:
     """Source of the positions of one robot."""
 
+    key: str
     inbox: pubsub.Inbox[messages.Position]
     exact: bool  # noise-free positions from a simulation, which may repeat
+    late_s: float  # later ones are refused [s]
     session: str | None = None  # that its samples name, if they do
     alive_at: float = -inf  # arrival of its last position that was new [s]; minus infinity: none yet
     foreign_at: float = -inf  # arrival of the last position from a second source [s]
     # stamp of the last position less the time of its arrival [s]: the clock of the source is ahead by at least this
     # value, or, if it is negative, behind or late; NaN before the first
     ahead: float = nan
+    used_at: float = -inf  # arrival of the last position that was new and not late [s]
     last: tuple[Vector, float | None] | None = None  # position [m] and yaw [rad]
     new_at: float = -inf  # arrival of the last pose that was new [s],
     repeats: bool = False  # and whether others came since
@@ -67,21 +77,23 @@ class MeasuredPositions:
         valid_box: Vector,
         *,
         exact: Sequence[int] = (),
+        late_s: Sequence[float] = (),
         silence_s: float,
     ) -> None:
         """Subscribe for `rows` of the robots `names`; positions beyond `valid_box` [m] are refused.
 
         Args:
             exact: Rows with noise-free positions from a simulation, which may repeat.
+            late_s: Delay beyond which the positions of a robot are refused, for all robots [s]; left out: any delay.
             silence_s: Time without a new position after which another source takes over [s].
         """
         self._valid_box, self._silence_s = valid_box, silence_s
-        self._received_at = -inf  # the last call [s]
+        self._received_at, self._begun = -inf, inf  # the last call and the first one [s]
         self.sources: dict[int, PositionSource] = {}  # by row
         for row in rows:
-            subscriber = pubsub.subscriber(session, keys.position(names[row]), 32)
-            inbox = pubsub.Inbox(subscriber, messages.Position, keys=keys)
-            self.sources[row] = PositionSource(inbox, row in exact)
+            key = keys.position(names[row])
+            inbox = pubsub.Inbox(pubsub.subscriber(session, key, 32), messages.Position, keys=keys)
+            self.sources[row] = PositionSource(key, inbox, row in exact, late_s[row] if late_s else inf)
 
     @property
     def malformed(self) -> int:
@@ -94,6 +106,7 @@ class MeasuredPositions:
         Yields row, time of measurement [s], position [m], and yaw [rad], NaN if unknown.
         """
         slept, self._received_at = now - self._received_at > self._silence_s, now
+        self._begun = min(self._begun, now)
         for row, source in self.sources.items():
             if slept and source.alive_at > -inf:  # a standstill here is no silence of a source
                 source.alive_at = now
@@ -109,7 +122,11 @@ class MeasuredPositions:
                 except messages.Malformed as error:
                     source.inbox.refuse(str(error))
                     continue
-                if source.measures(session, (measured.position, measured.yaw), now):
+                new = source.measures(session, (measured.position, measured.yaw), now)
+                if new and source.ahead < -source.late_s:
+                    source.inbox.refuse(LATE.format(-source.ahead, source.late_s))
+                elif new:
+                    source.used_at = now
                     yaw = nan if measured.yaw is None else measured.yaw
                     yield row, validation.taken(measured.stamp - utc, now), measured.position, yaw
 
@@ -119,7 +136,18 @@ class MeasuredPositions:
             state = states[row]
             if not isnan(source.ahead):
                 state.ahead = source.ahead
-            frozen = source.repeats and now - source.new_at > REPEATED_S
-            for what, there in ((FROZEN, frozen), (SECOND, now - source.foreign_at <= SECOND_S)):
-                if there:
-                    state.note = f"{what}; {state.note}" if state.note else what
+            for fault in self._faults(source, now):
+                state.note = f"{fault}; {state.note}" if state.note else fault
+
+    def _faults(self, source: PositionSource, now: float) -> Iterator[str]:
+        """Faults of a source at `now` [s], in words."""
+        unused_s = now - source.used_at
+        if source.repeats and now - source.new_at > REPEATED_S:
+            yield FROZEN
+        if now - source.foreign_at <= SECOND_S:
+            yield SECOND
+        if source.ahead < -source.late_s and unused_s > REPEATED_S:
+            yield LATE.format(-source.ahead, source.late_s)
+        elif unused_s == inf and now - self._begun > NOTHING_S and not source.repeats:
+            refused = source.inbox.malformed > 0
+            yield UNUSED.format(source.key, source.inbox.trouble) if refused else NOTHING.format(source.key)

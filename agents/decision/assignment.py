@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import inf
+from math import inf, nan
 
 from agents.body.kinds import Kind
 from agents.body.limits import Limits
@@ -47,6 +47,7 @@ class Assignment:
     changes: tuple[Change, ...] = ()  # of the targets of all links
     start: tuple[float, float] | None = None  # where it begins [m]; None: anywhere
     start_within: float = 0.0  # farthest from there that it may take off [m]
+    start_yaw: float = nan  # wanted there [rad]; NaN: any
     # all robots: name, x and y where they begin [m], radius [m]; empty where that is not known
     starts: tuple[tuple[str, float, float, float], ...] = ()
     # goals come from a central controller; then links of the law, anchors and legs are empty

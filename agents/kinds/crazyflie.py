@@ -33,6 +33,10 @@ CRAZYFLIE: Final = Kind(
     turn_response=7.6,  # step response of the firmware's yaw controller
     lag=0.4,  # velocity loop and tilt, 0.2 s each
     overshoot=0.11,  # the firmware's height loop, of 27 to 36 g: 7 to 11 %, for 10 to 15 s
+    # the firmware's loops ring by positions that are 0.2 s late (0.15 s: a sway of 0.2 m that dies out)
+    late_s=0.15,
+    # 0.2 to 0.35 s more than a drone of 29 g under the firmware's height loop, which lifts off late
+    lift_s=(0.55, 0.55, 0.16),
     # fitted to step responses of a rigid body under the firmware's cascade (docs/mujoco.md)
     motion=Flight((2.0, 2.0, 2.8), (5.0, 5.0, 3.5), (1.1, 1.1, 1.4), (5.0, 5.0, inf)),
     airframe=Airframe(

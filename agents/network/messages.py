@@ -182,7 +182,11 @@ class Status(Message, frozen=True):
 
 
 class Position(Message, frozen=True, omit_defaults=True):
-    """Pose of a robot, measured or known from outside of it."""
+    """Pose of a robot, measured or known from outside of it.
+
+    Pass on all digits of a measurement: a pose that equals the one before to the last bit counts as frozen, and is not
+    used. The stamp is the time of the measurement, not of sending: late positions make drones swing.
+    """
 
     robot: str
     stamp: float  # [s] UTC

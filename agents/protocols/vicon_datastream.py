@@ -46,6 +46,7 @@ POSES: Final = (
 )  # what there is to know of rigid bodies
 
 _WORD = struct.Struct("<I")
+_PERIOD = struct.Struct("<q")
 _HEAD = struct.Struct("<II")
 _SEGMENT = struct.Struct("<I3d9d")
 
@@ -89,7 +90,13 @@ def pack_kinds(kinds: Iterable[int]) -> bytes:
 
 def pack_stream_info(rate_hz: float) -> bytes:
     """The block with the frame rate."""
-    return block(BlockKind.STREAM_INFO, struct.pack("<q", round(CLOCK_HZ / rate_hz)))
+    return block(BlockKind.STREAM_INFO, _PERIOD.pack(round(CLOCK_HZ / rate_hz)))
+
+
+def unpack_period(payload: bytes) -> float:
+    """Time from one frame to the next [s]; 0 if the block has no number above 0."""
+    (ticks,) = _unpack(_PERIOD, payload, 0)
+    return max(int(ticks), 0) / CLOCK_HZ
 
 
 def pack_axes(up: int = Z_UP) -> bytes:

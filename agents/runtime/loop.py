@@ -187,8 +187,11 @@ class Runtime:
         located = [row for row, there in enumerate(self._setup.externally_measured) if there]
         exact = [row for row, there in enumerate(self._setup.exact) if there]
         silence_s = self._limits.position_timeout_s
+        late_s = [robot.assignment.limits.late_s for robot in self.robots]
         self._located = (
-            MeasuredPositions(session, keys, names, located, self._valid_box, exact=exact, silence_s=silence_s)
+            MeasuredPositions(
+                session, keys, names, located, self._valid_box, exact=exact, late_s=late_s, silence_s=silence_s
+            )
             if located
             else None
         )

@@ -17,6 +17,7 @@ from agents.decision.neighbours import Neighbour, Neighbours
 from agents.decision.perception import SCAN_S
 from agents.decision.situation import LATE_SHARE, SILENT_S, ProcessHealth, Situation
 from agents.plugins.predictors import Predictor
+from agents.safety.direction_check import DirectionCheck
 from agents.safety.hazards import Cause
 from agents.safety.landing import LOW, SLOW
 from agents.safety.motion_check import RUSH_S, MotionCheck
@@ -28,12 +29,12 @@ LOWEST_DESCENT_M_S: Final = 0.2  # [m/s] no device lands more slowly,
 CREEPS: Final = 0.025  # [m/s] or more slowly than this for
 STEP: Final = 0.05  # [m]
 STALLS_S: Final = 4.0  # time after which a climb without `STEP` of gained height counts as stalled; of
+STALLS_OUTSIDE_S: Final = 0.7  # robot that flies on board by positions from outside, once it has risen; of
 STALLS_VELOCITY_S: Final = 10.0  # a device that takes velocities, which may need a second order to take off
 SINKS: Final = 0.15  # [m/s] and downward: the robot does not fly to its goal
 AHEAD_S: Final = 0.1  # no network here is later than this: stamps further ahead come from a clock that is ahead
 FOREIGN_S: Final = 0.5  # a gap in the poses from another source does not end their hazard before
 NOT_UNIT: Final = 0.1  # largest deviation of the squared norm of a quaternion from 1
-BEHIND: Final = 0.5  # share of the age at which a position is invalid: stamps this far behind give a warning
 
 
 @dataclass(eq=False, slots=True)
@@ -61,7 +62,7 @@ class Ascent:
     the floor.
     """
 
-    def __init__(self, kind: Kind, hover: float) -> None:
+    def __init__(self, kind: Kind, hover: float, *, outside: bool) -> None:
         self.climbing = False  # on the last tick
         self.hover = hover  # height at the end [m]
         self.begin = UNKNOWN  # position at the begin [m]
@@ -69,21 +70,29 @@ class Ascent:
         self.aside = 0.0  # distance from there, seen from above [m]
         self.carried = False  # it is carried aside
         self.patience_s = STALLS_VELOCITY_S if kind.takes == "velocity" else STALLS_S  # time for a step of height [s]
+        at_once, per_metre, low = kind.lift_s if outside else (inf, 0.0, 0.0)
+        self.lifts_s = at_once + per_metre * hover + low / hover if hover > 0.0 else inf  # time for the first step [s],
+        self.rises_s = STALLS_OUTSIDE_S if outside else inf  # and for each of the others [s]
         self.highest = 0.0  # last step of height [m],
         self.risen_at = 0.0  # and its time [s]
+        self.risen = False  # there was such a step
         self.stalled = False  # it is measured to stay low
+        self.stuck = False  # likewise, by positions from outside: it flies higher and higher
 
-    def update(self, t: float, climbing: bool, flying: bool, position: Vector) -> None:
-        """Follow a robot that may be `climbing` and `flying` at `t` [s], at a `position` [m]."""
+    def update(self, t: float, climbing: bool, spinning: bool, position: Vector) -> None:
+        """Follow a robot that may be `climbing`, with motors `spinning`, at `t` [s], at a `position` [m]."""
         begins, self.climbing = climbing and not self.climbing, climbing
         if begins:
             self.begin = position
         height = position[2]
-        if begins or not flying or not height <= self.highest + STEP:
-            self.highest, self.risen_at = height, t
+        stands = begins or not spinning
+        if stands or not height <= self.highest + STEP:
+            self.highest, self.risen_at, self.risen = height, t, not stands
         self.aside = planar(position, self.begin)
         self.carried = climbing and self.aside > self.free
-        self.stalled = climbing and self.hover - height > SUNK and t - self.risen_at > self.patience_s
+        low, since = climbing and self.hover - height > SUNK, t - self.risen_at
+        self.stalled = low and since > self.patience_s
+        self.stuck = (low and since > self.rises_s) if self.risen else (climbing and since > self.lifts_s)
 
 
 @dataclass(eq=False, slots=True)
@@ -117,7 +126,7 @@ class LandingProgress:
 class Detector:
     """Detector of the causes of hazards of one robot."""
 
-    FIXED: ClassVar = ("flies", "sees")
+    FIXED: ClassVar = ("flies", "outside", "sees")
 
     def __init__(self, assignment: Assignment) -> None:
         kind, limits = assignment.kind, assignment.limits
@@ -131,9 +140,11 @@ class Detector:
         self.lean = half * half  # largest x² + y² of an attitude
         self.battery_low = limits.battery_low
         self.silence_s = limits.position_timeout_s  # of the device, and of the pose, that is too long [s]
-        self.behind_s = BEHIND * limits.position_timeout_s  # stamps that are older have a wrong clock [s]
+        self.behind_s = limits.behind_s  # stamps that are older have a wrong clock [s]
         self.separation = 0.0 if limits.separation is None else limits.separation  # of robots, least [m]; 0: any
-        self.motion_check, self.ascent = MotionCheck(kind), Ascent(kind, assignment.hover)
+        self.outside = limits.late_s < inf  # it flies on board by positions from outside
+        self.motion_check, self.direction = MotionCheck(kind, outside=self.outside), DirectionCheck(kind)
+        self.ascent = Ascent(kind, assignment.hover, outside=self.outside)
         self.descent = LandingProgress(limits.high[2])
         self.leaned = False  # on the tick before
         self.leans_since = 0.0  # time of the first sample of that [s]
@@ -172,17 +183,13 @@ class Detector:
             if (x * x + y * y > self.lean or self.leaned) and self.leans(state):
                 found |= 1 << Cause.TILT
             if status.climbing or self.ascent.climbing:
-                self.ascent.update(t, status.climbing, state.flying, now.position)
+                self.ascent.update(t, status.climbing, state.flying and state.spinning, now.position)
         if status.landing or status.ordered or status.not_finite or status.unguided:
             found |= self.of_orders(now, status)
         if self.sees and self.sees_nothing(t, state) and status.cruising:
             found |= 1 << Cause.UNSEEING
-        motion_check, ascent = self.motion_check, self.ascent
-        motion_check.update(t, status.setpoint, now.position, now.yaw, status.cruising and not now.invalid)
-        if motion_check.unresponsive or ascent.stalled:
-            found |= 1 << Cause.UNRESPONSIVE
-        if motion_check.uncommanded or ascent.carried:
-            found |= 1 << Cause.STRAYING
+        self.motion_check.update(t, status.setpoint, now.position, now.yaw, status.cruising and not now.invalid)
+        found |= self.of_obedience(now, status)
         return found if now.sound else found | self.of_place(now)
 
     def too_near(self, now: Situation, neighbours: Neighbours) -> int:
@@ -254,7 +261,7 @@ class Detector:
             found |= 1 << Cause.FALLEN
         if t - state.received > self.silence_s:
             found |= 1 << Cause.UNREACHABLE
-        if clock_off(state.ahead, self.silence_s):
+        if clock_off(state.ahead, self.behind_s):
             found |= 1 << Cause.CLOCK
         return found
 
@@ -290,6 +297,27 @@ class Detector:
         if now.flyaway and self.flies:
             found |= 1 << Cause.FAR_OUTSIDE
         return found
+
+    def of_obedience(self, now: Situation, status: RobotStatus) -> int:
+        """Motion that is not as commanded."""
+        motion_check, ascent, found = self.motion_check, self.ascent, 0
+        if motion_check.unresponsive or ascent.stalled:
+            found |= 1 << Cause.UNRESPONSIVE
+        if motion_check.uncommanded or ascent.carried:
+            found |= 1 << Cause.STRAYING
+        return found | self.of_outside(now, status) if self.outside else found
+
+    def of_outside(self, now: Situation, status: RobotStatus) -> int:
+        """Positions from outside that mislead a controller on board."""
+        direction, goal = self.direction, status.setpoint
+        if status.climbing:
+            goal = (self.ascent.begin[0], self.ascent.begin[1], 0.0, 0.0)
+        if not (now.state.flying and isfinite(goal[0]) and isfinite(goal[1]) and (status.climbing or status.cruising)):
+            direction.forget()
+        elif not now.invalid:
+            direction.update(now.t, goal[0], goal[1], now.position, now.velocity)
+        found = 1 << Cause.TURNED if direction.turned else 0
+        return found | 1 << Cause.STUCK if self.ascent.stuck else found
 
     def leans(self, state: BodyState) -> bool:
         """Whether it leans, by a first sample or a newer one: the first one alone, repeated, proves nothing."""
@@ -380,6 +408,11 @@ class Detector:
             Cause.UNREACHABLE: lambda: f"for {t - state.received:.1f} s",
             Cause.HOVERING: lambda: f"at {now.position[2]:.2f} m",
             Cause.UNSEEING: lambda: f"for {t - self.scanned:.1f} s",
+            Cause.STUCK: lambda: f"{now.position[2] - ascent.begin[2]:.2f} m high after {t - ascent.risen_at:.1f} s",
+            Cause.TURNED: lambda: (
+                f"by {degrees(abs(self.direction.angle)):.0f}°; does the x axis of its object in the "
+                "motion capture point along its nose?"
+            ),
             Cause.UNSTARTED: lambda: f"the conductor is gone for {t - health.conductor_lost_since:.1f} s",
         }
         return extents[cause]()
@@ -431,9 +464,9 @@ def lost_position(now: Situation) -> str:
     return f"the last is {age:.2f} s old" if age >= 0.0 else f"it is stamped {-age:.3g} s ahead"
 
 
-def clock_off(ahead: float, silence_s: float) -> bool:
-    """Whether positions come from a wrong clock; `ahead` as in `BodyState`, invalid after `silence_s`."""
-    return ahead > AHEAD_S or ahead < -BEHIND * silence_s
+def clock_off(ahead: float, behind_s: float) -> bool:
+    """Whether positions come late or from a wrong clock; `ahead` as in `BodyState`, `behind_s` as in `Limits`."""
+    return ahead > AHEAD_S or ahead < -behind_s
 
 
 def clock_text(name: str, ahead: float) -> str:

@@ -105,6 +105,9 @@ class Cause(IntEnum):
     HOVERING = Rule("it hovers although commanded to land", Outcome.WARN, after_s=2.0, landing=True)
     UNSEEING = Rule("its range sensors are silent", Outcome.HOLD)  # avoidance would drive it against what it saw
     UNSTARTED = Rule("no start will come", Outcome.LAND)  # it would hover until its battery is empty
+    # by positions that are wrong it flies away, in the air or in a landing: it falls from some decimetres instead
+    STUCK = Rule("its measured height does not follow its climb", Outcome.CUT)
+    TURNED = Rule("it flies beside its commands", Outcome.CUT, after_s=0.3)
 
 
 _LOST: Final[Mapping[str, Outcome]] = {

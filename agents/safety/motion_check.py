@@ -28,6 +28,7 @@ FORGET_S: Final = 5.0  # time after which uncommanded motion is forgotten
 KEPT: Final = 1.0 - PIECE_S / FORGET_S  # share of earlier uncommanded motion that a piece keeps
 RUSH_S: Final = 0.5  # tolerated uncommanded travel, in seconds at top speed, besides the size of the robot
 ROUNDING_S: Final = 1e-6
+OUTSIDE_M: Final = 0.4  # [m] and that of robots that fly on board by positions from outside, which may ring
 TURN: Final = 1.5  # tolerated uncommanded rotation of a wheeled robot [rad]
 
 
@@ -42,14 +43,16 @@ class MotionCheck:
         "uncommanded_turn", "unresponsive", "way", "way_before", "without", "x", "y", "z",
     )  # fmt: skip
 
-    def __init__(self, kind: Kind) -> None:
+    def __init__(self, kind: Kind, *, outside: bool = False) -> None:
+        """`outside`: of a robot that flies on board by positions from outside."""
         self.flies, self.speed, self.response = kind.flies, kind.speed, kind.response
         self.by_position, self.by_twist = kind.takes == "position", kind.takes == "twist"
         self.rim = 0.0 if kind.flies else kind.radius  # [m] turning moves wheels by it
         self.slow = (SLOW_FLIES if kind.flies else SLOW_WHEELS) * kind.speed  # slower: no command to move [m/s]
         # least commanded travel without motion that counts [m]
         self.without = WITHOUT_S * kind.speed * (1.0 if kind.flies else 0.5)
-        self.free = RUSH_S * kind.speed + kind.radius  # tolerated uncommanded travel [m]
+        # tolerated uncommanded travel [m]
+        self.free = OUTSIDE_M if outside else RUSH_S * kind.speed + kind.radius
         self.last = self.due = -inf  # time of the last tick, and end of the sample [s]
         self.x = self.y = self.z = self.commanded_turn = 0.0  # commanded in this sample [m], [rad]
         self.samples = 0  # of this piece

@@ -91,6 +91,9 @@ class ExternalPositions:
         self.jump = nan  # length of its jump [m]; NaN: it did not jump
         self.deceived = False  # its positions are wrong for good
         self.doubted = False  # its position is not believed
+        # where it is measured [m] while that is not believed because it disobeys; NaN: nowhere, or it has jumped
+        self.place = UNKNOWN
+        self._disobeys = False  # it is not believed because of that
         self._continuity = Continuity(kind, 2.0 * kind.radius)
         self._time = -inf  # of the last position [s]
         self._turn_rate = PLAUSIBLE_SPEED * kind.turn_rate  # that it can have [rad/s]
@@ -106,10 +109,11 @@ class ExternalPositions:
             return False
         self._time = time
         if not watched:
-            self.deceived = False
+            self.deceived = self._disobeys = False
             self._continuity.forget()
         self.jump = self._continuity.jump(time, position, 0.0, watched)
         self.doubted = self.deceived or not isnan(self.jump)
+        self.place = position if self._disobeys and isnan(self.jump) else UNKNOWN
         return not (self.deceived or self._continuity.jumped)
 
     def believed_yaw(self, time: float, yaw: float, *, watched: bool) -> float:
@@ -128,8 +132,9 @@ class ExternalPositions:
         return yaw if abs(self._flipped) < FLIP else nan
 
     def disbelieve(self) -> None:
-        """Reject external positions while the robot is in motion."""
+        """Reject external positions while the robot is in motion; without a jump, because it disobeys."""
         if self._time > -inf:
+            self._disobeys = self._disobeys or (isnan(self.jump) and not self.deceived)
             self.deceived = self.doubted = True
 
     def forget(self) -> None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain
-from math import degrees, hypot, inf, isnan
+from math import degrees, hypot, inf, isnan, radians, remainder, tau
 from numbers import Real
 from typing import Final
 
@@ -28,8 +28,11 @@ FLOOR_M: Final = 0.5  # largest height of a standing drone: positioning systems 
 REST_M_S: Final = 0.3  # and largest speed
 LEVEL: Final = 0.35  # [rad] and largest tilt
 WALL_M: Final = 0.05  # a place measured this far outside the arena may be inside
+TURNED: Final = radians(20.0)  # largest difference of a yaw from that of its start
 ABOVE_M: Final = 0.1  # [m] a robot higher than this is above one that stands,
 BESIDE_M: Final = 0.1  # [m] unless there is more than this between the two, seen from above
+# remedy for a measured yaw that is not that of the robot
+FRAME: Final = "turn the frame of its object in the motion capture, until the x axis points along its nose"
 NUMBERS: Final = {1: "a number", 3: "three numbers", 4: "four numbers"}  # of a result
 
 
@@ -81,12 +84,14 @@ class Preflight:
             yield f"it is {now.excess:.2f} m outside the arena"
 
     def _nowhere(self, now: Situation) -> str:
-        state, silence_s = now.state, self._limits.position_timeout_s
-        if isnan(now.yaw) and is_finite(now.position) and now.t - state.time <= silence_s:
+        state, limits = now.state, self._limits
+        if isnan(now.yaw) and is_finite(now.position) and now.t - state.time <= limits.position_timeout_s:
             return "it does not know which way it looks"
         text = "no position of its own"
         return (
-            f"{text}: {clock_text(self._assignment.name, state.ahead)}" if clock_off(state.ahead, silence_s) else text
+            f"{text}: {clock_text(self._assignment.name, state.ahead)}"
+            if clock_off(state.ahead, limits.behind_s)
+            else text
         )
 
     def _at_start(self, now: Situation) -> Iterator[str]:
@@ -98,6 +103,9 @@ class Preflight:
         away = hypot(x - start[0], y - start[1])
         if away > limit:
             yield f"it is {away:.2f} m from its start ({start[0]:g}, {start[1]:g}), more than {limit:g} m"
+        turned = remainder(now.yaw - self._assignment.start_yaw, tau)
+        if abs(turned) > TURNED:
+            yield f"it is turned by {degrees(turned):.0f}° from the yaw of its `start`: turn it, or {FRAME}"
         if 2.0 * away < self._nearest_start:  # nearer to its own than to any: none of a thousand need be asked
             return
         places = [(hypot(x - other_x, y - other_y), name) for name, other_x, other_y, _ in self._other_starts]

@@ -12,7 +12,7 @@ from agents.body.kinds import Kind
 from agents.body.limits import Limits
 from agents.decision.situation import Situation
 from agents.plugins.avoidance import Avoidance, Nearby, OwnState
-from agents.vectors import NO_SETPOINT, Setpoint, clamp
+from agents.vectors import NO_SETPOINT, Setpoint, Vector, clamp
 
 FLOOR_M: Final = 0.05  # [m] least height of a goal above the floor, or the robot's own: a descent overshoots its goal
 OUTSIDE_M: Final = 0.25  # [m] outside the arena: no longer under control
@@ -70,6 +70,13 @@ class SetpointFilter:
             now.excess = max(beside, low_z - z, z - high_z, 0.0)
             now.outside_wall = beside > 0.0 or z > high_z
             now.outside, now.flyaway = now.excess > OUTSIDE_M, now.excess > self._cut_beyond_m
+
+    def judge_far(self, now: Situation, place: Vector) -> None:
+        """Judge a `place` [m] that is not believed, NaN for none, by the distance beyond which motors are cut."""
+        (x, y, z), (low_x, low_y, low_z), (high_x, high_y, high_z) = place, self._walls_low, self._walls_high
+        excess = max(0.0, low_x - x, x - high_x, low_y - y, y - high_y, low_z - z, z - high_z)
+        if excess > self._cut_beyond_m:  # not of NaN, which is never larger
+            now.excess, now.flyaway, now.sound = excess, True, False
 
     def limit(self, setpoint: Setpoint, now: Situation) -> Setpoint:
         """Safe setpoint in place of a decided one, of a robot without avoidance; `now` was judged.

@@ -24,6 +24,7 @@ from agents.protocols.crazyflie import (
     overload,
     radio_loads,
 )
+from agents.protocols.crtp import Info
 from agents.vectors import UNKNOWN, Setpoint, Vector
 from bridges.crazyflie.file_faults import file_faults
 from bridges.crazyflie.link import prepare
@@ -145,6 +146,7 @@ class CrazyflieBody(Body):
             yaw,
             battery=telemetry.battery,
             flying=telemetry.airborne,
+            spinning=Info.FLYING in telemetry.info,
             received=max(telemetry.pose_time, telemetry.status_time) - self._zero,
             note=self._note(row, now),
             refusal=pilot.refusal,

@@ -16,6 +16,7 @@ from typing import Final
 
 from agents.body.interface import UNANSWERED
 from agents.clock import uptime
+from agents.kinds.crazyflie import CRAZYFLIE
 from agents.protocols.crazyflie import SETPOINT_PACKETS, CrazyflieSettings, Outside
 from agents.protocols.crtp import HighLevel, Info, LogStatus
 from bridges.crazyflie.link import CrazyflieLink
@@ -30,7 +31,7 @@ FLOOR: Final = -0.1  # [m] where they end: the motors stop there, and the drone 
 # the square of the time: quick, and deep enough to end on the floor
 BLIND_DESCENT: Final = 0.45  # [m/s]
 BLIND_FLOOR: Final = -1.0  # [m]
-EXTERNAL_AGE_S: Final = 0.15  # older positions from outside make the estimator ring: they are not passed on
+EXTERNAL_AGE_S: Final = CRAZYFLIE.late_s  # older positions from outside make the estimator ring: they are not passed on
 # with positions from outside a landing is led down: when the radio is lost on the way, the descent on board goes on
 LED: Final = 0.3  # [m/s]
 LED_TO: Final = 0.3  # [m] height from which the planner's own landing is too short to become wrong

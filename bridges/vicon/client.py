@@ -26,6 +26,7 @@ class Frame:
     latency_s: float  # age when sent
     poses: dict[str, Segment | None]  # root segment of each subject; None while occluded
     z_up: bool
+    period_s: float = 0.0  # from one frame to the next; 0: the server has not said it
 
 
 class Decoder:
@@ -33,7 +34,7 @@ class Decoder:
 
     def __init__(self) -> None:
         self._subjects: dict[int, Subject] = {}
-        self._z_up = True
+        self._z_up, self._period = True, 0.0
 
     def frame(self, body: bytes) -> Frame | None:
         """Decode a packet; None if it has only names, axes or answers; raises Malformed if it is damaged."""
@@ -48,6 +49,8 @@ class Decoder:
                 number = vicon_datastream.unpack_frame_number(payload)
             elif kind == BlockKind.LATENCY_INFO:
                 latency = vicon_datastream.unpack_latency(payload)
+            elif kind == BlockKind.STREAM_INFO:
+                self._period = vicon_datastream.unpack_period(payload)
             elif kind == BlockKind.SUBJECT_INFO:
                 known = vicon_datastream.unpack_subject(payload)
                 named[known.number] = known
@@ -61,7 +64,7 @@ class Decoder:
             known.name: next((s for s in seen.get(known.number, ()) if s.number == known.root), None)
             for known in self._subjects.values()
         }
-        return Frame(number, latency if latency > 0.0 else 0.0, poses, self._z_up)
+        return Frame(number, latency if latency > 0.0 else 0.0, poses, self._z_up, self._period)
 
 
 class Reader:

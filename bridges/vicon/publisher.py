@@ -35,6 +35,8 @@ SILENCE_S: Final = 2.0  # time without a frame before the next connection
 LOST_S: Final = 0.5  # time of an occlusion before it is reported; robots tolerate half a second as well
 REPEATED_S: Final = 0.3  # time of a pose that is the same to the last bit after which it counts as not measured
 POLL_S: Final = 0.2  # latency of noticing the end of the process
+RATE_OFF: Final = 0.005  # largest error of the frame rate that the server says: a queue that grows faster shows [s/s]
+QUEUE_S: Final = 0.1  # frames that wait for longer are reported
 SKEW: Final = 1e-3  # tolerance of a rotation's orthonormality
 
 
@@ -50,6 +52,25 @@ def heading(rotation: Sequence[float]) -> float:
         abs(a * e - b * d - i),
     )
     return math.atan2(d, a) if worst < SKEW and math.isfinite(sum(rotation)) else math.nan
+
+
+class FrameQueue:
+    """Time for which frames wait in queues: arrival less what their numbers say, less the least of that so far.
+
+    A queue that empties shows at once; what is constant does not show.
+    """
+
+    def __init__(self) -> None:
+        self._number, self._period, self._arrived, self._least = 0, 0.0, 0.0, math.inf
+
+    def wait_s(self, frame: Frame, arrived: float) -> float:
+        """Time for which a frame waited that arrived at `arrived` on any steady clock [s]; 0 where it is unknown."""
+        if frame.number < self._number or frame.period_s != self._period:  # another stream
+            self._least = math.inf
+        crept, delay = RATE_OFF * (arrived - self._arrived), arrived - frame.number * frame.period_s
+        self._number, self._period, self._arrived = frame.number, frame.period_s, arrived
+        self._least = min(self._least + crept, delay)
+        return delay - self._least if frame.period_s > 0.0 else 0.0
 
 
 class PoseFilter:
@@ -73,13 +94,16 @@ class PoseFilter:
         """Number of poses refused: no rotation, not finite, or a jump faster than any robot."""
         return self._invalid + sum(last.refused for last in self._last)
 
-    def filter_poses(self, frame: Frame, arrived: float) -> list[tuple[str, float, Segment, float]]:
+    def filter_poses(
+        self, frame: Frame, arrived: float, waited: float = 0.0
+    ) -> list[tuple[str, float, Segment, float]]:
         """Name, time of measurement [s], segment and yaw [rad] of each robot with a plausible pose.
 
         Args:
             arrived: Time of arrival on any steady clock [s]; the times of measurement are on the same clock.
+            waited: Time for which the frame waited in queues [s].
         """
-        measured = arrived - frame.latency_s
+        measured = arrived - frame.latency_s - waited
         if frame.z_up is self._not_z_up:
             self._not_z_up = not frame.z_up
             self._print_line("the z axis points up" if frame.z_up else NOT_Z_UP)
@@ -164,7 +188,7 @@ class Bridge:
         return True
 
     def _pump(self, reader: Reader, over: Callable[[], bool]) -> None:
-        heard, number = uptime(), None
+        heard, number, queue = uptime(), None, FrameQueue()
         while not over():
             frame = reader.newest(POLL_S)
             now = uptime()
@@ -173,7 +197,10 @@ class Bridge:
                     raise TimeoutError(f"no new frame for {SILENCE_S:g} s (is the system live, and not paused?)")
                 continue
             heard, number = now, frame.number
-            for robot, measured, segment, yaw in self._filter.filter_poses(frame, now):
+            waited = queue.wait_s(frame, now)
+            if waited > QUEUE_S:
+                self._report_once("frames wait in a queue before they arrive: is the network or a computer too slow?")
+            for robot, measured, segment, yaw in self._filter.filter_poses(frame, now, waited):
                 self._publish(messages.position(robot, self._clock.at(measured), segment.position, yaw))
 
     def _report_once(self, state: str) -> None:

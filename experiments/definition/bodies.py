@@ -32,14 +32,9 @@ def missing_library(body: str) -> str:
     return kind.library if kind and kind.library and importlib.util.find_spec(kind.library) is None else ""
 
 
-def own_bodies(kind: Kind) -> tuple[str, ...]:
-    """Bodies that drive robots of this kind only."""
-    return kind.bodies if kind.twin is None else (*kind.bodies, kind.twin.body)
-
-
 def driven_kind(body: str) -> Kind | None:
     """The kind that a body drives; None of those that drive any, as simulators do."""
-    return next((kind for kind in KINDS.usable() if body in own_bodies(kind)), None)
+    return next((kind for kind in KINDS.usable() if body in kind.own_bodies), None)
 
 
 def body_class(address: str) -> type[Body] | None:

@@ -25,7 +25,7 @@ from agents.plugins.planners import Leg
 from agents.plugins.predictors import HOLD, Predictor
 from agents.plugins.triggers import Periodic, Trigger
 from agents.vectors import Vector
-from experiments.definition.experiment import VICON_TWIN, WORLD, Choice, Experiment, Hybrid
+from experiments.definition.experiment import VICON_TWIN, WORLD, Choice, Experiment, Hybrid, RobotTable
 from experiments.definition.formation import Pattern, compile_anchors, linked
 from experiments.definition.graph import Links, adjacency
 from experiments.definition.links import OneWay, one_way_links
@@ -51,6 +51,13 @@ def finds_contacts(engine: Choice) -> bool:
     except (registry.PluginError, msgspec.ValidationError):
         return False
     return chosen.CONTACTS
+
+
+def latest_s(robot: RobotTable) -> float:
+    """Largest delay of positions from outside by which a robot flies on board [s]; infinity: by none."""
+    kind = KINDS[robot.kind]
+    flies = robot.position == "external" and registry.body_name(robot.body) in kind.own_bodies
+    return kind.late_s if flies else math.inf
 
 
 @dataclass(frozen=True)
@@ -349,7 +356,8 @@ class Plan:
         if self.experiment.robots[name].body == WORLD:  # without its world it cannot move, and may wait
             hold_s = self.experiment.world.patience_s
         low, high = (-x / 2, -y / 2, 0.0), (x / 2, y / 2, z)
-        return Limits(low=low, high=high, hold_s=hold_s, **msgspec.structs.asdict(safety))
+        late_s = latest_s(self.experiment.robots[name])
+        return Limits(low=low, high=high, hold_s=hold_s, late_s=late_s, **msgspec.structs.asdict(safety))
 
     def assignment(self, name: str, *, centrally: bool = False) -> Assignment:
         """The part of a robot.
@@ -363,6 +371,7 @@ class Plan:
         rates, within = experiment.rates, experiment.safety.start_within
         row = self._row[name]
         patient = experiment.start.missing != "go-on"
+        begin, scattered = experiment.robots[name].start, experiment.start.scatter_yaw > 0.0
         return Assignment(
             name=name,
             kind=self.kinds[row],
@@ -390,6 +399,7 @@ class Plan:
             patience_s=None if patient else experiment.start.deadline_s,
             start=self.starts[row][1:3] if within else None,
             start_within=within + math.sqrt(2.0) * experiment.start.scatter,
+            start_yaw=math.nan if scattered or len(begin) < 3 else begin[2],
             starts=self.starts if within and not experiment.start.scatter else (),
             guided=guided,
         )

@@ -10,7 +10,7 @@ from agents.body.interface import BodyError
 from agents.body.kinds import KINDS, Kind
 from agents.plugins import files, registry
 from agents.plugins.registry import did_you_mean
-from experiments.definition.bodies import body_faults, device_struct, driven_kind, own_bodies
+from experiments.definition.bodies import body_faults, device_struct, driven_kind
 from experiments.definition.experiment import MEAN, WORLD, WORST, Experiment, RobotTable
 from experiments.file.problems import Fault
 from experiments.file.structure import table_faults
@@ -149,7 +149,7 @@ def _body(engine: EngineFactory, path: tuple[str, str], robot: RobotTable, kind:
         yield Fault((*path, "body"), f"no {body!r} among the bodies", hint)
     driven = driven_kind(body)
     if kind is not None and driven is not None and driven is not kind:
-        known = ", ".join(("twin", WORLD, *own_bodies(kind)))
+        known = ", ".join(("twin", WORLD, *kind.own_bodies))
         hint = f"write kind = '{driven.name}', or a body of a {kind.name}: {known}"
         yield Fault((*path, "body"), f"'{body}' drives a {driven.name}, and {path[1]} is a {kind.name}", hint)
     elif kind is not None and body in ("twin", WORLD):

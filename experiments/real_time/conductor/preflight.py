@@ -22,7 +22,7 @@ from agents.body.interface import UNANSWERED
 from agents.body.kinds import KINDS, Trial
 from agents.network import messages
 from experiments.definition.experiment import ChannelTable, Formation, LegTable, RobotTable
-from experiments.definition.plan import Plan
+from experiments.definition.plan import Plan, latest_s
 from experiments.file.document import Document
 from experiments.real_time.conductor import preflight_checks as checks
 from experiments.real_time.conductor.case_processes import CaseContext
@@ -244,16 +244,30 @@ class Inspector(CaseRun):
             tried.charge = _lowest(tried.charge, None if seen.status is None else seen.status.battery)
 
         def over() -> bool:
+            if strays():
+                return True
             measure()
             return seen.reached("landing") or name in self._ended
+
+        def strays() -> bool:
+            """Whether a drone goes aside; one that flies by positions from outside is stopped, for it would go on."""
+            side, limit = checks.aside(tried.states), checks.hop_limit(robot)
+            if robot.hover is None or side <= limit:
+                return False
+            outside = math.isfinite(latest_s(robot))
+            self._order(name, messages.Order("stop" if outside else "land"))
+            tried.failure = f"{side:.2f} m to the side (limit {limit:g} m): {'stopped' if outside else 'landed'} there"
+            return True
 
         if robot.hover is None:
             self._wait(DRIVE_S + start_lead_s(1) + LAND_S, over)
         else:
             self._wait(CLIMB_S, lambda: over() or seen.reached("airborne"))
+            if tried.failure:
+                return
             if not seen.reached("airborne"):
                 tried.failure = f"not at {robot.hover:g} m after {CLIMB_S:g} s: {self._reason(name)}"
-            elif not self._wait(hold_s, over):
+            elif not self._wait(hold_s, over) and not tried.failure:
                 tried.states = list(tried.states)  # the landing is no part of it
                 self._order(name, messages.Order("land"))
                 if not self._wait(LAND_S, lambda: seen.reached("done") or name in self._ended):

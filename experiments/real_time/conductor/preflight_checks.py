@@ -13,13 +13,15 @@ import msgspec
 import numpy as np
 
 from agents.body.kinds import KINDS, Trial
-from agents.body.limits import Safety
+from agents.body.limits import Safety, behind_limit_s
 from agents.body.measured_positions import FROZEN
 from agents.network import messages
 from agents.plugins import registry
 from agents.safety.detection import clock_off, clock_text
+from agents.safety.preflight import FRAME, TURNED
 from experiments.definition.bodies import driven_kind
 from experiments.definition.experiment import WORLD, RobotTable
+from experiments.definition.plan import latest_s
 from experiments.real_time.conductor.run_view import AHEAD_S, BEHIND_S
 from twins.arrays import Array
 
@@ -28,12 +30,14 @@ Verdict = Literal["ok", "warn", "bad", "unknown"]
 HOP_M: Final = 0.2  # height of the hop
 HOP_OFF_M: Final = 0.08  # farther from this height on average: bad
 HELD: Final = 25  # last states of a hop, by which its height is measured
-HOP_DRIFT_M: Final = 0.2  # a hop that ends farther to the side is bad
+# a hop that goes farther to the side is bad, and ends there: of a drone of which the take-off ends at its hop,
+HOP_ASIDE_M: Final = 0.1
+HOP_DRIFT_M: Final = 0.2  # and of one that climbs to a height of its own
+DRIFTS: Final = f"yaw of its positions against its nose ({FRAME}), propellers, calibration of its IMU"  # remedy
 DRIVE_M: Final = 0.1  # way of the drive of a robot on wheels
 DRIVE_OFF_M: Final = 0.03  # farther from this way: bad
 STEADY_M: Final = 0.02  # largest spread of the position of a robot at rest without a warning,
 UNSTEADY_M: Final = 0.05  # and with which it must not fly
-TURNED: Final = math.radians(20.0)  # yaw farther than this from that of `start`: bad
 STALE: Final = 0.5  # share of `position_timeout_s`: positions older than this at times are bad
 OLD_MONTHS: Final = 24  # firmware older than this: a warning
 STOP_S: Final = 1.0  # a stop that takes longer is bad
@@ -177,8 +181,15 @@ def _position(each: Observed, safety: Safety) -> Check:
     ages = [seen.age_s for seen in each.inspections if seen.age_s is not None]
     age = f"at most {1e3 * max(ages):.0f} ms old" if ages else "of unknown age"
     found = f"spread {1e3 * spread:.1f} mm, {age}"
-    if ages and max(ages) > STALE * safety.position_timeout_s:
+    delay = float(np.median([-seen.ahead_s for seen in each.inspections if seen.ahead_s is not None] or [0.0]))
+    late = delay > behind_limit_s(safety, latest_s(each.robot))
+    if late or (ages and max(ages) > STALE * safety.position_timeout_s):
         remedy = f"gaps in {source}: markers or stations hidden, network or radio overloaded"
+        if late:
+            found += f", {1e3 * delay:.0f} ms late"
+            remedy = (
+                f"{source} is slow: its filters, the network, a busy computer; two clocks that differ look the same"
+            )
         return Check("position", "bad", found, remedy)
     if spread > STEADY_M:
         remedy = f"{source} is unsteady for a robot at rest: calibrate it, remove reflections, look for lost markers"
@@ -207,7 +218,8 @@ def _start(name: str, observed: Mapping[str, Observed], safety: Safety) -> Check
         )
         return Check("start pose", "bad", said, remedy)
     if turned is not None and abs(turned) > TURNED:
-        return Check("start pose", "bad", said, f"turn it to {wanted:g} rad, or correct `start`")
+        frame = f"if its nose is right, {FRAME}; else " if each.robot.position == "external" else ""
+        return Check("start pose", "bad", said, f"{frame}turn it to {wanted:g} rad, or correct `start`")
     if _counts_from_start(each.robot):
         return Check("start pose", "unknown", "counts from `start`")
     return Check("start pose", "ok", said)
@@ -241,7 +253,7 @@ def _clock(name: str, each: Observed, safety: Safety) -> Check:
         found = f"its computer's is {-each.behind_s:+.2f} s off"
         return Check("clock", "bad", found, "set it (chrony or NTP), or use [hosts]")
     ahead = math.nan if each.last.ahead_s is None else each.last.ahead_s
-    if clock_off(ahead, safety.position_timeout_s):
+    if clock_off(ahead, behind_limit_s(safety, latest_s(each.robot))):
         return Check("clock", "bad", clock_text(name, ahead), "set the clock of the computer that measures positions")
     return Check("clock", "ok", f"{1e3 * each.behind_s:.1f} ms from stamp to arrival")
 
@@ -293,10 +305,12 @@ def hop(observed: Observed, tried: Tried, safety: Safety) -> Check:
     loaded = f"; battery {load} under load" if load else ""
     positions = positions_of(tried.states)
     if tried.failure:
-        return Check(what, "bad", tried.failure + loaded, "look at its log; do not fly it before the cause is clear")
+        strays = what == "hop" and aside(tried.states) > hop_limit(observed.robot)
+        remedy = DRIFTS if strays else "look at its log; do not fly it before the cause is clear"
+        return Check(what, "bad", tried.failure + loaded, remedy)
     if not len(positions):
         return Check(what, "bad", "its position was not known", "see the line on its position")
-    side = float(np.hypot(*(positions[:, :2] - positions[0, :2]).T).max())
+    side = aside(tried.states)
     remedy = ""
     if what == "drive":
         said = f"{side:.3f} m of {DRIVE_M:g} m{loaded}"
@@ -310,11 +324,22 @@ def hop(observed: Observed, tried: Tried, safety: Safety) -> Check:
         said = f"{height:.2f} m of {wanted:g} m high, {side:.2f} m to the side{loaded}"
         if abs(height - wanted) > HOP_OFF_M:
             remedy = "does not keep its height: propellers, battery, trim, height of its positioning system"
-        elif side > HOP_DRIFT_M:
-            remedy = "drifts: yaw of its positioning system against its nose, propellers, calibration of its IMU"
+        elif side > hop_limit(observed.robot):
+            remedy = DRIFTS
     if not remedy and tried.charge is not None and tried.charge < safety.battery_low:
         return Check(what, "bad", said, KINDS[observed.robot.kind].charge)
     return Check(what, "bad" if remedy else "ok", said, remedy)
+
+
+def aside(states: Sequence[messages.State]) -> float:
+    """Largest distance from the first position, seen from above [m]."""
+    positions = positions_of(states)
+    return float(np.hypot(*(positions[:, :2] - positions[:1, :2]).T).max(initial=0.0))
+
+
+def hop_limit(robot: RobotTable) -> float:
+    """Distance to the side at which a hop ends [m]."""
+    return HOP_DRIFT_M if math.isfinite(KINDS[robot.kind].takeoff_height) else HOP_ASIDE_M
 
 
 def hop_of(robot: RobotTable) -> Literal["hop", "drive"]:

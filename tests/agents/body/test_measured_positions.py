@@ -8,7 +8,7 @@ import pytest
 
 from agents.body.external_pose import FASTEST, PATIENCE_S, External
 from agents.body.interface import BodyState
-from agents.body.measured_positions import FROZEN, SECOND, MeasuredPositions
+from agents.body.measured_positions import FROZEN, LATE, NOTHING, NOTHING_S, SECOND, MeasuredPositions
 from agents.decision.lifecycle import Phase
 from agents.network import messages
 from agents.network.keys import Keys
@@ -109,6 +109,49 @@ def test_frozen_motion_capture_lands_what_flies(frozen_s, phase):
         (held, text), (landed, _), *_ = [each for each in said if "its own position is lost" in each[1]]
         assert text.startswith("hold: its own position is lost: the last is 0.5")
         assert [held - frozen_s, landed - frozen_s] == pytest.approx([0.5, 0.8], abs=0.03)
+
+
+@pytest.mark.parametrize(("delay_s", "taken", "note"), [(0.14, 49, ""), (0.16, 0, LATE.format(0.16, 0.15))])
+def test_late_positions_are_refused_and_named(delay_s, taken, note):
+    net, state = Net(), BodyState()
+    with net.worn():
+        heard, used = listening(net, late_s=[inf, 0.15]), 0
+        for tick in range(50):
+            t = 8.0 + DT * tick
+            net.deliver(position(UTC + t - delay_s, (0.1 + 0.001 * tick, 0.2, 0.0)))
+            used += len(list(heard.receive(UTC, t)))
+        heard.annotate([BodyState(), state], t)
+    assert (used, heard.malformed, state.note) == (taken, 49 - taken, note)
+
+
+def test_single_late_position_is_no_fault():
+    net, state = Net(), BodyState()
+    with net.worn():
+        heard = listening(net, late_s=[inf, 0.15])
+        for tick, delay_s in enumerate([0.0, 0.0, 0.0, 0.4]):
+            net.deliver(position(UTC + 8.0 + 0.1 * tick - delay_s, (0.1 + 0.001 * tick, 0.2, 0.0)))
+            taken = list(heard.receive(UTC, 8.0 + 0.1 * tick))
+        heard.annotate([BodyState(), state], 8.3)
+    assert (taken, state.note) == ([], "")
+
+
+def test_what_never_comes_is_named_soon():
+    net = Net()
+    with net.worn():
+        heard = listening(net)
+        for t, payload, note in (
+            (1.0, None, ""),
+            (1.0 + NOTHING_S, None, ""),
+            (1.1 + NOTHING_S, None, NOTHING.format("park/T/position")),
+            (5.0, position(UTC + 5.0, (99.0, 0.0, 0.0)), "what comes on park/T/position is refused: "),
+        ):
+            if payload is not None:
+                net.deliver(payload)
+            list(heard.receive(UTC, t))
+            state = BodyState()
+            heard.annotate([BodyState(), state], t)
+            assert state.note.startswith(note)
+            assert bool(state.note) == bool(note)
 
 
 def test_the_first_of_two_sources_stays_until_silent():

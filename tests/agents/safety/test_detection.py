@@ -16,7 +16,7 @@ from agents.kinds.turtlebot3 import TURTLEBOT3
 from agents.plugins.predictors import HOLD
 from agents.safety.detection import FOREIGN_S, LOWEST_DESCENT_M_S, Detector, RobotStatus, tilt_angle, tilted
 from agents.safety.hazards import Cause, Hazards, Outcome
-from agents.safety.preflight import LOST_S, Preflight
+from agents.safety.preflight import FRAME, LOST_S, Preflight
 from agents.safety.setpoint_filter import SetpointFilter
 from agents.vectors import UNKNOWN, ZERO
 
@@ -289,8 +289,8 @@ def test_silent_neighbours_and_goals_are_awaited_briefly():
         assert held_s(guided, 0.1) == ticks
 
 
-def climbs(kind=CRAZYFLIE):
-    robot = Watched(kind)
+def climbs(kind=CRAZYFLIE, **safety):
+    robot = Watched(kind, **safety)
     robot.status.cruising, robot.status.climbing = False, True
     return robot
 
@@ -312,6 +312,14 @@ def test_climb_without_measured_height(kind, patience_s):
     robot = climbs(kind).measure(position=(0.0, 0.0, 0.02))
     assert robot.step(patience_s).texts == []
     assert robot.step(0.03).texts == ["land: it does not obey commands to move: it does not rise"]
+
+
+@pytest.mark.parametrize(("spinning", "texts"), [(True, 1), (False, 0)], ids=["motors", "arms"])
+def test_climb_by_frozen_captured_height_is_cut(spinning, texts):
+    robot = climbs(late_s=0.15).measure(position=(0.0, 0.0, 0.02), spinning=spinning)
+    assert robot.step(1.1).texts == []
+    assert len(robot.step(0.1).texts) == texts
+    assert robot.texts[:1] == ["cut: its measured height does not follow its climb: 0.00 m high after 1.1 s"][:texts]
 
 
 def lands(**measured):
@@ -362,11 +370,11 @@ START = (0.1, 0.2)
 class Standing(Watched):
     """A robot that stands at its start, beside one robot that it receives."""
 
-    def __init__(self, kind=CRAZYFLIE, *, start_within=0.3, other=(0.35, 0.2), **safety):
+    def __init__(self, kind=CRAZYFLIE, *, start_within=0.3, start_yaw=NAN, other=(0.35, 0.2), **safety):
         super().__init__(kind, "G", **safety)
         starts = (("F", *START, kind.radius), ("G", *other, kind.radius))
         given = {"name": "F", "kind": kind, "limits": self.limits, "predictor": HOLD, "start": START, "starts": starts}
-        self.preflight = Preflight(SimpleNamespace(**given, start_within=start_within))
+        self.preflight = Preflight(SimpleNamespace(**given, start_within=start_within, start_yaw=start_yaw))
         self.filter = SetpointFilter(kind, self.limits)
         self.move_other((*other, 0.0))
 
@@ -421,6 +429,8 @@ def test_kind_start_and_separation_decide():
         ({"other": (0.22, 0.2)}, {"position": (0.22, 0.2, 0.0)}, ""),  # two that start in one another are none
         ({"kind": KHEPERA4, "other": (0.3, 0.3), "separation": 0.3}, {}, "it is 0.22 m from G, nearer than 0.3 m"),
         ({"kind": KHEPERA4, "other": (0.3, 0.3), "separation": 0.2}, {}, ""),
+        ({"start_yaw": 3.0}, {"yaw": -3.0}, ""),
+        ({"start_yaw": 0.0}, {"yaw": 1.05}, f"it is turned by 60° from the yaw of its `start`: turn it, or {FRAME}"),
     ):
         assert Standing(**given).check(**values) == reason
 

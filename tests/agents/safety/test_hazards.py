@@ -58,6 +58,8 @@ WHILE_IT_LASTS = {  # of a drone: outcomes, and the ticks at which they begin, o
     ((1000, "LAND"),): "UNSTARTED",
     ((10, "CUT"),): "FAR_OUTSIDE TILT",
     ((2000, "CUT"),): "LANDING",
+    ((0, "CUT"),): "STUCK",
+    ((30, "CUT"),): "TURNED",
 }
 EXPECTED = {Cause[name]: list(changes) for changes, names in WHILE_IT_LASTS.items() for name in names.split()}
 

@@ -7,6 +7,7 @@ import pytest
 from agents.kinds.crazyflie import CRAZYFLIE
 from agents.kinds.khepera4 import KHEPERA4
 from agents.safety.positions import FLIP, JUMP_M, PLAUSIBLE_SPEED, Continuity, ExternalPositions
+from agents.vectors import UNKNOWN
 
 FAR = JUMP_M + PLAUSIBLE_SPEED * CRAZYFLIE.speed * 0.3  # [m] within a gap of 0.3 s in the measurements
 FLIPPED = FLIP + PLAUSIBLE_SPEED * KHEPERA4.turn_rate * 0.02  # [rad] within 0.02 s
@@ -98,6 +99,14 @@ def test_doubted_position_is_forgotten_or_stays_wrong():
             external.forget()
             assert believed(external, [5.0], begin=9.0) == [True]
         assert not external.doubted
+    for places, place in (([0.0, 0.01], (0.02, 0.0, 1.0)), ([0.0, 0.3], UNKNOWN)):  # it disobeys, or jumped
+        external = ExternalPositions(CRAZYFLIE)
+        believed(external, places)
+        external.disbelieve()
+        assert not external.believes(1.0, (places[-1] + 0.01, 0.0, 1.0), watched=True)
+        assert external.place == pytest.approx(place, nan_ok=True)
+        external.believes(2.0, (0.0, 0.0, 0.0), watched=False)
+        assert all(map(isnan, external.place))
     inside = ExternalPositions(CRAZYFLIE)
     inside.disbelieve()  # it measures its position itself
     assert not inside.doubted

@@ -5,6 +5,7 @@ import socket
 import threading
 import time
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -17,7 +18,7 @@ from agents.network import session as network
 from agents.protocols import vicon_datastream
 from agents.protocols.vicon_datastream import Segment
 from bridges.vicon.client import Frame
-from bridges.vicon.publisher import Bridge, PoseFilter, heading, parse_maps, parse_server
+from bridges.vicon.publisher import Bridge, FrameQueue, PoseFilter, heading, parse_maps, parse_server
 from experiments.file import document
 from tests.commands import python, started
 from tests.system.lab import RobotProcess, Watcher
@@ -149,6 +150,21 @@ def test_a_pose_that_repeats_itself_is_not_published(printed):
     frozen = "CF01: the pose of 'CF01' repeats itself to the last bit: the motion capture is frozen"
     seen = "CF01 is seen as 'CF01'"
     assert printed == [seen, frozen, seen, frozen]
+
+
+@pytest.mark.parametrize(
+    ("rate_off", "grows", "waited"),
+    [(0.0, 0.0, (0.0, 0.0)), (0.002, 0.0, (0.0, 0.001)), (0.0, 0.1, (0.9, 1.0)), (0.0, -0.1, (0.0, 0.0))],
+)
+def test_growing_queue_shows_by_frame_numbers(rate_off, grows, waited):
+    """Ten seconds at 100 Hz of a server whose rate is a little off, with a queue that grows [s/s]."""
+    queue, least, most = FrameQueue(), *waited
+    for number in range(1000):
+        arrived = 7.0 + number * 0.01 * (1.0 + rate_off + grows)
+        wait_s = queue.wait_s(replace(frame(number), period_s=0.01), arrived)
+    assert least <= wait_s <= most
+    assert queue.wait_s(replace(frame(5), period_s=0.01), arrived + 1.0) == 0.0, "it was started again"
+    assert queue.wait_s(frame(6), arrived + 99.0) == 0.0, "its rate is unknown"
 
 
 def test_overtaking_frames_and_false_axes_are_left_out(printed):

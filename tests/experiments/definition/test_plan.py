@@ -228,6 +228,21 @@ def test_limits_are_arena_and_safety_of_the_file():
     assert three().limits("A").top_speed == np.inf
 
 
+def test_late_positions_matter_to_kinds_and_bodies():
+    for kind, body, position, late_s, behind_s in (
+        ("crazyflie", "radio://0/80/2M", "external", 0.15, 0.1),
+        ("crazyflie", "crazyflie-twin", "external", 0.15, 0.1),
+        ("crazyflie", "crazyflie-twin", "body", math.inf, 0.25),
+        ("crazyflie", "twin", "external", math.inf, 0.25),
+        ("tello", "tello-twin", "external", math.inf, 0.25),
+        ("khepera4", "khepera4-twin", "external", math.inf, 0.25),
+    ):
+        hover = 0.5 if KINDS[kind].flies else None
+        robot = RobotTable(kind=kind, start=[0.0, 0.0], hover=hover, body=body, position=position)
+        limits = Plan(small({"A": robot})).limits("A")
+        assert (limits.late_s, limits.behind_s) == (late_s, pytest.approx(behind_s))
+
+
 def test_links_may_have_gains_of_their_own():
     given = {"A > B": LinkTable(distance=0.5, gain=7.0), "B - C": 0.6, "C > A": LinkTable(distance=1.0)}
     net = three(formation=Formation(gain=2.0, links=given)).links

@@ -11,6 +11,7 @@ from agents.body.measured_positions import FROZEN
 from agents.clock import Clock
 from agents.kinds.tello import TELLO
 from agents.network.messages import Inspection, Reply, State, Status
+from agents.safety.preflight import FRAME
 from experiments.definition.experiment import RobotTable
 from experiments.definition.plan import Plan
 from experiments.file import document
@@ -122,6 +123,17 @@ def test_captured_positions_that_never_change_are_red(body, position, verdict):
     assert (made.verdict, made.found) == ("bad", FROZEN)
 
 
+def test_late_or_turned_positions_name_what_to_mend():
+    robot = changed(DRONE, position="external", device={})
+    for ahead_s, verdict in ((-0.09, "ok"), (-0.12, "bad")):
+        made = checked(observed_still(robot, noise=0.0005, ahead_s=ahead_s))["position"]
+        assert made.verdict == verdict
+        assert ("120 ms late" in made.found, "is slow" in made.remedy) == (verdict == "bad",) * 2
+    turned = checked(observed_still(robot, noise=0.0005, yaw=1.05))["start pose"]
+    assert turned.remedy == f"if its nose is right, {FRAME}; else turn it to 0 rad, or correct `start`"
+    assert "object" not in checked(observed_still(yaw=1.05))["start pose"].remedy
+
+
 def test_robots_of_a_kind_have_the_same_firmware():
     made = checked(observed_still(), CF02=observed_still(OTHER, firmware="2025.09"))["firmware"]
     assert (made.verdict, made.remedy) == ("warn", "CF02 has 2025.09: flash the same to all of a kind")
@@ -172,7 +184,8 @@ def test_stops(robot, tried, verdict):
     [
         (DRONE, (0.02, 0.5, 0.21), "ok", ""),
         (DRONE, (0.0, 0.5, 0.05), "bad", "does not keep its height"),
-        (DRONE, (0.3, 0.5, 0.2), "bad", "drifts"),
+        (DRONE, (0.09, 0.5, 0.2), "ok", ""),
+        (DRONE, (0.11, 0.5, 0.2), "bad", "yaw of its positions against its nose"),
         (WHEELS, (0.1, 0.5, 0.0), "ok", ""),
         (WHEELS, (0.0, 0.5, 0.0), "bad", "does not drive although commanded to"),
         (WHEELS, (0.2, 0.5, 0.0), "bad", "its speed is not the commanded one"),
@@ -271,3 +284,40 @@ def test_interrupt_before_a_trial_moves_nothing(at, given):
     trying = Trying(at)
     assert bool(trying.tried().failure) == (at != "never")
     assert [order for order in trying.given if order != "inspect"] == given
+
+
+class Hopping(Trying):
+    """Checks of a drone that goes aside in its hop, at x [m]."""
+
+    def __init__(self, robot, x):
+        super().__init__("never")
+        self._robot, self._x, self._ticks = robot, x, 0
+        self._experiment = small({"KH01": robot})
+        self._progress = SimpleNamespace(states=[])
+
+    def _update(self):
+        super()._update()
+        self._ticks += 1
+        x = self._x if self._ticks > 5 else 0.0
+        self._states.get("KH01", []).append(State("KH01", self._ticks, 0.02 * self._ticks, "", (x, 0.0, 0.2)))
+
+    def _obey(self, names, order):
+        if order.order in ("stop", "land"):
+            self._enter("done")
+        return super()._obey(names, order) if order.order != "takeoff" else {"KH01": Reply("KH01", ok=True, phase="")}
+
+
+@pytest.mark.parametrize(
+    ("robot", "x", "end"),
+    [
+        (changed(DRONE, position="external", device={}), 0.12, "stop"),
+        (DRONE, 0.12, "land"),
+        (changed(TELLO_TABLE, body="tello://192.168.10.1"), 0.25, "land"),
+    ],
+)
+def test_hop_that_goes_aside_ends_there(robot, x, end):
+    trying = Hopping(robot, x)
+    tried = trying.tried()
+    assert tried.failure.startswith(f"{x:.2f} m to the side (limit ")
+    assert [order for order in trying.given if order != "inspect"][-1] == end
+    assert "yaw of its positions" in checks.hop(observed_still(robot), tried, Safety()).remedy

@@ -1,0 +1,78 @@
+"""Check of the direction of flight: a drone must accelerate where it is commanded to.
+
+A drone that takes the yaw of its positions for its own, although the frame of its object is turned against its nose,
+accelerates beside each command by that angle. From 60° on it circles wider and wider. The check compares the
+acceleration that follows from position errors and velocities with the measured one. Their correlation tells the angle
+as soon as the drone wobbles by some centimetres. A push, noise or a lag of another size turns nothing.
+
+Quiet: all of it.
+"""
+
+from __future__ import annotations
+
+from math import atan2, exp, hypot, inf, sqrt
+from typing import Final
+
+from agents.body.kinds import Kind
+from agents.vectors import ZERO, Vector
+
+SAMPLE_S: Final = 0.05  # from one comparison to the next
+MISSED_S: Final = 0.3  # time without a comparison after which the acceleration is unknown
+FORGET_S: Final = 0.6  # time constant with which comparisons are forgotten
+LEAST: Final = 0.25  # [m/s²] mean of the commanded accelerations, below which their directions are noise
+ALIKE: Final = 0.6  # least correlation of commanded and measured accelerations
+ASIDE: Final = (
+    0.65  # [rad] largest angle between the two: right ones show up to 0.53, a frame turned by 60° at least 0.72
+)
+ROUNDING_S: Final = 1e-6
+
+
+class DirectionCheck:
+    """Commanded and measured accelerations of one drone, seen from above."""
+
+    __slots__ = (
+        "angle", "asks", "cross", "due", "gain", "inline", "lag", "last", "moves", "response", "speed", "turned",
+        "velocity", "x", "y",
+    )  # fmt: skip
+
+    def __init__(self, kind: Kind) -> None:
+        self.response, self.speed = kind.response, kind.speed
+        self.lag = 0.5 * max(kind.lag, SAMPLE_S)  # of the tilt; the velocity loop has the other half [s]
+        self.gain = 1.0 / self.lag  # of that loop [1/s]
+        self.forget()
+
+    def forget(self) -> None:
+        """Restart."""
+        self.turned = False  # the drone accelerates beside its commands
+        self.angle = 0.0  # by this [rad]
+        self.last = self.due = -inf  # times of the last comparison and of the next [s]
+        self.velocity = ZERO  # at the last comparison [m/s]
+        self.x = self.y = 0.0  # acceleration that is commanded, with the lag of the tilt [m/s²]
+        # sums over comparisons: products along and across, squares of commanded and of measured ones [m²/s³]
+        self.inline = self.cross = self.asks = self.moves = 0.0
+
+    def update(self, t: float, goal_x: float, goal_y: float, position: Vector, velocity: Vector) -> None:
+        """Compare at `t` [s], on the way to a goal [m]; `position` [m] and `velocity` [m/s] are measured."""
+        if t < self.due:
+            return
+        since, self.last, self.due = t - self.last, t, t + SAMPLE_S - ROUNDING_S
+        x, y = self.response * (goal_x - position[0]), self.response * (goal_y - position[1])
+        share = min(self.speed / max(hypot(x, y), self.speed), 1.0)
+        x, y = self.gain * (share * x - velocity[0]), self.gain * (share * y - velocity[1])
+        before, self.velocity = self.velocity, velocity
+        if since < MISSED_S:
+            self.compare(since, (velocity[0] - before[0]) / since, (velocity[1] - before[1]) / since)
+            tilts = since / (self.lag + since)
+            self.x += tilts * (x - self.x)
+            self.y += tilts * (y - self.y)
+
+    def compare(self, since: float, x: float, y: float) -> None:
+        """Add an acceleration x, y [m/s²], measured in `since` [s]."""
+        keep = exp(-since / FORGET_S)
+        self.inline = keep * self.inline + since * (self.x * x + self.y * y)
+        self.cross = keep * self.cross + since * (self.x * y - self.y * x)
+        self.asks = keep * self.asks + since * (self.x * self.x + self.y * self.y)
+        self.moves = keep * self.moves + since * (x * x + y * y)
+        self.angle = atan2(self.cross, self.inline)
+        alike = hypot(self.inline, self.cross) > ALIKE * sqrt(self.asks * self.moves)
+        self.turned = alike and abs(self.angle) > ASIDE and self.asks > LEAST * LEAST * FORGET_S
