@@ -89,6 +89,27 @@ class Endpoint:
             return None
 
 
+def obstacle(endpoint: str, limit_s: float) -> str:
+    """Reason of the system why an endpoint cannot be connected with; empty if it can, refuses, or says no reason.
+
+    `endpoint` is one as Zenoh takes it, `limit_s` [s] the limit for its port to accept.
+    """
+    try:
+        where = Endpoint.parse(endpoint)
+        if where.protocol == UNIX:
+            with socket.socket(socket.AF_UNIX) as knock:
+                knock.connect(where.host)
+        elif where.protocol == "quic":
+            socket.getaddrinfo(where.host, where.port)
+        else:
+            socket.create_connection((where.host, where.port), limit_s).close()
+    except (ConnectionRefusedError, TimeoutError, ValueError):
+        return ""
+    except OSError as error:
+        return f"{where.host}: {error.strerror or error}"
+    return ""
+
+
 def free_endpoint(preferred_port: int = DEFAULT_PORT, protocol: str = "tcp") -> str:
     """A loopback endpoint to listen on: of the preferred port, or of any free one when that is taken."""
     for port in (preferred_port, 0):

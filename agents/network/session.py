@@ -143,6 +143,7 @@ T_co = TypeVar("T_co", covariant=True)
 RETRY_S: Final = 0.1  # between attempts to open; an open client keeps to the `connect/retry` of its configuration
 GATHER_S: Final = 1.0
 LINK_S: Final = 0.01
+KNOCK_S: Final = 0.3  # limit for a port to accept a connection, when the reason of a failure is looked for
 ENDPOINT_FREE_S: Final = 3.0  # limit for the endpoint of a robot of a mesh that is restarted to become free
 ROBOT_LEASE_S: Final = 1.2  # of robots: the neighbours of a robot that hangs must detect it within 1.5 s
 ASK_EVERY_S: Final = 0.4  # between two queries to the router
@@ -236,9 +237,11 @@ def _silence(endpoints: Sequence[str], identity: str) -> str:
         remedy = "a mesh lasts as long as its run, --connect names another"
     elif folder is None:
         remedy += "; in a lab it needs --lab"
+    plain = topology.bare(endpoints)
+    obstacles = dict.fromkeys(filter(None, (topology.obstacle(each, KNOCK_S) for each in plain)))
     return (
         f"{'no member' if topology.is_mesh(endpoints) else 'no router'} answers at "
-        f"{', '.join(topology.bare(endpoints)) or 'no endpoint'}{refused}: {remedy}"
+        f"{', '.join(plain) or 'no endpoint'}{''.join(f' ({each})' for each in obstacles)}{refused}: {remedy}"
     )
 
 

@@ -327,8 +327,8 @@ class Events:
 @pytest.fixture
 def guarded(monkeypatch):
     """Guard of a lab's router, without a network, and the links that it has hung up on."""
-    identities = {name: lab.Identity(role, name, "1", "2100") for name, role in
-                  {"router": "router", "observer": "observer", "CF01": "robot", "KH01": "robot"}.items()}  # fmt: skip
+    roles = {"router": "router", "ana": "operator", "observer": "observer", "CF01": "robot", "KH01": "robot"}
+    identities = {name: lab.Identity(role, name, "1", "2100") for name, role in roles.items()}
     own = {name: Grant(tokens=KEYS.owner_tokens(KEYS.alive(name))) for name in ("CF01", "KH01")}
     events, hung_up = Events(), []
     monkeypatch.setattr(routing_process, "hang_up_on", lambda link: hung_up.append(link) or True)
@@ -338,7 +338,8 @@ def guarded(monkeypatch):
 
 def test_certificate_has_a_few_sessions(guarded):
     observers = [Link(str(number), "observer") for number in range(MOST_SESSIONS + 1)]
-    for link in (*observers[:-1], *(Link(f"r{number}", "router") for number in range(MOST_SESSIONS + 1))):
+    trusted = [Link(f"{name}{number}", name) for number in range(MOST_SESSIONS + 1) for name in ("router", "ana")]
+    for link in (*observers[:-1], *trusted):
         guarded.link(link)
     assert not guarded.hung_up
     guarded.link(observers[-1])
@@ -367,6 +368,13 @@ def test_nobody_may_ask_for_a_labs_tables(folder):
     secure = settings("router", listen=[listen], name="router", rights=Rights("park", {}, {}))
     assert secure["adminspace/enabled"] is False
     assert config(secure).get_json("adminspace/enabled") == "false"
+
+
+@pytest.mark.parametrize("mode", ["client", "peer", "router"])
+def test_members_that_do_not_read_delay_shortly(mode):
+    queue = json.loads(config(settings(mode)).get_json("transport/link/tx/queue/congestion_control"))
+    assert queue["block"]["wait_before_close"] == queue["drop"]["max_wait_before_drop_fragments"] == 20_000  # [µs]
+    assert queue["drop"]["wait_before_drop"] == 1_000
 
 
 def test_router_without_an_answer_ends_its_process(eventually):

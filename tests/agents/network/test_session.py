@@ -15,13 +15,14 @@ import pytest
 import zenoh
 
 from agents.network import pubsub
-from agents.network.endpoints import free_endpoint
+from agents.network.endpoints import free_endpoint, obstacle
 from agents.network.messages import JSON, Stop
 from agents.network.session import (
     ANSWER_S,
     ASK_EVERY_S,
     SLICE_NS,
     RouterWatch,
+    Unreachable,
     connected,
     count_links,
     forbid_lingering,
@@ -31,6 +32,7 @@ from agents.network.session import (
 )
 from agents.network.zenoh_config import LEASE_S, config, settings
 from agents.runtime.router import serve_router
+from tests.cases import for_each
 from tests.commands import python, started
 from tests.conftest import RouterProcess
 from tests.network import Net
@@ -77,6 +79,32 @@ def test_pose_said_while_the_router_was_down_arrives(two, router, eventually):
     router.start()
     eventually(lambda: got.extend(payloads(poses.handler)) or got[-1] == b"while down")
     assert connected(sender)
+
+
+@for_each(
+    "endpoint, reason",
+    [
+        ("tcp/255.255.255.255:7447", "255.255.255.255: "),
+        ("unixsock-stream//no/such/socket", "/no/such/socket: No such file or directory"),
+    ],
+)
+def test_failed_connection_tells_the_systems_reason(endpoint, reason):
+    assert obstacle(endpoint, 0.3).startswith(reason)
+    with pytest.raises(Unreachable, match=rf"at {endpoint} \({reason}.*`./zenpark router` starts one"):
+        open_session([endpoint], name="test", wait_s=0.0)
+
+
+def test_unknown_name_is_the_reason(monkeypatch):
+    def unknown(*_, **__):
+        raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
+
+    monkeypatch.setattr(socket, "getaddrinfo", unknown)
+    for protocol in ("tcp", "tls", "quic"):
+        assert obstacle(f"{protocol}/lab:7447", 0.3) == "lab: Name or service not known"
+
+
+def test_refused_connection_has_no_further_reason():
+    assert obstacle(free_endpoint(preferred_port=0), 0.3) == ""
 
 
 @pytest.mark.parametrize("bell", [None, pubsub.Bell()])
