@@ -24,12 +24,12 @@ from zenoh.handlers import Callback, FifoChannel, Handler, RingChannel
 from agents.network import messages
 from agents.network.keys import Keys
 from agents.network.messages import M
-from agents.network.session import Polled, received
+from agents.network.session import Polled, received, tokens_present
 
 HEARTBEAT_S: Final = 0.5  # delay until the loss of the last pose before a silence is noticed
 POSES: Final = 16  # queued poses of one robot
 EVENTS: Final = 64  # of a run, repeated to a subscriber that was cut off: without a router much happens at once
-SOURCES: Final = 4096  # publishers with known numbers, and answers to a question for last values
+SOURCES: Final = 4096  # publishers with known numbers
 ORDERS: Final = 8  # queued
 LONGEST_ORDER: Final = 4096  # [bytes] an order to land or to stop is shorter
 TOKEN_CHANGES: Final = 256  # queued
@@ -145,14 +145,13 @@ class PoseSubscriber:
 
 
 def last_values(session: zenoh.Session, keyexpr: str, limit_s: float) -> list[zenoh.Sample]:
-    """Last value of each `pose_publisher`; those that have not answered after `limit_s` [s] are missing."""
-    asked = session.get(
-        f"{keyexpr}/@adv/pub/**?_max=1;_anyke",
-        FifoChannel(SOURCES),
-        consolidation=zenoh.ConsolidationMode.NONE,
-        timeout=limit_s,
-    )
-    return [reply.ok for reply in asked if reply.ok is not None]
+    """Last value of each `pose_publisher`; those that have not answered after `limit_s` [s] are missing.
+
+    Each is asked by its own key: in a lab a question on a wildcard does not reach them.
+    """
+    caches = sorted(tokens_present(session, f"{keyexpr}/@adv/pub/**") or ())
+    asked = [session.get(f"{cache}?_max=1;_anyke", FifoChannel(ORDERS), timeout=limit_s) for cache in caches]
+    return [reply.ok for answers in asked for reply in answers if reply.ok is not None]
 
 
 def publisher(
