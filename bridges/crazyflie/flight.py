@@ -145,7 +145,7 @@ class FlightControl:
     def note_external(self, height: float, yaw: float, age: float) -> None:
         """Store the height [m] and yaw [rad], or NaN, as measured from outside `age` [s] ago. From any thread."""
         self._external, self._external_at = (height, yaw), uptime()
-        if age <= EXTERNAL_AGE_S:
+        if age <= EXTERNAL_AGE_S or self._located_at == -math.inf:  # the first have waited while it connected
             self._located_at = self._external_at
 
     @property
