@@ -45,6 +45,15 @@ FAR_OFF: Final = 0.01  # [m] a shape that misses a distance by more is another s
 GUESSES: Final = 400  # random places of robots from which a shape is sought: each costs time with their number
 
 
+def sampled_loop(plan: Plan, asked: Links, position: Array) -> Modes:
+    """Modes of the sampled loop of a gradient law at `position` (N, 3) [m], with what the links ask for."""
+    kinds, hz = plan.kinds, plan.experiment.rates.coordination_hz
+    return modes(
+        cast(Gradient, plan.law), asked, position, closed_shares(kinds, hz), hz,
+        bearable=bearable_factors(kinds, hz), anchors=plan.anchors_by_row, within_s=plan.experiment.duration_s,
+    )  # fmt: skip
+
+
 @dataclass(frozen=True)
 class Analysis:
     """Figures of one case; each is computed at its first use."""
@@ -194,14 +203,7 @@ class Analysis:
     @cached_property
     def modes(self) -> Modes | None:
         """Modes of the sampled loop at the shape."""
-        if self.shape is None:
-            return None
-        kinds, hz = self.plan.kinds, self.plan.experiment.rates.coordination_hz
-        return modes(
-            self.law, self.first_links, self.shape.position, closed_shares(kinds, hz), hz,
-            bearable=bearable_factors(kinds, hz), anchors=self.plan.anchors_by_row,
-            within_s=self.plan.experiment.duration_s,
-        )  # fmt: skip
+        return None if self.shape is None else sampled_loop(self.plan, self.first_links, self.shape.position)
 
     def _shapes(self, wanted: Links, there: Mask) -> list[Shape]:
         """Shapes from the ends, the starts, the scaled distances and random places as guesses, until one is exact."""

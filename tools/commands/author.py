@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import textwrap
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -13,6 +14,13 @@ from experiments.catalogue import index
 from tools.options import WIDEST, AsJson, example, print_result, warn
 
 app: Final = typer.Typer()
+
+
+class Gain(StrEnum):
+    """Gains of an imported file."""
+
+    THEIRS = "theirs"
+    STABLE = "stable"
 
 
 @app.command(epilog=example("new triangle mine.toml", "new --hemisphere 40 swarm.toml"))
@@ -64,14 +72,16 @@ def new(
 def import_(
     file: Annotated[str, Argument(metavar="FILE.yaml", help="An experiment of Robotic Park's authors.")],
     target: Annotated[str | None, Argument(metavar="TARGET", help="The file to write. [FILE.toml]")] = None,
+    *,
     duration: Annotated[float, Option(min=1.0, max=86400.0, help="Duration, which their files lack [s].")] = 60.0,
     poses: Annotated[str | None, Option(metavar="FILE", help="Starts: index (.yaml) or Webots world (.wbt).")] = None,
+    gain: Annotated[Gain, Option(help="Gains of the file, or lowered where the twins would swing.")] = Gain.THEIRS,
     as_json: AsJson = False,
 ) -> None:
     """Turn an experiment file of Robotic Park's authors into one of zenpark."""
     from experiments.authoring.robotic_park.convert import convert
 
-    path, notes = convert(file, target, duration, poses)
+    path, notes = convert(file, target, duration, poses, calm=gain is Gain.STABLE)
     lines = [f"{path}: from {file}; `./zenpark check {path}`, `./zenpark run {path} --virtual`"]
     if notes:
         lines.append("Not carried over, or not as it was:")

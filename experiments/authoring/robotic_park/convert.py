@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 import textwrap
 from collections import Counter
-from collections.abc import Hashable, Iterator, Sequence
+from collections.abc import Collection, Hashable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
@@ -20,10 +20,14 @@ from experiments.authoring.robotic_park import file as park_files
 from experiments.authoring.robotic_park.file import PLACES, SURFACES, ParkExperiment, ParkRobot, Task
 from experiments.authoring.robotic_park.heights import Heights, find_heights, origin_of
 from experiments.catalogue import index
+from experiments.check.analysis import sampled_loop
 from experiments.check.findings import join_names
+from experiments.check.realisation import targets_of_law
+from experiments.check.theory import OSCILLATING_GAIN, UNSTABLE_GAIN
 from experiments.file import catalogue as entries
 from experiments.file import document
 from experiments.file.consistency.whole import divisor
+from experiments.file.problems import DocumentError
 from experiments.file.reference import written
 
 V = TypeVar("V", bound=Hashable)
@@ -31,31 +35,39 @@ RATE_HZ: Final = 100.0  # of bodies: their position controllers run at that
 ROOM: Final = 0.6  # [m] around starts and shape
 PARK: Final = (4.0, 4.0, 2.5)  # [m] the arena, if there is room in it
 WIDTH: Final = 110
+CALM: Final = 0.98  # share of the largest calm gain that is written: gains are rounded
 SAME: Final = 1e-6  # [m] two ends of a link mean the same
 LEVEL: Final = 0.02  # [m] heights that differ by less are the same
 LAWS: Final = {"distance": "distance", "pose": "displacement"}  # for their kinds of tasks
 RADIO: Final = re.compile(r"radio://(\d+)/\d+/(?:250K|1M|2M)/[0-9A-Fa-f]{10}")
 
 
-def convert(file: str, target: str | None, duration_s: float, poses: str | None = None) -> tuple[Path, list[str]]:
+def convert(
+    file: str, target: str | None, duration_s: float, poses: str | None = None, *, calm: bool = False
+) -> tuple[Path, list[str]]:
     """Write the experiment file of one of theirs; return its path and what was not carried over.
+
+    `calm`: As `convert_text`.
 
     Raises:
         DocumentError: If the file cannot be read, is no experiment of theirs, or the new one cannot be written.
     """
     text = park_files.text_of(file, "name an experiment file of Robotic Park's authors (.yaml)")
-    made, notes = convert_text(text, file, duration_s, poses)
+    made, notes = convert_text(text, file, duration_s, poses, calm=calm)
     path = entries.write_new(made, Path(target or f"{Path(file).stem}.toml"))
     document.read(path)
     return path, notes
 
 
-def convert_text(text: str, label: str, duration_s: float, poses: str | None = None) -> tuple[str, list[str]]:
+def convert_text(
+    text: str, label: str, duration_s: float, poses: str | None = None, *, calm: bool = False
+) -> tuple[str, list[str]]:
     """The text of the experiment file, and what was not carried over.
 
     Args:
         label: Its name; the files that an index names are looked for beside it.
         poses: A file with starts, see `starts_from`; they go before those of theirs.
+        calm: Gains that ring with the twins are lowered, all by one factor, until they do not.
 
     Raises:
         DocumentError: With the errors in theirs, by the path of the key.
@@ -93,18 +105,59 @@ def convert_text(text: str, label: str, duration_s: float, poses: str | None = N
         "formation.links": links,
         "formation.anchors": anchors,
     }
+    made_up = {robot.name for robot in park.robots if robot.start is None}
+    if (gain := _loop_gain(_text(tables, made_up), found)) > OSCILLATING_GAIN:
+        notes.insert(0, _calm(tables, gain, lower=calm))
     lines = [f"#:schema ./{index.SCHEMA}", f"# Imported from {_plain(name.name)}."]
     lines += ["# Not carried over, or not as it was:"] if notes else []
     for note in notes:
         lines += textwrap.wrap(_plain(note), WIDTH, initial_indent="# - ", subsequent_indent="#   ")
-    made_up = {robot.name for robot in park.robots if robot.start is None}
+    return "\n".join([*lines, _text(tables, made_up)]), notes
+
+
+def _text(tables: Mapping[str, Mapping[str, Any]], made_up: Collection[str]) -> str:
+    """Tables of an experiment file as text, with a remark at robots with an invented start."""
+    lines = []
     for header, table in tables.items():
         lines += [f"[{header}]"] if header and table else []
         for key, value in table.items():
             remark = "  # start made up" if header == "robots" and key in made_up else ""
             lines.append(f"{written(key) if ' ' in key else key} = {written(value)}{remark}")
         lines += [""] if table else []
-    return "\n".join(lines), notes
+    return "\n".join(lines)
+
+
+def _loop_gain(text: str, found: Heights) -> float:
+    """Gain of the sampled loop of an experiment at its shape, as `check` states it; 0 without a shape or links."""
+    try:
+        plan = document.loads(text).plan
+    except DocumentError:
+        return 0.0  # the written file is read again, and refused
+    if not found.met or not (len(plan.links) or plan.anchors_by_row):
+        return 0.0
+    return sampled_loop(plan, targets_of_law(plan.law, plan.links), found.shape).gain
+
+
+def _calm(tables: Mapping[str, dict[str, Any]], gain: float, *, lower: bool) -> str:
+    """Note on gains that ring; `lower` multiplies them all by the largest factor with which they do not."""
+    share, formation = CALM * OSCILLATING_GAIN / gain, tables["formation"]
+    owners = [formation, *tables["formation.links"].values(), *tables["formation.anchors"].values()]
+    key = "gain" if "gain" in formation else "stiffness"
+    theirs, most = formation[key], _rounded(share * formation[key])
+    rings = "swings for ever" if gain >= UNSTABLE_GAIN else "oscillates before it settles"
+    loop = f"with zenpark's twins the sampled loop {rings} (gain {gain:.2g}, limit {UNSTABLE_GAIN:g})"
+    if not lower:
+        return f"{key} {theirs:g}: {loop}. At most {most:g} is calm: `--gain stable` writes it, and lowers all gains so"
+    for owner in owners:
+        for name in ("gain", "stiffness"):
+            if isinstance(owner, dict) and name in owner:
+                owner[name] = _rounded(share * owner[name])
+    return f"{key} {theirs:g} of theirs is {most:g}, and all others are lowered as much: with theirs, {loop}"
+
+
+def _rounded(gain: float) -> float:
+    """A gain with three digits."""
+    return float(f"{gain:.3g}")
 
 
 def _plain(text: str) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Final
 
 import numpy as np
@@ -39,8 +40,11 @@ class Room:
 
     def holds(self, shape: Shape) -> bool:
         """Whether robots stand apart, and drones are in the air."""
-        low = shape.position[self.flies, 2].min(initial=np.inf)
-        return not len(self.solids.overlaps(shape.position)) and bool(low >= self.lowest)
+        return not (self.too_low(shape) or len(self.solids.overlaps(shape.position)))
+
+    def too_low(self, shape: Shape) -> bool:
+        """Whether a drone is below the floor or near it."""
+        return bool(shape.position[self.flies, 2].min(initial=np.inf) < self.lowest)
 
 
 def find_shape(wanted: Links, anchors: Anchored, start: Array, climbs: Mask, room: Room | None = None) -> Shape:
@@ -49,7 +53,7 @@ def find_shape(wanted: Links, anchors: Anchored, start: Array, climbs: Mask, roo
     A formation that can be met at the heights of the starts stays there. Otherwise heights are free. Least squares then
     begin at the starts, at a dome above them and at starts that are moved at random (always the same ones). A single
     beginning ends in a local minimum for about two of three of the shapes in space that the authors fly. A shape that
-    hangs below the floor is mirrored.
+    hangs below the floor is mirrored at the height of its robots on wheels or of an anchor, or its drones there alone.
 
     Args:
         start: (N, 3) [m].
@@ -61,18 +65,25 @@ def find_shape(wanted: Links, anchors: Anchored, start: Array, climbs: Mask, roo
     mirrored = start * [1.0, -1.0, 1.0] + [0.0, 2.0 * start[:, 1].mean(), 0.0]
     found = find_shapes(wanted, [start, mirrored], moves, anchors, solids=solids)
     beginnings = _guesses_in_space(start, climbs) if climbs.any() and not found[-1].good else iter(())
-    fixed = np.concatenate([start[~climbs, 2], [each.point[2] for _, each in anchors]])
-    mirror = float(fixed.mean()) if len(fixed) else 0.0
+    mirrors = dict.fromkeys([*start[~climbs, 2].tolist(), *(each.point[2] for _, each in anchors)]) or (0.0,)
     for guess in beginnings:
         found += find_shapes(wanted, [guess], moves, anchors, climbs, solids=solids)
-        if found[-1].worst <= SHAPE_MET and not (room is None or room.holds(found[-1])):
-            turned = found[-1].position.copy()
-            turned[climbs, 2] = 2.0 * mirror - turned[climbs, 2]
-            found += find_shapes(wanted, [turned], moves, anchors, climbs, solids=solids)
+        if room is not None and found[-1].worst <= SHAPE_MET and not room.holds(found[-1]):
+            place = found[-1].position
+            parts = climbs, climbs & (place[:, 2] < room.lowest)  # the whole, and what hangs below alone
+            for mirror, part in product(mirrors, parts):
+                turned = place.copy()
+                turned[part, 2] = 2.0 * mirror - turned[part, 2]
+                found += find_shapes(wanted, [turned], moves, anchors, climbs, solids=solids)
+                if found[-1].worst <= SHAPE_MET and room.holds(found[-1]):
+                    break
         if found[-1].good and (room is None or room.holds(found[-1])):
             break
-    kept = [each for each in found if room is None or room.holds(each)]
-    return min(kept or found, key=lambda each: round(each.worst, 4))
+    if room is None:
+        return min(found, key=lambda each: round(each.worst, 4))
+    kept = [each for each in found if room.holds(each)]
+    # where all numbers put robots into one another, at least drones stay above the floor
+    return min(kept or found, key=lambda each: (each.worst > SHAPE_MET, room.too_low(each), round(each.worst, 4)))
 
 
 def _guesses_in_space(start: Array, climbs: Mask) -> Iterator[Array]:
@@ -97,6 +108,7 @@ class Heights:
     hover: Array  # (N,) heights that are held [m]; 0 on the floor
     anchored: bool  # distances to the origin agree with the others, and are carried over
     centre: tuple[float, float, float]  # place of the origin [m]
+    met: bool = True  # whether the shape meets the distances
 
 
 def find_heights(park: ParkExperiment, notes: list[str]) -> Heights:
@@ -132,7 +144,7 @@ def find_heights(park: ParkExperiment, notes: list[str]) -> Heights:
         unmet = "no shape was found that meets them with robots apart from one another, even in space; the best one"
         missed_by = f"misses by {1e3 * found.worst:.0f} mm, so drones hold the heights at which they start"
         notes.append(f"the distances: {unmet} {missed_by}")
-        return plain
+        return replace(plain, met=False)
     shape, lift = found.position, 0.0
     flat = not (np.abs(shape[:, 2] - start[:, 2])[flies] > MOVED).any()
     if flies.all() and not given and not flat:
@@ -141,7 +153,7 @@ def find_heights(park: ParkExperiment, notes: list[str]) -> Heights:
     hover = np.where(flies, np.round(shape[:, 2], 3), 0.0)
     if hover[flies].min(initial=LOWEST) < LOWEST:
         notes.append(f"the shape needs a drone at {hover[flies].min():.2f} m: drones hold the heights of their starts")
-        return replace(plain, anchored=False)
+        return replace(plain, anchored=False, met=False)
     if (np.abs(hover - start[:, 2])[flies] > MOVED).any():
         notes.append(
             "their drones climb while they form the shape, zenpark's hold a height: each takes off to that which it has"

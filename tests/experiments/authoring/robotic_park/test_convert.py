@@ -1,7 +1,7 @@
 """Files in the structure of Robotic Park's authors become experiments that are sound and run."""
 
 import math
-from functools import cache
+from functools import cache, partial
 from itertools import combinations
 
 import msgspec
@@ -73,6 +73,35 @@ def test_files_convert_pass_the_check_and_settle(count, allowed):
     last = log.true_position[np.searchsorted(log.time, 19.9)]
     errors = law_errors(plan.law, last, last[plan.links.sender], plan.links)
     assert errors.max() < (allowed or read.experiment.tolerance)
+
+
+def worst_error(text):
+    """Largest error of a link in the last five of twenty seconds [m]."""
+    plan, log = document.loads(text).plan, fly(document.loads(text).experiment).log
+    late = log.true_position[np.searchsorted(log.time, 15.0) : np.searchsorted(log.time, 19.9)]
+    return max(law_errors(plan.law, each, each[plan.links.sender], plan.links).max() for each in late)
+
+
+@pytest.mark.slow
+def test_gains_that_ring_are_said_and_lowered():
+    made = dome(8, gain=0.5)
+    (text, notes), (calm, lowered) = (convert_text(made, "park.yaml", 20.0, calm=calm) for calm in (False, True))
+    assert notes[0].startswith("gain 1: with zenpark's twins the sampled loop swings for ever (gain 2.5, limit 2)")
+    assert "# - gain 1: with" in text.partition("title")[0]
+    assert (notes[1:], lowered[0][:20]) == (lowered[1:], "gain 1 of theirs is ")
+    assert worst_error(text) > 0.05
+    assert worst_error(calm) < 0.02
+
+
+def test_files_that_ring_are_as_many_as_before():
+    """Counts of files whose gains swing for ever, or oscillate first, of four shapes and three gains."""
+    makers = (dome, 5), (dome, 8), (partial(dome, origin=True), 8), (partial(column, drones=4), 12)
+    notes = [convert_text(make(count, gain=gain), "park.yaml", 20.0)[1]
+             for make, count in makers for gain in (0.25, 0.5, 1.0)]  # fmt: skip
+    found = [sum(f"{words} (gain" in each[0] for each in notes) for words in ("for ever", "settles")]
+    assert found == [7, 2]
+    made, _ = convert_text(dome(8, gain=1.0), "park.yaml", 20.0, calm=True)
+    assert not {each.code for each in examine(document.loads(made))[0]} & {"unstable", "oscillates"}
 
 
 def test_drones_hover_at_the_heights_of_the_shape():
@@ -459,6 +488,15 @@ def test_a_shape_below_the_floor_is_mirrored():
     assert max(below.worst, above.worst) < ENOUGH
     assert below.position[climbs, 2].max() < 0.0
     assert above.position[:, 2] == pytest.approx([0.0] * 5 + [0.9, 0.8], abs=1e-3)
+
+
+def test_shape_of_crowded_drones_stays_above_the_floor():
+    """Two of its drones are too near to one another, upright and mirrored."""
+    top = [[0.6, 0.0, 1.0], [-0.5, 0.3, 0.9], [0.0, -0.6, 0.95], [0.0, -0.6, 1.02]]
+    shape, climbs = np.concatenate([ring(5), top]), np.arange(9) >= 5
+    found = find_shape(asked(shape), (), shape * [1.2, 1.0, -0.2], climbs, solids(climbs))
+    assert found.worst < ENOUGH
+    assert found.position[:, 2] == pytest.approx(shape[:, 2], abs=1e-3)
 
 
 def test_robots_in_one_place_are_no_shape():
