@@ -149,10 +149,14 @@ def patient_router() -> Iterator[RouterProcess]:
 
 
 @pytest.fixture
-def runtime_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder of this test for what runs and devices keep while they are up; it does not exist yet."""
-    monkeypatch.setenv("ZENPARK_RUNTIME_DIR", str(tmp_path / "runs"))
-    return tmp_path / "runs"
+def runtime_folder(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder of this test for what runs and devices keep while they are up; it does not exist yet.
+
+    A socket has at most 107 letters, and `tmp_path` of a worker nearly as many.
+    """
+    with tempfile.TemporaryDirectory(prefix="zp-") as short:
+        monkeypatch.setenv("ZENPARK_RUNTIME_DIR", f"{short}/runs")
+        yield Path(short) / "runs"
 
 
 @pytest.fixture
