@@ -110,7 +110,11 @@ def claim(
 
 
 def confirm_ownership(
-    session: zenoh.Session, alive: Sequence[str], pause: threading.Event, timing: OwnershipTiming = USUAL
+    session: zenoh.Session,
+    alive: Sequence[str],
+    pause: threading.Event,
+    timing: OwnershipTiming = USUAL,
+    note: Callable[[bool], object] = lambda _: None,  # called with each answer: whether there is another owner
 ) -> None:
     """Returns when it is certain that no other process has taken the names since they were owned.
 
@@ -130,16 +134,19 @@ def confirm_ownership(
         now = time.monotonic()
         if not linked or None in found or not network.connected(session):
             free = inf
+            note(False)
         elif others := [
             key
             for key, tokens in zip(alive, found, strict=True)
             if any(Keys.life_of(token) not in (None, mine) for token in tokens or ())
         ]:
             free, taken = inf, min(taken, now)
+            note(True)
             if now - taken > timing.vanish_s:
                 raise NameTaken(", ".join(others))
         else:
             free, taken = min(free, now), inf
+            note(False)
             if now - free > SETTLE_S:
                 return
         pause.wait(timing.retry_s)
@@ -154,6 +161,7 @@ class OwnershipCheck:
         self._alive, self._stood_s, self._timing = alive, 0.5 * lease_s, timing
         self.awake_at = uptime()  # last run of the process [s]
         self.linked = True  # whether the session had a router, or a neighbour in a mesh, at the last look
+        self.contested = False  # by the last answer of a check there is another owner, which may still give way
         self._taken = ""
         self._asking: threading.Thread | None = None
         self._anew = False
@@ -205,9 +213,12 @@ class OwnershipCheck:
     def end(self) -> None:
         self._over.set()
 
+    def _note(self, contested: bool) -> None:
+        self.contested = contested
+
     def _ask(self) -> None:
         try:
-            confirm_ownership(self._session, self._alive, self._over, self._timing)
+            confirm_ownership(self._session, self._alive, self._over, self._timing, self._note)
         except NameTaken as taken:
             self._taken = str(taken)
         except network.Unreachable:

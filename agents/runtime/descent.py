@@ -73,8 +73,8 @@ class Descent:
 
         While it waits it must not command its bodies, since another process may drive them. Without an answer those on
         wheels halt after `neighbour_timeout_s`. After `offline_s`, or `ANSWER_S` if the process is asked to end, all
-        land. The process then drives its bodies again, until it learns that they belong to another one. One that is cut
-        off again holds and lands by its decisions.
+        land. While the answer names another owner, neither happens. The process then drives its bodies again, until it
+        learns that they belong to another one. One that is cut off again holds and lands by its decisions.
         """
         ownership, session = self._keeper.ownership, self.session
         stood = ownership.check_standstill()
@@ -87,7 +87,7 @@ class Descent:
         limits, drives = self._limits, self._on_wheels
         began, self._keeper.hands_off = self._ticks.elapsed(), True
         while not self._keeper.is_owner() and (stood or network.connected(session)):
-            waited = self._ticks.elapsed() - began
+            waited = 0.0 if ownership.contested else self._ticks.elapsed() - began  # else the other owner drives them
             if waited > limits.offline_s or (waited > ANSWER_S and self.reason_to_end() is not None):
                 what = "stood still" if stood else "was cut off"
                 self._recover(f"it {what}, and for {waited:.0f} s no router answers about the owner of its name")

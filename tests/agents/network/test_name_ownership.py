@@ -14,6 +14,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from agents.body.limits import Safety
 from agents.network import messages, name_ownership, pubsub
 from agents.network import session as network
 from agents.network.keys import Keys
@@ -23,7 +24,7 @@ from tests.cases import for_each
 from tests.conftest import RouterProcess
 from tests.fuzz.messages import sent
 from tests.network import Attentive, Mute, Net, Reply, Sample
-from tests.small import pair
+from tests.small import pair, small
 from tests.waiting import ManualClock, until
 
 KEY = Keys().alive("CF01")
@@ -261,6 +262,9 @@ def test_displaced_owner_leaves_the_body_alone(way, monkeypatch):
 @pytest.mark.parametrize("taken", [True, False], ids=["taken", "free"])
 def test_link_that_is_back_waits_for_owner(taken, monkeypatch):
     body, keys = Commanded(), Keys()
+    # on wheels it would halt soon without an answer
+    wheels = small({"F": "khepera4"}, safety=Safety(neighbour_timeout_s=0.1))
+    experiment, timing = (wheels, OwnershipTiming(vanish_s=0.5)) if taken else (DRONE, OwnershipTiming())
     marks: list[tuple[int, int]] = []  # commands and puts so far: at the loss of the link, and at its return
     puts: list[bytes] = []
 
@@ -281,7 +285,7 @@ def test_link_that_is_back_waits_for_owner(taken, monkeypatch):
     monkeypatch.setattr(Mute, "put", lambda _, payload, **__: puts.append(payload))
     with Net().worn() as net:
         monkeypatch.setattr(network, "connected", linked)
-        runtime = process(DRONE, body, ownership=OwnershipTiming(vanish_s=0.0), descent=QUICK)
+        runtime = process(experiment, body, ownership=timing, descent=QUICK)
         with pytest.raises(NameTaken if taken else OSError, match="has taken" if taken else "commands again"):
             runtime.run()
     lost, back = marks

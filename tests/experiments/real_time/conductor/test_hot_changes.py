@@ -183,12 +183,16 @@ def test_whole_orders_that_are_refused(stage):
 
 
 def test_refused_change_leaves_the_one_under_way(stage, monkeypatch):
-    leaves = stage.end
-    monkeypatch.setattr(stage, "end", lambda _name: None)  # it takes a while to land
+    end, appear = stage.end, stage.appear
+    for slow in ("end", "appear"):  # it takes a while to land, and to be ready
+        monkeypatch.setattr(stage, slow, lambda *_: None)
     first = stage.ask("replace", "CF01")
     stage.go_on(1.0)
     assert "is being changed already" in stage.after(stage.ask("remove", "CF01")).refused["CF01"]
-    leaves("CF01")
+    end("CF01")
+    stage.go_on(2.0)
+    monkeypatch.setattr(stage, "appear", appear)
+    stage.appear("CF01")
     assert "takes part after" in stage.after(first, 5.0).done["CF01"]
 
 
