@@ -13,9 +13,10 @@ from agents.plugins import registry
 from agents.plugins.law import Control, Law
 from agents.plugins.laws import Gradient
 from agents.vectors import UNKNOWN, ZERO, norm
+from experiments.check import check as checks
 from experiments.check.analysis import Analysis
 from experiments.check.check import check, examine, figures
-from experiments.check.findings import CheckNumbers
+from experiments.check.findings import CheckNumbers, Finding
 from experiments.check.ideal_run import Prediction
 from experiments.check.safety import batteries, safety
 from experiments.definition.experiment import LegTable, RobotTable
@@ -393,3 +394,10 @@ def test_devices_of_robots_are_judged(tmp_path, monkeypatch):
     assert "go to the estimators of CF02, at most 20 a second" in found[2][1]
     assert "nowhere.yaml" in invoke("run", "real.toml", code=2).stderr  # and no process has started
     assert "nowhere.yaml" not in invoke("run", "real.toml", "--virtual", "--no-report").stderr
+
+
+def test_findings_name_some_of_many_cases(monkeypatch):
+    found = Finding("warning", "far", "it is far", "come nearer")
+    monkeypatch.setattr(checks, "SUBJECTS", (lambda number: [found] if number else [],))
+    shown = checks._findings(document.read("triangle"), {f"case{k}": k for k in range(12)})
+    assert shown[0].message == "in cases 'case1', 'case2', 'case3', 'case4', 'case5' and 6 more: it is far"
