@@ -17,6 +17,7 @@ import pytest
 
 from experiments.file import catalogue
 from experiments.real_time.hosts import authority
+from experiments.real_time.hosts.hosts import ANSWER_S, DRIFT_S
 from experiments.recording import playback
 from experiments.recording.topics import CHUNK_BYTES
 from tests.system.lab import NEAR_TRIANGLE, ROOT, TRIANGLE, options, typed, until
@@ -159,6 +160,20 @@ def test_machine_cut_off_lands_its_robots_only(lab, tmp_path):
         lab["lab3"].plug_in_again()
     assert re.search(r"Failed in event: CF01 at \d+\.\d s: was lost: its process ended", out), out
     assert "done (finished)" in desk.said("KH01")
+
+
+def test_station_that_stands_still_loses_no_figures(lab, tmp_path):
+    """As a small computer that swaps; it answers again before the end of the run."""
+    desk = AtDesk(lab, tmp_path, EACH)
+    flight = desk.run("--no-report", "duration_s=12")
+    desk.until_running(*TRIANGLE)
+    (station,) = [each for each in lab["lab2"].processes() if "station" in each.cmdline()]
+    station.suspend()
+    threading.Event().wait(ANSWER_S + DRIFT_S + 1.0)
+    station.resume()
+    out = desk.end(flight)
+    assert "note: lab2: its station says nothing for 5 s" in out
+    assert " Hz per robot" in out
 
 
 @pytest.mark.parametrize("keys", [False, True], ids=["open", "lab"])

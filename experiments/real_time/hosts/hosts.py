@@ -164,9 +164,8 @@ class Station:
         deadline = time.monotonic() + limit_s
         text = msgspec.json.encode(question) + b"\n"
         left = self._ours.utc()
-        with suppress(
-            BrokenPipeError, BlockingIOError
-        ):  # the output of ssh tells the reason; a full pipe: it is silent
+        # the output of ssh tells the reason; where the pipe is full, the station is silent
+        with suppress(BrokenPipeError, BlockingIOError):
             os.write(self._out.fileno(), text)
         while self._waiting.poll(max(0.0, deadline - time.monotonic()) * 1e3):
             data = os.read(self._in.fileno(), 65536)
