@@ -1,7 +1,7 @@
 """Live table of the robots of a run, cut to the terminal: for the run's own process and for `./zenpark top`.
 
 Rows that need attention come first; where rows do not fit, a line of totals stands for all of them. Columns drop from
-the right, names are never cut.
+the right, names are never cut. Notes that do not fit their column follow whole, in the place of events.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from itertools import accumulate
 from math import inf
+from textwrap import wrap
 from typing import TYPE_CHECKING, Final
 
 from agents.network.messages import Event, Status
@@ -217,7 +218,7 @@ def _cells(row: LiveRow) -> list[Text]:
 
 
 def drawn(title: str, rows: Sequence[LiveRow], events: Sequence[Event], width: int, height: int) -> Group:
-    """Table of robots, in the order of the experiment, with a title and, below it, as many last events as have room.
+    """Table of robots, in the order of the experiment, with a title, cut notes, and as many last events as have room.
 
     `width` [characters] and `height` [lines] are limits of all of it.
     """
@@ -243,10 +244,20 @@ def drawn(title: str, rows: Sequence[LiveRow], events: Sequence[Event], width: i
         )
     for line in cells:
         table.add_row(*line[: kept + noted])
+    space = width - ends[kept - 1] - GAP if noted else 0
+    spare = max(0, height - 2 - len(chosen))
+    whole = [
+        line
+        for row in chosen
+        if len(row.note) > space
+        for line in wrap(printable(f"{row.name}: {row.note}"), width, initial_indent="  ", subsequent_indent="    ")
+    ][:spare]
+    below = min(below, spare - len(whole))
     said = [printable(f"  {event.kind} {event.source}: {event.text}") for event in [*events][len(events) - below :]]
     return Group(
-        Text(printable(title)[:width], style="bold"), table, *(Text(each[:width], style="dim") for each in said)
-    )
+        Text(printable(title)[:width], style="bold"), table, *map(Text, whole),
+        *(Text(each[:width], style="dim") for each in said),
+    )  # fmt: skip
 
 
 def heading(what: str, elapsed: float | None, duration: float | None, name: str = "") -> str:

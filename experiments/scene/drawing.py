@@ -20,7 +20,8 @@ from twins.arrays import Array, Index, Mask
 if TYPE_CHECKING:
     import viser
 
-LABELS: Final = 24  # names of more robots are shown only where something is wrong, and of leaders
+LABELS: Final = 24  # names of more robots are shown only where something is wrong, and of leaders and the worst
+WORST: Final = 5  # of more robots than that, robots with the largest errors that are named
 LABEL_ROUNDS: Final = (2, 3)  # names of few robots, and of more, move at each second and third round
 GOAL_ROUNDS: Final = 3
 TURNS: Final = 3  # digits of quaternions: a tenth of a degree, so that noise does not redraw bodies at rest
@@ -31,17 +32,18 @@ SHADOWS: Final = 24  # shadows of more robots cost a browser without a graphics 
 
 @dataclass(frozen=True)
 class Look:
-    """Colours of what is no robot."""
+    """Colours of what is no robot, and of robots in a dark scene."""
 
     background: Colour
     grid: Colour
     section: Colour
     edge: Colour
     obstacle: Colour
+    darkest: int = 0  # least value of a colour of a body
 
 
 LIGHT: Final = Look((255, 255, 255), (226, 228, 232), (190, 193, 200), (90, 94, 102), (168, 172, 180))
-DARK: Final = Look((20, 20, 20), (52, 54, 60), (95, 100, 110), (150, 155, 165), (105, 110, 120))
+DARK: Final = Look((20, 20, 20), (52, 54, 60), (95, 100, 110), (150, 155, 165), (105, 110, 120), darkest=110)
 
 
 @dataclass
@@ -152,7 +154,7 @@ class SceneDrawing:
         stage = self.stage
         rows = np.array([row for row, kind in enumerate(stage.kinds) if kind.name == name], dtype=np.intp)
         model = models.model(stage.kinds[rows[0]])
-        colours, place = stage.colours[rows], chassis(stage)[rows]
+        colours, place = stage.colours[rows], np.maximum(chassis(stage)[rows], self._look.darkest)
         parts = [
             self._batch(f"robots/{name}/body", model.body, len(rows), place),
             self._batch(f"robots/{name}/accent", model.accent, len(rows), colours),
@@ -293,7 +295,9 @@ class SceneDrawing:
         wanted: Mask = np.isfinite(moment.position).all(axis=1) & np.asarray(self.shown.names)
         if not self._few:
             leading = np.isin(np.array(self.stage.names), self.stage.leaders)
+            worst = np.argsort(appearance.sums_of_errors(self.stage, moment.error))[-WORST:]
             notable = np.isin(moment.condition, appearance.RINGED) | leading
+            notable[worst] = True
             wanted &= notable & (np.cumsum(wanted & notable) <= LABELS)
         for row in [row for row in self._labels if not wanted[row]]:
             self._labels.pop(row).remove()

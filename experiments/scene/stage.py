@@ -362,10 +362,16 @@ class LinkTracker:
 
         NaN where none is known, as of a leader, which receives on none.
         """
-        rows, known = len(self._stage.names), np.isfinite(error)
-        ends = self._stage.links.receiver[known]
-        there = np.bincount(ends, minlength=rows) > 0
-        return np.where(there, np.bincount(ends, error[known], minlength=rows), np.nan)
+        known = np.isfinite(error)
+        there = np.bincount(self._stage.links.receiver[known], minlength=len(self._stage.names)) > 0
+        return np.where(there, sums_of_errors(self._stage, error), np.nan)
+
+
+def sums_of_errors(stage: SceneModel, error: Array) -> Array:
+    """Sum of the known errors of the links on which each robot receives (N,) [m]."""
+    known = np.isfinite(error)
+    sums: Array = np.bincount(stage.links.receiver[known], error[known], minlength=len(stage.names)).astype(float)
+    return sums
 
 
 class Trail:

@@ -57,6 +57,15 @@ def test_table_fits_the_terminal_with_whole_names(width, height, count):
         assert f"+{count - len(named)} more" in total[0]
 
 
+def test_reason_is_whole_at_eighty_columns():
+    reason = "its control loop hangs: no tick for 0.5 s, and it has landed by itself since then, as its watchdog says"
+    done = msgspec.structs.replace(STATUS, phase="done", reason=reason)
+    all_rows = [*rows(5), Trends().row("robot-05", done, now=10.1, error=0.0)]
+    text = " ".join(line.strip() for line in lines("t", all_rows, EVENTS, 80, 24))
+    assert f"robot-05: {reason}" in text
+    assert text.count("number") == 5
+
+
 def test_a_wide_table_has_all_columns_and_totals():
     text = lines("t", rows(100), [], 140, 20)
     assert all(head in text[1] for head in HEADS)
