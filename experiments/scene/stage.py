@@ -265,7 +265,13 @@ class SceneModel:
         return [each for each in found if not carried & {each.first, each.second}]
 
     def in_the_way(self, moment: Moment, name: str, goal: tuple[float, float]) -> tuple[list[str], list[str]]:
-        """Bodies that a robot would touch at a goal x, y [m], and on the straight way there, as all stand now."""
+        """Bodies that a robot would touch at a goal x, y [m], and on the straight way there, as all stand now.
+
+        None of a goal outside the arena, which the robot refuses.
+        """
+        low, high = self.scene.low[:2], self.scene.high[:2]
+        if not ((low <= goal) & (goal <= high)).all():
+            return [], []
         row, place = self.names.index(name), moment.position.copy()
         found: list[list[str]] = []
         begin = place[row, :2].copy()

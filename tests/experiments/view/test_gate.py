@@ -138,7 +138,11 @@ def test_late_orders_of_closed_pages_are_dropped(operator):
 
 @pytest.mark.parametrize(
     ("apart", "said", "count"),
-    [(0.1, "not ordered: it would touch KH02 there.", 0), (-0.6, "0 of 0 robots; KH02 is on the straight way", 1)],
+    [
+        (0.1, "not ordered: it would touch KH02 there.", 0),
+        (-0.6, "0 of 0 robots; KH02 is on the straight way", 1),
+        (-9.0, "0 of 0 robots", 1),
+    ],
 )
 def test_leader_is_not_sent_into_a_robot(apart, said, count, operator):
     acting, gate, given = operator
