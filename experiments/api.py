@@ -23,9 +23,8 @@ if TYPE_CHECKING:
     from agents.plugins.registry import PluginError
     from agents.plugins.triggers import Trigger
     from agents.vectors import Vector, clamp, distance, norm, wrap
-    from experiments.check import ideal_run
     from experiments.check.check import check, figures
-    from experiments.definition import graph, rigidity
+    from experiments.definition import formation, graph, rigidity
     from experiments.file.document import Document, load, loads
     from experiments.metrics import signals
     from experiments.metrics.metric import Metric
@@ -59,7 +58,7 @@ __all__ = [  # noqa: RUF022 - by subject, as in docs/python.md
     # orders to a run in real time
     "RunOrder", "Keys", "send_run_order",
     # modules of theory and of figures
-    "graph", "rigidity", "ideal_run", "signals", "pareto", "style",
+    "graph", "rigidity", "formation", "signals", "pareto", "style",
 ]  # fmt: skip
 
 

@@ -21,8 +21,8 @@ from zenpark import (
     check,
     figures,
     folder,
+    formation,
     graph,
-    ideal_run,
     loads,
     show,
     simulate,
@@ -248,7 +248,7 @@ assert np.all(np.abs(off) < 0.125)
 # %%
 HZ = 10.0  # decisions in a second
 BODY_HZ = 100.0  # steps of the position controller
-h = float(ideal_run.closed_shares([TELLO], HZ)[0])
+h = float(formation.closed_shares([TELLO], HZ)[0])
 
 
 def sampled_rate(taken: float) -> float:
@@ -326,7 +326,7 @@ show(rates(), OUT / "consensus-rates")
 
 # %%
 largest = float(spectrum["ring"][0][-1])
-h = 2.0 / float(ideal_run.bearable_factors([TELLO], HZ)[0])
+h = 2.0 / float(formation.bearable_factors([TELLO], HZ)[0])
 print(f"the limit of the ring: k = 2/(h λ_max) = {2.0 / (h * largest):.2f} per decision")
 LOOP = (0.4, 0.8, 1.1, 1.5, 1.8, 2.1, 2.5)  # h k λ_max
 left_over, said, steps = [], [], {}

@@ -22,7 +22,6 @@ from zenpark import (
     check,
     figures,
     folder,
-    ideal_run,
     load,
     loads,
     rigidity,
@@ -30,6 +29,9 @@ from zenpark import (
     simulate,
     style,
 )  # fmt: skip
+from zenpark import (
+    formation as loops,
+)
 
 OUT = folder("docs/tutorials/out")
 Mask = NDArray[np.bool_]
@@ -334,7 +336,7 @@ for rise in SLACK:
 
 assert eigenvalue == sorted(eigenvalue, reverse=True)
 HZ = 10.0  # decisions in a second
-h = float(ideal_run.closed_shares([KINDS["crazyflie"]], HZ)[0])
+h = float(loops.closed_shares([KINDS["crazyflie"]], HZ)[0])
 assert np.allclose(slowest[2:], 1.0 / (HZ * h * GAIN * np.array(eigenvalue[2:])), rtol=0.05)
 faster = 1.0 - np.array(constant) / np.array(slowest)
 assert np.all(faster > 0.0)

@@ -14,7 +14,7 @@ from agents.plugins.registry import did_you_mean
 from experiments.authoring import layouts
 from experiments.authoring.layouts import Layout, LayoutError
 from experiments.catalogue import index
-from experiments.check.ideal_run import bearable_factors
+from experiments.definition.formation import bearable_factors
 from experiments.file import catalogue as entries
 from experiments.file.problems import refusal
 from twins.arrays import Array, norm

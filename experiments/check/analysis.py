@@ -14,7 +14,7 @@ from agents.body.limits import Limits
 from agents.plugins.laws import Gradient
 from agents.plugins.planners import Planner
 from experiments.check.findings import FORGIVEN
-from experiments.check.ideal_run import Prediction, bearable_factors, closed_shares
+from experiments.check.ideal_run import Prediction
 from experiments.check.realisation import (
     Shape,
     Solids,
@@ -28,7 +28,7 @@ from experiments.check.realisation import (
 )
 from experiments.check.stability import Modes, modes
 from experiments.definition.experiment import LinkTable
-from experiments.definition.formation import anchor_errors, errors_over_time
+from experiments.definition.formation import anchor_errors, bearable_factors, closed_shares, errors_over_time
 from experiments.definition.graph import Links, components, edges
 from experiments.definition.links import held_height, link_pairs
 from experiments.definition.plan import Plan

@@ -10,13 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from typing import Final, NamedTuple
 
 import msgspec
 import numpy as np
 
-from agents.body.kinds import Flight, Kind
+from agents.body.kinds import Kind
 from agents.safety.hazards import HazardChange, Outcome
 from experiments.definition.experiment import WorldTable
 from experiments.definition.plan import Plan
@@ -29,8 +28,6 @@ ENDLESS_M: Final = 1e6  # [m] walls that no robot meets
 WORK: Final = 2.2e5  # robot ticks that are flown, of 10 to 20 µs each: 310 s of seven robots, 2 s of a thousand
 FLIGHTS: Final = 2  # of a check: without noise, and with it
 SPEED_UP: Final = 15.0  # factor of the work that compiled functions fly: 33 s of a thousand
-STEPS_HZ: Final = 100.0  # steps of a drone's model between two decisions
-ROUNDED: Final = 1e-9  # of eigenvalues
 REPETITIONS: Final = 5  # flights with noise, each with another seed
 
 
@@ -51,52 +48,6 @@ class Prediction:
     def end_s(self) -> float:
         """Time of the last position [s]."""
         return float(self.time[-1])
-
-
-def closed_shares(kinds: Sequence[Kind], hz: float) -> Array:
-    """h (N,): the share of a position error that each robot closes between two decisions."""
-    return 1.0 - np.exp(-np.array([kind.response for kind in kinds]) / hz)
-
-
-def bearable_factors(kinds: Sequence[Kind], hz: float) -> Array:
-    """λ (N,): the largest factor with which goals g = p − λ p, decided at `hz`, leave a robot's loop stable.
-
-    On wheels a robot closes its share h of the error, and is unstable from 2/h; a drone overshoots its goal, because
-    it must tilt first, and bears less.
-    """
-    factor = 2.0 / closed_shares(kinds, hz)
-    drones = {kind.name: kind.motion for kind in kinds if isinstance(kind.motion, Flight)}
-    for name, flight in drones.items():
-        factor[[kind.name == name for kind in kinds]] = _bearable_factor(flight, hz)
-    return factor
-
-
-def linear_step(response: Flight, axis: int, dt: float) -> Array:
-    """Step (4, 4) of a `Quadrotor` within its limits, of position [m], velocity [m/s], its change in a step, goal."""
-    tilt, gain = min(dt * response.tilt[axis], 1.0), dt * response.velocity[axis]
-    pull = tilt * gain * response.position[axis]
-    place, speed, _, goal = np.eye(4)
-    change = np.array([-pull, -tilt * gain, 1.0 - tilt, pull])
-    velocity = speed + change
-    return np.stack([place + dt * velocity, velocity, change, goal])
-
-
-@cache
-def _bearable_factor(response: Flight, hz: float) -> float:
-    steps = max(round(STEPS_HZ / hz), 1)
-    period = np.linalg.matrix_power(linear_step(response, 0, 1.0 / (hz * steps)), steps)
-
-    def stable(factor: float) -> bool:
-        loop = period[:3, :3] + np.outer(period[:3, 3], [1.0 - factor, 0.0, 0.0])
-        return bool(np.abs(np.linalg.eigvals(loop)).max() <= 1.0 + ROUNDED)
-
-    low, high = 0.0, 1.0
-    while stable(high):
-        low, high = high, 2.0 * high
-    while high - low > ROUNDED * high:
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if stable(middle) else (low, middle)
-    return low
 
 
 def has_noise(plan: Plan) -> bool:

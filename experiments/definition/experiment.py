@@ -188,7 +188,13 @@ class Formation(FileTable, frozen=True):
 
     law: Annotated[Choice, doc("a registered law")] = "distance"
     update: Annotated[Choice | None, doc("trigger of a recomputation of the law; left out: every decision")] = None
-    gain: Annotated[Positive, doc("μ of links with a distance as target [1/(m²·decision)] (paper, eq. (6))")] = 3.0
+    gain: Annotated[
+        Positive,
+        doc(
+            "μ of links with a distance as target [1/(m²·decision)] (paper, eq. (6)); left out: 3, less where "
+            "long links would make the loop ring"
+        ),
+    ] = 3.0
     stiffness: Annotated[
         Positive, doc("k of links with an offset or a bearing as their target, or of all for some laws [1/decision]")
     ] = 0.5

@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Final
 
 import numpy as np
 
+from agents.body.kinds import KINDS, Flight, Kind
 from agents.formation import anchors
 from agents.formation.changes import Change, Target, change_target, exists, planned_at
 from agents.formation.link import BY_DISTANCE, Link
@@ -22,6 +23,13 @@ from twins.arrays import Array, Mask, norm
 
 Anchored = Sequence[tuple[int, anchors.Anchor]]  # anchors, each with the row of its robot
 
+STEPS_HZ: Final = 100.0  # steps of a drone's model between two decisions
+ROUNDED: Final = 1e-9  # of eigenvalues
+CALM: Final = 1.15  # gain of the sampled loop, which rings from 1.2 on and is unstable from 2
+BRACED: Final = 1.4  # bound by lengths of links of a braced formation, as a multiple of the gain that directions leave
+TO_ORIGIN: Final = 2.0  # gain of an anchor, of that of a link: as the authors' controllers pull to the origin
+MOST_ROBOTS: Final = 300  # eigenvalues of more take longer than the run
+TINY: Final = 1e-9
 AT_ONCE: Final = 2_000_000  # distances of links that are held in memory at once
 
 
@@ -184,7 +192,7 @@ def errors_over_time(law: Law, pattern: Pattern, time: Array, position: Array) -
 def compile_anchors(experiment: Experiment) -> dict[str, tuple[anchors.Anchor, ...]]:
     """Anchors of each robot that has one."""
     formation = experiment.formation
-    to_origin = 2.0 * formation.gain  # twice that of a link: as the authors' controllers pull to the origin
+    to_origin = TO_ORIGIN * formation.gain
     found: dict[str, tuple[anchors.Anchor, ...]] = {}
     for name, given in formation.anchors.items():
         each = given if isinstance(given, AnchorTable) else AnchorTable(distance=given)
@@ -228,3 +236,76 @@ def _unit(direction: Sequence[float] | None) -> tuple[float, float, float]:
 
 def vectors(rows: Sequence[Sequence[float]]) -> Array:
     return np.array(rows, dtype=float).reshape(-1, 3)
+
+
+def closed_shares(kinds: Sequence[Kind], hz: float) -> Array:
+    """h (N,): the share of a position error that each robot closes between two decisions."""
+    return 1.0 - np.exp(-np.array([kind.response for kind in kinds]) / hz)
+
+
+def bearable_factors(kinds: Sequence[Kind], hz: float) -> Array:
+    """λ (N,): the largest factor with which goals g = p − λ p, decided at `hz`, leave a robot's loop stable.
+
+    On wheels a robot closes its share h of the error, and is unstable from 2/h; a drone overshoots its goal, because
+    it must tilt first, and bears less.
+    """
+    factor = 2.0 / closed_shares(kinds, hz)
+    drones = {kind.name: kind.motion for kind in kinds if isinstance(kind.motion, Flight)}
+    for name, flight in drones.items():
+        factor[[kind.name == name for kind in kinds]] = _bearable_factor(flight, hz)
+    return factor
+
+
+def linear_step(response: Flight, axis: int, dt: float) -> Array:
+    """Step (4, 4) of a `Quadrotor` within its limits, of position [m], velocity [m/s], its change in a step, goal."""
+    tilt, gain = min(dt * response.tilt[axis], 1.0), dt * response.velocity[axis]
+    pull = tilt * gain * response.position[axis]
+    place, speed, _, goal = np.eye(4)
+    change = np.array([-pull, -tilt * gain, 1.0 - tilt, pull])
+    velocity = speed + change
+    return np.stack([place + dt * velocity, velocity, change, goal])
+
+
+@cache
+def _bearable_factor(response: Flight, hz: float) -> float:
+    steps = max(round(STEPS_HZ / hz), 1)
+    period = np.linalg.matrix_power(linear_step(response, 0, 1.0 / (hz * steps)), steps)
+
+    def stable(factor: float) -> bool:
+        loop = period[:3, :3] + np.outer(period[:3, 3], [1.0 - factor, 0.0, 0.0])
+        return bool(np.abs(np.linalg.eigvals(loop)).max() <= 1.0 + ROUNDED)
+
+    low, high = 0.0, 1.0
+    while stable(high):
+        low, high = high, 2.0 * high
+    while high - low > ROUNDED * high:
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if stable(middle) else (low, middle)
+    return low
+
+
+def calm_gain(experiment: Experiment) -> float:
+    """Gain μ for a file that gives none: the default, or less where long links would make the loop ring.
+
+    The loop takes H M from an error with M at most the Laplacian of the links, each with the weight μ d² of its length
+    from above. Its largest eigenvalue is brought down to `CALM`; in a braced formation links pull in many directions.
+    """
+    formation, row = experiment.formation, {name: k for k, name in enumerate(experiment.robots)}
+    weight = np.zeros((len(row), len(row)))
+    for text, given in formation.link_tables.items():
+        if given.distance is not None and given.gain is None:
+            for receiver, sender in link_pairs(text):
+                rise = held_height(experiment, receiver) - held_height(experiment, sender)
+                weight[row[receiver], row[sender]] = max(given.distance**2 - rise**2, 0.0)
+    alone = np.zeros(len(row))
+    for name, each in formation.anchors.items():
+        given_gain = each.gain if isinstance(each, AnchorTable) else None
+        length = each.distance if isinstance(each, AnchorTable) else each
+        alone[row[name]] = 0.0 if given_gain else TO_ORIGIN * length**2
+    kinds = [KINDS[robot.kind] for robot in experiment.robots.values()]
+    share = 2.0 / bearable_factors(kinds, experiment.rates.coordination_hz)
+    taken = share[:, None] * (np.diag(weight.sum(axis=1) + alone) - weight)
+    calm = CALM * (BRACED if int((weight + weight.T > 0.0).sum()) >= 2 * len(row) else 1.0)
+    if len(row) > MOST_ROBOTS or not np.isfinite(taken).all():  # rows, without eigenvalues: at most twice as much
+        return min(formation.gain, calm / max(2.0 * float(np.nan_to_num(np.diag(taken)).max()), TINY))
+    return min(formation.gain, calm / max(float(np.linalg.eigvals(taken).real.max(initial=0.0)), TINY))

@@ -38,7 +38,7 @@ def fill_from_shape(document: dict[str, Any]) -> list[Fault]:
         if given == SHAPE or (shape is not None and isinstance(given, dict) and not {*TARGETS} & given.keys())
     ]
     links.update({text: {} for text, given in links.items() if given == ALONE})
-    law = _law(formation.get("law", Formation().law))
+    law = law_of(formation.get("law", Formation().law))
     word = TARGET_KINDS["any" if law is None else law.NEEDS].fields[0]
     for text in bare:
         target = _target_in(shape, robots, text, word, ("formation", "links", text))
@@ -96,11 +96,11 @@ def fill_from_files(document: dict[str, Any], folder: pathlib.Path) -> list[Faul
 
 def law_files(choice: object) -> Mapping[str, str]:
     """Parameters of a law that name files, and those that get their content; none of a law that cannot be used."""
-    law = _law(choice)
+    law = law_of(choice)
     return {} if law is None else law.FILES
 
 
-def _law(choice: object) -> type[Law] | None:
+def law_of(choice: object) -> type[Law] | None:
     """The law of a choice; None if it cannot be used, which is said with its place where the law is read."""
     name = choice.get("kind") if isinstance(choice, Mapping) else choice
     try:

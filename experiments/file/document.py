@@ -19,11 +19,12 @@ from agents.plugins.calls import supervised
 from agents.plugins.registry import did_you_mean
 from experiments.catalogue import index
 from experiments.definition.experiment import Experiment
+from experiments.definition.formation import calm_gain
 from experiments.definition.plan import Plan
 from experiments.file import catalogue, structure
 from experiments.file.cases import Source, each_once, resolve
 from experiments.file.choices import Adopted, tables
-from experiments.file.completion import fill_from_files, fill_from_shape, law_files
+from experiments.file.completion import fill_from_files, fill_from_shape, law_files, law_of
 from experiments.file.consistency.robots import device_faults
 from experiments.file.consistency.whole import consistency_faults, criteria_faults
 from experiments.file.overrides import parse_all
@@ -147,8 +148,19 @@ def _document(file: Path, label: str, text: str, flags: Sequence[str], *, receiv
         source.refuse([*criteria, *each_once(found, tables)])
     except RecursionError:
         raise refusal(label, "tables or lists are nested too deeply", "flatten them") from None
+    plans = {name: _calmed(plan, documents[name]) for name, plan in plans.items()}
     cases = {name: plan for name, plan in plans.items() if name is not None} or {UNNAMED: plans[None]}
     return Document(file, source, plans[None], cases, adopted.plugins)
+
+
+def _calmed(plan: Plan, document: Mapping[str, Any]) -> Plan:
+    """The plan with a calm gain, if the document gives none and its law pulls by it."""
+    formation = plan.experiment.formation
+    law = law_of(formation.law)
+    if "gain" in document.get("formation", {}) or law is None or law.PULLS_BY == "stiffness":
+        return plan
+    gain = calm_gain(plan.experiment)
+    return plan if gain == formation.gain else plan.changed(formation=msgspec.structs.replace(formation, gain=gain))
 
 
 def join_texts(texts: Sequence[str]) -> str:

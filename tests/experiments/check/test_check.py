@@ -131,7 +131,7 @@ def test_remedy_for_a_users_law_names_the_law(monkeypatch, law, code, message, r
         ("disturbance={}", ("warning", "not-random"), "runs of other seeds are the same", "position_sigma"),
         ("timeline.0.plan.speed=0.21", ("warning", "leader-near-limit"), "of the 0.22 m/s", "0.2 m/s"),
         ("timeline.0.plan.speed=0.02", ("warning", "leg-cut"), "lasts 37.5 s", "59"),
-        ("robots.KH01.start=[-0.98,-0.8]", ("warning", "start-margin"), "0.02 m from a wall", "margin"),
+        ("robots.KH01.start=[-0.98,-0.8]", ("warning", "start-margin"), "starts in a wall", "margin"),
         ("robots.CF01.start=[-0.6,0.75]", ("error", "start-overlap"), "TB01 and CF01 start 0.05 m", "floor"),
         ("cases.periodic.trigger.period_s=0.005", ("warning", "trigger-too-fast"), "in case 'periodic'", "to 200"),
         ("cases.periodic.trigger.period_s=0.03", ("warning", "trigger-uneven"), "every 0.04 s", "multiple of 0.02"),
@@ -155,6 +155,26 @@ def test_numbers_just_within_limits_are_sound():
 
 
 SQUARE = {"A - B": 1.0, "B - D": 1.0, "D - C": 1.0, "A - C": 1.0, "A - D": 1.4, "B - C": 1.1}
+
+
+@pytest.mark.usefixtures("unflown")
+@pytest.mark.parametrize(
+    "formation",
+    [
+        "anchors = { A = 0.7 }\n[formation.links]\n'A - B' = 0.3",
+        "links = { 'A - B' = 2.0, 'B - C' = 2.0, 'A - C' = 2.8 }",
+        "links = { 'A > B' = 0.6, 'B > C' = 1.5 }",
+    ],
+)
+def test_gain_that_is_left_out_is_calm(tmp_path, formation):
+    drones = "".join(
+        f"{name} = {{ kind = 'crazyflie', start = [{k}, 0.1], hover = 0.8 }}\n" for k, name in enumerate("ABC")
+    )
+    (tmp_path / "x.toml").write_text(f"title = 'x'\nduration_s = 5\n[robots]\n{drones}[formation]\n{formation}\n")
+    made = document.read(tmp_path / "x.toml")
+    assert figures(next(iter(made.cases().values()))).loop_gain < 1.65  # stable below 2
+    assert made.experiment.formation.gain <= 3.0
+    assert document.read(tmp_path / "x.toml", ["formation.gain=3.0"]).experiment.formation.gain == 3.0
 
 
 @pytest.mark.usefixtures("unflown")

@@ -7,10 +7,11 @@ from agents.body.interface import Disturbance, Jitter
 from agents.kinds.crazyflie import CRAZYFLIE
 from experiments.check.analysis import Analysis
 from experiments.check.check import figures
-from experiments.check.ideal_run import Prediction, isolated, linear_step, predict, repetitions
+from experiments.check.ideal_run import Prediction, isolated, predict, repetitions
 from experiments.check.motion import flight
 from experiments.check.theory import unknown_robots, unused_gains
 from experiments.definition.experiment import Arena, Experiment, Formation, LegTable, LinkTable, RobotTable
+from experiments.definition.formation import linear_step
 from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.virtual_time import conductor, simulation, stretch
