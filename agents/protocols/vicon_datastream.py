@@ -8,6 +8,7 @@ sent once and is then valid until it is sent again.
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Iterable, Iterator
 from enum import IntEnum
@@ -20,6 +21,16 @@ NO_PARENT: Final = 0xFFFFFFFF  # of a root segment
 CLOCK_HZ: Final = 135_000_000  # unit of the frame period
 MM: Final = 1000.0  # millimetres in a metre
 Z_UP: Final = 0
+
+
+def parse_server(server: str) -> tuple[str, int]:
+    """Host and port of "HOST" or "HOST:PORT"; raises ValueError if it is neither."""
+    host, colon, port = server.partition(":")
+    if not re.fullmatch(r"[\w.-]+", host) or (
+        colon and not (port.isascii() and port.isdigit() and 0 < int(port) < 65536)
+    ):
+        raise ValueError(f"'{server}' is neither HOST nor HOST:PORT, such as 192.168.0.10:801")
+    return host, int(port) if colon else PORT
 
 
 class BlockKind(IntEnum):

@@ -22,7 +22,7 @@ from agents.network import session as network
 from agents.network.keys import Keys
 from agents.network.shutdown import Farewell, closing_cleanly, end
 from agents.protocols import vicon_datastream
-from agents.protocols.vicon_datastream import MalformedBlock, Segment
+from agents.protocols.vicon_datastream import MalformedBlock, Segment, parse_server
 from agents.runtime import command_line
 from agents.runtime.command_line import NetworkLaunch, on_termination
 from agents.runtime.lifeline import Lifeline
@@ -261,14 +261,6 @@ def serve(launch: ViconLaunch) -> int:
         f"this network (ping {host}), and does its firewall let TCP port {port} in?"
     )
     return 2
-
-
-def parse_server(server: str) -> tuple[str, int]:
-    """Host and port of "HOST" or "HOST:PORT"; raises ValueError if it is neither."""
-    host, colon, port = server.partition(":")
-    if not host or (colon and not (port.isascii() and port.isdigit() and 0 < int(port) < 65536)):
-        raise ValueError(f"'{server}' is neither HOST nor HOST:PORT, such as 192.168.0.10:801")
-    return host, int(port) if colon else vicon_datastream.PORT
 
 
 def parse_maps(maps: Sequence[str]) -> dict[str, str]:

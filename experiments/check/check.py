@@ -56,6 +56,7 @@ SUBJECTS: Final = (
     motion.flight, motion.starts, motion.formation, motion.anchors, noise.softness, motion.walls, motion.ceiling,
     motion.encounters, motion.speeds, motion.turning_circle, motion.rates, motion.ends,
     safety.architecture, safety.safety, safety.batteries, safety.libraries, safety.devices,
+    safety.turned,
     chance, compilation,
 )  # fmt: skip
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from math import degrees
 from typing import Final
 
 import numpy as np
@@ -108,6 +109,17 @@ def devices(analysis: Analysis) -> Iterator[Finding]:
         if fault.severity != "error" or fault.here:
             path = ("robots", fault.robot, *fault.key)
             yield Finding(fault.severity, DEVICE, f"{fault.robot}: {fault.message}", fault.remedy, path)
+
+
+def turned(analysis: Analysis) -> Iterator[Finding]:
+    """Say which flying robots begin turned: the third number of `start` is no height."""
+    experiment = analysis.plan.experiment
+    yaws = {name: robot.start[2] for name, robot in experiment.robots.items() if len(robot.start) == 3}
+    flying = {name: yaw for name, yaw in yaws.items() if yaw and KINDS[experiment.robots[name].kind].flies}
+    if flying:
+        words = join_names([f"{name} by {degrees(yaw):.0f}°" for name, yaw in flying.items()])
+        message = f"drones that begin turned to the left: {words}; the third number of `start` is the yaw [rad]"
+        yield Finding("note", "turned", message, "", ("robots", next(iter(flying)), "start"))
 
 
 def architecture(analysis: Analysis) -> Iterator[Finding]:

@@ -18,6 +18,7 @@ from agents.vectors import NotNegative, Positive, Share
 from twins.scene import Obstacle, Planar
 
 WORLD: Final = "world"  # the body of a robot that lives in the twin service
+VICON: Final = "vicon://"  # before the host of a Vicon, in `positioning`
 VICON_TWIN: Final = "vicon-twin"  # motion capture that is simulated as well
 TARGETS: Final = ("distance", "offset", "bearing")  # fields of the target of a link, of which it has one
 NO_TARGET: Final = "nothing"  # in place of a field: a link alone
@@ -29,7 +30,8 @@ def doc(description: str, **limits: Any) -> Meta:  # noqa: ANN401 - as Meta take
 
 
 Rate = Annotated[float, Meta(gt=0, le=2000)]
-Name = Annotated[str, Meta(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
+LONGEST_NAME: Final = 32  # letters: names are parts of files, keys and columns
+Name = Annotated[str, Meta(pattern=r"^[A-Za-z][A-Za-z0-9_]*$", max_length=LONGEST_NAME)]
 Vector = Annotated[list[float], Meta(min_length=2, max_length=3)]
 Spatial = tuple[Positive, Positive, Positive]
 Choice = str | dict[str, Any]  # a plug-in by name, or a table with its `kind` and its parameters

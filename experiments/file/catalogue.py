@@ -74,4 +74,6 @@ def _arena_beside(text: str, folder: Path) -> ArenaFile | None:
 def no_entry(name: str) -> DocumentError:
     """Error of a name that is neither a file nor an entry."""
     hint = f"{did_you_mean(name, index.names())} (./zenpark new copies one)"
+    if name == "-":
+        hint = "/dev/stdin is the standard input"
     return refusal(name, "neither a file nor an experiment of the catalogue", hint)

@@ -10,6 +10,7 @@ import re
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from datetime import date, time
 from functools import cached_property
 from typing import Final
 
@@ -251,6 +252,8 @@ def key_name(path: Path) -> str:
 
 def shown(value: object) -> str:
     """A value of the document, short enough for one line."""
+    if isinstance(value, date | time):  # of TOML
+        return value.isoformat()
     words = {True: "true", False: "false", None: "null"}
     text = words[value] if value is None or isinstance(value, bool) else repr(value)
     return text if len(text) <= 40 else f"{text[:37]}..."

@@ -8,14 +8,15 @@ from __future__ import annotations
 
 import re
 import types
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from math import radians
 from typing import Annotated, Any, Final, Literal, Union, get_args, get_origin
 
 import msgspec
 
 from agents.plugins import files, registry
 from agents.plugins.registry import did_you_mean
-from experiments.definition.experiment import Experiment
+from experiments.definition.experiment import LONGEST_NAME, Experiment
 from experiments.file.choices import fields_of, group_of, parameters, struct_of
 from experiments.file.problems import DocumentError, Fault, Path, Problem, key_name, refusal, shown
 
@@ -32,6 +33,11 @@ _WORDS: Final = {
     "float": "a number", "int": "a whole number", "str": "text", "bool": "true or false", "array": "a list",
     "object": "a table",
 }  # fmt: skip
+_QUANTITY: Final = re.compile(r"\s*([-+]?\d+(?:[.,]\d*)?)\s*([a-zA-Z°/]*)\s*")  # number and unit
+_UNITS: Final = {
+    **dict.fromkeys(("", "s", "m", "hz", "rad", "m/s"), 1.0),
+    **{"ms": 1e-3, "mm": 1e-3, "cm": 1e-2, "min": 60.0, "deg": radians(1.0), "°": radians(1.0)},
+}  # as SI
 _UNIONS: Final = (Union, types.UnionType)
 LINK: Final = 'write "{name}" = 0.5, in metres; or "{name}" = {{ offset = [0.5, 0.0] }}, or "{name}" = "shape"'
 _FIELDS: Final = frozenset(Experiment.__struct_fields__)
@@ -40,8 +46,24 @@ _FIELDS: Final = frozenset(Experiment.__struct_fields__)
 def faults(document: Mapping[str, Any], struct: type[msgspec.Struct] = Experiment) -> list[Fault]:
     """All faults of type, range and key; empty if `msgspec.convert` takes the document."""
     found = _table(document, struct, ())
+    found = [*_strangers(document, found)]
     strayed = {f"'{fault.path[-1]}' is missing" for fault in found if "belongs at the top" in fault.hint}
     return [fault for fault in found if fault.path or fault.message not in strayed]
+
+
+def _strangers(document: Mapping[str, Any], found: Sequence[Fault]) -> Iterator[Fault]:
+    """Faults, of which those that a robot lacks kind and start are one: it was to be another robot."""
+    for fault in found:
+        path, robots = fault.path, document.get("robots")
+        table = robots.get(path[1]) if path[:1] == ("robots",) and len(path) == 2 and isinstance(robots, dict) else None
+        if not isinstance(table, dict) or {"kind", "start"} & table.keys() or len(robots) < 2:  # type: ignore[arg-type]
+            yield fault
+        elif fault.message.startswith("'kind' is missing"):
+            others = [name for name in robots if name != path[1]]  # type: ignore[union-attr]
+            hint = f"{did_you_mean(str(path[1]), others)}; to add a robot give it kind and start"
+            yield Fault(path, f"no robot is called '{path[1]}'", hint, on_key=True)
+        elif not fault.message.startswith("'start' is missing"):
+            yield fault
 
 
 def table_faults(table: Mapping[str, Any], struct: type[msgspec.Struct], path: Path) -> list[Fault]:
@@ -208,6 +230,8 @@ def _in_words(text: str, value: object, annotation: object, path: Path, note: st
     if path[-2:-1] == ("shape",) and isinstance(value, list):
         message = f"'{name}' must be numbers, x, y (, z) [m], not {shown(value)}"
         return Fault(path, message, f"write {name} = [0.5, 0.0]")
+    if isinstance(value, str) and {_WORDS["float"], _WORDS["int"], _WORDS["array"]} & {*wanted}:
+        note = _number_meant(value, name) or note
     for table in tables[:1] if not isinstance(value, dict) else []:
         fields = msgspec.structs.fields(table)
         needed = [field.encode_name for field in fields if field.required] or [fields[0].encode_name]
@@ -216,7 +240,22 @@ def _in_words(text: str, value: object, annotation: object, path: Path, note: st
     return Fault(path, f"'{name}' must be {' or '.join(wanted)}{limit}", note)
 
 
+def _number_meant(text: str, name: str) -> str:
+    """Remedy for a text that holds a number with a unit or a comma, or a list of numpy's numbers; empty for others."""
+    if "np.float64(" in text:
+        return "numbers of numpy 2 print so; use float(...) of each before"
+    match = _QUANTITY.fullmatch(text)
+    factor = _UNITS.get(match[2].lower()) if match else None
+    if match is None or factor is None:
+        return ""
+    number = f"{float(match[1].replace(',', '.')) * factor:g}"
+    return f"write {name} = {number if '.' in number or 'e' in number else number + '.0'}, without unit and quotes"
+
+
 def _key(key: str, annotation: object, path: Path) -> list[Fault]:
+    if len(key) > LONGEST_NAME and path[0] in ("robots", "spares", "cases", "hosts"):
+        message = f"a name of {len(key)} letters is too long"
+        return [Fault(path, message, f"use at most {LONGEST_NAME}", on_key=True)]
     if _judged(key, annotation, path, "") or "\n" in key:  # `$` of a pattern lets a last line end pass
         what = "letters, digits and _ . -" if path[0] == "cases" else "letters, digits and _, beginning with a letter"
         return [Fault(path, f"{shown(key)} cannot be a name", f"use {what}", on_key=True)]

@@ -19,6 +19,7 @@ MAX_TEXT_BYTES: Final = 4_000_000  # bytes; a hundred robots take ten thousand
 BEGIN: Final = "./zenpark new copies an experiment to begin with"
 # key of many parts, for 20,000 of which `tomllib` takes seconds and gigabytes; numbers in lists are none
 _ENDLESS: Final = re.compile(r"""(?<![\w"'.-])(?:["']?[\w-]++["']?[ \t]*+\.[ \t]*+){50}""")
+_INLINE: Final = "an inline table stands on one line and ends without a comma; or write [table] and its keys below"
 _AT: Final = re.compile(r" \(at (?:line (\d+), column (\d+)|end of document)\)$")
 _REMEDIES: Final = (
     ("Invalid value", 'text stands in quotes, as in kind = "crazyflie"; numbers have a point, not a comma'),
@@ -30,6 +31,7 @@ _REMEDIES: Final = (
     ("Expected newline", "one key = value in a line; text stands in quotes, a comment begins with #"),
     ("Expected ']", "a header is [table], or [[timeline]] with two brackets; names are letters, digits and _"),
     ("Invalid initial character", "a key is letters, digits, _ and -, or stands in quotes"),
+    ("Invalid statement", "an experiment file is TOML: a line is key = value, [table] or # comment"),
     ("Unescaped '\\'", "write a backslash twice, or use single quotes"),
 )
 
@@ -65,6 +67,8 @@ def reason(error: OSError | ValueError) -> str:
 
 def decoded(content: bytes, label: str) -> str:
     """Text, with plain line ends; raises DocumentError if it is binary, empty or not UTF-8."""
+    if content.startswith((b"\xff\xfe", b"\xfe\xff")):
+        raise refusal(label, "is text in UTF-16, as PowerShell's > writes it", "save it as UTF-8")
     if b"\0" in content:
         raise refusal(label, "is binary, no text", "name an experiment file (.toml or .json)")
     try:
@@ -136,8 +140,17 @@ def _toml_problem(text: str, label: str, message: str) -> Problem:
         message = f"{word} stands here a second time{f', first in line {first}' if first else ''}"
         column = len(source) - len(source.lstrip()) + 1
         return Problem(label, line, column, message, "rename or remove one of the two", source)
+    if message.startswith("Invalid initial character for a key part") and _in_inline_table(lines, line, column):
+        return Problem(label, line, column, "an inline table goes on here, or ends with a comma", _INLINE, source)
     hint = next((remedy for beginning, remedy in _REMEDIES if message.startswith(beginning)), "")
     return Problem(label, line, column, message, hint, source)
+
+
+def _in_inline_table(lines: list[str], line: int, column: int) -> bool:
+    """Whether a brace is open before a place, of those on its line and on the lines of the value above."""
+    before = "\n".join([*lines[: line - 1], lines[line - 1][: column - 1]])
+    plain = re.sub(r'"(?:[^"\\\n]|\\.)*"|\'[^\'\n]*\'|#[^\n]*', "", before)
+    return plain.count("{") > plain.count("}")
 
 
 def _repeated_key(lines: list[str], line: int) -> tuple[str, int | None]:

@@ -52,6 +52,10 @@ class Metric(msgspec.Struct, frozen=True):
     figure: ClassVar[bool] = False  # a bar; with `relative` and `shown` a Pareto front as well
     needs: ClassVar[tuple[str, ...]] = ("true_position",)  # fields of the trace: a sweep keeps these
 
+    def applies(self, trace: Trace) -> bool:
+        """Whether it has a meaning for a run; where it has none it is no column, unless a file asks for it."""
+        return True
+
     def of(self, trace: Trace, shared: Measurement) -> Array | Index | float:
         """Values of all robots (N,), or of the case (); NaN where unknown. A pure function: it changes no array."""
         raise NotImplementedError
@@ -176,8 +180,22 @@ def swept_metrics() -> dict[str, Metric]:
 
 
 def foreign_metrics(cases: Iterable[CaseMetrics] = ()) -> dict[str, Metric]:
-    """Metrics of other distributions, and those in files that criteria of the cases name."""
-    return installed_metrics()[0] | metrics_of_criteria([each for case in cases for each in case.criteria])[0]
+    """Metrics of other distributions, and those in files that criteria of the cases name.
+
+    Of `cases` only those that a criterion names or a case has: others do not apply to them.
+    """
+    measured, installed = list(cases), installed_metrics()[0]
+    criteria = [each for case in measured for each in case.criteria]
+    if measured:
+        named = {each.metric for each in criteria}
+        held = {name for case in measured for name in installed if _has_value(case, name)}
+        installed = {name: metric for name, metric in installed.items() if name in named | held}
+    return installed | metrics_of_criteria(criteria)[0]
+
+
+def _has_value(case: CaseMetrics, name: str) -> bool:
+    values = (case.mean.get(name), *(robot.extra.get(name) for robot in case.robots))
+    return any(value is not None for value in values)
 
 
 def console_metrics() -> dict[str, Metric]:
@@ -280,6 +298,9 @@ def values_of(
             count = len(trace.robots)
             wanted = f"{count} numbers, one for each robot"
         try:
+            if name not in OURS and not metric.applies(shown):
+                found[name] = [None] * count
+                continue
             with np.errstate(all="ignore"):
                 values = np.asarray(metric.of(trace if name in OURS else shown, shared))
             if values.shape != ((count,) if metric.per == "robot" else ()) or values.dtype.kind not in "iuf":

@@ -27,7 +27,7 @@ def ratios(runs: Sequence[CaseMetrics], reference: Sequence[CaseMetrics], index:
     data than others. Such a run of the reference is left out.
     """
     every = [*runs, *reference]
-    metric = known_metrics(every[:1]).get(index)
+    metric = known_metrics(every).get(index)
     sums = metric is not None and metric.sums
     longest, most = max(run.duration_s for run in every), max(coverage(run) for run in every)
 

@@ -123,6 +123,8 @@ def seeds_of(argument: str | None, first: int, count: int = SEEDS) -> tuple[int,
     if found is None:
         raise refusal(argument, f"'{text}' names no seeds", f"write {word}=50, or {word}=101:150")
     begin, end = (first, first + int(found[1]) - 1) if found[2] is None else (int(found[1]), int(found[2]))
+    if end < begin:
+        raise refusal(argument, f"{text} goes down", f"write {word}={end}:{begin}")
     if not 0 < end - begin + 1 <= MOST_SEEDS:
         raise refusal(argument, f"these are {max(0, end - begin + 1)} seeds", f"give 1 to {MOST_SEEDS} of them")
     if end >= 2**32:

@@ -53,9 +53,10 @@ COMMANDS = (
     ("run triangle.toml --vitual", "No such option: --vitual", "--virtual"),
     ("run", "Missing argument 'FILE'", "`./zenpark run --help`"),
     ("rum", "No such command 'rum'", "Did you mean 'run'?"),
+    ("check -", "-: neither a file nor", "/dev/stdin is the standard input"),
     ("check full", "full: is a folder", "name a file in it: triangle.toml"),
     ("check empty.toml", "empty.toml: is empty", "./zenpark new copies an experiment"),
-    ("check utf16.toml", "utf16.toml: is binary, no text", "name an experiment file"),
+    ("check utf16.toml", "utf16.toml: is text in UTF-16", "save it as UTF-8"),
     ("check triangle.toml --plot x.doc", "--plot: x.doc", "must end in .svg, .pdf or .png"),
     ("check page.html", "page.html: is a page, no experiment", "such as experiment.toml"),
     ("explain disturbance.hover", "'disturbance.hover'", "did you mean 'disturbance.hover_jitter'?"),
@@ -87,7 +88,7 @@ COMMANDS = (
     ("keys --connect tcp/127.0.0.1:9", "no router answers at tcp/127.0.0.1:9", "--connect names another"),
     ("echo park//x", "'park//x' is not a key expression", "Write it like park/*/pose"),
     ("keys --connect @nope", "nope: cannot be read", "network.txt"),
-    ("sweep triangle.toml seeds=5:1", "these are 0 seeds", "give 1 to"),
+    ("sweep triangle.toml seeds=5:1", "seeds=5:1: 5:1 goes down", "write seeds=1:5"),
 )
 
 

@@ -10,8 +10,9 @@ from agents.body.interface import BodyError
 from agents.body.kinds import KINDS, Kind
 from agents.plugins import files, registry
 from agents.plugins.registry import did_you_mean
+from agents.protocols.vicon_datastream import parse_server
 from experiments.definition.bodies import body_faults, device_struct, driven_kind
-from experiments.definition.experiment import MEAN, WORLD, WORST, Experiment, RobotTable
+from experiments.definition.experiment import MEAN, VICON, VICON_TWIN, WORLD, WORST, Experiment, RobotTable
 from experiments.file.problems import Fault
 from experiments.file.structure import table_faults
 from twins.engines.engine import EngineFactory, require_carried
@@ -55,6 +56,21 @@ def device_faults(experiment: Experiment) -> Iterator[Fault]:
         if fault.severity == "error" and not fault.here:
             table = "robots" if fault.robot in experiment.robots else "spares"
             yield Fault((table, fault.robot, *fault.key), fault.message, fault.remedy)
+
+
+def positioning_faults(experiment: Experiment) -> Iterator[Fault]:
+    """Fault of a source of positions that there is not."""
+    given, known = experiment.positioning, f"known: {VICON}HOST, {VICON_TWIN}"
+    if given is None or given == VICON_TWIN:
+        return
+    if not given.startswith(VICON):
+        hint = f"{known}; another source publishes the key `position` itself, without `positioning`"
+        yield Fault(("positioning",), f"no {given!r} among the sources of positions", hint)
+        return
+    try:
+        parse_server(given.removeprefix(VICON))
+    except ValueError as error:
+        yield Fault(("positioning",), str(error), known)
 
 
 def _standby(experiment: Experiment) -> Iterator[Fault]:

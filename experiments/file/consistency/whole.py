@@ -14,7 +14,7 @@ from experiments.file.choices import struct_of
 from experiments.file.consistency import network
 from experiments.file.consistency.arena import arena_faults
 from experiments.file.consistency.formation import formation_faults
-from experiments.file.consistency.robots import robot_faults
+from experiments.file.consistency.robots import positioning_faults, robot_faults
 from experiments.file.problems import Fault, after_the_end, unknown_robot
 
 
@@ -27,6 +27,7 @@ def consistency_faults(plan: Plan) -> Iterator[Fault]:
     yield from _timeline(experiment)
     yield from _choices(plan)
     yield from robot_faults(experiment, plan.engine)
+    yield from positioning_faults(experiment)
     yield from arena_faults(experiment.arena, experiment.robots)
     yield from formation_faults(plan)
     yield from network.channel_faults(plan)

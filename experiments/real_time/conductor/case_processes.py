@@ -17,7 +17,7 @@ import msgspec
 from agents.plugins import registry
 from experiments.definition import bodies, standby
 from experiments.definition.access_rights import has_world
-from experiments.definition.experiment import VICON_TWIN, RobotTable
+from experiments.definition.experiment import VICON, VICON_TWIN, RobotTable
 from experiments.definition.plan import Plan
 from experiments.file.document import case_document, write_json
 from experiments.real_time.conductor.orders import Emergency
@@ -28,7 +28,6 @@ from experiments.recording.reader import PARTS, RecordingError, recover
 ALONE_S: Final = 3.0  # limit for a robot that joins a run under way to wait for silent neighbours
 LEAST_SIGMA: Final = 1e-5  # [m] noise of simulated motion capture: what repeats itself to the last bit is not believed
 STARTS: Final = 4  # a process that dies more often is not helped by another start
-VICON: Final = "vicon://"
 HOLD: Final = ": robots hold meanwhile"
 
 

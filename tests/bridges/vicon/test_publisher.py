@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 from agents.network import messages, pubsub
 from agents.network import session as network
 from agents.protocols import vicon_datastream
-from agents.protocols.vicon_datastream import Segment
+from agents.protocols.vicon_datastream import Segment, parse_server
 from bridges.vicon.client import Frame
-from bridges.vicon.publisher import Bridge, FrameQueue, PoseFilter, heading, parse_maps, parse_server
+from bridges.vicon.publisher import Bridge, FrameQueue, PoseFilter, heading, parse_maps
 from experiments.file import document
 from tests.commands import python, started
 from tests.system.lab import RobotProcess, Watcher

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from agents.plugins import registry
+from experiments.definition.experiment import Criterion
 from experiments.definition.plan import Plan
 from experiments.file.document import load
 from experiments.file.problems import DocumentError
@@ -145,6 +146,21 @@ def test_metric_of_wrong_shape_is_unknown(known, short_trace):
     assert fault.startswith("metric wrong failed: ValueError: it gives float64 (30,), not 3 numbers")
     assert found.mean["wrong"] is None
     assert found.mean["way_m"] == pytest.approx(np.mean([robot.extra["way_m"] for robot in found.robots]))
+
+
+class Strange(Wrong, frozen=True):
+    def applies(self, trace):
+        return trace.case == "other"
+
+
+def test_metric_applies_where_it_says(known, short_trace):
+    """One of another project is neither a failure nor a column of each run of this user."""
+    known(strange=Strange(), way_m=Way())
+    found = measure(short_trace)
+    assert (found.metric_faults, found.mean["strange"]) == ((), None)
+    assert {*metric.foreign_metrics([found])} == {"way_m"}
+    asked = msgspec.structs.replace(found, criteria=(Criterion(metric="strange", at_most=1.0),))
+    assert {*metric.foreign_metrics([asked])} == {"strange", "way_m"}
 
 
 def test_reports_of_older_runs_lack_a_metric(known, short_trace, tmp_path):
