@@ -92,6 +92,7 @@ UsageError: Final[type[typer.BadParameter]] = typer.BadParameter.__mro__[
 
 def _plain(message: str) -> str:
     """The library's words for a value that an option does not take, in those of our own errors."""
+    message = re.sub(r"(Did you mean '[^']*')(?:, '[^']*')+", r"\1", message)  # the nearest command
     found = re.fullmatch(r"Invalid value for '?(.+?)'?: (?:Input should (be .*?)(?:, unable to .*)?|(.*))", message)
     return message if found is None else f"{found[1]}: {f'must {found[2]}' if found[2] else found[3]}"
 

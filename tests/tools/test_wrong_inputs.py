@@ -53,6 +53,7 @@ COMMANDS = (
     ("run triangle.toml --vitual", "No such option: --vitual", "--virtual"),
     ("run", "Missing argument 'FILE'", "`./zenpark run --help`"),
     ("rum", "No such command 'rum'", "Did you mean 'run'?"),
+    ("chek triangle.toml", "No such command 'chek'. Did you mean 'check'?", "--help` shows what there is"),
     ("check -", "-: neither a file nor", "/dev/stdin is the standard input"),
     ("check full", "full: is a folder", "name a file in it: triangle.toml"),
     ("check empty.toml", "empty.toml: is empty", "./zenpark new copies an experiment"),
