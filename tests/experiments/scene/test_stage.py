@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from math import inf
+from unittest.mock import MagicMock
 
 import msgspec
 import numpy as np
@@ -12,7 +13,7 @@ from agents.network import messages
 from experiments.definition.experiment import Arena, LinkTable
 from experiments.definition.plan import Plan
 from experiments.file.document import load
-from experiments.scene import markers, models, stage
+from experiments.scene import drawing, markers, models, stage
 from experiments.scene.stage import BodyLocation, Condition, LinkTracker, Moment, SceneModel, Trail
 from tests.experiments.traces import link_errors
 from tests.small import small
@@ -162,3 +163,19 @@ def test_obstacles_stand_where_the_file_says():
     drawn = markers.drawing(Plan(small({"A": "khepera4"}, arena=Arena(obstacles={"lamp": lamp}))))(0.0, {})
     (marker,) = [each for each in drawn if each.group == "obstacles"]
     assert (marker.scale[2], marker.position[2]) == pytest.approx((0.3, 1.55))
+
+
+def test_dark_bodies_and_worst_of_many_are_seen():
+    robots = {f"R{k:02}": "khepera4" for k in range(30)}
+    scene = SceneModel.of_plan(Plan(small(robots, {f"R00 > R{k:02}": 0.5 for k in range(1, 30)})))
+    real = replace(scene, places=(BodyLocation.REAL,) * 30)
+    server = MagicMock()
+    drawn = drawing.SceneDrawing(server, real, drawing.DARK)
+    body = server.scene.add_batched_meshes_simple.call_args_list[0]
+    assert body.kwargs["batched_colors"].min() > 30, "linear light"
+    moment = at_start(real)
+    moment.condition[:] = Condition.ACTIVE
+    moment.error = 0.001 * np.arange(len(real.links))
+    drawn._draw_labels(moment)
+    named = {call.args[1] for call in server.scene.add_label.call_args_list}
+    assert named == {"R00 · real", *(f"R{k} · real" for k in range(25, 30))}
