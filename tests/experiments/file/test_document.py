@@ -4,11 +4,14 @@ import json
 import math
 import re
 import tomllib
+from importlib.metadata import EntryPoint
 from pathlib import Path
+from typing import Annotated
 
 import msgspec
 import pytest
 
+from agents.body.interface import BodyFault
 from agents.formation.link import BY_NOTHING
 from agents.plugins import registry
 from experiments.catalogue import index
@@ -23,6 +26,7 @@ from experiments.file.structure import OBJECT, parse_object
 from experiments.file.text import MAX_TEXT_BYTES
 from tests.experiments.traces import parse_links
 from tests.small import PERIODIC, changed
+from twins.body import TwinBody
 from twins.devices.device import Faults
 from twins.scene import Obstacle
 
@@ -537,3 +541,34 @@ def test_wrong_json_behind_a_flag_has_a_remedy(text, messages, hint):
 
 def test_one_case_may_be_named_as_text():
     assert list(document.chosen(document.load("triangle"), "event")) == ["event"]
+
+
+class RoverSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    gear: Annotated[int, msgspec.Meta(ge=1, le=5)] = 1
+
+
+class Rovers(TwinBody):
+    """Body of a user."""
+
+    SETTINGS = RoverSettings
+
+    @classmethod
+    def faults(cls, robots):
+        yield from super().faults(robots)
+        for each in robots:
+            if not each.address.endswith(":5005"):
+                yield BodyFault(each.name, ("body",), f"{each.name} has no port", "write rover://HOST:5005")
+
+
+def test_body_of_a_user_judges_its_robots(monkeypatch, write):
+    before, entry = registry.registered, EntryPoint("rover", f"{__name__}:Rovers", registry.BODIES)
+    mine = {registry.BODIES: {"rover": [entry]}}
+    monkeypatch.setattr(registry, "registered", lambda group: before(group) | mine.get(group, {}))
+    wrong = TWO.replace("start = [0.0, 0.0]", 'start = [0.0, 0.0]\nbody = "rover://a"')
+    wrong += 'body = "rover://b:5005"\ndevice = { gear = 9 }\n'
+    problems = [(each.line, each.message, each.hint) for each in refusal(write(wrong)).problems]
+    assert problems == [
+        (6, "KH01 has no port", "write rover://HOST:5005"),
+        (11, "'gear' must be a whole number <= 5, not 9", "left out: 1"),
+    ]
+    read(write(wrong.replace("rover://a", "rover://a:5005").replace("gear = 9", "gear = 2")))
