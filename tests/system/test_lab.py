@@ -13,7 +13,7 @@ from agents.network import session as network
 from agents.network.keys import Keys
 from experiments.real_time.hosts import authority
 from tests.commands import zenpark
-from tests.system.lab import Flight, in_lab, until
+from tests.system.lab import TRIANGLE, Flight, in_lab, until
 from tests.system.secured import Laboratory, refused
 
 pytestmark = pytest.mark.system
@@ -27,9 +27,11 @@ def test_one_command_runs_while_others_watch_and_stop(tmp_path):
     assert Path(lab) == tmp_path / "lab"
     reach = ("--connect", endpoint, "--lab", lab)
     shown = zenpark("keys", *reach)
-    for name in ("KH01", "KH02", "CF01", "recorder", "conductor", "router"):
-        assert f"\n{name}  (" in f"\n{shown.stdout}"
-    assert "park/CF01/order" in shown.stdout
+    for name in TRIANGLE:
+        assert f"\n{name}  running  " in f"\n{shown.stdout}"
+    for token in ("park/run/conductor", "park/run/recorder"):
+        assert f"  {token}\n" in shown.stdout
+    assert "park/CF01/state" in shown.stdout
     assert zenpark("echo", "park/*/pose", "-n", "3", *reach).stdout.count('"robot":') == 3
     assert "park/CF01/state" in zenpark("hz", "park/*/state", "--seconds", "1", *reach).stdout
     zenpark("echo", "park/*/pose", "--seconds", "0.3", "--connect", endpoint, code=2)
