@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable, Container, Iterable, Iterator
 from contextlib import suppress
 from itertools import chain, count
-from typing import Any, Final, Generic, Protocol, TypeVar
+from typing import Any, Final, Generic, Protocol, Self, TypeVar
 
 import zenoh
 from zenoh.ext import (
@@ -124,6 +124,12 @@ class PoseSubscriber:
             if self._repeats_its_number(sample):
                 return sample
         return None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.undeclare()
 
     def undeclare(self) -> None:
         self._advanced.undeclare()
