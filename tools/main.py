@@ -154,6 +154,9 @@ def call(command: typer.Typer, name: str = "zenpark") -> None:
         else:
             asked = " ".join(["./zenpark", *words, "--help"])
             remedy = f"`{asked}` shows what there is"
+            examples = (error.ctx.command.epilog or "" if error.ctx else "").split("./zenpark ")[1:]
+            if message.startswith("Missing argument") and examples:
+                remedy = f"for example: ./zenpark {examples[0].strip()}"
             _report(message, f"\n  {remedy}")
         sys.exit(2)
     except typer.Abort:

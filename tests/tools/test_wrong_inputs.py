@@ -51,7 +51,7 @@ COMMANDS = (
     ("run trianlge", "trianlge: neither a file nor an experiment", "did you mean 'triangle'?"),
     ("run nope.zip", "nope.zip: is no bundle", "`./zenpark export RUN --bundle`"),
     ("run triangle.toml --vitual", "No such option: --vitual", "--virtual"),
-    ("run", "Missing argument 'FILE'", "`./zenpark run --help`"),
+    ("run", "Missing argument 'FILE'", "for example: ./zenpark run "),
     ("rum", "No such command 'rum'", "Did you mean 'run'?"),
     ("chek triangle.toml", "No such command 'chek'. Did you mean 'check'?", "--help` shows what there is"),
     ("check -", "-: neither a file nor", "/dev/stdin is the standard input"),
