@@ -124,6 +124,17 @@ def test_offline_the_core_is_kept(bootstrap, installing, replaced, capsys):
     assert "UV_HTTP_RETRIES" not in installing.commands[1][1]
 
 
+@pytest.mark.parametrize(("words", "waits"), [(["estop"], 0), (["robot", "land"], 0), (["runs"], 1)])
+def test_stops_wait_for_no_packages(words, waits, bootstrap, replaced, monkeypatch):
+    (bootstrap.VENV / "bin" / "zenpark").touch()
+    prepared = []
+    monkeypatch.setattr(bootstrap, "prepare", prepared.append)
+    assert not bootstrap.ready("core")
+    bootstrap.main(words)
+    assert [command[2:] for command, _ in replaced] == [words]
+    assert len(prepared) == waits
+
+
 def test_higher_level_only_adds_packages(bootstrap, installing):
     bootstrap.prepare("view")
     assert bootstrap.ready("view")
