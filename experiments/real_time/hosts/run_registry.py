@@ -235,7 +235,7 @@ def look() -> Listing:
     folders, trouble = readable_folders()
     files = [file for folder in folders for file in folder.glob("*.json")]
     found = {file: run for file in files if (run := _read(file)) is not None}
-    dead = {file: topology.bare(run.endpoints) for file, run in found.items() if not run.alive}
+    dead = {file: topology.bare(run.endpoints) for file, run in found.items() if not (run.alive or _listens(run))}
     silent = _silent({endpoint for endpoints in dead.values() for endpoint in endpoints})
     for file, endpoints in dead.items():
         if silent.issuperset(endpoints):
@@ -279,6 +279,21 @@ def _read(file: Path) -> RegisteredRun | None:
         return None
     run = msgspec.structs.replace(run, user=user, socket=_socket_of(file, user))
     return run if run.pid > 0 and run.endpoints and run.realm else None
+
+
+def _listens(run: RegisteredRun) -> bool:
+    """Whether a process takes stops at the socket of a run; that of another container is not seen otherwise."""
+    if not run.socket:
+        return False
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as knocking:
+        knocking.settimeout(KNOCK_S)
+        try:
+            knocking.connect(run.socket)
+        except (ConnectionRefusedError, FileNotFoundError):
+            return False
+        except OSError:
+            pass  # busy
+    return True
 
 
 def _socket_of(file: Path, user: int) -> str:

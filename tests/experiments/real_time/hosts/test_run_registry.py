@@ -49,6 +49,13 @@ def test_run_is_listed_while_it_is_up(runtime_folder):
     assert runtime_folder.stat().st_mode & 0o777 == 0o700
 
 
+def test_run_of_another_container_stays_listed(runtime_folder):
+    run = dead()  # the number of its process belongs to another namespace
+    with registered(run, lambda _: StopReport([], [])):
+        assert [each.since for each in runs()] == [run.since]
+        assert len(list(runtime_folder.iterdir())) == 2, "file and socket"
+
+
 def test_dead_run_is_listed_while_its_router_answers(runtime_folder):
     run = dead()
     with registered(run):
