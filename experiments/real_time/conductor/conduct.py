@@ -83,7 +83,8 @@ def conduct(read: Document, folder: Path, options: RunOptions, user: Supervision
     """Run an experiment in real time: a router, a process per robot, a recorder.
 
     Args:
-        user: After an interrupt or an emergency stop no further case begins.
+        user: After an interrupt or an emergency stop no further case begins; nor when an operator has landed, stopped
+            or held robots, and may be among them.
 
     Raises:
         LabError: If a certificate is missing.
@@ -96,15 +97,18 @@ def conduct(read: Document, folder: Path, options: RunOptions, user: Supervision
     """
     results: dict[str, CaseResult] = {}
     embodied = with_bodies(read, options)
-    emergency = user.emergency
+    emergency, halted = user.emergency, ""
     with run_setup(read, embodied, folder, options, user) as (contexts, left), user.show as show:
         for name, context in contexts.items():
             if context.ended():
                 break
             results[name] = Conductor(context, show).run()
+            if halted := results[name].halted:
+                break
     unflown = ", ".join(name for name in embodied if name not in results)
     stopped = [emergency.words + (f"; not run: {unflown}" if unflown else "")] if emergency else []
     failures = [f"{case}: {why}" for case, result in results.items() for why in result.failures]
+    failures += [f"not run: {unflown}, since {halted}"] if halted and unflown else []
     # a failure says why the recording of a case is not there
     begun = {case: end.recording for case, end in results.items() if end.start is not None and end.recording.is_file()}
     untold = [f"{case}: {why}" for case, end in results.items() if case not in begun for why in end.failures]

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Final
 
 from agents.clock import Clock
+from agents.decision.lifecycle import PAUSED
 from agents.network import messages
 from agents.network.keys import Keys
 from agents.runtime.orders import LAND, STOP
@@ -45,6 +46,8 @@ class CaseResult:
     ready_s: float | None
     lost: tuple[str, ...]
     failures: tuple[str, ...] = ()  # that its recording may not tell
+    # why no further case begins: an operator landed, stopped or held robots, and may be among them; empty: it begins
+    halted: str = ""
 
 
 class CaseRun:
@@ -97,6 +100,7 @@ class Conductor(CaseRun):
         self.failures: list[str] = []
         # robots that an operator has landed or stopped before the end, by reason and time in words
         self._landed: dict[tuple[str, str], list[str]] = {}
+        self._held: set[str] = set()  # robots that an operator holds, as far as they say
         try:
             self._processes.prepare()
             with ExitStack() as stack:
@@ -128,7 +132,10 @@ class Conductor(CaseRun):
             parted = self._processes.join_parts()
         lost = tuple(name for name, view in self._robots.items() if view.left_because == "lost")
         failures = [*([f"lost {', '.join(lost)}"] if lost else []), *self.failures, *([parted] if parted else [])]
-        return CaseResult(self._context.recording, start, ready, lost, tuple(failures))
+        landed = [f"{', '.join(names)} {reason} by an operator" for (reason, _), names in self._landed.items()]
+        held = [f"{', '.join(sorted(self._held))} held by an operator to the end"] if self._held else []
+        halted = "; ".join([*landed, *held])
+        return CaseResult(self._context.recording, start, ready, lost, tuple(failures), halted)
 
     def _join(self, stack: ExitStack) -> None:
         super()._join(stack)
@@ -247,6 +254,7 @@ class Conductor(CaseRun):
         self._progress.phase = "starting together"
         while (now := self._clock.utc()) < end + OVER_S and not self._context.ended():
             self._update()
+            self._note_holds()
             self._view.report_drift(*self._drift.news())
             self._progress.elapsed = now - start
             self._report_tardy(start)
@@ -267,6 +275,14 @@ class Conductor(CaseRun):
             time.sleep(POLL_S)
         for (reason, when), names in self._landed.items():
             self.failures.append(f"{', '.join(names)} landed {when}: {reason} by an operator")
+
+    def _note_holds(self) -> None:
+        """Note which robots hold by order; one that lands at the end does not say so any more."""
+        for name, view in self._robots.items():
+            if view.gone or (view.phase == "running" and self._reason(name) != PAUSED):
+                self._held.discard(name)
+            elif view.phase == "running":
+                self._held.add(name)
 
     def _note_landings(self, elapsed: float, busy: Container[str]) -> None:
         """Note robots that others have ordered to land or to stop before the end: the run is spoilt without a fault."""

@@ -61,7 +61,7 @@ class Course(Conductor):
         self.robots = self._robots = {name: RobotView() for name in self._experiment.robots}
         self._progress = Progress("only", "", None, 10.0, self._robots)
         self._phases, self._deaths, self._frozen = phases, dict(deaths), dict(frozen)
-        self.failures, self._starting, self._landed = [], set(), {}
+        self.failures, self._starting, self._landed, self._held = [], set(), {}, set()
         self.reasons = {}  # of robots that have landed at 3 s, before all others
         self._changes = self._drift = MagicMock(under_way=())
         self._context = MagicMock(ended=lambda: False, emergency=None)
@@ -125,6 +125,37 @@ def test_robot_that_was_ordered_down_spoils_the_run(reason, spoilt):
     course.reasons = dict.fromkeys(course.robots, "ordered to land")
     (text,) = course.walked()
     assert re.fullmatch(r"KH01, KH02, CF01 landed after \d\.\d of 10 s: ordered to land by an operator", text)
+
+
+def test_robots_held_to_the_end_are_known():
+    course = Course({0.0: "running"})
+    first, second, _ = course.robots
+    for phase, reasons in (("running", ("ordered to hold", "ordered to hold", "")), ("landing", ("finished", "", ""))):
+        for (name, view), reason in zip(course.robots.items(), reasons, strict=True):
+            view.status = changed(status(name, at=1.0), phase=phase, reason=reason)
+        course._note_holds()
+    assert course._held == {first, second}
+    course.robots[second].status = changed(status(second, at=2.0), phase="running", reason="")
+    course.robots[first].left_because = "removed"
+    course._note_holds()
+    assert course._held == set()
+
+
+@pytest.mark.parametrize(("halted", "flown"), [("", ["one", "two"]), ("KH01 ordered to land by an operator", ["one"])])
+def test_no_case_follows_an_operator_who_lands(halted, flown, monkeypatch, tmp_path):
+    contexts = {name: MagicMock(ended=lambda: False) for name in ("one", "two")}
+    begun = []
+
+    def conductor(context, _show):
+        begun.append(next(name for name, each in contexts.items() if each is context))
+        return MagicMock(run=lambda: module.CaseResult(tmp_path / "none", None, None, (), (), halted))
+
+    monkeypatch.setattr(conduct, "with_bodies", lambda *_: dict.fromkeys(contexts))
+    monkeypatch.setattr(conduct, "run_setup", lambda *_: nullcontext((contexts, [])))
+    monkeypatch.setattr(conduct, "Conductor", conductor)
+    ended = conduct.conduct(MagicMock(), tmp_path, RunOptions(), Supervision(nullcontext(print), lambda: False))
+    assert begun == flown
+    assert ended.failures == [f"not run: two, since {halted}"] * bool(halted)
 
 
 @pytest.fixture
