@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from math import degrees
 from typing import Final
 
+import msgspec
 import numpy as np
 
 from agents.body.kinds import KINDS
@@ -18,6 +19,7 @@ from twins.arrays import norm
 
 BEFORE_START_S: Final = 5.0  # of the battery are spent before the common start
 LISTED: Final = 12  # names
+LOOSE: Final = 10.0  # multiple of the default from which a limit has no effect: its unit was mistaken, say
 
 
 def safety(analysis: Analysis) -> Iterator[Finding]:
@@ -29,6 +31,11 @@ def safety(analysis: Analysis) -> Iterator[Finding]:
     if chosen.cut_beyond_m <= OUTSIDE_M:
         message = f"motors are cut {chosen.cut_beyond_m:g} m outside the arena, but drones land {OUTSIDE_M:g} m outside"
         yield Finding("warning", "cut-outside", message, f"raise it above {OUTSIDE_M:g}", ("safety", "cut_beyond_m"))
+    for each in msgspec.structs.fields(chosen):
+        value, usual = getattr(chosen, each.name), each.default
+        if isinstance(usual, float) and value >= LOOSE * usual:
+            message = f"{each.name} is {value:g}, {value / usual:.0f} times the usual {usual:g}: it has no effect"
+            yield Finding("warning", "loose-limit", message, "give seconds and metres", ("safety", each.name))
     if chosen.separation is not None:
         yield from _separation(analysis, chosen.separation)
 

@@ -168,6 +168,7 @@ def test_scripted_landing_silences_and_loses_a_robot(architecture):
     [
         ({"battery_low": 0.5}, "battery"),
         ({"cut_beyond_m": 0.2}, "cut-outside"),
+        ({"position_timeout_s": 500.0}, "loose-limit"),
         ({"separation": 0.9}, "separation-start"),
         ({"separation": 0.6}, "separation-link"),
     ],
