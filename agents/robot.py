@@ -101,10 +101,16 @@ class Robot:
     # ------------------------------------------------------------------ inputs
 
     def hold(self) -> str:
-        """Order to stay in place; returns the reason of a refusal, empty when accepted."""
-        if self.lifecycle.phase not in (AIRBORNE, RUNNING):
-            return f"cannot hold while {Phase(self.lifecycle.phase).word}"
-        self._ordered, self.lifecycle.reason = True, PAUSED
+        """Order to stay in place; returns the reason of a refusal, empty when accepted.
+
+        One that climbs stays at its height, and one that waits does not take off.
+        """
+        life = self.lifecycle
+        if life.phase > RUNNING:
+            return f"cannot hold while {Phase(life.phase).word}"
+        self._ordered, life.reason = True, PAUSED
+        if life.phase <= READY and not life.climbing:
+            life.failing = PAUSED
         return ""
 
     def resume(self) -> None:
@@ -410,7 +416,8 @@ class Robot:
         if assignment.patience_s is None or t <= assignment.patience_s:
             lacks = self.neighbours.unreceived() or (self.guidance is not None and self.guidance.missing)
         missing = self.missing_neighbours() if lacks else []
-        failing = self._preflight.check(self.now, missing, self.neighbours, self.health)
+        waits = self._ordered and not life.climbing
+        failing = PAUSED if waits else self._preflight.check(self.now, missing, self.neighbours, self.health)
         life.failing, lost = failing, self._preflight.lost(t, failing)
         if failing:
             life.set_missing(failing)

@@ -56,6 +56,7 @@ class Descent:
         self.airborne = False  # a row flew at the last reading of its body, or took off since
         self.asked_at = -inf  # end of the last wait for the owner of the names, on the clock `uptime` [s]
         self.reason_to_end: Callable[[], str | None] = lambda: None
+        self.stop_s = timing.stop_s  # [s] limit for a body to confirm that its motors are off
         kinds = [robot.assignment.kind for robot in robots]
         self._robots, self._body, self._keeper, self._ticks = robots, body, keeper, ticks
         self._recover, self._timing = recover, timing
@@ -115,7 +116,7 @@ class Descent:
         """Register the steps of the end: land what still flies, stop it, end the watchdog, close the body."""
         steps.callback(self._close_body)
         steps.callback(self.watchdog.end)
-        steps.callback(self._order_down, self._body.stop, self._timing.stop_s)
+        steps.callback(self._order_down, self._body.stop, self.stop_s)
         steps.callback(self._land)
 
     def _close_body(self) -> None:

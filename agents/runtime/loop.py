@@ -232,7 +232,7 @@ class Runtime:
         self.run_ticks(stopping)
 
     def run_ticks(self, stopping: Callable[[], str | None]) -> None:
-        ticks, counts, farewell = self.ticks, self.counts, inf
+        ticks, counts, farewell, patience = self.ticks, self.counts, inf, inf
         while True:
             self.watchdog.beat()
             if self.watchdog.tripped:
@@ -257,9 +257,11 @@ class Runtime:
                 self._stopping = reason
                 for robot in self.robots:
                     robot.lifecycle.land(reason)
-            if (self._stopping is not None or self._setup.once) and (
-                t > farewell or all(robot.lifecycle.phase == DONE for robot in self.robots)
-            ):
+            down = all(robot.lifecycle.phase == DONE for robot in self.robots)
+            if down and patience == inf:
+                patience = t + self._descent.stop_s
+            confirmed = not self._descent.airborne or t > patience  # statuses tell of a stop that is confirmed late
+            if (self._stopping is not None or self._setup.once) and (t > farewell or (down and confirmed)):
                 self._telemetry.send_statuses(t, everything=True)
                 return
 

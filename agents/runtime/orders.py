@@ -19,7 +19,7 @@ from agents.robot import Robot
 from agents.runtime.telemetry import Counts
 from agents.vectors import Setpoint
 
-SOON_S: Final = 3600.0  # a common start further ahead results from a wrong clock
+SOON_S: Final = 30.0  # a common start further ahead results from a wrong clock: people are near by then
 LAND: Final = "ordered to land"
 STOP: Final = "ordered to stop"
 OWN: Final = ("clamp", "tracking_gain")

@@ -17,14 +17,15 @@ from typing import Final
 import msgspec
 import zenoh
 
-from agents.body.interface import BodyState
-from agents.decision.lifecycle import Phase
+from agents.body.interface import UNANSWERED, BodyState
+from agents.decision.lifecycle import SETTLED, Phase
 from agents.decision.stepping import Stepping
 from agents.network import messages, pubsub
 from agents.network.keys import Keys
 from agents.robot import Robot
 from agents.runtime import range_inbox
 from agents.runtime.pose_inbox import PoseInbox
+from agents.vectors import norm
 
 STATUS_S: Final = 1.0
 ROUNDING_S: Final = 1e-6
@@ -90,6 +91,9 @@ class TelemetryPublisher:
         self._reported: list[tuple[object, ...]] = [()] * len(names)
         self._incidents: list[deque[messages.Incident]] = [deque(maxlen=INCIDENTS) for _ in names]
         self._numbers = [0] * len(names)
+        self._at_rest = [False] * len(
+            names
+        )  # True if the body has confirmed that its motors are off, or its wheels stand
 
     def send_states(self, t: float) -> None:
         """Sends the state of every robot, also of one without a known position."""
@@ -101,7 +105,7 @@ class TelemetryPublisher:
                 self._names[row],
                 self._seq,
                 self.utc + t,
-                WORDS[robot.lifecycle.phase],
+                WORDS[self._phase(row)],
                 messages.vector(now.position),
                 messages.vector(now.velocity),
                 messages.heading(now.yaw),
@@ -149,8 +153,9 @@ class TelemetryPublisher:
         `changed`: neighbours appeared or vanished, which the phases do not show.
         """
         counts = self._counts
-        for robot in self._robots:
-            changed = changed or robot.lifecycle.moved or bool(robot.hazards.incidents)
+        for row, robot in enumerate(self._robots):
+            waited = robot.lifecycle.phase == Phase.DONE and not self._at_rest[row]
+            changed = changed or robot.lifecycle.moved or waited or bool(robot.hazards.incidents)
         if not (everything or changed):
             return
         self._note_incidents()
@@ -158,12 +163,13 @@ class TelemetryPublisher:
             self.due = t + STATUS_S
         for row, robot in enumerate(self._robots):
             life, missing = robot.lifecycle, robot.missing_neighbours()
-            news = (life.phase, messages.without_numbers(life.reason), tuple(missing), self._numbers[row])
+            phase = self._phase(row)
+            news = (phase, messages.without_numbers(life.reason), tuple(missing), self._numbers[row])
             if not everything and news == self._reported[row]:
                 continue
             if news[:2] != self._reported[row][:2]:
                 print(
-                    f"{self._names[row]}: {WORDS[life.phase]}" + (f" ({life.reason})" if life.reason else ""),
+                    f"{self._names[row]}: {WORDS[phase]}" + (f" ({life.reason})" if life.reason else ""),
                     flush=True,
                 )
             self._reported[row] = news
@@ -181,7 +187,7 @@ class TelemetryPublisher:
         return messages.Status(
             robot=self._names[row],
             stamp=self.utc + t,
-            phase=WORDS[life.phase],
+            phase=WORDS[self._phase(row)],
             reason=life.reason,
             body="" if state is None else state.note,
             battery=None if state is None else messages.number(state.battery),
@@ -208,6 +214,17 @@ class TelemetryPublisher:
             hazard=robot.hazards.worst(),
             incidents=list(self._incidents[row]),
         )
+
+    def _phase(self, row: int) -> int:
+        """Phase of a robot for others: one that was stopped lands until its body confirms that, then it is done."""
+        robot = self._robots[row]
+        phase, state = robot.lifecycle.phase, robot.now.state
+        if phase != Phase.DONE:
+            self._at_rest[row] = False
+        elif not self._at_rest[row]:
+            rolls = not robot.assignment.kind.flies and norm(robot.now.velocity) >= SETTLED
+            self._at_rest[row] = not (state.flying or rolls or UNANSWERED in state.note)
+        return int(Phase.LANDING) if phase == Phase.DONE and not self._at_rest[row] else phase
 
     def _note_incidents(self) -> None:
         """Moves incidents from the decision into statuses, and prints them: the log outlives the network."""

@@ -85,14 +85,14 @@ def test_orders_are_answered_and_refused_with_a_reason(router, watcher, low_file
         def order(word, **fields):
             return watcher.order("CF01", messages.Order(word, **fields))
 
-        for reply in (order("start", at=time.time()), order("hold"), order("set", name="trigger.period_s", value=0.0)):
+        for reply in (order("start", at=time.time()), order("go"), order("set", name="trigger.period_s", value=0.0)):
             assert not reply.ok
         assert "needs `at`" in order("start").reason
         assert order("get", name="clamp").value == pytest.approx(0.1)
         assert order("set", name="clamp", value=0.05).value == pytest.approx(0.05)
         assert "known: clamp" in order("set", name="clmp", value=1.0).reason
         assert watcher.order("nobody", messages.Order("land")).reason == "no answer"
-        bare = [b'{"order": "get", "name": "clamp"}', b'{"order": "hold"}']  # as z_get sends them: without an encoding
+        bare = [b'{"order": "get", "name": "clamp"}', b'{"order": "go"}']  # as z_get sends them: without an encoding
         answers = [
             messages.decode(reply.ok.payload.to_bytes(), messages.JSON, messages.Reply)
             for payload in bare
@@ -102,7 +102,9 @@ def test_orders_are_answered_and_refused_with_a_reason(router, watcher, low_file
         assert sorted((answer.robot, answer.value, answer.reason) for answer in answers if answer.ok) == [
             ("CF01", 0.05, ""), ("KH01", 0.1, ""), ("KH02", 0.1, "")
         ]  # fmt: skip
-        assert {answer.reason for answer in answers if not answer.ok} == {"cannot hold while ready"}
+        assert {answer.reason for answer in answers if not answer.ok} == {
+            "an order to go needs a `goal`, x and y in metres"
+        }
         watcher.take_off(*TRIANGLE)
         watcher.start(*TRIANGLE)
         watcher.give(messages.Order("hold"), "CF01")

@@ -1,6 +1,7 @@
 """The loop of a robot process: skipped ticks, standstills, stops, poses that wake it, and robots that come back."""
 
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
@@ -101,6 +102,66 @@ def test_standstill_before_takeoff_keeps_it_down(on_stage, monkeypatch):
     monkeypatch.setattr(Robot, "act", stands)
     stage.run(visit)
     assert "takeoff" not in [order for _, order in stage.orders]
+
+
+def test_stop_is_done_when_body_confirms(on_stage, capsys):
+    stage = on_stage(DRONE)
+    cut, answers_at = stage.body.stop, BEGIN + 12.0
+    stage.body.stop = lambda rows: cut(rows) if stage.clock.now >= answers_at else None
+    phases = []
+
+    def visit(phase):
+        if phase == Phase.READY:
+            stage.robot.lifecycle.takeoff()
+        elif phase == Phase.AIRBORNE:
+            stage.runtime.estop.receive(STOP)
+        elif stage.clock.now >= answers_at:
+            stage.body.stop([0])
+        phases.extend(re.findall(r"^F: (\w+)", capsys.readouterr().out, re.MULTILINE))
+        return stage.clock.now >= answers_at + 0.1
+
+    stage.run(visit)
+    assert phases == ["ready", "airborne", "landing", "done"]
+
+
+@pytest.mark.parametrize(("lifted", "height"), [(False, 0.0), (True, 0.5)])
+def test_hold_before_the_start_holds(lifted, height, on_stage):
+    stage = on_stage(DRONE)
+    answers, held = [], []
+
+    def visit(phase):
+        life, t = stage.robot.lifecycle, stage.clock.now - BEGIN
+        if phase == Phase.READY and lifted and not life.climbing:
+            life.takeoff()
+        if phase == Phase.READY and life.climbing == lifted and not answers:
+            answers.append(carry_out(stage.robot, messages.Order("hold"), t, BEGIN))
+            answers.append(carry_out(stage.robot, messages.Order("takeoff"), t, BEGIN))
+        if phase == Phase.AIRBORNE:
+            carry_out(stage.robot, messages.Order("start", at=BEGIN + t), t, BEGIN)
+        if phase == Phase.RUNNING:
+            held.append(stage.robot.hazards.held)
+        return t > 4.0
+
+    stage.run(visit)
+    assert answers == [("", None), ("" if lifted else "cannot take off now: ordered to hold", None)]
+    assert stage.runtime.states[0].position[2] == pytest.approx(height, abs=0.01)
+    assert {*held} == ({True} if lifted else set())
+
+
+def test_start_by_a_wrong_clock_is_refused(on_stage):
+    stage, answers = on_stage(DRONE), []
+
+    def visit(phase):
+        t = stage.clock.now - BEGIN
+        if phase == Phase.READY:
+            stage.robot.lifecycle.takeoff()
+        if phase == Phase.AIRBORNE:
+            orders = [messages.Order("start", at=BEGIN + t + ahead_s) for ahead_s in (60.0, 1.0)]
+            answers.extend(carry_out(stage.robot, order, t, BEGIN)[0] for order in orders)
+        return phase == Phase.AIRBORNE
+
+    stage.run(visit)
+    assert ["are the clocks set?" in each for each in answers] == [True, False]
 
 
 @pytest.mark.parametrize("during", [Phase.READY, Phase.AIRBORNE])
