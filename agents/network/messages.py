@@ -332,6 +332,7 @@ class Inspection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_d
     capacity_hz: float | None = None  # [1/s] that this radio carries
     flying: bool = False  # motors of a drone on
     age_s: float | None = None  # [s] of its position
+    delay_s: float | None = None  # [s] of positions from outside, whatever their stamps say, in the last climb
     ahead_s: float | None = None  # [s] stamp of the last external position less the time of its arrival
 
 

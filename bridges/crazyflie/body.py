@@ -194,6 +194,7 @@ class CrazyflieBody(Body):
             volts=number(self._telemetry[row].volts),
             packets_hz=load,
             capacity_hz=self._capacity.get(self._dongles[row]),
+            delay_s=number(self.pilots[row].delay),
         )
 
     def close(self, *, land: bool = True) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from math import cos, inf, isfinite, sin
+from math import cos, inf, isfinite, nan, sin
 from typing import Final
 
 from agents.body.interface import BodyError
@@ -151,6 +151,12 @@ class CrazyfliePilot:
     def firmware(self) -> str | None:
         """Version of the firmware; None before the drone has said it."""
         return None if self.link is None else self.link.firmware
+
+    @property
+    def delay(self) -> float:
+        """Delay [s] of positions from outside in the last climb; NaN if that is not known."""
+        system = self._settings.positioning
+        return self._telemetry.climb.delay(system.position_sigma) if isinstance(system, Outside) else nan
 
     def close(self, *, land: bool = True) -> None:
         """Land the drone if it flies, unless it is to be left as it is, then end the thread."""
@@ -466,6 +472,7 @@ class CrazyfliePilot:
                 return
             self._forwarded_at = now
             x, y, z = position
+            self._telemetry.climb.tell(now, z)
             if system.attitude and isfinite(yaw):
                 link.cf.extpos.send_extpose(x, y, z, 0.0, 0.0, sin(0.5 * yaw), cos(0.5 * yaw))
             else:

@@ -12,6 +12,7 @@ from typing import Final
 
 from agents.clock import uptime
 from agents.protocols.crtp import MM, Info, Power
+from bridges.crazyflie.delay import ClimbLog
 from bridges.crazyflie.link import CrazyflieLink
 from bridges.crazyflie.positioning import SETTLED_BELOW
 
@@ -100,6 +101,7 @@ class Telemetry:
         self.volts = nan  # of the battery [V]
         self.stations = -1  # lighthouse.status, or -1
         self.ranges = (nan,) * len(RANGES)  # front, back, left, right, up [m]; NaN: nothing in reach
+        self.climb = ClimbLog()
         self.airborne = False  # motors on, as far as the bridge knows
         self._lighthouse, self._absolute = lighthouse, absolute
 
@@ -151,6 +153,7 @@ class Telemetry:
         self._add_volts(values.get("pm.vbat", nan), measured - self.status_time)
         self.stations = int(values.get("lighthouse.status", -1))
         self.status_time = measured
+        self.climb.feel(measured, self.pose[2], self.pose[5])
         if self._measures(values.get(VARIANCE, 0.0)) or not self.settled:
             self.pose_time = measured
 

@@ -134,5 +134,6 @@ def test_drones_hop_through_their_bridges_under_motion_capture(preflight):
     drone, tello = preflight(DRONES, "--hop", "--bodies", "protocol")
     assert {drone[name]["verdict"] for name in ("address", "firmware", "battery", "position", "radio", "hop")} == {"ok"}
     assert " V under load" in drone["hop"]["found"]
+    assert " ms late" in drone["hop"]["found"]
     assert tello["hop"]["verdict"] == "ok"
     assert "of 0.8 m high" in tello["hop"]["found"]

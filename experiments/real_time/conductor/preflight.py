@@ -241,6 +241,7 @@ class Inspector(CaseRun):
                 measured = time.monotonic()
                 for _, inspection in self._inspect([name]):
                     tried.volts = _lowest(tried.volts, inspection.volts)
+                    tried.delay_s = tried.delay_s if inspection.delay_s is None else inspection.delay_s
             tried.charge = _lowest(tried.charge, None if seen.status is None else seen.status.battery)
 
         def over() -> bool:

@@ -34,10 +34,13 @@ HELD: Final = 25  # last states of a hop, by which its height is measured
 HOP_ASIDE_M: Final = 0.1
 HOP_DRIFT_M: Final = 0.2  # and of one that climbs to a height of its own
 DRIFTS: Final = f"yaw of its positions against its nose ({FRAME}), propellers, calibration of its IMU"  # remedy
+SLOW: Final = "is slow: its filters, the network, a busy computer"  # remedy
+SLOW_BEFORE: Final = f"motion capture {SLOW}; its stamps need not know of it"
 DRIVE_M: Final = 0.1  # way of the drive of a robot on wheels
 DRIVE_OFF_M: Final = 0.03  # farther from this way: bad
 STEADY_M: Final = 0.02  # largest spread of the position of a robot at rest without a warning,
 UNSTEADY_M: Final = 0.05  # and with which it must not fly
+HOP_LATE_S: Final = 0.1  # positions that a hop shows to be later are bad
 STALE: Final = 0.5  # share of `position_timeout_s`: positions older than this at times are bad
 OLD_MONTHS: Final = 24  # firmware older than this: a warning
 STOP_S: Final = 1.0  # a stop that takes longer is bad
@@ -98,6 +101,7 @@ class Tried:
     states: list[messages.State] = field(default_factory=list)  # from the order to move on, or from that to stop on
     volts: float | None = None  # lowest
     charge: float | None = None  # lowest
+    delay_s: float | None = None  # of positions from outside
     note: str = ""  # of the body, at the end
 
 
@@ -187,9 +191,7 @@ def _position(each: Observed, safety: Safety) -> Check:
         remedy = f"gaps in {source}: markers or stations hidden, network or radio overloaded"
         if late:
             found += f", {1e3 * delay:.0f} ms late"
-            remedy = (
-                f"{source} is slow: its filters, the network, a busy computer; two clocks that differ look the same"
-            )
+            remedy = f"{source} {SLOW}; two clocks that differ look the same"
         return Check("position", "bad", found, remedy)
     if spread > STEADY_M:
         remedy = f"{source} is unsteady for a robot at rest: calibrate it, remove reflections, look for lost markers"
@@ -302,16 +304,16 @@ def hop(observed: Observed, tried: Tried, safety: Safety) -> Check:
     """Hop of a drone to its `hover`, or drive of a robot on wheels by `DRIVE_M`; the battery under load."""
     what = hop_of(observed.robot)
     load = _charged(tried.charge, tried.volts)
-    loaded = f"; battery {load} under load" if load else ""
+    loaded = _delayed(observed.robot, tried) + (f"; battery {load} under load" if load else "")
+    slow = SLOW_BEFORE if (tried.delay_s or 0.0) > HOP_LATE_S else ""
     positions = positions_of(tried.states)
     if tried.failure:
         strays = what == "hop" and aside(tried.states) > hop_limit(observed.robot)
         remedy = DRIFTS if strays else "look at its log; do not fly it before the cause is clear"
-        return Check(what, "bad", tried.failure + loaded, remedy)
+        return Check(what, "bad", tried.failure + loaded, slow or remedy)
     if not len(positions):
         return Check(what, "bad", "its position was not known", "see the line on its position")
-    side = aside(tried.states)
-    remedy = ""
+    side, remedy = aside(tried.states), slow
     if what == "drive":
         said = f"{side:.3f} m of {DRIVE_M:g} m{loaded}"
         if side < DRIVE_OFF_M:
@@ -322,13 +324,20 @@ def hop(observed: Observed, tried: Tried, safety: Safety) -> Check:
         wanted = observed.robot.hover or HOP_M
         height = float(np.median(positions[-HELD:, 2]) - positions[0, 2])
         said = f"{height:.2f} m of {wanted:g} m high, {side:.2f} m to the side{loaded}"
-        if abs(height - wanted) > HOP_OFF_M:
+        if not slow and abs(height - wanted) > HOP_OFF_M:
             remedy = "does not keep its height: propellers, battery, trim, height of its positioning system"
-        elif side > hop_limit(observed.robot):
+        elif not slow and side > hop_limit(observed.robot):
             remedy = DRIFTS
     if not remedy and tried.charge is not None and tried.charge < safety.battery_low:
         return Check(what, "bad", said, KINDS[observed.robot.kind].charge)
     return Check(what, "bad" if remedy else "ok", said, remedy)
+
+
+def _delayed(robot: RobotTable, tried: Tried) -> str:
+    """Delay of the positions from outside by which a drone flies on board, empty where there are none."""
+    if tried.delay_s is not None:
+        return f", positions {1e3 * tried.delay_s:.0f} ms late"
+    return "" if tried.failure or math.isinf(latest_s(robot)) else ", delay of positions unknown"
 
 
 def aside(states: Sequence[messages.State]) -> float:

@@ -374,7 +374,7 @@ def test_gaps_after_the_take_off(monkeypatch):
 def test_ready_at_height_in_spite_of_the_overshoot(fleet, height, soon):
     """Followed by lifecycle and detectors as in a robot's process, for 12 s at its height."""
     lifecycle, setpoint = Lifecycle(CRAZYFLIE, height, 100.0), (0.0, 0.0, height, 0.0)
-    ascent, motion_check = Ascent(CRAZYFLIE, height), MotionCheck(CRAZYFLIE)
+    ascent, motion_check = Ascent(CRAZYFLIE, height, outside=False), MotionCheck(CRAZYFLIE)
     (vehicle,) = fleet.vehicles
 
     def advance(t, *, ready=False):

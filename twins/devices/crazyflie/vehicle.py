@@ -8,7 +8,6 @@ from typing import Final
 
 import numpy as np
 
-from agents.body.external_pose import velocity_after
 from agents.body.interface import BodyRequest
 from agents.body.kinds import Flight
 from agents.kinds.crazyflie import CRAZYFLIE
@@ -245,9 +244,9 @@ class Vehicle:
         # it believes to be where it was switched on, and to look along x
         accelerometer = 1e-3 * GRAVITY * faults.accelerometer_mg
         self.estimator = Estimator(difference(ZERO, self.model.held), -yaw, accelerometer)
-        self.place = self._last_measured = self.model.held  # true position [m]
+        self.place = self.model.held  # true position [m]
         self.estimate = ZERO  # reported position [m]
-        self.velocity = ZERO  # reported, from measured positions [m/s]
+        self.velocity = ZERO  # reported [m/s]
         self.acceleration = ZERO  # [m/s²]
         self.attitude = TRIM  # roll to the right, pitch nose up [rad]
 
@@ -339,7 +338,7 @@ class Vehicle:
         if self._jitter.present:
             dx, dy = self._jitter.advance(z)
             x, y = x + dx, y + dy
-        self.place = x, y, z
+        moved, self.place = difference((x, y, z), self.place), (x, y, z)
         self.battery.advance(t)
         self.estimator.advance(
             t, dt, self.acceleration, ready=self.decks.ready, flow=self.decks.flow, flying=model.flying
@@ -350,8 +349,8 @@ class Vehicle:
         refill(self._jitter.noise, self._measurement.noise)
         wrong_x, wrong_y, wrong_z = self.estimator.error
         self.estimate = x + wrong_x, y + wrong_y, z + wrong_z
-        self.velocity = velocity_after(self.velocity, difference((x, y, z), self._last_measured), dt)
-        self._last_measured = x, y, z
+        u, v, w = self.estimator.rate
+        self.velocity = moved[0] / dt + u, moved[1] / dt + v, moved[2] / dt + w
         return locked
 
     def _steer(self, before: Vector, place: Vector, target: Setpoint) -> None:

@@ -199,6 +199,23 @@ def test_hops_and_drives(robot, end, verdict, remedy):
     assert checks.hop(observed_still(robot), Tried(states=tried.states, charge=0.05), Safety()).verdict == "bad"
 
 
+@pytest.mark.parametrize(
+    ("tried", "verdict", "found"),
+    [
+        ({}, "ok", "to the side, delay of positions unknown"),
+        ({"delay_s": 0.03}, "ok", "to the side, positions 30 ms late"),
+        ({"delay_s": 0.12}, "bad", "to the side, positions 120 ms late"),
+        ({"delay_s": 0.3, "failure": "came down by itself"}, "bad", "came down by itself, positions 300 ms late"),
+    ],
+)
+def test_a_hop_tells_late_positions(tried, verdict, found):
+    robot, end = changed(DRONE, position="external", device={}), (0.0, 0.5, 0.2)
+    way = states((0.0, 0.5, 0.0), end, end)
+    made = checks.hop(observed_still(robot), Tried(states=way, **tried), Safety())
+    assert (made.verdict, made.remedy) == (verdict, checks.SLOW_BEFORE if verdict == "bad" else "")
+    assert made.found.endswith(found)
+
+
 def test_robots_are_checked_without_formation_and_low():
     plan = alone(next(iter(document.load("robotic-park").cases().values())))
     case = plan.experiment
