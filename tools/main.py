@@ -97,6 +97,17 @@ def _plain(message: str) -> str:
     return message if found is None else f"{found[1]}: {f'must {found[2]}' if found[2] else found[3]}"
 
 
+def _remedy(words: Sequence[str], message: str, epilog: str) -> str:
+    """What to do about a wrong use of the command `words`; an emergency stop that was not sent is said first."""
+    if [*words] == ["estop"] or re.match(r"no such command '(e-?)?stop\W*'", message.lower()):
+        return "NOTHING WAS STOPPED: `./zenpark estop` stops all, `./zenpark robot stop NAME` one"
+    examples = epilog.split("./zenpark ")[1:]
+    if message.startswith("Missing argument") and examples:
+        return f"for example: ./zenpark {examples[0].strip()}"
+    asked = " ".join(["./zenpark", *words, "--help"])
+    return f"`{asked}` shows what there is"
+
+
 def _report(message: str, remedy: str = "", problems: Sequence[object] | None = None) -> None:
     """Print an error; where JSON was asked for, on standard output as JSON too."""
     warn([f"{message}{remedy}"])
@@ -152,12 +163,8 @@ def call(command: typer.Typer, name: str = "zenpark") -> None:
         if error.ctx is not None and message == error.ctx.get_help():
             print(message)
         else:
-            asked = " ".join(["./zenpark", *words, "--help"])
-            remedy = f"`{asked}` shows what there is"
-            examples = (error.ctx.command.epilog or "" if error.ctx else "").split("./zenpark ")[1:]
-            if message.startswith("Missing argument") and examples:
-                remedy = f"for example: ./zenpark {examples[0].strip()}"
-            _report(message, f"\n  {remedy}")
+            epilog = error.ctx.command.epilog or "" if error.ctx else ""
+            _report(message, f"\n  {_remedy(words, message, epilog)}")
         sys.exit(2)
     except typer.Abort:
         sys.exit(130)

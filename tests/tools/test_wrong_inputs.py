@@ -74,6 +74,8 @@ COMMANDS = (
     ("hosts check triangle.toml", "the experiment has no hosts", "[hosts.lab1]"),
     ("agent triangle.toml KH09", "no robot 'KH09' in this experiment", "did you mean 'KH02'?"),
     ("robot stop *", "NAME...: '*' cannot be a name", "use letters, digits and _"),
+    ("estop KH01", "unexpected extra argument(s) (KH01)", "NOTHING WAS STOPPED"),
+    ("STOP", "No such command 'STOP'", "NOTHING WAS STOPPED"),
     ("estop --realm *", "--realm: '*' cannot be a name", "use letters, digits and _"),
     ("agent join ../x", "NAME...: '../x' cannot be a name", "use letters, digits and _"),
     ("centre triangle.toml", "every robot of this experiment decides for itself", 'architecture = "centralised"'),
