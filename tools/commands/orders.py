@@ -126,8 +126,11 @@ def _order_robots(what: messages.OrderKind, robots: Sequence[str], by: Operator)
         if not receivers:
             return by.refuse(f"no robot in the realm '{by.realm}'; `./zenpark keys` shows the members")
         at = time.time() + orders.start_lead_s(len(receivers)) if what == "start" else None
-        replies = orders.send_order(opened, keys, receivers, messages.Order(what, at=at))
-        _, does = ORDERS.get(what, ("", "stops"))
+        if what == "stop":
+            replies = orders.send_stop_order(opened, keys, receivers)
+        else:
+            replies = orders.send_order(opened, keys, receivers, messages.Order(what, at=at))
+        _, does = ORDERS.get(what, ("", "has stopped"))
         already = UNDER_WAY.get(what, ())
         done = {
             name: reply.reason or (f"is {reply.phase} already" if reply.phase in already else does)

@@ -16,11 +16,13 @@ import msgspec
 import zenoh
 
 from agents.body.kinds import KINDS
+from agents.decision.lifecycle import PAUSED
 from agents.errors import Refusal
 from agents.network import messages
 from agents.network.keys import Keys
 from agents.plugins import registry
 from agents.plugins.registry import did_you_mean
+from agents.runtime.orders import LAND, STOP
 from experiments.definition.experiment import WORLD, RobotTable
 from experiments.definition.plan import Plan
 from experiments.real_time.conductor.case_processes import CaseProcesses
@@ -106,11 +108,25 @@ class HotChanges:
         view = self._robots
         if policy == "none" or self._start is None or not all(view[each].left_because == "lost" for each in names):
             return
+        if calmed := self._calmed_by_operator(name):
+            self._view.report("given up", name, f"{calmed}: `./zenpark robot restart {name}` when the arena is free")
+            return
         self._losses[name] = self._losses.get(name, 0) + 1
         if self._losses[name] > RESTARTS:
             self._view.report("given up", name, f"lost {self._losses[name]} times")
             return
         self._begin(_Asked(messages.RunOrder(policy, names, operator="on_loss")))
+
+    def _calmed_by_operator(self, name: str) -> str:
+        """Which robot an operator holds, or has landed or stopped if it is this one; empty: none.
+
+        Such an operator may be among the robots, of which none takes off by itself then.
+        """
+        for other, view in self._robots.items():
+            reason = "" if view.status is None else view.status.reason
+            if reason.startswith(PAUSED) or (other == name and reason.startswith((LAND, STOP))):
+                return f"{other} was {reason}"
+        return ""
 
     def advance(self) -> None:
         """Take new orders, continue the changes under way, and answer those that are done."""

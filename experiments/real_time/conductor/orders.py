@@ -31,6 +31,8 @@ LEAD_EACH_S: Final = 0.01  # and the additional time for each robot
 STOP_ANSWER_S: Final = 2.0
 STOP_AGAIN_S: Final = 0.05
 STOPPED: Final = "done"
+UNKNOWN: Final = "NOT known to have stopped: cut its power, or `./zenpark estop`"
+LOOK_S: Final = 0.2  # time for reports of robots without a token, which were landing
 CHANGE_S: Final = 90.0  # a robot lands, its process ends, another starts, is ready, and climbs
 
 R = TypeVar("R", messages.Reply, messages.WorldReply, messages.RunReply)
@@ -54,6 +56,19 @@ def send_order(
         reply, why = _read(answers, keys.order(robot), messages.Reply, robot)
         replies[robot] = reply or messages.Reply(robot, ok=False, phase="unknown", reason=why or "no answer")
     return replies
+
+
+def send_stop_order(session: zenoh.Session, keys: Keys, robots: Sequence[str]) -> dict[str, messages.Reply]:
+    """Order robots to stop and return their replies; a refusal for one that does not report in time that it stopped."""
+    statuses = pubsub.pose_subscriber(session, keys.status("*"), 4096)
+    inbox = pubsub.Inbox(statuses, messages.Status, keys=keys)
+    replies = send_order(session, keys, robots, messages.Order("stop"))
+    moving = {name for name, reply in replies.items() if reply.ok}
+    deadline = time.monotonic() + STOP_ANSWER_S
+    while moving and time.monotonic() < deadline:
+        moving -= {status.robot for status in inbox.read() if status.phase == STOPPED}
+        time.sleep(STOP_AGAIN_S)
+    return replies | {name: messages.Reply(name, ok=False, phase="landing", reason=UNKNOWN) for name in moving}
 
 
 def send_world_order(session: zenoh.Session, keys: Keys, order: messages.WorldOrder) -> messages.WorldReply:
@@ -225,7 +240,9 @@ class EmergencyStop:
             self.moving = set(self.seen)
             begun = time.monotonic()  # after the question who is there, which may take as long
             watch = pubsub.AliveWatch(session, keys.alive("*"))
-            while (self.moving or self._awaited(session, begun)) and time.monotonic() < begun + STOP_ANSWER_S:
+            while (now := time.monotonic()) < begun + STOP_ANSWER_S and (
+                self.moving or now < begun + LOOK_S or self._awaited(session, begun)
+            ):
                 urgent.put(payload)
                 time.sleep(STOP_AGAIN_S)
                 for token, there in watch.changes():
@@ -234,6 +251,9 @@ class EmergencyStop:
                         self.seen.add(robot)
                         self.moving.add(robot)
                 for status in inbox.read():
+                    if status.robot not in self.seen and status.reason.startswith(messages.EMERGENCY):
+                        self.seen.add(status.robot)  # it has no token, because a hazard was landing it
+                        self.moving.add(status.robot)
                     if status.phase == STOPPED:
                         self.moving.discard(status.robot)
 

@@ -41,6 +41,7 @@ from experiments.real_time.hosts.run_registry import RegisteredRun, StopReport, 
 from experiments.recording.playback import read
 from tests.experiments import recordings as rec
 from tests.experiments.recordings import START, status
+from tests.fuzz.messages import sent
 from tests.network import Net, Reply, Sample
 from tests.small import changed, pair
 from tests.waiting import ManualClock, until
@@ -336,6 +337,34 @@ def test_stop_is_repeated_although_a_router_hangs(monkeypatch):
         stop.send("a test")
     assert (stop.failure, stop.moving) == (None, {"A"})
     assert len(stops) > orders.STOP_ANSWER_S / orders.STOP_AGAIN_S
+
+
+@pytest.mark.parametrize(("phase", "moving"), [("landing", {"B"}), ("done", set())])
+def test_stop_names_robots_without_a_token(phase, moving, monkeypatch):
+    with Net().worn() as net:
+        said = sent("park/B/status", changed(status("B", at=1.0), phase=phase, reason="emergency stop by me"))[0]
+        monkeypatch.setattr(orders, "time", ManualClock())
+        monkeypatch.setattr(orders, "alive", lambda *_: set())
+        monkeypatch.setattr(orders, "closing_cleanly", lambda session: nullcontext((session, [])))
+        monkeypatch.setattr(orders, "stop_publisher", lambda *_: SimpleNamespace(put=lambda _: net.deliver(said)))
+        stop = orders.EmergencyStop(["tcp/127.0.0.1:1"], "park", "operator")
+        stop.send("a test")
+    assert (stop.failure, stop.seen, stop.moving) == (None, {"B"}, moving)
+
+
+@pytest.mark.parametrize(("phase", "ok"), [("landing", False), ("done", True)])
+def test_order_to_stop_waits_for_the_motors(phase, ok, monkeypatch):
+    said = sent("park/A/status", changed(status("A", at=1.0), phase=phase))[0]
+    with Net().worn() as net:
+
+        def answer(*_):
+            net.deliver(said)
+            return {"A": messages.Reply("A", ok=True, phase="done")}
+
+        monkeypatch.setattr(orders, "time", ManualClock())
+        monkeypatch.setattr(orders, "send_order", answer)
+        reply = orders.send_stop_order(net.session, KEYS, ["A"])["A"]
+    assert (reply.ok, "NOT known to have stopped" in reply.reason) == (ok, not ok)
 
 
 def test_stop_without_robots_ends_the_run():

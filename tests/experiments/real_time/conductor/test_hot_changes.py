@@ -217,6 +217,25 @@ def test_a_lost_robot_is_started_again_three_times(monkeypatch):
     assert (stage.robots["KH01"].left_because, stage.said[-1]) == ("lost", ("given up", "KH01", "lost 4 times"))
 
 
+@pytest.mark.parametrize(
+    ("calmed", "reason", "restarts"),
+    [
+        ("KH01", "ordered to land", 0),
+        ("KH01", "ordered to stop", 0),
+        ("CF01", "ordered to hold", 0),
+        ("CF01", "ordered to land", 1),
+        ("CF01", "", 1),
+    ],
+)
+def test_no_robot_restarts_by_itself_among_people(calmed, reason, restarts, monkeypatch):
+    stage = Stage(monkeypatch, on_loss="restart")
+    stage.robots[calmed].status = changed(stage.robots[calmed].status, reason=reason)
+    stage.end("KH01")
+    stage.go_on(5.0)
+    assert stage.did == [("start", "KH01")] * restarts
+    assert [kind for kind, *_ in stage.said].count("given up") == 1 - restarts
+
+
 def test_a_spare_takes_over_once(monkeypatch):
     stage = Stage(monkeypatch, on_loss="replace")
     stage.end("CF01")
