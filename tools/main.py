@@ -98,7 +98,7 @@ def _plain(message: str) -> str:
 
 
 def _remedy(words: Sequence[str], message: str, epilog: str) -> str:
-    """What to do about a wrong use of the command `words`; an emergency stop that was not sent is said first."""
+    """Remedy for a wrong use of the command `words`; of an emergency stop it says that nothing was stopped."""
     if [*words] == ["estop"] or re.match(r"no such command '(e-?)?stop\W*'", message.lower()):
         return "NOTHING WAS STOPPED: `./zenpark estop` stops all, `./zenpark robot stop NAME` one"
     examples = epilog.split("./zenpark ")[1:]

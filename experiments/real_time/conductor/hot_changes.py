@@ -118,7 +118,7 @@ class HotChanges:
         self._begin(_Asked(messages.RunOrder(policy, names, operator="on_loss")))
 
     def _calmed_by_operator(self, name: str) -> str:
-        """Which robot an operator holds, or has landed or stopped if it is this one; empty: none.
+        """Robot that an operator holds, or has landed or stopped if it is this one, in words; empty: none.
 
         Such an operator may be among the robots, of which none takes off by itself then.
         """
