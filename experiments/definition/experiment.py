@@ -351,7 +351,9 @@ class Criterion(FileTable, frozen=True):
 
     metric: Annotated[str | None, doc('metric, also in a file beside this ("way.py:Way"); or give `measure`')] = None
     measure: Annotated[str | None, doc("number that the law measures, averaged over the last second of the run")] = None
-    of: Annotated[str, doc("mean over robots, worst (largest for `at_most`, smallest for `at_least`), or name")] = MEAN
+    of: Annotated[
+        str, doc("mean over robots, worst (largest for `at_most`, smallest for `at_least`: one limit), or name")
+    ] = MEAN
     case: Annotated[str | None, doc("judged case; left out: each case")] = None
     at_most: Annotated[float | None, doc("upper limit, in the unit of the metric")] = None
     at_least: Annotated[float | None, doc("lower limit, in the unit of the metric")] = None
@@ -365,6 +367,8 @@ class Criterion(FileTable, frozen=True):
             raise ValueError("a criterion needs a limit; add at_most = 0.5, or at_least")
         if self.at_most is not None and self.at_least is not None and self.at_least > self.at_most:
             raise ValueError("`at_least` is above `at_most`; exchange them")
+        if self.of == WORST and None not in (self.at_most, self.at_least):
+            raise ValueError("the worst robot has one limit, since two are of different robots; write two criteria")
         if self.relative_to is not None and self.relative_to == self.case:
             raise ValueError("`relative_to` names the case that is judged; name another one")
 

@@ -62,7 +62,8 @@ def judge(cases: Sequence[CaseMetrics]) -> list[Judgement]:
     found = []
     for asked in [*{msgspec.json.encode(each): each for case in cases for each in case.criteria}.values()]:
         names = [name for name in runs if asked.case in (None, name) and name != asked.relative_to]
-        there = {each.seed: _value(asked, each) for each in runs.get(asked.relative_to or "", ())}
+        reference = runs.get(asked.relative_to or "", ())
+        there = {each.seed: None if each.spoiled else _value(asked, each) for each in reference}
         found += [Judgement(asked, name, _values(asked, runs[name], there), _measures(runs[name])) for name in names]
         if not names:
             found.append(Judgement(asked, "", {}))
@@ -115,11 +116,13 @@ def _measures(runs: Sequence[CaseMetrics]) -> tuple[str, ...]:
 def _values(
     asked: Criterion, runs: Sequence[CaseMetrics], reference: Mapping[int, float | None]
 ) -> dict[int, float | None]:
-    """Judged values by seed; empty where the reference was not run."""
+    """Judged values by seed; empty where the reference was not run, and unknown ratios of spoiled runs."""
     values = {run.seed: _value(asked, run) for run in runs}
     if asked.relative_to is None:
         return values
-    return {seed: ratio(value, reference.get(seed)) for seed, value in values.items()} if reference else {}
+    spoiled = {run.seed for run in runs if run.spoiled}
+    ratios = {seed: ratio(value, reference.get(seed)) for seed, value in values.items()}
+    return {seed: None if seed in spoiled else value for seed, value in ratios.items()} if reference else {}
 
 
 def _value(asked: Criterion, run: CaseMetrics) -> float | None:

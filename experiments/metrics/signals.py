@@ -5,19 +5,21 @@ Positions that are unknown are NaN; nothing here lets one robot's NaN reach anot
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Callable, Mapping, Sequence, ValuesView
+from dataclasses import dataclass, fields, replace
+from functools import cached_property, wraps
 from itertools import pairwise
 from math import inf, nan
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
+from msgspec import structs
 
 from agents.plugins.laws import Distance, Gradient
 from agents.plugins.predictors import HOLD, Predictor
 from agents.safety.hazards import OVER, QUIET_S, UNRESOLVED, is_blind
 from agents.vectors import Vector
+from experiments.arrays import ArrayTable
 from experiments.definition.formation import errors_over_time
 from experiments.definition.graph import Links
 from experiments.metrics.clearance import Clearance
@@ -303,31 +305,65 @@ def link_deliveries(trace: Trace) -> tuple[LinkDelivery, ...]:
     )
 
 
+Value = TypeVar("Value")
+
+
+def _kept(of: Callable[[Any], Value]) -> cached_property[Value]:
+    """Property that is computed once; its arrays cannot be changed, since several metrics read them."""
+
+    @wraps(of)
+    def computed(measurement: Measurement) -> Value:
+        found = of(measurement)
+        several = vars(found).values() if isinstance(found, LinkErrors) else found
+        for each in several if isinstance(several, (Sequence, ValuesView)) else (found,):
+            if isinstance(each, np.ndarray):
+                each.flags.writeable = False
+        return found
+
+    return cached_property(computed)
+
+
+def _locked_copy(trace: Trace) -> Trace:
+    """The same trace, with arrays that cannot be changed."""
+
+    def locked(value: Any) -> Any:  # noqa: ANN401 - any field of a trace
+        if isinstance(value, np.ndarray):
+            value = value.view()
+            value.flags.writeable = False
+        elif isinstance(value, ArrayTable):
+            value = structs.replace(value, **{name: locked(each) for name, each in structs.asdict(value).items()})
+        elif isinstance(value, Mapping):
+            value = {name: locked(each) for name, each in value.items()}
+        return value
+
+    return replace(trace, **{each.name: locked(getattr(trace, each.name)) for each in fields(trace)})
+
+
 class Measurement:
     """Quantities of a trace of T samples and N robots that several metrics need; unknown numbers are NaN.
 
     All errors are taken on true positions. A robot that died has NaN positions from then on: its links are left out
-    from that moment.
+    from that moment. No array can be changed, see `_kept`: a metric would falsify the others.
     """
 
     def __init__(self, trace: Trace) -> None:
-        self.trace = trace
+        self.trace = _locked_copy(trace)
         self.has_errors = isinstance(trace.plan.law, Gradient)  # only gradient laws measure errors of links
         leading = trace.plan.leaders
         self.leaders = () if len(leading) == len(trace.robots) else leading  # robots that means leave out
         self.bounds = bounds_of(trace)  # phases
 
-    @cached_property
+    @_kept
     def window(self) -> int:
         """Samples of the moving mean."""
         return max(1, round(WINDOW_S / float(self.trace.time[1] - self.trace.time[0])))
 
-    @cached_property
+    @_kept
     def errors(self) -> LinkErrors:
         """Errors of the links [m]."""
         return LinkErrors.of_trace(self.trace)
 
-    @cached_property
+    @_kept
     def robot_errors(self) -> Array:
         """e_i(t) = Σ_j e_ij (T, N) [m] over the own links of each robot; NaN where none of them is known."""
         error, own = self.errors.error, self.errors.own
@@ -336,7 +372,7 @@ class Measurement:
         total[known.astype(float) @ own == 0.0] = np.nan
         return np.asarray(total)
 
-    @cached_property
+    @_kept
     def integrals(self) -> tuple[Array, Array, Array]:
         """∫ e dt [m s], ∫ t·e dt [m s²] and √(mean e²) [m] of each robot, (N,) each."""
         total, time = self.robot_errors, self.trace.time
@@ -344,17 +380,17 @@ class Measurement:
         iae, itae = np.where(np.isfinite(rmse), [integral(total, time), integral(time[:, None] * total, time)], np.nan)
         return iae, itae, np.asarray(rmse)
 
-    @cached_property
+    @_kept
     def clearance(self) -> Clearance:
         """Distances between surfaces."""
         return Clearance.of_trace(self.trace)
 
-    @cached_property
+    @_kept
     def belief(self) -> Array:
         """Errors of the believed positions (T, E) [m], see `signals.belief_errors`."""
         return belief_errors(self.trace, self.errors.net)
 
-    @cached_property
+    @_kept
     def cost(self) -> float:
         """J2 of the authors' benchmark (`benchmark_evaluation.m` of 2024), summed over the robots that receive poses.
 
@@ -399,30 +435,30 @@ class Measurement:
             cost += effort + 0.05 * float(integral(e, t)[0]) + 0.005 * float(integral(t[:, None] * e, t)[0])
         return cost
 
-    @cached_property
+    @_kept
     def known(self) -> Array:
         """Share of the time at which each robot was to be there, at which its position is known (N,); 0 without any."""
         there = self.errors.there
         return np.asarray((self.errors.alive & there).sum(axis=0) / np.maximum(there.sum(axis=0), 1))
 
-    @cached_property
+    @_kept
     def died(self) -> tuple[str, ...]:
         """Followers without a known position for too long: means leave them out."""
         names = zip(self.trace.robots, self.known, strict=True)
         return tuple(name for name, share in names if share < KNOWN and name not in self.leaders)
 
-    @cached_property
+    @_kept
     def kept(self) -> list[int]:
         """Rows of the robots in the means."""
         out = {*self.leaders, *self.died}
         return [i for i, name in enumerate(self.trace.robots) if name not in out]
 
-    @cached_property
+    @_kept
     def acquired(self) -> list[float | None]:
         """Acquisition of each robot in the first phase [s]; None if never."""
         return [each.acquired_s for each in self.phases[0]]
 
-    @cached_property
+    @_kept
     def phases(self) -> list[list[PhaseMetrics]]:
         """Per phase and robot: time of acquisition and residual error."""
         found = []
@@ -432,14 +468,14 @@ class Measurement:
             found.append([PhaseMetrics(start, when, *left) for when, left in zip(acquired, worst, strict=True)])
         return found
 
-    @cached_property
+    @_kept
     def together(self) -> tuple[float | None, ...]:
         """Per phase: from when on all robots in the means have acquired [s]; None if one never does."""
         linked = [i for i in self.kept if self.errors.own[:, i].any()]
         times = [[when for i in linked if (when := phase[i].acquired_s) is not None] for phase in self.phases]
         return tuple(max(each) if each and len(each) == len(linked) else None for each in times)
 
-    @cached_property
+    @_kept
     def rotation(self) -> tuple[float | None, ...]:
         """Per phase: net rotation of the robots in the means from acquisition on [rad/s]; None before any shape."""
         place, time = self.trace.true_position[:, self.kept], self.trace.time
@@ -450,14 +486,14 @@ class Measurement:
             found.append(net_rotation(place[after:end], time[after:end]) if formed else None)
         return tuple(found)
 
-    @cached_property
+    @_kept
     def settled(self) -> list[float | None]:
         """From when on the error of each robot stays in its 2 % band [s]; None if never."""
         total = self.robot_errors
         unsettled = ~(total <= BAND * np.where(np.isfinite(total), total, 0.0).max(axis=0))
         return after_last(unsettled & (self.errors.there | np.isfinite(total)), self.trace.time)
 
-    @cached_property
+    @_kept
     def transmissions(self) -> tuple[Index, Index]:
         """Poses sent by each robot, by their running numbers, and those of them in the recording, (N,) each."""
         trace, rows = self.trace, range(len(self.trace.robots))
@@ -466,7 +502,7 @@ class Measurement:
         missing = [count_unrecorded(zip(*columns, strict=True), rate) for columns in poses]
         return recorded + np.array(missing, dtype=np.intp), recorded
 
-    @cached_property
+    @_kept
     def rate(self) -> Array:
         """Poses that each robot sent in a second, from when it takes part (N,) [Hz]."""
         trace, time, sent = self.trace, self.trace.time, self.transmissions[0]
@@ -475,12 +511,12 @@ class Measurement:
         early = np.array([(trace.sent_by(i).stamp < when).sum() for i, when in enumerate(joined)], dtype=np.intp)
         return np.asarray((sent - early) / present)
 
-    @cached_property
+    @_kept
     def waits(self) -> list[Array]:
         """Times between the transmissions of each robot [s]."""
         return [np.diff(np.sort(self.trace.sent_by(i).stamp)) for i in range(len(self.trace.robots))]
 
-    @cached_property
+    @_kept
     def payload(self) -> Index:
         """Payload that each robot sent (N,) [bytes]."""
         sent = self.trace.sent
@@ -488,7 +524,7 @@ class Measurement:
         size = np.bincount(sent.link, weights=sent.bytes, minlength=len(self.trace.robots))
         return size.astype(np.intp)
 
-    @cached_property
+    @_kept
     def dropped(self) -> Index:
         """Poses of each robot that the modelled network dropped, over all receivers (N,)."""
         rows, dropped = len(self.trace.robots), self.trace.dropped

@@ -26,6 +26,7 @@ SUFFIX: Final = ".zip"
 LEFT_OUT: Final = ("logs", f"{ORIGIN}.new")  # of the run's folder
 DATE: Final = (2000, 1, 1, 0, 0, 0)  # of every member: the same run makes the same archive
 SUMS: Final = "SHA256SUMS"
+TABLE: Final = "metrics.csv"
 PIECE: Final = 1 << 20  # [bytes] in memory at once
 MAX_BUNDLE_BYTES: Final = 1 << 34  # [bytes] of all members together
 # what the library raises of archives that are damaged, ciphered or of another method
@@ -156,12 +157,19 @@ def differences(repeated: Path, former: Path) -> list[str]:
         old, new = dict(flattened(theirs)), dict(flattened(mine))
         changed = [path for path in sorted(old.keys() | new.keys()) if old.get(path) != new.get(path)]
         found.append("figures: " + ", ".join(f"{path} {old.get(path)} → {new.get(path)}" for path in changed[:5]))
-    for file in sorted(former.glob("*.mcap")):
-        if not (repeated / file.name).exists():
-            found.append(f"{file.name} is missing")
-        elif _messages(repeated / file.name) != _messages(file):
-            found.append(f"{file.name}: other messages")
+    if (repeated / TABLE).exists() and not _same(repeated / TABLE, former / TABLE):
+        found.append(f"{TABLE}: another table")
+    for name in sorted({file.name for folder in (repeated, former) for file in folder.glob("*.mcap")}):
+        mine, theirs = repeated / name, former / name
+        if not (mine.exists() and theirs.exists()):
+            found.append(f"{name} is missing {'in the bundle' if mine.exists() else 'in the repeated run'}")
+        elif _messages(mine) != _messages(theirs):
+            found.append(f"{name}: other messages")
     return found
+
+
+def _same(mine: Path, theirs: Path) -> bool:
+    return theirs.is_file() and mine.read_bytes() == theirs.read_bytes()
 
 
 def _messages(file: Path) -> str:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 NONE: Final = "–"
+MOST_DECIMALS: Final = 6  # of an interval; smaller ones have an exponent
 
 
 Cell = str | tuple[str, str]  # a text, or a text and a smaller one behind it
@@ -63,7 +64,9 @@ def interval(values: Spread, scale: float = 1.0) -> str:
     ):  # values that differ by rounding
         return number(values.mean, scale)
     mean, half = values.mean * scale, values.ci95 * scale
-    decimals = min(6, max(0, -math.floor(math.log10(half)), 2 - math.floor(math.log10(max(abs(mean), half)))))
+    decimals = max(0, -math.floor(math.log10(half)), 2 - math.floor(math.log10(max(abs(mean), half))))
+    if decimals > MOST_DECIMALS:
+        return f"{number(mean)} ± {half:.0e}"
     return f"{mean:,.{decimals}f} ± {half:,.{decimals}f}".replace(",", "\u202f").replace("-", "−")
 
 

@@ -13,7 +13,7 @@ from experiments.file.problems import Fault
 from twins import scene as outlines
 from twins.scene import Scene
 
-_WALL: Final = "wall"  # name of the border of the arena in contacts
+WALL: Final = "wall"  # name of the border of the arena in contacts
 _ROUNDING: Final = 1e-9  # [m]
 
 
@@ -25,8 +25,8 @@ def arena_faults(arena: Arena, robots: Mapping[str, RobotTable]) -> Iterator[Fau
     x, y, z = arena.size
     for number, (name, obstacle) in enumerate(arena.obstacles.items()):
         path = ("arena", "obstacles", name)
-        if name == _WALL:
-            message = f"an obstacle cannot be called '{_WALL}', which means the border of the arena"
+        if name == WALL:
+            message = f"an obstacle cannot be called '{WALL}', which means the border of the arena"
             yield Fault(path, message, "rename it", on_key=True)
         if name in robots:
             yield Fault(path, f"'{name}' is the name of a robot already", "rename one of them", on_key=True)

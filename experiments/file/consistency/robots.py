@@ -13,6 +13,7 @@ from agents.plugins.registry import did_you_mean
 from agents.protocols.vicon_datastream import parse_server
 from experiments.definition.bodies import body_faults, device_struct, driven_kind
 from experiments.definition.experiment import MEAN, VICON, VICON_TWIN, WORLD, WORST, Experiment, RobotTable
+from experiments.file.consistency.arena import WALL
 from experiments.file.problems import Fault
 from experiments.file.structure import table_faults
 from twins.engines.engine import EngineFactory, require_carried
@@ -21,7 +22,7 @@ from twins.sensing.range_sensors import sensors
 
 _ROLES: Final = ("recorder", "world", "centre", "vicon")  # processes of a case beside those of its robots
 # words of keys, of [disturbance], of events and of tables of results
-_RESERVED: Final = ("all", "estop", "run", "conductor", MEAN, WORST, *_ROLES)  # and the kinds of robots
+_RESERVED: Final = ("all", "estop", "run", "conductor", WALL, MEAN, WORST, *_ROLES)  # and the kinds of robots
 
 
 def robot_faults(experiment: Experiment, engine: EngineFactory) -> Iterator[Fault]:

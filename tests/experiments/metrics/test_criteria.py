@@ -94,6 +94,17 @@ def test_what_was_not_run_is_not_judged(cases):
     assert answer(short, metric="f_hz", at_least=0.0) == [False, False]
 
 
+def test_the_worst_robot_has_one_limit():
+    with pytest.raises(ValueError, match="the worst robot has one limit"):
+        Criterion(metric="f_hz", of="worst", at_least=3.0, at_most=50.0)
+
+
+@pytest.mark.parametrize("spoiled", ["periodic", "event"])
+def test_no_ratio_of_a_spoiled_run_passes(cases, spoiled):
+    found = [replace(case, spoiled=("disturbed",) if case.case == spoiled else ()) for case in cases]
+    assert answer(found, metric="f_hz", case="event", relative_to="periodic", at_most=9.0) == [False]
+
+
 def test_every_seed_must_pass():
     runs = simulate_seeds(loads(FILE, *SHORT), [1, 2, 3], cases=["event"])
     found = [case for run in runs for case in run.metrics.values()]

@@ -13,7 +13,7 @@ from experiments.definition.experiment import Criterion
 from experiments.definition.plan import Plan
 from experiments.file.document import load
 from experiments.file.problems import DocumentError
-from experiments.metrics import metric
+from experiments.metrics import metric, signals
 from experiments.metrics.measure import measure
 from experiments.metrics.metric import Metric
 from experiments.metrics.statistics import ratios
@@ -87,6 +87,41 @@ def test_installed_metric_is_everywhere(installed):
     assert all(text in page for text in ("Way [m]", "Length of the path", "Gap [m] of the case", "broken failed"))
     assert "Way [m]" in shelled("report", "run", "--markdown").stdout
     assert read_origin(folder / "run").made_by.plugins == {"my-metrics": "0.1"}
+
+
+class Moves(Metric, frozen=True):
+    label = "Moves"
+
+    def of(self, trace, shared):
+        place = trace.true_position
+        place -= place[0]
+        return place[-1, :, 0]
+
+
+class Grows(Metric, frozen=True):
+    label = "Grows"
+
+    def of(self, trace, shared):
+        shared.robot_errors[:] *= 2.0
+        return shared.robot_errors[-1]
+
+
+class Late(Metric, frozen=True):
+    label = "Late"
+
+    def of(self, trace, shared):
+        shared.trace.sent.stamp[:] += 1.0
+        return shared.rate
+
+
+def test_no_metric_changes_what_others_read(short_trace):
+    shared = signals.Measurement(short_trace)
+    before = short_trace.true_position.copy(), shared.robot_errors.copy(), short_trace.sent.stamp.copy()
+    values, failed = metric.values_of({"moves": Moves(), "grows": Grows(), "late": Late()}, shared)
+    assert all("read-only" in each for each in failed)
+    assert [*map(set, values.values())] == [{None}] * len(failed) == [{None}] * 3
+    after = short_trace.true_position, shared.robot_errors, short_trace.sent.stamp
+    assert all(np.array_equal(*each, equal_nan=True) for each in zip(before, after, strict=True))
 
 
 @pytest.mark.slow

@@ -71,6 +71,16 @@ def test_what_comes_out_otherwise_is_said(bundled, tmp_path):
     assert "[0].mean.iae" in found[0]
 
 
+def test_a_bundle_without_its_results_is_not_repeated(bundled, tmp_path):
+    unpacked = tmp_path / "former"
+    bundle.unpack(bundled / "run.zip", unpacked)
+    (unpacked / "event.mcap").unlink()
+    table = unpacked / "metrics.csv"
+    table.write_text(table.read_text("utf-8").replace("event", "events"), "utf-8")
+    found = bundle.differences(bundled / "run", unpacked)
+    assert found == ["metrics.csv: another table", "event.mcap is missing in the bundle"]
+
+
 @pytest.mark.parametrize(
     ("member", "says"),
     [("experiment_toml", "experiment.toml is not what was put into it"), ("SHA256SUMS", "nothing.txt is missing")],

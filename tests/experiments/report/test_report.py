@@ -12,7 +12,7 @@ import pytest
 from agents.network.messages import Contact, Event, WorldState
 from experiments.definition.experiment import Arena, Shadow, Start
 from experiments.metrics.measure import measure
-from experiments.metrics.statistics import spread
+from experiments.metrics.statistics import Spread, spread
 from experiments.recording.run_folder import RunOrigin
 from experiments.report import report
 from experiments.report.metrics_files import write_csv
@@ -299,6 +299,8 @@ def test_numbers_have_the_digits_that_they_bear():
     texts = {None: "–", 0.0: "0", 2: "2", 0.2881: "0.288", -4.76: "−4.76", 20517.4: "20\u202f517", 1.234e-4: "1.2e-04"}
     assert [number(value) for value in texts] == [*texts.values()]
     assert [interval(spread(values)) for values in ([4.55, 4.57, 4.59], [50.0] * 2, [])] == ["4.57 ± 0.05", "50.0", "–"]
+    assert interval(Spread(-1.23e-7, None, 3.4e-8, 5)) == "−1.2e-07 ± 3e-08"
+    assert interval(Spread(50.0, None, 1e-7, 5)) == "50.0 ± 1e-07"
 
 
 def test_losses_sum_over_robots_and_seeds_everywhere():
