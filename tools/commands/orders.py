@@ -69,6 +69,10 @@ UNDER_WAY: Final[Mapping[messages.OrderKind, Sequence[str]]] = {
     "takeoff": ("airborne", "running"),
     "start": ("running",),
 }
+UNCHANGED: Final[Mapping[messages.OrderKind, str]] = {
+    "takeoff": "is {} already",
+    "start": "is {} already; if it was held, it goes on",
+}
 # changes of a run, which its conductor makes
 CHANGES: Final[Mapping[messages.ChangeKind, str]] = {
     "remove": "Land robots and end their processes; the others go on without them.",
@@ -133,7 +137,7 @@ def _order_robots(what: messages.OrderKind, robots: Sequence[str], by: Operator)
         _, does = ORDERS.get(what, ("", "has stopped"))
         already = UNDER_WAY.get(what, ())
         done = {
-            name: reply.reason or (f"is {reply.phase} already" if reply.phase in already else does)
+            name: reply.reason or (UNCHANGED[what].format(reply.phase) if reply.phase in already else does)
             for name, reply in replies.items()
             if reply.ok
         }

@@ -423,7 +423,8 @@ class Conductor(CaseRun):
         return status.reason or f"it is {status.phase}"
 
     def start_failure(self, names: Sequence[str], what: str) -> str:
-        moved = "a take-off was ordered: robots may have moved, all are landed" if self._lifted else "nothing has moved"
+        flown = self._lifted or any(view.reached("airborne") for view in self._robots.values())
+        moved = "a take-off was ordered: robots may have moved, all are landed" if flown else "nothing has moved"
         lines = [f"{', '.join(names)}: {what}; {moved}"]
         for name in names:
             gone = self._robots[name].gone  # then the event of its end has shown the last line of its output

@@ -9,6 +9,8 @@ from dataclasses import dataclass, field
 from math import inf
 from typing import Final, Literal
 
+import zenoh
+
 from agents.clock import Clock
 from agents.decision.lifecycle import FINISHED, SCRIPTED, TOLD_TO_END, Phase
 from agents.errors import ExplainedError
@@ -28,6 +30,8 @@ ORDER: Final = tuple(phase.word for phase in Phase)
 AHEAD_S: Final = -0.02  # what comes before it was said is from a clock that is ahead [s],
 BEHIND_S: Final = 0.1  # and what always takes this long, from one that is behind
 FROZEN_S: Final = 3.0  # age of a status from which on a robot is shown as silent
+OTHERS_S: Final = 3.0  # limit for the conductor of the case before to leave the network
+LOOK_S: Final = 0.2  # between two looks for it
 ROUTER_S: Final = 10.0  # limit for a router that was just started to answer
 MISSED_S: Final = 1.0  # a robot that changes from one router to another is back sooner
 STILL_S: Final = 3.0  # a recorder without a token for longer than this is killed, and started again
@@ -116,6 +120,21 @@ class RunFailed(ExplainedError):
     """A run that could not begin or go on, with reason and remedy."""
 
 
+def await_sole_conductor(session: zenoh.Session, keys: Keys) -> None:
+    """Wait until no other conductor is in the realm: that of the case before is just leaving.
+
+    Raises RunFailed if one stays: its robots would get the orders of both.
+    """
+    deadline = time.monotonic() + OTHERS_S
+    while network.tokens_present(session, keys.conductor):
+        if time.monotonic() > deadline:
+            raise RunFailed(
+                f"another run is up at this router, in the realm '{keys.realm}': its robots would take the orders of "
+                "both; wait for its end, or choose another network.realm"
+            )
+        time.sleep(LOOK_S)
+
+
 class NetworkView:
     """The network as the conductor of a case sees it."""
 
@@ -130,6 +149,8 @@ class NetworkView:
         self.session, declared = stack.enter_context(closing_cleanly(opened))
         declared.append(self)
         session = self.session
+        if experiment.network.connect is not None:  # a router of our own has no other runs
+            await_sole_conductor(session, keys)
         self._events = pubsub.pose_publisher(session, keys.event, messages.JSON, pubsub.EVENTS)
         if list(endpoints) != [DEFAULT_ENDPOINT]:
             network_file = f"--connect @{context.folder / mesh.ENDPOINTS}"

@@ -27,7 +27,7 @@ from experiments.definition.experiment import Formation, Host, RobotTable, Start
 from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.file.problems import DocumentError
-from experiments.real_time.conductor import conduct, orders
+from experiments.real_time.conductor import conduct, orders, run_view
 from experiments.real_time.conductor import conductor as module
 from experiments.real_time.conductor.case_processes import STARTS, CaseContext, CaseProcesses, Death
 from experiments.real_time.conductor.conduct import PORT_CHOICES, RunOptions, Supervision, run_setup, with_bodies
@@ -365,6 +365,24 @@ def test_order_to_stop_waits_for_the_motors(phase, ok, monkeypatch):
         monkeypatch.setattr(orders, "send_order", answer)
         reply = orders.send_stop_order(net.session, KEYS, ["A"])["A"]
     assert (reply.ok, "NOT known to have stopped" in reply.reason) == (ok, not ok)
+
+
+@pytest.mark.parametrize(("leaves_at", "refused"), [(0.0, False), (1.0, False), (9.0, True)])
+def test_robots_of_another_run_are_not_taken(leaves_at, refused, monkeypatch):
+    clock = ManualClock(0.0)
+    there = lambda *_: {KEYS.conductor} if clock.now < leaves_at else set()  # noqa: E731
+    monkeypatch.setattr(run_view, "time", clock)
+    monkeypatch.setattr(run_view.network, "tokens_present", there)
+    with pytest.raises(RunFailed, match="another run is up at this router") if refused else nullcontext():
+        run_view.await_sole_conductor(MagicMock(), KEYS)
+
+
+def test_failure_says_what_others_have_moved():
+    course = Course({0.0: "running"})
+    course._lifted, (name, view) = False, next(iter(course.robots.items()))
+    assert "nothing has moved" in course.start_failure([name], "late")
+    view.status = changed(status(name, at=0.0), phase="airborne")
+    assert "robots may have moved" in course.start_failure([name], "late")
 
 
 def test_stop_without_robots_ends_the_run():
