@@ -200,7 +200,8 @@ def converted(value: Any) -> Any:  # noqa: ANN401 - any field of a struct
     """A value as `savemat` takes it: a number as double, unknown as NaN, an array of texts for a cell array."""
     match value:
         case dict():
-            return {name: converted(each) for name, each in value.items()}
+            names = matlab_names(name for name in value if not name.isidentifier())  # metrics in files
+            return {names.get(name, name): converted(each) for name, each in value.items()}
         case str():
             return value
         case list() | tuple() if all(isinstance(each, str) for each in value):

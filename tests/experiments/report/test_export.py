@@ -73,6 +73,11 @@ def test_arrays_come_back_as_they_were(recorded_run, mat):
     assert (raw["robots"].shape, raw["robots"].dtype, raw["time"].shape) == ((3, 1), object, (201, 1))
 
 
+def test_metrics_of_files_have_names_for_matlab():
+    found = export.converted({"way.py:Way": [1.0, None], "a_b": {"of file.py:Way": 2.0}})
+    assert ([*found], [*found["a_b"]]) == (["way_py_Way", "a_b"], ["of_file_py_Way"])
+
+
 def test_who_spoke_and_who_listens_count_from_one(recorded_run, mat):
     trace, read = recorded_run[1].traces["event"], mat["event"]
     sent, links, net = read["sent"], read["links"], trace.plan.links
