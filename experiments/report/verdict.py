@@ -309,9 +309,10 @@ def _against_the_first(cases: Sequence[CaseMetrics]) -> Lines:
             share = f"{abs(fewer):.1f}"
             how = f"{share} % {'fewer' if fewer > 0.0 else 'more'}" if float(share) else "as many"
             how += f" transmissions {'than' if float(share) else 'as'} {reference}"
-            means = [interval(spread([run.mean["f_hz"] for run in group])) for group in (runs, first)]
+            compared = [[run for run in group if not run.spoiled] for group in (runs, first)]
+            means = [interval(spread([run.mean["f_hz"] for run in group])) for group in compared]
             text = f"{name} needs {how}: f {means[0]} rather than {means[1]} Hz"
-            text += f"{_with_leaders(runs, first)}{some}."
+            text += f"{_with_leaders(*compared)}{some}."
             yield VerdictLine("good" if fewer > 0.0 and float(share) and not some else "plain", text)
         errors = [(OURS[name].label, spread(ratios(runs, first, name))) for name in ERRORS]
         known = [(label, each) for label, each in errors if each.mean is not None]

@@ -230,9 +230,10 @@ def test_spoiled_runs_have_neither_ratio_nor_praise(live_trace, tmp_path):
 def test_a_spoiled_seed_is_left_out_of_ratios(live_trace):
     first = [replace(measure(live_trace), seed=seed) for seed in (1, 2, 3)]
     others = [replace(each, case="event") for each in first]
-    others[1] = replace(others[1], spoiled=("robots failed",))
+    rate = others[1].mean["f_hz"]
+    others[1] = replace(others[1], spoiled=("robots failed",), mean=others[1].mean | {"f_hz": 100.0 * rate})
     assert ratios(others, first, "iae") == ratios(first, others, "iae") == [1.0, None, 1.0]
-    assert "seeds compared: 2 of 3" in texts(*first, *others)
+    assert f"f {number(rate)} rather than {number(rate)} Hz (seeds compared: 2 of 3)" in texts(*first, *others)
 
 
 def test_integrals_over_holes_are_not_compared(live_trace):
