@@ -11,6 +11,7 @@ import msgspec
 from experiments.metrics.results import CaseMetrics
 
 MISSED: Final = 0.01  # share of missed deadlines from which on a run is spoiled
+STALLED: Final = 0.05  # share of those of one robot: among many others a robot that stood still would not show
 LOST: Final = 0.01  # share of lost poses from which on a run is spoiled
 SLOW: Final = 0.9  # real-time factor of a world below which a run is spoiled
 BY_OPERATOR: Final = "by an operator"
@@ -29,6 +30,8 @@ def reasons(case: CaseMetrics) -> tuple[str, ...]:
         found.append(f"too little is known of {', '.join(case.died)}")
     if missed >= MISSED:
         found.append(f"{100.0 * missed:.2g} % of the deadlines were missed")
+    elif stalled := [each.robot for each in case.robots if (each.missed_share or 0.0) >= STALLED]:
+        found.append(f"{', '.join(stalled)} missed {100.0 * STALLED:g} % of its deadlines or more")
     if lost >= LOST:
         found.append(f"{100.0 * lost:.2g} % of the poses were lost")
     by_operators = [each for each in case.troubles if BY_OPERATOR in each]

@@ -61,7 +61,7 @@ def shortened(words: list[str]) -> list[str]:
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("guide", [*SHORT, *(pytest.param(guide, marks=pytest.mark.nightly) for guide in LONG)])
-def test_a_guide_can_be_followed(guide, tmp_path, monkeypatch):
+def test_a_guide_can_be_followed(guide, hub, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("ZENPARK_RUNTIME_DIR", str(tmp_path / "runs"))
     Path("docs").symlink_to(DOCS)
@@ -70,7 +70,8 @@ def test_a_guide_can_be_followed(guide, tmp_path, monkeypatch):
         if step.kind == "toml":
             Path(step.file).write_text(step.text, "utf-8")
         elif step.kind == "python" and "reopen" not in step.text:
-            exec(compile(step.text, guide, "exec"), {})
+            text = step.text.replace("tcp/127.0.0.1:7447", hub.endpoint)
+            exec(compile(text, guide, "exec"), {"camera": lambda: [(0.1, 0.2, 0.0, 0.3, 1e9)]})
         elif step.kind == "command" and computes(words := shlex.split(step.text)):
             invoke(*shortened(words), code=step.code)
         else:

@@ -79,8 +79,12 @@ def test_both_ends_of_a_link_want_the_same():
     assert asked["C", "B"].relative == (0.0, 0.6, 0.6)  # the heights that they hold
     assert asked["B", "C"].distance == pytest.approx(np.hypot(0.6, 0.6))
     assert {link.target.gain for link in links} == {0.5}  # the stiffness, not the gain of distances
-    gains = {f"{link.sender}{link.receiver}": link.target.gain for link in four_with(MIXED).plan.one_way_links}
-    assert gains == {"AB": 0.5, "CB": 3.0, "BC": 3.0, "AC": 3.0, "DC": 3.0, "CD": 3.0, "AD": 0.5}
+    mixed = four_with(MIXED).plan
+    calm, gains = (
+        mixed.experiment.formation.gain,
+        {f"{e.sender}{e.receiver}": e.target.gain for e in mixed.one_way_links},
+    )
+    assert gains == {"AB": 0.5, "CB": calm, "BC": calm, "AC": calm, "DC": calm, "CD": calm, "AD": 0.5}
     distance = four_with(SQUARE.replace('"displacement"', '"distance"')).plan.formation.links.distance
     assert distance[:2].tolist() == pytest.approx([0.6, np.hypot(0.6, 0.6)])
 
@@ -94,8 +98,9 @@ D = { distance = 0.7, gain = 9.0 }
 [formation.links]
 "A - B" = 0.5
 """
-    anchors = compile_anchors(four_with(anchored).experiment)
-    assert [anchor.gain for (anchor,) in anchors.values()] == [6.0, 0.5, 6.0, 9.0]
+    given = four_with(anchored).experiment
+    anchors, twice = compile_anchors(given), 2.0 * given.formation.gain
+    assert [anchor.gain for (anchor,) in anchors.values()] == [twice, 0.5, twice, 9.0]
     place = np.array([[1.0, 0.0, 0.0], [0.5, 7.0, 0.0], [3.0, 4.0, 0.6], [0.0, 0.7, 0.0]])
     for (anchor,), at in zip(anchors.values(), place.tolist(), strict=True):
         assert anchor.error(tuple(at)) == pytest.approx(0.0, abs=1e-15)

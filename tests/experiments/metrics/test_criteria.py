@@ -204,6 +204,8 @@ def test_run_that_an_operator_changed_is_spoiled(live_trace, events, spoiled):
 
 def test_losses_that_no_recorder_saw_spoil(live_trace):
     good = measure(live_trace)
+    still = replace(good, robots=(replace(good.robots[0], missed_share=0.06), *good.robots[1:]), missed_share=0.009)
+    assert reasons(still) == (f"{good.robots[0].robot} missed 5 % of its deadlines or more",)
     assert reasons(replace(good, world_factor=0.5)) == ("the world ran at 0.50 of real time",)
     assert with_failures(good, []) is good
     told = with_failures(good, ["lost CF01, CF02", "the recorder ended"])

@@ -171,7 +171,8 @@ def test_replaced_process_sends_nothing(what, way, monkeypatch):
     monkeypatch.setattr(Attentive, "silent_since", lambda *_: silent[0])
     ownership = OwnershipCheck([TOKENS[what]], timing=OwnershipTiming(vanish_s=0.0))
     with Net().worn() as net:
-        monkeypatch.setattr(pubsub, "publisher", lambda *_, **__: Counted())
+        for kind in ("publisher", "NumberedPublisher"):
+            monkeypatch.setattr(pubsub, kind, lambda *_, **__: Counted())
         process = (joined_world if what == "world" else centre)(net, ownership=ownership)
         if what == "centre":
             monkeypatch.setattr(process.centre, "decide", lambda *_: [CentreGoal(0, (0.0, 0.0, 0.0), 0.0, 0.0)])
