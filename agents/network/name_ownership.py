@@ -161,7 +161,7 @@ class OwnershipCheck:
         self._alive, self._stood_s, self._timing = alive, 0.5 * lease_s, timing
         self.awake_at = uptime()  # last run of the process [s]
         self.linked = True  # whether the session had a router, or a neighbour in a mesh, at the last look
-        self.contested = False  # by the last answer of a check there is another owner, which may still give way
+        self.contested = False  # True if the last answer named another owner, which may still give way
         self._taken = ""
         self._asking: threading.Thread | None = None
         self._anew = False

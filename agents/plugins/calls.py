@@ -133,7 +133,7 @@ def supervised(limit_s: float = LIMIT_S) -> Iterator[None]:
         os._exit = end
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         signal.signal(signal.SIGALRM, former)
-        if left:  # of a clock that a caller has set
+        if left:  # rest of a timer that a caller has set
             signal.setitimer(signal.ITIMER_REAL, max(left - (time.monotonic() - begun), 1e-3), period)
 
 

@@ -26,7 +26,7 @@ YOUNG_S: Final = 0.1  # 99 % of poses are younger, or the rates are refused
 TURNS: Final = 2  # of a radio through its robots, for which a pose waits at most, behind answers
 PERIOD_S: Final = 0.01  # periods of logs are multiples of this
 SETPOINT_PACKETS: Final = 2  # of one setpoint, each of which is answered: its trajectory, and the start of that
-LAST_CHANNEL: Final = 125  # of a Crazyradio
+LAST_CHANNEL: Final = 125  # highest channel of a Crazyradio
 DEFAULT_ADDRESS: Final = "E7E7E7E7E7"  # of a Crazyflie as it is sold, and of cflib
 ADDRESSES: Final = (
     re.compile(r"radio://[0-9A-Za-z]+/([0-9]|[1-9][0-9]|1[01][0-9]|12[0-5])/(250K|1M|2M)(/[0-9A-Fa-f]{1,10})?(\?.*)?"),

@@ -101,7 +101,7 @@ class Runtime:
         self._stopping: str | None = None
         self._retired: set[int] = set()  # rows that land, or have landed, while the run goes on
         self._cut_off = False  # motors were cut by a stop that the loop has not polled yet
-        self._early_stop: messages.Stop | None = None  # on the lifeline, maybe before there is a network
+        self._early_stop: messages.Stop | None = None  # stop on the lifeline, maybe before there is a network
         self._estimators = [External() for _ in self._names]
         self.states: Sequence[BodyState] = ()  # last reading of the body
         self._opened = self._joined = False

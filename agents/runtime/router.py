@@ -36,8 +36,8 @@ EMPTY_S: Final = 1.0  # no client for this long: a client that lost its connecti
 LOOK_S: Final = 0.1
 PORT_FREE_S: Final = 10.0  # limit for the port of a router that restarts to become free
 AGAIN_S: Final = 0.1
-MOST_TOKENS: Final = 1000  # of a robot: they cost the router 40 ms, three times as many 0.3 s, ten times 4.6 s
-MOST_SESSIONS: Final = 8  # of a certificate: each that does not read delays an emergency stop by `BLOCKED_S`
+MOST_TOKENS: Final = 1000  # tokens of a robot: more slow the router down
+MOST_SESSIONS: Final = 8  # sessions of a certificate: each that does not read delays an emergency stop by `BLOCKED_S`
 STUCK_S: Final = 2.0  # limit for an answer of the router to itself
 # Period of the checks for new connections, tokens, revoked certificates and signals: a signal that the kernel delivers
 # to another thread, as after a SIGCONT, does not wake the waiting one.
@@ -152,8 +152,8 @@ class Guard:
         self._told: set[str] = set()
         self._clock = Clock()
         self._hazards: deque[str] = deque()  # not published yet
-        self._links: dict[str, list[zenoh.Link]] = {}  # by certificate
-        self._tokens = Counter[str]()  # by the first chunk below the realm
+        self._links: dict[str, list[zenoh.Link]] = {}  # links of each certificate
+        self._tokens = Counter[str]()  # tokens of each first chunk below the realm
         # in the receiving thread: each moment that a thief stays is one in which the robot is refused
         callback = Callback(self._check_link, indirect=False)
         self._listener = session.info.declare_link_events_listener(callback, history=True)

@@ -45,7 +45,7 @@ class Served:
             return self.device.truth()
 
     def captured(self, **faults):
-        """What motion capture tells of the truth, with these faults, for `Driver.truth`."""
+        """Poses that motion capture measures with these faults, for `Driver.truth`."""
         capture, wrong = Capture(), Faults(**faults)
 
         def told():

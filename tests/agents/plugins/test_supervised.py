@@ -78,7 +78,7 @@ def test_command_fails_with_the_line(task, statement):
 
 
 def module_of(text):
-    """What a module of a user's file defines."""
+    """Names that a module of a user's file defines."""
     made = ModuleType(f"{files.PREFIX}mine")
     exec(compile(text, "mine.py", "exec"), made.__dict__)
     return made

@@ -79,7 +79,7 @@ def test_lateness_before_the_stamp_ends_inside(late_s, from_s):
 
 
 def test_disobedient_position_cuts_far_outside_still():
-    """One that jumped does not: it may be another robot's."""
+    """A position that jumped does not: it may be another robot's."""
     for jump_m, cut in ((0.0, True), (3.0, False)):
         flown = Flown(hover=1.5).fly(1.0)
         robot, (x, y, z) = flown.robot, flown.vehicle.place

@@ -425,7 +425,7 @@ def test_findings_name_some_of_many_cases(monkeypatch):
 
 @pytest.mark.usefixtures("unflown")
 def test_yaw_of_a_drone_is_said():
-    """Whoever takes the third number of `start` for a height gets a drone that is turned by 57°."""
+    """A third number of `start` that is meant as a height turns the drone by 57°."""
     found = findings(document.read(TRIANGLE, ["robots.CF01.start=[0.0, 0.5, 1.0]"]), ["event"])["turned"]
     assert (found.severity, "CF01 by 57°" in found.message) == ("note", True)
     assert "turned" not in findings(document.read(TRIANGLE, ["robots.KH01.start=[-0.6, -0.45, 1.0]"]), ["event"])

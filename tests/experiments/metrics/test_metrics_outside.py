@@ -189,7 +189,7 @@ class Strange(Wrong, frozen=True):
 
 
 def test_metric_applies_where_it_says(known, short_trace):
-    """One of another project is neither a failure nor a column of each run of this user."""
+    """A metric of another project is neither a failure nor a column of each run of this user."""
     known(strange=Strange(), way_m=Way())
     found = measure(short_trace)
     assert (found.metric_faults, found.mean["strange"]) == ((), None)
