@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator
 
+from agents.body.kinds import KINDS
 from agents.plugins import files, registry
 from agents.plugins.laws import Gradient
 from agents.plugins.predictors import HOLD
@@ -78,7 +79,9 @@ def _numbers(experiment: Experiment) -> Iterator[Fault]:
             yield Fault(("rates", name), f"{name} = {body / ratio:g} does not divide body_hz = {body:g}", hint)
 
     width, depth, _ = experiment.arena.size
-    margin, widest = experiment.safety.margin, min(width, depth) / 2.0
+    radii = {kind.name: kind.radius for kind in KINDS.usable()}
+    largest = max((radii.get(robot.kind, 0.0) for robot in experiment.robots.values()), default=0.0)
+    margin, widest = experiment.safety.margin, max(min(width, depth) / 2.0 - largest, 0.0)
     if margin >= widest:  # every goal would be clamped to beyond the middle, where the robots meet
         message = f"a margin of {margin:g} m leaves no place for goals in an arena of {width:g} by {depth:g} m"
         yield Fault(("safety", "margin"), message, f"give less than {widest:g}, in metres, or enlarge size in [arena]")
