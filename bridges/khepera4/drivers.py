@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 import re
@@ -19,6 +20,7 @@ NEVER: Final = math.inf
 REPORTED_S: Final = (0.004, 0.045)  # a report of way that covers less or more is not used to complete another
 GAP_S: Final = 0.3  # [s] commands further apart were parted by a gap of the link
 FIRST_ANSWER_S: Final = 3.0  # [s] for the first answer: a late one spends the only client of a server of 2023
+ASK_AGAIN_S: Final = 1.4  # [s] after which `p` is sent again: glued to the stop before it, a server does not see it
 MAX_INPUT_BYTES: Final = 1 << 16  # [bytes] longest input: no robot sends as much
 PLACED_S: Final = 1.0  # [s] between two positions that are given to a server which does not tell its own
 
@@ -287,13 +289,15 @@ def identify(
     """
     wire.send(b"stop")
     time.sleep(protocol.GAP_S)
-    wire.send(b"p")
-    try:
-        answer = wire.receive(uptime() + max(first_answer_s, chosen.silence_s))
-    except TimeoutError as error:
-        raise TimeoutError(
-            "no answer to p; a server of 2023 serves one client in its life: restart it on the robot, for each case"
-        ) from error
+    answer, deadline = b"", uptime() + max(first_answer_s, chosen.silence_s)
+    while not answer:
+        if uptime() >= deadline:
+            raise TimeoutError(
+                "no answer to p; a server of 2023 serves one client in its life: restart it on the robot, for each case"
+            )
+        wire.send(b"p")
+        with contextlib.suppress(TimeoutError):
+            answer = wire.receive(min(deadline, uptime() + ASK_AGAIN_S))
     time.sleep(protocol.GAP_S)
     fitting = protocol.fitting(answer.decode("ascii", "replace").strip("\0\r\n "))
     if not fitting:

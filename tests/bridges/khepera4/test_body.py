@@ -214,6 +214,23 @@ def test_garbled_answer_stops_the_robot(served, speaks, question, comes_back):
             driver.until(lambda: not driver.state.note[0] and model.velocity[0] > 0.05, "it goes on")
 
 
+@pytest.mark.parametrize("speaks", [PARK, ONCE])
+def test_lost_first_question_is_asked_again(served, speaks):
+    """A server that reads the stop and the question at once obeys the stop alone."""
+    twins = served(rows := replace(ONE, device=(speaks,)))
+    (server,) = twins.device.servers
+    answered, asked = server._answer, []
+
+    def glued(received, t):
+        asked.append(received)
+        return b"" if asked.count(b"p") == 1 else answered(received, t)
+
+    server._answer = glued
+    with opened(reached(rows, twins.addresses)) as driver:
+        driver.decide = constant(0.1)
+        driver.until(lambda: server.robot.model.velocity[0] > 0.05)
+
+
 @pytest.mark.system
 def test_external_position_replaces_odometry(served):
     twins = served(request("khepera4", ["khepera4-twin"], external=True, start=[[0.3, 0.0, 0.0]]))
