@@ -17,6 +17,7 @@ from agents.network.messages import Order
 from agents.network.zenoh_config import ASK_S
 from agents.robot import Robot
 from agents.runtime.telemetry import Counts
+from agents.safety.hazards import BY_OPERATOR, Cause, HazardChange, Outcome
 from agents.vectors import Setpoint
 
 SOON_S: Final = 30.0  # a common start further ahead results from a wrong clock: people are near by then
@@ -103,7 +104,8 @@ def carry_out(robot: Robot, order: Order, t: float, utc: float) -> Answer:
         case "takeoff" | "start":
             refusal = _begin(robot, order, t, utc)
         case "go":
-            refusal = robot.go(order.goal, t)
+            if not (refusal := robot.go(order.goal, t)) and order.goal is not None:
+                _tell(robot, t, "sent to x = {:g} m, y = {:g} m".format(*order.goal))
         case "hold":
             refusal = robot.hold()
         case "resume":
@@ -115,8 +117,17 @@ def carry_out(robot: Robot, order: Order, t: float, utc: float) -> Answer:
         case "stop":
             robot.lifecycle.stop(STOP)
         case "get" | "set":
-            return _parameter(robot, order)
+            refusal, value = _parameter(robot, order)
+            if order.order == "set" and not refusal:
+                _tell(robot, t, f"given {order.name} = {order.value:g}")
+            return refusal, value
     return refusal, None
+
+
+def _tell(robot: Robot, t: float, what: str) -> None:
+    """Notes an order that makes the run another one than that of its file."""
+    text = f"warn: was {what} {BY_OPERATOR}"
+    robot.hazards.incidents.append(HazardChange(t, Cause.ORDERED, Outcome.WARN, text))
 
 
 def _begin(robot: Robot, order: Order, t: float, utc: float) -> str:

@@ -18,7 +18,7 @@ from agents.decision.perception import SCAN_S
 from agents.decision.situation import LATE_SHARE, SILENT_S, ProcessHealth, Situation
 from agents.plugins.predictors import Predictor
 from agents.safety.direction_check import DirectionCheck
-from agents.safety.hazards import Cause
+from agents.safety.hazards import BY_OPERATOR, Cause
 from agents.safety.landing import LOW, SLOW
 from agents.safety.motion_check import RUSH_S, MotionCheck
 from agents.safety.setpoint_filter import OUTSIDE_M
@@ -372,7 +372,7 @@ class Detector:
             return f"{short:.2f} m below its goal, and sinks at {-now.velocity[2]:.2f} m/s"
 
         extents: dict[Cause, Callable[[], str]] = {
-            Cause.ORDERED: lambda: "by an operator",
+            Cause.ORDERED: lambda: BY_OPERATOR,
             Cause.POSITION: lambda: lost_position(now),
             Cause.MARGIN: lambda: outside(0.0),
             Cause.OUTSIDE: lambda: outside(OUTSIDE_M),

@@ -24,6 +24,7 @@ QUIET_S: Final = 1.0  # absence of a cause that ends its hazard: a flickering on
 ROUNDING_S: Final = 1e-9
 NEVER: Final = inf
 ALL: Final = -1  # bits of all causes
+BY_OPERATOR = "by an operator"
 OVER, UNRESOLVED = "over", "unresolved at the end"  # first words of the last incident of a hazard
 
 

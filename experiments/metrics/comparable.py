@@ -8,13 +8,13 @@ from typing import Final
 
 import msgspec
 
+from agents.safety.hazards import BY_OPERATOR
 from experiments.metrics.results import CaseMetrics
 
 MISSED: Final = 0.01  # share of missed deadlines from which on a run is spoiled
 STALLED: Final = 0.05  # share of those of one robot: among many others a robot that stood still would not show
 LOST: Final = 0.01  # share of lost poses from which on a run is spoiled
 SLOW: Final = 0.9  # real-time factor of a world below which a run is spoiled
-BY_OPERATOR: Final = "by an operator"
 SPOILING: Final = ("began", "could not read", BY_OPERATOR)  # what troubles that spoil a run say
 SAME_LENGTH: Final = 0.005  # share of the longest by which lengths of runs may differ
 SAME_COVERAGE: Final = 0.01  # by which known shares of errors may differ where integrals are compared

@@ -15,12 +15,12 @@ import msgspec
 import numpy as np
 
 from agents.network.messages import Event
-from agents.safety.hazards import UNRESOLVED, Cause, failed, is_blind
+from agents.safety.hazards import BY_OPERATOR, UNRESOLVED, Cause, failed, is_blind
 from experiments.definition import link_conditions
 from experiments.definition.graph import Links
 from experiments.metrics import centralised
 from experiments.metrics.clearance import collisions
-from experiments.metrics.comparable import BY_OPERATOR, reasons
+from experiments.metrics.comparable import reasons
 from experiments.metrics.metric import case_values, known_metrics, metrics_of_criteria, unusable_metrics, values_of
 from experiments.metrics.results import Approach, Belief, CaseMetrics, Collision, LawMeasure, RobotMetrics
 from experiments.metrics.shadow import agreement
@@ -99,6 +99,7 @@ def measure(trace: Trace) -> CaseMetrics:
             *(f"{event.source} {event.text}" for event in trace.events if event.kind in TROUBLES),
             *_taken_out(trace).values(),
             *_held(trace),
+            *_redirected(trace),
         ),
         failures=failures(trace, shared.known.tolist()),
         network_messages=sum(robot.messages + robot.goals for robot in robots),
@@ -211,6 +212,16 @@ def _held(trace: Trace) -> list[str]:
                 held[event.source] += at - since.pop(event.source, at)
     long = {name: total for name, total in held.items() if total > HELD * end}
     return [f"{name} was held {BY_OPERATOR} for {total:.1f} of {end:g} s" for name, total in long.items()]
+
+
+def _redirected(trace: Trace) -> list[str]:
+    """Robots that operators have sent elsewhere or given other numbers, a sentence about the first time of each."""
+    found: dict[str, str] = {}
+    for event in trace.events:
+        if event.kind == "hazard" and event.text.startswith("warn: ") and event.text.endswith(BY_OPERATOR):
+            told = f"{event.source} {event.text.removeprefix('warn: ')} at {max(event.stamp, 0.0):.1f} s"
+            found.setdefault(event.source, told)
+    return [*found.values()]
 
 
 def ended_early(trace: Trace) -> bool:

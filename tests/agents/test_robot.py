@@ -132,7 +132,14 @@ def test_leader_goes_where_it_is_sent():
         ("F", order, "only a leader"),
     ):
         assert why in carry_out(swarm.robot(name), wrong, swarm.t, 0.0)[0]
+    leader.hazards.incidents.clear()
     assert carry_out(leader, order, swarm.t, 0.0) == ("", None)
+    assert carry_out(leader, Order("set", name="trigger.period_s", value=0.1), swarm.t, 0.0) == ("", 0.1)
+    assert carry_out(leader, Order("get", name="trigger.period_s"), swarm.t, 0.0) == ("", 0.1)
+    assert [incident.text for incident in leader.hazards.incidents] == [
+        "warn: was sent to x = 0.2 m, y = 0.1 m by an operator",
+        "warn: was given trigger.period_s = 0.1 by an operator",
+    ]
     gone = dist(swarm.run(0.5).last("L", "goal"), (0.0, 0.0, 0.0))
     assert 0.0 < gone < 0.5 * 0.5 * 0.28  # it goes at half its speed, not at once
     assert dist(swarm.run(8.0).last("L", "truth"), (0.2, 0.1, 0.0)) < 0.01

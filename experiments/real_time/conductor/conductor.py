@@ -223,12 +223,15 @@ class Conductor(CaseRun):
     def _take_off(self) -> bool:
         """Order all robots to climb, those that were not ready again when they are; False if interrupted."""
         self._lifted = True
-        refused = self._order(messages.Order("takeoff"))
+        refused = {name: time.monotonic() for name in self._order(messages.Order("takeoff"))}
 
         def again() -> None:
-            for name in [name for name in refused if self._robots[name].phase == "ready"]:
-                refused.remove(name)
-                refused.extend(self._order(messages.Order("takeoff"), [name]))
+            now = time.monotonic()
+            due = [name for name, asked in refused.items() if now > asked + LATE_S]
+            for name in [name for name in due if self._robots[name].phase == "ready"]:
+                refused[name] = now
+                if not self._order(messages.Order("takeoff"), [name]):
+                    del refused[name]
 
         return self.await_phase("airborne", CLIMB_S, meanwhile=again)
 

@@ -172,6 +172,10 @@ def held(*ends):
     return [Event(at, "hazard", "CF01", words[k % 2]) for k, at in enumerate(ends)]
 
 
+def given(*times):
+    return [Event(at, "hazard", "CF01", "warn: was given trigger.threshold = 0.02 by an operator") for at in times]
+
+
 def changed_by(who, word="remove"):
     return [Event(2.0, word, "CF01", f"asked by {who}"), Event(2.1, "robot", "CF01", "landing: ordered to leave")]
 
@@ -188,6 +192,7 @@ def changed_by(who, word="remove"):
         (changed_by("an operator", "replace"), "CF01 was replaced by an operator at 2.1 s"),
         (changed_by("on_loss", "restart"), None),
         (changed_by("ann")[:1], None),
+        (given(1.0, 2.0), "CF01 was given trigger.threshold = 0.02 by an operator at 1.0 s"),
     ],
 )
 def test_run_that_an_operator_changed_is_spoiled(live_trace, events, spoiled):
