@@ -29,6 +29,15 @@ def findings(cases: Sequence[CaseMetrics], notes: Sequence[str] = ()) -> list[Ve
     """
     formation = any(case.belief for case in cases)
     judged = [case for case in cases if case.belief and case.has_errors]  # others have laws without errors
+    sound = [  # what is as it should be stands behind what the run has shown
+        *_lost_poses(cases),
+        *_foreign(cases),
+        *_modelled(cases),
+        *_deadlines(cases),
+        *_gaps(cases),
+        *_died(cases),
+        *_guided(cases),
+    ]
     found = [
         *failures(cases),
         *spoiled(cases),
@@ -37,16 +46,11 @@ def findings(cases: Sequence[CaseMetrics], notes: Sequence[str] = ()) -> list[Ve
         *criteria_met(cases),
         *_troubles(cases),
         *metric_faults(cases),
-        *_lost_poses(cases),
-        *_foreign(cases),
-        *_modelled(cases),
-        *_deadlines(cases),
-        *_gaps(cases),
-        *_died(cases),
-        *_guided(cases),
+        *(line for line in sound if line.mark != "good"),
         *([*_acquired(judged), _worst_link(judged)] if judged else []),
         *(_against_the_first(cases) if formation else []),
         *contacts(cases),
+        *(line for line in sound if line.mark == "good"),
         *_avoided(cases),
         *_unfinished(cases),
         *_room(cases),
