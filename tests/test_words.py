@@ -11,7 +11,8 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 LONGEST = 30  # words of a sentence
-PLACES = ("agents", "bridges", "experiments", "face", "tools", "twins", "README.md", "docs")
+PLACES = ("agents", "bridges", "experiments", "face", "tools", "twins", "docs")
+PLACES += ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")
 # clauses in the place of a noun or of a number, and words that few readers know
 PHRASES = re.compile(
     r"\b(so (long|much|many|often)|(that|how) much|but for|as often as|com(e|es|ing) to|came to|whose|who(m|so)?ever|"

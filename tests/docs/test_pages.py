@@ -22,7 +22,7 @@ from tests.commands import ROOT
 from tools.main import app
 
 TOPS = ("agents", "bridges", "twins", "experiments", "tools")
-PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md"), *(ROOT / "bridges").rglob("*.md")])
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "bridges").rglob("*.md")])
 DOTTED = re.compile(rf"(?<![\w./-])(?:{'|'.join(TOPS)})(?:\.\w+)+")
 PATH = re.compile(rf"(?<![\w./-])(?:{'|'.join((*TOPS, 'docs', 'tests'))})/[\w./{{}},*-]*")
 MADE = {"docs/tutorials/out"}  # by the lessons
