@@ -75,7 +75,12 @@ def claim(
         """Names with an earlier claim, or with another owner if `owners` count."""
         deadline = time.monotonic() + timing.answer_s
         while True:
+            asked = time.monotonic()
             found = {key: network.tokens_present(session, Keys.lives(key)) for key in alive}
+            if (
+                time.monotonic() - asked > SETTLE_S
+            ):  # a lost link ends a question as an answer does, and is noticed later
+                pause.wait(SETTLE_S)
             if pause.is_set():
                 raise network.Unreachable("asked to end before the name was taken")
             if None not in found.values() and network.connected(session):
