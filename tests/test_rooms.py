@@ -257,3 +257,9 @@ def test_kinds_stand_in_their_own_files():
         or (isinstance(node, ast.Constant) and isinstance(node.value, str) and re.search(word.pattern, node.value))
     }
     assert naming == NAMES_KINDS.keys()
+
+
+def test_modules_read_the_module_time():
+    """A test, or a simulation, that replaces a function of `time` replaces it everywhere."""
+    named = [name for name, text in texts().items() if re.search(r"^\s*from time import", text, re.MULTILINE)]
+    assert named == ["experiments.virtual_time.stretch"]

@@ -12,6 +12,7 @@ from typing import Any, Final, Generic, Protocol, Self, TypeVar
 import zenoh
 from zenoh.ext import (
     AdvancedPublisher,
+    AdvancedSubscriber,
     CacheConfig,
     HistoryConfig,
     MissDetectionConfig,
@@ -61,6 +62,15 @@ def pose_publisher(session: zenoh.Session, key: str, mime: str, kept: int = 1) -
     )
 
 
+def advanced_subscriber(session: zenoh.Session, key: str, handler: object, kept: int) -> AdvancedSubscriber[Any]:
+    """The advanced half of `pose_subscriber`."""
+    history = HistoryConfig(max_samples=kept, detect_late_publishers=True)
+    made: AdvancedSubscriber[Any]
+    either: Any = handler  # a channel or a callback, for which the types of Zenoh have two signatures
+    made = declare_advanced_subscriber(session, key, either, history=history, recovery=_RECOVERY)
+    return made
+
+
 class Bell:
     """Ends the wait of one thread early; a ring before the wait counts, several are one."""
 
@@ -100,15 +110,14 @@ class PoseSubscriber:
         """Subscribes; see `pose_subscriber`."""
         self._waiting = deque[zenoh.Sample](maxlen=depth)
         self._numbers: dict[str, int] = {}  # last source number, by source
-        history = HistoryConfig(max_samples=kept, detect_late_publishers=True)
 
         def append(sample: zenoh.Sample) -> None:  # under a lock of the subscriber: it may only append and ring
             self._waiting.append(sample)
             if bell is not None:
                 bell.ring()
 
-        handler: Any = RingChannel(depth) if bell is None else Callback(append, indirect=False)
-        self._advanced = declare_advanced_subscriber(session, key, handler, history=history, recovery=_RECOVERY)
+        handler: object = RingChannel(depth) if bell is None else Callback(append, indirect=False)
+        self._advanced = advanced_subscriber(session, key, handler, kept)
         self._plain = session.declare_subscriber(key, RingChannel(depth))
         self._numbered = self._pop if bell is not None else self._advanced.handler.try_recv
         self._all = self._plain.handler.try_recv

@@ -196,8 +196,7 @@ def open_session(
     deadline = time.monotonic() + (min(wait_s, ENDPOINT_FREE_S) if ends.listen else wait_s)
     while True:
         try:
-            with prompt_threads():
-                session = zenoh.open(chosen)
+            session = open_with(chosen)
         except zenoh.ZError as error:
             if time.monotonic() < deadline and not ended.wait(RETRY_S):
                 continue
@@ -211,6 +210,12 @@ def open_session(
                 return session
             session.close()
         raise Unreachable(_silence(endpoints, identity or name)) from None
+
+
+def open_with(chosen: zenoh.Config) -> zenoh.Session:
+    """A session, of a client or of a router: the one place in which zenpark opens any."""
+    with prompt_threads():
+        return zenoh.open(chosen)
 
 
 def _gathered(session: zenoh.Session, members: int, gather_s: float, ended: threading.Event, deadline: float) -> bool:

@@ -24,13 +24,12 @@ SILENCE_S: Final = 3.0
 FAR_SILENCE_S: Final = 4.5
 LONGEST: Final = 4096  # of a line [bytes]
 
-
 GONE: Final = "the starter is gone"  # or has ended
 _STOP: Final = b"stop "
 
 
 def stop_line(stop: messages.Stop) -> bytes:
-    """Line with an emergency stop."""
+    """LifelineEnd with an emergency stop."""
     words = messages.Stop(stop.operator[: messages.MAX_WORDS], stop.reason[: messages.MAX_WORDS])
     return _STOP + messages.encode(words) + b"\n"
 
@@ -40,18 +39,35 @@ def stop_in(line: bytes) -> messages.Stop | None:
     return messages.read_stop(line.removeprefix(_STOP), messages.JSON) if line.startswith(_STOP) else None
 
 
+class LifelineEnd:
+    """The reading end of a lifeline: a file descriptor, standard input as a rule."""
+
+    def __init__(self, fd: int = 0) -> None:
+        self._fd, self._poll = fd, select.poll()  # not select(): a process with many files has descriptors beyond 1023
+        self._poll.register(fd, select.POLLIN)
+
+    def wait(self, timeout_s: float) -> bool:
+        """Waits for data or the end; returns whether there is one in time."""
+        return bool(self._poll.poll(timeout_s * 1000))
+
+    def read(self) -> bytes:
+        """Data that has arrived; empty at the end. Raises OSError if the line is broken."""
+        return os.read(self._fd, LONGEST)
+
+
 class Lifeline:
-    """Watches a file descriptor in a daemon thread; the owner reacts to a loss: a robot lands first."""
+    """Watches a line in a daemon thread; the owner reacts to a loss: a robot lands first."""
 
     def __init__(
         self,
         lost: threading.Event,  # set once when the launcher is gone
         timeout_s: float = SILENCE_S,  # silence [s] that counts as loss
-        fd: int = 0,  # standard input
+        line: LifelineEnd | None = None,  # standard input if left out
         on_line: Callable[[bytes], None] | None = None,  # called in that thread with each line that is no heartbeat
     ) -> None:
         self.reason: str | None = None  # of the loss; set before `lost`
-        self._lost, self._timeout_s, self._fd, self._on_line = lost, timeout_s, fd, on_line
+        self._lost, self._timeout_s, self._on_line = lost, timeout_s, on_line
+        self._line = line or LifelineEnd()
         self._rest = b""
         self._thread = threading.Thread(target=self._watch, name="lifeline", daemon=True)
 
@@ -67,11 +83,9 @@ class Lifeline:
         self._lost.set()
 
     def _until_lost(self) -> str:
-        waiting = select.poll()  # not select(): a process with many files has descriptors beyond 1023
-        waiting.register(self._fd, select.POLLIN)
         try:
-            while waiting.poll(self._timeout_s * 1000):
-                data = os.read(self._fd, LONGEST)
+            while self._line.wait(self._timeout_s):
+                data = self._line.read()
                 if not data:
                     return GONE
                 if self._on_line is not None:

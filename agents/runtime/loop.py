@@ -6,7 +6,6 @@ neighbours can wake the loop between two ticks: then they are known at once, whi
 
 from __future__ import annotations
 
-import gc
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -35,7 +34,7 @@ from agents.network.shutdown import leave
 from agents.plugins.calls import explain
 from agents.plugins.registry import FAILURES
 from agents.robot import Robot
-from agents.runtime.command_line import on_termination
+from agents.runtime import command_line
 from agents.runtime.descent import Descent, DescentTiming
 from agents.runtime.goal_inbox import GoalInbox
 from agents.runtime.lifeline import SILENCE_S as LIFELINE_S
@@ -132,7 +131,7 @@ class Runtime:
         asked = threading.Event()
 
         # at the end all steps are tried, the last entry first, even if others raise
-        with on_termination(asked.set), ExitStack() as out:
+        with command_line.on_termination(asked.set), ExitStack() as out:
             session = network.open_session(
                 self._setup.endpoints,
                 name="+".join(self._names),
@@ -221,8 +220,7 @@ class Runtime:
     # ------------------------------------------------------------------ the loop
 
     def _loop(self, stopping: Callable[[], str | None]) -> None:
-        gc.collect()
-        gc.freeze()  # imported objects live as long as the process: a collection need not visit them
+        command_line.spare_imports()
         self._descent.reason_to_end = stopping
         self._descent.await_ownership()  # opening the body may have taken long
         # one reading: a step of the wall clock in mid-run does not move the experiment

@@ -22,10 +22,11 @@ from zenoh.handlers import Callback
 from agents.clock import Clock
 from agents.errors import ExplainedError
 from agents.network import lab, messages
+from agents.network import session as network
 from agents.network.access_control import Rights
 from agents.network.endpoints import DEFAULT_ENDPOINT, EndpointError
 from agents.network.keys import Keys
-from agents.network.session import deserted, forbid_lingering, hang_up_on, prompt_threads, tokens_present
+from agents.network.session import deserted, forbid_lingering, hang_up_on, tokens_present
 from agents.network.shutdown import closing_cleanly, end
 from agents.network.zenoh_config import config, reason, settings
 from agents.runtime import command_line
@@ -222,9 +223,9 @@ class StuckCheck:
     once for each turn of the thread.
     """
 
-    def __init__(self, ask: Callable[[], bool], end: Callable[[int], object] = os._exit) -> None:
-        """Begins to `ask`, which returns whether there was an answer; `end` is called with the code of the process."""
-        self._ask, self._end = ask, end
+    def __init__(self, ask: Callable[[], bool], end: Callable[[int], object] | None = None) -> None:
+        """Begins to `ask`, which returns whether there was an answer; `end` ends the process with an exit code."""
+        self._ask, self._end = ask, end or os._exit
         self._asked = self._answered = 0  # number of questions
         for each in (self._question, self._watch):
             threading.Thread(target=each, name="stuck", daemon=True).start()
@@ -258,8 +259,7 @@ def _routing(chosen: zenoh.Config, endpoints: Sequence[str], wait_s: float, stop
     deadline = time.monotonic() + wait_s
     while True:
         try:
-            with prompt_threads():
-                return zenoh.open(chosen)
+            return network.open_with(chosen)
         except zenoh.ZError as error:
             if time.monotonic() < deadline and not stop.wait(AGAIN_S):
                 continue

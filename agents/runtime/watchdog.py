@@ -38,10 +38,10 @@ class Watchdog:
         alarm: Callable[[str], object],  # reports the reason to the other processes
         silence_s: float = SILENCE_S,  # longest time without a beat [s]
         down_s: float = DOWN_S,  # from then until the motors are cut [s]
-        end: Callable[[int], object] = os._exit,  # ends the process with an exit code
+        end: Callable[[int], object] | None = None,  # ends the process with an exit code
     ) -> None:
         self.tripped = ""  # why the robots were ordered to land; empty before, and after `forgive`
-        self._body, self._rows, self._alarm, self._end = body, rows, alarm, end
+        self._body, self._rows, self._alarm, self._end = body, rows, alarm, end or os._exit
         self.down_s, self._silence_s = down_s, silence_s
         self._beats = 0
         self._over = threading.Event()

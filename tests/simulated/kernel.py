@@ -1,7 +1,7 @@
 """Simulated time, threads and processes: everything runs in one real thread, in an order that a seed decides.
 
 A simulated thread is a greenlet. It runs until it blocks (`sleep`, `Event.wait`, `Lock.acquire`, `Thread.join`,
-`Poll.poll`), so unmodified blocking code works. No time passes while it runs.
+`LifelineEnd.wait`), so unmodified blocking code works. No time passes while it runs.
 """
 
 from __future__ import annotations
@@ -462,26 +462,23 @@ class Thread:
             self._task.joiners.wait(timeout)
 
 
-class Poll:
-    """As `select.poll`, of the standard input."""
+class LifelineEnd:
+    """As `agents.runtime.lifeline.LifelineEnd`, of the standard input."""
 
-    def register(self, *_: object) -> None:
-        pass
-
-    def poll(self, ms: float | None = None) -> list[tuple[int, int]]:
+    def __init__(self, _descriptor: int = 0) -> None:
         process = current().process
         assert process is not None
-        if not process.stdin and not process.eof:
-            process.readers.wait(None if ms is None else ms / 1000.0)
-        return [(0, 1)] if process.stdin or process.eof else []
+        self._process = process
 
+    def wait(self, timeout_s: float) -> bool:
+        if not self._process.stdin and not self._process.eof:
+            self._process.readers.wait(timeout_s)
+        return bool(self._process.stdin) or self._process.eof
 
-def read(_descriptor: int, count: int) -> bytes:
-    """As `os.read`, of the standard input."""
-    process = current().process
-    assert process is not None
-    data, process.stdin = bytes(process.stdin[:count]), process.stdin[count:]
-    return data
+    def read(self) -> bytes:
+        data = bytes(self._process.stdin)
+        self._process.stdin.clear()
+        return data
 
 
 # ---------------------------------------------------------------------- the real world

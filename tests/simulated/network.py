@@ -9,6 +9,7 @@ plain ones, tokens and questions, as those of Zenoh are. Time is in seconds.
 from __future__ import annotations
 
 import itertools
+import json
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import lru_cache
@@ -27,6 +28,10 @@ REORDERED_S: Final = 0.1  # longest delay of a message that others overtake
 REPEATED_S: Final = 0.2  # longest time until the copy of a message arrives
 HEARTBEAT_S: Final = 0.5  # from a sample of an advanced publisher until its number is repeated
 HISTORY_S: Final = 10.0  # limit of the questions of an advanced subscriber
+SETTINGS: Final = (
+    "mode", "connect/endpoints", "listen/endpoints", "metadata",
+    "transport/link/tx/lease", "transport/unicast/open_timeout",
+)  # fmt: skip
 ROUTER, CLIENT = zenoh.WhatAmI.ROUTER, zenoh.WhatAmI.CLIENT
 
 
@@ -222,12 +227,11 @@ class Network:
         self.routers: list[Router] = []
         self.numbers = itertools.count(1)
 
-    def open(self, settings: Mapping[str, Any]) -> Session | Router:
+    def open(self, config: zenoh.Config) -> Session | Router:
         """A node with settings of `agents.network.zenoh_config`; raises ZError if no router answers."""
-        lease_s = settings["transport/link/tx/lease"] / 1000.0
-        if settings["mode"] == "router":
-            return Router(self, lease_s, settings)
-        return Session(self, lease_s, settings)
+        settings = {key: json.loads(config.get_json(key)) for key in SETTINGS}
+        kind = Router if settings["mode"] == "router" else Session
+        return kind(self, settings["transport/link/tx/lease"] / 1000.0, settings)
 
     def at(self, endpoint: str) -> Router | None:
         """The router that listens on an endpoint."""
@@ -473,7 +477,7 @@ class Session(Node):
 
     def __init__(self, network: Network, lease_s: float, settings: Mapping[str, Any]) -> None:
         super().__init__(network, lease_s)
-        self.name = settings.get("metadata", {}).get("name", "")
+        self.name = (settings["metadata"] or {}).get("name", "")
         self._endpoints, self._limit_s = (
             settings["connect/endpoints"],
             settings["transport/unicast/open_timeout"] / 1000.0,
@@ -486,7 +490,7 @@ class Session(Node):
         self._remote: dict[str, None] = {}  # keys of tokens of others
         self._questions: list[Replies] = []
         self._routes: dict[str, list[Subscriber]] = {}
-        far = lambda: [] if self.link is None else [self.link.far]  # noqa: E731
+        far: Callable[[], list[Node]] = lambda: [] if self.link is None else [self.link.far]  # noqa: E731
         self.info = SimpleNamespace(
             routers_zid=lambda: [each.zid() for each in far()],
             transports=lambda: [SimpleNamespace(whatami=ROUTER) for _ in far()],
@@ -545,7 +549,8 @@ class Session(Node):
     def _begin(self, router: Router) -> None:
         self.link = Link(self, router)
         router.welcome(self.link)
-        for each in (*self.subscribers, *self.queryables, *self.tokens):
+        things: list[Subscriber | Token] = [*self.subscribers, *self.queryables, *self.tokens]
+        for each in things:
             self._declare(each, each.key)
         self._send(router.change)
 

@@ -3,7 +3,7 @@
 import pytest
 import zenoh
 
-from agents.network.zenoh_config import settings
+from agents.network.zenoh_config import config, settings
 from tests.simulated.kernel import BEGIN, Kernel, Process, sleep
 from tests.simulated.network import Network
 
@@ -21,12 +21,12 @@ class Stage:
         return Process(name, lambda: act(*args))
 
     def route(self, row):
-        self.network.open(settings("router", listen=[PLACES[row]], connect=PLACES[:row]))
+        self.network.open(config(settings("router", listen=[PLACES[row]], connect=PLACES[:row])))
         sleep(1000.0)
 
     def join(self, *places):
         sleep(0.1)
-        return self.network.open(settings("client", connect=places or PLACES[:1]))
+        return self.network.open(config(settings("client", connect=places or PLACES[:1])))
 
     def note(self, sample):
         there = sample.kind == zenoh.SampleKind.PUT

@@ -8,7 +8,6 @@ machine of the conductor, with the clock of the experiment.
 
 from __future__ import annotations
 
-import gc
 import os
 import threading
 import time
@@ -85,8 +84,7 @@ class CentreProcess:
 
     def run(self, over: threading.Event) -> None:
         """Decides until `over` is set."""
-        gc.collect()
-        gc.freeze()  # imported objects live as long as the process: a collection need not visit them
+        command_line.spare_imports()
         ticks = self.ticks
         self._utc = self._clock.at(ticks.start())
         ticks.zero += self.patience_s

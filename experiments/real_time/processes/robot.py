@@ -12,7 +12,6 @@ if __name__ == "__main__":
     sys.modules["_hashlib"] = None  # type: ignore[assignment]
 
 import os
-import select
 import socket
 import time
 from collections.abc import Sequence
@@ -32,8 +31,7 @@ from agents.network.keys import Keys
 from agents.network.lab import secured
 from agents.network.shutdown import end
 from agents.plugins import registry
-from agents.runtime import command_line
-from agents.runtime.lifeline import FAR_SILENCE_S, SILENCE_S
+from agents.runtime import command_line, lifeline
 from agents.runtime.loop import Runtime, Setup
 from experiments.definition import bodies, mesh
 from experiments.definition.endpoints import router_endpoints
@@ -101,7 +99,7 @@ def _run(plan: Plan, launch: RobotLaunch, endpoints: Sequence[str]) -> int:
         encoding=experiment.network.encoding,
         state_hz=experiment.rates.state_hz,
         lifeline=launch.lifeline,
-        lifeline_s=FAR_SILENCE_S if launch.file == STDIN else SILENCE_S,
+        lifeline_s=lifeline.FAR_SILENCE_S if launch.file == STDIN else lifeline.SILENCE_S,
         externally_measured=[robot.position == "external" for robot in robots],
         exact=[name not in plan.externally_measured for name in names],
         # bodies in other processes receive their range readings by themselves
@@ -128,11 +126,9 @@ def _conditions(plan: Plan, ends: Ends, stream: str = "") -> list[Conditions]:
 def read_experiment() -> str:
     """The first line of standard input; the following ones belong to the lifeline."""
     deadline = time.monotonic() + EXPERIMENT_S
-    waiting = select.poll()
-    waiting.register(0, select.POLLIN)
-    text = b""
-    while waiting.poll(max(0.0, deadline - time.monotonic()) * 1e3):
-        data = os.read(0, 65536)
+    source, text = lifeline.LifelineEnd(), b""
+    while source.wait(max(0.0, deadline - time.monotonic())):
+        data = source.read()
         line, end, _ = data.partition(b"\n")
         text += line
         if end:

@@ -6,7 +6,6 @@ Robots reach it by keys only (`docs/external-simulators.md`). Here are clock, or
 
 from __future__ import annotations
 
-import gc
 import threading
 import time
 from collections.abc import Callable
@@ -88,8 +87,7 @@ class WorldProcess:
     def run(self, over: threading.Event) -> None:
         """Runs until `over` is set, or until launcher and then robots are gone."""
         pace, ticks = self._pace, self._ticks
-        gc.collect()
-        gc.freeze()  # imported objects live as long as the process: a collection need not visit them
+        command_line.spare_imports()
         self.utc = self._clock.at(ticks.start())
         token = pubsub.alive_token(self._session, self._keys.world_alive)
         self._report(0.0)

@@ -12,7 +12,7 @@ from agents.network.endpoints import DEFAULT_ENDPOINT, free_endpoint
 from agents.network.lab import LabError
 from agents.network.messages import MAX_WORDS, UNKNOWN, Stop
 from agents.runtime.command_line import NetworkLaunch, Output, interrupts, on_termination, parse
-from agents.runtime.lifeline import LONGEST, Lifeline, stop_in, stop_line
+from agents.runtime.lifeline import LONGEST, Lifeline, LifelineEnd, stop_in, stop_line
 from tests.commands import started
 
 
@@ -100,7 +100,7 @@ def lifeline_end(pipe):
 
     def lifeline_end(*parts, fd=pipe[0], timeout_s=60.0, **given):
         lost = threading.Event()
-        line = Lifeline(lost, timeout_s=timeout_s, fd=fd, **given)
+        line = Lifeline(lost, timeout_s=timeout_s, line=LifelineEnd(fd), **given)
         line.start()
         if parts:
             line.join(0.05)  # it waits for what comes later
