@@ -1,0 +1,89 @@
+"""Directed scripts: each sentence here was once wrong in a whole run, with all its processes."""
+
+from tests.simulated.faults import Fault
+from tests.simulated.laboratory import Flight, fly
+
+SPAN_S = 8.0
+
+
+def triangle(*script: Fault, **options) -> Flight:
+    """Two Kheperas and a Crazyflie, for eight seconds."""
+    settings = [f"duration_s={SPAN_S:g}", *options.pop("settings", [])]
+    return fly("triangle", *script, case="event", settings=settings, **options)
+
+
+def test_run_without_faults_is_good():
+    flight = triangle()
+    assert (flight.code, flight.violations, flight.crashes) == (0, [], [])
+    assert [case["case"] for case in flight.metrics] == ["event"]
+    assert {each.code for each in flight.processes} == {0}
+    for name in ("KH01", "KH02", "CF01"):
+        assert abs(flight.robots[name].entered("running")[0]) < 0.021, name
+    assert SPAN_S < flight.robots["CF01"].off() < SPAN_S + 2.5
+
+
+def test_former_owner_is_silent_when_it_is_back():
+    flight = triangle(Fault(1.0, "cut", "KH02", lasts=3.0), Fault(2.4, "twice", "KH02"))
+    former, second = flight.of("KH02")[0], flight.of("second KH02")[0]
+    track = flight.robots["KH02"]
+    assert [t for t, pid in track.poses if pid == second.pid]
+    assert not [t for t, pid in (*track.poses, *track.commands) if pid == former.pid and t > 4.2]
+    assert former.code == 2
+    assert flight.violations == []
+
+
+def test_recorder_that_dies_before_its_file_is_there_costs_no_result():
+    flight = triangle(Fault(0.027, "kill", "recorder", since="launch"))
+    assert "event.mcap" in flight.files
+    assert not [file for file in flight.files if "part2.mcap" in file]
+    assert flight.metrics is not None
+    assert flight.code in {0, 1}, flight.output
+
+
+def test_robot_that_is_left_out_delays_nobody():
+    late = ['robots.KH02.position="external"', 'start.missing="go-on"', "start.deadline_s=3.0"]
+    flight = triangle(Fault(0.0, "capture", "KH02", "gone", since="launch"), settings=late)
+    assert flight.code == 1
+    assert "takes no part" in flight.output
+    assert flight.started < 3.0 + 5.0 + 6.0
+    assert flight.ended < SPAN_S + 5.0
+
+
+def test_robot_that_begins_early_fails_the_run():
+    flight = triangle(Fault(0.3, "order", "KH01", "start", since="ready"))
+    began = flight.robots["KH01"].entered("running")[0]
+    assert began < -0.5
+    assert flight.code == 1
+    assert flight.happened("failed", "KH01", "before the common start")
+
+
+def test_robot_with_a_slow_clock_is_counted():
+    flight = triangle(clocks={"KH02": -4.5})
+    began = flight.robots["KH02"].entered("running")
+    assert (began and began[0] < 0.1) or flight.code == 1, flight.describe()
+
+
+def test_recording_of_one_state_period_is_no_traceback():
+    flight = triangle(Fault(0.02, "pause", "recorder", lasts=1.0), Fault(0.8, "kill", "recorder"))
+    assert flight.crashes == []
+    assert "Traceback" not in flight.output
+
+
+def test_robot_that_an_operator_held_spoils_the_run():
+    flight = triangle(Fault(0.5, "order", "KH02", "hold"), Fault(7.5, "order", "KH02", "resume"))
+    assert [answer.code for answer in flight.answers] == [0, 0]
+    assert flight.code == 3
+
+
+def test_robot_that_an_operator_removed_spoils_the_run():
+    flight = triangle(Fault(2.0, "order", "KH02", "remove"))
+    assert flight.answers[0].code == 0
+    assert flight.code == 3
+
+
+def test_emergency_stop_cuts_motors_at_once():
+    flight = triangle(Fault(2.0, "estop"))
+    assert flight.answers[0].code == 0
+    assert "stopped: CF01, KH01, KH02" in flight.answers[0].output
+    assert 2.0 <= flight.robots["CF01"].off(after=2.0) < 2.3
+    assert flight.code == 1
