@@ -32,7 +32,7 @@ def test_former_owner_is_silent_when_it_is_back():
     assert flight.violations == []
 
 
-def test_recorder_that_dies_before_its_file_is_there_costs_no_result():
+def test_recorder_killed_before_its_file_costs_no_result():
     flight = triangle(Fault(0.027, "kill", "recorder", since="launch"))
     assert "event.mcap" in flight.files
     assert not [file for file in flight.files if "part2.mcap" in file]
