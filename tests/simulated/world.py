@@ -16,7 +16,6 @@ import itertools
 import math
 import os
 import secrets
-import select
 import signal
 import subprocess
 import sys
@@ -34,7 +33,6 @@ import zenoh
 
 import agents.clock
 import agents.runtime.router as router_process
-import agents.runtime.watchdog
 from agents.body.interface import Body
 from agents.network import messages, pubsub
 from agents.network import session as network_session
@@ -672,8 +670,8 @@ def _patch_clocks_and_threads() -> None:
     telemetry.resident_mb = lambda: 0.0
     threading.Event, threading.Lock, threading.Thread = sim.Event, sim.Lock, sim.Thread
     threading.enumerate = lambda: []
-    lifeline.select, lifeline.os = SimpleNamespace(poll=sim.Poll, POLLIN=select.POLLIN), SimpleNamespace(read=sim.read)
-    loop.gc = SimpleNamespace(collect=lambda: 0, freeze=lambda: None)
+    lifeline.LifelineEnd = sim.LifelineEnd
+    command_line.spare_imports = lambda: None
     calls.signal = SimpleNamespace()  # without `setitimer` plug-ins are not supervised
     orders.ThreadPoolExecutor = Pool
 
@@ -699,8 +697,6 @@ def _patch_processes() -> None:
     signal.signal = handle
     signal.getsignal = lambda number: sim.current().process.handlers.get(int(number), signal.SIG_DFL)
     signal.pthread_sigmask = lambda *_: set()
-    agents.runtime.watchdog.Watchdog.__init__.__kwdefaults__["end"] = die
-    router_process.StuckCheck.__init__.__defaults__ = (die,)
     sys.stdout = sys.stderr = Output()
     command_line.detach = joining.detach = lambda: None
     launcher.Launcher.preload, launcher.Launcher.start = lambda _: None, _start
@@ -720,20 +716,12 @@ def _patch_processes() -> None:
 
 
 def _patch_network() -> None:
-    pubsub.RingChannel = network_session.RingChannel = net.Ring
-    pubsub.declare_advanced_publisher = lambda session, key, encoding="", cache=1, **_: net.AdvancedPublisher(
-        session, str(key), encoding, cache
-    )
-    pubsub.declare_advanced_subscriber = lambda session, key, handler, history=1, **_: net.AdvancedSubscriber(
-        session, str(key), handler, history
-    )
-    pubsub.CacheConfig, pubsub.HistoryConfig = lambda count: count, lambda max_samples, **_: max_samples
+    pubsub.RingChannel = network_session.RingChannel = pubsub.FifoChannel = net.Ring
+    pubsub.pose_publisher = lambda session, key, mime, kept=1: net.AdvancedPublisher(session, key, mime, kept)
+    pubsub.advanced_subscriber = net.AdvancedSubscriber
     pubsub.Callback = lambda function, indirect: function
-    pubsub.FifoChannel = net.Ring
     zenoh.SourceInfo = net.source_info
-    zenoh.open = lambda chosen: world.network.open(chosen)  # noqa: PLW0108 - of the world that comes
-    network_session.config = router_process.config = lambda settings: settings
-    network_session.prompt_threads = router_process.prompt_threads = contextlib.nullcontext
+    network_session.open_with = lambda chosen: world.network.open(chosen)  # noqa: PLW0108 - of the world that comes
     network_session.forbid_lingering = router_process.forbid_lingering = lambda: 0
     network_session.hang_up = lambda session: session.hang_up()
 
