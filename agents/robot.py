@@ -76,20 +76,20 @@ class Robot:
         self._dt = 1.0 / assignment.body_hz
         avoids = assignment.avoidance is not None and assignment.avoids
         self._perception = Perception(assignment) if avoids else None
-        self.now = Situation()  # of this tick
+        self.now = Situation()  # situation of this tick
         self.tick = 0  # number of the next tick; 0 at the common start, so that robots decide together
         self.goal, self.goal_yaw = UNKNOWN, nan  # pursued [m], and wanted there [rad], NaN for any
         self.error = 0.0  # Σ of the link errors as the robot knows them [m]; 0 if guided, NaN without a position
-        self.setpoint = NO_SETPOINT  # of the last tick, NaN where the body drives by itself
+        self.setpoint = NO_SETPOINT  # setpoint of the last tick, NaN where the body drives by itself
         self.changed = self.avoided = False  # decided setpoint changed by safety, by avoidance
         self.takes_off = self.lands = self.stops = False  # commands to the body on this tick
         # what is transmitted, where `transmit` says so [m], [m/s]
         self.sent_position = self.sent_velocity = UNKNOWN
-        self.decisions = 0  # since the common start
+        self.decisions = 0  # count since the common start
         self.updates = 0  # decisions that recomputed the goal; of a guided robot, received goals
         # ticks on which safety, and avoidance, changed the setpoint, from the common start on
         self.interventions = self.evasions = 0
-        self.causes = 0  # of hazards on this tick, a bit for each
+        self.causes = 0  # causes of hazards on this tick, a bit for each
         self.decision_due = False  # whether the goal is decided on this tick; known from its first half on
         self.begun = False  # whether the robot has begun to run
         self._ordered = self._blind = False

@@ -22,7 +22,7 @@ class Ticks:
         self.period = 1.0 / hz  # [s]
         self._catch_up, self._clock = catch_up, clock
         self._skips = 0  # ticks that are over before the next one begins
-        self.late_s = 0.0  # [s] from the time of the last tick to its begin
+        self.late_s = 0.0  # [s] delay of the last tick's begin
         self.start()
 
     def start(self) -> float:

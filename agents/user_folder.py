@@ -13,7 +13,7 @@ OWN: Final = stat.S_IRWXU
 
 
 SESSIONS: Final = Path("/run/user")  # a folder for each user who is logged in, on Linux with systemd
-TEMPORARY: Final = Path("/tmp")  # where no variable names another one
+TEMPORARY: Final = Path("/tmp")  # folder where no variable names another one
 
 
 def runtime_folders() -> list[Path]:

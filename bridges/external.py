@@ -31,7 +31,7 @@ from bridges.measured_flight import FRESH_S, SETTLED, MeasuredFlight
 Action = Literal["drive", "takeoff", "land", "stop"]
 
 OPEN_S: Final = 5.0  # deadline of the router's answer and of the first position of every row
-POLL_S: Final = 0.02  # between looks for them
+POLL_S: Final = 0.02  # pause between looks for them
 WORLD: Final = "world"  # the address of robots in the shared world process
 REPEAT_S: Final = 0.1  # period of repeated orders: the publisher drops samples when its queue is full
 HALT_S: Final = 3.0  # time for which `land` is repeated to a robot on wheels
@@ -48,18 +48,18 @@ class _ExternalRobot:
     name: str
     address: str
     flies: bool
-    steers: bool  # by its yaw: setpoints are twists
+    steers: bool  # True for one that steers by its yaw: setpoints are twists
     # grows over restarts: a simulator that outlives this process can tell new orders from old
     seq: int
     yaw: float  # last measured [rad],
-    yaw_at: float = -inf  # and when
+    yaw_at: float = -inf  # time of that yaw
     pose: External = field(default_factory=External)
     flight: MeasuredFlight = field(default_factory=MeasuredFlight)
     stopped_since: float = inf
     # order repeated under its own sequence number until it is completed, not begun: the simulator may be restarted
     # half-way through a climb or a landing, and then knows no earlier order
     repeated: messages.Command | None = None
-    repeated_until: float = inf  # at most [s]
+    repeated_until: float = inf  # latest end [s]
 
     @property
     def stopped(self) -> bool:
@@ -106,7 +106,7 @@ class ExternalBody(Body):
         self._zero, self._open_timeout = uptime(), open_timeout
         self._clock, self._corrected = request.clock, request.clock.correction_s
         self._utc = request.clock.utc()  # one reading, as in the runtime: a step of the wall clock has no effect
-        self._clock_offset = inf  # from the caller's clock to this one [s]
+        self._clock_offset = inf  # offset from the caller's clock to this one [s]
         self._robots = [
             _ExternalRobot(name, address, kind.flies, kind.takes == "twist", round(1e3 * self._utc), yaw)
             for name, address, kind, yaw in zip(
@@ -115,7 +115,7 @@ class ExternalBody(Body):
         ]
         self._read_at = inf  # last call of `read`
         self._next_repeat = 0.0
-        self._lock = threading.Lock()  # of the sequence numbers: `land` and `stop` are called from other threads too
+        self._lock = threading.Lock()  # guards the sequence numbers: other threads call `land` and `stop`
         self._session: zenoh.Session | None = None
 
     # ------------------------------------------------------------------ Body

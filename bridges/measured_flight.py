@@ -10,9 +10,9 @@ from agents.safety.detection import LOWEST_DESCENT_M_S
 from agents.vectors import ZERO, Vector, norm
 
 FRESH_S: Final = 0.5  # older positions are lost; robots tolerate as much
-LANDING_S: Final = 10.0  # from `land`, and a slow descent, until a robot without positions counts as landed
+LANDING_S: Final = 10.0  # time from `land`, and a slow descent, until a robot without positions counts as landed
 GROUNDED_S: Final = 1.0  # time measured on the ground after which a robot in flight has landed by itself
-AWAY_M: Final = 0.05  # [m] above the ground: higher is in the air, lower is down
+AWAY_M: Final = 0.05  # [m] height above the ground: higher is in the air, lower is down
 FLOOR_M: Final = 0.2  # [m] a take-off from higher up is one from a table: the floor is at 0
 TABLE_M: Final = 0.3  # [m] horizontally from there it ends
 SETTLED: Final = 0.1  # [m/s] slower robots stand
@@ -25,7 +25,7 @@ class MeasuredFlight:
     flying: bool = False
     landing_since: float = inf  # order to land or to stop; infinity without one
     _start: Vector = ZERO  # place of the take-off [m]
-    _highest: float = -inf  # since the order to land [m]
+    _highest: float = -inf  # greatest height since the order to land [m]
     _still_since: float = inf
     _grounded_since: float = inf  # measured on the ground although it should fly
 

@@ -74,7 +74,7 @@ class _RobotTopics:
     goal_publisher: zenoh.Publisher
     frame: str
     scan: Publisher | None = None  # None until the first range readings
-    stamp: float = 0.0  # of the last pose published to ROS, UTC [s]
+    stamp: float = 0.0  # stamp of the last pose published to ROS, UTC [s]
     height: GoalHeight = field(default_factory=GoalHeight)
 
     def close(self) -> None:
@@ -106,7 +106,7 @@ class Graph:
         self._centres = pubsub.AliveWatch(session, keys.centre_alive)
         self._centralised = False
         self._clock = participant.clock
-        self._seq = round(self._clock.utc() * 1e3)  # above the sequence numbers of any earlier sender of goals
+        self._seq = round(self._clock.utc() * 1e3)  # greater than the sequence numbers of any earlier sender of goals
 
     @property
     def malformed(self) -> int:
@@ -240,7 +240,7 @@ def scan(types: Types, ranges: messages.Ranges, frame: str) -> Message | None:
     values = [nan] * (max(places) + 1)
     for place, (_, distance) in zip(places, flat, strict=True):
         hit = inf if distance is None else distance
-        if not values[place] <= hit:  # of two rays at one place the nearer hit counts
+        if not values[place] <= hit:  # the nearer of two hits at one place counts
             values[place] = hit
     return types.make(
         ros2.LASER_SCAN,

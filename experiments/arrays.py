@@ -49,12 +49,12 @@ class PoseTable(ArrayTable, frozen=True):
 
     link: Index  # directed link; in a table of sent poses, the sender's row
     seq: Index  # running number of the sender
-    stamp: Array  # [s] when the pose was sent
+    stamp: Array  # [s] time at which the pose was sent
     arrival: Array  # [s]
     position: Array  # (M, 3) [m]
     velocity: Array  # (M, 3) [m/s]
     yaw: Array | None = None  # [rad]
-    bytes: Index | None = None  # of the payload
+    bytes: Index | None = None  # length of the payload
     extra: Array | None = None  # (M, k) transmitted with the pose
 
     def since(self, begin: float) -> Self:

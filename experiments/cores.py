@@ -41,7 +41,7 @@ def pool(count: int) -> Iterator[ProcessPoolExecutor | None]:
         yield None
         return
     before = {name: os.environ[name] for name in ONE_THREAD if name in os.environ}
-    os.environ.update(dict.fromkeys(ONE_THREAD, "1"))  # for the processes
+    os.environ.update(dict.fromkeys(ONE_THREAD, "1"))  # set for the processes
     try:
         yield made
     finally:

@@ -79,11 +79,11 @@ class FigureSet(dict[str, "Figure"]):
 class Run:
     """Results of a run."""
 
-    title: str  # of the experiment
-    seed: int  # of the noise
-    traces: dict[str, Trace]  # by case
-    metrics: dict[str, CaseMetrics]  # by case
-    folder: Path | None = None  # of the recordings; None if none were made
+    title: str  # title of the experiment
+    seed: int  # seed of the noise
+    traces: dict[str, Trace]  # traces by case
+    metrics: dict[str, CaseMetrics]  # metrics by case
+    folder: Path | None = None  # folder of the recordings; None if none were made
     source: str = ""  # text of the experiment file
     notes: tuple[str, ...] = ()  # robots lost, a damaged recording, a case that never began
     made: float = field(default_factory=time.time)  # [s] UTC
@@ -134,7 +134,7 @@ def _column(values: Sequence[Any]) -> list[Any]:
 
 
 Progress = Callable[[str, int, int], None]  # case, simulated seconds, seconds in all
-Watch = Callable[[str, Plan], Callable[[simulation.Snapshot], object] | None]  # of a case
+Watch = Callable[[str, Plan], Callable[[simulation.Snapshot], object] | None]  # watcher of a case
 
 
 def simulate(

@@ -28,7 +28,7 @@ RECENT_S: Final = 5.0  # a counter that grew within this time is coloured
 LOW_BATTERY: Final = 0.25
 FLAT_BATTERY: Final = 0.1
 EVENTS: Final = 5  # number of the last ones below the table
-GAP: Final = 2  # between columns [characters]
+GAP: Final = 2  # space between columns [characters]
 NOTE: Final = 10  # least width of the last column
 BAR: Final = 20
 
@@ -59,14 +59,14 @@ class LiveRow:
     phase: str
     rank: Rank = Rank.FINE
     error: float | None = None  # [m]
-    rate: float = 0.0  # [Hz] of transmitted poses
+    rate: float = 0.0  # [Hz] rate of transmitted poses
     late: int | None = None  # ticks that were skipped
     lost: int | None = None  # samples of neighbours
     cpu: float | None = None  # share of a core; of its process, if several robots share one
     battery: float | None = None  # 0 to 1
     sent: int | None = None  # poses
     note: str = ""
-    growing: frozenset[str] = frozenset()  # of "late" and "lost": those that grew in the last seconds
+    growing: frozenset[str] = frozenset()  # counters "late" and "lost" that grew in the last seconds
     pid: int = 0
 
 
@@ -76,7 +76,7 @@ class _Counters:
 
     status: Status
     cpu: float | None = None
-    rate: float = 0.0  # [Hz] of transmitted poses
+    rate: float = 0.0  # [Hz] rate of transmitted poses
     grew: dict[str, float] = field(default_factory=dict)  # [s, UTC] last growth, by counter
 
 

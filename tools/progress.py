@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 REFRESH_S: Final = 0.25
 LINE_S: Final = 5.0
 QUIET: Final = ("robot",)  # kinds of events that the table shows better
-ORDERED: Final = ("landing: ordered to ", "done: ordered to stop")  # by an operator,
-LANDING: Final = ("landing", "stopped", "done")  # except in these phases, by the conductor
+ORDERED: Final = ("landing: ordered to ", "done: ordered to stop")  # texts by an operator
+LANDING: Final = ("landing", "stopped", "done")  # phases in which the conductor gives these orders
 
 
 class Lines:
@@ -109,7 +109,7 @@ def _silence(progress: Progress) -> str:
     return f"no router answers for {silent_s:.1f} s" if silent_s > 0.0 else ""
 
 
-BAR_LINE_S: Final = 5.0  # where there is no terminal, progress is a line now and then
+BAR_LINE_S: Final = 5.0  # period of a line where there is no terminal
 SHORT_S: Final = 2.0  # what is over sooner needs no passing bar
 BAR_REFRESH_S: Final = 0.1
 

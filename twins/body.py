@@ -43,7 +43,7 @@ class Twin:
         "_latency", "_measured", "_measured_at", "_measurement", "_measures", "_t", "_used", "_velocity", "motion",
     )  # fmt: skip
 
-    motion: Motion  # of an engine
+    motion: Motion  # motion by an engine
     _jitter: HoverJitter
     _measurement: MeasurementNoise
     _drift: OdometryDrift
@@ -53,14 +53,14 @@ class Twin:
     _drifts: bool
     _delays: bool
     _drives: bool  # uses its battery all the time; what flies, with its motors on
-    _endurance: float  # of a full battery [s],
-    _used: float  # and the used part of it [s]
+    _endurance: float  # time that a full battery lasts [s],
+    _used: float  # used part of it [s]
     _command: Setpoint  # given since the last step; NaN: none
     _before: Vector  # true position before the step [m]
     _t: float  # time of the last step [s]
     _measured_at: float  # time of the last measurement [s], −inf before the first,
     _measured: Vector  # its position [m],
-    _velocity: Vector  # and velocity [m/s]
+    _velocity: Vector  # its velocity [m/s]
 
     def __init__(
         self, motion: Motion, kind: Kind, disturbance: Disturbance, *, name: str, seed: int, dt: float
@@ -218,7 +218,7 @@ class TwinBody(Placeable):
     def read(self, t: float) -> Sequence[BodyState]:
         """See `Body.read`; the states are the same objects at every call."""
         steps = round((t - self._t) / self._dt)
-        if steps == 1:  # as a rule
+        if steps == 1:  # the rule
             self._advance(t)
         elif steps > 1:
             for now in instants(self._t, t, self._dt):

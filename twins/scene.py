@@ -54,7 +54,7 @@ class Scene:
     low: Array  # (3,) corner of the arena [m]
     high: Array  # (3,) opposite corner [m]
     walled: bool  # the arena's border is a wall
-    names: tuple[str, ...]  # of the obstacles (M)
+    names: tuple[str, ...]  # names of the obstacles (M)
     outline: tuple[
         Array | None, ...
     ]  # own frame: corners (k, 2) of a box, anticlockwise; points of a wall; None: cylinder

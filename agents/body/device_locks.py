@@ -19,7 +19,7 @@ from typing import Final
 from agents.body.interface import BodyError
 from agents.user_folder import foreign_folders, runtime_folders
 
-LONGEST: Final = 200  # [bytes] of the description of a holder
+LONGEST: Final = 200  # [bytes] longest description of a holder
 
 
 def numeric(host: str) -> str:
@@ -60,7 +60,7 @@ class Claims:
         while self._locks:
             path, lock = self._locks.popitem()
             with suppress(OSError):
-                path.unlink()  # while it is locked: a process that waits at this file finds that it is gone
+                path.unlink()  # still locked: a process that waits at this file finds that it is gone
             os.close(lock)
 
 

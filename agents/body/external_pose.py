@@ -15,7 +15,7 @@ from agents.vectors import UNKNOWN, ZERO, Vector
 SMOOTHING_S: Final = 0.1  # time constant of the velocity estimate
 FASTEST: Final = 5.0  # [m/s] a faster jump results from a mistaken marker
 FARTHEST: Final = 1e6  # [m] largest coordinate
-PATIENCE_S: Final = 0.5  # after this silence any position is accepted
+PATIENCE_S: Final = 0.5  # silence after which any position is accepted [s]
 
 
 def velocity_after(velocity: Vector, moved: Vector, since: float) -> Vector:
@@ -32,13 +32,13 @@ def velocity_after(velocity: Vector, moved: Vector, since: float) -> Vector:
 class External:
     """The last external pose of a robot, and a filtered derivative of it."""
 
-    time: float = -inf  # of the pose [s], minus infinity before the first
+    time: float = -inf  # time of the pose [s], minus infinity before the first
     position: Vector = UNKNOWN  # [m], NaN before the first pose
     velocity: Vector = ZERO  # [m/s]
     yaw: float = nan  # [rad], NaN while the newest pose has none
     refused: int = 0  # poses that jumped farther than a robot can move
     _turned: float = nan  # last measured yaw less the body's own at that time [rad], NaN before the first
-    _turned_at: float = nan  # and that time [s]
+    _turned_at: float = nan  # time of that yaw [s]
 
     def update(self, t: float, position: Vector, yaw: float) -> bool:
         """Store a pose; returns False if it is old, or jumps farther than a robot can move."""

@@ -69,14 +69,14 @@ class BodyRequest:
     addresses: tuple[str, ...]  # the `body` of the experiment file: "twin", "radio://0/80/2M/E7E7E7E701", ...
     start: tuple[Vector, ...]  # [m]
     yaw: tuple[float, ...]  # [rad]
-    rate_hz: float  # [1/s] of readings and commands
+    rate_hz: float  # [1/s] rate of readings and commands
     seeds: tuple[int, ...]
     disturbance: tuple[Disturbance, ...]
     external: tuple[bool, ...]  # rows with a position from outside, through `Body.locate`
     device: tuple[Mapping[str, Any], ...]  # settings of the hardware in the experiment file; the body checks them
-    endpoints: tuple[str, ...]  # for bodies on the network
+    endpoints: tuple[str, ...]  # used by bodies on the network
     keys: Keys
-    clock: Clock = field(default_factory=Clock)  # of stamps on the network
+    clock: Clock = field(default_factory=Clock)  # clock of the stamps on the network
 
     def select(self, rows: Sequence[int]) -> BodyRequest:
         per_row = ("names", "kinds", "addresses", "start", "yaw", "seeds", "disturbance", "external", "device")
@@ -115,17 +115,17 @@ class BodyFault:
 class RangeScan(msgspec.Struct, frozen=True):
     """Sweep of a robot's range sensors; all sequences have an entry for each ray."""
 
-    time: float  # [s] of the measurement, on the clock of `Body.read`
-    bearing: Sequence[float]  # from the robot's nose, to the left [rad]
+    time: float  # [s] time of the measurement, on the clock of `Body.read`
+    bearing: Sequence[float]  # angles from the robot's nose, to the left [rad]
     elevation: Sequence[float]  # up [rad]
-    distance: Sequence[float]  # from the robot's centre [m]; NaN where nothing is in reach
+    distance: Sequence[float]  # distances from the robot's centre [m]; NaN where nothing is in reach
 
 
 @dataclass(eq=False, slots=True)
 class BodyState:
     """State of the body of one robot; unknown numbers are NaN."""
 
-    time: float = nan  # when the pose was measured, on the clock of `Body.read` [s]
+    time: float = nan  # time at which the pose was measured, on the clock of `Body.read` [s]
     position: Vector = UNKNOWN  # measured [m]
     velocity: Vector = UNKNOWN  # measured or estimated [m/s]
     yaw: float = nan  # measured [rad]
@@ -134,9 +134,9 @@ class BodyState:
     battery: float = nan  # charge, 0 to 1
     flying: bool = False  # motors on, off the ground or about to be
     spinning: bool = True  # the motors of a flying robot turn, as far as its device tells: one that arms waits first
-    attitude: Attitude = NO_ATTITUDE  # of bodies that measure more than yaw
-    shadow_position: Vector = UNKNOWN  # of the twin that runs beside the robot [m] (`agents.body.shadow_twin`)
-    shadow_yaw: float = nan  # of that twin [rad]
+    attitude: Attitude = NO_ATTITUDE  # known if the body measures more than yaw
+    shadow_position: Vector = UNKNOWN  # place of the twin that runs beside the robot [m] (`agents.body.shadow_twin`)
+    shadow_yaw: float = nan  # yaw of that twin [rad]
     ahead: float = nan  # stamp of the last external position less the time of its arrival [s]
     received: float = nan  # newest answer of the device, on the clock of `Body.read` [s]
     note: str = ""  # report of the hardware (supervisor, link), for people

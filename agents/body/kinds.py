@@ -64,11 +64,11 @@ class Airframe:
     """Rigid quadrotor with motors at 45° to its nose."""
 
     mass: float  # [kg]
-    inertia: tuple[float, float, float]  # about its own x, y, z [kg m²]
-    arm: float  # from the centre to a motor [m]
-    thrust: float  # of a motor at full command [N]
-    torque: float  # of a motor about its axis, per thrust [m]
-    size: tuple[float, float, float]  # of the collision box [m]
+    inertia: tuple[float, float, float]  # moments about its own x, y, z [kg m²]
+    arm: float  # distance of a motor from the centre [m]
+    thrust: float  # force of a motor at full command [N]
+    torque: float  # moment of a motor about its axis, per thrust [m]
+    size: tuple[float, float, float]  # sides of the collision box [m]
 
     def scaled(self, mass: float, arm: float, size: tuple[float, float, float]) -> Airframe:
         """Scale a design: thrust with the mass, inertia with mass and arm squared, torque with the arm."""
@@ -81,8 +81,8 @@ class Airframe:
 class ProtocolTwin:
     """Protocol twin of a kind, for `--bodies protocol`."""
 
-    body: str  # of the group `zenpark.devices`
-    process: str | None = None  # that the robots of a kind share, if one link carries several
+    body: str  # name in the group `zenpark.devices`
+    process: str | None = None  # name of the process that the robots of a kind share, if one link carries several
     position: Literal["body", "external"] = "external"  # source of its position
     device: Mapping[str, object] = field(default_factory=dict, hash=False)  # settings on top of those of the file
 
@@ -91,9 +91,9 @@ class ProtocolTwin:
 class Trial:
     """Trial of a kind in `./zenpark preflight`, before its other flights."""
 
-    name: str  # of the check, and of the option that asks for it
+    name: str  # name of the check, and of the option that asks for it
     device: Mapping[str, object] = field(hash=False)  # settings on top of those of the file
-    hold_s: float  # for which it takes after the take-off [s]
+    hold_s: float  # duration after the take-off [s]
     # a `module:function` of the recorded states, the failure in words and the device settings; it gives what was found
     # and the remedy, empty if all is well
     judge: str
@@ -106,8 +106,8 @@ class Sensor:
     name: str
     bearing: tuple[float, ...]  # (m) of the rays from the robot's nose, to the left [rad]
     elevation: tuple[float, ...] = ()  # (m) 0 or ±π/2 [rad]; empty: all 0
-    mount: float = 0.0  # from the robot's centre to the sensor, along each ray [m]
-    height: float  # above the robot's position, which is the lowest point of its body [m]
+    mount: float = 0.0  # distance from the robot's centre to the sensor, along each ray [m]
+    height: float  # height above the robot's position, which is the lowest point of its body [m]
     nearest: float = 0.0  # closer objects are not reported [m]; with 0, an object that touches the sensor is at 0
     farthest: float  # farther objects are not reported [m]
     rate_hz: float
@@ -142,44 +142,44 @@ class Steering(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Kind:
     """Kind of robot."""
 
-    name: str  # as in the experiment file, and as registered
+    name: str  # name in the experiment file and in the registry
     takes: Takes  # the setpoint that its body takes
     flies: bool  # takes off and lands
     radius: float  # horizontal half-size [m]
     height: float  # vertical size [m]; a position is that of the lowest point, so a body reaches from z to z + height
     mass: float  # ready to fly, with battery and decks [kg]
-    endurance_s: float  # with a full battery, maker's figure
+    endurance_s: float  # endurance with a full battery, maker's figure
     speed: float  # largest speed [m/s]; per axis for robots that fly
     turn_rate: float  # largest yaw rate [rad/s]
     response: float  # rate at which its position controller closes a position error [1/s]
     turn_response: float  # rate at which it closes a yaw error [1/s]
     # time constant with which its velocity follows what is commanded [s]
-    lag: float = 0.1  # of a robot on wheels at 2 m/s², from 0.3 m/s, and a tick or two
-    overshoot: float = 0.0  # of a take-off of the real robot, share of its height, at most
+    lag: float = 0.1  # delay of a robot on wheels at 2 m/s², from 0.3 m/s, and a tick or two
+    overshoot: float = 0.0  # largest overshoot of a take-off of the real robot, share of its height
     late_s: float = inf  # largest delay of positions from outside by which its controller on board flies well [s]
     # time from its motors to the first 5 cm of a climb to a height h by such positions, at most: a + b h + c / h [s]
     lift_s: Vector = (inf, 0.0, 0.0)
     turn_radius: float = 0.0  # smallest, of one that cannot turn on the spot [m]
-    steering: Steering | None = None  # of one that takes twists; None: as two wheels turn
+    steering: Steering | None = None  # used by kinds that take twists; None: as two wheels turn
     # of its twin, or a `module:class`, see `twins.models.ground.Ground`; None: it has no twin
     motion: Motion | str | None = None
     sensors: tuple[Sensor, ...] = ()  # range sensors that each has
     decks: tuple[Sensor, ...] = ()  # those that a robot has if the file says so
-    airframe: Airframe | None = None  # for the engine mujoco; None: that engine refuses it
+    airframe: Airframe | None = None  # needed by the engine mujoco; None: that engine refuses the kind
     # how it is known
     aliases: tuple[str, ...] = ()  # parts of names by which importers know it
-    prefix: str = "R"  # of the names of its robots in generated experiments
-    colour: str = "#7a7a7a"  # in figures of many robots
+    prefix: str = "R"  # first letters of its robots' names in generated experiments
+    colour: str = "#7a7a7a"  # colour in figures of many robots
     mesh: str = (
         ""  # its picture, a `module:function` from a kind to a `experiments.scene.models.Model`; "": by its size
     )
     # hardware
-    bodies: tuple[str, ...] = ()  # of the group `zenpark.bodies` that drive this kind only
-    library: str = ""  # that those need
+    bodies: tuple[str, ...] = ()  # names in the group `zenpark.bodies` that drive this kind only
+    library: str = ""  # library that those bodies need
     twin: ProtocolTwin | None = None
     # `module:function` of name, body and device settings: a robot's address in ROS 2 on routers of the experiment
     ros_address: str = ""
-    takeoff_height: float = nan  # to which it climbs by itself [m]; NaN: to any
+    takeoff_height: float = nan  # height to which it climbs by itself [m]; NaN: to any
     trial: Trial | None = None
     connect: str = ""  # remedy for a robot that does not answer
     charge: str = "charge it"  # remedy for an empty battery

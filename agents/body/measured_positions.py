@@ -35,7 +35,7 @@ class PositionSource:
     inbox: pubsub.Inbox[messages.Position]
     exact: bool  # noise-free positions from a simulation, which may repeat
     late_s: float  # later ones are refused [s]
-    session: str | None = None  # that its samples name, if they do
+    session: str | None = None  # session that its samples name, if they do
     alive_at: float = -inf  # arrival of its last position that was new [s]; minus infinity: none yet
     foreign_at: float = -inf  # arrival of the last position from a second source [s]
     # stamp of the last position less the time of its arrival [s]: the clock of the source is ahead by at least this
@@ -44,7 +44,7 @@ class PositionSource:
     used_at: float = -inf  # arrival of the last position that was new and not late [s]
     last: tuple[Vector, float | None] | None = None  # position [m] and yaw [rad]
     new_at: float = -inf  # arrival of the last pose that was new [s],
-    repeats: bool = False  # and whether others came since
+    repeats: bool = False  # True if other positions came since
 
     def measures(self, session: str | None, pose: tuple[Vector, float | None], now: float) -> bool:
         """Whether a pose was measured; of the first one of a session that is known when the next one differs."""
@@ -89,7 +89,7 @@ class MeasuredPositions:
         """
         self._valid_box, self._silence_s = valid_box, silence_s
         self._received_at, self._begun = -inf, inf  # the last call and the first one [s]
-        self.sources: dict[int, PositionSource] = {}  # by row
+        self.sources: dict[int, PositionSource] = {}  # sources by row
         for row in rows:
             key = keys.position(names[row])
             inbox = pubsub.Inbox(pubsub.subscriber(session, key, 32), messages.Position, keys=keys)

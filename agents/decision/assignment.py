@@ -26,26 +26,26 @@ class Assignment:
     hover: float  # height that a flying robot holds [m]; NaN on wheels
     neighbours: tuple[Incoming, ...]  # links on which it receives, those of its law first
     law: Law
-    trigger: Trigger  # of transmissions
+    trigger: Trigger  # decides when to transmit
     clamp: float  # largest step of a goal per axis and decision [m]
     tracking_gain: float  # k of (7) [1/(m² decision)]
     limits: Limits
     body_hz: float  # rate of ticks
     pose_every: int  # ticks from one question to the trigger to the next
     decide_every: int  # ticks from one goal to the next
-    duration: float  # of the experiment [s]
-    lands_at: float = inf  # in it, if not at its end [s]
-    number: int = 0  # among all robots of the experiment
-    count: int = 1  # of these
+    duration: float  # duration of the experiment [s]
+    lands_at: float = inf  # time of an earlier landing [s]
+    number: int = 0  # index among all robots of the experiment
+    count: int = 1  # number of all robots
     legs: tuple[Leg, ...] = ()  # its plan
     patience_s: float | None = None  # wait for a missing neighbour [s]; None: without limit
-    predictor: Predictor = HOLD  # of neighbours between two messages
-    update: Trigger | None = None  # of the law; None: at every decision
+    predictor: Predictor = HOLD  # extrapolates neighbours between two messages
+    update: Trigger | None = None  # decides when the law is evaluated; None: at every decision
     avoidance: Avoidance | None = None  # None: no collision avoidance
     avoids: bool = True
     anchors: tuple[Anchor, ...] = ()  # distances to fixed points, lines, planes
-    changes: tuple[Change, ...] = ()  # of the targets of all links
-    start: tuple[float, float] | None = None  # where it begins [m]; None: anywhere
+    changes: tuple[Change, ...] = ()  # changes of the targets of all links
+    start: tuple[float, float] | None = None  # place where it begins [m]; None: anywhere
     start_within: float = 0.0  # farthest from there that it may take off [m]
     start_yaw: float = nan  # wanted there [rad]; NaN: any
     # all robots: name, x and y where they begin [m], radius [m]; empty where that is not known

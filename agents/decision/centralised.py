@@ -28,7 +28,7 @@ class CentreGoal(NamedTuple):
     goal: Vector  # [m]
     yaw: float  # wanted at the goal [rad], NaN for any
     pose_stamp: float  # time of the pose from which the goal was computed [s]
-    velocity: Vector = UNKNOWN  # of a law that gives velocities [m/s]; its third NaN: the height is held
+    velocity: Vector = UNKNOWN  # output of a law that gives velocities [m/s]; its third NaN: the height is held
 
 
 class Followed:
@@ -36,16 +36,16 @@ class Followed:
 
     def __init__(self, assignment: Assignment) -> None:
         self.guided = self.needed = assignment.guided  # gets goals; its poses are needed
-        self.held = False  # by its safety, as far as known; set by the caller
+        self.held = False  # True if its safety holds it, as far as known; set by the caller
         self.words: Mapping[str, Values] = NO_WORDS  # what its law says, as it was at the last decision
-        self.computer, self.keeping = GoalComputer(assignment), StationKeeping(assignment.ground)  # of its goals
+        self.computer, self.keeping = GoalComputer(assignment), StationKeeping(assignment.ground)  # makers of its goals
         # guided robots that receive its poses, and by which link
         self.receivers: list[tuple[GoalComputer, int]] = []
         self.position, self.velocity, self.yaw = UNKNOWN, ZERO, 0.0  # last received [m], [m/s], [rad]
         self.stamp = -inf  # [s]; minus infinity before the first pose
         self.lost_since = -inf  # [s]; infinity: alive; minus infinity: never seen
         self.goal, self.goal_yaw = UNKNOWN, nan  # last goal [m], and what is wanted there [rad], NaN for any
-        self.pose_stamp = -inf  # of the pose on which it rests [s]
+        self.pose_stamp = -inf  # stamp of the pose on which it rests [s]
         self.sent_at = -inf  # [s]
         self.updates = 0  # decisions that recomputed its goal
 
@@ -62,7 +62,7 @@ class Centre:
                 sender = self.robots[incoming.sender]
                 sender.receivers.append((robot.computer, link))
                 sender.needed = True
-        self.decisions = 0  # since the first guided robot began
+        self.decisions = 0  # count since the first guided robot began
 
     @property
     def needed(self) -> list[int]:
@@ -171,7 +171,7 @@ class Centre:
                 robot.updates += 1
             if computer.stepping is not None:
                 if not computer.stepping.sound:
-                    return None  # without goals it holds
+                    return None  # a robot without goals holds
                 velocity = (computer.follows and computer.stepping.velocity) or UNKNOWN
         held = (runs and computer.without_neighbours()) or waits
         robot.keeping.hold(held, position)

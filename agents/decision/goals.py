@@ -59,7 +59,7 @@ class GoalComputer:
         if assignment.update is not None:
             self._updating = ControlUpdates(assignment.update, len(links), anchored=bool(self._anchors))
         self.goal, self.yaw = UNKNOWN, nan  # decided last [m], and wanted there [rad], NaN for any
-        self.offset = ZERO  # of the law at the last decision, before it was clamped [m]
+        self.offset = ZERO  # offset of the law at the last decision, before it was clamped [m]
         self.error = self.energy = 0.0  # Σ|e| of the links [m] and Σ ½e² [m²], of the last call of `errors`
 
     def update_links(self, t: float) -> None:

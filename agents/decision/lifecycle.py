@@ -18,10 +18,10 @@ class Phase(IntEnum):
 
     IDLE = 0  # process alive, something missing: position or a neighbour
     READY = 1  # body open, own position fresh, all neighbours received, `agents.safety.preflight` passed
-    AIRBORNE = 2  # at its hover height (a ground robot: at once), waiting for the common start
+    AIRBORNE = 2  # hovers at its height (a ground robot: at once) and waits for the common start
     RUNNING = 3  # the experiment
     LANDING = 4  # going down, or rolling out
-    DONE = 5  # on the ground, motors off
+    DONE = 5  # stands on the ground, motors off
 
     @property
     def word(self) -> str:
@@ -32,8 +32,8 @@ class Phase(IntEnum):
 # the members of an enumeration are slow to look up, and every tick asks for them
 IDLE, READY, AIRBORNE, RUNNING, LANDING, DONE = (int(phase) for phase in Phase)
 
-AT_HEIGHT: Final = 0.05  # [m] below the hover height, and less: arrived,
-ABOVE_HEIGHT: Final = 0.1  # or above it: a Crazyflie overshoots, and takes 10 s to come back
+AT_HEIGHT: Final = 0.05  # [m] distance below the hover height at which it has arrived
+ABOVE_HEIGHT: Final = 0.1  # [m] excess of height that counts as arrived: a Crazyflie overshoots
 FINISHED: Final = "finished"  # reasons for a landing that is no fault; orders are others
 SCRIPTED: Final = "lands as its file says"
 TOLD_TO_END: Final = "asked to end"
@@ -48,8 +48,8 @@ class Lifecycle:
         """Of a robot that hovers at `hover` [m], in an experiment of `duration`, and lands at `lands_at` [s] in it."""
         self._flies, self._hover = kind.flies, hover
         self._ends_after, self._scripted = min(duration, lands_at), lands_at < duration
-        self.phase = self._before = IDLE  # of `Phase`
-        self.climbing = False  # on its way up
+        self.phase = self._before = IDLE  # members of `Phase`
+        self.climbing = False  # True on its way up
         self.start_at = inf  # the common start on the process's clock [s]; infinity before it is known
         self.settled_until = -inf  # the robot runs, and goes on, until then [s]: there is no need to advance
         self.moved = False  # whether the phase changed on the last tick, or by an order since the one before
@@ -154,4 +154,4 @@ class Lifecycle:
         if self.phase == RUNNING and t - self.start_at >= self._ends_after - 1e-6:
             self.land(SCRIPTED if self._scripted else FINISHED)
         if self.phase == LANDING and not self.land_due and self._is_down(velocity, flying):
-            self.phase = DONE  # but not before the body has received the command
+            self.phase = DONE  # set after the body has received the command

@@ -21,8 +21,8 @@ class Incoming(msgspec.Struct, frozen=True):
     """A link on which a robot receives poses, as the experiment has it."""
 
     sender: int  # number among all robots of the experiment
-    name: str  # of the sender
-    kind: Kind  # of the sender
+    name: str  # name of the sender
+    kind: Kind  # kind of the sender
     distance: float  # target and gain, see `Link`
     gain: float = 1.0
     relative: Vector = UNKNOWN
@@ -30,9 +30,9 @@ class Incoming(msgspec.Struct, frozen=True):
     wants: int = 0
     in_law: bool = True  # else the poses are for avoidance alone
     awaited: bool = True  # the robot is not ready without a pose of this sender
-    targets: tuple[Target, ...] = ()  # after each change of the formation
+    targets: tuple[Target, ...] = ()  # targets after each change of the formation
     since: float = -inf  # time after the common start at which the link begins [s],
-    until: float = inf  # and at which it ends [s]
+    until: float = inf  # time at which that change ends [s]
     reach: float = inf  # distance below which it begins [m]; infinity: any
     release: float = inf  # distance above which it ends [m]; the gap to `reach` prevents flicker
 
@@ -85,7 +85,7 @@ class Neighbours:
 
     def __init__(self, incoming: Sequence[Incoming], silence_s: float) -> None:
         """Start without poses; lost senders leave the law after `silence_s` [s]."""
-        self.all = [Neighbour(each) for each in incoming]  # in the order of the links
+        self.all = [Neighbour(each) for each in incoming]  # same order as the links
         self.incomplete = True  # a sender is missing or lost, so that time alone can change the active links
         self.lagging = False  # the clock of a sender lags
         self.refused = False  # all poses of a sender are refused

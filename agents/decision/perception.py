@@ -15,14 +15,14 @@ from agents.plugins.calls import failure, wrong
 from agents.plugins.registry import FAILURES
 from agents.vectors import Vector, clamp, is_finite, planar
 
-SIGHT_M: Final = 3.0  # [m] between axes; farther things are ignored
+SIGHT_M: Final = 3.0  # [m] distance of axes beyond which things are ignored
 AHEAD_S: Final = 0.1  # received positions are extrapolated for this long: a silent robot may have stopped
-BELIEVED_S: Final = 0.5  # and received velocities are used for this long
+BELIEVED_S: Final = 0.5  # [s] longest use of a received velocity
 SCAN_S: Final = 1.0  # readings older than this are dropped
 CLIMB: Final = 0.1  # [m/s] a robot that sinks or rises faster may be landing or taking off,
-CLIMB_S: Final = 2.0  # and is in the way wherever it can be within this time
+CLIMB_S: Final = 2.0  # [s] time within which a climbing drone may be in the way
 OUTLINE: Final = 0.05  # [m] a reading that ends this near to a received robot has hit that robot,
-OUTLINE_SHARE: Final = 0.05  # and this share of its length, as long ones are measured worse
+OUTLINE_SHARE: Final = 0.05  # share of its length that is added: long ones are measured worse
 INSIDE: Final = 0.5  # share of its radius: a shorter reading of a robot is none
 STEEP: Final = 0.5  # cosine of the elevation above which a ray looks up or down, not around
 
@@ -33,7 +33,7 @@ class Point(NamedTuple):
     x: float  # [m]
     y: float
     height: float  # [m]
-    distance: float  # from the robot, when it was measured [m]
+    distance: float  # distance from the robot, when it was measured [m]
 
 
 class Perception:
@@ -48,14 +48,14 @@ class Perception:
         self._clearance = assignment.avoidance.clearance  # things farther above or below are ignored [m]
         self._radius, self._height = kind.radius, kind.height
         self._links = len(assignment.neighbours)
-        self.near = Nearby()  # of the last call of `sense`
+        self.near = Nearby()  # result of the last call of `sense`
         self.near.reserve(self._links)
         own = self.own = OwnState()  # likewise
         own.radius, own.height, own.turn_rate = kind.radius, kind.height, kind.turn_rate
         own.speed, own.response, own.lag = min(kind.speed, limits.top_speed), kind.response, kind.lag
         own.by_position, own.by_twist = kind.takes == "position", kind.takes == "twist"
         own.flies = kind.flies
-        self._horizon = kind.radius + _horizon(self.avoidance, own)  # from the own axis [m]
+        self._horizon = kind.radius + _horizon(self.avoidance, own)  # range of sight from the own axis [m]
         self._in_time = self._horizon + HURRY * own.speed * SCAN_S  # what comes within the horizon before it is old
         self.sees = False  # there are range readings
         self._scan: RangeScan | None = None

@@ -12,7 +12,7 @@ from agents.body.kinds import Agility, Kind, Steering
 from agents.vectors import UNKNOWN, Setpoint, Vector, clamp, wrap
 
 REACHED: Final = 0.005  # [m] a ground robot stops nearer than this to its goal; half the threshold of a 1 cm trigger
-TURNED: Final = radians(2.0)  # [rad] and nearer than this to the wanted yaw
+TURNED: Final = radians(2.0)  # [rad] largest error of yaw that counts as reached
 
 LEASH: Final = 0.05  # [m] farthest of a reference from its robot: it does not wind up where the robot is held back
 
@@ -25,7 +25,7 @@ class PositionController:
     def __init__(self, kind: Kind) -> None:
         # its body takes positions, and closes in on them by itself, or twists; one that takes neither takes velocities
         self._flies_to, self._drives = kind.takes == "position", kind.takes == "twist"
-        self._flies, self._steering = kind.flies, kind.steering or TwoWheels()  # of a kind that takes twists
+        self._flies, self._steering = kind.flies, kind.steering or TwoWheels()  # steering of a kind that takes twists
         self._agility = Agility(kind.response, kind.turn_response, kind.speed, kind.turn_rate)
 
     def setpoint(self, goal: Vector, goal_yaw: float, position: Vector, yaw: float) -> Setpoint:

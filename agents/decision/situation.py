@@ -13,7 +13,7 @@ from agents.vectors import UNKNOWN, Vector
 # publisher, 0.5 s after its last pose, or with the history that is requested after a reconnection
 SILENT_S: Final = 1.0
 LATE_WINDOW_S: Final = 1.0  # window in which missed ticks are counted
-LATE_SHARE: Final = 0.9  # with a larger share of missed ticks the control loop fails
+LATE_SHARE: Final = 0.9  # share of missed ticks from which the control loop fails
 
 
 @dataclass(eq=False, slots=True)
@@ -22,7 +22,7 @@ class ProcessHealth:
 
     offline_since: float = inf  # loss of the router [s]; infinity while connected
     conductor_lost_since: float = inf  # loss of the conductor [s]; infinity while alive, or never seen
-    missed_share: float = 0.0  # of the last ticks, 0 to 1
+    missed_share: float = 0.0  # share of the last ticks, 0 to 1
     resumed_at: float = -inf  # end of the last suspension [s]
     suspended_s: float = 0.0  # its duration [s]
     connected_since: float = -inf  # begin of the connection to a router after it [s]
@@ -56,7 +56,7 @@ class Situation:
     """One robot on a tick; overwritten on each."""
 
     t: float = 0.0  # now [s]
-    state: BodyState = field(default_factory=BodyState)  # as the body gave it; the decision uses what follows
+    state: BodyState = field(default_factory=BodyState)  # reading of the body; the decision uses what follows
     position: Vector = UNKNOWN  # measured [m]; NaN where it jumped
     velocity: Vector = UNKNOWN  # measured or estimated [m/s]
     yaw: float = nan  # measured [rad]
@@ -64,9 +64,9 @@ class Situation:
     yaw_jump: float = nan  # size of the jump of its yaw [rad]; NaN: it did not jump
     sound: bool = True  # pose known, fresh and inside the arena: the five below are False and 0
     invalid: bool = False  # own pose missing, stale or not finite: no closed loop is possible
-    outside_wall: bool = False  # outside a wall, or above the ceiling
-    outside: bool = False  # outside the arena beyond any doubt
-    flyaway: bool = False  # so far outside that a flying robot must be stopped there
+    outside_wall: bool = False  # True outside a wall, or above the ceiling
+    outside: bool = False  # True outside the arena beyond any doubt
+    flyaway: bool = False  # True so far outside that a flying robot must be stopped there
     excess: float = 0.0  # distance from the arena along the worst axis [m]; 0 inside
 
     def begin(self, t: float) -> None:

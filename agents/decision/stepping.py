@@ -76,7 +76,7 @@ class Stepping:
         )  # fmt: skip
         self.memory = self._begin()
         self.speech = Speech(law, self.memory) if law.SAYS else None  # None: the law says nothing
-        self.control = Control()  # of the last step
+        self.control = Control()  # result of the last step
         self.measures: dict[str, float] = {}  # likewise
         self.moves = True  # the robot may move; set by its caller, and likewise
         self.scan: Any = None  # range readings

@@ -20,7 +20,7 @@ class Transmitter:
 
     def __init__(self, trigger: Trigger, predictor: Predictor, kind: Kind, speech: Speech | None = None) -> None:
         self.asking, self.smoothed = TriggerState(trigger), LowPass(kind)
-        self.predictor = predictor  # of the receivers
+        self.predictor = predictor  # predictor of the receivers
         self._smooths, self._speaks = trigger.smoothing_s > 0.0, speech is not None
         self.speech = cast(Speech, speech)  # what is said beside the pose, if anything is
         # of the last question: what would be transmitted [m], [m/s], NaN where unknown

@@ -22,8 +22,8 @@ class Change(msgspec.Struct, frozen=True):
 
     at: float  # begin since the common start [s]
     over: float  # duration [s]; 0: at once
-    scale: float  # of the shape seen from above; heights are kept
-    turn: float  # about the vertical, to the left [rad]
+    scale: float  # scale of the shape seen from above; heights are kept
+    turn: float  # turn about the vertical, to the left [rad]
 
 
 class Target(msgspec.Struct, frozen=True):

@@ -22,7 +22,7 @@ class Link:
     """
 
     distance: float = nan  # d_ij [m]; NaN where only a direction is wanted
-    gain: float = 1.0  # of the law
+    gain: float = 1.0  # factor of the law
     relative: Vector = UNKNOWN  # wanted p_i − p_j [m]; NaN for distances and directions
     bearing: Vector = UNKNOWN  # unit vector along the wanted p_i − p_j, NaN where none; z alone NaN: seen from above
-    wants: int = BY_DISTANCE  # BY_DISTANCE, BY_RELATIVE, BY_BEARING or BY_NOTHING
+    wants: int = BY_DISTANCE  # one of BY_DISTANCE, BY_RELATIVE, BY_BEARING, BY_NOTHING

@@ -8,7 +8,7 @@ from typing import Final
 from agents.body.kinds import Agility, Kind, Steered, Steering
 from agents.vectors import clamp
 
-BASE: Final = 0.15  # [m] between the axles
+BASE: Final = 0.15  # [m] distance of the axles
 RADIUS: Final = 0.26  # [m] smallest turning radius
 NEAR: Final = 0.02  # [m] it stops nearer than this to its goal
 FIRMLY: Final = 1.2  # times the curvature of the arc to a goal: turned toward it before it is reached

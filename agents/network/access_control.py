@@ -18,7 +18,7 @@ from agents.network.lab import LabError, Register
 
 Flow = Literal["ingress", "egress"]
 
-MOST_BYTES: Final = 64 * 1024  # of a message below the name of a robot, as readers accept
+MOST_BYTES: Final = 64 * 1024  # size of a message below the name of a robot, as readers accept
 PASSED: Final = (
     "put", "query", "reply", "declare_subscriber", "declare_queryable",
     "liveliness_token", "liveliness_query", "declare_liveliness_subscriber",
@@ -47,8 +47,8 @@ class Rights(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Rights in an experiment: of each robot by its name, of all others by their role."""
 
     realm: str  # first chunk of every key
-    robots: dict[str, Grant]  # by name
-    roles: dict[str, Grant]  # by role
+    robots: dict[str, Grant]  # grants by name of a robot
+    roles: dict[str, Grant]  # grants by role
     linked: bool = False  # routers forward to each other what they have let in; else a router may publish nothing
 
     def joined(self, other: Rights) -> Rights:

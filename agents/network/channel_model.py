@@ -76,9 +76,9 @@ class Conditions(msgspec.Struct, frozen=True):
     burst: float = nan  # mean length, at least 1 / (1 - loss); NaN: each sample is lost or not by itself
     bandwidth: float = inf  # [bit/s], infinity: no limit
     queue: float = inf  # [s]
-    key: int = 0  # of `key`, from the seed and the names of sender and receiver
+    key: int = 0  # first half of `key`, drawn by the seed and the names of sender and receiver
     outages: tuple[tuple[float, float], ...] = ()  # begin and end of each [s] after the common start
-    duration: float = inf  # [s] from the common start; later nothing is lost or delayed
+    duration: float = inf  # [s] time after the common start; later nothing is lost or delayed
 
     @classmethod
     def of(cls, effects: LinkEffects, outages: Sequence[tuple[float, float]], duration: float) -> Conditions:
@@ -106,7 +106,7 @@ class LinkChannel:
         self._conditions, self.delay = conditions, conditions.delay  # [s]
         self.dropped = 0  # samples that were lost
         self._enter, self._leave = _thresholds(conditions)
-        self._free = -inf  # when the link has sent all that it has taken [s]
+        self._free = -inf  # time at which the link has sent all that it has taken [s]
         # the delay is all that there is
         self.plain = not (conditions.random or conditions.bandwidth < inf or conditions.outages)
 
@@ -156,7 +156,7 @@ class LinkChannel:
         key, enter, leave = self._conditions.key, self._enter, self._leave
         while True:
             u = uniform(key, seq * USES + LOSS)
-            if seq == 0:  # before the first sample: as often bad as in the long run
+            if seq == 0:  # first sample: as often bad as in the long run
                 return u < self._conditions.loss
             if u < enter:
                 return True

@@ -134,7 +134,7 @@ def free_endpoints(count: int, protocol: str = "tcp") -> list[str]:
 Mode = Literal["client", "peer", "router"]
 
 OWNER: Final = "#of="
-TOGETHER: Final = "+"  # between the names of robots that share a process
+TOGETHER: Final = "+"  # separates the names of robots that share a process
 
 
 @dataclass(frozen=True)

@@ -31,14 +31,14 @@ class Keys:
 
     # of each robot, by its name
 
-    pose = _robot_key("pose")  # for the neighbours, sent when the trigger says so
+    pose = _robot_key("pose")  # pose for the neighbours, sent when the trigger says so
     state = _robot_key("state")  # telemetry for recorder and viewers
     memory = _robot_key("memory")  # likewise, of laws that remember
     status = _robot_key("status")  # lifecycle and counters, at 1 Hz and on every change
     order = _robot_key("order")  # queryable that takes orders and always replies
     alive = _robot_key("alive")  # liveliness token
     position = _robot_key("position")  # pose measured from outside (motion capture, a twin service)
-    goal = _robot_key("goal")  # from the central controller, or from outside
+    goal = _robot_key("goal")  # goal given by the central controller, or from outside
     setpoint = _robot_key("setpoint")  # commands for a body that lives in another process
     ranges = _robot_key("ranges")  # readings of the range sensors
     truth = _robot_key("truth")  # true pose of a protocol twin: for recorder and motion capture, never for robots
@@ -58,7 +58,7 @@ class Keys:
 
     estop = _RealmKey("estop")  # emergency stop for all robots
     event = _RealmKey("run/event")  # phases, losses, orders: the operator's, as all below `run`
-    experiment = _RealmKey("run/experiment")  # as it runs, late joiners included
+    experiment = _RealmKey("run/experiment")  # case that runs, late joiners included
     conductor = _RealmKey("run/conductor")  # liveliness token
     run_order = _RealmKey("run/order")  # queryable: remove, restart, replace, add robots
     clock = _RealmKey("run/clock")  # clock offsets of other machines from the conductor's

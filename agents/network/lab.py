@@ -29,8 +29,8 @@ ROLES: Final[tuple[Role, ...]] = get_args(Role)
 REGISTER: Final = "lab.json"
 AUTHORITY: Final = "ca"
 MARK: Final = "#lab="
-UNUSABLE: Final = ";?"  # in the path of a lab: they separate the parts of an endpoint
-MARK_BYTES: Final = 8  # of an id of 16
+UNUSABLE: Final = ";?"  # letters that may not stand in the path of a lab: they separate the parts of an endpoint
+MARK_BYTES: Final = 8  # first bytes of an id of 16
 SECURE: Final = ("tls", "quic")
 DEFAULT_SECURE: Final = "tls/127.0.0.1:7447"
 
@@ -46,7 +46,7 @@ class Identity(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # of its present certificate: its name, or `CF01.2` for the second one. A certificate with an earlier common name is
     # still the lab's, and gives no right.
     common_name: str
-    serial: str  # of that certificate, in hexadecimal
+    serial: str  # number of that certificate, in hexadecimal
     until: str  # end of its validity, UTC, ISO 8601
     hosts: list[str] = []  # names and addresses at which it may listen
 

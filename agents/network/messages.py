@@ -73,7 +73,7 @@ class LawMemory(Message, frozen=True, omit_defaults=True):
     seq: int
     stamp: float  # [s] UTC
     memory: list[Variable] = []
-    measures: list[Variable] = []  # of one number each
+    measures: list[Variable] = []  # quantities of one number each
 
     @property
     def variables(self) -> dict[str, list[float]]:
@@ -125,13 +125,13 @@ class State(Message, frozen=True, omit_defaults=True):
     # v [m/s], ω [rad/s], 0, 0 for twists
     setpoint: Setpoint | None = None
     error: float | None = None  # [m] Σ|d − distance| over the links of the robot, by its own knowledge
-    true_position: Vector | None = None  # [m] of a twin
-    true_yaw: float | None = None  # [rad] of a twin
+    true_position: Vector | None = None  # [m] known of a twin
+    true_yaw: float | None = None  # [rad] known of a twin
     received: list[PoseReceipt] = []  # poses of neighbours since the last state
     attitude: Setpoint | None = None  # quaternion w, x, y, z, of bodies that measure more than yaw
-    shadow_position: Vector | None = None  # [m] of the twin beside a real robot
+    shadow_position: Vector | None = None  # [m] place of the twin beside a real robot
     shadow_yaw: float | None = None  # [rad]
-    goal_receipts: list[GoalReceipt] = []  # since the last state
+    goal_receipts: list[GoalReceipt] = []  # receipts since the last state
 
 
 class Incident(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -147,17 +147,17 @@ class Status(Message, frozen=True):
 
     robot: str
     stamp: float  # [s] UTC
-    phase: str  # of the lifecycle
-    reason: str  # for the phase
+    phase: str  # word of the lifecycle
+    reason: str  # cause of the phase
     body: str = ""  # report of the body
     battery: float | None = None  # charge, 0 to 1
     sent: int = 0  # poses
     received: int = 0  # poses of neighbours
-    lost: dict[str, int] = {}  # by neighbour: samples that never arrived, by their sequence numbers
-    dropped: dict[str, int] = {}  # by neighbour, if any: samples that the modelled channel dropped
+    lost: dict[str, int] = {}  # samples by neighbour that never arrived, by their sequence numbers
+    dropped: dict[str, int] = {}  # samples by neighbour that the modelled channel dropped
     malformed: int = 0  # refused payloads
     refused: int = 0  # orders
-    ticks: int = 0  # since the common start
+    ticks: int = 0  # count since the common start
     missed: int = 0  # ticks that were skipped
     decisions: int = 0  # ticks with a goal that was computed or received
     interventions: int = 0  # ticks on which safety changed the decision
@@ -172,8 +172,8 @@ class Status(Message, frozen=True):
     # worst present hazard and its outcome: "hold: minimum separation: 0.18 m from CF03 (limit 0.25 m)"
     hazard: str = ""
     incidents: list[Incident] = []  # the last ones, repeated in each status so that a lost status loses none
-    stale: dict[str, int] = {}  # by neighbour, if any: samples older than a known one
-    foreign: dict[str, int] = {}  # by neighbour, if any: samples from another source than its process
+    stale: dict[str, int] = {}  # samples by neighbour that were older than a known one
+    foreign: dict[str, int] = {}  # samples by neighbour from another source than its process
 
     def incidents_since(self, before: Status | None) -> list[Incident]:
         """Incidents since an earlier status; all, if that is of another process."""
@@ -228,8 +228,8 @@ class CentreState(Message, frozen=True):
     missed: int = 0  # decisions that were skipped because they were late
     goals: int = 0  # sent
     received: dict[str, int] = {}  # poses
-    lost: dict[str, int] = {}  # by their sequence numbers
-    dropped: dict[str, int] = {}  # by the modelled channel
+    lost: dict[str, int] = {}  # samples missing by their sequence numbers
+    dropped: dict[str, int] = {}  # samples dropped by the modelled channel
     malformed: int = 0
     pid: int = 0
     cpu_s: float = 0.0
@@ -243,8 +243,8 @@ class Command(Message, frozen=True):
     seq: int
     stamp: float  # [s] UTC
     action: Literal["drive", "takeoff", "land", "stop"]
-    setpoint: Setpoint | None = None  # of `drive`, see `State`
-    height: float | None = None  # [m] of `takeoff`
+    setpoint: Setpoint | None = None  # argument of `drive`, see `State`
+    height: float | None = None  # [m] argument of `takeoff`
 
 
 class Ranges(Message, frozen=True):
@@ -252,7 +252,7 @@ class Ranges(Message, frozen=True):
 
     robot: str
     stamp: float  # [s] UTC
-    bearing: list[float]  # [rad] from the robot's nose
+    bearing: list[float]  # [rad] angles from the robot's nose
     elevation: list[float]  # [rad]
     distance: list[float | None]  # [m]; None: nothing in reach
 
@@ -296,7 +296,7 @@ class WorldOrder(Message, frozen=True):
     """Order of an operator to a world."""
 
     order: Literal["pause", "resume", "reset"]
-    name: str | None = None  # of reset: a robot (left out: all)
+    name: str | None = None  # argument of reset: a robot (left out: all)
 
 
 class WorldReply(Message, frozen=True):
@@ -316,8 +316,8 @@ class Order(Message, frozen=True):
 
     order: OrderKind
     at: float | None = None  # [s] UTC of a start; of a take-off into a run under way, when that began
-    name: str | None = None  # of the parameter to get or set
-    value: float | None = None  # of the parameter to set
+    name: str | None = None  # name of the parameter to get or set
+    value: float | None = None  # value of the parameter to set
     goal: tuple[float, float] | None = None  # x, y [m] of go: where a leader goes, in a straight line
     # of both: `Status.origin` of the robot's former process; its plan goes on from there
     origin: Setpoint | None = None
@@ -327,12 +327,12 @@ class Inspection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_d
     """Facts about a robot's device before a run; None: this kind of body has none."""
 
     firmware: str | None = None  # version as the device reports it, such as "2025.02"
-    volts: float | None = None  # [V] of the battery now
-    packets_hz: float | None = None  # [1/s] that the robots of this process ask of the radio that carries this one
-    capacity_hz: float | None = None  # [1/s] that this radio carries
+    volts: float | None = None  # [V] present voltage of the battery
+    packets_hz: float | None = None  # [1/s] packets that this process's robots ask of the radio of this one
+    capacity_hz: float | None = None  # [1/s] packets that this radio carries
     flying: bool = False  # motors of a drone on
-    age_s: float | None = None  # [s] of its position
-    delay_s: float | None = None  # [s] of positions from outside, whatever their stamps say, in the last climb
+    age_s: float | None = None  # [s] age of its position
+    delay_s: float | None = None  # [s] delay of positions from outside, whatever their stamps say, in the last climb
     ahead_s: float | None = None  # [s] stamp of the last external position less the time of its arrival
 
 
@@ -344,7 +344,7 @@ class Reply(Message, frozen=True):
     phase: str
     reason: str = ""
     value: float | None = None
-    inspection: Inspection | None = None  # of "inspect"
+    inspection: Inspection | None = None  # answer to "inspect"
 
 
 class RunOrder(Message, frozen=True):
@@ -353,18 +353,18 @@ class RunOrder(Message, frozen=True):
     order: ChangeKind
     robots: list[str]
     operator: str = ""  # name of the operator
-    spare: str | None = None  # of replace: robot of the experiment file that takes over
-    body: str | None = None  # of replace: address of the new body
+    spare: str | None = None  # argument of replace: robot of the experiment file that takes over
+    body: str | None = None  # argument of replace: address of the new body
     at: tuple[float, float] | None = None  # [m] x, y of its start
-    yaw: float = 0.0  # [rad] of its start
+    yaw: float = 0.0  # [rad] yaw at its start
 
 
 class RunReply(Message, frozen=True):
     """Reply of a conductor when all is done."""
 
-    done: dict[str, str] = {}  # by robot
-    refused: dict[str, str] = {}  # by robot, with the reason
-    reason: str = ""  # for which the whole order is refused
+    done: dict[str, str] = {}  # result by robot
+    refused: dict[str, str] = {}  # reason by robot
+    reason: str = ""  # cause of a refusal of the whole order
 
 
 class Stop(Message, frozen=True):
@@ -395,7 +395,7 @@ class HostClock(Message, frozen=True):
     stamp: float  # [s] UTC of the conductor
     offset: float  # [s] reading of the host less that of the conductor
     uncertainty: float  # [s]
-    robots: list[str]  # on the host
+    robots: list[str]  # robots of the host
     # [s] correction that the robots subtract from their stamps from now on, reached at the rate `agents.clock.SLEW`;
     # None: the offset of the first such message of a run
     applied: float | None = None

@@ -26,7 +26,7 @@ from agents.network.keys import Keys
 from agents.network.zenoh_config import LEASE_S
 
 ANSWER_S: Final = 10.0  # limit for the routers to answer
-TURN_S: Final = 0.01  # between two polls of a check
+TURN_S: Final = 0.01  # pause between two polls of a check
 SETTLE_S: Final = 0.2  # limit for a token to travel from one router to the next, and for a lost link to be noticed
 
 
@@ -34,9 +34,9 @@ SETTLE_S: Final = 0.2  # limit for a token to travel from one router to the next
 class OwnershipTiming:
     """Limits of the questions who owns a name [s]."""
 
-    vanish_s: float = 2.5  # for the tokens of a killed owner to vanish
-    answer_s: float = ANSWER_S  # for the routers to answer
-    retry_s: float = network.RETRY_S  # between two questions
+    vanish_s: float = 2.5  # time for the tokens of a killed owner to vanish
+    answer_s: float = ANSWER_S  # time for the routers to answer
+    retry_s: float = network.RETRY_S  # pause between two questions
 
 
 USUAL: Final = OwnershipTiming()
@@ -243,7 +243,7 @@ class NameKeeper:
         self._keys, self._names, self._began, self._timing = keys, names, began, timing
         self.ownership = OwnershipCheck([keys.alive(name) for name in names], network.ROBOT_LEASE_S, timing)
         self._owned: list[zenoh.LivelinessToken] = []
-        self._tokens: dict[int, zenoh.LivelinessToken] = {}  # by row
+        self._tokens: dict[int, zenoh.LivelinessToken] = {}  # tokens by row
         self._lock = threading.Lock()
 
     def claim(self, session: zenoh.Session, endpoints: Sequence[str], stop: threading.Event) -> None:

@@ -29,7 +29,7 @@ from agents.network.session import Polled, received, tokens_present
 
 HEARTBEAT_S: Final = 0.5  # delay until the loss of the last pose before a silence is noticed
 POSES: Final = 16  # queued poses of one robot
-EVENTS: Final = 64  # of a run, repeated to a subscriber that was cut off: without a router much happens at once
+EVENTS: Final = 64  # events of a run, repeated to a subscriber that was cut off: without a router much happens at once
 SOURCES: Final = 4096  # publishers with known numbers
 ORDERS: Final = 8  # queued
 LONGEST_ORDER: Final = 4096  # [bytes] an order to land or to stop is shorter
@@ -111,7 +111,7 @@ class PoseSubscriber:
         self._waiting = deque[zenoh.Sample](maxlen=depth)
         self._numbers: dict[str, int] = {}  # last source number, by source
 
-        def append(sample: zenoh.Sample) -> None:  # under a lock of the subscriber: it may only append and ring
+        def append(sample: zenoh.Sample) -> None:  # runs under a lock of the subscriber: it may only append and ring
             self._waiting.append(sample)
             if bell is not None:
                 bell.ring()
@@ -227,7 +227,7 @@ class Inbox(Generic[M]):
         subscription: Subscription,
         kind: type[M],
         *,
-        keys: Keys | None = None,  # if given, a message must carry the name of the robot of its key
+        keys: Keys | None = None,  # keys that name the robot of a message; a message must carry that name
         robots: Container[str] | None = None,  # robots with accepted messages; None: all
         on_refusal: Callable[[str, str], object] | None = None,  # called with key and reason of each refusal
     ) -> None:
@@ -236,7 +236,7 @@ class Inbox(Generic[M]):
         # the next queued sample, or None; Zenoh makes a new handler at each access
         self.take = subscription.handler.try_recv
         self._robots = robots
-        self._key, self._owner = "", None if keys is None else keys.whose("")  # of the last sample: mostly the next's
+        self._key, self._owner = "", None if keys is None else keys.whose("")  # last key: mostly the next's
         self.malformed, self.trouble = 0, ""  # refused payloads, and the reason of the last refusal
 
     def read(self, check: Callable[[M], object] | None = None) -> Iterator[M]:
@@ -342,7 +342,7 @@ class ImmediateSubscriber:
     ) -> None:
         """Subscribes: each stop is given to `obey`; the newest `depth` wait to be polled from then on."""
         self._obey = obey
-        self.waiting: deque[messages.Stop] = deque(maxlen=depth)  # to be polled
+        self.waiting: deque[messages.Stop] = deque(maxlen=depth)  # stops to be polled
         self._subscriber = session.declare_subscriber(key, Callback(self.receive, indirect=False))
 
     def try_recv(self) -> messages.Stop | None:
@@ -425,7 +425,7 @@ class LastValue:
         self._payload: bytes | None = None
         self._queries = CallbackQueue[zenoh.Query](ORDERS)
         self.waiting = self._queries.waiting  # queued
-        self._queryable = session.declare_queryable(key, self._queries.callback)  # as long as it is referenced
+        self._queryable = session.declare_queryable(key, self._queries.callback)  # lives as long as it is referenced
 
     def hold(self, payload: bytes) -> None:
         self._payload = payload

@@ -140,13 +140,13 @@ def _ask(slice_ns: int) -> bool:
 
 T_co = TypeVar("T_co", covariant=True)
 
-RETRY_S: Final = 0.1  # between attempts to open; an open client keeps to the `connect/retry` of its configuration
+RETRY_S: Final = 0.1  # pause between attempts to open; an open client keeps to the `connect/retry` of its configuration
 GATHER_S: Final = 1.0
 LINK_S: Final = 0.01
 KNOCK_S: Final = 0.3  # limit for a port to accept a connection, when the reason of a failure is looked for
 ENDPOINT_FREE_S: Final = 3.0  # limit for the endpoint of a robot of a mesh that is restarted to become free
-ROBOT_LEASE_S: Final = 1.2  # of robots: the neighbours of a robot that hangs must detect it within 1.5 s
-ASK_EVERY_S: Final = 0.4  # between two queries to the router
+ROBOT_LEASE_S: Final = 1.2  # lease of robots: the neighbours of a robot that hangs must detect it within 1.5 s
+ASK_EVERY_S: Final = 0.4  # pause between two queries to the router
 ANSWER_S: Final = 0.3  # time without a reply after which the router counts as silent
 ASKED: Final = 8  # pending queries
 LOOK_S: Final = 0.1  # most time between two polls that counts as silence of the router
@@ -165,12 +165,12 @@ class Polled(Protocol[T_co]):
 def open_session(
     endpoints: Sequence[str],  # routers, best first; or members of a mesh
     *,
-    name: str,  # as `./zenpark keys` shows it
+    name: str,  # name that `./zenpark keys` shows
     wait_s: float = 10.0,  # limit for an answer [s]
     stop: threading.Event | None = None,  # ends the wait when it is set
     lease_s: float = LEASE_S,  # see `agents.network.zenoh_config`
     identity: str | None = None,  # name in the certificate, in a lab; `name` if left out
-    rights: access_control.Rights | None = None,  # of all identities, enforced by the members of a mesh in a lab
+    rights: access_control.Rights | None = None,  # rights of all identities, enforced by the members of a mesh in a lab
     gather_s: float = GATHER_S,  # limit for further members of a mesh to answer when one has [s]
 ) -> zenoh.Session:
     """A session on the network of some endpoints; use it in a `with`.
@@ -275,9 +275,9 @@ class RouterWatch:
         self._now, self._asked, self._unanswered = 0.0, -inf, inf  # the latter: when the oldest question was asked
         self._looked = inf
         self._silent_since = inf
-        self._left = 0.0  # when a silent router was left last, or the silence or the time without any link began
+        self._left = 0.0  # begin of the silence or of the time without any link, or of the last change of router
         self._arrived = 0
-        self._answers = 0  # since the silence began
+        self._answers = 0  # count since the silence began
 
     def silent_since(self, t: float, arrived: int = 0) -> float:
         """Begin [s] of the silence of the router, or of the loss of the last link; infinity while it answers.

@@ -26,9 +26,9 @@ from agents.network.messages import (
 FUTURE_S: Final = 5.0  # a stamp further ahead comes from a wrong clock or a forgery, and would suppress correct samples
 MAX_SPEED: Final = 50.0  # [m/s]; nothing here moves faster
 ABSURD: Final = 1e6  # [m, m/s, rad, rad/s] no setpoint is that large
-MAX_NUMBERS: Final = 64  # that a robot says beside its pose
+MAX_NUMBERS: Final = 64  # most numbers that a robot says beside its pose
 ENORMOUS: Final = 1e12  # no variable of a law is that large, whatever its unit
-MAX_RAYS: Final = 720  # of one sweep; the finest scanner here has 360
+MAX_RAYS: Final = 720  # most rays of one sweep; the finest scanner here has 360
 MAX_RANGE: Final = 100.0  # [m]; no range sensor here sees farther
 WORLD: Final = "world"  # source of all events of the world
 REACH_M: Final = 1.0  # a position farther outside the arena is refused

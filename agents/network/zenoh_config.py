@@ -18,7 +18,7 @@ from agents.network.endpoints import DEFAULT_ENDPOINT, UNIX, EndpointError, Mode
 LEASE_S: Final = 2.0  # a peer silent for this long is considered dead
 ASK_S: Final = 2.0  # limit for a reply to a query
 OPEN_S: Final = 3.0  # limit of a handshake,
-NEXT_S: Final = 1.0  # and where there is another router
+NEXT_S: Final = 1.0  # patience where there is another router
 # Longest wait for a member that does not read: it is then disconnected, or in the second case not sent the message. Who
 # waits holds up all others meanwhile. Zenoh's own limits are 5 s and 50 ms.
 BLOCKED_S: Final = 0.02
@@ -26,7 +26,7 @@ _WAITS: Final = (
     "transport/link/tx/queue/congestion_control/block/wait_before_close",
     "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments",
 )
-MOST_BYTES: Final = 4 * 1024 * 1024  # of a message that a router of a lab puts together; the largest is an experiment
+MOST_BYTES: Final = 4 * 1024 * 1024  # largest message that a router of a lab puts together: an experiment
 
 # 4 threads instead of 7 in each client and a sixth less CPU at 50 Hz. Zenoh reads it once, at the first open.
 _RUNTIME: Final = (
@@ -55,7 +55,7 @@ def settings(
     name: str | None = None,  # shown by `./zenpark keys`
     lease_s: float = LEASE_S,  # silence after which the others consider this session dead [s]
     identity: str | None = None,  # name in the certificate, in a lab; `name` if left out
-    rights: access_control.Rights | None = None,  # of all identities; a router of a lab needs them
+    rights: access_control.Rights | None = None,  # rights of all identities; a router of a lab needs them
 ) -> dict[str, object]:
     """Settings of every session: no multicast, no gossip, no shared memory, listening on loopback only.
 

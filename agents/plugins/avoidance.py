@@ -16,11 +16,11 @@ from msgspec import Meta
 
 from agents.vectors import ZERO, NotNegative, Positive, Setpoint, Vector
 
-ABSENT_M: Final = 1e6  # [m] from 0 on both axes: what is not there
+ABSENT_M: Final = 1e6  # [m] distance from 0 on both axes of what is not there
 COINCIDENT: Final = 1e-6  # [m] axes nearer than this have no direction
 TOUCHING: Final = 1e-3  # [m] smallest gap in a force: forces stay finite
 LAYER: Final = 0.05  # [m] depth within d0 in which the push of a thing grows to its full size
-ASIDE: Final = 0.1  # of the pull against a push: the step aside
+ASIDE: Final = 0.1  # share of the pull against a push: the step aside
 HURRY: Final = 2.0  # times its limit of speed: no robot is faster, not along the diagonal of limits per axis either
 
 
@@ -42,7 +42,7 @@ class Thing:
     lag: float = 0.0  # time constant of its velocity [s]; 0 for range readings
     away_x: float = 0.0  # unit vector from the thing to the robot
     away_y: float = 0.0
-    gap: float = 0.0  # between surfaces once both have stopped closing in [m]
+    gap: float = 0.0  # distance of the surfaces once both have stopped closing in [m]
 
     def vanish(self) -> None:
         """Be a point at rest, out of reach of everything."""
@@ -66,7 +66,7 @@ class Nearby:
     def __init__(self) -> None:
         self.count = 0
         self.things: list[Thing] = []
-        self.planes: list[Plane] = []  # for an avoidance to write on, as many as things
+        self.planes: list[Plane] = []  # planes that an avoidance writes, as many as things
         self.reserve(1)  # a compiler wants to see what is in a list
 
     def reserve(self, count: int) -> None:
@@ -200,7 +200,7 @@ class Potential(Avoidance, frozen=True):
         v = self.velocity if self.velocity < inf else own.speed
         h = self.period_s if self.period_s > 0.0 else 1.0 / own.response
         away_x, away_y = force_x / strength, force_y / strength
-        right_x, right_y = -away_y, away_x  # of one that looks against the push
+        right_x, right_y = -away_y, away_x  # right of one that looks against the push
         against, across = max(-(way_x * away_x + way_y * away_y), 0.0), way_x * right_x + way_y * right_y
         aside = (ASIDE if across >= -0.5 * ASIDE * against else -ASIDE) * against
         inner = self.reach - min(LAYER, 0.5 * self.reach)

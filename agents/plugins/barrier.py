@@ -14,10 +14,10 @@ from agents.plugins.avoidance import HURRY, Avoidance, Nearby, OwnState, Plane, 
 from agents.vectors import NotNegative, Positive, Setpoint, Vector, clamp
 
 SLACK: Final = 1e-9  # [m/s] violations smaller than this are arithmetic
-ROUNDS: Final = 64  # of raising bounds that clash; 60,000 random scenes of up to 30 half-planes took 18 at most
+ROUNDS: Final = 64  # rounds of raising bounds that clash; 60,000 random scenes of up to 30 half-planes took 18 at most
 PARALLEL: Final = 1e-9  # sine of the angle below which two half-planes have no corner
 SKEW: Final = 0.2  # a robot on wheels hardly flees along a heading this far (its cosine) from broadside
-LEAST: Final = 1e-100  # to divide by: beyond any speed, and still a number
+LEAST: Final = 1e-100  # smallest divisor: beyond any speed, and still a number
 
 Planar = tuple[float, float]  # x, y
 Solution = tuple[float, float, float]  # x, y, and the excess of clashing bounds, or -1: none clash [m/s]

@@ -26,7 +26,7 @@ from agents.plugins.law import Law, NeighbourView, View
 from agents.plugins.registry import FAILURES, PluginError, owner_of
 
 LONGEST: Final = 60  # characters of a result that is shown
-LIMIT_S: Final = 5.0  # [s] within which a call of a plug-in must return; it is noticed after twice that at the latest
+LIMIT_S: Final = 5.0  # [s] longest call of a plug-in; it is noticed after twice that at the latest
 PREPARING: Final = {"<module>", "begin", "build", "analyse", "of"}  # calls that may load libraries or read a whole run
 PATIENCE: Final = 12  # times `LIMIT_S` that such calls may take
 

@@ -19,10 +19,10 @@ from typing import Any, Final
 
 from agents.user_folder import OWN, cache_folder
 
-CHOICE: Final = r"[^@:\\/][^@:\\]*\.py:[A-Za-z_][A-Za-z0-9_]*"  # as a user writes it
-PREFIX: Final = "zenpark_file_"  # of the names of their modules
+CHOICE: Final = r"[^@:\\/][^@:\\]*\.py:[A-Za-z_][A-Za-z0-9_]*"  # class in a file, as a user writes it
+PREFIX: Final = "zenpark_file_"  # first letters of the names of their modules
 KEPT: Final = "plugins"  # folder of the copies, in the cache
-MAX_FILE_BYTES: Final = 1_000_000  # [bytes] of such a file
+MAX_FILE_BYTES: Final = 1_000_000  # [bytes] largest such file
 _CHOICE: Final = re.compile(rf"({CHOICE})(?:@([0-9a-f]{{32}}))?")
 _OTHERS: Final = 0o022  # mode of what others may write
 

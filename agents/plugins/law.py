@@ -21,7 +21,7 @@ from agents.vectors import UNKNOWN, ZERO, Vector
 Need = Literal["distance", "relative", "bearing", "any", "nothing"]
 Gain = Literal["gain", "stiffness", "by link"]
 Severity = Literal["error", "warning", "note"]
-Values = tuple[float, ...]  # of a variable; NaN: not known yet
+Values = tuple[float, ...]  # values of a variable; NaN: not known yet
 Memory = Mapping[str, Values]  # variables by name
 
 T = TypeVar("T")
@@ -41,11 +41,11 @@ class RobotFacts:
     """A robot as its law knows it before anything happens."""
 
     name: str
-    number: int  # among all robots of the experiment, from 0 on
-    count: int  # of all robots
+    number: int  # index among all robots of the experiment, from 0 on
+    count: int  # number of all robots
     flies: bool
-    speed: float  # of its kind [m/s]
-    step_s: float  # from one step to the next [s]
+    speed: float  # largest speed of its kind [m/s]
+    step_s: float  # time from one step to the next [s]
 
     def of(self, table: Mapping[str, T], default: T | None = None) -> T:
         """Value of this robot in a table by names; raises ValueError if it has none and there is no default."""
@@ -59,12 +59,12 @@ class RobotFacts:
 class NeighbourView:
     """A neighbour as the robot believes it, with the link to it."""
 
-    number: int  # among all robots of the experiment
+    number: int  # index among all robots of the experiment
     name: str
     position: Vector  # predicted for now [m]
-    velocity: Vector  # as sent last [m/s]
-    yaw: float  # as sent last [rad], NaN where unknown
-    age: float  # of its last pose [s]
+    velocity: Vector  # velocity in its last pose [m/s]
+    yaw: float  # yaw in its last pose [rad], NaN where unknown
+    age: float  # time since its last pose [s]
     said: Memory  # variables as it said them last; NaN before the first
     link: Link  # its target and gain
 
@@ -76,13 +76,13 @@ class View:
     robot: RobotFacts
     said: Memory  # own variables, as said last: what the neighbours believe of this robot
     neighbours: Sequence[NeighbourView]  # those of its links that are there, in the order of their numbers
-    time: float = 0.0  # since the common start, by ticks [s]
-    step_s: float = field(init=False)  # since the last step, by ticks [s]
+    time: float = 0.0  # time since the common start, by ticks [s]
+    step_s: float = field(init=False)  # time since the last step, by ticks [s]
     position: Vector = UNKNOWN  # own, measured [m]
     velocity: Vector = ZERO  # own, measured [m/s]
     yaw: float = 0.0  # own [rad]
-    target: Vector = UNKNOWN  # of the robot's plan now [m]; NaN without one
-    target_velocity: Vector = ZERO  # of that target [m/s]; 0 at first
+    target: Vector = UNKNOWN  # place of the robot's plan now [m]; NaN without one
+    target_velocity: Vector = ZERO  # velocity of that target [m/s]; 0 at first
     scan: Any = None  # range readings, see `agents.body.interface.RangeScan`; None without
     leads: bool = False  # the law does not move it: it has no links, and follows a plan or stays
     moves: bool = True  # False while safety holds it: integrals of what its motion must mend stop then

@@ -32,11 +32,11 @@ PREDICTORS: Final = "zenpark.predictors"
 PLANNERS: Final = "zenpark.planners"
 AVOIDANCES: Final = "zenpark.avoidances"
 ENGINES: Final = "zenpark.engines"  # physics of the twins of a world
-STRUCTS: Final = (TRIGGERS, PREDICTORS, LAWS, PLANNERS, AVOIDANCES, ENGINES)  # of which a file gives parameters
-CHOSEN: Final = (ROBOTS, *STRUCTS)  # of which a file names some
+STRUCTS: Final = (TRIGGERS, PREDICTORS, LAWS, PLANNERS, AVOIDANCES, ENGINES)  # groups with parameters in a file
+CHOSEN: Final = (ROBOTS, *STRUCTS)  # groups with names in a file
 METRICS: Final = "zenpark.metrics"  # measured quantities, without parameters
 FACE: Final = "zenpark"  # module of the names that plug-ins import
-NAMED_BY_FILE: Final = (*STRUCTS, METRICS)  # of which a class may stand in a file beside the experiment
+NAMED_BY_FILE: Final = (*STRUCTS, METRICS)  # groups with classes that a file beside the experiment may hold
 DEVICES: Final = "zenpark.devices"  # protocol twins: simulated far ends of the protocols of bodies
 # Base of the classes of each group, as `module:class`: what zenpark asks of a plug-in stands there, with its default.
 BASES: Final = {

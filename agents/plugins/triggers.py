@@ -31,9 +31,9 @@ class LastEvent:
 
     position: Vector = NOWHERE  # transmitted [m]; infinite before the first event
     velocity: Vector = ZERO  # transmitted [m/s]
-    offset: Vector = ZERO  # of the law [m]
-    time: float = -inf  # of the event [s]; minus infinity before the first
-    energy: float = 0.0  # of the formation error [m²]
+    offset: Vector = ZERO  # output of the law [m]
+    time: float = -inf  # time of the event [s]; minus infinity before the first
+    energy: float = 0.0  # energy of the formation error [m²]
 
 
 class TriggerView:
@@ -63,7 +63,7 @@ class TriggerView:
 class Trigger(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Base of all triggers, with the parameters that every one has."""
 
-    PLACES: ClassVar[tuple[Place, ...]] = ("communication", "control")  # where it makes sense
+    PLACES: ClassVar[tuple[Place, ...]] = ("communication", "control")  # places where it makes sense
     PREDICTION: ClassVar[str] = "hold"  # default of an experiment that names none
     JUDGES_ERRORS: ClassVar[bool] = False  # uses errors of the formation, which are 0 for robots that a centre guides
     JUDGES_DRIFT: ClassVar[bool] = False  # waits by the drift of the pose, and uses no other input meanwhile
@@ -91,7 +91,7 @@ class TriggerState:
 
     def __init__(self, trigger: Trigger) -> None:
         self.trigger = trigger  # may be replaced by one of the same kind
-        self.view = TriggerView(trigger.MEMORY)  # for the next question
+        self.view = TriggerView(trigger.MEMORY)  # argument of the next question
         self.last, self.evaluated_at = self.view.last, -inf  # [s]
 
     def due(self) -> bool:

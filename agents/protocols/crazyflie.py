@@ -21,13 +21,13 @@ Wait = Annotated[float, Meta(gt=0, le=60)]
 # [1/s] up and down, that one Crazyradio carries without queues, unless more is measured: half of the 500 exchanges per
 # second of cflib's maintainers (issue 258), with which a queue on board grows to seconds
 PACKETS_PER_RADIO: Final = 250.0
-MEASURED_SHARE: Final = 0.7  # of the measured exchanges per second: full packets are slower than those without content
+MEASURED_SHARE: Final = 0.7  # share of the measured exchanges per second: full packets are slower than empty ones
 YOUNG_S: Final = 0.1  # 99 % of poses are younger, or the rates are refused
-TURNS: Final = 2  # of a radio through its robots, for which a pose waits at most, behind answers
+TURNS: Final = 2  # turns of a radio through its robots, for which a pose waits at most, behind answers
 PERIOD_S: Final = 0.01  # periods of logs are multiples of this
-SETPOINT_PACKETS: Final = 2  # of one setpoint, each of which is answered: its trajectory, and the start of that
+SETPOINT_PACKETS: Final = 2  # packets of one setpoint, each of which is answered: its trajectory, and the start of that
 LAST_CHANNEL: Final = 125  # highest channel of a Crazyradio
-DEFAULT_ADDRESS: Final = "E7E7E7E7E7"  # of a Crazyflie as it is sold, and of cflib
+DEFAULT_ADDRESS: Final = "E7E7E7E7E7"  # address of a Crazyflie as it is sold, and of cflib
 ADDRESSES: Final = (
     re.compile(r"radio://[0-9A-Za-z]+/([0-9]|[1-9][0-9]|1[01][0-9]|12[0-5])/(250K|1M|2M)(/[0-9A-Fa-f]{1,10})?(\?.*)?"),
     re.compile(r"usb://[0-9]+"),
@@ -44,7 +44,7 @@ class Lighthouse(DeviceTable, frozen=True, tag_field="system", tag="lighthouse")
 
     # geometry and calibration as the Crazyflie client saves them; None: what is stored on board
     file: str | None = None
-    base_stations: Annotated[int, Meta(ge=1, le=16)] = 4  # that the firmware knows
+    base_stations: Annotated[int, Meta(ge=1, le=16)] = 4  # number that the firmware knows
 
 
 class Loco(DeviceTable, frozen=True, tag_field="system", tag="loco"):
@@ -77,10 +77,10 @@ class CrazyflieSettings(DeviceTable, frozen=True):
     # on board; None: Kalman if a positioning system is named, else as it is
     estimator: Literal["auto", "complementary", "kalman", "ukf"] | None = None
     parameters: dict[str, float] = {}  # firmware parameters to set on connecting
-    recover: bool = False  # on connecting, recover from a crash: only when the drone stands upright on the floor again
+    recover: bool = False  # recovers from a crash on connecting: only when the drone stands upright on the floor again
     arm: bool = True  # arm it before taking off, where the platform asks for that
-    platform: Literal["crazyflie", "brushless"] = "crazyflie"  # for the twin only: a `brushless` one must be armed
-    link: Literal["udp", "radio"] = "udp"  # for the twin only: `radio` puts a software Crazyradio between
+    platform: Literal["crazyflie", "brushless"] = "crazyflie"  # used by the twin alone: a `brushless` one must be armed
+    link: Literal["udp", "radio"] = "udp"  # used by the twin alone: `radio` puts a software Crazyradio between
     # for the twin only: files of cflib's cache with the parameters and the log variables that it lists; empty: built in
     tables: list[str] = []
     # for the twin only: gaps of its radio, begin after the take-off and duration [s]

@@ -17,14 +17,14 @@ RELATIVE_YAW: Final = 10  # the first with `HighLevel.START_2`
 PARAM_READ, PARAM_WRITE = 1, 2  # channels of `Port.PARAM`
 NULL: Final = (15, 3)  # port and channel of a packet without content
 VERSIONS: Final = 1  # channel of `Port.PLATFORM` on which a drone says its versions,
-FIRMWARE: Final = 1  # and the question for that of its firmware, which is a text such as "2025.02"
-MTU: Final = 30  # [bytes] of payload
-TRAJECTORIES: Final = 10  # that may be defined,
-IN_MEMORY: Final = 1  # in their only place,
-UNCOMPRESSED, COMPRESSED = 0, 1  # of these kinds
+FIRMWARE: Final = 1  # question for its firmware, which is a text such as "2025.02"
+MTU: Final = 30  # [bytes] largest payload
+TRAJECTORIES: Final = 10  # largest number of defined trajectories
+IN_MEMORY: Final = 1  # code of their only place
+UNCOMPRESSED, COMPRESSED = 0, 1  # codes of their kinds
 MEMORY_WRITE: Final = 2  # channel of `Port.MEMORY`
 GREETING: Final = b"Bitcraze Crazyflie".ljust(MTU, b"\0")  # distinguishes a Crazyflie from a boot loader
-LOG_PAYLOAD: Final = 26  # [bytes] of values in one packet of a log block
+LOG_PAYLOAD: Final = 26  # [bytes] values in one packet of a log block
 LOG_BLOCKS: Final = 16
 LOG_VARIABLES: Final = 128
 
@@ -49,7 +49,7 @@ class LogStatus(IntEnum):
     """The last byte of an answer; cflib falls over log errors that are not among these."""
 
     OK = 0
-    REFUSED = 1  # by the planner: taking off while it flies, landing while it lands
+    REFUSED = 1  # refused by the planner: taking off while it flies, landing while it lands
     UNKNOWN = errno.ENOENT
     IO = errno.EIO
     TOO_LARGE = errno.E2BIG
@@ -138,7 +138,7 @@ class HighLevel(IntEnum):
     OLD_LAND = 2
     STOP = 3
     OLD_GO_TO = 4
-    START = 5  # of protocol versions below 10
+    START = 5  # start in protocol versions below 10
     DEFINE = 6
     TAKEOFF = 7
     LAND = 8
@@ -226,7 +226,7 @@ START: Final = Struct("<??Bf")  # relative, reversed, trajectory, time scale
 START_2: Final = Struct("<???Bf")  # relative position, relative yaw, reversed, trajectory, time scale
 PIECE: Final = Struct("<33f")  # coefficients of x, y, z, yaw, constant first, and time [s]
 NRF: Final = 0xFE  # addressee of power commands
-ADDRESS: Final = bytes.fromhex("E7E7E7E7")  # of the boot loader, without its first byte B1
+ADDRESS: Final = bytes.fromhex("E7E7E7E7")  # address of the boot loader, without its first byte B1
 
 MM: Final = 1e-3
 SECONDS_MS: Final = 1000.0

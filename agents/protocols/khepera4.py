@@ -15,14 +15,14 @@ from typing import Final, Literal
 import msgspec
 
 PARK_PORT: Final = 50000
-GAP_S: Final = 0.010  # between two park commands: glued in one segment, the second is lost
-PULSE: Final = 6.781e-6  # [m] of way per encoder pulse
-UNIT: Final = 0.6781e-3  # [m/s] per unit of speed: pulses per 10 ms
-BASE: Final = 0.1054  # [m] between the wheels
+GAP_S: Final = 0.010  # [s] pause between two park commands: glued in one segment, the second is lost
+PULSE: Final = 6.781e-6  # [m] way per encoder pulse
+UNIT: Final = 0.6781e-3  # [m/s] speed per unit: pulses per 10 ms
+BASE: Final = 0.1054  # [m] distance of the wheels
 FASTEST: Final = 1200  # units: 0.81 m/s
 CENTIMETRE: Final = 0.01
 
-RIM: Final = 0.070  # [m] from the robot's centre to its sensors
+RIM: Final = 0.070  # [m] distance from the robot's centre to its sensors
 # [rad] ultrasonic, in the order of both protocols
 SOUND_BEARING: Final = tuple(map(math.radians, (90.0, 45.0, 0.0, -45.0, -90.0)))
 # [rad] infrared; four look down
@@ -31,7 +31,7 @@ SOUND_NOTHING: Final = 1000  # [cm] nothing between 25 and 250 cm; 2000: switche
 SOUND_NEAREST: Final = 0.25  # [m] nearer than this it reads 0
 LIGHT_NOTHING: Final = 100  # reflected light of nothing at all
 LIGHT_TOUCHING: Final = 1000
-LIGHT_SCALE: Final = 0.0925  # [m] so that LIGHT_NOTHING falls at 0.2 m; not calibrated, surfaces differ
+LIGHT_SCALE: Final = 0.0925  # [m] chosen so that LIGHT_NOTHING falls at 0.2 m; not calibrated, surfaces differ
 
 
 Server = Literal["2023-01-07", "2023-01-15", "2023-04-10", "2025-05", "fork", "kteam"]
@@ -44,8 +44,8 @@ class ParkServer:
     All read one command per `read()`, without a time limit for the last one: none stops a robot without a link.
     """
 
-    answer: Literal["increments", "heading", "pose"]  # of `p`: d,dθ or d,θ or x,y,θ
-    decimals: int  # of the numbers in that answer
+    answer: Literal["increments", "heading", "pose"]  # answer to `p`: d,dθ or d,θ or x,y,θ
+    decimals: int  # decimals of the numbers in that answer
     drives: bool  # whether `d` moves the robot; else only `g` does
     per_turn: bool  # d of `p` is the way in one turn of the server's loop, so each other command swallows a part
     clients: int | None  # connections that it accepts in its life; None: any number, one after the other
@@ -73,8 +73,8 @@ class Khepera4Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
     server: Server | None = None  # what runs on the robot; None: found out where `p` tells, else refused
     poll_hz: float = 25.0  # [1/s] drive command and odometry
     ranges: bool | None = None  # read its range sensors, five times a second; None: with K-Team's protocol only
-    silence_s: float = 0.5  # [s] without an answer after which the robot is stopped
-    low_battery: float = 0.05  # below this charge it stops (K-Team's protocol only; park has no battery)
+    silence_s: float = 0.5  # [s] time without an answer after which the robot is stopped
+    low_battery: float = 0.05  # charge below which it stops (K-Team's protocol only; park has no battery)
 
     def __post_init__(self) -> None:
         if not 2.0 <= self.poll_hz <= 30.0:

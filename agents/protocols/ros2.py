@@ -172,7 +172,7 @@ def qos(*, best_effort: bool = False, depth: int = 10) -> str:
 
 RELIABLE: Final = qos()
 SENSOR_DATA: Final = qos(best_effort=True, depth=5)
-TRANSFORMS: Final = qos(depth=100)  # of tf2_ros
+TRANSFORMS: Final = qos(depth=100)  # profile of tf2_ros
 
 
 # ---------------------------------------------------------------------- tokens and attachments

@@ -32,7 +32,7 @@ class Participant:
         self.domain: Final = domain
         self.zid: Final = str(session.zid())
         self.clock: Final = Clock()
-        self.numbers: Final = count()  # of its entities
+        self.numbers: Final = count()  # numbers of its entities
 
     def node(self, name: str, namespace: str = "") -> Node:
         """A node; namespace as in "tb3_0", without the leading slash."""

@@ -16,34 +16,34 @@ import msgspec
 from agents.body.interface import BodyError, settings
 from agents.network.messages import State
 
-HOST: Final = "192.168.10.1"  # of a Tello that is its own access point
-CONTROL_PORT: Final = 8889  # at the drone for commands; djitellopy binds the same number here for the answers
+HOST: Final = "192.168.10.1"  # address of a Tello that is its own access point
+CONTROL_PORT: Final = 8889  # port of the drone for commands; djitellopy binds the same number here for the answers
 STATE_PORT: Final = 8890  # here, where the drone sends its state
 STATE_HZ: Final = 10.0
-AUTO_LAND_S: Final = 15.0  # without a command for this long the drone lands by itself
-TAKEOFF_HEIGHT: Final = 0.8  # [m] to which `takeoff` climbs
+AUTO_LAND_S: Final = 15.0  # [s] time without a command after which the drone lands by itself
+TAKEOFF_HEIGHT: Final = 0.8  # [m] height to which `takeoff` climbs
 STICK: Final = 100  # full deflection
-STICK_SPEED: Final = 1.0  # [m/s] at full deflection, unless measured: a guess, the maker gives no figure
-TEST_SPEED: Final = 0.2  # [m/s] of the stick test, as far as known: 2 s forward, at rest 1 s before and after, 2 s back
+STICK_SPEED: Final = 1.0  # [m/s] speed at full deflection, unless measured: a guess, the maker gives no figure
+TEST_SPEED: Final = 0.2  # [m/s] speed of the stick test, as far as known: 2 s forward, 1 s of rest, 2 s back
 TEST_ENDS_S: Final = (1.0, 3.0, 4.0, 6.0, 7.0)  # [s] ends of its parts, from the end of the take-off
 TEST_WINDOW_S: Final = 1.0  # the speed of sticks is that over this time, when it has settled
-SLOWEST_STICK: Final = 0.1  # [m/s] at full deflection; less is none
+SLOWEST_STICK: Final = 0.1  # [m/s] least speed at full deflection
 STICK_UNEVEN: Final = 0.3  # largest difference of forward and back, as a share of their mean
 STICK_OFF: Final = 0.1  # largest error of the setting `stick_speed`, as a share of it
-STICK_TURN: Final = math.radians(100.0)  # [rad/s] at full deflection, likewise
+STICK_TURN: Final = math.radians(100.0)  # [rad/s] rate at full deflection, likewise
 
 
 class TelloSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
     """The `device` table of a Tello."""
 
-    silence_s: float = 1.0  # [s] without a state line after which the drone counts as lost; it comes at 10 Hz
+    silence_s: float = 1.0  # [s] time without a state line after which the drone counts as lost; it comes at 10 Hz
     rc_hz: float = 20.0  # [1/s] stick positions sent
-    low_battery: float = 0.10  # below this charge it does not take off, and lands
+    low_battery: float = 0.10  # charge below which it does not take off, and lands
     stick_speed: float = (
-        STICK_SPEED  # [m/s] at full deflection of the sticks; `./zenpark preflight --sticks` measures it
+        STICK_SPEED  # [m/s] speed at full deflection of the sticks; `./zenpark preflight --sticks` measures it
     )
-    stick_test: bool = False  # after the take-off it flies the stick test instead of setpoints
-    twin_stick_speed: float = STICK_SPEED  # for the twin only: [m/s] that its sticks really give
+    stick_test: bool = False  # flies the stick test after the take-off instead of setpoints
+    twin_stick_speed: float = STICK_SPEED  # used by the twin alone: [m/s] that its sticks really give
 
     def __post_init__(self) -> None:
         if not (0.1 <= self.stick_speed <= 10.0 and 0.1 <= self.twin_stick_speed <= 10.0):

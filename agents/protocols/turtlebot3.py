@@ -30,9 +30,9 @@ SCAN_HZ: Final = 5.0  # LDS-01; the LDS-02 turns twice as fast
 BATTERY_HZ: Final = 1.0
 STEP: Final = 0.01  # [m/s, rad/s] the node cuts speeds down to whole steps
 RAYS: Final = 360
-NEAREST, FARTHEST = 0.12, 3.5  # [m] of the LDS-01
+NEAREST, FARTHEST = 0.12, 3.5  # [m] range of the LDS-01
 EMPTY_V, FULL_V = 10.5, 12.3  # the firmware maps these voltages to 0 and 100 %
-ABSENT_V: Final = 7.0  # at this and below the node says that there is no battery
+ABSENT_V: Final = 7.0  # largest voltage at which the node says that there is no battery
 
 _NAMESPACE: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
 
@@ -53,7 +53,7 @@ class TurtleBot3Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unkno
     # at the start pose of the experiment: the robot when its body is opened, or the origin of its odometry, which is
     # where its node was started
     origin: Literal["open", "boot"] = "open"
-    style: Style = "ros2dds"  # of the twin
+    style: Style = "ros2dds"  # style of the twin
     # [s] without a command after which the twin stops; None as in a TurtleBot3 as sold, which has no such watchdog
     watchdog_s: Annotated[float, Meta(gt=0)] | None = None
 

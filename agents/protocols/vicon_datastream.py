@@ -17,7 +17,7 @@ from typing import Final, NamedTuple
 PORT: Final = 801
 MAGIC: Final = 0x1A2B0001
 MAX_PACKET: Final = 4_000_000  # [bytes]; a frame of a hundred bodies has 30 kB, a length beyond this is noise
-NO_PARENT: Final = 0xFFFFFFFF  # of a root segment
+NO_PARENT: Final = 0xFFFFFFFF  # parent of a root segment
 CLOCK_HZ: Final = 135_000_000  # unit of the frame period
 MM: Final = 1000.0  # millimetres in a metre
 Z_UP: Final = 0
@@ -197,7 +197,7 @@ def unpack_subject(payload: bytes) -> Subject:
     root = 0
     for _ in range(count):
         parent, segment = _unpack(_HEAD, payload, at)
-        _, at = _read_text(payload, at + _HEAD.size + 24)  # over its six bounds, to its name
+        _, at = _read_text(payload, at + _HEAD.size + 24)  # name behind its six bounds
         if parent == NO_PARENT:
             root = segment
     return Subject(number, name, root)

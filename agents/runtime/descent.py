@@ -28,7 +28,7 @@ class DescentTiming:
 
     landing_s: float = FAREWELL_S  # [s] least limit for a landing
     stop_s: float = STOPPED_S  # [s] limit for a body to confirm that its motors are off
-    again_s: float = AGAIN_S  # [s] between two orders
+    again_s: float = AGAIN_S  # [s] pause between two orders
     slowest: float = LOWEST_DESCENT_M_S  # [m/s] lowest speed of a descent
 
 
@@ -47,7 +47,7 @@ class Descent:
         keeper: NameKeeper,
         ticks: Ticks,
         *,
-        silence_s: float,  # [s] without a tick after which the watchdog lands the robots
+        silence_s: float,  # [s] time without a tick after which the watchdog lands the robots
         alarm: Callable[[str], object],  # tells the other processes why they land, in another thread
         recover: Callable[[str], object],  # lands the robots by their decisions, for a reason
         timing: DescentTiming,
@@ -65,7 +65,7 @@ class Descent:
         self._on_wheels = tuple(row for row, kind in enumerate(kinds) if not kind.flies)
         ceiling = self._limits.high[2] if any(kind.flies for kind in kinds) else 0.0
         longest_s = ceiling / timing.slowest  # [s] landing: what still descends after a limit would fall
-        self.limit_s = max(timing.landing_s, longest_s)  # [s] for a landing
+        self.limit_s = max(timing.landing_s, longest_s)  # [s] longest landing
         down_s = max(DOWN_S, longest_s)
         self.watchdog = Watchdog(body, self._everyone, alarm=alarm, silence_s=silence_s, down_s=down_s)
 

@@ -55,7 +55,7 @@ class GoalInbox:
         for token, there in self._watch.changes():
             if token != self._centre:
                 self._begin(Keys.life_of(token), there=there)
-            elif there or network.connected(self._session):  # without a router every token vanishes: proves nothing
+            elif there or network.connected(self._session):  # tokens vanish without a router, too: proves nothing
                 for guidance in self._guidance.values():
                     guidance.mark_alive() if there else guidance.mark_lost(t)
         for row, inbox in self._inboxes.items():

@@ -22,9 +22,9 @@ SILENCE_S: Final = 3.0
 # Of a process on another machine. TCP sends again 0.2, 0.6, 1.4, 3.0 and 6.2 s after a cable was cut: one that is back
 # within 3 s is noticed after 3 s.
 FAR_SILENCE_S: Final = 4.5
-LONGEST: Final = 4096  # of a line [bytes]
+LONGEST: Final = 4096  # longest line [bytes]
 
-GONE: Final = "the starter is gone"  # or has ended
+GONE: Final = "the starter is gone"  # reason of the loss: gone, or ended
 _STOP: Final = b"stop "
 
 
@@ -65,7 +65,7 @@ class Lifeline:
         line: LifelineEnd | None = None,  # standard input if left out
         on_line: Callable[[bytes], None] | None = None,  # called in that thread with each line that is no heartbeat
     ) -> None:
-        self.reason: str | None = None  # of the loss; set before `lost`
+        self.reason: str | None = None  # reason of the loss; set before `lost`
         self._lost, self._timeout_s, self._on_line = lost, timeout_s, on_line
         self._line = line or LifelineEnd()
         self._rest = b""

@@ -48,7 +48,7 @@ from agents.ticks import Ticks
 from agents.vectors import Setpoint
 
 STOP_YIELD_S: Final = 0.05  # sleep after an emergency stop, so that other processes get the CPU to stop their motors
-ROUTER_S: Final = 0.045  # between two checks of the router
+ROUTER_S: Final = 0.045  # pause between two checks of the router
 
 Ranging = Literal["body", "world", "remote"]
 
@@ -59,7 +59,7 @@ class Setup:
 
     keys: Keys  # key expressions of the realm
     endpoints: Sequence[str]  # routers, or the members of a mesh
-    encoding: messages.Encoding  # of sent payloads
+    encoding: messages.Encoding  # encoding of sent payloads
     state_hz: float  # [1/s] rate of telemetry
     lifeline: bool  # whether standard input is a lifeline
     externally_measured: Sequence[bool]  # robots with a position measured from outside
@@ -70,8 +70,8 @@ class Setup:
     exact: Sequence[bool] = ()
     # effects of the modelled channel on received poses, for each robot by link; empty: none
     conditions: Sequence[Sequence[Conditions]] = ()
-    goal_conditions: Sequence[Conditions] = ()  # on received goals, for each robot; empty: none
-    clock: Clock = field(default_factory=Clock)  # of the experiment
+    goal_conditions: Sequence[Conditions] = ()  # conditions on received goals, for each robot; empty: none
+    clock: Clock = field(default_factory=Clock)  # clock of the experiment
     once: bool = False  # the process ends when its robots are down after an experiment
     rights: Rights | None = None  # enforced by the robots themselves in the mesh of a lab
     # [s] without a tick after which the watchdog lands the robots
@@ -274,7 +274,7 @@ class Runtime:
             return
         while ahead > 0.0 and bell.wait(ahead):
             now = ticks.elapsed()
-            if now < ticks.next and not self._cut_off:  # after a stop other processes need the CPU
+            if now < ticks.next and not self._cut_off:  # other processes need the CPU after a stop
                 self._neighbours.deliver(now, self._utc)
             # not by `until_next`: a wait that lasts too long delays its tick and skips none
             ahead = ticks.next - ticks.elapsed()

@@ -30,7 +30,7 @@ class ReceivedPose(msgspec.Struct, frozen=True):
     """A valid pose that is newer than those before it."""
 
     pose: messages.Pose
-    size: int  # [bytes] of its payload
+    size: int  # [bytes] length of its payload
     missed: int  # lost poses before it
     # [s] UTC of the measurement, as far as its stamp can be true: not after its arrival, and, if the clock of the robot
     # is behind, not longer before it than a network delays poses

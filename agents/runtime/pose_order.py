@@ -18,9 +18,9 @@ class PoseOrder:
     """
 
     def __init__(self) -> None:
-        self.seq, self.stamp = 0, 0.0  # of the last pose; 0: none of this session
-        self._session: str | None = None  # of the robot, as far as it is known
-        self._named = False  # that session had a life token
+        self.seq, self.stamp = 0, 0.0  # number and stamp of the last pose; 0: none of this session
+        self._session: str | None = None  # session of the robot, as far as it is known
+        self._named = False  # True if that session had a life token
         self._lives: list[str] = []  # sessions with a life token, the first one first
 
     def note_life(self, session: str, *, there: bool) -> bool:

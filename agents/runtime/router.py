@@ -46,12 +46,12 @@ LOOK_AGAIN_S: Final = 0.5
 
 
 def serve(
-    endpoints: Sequence[str],  # to listen on: on loopback, or anywhere with a lab
+    endpoints: Sequence[str],  # places to listen on: on loopback, or anywhere with a lab
     *,
     link: Sequence[str] = (),  # other routers, with which it shares all keys
     lifeline: bool = False,  # standard input is a lifeline
     linger_s: float = 0.0,  # time that it stays after its loss, for robots that land [s]; less without clients
-    rights: Rights | None = None,  # of all identities, in a lab
+    rights: Rights | None = None,  # rights of all identities, in a lab
 ) -> int:
     """Runs a router until SIGINT, SIGTERM or the loss of its lifeline; returns the exit code of the process.
 
@@ -108,7 +108,7 @@ def serve_router(
     """
     register = _register(endpoints)
     patience_s = 0.0
-    read = _stamp(register)  # before reading: a change in between is detected
+    read = _stamp(register)  # read before the register: a change in between is detected
     chosen = config(settings("router", listen=endpoints, connect=link, name="router", rights=rights))
     while True:
         with closing_cleanly(_routing(chosen, endpoints, patience_s, stop)) as (session, declared):

@@ -17,8 +17,8 @@ from agents.body.interface import Body
 
 SILENCE_S: Final = 0.5
 DOWN_S: Final = 10.0  # least limit for the robots of a loop that hangs to land,
-CUT_S: Final = 0.5  # and for the body to cut the motors; then the process ends
-AGAIN_S: Final = 0.5  # between two orders to land: the first may be lost
+CUT_S: Final = 0.5  # time for the body to cut the motors; then the process ends
+AGAIN_S: Final = 0.5  # pause between two orders to land: the first may be lost
 LOOKS: Final = 5  # checks in each silence
 HUNG: Final = 70  # exit code of a process with a loop that hung for good
 
@@ -37,7 +37,7 @@ class Watchdog:
         *,
         alarm: Callable[[str], object],  # reports the reason to the other processes
         silence_s: float = SILENCE_S,  # longest time without a beat [s]
-        down_s: float = DOWN_S,  # from then until the motors are cut [s]
+        down_s: float = DOWN_S,  # time from then until the motors are cut [s]
         end: Callable[[int], object] | None = None,  # ends the process with an exit code
     ) -> None:
         self.tripped = ""  # why the robots were ordered to land; empty before, and after `forgive`

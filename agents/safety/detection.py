@@ -24,14 +24,14 @@ from agents.safety.motion_check import RUSH_S, MotionCheck
 from agents.safety.setpoint_filter import OUTSIDE_M
 from agents.vectors import NO_SETPOINT, UNKNOWN, Setpoint, Vector, is_finite, norm, planar
 
-SUNK: Final = 0.15  # [m] below its goal
+SUNK: Final = 0.15  # [m] depth below its goal
 LOWEST_DESCENT_M_S: Final = 0.2  # [m/s] no device lands more slowly,
-CREEPS: Final = 0.025  # [m/s] or more slowly than this for
+CREEPS: Final = 0.025  # [m/s] largest speed of a robot that creeps
 STEP: Final = 0.05  # [m]
-STALLS_S: Final = 4.0  # time after which a climb without `STEP` of gained height counts as stalled; of
-STALLS_OUTSIDE_S: Final = 0.7  # robot that flies on board by positions from outside, once it has risen; of
-STALLS_VELOCITY_S: Final = 10.0  # a device that takes velocities, which may need a second order to take off
-SINKS: Final = 0.15  # [m/s] and downward: the robot does not fly to its goal
+STALLS_S: Final = 4.0  # [s] time after which a climb without `STEP` of gained height counts as stalled
+STALLS_OUTSIDE_S: Final = 0.7  # [s] the same of a robot that flies by positions from outside, once it has risen
+STALLS_VELOCITY_S: Final = 10.0  # [s] the same of a device that takes velocities: it may need a second order
+SINKS: Final = 0.15  # [m/s] downward speed at which the robot does not fly to its goal
 AHEAD_S: Final = 0.1  # no network here is later than this: stamps further ahead come from a clock that is ahead
 FOREIGN_S: Final = 0.5  # a gap in the poses from another source does not end their hazard before
 NOT_UNIT: Final = 0.1  # largest deviation of the squared norm of a quaternion from 1
@@ -42,17 +42,17 @@ class RobotStatus:
     """Status of a robot in its experiment, for `Detector`; the robot overwrites it on each tick."""
 
     ordered: bool = False  # holds by order
-    cruising: bool = False  # at its height or running: its setpoints are followed
-    climbing: bool = False  # on its way up
+    cruising: bool = False  # True at its height or running: its setpoints are followed
+    climbing: bool = False  # True on its way up
     landing: bool = False  # descending
     alone: bool = False  # the law has no input
     unguided: bool = False  # running without the guidance that it needs
     goal_stamp: float = -inf  # decision time of the goal of a guided robot [s]; −inf: it is not guided
-    unstarted: bool = False  # on its way up, or in the air, without a start order
+    unstarted: bool = False  # True on its way up, or in the air, without a start order
     goal_height: float = nan  # [m]
-    setpoint: Setpoint = NO_SETPOINT  # of the tick before, NaN when the body drives by itself
+    setpoint: Setpoint = NO_SETPOINT  # setpoint of the tick before, NaN when the body drives by itself
     not_finite: bool = False  # the last setpoint was not finite
-    aside: bool = False  # on its way to a landing place
+    aside: bool = False  # True on its way to a landing place
 
 
 class Ascent:
@@ -63,7 +63,7 @@ class Ascent:
     """
 
     def __init__(self, kind: Kind, hover: float, *, outside: bool) -> None:
-        self.climbing = False  # on the last tick
+        self.climbing = False  # state on the last tick
         self.hover = hover  # height at the end [m]
         self.begin = UNKNOWN  # position at the begin [m]
         self.free = RUSH_S * kind.speed + kind.radius  # distance from there that is no matter [m]
@@ -72,9 +72,9 @@ class Ascent:
         self.patience_s = STALLS_VELOCITY_S if kind.takes == "velocity" else STALLS_S  # time for a step of height [s]
         at_once, per_metre, low = kind.lift_s if outside else (inf, 0.0, 0.0)
         self.lifts_s = at_once + per_metre * hover + low / hover if hover > 0.0 else inf  # time for the first step [s],
-        self.rises_s = STALLS_OUTSIDE_S if outside else inf  # and for each of the others [s]
+        self.rises_s = STALLS_OUTSIDE_S if outside else inf  # time for each of the others [s]
         self.highest = 0.0  # last step of height [m],
-        self.risen_at = 0.0  # and its time [s]
+        self.risen_at = 0.0  # time of that height [s]
         self.risen = False  # there was such a step
         self.stalled = False  # it is measured to stay low
         self.stuck = False  # likewise, by positions from outside: it flies higher and higher
@@ -100,10 +100,10 @@ class LandingProgress:
     """Progress of a landing."""
 
     room: float  # height from which a robot of unknown height descends [m]
-    landing: bool = False  # on the last tick
-    due: float = 0.0  # when it is down, at the slowest [s]
+    landing: bool = False  # state on the last tick
+    due: float = 0.0  # time at which it is down, at the slowest [s]
     lowest: float = 0.0  # last step of height [m],
-    lowered_at: float = 0.0  # and its time [s]
+    lowered_at: float = 0.0  # time of that height [s]
     late: bool = False  # its motors do no good
     hovers: bool = False  # it stays at a height; it is never cut: it would fall
 
@@ -139,17 +139,17 @@ class Detector:
         half = sin(0.5 * limits.tilt)
         self.lean = half * half  # largest x² + y² of an attitude
         self.battery_low = limits.battery_low
-        self.silence_s = limits.position_timeout_s  # of the device, and of the pose, that is too long [s]
+        self.silence_s = limits.position_timeout_s  # silence of the device, and of the pose, that is too long [s]
         self.behind_s = limits.behind_s  # stamps that are older have a wrong clock [s]
-        self.separation = 0.0 if limits.separation is None else limits.separation  # of robots, least [m]; 0: any
+        self.separation = 0.0 if limits.separation is None else limits.separation  # least distance [m]; 0: any
         self.outside = limits.late_s < inf  # it flies on board by positions from outside
         self.motion_check, self.direction = MotionCheck(kind, outside=self.outside), DirectionCheck(kind)
         self.ascent = Ascent(kind, assignment.hover, outside=self.outside)
         self.descent = LandingProgress(limits.high[2])
-        self.leaned = False  # on the tick before
+        self.leaned = False  # state on the tick before
         self.leans_since = 0.0  # time of the first sample of that [s]
         self.sees = False  # it avoids, and has range readings
-        self.scan: RangeScan | None = None  # on the tick before
+        self.scan: RangeScan | None = None  # scan on the tick before
         self.scanned = inf  # time of the newest range readings [s]; infinity before the first
 
     def causes(self, now: Situation, status: RobotStatus, neighbours: Neighbours, health: ProcessHealth) -> int:

@@ -16,7 +16,7 @@ from typing import Final
 from agents.body.kinds import Kind
 from agents.vectors import ZERO, Vector
 
-SAMPLE_S: Final = 0.05  # from one comparison to the next
+SAMPLE_S: Final = 0.05  # time from one comparison to the next
 MISSED_S: Final = 0.3  # time without a comparison after which the acceleration is unknown
 FORGET_S: Final = 0.6  # time constant with which comparisons are forgotten
 LEAST: Final = 0.25  # [m/s²] mean of the commanded accelerations, below which their directions are noise
@@ -37,16 +37,16 @@ class DirectionCheck:
 
     def __init__(self, kind: Kind) -> None:
         self.response, self.speed = kind.response, kind.speed
-        self.lag = 0.5 * max(kind.lag, SAMPLE_S)  # of the tilt; the velocity loop has the other half [s]
-        self.gain = 1.0 / self.lag  # of that loop [1/s]
+        self.lag = 0.5 * max(kind.lag, SAMPLE_S)  # lag of the tilt; the velocity loop has the other half [s]
+        self.gain = 1.0 / self.lag  # gain of that loop [1/s]
         self.forget()
 
     def forget(self) -> None:
         """Restart."""
         self.turned = False  # the drone accelerates beside its commands
-        self.angle = 0.0  # by this [rad]
+        self.angle = 0.0  # angle by this comparison [rad]
         self.last = self.due = -inf  # times of the last comparison and of the next [s]
-        self.velocity = ZERO  # at the last comparison [m/s]
+        self.velocity = ZERO  # velocity at the last comparison [m/s]
         self.x = self.y = 0.0  # acceleration that is commanded, with the lag of the tilt [m/s²]
         # sums over comparisons: products along and across, squares of commanded and of measured ones [m²/s³]
         self.inline = self.cross = self.asks = self.moves = 0.0

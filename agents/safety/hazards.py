@@ -42,17 +42,17 @@ class Outcome(IntEnum):
 class Rule:
     """Response to a cause."""
 
-    words: str  # for people
+    words: str  # name for people
     first: Outcome  # outcome when the cause lasted for `after_s` without a break
     after_s: float = 0.0  # [s]
     then: Outcome = Outcome.NONE  # outcome after `then_s`
-    then_s: float = NEVER  # [s] since the cause began, as `after_s`
+    then_s: float = NEVER  # [s] time since the cause began, as `after_s`
     clears_s: float = 0.0  # absence of the cause that ends a hold [s]
     repeats: bool = False  # a cause that returns within `QUIET_S` counts as lasting
     place: bool = True  # a hold keeps the place where it began; else only setpoints stop
     landing: bool = False  # checked while a robot lands as well
     grounded: Outcome | None = None  # `then` of robots that do not fly, where different
-    grounded_s: float = 0.0  # by which their `then` comes later [s]
+    grounded_s: float = 0.0  # delay of their `then` [s]
 
 
 class Cause(IntEnum):
@@ -169,7 +169,7 @@ class Hazards:
         table = rules(limits)
         self.held = False  # the robot must keep its place
         self.under_way = False  # a hazard exists, or its begin or end is pending: `update` must be called
-        self.incidents: list[HazardChange] = []  # since the reader emptied the list
+        self.incidents: list[HazardChange] = []  # changes since the reader emptied the list
         # as in `Rule`, by the number of the cause, or as a set
         self.first, self.after_s = [int(rule.first) for rule in table], [rule.after_s for rule in table]
         self.then = [int(rule.then if kind.flies or rule.grounded is None else rule.grounded) for rule in table]
@@ -184,10 +184,10 @@ class Hazards:
         self.last = [-NEVER] * len(table)  # last presence [s]
         self.lasted_s = [0.0] * len(table)  # duration of its last hazard that ended [s]
         self.level = [0] * len(table)  # outcome
-        self.present = 0  # on the last tick
+        self.present = 0  # causes on the last tick
         self.open = 0  # present on the last tick, or with a hazard
         self.unresolved = 0  # present until the robot ended, on the last tick
-        self.texts: dict[Cause, str] = {}  # of hazards
+        self.texts: dict[Cause, str] = {}  # texts of hazards
 
     def update(
         self, t: float, causes: int, words: Callable[[Cause], str], *, active: bool, landing: bool

@@ -14,15 +14,15 @@ from agents.decision.neighbours import Neighbours
 from agents.decision.situation import ProcessHealth, Situation
 from agents.vectors import UNKNOWN, clamp, is_finite, norm, planar
 
-NEAR: Final = 0.05  # [m] between surfaces, seen from above: with less a robot does not land in place
+NEAR: Final = 0.05  # [m] distance of surfaces, seen from above: with less a robot does not land in place
 ROOM: Final = 0.12  # [m] the same at the place aside
-LOW: Final = 0.2  # [m] above the floor: from lower it lands in place
+LOW: Final = 0.2  # [m] height above the floor: from lower it lands in place
 BESIDE: Final = 0.1  # [m] smallest difference of heights at which robots are not in each other's way
 SLOW: Final = 0.15  # [m/s] a robot that moved aside lands when slower
 PATIENCE_S: Final = 3.0  # [s] longest time to move aside
 ROUNDING: Final = 1e-9
 RINGS: Final = tuple(0.05 * k for k in range(1, 31))  # [m] distances of tried places
-WAYS: Final = tuple((cos(k * pi / 8), sin(k * pi / 8)) for k in range(16))  # and their directions
+WAYS: Final = tuple((cos(k * pi / 8), sin(k * pi / 8)) for k in range(16))  # directions of tried places
 
 
 class Occupied(NamedTuple):
@@ -31,7 +31,7 @@ class Occupied(NamedTuple):
     x: float  # [m]
     y: float  # [m]
     touching: float  # distance of the axes at which both touch [m]
-    gap: float  # between surfaces, seen from above [m]
+    gap: float  # distance of surfaces, seen from above [m]
     lower: bool  # it may be flown over
 
 
@@ -43,7 +43,7 @@ class Landing:
         self._assignment = assignment
         self.aside = False  # it must land and is not at its place yet
         self.place = UNKNOWN  # its landing place [m], NaN: none
-        self._until = -inf  # when it lands in place [s]
+        self._until = -inf  # time at which it lands in place [s]
         self._nearest = ""  # robot below it
 
     def filter_land(

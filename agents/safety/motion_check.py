@@ -23,12 +23,12 @@ PIECE_S: Final = PIECE * SAMPLE_S
 SLOW_FLIES, SLOW_WHEELS = 0.25, 0.1  # shares of a kind's speed: slower setpoints are no command to move
 MOVES: Final = 0.2  # least share of the commanded travel that a robot moves
 WITHOUT_S: Final = 1.5  # commanded travel without motion, in seconds at top speed, that counts as unresponsive,
-LEAST_WITHOUT_S: Final = 2.0  # if it lasted at least this long
+LEAST_WITHOUT_S: Final = 2.0  # shortest time without motion that counts
 FORGET_S: Final = 5.0  # time after which uncommanded motion is forgotten
 KEPT: Final = 1.0 - PIECE_S / FORGET_S  # share of earlier uncommanded motion that a piece keeps
 RUSH_S: Final = 0.5  # tolerated uncommanded travel, in seconds at top speed, besides the size of the robot
 ROUNDING_S: Final = 1e-6
-OUTSIDE_M: Final = 0.4  # [m] and that of robots that fly on board by positions from outside, which may ring
+OUTSIDE_M: Final = 0.4  # [m] the same of robots that fly on board by positions from outside, which may ring
 TURN: Final = 1.5  # tolerated uncommanded rotation of a wheeled robot [rad]
 
 
@@ -55,7 +55,7 @@ class MotionCheck:
         self.free = OUTSIDE_M if outside else RUSH_S * kind.speed + kind.radius
         self.last = self.due = -inf  # time of the last tick, and end of the sample [s]
         self.x = self.y = self.z = self.commanded_turn = 0.0  # commanded in this sample [m], [rad]
-        self.samples = 0  # of this piece
+        self.samples = 0  # count of this piece
         self.forget(UNKNOWN, nan)
 
     def forget(self, position: Vector, yaw: float) -> None:
@@ -97,7 +97,7 @@ class MotionCheck:
                 self.x += x * since
                 self.y += y * since
                 self.z += z * since
-            elif speed < inf:  # with a setpoint and a pose
+            elif speed < inf:  # setpoint and pose are known
                 share = self.speed / speed
                 self.x += x * share * since
                 self.y += y * share * since
@@ -157,7 +157,7 @@ class MotionCheck:
             self.commanded_s += SAMPLE_S
         else:
             self.commanded_s -= SAMPLE_S  # a pause that was as long lets it be forgotten
-        commanded = norm(self.unanswered) + rim * abs(self.unanswered_turn)  # to and fro is no way
+        commanded = norm(self.unanswered) + rim * abs(self.unanswered_turn)  # motion to and fro is no way
         moved = distance(position, self.anchor) + rim * abs(wrap(yaw - self.anchor_yaw))
         if moved > MOVES * max(commanded, self.without) or self.commanded_s < 0.0:
             commanded = self.commanded_s = self.unanswered_turn = 0.0

@@ -13,12 +13,12 @@ from typing import Final
 from agents.body.kinds import Kind
 from agents.vectors import UNKNOWN, Vector, clamp
 
-JUMP_M: Final = 0.5  # [m] beyond what a robot can move between two measurements: it is not where its position says
+JUMP_M: Final = 0.5  # [m] excess over what a robot can move between two measurements: it is not where its position says
 GAP_S: Final = 0.5  # longest time that counts between them; after a longer one it stood, or was landed
 PLAUSIBLE_SPEED: Final = 1.5  # share of a kind's speed: what it can move
-FLIP: Final = 0.5  # [rad] beyond what a robot can turn between two measurements: its markers are mistaken
+FLIP: Final = 0.5  # [rad] excess over what a robot can turn between two measurements: its markers are mistaken
 ABSURD: Final = 1e6  # [rad] no yaw
-MOST_TURNED: Final = 1.2  # [rad] between two measurements, however long the time between them
+MOST_TURNED: Final = 1.2  # [rad] largest turn between two measurements, however long the time between them
 
 
 class Continuity:
@@ -32,8 +32,8 @@ class Continuity:
         self.jumped = False  # it has jumped
         self.yaw_jump = nan  # size of the jump of its yaw [rad]; NaN: it did not jump
         self._jump_m, self._squared = jump_m, jump_m * jump_m
-        self._fastest = PLAUSIBLE_SPEED * kind.speed  # that it can be [m/s]
-        self._turn_rate = PLAUSIBLE_SPEED * kind.turn_rate  # and turn [rad/s]
+        self._fastest = PLAUSIBLE_SPEED * kind.speed  # largest speed that it can have [m/s]
+        self._turn_rate = PLAUSIBLE_SPEED * kind.turn_rate  # largest turn rate that it can have [rad/s]
         self._wheels = kind.takes == "twist"
         self._place, self._time = UNKNOWN, 0.0  # last plausible position [m], NaN: none, and its time [s]
         self._yaw = nan  # last plausible yaw [rad], NaN: none
@@ -95,8 +95,8 @@ class ExternalPositions:
         self.place = UNKNOWN
         self._disobeys = False  # it is not believed because of that
         self._continuity = Continuity(kind, 2.0 * kind.radius)
-        self._time = -inf  # of the last position [s]
-        self._turn_rate = PLAUSIBLE_SPEED * kind.turn_rate  # that it can have [rad/s]
+        self._time = -inf  # time of the last position [s]
+        self._turn_rate = PLAUSIBLE_SPEED * kind.turn_rate  # largest turn rate that it can have [rad/s]
         self._yaw = self._yaw_time = nan  # last measured [rad], and when [s]
         self._flipped = 0.0  # sum of the jumps of the yaw [rad]
 

@@ -25,15 +25,15 @@ from agents.vectors import NO_SETPOINT, ZERO, Vector, is_finite, norm, planar
 
 LOST_S: Final = 0.5  # time of a failing check after which a ready robot is not ready any more
 FLOOR_M: Final = 0.5  # largest height of a standing drone: positioning systems differ about the floor
-REST_M_S: Final = 0.3  # and largest speed
-LEVEL: Final = 0.35  # [rad] and largest tilt
+REST_M_S: Final = 0.3  # largest speed at rest
+LEVEL: Final = 0.35  # [rad] largest tilt at rest
 WALL_M: Final = 0.05  # a place measured this far outside the arena may be inside
 TURNED: Final = radians(20.0)  # largest difference of a yaw from that of its start
 ABOVE_M: Final = 0.1  # [m] a robot higher than this is above one that stands,
-BESIDE_M: Final = 0.1  # [m] unless there is more than this between the two, seen from above
+BESIDE_M: Final = 0.1  # [m] enough distance of the two, seen from above
 # remedy for a measured yaw that is not that of the robot
 FRAME: Final = "turn the frame of its object in the motion capture, until the x axis points along its nose"
-NUMBERS: Final = {1: "a number", 3: "three numbers", 4: "four numbers"}  # of a result
+NUMBERS: Final = {1: "a number", 3: "three numbers", 4: "four numbers"}  # kinds of a result
 
 
 class Preflight:

@@ -15,11 +15,11 @@ from agents.plugins.avoidance import Avoidance, Nearby, OwnState
 from agents.vectors import NO_SETPOINT, Setpoint, Vector, clamp
 
 FLOOR_M: Final = 0.05  # [m] least height of a goal above the floor, or the robot's own: a descent overshoots its goal
-OUTSIDE_M: Final = 0.25  # [m] outside the arena: no longer under control
+OUTSIDE_M: Final = 0.25  # [m] distance outside the arena: no longer under control
 ABSURD: Final = 1e6  # [m, m/s, rad, rad/s] larger than any place, speed or angle; NaN is not smaller either
 BEFORE_WALL: Final = 0.6  # share of the way to a wall that a goal may be ahead: a drone overshoots a step by a tenth
 ROUNDING: Final = 1e-9  # smaller differences are arithmetic, not interventions
-REST: Final[Setpoint] = (0.0, 0.0, 0.0, 0.0)  # of robots that take velocities or twists
+REST: Final[Setpoint] = (0.0, 0.0, 0.0, 0.0)  # setpoint of rest for robots that take velocities or twists
 
 
 class SetpointFilter:
@@ -33,19 +33,19 @@ class SetpointFilter:
         # the body takes positions, or twists; one that takes neither takes velocities
         self._flies_to, self._drives = kind.takes == "position", kind.takes == "twist"
         self._speed, self._turn_rate = min(kind.speed, limits.top_speed), kind.turn_rate  # [m/s], [rad/s]
-        self._fastest = inf if kind.flies else self._speed  # in any direction [m/s]; what flies is limited per axis
+        self._fastest = inf if kind.flies else self._speed  # largest speed in any direction [m/s]
         self._turn_radius = kind.turn_radius  # smallest [m]; 0: it turns on the spot
         # time in which the body closes a position error [s]: it goes as fast as its goal is far
         self._closes_s = 1.0 / kind.response
         # way that it can drive in that time, and as long as a pose is valid [m]
         self._far = self._speed * (self._closes_s + limits.position_timeout_s)
         self._step = min(limits.max_goal_distance, self._speed * self._closes_s)  # longest way to a goal [m]
-        self._walls_low, self._walls_high, margin = limits.low, limits.high, limits.margin  # of the arena [m]
+        self._walls_low, self._walls_high, margin = limits.low, limits.high, limits.margin  # walls of the arena [m]
         beside = margin + kind.radius  # its surface, not its centre, keeps the margin
         # a goal on the floor would be flown into it; heights do not limit ground robots
         (x, y, z), (far_x, far_y, far_z) = limits.low, limits.high
         bottom, top = (z + max(kind.height, FLOOR_M), far_z - margin) if kind.flies else (-inf, inf)
-        self._low, self._high = (x + beside, y + beside, bottom), (far_x - beside, far_y - beside, top)  # of goals [m]
+        self._low, self._high = (x + beside, y + beside, bottom), (far_x - beside, far_y - beside, top)  # limits [m]
         self._cut_beyond_m, self._position_timeout_s = limits.cut_beyond_m, limits.position_timeout_s
 
     def judge(self, now: Situation) -> None:

@@ -33,7 +33,7 @@ from bridges.crazyflie.telemetry import BEARING, ELEVATION, Telemetry
 
 STALE_S: Final = 0.5  # the note reports poses older than this
 POLL_S: Final = 0.01
-WINDOW_S: Final = 0.25  # in which the exchanges of a radio are counted
+WINDOW_S: Final = 0.25  # averaging window of the radio's load [s]
 MEASURING_S: Final = 8.0  # time in which a radio is measured: others may still start on it
 
 
@@ -168,7 +168,7 @@ class CrazyflieBody(Body):
     def takeoff(self, rows: Sequence[int], heights: Sequence[float]) -> None:
         """See `Body.takeoff`."""
         for row, up in zip(rows, heights, strict=True):
-            self._telemetry[row].airborne = True  # at once: callers wait for a landing as long as this is set
+            self._telemetry[row].airborne = True  # set at once: callers wait for a landing as long as this is set
             self.pilots[row].give_order("takeoff", up)
 
     def land(self, rows: Sequence[int]) -> None:

@@ -13,11 +13,11 @@ from typing import Final
 
 import numpy as np
 
-NOISE: Final = 1e-3  # [m²/s³] of the vertical acceleration, which the firmware's estimator assumes
+NOISE: Final = 1e-3  # [m²/s³] noise of the vertical acceleration, which the firmware's estimator assumes
 RISEN_M: Final = 0.08  # [m] height at which a climb is dated
-BEFORE_S, AFTER_S = 1.6, 0.5  # of the part around that time which is compared
+BEFORE_S, AFTER_S = 1.6, 0.5  # parts before and after that time which are compared [s]
 REST_S: Final = 0.6  # begin of that part, at rest
-STEP_S: Final = 0.01  # between the delays that are tried
+STEP_S: Final = 0.01  # step between the delays that are tried [s]
 TRIED: Final = np.arange(51)[:, None] * STEP_S  # [s]
 ALIKE_M: Final = 0.012  # [m] deviation of the two heights, up to which one is the other
 KEPT_S: Final = 6.0
@@ -68,15 +68,15 @@ def delay(board: Sequence[BoardSample], given: Sequence[GivenSample], sigma: flo
     rest = (at >= begin) & (at < begin + REST_S)
     if not rest.any():
         return nan
-    off -= off[rest].mean()  # at rest they correct the error of the accelerometer
+    off -= off[rest].mean()  # corrects the error of the accelerometer at rest
     every = np.diff(at, prepend=at[0])
-    gain = sqrt(NOISE / np.median(every[1:])) / sigma  # [1/s²] of the filter at its steady state
+    gain = sqrt(NOISE / np.median(every[1:])) / sigma  # [1/s²] gain of the filter at its steady state
     rate = rate + gain * np.interp(t, at, np.cumsum(every * off))
     felt = np.concatenate([[0.0], np.cumsum(0.5 * np.diff(t) * (rate[1:] + rate[:-1]))])
     part = (at >= begin) & (at <= end)
     at, heights = at[part], heights[part]
     left = heights - np.interp(at - TRIED, t, felt)
-    trend, _ = np.linalg.qr(np.vander(at - dated, 2))  # that of an integral: a constant, and a wrong rate
+    trend, _ = np.linalg.qr(np.vander(at - dated, 2))  # trend of an integral: a constant, and a wrong rate
     left = (left - left @ trend @ trend.T).std(axis=1)
     best = int(left.argmin())
     return float(TRIED[best, 0]) if left[best] < ALIKE_M else nan

@@ -16,7 +16,7 @@ from typing import Any, Final
 from agents.protocols.crazyradio import ACK, ANSWER, EXCHANGE, RETRY_S, SWITCH_S, Simulated
 
 ANSWER_S: Final = 0.1  # longest wait for the simulated air
-MAX_ANSWER_BYTES: Final = 64  # [bytes] of an answer
+MAX_ANSWER_BYTES: Final = 64  # [bytes] longest answer
 REFUSED_S: Final = 0.01  # exchange with an air that is gone
 
 # requests of the dongle's configuration

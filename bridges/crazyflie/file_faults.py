@@ -24,7 +24,7 @@ from bridges.crazyflie.geometry import check_anchors, in_one_plane, stations
 
 BODY: Final = ("body",)
 SYSTEM: Final = ("device", "positioning")
-APART: Final = 2  # [channels of 1 MHz] from which on two radios leave each other alone
+APART: Final = 2  # [channels of 1 MHz] distance from which on two radios leave each other alone
 
 
 def file_faults(robots: Sequence[BodyEntry]) -> Iterator[BodyFault]:

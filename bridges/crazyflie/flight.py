@@ -26,7 +26,7 @@ from bridges.crazyflie.trajectory import HOLD_S, SINK, STOP_S, Target, stop_desc
 CLIMB: Final = 0.4  # [m/s] mean speed of take-offs
 DESCENT: Final = 0.22  # [m/s] mean speed of landings: never 0.5 m/s
 UNKNOWN: Final = 3.0  # [m] height from which a drone that has reported none is landed
-FLOOR: Final = -0.1  # [m] where they end: the motors stop there, and the drone lags behind
+FLOOR: Final = -0.1  # [m] height at which they end: the motors stop there, and the drone lags behind
 # without positions from outside, where the estimate of the height is wrong by half the error of the accelerometer times
 # the square of the time: quick, and deep enough to end on the floor
 BLIND_DESCENT: Final = 0.45  # [m/s]
@@ -35,7 +35,7 @@ EXTERNAL_AGE_S: Final = CRAZYFLIE.late_s  # older positions from outside make th
 # with positions from outside a landing is led down: when the radio is lost on the way, the descent on board goes on
 LED: Final = 0.3  # [m/s]
 LED_TO: Final = 0.3  # [m] height from which the planner's own landing is too short to become wrong
-BLIND_S: Final = 0.5  # without a young position from outside a drone is blind
+BLIND_S: Final = 0.5  # [s] time without a young position from outside after which a drone is blind
 SHORTEST_S: Final = 1.5  # duration of a take-off or landing
 UPLOAD_S: Final = 3.0  # limit for writing a climb, part by part
 REPLY_S: Final = 0.15  # deadline of the reply to a high-level command; then the command is repeated
@@ -45,21 +45,21 @@ STOPPING_S: Final = 2.0  # time after a stop for which a Crazyflie that does not
 ANSWER_S: Final = 2.5  # the note reports an emergency stop that is unconfirmed for longer
 POLL_S: Final = 0.02
 FRESH_S: Final = 1.0  # an older status is ignored
-LOOP_SILENCE_S: Final = 1.0  # in flight, the robot's loop must command at least this often
-FLYING_FLAG_S: Final = 3.0  # from a take-off to the flag "flying" in the status
-LANDING_GAP_S: Final = 0.8  # after a longer gap the drone is landed: it has flown without control
+LOOP_SILENCE_S: Final = 1.0  # [s] longest pause of the robot's loop between commands in flight
+FLYING_FLAG_S: Final = 3.0  # [s] time from a take-off to the flag "flying" in the status
+LANDING_GAP_S: Final = 0.8  # [s] gap after which the drone is landed: it has flown without control
 SLOWEST_HZ: Final = 2.5  # setpoints over a radio that has become slow
 REFRESH_S: Final = 0.25  # a setpoint that does not change is sent again after this
 STRAIGHT: Final = 0.1  # [rad] a smaller yaw is turned to 0 on the way up: two packets instead of seventeen
 SAME: Final = 0.5e-3  # [m], [rad] a smaller change of a setpoint is none: positions are sent in millimetres
 PERIODS: Final = 2.5  # periods of setpoints for which, and for `HOLD_S`, the last one is held
-MARGIN_S: Final = 2.0  # from the end of its trajectory at the floor until an unreachable drone is down
-HOLD_AGE_S: Final = 0.3  # while the last pose is older, new setpoints are ignored
+MARGIN_S: Final = 2.0  # [s] time from the end of its trajectory at the floor until an unreachable drone is down
+HOLD_AGE_S: Final = 0.3  # [s] age of the last pose from which new setpoints are ignored
 AGAIN_S: Final = 3.0  # a landing that takes longer than planned by this is ordered again
 RELEASE_S: Final = 1.0  # period at which setpoints of another client are ended; after 2 s without new ones they lock it
 LAND_S: Final = 0.5  # period at which a landing is ordered again: setpoints of another client end it unnoticed,
-NEAR_S: Final = 0.3  # but not within this time of its end: after it the motors would start again;
-LOW: Final = 0.2  # [m] if the drone is higher then, it flies, or stands on a table:
+NEAR_S: Final = 0.3  # [s] least distance to its end: after it the motors would start again;
+LOW: Final = 0.2  # [m] height from which the drone flies, or stands on a table:
 LATE_LANDINGS: Final = 3  # number of attempts
 UNSTARTED_S: Final = 1.0  # a drone that has descended by itself for longer, because no setpoint was started, is landed
 STARTS: Final = 8  # trajectories that may be on board
@@ -104,25 +104,25 @@ class FlightControl:
         self._sent: Target | None = None  # last setpoint,
         self._sent_at = -math.inf  # [s]
         self._released_at = -math.inf  # last end of other clients' setpoints [s]
-        self._down_at = -math.inf  # by then the drone is down, if nothing more reaches it [s]
+        self._down_at = -math.inf  # time at which the drone is down, if nothing more reaches it [s]
         self._top: Target | None = None  # end of the climb, held until the first setpoint
         self._external = (math.nan, math.nan)  # height [m] and yaw [rad] that were measured from outside
         self._external_at = -math.inf  # arrival of the newest [s]
         self._located_at = -math.inf  # arrival of the newest that was young [s]
         self.outside = isinstance(settings.positioning, Outside)  # positions from outside correct its estimate
         self._blind_landing = False  # the landing began without positions
-        self._ended_landings = 0  # that another client has ended
+        self._ended_landings = 0  # count of those that another client has ended
         self._led = False  # the landing is led down
         self._led_from: tuple[Target, float] | None = None  # its begin: place, and time [s]; None: not known yet
         self._refused = False  # `trouble` is a reason against a take-off
         self._ordered = SHORTEST_S, False  # duration of the last landing that was ordered [s], without positions
-        self._late_landings = 0  # that were ordered and begun after their end
-        self._land_replies = 0  # of the planner to orders to land
+        self._late_landings = 0  # count of those that were ordered and begun after their end
+        self._land_replies = 0  # replies of the planner to orders to land
         self._armed_at = -math.inf  # last order to arm [s]
         self._disarm_at = math.inf  # next order to disarm [s]; infinity: none
         # heights [m] to which trajectories lead: of the last that is confirmed, and of those that are not
         self._on_board: deque[float] = deque(maxlen=STARTS)
-        self._start_replies = 0  # of the planner to starts
+        self._start_replies = 0  # replies of the planner to starts
         self._stream_hz = settings.stream_hz
         self.span_s = 0.0  # duration of the take-off or landing [s]
 
@@ -209,18 +209,18 @@ class FlightControl:
         trajectory = None if self.trouble else self._write_climb(place, (height, span))
         if trajectory is None:
             return
-        self._disarm_at = -math.inf  # unless it takes off
+        self._disarm_at = -math.inf  # time of disarming, unless it takes off
         self.trouble = self._arm()
         if self.trouble:
             return
-        for _ in range(3):  # without answer: low-level setpoints of another program would mute the planner
+        for _ in range(3):  # sent without answer: low-level setpoints of another program would mute the planner
             self._release()
             self._pause(POLL_S)
         self._disarm_at = math.inf
         self._target, self._top, self._sent, self.span_s = None, (x, y, height, place[3]), None, span
         self._on_board.clear()
         self._on_board.append(height)
-        self.enter(FlightPhase.CLIMBING)  # from here on a stop cuts the motors
+        self.enter(FlightPhase.CLIMBING)  # a stop cuts the motors from here on
         trajectories = self.link.trajectories
         answer = self._command_planner(
             trajectories.start_command, lambda: trajectories.start(trajectory), Info.PLANNER_ACTIVE

@@ -27,9 +27,9 @@ from agents.user_folder import cache_folder
 from bridges.crazyflie.dongle import plug_in
 from bridges.crazyflie.trajectory import PLACES, PromptRadio, TrajectoryMemory
 
-FIRST_S: Final = 0.6  # to the first packet; cflib never repeats its first two requests
-SILENCE_S: Final = 1.0  # between two answers while the connection is set up
-ANSWER_S: Final = 3.0  # to the answer about a parameter
+FIRST_S: Final = 0.6  # time to the first packet; cflib never repeats its first two requests
+SILENCE_S: Final = 1.0  # time between two answers while the connection is set up
+ANSWER_S: Final = 3.0  # time to the answer about a parameter
 REPEAT_S: Final = 0.3  # a question about a parameter is repeated after this
 BUSY_S: Final = 0.1  # no packet is handed to a radio that has been silent for longer: it would be sent after the gap
 POLLS: Final = 1_000_000  # unanswered ones before cflib gives a link up: never before `Link.gap` has shown it
@@ -129,17 +129,17 @@ class CrazyflieLink:
         from cflib.crazyflie import Crazyflie  # noqa: PLC0415
 
         self.address = address
-        self.last_packet = uptime()  # [s] of any kind, also one without content, which only a radio sends
+        self.last_packet = uptime()  # [s] time of any packet, also of an empty one, which only a radio sends
         self.exchanges = 0  # packets received
-        self._longest_gap = 0.0  # [s] between two of them, see `take_gap`
+        self._longest_gap = 0.0  # [s] longest pause of two packets, see `take_gap`
         self.firmware: str | None = None  # version, as the drone says it
-        self.replies: dict[int, tuple[int, int]] = {}  # of the planner, by command: number of replies, last code
+        self.replies: dict[int, tuple[int, int]] = {}  # replies of the planner, by command: number, last code
         self._last_answer = self.last_packet  # [s] packet with a content
         self._connected = threading.Event()
         self.error: str | None = None  # reason of the loss; None while connected
         self.answered = self._unsafe = False  # any packet was received; safelink is missing
         self.blocks: dict[str, Any] = {}
-        self._periods: dict[str, int] = {}  # that were asked for, in units of 10 ms
+        self._periods: dict[str, int] = {}  # periods that were asked for, in units of 10 ms
         self._parameters: dict[int, tuple[str, str]] = {}  # asked for, by number: name, format
         self._values: dict[str, float] = {}  # answers about parameters
         self.trajectories = TrajectoryMemory(self._send)
@@ -374,7 +374,7 @@ class CrazyflieLink:
         self._longest_gap = max(self._longest_gap, now - self.last_packet)
         self.last_packet = now
         self.exchanges += 1
-        if not self.answered:  # over a radio, cflib has tried for safelink before it hands the first packet on
+        if not self.answered:  # cflib has tried for safelink before it hands the first packet on
             self._unsafe = self.is_radio and getattr(self.cf.link, "needs_resending", False)
             self.answered = True
         if (packet.port, packet.channel) != crtp.NULL:

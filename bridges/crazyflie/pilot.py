@@ -27,18 +27,18 @@ from bridges.crazyflie.telemetry import Telemetry
 from bridges.crazyflie.trajectory import Target
 
 NO_ANSWER_S: Final = 2.4  # time without any answer after which no Crazyflie is there
-RADIO_LOST_S: Final = 3.0  # without an answered poll the link is lost, and a new one is opened
+RADIO_LOST_S: Final = 3.0  # time without an answered poll after which the link is lost, and a new one is opened
 LOST_S: Final = 1.0  # likewise without a packet over UDP or USB
-LOGS_S: Final = 1.0  # after a longer gap the firmware has removed its log blocks
-LOGLESS_S: Final = 0.5  # without a log packet over a working link, the log blocks are created again
+LOGS_S: Final = 1.0  # gap after which the firmware has removed its log blocks
+LOGLESS_S: Final = 0.5  # time without a log packet over a working link after which the log blocks are created again
 STATUS_S: Final = 2.0  # deadline of the first status
 RETRY_S: Final = 0.5
 QUEUE_S: Final = 0.5  # poses that wait for longer, and not only for a moment, are too many: the rate of logs is halved
 LATE_S: Final = 1.0
-CALM_S: Final = 5.0  # without a queue on the ground, and the rates are those chosen again
+CALM_S: Final = 5.0  # time without a queue on the ground after which the rates are those chosen again
 LEAST_SHARE: Final = 0.1
 SLOWING_S: Final = 2.0  # more before that is done again: a queue drains meanwhile
-LOOP_HZ: Final = 20.0  # at least, for gaps and phases, however few setpoints are streamed
+LOOP_HZ: Final = 20.0  # least rate, for gaps and phases, however few setpoints are streamed
 FAR: Final = 0.5  # [m] an estimate farther from the first external position after a gap is reset there
 LANDING_S: Final = 12.0  # least time that `close` waits for a landing
 JOIN_S: Final = 5.0
@@ -91,7 +91,7 @@ class CrazyfliePilot:
         self._stood_still = 0.0  # [s] a standstill of the process that was not acted on yet
         self._logs_at = -inf  # last creation of the log blocks [s]
         self._late_since, self._late_until = inf, -inf  # begin and end of a queue before the radio [s]
-        self._share = 1.0  # of the rates of logs and setpoints that were chosen
+        self._share = 1.0  # share of the rates of logs and setpoints that were chosen
         rate = max(settings.stream_hz, LOOP_HZ)
         if isinstance(settings.positioning, Outside):
             rate = max(rate, settings.positioning.rate_hz)
@@ -269,7 +269,7 @@ class CrazyfliePilot:
         telemetry.reset_status()
         self._share = 1.0
         self._flight.scale_setpoints(1.0)
-        link.define_trajectories(stops=self._flight.outside)  # before answers wait behind logs
+        link.define_trajectories(stops=self._flight.outside)  # defined before answers wait behind logs
         ranges_hz = settings.ranges_hz if settings.multiranger else None
         telemetry.start_logging(link, log_hz=settings.log_hz, ranges_hz=ranges_hz)
         link.ask_firmware()

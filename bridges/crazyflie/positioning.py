@@ -28,7 +28,7 @@ SINGLE: Final = 1e-5  # relative tolerance of what a Crazyflie stores in single 
 RESET_S: Final = 0.1  # duration of the estimator's reset
 VARIANCE_HZ: Final = 10.0  # beside poses, for which the budget of the radio is meant
 SETTLED_SPREAD: Final = 1e-3  # [m²] settled: the variances of half a second differ by less,
-SETTLED_BELOW: Final = 0.1  # [m²] and are below this
+SETTLED_BELOW: Final = 0.1  # [m²] limit of all of them
 SAMPLES: Final = 5
 VARIANCES: Final = {f"kalman.varP{axis}": "float" for axis in "XYZ"}
 

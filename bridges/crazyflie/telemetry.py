@@ -43,7 +43,7 @@ SMOOTHING_S: Final = 2.0  # time constant of the voltage: a short load is no emp
 WRAP_MS: Final = 1 << 24  # stamps of log packets have 24 bits
 BACK_MS: Final = 1000  # a stamp that is further back comes from a drone that was switched off and on
 AHEAD_S: Final = 10.0  # likewise one that is further ahead: longer than a full queue with late packets
-LATE_S: Final = 2.0  # and the first over a new connection that is older: no queue outlives one
+LATE_S: Final = 2.0  # largest age of the first packet over a new connection: no queue outlives one
 DRIFT: Final = 1e-4  # [s/s] largest difference between the clocks of a drone and of this computer
 INFO_TEXT: Final = {
     Info.LOCKED: "locked: switch it off and on",
@@ -69,7 +69,7 @@ class PacketAge:
         if self._last is None:
             self._last = stamp
         since = (stamp - self._last + WRAP_MS // 2) % WRAP_MS - WRAP_MS // 2
-        change = arrival - 1e-3 * (self._last + since) - self._least  # of the smallest difference, infinite at first
+        change = arrival - 1e-3 * (self._last + since) - self._least  # change of the smallest difference
         late = self.connected_anew and isfinite(self._least) and change > LATE_S
         self.connected_anew = False
         if since < -BACK_MS or (change < -AHEAD_S and isfinite(self._least)) or late:
@@ -89,16 +89,16 @@ class Telemetry:
     def __init__(self, *, lighthouse: bool, absolute: bool = False) -> None:
         """`lighthouse`: has base stations; `absolute`: positions are measured, see `Convergence`."""
         self.stamps = PacketAge()
-        self.arrival = -inf  # of the last packet of a log
-        self.status_time = -inf  # of the last status over this connection
-        self.pose_time = self.ranges_time = -inf  # of the last pose that was measured
+        self.arrival = -inf  # arrival of the last packet of a log
+        self.status_time = -inf  # time of the last status over this connection
+        self.pose_time = self.ranges_time = -inf  # time of the last pose that was measured
         self.pose: tuple[float, ...] = (nan,) * 7  # x, y, z [m], their rates [m/s], yaw [rad]
         self.settled = False  # position estimate has settled and may be used
         self.info = Info(0)  # flags of the supervisor
         self.reports_plans = False  # the firmware reports whether its planner is active
         self.power = int(Power.BATTERY)  # state of power management
         self.battery = nan  # charge, 0 to 1
-        self.volts = nan  # of the battery [V]
+        self.volts = nan  # voltage of the battery [V]
         self.stations = -1  # lighthouse.status, or -1
         self.ranges = (nan,) * len(RANGES)  # front, back, left, right, up [m]; NaN: nothing in reach
         self.climb = ClimbLog()

@@ -26,14 +26,14 @@ from agents.protocols import crtp
 from agents.protocols.crazyradio import COUNTERS, NULL
 from agents.protocols.crtp import HighLevel, Port
 
-HOLD_S: Final = 1.0  # at least, before the descent
-SINK: Final = 0.3  # [m/s] of the descent
+HOLD_S: Final = 1.0  # [s] least hover before the descent
+SINK: Final = 0.3  # [m/s] speed of the descent
 BELOW: Final = -1.0  # [m] height at its end: below any floor, because only an order to land stops the motors
-STOP_SINK: Final = 0.15  # [m/s²] of a descent that ends in a stop
+STOP_SINK: Final = 0.15  # [m/s²] acceleration of a descent that ends in a stop
 WRONG: Final = 0.05  # [m/s²] error of an accelerometer with which it still ends on the floor: 5 mg
 STOP_STEP: Final = 0.5  # [m] heights between which its duration is the same, and is not written again
-STOP_S: Final = 2.0  # from its end until the firmware stops and locks the motors
-FARTHEST: Final = 32.0  # [m] from the origin in a compressed trajectory
+STOP_S: Final = 2.0  # [s] time from its end until the firmware stops and locks the motors
+FARTHEST: Final = 32.0  # [m] largest distance from the origin in a compressed trajectory
 CHUNK: Final = 24  # [bytes] written by one packet
 LONGEST_MS: Final = 0xFFFF
 SHORTEST_S: Final = 0.01
@@ -164,7 +164,7 @@ class TrajectoryMemory:
 
     def write_climb(self, place: Target, climb: tuple[float, float], seconds: float) -> int | None:
         """Write the next part of a climb, see `polynomials`; returns its number when all of it is confirmed."""
-        self._upcoming = None  # of an earlier flight
+        self._upcoming = None  # trajectory of an earlier flight
         short = not self.stops and _fits((*place[:2], climb[0], place[3]))
         data = compressed(place, seconds, climb) if short else polynomials(place, seconds, climb, stops=self.stops)
         number = TAKEOFFS[0 if short else 1]

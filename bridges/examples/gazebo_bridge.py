@@ -10,7 +10,7 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-PATIENCE_S = 0.5  # without a new setpoint a robot stops
+PATIENCE_S = 0.5  # time without a new setpoint after which a robot stops
 
 
 def heading(q: Any) -> float:  # noqa: ANN401 - a gz.msgs.Quaternion

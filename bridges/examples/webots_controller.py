@@ -8,9 +8,9 @@ import math
 import sys
 import time
 
-WHEEL_RADIUS = 0.021  # [m] of the Khepera IV
+WHEEL_RADIUS = 0.021  # [m] radius of the Khepera IV's wheels
 HALF_BASE = 0.0527  # [m]
-PATIENCE_S = 0.5  # without a new setpoint the wheels stop
+PATIENCE_S = 0.5  # time without a new setpoint after which the wheels stop
 
 
 def main(name: str, endpoint: str) -> None:

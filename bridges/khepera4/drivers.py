@@ -19,10 +19,10 @@ from bridges.khepera4.odometry import Odometer
 NEVER: Final = math.inf
 REPORTED_S: Final = (0.004, 0.045)  # a report of way that covers less or more is not used to complete another
 GAP_S: Final = 0.3  # [s] commands further apart were parted by a gap of the link
-FIRST_ANSWER_S: Final = 3.0  # [s] for the first answer: a late one spends the only client of a server of 2023
-ASK_AGAIN_S: Final = 1.4  # [s] after which `p` is sent again: glued to the stop before it, a server does not see it
+FIRST_ANSWER_S: Final = 3.0  # [s] patience for the first answer: a late one spends the only client of a server of 2023
+ASK_AGAIN_S: Final = 1.4  # [s] pause before another `p`: a server does not see the one that is glued to a stop
 MAX_INPUT_BYTES: Final = 1 << 16  # [bytes] longest input: no robot sends as much
-PLACED_S: Final = 1.0  # [s] between two positions that are given to a server which does not tell its own
+PLACED_S: Final = 1.0  # [s] pause between two positions that are given to a server which does not tell its own
 
 Ranges = tuple[Sequence[float], Sequence[float]]  # bearings [rad], distances from the robot's centre [m]
 
@@ -82,7 +82,7 @@ class Driver(ABC):
     def __init__(self, wire: Wire, chosen: protocol.Khepera4Settings, *, ranged: bool) -> None:
         """`ranged`: it reads ranges."""
         self._wire, self.ranged = wire, ranged
-        self.patience_s = chosen.silence_s  # [s] without an answer after which a request fails
+        self.patience_s = chosen.silence_s  # [s] time without an answer after which a request fails
 
     @abstractmethod
     def begin(self) -> None:
@@ -113,11 +113,11 @@ class RoboticParkServer(Driver):
         self.server = server
         self._number = re.compile(rf"[-+]?\d+\.\d{{{server.decimals}}}")
         self._count = 3 if server.answer == "pose" else 2
-        self._angle = server.base / protocol.BASE  # of a true angle, per angle that the server counts
+        self._angle = server.base / protocol.BASE  # true angle per angle that the server counts
         self._free = -math.inf  # [s] earliest time of the next command
-        self._sent = (math.nan, math.nan)  # [s] of the last two commands, the later one last
-        self._asked = self._counted = math.nan  # [s] of the last p; end of the way that is counted
-        self._speed = (0.0, 0.0)  # [m/s, rad/s] by the last good report
+        self._sent = (math.nan, math.nan)  # [s] times of the last two commands, the later one last
+        self._asked = self._counted = math.nan  # [s] time of the last p; end of the way that is counted
+        self._speed = (0.0, 0.0)  # [m/s, rad/s] speeds by the last good report
 
     def begin(self) -> None:
         """See `Driver`. `identify` has made sure of the server."""
@@ -153,7 +153,7 @@ class RoboticParkServer(Driver):
 
     def _send(self, command: bytes, instead: bytes = b"", until: float = NEVER) -> float:
         """Send a command in a segment of its own, or `instead` if it is past `until`; returns when [s]."""
-        time.sleep(max(0.0, self._free - uptime()))  # of two commands in one segment the second is lost
+        time.sleep(max(0.0, self._free - uptime()))  # pause: the second of two commands in one segment is lost
         self._wire.send(command if uptime() <= until else instead)
         now = uptime()
         self._free = now + protocol.GAP_S
@@ -214,10 +214,10 @@ class GoalPark(RoboticParkServer):
         super().__init__(wire, chosen, server)
         self._theta = 0.0  # [rad] heading by the server's count
         self._placed = -math.inf  # [s] time at which the server's position was set
-        self._way = 0.0, 0.0  # [m] since then, in its frame
-        self._about = 0.0  # [rad/s] of a turn toward a goal behind
+        self._way = 0.0, 0.0  # [m] way since then, in its frame
+        self._about = 0.0  # [rad/s] rate of a turn toward a goal behind
         self._goal = (0.0, 0.0)  # [m] the last one, of a server that counts poses
-        self._ahead = 0.0  # [m] to the farthest goal since the last count, behind which it has not driven
+        self._ahead = 0.0  # [m] distance to the farthest goal since the last count, behind which it has not driven
 
     def begin(self) -> None:
         """See `Driver`. The heading must be known before a goal is sent."""

@@ -25,16 +25,16 @@ from bridges.khepera4.drivers import FIRST_ANSWER_S, Driver, KTeam, Wire, WrongS
 from bridges.khepera4.odometry import Odometer
 
 CONNECT_S: Final = 1.5
-RETRY_S: Final = 0.5  # between the end of a connection and the next attempt
+RETRY_S: Final = 0.5  # pause between the end of a connection and the next attempt
 STOPS: Final = 3  # stop commands at the end of the link
 RANGES_S: Final = 0.2
 BATTERY_S: Final = 5.0
 STOP_TRIES_S: Final = 3.0  # time for attempts to stop a robot after its connection broke in motion
-STOP_RETRY_S: Final = 0.1  # between two such attempts
+STOP_RETRY_S: Final = 0.1  # pause between two such attempts
 STANDING: Final = 0.02  # [m/s] slower robots stand
 AGAIN_S: Final = 0.2  # period of stops to a silent robot, which obeys as soon as it receives again
 KEEP_S: Final = 20.0  # time of stops to a silent robot over the same connection: most servers accept no other
-TCP_THIN_LINEAR_TIMEOUTS: Final = 16  # of Linux: the first repetitions of lost bytes do not wait longer and longer
+TCP_THIN_LINEAR_TIMEOUTS: Final = 16  # option of Linux: the first repetitions of lost bytes wait no longer
 FORM: Final = (
     "write khepera4://HOST for Robotic Park's server, kteam://HOST:PORT or kteam:///dev/ttyS0 for K-Team's kh4server"
 )
@@ -51,7 +51,7 @@ class KheperaAddress:
     host: str
     port: int
     serial: str
-    server: str | None  # of Robotic Park's; None: not named
+    server: str | None  # name among Robotic Park's; None: not named
 
     @classmethod
     def parse(cls, robot: str, address: str) -> KheperaAddress:
@@ -103,7 +103,7 @@ class KheperaAddress:
             return Wire(wire.fileno(), wire.close)
         line = os.open(self.serial, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
         try:
-            fcntl.flock(line, fcntl.LOCK_EX | fcntl.LOCK_NB)  # before any change: another process may drive the robot
+            fcntl.flock(line, fcntl.LOCK_EX | fcntl.LOCK_NB)  # locked first: another process may drive the robot
         except OSError as error:
             os.close(line)
             raise BlockingIOError(error.errno, "another process has this line") from None
@@ -148,11 +148,11 @@ class Khepera4Link:
         self.setpoint = (0.0, 0.0, -math.inf)  # v [m/s], ω [rad/s], time [s, `uptime`] of what it was decided on
         self.halted_since = math.inf  # [s, `uptime`]; infinity while the robot may move
         self.refused = False  # the server must not be driven; it is not tried again
-        self.server = ""  # that runs on the robot, by its answers; empty while not known
-        self.trouble = f"{address}: not connected yet"  # for users; empty while connected
+        self.server = ""  # name by the robot's answers; empty while not known
+        self.trouble = f"{address}: not connected yet"  # reason for users; empty while connected
         self._address, self._settings, self._server = address, chosen, address.server_of(name, chosen)
         self._odometer, self._first_answer_s = Odometer(*start), first_answer_s
-        self._stands = True  # by the last command that was answered
+        self._stands = True  # True by the last command that was answered
         self._stop_deadline = math.inf
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"{name} link", daemon=True)
@@ -248,7 +248,7 @@ class Khepera4Link:
             raise
 
     def _exchange(self, driver: Driver) -> None:
-        driver.move(self._odometer)  # before any motion: counters at zero show that the robot was switched off and on
+        driver.move(self._odometer)  # asked before any motion: counters at zero show a restart of the robot
         self._stands = True
         ticks = Ticks(self._settings.poll_hz, clock=uptime)
         ranges_due = battery_due = answered = ticks.zero

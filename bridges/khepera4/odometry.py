@@ -16,7 +16,7 @@ class Odometer:
 
     def __init__(self, x: float, y: float, yaw: float) -> None:
         self.x, self.y, self.yaw = x, y, yaw  # [m], [m], [rad]
-        self.velocity = (0.0, 0.0)  # in the world [m/s]
+        self.velocity = (0.0, 0.0)  # velocity in the world [m/s]
         self._last: tuple[float, ...] | None = None
         self._stamp = math.nan
         self._maybe_reset = False

@@ -49,7 +49,7 @@ class TelloBody(Body):
     def faults(cls, robots: Sequence[BodyEntry]) -> Iterator[BodyFault]:
         """See `Body.faults`."""
         places: dict[str, str] = {}  # IPv4 addresses by robot
-        first: dict[str, BodyEntry] = {}  # by machine
+        first: dict[str, BodyEntry] = {}  # entries by machine
         for each in robots:
             wrong = list(judged(each, BODY, partial(protocol.endpoint, each.name, each.address)))
             yield from wrong
@@ -166,7 +166,7 @@ class TelloBody(Body):
             self._thread.join()
             self._thread = None
         try:
-            call_all(pilot.leave for pilot in self.pilots)  # which can still be stopped
+            call_all(pilot.leave for pilot in self.pilots)  # drones that can still be stopped
         finally:
             self.pilots = []
             if self._library is not None:

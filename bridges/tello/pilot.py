@@ -18,19 +18,19 @@ from agents.body.kinds import Kind
 from agents.clock import uptime
 from agents.protocols import tello as protocol
 
-SDK_RETRY_S: Final = 0.5  # between two attempts to enter SDK mode
-LAND_RETRY_S: Final = 1.0  # between two `land` without an answer
+SDK_RETRY_S: Final = 0.5  # pause between two attempts to enter SDK mode
+LAND_RETRY_S: Final = 1.0  # pause between two `land` without an answer
 TAKEOFF_RETRY_S: Final = 6.0  # likewise of `takeoff`, which a drone answers when it is up
 SHORTEST_TAKEOFF_S: Final = 1.0  # no drone is up earlier
-TAKEOFF_S: Final = 20.0  # after this time the take-off has failed
+TAKEOFF_S: Final = 20.0  # time after which the take-off has failed
 LAST_REPEATS: Final = 5  # transmissions of the last command of a process: a datagram may be lost
 MOTORS_STOPPED_S: Final = 1.5  # time of a constant counter of motor seconds after which the motors stand still,
-CUT_S: Final = 2.5  # and time after a received emergency stop at which this is known
+CUT_S: Final = 2.5  # time after a received emergency stop at which this is known
 UNREAD_S: Final = 2.0  # drones land when their process has not read the state for longer
 ON_GROUND_S: Final = 3.0  # low for this long, motors not running: on the ground
 LANDED_ALONE_S: Final = 20.0  # silent for this long: landed by itself
 LOW: Final = 30  # [cm] the reported height is rounded and drifts
-TOO_HIGH_M: Final = 1.0  # [m] above the end of its climb, by its own height: its positions are those of something else
+TOO_HIGH_M: Final = 1.0  # [m] excess over the end of its climb: its positions are those of something else
 UNORDERED: Final = 3  # seconds on the motors' clock of a high drone that rests: it flies without an order
 REFUSED: Final = "no take-off: "
 REFUSALS: Final = 3  # answers in a row that refuse the sticks: the note says so
@@ -79,10 +79,10 @@ class TelloPilot:
         self._state: Mapping[str, Any] = {}
         self._zero_yaw: int | None = None
         self._height, self._motors = 0, -1
-        self._running = self.aloft = -math.inf  # when the motors' clock last moved, when it was last not low
+        self._running = self.aloft = -math.inf  # last motion of the motors' clock, last time that it was not low
         self._began_at = self._sent_at = self._cut_at = self._up_at = self._ordered_up_at = -math.inf
         self._rested = 0  # seconds on the motors' clock since the drone rests
-        self._refusals, self._refused_at, self._refusal = 0, -math.inf, ""  # of the sticks: number, last time, answer
+        self._refusals, self._refused_at, self._refusal = 0, -math.inf, ""  # refusals: number, last time, answer
         self._send_error = ""
 
     @property
@@ -191,7 +191,7 @@ class TelloPilot:
             if self._on_ground(now):  # the answer was lost
                 self._rest(self.trouble)
             elif now - self._sent_at >= LAND_RETRY_S:
-                if self._sent_at == -math.inf:  # after a failed step
+                if self._sent_at == -math.inf:  # a step has failed
                     self._rest_sticks()
                 self._send_and_await("land", now)
         else:

@@ -39,7 +39,7 @@ from agents.vectors import UNKNOWN, Setpoint, Vector
 from bridges.turtlebot3.odometry import SILENCE_S
 from bridges.turtlebot3.robot import REPEAT_S, TurtleBotConnection
 
-OPEN_S: Final = 4.5  # from the first attempt to reach the router to odometry of every robot
+OPEN_S: Final = 4.5  # time from the first attempt to reach the router to odometry of every robot
 DIAGNOSIS_S: Final = 0.3  # how long a failing `open` looks for other robots, to name them in the error
 POLL_S: Final = 0.01
 STANDSTILL_S: Final = 3.0  # how long `close` waits for the robots to stand

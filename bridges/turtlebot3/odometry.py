@@ -14,13 +14,13 @@ from agents.protocols import ros2
 from agents.protocols.ros2 import Message
 from agents.vectors import wrap
 
-SILENCE_S: Final = 0.5  # with older odometry the robot is out of reach and gets zeros
+SILENCE_S: Final = 0.5  # age of odometry from which the robot is out of reach and gets zeros
 STANDING: Final = (0.015, 0.06)  # [m/s, rad/s] slower robots stand
 FASTEST: Final = 0.5  # [m/s] odometry that jumps faster was restarted
-RESETS: Final = (3, 5.0)  # as many within as many seconds are no restarts: two robots send odometry, or it is broken
+RESETS: Final = (3, 5.0)  # number within seconds that are no restarts: two robots send odometry, or it is broken
 DRIFT: Final = 1e-3  # [s/s] largest difference between the robot's clock, which may be slewed, and ours
 ORIGIN: Final = 0.01  # [m] odometry closer to zero is at its origin
-SETTLING_S: Final = 0.12  # after the first message of a node, to the second of which it adds the yaw of its IMU
+SETTLING_S: Final = 0.12  # time after the first message of a node, to the second of which it adds the yaw of its IMU
 
 Planar = tuple[float, float, float]  # x, y [m], yaw [rad]
 
@@ -52,16 +52,16 @@ class Odometry:
 
     def __init__(self, start: Planar, *, boot: bool) -> None:
         """Of a robot at `start`; `boot`: it stood there when it was switched on, not when it is first received."""
-        self.pose: Planar = (nan, nan, nan)  # in the arena; NaN before the first odometry
+        self.pose: Planar = (nan, nan, nan)  # pose in the arena; NaN before the first odometry
         self.speed = (0.0, 0.0)  # v [m/s] and ω [rad/s]
         self.received = -inf  # time of the last odometry
-        self.age = 0.0  # of the last odometry when it arrived, by its stamp [s]
+        self.age = 0.0  # age of the last odometry when it arrived, by its stamp [s]
         self.restarted = False
         self._start, self._stamps = start, StampAge()
-        self._raw_pose: Planar = (nan, nan, nan)  # in odometry's own frame,
-        self._stamp = inf  # and when, on the clock of the robot [s]
+        self._raw_pose: Planar = (nan, nan, nan)  # pose in odometry's own frame
+        self._stamp = inf  # time of that pose, on the clock of the robot [s]
         self._frame: Planar | None = start if boot else None  # origin of odometry in the arena,
-        self._settled_at = -inf  # which is not certain until then [s]
+        self._settled_at = -inf  # time from which the yaw is certain [s]
         self._resets: deque[float] = deque(maxlen=RESETS[0])  # times of the last
 
     def update(self, message: Message, now: float) -> bool:

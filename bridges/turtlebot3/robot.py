@@ -63,7 +63,7 @@ class RepeatedVelocity:
             if self.velocity != velocity:
                 self._zeros = 0
         elif self.velocity == REST:
-            self._still_since = now  # from here on the robot should move
+            self._still_since = now  # the robot should move from here on
         self.velocity = velocity
 
     def due(self, now: float, odometry: Odometry) -> Velocity | None:
@@ -108,10 +108,10 @@ class TurtleBotConnection:
         x, y, _ = request.start[row]
         self.odometry = Odometry((x, y, request.yaw[row]), boot=chosen.origin == "boot")
         self.commanded = RepeatedVelocity((kind.speed, kind.turn_rate))
-        self.volts = nan  # of the battery [V]
+        self.volts = nan  # voltage of the battery [V]
         self.battery = nan  # charge, 0 to 1
         self.scan: RangeScan | None = None  # the newest
-        self.joined = False  # to its topics
+        self.joined = False  # True once its topics are joined
         self.time = -inf  # time of measurement of the pose, on the clock of `Body.read` [s]
         self._clock = request.clock
         self._scan_age = StampAge()

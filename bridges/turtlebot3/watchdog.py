@@ -16,10 +16,10 @@ import sys
 import time
 from typing import Any
 
-CHECK_S = 0.02  # between two looks at the clock
-ZERO_S = 0.05  # between two zeros
+CHECK_S = 0.02  # pause between two looks at the clock
+ZERO_S = 0.05  # pause between two zeros
 ZEROS_S = 1.0  # time for which zeros are repeated: one may be lost
-GRAPH_S = 1.0  # between two looks for the type that the robot takes
+GRAPH_S = 1.0  # pause between two looks for the type that the robot takes
 TYPES = {"twist": "geometry_msgs/msg/Twist", "stamped": "geometry_msgs/msg/TwistStamped"}
 
 

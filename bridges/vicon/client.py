@@ -22,11 +22,11 @@ CHUNK: Final = 1 << 18  # [bytes] read at once: about ten frames of twenty bodie
 class Frame:
     """One frame of motion capture."""
 
-    number: int  # of the server
+    number: int  # number of the server
     latency_s: float  # age when sent
     poses: dict[str, Segment | None]  # root segment of each subject; None while occluded
     z_up: bool
-    period_s: float = 0.0  # from one frame to the next; 0: the server has not said it
+    period_s: float = 0.0  # time from one frame to the next; 0: the server has not said it
 
 
 class Decoder:

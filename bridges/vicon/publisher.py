@@ -30,7 +30,7 @@ from bridges.vicon.client import Frame, Reader
 
 FIRST_S: Final = 5.0  # deadline of the first answer of the server
 ATTEMPT_S: Final = 2.0  # deadline of each attempt to connect
-PAUSE_S: Final = 0.5  # between attempts
+PAUSE_S: Final = 0.5  # pause between attempts
 SILENCE_S: Final = 2.0  # time without a frame before the next connection
 LOST_S: Final = 0.5  # time of an occlusion before it is reported; robots tolerate half a second as well
 REPEATED_S: Final = 0.3  # time of a pose that is the same to the last bit after which it counts as not measured
@@ -84,7 +84,7 @@ class PoseFilter:
         self._last = [External() for _ in self._subjects]
         self._seen_at = [-math.inf] * count  # time of each robot's last pose [s]
         self._pose: list[Segment | None] = [None] * count  # last pose of each robot,
-        self._new_at = [-math.inf] * count  # since when it is the same [s]
+        self._new_at = [-math.inf] * count  # time since which it is the same [s]
         self._reported: list[str | None] = [None] * count
         self._not_z_up = False
         self._invalid = 0

@@ -20,13 +20,13 @@ from experiments.file.problems import refusal
 from twins.arrays import Array, norm
 
 LAWS: Final = ("distance", "displacement")
-HOVER: Final = 0.8  # [m] of flying robots in a plane
-ROOM: Final = 0.5  # [m] around the formation, on all sides and above
+HOVER: Final = 0.8  # [m] height of flying robots in a plane
+ROOM: Final = 0.5  # [m] room around the formation, on all sides and above
 TAKEN: Final = 0.9  # share of the stiffest error that one decision takes: the loop settles without ringing
 POWER: Final = 200  # rounds of the power method: λ to a few percent
 HIGHEST: Final = 3.0  # gain of the reference experiment
 FREE: Final = 0.3  # share of the spacing that starts may be scattered by, on each axis
-PASSING: Final = 0.1  # [m] between robots on their way
+PASSING: Final = 0.1  # [m] distance of robots on their way
 MAX_ROBOTS: Final = 5000  # robots: five times as many as anything here was tried with
 TELEMETRY: Final = 5000.0  # samples in a second, of all robots: 1,000 at 50 Hz are 10 MB, which fill a disk
 WOBBLE: Final = "# hover_jitter = { sigma = 0.01, correlation_s = 0.5 }   # m, s: real drones wobble"
@@ -36,10 +36,10 @@ WOBBLE: Final = "# hover_jitter = { sigma = 0.01, correlation_s = 0.5 }   # m, s
 class LayoutOptions:
     """Options of a generated experiment."""
 
-    kind: str = "crazyflie"  # of all robots
-    spacing: float = 0.6  # between neighbours [m]
-    scatter: float | None = None  # of the starts [m]; None for as much as keeps neighbours apart
-    seed: int = 1  # of the file
+    kind: str = "crazyflie"  # kind of all robots
+    spacing: float = 0.6  # distance of neighbours [m]
+    scatter: float | None = None  # deviation of the starts [m]; None for as much as keeps neighbours apart
+    seed: int = 1  # seed of the file
     duration_s: float = 60.0  # [s]
     law: str = "distance"  # distance, or displacement, which finds the shape from any starts
 
@@ -86,7 +86,7 @@ def experiment_file(made: Layout, wanted: LayoutOptions) -> str:
     distance = norm(first - second)
     needed = 2.0 * kind.radius + PASSING
     least = distance.min()
-    if not least >= needed:  # nor if it is no number
+    if not least >= needed:  # refused as well if it is no number
         raise LayoutError(f"robots of kind {kind.name} need a spacing of {needed:.2f} m or more, not {least:.2f} m")
     scatter = round(FREE * wanted.spacing, 3) if wanted.scatter is None else wanted.scatter
     digits = max(2, len(str(len(made))))

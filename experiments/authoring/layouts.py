@@ -13,7 +13,7 @@ from twins.arrays import Array, Index, norm
 GOLDEN: Final = math.pi * (3.0 - math.sqrt(5.0))  # [rad] no two multiples of it fall close together
 RIM: Final = math.cos(math.radians(75.0))  # a hemisphere ends here: below, robots would stand above one another
 SLIVER: Final = math.cos(math.radians(120.0))  # a triangle of the rim that is blunter only bridges a bay of it
-LOWEST: Final = 0.4  # [m] of a robot of a hemisphere, clear of the ground effect
+LOWEST: Final = 0.4  # [m] lowest robot of a hemisphere, clear of the ground effect
 
 
 class LayoutError(ValueError):
@@ -24,7 +24,7 @@ class LayoutError(ValueError):
 class Layout:
     """Shape and links of a formation."""
 
-    title: str  # for people
+    title: str  # name for people
     position: Array  # (N, 3) [m], centred on the origin; z is the height that a flying robot holds, 0 where any will do
     pairs: Index  # (M, 2) rows that receive from each other, smaller row first
 

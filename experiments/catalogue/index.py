@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Final
 
 FOLDER: Final = Path(__file__).parent
-SCHEMA: Final = "zenpark.schema.json"  # in the first line of each entry; `./zenpark new` writes it beside the copy
+SCHEMA: Final = "zenpark.schema.json"  # schema named by the first line of each entry; `./zenpark new` writes it
 _ARENA: Final = ".arena.toml"  # how the names of arena files end here, which are no experiments
 
 

@@ -37,10 +37,10 @@ from experiments.file.problems import Path
 from experiments.metrics.signals import WINDOW_S, after_last, moving_mean
 from twins.arrays import Array, Index, Mask, norm
 
-MOST_ROBOTS: Final = 500  # of which it is asked what can be lost: the time grows with their third power
+MOST_ROBOTS: Final = 500  # most robots that are asked what can be lost: the time grows with their third power
 MOST_BENT: Final = 100  # likewise, robots of which it is asked how far noise bends them
 NOISE: Final = 1e-3  # [m] errors of positions that real robots have, where the file gives none
-FITTING: Final = 1e-4  # [m] between a target and that of the best shape
+FITTING: Final = 1e-4  # [m] difference of a target and that of the best shape
 FAR_OFF: Final = 0.01  # [m] a shape that misses a distance by more is another shape
 GUESSES: Final = 400  # random places of robots from which a shape is sought: each costs time with their number
 
@@ -210,7 +210,7 @@ class Analysis:
         experiment, silent, end = self.plan.experiment, self.without_neighbours, self.prediction.position[-1].copy()
         rows, links, moves = len(end), wanted.take(there), self.placed
         aloft = np.column_stack([self.start[:, :2], self.height])
-        landed = moves & (end[:, 2] < aloft[:, 2] / 2)  # before the end: on the floor it has no place in the shape
+        landed = moves & (end[:, 2] < aloft[:, 2] / 2)  # robots on the floor have no place in the shape
         end[landed, 2] = aloft[landed, 2]
         rng = np.random.default_rng(experiment.seed)
 

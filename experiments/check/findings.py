@@ -15,7 +15,7 @@ Severity = Literal["error", "warning", "remark", "note"]
 SHOWN_FINDINGS: Final = 5  # findings of one sort; the others are counted
 NOT_RANDOM: Final = "not-random"  # code of the warning that no seed changes anything
 DEVICE: Final = "device"  # code of what bodies say of the devices of their robots
-FORGIVEN: Final = 1e-6  # of rounding
+FORGIVEN: Final = 1e-6  # allowance for rounding
 DELAYED: Final = 1.2  # times the acquisition without noise, from which on the one with noise is given as well
 MARK: Final[dict[Severity, str]] = {"error": "✗", "warning": "!", "remark": "·", "note": "✓"}
 
@@ -51,10 +51,10 @@ class CheckNumbers(msgspec.Struct, frozen=True, kw_only=True):
     obstacles: dict[str, str]  # what each is, by name
     links: int  # directed ones
     edges: int  # pairs that are linked, directions ignored
-    parts: int  # of the network
+    parts: int  # components of the network
     leaders: tuple[str, ...]  # names
-    algebraic_connectivity: float  # of the network without directions
-    rank: int | None  # of the rigidity matrix when heights are held, `rank_needed` for a rigid formation
+    algebraic_connectivity: float  # second eigenvalue of the network without directions
+    rank: int | None  # rank of the rigidity matrix when heights are held, `rank_needed` for a rigid formation
     rank_needed: int | None  # see `rank`
     rank_space: int | None  # the same in full space
     rank_space_needed: int | None  # see `rank_space`
@@ -68,16 +68,16 @@ class CheckNumbers(msgspec.Struct, frozen=True, kw_only=True):
     loop_gain: float | None  # h·μ·λ_max; the loop is unstable from 2
     slowest_mode_s: float | None  # time constant of the slowest mode that moves
     free_modes: int  # modes that are slower than the run: nothing brings them back in time
-    speed_needed: float | None  # of the fastest plan [m/s]
-    speed_available: float | None  # of the slowest follower [m/s]
-    acquired_s: float | None  # when the formation keeps within the tolerance, before any plan begins
+    speed_needed: float | None  # speed of the fastest plan [m/s]
+    speed_available: float | None  # speed of the slowest follower [m/s]
+    acquired_s: float | None  # time from which the formation keeps within the tolerance, before any plan begins
     acquired_noisy_s: float | None  # the same, with the noise of the file's seed; None without such a flight as well
     end_error_mm: float | None  # worst link at the end
-    end: dict[str, tuple[float, float, float]]  # where each robot is expected to end [m]
+    end: dict[str, tuple[float, float, float]]  # expected place of each robot at the end [m]
     end_inside: bool  # whether all of them are inside the arena then
     messages_hz: float  # poses that all robots send in a second, estimated
     pose_bytes: int  # payload of one pose, its numbers at their longest
-    words_bytes: int  # of these what the law says
+    words_bytes: int  # share of these bytes that the law says
     pose_kbit_s: float  # payload of one robot at the largest rate of its trigger [kbit/s]
     predicted_s: float  # share of the run that was predicted
 

@@ -140,7 +140,7 @@ class PairApproach(NamedTuple):
     first: int
     second: int
     touch: float  # sum of their radii [m]
-    distance: float  # in the plane [m]
+    distance: float  # distance in the plane [m]
     gap: float  # free height between them then, negative where none is above the other [m]
     time: float  # [s]
 

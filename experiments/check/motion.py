@@ -26,8 +26,8 @@ from experiments.file.problems import Path
 from experiments.metrics.signals import WINDOW_S
 from twins.arrays import Array, Index, Mask, norm
 
-CLEARANCE: Final = 0.1  # [m] between one robot's top and another's bottom
-NEARLY: Final = 0.9  # of its speed: the rest is needed to catch up
+CLEARANCE: Final = 0.1  # [m] distance of one robot's top and another's bottom
+NEARLY: Final = 0.9  # share of its speed: the rest is needed to catch up
 LATE: Final = 0.25  # share of a run, at its end, in which a formation must be at rest
 SWINGS: Final = 6.0  # ways of an error there, as multiples of its range, that make it an oscillation
 WIDE: Final = 0.01  # [m] smaller swings of a law that has no tolerance are its trigger's

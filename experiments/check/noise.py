@@ -16,7 +16,7 @@ from experiments.metrics.signals import WINDOW_S
 
 SOFT: Final = 3.0  # time constants of a mode that must fit into the run: 5 % of its error are left then
 LATER: Final = 2.0  # multiple of the time without noise above which a formation is acquired late
-NARROW: Final = 0.6  # of the tolerance: noise may move a link that is farther off out of it
+NARROW: Final = 0.6  # share of the tolerance: noise may move a link that is farther off out of it
 WITHOUT: Final = {  # findings that noise may refute: what robots do without it
     "acquired-late": "are late",
     "wheels-stop": "on wheels stop short of their goals",
@@ -31,7 +31,7 @@ class Flights:
     """Flights with noise, of several seeds."""
 
     flown: list[Analysis]  # the case with these motions
-    seeds: str  # of all, in words
+    seeds: str  # all seeds, in words
     count: int
 
     @classmethod

@@ -191,7 +191,7 @@ def find_shapes(
     found, free = list[Shape](), _free(moves, climbs)
     for guess in guesses:
         shape = fitted_shape(links, anchors, guess, free)
-        if solids is not None and shape.worst <= OFF:  # for other shapes it does not matter
+        if solids is not None and shape.worst <= OFF:  # does not matter for other shapes
             shape = replace(shape, overlaps=solids.overlaps(shape.position))
         found.append(shape)
         if shape.good:
@@ -378,7 +378,7 @@ def contradictions(links: Links) -> list[Contradiction]:
         neighbours.setdefault(j, []).append((i, offset))
         neighbours.setdefault(i, []).append((j, -offset))
     place: dict[int, Array] = {}
-    way: dict[int, list[int]] = {}  # from the root of a tree through the network to each row
+    way: dict[int, list[int]] = {}  # path from the root of a tree through the network to each row
     for root in neighbours:
         if root in place:
             continue

@@ -17,7 +17,7 @@ from experiments.check.findings import DEVICE, FORGIVEN, Finding, join_names
 from experiments.definition import bodies
 from twins.arrays import norm
 
-BEFORE_START_S: Final = 5.0  # of the battery are spent before the common start
+BEFORE_START_S: Final = 5.0  # time of the battery that is spent before the common start
 LISTED: Final = 12  # names
 LOOSE: Final = 10.0  # multiple of the default from which a limit has no effect: its unit was mistaken, say
 

@@ -18,10 +18,10 @@ from experiments.definition.formation import Anchored, anchor_offsets, law_offse
 from experiments.definition.graph import Links
 from twins.arrays import Array, Index, norm
 
-STEP: Final = 1e-4  # [m] of the differences that stand for the law's derivative
+STEP: Final = 1e-4  # [m] size of the differences that stand for the law's derivative
 STANDING: Final = 1e-6  # modes slower than the fastest by this factor do not move at all
-UNMOVED: Final = 1e-6  # of the fastest: the law ignores a motion of the whole with a smaller answer
-EVEN: Final = 1e-9  # of the fastest: a loop that is symmetric up to this has real modes, which are quicker to find
+UNMOVED: Final = 1e-6  # share of the fastest: the law ignores a motion of the whole with a smaller answer
+EVEN: Final = 1e-9  # share of the fastest: a loop that is symmetric up to this has real modes
 
 
 @dataclass(frozen=True)

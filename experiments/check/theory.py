@@ -30,14 +30,14 @@ from twins.arrays import Index, Mask, norm
 
 BENT: Final = 8.0  # times the noise: formations that no straight line or circle weakens move by 1 to 5 times
 FEW: Final = 6  # names that are listed
-GAIN: Final = {"gain": "the gain", "stiffness": "the stiffness", "by link": "the gain or the stiffness"}  # of the file
+GAIN: Final = {"gain": "the gain", "stiffness": "the stiffness", "by link": "the gain or the stiffness"}  # names
 UNSTABLE_GAIN: Final = 2.0  # share of an error that one decision corrects
 # of a pose: running number, stamp [s], position [m] and velocity [m/s]
 LONG_POSE: Final = (1_000_000, 1.7e9 + 0.123456, (-1.234567,) * 3, (-0.123456,) * 3)
 LONG_YAW: Final = -1.234567  # [rad]
-LONG_NUMBER: Final = -1.234567e-05  # of what is said
+LONG_NUMBER: Final = -1.234567e-05  # longest number that is said
 MILLIMETRES: Final = 50.0  # [m] a longer link is probably written in millimetres
-OSCILLATING_GAIN: Final = 1.2  # beyond 1 an error changes its sign; the rest to 2 is for lag that no model has
+OSCILLATING_GAIN: Final = 1.2  # limit of the gain: an error changes its sign beyond 1; no model has the lag up to 2
 
 
 def network(analysis: Analysis) -> Iterator[Finding]:

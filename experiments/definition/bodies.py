@@ -23,7 +23,7 @@ from twins.scene import Scene
 
 BODIES: Final = ("twin", "world", "protocol")  # what `--bodies` takes
 TRIES: Final = 200  # places that are drawn for a robot before it stays where the file puts it
-CLEAR: Final = 0.02  # [m] between robots that are scattered
+CLEAR: Final = 0.02  # [m] distance of robots that are scattered
 
 
 def missing_library(body: str) -> str:

@@ -18,10 +18,10 @@ from agents.vectors import NotNegative, Positive, Share
 from twins.scene import Obstacle, Planar
 
 WORLD: Final = "world"  # the body of a robot that lives in the twin service
-VICON: Final = "vicon://"  # before the host of a Vicon, in `positioning`
+VICON: Final = "vicon://"  # prefix of the host of a Vicon, in `positioning`
 VICON_TWIN: Final = "vicon-twin"  # motion capture that is simulated as well
 TARGETS: Final = ("distance", "offset", "bearing")  # fields of the target of a link, of which it has one
-NO_TARGET: Final = "nothing"  # in place of a field: a link alone
+NO_TARGET: Final = "nothing"  # stands in place of a field: a link alone
 
 
 def doc(description: str, **limits: Any) -> Meta:  # noqa: ANN401 - as Meta takes them
@@ -340,10 +340,10 @@ class Hybrid(FileTable, frozen=True):
 JUDGED: Final = (
     *("f_hz", "messages", "bytes", "iae", "itae", "rmse", "acquired_s", "updates", "lost", "dropped"),
     *("missed_deadlines", "residual", "settle_s", "collisions", "receivers"),
-    *("j2", "belief_rms", "belief_max", "closest"),  # of the case
+    *("j2", "belief_rms", "belief_max", "closest"),  # fields of the case
 )
-MEAN: Final = "mean"  # over robots
-WORST: Final = "worst"  # of them
+MEAN: Final = "mean"  # mean over robots
+WORST: Final = "worst"  # worst robot
 
 
 class Criterion(FileTable, frozen=True):

@@ -24,7 +24,7 @@ from twins.arrays import Array, Mask, norm
 Anchored = Sequence[tuple[int, anchors.Anchor]]  # anchors, each with the row of its robot
 
 STEPS_HZ: Final = 100.0  # steps of a drone's model between two decisions
-ROUNDED: Final = 1e-9  # of eigenvalues
+ROUNDED: Final = 1e-9  # rounding of eigenvalues
 CALM: Final = 1.15  # gain of the sampled loop, which rings from 1.2 on and is unstable from 2
 BRACED: Final = 1.4  # bound by lengths of links of a braced formation, as a multiple of the gain that directions leave
 TO_ORIGIN: Final = 2.0  # gain of an anchor, of that of a link: as the authors' controllers pull to the origin
@@ -39,7 +39,7 @@ class Pattern:
 
     links: Links  # (E), sorted by receiver, then sender
     one_way: tuple[OneWay, ...]  # (E)
-    changes: tuple[Change, ...]  # of the targets, in order of time
+    changes: tuple[Change, ...]  # changes of the targets, in order of time
     targets: tuple[tuple[Target, ...], ...]  # (E) after each change
 
     @classmethod

@@ -15,15 +15,15 @@ from experiments.definition.experiment import NO_TARGET, TARGETS, Experiment, Ta
 _LINK: Final = re.compile(r"\s*(\w+)\s*([>-])\s*(\w+)\s*", re.ASCII)
 _ALMOST: Final = re.compile(r"\s*(\w+)\s*([^\w\s]+)\s*(\w+)\s*", re.ASCII)
 FORM: Final = 'a link reads "A > B" (B receives from A) or "A - B" (both receive)'
-RELEASE: Final = 1.1  # of the range: what separates coming from going, so that a link does not flicker
+RELEASE: Final = 1.1  # multiple of the range: what separates coming from going, so that a link does not flicker
 
 
 class TargetKind(NamedTuple):
     """Kind of target that a law takes of a link."""
 
-    fields: tuple[str, ...]  # of `TargetTable` that give it; the first is the one that a drawn shape gives
+    fields: tuple[str, ...]  # fields of `TargetTable` that give it; the first is the one that a drawn shape gives
     words: str
-    example: str  # as the file writes it
+    example: str  # text that a file could have
     wants: int | None  # how the law takes every link, see `agents.formation.link`; None: by its own target
 
 
@@ -43,12 +43,12 @@ class OneWay:
 
     receiver: str  # name
     sender: str  # name
-    target: Link  # at the beginning; a change makes copies
-    since: float = 0.0  # from when on [s]
-    until: float = math.inf  # until when [s], infinity to the end
+    target: Link  # target at the beginning; a change makes copies
+    since: float = 0.0  # begin [s]
+    until: float = math.inf  # end [s], infinity for the end of the run
     reach: float = math.inf  # nearer than this it is there [m], infinity always
     release: float = math.inf  # farther than this it is there no more [m]
-    text: str = ""  # as the file writes it; empty for links by proximity only
+    text: str = ""  # text of the file; empty for links by proximity only
 
 
 def link_pairs(text: str) -> tuple[tuple[str, str], ...]:

@@ -13,7 +13,7 @@ from experiments.definition import access_rights
 from experiments.definition.experiment import VICON_TWIN
 from experiments.definition.plan import Plan
 
-ENDPOINTS: Final = "network.txt"  # for --connect @FOLDER/network.txt, which looks at a run
+ENDPOINTS: Final = "network.txt"  # file for --connect @FOLDER/network.txt, which looks at a run
 
 
 def member_endpoints(cases: Iterable[Plan], *, secure: bool) -> list[str]:

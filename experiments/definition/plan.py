@@ -353,7 +353,7 @@ class Plan:
         """Limits of a robot."""
         (x, y, z), safety = self.experiment.arena.size, self.experiment.safety
         hold_s = safety.land_without_position_s
-        if self.experiment.robots[name].body == WORLD:  # without its world it cannot move, and may wait
+        if self.experiment.robots[name].body == WORLD:  # cannot move without its world, and may wait
             hold_s = self.experiment.world.patience_s
         low, high = (-x / 2, -y / 2, 0.0), (x / 2, y / 2, z)
         late_s = latest_s(self.experiment.robots[name])
@@ -367,7 +367,7 @@ class Plan:
                 guides, and there are none for one that decides for itself.
         """
         experiment, guided = self.experiment, name in self.guided
-        decides = guided == centrally  # for this robot, at this place
+        decides = guided == centrally  # decides for this robot, at this place
         rates, within = experiment.rates, experiment.safety.start_within
         row = self._row[name]
         patient = experiment.start.missing != "go-on"

@@ -13,7 +13,7 @@ from twins.arrays import Array, Index, Mask, norm
 # of the largest singular value: smaller ones are zero. A shape that bends to first order is solved to the root of the
 # solver's accuracy only, some 1e-6 m, and the singular value that is zero at the exact shape is as large as that
 SINGULAR: Final = 1e-5
-STIFF: Final = 0.05  # of the largest singular value: motions with larger ones are not soft
+STIFF: Final = 0.05  # share of the largest singular value: motions with larger ones are not soft
 CERTAIN: Final = SINGULAR**2  # a link bears all of its own load alone if it bears all but this: shares are squares
 
 
@@ -84,7 +84,7 @@ def bend(position: Array, pairs: Index, sigma: float, moves: Mask | None = None)
     slope[: len(singular)] = singular[:needed]
     stiff = min(int((slope > STIFF * singular[0]).sum()), needed - 1)
     length, found = norm(position[pairs[:, 0]] - position[pairs[:, 1]]), Bend(0, 0.0)
-    error = sigma * math.sqrt(2.0 * float((length**2).mean()))  # of half the square of a length, noise at both ends
+    error = sigma * math.sqrt(2.0 * float((length**2).mean()))  # error of half the square, noise at both ends
     count = np.bincount(pairs.ravel(), minlength=len(position))[:, None]
     for k in range(stiff, needed):
         velocity = np.zeros(position.shape)

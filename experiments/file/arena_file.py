@@ -23,7 +23,7 @@ from experiments.file.problems import Fault, Text, refusal
 
 LOOKED_AT: Final = 100  # files beside an experiment, for the one that was meant
 KEPT: Final = "experiment.toml"  # name of the experiment in the folder of a run, in which its arena files lie as well
-SUFFIX: Final = ".toml"  # of no other file there
+SUFFIX: Final = ".toml"  # unused by any other file there
 _HERE: Final = ("arena", "file")
 _BELONGS: Final = "belongs in the experiment file: an arena file holds nothing but [arena]"
 
@@ -38,7 +38,7 @@ class _Whole(FileTable, frozen=True):
 class ArenaFile(Text):
     """Arena file without errors."""
 
-    name: str  # as the experiment names it
+    name: str  # name in the experiment
     table: dict[str, Any]  # its [arena]
 
 

@@ -46,7 +46,7 @@ def _pattern(path: Path) -> tuple[str | int | type, ...]:
 class Adopted:
     """Copies of the Python files that a document names, see `agents.plugins.files`."""
 
-    folder: pathlib.Path  # of the experiment file
+    folder: pathlib.Path  # folder of the experiment file
     plugins: dict[str, pathlib.Path] = field(default_factory=dict)  # copies, by choice
 
     def adopt(self, value: Any, path: Path = ()) -> tuple[Any, list[Fault]]:  # noqa: ANN401 - a document

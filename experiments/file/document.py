@@ -46,7 +46,7 @@ class Document:
     source: Source  # its text, with the places of its keys
     # what it says, before any case changes it; `--set` is in it. Its arena is complete, whatever file it begins with.
     plan: Plan
-    resolved: Mapping[str, Plan]  # by case
+    resolved: Mapping[str, Plan]  # plans by case
     plugins: Mapping[str, Path]  # files of plug-ins, by their names in the experiment
 
     @property
@@ -142,7 +142,7 @@ def _document(file: Path, label: str, text: str, flags: Sequence[str], *, receiv
         whole = tables or not is_json  # a case that was written as JSON names cases that are not in it
         criteria = list(criteria_faults(plans[None].experiment, tables or [UNNAMED])) if whole else []
         found = {name: list(consistency_faults(plan)) for name, plan in plans.items()}
-        if not received:  # where it was read its devices were looked at; a robot needs none of the others' bodies
+        if not received:  # its devices were looked at already; a robot needs none of the others' bodies
             for name, plan in plans.items():
                 found[name] += device_faults(plan.experiment)
         source.refuse([*criteria, *each_once(found, tables)])

@@ -31,7 +31,7 @@ _OWNERS: Final[dict[str, Path]] = {  # structs with a choice of a plug-in, and w
     "WorldTable": ("world",),
 }
 CASE: Final = "InCase"
-SHAPES: Final = ("box", "radius", "wall")  # of an obstacle, likewise
+SHAPES: Final = ("box", "radius", "wall")  # shapes of an obstacle, likewise
 WORD: Final = 2**63  # integers lie below it, and not below its negative
 
 
@@ -56,7 +56,7 @@ def described() -> dict[str, Any]:
             if (group := group_of((*path, name))) is not None:
                 kept = {key: field[key] for key in ("description", "default") if key in field}
                 fields[name] = {**kept, **_choice(group, definitions)}
-    for name, field in definitions["LinkChannelTable"]["properties"].items():  # as at the channel
+    for name, field in definitions["LinkChannelTable"]["properties"].items():  # same as at the channel
         field["description"] = definitions["ChannelTable"]["properties"][name]["description"]
     definitions["Formation"]["properties"]["links"]["additionalProperties"]["anyOf"].append({"enum": [SHAPE, ALONE]})
     definitions["RobotTable"]["properties"]["kind"]["enum"] = [kind.name for kind in KINDS.usable()]
@@ -67,7 +67,7 @@ def described() -> dict[str, Any]:
         del partial["Experiment" + CASE]["properties"][key]
     case = {"$ref": f"#/definitions/Experiment{CASE}"}
     definitions["Experiment"]["properties"]["cases"]["additionalProperties"] = case
-    top = definitions.pop("Experiment")  # in full: a reference would hide its neighbours from draft-7 readers
+    top = definitions.pop("Experiment")  # written in full: a reference would hide its neighbours from draft-7 readers
     whole = {"$schema": "http://json-schema.org/draft-07/schema#", **top, "definitions": definitions | partial}
     return dict(msgspec.to_builtins(whole))
 
@@ -142,7 +142,7 @@ def _parameters(group: str, name: str) -> tuple[dict[str, Any], dict[str, Any]]:
     try:
         (reference,), parts = msgspec.json.schema_components([chosen], ref_template="#/definitions/{name}")
     except (TypeError, NameError) as error:
-        why = str(error).splitlines()[-1]  # before it are remedies for programs
+        why = str(error).splitlines()[-1]  # remedies for programs stand before it
         raise registry.PluginError(f"plug-in {name!r} ({chosen.__module__}:{chosen.__name__}): {why}") from error
     return reference, parts
 

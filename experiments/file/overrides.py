@@ -30,7 +30,7 @@ class Override:
 
     flag: str
     path: Path
-    value: Any  # of the type that TOML gives it
+    value: Any  # value of the type that TOML gives it
     case: str | None
 
     @property
@@ -108,7 +108,7 @@ def assign(document: dict[str, Any], override: Override, *, part: bool = False) 
         step, below = _known(at, name, path, override, part=part), override.path[len(path)]
         group = group_of(path)
         inside = at[step] if isinstance(at, list) else at.get(step)
-        if inside is None and group and not part and len(path) <= 2:  # where the file makes no choice; no plan has one
+        if inside is None and group and not part and len(path) <= 2:  # the file makes no choice there; no plan has one
             inside = attrgetter(".".join(map(str, path)))(_DEFAULTS)
         inside = {} if inside is None else _as_table(inside, path)
         if not isinstance(inside, dict | list):

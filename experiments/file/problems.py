@@ -109,7 +109,7 @@ class _Scan:
         while dot:
             match = _match(_KEY_PART, self.text, at)
             name, dot, at = match[1], match[2], match.end()
-            if name[:1] in ('"', "'"):  # without its quotes and escapes
+            if name[:1] in ('"', "'"):  # text inside its quotes and escapes
                 name = str(msgspec.json.decode(name) if self.json else tomllib.loads(f"key = {name}")["key"])
             parts.append((name, match.start(1)))
         return parts, at
@@ -179,9 +179,9 @@ def after_the_end(path: Path, what: str, from_s: float, duration_s: float) -> It
 class Problem:
     """Error at a place. Line and column are 1-based, 0 without a text to point into."""
 
-    file: str  # as the user named it; or the command-line flag that is at fault
+    file: str  # name that the user gave; or the command-line flag that is at fault
     line: int  # line number
-    column: int  # in characters
+    column: int  # number of characters
     message: str  # what is wrong
     hint: str = ""  # what to do
     source: str = ""  # the line of text
@@ -224,7 +224,7 @@ class Text:
     """Text of a file: where each fault has its place."""
 
     label: str  # the file, as the user named it
-    text: str  # as it stands there
+    text: str  # text that stands there
     is_json: bool
 
     @cached_property
@@ -252,7 +252,7 @@ def key_name(path: Path) -> str:
 
 def shown(value: object) -> str:
     """A value of the document, short enough for one line."""
-    if isinstance(value, date | time):  # of TOML
+    if isinstance(value, date | time):  # types of TOML
         return value.isoformat()
     words = {True: "true", False: "false", None: "null"}
     text = words[value] if value is None or isinstance(value, bool) else repr(value)

@@ -39,11 +39,11 @@ _TYPES: Final = {
 class Entry(msgspec.Struct, frozen=True):
     """Key of the experiment file, with all that a reader needs."""
 
-    key: str  # with the names in capitals: robots.ROBOT.start; plug-ins: trigger(send-on-delta).threshold
+    key: str  # path with the names in capitals: robots.ROBOT.start; plug-ins: trigger(send-on-delta).threshold
     text: str
-    type: str  # in words
-    limits: str  # in words; empty without any
-    default: str  # as it would be written; empty if there is none
+    type: str  # type, said in words
+    limits: str  # limits, said in words; empty without any
+    default: str  # default as it would be written; empty if there is none
     required: bool
     example: str  # lines of a file
 
@@ -141,7 +141,7 @@ def _has_end(entry: Entry, sought: str) -> bool:
 def _walk(node: Mapping[str, Any], path: str, needed: Mapping[str, object] = NONE) -> Iterator[Entry]:
     """Entries below a path; in a plug-in with the parameters that it cannot do without."""
     for name, field in node.get("properties", {}).items():
-        if name == "kind" and {"const", "pattern"} & field.keys():  # of a plug-in
+        if name == "kind" and {"const", "pattern"} & field.keys():  # kind of a plug-in
             continue
         key = f"{path}.{name}" if path else name
         yield _entry(key, field, name in node.get("required", []), needed)
@@ -253,7 +253,7 @@ def _occurrences(value: object, parts: Sequence[str], path: tuple[Step, ...]) ->
     elif not isinstance(value, dict):
         return
     elif first.startswith("("):
-        if value.get("kind") == first.strip("()") and (not later or later[0] in value):  # in full: others may be needed
+        if value.get("kind") == first.strip("()") and (not later or later[0] in value):  # complete: others may count
             yield from _occurrences(value, (), (*path, (first, None)))
     elif first.isupper():
         for name, each in value.items():

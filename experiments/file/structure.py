@@ -20,7 +20,7 @@ from experiments.definition.experiment import LONGEST_NAME, Experiment
 from experiments.file.choices import fields_of, group_of, parameters, struct_of
 from experiments.file.problems import DocumentError, Fault, Path, Problem, key_name, refusal, shown
 
-_REMEDY: Final = {  # of a missing key
+_REMEDY: Final = {  # remedy for a missing key
     "title": 'add title = "what this experiment shows"',
     "duration_s": "add duration_s = 30.0",
     "robots": 'add at least one: [robots.KH01] with kind = "khepera4" and start = [0.0, 0.0]',
@@ -37,7 +37,7 @@ _QUANTITY: Final = re.compile(r"\s*([-+]?\d+(?:[.,]\d*)?)\s*([a-zA-Z°/]*)\s*") 
 _UNITS: Final = {
     **dict.fromkeys(("", "s", "m", "hz", "rad", "m/s"), 1.0),
     **{"ms": 1e-3, "mm": 1e-3, "cm": 1e-2, "min": 60.0, "deg": radians(1.0), "°": radians(1.0)},
-}  # as SI
+}  # same unit as SI
 _UNIONS: Final = (Union, types.UnionType)
 LINK: Final = 'write "{name}" = 0.5, in metres; or "{name}" = {{ offset = [0.5, 0.0] }}, or "{name}" = "shape"'
 _FIELDS: Final = frozenset(Experiment.__struct_fields__)

@@ -14,7 +14,7 @@ import msgspec
 from experiments.file.problems import DocumentError, Fault, Problem, at_offset, key_name, refusal
 from experiments.file.problems import Path as Keys
 
-MAX_NUMBER: Final = 1e12  # in any unit; squares and products of larger numbers are not finite for long
+MAX_NUMBER: Final = 1e12  # largest number in any unit; squares and products of larger numbers are not finite for long
 MAX_TEXT_BYTES: Final = 4_000_000  # bytes; a hundred robots take ten thousand
 BEGIN: Final = "./zenpark new copies an experiment to begin with"
 # key of many parts, for 20,000 of which `tomllib` takes seconds and gigabytes; numbers in lists are none

@@ -17,7 +17,7 @@ LOST: Final = 0.01  # share of lost poses from which on a run is spoiled
 SLOW: Final = 0.9  # real-time factor of a world below which a run is spoiled
 SPOILING: Final = ("began", "could not read", BY_OPERATOR)  # what troubles that spoil a run say
 SAME_LENGTH: Final = 0.005  # share of the longest by which lengths of runs may differ
-SAME_COVERAGE: Final = 0.01  # by which known shares of errors may differ where integrals are compared
+SAME_COVERAGE: Final = 0.01  # largest difference of known shares of errors where integrals are compared
 
 
 def reasons(case: CaseMetrics) -> tuple[str, ...]:

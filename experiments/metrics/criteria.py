@@ -18,8 +18,8 @@ class Judgement(msgspec.Struct, frozen=True):
     """A criterion against the runs of one case."""
 
     criterion: Criterion
-    case: str  # that is judged; empty if none of the runs is of the case
-    values: dict[int, float | None]  # by seed, over the reference where limits are relative; None: unknown
+    case: str  # case that is judged; empty if none of the runs is of the case
+    values: dict[int, float | None]  # value by seed, over the reference where limits are relative; None: unknown
     measures: tuple[str, ...] = ()  # numbers that the law of the case measures
 
     @property

@@ -124,7 +124,7 @@ def _robots(
     settled = [duration if when is None else when for when in shared.settled] if shared.has_errors else nothing
     fields = RobotMetrics.__struct_fields__
     extra = {name: column for name, column in found.items() if name not in fields}
-    columns: dict[str, Sequence[Any]] = {  # of N values each
+    columns: dict[str, Sequence[Any]] = {  # N values each
         **{name: column for name, column in found.items() if name in fields},
         "robot": trace.robots,
         "kind": [experiment.robots[name].kind for name in trace.robots],

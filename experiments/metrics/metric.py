@@ -32,8 +32,8 @@ Per = Literal["robot", "case"]
 Better = Literal["less", "more", ""]
 Mean = Literal["known", "all", "sum", "worst"]
 Number = float | None
-PLAIN: Final = str.maketrans({"²": "^2", "³": "^3", "·": " "})  # for MATLAB, which reads ASCII
-FORMULA: Final = str.maketrans({"²": "$^2$", "³": "$^3$", "·": " "})  # for figures
+PLAIN: Final = str.maketrans({"²": "^2", "³": "^3", "·": " "})  # signs for MATLAB, which reads ASCII
+FORMULA: Final = str.maketrans({"²": "$^2$", "³": "$^3$", "·": " "})  # signs for figures
 
 
 class Metric(msgspec.Struct, frozen=True):
@@ -89,7 +89,7 @@ def _ours(of: Callable[[Measurement], Array | Index | float], label: str, meanin
 
 UNSEEN: Final = {"mean": "sum", "swept": False, "shown": False}  # they do not occur in virtual time
 OF_CASE: Final = {"per": "case", "swept": False, "shown": False}
-OURS: Final[Mapping[str, Metric]] = {  # by the names of the fields of `RobotMetrics`, and then those of the case
+OURS: Final[Mapping[str, Metric]] = {  # names of the fields of `RobotMetrics`, and then those of the case
     "f_hz": _ours(
         attrgetter("rate"), "f",
         "Transmissions over duration. Counted by running numbers, so that what a recorder lost counts too.",
@@ -153,7 +153,7 @@ OURS: Final[Mapping[str, Metric]] = {  # by the names of the fields of `RobotMet
         unit="m", better="more", **OF_CASE,
     ),
 }  # fmt: skip
-CONSOLE: Final = ("f_hz", "iae", "rmse", "acquired_s")  # of ours, in a line of the terminal
+CONSOLE: Final = ("f_hz", "iae", "rmse", "acquired_s")  # those of ours in a line of the terminal
 ERRORS: Final = tuple(name for name, metric in OURS.items() if metric.figure and metric.relative)
 TAKEN: Final = {  # columns of tables
     *RobotMetrics.__struct_fields__, *CaseMetrics.__struct_fields__,
@@ -274,7 +274,7 @@ class _LeanTrace(Trace):
     """Trace of a sweep; a field that no metric needs is not kept, and reading it raises PluginError."""
 
     def __getattribute__(self, name: str) -> Any:  # noqa: ANN401 - as the fields are
-        if name in _COLUMNS - LEAN - {"sent"}:  # of `sent` numbers and times are kept
+        if name in _COLUMNS - LEAN - {"sent"}:  # numbers and times of `sent` are kept
             raise registry.PluginError(f"it reads {name!r}, which its `needs` does not name: a sweep keeps no more")
         return super().__getattribute__(name)
 

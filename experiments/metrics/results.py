@@ -10,8 +10,8 @@ from experiments.definition.experiment import Criterion
 class PhaseMetrics(msgspec.Struct, frozen=True):
     """Robot in a later phase: from a leg of the timeline to the next, or to the end."""
 
-    start_s: float  # [s] since the common start
-    acquired_s: float | None  # [s] since the start of the phase
+    start_s: float  # [s] time since the common start
+    acquired_s: float | None  # [s] time since the start of the phase
     residual: float | None  # [m] worst link, |error| averaged over the last second
     worst: str  # robot at the other end of that link
 
@@ -22,7 +22,7 @@ class Collision(msgspec.Struct, frozen=True):
     time_s: float  # [s] beginning, since the common start
     first: str  # robot, or the first name that the world reported
     second: str  # robot, obstacle, or `wall`
-    impulse: float | None  # [N s] of the world's engine; None where worked out from positions
+    impulse: float | None  # [N s] impulse in the world's engine; None where worked out from positions
     overlap: float  # [m] depth
 
 
@@ -30,8 +30,8 @@ class Approach(msgspec.Struct, frozen=True):
     """Closest approach of a robot to another one, or to an obstacle or wall."""
 
     between: tuple[str, str]
-    gap: float  # [m] between the surfaces, negative where they overlapped
-    at_s: float  # [s] since the common start
+    gap: float  # [m] distance of the surfaces, negative where they overlapped
+    at_s: float  # [s] time since the common start
 
 
 class ShadowMetrics(msgspec.Struct, frozen=True):
@@ -47,7 +47,7 @@ class ShadowMetrics(msgspec.Struct, frozen=True):
     largest: float  # [m] largest distance
     # Pearson's correlation of positions along x, y and z; None where one of the two hardly moved
     correlation: tuple[float | None, float | None, float | None]
-    correlation_speed: float | None  # of the speeds, each over `experiments.metrics.shadow.SPEED_S`
+    correlation_speed: float | None  # correlation of the speeds, each over `experiments.metrics.shadow.SPEED_S`
     known: float  # share of the run in which both are known
 
 
@@ -66,15 +66,15 @@ class CentralisedMetrics(msgspec.Struct, frozen=True):
     delay_p95_s: float | None  # [s] 95 % of these delays are shorter
     delay_max_s: float | None  # [s]
     load: float | None  # share of a core; None in virtual time
-    load_max: float | None  # in the busiest second
+    load_max: float | None  # load of the busiest second
     missed: int  # decisions skipped, because they were too late
 
 
 class LawMeasure(msgspec.Struct, frozen=True):
     """A measure of a law that remembers, in the unit of the law."""
 
-    mean: float | None  # over the run
-    end: float | None  # over the last second
+    mean: float | None  # mean over the run
+    end: float | None  # mean over the last second
 
 
 class RobotMetrics(msgspec.Struct, frozen=True):
@@ -93,7 +93,7 @@ class RobotMetrics(msgspec.Struct, frozen=True):
     # phase; None if never
     acquired_s: float | None
     lost: int  # poses that by their numbers were sent and never reached a receiver
-    dropped: int  # by the modelled network, over all receivers
+    dropped: int  # number dropped by the modelled network, over all receivers
     missed_deadlines: int  # ticks that were skipped: their time had passed
     residual: float | None  # [m] worst link, |error| averaged over the last second of the first phase
     worst: str  # robot at the other end of that link
@@ -111,15 +111,15 @@ class RobotMetrics(msgspec.Struct, frozen=True):
     coverage: float | None  # known share of its link errors; None for laws without errors
     known: float  # share of the run in which its own position is known
     collisions: int  # contacts with robots, obstacles and walls
-    impulse: float | None  # [N s] of the hardest contact; None if unknown
-    overlap: float | None  # [m] of the deepest contact; None without a contact
+    impulse: float | None  # [N s] impulse of the hardest contact; None if unknown
+    overlap: float | None  # [m] overlap of the deepest contact; None without a contact
     short: float | None  # [m] distance from the end of its plan; None without a plan
     near: Approach | None  # closest approach to another robot
     near_arena: Approach | None  # closest approach to an obstacle or a wall
     interventions: int  # ticks on which safety changed the decision
-    intervened_share: float | None  # over ticks
+    intervened_share: float | None  # share of the ticks
     avoided: int  # ticks on which avoidance changed the decision
-    avoided_share: float | None  # over ticks
+    avoided_share: float | None  # share of the ticks
     shadow: ShadowMetrics | None  # None without a shadow twin
     goals: int = 0  # sent to it by the central controller
     goal_bytes: int = 0  # payload of these goals
@@ -128,7 +128,7 @@ class RobotMetrics(msgspec.Struct, frozen=True):
     delay_max_s: float | None = None  # [s]
     foreign: int = 0  # poses in its name that did not come from its process, and were refused
     extra: dict[str, float | None] = {}  # metrics of other distributions, by name
-    measures: dict[str, LawMeasure] = {}  # of its law, by name
+    measures: dict[str, LawMeasure] = {}  # measures of its law, by name
 
     def value(self, name: str) -> float | None:
         """The value of a metric; None if it is unknown, or was not measured."""
@@ -156,8 +156,8 @@ class LinkDelivery(msgspec.Struct, frozen=True):
     receiver: str
     sender: str
     received: int  # poses received
-    dropped: int  # by the modelled network
-    delay_mean: float | None  # [s] from the stamp of a pose to its arrival, whatever caused it
+    dropped: int  # number dropped by the modelled network
+    delay_mean: float | None  # [s] time from the stamp of a pose to its arrival, whatever caused it
     delay_max: float | None  # [s]
 
 
@@ -166,7 +166,7 @@ class Judged(msgspec.Struct, frozen=True):
 
     what: str
     limit: str
-    value: float | None  # over the reference where the limit is; None: unknown
+    value: float | None  # value over the reference where the limit is; None: unknown
     passed: bool | None  # None: not judged, since the reference was not run
 
 
@@ -176,10 +176,10 @@ class CaseMetrics(msgspec.Struct, frozen=True):
     case: str
     seed: int
     clock: str  # "real" or "virtual"
-    duration_s: float  # [s] of the trace
-    planned_s: float  # [s] of the experiment
+    duration_s: float  # [s] length of the trace
+    planned_s: float  # [s] length of the experiment
     interrupted: bool  # the run ended before `planned_s`
-    tolerance: float  # [m] of the acquisition
+    tolerance: float  # [m] tolerance of the acquisition
     starts_s: tuple[float, ...]  # [s] start of each phase
     robots: tuple[RobotMetrics, ...]
     leaders: tuple[str, ...]  # robots that the means leave out because they lead
@@ -190,16 +190,16 @@ class CaseMetrics(msgspec.Struct, frozen=True):
     acquired_s: tuple[float | None, ...]
     # [rad/s] net rotation rate of the formation per phase, from acquisition on
     rotation_rad_s: tuple[float | None, ...]
-    belief: tuple[Belief, ...]  # per link
+    belief: tuple[Belief, ...]  # one of each link
     excursion: float  # [m] farthest outside the arena
     excursion_robot: str  # empty if none was outside
     lost: int  # sum over the robots
-    dropped: int  # by the modelled network, sum over the robots
-    link_deliveries: tuple[LinkDelivery, ...]  # per link
+    dropped: int  # number dropped by the modelled network, sum over the robots
+    link_deliveries: tuple[LinkDelivery, ...]  # one of each link
     modelled: bool  # the file asks for network effects
     missed_deadlines: int  # sum over the robots
     missed_share: float | None  # missed deadlines over the ticks that were due, of all robots
-    collisions: tuple[Collision, ...]  # in order of time
+    collisions: tuple[Collision, ...]  # collisions, ordered by time
     watched: bool  # a world reported contacts; else collisions come from recorded positions
     near: Approach | None  # closest approach of two robots, surface to surface
     near_arena: Approach | None  # closest approach of a robot to an obstacle or a wall
@@ -220,13 +220,13 @@ class CaseMetrics(msgspec.Struct, frozen=True):
     failures: tuple[str, ...] = ()
     network_messages: int = 0  # poses of all robots, leaders too, and goals of the central controller
     network_bytes: int = 0  # payload of these messages
-    deliveries: int = 0  # of the same messages those that arrived, counted once for each receiver
+    deliveries: int = 0  # arrivals of the same messages, counted once for each receiver
     guidance: CentralisedMetrics | None = None  # None if each robot decides for itself
     # why the figures are compared with none of another case, one clause each, see `metrics.comparable`
     spoiled: tuple[str, ...] = ()
-    measures: dict[str, LawMeasure] = {}  # of the law by name, means over the robots in the means
+    measures: dict[str, LawMeasure] = {}  # measures of the law by name, means over the robots in the means
     metric_faults: tuple[str, ...] = ()  # metrics of other distributions that failed or cannot be used, a sentence each
-    criteria: tuple[Criterion, ...] = ()  # of the experiment
+    criteria: tuple[Criterion, ...] = ()  # criteria of the experiment
     judged: tuple[Judged, ...] = ()  # those that are for this case, as written with all cases of the run
 
     @property

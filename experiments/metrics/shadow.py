@@ -11,11 +11,11 @@ from experiments.metrics.results import ShadowMetrics
 from experiments.recording.trace import Trace
 from twins.arrays import Array, Mask, norm
 
-SPEED_S: Final = 0.2  # [s] over which a speed is taken: shorter, and it would be the noise's
+SPEED_S: Final = 0.2  # [s] time over which a speed is taken: shorter, and it would be the noise's
 STILL_M: Final = 1e-3  # [m] standard deviation of what hardly moved: it has no correlation
 STILL_M_S: Final = 5e-3  # [m/s] likewise
 JUMP: Final = 6.0  # times the usual change from sample to sample: there the twin was put onto the robot
-JUMP_M: Final = 1e-3  # [m] and more than this
+JUMP_M: Final = 1e-3  # [m] least length of a jump
 
 
 def differences(trace: Trace) -> Array:

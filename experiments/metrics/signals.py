@@ -28,8 +28,8 @@ from experiments.recording.losses import count_unrecorded
 from experiments.recording.trace import ROUNDING_S, Trace
 from twins.arrays import Array, Index, Mask, norm
 
-WINDOW_S: Final = 1.0  # [s] of the moving mean that decides on acquisition, and of the residual
-BAND: Final = 0.02  # of the largest error: the 2 % band of the settling time
+WINDOW_S: Final = 1.0  # [s] window of the moving mean that decides on acquisition, and of the residual
+BAND: Final = 0.02  # share of the largest error: the 2 % band of the settling time
 KNOWN: Final = 0.95  # least share of known positions of a robot: below it the robot counts as died
 RETURN_S: Final = 3.0  # robots come back one after the other when the network does
 
@@ -66,7 +66,7 @@ class LinkErrors:
     # when an unknown position tells nothing of it
     there: Mask
     gone: Mask  # (T, N) from then on neither a robot's position nor an error of its links is known any more
-    away_s: float  # [s] without any known position in the whole trace, see `network_away`
+    away_s: float  # [s] time without any known position in the whole trace, see `network_away`
 
     @classmethod
     def of_trace(cls, trace: Trace) -> LinkErrors:

@@ -23,12 +23,12 @@ from experiments.recording.run_folder import METRICS, ORIGIN, SOURCE, RunOrigin,
 from experiments.recording.version import PACKAGES, ROOT
 
 SUFFIX: Final = ".zip"
-LEFT_OUT: Final = ("logs", f"{ORIGIN}.new")  # of the run's folder
-DATE: Final = (2000, 1, 1, 0, 0, 0)  # of every member: the same run makes the same archive
+LEFT_OUT: Final = ("logs", f"{ORIGIN}.new")  # parts of the run's folder
+DATE: Final = (2000, 1, 1, 0, 0, 0)  # date of every member: the same run makes the same archive
 SUMS: Final = "SHA256SUMS"
 TABLE: Final = "metrics.csv"
-PIECE: Final = 1 << 20  # [bytes] in memory at once
-MAX_BUNDLE_BYTES: Final = 1 << 34  # [bytes] of all members together
+PIECE: Final = 1 << 20  # [bytes] part in memory at once
+MAX_BUNDLE_BYTES: Final = 1 << 34  # [bytes] limit of all members together
 # what the library raises of archives that are damaged, ciphered or of another method
 DAMAGED: Final = (
     OSError, zipfile.BadZipFile, zlib.error, struct.error, EOFError, ValueError, LookupError, RuntimeError

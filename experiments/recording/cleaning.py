@@ -12,7 +12,7 @@ from typing import Final
 
 from experiments.recording.run_folder import ORIGIN, SOURCE, read_origin
 
-LAST: Final = (ORIGIN, SOURCE)  # by which a folder is known as that of a run
+LAST: Final = (ORIGIN, SOURCE)  # files that show a folder to be that of a run
 
 
 class InUse(OSError):
@@ -38,7 +38,7 @@ def locked(folder: Path, how: int) -> Iterator[bool]:
             fcntl.flock(descriptor, how)
         except BlockingIOError:
             raise InUse(f"{folder} is in use") from None
-        except OSError:  # on some network file systems
+        except OSError:  # raised by some network file systems
             yield False
         else:
             yield True

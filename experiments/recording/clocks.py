@@ -38,11 +38,11 @@ class ClockOffset:
     """Offset of one host's clock from ours over a run."""
 
     host: str
-    robots: tuple[str, ...]  # that ran there
-    first: float  # [s] at the beginning; subtracted from every stamp where it was made
-    last: float  # [s] at the end
+    robots: tuple[str, ...]  # robots that ran there
+    first: float  # [s] offset at the beginning; subtracted from every stamp where it was made
+    last: float  # [s] offset at the end
     uncertainty: float  # [s] the larger of both measurements
-    over: float  # [s] between both measurements
+    over: float  # [s] time between both measurements
     # [s] largest measured error left in stamps; `last` less `first` if they were not corrected during the run
     worst: float = 0.0
 
@@ -70,7 +70,7 @@ class Correction:
 
     def __init__(self, measured: Iterable[HostClock]) -> None:
         """`measured` are all offsets of a run, in order of time for each host."""
-        self._series: dict[str, tuple[Array, Array, Array, Array]] = {}  # by host
+        self._series: dict[str, tuple[Array, Array, Array, Array]] = {}  # series by host
         self._measured: dict[str, list[HostClock]] = {}
         for each in measured:
             self._measured.setdefault(each.host, []).append(each)

@@ -133,10 +133,10 @@ class AboutRun:
 class Playback:
     """A recording as a trace."""
 
-    trace: Trace  # until the end of the run
+    trace: Trace  # trace up to the end of the run
     started: float  # [s] UTC of the common start; of a virtual run `trace.EPOCH`
     complete: bool  # the recorder finished the file and nothing in it is damaged
-    messages: int  # in the file, those of other programs included
+    messages: int  # number in the file, those of other programs included
     damaged: int  # what could not be read of the file [bytes]
 
 

@@ -39,7 +39,7 @@ HEAD: Final = np.dtype([("", "u1"), ("length", "<u8"), ("channel", "<u2"), ("", 
 FOOTER_BYTES: Final = _RECORD.size + _FOOTER.size
 PRIVATE: Final = 0x80  # first operation code that MCAP leaves to programs
 CHECKED: Final = (Opcode.CHUNK, Opcode.ATTACHMENT)  # records with a checksum
-START: Final = re.compile(rb"[\x06\x09\x0c](?=.{4}\x00{4})", re.DOTALL)  # of these or of metadata, below 4 GB
+START: Final = re.compile(rb"[\x06\x09\x0c](?=.{4}\x00{4})", re.DOTALL)  # begin of these or of metadata, below 4 GB
 BLOCK_BYTES: Final = 1 << 20
 _DAMAGE: Final = (McapError, struct.error, zstandard.ZstdError, ValueError, RuntimeError, OverflowError, MemoryError)
 
@@ -64,10 +64,10 @@ class Records:
 
     path: Path
     header: Header | None = None  # profile and library
-    schemas: dict[int, Schema] = field(default_factory=dict)  # by their id in the file
-    channels: dict[int, Channel] = field(default_factory=dict)  # by their id in the file
-    attachments: list[Attachment] = field(default_factory=list)  # in the order of the file
-    metadata: list[Metadata] = field(default_factory=list)  # in the order of the file
+    schemas: dict[int, Schema] = field(default_factory=dict)  # schemas by their id in the file
+    channels: dict[int, Channel] = field(default_factory=dict)  # channels by their id in the file
+    attachments: list[Attachment] = field(default_factory=list)  # attachments, ordered as in the file
+    metadata: list[Metadata] = field(default_factory=list)  # metadata, ordered as in the file
     complete: bool = False  # the file was finished by its recorder and nothing in it is damaged; known at the end
     damaged: int = 0  # what cannot be read [bytes], without a last record that was being written; known at the end
 
@@ -227,7 +227,7 @@ class Recovered:
     """Result of `recover`."""
 
     messages: int
-    robots: tuple[str, ...]  # in the order in which they appear
+    robots: tuple[str, ...]  # robots, ordered by their first appearance
     complete: bool  # the source was whole already, and no target was written
     damaged: int = 0  # what could not be read of the sources [bytes]
 

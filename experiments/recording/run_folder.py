@@ -22,7 +22,7 @@ RUNS: Final = Path("runs")
 SOURCE: Final = KEPT
 ORIGIN: Final = "run.json"
 METRICS: Final = "metrics.json"
-SWEEP: Final = "sweep.json"  # in the folder of a sweep instead
+SWEEP: Final = "sweep.json"  # name in the folder of a sweep instead
 LATEST: Final = 1e11  # [s] UTC that a date can be made of
 
 
@@ -30,22 +30,22 @@ class RunOrigin(msgspec.Struct, frozen=True, omit_defaults=True):
     """Origin of a run, in `run.json` of its folder: enough to do it again."""
 
     command: str = ""  # how to do the run again, for people
-    date: str = ""  # when it was, for people
-    title: str = ""  # of the experiment
+    date: str = ""  # date for people
+    title: str = ""  # title of the experiment
     file: str = ""  # experiment file, or name in the catalogue, as it was given
-    virtual: bool = False  # in virtual time
-    cases: list[str] = []  # that were chosen; empty: all
-    changes: list[str] = []  # behind `--set` and `--seed`
+    virtual: bool = False  # True in virtual time
+    cases: list[str] = []  # cases that were chosen; empty: all
+    changes: list[str] = []  # values of `--set` and `--seed`
     seeds: Annotated[int, msgspec.Meta(ge=1, le=100_000)] = 1  # number of seeds, from that of the file on
-    bodies: str | None = None  # behind `--bodies`
+    bodies: str | None = None  # value of `--bodies`
     here: bool = False  # all robots on this machine
-    anyway: bool = False  # although the check found errors
-    tags: list[str] = []  # by which people find it again
+    anyway: bool = False  # True although the check found errors
+    tags: list[str] = []  # words by which people find it again
     begun: float = 0.0  # [s] UTC
     ended: float | None = None  # [s] UTC; None while it goes on, or if it was killed
     load_after: float | None = None  # see `Provenance.load`
     made_by: Provenance | None = None  # code, versions and machine
-    failures: list[str] = []  # that its recordings do not tell, each with its case in front
+    failures: list[str] = []  # failures that its recordings do not tell, each with its case in front
 
 
 def read_origin(folder: Path) -> RunOrigin | None:
@@ -135,13 +135,13 @@ class PastRun(msgspec.Struct, frozen=True):
     folder: str
     origin: RunOrigin
     made: float  # [s] UTC
-    megabytes: float  # of all files
+    megabytes: float  # size of all files
     recorded: bool  # whether it has a recording
     seeds: list[int]
     cases: dict[str, dict[str, dict[int, float | None]]]  # metrics of each case, by seed; None: not known
     # of each case and seed notes for a reader of its figures: share of its time, disturbances
     remarks: dict[str, dict[int, str]] = {}
-    lengths: dict[str, dict[int, float]] = {}  # of each case by seed [s]; those of another version are not known
+    lengths: dict[str, dict[int, float]] = {}  # lengths of each case by seed [s]; unknown of another version
     lost: int = 0  # poses that were sent and never received, of all cases
     fault: str = ""  # why figures are missing, and the remedy
 

@@ -41,7 +41,7 @@ KINDS_JSON: Final = "kinds.json"
 METADATA: Final = "zenpark"
 CHUNK_BYTES: Final = 32 * 1024  # lost at most by a kill: a third of a second of seven robots
 DEPTH: Final = 20_000  # samples that may wait while the disk does
-RARE: Final = 1_000  # of those at 1 Hz or rarer: a ring takes its memory as it first goes round
+RARE: Final = 1_000  # depth of those at 1 Hz or rarer: a ring takes its memory as it first goes round
 
 Message = Pose | LawMemory | State | Status | Event | Contact | WorldState | Goal | CentreState | HostClock
 
@@ -50,7 +50,7 @@ class SentPose(BarePose, frozen=True, kw_only=True):
     """A pose as it was sent to the neighbours, by a robot with a law without variables to transmit."""
 
     received: float  # [s] UTC, by the recorder
-    size: int  # [bytes] of the payload on the network
+    size: int  # [bytes] length of the payload on the network
 
 
 class SpokenPose(SentPose, frozen=True, kw_only=True):
@@ -63,26 +63,26 @@ class SentGoal(BareGoal, frozen=True, kw_only=True):
     """A goal as the central controller sent it, without its velocity."""
 
     received: float  # [s] UTC, by the recorder
-    size: int  # [bytes] of the payload on the network
+    size: int  # [bytes] length of the payload on the network
 
 
 @dataclass(frozen=True)
 class Topic:
     """Topic of a kind of message."""
 
-    message: type[Message]  # on the network
-    recorded: type[msgspec.Struct]  # in the file, as `zenpark_msgs/<its name>`
-    name: str  # in the file, with `{robot}` for the robot's name
+    message: type[Message]  # type on the network
+    recorded: type[msgspec.Struct]  # type in the file, `zenpark_msgs/<its name>`
+    name: str  # name in the file, with `{robot}` for the robot's name
     key: Callable[[Keys], str]
     depth: int = RARE  # samples that may wait for the recorder
-    repeated: bool = False  # by the publisher's cache for late subscribers
+    repeated: bool = False  # True if the publisher's cache repeats it for late subscribers
     finite: bool = False  # messages with numbers that are not finite are malformed
 
 
 # of poses with what a law says; they come with the others, and older recordings have none
 SPOKEN: Final = Topic(Pose, SpokenPose, "/{robot}/spoken_pose", lambda keys: keys.pose("*"), DEPTH, repeated=True)
 TOPICS: Final = (
-    Topic(State, State, "/{robot}/state", lambda keys: keys.state("*"), DEPTH),  # with the poses received since
+    Topic(State, State, "/{robot}/state", lambda keys: keys.state("*"), DEPTH),  # carries the poses received since
     Topic(Pose, SentPose, "/{robot}/pose", lambda keys: keys.pose("*"), DEPTH, repeated=True),
     SPOKEN,
     Topic(LawMemory, LawMemory, "/{robot}/memory", lambda keys: keys.memory("*"), DEPTH),

@@ -19,7 +19,7 @@ from twins.arrays import Array, Index, Mask
 
 EPOCH: Final = 1_700_000_000.0  # UTC [s] of the common start in virtual time: any, but the same in every run
 ROUNDING_S: Final = 1e-6  # UTC seconds in a float are exact to a quarter of a microsecond
-WALL: Final = "wall"  # of the arena, in contacts
+WALL: Final = "wall"  # name of the arena's wall in contacts
 
 M = TypeVar("M", Contact, WorldState)
 
@@ -127,7 +127,7 @@ class Trace:
     """Trace of a case. Arrays over samples (T) and robots (N); times since the common start [s]."""
 
     case: str
-    plan: Plan  # of this case, overrides applied
+    plan: Plan  # plan of this case, overrides applied
     seed: int
     robots: tuple[str, ...]  # names, in the order of the rows
     clock: str  # "real" or "virtual"
@@ -137,8 +137,8 @@ class Trace:
     true_position: Array  # (T, N, 3) [m] of twins, else as measured
     goal: Array  # (T, N, 3) [m]
     setpoint: Array  # (T, N, 4) as sent to the body, see `agents.network.messages.State`
-    sent: PoseTable  # by the robots, in order of time; `link` is the row of the sender
-    received: PoseTable  # in order of arrival; `link` is one of `plan.pose_links`
+    sent: PoseTable  # poses sent by the robots, ordered by time; `link` is the row of the sender
+    received: PoseTable  # poses ordered by arrival; `link` is one of `plan.pose_links`
     lost: Index  # (N,) poses of each robot that by their numbers were sent but not received, or not recorded
     missed_deadlines: Index  # (N,) ticks that began more than one period late
     ticks: Index  # (N,)
@@ -153,8 +153,8 @@ class Trace:
     shadow_yaw: Array | None = None  # (T, N) [rad] of those twins
     dropped: Index | None = None  # (E,) by the modelled network on each of `plan.pose_links`; None if unknown
     foreign: Index | None = None  # (N,) poses in the name of each robot, refused: not from its process; None if unknown
-    goals: Goals | None = None  # of the central controller; None if each robot decides for itself
-    clocks: tuple[ClockOffset, ...] = ()  # of the other machines; stamps made there are corrected
+    goals: Goals | None = None  # goals of the central controller; None if each robot decides for itself
+    clocks: tuple[ClockOffset, ...] = ()  # offsets of the other machines; stamps made there are corrected
     # of laws that remember, by name: variables (T, N, k), and measures (T, N), NaN where unknown
     memory: Mapping[str, Array] = field(default_factory=dict)
     measures: Mapping[str, Array] = field(default_factory=dict)

@@ -41,7 +41,7 @@ class Provenance(msgspec.Struct, frozen=True, omit_defaults=True):
     code: str  # digest of all modules, see `digest`
     python: str
     packages: dict[str, str]  # versions of `LIBRARIES` and of those of kinds
-    commit: str = ""  # of a checkout; "+changes" behind it if files differ from it
+    commit: str = ""  # commit of a checkout; "+changes" behind it if files differ from it
     plugins: dict[str, str] = {}  # distributions with plug-ins, except our own, and their versions
     host: str = ""
     system: str = ""

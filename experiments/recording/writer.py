@@ -161,7 +161,7 @@ class McapFile:
 
     def close(self) -> None:
         """Close the file of the indices, which is then deleted, and the file itself."""
-        with suppress(OSError):  # on a full disk; it is not read any more
+        with suppress(OSError):  # raised by a full disk; it is not read any more
             self._indices.close()
         self._file.close()
 
@@ -175,8 +175,8 @@ class McapFile:
 DRAWN: Final = "/{robot}/true_pose"
 FRAMES: Final = "/tf"
 SCENE: Final = "/scene"
-FRAMES_S: Final = 0.04  # between two transforms of a robot [s]
-SCENE_S: Final = 0.2  # between two drawings of the scene [s]
+FRAMES_S: Final = 0.04  # pause of two transforms of a robot [s]
+SCENE_S: Final = 0.2  # pause of two drawings of the scene [s]
 LATE_S: Final = 2.0  # age of a message on arrival above which its clock is wrong [s]
 ROUNDING_S: Final = 1e-6
 LATEST_S: Final = 2.0**32  # a stamp beyond (the year 2106) is a broken clock; nanoseconds of it may not fit the file
@@ -217,12 +217,12 @@ class Recording:
         """
         self.path = path
         self.refused = 0  # messages left out, because they hold what their type excludes
-        self._channels: dict[tuple[str, str], int] = {}  # by topic and robot, if the topic is of one
+        self._channels: dict[tuple[str, str], int] = {}  # channels by topic and robot, if the topic is of one
         self._schemas: dict[str, int] = {}
         self._stamp = -inf  # [s, UTC] the last good one
         self._latest = 0  # [ns] the same
         self._utc, self._draw = utc, draw
-        self._places: dict[str, Vector] = {}  # [m] of each robot, the last known
+        self._places: dict[str, Vector] = {}  # [m] place of each robot, the last known
         self._framed: dict[str, float] = {}  # [s, UTC] stamp of its last transform, by robot
         self._scene_at = -inf  # [s, UTC]
         self._topics = {
@@ -401,7 +401,7 @@ class Recording:
 class _Written:
     """A topic as the file has it."""
 
-    name: str  # with `{robot}` for the robot's name
+    name: str  # name with `{robot}` for the robot's name
     kind: str  # the ROS 2 type
     schema: str
     encode: Callable[[Any], bytes]

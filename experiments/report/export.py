@@ -118,7 +118,7 @@ def _of_law(trace: Trace) -> dict[str, Array]:
     return found | {f"measure_{name}": values for name, values in trace.measures.items()}
 
 
-FRAMES_HZ: Final = 15.0  # of a film
+FRAMES_HZ: Final = 15.0  # frames of a film
 
 
 def write_video(traces: Mapping[str, Trace], file: Path, speed: float = 4.0) -> None:
@@ -191,7 +191,7 @@ def structure(trace: Trace, metrics: CaseMetrics) -> dict[str, Any]:
         },
         "units": UNITS | {"metrics": measured | UNITS["metrics"]},
     }
-    if trace.memory or trace.measures:  # of a law that remembers
+    if trace.memory or trace.measures:  # columns of a law that remembers
         case |= {what: dict(getattr(trace, what)) for what in ("memory", "measures")}
     return {name: converted(value) for name, value in case.items()}
 

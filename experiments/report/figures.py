@@ -33,15 +33,15 @@ from experiments.report.trajectories import LOW, formation, has_positions, plan_
 from twins.arrays import Array
 
 BAND: Final = "#009E73"  # the tolerance
-LEAST_ERROR: Final = 1e-5  # [m] below this an error axis does not go
+LEAST_ERROR: Final = 1e-5  # [m] least end of an error axis
 WIDE: Final = 8.0  # rates farther apart are drawn on a logarithmic axis
 SHORT: Final = 10  # letters of a name that stands behind other words on an axis
 LONGEST: Final = 20  # letters of a name on an axis
 LONGEST_TITLE: Final = 50  # letters of a name above a panel
 MOST_VALUES: Final = 12  # cases that have their values above their bars
 MOST_PANELS: Final = 16  # cases of a page, each with a panel
-MOST_SEEDS: Final = 50  # of a case, for the range of its errors
-MOST_MEASURES: Final = 6  # of a law, each with a panel
+MOST_SEEDS: Final = 50  # seeds of a case, for the range of its errors
+MOST_MEASURES: Final = 6  # measures of a law, each with a panel
 SOLID: Final = 0.95  # share of the time that marks cover where there is nothing to see between them
 
 __all__ = ["formation", "plan_view"]  # besides those of this module

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 NONE: Final = "–"
-MOST_DECIMALS: Final = 6  # of an interval; smaller ones have an exponent
+MOST_DECIMALS: Final = 6  # decimals of an interval; smaller ones have an exponent
 
 
 Cell = str | tuple[str, str]  # a text, or a text and a smaller one behind it

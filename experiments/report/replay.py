@@ -19,9 +19,9 @@ from experiments.scene.stage import FAIR_M, GOOD_M, SceneModel, link_levels
 from twins.arrays import Array
 
 CASES: Final = 2  # side by side
-STILL: Final = 0.6  # of the run: when the picture was taken that stands where no script runs, and in print
-STEP_S: Final = 0.1  # between two samples
-NUMBERS: Final = 300_000  # at most, of all samples: 2 MB
+STILL: Final = 0.6  # share of the run: time of the picture where no script runs, and in print
+STEP_S: Final = 0.1  # pause of two samples
+NUMBERS: Final = 300_000  # limit for all samples: 2 MB
 QUIET: Final = ("robot", "output", "clock", "router")  # kinds of events that are not on the slider
 SCRIPT: Final = Path(__file__).with_name("replay.js")
 

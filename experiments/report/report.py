@@ -139,7 +139,7 @@ def write(
         command=made.command,
         verdict=verdict,
         sections=sections,
-        foot=() if made.made_by is None else made.made_by.words,  # of an old run it is not known
+        foot=() if made.made_by is None else made.made_by.words,  # unknown of an old run
         replay=replay.embedded(traces),
     )
 

@@ -28,7 +28,7 @@ from twins.scene import Scene
 
 BODY: Final = "#d2d2d2"
 EDGE: Final = "#4a4a4a"
-FLOOR: Final = "#f1f1f1"  # of a start box
+FLOOR: Final = "#f1f1f1"  # colour of a start box
 NAMED: Final = 6  # obstacles that have their names in the picture; more would hide it
 ROUND: Final = 40  # corners of a circle
 WHOLE: Final = 2.0  # an arena is shown whole in space if it is not larger than this, seen from what is in it

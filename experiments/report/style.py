@@ -38,25 +38,25 @@ Line = dict[str, Any]  # keyword arguments of a curve
 
 WIDTH: Final = 3.5  # [in] one column of a page in two columns; its whole width is 7.16
 TALLEST: Final = 8.8  # [in] one page
-SHORTEST_S: Final = 0.1  # of a time axis, which a single sample would not have
-POINTS: Final = 1500  # of a curve; more than a printed column can show
-ALL_POINTS: Final = 40_000  # of all curves of a figure, so that many robots do not make a file of megabytes
+SHORTEST_S: Final = 0.1  # length of a time axis, which a single sample would not have
+POINTS: Final = 1500  # points of a curve; more than a printed column can show
+ALL_POINTS: Final = 40_000  # points of all curves of a figure, so that many robots do not make a file of megabytes
 INK: Final = "#000000"
 PAPER: Final = "#ffffff"
 MAGENTA: Final = "#D6007F"
-HALO: Final = [withStroke(linewidth=1.5, foreground=PAPER)]  # of a name upon curves
+HALO: Final = [withStroke(linewidth=1.5, foreground=PAPER)]  # edge of a name upon curves
 # Okabe and Ito; yellow is left out because it vanishes on white paper
 CASES: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
 HATCHES: Final = ("", "////", "....", "xxxx", "\\\\\\\\", "----", "++++")
 # robots: Tol's muted colours, so that none of them is taken for a case
 ROBOTS: Final = ("#000000", "#CC6677", "#44AA99", "#999933", "#6FB7DC", "#AA4499", "#C9A227")
-CORNERS: Final = ((3.0, 3.0), (-3.0, 3.0), (3.0, -3.0), (-3.0, -3.0))  # [pt] of a text from its point
+CORNERS: Final = ((3.0, 3.0), (-3.0, 3.0), (3.0, -3.0), (-3.0, -3.0))  # [pt] distance of a text from its point
 MAX_COLOURED_ROBOTS: Final = 8  # robots that have a colour each; more are coloured by kind
-MOST_ENTRIES: Final = 16  # of a legend
+MOST_ENTRIES: Final = 16  # entries of a legend
 LEGEND_LINE: Final = 0.14  # [in]
-LEGEND_PT: Final = 31.0  # [pt] of a line and its distances in a legend
-LETTER_PT: Final = 3.2  # [pt] of a letter in a legend, on average
-MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X", "*")  # of cases, parameters, or `MAX_COLOURED_ROBOTS` robots
+LEGEND_PT: Final = 31.0  # [pt] length of a line and its distances in a legend
+LETTER_PT: Final = 3.2  # [pt] width of a letter in a legend, on average
+MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X", "*")  # cases, parameters, or `MAX_COLOURED_ROBOTS` robots
 
 # neither the window system nor the places of programs are style: both stay as the process has them
 _DEFAULTS: Final = {
@@ -92,7 +92,7 @@ STYLE: Final[Mapping[Any, Any]] = _DEFAULTS | {
     "xtick.major.size": 2.5,
     "ytick.major.size": 2.5,
     "hatch.linewidth": 0.5,
-    "path.simplify_threshold": 0.25,  # of a point: half the thinnest line
+    "path.simplify_threshold": 0.25,  # share of a point: half the thinnest line
     "figure.dpi": 100,
     "savefig.dpi": 300,
     "savefig.transparent": True,
@@ -296,7 +296,7 @@ def fitting(width: float, labels: Collection[str], columns: int) -> int:
         rows = [len(part) for part in np.array_split(np.arange(len(labels)), count)]
         ends = np.cumsum(rows)
         if sum(max(wide[end - n : end]) for end, n in zip(ends, rows, strict=True)) <= 72.0 * width:
-            return math.ceil(len(labels) / max(rows))  # as many as are full
+            return math.ceil(len(labels) / max(rows))  # number of full ones
     return 1
 
 

@@ -26,7 +26,7 @@ Line = tuple[str, Callable[[CaseMetrics], float | None], float]  # label, value 
 Column = tuple[str, Callable[[Sequence[Any]], Cell]]  # head, cell of the same robot or link in all seeds
 
 MOST_EVENTS: Final = 200
-ALIKE_S: Final = 0.2  # [s] between the same event of two cases
+ALIKE_S: Final = 0.2  # [s] least difference of the same event of two cases
 ROUTINE: Final = ("adopted", "body", "clock", "ready", "robot", "router", "output", "start")  # kinds that stand folded
 MOST_COLLISIONS: Final = 100
 

@@ -31,7 +31,7 @@ from twins.arrays import Array
 LOW: Final = 0.2  # [m] robots below that are as well seen from above
 LONGEST: Final = 22  # letters of a name above one of two panels
 OVERLAID: Final = 3  # cases that can be distinguished upon each other, from above
-FLAT: Final = 0.15  # of its width is how high a picture of robots on the floor is, where tall things stand there
+FLAT: Final = 0.15  # share of its width: height of a picture of robots on the floor where tall things stand there
 
 
 @style.styled
@@ -231,7 +231,7 @@ def _crop(figure: Figure, axes: Axes3D, above: float) -> None:
     box = Bbox.union([each for each in boxes if np.isfinite(each.extents).all() and each.height > 0.0])
     corners = np.array(list(itertools.product(axes.get_xlim(), axes.get_ylim(), axes.get_zlim())))
     x, y, _ = proj3d.proj_transform(*corners.T, axes.get_proj())
-    height_of = axes.transData.transform(np.column_stack([x, y]))[:, 1]  # [px] of the corners of the grid
+    height_of = axes.transData.transform(np.column_stack([x, y]))[:, 1]  # [px] corners of the grid
     bottom, top = min(box.y0, height_of.min()) / figure.dpi, max(box.y1, height_of.max()) / figure.dpi
     place = axes.get_position(original=True)
     whole = top - bottom + above + 0.08
@@ -241,7 +241,7 @@ def _crop(figure: Figure, axes: Axes3D, above: float) -> None:
     )
 
 
-TRAIL_S: Final = 12.0  # of motion that a frame of a film shows behind each robot
+TRAIL_S: Final = 12.0  # motion that a frame of a film shows behind each robot
 
 
 def film(traces: Sequence[Trace]) -> tuple[Figure, Callable[[float], None]]:
@@ -333,12 +333,12 @@ def _frame(axes: Axes3D, traces: Sequence[Trace]) -> None:
     ground = bool(low[2] > -0.1)
     low, high = middle - 0.54 * size, middle + 0.54 * size
     if ground:
-        tallest = float(plan.scene.top.max(initial=0.0))  # of the obstacles
+        tallest = float(plan.scene.top.max(initial=0.0))  # height of the obstacles
         low[2], high[2] = 0.0, max(high[2], min(tallest, FLAT * float((high - low)[:2].max())))
     scenery.in_space(axes, plan, low, high)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
     x, y, z = (high - low) / math.dist(high, low)
-    wide, tall = 0.87 * x + 0.5 * y, 0.44 * (0.5 * x + 0.87 * y) + 0.9 * z  # from 26° above and 60° aside
+    wide, tall = 0.87 * x + 0.5 * y, 0.44 * (0.5 * x + 0.87 * y) + 0.9 * z  # seen from 26° above and 60° aside
     axes.set_box_aspect((x, y, z), zoom=min(0.94 / wide, 0.82 / tall))
     axes.view_init(26, -60)
     pad = -6 if z > FLAT else -3

@@ -9,7 +9,7 @@ from typing import Final
 
 from experiments.report.page import Cell, Table
 
-WIDEST_COLUMN: Final = 4.2  # [in] of a page in two columns; a wider float spans both
+WIDEST_COLUMN: Final = 4.2  # [in] column of a page in two columns; a wider float spans both
 
 # what LaTeX would take for a command, and what pdflatex has no letter for
 _LATEX: Final = {

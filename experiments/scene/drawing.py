@@ -21,11 +21,11 @@ if TYPE_CHECKING:
     import viser
 
 LABELS: Final = 24  # names of more robots are shown only where something is wrong, and of leaders and the worst
-WORST: Final = 5  # of more robots than that, robots with the largest errors that are named
+WORST: Final = 5  # number of robots with the largest errors that are named, where there are more
 LABEL_ROUNDS: Final = (2, 3)  # names of few robots, and of more, move at each second and third round
 GOAL_ROUNDS: Final = 3
 TURNS: Final = 3  # digits of quaternions: a tenth of a degree, so that noise does not redraw bodies at rest
-COARSE: Final = 5  # of more robots than that, trails have each fifth point
+COARSE: Final = 5  # number of robots beyond which trails have each fifth point
 PLACE_M: Final = 0.03  # half-size of the mark of a place that a robot says
 SHADOWS: Final = 24  # shadows of more robots cost a browser without a graphics card too much
 

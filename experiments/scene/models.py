@@ -14,8 +14,8 @@ from agents.plugins import registry
 from twins.arrays import Array
 from twins.scene import Scene
 
-SIDES: Final = 10  # of what looks round
-ROUND: Final = 28  # of a cylinder among the obstacles
+SIDES: Final = 10  # sides of what looks round
+ROUND: Final = 28  # sides of a cylinder among the obstacles
 WALL_M: Final = 0.02  # drawn thickness of a wall
 
 Faces = NDArray[np.uint32]
@@ -92,8 +92,8 @@ def annulus(inner: float, outer: float, sides: int = 32) -> Mesh:
 class Model:
     """A kind of robot: heading along x, lowest point at z = 0."""
 
-    body: Mesh  # in the colour of the place of its body
-    accent: Mesh  # in the robot's colour; its nose
+    body: Mesh  # mesh in the colour of the place of its body
+    accent: Mesh  # mesh in the robot's colour; its nose
 
     @property
     def whole(self) -> Mesh:

@@ -41,11 +41,11 @@ WAY_POINTS: Final = 40  # points of a straight way at which it is looked for bod
 TOUCH_S: Final = 1.0  # time for which a contact is shown after its end, or after a world has reported it
 FLASH_S: Final = 0.12  # time for which a link is lit after its sender transmits
 TRAIL: Final = 60  # points of a trail
-TRAIL_S: Final = 0.2  # between two of them
+TRAIL_S: Final = 0.2  # pause of two of them
 DASH_M: Final = 0.04
 TALL_M: Final = 1.2  # obstacles are drawn no higher: one up to the ceiling would hide what stands behind it
-NAME_M: Final = 0.25  # above the highest robot
-NOWHERE: Final = (0.0, 0.0, -1000.0)  # where hidden parts are put: far below the floor
+NAME_M: Final = 0.25  # height above the highest robot
+NOWHERE: Final = (0.0, 0.0, -1000.0)  # place of hidden parts: far below the floor
 
 # Okabe and Ito's colours, which the colour-blind tell apart, and two more
 MANY_GOALS: Final = 24  # goals of more robots are drawn on demand
@@ -81,7 +81,7 @@ class Condition(IntEnum):
     OUT = 5  # landed before the end of its plan
     SILENT = 6  # its last status is old
     TOUCHING = 7  # overlaps another robot, an obstacle or a wall
-    STOPPED = 8  # by an emergency stop
+    STOPPED = 8  # stopped by an emergency stop
     DEAD = 9  # its liveliness token is gone
 
 
@@ -164,7 +164,7 @@ class SceneModel:
     scene: Scene
     links: Links
     leaders: tuple[str, ...]
-    margin: float  # [m] between surfaces, kept by avoidance; 0 without any
+    margin: float  # [m] distance of surfaces, kept by avoidance; 0 without any
     plan: Plan | None = field(default=None, repr=False)  # None: only the robots are known
 
     @classmethod
@@ -305,9 +305,9 @@ class Moment:
     attitude: Array | None = None  # (N, 4) quaternions w, x, y, z; NaN: only yaw is known
     shadow: Array | None = None  # (N, 3) [m] of the twins beside the robots
     shadow_yaw: Array | None = None  # (N,) [rad]
-    time: float | None = None  # [s] since the common start; None before it
+    time: float | None = None  # [s] time since the common start; None before it
     places: Array | None = None  # (N, P, 3) [m] that the robots say, see `SceneModel.said_places`
-    measures: Sequence[Mapping[str, float]] = ()  # of the law, by robot; none known if empty
+    measures: Sequence[Mapping[str, float]] = ()  # measures of the law, by robot; none known if empty
     overlaps: Sequence[Overlap] = ()  # robots that touch one another, an obstacle or a wall
 
 

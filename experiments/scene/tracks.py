@@ -42,7 +42,7 @@ class Track:
     shadow_yaw: Array  # (K,) [rad]
     sent: Array  # (P,) [s] of each pose to the neighbours
     statuses: tuple[Status, ...]  # stamps since the common start
-    memories: tuple[LawMemory, ...] = ()  # of a law that remembers, likewise
+    memories: tuple[LawMemory, ...] = ()  # memories of a law that remembers, likewise
 
     @classmethod
     def of_states(
@@ -88,10 +88,10 @@ class Tracks:
     plan: Plan
     clock: str  # "real" or "virtual"
     robots: tuple[str, ...]
-    tracks: tuple[Track, ...]  # in the order of `robots`
+    tracks: tuple[Track, ...]  # tracks, ordered as `robots`
     events: tuple[Event, ...]  # incidents of robots included, in order of time; stamps since the common start
     world: tuple[WorldState, ...]
-    contacts: tuple[Contact, ...]  # that the world reported
+    contacts: tuple[Contact, ...]  # contacts that the world reported
     begin: float  # [s] first sample, since the common start: not later than 0
     end: float  # [s] last sample
 

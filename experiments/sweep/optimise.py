@@ -34,8 +34,8 @@ from experiments.sweep.workers import workers
 
 Progress = Callable[[str, int, int], None]  # case, evaluations done, largest number of them
 
-FINE: Final = 0.01  # of a range: resolution of the search
-SIGMA: Final = 0.3  # of a range: first width of the search
+FINE: Final = 0.01  # share of a range: resolution of the search
+SIGMA: Final = 0.3  # share of a range: first width of the search
 EVALUATIONS: Final = (20, 20)  # largest number, and the increase for each parameter
 SEARCH: Final = 1 / 3  # share of the tuning seeds that serves the search
 TUNING: Final = 60  # seeds, if no number is given
@@ -102,11 +102,11 @@ class TuningResult:
     tuning: tuple[int, ...]  # seeds of the search
     seeds: tuple[int, ...]  # seeds of the report
     rows: tuple[CellRow, ...]  # the reference, and the best of each case, on `seeds`
-    tried: tuple[CellRow, ...]  # in the order of the search, on the first third of `tuning`
+    tried: tuple[CellRow, ...]  # cells, ordered as searched, on the first third of `tuning`
     # of each case what was chosen, on the other two thirds; its limits may be broken if nothing kept them
     chosen: tuple[CellRow, ...]
-    folder: Path  # of the runs
-    notes: tuple[str, ...]  # for the user
+    folder: Path  # folder of the runs
+    notes: tuple[str, ...]  # remarks for the user
 
 
 def parse_objective(text: str) -> Objective:

@@ -16,8 +16,8 @@ from experiments.sweep.sweep import SweepResult
 from experiments.sweep.table import CellRow, numbers, parameter_columns, relative_metrics
 
 PAGE: Final = "sweep.html"
-MOST_LINES: Final = 40  # of a table that stands open
-LEVELS: Final = (1.01, 1.02, 1.05)  # of IAE: the fewest messages within each are named
+MOST_LINES: Final = 40  # lines of a table that stands open
+LEVELS: Final = (1.01, 1.02, 1.05)  # multiples of IAE: the fewest messages within each are named
 TERMS: Final = (
     ("Messages", "Transmissions of a robot, mean over all but the leaders; relative to the reference, seed by seed."),
     ("IAE, ITAE", "Of the formation error of a robot, mean over all but the leaders; likewise."),

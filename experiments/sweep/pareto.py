@@ -67,7 +67,7 @@ def pareto(rows: Sequence[CellRow], index: str = "iae", *, joined: bool = True, 
     joined = joined and max(len(cases), len(marks)) <= MOST_CURVES
     if not joined:
         found = {(case, ""): [row for row in known if row.case == case] for case in cases}
-    several = joined and len(marks) > 1  # then markers tell the other parameters apart, colours the cases
+    several = joined and len(marks) > 1  # markers then tell the other parameters apart, colours the cases
     for (case, other), curve in found.items():
         k = cases.index(case)
         style = {

@@ -29,9 +29,9 @@ from experiments.file.overrides import Override, parse
 from experiments.file.problems import DocumentError, Problem, refusal
 from experiments.sweep.runs import digest
 
-SEEDS: Final = 20  # if no number is given
+SEEDS: Final = 20  # seeds if no number is given
 FIRST_TUNING: Final = 1001  # the first seed on which parameters are sought, if none is named
-DIGITS: Final = 4  # of a value in a range
+DIGITS: Final = 4  # digits of a value in a range
 # tables of the file that make the environment of a run: not chosen, but met
 ENVIRONMENT: Final = ("arena", "channel", "disturbance", "duration_s", "hosts", "robots", "start", "timeline", "world")
 MOST_CELLS: Final = 20_000
@@ -67,10 +67,10 @@ class Span:
 class Axis:
     """A value of the file that a sweep changes."""
 
-    argument: str  # as it was written
-    path: str  # as behind `--set`
-    values: tuple[str, ...]  # as behind `--set`, each once; empty if only a span is given
-    span: Span | None  # of the values, if they are one
+    argument: str  # text that was written
+    path: str  # path, written as for `--set`
+    values: tuple[str, ...]  # values, written as for `--set`, each once; empty if only a span is given
+    span: Span | None  # span of the values, if they are one
 
     def at(self, share: float) -> str:
         """The value so far along its span."""
@@ -87,7 +87,7 @@ class Cell:
     # digest of the reference of the ratios: the first case of the file with the same values, except those of its
     # trigger
     reference: str
-    digest: str  # of what is run
+    digest: str  # digest of what is run
     # those of `parameters` that the reference has too, or that are no choice: cells are compared where these are equal
     environment: Mapping[str, Any]
 

@@ -41,10 +41,10 @@ from experiments.virtual_time import stretch
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-MOST_SEEDS: Final = 100  # of one cell side by side: more are hardly faster, and progress would come in larger steps
+MOST_SEEDS: Final = 100  # seeds of one cell side by side: more are hardly faster, with larger steps of progress
 SHARE: Final = 3  # least number of pieces of a worker's part, so that all end at about the same time
-MOST_BYTES: Final = 2e8  # of samples that one process logs
-LEAN_BYTES, WHOLE_BYTES = 48.0, 340.0  # of a sample of a robot
+MOST_BYTES: Final = 2e8  # samples that one process logs
+LEAN_BYTES, WHOLE_BYTES = 48.0, 340.0  # size of a sample of a robot
 LONGEST: Final = 60  # letters of a folder's name that is made up here
 AROUND_S: Final = 15.0  # take-off and landing are logged, too
 
@@ -57,12 +57,12 @@ class SweepResult:
 
     read: Document
     axes: tuple[Axis, ...]
-    seeds: tuple[int, ...]  # of the runs
+    seeds: tuple[int, ...]  # seeds of the runs
     rows: tuple[CellRow, ...]  # the table
     failures: tuple[str, ...]  # reasons, each once
     missing: int  # runs not done, because the sweep was interrupted
-    folder: Path  # of the runs
-    notes: tuple[str, ...]  # for the user
+    folder: Path  # folder of the runs
+    notes: tuple[str, ...]  # remarks for the user
 
     def __str__(self) -> str:
         """The table, as the command prints it."""

@@ -29,11 +29,11 @@ class CellRow(msgspec.Struct, frozen=True):
     case: str
     parameters: dict[str, Any]  # values of the axes that it has, by path
     environment: dict[str, Any]  # those of them that are no choice, see `Cell`: only cells of equal ones are compared
-    units: dict[str, str]  # of the parameters that have a short one, by path
+    units: dict[str, str]  # units of the parameters that have a short one, by path
     reference: bool  # the ratios of others are taken over it
     seeds: int  # runs that succeeded
     failed: int  # runs that failed, or in which a robot did; the statistics leave them out
-    mean: dict[str, Spread]  # over the seeds: each of `swept_metrics`; `acquired_s` over those in which all acquired
+    mean: dict[str, Spread]  # means over the seeds; `acquired_s` over those in which all acquired
     # of each relative metric over the reference with the same seed, then over the seeds; only of runs of equal length
     ratio: dict[str, Spread]
     acquired: float | None  # share of the seeds in which every robot but the leaders acquired
@@ -184,7 +184,7 @@ def text(rows: Sequence[CellRow]) -> list[str]:
 def parameter_columns(rows: Sequence[CellRow]) -> dict[str, list[str]]:
     """Heads of the columns of parameters, and of each the value in every row; those of several cases share a column."""
     paths: dict[str, list[str]] = {}
-    most_first = sorted(rows, key=lambda row: -len(row.parameters))  # in the order of the axes
+    most_first = sorted(rows, key=lambda row: -len(row.parameters))  # same order as the axes
     for path in dict.fromkeys(path for row in most_first for path in row.parameters):
         paths.setdefault(short(path), []).append(path)
     columns: dict[str, list[str]] = {}

@@ -30,16 +30,16 @@ if TYPE_CHECKING:
     from experiments.view.serving import PageServer
 
 REASON: Final = "button of zenpark view"
-SETTLED_S: Final = 0.4  # after the last move of a slider, or the end of a drag, its value is sent
+SETTLED_S: Final = 0.4  # pause since the last move of a slider, or the end of a drag; then its value is sent
 SLIDERS: Final = 6
-STEPS: Final = 50  # of a slider up to the value of the file, and
+STEPS: Final = 50  # steps of a slider up to the value of the file
 RANGE: Final = 4.0  # times that value at its end
 CALMING: Final = ("hold", "land")  # orders that count whatever the page shows
 OBSERVER: Final = "observer"
 NOTE_S: Final = 8.0
-HANDLE: Final = 0.25  # [m] of a target, in an arena of 2.5 m; in a larger one, as much larger
+HANDLE: Final = 0.25  # [m] size of a target, in an arena of 2.5 m; in a larger one, as much larger
 LEADERS: Final = 5  # most that are dragged
-HELD_S: Final = 1.5  # until the goal that a leader reports is the one that it was sent to
+HELD_S: Final = 1.5  # time until the goal that a leader reports is the one that it was sent to
 LAST: Final = "Repeat it with `./zenpark estop`, or cut the power."
 
 
@@ -50,7 +50,7 @@ class WatchedRun:
     endpoints: Sequence[str]
     realm: str
     identity: str  # identity to show, in a lab
-    run: RegisteredRun | None = None  # of this machine, if it is registered
+    run: RegisteredRun | None = None  # run of this machine, if it is registered
 
     @property
     def words(self) -> str:
@@ -70,7 +70,7 @@ def may_act(watched: WatchedRun) -> bool:
         return watched.identity != OBSERVER
     try:
         known = lab.register(folder).identities.get(watched.identity)
-    except lab.LabError:  # where only the own certificate is: that of an observer
+    except lab.LabError:  # only the own certificate is there: that of an observer
         return False
     return known is not None and known.role == "operator"
 
@@ -85,13 +85,13 @@ class Acting:
         self._urgent = orders.stop_publisher(session, keys)
         self._alive: Sequence[str] = ()
         self._stage = SceneModel.of_robots(())
-        self._parts: list[Any] = []  # of the present stage
-        self._targets: dict[str, Any] = {}  # by leader
+        self._parts: list[Any] = []  # parts of the present stage
+        self._targets: dict[str, Any] = {}  # targets by leader
         self._held_until = -inf  # [s, monotonic] targets stay where they were dragged
         self._dragged = self._ended = False
         self.due: dict[str, tuple[float, Callable[[], object]]] = {}  # orders that wait until a control is at rest
         self._lock = threading.Lock()
-        self._number = 0  # of the present stage
+        self._number = 0  # number of the present stage
 
     def build(self, server: PageServer) -> None:
         """Adds the buttons."""
@@ -221,7 +221,7 @@ class Acting:
             return
         value, what = parameter.limited(float(event.target.value)), parameter.name
         if value != event.target.value:
-            event.target.value = value  # on all pages
+            event.target.value = value  # set on all pages
         if self._refuse(event.client_id, what):
             return
         order = messages.Order("set", name=parameter.name, value=value)
@@ -282,8 +282,8 @@ class Acting:
 class Parameter:
     """A parameter that robots change in flight."""
 
-    name: str  # of the order
-    value: float  # in the file
+    name: str  # name of the order
+    value: float  # value in the file
     unit: str = ""
 
     @property

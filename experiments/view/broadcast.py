@@ -27,7 +27,7 @@ from experiments.recording.topics import Topic
 from experiments.view.replay import ReplayClock
 
 STEP_S: Final = 0.01
-SEEN_S: Final = 1.0  # until the tokens of a run that is up have come
+SEEN_S: Final = 1.0  # time until the tokens of a run that is up have come
 ENCODED: Final = (messages.State, messages.Status, messages.Pose, messages.Goal)  # the rest is JSON
 
 
@@ -40,7 +40,7 @@ class Broadcast:
         `watch_s` is how long it looks for others in the realm before it plays.
         """
         records = Records(path)
-        self._topics: dict[int, Topic | None] = {}  # by channel
+        self._topics: dict[int, Topic | None] = {}  # topics by channel
         self._sent: list[tuple[int, int, bytes]] = []  # log time [ns], channel, data
         for message in records.messages():
             if message.channel not in self._topics:

@@ -42,8 +42,8 @@ class Seen:
 
     drawn: float = -inf  # [s, UTC] time of the picture; -inf before the first report
     stage: int = -1  # number of the case
-    hidden: bool = False  # behind another page or window, where browsers draw nothing
-    opened: float = -inf  # [s, UTC] of a page that has reported nothing yet
+    hidden: bool = False  # True behind another page or window, where browsers draw nothing
+    opened: float = -inf  # [s, UTC] opening of a page that has reported nothing yet
 
 
 @dataclass
@@ -51,7 +51,7 @@ class Gate:
     """Gate of one server."""
 
     secret: str = field(default_factory=lambda: secrets.token_urlsafe(24), repr=False)
-    seen: dict[int, Seen] = field(default_factory=dict)  # by page that is open
+    seen: dict[int, Seen] = field(default_factory=dict)  # pages that are open, by number
     stops: int = 0  # emergency stops that pages have sent, which a page looks for after its own
     _tickets: set[str] = field(default_factory=set, repr=False)
 
@@ -73,7 +73,7 @@ class Gate:
             self._tickets.discard(rest)
         if _upgrades(request.headers):
             return inner(connection, request)
-        if redeemed or not slash:  # without it names in the page would be beside its folder, not in it
+        if redeemed or not slash:  # names in the page would be beside its folder, not in it
             return _text(HTTPStatus.SEE_OTHER, "", Location=f"/{self.secret}/")
         if rest == CLOCK:
             self._note(target.query)
@@ -111,7 +111,7 @@ def own(headers: Headers) -> bool:
     hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
     if len(hosts) != 1 or OWN_HOST.fullmatch(hosts[0]) is None:
         return False
-    if not origins:  # as browsers ask for a page, but never for a websocket
+    if not origins:  # browsers ask so for a page, but never for a websocket
         return not _upgrades(headers)
     return origins == [f"http://{hosts[0]}"]
 
@@ -123,7 +123,7 @@ def _upgrades(headers: Headers) -> bool:
 def _page(inner: Handler, connection: ServerConnection, request: Request, path: str) -> Response | None:
     """A file of the page; its first one with our script in it."""
     if not path:
-        request.headers.pop("Accept-Encoding", None)  # for plain text
+        request.headers.pop("Accept-Encoding", None)  # asks for plain text
     response = inner(connection, Request(f"/{path}", request.headers))
     if response is not None:
         if not path:

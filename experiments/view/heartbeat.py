@@ -11,9 +11,9 @@ CLOCK: Final = "clock"  # path that answers with the time of this machine and th
 SCRIPT: Final = b"<script>%s</script>" % Path(__file__).with_name("heartbeat.js").read_bytes()
 STALE_S: Final = 5.0  # a page with an older picture gives no order that sets robots in motion
 RECORDED_S: Final = 60.0  # messages that were never younger than this are of a recording that is played
-LAG_S: Final = 1.0  # from a picture to the report of a page that shows it, with nothing in the way
-STEEP: Final = 2.0  # [s/s] by which the time between two pictures grows with what is above that
-SLOWEST_S: Final = 2.0  # between two pictures
+LAG_S: Final = 1.0  # time from a picture to the report of a page that shows it, with nothing in the way
+STEEP: Final = 2.0  # [s/s] growth of the time between two pictures with what is above that
+SLOWEST_S: Final = 2.0  # longest pause of two pictures
 
 
 class DataAge:
@@ -21,7 +21,7 @@ class DataAge:
 
     def __init__(self) -> None:
         self._stamp = self._arrived = -inf
-        self._least = inf  # [s] from stamp to arrival
+        self._least = inf  # [s] time from stamp to arrival
 
     def add(self, stamp: float, utc: float, now: float) -> None:
         """Poses of `stamp` [s, UTC] arrived at `utc` [s, UTC], which is `now` [s, monotonic]."""

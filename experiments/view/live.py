@@ -32,15 +32,15 @@ if TYPE_CHECKING:
     from experiments.view.serving import PageServer
 
 FRAME_S: Final = 1.0 / 25.0
-FAREWELL_S: Final = 0.5  # until the last words have reached the pages
-IDLE_S: Final = 0.2  # between two rounds while no page is open
+FAREWELL_S: Final = 0.5  # time until the last words have reached the pages
+IDLE_S: Final = 0.2  # pause of two rounds while no page is open
 TABLE_S: Final = 0.5
 FOV: Final = 0.8  # [rad] upright
 ASPECT: Final = 1.2  # width over height of a page that is not known
 FROM: Final = np.array([-0.40, -0.77, 0.50])  # direction of the camera, as seen from the arena
-FREE: Final = np.array([-0.92, 0.92])  # of a page from its middle to its edges, where the arena is shown
+FREE: Final = np.array([-0.92, 0.92])  # share of a page from its middle to its edges, where the arena is shown
 PHONE: Final = 0.7  # width over height of a page with its panel below, not beside
-ABOVE: Final = np.array([0.24, 0.96])  # as `FREE`, upwards, of such a page
+ABOVE: Final = np.array([0.24, 0.96])  # the same as `FREE`, upwards, of such a page
 
 
 def standpoint(size: Sequence[float] | Array, aspect: float) -> tuple[Array, Array]:
@@ -72,7 +72,7 @@ class Camera:
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server
         self._size: Array = np.ones(3)  # [m]
-        self._placed: dict[int, Array] = {}  # [m] by page
+        self._placed: dict[int, Array] = {}  # [m] place by page
         server.initial_camera.fov = FOV
         server.on_client_connect(self._add_client)
 
@@ -162,7 +162,7 @@ class LiveView:
         self._page = Page(server, dark=dark)
         self._trailed: object = None
         self._stages, self._failure, self._over = 0, "", False
-        self._elapsed: float | None = None  # [s] since the common start; stands still with the last picture
+        self._elapsed: float | None = None  # [s] time since the common start; stands still with the last picture
         if acting is not None:
             acting.build(server)
         self._begin()

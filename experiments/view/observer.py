@@ -55,8 +55,8 @@ class RobotReport:
     known: bool = False  # it was alive, or reported, at some time
     sent_at: float = -inf  # [s, monotonic] arrival of its last transmitted pose
     sent: int = 0  # poses since the rate was computed
-    rate: float = 0.0  # [1/s] of transmitted poses, over the last second
-    delay: dict[str, float] = field(default_factory=dict)  # [s] of the last pose, by sender
+    rate: float = 0.0  # [1/s] rate of transmitted poses, over the last second
+    delay: dict[str, float] = field(default_factory=dict)  # [s] delay of the last pose, by sender
 
 
 class Observer:
@@ -64,11 +64,11 @@ class Observer:
 
     stage: SceneModel
     case: str
-    robots: dict[str, RobotReport]  # by name, in the order of the stage
-    events: deque[messages.Event]  # of the run, incidents of robots included, oldest first
+    robots: dict[str, RobotReport]  # reports by name, ordered as the stage
+    events: deque[messages.Event]  # events of the run, incidents of robots included, oldest first
     world: messages.WorldState | None
     scans: dict[str, messages.Ranges]  # last range readings, while they are asked for
-    age: DataAge  # of the poses
+    age: DataAge  # age of the poses
 
     def __init__(self, session: zenoh.Session, keys: Keys) -> None:
         self._session, self._keys, self._clock = session, keys, Clock()
@@ -137,7 +137,7 @@ class Observer:
             try:
                 read = document.received(sample.payload.to_bytes().decode(), str(sample.key_expr))
             except (DocumentError, UnicodeDecodeError):
-                continue  # of another version: robots are drawn without it
+                continue  # another version: robots are drawn without it
             case, plan = next(iter(read.cases().items()))
             if (case, plan) != (self.case, self.stage.plan):
                 self._begin(SceneModel.of_plan(plan), case)

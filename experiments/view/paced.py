@@ -103,7 +103,7 @@ class PacedView:
         touching = {name for each in overlaps for name in (each.first, each.second)}
         conditions = [condition(status, touches=status.robot in touching) for status in self._statuses(instant)]
         self._trail.add(instant.now, position)
-        laws = [robot.stepping for robot in robots]  # of guided robots nothing is known here
+        laws = [robot.stepping for robot in robots]  # nothing is known here of guided robots
         return Moment(
             position=position,
             yaw=np.where(np.isfinite(true_yaw), true_yaw, yaw),

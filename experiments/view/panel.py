@@ -32,9 +32,9 @@ if TYPE_CHECKING:
 
 HISTORY_S: Final = 30.0
 PLOT_S: Final = 0.25
-CURVES: Final = 12  # of more robots, the largest, the median and the smallest value are plotted
+CURVES: Final = 12  # curves of more robots: the largest, the median and the smallest value are plotted
 TABLE: Final = 20  # rows; of more robots, those that need attention first, then the worst
-MEASURES: Final = 3  # of a law, in the table
+MEASURES: Final = 3  # measures of a law, in the table
 EVENTS: Final = 12
 LINKS: Final = 30  # rows
 FEW_MISSED: Final = 0.01  # share of ticks; more are shown in red
@@ -54,10 +54,10 @@ class RobotRow:
     rate: float | None = None  # [1/s]
     battery: float | None = None  # 0 to 1
     missed: int | None = None  # ticks
-    missed_share: float = 0.0  # of all ticks
+    missed_share: float = 0.0  # share of all ticks
     delay: float | None = None  # [s] largest of its links
     note: str = ""
-    measures: Mapping[str, float] = field(default_factory=dict)  # of its law
+    measures: Mapping[str, float] = field(default_factory=dict)  # measures of its law
 
     def measured(self, measures: Sequence[Mapping[str, float]], row: int) -> RobotRow:
         """The same with the measures of its law, of those of all robots."""

@@ -40,9 +40,9 @@ if TYPE_CHECKING:
 M = TypeVar("M", Contact, Status, WorldState, LawMemory)
 NOTHING: Final = LawMemory("", 0, 0.0)
 SPEEDS: Final = ("0.1", "0.25", "0.5", "1", "2", "5", "10", "20")
-STEP_S: Final = 0.02  # of a single step: a sample at 50 Hz
-APART: Final = 0.15  # between words on the slider, in its lengths
-GAP: Final = 1.15  # from arena to arena, in its lengths
+STEP_S: Final = 0.02  # length of a single step: a sample at 50 Hz
+APART: Final = 0.15  # distance of words on the slider, in its lengths
+GAP: Final = 1.15  # distance from arena to arena, in its lengths
 
 
 class Film:

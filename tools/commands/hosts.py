@@ -30,7 +30,7 @@ On = Annotated[
 
 YES, NO, DOUBTFUL, NOTHING = "✓", "✗", "!", "–"
 HEADING: Final = ("host", "reachable", "zenpark", "Python", "clock", "devices", "router")
-SECURED: Final = (*HEADING[:-1], "certificates", HEADING[-1])  # in a lab
+SECURED: Final = (*HEADING[:-1], "certificates", HEADING[-1])  # columns in a lab
 VAGUE_S: Final = 0.02  # a clock with a larger uncertainty lets robots start apart
 REACH_S: Final = 15.0
 
@@ -41,7 +41,7 @@ class HostRow:
 
     cells: dict[str, str]
     trouble: list[str] = field(default_factory=list)
-    blank: str = NOTHING  # of columns without a cell
+    blank: str = NOTHING  # text of columns without a cell
 
     @property
     def well(self) -> bool:

@@ -34,7 +34,7 @@ class NetworkMember:
     """Robot or process, by the chunk of its keys behind the realm."""
 
     name: str
-    phase: str = ""  # of a robot
+    phase: str = ""  # phase of a robot
     sessions: list[str] = field(default_factory=list)  # Zenoh ids that its tokens tell
     alive: list[str] = field(default_factory=list)  # liveliness tokens
     publishes: list[str] = field(default_factory=list)
@@ -188,7 +188,7 @@ class Rate:
     sigma: float
     shortest: float
     longest: float
-    silence: float  # since the last sample
+    silence: float  # time since the last sample
 
     def __str__(self) -> str:
         times = (self.mean, self.sigma, self.shortest, self.longest)
@@ -249,7 +249,7 @@ def hz(
     cadence = Cadence()
     arrived = deque[tuple[str, float, int]](maxlen=DEPTH)
 
-    def note(sample: zenoh.Sample) -> None:  # in the receiving thread: this process's poll is no arrival
+    def note(sample: zenoh.Sample) -> None:  # runs in the receiving thread: this process's poll is no arrival
         arrived.append((str(sample.key_expr), time.monotonic(), len(sample.payload)))
 
     with session("hz", place(connect, lab), identity) as opened:

@@ -54,7 +54,7 @@ NamesOrAll = Annotated[
 ]
 
 IDENTITY: Final = "operator"
-WAIT_S: Final = 2.0  # for a router
+WAIT_S: Final = 2.0  # patience for a router
 MOST_NAMES: Final = 20  # robots that a line of the emergency stop names; --json names all
 # orders to the robots themselves, in a run or by hand, without names to all of them: help, and what a robot does then
 ORDERS: Final[Mapping[messages.OrderKind, tuple[str, str]]] = {
@@ -284,7 +284,7 @@ def estop(
     if given := routers(connect, lab):
         stops = [EmergencyStop(given, realm or "park", identity or IDENTITY)]
     else:
-        others = _of_environment(lab), [DEFAULT_ENDPOINT]  # of another machine; of a zenohd, say
+        others = _of_environment(lab), [DEFAULT_ENDPOINT]  # endpoints of another machine; of a zenohd, say
         stops = stops_of_all_runs(*others, realm=realm, identity=identity)
     return stop_all(stops, dry_run=dry_run, as_json=as_json)
 

@@ -254,7 +254,7 @@ def export(  # noqa: PLR0917 - a command line
     if (video is None and suffix not in (".mat", ".csv", ".zip")) or (suffix != own and (as_csv or as_bundle)):
         raise ExplainedError(f"{file}: is no name for what is exported; let it end with .mat, .csv or .zip (a bundle)")
     if suffix == ".mat":
-        require_savemat()  # before a long recording is read
+        require_savemat()  # asked before a long recording is read
     found = reopen(Path(folder))
     if not found.traces:
         raise ExplainedError(f"{folder}: no case had begun; there is nothing to export")

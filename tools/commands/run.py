@@ -48,8 +48,8 @@ if TYPE_CHECKING:
 app: Final = typer.Typer()
 
 STOPPED: Final = 1  # exit code of a run that an emergency stop has ended,
-FAILED: Final = 1  # and of one in which a robot did not do its part, or that does not keep a criterion
-SPOILED: Final = 3  # of a run with figures that cannot be compared
+FAILED: Final = 1  # code of one in which a robot did not do its part, or that does not keep a criterion
+SPOILED: Final = 3  # code of a run with figures that cannot be compared
 FEW: Final = 6  # hazards of runs in virtual time that are printed
 
 

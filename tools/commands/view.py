@@ -43,10 +43,10 @@ if TYPE_CHECKING:
 app: Final = typer.Typer()
 
 PORT: Final = 8080
-START_S: Final = 30.0  # until a run that was started just now is registered
+START_S: Final = 30.0  # time until a run that was started just now is registered
 POLL_S: Final = 0.1
 END_S: Final = 10.0  # limit for the page of a run to end with it
-REFRESH_S: Final = 0.25  # of the table
+REFRESH_S: Final = 0.25  # period of the table
 FIRST_S: Final = 5.0  # limit for the reports of a table that is printed once
 
 

@@ -34,17 +34,17 @@ class Faults(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """Injected faults; by default none. Devices ignore faults that they cannot have."""
 
     loss: float = 0.0  # share of packets lost, in each direction
-    delay_s: float = 0.0  # [s] of each packet that the device sends
+    delay_s: float = 0.0  # [s] delay of each packet that the device sends
     silent_from_s: float | None = None  # [s] begin of silence on the device's clock: nothing sent, nothing received
     silent_for_s: float = 1e9  # [s] duration of the silence
     battery: float = 1.0  # charge at the start, 0 to 1
     drain: float = 1.0  # battery drain as a multiple of the maker's figure
     refuse_arming: bool = False
     accelerometer_mg: float = 0.0  # constant vertical error of a Crazyflie's accelerometer [mg]
-    refuse_landing_s: float = 0.0  # [s] for which a Tello answers `land` with "error", from the first one
+    refuse_landing_s: float = 0.0  # [s] time for which a Tello answers `land` with "error", from the first one
     exchanges_hz: float = 500.0  # [1/s] exchanges of a software radio, 300 to 1000 by dongle and computer
     tumbled_from_s: float | None = None  # [s] begin of lying on its side, as after a collision
-    tumbled_for_s: float = 1e9  # [s] until it is put upright
+    tumbled_for_s: float = 1e9  # [s] time until it is put upright
     # [s] begin of an occlusion of all robots from motion capture, base stations and anchors
     occluded_from_s: float | None = None
     occluded_for_s: float = 1e9  # [s] duration of the occlusion
@@ -169,7 +169,7 @@ class Device(Server):
     """Simulated device for some robots of one kind, made with a `DeviceRequest`."""
 
     addresses: tuple[str, ...]  # one per row: the body's address for the bridge, such as "udp://127.0.0.1:19850"
-    models: Sequence[Motion]  # of the rows, for `truth`
+    models: Sequence[Motion]  # motions of the rows, for `truth`
 
     def truth(self) -> tuple[Array, Array]:
         """True positions (n, 3) [m] and yaws (n,) [rad] of the robots."""
@@ -192,4 +192,4 @@ class DeviceRequest:
 
     body: BodyRequest
     faults: Faults
-    by_hand: bool = False  # without an experiment: addresses at which vendor libraries scan, where they are free
+    by_hand: bool = False  # True without an experiment: addresses at which vendor libraries scan, where they are free

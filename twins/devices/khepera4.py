@@ -21,9 +21,9 @@ from twins.models.disturbance import Latency, OdometryDrift
 from twins.models.noise import refill
 
 GARBAGE: Final = (3.0, -2.0)  # [m] goal of servers without a goal from a client: the content of the memory
-RECEIVE_S: Final = 0.05  # [s] after which the fork's loop turns without a command,
-SELECT_S: Final = 1.0  # [s] that of 2023-04-10, and
-MAIN_S: Final = 0.02  # [s] that of 2025-05, whether or not there are commands
+RECEIVE_S: Final = 0.05  # [s] pause after which the fork's loop turns without a command
+SELECT_S: Final = 1.0  # [s] the same of 2023-04-10
+MAIN_S: Final = 0.02  # [s] the same of 2025-05, whether or not there are commands
 
 
 class _WheeledRobot:
@@ -35,7 +35,7 @@ class _WheeledRobot:
         disturbance, name, seed = body.disturbance[row], body.names[row], body.seeds[row]
         self._latency, self._drift = Latency(disturbance, self._dt), OdometryDrift(disturbance, name, seed)
         self.charge = faults.battery
-        self.pulses = (0.0, 0.0)  # of the left and the right encoder, since power-on
+        self.pulses = (0.0, 0.0)  # counts of the left and the right encoder, since power-on
         self.speed = (0.0, 0.0)  # units
         self.twist = (0.0, 0.0)  # commanded v [m/s], ω [rad/s]
         self.sounding = 31  # mask of the ultrasonic sensors
@@ -59,7 +59,7 @@ class _WheeledRobot:
         model.command(self._latency.delay((*self.twist, 0.0, 0.0)))
         model.move(self._dt)
         x, y, turn = model.position[0] - x, model.position[1] - y, model.yaw - yaw
-        if drift.present:  # of the encoders: wheels that slip
+        if drift.present:  # drift of the encoders: wheels that slip
             error_x, error_y = drift.x, drift.y
             drift.advance(x, y)
             refill(drift.noise)
@@ -87,7 +87,7 @@ class ParkProgram:
         self._place = [0.0, 0.0]  # [m]
         self._theta = self._way = self._sum = 0.0  # [rad]; [m] in the last turn; sum of the bearing errors [rad]
         self._goal, self._active = GARBAGE, False
-        self._due = 0.0  # [s] of the next turn without a command
+        self._due = 0.0  # [s] time of the next turn without a command
 
     def begin_session(self) -> None:
         """A client was accepted."""

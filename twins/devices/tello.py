@@ -23,8 +23,8 @@ from twins.devices.device import Device, DeviceRequest, Faults, FaultyLink
 from twins.models.quadrotor import Quadrotor
 
 PORT: Final = 18889  # not the drone's own 8889: djitellopy binds that on every address of this host
-HOSTS: Final = range(2, 255)  # of 127.0.0.x: djitellopy distinguishes drones by address only
-LOWEST_TAKEOFF_CHARGE: Final = 0.10  # with less charge take-offs are refused
+HOSTS: Final = range(2, 255)  # addresses 127.0.0.x: djitellopy distinguishes drones by address only
+LOWEST_TAKEOFF_CHARGE: Final = 0.10  # charge below which take-offs are refused
 LANDING_CHARGE: Final = 0.05  # charge of an automatic landing
 NEAR: Final = 0.03  # [m] distance from the goal at which a move is complete
 NEAR_YAW: Final = 0.01  # [rad] likewise for a turn
@@ -40,7 +40,7 @@ MOVES: Final = {
 
 LOWEST_FLIP_CHARGE: Final = 0.50
 FLIPS: Final = {"l": "left", "r": "right", "f": "forward", "b": "back"}
-FLIP_M: Final = 0.2  # by which a flip displaces it
+FLIP_M: Final = 0.2  # displacement by a flip
 PASSED: Final = 0.15  # [m] distance from a point of an arc at which the next one is flown to
 ARC_M: Final = 0.2
 LINE: Final = 1e-6  # [m⁴] three points with a smaller squared area are on a line
@@ -77,7 +77,7 @@ class _Drone(FaultyLink[tuple[bytes, tuple[str, int]]]):
         self.model = Quadrotor(body.kinds[row], body.start[row], body.yaw[row])
         self._twin = Twin(self.model, body.kinds[row], disturbance, name=name, seed=seed, dt=self._dt)
         self.number, self.start_yaw = row, body.yaw[row]
-        self.stick_speed = chosen.twin_stick_speed  # [m/s] at full deflection
+        self.stick_speed = chosen.twin_stick_speed  # [m/s] speed at full deflection
         self.seeks_pads = False  # mission pads are switched on
         self.mode = Mode.GROUND
         self.sdk = False
@@ -88,11 +88,11 @@ class _Drone(FaultyLink[tuple[bytes, tuple[str, int]]]):
         self.goal = ZERO
         self.further: list[Vector] = []  # points after the goal
         self.heading = 0.0
-        self.pace = protocol.STICK_SPEED  # [m/s] of moves
+        self.pace = protocol.STICK_SPEED  # [m/s] speed of moves
         self.motors_s = 0.0
         self.charge = faults.battery
         self.state_due = 0.0
-        self.landing_due = math.inf  # before this time `land` is refused
+        self.landing_due = math.inf  # time until which `land` is refused
 
     @property
     def aloft(self) -> bool:
@@ -138,7 +138,7 @@ class _Drone(FaultyLink[tuple[bytes, tuple[str, int]]]):
         if word == "command":
             self.sdk = True
         if not self.sdk:
-            return  # before `command` the drone listens to the phone only
+            return  # the drone listens to the phone alone until `command`
         self.peer, self.last_command = sender, self.t
         try:
             answer = self._answer(word) if word.endswith("?") else self._execute(word, words[1:], sender)

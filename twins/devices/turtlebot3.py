@@ -122,7 +122,7 @@ class TurtleBot3Twin(Device):
             ros2.types(where.distro),
             style=where.style,
             domain=where.domain,
-            announces=True,  # with ros2dds the twin includes the bridge on the robot
+            announces=True,  # set where, with ros2dds, the twin includes the bridge on the robot
         )
 
     def advance(self, t: float) -> None:
@@ -229,7 +229,7 @@ class TurtleBot3Twin(Device):
                 charge=nan,
                 capacity=nan,
                 design_capacity=1.8,
-                percentage=100.0 * charge,  # as the robot does; ROS defines 0 to 1
+                percentage=100.0 * charge,  # the robot's scale; ROS defines 0 to 1
                 power_supply_status=0,
                 power_supply_health=0,
                 power_supply_technology=0,

@@ -16,14 +16,14 @@ import numpy as np
 
 from twins.arrays import Array, Index, Mask, any_true, clamp
 
-RATE_HZ: Final = 500.0  # of the attitude and rate loops
+RATE_HZ: Final = 500.0  # rate of the attitude and rate loops
 OUTER: Final = 5  # divisor of the rate for the position and velocity loops: 100 Hz
-FULL: Final = 65535.0  # of a motor
-TORQUE_LIMIT: Final = 32767.0  # of the rate loops' output
+FULL: Final = 65535.0  # largest command of a motor
+TORQUE_LIMIT: Final = 32767.0  # largest output of the rate loops
 BASE: Final = 36000.0  # thrust before the vertical loop's output is added: 0.995 of the weight
 LEAST: Final = 20000.0
 THRUST_SCALE: Final = 1000.0
-SPEED: Final = 1.0 * 1.1  # [m/s] per axis; the firmware allows its position loop 10 % more than its limit
+SPEED: Final = 1.0 * 1.1  # [m/s] speed per axis; the firmware allows its position loop 10 % more than its limit
 TILT: Final = 20.0  # [deg]
 # motors: front right, back right, back left, front left; share of each in a torque about x, y (nose down) and z
 MIX: Final = np.array([[-0.5, -0.5, -1.0], [-0.5, 0.5, 1.0], [0.5, 0.5, -1.0], [0.5, -0.5, 1.0]])

@@ -28,7 +28,7 @@ Pose = tuple[float, float, float]  # x, y [m], yaw [rad]
 class EngineInput:
     """Input of an engine: n robots and the scene."""
 
-    kinds: tuple[Kind, ...]  # of the robots
+    kinds: tuple[Kind, ...]  # kinds of the robots
     start: Sequence[Vector]  # [m]
     yaw: Sequence[float]  # [rad]
     dt: float  # step of `Engine.advance` [s]
@@ -40,10 +40,10 @@ class EngineInput:
 class Touch:
     """Beginning of a contact."""
 
-    time: float  # since the engine was built [s]
+    time: float  # time since the engine was built [s]
     first: int  # row
     second: int  # row, or −1 − k for obstacle k of the scene, or −1 − M for a wall of the arena (M obstacles)
-    impulse: float  # of the step in which the contact began [N s]
+    impulse: float  # impulse of the step in which the contact began [N s]
     overlap: float  # [m]
 
 
@@ -67,7 +67,7 @@ class Mirrored(Motion):
 class Engine(ABC):
     """Motion of n robots and of the obstacles."""
 
-    motions: Sequence[Motion]  # of the robots; the same objects for ever
+    motions: Sequence[Motion]  # motions of the robots; the same objects for ever
     obstacles: Sequence[Pose]  # current poses of the obstacles
 
     @abstractmethod
@@ -133,7 +133,7 @@ class World:
     scene: Scene
     engine: EngineFactory
     sensors: Sequence[tuple[str, ...]]  # range sensors, by name (`twins.sensing.range_sensors.sensors`)
-    sensor_noise: float  # of the range sensors, as a multiple of the real noise
+    sensor_noise: float  # noise of the range sensors, as a multiple of the real noise
     mirrored: Sequence[bool]  # robots that really are elsewhere, shown here at their received poses
 
 

@@ -29,7 +29,7 @@ from twins.models.onboard_flight import OnboardFlight
 from twins.models.quadrotor import GRAVITY
 from twins.scene import Scene
 
-SUBSTEPS: Final = 2  # of MuJoCo in a step of the firmware
+SUBSTEPS: Final = 2  # steps of MuJoCo in a step of the firmware
 QUIET_S: Final = 0.1  # time at rest with its motors off after which a drone is no longer simulated
 AT_REST: Final = 0.005  # [m/s], and ten times that in rad/s
 TIPPED: Final = 0.5  # cosine of the largest tilt for a take-off, as in the firmware's supervisor
@@ -169,7 +169,7 @@ class Drones:
         self._control = int(mujoco.mjtState.mjSTATE_CTRL.value)
         self._firmware = Firmware(rows, self._period)
         self.state = np.zeros((rows, FULL_STATE))
-        self._quiet = np.zeros(rows)  # for how long each has been still [s]
+        self._quiet = np.zeros(rows)  # time for which each has been still [s]
         self._wobble = np.zeros((rows, 2))
         self._angles = np.zeros((rows, 3))
         self._yaw, self._heading = np.zeros(rows), np.zeros(rows)  # yaw, and its setpoint [rad]

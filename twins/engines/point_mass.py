@@ -26,7 +26,7 @@ class PointMass(EngineFactory, frozen=True):
         return PointMassEngine(moving_models(stage), stage.dt, stage.scene)
 
 
-TWINLESS: Final = "give the kind a `motion` (docs/plugins.md), or name another body"  # if `has_model` is false
+TWINLESS: Final = "give the kind a `motion` (docs/plugins.md), or name another body"  # remedy without a model
 
 
 MODELS: Final[dict[type, Callable[[Kind, Vector, float], Motion]]] = {

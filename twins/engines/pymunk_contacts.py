@@ -37,11 +37,11 @@ class Contacts:
     numbers: dict[pymunk.Shape, int]  # row of each shape, or negative number of an obstacle
     layers: Layers  # only bodies that overlap in height touch; updated by the engine
     step: float  # [s]
-    skin: float  # of each shape [m]
-    restitution: float  # of an impact; bodies that keep pushing do not bounce
+    skin: float  # skin of each shape [m]
+    restitution: float  # factor of an impact; bodies that keep pushing do not bounce
     slide: float  # speed at which bodies that overlapped from above separate [m/s]
     found: list[Touch]  # new contacts; the engine's own list
-    time: float = 0.0  # of the step, since the engine was built [s]; set by the engine
+    time: float = 0.0  # time of the step, since the engine was built [s]; set by the engine
     _last: dict[tuple[int, int], float] = field(default_factory=dict)  # time of each pair's last contact
     _fresh: dict[tuple[int, int], float] = field(default_factory=dict)  # overlaps of pairs that may begin to touch
 

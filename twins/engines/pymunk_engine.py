@@ -177,11 +177,11 @@ class _RobotBody:
         """Numbers from `at` and, of the wheels, from `wheels` on."""
         self._cells, self._at, self._wheels = cells, at, wheels
         self._force = kind.mass / step  # changes the speed by 1 m/s in one step
-        self._wobble = self._drift = self._target = (0.0, 0.0)  # of the last tick [m], [m/s], [m/s]
+        self._wobble = self._drift = self._target = (0.0, 0.0)  # state of the last tick [m], [m/s], [m/s]
         self._stands = True
         self.flies, self.tall = kind.flies, kind.height  # [m]
         self.foot: pymunk.PivotJoint | None = None  # friction of a landed robot with the floor,
-        self.grip = 0.0  # and its force [N]
+        self.grip = 0.0  # its force [N]
 
     def put(self, position: Vector, yaw: float) -> None:
         """Place the body at rest."""
@@ -266,7 +266,7 @@ def _felt(blow: float, drift: float) -> float:
 class _Space:
     """Pymunk's space, and the numbers of its bodies."""
 
-    cells: memoryview[float]  # of all bodies, WIDTH each; pymunk's own memory
+    cells: memoryview[float]  # state of all bodies, WIDTH each; pymunk's own memory
     obstacles: dict[int, int]  # index of the first number of each obstacle with a plan or a mass
 
     def __init__(self, place: ArenaSpace, contacts: Contacts, iterations: int) -> None:

@@ -52,9 +52,9 @@ class ArenaSpace:
         default_factory=dict
     )  # row of each shape, or −1 − k of obstacle k, or walls
     rows: dict[int, pymunk.Body] = field(default_factory=dict)  # robots
-    wheels: dict[int, pymunk.Body] = field(default_factory=dict)  # of ground robots: shapeless, moves as commanded
+    wheels: dict[int, pymunk.Body] = field(default_factory=dict)  # ground robots: shapeless, moves as commanded
     feet: dict[int, tuple[pymunk.PivotJoint, float]] = field(default_factory=dict)  # grip of landed rows, its force [N]
-    obstacles: dict[int, pymunk.Body] = field(default_factory=dict)  # with a plan or a mass
+    obstacles: dict[int, pymunk.Body] = field(default_factory=dict)  # obstacles that have a plan or a mass
 
     def __post_init__(self) -> None:
         self._floor = self.space.static_body  # first of all bodies, so that bodies of one sort are contiguous

@@ -22,12 +22,12 @@ class Differential(Motion):
     )  # fmt: skip
 
     _base: float  # distance between the wheels [m],
-    _half_base: float  # and half of it
+    _half_base: float  # half of it
     _limit: float  # largest rim speed [m/s]
     _acceleration: float  # largest, of the rim [m/s²]
     _left: float  # rim speeds [m/s],
     _right: float
-    _wanted_left: float  # and what they are commanded to be
+    _wanted_left: float  # commanded speed
     _wanted_right: float
 
     def __init__(self, kind: Kind, start: Vector, yaw: float) -> None:

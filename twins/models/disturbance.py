@@ -108,7 +108,7 @@ class Latency:
     present: bool
     _ticks: int
     _past: list[Setpoint]  # commands of the last ticks, in a ring,
-    _now: int  # and the index of the oldest
+    _now: int  # index of the oldest
 
     def __init__(self, disturbance: Disturbance, dt: float) -> None:
         self._ticks = round((disturbance.latency_s or 0.0) / dt)

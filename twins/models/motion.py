@@ -12,7 +12,7 @@ class Motion:
     __slots__ = ("attitude", "flying", "position", "velocity", "wobble", "yaw")
 
     position: Vector  # the truth, hover jitter included [m]
-    velocity: Vector  # as known by the robot's controller: without hover jitter [m/s]
+    velocity: Vector  # velocity known by the robot's controller: without hover jitter [m/s]
     yaw: float  # [rad]
     flying: bool  # motors on, in the air or about to be
     attitude: Attitude  # unit quaternion from robot to world; NaN: upright

@@ -26,15 +26,15 @@ class OnboardFlight(Motion):
     wind: tuple[float, float]  # acceleration that it adds while the motors are on [m/s²]
     _by_velocity: bool  # setpoints are velocity and yaw rate
     _target: Vector  # setpoint of the position [m],
-    _yaw_setpoint: float  # and of the yaw [rad]
+    _yaw_setpoint: float  # yaw commanded to it [rad]
     _velocity_setpoint: Vector  # [m/s]
     _yaw_rate: float  # [rad/s]
     _landing: bool
     _climbing: bool  # a take-off or landing leads the height of the target,
-    _from: float  # from this height [m]
-    _to: float  # to this one [m];
+    _from: float  # height at the begin [m]
+    _to: float  # height at the end [m]
     _elapsed: float  # time since its begin [s],
-    _climb_s: float  # and its duration [s]
+    _climb_s: float  # duration of the climb [s]
 
     def __init__(self, kind: Kind, start: Vector, yaw: float) -> None:
         """At rest at `start` [m] with `yaw` [rad], motors off."""

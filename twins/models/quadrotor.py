@@ -27,7 +27,7 @@ class Quadrotor(OnboardFlight):
     _step_gain: Vector  # k_v dt
     _tilt: Vector  # share of the acceleration that is reached in a step
     _push: tuple[float, float]  # change of velocity in a step by the wind [m/s]
-    _change: Vector  # of velocity in a step, with the lag of tilting [m/s]
+    _change: Vector  # change of velocity in a step, with the lag of tilting [m/s]
 
     def __init__(self, kind: Kind, start: Vector, yaw: float) -> None:
         flight = kind.motion

@@ -19,8 +19,8 @@ from agents.body.kinds import Kind
 from twins.arrays import Array, Index, clamp
 from twins.scene import Scene
 
-STRIDE: Final = 16.0  # between the bearings of two fans in one sorted array: more than two turns
-SLACK: Final = 1e-9  # [rad] and share of an edge: a ray into the corner of two edges hits one of them
+STRIDE: Final = 16.0  # step between the bearings of two fans in one sorted array: more than two turns
+SLACK: Final = 1e-9  # [rad], and share of an edge: a ray into the corner of two edges hits one of them
 BUDGET: Final = 1 << 18  # pairs: a few MB for each number of a pair
 CROWDED: Final = 8  # objects per ray for which memory is planned; more cost more rounds
 FULL: Final = 2.0 * np.pi
@@ -32,8 +32,8 @@ class Fan:
 
     bearing: Array  # (m,) from the robot's nose, to the left [rad]
     elevation: Array  # (m,) 0, or ±π/2 [rad]
-    height: float  # of the sensor above the robot's position [m]
-    reach: float  # from the robot's centre [m]
+    height: float  # height of the sensor above the robot's position [m]
+    reach: float  # distance from the robot's centre [m]
 
     def __post_init__(self) -> None:
         """Raises ValueError for a ray that is neither level nor vertical."""

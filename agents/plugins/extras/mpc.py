@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     Array = NDArray[np.float64]
 
 AROUND: Final = 1.5  # spacings within which neighbours count, where one of them comes too near
-STRAY: Final = 0.15  # [m] from the plan at which a robot plans from its measured place
+STRAY: Final = 0.15  # [m] distance from the plan at which a robot plans from its measured place
 CATCH_UP: Final = 1.0  # rate at which it returns to its plan [1/s]
 TOGETHER: Final = 1e-6  # [m] places nearer than this have no direction
 
@@ -119,8 +119,8 @@ class Horizon:
         self._np, self._solve, self._period = np, daqp.solve, period
         self._times = period * np.arange(1.0, steps + 1.0)
         since = (self._times[:, None] - self._times) / period  # steps from the end of one to the end of another
-        self._shift = np.where(since >= 0.0, period * period * (since + 0.5), 0.0)  # of places, by accelerations
-        self._gain = np.where(since >= 0.0, period, 0.0)  # of velocities
+        self._shift = np.where(since >= 0.0, period * period * (since + 0.5), 0.0)  # change of places by accelerations
+        self._gain = np.where(since >= 0.0, period, 0.0)  # change of velocities by accelerations
         half = np.einsum("ki,kj->ij", self._shift, self._shift) + effort * np.eye(steps)  # a BLAS has bits of its own
         self._hessian = 2.0 * np.kron(np.eye(2), half)
         self._velocities = np.kron(np.eye(2), self._gain)

@@ -14,7 +14,7 @@ from agents.plugins.law import Control, Law, Memory, RobotFacts, Severity, View
 from agents.plugins.registry import PluginError
 
 OWN: Final = 4  # numbers of a robot's own motion in an observation
-EACH: Final = 4  # and of each neighbour
+EACH: Final = 4  # numbers of each neighbour
 PLANAR: Final = 2  # numbers of an action
 
 Act = Callable[[Sequence[float]], tuple[float, float]]

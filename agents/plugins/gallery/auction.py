@@ -14,7 +14,7 @@ from agents.vectors import NotNegative, Positive
 
 Place = tuple[float, float]
 
-MOST_TASKS: Final = 31  # of 64 numbers, two for each task
+MOST_TASKS: Final = 31  # two of 64 numbers for each task
 
 
 class Auction(Law, frozen=True):
@@ -67,7 +67,7 @@ class Auction(Law, frozen=True):
         called, size = (
             float(len(places)),
             max(robot.count, len(places)),
-        )  # to stay is a task, too, where robots are left
+        )  # staying is a task, too, where robots are left
         if memory["called"][0] != called:
             ways = [dist(here, place) for place in places]
             memory = {**self.begin(robot), "way": (*ways, *(0.0,) * (len(memory["way"]) - len(ways)))}
@@ -84,7 +84,7 @@ class Auction(Law, frozen=True):
             level[best] += 1.0 + floor((profit[best] - second) / self.epsilon)
             bidder[best] = me
             held = [best]
-        for k in held[:-1]:  # after a restart a robot may hold what it bid for before, too
+        for k in held[:-1]:  # a robot may hold, after a restart, what it bid for before
             level[k], bidder[k] = level[k] + 1.0, -1.0
         bids = {"level": tuple(level), "bidder": tuple(bidder)}
         calm = memory["calm"][0] + view.step_s if all(bids[name] == memory[name] for name in bids) else 0.0

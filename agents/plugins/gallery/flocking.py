@@ -10,7 +10,7 @@ from msgspec import Meta
 from agents.plugins.law import Control, Law, Memory, RobotFacts, View
 from agents.vectors import NotNegative, Positive
 
-EPSILON = 5.0  # of the σ-norm, where lengths are in spacings
+EPSILON = 5.0  # parameter of the σ-norm, where lengths are in spacings
 INTERACTION_RANGE = 1.2  # spacings at which robots act on each other
 FLAT = 0.2  # share of the reach below which they do so in full
 

@@ -40,7 +40,7 @@ class Tracking(Law, frozen=True):
     SAYS: ClassVar[Mapping[str, Said]] = {  # 1 cm of threshold: one reading
         "y": Said(unit="m", metre=100.0),
         "Y": Said(metre=100.0),
-        "x": Said(unit="m", metre=100.0, place=0),  # for views
+        "x": Said(unit="m", metre=100.0, place=0),  # unit and scale for views
     }
 
     target: Annotated[

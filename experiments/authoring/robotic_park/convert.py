@@ -31,14 +31,14 @@ from experiments.file.problems import DocumentError
 from experiments.file.reference import written
 
 V = TypeVar("V", bound=Hashable)
-RATE_HZ: Final = 100.0  # of bodies: their position controllers run at that
-ROOM: Final = 0.6  # [m] around starts and shape
+RATE_HZ: Final = 100.0  # rate of bodies: their position controllers run at that
+ROOM: Final = 0.6  # [m] room around starts and shape
 PARK: Final = (4.0, 4.0, 2.5)  # [m] the arena, if there is room in it
 WIDTH: Final = 110
 CALM: Final = 0.98  # share of the largest calm gain that is written: gains are rounded
 SAME: Final = 1e-6  # [m] two ends of a link mean the same
 LEVEL: Final = 0.02  # [m] heights that differ by less are the same
-LAWS: Final = {"distance": "distance", "pose": "displacement"}  # for their kinds of tasks
+LAWS: Final = {"distance": "distance", "pose": "displacement"}  # law for each of their kinds of tasks
 RADIO: Final = re.compile(r"radio://(\d+)/\d+/(?:250K|1M|2M)/[0-9A-Fa-f]{10}")
 
 

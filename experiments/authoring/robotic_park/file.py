@@ -29,7 +29,7 @@ Pose: TypeAlias = tuple[float, float, float]
 When: TypeAlias = Literal["Continuous", "EventBased", "EvenBased"]  # both spellings are theirs
 Number = Annotated[float, Meta(ge=-1e12, le=1e12)]
 Positive = Annotated[float, Meta(gt=0, le=1e12)]
-LENGTH: Final = Meta(min_length=2, max_length=3)  # of a pose
+LENGTH: Final = Meta(min_length=2, max_length=3)  # numbers of a pose
 CENTRAL: Final = "centralized"
 CENTRES: Final = ("origin", "sphere")
 MISSING: Final = "there is no such file"
@@ -39,10 +39,10 @@ PLACES: Final = ("origin", "line", *SURFACES)  # relations that are no robots
 TASKS: Final = ("distance", "pose", "relative_pose")
 NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 TOOLS: Final = ("CPU_Monitoring", "Interface", "Data_Logging", "Supervisor")
-EXAMPLES: Final = {"name": "name: dron01", "type": "type: virtual", "pose": "pose: 0.5, 0.5, 0.0"}  # of keys
-OLDER: Final = {"pose", "config_path", "communication", "task", "agent_ip", "control_mode"}  # of a robot of 2023
+EXAMPLES: Final = {"name": "name: dron01", "type": "type: virtual", "pose": "pose: 0.5, 0.5, 0.0"}  # text of each key
+OLDER: Final = {"pose", "config_path", "communication", "task", "agent_ip", "control_mode"}  # keys of a robot of 2023
 OLDER_LAW: Final = {"gain": 0.25, "upperLimit": 0.08, "lowerLimit": -0.08}
-WORD: Final = re.compile(r'"[^"]*"|#[^\n]*|[{}\[\]]|[^\s{}\[\]"#]+')  # of a Webots world
+WORD: Final = re.compile(r'"[^"]*"|#[^\n]*|[{}\[\]]|[^\s{}\[\]"#]+')  # word of a Webots world
 
 
 class Relation(NamedTuple):
@@ -55,7 +55,7 @@ class Relation(NamedTuple):
 class _Threshold(Struct, frozen=True):
     type: str = "Constant"
     co: Number | None = None
-    threshold: Number | None = None  # for `co`, in 2023
+    threshold: Number | None = None  # value for `co`, in 2023
     ai: Number | Literal["None", "none", "Null", "null"] = 0.0
 
 
@@ -146,7 +146,7 @@ class _Timed(Struct, frozen=True):
 class DriverBehaviour(NamedTuple):
     """Behaviour of the authors' driver of a kind that those in Webots and the central controller lack."""
 
-    plans_alone: bool = False  # with the period of the task, and an origin of its own
+    plans_alone: bool = False  # True with the period of the task, and an origin of its own
     divides: bool = False  # the pull of a neighbour by its distance
 
 
@@ -159,18 +159,18 @@ class ParkRobot(Struct, frozen=True):
     name: str
     type: Literal["physical", "virtual", "digital_twin"]
     pose: Annotated[list[Number], LENGTH] | Annotated[dict[str, Number], LENGTH] | None
-    uri: str = ""  # of a Crazyflie
+    uri: str = ""  # address of a Crazyflie
     agent_ip: str = ""
     ip: str = ""
     port_number: str | int = ""
     positioning: Literal["Intern", "Extern", "MoCap"] = "Intern"
     communication: _Communication = _Communication()
     local_pose: _Timed = _Timed()
-    controller: ParkTrigger = ParkTrigger()  # of the position
+    controller: ParkTrigger = ParkTrigger()  # trigger of the position
     controller_type: str = ""
-    init_theta: Number = 0.0  # [rad] of Kheperas of 2023, with a pose of two numbers
+    init_theta: Number = 0.0  # [rad] heading of Kheperas of 2023, with a pose of two numbers
     task: Task = Task(enable=False)
-    config_path: str = ""  # in an index
+    config_path: str = ""  # path in an index
 
     def __post_init__(self) -> None:
         if not self.kind:
@@ -211,8 +211,8 @@ class _Operation(Struct, frozen=True):
 
 
 class _Section(Struct, frozen=True):
-    type: str = "formation"  # of the experience
-    mode: str = "distributed"  # of the architecture
+    type: str = "formation"  # type of the experience
+    mode: str = "distributed"  # architecture
     enable: bool = False
 
 
@@ -231,7 +231,7 @@ class ParkExperiment:
     mode: str  # physical, virtual, hybrid
     robots: list[ParkRobot]
     central: bool  # decided by a central controller
-    recent: bool  # for drivers of 2024, which read `mars_data`; the first have the law of before, later ones not
+    recent: bool  # True for drivers of 2024, which read `mars_data`; the first have the law of before, later ones not
 
     def period(self, robot: ParkRobot) -> float:
         """Time between decisions of a robot [s]."""
@@ -520,7 +520,7 @@ def _world(file: str, text: str) -> Iterator[tuple[str, Pose]]:
     for word in WORD.findall(text):
         depth -= word in "}]"
         if depth < 2 and not word.startswith("#"):
-            node.append(word)  # of the node itself, not of those in it
+            node.append(word)  # belongs to the node itself, not to those in it
         depth += word in "{["
         if depth == 0 and word == "}":
             behind = {each: node[at + 1 : at + 5] for at, each in enumerate(node)}

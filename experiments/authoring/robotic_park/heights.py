@@ -23,11 +23,11 @@ BULGE: Final = 1.05  # radius of the dome, as a multiple of the farthest robot's
 ATTEMPTS: Final = 40  # random beginnings
 SPREAD: Final = (0.05, 0.1, 0.3, 0.6)  # [m] standard deviations of theirs
 SHAPE_MET: Final = 0.01  # [m] a larger error is another shape
-LOWEST: Final = 0.3  # [m] of a drone
+LOWEST: Final = 0.3  # [m] least height of a drone
 ALOFT: Final = 0.7  # [m] height of drones with a pose without height, as in the authors' files
-REAL_ORIGIN: Final = (0.0, 0.0, 0.8)  # [m] of the origin in the driver of real Crazyflies
+REAL_ORIGIN: Final = (0.0, 0.0, 0.8)  # [m] origin in the driver of real Crazyflies
 MOVED: Final = 0.02  # [m] a height that is another than at the start
-SPACING: Final = 0.6  # [m] between robots with an invented start
+SPACING: Final = 0.6  # [m] distance of robots with an invented start
 
 
 @dataclass(frozen=True)

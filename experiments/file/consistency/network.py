@@ -17,7 +17,7 @@ from experiments.file.choices import chosen
 from experiments.file.problems import Fault, Path, after_the_end, shown, unknown_robot
 
 _SSH: Final = "write it like lab1, pi@192.0.2.7 or ssh://pi@192.0.2.7:2222; all else belongs in ~/.ssh/config"
-_WORDS: Final = {  # of a host: what each is, and how to write it
+_WORDS: Final = {  # parts of a host: what each is, and how to write it
     "address": ("address that ssh takes", _SSH),
     "zenpark": ("path of a command", "write it like zenpark/zenpark, without blanks or options"),
     "lab": ("path of a folder", "write it like zenpark-lab, without blanks"),

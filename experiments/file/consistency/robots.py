@@ -22,7 +22,7 @@ from twins.sensing.range_sensors import sensors
 
 _ROLES: Final = ("recorder", "world", "centre", "vicon")  # processes of a case beside those of its robots
 # words of keys, of [disturbance], of events and of tables of results
-_RESERVED: Final = ("all", "estop", "run", "conductor", WALL, MEAN, WORST, *_ROLES)  # and the kinds of robots
+_RESERVED: Final = ("all", "estop", "run", "conductor", WALL, MEAN, WORST, *_ROLES)  # reserved beside kinds of robots
 
 
 def robot_faults(experiment: Experiment, engine: EngineFactory) -> Iterator[Fault]:

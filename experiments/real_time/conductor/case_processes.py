@@ -37,7 +37,7 @@ class CaseContext:
 
     plan: Plan  # overrides applied
     case: str  # its name, with which the names of its processes and files begin
-    folder: Path  # for the recording, and for the processes' output in logs/
+    folder: Path  # place of the recording, and of the processes' output in logs/
     source: Path  # the experiment file as it was written, for the recording
     endpoints: Sequence[str]  # routers as this machine reaches them
     launcher: Launcher
@@ -101,7 +101,7 @@ class CaseProcesses:
     def __init__(self, context: CaseContext) -> None:
         self._context = context
         self._launcher = context.launcher
-        self._groups = context.plan.experiment.processes  # by process, without the case
+        self._groups = context.plan.experiment.processes  # groups by process, without the case
         self._standins: list[str] = []  # processes of protocol twins, world and motion capture
         count = context.plan.experiment.network.routers
         self._supervised = {
@@ -118,7 +118,7 @@ class CaseProcesses:
         self._addressed, self._reached = context.file, context.plan
         self._joining = context.variant("joining")
         self._parts: list[Path] = []  # recordings of this case, one of each recorder
-        self._abroad: dict[str, Process] = {}  # by host and group
+        self._abroad: dict[str, Process] = {}  # processes by host and group
 
     def prepare(self, *, recorder: bool = True) -> None:
         """Start all but router and robots: the recorder, if one is wanted, then what robots need.

@@ -44,7 +44,7 @@ from experiments.recording.run_folder import SOURCE
 
 SILENT_S: Final = LEASE_S  # limit for a router to answer
 LOOK_S: Final = 0.05
-PORT_CHOICES: Final = 3  # of a run with no `network.listen`: a free port may be taken before its router listens there
+PORT_CHOICES: Final = 3  # attempts of a run with no `network.listen`: others may take a free port before
 
 
 @dataclass(frozen=True)
@@ -74,9 +74,9 @@ class Supervision:
 class Conducted:
     """End of a run in real time."""
 
-    recordings: dict[str, Path]  # of the cases that have begun, by name
-    notes: list[str]  # for the reader
-    failures: list[str]  # that the recordings may not tell: the run is spoilt
+    recordings: dict[str, Path]  # files of the cases that have begun, by name
+    notes: list[str]  # remarks for the reader
+    failures: list[str]  # failures that the recordings may not tell: the run is spoilt
 
 
 def conduct(read: Document, folder: Path, options: RunOptions, user: Supervision) -> Conducted:

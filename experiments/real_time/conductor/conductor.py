@@ -45,7 +45,7 @@ class CaseResult:
     start: float | None
     ready_s: float | None
     lost: tuple[str, ...]
-    failures: tuple[str, ...] = ()  # that its recording may not tell
+    failures: tuple[str, ...] = ()  # failures that its recording may not tell
     # why no further case begins: an operator landed, stopped or held robots, and may be among them; empty: it begins
     halted: str = ""
 
@@ -430,7 +430,7 @@ class Conductor(CaseRun):
         moved = "a take-off was ordered: robots may have moved, all are landed" if flown else "nothing has moved"
         lines = [f"{', '.join(names)}: {what}; {moved}"]
         for name in names:
-            gone = self._robots[name].gone  # then the event of its end has shown the last line of its output
+            gone = self._robots[name].gone  # the event of its end has then shown the last line of its output
             if not gone or self._robots[name].status is not None:
                 last = "" if gone else self._processes.last_line(name)
                 lines.append(f"  {name}: {self._reason(name)}" + (f"\n    {last}" if last else ""))

@@ -35,7 +35,7 @@ ROOM_S: Final = 20.0  # limit for the place of a robot to become free, where no 
 RESTARTS: Final = 3  # a robot that is lost more often is not helped by a restart
 MAX_ORDERS: Final = 100  # orders at once
 INSIST_S: Final = 5.0  # an order that a robot refuses is repeated for this long,
-AGAIN_S: Final = 0.5  # with this period
+AGAIN_S: Final = 0.5  # period
 
 MARGIN_M: Final = 0.1  # free space around a robot that begins to move
 TWIN: Final = "twin"  # a body that is there as long as its process

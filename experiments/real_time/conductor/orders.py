@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 REPLY_S: Final = 1.0
 STARTING_S: Final = 10.0  # limit for routers that were just started: on a busy machine that takes seconds
-LEAD_S: Final = 0.5  # from the order to the common start: every robot has it by then,
-LEAD_EACH_S: Final = 0.01  # and the additional time for each robot
+LEAD_S: Final = 0.5  # time from the order to the common start: every robot has it by then
+LEAD_EACH_S: Final = 0.01  # additional time for each robot
 STOP_ANSWER_S: Final = 2.0
 STOP_AGAIN_S: Final = 0.05
 STOPPED: Final = "done"
@@ -238,7 +238,7 @@ class EmergencyStop:
             declared += [urgent, statuses]
             self.seen = alive(session, keys)
             self.moving = set(self.seen)
-            begun = time.monotonic()  # after the question who is there, which may take as long
+            begun = time.monotonic()  # begun after the question who is there, which may take as long
             watch = pubsub.AliveWatch(session, keys.alive("*"))
             while (now := time.monotonic()) < begun + STOP_ANSWER_S and (
                 self.moving or now < begun + LOOK_S or self._awaited(session, begun)
@@ -268,7 +268,7 @@ class Emergency:
 
     def __init__(self) -> None:
         self.stop: messages.Stop | None = None  # the first one received
-        self.launcher: Launcher | None = None  # of the run's processes, while there is one
+        self.launcher: Launcher | None = None  # launcher of the run's processes, while there is one
 
     def __bool__(self) -> bool:
         return self.stop is not None

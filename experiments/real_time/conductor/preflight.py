@@ -37,13 +37,13 @@ from experiments.real_time.hosts.launcher import LAND_S
 PREFLIGHT: Final = "preflight"  # name of the case, in files and on the console
 POLL_S: Final = 0.02
 SAMPLE_S: Final = 2.0  # time for which robots are observed at rest
-INSPECT_S: Final = 0.2  # from one inspection to the next
+INSPECT_S: Final = 0.2  # pause of two inspections
 HOLD_S: Final = 2.0  # time for which a hopping drone stays at its height
 DRIVE_M_S: Final = 0.05  # speed of the drive
 DRIVE_S: Final = 4.0  # its duration: the way, and time to stop
-RADIUS_M: Final = 1.0  # of its arc, which begins along the robot's nose
+RADIUS_M: Final = 1.0  # radius of its arc, which begins along the robot's nose
 RISEN_M: Final = 0.03  # a climbing drone is stopped when it is this high,
-MOVED_M: Final = 0.02  # and a robot on wheels when it has moved so far
+MOVED_M: Final = 0.02  # way after which a robot on wheels has moved
 TRY_S: Final = 4.0  # time without motion after which a robot is stopped nevertheless
 STOP_LIMIT_S: Final = 3.0  # time limit for a stop
 STANDS_M_S: Final = 0.02  # slower: a robot on wheels stands
@@ -96,7 +96,7 @@ class Inspector(CaseRun):
         super().__init__(context, show)
         self._trials = trials
         self._ended: dict[str, str] = {}  # last words of processes that have ended
-        self._states: dict[str, list[messages.State]] = {}  # of the robots that are observed
+        self._states: dict[str, list[messages.State]] = {}  # states of the robots that are observed
 
     def run(self) -> list[RobotChecks]:
         """Check all robots; those that have moved are down in any case."""

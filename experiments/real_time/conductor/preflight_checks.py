@@ -32,20 +32,20 @@ HOP_OFF_M: Final = 0.08  # farther from this height on average: bad
 HELD: Final = 25  # last states of a hop, by which its height is measured
 # a hop that goes farther to the side is bad, and ends there: of a drone of which the take-off ends at its hop,
 HOP_ASIDE_M: Final = 0.1
-HOP_DRIFT_M: Final = 0.2  # and of one that climbs to a height of its own
+HOP_DRIFT_M: Final = 0.2  # drift of one that climbs to a height of its own
 DRIFTS: Final = f"yaw of its positions against its nose ({FRAME}), propellers, calibration of its IMU"  # remedy
 SLOW: Final = "is slow: its filters, the network, a busy computer"  # remedy
 SLOW_BEFORE: Final = f"motion capture {SLOW}; its stamps need not know of it"
 DRIVE_M: Final = 0.1  # way of the drive of a robot on wheels
 DRIVE_OFF_M: Final = 0.03  # farther from this way: bad
 STEADY_M: Final = 0.02  # largest spread of the position of a robot at rest without a warning,
-UNSTEADY_M: Final = 0.05  # and with which it must not fly
+UNSTEADY_M: Final = 0.05  # noise with which it must not fly
 HOP_LATE_S: Final = 0.1  # positions that a hop shows to be later are bad
 STALE: Final = 0.5  # share of `position_timeout_s`: positions older than this at times are bad
 OLD_MONTHS: Final = 24  # firmware older than this: a warning
 STOP_S: Final = 1.0  # a stop that takes longer is bad
 STOP_WAY_M: Final = 0.05  # a robot on wheels rolls no farther after a stop
-RELEASE: Final = re.compile(r"(20\d\d)\.(\d{1,2})")  # as Bitcraze numbers them
+RELEASE: Final = re.compile(r"(20\d\d)\.(\d{1,2})")  # numbers that Bitcraze gives
 
 
 class Check(msgspec.Struct, frozen=True):
@@ -54,7 +54,7 @@ class Check(msgspec.Struct, frozen=True):
     check: str
     verdict: Verdict
     found: str
-    remedy: str = ""  # of a warning and of a bad one
+    remedy: str = ""  # remedy of a warning and of a bad one
 
 
 class RobotChecks(msgspec.Struct, frozen=True):
@@ -97,12 +97,12 @@ class Tried:
     """Result of a hop, a drive or a stop."""
 
     failure: str = ""  # why it could not be tried, or what went wrong on the way
-    stopped_s: float = math.nan  # from the order to motors off
-    states: list[messages.State] = field(default_factory=list)  # from the order to move on, or from that to stop on
+    stopped_s: float = math.nan  # time from the order to motors off
+    states: list[messages.State] = field(default_factory=list)  # states since the order to move, or since that to stop
     volts: float | None = None  # lowest
     charge: float | None = None  # lowest
-    delay_s: float | None = None  # of positions from outside
-    note: str = ""  # of the body, at the end
+    delay_s: float | None = None  # delay of positions from outside
+    note: str = ""  # note of the body, at the end
 
 
 def positions_of(states: Sequence[messages.State]) -> Array:

@@ -28,10 +28,10 @@ from experiments.real_time.conductor.case_processes import CaseContext
 
 ORDER: Final = tuple(phase.word for phase in Phase)
 AHEAD_S: Final = -0.02  # what comes before it was said is from a clock that is ahead [s],
-BEHIND_S: Final = 0.1  # and what always takes this long, from one that is behind
+BEHIND_S: Final = 0.1  # delay that shows one that is behind
 FROZEN_S: Final = 3.0  # age of a status from which on a robot is shown as silent
 OTHERS_S: Final = 3.0  # limit for the conductor of the case before to leave the network
-LOOK_S: Final = 0.2  # between two looks for it
+LOOK_S: Final = 0.2  # pause of two looks for it
 ROUTER_S: Final = 10.0  # limit for a router that was just started to answer
 MISSED_S: Final = 1.0  # a robot that changes from one router to another is back sooner
 STILL_S: Final = 3.0  # a recorder without a token for longer than this is killed, and started again
@@ -93,7 +93,7 @@ class Progress:
     duration: float
     robots: dict[str, RobotView]
     events: list[messages.Event] = field(default_factory=list)
-    states: list[messages.State] = field(default_factory=list)  # of the last update
+    states: list[messages.State] = field(default_factory=list)  # states of the last update
     silent_since: float = inf  # [s, monotonic] begin of the silence of the routers
     clock: Clock = field(default_factory=Clock)
 
@@ -160,7 +160,7 @@ class NetworkView:
         self._clock = pubsub.publisher(session, keys.clock, messages.JSON)
         self._experiment = pubsub.pose_publisher(session, keys.experiment, messages.JSON)
         self._experiment.put(document.case_document(context.plan, context.case))
-        self.orders = pubsub.Orders(session, keys.run_order, messages.RunOrder)  # to the conductor
+        self.orders = pubsub.Orders(session, keys.run_order, messages.RunOrder)  # orders to the conductor
         self._token = pubsub.alive_token(session, keys.conductor)
         statuses = pubsub.pose_subscriber(session, keys.status("*"), 4096)
         self._statuses = pubsub.Inbox(statuses, messages.Status, keys=keys, robots=self.robots)

@@ -29,7 +29,7 @@ from agents.network.lab import AUTHORITY, REGISTER, ROLES, Identity, LabError, R
 Key = ec.EllipticCurvePrivateKey
 SERVICES: Final[tuple[Role, ...]] = tuple(role for role in ROLES if role != "robot")
 HERE: Final = ("localhost", "127.0.0.1", "::1")
-DAYS: Final = 90.0  # of a certificate
+DAYS: Final = 90.0  # life of a certificate
 AUTHORITY_DAYS: Final = 1826.0  # five years
 MOST_OF_NAME: Final = 24  # characters of a lab's name in its certificate; a common name holds 64
 CLOCKS: Final = timedelta(hours=1)  # how far a robot's clock may be behind

@@ -67,7 +67,7 @@ def _wrong(folder: Path, name: str) -> str:
         return f"others can read {key.name}; revoke it if they have read it"
     try:
         ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT).load_cert_chain(certificate, key, lambda: b"")
-    except OSError:  # of which ssl.SSLError is one
+    except OSError:  # ssl.SSLError is one
         return f"{key.name} is not the key of {certificate.name}"
     return ""
 

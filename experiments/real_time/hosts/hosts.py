@@ -41,10 +41,10 @@ from experiments.recording import clocks, version
 
 HELLO_S: Final = 60.0  # the first start of a zenpark that was changed brings its packages up to date
 ANSWER_S: Final = 5.0
-SAMPLES: Final = 24  # of a clock, before a run,
-DRIFT_SAMPLES: Final = 8  # and in it, with this period:
+SAMPLES: Final = 24  # readings of a clock before a run
+DRIFT_SAMPLES: Final = 8  # readings of a clock in a run, with this period
 DRIFT_S: Final = 1.0  # NTP slews a clock by at most 500 ppm: 0.5 ms
-HANDSHAKES: Final = 6  # at once with one machine: sshd refuses some of more than ten (MaxStartups)
+HANDSHAKES: Final = 6  # connections at once with one machine: sshd refuses some of more than ten (MaxStartups)
 POLL_S: Final = 0.02
 STATION: Final = "host@"  # prefix of the process of the connection to a host: no name of a case has this sign
 
@@ -266,7 +266,7 @@ class Hosts:
         self.obey: Callable[[messages.Stop], object] = launcher.stop  # gets emergency stops that came from a host
         self._run = secrets.token_hex(8)
         self._stations: dict[str, Station] = {}
-        self.by_robot: dict[str, Station] = {}  # of the case
+        self.by_robot: dict[str, Station] = {}  # stations of the case
 
     def join(self, plan: Plan) -> list[HostClock]:
         """Connect the hosts of a case with robots and an address; return their clocks. Errors name all obstacles."""

@@ -24,7 +24,7 @@ PUT_CERTIFICATES: Final = Path(__file__).with_name("put_certificates.sh").read_t
 PUT_WATCHDOG: Final = Path(__file__).with_name("put_watchdog.sh").read_text("utf-8")
 REMOVE_WATCHDOG: Final = Path(__file__).with_name("remove_watchdog.sh").read_text("utf-8")
 WATCHDOG: Final = Path(watchdog.__file__)
-WATCHDOG_FOLDER: Final = "zenpark-watchdog"  # in the home folder on the robot
+WATCHDOG_FOLDER: Final = "zenpark-watchdog"  # name in the home folder on the robot
 
 
 def put(name: str, host: Host) -> str:

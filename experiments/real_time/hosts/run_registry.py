@@ -25,10 +25,10 @@ from agents.network import lab, messages
 from agents.network.endpoints import UNIX, Endpoint
 from agents.user_folder import readable_folders, runtime_folders
 
-MAX_ENTRY_BYTES: Final = 1 << 20  # [bytes] of a file
+MAX_ENTRY_BYTES: Final = 1 << 20  # [bytes] largest file
 KNOCK_S: Final = 0.3  # longest time of a local router to accept a connection
 TELL_S: Final = 3.0  # limit for a run to answer a stop: it waits for its robots meanwhile
-TURN_S: Final = 0.5  # between two looks whether a run has ended
+TURN_S: Final = 0.5  # pause of two looks whether a run has ended
 SOCKET: Final = ".stop"  # suffix of the socket of a run, beside its file
 
 
@@ -39,8 +39,8 @@ class RegisteredRun(msgspec.Struct, frozen=True):
     pid: int
     born: str  # start of the process, in ticks of the operating system; empty if unknown
     since: float  # [s] UTC start of the process
-    title: str  # of the experiment
-    folder: str  # of the results, absolute
+    title: str  # title of the experiment
+    folder: str  # folder of the results, absolute
     endpoints: list[str]  # routers, or members of a mesh, each with its lab
     realm: str = "park"  # first chunk of the keys
     identity: str = "operator"  # name in the certificate that may stop it, in a lab
@@ -84,7 +84,7 @@ def born(pid: int) -> str | None:
     except ProcessLookupError:
         return None
     except (OSError, OverflowError):
-        pass  # of another user
+        pass  # belongs to another user
     return ""
 
 
@@ -109,7 +109,7 @@ def own_entry(
 class StopReport(msgspec.Struct, frozen=True):
     """Answer of a run to an emergency stop that needed no router."""
 
-    robots: list[str]  # that have a running process
+    robots: list[str]  # robots that have a running process
     stopped: list[str]  # those of them that have reported motors off
 
 
@@ -190,7 +190,7 @@ def _take_stops(listener: socket.socket, obey: Obey, over: threading.Event) -> N
 
 
 def _answer(asker: socket.socket, obey: Obey) -> None:
-    with asker, suppress(OSError):  # who asked is gone
+    with asker, suppress(OSError):  # the asker may be gone
         asker.settimeout(TELL_S)
         if text := asker.makefile("rb").readline(messages.MAX_PAYLOAD):
             asker.sendall(msgspec.json.encode(obey(messages.read_stop(text, messages.JSON))))
@@ -212,7 +212,7 @@ class Listing(NamedTuple):
     """Result of a look for runs."""
 
     runs: list[RegisteredRun]
-    folders: list[Path]  # that were looked at
+    folders: list[Path]  # folders that were looked at
     trouble: list[str]  # why a folder could not be looked at
 
     @property

@@ -38,7 +38,7 @@ from experiments.real_time.processes.zygote import NoZygote
 from experiments.recording import version
 
 POLL_S: Final = 0.1
-FROZEN_S: Final = 2.0  # after the loss of the lifeline; a process that is frozen for longer is killed
+FROZEN_S: Final = 2.0  # patience after the loss of the lifeline; a process that is frozen for longer is killed
 REACH_S: Final = 3.0
 USB: Final = Path("/sys/bus/usb/devices")
 RADIO: Final = {"1915:7777": "Crazyradio", "0483:5740": "Crazyflie on USB"}
@@ -51,7 +51,7 @@ class Question(msgspec.Struct, frozen=True, omit_defaults=True):
     bodies: list[str] = []  # robots with devices in question
     lab: str | None = None  # folder of certificates
     names: list[str] = []  # certificates that are asked for, or shown to routers
-    run: RegisteredRun | None = None  # to be listed on this machine
+    run: RegisteredRun | None = None  # entry to be listed on this machine
 
 
 class HostCheck(msgspec.Struct, frozen=True):

@@ -78,7 +78,7 @@ class CentreProcess:
         self._phase, self._start = [IDLE] * len(names), [inf] * len(names)
         self._begun = inf
         self._clock = Clock()
-        self._seq = round(self._clock.utc() * 1e3)  # beyond any number of a former central controller
+        self._seq = round(self._clock.utc() * 1e3)  # greater than any number of a former central controller
         self._sent = self.missed = 0
         self.late_s, self._reported, self._cpu_s = 0.0, 0.0, time.process_time()
 
@@ -156,7 +156,7 @@ class CentreProcess:
 
     def _report(self, t: float) -> None:
         cpu_s = time.process_time()
-        senders = {sender.links[0]: sender for sender in self._poses.senders}  # by row
+        senders = {sender.links[0]: sender for sender in self._poses.senders}  # senders by row
         report = messages.CentreState(
             stamp=self._utc + t,
             robots=[self._names[row] for row in self.guided],

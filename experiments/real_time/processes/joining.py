@@ -58,7 +58,7 @@ class Network(NamedTuple):
     keys: Keys
     endpoints: list[str]
     declared: list[object]  # kept until the session is closed, see `agents.network.shutdown.leave`
-    ownership: OwnershipCheck  # of the `token`
+    ownership: OwnershipCheck  # owner of the `token`
 
 
 @contextmanager
@@ -66,7 +66,7 @@ def joined(
     plan: Plan,
     endpoints: list[str],
     *,
-    name: str,  # of the session, and of its certificate in a lab
+    name: str,  # name of the session, and of its certificate in a lab
     stop: threading.Event,  # ends the wait for a router when it is set
     on_signal: Callable[[], object],  # called by SIGINT and SIGTERM
     lost: threading.Event | None = None,  # set when the lifeline is lost; None: standard input is no lifeline

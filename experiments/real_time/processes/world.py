@@ -71,7 +71,7 @@ class WorldProcess:
         self._engine, hz = plan.engine_name, plan.experiment.rates.body_hz
         self._ticks = Ticks(hz, catch_up=round(SLIP_S * hz), clock=clock)
         self._clock = Clock()
-        self.utc = self._clock.utc()  # at which the clock of the world was 0 [s]
+        self.utc = self._clock.utc()  # time at which the clock of the world was 0 [s]
         self.events = Events(joint, self._clock)
         self.commands = Commands(plan, population, joint, self.events)
         self.states = States(plan, population, joint, self.events, self._clock)

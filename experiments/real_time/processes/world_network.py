@@ -28,10 +28,10 @@ from experiments.real_time.processes.world_population import HOLD_S, WorldBodies
 
 DEPTH: Final = 16_384  # queued commands: those of two hundred robots in 0.8 s
 TRUTH_HZ: Final = 50.0
-LAND_S: Final = 3.0  # without a command for this long a flying robot lands
+LAND_S: Final = 3.0  # time without a command after which a flying robot lands
 CLIMB_S: Final = 15.0  # limit for the first setpoint after a climb, or after a restart of the world
-GONE_S: Final = 1.0  # without a state for this long a mirrored robot is removed
-HANG_S: Final = 0.3  # after a longer suspension of the world silence proves nothing
+GONE_S: Final = 1.0  # time without a state after which a mirrored robot is removed
+HANG_S: Final = 0.3  # suspension of the world from which silence proves nothing
 ANSWER_S: Final = 1.0  # limit for robots to send their state
 STRANGERS: Final = 100  # distinct unknown robots that are reported
 IN_AIR_M: Final = 0.05
@@ -120,7 +120,7 @@ class Commands:
         holding, tired = set[int](), list[int]()
         for row, motion in enumerate(body.engine.motions):
             hold_s = population.hold_s[row]
-            if self._cut_off:  # without a router no command arrives: robots hold, but need not land
+            if self._cut_off:  # no command arrives: robots hold, but need not land
                 self.quiet[row] = max(self.quiet[row], t - HOLD_S - 1e-3)
                 hold_s = HOLD_S
             silence = t - self.quiet[row]
@@ -272,7 +272,7 @@ class States:
 class Publications:
     """Positions, true poses, range readings and contacts, published after each step."""
 
-    contacts = 0  # that have begun
+    contacts = 0  # number that have begun
 
     def __init__(self, plan: Plan, population: WorldBodies, joint: Network, events: Events) -> None:
         session, keys, experiment = joint.session, joint.keys, plan.experiment
@@ -334,7 +334,7 @@ class _Mirror:
     place: Vector = UNKNOWN  # [m], NaN while it is absent
     velocity: Vector = ZERO  # [m/s]
     yaw: float = 0.0  # [rad]
-    received_at: float = -inf  # of the last state [s]
+    received_at: float = -inf  # arrival of the last state [s]
 
 
 def _rounded(position: Vector, yaw: float) -> tuple[Vector, float]:

@@ -21,17 +21,17 @@ from twins import scene
 from twins.body import TwinBody
 
 WALL: Final = "wall"  # name of the walls of the arena in contacts
-HOLD_S: Final = 0.5  # without a command for this long a flying robot holds its position
+HOLD_S: Final = 0.5  # time without a command after which a flying robot holds its position
 
 
 class WorldBodies:
     """The robots of a world by their rows, and all that may happen to them."""
 
-    names: tuple[str, ...]  # of the n rows: the robots of the experiment
+    names: tuple[str, ...]  # names of the n rows: the robots of the experiment
     carried: tuple[bool, ...]  # rows that are simulated here; the others are mirrors
     seen: tuple[bool, ...]  # rows with simulated range sensors: carried ones, and those that ask for them
     hold_s: tuple[float, ...]  # [s] time without a command after which a row is held; infinity: it drives on
-    body: TwinBody  # of these rows
+    body: TwinBody  # body of these rows
     time: float  # [s] simulated since the start
     states: Sequence[BodyState]  # last reading of the body
 

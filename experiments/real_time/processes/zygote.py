@@ -34,14 +34,14 @@ from agents.user_folder import runtime_folder
 MODULE: Final = "experiments.real_time.processes.zygote"
 ROBOT: Final = "experiments.real_time.processes.robot"
 PRELOADED: Final = (ROBOT, "numpy.random", "twins.body", "bridges.external")
-SWITCH: Final = "ZENPARK_ZYGOTE"  # in the environment: 0 spawns each process
+SWITCH: Final = "ZENPARK_ZYGOTE"  # variable of the environment: 0 spawns each process
 ONE_THREAD: Final = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}  # numpy starts others at its import
 TITLE: Final = 4096  # room for the command line that tools show [bytes]
 LIFELINE: Final = 0  # standard input
-NAME: Final = 15  # of a process, as `ps` and `top` show it [bytes]
+NAME: Final = 15  # longest name of a process, as `ps` and `top` show it [bytes]
 PACKET: Final = 65536  # [bytes]
-REPLY_S: Final = 10.0  # for an answer; before the first one the zygote imports
-CODE_S: Final = 2.0  # for the exit code of a process that has ended
+REPLY_S: Final = 10.0  # patience for an answer; the zygote imports before the first one
+CODE_S: Final = 2.0  # patience for the exit code of a process that has ended
 UNKNOWN: Final = 256  # exit code of a process after the end of its zygote
 
 
@@ -82,7 +82,7 @@ def command(listener: socket.socket) -> list[str]:
 class Request(NamedTuple):
     """Module to run, as `python -m MODULE ARGUMENT...` does."""
 
-    name: str  # of the process, for `ps`
+    name: str  # name of the process, for `ps`
     module: str
     arguments: Sequence[str]
     environment: Mapping[str, str] = {}  # added to that of the zygote
@@ -173,7 +173,7 @@ def stand_for(run: str, arguments: Sequence[str]) -> int | None:
         signal.signal(number, lambda number, _: forked.send_signal(number))
     code = forked.wait()
     if code < 0:
-        with contextlib.suppress(OSError):  # that of SIGKILL cannot be set
+        with contextlib.suppress(OSError):  # the handler of SIGKILL cannot be set
             signal.signal(-code, signal.SIG_DFL)
         os.kill(os.getpid(), -code)
     return min(code, 255)
@@ -225,7 +225,7 @@ class Zygote:
                 return request
         except (OSError, ValueError, TypeError, NoZygote) as error:
             print(f"zygote: nothing was forked: {error}", file=sys.stderr)
-            asker.close()  # which is the answer
+            asker.close()  # closing is the answer
             return None
         finally:
             for fd in streams:
@@ -277,7 +277,7 @@ def main() -> None:
     for module in PRELOADED:
         import_module(module)
     del sys.modules[ROBOT]  # it runs as the main module of the new process
-    os.register_at_fork(after_in_child=import_module("numpy.random").seed)  # as the standard library's `random` does
+    os.register_at_fork(after_in_child=import_module("numpy.random").seed)  # done by `random` as well
     gc.collect()
     gc.freeze()  # the collector would write to the pages that all share
     request = Zygote(socket.socket(fileno=int(sys.argv[1]))).serve()

@@ -41,7 +41,7 @@ class Codec(Generic[S]):
 
     name: str  # type of the message, such as `zenpark_msgs/msg/State`
     schema: str  # its definition as ros2msg text, with the definitions it needs
-    encode: Callable[[S], bytes]  # from the struct to CDR with its encapsulation header; raises `Unencodable`
+    encode: Callable[[S], bytes]  # makes CDR with its encapsulation header of the struct; raises `Unencodable`
     decode: Callable[[bytes], S]  # the way back; raises `Undecodable`
 
 
@@ -110,7 +110,7 @@ class _Writer:
         if not info.fields:
             raise TypeError(f"{kind.__name__} has no fields; a ROS message needs at least one")
         made, own = self._name("T", kind), f"{PACKAGE}/{kind.__name__}"
-        self.definitions[own] = self.definitions.get(own, "")  # before those inside it
+        self.definitions[own] = self.definitions.get(own, "")  # entered before those inside it
         parts, lines = [], []
         for field in info.fields:
             where, inner, name = f"{kind.__name__}.{field.name}", f"{value}.{field.name}", field.encode_name

@@ -68,7 +68,7 @@ MARKERS_SCHEMA: Final = SEPARATOR.join(
 
 CUBE, CYLINDER, LINE_STRIP, LINE_LIST, TEXT = 1, 3, 4, 5, 9  # types of a marker
 Colour = tuple[int, int, int]
-Draw = Callable[[float, dict[str, Vector]], "Sequence[Marker]"]  # of the time [s, UTC] and the places [m] of robots
+Draw = Callable[[float, dict[str, Vector]], "Sequence[Marker]"]  # asks for the time [s, UTC] and the places [m]
 LEVEL: Final[Setpoint] = (1.0, 0.0, 0.0, 0.0)  # quaternion w, x, y, z
 
 
@@ -82,9 +82,9 @@ class Marker:
     colour: Colour
     opacity: float = 1.0
     frame: str = FRAME
-    position: Vector = (0.0, 0.0, 0.0)  # [m] in its frame
+    position: Vector = (0.0, 0.0, 0.0)  # [m] place in its frame
     attitude: Setpoint = LEVEL
-    points: Sequence[Vector] = ()  # [m] of lines
+    points: Sequence[Vector] = ()  # [m] points of lines
     colours: Sequence[Colour] = ()  # one a point, or none
     text: str = ""
     # CDR behind the stamp, by number and place in the message modulo 8: most markers are drawn again and again

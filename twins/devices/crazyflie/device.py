@@ -19,7 +19,7 @@ from twins.devices.crazyflie.radio import HOST, Air, RadioLink
 from twins.devices.crazyflie.vehicle import Vehicle
 from twins.devices.device import Device, DeviceRequest, FaultyLink
 
-SCANNED_PORTS: Final = range(19850, 19860)  # at which cflib looks for simulations
+SCANNED_PORTS: Final = range(19850, 19860)  # ports at which cflib looks for simulations
 MAX_PACKET_BYTES: Final = 64  # [bytes]
 AT_ONCE: Final = 64  # packets read from one socket before the others are served
 RECEIVE_BYTES: Final = 1 << 20
@@ -102,7 +102,7 @@ class CrazyflieTwin(Device):
         self.lines = self._open_links(request)
         self.drones = [Drone(vehicle, line.send) for vehicle, line in zip(vehicles, self.lines, strict=True)]
         self.addresses = tuple(line.address for line in self.lines)
-        self._gaps = [sorted(vehicle.settings.gaps) for vehicle in vehicles]  # that have not begun
+        self._gaps = [sorted(vehicle.settings.gaps) for vehicle in vehicles]  # gaps that have not begun
         self._took_off = [inf] * len(vehicles)  # [s] first time of each
 
     def _open_links(self, request: DeviceRequest) -> Sequence[UdpLink | RadioLink]:

@@ -48,7 +48,7 @@ CONSOLE_TEXTS: Final = {  # parameters that make a Crazyflie write to its consol
 }
 Send = Callable[[Port, int, bytes], None]
 LEAST: Final = "posCtlPid.thrustMin"
-SIGMA: Final = "locSrv.extPosStdDev"  # of external positions [m]
+SIGMA: Final = "locSrv.extPosStdDev"  # noise of external positions [m]
 MAX_WHOLE_PARAMETER: Final = 2.0**32  # upper bound of whole parameters, far above any length, angle or speed
 LEAST_THRUST, MOST_THRUST = 1000, 60000
 TAKEOFFS: Final = (HighLevel.TAKEOFF, HighLevel.OLD_TAKEOFF, HighLevel.TAKEOFF_VELOCITY)
@@ -337,7 +337,7 @@ class Drone:
 
     def _plan(self, command: int, group: int, data: bytes) -> LogStatus:
         vehicle, planner = self.vehicle, self.vehicle.planner
-        if command == HighLevel.DEFINE:  # for all groups: the number of the trajectory is in the place of the mask
+        if command == HighLevel.DEFINE:  # the number of the trajectory is in the place of the mask
             return self.trajectories.define(group, *crtp.DEFINE.unpack_from(data))
         if command == HighLevel.GROUP:
             if (number := self.parameters.number.get("hlCommander.groupmask")) is not None:

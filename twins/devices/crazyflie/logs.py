@@ -18,8 +18,8 @@ from twins.devices.crazyflie.tables import LOG_TYPES, PACKINGS, VariableTable, p
 from twins.devices.crazyflie.vehicle import Vehicle
 from twins.models.quadrotor import GRAVITY
 
-ROOM: Final = (2.0, 2.0, 2.5)  # [m] from the origin to the walls, and height: measured by the Multi-ranger
-SENSOR_RANGE_M: Final = 4.0  # [m] of its sensors
+ROOM: Final = (2.0, 2.0, 2.5)  # [m] distance of the walls from the origin, and height: measured by the Multi-ranger
+SENSOR_RANGE_M: Final = 4.0  # [m] range of its sensors
 NOTHING_MM: Final = 32766  # reading when nothing is in reach
 SENSORS: Final = {"front": 0.0, "left": 0.5 * math.pi, "back": math.pi, "right": 1.5 * math.pi}
 MILLISECONDS: Final = 0xFFFFFF
@@ -33,7 +33,7 @@ Numbers = Vector | Array
 class Block:
     """One log block."""
 
-    variables: list[tuple[Read, str]] = field(default_factory=list)  # and the type in which each is sent
+    variables: list[tuple[Read, str]] = field(default_factory=list)  # value, and the type in which each is sent
     period: float = 0.0  # [s], 0 while it is stopped
     next: float = 0.0
 

@@ -20,7 +20,7 @@ ACTIVE: Final = 0x1000  # address of the list of active anchors
 ANCHOR_PAGES: Final = 0x2000
 
 BOARDS: Final = {"bcDWM1000": 0x06, "bcMultiranger": 0x0C, "bcFlow2": 0x0F, "bcLighthouse4": 0x10}  # product numbers
-DECK_VERSION: Final = 3  # of the list of deck memories, which is empty otherwise
+DECK_VERSION: Final = 3  # version of the list of deck memories, which is empty otherwise
 
 SIZES: Final = {
     MemoryKind.EEPROM: 0x20,
@@ -49,7 +49,7 @@ class Memories:
         self._bytes[MemoryKind.DECKS][0] = DECK_VERSION
         settings = b"0xBC" + struct.pack("<BBBffBI", 1, 80, 2, 0.0, 0.0, 0xE7, 0xE7E7E7E7)  # radio, trim, address
         self._bytes[MemoryKind.EEPROM][: len(settings) + 1] = settings + bytes((sum(settings) % 0x100,))
-        self.write_errors = 0  # of the tester: bytes that are not their address
+        self.write_errors = 0  # errors of the tester: bytes that are not their address
         self.stored = (0, 0)  # masks of the stations with a geometry, and a calibration, that survives a restart
 
     def restart(self) -> None:

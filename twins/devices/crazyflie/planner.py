@@ -18,7 +18,7 @@ from agents.vectors import Pose, Vector, clamp
 from twins.arrays import Array
 
 SHORTEST: Final = 0.01  # [s]
-ORDER: Final = 7  # of the polynomials
+ORDER: Final = 7  # degree of the polynomials
 
 Piece = tuple[float, Array]  # duration [s], coefficients (4, ORDER + 1) of x, y, z, yaw, constant first
 
@@ -67,7 +67,7 @@ class OnboardPlanner:
 
     def __init__(self) -> None:
         self.plan = PlannerState.IDLE
-        self._begin, self._span = 0.0, 1.0  # of the current piece [s]
+        self._begin, self._span = 0.0, 1.0  # begin and length of the current piece [s]
         self._coefficients = np.zeros((4, ORDER + 1))
         self._powers: list[list[float]] = []  # the same, of the four axes, highest power first
         self._rest: list[Piece] = []  # pieces after the current one

@@ -20,7 +20,7 @@ from twins.devices.device import Faults, FaultyLink
 HOST: Final = "127.0.0.1"
 CHANNEL: Final = 80
 RATE: Final = "2M"
-MAX_DATAGRAM_BYTES: Final = 64  # [bytes] of a datagram
+MAX_DATAGRAM_BYTES: Final = 64  # [bytes] longest datagram
 AT_ONCE: Final = 64  # exchanges before the models advance
 NOTHING: Final = bytes((NULL, 0x01, 0x00))  # acknowledgement of a drone with nothing to send
 LOG_DATA: Final = header(Port.LOG, 2)
@@ -32,7 +32,7 @@ class RadioLink(FaultyLink[bytes]):
     def __init__(self, random: np.random.Generator, faults: Faults, row: int) -> None:
         super().__init__(faults, random)
         self.own = bytes.fromhex(f"E7E7E7E7{row + 1:02X}")  # address on the air
-        self.address = ""  # for the bridge
+        self.address = ""  # address for the bridge
         self.queue: deque[bytes] = deque()
         self.dropped = 0  # log packets that found the queue full
         self.safelink = False

@@ -15,9 +15,9 @@ from agents.protocols.crtp import Info
 LEVEL_S: Final = 0.5  # an older low-level setpoint is ignored: the drone levels out
 LOCK_S: Final = 2.0  # time without setpoints after which the drone locks
 FLYING_S: Final = 2.0  # time after the last turn of its motors for which a drone counts as flying
-LANDED_S: Final = 3.0  # from landing to disarming
-PREFLIGHT_S: Final = 30.0  # from arming to disarming, if it does not take off
-SPIN_UP_S: Final = 0.5  # from the arming of brushless motors to their readiness
+LANDED_S: Final = 3.0  # time from landing to disarming
+PREFLIGHT_S: Final = 30.0  # time from arming to disarming, if it does not take off
+SPIN_UP_S: Final = 0.5  # time from the arming of brushless motors to their readiness
 WATCHDOG_S: Final = 1.0  # longest time between two packets of the emergency watchdog
 
 
@@ -29,9 +29,9 @@ class SupervisorState(IntEnum):
     FLYING = 2
     LEVEL = 3  # setpoints have ceased: height and attitude are held, not the position
     LANDED = 4
-    LOCKED = 5  # until a restart
+    LOCKED = 5  # lasts until a restart
     ARMING = 6  # brushless motors spin up: armed, but not yet allowed to fly
-    CRASHED = 7  # until it stands upright again and recovery is requested
+    CRASHED = 7  # lasts until it stands upright again and recovery is requested
 
 
 MAY_FLY: Final = (SupervisorState.READY, SupervisorState.FLYING, SupervisorState.LEVEL, SupervisorState.LANDED)

@@ -69,7 +69,7 @@ class Trajectories:
             rotation = np.array(
                 [[cos, -sin, 0.0, 0.0], [sin, cos, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
             )
-            shift = np.append(start[:3] - first[:3], turn)  # as the firmware: of the start before it is turned
+            shift = np.append(start[:3] - first[:3], turn)  # shift before the turn, as the firmware has it
             pieces = [(span, rotation @ coefficients) for span, coefficients in pieces]
             for _, coefficients in pieces:
                 coefficients[:, 0] += shift
@@ -96,7 +96,7 @@ def _compressed(memory: bytes) -> list[Piece]:
             count = POINTS[header >> 2 * axis & 3]
             points = [end[axis], *(SCALES[axis] * point for point in struct.unpack_from(f"<{count}h", memory, at))]
             at += 2 * count
-            for j in range(count + 1):  # from the Bernstein basis to powers of t
+            for j in range(count + 1):  # step from the Bernstein basis to powers of t
                 total = sum((-1) ** (i + j) * comb(j, i) * points[i] for i in range(j + 1))
                 coefficients[axis, j] = comb(count, j) * total / span**j
             end[axis] = points[-1]

@@ -29,15 +29,15 @@ from twins.models.quadrotor import GRAVITY, Quadrotor
 SETTLING_S: Final = 0.1  # time constant of the convergence of estimate and variance with measurements
 PRECISE: Final = 1e-5  # [m²] final variance
 LOST: Final = 100.0  # [m²] variance after a reset
-GROWTH: Final = 1.0  # [m²/s] of the variance without measurements
-DRIFT: Final = (0.05, -0.05)  # [m/s²] along x, y: 0.3° of error in the attitude, twice
+GROWTH: Final = 1.0  # [m²/s] growth of the variance without measurements
+DRIFT: Final = (0.05, -0.05)  # [m/s²] error along x, y: 0.3° of error in the attitude, twice
 FRESH_S: Final = 0.5  # age of external positions from which the attitude drifts
 # [m²/s³] noise of the acceleration, horizontal and vertical: the firmware's 0.5 and 1 m/s², drawn every millisecond
 HORIZONTAL_NOISE, VERTICAL_NOISE = 2.5e-4, 1e-3
 SLOW: Final = 1e-4  # [m²/s²] variance of the velocity after a reset
 SHARPEST: Final = 1e-4  # [m] least standard deviation of external positions
 THROWN: Final = 1.5  # [m] a position farther from the estimate throws it in flight,
-THROWN_TURN: Final = 2.0  # by this yaw [rad]
+THROWN_TURN: Final = 2.0  # yaw by which it is thrown [rad]
 SEEN_TURN: Final = 0.5  # share of a wrong yaw in the estimate: roll and pitch are corrected for the rest
 
 
@@ -142,15 +142,15 @@ class Estimator:
 
 # voltage [V] of a battery at rest by charge, in steps of 10 %: the curve from which the firmware gives pm.batteryLevel
 VOLTS: Final = (3.0, 3.78, 3.83, 3.87, 3.89, 3.92, 3.96, 4.0, 4.04, 4.1, 4.2)
-SAG_V: Final = 0.3  # under the load of hovering: 2 A through 0.15 ohm
+SAG_V: Final = 0.3  # drop under the load of hovering: 2 A through 0.15 ohm
 LOW_V: Final = 3.2  # the firmware's own threshold
-LOW_S: Final = 5.0  # from the first voltage below it to the state "low"
+LOW_S: Final = 5.0  # time from the first voltage below it to the state "low"
 IMPACT: Final = 4.2  # [m/s] a robot that hits the floor faster (a fall of 0.9 m) ends on its side
 SKATING: Final = 2.0  # [m/s] largest speed of that
 TRIM: Final = (radians(0.4), radians(-0.3))  # roll, pitch of a robot at rest [rad]: none is exactly level
 STEEPEST_ACCELERATION: Final = GRAVITY * tan(STEEPEST)  # [m/s²] horizontal
 LEANING_S: Final = 0.05  # time constant of the attitude
-ENOUGH_ANCHORS: Final = 4  # for three dimensions and a common clock
+ENOUGH_ANCHORS: Final = 4  # anchors for three dimensions and a common clock
 
 
 class Battery:

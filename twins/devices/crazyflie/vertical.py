@@ -34,7 +34,7 @@ class VerticalLoops:
 
     def reset(self) -> None:
         """Motors off."""
-        self.thrust = 0.0  # of the motors, of 65,535
+        self.thrust = 0.0  # thrust of the motors, of 65,535
         self._height = self._climb = 0.0  # integrals [m s], [m]
 
     @property
