@@ -104,6 +104,14 @@ class Airborne:
         return list(dict.fromkeys(self.calls))
 
 
+def clocked(monkeypatch: pytest.MonkeyPatch, clock: ManualClock, *, asks_for_owners: bool = True) -> None:
+    """Let the loops of processes take their time from a clock; with `asks_for_owners` after a standstill, too."""
+    for module in (loop, descent):
+        monkeypatch.setattr(module, "time", clock)
+    for module in (loop, name_ownership) if asks_for_owners else (loop,):
+        monkeypatch.setattr(module, "uptime", clock.monotonic)
+
+
 class Stage:
     """A process on a simulated clock.
 
@@ -125,10 +133,7 @@ class Stage:
         **changes: Any,
     ) -> None:
         self.net, self.clock = net, clock or ManualClock(BEGIN)
-        for module in (loop, descent):
-            monkeypatch.setattr(module, "time", self.clock)
-        for module in (loop, name_ownership) if asks_for_owners else (loop,):
-            monkeypatch.setattr(module, "uptime", self.clock.monotonic)
+        clocked(monkeypatch, self.clock, asks_for_owners=asks_for_owners)
         self.body = twins(experiment, names)
         self.runtime = process(experiment, self.body, names, **changes)
         self.orders: list[tuple[float, str]] = []

@@ -4,9 +4,10 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import repeat
 from typing import Any
 
 import psutil
@@ -16,21 +17,28 @@ from agents.network import messages
 from agents.network.keys import Keys
 from agents.network.name_ownership import NameKeeper
 from agents.robot import Robot
-from agents.runtime import loop
+from agents.runtime import loop, watchdog
 from agents.runtime.descent import Descent, DescentTiming
 from agents.runtime.watchdog import HUNG, Watchdog
 from agents.ticks import Ticks
 from experiments.definition.experiment import Arena
 from experiments.definition.plan import Plan
-from tests.agents.runtime.process import DRONE, QUICK, Airborne, process
+from tests.agents.runtime.process import DRONE, QUICK, Airborne, clocked, process
 from tests.cases import mostly_slow
 from tests.commands import started
 from tests.fuzz.messages import sent
 from tests.network import Net
 from tests.small import small
-from tests.waiting import until
+from tests.waiting import ManualClock, until
 
 STOP = sent("park/estop", messages.Stop("a test", "to see"))[0]
+
+
+@pytest.fixture(autouse=True)
+def clock(monkeypatch):
+    """Of the loops; that of the watchdogs is real."""
+    clocked(monkeypatch, clock := ManualClock(1000.0, step=1e-4))
+    return clock
 
 
 def run_to_end(body: Airborne, silence_s: float = 5.0, timing: DescentTiming = QUICK) -> None:
@@ -107,7 +115,7 @@ def test_emergency_stop_during_a_descent():
 def test_hanging_read_is_landed_by_the_watchdog():
     body = Airborne()
     body.looks = lambda: until(lambda: body.landing)
-    run_and_break(body, silence_s=0.1)
+    run_and_break(body, silence_s=0.3)
     assert body.order == ["open", "land", "stop", "close"]
 
 
@@ -134,59 +142,65 @@ def test_stop_between_ticks_yields_the_processor(monkeypatch):
     assert done == [done[0], loop.STOP_YIELD_S, done[0]]
 
 
-class Kennel:
-    """A watchdog and its body, which writes down what it is told, and hangs in what it was asked to hang in."""
+class Kennel(ManualClock):
+    """A watchdog on a clock of its own, and its body, which writes down what it is told, and hangs in what is `stuck`.
 
-    def __init__(self, down_s: float = 10.0, silence_s: float = 0.1, stuck: str = "") -> None:
+    `watch` lets it look at its loop as often as `life` yields; what is not stuck is done before the next look.
+    """
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, down_s: float = 10.0, stuck: str = "") -> None:
+        super().__init__()
+        monkeypatch.setattr(watchdog, "time", self)
         self.orders, self.alarms, self.ends = [], [], []
         self.stuck, self.never = stuck, threading.Event()
         self.land, self.stop = partial(self.take, "land"), partial(self.take, "stop")
-        self.dog = Watchdog(
-            self, (0, 1), alarm=self.alarms.append, silence_s=silence_s, down_s=down_s, end=self.ends.append
-        )
+        self.dog = Watchdog(self, (0, 1), alarm=self.alarms.append, silence_s=0.5, down_s=down_s, end=self.ends.append)
+        self.dog._over = self  # type: ignore[assignment]
 
     def take(self, what: str, rows: Sequence[int]) -> None:
         assert rows == (0, 1)
         self.orders.append(what)
         if self.stuck == what:
-            self.never.wait(10.0)
+            self.never.wait(30.0)
 
-    def __enter__(self):
-        self.dog.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.dog.end()
+    def watch(self, life: Iterator[None]) -> None:
+        self.life = life
+        self.dog._watch()
         self.never.set()
 
-    def beat_for(self, seconds: float) -> None:
-        end = time.monotonic() + seconds
-        until(lambda: self.dog.beat() or time.monotonic() > end)
+    def wait(self, seconds: float) -> bool:
+        for what, thread in self.dog._at_work.items():
+            if what != self.stuck:
+                thread.join()
+        self.sleep(seconds)
+        return next(self.life, self) is self
 
 
-@pytest.mark.slow
-def test_hanging_loop_is_landed_and_may_recover():
-    with Kennel(silence_s=0.5) as kennel:
-        kennel.beat_for(1.0)
+def test_hanging_loop_is_landed_and_may_recover(monkeypatch):
+    kennel = Kennel(monkeypatch)
+
+    def life() -> Iterator[None]:
+        for _ in range(10):
+            yield kennel.dog.beat()
         assert (kennel.orders, kennel.alarms, kennel.dog.tripped) == ([], [], "")
-        until(lambda: kennel.orders and kennel.alarms)
-        assert kennel.dog.tripped == kennel.alarms[0]
+        while not kennel.orders:
+            yield
+        assert kennel.alarms == [kennel.dog.tripped]
         assert kennel.dog.tripped.startswith("its control loop hangs: no tick for ")
         assert kennel.dog.forgive() == kennel.alarms[0]
         assert not kennel.dog.tripped
-        kennel.beat_for(1.0)
-    assert (set(kennel.orders), len(kennel.alarms)) == ({"land"}, 1)
-    assert not kennel.ends
+        for _ in range(10):
+            yield kennel.dog.beat()
+
+    kennel.watch(life())
+    assert (kennel.orders, len(kennel.alarms), kennel.ends) == (["land"], 1, [])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("stuck", ["", "land", "stop"])
-def test_endless_hang_is_cut_and_ended(stuck):
-    with Kennel(down_s=0.8, stuck=stuck) as kennel:
-        until(lambda: kennel.ends)
-    assert (kennel.ends, kennel.orders[-1]) == ([HUNG], "stop")
-    assert kennel.orders.count("stop") == 1
-    assert kennel.orders.count("land") == 1 if stuck == "land" else kennel.orders.count("land") >= 2
+def test_endless_hang_is_cut_and_ended(stuck, monkeypatch):
+    kennel = Kennel(monkeypatch, down_s=0.8, stuck=stuck)
+    kennel.watch(repeat(None))
+    assert (kennel.ends, kennel.orders) == ([HUNG], ["land"] * (1 if stuck == "land" else 2) + ["stop"])
 
 
 FROZEN = """
