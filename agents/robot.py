@@ -68,7 +68,8 @@ class Robot:
         speech = None if stepping is None or assignment.guided else stepping.speech
         self.transmitter = Transmitter(assignment.trigger, assignment.predictor, kind, speech)
         self.hazards, self.landing = Hazards(kind, limits), Landing(assignment)
-        self._detector, self._preflight, self._status = Detector(assignment), Preflight(assignment), RobotStatus()
+        self._detector, self._preflight = Detector(assignment), Preflight(assignment)
+        self._status = RobotStatus()
         self._controller, self._filter = PositionController(kind), SetpointFilter(kind, limits)
         self._continuity, self._external = Continuity(kind), ExternalPositions(kind)
         self._flies, self._predicts = kind.flies, assignment.predictor is not HOLD
@@ -294,11 +295,13 @@ class Robot:
     def _step(self, t: float, stepping: Stepping) -> None:
         """Before its first question on a tick: a law that says something steps, so that it says what is new."""
         life, now = self.lifecycle, self.now
-        running, start, tick = life.phase == RUNNING, life.start_at, self.tick
+        running = life.phase == RUNNING
+        start, tick = life.start_at, self.tick
         joins = life.phase == AIRBORNE and self._run_began < t
         if joins:
             start, tick = self._run_began, round((t - self._run_began) * self.assignment.body_hz)
-        stepping.moves, stepping.scan, stepping.tick = running and not self._holds(), now.state.scan, tick
+        stepping.moves, stepping.scan = running and not self._holds(), now.state.scan
+        stepping.tick = tick
         if stepping.speech is not None and (running or joins) and not now.invalid and self.guidance is None:
             self.goals.step(t, now.position, now.velocity, now.yaw, start)
 
@@ -355,7 +358,8 @@ class Robot:
         """Find the causes of hazards on this tick; returns whether there are any, or hazards under way. Quiet."""
         life, status, guidance = self.lifecycle, self._status, self.guidance
         phase = life.phase
-        status.ordered, status.setpoint, status.not_finite = self._ordered, self.setpoint, self._filter.not_finite
+        status.ordered, status.setpoint = self._ordered, self.setpoint
+        status.not_finite = self._filter.not_finite
         status.goal_height, status.aside = self.goal[2], self.landing.aside
         status.cruising, status.climbing = AIRBORNE <= phase <= RUNNING, life.climbing
         status.landing = phase == LANDING
@@ -409,7 +413,8 @@ class Robot:
 
     def _ready(self) -> bool:
         """Whether nothing is missing for a take-off; asked before it alone. Raises PluginError as `rehearse`."""
-        t, life, assignment = self.now.t, self.lifecycle, self.assignment
+        t = self.now.t
+        life, assignment = self.lifecycle, self.assignment
         if life.phase == IDLE and not self.now.invalid:
             rehearse(assignment, self.goals, self.transmitter, self._perception, position=self.now.position, t=t)
         lacks = False

@@ -129,7 +129,8 @@ class ExternalBody(Body):
             )
         except ExplainedError as error:
             raise BodyError(f"{', '.join(self._names)}: {error}") from None
-        session, keys, mime = self._session, self._keys, messages.MIME["json"]
+        session, keys = self._session, self._keys
+        mime = messages.MIME["json"]
         rows = range(len(self._names))
         self._positions = MeasuredPositions(session, keys, self._names, rows, VALID_BOX, exact=rows, silence_s=FRESH_S)
         self._ranges = RangeInbox(session, keys, self._names, rows)

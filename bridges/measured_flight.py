@@ -33,7 +33,8 @@ class MeasuredFlight:
         """Begin a flight at a position [m], NaN if unknown."""
         x, y, z = position
         self._start = x if isfinite(x) else 0.0, y if isfinite(y) else 0.0, z if isfinite(z) else 0.0
-        self.flying, self.landing_since, self._highest = True, inf, -inf
+        self.flying, self.landing_since = True, inf
+        self._highest = -inf
 
     def land(self, now: float) -> None:
         """Note an order to land; a repeated one in flight changes nothing."""
@@ -51,7 +52,8 @@ class MeasuredFlight:
         """
         if not self.flying:
             return False
-        landing, aged, z = isfinite(self.landing_since), now - measured > FRESH_S, position[2]
+        landing, aged = isfinite(self.landing_since), now - measured > FRESH_S
+        z = position[2]
         still = not aged and norm(velocity) < SETTLED
         self._still_since = min(self._still_since, now) if still else inf
         if not landing:

@@ -64,7 +64,8 @@ class ProgressTable:
         from rich.live import Live
 
         self._live = Live(console=Console(stderr=True), refresh_per_second=4, auto_refresh=False)
-        self._news, self._next, self._trends = EventFeed(), 0.0, Trends()
+        self._news, self._next = EventFeed(), 0.0
+        self._trends = Trends()
 
     def __enter__(self) -> Self:
         self._live.__enter__()

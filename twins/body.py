@@ -77,7 +77,8 @@ class Twin:
             motion.blow(disturbance.wind)
         self._command, self._before = NO_SETPOINT, motion.position
         self._t = self._used = 0.0
-        self._measured_at, self._measured, self._velocity = -inf, ZERO, ZERO
+        self._measured_at = -inf
+        self._measured, self._velocity = ZERO, ZERO
 
     def command(self, setpoint: Setpoint) -> None:
         """Set the setpoint, see `Body.command`; it takes effect after the latency."""
@@ -147,7 +148,8 @@ class Twin:
             velocity = velocity_after(self._velocity, (position[0] - x, position[1] - y, position[2] - z), since)
             self._velocity = velocity if velocity[0] == velocity[0] else ZERO
         self._measured_at, self._measured = t, position
-        state.time, state.position, state.velocity, state.yaw = t, position, self._velocity, yaw
+        state.time, state.position = t, position
+        state.velocity, state.yaw = self._velocity, yaw
         charge = 1.0 - self._used / self._endurance
         state.battery = charge if charge > 0.0 else 0.0
         state.flying, state.attitude = motion.flying, motion.attitude

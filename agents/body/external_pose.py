@@ -24,7 +24,8 @@ def velocity_after(velocity: Vector, moved: Vector, since: float) -> Vector:
     A low-pass with `SMOOTHING_S` on the difference quotient, used for motion capture and odometry. White noise σ of the
     positions makes σ / `SMOOTHING_S` of noise, at any rate.
     """
-    (u, v, w), (x, y, z), share = velocity, moved, since / (SMOOTHING_S + since)
+    (u, v, w), (x, y, z) = velocity, moved
+    share = since / (SMOOTHING_S + since)
     return u + share * (x / since - u), v + share * (y / since - v), w + share * (z / since - w)
 
 
@@ -56,7 +57,8 @@ class External:
             self.velocity = velocity_after(self.velocity, (x, y, z), since)
         else:
             self.velocity = ZERO
-        self.time, self.position, self.yaw = t, position, yaw if isfinite(yaw) else nan
+        self.time, self.position = t, position
+        self.yaw = yaw if isfinite(yaw) else nan
         return True
 
     def estimate(self, t: float, state: BodyState) -> None:

@@ -49,7 +49,8 @@ class PositionSource:
     def measures(self, session: str | None, pose: tuple[Vector, float | None], now: float) -> bool:
         """Whether a pose was measured; of the first one of a session that is known when the next one differs."""
         if session != self.session or self.alive_at == -inf:
-            self.session, self.last, self.alive_at = session, None, now
+            self.session, self.last = session, None
+            self.alive_at = now
         elif self.exact or pose != self.last:  # a frozen source is not alive
             self.alive_at = now
         if self.exact:

@@ -48,7 +48,8 @@ class Shadowed(Body):
 
     def __init__(self, body: Body, twin: Placeable, rows: Sequence[int], restart_s: Sequence[float]) -> None:
         """`twin` has a robot for each of `rows` of the body; `restart_s` [s] of each is infinite for once."""
-        self._body, self._rows, self._restart = body, tuple(rows), tuple(restart_s)
+        self._body = body
+        self._rows, self._restart = tuple(rows), tuple(restart_s)
         self._twin: Placeable | None = twin
         self._trouble = ""
         count = len(self._rows)

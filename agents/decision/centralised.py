@@ -41,7 +41,8 @@ class Followed:
         self.computer, self.keeping = GoalComputer(assignment), StationKeeping(assignment.ground)  # makers of its goals
         # guided robots that receive its poses, and by which link
         self.receivers: list[tuple[GoalComputer, int]] = []
-        self.position, self.velocity, self.yaw = UNKNOWN, ZERO, 0.0  # last received [m], [m/s], [rad]
+        self.position, self.velocity = UNKNOWN, ZERO  # last received [m], [m/s]
+        self.yaw = 0.0  # likewise [rad]
         self.stamp = -inf  # [s]; minus infinity before the first pose
         self.lost_since = -inf  # [s]; infinity: alive; minus infinity: never seen
         self.goal, self.goal_yaw = UNKNOWN, nan  # last goal [m], and what is wanted there [rad], NaN for any
@@ -159,7 +160,8 @@ class Centre:
 
     def _goal_of(self, row: int, t: float, start: float, *, runs: bool, waits: bool) -> CentreGoal | None:
         robot, assignment = self.robots[row], self.assignments[row]
-        computer, new, velocity = robot.computer, False, UNKNOWN
+        computer, new = robot.computer, False
+        velocity = UNKNOWN
         position = UNKNOWN
         if isfinite(robot.stamp):
             position = assignment.predictor.position(robot, t - robot.stamp)
@@ -176,7 +178,8 @@ class Centre:
         held = (runs and computer.without_neighbours()) or waits
         robot.keeping.hold(held, position)
         if held:
-            robot.goal, robot.goal_yaw, velocity = robot.keeping.at, nan, UNKNOWN
+            robot.goal = robot.keeping.at
+            robot.goal_yaw, velocity = nan, UNKNOWN
         if new or held:
             robot.pose_stamp = robot.stamp
         if held or not runs:
@@ -210,7 +213,8 @@ class ReceivedGoals:
         if not (stamp > self.stamp and is_finite(goal)):
             return False
         self.goal = goal if self._flies else (goal[0], goal[1], 0.0)
-        self.goal_yaw, self.stamp, self.fresh, self.velocity = yaw, stamp, True, velocity
+        self.goal_yaw, self.stamp = yaw, stamp
+        self.fresh, self.velocity = True, velocity
         if stamp > self.lost_since:  # decided after the loss: another controller
             self.lost_since = inf
         return True

@@ -43,7 +43,8 @@ class ControlUpdates:
         """
         view, last = self.asking.view, self.asking.last
         view.t, view.position, view.velocity, view.offset = t, position, velocity, offset
-        view.error, view.energy, view.since_start, view.since_event = error, energy, since_start, t - last.time
+        view.error, view.energy, view.since_start = error, energy, since_start
+        view.since_event = t - last.time
         deviation = drift = 0.0
         for k in range(len(self._inputs)):
             sender, before = neighbours.all[k], self._inputs[k]

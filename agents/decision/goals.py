@@ -219,7 +219,8 @@ class GoalComputer:
         """View without the target of the plan."""
         stepping, predictor = cast(Stepping, self.stepping), self._predictor
         view = stepping.view()
-        view.position, view.velocity, view.yaw, view.leads = position, velocity, yaw, not self.follows
+        view.position, view.velocity, view.yaw = position, velocity, yaw
+        view.leads = not self.follows
         view.neighbours = [
             NeighbourView(
                 sender.sender, sender.name, sender.place(predictor, t), sender.velocity, sender.yaw, t - sender.stamp,

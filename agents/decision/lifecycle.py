@@ -81,13 +81,15 @@ class Lifecycle:
     def land(self, reason: str) -> None:
         """Land, or roll out, in any phase."""
         if self.phase < LANDING:
-            self.phase, self.climbing, self.reason = LANDING, False, reason
+            self.phase, self.climbing = LANDING, False
+            self.reason = reason
             self.takeoff_due, self.land_due = False, True
             self.settled_until = -inf
 
     def stop(self, reason: str) -> None:
         """Motors off."""
-        self.phase, self.climbing, self.reason = DONE, False, reason
+        self.phase, self.climbing = DONE, False
+        self.reason = reason
         self.takeoff_due = self.land_due = False  # the body would get them after the stop
         self.stop_due = True
         self.settled_until = -inf

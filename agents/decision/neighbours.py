@@ -121,7 +121,8 @@ class Neighbours:
     def discard_pose(self, link: int) -> None:
         """Discard the pose of a sender that was restarted: it stands where it was last."""
         sender = self.all[link]
-        sender.velocity, sender.stamp, sender.arrival = ZERO, -inf, -inf
+        sender.velocity = ZERO
+        sender.stamp, sender.arrival = -inf, -inf
         sender.yaw, sender.said = nan, NO_WORDS
         self.incomplete = True
 

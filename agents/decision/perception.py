@@ -52,7 +52,8 @@ class Perception:
         self.near.reserve(self._links)
         own = self.own = OwnState()  # likewise
         own.radius, own.height, own.turn_rate = kind.radius, kind.height, kind.turn_rate
-        own.speed, own.response, own.lag = min(kind.speed, limits.top_speed), kind.response, kind.lag
+        own.speed = min(kind.speed, limits.top_speed)
+        own.response, own.lag = kind.response, kind.lag
         own.by_position, own.by_twist = kind.takes == "position", kind.takes == "twist"
         own.flies = kind.flies
         self._horizon = kind.radius + _horizon(self.avoidance, own)  # range of sight from the own axis [m]
@@ -119,7 +120,8 @@ class Perception:
         thing = self.near.add()
         thing.x, thing.y = x, y
         thing.velocity_x, thing.velocity_y = (vx, vy) if believed else (0.0, 0.0)
-        thing.radius, thing.lag, thing.is_robot = sender.radius, sender.lag, True
+        thing.radius, thing.lag = sender.radius, sender.lag
+        thing.is_robot = True
         thing.low, thing.high = min(z, 0.0) if lost else low, high
 
     def _update_points(self, scan: RangeScan | None, now: Situation, neighbours: Neighbours) -> None:
@@ -146,10 +148,12 @@ class Perception:
                     self._points.append(point)
 
     def _add_points(self, here: Vector) -> None:
-        low, high, near_x, near_y = -self._clearance, self._height + self._clearance, here[0], here[1]
+        low, high = -self._clearance, self._height + self._clearance
+        near_x, near_y = here[0], here[1]
         squared = self._horizon * self._horizon
         for point in self._points:
-            off_x, off_y, up = point.x - near_x, point.y - near_y, point.height - here[2]
+            off_x, off_y = point.x - near_x, point.y - near_y
+            up = point.height - here[2]
             if low < up < high and off_x * off_x + off_y * off_y <= squared:
                 thing = self.near.add()
                 thing.x, thing.y, thing.low, thing.high = point.x, point.y, point.height, point.height

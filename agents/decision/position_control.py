@@ -45,7 +45,8 @@ class PositionController:
         turn = 0.0 if isnan(goal_yaw) else agility.turn_response * wrap(goal_yaw - yaw)
         if isnan(turn):
             turn = 0.0
-        vx, vy, vz = response * (x - here_x), response * (y - here_y), 0.0
+        vx, vy = response * (x - here_x), response * (y - here_y)
+        vz = 0.0
         if self._flies:
             vz = response * (z - here_z)
         if -speed <= vx <= speed and -speed <= vy <= speed and -speed <= vz <= speed:
@@ -62,7 +63,8 @@ class VelocityFollower:
 
     def __init__(self, kind: Kind, ground: float) -> None:
         """`ground`: height that the robot holds [m]."""
-        self._by_twist, self._flies, self._ground = kind.takes == "twist", kind.flies, ground
+        self._by_twist, self._flies = kind.takes == "twist", kind.flies
+        self._ground = ground
         self._response, self._speed = kind.response, kind.speed
         self.reference = UNKNOWN  # [m]; NaN: the next one is the place of the robot
 

@@ -72,4 +72,5 @@ class Situation:
     def begin(self, t: float) -> None:
         """Begin a tick at `t` [s] with the state of the body."""
         state = self.state
-        self.t, self.position, self.velocity, self.yaw = t, state.position, state.velocity, state.yaw
+        self.t = t
+        self.position, self.velocity, self.yaw = state.position, state.velocity, state.yaw

@@ -125,7 +125,8 @@ class Stepping:
     def view(self) -> View:
         """View for the next step, without what is not known here."""
         view = View(self.facts, {} if self.speech is None else self.speech.said, ())
-        view.time, view.moves, view.scan = self.tick * self.tick_s, self.moves, self.scan
+        view.time = self.tick * self.tick_s
+        view.moves, view.scan = self.moves, self.scan
         if self._stepped >= 0:
             passed = (self.tick - self._stepped) * self.tick_s
             view.step_s = min(max(passed, self.tick_s), MOST_STEPS * self.facts.step_s)

@@ -57,7 +57,8 @@ class Transmitter:
             position, velocity = smoothed.position, smoothed.velocity
         view, last = asking.view, asking.last
         view.t, view.position, view.velocity, view.error, view.energy = t, position, velocity, error, energy
-        view.since_start, view.offset, view.since_event = since_start, offset, t - last.time
+        view.since_start, view.offset = since_start, offset
+        view.since_event = t - last.time
         if last.time > -inf:
             believed = self.predictor.position(last, view.since_event)
             view.deviation = distance(position, believed)

@@ -36,6 +36,7 @@ class Anchor(msgspec.Struct, frozen=True):
 
     def displacement(self, position: Vector) -> Vector:
         """x from the nearest point of the point, line or plane to the robot [m]."""
-        (x, y, z), (ax, ay, az), whole = difference(position, self.point), self.axis, self.whole
+        (x, y, z), (ax, ay, az) = difference(position, self.point), self.axis
+        whole = self.whole
         part = dot((x, y, z), self.axis) * self.along
         return whole * x + part * ax, whole * y + part * ay, whole * z + part * az

@@ -102,7 +102,8 @@ def _toward_unit(old: Vector, new: Vector, share: float) -> Vector:
 
 
 def _turned(vector: Vector, angle: float) -> Vector:
-    (x, y, z), c, s = vector, cos(angle), sin(angle)
+    x, y, z = vector
+    c, s = cos(angle), sin(angle)
     return c * x - s * y, s * x + c * y, z
 
 

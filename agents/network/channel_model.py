@@ -153,7 +153,8 @@ class LinkChannel:
         between it keeps its state, so the last sample with another u decides. The method looks for that sample and
         keeps no state.
         """
-        key, enter, leave = self._conditions.key, self._enter, self._leave
+        key = self._conditions.key
+        enter, leave = self._enter, self._leave
         while True:
             u = uniform(key, seq * USES + LOSS)
             if seq == 0:  # first sample: as often bad as in the long run

@@ -163,7 +163,8 @@ class OwnershipCheck:
 
     def __init__(self, alive: Sequence[str], lease_s: float = LEASE_S, timing: OwnershipTiming = USUAL) -> None:
         """Begin when the names are owned: liveliness keys `alive`, in a session with the lease `lease_s` [s]."""
-        self._alive, self._stood_s, self._timing = alive, 0.5 * lease_s, timing
+        self._alive, self._stood_s = alive, 0.5 * lease_s
+        self._timing = timing
         self.awake_at = uptime()  # last run of the process [s]
         self.linked = True  # whether the session had a router, or a neighbour in a mesh, at the last look
         self.contested = False  # True if the last answer named another owner, which may still give way

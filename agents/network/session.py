@@ -269,10 +269,12 @@ class RouterWatch:
 
     def __init__(self, session: zenoh.Session, key: str, endpoints: Sequence[str] = ()) -> None:
         """Begins with the first `silent_since`; in a lab, `key` is a liveliness key that this session may watch."""
-        self._session, self._key, self._others = session, key, len(endpoints) > 1
+        self._session, self._key = session, key
+        self._others = len(endpoints) > 1
         self._waiting: deque[tuple[float, Polled[zenoh.Reply]]] = deque(maxlen=ASKED)
         # Times of a clock that stands between polls: a process that gets no processor cannot blame the router.
-        self._now, self._asked, self._unanswered = 0.0, -inf, inf  # the latter: when the oldest question was asked
+        self._now, self._asked = 0.0, -inf
+        self._unanswered = inf  # time of the oldest question [s]
         self._looked = inf
         self._silent_since = inf
         self._left = 0.0  # begin of the silence or of the time without any link, or of the last change of router
@@ -290,7 +292,8 @@ class RouterWatch:
         info = self._session.info
         if not info.routers_zid():
             self._waiting.clear()
-            self._asked, self._unanswered, self._answers, self._left = -inf, inf, 0, self._now
+            self._asked, self._unanswered = -inf, inf
+            self._answers, self._left = 0, self._now
             self._silent_since = inf if info.peers_zid() else min(self._silent_since, t)
             return self._silent_since
         if self._answered():

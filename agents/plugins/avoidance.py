@@ -113,7 +113,8 @@ def measure_gap(own: OwnState, thing: Thing) -> None:
     x, y = own.position[0] - thing.x, own.position[1] - thing.y
     apart = sqrt(x * x + y * y)
     if not apart > COINCIDENT:
-        x, y, apart = COINCIDENT, 0.0, max(apart, COINCIDENT)
+        x, y = COINCIDENT, 0.0
+        apart = max(apart, COINCIDENT)
     x, y = x / apart, y / apart
     going, coming = -(x * own.velocity[0] + y * own.velocity[1]), x * thing.velocity_x + y * thing.velocity_y
     going = max(going, 0.0)

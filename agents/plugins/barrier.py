@@ -137,7 +137,8 @@ class Barrier(Avoidance, frozen=True):
         One that comes faster than the robot can flee will not mind it: there it is the side of its way where the robot
         is.
         """
-        x, y, share = -thing.away_x, -thing.away_y, self.right
+        x, y = -thing.away_x, -thing.away_y
+        share = self.right
         if x * thing.velocity_x + y * thing.velocity_y < -own.speed:
             off = x * thing.velocity_y - y * thing.velocity_x  # > 0: the robot is left of its way
             if off < 0.0:
@@ -149,7 +150,8 @@ class Barrier(Avoidance, frozen=True):
 
 def most_violated(x: float, y: float, near: Nearby) -> int:
     """The half-plane that bars the velocity x, y [m/s] most; -1: none does."""
-    worst, most, planes = -1, SLACK, near.planes
+    worst, most = -1, SLACK
+    planes = near.planes
     for k in range(near.count):
         plane = planes[k]
         over = plane.x * x + plane.y * y - plane.b
@@ -161,7 +163,8 @@ def most_violated(x: float, y: float, near: Nearby) -> int:
 def along_heading(v: float, own: OwnState, near: Nearby) -> float:
     """The speed nearest to v [m/s] in the interval that all half-planes leave along the heading."""
     head_x, head_y = cos(own.yaw), sin(own.yaw)
-    high, low, any_bars = inf, -inf, False
+    high, low = inf, -inf
+    any_bars = False
     for k in range(near.count):
         plane = near.planes[k]
         bound, gain = plane.b, plane.x * head_x + plane.y * head_y
@@ -224,7 +227,8 @@ def solution(x: float, y: float, speed: float, near: Nearby, raised: float) -> S
         if not abs(b) <= speed:
             return u, v, 0.0
         high = inf if speed == inf else sqrt((speed - b) * (speed + b))
-        low, above, below = -high, k, k
+        low = -high
+        above, below = k, k
         for j in range(k):
             other = planes[j]
             sine = p * other.y - q * other.x
@@ -237,7 +241,8 @@ def solution(x: float, y: float, speed: float, near: Nearby, raised: float) -> S
                 if room < low * sine:
                     low, below = room / sine, j
             elif room < 0.0 and p * other.x + q * other.y < 0.0:
-                low, high, above, below = inf, -inf, j, j
+                low, high = inf, -inf
+                above, below = j, j
                 break
         if low > high:
             return u, v, clash_of(plane, planes[below], planes[above], raised, slack)

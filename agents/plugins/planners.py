@@ -165,7 +165,8 @@ class Itinerary:
         """
         self.legs = (Leg(0.0, Hold()), *legs) if holds_before else tuple(legs)
         self.origin: Pose | None = None  # x, y, z [m] and yaw [rad] where its first leg began; None before
-        self._leg, self._anchor, self._heading = -1, ZERO, 0.0
+        self._leg, self._anchor = -1, ZERO
+        self._heading = 0.0
         self.next_at = self.legs[0].at if self.legs else inf  # time of the next leg [s]; infinity after the last
 
     def target(self, t: float, position: Vector, yaw: float) -> Pose:
@@ -185,7 +186,8 @@ class Itinerary:
         while self._leg + 1 < len(self.legs) and t >= self.legs[self._leg + 1].at - 1e-9:
             if self._leg < 0:
                 x, y, z = position
-                self.origin, self._anchor, self._heading = (x, y, z, yaw), position, yaw
+                self.origin = (x, y, z, yaw)
+                self._anchor, self._heading = position, yaw
             else:
                 before, after = self.legs[self._leg], self.legs[self._leg + 1]
                 x, y, z, toward = before.planner.target(after.at - before.at, self._anchor, self._heading)

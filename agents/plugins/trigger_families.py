@@ -121,7 +121,8 @@ class IntegralTrigger(Trigger, frozen=True):
     def fires(self, view: TriggerView) -> bool:
         memory, event = view.memory, view.last.time
         if memory.event != event:
-            memory.area, memory.until, memory.event = 0.0, event, event
+            memory.area = 0.0
+            memory.until, memory.event = event, event
         if isfinite(view.deviation) and isfinite(memory.until):
             memory.area += view.deviation * (view.t - memory.until)
         memory.until = view.t
@@ -177,7 +178,8 @@ class Lyapunov(Trigger, frozen=True):
     largest: Annotated[Positive, Meta(description="δ: deviation that is allowed at any level [m]")] = 0.012
 
     def fires(self, view: TriggerView) -> bool:
-        now, then, slack = view.energy, view.last.energy, 0.5 * self.floor * self.floor
+        now, then = view.energy, view.last.energy
+        slack = 0.5 * self.floor * self.floor
         left = now < self.level * then - slack or now > then / self.level + slack
         return left or view.deviation > self.largest
 

@@ -152,7 +152,8 @@ class Descent:
         if self._keeper.hands_off:
             return
         failures: list[Exception] = []
-        begin, again, obeyed = self._ticks.elapsed(), -inf, False
+        begin, again = self._ticks.elapsed(), -inf
+        obeyed = False
         while True:
             self.watchdog.beat()
             self.await_ownership()

@@ -230,7 +230,8 @@ class Runtime:
         self.run_ticks(stopping)
 
     def run_ticks(self, stopping: Callable[[], str | None]) -> None:
-        ticks, counts, farewell, patience = self.ticks, self.counts, inf, inf
+        ticks, counts = self.ticks, self.counts
+        farewell, patience = inf, inf
         while True:
             self.watchdog.beat()
             if self.watchdog.tripped:
@@ -337,7 +338,8 @@ class Runtime:
 
     def _decide(self, t: float, states: Sequence[BodyState]) -> bool:
         """Let all robots decide, transmit and act; returns whether all are running, as before."""
-        counts, running, begun = self.counts, True, self.robots[0].decisions > 0
+        counts, running = self.counts, True
+        begun = self.robots[0].decisions > 0
         for row, robot in enumerate(self.robots):
             if robot.transmit(t, states[row]) and row not in self._retired:
                 self._send_pose(row, robot, states[row].yaw, t)

@@ -115,7 +115,8 @@ class NeighbourSubscription:
             # reception, too late for a network, proves it at once; the first pose ever may be that of a silent robot.
             slow = self.behind or (pose.stamp < before and age > LATE_S)
             measured = now - LATE_S if slow else validation.taken(pose.stamp, now)
-            self._received_at, self._refusals, self.doubt = now, 0, ""
+            self._received_at = now
+            self._refusals, self.doubt = 0, ""
             yield ReceivedPose(pose, len(sample.payload), missed, measured, news == "anew")
 
     def _note_refusal(self, now: float, reason: str) -> None:
@@ -133,7 +134,8 @@ class NeighbourSubscription:
             if token == self._token:
                 if there and self.alive is False and self._order.return_token():
                     yield "new session"
-                self.alive, self._refusals, self.doubt = there, 0, ""
+                self.alive = there
+                self._refusals, self.doubt = 0, ""
                 yield "appeared" if there else "vanished"
             elif (session := Keys.life_of(token)) is not None and self._order.note_life(session, there=there):
                 yield "new session"
@@ -184,7 +186,8 @@ class ModelledInbox:
 
         `counted` tells whether a pose of that stamp [s] matters, so that those lost before it count.
         """
-        self._knowledge, self._channel, self._counted = knowledge, Channel(conditions), counted
+        self._knowledge, self._channel = knowledge, Channel(conditions)
+        self._counted = counted
         self.senders = [
             NeighbourSubscription(session, keys, name, mine, valid_box=valid_box, rate=rate, depth=depth, bell=bell)
             for name, mine in links.items()

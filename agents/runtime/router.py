@@ -149,7 +149,8 @@ class Guard:
     """
 
     def __init__(self, session: zenoh.Session, known: lab.Register, rights: Rights) -> None:
-        self._session, self._known, self._rights, self._keys = session, known, rights, Keys(rights.realm)
+        self._session, self._known, self._rights = session, known, rights
+        self._keys = Keys(rights.realm)
         self._told: set[str] = set()
         self._clock = Clock()
         self._hazards: deque[str] = deque()  # not published yet

@@ -99,7 +99,8 @@ class TelemetryPublisher:
         """Sends the state of every robot, also of one without a known position."""
         self._seq += 1
         for row, robot in enumerate(self._robots):
-            now, state, setpoint = robot.now, robot.now.state, robot.setpoint
+            now, state = robot.now, robot.now.state
+            setpoint = robot.setpoint
             attitude, shadow = state.attitude, state.shadow_position
             message = messages.State(
                 self._names[row],

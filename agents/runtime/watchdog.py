@@ -41,7 +41,8 @@ class Watchdog:
         end: Callable[[int], object] | None = None,  # ends the process with an exit code
     ) -> None:
         self.tripped = ""  # why the robots were ordered to land; empty before, and after `forgive`
-        self._body, self._rows, self._alarm, self._end = body, rows, alarm, end or os._exit
+        self._body, self._rows, self._alarm = body, rows, alarm
+        self._end = end or os._exit
         self.down_s, self._silence_s = down_s, silence_s
         self._beats = 0
         self._over = threading.Event()
@@ -77,14 +78,16 @@ class Watchdog:
     def _watch(self) -> None:
         period = self._silence_s / LOOKS
         looked = since = time.monotonic()
-        counted, hung, again = self._beats, 0.0, 0.0
+        counted = self._beats
+        hung, again = 0.0, 0.0
         while not self._over.wait(period):
             last, looked = looked, time.monotonic()
             if looked - last > self._silence_s:
                 since += looked - last  # the whole process stood still
                 continue
             if self._beats != counted:
-                counted, since, hung = self._beats, looked, 0.0
+                counted, since = self._beats, looked
+                hung = 0.0
                 continue
             if looked - since < self._silence_s:
                 continue

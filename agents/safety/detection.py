@@ -87,7 +87,8 @@ class Ascent:
         height = position[2]
         stands = begins or not spinning
         if stands or not height <= self.highest + STEP:
-            self.highest, self.risen_at, self.risen = height, t, not stands
+            self.highest, self.risen_at = height, t
+            self.risen = not stands
         self.aside = planar(position, self.begin)
         self.carried = climbing and self.aside > self.free
         low, since = climbing and self.hover - height > SUNK, t - self.risen_at
@@ -130,7 +131,8 @@ class Detector:
 
     def __init__(self, assignment: Assignment) -> None:
         kind, limits = assignment.kind, assignment.limits
-        self.name, self.limits, self.predictor = assignment.name, limits, assignment.predictor
+        self.name, self.limits = assignment.name, limits
+        self.predictor = assignment.predictor
         self.flies, self.radius = kind.flies, kind.radius
         # [m/s] a faster robot has lost control; the speed of flying kinds is per axis
         self.fastest = limits.overspeed * (sqrt(3.0) if kind.flies else 1.0) * kind.speed
@@ -154,7 +156,8 @@ class Detector:
 
     def causes(self, now: Situation, status: RobotStatus, neighbours: Neighbours, health: ProcessHealth) -> int:
         """Causes that are present, as a set of bits `1 << cause`; call it once on every tick."""
-        t, state, found = now.t, now.state, 0
+        t, state = now.t, now.state
+        found = 0
         if self.separation > 0.0:
             found |= self.too_near(now, neighbours)
         if neighbours.incomplete or neighbours.lagging or neighbours.refused or t - neighbours.foreign_at < FOREIGN_S:
@@ -300,7 +303,8 @@ class Detector:
 
     def of_obedience(self, now: Situation, status: RobotStatus) -> int:
         """Motion that is not as commanded."""
-        motion_check, ascent, found = self.motion_check, self.ascent, 0
+        motion_check, ascent = self.motion_check, self.ascent
+        found = 0
         if motion_check.unresponsive or ascent.stalled:
             found |= 1 << Cause.UNRESPONSIVE
         if motion_check.uncommanded or ascent.carried:

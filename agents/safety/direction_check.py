@@ -55,7 +55,8 @@ class DirectionCheck:
         """Compare at `t` [s], on the way to a goal [m]; `position` [m] and `velocity` [m/s] are measured."""
         if t < self.due:
             return
-        since, self.last, self.due = t - self.last, t, t + SAMPLE_S - ROUNDING_S
+        since, self.last = t - self.last, t
+        self.due = t + SAMPLE_S - ROUNDING_S
         x, y = self.response * (goal_x - position[0]), self.response * (goal_y - position[1])
         share = min(self.speed / max(hypot(x, y), self.speed), 1.0)
         x, y = self.gain * (share * x - velocity[0]), self.gain * (share * y - velocity[1])

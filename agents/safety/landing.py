@@ -85,7 +85,8 @@ class Landing:
 
     def _choose(self, now: Situation, neighbours: Neighbours) -> None:
         """Choose a place, or keep the place while it is free."""
-        kind, limits, (x, y, z) = self._assignment.kind, self._assignment.limits, now.position
+        kind, limits = self._assignment.kind, self._assignment.limits
+        x, y, z = now.position
         others = []
         for sender in neighbours.all:
             place = sender.place(self._assignment.predictor, now.t)
@@ -115,7 +116,8 @@ class Landing:
 
 def _room(x: float, y: float, there_x: float, there_y: float, others: list[Occupied]) -> float:
     """Least gap at a place to fly to from x, y [m]; −inf where the way there is barred."""
-    least, way_x, way_y = inf, there_x - x, there_y - y
+    least = inf
+    way_x, way_y = there_x - x, there_y - y
     squared = way_x * way_x + way_y * way_y
     for other in others:
         if not other.lower:

@@ -77,7 +77,8 @@ class Continuity:
 
     def forget(self) -> None:
         """The robot is where its position says, wherever that is, and its yaw is right."""
-        self._place, self._yaw, self.jumped = UNKNOWN, nan, False
+        self._place, self._yaw = UNKNOWN, nan
+        self.jumped = False
 
 
 class ExternalPositions:

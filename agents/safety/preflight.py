@@ -150,7 +150,8 @@ def rehearse(
     *, position: Vector, t: float,
 ) -> None:  # fmt: skip
     """Call each plug-in of a robot at `position` [m]; raises PluginError where a result is not what it must be."""
-    predictor, law, sent = transmitter.predictor, goals.law, LastEvent()
+    predictor, law = transmitter.predictor, goals.law
+    sent = LastEvent()
     sent.position = position
     _expect("predictor", predictor, "position", predictor.position(sent, 0.0), 3)
     _expect("predictor", predictor, "velocity", predictor.velocity(sent, 0.0), 3)

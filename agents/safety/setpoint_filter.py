@@ -73,10 +73,12 @@ class SetpointFilter:
 
     def judge_far(self, now: Situation, place: Vector) -> None:
         """Judge a `place` [m] that is not believed, NaN for none, by the distance beyond which motors are cut."""
-        (x, y, z), (low_x, low_y, low_z), (high_x, high_y, high_z) = place, self._walls_low, self._walls_high
+        x, y, z = place
+        (low_x, low_y, low_z), (high_x, high_y, high_z) = self._walls_low, self._walls_high
         excess = max(0.0, low_x - x, x - high_x, low_y - y, y - high_y, low_z - z, z - high_z)
         if excess > self._cut_beyond_m:  # not of NaN, which is never larger
-            now.excess, now.flyaway, now.sound = excess, True, False
+            now.excess = excess
+            now.flyaway, now.sound = True, False
 
     def limit(self, setpoint: Setpoint, now: Situation) -> Setpoint:
         """Safe setpoint in place of a decided one, of a robot without avoidance; `now` was judged.
@@ -121,7 +123,8 @@ class SetpointFilter:
                 and low_x + far < x < high_x - far and low_y + far < y < high_y - far
             )  # fmt: skip
         if self._flies_to:
-            step_x, step_y, step_z, longest = a - x, b - y, c - z, self._step
+            step_x, step_y, step_z = a - x, b - y, c - z
+            longest = self._step
             return (
                 step_x * step_x + step_y * step_y + step_z * step_z < longest * longest
                 and BEFORE_WALL * (low_x - x) < step_x < BEFORE_WALL * (high_x - x)

@@ -33,7 +33,8 @@ class Dongle:
         self.air = air
         self._ctx = self  # pyusb's resources of a device
         self._socket: socket.socket | None = None
-        self._channel, self._rate, self._retries, self._address = 2, 2, 3, bytes((0xE7,) * 5)
+        self._channel, self._rate, self._retries = 2, 2, 3
+        self._address = bytes((0xE7,) * 5)
         self._number = 0
         self._status = b"\0"
         self._ends = self._extra = 0.0  # end of the exchange [s, monotonic]; time to add to the next one [s]

@@ -217,7 +217,8 @@ class FlightControl:
             self._release()
             self._pause(POLL_S)
         self._disarm_at = math.inf
-        self._target, self._top, self._sent, self.span_s = None, (x, y, height, place[3]), None, span
+        self._target, self._top = None, (x, y, height, place[3])
+        self._sent, self.span_s = None, span
         self._on_board.clear()
         self._on_board.append(height)
         self.enter(FlightPhase.CLIMBING)  # a stop cuts the motors from here on
@@ -486,7 +487,8 @@ class FlightControl:
         return Info.FLYING in self._telemetry.info
 
     def enter(self, phase: FlightPhase) -> None:
-        self.phase, self.phase_since, self._refused = phase, uptime(), False
+        self.phase, self.phase_since = phase, uptime()
+        self._refused = False
         self._led, self._led_from = False, None
         self.publish_airborne()
 

@@ -73,7 +73,8 @@ class PacketAge:
         late = self.connected_anew and isfinite(self._least) and change > LATE_S
         self.connected_anew = False
         if since < -BACK_MS or (change < -AHEAD_S and isfinite(self._least)) or late:
-            self.restarted, self._last, self._least = True, stamp, inf
+            self.restarted = True
+            self._last, self._least = stamp, inf
         elif since > 0:
             self._last += since
         delay = arrival - 1e-3 * (self._last + min(since, 0))

@@ -91,7 +91,8 @@ class KheperaBody(Body):
 
     def _state(self, row: int, link: Khepera4Link, t: float, now: float) -> BodyState:
         odometry = link.odometry
-        x, (vx, vy), received = odometry.x, odometry.velocity, odometry.stamp - now + t
+        x, (vx, vy) = odometry.x, odometry.velocity
+        received = odometry.stamp - now + t
         state = BodyState(
             received,
             # unknown before the first odometry: the pose is counted by the robot, not read from the file

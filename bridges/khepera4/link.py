@@ -150,7 +150,8 @@ class Khepera4Link:
         self.refused = False  # the server must not be driven; it is not tried again
         self.server = ""  # name by the robot's answers; empty while not known
         self.trouble = f"{address}: not connected yet"  # reason for users; empty while connected
-        self._address, self._settings, self._server = address, chosen, address.server_of(name, chosen)
+        self._address, self._settings = address, chosen
+        self._server = address.server_of(name, chosen)
         self._odometer, self._first_answer_s = Odometer(*start), first_answer_s
         self._stands = True  # True by the last command that was answered
         self._stop_deadline = math.inf

@@ -140,7 +140,8 @@ class TelloBody(Body):
             now = uptime()
             for pilot, setpoint in zip(self.pilots, setpoints, strict=True):
                 if math.isfinite(sum(setpoint)) and pilot.duty in (Duty.HOLD, Duty.FLY):
-                    pilot.duty, pilot.setpoint, pilot.setpoint_time = Duty.FLY, setpoint, now
+                    pilot.duty = Duty.FLY
+                    pilot.setpoint, pilot.setpoint_time = setpoint, now
 
     def takeoff(self, rows: Sequence[int], heights: Sequence[float]) -> None:
         with self._lock:

@@ -82,7 +82,8 @@ class TelloPilot:
         self._running = self.aloft = -math.inf  # last motion of the motors' clock, last time that it was not low
         self._began_at = self._sent_at = self._cut_at = self._up_at = self._ordered_up_at = -math.inf
         self._rested = 0  # seconds on the motors' clock since the drone rests
-        self._refusals, self._refused_at, self._refusal = 0, -math.inf, ""  # refusals: number, last time, answer
+        self._refusals, self._refusal = 0, ""  # refusals of the sticks: number, last answer
+        self._refused_at = -math.inf  # time of the last one [s]
         self._send_error = ""
 
     @property
@@ -218,7 +219,8 @@ class TelloPilot:
         return not self.silent(now) and now - max(self.aloft, self._running, self._ordered_up_at) > ON_GROUND_S
 
     def _rest(self, trouble: str) -> None:
-        self.duty, self.trouble, self._rested = Duty.REST, trouble, 0
+        self.duty, self.trouble = Duty.REST, trouble
+        self._rested = 0
 
     def _send_sticks(self, now: float, last_read: float) -> None:
         if now - last_read > UNREAD_S:
@@ -277,7 +279,8 @@ class TelloPilot:
     def _receive(self, now: float) -> None:
         state = self._drone.get_current_state()
         if state is not self._state and state:  # the library has no time stamps, but a new dict for each state line
-            self._state, self.state_received, self._send_error = state, now, ""
+            self._state, self.state_received = state, now
+            self._send_error = ""
             self._store_state(state, now)
         if self.position[2] - self._floor > 0.01 * LOW:  # whatever the drone measures
             self.aloft = now
@@ -317,7 +320,8 @@ class TelloPilot:
             elif refused:
                 self._rest_sticks()
         elif self.duty in (Duty.HOLD, Duty.FLY) and refused:
-            self._refusals, self._refused_at, self._refusal = self._refusals + 1, now, answer
+            self._refusals = self._refusals + 1
+            self._refused_at, self._refusal = now, answer
 
     def _begin(self, duty: Duty, command: str, now: float) -> None:
         self.duty, self._began_at = duty, now

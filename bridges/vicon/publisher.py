@@ -61,14 +61,16 @@ class FrameQueue:
     """
 
     def __init__(self) -> None:
-        self._number, self._period, self._arrived, self._least = 0, 0.0, 0.0, math.inf
+        self._number, self._period, self._arrived = 0, 0.0, 0.0
+        self._least = math.inf
 
     def wait_s(self, frame: Frame, arrived: float) -> float:
         """Time for which a frame waited that arrived at `arrived` on any steady clock [s]; 0 where it is unknown."""
         if frame.number < self._number or frame.period_s != self._period:  # another stream
             self._least = math.inf
         crept, delay = RATE_OFF * (arrived - self._arrived), arrived - frame.number * frame.period_s
-        self._number, self._period, self._arrived = frame.number, frame.period_s, arrived
+        self._number, self._period = frame.number, frame.period_s
+        self._arrived = arrived
         self._least = min(self._least + crept, delay)
         return delay - self._least if frame.period_s > 0.0 else 0.0
 
@@ -188,7 +190,8 @@ class Bridge:
         return True
 
     def _pump(self, reader: Reader, over: Callable[[], bool]) -> None:
-        heard, number, queue = uptime(), None, FrameQueue()
+        heard, number = uptime(), None
+        queue = FrameQueue()
         while not over():
             frame = reader.newest(POLL_S)
             now = uptime()

@@ -207,8 +207,10 @@ class Analysis:
 
     def _shapes(self, wanted: Links, there: Mask) -> list[Shape]:
         """Shapes from the ends, the starts, the scaled distances and random places as guesses, until one is exact."""
-        experiment, silent, end = self.plan.experiment, self.without_neighbours, self.prediction.position[-1].copy()
-        rows, links, moves = len(end), wanted.take(there), self.placed
+        experiment, silent = self.plan.experiment, self.without_neighbours
+        end = self.prediction.position[-1].copy()
+        rows, links = len(end), wanted.take(there)
+        moves = self.placed
         aloft = np.column_stack([self.start[:, :2], self.height])
         landed = moves & (end[:, 2] < aloft[:, 2] / 2)  # robots on the floor have no place in the shape
         end[landed, 2] = aloft[landed, 2]

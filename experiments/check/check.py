@@ -133,8 +133,10 @@ def _finite(value: float) -> float | None:
 @QUIET
 @supervised()
 def _figures(analysis: Analysis) -> CheckNumbers:
-    plan, links, limits, prediction = analysis.plan, analysis.plan.links, analysis.limits, analysis.prediction
-    arena, end, fastest, follower = plan.experiment.arena, prediction.position[-1], analysis.fastest, analysis.follower
+    plan, links = analysis.plan, analysis.plan.links
+    limits, prediction = analysis.limits, analysis.prediction
+    arena, end = plan.experiment.arena, prediction.position[-1]
+    fastest, follower = analysis.fastest, analysis.follower
     shape, (planar, spatial), spare, loop = analysis.shape, analysis.rigidity, analysis.spare, analysis.modes
     flown = not prediction.stuck  # else the robots stand at their starts, which says nothing of a run
     payload, words, load = theory.load(analysis)

@@ -36,7 +36,8 @@ SETTLED: Final = 1e-3  # [m] travel per decision below which robots are at rest,
 
 def starts(analysis: Analysis) -> Iterator[Finding]:
     """Check that robots start inside the arena and clear of one another; flying ones too start on the floor."""
-    names, limits, start = analysis.plan.names, analysis.limits, analysis.start[:, :2]
+    names, limits = analysis.plan.names, analysis.limits
+    start = analysis.start[:, :2]
     inside = np.minimum(start - limits.low[:2], np.array(limits.high[:2]) - start).min(axis=1) - _radii(analysis)
     problems = []
     for row in np.flatnonzero(inside < limits.margin - FORGIVEN):
@@ -45,7 +46,8 @@ def starts(analysis: Analysis) -> Iterator[Finding]:
         remedy = "start it farther inside, or reduce margin in [safety]"
         problems.append(Finding("warning", "start-margin", message, remedy, ("robots", names[row], "start")))
     for i, j in zip(*np.nonzero(np.triu(_overlap_at_start(analysis))), strict=True):
-        first, second, apart = names[i], names[j], norm(start[i] - start[j])
+        first, second = names[i], names[j]
+        apart = norm(start[i] - start[j])
         needed = analysis.plan.kinds[i].radius + analysis.plan.kinds[j].radius
         message = f"{first} and {second} start {apart:.2f} m apart, but need {needed:.2f} m to stand side by side"
         remedy = "all start on the floor, flying ones too: move one of them"
@@ -99,7 +101,8 @@ def formation(analysis: Analysis) -> Iterator[Finding]:
 
 
 def _formation(analysis: Analysis) -> Iterator[Finding]:
-    experiment, prediction, last = analysis.plan.experiment, analysis.prediction, analysis.error[-1]
+    experiment, prediction = analysis.plan.experiment, analysis.prediction
+    last = analysis.error[-1]
     undecided = _cut(analysis) and last.max(initial=0.0) > experiment.tolerance
     if analysis.met_shape is None or prediction.stuck or not len(last) or undecided:
         return
@@ -266,7 +269,8 @@ def _stopped(analysis: Analysis, at: int, left: str) -> Finding | None:
 
 def _standing_wheels(analysis: Analysis, at: int) -> Index:
     """Rows on wheels that stand at sample `at`, because their goals are too near to drive to."""
-    plan, time, position = analysis.plan, analysis.prediction.time, analysis.prediction.position
+    plan = analysis.plan
+    time, position = analysis.prediction.time, analysis.prediction.position
     at %= len(time)
     here, before = position[at], position[max(0, at - round(WINDOW_S * plan.experiment.rates.coordination_hz))]
     links, there = plan.formation.at(float(time[at])), plan.formation.present(time[at : at + 1], position[at : at + 1])
@@ -280,7 +284,8 @@ def _standing_wheels(analysis: Analysis, at: int) -> Index:
 
 def walls(analysis: Analysis) -> Iterator[Finding]:
     """Check that no robot leaves the arena, or is held back by the margin at a wall."""
-    names, limits, track = analysis.plan.names, analysis.limits, analysis.prediction.position
+    names, limits = analysis.plan.names, analysis.limits
+    track = analysis.prediction.position
     beyond = np.maximum(track - limits.high, limits.low - track)  # (T, N, 3), positive outside
     outside = beyond.max(axis=2) > FORGIVEN
     beside = beyond[..., :2].max(axis=2) + _radii(analysis)  # (T, N), surfaces
@@ -376,9 +381,11 @@ def _left_arena(analysis: Analysis, row: int, outside: Mask) -> Finding:
 
 def speeds(analysis: Analysis) -> Iterator[Finding]:
     """Check that plans ask for no more speed than the robots have."""
-    names, experiment, problems = analysis.plan.names, analysis.plan.experiment, []
+    names, experiment = analysis.plan.names, analysis.plan.experiment
+    problems = []
     for number, robot, plan in analysis.legs:
-        row, asked, path = names.index(robot), plan.speed(), ("timeline", number, "plan")
+        row, asked = names.index(robot), plan.speed()
+        path = ("timeline", number, "plan")
         leads = row in analysis.without_neighbours
         has = float((analysis.speed if leads else analysis.pull)[row])
         what = f"the leg at {experiment.timeline[number].at_s:g} s asks {robot} for {asked:.3g} m/s"

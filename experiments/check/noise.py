@@ -37,7 +37,8 @@ class Flights:
     @classmethod
     def of(cls, analysis: Analysis) -> Flights:
         bare = isolated(analysis.plan)
-        count, first, beside = repetitions(bare), bare.experiment.seed, analysis.prediction.noisy
+        count = repetitions(bare)
+        first, beside = bare.experiment.seed, analysis.prediction.noisy
         flown = [] if beside is None else [beside]
         flown += [fly(bare, seed) for seed in range(first + len(flown), first + count)]
         seeds = f"seed {first}" if count == 1 else f"seeds {first} to {first + count - 1}"
@@ -97,7 +98,8 @@ def softness(analysis: Analysis) -> Iterator[Finding]:
 
     Experiments with a late flight with noise, and soft ones, are flown with more seeds.
     """
-    experiment, loop, formed = analysis.plan.experiment, analysis.modes, analysis.acquired_for_good
+    experiment = analysis.plan.experiment
+    loop, formed = analysis.modes, analysis.acquired_for_good
     if analysis.met_shape is None or loop is None or formed is None:
         return
     if analysis.prediction.stuck or not has_noise(analysis.plan):
@@ -107,7 +109,8 @@ def softness(analysis: Analysis) -> Iterator[Finding]:
     if not (soft or _doubtful(analysis, formed, late)):
         return
     flights = Flights.of(analysis)
-    count, times, most = flights.count, flights.acquired, experiment.tolerance + FORGIVEN
+    count, times = flights.count, flights.acquired
+    most = experiment.tolerance + FORGIVEN
     spans = [(analysis.acquired(until) or 0.0, until) for until in analysis.spans_end]
     largest = [_largest_error(each, spans) for each in flights.flown]
     lost = sum(error > most for error, _ in largest)

@@ -61,7 +61,8 @@ def obstacles(analysis: Analysis) -> Iterator[Finding]:
 
 def _met(analysis: Analysis, number: int, rows: Index, near: Mask, *, keeps: bool) -> Finding:
     """Finding that `rows` (K,) meet an obstacle at the times `near` (T, K); `keeps`: avoidance is on."""
-    scene, prediction, names = analysis.plan.scene, analysis.prediction, analysis.plan.names
+    scene, prediction = analysis.plan.scene, analysis.prediction
+    names = analysis.plan.names
     name, path = scene.names[number], ("arena", "obstacles", scene.names[number])
     which = int(near.argmax(axis=0).argmin())
     first, at = int(rows[which]), int(near[:, which].argmax())

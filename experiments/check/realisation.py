@@ -252,7 +252,8 @@ def fitted_shape(links: Links, anchors: Anchored, guess: Array, free: Mask) -> S
         then = residuals(links, anchors, tried)
         before, after = float(now.value @ now.value), float(then.value @ then.value)
         if after < before:
-            position, damping, now = tried, max(damping / 10.0, 1e-10), then
+            position, damping = tried, max(damping / 10.0, 1e-10)
+            now = then
         else:
             damping *= 10.0
         small = float(np.abs(now.value).max(initial=0.0)) < ENOUGH
@@ -382,7 +383,8 @@ def contradictions(links: Links) -> list[Contradiction]:
     for root in neighbours:
         if root in place:
             continue
-        place[root], way[root], queue = np.zeros(3), [root], [root]
+        place[root] = np.zeros(3)
+        way[root], queue = [root], [root]
         for row in queue:
             for to, step in neighbours[row]:
                 if to not in place:

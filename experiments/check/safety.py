@@ -65,7 +65,8 @@ def batteries(analysis: Analysis) -> Iterator[Finding]:
 
 def _separation(analysis: Analysis, limit: float) -> Iterator[Finding]:
     """Check the separation of linked pairs: at the start, at their target, and on their way."""
-    names, path, track = analysis.plan.names, ("safety", "separation"), analysis.prediction.position
+    names, path = analysis.plan.names, ("safety", "separation")
+    track = analysis.prediction.position
     links, poses = analysis.plan.links, analysis.plan.pose_links
     pairs = sorted({tuple(sorted(pair)) for pair in zip(poses.receiver.tolist(), poses.sender.tolist(), strict=True)})
     wanted = {

@@ -43,7 +43,8 @@ OSCILLATING_GAIN: Final = 1.2  # limit of the gain: an error changes its sign be
 def network(analysis: Analysis) -> Iterator[Finding]:
     """Check that the network is connected, and that every robot is reached by a leader."""
     experiment, names, links = analysis.plan.experiment, analysis.plan.names, analysis.plan.links
-    path, rows, problems = ("formation", "links"), len(names), list[Finding]()
+    path, rows = ("formation", "links"), len(names)
+    problems = list[Finding]()
     if not len(links):
         how = "goes to its anchor" if experiment.formation.anchors else "follows its own plan"
         yield Finding("note", "no-formation", f"no links: every robot {how}, or stays where it is")
@@ -400,7 +401,8 @@ def strength(analysis: Analysis, wants: int = BY_DISTANCE) -> tuple[str, Path]:
 
 def stability(analysis: Analysis) -> Iterator[Finding]:
     """Check that the sampled loop is stable near the shape."""
-    loop, shape, formation = analysis.modes, analysis.met_shape, analysis.plan.experiment.formation
+    loop, shape = analysis.modes, analysis.met_shape
+    formation = analysis.plan.experiment.formation
     if loop is None or shape is None or next(lengths(analysis), None) is not None:
         return
     law, choice = analysis.law, analysis.plan.law_name

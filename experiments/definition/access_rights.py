@@ -52,7 +52,8 @@ def has_world(plan: Plan) -> bool:
 
 
 def _rights(plan: Plan) -> Rights:
-    experiment, senders, guided = plan.experiment, senders_by_receiver(plan), plan.guided
+    experiment, senders = plan.experiment, senders_by_receiver(plan)
+    guided = plan.guided
     keys = Keys(experiment.network.realm)
     robots: dict[str, Grant] = {}
     for group in experiment.processes.values():

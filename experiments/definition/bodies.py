@@ -90,7 +90,8 @@ def scattered_poses(plan: Plan, names: Sequence[str], seed: int) -> tuple[list[V
 
     Places are drawn for all robots of the experiment in the order of the file, so that all processes agree.
     """
-    experiment, robots, begin = plan.experiment, plan.kinds, plan.experiment.start
+    experiment, robots = plan.experiment, plan.kinds
+    begin = plan.experiment.start
     positions, yaws = plan.start_poses()
     if begin.scatter > 0.0 or begin.scatter_yaw > 0.0:
         rng = np.random.default_rng([seed, 0x73746172])

@@ -272,7 +272,8 @@ class Plan:
     @cached_property
     def pose_links(self) -> Links:
         """Every link on which robots receive poses, receiver by receiver, those that only avoidance needs last."""
-        guided, row, given = set(self.guided), self._row, self.formation.targets_at(0.0)
+        guided, row = set(self.guided), self._row
+        given = self.formation.targets_at(0.0)
         targets, ends = list[Link](), list[tuple[int, int]]()
         for receiver in self.names:
             numbers = () if receiver in guided else self._links_to.get(receiver, ())

@@ -31,7 +31,8 @@ def fill_from_shape(document: dict[str, Any]) -> list[Fault]:
     links = formation.get("links") if isinstance(formation, dict) else None
     if not isinstance(formation, dict) or not isinstance(links, dict):
         return []
-    shape, robots, faults = formation.get("shape"), document.get("robots"), list[Fault]()
+    shape, robots = formation.get("shape"), document.get("robots")
+    faults = list[Fault]()
     bare = [
         text
         for text, given in links.items()

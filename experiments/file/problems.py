@@ -108,7 +108,8 @@ class _Scan:
         parts, dot = [], "."
         while dot:
             match = _match(_KEY_PART, self.text, at)
-            name, dot, at = match[1], match[2], match.end()
+            name, dot = match[1], match[2]
+            at = match.end()
             if name[:1] in ('"', "'"):  # text inside its quotes and escapes
                 name = str(msgspec.json.decode(name) if self.json else tomllib.loads(f"key = {name}")["key"])
             parts.append((name, match.start(1)))

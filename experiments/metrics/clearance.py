@@ -37,7 +37,8 @@ class Clearance:
     @classmethod
     def of_trace(cls, trace: Trace) -> Clearance:
         """Clearance in a whole trace; obstacles that can be pushed count only where no world watched for contacts."""
-        names, scene, robots_of = trace.robots, trace.plan.scene, trace.plan.experiment.robots
+        names, scene = trace.robots, trace.plan.scene
+        robots_of = trace.plan.experiment.robots
         solid = Cylinders.of([KINDS[robots_of[name].kind] for name in names], trace.true_position)
         robots: list[Approach | None] = [None] * len(names)
         arena: list[Approach | None] = [None] * len(names)

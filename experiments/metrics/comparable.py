@@ -22,7 +22,8 @@ SAME_COVERAGE: Final = 0.01  # largest difference of known shares of errors wher
 
 def reasons(case: CaseMetrics) -> tuple[str, ...]:
     """Reasons why the figures of a run are not compared with those of another one, one clause each."""
-    lost, missed, factor = lost_share(case), case.missed_share or 0.0, case.world_factor
+    lost, missed = lost_share(case), case.missed_share or 0.0
+    factor = case.world_factor
     found = []
     if case.failures:
         found.append("robots failed")

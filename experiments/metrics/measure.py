@@ -47,9 +47,12 @@ def measure(trace: Trace) -> CaseMetrics:
     metrics, left_out = known_metrics() | asked, unusable_metrics()
     shared = Measurement(trace)
     values, faults = values_of(metrics, shared)
-    mean, names, errors, belief = case_values(metrics, values, shared.kept), trace.robots, shared.errors, shared.belief
-    gaps, beyond, links = errors.gaps(), outside_arena(trace), link_deliveries(trace)
-    together, rotation, farthest = shared.together, shared.rotation, int(beyond.argmax())
+    mean = case_values(metrics, values, shared.kept)
+    names, errors, belief = trace.robots, shared.errors, shared.belief
+    gaps = errors.gaps()
+    beyond, links = outside_arena(trace), link_deliveries(trace)
+    together, rotation = shared.together, shared.rotation
+    farthest = int(beyond.argmax())
     rms = np.sqrt(mean_known(belief**2))
     largest = np.where(np.isfinite(belief), belief, -np.inf).max(axis=0, initial=-np.inf)
     touched = collisions(trace, shared.clearance)
@@ -117,8 +120,10 @@ def _robots(
     shared: Measurement, touched: Sequence[Collision], found: Mapping[str, Sequence[Any]]
 ) -> tuple[RobotMetrics, ...]:
     """Metrics of each robot, from the contacts and from columns (N,) that were `found` elsewhere."""
-    trace, clearance, first = shared.trace, shared.clearance, shared.phases[0]
-    rows, experiment, nothing = range(len(trace.robots)), trace.plan.experiment, [None] * len(trace.robots)
+    trace, clearance = shared.trace, shared.clearance
+    first = shared.phases[0]
+    rows, experiment = range(len(trace.robots)), trace.plan.experiment
+    nothing = [None] * len(trace.robots)
     duration = float(trace.time[-1] - trace.time[0])
     contacts = [[each for each in touched if name in {each.first, each.second}] for name in trace.robots]
     settled = [duration if when is None else when for when in shared.settled] if shared.has_errors else nothing
@@ -200,7 +205,8 @@ def _taken_out(trace: Trace) -> dict[str, str]:
 
 def _held(trace: Trace) -> list[str]:
     """Robots that operators have held for more than a share of the run, one sentence each."""
-    end, held, since = float(trace.time[-1]), dict.fromkeys(trace.robots, 0.0), dict[str, float]()
+    end, held = float(trace.time[-1]), dict.fromkeys(trace.robots, 0.0)
+    since = dict[str, float]()
     last = [Event(end, "hazard", name, f"{UNRESOLVED}: {Cause.ORDERED.rule.words}") for name in trace.robots]
     for event in (*trace.events, *last):
         outcome, _, words = event.text.partition(": ")

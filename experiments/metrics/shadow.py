@@ -46,7 +46,8 @@ def agreement(trace: Trace) -> list[ShadowMetrics | None]:
         if not mine.any():
             found.append(None)
             continue
-        robot, twin, apart = trace.position[:, i], trace.shadow_position[:, i], difference[:, i]
+        robot, twin = trace.position[:, i], trace.shadow_position[:, i]
+        apart = difference[:, i]
         bias = apart[mine].mean(axis=0).tolist()
         gap = norm(apart[mine])
         found.append(

@@ -231,7 +231,8 @@ def belief_errors(trace: Trace, net: Links) -> Array:
 
     NaN before the first pose, and after a death.
     """
-    rows, received, links = len(trace.robots), trace.received, trace.plan.pose_links
+    rows, received = len(trace.robots), trace.received
+    links = trace.plan.pose_links
     number = np.full((rows, rows), -1)
     number[net.receiver, net.sender] = np.arange(len(net))
     link = number[links.receiver, links.sender][received.link]
@@ -285,7 +286,8 @@ def outside_arena(trace: Trace) -> Array:
 def link_deliveries(trace: Trace) -> tuple[LinkDelivery, ...]:
     """Delivery statistics of every link, those that only avoidance needs included."""
     links, received = trace.plan.pose_links, trace.received
-    count, link, took = len(links), received.link, received.arrival - received.stamp
+    count, link = len(links), received.link
+    took = received.arrival - received.stamp
     dropped = np.zeros(count, dtype=np.intp) if trace.dropped is None else trace.dropped
     counts = np.bincount(link, minlength=count)
     total = np.bincount(link, weights=took, minlength=count)
@@ -505,7 +507,8 @@ class Measurement:
     @_kept
     def rate(self) -> Array:
         """Poses that each robot sent in a second, from when it takes part (N,) [Hz]."""
-        trace, time, sent = self.trace, self.trace.time, self.transmissions[0]
+        trace, time = self.trace, self.trace.time
+        sent = self.transmissions[0]
         joined = np.zeros(len(sent)) if trace.joined is None else trace.joined
         present = np.maximum(time[-1] - np.maximum(joined, time[0]), time[1] - time[0])
         early = np.array([(trace.sent_by(i).stamp < when).sum() for i, when in enumerate(joined)], dtype=np.intp)

@@ -128,7 +128,8 @@ def student_95(freedom: int) -> float:
 
 def _share_inside(angle: float, freedom: int) -> float:
     """Share of Student's t inside of ±√n tan θ."""
-    odd, cosine, total = freedom % 2, math.cos(angle), 0.0
+    odd, cosine = freedom % 2, math.cos(angle)
+    total = 0.0
     term = cosine if odd else 1.0
     for power in range(odd, freedom - 1, 2):
         total += term

@@ -250,7 +250,8 @@ class Content:
 
 def _trace(content: Content, about: AboutRun, run: tuple[float, float], time: Array) -> Trace:
     """The trace of a run by its common start, UTC, and its length [s], on the grid `time` (T,)."""
-    plan, experiment, robots = about.plan, about.plan.experiment, about.plan.names
+    plan = about.plan
+    experiment, robots = about.plan.experiment, about.plan.names
     rate, (start, duration) = experiment.rates.state_hz, run
     states = by_robot(content[State], robots)
     poses = [

@@ -114,7 +114,8 @@ class Records:
                 if found == size and end > size:  # a last record that was being written
                     break
                 self.damaged += found - at + unread if found > at else found - checked
-                at, checked, unread = found, found + 1, 0
+                at, checked = found, found + 1
+                unread = 0
                 continue
             places: list[int] = []
             try:
@@ -124,7 +125,8 @@ class Records:
                 unread += end - at
             else:
                 if opcode in CHECKED:
-                    self.damaged, checked, unread = self.damaged + unread, end, 0
+                    self.damaged, checked = self.damaged + unread, end
+                    unread = 0
             if places:
                 yield data, places
             at = end
@@ -146,7 +148,8 @@ class Records:
     def _places(self, data: bytes) -> list[int]:
         """Places where the records of messages begin, among records that follow each other; other records are kept."""
         places = []
-        at, end, unpack = 0, len(data), _RECORD.unpack_from
+        at, end = 0, len(data)
+        unpack = _RECORD.unpack_from
         while at < end:
             opcode, length = unpack(data, at)
             if opcode != Opcode.MESSAGE:

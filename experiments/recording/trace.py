@@ -84,7 +84,8 @@ class Goals:
                 goal rests (`extra`).
         """
         assert receipts.extra is not None
-        acted, row, pose = receipts.arrival, receipts.link, receipts.extra[:, 0]
+        acted, row = receipts.arrival, receipts.link
+        pose = receipts.extra[:, 0]
         reached, first = in_run(acted, duration), _first_of_pose(acted, row, pose)
         first &= reached
         return cls(

@@ -122,7 +122,8 @@ class McapFile:
         data = self._chunk.end()
         packed, size = zstandard.compress(data), len(data)
         offset, length = self._put(Chunk("zstd", packed, self._last, self._first, zlib.crc32(data), size))
-        begin, indices, offsets = self._file.tell(), RecordBuilder(), dict[int, int]()
+        begin, indices = self._file.tell(), RecordBuilder()
+        offsets = dict[int, int]()
         for channel, numbers in self._index.items():
             offsets[channel] = begin + indices.count
             head = (Opcode.MESSAGE_INDEX, 6 + 8 * len(numbers), channel, 8 * len(numbers))
@@ -139,7 +140,8 @@ class McapFile:
         first = min(counted.message_start_time, self._first) if counted.chunk_count else self._first
         counted.message_start_time, counted.message_end_time = first, max(counted.message_end_time, self._last)
         counted.chunk_count += 1
-        self.end, self._last, self.full = max(self.end, self._last), 0, False
+        self.end = max(self.end, self._last)
+        self._last, self.full = 0, False
         self._index.clear()
 
     def finish(self) -> None:
@@ -147,7 +149,8 @@ class McapFile:
         self.flush()
         self._put(DataEnd(0))
         self._counted.write(self._summary[Opcode.STATISTICS])
-        begin, sum_, offsets = self._file.tell(), 0, RecordBuilder()
+        begin, sum_ = self._file.tell(), 0
+        offsets = RecordBuilder()
         self._indices.seek(0)
         for group in GROUPS:
             start, kept = self._file.tell(), self._summary[group].end()

@@ -154,7 +154,8 @@ def write_video(traces: Mapping[str, Trace], file: Path, speed: float = 4.0) -> 
 
 def structure(trace: Trace, metrics: CaseMetrics) -> dict[str, Any]:
     """A case as what becomes a struct: texts, arrays of doubles, arrays of texts, and structs in it."""
-    net, sent, experiment = trace.plan.links, trace.sent, trace.plan.experiment
+    net, sent = trace.plan.links, trace.sent
+    experiment = trace.plan.experiment
     arrays = ("time", "position", "yaw", "true_position", "goal", "setpoint")
     kinds = get_type_hints(RobotMetrics).items()
     columns = [name for name, kind in kinds if set(get_args(kind) or (kind,)) <= {int, float, NoneType}]

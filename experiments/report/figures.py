@@ -199,7 +199,8 @@ def errors(
     axes = figure.subplots()
     first = {trace.case: trace for trace in first_seed(traces)}
     handles: dict[str, Artist] = {}
-    lowest, highest, tolerance = np.inf, 0.0, traces[0].plan.experiment.tolerance
+    lowest, highest = np.inf, 0.0
+    tolerance = traces[0].plan.experiment.tolerance
     for k, (name, band) in enumerate((bands or error_bands(traces)).items()):
         line = style.case_curve(k)
         if band.seeds > 1:

@@ -83,7 +83,8 @@ class SceneDrawing:
 
     def __init__(self, server: viser.ViserServer, stage: SceneModel, look: Look, root: str = "/case") -> None:
         """Draws what does not move; `root` is the name of the node that carries everything, which `move_to` moves."""
-        self._scene, self.stage, self._look, self._root = server.scene, stage, look, root
+        self._scene = server.scene
+        self.stage, self._look, self._root = stage, look, root
         self.shown = VisibleParts()
         self._round = 0
         self._frame = self._scene.add_frame(root, show_axes=False)

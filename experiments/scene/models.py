@@ -170,7 +170,8 @@ def model(kind: Kind) -> Model:
 
 def obstacle(scene: Scene, number: int) -> Mesh:
     """Mesh of an obstacle in its own frame [m]."""
-    low, high, outline = float(scene.bottom[number]), float(scene.top[number]), scene.outline[number]
+    low, high = float(scene.bottom[number]), float(scene.top[number])
+    outline = scene.outline[number]
     if outline is None:
         return cylinder(float(scene.radius[number]), low, high, ROUND)
     if scene.closed[number]:

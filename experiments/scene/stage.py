@@ -351,7 +351,8 @@ class LinkTracker:
 
     def errors(self, time: float | None, position: Array) -> Array:
         """Error of each link (E,) [m], NaN for those that are not there, at a time since the common start [s]."""
-        net, pattern, elapsed = self._stage.links, self._pattern, 0.0 if time is None else max(time, 0.0)
+        net, pattern = self._stage.links, self._pattern
+        elapsed = 0.0 if time is None else max(time, 0.0)
         found = np.full(len(net), np.nan)
         if not isinstance(self._law, Gradient) or pattern is None:
             return found

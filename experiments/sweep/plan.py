@@ -230,7 +230,8 @@ def _axis(argument: str, path: str, text: str) -> Axis:
 
 def _parts(text: str) -> list[str]:
     """A list of values apart: commas inside of brackets and quotes belong to a value."""
-    parts, depth, quote = [""], 0, ""
+    parts = [""]
+    depth, quote = 0, ""
     for letter in text:
         if quote:
             quote = "" if letter == quote else quote

@@ -79,7 +79,8 @@ class Acting:
     """Buttons of an operator's page, and the orders that they give."""
 
     def __init__(self, session: zenoh.Session, watched: WatchedRun) -> None:
-        self._session, self._watched, self._clock = session, watched, Clock()
+        self._session, self._watched = session, watched
+        self._clock = Clock()
         self._keys = keys = Keys(watched.realm)
         self._events = pubsub.pose_publisher(session, keys.event, messages.JSON, pubsub.EVENTS)
         self._urgent = orders.stop_publisher(session, keys)

@@ -107,7 +107,8 @@ class Page:
 
     def __init__(self, server: viser.ViserServer, *, dark: bool) -> None:
         self._server, self.look = server, DARK if dark else LIGHT
-        self.panel, self.shown, self.camera = Panel(server), VisibleParts(), Camera(server)
+        self.panel, self.shown = Panel(server), VisibleParts()
+        self.camera = Camera(server)
         self._plotted = self._tabled = -inf
         self._boxes: dict[str, Any] = {}
         with server.gui.add_folder("Show", order=50.0, expand_by_default=False):
@@ -209,7 +210,8 @@ class LiveView:
 
     def draw(self, now: float) -> None:
         """Draws what is known now [s, monotonic]."""
-        observer, page, moment = self.observer, self._page, self.observer.moment()
+        observer, page = self.observer, self._page
+        moment = self.observer.moment()
         observer.watch_ranges(wanted=page.shown.ranges)
         moved, self._trailed = moment.trail is not self._trailed, moment.trail
         with self._server.atomic():
@@ -236,7 +238,8 @@ class LiveView:
         self._mark.content = heartbeat.mark(self._stages, utc, age, words, over=self._over)
 
     def _tabulate(self, moment: Moment) -> None:
-        observer, stage, panel = self.observer, self.observer.stage, self._page.panel
+        observer = self.observer
+        stage, panel = self.observer.stage, self._page.panel
         errors = self._errors.of_robots(moment.error)
         rows = []
         for k, name in enumerate(stage.names):

@@ -71,7 +71,8 @@ class Observer:
     age: DataAge  # age of the poses
 
     def __init__(self, session: zenoh.Session, keys: Keys) -> None:
-        self._session, self._keys, self._clock = session, keys, Clock()
+        self._session, self._keys = session, keys
+        self._clock = Clock()
         self._experiments = pubsub.pose_subscriber(session, keys.experiment, 4)
         self._states = pubsub.subscriber(session, keys.state("*"), DEPTH)
         self._memories = pubsub.subscriber(session, keys.memory("*"), DEPTH)
@@ -164,7 +165,8 @@ class Observer:
         if not self.conducted:  # else the conductor says so
             for incident in status.incidents_since(report.status):
                 self.events.append(messages.Event(incident.stamp, "hazard", status.robot, incident.text))
-        report.status, report.heard_at, report.known = status, now, True
+        report.status, report.heard_at = status, now
+        report.known = True
 
     def _read_states(self, now: float) -> None:
         states = list(self._newest(self._states, messages.State))

@@ -205,7 +205,8 @@ class ReplayView:
 
     def __init__(self, server: viser.ViserServer, films: Sequence[Film], where: str, *, dark: bool) -> None:
         """Draws all cases beside one another; `where` says which run it is."""
-        self._server, self._films, self._where = server, list(films), where
+        self._server, self._films = server, list(films)
+        self._where = where
         self.clock = ReplayClock(min(film.tracks.begin for film in films), max(film.tracks.end for film in films))
         self._drawn: object = None
         self._tabled = -inf
@@ -286,7 +287,8 @@ class ReplayView:
         self._drawn = None
 
     def _tabulate(self, t: float) -> None:
-        film, history, panel = self._films[self._shown], self._histories[self._shown], self._page.panel
+        film, history = self._films[self._shown], self._histories[self._shown]
+        panel = self._page.panel
         tracks = film.tracks
         if abs(self._slider.value - t) > 0.5 * STEP_S:
             self._slider.value = round(t, 2)

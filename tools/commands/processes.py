@@ -117,7 +117,8 @@ def router(
         raise LabError(f"name the experiment too, from which the rights follow: ./zenpark router FILE --lab {lab}")
     rights, folder = (None, None) if file is None else _rights(file, lab, bodies)
     if folder is None:
-        endpoints, linked, rights = listen or [DEFAULT_ENDPOINT], connect or [], None
+        endpoints, linked = listen or [DEFAULT_ENDPOINT], connect or []
+        rights = None
     else:
         endpoints, linked = secured(listen or [], folder), secured(connect, folder) if connect else []
     if print_config:

@@ -143,7 +143,8 @@ def _run(origin: RunOrigin, handling: Handling, *, former: Path | None = None, b
         with using(folder), _kept_origin(folder, origin, read, options, unwritten):
             if origin.virtual:
                 with viewing.paced(handling.pace or 1.0) if handling.view else nullcontext(lambda *_: None) as watch:
-                    runs, stopped, code = _simulate(read, folder, options, origin.seeds, watch, unwritten), "", 0
+                    runs = _simulate(read, folder, options, origin.seeds, watch, unwritten)
+                    stopped, code = "", 0
             else:
                 with viewing.following(folder, options.identity) if handling.view else nullcontext():
                     runs, stopped, code = _conduct(read, folder, options, unwritten, quiet=handling.as_json)

@@ -162,7 +162,8 @@ class _Top:
     def _rows(self) -> list[LiveRow]:
         from experiments.scene.stage import Condition, condition, touched
 
-        observer, now, rows = self._observer, self._observer.now(), []
+        observer, now = self._observer, self._observer.now()
+        rows = []
         stage = observer.stage
         linked = {stage.names[row] for row in stage.links.receiver.tolist()}
         for name in [*stage.names, *sorted(observer.robots.keys() - {*stage.names})]:
@@ -183,7 +184,8 @@ class _Top:
         from experiments.file.document import UNNAMED
         from tools.live_table import common_phase, drawn, heading
 
-        stage, rows, where = self._observer.stage, self._rows(), self._watched
+        stage, rows = self._observer.stage, self._rows()
+        where = self._watched
         title = stage.title or (where.run.title if where.run is not None else f"realm {where.realm}")
         duration = None if stage.plan is None else stage.plan.experiment.duration_s
         phase, case = common_phase([row.phase for row in rows]), self._observer.case
@@ -220,7 +222,8 @@ def replay(
             played = Broadcast(session, file, realm)
             declared.append(played)
             clock = ReplayClock(0.0, played.end - played.begin)
-            clock.playing, clock.speed, clock.loop = True, rate, loop
+            clock.playing = True
+            clock.speed, clock.loop = rate, loop
             if sys.stdin.isatty():
                 threading.Thread(target=_pause_on_enter, args=(clock,), daemon=True).start()
             print(f"{file}: {clock.end:.1f} s, in the realm {played.keys.realm}", flush=True)

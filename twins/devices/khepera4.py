@@ -58,7 +58,8 @@ class _WheeledRobot:
         (x, y, _), yaw = model.position, model.yaw
         model.command(self._latency.delay((*self.twist, 0.0, 0.0)))
         model.move(self._dt)
-        x, y, turn = model.position[0] - x, model.position[1] - y, model.yaw - yaw
+        x, y = model.position[0] - x, model.position[1] - y
+        turn = model.yaw - yaw
         if drift.present:  # drift of the encoders: wheels that slip
             error_x, error_y = drift.x, drift.y
             drift.advance(x, y)
@@ -82,7 +83,8 @@ class ParkProgram:
     """
 
     def __init__(self, robot: _WheeledRobot, name: str) -> None:
-        self.robot, self.name, self.kind = robot, name, protocol.PARK[name]
+        self.robot, self.name = robot, name
+        self.kind = protocol.PARK[name]
         self._last = robot.pulses
         self._place = [0.0, 0.0]  # [m]
         self._theta = self._way = self._sum = 0.0  # [rad]; [m] in the last turn; sum of the bearing errors [rad]

@@ -196,13 +196,15 @@ class _Drone(FaultyLink[tuple[bytes, tuple[str, int]]]):
         """Start an automatic manoeuvre: take-off, landing or emergency stop; returns an immediate answer, or empty."""
         if word == "emergency":
             self.model.stop()
-            self.mode, self.answer_to, self.sticks = Mode.FALL, None, (0, 0, 0, 0)
+            self.mode, self.answer_to = Mode.FALL, None
+            self.sticks = (0, 0, 0, 0)
             return "ok"
         if word == "takeoff":
             if self.mode is not Mode.GROUND or self.charge < LOWEST_TAKEOFF_CHARGE:
                 return "error"
             self.model.takeoff(protocol.TAKEOFF_HEIGHT)
-            self.mode, self.answer_to, self.sticks = Mode.CLIMB, sender, (0, 0, 0, 0)
+            self.mode, self.answer_to = Mode.CLIMB, sender
+            self.sticks = (0, 0, 0, 0)
             return ""
         self.landing_due = min(self.landing_due, self.t + self.faults.refuse_landing_s)
         if self.mode in (Mode.GROUND, Mode.CLIMB, Mode.FALL) or self.t < self.landing_due:

@@ -80,7 +80,8 @@ class ViconTwin(Server):
             port: 0 for any free port.
         """
         self._subjects = list(subjects)
-        self._rate, self._sigma, self._rng = rate_hz, sigma, rng or np.random.default_rng(0)
+        self._rate, self._sigma = rate_hz, sigma
+        self._rng = rng or np.random.default_rng(0)
         self.link = FaultyLink[bytes](faults or Faults())
         self._position = np.zeros((len(self._subjects), 3))
         self._rotation = np.repeat(np.eye(3)[None], len(self._subjects), axis=0)
@@ -97,7 +98,8 @@ class ViconTwin(Server):
 
     def place(self, row: int, position: Array, rotation: Array) -> None:
         """Set position (3,) [m] and rotation to the world (3, 3) of a subject, and make it visible."""
-        self._position[row], self._rotation[row], self._visible[row] = position, rotation, True
+        self._position[row], self._rotation[row] = position, rotation
+        self._visible[row] = True
 
     def hide(self, row: int) -> None:
         """Make a subject invisible."""

@@ -54,7 +54,8 @@ class Mirrored(Motion):
         self.position = self._position = UNKNOWN
         self.velocity = self._velocity = ZERO
         self.yaw = self._yaw = yaw
-        self.flying, self.attitude, self.wobble = False, NO_ATTITUDE, (0.0, 0.0)
+        self.flying, self.attitude = False, NO_ATTITUDE
+        self.wobble = (0.0, 0.0)
 
     def show(self, position: Vector, yaw: float, velocity: Vector) -> None:
         """Set the state from the next step on: [m], [rad], [m/s]; NaN: absent."""

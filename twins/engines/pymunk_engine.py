@@ -162,7 +162,8 @@ class PlanarEngine(Engine):
             turn = ((to_yaw - yaw + math.pi) % (2.0 * math.pi) - math.pi) / self._dt
             v_x, v_y = (to_x - x) / self._dt, (to_y - y) / self._dt
             if math.sqrt(v_x * v_x + v_y * v_y) > LEAP:
-                x, y, yaw, v_x, v_y, turn = to_x, to_y, to_yaw, 0.0, 0.0, 0.0
+                x, y, yaw = to_x, to_y, to_yaw
+                v_x, v_y, turn = 0.0, 0.0, 0.0
             cells, at = self._space.cells, self._space.obstacles[k]
             cells[at + X], cells[at + Y] = x - self._step * v_x, y - self._step * v_y
             cells[at + YAW] = yaw - self._step * turn
@@ -186,7 +187,8 @@ class _RobotBody:
     def put(self, position: Vector, yaw: float) -> None:
         """Place the body at rest."""
         cells, at = self._cells, self._at
-        cells[at + X], cells[at + Y], cells[at + YAW] = position[0], position[1], yaw
+        cells[at + X], cells[at + Y] = position[0], position[1]
+        cells[at + YAW] = yaw
         cells[at + V_X] = cells[at + V_Y] = cells[at + TURN] = 0.0
         self._wobble = (0.0, 0.0)
 
@@ -250,10 +252,12 @@ class _RobotBody:
         x, y, _ = motion.position
         v_x, v_y, _ = motion.velocity if is_finite(motion.velocity) else (0.0, 0.0, 0.0)
         if not (math.isfinite(x) and math.isfinite(y)):
-            x, y, v_x, v_y = AWAY, AWAY, 0.0, 0.0
+            x, y = AWAY, AWAY
+            v_x, v_y = 0.0, 0.0
         cells[at + X], cells[at + Y] = x - step * v_x, y - step * v_y
         cells[at + YAW] = motion.yaw if math.isfinite(motion.yaw) else 0.0
-        cells[at + V_X], cells[at + V_Y], cells[at + TURN] = v_x, v_y, 0.0
+        cells[at + V_X], cells[at + V_Y] = v_x, v_y
+        cells[at + TURN] = 0.0
 
 
 def _felt(blow: float, drift: float) -> float:

@@ -36,7 +36,8 @@ class Differential(Motion):
         assert isinstance(wheels, Wheels)
         self._base, self._half_base = wheels.base, 0.5 * wheels.base
         self._limit, self._acceleration = wheels.speed, wheels.acceleration
-        self.attitude, self.flying, self.wobble = NO_ATTITUDE, False, (0.0, 0.0)
+        self.attitude, self.flying = NO_ATTITUDE, False
+        self.wobble = (0.0, 0.0)
         self.place(start, yaw, flying=False)
 
     def command(self, setpoint: Setpoint) -> None:

@@ -24,7 +24,8 @@ class Ground(Motion):
 
     def __init__(self, kind: Kind, start: Vector, yaw: float) -> None:
         """At rest at `start` [m] with `yaw` [rad]."""
-        self.attitude, self.flying, self.wobble = NO_ATTITUDE, False, (0.0, 0.0)
+        self.attitude, self.flying = NO_ATTITUDE, False
+        self.wobble = (0.0, 0.0)
         self.place(start, yaw, flying=False)
 
     def command(self, setpoint: Setpoint) -> None:

@@ -39,7 +39,8 @@ class Noise:
     def __init__(self, name: str, seed: int, purpose: str, scale: Sequence[float], block: int = BLOCK) -> None:
         """`scale`: standard deviations. The stream does not depend on `block`, the draws per refill."""
         self.present = any(scale)
-        self.ahead, self.next, self.end = array("d"), 0, -1
+        self.ahead, self.next = array("d"), 0
+        self.end = -1
         self._scale, self._block = tuple(scale), block
         if self.present:
             self._generator = stream(name, seed, purpose)

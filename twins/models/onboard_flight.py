@@ -39,7 +39,8 @@ class OnboardFlight(Motion):
     def __init__(self, kind: Kind, start: Vector, yaw: float) -> None:
         """At rest at `start` [m] with `yaw` [rad], motors off."""
         self._by_velocity = kind.takes == "velocity"
-        self.attitude, self.wobble, self.wind = NO_ATTITUDE, (0.0, 0.0), (0.0, 0.0)
+        self.attitude = NO_ATTITUDE
+        self.wobble, self.wind = (0.0, 0.0), (0.0, 0.0)
         self._from = self._to = start[2]
         self._elapsed, self._climb_s = 0.0, 1.0
         self.place(start, yaw, flying=False)
@@ -79,7 +80,8 @@ class OnboardFlight(Motion):
         self.velocity = self._velocity_setpoint = ZERO
         self.yaw = self._yaw_setpoint = yaw
         self._yaw_rate = 0.0
-        self.flying, self._landing, self._climbing = flying, False, False
+        self.flying = flying
+        self._landing, self._climbing = False, False
 
     def _climb(self, height: float) -> None:
         self._target = self.held

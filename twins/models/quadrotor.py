@@ -35,7 +35,9 @@ class Quadrotor(OnboardFlight):
         self._response = flight
         self._gain, self._speed = flight.position, flight.speed
         self._turn, self._turn_rate = kind.turn_response, kind.turn_rate
-        self._dt, self._step_gain, self._tilt, self._push = 0.0, ZERO, ZERO, (0.0, 0.0)
+        self._dt = 0.0
+        self._step_gain, self._tilt = ZERO, ZERO
+        self._push = (0.0, 0.0)
         super().__init__(kind, start, yaw)
 
     def place(self, position: Vector, yaw: float, *, flying: bool) -> None:
@@ -76,7 +78,8 @@ class Quadrotor(OnboardFlight):
         ay = (1.0 - tilt_y) * ay + tilt_y * (gain_y * (wy - vy))
         az = (1.0 - tilt_z) * az + tilt_z * (gain_z * (wz - vz))
         self._change = (ax, ay, az)
-        vx, vy, vz = vx + ax + push_x, vy + ay + push_y, vz + az
+        vx, vy = vx + ax + push_x, vy + ay + push_y
+        vz = vz + az
         x, y, z = x + dt * vx, y + dt * vy, z + dt * vz
         self.yaw += dt * clamp(turn, -self._turn_rate, self._turn_rate)
         if self._landing and self._touches_down(z):
@@ -88,7 +91,8 @@ class Quadrotor(OnboardFlight):
         self.position = (x + wobble_x, y + wobble_y, z)
 
     def _set_step(self, dt: float) -> None:
-        gain, tilt, wind = self._response.velocity, self._response.tilt, self.wind
+        gain, tilt = self._response.velocity, self._response.tilt
+        wind = self.wind
         self._dt, self._step_gain = dt, (dt * gain[0], dt * gain[1], dt * gain[2])
         self._tilt = (min(dt * tilt[0], 1.0), min(dt * tilt[1], 1.0), min(dt * tilt[2], 1.0))
         self._push = (dt * wind[0], dt * wind[1])

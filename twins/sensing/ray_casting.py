@@ -169,7 +169,8 @@ class Caster:
         )
 
     def _cast_on_cylinders(self, distance: Array, origins: _FanOrigins, geometry: _Geometry) -> None:
-        dx, dy, radius = geometry.x - origins.x, geometry.y - origins.y, self._radius
+        dx, dy = geometry.x - origins.x, geometry.y - origins.y
+        radius = self._radius
         square = dx * dx + dy * dy
         near = (square <= (origins.reach + radius) ** 2) & (
             square > radius**2

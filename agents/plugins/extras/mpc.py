@@ -66,13 +66,15 @@ class Mpc(Law, frozen=True):
         """Plan again from the state of the last plan, and move along."""
         ahead, speed = horizon(self.steps, self.period, self.effort), min(self.speed, view.robot.speed)
         p, v = advance(memory["state"], view, speed)
-        conflicts, slack, a = [], 0.0, ahead.rest
+        conflicts, slack = [], 0.0
+        a = ahead.rest
         if view.moves and not view.leads:
             mine = ahead.later(memory["path"], view.step_s) if is_known(memory["path"]) else ahead.positions(p, v, a)
             conflicts = ahead.conflicts(mine, view.neighbours, self.spacing, self.right)
             goal = self.goal.get(view.robot.name, p)
             a, slack = ahead.plan(p, v, goal, conflicts, (speed, self.acceleration, self.penalty))
-        path, (ax, ay), dt = ahead.positions(p, v, a), a[0].tolist(), view.robot.step_s
+        path, (ax, ay) = ahead.positions(p, v, a), a[0].tolist()
+        dt = view.robot.step_s
         x = v[0] + ax * dt + CATCH_UP * (p[0] - view.position[0])
         y = v[1] + ay * dt + CATCH_UP * (p[1] - view.position[1])
         return Control(
@@ -98,7 +100,8 @@ def advance(state: tuple[float, ...], view: View, speed: float) -> tuple[Planar,
     x, y = x + dt * (vx + 0.5 * dt * ax), y + dt * (vy + 0.5 * dt * ay)
     vx, vy = vx + dt * ax, vy + dt * ay
     if not (view.moves and not view.leads and hypot(x - here_x, y - here_y) < STRAY):
-        x, y, (vx, vy, _) = here_x, here_y, view.target_velocity if view.leads else view.velocity
+        x, y = here_x, here_y
+        vx, vy, _ = view.target_velocity if view.leads else view.velocity
         if not (view.moves and isfinite(vx + vy)):
             vx = vy = 0.0
     return (x, y), (clamp(vx, -speed, speed), clamp(vy, -speed, speed))
@@ -116,7 +119,8 @@ class Horizon:
             raise PluginError(
                 "the law mpc needs an extra library: ./zenpark install daqp, or pip install -e '.[mpc]'"
             ) from None
-        self._np, self._solve, self._period = np, daqp.solve, period
+        self._np, self._solve = np, daqp.solve
+        self._period = period
         self._times = period * np.arange(1.0, steps + 1.0)
         since = (self._times[:, None] - self._times) / period  # steps from the end of one to the end of another
         self._shift = np.where(since >= 0.0, period * period * (since + 0.5), 0.0)  # change of places by accelerations
@@ -176,7 +180,8 @@ class Horizon:
 
         `limits`: of speed [m/s] and acceleration [m/s²], and the penalty of a violation.
         """
-        np, steps, count = self._np, len(self.rest), len(conflicts)
+        np, steps = self._np, len(self.rest)
+        count = len(conflicts)
         speed, most, penalty = limits
         free = self.positions(p, v, self.rest)
         hessian, rows = np.zeros((2 * steps + count,) * 2), np.zeros((2 * steps + count,) * 2)

@@ -62,7 +62,8 @@ class Auction(Law, frozen=True):
 
     def step(self, view: View, memory: Memory) -> Control:
         """Receive bids, bid, and move on when bids are calm."""
-        here, robot, me = view.position[:2], view.robot, float(view.robot.number)
+        here, robot = view.position[:2], view.robot
+        me = float(view.robot.number)
         places = self.called(view.time)
         called, size = (
             float(len(places)),
@@ -71,7 +72,8 @@ class Auction(Law, frozen=True):
         if memory["called"][0] != called:
             ways = [dist(here, place) for place in places]
             memory = {**self.begin(robot), "way": (*ways, *(0.0,) * (len(memory["way"]) - len(ways)))}
-        way, level, bidder = memory["way"], [*memory["level"]], [*memory["bidder"]]
+        way = memory["way"]
+        level, bidder = [*memory["level"]], [*memory["bidder"]]
         for each in view.known(*self.SAYS):
             if each.said["called"][0] == called:
                 for k, bid in enumerate(zip(each.said["level"], each.said["bidder"], strict=True)):

@@ -42,7 +42,8 @@ class Averaging(Law, frozen=True):
         (name_x, name_q), dt = names, view.step_s
         x_new, q_new, differences = [], [], []
         for k, (u, x, q) in enumerate(zip(signal, memory[name_x], memory[name_q], strict=True)):
-            said_x, said_q, apart, apart_q = view.said[name_x][k], view.said[name_q][k], 0.0, 0.0
+            said_x, said_q = view.said[name_x][k], view.said[name_q][k]
+            apart, apart_q = 0.0, 0.0
             for weight, each in heard:
                 apart += weight * (said_x - each.said[name_x][k])
                 apart_q += weight * (said_q - each.said[name_q][k])

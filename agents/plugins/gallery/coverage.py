@@ -80,7 +80,8 @@ def nearer(polygon: list[Place], own: Place, other: Place) -> list[Place]:
     beyond = [nx * x + ny * y - level for x, y in polygon]
     kept: list[Place] = []
     for k, (x, y) in enumerate(polygon):
-        (last_x, last_y), before, here = polygon[k - 1], beyond[k - 1], beyond[k]
+        (last_x, last_y), before = polygon[k - 1], beyond[k - 1]
+        here = beyond[k]
         if (before > 0.0) != (here > 0.0):
             share = before / (before - here)
             kept.append((last_x + share * (x - last_x), last_y + share * (y - last_y)))

@@ -59,7 +59,8 @@ class Enclosing(Law, frozen=True):
 
     def estimate(self, view: View, memory: Memory) -> Memory:
         """Place and velocity of the target, and links to it, after a step of Euler's method."""
-        (a, b), (speed_x, speed_y), most = memory["target"], memory["speed"], float(view.robot.count)
+        (a, b), (speed_x, speed_y) = memory["target"], memory["speed"]
+        most = float(view.robot.count)
         heard = [each for each in view.known(*self.SAYS) if each.said["links"][0] + 1.0 < most]
         if not heard:
             return {"target": (a, b), "speed": (0.0, 0.0), "links": (most,)}

@@ -43,7 +43,8 @@ class Flocking(Law, frozen=True):
         """Step of Euler's method; a robot that is held, or led by its plan, starts again from rest."""
         if view.leads or not view.moves:
             return Control(memory={"v": (0.0, 0.0)}, velocity=(0.0, 0.0, nan))
-        (vx, vy), (x, y, _), t = memory["v"], view.position, view.time
+        (vx, vy), (x, y, _) = memory["v"], view.position
+        t = view.time
         ux = -self.pull * (x - self.place[0] - t * self.velocity[0]) - self.damping * (vx - self.velocity[0])
         uy = -self.pull * (y - self.place[1] - t * self.velocity[1]) - self.damping * (vy - self.velocity[1])
         for each in view.neighbours:

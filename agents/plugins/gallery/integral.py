@@ -34,7 +34,8 @@ class Integral(Law, frozen=True):
 
     def step(self, view: View, memory: Memory) -> Control:
         """Step of Euler's method."""
-        (z_x, z_y), x, y = memory["z"], 0.0, 0.0
+        z_x, z_y = memory["z"]
+        x, y = 0.0, 0.0
         for each in view.neighbours:
             x += view.position[0] - each.position[0] - each.link.relative[0]
             y += view.position[1] - each.position[1] - each.link.relative[1]

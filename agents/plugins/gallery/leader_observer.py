@@ -45,7 +45,8 @@ class LeaderObserver(Law, frozen=True):
         if view.leads:
             return Control(memory={"v": view.target_velocity[:2], "links": (0.0,)})
         heard, most = view.known(*self.SAYS), float(view.robot.count)
-        share, x, y, apart_x, apart_y = 1.0 / max(len(heard), 1), 0.0, 0.0, 0.0, 0.0
+        share = 1.0 / max(len(heard), 1)
+        x, y, apart_x, apart_y = 0.0, 0.0, 0.0, 0.0
         for each in heard:
             x += share * (view.position[0] - each.position[0] - each.link.relative[0])
             y += share * (view.position[1] - each.position[1] - each.link.relative[1])

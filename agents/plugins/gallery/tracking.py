@@ -134,7 +134,8 @@ def predicted(y: Values, matrix: Values, seconds: float, density: float, every: 
 @lru_cache(maxsize=8)  # most ages are equal
 def transition(t: float, density: float, every: Values) -> tuple[Matrix, Matrix]:
     """W F⁻ᵀ and F⁻¹ for `t` [s], where `every` is the sum of information."""
-    a, b, c = density * t**3 / 3.0, density * t * t / 2.0, density * t
+    a, b = density * t**3 / 3.0, density * t * t / 2.0
+    c = density * t
     noise = ((a, 0.0, b, 0.0), (0.0, a, 0.0, b), (b, 0.0, c, 0.0), (0.0, b, 0.0, c))
     back = ((1.0, 0.0, -t, 0.0), (0.0, 1.0, 0.0, -t), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
     there = transposed(back)

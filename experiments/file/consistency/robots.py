@@ -141,7 +141,8 @@ def _unknown(path: tuple[str, str], name: str) -> Fault:
 
 
 def _hover(experiment: Experiment, path: tuple[str, str], robot: RobotTable, kind: Kind) -> Iterator[Fault]:
-    name, top, margin = path[1], experiment.arena.size[2], experiment.safety.margin
+    name, top = path[1], experiment.arena.size[2]
+    margin = experiment.safety.margin
     if not kind.flies:
         if robot.hover is not None:
             message = f"'{name}' is a {robot.kind}, which does not fly"

@@ -250,7 +250,8 @@ class CaseProcesses:
 
         `changed` are robots with other settings, this time only.
         """
-        robots, file, plan = self._context.plan.experiment.robots, self._addressed, self._reached
+        robots = self._context.plan.experiment.robots
+        file, plan = self._addressed, self._reached
         if changed:
             plan = plan.changed(robots={**plan.experiment.robots, **changed})
             file = self._context.variant("changed")
@@ -336,7 +337,8 @@ class CaseProcesses:
         """Processes that ended since the last call; recorder, router, world, centre and positioning restart,
         a few times."""
         for process in self._launcher.died():
-            role, end, because = process.name.removeprefix(self._context.process("")), process.exit, process.because
+            role = process.name.removeprefix(self._context.process(""))
+            end, because = process.exit, process.because
             if (again := self.again(process)) is not None:
                 yield Death(again[0], "conductor", again[1])
             elif process.name in self._standins:

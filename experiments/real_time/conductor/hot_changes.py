@@ -64,7 +64,8 @@ class _Change:
 class HotChanges:
     def __init__(self, plan: Plan, processes: CaseProcesses, view: NetworkView, keys: Keys) -> None:
         """Refuse everything until `begin`."""
-        self._experiment, self._processes, self._view, self._keys = plan.experiment, processes, view, keys
+        self._experiment = plan.experiment
+        self._processes, self._view, self._keys = processes, view, keys
         self._robots = view.robots
         self._start: float | None = None
         self._changes: list[_Change] = []

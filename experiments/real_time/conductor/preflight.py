@@ -168,7 +168,8 @@ class Inspector(CaseRun):
 
     def _try(self, name: str, each: Observed, *, red: bool) -> Iterator[Check]:
         """Hop or drive, then stop in motion, of one robot; what is red is not moved."""
-        robot, asked, safety = self._processes.robot(name), self._trials, self._experiment.safety
+        robot, asked = self._processes.robot(name), self._trials
+        safety = self._experiment.safety
         trials: list[tuple[str, str, bool, Callable[[], Check]]] = [
             (checks.hop_of(robot), "hop", asked.hop, lambda: checks.hop(each, self._move(name, robot), safety)),
             ("stop, motors on", "stop", asked.stop,

@@ -79,7 +79,8 @@ class RobotView:
     def forget_process(self) -> None:
         """Forget the process that has ended, except its last place and its origin."""
         self.former = self.status.pid if self.status is not None else self.former
-        self.status, self.alive, self.vanished, self.seen = None, False, inf, inf
+        self.status, self.alive = None, False
+        self.vanished, self.seen = inf, inf
         self.behind, self.began = inf, None
 
 
@@ -140,7 +141,8 @@ class NetworkView:
 
     def __init__(self, stack: ExitStack, context: CaseContext, progress: Progress) -> None:
         """Join the network; `stack` leaves it."""
-        self.clock, self.robots, self._progress = progress.clock, progress.robots, progress
+        self.clock, self.robots = progress.clock, progress.robots
+        self._progress = progress
         self._launcher, self._begun = context.launcher, time.monotonic()
         experiment, endpoints = context.plan.experiment, context.endpoints
         self._keys = keys = Keys(experiment.network.realm)

@@ -102,7 +102,8 @@ class Station:
             obey: Gets the emergency stops that were ordered on the host.
         """
         assert host.address is not None
-        self.name, self.host, self.address = name, host, host.address
+        self.name, self.host = name, host
+        self.address = host.address
         self.clock: HostClock | None = None  # the last measurement
         self.lab = lab.lab_of(routers)  # folder on this machine
         self._routers = [Endpoint.parse(router) for router in lab.bare(routers)]

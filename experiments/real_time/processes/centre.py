@@ -48,7 +48,8 @@ class CentreProcess:
         self._names = names
         self.centre = centre = Centre([plan.assignment(name, centrally=True) for name in names])
         common = centre.assignments[0]  # rates, limits and duration are those of the experiment
-        self._duration, self._session, self._keys = common.duration, session, keys
+        self._duration = common.duration
+        self._session, self._keys = session, keys
         self._ownership = joint.ownership
         self._router = network.RouterWatch(session, keys.centre_alive, joint.endpoints)
         self._cut_off = False
@@ -80,7 +81,8 @@ class CentreProcess:
         self._clock = Clock()
         self._seq = round(self._clock.utc() * 1e3)  # greater than any number of a former central controller
         self._sent = self.missed = 0
-        self.late_s, self._reported, self._cpu_s = 0.0, 0.0, time.process_time()
+        self.late_s, self._reported = 0.0, 0.0
+        self._cpu_s = time.process_time()
 
     def run(self, over: threading.Event) -> None:
         """Decides until `over` is set."""
@@ -174,7 +176,8 @@ class CentreProcess:
             cpu_s=cpu_s,
             rss_mb=resident_mb(),
         )
-        self._cpu_s, self._reported, self.late_s = cpu_s, t, 0.0
+        self._cpu_s, self._reported = cpu_s, t
+        self.late_s = 0.0
         self._reports.put(messages.encode(report))
 
 

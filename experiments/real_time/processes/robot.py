@@ -88,7 +88,8 @@ def fly(launch: RobotLaunch) -> int:
 
 
 def _run(plan: Plan, launch: RobotLaunch, endpoints: Sequence[str]) -> int:
-    experiment, names, clock = plan.experiment, launch.names, Clock(launch.clock_correction)
+    experiment, names = plan.experiment, launch.names
+    clock = Clock(launch.clock_correction)
     endpoints = mesh.neighbour_endpoints(plan, names, endpoints)
     request = replace(bodies.body_request(plan, names, experiment.seed, endpoints), clock=clock)
     body = shadowed(assemble(request), request, bodies.shadow_periods(plan, names))

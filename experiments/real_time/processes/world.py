@@ -49,7 +49,8 @@ class Pace:
         if span < REPORT_S:
             return False
         self.factor, self.load = self.ticks * dt / span, self.worked / span
-        self.since, self.ticks, self.worked = now, 0, 0.0
+        self.since = now
+        self.ticks, self.worked = 0, 0.0
         return True
 
 

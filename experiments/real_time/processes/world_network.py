@@ -183,7 +183,9 @@ class States:
     """States and statuses of the robots: poses of mirrored ones, former poses of simulated ones, start of the run."""
 
     def __init__(self, plan: Plan, population: WorldBodies, joint: Network, events: Events, clock: Clock) -> None:
-        self._population, self._session, self._keys, self._events = population, joint.session, joint.keys, events
+        self._population = population
+        self._session, self._keys = joint.session, joint.keys
+        self._events = events
         self._clock, self._names = clock, population.names
         x, y, z = plan.experiment.arena.size
         self._valid_box = validation.valid_box_of((-0.5 * x, -0.5 * y, 0.0), (0.5 * x, 0.5 * y, z))
@@ -299,7 +301,8 @@ class Publications:
 
     def publish(self, stamp: float) -> None:
         """Publishes all that is new at `stamp` [s] UTC."""
-        states, names, encoding = self._population.states, self._names, self._encoding
+        states = self._population.states
+        names, encoding = self._names, self._encoding
         for row, publisher in self._positions.items():
             state = states[row]
             position = messages.position(names[row], stamp, *_rounded(state.position, state.yaw))

@@ -37,7 +37,8 @@ class WorldBodies:
 
     def __init__(self, plan: Plan) -> None:
         """All robots at their starts."""
-        self._plan, self.names, experiment = plan, plan.names, plan.experiment
+        self._plan = plan
+        self.names, experiment = plan.names, plan.experiment
         robots = list(experiment.robots.values())
         self._kinds = plan.kinds
         self.flies = tuple(kind.flies for kind in self._kinds)
@@ -109,7 +110,8 @@ class WorldBodies:
                 raise Refusal(f"{name} is only mirrored here: it is where its own process says")
             self._require_room(rows[0])
         for row in rows:
-            flying, (x, y, _), yaw = before[row].flying, *self._home[row]
+            flying = before[row].flying
+            (x, y, _), yaw = self._home[row]
             self.put(self.names[row], (x, y, before[row].position[2] if flying else 0.0), yaw, flying=flying)
 
     def _create_body(self) -> None:
@@ -134,7 +136,8 @@ class WorldBodies:
 
     def _require_room(self, row: int) -> None:
         """Raises Refusal if a robot on the floor would overlap something at its start."""
-        name, own, (x, y, _) = self.names[row], self._kinds[row], self._home[row][0]
+        name, own = self.names[row], self._kinds[row]
+        x, y, _ = self._home[row][0]
         for other, (kind, motion) in enumerate(zip(self._kinds, self.body.engine.motions, strict=True)):
             if other != row and motion.position[2] < own.height:
                 apart = math.hypot(motion.position[0] - x, motion.position[1] - y)

@@ -113,7 +113,8 @@ class _Writer:
         self.definitions[own] = self.definitions.get(own, "")  # entered before those inside it
         parts, lines = [], []
         for field in info.fields:
-            where, inner, name = f"{kind.__name__}.{field.name}", f"{value}.{field.name}", field.encode_name
+            where, inner = f"{kind.__name__}.{field.name}", f"{value}.{field.name}"
+            name = field.encode_name
             if not FIELD.fullmatch(name):
                 raise TypeError(f"{where}: ROS wants lower_snake_case")
             match field.type:
@@ -167,7 +168,8 @@ class _Writer:
                 f"out += {put}({', '.join(self._values)})",
                 f"{', '.join(self._taken)}, = {take}(data, i); i += {run.size}",
             )
-        self._codes, self._values, self._taken = "", [], []
+        self._codes = ""
+        self._values, self._taken = [], []
 
     def functions(self, rebuilt: str) -> tuple[Callable[[S], bytes], Callable[[bytes], S]]:
         """The encoder and the decoder."""

@@ -20,7 +20,8 @@ class Commander:
 
     def __init__(self, flight: Flight, turn_response: float) -> None:
         """Gains of the model's loops: a velocity v is the position v / gain ahead; `turn_response` of the yaw [1/s]."""
-        self._gain, self._speed_gain, self._turn_gain = flight.position, flight.velocity[0], turn_response
+        self._gain, self._speed_gain = flight.position, flight.velocity[0]
+        self._turn_gain = turn_response
         self.command(-inf, on=False)
         self._low_level = False
 
@@ -55,7 +56,8 @@ class Commander:
         roll, pitch = (clamp(angle, -STEEPEST, STEEPEST) for angle in lean)
         # acceleration along the axes of the robot, on axes without setpoint [m/s²]
         self._lean = -GRAVITY * tan(pitch), -GRAVITY * tan(roll)
-        self.on, self.received, self._low_level = on, t, True
+        self.on, self.received = on, t
+        self._low_level = True
 
     def stop(self) -> None:
         """Forget the setpoint: motors off."""

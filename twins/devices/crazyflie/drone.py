@@ -309,7 +309,8 @@ class Drone:
             if data[0] == 0:
                 self.vehicle.commander.release()
             return
-        kind, rest, free = data[0], data[1:], math.nan
+        kind, rest = data[0], data[1:]
+        free = math.nan
         sense = -1.0 if kind in (Setpoint.OLD_VELOCITY, Setpoint.OLD_HEIGHT, Setpoint.OLD_HOVER) else 1.0
         if kind == Setpoint.POSITION:
             x, y, z, yaw = _numbers(crtp.FOUR, rest)
@@ -358,7 +359,8 @@ class Drone:
     def _climb(self, command: int, pose: Array, data: bytes) -> LogStatus:
         landing = command in LANDINGS
         if command in (HighLevel.OLD_TAKEOFF, HighLevel.OLD_LAND):
-            (height, span), yaw, keep = _numbers(crtp.OLD_CLIMB, data), 0.0, False
+            height, span = _numbers(crtp.OLD_CLIMB, data)
+            yaw, keep = 0.0, False
         elif command in (HighLevel.TAKEOFF_VELOCITY, HighLevel.LAND_VELOCITY):
             height, relative, yaw, keep, speed = _numbers(crtp.CLIMB_VELOCITY, data)
             height = float(pose[2]) + (-height if landing else height) if relative else height

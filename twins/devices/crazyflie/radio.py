@@ -75,7 +75,8 @@ class RadioLink(FaultyLink[bytes]):
         self.heard = self.t
         null = packet[0] | COUNTERS == NULL | COUNTERS
         if null and len(packet) == 3 and packet[1] == SAFELINK:
-            self.safelink, self._up, self._down = bool(packet[2]), 1, 1
+            self.safelink = bool(packet[2])
+            self._up, self._down = 1, 1
             self._acknowledgement = packet
             return None
         forwarded = None

@@ -105,7 +105,8 @@ class Supervisor:
         return self.state != before and self.state in (SupervisorState.LOCKED, SupervisorState.CRASHED)
 
     def _next(self, t: float, age: float) -> SupervisorState:  # noqa: PLR0911 - a table of transitions
-        state, flying, settled = self.state, t - self._motors_ran < FLYING_S, t - self._since
+        state, flying = self.state, t - self._motors_ran < FLYING_S
+        settled = t - self._since
         airborne = state in (SupervisorState.FLYING, SupervisorState.LEVEL)
         late = self._stop or t - self._watchdog > WATCHDOG_S or (airborne and age > LOCK_S)
         if late or (state == SupervisorState.LEVEL and self.tumbled):

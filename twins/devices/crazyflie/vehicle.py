@@ -51,7 +51,8 @@ class KalmanGains:
 
     def reset(self) -> None:
         """Covariance of an unknown position, at rest."""
-        self._place, self._mixed, self._speed = LOST, 0.0, SLOW  # [m²], [m²/s], [m²/s²]
+        self._place, self._mixed = LOST, 0.0  # [m²], [m²/s]
+        self._speed = SLOW  # [m²/s²]
 
     def predict(self, dt: float) -> None:
         """Let the covariance grow for dt [s] without a position."""
@@ -128,7 +129,8 @@ class Estimator:
             u, v, w = self.rate
             drift_x, drift_y = DRIFT if flying and not measured else (0.0, 0.0)
             if self.turn != 0.0:  # accelerations are turned by a wrong yaw
-                c, s, (a, b, _) = cos(SEEN_TURN * self.turn), sin(SEEN_TURN * self.turn), moved
+                c, s = cos(SEEN_TURN * self.turn), sin(SEEN_TURN * self.turn)
+                a, b, _ = moved
                 drift_x, drift_y = drift_x + c * a - s * b - a, drift_y + s * a + c * b - b
             self.rate = u, v, w = u + dt * drift_x, v + dt * drift_y, w + dt * self._accelerometer
             self.error = x + dt * u, y + dt * v, z + dt * w
@@ -239,7 +241,8 @@ class Vehicle:
         self.vertical = VerticalLoops(settings.platform, self.dt)
         flight = CRAZYFLIE.motion
         assert isinstance(flight, Flight)
-        self._gain, self._speed_gain, self._limit = flight.position, flight.velocity[0], flight.speed[0]
+        self._gain = flight.position
+        self._speed_gain, self._limit = flight.velocity[0], flight.speed[0]
         self.planner, self.commander = OnboardPlanner(), Commander(flight, kind.turn_response)
         # it believes to be where it was switched on, and to look along x
         accelerometer = 1e-3 * GRAVITY * faults.accelerometer_mg
@@ -364,7 +367,8 @@ class Vehicle:
         offset = 0.0 if isnan(target[2]) else target[2] - place[2]
         wanted = self._gain[2] * offset if isnan(self.commander.target[2]) else None
         acceleration = self.vertical.advance(offset, before[2] + w, wanted, self.commander.thrust)
-        (x, y, _), (v_x, v_y, _), speed = model.held, model.velocity, before[2] + self.dt * acceleration
+        (x, y, _), (v_x, v_y, _) = model.held, model.velocity
+        speed = before[2] + self.dt * acceleration
         model.held = x, y, place[2] + self.dt * speed
         share = self.dt * self._speed_gain
         more_x, more_y = -u, -v
@@ -394,7 +398,8 @@ class Vehicle:
         self.supervisor.tumbled |= height <= 0.0 and before[2] < -IMPACT
         if height >= 0.0:
             return
-        x, y, v_x, v_y = place[0], place[1], 0.0, 0.0
+        x, y = place[0], place[1]
+        v_x, v_y = 0.0, 0.0
         if model.flying and self.vertical.sliding:
             wanted_x = clamp(self._gain[0] * (setpoint[0] - x), -SKATING, SKATING)
             wanted_y = clamp(self._gain[1] * (setpoint[1] - y), -SKATING, SKATING)
@@ -407,7 +412,8 @@ class Vehicle:
         (v_x, v_y, v_z), dt = self.model.velocity, self.dt
         moved = (v_x - before[0]) / dt, (v_y - before[1]) / dt, (v_z - before[2]) / dt
         self.acceleration = x, y, z = moved if self.model.flying else ZERO
-        c, s, lift = cos(self.model.yaw), sin(self.model.yaw), GRAVITY + z
+        c, s = cos(self.model.yaw), sin(self.model.yaw)
+        lift = GRAVITY + z
         share, (roll, pitch) = 1.0 - exp(-dt / LEANING_S), self.attitude
         wanted_roll, wanted_pitch = TRIM[0] + atan2(s * x - c * y, lift), TRIM[1] - atan2(c * x + s * y, lift)
         self.attitude = roll + share * (wanted_roll - roll), pitch + share * (wanted_pitch - pitch)
