@@ -35,11 +35,11 @@ from experiments.real_time.processes.zygote import Forked, NoZygote
 
 ROUTER: Final = "router"  # the first; others are router2, router3, ...
 ZYGOTE: Final = "zygote"
-LAND_S: Final = 15.0  # for robots to come down after their lifeline was cut
+LAND_S: Final = 15.0  # time for robots to come down after their lifeline was cut
 LINGER_S: Final = 15.0  # the router outlives a killed conductor, so that the landing is recorded
 READY_S: Final = 15.0  # limit for a process to say that it is ready
 POLL_S: Final = 0.02
-STOP_PATIENCE_S: Final = 0.1  # for the lock of the list of processes
+STOP_PATIENCE_S: Final = 0.1  # patience for the lock of the list of processes
 TAIL: Final = 12  # lines of a dead process's output that are worth showing
 
 Handle = subprocess.Popen[bytes] | Forked
@@ -53,10 +53,10 @@ class Process:
     handle: Handle
     lifeline: IO[bytes]  # its standard input
     log: Path  # begins with the output of processes of this name before it
-    begins: int  # [bytes] where its own output begins there
+    begins: int  # [bytes] begin of its own output there
     shown: int  # [bytes] end of what `news` has returned
     unsent: bytearray = field(default_factory=bytearray)  # input that its pipe has not taken yet
-    robots: Sequence[str] = ()  # that it drives
+    robots: Sequence[str] = ()  # robots that it drives
     begun: float = field(default_factory=time.monotonic)  # [s]
     fault: str = ""  # reason why it was killed
 
@@ -156,7 +156,7 @@ class Launcher:
         self._lock = threading.Lock()
         self._over = threading.Event()
         self._silence_at, self._beat_at = -inf, time.monotonic()
-        self._line = b"\n"  # of each heartbeat
+        self._line = b"\n"  # line of each heartbeat
         self._beat = threading.Thread(target=self._beats, name="heartbeat", daemon=True)
 
     def __enter__(self) -> Self:
@@ -373,8 +373,8 @@ class RouterEnded(StandInError):
 
 @dataclass(frozen=True)
 class Router:
-    name: str  # of its process
-    listen: Sequence[str]  # where it listens
+    name: str  # name of its process
+    listen: Sequence[str]  # places where it listens
     # routers before it, which it connects to for as long as it lives, so that any two are linked once
     link: Sequence[str] = ()
 
@@ -416,7 +416,7 @@ def start_routers(launcher: Launcher, routers: Sequence[Router], rights: Path | 
             raise (error if process.alive else RouterEnded(str(error))) from None
 
 
-RUN: Final = "ZENPARK_RUN"  # in the environment of every process of a run, here or on a host, by which they are found
+RUN: Final = "ZENPARK_RUN"  # variable of every process of a run, here or on a host, by which they are found
 
 
 def tagged(tag: str) -> Iterator[tuple[int, list[str]]]:
@@ -424,5 +424,5 @@ def tagged(tag: str) -> Iterator[tuple[int, list[str]]]:
     for folder in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):  # another user's, or ended meanwhile
             if tag.encode() in (folder / "environ").read_bytes().split(b"\0"):
-                words = (folder / "cmdline").read_bytes().rstrip(b"\0")  # of a forked process there are many at the end
+                words = (folder / "cmdline").read_bytes().rstrip(b"\0")  # a forked process has many at the end
                 yield int(folder.name), words.decode(errors="replace").split("\0")

@@ -41,7 +41,7 @@ class Recorder:
         self._keys, self._recording = keys, recording
         self._session = session
         self._arrival = Clock()
-        self.unread: dict[str, tuple[int, str]] = {}  # by key: how many, and why the last
+        self.unread: dict[str, tuple[int, str]] = {}  # number by key, and why the last
         self._reported: dict[str, int] = {}
         self.alive: set[str] = set()  # tokens of the robots that are left
         topics = [topic for topic in TOPICS if topic is not SPOKEN]
@@ -49,7 +49,7 @@ class Recorder:
         self._world_events = self._inbox(pubsub.subscriber(session, keys.world_event, RARE), messages.Event)
         self._truths = self._inbox(pubsub.subscriber(session, keys.truth("*"), DEPTH), messages.Position)
         self._truth: dict[str, deque[messages.Position]] = {}
-        self._waiting: dict[str, deque[tuple[float, messages.State]]] = {}  # for truth, since when
+        self._waiting: dict[str, deque[tuple[float, messages.State]]] = {}  # states that wait for truth, since when
         self._watch = pubsub.AliveWatch(session, keys.alive("*"))
         self._token = pubsub.alive_token(session, keys.recorder)
 
