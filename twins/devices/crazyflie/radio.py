@@ -120,7 +120,8 @@ class Air:
                 continue
             number, channel, rate, drone, retries = EXCHANGE.unpack_from(datagram)
             row = self._rows.get(drone)
-            status, acknowledgement, packet = 0, b"", None
+            status, acknowledgement = 0, b""
+            packet = None
             if row is not None and (channel, rate) == (CHANNEL, DATA_RATES[RATE]):
                 self._links[row].t = t
                 status, acknowledgement, packet = self._links[row].exchange(datagram[EXCHANGE.size :], retries)
