@@ -34,11 +34,12 @@ def fly(request: Request) -> Flight:
     folder = laboratory.scratch() if request.folder is None else Path(request.folder)
     begun = world.REAL.process_time()
     try:
-        words = _command(request, folder)
+        file = _file(request, folder)
+        words, script = _command(request, file, folder), _script(request, file)
         os.environ["ZENPARK_RUNTIME_DIR"] = os.environ["ZENPARK_CACHE_DIR"] = str(folder / "user")
         with kernel.guard(*ALLOWED), kernel.Kernel(request.seed, request.preempt) as running:
             world.patch()
-            laboratory_world = world.World(running, _script(request), varied=request.varied, clocks=request.clocks)
+            laboratory_world = world.World(running, script, varied=request.varied, clocks=request.clocks)
             checked = rules.Rules(laboratory_world)
             laboratory_world.run(words, request.limit_s)
             checked.judge(folder / "run")
@@ -64,23 +65,27 @@ def leave() -> None:
     world.REAL.exit(0)
 
 
-def _command(request: Request, folder: Path) -> list[str]:
-    name = request.experiment
-    if "\n" in name:
-        folder.mkdir(parents=True, exist_ok=True)
-        file = folder / "experiment.toml"
-        file.write_text(name, "utf-8")
-        name = str(file)
+def _file(request: Request, folder: Path) -> str:
+    """The experiment as the command takes it: a name of the catalogue, or a file with its text."""
+    if "\n" not in request.experiment:
+        return request.experiment
+    folder.mkdir(parents=True, exist_ok=True)
+    file = folder / "experiment.toml"
+    file.write_text(request.experiment, "utf-8")
+    return str(file)
+
+
+def _command(request: Request, file: str, folder: Path) -> list[str]:
     chosen = [] if request.case is None else ["--case", request.case]
     settings = [word for setting in request.settings for word in ("--set", setting)]
-    return ["run", name, *chosen, *settings, "--no-report", "--out", str(folder / "run"), *request.words]
+    return ["run", file, *chosen, *settings, "--no-report", "--out", str(folder / "run"), *request.words]
 
 
-def _script(request: Request) -> list[faults.Fault]:
+def _script(request: Request, file: str) -> list[faults.Fault]:
     """The script, with random faults if some are drawn."""
     if request.drawn is None:
         return list(request.script)
-    plans = load(request.experiment, *request.settings).cases()
+    plans = load(file, *request.settings).cases()
     plan = plans[request.case or next(iter(plans))]
     robots = plan.experiment.robots
     captured = [name for name, robot in robots.items() if robot.position == "external" and robot.body != "world"]

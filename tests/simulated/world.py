@@ -12,7 +12,6 @@ import contextlib
 import functools
 import importlib
 import io
-import itertools
 import math
 import os
 import secrets
@@ -25,7 +24,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from errno import ENOSPC, EROFS
-from math import nan
+from math import inf, nan
 from types import SimpleNamespace
 from typing import Any
 
@@ -103,8 +102,12 @@ class World:
         self.samples: dict[str, list[tuple[float, Vector, Vector, bool]]] = {}  # every `LOOK_S`, true
         self.takeoffs_ordered: list[tuple[float, str]] = []
         self.stops: list[float] = []
+        self.drivers: dict[str, tuple[sim.Process, float]] = {}  # newest process that has driven a robot, and when
+        self.rising: dict[tuple[int, str], bool] = {}  # by process and robot: it was just told to take off
+        self.cases: list[str] = []
         self.ends: dict[int, float] = {}  # by process id
         self._flying: dict[str, bool] = {}
+        self._over = inf
         self.disturbed_until = 0.0
         self.watchers: list[Callable[[], None]] = []  # called every `LOOK_S`
         self.on_command: list[Callable[[str, sim.Process], None]] = []
@@ -113,6 +116,11 @@ class World:
     @property
     def processes(self) -> list[sim.Process]:
         return self.kernel.processes
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether the script has a Ctrl-C."""
+        return any(fault.kind in {"interrupt", "term"} for fault in self.script)
 
     @property
     def now(self) -> float:
@@ -132,20 +140,13 @@ class World:
         self._close_pipes_at_exit(self.conductor)
         self._schedule("launch")
         self.after(LOOK_S, self._look)
-        looks = itertools.count()
-        over = 0.0
+        self.kernel.run(lambda: self.now > self._over + END_S, self.now + limit_s)
 
-        def ended() -> bool:
-            nonlocal over
-            if next(looks) % 64 or any(self._of_run(each) for each in self.processes if not each.dead):
-                return False
-            over = over or self.now
-            return self.now > over + END_S
-
-        self.kernel.run(ended, self.now + limit_s)
-
-    def _of_run(self, process: sim.Process) -> bool:
-        return not process.name.startswith(OUTSIDE)
+    def note_end(self, process: sim.Process) -> None:
+        """Note that a process has ended, maybe the last one of the run."""
+        self.ends.setdefault(process.pid, self.now)
+        if all(each.dead for each in self.processes if not each.name.startswith(OUTSIDE)):
+            self._over = min(self._over, self.now)
 
     def _close_pipes_at_exit(self, process: sim.Process) -> None:
         leave = process.exit
@@ -577,6 +578,7 @@ class WatchedBody(Body):
         self.body.command(setpoints)
 
     def takeoff(self, rows: Sequence[int], heights: Sequence[float]) -> None:
+        world.rising.update(((self.process.pid, self.names[row]), True) for row in rows)
         self._note([self.names[row] for row in rows])
         self.body.takeoff(rows, heights)
 
@@ -728,7 +730,7 @@ def _patch_network() -> None:
 
 def _watch_product() -> None:
     """Let the laboratory see what the product does."""
-    _wrap(sim.Process, "exit", before=lambda process, _: world.ends.setdefault(process.pid, world.now))
+    _wrap(sim.Process, "exit", after=lambda process, _: world.note_end(process))
     shadowed = robot_process.shadowed
     robot_process.shadowed = lambda body, request, periods: WatchedBody(shadowed(body, request, periods), request.names)
     _wrap(loop.Runtime, "__init__", after=_note_runtime)
@@ -801,6 +803,7 @@ def _note_pose(runtime: loop.Runtime, row: int, *_: object, **__: object) -> Non
 
 def _note_case(_: conducting.CaseRun, context: Any, *_a: object, **__: object) -> None:
     world.plan = context.plan
+    world.cases.append(context.case)
     measured = [name for name, robot in context.plan.experiment.robots.items() if robot.position == "external"]
     outside = [name for name in measured if context.plan.experiment.robots[name].body != "world"]
     if outside and context.plan.experiment.positioning is None:
