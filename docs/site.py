@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     import click
     from mkdocs.config.defaults import MkDocsConfig
     from mkdocs.structure.files import Files
+    from mkdocs.structure.pages import Page
 
 NOTEBOOKS: Final = (
     "experiments.file.document",
@@ -26,6 +27,7 @@ NOTEBOOKS: Final = (
     "experiments.sweep.sweep",
     "experiments.recording.trace",
 )
+SOUGHT: Final = {"safety.md": 30, "first-flight.md": 8, "vicon.md": 4, "plugins.md": 2}  # weights in the search
 FORMULA: Final = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
 PLUGINS: Final = (
     "agents.vectors",
@@ -51,6 +53,13 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     for name, make in PAGES.items():
         files.append(File.generated(config, f"reference/{name}.md", content="\n".join(make())))
     return files
+
+
+def on_page_markdown(markdown: str, *, page: Page, **_: object) -> str:
+    """Pages that most questions are about come first in the search: safety before all others."""
+    if weight := SOUGHT.get(page.file.src_uri):
+        page.meta["search"] = {"boost": weight}
+    return markdown
 
 
 def on_page_content(html: str, **_: object) -> str:
