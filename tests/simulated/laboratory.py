@@ -250,11 +250,16 @@ def fly(
 
 
 def run(request: Request) -> Flight:
-    """Run a request in a child of the clean process, which is started at the first call."""
+    """Run a request in a child of the clean process."""
+    return nursery().run(request)
+
+
+def nursery() -> Nursery:
+    """The clean process of this one, which is started at the first call."""
     global _nursery  # noqa: PLW0603
     if _nursery is None:
         _nursery = Nursery()
-    return _nursery.run(request)
+    return _nursery
 
 
 def close() -> None:

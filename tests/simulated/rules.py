@@ -115,13 +115,13 @@ class Look:
             )
             self.phases[process.pid, name] = phase
 
-    def linked(self, process: Process | None) -> bool:
-        """Whether a process has a router that answers, over a cable that is neither cut nor slow."""
+    def linked(self, process: Process | None, *, slowly: bool = False) -> bool:
+        """Whether a process has a router that answers, over a cable that is not cut, nor slow unless that is enough."""
         if process is None or process.dead or process.paused:
             return False
         session = self.world.session(process)
         link = None if session is None else session.link
-        if session is None or link is None or not link.open() or session.cut or session.slow >= 100:
+        if session is None or link is None or not link.open() or session.cut or (session.slow >= 100 and not slowly):
             return False
         return not (link.far.cut or link.far.process.paused)
 
@@ -196,7 +196,7 @@ def finite_motion(_: Look, seen: Seen) -> str:
 
 @rule(OF_ROBOTS, "| no answer from a router for this time")
 def hold_without_router(look: Look, seen: Seen) -> str:
-    offline = not look.linked(seen.process) and seen.phase in (AIRBORNE, RUNNING) and seen.governed
+    offline = not look.linked(seen.process, slowly=True) and seen.phase in (AIRBORNE, RUNNING) and seen.governed
     lasted = look.lasting(("hold", seen.name), offline, 2.2)
     goes_on = lasted and seen.prompt and not seen.hazard.startswith(HELD)
     return f"no router for {lasted:.1f} s, hazard '{seen.hazard}'" if goes_on else ""
@@ -204,7 +204,7 @@ def hold_without_router(look: Look, seen: Seen) -> str:
 
 @rule(OF_ROBOTS, "land after `offline_s` 10 s: no emergency stop would reach it")
 def landing_without_router(look: Look, seen: Seen) -> str:
-    offline = not look.linked(seen.process) and seen.phase in (AIRBORNE, RUNNING) and seen.governed
+    offline = not look.linked(seen.process, slowly=True) and seen.phase in (AIRBORNE, RUNNING) and seen.governed
     lasted = look.lasting(("offline", seen.name), offline, 12.5)
     return f"no router for {lasted:.1f} s, still {Phase(seen.phase).word}" if lasted else ""
 
@@ -257,6 +257,32 @@ def landing_without_launcher(look: Look, seen: Seen) -> str:
     there = orphan and seen.phase in (AIRBORNE, RUNNING) and seen.prompt and seen.governed
     lasted = look.lasting(("lifeline", seen.name), there, 4.0)
     return f"its launcher is silent for {lasted:.1f} s, still {Phase(seen.phase).word}" if lasted else ""
+
+
+@rule(OF_ROBOTS, "")
+def obedience(look: Look, seen: Seen) -> str:
+    """Half a second after it was accepted an order is obeyed."""
+    obeys = {
+        "land": seen.phase >= LANDING,
+        "stop": seen.phase >= LANDING,
+        "hold": seen.phase != RUNNING or seen.hazard.startswith(HELD),
+    }
+    for _, who, words, process in look.world.answers:
+        age = look.now - look.world.ends.get(process.pid, inf)
+        word = words.split()[1] if words.startswith("robot ") else ""
+        newest = not any(
+            t > look.now - age - 1.0 and other == who for t, other, _, each in look.world.answers if each is not process
+        )
+        due = who == seen.name and process.code == 0 and 0.5 <= age < 0.5 + LOOK_S and newest
+        if (
+            due
+            and seen.governed
+            and seen.prompt
+            and seen.process.started < look.now - age
+            and not obeys.get(word, True)
+        ):
+            return f"accepted `{words}`, and is {Phase(seen.phase).word}, hazard '{seen.hazard}'"
+    return ""
 
 
 @rule(OF_ROBOTS, "A neighbour counts as alive only while there is a token with its exact key")
@@ -417,12 +443,14 @@ def robots_are_down(end: End) -> Iterator[str]:
 
 @rule(AT_THE_END, "")
 def all_end(end: End) -> Iterator[str]:
+    """All processes of the run end."""
     if left := [process.name for process in end.own if not process.dead]:
         yield f"still there: {', '.join(left)}"
 
 
 @rule(AT_THE_END, "")
 def no_exception(end: End) -> Iterator[str]:
+    """No exception ends a thread or a process, and none is printed."""
     for _, process, thread, text in end.world.kernel.crashes:
         yield f"{process}/{thread}: {text.strip().splitlines()[-1]}\n{text}"
     crashed = {crash[1] for crash in end.world.kernel.crashes}
@@ -433,6 +461,7 @@ def no_exception(end: End) -> Iterator[str]:
 
 @rule(AT_THE_END, "")
 def exit_codes(end: End) -> Iterator[str]:
+    """Exit codes are those that the documentation lists."""
     for process in end.own:
         good = (0, 1, 2, 3, 130, -9, -15) if process is end.world.conductor else (0, -9, 2, 70, -15)
         if process.dead and process.code not in good:
@@ -441,13 +470,14 @@ def exit_codes(end: End) -> Iterator[str]:
 
 @rule(AT_THE_END, "ends with exit code 1 and says so in its last line")
 def words_for_a_failure(end: End) -> Iterator[str]:
-    reasons = ("zenpark: ", "Spoiled", "failed", "landed")
+    reasons = ("zenpark: ", "Spoiled", "failed", "landed", "emergency stop")
     if end.code in {1, 2, 3} and not any(word in end.output for word in reasons):
         yield f"exit code {end.code} without a reason: {end.output[-300:]}"
 
 
 @rule(AT_THE_END, "")
 def counters(end: End) -> Iterator[str]:
+    """No counter of lost poses is negative."""
     for name, process in end.world.robots.items():
         runtime = end.world.runtimes.get(process.pid)
         if runtime is not None and runtime._joined:
@@ -490,6 +520,7 @@ def no_success_after_a_stop(end: End) -> Iterator[str]:
 
 @rule(AT_THE_END, "")
 def no_success_after_a_change(end: End) -> Iterator[str]:
+    """Exit code 0 only if no operator has landed, stopped or exchanged a robot in the run."""
     for t, who, words, process in end.world.answers:
         changed = words.split()[1:2] in (["remove"], ["replace"], ["land"], ["stop"])
         if end.code == 0 and changed and process.code == 0 and 0.1 < t - end.start < end.duration_s - 0.3:

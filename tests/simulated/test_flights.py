@@ -87,3 +87,16 @@ def test_emergency_stop_cuts_motors_at_once():
     assert "stopped: CF01, KH01, KH02" in flight.answers[0].output
     assert 2.0 <= flight.robots["CF01"].off(after=2.0) < 2.3
     assert flight.code == 1
+
+
+def test_run_without_any_recorder_does_not_begin():
+    flight = triangle(Fault(0.01, "disk", "recorder", "full", since="launch"))
+    assert (flight.code, flight.started) == (2, None)
+    assert "nothing would be recorded" in flight.output
+    assert flight.violations == []
+
+
+def test_recorder_is_awaited_before_the_start():
+    flight = triangle(Fault(0.5, "kill", "recorder", since="ready"))
+    assert flight.code == 0, flight.output
+    assert flight.metrics[0]["planned_s"] == SPAN_S

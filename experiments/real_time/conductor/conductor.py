@@ -233,7 +233,8 @@ class Conductor(CaseRun):
                 if not self._order(messages.Order("takeoff"), [name]):
                     del refused[name]
 
-        return self.await_phase("airborne", CLIMB_S, meanwhile=again)
+        # a recorder that has ended meanwhile is awaited again: a run without any would be flown for nothing
+        return self.await_phase("airborne", CLIMB_S, recorder=True, meanwhile=again)
 
     def _start(self) -> float:
         """Order the common start; returns its time [s, UTC]."""

@@ -1,0 +1,26 @@
+"""Rules of the laboratory are sentences of the documentation, and each can fail."""
+
+import itertools
+import re
+from pathlib import Path
+
+import pytest
+
+from tests.simulated import rules
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+ALL = [*rules.OF_ROBOTS, *rules.OF_PAIRS, *rules.OF_COMMANDS, *rules.OF_POSES, *rules.AT_THE_END]
+
+
+def test_rules_quote_the_documentation():
+    text = " ".join(re.sub(r"\s+", " ", (DOCS / name).read_text("utf-8")) for name in ("safety.md", "hanging.md"))
+    assert not [rule.name for rule in ALL if rule.sentence not in text]
+
+
+def test_rules_have_names_of_their_own():
+    assert not [one.name for one, other in itertools.combinations(ALL, 2) if one.name == other.name]
+
+
+@pytest.mark.parametrize("rule", [rule for rule in ALL if not rule.sentence], ids=lambda rule: rule.name)
+def test_rules_without_sentence_explain_themselves(rule):
+    assert rule.check.__doc__
