@@ -41,7 +41,7 @@ def invoke(*words: object, code: int | None = 0) -> Result:
 
 
 def python(
-    *words: object, code: int | None = 0, timeout_s: float = 60.0, **options: Any
+    *words: object, code: int | None = 0, timeout_s: float = 240.0, **options: Any
 ) -> subprocess.CompletedProcess[str]:
     """Python process, run to its end: `returncode`, `stdout`, `stderr`.
 

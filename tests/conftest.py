@@ -117,7 +117,7 @@ class RouterProcess:
         return self._reap()
 
     def _reap(self) -> int:
-        code = self.process.wait(30)
+        code = self.process.wait(100.0)
         assert self.process.stdout is not None
         self.process.stdout.close()
         return code
@@ -180,7 +180,7 @@ def no_orphans(request: pytest.FixtureRequest) -> Iterator[None]:
     threads = set(threading.enumerate())
     processes = set(psutil.Process().children(recursive=True))
     yield
-    _, left = psutil.wait_procs(set(psutil.Process().children(recursive=True)) - processes, timeout=10.0)
+    _, left = psutil.wait_procs(set(psutil.Process().children(recursive=True)) - processes, timeout=60.0)
     what = [f"{process.pid}: {' '.join(process.cmdline())}" for process in left]
     for process in left:
         process.kill()
@@ -188,5 +188,5 @@ def no_orphans(request: pytest.FixtureRequest) -> Iterator[None]:
     for thread in set(threading.enumerate()) - threads:
         if thread.name == "Shared Radio":
             continue  # cflib keeps one for each dongle as long as the process lives
-        thread.join(10.0)
+        thread.join(60.0)
         assert not thread.is_alive(), f"thread left behind: {thread.name}"

@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable
 
-PATIENCE_S = 30.0  # nothing takes so long, on the slowest machine
+PATIENCE_S = 60.0  # nothing takes so long, on the slowest machine
 
 
 def until(true: Callable[[], object], what: str = "it is true", limit_s: float = PATIENCE_S) -> None:

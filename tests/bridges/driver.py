@@ -31,7 +31,7 @@ class Driver:
 
     def __init__(self, body, decide=None, *, truth=None, clock=time.monotonic, fast=1.0):
         self.body, self.decide, self.truth = body, decide, truth
-        self.zero, self.t, self.slowest = clock(), 0.0, 0.0
+        self.zero, self.t = clock(), 0.0
         self.state = None
         self._clock, self._period = clock, 0.01 / fast
         self._pause = threading.Event()
@@ -42,19 +42,17 @@ class Driver:
         if self.truth is not None:
             for row, (position, yaw) in enumerate(zip(*self.truth(), strict=True)):
                 self.body.locate(row, self.t, tuple(map(float, position)), float(yaw))
-        begin = time.monotonic()
         states = self.body.read(self.t)
         self.state = Columns(states)
         self.body.command([NO_SETPOINT] * len(states) if self.decide is None else list(self.decide(states)))
-        self.slowest = max(self.slowest, time.monotonic() - begin)
         return self.state
 
     def until(self, true, what="it is true"):
         """Go on until something is true; returns how long that took [s]."""
-        begin = self.t
+        begin, deadline = self.t, time.monotonic() + PATIENCE_S
         self.tick()
         while not true():
-            assert self.t - begin < PATIENCE_S, f"not in {PATIENCE_S:g} s: {what}; notes: {self.state.note}"
+            assert time.monotonic() < deadline, f"not in {PATIENCE_S:g} s: {what}; notes: {self.state.note}"
             self.tick()
         return self.t - begin
 

@@ -260,7 +260,7 @@ def sides(router):
         assert process.stdout.readline() == "ros2 ready: node /zenpark, domain 7, jazzy\n"
         yield RosNode(outside), Realm(inside)
         process.send_signal(signal.SIGTERM)
-        assert process.wait(30) == 0
+        assert process.wait(100.0) == 0
 
 
 def endpoints(*names, scan=False):

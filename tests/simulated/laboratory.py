@@ -293,7 +293,7 @@ class Nursery:
         for pipe in (self._process.stdin, self._process.stdout):
             assert pipe is not None
             pipe.close()
-        self._process.wait(30.0)
+        self._process.wait(100.0)
 
 
 _nursery: Nursery | None = None

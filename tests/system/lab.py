@@ -142,7 +142,7 @@ class Watcher:
 class Started:
     """A process started by hand as a user would, with its standard input held open."""
 
-    patience_s = 40.0  # for its end
+    patience_s = 100.0  # for its end
 
     def __init__(self, module, *arguments):
         streams = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}

@@ -120,7 +120,7 @@ class Machine:
     def close(self):
         if self._sshd is not None:
             self._sshd.terminate()
-            self._sshd.wait(30)
+            self._sshd.wait(100.0)
         for pid in ip(f"netns pids {self.namespace}", check=False).split():
             with contextlib.suppress(psutil.NoSuchProcess):
                 psutil.Process(int(pid)).kill()

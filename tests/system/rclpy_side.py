@@ -81,7 +81,7 @@ def drive(kind, watchdog):
         until(lambda: len(heard) >= 20 and set(heard[-20:]) == {0.1})
         heard.clear()
         dog.terminate()
-        ended = dog.wait(30)
+        ended = dog.wait(100.0)
         until(lambda: heard.count(0.1) >= 20)
     finally:
         for child in children:

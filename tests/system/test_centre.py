@@ -97,7 +97,7 @@ def test_by_hand_and_what_nobody_should_believe(router, watcher, tmp_path):
         ready = "centre ready: guides TB01, KH01, KH02 at 10 Hz; realm park at"
         assert centre.process.stdout.readline().startswith(ready)
         watcher.until_all("ready", *names)
-        second = python("-m", *command, code=2, timeout_s=20)
+        second = python("-m", *command, code=2)
         assert "a centre guides the robots in the realm 'park' already" in second.stderr
         watcher.take_off(*names)
         watcher.start(*names)

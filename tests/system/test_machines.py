@@ -139,7 +139,7 @@ def test_launchers_death_lands_everybody_and_clears_all(lab, tmp_path):
     until(lambda: recording.stat().st_size > begun + CHUNK_BYTES, "the experiment comes to the disk")
     os.kill(flight.pid, signal.SIGKILL)
     until(lambda: not desk.busy(), "no process is left")
-    flight.communicate(timeout=30)
+    flight.communicate(timeout=100)
     for robot in TRIANGLE:
         last = [f"{robot}: {state} (the starter is gone)" for state in ("landing", "done")]
         assert desk.said(robot).splitlines()[-2:] == last
@@ -204,7 +204,7 @@ def test_a_short_cut_of_the_cable_lands_nobody(lab, tmp_path):
     lab["lab3"].unplug()
     threading.Event().wait(CUT_S)
     lab["lab3"].plug_in_again()
-    out, _ = flight.communicate(timeout=60)
+    out, _ = flight.communicate(timeout=100)
     assert "lost CF01" not in out
     assert "done (finished)" in desk.said("CF01")
     until(lambda: not desk.busy(), "no process is left")

@@ -248,7 +248,7 @@ def started(endpoint, *arguments):
     finally:
         process.send_signal(signal.SIGCONT)
         process.terminate()
-        process.wait(30)
+        process.wait(100.0)
 
 
 def answers(endpoint, process):

@@ -71,7 +71,7 @@ def interrupted(folder, end):
         end(process, children)
         _, said = process.communicate()
         assert "Traceback" not in said
-        assert not psutil.wait_procs(children, timeout=30.0)[1]
+        assert not psutil.wait_procs(children, timeout=60.0)[1]
         return process.returncode, said
 
 

@@ -266,7 +266,7 @@ def routing(folder):
     router = threading.Thread(target=serve_router, args=([endpoint], stop), kwargs=given)
     router.start()
     try:
-        assert ready.wait(30.0)
+        assert ready.wait(100.0)
         yield endpoint
     finally:
         stop.set()

@@ -19,13 +19,13 @@ from agents.network import messages, name_ownership, pubsub
 from agents.network import session as network
 from agents.network.keys import Keys
 from agents.network.name_ownership import NameTaken, OwnershipTiming, claim, confirm_ownership
-from tests.agents.runtime.process import DRONE, QUICK, Airborne, process
+from tests.agents.runtime.process import DRONE, QUICK, Airborne, clocked, process
 from tests.cases import for_each
 from tests.conftest import RouterProcess
 from tests.fuzz.messages import sent
 from tests.network import Attentive, Mute, Net, Reply, Sample
 from tests.small import pair, small
-from tests.waiting import ManualClock, until
+from tests.waiting import PATIENCE_S, ManualClock, until
 
 KEY = Keys().alive("CF01")
 AT_ONCE = OwnershipTiming(retry_s=0.0)
@@ -50,7 +50,7 @@ class Table(ManualClock):
         with self._turn:
             self._waiting.add(name)
             self._turn.notify_all()
-            assert self._turn.wait_for(lambda: self._drawn() == name, 10.0)
+            assert self._turn.wait_for(lambda: self._drawn() == name, PATIENCE_S)
             self._waiting.discard(name)
             self.now += 0.02
 
@@ -276,9 +276,33 @@ def test_displaced_owner_leaves_the_body_alone(way, monkeypatch):
         assert body.commands == told[0]
 
 
+class Shared(ManualClock):
+    """Clock of the loop of a process, and of its question for the owner of its names while that is asked."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        super().__init__(1000.0)
+        clocked(monkeypatch, self)
+        monkeypatch.setattr(name_ownership, "time", self)
+
+    def of(self, ownership: name_ownership.OwnershipCheck) -> None:
+        self._check, clock = ownership, self
+
+        class Pause(threading.Event):
+            def wait(self, timeout: float | None = None) -> bool:
+                clock.now += timeout or 0.0
+                return super().wait(0.002)
+
+        ownership._over = Pause()
+
+    def sleep(self, seconds: float) -> None:
+        if self._check._asking is None or not self._check._asking.is_alive():
+            self.now += seconds
+        threading.Event().wait(0.0005)
+
+
 @pytest.mark.parametrize("taken", [True, False], ids=["taken", "free"])
 def test_link_that_is_back_waits_for_owner(taken, monkeypatch):
-    body, keys = Commanded(), Keys()
+    body, keys, clock = Commanded(), Keys(), Shared(monkeypatch)
     # on wheels it would halt soon without an answer
     wheels = small({"F": "khepera4"}, safety=Safety(neighbour_timeout_s=0.1))
     experiment, timing = (wheels, OwnershipTiming(vanish_s=0.5)) if taken else (DRONE, OwnershipTiming())
@@ -303,6 +327,7 @@ def test_link_that_is_back_waits_for_owner(taken, monkeypatch):
     with Net().worn() as net:
         monkeypatch.setattr(network, "connected", linked)
         runtime = process(experiment, body, ownership=timing, descent=QUICK)
+        clock.of(runtime.keeper.ownership)
         with pytest.raises(NameTaken if taken else OSError, match="has taken" if taken else "commands again"):
             runtime.run()
     lost, back = marks

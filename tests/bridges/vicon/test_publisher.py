@@ -23,7 +23,7 @@ from experiments.file import document
 from tests.commands import python, started
 from tests.system.lab import RobotProcess, Watcher
 from tests.twins import loopback
-from tests.waiting import ManualClock, until
+from tests.waiting import PATIENCE_S, ManualClock, until
 from twins.devices.vicon import upright
 
 Camera = partial(loopback.Camera, sigma=1e-9)  # what repeats itself is not believed
@@ -192,13 +192,14 @@ def test_the_command_line_is_understood_or_refused():
 
 
 def test_positions_arrive_as_placed_and_when_measured(printed):
+    begin = time.time()
     with Camera(["cf_1", "KH01"], rate_hz=200.0) as camera:
         camera.place("cf_1", [0.123456789, -0.5, 1.0], 0.3)
         camera.place("KH01", [-1.0, 0.25, 0.06], -2.0)
         camera.twin.latency_s = 0.25
         with published(camera.twin.address, printed, CF01="cf_1", KH01="KH01") as positions:
-            until(lambda: len(positions) > 200)
-            now = time.time()
+            until(lambda: len(positions) > 60)
+    now = time.time()
     drone, rover = ([each for each in positions if each.robot == robot] for robot in ("CF01", "KH01"))
     np.testing.assert_allclose([each.position for each in drone], len(drone) * [(0.123456789, -0.5, 1.0)])
     np.testing.assert_allclose([each.yaw for each in rover], -2.0)
@@ -206,8 +207,10 @@ def test_positions_arrive_as_placed_and_when_measured(printed):
     assert np.diff(stamps).min() > 0.0
     frames = np.median(np.diff(stamps)) / 0.005  # on a busy machine the camera leaves out some
     assert frames == pytest.approx(max(round(frames), 1), abs=0.2)
-    assert -2.0 < stamps[-1] + 0.25 - now < 0.5
-    assert printed == [f"connected to {camera.twin.address}", "CF01 is seen as 'cf_1'", "KH01 is seen as 'KH01'"]
+    assert begin < stamps[0] + 0.25
+    assert stamps[-1] + 0.25 < now + 0.01
+    said = [line for line in printed if "wait in a queue" not in line]  # on a busy machine they do
+    assert said == [f"connected to {camera.twin.address}", "CF01 is seen as 'cf_1'", "KH01 is seen as 'KH01'"]
 
 
 def test_lost_server_and_nonsense_server_are_survived(printed):
@@ -222,8 +225,9 @@ def test_lost_server_and_nonsense_server_are_survived(printed):
         port = camera.port
         positions = stack.enter_context(published(camera.twin.address, printed, CF01="CF01"))
         until(lambda: len(positions) > 20)
-        camera.occlude(0.8)
+        camera.occlude(math.inf)
         said("CF01 is not seen")
+        camera.occlude(0.0)
         said("CF01 is seen", 2)
         camera.kill()
         said(f"lost {camera.twin.address}")
@@ -235,7 +239,7 @@ def test_lost_server_and_nonsense_server_are_survived(printed):
             (offer + vicon_datastream.block(vicon_datastream.MAGIC, b"\x05\x00\x00\x00\xff\xff\xff\xff"), "a block of"),
         ):
             with socket.create_server(("127.0.0.1", port)) as server:
-                server.settimeout(10.0)
+                server.settimeout(PATIENCE_S)
                 client, _ = server.accept()
                 with client:
                     client.sendall(nonsense)
@@ -299,4 +303,4 @@ def test_short_occlusion_is_flown_through_long_one_lands(router, tmp_path):
         watcher.until(lambda: heights[-1] < 0.03, "it is on the ground")
         robots.end()
         bridge.stdin.close()
-        assert bridge.wait(30) == 0, "it ends with its starter"
+        assert bridge.wait(100.0) == 0, "it ends with its starter"

@@ -23,6 +23,7 @@ from experiments.view import acting as orders
 from experiments.view import heartbeat
 from experiments.view.gate import Gate, Seen
 from tests.experiments.scene.test_stage import at_start
+from tests.waiting import PATIENCE_S, until
 
 HOST = "127.0.0.1:8080"
 HANDSHAKE = ("Upgrade", "websocket")
@@ -174,16 +175,18 @@ def test_emergency_stop_tells_its_result_without_session(blocked, operator, monk
     def put(_):
         if not blocked:
             raise RuntimeError("closed")
-        free.wait(30.0)
+        free.wait(60.0)
 
     acting._urgent = acting._events = SimpleNamespace(put=put)
     monkeypatch.setattr(orders.orders.EmergencyStop, "send", lambda self, _: self.seen.add("KH01"))
     page = MagicMock()
     acting._server.get_clients = lambda: {1: page}
+    others = set(threading.enumerate())
     stopping = threading.Thread(target=acting.emergency_stop, daemon=True)
     stopping.start()
-    stopping.join(2.0)
+    stopping.join(PATIENCE_S)
     free.set()
+    until(lambda: set(threading.enumerate()) <= others, "those that tell of it have ended")
     assert "stopped: KH01" in page.add_notification.call_args.args[1]
 
 

@@ -100,7 +100,7 @@ def test_vendors_client_and_ours_read_same_poses():
             camera.place(name, position, yaw)
         (frame,) = read(camera.port)
         command = [sys.executable, "-c", VENDOR, camera.twin.address]
-        vendor = subprocess.run(command, capture_output=True, text=True, timeout=20, check=True)
+        vendor = subprocess.run(command, capture_output=True, text=True, timeout=200, check=True)
     theirs = json.loads(vendor.stdout)
     assert theirs.keys() == frame.poses.keys() == placed.keys()
     for name, (position, yaw) in placed.items():
@@ -215,7 +215,7 @@ def test_the_process_shows_the_truth_that_it_hears(process, router):
         until(lambda: reader.newest(1.0).poses["CF01"] is None, "silence is no place")
         reader.close()
     process.send_signal(signal.SIGTERM)
-    assert process.wait(30) == 0
+    assert process.wait(100.0) == 0
 
 
 @pytest.mark.mechanism("lifeline: motion capture stays until the robots are down")
@@ -231,7 +231,7 @@ def test_process_ends_with_its_starter_after_the_robots(process, router):
             assert reader.newest(1.0) is not None
         assert process.poll() is None
         token.undeclare()
-        assert process.wait(30) == 0
+        assert process.wait(100.0) == 0
     reader.close()
 
 

@@ -393,7 +393,7 @@ def test_stop_without_robots_ends_the_run():
         assert (stop.expected, stop.run_ended, process.poll()) == (True, False, None)
         stop.send("a test")
         assert stop.run_ended
-        assert process.wait(10.0) == -signal.SIGTERM
+        assert process.wait(100.0) == -signal.SIGTERM
         again.send("a test")
         assert not again.run_ended
 

@@ -157,7 +157,7 @@ def station(run, **options):
     with process_of(run, SERVE, stderr=None, **options) as process:
         yield ask, process
         process.stdin.close()
-        assert process.wait(30) == 0
+        assert process.wait(100.0) == 0
 
 
 @pytest.mark.system
@@ -172,7 +172,7 @@ def test_it_sweeps_up_its_own_run_only():
             found = []  # a process has its environment only after its exec
             until(lambda: found.extend(ask("sweep").found) or found, "it is found")
             assert [each.what for each in found] == [str(mine.pid)]
-            assert mine.wait(30) == -9
+            assert mine.wait(100.0) == -9
         assert other.poll() is None
 
 
@@ -217,7 +217,7 @@ def test_station_awaits_landing_robots_and_kills_frozen_ones():
         with station("run.lab1") as (ask, _):
             ask("clock")
             frozen.send_signal(signal.SIGSTOP)
-        assert frozen.wait(30) == -signal.SIGKILL
+        assert frozen.wait(100.0) == -signal.SIGKILL
 
 
 @pytest.mark.system
@@ -236,8 +236,8 @@ def test_a_preloaded_station_forks_its_robots(number):
             elif number is not None:
                 robot.send_signal(number)
             if number is not None:
-                robot.wait(30)  # before its lifeline ends
-            out, errors = robot.communicate(timeout=30)
+                robot.wait(100.0)  # before its lifeline ends
+            out, errors = robot.communicate(timeout=100)
             assert robot.returncode == (2 if number is None else -number)
             assert (out, "no experiment came" in errors) == ("", number is None)
         assert ask("sweep").found == []

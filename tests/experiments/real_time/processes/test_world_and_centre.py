@@ -215,7 +215,7 @@ def test_frozen_and_replaced(what, router, tmp_path):
         until(lambda: not owners(), "its lease is over")
         new = start()
         old.thaw()
-        assert old.process.wait(30.0) == 2
+        assert old.process.wait(100.0) == 2
         assert f"another process has taken the name '{what}' in the realm 'park'" in old.said()
         assert new.process.poll() is None
 
@@ -239,7 +239,7 @@ def test_full_disk_of_a_log_ends_no_world(router, tmp_path):
         until(there, "the world is up")
         process.terminate()
         process.stdin.close()
-        assert process.wait(20.0) == 0
+        assert process.wait(100.0) == 0
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")

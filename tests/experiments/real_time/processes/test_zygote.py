@@ -52,7 +52,7 @@ def begin(launcher, name, *arguments):
 def test_exit_codes_are_passed_on(launcher, end, words):
     process = begin(launcher, "a", end)
     assert isinstance(process.handle, zygote.Forked)
-    assert process.handle.wait(30.0) == process.handle.poll()
+    assert process.handle.wait(100.0) == process.handle.poll()
     assert (process.exit, process.because == ": ValueError: a crash") == (words, end == "raise")
     assert launcher.died() == [process]
 
@@ -61,7 +61,7 @@ def test_exit_codes_are_passed_on(launcher, end, words):
 def test_a_forked_process_shares_nothing_open_with_others(launcher):
     processes = [begin(launcher, name, "stay", name) for name in ("case-KH01", "case-CF01", "case-CF02")]
     launcher.release("case-CF01")
-    assert processes[1].handle.wait(30.0) == 5, "no other process holds its lifeline"
+    assert processes[1].handle.wait(100.0) == 5, "no other process holds its lifeline"
     for generator in (0, 1):
         assert len({process.output.splitlines()[1].split()[generator] for process in processes}) == 3
     for process in processes:
@@ -95,7 +95,7 @@ def test_an_ended_zygote_takes_no_process_along(launcher, end):
     assert process.alive
     later = begin(launcher, "b", "7")
     assert not isinstance(later.handle, zygote.Forked)
-    assert later.handle.wait(30.0) == 7
+    assert later.handle.wait(100.0) == 7
     assert process.alive
     launcher.release("a")
     until(lambda: not process.alive, "it ends with its lifeline")
@@ -126,4 +126,4 @@ def test_without_a_zygote_all_are_spawned(tmp_path, monkeypatch):
         launcher.preload()
         assert not launcher.running(ZYGOTE)
         process = launcher.start("a", "this", forked=True)
-        assert process.handle.wait(30.0) == 0
+        assert process.handle.wait(100.0) == 0
