@@ -76,6 +76,8 @@ def main() -> None:
         if found := intruders(root):
             print(explanation(found, root), file=sys.stderr)
             sys.exit(2)
+        for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):  # threads of numpy that wait for each other spin
+            os.environ.setdefault(name, "1")
         _become_station(sys.argv[1:])
         from tools.main import main as command_line  # noqa: PLC0415 (not before the check)
 
