@@ -1,7 +1,7 @@
 """Random scripts by the thousand; a seed that breaks a rule is shrunk to the few faults that do it.
 
 python -m tests.simulated.campaign --seeds 1 200                  # seeds 1 to 200, over all experiments in turn
-python -m tests.simulated.campaign --seeds 1 200 --of mix-capture --processes 2
+python -m tests.simulated.campaign --seeds 1 200 --of random --processes 2
 python -m tests.simulated.campaign --one 17 -v                    # repeats seed 17, with all that was seen
 python -m tests.simulated.campaign --one 17 --shrink              # the fewest faults that break the same rule
 """
@@ -17,44 +17,21 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from pathlib import Path
 
+from tests.simulated.experiments import FIXED, NAMES, RANDOM, setting_of
 from tests.simulated.faults import Fault
 from tests.simulated.laboratory import Flight, Nursery, Request, SimulatorError
 
-HERE = Path(__file__).parent
 SHRINK_S = 60.0  # of processor time
 FEW = 3  # faults of a script that is short enough
 
 
-@dataclass(frozen=True)
-class Setting:
-    """An experiment of a campaign."""
-
-    experiment: str
-    case: str
-    settings: tuple[str, ...] = ()
-
-
-AVOIDING = ('avoidance.kind="barrier"', 'avoidance.hears="all"', "avoidance.clearance=1.0")
-MIX = (HERE / "mix.toml").read_text("utf-8")
-SETTINGS = {
-    "triangle": Setting("triangle", "event", ("duration_s=8",)),
-    "triangle-avoiding": Setting("triangle", "periodic", ("duration_s=8", *AVOIDING)),
-    "mix-event": Setting(MIX, "event"),
-    "mix-capture": Setting(MIX, "capture"),
-    "mix-centre": Setting(MIX, "centre"),
-    "mix-packed": Setting(MIX, "packed"),
-    "mix-world": Setting(MIX, "world"),
-}
-
-
 def request_of(seed: int, name: str | None = None) -> Request:
     """The flight of a seed: its experiment, unless one is named, its script, lateness, and times of starts."""
-    names = list(SETTINGS)
-    setting = SETTINGS[name or names[seed % len(names)]]
+    names = [*FIXED, RANDOM, RANDOM]
+    setting = setting_of(name or names[seed % len(names)], seed)
     rng = random.Random(f"request {seed}")
-    clocks = rng.choice((0.03, -0.03, 0.4, -0.4, 2.0, -2.0, 4.5, -4.5, 20.0, -20.0))
+    clock = rng.choice((0.03, -0.03, 0.4, -0.4, 2.0, -2.0, 4.5, -4.5, 20.0, -20.0))
     return Request(
         setting.experiment,
         seed=seed,
@@ -62,7 +39,7 @@ def request_of(seed: int, name: str | None = None) -> Request:
         settings=setting.settings,
         preempt=rng.choice((0.0, 0.002, 0.03)),
         varied=rng.random() < 0.6,
-        clocks={rng.choice(("KH01", "CF01", "A", "B")): clocks} if rng.random() < 0.15 else {},
+        clocks={rng.choice(("KH01", "CF01", "A", "B")): clock} if rng.random() < 0.15 else {},
         drawn=seed,
     )
 
@@ -169,7 +146,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.simulated.campaign", description=__doc__)
     parser.add_argument("--seeds", nargs=2, type=int, metavar=("FIRST", "COUNT"))
     parser.add_argument("--one", type=int, metavar="SEED")
-    parser.add_argument("--of", choices=list(SETTINGS), help="this experiment alone")
+    parser.add_argument("--of", choices=NAMES, help="this experiment alone")
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--shrink", action="store_true")
     parser.add_argument("-v", action="store_true", help="all that was seen")
