@@ -187,6 +187,7 @@ WEIGHTS = {
     "pause": 4, "kill": 2, "cut": 4, "loss": 2, "duplicate": 1, "reorder": 1, "slow": 1, "late": 2, "step": 2,
     "drift": 1, "hang": 2, "disk": 1.5, "body": 4, "order": 6, "estop": 0.7, "interrupt": 0.3, "twice": 1.5,
     "term": 0.7,
+    "command": 1,
 }  # fmt: skip
 COUNTS = (1, 2, 3, 5, 8, 12)
 LENGTHS = (0.2, 0.7, 1.3, 2.5, 6.0, 14.0)  # [s]
@@ -205,10 +206,15 @@ SIZES: dict[str, Sequence[Any]] = {
     "hang": (0.3, 0.8, 3.0, 12.0),
     "disk": ("full", "read-only", 0.05, 0.6),
     "twice": (0.0, -100.0, 100.0),
+    "command": (
+        "robot hold", "robot resume", "robot land", "robot start", "estop --dry-run", "runs", "keys", "world pause",
+        "world resume", "world reset",
+    ),
     "order": ORDERS,
     "body": (
         "nan", ("jump", 0.2), ("jump", -0.2), ("jump", 1.0), ("jump", -3.0), "stuck", ("stuck", 0.0005), ("late", 0.2),
-        ("late", 0.6), ("late", 3.0), "silent", ("battery", 0.05), "motors",
+        ("late", 0.6), ("late", 3.0), "silent", ("battery", 0.05), "motors", ("adrift", 0.3),
+        ("adrift", 1.0),
     ),
     "capture": (
         "gone", "stuck", ("stuck", 0.0005), ("jump", 0.3), ("jump", -0.6), ("jump", 2.0), ("stamp", -0.2),
@@ -249,7 +255,7 @@ def _draw_one(  # noqa: PLR0917 - as `draw`, which has made them
         who = rng.choice(("recorder", "recorder", "conductor"))
     elif kind == "capture":
         who = rng.choice(captured)
-    elif kind in {"estop", "interrupt"}:
+    elif kind in {"estop", "interrupt", "command"}:
         who = ""
     size = rng.choice(SIZES[kind]) if kind in SIZES else 1.0
     return Fault(round(at, 3), kind, who, size, round(lasts, 3))

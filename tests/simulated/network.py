@@ -741,6 +741,12 @@ class Subscriber:
         current().step()
         return self._waiting.popleft() if self._waiting else None
 
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.undeclare()
+
     def tell(self, key: str, there: bool) -> None:
         """A token has appeared or vanished."""
         if match(self.key, key) and (key in self._seen) != there:

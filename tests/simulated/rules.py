@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 from collections.abc import Callable, Hashable, Iterator
 from dataclasses import dataclass, field
 from math import hypot, inf, isfinite
@@ -233,7 +234,10 @@ def silent_landing(look: Look, seen: Seen) -> str:
 def _misled(look: Look, seen: Seen) -> bool:
     """Whether its body or its process cannot do what it should."""
     faults = [fault for fault in look.world.script if fault.who == seen.name and fault.kind in {"body", "capture"}]
-    return any("motors" in str(fault.size) or "stuck" in str(fault.size) for fault in faults) or not seen.prompt
+    return (
+        any(any(word in str(fault.size) for word in ("motors", "stuck", "adrift")) for fault in faults)
+        or not seen.prompt
+    )
 
 
 @rule(OF_ROBOTS, "its landing makes no progress for this time")
@@ -282,6 +286,19 @@ def obedience(look: Look, seen: Seen) -> str:
             and not obeys.get(word, True)
         ):
             return f"accepted `{words}`, and is {Phase(seen.phase).word}, hazard '{seen.hazard}'"
+    return ""
+
+
+@rule(OF_ROBOTS, "For each run it prints which of *its* robots have")
+def truth_about_stops(look: Look, seen: Seen) -> str:
+    """Motors are off when a command says that a robot has stopped."""
+    for _, _, words, process in look.world.answers:
+        age = look.now - look.world.ends.get(process.pid, inf)
+        fresh = 0.0 <= age < LOOK_S and seen.process.started < look.now - age - 2.5
+        text = "".join(process.out) if fresh and words.startswith(("estop", "robot stop")) else ""
+        named = re.search(rf"^(stopped: .*\b{seen.name}\b.*|{seen.name}: has stopped)$", text, re.MULTILINE)
+        if named and seen.flying and "dry-run" not in words:
+            return f"motors on, `{words}` said: {named[0]}"
     return ""
 
 
@@ -466,6 +483,29 @@ def exit_codes(end: End) -> Iterator[str]:
         good = (0, 1, 2, 3, 130, -9, -15) if process is end.world.conductor else (0, -9, 2, 70, -15)
         if process.dead and process.code not in good:
             yield f"{process.name}: exit code {process.code}"
+
+
+@rule(AT_THE_END, "")
+def exit_codes_of_the_run(end: End) -> Iterator[str]:
+    """The run ends with 130 if it was interrupted, with 2 if it was not flown or its own process stood still."""
+    conductor, kinds = end.world.conductor, {fault.kind for fault in end.world.script}
+    if end.code == 130 and not end.world.interrupted:
+        yield "exit code 130 without an interrupt"
+    if end.code == 2 and "start" in end.world.moments and conductor.paused_at == -inf and not kinds & {"late", "hang"}:
+        yield f"exit code 2 of a run that began: {end.output[-300:]}"
+    if end.code in {KILLED, -15} and not kinds & {"kill", "term"}:
+        yield f"exit code {end.code}"
+
+
+@rule(AT_THE_END, "")
+def commands_end(end: End) -> Iterator[str]:
+    """Commands of operators end, with a code that the documentation lists."""
+    for t, _, words, process in end.world.answers:
+        ended = end.world.ends.get(process.pid, inf)
+        if process.code not in {0, 1, 2, None}:
+            yield f"`{words}`: exit code {process.code}"
+        if ended - t > (95.0 if "re" in words else 12.0) and end.look.now - t > 95.0:
+            yield f"`{words}` takes {ended - t:.0f} s"
 
 
 @rule(AT_THE_END, "ends with exit code 1 and says so in its last line")

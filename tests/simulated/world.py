@@ -552,8 +552,8 @@ READINGS: dict[str, Callable[[Any, float, dict[str, Any]], None]] = {
 class WatchedBody(Body):
     """A body of the product, with faults of its readings, and a record of the process that drives it."""
 
-    def __init__(self, body: Body, names: Sequence[str]) -> None:
-        self.body, self.names, self.process = body, names, sim.current().process
+    def __init__(self, body: Body, names: Sequence[str], rate_hz: float) -> None:
+        self.body, self.names, self.process, self._period_s = body, names, sim.current().process, 1.0 / rate_hz
         world.bodies.append(self)
 
     def motion(self, row: int) -> Motion | None:
@@ -564,14 +564,24 @@ class WatchedBody(Body):
         self.body.open()
 
     def read(self, t: float) -> Any:
+        for row, name in enumerate(self.names):
+            self._carry(row, *world.readings.get(name, ("", 0.0, {})))
         states = self.body.read(t)
         self._note_motors()
         if world.readings and self.process is world.robots.get(self.names[0], self.process):
             for name, state in zip(self.names, states, strict=True):
-                if name in world.readings:
-                    word, number, memory = world.readings[name]
+                word, number, memory = world.readings.get(name, ("", 0.0, {}))
+                if word in READINGS:
                     READINGS[word](state, number, memory)
         return states
+
+    def _carry(self, row: int, word: str, speed: float, _: object) -> None:
+        """Let wind, or somebody, carry a robot aside [m/s]."""
+        motion = self.motion(row) if word == "adrift" else None
+        if motion is not None:
+            for place in {"held", "position"} & {*dir(motion)}:
+                x, y, z = getattr(motion, place)
+                setattr(motion, place, (x + speed * self._period_s, y, z))
 
     def command(self, setpoints: Any) -> None:
         self._note(self.names)
@@ -704,7 +714,9 @@ def _patch_processes() -> None:
     launcher.Launcher.preload, launcher.Launcher.start = lambda _: None, _start
     conduct.free_endpoints = lambda count, protocol: [f"{protocol}/127.0.0.1:{7447 + k}" for k in range(count)]
     run_registry.registered, run_registry.tell = _registered, _tell
-    run_registry.runs = lambda: [run for run, _, process in world.runs if not process.dead]
+    run_registry.look = lambda: run_registry.Listing(
+        [run for run, _, process in world.runs if not process.dead], [], []
+    )
     run_registry.born = lambda pid: (
         "" if any(each.pid == pid and not each.dead for each in sim.current().processes) else None
     )
@@ -732,7 +744,9 @@ def _watch_product() -> None:
     """Let the laboratory see what the product does."""
     _wrap(sim.Process, "exit", after=lambda process, _: world.note_end(process))
     shadowed = robot_process.shadowed
-    robot_process.shadowed = lambda body, request, periods: WatchedBody(shadowed(body, request, periods), request.names)
+    robot_process.shadowed = lambda body, request, periods: WatchedBody(
+        shadowed(body, request, periods), request.names, request.rate_hz
+    )
     _wrap(loop.Runtime, "__init__", after=_note_runtime)
     _wrap(loop.Runtime, "tick", after=_note_phases)
     _wrap(loop.Runtime, "_send_pose", before=_note_pose)
