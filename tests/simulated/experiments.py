@@ -23,7 +23,7 @@ class Setting:
     settings: tuple[str, ...] = ()
 
 
-SHORT = ("duration_s=8", "rates.body_hz=50")
+SHORT = ("duration_s=6", "rates.body_hz=50")
 AVOIDING = ('avoidance.kind="barrier"', 'avoidance.hears="all"', "avoidance.clearance=1.0")
 FIXED = {
     "triangle": Setting("triangle", "event", SHORT),
@@ -62,7 +62,7 @@ def make(rng: random.Random) -> str:
     kinds = {name: rng.choice(("khepera4", "crazyflie", "crazyflie", "turtlebot3", "tello")) for name in names}
     heights = {name: round(rng.uniform(0.5, 1.2), 2) for name in names if kinds[name] in {"crazyflie", "tello"}}
     starts = dict(zip(names, places, strict=True))
-    lines = ['title = "Random"', "duration_s = 8.0", _choice(rng, "on_loss", ("restart",))]
+    lines = ['title = "Random"', "duration_s = 6.0", _choice(rng, "on_loss", ("restart",))]
     lines += ["rates.body_hz = 50", "arena.size = [4.0, 4.0, 2.5]", "disturbance.all.position_sigma = 0.0003"]
     lines += _options(rng, kinds)
     lines += _robots(rng, kinds, starts, heights)

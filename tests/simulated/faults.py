@@ -189,6 +189,8 @@ WEIGHTS = {
     "term": 0.7,
     "command": 1,
 }  # fmt: skip
+SINCE = {"start": 8, "launch": 2, "ready": 1, "landing": 1}  # how often a fault counts from a moment
+BUSY_S = {"launch": 3.0, "ready": 2.0, "landing": 2.0}  # time after it in which much happens
 COUNTS = (1, 2, 3, 5, 8, 12)
 LENGTHS = (0.2, 0.7, 1.3, 2.5, 6.0, 14.0)  # [s]
 ORDERS = (
@@ -258,4 +260,7 @@ def _draw_one(  # noqa: PLR0917 - as `draw`, which has made them
     elif kind in {"estop", "interrupt", "command"}:
         who = ""
     size = rng.choice(SIZES[kind]) if kind in SIZES else 1.0
-    return Fault(round(at, 3), kind, who, size, round(lasts, 3))
+    since = rng.choices([*SINCE], weights=SINCE.values())[0]
+    if since != "start":
+        at = rng.uniform(0.0, BUSY_S[since])
+    return Fault(round(at, 3), kind, who, size, round(lasts, 3), since)

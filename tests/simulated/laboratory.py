@@ -274,7 +274,8 @@ class Nursery:
     """A clean process that has imported everything, and forks a child for each flight."""
 
     def __init__(self) -> None:
-        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+        threads = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"), "1")  # others spin, and die in the fork
+        environment = {**os.environ, "PYTHONPATH": str(ROOT), **threads}
         self._process = subprocess.Popen(
             [sys.executable, "-m", "tests.simulated.laboratory"], cwd=ROOT, env=environment,
             stdin=subprocess.PIPE, stdout=subprocess.PIPE,
