@@ -235,7 +235,9 @@ class World:
 
     def start_second(self, name: str, wall: float) -> None:
         """Start another process of a robot by hand: without a lifeline."""
-        words = [word for word in self.launched[name] if word != "--lifeline"]
+        words = [word for word in self.launched.get(name, ()) if word != "--lifeline"]
+        if not words:
+            return
         process = sim.Process(f"second {name}", lambda: main(robot_process.__name__, [*words, "--once"]), {})
         process.wall = wall
 
