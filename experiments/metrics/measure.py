@@ -186,7 +186,16 @@ def failures(trace: Trace, known: Sequence[float]) -> tuple[str, ...]:
     for name, share in zip(trace.robots, known, strict=True):
         if share < PRESENT and name not in taken_out:
             found.setdefault(name, f"{name}: its position was known for {share:.0%} of the time only")
+    if ended_early(trace) and not _landed_by_conductor(trace):
+        planned = trace.plan.experiment.duration_s
+        found[""] = f"the recording breaks off after {trace.time[-1]:.1f} s of {planned:g} s"
     return tuple(found.values())
+
+
+def _landed_by_conductor(trace: Trace) -> bool:
+    """Whether the recording has the end of the run: the conductor's order to land, also of an interrupted run."""
+    phases = (event for event in trace.events if (event.kind, event.source) == ("phase", "conductor"))
+    return any(event.text.startswith("landing") for event in phases)
 
 
 def _taken_out(trace: Trace) -> dict[str, str]:

@@ -551,6 +551,15 @@ def no_success_without_all(end: End) -> Iterator[str]:
             yield f"{name}: held for {held:.1f} of {end.duration_s:g} s"
 
 
+@rule(AT_THE_END, "")
+def no_success_of_a_part(end: End) -> Iterator[str]:
+    """Exit code 0 only if the figures are over the whole run."""
+    metrics = end.folder / "metrics.json"
+    for case in msgspec.json.decode(metrics.read_bytes()) if end.code == 0 and metrics.is_file() else ():
+        if case["interrupted"]:
+            yield f"{case['case']}: figures of {case['duration_s']:.1f} of {case['planned_s']:g} s"
+
+
 @rule(AT_THE_END, "An emergency stop ends the whole run")
 def no_success_after_a_stop(end: End) -> Iterator[str]:
     at = min(end.world.stops, default=inf) - end.start

@@ -1,5 +1,7 @@
 """Directed scripts: each sentence here was once wrong in a whole run, with all its processes."""
 
+import re
+
 from tests.simulated.faults import Fault
 from tests.simulated.laboratory import Flight, fly
 
@@ -100,3 +102,10 @@ def test_recorder_is_awaited_before_the_start():
     flight = triangle(Fault(0.5, "kill", "recorder", since="ready"))
     assert flight.code == 0, flight.output
     assert flight.metrics[0]["planned_s"] == SPAN_S
+
+
+def test_recording_that_breaks_off_fails_the_run():
+    flight = triangle(Fault(7.0, "cut", "recorder", lasts=20.0))
+    assert flight.code == 1
+    assert re.search(r"Failed in event: the recording breaks off after [67]\.\d s of 8 s\.", flight.output)
+    assert flight.violations == []
