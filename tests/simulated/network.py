@@ -26,7 +26,7 @@ LOOK_S: Final = 0.01  # between two looks whether an end that is cut off, or fro
 FLUSH_S: Final = 0.001  # from the mending of a cable until what it held arrives
 REORDERED_S: Final = 0.1  # longest delay of a message that others overtake
 REPEATED_S: Final = 0.2  # longest time until the copy of a message arrives
-HEARTBEAT_S: Final = 0.5  # from a sample of an advanced publisher until its number is repeated
+HEARTBEAT_S: Final = 0.5  # period in which an advanced publisher repeats the number of a new sample
 HISTORY_S: Final = 10.0  # limit of the questions of an advanced subscriber
 SETTINGS: Final = (
     "mode", "connect/endpoints", "listen/endpoints", "metadata",
@@ -127,7 +127,7 @@ class Link:
     Attributes:
         near, far: Its ends: the client and its router, or two routers.
         subscribers, queryables, tokens: What the near end has declared: keys, by the thing that was declared.
-        shown: Keys of tokens of others that the near end was told.
+        shown: Keys of tokens that the near end was told.
         asked: Questions that the near end has not answered yet.
         since: Time at which it was opened [s].
     """
@@ -386,15 +386,15 @@ class Router(Node):
 
     # liveliness
 
-    def _tokens(self, apart_from: Link | None = None) -> dict[str, None]:
-        """Keys of all tokens of the network, those of one client left out."""
-        found = (link for router in self._reached() for link in router.clients if link is not apart_from)
+    def _tokens(self) -> dict[str, None]:
+        """Keys of all tokens of the network."""
+        found = (link for router in self._reached() for link in router.clients)
         return {key: None for link in found for key in link.tokens.values()}
 
     def change(self, passed: Sequence[Router] = ()) -> None:
         """Tell clients what has changed of tokens, and what questions are over; and the other routers to do so."""
+        wanted = self._tokens()
         for link in list(self.clients):
-            wanted = self._tokens(link)
             gone = [key for key in link.shown if key not in wanted]
             new = [key for key in wanted if key not in link.shown]
             link.shown = wanted
@@ -418,7 +418,7 @@ class Router(Node):
     def list_tokens(self, link: Link, key: str, replies: Replies) -> None:
         for each in self._tokens():
             if match(key, each):
-                link.send(self, replies.add, Sample(each))
+                link.send(self, link.near.add_token, replies, each)  # type: ignore[attr-defined]
         link.send(self, replies.finish)
 
     def liveliness(self) -> SimpleNamespace:
@@ -487,7 +487,8 @@ class Session(Node):
         self.watches: list[Subscriber] = []
         self.queryables: list[Subscriber] = []
         self.tokens: list[Token] = []
-        self._remote: dict[str, None] = {}  # keys of tokens of others
+        self._remote: dict[str, None] = {}  # keys of tokens of the router that are watched
+        self._told: dict[str, None] = {}  # keys of tokens that have appeared to watches
         self._questions: list[Replies] = []
         self._routes: dict[str, list[Subscriber]] = {}
         far: Callable[[], list[Node]] = lambda: [] if self.link is None else [self.link.far]  # noqa: E731
@@ -561,8 +562,9 @@ class Session(Node):
         questions, self._questions = self._questions, []
         for replies in questions:
             replies.finish()
-        for key in list(self._remote):
-            self.show(key, False)
+        gone, self._remote = self._remote, {}
+        for key in gone:  # tokens of this session, which the router had as well, seem to vanish too
+            self._tell(key, False)
         Task(self.process, self._reconnect, "reconnect")
 
     def _send(self, call: Callable[..., object], *args: Any, drop: bool = False, express: bool = False) -> None:
@@ -643,43 +645,61 @@ class Session(Node):
         if token in self.tokens:
             self.tokens.remove(token)
             self._declare(token, None)
-            self._tell(token.key, token.key in self._known())
+            if token.key not in self._remote and all(each.key != token.key for each in self.tokens):
+                self._tell(token.key, False)
 
     def watch_tokens(self, key: object, handler: Any, history: bool = False) -> Subscriber:
         watch = Subscriber(self, str(key), handler, "")
         self.watches.append(watch)
         if history:
-            for each in {token.key: None for token in self.tokens}:
-                watch.tell(each, True)
+            for each in [each for each in self._told if match(watch.key, each)]:
+                watch.push(Sample(each))
+            for token in self.tokens:
+                self._tell(token.key, True)
             if (link := self.link) is not None:
                 link.send(self, link.far.repeat, link)  # type: ignore[attr-defined]
         return watch
 
     def get_tokens(self, key: object, handler: object = None, timeout: float = 10.0) -> Replies:
+        """Tokens that match: those that this session knows at once, then those that the router lists besides.
+
+        As with Zenoh, tokens that a new watch hears of while the question is on its way are in neither part.
+        """
         replies = self._asked(timeout)
+        known = [each for each in {token.key: None for token in self.tokens} | self._remote if match(str(key), each)]
+        for each in known:
+            replies.add(Sample(each))
         if (link := self.link) is not None:
             link.send(self, link.far.list_tokens, link, str(key), replies)  # type: ignore[attr-defined]
-            return replies
-        for each in {token.key: None for token in self.tokens}:
-            if match(str(key), each):
-                replies.add(Sample(each))
-        replies.finish()
+        else:
+            replies.finish()
         return replies
 
-    def show(self, key: str, there: bool) -> None:
-        """A token of another session has appeared or vanished."""
-        if there:
-            self._remote[key] = None
-        else:
-            self._remote.pop(key, None)
-        self._tell(key, key in self._known())
+    def add_token(self, replies: Replies, key: str) -> None:
+        if key not in self._remote and all(token.key != key for token in self.tokens):
+            replies.add(Sample(key))
 
-    def _known(self) -> dict[str, None]:
-        return self._remote | {token.key: None for token in self.tokens}
+    def show(self, key: str, there: bool) -> None:
+        """The router has, or has no longer, a token; those of this session are among its tokens as well."""
+        if there and any(match(watch.key, key) for watch in self.watches):
+            self._remote[key] = None
+            self._tell(key, True)
+        elif key in self._remote:
+            del self._remote[key]
+            if all(token.key != key for token in self.tokens):
+                self._tell(key, False)
 
     def _tell(self, key: str, there: bool) -> None:
-        for watch in list(self.watches):
-            watch.tell(key, there)
+        """Tell the watches of a token, of one that has appeared once."""
+        watches = [watch for watch in self.watches if match(watch.key, key)]
+        if there and (key in self._told or not watches):
+            return
+        if there:
+            self._told[key] = None
+        else:
+            self._told.pop(key, None)
+        for watch in watches:
+            watch.push(Sample(key, deleted=not there))
 
     # questions
 
@@ -735,7 +755,6 @@ class Subscriber:
         depth = getattr(handler, "depth", None)
         self._waiting: deque[Any] = deque(maxlen=depth)
         self.push: Callable[[Any], object] = handler if callable(handler) else self._waiting.append
-        self._seen: dict[str, None] = {}
 
     def try_recv(self) -> Any:
         current().step()
@@ -746,15 +765,6 @@ class Subscriber:
 
     def __exit__(self, *_: object) -> None:
         self.undeclare()
-
-    def tell(self, key: str, there: bool) -> None:
-        """A token has appeared or vanished."""
-        if match(self.key, key) and (key in self._seen) != there:
-            if there:
-                self._seen[key] = None
-            else:
-                del self._seen[key]
-            self.push(Sample(key, deleted=not there))
 
     def undeclare(self) -> None:
         self.session.drop(self)
@@ -878,7 +888,7 @@ class AdvancedPublisher(Publisher):
         super().__init__(session, key, mime)
         self._cache: deque[Sample] = deque(maxlen=kept)
         self._count = itertools.count()
-        self._beating = False
+        self._beating, self._since = False, current().now
         self._place = f"{key}/@adv/pub/{self.id}/_"
         self._queryable = session.declare_queryable(self._place, self._answer)
         self._token = session.declare_token(self._place)
@@ -888,7 +898,8 @@ class AdvancedPublisher(Publisher):
         self._cache.append(sample)
         if not self._beating:
             self._beating = True
-            current().after(HEARTBEAT_S, self.session.process.call, self._beat)
+            past = (current().now - self._since) % HEARTBEAT_S
+            current().after(HEARTBEAT_S - past, self.session.process.call, self._beat)
         self.session.send(sample, drop=self._drop)
 
     def undeclare(self) -> None:

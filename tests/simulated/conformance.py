@@ -1,0 +1,649 @@
+"""Scripts of what happens to routers and clients, each played with real processes and in the simulated network.
+
+A client is an `Actor`, the same code on both sides: it obeys one step after the other, and reports what it notices. The
+guess of a script was written down before it was played first.
+"""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, Final, NamedTuple
+
+import zenoh
+from zenoh.handlers import Callback, RingChannel
+
+from agents.network import pubsub
+from agents.network.endpoints import free_endpoint
+from agents.network.zenoh_config import config, settings
+from tests.simulated import kernel as simulated
+from tests.simulated import network
+from tests.simulated.kernel import BEGIN, Kernel, Process
+
+ROOT: Final = Path(__file__).resolve().parents[2]
+LEAD_S: Final = 0.5  # from the start of all real processes until the first step [s]
+TOGETHER_S: Final = 0.15  # events nearer than this have no order [s]
+READY: Final = "ready"
+FAULTS: Final = ("cut", "freeze", "kill", "close")
+PATIENCE_S: Final = 30.0  # limit for real events that are expected [s]
+QUIET_S: Final = 0.5  # time in which no event follows that is not expected [s]
+
+
+class Event(NamedTuple):
+    """What a client noticed, [s] after the beginning."""
+
+    t: float
+    who: str
+    kind: str  # "token", "value", or the outcome of a step
+    key: str
+    value: str
+
+
+@dataclass(frozen=True)
+class Script:
+    """Steps (time [s], who, what, arguments) of clients, cables (`cut`, `mend`) and processes."""
+
+    guess: str
+    steps: Sequence[tuple[Any, ...]]
+    length: float  # [s]
+    routers: int = 1
+    seen: str = "as guessed"
+    quick: bool = False  # played with real processes in every run of the tests
+    leases: Mapping[str, float] = field(default_factory=lambda: {"a": 1.2})  # those that are not 2 s [s]
+
+    @property
+    def clients(self) -> list[str]:
+        return sorted({step[1] for step in self.steps if not step[1].startswith("router")})
+
+    @property
+    def cables(self) -> list[str]:
+        return sorted({step[1] for step in self.steps if step[2] == "cut"})
+
+
+REAL: Final = SimpleNamespace(
+    open=zenoh.open,
+    advanced_publisher=pubsub.pose_publisher,
+    advanced_subscriber=lambda session, key, call, kept: pubsub.advanced_subscriber(
+        session, key, Callback(call, indirect=False), kept
+    ),
+    ring=RingChannel,
+    callback=lambda call: Callback(call, indirect=False),
+    source_info=zenoh.SourceInfo,
+    thread=threading.Thread,
+)
+
+
+def library(net: network.Network) -> SimpleNamespace:
+    """The same names of the simulation."""
+    return SimpleNamespace(
+        open=net.open,
+        advanced_publisher=network.AdvancedPublisher,
+        advanced_subscriber=network.AdvancedSubscriber,
+        ring=network.Ring,
+        callback=lambda call: call,
+        source_info=network.source_info,
+        thread=simulated.Thread,
+    )
+
+
+class Actor:
+    """A client that does what the steps of a script say."""
+
+    def __init__(
+        self, zenoh: SimpleNamespace, endpoints: Sequence[str], lease_s: float, report: Callable[..., object]
+    ) -> None:
+        self._zenoh, self._endpoints, self._lease_s, self._report = zenoh, endpoints, lease_s, report
+        self._session: Any = None
+        self._things: dict[str, Any] = {}  # publishers, tokens and rings by key
+        self._kept: list[Any] = []
+        self._queries: list[Any] = []
+
+    def obey(self, line: str) -> None:
+        what, *arguments = json.loads(line)
+        getattr(self, what)(*arguments)
+
+    def open(self, first: int = 0) -> None:
+        """Join the first router that answers, from `first` on."""
+        endpoints = [*self._endpoints[first:], *self._endpoints[:first]]
+        chosen = config(settings("client", connect=endpoints, lease_s=self._lease_s))
+        try:
+            self._session = self._zenoh.open(chosen)
+        except zenoh.ZError:
+            self._report("open", "", "failed")
+        else:
+            self._report("open", "", "done")
+
+    def close(self) -> None:
+        self._session.close()
+
+    # samples
+
+    def publisher(self, key: str) -> None:
+        self._things[key] = self._session.declare_publisher(key)
+
+    def advanced(self, key: str, kept: int) -> None:
+        self._things[key] = self._zenoh.advanced_publisher(self._session, key, "text/plain", kept)
+
+    def put(self, key: str, *values: str) -> None:
+        for value in values:
+            self._things[key].put(value.encode())
+
+    def put_numbered(self, key: str, number: int, *values: str) -> None:
+        for value in values:
+            publisher = self._things[key]
+            publisher.put(value.encode(), source_info=self._zenoh.source_info(publisher.id, number))
+
+    def subscribe(self, key: str) -> None:
+        self._kept.append(self._session.declare_subscriber(key, self._zenoh.callback(self._note_value)))
+
+    def subscribe_advanced(self, key: str, kept: int) -> None:
+        self._kept.append(self._zenoh.advanced_subscriber(self._session, key, self._note_value, kept))
+
+    def subscribe_ring(self, key: str, depth: int) -> None:
+        self._things[key] = self._session.declare_subscriber(key, self._zenoh.ring(depth))
+
+    def drain(self, key: str) -> None:
+        take = self._things[key].handler.try_recv
+        self._report("drained", key, " ".join(bytes(each.payload.to_bytes()).decode() for each in iter(take, None)))
+
+    def _note_value(self, sample: Any) -> None:
+        self._report("value", str(sample.key_expr), sample.payload.to_bytes().decode())
+
+    # tokens
+
+    def token(self, key: str, name: str = "") -> None:
+        self._things[name or key] = self._session.liveliness().declare_token(key)
+
+    def withdraw(self, name: str) -> None:
+        self._things.pop(name).undeclare()
+
+    def watch(self, key: str) -> None:
+        made = self._session.liveliness().declare_subscriber(key, self._zenoh.callback(self._note_token), history=True)
+        self._kept.append(made)
+
+    def _note_token(self, sample: Any) -> None:
+        there = sample.kind == zenoh.SampleKind.PUT
+        self._report("token", str(sample.key_expr), "appears" if there else "vanishes")
+
+    def ask_tokens(self, key: str, limit_s: float) -> None:
+        self._answers("tokens", key, lambda: self._session.liveliness().get(key, timeout=limit_s))
+
+    # questions
+
+    def queryable(self, key: str, value: str | None) -> None:
+        """Answer questions at once, or never if there is no value."""
+
+        def answer(query: Any) -> None:
+            self._report("asked", key, "")
+            if value is None:
+                self._queries.append(query)
+                return
+            with query:
+                query.reply(key, value.encode())
+
+        self._kept.append(self._session.declare_queryable(key, self._zenoh.callback(answer)))
+
+    def ask(self, key: str, limit_s: float) -> None:
+        both = {"target": zenoh.QueryTarget.ALL, "consolidation": zenoh.ConsolidationMode.NONE}
+        self._answers("answers", key, lambda: self._session.get(key, timeout=limit_s, **both))
+
+    def _answers(self, kind: str, key: str, ask: Callable[[], Any]) -> None:
+        def wait() -> None:
+            found = []
+            for reply in ask():
+                good = reply.ok is not None
+                sample = reply.ok if good else reply.err
+                text = sample.payload.to_bytes().decode() or str(sample.key_expr) if good else "no answer in time"
+                found.append(text)
+            self._report(kind, key, " ".join(sorted({*found})))  # the router may say as well that it waits no longer
+
+        self._zenoh.thread(target=wait, daemon=True).start()
+
+
+# ---------------------------------------------------------------------- the two stages
+
+
+def simulate(script: Script, seed: int = 1) -> list[Event]:
+    """What clients notice in the simulation."""
+    events: list[Event] = []
+    places = [f"tcp/127.0.0.1:{7447 + row}" for row in range(script.routers)]
+    with Kernel(seed) as kernel:
+        net = network.Network()
+        processes: dict[str, Process] = {}
+
+        def route(row: int) -> None:
+            net.open(config(settings("router", listen=[places[row]], connect=places[:row])))
+            simulated.sleep(1e6)
+
+        def act(who: str) -> None:
+            def report(*words: str) -> None:
+                events.append(Event(kernel.now - BEGIN - LEAD_S, who, *words))
+
+            actor = Actor(library(net), places, script.leases.get(who, 2.0), report)
+            end, rest = simulated.LifelineEnd(), b""
+            while end.wait(1e6):
+                *lines, rest = (rest + end.read()).split(b"\n")
+                for line in lines:
+                    actor.obey(line.decode())
+
+        def start(who: str) -> None:
+            row = int(who.removeprefix("router") or 1) - 1 if who.startswith("router") else None
+            main = (lambda: act(who)) if row is None else (lambda: route(row))
+            processes[who] = Process(who, main)
+
+        def step(who: str, what: str, *arguments: object) -> None:
+            process = processes[who]
+            if what in ("cut", "mend"):
+                for session in process.sessions:
+                    net.cut(session, what == "cut")
+            elif what in ("freeze", "thaw", "kill"):
+                {"freeze": process.pause, "thaw": process.resume, "kill": process.kill}[what]()
+            elif what == "start":
+                start(who)
+            else:
+                process.give(json.dumps([what, *arguments]).encode() + b"\n")
+
+        for row in range(script.routers):
+            start(f"router{row + 1 if row else ''}")
+        for who in script.clients:
+            start(who)
+        for t, *words in script.steps:
+            kernel.at(BEGIN + LEAD_S + t, step, *words)
+        kernel.run(limit=BEGIN + LEAD_S + script.length)
+        assert not kernel.crashes, kernel.crashes[0][-1]
+    return events
+
+
+class RealStage:
+    """Real processes: routers, a relay for each client that is cut off, clients."""
+
+    def __init__(self, script: Script) -> None:
+        self._script, self._zero = script, 0.0
+        self._processes: dict[str, subprocess.Popen[str]] = {}  # newest of each name
+        self._started: list[subprocess.Popen[str]] = []
+        self._readers: list[threading.Thread] = []
+        self._lines: list[tuple[str, str]] = []
+        self._places = [free_endpoint(preferred_port=0) for _ in range(script.routers)]
+        self._ready = threading.Semaphore(0)
+
+    def play(self, expected: Sequence[Event] = ()) -> list[Event]:
+        """Events until all that are expected are there, and for as long as the script lasts."""
+        with ExitStack() as stack:
+            stack.callback(self._end)
+            for row in range(self._script.routers):
+                self._start(f"router{row + 1 if row else ''}")
+                self._await(1)
+            for who in self._script.clients:
+                self._start(who)
+            self._await(len(self._script.clients))
+            self._zero = time.monotonic() + LEAD_S
+            pause, disturbed = threading.Event(), False
+            for t, who, what, *arguments in self._script.steps:
+                pause.wait(max(0.0, self._zero + t - time.monotonic()))
+                self._step(who, what, *arguments)
+                disturbed = disturbed or what in FAULTS
+                if not disturbed:  # a slow machine gets its time
+                    self._await(1)
+                    self._zero = max(self._zero, time.monotonic() - t)
+            pause.wait(max(0.0, self._zero + self._script.length - time.monotonic()))
+            limit = time.monotonic() + PATIENCE_S
+            while expected and time.monotonic() < limit and differences(list(self._events()), expected):
+                pause.wait(0.1)
+            pause.wait(QUIET_S)
+        return list(self._events())
+
+    def _await(self, count: int) -> None:
+        for _ in range(count):
+            assert self._ready.acquire(timeout=60.0), f"not all is ready, but {self._lines}"
+
+    def _start(self, who: str) -> None:
+        if who.startswith("router"):
+            row = int(who.removeprefix("router") or 1) - 1
+            link = [word for place in self._places[:row] for word in ("--connect", place)]
+            self._spawn(who, "agents.runtime.router", "--listen", self._places[row], *link)
+            return
+        places = self._places
+        if who in self._script.cables:
+            near = [free_endpoint(preferred_port=0) for _ in places]
+            ports = [place.rpartition(":")[2] for pair in zip(near, places, strict=True) for place in pair]
+            self._spawn(f"cable {who}", "tests.reliability.cable", *ports)
+            places = near
+        lease_s = self._script.leases.get(who, 2.0)
+        self._spawn(who, "tests.simulated.conformance", str(lease_s), *places)
+
+    def _spawn(self, who: str, module: str, *arguments: str) -> None:
+        command = [sys.executable, "-m", module, *arguments]
+        pipe = subprocess.PIPE
+        made = subprocess.Popen(command, cwd=ROOT, stdin=pipe, stdout=pipe, text=True, bufsize=1)
+        self._processes[who] = made
+        self._started.append(made)
+
+        def read() -> None:
+            assert made.stdout is not None
+            for line in made.stdout:
+                if READY in line:
+                    self._ready.release()
+                else:
+                    self._lines.append((who, line))
+
+        self._readers.append(threading.Thread(target=read))
+        self._readers[-1].start()
+
+    def _step(self, who: str, what: str, *arguments: object) -> None:
+        signals = {"freeze": signal.SIGSTOP, "thaw": signal.SIGCONT, "kill": signal.SIGKILL}
+        if what in ("cut", "mend"):
+            self._processes[f"cable {who}"].send_signal(signal.SIGSTOP if what == "cut" else signal.SIGCONT)
+        elif what in signals:
+            self._processes[who].send_signal(signals[what])
+            if what == "kill":
+                self._processes[who].wait(30.0)
+        elif what == "start":
+            self._start(who)
+        else:
+            stdin = self._processes[who].stdin
+            assert stdin is not None
+            stdin.write(json.dumps([what, *arguments]) + "\n")
+
+    def _end(self) -> None:
+        for each in self._started:
+            each.kill()
+        for each in self._started:
+            each.wait(30.0)
+        for reader in self._readers:
+            reader.join(30.0)
+        for each in self._started:
+            for stream in (each.stdin, each.stdout):
+                if stream is not None:
+                    stream.close()
+
+    def _events(self) -> Iterator[Event]:
+        for who, line in list(self._lines):
+            t, *words = json.loads(line)
+            yield Event(t - self._zero, who, *words)  # early ones seem earlier if the machine was slow
+
+
+def act_in_process(lease_s: str, *places: str) -> None:
+    """The process of a real client: steps come by standard input, events go to standard output."""
+    lock = threading.Lock()
+
+    def report(*words: object) -> None:
+        with lock:  # callbacks have threads of their own
+            print(json.dumps([time.monotonic(), *words]), flush=True)
+
+    actor = Actor(REAL, places, float(lease_s), report)
+    report(READY)
+    for line in sys.stdin:
+        actor.obey(line)
+        report(READY)
+
+
+# ---------------------------------------------------------------------- comparison
+
+
+def histories(events: Sequence[Event]) -> dict[tuple[str, str, str], list[Event]]:
+    """Events of each client, kind and key; of a value that is seen again and again the last one alone counts."""
+    found: dict[tuple[str, str, str], list[Event]] = {}
+    for event in sorted(events):
+        known = found.setdefault((event.who, event.kind, event.key), [])
+        if event.kind == "value":
+            known.clear()
+        known.append(event)
+    return found
+
+
+def differences(real: Sequence[Event], simulated: Sequence[Event]) -> list[str]:
+    """Sentences about events that only one side has, or that both have in another order."""
+    one, other = histories(real), histories(simulated)
+    told = [
+        f"{' '.join(key)}: really {[each.value for each in one.get(key, [])]}, "
+        f"simulated {[each.value for each in other.get(key, [])]}"
+        for key in sorted(one.keys() | other.keys())
+        if [each.value for each in one.get(key, [])] != [each.value for each in other.get(key, [])]
+    ]
+    if told:
+        return told
+    pairs = [pair for key in one if key[1] != "value" for pair in zip(one[key], other[key], strict=True)]
+    for a, a_simulated in pairs:
+        for b, b_simulated in pairs:
+            if a.who == b.who and a.t < b.t - TOGETHER_S and a_simulated.t > b_simulated.t + TOGETHER_S:
+                told.append(f"{a} is before {b}, but simulated behind it")
+    return told
+
+
+def delays(real: Sequence[Event], simulated: Sequence[Event]) -> list[tuple[float, Event]]:
+    """How much later an event is in reality than in the simulation [s], for each real event."""
+    other = histories(simulated)
+    return [
+        (event.t - twin.t, event)
+        for key, events in histories(real).items()
+        for event, twin in zip(events, other.get(key, []), strict=False)
+    ]
+
+
+# ---------------------------------------------------------------------- scripts
+
+Steps = list[tuple[Any, ...]]
+JOINED: Final[Steps] = [
+    (0.0, "b", "open"), (0.1, "b", "watch", "t/*"), (0.2, "b", "subscribe_advanced", "v/*", 1),
+    (0.3, "a", "open"), (0.4, "a", "advanced", "v/a", 1), (0.5, "a", "token", "t/a"), (0.6, "a", "put", "v/a", "1"),
+]  # fmt: skip
+ALONE: Final[Steps] = [(0.0, "a", "open"), (0.0, "b", "open")]
+
+SCRIPTS: Final[dict[str, Script]] = {
+    "a cut shorter than the lease": Script(
+        "no token changes; the value that was put meanwhile arrives when the cable is back",
+        [*JOINED, (1.0, "a", "cut"), (1.1, "a", "put", "v/a", "2"), (1.5, "a", "mend")],
+        2.5,
+    ),
+    "a cut longer than the lease": Script(
+        "the token vanishes 1.2 s after the cut, and is back with the last value at once when the cable is",
+        [*JOINED, (1.0, "a", "cut"), (1.5, "a", "put", "v/a", "2"), (3.6, "a", "mend")],
+        4.0,
+        quick=True,
+    ),
+    "the observer is cut off": Script(
+        "it loses the token after the 2 s of the router, and has token and last value again after the cut",
+        [*JOINED, (1.0, "b", "cut"), (1.5, "a", "put", "v/a", "2"), (5.0, "b", "mend")],
+        6.0,
+    ),
+    "a client is frozen for a moment": Script(
+        "nothing changes",
+        [*JOINED, (1.0, "a", "freeze"), (1.5, "a", "thaw"), (1.7, "a", "put", "v/a", "2")],
+        2.5,
+    ),
+    "a client is frozen": Script(
+        "its token vanishes after 1.2 s; after that it notices the end of its link at once and comes back",
+        [*JOINED, (1.0, "a", "freeze"), (2.8, "a", "thaw"), (3.6, "a", "put", "v/a", "2")],
+        4.0,
+        quick=True,
+    ),
+    "the observer is frozen": Script(
+        "it sees the token vanish and come back, and the value that was put while it was frozen",
+        [*JOINED, (1.0, "b", "freeze"), (1.5, "a", "put", "v/a", "2"), (4.5, "b", "thaw")],
+        6.0,
+    ),
+    "the router is frozen for a moment": Script(
+        "nothing changes; values are late",
+        [*JOINED, (1.0, "router", "freeze"), (1.2, "a", "put", "v/a", "2"), (1.5, "router", "thaw")],
+        2.5,
+    ),
+    "the router is frozen": Script(
+        "clients close their links after 2 s, and are back as soon as it goes on",
+        [*JOINED, (1.0, "router", "freeze"), (1.5, "a", "put", "v/a", "2"), (4.6, "router", "thaw")],
+        6.0,
+    ),
+    "a client is killed": Script("its token vanishes at once", [*JOINED, (1.0, "a", "kill")], 2.0),
+    "a client leaves": Script("its token vanishes at once", [*JOINED, (1.0, "a", "close")], 2.0),
+    "the router is killed and started again": Script(
+        "tokens vanish at once, and are back within half a second, with the value that was put meanwhile",
+        [*JOINED, (1.0, "router", "kill"), (1.3, "a", "put", "v/a", "2"), (2.0, "router", "start")],
+        4.0,
+        quick=True,
+    ),
+    "a client joins late": Script(
+        "it has the last value of `a`, and of `c` the three that it keeps",
+        [
+            (0.0, "a", "open"), (0.0, "c", "open"), (0.1, "a", "advanced", "v/a", 1), (0.1, "c", "advanced", "w/c", 3),
+            (0.3, "a", "put", "v/a", "1", "2", "3"), (0.3, "c", "put", "w/c", "1", "2", "3", "4"),
+            (1.0, "b", "open"), (1.1, "b", "subscribe_advanced", "v/*", 1), (1.1, "b", "subscribe_advanced", "w/*", 3),
+            (1.8, "c", "put", "w/c", "5"),
+        ],
+        2.6,
+    ),
+    "a ring overflows": Script(
+        "the newest three are left",
+        [
+            *ALONE, (0.1, "b", "subscribe_ring", "v/*", 3), (0.3, "a", "publisher", "v/a"),
+            (0.5, "a", "put", "v/a", *"123456789"), (1.5, "b", "drain", "v/*"),
+        ],
+        1.7,
+    ),
+    "a publisher repeats its number": Script(
+        "an advanced subscriber has the first one, a plain one has all",
+        [
+            *ALONE, (0.1, "b", "subscribe_advanced", "v/*", 1), (0.1, "b", "subscribe_ring", "v/*", 9),
+            (0.5, "a", "publisher", "v/a"), (0.7, "a", "put_numbered", "v/a", 5, *"1234"), (1.7, "b", "drain", "v/*"),
+        ],
+        1.9,
+    ),
+    "a token is withdrawn and declared": Script(
+        "each change is seen, and that one by a client which watches its own token",
+        [
+            *JOINED, (0.8, "a", "watch", "t/*"), (1.2, "a", "withdraw", "t/a"), (1.6, "a", "token", "t/a"),
+            (2.0, "a", "withdraw", "t/a"),
+        ],
+        2.5,
+    ),
+    "two clients hold one token": Script(
+        "it appears once, and vanishes with the second",
+        [
+            *JOINED, (0.7, "c", "open"), (0.8, "a", "watch", "t/*"), (0.9, "c", "token", "t/a"),
+            (1.3, "c", "withdraw", "t/a"), (1.6, "c", "token", "t/a"), (2.0, "a", "kill"),
+            (2.5, "c", "withdraw", "t/a"),
+        ],
+        3.0,
+    ),
+    "a client holds one token twice": Script(
+        "it appears once, and vanishes with the second",
+        [*JOINED, (0.8, "a", "token", "t/a", "twin"), (1.2, "a", "withdraw", "t/a"), (1.6, "a", "withdraw", "twin")],
+        2.0,
+    ),
+    "a client watches its own tokens without a router": Script(
+        "they stay",
+        [
+            *JOINED, (0.75, "a", "watch", "t/*"), (1.0, "router", "kill"), (1.5, "a", "token", "t/z"),
+            (2.0, "a", "withdraw", "t/a"), (2.5, "a", "token", "t/a"), (3.0, "router", "start"),
+        ],
+        5.0,
+        seen="those that the router had vanish, and one that is withdrawn afterwards vanishes twice",
+    ),
+    "a client watches twice": Script(
+        "the second watch has all tokens at once, even while the router is frozen",
+        [
+            *JOINED, (0.9, "b", "watch", "t/*"), (1.2, "router", "freeze"), (1.4, "b", "watch", "t/*"),
+            (1.8, "router", "thaw"), (2.5, "a", "withdraw", "t/a"),
+        ],
+        3.0,
+    ),
+    "tokens are asked for": Script(
+        "all are listed, those of the asker too; without an answer of the router there is an error alone",
+        [
+            *JOINED, (0.7, "b", "token", "t/b"), (0.7, "c", "open"), (0.8, "c", "token", "t/c"),
+            (1.1, "b", "ask_tokens", "t/*", 9.0), (1.1, "c", "ask_tokens", "t/*", 9.0), (1.4, "router", "freeze"),
+            (1.5, "b", "ask_tokens", "t/*", 0.3), (1.5, "c", "ask_tokens", "t/*", 0.3), (2.1, "router", "thaw"),
+            (2.8, "c", "ask_tokens", "t/*", 9.0),
+        ],
+        3.2,
+        seen="before the error come tokens that the session knows: its own, and those that it watches",
+        quick=True,
+    ),
+    "tokens are asked for without a router": Script(
+        "the asker lists its own ones at once",
+        [*JOINED, (0.7, "b", "token", "t/b"), (1.2, "router", "kill"), (1.7, "b", "ask_tokens", "t/*", 9.0)],
+        2.5,
+        seen="as guessed; but its own ones have vanished for its watch",
+    ),
+    "who is asked is killed": Script(
+        "the question ends at once, without an answer",
+        [*ALONE, (0.2, "a", "queryable", "q/a", None), (0.6, "b", "ask", "q/a", 9.0), (1.2, "a", "kill")],
+        2.0,
+    ),
+    "who is asked is frozen": Script(
+        "the question ends when the router closes the link, after 1.2 s",
+        [*ALONE, (0.2, "a", "queryable", "q/a", "yes"), (0.6, "a", "freeze"), (0.8, "b", "ask", "q/a", 9.0)],
+        3.0,
+    ),
+    "who asks is cut off": Script(
+        "the question ends when the asker closes its link, 2 s after the cut, without an answer",
+        [
+            *ALONE, (0.2, "a", "queryable", "q/a", "yes"), (0.6, "b", "cut"), (0.8, "b", "ask", "q/a", 9.0),
+            (4.0, "b", "mend"),
+        ],
+        5.0,
+    ),
+    "a question is answered too late": Script(
+        "the asker has an error after its limit",
+        [*ALONE, (0.2, "a", "queryable", "q/a", None), (0.6, "b", "ask", "q/a", 0.8)],
+        2.0,
+        seen="as guessed; now and then there are two errors, of the router as well",
+    ),
+    "two clients answer one question": Script(
+        "both answers arrive; a question on a key without a queryable ends at once",
+        [
+            *ALONE, (0.0, "c", "open"), (0.2, "a", "queryable", "q/a", "yes"), (0.2, "c", "queryable", "q/*", "maybe"),
+            (0.6, "b", "ask", "q/a", 9.0), (0.8, "b", "ask", "r/a", 9.0),
+        ],
+        1.5,
+    ),
+    "a client joins a frozen router": Script(
+        "opening fails after 3 s; one that begins later succeeds when the router goes on",
+        [*ALONE, (0.5, "router", "freeze"), (0.7, "c", "open"), (2.3, "d", "open"), (4.5, "router", "thaw")],
+        5.0,
+    ),
+    "the first of two routers is killed": Script(
+        "clients are on the second at once: the token vanishes and is back",
+        [*JOINED, (1.0, "router", "kill"), (1.5, "a", "put", "v/a", "2"), (2.5, "b", "ask_tokens", "t/*", 9.0)],
+        3.0,
+        routers=2,
+    ),
+    "the first of two routers is frozen": Script(
+        "after 2 s both go over, each attempt with the first one takes 1 s",
+        [
+            *JOINED, (1.0, "router", "freeze"), (1.5, "a", "put", "v/a", "2"), (5.5, "b", "ask_tokens", "t/*", 9.0),
+            (6.5, "router", "thaw"), (7.5, "a", "put", "v/a", "3"),
+        ],
+        8.0,
+        routers=2,
+    ),
+    "clients of two routers": Script(
+        "a token and a value pass; when the first router is killed both are gone, and back when `a` is on the second",
+        [
+            (0.0, "b", "open", 1), (0.1, "b", "watch", "t/*"), (0.2, "b", "subscribe_advanced", "v/*", 1),
+            *JOINED[3:], (1.2, "router", "kill"), (1.8, "a", "put", "v/a", "2"), (2.3, "b", "ask_tokens", "t/*", 9.0),
+        ],
+        3.0,
+        routers=2,
+    ),
+    "the link of two routers is lost": Script(
+        "a client of the other router sees the token vanish after 2 s, and come back when the frozen router goes on",
+        [
+            (0.0, "b", "open", 1), (0.1, "b", "watch", "t/*"), (0.2, "b", "subscribe_advanced", "v/*", 1),
+            *JOINED[3:], (1.2, "router", "freeze"), (5.6, "router", "thaw"), (7.0, "a", "put", "v/a", "2"),
+        ],
+        8.0,
+        routers=2,
+    ),
+}  # fmt: skip
+
+
+if __name__ == "__main__":
+    act_in_process(*sys.argv[1:])
