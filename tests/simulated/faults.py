@@ -30,8 +30,8 @@ class Fault:
     | hang | robot | its loop alone stands still [s] |
     | step, drift | process | of its wall clock [s]; of its uptime [s/s] |
     | disk | process | "full", "read-only", or seconds that each write takes |
-    | body | robot | a word of `world.READINGS`, or such a word and a number |
-    | capture | robot | a word of `world.CAPTURES`, or such a word and a number: external positions alone |
+    | body | robot | "adrift", or a word of `bodies.READINGS`, or such a word and a number |
+    | capture | robot | a word of `bodies.capture`, or such a word and a number: external positions alone |
     | order | robot | words of `./zenpark robot`: "hold", "land", "replace --body twin" |
     | command | | words after `./zenpark`: "estop --json" |
     | estop | | as `./zenpark estop` |

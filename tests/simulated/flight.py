@@ -15,7 +15,7 @@ from types import CodeType, FunctionType
 
 from agents.decision.lifecycle import Phase
 from experiments.file.document import load, write_json
-from tests.simulated import faults, kernel, laboratory, rules, world
+from tests.simulated import faults, kernel, laboratory, processes, rules, seam, world
 from tests.simulated.laboratory import Flight, Mutant, Request, SimulatorError
 
 for _package in ("agents", "experiments", "tools", "twins"):  # an import in a flight would take real time
@@ -32,19 +32,19 @@ def fly(request: Request) -> Flight:
     if request.mutant is not None:
         mutate(request.mutant)
     folder = laboratory.scratch() if request.folder is None else Path(request.folder)
-    begun = world.REAL.process_time()
+    begun = processes.REAL.process_time()
     try:
         file = _file(request, folder)
         words, script = _command(request, file, folder), _script(request, file)
         os.environ["ZENPARK_RUNTIME_DIR"] = os.environ["ZENPARK_CACHE_DIR"] = str(folder / "user")
         with kernel.guard(*ALLOWED), kernel.Kernel(request.seed, request.preempt) as running:
-            world.patch()
+            seam.patch()
             laboratory_world = world.World(running, script, varied=request.varied, clocks=request.clocks)
             checked = rules.Rules(laboratory_world)
             laboratory_world.run(words, request.limit_s)
             checked.judge(folder / "run")
             flight = _collect(laboratory_world, checked, request, folder / "run")
-        flight.cpu_s = world.REAL.process_time() - begun
+        flight.cpu_s = processes.REAL.process_time() - begun
         return flight
     finally:
         if request.folder is None:
@@ -62,7 +62,7 @@ def warm_up() -> None:
 
 def leave() -> None:
     """End this process."""
-    world.REAL.exit(0)
+    processes.REAL.exit(0)
 
 
 def _file(request: Request, folder: Path) -> str:
