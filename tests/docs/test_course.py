@@ -82,7 +82,6 @@ def test_a_lesson_is_a_notebook(lesson):
 
 
 @pytest.mark.nightly
-@pytest.mark.timeout(300)
 @pytest.mark.parametrize("lesson", NAMES)
 def test_what_a_lesson_claims_is_true(lesson, tmp_path):
     done = python("-W", "error", LESSONS / f"{lesson}.py", tmp_path / "figures", cwd=tmp_path, timeout_s=280.0)

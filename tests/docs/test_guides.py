@@ -59,7 +59,6 @@ def shortened(words: list[str]) -> list[str]:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 @pytest.mark.parametrize("guide", [*SHORT, *(pytest.param(guide, marks=pytest.mark.nightly) for guide in LONG)])
 def test_a_guide_can_be_followed(guide, hub, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -81,7 +80,6 @@ def test_a_guide_can_be_followed(guide, hub, tmp_path, monkeypatch):
 
 
 @pytest.mark.system
-@pytest.mark.timeout(150)
 @pytest.mark.parametrize("command", REAL)
 def test_a_guide_flies_in_real_time(command, tmp_path, monkeypatch):
     found = [step for guide in GUIDES for step in steps(guide)]

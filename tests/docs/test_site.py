@@ -30,7 +30,6 @@ def text(page: Path) -> str:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(600)
 def test_the_site_has_every_page_and_fetches_nothing(site):
     docs = ROOT / "docs"
     pages = [page.relative_to(docs).with_suffix("") for page in [*docs.glob("*.md"), *docs.glob("[gr]*/*.md")]]
@@ -43,7 +42,6 @@ def test_the_site_has_every_page_and_fetches_nothing(site):
 
 @pytest.mark.slow
 @needs_chromium
-@pytest.mark.timeout(600)
 def test_search_and_formulas_work_from_disk(site):
     from playwright.sync_api import sync_playwright  # noqa: PLC0415
 
@@ -62,7 +60,6 @@ def test_search_and_formulas_work_from_disk(site):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(600)
 def test_reference_has_every_key_command_topic_and_column(site):
     file = (site / "reference" / "experiment-file.html").read_text("utf-8")
     assert not [entry.key for entry in reference.entries() if entry.words[-1] not in file]

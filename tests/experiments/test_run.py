@@ -119,7 +119,6 @@ CELLS = (
 
 
 @pytest.mark.system
-@pytest.mark.timeout(200)
 def test_jupyter_shows_run_figures_and_the_reread_run(tmp_path, monkeypatch):
     nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(CHECKOUT), str(CHECKOUT / "face")]))

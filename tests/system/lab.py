@@ -293,6 +293,9 @@ def assert_formed(trace, within_m, since_s):
         assert np.abs(apart - (link if isinstance(link, float) else link.distance)).mean() < within_m, text
 
 
+SLOW_S = 10.0  # for a busy machine; the lease of the router is six times as long
+
+
 def assert_held_in_time(flight, case, stopped):
     """Robots of a finished run held once because the router froze at `stopped` [s, UTC], as each recorded it itself."""
     trace = flight.read(case).trace
@@ -302,5 +305,5 @@ def assert_held_in_time(flight, case, stopped):
         status = typed(flight.folder / f"{case}.mcap", f"/{name}/status")[-1]
         hold, over = [each for each in status.incidents if "no connection to a router" in each.text]
         assert hold.text.startswith("hold: ")
-        assert stopped < hold.stamp < stopped + trace.plan.experiment.safety.neighbour_timeout_s + 1.0
+        assert stopped < hold.stamp < stopped + trace.plan.experiment.safety.neighbour_timeout_s + SLOW_S
         assert over.text.startswith("over: ")

@@ -35,7 +35,6 @@ HYBRID = '{ kind = "hybrid", robots = ["TB01", "KH01"] }'
 
 
 @pytest.mark.mechanism("central controller: silent, killed")
-@pytest.mark.timeout(120)
 def test_robots_hold_while_the_centre_is_dead(tmp_path):
     file, folder = tmp_path / "three.toml", tmp_path / "run"
     file.write_text(FAST.format(duration=12.0, architecture=HYBRID))

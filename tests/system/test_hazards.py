@@ -79,7 +79,6 @@ def written(folder, text):
     return file
 
 
-@pytest.mark.timeout(120)
 def test_every_run_of_the_machine_ends_with_reason(tmp_path, capsys):
     file = written(tmp_path, TWO_CASES)
     flight = Flight(tmp_path / "run", file)
@@ -109,7 +108,6 @@ def test_every_run_of_the_machine_ends_with_reason(tmp_path, capsys):
 
 
 @pytest.mark.mechanism("emergency stop of a run")
-@pytest.mark.timeout(120)
 def test_before_the_common_start_too(tmp_path):
     high = ("robots.CF01.hover=2.0", 'formation.links={"CF01 - KH01" = 2.2}')
     flight = Flight(tmp_path / "run", written(tmp_path, TWO_CASES), *high)

@@ -14,7 +14,6 @@ from tests.system.lab import NEAR, Flight, assert_formed, gone, until
 pytestmark = pytest.mark.system
 
 
-@pytest.mark.timeout(180)
 @pytest.mark.parametrize(("bodies", "within_m"), [("protocol", 0.05), ("world", 0.03)])
 def test_the_reference_experiment_flies_in_other_bodies(tmp_path, bodies, within_m):
     words = ("--bodies", bodies, "--case", "event", "--json", "duration_s=12", "timeline=[]")
@@ -95,7 +94,6 @@ def preflight(tmp_path):
     return check
 
 
-@pytest.mark.timeout(90)
 def test_one_hops_and_stops_while_another_is_red(preflight):
     drone, wheels = preflight(TWO.replace("BODY", "khepera4://127.0.0.1:9"), "--hop", "--stop", code=1)
     names = ("ready", "stop, motors off", "hop", "stop, motors on")
@@ -105,7 +103,6 @@ def test_one_hops_and_stops_while_another_is_red(preflight):
 
 
 @pytest.mark.mechanism("preflight: a hop that is interrupted")
-@pytest.mark.timeout(90)
 def test_ctrl_c_lands_the_robot_that_hops(preflight, tmp_path):
     log = tmp_path / "out" / "logs" / "preflight-CF01.log"
 
@@ -129,7 +126,6 @@ T01 = { kind = "tello", start = [0.0, 0.6, 0.0], hover = 0.8 }
 """
 
 
-@pytest.mark.timeout(150)
 def test_drones_hop_through_their_bridges_under_motion_capture(preflight):
     drone, tello = preflight(DRONES, "--hop", "--bodies", "protocol")
     assert {drone[name]["verdict"] for name in ("address", "firmware", "battery", "position", "radio", "hop")} == {"ok"}

@@ -122,7 +122,6 @@ def test_unstartable_robot_ends_run_as_the_file_says(tmp_path):
     assert robots["CF01"]["messages"] == 0
 
 
-@pytest.mark.timeout(150)
 @pytest.mark.parametrize(("changes", "passed"), [((), False), ((LAW, "criteria.0.at_most=0.6"), True)])
 def test_a_run_in_real_time_is_judged(changes, passed, tmp_path):
     """By criteria, with a law and metrics in files beside the experiment."""
@@ -212,7 +211,6 @@ class Averages(Watcher):
         self.until(agreed, "they agree", FORMED_S)
 
 
-@pytest.mark.timeout(200)
 @pytest.mark.mechanism("words")
 def test_robots_agree_on_an_average_in_real_time(tmp_path):
     """With a fifth of the messages lost, in two processes of three robots."""
@@ -231,7 +229,6 @@ def test_robots_agree_on_an_average_in_real_time(tmp_path):
     assert len(typed(file, "/KH01/pose")) < len(spoken) / 3  # those before its first step
 
 
-@pytest.mark.timeout(350)
 @pytest.mark.mechanism("words: restart")
 def test_a_restarted_robot_joins_without_drawing_the_others(tmp_path):
     """The first words of a restarted robot are a step old, and its number is 1 from the average, which all keep."""

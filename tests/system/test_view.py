@@ -179,7 +179,6 @@ def test_page_orders_reach_robots_and_become_events(router, watcher, tmp_path):
         page.until(lambda: everywhere(lambda status: status.phase == "done"), "statuses say so")
 
 
-@pytest.mark.timeout(240)
 def test_lab_observer_watches_and_shift_s_stops_run(tmp_path):
     file = in_lab(tmp_path)
     flight = Flight(tmp_path / "run", file, "--case", "event", "duration_s=90")

@@ -97,7 +97,6 @@ FOUR = [encounter(("khepera4", "turtlebot3", "crazyflie", "tello"), BARRIER)]
 BAD = ChannelTable(delay_s=0.02, jitter_s=0.02, loss=0.2)
 
 
-@pytest.mark.timeout(600)
 @pytest.mark.parametrize(
     ("experiments", "seeds", "least", "arrived"),
     [
@@ -120,7 +119,6 @@ def test_robots_keep_apart_until_they_arrive(experiments, seeds, least, arrived)
     assert avoided.any()
 
 
-@pytest.mark.timeout(600)
 @pytest.mark.nightly
 def test_thousand_random_encounters_without_collision():
     found = [

@@ -44,7 +44,7 @@ from tests.experiments.recordings import START, status
 from tests.fuzz.messages import sent
 from tests.network import Net, Reply, Sample
 from tests.small import changed, pair
-from tests.waiting import ManualClock, until
+from tests.waiting import PATIENCE_S, ManualClock, until
 
 KEYS = Keys()
 DEAD = Death("recorder", "conductor", "the recorder ended (killed by SIGKILL); started again")
@@ -304,7 +304,7 @@ def test_order_reaches_all_before_one_has_answered(router):
         thread = threading.Thread(target=answer)
         thread.start()
         try:
-            replies = orders.send_order(conductor, KEYS, [*names, "D"], messages.Order("hold"), 20.0)
+            replies = orders.send_order(conductor, KEYS, [*names, "D"], messages.Order("hold"), PATIENCE_S)
         finally:
             over.set()
             thread.join()
