@@ -18,29 +18,31 @@ from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
-from tests.simulated.experiments import FIXED, NAMES, RANDOM, setting_of
-from tests.simulated.faults import Fault
+from tests.simulated.experiments import FIXED, LONG, NAMES, RANDOM, setting_of
+from tests.simulated.faults import KINDS, Fault
 from tests.simulated.laboratory import Flight, Nursery, Request, SimulatorError
 
 SHRINK_S = 60.0  # of processor time
-FEW = 3  # faults of a script that is short enough
+QUICK = 1000  # seeds below it are short flights
 
 
-def request_of(seed: int, name: str | None = None) -> Request:
+def request_of(seed: int, name: str | None = None, kinds: Sequence[str] = ()) -> Request:
     """The flight of a seed: its experiment, unless one is named, its script, lateness, and times of starts."""
     names = [*FIXED, RANDOM, RANDOM]
     setting = setting_of(name or names[seed % len(names)], seed)
     rng = random.Random(f"request {seed}")
+    lasts = () if name in LONG else (f"duration_s={4 if seed < QUICK else 8}",)
     clock = rng.choice((0.03, -0.03, 0.4, -0.4, 2.0, -2.0, 4.5, -4.5, 20.0, -20.0))
     return Request(
         setting.experiment,
         seed=seed,
         case=setting.case,
-        settings=setting.settings,
+        settings=(*setting.settings, *lasts),
         preempt=rng.choice((0.0, 0.002, 0.03)),
         varied=rng.random() < 0.6,
         clocks={rng.choice(("KH01", "CF01", "A", "B")): clock} if rng.random() < 0.15 else {},
         drawn=seed,
+        kinds=tuple(kinds),
     )
 
 
@@ -69,9 +71,24 @@ def shrink(request: Request, flight: Flight, nursery: Nursery) -> tuple[list[Fau
     return script, flight
 
 
-def repeat(seed: int, name: str | None) -> str:
-    """The command that repeats a flight."""
-    return f"python -m tests.simulated.campaign --one {seed}{f' --of {name}' if name else ''} -v"
+@dataclass(frozen=True)
+class Choice:
+    """What a campaign flies: an experiment, and kinds of faults; all of both if they are left out."""
+
+    name: str | None = None
+    kinds: tuple[str, ...] = ()
+
+    def request(self, seed: int) -> Request:
+        return request_of(seed, self.name, self.kinds)
+
+    def repeat(self, seed: int) -> str:
+        """The command that repeats a flight."""
+        name = f" --of {self.name}" if self.name else ""
+        kinds = f" --kinds {' '.join(self.kinds)}" if self.kinds else ""
+        return f"python -m tests.simulated.campaign --one {seed}{name}{kinds} -v"
+
+
+ALL = Choice()
 
 
 @dataclass
@@ -97,27 +114,27 @@ class Sum:
         )
 
 
-def fly(seeds: Iterable[int], name: str | None, nursery: Nursery) -> Iterator[tuple[int, Flight | SimulatorError]]:
+def fly(seeds: Iterable[int], choice: Choice, nursery: Nursery) -> Iterator[tuple[int, Flight | SimulatorError]]:
     for seed in seeds:
         try:
-            yield seed, nursery.run(request_of(seed, name))
+            yield seed, nursery.run(choice.request(seed))
         except SimulatorError as error:
             yield seed, error
 
 
-def failure(seed: int, name: str | None, nursery: Nursery, flight: Flight | SimulatorError) -> str:
+def failure(seed: int, choice: Choice, nursery: Nursery, flight: Flight | SimulatorError) -> str:
     """What a seed breaks, shrunk, and the command that repeats it; empty if all is well."""
     if isinstance(flight, SimulatorError):
-        return f"seed {seed}: {flight}\n  {repeat(seed, name)}"
+        return f"seed {seed}: {flight}\n  {choice.repeat(seed)}"
     if not flight.violations:
         return ""
-    script, least = shrink(request_of(seed, name), flight, nursery)
-    lines = [f"seed {seed}, exit code {flight.code}: {repeat(seed, name)}"]
+    script, least = shrink(choice.request(seed), flight, nursery)
+    lines = [f"seed {seed}, exit code {flight.code}: {choice.repeat(seed)}"]
     lines += [f"  {each.rule} at {each.t:.2f} s: {each.text}" for each in least.violations]
     return "\n".join([*lines, *(f"    {fault}" for fault in script)])
 
 
-def campaign(seeds: Sequence[int], name: str | None, processes: int) -> int:
+def campaign(seeds: Sequence[int], choice: Choice, processes: int) -> int:
     """Fly seeds in some processes at a time, and print what they break; the exit code."""
     total, rules, codes, waiting = Sum(), Counter[str](), Counter[int | None](), iter(seeds)
     begun = time.monotonic()
@@ -125,14 +142,14 @@ def campaign(seeds: Sequence[int], name: str | None, processes: int) -> int:
     def work(_: int) -> None:
         nursery = Nursery()
         for seed in waiting:
-            for _seed, flight in fly([seed], name, nursery):
+            for _seed, flight in fly([seed], choice, nursery):
                 if isinstance(flight, Flight):
                     total.add(flight)
                     codes[flight.code] += 1
                     rules.update(broken(flight))
                 else:
                     rules["simulator"] += 1
-                if text := failure(seed, name, nursery, flight):
+                if text := failure(seed, choice, nursery, flight):
                     print(text, flush=True)
         nursery.close()
 
@@ -150,14 +167,16 @@ def main() -> int:
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--shrink", action="store_true")
     parser.add_argument("-v", action="store_true", help="all that was seen")
+    parser.add_argument("--kinds", nargs="+", default=(), choices=list(KINDS), help="kinds of faults")
     given = parser.parse_args()
+    choice = Choice(given.of, tuple(given.kinds))
     if given.one is None:
         first, count = given.seeds or (1, 200)
-        return campaign(list(itertools.islice(itertools.count(first), count)), given.of, given.processes)
+        return campaign(list(itertools.islice(itertools.count(first), count)), choice, given.processes)
     nursery = Nursery()
-    flight = nursery.run(request_of(given.one, given.of))
+    flight = nursery.run(choice.request(given.one))
     if given.shrink:
-        print(failure(given.one, given.of, nursery, flight))
+        print(failure(given.one, choice, nursery, flight))
     if given.v:
         print(flight.describe())
     for each in flight.violations:

@@ -23,11 +23,11 @@ class Setting:
     settings: tuple[str, ...] = ()
 
 
-SHORT = ("duration_s=6", "rates.body_hz=50")
+SLOWLY = ("rates.body_hz=50",)
 AVOIDING = ('avoidance.kind="barrier"', 'avoidance.hears="all"', "avoidance.clearance=1.0")
 FIXED = {
-    "triangle": Setting("triangle", "event", SHORT),
-    "triangle-avoiding": Setting("triangle", "periodic", (*SHORT, *AVOIDING)),
+    "triangle": Setting("triangle", "event", SLOWLY),
+    "triangle-avoiding": Setting("triangle", "periodic", (*SLOWLY, *AVOIDING)),
     "mix-event": Setting(MIX, "event"),
     "mix-capture": Setting(MIX, "capture"),
     "mix-centre": Setting(MIX, "centre"),

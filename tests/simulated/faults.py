@@ -226,14 +226,16 @@ SIZES: dict[str, Sequence[Any]] = {
 }  # fmt: skip
 
 
-def draw(seed: int, robots: Sequence[str], captured: Sequence[str], duration_s: float) -> list[Fault]:
+def draw(
+    seed: int, robots: Sequence[str], captured: Sequence[str], duration_s: float, only: Sequence[str] = ()
+) -> list[Fault]:
     """A random script, sorted by time; half of them have few kinds and few victims, which meet more often."""
     rng = random.Random(seed)
     weights = {**WEIGHTS, **({"capture": 5} if captured else {})}
-    names, kinds = list(robots), list(weights)
+    names, kinds = list(robots), [kind for kind in weights if not only or kind in only]
     count = rng.choice(COUNTS)
     if rng.random() < 0.5:
-        kinds, names = rng.sample(kinds, 3), rng.sample(names, min(2, len(names)))
+        kinds, names = rng.sample(kinds, min(3, len(kinds))), rng.sample(names, min(2, len(names)))
     drawn = [_draw_one(rng, kinds, weights, names, captured, duration_s) for _ in range(count)]
     return sorted(drawn, key=lambda fault: fault.at)
 

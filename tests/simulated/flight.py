@@ -89,7 +89,7 @@ def _script(request: Request, file: str) -> list[faults.Fault]:
     plan = plans[request.case or next(iter(plans))]
     robots = plan.experiment.robots
     captured = [name for name, robot in robots.items() if robot.position == "external" and robot.body != "world"]
-    return faults.draw(request.drawn, plan.names, captured, plan.experiment.duration_s)
+    return faults.draw(request.drawn, plan.names, captured, plan.experiment.duration_s, request.kinds)
 
 
 def mutate(mutant: Mutant) -> None:

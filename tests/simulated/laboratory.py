@@ -56,7 +56,8 @@ class Request:
     limit_s: float = LIMIT_S
     words: tuple[str, ...] = ()
     folder: str | None = None
-    drawn: int | None = None
+    drawn: int | None = None  # seed of a random script
+    kinds: tuple[str, ...] = ()  # of its faults; empty: all
 
 
 @dataclass(frozen=True)

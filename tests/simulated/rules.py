@@ -78,7 +78,7 @@ class Look:
     sent: dict[tuple[int, str], int] = field(default_factory=dict)  # poses, by process and robot
     phases: dict[tuple[int, str], int] = field(default_factory=dict)
     ran_s: dict[str, float] = field(default_factory=dict)  # time in the experiment, by robot
-    held_s: dict[str, float] = field(default_factory=dict)
+    held_s: dict[str, float] = field(default_factory=dict)  # and by order of an operator
 
     @property
     def now(self) -> float:
@@ -547,7 +547,7 @@ def no_success_without_all(end: End) -> Iterator[str]:
             continue
         if ran < 0.8 * end.duration_s:
             yield f"{name}: ran for {ran:.1f} of {end.duration_s:g} s"
-        elif held > 0.2 * end.duration_s:
+        elif held > 0.2 * end.duration_s + 3.0 * LOOK_S:
             yield f"{name}: held for {held:.1f} of {end.duration_s:g} s"
 
 
@@ -650,7 +650,7 @@ class Rules:
         assert look.world.plan is not None
         if 0.0 <= look.now - start <= look.world.plan.experiment.duration_s and seen.phase == RUNNING:
             look.ran_s[seen.name] = look.ran_s.get(seen.name, 0.0) + LOOK_S
-            if seen.hazard.startswith("hold"):
+            if seen.hazard.startswith("hold") and "order" in seen.hazard:
                 look.held_s[seen.name] = look.held_s.get(seen.name, 0.0) + LOOK_S
 
     def _use(self, rules: list[Rule], name: str, process: Process) -> None:

@@ -24,12 +24,12 @@ laboratory.close()
 
 
 def failures(seeds: range) -> str:
-    found = (campaign.failure(seed, None, laboratory.nursery(), flight) for seed, flight in fly(seeds))
+    found = (campaign.failure(seed, campaign.ALL, laboratory.nursery(), flight) for seed, flight in fly(seeds))
     return "\n".join(text for text in found if text)
 
 
 def fly(seeds: range):
-    return campaign.fly(seeds, None, laboratory.nursery())
+    return campaign.fly(seeds, campaign.ALL, laboratory.nursery())
 
 
 @pytest.mark.slow
@@ -68,4 +68,6 @@ def test_broken_rule_is_shrunk_to_its_faults():
     flight = laboratory.run(request)
     assert campaign.broken(flight) == {"hold-without-router"}
     assert campaign.shrink(request, flight, laboratory.nursery())[0] == [script[2]]
-    assert "campaign --one 7 -v" in campaign.failure(7, None, laboratory.nursery(), laboratory.SimulatorError("spins"))
+    assert "campaign --one 7 -v" in campaign.failure(
+        7, campaign.ALL, laboratory.nursery(), laboratory.SimulatorError("spins")
+    )
