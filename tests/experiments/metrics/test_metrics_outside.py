@@ -128,7 +128,7 @@ def test_no_metric_changes_what_others_read(short_trace):
 def test_installed_metric_is_a_limit_of_a_search(installed):
     (line,) = re.findall(r"^    \./zenpark (sweep .*--optimise.*)$", GUIDE, re.MULTILINE)
     words = [word for word in shlex.split(line) if not word.startswith(("seeds=", "tuning="))]
-    short = ["seeds=1:2", "tuning=1001:1002", "--set", "duration_s=1", "--processes", "1", "--anyway", "--no-report"]
+    short = ["seeds=1:2", "tuning=1001:1006", "--set", "duration_s=1", "--processes", "1", "--anyway", "--no-report"]
     done = installed[1](*words, *short, "--out", "tuned")
     assert done.returncode == 0, done.stderr
     assert re.search(r"^event threshold=.*: keeps Way ratio <= 1.02$", done.stdout, re.MULTILINE)
