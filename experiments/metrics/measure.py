@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 
 from agents.network.messages import Event
-from agents.safety.hazards import BY_OPERATOR, UNRESOLVED, Cause, failed, is_blind
+from agents.safety.hazards import BY_OPERATOR, OVER, QUIET_S, UNRESOLVED, Cause, failed, is_blind
 from experiments.definition import link_conditions
 from experiments.definition.graph import Links
 from experiments.metrics import centralised
@@ -220,7 +220,7 @@ def _held(trace: Trace) -> list[str]:
     for event in (*trace.events, *last):
         outcome, _, words = event.text.partition(": ")
         if event.kind == "hazard" and event.source in held and words.startswith(Cause.ORDERED.rule.words):
-            at = min(max(event.stamp, 0.0), end)
+            at = min(max(event.stamp - (QUIET_S if outcome == OVER else 0.0), 0.0), end)
             if outcome == "hold":
                 since.setdefault(event.source, at)
             else:

@@ -6,7 +6,7 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from math import nan
+from math import cos, nan, sin
 from typing import Any
 
 from agents.body.interface import Body
@@ -63,6 +63,33 @@ def _still(state: Any, _: float, __: dict[str, Any]) -> None:
     state.flying = False
 
 
+def _tilted(state: Any, angle: float, _: dict[str, Any]) -> None:
+    state.attitude = (cos(0.5 * angle), sin(0.5 * angle), 0.0, 0.0)
+
+
+def _fast(state: Any, speed: float, _: dict[str, Any]) -> None:
+    state.velocity = (speed, 0.0, 0.0)
+
+
+def _sinking(state: Any, size: float, _: dict[str, Any]) -> None:
+    x, y, z = state.position
+    state.position, state.velocity = (x, y, z - size), (0.0, 0.0, -size)
+
+
+def _drifting(state: Any, speed: float, memory: dict[str, Any]) -> None:
+    x, y, z = state.position
+    state.position = (x + speed * (state.time - memory.setdefault("since", state.time)), y, z)
+
+
+def _mute(state: Any, _: float, memory: dict[str, Any]) -> None:
+    """A device that does not answer any more."""
+    state.received = memory.setdefault("received", state.time)
+
+
+def _deaf(*_: object) -> None:
+    """A device that measures and does not obey stops."""
+
+
 READINGS: dict[str, Callable[[Any, float, dict[str, Any]], None]] = {
     "nan": _unknown,
     "jump": _jump,
@@ -71,6 +98,12 @@ READINGS: dict[str, Callable[[Any, float, dict[str, Any]], None]] = {
     "silent": _silent,
     "battery": _charge,
     "motors": _still,
+    "tilt": _tilted,
+    "speed": _fast,
+    "sink": _sinking,
+    "drift": _drifting,
+    "mute": _mute,
+    "deaf": _deaf,
 }
 
 
@@ -122,7 +155,8 @@ class WatchedBody(Body):
         self.body.land(rows)
 
     def stop(self, rows: Sequence[int]) -> None:
-        self.body.stop(rows)
+        readings = current().readings
+        self.body.stop([row for row in rows if readings.get(self.names[row], ("",))[0] != "deaf"])
         self._note_motors()
 
     def _note_motors(self) -> None:

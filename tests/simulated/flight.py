@@ -141,6 +141,10 @@ def _collect(seen: world.World, checked: rules.Rules, request: Request, folder: 
     robots = {name: laboratory.Track() for name in (seen.plan.names if seen.plan is not None else ())}
     for t, name, pid, phase, reason in seen.phases:
         robots[name].phases.append(laboratory.Phase(since(t), Phase(phase).word, reason, pid))
+    for t, name, text in seen.hazards:
+        robots[name].hazards.append((since(t), text))
+    for t, name, missing in seen.missing:
+        robots[name].missing.append((since(t), missing))
     for t, name, on in seen.motors:
         robots[name].motors.append((since(t), on))
     for name, samples in seen.samples.items():

@@ -254,6 +254,7 @@ class Process:
         wall: Error of its wall clock [s].
         drift: Error of the rate of its clocks [s/s].
         late: Mean lateness of its threads [s].
+        stall: By which its next sleep lasts longer [s].
         started, paused_at, resumed_at: Times of the last such event [s].
     """
 
@@ -267,7 +268,7 @@ class Process:
         self.sessions: list[Any] = []
         self.ended = Waiters()
         self.handlers: dict[int, Any] = {}
-        self.wall, self.drift, self.late = 0.0, 0.0, LATE_S
+        self.wall, self.drift, self.late, self.stall = 0.0, 0.0, LATE_S, 0.0
         self.stdin, self.eof, self.readers = bytearray(), False, Waiters()
         self.started, self.paused_at, self.resumed_at = kernel.now, -inf, -inf
         kernel.processes.append(self)
@@ -372,6 +373,10 @@ def wall() -> float:
 
 def sleep(seconds: float) -> None:
     _wait(seconds, late=True)
+    process = current().process
+    if process is not None and process.stall:
+        stall, process.stall = process.stall, 0.0
+        block(stall)
 
 
 class Event:

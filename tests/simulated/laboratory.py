@@ -127,6 +127,8 @@ class Track:
     """What one robot did, in all of its processes."""
 
     phases: list[Phase] = field(default_factory=list)
+    hazards: list[tuple[float, str]] = field(default_factory=list)  # begins, changes and ends
+    missing: list[tuple[float, tuple[str, ...]]] = field(default_factory=list)  # neighbours, as the conductor learns it
     motors: list[tuple[float, bool]] = field(default_factory=list)  # times of changes
     samples: list[Sample] = field(default_factory=list)  # every 50 ms
     commands: list[tuple[float, int]] = field(default_factory=list)  # to the body: time, and process

@@ -650,7 +650,8 @@ class Rules:
         assert look.world.plan is not None
         if 0.0 <= look.now - start <= look.world.plan.experiment.duration_s and seen.phase == RUNNING:
             look.ran_s[seen.name] = look.ran_s.get(seen.name, 0.0) + LOOK_S
-            if seen.hazard.startswith("hold") and "order" in seen.hazard:
+            ordered = seen.hazard.startswith("hold") and "order" in seen.hazard
+            if ordered and seen.robot.hazards.held:  # a hold that is over is told for a second longer
                 look.held_s[seen.name] = look.held_s.get(seen.name, 0.0) + LOOK_S
 
     def _use(self, rules: list[Rule], name: str, process: Process) -> None:

@@ -26,6 +26,7 @@ from agents.network import messages, pubsub
 from agents.network import session as network_session
 from agents.plugins import calls
 from agents.runtime import command_line, lifeline, loop, telemetry
+from agents.safety.hazards import Hazards
 from experiments.check import kept
 from experiments.real_time.conductor import conduct, orders, run_view
 from experiments.real_time.conductor import conductor as conducting
@@ -129,9 +130,11 @@ def _watch_product() -> None:
     )
     _wrap(loop.Runtime, "__init__", after=_note_runtime)
     _wrap(loop.Runtime, "tick", after=_note_phases)
+    _wrap(Hazards, "_record", before=_count_hazards, after=_note_hazards)
     _wrap(loop.Runtime, "_send_pose", before=_note_pose)
     _wrap(world_population.WorldBodies, "__init__", after=_note_population)
     _wrap(conducting.CaseRun, "__init__", after=_note_case)
+    _wrap(run_view.NetworkView, "receive_status", after=_note_status)
     _wrap(run_view.NetworkView, "report", after=_note_event)
     lines = shown_progress.Lines.__call__
 
@@ -186,6 +189,21 @@ def _note_phases(runtime: loop.Runtime, *_: object, **__: object) -> None:
             known[row] = phase
             name, pid, reason = runtime._names[row], sim.current().process.pid, robot.lifecycle.reason
             current().phases.append((current().now, name, pid, phase, reason))
+
+
+def _count_hazards(hazards: Hazards, *_: object) -> None:
+    hazards.__dict__["_noted"] = len(hazards.incidents)
+
+
+def _note_hazards(hazards: Hazards, *_: object) -> None:
+    robots = (robot for runtime in current().runtimes.values() for robot in runtime.robots)
+    name = next(robot.assignment.name for robot in robots if robot.hazards is hazards)
+    news = hazards.incidents[hazards.__dict__["_noted"] :]
+    current().hazards.extend((current().now, name, each.text) for each in news)
+
+
+def _note_status(_: run_view.NetworkView, status: messages.Status) -> None:
+    current().missing.append((current().now, status.robot, tuple(status.missing)))
 
 
 def _note_pose(runtime: loop.Runtime, row: int, *_: object, **__: object) -> None:

@@ -73,6 +73,8 @@ class World:
         self.notes: list[tuple[float, str]] = []
         self.events: list[messages.Event] = []
         self.phases: list[tuple[float, str, int, int, str]] = []  # time, robot, process, phase, reason
+        self.hazards: list[tuple[float, str, str]] = []  # time, robot, text
+        self.missing: list[tuple[float, str, tuple[str, ...]]] = []  # neighbours, by statuses
         self.commands: list[tuple[float, str, int]] = []
         self.poses: list[tuple[float, str, int]] = []
         self.motors: list[tuple[float, str, bool]] = []  # changes
@@ -195,9 +197,8 @@ class World:
             sim.current().at(self.now, _raise_in, process.main, error)
 
     def hang(self, process: sim.Process, seconds: float) -> None:
-        """Let the next sleep of a loop take so much longer."""
-        before, process.late = process.late, seconds
-        self.after(0.02, lambda: setattr(process, "late", before))
+        """Let the next sleep of a process, which is that of its loop, take so much longer."""
+        process.stall = seconds
 
     def started(self, process: sim.Process, module: str, words: Sequence[str]) -> None:
         """Note a process that the launcher has started."""

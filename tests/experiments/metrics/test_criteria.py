@@ -9,6 +9,7 @@ import pytest
 from msgspec.structs import replace
 
 from agents.network.messages import Event
+from agents.safety.hazards import QUIET_S
 from experiments.catalogue import index
 from experiments.definition.experiment import JUDGED, Criterion
 from experiments.file.document import loads, write_json
@@ -169,7 +170,7 @@ def test_what_spoils_a_run(live_trace, columns, event, reason):
 
 def held(*ends):
     words = ("hold: ordered to hold: by an operator", "over: ordered to hold, after 1 s")
-    return [Event(at, "hazard", "CF01", words[k % 2]) for k, at in enumerate(ends)]
+    return [Event(at + k % 2 * QUIET_S, "hazard", "CF01", words[k % 2]) for k, at in enumerate(ends)]
 
 
 def given(*times):
@@ -184,7 +185,7 @@ def changed_by(who, word="remove"):
     ("events", "spoiled"),
     [
         (held(1.0, 1.7), None),
-        (held(1.0, 1.5, 2.0, 2.5), "CF01 was held by an operator for 1.0 of 4 s"),
+        (held(0.5, 1.0, 2.5, 3.0), "CF01 was held by an operator for 1.0 of 4 s"),
         (held(3.0), "CF01 was held by an operator for 1.0 of 4 s"),
         (held(3.5), None),
         (held(-3.0, -0.5), None),

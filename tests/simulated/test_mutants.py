@@ -1,0 +1,138 @@
+"""Defects that are put into the product: each breaks the script that is written for its sentence."""
+
+from functools import partial
+
+import pytest
+
+from tests.simulated import laboratory, test_changes, test_hosts, test_runs, test_safety
+from tests.simulated.laboratory import Mutant
+
+RUNTIME, CONDUCTOR = "agents/runtime/", "experiments/real_time/conductor/"
+LOOP, WATCHDOG, HOT = f"{RUNTIME}loop.py", f"{RUNTIME}watchdog.py", f"{CONDUCTOR}hot_changes.py"
+OWNERSHIP, MEASURE = "agents/network/name_ownership.py", "experiments/metrics/measure.py"
+HAZARDS, DETECTION = "agents/safety/hazards.py", "agents/safety/detection.py"
+
+
+def row(name):
+    """Script of one row of the hazards."""
+    long = name in test_safety.LONG_ROWS
+    rows = test_safety.LONG_ROWS if long else test_safety.ROWS
+    found = test_safety.fly_rows({name: rows[name]}, 12.5 if long else 4.0)
+    test_safety.check_row(name, found[name])
+
+
+def run(name):
+    return partial(test_runs.test_exit_code, name)
+
+
+# file, what stands there, what the mutant has instead, script
+MUTANTS = {
+    "owner not asked after a cut": (
+        f"{RUNTIME}descent.py", "if ownership.check_return(session) or stood:", "if False:",
+        test_safety.test_former_owner_commands_nothing,
+    ),
+    "stop left to the loop": (
+        LOOP, "        if self._opened:\n            self._body.stop", "        if False:\n            self._body.stop",
+        test_safety.test_emergency_stop_ends_the_run,
+    ),
+    "silent router unseen": (
+        "agents/network/session.py", "> ANSWER_S and self._silent_since", "> 99.0 and self._silent_since",
+        partial(row, "cut_shortly"),
+    ),
+    "vanished token not forgotten": (
+        f"{RUNTIME}pose_inbox.py", "self.alive = there\n", "self.alive = self.alive or there\n",
+        test_changes.test_killed_robot_is_restarted_and_takes_part,
+    ),
+    "end of the lifeline ignored": (
+        f"{RUNTIME}lifeline.py", "        self._lost.set()", "        pass",
+        test_hosts.test_killed_launcher_leaves_nobody_aloft,
+    ),
+    "ordered landing fails no run": (
+        f"{CONDUCTOR}conductor.py", ".startswith((LAND, STOP)):", ".startswith('nothing'):", run("landed"),
+    ),
+    "second claim wins": (
+        OWNERSHIP, "while others := rivals(owners=True):", "while others := []:",
+        test_safety.test_second_process_ends_without_a_command,
+    ),
+    "loss of a neighbour not noted": (
+        DETECTION, "if status.cruising and is_lost(", "if False and is_lost(",
+        test_safety.test_lost_neighbour_is_left_out_after_a_second,
+    ),
+    "twice the time to land": (
+        f"{CONDUCTOR}conductor.py", "time.monotonic() + LAND_S, -inf", "time.monotonic() + 2.0 * LAND_S, -inf",
+        test_hosts.test_frozen_robot_is_ordered_down_then_killed,
+    ),
+    "hold not lifted": (
+        "agents/robot.py", "        self._ordered = False\n        if self.lifecycle.reason == PAUSED:",
+        "        if self.lifecycle.reason == PAUSED:", test_safety.test_robot_that_was_ordered_to_hold_holds,
+    ),
+    "parts of a recording not joined": (
+        f"{CONDUCTOR}case_processes.py", "if len(self._parts) < 2:", "if len(self._parts) < 9:",
+        test_runs.test_recorder_that_hangs_is_replaced,
+    ),
+    "start apart by less than a second": (
+        f"{CONDUCTOR}conductor.py", "if abs(off) > TARDY_S:", "if abs(off) > LATE_S:", run("early"),
+    ),
+    "removed robot is no matter": (MEASURE, "*_taken_out(trace).values(),", "", run("removed")),
+    "no word of a wrong clock": (
+        f"{CONDUCTOR}conductor.py", "if not view.gone and view.clock_off:", "if not view:",
+        partial(test_hosts.test_clock_of_another_machine, "behind"),
+    ),
+    "spare does not take part": (
+        HOT, "            self._spares.used[spare] = name\n        yield from self._join(names)",
+        "            self._spares.used[spare] = name\n        yield",
+        test_changes.test_spare_takes_over_the_name_of_a_frozen_robot,
+    ),
+    "removal leaves the token": (
+        LOOP, "                self.keeper.withdraw((row,))", "                pass",
+        test_changes.test_removed_drone_leaves_formation_before_it_is_down,
+    ),
+    "restart begins at 0": (
+        HOT, 'order = messages.Order("takeoff", at=self._start, origin',
+        'order = messages.Order("takeoff", at=self._view.clock.utc(), origin',
+        test_changes.test_killed_robot_is_restarted_and_takes_part,
+    ),
+    "watchdog that does not land": (
+        WATCHDOG, 'self._call_in_thread("land", lambda: self._body.land(self._rows))', "pass",
+        test_safety.test_hanging_loop_is_landed_then_cut,
+    ),
+    "watchdog that does not end": (
+        WATCHDOG, "if looked - hung > self.down_s:", "if False:", test_safety.test_hanging_loop_is_landed_then_cut,
+    ),
+    "twice the time without router": (
+        HAZARDS, '"then_s": limits.offline_s}', '"then_s": 2.0 * limits.offline_s}', partial(row, "cut_off"),
+    ),
+    "twice the time without position": (
+        HAZARDS, '{"then_s": limits.land_without_position_s if', '{"then_s": 2.0 * limits.land_without_position_s if',
+        partial(row, "blind"),
+    ),
+    "jump believed": (
+        "agents/safety/positions.py", "        return gap if self.jumped else nan", "        return nan",
+        partial(row, "jump"),
+    ),
+    "stop not passed on to lifelines": (
+        f"{CONDUCTOR}orders.py", "            self.launcher.stop(stop)", "            pass",
+        test_safety.test_stop_without_router_goes_by_lifelines,
+    ),
+    "thawed launcher goes on": (
+        f"{CONDUCTOR}run_view.py", "if self._launcher.last_silence > self._begun:", "if False:",
+        test_hosts.test_frozen_launcher_lands_all_and_gives_no_order,
+    ),
+    "broken recording is no matter": (
+        MEASURE, "if ended_early(trace) and not", "if False and not", run("recorder_hangs_at_the_end"),
+    ),
+    "long hold is no matter": (MEASURE, "if total > HELD * end}", "if total > end}", run("held")),
+    "suspension unnoticed": (
+        LOOP, "if missed * self._dt > self._setup.loop_timeout_s:", "if missed * self._dt > 99.0:",
+        test_safety.test_suspended_robot_holds_until_it_hears,
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", MUTANTS)
+def test_script_finds_the_mutant(name, monkeypatch):
+    file, old, new, script = MUTANTS[name]
+    for module in (test_changes, test_hosts, test_runs, test_safety):
+        monkeypatch.setattr(module, "fly", partial(laboratory.fly, mutant=Mutant(file, old, new)))
+    with pytest.raises((AssertionError, ValueError, IndexError, StopIteration)):
+        script()

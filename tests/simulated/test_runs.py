@@ -1,0 +1,95 @@
+"""Exit codes of `./zenpark run`, as docs/runs.md has them, with the recording that is left."""
+
+from dataclasses import dataclass, field
+from math import inf
+
+import pytest
+
+from tests.simulated.faults import Fault
+from tests.simulated.laboratory import fly
+from tests.simulated.small import DRONE, PAIR, TRIO
+
+QUICK = ("rates.body_hz=50",)
+NEVER = 'robots.B.position="external"'
+ABSENT = Fault(0.0, "capture", "B", "gone", since="launch")
+GO_ON = (NEVER, 'start.missing="go-on"', "start.deadline_s=2")
+
+
+@dataclass(frozen=True)
+class Run:
+    """Faults of a run, its exit code, and a part of what it says."""
+
+    code: int
+    said: str = ""
+    faults: tuple[Fault, ...] = ()
+    settings: tuple[str, ...] = ()
+    clocks: dict[str, float] = field(default_factory=dict)
+    experiment: str = PAIR
+
+
+def order(at, words, who="B", **more):
+    return (Fault(at, "order", who, words, **more),)
+
+
+def blind(at, lasts):
+    return (Fault(at, "body", "B", "nan", lasts),)
+
+
+def frozen(who, lasts=inf):
+    return (Fault(1.0, "pause", who, lasts=lasts),)
+
+
+ROWS = {
+    "undisturbed": Run(0),
+    "shortly_held": Run(0, faults=(*order(1.0, "hold"), *order(1.3, "resume"))),
+    "killed": Run(1, "B at 1.0 s: was lost: its process ended (killed by SIGKILL)", (Fault(1.0, "kill", "B"),)),
+    "blind_at_the_end": Run(
+        1, "B at 2.7 s: its own position is lost: none, until the end", (Fault(2.6, "body", "B", "nan"),)
+    ),
+    "blind_for_a_fifth": Run(
+        1, "B: its position was known for 78% of the time only", (Fault(1.0, "body", "B", "nan", 0.7),)
+    ),
+    "shortly_blind": Run(3, "too little is known of B", (Fault(1.0, "body", "B", "nan", 0.3),)),
+    "fell": Run(1, "C at 1.0 s: land: it came down by itself", (Fault(1.0, "body", "C", "motors"),), experiment=DRONE),
+    "landed": Run(1, "B landed after 1.0 of 3 s: ordered to land by an operator", order(1.0, "land")),
+    "stopped": Run(1, "B landed after 1.0 of 3 s: ordered to stop by an operator", order(1.0, "stop")),
+    "all_landed": Run(1, "landed after 1.0 of 3 s", (*order(1.0, "land"), *order(1.0, "land", "A"))),
+    "left_out": Run(1, "B at 0.0 s: takes no part: it is not ready: no position of its own", (ABSENT,), GO_ON),
+    "not_ready": Run(2, "A, B: not ready after 2 s; nothing has moved", (ABSENT,), (NEVER, "start.deadline_s=2")),
+    "early_by_seconds": Run(1, "before the common start", order(0.2, "start", "A", since="ready"), experiment=DRONE),
+    "early": Run(3, "did not begin together", order(-0.2, "start")),
+    "clock_slow": Run(0, clocks={"B": -0.09}),
+    "clock_slower": Run(3, "did not begin together", clocks={"B": -0.2}),
+    "emergency": Run(1, "emergency stop by operator: zenpark estop", (Fault(1.0, "estop"),)),
+    "held": Run(3, "B was held by an operator for 0.7 of 3 s", (*order(1.0, "hold"), *order(1.7, "resume"))),
+    "removed": Run(3, "B was removed by an operator at 1.1 s", order(1.0, "remove"), experiment=TRIO),
+    "restarted": Run(3, "B was restarted by an operator at 1.1 s", order(1.0, "restart")),
+    "replaced": Run(3, "B was replaced by an operator at 1.1 s", order(1.0, "replace --body twin")),
+    "interrupted": Run(130, "Interrupted after 1.0 s of 3 s", (Fault(1.0, "interrupt"),)),
+    "recorder_killed": Run(1, "the recorder ended (killed by SIGKILL)", (Fault(1.0, "kill", "recorder"),)),
+    "recorder_hangs_to_the_end": Run(
+        1, "the recording breaks off after", (Fault(1.0, "pause", "recorder", lasts=inf),)
+    ),
+    "disk_full": Run(1, "cannot be written: No space left", (Fault(1.0, "disk", "recorder", "full"),)),
+    "stood_still": Run(2, "this process stood still for more than 3 s", frozen("conductor", 5.0)),
+    "unknown_key": Run(2, "durations", settings=("durations=3",)),
+}
+
+
+@pytest.mark.parametrize("name", ROWS)
+def test_exit_code(name):
+    run = ROWS[name]
+    flight = fly(run.experiment, *run.faults, clocks=run.clocks, settings=[*QUICK, *run.settings])
+    assert flight.code == run.code, flight.describe()
+    assert run.said in flight.output, flight.output
+    assert (flight.crashes, flight.violations) == ([], [])
+    assert (flight.metrics is None) == (flight.started is None or run.said.startswith("this process stood"))
+
+
+def test_recorder_that_hangs_is_replaced():
+    flight = fly(PAIR, *frozen("recorder"), settings=[*QUICK, "duration_s=7"])
+    (killed, _) = flight.of("default-recorder")
+    assert 1.0 + 4.4 < killed.ended < 1.0 + 5.1
+    assert killed.code == -9
+    assert (flight.code, flight.violations) == (1, [])
+    assert not [file for file in flight.files if "part2" in file]

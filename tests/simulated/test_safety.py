@@ -1,0 +1,202 @@
+"""What docs/safety.md promises of robots, by the exact clock of the simulated laboratory."""
+
+from dataclasses import replace
+from math import inf
+
+import pytest
+
+from tests.simulated.faults import Fault
+from tests.simulated.laboratory import fly
+from tests.simulated.small import AT_S, DRONE, TICK_S, TRIO, body, hall
+
+FLIER, WHEELS = "crazyflie", "khepera4"
+LOST = "its own position is lost"
+SILENT = "no connection to a router"
+SOON_S = 2.5 * TICK_S  # the robot reads its body, decides and tells
+HEARD_S = 0.1  # of an event, with the look of the conductor every 0.05 s
+
+
+def at(since, *texts):
+    """Changes of a hazard, each not before a time since the fault [s], and then at once."""
+    return [
+        (since + later, since + later + SOON_S, text) for later, text in zip((0.0, *[0.0] * 9), texts, strict=False)
+    ]
+
+
+# kind, fault, and hazards of the robot: earliest and latest time since the fault [s], and how the text begins
+ROWS = {
+    "flies_away": (FLIER, body(("drift", 2.0)), [
+        (0.08, 0.2, "warn: it is beyond a wall"), (0.2, 0.3, "land: it left the arena: 0.2"),
+        (0.55, 0.65, "cut: it flies away"), (1.1, 1.3, "over: it is beyond a wall"),
+    ]),
+    "blind": (FLIER, body("nan"), [*at(0.0, f"hold: {LOST}: none"), *at(0.3, f"land: {LOST}")]),
+    "stale": (FLIER, body("silent"), [*at(0.5, f"hold: {LOST}: the last is 0.5"), *at(0.8, f"land: {LOST}")]),
+    "jump": (FLIER, body(("jump", 1.0)), [*at(0.0, f"hold: {LOST}: it jumped by 1.0"), *at(0.3, f"land: {LOST}")]),
+    "far_jump": (FLIER, body(("jump", 30.0)), [*at(0.0, f"hold: {LOST}: it jumped"), *at(0.3, f"land: {LOST}")]),
+    "outlier": (FLIER, body(("jump", 1.0), 0.25), [*at(0.0, f"hold: {LOST}"), *at(1.23, f"over: {LOST}")]),
+    "blind_wheels": (WHEELS, body("nan", 2.0), [*at(0.0, f"hold: {LOST}: none"), *at(2.98, f"over: {LOST}")]),
+    "tilt": (FLIER, body(("tilt", 1.3)), at(0.1, "cut: it has tipped over: it leans 74°")),
+    "overspeed": (FLIER, body(("speed", 9.0)), [*at(0.2, "hold: it moves faster"), *at(1.0, "land: it moves faster")]),
+    "battery": (FLIER, body(("battery", 0.05)), at(1.0, "land: its battery is low: 5%")),
+    "sagging": (FLIER, body(("battery", 0.05), 0.9), []),
+    "motors": (FLIER, body("motors"), at(0.0, "land: it came down by itself: its motors are off")),
+    "sinking": (FLIER, body(("sink", 0.2)), at(0.1, "land: it comes down by itself: 0.20 m below")),
+    "straying": (FLIER, body(("drift", 0.5)), [(1.3, 1.6, "land: it moves without a command")]),
+    "mute": (FLIER, body("mute"), [*at(1.0, "warn: its device does not answer"), (3.9, inf, "unresolved at the end")]),
+    "stuck_wheels": (WHEELS, body("stuck"), [
+        (2.2, 2.45, "warn: it does not obey commands to move"), (4.2, 4.45, "land: it does not obey commands to move"),
+    ]),
+}  # fmt: skip
+DRIVE = """
+[[timeline]]
+at_s = 0.5
+robot = "stuck_wheels"
+plan = { kind = "line", move_by = [0.0, 2.0], speed = 0.7 }
+"""
+LONG_ROWS = {
+    "cut_off": (FLIER, Fault(AT_S, "cut", lasts=14.0), [
+        (1.3, 1.8, f"hold: {SILENT}"), (10.3, 10.8, f"land: {SILENT}"),
+    ]),
+    "cut_wheels": (WHEELS, Fault(AT_S, "cut", lasts=14.0), [
+        (1.3, 1.8, f"hold: {SILENT}"), (10.3, 10.8, f"land: {SILENT}"),
+    ]),
+    "cut_shortly": (FLIER, Fault(AT_S, "cut", lasts=2.5), [
+        (1.3, 1.8, f"hold: {SILENT}"), (2.5, 4.6, f"over: {SILENT}"),
+    ]),
+    "hardly_cut": (FLIER, Fault(AT_S, "cut", lasts=0.9), []),
+}  # fmt: skip
+
+
+def fly_rows(rows, duration_s, end=""):
+    """Hazards of the robots of some rows, in seconds after the fault of each row."""
+    faults = [replace(fault, who=name) for name, (_, fault, _) in rows.items()]
+    flight = fly(hall({name: kind for name, (kind, *_) in rows.items()}, duration_s, end), *faults)
+    assert flight.crashes == []
+    assert all(flight.robots[name].off() < duration_s + 2.5 for name, (kind, *_) in rows.items() if kind == FLIER)
+    return {name: [(t - AT_S, text) for t, text in flight.robots[name].hazards] for name in rows}
+
+
+def check_row(name, found):
+    expected = {**ROWS, **LONG_ROWS}[name][-1]
+    assert len(found) == len(expected), found
+    for (earliest, latest, begin), (t, text) in zip(expected, found, strict=True):
+        assert text.startswith(begin)
+        assert earliest - 1e-6 <= t <= latest, text
+
+
+@pytest.fixture(scope="module")
+def hazards():
+    return fly_rows(ROWS, 5.6, DRIVE) | fly_rows(LONG_ROWS, 12.5)
+
+
+@pytest.mark.parametrize("name", [*ROWS, *LONG_ROWS])
+def test_hazard_of_one_robot(name, hazards):
+    check_row(name, hazards[name])
+
+
+def test_lost_neighbour_is_left_out_after_a_second():
+    killed, frozen = AT_S, 2.505
+    flight = fly(TRIO, Fault(killed, "kill", "C"), Fault(frozen, "pause", "B", lasts=9.0), settings=["duration_s=6"])
+    robot = flight.robots["A"]
+    t = next(t for t, missing in robot.missing if t > 0.0 and "C" in missing)
+    assert killed < t < killed + 0.1 + HEARD_S
+    t = next(t for t, missing in robot.missing if t > 0.0 and "B" in missing)
+    assert frozen + 1.2 - 0.6 < t < frozen + 1.5
+    warned, alone = [
+        each for each in robot.hazards if each[1].startswith(("warn: a neighbour is lost: C", "hold: all"))
+    ]
+    assert warned[0] == pytest.approx(killed + 1.0, abs=SOON_S)
+    assert alone[0] == pytest.approx(t + 1.0, abs=HEARD_S)
+
+
+def test_suspended_robot_holds_until_it_hears():
+    shortly, long_s = Fault(AT_S, "pause", "A", lasts=0.45), Fault(AT_S, "pause", "B", lasts=0.7)
+    flight = fly(TRIO, shortly, long_s)
+    assert not [text for _, text in flight.robots["A"].hazards if "stood still" in text]
+    (t, hold), (over, end) = [each for each in flight.robots["B"].hazards if "stood still" in each[1]]
+    assert hold.startswith("hold: its process stood still: for 0.")
+    assert AT_S + 0.7 <= t < AT_S + 0.7 + 0.25, "it asks for the owner of its name first"
+    assert t < over < t + 1.0 + 1.0 + SOON_S
+    assert end.startswith("over: ")
+
+
+def test_second_process_ends_without_a_command():
+    flight = fly(TRIO, Fault(AT_S, "twice", "A"), settings=["duration_s=5"])
+    (second,) = flight.of("second A")
+    assert second.code == 2
+    assert "a robot of this name is on the network already" in second.output
+    assert second.pid not in {pid for _, pid in (*flight.robots["A"].commands, *flight.robots["A"].poses)}
+    assert (flight.code, flight.robots["A"].hazards) == (0, [])
+
+
+def test_former_owner_commands_nothing():
+    back = 3.5
+    flight = fly(TRIO, Fault(0.5, "cut", "A", lasts=back - 0.5), Fault(1.9, "twice", "A"), settings=["duration_s=7"])
+    robot, former, (second,) = flight.robots["A"], flight.of("default-A")[0], flight.of("second A")
+    assert [t for t, pid in robot.poses if pid == second.pid]
+    late = [t for t, pid in (*robot.poses, *robot.commands) if pid == former.pid and t > back + TICK_S]
+    assert late == []
+    assert former.code == 2
+    assert back + 2.5 <= former.ended < back + 2.5 + 0.5
+
+
+def test_hanging_loop_is_landed_then_cut():
+    flight = fly(DRONE, Fault(AT_S, "hang", "C", 100.0), settings=["duration_s=14", "arena.size=[4.0, 4.0, 2.5]"])
+    (process,) = flight.of("default-C")
+    (told,) = flight.happened("hazard", "C")
+    assert told.text.startswith("land: its control loop hangs: no tick for 0.")
+    assert AT_S + 0.5 < told.t < AT_S + 0.7 + HEARD_S
+    assert AT_S + 0.5 <= next(t for t, _ in flight.robots["C"].commands if t > AT_S + 0.1) < AT_S + 0.7
+    assert flight.robots["A"].missing[-1][1] == ("C",)
+    assert AT_S + 0.5 + 12.5 < process.ended < AT_S + 0.7 + 12.5 + 1.0  # 2.5 m at 0.2 m/s
+    assert process.code == 70
+    assert flight.robots["C"].off(after=process.ended) == process.ended
+
+
+CASES = '\n[cases]\nfirst.trigger = "periodic"\nsecond.trigger = "periodic"\n'
+
+
+def test_emergency_stop_ends_the_run():
+    flight = fly(DRONE + CASES, Fault(AT_S, "estop"))
+    assert flight.robots["C"].off(after=AT_S) < AT_S + 0.005, "in the receiving thread, before the next tick"
+    assert flight.code == 1
+    assert "zenpark: emergency stop by operator: zenpark estop" in flight.output
+    assert not [each for each in flight.processes if each.name.startswith("second-")]
+
+
+def test_stop_without_router_goes_by_lifelines():
+    asleep = 3.505
+    stood = Fault(1.0, "pause", "router", lasts=20.0), Fault(1.2, "pause", "A", lasts=asleep - 1.2)
+    flight = fly(DRONE, *stood, Fault(1.505, "estop"), settings=["duration_s=6"])
+    assert flight.robots["C"].off(after=1.505) < 1.505 + 0.1
+    done = flight.robots["A"].entered("done")[0]
+    assert asleep < done < asleep + 0.5 + 0.2
+    assert [phase.reason for phase in flight.robots["A"].phases][-1].startswith("emergency stop")
+    assert flight.code == 1
+
+
+def test_stop_that_no_body_obeys_is_told():
+    flight = fly(DRONE, Fault(0.0, "body", "C", "deaf"), Fault(AT_S, "estop"), settings=["rates.body_hz=50"])
+    (answer,) = flight.answers
+    assert answer.code == 1
+    assert "NOT known to have stopped: C" in answer.output
+    (lost,) = flight.happened("lost", "C", "did not end its landing within 15 s")
+    (process,) = flight.of("default-C")
+    assert process.ended == pytest.approx(lost.t + 5.0, abs=0.2)
+    assert flight.code == 1
+
+
+def test_robot_that_was_ordered_to_hold_holds():
+    flight = fly(
+        DRONE, Fault(-0.3, "order", "A", "hold"), Fault(AT_S, "order", "C", "hold"), Fault(2.0, "order", "A", "start"),
+        Fault(2.5, "order", "C", "resume"), settings=["duration_s=4"],
+    )  # fmt: skip
+    (held, _), (over, _) = flight.robots["A"].hazards
+    assert held < 0.1, "the common start ends no hold"
+    assert 2.0 < over < 2.0 + 1.0 + HEARD_S
+    (held, text), (over, _) = flight.robots["C"].hazards
+    assert text == "hold: ordered: by an operator"
+    assert AT_S < held < AT_S + HEARD_S
+    place = flight.robots["C"].at(held + 0.5).position
+    assert flight.robots["C"].at(2.5).position == pytest.approx(place, abs=0.03)
+    assert 2.5 < over < 2.5 + 1.0 + HEARD_S
