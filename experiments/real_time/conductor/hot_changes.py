@@ -84,12 +84,13 @@ class HotChanges:
         self._start = start
 
     def close(self) -> None:
-        """Accept no more orders and give up changes under way: all land."""
-        self._start = None
+        """Accept no more orders and give up changes under way: all land. The end of a robot that leaves is no loss."""
+        self._start, leaving = None, {*self._leaving}
         for change in self._changes:
             change.steps.close()
             self._answer(change, refused="the run is over")
         self._changes.clear()
+        self._leaving = leaving
         self._reply_to_finished()
 
     def expects(self, name: str, how: str) -> bool:
