@@ -42,6 +42,7 @@ def test_killed_robot_is_restarted_and_takes_part():
     assert [phase.phase for phase in robot.phases if phase.pid == second.pid][-3:] == ["running", "landing", "done"]
     assert robot.entered("landing")[-1] == pytest.approx(3.0, abs=0.03), "its time is that of the others"
     assert any(t > 2.0 for t, pid in robot.poses if pid == second.pid)
+    assert "a tool sends poses" not in str(flight.robots["A"].hazards), "they are those of the new process"
     assert misses(flight) == set()
     assert (flight.code, flight.violations) == (1, [])
 

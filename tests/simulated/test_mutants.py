@@ -7,6 +7,7 @@ import pytest
 from tests.simulated import laboratory, test_changes, test_hosts, test_runs, test_safety
 from tests.simulated.laboratory import Mutant
 
+LIMIT_S = 45.0  # longest flight of a script, and twice the time to land
 RUNTIME, CONDUCTOR = "agents/runtime/", "experiments/real_time/conductor/"
 LOOP, WATCHDOG, HOT = f"{RUNTIME}loop.py", f"{RUNTIME}watchdog.py", f"{CONDUCTOR}hot_changes.py"
 OWNERSHIP, MEASURE = "agents/network/name_ownership.py", "experiments/metrics/measure.py"
@@ -40,7 +41,7 @@ MUTANTS = {
         partial(row, "cut_shortly"),
     ),
     "vanished token not forgotten": (
-        f"{RUNTIME}pose_inbox.py", "self.alive = there\n", "self.alive = self.alive or there\n",
+        f"{RUNTIME}pose_order.py", "+ ([session] if there else [])", "+ [session]",
         test_changes.test_killed_robot_is_restarted_and_takes_part,
     ),
     "end of the lifeline ignored": (
@@ -51,7 +52,7 @@ MUTANTS = {
         f"{CONDUCTOR}conductor.py", ".startswith((LAND, STOP)):", ".startswith('nothing'):", run("landed"),
     ),
     "second claim wins": (
-        OWNERSHIP, "while others := rivals(owners=True):", "while others := []:",
+        OWNERSHIP, "return other < rank if other is not None else owners and", "return False and",
         test_safety.test_second_process_ends_without_a_command,
     ),
     "loss of a neighbour not noted": (
@@ -88,8 +89,7 @@ MUTANTS = {
         test_changes.test_removed_drone_leaves_formation_before_it_is_down,
     ),
     "restart begins at 0": (
-        HOT, 'order = messages.Order("takeoff", at=self._start, origin',
-        'order = messages.Order("takeoff", at=self._view.clock.utc(), origin',
+        HOT, 'messages.Order("start", at=self._start', 'messages.Order("start", at=self._view.clock.utc()',
         test_changes.test_killed_robot_is_restarted_and_takes_part,
     ),
     "watchdog that does not land": (
@@ -103,7 +103,7 @@ MUTANTS = {
         HAZARDS, '"then_s": limits.offline_s}', '"then_s": 2.0 * limits.offline_s}', partial(row, "cut_off"),
     ),
     "twice the time without position": (
-        HAZARDS, '{"then_s": limits.land_without_position_s if', '{"then_s": 2.0 * limits.land_without_position_s if',
+        HAZARDS, "if limits.hold_s is None else limits.hold_s}", "if False else 0.6}",
         partial(row, "blind"),
     ),
     "jump believed": (
@@ -119,7 +119,7 @@ MUTANTS = {
         test_hosts.test_frozen_launcher_lands_all_and_gives_no_order,
     ),
     "broken recording is no matter": (
-        MEASURE, "if ended_early(trace) and not", "if False and not", run("recorder_hangs_at_the_end"),
+        MEASURE, "if ended_early(trace) and not", "if False and not", run("recorder_hangs_to_the_end"),
     ),
     "long hold is no matter": (MEASURE, "if total > HELD * end}", "if total > end}", run("held")),
     "suspension unnoticed": (
@@ -133,6 +133,6 @@ MUTANTS = {
 def test_script_finds_the_mutant(name, monkeypatch):
     file, old, new, script = MUTANTS[name]
     for module in (test_changes, test_hosts, test_runs, test_safety):
-        monkeypatch.setattr(module, "fly", partial(laboratory.fly, mutant=Mutant(file, old, new)))
+        monkeypatch.setattr(module, "fly", partial(laboratory.fly, mutant=Mutant(file, old, new), limit_s=LIMIT_S))
     with pytest.raises((AssertionError, ValueError, IndexError, StopIteration)):
         script()
