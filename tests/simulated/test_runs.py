@@ -44,9 +44,7 @@ ROWS = {
     "shortly_held": Run(0, faults=(*order(1.0, "hold"), *order(1.3, "resume"))),
     "killed": Run(1, "s: was lost: its process ended (killed by SIGKILL)", (Fault(1.0, "kill", "B"),)),
     "blind_at_the_end": Run(1, "its own position is lost: none, until the end", (Fault(2.6, "body", "B", "nan"),)),
-    "blind_for_a_fifth": Run(
-        1, "B: its position was known for 7 the time only", (Fault(1.0, "body", "B", "nan", 0.7),)
-    ),
+    "blind_for_a_fifth": Run(1, "B: its position was known for 7", (Fault(1.0, "body", "B", "nan", 0.7),)),
     "shortly_blind": Run(3, "too little is known of B", (Fault(1.0, "body", "B", "nan", 0.3),)),
     "fell": Run(1, "s: land: it came down by itself", (Fault(1.0, "body", "C", "motors"),), experiment=DRONE),
     "landed": Run(1, "B landed after 1.0 of 3 s: ordered to land by an operator", order(1.0, "land")),
