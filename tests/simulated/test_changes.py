@@ -81,7 +81,7 @@ def test_robots_leave_and_come_while_others_continue():
     assert not flight.happened("lost")
 
 
-def test_spare_takes_over_the_name_of_a_frozen_robot():
+def test_spare_takes_over_name_of_frozen_robot():
     flight = fly(
         HOT, Fault(0.5, "pause", "B", lasts=60.0), order(0.6, "replace --with S2", "B"),
         order(0.8, "replace --with S1", "B"), order(6.5, "replace --with S1", "B"), settings=["duration_s=8"],

@@ -82,7 +82,7 @@ MUTANTS = {
     "spare does not take part": (
         HOT, "            self._spares.used[spare] = name\n        yield from self._join(names)",
         "            self._spares.used[spare] = name\n        yield",
-        test_changes.test_spare_takes_over_the_name_of_a_frozen_robot,
+        test_changes.test_spare_takes_over_name_of_frozen_robot,
     ),
     "removal leaves the token": (
         LOOP, "                self.keeper.withdraw((row,))", "                pass",
