@@ -331,7 +331,7 @@ def nightly(*values):
         nightly(8, 400.0, {"stream_hz": 7.0}, 0.0),
         nightly(15, 664.0, {"stream_hz": 5.0}, 0.0),
         nightly(5, 250.0, {"stream_hz": 7.0}, 0.0),
-        (8, 400.0, {"stream_hz": 4.0}, 0.5),  # seventeen parts of polynomials for a take-off, one at a time
+        nightly(8, 400.0, {"stream_hz": 4.0}, 0.5),  # seventeen parts of polynomials for a take-off, one at a time
     ],
 )
 def test_rates_that_a_radio_carries_leave_poses_young(monkeypatch, rows, exchanges, rates, yaw):
@@ -473,11 +473,9 @@ def test_short_gaps_one_after_the_other(circling):
     assert circling.phases == {FlightPhase.FLYING}
 
 
-@pytest.fixture(
-    params=[(0.8, -4.0), (0.8, 4.0), (1.5, -4.0), (1.5, 4.0)], ids=lambda case: f"{case[0]} m, {case[1]:+g} mg"
-)
+@pytest.fixture(params=[(0.8, -4.0), nightly((0.8, 4.0)), nightly((1.5, -4.0)), (1.5, 4.0)], ids=str)
 def measured(request, monkeypatch):
-    """On its way up by positions from outside, with an accelerometer that is wrong."""
+    """On its way up to a height [m] by positions from outside, with an accelerometer that is wrong [mg]."""
     height, error = request.param
     with Fleet(monkeypatch, 1, 500.0, external=True, accelerometer_mg=error) as flown:
         yield flown.climb(height, 0.1)

@@ -240,7 +240,7 @@ def test_command_prints_a_table_or_json():
         "timeline.0.plan.speed=1e300",
         "safety.speed=1e-9",
         "arena.size=[1e300,1e300,1e300]",
-        "rates.coordination_hz=0.01",
+        pytest.param("rates.coordination_hz=0.01", marks=pytest.mark.nightly),
     ],
 )
 def test_absurd_numbers_end_in_findings(change):

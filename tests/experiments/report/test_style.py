@@ -85,7 +85,7 @@ def pictures(folder, traces, known):
     return found | {"film": (folder / "film.gif").read_bytes()}
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_no_style_of_the_process_changes_pictures(tmp_path):
     (tmp_path / STYLE_FILE).write_text(HOSTILE)
     traces = [flown("triangle", case, "duration_s=3.0", "timeline=[]").trace for case in ("periodic", "event")]

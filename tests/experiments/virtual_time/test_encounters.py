@@ -130,7 +130,8 @@ def test_thousand_random_encounters_without_collision():
     assert np.mean([share for *_, share in found]) >= 0.995  # arrival is not guaranteed
 
 
-@pytest.mark.parametrize("case", [pytest.param("periodic", marks=pytest.mark.nightly), "event"])
+@pytest.mark.nightly
+@pytest.mark.parametrize("case", ["periodic", "event"])
 def test_it_passes_without_contact_and_recovers(case):
     flight = flown("obstacle-course", case)
     clearance = Clearance.of_trace(flight.trace)
