@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+import os
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from errno import EIO
 from math import cos, nan, sin
 from typing import Any
 
@@ -20,6 +22,7 @@ from tests.simulated import kernel as sim
 from tests.simulated.world import current
 from twins.models.motion import Motion
 
+SPOIL_S = 0.02  # period of a stranger's messages
 CAPTURE_S = 0.01  # period of the motion capture
 CAPTURE_SIGMA = 0.0005  # [m] its noise
 
@@ -57,6 +60,10 @@ def _silent(state: Any, _: float, memory: dict[str, Any]) -> None:
 
 def _charge(state: Any, charge: float, _: dict[str, Any]) -> None:
     state.battery = charge
+
+
+def _raise(_: Any, __: float, ___: dict[str, Any]) -> None:
+    raise OSError(EIO, os.strerror(EIO))
 
 
 def _still(state: Any, _: float, __: dict[str, Any]) -> None:
@@ -104,6 +111,7 @@ READINGS: dict[str, Callable[[Any, float, dict[str, Any]], None]] = {
     "drift": _drifting,
     "mute": _mute,
     "deaf": _deaf,
+    "error": _raise,
 }
 
 
@@ -152,7 +160,8 @@ class WatchedBody(Body):
 
     def land(self, rows: Sequence[int]) -> None:
         self._note([self.names[row] for row in rows])
-        self.body.land(rows)
+        readings = current().readings
+        self.body.land([row for row in rows if readings.get(self.names[row], ("",))[0] != "aloft"])
 
     def stop(self, rows: Sequence[int]) -> None:
         readings = current().readings
@@ -178,6 +187,18 @@ class WatchedBody(Body):
             current().commands.append((current().now, name, self.process.pid))
             for watch in current().on_command:
                 watch(name, self.process)
+
+
+def spoil(name: str, keys: Keys, lasts: float) -> int:
+    """Process of a stranger: it sends what nobody can read on all keys that concern a robot, for some time [s]."""
+    session, rng = network_session.open_session([DEFAULT_ENDPOINT], name="stranger"), sim.current().rng
+    over = time.monotonic() + lasts
+    while time.monotonic() < over:
+        for key in (keys.pose(name), keys.status(name), keys.state(name), keys.position(name), keys.order(name)):
+            session.put(key, rng.randbytes(rng.randrange(40)), encoding=rng.choice((messages.JSON, "", "text/plain")))
+        time.sleep(SPOIL_S)
+    session.close()
+    return 0
 
 
 def capture(names: Sequence[str], realm: str) -> int:

@@ -30,12 +30,13 @@ class Fault:
     | hang | robot | its loop alone stands still [s] |
     | step, drift | process | of its wall clock [s]; of its uptime [s/s] |
     | disk | process | "full", "read-only", or seconds that each write takes |
-    | body | robot | "adrift", or a word of `bodies.READINGS`, or such a word and a number |
+    | body | robot | "adrift", "aloft" (no order to land is obeyed), or a word of `bodies.READINGS`, or such a word and a number |
     | capture | robot | a word of `bodies.capture`, or such a word and a number: external positions alone |
     | order | robot | words of `./zenpark robot`: "hold", "land", "replace --body twin" |
     | command | | words after `./zenpark`: "estop --json" |
     | estop | | as `./zenpark estop` |
     | interrupt | conductor | Ctrl-C |
+    | corrupt | robot | a stranger sends what nobody can read on its keys |
     | twice | robot | a second process of its name; clock correction [s] |
 
     A process is a robot, "router", "router2", "recorder", "world", "centre", "conductor" or "capture"; a robot's name
@@ -154,6 +155,10 @@ def _estop(world: World, _: Fault) -> None:
     world.operate(["estop"], "")
 
 
+def _corrupt(world: World, fault: Fault) -> None:
+    world.spoil(fault.who, fault.lasts)
+
+
 def _twice(world: World, fault: Fault) -> None:
     world.start_second(fault.who, float(fault.size) if fault.size != 1.0 else 0.0)
 
@@ -178,6 +183,7 @@ KINDS: dict[str, Callable[[World, Fault], None]] = {
     "order": _order,
     "command": _command,
     "estop": _estop,
+    "corrupt": _corrupt,
     "twice": _twice,
 }
 LASTING_KINDS = ("order", "command", "estop", "late", "drift", "step", "disk")  # the network is as it was
@@ -188,6 +194,7 @@ WEIGHTS = {
     "drift": 1, "hang": 2, "disk": 1.5, "body": 4, "order": 6, "estop": 0.7, "interrupt": 0.3, "twice": 1.5,
     "term": 0.7,
     "command": 1,
+    "corrupt": 1,
 }  # fmt: skip
 SINCE = {"start": 8, "launch": 2, "ready": 1, "landing": 1}  # how often a fault counts from a moment
 BUSY_S = {"launch": 3.0, "ready": 2.0, "landing": 2.0}  # time after it in which much happens

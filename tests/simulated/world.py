@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from agents.network import messages
+from agents.network.keys import Keys
 from agents.runtime import loop
 from agents.vectors import Vector
 from experiments.definition.plan import Plan
@@ -218,6 +219,13 @@ class World:
             return
         process = sim.Process(f"second {name}", lambda: main(robot_process.__name__, [*words, "--once"]), {})
         process.wall = wall
+
+    def spoil(self, name: str, lasts: float) -> None:
+        """Let a stranger send what nobody can read on the keys of a robot, for some time [s]."""
+        from tests.simulated import bodies  # noqa: PLC0415 - which needs this module
+
+        realm = "park" if self.plan is None else self.plan.experiment.network.realm
+        sim.Process("operator: a stranger", lambda: bodies.spoil(name, Keys(realm), lasts))
 
     def operate(self, words: Sequence[str], who: str) -> None:
         """Let an operator type a command."""
