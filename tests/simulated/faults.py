@@ -30,7 +30,7 @@ class Fault:
     | hang | robot | its loop alone stands still [s] |
     | step, drift | process | of its wall clock [s]; of its uptime [s/s] |
     | disk | process | "full", "read-only", or seconds that each write takes |
-    | body | robot | "adrift", "aloft" (no order to land is obeyed), or a word of `bodies.READINGS`, or such a word and a number |
+    | body | robot | "adrift", "aloft" (it obeys no order to land), or a word of `bodies.READINGS`; with a number |
     | capture | robot | a word of `bodies.capture`, or such a word and a number: external positions alone |
     | order | robot | words of `./zenpark robot`: "hold", "land", "replace --body twin" |
     | command | | words after `./zenpark`: "estop --json" |

@@ -195,7 +195,7 @@ def finite_motion(_: Look, seen: Seen) -> str:
     return "" if known else f"its true position is {seen.motion.position}"  # type: ignore[union-attr]
 
 
-@rule(OF_ROBOTS, "| no answer from a router for this time")
+@rule(OF_ROBOTS, "It holds 1.3 to 1.8 s after the loss")
 def hold_without_router(look: Look, seen: Seen) -> str:
     offline = not look.linked(seen.process, slowly=True) and seen.phase in (AIRBORNE, RUNNING) and seen.governed
     lasted = look.lasting(("hold", seen.name), offline, 2.2)
@@ -203,7 +203,7 @@ def hold_without_router(look: Look, seen: Seen) -> str:
     return f"no router for {lasted:.1f} s, hazard '{seen.hazard}'" if goes_on else ""
 
 
-@rule(OF_ROBOTS, "land after `offline_s` 10 s: no emergency stop would reach it")
+@rule(OF_ROBOTS, "and lands 10.3 to 10.8 s after it")
 def landing_without_router(look: Look, seen: Seen) -> str:
     offline = not look.linked(seen.process, slowly=True) and seen.phase in (AIRBORNE, RUNNING) and seen.governed
     lasted = look.lasting(("offline", seen.name), offline, 12.5)
