@@ -220,12 +220,18 @@ class Link:
 
 
 class Network:
-    """All nodes, with the endpoints that routers listen on."""
+    """All nodes, with the endpoints that routers listen on.
+
+    Attributes:
+        forgets: Probability that a question for tokens, of a session that watches the same keys, has an empty answer
+            (`findings/zenoh-liveliness-get-beside-subscriber.sh`).
+    """
 
     def __init__(self) -> None:
         self.sessions: list[Session] = []
         self.routers: list[Router] = []
         self.numbers = itertools.count(1)
+        self.forgets = 0.0
 
     def open(self, config: zenoh.Config) -> Session | Router:
         """A node with settings of `agents.network.zenoh_config`; raises ZError if no router answers."""
@@ -666,6 +672,9 @@ class Session(Node):
         As with Zenoh, tokens that a new watch hears of while the question is on its way are in neither part.
         """
         replies = self._asked(timeout)
+        watching = self.link is not None and any(match(watch.key, str(key)) for watch in self.watches)
+        if watching and self.network.forgets and current().rng.random() < self.network.forgets:
+            key = "-"  # a key that no token has
         known = [each for each in {token.key: None for token in self.tokens} | self._remote if match(str(key), each)]
         for each in known:
             replies.add(Sample(each))

@@ -70,6 +70,26 @@ def test_a_cut_client_is_lost_and_found_again(kernel):
     assert stage.log[3][0] == 5.5
 
 
+@pytest.mark.parametrize(
+    ("pause_s", "forgets", "listed"), [(0.0, 0.0, []), (1.0, 0.0, ["park/a/alive"]), (1.0, 1.0, [])]
+)
+def test_who_watches_tokens_may_ask_in_vain(kernel, pause_s, forgets, listed):
+    stage, found = Stage(kernel), []
+    stage.network.forgets = forgets
+
+    def ask():
+        session = stage.join()
+        sleep(2.0)
+        session.liveliness().declare_subscriber("park/*/alive", stage.note, history=True)
+        sleep(pause_s)
+        found.extend(reply.ok.key_expr for reply in session.liveliness().get("park/*/alive"))
+
+    stage.process("robot", stage.robot)
+    stage.process("asker", ask)
+    kernel.run(limit=BEGIN + 5.0)
+    assert found == listed
+
+
 def test_clients_of_linked_routers_meet(kernel):
     stage = Stage(kernel, routers=3)
     stage.process("witness", stage.witness, PLACES[2])
