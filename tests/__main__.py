@@ -13,7 +13,7 @@ from tools.main import call
 from tools.options import example
 
 MEASUREMENTS = {
-    "--chaos": (chaos, ("triangle --faults 20 --seed 1", "triangle --kinds kill,freeze")),
+    "--chaos": (chaos, ("triangle --faults 20 --seed 1", "triangle --kinds kill,pause")),
     "--soak": (soak, ("--minutes 60", "triangle --minutes 10")),
     "--bench": (bench, ("start", "process --json")),
 }

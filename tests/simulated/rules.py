@@ -510,7 +510,7 @@ def commands_end(end: End) -> Iterator[str]:
 
 @rule(AT_THE_END, "ends with exit code 1 and says so in its last line")
 def words_for_a_failure(end: End) -> Iterator[str]:
-    reasons = ("zenpark: ", "Spoiled", "failed", "landed", "emergency stop")
+    reasons = ("zenpark: ", "Spoiled", "Not passed", "failed", "landed", "emergency stop")
     if end.code in {1, 2, 3} and not any(word in end.output for word in reasons):
         yield f"exit code {end.code} without a reason: {end.output[-300:]}"
 

@@ -86,3 +86,38 @@ def test_clock_of_another_machine(name):
     assert [float(each.text.split()[3]) for each in told] == [pytest.approx(off, abs=0.02)] * said
     assert all(each.t < 0.0 for each in told)
     assert flight.code == code
+
+
+def test_killed_launcher_waits_for_no_frozen_robot():
+    thawed = 8.0
+    flight = fly(DRONE, Fault(0.5, "pause", "A", lasts=thawed - 0.5), Fault(AT_S, "kill", "conductor"))
+    frozen = flight.of("default-A")[0]
+    assert max(each.ended for each in flight.processes if each is not frozen) < AT_S + 3.2
+    assert thawed + 10.0 < frozen.ended < thawed + 10.5, "its router is gone"
+    assert flight.robots["C"].off() < AT_S + 2.5
+    assert "default.mcap" in flight.files
+
+
+def test_robot_frozen_in_its_landing_is_lost():
+    flight = fly(DRONE, Fault(0.1, "pause", "C", lasts=inf, since="landing"), settings=["duration_s=1"])
+    landing = flight.happened("phase", text="landing")[0].t
+    (lost,) = flight.happened("lost", "C", "did not end its landing within 15 s: ")
+    assert lost.t == pytest.approx(landing + 15.0, abs=0.2)
+    assert flight.code == 1
+    assert "Failed in default: C at " in flight.output
+
+
+def test_killed_router_is_started_again_in_flight():
+    flight = fly(TRIO, Fault(AT_S, "kill", "router"))
+    (told,) = flight.happened("router")
+    assert told.text.startswith("the router ended (killed by SIGKILL); started again")
+    assert [phase.reason for track in flight.robots.values() for phase in track.phases[-1:]] == ["finished"] * 3
+    assert not any(text.startswith("land") for track in flight.robots.values() for _, text in track.hazards)
+    assert flight.violations == []
+
+
+def test_second_router_carries_on_at_once():
+    flight = fly(TRIO, Fault(AT_S, "kill", "router"), settings=["network.routers=2"])
+    assert flight.happened("router", text="the router ended (killed by SIGKILL); started again: all go on at another")
+    assert [track.hazards for track in flight.robots.values()] == [[], [], []]
+    assert (flight.code, flight.violations) == (0, [])

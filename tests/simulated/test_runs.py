@@ -9,6 +9,7 @@ from tests.simulated.faults import Fault
 from tests.simulated.laboratory import fly
 from tests.simulated.small import DRONE, PAIR, TRIO
 
+LIMIT = '[[criteria]]\nmetric = "f_hz"\nat_most = {}\nwhy = "Few messages are wanted."\n'
 QUICK = ("rates.body_hz=50",)
 NEVER = 'robots.B.position="external"'
 ABSENT = Fault(0.0, "capture", "B", "gone", since="launch")
@@ -68,6 +69,8 @@ ROWS = {
     ),
     "disk_full": Run(1, "cannot be written: No space left", (Fault(1.0, "disk", "recorder", "full"),)),
     "stood_still": Run(2, "this process stood still for more than 3 s", frozen("conductor", 5.0)),
+    "criterion_met": Run(0, "Passed: 1 of 1", experiment=PAIR + LIMIT.format(11)),
+    "criterion_not_met": Run(1, "Few messages are wanted.", experiment=PAIR + LIMIT.format(9)),
     "unknown_key": Run(2, "durations", settings=("durations=3",)),
 }
 

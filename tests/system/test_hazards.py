@@ -12,7 +12,7 @@ from agents.network import messages, pubsub
 from experiments.real_time.conductor.orders import EmergencyStop
 from experiments.real_time.hosts import run_registry
 from tests.commands import ROOT
-from tests.system.lab import ENVIRONMENT, Flight, RobotProcess, WorldProcess, typed
+from tests.system.lab import ENVIRONMENT, Flight, RobotProcess, WorldProcess
 from tools.commands import orders as order_commands
 
 pytestmark = pytest.mark.system
@@ -28,20 +28,6 @@ B = { kind = "khepera4", start = [0.3, 0.0] }
 links = { "A - B" = 0.3 }
 [safety]
 """
-
-
-def test_drone_with_low_battery_lands_and_others_continue(tmp_path):
-    folder = tmp_path / "run"
-    low = "safety.battery_low=0.985"  # it flies for 7 minutes on a charge
-    flight = Flight(folder, "triangle", "--case", "event", low, "duration_s=8")
-    flight.until_said(r"hazard CF01: land: its battery is low: 98% \(limit 98%\)")
-    assert flight.finish()[0] == 1
-    assert "zenpark: Failed in event: CF01 at " in flight.said()
-    played = flight.read()
-    said = [pose.position[2] for pose in typed(folder / "event.mcap", "/CF01/pose") if pose.stamp > played.started]
-    assert min(said) > 0.6 - 0.1, "it has flown, and nobody follows it to the floor"
-    ends = {event.source: event.text for event in played.trace.events if event.kind == "robot"}
-    assert (ends["CF01"], ends["KH01"]) == ("done: its battery is low", "done: finished")
 
 
 @pytest.mark.mechanism("hazard: conductor lost")
@@ -203,22 +189,6 @@ def test_process_frozen_aloft_is_landed_and_notices(lonely, watcher):
     watcher.until_all("done", "TE01")
 
 
-def test_frozen_process_leaves_body_to_its_replacement(lonely, router, watcher):
-    lonely.robot.freeze()
-    lonely.until_down()
-    watcher.until(lambda: "TE01" not in watcher.alive, "its lease is over")
-    watcher.status.clear()
-    with RobotProcess(router.endpoint, lonely.file, "TE01"):
-        watcher.take_off("TE01")
-        high, before = lonely.truths[-1].position[2], len(lonely.truths)
-        lonely.robot.thaw()
-        watcher.until(lambda: lonely.robot.process.poll() is not None, "the old one leaves")
-        assert lonely.robot.process.returncode == 2
-        assert "TE01: another process has taken this name" in lonely.robot.said()
-        assert min(truth.position[2] for truth in lonely.truths[before:]) > high - 0.05
-        assert watcher.phase("TE01") == "airborne"
-
-
 def test_stop_behind_a_flood_of_deletions_is_obeyed(lonely, watcher):
     for _ in range(2000):
         watcher.session.delete(watcher.keys.estop)
@@ -228,19 +198,3 @@ def test_stop_behind_a_flood_of_deletions_is_obeyed(lonely, watcher):
     watcher.until_all("done", "TE01")
     lonely.until_down()
     assert watcher.status["TE01"].reason == "emergency stop by a test: now"
-
-
-def test_process_hanging_in_final_landing_fails_the_run(tmp_path):
-    short = ("duration_s=1.5", "robots.CF01.hover=0.3")
-    flight = Flight(tmp_path / "out", written(tmp_path, TWO_CASES), "--case", "first", *short, report=True)
-    try:
-        flight.until_said("phase conductor: landing")
-        flight.children()["CF01"].suspend()
-        assert flight.finish(90.0)[0] == 1
-    finally:
-        flight.process.kill()
-    assert re.search(r"lost CF01: did not end its landing within 15 s: \w+", flight.said())
-    assert "zenpark: Failed in first: CF01 at " in flight.said()
-    report = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
-    verdict = report[report.index("In short") :]
-    assert verdict.index("CF01 at") < verdict.index("No pose was lost")

@@ -1,8 +1,6 @@
 """Robots that are adopted, hold, are removed, restarted, replaced and added while the others fly on."""
 
 import json
-import os
-import re
 import signal
 
 import pytest
@@ -10,8 +8,6 @@ import pytest
 from agents.network import messages
 from experiments.file import catalogue
 from experiments.real_time.conductor import orders
-from experiments.report import report
-from experiments.run import reopen
 from tests.commands import zenpark
 from tests.system.lab import PATIENCE_S, TRIANGLE, Flight, RobotProcess, Watcher
 
@@ -66,31 +62,6 @@ def hot(tmp_path):
         made.end()
 
 
-def test_killed_robot_is_restarted_and_takes_part(hot):
-    watcher, status = hot.watcher, hot.watcher.status
-    first = status["CF01"].pid
-    os.kill(first, signal.SIGKILL)
-    hot.until_said("lost CF01: its process ended")
-    died = status["KH01"].stamp
-    watcher.until(lambda: status["KH01"].stamp > died + 1.5, "a gap of telemetry that is not bridged")
-    reply = hot.change("restart", "CF01")
-    assert set(reply.done) == {"CF01"}, reply
-    watcher.until(lambda: status["CF01"].pid != first and watcher.all("running", "CF01"), "it runs")
-    watcher.until(lambda: set(status["KH01"].missing) <= {"KH03"}, "it is heard again")
-    assert abs(status["CF01"].started - status["KH01"].started) < 0.1, "its time is that of the others"
-    watcher.until(lambda: status["CF01"].decisions >= 10, "it has taken part for a while")
-    hot.end()
-    assert hot.read().complete
-    run = reopen(hot.folder)
-    told = {event.kind for event in run.traces["event"].events if event.source == "CF01"}
-    assert told >= {"lost", "restart", "changed"}
-    known = {robot.robot: robot.known for robot in run.metrics["event"].robots}
-    assert 0.0 < known["CF01"] < known["KH01"]
-    assert "KH03" not in known  # on standby, never added
-    page = report.write(hot.folder / "report", list(run.traces.values()), notes=run.notes).read_text("utf-8")
-    assert "takes part again after" in page
-
-
 @pytest.mark.mechanism("hot change: hold, remove, add")
 def test_robots_hold_leave_and_come_while_others_continue(hot):
     watcher, status = hot.watcher, hot.watcher.status
@@ -117,29 +88,6 @@ def test_robots_hold_leave_and_come_while_others_continue(hot):
     events = [(event.kind, event.source, event.text) for event in hot.read().trace.events]
     assert ("order", "operator", "hold: CF01") in events
     assert " lost " not in hot.said()
-
-
-def test_a_spare_takes_over_a_name(hot):
-    watcher, status = hot.watcher, hot.watcher.status
-    unknown = hot.zenpark("restart", "CF02", code=2)
-    assert "no robot 'CF02' in this run; did you mean 'CF01'" in unknown.stderr
-    wrong = hot.zenpark("replace", "CF01", "--with", "S2", code=1)
-    assert wrong.stderr == "CF01: no: S2 is a khepera4 and cannot be CF01, a crazyflie\n"
-    watcher.look()
-    x, y, _ = watcher.state["KH02"].position
-    near = hot.change("replace", "KH01", body="twin", at=(round(x, 3), round(y + 0.1, 3)))
-    assert "needs 0.1 m around it" in near.refused["KH01"]
-    before, began = status["CF01"].pid, status["CF01"].origin
-    os.kill(before, signal.SIGSTOP)  # it hangs: its process is ended for it
-    reply = hot.change("replace", "CF01", spare="S1")
-    assert "S1 has its name" in reply.done["CF01"], reply
-    watcher.until(lambda: status["CF01"].pid != before and watcher.all("running", "CF01"), "it runs")
-    assert status["CF01"].origin == began  # plans of the name begin where they began
-    assert "S1 has taken over CF01 already" in hot.change("replace", "CF01", spare="S1").refused["CF01"]
-    hot.end()
-    orphan = hot.zenpark("restart", "CF01", code=2)
-    assert orphan.stdout == ""
-    assert re.search("no router answers|this run is not there", orphan.stderr)  # its port may be somebody else's by now
 
 
 SHORT = ("--case", "event", "--json", "duration_s=2")

@@ -1,11 +1,9 @@
 """Robot processes started by hand: whom they hear, what they notice and survive, how they end, are watched."""
 
-import contextlib
 import itertools
 import json
 import math
 import os
-import signal
 import threading
 import time
 from collections import defaultdict
@@ -26,7 +24,7 @@ from experiments.file.document import load
 from experiments.run import simulate
 from tests.commands import zenpark
 from tests.conftest import RouterProcess
-from tests.system.lab import TRIANGLE, Flight, RobotProcess, gone, typed, until
+from tests.system.lab import TRIANGLE, RobotProcess, typed, until
 from tests.tools.commands.test_live_table import STATUS
 
 pytestmark = pytest.mark.system
@@ -238,41 +236,6 @@ def test_an_estop_that_nobody_answers_ends(router):
         done = zenpark("estop", "--connect", router.endpoint, code=None)
     assert done.returncode in {1, 2}
     assert "Traceback" not in done.stderr
-
-
-@pytest.mark.parametrize("bodies", ["twin", "world"])
-def test_frozen_robot_delays_nobody_when_launcher_is_killed(tmp_path, bodies):
-    flight = Flight(tmp_path / "run", "triangle", "--case", "event", "--bodies", bodies, "duration_s=60")
-    flight.until_flown()
-    children = flight.children()
-    frozen = children.pop("KH01")
-    frozen.suspend()
-    try:
-        threading.Event().wait(0.5)
-        flight.process.kill()
-        until(lambda: gone([children["CF01"], children["KH02"]]), "the robots have landed")
-        until(lambda: gone(list(children.values())), "everybody else is gone")
-        assert flight.read().complete
-        assert flight.logs().count("done (the starter is gone)") == 2
-        frozen.resume()
-        until(lambda: gone([frozen]), "the frozen one too")
-    finally:
-        flight.finish()
-        for process in (frozen, *children.values()):
-            with contextlib.suppress(psutil.NoSuchProcess):
-                process.kill()
-
-
-def test_suspended_conductor_gives_no_further_order(tmp_path):
-    flight = Flight(tmp_path / "run", "triangle", "--case", "event")
-    flight.until_flown()
-    robots = [process for name, process in flight.children().items() if name in TRIANGLE]
-    flight.process.send_signal(signal.SIGSTOP)
-    until(lambda: gone(robots), "the robots land and end", 40.0)
-    flight.process.send_signal(signal.SIGCONT)
-    assert flight.finish()[0] == 2
-    assert "this process stood still for more than 3 s; its robots have landed without it" in flight.said()
-    assert "landing" not in [line.rpartition("phase conductor: ")[2] for line in flight.said().splitlines()]
 
 
 @pytest.mark.mechanism("table of a run from another shell")

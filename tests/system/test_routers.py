@@ -8,7 +8,6 @@ import time
 import urllib.request
 from contextlib import ExitStack, contextmanager
 
-import psutil
 import pytest
 import zenoh
 
@@ -28,28 +27,6 @@ from tools.commands.network import members
 from tools.commands.processes import of_zenohd
 
 pytestmark = pytest.mark.system
-
-
-def test_a_killed_router_holds_nobody_up(tmp_path):
-    flight = Flight(tmp_path / "run", "triangle", "--case", "periodic", "network.routers=2", "duration_s=8")
-    flight.until_flown()
-    one, other = (flight.folder / "network.txt").read_text().split()
-    with Watcher(other) as watcher:
-        watcher.until(lambda: len(watcher.state) == 3 == len(watcher.alive), "robots at one are seen at the other")
-        children = psutil.Process(flight.process.pid).children()
-        lines = {tuple(each.cmdline()): each for each in children}
-        (first,) = (each for line, each in lines.items() if f"--listen {one}" in " ".join(line))
-        first.kill()
-        told = {name: state.seq for name, state in watcher.state.items()}
-        watcher.until(lambda: all(watcher.state[name].seq > told[name] + 10 for name in told), "all go on")
-        flight.until_said(r"the router ended \(killed by SIGKILL\); started again: all go on at another meanwhile")
-        with Watcher(one) as late:
-            late.until(lambda: len(late.state) == 3 == len(late.alive), "a newcomer at the first sees all")
-        watcher.until(lambda: all(not status.missing for status in watcher.status.values()), "nobody is missed")
-    assert flight.finish()[0] == 0, flight.logs()
-    run = reopen(flight.folder)
-    assert not run.notes, "nobody was held for lost, and the recording is whole"
-    assert not [event for event in run.traces["periodic"].events if event.kind == "hazard" and "hold" in event.text]
 
 
 @pytest.mark.mechanism("router of a run frozen")
