@@ -144,8 +144,8 @@ def _numbers(value: Any) -> Any:  # noqa: ANN401 - a parameter of a plug-in
 
 
 def chosen(experiment: Experiment) -> list[tuple[str, str]]:
-    """Group and name of every plug-in that an experiment chooses, kinds of robots aside."""
-    return [(group, registry.split(choice)[0]) for group, choice in _choices(msgspec.to_builtins(experiment), ())]
+    """Group and name of every plug-in that an experiment chooses, kinds of robots and defaults aside."""
+    return [(group, registry.split(choice)[0]) for group, choice in _choices(tables(experiment), ())]
 
 
 def _choices(value: Any, path: Path) -> Iterator[tuple[str, Any]]:  # noqa: ANN401 - a document

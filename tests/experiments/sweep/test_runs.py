@@ -139,6 +139,12 @@ def test_versions_of_used_libraries_count(short_park, monkeypatch, parts, librar
     assert library in version.LIBRARIES
 
 
+def test_workers_read_the_same_code():
+    """A default that a file spells out, as the park its law, is no other code in a process that gets the case."""
+    for plan in document.read("robotic-park").cases().values():
+        assert code_of(Plan.decoded(document.write_json(plan))) == code_of(plan)
+
+
 def test_a_plug_in_that_changes_changes_the_code(short_park, tmp_path, monkeypatch):
     file = tmp_path / "my_triggers.py"
     file.write_text("one")
