@@ -77,10 +77,8 @@ def claim(
         while True:
             asked = time.monotonic()
             found = {key: network.tokens_present(session, Keys.lives(key)) for key in alive}
-            if (
-                time.monotonic() - asked > SETTLE_S
-            ):  # a lost link ends a question as an answer does, and is noticed later
-                pause.wait(SETTLE_S)
+            if time.monotonic() - asked > SETTLE_S:
+                pause.wait(SETTLE_S)  # a link that is lost ends a question as an answer does, before that is noticed
             if pause.is_set():
                 raise network.Unreachable("asked to end before the name was taken")
             if None not in found.values() and network.connected(session):

@@ -269,7 +269,7 @@ def test_displaced_owner_leaves_the_body_alone(way, monkeypatch):
 
     setattr(body, "open" if way == "opening" else "looks", displaced)
     with Net().worn() as net, pytest.raises(NameTaken, match="F: another process has taken this name while this one"):
-        process(DRONE, body, ownership=OwnershipTiming(vanish_s=0.0)).run()
+        process(DRONE, body, ownership=OwnershipTiming(vanish_s=0.0), loop_timeout_s=PATIENCE_S).run()
     assert body.calls == ([] if way == "opening" else ["open"])
     assert (told[0] > 0) == (way != "opening")
     if way != "cut off":
@@ -326,7 +326,7 @@ def test_link_that_is_back_waits_for_owner(taken, monkeypatch):
     monkeypatch.setattr(Mute, "put", lambda _, payload, **__: puts.append(payload))
     with Net().worn() as net:
         monkeypatch.setattr(network, "connected", linked)
-        runtime = process(experiment, body, ownership=timing, descent=QUICK)
+        runtime = process(experiment, body, ownership=timing, descent=QUICK, loop_timeout_s=PATIENCE_S)
         clock.of(runtime.keeper.ownership)
         with pytest.raises(NameTaken if taken else OSError, match="has taken" if taken else "commands again"):
             runtime.run()
@@ -367,7 +367,7 @@ def test_late_alarm_leaves_the_tokens(monkeypatch):
 
     with Net().worn() as net, monkeypatch.context() as patched:
         patched.setattr(pubsub, "alive_token", declared)
-        runtime = process(pair(), body, descent=QUICK)
+        runtime = process(pair(), body, descent=QUICK, loop_timeout_s=PATIENCE_S)
         body.looks = partial(next, steps(), None)
         with pytest.raises(OSError, match="the test is over"):
             runtime.run()

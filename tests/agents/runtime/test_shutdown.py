@@ -172,6 +172,8 @@ class Kennel(ManualClock):
         for what, thread in self.dog._at_work.items():
             if what != self.stuck:
                 thread.join()
+            else:
+                until(lambda: self.stuck in self.orders, "it hangs")
         self.sleep(seconds)
         return next(self.life, self) is self
 

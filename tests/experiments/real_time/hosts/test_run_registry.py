@@ -58,9 +58,11 @@ def test_run_of_another_container_stays_listed(runtime_folder):
 
 def test_dead_run_is_listed_while_its_router_answers(runtime_folder):
     run = dead()
-    with registered(run):
-        assert runs() == []
-        assert list(runtime_folder.iterdir()) == [], "cleaned"
+    with socket.socket() as deaf:  # it keeps the port from others, and refuses
+        deaf.bind(("127.0.0.1", 0))
+        with registered(changed(run, endpoints=[f"tcp/127.0.0.1:{deaf.getsockname()[1]}"])):
+            assert runs() == []
+            assert list(runtime_folder.iterdir()) == [], "cleaned"
     with socket.create_server(("127.0.0.1", 0)) as router:
         left = changed(run, endpoints=[f"tcp/127.0.0.1:{router.getsockname()[1]}"])
         with registered(left):
