@@ -4,6 +4,7 @@ from functools import partial
 
 import pytest
 
+from tests.cases import mostly_slow
 from tests.simulated import laboratory, test_changes, test_hosts, test_runs, test_safety
 from tests.simulated.laboratory import Mutant
 
@@ -129,7 +130,7 @@ MUTANTS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", MUTANTS)
+@pytest.mark.parametrize("name", mostly_slow(MUTANTS, 13))
 def test_script_finds_the_mutant(name, monkeypatch):
     file, old, new, script = MUTANTS[name]
     for module in (test_changes, test_hosts, test_runs, test_safety):
