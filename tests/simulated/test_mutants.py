@@ -130,7 +130,7 @@ MUTANTS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", mostly_slow(MUTANTS, 13))
+@pytest.mark.parametrize("name", mostly_slow(MUTANTS, 2))
 def test_script_finds_the_mutant(name, monkeypatch):
     file, old, new, script = MUTANTS[name]
     for module in (test_changes, test_hosts, test_runs, test_safety):
