@@ -111,6 +111,18 @@ class Mute(_Closing):
         return 0
 
 
+class Token(Mute):
+    """A token of the own session, which is in each answer about its key."""
+
+    def __init__(self, tokens: list[str], key: str) -> None:
+        self._tokens, self._key = tokens, key
+        tokens.append(key)
+
+    def undeclare(self, *_: object) -> None:
+        if self._key in self._tokens:
+            self._tokens.remove(self._key)
+
+
 class Attentive:
     """A router that always answers."""
 
@@ -128,7 +140,7 @@ class Session(_Closing):
         self._net = net
         self.zid = lambda: "f00d"
         self.liveliness = lambda: self
-        self.declare_token = self.declare_publisher = lambda *_, **__: Mute()
+        self.declare_publisher = lambda *_, **__: Mute()
 
     def declare_subscriber(self, key: str, handler: object = None, **_: object) -> Channel:
         return self._net.listen(key, handler)
@@ -136,8 +148,13 @@ class Session(_Closing):
     def declare_queryable(self, key: str, handler: object, **_: object) -> Channel:
         return self._net.listen(key, handler, asked=True)
 
-    def get(self, *_: object, **__: object) -> list[Reply]:
-        return list(self._net.replies)
+    def declare_token(self, key: str) -> Token:
+        return Token(self._net.tokens, key)
+
+    def get(self, key: str, *_: object, **__: object) -> list[Reply]:
+        asked = expression(str(key).partition("?")[0])
+        own = [token for token in self._net.tokens if asked is not None and asked.intersects(zenoh.KeyExpr(token))]
+        return [*self._net.replies, *(Reply(Sample(token, "", b""), good=True) for token in own)]
 
 
 @lru_cache(4096)
@@ -154,13 +171,15 @@ class Net:
 
     Attributes:
         first: What waits for whoever subscribes, by key.
-        replies: What every question is answered with.
+        replies: What every question is answered with, besides `tokens` that it asks for.
+        tokens: Keys of the tokens of the session.
     """
 
     def __init__(self) -> None:
         self.channels: list[Channel] = []
         self.first: dict[str, Sample] = {}
         self.replies: list[Reply] = []
+        self.tokens: list[str] = []
         self.session = Session(self)
         self.forget = self.channels.clear
 

@@ -15,7 +15,7 @@ from types import SimpleNamespace
 import pytest
 
 from agents.body.limits import Safety
-from agents.network import messages, name_ownership, pubsub
+from agents.network import messages, name_ownership
 from agents.network import session as network
 from agents.network.keys import Keys
 from agents.network.name_ownership import NameTaken, OwnershipTiming, claim, confirm_ownership
@@ -336,18 +336,14 @@ def test_link_that_is_back_waits_for_owner(taken, monkeypatch):
         assert (body.calls, body.commands, len(puts)) == (["open"], *back)
 
 
-def test_late_alarm_leaves_the_tokens(monkeypatch):
-    body, tokens, shown = Commanded(rows=2), [], [Keys().alive("A"), Keys().alive("B")]
-
-    def declared(_session: object, key: str) -> SimpleNamespace:
-        tokens.append(key)
-        return SimpleNamespace(undeclare=lambda: tokens.remove(key))
+def test_late_alarm_leaves_the_tokens():
+    body, shown = Commanded(rows=2), [Keys().alive("A"), Keys().alive("B")]
 
     def alarm(why: str, expected: list[str]) -> None:
         """The robots leave the formation, in a thread of the watchdog."""
         runtime.watchdog.call_for_help(why)
         until(lambda: not any(thread.name == "watchdog: alarm" for thread in threading.enumerate()))
-        assert [key for key in tokens if key in shown] == expected
+        assert [key for key in net.tokens if key in shown] == expected
 
     def hang() -> None:
         runtime.watchdog.tripped = "it hangs"
@@ -362,15 +358,28 @@ def test_late_alarm_leaves_the_tokens(monkeypatch):
         yield
         hang()
         yield  # A is retired, without the token that the alarm has taken back
-        assert [key for key in tokens if key in shown] == shown[1:]
+        assert [key for key in net.tokens if key in shown] == shown[1:]
         raise OSError("the test is over")
 
-    with Net().worn() as net, monkeypatch.context() as patched:
-        patched.setattr(pubsub, "alive_token", declared)
+    with Net().worn() as net:
         runtime = process(pair(), body, descent=QUICK, loop_timeout_s=PATIENCE_S)
         body.looks = partial(next, steps(), None)
         with pytest.raises(OSError, match="the test is over"):
             runtime.run()
+
+
+@pytest.mark.parametrize("forgets", [0, 3])
+def test_empty_answer_is_no_answer(forgets):
+    """The own token is missing: nothing is known of others, whatever the reason."""
+    session, answers = Net().session, []
+    own = session.declare_token(Keys.life("park/F/alive", session.zid()))
+    with Net().worn():
+        hidden = iter([*[True] * forgets, *[False] * 1000])
+        get = session.get
+        session.get = lambda key, **given: [] if next(hidden) else get(key, **given)
+        confirm_ownership(session, ["park/F/alive"], threading.Event(), note=answers.append)
+    own.undeclare()
+    assert len(answers) >= forgets + 2
 
 
 @pytest.mark.mechanism("name ownership")
