@@ -145,6 +145,8 @@ def campaign(seeds: Sequence[int], choice: Choice, processes: int) -> int:
             for _seed, flight in fly([seed], choice, nursery):
                 if isinstance(flight, Flight):
                     total.add(flight)
+                    if total.flights % 25 == 0:
+                        print(f"{total}; broken {dict(rules)}", file=sys.stderr, flush=True)
                     codes[flight.code] += 1
                     rules.update(broken(flight))
                 else:
