@@ -25,6 +25,7 @@ from agents.network import messages, pubsub
 from agents.network import session as network
 from agents.network.shutdown import leave
 from agents.runtime.range_inbox import RangeInbox
+from agents.safety.preflight import FLOOR_M
 from agents.vectors import NO_SETPOINT, ZERO, Setpoint, Vector, norm
 from bridges.measured_flight import FRESH_S, SETTLED, MeasuredFlight
 
@@ -75,6 +76,12 @@ class _ExternalRobot:
         """Velocity [m/s]; a robot on wheels without positions stands some time after a halt."""
         stands = not self.flies and now - self.flight.landing_since > HALT_S and now - self.pose.time > FRESH_S
         return ZERO if stands else self.pose.velocity
+
+    def adopt_flight(self) -> None:
+        """Count a robot in the air as flying: a former process, which has died there, had ordered its take-off."""
+        x, y, z = self.pose.position
+        if self.flies and not self.flight.flying and z > FLOOR_M:
+            self.flight.take_off((x, y, 0.0))
 
     def goes_on(self, now: float) -> bool:
         """Whether the robot was stopped, and is not measured to stand."""
@@ -196,6 +203,7 @@ class ExternalBody(Body):
         for row in rows:
             robot = self._robots[row]
             if not robot.stopped:
+                robot.adopt_flight()
                 robot.flight.land(self._now())
                 self._send_order(row, "land", inf if robot.flight.flying else HALT_S)
 
@@ -205,6 +213,7 @@ class ExternalBody(Body):
             robot = self._robots[row]
             if not robot.stopped:
                 robot.stopped_since = now = self._now()
+                robot.adopt_flight()
                 # from now on the robot counts as flying until it is measured on the ground
                 robot.flight.land(now)
                 self._send_order(row, "stop", inf)

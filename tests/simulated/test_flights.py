@@ -2,6 +2,7 @@
 
 import re
 
+from tests.simulated.experiments import MIX
 from tests.simulated.faults import Fault
 from tests.simulated.laboratory import Flight, fly
 
@@ -102,6 +103,15 @@ def test_recorder_is_awaited_before_the_start():
     flight = triangle(Fault(0.5, "kill", "recorder", since="ready"))
     assert flight.code == 0, flight.output
     assert flight.metrics[0]["planned_s"] == SPAN_S
+
+
+def test_drone_found_in_the_air_lands_before_it_is_done():
+    flight = fly(MIX, Fault(4.1, "kill", "C"), case="world")
+    former, later = flight.of("world-C")
+    done = [each.t for each in flight.robots["C"].phases if (each.phase, each.pid) == ("done", later.pid)]
+    assert (former.code, later.code) == (-9, 0)
+    assert done[0] >= flight.robots["C"].off(after=4.1)
+    assert flight.violations == []
 
 
 def test_recording_that_breaks_off_fails_the_run():
