@@ -105,7 +105,7 @@ def test_recorder_is_awaited_before_the_start():
     assert flight.metrics[0]["planned_s"] == SPAN_S
 
 
-def test_drone_found_in_the_air_lands_before_it_is_done():
+def test_drone_found_aloft_is_down_when_done():
     flight = fly(MIX, Fault(4.1, "kill", "C"), case="world")
     former, later = flight.of("world-C")
     done = [each.t for each in flight.robots["C"].phases if (each.phase, each.pid) == ("done", later.pid)]
