@@ -232,12 +232,11 @@ def silent_landing(look: Look, seen: Seen) -> str:
 
 
 def _misled(look: Look, seen: Seen) -> bool:
-    """Whether its body or its process cannot do what it should."""
-    faults = [fault for fault in look.world.script if fault.who == seen.name and fault.kind in {"body", "capture"}]
-    return (
-        any(any(word in str(fault.size) for word in ("motors", "stuck", "adrift")) for fault in faults)
-        or not seen.prompt
-    )
+    """Whether its body or its process cannot do what it should; a twin stands still while its loop hangs."""
+    faults = [fault for fault in look.world.script if fault.who == seen.name]
+    sizes = [str(fault.size) for fault in faults if fault.kind in {"body", "capture"}]
+    wrong = any(word in size for size in sizes for word in ("motors", "stuck", "adrift"))
+    return wrong or any(fault.kind == "hang" for fault in faults) or not seen.prompt
 
 
 @rule(OF_ROBOTS, "its landing makes no progress for this time")
