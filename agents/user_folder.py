@@ -67,6 +67,13 @@ def foreign_folders() -> list[Path]:
     return foreign
 
 
+def private(folder: Path) -> Path:
+    """A folder of the user alone, made if it is missing; raises PermissionError for one that others could write to."""
+    folder.mkdir(OWN, parents=True, exist_ok=True)
+    _check(folder, os.getuid())
+    return folder
+
+
 def _check(folder: Path, user: int) -> None:
     """Raises PermissionError for a folder to which others than its user could write."""
     about = folder.lstat()

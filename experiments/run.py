@@ -35,7 +35,7 @@ from experiments.recording.reader import RecordingError
 from experiments.recording.run_folder import METRICS, SOURCE, SWEEP, case_figures, differences_from_first, read_origin
 from experiments.recording.trace import Trace
 from experiments.report import metrics_files
-from experiments.virtual_time import simulation
+from experiments.virtual_time import simulation, stretch
 from experiments.virtual_time.log import RunRecorder
 
 if TYPE_CHECKING:
@@ -187,14 +187,16 @@ def simulate_seeds(
     works = {name: standby.without_standby(case) for name, case in chosen(read, cases).items()}
     runs = [Run(read.experiment.title, seed, {}, {}, folder, read.listing) for seed in seeds]
     first, *others = runs
+    expected_s = {name: len(seeds) * stretch.plain_s(plan) for name, plan in works.items()}
     count = min(_profitable_processes(works, len(others)) if processes is None else processes, len(works) * len(others))
     with pool(count) as workers:
         shared = dict[tuple[str, int], Future[Flown]]()
         if workers is not None:
             for name, run in product(works, others):
-                shared[name, run.seed] = workers.submit(_flown, name, works[name], run.seed)
+                shared[name, run.seed] = workers.submit(_flown, name, works[name], run.seed, expected_s[name])
         for name, plan in works.items():
             duration_s = plan.experiment.duration_s
+            stretch.expect(expected_s[name])
             passing = partial(_pass_progress, progress, name, duration_s)
             log = simulation.simulate(plan, first.seed, progress=passing, watch=watch(name, plan))
             logbook = RunRecorder(log, plan, name)
@@ -211,10 +213,11 @@ def simulate_seeds(
                     unrecorded = unrecorded or f"{file}: cannot be written: {error.__cause__.strerror}"
             for number, run in enumerate(others, 2):
                 future = shared.get((name, run.seed))
-                found = _flown(name, plan, run.seed, passing) if future is None else _result(future)
+                found = _flown(name, plan, run.seed, expected_s[name], passing) if future is None else _result(future)
                 run.traces[name], run.metrics[name] = found
                 passing(duration_s * number / len(seeds))
             passing(math.inf)
+    stretch.expect(0.0)
     if unrecorded:
         raise Unrecorded(f"{unrecorded}; make room there, or choose another place", runs)
     return runs
@@ -223,8 +226,11 @@ def simulate_seeds(
 Flown = tuple[Trace, CaseMetrics]
 
 
-def _flown(name: str, plan: Plan, seed: int, progress: Callable[[float], object] = lambda _: None) -> Flown:
-    """Trace and metrics of a run of a case."""
+def _flown(
+    name: str, plan: Plan, seed: int, expected_s: float, progress: Callable[[float], object] = lambda _: None
+) -> Flown:
+    """Trace and metrics of a run of a case; `expected_s`: about what all its runs would take in plain Python [s]."""
+    stretch.expect(expected_s)
     trace = RunRecorder(simulation.simulate(plan, seed, progress=progress), plan, name).trace()
     return trace, measure.measure(trace)
 

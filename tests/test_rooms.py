@@ -145,10 +145,6 @@ def test_robots_compute_without_arrays():
     assert not [name for name in EXTRAS if "numpy" in imported(ast.parse(texts()[name]).body)]
 
 
-def test_one_module_knows_the_compiler():
-    assert importing("numba", "llvmlite") == {"experiments.virtual_time.compiler"}
-
-
 def test_no_folder_is_too_full():
     count = Counter(file.parent for file in modules().values())
     assert [str(folder) for folder, inside in count.items() if inside > MOST] == []
@@ -262,4 +258,4 @@ def test_kinds_stand_in_their_own_files():
 def test_modules_read_the_module_time():
     """A test, or a simulation, that replaces a function of `time` replaces it everywhere."""
     named = [name for name, text in texts().items() if re.search(r"^\s*from time import", text, re.MULTILINE)]
-    assert named == ["experiments.virtual_time.stretch"]
+    assert not named

@@ -104,7 +104,8 @@ class SetpointFilter:
         if now.invalid or self.not_finite:
             return safe
         a, b, c, d = avoidance.restrain(safe, own, near)
-        if (a, b, c, d) == safe or not (isfinite(a) and isfinite(b) and isfinite(c) and isfinite(d)):
+        same = a == safe[0] and b == safe[1] and c == safe[2] and d == safe[3]
+        if same or not (isfinite(a) and isfinite(b) and isfinite(c) and isfinite(d)):
             return safe
         again = self._within((a, b, c, d), now)
         self.avoided, self.changed = differ(again, safe), differ(again, setpoint)

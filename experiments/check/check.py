@@ -14,7 +14,7 @@ from experiments.check import motion, noise, safety, theory
 from experiments.check import obstacles as surroundings
 from experiments.check.analysis import Analysis
 from experiments.check.findings import FORGIVEN, MARK, NOT_RANDOM, CheckNumbers, Finding, first_of_each_code
-from experiments.check.ideal_run import predict, ticking_plugins
+from experiments.check.ideal_run import isolated, predict, refusal, ticking_plugins
 from experiments.check.realisation import algebraic_connectivity
 from experiments.definition import standby
 from experiments.definition.graph import edges
@@ -22,7 +22,7 @@ from experiments.definition.plan import Plan
 from experiments.file.cases import Source
 from experiments.file.document import Document, chosen
 from experiments.file.problems import Fault, Path, Problem, TextPosition, nearest
-from experiments.virtual_time.source import is_foreign, outside
+from experiments.virtual_time import machine
 
 MOST_NAMED: Final = 5  # cases that a finding names
 QUIET: Final = np.errstate(all="ignore")  # absurd numbers overflow on their way to a finding that says so
@@ -37,16 +37,16 @@ def chance(analysis: Analysis) -> Iterator[Finding]:
 
 
 def compilation(analysis: Analysis) -> Iterator[Finding]:
-    """Say what a plug-in that cannot be compiled costs."""
+    """Say what a plug-in of others that cannot be compiled costs."""
+    plan = analysis.plan
+    foreign = [each for each in ticking_plugins(plan) if each.__module__.partition(".")[0] != "agents"]
     cost = "runs in virtual time and sweeps take 10 to 20 times as long as compiled ones"
-    for plugin in ticking_plugins(analysis.plan):
-        if not analysis.is_gradient and plugin is type(analysis.plan.law):
-            if is_foreign(plugin):
-                yield Finding("remark", "uncompiled", f"laws that remember are not compiled: {cost}")
-            continue
-        for text in outside(plugin)[:1]:
-            message = f"{plain(text)}, which is not compiled: {cost} (docs/plugins.md, the subset)"
-            yield Finding("remark", "uncompiled", message)
+    if foreign and not analysis.is_gradient:
+        if type(plan.law) in foreign:
+            yield Finding("remark", "uncompiled", f"laws that remember are not compiled: {cost}")
+    elif foreign and machine.works() and (text := refusal(isolated(plan).changed(avoidance=plan.experiment.avoidance))):
+        message = f"{plain(text)}, which is not compiled: {cost} (docs/plugins.md, the subset)"
+        yield Finding("remark", "uncompiled", message)
 
 
 SUBJECTS: Final = (

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
@@ -21,7 +22,6 @@ from experiments.definition.experiment import WorldTable
 from experiments.definition.plan import Plan
 from experiments.recording.trace import ROUNDING_S, poses_in_run
 from experiments.virtual_time import conductor, simulation, stretch
-from experiments.virtual_time.source import outside
 from twins.arrays import Array, norm
 
 ENDLESS_M: Final = 1e6  # [m] walls that no robot meets
@@ -84,14 +84,18 @@ def isolated(plan: Plan) -> Plan:
 
 def flown_ticks(bare: Plan, ticks: float) -> float:
     """Robot ticks that are flown, of `ticks`."""
-    most = SPEED_UP * WORK
-    if FLIGHTS * stretch.TICK_S * min(ticks, most) < stretch.COMPILES_S:  # to compile would take longer
+    if ticks <= WORK or refusal(bare):
         return WORK
-    flight = simulation.VirtualRun(bare, bare.experiment.seed, quiet=True, lean=True)
-    if not stretch.possible(flight) or any(map(outside, ticking_plugins(bare))):
-        return WORK
-    stretch.WORK[0] += stretch.COMPILES_S  # the first flight is compiled as well
-    return most
+    return SPEED_UP * WORK
+
+
+def refusal(bare: Plan) -> str:
+    """Reason why the ticks of a plan are not compiled, as a second of it shows; empty if they are."""
+    stretch.WORK[0] += stretch.PAYS_S
+    flight = simulation.VirtualRun(bare.changed(duration_s=1.0), bare.experiment.seed, quiet=True, lean=True)
+    with suppress(conductor.Stuck):
+        flight.fly(landing=False, progress=lambda _: None, watch=None)
+    return "it is not possible" if flight.stretches is None else flight.stretches.refusal
 
 
 def ticking_plugins(plan: Plan) -> list[type]:

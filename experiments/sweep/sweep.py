@@ -36,7 +36,7 @@ from experiments.sweep.runs import RunMetrics, code_of, lean_enough
 from experiments.sweep.store import Store, StoreOrigin
 from experiments.sweep.table import CellRow
 from experiments.sweep.workers import Work, Workers, workers
-from experiments.virtual_time import stretch
+from experiments.virtual_time import machine, stretch
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -156,6 +156,7 @@ class SweepRunner:
         # cases in turn, so that each process compiles another one
         works = [work for turn in zip_longest(*by_case.values()) for work in turn if work is not None]
         done = 0
+        machine.works()  # says once if not, and not in each process
         progress(0, total)
         for work, outcome in self.workers.done(works):
             self.store.add(work.cell, work.code, outcome)

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from array import array
+from collections.abc import Sequence
 from typing import Final
 
 from agents.decision.neighbours import Neighbour
@@ -138,6 +139,17 @@ class Ledger:
         samples[k + 11], samples[k + 12], samples[k + 13] = robot.goal
         samples[k + 14], samples[k + 15], samples[k + 16], samples[k + 17] = robot.setpoint
         samples[k + 18] = robot.error
+
+
+class Crew:
+    """Members, those of the same layout in lists g0, g1, ..., and the notes of a stretch."""
+
+    ledger: Ledger
+
+    def __init__(self, groups: Sequence[list[Member]], ledger: Ledger) -> None:
+        self.ledger = ledger
+        for k, group in enumerate(groups):
+            setattr(self, f"g{k}", group)
 
 
 def advance(members: list[Member], t: float, dt: float) -> None:

@@ -6,7 +6,6 @@ each. Which attributes a record has follows from the values that an object has; 
 
 from __future__ import annotations
 
-import hashlib
 import struct
 from array import array
 from collections.abc import Callable, Iterable, Sequence
@@ -45,9 +44,9 @@ class Items:
 class RecordLayout:
     """Attributes of objects of one class with values of the same kinds."""
 
-    def __init__(self, owner: type, fields: dict[str, Any], fixed: dict[str, Any], name: str) -> None:
-        """`fixed`: attributes that are constants, with their values; `name` tells layouts apart in any process."""
-        self.owner, self.fields, self.fixed, self.name = owner, fields, fixed, name
+    def __init__(self, owner: type, fields: dict[str, Any], fixed: dict[str, Any]) -> None:
+        """`fixed`: attributes that are constants, with their values."""
+        self.owner, self.fields, self.fixed = owner, fields, fixed
         self.frozen = is_frozen(owner)
         self.offset, words = dict[str, int](), 0
         for attribute, kind in fields.items():
@@ -56,7 +55,7 @@ class RecordLayout:
         self.store, self.load = _storing(self), _loading(self)
 
     def __repr__(self) -> str:
-        return self.name
+        return f"{self.owner.__name__} at {id(self)}"
 
 
 def width(kind: Any) -> int:
@@ -160,9 +159,7 @@ class Layouts:
         key = (owner, tuple(fields.items()), repr(fixed) if fixed else "")
         layout = LAYOUTS.get(key)
         if layout is None:
-            text = f"{owner.__module__}.{owner.__qualname__} {fields} {fixed}"
-            name = f"{owner.__name__}-{hashlib.sha256(text.encode()).hexdigest()[:20]}"
-            layout = LAYOUTS[key] = RecordLayout(owner, fields, fixed, name)
+            layout = LAYOUTS[key] = RecordLayout(owner, fields, fixed)
         self._of[id(thing)] = (thing, layout)
         return layout
 
@@ -170,8 +167,8 @@ class Layouts:
 class Image:
     """Objects stored in memory, for as long as compiled functions work on them."""
 
-    def __init__(self, roots: Sequence[tuple[Any, Any]], words: int = 1 << 12) -> None:
-        """Store `roots`, each with its kind, and all objects that they lead to.
+    def __init__(self, roots: Sequence[tuple[Any, RecordLayout]], words: int = 1 << 12) -> None:
+        """Store `roots`, each with its layout, and all objects that they lead to.
 
         Args:
             words: About as many as they take.
@@ -179,14 +176,9 @@ class Image:
         Raises:
             TypeError: If an object is not as its layout says.
         """
-        self._roots, self._size = roots, words
+        self.roots, self._size = roots, words
         while not self._store():
             self._size *= 2
-
-    @property
-    def places(self) -> list[int]:
-        """Addresses of the roots, each with the number of objects there."""
-        return [number for thing, kind in self._roots for number in (self.address(thing), _count(thing, kind))]
 
     def address(self, thing: Any) -> int:
         return self.known[id(thing)]
@@ -208,8 +200,8 @@ class Image:
         self._lists: list[tuple[list[Any], Items, int]] = []
         self.used = 0
         try:
-            for thing, kind in self._roots:
-                self.put_items(thing, kind) if isinstance(kind, Items) else self.put(thing, kind)
+            for thing, layout in self.roots:
+                self.put(thing, layout)
         except _FullError:
             return False
         return True
@@ -257,10 +249,6 @@ class Image:
                     self._lists.append((items, kind, at))
             struct.pack_into(f"{count * kind.words}{kind.code}", self.memory, at, *values)
         return found, count
-
-
-def _count(thing: Any, kind: Any) -> int:
-    return len(thing) if isinstance(kind, Items) else 1
 
 
 class _FullError(Exception):

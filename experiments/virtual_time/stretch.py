@@ -1,24 +1,12 @@
-"""Stretches of a run in which nothing happens to a robot, flown by compiled functions.
-
-What is compiled is kept in the user's cache folder: the first time takes 5 to 15 s, later ones a fraction of a second.
-It is used where it pays.
-"""
+"""Stretches of a run in which nothing happens to a robot, flown by functions that are compiled where it pays."""
 
 from __future__ import annotations
 
-import fcntl
-import gc
-import hashlib
-import os
-import re
+import ctypes
 import sys
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib.util import find_spec
-from inspect import isfunction
-from pathlib import Path
-from time import time
 from typing import Any, Final, Protocol
 
 import msgspec
@@ -27,19 +15,17 @@ import numpy as np
 from agents.decision.lifecycle import READY
 from agents.plugins.planners import NO_TARGET, Itinerary
 from agents.robot import Robot
-from agents.user_folder import cache_folder
 from experiments.definition.plan import Plan
-from experiments.recording.version import digest, file_digest
-from experiments.virtual_time import company
-from experiments.virtual_time.company import AT_END, Ledger, Member, Planned, Way
+from experiments.virtual_time import company, machine
+from experiments.virtual_time.company import AT_END, Crew, Ledger, Member, Planned, Way
 from experiments.virtual_time.network import VirtualNetwork
-from experiments.virtual_time.records import BOOL, FLOAT, INT, Image, Items, Layouts, RecordLayout
-from experiments.virtual_time.source import OURS
+from experiments.virtual_time.records import Image, Layouts, RecordLayout
+from experiments.virtual_time.translation import BOOLEAN, DOUBLE, WHOLE, OutsideError, Program
 from twins.body import TwinBody
 
 TICK_S: Final = 15e-6  # of CPU for a tick of a robot in plain Python: 10 to 20 µs
-PAYS_S: Final = 1.0  # for less work in a process plain Python is quicker than to load numba and a loop (0.6 s),
-COMPILES_S: Final = 10.0  # or to compile, which is kept
+PAYS_S: Final = 0.3  # for less work in a process plain Python is quicker than to translate and compile
+OFTEN_S: Final = 20.0  # of work that follows, for which a second of `cc` pays
 LONGEST: Final = 10_000  # ticks of a stretch,
 ROBOT_TICKS: Final = 1_000_000  # and of all robots in it: noise is drawn, and room kept, for all of them beforehand
 LEAST: Final = 20  # after a stretch of fewer ticks
@@ -48,9 +34,8 @@ LONGEST_PAUSE: Final = 160  # at most
 ROOM: Final = 2  # more samples on a link than its delay asks for
 STEPS: Final = ("advance", "deliver", "observe", "transmit", "detect", "pursue", "note")
 DRIVER: Final = """
-def {name}({parameters}, at, rows, k, end, dt, log_every, instant):
-    {open}
-    ledger = open_ledger(at, rows)
+def stretch(crew, k, end, dt, log_every, instant):
+    ledger = crew.ledger
     while k < end:
         t = k * dt
         {advance}
@@ -69,20 +54,20 @@ def {name}({parameters}, at, rows, k, end, dt, log_every, instant):
             ledger.reason = AT_HAZARDS
             return k
         {pursue}
-        if (g0[0].robot.tick - 1) % log_every == 0:
+        if (crew.g0[0].robot.tick - 1) % log_every == 0:
             {note}
             ledger.times[ledger.sample] = t
             ledger.sample += 1
         k += 1
     return k
 """
-WORK: Final = [0.0]  # seconds of plain Python that the flights of this process take, about, and those that will follow
-COLOUR: Final = re.compile(r"\x1b\[[0-9;]*m")  # of a compiler's messages
-REFUSED: Final[dict[str, str]] = {}  # by driver, why it cannot be compiled
-DRIVERS: Final[dict[tuple[Any, ...], Any]] = {}  # compiled loops of this process; None: it cannot be compiled
+TYPES: Final[dict[str, Any]] = {WHOLE: ctypes.c_int64, DOUBLE: ctypes.c_double, BOOLEAN: ctypes.c_bool}
+GIVEN: Final = (WHOLE, WHOLE, DOUBLE, WHOLE, BOOLEAN)  # arguments of the driver behind the crew
+WORK: Final = [0.0, 0.0]  # seconds of plain Python that flights of this process take, about, and that were announced
+REFUSED: Final[dict[str, str]] = {}  # by law or crew, why it cannot be compiled
+DRIVERS: Final[dict[RecordLayout, CompiledLoop]] = {}  # of this process
 RECENT: Final[dict[bytes, Prepared]] = {}  # of cases that this process has flown; a few
 MAX_RECENT: Final = 8  # of those
-STEADY: Final = frozenset({"numpy", "msgspec"})  # of others, but no plug-ins
 
 
 class Flown(Protocol):
@@ -115,13 +100,13 @@ def plain_s(plan: Plan) -> float:
 
 
 def expect(seconds: float) -> None:
-    """Announce flights: seconds of plain Python in this process and in those that share its compiled loops."""
-    WORK[0] = max(WORK[0], seconds)
+    """Announce flights of a case, some of them in this process: seconds of plain Python."""
+    WORK[:] = max(WORK[0], seconds), seconds
 
 
 def possible(flight: Flown) -> bool:
-    """Whether the robots of a flight can be flown by compiled functions, unless their compiler refuses a plug-in."""
-    if not flight.lonely or find_spec("numba") is None:
+    """Whether the robots of a flight can be flown by compiled functions, unless a plug-in is outside of the subset."""
+    if not flight.lonely or not machine.works():
         return False
     if any(robot.goals.changes_shape or robot.guidance is not None for robot in flight.robots):
         return False
@@ -133,13 +118,22 @@ def possible(flight: Flown) -> bool:
 
 
 @dataclass
+class CompiledLoop:
+    """Compiled loop over ticks for a crew, or why there is none."""
+
+    program: Program
+    often: bool  # compiled for speed
+    run: Any = None
+    refusal: str = ""
+
+
+@dataclass
 class Prepared:
     """Stored layout of the robots of a case, and their compiled loop."""
 
     rows: list[list[int]]  # of robots of the same layout
-    kinds: tuple[Items, ...]  # of each of those
-    of_ledger: RecordLayout
-    run: Any
+    layout: RecordLayout  # of the crew
+    driver: CompiledLoop
     words: int = 1 << 12  # that all objects take, at most, so far
 
 
@@ -147,6 +141,7 @@ class Stretches:
     """Compiled ticks of the robots of a flight."""
 
     flown: int  # ticks so far
+    refusal: str  # why nothing can be compiled, empty as long as it can
 
     def __init__(self, flight: Flown) -> None:
         self._flight, self._case = flight, msgspec.json.encode(flight.plan.experiment)
@@ -160,7 +155,9 @@ class Stretches:
             self._members[sender.sender].ways.append(way)
             self._ways.append(way)
         self._plans: dict[int, Planned] = {}
-        self._paused_until, self._pause, self._refused, self._misfit, self.flown = 0, PAUSE, False, "", 0
+        self.flown, self.refusal = 0, ""
+        self._prepared: Prepared | None = None
+        self._paused_until, self._pause, self._refused = 0, PAUSE, False
 
     def fly(self, k: int, end: int) -> tuple[int, int]:
         """Fly the ticks from `k` on to before `end`; returns the tick at which the stretch ended, and why.
@@ -184,7 +181,6 @@ class Stretches:
         with self._planned(k, end):
             last = self._run(ledger, k, end)
         if last < 0:
-            self._paused_until = k + LONGEST
             flight.network.leave(self._ways, self._members, ledger, before, -np.inf)
             return k, AT_END
         if last - k < LEAST:
@@ -199,61 +195,53 @@ class Stretches:
         return last, ledger.reason
 
     def _run(self, ledger: Ledger, k: int, end: int) -> int:
-        """Run the compiled loop; returns the tick at which it ended, −1 without one."""
-        flight = self._flight
-        try:
-            prepared = RECENT.get(self._case)
-            image = None if prepared is None else self._image(prepared, ledger)
-            if prepared is None or image is None:
-                prepared = self._prepared(ledger)
-                if prepared is None:
-                    return -1
-                image = self._image(prepared, ledger)
-        except LookupError:
+        """Run the compiled loop; returns the tick at which it ended, −1 without one or after an error."""
+        flight, prepared, image, found = self._flight, self._prepared or RECENT.get(self._case), None, -1
+        if prepared is not None and (self._prepared is not None or not prepared.driver.program.changed()):
+            image = self._image(prepared, ledger)
+        if prepared is None or image is None:
+            prepared = self._new(ledger)
+            image = self._image(prepared, ledger)
+        self._prepared, self.refusal = prepared, prepared.driver.refusal or self.refusal
+        if self.refusal:
+            REFUSED[str(prepared.layout)] = self.refusal
+        elif image is not None:
+            crew = image.address(image.roots[0][0])
+            found = prepared.driver.run(crew, k, end, flight.dt, flight.log_every, flight.network.instant)
+        if found < 0:  # flown plain; that tells an error
             self._refused = True
-            return -1
-        if image is None:
-            REFUSED[str(prepared.of_ledger)], self._refused = self._misfit, True
-            return -1
-        instant = flight.network.instant
-        try:
-            found = prepared.run(*image.places, k, end, flight.dt, flight.log_every, instant)
-        except (ArithmeticError, LookupError, ValueError):  # of a plug-in: flown plain, the error tells where
-            self._refused = True
-            return -1
-        image.load()
+        elif image is not None:
+            image.load()
         return int(found)
 
     def _image(self, prepared: Prepared, ledger: Ledger) -> Image | None:
         """All objects in memory, None if they are not of these layouts."""
-        groups = [[self._members[row] for row in rows] for rows in prepared.rows]
+        crew = Crew([[self._members[row] for row in rows] for rows in prepared.rows], ledger)
         try:
-            image = Image([*zip(groups, prepared.kinds, strict=True), (ledger, prepared.of_ledger)], prepared.words)
+            image = Image([(crew, prepared.layout)], prepared.words)
         except TypeError as error:
-            self._misfit = str(error)
+            self.refusal = str(error)
             return None
-        prepared.words = max(prepared.words, image.used)
+        self.refusal, prepared.words = "", max(prepared.words, image.used)
         return image
 
-    def _prepared(self, ledger: Ledger) -> Prepared | None:
-        """Layouts and compiled loop of these robots, None as long as that does not pay; raises LookupError if never."""
-        layouts, groups = Layouts(), dict[str, list[int]]()
+    def _new(self, ledger: Ledger) -> Prepared:
+        """Layouts and compiled loop of these robots; raises OutsideError, or NoCompilerError, if there is none."""
+        layouts, groups = Layouts(), dict[RecordLayout | None, list[int]]()
         for member in self._members:
             layouts.of(member)
         if layouts.guessed:  # the kinds of lists that are empty for some robots are known now
             layouts.forget()
         for member in self._members:
-            groups.setdefault(str(layouts.of(member)), []).append(member.row)
-        kinds = tuple(Items(layouts.of(self._members[rows[0]])) for rows in groups.values())
-        of_ledger = Layouts().of(ledger)
-        assert of_ledger is not None
-        run = driver(kinds, of_ledger)
-        if run is None:
-            return None
+            groups.setdefault(layouts.of(member), []).append(member.row)
+        rows = [*groups.values()]
+        layout = layouts.of(Crew([[self._members[row] for row in each] for each in rows], ledger))
+        assert layout is not None
         while len(RECENT) >= MAX_RECENT:
             del RECENT[next(iter(RECENT))]
-        RECENT[self._case] = made = Prepared([*groups.values()], kinds, of_ledger, run)
-        return made
+        often = max(WORK[1], plain_s(self._flight.plan)) > OFTEN_S
+        RECENT[self._case] = found = Prepared(rows, layout, driver(layout, len(rows), often=often))
+        return found
 
     def _next_leg(self) -> int:
         """Tick on which the next leg of a plan begins, or a later one; those of a decision around it are plain."""
@@ -294,112 +282,32 @@ def _goes_on(robot: Robot, t: float) -> bool:
     return (robot.lifecycle.phase > READY or robot.lifecycle.climbing) and robot.is_steady(t)
 
 
-def driver(kinds: tuple[Items, ...], of_ledger: RecordLayout) -> Any:
-    """Compiled loop over ticks for groups of robots of these kinds; None without one, and as long as it does not pay.
+def driver(crew: RecordLayout, groups: int, *, often: bool) -> CompiledLoop:
+    """Compiled loop over ticks for a crew of this number of groups."""
+    known = DRIVERS.get(crew)
+    if known is None or known.program.changed() or often > known.often:
+        DRIVERS[crew] = known = CompiledLoop(Program(), often)
 
-    Raises LookupError if there will be none.
-    """
-    key = (*kinds, of_ledger)
-    if key not in DRIVERS:
-        owners = {layout.owner for layout in _layouts(key)}
-        text = f"{kinds} {of_ledger} {code_of(owners)} {digest()}"
-        name, folder = "fly_" + hashlib.sha256(text.encode()).hexdigest()[:24], cache_folder() / "compiled"
-        known = any(folder.glob(f"*/*{name}*.nbi"))
-        if not known and WORK[0] < COMPILES_S:
-            return None
-        with _alone(folder, name) as alone:
-            if not (known or alone):  # another process makes it
-                return None
-            DRIVERS[key] = _compiled(name, kinds, of_ledger, folder)
-    if DRIVERS[key] is None:
-        raise LookupError
-    return DRIVERS[key]
+        def each(text: str) -> str:
+            return "; ".join(text.format(f"crew.g{k}") for k in range(groups))
 
-
-def code_of(owners: Iterable[type]) -> str:
-    """Digest of the modules of plug-ins of others, with functions and numbers that they have from elsewhere."""
-    waiting, known, total = {base.__module__ for owner in owners for base in owner.__mro__}, set[str](), []
-    while waiting:
-        name = waiting.pop()
-        top = name.partition(".")[0]
-        if name in known or top in OURS or top in STEADY or top in sys.stdlib_module_names:
-            continue
-        known.add(name)
-        module = sys.modules[name]
-        file = getattr(module, "__file__", None)
-        values = vars(module)
-        numbers = {key: each for key, each in values.items() if isinstance(each, int | float | tuple)}
-        total.append(f"{name} {file_digest(Path(file)) if file else time()} {numbers}")  # of a notebook: never the same
-        waiting |= {str(each.__module__) for each in values.values() if isfunction(each)}
-    return " ".join(sorted(total))
-
-
-def _compiled(name: str, kinds: Sequence[Items], of_ledger: RecordLayout, folder: Path) -> Any:
-    """Loop of that name, from the cache folder or new; None if it cannot be had, and then `REFUSED` says why."""
-    gc.disable()  # a compiler leaves much behind at once, and hardly any circles: a fifteenth of its time
-    try:
-        return _loop(name, kinds, of_ledger, folder)
-    except Exception as error:  # noqa: BLE001 - of a compiler, its cache and plug-ins: the run is flown without them
-        REFUSED[name] = COLOUR.sub("", f"{type(error).__name__}: {error}")
-        return None
-    finally:
-        gc.enable()
-
-
-def _loop(name: str, kinds: Sequence[Items], of_ledger: RecordLayout, folder: Path) -> Any:
-    if not (folder.is_dir() and os.access(folder, os.W_OK)):
-        raise OSError(f"nothing can be kept in {folder}")
-    from experiments.virtual_time.compiler import compiled, kept, opened  # noqa: PLC0415 - half a second, and a level
-
-    count = range(len(kinds))
-
-    def each(text: str) -> str:
-        return "; ".join(text.format(k=k) for k in count)
-
-    source = DRIVER.format(
-        name=name,
-        parameters=", ".join(f"a{k}, n{k}" for k in count),
-        open=each("g{k} = open{k}(a{k}, n{k})"),
-        advance=each("advance(g{k}, t, dt)"),
-        deliver=each("deliver(g{k}, t)"),
-        observe=each("moves = observe(g{k}, t) or moves"),
-        transmit=each("transmit(g{k}, t, ledger)"),
-        detect=each("trouble = detect(g{k}, t) or trouble"),
-        pursue=each("pursue(g{k}, t)"),
-        note=each("note(g{k}, ledger)"),
-    )
-    space: dict[str, Any] = {"__name__": __name__, "AT_PHASES": company.AT_PHASES, "AT_HAZARDS": company.AT_HAZARDS}
-    space |= {step: compiled(getattr(company, step)) for step in STEPS}
-    space |= {f"open{k}": opened(kind) for k, kind in enumerate(kinds)}
-    space["open_ledger"] = opened(of_ledger)
-    exec(compile(source, __file__, "exec"), space)
-    return kept(space[name], (*(INT,) * (2 * len(kinds) + 4), FLOAT, INT, BOOL), folder)
-
-
-def _layouts(kinds: Sequence[Any]) -> Iterator[RecordLayout]:
-    """All layouts that these kinds lead to."""
-    for kind in kinds:
-        if isinstance(kind, Items):
-            yield from _layouts([kind.item])
-        elif isinstance(kind, RecordLayout):
-            yield kind
-            yield from _layouts(list(kind.fields.values()))
-
-
-@contextmanager
-def _alone(folder: Path, name: str) -> Iterator[bool]:
-    """Whether no other process compiles this loop now; none does as long as this lasts."""
-    with suppress(OSError):
-        folder.mkdir(parents=True, exist_ok=True)
-    try:
-        file = (folder / f"{name}.lock").open("w")
-    except OSError:  # nothing can be kept there
-        yield True
-        return
-    with file:
+        source = DRIVER.format(
+            advance=each("advance({}, t, dt)"),
+            deliver=each("deliver({}, t)"),
+            observe=each("moves = observe({}, t) or moves"),
+            transmit=each("transmit({}, t, ledger)"),
+            detect=each("trouble = detect({}, t) or trouble"),
+            pursue=each("pursue({}, t)"),
+            note=each("note({}, ledger)"),
+        )
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            yield False
+            text = known.program.entry(source, vars(company), (crew, *GIVEN))
+            (address,) = machine.machine(text, ["fly"], often=often)
+        except Exception as error:  # noqa: BLE001 - of any plug-in and compiler: the run is flown without them
+            named = isinstance(error, OutsideError | machine.NoCompilerError)
+            known.refusal = str(error) if named else f"{type(error).__name__}: {error}"
         else:
-            yield True
+            # no other thread runs meanwhile: `fault` is one for all
+            of_c = ctypes.PYFUNCTYPE(ctypes.c_int64, ctypes.c_void_p, *(TYPES[kind] for kind in GIVEN))
+            known.run = of_c(address)
+    return known

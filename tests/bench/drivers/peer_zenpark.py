@@ -59,7 +59,7 @@ def measure(robots, kind, engine, evaluator, duration_s, *, complete=False):
     Raises:
         SystemExit: If it did not, or if nothing was compiled.
     """
-    stretch.WORK[0] = {"plain": -math.inf, "compiled": math.inf}[evaluator]
+    stretch.WORK[:] = [{"plain": -math.inf, "compiled": math.inf}[evaluator]] * 2
     start_s, start = 0.0, 0.0
 
     def progress(now):

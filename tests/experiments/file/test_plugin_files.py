@@ -77,7 +77,7 @@ def test_law_beside_the_experiment_moves_robots(task):
     assert load(task, "formation.law.gain=0.3").experiment.formation.law["gain"] == 0.3
     metrics = simulate(read).metrics
     assert 0.0 < metrics["fast"].mean["iae"] < metrics["slow"].mean["iae"]
-    # the law is in the subset that numba compiles
+    # the law is in the subset that is compiled
     assert [each for each in check(read) if each.severity == "error" or "compiled" in each.message] == []
     (task.parent / "solutions").mkdir()
     shutil.copy(task.parent / "meet.py", task.parent / "solutions")

@@ -1,11 +1,12 @@
 """Compiled stretches: the same as plain runs in every bit, for every registered plug-in, a user's too."""
 
 import math
-import os
-import tempfile
+import shutil
 from dataclasses import replace
+from importlib import import_module
 from math import sqrt
 from pathlib import Path
+from types import FunctionType
 from typing import ClassVar
 
 import numpy as np
@@ -22,13 +23,12 @@ from agents.plugins.registry import AVOIDANCES, LAWS, PREDICTORS, TRIGGERS, Plug
 from agents.plugins.triggers import Trigger
 from agents.vectors import UNKNOWN, clamp, norm
 from experiments.definition.experiment import ChannelTable, Formation, LegTable, RobotTable, WorldTable
-from experiments.virtual_time import stretch
+from experiments.virtual_time import machine, stretch
 from tests.agents.plugins.test_every_plugin import made as plugin
-from tests.experiments.virtual_time.evaluators import evaluated, same
+from tests.experiments.virtual_time.evaluators import alike, evaluated, same
 from tests.small import changed
 from tests.small import pair as small_pair
 
-pytest.importorskip("numba")
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 WANTS = {"distance": BY_DISTANCE, "any": BY_DISTANCE, "relative": BY_RELATIVE, "bearing": BY_BEARING}
 NATURE = {
@@ -37,15 +37,6 @@ NATURE = {
     "khepera4": Disturbance(odometry_drift=0.002),
     "turtlebot3": Disturbance(latency_s=0.04),
 }
-
-
-@pytest.fixture(autouse=True, scope="module")
-def kept():
-    """A cache folder that survives the tests, so that later ones need not compile again."""
-    before = os.environ["ZENPARK_CACHE_DIR"]
-    os.environ["ZENPARK_CACHE_DIR"] = str(Path(tempfile.gettempdir()) / f"zenpark-compiled-{os.getuid()}")
-    yield
-    os.environ["ZENPARK_CACHE_DIR"] = before
 
 
 @pytest.fixture(autouse=True)
@@ -68,9 +59,8 @@ def plugins(group, place=""):
     return [each for each in every if not place or place in each.PLACES]
 
 
-@pytest.mark.nightly
-def test_every_plugin_and_model():
-    """Robot after robot has the next law, trigger, predictor, avoidance and kind: one compilation covers all."""
+def every_plugin():
+    """Experiment, and change of its robots: each has the next law, trigger, predictor, avoidance and kind."""
     sending, updating = plugins(TRIGGERS, "communication"), plugins(TRIGGERS, "control")
     predictors, avoidances = plugins(PREDICTORS), plugins(AVOIDANCES)
     laws = [law for law in plugins(LAWS) if isinstance(law, Gradient)]  # those that remember are flown plain
@@ -97,8 +87,62 @@ def test_every_plugin_and_model():
         robots=robots, formation=Formation(links=links), disturbance=NATURE, duration_s=5.0,
         avoidance={"kind": "potential"}, channel=ChannelTable(delay_s=0.03),
     )  # fmt: skip
-    _, ticks = same(experiment, change=change)
-    assert ticks > 500
+    return experiment, change
+
+
+# functions of quiet modules that no quiet tick calls: they are rare, or every subclass has its own
+RARE = {
+    "agents.decision.position_control": {"VelocityFollower.goal"},
+    "agents.decision.transmission": {"LowPass._driven", "LowPass.smooth", "Transmitter.replace_trigger", "_drawn"},
+    "agents.plugins.avoidance": {
+        "Avoidance.deviate", "Avoidance.horizon", "Avoidance.kept_gap", "Nearby.reserve", "Potential.horizon",
+    },
+    "agents.plugins.barrier": {"Barrier.horizon", "Barrier.kept_gap"},
+    "agents.plugins.laws": {"Gradient.error", "Gradient.pull", "tracking_offset"},
+    "agents.plugins.predictors": {"ConstantVelocity.reach", "Predictor.reach"},
+    "agents.plugins.triggers": {"Trigger.fires"},
+    "agents.safety.positions": {
+        "Continuity.forget", "ExternalPositions.believed_yaw", "ExternalPositions.believes",
+        "ExternalPositions.disbelieve", "ExternalPositions.forget",
+    },
+    "twins.models.differential": {"Differential.land", "Differential.place", "Differential.push"},
+    "twins.models.ground": {
+        "Bicycle.push", "Bicycle.rest", "Ground.land", "Ground.place", "Ground.rest", "Omni.rest",
+    },
+    "twins.models.motion": {
+        "Motion.command", "Motion.land", "Motion.move", "Motion.place", "Motion.push", "Motion.stop", "Motion.takeoff",
+    },
+    "twins.models.noise": {"Noise._drawn", "Noise.refill", "Noise.reserve", "refill", "stream"},
+    "twins.models.onboard_flight": {
+        "OnboardFlight._climb", "OnboardFlight.blow", "OnboardFlight.land", "OnboardFlight.place",
+        "OnboardFlight.stop", "OnboardFlight.takeoff",
+    },
+    "twins.models.quadrotor": {"Quadrotor.place"},
+    "agents.decision.control_updates": set(), "agents.plugins.trigger_families": set(), "agents.vectors": set(),
+    "agents.safety.motion_check": set(), "agents.safety.setpoint_filter": set(),
+}  # fmt: skip
+
+
+def functions(module):
+    """Functions of a module and of its classes; special, class methods and properties are not quiet."""
+    for found in vars(module).values():
+        if getattr(found, "__module__", "") == module.__name__:
+            inside = [found, *getattr(found, "__dict__", {}).values()]
+            yield from (
+                each for each in inside if isinstance(each, FunctionType) and each.__module__ == module.__name__
+            )
+
+
+def test_every_plugin_and_model(monkeypatch):
+    """The same as in Python, and of the quiet modules every function is compiled but those that are rare."""
+    monkeypatch.setattr(stretch, "DRIVERS", {})
+    monkeypatch.setattr(stretch, "RECENT", {})
+    experiment, change = every_plugin()
+    assert same(experiment, change=change)[1] > 500
+    reached = set[FunctionType]().union(*(each.program.functions for each in stretch.DRIVERS.values()))
+    for name, rare in RARE.items():
+        every = {each for each in functions(import_module(name)) if not each.__name__.startswith("__")}
+        assert {each.__qualname__ for each in every - reached} == rare, name
 
 
 GAIN = 0.2
@@ -199,13 +243,31 @@ def test_law_outside_of_the_subset_is_flown_plain():
     assert f"{Path(__file__).name}:" in reason
 
 
-def test_what_is_not_compiled(monkeypatch, tmp_path):
-    for parts in ({"channel": ChannelTable(loss=0.1)}, {"world": WorldTable(engine="pymunk")}):
-        assert same(follower(duration_s=1.0, **parts))[1] == 0
-    (tmp_path / "file").touch()
-    monkeypatch.setenv("ZENPARK_CACHE_DIR", str(tmp_path / "file" / "folder"))  # cannot be made
-    stretch.DRIVERS.clear()
-    stretch.RECENT.clear()
-    assert same(follower(duration_s=1.0))[1] == 0
-    stretch.DRIVERS.clear()
-    stretch.REFUSED.clear()
+@pytest.mark.parametrize("parts", [{"channel": ChannelTable(loss=0.1)}, {"world": WorldTable(engine="pymunk")}])
+def test_what_is_not_compiled(parts):
+    assert same(follower(duration_s=1.0, **parts))[1] == 0
+
+
+def test_changed_constant_of_a_module_counts(monkeypatch):
+    """As in a notebook: its next run has the new number."""
+    experiment, change = follower(duration_s=2.0), lambda given: replace(given, law=Foreign())
+    first, _ = same(experiment, change=change)
+    monkeypatch.setitem(globals(), "GAIN", 0.4)
+    second, ticks = same(experiment, change=change)
+    assert ticks > 100
+    assert not alike(first.goal, second.goal)
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler here")
+@pytest.mark.parametrize("flags", [("", ""), ("-O1", "-O0 -fno-wrapv -fsanitize=undefined")], ids=["cc", "sanitized"])
+def test_every_plugin_by_cc(monkeypatch, tmp_path, capfd, flags):
+    """The same bits, and nothing that C leaves undefined."""
+    monkeypatch.setenv("ZENPARK_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(stretch, "OFTEN_S", 0.0)
+    monkeypatch.setattr(machine, "FLAGS", machine.FLAGS.replace(*flags))
+    for known in ("DRIVERS", "RECENT"):
+        monkeypatch.setattr(stretch, known, {})
+    every, change = every_plugin()
+    assert same(every, change=change)[1] > 500
+    assert list((tmp_path / "programs").glob("*.so"))
+    assert "runtime error" not in capfd.readouterr().err

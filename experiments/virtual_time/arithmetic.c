@@ -1,0 +1,87 @@
+/* Python's arithmetic, in C: the same bits for the same numbers.
+
+   What Python would raise sets `fault`: the ticks are then flown in Python, which tells the error. Whole numbers beyond
+   2^61 set it too, since Python's have no end. `turns` counts those of all loops: one that never ends is left. */
+
+typedef long long whole;
+
+double sin(double), cos(double), tan(double), asin(double), acos(double), atan(double), atan2(double, double);
+double exp(double), expm1(double), log(double), tanh(double), pow(double, double), fmod(double, double);
+double floor(double), ceil(double), trunc(double), rint(double), sqrt(double), fabs(double), copysign(double, double);
+#ifndef __TINYC__ /* an instruction each, where a compiler knows them */
+#define sqrt __builtin_sqrt
+#define fabs __builtin_fabs
+#define copysign __builtin_copysign
+#endif
+
+static whole fault, turns;
+static const union { whole bits; double number; } unknown = {0x7ff8000000000000}; /* NaN */
+static const double inf = 1e999, largest = 2305843009213693952.0; /* 2^61 */
+static const whole exact = 9007199254740992; /* 2^53, up to which floats have every whole number */
+
+/* whole numbers: a sum of two that fit is no more than 2^62 */
+static inline whole py_fits(whole i) { if (i > (whole)largest || i < -(whole)largest) fault = 1; return i; }
+static inline whole py_product(whole i, whole j) {
+  if (fabs((double)i * (double)j) < largest) return i * j;
+  fault = 1;
+  return 0;
+}
+static inline whole py_rest_i(whole i, whole j) { /* i % j: as j in sign */
+  if (j == 0) { fault = 1; return 0; }
+  whole rest = i % j;
+  return rest != 0 && (rest < 0) != (j < 0) ? rest + j : rest;
+}
+static inline whole py_floor_i(whole i, whole j) { /* i // j */
+  if (j == 0) { fault = 1; return 0; }
+  return i / j - (i % j != 0 && (i < 0) != (j < 0));
+}
+static inline whole py_left(whole i, whole j) { return j < 0 || j > 60 ? (fault = 1, 0) : py_product(i, (whole)1 << j); }
+static inline whole py_right(whole i, whole j) { return j < 0 ? (fault = 1, 0) : i >> (j > 62 ? 62 : j); }
+static inline whole py_abs_i(whole i) { return i < 0 ? -i : i; }
+static inline whole py_min_i(whole i, whole j) { return j < i ? j : i; }
+static inline whole py_max_i(whole i, whole j) { return j > i ? j : i; }
+static inline double py_exact(whole i) { if (i > exact || i < -exact) fault = 1; return (double)i; }
+static inline whole py_int(double x) { if (fabs(x) < largest) return (whole)x; fault = 1; return 0; }
+
+/* floats */
+static inline double py_over(double x, double y) { if (y == 0.0) fault = 1; return x / y; }
+static inline double py_rest(double x, double y) { /* x % y: as y in sign */
+  if (y == 0.0) fault = 1;
+  double rest = fmod(x, y);
+  return rest != 0.0 ? ((rest < 0.0) != (y < 0.0) ? rest + y : rest) : copysign(0.0, y);
+}
+static inline double py_floor_over(double x, double y) { /* x // y */
+  if (y == 0.0) fault = 1;
+  double rest = fmod(x, y), found = (x - rest) / y;
+  if (rest != 0.0 && (rest < 0.0) != (y < 0.0)) found -= 1.0;
+  if (found == 0.0) return copysign(0.0, x / y);
+  return floor(found) + (found - floor(found) > 0.5);
+}
+static inline double py_power(double x, double y) { /* x ** y; x * x is not always the same as pow(x, 2) */
+  if ((x < 0.0 && fabs(x) < inf && fabs(floor(y) - y) > 0.0) || (x == 0.0 && y < 0.0 && y > -inf)) fault = 1;
+  double found = pow(x, y);
+  if (fabs(found) == inf && fabs(x) < inf && fabs(y) < inf) fault = 1;
+  return found;
+}
+static inline double py_min(double x, double y) { return y < x ? y : x; }
+static inline double py_max(double x, double y) { return y > x ? y : x; }
+static inline double py_abs(double x) { return fabs(x); }
+static inline whole py_round(double x) { return py_int(rint(x)); }
+
+/* of `math`, where some numbers are an error */
+#define OF_MATH(name, error) static inline double py_##name(double x) { if (error) fault = 1; return name(x); }
+#define GROWS(name) static inline double py_##name(double x) { \
+  double found = name(x); if (found == inf && x < inf) fault = 1; return found; }
+OF_MATH(sqrt, x < 0.0) OF_MATH(log, x <= 0.0) OF_MATH(sin, fabs(x) == inf) OF_MATH(cos, fabs(x) == inf)
+OF_MATH(tan, fabs(x) == inf) OF_MATH(asin, fabs(x) > 1.0) OF_MATH(acos, fabs(x) > 1.0) GROWS(exp) GROWS(expm1)
+OF_MATH(atan, 0) OF_MATH(tanh, 0) OF_MATH(fabs, 0)
+static inline double py_atan2(double y, double x) { return atan2(y, x); }
+static inline double py_copysign(double x, double y) { return copysign(x, y); }
+static inline double py_degrees(double x) { return x * (180.0 / 3.141592653589793); }
+static inline double py_radians(double x) { return x * (3.141592653589793 / 180.0); }
+static inline whole py_floor(double x) { return py_int(floor(x)); }
+static inline whole py_ceil(double x) { return py_int(ceil(x)); }
+static inline whole py_trunc(double x) { return py_int(x); }
+static inline _Bool py_isfinite(double x) { return fabs(x) < inf; }
+static inline _Bool py_isinf(double x) { return fabs(x) == inf; }
+static inline _Bool py_isnan(double x) { return x != x; }
