@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
+import tokenize
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,6 +21,14 @@ PHRASES = re.compile(
     re.IGNORECASE,
 )
 FIRST = re.compile(r"\A(?:It|Its|They|Their|Who|What|Which|Whose|This|That|These|Those|He|She|We|You|There|How|Why)\b")
+# words that a noun, which is not there, would have to precede
+DEPENDENT = re.compile(
+    r"# ?(?:\[[^\]]*\] ?)?(of|in|on|at|by|for|from|with|without|within|to|towards?|into|onto|over|under|above|below|"
+    r"between|among|behind|before|after|until|since|while|when|where|if|unless|because|though|although|as|than|that|"
+    r"which|who|and|or|but|nor|so|then|via|per|against|along|around|about|beyond|except|inside|outside|near|through|"
+    r"during)\b",
+    re.IGNORECASE,
+)
 FENCE = re.compile(r"^ *(```|~~~).*?^ *\1|^(?: {4,}[^\n]*\n)+", re.MULTILINE | re.DOTALL)
 COMMENT = re.compile(r"(?:^|(?<=\s))#.*")  # in a text of several lines, what looks like one as well
 ITEM = re.compile(r"\n\s*\n|\n(?=\s*(?:[-*|>#]|\d+\.|`?\w[\w., ]*`?:) )")
@@ -74,4 +83,37 @@ def test_texts_are_plain(place):
                 said += FIRST.findall(text)
                 said += [each for each in sentences(text) if len(WORD.findall(each)) > LONGEST]
             found += [f"{file.relative_to(ROOT)}:{line}: {each}" for each in said]
+    assert not found, "\n".join(found)
+
+
+def trailing_comments(file: Path) -> Iterator[tuple[int, str]]:
+    with file.open("rb") as source:
+        for token in tokenize.tokenize(source.readline):
+            if token.type == tokenize.COMMENT and token.line[: token.start[1]].strip():
+                yield token.start[0], token.string
+
+
+def form(value: ast.expr) -> str:
+    """Form of an expression, without its names and numbers."""
+    return re.sub(r"(id|attr|value)='?[^,()']*'?", r"\1", ast.dump(value))
+
+
+def crowded(node: ast.AST) -> bool:
+    """Whether an assignment names more than two things that are no components of one."""
+    if not isinstance(node, ast.Assign) or not isinstance(node.value, ast.Tuple):
+        return False
+    target = node.targets[0]
+    return isinstance(target, ast.Tuple) and len(target.elts) > 2 and len({*map(form, node.value.elts)}) > 1
+
+
+@pytest.mark.parametrize("place", [place for place in PLACES if (ROOT / place / "__init__.py").exists()])
+def test_lines_are_read_at_one_glance(place):
+    found = []
+    for file in sorted((ROOT / place).rglob("*.py")):
+        found += [f"{file}:{line}: {text}" for line, text in trailing_comments(file) if DEPENDENT.match(text)]
+        found += [
+            f"{file}:{node.lineno}: {ast.unparse(node)}"
+            for node in ast.walk(ast.parse(file.read_text("utf-8")))
+            if crowded(node)
+        ]
     assert not found, "\n".join(found)

@@ -26,7 +26,7 @@ from twins.arrays import Array, norm
 
 ENDLESS_M: Final = 1e6  # [m] walls that no robot meets
 WORK: Final = 2.2e5  # robot ticks that are flown, of 10 to 20 µs each: 310 s of seven robots, 2 s of a thousand
-FLIGHTS: Final = 2  # of a check: without noise, and with it
+FLIGHTS: Final = 2  # flights of a check: without noise, and with it
 SPEED_UP: Final = 15.0  # factor of the work that compiled functions fly: 33 s of a thousand
 REPETITIONS: Final = 5  # flights with noise, each with another seed
 
@@ -37,8 +37,8 @@ class Prediction:
 
     time: Array  # (T,) [s] after the common start
     position: Array  # (T, N, 3) [m]
-    transmissions: int  # of all robots in the run
-    messages_hz: float  # of all robots, with the noise of the experiment, which makes robots transmit
+    transmissions: int  # number of all robots in the run
+    messages_hz: float  # rate of all robots, with the noise of the experiment, which makes robots transmit
     incidents: tuple[tuple[int, HazardChange], ...] = ()  # hazards on the way, each with the row of its robot
     velocities: tuple[bool, ...] = ()  # (N) robots with a velocity from the last step of their law; empty if stuck
     stuck: str = ""  # reason why the run does not begin; the robots stay at their starts then

@@ -28,18 +28,18 @@ from experiments.recording import version
 
 MAX_VERDICTS: Final = 200  # verdicts that are kept
 MOST_FILES: Final = 200  # beside an experiment, and in the catalogue, that are read
-MAX_VERDICT_BYTES: Final = 4_000_000  # [bytes] of such a file
-UNCOUNTED: Final = ("__pycache__", "runs")  # in a folder of modules: what Python, or a run, makes there
+MAX_VERDICT_BYTES: Final = 4_000_000  # [bytes] largest such file
+UNCOUNTED: Final = ("__pycache__", "runs")  # names made in a folder of modules by Python, or by a run
 OTHERS: Final = 0o022  # mode of a folder in which others may write
 
 
 class Verdict(msgspec.Struct, frozen=True):
     """Kept results of a check of an experiment."""
 
-    path: str  # of its file
+    path: str  # place of its file
     title: str
     findings: list[Finding]
-    figures: dict[str, CheckNumbers] | None  # by case; None where they were not asked for
+    figures: dict[str, CheckNumbers] | None  # figures by case; None where they were not asked for
 
 
 class KeptVerdict:
@@ -73,7 +73,7 @@ class KeptVerdict:
         if place is None or _code() != self._code or any(uncovered_modules()):
             return
         if any((each.code, each.severity) == (DEVICE, "error") for each in verdict.findings):
-            return  # of a file that may lie anywhere
+            return  # the file may lie anywhere
         with suppress(OSError, ValueError):
             content = msgspec.json.encode(verdict, enc_hook=_plain)
             place.parent.mkdir(mode=stat.S_IRWXU, parents=True, exist_ok=True)

@@ -31,18 +31,18 @@ from experiments.virtual_time.simulation import simulate
 PACKAGES: Final = ("agents", "twins")  # packages with plug-ins, which no line imports: all of them counts
 WORK: Final = "experiments/sweep/runs.py"  # this module: with what it imports, all other code that determines results
 _IMPORT: Final = re.compile(r"^\s*(?:from\s+([\w.]+)\s+)?import\s+(\([^)]*\)|.*)", re.MULTILINE)
-_COMMENT: Final = re.compile(r"\n?[^\S\n]*#[^\"'\n]*$|\n(?=\n)", re.MULTILINE)  # without quotes; and blank lines
+_COMMENT: Final = re.compile(r"\n?[^\S\n]*#[^\"'\n]*$|\n(?=\n)", re.MULTILINE)  # comments and blank lines
 FAILED: Final = (Stuck, BodyError, registry.PluginError)  # what a run may end with that other runs do not
 
 
 class RunMetrics(msgspec.Struct, frozen=True):
     """A run in numbers, the same to the bit as `experiments.metrics.measure.measure` makes of its whole trace."""
 
-    seed: int  # of the run
+    seed: int  # seed of the run
     # `swept_metrics` of the case: means over robots without leaders, sums over all robots
     values: dict[str, float | None] = {}
     gap_min_s: float | None = None  # shortest time between two transmissions of any robot [s]; None if none sent twice
-    duration_s: float = 0.0  # of the run [s]
+    duration_s: float = 0.0  # length of the run [s]
     # what kept robots from their parts, or ended the run before its time; empty: nothing. Such a run has failed
     failure: str = ""
     metric_faults: tuple[str, ...] = ()  # metrics that failed, a sentence each
@@ -51,7 +51,7 @@ class RunMetrics(msgspec.Struct, frozen=True):
 class WorkResult(msgspec.Struct, frozen=True):
     """Results of some seeds."""
 
-    runs: list[RunMetrics]  # that succeeded
+    runs: list[RunMetrics]  # runs that succeeded
     failed: dict[int, str] = {}  # reason by seed, of the others
     stranger: str = ""  # other digest of the code, or a missing plug-in: nothing was run
 
@@ -71,7 +71,7 @@ def fly(case: bytes, seeds: Sequence[int], code: str, plain_s: float = 0.0) -> b
     try:
         plan = Plan.decoded(case)
         mine = code_of(plan)
-    except (msgspec.ValidationError, registry.PluginError) as error:  # on a machine with another version, or no plug-in
+    except (msgspec.ValidationError, registry.PluginError) as error:  # another version made it, or a plug-in is missing
         return msgspec.json.encode(WorkResult([], stranger=str(error)))
     if mine != code:
         return msgspec.json.encode(WorkResult([], stranger=f"{mine}, not {code}"))
@@ -129,7 +129,7 @@ def digest_of_code(root: Path = ROOT) -> str:
 def without_comments(text: str) -> str:
     """A module without its comments, except those with quotes, and without blank lines."""
     parts = text.split('"""')
-    parts[::2] = [_COMMENT.sub("", part) for part in parts[::2]]  # between them stand docstrings and other texts
+    parts[::2] = [_COMMENT.sub("", part) for part in parts[::2]]  # docstrings and other texts stand between them
     return '"""'.join(parts)
 
 

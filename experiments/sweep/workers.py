@@ -29,7 +29,7 @@ class Work:
     case: bytes
     seeds: tuple[int, ...]
     code: str
-    plain_s: float  # that all runs of this case in the sweep would take in plain Python, about
+    plain_s: float  # time that all runs of this case in the sweep would take in plain Python, about
 
 
 @dataclass(frozen=True)
@@ -39,8 +39,8 @@ class Workers:
     executor: Executor | None
     count: Callable[[], int]  # works that run at once, now
     place: str
-    failures: tuple[type[Exception], ...] = ()  # of the executor
-    reason: Callable[[Exception], str] = str  # of a failure, in words
+    failures: tuple[type[Exception], ...] = ()  # errors of the executor
+    reason: Callable[[Exception], str] = str  # words for a failure
 
     def done(self, works: Sequence[Work]) -> Iterator[tuple[Work, WorkResult]]:
         """Runs all works, and yields each when it is done, in any order.

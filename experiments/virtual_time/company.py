@@ -17,11 +17,11 @@ from agents.vectors import Pose, Vector
 from twins.body import Twin
 
 WIDTH: Final = 19  # numbers of a robot in a sample
-PLACES: Final = {  # of each in those
+PLACES: Final = {  # first place of each in those
     "position": (0, 3), "velocity": (3, 6), "yaw": (6, 7), "true_position": (7, 10), "true_yaw": (10, 11),
     "goal": (11, 14), "setpoint": (14, 18), "error": (18, 19),
 }  # fmt: skip
-LEAN: Final = 3  # of true positions alone
+LEAN: Final = 3  # numbers of a true position alone
 SENT: Final = 10  # numbers of a transmission
 AT_END, AT_PHASES, AT_HAZARDS = 0, 1, 2
 
@@ -39,13 +39,15 @@ class Way:
     samples: array[float]  # time of arrival [s], number, stamp [s], position [m], velocity [m/s] and yaw [rad] of each
 
     def __init__(self, neighbour: Neighbour, delay: float, size: int) -> None:
-        self.neighbour, self.delay, self.size, self.first, self.next = neighbour, delay, size, 0, 0
+        self.neighbour, self.delay, self.size = neighbour, delay, size
+        self.first, self.next = 0, 0
         self.samples = array("d", (0.0,)) * (SENT * size)
 
     def put(self, seq: int, stamp: float, position: Vector, velocity: Vector, yaw: float) -> None:
         """A sample sets out."""
         k, samples = self.next * SENT, self.samples
-        samples[k], samples[k + 1], samples[k + 2] = stamp + self.delay, float(seq), stamp
+        samples[k], samples[k + 1] = stamp + self.delay, float(seq)
+        samples[k + 2] = stamp
         samples[k + 3], samples[k + 4], samples[k + 5] = position
         samples[k + 6], samples[k + 7], samples[k + 8] = velocity
         samples[k + 9] = yaw
@@ -59,7 +61,8 @@ class Way:
             if samples[k + 2] > sender.stamp:
                 sender.position = samples[k + 3], samples[k + 4], samples[k + 5]
                 sender.velocity = samples[k + 6], samples[k + 7], samples[k + 8]
-                sender.stamp, sender.arrival, sender.yaw = samples[k + 2], samples[k], samples[k + 9]
+                sender.stamp, sender.arrival = samples[k + 2], samples[k]
+                sender.yaw = samples[k + 9]
             self.first = (self.first + 1) % self.size
 
 
@@ -75,7 +78,8 @@ class Member:
     ways: list[Way]
 
     def __init__(self, row: int, robot: Robot, twin: Twin) -> None:
-        self.row, self.robot, self.twin, self.seq, self.ways = row, robot, twin, 0, []
+        self.row, self.robot, self.twin = row, robot, twin
+        self.seq, self.ways = 0, []
 
 
 class Planned:
@@ -88,7 +92,8 @@ class Planned:
     targets: list[Pose]
 
     def __init__(self, decide_hz: float) -> None:
-        self.first, self.decide_hz, self.targets = 0, decide_hz, [NO_TARGET]
+        self.first, self.decide_hz = 0, decide_hz
+        self.targets = [NO_TARGET]
 
     def target(self, t: float, position: Vector, yaw: float) -> Pose:
         """As `Itinerary.target`, at the time of a decision."""
@@ -100,24 +105,28 @@ class Ledger:
 
     __slots__ = ("count", "lean", "reason", "rows", "sample", "samples", "sent", "times")
 
-    lean: bool  # of samples true positions alone
+    lean: bool  # True for samples of true positions alone
     reason: int  # why a stretch ended: `AT_END`, or with the tick half done `AT_PHASES` or `AT_HAZARDS`
     count: int  # transmissions so far
     sent: array[float]  # row, number, time [s], position [m], velocity [m/s] and yaw [rad] of each
     rows: int
     sample: int  # samples so far
-    times: array[float]  # of samples [s]
+    times: array[float]  # times of samples [s]
     samples: array[float]  # `WIDTH` numbers for each sample and robot, or `LEAN`
 
     def __init__(self, rows: int, transmissions: int, samples: int, *, lean: bool) -> None:
-        self.rows, self.lean, self.count, self.sample, self.reason = rows, lean, 0, 0, AT_END
+        self.rows, self.lean = rows, lean
+        self.count, self.sample = 0, 0
+        self.reason = AT_END
         self.times = array("d", (0.0,)) * samples
         self.sent = array("d", (0.0,)) * (SENT * transmissions)
         self.samples = array("d", (0.0,)) * ((LEAN if lean else WIDTH) * samples * rows)
 
     def note_sent(self, member: Member, t: float) -> None:
-        robot, sent, k = member.robot, self.sent, self.count * SENT
-        sent[k], sent[k + 1], sent[k + 2] = float(member.row), float(member.seq), t
+        robot, sent = member.robot, self.sent
+        k = self.count * SENT
+        sent[k], sent[k + 1] = float(member.row), float(member.seq)
+        sent[k + 2] = t
         sent[k + 3], sent[k + 4], sent[k + 5] = robot.sent_position
         sent[k + 6], sent[k + 7], sent[k + 8] = robot.sent_velocity
         sent[k + 9] = robot.now.state.yaw

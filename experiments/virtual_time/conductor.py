@@ -10,7 +10,7 @@ from agents.decision.lifecycle import Phase
 from agents.errors import ExplainedError
 from agents.robot import Robot
 
-LEAD_S: Final = 0.5  # from the order to the common start
+LEAD_S: Final = 0.5  # time from the order to the common start
 ORDERS_S: Final = 0.5  # orders before the start fall on multiples of this, as those of a conductor do
 SOON_S: Final = 5.0  # a climb or a landing that has not ended is looked at again
 PATIENCE_S: Final = 60.0  # limit for robots to be ready, up or down: after it they never will be
@@ -23,7 +23,7 @@ class Stuck(ExplainedError):
 class VirtualConductor:
     """Orders take-off, common start and end."""
 
-    airborne_at: float  # [s] of the clock; NaN before
+    airborne_at: float  # [s] time of the clock; NaN before
     start_at: float  # [s] common start; NaN before it is known
     over: bool  # all robots are done
 

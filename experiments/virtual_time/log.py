@@ -41,7 +41,7 @@ SAMPLED: Final = ("position", "yaw", "true_position", "goal", "setpoint")  # col
 
 
 MANY_ROWS: Final = 10_000
-LARGE_CHUNK_BYTES: Final = 512 * 1024  # of a run that is over: there is nothing to be lost by a kill
+LARGE_CHUNK_BYTES: Final = 512 * 1024  # size for a run that is over: there is nothing to be lost by a kill
 
 T = TypeVar("T")
 

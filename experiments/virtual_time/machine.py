@@ -26,7 +26,7 @@ OF_C: Final = (
     "sin cos tan asin acos atan atan2 exp expm1 log tanh pow fmod floor ceil trunc rint sqrt fabs copysign "
     "memset memcpy memmove"
 )  # functions of the C library
-IN_MEMORY: Final = 1  # of libtcc's kinds of output
+IN_MEMORY: Final = 1  # code of an output that libtcc knows
 KEPT: Final[list[Any]] = []  # what compiled functions stand in
 
 

@@ -30,13 +30,13 @@ from twins.arrays import Array, Index
 class Sample(NamedTuple):
     """Pose, or goal of the central controller, on its way."""
 
-    row: int  # of the robot that sent it; of a goal, that it is for
+    row: int  # robot that sent it; of a goal, the robot that it is for
     seq: int
     stamp: float  # [s]
     position: Vector  # [m]
     velocity: Vector  # [m/s]
     yaw: float  # [rad]
-    pose: float = nan  # of a goal: stamp of the pose on which it rests [s]
+    pose: float = nan  # stamp of the pose on which a goal rests [s]
     words: Words = ()  # what is said beside a pose
 
 
@@ -76,7 +76,9 @@ class VirtualCentre:
         self._link_of = {row: link for link, row in enumerate(self._needed)}
         self._goal_link = {row: link for link, row in enumerate(self._guided)}
         self._seq = [0] * len(robots)
-        self._plan, self._sent, self._followed, self._received = plan, _Samples(1), _Samples(1), _Samples()
+        self._plan = plan
+        self._sent, self._followed = _Samples(1), _Samples(1)
+        self._received = _Samples()
         self.instant = self._goals.instant  # goals are received within the tick
 
     def transmit(self, sample: Sample, start: float, size: int) -> None:
@@ -91,7 +93,7 @@ class VirtualCentre:
             self.centre.receive(row, sample.position, sample.velocity, sample.stamp, arrival, yaw=sample.yaw)
             self._received.add(row, arrival, sample)
         newest = {link: sample for link, _, sample in sorted(self._goals.due(t), key=lambda each: each[2].stamp)}
-        for link, sample in sorted(newest.items()):  # of several for one robot the newest counts
+        for link, sample in sorted(newest.items()):  # the newest of several for one robot counts
             row = self._guided[link]
             guidance = self._robots[row].guidance
             assert guidance is not None
@@ -144,7 +146,7 @@ class VirtualNetwork:
         self._channel = Channel(conditions_of(plan, ends, seed))
         # by link: the robot that receives on it, and the number among its links
         self.receivers = [(robot, k) for robot in robots for k in range(len(robot.neighbours.all))]
-        self._links: list[list[int]] = [[] for _ in robots]  # on which each robot is the sender
+        self._links: list[list[int]] = [[] for _ in robots]  # links on which each robot is the sender
         for link, (robot, k) in enumerate(self.receivers):
             self._links[robot.neighbours.all[k].sender].append(link)
             robot.neighbours.mark_alive(k)  # all robots are there from the beginning
@@ -156,7 +158,7 @@ class VirtualNetwork:
         self.says = {} if robots[0].stepping is None else robots[0].stepping.says
         self._sent, self._received = _Samples(0 if lean else sum(self.says.values())), _Samples()
         self.instant = self._channel.instant  # poses that are transmitted are received within the tick
-        self.delays = self._channel.delays  # of each link [s]
+        self.delays = self._channel.delays  # delays of each link [s]
         self.is_plain = self.centre is None and self._channel.plain  # all that a link does is to take its time
 
     def transmit(self, row: int, robot: Robot, t: float, yaw: float, start: float) -> None:
@@ -205,7 +207,7 @@ class VirtualNetwork:
     def logged(self, begin: float) -> dict[str, Any]:
         """Columns of the log, see `experiments.virtual_time.simulation.Log`; the common start is at `begin` [s]."""
         received = self._received.table(begin)
-        received = received.take(np.lexsort((received.link, received.arrival)))  # as a recording has them
+        received = received.take(np.lexsort((received.link, received.arrival)))  # same order as in a recording
         return {
             "sent": self._sent.table(begin, bare=self._lean),
             "says": self.says,
@@ -239,7 +241,7 @@ class VirtualNetwork:
                 _, seq, stamp, x, y, z, vx, vy, vz, yaw = way.samples[k * SENT : (k + 1) * SENT]
                 under_way.append((stamp, row, link, Sample(row, int(seq), stamp, (x, y, z), (vx, vy, vz), yaw)))
                 way.first = (k + 1) % way.size
-        for stamp, _, link, sample in sorted(under_way, key=itemgetter(0, 1, 2)):  # as they were sent
+        for stamp, _, link, sample in sorted(under_way, key=itemgetter(0, 1, 2)):  # same order as they were sent
             self._channel.send(link, sample, sample.seq, stamp)
         sent = np.frombuffer(ledger.sent)[: ledger.count * SENT].reshape(-1, SENT)
         sent = sent[np.lexsort((sent[:, 0], sent[:, 2]))]  # robots of a kind are flown together

@@ -19,7 +19,7 @@ import numpy as np
 WORD: Final = 8  # bytes
 FLOAT, INT, BOOL = "float", "int", "bool"
 NUMBERS: Final[dict[type, str]] = {float: FLOAT, int: INT, bool: BOOL}
-LEFT_OUT: Final = {"assignment", "_assignment", "_generator", "_preflight"}  # of no use to a quiet function
+LEFT_OUT: Final = {"assignment", "_assignment", "_generator", "_preflight"}  # names of no use to a quiet function
 
 
 class Floats(NamedTuple):
@@ -33,8 +33,8 @@ class Items:
     """List, tuple or array of values of one kind."""
 
     item: Any
-    words: int = field(init=False, repr=False, compare=False)  # of an item
-    code: str = field(init=False, repr=False, compare=False)  # of `struct`, of a word
+    words: int = field(init=False, repr=False, compare=False)  # words of an item
+    code: str = field(init=False, repr=False, compare=False)  # letter of `struct` for a word
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "words", width(self.item))
@@ -91,7 +91,7 @@ class Layouts:
         self._filled: dict[tuple[type, str], Items] = {}
         self._of: dict[
             int, tuple[Any, RecordLayout | None]
-        ] = {}  # by identity; the object is kept, or another would take it
+        ] = {}  # layouts by identity; the object is kept, or another would take it
         self.guessed = False  # whether a list was empty of which no other one was filled
 
     def forget(self) -> None:
@@ -103,7 +103,7 @@ class Layouts:
         """Kind of a value, None if it has no place in a record; `where`: class and name of the attribute."""
         if (number := NUMBERS.get(type(value))) is not None:
             return number
-        if isinstance(value, int):  # of an enumeration
+        if isinstance(value, int):  # member of an enumeration
             return INT
         if isinstance(value, array):
             return Items(FLOAT)
@@ -123,7 +123,7 @@ class Layouts:
             if isinstance(value, tuple):
                 return Floats(len(value))
             items = Items(FLOAT)
-        elif of == {tuple}:  # of as many numbers
+        elif of == {tuple}:  # numbers of one type
             items = Items(self.kind(value[0]))
         else:
             kinds = {self.kind(each) for each in value}
@@ -275,7 +275,8 @@ def _items(memory: memoryview, at: int, count: int, kind: Items) -> list[Any]:
 
 def _storing(layout: RecordLayout) -> Callable[[Image, Any, int], None]:
     """Function that writes an object at a place of an image; raises TypeError for one of another layout."""
-    values, conditions, space = [], ["type(thing) is owner"], {"owner": layout.owner}
+    values, conditions = [], ["type(thing) is owner"]
+    space = {"owner": layout.owner}
     for name, kind in layout.fields.items():
         space[f"kind_{name}"] = kind
         if isinstance(kind, RecordLayout):

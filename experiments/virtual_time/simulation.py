@@ -80,11 +80,11 @@ class VirtualRunLog:
 class Snapshot:
     """Present state of a run in virtual time, for observers; read only."""
 
-    time: float  # [s] since the common start; NaN before it is known
-    now: float  # [s] of the clock of the decision
+    time: float  # [s] time since the common start; NaN before it is known
+    now: float  # [s] time of the clock of the decision
     robots: Sequence[Robot]
-    states: Sequence[BodyState]  # of their bodies
-    engine: Engine  # of the bodies
+    states: Sequence[BodyState]  # states of their bodies
+    engine: Engine  # engine of the bodies
 
 
 @supervised()
@@ -160,7 +160,8 @@ class VirtualRun:
         self, *, landing: bool, progress: Callable[[float], object], watch: Callable[[Snapshot], object] | None
     ) -> None:
         """Flies until all robots are done, or to the end of the run without `landing`."""
-        conductor, dt, first = self._conductor, self.dt, self.robots[0]
+        conductor, dt = self._conductor, self.dt
+        first = self.robots[0]
         self.stretches = stretches = stretches_of(self) if watch is None else None
         while not conductor.over:
             reason = AT_END
@@ -181,7 +182,8 @@ class VirtualRun:
 
     def step(self, t: float, reason: int = AT_END) -> None:
         """One tick at `t` [s], or the rest of one that a compiled stretch has begun, for this `reason`."""
-        robots, body, network, begin = self.robots, self._body, self.network, self._conductor.start_at
+        robots, body, network = self.robots, self._body, self.network
+        begin = self._conductor.start_at
         if reason == AT_END:
             self._states = body.read(t)
             network.deliver(t)
@@ -207,7 +209,8 @@ class VirtualRun:
 
     def _transmit(self, t: float) -> None:
         """Phases move on, poses are transmitted, and goals of a central controller."""
-        robots, network, start, sent = self.robots, self.network, self._conductor.start_at, False
+        robots, network = self.robots, self.network
+        start, sent = self._conductor.start_at, False
         for row, robot in enumerate(robots):
             if not robot.is_steady(t):
                 robot.live(t)
@@ -238,7 +241,8 @@ class VirtualRun:
     def note(self, ledger: Ledger) -> None:
         """Note the samples of a compiled stretch."""
         self._settle()
-        count, rows, columns = ledger.sample, len(self.robots), self._columns
+        count, rows = ledger.sample, len(self.robots)
+        columns = self._columns
         columns.setdefault("time", []).append(np.array(ledger.times[:count]))
         wide = LEAN if self.lean else WIDTH
         numbers = np.frombuffer(ledger.samples)[: count * rows * wide].reshape(count, rows, wide)
@@ -274,7 +278,7 @@ class VirtualRun:
                 columns[what] = None if what in OPTIONAL else np.zeros((len(time), len(names), 0))
                 continue
             columns[what] = np.concatenate(self._columns[what])
-            self._columns[what] = [columns[what]]  # of many robots its parts take as much as it does
+            self._columns[what] = [columns[what]]  # parts of many robots take as much as the whole does
             if what in OPTIONAL and np.isnan(columns[what]).all():
                 columns[what] = None
         incidents = [(row, each) for row, robot in enumerate(self.robots) for each in robot.hazards.incidents]

@@ -23,14 +23,14 @@ from experiments.virtual_time.records import Image, Layouts, RecordLayout
 from experiments.virtual_time.translation import BOOLEAN, DOUBLE, WHOLE, OutsideError, Program
 from twins.body import TwinBody
 
-TICK_S: Final = 15e-6  # of CPU for a tick of a robot in plain Python: 10 to 20 µs
-PAYS_S: Final = 0.3  # for less work in a process plain Python is quicker than to translate and compile
-OFTEN_S: Final = 20.0  # of work that follows, for which a second of `cc` pays
-LONGEST: Final = 10_000  # ticks of a stretch,
-ROBOT_TICKS: Final = 1_000_000  # and of all robots in it: noise is drawn, and room kept, for all of them beforehand
-LEAST: Final = 20  # after a stretch of fewer ticks
-PAUSE: Final = 10  # ticks that are flown in plain Python, twice as many after the next one,
-LONGEST_PAUSE: Final = 160  # at most
+TICK_S: Final = 15e-6  # [s] CPU time of a tick of a robot in plain Python: 10 to 20 µs
+PAYS_S: Final = 0.3  # [s] work below which plain Python is quicker than to translate and compile
+OFTEN_S: Final = 20.0  # [s] following work for which a second of `cc` pays
+LONGEST: Final = 10_000  # ticks of a stretch
+ROBOT_TICKS: Final = 1_000_000  # ticks of all its robots: noise is drawn, and room kept, for all of them beforehand
+LEAST: Final = 20  # ticks below which a stretch is followed by a pause
+PAUSE: Final = 10  # ticks that are flown in plain Python, twice as many after the next short stretch
+LONGEST_PAUSE: Final = 160  # ticks of the longest pause
 ROOM: Final = 2  # more samples on a link than its delay asks for
 STEPS: Final = ("advance", "deliver", "observe", "transmit", "detect", "pursue", "note")
 DRIVER: Final = """
@@ -64,10 +64,10 @@ def stretch(crew, k, end, dt, log_every, instant):
 TYPES: Final[dict[str, Any]] = {WHOLE: ctypes.c_int64, DOUBLE: ctypes.c_double, BOOLEAN: ctypes.c_bool}
 GIVEN: Final = (WHOLE, WHOLE, DOUBLE, WHOLE, BOOLEAN)  # arguments of the driver behind the crew
 WORK: Final = [0.0, 0.0]  # seconds of plain Python that flights of this process take, about, and that were announced
-REFUSED: Final[dict[str, str]] = {}  # by law or crew, why it cannot be compiled
-DRIVERS: Final[dict[RecordLayout, CompiledLoop]] = {}  # of this process
-RECENT: Final[dict[bytes, Prepared]] = {}  # of cases that this process has flown; a few
-MAX_RECENT: Final = 8  # of those
+REFUSED: Final[dict[str, str]] = {}  # reason by law or crew why it cannot be compiled
+DRIVERS: Final[dict[RecordLayout, CompiledLoop]] = {}  # drivers of this process
+RECENT: Final[dict[bytes, Prepared]] = {}  # cases that this process has flown; a few
+MAX_RECENT: Final = 8  # number of those
 
 
 class Flown(Protocol):
@@ -77,9 +77,9 @@ class Flown(Protocol):
     robots: list[Robot]
     twin: TwinBody
     network: VirtualNetwork
-    dt: float  # of a tick [s]
+    dt: float  # length of a tick [s]
     log_every: int  # ticks from one sample to the next
-    lean: bool  # of samples true positions alone
+    lean: bool  # True for samples of true positions alone
     lonely: bool  # each robot moves by itself, and the network does nothing but take its time
 
     def note(self, ledger: Ledger) -> None:
@@ -131,10 +131,10 @@ class CompiledLoop:
 class Prepared:
     """Stored layout of the robots of a case, and their compiled loop."""
 
-    rows: list[list[int]]  # of robots of the same layout
-    layout: RecordLayout  # of the crew
+    rows: list[list[int]]  # rows of robots of the same layout
+    layout: RecordLayout  # layout of the crew
     driver: CompiledLoop
-    words: int = 1 << 12  # that all objects take, at most, so far
+    words: int = 1 << 12  # words that all objects have taken, at most, so far
 
 
 class Stretches:
@@ -157,7 +157,8 @@ class Stretches:
         self._plans: dict[int, Planned] = {}
         self.flown, self.refusal = 0, ""
         self._prepared: Prepared | None = None
-        self._paused_until, self._pause, self._refused = 0, PAUSE, False
+        self._paused_until, self._pause = 0, PAUSE
+        self._refused = False
 
     def fly(self, k: int, end: int) -> tuple[int, int]:
         """Fly the ticks from `k` on to before `end`; returns the tick at which the stretch ended, and why.
@@ -171,7 +172,8 @@ class Stretches:
             return k, AT_END
         if not all(_goes_on(robot, k * flight.dt) for robot in flight.robots):
             return k, AT_END
-        ticks, rows, rates = end - k, len(self._members), flight.plan.experiment.rates
+        ticks, rows = end - k, len(self._members)
+        rates = flight.plan.experiment.rates
         questions = ticks // round(rates.body_hz / rates.pose_hz) + ROOM
         ledger = Ledger(rows, questions * rows, ticks // flight.log_every + ROOM, lean=flight.lean)
         for member in self._members:
@@ -196,7 +198,8 @@ class Stretches:
 
     def _run(self, ledger: Ledger, k: int, end: int) -> int:
         """Run the compiled loop; returns the tick at which it ended, −1 without one or after an error."""
-        flight, prepared, image, found = self._flight, self._prepared or RECENT.get(self._case), None, -1
+        flight, prepared = self._flight, self._prepared or RECENT.get(self._case)
+        image, found = None, -1
         if prepared is not None and (self._prepared is not None or not prepared.driver.program.changed()):
             image = self._image(prepared, ledger)
         if prepared is None or image is None:

@@ -23,11 +23,11 @@ from typing import Any, Final, NamedTuple
 from experiments.virtual_time.records import BOOL, FLOAT, INT, Floats, Items, RecordLayout
 
 ARITHMETIC: Final = Path(__file__).with_name("arithmetic.c")
-TURNS: Final = 10**9  # of all loops of a stretch: some seconds
+TURNS: Final = 10**9  # turns of all loops of a stretch: some seconds
 LEAVE: Final = "@leave"  # stands for the return of a function at an error
 # types: numbers, by C's names, and what has no value; that of an object is its layout, that of a list its `Items`
 DOUBLE, WHOLE, BOOLEAN, VOID, NONE = "double", "whole", "_Bool", "void", "none"
-STORED: Final = {FLOAT: DOUBLE, INT: WHOLE, BOOL: WHOLE}  # in a record
+STORED: Final = {FLOAT: DOUBLE, INT: WHOLE, BOOL: WHOLE}  # types in a record
 WORDS: Final = {DOUBLE: "a float", WHOLE: "a whole number", BOOLEAN: "a bool", VOID: "nothing", NONE: "None"}
 COMPARISONS: Final = {
     ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!=", ast.Is: "==",
@@ -35,7 +35,7 @@ COMPARISONS: Final = {
 }  # fmt: skip
 BITS: Final = {ast.BitAnd: "&", ast.BitOr: "|", ast.BitXor: "^"}
 SUMS: Final = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*"}
-DIVISIONS: Final = {  # by operator and type, with the function of `arithmetic.c`
+DIVISIONS: Final = {  # function of `arithmetic.c` by operator and type
     (ast.Div, DOUBLE): "py_over", (ast.Mod, DOUBLE): "py_rest", (ast.Mod, WHOLE): "py_rest_i",
     (ast.FloorDiv, DOUBLE): "py_floor_over", (ast.FloorDiv, WHOLE): "py_floor_i", (ast.Pow, DOUBLE): "py_power",
     (ast.LShift, WHOLE): "py_left", (ast.RShift, WHOLE): "py_right",
@@ -98,7 +98,7 @@ def constant(x: Any) -> Value:
     """A constant; raises TypeError for one that C does not have."""
     if x is None:
         return Value(NONE, "0", None)
-    if isinstance(x, int) and abs(x) < LARGEST:  # of an enumeration, too
+    if isinstance(x, int) and abs(x) < LARGEST:  # also a member of an enumeration
         return Value(BOOLEAN, str(int(x)), x) if isinstance(x, bool) else Value(WHOLE, f"({int(x)}LL)", int(x))
     if type(x) is float:
         text = x.hex() if math.isfinite(x) else "unknown.number" if math.isnan(x) else "inf" if x > 0.0 else "-inf"
@@ -132,7 +132,7 @@ def definition(function: FunctionType) -> ast.FunctionDef:
         tree = ast.parse(textwrap.dedent("".join(lines))).body[0]
     except (SyntaxError, IndexError):
         tree = ast.Pass()
-    around = set(code.co_freevars) - {"__class__"}  # of `super`
+    around = set(code.co_freevars) - {"__class__"}  # names around it, without that of `super`
     decorated = [ast.unparse(each) for each in getattr(tree, "decorator_list", ())] not in ([], ["property"])
     if not isinstance(tree, ast.FunctionDef) or around or decorated or hasattr(function, "__wrapped__"):
         raise OutsideError(f"{place(function)}: {function.__qualname__} is no plain function")
@@ -144,8 +144,8 @@ class Program:
 
     def __init__(self) -> None:
         self._found: list[tuple[Callable[[], Any], Any]] = []  # what names stood for, each with a way to look again
-        self._names: dict[Any, str] = {}  # of types
-        self._functions: dict[Any, tuple[str, Any] | None] = {}  # with the types of their results; None: under way
+        self._names: dict[Any, str] = {}  # names of types
+        self._functions: dict[Any, tuple[str, Any] | None] = {}  # names and types of results; None: under way
         self._texts = list[str]()  # types and functions, each behind those that it needs
 
     @property
@@ -217,7 +217,8 @@ class Walk(ast.NodeVisitor):
         self, program: Program, tree: ast.FunctionDef, space: dict[str, Any], function: FunctionType | None = None
     ) -> None:
         self._program, self._tree, self._space, self._function = program, tree, space, function
-        self._lines, self._count, self._ended = list[str](), 0, False
+        self._lines = list[str]()
+        self._count, self._ended = 0, False
         self._locals, self._set = dict[str, Any](), set[str]()  # types, and names that have a value here in any case
         self._result: Any = None  # type
         self.arguments: dict[str, Any] = {}
@@ -321,7 +322,8 @@ class Walk(ast.NodeVisitor):
         self.emit(f"if ({test.text}) {{")
         before = set(self._set)
         self.block(node.body)
-        after, ended, self._set = self._set, self._ended, before
+        after, ended = self._set, self._ended
+        self._set = before
         if node.orelse:
             self.emit("} else {")
         self.block(node.orelse)
@@ -596,7 +598,7 @@ class Walk(ast.NodeVisitor):
         a, b = self.number(a, kind, node), self.number(b, kind, node)
         if kind == WHOLE and op is ast.Div:
             return Value(DOUBLE, f"py_over(py_exact({a.text}), py_exact({b.text}))")
-        if kind == WHOLE and op is ast.Pow:  # with a negative exponent it is a float
+        if kind == WHOLE and op is ast.Pow:  # a negative exponent makes it a float
             if b.constant is ... or not 0 <= b.constant < 64:
                 raise self.error(node, "a power of a whole number with an exponent that is no small constant")
             return Value(WHOLE, f"py_product({a.text}, " * b.constant + "1LL" + ")" * b.constant)
