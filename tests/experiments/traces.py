@@ -77,6 +77,7 @@ def cut(whole, end):
         sent=whole.sent.take(whole.sent.stamp < end - 1e-9),
         received=whole.received.take(whole.received.arrival < end - 1e-9),
         time=whole.time[:count],
+        events=(*whole.events, Event(end, "phase", "conductor", "landing (interrupted)")),
     )
 
 
