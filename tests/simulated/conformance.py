@@ -315,7 +315,7 @@ class RealStage:
         if who in self._script.cables:
             near = [free_endpoint(preferred_port=0) for _ in places]
             ports = [place.rpartition(":")[2] for pair in zip(near, places, strict=True) for place in pair]
-            self._spawn(f"cable {who}", "tests.reliability.cable", *ports)
+            self._spawn(f"cable {who}", "tests.simulated.cable", *ports)
             places = near
         lease_s = self._script.leases.get(who, 2.0)
         self._spawn(who, "tests.simulated.conformance", str(lease_s), *places)
