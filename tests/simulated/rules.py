@@ -571,7 +571,12 @@ def no_success_after_a_change(end: End) -> Iterator[str]:
     """Exit code 0 only if no operator has landed, stopped or exchanged a robot in the run."""
     for t, who, words, process in end.world.answers:
         changed = words.split()[1:2] in (["remove"], ["replace"], ["land"], ["stop"])
-        if end.code == 0 and changed and process.code == 0 and 0.1 < t - end.start < end.duration_s - 0.3:
+        if (
+            end.code == 0
+            and changed
+            and process.code == 0
+            and 0.1 < t - end.start < end.duration_s - playback.EARLY_S - 0.1
+        ):
             yield f"{who}: `{words}` at {t - end.start:.1f} s"
 
 
