@@ -10,8 +10,8 @@ from tests.simulated import campaign, laboratory
 from tests.simulated.faults import Fault
 from tests.simulated.laboratory import ROOT
 
-FIRST, PARTS, EACH = 1, 10, 10  # seeds of every test run, in parts that workers share
-NIGHTLY, NIGHTLY_PARTS, NIGHTLY_EACH = 100_000, 50, 98  # with the others 5,000
+FIRST, PARTS, EACH = 1, 7, 10  # seeds of every test run, in parts that workers share: two minutes of a core
+NIGHTLY, NIGHTLY_PARTS, NIGHTLY_EACH = 100_000, 50, 99  # with the others 5,000
 
 TRACES = """
 import sys
