@@ -93,7 +93,7 @@ def turtlebot_bridge(net):
     body = TurtleBot3(request("turtlebot3", "ros2dds://tb3_0"))
     body.open()
     with ExitStack() as stack:
-        stack.callback(body._claims.release)  # it does not wait until the robot stands
+        stack.callback(body._close)  # `close` waits until the robot stands
         for k in count(1):
             data = yield
             net.deliver(data, gone=len(data) % 16 == 0)

@@ -37,7 +37,7 @@ _kernel: Kernel | None = None  # the running one
 
 
 class FlightError(BaseException):
-    """What ends a flight at once, whatever the code that caused it catches."""
+    """The end of a flight at once, whatever the code that caused it catches."""
 
 
 def current() -> Kernel:
@@ -60,7 +60,7 @@ class Kernel:
     def __init__(self, seed: int, preempt: float = 0.0) -> None:
         """A kernel in which a thread loses the processor at a lock or a message with probability `preempt`."""
         self.now, self.rng, self.preempt = BEGIN, random.Random(seed), preempt
-        self.hub = getcurrent()
+        self.hub, self.thread = getcurrent(), threading.get_ident()
         self.task: Task | None = None
         self.process: Process | None = None
         self.processes: list[Process] = []
@@ -509,8 +509,10 @@ def guard(*allowed: str) -> Iterator[None]:
 
     def watched(name: str, real: Callable[..., Any]) -> Callable[..., Any]:
         def call(*args: Any, **kwargs: Any) -> Any:
-            if _kernel is not None and _kernel.process is not None:
-                raise _kernel.fail(f"asks the real world: {name}")
+            kernel = _kernel
+            own = kernel is not None and kernel.thread == threading.get_ident()  # other real threads are of no flight
+            if kernel is not None and own and kernel.process is not None:
+                raise kernel.fail(f"asks the real world: {name}")
             return real(*args, **kwargs)
 
         return call

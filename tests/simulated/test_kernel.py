@@ -100,6 +100,26 @@ def spin():
         pass
 
 
+def test_guard_concerns_simulated_threads_alone():
+    """A real thread that another test has left behind, for instance."""
+    go, answers = threading.Event(), []
+
+    def ask():
+        go.wait()
+        answers.append(time.monotonic())
+
+    def main():
+        go.set()
+        other.join()
+
+    other = threading.Thread(target=ask)
+    other.start()
+    with guard(), Kernel(1) as kernel:
+        process = Process("p", main)
+        kernel.run()
+    assert (process.code, kernel.crashes, len(answers)) == (0, [], 1)
+
+
 @pytest.mark.parametrize(
     "leak", [spin, lambda: time.time() + 1.0, lambda: os.urandom(1), lambda: threading.Event().wait(0.01)]
 )
