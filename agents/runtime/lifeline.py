@@ -29,7 +29,7 @@ _STOP: Final = b"stop "
 
 
 def stop_line(stop: messages.Stop) -> bytes:
-    """LifelineEnd with an emergency stop."""
+    """Line with an emergency stop."""
     words = messages.Stop(stop.operator[: messages.MAX_WORDS], stop.reason[: messages.MAX_WORDS])
     return _STOP + messages.encode(words) + b"\n"
 

@@ -36,13 +36,13 @@ from tests.system import lab
 from tools.options import AsJson, File, Out, Settings, known_words, print_result
 
 KINDS: Final = ("pause", "kill", "term", "order", "estop", "interrupt", "twice")  # what signals and commands can do
-LENGTH: Final = "duration_s=15"  # of a round, unless the user chooses another
-GONE_S: Final = 60.0  # after the end of its time no process of a run is left
+LENGTH: Final = "duration_s=15"  # length of a round, unless the user chooses another
+GONE_S: Final = 60.0  # time after the end of a run in which its processes must have ended
 OUTSIDE_M: Final = 0.75  # farther outside a drone is cut
-CODES: Final = (0, 1, 2, 3, 130)  # of `./zenpark run`
+CODES: Final = (0, 1, 2, 3, 130)  # exit codes of `./zenpark run`
 REFUSED: Final = 2  # exit code of a process whose name is taken
 RESULT: Final = "chaos.json"
-FLIGHT: Any = lab.Flight  # without types
+FLIGHT: Any = lab.Flight  # class without types
 
 
 class Round(msgspec.Struct, frozen=True):
@@ -50,13 +50,13 @@ class Round(msgspec.Struct, frozen=True):
 
     seed: int
     script: list[str]
-    code: int  # of the real run
-    simulated: int | None  # of the simulated one
+    code: int  # exit code of the real run
+    simulated: int | None  # exit code of the simulated one
     violations: list[str]
 
 
 class RealRun:
-    """One run with real processes, and the levers of a script."""
+    """A run with real processes, and the levers of a script."""
 
     def __init__(self, folder: Path, file: str, case: str, settings: Sequence[str], names: Sequence[str]) -> None:
         self.flight = FLIGHT(folder, file, "--case", case, *settings)

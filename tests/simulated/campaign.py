@@ -22,7 +22,7 @@ from tests.simulated.experiments import FIXED, LONG, NAMES, RANDOM, setting_of
 from tests.simulated.faults import KINDS, Fault
 from tests.simulated.laboratory import Flight, Nursery, Request, SimulatorError
 
-SHRINK_S = 60.0  # of processor time
+SHRINK_S = 60.0  # processor time of a search
 QUICK = 1000  # seeds below it are short flights
 
 
@@ -73,7 +73,7 @@ def shrink(request: Request, flight: Flight, nursery: Nursery) -> tuple[list[Fau
 
 @dataclass(frozen=True)
 class Choice:
-    """What a campaign flies: an experiment, and kinds of faults; all of both if they are left out."""
+    """Choice of a campaign: an experiment, and kinds of faults; all of both if they are left out."""
 
     name: str | None = None
     kinds: tuple[str, ...] = ()
@@ -123,7 +123,7 @@ def fly(seeds: Iterable[int], choice: Choice, nursery: Nursery) -> Iterator[tupl
 
 
 def failure(seed: int, choice: Choice, nursery: Nursery, flight: Flight | SimulatorError) -> str:
-    """What a seed breaks, shrunk, and the command that repeats it; empty if all is well."""
+    """Rules that a seed breaks, its shrunk script, and the command that repeats it; empty if all is well."""
     if isinstance(flight, SimulatorError):
         return f"seed {seed}: {flight}\n  {choice.repeat(seed)}"
     if not flight.violations:

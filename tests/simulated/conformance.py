@@ -25,12 +25,12 @@ from zenoh.handlers import Callback, RingChannel
 from agents.network import pubsub
 from agents.network.endpoints import free_endpoint
 from agents.network.zenoh_config import config, settings
+from tests.simulated import advanced, links, network
 from tests.simulated import kernel as simulated
-from tests.simulated import network
 from tests.simulated.kernel import BEGIN, Kernel, Process
 
 ROOT: Final = Path(__file__).resolve().parents[2]
-LEAD_S: Final = 0.5  # from the start of all real processes until the first step [s]
+LEAD_S: Final = 0.5  # time from the start of all real processes until the first step [s]
 TOGETHER_S: Final = 0.15  # events nearer than this have no order [s]
 READY: Final = "ready"
 FAULTS: Final = ("cut", "freeze", "kill", "close")
@@ -39,7 +39,7 @@ QUIET_S: Final = 0.5  # time in which no event follows that is not expected [s]
 
 
 class Event(NamedTuple):
-    """What a client noticed, [s] after the beginning."""
+    """Observation of a client, [s] after the beginning."""
 
     t: float
     who: str
@@ -86,9 +86,9 @@ def library(net: network.Network) -> SimpleNamespace:
     """The same names of the simulation."""
     return SimpleNamespace(
         open=net.open,
-        advanced_publisher=network.AdvancedPublisher,
-        advanced_subscriber=network.AdvancedSubscriber,
-        ring=network.Ring,
+        advanced_publisher=advanced.AdvancedPublisher,
+        advanced_subscriber=advanced.AdvancedSubscriber,
+        ring=links.Ring,
         callback=lambda call: call,
         source_info=network.source_info,
         thread=simulated.Thread,
@@ -213,7 +213,7 @@ class Actor:
 
 
 def simulate(script: Script, seed: int = 1) -> list[Event]:
-    """What clients notice in the simulation."""
+    """Observations of the clients in the simulation."""
     events: list[Event] = []
     places = [f"tcp/127.0.0.1:{7447 + row}" for row in range(script.routers)]
     with Kernel(seed) as kernel:
@@ -420,7 +420,7 @@ def differences(real: Sequence[Event], simulated: Sequence[Event]) -> list[str]:
 
 
 def delays(real: Sequence[Event], simulated: Sequence[Event]) -> list[tuple[float, Event]]:
-    """How much later an event is in reality than in the simulation [s], for each real event."""
+    """Delay of each real event after the simulated one [s]."""
     other = histories(simulated)
     return [
         (event.t - twin.t, event)

@@ -10,7 +10,7 @@ from math import dist
 from pathlib import Path
 
 MIX = (Path(__file__).parent / "mix.toml").read_text("utf-8")
-APART_M = 0.9  # between two starts
+APART_M = 0.9  # distance of two starts
 RANDOM = "random"
 
 

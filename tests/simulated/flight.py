@@ -1,4 +1,4 @@
-"""One flight in this process, which can do nothing else afterwards; `tests.simulated.laboratory` forks it."""
+"""A flight in the process itself, which can do nothing else afterwards; `tests.simulated.laboratory` forks it."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def mutate(mutant: Mutant) -> None:
 
 
 def _body(code: CodeType) -> tuple[object, ...]:
-    """What a function does, wherever it stands in its file."""
+    """Code of a function, without its place in its file."""
     constants = tuple(_body(each) if isinstance(each, CodeType) else each for each in code.co_consts)
     return code.co_code, code.co_names, repr(constants)
 

@@ -24,7 +24,7 @@ from typing import IO, Any
 from tests.simulated.faults import Fault
 
 ROOT = Path(__file__).resolve().parents[2]
-LIMIT_S = 400.0  # of simulated time
+LIMIT_S = 400.0  # simulated time of the longest flight
 CPU_S = 60  # limit of processor time
 SHARED = Path("/dev/shm")
 
@@ -57,7 +57,7 @@ class Request:
     words: tuple[str, ...] = ()
     folder: str | None = None
     drawn: int | None = None  # seed of a random script
-    kinds: tuple[str, ...] = ()  # of its faults; empty: all
+    kinds: tuple[str, ...] = ()  # kinds of its faults; empty: all
 
 
 @dataclass(frozen=True)
@@ -124,14 +124,14 @@ class Violation:
 
 @dataclass
 class Track:
-    """What one robot did, in all of its processes."""
+    """History of a robot, in all of its processes."""
 
     phases: list[Phase] = field(default_factory=list)
     hazards: list[tuple[float, str]] = field(default_factory=list)  # begins, changes and ends
     missing: list[tuple[float, tuple[str, ...]]] = field(default_factory=list)  # neighbours, as the conductor learns it
     motors: list[tuple[float, bool]] = field(default_factory=list)  # times of changes
     samples: list[Sample] = field(default_factory=list)  # every 50 ms
-    commands: list[tuple[float, int]] = field(default_factory=list)  # to the body: time, and process
+    commands: list[tuple[float, int]] = field(default_factory=list)  # commands to the body: time, and process
     poses: list[tuple[float, int]] = field(default_factory=list)  # sent: time, and process
 
     def entered(self, phase: str) -> list[float]:
@@ -151,11 +151,11 @@ class Track:
 
 @dataclass
 class Flight:
-    """What a flight was. All times are in seconds after the common start; of one without, after the command began."""
+    """History of a flight. All times are in seconds after the common start; of one without, after the command began."""
 
     code: int | None  # exit code of `./zenpark run`; None: it did not end in time
     output: str  # its standard output and error
-    started: float | None  # from the begin of the command to the common start [s]; None: there was none
+    started: float | None  # time from the begin of the command to the common start [s]; None: there was none
     ended: float  # end of the command
     seed: int
     script: list[Fault]
@@ -166,8 +166,8 @@ class Flight:
     violations: list[Violation]
     crashes: list[tuple[float, str, str]]  # time, process and traceback of exceptions that nothing caught
     notes: list[tuple[float, str]]  # injected faults
-    metrics: list[dict[str, Any]] | None  # of metrics.json, by case
-    files: list[str]  # in the folder of the run
+    metrics: list[dict[str, Any]] | None  # metrics.json, by case
+    files: list[str]  # names in the folder of the run
     trace: str  # digest of all switches between threads
     cpu_s: float = 0.0
     robot_s: float = 0.0  # simulated seconds, summed over robots

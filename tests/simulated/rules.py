@@ -27,13 +27,13 @@ from tests.simulated.world import LOOK_S, OUTSIDE, World
 from twins.models.motion import Motion
 
 HELD = ("hold", "land", "cut")  # worst hazards with which a robot does not go on
-QUIET_S = 4.0  # after a disturbance, until all know all again
+QUIET_S = 4.0  # time after a disturbance, until all know all again
 ASKED = ("finished", "ordered to", "emergency", "asked to", "lands as")  # reasons to land that are no faults
 
 
 @dataclass
 class Seen:
-    """One robot at a look: its newest process, which is neither dead nor suspended and has joined."""
+    """Robot at a look: its newest process, which is neither dead nor suspended and has joined."""
 
     name: str
     process: Process
@@ -78,7 +78,7 @@ class Look:
     sent: dict[tuple[int, str], int] = field(default_factory=dict)  # poses, by process and robot
     phases: dict[tuple[int, str], int] = field(default_factory=dict)
     ran_s: dict[str, float] = field(default_factory=dict)  # time in the experiment, by robot
-    held_s: dict[str, float] = field(default_factory=dict)  # and by order of an operator
+    held_s: dict[str, float] = field(default_factory=dict)  # time for which an order of an operator held it
 
     @property
     def now(self) -> float:
@@ -141,7 +141,7 @@ EndRule = Callable[["End"], Iterator[str]]
 @dataclass(frozen=True)
 class Rule:
     name: str
-    sentence: str  # of `docs`; empty: nobody has to promise that
+    sentence: str  # text of `docs`; empty: no page has to promise that
     check: Callable[..., Any]
 
 
@@ -375,7 +375,7 @@ def contact(look: Look, one: Seen, other: Seen) -> str:
 
 
 def _second_voice(look: Look, name: str, process: Process) -> str:
-    """Who else drives a robot that this older process drives as well, though both are on the network."""
+    """Newer processes that drive the robot of an older one, though both are on the network."""
     newer = look.world.drivers.get(name)
     if newer is None:
         return ""
@@ -582,7 +582,7 @@ def no_success_after_a_change(end: End) -> Iterator[str]:
 
 @rule(AT_THE_END, "")
 def recording_is_kept(end: End) -> Iterator[str]:
-    """What was recorded is found, and its figures are finite."""
+    """The recording is found, and its figures are finite."""
     if end.code not in {0, 1, 3} or "start" not in end.world.moments or end.world.disks:
         return
     for case in end.world.cases[:1]:

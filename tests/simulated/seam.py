@@ -34,9 +34,8 @@ from experiments.real_time.hosts import launcher, run_registry
 from experiments.real_time.processes import joining, world_population
 from experiments.real_time.processes import robot as robot_process
 from experiments.recording import version, writer
-from tests.simulated import bodies, processes
+from tests.simulated import advanced, bodies, links, processes
 from tests.simulated import kernel as sim
-from tests.simulated import network as net
 from tests.simulated.world import current, running
 from tools import progress as shown_progress
 from tools.commands import run as run_command
@@ -67,7 +66,7 @@ def _patch_clocks_and_threads() -> None:
     threading.enumerate = lambda: []
     lifeline.LifelineEnd = sim.LifelineEnd
     command_line.spare_imports = lambda: None
-    calls.signal = SimpleNamespace()  # without `setitimer` plug-ins are not supervised
+    calls.signal = SimpleNamespace()  # plug-ins are not supervised without `setitimer`
     orders.ThreadPoolExecutor = processes.Pool
 
 
@@ -111,11 +110,11 @@ def _patch_processes() -> None:
 
 
 def _patch_network() -> None:
-    pubsub.RingChannel = network_session.RingChannel = pubsub.FifoChannel = net.Ring
-    pubsub.pose_publisher = lambda session, key, mime, kept=1: net.AdvancedPublisher(session, key, mime, kept)
-    pubsub.advanced_subscriber = net.AdvancedSubscriber
+    pubsub.RingChannel = network_session.RingChannel = pubsub.FifoChannel = links.Ring
+    pubsub.pose_publisher = lambda session, key, mime, kept=1: advanced.AdvancedPublisher(session, key, mime, kept)
+    pubsub.advanced_subscriber = advanced.AdvancedSubscriber
     pubsub.Callback = lambda function, indirect: function
-    zenoh.SourceInfo = net.source_info
+    zenoh.SourceInfo = links.source_info
     network_session.open_with = lambda chosen: current().network.open(chosen)  # noqa: PLW0108 - of the world that comes
     network_session.forbid_lingering = router_process.forbid_lingering = lambda: 0
     network_session.hang_up = lambda session: session.hang_up()

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 
 from tests.simulated.faults import Fault
 
-TICK_S = 0.01  # of robots at 100 Hz
-AT_S = 1.005  # between two ticks
+TICK_S = 0.01  # period of robots at 100 Hz
+AT_S = 1.005  # instant between two ticks
 
 PAIR = """
 title = "two on wheels"

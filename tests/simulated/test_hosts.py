@@ -1,4 +1,4 @@
-"""What docs/hosts.md promises where the launcher, the network, a robot or a clock breaks.
+"""Promises of docs/hosts.md where the launcher, the network, a robot or a clock breaks.
 
 Connections through ssh are not simulated: tests/system/test_machines.py has them.
 """

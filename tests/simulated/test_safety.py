@@ -1,4 +1,4 @@
-"""What docs/safety.md promises of robots, by the exact clock of the simulated laboratory."""
+"""Promises of docs/safety.md, by the exact clock of the simulated laboratory."""
 
 from dataclasses import replace
 from math import inf
@@ -13,7 +13,7 @@ FLIER, WHEELS = "crazyflie", "khepera4"
 LOST = "its own position is lost"
 SILENT = "no connection to a router"
 SOON_S = 2.5 * TICK_S  # the robot reads its body, decides and tells
-HEARD_S = 0.1  # of an event, with the look of the conductor every 0.05 s
+HEARD_S = 0.1  # delay of an event, with the look of the conductor every 0.05 s
 
 
 def at(since, *texts):

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 LOOK_S = 0.05  # period of samples and rules
 LATE_S = 0.0002  # mean lateness of a sleep on an idle machine [s]
-END_S = 0.05  # after the end of the last process
+END_S = 0.05  # time after the end of the last process
 OUTSIDE = ("operator", "capture", "second ")  # processes that no run has started
 
 _world: World | None = None
@@ -46,7 +46,7 @@ def current() -> World:
 
 
 class World:
-    """One laboratory, its script, and what was seen of it."""
+    """Laboratory of one flight: its script, and its history."""
 
     def __init__(
         self, kernel: sim.Kernel, script: Sequence[Fault], *, varied: bool, clocks: Mapping[str, float]
@@ -57,15 +57,15 @@ class World:
         self.kernel = kernel
         self.network = net.Network()
         self.script, self.varied, self.clocks = list(script), varied, dict(clocks)
-        self.moments: dict[str, float] = {"launch": self.now}  # of the script
+        self.moments: dict[str, float] = {"launch": self.now}  # moments that a script counts from
         self.bodies: list[WatchedBody] = []
         self.populations: list[tuple[sim.Process, world_population.WorldBodies]] = []
         self.readings: dict[str, Any] = {}  # faults of measurements by robot: word, number, memory
         self.captures: dict[str, Any] = {}
-        self.disks: dict[str, Any] = {}  # by the name of a process as in a script
+        self.disks: dict[str, Any] = {}  # disks by the name of a process in a script
         self.robots: dict[str, sim.Process] = {}  # newest process that the run has started
         self.launched: dict[str, list[str]] = {}  # command lines of robots
-        self.runtimes: dict[int, loop.Runtime] = {}  # by process id
+        self.runtimes: dict[int, loop.Runtime] = {}  # runtimes by process id
         self.runs: list[tuple[run_registry.RegisteredRun, run_registry.Obey, sim.Process]] = []
         self.progress: run_view.Progress | None = None
         self.seen: dict[int, int] = {}  # number of events that were noted, by progress
@@ -83,9 +83,9 @@ class World:
         self.takeoffs_ordered: list[tuple[float, str]] = []
         self.stops: list[float] = []
         self.drivers: dict[str, tuple[sim.Process, float]] = {}  # newest process that has driven a robot, and when
-        self.rising: dict[tuple[int, str], bool] = {}  # by process and robot: it was just told to take off
+        self.rising: dict[tuple[int, str], bool] = {}  # True by process and robot if it was just told to take off
         self.cases: list[str] = []
-        self.ends: dict[int, float] = {}  # by process id
+        self.ends: dict[int, float] = {}  # times by process id
         self._flying: dict[str, bool] = {}
         self._over = inf
         self.disturbed_until = 0.0

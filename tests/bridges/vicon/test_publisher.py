@@ -205,10 +205,10 @@ def test_positions_arrive_as_placed_and_when_measured(printed):
     np.testing.assert_allclose([each.yaw for each in rover], -2.0)
     stamps = np.array([each.stamp for each in drone])
     assert np.diff(stamps).min() > 0.0
-    assert np.median(np.diff(stamps)) > 0.8 * 0.005  # on a busy machine the camera leaves out some frames
+    assert np.median(np.diff(stamps)) > 0.8 * 0.005  # a busy machine leaves out some frames of the camera
     assert begin < stamps[0] + 0.25
     assert stamps[-1] + 0.25 < now + 0.01
-    said = [line for line in printed if "wait in a queue" not in line]  # on a busy machine they do
+    said = [line for line in printed if "wait in a queue" not in line]  # a busy machine has them
     assert said == [f"connected to {camera.twin.address}", "CF01 is seen as 'cf_1'", "KH01 is seen as 'KH01'"]
 
 

@@ -196,7 +196,7 @@ class Counting(Trigger, frozen=True):
 
 
 def test_stretches_of_legs_hazards_and_users_laws():
-    """One compilation covers followers of A with different laws, other seeds, and samples of positions alone.
+    """The same compilation covers followers of A with different laws, other seeds, and samples of positions alone.
 
     And a robot that lands early, a hazard, and a law that fails.
     """
