@@ -123,8 +123,9 @@ class WatchedBody(Body):
         current().bodies.append(self)
 
     def motion(self, row: int) -> Motion | None:
-        twins = getattr(self.body, "twins", None)
-        return None if twins is None else twins[row].motion
+        twins: Sequence[Any] | None = getattr(self.body, "twins", None)
+        motion: Motion | None = None if twins is None else twins[row].motion
+        return motion
 
     def open(self) -> None:
         self.body.open()

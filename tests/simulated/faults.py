@@ -137,7 +137,8 @@ def _capture(world: World, fault: Fault) -> None:
 
 def _misread(world: World, table: dict[str, Any], fault: Fault) -> None:
     word, number = fault.size if isinstance(fault.size, tuple | list) else (fault.size, 0.0)
-    table[fault.who] = made = (word, number, {})
+    made: tuple[str, float, dict[str, Any]] = (word, number, {})
+    table[fault.who] = made
     if fault.lasts:
         world.after(fault.lasts, lambda: table.get(fault.who) is made and table.pop(fault.who))
 

@@ -112,7 +112,12 @@ class Pool:
         found: list[object] = []
         thread = sim.Thread(target=lambda: found.append(call(*given)))
         thread.start()
-        return SimpleNamespace(result=lambda: (thread.join(), found[0])[1])
+
+        def result() -> object:
+            thread.join()
+            return found[0]
+
+        return SimpleNamespace(result=result)
 
 
 @contextlib.contextmanager
@@ -195,7 +200,7 @@ class DiskFile:
 
     def write(self, data: Any) -> int:
         writable(self._name)
-        return self._file.write(data)
+        return int(self._file.write(data))
 
 
 def open_file(file: Any, mode: str = "r", *given: Any, **more: Any) -> Any:

@@ -192,7 +192,7 @@ def inside_the_arena(look: Look, seen: Seen) -> str:
 @rule(OF_ROBOTS, "| its goal or setpoint is not finite | | hold: the setpoint is its own position |")
 def finite_motion(_: Look, seen: Seen) -> str:
     known = seen.motion is None or all(map(isfinite, seen.motion.position))
-    return "" if known else f"its true position is {seen.motion.position}"  # type: ignore[union-attr]
+    return "" if known else f"its true position is {seen.motion.position}"
 
 
 @rule(OF_ROBOTS, "It holds 1.3 to 1.8 s after the loss")
@@ -467,8 +467,8 @@ def all_end(end: End) -> Iterator[str]:
 @rule(AT_THE_END, "")
 def no_exception(end: End) -> Iterator[str]:
     """No exception ends a thread or a process, and none is printed."""
-    for _, process, thread, text in end.world.kernel.crashes:
-        yield f"{process}/{thread}: {text.strip().splitlines()[-1]}\n{text}"
+    for _, name, thread, text in end.world.kernel.crashes:
+        yield f"{name}/{thread}: {text.strip().splitlines()[-1]}\n{text}"
     crashed = {crash[1] for crash in end.world.kernel.crashes}
     for process in end.world.processes:
         if process.name not in crashed and "Traceback" in (text := "".join(process.out)):
@@ -540,9 +540,9 @@ def no_success_without_all(end: End) -> Iterator[str]:
         if process.code == KILLED and "router" not in process.name and 0.0 < ended < end.duration_s - 0.6:
             yield f"{process.name} was killed at {ended:.1f} s"
     assert end.world.plan is not None
-    for name, robot in end.world.plan.experiment.robots.items():
+    for name, asked in end.world.plan.experiment.robots.items():
         ran, held = end.look.ran_s.get(name, 0.0), end.look.held_s.get(name, 0.0)
-        if robot.standby or end.world.interrupted:
+        if asked.standby or end.world.interrupted:
             continue
         if ran < 0.8 * end.duration_s:
             yield f"{name}: ran for {ran:.1f} of {end.duration_s:g} s"
