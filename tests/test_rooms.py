@@ -224,6 +224,7 @@ def test_test_names_are_short_and_unique():
 
 # what names a kind outside of its own files, and why; all others ask its `Kind`
 NAMES_KINDS = {
+    "experiments.authoring.crazyswarm": "drones of another project",
     "experiments.authoring.generate": "kind of a new formation, if none is asked for",
     "experiments.authoring.robotic_park.file": "drivers of another project, by their robots",
     "experiments.definition.experiment": "example in a text",

@@ -202,22 +202,33 @@ def overload(radio: str, each: Sequence[CrazyflieSettings], exchanges_hz: float)
     return f"radio {radio}: {len(each)} robots {fault}: {_remedy(each, exchanges_hz)}"
 
 
-def _remedy(each: Sequence[CrazyflieSettings], exchanges_hz: float) -> str:
-    """The rates that fit a radio, or the number of robots that do."""
-    for robots in range(len(each), 0, -1):
+def fitting(each: CrazyflieSettings, robots: int, exchanges_hz: float) -> tuple[int, CrazyflieSettings]:
+    """Number of robots that a radio carries, up to `robots`, and the settings with rates at which it does.
+
+    The number is 0 where it carries none.
+    """
+    for number in range(robots, 0, -1):
         for percent in range(100, 0, -1):
-            lowered = _lowered(each[0], 0.01 * percent, robots, exchanges_hz)
-            some = [lowered] * robots
+            lowered = _lowered(each, 0.01 * percent, number, exchanges_hz)
+            some = [lowered] * number
             if sum(one.packets_hz for one in some) <= capacity(some, exchanges_hz) and (
                 oldest_pose(some, exchanges_hz) <= YOUNG_S
             ):
-                rates = f"log_hz = {lowered.log_hz:g}, stream_hz = {lowered.stream_hz:g}"
-                if isinstance(lowered.positioning, Outside):
-                    rates += f", positioning.rate_hz = {lowered.positioning.rate_hz:g}"
-                if robots == len(each):
-                    return f"in each device table write {rates}, or plug in another radio"
-                return f"plug in another radio; this one carries {robots}, with {rates}"
-    return "is another program using it?"
+                return number, lowered
+    return 0, each
+
+
+def _remedy(each: Sequence[CrazyflieSettings], exchanges_hz: float) -> str:
+    """The rates that fit a radio, or the number of robots that do."""
+    robots, lowered = fitting(each[0], len(each), exchanges_hz)
+    if not robots:
+        return "is another program using it?"
+    rates = f"log_hz = {lowered.log_hz:g}, stream_hz = {lowered.stream_hz:g}"
+    if isinstance(lowered.positioning, Outside):
+        rates += f", positioning.rate_hz = {lowered.positioning.rate_hz:g}"
+    if robots == len(each):
+        return f"in each device table write {rates}, or plug in another radio"
+    return f"plug in another radio; this one carries {robots}, with {rates}"
 
 
 def _lowered(each: CrazyflieSettings, share: float, robots: int, exchanges_hz: float) -> CrazyflieSettings:

@@ -1,4 +1,4 @@
-"""Commands that write experiment files: a new one, or one of Robotic Park's authors."""
+"""Commands that write experiment files: a new one, one of Robotic Park's authors, or one of Crazyswarm2."""
 
 from __future__ import annotations
 
@@ -68,20 +68,34 @@ def new(
     print(f"{path}: {made.title}, {len(made.pairs)} links; `./zenpark check {path}`, `./zenpark run {path} --virtual`")
 
 
-@app.command(name="import", epilog=example("import park.yaml park.toml --duration 60"))
+@app.command(name="import", epilog=example("import crazyflies.yaml", "import park.yaml park.toml --duration 60"))
 def import_(
-    file: Annotated[str, Argument(metavar="FILE.yaml", help="An experiment of Robotic Park's authors.")],
+    file: Annotated[
+        str, Argument(metavar="FILE.yaml", help="crazyflies.yaml of Crazyswarm2, or a file of Robotic Park's authors.")
+    ],
     target: Annotated[str | None, Argument(metavar="TARGET", help="The file to write. [FILE.toml]")] = None,
     *,
     duration: Annotated[float, Option(min=1.0, max=86400.0, help="Duration, which their files lack [s].")] = 60.0,
-    poses: Annotated[str | None, Option(metavar="FILE", help="Starts: index (.yaml) or Webots world (.wbt).")] = None,
-    gain: Annotated[Gain, Option(help="Gains of the file, or lowered where the twins would swing.")] = Gain.THEIRS,
+    poses: Annotated[
+        str | None, Option(metavar="FILE", help="Starts (Robotic Park): index (.yaml) or Webots world (.wbt).")
+    ] = None,
+    gain: Annotated[
+        Gain | None, Option(help="Gains of the file (Robotic Park), or lowered where the twins would swing. [theirs]")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Turn an experiment file of Robotic Park's authors into one of zenpark."""
+    """Turn an experiment file of Robotic Park's authors, or the drones of Crazyswarm2, into a file of zenpark."""
+    from experiments.authoring import crazyswarm
     from experiments.authoring.robotic_park.convert import convert
+    from experiments.authoring.robotic_park.file import text_of
 
-    path, notes = convert(file, target, duration, poses, calm=gain is Gain.STABLE)
+    text = text_of(file, "name a crazyflies.yaml of Crazyswarm2, or an experiment of Robotic Park's authors (.yaml)")
+    if crazyswarm.is_crazyswarm(file, text):
+        if poses is not None or gain is not None:
+            raise typer.BadParameter("--poses and --gain are for files of Robotic Park; this is one of Crazyswarm2")
+        path, notes = crazyswarm.convert(file, text, target, duration)
+    else:
+        path, notes = convert(file, target, duration, poses, calm=gain is Gain.STABLE)
     lines = [f"{path}: from {file}; `./zenpark check {path}`, `./zenpark run {path} --virtual`"]
     if notes:
         lines.append("Not carried over, or not as it was:")

@@ -39,7 +39,11 @@ PLACES: Final = ("origin", "line", *SURFACES)  # relations that are no robots
 TASKS: Final = ("distance", "pose", "relative_pose")
 NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 TOOLS: Final = ("CPU_Monitoring", "Interface", "Data_Logging", "Supervisor")
-EXAMPLES: Final = {"name": "name: dron01", "type": "type: virtual", "pose": "pose: 0.5, 0.5, 0.0"}  # text of each key
+EXAMPLES: Final = {  # text of each key
+    "name": "name: dron01", "type": "type: virtual", "pose": "pose: 0.5, 0.5, 0.0",
+    "uri": "uri: radio://0/80/2M/E7E7E7E701", "initial_position": "initial_position: [0.0, 0.5, 0.0]",
+    "initialPosition": "initialPosition: [0.0, 0.5, 0.0]", "id": "id: 1", "channel": "channel: 80",
+}  # fmt: skip
 OLDER: Final = {"pose", "config_path", "communication", "task", "agent_ip", "control_mode"}  # keys of a robot of 2023
 OLDER_LAW: Final = {"gain": 0.25, "upperLimit": 0.08, "lowerLimit": -0.08}
 WORD: Final = re.compile(r'"[^"]*"|#[^\n]*|[{}\[\]]|[^\s{}\[\]"#]+')  # word of a Webots world
@@ -326,7 +330,7 @@ def load(file: str, text: str) -> YamlValue:
     except (yaml.YAMLError, RecursionError, ValueError, TypeError) as error:  # a character, nesting, a date, a key
         raise refusal(file, f"is no YAML: {error}", "write it out in plain tables") from None
     if not isinstance(value, dict):
-        hint = "an experiment of Robotic Park has sections such as Operation and Robots"
+        hint = "an experiment of Robotic Park has sections such as Operation and Robots; one of Crazyswarm2 has robots"
         raise refusal(file, "is no table of sections", hint)
     return YamlValue(file, "", value)
 
@@ -344,7 +348,7 @@ def read(file: str, text: str, poses: Mapping[str, Pose], notes: list[str]) -> P
     root = load(file, text)
     given, entries = root.typed(_Sections), _entries(root)
     if not entries:
-        hint = "an experiment of Robotic Park lists them as Robot01, Robot02, ..."
+        hint = "an experiment of Robotic Park lists them as Robot01, Robot02, ...; Crazyswarm2 lists robots: by name"
         raise refusal(file, "'Robots' is missing or has none", hint)
     central = given.architecture.mode.lower() == CENTRAL
     if central:  # their central controller reads the relations of all robots, whatever `enable` says
