@@ -6,8 +6,10 @@ It starts at the robot's place (its anchor and heading when the leg begins), so 
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Sequence
-from itertools import pairwise
+from functools import lru_cache
+from itertools import accumulate, pairwise
 from math import copysign, cos, inf, isfinite, isnan, nan, pi, sin, sqrt, tau
 from typing import Annotated, Final
 
@@ -80,29 +82,30 @@ class Waypoints(Planner, frozen=True):
     loop: Annotated[bool, Meta(description="from the last point to the first, and again")] = False
 
     def target(self, elapsed: float, anchor: Vector, heading: float) -> Pose:
-        points = [spatial(point, anchor[2]) for point in self.points]  # heights left out stay
-        way, approach = elapsed * self.speed_, distance(anchor, points[0])
-        if self.loop and way > approach:
-            ring = [*points, points[0]]
-            lap = sum(distance(a, b) for a, b in pairwise(ring))
-            x, y, z = _point_along(ring, (way - approach) % (lap or 1.0))
-        else:
-            x, y, z = _point_along([anchor, *points], way)
-        return x, y, z, nan
+        route, ways = _route(anchor, self)
+        way = elapsed * self.speed_
+        if self.loop and way > ways[1]:
+            way = ways[1] + (way - ways[1]) % (ways[-1] - ways[1] or 1.0)
+        k = bisect_right(ways, way)
+        if k == len(route):
+            return (*route[-1], nan)
+        (x, y, z), (next_x, next_y, next_z) = route[k - 1], route[k]
+        share = (way - ways[k - 1]) / (ways[k] - ways[k - 1])
+        return x + share * (next_x - x), y + share * (next_y - y), z + share * (next_z - z), nan
 
     def speed(self) -> float:
         return self.speed_
 
+    def __hash__(self) -> int:
+        return hash((self.speed_, self.loop, len(self.points)))
 
-def _point_along(route: Sequence[Vector], way: float) -> Vector:
-    """The point reached after `way` metres along the polyline `route`; its last one beyond the end."""
-    for a, b in pairwise(route):
-        length = distance(a, b)
-        if way < length:
-            share = way / length
-            return a[0] + share * (b[0] - a[0]), a[1] + share * (b[1] - a[1]), a[2] + share * (b[2] - a[2])
-        way -= length
-    return route[-1]
+
+@lru_cache(maxsize=1024)
+def _route(anchor: Vector, leg: Waypoints) -> tuple[list[Vector], list[float]]:
+    """Points from the anchor on, and the way to each [m]: once for each leg, for a tick would walk all of them."""
+    points = [spatial(point, anchor[2]) for point in leg.points]  # heights left out stay
+    route = [anchor, *points, *points[: leg.loop]]
+    return route, [*accumulate((distance(a, b) for a, b in pairwise(route)), initial=0.0)]
 
 
 class Circle(Planner, frozen=True):

@@ -27,6 +27,8 @@ ENOUGH: Final = 3e-4  # [m] distances written with four decimals are met as well
 SLOWLY: Final = 1e-2  # share of the rest: smaller improvements of a small error are not worth their time
 OFF: Final = 1e-3  # [m] a shape that misses by more misses by more than written digits explain
 ROUNDED: Final = 1e-3  # [m] distances written with three decimals contradict one another by less
+DENSE: Final = 400  # unknowns up to which a matrix is solved: its time grows with the third power
+CLOSE: Final = 1e-2  # rest of a step by conjugate gradients, as a share: the next step sees to it
 MIRRORS: Final = 3  # robots on the wrong side that are sought
 MOST_MIRRORED: Final = 40  # robots of a formation in which they are sought: the time grows with the third power
 MOST_SIDES: Final = 4  # neighbours of a robot through which the lines are sought
@@ -57,6 +59,38 @@ class Residuals(NamedTuple):
                 np.add.at(square, (one[both], other[both]), sign * against * outer[both])
         size = axes * len(rows)
         return square.transpose(0, 2, 1, 3).reshape(size, size), slope.ravel()
+
+
+    def descent(self, free: Mask, damping: float) -> Array:
+        """Step x (N, 3) [m] of the coordinates that are `free`, with (JᵀJ + damping) x = −Jᵀ value, about.
+
+        By conjugate gradients, the diagonal as preconditioner: the Jacobian J is nearly empty, and JᵀJ is never made
+        (M. R. Hestenes, E. Stiefel, Journal of Research of the National Bureau of Standards 49(6), 1952).
+        """
+        at = 3 * np.stack([self.tail, np.maximum(self.head, 0)], axis=1)[:, :, None] + np.arange(3)
+        slope = np.stack([self.slope, np.where(self.head[:, None] < 0, 0.0, -self.slope)], axis=1)
+        at, slope, count = at.reshape(-1, 6), slope.reshape(-1, 6), free.size
+        fixed = ~free.ravel()
+
+        def gathered(values: Array) -> Array:
+            found = np.bincount(at.ravel(), values.ravel(), count).astype(float, copy=False)
+            found[fixed] = 0.0
+            return found
+
+        rest = -gathered(slope * self.value[:, None])
+        step, diagonal = np.zeros(count), gathered(slope**2) + damping
+        along = rest / diagonal
+        power = float(rest @ along)
+        enough = CLOSE * CLOSE * power
+        for _ in range(count):
+            if not power > enough:
+                break
+            image = gathered(slope * np.vecdot(slope, along[at])[:, None]) + damping * along
+            share = power / float(along @ image)
+            step, rest = step + share * along, rest - share * image
+            last, power = power, float(rest @ (rest / diagonal))
+            along = rest / diagonal + power / last * along
+        return step.reshape(-1, 3)
 
 
 def targets_of_law(law: Law, links: Links) -> Links:
@@ -244,11 +278,14 @@ def fitted_shape(links: Links, anchors: Anchored, guess: Array, free: Mask) -> S
     position, damping = guess.copy(), 1e-3
     now = residuals(links, anchors, position)
     for _ in range(200):
-        normal, slope = now.normal(rows, len(guess), axes)
-        step = np.zeros(len(slope))
-        step[own] = np.linalg.solve(normal[np.ix_(own, own)] + damping * np.eye(int(own.sum())), -slope[own])
         tried = position.copy()
-        tried[rows, :axes] += step.reshape(-1, axes)
+        if free.sum() > DENSE:
+            tried += now.descent(free, damping)
+        else:
+            normal, slope = now.normal(rows, len(guess), axes)
+            step = np.zeros(len(slope))
+            step[own] = np.linalg.solve(normal[np.ix_(own, own)] + damping * np.eye(int(own.sum())), -slope[own])
+            tried[rows, :axes] += step.reshape(-1, axes)
         then = residuals(links, anchors, tried)
         before, after = float(now.value @ now.value), float(then.value @ then.value)
         if after < before:

@@ -78,9 +78,11 @@ def matching(asked: str) -> list[Entry]:
     if asked in KINDS:
         return [_kind(KINDS[asked])]
     sought = "".join(f".{part}" for part in re.split(r"[.()\[\]]+", asked.strip().strip('"')) if part)
-    found = [entry for entry in entries() if sought and re.fullmatch("".join(map(_pattern, _split(entry.key))), sought)]
-    if not found and sought:
-        ends = [entry for entry in entries() if _has_end(entry, sought)]
+    end = sought.rpartition(".")[2]  # most patterns need not be compiled
+    near = [entry for entry in entries() if sought and (end in entry.key or entry.key[-1].isupper())]
+    found = [entry for entry in near if re.fullmatch("".join(map(_pattern, _split(entry.key))), sought)]
+    if not found:
+        ends = [entry for entry in near if _has_end(entry, sought)]
         found = sorted(ends, key=lambda entry: len(entry.words))
     tables = tuple(f"{entry.key}{sign}" for entry in found for sign in ".(")
     return found + [each for each in entries() if each.key.startswith(tables) and each not in found]

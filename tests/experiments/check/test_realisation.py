@@ -147,6 +147,16 @@ def test_distances_of_a_drawing_are_met_again(seed, rows):
     assert realisation.conflicts(net, height) == []
 
 
+def test_large_shapes_are_fitted_by_conjugate_gradients():
+    """A grid with diagonals, from a guess that is off by a tenth of its distances."""
+    grid = np.array([(k % 15, k // 15, 0.0) for k in range(225)])
+    near = [(i, j) for i, j in permutations(range(225), 2) if 0.0 < np.linalg.norm(grid[i] - grid[j]) < 1.5]
+    guess = grid + 0.1 * np.random.default_rng(1).normal(size=grid.shape) * (1.0, 1.0, 0.0)
+    free = np.broadcast_to(np.array([True, True, False]), grid.shape)
+    assert free.sum() > realisation.DENSE
+    assert realisation.fitted_shape(linked(grid, near), (), guess, free).worst < 1e-6
+
+
 def test_robots_on_the_wrong_side_are_named():
     rng = np.random.default_rng(0)
     shape = np.column_stack([rng.uniform(-1.0, 1.0, (5, 2)), np.zeros(5)])
