@@ -60,7 +60,6 @@ class Residuals(NamedTuple):
         size = axes * len(rows)
         return square.transpose(0, 2, 1, 3).reshape(size, size), slope.ravel()
 
-
     def descent(self, free: Mask, damping: float) -> Array:
         """Step x (N, 3) [m] of the coordinates that are `free`, with (JᵀJ + damping) x = −Jᵀ value, about.
 
