@@ -66,9 +66,10 @@ class Residuals(NamedTuple):
         By conjugate gradients, the diagonal as preconditioner: the Jacobian J is nearly empty, and JᵀJ is never made
         (M. R. Hestenes, E. Stiefel, Journal of Research of the National Bureau of Standards 49(6), 1952).
         """
-        at = 3 * np.stack([self.tail, np.maximum(self.head, 0)], axis=1)[:, :, None] + np.arange(3)
-        slope = np.stack([self.slope, np.where(self.head[:, None] < 0, 0.0, -self.slope)], axis=1)
-        at, slope, count = at.reshape(-1, 6), slope.reshape(-1, 6), free.size
+        ends = np.stack([self.tail, np.maximum(self.head, 0)], axis=1)
+        at = (3 * ends[:, :, None] + np.arange(3)).reshape(-1, 6)
+        slope = np.hstack([self.slope, np.where(self.head[:, None] < 0, 0.0, -self.slope)])
+        count = free.size
         fixed = ~free.ravel()
 
         def gathered(values: Array) -> Array:
