@@ -7,11 +7,11 @@ It starts at the robot's place (its anchor and heading when the leg begins), so 
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from itertools import accumulate, pairwise
 from math import copysign, cos, inf, isfinite, isnan, nan, pi, sin, sqrt, tau
-from typing import Annotated, Final
+from typing import Annotated, ClassVar, Final
 
 import msgspec
 from msgspec import Meta
@@ -25,6 +25,8 @@ NO_TARGET: Final[Pose] = (nan, nan, nan, nan)
 class Planner(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Base of all planners: target as a function of time."""
 
+    FILES: ClassVar[Mapping[str, str]] = {}  # parameters that name a file, and those that get its content, in base64
+
     def target(self, elapsed: float, anchor: Vector, heading: float) -> Pose:
         """Target x, y, z [m] and yaw [rad], NaN where any yaw will do.
 
@@ -35,6 +37,10 @@ class Planner(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     def speed(self) -> float:
         """Largest speed of the target [m/s]."""
         raise TypeError(f"{type(self).__name__} must define `speed`")
+
+    def source(self, elapsed: float) -> str:
+        """Place in a file of the target at a time since the leg began [s], for people; empty without a file."""
+        return ""
 
 
 def spatial(place: Sequence[float], height: float) -> Vector:

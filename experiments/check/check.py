@@ -54,7 +54,7 @@ SUBJECTS: Final = (
     theory.redundancy, theory.stability, theory.law,
     surroundings.contacts, surroundings.obstacles, surroundings.perception, surroundings.reality,
     motion.flight, motion.starts, motion.formation, motion.anchors, noise.softness, motion.walls, motion.ceiling,
-    motion.encounters, motion.speeds, motion.turning_circle, motion.rates, motion.ends,
+    motion.encounters, motion.speeds, motion.recordings, motion.turning_circle, motion.rates, motion.ends,
     safety.architecture, safety.safety, safety.batteries, safety.libraries, safety.devices,
     safety.turned,
     chance, compilation,

@@ -8,6 +8,7 @@ from typing import Final
 
 import numpy as np
 
+from agents.body.kinds import Kind
 from agents.decision.position_control import REACHED
 from agents.formation.link import BY_DISTANCE, BY_RELATIVE
 from agents.plugins.planners import Planner
@@ -31,6 +32,11 @@ NEARLY: Final = 0.9  # share of its speed: the rest is needed to catch up
 LATE: Final = 0.25  # share of a run, at its end, in which a formation must be at rest
 SWINGS: Final = 6.0  # ways of an error there, as multiples of its range, that make it an oscillation
 WIDE: Final = 0.01  # [m] smaller swings of a law that has no tolerance are its trigger's
+PROBED_S: Final = 0.02  # [s] time between the looked-at moments of a plan from a file
+ACCELERATES_S: Final = 0.2  # [s] window of a mean acceleration
+BEGINS_M: Final = 0.15  # [m] distance of a robot from the begin of its recording: less than a goal may be away
+GRAVITY: Final = 9.81  # [m/s²]
+TILT: Final = math.radians(20.0)  # [rad] limit of tilt in the position controllers of small drones
 SETTLED: Final = 1e-3  # [m] travel per decision below which robots are at rest, and in `WINDOW_S` one on wheels stands
 
 
@@ -320,6 +326,7 @@ def encounters(analysis: Analysis) -> Iterator[Finding]:
                 "give robots other ways or places from here on, or add an avoidance (`./zenpark explain avoidance`)"
             )
         message = f"{first} and {second} come within {each.distance:.2f} m at {each.time:.1f} s; {how}"
+        message += _sources(analysis, each.time, first, second)
         if experiment.avoidance is None or not (experiment.robots[first].avoids or experiment.robots[second].avoids):
             yield Finding("warning", "too-close", message, remedy, path)
         else:
@@ -367,6 +374,17 @@ def _first_time(analysis: Analysis, row: int, where: Mask) -> tuple[float, str]:
     return time, f"at {time:.1f} s, at ({x:.2f}, {y:.2f})"
 
 
+def _sources(analysis: Analysis, time: float, *robots: str) -> str:
+    """Places in files that robots follow at a time, in brackets; empty if they follow none."""
+    timeline = analysis.plan.experiment.timeline
+    found = []
+    for name in robots:
+        begun = [(timeline[k].at_s, plan) for k, robot, plan in analysis.legs if robot == name]
+        source = next((plan.source(time - at) for at, plan in reversed(begun) if at <= time), "")
+        found += [source] if source else []
+    return f" ({'; '.join(found)})" if found else ""
+
+
 def _left_arena(analysis: Analysis, row: int, outside: Mask) -> Finding:
     name, timeline = analysis.plan.names[row], analysis.plan.experiment.timeline
     time, when = _first_time(analysis, row, outside)
@@ -374,7 +392,8 @@ def _left_arena(analysis: Analysis, row: int, outside: Mask) -> Finding:
     message = f"{name} would leave the arena {when}"
     if row in analysis.without_neighbours and begun:
         remedy = "shorten the plan, start it elsewhere, or enlarge size in [arena]"
-        return Finding("error", "leaves-arena", f"{message}, by its plan", remedy, ("timeline", begun[-1], "plan"))
+        message = f"{message}, by its plan{_sources(analysis, time, name)}"
+        return Finding("error", "leaves-arena", message, remedy, ("timeline", begun[-1], "plan"))
     remedy = "start the formation farther inside, lead it elsewhere, or enlarge size in [arena]"
     return Finding("error", "leaves-arena", message, remedy, ("robots", name, "start"))
 
@@ -390,6 +409,11 @@ def speeds(analysis: Analysis) -> Iterator[Finding]:
         has = float((analysis.speed if leads else analysis.pull)[row])
         what = f"the leg at {experiment.timeline[number].at_s:g} s asks {robot} for {asked:.3g} m/s"
         remedy = f"plan for less than {NEARLY * has:.2g} m/s"
+        if plan.source(0.0):
+            elapsed, places = _probed(plan, np.zeros(3), experiment.duration_s)
+            what = f"{plan.source(elapsed[int(norm(np.diff(places, axis=0)).argmax())])}: {what}"
+            slower = getattr(plan, "stretch", 1.0) * asked / (NEARLY * has)
+            remedy = f"write stretch = {math.ceil(10.0 * slower) / 10.0:g}, which makes it slower"
         if leads and asked > has * (1.0 + 1e-9):
             problems.append(Finding("error", "leader-too-fast", f"{what}; it has {has:.3g} m/s", remedy, path))
         elif asked > NEARLY * has:
@@ -411,6 +435,79 @@ def speeds(analysis: Analysis) -> Iterator[Finding]:
     if not problems and fastest is not None:
         most = f"{fastest[2].speed():.2g} m/s at most"
         yield Finding("note", "speeds", f"no plan asks for more than the robots have ({most})")
+
+
+def recordings(analysis: Analysis) -> Iterator[Finding]:
+    """Check that plans from files begin at their robots, stay in the arena and accelerate no faster than these can."""
+    timeline, limits = analysis.plan.experiment.timeline, analysis.limits
+    track, rate = analysis.prediction.position, analysis.plan.experiment.rates.coordination_hz
+    for number, robot, plan in analysis.legs:
+        if not plan.source(0.0):
+            continue
+        row, at = analysis.plan.names.index(robot), timeline[number].at_s
+        where: Path = ("timeline", number, "plan")
+        later = [leg.at_s for leg in timeline[number + 1 :] if leg.robot == robot]
+        place = track[min(round(at * rate), len(track) - 1), row]
+        elapsed, path = _probed(plan, place, min([analysis.plan.experiment.duration_s, *later]) - at)
+        found = [*_begins_elsewhere(robot, plan, path[0], place, where)]
+        beyond = np.maximum(path - limits.high, limits.low - path).max(axis=1)
+        leaves = np.maximum(track[:, row] - limits.high, limits.low - track[:, row]).max() > FORGIVEN
+        if (beyond > FORGIVEN).any() and not leaves:  # else it is a finding of `walls`
+            k = int((beyond > FORGIVEN).argmax())
+            x, y, z = path[k]
+            message = f"{plan.source(elapsed[k])}: it leads {robot} out of the arena, to ({x:.2f}, {y:.2f}, {z:.2f})"
+            remedy = "enlarge size in [arena] if the room is larger, write relative = true, or shorten it with until_s"
+            found.append(Finding("error", "recording-outside", message, remedy, where))
+        k, most = _largest_acceleration(path)
+        limit = _acceleration_limit(analysis.plan.kinds[row])
+        if most > limit:
+            stretch = math.ceil(10.0 * getattr(plan, "stretch", 1.0) * math.sqrt(most / limit)) / 10.0
+            message = f"{plan.source(elapsed[k])}: it asks {robot} for {most:.2g} m/s², which has {limit:.2g} m/s²"
+            remedy = f"write stretch = {stretch:g}, which makes it slower"
+            found.append(Finding("warning", "recording-too-sharp", message, remedy, where))
+        yield from found
+        if not found:
+            message = f"{robot} follows {plan.source(0.0).partition(',')[0]}: {plan.speed():.2g} m/s, {most:.2g} m/s²"
+            yield Finding("note", "recordings", f"{message} at most", "", where)
+
+
+def _probed(plan: Planner, anchor: Array, lasts_s: float) -> tuple[list[float], Array]:
+    """Times since the leg began [s] (K), two or more, and the targets there (K, 3) [m]."""
+    elapsed = [PROBED_S * k for k in range(max(math.ceil(lasts_s / PROBED_S), 2))]
+    return elapsed, np.array([plan.target(t, tuple(anchor.tolist()), 0.0)[:3] for t in elapsed])
+
+
+def _begins_elsewhere(robot: str, plan: Planner, first: Array, place: Array, where: Path) -> Iterator[Finding]:
+    """Finding that a plan begins where its robot is not."""
+    away = float(norm(first - place))
+    if away > BEGINS_M:
+        (x, y, z), (at_x, at_y, at_z) = first, place
+        message = (
+            f"{plan.source(0.0)}: it begins at ({x:.2f}, {y:.2f}, {z:.2f}), {away:.2f} m from {robot}, "
+            f"which is at ({at_x:.2f}, {at_y:.2f}, {at_z:.2f}) then"
+        )
+        remedy = (
+            "write relative = true, change start or hover, begin later in the file (from_s), or lead it there before"
+        )
+        yield Finding("error", "recording-begins-elsewhere", message, remedy, where)
+
+
+def _largest_acceleration(path: Array) -> tuple[int, float]:
+    """Sample at which the mean acceleration over two windows is largest, and that [m/s²].
+
+    Over windows, because noise and corners of a recording have any acceleration in a moment.
+    """
+    step = round(ACCELERATES_S / PROBED_S)
+    if len(path) <= 2 * step:
+        return 0, 0.0
+    bend = norm(path[2 * step :] - 2.0 * path[step:-step] + path[: -2 * step]) / ACCELERATES_S**2
+    at = int(bend.argmax())
+    return at + step, float(bend[at])
+
+
+def _acceleration_limit(kind: Kind) -> float:
+    """Largest acceleration of a kind in its plane of motion [m/s²]."""
+    return GRAVITY * math.tan(TILT) if kind.flies else float(getattr(kind.motion, "acceleration", math.inf))
 
 
 def turning_circle(analysis: Analysis) -> Iterator[Finding]:

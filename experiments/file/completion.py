@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 import pathlib
 from base64 import b64encode
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, Final, cast
+
+import msgspec
 
 from agents.plugins import registry
 from agents.plugins.law import Law
@@ -19,7 +21,18 @@ from experiments.file.overrides import SHAPE
 from experiments.file.problems import Fault, Path
 
 ALONE: Final = "link"  # a link without a target
-LARGEST_FILE: Final = 1_000_000  # bytes that a law reads from a file
+LARGEST_FILE: Final = 1_000_000  # [bytes] largest file that an experiment names
+LOOKED_AT: Final = 100  # number of files beside an experiment, for the one that was meant
+# files that stand beside the experiment in the folder of a run or of a sweep
+TAKEN_NAMES: Final = (
+    "experiment.toml",
+    "metrics.csv",
+    "errors.csv",
+    "sweep.csv",
+    "tried.csv",
+    "metrics.json",
+    "run.json",
+)
 
 
 def fill_from_shape(document: dict[str, Any]) -> list[Fault]:
@@ -61,51 +74,88 @@ def fill_from_shape(document: dict[str, Any]) -> list[Fault]:
     return faults
 
 
-def fill_from_files(document: dict[str, Any], folder: pathlib.Path) -> list[Fault]:
-    """Gives the law, in place, the content of the files that it names, which are in `folder` or the catalogue.
+def fill_from_files(document: dict[str, Any], folder: pathlib.Path) -> tuple[list[Fault], dict[str, bytes]]:
+    """Gives law and plans, in place, the content of the files that they name, which are in `folder` or the catalogue.
 
-    Without such a file it keeps the content that it has: the experiment comes from where the file was.
+    Without such a file a choice keeps the content that it has: the experiment comes from where the file was.
+
+    Returns:
+        What is wrong, and the content of each file by its name.
     """
-    formation, faults = document.get("formation"), list[Fault]()
-    law = formation.get("law") if isinstance(formation, dict) else None
-    if not isinstance(formation, dict) or not isinstance(law, dict):
-        return []
-    formation["law"] = law = dict(law)
-    for parameter, content in law_files(law).items():
-        path, name = ("formation", "law", parameter), law.get(parameter)
-        if not isinstance(name, str) or not name:
-            continue
-        file = index.file_beside(name, folder)
-        if file is None:
-            hint = "put it beside the experiment file, and give its name alone"
-            faults.append(Fault(path, f"{name!r} is no name of a file", hint))
-            continue
-        try:
-            with file.open("rb") as stream:
-                found = stream.read(LARGEST_FILE + 1)
-        except OSError as error:
-            if content not in law:
-                message = f"{file} cannot be read: {error.strerror or error}"
-                faults.append(Fault(path, message, "put it beside the experiment file"))
-            continue
-        if len(found) > LARGEST_FILE:
-            message = f"{name} is longer than {LARGEST_FILE // 1_000_000} MB"
-            faults.append(Fault(path, message, "take a smaller one: it goes with the experiment to every robot"))
-        law[content] = b64encode(found[:LARGEST_FILE]).decode()
-    return faults
+    faults, contents = list[Fault](), dict[str, bytes]()
+    for table, key, path, group in _choices(document):
+        choice = table[key] = dict(table[key])
+        for parameter, content in named_files(choice, group).items():
+            name = choice.get(parameter)
+            if not isinstance(name, str) or not name:
+                continue
+            found = content_of(name, folder, (*path, parameter), missing=content not in choice)
+            if isinstance(found, Fault):
+                faults.append(found)
+            elif found is not None:
+                contents[name] = found
+                choice[content] = b64encode(found).decode()
+    return faults, contents
 
 
-def law_files(choice: object) -> Mapping[str, str]:
-    """Parameters of a law that name files, and those that get their content; none of a law that cannot be used."""
-    law = law_of(choice)
-    return {} if law is None else law.FILES
+def content_of(name: str, folder: pathlib.Path, path: Path, *, missing: bool = True) -> bytes | Fault | None:
+    """Content of a file that an experiment names; the fault at `path`.
+
+    Args:
+        missing: Whether a file that is not there is a fault; else None is returned for it.
+    """
+    file = index.file_beside(name, folder)
+    if file is None:
+        hint = "put it beside the experiment file, and give its name alone"
+        return Fault(path, f"{name!r} is no name of a file", hint)
+    if name.lower() in TAKEN_NAMES:
+        return Fault(path, f"{name!r} is the name of another file in the folder of a run", "call it otherwise")
+    try:
+        with file.open("rb") as stream:
+            found = stream.read(LARGEST_FILE + 1)
+    except OSError as error:
+        if not missing:
+            return None
+        message = f"{file} cannot be read: {error.strerror or error}"
+        known = [each.name for each in sorted(folder.glob(f"*{file.suffix}"))[:LOOKED_AT]]
+        hint = did_you_mean(name, known) if known and file.suffix else ""
+        return Fault(path, message, hint or "put it beside the experiment file")
+    if len(found) > LARGEST_FILE:
+        message = f"{name} is longer than {LARGEST_FILE // 1_000_000} MB"
+        return Fault(path, message, "take a smaller one: it goes with the experiment to every robot")
+    return found
+
+
+def _choices(document: Mapping[str, Any]) -> Iterator[tuple[dict[Any, Any], Any, Path, str]]:
+    """Tables of chosen laws and plans: the table or list that holds each, its key there, its path and its group."""
+    formation, timeline, arena = (document.get(key) for key in ("formation", "timeline", "arena"))
+    obstacles = arena.get("obstacles") if isinstance(arena, dict) else None
+    holders: list[tuple[Any, str, Path, str]] = [(formation, "law", ("formation",), registry.LAWS)]
+    legs = timeline if isinstance(timeline, list) else []
+    holders += [(leg, "plan", ("timeline", number), registry.PLANNERS) for number, leg in enumerate(legs)]
+    things = obstacles.items() if isinstance(obstacles, dict) else ()
+    holders += [(each, "plan", ("arena", "obstacles", name), registry.PLANNERS) for name, each in things]
+    for table, key, path, group in holders:
+        if isinstance(table, dict) and isinstance(table.get(key), dict):
+            yield table, key, (*path, key), group
+
+
+def named_files(choice: object, group: str) -> Mapping[str, str]:
+    """Parameters of a chosen plug-in that name files, and those that get their content; none if it cannot be used."""
+    struct = _struct(choice, group)
+    files: Mapping[str, str] = getattr(struct, "FILES", {})
+    return files
 
 
 def law_of(choice: object) -> type[Law] | None:
     """The law of a choice; None if it cannot be used, which is said with its place where the law is read."""
+    return cast("type[Law] | None", _struct(choice, registry.LAWS))
+
+
+def _struct(choice: object, group: str) -> type[msgspec.Struct] | None:
     name = choice.get("kind") if isinstance(choice, Mapping) else choice
     try:
-        return cast(type[Law], struct_of(registry.LAWS, name)) if isinstance(name, str) else None
+        return struct_of(group, name) if isinstance(name, str) else None
     except registry.PluginError:
         return None
 

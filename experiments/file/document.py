@@ -6,9 +6,8 @@ for name, plan in document.cases().items(): ...
 
 from __future__ import annotations
 
-from base64 import b64decode
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,7 +23,7 @@ from experiments.definition.plan import Plan
 from experiments.file import catalogue, structure
 from experiments.file.cases import Source, each_once, resolve
 from experiments.file.choices import Adopted, tables
-from experiments.file.completion import fill_from_files, fill_from_shape, law_files, law_of
+from experiments.file.completion import fill_from_files, fill_from_shape, law_of
 from experiments.file.consistency.robots import device_faults
 from experiments.file.consistency.whole import consistency_faults, criteria_faults
 from experiments.file.overrides import parse_all
@@ -48,6 +47,7 @@ class Document:
     plan: Plan
     resolved: Mapping[str, Plan]  # plans by case
     plugins: Mapping[str, Path]  # files of plug-ins, by their names in the experiment
+    beside: Mapping[str, bytes] = field(default_factory=dict)  # content of the files that it names
 
     @property
     def experiment(self) -> Experiment:
@@ -63,12 +63,9 @@ class Document:
         return dict(self.resolved)
 
     def keep(self, file: Path) -> None:
-        """Writes the text to a file, and beside it the arena files and files of plug-ins and laws that it names."""
-        for plan in self.resolved.values():
-            law = plan.experiment.formation.law
-            for parameter, model in law_files(law).items():
-                if isinstance(law, dict) and law.get(parameter):
-                    (file.parent / law[parameter]).write_bytes(b64decode(law[model]))
+        """Writes the text to a file, and beside it all files that it names."""
+        for name, found in self.beside.items():
+            (file.parent / name).write_bytes(found)
         file.write_text(self.text, encoding="utf-8")
         for each in self.source.arenas.values():
             (file.parent / each.name).write_text(each.text, encoding="utf-8")
@@ -133,10 +130,12 @@ def _document(file: Path, label: str, text: str, flags: Sequence[str], *, receiv
             for key in _OF_THE_FILE
             if key in table
         ]
-        shapes = {
-            name: [*fill_from_files(each, file.parent), *fill_from_shape(each), *structure.faults(each)]
-            for name, each in documents.items()
-        }
+        shapes, beside = dict[str | None, list[Fault]](), dict[str, bytes]()
+        for name, each in documents.items():
+            # files of what was received are those of another machine: their content came with it
+            missing, contents = ([], {}) if received else fill_from_files(each, file.parent)
+            shapes[name] = [*missing, *fill_from_shape(each), *structure.faults(each)]
+            beside |= contents
         source.refuse([*nested, *each_once(shapes, tables)])
         plans = {name: Plan(msgspec.convert(each, Experiment)) for name, each in documents.items()}
         whole = tables or not is_json  # a case that was written as JSON names cases that are not in it
@@ -150,7 +149,7 @@ def _document(file: Path, label: str, text: str, flags: Sequence[str], *, receiv
         raise refusal(label, "tables or lists are nested too deeply", "flatten them") from None
     plans = {name: _calmed(plan, documents[name]) for name, plan in plans.items()}
     cases = {name: plan for name, plan in plans.items() if name is not None} or {UNNAMED: plans[None]}
-    return Document(file, source, plans[None], cases, adopted.plugins)
+    return Document(file, source, plans[None], cases, adopted.plugins, beside)
 
 
 def _calmed(plan: Plan, document: Mapping[str, Any]) -> Plan:
@@ -180,11 +179,7 @@ def case_document(plan: Plan, case: str = UNNAMED) -> bytes:
     """
     arena = msgspec.structs.replace(plan.experiment.arena, file=None)  # what stood there is in it
     cases: dict[str, dict[str, Any]] = {} if case == UNNAMED else {case: {}}
-    formation, law = plan.experiment.formation, plan.experiment.formation.law
-    if isinstance(law, dict):  # likewise
-        law = {key: value for key, value in law.items() if key not in law_files(law)}
-        formation = msgspec.structs.replace(formation, law=law)
-    bare = plan.changed(arena=arena, formation=formation, hosts={}, criteria=[], cases=cases)
+    bare = plan.changed(arena=arena, hosts={}, criteria=[], cases=cases)
     return msgspec.json.encode(bare.experiment)
 
 

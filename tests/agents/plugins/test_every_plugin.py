@@ -1,6 +1,7 @@
 """Every registered plug-in, a user's too: a robot decides the same alone and in company, and bears losses."""
 
 import itertools
+from base64 import b64encode
 from dataclasses import replace
 from functools import partial
 from math import cos, isfinite, nan, pi, sin
@@ -30,6 +31,7 @@ REMEMBERING = [name for name in registry.names(LAWS) if not issubclass(registry.
 TALKING = {(LAWS, name) for name in REMEMBERING}
 PLACES = {"A": (-0.4, 0.0, 0.0), "B": (0.4, 0.1, 0.0), "C": (0.0, -0.5, 0.0)}
 WANTS = {"distance": BY_DISTANCE, "any": BY_DISTANCE, "relative": BY_RELATIVE, "bearing": BY_BEARING}
+PATH = b64encode(b"t,x,y\n0,0,0\n2,0.3,0.2\n").decode()
 SAMPLES = (0.3, [0.3, 0.2], [[0.3, 0.2], [-0.2, 0.4]])
 
 
@@ -40,6 +42,8 @@ def made(group, name):
         pytest.importorskip(kind.LIBRARY, reason=f"the law {name} needs {kind.LIBRARY}")
     if group == LAWS and kind.FILES and name in index.names():
         return document.read(index.find_file(name), []).plan.law
+    if group == PLANNERS and kind.FILES:
+        return registry.build(group, {"kind": name, "file": "a.csv", "content": PATH})
     needed = [field.encode_name for field in msgspec.structs.fields(kind) if field.required]
     for first, other in itertools.product(({}, *SAMPLES), SAMPLES):
         try:

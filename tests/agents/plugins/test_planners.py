@@ -1,5 +1,6 @@
 """Every registered planner: it starts where the robot is, never jumps, never asks for more than its speed."""
 
+from base64 import b64encode
 from math import atan2, cos, dist, hypot, inf, isnan, nan, pi, sin, sqrt
 
 import msgspec
@@ -23,6 +24,12 @@ PLANS = [
     {"kind": "circle", "radius": 0.6, "period_s": 12.0},
     {"kind": "circle", "radius": -0.4, "period_s": 9.0, "turns": 1.25},
     {"kind": "lemniscate", "size": 0.5, "period_s": 15.0},
+    {
+        "kind": "recorded",
+        "file": "a.csv",
+        "relative": True,
+        "content": b64encode(b"t,x,y\n1,0,0\n3,0.5,0.1\n3.5,0.5,-0.1\n").decode(),
+    },
 ]
 FEW, NUMBER = examples(25), st.floats(-1, 1)
 ANCHOR, HEADING = st.tuples(NUMBER, NUMBER, NUMBER), st.floats(-pi, pi)

@@ -132,8 +132,9 @@ def test_a_model_goes_with_the_experiment(tmp_path):
     (tmp_path / "own.onnx").unlink()
     (tmp_path / "own.json").write_bytes(document.write_json(given.plan))
     assert document.read(tmp_path / "own.json", []).experiment.formation.law == law
-    sent = document.received(document.case_document(given.cases()["event"], "event").decode(), "pipe")
-    assert sent.experiment.formation.law == {"kind": "policy", "model": law["model"]}
+    (tmp_path / "own.onnx").write_bytes(b"of another machine")
+    case = document.case_document(given.cases()["event"], "event").decode()
+    assert document.received(case, str(tmp_path / "pipe")).experiment.formation.law == law
 
 
 def test_more_neighbours_than_places_are_a_warning(tmp_path):
