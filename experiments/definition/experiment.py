@@ -185,6 +185,28 @@ class Proximity(FileTable, frozen=True):
             raise ValueError("`release` must not be nearer than `range`; or leave it out")
 
 
+class GraphTable(FileTable, frozen=True):
+    """Graph in a file: GraphML, an edge list or an adjacency matrix as CSV."""
+
+    file: Annotated[str, doc("file beside the experiment file: its name")]
+    target: Annotated[
+        Positive | Literal["shape", "link"] | None,
+        doc(
+            'target of edges without a distance: a distance [m], "shape": as in [formation.shape], or "link": none; '
+            "left out: by the shape, if there is one"
+        ),
+    ] = None
+    weight: Annotated[
+        Literal["gain", "distance", "nothing"],
+        doc("meaning of a weight: gain of the link, its distance [m], or nothing"),
+    ] = "gain"
+    directed: Annotated[bool, doc("whether a line `A B` of an edge list is A > B; else A - B")] = False
+    rows: Annotated[
+        Literal["receivers", "senders"] | None,
+        doc("what the rows of a matrix that is not symmetric do: receive from their columns, or send to them"),
+    ] = None
+
+
 class Formation(FileTable, frozen=True):
     """Formation: links with their targets, anchors, and the law."""
 
@@ -210,6 +232,10 @@ class Formation(FileTable, frozen=True):
             '"shape": as in [formation.shape], or "link": none, for laws that need no target'
         ),
     ] = {}
+    graph: Annotated[
+        str | GraphTable | None,
+        doc("file with more links, beside the experiment file: GraphML, edge list or adjacency CSV; those above win"),
+    ] = None
     anchors: Annotated[dict[Name, Positive | AnchorTable], doc("by robot: distance to the origin [m], or a place")] = {}
     shape: Annotated[
         dict[Name, Vector],

@@ -26,6 +26,7 @@ from experiments.file.choices import Adopted, tables
 from experiments.file.completion import fill_from_files, fill_from_shape, law_of
 from experiments.file.consistency.robots import device_faults
 from experiments.file.consistency.whole import consistency_faults, criteria_faults
+from experiments.file.graphs.links import fill_from_graph
 from experiments.file.overrides import parse_all
 from experiments.file.problems import DocumentError, Fault, Problem, Text, refusal
 from experiments.file.text import content, decoded, number_faults, parsed
@@ -133,9 +134,11 @@ def _document(file: Path, label: str, text: str, flags: Sequence[str], *, receiv
         shapes, beside = dict[str | None, list[Fault]](), dict[str, bytes]()
         for name, each in documents.items():
             # files of what was received are those of another machine: their content came with it
-            missing, contents = ([], {}) if received else fill_from_files(each, file.parent)
-            shapes[name] = [*missing, *fill_from_shape(each), *structure.faults(each)]
-            beside |= contents
+            for fill in () if received else (fill_from_files, fill_from_graph):
+                missing, contents = fill(each, file.parent)
+                shapes.setdefault(name, []).extend(missing)
+                beside |= contents
+            shapes.setdefault(name, []).extend([*fill_from_shape(each), *structure.faults(each)])
         source.refuse([*nested, *each_once(shapes, tables)])
         plans = {name: Plan(msgspec.convert(each, Experiment)) for name, each in documents.items()}
         whole = tables or not is_json  # a case that was written as JSON names cases that are not in it
