@@ -99,7 +99,7 @@ def graphml(edges, attributes=""):
         ("", "holds no edge"),
         (MATRIX, 'not symmetric|rows = "receivers"'),
         ("0,1\n1,0\n", "a matrix of 2 rows without names, and there are 3 robots"),
-        (MATRIX.replace("A,0,1,", "A,0,1"), "line 2: 3 numbers in a row|names"),
+        (MATRIX.replace("A,0,1,", "A,0,1"), "line 2: 2 numbers in a row|names"),
         (MATRIX.replace("B,0", "C,0"), "line 3: the row of 'C' stands where that of 'B' is due"),
         (MATRIX.replace("B,0", "B,x"), "line 3: 'x' is no weight"),
         (graphml('<edge source="A" target="X"/>'), "line 3: no robot is called 'X'"),
