@@ -131,13 +131,14 @@ class WatchedBody(Body):
         self.body.open()
 
     def read(self, t: float) -> Any:
-        for row, name in enumerate(self.names):
-            self._carry(row, *current().readings.get(name, ("", 0.0, {})))
+        readings = current().readings
+        for row, name in enumerate(self.names) if readings else ():
+            self._carry(row, *readings.get(name, ("", 0.0, {})))
         states = self.body.read(t)
         self._note_motors()
-        if current().readings and self.process is current().robots.get(self.names[0], self.process):
+        if readings and self.process is current().robots.get(self.names[0], self.process):
             for name, state in zip(self.names, states, strict=True):
-                word, number, memory = current().readings.get(name, ("", 0.0, {}))
+                word, number, memory = readings.get(name, ("", 0.0, {}))
                 if word in READINGS:
                     READINGS[word](state, number, memory)
         return states

@@ -14,8 +14,9 @@ from pathlib import Path
 from types import CodeType, FunctionType
 
 from agents.decision.lifecycle import Phase
-from experiments.file.document import load, write_json
+from experiments.file.document import load
 from tests.simulated import faults, kernel, laboratory, processes, rules, seam, world
+from tests.simulated.experiments import MIX
 from tests.simulated.laboratory import Flight, Mutant, Request, SimulatorError
 
 for _package in ("agents", "experiments", "tools", "twins"):  # an import in a flight would take real time
@@ -37,9 +38,9 @@ def fly(request: Request) -> Flight:
         file = _file(request, folder)
         words, script = _command(request, file, folder), _script(request, file)
         os.environ["ZENPARK_RUNTIME_DIR"] = os.environ["ZENPARK_CACHE_DIR"] = str(folder / "user")
-        with kernel.guard(*ALLOWED), kernel.Kernel(request.seed, request.preempt) as running:
-            seam.patch()
+        with kernel.Kernel(request.seed, request.preempt) as running:
             laboratory_world = world.World(running, script, varied=request.varied, clocks=request.clocks)
+            laboratory_world.network.forgets = request.forgets
             checked = rules.Rules(laboratory_world)
             laboratory_world.run(words, request.limit_s)
             checked.judge(folder / "run")
@@ -52,9 +53,14 @@ def fly(request: Request) -> Flight:
 
 
 def warm_up() -> None:
-    """Do once what each flight would do again, and keep the garbage collector off all that."""
-    for plan in load("triangle").cases().values():
-        write_json(plan)
+    """Do once what each flight would do again, and keep the garbage collector off all that.
+
+    Two short flights fill caches and let the interpreter adapt its code.
+    """
+    kernel.guard(*ALLOWED).__enter__()  # for good, as what `patch` replaces
+    seam.patch()
+    for case in ("event", "world"):
+        fly(Request(MIX, case=case, settings=("duration_s=1",)))
     gc.collect()
     gc.freeze()
     gc.disable()  # a flight is short, and its end would depend on what was there before

@@ -6,8 +6,6 @@ A simulated thread is a greenlet. It runs until it blocks (`sleep`, `Event.wait`
 
 from __future__ import annotations
 
-import hashlib
-import heapq
 import itertools
 import os
 import random
@@ -19,6 +17,7 @@ import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from heapq import heappop, heappush
 from math import inf
 from typing import Any, Final, Self
 from unittest import mock
@@ -60,6 +59,7 @@ class Kernel:
     def __init__(self, seed: int, preempt: float = 0.0) -> None:
         """A kernel in which a thread loses the processor at a lock or a message with probability `preempt`."""
         self.now, self.rng, self.preempt = BEGIN, random.Random(seed), preempt
+        self.stopped = False
         self.hub, self.thread = getcurrent(), threading.get_ident()
         self.task: Task | None = None
         self.process: Process | None = None
@@ -68,12 +68,12 @@ class Kernel:
         self.crashes: list[tuple[float, str, str, str]] = []
         self.log: list[tuple[float, str, str]] = []
         self.switches = 0
-        self.pids = itertools.count(1001)
+        self.pids, self.numbers = itertools.count(1001), itertools.count(1)
         self._events: list[tuple[float, int, Callable[..., object], tuple[Any, ...]]] = []
         self._count = itertools.count()
         self._steps = 0
         self._failure: FlightError | None = None
-        self._trace = hashlib.blake2b(digest_size=8)
+        self._trace = 0
 
     def __enter__(self) -> Self:
         global _kernel  # noqa: PLW0603 - the one name that simulated threads find their kernel by
@@ -89,26 +89,31 @@ class Kernel:
     @property
     def digest(self) -> str:
         """Digest of all switches: equal for equal histories."""
-        return self._trace.hexdigest()
+        return f"{self._trace & 0xFFFF_FFFF_FFFF_FFFF:016x}"
 
     def at(self, t: float, call: Callable[..., object], *args: Any) -> None:
         """Call a function at a time [s], at once if that is past."""
-        heapq.heappush(self._events, (max(t, self.now), next(self._count), call, args))
+        heappush(self._events, (t if t > self.now else self.now, next(self._count), call, args))
 
     def after(self, seconds: float, call: Callable[..., object], *args: Any) -> None:
         self.at(self.now + seconds, call, *args)
 
-    def run(self, over: Callable[[], object] = lambda: False, limit: float = inf) -> None:
-        """Run until `over()` is true, nothing is left, or the time `limit` [s]; raises FlightError at once."""
-        while self._events and self._events[0][0] <= limit and not over():
-            t, _, call, args = heapq.heappop(self._events)
+    def run(self, limit: float = inf) -> None:
+        """Run until `stop`, until nothing is left, or until the time `limit` [s]; raises FlightError at once."""
+        events = self._events
+        while events and events[0][0] <= limit and not self.stopped:
+            t, _, call, args = heappop(events)
             if t > self.now:
                 self.now, self._steps = t, 0
             call(*args)
             if self._failure is not None:
                 raise self._failure
-        if limit < inf and not over():
+        if limit < inf and not self.stopped:
             self.now = max(self.now, limit)
+
+    def stop(self) -> None:
+        """Let `run` return after the present event."""
+        self.stopped = True
 
     def say(self, text: str) -> None:
         self.log.append((round(self.now - BEGIN, 4), self.process.name if self.process else "-", text))
@@ -130,7 +135,7 @@ class Kernel:
         """Let a thread run until it blocks."""
         self.task, self.process = task, task.process
         self.switches += 1
-        self._trace.update(f"{self.now:.9f} {task.process.name} {task.name} {task.woken}\n".encode())
+        self._trace = hash((self._trace, self.now, task.process.pid, task.number, task.woken))  # has no random salt
         try:
             self.step()
             task.greenlet.switch()
@@ -155,6 +160,7 @@ class Task:
 
     def __init__(self, process: Process, call: Callable[[], object], name: str) -> None:
         self.process, self.name, self.done, self.woken = process, name, False, False
+        self.number = next(current().numbers)
         self._call, self._ticket = call, 0  # a ticket is good for one wait
         self.joiners = Waiters()
         kernel = current()
@@ -219,9 +225,10 @@ def _wait(timeout: float | None, *, late: bool = False) -> None:
     process = kernel.process
     if process is None:
         raise kernel.fail("waits outside of a process")
-    block(None if timeout is None else max(0.0, timeout) / (1.0 + process.drift))
+    wait = block if kernel.task is None else kernel.task.block
+    wait(None if timeout is None else max(0.0, timeout) / (1.0 + process.drift))
     if late or process.late > BUSY_S:
-        block(kernel.rng.expovariate(1.0 / process.late))
+        wait(kernel.rng.expovariate(1.0 / process.late))
 
 
 class Waiters:

@@ -52,6 +52,7 @@ class Request:
     mutant: Mutant | None = None
     preempt: float = 0.0
     varied: bool = False
+    forgets: float = 0.0
     clocks: Mapping[str, float] = field(default_factory=dict)
     limit_s: float = LIMIT_S
     words: tuple[str, ...] = ()
@@ -215,6 +216,7 @@ def fly(
     clocks: Mapping[str, float] | None = None,
     preempt: float = 0.0,
     varied: bool = False,
+    forgets: float = 0.0,
     words: Sequence[str] = (),
     folder: Path | None = None,
     limit_s: float = LIMIT_S,
@@ -239,6 +241,7 @@ def fly(
         clocks: Errors of wall clocks by robot [s]. Such a robot is on a machine of its own.
         preempt: Probability with which a thread loses the processor at a lock or a message.
         varied: Whether processes start after random times.
+        forgets: See `tests.simulated.network.Network`.
         words: More words of the command, such as "--tag".
         folder: Where the run's folder is made and stays. Left out: nothing stays.
         limit_s: Of simulated time; what still runs then breaks the rule "hang".
@@ -246,7 +249,7 @@ def fly(
     Raises SimulatorError for a flight that gave no result.
     """
     request = Request(
-        experiment, faults, seed, case, tuple(settings), mutant, preempt, varied, dict(clocks or {}), limit_s,
+        experiment, faults, seed, case, tuple(settings), mutant, preempt, varied, forgets, dict(clocks or {}), limit_s,
         tuple(words), None if folder is None else str(folder),
     )  # fmt: skip
     return run(request)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from functools import lru_cache
+from math import log
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Final
 
@@ -23,6 +24,7 @@ LATENCY_S: Final = 0.0003  # mean time of a message on a link
 FLUSH_S: Final = 0.001  # time from the mending of a cable until what it held arrives
 REORDERED_S: Final = 0.1  # longest delay of a message that others overtake
 REPEATED_S: Final = 0.2  # longest time until the copy of a message arrives
+PUT, DELETE = zenoh.SampleKind.PUT, zenoh.SampleKind.DELETE
 
 
 @lru_cache(8192)
@@ -54,7 +56,7 @@ class Sample:
         self, key: str, payload: bytes = b"", mime: object = "", source: Any = None, *, deleted: bool = False
     ) -> None:
         self.key_expr, self.payload, self.encoding, self.source_info = key, Payload(payload), str(mime), source
-        self.kind = zenoh.SampleKind.DELETE if deleted else zenoh.SampleKind.PUT
+        self.kind = DELETE if deleted else PUT
 
 
 class Ring:
@@ -147,18 +149,21 @@ class Link:
         """Call a function at the other end, in the order of all calls; it may be lost if `drop`."""
         if not self._open[sender]:
             return
-        kernel, to = current(), self.other(sender)
-        self._sent[sender] = kernel.now
-        if drop and ((lost := max(sender.loss, to.loss)) and kernel.rng.random() < lost):
+        kernel, to = current(), self.far if sender is self.near else self.near
+        now, rng = kernel.now, kernel.rng
+        self._sent[sender] = now
+        if drop and (sender.loss or to.loss) and rng.random() < max(sender.loss, to.loss):
             return
-        due = kernel.now + LATENCY_S * sender.slow * to.slow * (0.3 + kernel.rng.expovariate(1.0))
-        if drop and to.reorder and kernel.rng.random() < to.reorder:
-            due += kernel.rng.random() * REORDERED_S
+        due = now + LATENCY_S * sender.slow * to.slow * (0.3 - log(1.0 - rng.random()))  # exponentially distributed
+        if drop and to.reorder and rng.random() < to.reorder:
+            due += rng.random() * REORDERED_S
         elif not express:
-            due = self._due[to] = max(due, self._due[to])
+            if due < (last := self._due[to]):
+                due = last
+            self._due[to] = due
         kernel.at(due, self._arrive, to, call, args)
-        if drop and to.dup and kernel.rng.random() < to.dup:
-            kernel.at(due + kernel.rng.random() * REPEATED_S, self._arrive, to, call, args)
+        if drop and to.dup and rng.random() < to.dup:
+            kernel.at(due + rng.random() * REPEATED_S, self._arrive, to, call, args)
 
     def close(self, node: Node) -> None:
         """Close one end; the other one notices after all that was sent before."""

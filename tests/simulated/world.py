@@ -10,7 +10,6 @@ import functools
 import importlib
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -79,6 +78,7 @@ class World:
         self.commands: list[tuple[float, str, int]] = []
         self.poses: list[tuple[float, str, int]] = []
         self.motors: list[tuple[float, str, bool]] = []  # changes
+        self.true: dict[str, Motion] = {}  # motions at the last look
         self.samples: dict[str, list[tuple[float, Vector, Vector, bool]]] = {}  # every `LOOK_S`, true
         self.takeoffs_ordered: list[tuple[float, str]] = []
         self.stops: list[float] = []
@@ -87,7 +87,6 @@ class World:
         self.cases: list[str] = []
         self.ends: dict[int, float] = {}  # times by process id
         self._flying: dict[str, bool] = {}
-        self._over = inf
         self.disturbed_until = 0.0
         self.watchers: list[Callable[[], None]] = []  # called every `LOOK_S`
         self.on_command: list[Callable[[str, sim.Process], None]] = []
@@ -120,13 +119,13 @@ class World:
         self._close_pipes_at_exit(self.conductor)
         self._schedule("launch")
         self.after(LOOK_S, self._look)
-        self.kernel.run(lambda: self.now > self._over + END_S, self.now + limit_s)
+        self.kernel.run(self.now + limit_s)
 
     def note_end(self, process: sim.Process) -> None:
         """Note that a process has ended, maybe the last one of the run."""
         self.ends.setdefault(process.pid, self.now)
         if all(each.dead for each in self.processes if not each.name.startswith(OUTSIDE)):
-            self._over = min(self._over, self.now)
+            self.after(END_S, self.kernel.stop)
 
     def _close_pipes_at_exit(self, process: sim.Process) -> None:
         leave = process.exit
@@ -152,7 +151,9 @@ class World:
 
     def _look(self) -> None:
         self.after(LOOK_S, self._look)
+        self.true = {}
         for name, _, motion in self.motions():
+            self.true[name] = motion
             self.note_motors(name, motion)
             sample = self.now, motion.position, motion.velocity, motion.flying
             self.samples.setdefault(name, []).append(sample)
