@@ -28,6 +28,7 @@ from agents.network.zenoh_config import LEASE_S
 ANSWER_S: Final = 10.0  # limit for the routers to answer
 TURN_S: Final = 0.01  # pause between two polls of a check
 SETTLE_S: Final = 0.2  # limit for a token to travel from one router to the next, and for a lost link to be noticed
+TRIES: Final = 5  # questions until an answer is whole
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,7 @@ def claim(
         deadline = time.monotonic() + timing.answer_s
         while True:
             asked = time.monotonic()
-            found = {key: network.tokens_present(session, Keys.lives(key)) for key in alive}
+            found = {key: tokens_of(session, key) for key in alive}
             if time.monotonic() - asked > SETTLE_S:
                 pause.wait(SETTLE_S)  # a link that is lost ends a question as an answer does, before that is noticed
             if pause.is_set():
@@ -112,6 +113,19 @@ def claim(
     return tokens
 
 
+def tokens_of(session: zenoh.Session, alive: str) -> set[str] | None:
+    """Tokens of the owners of a name, and of those that claim it; None without an answer.
+
+    A token of this session is in each whole answer. Zenoh 1.10 may answer nothing beside a watch of the same keys, as
+    a process with two robots has: it is asked again at once. A link that is lost ends a question with nothing, too.
+    """
+    for _ in range(TRIES):
+        tokens = network.tokens_present(session, Keys.lives(alive))
+        if tokens or tokens is None:
+            break
+    return tokens
+
+
 def confirm_ownership(
     session: zenoh.Session,
     alive: Sequence[str],
@@ -133,10 +147,9 @@ def confirm_ownership(
     free = taken = inf
     while not pause.is_set():
         linked = network.connected(session)
-        found = [network.tokens_present(session, Keys.lives(key)) for key in alive]
+        found = [tokens_of(session, key) for key in alive]
         now = time.monotonic()
-        # the own token is in each whole answer; Zenoh 1.10 may answer nothing beside a watch of the same keys
-        if not linked or not all(found) or not network.connected(session):
+        if not linked or None in found or not network.connected(session):
             free = inf
             note(False)
         elif others := [
@@ -148,6 +161,8 @@ def confirm_ownership(
             note(True)
             if now - taken > timing.vanish_s:
                 raise NameTaken(", ".join(others))
+        elif not all(found):  # an owner that was seen may still be there
+            free = inf
         else:
             free, taken = min(free, now), inf
             note(False)

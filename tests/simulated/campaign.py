@@ -41,6 +41,7 @@ def request_of(seed: int, name: str | None = None, kinds: Sequence[str] = ()) ->
         preempt=rng.choice((0.0, 0.002, 0.03)),
         varied=rng.random() < 0.6,
         clocks={rng.choice(("KH01", "CF01", "A", "B")): clock} if rng.random() < 0.15 else {},
+        forgets=rng.choice((0.0, 0.0, 0.5)),
         drawn=seed,
         kinds=tuple(kinds),
     )
