@@ -36,6 +36,7 @@ from agents.vectors import NO_SETPOINT, UNKNOWN, ZERO, Pose, Setpoint, Vector, i
 CENTRE: Final = "centre"  # missing neighbour of a guided robot without guidance
 OLD_VELOCITY: Final = 3.0  # decisions after which a velocity of the central controller counts no more
 HALT: Final[Setpoint] = (0.0, 0.0, 0.0, 0.0)
+LAND_AGAIN_S: Final = 1.0  # pause between two orders to land for a body that hovers: one may be lost
 
 
 class Robot:
@@ -45,11 +46,11 @@ class Robot:
     # more than CPython keeps beside an object: the tick would look each up in a dictionary
     __slots__ = (
         "_asked", "_blind", "_continuity", "_controller", "_decide_every", "_decided", "_detector", "_dt",
-        "_external", "_filter", "_flies", "_follower", "_ordered", "_origin", "_perception", "_place", "_pose_every",
-        "_predicts", "_preflight", "_run_began", "_status", "_stepping", "assignment", "avoided", "begun", "causes",
-        "changed", "decision_due", "decisions", "error", "evasions", "goal", "goal_yaw", "goals", "guidance", "hazards",
-        "health", "interventions", "keeping", "landing", "lands", "lifecycle", "neighbours", "now", "sent_position",
-        "sent_velocity", "setpoint", "stops", "takes_off", "tick", "transmitter", "updates",
+        "_external", "_filter", "_flies", "_follower", "_land_again_at", "_ordered", "_origin", "_perception", "_place",
+        "_pose_every", "_predicts", "_preflight", "_run_began", "_status", "_stepping", "assignment", "avoided",
+        "begun", "causes", "changed", "decision_due", "decisions", "error", "evasions", "goal", "goal_yaw", "goals",
+        "guidance", "hazards", "health", "interventions", "keeping", "landing", "lands", "lifecycle", "neighbours",
+        "now", "sent_position", "sent_velocity", "setpoint", "stops", "takes_off", "tick", "transmitter", "updates",
     )  # fmt: skip
 
     def __init__(self, assignment: Assignment, health: ProcessHealth | None = None) -> None:
@@ -95,7 +96,7 @@ class Robot:
         self.begun = False  # whether the robot has begun to run
         self._ordered = self._blind = False
         self._decided = self._asked = -1
-        self._place = UNKNOWN
+        self._place, self._land_again_at = UNKNOWN, -inf
         self._origin: Pose | None = None
         self._run_began = inf  # common start of a run under way that the robot joins [s]; infinity: it joins none
 
@@ -452,6 +453,9 @@ class Robot:
             misled = isfinite(now.jump) or incident.cause in (Cause.UNRESPONSIVE, Cause.STRAYING)
             if self.assignment.kind.flies and misled:
                 self._external.disbelieve()  # it lands by what it knows itself
+        hovers = life.phase == LANDING and not self.landing.aside and self.causes >> Cause.HOVERING & 1
+        if hovers and now.t >= self._land_again_at:  # no descent is under way that a second order could disturb
+            self.lands, self._land_again_at = True, now.t + LAND_AGAIN_S
 
     def _decide(self, t: float) -> None:
         """A new goal of a running robot that decides for itself; it may have to stay."""

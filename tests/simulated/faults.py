@@ -223,8 +223,7 @@ SIZES: dict[str, Sequence[Any]] = {
     "order": ORDERS,
     "body": (
         "nan", ("jump", 0.2), ("jump", -0.2), ("jump", 1.0), ("jump", -3.0), "stuck", ("stuck", 0.0005), ("late", 0.2),
-        ("late", 0.6), ("late", 3.0), "silent", ("battery", 0.05), "motors", ("adrift", 0.3),
-        ("adrift", 1.0),
+        ("late", 0.6), ("late", 3.0), "silent", ("battery", 0.05), "motors", "aloft", ("adrift", 0.3), ("adrift", 1.0),
     ),
     "capture": (
         "gone", "stuck", ("stuck", 0.0005), ("jump", 0.3), ("jump", -0.6), ("jump", 2.0), ("stamp", -0.2),

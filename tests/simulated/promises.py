@@ -86,6 +86,7 @@ SAFETY: Final = {
     "moves aside, for up to 3 s": "agents/safety/test_landing.py::test_search_for_a_place_ends",
     "descended by 5 cm in 2 s": "agents/safety/test_detection.py::test_landing_that_does_no_good_is_cut",
     "`landing_s` 20 s | cut": f"{HAZARDS} agents/safety/test_detection.py::test_landing_that_does_no_good_is_cut",
+    "hovers in the air for 2 s | | warn, and every second": f"{SCRIPT}lost_order_to_land_is_repeated",
     "it is never cut there": "agents/safety/test_detection.py::test_hovering_or_slow_drone_is_never_cut",
     "absent for a second": f"{HAZARDS} agents/safety/test_hazards.py::test_cause_that_comes_and_goes",
     # below it
@@ -97,7 +98,7 @@ SAFETY: Final = {
     "land after 3 s without its heartbeat": f"{HOST}frozen_launcher_lands_all_and_gives_no_order",
     "and always `tcp/127.0.0.1:7447`": "tools/commands/test_network.py::test_estop_reaches_each_realm_of_a_router",
     "sends nothing and ends with 2": "agents/body/test_fleet.py::test_holder_is_named_and_its_death_frees_device",
-    "2.5 s without that the status": f"{SCRIPT}stop_that_no_body_obeys_is_told",
+    "2.5 s without that the status": f"{SCRIPT}stop_that_no_body_confirms_is_told",
     "waits for it (5 s; wheels 3 s)": f"{SCRIPT}stop_that_no_body_obeys_is_told",
     "Two measurements never do": f"{CAPTURED}frozen_motion_capture_lands_what_flies",
     "more than 0.15 s late": f"{CAPTURED}late_positions_are_refused_and_named",

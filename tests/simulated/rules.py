@@ -11,6 +11,7 @@ import math
 import re
 from collections.abc import Callable, Hashable, Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 from math import hypot, inf, isfinite
 from pathlib import Path
 from typing import Any
@@ -77,6 +78,7 @@ class Look:
     since: dict[Hashable, float] = field(default_factory=dict)  # begin of lasting conditions
     sent: dict[tuple[int, str], int] = field(default_factory=dict)  # poses, by process and robot
     phases: dict[tuple[int, str], int] = field(default_factory=dict)
+    links: dict[tuple[Process | None, bool], bool] = field(default_factory=dict)  # answers of `linked` at this look
     ran_s: dict[str, float] = field(default_factory=dict)  # time in the experiment, by robot
     held_s: dict[str, float] = field(default_factory=dict)  # time for which an order of an operator held it
 
@@ -101,7 +103,6 @@ class Look:
         plan = self.world.plan
         if plan is None:
             return
-        motions = {name: motion for name, _, motion in self.world.motions()}
         kinds = dict(zip(plan.names, plan.kinds, strict=True))
         for name, process in self.world.robots.items():
             runtime = self.world.runtimes.get(process.pid)
@@ -112,12 +113,18 @@ class Look:
             row = runtime._names.index(name)
             phase = runtime.robots[row].lifecycle.phase
             yield Seen(
-                name, process, runtime, row, kinds[name], motions.get(name), self.phases.get((process.pid, name), phase)
-            )
+                name, process, runtime, row, kinds[name], self.world.true.get(name),
+                self.phases.get((process.pid, name), phase),
+            )  # fmt: skip
             self.phases[process.pid, name] = phase
 
     def linked(self, process: Process | None, *, slowly: bool = False) -> bool:
         """Whether a process has a router that answers, over a cable that is not cut, nor slow unless that is enough."""
+        if (found := self.links.get((process, slowly))) is None:
+            found = self.links[process, slowly] = self._link(process, slowly=slowly)
+        return found
+
+    def _link(self, process: Process | None, *, slowly: bool) -> bool:
         if process is None or process.dead or process.paused:
             return False
         session = self.world.session(process)
@@ -126,10 +133,20 @@ class Look:
             return False
         return not (link.far.cut or link.far.process.paused)
 
+    @cached_property
+    def kinds(self) -> set[str]:
+        """Kinds of the faults of the script."""
+        return {fault.kind for fault in self.world.script}
+
+    @cached_property
     def lies(self) -> bool:
-        """Whether a script lets robots believe what is not true."""
-        kinds = {fault.kind for fault in self.world.script}
-        return bool(kinds & {"body", "capture", "step"})
+        """Whether the script lets robots believe what is not true."""
+        return bool(self.kinds & {"body", "capture", "step"})
+
+    @cached_property
+    def bent(self) -> bool:
+        """Whether the script changes clocks, or orders a start."""
+        return bool(self.kinds & {"step", "drift"}) or any("start" in str(each.size) for each in self.world.script)
 
 
 RobotRule = Callable[[Look, Seen], str]
@@ -169,7 +186,7 @@ def emergency_stop(look: Look, seen: Seen) -> str:
     at = min(look.world.stops, default=inf)
     if look.now <= at + 0.3 or seen.process.started > at or not seen.flying or not seen.prompt:
         return ""
-    apart = any(fault.kind in {"pause", "kill", "late", "hang"} for fault in look.world.script)
+    apart = look.kinds & {"pause", "kill", "late", "hang"}
     return "" if apart else f"motors on {look.now - at:.2f} s after the emergency stop"
 
 
@@ -181,7 +198,7 @@ def final_landing(_: Look, seen: Seen) -> str:
 
 @rule(OF_ROBOTS, "| more than 0.25 m outside the arena | | land | |")
 def inside_the_arena(look: Look, seen: Seen) -> str:
-    if seen.motion is None or look.lies():
+    if seen.motion is None or look.lies:
         return ""
     assert look.world.plan is not None
     (x, y, z), size = seen.motion.position, look.world.plan.experiment.arena.size
@@ -235,7 +252,7 @@ def _misled(look: Look, seen: Seen) -> bool:
     """Whether its body or its process cannot do what it should; a twin stands still while its loop hangs."""
     faults = [fault for fault in look.world.script if fault.who == seen.name]
     sizes = [str(fault.size) for fault in faults if fault.kind in {"body", "capture"}]
-    wrong = any(word in size for size in sizes for word in ("motors", "stuck", "adrift"))
+    wrong = any(word in size for size in sizes for word in ("motors", "stuck", "adrift", "aloft"))
     return wrong or any(fault.kind == "hang" for fault in faults) or not seen.prompt
 
 
@@ -265,6 +282,8 @@ def landing_without_launcher(look: Look, seen: Seen) -> str:
 @rule(OF_ROBOTS, "")
 def obedience(look: Look, seen: Seen) -> str:
     """Half a second after it was accepted an order is obeyed."""
+    if not look.world.answers:
+        return ""
     obeys = {
         "land": seen.phase >= LANDING,
         "stop": seen.phase >= LANDING,
@@ -307,10 +326,13 @@ def knowledge_of_tokens(look: Look, seen: Seen) -> str:
     flies = seen.phase in (AIRBORNE, RUNNING)
     knows = flies and look.calm and look.linked(seen.process) and seen.governed and seen.prompt
     for sender in seen.runtime._neighbours.senders:
+        if not knows:
+            look.since.pop(("token", seen.name, sender.name), None)
+            continue
         other = look.world.robots.get(sender.name)
         tokens = (token.key for session in look.world.sessions(sender.name) for token in session.tokens)
         there = sender._token in tokens
-        differs = knows and other is not None and (other.dead or look.linked(other)) and bool(sender.alive) != there
+        differs = other is not None and (other.dead or look.linked(other)) and bool(sender.alive) != there
         if lasted := look.lasting(("token", seen.name, sender.name), differs, 3.0):
             return f"believes that {sender.name} is {'alive' if sender.alive else 'gone'} for {lasted:.1f} s"
     return ""
@@ -321,13 +343,16 @@ def knowledge_of_tokens(look: Look, seen: Seen) -> str:
 )
 def knowledge_of_poses(look: Look, seen: Seen) -> str:
     """Three seconds after the last disturbance each robot has the newest poses."""
-    lossy = any(fault.kind in {"loss", "reorder"} for fault in look.world.script)
+    lossy = look.kinds & {"loss", "reorder"}
     knows = look.calm and not lossy and look.linked(seen.process) and seen.governed and seen.prompt
     for sender in seen.runtime._neighbours.senders:
+        if not knows:
+            look.since.pop(("pose", seen.name, sender.name), None)
+            continue
         other = look.world.robots.get(sender.name)
         theirs = None if other is None else look.world.runtimes.get(other.pid)
         deaf = False
-        if knows and theirs is not None and theirs._joined and look.linked(other) and not sender.doubt:
+        if theirs is not None and theirs._joined and look.linked(other) and not sender.doubt:
             row = theirs._names.index(sender.name)
             both = seen.phase in (AIRBORNE, RUNNING) and theirs.robots[row].lifecycle.phase in (AIRBORNE, RUNNING)
             deaf = both and sender._order.seq < theirs.counts.sent[row] - 2
@@ -353,8 +378,7 @@ def picture_of_the_conductor(look: Look, seen: Seen) -> str:
 def common_start(look: Look, seen: Seen) -> str:
     """Robots whose clocks are right begin together."""
     at, start = seen.robot.lifecycle.start_at, look.world.moments.get("start")
-    bent = any(fault.kind in {"step", "drift"} or "start" in str(fault.size) for fault in look.world.script)
-    if start is None or not isfinite(at) or bent or seen.name in look.world.clocks:
+    if start is None or not isfinite(at) or look.bent or seen.name in look.world.clocks:
         return ""
     off = seen.runtime._utc + at - EPOCH - start
     return f"begins {off:+.3f} s from the common start" if abs(off) > 0.02 else ""
@@ -366,7 +390,7 @@ def common_start(look: Look, seen: Seen) -> str:
 @rule(OF_PAIRS, "An `avoidance` keeps clear of its last known position, from the floor up")
 def contact(look: Look, one: Seen, other: Seen) -> str:
     assert look.world.plan is not None
-    if look.world.plan.experiment.avoidance is None or look.lies() or one.motion is None or other.motion is None:
+    if look.world.plan.experiment.avoidance is None or look.lies or one.motion is None or other.motion is None:
         return ""
     p, q = one.motion.position, other.motion.position
     beside = hypot(p[0] - q[0], p[1] - q[1]) < one.kind.radius + other.kind.radius
@@ -637,6 +661,7 @@ class Rules:
 
     def _check(self) -> None:
         look = self._look
+        look.links.clear()
         seen = [*look.seen()]
         self.robot_s += LOOK_S * len(seen)
         for one in seen:
@@ -659,6 +684,7 @@ class Rules:
                 look.held_s[seen.name] = look.held_s.get(seen.name, 0.0) + LOOK_S
 
     def _use(self, rules: list[Rule], name: str, process: Process) -> None:
+        self._look.links.clear()
         for each in rules:
             if text := each.check(self._look, name, process):
                 self._violate(each, name, f"{name}: {text}")

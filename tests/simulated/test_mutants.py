@@ -33,6 +33,10 @@ MUTANTS = {
         f"{RUNTIME}descent.py", "if ownership.check_return(session) or stood:", "if False:",
         test_safety.test_former_owner_commands_nothing,
     ),
+    "empty answer names no owner": (
+        OWNERSHIP, "elif not all(found):", "elif False:",
+        partial(test_safety.test_two_robots_of_a_process_are_certain_of_their_names, 1),
+    ),
     "stop left to the loop": (
         LOOP, "        if self._opened:\n            self._body.stop", "        if False:\n            self._body.stop",
         test_safety.test_emergency_stop_ends_the_run,
@@ -106,6 +110,14 @@ MUTANTS = {
     "twice the time without position": (
         HAZARDS, "if limits.hold_s is None else limits.hold_s}", "if False else 0.6}",
         partial(row, "blind"),
+    ),
+    "land ordered once": (
+        "agents/robot.py", "self.lands, self._land_again_at = True, now", "self._land_again_at = now",
+        test_safety.test_lost_order_to_land_is_repeated,
+    ),
+    "unconfirmed stop is no matter": (
+        "bridges/external.py", "- robot.stopped_since > ANSWER_S", "- robot.stopped_since > 99.0",
+        test_safety.test_stop_that_no_body_confirms_is_told,
     ),
     "jump believed": (
         "agents/safety/positions.py", "        return gap if self.jumped else nan", "        return nan",

@@ -140,6 +140,22 @@ def test_former_owner_commands_nothing():
     assert back + 2.5 <= former.ended < back + 2.5 + 0.5
 
 
+@pytest.mark.parametrize("seed", [1, 2])
+def test_two_robots_of_a_process_are_certain_of_their_names(seed):
+    """They hear each other, and such a session gets empty answers to its questions about tokens."""
+    back = 3.5
+    pair = TRIO.replace("-0.3] }", '-0.3], process = "pair" }')
+    cut = Fault(0.5, "cut", "A", lasts=back - 0.5)
+    alone = fly(pair, cut, settings=["duration_s=7"], forgets=0.5, seed=seed)
+    assert [each.reason for name in "AB" for each in alone.robots[name].phases[-1:]] == ["finished"] * 2
+    assert max(t for track in alone.robots.values() for t, text in track.hazards) < back + 2.5
+    taken = fly(pair, cut, Fault(1.9, "twice", "A"), settings=["duration_s=7"], forgets=0.5, seed=seed)
+    former = taken.of("default-pair")[0]
+    used = [(*taken.robots[name].poses, *taken.robots[name].commands) for name in "AB"]
+    assert not [t for rows in used for t, pid in rows if pid == former.pid and t > back + TICK_S]
+    assert (former.code, taken.violations) == (2, [])
+
+
 def test_hanging_loop_is_landed_then_cut():
     flight = fly(DRONE, Fault(AT_S, "hang", "C", 100.0), settings=["duration_s=14", "arena.size=[4.0, 4.0, 2.5]"])
     (process,) = flight.of("default-C")
@@ -151,6 +167,14 @@ def test_hanging_loop_is_landed_then_cut():
     assert AT_S + 0.5 + 12.5 < process.ended < AT_S + 0.7 + 12.5 + 1.0  # 2.5 m at 0.2 m/s
     assert process.code == 70
     assert flight.robots["C"].off(after=process.ended) == process.ended
+
+
+def test_lost_order_to_land_is_repeated():
+    end, lost = 3.0, 5.3
+    flight = fly(DRONE, Fault(end - 0.5, "body", "C", "aloft", lost - end + 0.5))
+    assert end + 2.0 < lost < end + 2.0 + 1.0, "the first two are"
+    assert end + 3.0 + 1.5 < flight.robots["C"].off() < end + 3.0 + 2.5
+    assert (flight.code, flight.violations) == (0, [])
 
 
 CASES = '\n[cases]\nfirst.trigger = "periodic"\nsecond.trigger = "periodic"\n'
@@ -184,6 +208,14 @@ def test_stop_that_no_body_obeys_is_told():
     (process,) = flight.of("default-C")
     assert process.ended == pytest.approx(lost.t + 5.0, abs=0.2)
     assert flight.code == 1
+
+
+def test_stop_that_no_body_confirms_is_told():
+    frozen = DRONE.replace("hover = 0.8", 'hover = 0.8, body = "world"')
+    flight = fly(frozen, Fault(AT_S, "pause", "world", lasts=60.0), Fault(AT_S, "estop"), settings=["rates.body_hz=50"])
+    (stop,) = flight.happened("stop")
+    (told,) = flight.happened("body", "C", "the emergency stop is not answered")
+    assert stop.t + 2.5 - HEARD_S < told.t < stop.t + 2.5 + HEARD_S
 
 
 def test_robot_that_was_ordered_to_hold_holds():
