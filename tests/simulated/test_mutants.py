@@ -33,8 +33,8 @@ MUTANTS = {
         f"{RUNTIME}descent.py", "if ownership.check_return(session) or stood:", "if False:",
         test_safety.test_former_owner_commands_nothing,
     ),
-    "empty answer names no owner": (
-        OWNERSHIP, "elif not all(found):", "elif False:",
+    "empty answer not asked for again": (
+        OWNERSHIP, "if tokens or tokens is None:", "if True:",
         partial(test_safety.test_two_robots_of_a_process_are_certain_of_their_names, 1),
     ),
     "stop left to the loop": (
