@@ -35,7 +35,7 @@ MUTANTS = {
     ),
     "empty answer not asked for again": (
         OWNERSHIP, "if tokens or tokens is None:", "if True:",
-        partial(test_safety.test_two_robots_of_a_process_are_certain_of_their_names, 1),
+        partial(test_safety.test_two_robots_of_a_process_keep_their_names, 1),
     ),
     "stop left to the loop": (
         LOOP, "        if self._opened:\n            self._body.stop", "        if False:\n            self._body.stop",

@@ -141,7 +141,7 @@ def test_former_owner_commands_nothing():
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_two_robots_of_a_process_are_certain_of_their_names(seed):
+def test_two_robots_of_a_process_keep_their_names(seed):
     """They hear each other, and such a session gets empty answers to its questions about tokens."""
     back = 3.5
     pair = TRIO.replace("-0.3] }", '-0.3], process = "pair" }')
