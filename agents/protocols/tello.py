@@ -6,9 +6,10 @@ The drone's own units are centimetres and degrees, its yaw grows clockwise, and 
 from __future__ import annotations
 
 import math
+import re
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
-from typing import Final
+from typing import Final, NamedTuple
 from urllib.parse import urlsplit
 
 import msgspec
@@ -17,6 +18,7 @@ from agents.body.interface import BodyError, settings
 from agents.network.messages import State
 
 HOST: Final = "192.168.10.1"  # address of a Tello that is its own access point
+INTERFACE: Final = re.compile(r"[^\s/:%]{1,15}")  # name of a network interface of Linux
 CONTROL_PORT: Final = 8889  # port of the drone for commands; djitellopy binds the same number here for the answers
 STATE_PORT: Final = 8890  # here, where the drone sends its state
 STATE_HZ: Final = 10.0
@@ -56,18 +58,35 @@ class TelloSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
             raise ValueError("low_battery is a share: 0 <= low_battery < 1")
 
 
-def endpoint(robot: str, address: str) -> tuple[str, int]:
-    """Host and port of `tello://HOST[:PORT]`; raises BodyError for another form, or a host that is no IPv4 address."""
+class TelloPlace(NamedTuple):
+    """Place of a Tello: host, port, and the network interface of this computer that leads there."""
+
+    host: str
+    port: int
+    interface: str = ""  # empty: as the computer routes
+
+    @property
+    def device(self) -> str:
+        """Host and interface: what distinguishes Tellos of one address."""
+        return f"{self.host}%{self.interface}" if self.interface else self.host
+
+
+def endpoint(robot: str, address: str) -> TelloPlace:
+    """Place of `tello://HOST[%INTERFACE][:PORT]`, with an IPv4 address as its host; raises BodyError for others."""
     try:
         parts = urlsplit(address)
-        host, port = parts.hostname or HOST, parts.port or CONTROL_PORT
+        host, zone, interface = (parts.hostname or HOST).partition("%")
+        port = parts.port or CONTROL_PORT
     except ValueError as error:
         raise BodyError(f"{robot}: '{address}': {error}; write tello://{HOST}") from error
+    if zone and not INTERFACE.fullmatch(interface):
+        form = f"write its name as `ip link` shows it, as in tello://{HOST}%wlan1"
+        raise BodyError(f"{robot}: '{address}' names no network interface; {form}")
     numbers = host.split(".")
     if len(numbers) != 4 or not all(n.isdecimal() and int(n) < 256 for n in numbers):
         # djitellopy tells drones apart by the address that their answers come from
         raise BodyError(f"{robot}: '{address}' is no Tello's address; give its IPv4 address, as in tello://{HOST}")
-    return host, port
+    return TelloPlace(host, port, interface)
 
 
 def sticks(

@@ -10,7 +10,9 @@ import contextlib
 import math
 import threading
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import partial
+from itertools import combinations
 from typing import Final
 
 from agents.body.device_locks import Claims
@@ -31,7 +33,7 @@ from agents.body.interface import (
 from agents.clock import uptime
 from agents.protocols import tello as protocol
 from agents.vectors import UNKNOWN, ZERO, Setpoint, Vector
-from bridges.tello.library import TelloLibrary
+from bridges.tello.library import TelloLibrary, filters_answers
 from bridges.tello.pilot import Duty, TelloPilot
 
 OPEN_S: Final = 3.0  # deadline of a drone's first state line
@@ -48,13 +50,13 @@ class TelloBody(Body):
     @classmethod
     def faults(cls, robots: Sequence[BodyEntry]) -> Iterator[BodyFault]:
         """See `Body.faults`."""
-        places: dict[str, str] = {}  # IPv4 addresses by robot
+        places: dict[str, protocol.TelloPlace] = {}  # places of robots, by name
         first: dict[str, BodyEntry] = {}  # entries by machine
         for each in robots:
             wrong = list(judged(each, BODY, partial(protocol.endpoint, each.name, each.address)))
             yield from wrong
             if not wrong:
-                places[each.name], _ = protocol.endpoint(each.name, each.address)
+                places[each.name] = protocol.endpoint(each.name, each.address)
             if not each.external:
                 message, remedy = "a Tello does not measure its position", 'write position = "external"'
                 yield BodyFault(each.name, ("position",), message, remedy)
@@ -63,7 +65,14 @@ class TelloBody(Body):
                 message = f"{other.name} and {each.name} are Tellos of one computer, all of which one process drives"
                 process = "tellos" if other.process == other.name else other.process
                 yield BodyFault(each.name, BODY, message, f'give each process = "{process}"')
-        yield from shared_devices(robots, lambda each: places.get(each.name))
+        for fault in shared_devices(robots, lambda each: places[each.name].device if each.name in places else None):
+            remedy = f"{fault.remedy}, or name the network interface of each, as in tello://{protocol.HOST}%wlan1"
+            yield replace(fault, remedy=remedy)
+        for one, two in combinations([each for each in robots if each.name in places], 2):
+            a, b = places[one.name], places[two.name]
+            if (one.host, a.host) == (two.host, b.host) and bool(a.interface) != bool(b.interface):
+                message = f"{one.name} and {two.name} have the address {a.host}, one of them without its interface"
+                yield BodyFault(two.name, BODY, message, f"name that of both, as in tello://{a.host}%wlan1")
 
     def __init__(self, request: BodyRequest, open_s: float = OPEN_S) -> None:
         """`open_s`: deadline of the first state line [s]."""
@@ -73,7 +82,7 @@ class TelloBody(Body):
         self._settings = [
             settings(protocol.TelloSettings, *row) for row in zip(request.names, request.device, strict=True)
         ]
-        self._claims = Claims(self._names, [f"tello://{host}" for host, _ in self._endpoints])
+        self._claims = Claims(self._names, [f"tello://{each.device}" for each in self._endpoints])
         self._start_yaw = request.yaw
         self._external = [External() for _ in self._names]
         self._library: TelloLibrary | None = None
@@ -87,12 +96,12 @@ class TelloBody(Body):
         """See `Body.open`. Drones without answer are retried while the others fly."""
         self._claims.take()
         try:
-            library = self._library = TelloLibrary()
+            library = self._library = TelloLibrary(interfaces=[each.interface for each in self._endpoints])
         except BodyError:
             self._claims.release()
             raise
         self.pilots = [
-            TelloPilot(library.drone(*place), kind, chosen)
+            TelloPilot(library.drone(place), kind, chosen)
             for place, kind, chosen in zip(self._endpoints, self._kinds, self._settings, strict=True)
         ]
         self._ending.clear()
@@ -104,11 +113,14 @@ class TelloBody(Body):
         if all(pilot.state_received == -math.inf for pilot in self.pilots):
             now = uptime()
             reasons = [
-                f"{name} at {host}:{port}: {pilot.note(now)}"
-                for name, (host, port), pilot in zip(self._names, self._endpoints, self.pilots, strict=True)
+                f"{name} at {place.device}:{place.port}: {pilot.note(now)}"
+                for name, place, pilot in zip(self._names, self._endpoints, self.pilots, strict=True)
             ]
             self.close()
             remedy = f"switch it on, join its Wi-Fi, let UDP {protocol.STATE_PORT} through the firewall"
+            if strict := [each.interface for each in self._endpoints if filters_answers(each.interface)]:
+                changes = " ".join(f"net.ipv4.conf.{name}.rp_filter=2" for name in strict)
+                remedy += f", let Linux take answers by the second of two adapters: sudo sysctl {changes}"
             raise BodyError(f"{'; '.join(reasons)} ({remedy})")
 
     def read(self, t: float) -> Sequence[BodyState]:

@@ -75,7 +75,9 @@ def made(body, asked):
         ("crazyflie", [RADIO] * 2, {}, False, "R1: R0 has the same body, radio://.*; give each its own address"),
         ("crazyflie", RADIO, OUTSIDE, False, "needs position = "),
         ("tello", "tello", {}, False, 'a Tello does not measure its position; write position = "external"'),
-        ("tello", [TELLO, f"{TELLO}:1"], {}, True, "R1: R0 has the same body, tello://10"),
+        ("tello", [TELLO, f"{TELLO}:1"], {}, True, "R1: R0 has the same body, tello://10.*192.168.10.1%wlan1"),
+        ("tello", [f"{TELLO}%wlan1", TELLO], {}, True, "10.0.0.2, one of them without its interface; name that"),
+        ("tello", f"{TELLO}%", {}, True, "names no network interface"),
     ],
 )
 def test_wrong_addresses_and_settings_are_named(kind, addresses, device, external, said):

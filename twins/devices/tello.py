@@ -412,7 +412,7 @@ def _listen(name: str, address: str) -> socket.socket:
     """Socket at the address, else on the first loopback host without a Tello."""
     _, named, place = address.partition("://")
     if named:
-        host, port = protocol.endpoint(name, f"tello://{place}")
+        host, port, _ = protocol.endpoint(name, f"tello://{place}")
         if not host.startswith("127."):
             raise BodyError(f"{name}: {address}: a twin needs a loopback address, such as tello-twin://127.0.0.2")
         hosts, port = [host], port if ":" in place else PORT

@@ -10,12 +10,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agents.body.interface import UNANSWERED
+from agents.body.interface import UNANSWERED, BodyError
 from agents.kinds.tello import TELLO
 from agents.protocols import tello as protocol
+from agents.protocols.tello import TelloPlace
 from bridges.tello import pilot
 from bridges.tello.body import TelloBody
-from bridges.tello.library import TelloLibrary
+from bridges.tello.library import TelloLibrary, filters_answers
 from bridges.tello.pilot import Duty, TelloPilot
 from tests.requests import request
 
@@ -443,7 +444,7 @@ def test_telemetry_outlives_bytes_of_nonsense():
             free.bind(("", 0))
         answers, states = (free.getsockname()[1] for free in (first, second))
     library = TelloLibrary(answers, states)
-    drone = library.drone("127.0.0.2", 18889)
+    drone = library.drone(TelloPlace("127.0.0.2", 18889))
     with socket.socket(type=socket.SOCK_DGRAM) as sender, socket.socket(type=socket.SOCK_DGRAM) as stranger:
         sender.bind(("127.0.0.2", 0))
         for data in (b"\xff", b"", b"ok", b"h:", b"h:x;bat:9", b"x" * 5000, b"\xffh:70;bat:9;"):
@@ -460,3 +461,30 @@ def test_telemetry_outlives_bytes_of_nonsense():
     assert drone.get_current_state() == {"h": 149, "bat": 80, "time": 3}
     assert drone.get_own_udp_object()["responses"] == [b"ok"]
     library.close()
+
+
+@pytest.mark.skipif(find_spec("djitellopy") is None, reason="needs djitellopy")
+def test_drones_of_one_address_have_an_interface_each():
+    with socket.socket(type=socket.SOCK_DGRAM) as first, socket.socket(type=socket.SOCK_DGRAM) as second:
+        for free in (first, second):
+            free.bind(("", 0))
+        answers, states = (free.getsockname()[1] for free in (first, second))
+    library = TelloLibrary(answers, states, ("", "lo"))
+    with socket.socket(type=socket.SOCK_DGRAM) as far:
+        far.bind(("127.0.0.2", 0))
+        far.settimeout(10.0)
+        places = [TelloPlace("127.0.0.2", far.getsockname()[1], interface) for interface in ("", "lo")]
+        drones = [library.drone(place) for place in places]
+        drones[1].send_command_without_return("command")
+        command, peer = far.recvfrom(100)
+        assert (command, peer[1]) == (b"command", answers)
+        far.sendto(b"h:20;bat:70;\r\n", ("127.0.0.1", states))
+        library.receive()
+        assert [drone.get_current_state().get("bat") for drone in drones] == [None, 70]
+        with pytest.raises(BodyError, match=rf"UDP port {answers} of this computer is taken"):
+            TelloLibrary(answers, states)
+    library.close()
+    with pytest.raises(BodyError, match=r"no network interface 'wlan9', only .*lo"):
+        TelloLibrary(answers, states, ("wlan9",))
+    assert not filters_answers("")
+    assert not filters_answers("wlan9")
