@@ -8,7 +8,7 @@ import json
 import os
 import pkgutil
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from math import inf
 from pathlib import Path
 from types import CodeType, FunctionType
@@ -24,8 +24,7 @@ for _package in ("agents", "experiments", "tools", "twins"):  # an import in a f
         with suppress(ImportError):
             importlib.import_module(_module.name)
 
-# what simulated processes ask of the real world without any effect on the flight
-ALLOWED = ()
+_for_good = ExitStack()
 
 
 def fly(request: Request) -> Flight:
@@ -57,7 +56,7 @@ def warm_up() -> None:
 
     Two short flights fill caches and let the interpreter adapt its code.
     """
-    kernel.guard(*ALLOWED).__enter__()  # for good, as what `patch` replaces
+    _for_good.enter_context(kernel.guard())
     seam.patch()
     for case in ("event", "world"):
         fly(Request(MIX, case=case, settings=("duration_s=1",)))

@@ -507,11 +507,10 @@ _REAL: Final = (
 
 
 @contextmanager
-def guard(*allowed: str) -> Iterator[None]:
+def guard() -> Iterator[None]:
     """Inside, a simulated process that asks the real world for time, chance or another process ends its flight.
 
-    The name of what may be asked is `allowed`, such as "time.sleep". Enter it first: names that the simulation
-    replaces afterwards are its own.
+    Enter it first: names that the simulation replaces afterwards are its own.
     """
 
     def watched(name: str, real: Callable[..., Any]) -> Callable[..., Any]:
@@ -525,10 +524,10 @@ def guard(*allowed: str) -> Iterator[None]:
         return call
 
     patches = [
-        mock.patch.object(module, name, watched(full, getattr(module, name)))
+        mock.patch.object(module, name, watched(f"{module.__name__}.{name}", getattr(module, name)))
         for module, *names in _REAL
         for name in names
-        if hasattr(module, name) and (full := f"{module.__name__}.{name}") not in allowed
+        if hasattr(module, name)
     ]
     for each in patches:
         each.start()

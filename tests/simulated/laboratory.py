@@ -173,7 +173,6 @@ class Flight:
     cpu_s: float = 0.0
     robot_s: float = 0.0  # simulated seconds, summed over robots
     simulated_s: float = 0.0
-    rules: int = 0
 
     def happened(self, kind: str, source: str = "", text: str = "") -> list[Event]:
         """Events of a kind, of a source if one is named, with a text in them."""

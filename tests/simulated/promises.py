@@ -7,7 +7,7 @@ the simulated laboratory. A value without a path says why no test is needed.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Final
 
 NUMBER = r"\d+(?:\.\d+)?"
@@ -29,7 +29,6 @@ POSES = "agents/runtime/test_pose_inbox.py::test_"
 READY = "agents/safety/test_detection.py::test_reason_why_a_drone_is_not_ready"
 STATION = "experiments/real_time/hosts/test_station.py::test_"
 MACHINES = "system/test_machines.py::test_"
-AUTHORITY = "experiments/real_time/hosts/test_authority.py::test_"
 SPOILED = "experiments/metrics/test_criteria.py::test_what_spoils_a_run"
 ROW = "simulated/test_safety.py::test_hazard_of_one_robot"
 SCRIPT = "simulated/test_safety.py::test_"
@@ -166,10 +165,3 @@ RUNS: Final = {
     "transmits in a second": "experiments/metrics/test_measure.py::test_transmissions_rates_and_gaps",
 }
 PAGES: Final[Mapping[str, Mapping[str, str]]] = {"safety": SAFETY, "hosts": HOSTS, "runs": RUNS}
-
-
-def promised(page: str) -> Iterator[tuple[int, str]]:
-    """Places of the times, exit codes and guarantees on a page, with their lines in words."""
-    for found in PROMISE.finditer(page):
-        begin, end = page.rfind("\n", 0, found.start()) + 1, page.find("\n", found.end())
-        yield found.start(), page[begin:end]

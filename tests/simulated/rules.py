@@ -149,12 +149,6 @@ class Look:
         return bool(self.kinds & {"step", "drift"}) or any("start" in str(each.size) for each in self.world.script)
 
 
-RobotRule = Callable[[Look, Seen], str]
-PairRule = Callable[[Look, Seen, Seen], str]
-UseRule = Callable[[Look, str, Process], str]
-EndRule = Callable[["End"], Iterator[str]]
-
-
 @dataclass(frozen=True)
 class Rule:
     name: str

@@ -59,6 +59,12 @@ def test_seeds_repeat_to_the_last_switch():
     assert len(set(printed.pop().splitlines())) == len(seeds)
 
 
+def test_flight_asks_nothing_of_the_real_world():
+    asks = laboratory.Mutant("agents/runtime/loop.py", "self._read(t)\n", "self._read(t + 0.0 * time.time_ns())\n")
+    with pytest.raises(laboratory.SimulatorError, match=r"asks the real world: time\.time_ns"):
+        laboratory.fly("triangle", case="event", mutant=asks)
+
+
 def test_broken_rule_is_shrunk_to_its_faults():
     blind = laboratory.Mutant("agents/safety/detection.py", "found |= 1 << Cause.ROUTER", "found |= 0")
     noise = [Fault(t, "late", "KH01", 0.005, 0.2) for t in (0.5, 1.0, 4.0, 5.0)]

@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from tests.simulated.bodies import WatchedBody
 
 LOOK_S = 0.05  # period of samples and rules
-LATE_S = 0.0002  # mean lateness of a sleep on an idle machine [s]
 END_S = 0.05  # time after the end of the last process
 OUTSIDE = ("operator", "capture", "second ")  # processes that no run has started
 
@@ -204,7 +203,6 @@ class World:
 
     def started(self, process: sim.Process, module: str, words: Sequence[str]) -> None:
         """Note a process that the launcher has started."""
-        process.late = LATE_S
         if module != robot_process.__name__:
             return
         for name in [word for word in words[1:] if self.plan is not None and word in self.plan.names]:
