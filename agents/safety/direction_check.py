@@ -10,7 +10,7 @@ Quiet: all of it.
 
 from __future__ import annotations
 
-from math import atan2, exp, hypot, inf, sqrt
+from math import atan2, exp, inf, sqrt
 from typing import Final
 
 from agents.body.kinds import Kind
@@ -58,7 +58,7 @@ class DirectionCheck:
         since, self.last = t - self.last, t
         self.due = t + SAMPLE_S - ROUNDING_S
         x, y = self.response * (goal_x - position[0]), self.response * (goal_y - position[1])
-        share = min(self.speed / max(hypot(x, y), self.speed), 1.0)
+        share = min(self.speed / max(sqrt(x * x + y * y), self.speed), 1.0)
         x, y = self.gain * (share * x - velocity[0]), self.gain * (share * y - velocity[1])
         before, self.velocity = self.velocity, velocity
         if since < MISSED_S:
@@ -75,5 +75,5 @@ class DirectionCheck:
         self.asks = keep * self.asks + since * (self.x * self.x + self.y * self.y)
         self.moves = keep * self.moves + since * (x * x + y * y)
         self.angle = atan2(self.cross, self.inline)
-        alike = hypot(self.inline, self.cross) > ALIKE * sqrt(self.asks * self.moves)
+        alike = self.inline * self.inline + self.cross * self.cross > ALIKE * ALIKE * self.asks * self.moves
         self.turned = alike and abs(self.angle) > ASIDE and self.asks > LEAST * LEAST * FORGET_S
