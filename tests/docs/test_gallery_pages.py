@@ -1,9 +1,10 @@
-"""What docs show: pictures of the gallery, drawn by a program that runs, and a layout of Foxglove."""
+"""What docs show: pictures of the gallery, drawn by a program that runs, and layouts of Foxglove and RViz."""
 
 import json
 import runpy
 
 import pytest
+import yaml
 from mcap.reader import make_reader
 
 from experiments.catalogue import index
@@ -14,6 +15,7 @@ from zenpark import load, simulate
 FOLDER = ROOT / "docs" / "gallery"
 DRAW = runpy.run_path(str(FOLDER / "draw.py"))
 LAYOUT = ROOT / "docs" / "viewers" / "foxglove.json"
+RVIZ = ROOT / "docs" / "viewers" / "zenpark.rviz"
 LAWS = {page.stem for page in FOLDER.glob("*.md")} - {"index"}
 
 
@@ -33,7 +35,7 @@ def test_figures_of_a_recorded_run_are_printed(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_foxglove_layout_names_what_a_recording_has(tmp_path):
+def test_layouts_name_what_a_recording_has(tmp_path):
     simulate(load("triangle", "duration_s=1.0", "timeline=[]"), cases=["event"], folder=tmp_path)
     file = tmp_path / "event.mcap"
     with file.open("rb") as stream:
@@ -46,5 +48,10 @@ def test_foxglove_layout_names_what_a_recording_has(tmp_path):
     assert {name: recorded[name] for name in scene["topics"]} == {"/scene": "visualization_msgs/msg/MarkerArray"}
     assert recorded[events["topicPath"]] == "zenpark_msgs/msg/Event"
     assert {"map", scene["followTf"], *(layer["frameId"] for layer in scene["layers"].values())} <= frames
+    rviz = yaml.safe_load(RVIZ.read_text("utf-8"))["Visualization Manager"]
+    shown = {each["Class"].rpartition("/")[2]: each for each in rviz["Displays"]}
+    assert {rviz["Global Options"]["Fixed Frame"], shown["Grid"]["Reference Frame"]} <= frames
+    assert recorded[shown["MarkerArray"]["Topic"]["Value"]] == "visualization_msgs/msg/MarkerArray"
+    assert recorded["/tf"] == "tf2_msgs/msg/TFMessage"
     markers = [marker for each in typed(file, "/scene") for marker in each.markers]
     assert {marker.header.frame_id for marker in markers} <= frames
