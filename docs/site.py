@@ -27,7 +27,12 @@ NOTEBOOKS: Final = (
     "experiments.sweep.sweep",
     "experiments.recording.trace",
 )
-SOUGHT: Final = {"safety.md": 30, "first-flight.md": 8, "vicon.md": 4, "plugins.md": 2}  # weights in the search
+SOUGHT: Final = {
+    "safety.md": 30,
+    "first-flight.md": 8,
+    "motion-capture.md": 4,
+    "plugins.md": 2,
+}  # weights in the search
 FORMULA: Final = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
 PLUGINS: Final = (
     "agents.vectors",

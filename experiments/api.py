@@ -22,7 +22,9 @@ if TYPE_CHECKING:
     from agents.plugins.predictors import Predictor
     from agents.plugins.registry import PluginError
     from agents.plugins.triggers import Trigger
+    from agents.protocols.byte_stream import MalformedStream
     from agents.vectors import Vector, clamp, distance, norm, wrap
+    from bridges.motion_capture.reader import CaptureFrame, CaptureReader, MeasuredPose
     from experiments.check.check import check, figures
     from experiments.definition import formation, graph, rigidity
     from experiments.file.document import Document, load, loads
@@ -53,6 +55,8 @@ __all__ = [  # noqa: RUF022 - by subject, as in docs/python.md
     # kinds and bodies
     "Kind", "KINDS", "Wheels", "Steered", "Holonomic", "Flight", "Ground",
     "Body", "BodyRequest", "BodyState", "BodyError", "BodyEntry", "BodyFault", "call_all",
+    # readers of motion capture
+    "CaptureReader", "CaptureFrame", "MeasuredPose", "MalformedStream",
     # vectors
     "Vector", "norm", "distance", "clamp", "wrap",
     # orders to a run in real time

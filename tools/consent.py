@@ -39,8 +39,8 @@ def touched(cases: Iterable[Plan]) -> list[str]:
             ("robots listen at", network.addresses.values()),
         ):  # fmt: skip
             found += [f"{what} {each}" for each in endpoints or () if not Endpoint.parse(each).is_loopback]
-        if case.positioning is not None and not case.positioning.endswith("-twin"):
-            found.append(f"motion capture: {case.positioning}")
+        if case.capture is not None and not case.capture.simulated:
+            found.append(f"motion capture: {case.capture.source}")
     return list(dict.fromkeys(found))
 
 

@@ -1,4 +1,4 @@
-"""Registry of plug-ins by entry points: bodies, kinds, triggers, laws, planners, avoidances, engines and metrics.
+"""Registry of plug-ins by entry points: bodies, kinds, readers of motion capture, triggers, laws, planners and others.
 
 A trigger, law, planner, avoidance or engine is a frozen `msgspec.Struct` of its parameters; a body is a class, made
 with a `agents.body.interface.BodyRequest`; a kind of robot is an object `agents.body.kinds.Kind`. Any distribution may
@@ -37,6 +37,7 @@ CHOSEN: Final = (ROBOTS, *STRUCTS)  # groups with names in a file
 METRICS: Final = "zenpark.metrics"  # measured quantities, without parameters
 FACE: Final = "zenpark"  # module of the names that plug-ins import
 NAMED_BY_FILE: Final = (*STRUCTS, METRICS)  # groups with classes that a file beside the experiment may hold
+POSITIONING: Final = "zenpark.positioning"  # readers of motion capture, by the schemes of their addresses
 DEVICES: Final = "zenpark.devices"  # protocol twins: simulated far ends of the protocols of bodies
 # Base of the classes of each group, as `module:class`: what zenpark asks of a plug-in stands there, with its default.
 BASES: Final = {
@@ -47,6 +48,7 @@ BASES: Final = {
     PLANNERS: "agents.plugins.planners:Planner",
     AVOIDANCES: "agents.plugins.avoidance:Avoidance",
     ENGINES: "twins.engines.engine:EngineFactory",
+    POSITIONING: "bridges.motion_capture.reader:CaptureReader",
     METRICS: "experiments.metrics.metric:Metric",
 }
 
@@ -232,7 +234,7 @@ def distributions(text: str | None = None) -> dict[str, str]:
 
 def _foreign() -> list[tuple[EntryPoint, Distribution]]:
     """Entry points of other distributions than ours."""
-    groups = (BODIES, DEVICES, METRICS, *CHOSEN)
+    groups = (BODIES, DEVICES, POSITIONING, METRICS, *CHOSEN)
     entries = (entry for group in groups for entry in installed().select(group=group))
     return [
         (entry, entry.dist)

@@ -8,11 +8,12 @@ sent once and is then valid until it is sent again.
 
 from __future__ import annotations
 
-import re
 import struct
 from collections.abc import Iterable, Iterator
 from enum import IntEnum
 from typing import Final, NamedTuple
+
+from agents.protocols.byte_stream import MalformedStream
 
 PORT: Final = 801
 MAGIC: Final = 0x1A2B0001
@@ -21,16 +22,6 @@ NO_PARENT: Final = 0xFFFFFFFF  # parent of a root segment
 CLOCK_HZ: Final = 135_000_000  # unit of the frame period
 MM: Final = 1000.0  # millimetres in a metre
 Z_UP: Final = 0
-
-
-def parse_server(server: str) -> tuple[str, int]:
-    """Host and port of "HOST" or "HOST:PORT"; raises ValueError if it is neither."""
-    host, colon, port = server.partition(":")
-    if not re.fullmatch(r"[\w.-]+", host) or (
-        colon and not (port.isascii() and port.isdigit() and 0 < int(port) < 65536)
-    ):
-        raise ValueError(f"'{server}' is neither HOST nor HOST:PORT, such as 192.168.0.10:801")
-    return host, int(port) if colon else PORT
 
 
 class BlockKind(IntEnum):
@@ -60,10 +51,6 @@ _WORD = struct.Struct("<I")
 _PERIOD = struct.Struct("<q")
 _HEAD = struct.Struct("<II")
 _SEGMENT = struct.Struct("<I3d9d")
-
-
-class MalformedBlock(ValueError):
-    """Bytes that are not in the DataStream format."""
 
 
 class Subject(NamedTuple):
@@ -149,16 +136,16 @@ class Framer:
         self._waiting = bytearray()
 
     def feed(self, received: bytes) -> list[bytes]:
-        """The bodies of the packets that are complete now, oldest first; raises Malformed for bytes that begin none."""
+        """The bodies of the packets that are complete now, oldest first."""
         waiting = self._waiting
         waiting += received
         bodies, at = [], 0
         while len(waiting) - at >= _HEAD.size:
             magic, length = _HEAD.unpack_from(waiting, at)
             if magic != MAGIC:
-                raise MalformedBlock(f"a packet begins with {magic:#010x}, not with {MAGIC:#010x}")
+                raise MalformedStream(f"a packet begins with {magic:#010x}, not with {MAGIC:#010x}")
             if length > MAX_PACKET:
-                raise MalformedBlock(f"a packet of {length} bytes is longer than any frame")
+                raise MalformedStream(f"a packet of {length} bytes is longer than any frame")
             end = at + _HEAD.size + length
             if end > len(waiting):
                 break
@@ -169,22 +156,22 @@ class Framer:
 
 
 def blocks(body: bytes) -> Iterator[tuple[int, bytes]]:
-    """Kind and payload of each block in the body of a packet; raises Malformed if one is longer than its rest."""
+    """Kind and payload of each block in the body of a packet; raises MalformedStream if one is longer than its rest."""
     at = 0
     while at < len(body):
         kind, length = _unpack(_HEAD, body, at)
         at += _HEAD.size
         if length > len(body) - at:
-            raise MalformedBlock(f"a block of {length} bytes in a packet that ends after {len(body) - at}")
+            raise MalformedStream(f"a block of {length} bytes in a packet that ends after {len(body) - at}")
         yield kind, body[at : at + length]
         at += length
 
 
 def unpack_kinds(payload: bytes) -> set[int]:
-    """Kinds that `pack_kinds` packed; raises Malformed, as the functions below, if the block is cut off."""
+    """Kinds that `pack_kinds` packed; raises MalformedStream, as the functions below, if the block is cut off."""
     (count,) = _unpack(_WORD, payload, 0)
     if 4 * count > len(payload) - 4:
-        raise MalformedBlock(f"a list of {count} kinds in {len(payload)} bytes")
+        raise MalformedStream(f"a list of {count} kinds in {len(payload)} bytes")
     return set(struct.unpack_from(f"<{count}I", payload, 4))
 
 
@@ -224,7 +211,7 @@ def unpack_segments(payload: bytes) -> tuple[int, list[Segment]]:
     """The number of a subject and where its segments are; no segments: it is occluded."""
     subject, count = _unpack(_HEAD, payload, 0)
     if count * _SEGMENT.size > len(payload) - _HEAD.size:
-        raise MalformedBlock(f"{count} segments in {len(payload)} bytes")
+        raise MalformedStream(f"{count} segments in {len(payload)} bytes")
     found = []
     for number, x, y, z, *rotation in _SEGMENT.iter_unpack(payload[8 : 8 + count * _SEGMENT.size]):
         found.append(Segment(number, (x / MM, y / MM, z / MM), tuple(rotation)))
@@ -244,7 +231,7 @@ def _read_text(payload: bytes, at: int) -> tuple[str, int]:
     (length,) = _unpack(_WORD, payload, at)
     end = at + 4 + length
     if end > len(payload):
-        raise MalformedBlock(f"a text of {length} bytes where {len(payload) - at - 4} are left")
+        raise MalformedStream(f"a text of {length} bytes where {len(payload) - at - 4} are left")
     return payload[at + 4 : end].decode(errors="replace"), end
 
 
@@ -252,4 +239,4 @@ def _unpack(layout: struct.Struct, payload: bytes, at: int) -> tuple[int, ...]:
     try:
         return layout.unpack_from(payload, at)
     except struct.error:
-        raise MalformedBlock(f"a block is cut off after {len(payload)} bytes") from None
+        raise MalformedStream(f"a block is cut off after {len(payload)} bytes") from None

@@ -18,12 +18,13 @@ from typing import Annotated, Any, Final
 from msgspec import Meta, Struct
 
 from agents.body.interface import BodyError
+from agents.plugins import registry
 from agents.plugins.registry import did_you_mean
 from agents.protocols import crazyflie as protocol
 from experiments.authoring.robotic_park.file import MISSING, YamlValue, load, text_of
 from experiments.catalogue import index
 from experiments.check.findings import join_names
-from experiments.definition.experiment import VICON, VICON_TWIN, Name
+from experiments.definition.experiment import VICON_TWIN, Name
 from experiments.file import catalogue as entries
 from experiments.file import document
 from experiments.file.problems import DocumentError, Problem, refusal
@@ -276,7 +277,7 @@ def _with_rates(drones: Sequence[SwarmDrone], notes: list[str]) -> list[SwarmDro
     return [replace(each, device=device.get(each.radio, {})) for each in drones]
 
 
-def _positioning(folder: Path, drones: Sequence[SwarmDrone], notes: list[str]) -> str:
+def _positioning(folder: Path, drones: Sequence[SwarmDrone], notes: list[str]) -> str | dict[str, str]:
     """Source of positions, by the file of the motion capture beside; empty if no drone needs one."""
     if not any(each.capture.enabled for each in drones):
         return ""
@@ -294,8 +295,9 @@ def _positioning(folder: Path, drones: Sequence[SwarmDrone], notes: list[str]) -
     system, host = (
         str(parameters.get(key, "")) if isinstance(parameters, dict) else "" for key in ("type", "hostname")
     )
-    if system == "vicon" and re.fullmatch(r"[\w.-]+(:\d+)?", host):
-        return f"{VICON}{host}"
+    if system in registry.names(registry.POSITIONING) and re.fullmatch(r"[\w.-]+(:\d+)?", host):
+        source = f"{system}://{host}"  # Crazyswarm2 leaves axes as they are: Motive is set to z up there
+        return {"source": source, "up": "z"} if system == "optitrack" else source
     notes.append(f"motion capture: {system or 'no type'} at {host or 'no host'} in {MOCAP}; its twin is taken")
     return VICON_TWIN
 

@@ -14,7 +14,7 @@ from agents.body.kinds import KINDS
 from agents.network.access_control import Grant, Rights
 from agents.network.keys import Keys
 from agents.plugins import registry
-from experiments.definition.experiment import VICON_TWIN, WORLD, RobotTable
+from experiments.definition.experiment import WORLD, RobotTable
 from experiments.definition.plan import Plan
 
 REMOTE_BODIES: Final = ("external", WORLD)  # bodies with poses from the process that carries them
@@ -38,7 +38,7 @@ def needed_identities(plan: Plan, operator: str = "operator") -> list[str]:
     twins = any(robot.body in registry.names(registry.DEVICES) for robot in robots)
     services = {
         "world": has_world(plan),
-        "twin": twins or experiment.positioning == VICON_TWIN,
+        "twin": twins or bool(experiment.capture and experiment.capture.simulated),
         "positioning": experiment.positioning is not None,
         "centre": bool(plan.guided),
     }

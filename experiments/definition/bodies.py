@@ -15,7 +15,7 @@ from agents.body.kinds import KINDS, Kind
 from agents.network.keys import Keys
 from agents.plugins import registry
 from agents.vectors import Vector, clamp
-from experiments.definition.experiment import VICON_TWIN, WORLD, Experiment, RobotTable
+from experiments.definition.experiment import TWIN, VICON_TWIN, WORLD, Experiment, Positioning, RobotTable
 from experiments.definition.plan import Plan
 from twins import scene as outlines
 from twins.engines.engine import World
@@ -185,7 +185,7 @@ def choose_bodies(plan: Plan, bodies: str | None) -> Plan:
     if bodies == "protocol":
         return behind_protocols(plan)
     experiment = plan.experiment
-    captured = bodies == WORLD and experiment.positioning == VICON_TWIN
+    captured = bodies == WORLD and experiment.capture is not None and experiment.capture.simulated
     robots = {
         name: msgspec.structs.replace(
             robot,
@@ -215,4 +215,11 @@ def behind_protocols(plan: Plan) -> Plan:
         device = {**given[name].device, **twin.device}
         where = {"body": twin.body, "process": twin.process, "position": twin.position, "device": device}
         robots[name] = msgspec.structs.replace(given[name], **where)
-    return plan.changed(robots=robots, positioning=VICON_TWIN)
+    return plan.changed(robots=robots, positioning=simulated_capture(plan.experiment.capture))
+
+
+def simulated_capture(capture: Positioning | None) -> str | Positioning:
+    """The protocol twin of a motion capture system, with its names and coordinates; a Vicon's where there is none."""
+    if capture is None or not registry.load(registry.POSITIONING, capture.system).TWIN:
+        return VICON_TWIN
+    return msgspec.structs.replace(capture, source=f"{capture.system}{TWIN}")

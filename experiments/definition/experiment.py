@@ -11,6 +11,7 @@ from typing import Annotated, Any, Final, Literal
 import msgspec
 from msgspec import Meta
 
+from agents.body.coordinates import Coordinates
 from agents.body.interface import Disturbance
 from agents.body.limits import Safety
 from agents.network.channel_model import AtLeastOne, Delay, LinkEffects
@@ -18,8 +19,8 @@ from agents.vectors import NotNegative, Positive, Share
 from twins.scene import Obstacle, Planar
 
 WORLD: Final = "world"  # the body of a robot that lives in the twin service
-VICON: Final = "vicon://"  # prefix of the host of a Vicon, in `positioning`
-VICON_TWIN: Final = "vicon-twin"  # motion capture that is simulated as well
+VICON_TWIN: Final = "vicon-twin"  # simulated motion capture, where the file names none
+TWIN: Final = "-twin"  # ends the name of motion capture that is simulated as well
 TARGETS: Final = ("distance", "offset", "bearing")  # fields of the target of a link, of which it has one
 NO_TARGET: Final = "nothing"  # stands in place of a field: a link alone
 
@@ -362,6 +363,27 @@ class Hybrid(FileTable, frozen=True):
     robots: Annotated[list[Name], doc("robots that the centre guides", min_length=1)]
 
 
+class Positioning(Coordinates, frozen=True):
+    """Motion capture that measures the robots with `position = "external"`."""
+
+    source: Annotated[str, doc("vicon, optitrack or qualisys, as SYSTEM://HOST[:PORT], or simulated, as SYSTEM-twin")]
+    names: Annotated[
+        dict[Name, Annotated[str, Meta(min_length=1)]],
+        doc("bodies in the system by robot, where they have other names"),
+    ] = msgspec.field(default_factory=dict)
+    latency_s: Annotated[NotNegative, doc("latency that the system's stream does not say [s]")] = 0.0
+
+    @property
+    def system(self) -> str:
+        """Name of the system, such as "vicon"."""
+        return self.source.partition("://")[0].removesuffix(TWIN)
+
+    @property
+    def simulated(self) -> bool:
+        """Whether the system is a protocol twin."""
+        return self.source.endswith(TWIN)
+
+
 # metrics of zenpark that a criterion can name; those of other distributions come beside them
 JUDGED: Final = (
     *("f_hz", "messages", "bytes", "iae", "itae", "rmse", "acquired_s", "updates", "lost", "dropped"),
@@ -428,7 +450,10 @@ class Experiment(FileTable, frozen=True):
     ] = "distributed"
     trigger: Annotated[Choice, doc("registered trigger that decides when a robot transmits")] = "periodic"
     prediction: Annotated[Choice | None, doc("estimated place between messages; left out: as the trigger needs")] = None
-    positioning: Annotated[str | None, doc('source of `position = "external"`: vicon://HOST[:PORT], vicon-twin')] = None
+    positioning: Annotated[
+        str | Positioning | None,
+        doc('source of `position = "external"`: SYSTEM://HOST[:PORT] or SYSTEM-twin, or a table'),
+    ] = None
     disturbance: Annotated[dict[str, Disturbance], doc('by kind or robot; "all" for every one; the narrower wins')] = {}
     avoidance: Annotated[Choice | None, doc("how robots avoid obstacles and each other; left out: they do not")] = None
     world: Annotated[WorldTable, doc("simulated world of the twins")] = WorldTable()
@@ -442,6 +467,12 @@ class Experiment(FileTable, frozen=True):
         dict[Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")], dict[str, Any]],
         doc("each may override any field; the first is the reference of every ratio"),
     ] = {}
+
+    @property
+    def capture(self) -> Positioning | None:
+        """Motion capture, also where the file names its source alone."""
+        given = self.positioning
+        return Positioning(source=given) if isinstance(given, str) else given
 
     @property
     def processes(self) -> dict[str, list[str]]:

@@ -10,7 +10,6 @@ from agents.network import lab
 from agents.network.access_control import Rights
 from agents.network.endpoints import Endpoint, free_endpoint
 from experiments.definition import access_rights
-from experiments.definition.experiment import VICON_TWIN
 from experiments.definition.plan import Plan
 
 ENDPOINTS: Final = "network.txt"  # file for --connect @FOLDER/network.txt, which looks at a run
@@ -31,7 +30,7 @@ def member_endpoints(cases: Iterable[Plan], *, secure: bool) -> list[str]:
             given = next((case.network.addresses[name] for name in group if name in case.network.addresses), "")
             found.setdefault(topology.TOGETHER.join(group), given)
         services += ["world"] * access_rights.has_world(plan) + ["centre"] * bool(plan.guided)
-        services += [VICON_TWIN] * (case.positioning == VICON_TWIN)
+        services += [case.capture.source] if case.capture and case.capture.simulated else []
     services = [*dict.fromkeys(services), "conductor"]
     taken = set(found.values())
     for name in (*found, *services):

@@ -25,7 +25,7 @@ from agents.plugins.planners import Leg
 from agents.plugins.predictors import HOLD, Predictor
 from agents.plugins.triggers import Periodic, Trigger
 from agents.vectors import Vector
-from experiments.definition.experiment import VICON_TWIN, WORLD, Choice, Experiment, Hybrid, RobotTable
+from experiments.definition.experiment import WORLD, Choice, Experiment, Hybrid, RobotTable
 from experiments.definition.formation import Pattern, compile_anchors, linked
 from experiments.definition.graph import Links, adjacency
 from experiments.definition.links import OneWay, one_way_links
@@ -308,7 +308,8 @@ class Plan:
         The world itself publishes positions of its robots, as two sources would contradict each other. With a simulated
         motion capture, which sees these robots as well, the world does not publish them.
         """
-        simulated, robots = self.experiment.positioning == VICON_TWIN, self.experiment.robots.items()
+        capture, robots = self.experiment.capture, self.experiment.robots.items()
+        simulated = capture is not None and capture.simulated
         measured = [(name, robot.body) for name, robot in robots if robot.position == "external"]
         return tuple(name for name, body in measured if simulated or body != WORLD)
 

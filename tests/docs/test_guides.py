@@ -11,7 +11,7 @@ import pytest
 from tests.commands import ROOT, invoke, zenpark
 
 DOCS = ROOT / "docs"
-SHORT = ("shadow-twin", "two-crazyflies", "vicon", "three-machines", "lab-certificates")
+SHORT = ("shadow-twin", "two-crazyflies", "motion-capture", "three-machines", "lab-certificates")
 LONG = ("first-hour", "from-a-paper", "mixed-reality", "teaching", "course/solutions/README")  # 10 to 30 s each
 GUIDES = (*SHORT, *LONG)
 STEP = re.compile(

@@ -13,21 +13,22 @@ import numpy as np
 from agents.body.kinds import KINDS
 from agents.protocols import crtp, khepera4
 from agents.protocols import vicon_datastream as vicon
+from agents.protocols.byte_stream import MalformedStream
 from agents.protocols.crtp import HighLevel, Log, Misc, Port, Setpoint, SupervisorCommand
 from agents.protocols.tello import TelloSettings
 from agents.protocols.vicon_datastream import BlockKind, Segment
 from bridges.khepera4.drivers import KTeam, identify
 from bridges.khepera4.odometry import Odometer
+from bridges.motion_capture.publisher import PoseFilter
+from bridges.motion_capture.vicon import Decoder
 from bridges.tello.pilot import TelloPilot
-from bridges.vicon.client import Decoder
-from bridges.vicon.publisher import PoseFilter
 from tests.fuzz.target import Target, Wire, place, renewed
 from tests.requests import request
 from twins.devices.crazyflie.device import CrazyflieTwin
 from twins.devices.device import DeviceRequest, Faults
 from twins.devices.khepera4 import KheperaDevice
 from twins.devices.tello import TelloDevice
-from twins.devices.vicon import ViconTwin, _Client
+from twins.devices.vicon import ViconClient, ViconTwin
 
 LETTERS = dict(zip("pqrstk", (*khepera4.PARK, "kteam"), strict=True))  # the first byte says which server
 
@@ -121,7 +122,7 @@ def _vicon_stream():
     ]
 
 
-@renewed(300, _vicon_stream, 50_000, refusals=(vicon.MalformedBlock,))
+@renewed(300, _vicon_stream, 50_000, refusals=(MalformedStream,))
 def vicon_bridge():
     """Output of a DataStream server, in chunks."""
     decoder, pose_filter = Decoder(), PoseFilter({"CF01": "cf1", "KH01": "kh1"}, lambda _: None)
@@ -135,8 +136,8 @@ def vicon_bridge():
                         vicon.unpack_kinds(payload)
                 frame = decoder.frame(body)
                 if frame is not None:
-                    for _, measured, segment, yaw in pose_filter.filter_poses(frame, 0.01 * k):
-                        assert np.isfinite((measured, yaw, *segment.position)).all()
+                    for _, measured, position, yaw in pose_filter.filter_poses(frame, 0.01 * k):
+                        assert np.isfinite((measured, yaw, *position)).all()
 
 
 @place(20_000)
@@ -148,7 +149,7 @@ def vicon_twin():
 
     def take(data):
         t, wire = 0.01 * next(ticks), Wire()
-        twin.clients = {wire: _Client()}
+        twin.clients = {wire: ViconClient()}
         wire.waiting += [data[:3000], data[3000:]] if len(data) > 3000 else [data]
         while wire.waiting and wire in twin.clients:
             twin.serve(wire, t)

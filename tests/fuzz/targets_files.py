@@ -26,9 +26,9 @@ from agents.network import messages as wire
 from agents.network import zenoh_config as sessions
 from agents.plugins import registry
 from agents.protocols import crazyflie, khepera4, tello, turtlebot3
-from agents.protocols.vicon_datastream import parse_server
 from bridges.crazyflie.geometry import stations
 from bridges.khepera4.link import KheperaAddress
+from bridges.motion_capture.reader import parse_server
 from experiments.authoring.robotic_park.convert import convert_text
 from experiments.catalogue import index
 from experiments.definition.links import link_pairs
@@ -387,7 +387,7 @@ def words():
             "khepera": partial(KheperaAddress.parse, "R1"),
             "tello": partial(tello.endpoint, "R1"),
             "turtlebot": lambda text: turtlebot3.address("R1", text, turtlebot3.TurtleBot3Settings()),
-            "vicon": parse_server,
+            "vicon": partial(parse_server, port=801),
             "faults": partial(msgspec.json.decode, type=Faults),
             "device": device,
             "key": key_expression,

@@ -35,7 +35,8 @@ from tests.fuzz.target import Target, place, renewed, split
 from tests.network import Net, Reply, Sample
 from tests.requests import request
 from tools.commands.network import members, readable
-from twins.devices.vicon import TruthSubscription, ViconTwin
+from twins.devices.capture import TruthSubscription
+from twins.devices.vicon import ViconTwin
 
 
 @cache

@@ -23,8 +23,8 @@ ROLES: Final = {  # by the module that a process runs
     "experiments.real_time.processes.recorder": "recorder",
     "experiments.real_time.processes.world": "world",
     "experiments.real_time.processes.centre": "centre",
-    "bridges.vicon.publisher": "positioning",
-    "twins.devices.vicon": "capture",
+    "bridges.motion_capture.publisher": "positioning",
+    "twins.devices.capture": "capture",
 }
 ROBOT: Final = "experiments.real_time.processes.robot"
 OTHER: Final = "other"

@@ -205,11 +205,12 @@ ROLES = {
     "experiments.real_time.processes.zygote": "zygote",
     "agents.runtime.router": "router",
     "experiments.real_time.processes.recorder": "recorder",
-    "bridges.vicon.publisher": "vicon",
-    "twins.devices.vicon": "vicon-twin",
     "experiments.real_time.processes.world": "world",
     "experiments.real_time.processes.centre": "centre",
 }  # of processes, by their modules
+
+
+CAPTURE = {"bridges.motion_capture.publisher": "{}", "twins.devices.capture": "{}-twin"}  # roles, with the system
 
 
 class Flight:
@@ -225,12 +226,14 @@ class Flight:
         self.process = subprocess.Popen(command, cwd=ROOT, env=variables, text=True, start_new_session=True, **streams)
 
     def children(self):
-        """The processes that it started, by robot name, "zygote", "router", "recorder", "world", "centre"."""
+        """The processes that it started, by robot name or role, such as "zygote", "router", "vicon", "vicon-twin"."""
         found = {}
         for child in psutil.Process(self.process.pid).children(recursive=True):
             with contextlib.suppress(psutil.NoSuchProcess, psutil.ZombieProcess):
                 line = child.cmdline()
                 names = [role for module, role in ROLES.items() if module in line]
+                for module, role in CAPTURE.items():
+                    names += [role.format(line[line.index(module) + 1])] if module in line else []
                 if ROBOT in line:
                     names = line[line.index(ROBOT) + 2 : line.index("--connect")]
                 found |= dict.fromkeys(names, child)

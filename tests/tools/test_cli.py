@@ -24,7 +24,7 @@ def test_every_command_has_help():
     twin view world
     """
     assert words.split() == COMMANDS
-    for command in (*COMMANDS, "bridge vicon", "bridge ros2"):
+    for command in (*COMMANDS, "bridge ros2"):
         assert invoke(*command.split(), "--help").stdout.lower().startswith(f"usage: zenpark {command} ")
 
 

@@ -7,8 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from twins.devices.capture import upright
 from twins.devices.device import Capture, DeviceRequest, Faults
-from twins.devices.vicon import ViconTwin, upright
+from twins.devices.vicon import ViconTwin
 
 
 class Served:

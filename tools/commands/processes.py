@@ -217,22 +217,30 @@ def twin(
 
 @app.command(
     context_settings={"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []},
-    epilog=example("bridge vicon --help", "bridge ros2 --help"),
+    epilog=example("bridge optitrack 192.168.10.1 --map CF01=cf_1", "bridge ros2 --help"),
 )
 def bridge(
     context: typer.Context,
-    what: Annotated[str, Argument(metavar="vicon|ros2", help="`./zenpark bridge vicon --help` says more.")],
+    what: Annotated[
+        str,
+        Argument(
+            metavar="SYSTEM", help="vicon, optitrack, qualisys, that of a plug-in, or ros2; with --help it says more."
+        ),
+    ],
 ) -> int:
-    """Bring motion capture in (vicon), or show the robots to ROS 2 (ros2)."""
+    """Bring in positions from motion capture, or show the robots to ROS 2."""
     from importlib import import_module
+
+    from agents.plugins import registry
 
     if what in ("-h", "--help"):
         typer.echo(context.get_help())
         raise typer.Exit
     given = [part for each in os.environ.get(CONNECT, "").split() for part in ("--connect", each)]
-    modules = {"vicon": "bridges.vicon.publisher", "ros2": "bridges.ros2"}
-    if what not in modules:
-        raise typer.BadParameter(f"'{what}' is neither vicon nor ros2", param_hint="bridge")
-    return int(
-        import_module(modules[what]).main(context.args if "--connect" in context.args else [*context.args, *given])
-    )
+    systems = registry.names(registry.POSITIONING)
+    if what not in (*systems, "ros2"):
+        raise typer.BadParameter(f"'{what}' is none of {', '.join(systems)}, ros2", param_hint="bridge")
+    words = context.args if "--connect" in context.args else [*context.args, *given]
+    if what == "ros2":
+        return int(import_module("bridges.ros2").main(words))
+    return int(import_module("bridges.motion_capture.publisher").main([what, *words]))

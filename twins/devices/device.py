@@ -24,8 +24,11 @@ from twins.arrays import Array
 from twins.models.motion import Motion
 
 # what motion capture tells wrongly: the same poses in new frames, the same frame again, two subjects exchanged, one
-# under another name; all poses as they were before, the frame of an object turned, an object that stands still
-CaptureFault = Literal["", "frozen", "repeated", "swapped", "renamed", "late", "turned", "stuck"]
+# under another name; all poses as they were before, the frame of an object turned, an object that stands still; one
+# left out of the frames, frames with wrong bytes, every second frame before the one that it follows
+CaptureFault = Literal[
+    "", "frozen", "repeated", "swapped", "renamed", "late", "turned", "stuck", "missing", "damaged", "overtaking"
+]
 CAPTURE_FAULTS: Final[tuple[CaptureFault, ...]] = get_args(CaptureFault)
 LATEST_S: Final = 2.0  # largest delay of motion capture
 

@@ -10,9 +10,9 @@ from agents.body.interface import BodyError
 from agents.body.kinds import KINDS, Kind
 from agents.plugins import files, registry
 from agents.plugins.registry import did_you_mean
-from agents.protocols.vicon_datastream import parse_server
+from bridges.motion_capture.reader import parse_server
 from experiments.definition.bodies import body_faults, device_struct, driven_kind
-from experiments.definition.experiment import MEAN, VICON, VICON_TWIN, WORLD, WORST, Experiment, RobotTable
+from experiments.definition.experiment import MEAN, TWIN, WORLD, WORST, Experiment, RobotTable
 from experiments.file.consistency.arena import WALL
 from experiments.file.problems import Fault
 from experiments.file.structure import table_faults
@@ -20,7 +20,7 @@ from twins.engines.engine import EngineFactory, require_carried
 from twins.engines.point_mass import TWINLESS, has_model
 from twins.sensing.range_sensors import sensors
 
-_ROLES: Final = ("recorder", "world", "centre", "vicon")  # processes of a case beside those of its robots
+_ROLES: Final = ("recorder", "world", "centre")  # processes of a case beside those of its robots and its motion capture
 # words of keys, of [disturbance], of events and of tables of results
 _RESERVED: Final = ("all", "estop", "run", "conductor", WALL, MEAN, WORST, *_ROLES)  # reserved beside kinds of robots
 
@@ -60,18 +60,35 @@ def device_faults(experiment: Experiment) -> Iterator[Fault]:
 
 
 def positioning_faults(experiment: Experiment) -> Iterator[Fault]:
-    """Fault of a source of positions that there is not."""
-    given, known = experiment.positioning, f"known: {VICON}HOST, {VICON_TWIN}"
-    if given is None or given == VICON_TWIN:
+    """Faults of a source of positions that there is not, of its address, and of names in it."""
+    capture = experiment.capture
+    if capture is None:
         return
-    if not given.startswith(VICON):
-        hint = f"{known}; another source publishes the key `position` itself, without `positioning`"
-        yield Fault(("positioning",), f"no {given!r} among the sources of positions", hint)
-        return
-    try:
-        parse_server(given.removeprefix(VICON))
-    except ValueError as error:
-        yield Fault(("positioning",), str(error), known)
+    table = () if isinstance(experiment.positioning, str) else ("source",)
+    readers = {name: registry.load(registry.POSITIONING, name) for name in registry.names(registry.POSITIONING)}
+    twins = [f"{name}{TWIN}" for name, reader in readers.items() if reader.TWIN]
+    known = ", ".join([*(f"{name}://HOST" for name in readers), *twins])
+    _, scheme, host = capture.source.partition("://")
+    reader = readers.get(capture.system)
+    if reader is None or (capture.source not in twins and not scheme):
+        hint = f"known: {known}; another source publishes the key `position` itself, without `positioning`"
+        yield Fault(("positioning", *table), f"no {capture.source!r} among the sources of positions", hint)
+    elif scheme:
+        try:
+            parse_server(host, reader.PORT)
+        except ValueError as error:
+            yield Fault(("positioning", *table), str(error), f"such as {capture.system}://192.168.10.1")
+    measured = [name for name, robot in experiment.robots.items() if robot.position == "external"]
+    for name in capture.names:
+        if name not in measured:
+            message = f"'{name}' is no robot with position = \"external\""
+            yield Fault(("positioning", "names", name), message, did_you_mean(name, measured), on_key=True)
+    bodies = [capture.names.get(name, name) for name in measured]
+    for name in measured:
+        if bodies.count(body := capture.names.get(name, name)) > 1:
+            path = ("positioning", "names", name) if name in capture.names else ("positioning",)
+            yield Fault(path, f"the body '{body}' of {name} is that of another robot", "name each robot's own body")
+            break
 
 
 def _standby(experiment: Experiment) -> Iterator[Fault]:
@@ -107,10 +124,11 @@ def _standby(experiment: Experiment) -> Iterator[Fault]:
 def _names(experiment: Experiment, path: tuple[str, str], robot: RobotTable, kinds: Sequence[str]) -> Iterator[Fault]:
     """Faults of the name of a robot, and of that of its process."""
     name = path[1]
-    if name in _RESERVED or name in kinds:
+    systems = registry.names(registry.POSITIONING)
+    if name in (*_RESERVED, *systems) or name in kinds:
         message = f"a robot cannot be called '{name}', which has a meaning of its own"
         yield Fault(path, message, "rename it", on_key=True)
-    if robot.process in _ROLES:
+    if robot.process in (*_ROLES, *systems):
         yield Fault((*path, "process"), f"'{robot.process}' is a process of every run", "rename it")
     elif robot.process in experiment.robots:
         message = f"'{robot.process}' is the name of a robot, so that its own process would be shared unasked"

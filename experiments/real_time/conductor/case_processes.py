@@ -17,7 +17,7 @@ import msgspec
 from agents.plugins import registry
 from experiments.definition import bodies, standby
 from experiments.definition.access_rights import has_world
-from experiments.definition.experiment import VICON, VICON_TWIN, RobotTable
+from experiments.definition.experiment import RobotTable
 from experiments.definition.plan import Plan
 from experiments.file.document import case_document, write_json
 from experiments.real_time.conductor.orders import Emergency
@@ -176,17 +176,23 @@ class CaseProcesses:
         if experiment.positioning is None or not measured:
             return
         realm = ["--realm", experiment.network.realm]
-        host = experiment.positioning.removeprefix(VICON)
-        if experiment.positioning == VICON_TWIN:
+        capture = experiment.capture
+        assert capture is not None
+        host = capture.source.partition("://")[2]
+        bodies = [f"{name}={capture.names.get(name, name)}" for name in measured]
+        coordinates = capture.options()
+        if capture.simulated:
             asked = (plan.disturbance(name).position_sigma or 0.0 for name in measured)
             sigma = max(LEAST_SIGMA, *asked)
             noise = ["--sigma", str(sigma), "--seed", str(experiment.seed)]
-            arguments = ["--listen", "127.0.0.1:0", *measured, *noise, *realm]
-            twin = context.start(VICON_TWIN, "twins.devices.vicon", *arguments)
+            arguments = [capture.system, *bodies, "--listen", "127.0.0.1:0", *noise, *coordinates, *realm]
+            twin = context.start(capture.source, "twins.devices.capture", *arguments)
             self._standins.append(twin.name)
-            host = twin.await_lines(r"^vicon (ready on) (\S+)$", 1, context.ended)["ready on"]
-        maps = [part for name in measured for part in ("--map", f"{name}={name}")]
-        bridge = partial(context.start, "vicon", "bridges.vicon.publisher", host, *maps, *realm)
+            host = twin.await_lines(rf"^{capture.system} (ready on) (\S+)$", 1, context.ended)["ready on"]
+        maps = [part for body in bodies for part in ("--map", body)]
+        late = f"--latency-s={capture.latency_s}"
+        words = [capture.system, host, *maps, *coordinates, late, *realm]
+        bridge = partial(context.start, capture.system, "bridges.motion_capture.publisher", *words)
         hold = ": robots without a position hold, drones land"
         self._standins.append(self._supervise(bridge, hold, hold).name)
 

@@ -22,12 +22,13 @@ from agents.network import session as network
 from agents.network.keys import Keys
 from agents.protocols import vicon_datastream
 from agents.protocols.vicon_datastream import BlockKind, Framer, Segment
-from bridges.vicon.client import Decoder, Reader
+from bridges.motion_capture.vicon import Decoder, ViconReader
 from tests.commands import python, started
 from tests.twins.loopback import Camera
 from tests.waiting import until
+from twins.devices.capture import upright
 from twins.devices.device import Faults
-from twins.devices.vicon import ViconTwin, upright
+from twins.devices.vicon import ViconTwin
 
 # the vendor's client, in a process of its own: it holds the interpreter, and never returns from a dead server
 VENDOR = """
@@ -44,7 +45,7 @@ os._exit(0)
 
 
 def read(port, frames=1):
-    with closing(Reader("127.0.0.1", port)) as reader:
+    with closing(ViconReader("127.0.0.1", port)) as reader:
         found = [reader.newest(2.0) for _ in range(frames)]
     assert None not in found
     return found
@@ -69,7 +70,7 @@ def test_packed_frames_are_unpacked_however_they_are_cut(bodies, number, cut):
     assert len(packets) == 2
     for body in packets:
         frame = decoder.frame(body)
-        assert (frame.number, frame.latency_s, frame.z_up) == (number, 1.375, True)
+        assert (frame.number, frame.latency_s, frame.up) == (number, 1.375, "z")
         assert list(frame.poses) == [f"körper {row}" for row in range(len(sent))]
         for seen, placed in zip(frame.poses.values(), sent, strict=True):
             assert seen.position == pytest.approx(placed.position, abs=1e-12)
@@ -87,8 +88,8 @@ def test_root_segment_is_subject_pose_and_names_update():
     decoder = Decoder()
     root = vicon_datastream.NO_PARENT
     assert decoder.frame(subject(1, "arm", [(root, 3), (3, 7)]) + subject(2, "leg", [(root, 0)])) is None
-    assert decoder.frame(moved).poses == {"arm": far, "leg": None}
-    assert decoder.frame(subject(1, "hand", [(7, 3), (root, 7)]) + moved).poses == {"hand": near}
+    assert decoder.frame(moved).poses == {"arm": far[1:], "leg": None}
+    assert decoder.frame(subject(1, "hand", [(7, 3), (root, 7)]) + moved).poses == {"hand": near[1:]}
 
 
 @pytest.mark.system
@@ -104,7 +105,7 @@ def test_vendors_client_and_ours_read_same_poses():
     theirs = json.loads(vendor.stdout)
     assert theirs.keys() == frame.poses.keys() == placed.keys()
     for name, (position, yaw) in placed.items():
-        _, *ours = frame.poses[name]
+        ours = [*frame.poses[name]]
         assert ours == [pytest.approx(position, abs=1e-12), pytest.approx(upright(yaw).ravel(), abs=1e-12)]
         # that wheel hands out single precision: to the last bit of it they are the same
         np.testing.assert_array_equal(np.float32(theirs[name][:3]), np.float32(ours[0]))
@@ -189,8 +190,8 @@ def test_a_client_may_ask_for_single_frames():
 @pytest.fixture
 def process(router, request):
     """Process of the twin; a parameter is a list of more options."""
-    words = ["CF01", "KH01", "--connect", router.endpoint, "--sigma", "0", "--rate", "200"]
-    with started("-m", "twins.devices.vicon", *words, *getattr(request, "param", [])) as made:
+    words = ["vicon", "CF01", "KH01", "--connect", router.endpoint, "--sigma", "0", "--rate", "200"]
+    with started("-m", "twins.devices.capture", *words, *getattr(request, "param", [])) as made:
         yield made
 
 
@@ -201,7 +202,7 @@ def test_the_process_shows_the_truth_that_it_hears(process, router):
     keys = Keys()
     with network.open_session([router.endpoint], name="test") as session:
         truth = pubsub.publisher(session, keys.truth("CF01"), messages.JSON)
-        reader = Reader("127.0.0.1", int(said.rpartition(":")[2]))
+        reader = ViconReader("127.0.0.1", int(said.rpartition(":")[2]))
         seen = None
         while seen is None:
             truth.put(messages.encode(messages.Position("CF01", time.time() - 0.02, (0.4, -0.2, 0.9), 0.7)))
@@ -223,7 +224,7 @@ def test_the_process_shows_the_truth_that_it_hears(process, router):
 @pytest.mark.system
 def test_process_ends_with_its_starter_after_the_robots(process, router):
     said = process.stdout.readline()
-    reader = Reader("127.0.0.1", int(said.rpartition(":")[2]))
+    reader = ViconReader("127.0.0.1", int(said.rpartition(":")[2]))
     with network.open_session([router.endpoint], name="robot") as session:
         token = pubsub.alive_token(session, Keys().alive("KH01"))
         process.stdin.close()
@@ -240,7 +241,7 @@ def test_process_ends_with_its_starter_after_the_robots(process, router):
     ("option", "value", "words"), [("--listen", "801", "is not HOST:PORT"), ("--rate", "0", ">= 1")]
 )
 def test_user_errors_are_reported_without_a_traceback(option, value, words):
-    command = ["-m", "twins.devices.vicon", "CF01", "--connect", "tcp/127.0.0.1:9"]
+    command = ["-m", "twins.devices.capture", "vicon", "CF01", "--connect", "tcp/127.0.0.1:9"]
     ended = python(*command, option, value, code=2)
     assert words in ended.stderr
     assert "Traceback" not in ended.stderr

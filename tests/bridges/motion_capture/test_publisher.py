@@ -1,11 +1,10 @@
-"""The Vicon bridge: what it believes, what it says, what it survives; and what robots make of it."""
+"""The bridge of motion capture: what it believes, what it says, what it survives; and what robots make of it."""
 
 import math
 import socket
 import threading
 import time
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -13,26 +12,27 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from agents.body.coordinates import yaw_of
 from agents.network import messages, pubsub
 from agents.network import session as network
 from agents.protocols import vicon_datastream
-from agents.protocols.vicon_datastream import Segment, parse_server
-from bridges.vicon.client import Frame
-from bridges.vicon.publisher import Bridge, FrameQueue, PoseFilter, heading, parse_maps
+from bridges.motion_capture.publisher import Bridge, FrameQueue, PoseFilter, parse_maps
+from bridges.motion_capture.reader import CaptureFrame, MeasuredPose, parse_server
+from bridges.motion_capture.vicon import ViconReader
 from experiments.file import document
 from tests.commands import python, started
 from tests.system.lab import RobotProcess, Watcher
 from tests.twins import loopback
 from tests.waiting import PATIENCE_S, ManualClock, until
-from twins.devices.vicon import upright
+from twins.devices.capture import upright
 
 Camera = partial(loopback.Camera, sigma=1e-9)  # what repeats itself is not believed
 UPRIGHT = tuple(upright(0.3).ravel().tolist())
 
 
-def frame(number=1, *, latency=0.0, z_up=True, **poses):
-    seen = {name: Segment(0, pose, UPRIGHT) if type(pose) is tuple else pose for name, pose in poses.items()}
-    return Frame(number, latency, seen, z_up)
+def frame(number=1, *, latency=0.0, up="z", clock=math.nan, **poses):
+    seen = {name: MeasuredPose(pose, UPRIGHT) if len(pose or ()) == 3 else pose for name, pose in poses.items()}
+    return CaptureFrame(number, seen, latency, up, clock)
 
 
 @pytest.fixture
@@ -45,7 +45,9 @@ def published(address, printed, **subjects):
     """Positions that a bridge in a thread publishes."""
     positions, end = [], threading.Event()
     pose_filter = PoseFilter(subjects, printed.append)
-    bridge = Bridge(*parse_server(address), pose_filter, positions.append, printed.append, pause_s=0.05)
+    bridge = Bridge(
+        *parse_server(address, 801), pose_filter, positions.append, printed.append, connect=ViconReader, pause_s=0.05
+    )
     thread = threading.Thread(target=bridge.run, args=(end.is_set,))
     thread.start()
     yield positions
@@ -102,28 +104,28 @@ def test_heading_follows_the_nose_and_only_rotations(yaw, pitch, roll, scale):
     tilt = np.array([[math.cos(pitch), 0, math.sin(pitch)], [0, 1, 0], [-math.sin(pitch), 0, math.cos(pitch)]])
     bank = np.array([[1, 0, 0], [0, math.cos(roll), -math.sin(roll)], [0, math.sin(roll), math.cos(roll)]])
     turned = upright(yaw) @ tilt @ bank
-    assert heading(turned.ravel().tolist()) == pytest.approx(yaw, abs=1e-9)
+    assert yaw_of(turned.ravel().tolist()) == pytest.approx(yaw, abs=1e-9)
     mirrored = turned * [1.0, 1.0, -1.0]
     for wrong in (turned * scale, turned / scale, mirrored, turned * np.nan, turned * 0.0, turned + np.inf):
-        assert math.isnan(heading(wrong.ravel().tolist()))
+        assert math.isnan(yaw_of(wrong.ravel().tolist()))
 
 
 def test_what_was_not_seen_is_not_said(printed):
     pose_filter = PoseFilter({"CF01": "cf_1", "KH01": "kh_1"}, printed.append)
-    nan = Segment(0, (math.nan, 0.0, 0.0), UPRIGHT)
-    flat = Segment(0, (0.0, 0.0, 0.0), (0.0,) * 9)
+    nan = MeasuredPose((math.nan, 0.0, 0.0), UPRIGHT)
+    flat = MeasuredPose((0.0, 0.0, 0.0), (0.0,) * 9)
     (first,) = pose_filter.filter_poses(
         frame(cf_1=(0.1, 0.2, 0.3), kh_1=None, other=(0.0, 0.0, 0.0), latency=0.004), 1.0
     )
-    assert first == ("CF01", 0.996, Segment(0, (0.1, 0.2, 0.3), UPRIGHT), pytest.approx(0.3))
+    assert first == ("CF01", 0.996, (0.1, 0.2, 0.3), pytest.approx(0.3))
     for pose in (nan, flat, None):
         assert pose_filter.filter_poses(frame(cf_1=pose, kh_1=pose), 1.1) == []
     assert pose_filter.refused == 4
-    assert printed == ["CF01 is seen as 'cf_1'", "KH01 is not seen: markers hidden, or subject 'kh_1' is switched off"]
+    assert printed == ["CF01 is seen as 'cf_1'", "KH01 is not seen: markers hidden, or body 'kh_1' is switched off"]
     pose_filter.filter_poses(frame(other=(0.0, 0.0, 0.0)), 1.6)
     assert printed[2:] == [
-        "CF01: no subject 'cf_1' (there are: other); name another with --map CF01=SUBJECT",
-        "KH01: no subject 'kh_1' (there are: other); name another with --map KH01=SUBJECT",
+        "CF01: no body 'cf_1' (there are: other); name another: --map CF01=BODY, or `names`",
+        "KH01: no body 'kh_1' (there are: other); name another: --map KH01=BODY, or `names`",
     ]
 
 
@@ -133,7 +135,7 @@ def test_jump_is_not_believed_until_it_lasts():
     for tick in range(200):  # half a metre a second, with an excursion of one frame and one that stays
         x = 0.005 * tick + (1.0 if tick == 50 or tick >= 100 else 0.0)
         poses = pose_filter.filter_poses(frame(CF01=(x, 0.0, 1.0)), 0.01 * tick)
-        assert [segment.position[0] for _, _, segment, _ in poses] in ([], [x])
+        assert [position[0] for _, _, position, _ in poses] in ([], [x])
         left_out += [] if poses else [tick]
     assert left_out == [50, *range(100, 121)]  # 1 m in 0.22 s a robot could just have flown
     assert pose_filter.refused == 22
@@ -161,31 +163,31 @@ def test_growing_queue_shows_by_frame_numbers(rate_off, grows, waited):
     queue, least, most = FrameQueue(), *waited
     for number in range(1000):
         arrived = 7.0 + number * 0.01 * (1.0 + rate_off + grows)
-        wait_s = queue.wait_s(replace(frame(number), period_s=0.01), arrived)
+        wait_s = queue.wait_s(frame(number, clock=0.01 * number), arrived)
     assert least <= wait_s <= most
-    assert queue.wait_s(replace(frame(5), period_s=0.01), arrived + 1.0) == 0.0, "it was started again"
-    assert queue.wait_s(frame(6), arrived + 99.0) == 0.0, "its rate is unknown"
+    assert queue.wait_s(frame(5, clock=0.05), arrived + 1.0) == 0.0, "it was started again"
+    assert queue.wait_s(frame(6), arrived + 99.0) == 0.0, "its clock is unknown"
 
 
 def test_overtaking_frames_and_false_axes_are_left_out(printed):
     pose_filter = PoseFilter({"CF01": "CF01"}, printed.append)
     assert len(pose_filter.filter_poses(frame(CF01=(0.0, 0.0, 1.0)), 1.00)) == 1
     assert pose_filter.filter_poses(frame(CF01=(0.0, 0.0, 1.0), latency=0.02), 1.01) == []  # measured before the last
-    assert pose_filter.filter_poses(frame(CF01=(0.0, 0.0, 1.0), z_up=False), 1.02) == []
+    assert pose_filter.filter_poses(frame(CF01=(0.0, 0.0, 1.0), up="other"), 1.02) == []
     assert len(pose_filter.filter_poses(frame(CF01=(0.0, 0.0, 1.0)), 1.03)) == 1
     assert printed[1:] == [
-        "no positions: the server's z axis does not point up; change this in its options",
+        "no positions: neither the z axis nor the y axis of the system points up; change this in its options",
         "the z axis points up",
     ]
 
 
 def test_the_command_line_is_understood_or_refused():
-    assert parse_server("vicon") == ("vicon", 801)
-    assert parse_server("10.0.0.7:8801") == ("10.0.0.7", 8801)
+    assert parse_server("vicon", 801) == ("vicon", 801)
+    assert parse_server("10.0.0.7:8801", 801) == ("10.0.0.7", 8801)
     assert parse_maps(["CF01=cf_1", "KH01"]) == {"CF01": "cf_1", "KH01": "KH01"}
     for wrong in ("", ":801", "host:", "host:0", "host:99999", "host:x"):
         with pytest.raises(ValueError, match="neither HOST nor HOST:PORT"):
-            parse_server(wrong)
+            parse_server(wrong, 801)
     for maps in (["=cf_1"], ["CF01="], ["CF01", "CF01=a"], ["CF01=a", "CF02=a"]):
         with pytest.raises(ValueError, match=r"neither ROBOT|another --map"):
             parse_maps(maps)
@@ -208,7 +210,9 @@ def test_positions_arrive_as_placed_and_when_measured(printed):
     assert np.median(np.diff(stamps)) > 0.8 * 0.005  # a busy machine leaves out some frames of the camera
     assert begin < stamps[0] + 0.25
     assert stamps[-1] + 0.25 < now + 0.01
-    said = [line for line in printed if "wait in a queue" not in line]  # a busy machine has them
+    said = [
+        line for line in printed if "wait in a queue" not in line and "frames/s" not in line
+    ]  # a busy machine has them
     assert said == [f"connected to {camera.twin.address}", "CF01 is seen as 'cf_1'", "KH01 is seen as 'KH01'"]
 
 
@@ -254,7 +258,16 @@ def test_lost_server_and_nonsense_server_are_survived(printed):
 @pytest.mark.system
 def test_a_wrong_host_is_said_and_ends_it(router):
     def said(server):
-        words = ("-m", "bridges.vicon.publisher", server, "--map", "CF01", "--connect", router.endpoint)
+        words = (
+            "-m",
+            "bridges.motion_capture.publisher",
+            "vicon",
+            server,
+            "--map",
+            "CF01",
+            "--connect",
+            router.endpoint,
+        )
         return python(*words, code=2).stderr
 
     assert said("127.0.0.1:vicon").startswith("zenpark: '127.0.0.1:vicon' is neither HOST nor HOST:PORT, such as 192.")
@@ -287,7 +300,9 @@ def test_short_occlusion_is_flown_through_long_one_lands(router, tmp_path):
         camera.place("CF01", [0.1, 0.6, 0.0])
         stack.enter_context(camera)
         words = ("--map", "CF01", "--lifeline", "--connect", router.endpoint)
-        bridge = stack.enter_context(started("-m", "bridges.vicon.publisher", camera.twin.address, *words, stderr=None))
+        bridge = stack.enter_context(
+            started("-m", "bridges.motion_capture.publisher", "vicon", camera.twin.address, *words, stderr=None)
+        )
         robots = stack.enter_context(RobotProcess(router.endpoint, file, "KH01", "KH02", "CF01"))
         watcher.take_off("CF01")
         camera.occlude(0.3)

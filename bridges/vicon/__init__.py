@@ -1,4 +1,0 @@
-"""Vicon motion capture: a DataStream client, and the process that publishes poses.
-
-May import: agents.
-"""
