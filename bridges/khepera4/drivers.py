@@ -278,9 +278,13 @@ class GoalPark(RoboticParkServer):
 
 
 def identify(
-    wire: Wire, chosen: protocol.Khepera4Settings, server: str | None, first_answer_s: float = FIRST_ANSWER_S
+    wire: Wire,
+    chosen: protocol.Khepera4Settings,
+    server: str | None,
+    first_answer_s: float = FIRST_ANSWER_S,
+    over: Callable[[], bool] = lambda: False,
 ) -> RoboticParkServer:
-    """Stop a park robot, and find out or make sure by the answer to `p` which `server` runs on it.
+    """Stop a park robot, and find out or make sure by the answer to `p` which `server` runs on it, until it is `over`.
 
     Raises:
         WrongServer: If the answer is that of no server, of several, or not that of `server`.
@@ -291,7 +295,7 @@ def identify(
     time.sleep(protocol.GAP_S)
     answer, deadline = b"", uptime() + max(first_answer_s, chosen.silence_s)
     while not answer:
-        if uptime() >= deadline:
+        if uptime() >= deadline or over():
             raise TimeoutError(
                 "no answer to p; a server of 2023 serves one client in its life: restart it on the robot, for each case"
             )

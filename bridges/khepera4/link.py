@@ -206,7 +206,9 @@ class Khepera4Link:
                         self.server = "kteam"
                         self._run_connection(KTeam(wire, self._settings))
                     else:
-                        park = identify(wire, self._settings, self._server, self._first_answer_s)
+                        park = identify(
+                            wire, self._settings, self._server, self._first_answer_s, lambda: self._finished
+                        )
                         self.server = next(name for name, kind in protocol.PARK.items() if kind is park.server)
                         self._run_connection(park)
                 except Exception as error:  # noqa: BLE001 - of any kind: the wheels must stop
