@@ -332,7 +332,9 @@ def _keys(table: object) -> Iterable[str]:
     return map(str, table) if isinstance(table, Mapping) else ()
 
 
-def _text(name: str, drones: Sequence[SwarmDrone], source: str, duration_s: float, notes: Sequence[str]) -> str:
+def _text(
+    name: str, drones: Sequence[SwarmDrone], source: str | dict[str, str], duration_s: float, notes: Sequence[str]
+) -> str:
     plain = "".join(letter if letter.isprintable() and letter not in '"\\' else "?" for letter in name)
     lines = [f"#:schema ./{index.SCHEMA}", f"# Imported from {plain}. Not carried over, or not as it was:"]
     for note in notes:

@@ -11,10 +11,12 @@ from unittest import mock
 import numpy as np
 
 from agents.body.kinds import KINDS
-from agents.protocols import crtp, khepera4
+from agents.protocols import crtp, khepera4, natnet, qtm
 from agents.protocols import vicon_datastream as vicon
 from agents.protocols.byte_stream import MalformedStream
 from agents.protocols.crtp import HighLevel, Log, Misc, Port, Setpoint, SupervisorCommand
+from agents.protocols.natnet import MessageKind, NatNetFrame, RigidBodyPose, ServerInfo
+from agents.protocols.qtm import BodyPose, PacketFramer, QtmFrame, QtmPacketKind
 from agents.protocols.tello import TelloSettings
 from agents.protocols.vicon_datastream import BlockKind, Segment
 from bridges.khepera4.drivers import KTeam, identify
@@ -138,6 +140,51 @@ def vicon_bridge():
                 if frame is not None:
                     for _, measured, position, yaw in pose_filter.filter_poses(frame, 0.01 * k):
                         assert np.isfinite((measured, yaw, *position)).all()
+
+
+def _natnet_packets():
+    bodies = [RigidBodyPose(k, (0.1 * k, 0.2, 0.3), (0.0, 0.0, 0.0, 1.0), True) for k in (1, 2)]
+    packets = []
+    for version in ((3, 0), (4, 0), (4, 2)):
+        frame = natnet.pack_frame(NatNetFrame(7, bodies, 1, 2, 3), version)
+        names = natnet.pack_descriptions({1: "cf1", 2: "kh1"}, version)
+        packets += [natnet.message(MessageKind.FRAME, frame), natnet.message(MessageKind.DESCRIPTIONS, names)]
+    info = ServerInfo("Motive", (4, 2), natnet.CLOCK_HZ, natnet.DATA_PORT, natnet.GROUP)
+    return [*packets, natnet.message(MessageKind.SERVER_INFO, natnet.pack_server_info(info))]
+
+
+@place(30_000)
+def natnet_packets():
+    """Packets of a NatNet server, of any version."""
+
+    def take(data):
+        kind, body = natnet.unpack_message(data)
+        if kind == MessageKind.SERVER_INFO:
+            natnet.unpack_server_info(body)
+            return
+        unpack = natnet.unpack_frame if kind == MessageKind.FRAME else natnet.unpack_descriptions
+        for version in ((3, 0), (4, 0), (4, 2)):
+            with suppress(MalformedStream):
+                unpack(body, version)
+
+    yield Target(_natnet_packets(), take, (MalformedStream,))
+
+
+@place(30_000)
+def qtm_packets():
+    """Output of QTM's real-time server."""
+    hidden = BodyPose((np.nan,) * 3, (np.nan,) * 9)
+    frame = qtm.pack_frame(QtmFrame(1.0, 3, [BodyPose((0.1, 0.2, 0.3), (1.0, 0.0, 0.0) * 3), hidden]))
+    names = qtm.command(qtm.pack_parameters(["cf1", "kh1"], 100.0), QtmPacketKind.XML)
+
+    def take(data):
+        for kind, payload in PacketFramer().feed(data):
+            if kind == QtmPacketKind.XML:
+                qtm.unpack_parameters(payload)
+            elif kind == QtmPacketKind.DATA:
+                qtm.unpack_frame(payload)
+
+    yield Target([frame, names, frame + names, qtm.command(qtm.WELCOME) + frame], take, (MalformedStream,))
 
 
 @place(20_000)

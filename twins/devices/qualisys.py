@@ -5,10 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from math import nan
+from typing import Final
 
 from agents.protocols import qtm
 from agents.protocols.qtm import BodyPose, PacketFramer, QtmFrame, QtmPacketKind
 from twins.devices.capture import CaptureClient, SeenBody, StreamTwin
+
+OLD: Final = (b"1.0", b"1.1", b"1.2", b"1.3", b"1.4", b"1.5", b"1.6", b"1.7")  # versions with bodies of doubles
 
 
 @dataclass(eq=False)
@@ -19,7 +22,7 @@ class QualisysClient(CaptureClient):
 
 
 class QualisysTwin(StreamTwin):
-    """Real-time server of QTM. A body that is not tracked is NaN; one that is missing is left out."""
+    """Real-time server of QTM: 6DOF bodies over TCP. A body that is not tracked is NaN; a missing one is left out."""
 
     def _greeted(self) -> CaptureClient:
         return QualisysClient(unsent=bytearray(qtm.command(qtm.WELCOME)))
@@ -32,19 +35,18 @@ class QualisysTwin(StreamTwin):
 
     def _reply(self, client: CaptureClient, command: bytes) -> bytes:
         word, _, argument = command.partition(b" ")
-        if word == b"version":
-            return qtm.command(b"Version set to " + argument)
-        if word == b"qtmversion":
-            return qtm.command(b"QTM Version is 2026.1 (build 1)")
-        if word == b"getparameters":
-            return qtm.command(qtm.pack_parameters(self._names(), self._rate), QtmPacketKind.XML)
-        if word == b"streamframes":
-            client.streams = argument != b"stop"
+        bodies = b"6d" in argument.split() and b"udp:" not in argument
+        if word == b"streamframes" and (bodies or argument == b"stop"):
+            client.streams = bodies
             return b""
-        if word == b"getcurrentframe":
+        if word == b"getcurrentframe" and bodies:
             client.asked += 1
             return b""
-        return qtm.command(b"Parse error", QtmPacketKind.ERROR)
+        if word == b"getparameters":
+            return qtm.command(qtm.pack_parameters(self._names(), self._rate), QtmPacketKind.XML)
+        if word == b"version" and argument not in OLD:
+            return qtm.command(b"Version set to " + argument)
+        return qtm.command(b"Not supported", QtmPacketKind.ERROR)
 
     def _packet(self, client: CaptureClient, frame: bytes) -> bytes:
         return frame
