@@ -11,11 +11,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import isfinite, nan
-from typing import Any, ClassVar, Literal, TypeVar
+from typing import Any, ClassVar, Final, Literal, TypeVar
 
 import msgspec
 
-from agents.formation.link import Link
+from agents.formation.link import BY_BEARING, BY_DISTANCE, BY_RELATIVE, Link, target_error
 from agents.vectors import UNKNOWN, ZERO, Vector
 
 Need = Literal["distance", "relative", "bearing", "any", "nothing"]
@@ -25,6 +25,9 @@ Values = tuple[float, ...]  # values of a variable; NaN: not known yet
 Memory = Mapping[str, Values]  # variables by name
 
 T = TypeVar("T")
+
+# how a law takes every link, by what it needs; the others take each link by its own target
+WANTS: Final[Mapping[Need, int]] = {"distance": BY_DISTANCE, "relative": BY_RELATIVE, "bearing": BY_BEARING}
 
 
 class Said(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -123,6 +126,10 @@ class Law(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def step(self, view: View, memory: Memory) -> Control:
         """State transition, messages and motion of one robot; pure."""
         raise TypeError(f"{type(self).__name__} must define `step`")
+
+    def error(self, apart: Vector, link: Link) -> float:
+        """Error [m] of a link whose ends are `apart` = p_i − p_j [m]; NaN where it has no target."""
+        return target_error(apart, link, WANTS.get(self.NEEDS, link.wants))
 
     def analyse(self, plan: Any) -> Iterable[tuple[Severity, str, str]]:  # noqa: ANN401 - plug-ins know no experiment
         """Theory for `check`: findings on a compiled case, `experiments.definition.plan.Plan`, each with its remedy."""

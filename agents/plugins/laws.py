@@ -10,7 +10,7 @@ from typing import Annotated, ClassVar
 
 from msgspec import Meta
 
-from agents.formation.link import BY_BEARING, BY_DISTANCE, Link
+from agents.formation.link import BY_BEARING, BY_DISTANCE, Link, from_ray, target_error
 from agents.plugins.law import Gain, Law, Need
 from agents.vectors import NotNegative, Vector, clamp, difference, norm
 
@@ -110,11 +110,8 @@ class Mixed(Gradient, frozen=True):
         return pull_to_ray(apart, link) if link.wants == BY_BEARING else pull_to_place(apart, link)
 
     def error(self, apart: Vector, link: Link) -> float:
-        if link.wants == BY_DISTANCE:
-            return abs(link.distance - norm(apart))
-        if link.wants == BY_BEARING:
-            return norm(from_ray(apart, link.bearing))
-        return norm(difference(apart, link.relative))
+        """By the target of the link."""
+        return target_error(apart, link, link.wants)
 
 
 def pull_to_distance(apart: Vector, link: Link, dead_zone: float) -> Vector:
@@ -137,16 +134,6 @@ def pull_to_place(apart: Vector, link: Link) -> Vector:
 def pull_to_ray(apart: Vector, link: Link) -> Vector:
     (x, y, z), k = from_ray(apart, link.bearing), -link.gain
     return k * x, k * y, k * z
-
-
-def from_ray(apart: Vector, bearing: Vector) -> Vector:
-    """Vector from the nearest point of the ray along the bearing to x; seen from above where the bearing is."""
-    (x, y, z), (gx, gy, gz) = apart, bearing
-    if gz != gz and gx == gx:  # noqa: PLR0124 - NaN
-        z = gz = 0.0
-    along = x * gx + y * gy + z * gz
-    along = max(along, 0.0)
-    return x - along * gx, y - along * gy, z - along * gz
 
 
 def tracking_offset(position: Vector, target: Vector, gain: float) -> Vector:

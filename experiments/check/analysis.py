@@ -28,13 +28,19 @@ from experiments.check.realisation import (
 )
 from experiments.check.stability import Modes, modes
 from experiments.definition.experiment import LinkTable
-from experiments.definition.formation import anchor_errors, bearable_factors, closed_shares, errors_over_time
+from experiments.definition.formation import (
+    anchor_errors,
+    bearable_factors,
+    closed_shares,
+    errors_over_time,
+    targeted,
+)
 from experiments.definition.graph import Links, components, edges
 from experiments.definition.links import held_height, link_pairs
 from experiments.definition.plan import Plan
 from experiments.definition.rigidity import Bend, Redundancy, Rigidity
 from experiments.file.problems import Path
-from experiments.metrics.signals import WINDOW_S, after_last, moving_mean
+from experiments.metrics.signals import WINDOW_S, after_last, has_errors, moving_mean
 from twins.arrays import Array, Index, Mask, norm
 
 MOST_ROBOTS: Final = 500  # most robots that are asked what can be lost: the time grows with their third power
@@ -68,8 +74,13 @@ class Analysis:
 
     @property
     def is_gradient(self) -> bool:
-        """Whether the law pulls toward targets of its links; else there is neither shape nor error."""
+        """Whether the law is without memory: what it does follows from where robots stand."""
         return isinstance(self.plan.law, Gradient)
+
+    @cached_property
+    def has_targets(self) -> bool:
+        """Whether any link has a target; else there is neither shape nor error."""
+        return has_errors(self.plan)
 
     @cached_property
     def placed(self) -> Mask:
@@ -111,8 +122,12 @@ class Analysis:
 
     @cached_property
     def standing(self) -> Mask:
-        """(E,) links that exist at the beginning, however far the robots are from each other."""
-        return self.plan.formation.planned_at(0.0)
+        """(E,) links with a target that exist at the beginning, however far the robots are from each other."""
+        return self._standing_at(0.0)
+
+    def _standing_at(self, elapsed: float) -> Mask:
+        pattern = self.plan.formation
+        return pattern.planned_at(elapsed) & targeted(self.plan.law, pattern)
 
     @cached_property
     def first_links(self) -> Links:
@@ -123,14 +138,14 @@ class Analysis:
     def stages(self) -> list[list[Shape]]:
         """Shapes that were tried for the beginning, and for the time after each change.
 
-        Empty of a law that is no gradient, or without links and anchors.
+        Empty without targets of links, and without anchors.
         """
         plan, pattern = self.plan, self.plan.formation
-        if not self.is_gradient or not (self.standing.any() or plan.anchors_by_row):
+        if not (self.standing.any() or plan.anchors_by_row):
             return []
         times = (0.0, *(each.at + each.over for each in pattern.changes))
         return [
-            self._shapes(targets_of_law(plan.law, wanted), pattern.planned_at(at))
+            self._shapes(targets_of_law(plan.law, wanted), self._standing_at(at))
             for at, wanted in zip(times, pattern.stages(), strict=True)
         ]
 
@@ -193,7 +208,12 @@ class Analysis:
         return () if self.spare is None else tuple(self.plan.names[row] for row in np.flatnonzero(~self.spare.robots))
 
     def grows_at(self, position: Array) -> bool:
-        """Whether an error grows where the robots stand, (N, 3) [m]: a saddle, which the loop leaves when touched."""
+        """Whether an error grows where the robots stand, (N, 3) [m]: a saddle, which the loop leaves when touched.
+
+        Unknown of a law that remembers.
+        """
+        if not self.is_gradient:
+            return False
         kinds, hz = self.plan.kinds, self.plan.experiment.rates.coordination_hz
         loop = modes(
             self.law, self.first_links, position, closed_shares(kinds, hz), hz, anchors=self.plan.anchors_by_row
@@ -202,8 +222,12 @@ class Analysis:
 
     @cached_property
     def modes(self) -> Modes | None:
-        """Modes of the sampled loop at the shape."""
-        return None if self.shape is None else sampled_loop(self.plan, self.first_links, self.shape.position)
+        """Modes of the sampled loop at the shape; None of a law that remembers."""
+        return (
+            None
+            if self.shape is None or not self.is_gradient
+            else sampled_loop(self.plan, self.first_links, self.shape.position)
+        )
 
     def _shapes(self, wanted: Links, there: Mask) -> list[Shape]:
         """Shapes from the ends, the starts, the scaled distances and random places as guesses, until one is exact."""

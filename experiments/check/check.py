@@ -50,7 +50,7 @@ def compilation(analysis: Analysis) -> Iterator[Finding]:
 
 
 SUBJECTS: Final = (
-    theory.network, theory.presence, theory.lengths, theory.realisation, theory.offsets, theory.rigidity,
+    theory.network, theory.presence, theory.lengths, theory.realisation, theory.rigidity,
     theory.redundancy, theory.stability, theory.law,
     surroundings.contacts, surroundings.obstacles, surroundings.perception, surroundings.reality,
     motion.flight, motion.starts, motion.formation, motion.anchors, noise.softness, motion.walls, motion.ceiling,

@@ -101,8 +101,8 @@ def _cut(analysis: Analysis) -> bool:
 
 def formation(analysis: Analysis) -> Iterator[Finding]:
     """Check that the formation is acquired, and kept at the end, without noise or with it."""
-    found = _formation(analysis) if analysis.is_gradient else _swings(analysis)
-    for finding in found:
+    swings = [] if analysis.is_gradient else [*_swings(analysis)]
+    for finding in swings or _formation(analysis):
         yield noise.with_noise(analysis, finding)
 
 
@@ -134,6 +134,9 @@ def _formation(analysis: Analysis) -> Iterator[Finding]:
         what, path = ("shape changes", ("formation", "changes")) if changes else ("plans begin", ("timeline",))
         message = f"the formation is not acquired when the {what} at {departure:g} s: {early}"
         remedy = f"begin later, start nearer to the shape, or raise {strength(analysis)[0]}"
+        if not analysis.is_gradient and (formed := analysis.acquired(end)) is not None:  # it may know how leaders move
+            yield Finding("note", "acquired", f"{message}; it is after {formed:.1f} s, and at the end {left}")
+            return
         yield Finding("warning", "acquired-late", message, remedy, path)
     elif not prediction.transmissions and experiment.architecture == "distributed":
         moved = float(norm(prediction.position - prediction.position[0]).max())
@@ -175,7 +178,7 @@ def _another_shape(analysis: Analysis, left: str) -> Finding:
 
 
 def _swings(analysis: Analysis) -> Iterator[Finding]:
-    """Check that no law that remembers, or gives velocities, swings to the end: its links have no error to look at."""
+    """Check that no law that remembers, or gives velocities, swings to the end, whatever its links ask for."""
     links, position = analysis.plan.links, analysis.prediction.position
     if analysis.prediction.stuck or not len(links):
         return
@@ -254,6 +257,8 @@ def _on_the_wrong_side(analysis: Analysis) -> tuple[str, str] | None:
 def _stopped(analysis: Analysis, at: int, left: str) -> Finding | None:
     """Finding that wheeled robots which stand still at sample `at` prevent acquisition."""
     experiment, links = analysis.plan.experiment, analysis.plan.links
+    if not analysis.is_gradient:
+        return None
     off = np.flatnonzero(analysis.error[at] > experiment.tolerance)
     ends = np.union1d(links.receiver[off], links.sender[off])
     stopped = np.intersect1d(_standing_wheels(analysis, at), ends)

@@ -100,11 +100,11 @@ def softness(analysis: Analysis) -> Iterator[Finding]:
     """
     experiment = analysis.plan.experiment
     loop, formed = analysis.modes, analysis.acquired_for_good
-    if analysis.met_shape is None or loop is None or formed is None:
+    if analysis.met_shape is None or formed is None:
         return
     if analysis.prediction.stuck or not has_noise(analysis.plan):
         return
-    soft = bool(loop.free) or SOFT * loop.slowest_s > experiment.duration_s
+    soft = loop is not None and (bool(loop.free) or SOFT * loop.slowest_s > experiment.duration_s)
     late = max(LATER * formed, formed + WINDOW_S)
     if not (soft or _doubtful(analysis, formed, late)):
         return
@@ -126,12 +126,11 @@ def softness(analysis: Analysis) -> Iterator[Finding]:
         how = f"{how} ({flights.seeds})"
     else:
         return
-    modes = f"slowest mode {loop.slowest_s:.1f} s"
-    if loop.free:
-        modes = f"{loop.free} mode{'s' * (loop.free > 1)} slower than the run"
-    message = (
-        f"soft formation, {modes}: acquired after {formed:.1f} s without noise, but with the noise of [disturbance]"
-    )
+    modes = "soft formation"
+    if loop is not None:
+        slower = f"{loop.free} mode{'s' * (loop.free > 1)} slower than the run"
+        modes += f", {slower if loop.free else f'slowest mode {loop.slowest_s:.1f} s'}"
+    message = f"{modes}: acquired after {formed:.1f} s without noise, but with the noise of [disturbance]"
     remedy = f"raise {strength(analysis)[0]}, add links that stiffen the formation, or allow a larger tolerance"
     yield Finding("warning", "soft", f"{message} {how}", remedy, ("formation", "links"))
 

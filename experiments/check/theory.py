@@ -91,7 +91,7 @@ def network(analysis: Analysis) -> Iterator[Finding]:
 def lengths(analysis: Analysis) -> Iterator[Finding]:
     """Check that distances are no millimetres: most of them longer than the arena."""
     distance, size = analysis.asked.distance[_measured(analysis)], np.array(analysis.plan.experiment.arena.size)
-    if not analysis.is_gradient or not len(distance) or np.median(distance) <= norm(size):
+    if not analysis.has_targets or not len(distance) or np.median(distance) <= norm(size):
         return
     longest = int(np.flatnonzero(_measured(analysis))[distance.argmax()])
     asked, whole = float(distance.max()), " × ".join(f"{length:g}" for length in size)
@@ -147,12 +147,6 @@ def _in_one_place(analysis: Analysis, shape: Shape) -> Finding:
     return Finding("error" if wanted else "warning", "in-one-place", message, remedy, ("formation", "links"))
 
 
-def offsets(analysis: Analysis) -> Iterator[Finding]:
-    """Check that the offsets of a law that remembers add up; what it makes of them is its own."""
-    if not analysis.is_gradient:
-        yield from _contradictions(analysis, "warning")
-
-
 def _contradictions(analysis: Analysis, severity: Severity, more: str = "") -> Iterator[Finding]:
     """Finding on the shortest ring of links with offsets that do not add up."""
     for ring in contradictions(analysis.first_links)[:1]:
@@ -165,7 +159,7 @@ def _contradictions(analysis: Analysis, severity: Severity, more: str = "") -> I
 
 
 def _unrealisable(analysis: Analysis, shape: Shape) -> Iterator[Finding]:
-    severity: Severity = "error" if shape.worst > FAR_OFF else "warning"
+    severity: Severity = "error" if shape.worst > FAR_OFF and analysis.is_gradient else "warning"
     anchors = analysis.plan.anchors_by_row
     if anchors and shape.anchored.max(initial=0.0) >= shape.error.max(initial=0.0):
         name = analysis.plan.names[anchors[int(shape.anchored.argmax())][0]]
@@ -390,13 +384,16 @@ def strength(analysis: Analysis, wants: int = BY_DISTANCE) -> tuple[str, Path]:
     The gain of [formation] for links with such a target, or the law's own parameters if it goes by these alone.
     """
     law, links = analysis.law, analysis.asked
+    alone = f"the law's own parameters ({', '.join(law.__struct_fields__) or 'it has none yet'})", ("formation", "law")
+    if not analysis.is_gradient:
+        return alone
     place = analysis.start + 0.1 * np.random.default_rng(0).normal(size=analysis.start.shape)
     single = law_offsets(law, place, place[links.sender], links)
     stronger = msgspec.structs.replace(links, gain=2.0 * links.gain)
     double = law_offsets(law, place, place[links.sender], stronger)
     if analysis.plan.anchors_by_row or not np.array_equal(single, double, equal_nan=True):
         return GAIN[law.PULLS_BY], ("formation", gain_key(law, wants))
-    return f"the law's own parameters ({', '.join(law.__struct_fields__) or 'it has none yet'})", ("formation", "law")
+    return alone
 
 
 def stability(analysis: Analysis) -> Iterator[Finding]:

@@ -13,7 +13,7 @@ import numpy as np
 from agents.body.kinds import KINDS, Flight, Kind
 from agents.formation import anchors
 from agents.formation.changes import Change, Target, change_target, exists, planned_at
-from agents.formation.link import BY_DISTANCE, Link
+from agents.formation.link import BY_DISTANCE, BY_NOTHING, Link
 from agents.plugins.law import Law
 from agents.plugins.laws import Distance, Gradient
 from experiments.definition.experiment import AnchorTable, ChangeTable, Experiment
@@ -160,18 +160,21 @@ def anchor_errors(held: Anchored, position: Array) -> Array:
     return np.array(found, dtype=float).reshape(len(held), len(position)).T
 
 
-def errors_over_time(law: Law, pattern: Pattern, time: Array, position: Array) -> Array:
-    """Error of each link (T, E) as the law measures it; NaN where the link is not there or an end is unknown.
+def targeted(law: Law, pattern: Pattern) -> Mask:
+    """Links (E,) with an error: their target stands at the link, or the law needs that of robots that are near."""
+    needed = law.NEEDS != "nothing"
+    given = [link.target.wants != BY_NOTHING and bool(needed or link.text) for link in pattern.one_way]
+    return np.array(given, dtype=bool)
 
-    A law that is no gradient measures none: all are NaN.
+
+def errors_over_time(law: Law, pattern: Pattern, time: Array, position: Array) -> Array:
+    """Error of each link (T, E) by its target; NaN where the link is not there, has no target, or an end is unknown.
 
     Args:
         time: (T,) since the common start [s].
         position: (T, N, 3) true [m].
     """
     links = pattern.links
-    if not isinstance(law, Gradient):
-        return np.full((len(time), len(links)), np.nan)
     if type(law) is Distance and not pattern.changes:
         step = max(1, AT_ONCE // max(1, len(links)))
         error = np.empty((len(time), len(links)))
@@ -185,6 +188,7 @@ def errors_over_time(law: Law, pattern: Pattern, time: Array, position: Array) -
             targets = pattern.targets_at(t) if pattern.changes else targets
             apart = (position[k, links.receiver] - position[k, links.sender]).tolist()
             error[k] = [law.error(tuple(away), link) for away, link in zip(apart, targets, strict=True)]
+        error[:, ~targeted(law, pattern)] = np.nan
     there = pattern.present(time, position)
     return error if there is None else np.where(there, error, np.nan)
 

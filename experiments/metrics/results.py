@@ -98,7 +98,7 @@ class RobotMetrics(msgspec.Struct, frozen=True):
     residual: float | None  # [m] worst link, |error| averaged over the last second of the first phase
     worst: str  # robot at the other end of that link
     phases: tuple[PhaseMetrics, ...]  # each later phase
-    # [s] when e enters the 2 % band of its largest value for good; the duration if never, None for laws without errors
+    # [s] when e enters the 2 % band of its largest value for good; the duration if never, None without targets of links
     settle_s: float | None
     missed_share: float | None  # missed deadlines over the ticks that were due, made or missed
     updates: int  # recomputed goals
@@ -108,7 +108,7 @@ class RobotMetrics(msgspec.Struct, frozen=True):
     recorded: int  # poses in the recording
     receivers: int  # receivers, with the central controller
     received: int  # poses of it received, by all receivers together
-    coverage: float | None  # known share of its link errors; None for laws without errors
+    coverage: float | None  # known share of its link errors; None without targets
     known: float  # share of the run in which its own position is known
     collisions: int  # contacts with robots, obstacles and walls
     impulse: float | None  # [N s] impulse of the hardest contact; None if unknown
@@ -231,5 +231,5 @@ class CaseMetrics(msgspec.Struct, frozen=True):
 
     @property
     def has_errors(self) -> bool:
-        """Whether links have errors: only gradient laws measure them."""
+        """Whether links have errors: any of them has a target."""
         return self.mean.get("j2") is not None

@@ -20,8 +20,9 @@ from agents.plugins.predictors import HOLD, Predictor
 from agents.safety.hazards import OVER, QUIET_S, UNRESOLVED, is_blind
 from agents.vectors import Vector
 from experiments.arrays import ArrayTable
-from experiments.definition.formation import errors_over_time
+from experiments.definition.formation import errors_over_time, targeted
 from experiments.definition.graph import Links
+from experiments.definition.plan import Plan
 from experiments.metrics.clearance import Clearance
 from experiments.metrics.results import LinkDelivery, PhaseMetrics
 from experiments.recording.losses import count_unrecorded
@@ -32,6 +33,11 @@ WINDOW_S: Final = 1.0  # [s] window of the moving mean that decides on acquisiti
 BAND: Final = 0.02  # share of the largest error: the 2 % band of the settling time
 KNOWN: Final = 0.95  # least share of known positions of a robot: below it the robot counts as died
 RETURN_S: Final = 3.0  # robots come back one after the other when the network does
+
+
+def has_errors(plan: Plan) -> bool:
+    """Whether links have errors: any of them has a target. A law without memory goes by targets, even of no link."""
+    return isinstance(plan.law, Gradient) or bool(targeted(plan.law, plan.formation).any())
 
 
 def phase_starts(trace: Trace) -> tuple[float, ...]:
@@ -56,10 +62,11 @@ class LinkErrors:
 
     time: Array  # (T,) [s]
     net: Links
-    # (E, N) 1 where a link counts for a robot: those on which it receives, or without any, those on which it sends
+    # (E, N) 1 where a link with a target counts for a robot: those on which it receives, or without any, those on
+    # which it sends
     own: Array
-    # (T, E) as the law measures it, |‖p_i − p_j‖ − d_ij| for distances [m]; NaN where an end is unknown or the link
-    # is not there
+    # (T, E) by the target, |‖p_i − p_j‖ − d_ij| for distances [m]; NaN where an end is unknown, or the link is not
+    # there or has no target
     error: Array
     alive: Mask  # (T, N) whether the robot's own position is known
     # (T, N) whether a robot was to be there: not before it joined, nor while the network was away (see `network_away`),
@@ -79,7 +86,8 @@ class LinkErrors:
         blind = without_position(trace)
         alive &= ~blind
         place = np.where(blind[:, :, None], np.nan, trace.true_position) if blind.any() else trace.true_position
-        as_receiver, as_sender = (np.eye(rows)[ends] for ends in (pattern.links.receiver, pattern.links.sender))
+        counts, ends = targeted(trace.plan.law, pattern)[:, None], (pattern.links.receiver, pattern.links.sender)
+        as_receiver, as_sender = (np.eye(rows)[each] * counts for each in ends)
         own = np.where(as_receiver.any(axis=0), as_receiver, as_sender)
         error = errors_over_time(trace.plan.law, pattern, trace.time, place)
         gone = ~np.maximum.accumulate((alive & (np.isfinite(error) @ own > 0.0))[::-1])[::-1]
@@ -350,7 +358,7 @@ class Measurement:
 
     def __init__(self, trace: Trace) -> None:
         self.trace = _locked_copy(trace)
-        self.has_errors = isinstance(trace.plan.law, Gradient)  # only gradient laws measure errors of links
+        self.has_errors = has_errors(trace.plan)
         leading = trace.plan.leaders
         self.leaders = () if len(leading) == len(trace.robots) else leading  # robots that means leave out
         self.bounds = bounds_of(trace)  # phases
@@ -401,8 +409,8 @@ class Measurement:
         d²) differs from its end by more than 2 % of |g(0) − g(end)|. n_m are transmissions, n_u computed goals; IAE and
         ITAE are those of Σ|r − d|, halved because a link has two ends (their script takes the ITAE of the last
         neighbour only, which is taken for a slip). Without distances, and where wanted distances change, g is their
-        error. Goals are counted by their changes in the samples, in proportion to all that were computed. NaN for laws
-        without errors.
+        error. Goals are counted by their changes in the samples, in proportion to all that were computed. NaN for
+        links without targets.
         """
         if not self.has_errors:
             return nan

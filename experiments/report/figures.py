@@ -20,11 +20,10 @@ from matplotlib.patches import Patch, PathPatch
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 from numpy.typing import NDArray
 
-from agents.plugins.laws import Gradient
 from experiments.metrics.metric import ERRORS, FORMULA, known_metrics
 from experiments.metrics.results import CaseMetrics
 from experiments.metrics.shadow import differences, in_heading
-from experiments.metrics.signals import WINDOW_S, Measurement, moving_mean
+from experiments.metrics.signals import WINDOW_S, Measurement, has_errors, moving_mean
 from experiments.metrics.statistics import Spread, by_case, ratios, spread
 from experiments.recording.trace import Trace
 from experiments.report import style
@@ -55,8 +54,8 @@ def all_figures(
 ) -> dict[str, Figure]:
     """All figures of a run by name; motions of the first seed, `errors` of all seeds.
 
-    Figures without content are left out: all without a trace; ratios of a single case; errors of laws that measure
-    none. Pictures of space need known positions, and in perspective robots above the floor.
+    Figures without content are left out: all without a trace; ratios of a single case; errors of links without
+    targets. Pictures of space need known positions, and in perspective robots above the floor.
 
     Args:
         cases, traces: The run; several seeds of a case have one name.
@@ -69,7 +68,7 @@ def all_figures(
         figures["plan_view"] = plan_view(first, width)
         if any((trace.true_position[..., 2] > LOW).any() for trace in first):
             figures["formation"] = formation(first, width)
-    judged = [trace for trace in known if isinstance(trace.plan.law, Gradient)]
+    judged = [trace for trace in known if has_errors(trace.plan)]
     if judged:
         figures["errors"] = errors(judged, cases, width, bands)
     if any(trace.measures for trace in first):
@@ -127,7 +126,7 @@ def global_bars(cases: Sequence[CaseMetrics], width: float = style.WIDTH) -> Fig
 
 
 def _bar_metrics(cases: Sequence[CaseMetrics]) -> list[tuple[str, str, str]]:
-    """Metrics that are drawn as bars: name, label and unit as matplotlib writes them; no errors of laws without any."""
+    """Metrics drawn as bars: name, label and unit as matplotlib writes them; errors only of links with targets."""
     judged = any(case.has_errors for case in cases)
     found = []
     for name, metric in known_metrics(cases).items():

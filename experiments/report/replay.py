@@ -9,13 +9,12 @@ from typing import Any, Final
 
 import numpy as np
 
-from experiments.definition.formation import errors_over_time
 from experiments.recording.trace import Trace
 from experiments.report import figures, trajectories
 from experiments.report.page import inline, template
 from experiments.report.style import svg
 from experiments.scene.models import ROUND, circle
-from experiments.scene.stage import FAIR_M, GOOD_M, SceneModel, link_levels
+from experiments.scene.stage import FAIR_M, GOOD_M, SceneModel, drawn_errors, link_levels
 from twins.arrays import Array
 
 CASES: Final = 2  # side by side
@@ -95,8 +94,7 @@ def _case(trace: Trace, step: float) -> dict[str, Any]:
     rows = np.concatenate([place, np.nan_to_num(trace.yaw[at])[..., None]], axis=2)
     level = np.full((len(grid), len(stage.links)), -1)
     if stage.plan is not None and len(stage.links):
-        error = errors_over_time(stage.plan.law, stage.plan.formation, grid, place)
-        level = link_levels(error)
+        level = link_levels(drawn_errors(stage.plan, grid, place))
     poses = np.stack([stage.scene.at(float(t)) for t in grid]).reshape(len(grid), -1)
     return {
         "name": trace.case,

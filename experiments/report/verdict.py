@@ -28,7 +28,7 @@ def findings(cases: Sequence[CaseMetrics], notes: Sequence[str] = ()) -> list[Ve
     `notes` of the run stand behind what a reader must know first.
     """
     formation = any(case.belief for case in cases)
-    judged = [case for case in cases if case.belief and case.has_errors]  # others have laws without errors
+    judged = [case for case in cases if case.belief and case.has_errors]  # others have links without targets
     sound = [  # what is as it should be stands behind what the run has shown
         *_lost_poses(cases),
         *_foreign(cases),

@@ -253,7 +253,7 @@ class SceneDrawing:
         ends = appearance.segments(self.stage, moment.position)
         colours = appearance.link_colours(moment.error)
         both = np.repeat(colours[:, None], 2, axis=1)
-        there = np.isfinite(moment.error) & self.shown.links
+        there = ~np.isnan(moment.error) & self.shown.links
         whole = there & ~moment.broken
         _update(self._links, "points", appearance.visible(ends, whole))
         _update(self._links, "colors", both)

@@ -22,9 +22,9 @@ from agents.decision.lifecycle import FINISHED, SCRIPTED, TOLD_TO_END, Phase
 from agents.kinds.theory import POINT
 from agents.network.messages import EMERGENCY, Ranges, State, Status, WorldState
 from agents.plugins import registry
-from agents.plugins.laws import Gradient
 from experiments.arrays import known_rows
 from experiments.definition.experiment import WORLD
+from experiments.definition.formation import errors_over_time, targeted
 from experiments.definition.graph import Links, links
 from experiments.definition.plan import Plan, finds_contacts
 from experiments.metrics.clearance import Overlap, present_overlaps
@@ -34,6 +34,7 @@ from twins.scene import Scene
 Colours = NDArray[np.uint8]
 Colour = tuple[int, int, int]
 
+BARE: Final = inf  # stands for the error of a link that is there and has no target: it is drawn grey
 GOOD_M: Final = 0.025  # error of a link that counts as kept
 FAIR_M: Final = 0.05
 SILENT_S: Final = 3.0  # time without a status after which a robot counts as silent
@@ -298,7 +299,7 @@ class Moment:
     goal: Array  # (N, 3) [m]
     condition: Index  # (N,) of `Condition`
     silent_for: Array  # (N,) [s] since the last transmission of each robot
-    error: Array  # (E,) [m] of each link; NaN: unknown, or the link is not there
+    error: Array  # (E,) [m] of each link; NaN: unknown, or the link is not there; `BARE`: it has no target
     broken: Mask  # (E,) links with a receiver that does not get poses of its sender
     obstacles: Array  # (M, 3) x, y [m], yaw [rad]
     trail: Array  # (N, K, 3) [m] former positions, the newest first
@@ -338,7 +339,7 @@ def drawn_columns(states: Iterable[State | None]) -> dict[str, Array]:
 
 
 class LinkTracker:
-    """Errors of the links as the law measures them, along a motion."""
+    """Errors of the links by their targets, along a motion."""
 
     def __init__(self, stage: SceneModel) -> None:
         self._stage = stage
@@ -346,22 +347,24 @@ class LinkTracker:
         self._law = None if plan is None else _if_installed(lambda: plan.law)
         self._pattern = None if plan is None or self._law is None else plan.formation
         self._present: list[bool] = []
-        if self._pattern is not None:
+        self._counts: list[bool] = []
+        if self._law is not None and self._pattern is not None:
+            self._counts = targeted(self._law, self._pattern).tolist()
             self._present = self._pattern.planned_at(0.0).tolist()
 
     def errors(self, time: float | None, position: Array) -> Array:
-        """Error of each link (E,) [m], NaN for those that are not there, at a time since the common start [s]."""
+        """Error of each link (E,) [m] at a time since the common start [s]; NaN if not there, `BARE` without target."""
         net, pattern = self._stage.links, self._pattern
         elapsed = 0.0 if time is None else max(time, 0.0)
         found = np.full(len(net), np.nan)
-        if not isinstance(self._law, Gradient) or pattern is None:
+        if self._law is None or pattern is None:
             return found
         apart = (position[net.receiver] - position[net.sender]).tolist()
         for k, (link, away) in enumerate(zip(pattern.targets_at(elapsed), apart, strict=True)):
             if pattern.bounded:
                 self._present[k] = pattern.exists(k, elapsed, math.hypot(*away), was=self._present[k])
             if self._present[k] or not pattern.bounded:
-                found[k] = self._law.error(tuple(away), link)
+                found[k] = self._law.error(tuple(away), link) if self._counts[k] else BARE
         return found
 
     def of_robots(self, error: Array) -> Array:
@@ -372,6 +375,15 @@ class LinkTracker:
         known = np.isfinite(error)
         there = np.bincount(self._stage.links.receiver[known], minlength=len(self._stage.names)) > 0
         return np.where(there, sums_of_errors(self._stage, error), np.nan)
+
+
+def drawn_errors(plan: Plan, time: Array, position: Array) -> Array:
+    """Errors of links (T, E) [m] as `LinkTracker` gives them, along true positions (T, N, 3) at times (T,)."""
+    pattern = plan.formation
+    error = errors_over_time(plan.law, pattern, time, position)
+    there = pattern.present(time, position)
+    bare = ~targeted(plan.law, pattern) if there is None else there & ~targeted(plan.law, pattern)
+    return np.where(bare, BARE, error)
 
 
 def sums_of_errors(stage: SceneModel, error: Array) -> Array:
@@ -422,8 +434,8 @@ def shown(position: Array) -> Array:
 
 
 def link_levels(error: Array) -> Index:
-    """Levels of links by their errors [m]: 0 for a good one, 1 fair, 2 bad, −1 unknown."""
-    return np.where(np.isnan(error), -1, (error > GOOD_M).astype(int) + (error > FAIR_M))
+    """Levels of links by their errors [m]: 0 for a good one, 1 fair, 2 bad, 3 without target, −1 unknown."""
+    return np.where(np.isnan(error), -1, (error > GOOD_M).astype(int) + (error > FAIR_M) + (error == BARE))
 
 
 def link_colours(error: Array) -> Colours:

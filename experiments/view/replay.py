@@ -13,7 +13,6 @@ import numpy as np
 
 from agents.decision.lifecycle import Phase
 from agents.network.messages import Contact, LawMemory, Status, WorldState
-from experiments.definition.formation import errors_over_time
 from experiments.metrics.clearance import Overlap
 from experiments.recording.trace import ROUNDING_S
 from experiments.scene.drawing import SceneDrawing
@@ -27,6 +26,7 @@ from experiments.scene.stage import (
     Moment,
     SceneModel,
     condition,
+    drawn_errors,
     touched,
 )
 from experiments.scene.tracks import LOST_S, Track, Tracks
@@ -113,7 +113,7 @@ class Film:
         position = np.stack([track.positions(grid) for track in tracks.tracks], axis=1)
         error = np.zeros((len(grid), len(stage.links)))
         if stage.plan is not None and len(stage.links):
-            error = np.nan_to_num(errors_over_time(stage.plan.law, stage.plan.formation, grid, position))
+            error = np.nan_to_num(drawn_errors(stage.plan, grid, position), posinf=np.inf)
         sent = [np.searchsorted(each.sent, grid) - np.searchsorted(each.sent, grid - 1.0) for each in tracks.tracks]
         history.time = grid.tolist()
         history.error = [self.links.of_robots(each) for each in error]

@@ -103,7 +103,7 @@ def divisor(body: float, wanted: float) -> float:
 def _choices(plan: Plan) -> Iterator[Fault]:
     """Plug-ins that do not fit: triggers in the wrong place or without their prediction, and what a law excludes.
 
-    A law that is no gradient has no errors of links, and its memory is the robot's own.
+    A law that is no gradient decides without errors of links, and its memory is the robot's own.
     """
     experiment, trigger, update, law = plan.experiment, plan.trigger, plan.update, plan.law
     if "communication" not in trigger.PLACES:
@@ -133,7 +133,7 @@ def _choices(plan: Plan) -> Iterator[Fault]:
         message = f"anchors pull robots of laws that pull along links; '{plan.law_name}' does not know them"
         yield Fault(("formation", "anchors"), message, "leave anchors out", on_key=True)
     if trigger.JUDGES_ERRORS:
-        message = f"'{plan.trigger_name}' judges errors of links, and the law '{plan.law_name}' has none"
+        message = f"'{plan.trigger_name}' judges errors of links, by which the law '{plan.law_name}' does not pull"
         yield Fault(("trigger",), message, "take another trigger, such as send-on-delta")
     elif trigger.JUDGES_DRIFT and law.SAYS:
         message = (
