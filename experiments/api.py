@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from agents.network.keys import Keys
     from agents.network.messages import RunOrder
     from agents.plugins.avoidance import Avoidance, measure_gap
-    from agents.plugins.law import Control, Law, Memory, RobotFacts, Said, View
+    from agents.plugins.law import Control, Law, Measure, Memory, RobotFacts, Said, View
     from agents.plugins.laws import Gradient
     from agents.plugins.planners import Planner
     from agents.plugins.predictors import Predictor
@@ -49,7 +49,7 @@ __all__ = [  # noqa: RUF022 - by subject, as in docs/python.md
     # more of experiments
     "Document", "figures", "reopen_seeds", "folder",
     # what laws and metrics get and raise
-    "View", "Memory", "RobotFacts", "Link", "PluginError", "Measurement", "Array",
+    "View", "Memory", "Measure", "RobotFacts", "Link", "PluginError", "Measurement", "Array",
     # other bases of plug-ins
     "Predictor", "Avoidance", "measure_gap", "EngineFactory", "PointMassEngine", "moving_models",
     # kinds and bodies

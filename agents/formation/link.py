@@ -29,7 +29,7 @@ class Link:
 
 
 def target_error(apart: Vector, link: Link, wants: int) -> float:
-    """Error [m] of a link whose ends are `apart` = p_i − p_j [m], for a kind of target; NaN without a target.
+    """Error [m] of a link with `apart` = p_i − p_j [m], for a kind of target; NaN without a target.
 
     |d − ‖x‖| for distances, ‖x − d‖ for relative positions, and the distance from the ray for directions.
     """

@@ -39,6 +39,13 @@ class Said(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     place: int | None = None
 
 
+class Measure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Unit of a measure of a law, and which way it is better; with "" it is no figure and no ratio."""
+
+    unit: str = ""
+    better: Literal["less", "more", ""] = "less"
+
+
 @dataclass(eq=False)
 class RobotFacts:
     """A robot as its law knows it before anything happens."""
@@ -105,7 +112,7 @@ class Control(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     velocity: Vector | None = None  # [m/s]; the third NaN: the height is held
     goal: Vector | None = None  # [m]; likewise. Limited per axis and decision by `clamp` of the formation
     yaw: float = nan  # wanted [rad], NaN for any
-    measures: Mapping[str, float] = {}  # numbers by name for figures and metrics, never said
+    measures: Mapping[str, float] = {}  # numbers by name for figures and metrics, never said; see `Law.MEASURES`
 
 
 class Law(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -114,6 +121,7 @@ class Law(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     NEEDS: ClassVar[Need] = "nothing"  # target that it needs of every link
     PULLS_BY: ClassVar[Gain] = "gain"  # gain of the file for links without their own
     SAYS: ClassVar[Mapping[str, Said]] = {}  # variables of the memory that go out with the pose
+    MEASURES: ClassVar[Mapping[str, Measure]] = {}  # units of its measures; of one left out there is none
     ALONE: ClassVar[bool] = False  # moves a robot without neighbours, which else stays in place
     PREDICTION: ClassVar[str] = "hold"  # default of an experiment that names none
     LIBRARY: ClassVar[str] = ""  # distribution that it needs beside zenpark: its version decides on results, too
@@ -128,7 +136,7 @@ class Law(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         raise TypeError(f"{type(self).__name__} must define `step`")
 
     def error(self, apart: Vector, link: Link) -> float:
-        """Error [m] of a link whose ends are `apart` = p_i − p_j [m]; NaN where it has no target."""
+        """Error [m] of a link with `apart` = p_i − p_j [m]; NaN where it has no target."""
         return target_error(apart, link, WANTS.get(self.NEEDS, link.wants))
 
     def analyse(self, plan: Any) -> Iterable[tuple[Severity, str, str]]:  # noqa: ANN401 - plug-ins know no experiment

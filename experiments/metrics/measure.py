@@ -21,12 +21,21 @@ from experiments.definition.graph import Links
 from experiments.metrics import centralised
 from experiments.metrics.clearance import collisions
 from experiments.metrics.comparable import reasons
-from experiments.metrics.metric import case_values, known_metrics, metrics_of_criteria, unusable_metrics, values_of
+from experiments.metrics.metric import (
+    OF_LAW,
+    case_values,
+    known_metrics,
+    law_metrics,
+    measures_of,
+    metrics_of_criteria,
+    unusable_metrics,
+    values_of,
+)
 from experiments.metrics.results import Approach, Belief, CaseMetrics, Collision, LawMeasure, RobotMetrics
 from experiments.metrics.shadow import agreement
 from experiments.metrics.signals import Measurement, link_deliveries, mean_known, outside_arena
 from experiments.recording.trace import Trace
-from twins.arrays import Array, norm
+from twins.arrays import norm
 
 TROUBLES: Final = ("late", "unread")  # kinds of events of the run itself, not of a robot
 PRESENT: Final = 0.8  # least share of known positions of a robot: below it the robot was out of reach
@@ -44,7 +53,7 @@ def measure(trace: Trace) -> CaseMetrics:
     if len(trace.time) < 2:
         raise ValueError(f"case '{trace.case}' holds fewer than two samples: the run ended before it began")
     asked, missing = metrics_of_criteria(trace.plan.experiment.criteria)
-    metrics, left_out = known_metrics() | asked, unusable_metrics()
+    metrics, left_out = known_metrics() | asked | law_metrics(measures_of(trace)), unusable_metrics()
     shared = Measurement(trace)
     values, faults = values_of(metrics, shared)
     mean = case_values(metrics, values, shared.kept)
@@ -109,7 +118,7 @@ def measure(trace: Trace) -> CaseMetrics:
         network_bytes=sum(robot.bytes + robot.goal_bytes for robot in robots),
         deliveries=arrived,
         guidance=guidance,
-        measures=_law_measures(shared, shared.kept),
+        measures=_law_measures(trace, mean),
         metric_faults=(*left_out, *missing, *faults),
         criteria=tuple(trace.plan.experiment.criteria),
     )
@@ -156,7 +165,7 @@ def _robots(
         "avoided_share": list(map(_share, trace.avoided, trace.ticks)),
         "foreign": [0] * len(rows) if trace.foreign is None else trace.foreign.tolist(),
         "extra": [{name: column[i] for name, column in extra.items()} for i in rows],
-        "measures": [_law_measures(shared, [i]) for i in rows],
+        "measures": [_law_measures(trace, {name: column[i] for name, column in extra.items()}) for i in rows],
     }
     return tuple(RobotMetrics(**{name: column[i] for name, column in columns.items()}) for i in rows)
 
@@ -244,14 +253,12 @@ def ended_early(trace: Trace) -> bool:
     return float(trace.time[-1]) < trace.plan.experiment.duration_s - 1.5 * float(trace.time[1] - trace.time[0])
 
 
-def _law_measures(shared: Measurement, rows: Sequence[int]) -> dict[str, LawMeasure]:
-    """Each measure of the law, mean over these robots."""
-
-    def mean(values: Array) -> float | None:
-        return _number(mean_known(values[:, rows].reshape(-1)).item())
-
-    every = shared.trace.measures.items()
-    return {name: LawMeasure(mean(values), mean(values[-shared.window :])) for name, values in every}
+def _law_measures(trace: Trace, values: Mapping[str, float | None]) -> dict[str, LawMeasure]:
+    """Each measure of the law, of the values of `law_metrics`."""
+    return {
+        name: LawMeasure(values[f"{OF_LAW}{name}_mean"], values[f"{OF_LAW}{name}_end"], each.unit, each.better)
+        for name, each in measures_of(trace).items()
+    }
 
 
 def _distance_to_goal(trace: Trace, net: Links, row: int) -> float | None:

@@ -10,8 +10,8 @@ import statistics
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields
-from functools import cache
-from math import isfinite
+from functools import cache, partial
+from math import isfinite, nan
 from operator import attrgetter
 from pathlib import Path
 from traceback import extract_tb
@@ -22,7 +22,9 @@ import numpy as np
 
 from agents.plugins import files, registry
 from agents.plugins.calls import supervised
+from agents.plugins.law import Measure
 from experiments.definition.experiment import Criterion
+from experiments.definition.plan import Plan
 from experiments.metrics.results import CaseMetrics, RobotMetrics
 from experiments.metrics.signals import Measurement, closest_distance, mean_known
 from experiments.recording.trace import Trace
@@ -167,20 +169,87 @@ LEAN: Final = frozenset(
     }
 )
 _COLUMNS: Final = frozenset(each.name for each in fields(Trace))
+OF_LAW: Final = "measure_"  # first letters of the names of metrics that are measures of a law
+_FACTS: Final = ("label", "unit", "per", "better", "mean", "sums", "relative", "swept", "shown", "figure")
 
 
 def known_metrics(cases: Iterable[CaseMetrics] = ()) -> dict[str, Metric]:
-    """All metrics by name: ours, those of other distributions, and those in files that criteria of the cases name."""
+    """All metrics by name: ours, and `foreign_metrics` of the cases."""
     return {**OURS, **foreign_metrics(cases)}
 
 
-def swept_metrics() -> dict[str, Metric]:
-    """Metrics that are columns of sweeps."""
-    return {name: metric for name, metric in known_metrics().items() if metric.swept}
+def swept_metrics(plans: Iterable[Plan] = ()) -> dict[str, Metric]:
+    """Metrics that are columns of sweeps, with those that criteria and laws of these plans name."""
+    found = known_metrics()
+    for plan in plans:
+        found |= metrics_of_criteria(plan.experiment.criteria)[0] | law_metrics(plan.law.MEASURES)
+    return {name: metric for name, metric in found.items() if metric.swept}
+
+
+def law_metrics(measures: Mapping[str, Measure]) -> dict[str, Metric]:
+    """Two metrics of each measure of a law: over the run, with a ratio and a figure, and over the last second."""
+    found = dict[str, Metric]()
+    for name, measure in measures.items():
+        facts: dict[str, Any] = {"unit": measure.unit, "better": measure.better, "applies": partial(_measured, name)}
+        facts |= {"needs": ("true_position", "measures")}
+        judged = bool(measure.better)
+        found[f"{OF_LAW}{name}_mean"] = _ours(
+            partial(_mean_of_measure, name), f"{name} (mean)", f"Measure {name} of the law, mean over the run.",
+            relative=judged, figure=judged, **facts,
+        )  # fmt: skip
+        found[f"{OF_LAW}{name}_end"] = _ours(
+            partial(_end_of_measure, name), f"{name} (end)",
+            f"Measure {name} of the law, mean over the last second.", relative=False, **facts,
+        )  # fmt: skip
+    return found
+
+
+def _measured(name: str, trace: Trace) -> bool:
+    return name in trace.measures
+
+
+def _mean_of_measure(name: str, shared: Measurement) -> Array:
+    return mean_known(shared.trace.measures[name])
+
+
+def _end_of_measure(name: str, shared: Measurement) -> Array:
+    return mean_known(shared.trace.measures[name][-shared.window :])
+
+
+def measures_of(trace: Trace) -> dict[str, Measure]:
+    """Measures that the law of a run gave."""
+    return {name: trace.plan.law.MEASURES.get(name, Measure()) for name in trace.measures}
+
+
+def measures_in(values: Iterable[str]) -> dict[str, Measure]:
+    """Measures without a unit, by the names of their metrics among those of `values`."""
+    named = (name for name in values if name.startswith(OF_LAW) and name.endswith("_mean"))
+    return {name.removeprefix(OF_LAW).removesuffix("_mean"): Measure() for name in named}
+
+
+def facts_of(metrics: Mapping[str, Metric]) -> dict[str, dict[str, Any]]:
+    """Attributes of metrics that are neither ours nor installed, for a file."""
+    known = known_metrics()
+    return {
+        name: {fact: getattr(metric, fact) for fact in _FACTS} | {"meaning": metric.meaning}
+        for name, metric in metrics.items()
+        if name not in known
+    }
+
+
+def from_facts(facts: Mapping[str, Mapping[str, Any]]) -> dict[str, Metric]:
+    """Metrics as `facts_of` describes them, without a way to measure them; raises ValueError for other facts."""
+    if any({*_FACTS, "meaning"} != {*each} for each in facts.values()):
+        raise ValueError("metrics of another version")
+    return {name: _ours(_elsewhere, **each) for name, each in facts.items()}
+
+
+def _elsewhere(_shared: Measurement) -> float:
+    return nan
 
 
 def foreign_metrics(cases: Iterable[CaseMetrics] = ()) -> dict[str, Metric]:
-    """Metrics of other distributions, and those in files that criteria of the cases name.
+    """Metrics of other distributions, those in files that criteria of the cases name, and measures of their laws.
 
     Of `cases` only those that a criterion names or a case has: others do not apply to them.
     """
@@ -190,7 +259,8 @@ def foreign_metrics(cases: Iterable[CaseMetrics] = ()) -> dict[str, Metric]:
         named = {each.metric for each in criteria}
         held = {name for case in measured for name in installed if _has_value(case, name)}
         installed = {name: metric for name, metric in installed.items() if name in named | held}
-    return installed | metrics_of_criteria(criteria)[0]
+    measures = {name: Measure(each.unit, each.better) for case in measured for name, each in case.measures.items()}
+    return installed | metrics_of_criteria(criteria)[0] | law_metrics(measures)
 
 
 def _has_value(case: CaseMetrics, name: str) -> bool:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import msgspec
 
 from experiments.definition.experiment import Criterion
@@ -75,6 +77,8 @@ class LawMeasure(msgspec.Struct, frozen=True):
 
     mean: float | None  # mean over the run
     end: float | None  # mean over the last second
+    unit: str = ""
+    better: Literal["less", "more", ""] = "less"
 
 
 class RobotMetrics(msgspec.Struct, frozen=True):

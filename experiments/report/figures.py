@@ -20,7 +20,7 @@ from matplotlib.patches import Patch, PathPatch
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 from numpy.typing import NDArray
 
-from experiments.metrics.metric import ERRORS, FORMULA, known_metrics
+from experiments.metrics.metric import ERRORS, FORMULA, known_metrics, measures_of
 from experiments.metrics.results import CaseMetrics
 from experiments.metrics.shadow import differences, in_heading
 from experiments.metrics.signals import WINDOW_S, Measurement, has_errors, moving_mean
@@ -238,6 +238,7 @@ def errors(
 def measures(traces: Sequence[Trace], width: float = style.WIDTH) -> Figure:
     """Measures of laws that remember, over time: a panel each, the median of the robots thick, single ones thin."""
     names = [*dict.fromkeys(name for trace in traces for name in trace.measures)][:MOST_MEASURES]
+    units = {name: each.unit for trace in traces for name, each in measures_of(trace).items()}
     height = style.panel_height(len(names), 1.3)
     figure = style.Drawing(figsize=(width, height * len(names) + 0.7), layout="constrained")
     panels = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
@@ -255,7 +256,7 @@ def measures(traces: Sequence[Trace], width: float = style.WIDTH) -> Figure:
             handles[style.plain(trace.case)] = Line2D([], [], **line, linewidth=1.3)
         style.mark_phases(axes, traces[0])
         axes.grid()
-        axes.set_ylabel(style.plain(name))
+        axes.set_ylabel(style.plain(f"{name} [{units[name]}]" if units.get(name) else name))
         axes.yaxis.set_major_locator(MaxNLocator(4))
     style.time_axis(panels[-1], traces)
     figure.align_ylabels(list(panels))

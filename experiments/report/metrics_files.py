@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from experiments.metrics import criteria
-from experiments.metrics.results import CaseMetrics, LawMeasure, RobotMetrics, ShadowMetrics
+from experiments.metrics.results import CaseMetrics, RobotMetrics, ShadowMetrics
 from experiments.metrics.statistics import ratios
 from twins.arrays import Array
 
@@ -60,7 +60,7 @@ def write_csv(path: Path, cases: Sequence[CaseMetrics]) -> None:
         for case in cases:
             table.writerows(_robot_rows(case))
             known = {"seed": case.seed, "case": case.case, "spoiled": int(bool(case.spoiled))}
-            table.writerow({**known, "robot": "mean", **case.mean, **_flat_measures(case.measures)})
+            table.writerow({**known, "robot": "mean", **case.mean})
 
 
 def rows(cases: Sequence[CaseMetrics]) -> Iterator[dict[str, object]]:
@@ -77,8 +77,7 @@ def _columns(cases: Sequence[CaseMetrics]) -> list[str]:
     shadows = list(_flat_shadow(None)) if any(robot.shadow for case in cases for robot in case.robots) else []
     phases = [f"phase{k}_{what}" for k in range(2, later + 1) for what in ("acquired_s", "residual", "worst")]
     added = dict.fromkeys(name for case in cases for name in case.mean if name not in _PLAIN)
-    of_law = dict.fromkeys(name for case in cases for name in _flat_measures(case.measures))
-    return ["seed", "case", "spoiled", "in_mean", *_PLAIN, *phases, *near, *shadows, *added, *of_law]
+    return ["seed", "case", "spoiled", "in_mean", *_PLAIN, *phases, *near, *shadows, *added]
 
 
 _PLAIN: Final = [field for field in RobotMetrics.__struct_fields__ if field not in _NESTED]
@@ -94,18 +93,9 @@ def _robot_rows(case: CaseMetrics) -> Iterator[dict[str, object]]:
             if near is not None:
                 row |= {f"{what}_gap": near.gap, f"{what}_to": near.between[1], f"{what}_at_s": near.at_s}
         row |= _flat_shadow(robot.shadow) if robot.shadow else {}
-        row |= robot.extra | _flat_measures(robot.measures)
+        row |= robot.extra
         known = {"seed": case.seed, "case": case.case, "spoiled": int(bool(case.spoiled))}
         yield {**known, "in_mean": int(robot.robot not in out), **row}
-
-
-def _flat_measures(measures: Mapping[str, LawMeasure]) -> dict[str, float | None]:
-    """Measures of a law as columns, `measure_NAME_mean` and `measure_NAME_end`."""
-    return {
-        f"measure_{name}_{what}": getattr(value, what)
-        for name, value in measures.items()
-        for what in LawMeasure.__struct_fields__
-    }
 
 
 def _flat_shadow(shadow: ShadowMetrics | None) -> dict[str, object]:

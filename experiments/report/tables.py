@@ -172,11 +172,6 @@ def whole_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
         "Hardest impulse [mN s]": [
             ("of a collision", lambda case: _known(max, (each.impulse for each in case.collisions)), 1000.0)
         ],
-        "Measures of the law": [
-            (f"{name}, {words}", partial(_of_law, name=name, what=what), 1.0)
-            for name in dict.fromkeys(name for case in cases for name in case.measures)
-            for what, words in (("mean", "mean"), ("end", "at the end"))
-        ],
     }
     tables = [
         replace(_table_by_case(unit, cases, lines), note=EXTREMES if several and unit in EXTREME_UNITS else "")
@@ -192,11 +187,6 @@ def whole_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
     formed = any(case.belief and case.has_errors for case in cases)
     shown = [table if formed and table is tables[0] else _occurred(table) for table in tables]
     return tuple(table for table in shown if table.rows)
-
-
-def _of_law(case: CaseMetrics, name: str, what: str) -> float | None:
-    """A number of a measure of the law; None where the law of the case has no such measure."""
-    return getattr(case.measures.get(name), what, None)
 
 
 def _total(runs: Sequence[CaseMetrics], name: str) -> float | None:

@@ -203,6 +203,13 @@ class SceneModel:
         said = {} if law is None else law.SAYS
         return {name: each.place for name, each in said.items() if each.place is not None}
 
+    @cached_property
+    def units(self) -> dict[str, str]:
+        """Units of the measures of the law that have one."""
+        plan = self.plan
+        law = None if plan is None else _if_installed(lambda: plan.law)
+        return {} if law is None else {name: each.unit for name, each in law.MEASURES.items() if each.unit}
+
     def said_places(self, memories: Sequence[Mapping[str, Sequence[float]]], position: Array) -> Array:
         """Places (N, P, 3) [m] in the memories of the robots, NaN where unknown.
 

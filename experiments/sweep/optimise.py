@@ -15,21 +15,22 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
 
 from agents.errors import ExplainedError
+from agents.plugins.files import plain
 from agents.plugins.registry import did_you_mean
 from experiments.file.document import Document, chosen, load
 from experiments.file.problems import refusal
-from experiments.metrics.metric import short_name, swept_metrics
+from experiments.metrics.metric import Metric, short_name, swept_metrics
 from experiments.recording.run_folder import naming
 from experiments.sweep.plan import FIRST_TUNING, Axis, Cell, arguments, combination, compared, seeds_of
 from experiments.sweep.store import Store
 from experiments.sweep.sweep import SweepRunner, folder_of, origin
-from experiments.sweep.table import CellRow, relative_metrics, words_of
+from experiments.sweep.table import CellRow, words_of
 from experiments.sweep.workers import workers
 
 Progress = Callable[[str, int, int], None]  # case, evaluations done, largest number of them
@@ -44,7 +45,7 @@ ROUND: Final = 6  # number of the best that are looked at again at a time, until
 ROUNDS: Final = 4
 BROKEN: Final = 1e6  # added to what breaks a limit
 
-_LIMIT: Final = re.compile(r"\s*([A-Za-z_]\w*)\s*([<>])=?\s*([0-9]+\.?[0-9]*|\.[0-9]+)\s*")
+_LIMIT: Final = re.compile(r"\s*((?:[^<>=,:]+\.py:)?[A-Za-z_]\w*)\s*([<>])=?\s*([0-9]+\.?[0-9]*|\.[0-9]+)\s*")
 
 
 @dataclass(frozen=True)
@@ -55,9 +56,9 @@ class Limit:
     bound: float
     least: bool = False  # the metric must not be smaller; else not larger
 
-    def __str__(self) -> str:
-        relative = relative_metrics()
-        word = f"{relative[self.index].label} ratio" if self.index in relative else self.index
+    def words(self, metrics: Mapping[str, Metric]) -> str:
+        """The limit in words, of a search with these metrics."""
+        word = f"{metrics[self.index].label} ratio" if metrics[self.index].relative else plain(self.index)
         return f"{word} {'>=' if self.least else '<='} {self.bound:g}"
 
     def excess(self, value: float) -> float:
@@ -71,10 +72,15 @@ class Objective:
 
     index: str
     limits: tuple[Limit, ...]
+    metrics: Mapping[str, Metric] = field(default_factory=swept_metrics, compare=False)  # metrics that can be named
+
+    def limits_in_words(self, between: str) -> str:
+        """All limits, with words between two of them."""
+        return between.join(limit.words(self.metrics) for limit in self.limits)
 
     def rank(self, row: CellRow) -> float:
         """A number, the less the better, limits first; more than any other if it cannot be known, or if runs failed."""
-        aim, metrics = row.value(self.index).mean, swept_metrics()
+        aim, metrics = row.value(self.index).mean, self.metrics
         if aim is None or row.failed:
             return 3.0 * BROKEN
         excess = 0.0
@@ -107,13 +113,15 @@ class TuningResult:
     chosen: tuple[CellRow, ...]
     folder: Path  # folder of the runs
     notes: tuple[str, ...]  # remarks for the user
+    metrics: Mapping[str, Metric]  # metrics of the tables
 
 
-def parse_objective(text: str) -> Objective:
+def parse_objective(text: str, metrics: Mapping[str, Metric] | None = None) -> Objective:
     """`messages, iae<=1.01, itae<=1.05`: first what is to be least, then limits.
 
-    Raises DocumentError if it cannot be understood.
+    Of these metrics; left out: of those of all sweeps. Raises DocumentError if it cannot be understood.
     """
+    metrics = swept_metrics() if metrics is None else metrics
     place = f'--optimise "{text}"'
     first, *rest = (part.strip() for part in text.split(","))
     if not first or _LIMIT.fullmatch(first):
@@ -123,15 +131,15 @@ def parse_objective(text: str) -> Objective:
     limits = []
     for part in rest:
         found = _LIMIT.fullmatch(part)
-        if not found or (found[2] == ">" and swept_metrics()[_known(found[1], place)].better != "more"):
+        if not found or (found[2] == ">" and metrics[_known(found[1], place, metrics)].better != "more"):
             raise refusal(place, f"'{part}' is no limit", "write one as iae<=1.01")
-        limits.append(Limit(_known(found[1], place), float(found[3]), found[2] == ">"))
-    least = _known(first, place)
-    if not swept_metrics()[least].better:
+        limits.append(Limit(_known(found[1], place, metrics), float(found[3]), found[2] == ">"))
+    least = _known(first, place, metrics)
+    if not metrics[least].better:
         raise refusal(place, f"neither less nor more of '{first}' is better", "name another metric, such as messages")
     if not limits:
         raise refusal(place, "without a limit the best is to say nothing", "add one, such as iae<=1.01")
-    return Objective(least, tuple(limits))
+    return Objective(least, tuple(limits), metrics)
 
 
 def searched(tuning: Sequence[int]) -> tuple[int, ...]:
@@ -163,8 +171,8 @@ def tune(
         ExplainedError: If the library is not installed, or the workers are lost.
         KeyboardInterrupt: After Ctrl-C; the same call goes on from there.
     """
-    objective = parse_objective(wanted)
     read = load(file, *settings)
+    objective = parse_objective(wanted, swept_metrics(read.cases().values()))
     axes, words = arguments(given)
     seeds = seeds_of(words.get("seeds"), read.experiment.seed)
     tuning = seeds_of(words.get("tuning"), FIRST_TUNING, TUNING)
@@ -209,8 +217,9 @@ def tune(
             runner.run_missing(final, seeds)
             reported = runner.rows(final, seeds)
             notes += runner.metric_faults(final, seeds)
+            metrics = runner.metrics(final, seeds)
     return TuningResult(
-        read, objective, tuning, seeds, tuple(reported), tuple(tried), tuple(selected), folder, tuple(notes)
+        read, objective, tuning, seeds, tuple(reported), tuple(tried), tuple(selected), folder, tuple(notes), metrics
     )
 
 
@@ -282,8 +291,8 @@ def _library() -> Any:  # noqa: ANN401 - it has no types
         ) from None
 
 
-def _known(name: str, place: str) -> str:
-    names = {word: metric for metric in swept_metrics() for word in (metric, short_name(metric))}
+def _known(name: str, place: str, metrics: Mapping[str, Metric]) -> str:
+    names = {word: metric for metric in metrics for word in (metric, metric.lower(), short_name(metric))}
     if name.lower() not in names:
         raise refusal(place, f"no metric is called '{name}'", did_you_mean(name, names))
     return names[name.lower()]

@@ -3,17 +3,25 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
-from experiments.metrics.metric import foreign_metrics
+from agents.plugins.files import plain
+from experiments.metrics.metric import OURS, Metric
 from experiments.report import page, style
 from experiments.report.tables import over_seeds, ratio_words
 from experiments.sweep.optimise import TuningResult, searched
 from experiments.sweep.pareto import by_environment, front, pareto
 from experiments.sweep.sweep import SweepResult
-from experiments.sweep.table import CellRow, numbers, parameter_columns, relative_metrics
+from experiments.sweep.table import (
+    CellRow,
+    known_numbers,
+    main_error,
+    numbers,
+    parameter_columns,
+    relative_metrics,
+)
 
 PAGE: Final = "sweep.html"
 MOST_LINES: Final = 40  # lines of a table that stands open
@@ -48,6 +56,7 @@ def write(found: SweepResult | TuningResult, command: str) -> Path:
         ("Cells", str(len(found.tried if isinstance(found, TuningResult) else found.rows))),
     ]
     notes = [page.VerdictLine("fair", note) for note in found.notes]
+    others = [metric for name, metric in found.metrics.items() if name not in OURS]
     if isinstance(found, TuningResult):
         title, sections = "Tuned", _searched(found)
         facts.append(("Tuning seeds", page.seeds_in_words(found.tuning)))
@@ -61,7 +70,7 @@ def write(found: SweepResult | TuningResult, command: str) -> Path:
         if found.failures:
             text = f"{len(found.failures)} runs failed, and count in no figure; the first: {found.failures[0]}"
             notes.append(page.VerdictLine("bad", text))
-        notes += fewest(found.rows)
+        notes += fewest(found.rows, found.metrics)
     return page.render(
         found.folder / PAGE,
         title=f"{title}: {found.read.experiment.title}",
@@ -72,7 +81,7 @@ def write(found: SweepResult | TuningResult, command: str) -> Path:
         sections=[
             *sections,
             page.Section("The experiment", listing=found.read.listing, folded="Show the file"),
-            page.Section("Definitions", terms=(*TERMS, *((m.label, m.meaning) for m in foreign_metrics().values()))),
+            page.Section("Definitions", terms=(*TERMS, *((added.label, added.meaning) for added in others))),
         ],
     )
 
@@ -80,40 +89,42 @@ def write(found: SweepResult | TuningResult, command: str) -> Path:
 def _swept(found: SweepResult) -> list[page.Section]:
     folded = "Show the table" if len(found.rows) > MOST_LINES else ""
     return [
-        page.Section("Messages against error", pictures=pictures(found.folder, found.rows, joined=True)),
-        page.Section("All cells", tables=(table(found.rows),), folded=folded),
+        page.Section("Messages against error", pictures=pictures(found.folder, found.rows, found.metrics)),
+        page.Section("All cells", tables=(table(found.rows, found.metrics),), folded=folded),
     ]
 
 
 def _searched(tuned: TuningResult) -> list[page.Section]:
     reference = [row for row in tuned.rows if row.reference]
     seeds, tried = page.seeds_in_words(tuned.seeds), page.seeds_in_words(searched(tuned.tuning))
-    drawn = pictures(tuned.folder, [*reference, *tuned.tried], joined=False)
+    drawn = pictures(tuned.folder, [*reference, *tuned.tried], tuned.metrics, joined=False)
     return [
-        page.Section("Result", (f"On seeds {seeds}, which no choice has seen.",), (table(tuned.rows),)),
+        page.Section("Result", (f"On seeds {seeds}, which no choice has seen.",), (table(tuned.rows, tuned.metrics),)),
         page.Section("All points of the search", (f"On seeds {tried}.",), pictures=drawn),
-        page.Section("Table of the search", tables=(table(tuned.tried),), folded="Show the table"),
+        page.Section("Table of the search", tables=(table(tuned.tried, tuned.metrics),), folded="Show the table"),
     ]
 
 
 def verdict(tuned: TuningResult) -> list[page.VerdictLine]:
     """For each case whether the limits were kept on the reporting seeds, and at how many messages."""
-    limits = " and ".join(map(str, tuned.objective.limits))
+    limits, error = tuned.objective.limits_in_words(" and "), main_error(tuned.rows, tuned.metrics)
     found = []
     for row in (row for row in tuned.rows if not row.reference):
         kept = tuned.objective.kept(row)
-        text = f"{row.label}: {_saved(row)}, {'keeps' if kept else 'does not keep'} {limits}"
+        text = f"{row.label}: {_saved(row, error, tuned.metrics)}, {'keeps' if kept else 'does not keep'} {limits}"
         found.append(page.VerdictLine("good" if kept else "bad", text))
     return found
 
 
-def table(rows: Sequence[CellRow], title: str = "", chosen: Sequence[str] = ()) -> page.Table:
+def table(
+    rows: Sequence[CellRow], metrics: Mapping[str, Metric], title: str = "", chosen: Sequence[str] = ()
+) -> page.Table:
     """A row for each cell: case, parameters, numbers; some of them (keys of `numbers`), if `chosen`.
 
     With a `title`, for a paper: a number that is the same in all cells stands in the note, with the number of seeds.
     """
     parameters = parameter_columns(rows)
-    shown = numbers()
+    shown = numbers(metrics) if chosen else known_numbers(rows, metrics)
     columns = {shown[name][0]: [shown[name][1](row) for row in rows] for name in chosen or shown}
     alike = {head: cells[0] for head, cells in columns.items() if title and not chosen and len({*cells}) == 1}
     columns = parameters | {head: cells for head, cells in columns.items() if head not in alike}
@@ -129,7 +140,13 @@ def table(rows: Sequence[CellRow], title: str = "", chosen: Sequence[str] = ()) 
 
 
 def pictures(
-    folder: Path, rows: Sequence[CellRow], *, joined: bool = True, width: float = style.WIDTH, pdf: bool = False
+    folder: Path,
+    rows: Sequence[CellRow],
+    metrics: Mapping[str, Metric],
+    *,
+    joined: bool = True,
+    width: float = style.WIDTH,
+    pdf: bool = False,
 ) -> tuple[page.PageFigure, ...]:
     """Messages against IAE, ITAE and other known metrics with a figure, so wide [in]; also as files, see `style.save`.
 
@@ -137,14 +154,15 @@ def pictures(
     """
     against = {
         name: metric
-        for name, metric in relative_metrics().items()
-        if metric.figure and metric.shown and any(row.ratio[name].mean is not None for row in rows)
+        for name, metric in relative_metrics(metrics).items()
+        if metric.figure and metric.shown and any(row.value(name).mean is not None for row in rows)
     }
+    files = {name: f"pareto_{plain(name).replace(':', '_')}" for name in against}
     for file in (folder / "figures").glob("pareto_*.*"):
-        if file.stem.removeprefix("pareto_") not in against:
+        if file.stem not in files.values():
             file.unlink(missing_ok=True)
-    drawn = {name: pareto(rows, name, joined=joined, width=width) for name in against}
-    saved = [style.save(each, folder / "figures", f"pareto_{name}", pdf=pdf) for name, each in drawn.items()]
+    drawn = {name: pareto(rows, name, metrics=metrics, joined=joined, width=width) for name in against}
+    saved = [style.save(each, folder / "figures", files[name], pdf=pdf) for name, each in drawn.items()]
     more = ["; more is better" * (metric.better == "more") for metric in against.values()]
     captions = [
         f"Messages against {metric.label}, likewise{which}." if k else CAPTION.format(metric.label + which)
@@ -153,35 +171,46 @@ def pictures(
     return page.numbered(zip(saved, captions, strict=True))
 
 
-def fewest(rows: Sequence[CellRow]) -> list[page.VerdictLine]:
+def fewest(rows: Sequence[CellRow], metrics: Mapping[str, Metric]) -> list[page.VerdictLine]:
     """Per environment the cell with the fewest messages within each level of error; the nearest one if none is."""
-    others = [row for row in rows if not row.reference and not row.failed and row.ratio["iae"].mean is not None]
+    error = main_error(rows, metrics)
+    others = [row for row in rows if not row.reference and not row.failed and row.ratio[error].mean is not None]
     parts = by_environment(others)
     found: list[page.VerdictLine] = []
     for where, part in parts.items():
         levels = LEVELS if len(parts) == 1 else LEVELS[-1:]
-        found += _fewest_within(part, levels, f"With {where}: " if len(parts) > 1 else "")
+        found += _fewest_within(part, levels, f"With {where}: " if len(parts) > 1 else "", error, metrics)
     return found
 
 
-def _fewest_within(rows: Sequence[CellRow], levels: Sequence[float], where: str) -> list[page.VerdictLine]:
+def _fewest_within(
+    rows: Sequence[CellRow], levels: Sequence[float], where: str, error: str, metrics: Mapping[str, Metric]
+) -> list[page.VerdictLine]:
     """As `fewest`, of one environment, with words about that in front."""
+    label = metrics[error].label
     found: dict[str, page.VerdictLine] = {}
     for level in levels:
-        within = [row for row in front(rows) if (row.ratio["iae"].mean or 0.0) <= level]
+        within = [row for row in front(rows, error, metrics) if (row.ratio[error].mean or 0.0) <= level]
         if within:
-            what = f"{where}fewest messages with an IAE ratio of at most {level:g}"
-            text = f"{what[0].upper()}{what[1:]}: {within[0].label}: {_saved(within[0])}"
+            what = f"{where}fewest messages with {_an(label)} ratio of at most {level:g}"
+            text = f"{what[0].upper()}{what[1:]}: {within[0].label}: {_saved(within[0], error, metrics)}"
             found.setdefault(within[0].label, page.VerdictLine("good" if within[0].acquired == 1.0 else "fair", text))
     if not found:
-        nearest = min(rows, key=lambda row: row.ratio["iae"].mean or 0.0)
-        what = f"{where}no cell has an IAE ratio of at most {LEVELS[-1]:g}; the nearest"
-        text = f"{what[0].upper()}{what[1:]}: {nearest.label}: {_saved(nearest)}"
+        nearest = min(rows, key=lambda row: row.ratio[error].mean or 0.0)
+        what = f"{where}no cell has {_an(label)} ratio of at most {LEVELS[-1]:g}; the nearest"
+        text = f"{what[0].upper()}{what[1:]}: {nearest.label}: {_saved(nearest, error, metrics)}"
         return [page.VerdictLine("fair", text)]
     return list(found.values())
 
 
-def _saved(row: CellRow) -> str:
+def _an(label: str) -> str:
+    return f"an {label}" if label == OURS["iae"].label else f"a {label}"
+
+
+def _saved(row: CellRow, error: str, metrics: Mapping[str, Metric]) -> str:
     messages = row.ratio["messages"].mean
     less = "?" if messages is None else f"{100.0 * (messages - 1.0):+.1f} %".replace("-", "\N{MINUS SIGN}")
-    return f"{less} messages, IAE {ratio_words(row.ratio['iae'])}, ITAE {ratio_words(row.ratio['itae'])}"
+    errors = (error, "itae") if error == "iae" else (error,)
+    return ", ".join(
+        [f"{less} messages", *(f"{metrics[each].label} {ratio_words(row.ratio[each])}" for each in errors)]
+    )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from experiments.metrics.metric import known_metrics
+from experiments.metrics.metric import Metric, swept_metrics
 from experiments.report.style import (
     CASES,
     CORNERS,
@@ -41,7 +41,14 @@ SPAN: Final = 8.0  # a wider range of messages is drawn on a logarithmic axis
 
 
 @styled
-def pareto(rows: Sequence[CellRow], index: str = "iae", *, joined: bool = True, width: float = WIDTH) -> Figure:
+def pareto(
+    rows: Sequence[CellRow],
+    index: str = "iae",
+    *,
+    metrics: Mapping[str, Metric] | None = None,
+    joined: bool = True,
+    width: float = WIDTH,
+) -> Figure:
     """Messages against an error, both over the reference with the same seeds; one curve for each trigger.
 
     Of several parameters the first runs along the curves, markers show the others. Full markers: no other cell of the
@@ -52,10 +59,12 @@ def pareto(rows: Sequence[CellRow], index: str = "iae", *, joined: bool = True, 
     Args:
         rows: The cells; those without known ratios are left out.
         index: Of the error: `iae`, or another metric that has a ratio.
+        metrics: Those of the sweep; left out: those of all sweeps.
         joined: Whether cells of a case are joined along a parameter, if these curves are few; else they are a cloud.
     """
+    metrics = swept_metrics() if metrics is None else metrics
     known = [row for row in rows if not row.reference and _point_of(row, index) is not None]
-    fronts = [front(rows, index) for rows in by_environment(known).values()]
+    fronts = [front(rows, index, metrics) for rows in by_environment(known).values()]
     best = {id(row) for rows in fronts for row in rows}
     figure = Drawing(figsize=(width, min(2.9, 0.83 * width)), layout="constrained")
     axes = figure.subplots()
@@ -87,7 +96,7 @@ def pareto(rows: Sequence[CellRow], index: str = "iae", *, joined: bool = True, 
     cross: dict[str, Any] = {"color": INK, "markersize": 7, "markeredgewidth": 1.0, "zorder": 4}
     axes.plot(1.0, 1.0, "+", label=f"{_reference(rows)} (reference)", **cross)
     axes.set_xlabel(f"messages relative to {_reference(rows)}")
-    axes.set_ylabel(f"{plain(known_metrics()[index].label)} relative to {_reference(rows)}")
+    axes.set_ylabel(f"{plain(metrics[index].label)} relative to {_reference(rows)}")
     low = min((row.ratio["messages"].mean or 1.0 for row in known), default=1.0)
     if low < 1.0 / SPAN:
         axes.set_xscale("log")
@@ -100,7 +109,7 @@ def pareto(rows: Sequence[CellRow], index: str = "iae", *, joined: bool = True, 
     return figure
 
 
-def front(rows: Sequence[CellRow], index: str = "iae") -> list[CellRow]:
+def front(rows: Sequence[CellRow], index: str = "iae", metrics: Mapping[str, Metric] | None = None) -> list[CellRow]:
     """Cells than which none has fewer messages and no more error, or less error and no more messages.
 
     Of a metric of which more is better, less counts as more error.
@@ -109,7 +118,7 @@ def front(rows: Sequence[CellRow], index: str = "iae") -> list[CellRow]:
     """
     found: list[CellRow] = []
     last = (math.inf, math.inf)
-    sign = -1.0 if known_metrics()[index].better == "more" else 1.0
+    sign = -1.0 if (swept_metrics() if metrics is None else metrics)[index].better == "more" else 1.0
     points = [
         ((at[0], sign * at[1]), row) for row in rows if not row.failed and (at := _point_of(row, index)) is not None
     ]

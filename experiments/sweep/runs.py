@@ -15,11 +15,21 @@ import numpy as np
 
 from agents.body.interface import BodyError
 from agents.plugins import registry
+from agents.plugins.laws import Gradient
 from experiments.definition.plan import Plan
 from experiments.definition.standby import without_standby
 from experiments.file.choices import plugin_files, tables
 from experiments.metrics.measure import ended_early, failures
-from experiments.metrics.metric import LEAN, case_values, foreign_metrics, swept_metrics, values_of
+from experiments.metrics.metric import (
+    LEAN,
+    case_values,
+    foreign_metrics,
+    law_metrics,
+    measures_of,
+    metrics_of_criteria,
+    swept_metrics,
+    values_of,
+)
 from experiments.metrics.signals import Measurement
 from experiments.recording.trace import Trace
 from experiments.recording.version import ROOT, engine_versions, file_digest
@@ -101,7 +111,8 @@ def code_of(plan: Plan) -> str:
     engine = plan.engine_name
     libraries = [engine, *engine_versions(engine), *(engine_versions(library) if library else [])]
     others = sorted(file_digest(file) for file in files if file.parent.parent != ROOT)
-    others += [f"{name} {file_digest(Path(getfile(type(each))))}" for name, each in foreign_metrics().items()]
+    added = foreign_metrics() | metrics_of_criteria(plan.experiment.criteria)[0]
+    others += [f"{name} {file_digest(Path(getfile(type(each))))}" for name, each in added.items()]
     return hashlib.sha256(":".join((digest_of_code(), np.__version__, *libraries, *others)).encode()).hexdigest()[:20]
 
 
@@ -133,9 +144,11 @@ def without_comments(text: str) -> str:
     return '"""'.join(parts)
 
 
-def lean_enough() -> bool:
-    """Whether a lean log has all that the metrics need."""
-    return all(LEAN.issuperset(metric.needs) for metric in swept_metrics().values())
+def lean_enough(plan: Plan) -> bool:
+    """Whether a lean log has all that the metrics need; what a law measures is known by its run only."""
+    return isinstance(plan.law, Gradient) and all(
+        LEAN.issuperset(each.needs) for each in swept_metrics([plan]).values()
+    )
 
 
 def fly_seeds(plan: Plan, seeds: tuple[int, ...]) -> tuple[list[RunMetrics], dict[int, str]]:
@@ -143,7 +156,7 @@ def fly_seeds(plan: Plan, seeds: tuple[int, ...]) -> tuple[list[RunMetrics], dic
     runs, failed = [], {}
     for seed in seeds:
         try:
-            log = simulate(plan, seed, lean=lean_enough())
+            log = simulate(plan, seed, lean=lean_enough(plan))
         except FAILED as error:
             failed[seed] = str(error)
         else:
@@ -153,7 +166,7 @@ def fly_seeds(plan: Plan, seeds: tuple[int, ...]) -> tuple[list[RunMetrics], dic
 
 def run_metrics(trace: Trace) -> RunMetrics:
     """Metrics of one run, from a trace that may be lean."""
-    shared, metrics = Measurement(trace), swept_metrics()
+    shared, metrics = Measurement(trace), swept_metrics([trace.plan]) | law_metrics(measures_of(trace))
     values, faults = values_of(metrics, shared, lean=trace.position.shape[2] == 0)
     return RunMetrics(
         seed=trace.seed,

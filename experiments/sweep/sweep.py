@@ -16,7 +16,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -28,7 +28,7 @@ from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.file.document import Document, load
 from experiments.file.problems import refusal
-from experiments.metrics.metric import unusable_metrics
+from experiments.metrics.metric import Metric, law_metrics, measures_in, swept_metrics, unusable_metrics
 from experiments.recording.run_folder import RUNS, naming
 from experiments.sweep import table
 from experiments.sweep.plan import Axis, Cell, arguments, cells, seeds_of
@@ -63,16 +63,17 @@ class SweepResult:
     missing: int  # runs not done, because the sweep was interrupted
     folder: Path  # folder of the runs
     notes: tuple[str, ...]  # remarks for the user
+    metrics: Mapping[str, Metric]  # metrics of the table
 
     def __str__(self) -> str:
         """The table, as the command prints it."""
-        return "\n".join(table.text(self.rows))
+        return "\n".join(table.text(self.rows, self.metrics))
 
-    def pareto(self) -> Figure:
-        """Messages against error, see `experiments.sweep.pareto`."""
+    def pareto(self, index: str = "") -> Figure:
+        """Messages against an error, see `experiments.sweep.pareto`; IAE, or what stands in its place, if left out."""
         from experiments.sweep.pareto import pareto  # noqa: PLC0415 - matplotlib takes 0.6 s
 
-        return pareto(self.rows)
+        return pareto(self.rows, index or table.main_error(self.rows, self.metrics), metrics=self.metrics)
 
 
 def sweep(
@@ -119,11 +120,12 @@ def sweep(
             runner = SweepRunner(store, working, most_seeds)
             with suppress(KeyboardInterrupt):  # what is done is kept
                 runner.run_missing(plan, seeds, progress)
+        metrics = runner.metrics(plan, seeds)
         rows = runner.rows(plan, seeds)
         failures = runner.failures(plan, seeds)
         notes += runner.metric_faults(plan, seeds)
         missing = sum(len(runner.missing(cell, seeds)) for cell in _distinct(plan))
-    return SweepResult(read, tuple(axes), seeds, tuple(rows), failures, missing, folder, tuple(notes))
+    return SweepResult(read, tuple(axes), seeds, tuple(rows), failures, missing, folder, tuple(notes), metrics)
 
 
 @dataclass
@@ -170,14 +172,20 @@ class SweepRunner:
 
     def rows(self, plan: Sequence[Cell], seeds: Sequence[int]) -> list[CellRow]:
         """The cells of which anything is done."""
-        by_digest = {cell.digest: cell for cell in plan}
+        by_digest, metrics = {cell.digest: cell for cell in plan}, self.metrics(plan, seeds)
         found = []
         for cell in plan:
             known, mine = self._known(cell, seeds), self._runs(cell, seeds)
             if known:
                 reference = self._runs(by_digest[cell.reference], seeds)
-                found.append(table.row(cell, mine, reference, len(known) - len(mine)))
+                found.append(table.row(cell, mine, reference, len(known) - len(mine), metrics))
         return found
+
+    def metrics(self, plan: Sequence[Cell], seeds: Sequence[int]) -> dict[str, Metric]:
+        """Metrics of the cells: of all sweeps, of their criteria, and measures of their laws."""
+        found = swept_metrics({cell.digest: cell.plan for cell in plan}.values())
+        values = {name for cell in _distinct(plan) for run in self._runs(cell, seeds).values() for name in run.values}
+        return found | law_metrics(measures_in(sorted(values - {*found})))
 
     def failures(self, plan: Sequence[Cell], seeds: Sequence[int]) -> tuple[str, ...]:
         """Reasons of failed runs."""
@@ -205,7 +213,7 @@ def side_by_side(plan: Plan) -> int:
     """Seeds of an experiment that one process simulates side by side."""
     experiment = plan.experiment
     samples = (experiment.duration_s + AROUND_S) * experiment.rates.state_hz
-    size = LEAN_BYTES if lean_enough() else WHOLE_BYTES
+    size = LEAN_BYTES if lean_enough(plan) else WHOLE_BYTES
     return max(1, min(MOST_SEEDS, int(MOST_BYTES / (size * samples * len(experiment.robots)))))
 
 

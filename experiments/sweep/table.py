@@ -12,7 +12,7 @@ import msgspec
 
 from experiments.file import reference as reference_of_file
 from experiments.metrics.comparable import equally_long
-from experiments.metrics.metric import Metric, short_name, swept_metrics
+from experiments.metrics.metric import Metric, facts_of, from_facts, short_name, swept_metrics
 from experiments.metrics.statistics import Spread, ratio, spread
 from experiments.report.page import NONE, interval
 from experiments.report.tables import ratio_words
@@ -63,8 +63,15 @@ class CellRow(msgspec.Struct, frozen=True):
         return f"{self.case} {self.words}".strip()
 
 
-def row(cell: Cell, runs: Mapping[int, RunMetrics], reference: Mapping[int, RunMetrics], failed: int = 0) -> CellRow:
-    """A cell's runs, by seed, and those of its reference."""
+def row(
+    cell: Cell,
+    runs: Mapping[int, RunMetrics],
+    reference: Mapping[int, RunMetrics],
+    failed: int = 0,
+    metrics: Mapping[str, Metric] | None = None,
+) -> CellRow:
+    """A cell's runs, by seed, and those of its reference; some `metrics` instead of those of all sweeps."""
+    metrics = swept_metrics() if metrics is None else metrics
     mine = [runs[seed] for seed in sorted(runs)]
     paired = [
         (runs[seed], reference[seed])
@@ -72,7 +79,6 @@ def row(cell: Cell, runs: Mapping[int, RunMetrics], reference: Mapping[int, RunM
         if seed in reference and equally_long((runs[seed].duration_s, reference[seed].duration_s))
     ]
     acquired = [run.values["acquired_s"] is not None for run in mine]
-    relative = relative_metrics()
     gaps = [run.gap_min_s for run in mine if run.gap_min_s is not None]
     return CellRow(
         case=cell.case,
@@ -82,25 +88,34 @@ def row(cell: Cell, runs: Mapping[int, RunMetrics], reference: Mapping[int, RunM
         reference=cell.digest == cell.reference,
         seeds=len(mine),
         failed=failed,
-        mean={name: spread([run.values[name] for run in mine]) for name in swept_metrics()},
+        mean={name: spread([run.values.get(name) for run in mine]) for name in metrics},
         ratio={
-            name: spread([ratio(one.values[name], other.values[name]) for one, other in paired]) for name in relative
+            name: spread([ratio(one.values.get(name), other.values.get(name)) for one, other in paired])
+            for name in relative_metrics(metrics)
         },
         acquired=sum(acquired) / len(acquired) if acquired else None,
         gap_min_s=min(gaps, default=None),
     )
 
 
-def relative_metrics() -> dict[str, Metric]:
-    """Metrics of sweeps that are taken over the reference."""
-    return {name: metric for name, metric in swept_metrics().items() if metric.relative}
+def relative_metrics(metrics: Mapping[str, Metric] | None = None) -> dict[str, Metric]:
+    """Metrics of all sweeps, or those of `metrics`, that are taken over the reference."""
+    metrics = swept_metrics() if metrics is None else metrics
+    return {name: metric for name, metric in metrics.items() if metric.relative}
 
 
-def write_csv(path: Path, rows: Sequence[CellRow]) -> None:
+def main_error(rows: Sequence[CellRow], metrics: Mapping[str, Metric]) -> str:
+    """The metric of which less is better that tells cells apart: IAE; without targets the first with a known ratio."""
+    drawn = [name for name, each in relative_metrics(metrics).items() if each.figure and each.better == "less"]
+    known = (name for name in drawn if any(row.ratio.get(name, UNKNOWN).mean is not None for row in rows))
+    return next(known, "iae")
+
+
+def write_csv(path: Path, rows: Sequence[CellRow], metrics: Mapping[str, Metric]) -> None:
     """A line for each row; empty where a value is unknown, and where a case has no such parameter."""
     paths = list(dict.fromkeys(path for each in rows for path in each.parameters))
-    columns = [part for name in swept_metrics() for part in (name, f"{name}_ci95")]
-    columns += [part for name in relative_metrics() for part in (f"{name}_ratio", f"{name}_ratio_ci95")]
+    columns = [part for name in metrics for part in (name, f"{name}_ci95")]
+    columns += [part for name in relative_metrics(metrics) for part in (f"{name}_ratio", f"{name}_ratio_ci95")]
     head = ["case", *paths, "reference", "seeds", "failed", *columns, "acquired_share", "gap_min_s"]
     with path.open("w", newline="", encoding="utf-8") as file:
         table = csv.DictWriter(file, head, restval="")
@@ -114,11 +129,14 @@ def write_csv(path: Path, rows: Sequence[CellRow]) -> None:
             table.writerow({**found, "acquired_share": each.acquired, "gap_min_s": each.gap_min_s})
 
 
-def document(title: str, seeds: Sequence[int], rows: Sequence[CellRow], **more: object) -> dict[str, Any]:
-    """The table for programs."""
+def document(
+    title: str, seeds: Sequence[int], rows: Sequence[CellRow], metrics: Mapping[str, Metric], **more: object
+) -> dict[str, Any]:
+    """The table for programs, with what metrics of files and of laws are."""
     reference = next((each.case for each in rows if each.reference), None)
     listed = [msgspec.to_builtins(each) for each in rows]
-    return {"experiment": title, "reference": reference, "seeds": list(seeds), **more, "cells": listed}
+    added = {"metrics": facts} if (facts := facts_of(metrics)) else {}
+    return {"experiment": title, "reference": reference, "seeds": list(seeds), **more, **added, "cells": listed}
 
 
 def write_json(path: Path, table: Mapping[str, Any]) -> None:
@@ -126,14 +144,15 @@ def write_json(path: Path, table: Mapping[str, Any]) -> None:
     path.write_bytes(msgspec.json.format(msgspec.json.encode(table), indent=2) + b"\n")
 
 
-def read_json(path: Path) -> tuple[dict[str, Any], list[CellRow]]:
-    """A table that `write_json` has written, and its rows.
+def read_json(path: Path) -> tuple[dict[str, Any], list[CellRow], dict[str, Metric]]:
+    """A table that `write_json` has written, its rows, and its metrics.
 
     Raises ValueError if there is none, or that of another version.
     """
     try:
         found = msgspec.json.decode(path.read_bytes(), type=dict[str, Any])
-        return found, msgspec.convert(found.get("cells"), list[CellRow])
+        metrics = swept_metrics() | from_facts(msgspec.convert(found.get("metrics", {}), dict[str, dict[str, Any]]))
+        return found, msgspec.convert(found.get("cells"), list[CellRow]), metrics
     except (OSError, RecursionError) as error:
         raise ValueError(str(error)) from None
 
@@ -154,10 +173,10 @@ def _ratio_of(row: CellRow, name: str) -> str:
     return ratio_words(ratio) + (f" ({ratio.n} of {row.seeds})" if ratio.n not in {0, row.seeds} else "")
 
 
-def numbers() -> dict[str, tuple[str, Callable[[CellRow], str]]]:
+def numbers(metrics: Mapping[str, Metric]) -> dict[str, tuple[str, Callable[[CellRow], str]]]:
     """Head and text of each column for people, by the name behind `--metrics`."""
     found: dict[str, tuple[str, Callable[[CellRow], str]]] = {}
-    for name, metric in swept_metrics().items():
+    for name, metric in metrics.items():
         if metric.shown and metric.relative:
             found[short_name(name)] = (f"{metric.label} ratio", partial(_ratio_of, name=name))
         elif metric.shown:
@@ -166,9 +185,18 @@ def numbers() -> dict[str, tuple[str, Callable[[CellRow], str]]]:
     return found
 
 
-def text(rows: Sequence[CellRow]) -> list[str]:
+def known_numbers(
+    rows: Sequence[CellRow], metrics: Mapping[str, Metric]
+) -> dict[str, tuple[str, Callable[[CellRow], str]]]:
+    """Columns of `numbers` without those of errors where no link has any."""
+    unknown = {short_name(name) for name in ("iae", "itae", "acquired_s")}
+    bare = all(row.mean.get("iae", UNKNOWN).mean is None for row in rows)
+    return {name: column for name, column in numbers(metrics).items() if not bare or name not in unknown}
+
+
+def text(rows: Sequence[CellRow], metrics: Mapping[str, Metric]) -> list[str]:
     """The main columns, for the terminal."""
-    shown = numbers().values()
+    shown = known_numbers(rows, metrics).values()
     heads = [head for head, _ in shown]
     lines: list[tuple[str, ...]] = [("case", "parameters", "seeds", *heads)]
     for row in rows:

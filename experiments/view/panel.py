@@ -254,7 +254,8 @@ def table(rows: Sequence[RobotRow], stage: SceneModel) -> str:
         left = f"<div style='opacity:0.6'>and {len(rows) - TABLE} more; the worst are shown</div>"
         shown = shown[:TABLE]
     measures = [*dict.fromkeys(name for row in shown for name in row.measures)][:MEASURES]
-    every = (*HEADS, *map(escape, measures))
+    named = (f"{name} [{stage.units[name]}]" if name in stage.units else name for name in measures)
+    every = (*HEADS, *map(escape, named))
     filled = []
     for row in shown:
         more = (f"{row.measures[name]:.3g}" if name in row.measures else "" for name in measures)

@@ -94,7 +94,7 @@ def report(
     seeds = pool_seeds(folders, read) if pooled else [run for found in read for run in found]
     cases = pages.labelled(named) if several else [case for run in seeds for case in run.metrics.values()]
     if form is not None:
-        names = {short_name(name): name for name in summary_metrics()}
+        names = {short_name(name): name for name in summary_metrics(cases)}
         tables = pages.result_tables(cases, [names[name] for name in known_words("--metrics", [metrics or ""], names)])
         _put(form(tables), out)
         return 0
@@ -193,12 +193,12 @@ def _report_sweep(
     from experiments.sweep import table
 
     try:
-        document, rows = table.read_json(folder / SWEEP)
+        document, rows, known = table.read_json(folder / SWEEP)
     except ValueError as error:
         raise RecordingError(f"{folder / SWEEP}: cannot be read: {error}; make the sweep again") from None
     if form is not None:
-        chosen = known_words("--metrics", [metrics or ""], table.numbers())
-        _put(form([pages.table(rows, str(document.get("experiment", folder.name)), chosen)]), out)
+        chosen = known_words("--metrics", [metrics or ""], table.numbers(known))
+        _put(form([pages.table(rows, known, str(document.get("experiment", folder.name)), chosen)]), out)
         return 0
     searched = "tuning" in document  # its figures show all that was tried
     if searched:
@@ -208,7 +208,7 @@ def _report_sweep(
             raise RecordingError(f"{folder}: a search of another version; make it again") from None
         rows = [*(row for row in rows if row.reference), *tried]
     target = Path(out or folder)
-    pages.pictures(target, rows, joined=not searched, width=width, pdf=pdf)
+    pages.pictures(target, rows, known, joined=not searched, width=width, pdf=pdf)
     figures = target / "figures"
     print_result({"figures": figures, "cells": len(rows)}, str(figures), as_json=as_json)
     return 0

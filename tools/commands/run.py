@@ -438,7 +438,7 @@ def _hazards(runs: Sequence[Run]) -> Iterator[str]:
 
 def _case_line(name: str, runs: Sequence[Run], found: dict[str, Any]) -> str:
     """The key figures of a case, over all seeds: means of a robot; losses are sums over all robots."""
-    from experiments.metrics.metric import foreign_metrics, terminal_labels
+    from experiments.metrics.metric import OF_LAW, foreign_metrics, terminal_labels
     from experiments.metrics.statistics import Spread, spread
     from experiments.report.page import interval
     from experiments.report.tables import ratio_words
@@ -457,6 +457,9 @@ def _case_line(name: str, runs: Sequence[Run], found: dict[str, Any]) -> str:
         line += f", IAE {mean['iae']} m s, RMSE {mean['rmse']} m, {_acquired(mean['acquired_s'], measured)}"
     foreign = foreign_metrics(measured).items()
     added = {name: metric for name, metric in foreign if metric.shown and name in mean}
+    of_law = [each for each in added if each.startswith(OF_LAW)]
+    for each in of_law[0 if case["mean"]["iae"] is not None else FEW :]:  # measures stand for errors
+        del added[each]
     labels = terminal_labels(added)
     line += "".join(f", {labels[name]} {mean[name]} {metric.unit}".rstrip() for name, metric in added.items())
     line += f", lost {sum(each.lost for each in measured)}"

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 app: Final = typer.Typer()
 
 INTERRUPTED: Final = 130  # exit code
+UNDRAWN: Final = "no metric with a ratio is known: give links a target, or the law a measure"
 
 
 @app.command(
@@ -95,9 +96,9 @@ def sweep(
         except KeyboardInterrupt:
             print("interrupted: all that was tried is kept; the same command goes on from there", file=sys.stderr)
             return 130
-    table = tables.document(found.read.experiment.title, found.seeds, found.rows, **more)
+    table = tables.document(found.read.experiment.title, found.seeds, found.rows, found.metrics, **more)
     with naming(found.folder):
-        tables.write_csv(found.folder / "sweep.csv", found.rows)
+        tables.write_csv(found.folder / "sweep.csv", found.rows, found.metrics)
         tables.write_json(found.folder / SWEEP, table)
     lines += [f"note: {note}" for note in found.notes]
     lines.append(f"table: {found.folder / 'sweep.csv'}, {found.folder / SWEEP}")
@@ -110,7 +111,8 @@ def sweep(
         words += [part for setting in changes for part in ("--set", setting)]
         with naming(found.folder):
             page = pages.write(found, shlex.join([*words, *(["--optimise", optimise] if optimise else [])]))
-        lines += [f"figures: {found.folder / 'figures'}", f"page: {page}"]
+        figures = found.folder / "figures"
+        lines += [f"figures: {figures}" if any(figures.glob("*")) else f"figures: none, {UNDRAWN}", f"page: {page}"]
     print_result(table, *lines, as_json=as_json)
     if open_report and page is not None and code != INTERRUPTED:
         open_in_browser(page.resolve().as_uri())
@@ -155,11 +157,11 @@ def _optimise(file: str, given: Sequence[str], objective: str, options: dict[str
         found = tune(
             file, given, objective, **options, progress=lambda case, done, of: bar.show(f"{case}: tried", done, of)
         )
-    tables.write_csv(found.folder / "tried.csv", found.tried)
+    tables.write_csv(found.folder / "tried.csv", found.tried, found.metrics)
     tuning, seeds = seeds_in_words(found.tuning), seeds_in_words(found.seeds)
-    lines = [f"tuned on seeds {tuning}, reported on seeds {seeds}", *tables.text(found.rows)]
+    lines = [f"tuned on seeds {tuning}, reported on seeds {seeds}", *tables.text(found.rows, found.metrics)]
     kept = {row.label: found.objective.kept(row) for row in found.rows if not row.reference}
-    limits = ", ".join(map(str, found.objective.limits))
+    limits = found.objective.limits_in_words(", ")
     lines += [f"{label}: {'keeps' if well else 'DOES NOT KEEP'} {limits}" for label, well in kept.items()]
     more = {
         "tuning": list(found.tuning),

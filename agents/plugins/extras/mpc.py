@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final
 import msgspec
 from msgspec import Meta
 
-from agents.plugins.law import Control, Law, Memory, NeighbourView, RobotFacts, Said, Severity, View, is_known
+from agents.plugins.law import Control, Law, Measure, Memory, NeighbourView, RobotFacts, Said, Severity, View, is_known
 from agents.plugins.registry import PluginError
 from agents.vectors import NotNegative, Positive, clamp
 
@@ -42,6 +42,7 @@ class Mpc(Law, frozen=True):
 
     SAYS: ClassVar[Mapping[str, Said]] = {"path": Said(unit="m", place=-2)}  # its end is drawn
     ALONE: ClassVar[bool] = True
+    MEASURES: ClassVar[Mapping[str, Measure]] = {"conflicts": Measure(), "slack": Measure("m")}
     PREDICTION: ClassVar[str] = "constant-velocity"
     LIBRARY: ClassVar[str] = "daqp"
 

@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar, Final
 
 from msgspec import Meta
 
-from agents.plugins.law import Control, Law, Memory, RobotFacts, Severity, View
+from agents.plugins.law import Control, Law, Measure, Memory, RobotFacts, Severity, View
 from agents.plugins.registry import PluginError
 
 OWN: Final = 4  # numbers of a robot's own motion in an observation
@@ -30,6 +30,10 @@ class Policy(Law, frozen=True):
     """
 
     PREDICTION: ClassVar[str] = "constant-velocity"
+    MEASURES: ClassVar[Mapping[str, Measure]] = {
+        "wanted_x": Measure("m/s", better=""),
+        "wanted_y": Measure("m/s", better=""),
+    }
     LIBRARY: ClassVar[str] = "onnxruntime"
     FILES: ClassVar[Mapping[str, str]] = {"file": "model"}
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar, Final
 import msgspec
 from msgspec import Meta
 
-from agents.plugins.law import Control, Law, Memory, RobotFacts, Said, Severity, View
+from agents.plugins.law import Control, Law, Measure, Memory, RobotFacts, Said, Severity, View
 from agents.vectors import NotNegative, Positive
 
 Place = tuple[float, float]
@@ -31,6 +31,7 @@ class Auction(Law, frozen=True):
     """
 
     ALONE: ClassVar[bool] = True
+    MEASURES: ClassVar[Mapping[str, Measure]] = {"task": Measure(better=""), "calm": Measure("s", better="")}
     SAYS: ClassVar[Mapping[str, Said]] = {
         "level": Said(unit="ε", metre=1e-3),
         "bidder": Said(metre=1e-3),

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from math import exp, nan
 from typing import Annotated, ClassVar
 
 import msgspec
 from msgspec import Meta
 
-from agents.plugins.law import Control, Law, Memory, View
+from agents.plugins.law import Control, Law, Measure, Memory, View
 from agents.vectors import Positive
 
 Place = tuple[float, float]
@@ -25,6 +25,7 @@ class Coverage(Law, frozen=True):
     """
 
     ALONE: ClassVar[bool] = True
+    MEASURES: ClassVar[Mapping[str, Measure]] = {"cost": Measure(), "mass": Measure(better="")}
 
     gain: Annotated[Positive, Meta(description="k [1/s]")] = 0.5
     area: Annotated[

@@ -8,7 +8,7 @@ from typing import Annotated, ClassVar
 
 from msgspec import Meta
 
-from agents.plugins.law import Control, Law, Memory, RobotFacts, Said, View, is_known
+from agents.plugins.law import Control, Law, Measure, Memory, RobotFacts, Said, View, is_known
 from agents.vectors import Positive
 
 
@@ -24,6 +24,7 @@ class Enclosing(Law, frozen=True):
     """
 
     PREDICTION: ClassVar[str] = "constant-velocity"
+    MEASURES: ClassVar[Mapping[str, Measure]] = {"radius": Measure("m", better=""), "gap": Measure("rad", better="")}
     SAYS: ClassVar[Mapping[str, Said]] = {
         "target": Said(unit="m", place=0),
         "speed": Said(unit="m/s", metre=0.5),  # 1 cm of threshold: 5 mm/s

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from math import hypot, nan
 from typing import Annotated, ClassVar
 
 from msgspec import Meta
 
-from agents.plugins.law import Control, Law, Memory, Need, RobotFacts, View
+from agents.plugins.law import Control, Law, Measure, Memory, Need, RobotFacts, View
 from agents.vectors import Positive
 
 
@@ -23,6 +24,7 @@ class Integral(Law, frozen=True):
     """
 
     NEEDS: ClassVar[Need] = "relative"
+    MEASURES: ClassVar[Mapping[str, Measure]] = {"error": Measure("m")}
 
     gain: Annotated[Positive, Meta(description="k [1/s]")] = 0.5
     integral: Annotated[Positive, Meta(description="κ [1/s²]")] = 0.1

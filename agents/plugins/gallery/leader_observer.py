@@ -8,7 +8,7 @@ from typing import Annotated, ClassVar
 
 from msgspec import Meta
 
-from agents.plugins.law import Control, Law, Memory, Need, RobotFacts, Said, View
+from agents.plugins.law import Control, Law, Measure, Memory, Need, RobotFacts, Said, View
 from agents.vectors import Positive
 
 
@@ -27,6 +27,7 @@ class LeaderObserver(Law, frozen=True):
 
     NEEDS: ClassVar[Need] = "relative"
     PREDICTION: ClassVar[str] = "constant-velocity"
+    MEASURES: ClassVar[Mapping[str, Measure]] = {"lag": Measure("m")}
     SAYS: ClassVar[Mapping[str, Said]] = {
         "v": Said(unit="m/s", metre=0.1),  # 1 cm of threshold: 1 mm/s
         "links": Said(metre=1e-3),

@@ -11,7 +11,7 @@ from typing import Annotated, Any, ClassVar, Final, Literal
 
 from msgspec import Meta
 
-from agents.plugins.law import Control, Law, Memory, RobotFacts, Said, Severity, Values, View, is_known
+from agents.plugins.law import Control, Law, Measure, Memory, RobotFacts, Said, Severity, Values, View, is_known
 from agents.vectors import Positive, Vector, difference
 
 Matrix = Sequence[Sequence[float]]  # 4 × 4, for a state of x, y [m] and v_x, v_y [m/s]
@@ -37,6 +37,7 @@ class Tracking(Law, frozen=True):
     """
 
     PREDICTION: ClassVar[str] = "constant-velocity"
+    MEASURES: ClassVar[Mapping[str, Measure]] = {"uncertainty": Measure("m"), "reading": Measure(better="")}
     SAYS: ClassVar[Mapping[str, Said]] = {  # 1 cm of threshold: one reading
         "y": Said(unit="m", metre=100.0),
         "Y": Said(metre=100.0),

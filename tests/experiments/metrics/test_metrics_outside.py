@@ -214,10 +214,10 @@ def test_reports_of_older_runs_lack_a_metric(known, short_trace, tmp_path):
 
 def test_sweep_keeps_what_metrics_need(known, short_triangle):
     known(way_m=Way())
-    assert runs.lean_enough()
+    assert runs.lean_enough(Plan(short_triangle))
     ((lean,), _) = runs.fly_seeds(Plan(short_triangle), (1,))
     known(way_m=Way(), height=Height())
-    assert not runs.lean_enough()
+    assert not runs.lean_enough(Plan(short_triangle))
     ((whole,), _) = runs.fly_seeds(Plan(short_triangle), (1,))
     assert whole.values.items() > lean.values.items()
     assert (whole.values["height"] is None, whole.metric_faults) == (False, ())

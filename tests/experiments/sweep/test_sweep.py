@@ -157,7 +157,7 @@ def test_curves_go_along_the_first_parameter(tmp_path):
     axes = pareto(found.rows).axes[0]
     assert [text.get_text() for text in axes.texts] == ["threshold = 0.005 m", "0.02"]
     assert axes.get_legend_handles_labels()[1][1:] == ["event", "gain = 2", "gain = 3", "periodic (reference)"]
-    page = sweep_page.table(found.rows, "a title")
+    page = sweep_page.table(found.rows, found.metrics, "a title")
     assert page.head[:3] == ("Case", "threshold [m]", "gain")
     assert "In all cells: " in page.note
     pareto(found.rows[:1]).canvas.draw()  # nothing but the reference
@@ -189,6 +189,8 @@ def test_the_command_writes_table_figures_and_page(done, capsys):
     assert {file.name for file in (done.folder / "figures").iterdir()} == {"pareto_iae.svg", "pareto_itae.svg"}
     assert commands.sweep("triangle", given, **options, as_json=True) == 0
     assert json.loads(capsys.readouterr().out)["cells"] == table["cells"]
-    sweep_table.write_json(done.folder / "sweep.json", sweep_table.document("t", [1], done.rows[:1], tuning=[7]))
+    sweep_table.write_json(
+        done.folder / "sweep.json", sweep_table.document("t", [1], done.rows[:1], done.metrics, tuning=[7])
+    )
     with pytest.raises(RecordingError, match="a search of another version; make it again"):
         report([str(done.folder)])
