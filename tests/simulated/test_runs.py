@@ -92,3 +92,12 @@ def test_recorder_that_hangs_is_replaced():
     assert killed.code == -9
     assert (flight.code, flight.violations) == (1, [])
     assert not [file for file in flight.files if "part2" in file]
+
+
+def test_recorder_started_after_the_end_leaves_no_part():
+    flight = fly(PAIR, Fault(2.2, "pause", "conductor", lasts=2.95))
+    first, second = flight.of("default-recorder")
+    assert (first.code, second.code) == (0, 0)
+    assert first.ended < second.begun
+    assert "not joined" not in flight.output
+    assert not [file for file in flight.files if "part2" in file]

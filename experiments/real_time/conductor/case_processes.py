@@ -238,8 +238,8 @@ class CaseProcesses:
         first, *later = self._parts
         joined = first.with_suffix(".joined")
         try:
-            recover(first, joined, later)
-            joined.replace(first)
+            if not recover(first, joined, later).complete:  # else nothing is written: the later parts are empty
+                joined.replace(first)
             for part in later:
                 part.unlink(missing_ok=True)
         except (RecordingError, OSError) as error:
