@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import importlib
+from collections.abc import Iterable, Mapping, Sequence
 from math import nan, pi, tau
 from typing import Any, Self
 
@@ -21,6 +22,16 @@ def known_rows(values: Iterable[Sequence[float] | float | None], width: int = 1)
     """Numbers or vectors as rows (n, width); NaN where there is none."""
     blank = nan if width == 1 else (nan,) * width
     return np.array([blank if each is None else each for each in values], dtype=float).reshape(-1, width)
+
+
+def data_frame(columns: Mapping[str, Any]) -> Any:  # noqa: ANN401 - of pandas or of polars
+    """Columns as a data frame of pandas, or of polars where only that is installed; raises ImportError without both."""
+    for library in ("pandas", "polars"):
+        try:
+            return importlib.import_module(library).DataFrame(columns)
+        except ModuleNotFoundError:
+            continue
+    raise ImportError("neither pandas nor polars is installed; `./zenpark install pandas` installs one of them")
 
 
 class ArrayTable(msgspec.Struct, frozen=True):

@@ -6,7 +6,6 @@ show(run.figures()["errors"], "figures/errors")     # the last line of a cell: s
 
 from __future__ import annotations
 
-import importlib
 import math
 import sys
 import time
@@ -21,6 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from agents.errors import ExplainedError
+from experiments.arrays import data_frame
 from experiments.cores import KILLED, cores, pool
 from experiments.definition import standby
 from experiments.definition.plan import Plan
@@ -113,13 +113,7 @@ class Run:
         Columns are those of `metrics.csv`; an unknown number is NaN. Raises ImportError if neither is installed.
         """
         rows = list(metrics_files.rows(list(self.metrics.values())))
-        columns = {name: _column([row[name] for row in rows]) for name in (rows[0] if rows else ())}
-        for library in ("pandas", "polars"):
-            try:
-                return importlib.import_module(library).DataFrame(columns)
-            except ModuleNotFoundError:
-                continue
-        raise ImportError("neither pandas nor polars is installed; `./zenpark install pandas` installs one of them")
+        return data_frame({name: _column([row[name] for row in rows]) for name in (rows[0] if rows else ())})
 
     def summary(self) -> dict[str, Any]:
         """The figures for scripts, as `./zenpark run --json` prints them."""

@@ -167,6 +167,21 @@ def targeted(law: Law, pattern: Pattern) -> Mask:
     return np.array(given, dtype=bool)
 
 
+def counted_links(law: Law, pattern: Pattern, rows: int) -> Array:
+    """(E, N) 1 where a link with a target counts for a robot: it receives on it, or sends, if it receives on none."""
+    counts, links = targeted(law, pattern)[:, None], pattern.links
+    as_receiver, as_sender = (np.eye(rows)[ends] * counts for ends in (links.receiver, links.sender))
+    return np.where(as_receiver.any(axis=0), as_receiver, as_sender)
+
+
+def robot_sums(error: Array, own: Array) -> Array:
+    """Σ of the known errors (T, E) over the links that count for each robot, `own` (E, N); NaN where none is known."""
+    known = np.isfinite(error)
+    total = np.where(known, error, 0.0) @ own
+    total[known.astype(float) @ own == 0.0] = np.nan
+    return np.asarray(total)
+
+
 def errors_over_time(law: Law, pattern: Pattern, time: Array, position: Array) -> Array:
     """Error of each link (T, E) by its target; NaN where the link is not there, has no target, or an end is unknown.
 

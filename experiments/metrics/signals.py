@@ -17,10 +17,9 @@ from msgspec import structs
 
 from agents.plugins.laws import Distance, Gradient
 from agents.plugins.predictors import HOLD, Predictor
-from agents.safety.hazards import OVER, QUIET_S, UNRESOLVED, is_blind
 from agents.vectors import Vector
 from experiments.arrays import ArrayTable
-from experiments.definition.formation import errors_over_time, targeted
+from experiments.definition.formation import counted_links, robot_sums, targeted
 from experiments.definition.graph import Links
 from experiments.definition.plan import Plan
 from experiments.metrics.clearance import Clearance
@@ -83,13 +82,8 @@ class LinkErrors:
         there = np.repeat(~away[:, None], rows, axis=1)
         if trace.joined is not None:
             there &= trace.time[:, None] >= trace.joined
-        blind = without_position(trace)
-        alive &= ~blind
-        place = np.where(blind[:, :, None], np.nan, trace.true_position) if blind.any() else trace.true_position
-        counts, ends = targeted(trace.plan.law, pattern)[:, None], (pattern.links.receiver, pattern.links.sender)
-        as_receiver, as_sender = (np.eye(rows)[each] * counts for each in ends)
-        own = np.where(as_receiver.any(axis=0), as_receiver, as_sender)
-        error = errors_over_time(trace.plan.law, pattern, trace.time, place)
+        alive &= ~trace.blind
+        own, error = counted_links(trace.plan.law, pattern, rows), trace.link_errors
         gone = ~np.maximum.accumulate((alive & (np.isfinite(error) @ own > 0.0))[::-1])[::-1]
         return cls(trace.time, pattern.links, own, error, alive, there, np.asarray(gone), away_s)
 
@@ -142,19 +136,6 @@ class LinkErrors:
             other = self.net.sender[k] if self.net.receiver[k] == i else self.net.receiver[k]
             found.append((float(mean[k]), names[other]))
         return found
-
-
-def without_position(trace: Trace) -> Mask:
-    """(T, N) samples at which a robot had lost its own position, by its hazards: its body may repeat an old one."""
-    blind = np.zeros((len(trace.time), len(trace.robots)), dtype=bool)
-    for event in trace.events:
-        lost = event.kind == "lost"  # its process ended: there are no more positions, or those of the next one
-        if event.source not in trace.robots or not (lost or (event.kind == "hazard" and is_blind(event.text))):
-            continue
-        since = event.stamp - QUIET_S if not lost and event.text.startswith(OVER) else event.stamp
-        begins = not (lost or event.text.startswith((OVER, UNRESOLVED)))
-        blind[trace.time >= since, trace.robots.index(event.source)] = begins
-    return blind
 
 
 def sums_over_window(error: Array, window: int) -> tuple[Array, Array]:
@@ -376,11 +357,7 @@ class Measurement:
     @_kept
     def robot_errors(self) -> Array:
         """e_i(t) = Σ_j e_ij (T, N) [m] over the own links of each robot; NaN where none of them is known."""
-        error, own = self.errors.error, self.errors.own
-        known = np.isfinite(error)
-        total = np.where(known, error, 0.0) @ own
-        total[known.astype(float) @ own == 0.0] = np.nan
-        return np.asarray(total)
+        return robot_sums(self.errors.error, self.errors.own)
 
     @_kept
     def integrals(self) -> tuple[Array, Array, Array]:

@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Final, Literal, TypeVar
+from typing import Any, Final, Literal, TypeVar
 
 import msgspec
 import numpy as np
 
 from agents.network import messages
 from agents.network.messages import Contact, Event, WorldState
-from experiments.arrays import PoseTable
+from agents.safety.hazards import OVER, QUIET_S, UNRESOLVED, is_blind
+from experiments.arrays import PoseTable, data_frame
+from experiments.definition.formation import counted_links, errors_over_time, robot_sums
 from experiments.definition.plan import Plan, finds_contacts
 from experiments.recording.clocks import ClockOffset
 from twins.arrays import Array, Index, Mask
@@ -160,6 +162,54 @@ class Trace:
     memory: Mapping[str, Array] = field(default_factory=dict)
     measures: Mapping[str, Array] = field(default_factory=dict)
     joined: Array | None = None  # (N,) [s] since when each robot takes part; None: all from the start
+
+    @cached_property
+    def blind(self) -> Mask:
+        """(T, N) samples at which a robot had lost its own position, by its hazards: its body may repeat an old one."""
+        blind = np.zeros((len(self.time), len(self.robots)), dtype=bool)
+        for event in self.events:
+            lost = event.kind == "lost"  # its process ended: there are no more positions, or those of the next one
+            if event.source not in self.robots or not (lost or (event.kind == "hazard" and is_blind(event.text))):
+                continue
+            since = event.stamp - QUIET_S if not lost and event.text.startswith(OVER) else event.stamp
+            begins = not (lost or event.text.startswith((OVER, UNRESOLVED)))
+            blind[self.time >= since, self.robots.index(event.source)] = begins
+        return blind
+
+    @cached_property
+    def link_errors(self) -> Array:
+        """Errors (T, E) [m] of links on true positions, see `formation.errors_over_time`; unknown of blind robots."""
+        unknown, place = self.blind, self.true_position
+        place = np.where(unknown[:, :, None], np.nan, place) if unknown.any() else place
+        return errors_over_time(self.plan.law, self.plan.formation, self.time, place)
+
+    def columns(self) -> dict[str, Array]:
+        """Time series of the robots by name, each (T, N): places [m], yaw [rad], error [m], what the law remembers."""
+        places = {"": self.position, "true_": self.true_position, "goal_": self.goal}
+        found = {f"{what}{axis}": each[..., k] for what, each in places.items() for k, axis in enumerate("xyz")}
+        found["yaw"] = self.yaw
+        found["error"] = robot_sums(
+            self.link_errors, counted_links(self.plan.law, self.plan.formation, len(self.robots))
+        )
+        for name, values in self.memory.items():
+            size = values.shape[2]
+            parts = {f"memory_{name}[{k}]" if size > 1 else f"memory_{name}": values[..., k] for k in range(size)}
+            found |= parts
+        return found | {f"measure_{name}": values for name, values in self.measures.items()}
+
+    def to_frame(self) -> Any:  # noqa: ANN401 - of pandas or of polars
+        """Time series as a data frame of pandas, or of polars where only that is installed: a row per time and robot.
+
+        Columns are case, time [s], robot, and `columns`, as `./zenpark export --csv` writes them; an unknown number is
+        NaN. Raises ImportError if neither is installed.
+        """
+        rows, count = len(self.time), len(self.robots)
+        heads = {
+            "case": [self.case] * (rows * count),
+            "time": np.repeat(self.time, count),
+            "robot": [*self.robots] * rows,
+        }
+        return data_frame(heads | {name: values.ravel() for name, values in self.columns().items()})
 
     def sent_by(self, row: int) -> PoseTable:
         return self.sent.take(self._sent_by_row[row])

@@ -24,7 +24,6 @@ from experiments.metrics.metric import PLAIN, known_metrics
 from experiments.metrics.results import CaseMetrics, RobotMetrics
 from experiments.metrics.signals import Measurement, phase_starts
 from experiments.recording.trace import Trace
-from twins.arrays import Array
 
 LONGEST: Final = 63  # letters of a name in MATLAB
 MAX_VARIABLE_BYTES: Final = 2**31  # bytes of a variable that MATLAB reads from a file of this version
@@ -91,31 +90,20 @@ def write_mat(
 def write_csv(traces: Mapping[str, Trace], file: Path) -> None:
     """Writes a table with a line for each case, time and robot; empty where a value is unknown.
 
-    Behind the columns of all runs stand those of laws that remember, see `_of_law`.
+    Behind the columns of all runs stand those of laws that remember, see `Trace.columns`.
     """
-    of_law = dict.fromkeys(name for trace in traces.values() for name in _of_law(trace))
+    columns = {case: trace.columns() for case, trace in traces.items()}
+    of_law = dict.fromkeys(name for found in columns.values() for name in found if name not in COLUMNS)
     with _writing(file), file.open("w", newline="", encoding="utf-8") as stream:
         table = csv.writer(stream)
         table.writerow(["case", "time", "robot", *COLUMNS, *of_law])
         for case, trace in traces.items():
-            parts = (trace.position, trace.yaw[..., None], trace.true_position, trace.goal)
-            told, unknown = _of_law(trace), np.full(trace.yaw.shape, np.nan)
-            more = [told.get(name, unknown)[..., None] for name in of_law]
-            values = np.concatenate([*parts, Measurement(trace).robot_errors[..., None], *more], axis=2)
+            unknown = np.full(trace.yaw.shape, np.nan)
+            values = np.stack([columns[case].get(name, unknown) for name in (*COLUMNS, *of_law)], axis=2)
             cells = values.astype(object)
             cells[~np.isfinite(values)] = None
             for t, rows in zip(trace.time.tolist(), cells.tolist(), strict=True):
                 table.writerows([case, t, robot, *row] for robot, row in zip(trace.robots, rows, strict=True))
-
-
-def _of_law(trace: Trace) -> dict[str, Array]:
-    """Columns of a law that remembers, each (T, N): `memory_NAME`, `memory_NAME[0]` and so on, `measure_NAME`."""
-    found = {}
-    for name, values in trace.memory.items():
-        size = values.shape[2]
-        for k in range(size):
-            found[f"memory_{name}[{k}]" if size > 1 else f"memory_{name}"] = values[..., k]
-    return found | {f"measure_{name}": values for name, values in trace.measures.items()}
 
 
 FRAMES_HZ: Final = 15.0  # frames of a film

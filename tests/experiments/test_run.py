@@ -6,12 +6,14 @@ import sys
 from types import SimpleNamespace
 from unittest.mock import Mock
 
+import numpy as np
 import pytest
 
 from experiments import cores
 from experiments.check.check import check
 from experiments.file.document import loads, read
 from experiments.metrics.measure import measure
+from experiments.metrics.signals import Measurement
 from experiments.recording.reader import RecordingError
 from experiments.run import CHECKOUT, FigureSet, Run, reopen, show, simulate_seeds
 from experiments.sweep.workers import workers
@@ -107,6 +109,12 @@ def test_frames_are_of_the_library_that_is_there(crowded, monkeypatch, installed
     assert columns["robot"] == ["CF01", "CF02", "CF03"]
     assert {"seed", "case", "f_hz", "iae", "near_gap"} <= columns.keys()
     assert [type(each) for each in columns["acquired_s"]] == [float] * 3, "none has acquired: NaN"
+    trace = next(iter(crowded.traces.values()))
+    series = trace.to_frame()
+    assert {len(column) for column in series.values()} == {3 * len(trace.time)}
+    assert (series["robot"][:4], series["time"][3]) == (["CF01", "CF02", "CF03", "CF01"], trace.time[1])
+    assert [series["true_x"][4], series["goal_z"][-1]] == [trace.true_position[1, 1, 0], trace.goal[-1, -1, 2]]
+    assert np.array_equal(series["error"], Measurement(trace).robot_errors.ravel(), equal_nan=True)
 
 
 CELLS = (
