@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from agents.network.keys import Keys
     from agents.network.messages import RunOrder
     from agents.plugins.avoidance import Avoidance, measure_gap
+    from agents.plugins.cells import law_file
     from agents.plugins.law import Control, Law, Measure, Memory, RobotFacts, Said, View
     from agents.plugins.laws import Gradient
     from agents.plugins.planners import Planner
@@ -47,7 +48,7 @@ __all__ = [  # noqa: RUF022 - by subject, as in docs/python.md
     "load", "loads", "check", "simulate", "sweep", "reopen", "show",
     "Law", "Gradient", "Control", "Said", "Trigger", "Planner", "Metric", "Trace",
     # more of experiments
-    "Document", "figures", "reopen_seeds", "folder",
+    "Document", "figures", "reopen_seeds", "folder", "law_file",
     # what laws and metrics get and raise
     "View", "Memory", "Measure", "RobotFacts", "Link", "PluginError", "Measurement", "Array",
     # other bases of plug-ins

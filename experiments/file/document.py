@@ -6,15 +6,19 @@ for name, plan in document.cases().items(): ...
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import msgspec
 
-from agents.plugins import files
+from agents.plugins import files, registry
 from agents.plugins.calls import supervised
+from agents.plugins.cells import law_file
+from agents.plugins.law import Law
 from agents.plugins.registry import did_you_mean
 from experiments.catalogue import index
 from experiments.definition.experiment import Experiment
@@ -101,8 +105,27 @@ def read(path: str | Path, overrides: Sequence[str] = ()) -> Document:
     return _document(file, label, text, overrides)
 
 
-def load(file: str | Path, *overrides: str) -> Document:
-    return read(file, overrides)
+def load(file: str | Path, *overrides: str, law: Law | type[Law] | None = None) -> Document:
+    """As `read`, with another law if one is given: a class or an object, also of a notebook's cell or of a script."""
+    if law is None:
+        return read(file, overrides)
+    plugin = law if isinstance(law, type) else type(law)
+    with TemporaryDirectory() as folder:
+        try:
+            kind, _ = files.adopt(law_file(plugin, folder), Path(folder))
+        except registry.PluginError as error:
+            raise refusal(f"law={plugin.__name__}", *str(error).split("; ", 1)) from None
+    given = {"kind": kind}
+    if not isinstance(law, type):
+        given |= {name: each for name, each in msgspec.to_builtins(law).items() if each is not None}
+    return read(file, (*overrides, f"formation.law={inline(given)}"))
+
+
+def inline(value: Any) -> str:  # noqa: ANN401 - a parameter of a plug-in
+    """A value as TOML on one line."""
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{json.dumps(key)} = {inline(each)}" for key, each in value.items()) + "}"
+    return f"[{', '.join(map(inline, value))}]" if isinstance(value, list) else json.dumps(value)
 
 
 def loads(text: str, *overrides: str) -> Document:
