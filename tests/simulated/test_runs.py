@@ -67,6 +67,7 @@ ROWS = {
     "recorder_hangs_to_the_end": Run(
         1, "the recording breaks off after", (Fault(1.0, "pause", "recorder", lasts=inf),)
     ),
+    "recorder_cut_off": Run(1, "failed: no begin of a robot", (Fault(-0.3, "cut", "recorder", lasts=20.0),)),
     "disk_full": Run(1, "cannot be written: No space left", (Fault(1.0, "disk", "recorder", "full"),)),
     "stood_still": Run(2, "this process stood still for more than 3 s", frozen("conductor", 5.0)),
     "criterion_met": Run(0, "Passed: 1 of 1", experiment=PAIR + LIMIT.format(11)),
@@ -82,7 +83,8 @@ def test_exit_code(name):
     assert flight.code == run.code, flight.describe()
     assert run.said in flight.output, flight.output
     assert (flight.crashes, flight.violations) == ([], [])
-    assert (flight.metrics is None) == (flight.started is None or run.said.startswith("this process stood"))
+    unseen = flight.started is None or run.said.startswith(("this process stood", "failed: "))
+    assert (flight.metrics is None) == unseen
 
 
 def test_recorder_that_hangs_is_replaced():

@@ -151,11 +151,11 @@ def _run(origin: RunOrigin, handling: Handling, *, former: Path | None = None, b
         if not runs:
             return code
         if not runs[0].traces:
-            why = stopped or "interrupted"
+            why = stopped or ("interrupted" if code else "failed: no begin of a robot is recorded")
             why += "" if why.startswith("failed: ") else ", before the common start"
             why += f": there is nothing to report; logs: {folder / 'logs'}"
             print_result({"ok": False, "error": why}, why, as_json=handling.as_json)
-            return code or (FAILED if stopped else 130)
+            return code or FAILED
         _write(runs, folder, handling, unwritten)
         warn([*([stopped] if stopped else []), *unwritten])
         if not code:

@@ -176,7 +176,7 @@ class Conductor(CaseRun):
             raise run_view.RunFailed(self.start_failure(late, f"not ready after {limit_s:g} s"))
         for name in late:
             self._robots[name].left_because = "late"
-            self._view.report("failed", name, f"takes no part: it is not ready: {self._reason(name)}")
+            self._fail(name, f"takes no part: it is not ready: {self._reason(name)}")
         return on
 
     def await_phase(
@@ -315,22 +315,30 @@ class Conductor(CaseRun):
 
     def _report_tardy(self, start: float) -> None:
         """Report robots that began earlier or later than all, also by a wrong clock: it spoils or fails the run."""
-        for name in list(self._starting):
+        for name in sorted(self._starting):
             view = self._robots[name]
             if view.began is None and not view.gone and name not in self._changes.under_way:
                 continue
             self._starting.remove(name)
             off = 0.0 if view.began is None else view.began + view.clock_off - start
             if abs(off) > TARDY_S:
-                kind, when = "late" if abs(off) <= LATE_S else "failed", "before" if off < 0.0 else "after"
-                self._view.report(kind, name, f"began {abs(off):.2f} s {when} the common start")
+                text = f"began {abs(off):.2f} s {'before' if off < 0.0 else 'after'} the common start"
+                if abs(off) <= LATE_S:
+                    self._view.report("late", name, text)
+                else:
+                    self._fail(name, text)
+
+    def _fail(self, name: str, text: str) -> None:
+        """Report a failure of a robot; a conductor that is cut off cannot tell the recorder."""
+        self._view.report("failed", name, text)
+        self.failures.append(f"{name} {text}")
 
     def _report_unbegun(self) -> None:
         """Report robots that did not begin at all, at the end of a run that went on to there."""
-        for name in [] if self._context.ended() else self._starting:
+        for name in [] if self._context.ended() else sorted(self._starting):
             view = self._robots[name]
             if view.began is None and not view.gone and not (view.status is not None and view.status.started):
-                self._view.report("failed", name, f"took no part: it did not begin: {self._reason(name)}")
+                self._fail(name, f"took no part: it did not begin: {self._reason(name)}")
 
     def _land(self) -> None:
         self._view.refuse_joining()
