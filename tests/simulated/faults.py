@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 import signal
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -199,6 +199,7 @@ WEIGHTS = {
 }  # fmt: skip
 SINCE = {"start": 8, "launch": 2, "ready": 1, "landing": 1}  # how often a fault counts from a moment
 BUSY_S = {"launch": 3.0, "ready": 2.0, "landing": 2.0}  # time after it in which much happens
+OF_ANY = ("pause", "kill", "term", "cut", "loss", "slow", "late", "step")  # kinds that may hit any process
 COUNTS = (1, 2, 3, 5, 8, 12)
 LENGTHS = (0.2, 0.7, 1.3, 2.5, 6.0, 14.0)  # [s]
 ORDERS = (
@@ -234,9 +235,18 @@ SIZES: dict[str, Sequence[Any]] = {
 
 
 def draw(
-    seed: int, robots: Sequence[str], captured: Sequence[str], duration_s: float, only: Sequence[str] = ()
+    seed: int,
+    robots: Sequence[str],
+    captured: Sequence[str],
+    duration_s: float,
+    only: Sequence[str] = (),
+    *,
+    others: Sequence[str] = (),
 ) -> list[Fault]:
-    """A random script, sorted by time; half of them have few kinds and few victims, which meet more often."""
+    """A random script, sorted by time; half of them have few kinds and few victims, which meet more often.
+
+    `captured`: robots with a motion capture; `others`: further processes of the run that faults may hit.
+    """
     rng = random.Random(seed)
     weights = {**WEIGHTS, **({"capture": 5} if captured else {})}
     names, kinds = list(robots), [kind for kind in weights if not only or kind in only]
@@ -244,6 +254,9 @@ def draw(
     if rng.random() < 0.5:
         kinds, names = rng.sample(kinds, min(3, len(kinds))), rng.sample(names, min(2, len(names)))
     drawn = [_draw_one(rng, kinds, weights, names, captured, duration_s) for _ in range(count)]
+    for number, fault in enumerate(drawn) if others else ():
+        if fault.kind in OF_ANY and rng.random() < 0.35:
+            drawn[number] = replace(fault, who=rng.choice(others))
     return sorted(drawn, key=lambda fault: fault.at)
 
 

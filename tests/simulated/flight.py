@@ -94,7 +94,10 @@ def _script(request: Request, file: str) -> list[faults.Fault]:
     plan = plans[request.case or next(iter(plans))]
     robots = plan.experiment.robots
     captured = [name for name, robot in robots.items() if robot.position == "external" and robot.body != "world"]
-    return faults.draw(request.drawn, plan.names, captured, plan.experiment.duration_s, request.kinds)
+    others = [f"router{number}" for number in range(2, plan.experiment.network.routers + 1)]
+    others += ["centre"] * (plan.experiment.architecture == "centralised")
+    others += ["world"] * any(robot.body == "world" for robot in robots.values())
+    return faults.draw(request.drawn, plan.names, captured, plan.experiment.duration_s, request.kinds, others=others)
 
 
 def mutate(mutant: Mutant) -> None:

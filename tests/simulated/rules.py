@@ -243,7 +243,11 @@ def silent_landing(look: Look, seen: Seen) -> str:
 
 
 def _misled(look: Look, seen: Seen) -> bool:
-    """Whether its body or its process cannot do what it should; a twin stands still while its loop hangs."""
+    """Whether its body, world or process cannot do what it should; a twin stands still while its loop hangs."""
+    assert look.world.plan is not None
+    carried = look.world.plan.experiment.robots[seen.name].body == "world"
+    if carried and any(fault.who == "world" for fault in look.world.script):
+        return True
     faults = [fault for fault in look.world.script if fault.who == seen.name]
     sizes = [str(fault.size) for fault in faults if fault.kind in {"body", "capture"}]
     wrong = any(word in size for size in sizes for word in ("motors", "stuck", "adrift", "aloft"))
