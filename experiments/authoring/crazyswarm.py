@@ -163,7 +163,7 @@ def _listed(root: YamlValue) -> list[tuple[str, YamlValue]]:
 
 
 def _drone(root: YamlValue, name: str, entry: YamlValue) -> SwarmDrone:
-    if "id" in entry.value:
+    if "robots" not in root.value:
         numbered = entry.typed(_NumberedEntry)
         uri, key = f"radio://0/{numbered.channel}/2M/E7E7E7E7{numbered.id:02X}", entry.key
         kind, position = numbered.type, numbered.initial_position
@@ -313,7 +313,7 @@ def _notes(root: YamlValue, drones: Sequence[SwarmDrone]) -> Iterator[str]:
     if parameters:
         yield (f"firmware_params: {join_names(parameters, 8)}; those on board stay; `device.parameters` sets others")
     others = dict.fromkeys(key for _, entry in _listed(root) for key in entry.value if key not in TAKEN)
-    unread = [key for key in (*root.value.get("all", {}), *others) if key != "firmware_params"]
+    unread = [key for key in (*_keys(root.value.get("all")), *others) if key != "firmware_params"]
     if unread:
         yield f"{', '.join(dict.fromkeys(unread))}: logging, limits and tools of Crazyswarm; zenpark has its own"
 

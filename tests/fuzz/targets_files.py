@@ -13,6 +13,7 @@ import zlib
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
+from math import isfinite
 from pathlib import Path
 
 import msgspec
@@ -25,10 +26,12 @@ from agents.errors import ExplainedError
 from agents.network import messages as wire
 from agents.network import zenoh_config as sessions
 from agents.plugins import registry
+from agents.plugins.recorded import formats
 from agents.protocols import crazyflie, khepera4, tello, turtlebot3
 from bridges.crazyflie.geometry import stations
 from bridges.khepera4.link import KheperaAddress
 from bridges.motion_capture.reader import parse_server
+from experiments.authoring import crazyswarm
 from experiments.authoring.robotic_park.convert import convert_text
 from experiments.catalogue import index
 from experiments.definition.links import link_pairs
@@ -46,7 +49,10 @@ from experiments.sweep import store
 from experiments.sweep.plan import arguments, cells, seeds_of
 from experiments.sweep.runs import RunMetrics
 from experiments.sweep.store import RUNS, Store, StoreOrigin
+from tests.agents.plugins import test_recorded as trajectory_files
 from tests.experiments import robotic_park_files as theirs
+from tests.experiments.authoring import test_crazyswarm as swarms
+from tests.experiments.file import test_graphs as graph_files
 from tests.fuzz.messages import KEYS, good, of_all
 from tests.fuzz.target import Target, place, split
 from tools.commands.network import key_expression
@@ -156,6 +162,53 @@ def park_yaml():
             file.write_text(text, encoding="utf-8")
             with suppress(DocumentError):  # robots that stand in each other are for its user to see
                 document.read(file)
+
+        yield Target(examples, take, (DocumentError,))
+
+
+@place(4_000, 40)
+def crazyflies_yaml():
+    """Drones of Crazyswarm2 and Crazyswarm; what becomes of them is read."""
+    examples = [swarms.swarm(swarms.drone(1), swarms.drone(2, "false"), captured="true"), swarms.OLD]
+
+    @refusing_well
+    def take(data):
+        made, _ = crazyswarm.convert_text(decoded(data, "some.yaml"), "some.yaml", 20.0)
+        document.loads(made)
+
+    yield Target([text.encode() for text in examples], take, (DocumentError,))
+
+
+@place(8_000, 100)
+def trajectories():
+    """Plans from files: each can be asked for any time."""
+    examples = ["t,x,y,z,yaw\n5,0,0,0.5,0\n6,1,2,0.7,1\n", "0 0 0 1 0 0 0 1\n1 1 0 1 0 0 1 0\n", trajectory_files.VICON]
+    examples.append(f"{trajectory_files.HEADER}\n{trajectory_files.piece(2, x=(0, 1), yaw=(0.5,))}\n")
+
+    def take(data):
+        curve = formats.read(data.decode("utf-8", "replace"), "drone")
+        for share in (-1.0, 0.0, 0.3, 1.0, 2.0):
+            assert isfinite(sum(curve.pose(share * curve.duration)[:2]) + curve.speed)
+
+    yield Target([text.encode() for text in examples], take, (formats.FormatError,))
+
+
+@place(8_000, 60)
+def graphs():
+    """A graph beside an experiment."""
+    examples = [
+        b"A B 0.5\nB C\n",
+        graph_files.MATRIX.encode(),
+        graph_files.graphml('<edge source="A" target="B"/>').encode(),
+    ]
+    with place_for("some.toml") as file:
+        rows = 'graph = { file = "a.graph", target = 0.7, rows = "senders" }\n'
+        file.write_text(f"{graph_files.ROBOTS}[formation]\n{rows}")
+
+        @refusing_well
+        def take(data):
+            (file.parent / "a.graph").write_bytes(data)
+            document.read(file)
 
         yield Target(examples, take, (DocumentError,))
 

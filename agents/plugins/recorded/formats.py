@@ -37,6 +37,10 @@ QUATERNION: Final = ("qx", "qy", "qz", "qw")
 COLUMNS: Final = {name: column for column, names in NAMES.items() for name in names}
 UNIT: Final = re.compile(r"(.+?)\s*(?:\[\s*([\w°]+)\s*\]|\(\s*([\w°]+)\s*\)|_(ns|us|ms|s|mm|cm|m|rad|deg))")
 VICON_HEADER: Final = "frame,sub frame,"
+FARTHEST: Final = 1e4  # largest place [m] or angle [rad]
+LARGEST: Final = 1e6  # largest coefficient of a polynomial, and duration of a piece [s]
+LATEST_S: Final = 1e12  # largest time [s]
+TICK_S: Final = 1e-6  # least time between two poses [s]
 HIDDEN_S: Final = 0.5  # a body that motion capture loses for longer has no path [s]
 
 
@@ -121,6 +125,10 @@ def _samples(rows: Rows, places: dict[str, int], factors: dict[str, float]) -> l
     turned = all(name in places for name in QUATERNION)
     for number, cells in rows:
         value = {name: factors.get(name, 1.0) * _number(number, cells, place) for name, place in places.items()}
+        if abs(value["t"]) > LATEST_S or any(abs(value[name]) > FARTHEST for name in value if name != "t"):
+            raise FormatError(
+                f"line {number}: a place or a time beyond all measure; mend its units, or remove the line"
+            )
         zero = value["t"] if zero is None else zero
         yaw = _yaw(*(value[name] for name in QUATERNION)) if turned else value.get("yaw", nan)
         found.append(TimedPose(value["t"] - zero, (value["x"], value["y"], value.get("z", nan)), yaw, number))
@@ -131,7 +139,7 @@ def _in_order(found: list[TimedPose]) -> list[TimedPose]:
     if len(found) < 2:
         raise FormatError("the file holds fewer than two poses; give one line for each, with its time")
     for before, after in pairwise(found):
-        if after.time <= before.time:
+        if after.time - before.time < TICK_S:
             message = f"line {after.line}: its time {after.time:g} s is not after that of line {before.line}"
             raise FormatError(f"{message}; sort the lines by time, and remove those that stand twice")
     return found
@@ -169,8 +177,10 @@ def _pieces(rows: Rows) -> list[Piece]:
             hint = f"a piece is a duration and {AXES * ORDER} coefficients, of x, y, z and yaw from the 0th power on"
             raise FormatError(f"line {number}: {len(cells)} numbers; {hint}")
         duration, *values = (_number(number, cells, place) for place in range(len(cells)))
-        if duration <= 0.0:
+        if not TICK_S <= duration <= LARGEST:
             raise FormatError(f"line {number}: the duration {duration:g} s; give a positive one")
+        if any(abs(value) > LARGEST for value in values):
+            raise FormatError(f"line {number}: a coefficient beyond all measure; mend its units")
         axes = [tuple(values[ORDER * axis : ORDER * (axis + 1)]) for axis in range(AXES)]
         found.append(Piece(duration, (axes[0], axes[1], axes[2], axes[3]), number))
     if not found:
@@ -193,6 +203,8 @@ def _vicon(lines: Sequence[str], head: int, body: str) -> list[TimedPose]:
         raise FormatError(
             "no rate stands above its columns; export from Vicon with the header, rate included"
         ) from None
+    if rate <= 0.0:
+        raise FormatError(f"its rate is {rate:g} Hz; export from Vicon with the header, rate included")
     channel = _channel(lines, head, body)
     found, zero = list[TimedPose](), None
     for number, line in enumerate(lines[head + 1 :], head + 2):
@@ -207,6 +219,8 @@ def _vicon(lines: Sequence[str], head: int, body: str) -> list[TimedPose]:
             continue  # the body was hidden
         value = {name: _number(number, cells, place) for name, place in channel.place.items()}
         time = _number(number, cells, 0) / rate
+        if any(abs(each) > 1e3 * FARTHEST for each in value.values()) or abs(time) > LATEST_S:
+            raise FormatError(f"line {number}: a place or a time beyond all measure; export again")
         zero = time if zero is None else zero
         place = 1e-3 * value["tx"], 1e-3 * value["ty"], 1e-3 * value["tz"]
         found.append(TimedPose(time - zero, place, _vicon_yaw(value, channel.angle), number))

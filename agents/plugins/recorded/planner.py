@@ -28,7 +28,9 @@ class Recorded(Planner, frozen=True):
     relative: Annotated[
         bool, Meta(description="from where the robot is when the leg begins; else places are those of the arena")
     ] = False
-    stretch: Annotated[Positive, Meta(description="multiple of its times: with 2 at half the speed")] = 1.0
+    stretch: Annotated[float, Meta(ge=0.01, le=100, description="multiple of its times: with 2 at half the speed")] = (
+        1.0
+    )
     from_s: Annotated[NotNegative, Meta(description="time in the file from which on it is followed [s]")] = 0.0
     until_s: Annotated[Positive | None, Meta(description="time in the file up to which; left out: its end [s]")] = None
     content: Annotated[

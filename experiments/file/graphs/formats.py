@@ -94,7 +94,9 @@ def _edge(line: int, cells: Sequence[str], *, directed: bool) -> Edge:
     rest = " ".join(words[2:])
     if rest.startswith("{"):
         found = re.findall(r"['\"](\w+)['\"]\s*:\s*([-+.\deE]+)", rest)
-        return Edge(words[0], words[1], directed, {name: float(value) for name, value in found}, line)
+        return Edge(
+            words[0], words[1], directed, {name: float(value) for name, value in found if _is_number(value)}, line
+        )
     if len(words) > 3 or (rest and not _is_number(rest)):
         raise GraphError(f"line {line}: {rest[:40]!r} is no weight; write two names and, if wanted, a number")
     return Edge(words[0], words[1], directed, {"weight": float(rest)} if rest else {}, line)
