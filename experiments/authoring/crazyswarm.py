@@ -295,6 +295,7 @@ def _positioning(folder: Path, drones: Sequence[SwarmDrone], notes: list[str]) -
     system, host = (
         str(parameters.get(key, "")) if isinstance(parameters, dict) else "" for key in ("type", "hostname")
     )
+    system = system.removesuffix("_closed_source")
     if system in registry.names(registry.POSITIONING) and re.fullmatch(r"[\w.-]+(:\d+)?", host):
         source = f"{system}://{host}"  # Crazyswarm2 leaves axes as they are: Motive is set to z up there
         return {"source": source, "up": "z"} if system == "optitrack" else source

@@ -478,7 +478,7 @@ def recordings(analysis: Analysis) -> Iterator[Finding]:
 
 def _probed(plan: Planner, anchor: Array, lasts_s: float) -> tuple[list[float], Array]:
     """Times since the leg began [s] (K), two or more, and the targets there (K, 3) [m]."""
-    lasts_s = min(lasts_s, getattr(plan, "duration", lasts_s) + 1.0)  # then it stays
+    lasts_s = min(lasts_s, getattr(plan, "duration", lasts_s) + 1.0)
     elapsed = [PROBED_S * k for k in range(max(math.ceil(lasts_s / PROBED_S), 2))]
     return elapsed, np.array([plan.target(t, tuple(anchor.tolist()), 0.0)[:3] for t in elapsed])
 

@@ -72,6 +72,8 @@ def test_motion_capture_is_that_of_the_file_beside(tmp_path):
     (tmp_path / "motion_capture.yaml").write_text(beside.format("optitrack"))
     capture = converted(text, tmp_path)[0].experiment.capture
     assert (capture.source, capture.up) == ("optitrack://192.168.0.5", "z")
+    (tmp_path / "motion_capture.yaml").write_text(beside.format("optitrack_closed_source"))
+    assert converted(text, tmp_path)[0].experiment.positioning.source == "optitrack://192.168.0.5"
     (tmp_path / "motion_capture.yaml").write_text("just text\n")
     with pytest.raises(DocumentError, match=r"motion_capture\.yaml"):
         converted(text, tmp_path)
