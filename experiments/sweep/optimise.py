@@ -25,7 +25,7 @@ from agents.plugins.files import plain
 from agents.plugins.registry import did_you_mean
 from experiments.file.document import Document, chosen, load
 from experiments.file.problems import refusal
-from experiments.metrics.metric import Metric, short_name, swept_metrics
+from experiments.metrics.metric import OF_LAW, Metric, short_name, swept_metrics
 from experiments.recording.run_folder import naming
 from experiments.sweep.plan import FIRST_TUNING, Axis, Cell, arguments, combination, compared, seeds_of
 from experiments.sweep.store import Store
@@ -294,5 +294,6 @@ def _library() -> Any:  # noqa: ANN401 - it has no types
 def _known(name: str, place: str, metrics: Mapping[str, Metric]) -> str:
     names = {word: metric for metric in metrics for word in (metric, metric.lower(), short_name(metric))}
     if name.lower() not in names:
-        raise refusal(place, f"no metric is called '{name}'", did_you_mean(name, names))
+        hint = "name the measure in MEASURES of the law" if name.startswith(OF_LAW) else did_you_mean(name, names)
+        raise refusal(place, f"no metric is called '{name}'", hint)
     return names[name.lower()]

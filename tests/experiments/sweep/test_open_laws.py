@@ -6,6 +6,7 @@ import pytest
 
 from experiments.check.check import examine
 from experiments.file.document import load
+from experiments.file.problems import DocumentError
 from experiments.metrics.metric import law_metrics
 from experiments.metrics.results import CaseMetrics
 from experiments.report import figures, replay
@@ -114,6 +115,8 @@ def test_tables_keep_what_metrics_are(swept, tmp_path):
     assert chosen.head[-2:] == ("push (end) [m]", "Place ratio")
     limits = parse_objective("messages, place.py:Place<=1.1, measure_push_mean<=2", found.metrics).limits
     assert [limit.index for limit in limits] == ["place.py:Place", "measure_push_mean"]
+    with pytest.raises(DocumentError, match="name the measure in MEASURES of the law"):
+        parse_objective("messages, measure_pull_mean<=2", found.metrics)
 
 
 def test_check_has_the_same_rows(file):
