@@ -44,12 +44,16 @@ class Coordinates(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
             a, b, c, d, e, f, g, h, i = rotation
             y, z = -z, y
             rotation = (a, -c, b, -g, i, -h, d, -f, e)
-        scale = UNITS[self.unit]
-        cos, sin = math.cos(self.heading), math.sin(self.heading)
-        x, y, z = (scale * each - begin for each, begin in zip((x, y, z), self.origin, strict=True))
         yaw = yaw_of(rotation)
-        turned = yaw if self.heading == 0.0 else math.remainder(yaw - self.heading, math.tau)
-        return (cos * x + sin * y, cos * y - sin * x, z), turned
+        turn, scale = self.heading, UNITS[self.unit]
+        begin_x, begin_y, begin_z = self.origin
+        x = scale * x - begin_x
+        y = scale * y - begin_y
+        z = scale * z - begin_z
+        if turn == 0.0:
+            return (x, y, z), yaw
+        cos, sin = math.cos(turn), math.sin(turn)
+        return (cos * x + sin * y, cos * y - sin * x, z), math.remainder(yaw - turn, math.tau)
 
     def measured(self, position: Vector, yaw: float) -> tuple[Vector, float]:
         """The inverse of `placed`, with z up and in metres, for twins of systems."""

@@ -121,7 +121,7 @@ class PoseFilter:
             frozen = pose is not None and arrived - self._new_at[row] >= REPEATED_S
             if pose is not None and not (self._refusal or frozen):
                 position, yaw = self._coordinates.placed(*pose, up)
-                if math.isnan(yaw) or not all(map(math.isfinite, position)):
+                if not math.isfinite(yaw + sum(position)):
                     self._invalid += 1
                 elif self._last[row].update(measured, position, yaw):
                     self._seen_at[row] = arrived
