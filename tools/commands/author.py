@@ -89,7 +89,7 @@ def import_(
     from experiments.authoring.robotic_park.convert import convert
     from experiments.authoring.robotic_park.file import text_of
 
-    text = text_of(file, "name a crazyflies.yaml of Crazyswarm2, or an experiment of Robotic Park's authors (.yaml)")
+    text = text_of(file, "name an experiment file of Robotic Park's authors, or a crazyflies.yaml of Crazyswarm2")
     if crazyswarm.is_crazyswarm(file, text):
         if poses is not None or gain is not None:
             raise typer.BadParameter("--poses and --gain are for files of Robotic Park; this is one of Crazyswarm2")

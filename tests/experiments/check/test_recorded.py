@@ -57,6 +57,12 @@ def test_file_goes_with_the_experiment(file, tmp_path):
             "recording-begins-elsewhere",
             "line 2: it begins at (0.00, 0.00, 0.10), 0.50 m from",
         ),
+        (
+            "5,0.8,0.1",
+            "9.8,2.02,0.1",
+            "recording-outside",
+            "path.csv, line 3: it leads CF01 out of the arena, to (2.00,",
+        ),
         ("5,0.8,0.1", "7,2.5,0.1", "leaves-arena", "by its plan (path.csv, line 3)"),
         (
             "4,0.8,0,0.6\n5,0.8,0.1",
