@@ -139,8 +139,9 @@ def test_sticks_by_hand():
 
 def test_addresses():
     for address in ("tello", "tello://", "tello://192.168.10.1"):
-        assert protocol.endpoint("T", address) == ("192.168.10.1", 8889)
-    assert protocol.endpoint("T", "tello://127.0.0.2:18889") == ("127.0.0.2", 18889)
+        assert protocol.endpoint("T", address) == ("192.168.10.1", 8889, "")
+    assert protocol.endpoint("T", "tello://127.0.0.2:18889") == ("127.0.0.2", 18889, "")
+    assert protocol.endpoint("T", "tello://10.0.0.2%Wlan1:9") == ("10.0.0.2", 9, "Wlan1")
 
 
 def test_take_off_is_sent_once_and_answered_aloft(grounded):
