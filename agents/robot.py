@@ -226,6 +226,8 @@ class Robot:
         self.now.state = state
         if state.scan is not None and self._perception is not None:
             self._perception.sees = self._detector.sees = True
+        if self._stepping is not None:
+            self._stepping.scan = state.scan
         self.observe(t)
 
     def observe(self, t: float) -> None:
@@ -300,8 +302,8 @@ class Robot:
         start, tick = life.start_at, self.tick
         joins = life.phase == AIRBORNE and self._run_began < t
         if joins:
-            start, tick = self._run_began, round((t - self._run_began) * self.assignment.body_hz)
-        stepping.moves, stepping.scan = running and not self._holds(), now.state.scan
+            start, tick = self._run_began, round((t - self._run_began) / stepping.tick_s)
+        stepping.moves = running and not self._holds()
         stepping.tick = tick
         if stepping.speech is not None and (running or joins) and not now.invalid and self.guidance is None:
             self.goals.step(t, now.position, now.velocity, now.yaw, start)
@@ -309,14 +311,14 @@ class Robot:
     def _renew_goal(self, t: float, stepping: Stepping) -> None:
         """A law gives a velocity, here or at the central controller: the goal moves on with it on every tick."""
         follower, velocity, now, guidance = self._follower, stepping.velocity, self.now, self.guidance
-        follows = self.goals.follows and self.decisions > 0
+        follows = self.goals.follows and self.decisions > 0 and not stepping.gives_goal
         if guidance is not None:  # a robot without new goals stands still, long before it counts as unguided
             velocity = guidance.velocity
             follows = isfinite(velocity[0]) and t - guidance.stamp <= OLD_VELOCITY * self._decide_every * self._dt
-        moves = self.lifecycle.phase == RUNNING and not self.keeping.held and follows
-        if follower is None or velocity is None or not moves:
-            if follower is not None:
-                follower.reference = UNKNOWN
+        if follower is None:
+            return
+        if not (self.lifecycle.phase == RUNNING and not self.keeping.held and follows):
+            follower.reference = UNKNOWN
         elif not now.invalid:
             self.goal = follower.goal(velocity, now.position, self._dt)
 

@@ -174,7 +174,8 @@ class Centre:
             if computer.stepping is not None:
                 if not computer.stepping.sound:
                     return None  # a robot without goals holds
-                velocity = (computer.follows and computer.stepping.velocity) or UNKNOWN
+                if computer.follows and not computer.stepping.gives_goal:
+                    velocity = computer.stepping.velocity
         held = (runs and computer.without_neighbours()) or waits
         robot.keeping.hold(held, position)
         if held:

@@ -26,6 +26,7 @@ class GoalComputer:
     """Goals of one robot."""
 
     FIXED: ClassVar = ("_gated", "changes_shape", "follows", "needs_company")
+    RARE: ClassVar = ("step", "reshape")
 
     def __init__(self, assignment: Assignment, *, passive: bool = False) -> None:
         """Of a robot with an `assignment`; `passive`: its goals come from elsewhere."""
@@ -113,10 +114,10 @@ class GoalComputer:
             yaw: Likewise [rad].
         """
         if self.stepping is not None:
-            return self._decide_by_steps(t, position, velocity, yaw, start)
+            return self._decide_by_steps(self.stepping, t, position, velocity, yaw, start)
         elapsed = t - start
         if self.changes_shape:
-            self._reshape(elapsed, position, t)
+            self.reshape(elapsed, position, t)
         offset = ZERO
         if self.follows:
             offset = self.law_offset(t, position)
@@ -182,7 +183,7 @@ class GoalComputer:
     def step(self, t: float, position: Vector, velocity: Vector, yaw: float, start: float) -> None:
         """Let a law that is no gradient step; for the arguments see `decide`. Not quiet."""
         if self.changes_shape:
-            self._reshape(t - start, position, t)
+            self.reshape(t - start, position, t)
         if self.stepping is not None:
             self.stepping.step(self._view(t, position, velocity, yaw, start))
 
@@ -231,15 +232,17 @@ class GoalComputer:
         ]  # fmt: skip
         return view
 
-    def _decide_by_steps(self, t: float, position: Vector, velocity: Vector, yaw: float, start: float) -> bool:
+    def _decide_by_steps(  # noqa: PLR0917 - quiet: compilers take no arguments by name alone
+        self, stepping: Stepping, t: float, position: Vector, velocity: Vector, yaw: float, start: float
+    ) -> bool:
         """As `decide`, for a law that is no gradient; where it gives a velocity, the goal is the robot's place."""
-        stepping = cast(Stepping, self.stepping)
         if stepping.speech is None:
             self.step(t, position, velocity, yaw, start)
         place = position[0], position[1], self.ground
-        goal, goal_yaw = place, stepping.control.yaw
+        goal, goal_yaw = place, stepping.yaw
         if self.follows:
-            if (wanted := stepping.control.goal) is not None:
+            if stepping.gives_goal:
+                wanted = stepping.goal
                 goal = goal_position(place, difference(wanted, place), self.clamp)
                 if not self._flies or isnan(wanted[2]):
                     goal = goal[0], goal[1], self.ground
@@ -254,7 +257,17 @@ class GoalComputer:
         self.goal, self.yaw = goal, goal_yaw
         return True
 
-    def _reshape(self, elapsed: float, position: Vector, t: float) -> None:
+    def rare_parts(self) -> list[object]:
+        """Objects beside this one that `step` and `reshape` read or change."""
+        parts: list[object] = [*self.neighbours.all]
+        if self.changes_shape:
+            parts += [sender.link for sender in self.neighbours.all]
+            parts += [] if self._updating is None else [self._updating.asking.last]
+        if self.stepping is not None:
+            parts += [self.stepping] if self.stepping.speech is None else [self.stepping, self.stepping.speech]
+        return parts
+
+    def reshape(self, elapsed: float, position: Vector, t: float) -> None:
         """Set targets and presence of the links `elapsed` [s] after the start."""
         elapsed, changed = max(elapsed, 0.0), False
         for sender, given in zip(self.neighbours.all, self._given, strict=True):

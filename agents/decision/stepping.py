@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from math import dist, inf, isfinite, nan
 from numbers import Real
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 from agents.decision.assignment import Assignment
 from agents.network.validation import ENORMOUS, MAX_NUMBERS
@@ -20,6 +20,7 @@ from agents.vectors import UNKNOWN, Vector, is_finite
 Words = tuple[tuple[str, Values], ...]  # what a robot says beside its pose: variables by name
 
 MOST_STEPS: Final = 3.0  # longest pause that counts, in periods: after a longer one integrals would leap
+REST: Final = (0.0, 0.0, nan)  # [m/s]
 DIGITS: Final = 7  # significant ones of what is said: units are unknown
 
 
@@ -32,38 +33,58 @@ class Speech:
 
     def __init__(self, law: Law, memory: Memory) -> None:
         self._metres = {name: said.metre for name, said in law.SAYS.items()}
+        self.now: dict[str, Values] = {}
+        self._before = self.now  # variables as said last, unless the present ones are said
+        self._current = True  # the present variables are said; at first as they begin
         self.update(memory)
-        self.said = self.now  # variables as said last; at first as they begin
         self.spoken = self._stepped = False  # it has said something
-        self.words: Words = ()  # variables as said last, those that are known
+        self._current = True
 
     def update(self, memory: Memory) -> None:
         """The variables are these after a step."""
-        self._stepped = True
-        self.now: dict[str, Values] = {name: tuple(map(rounded, memory[name])) for name in self._metres}
+        if self._current:
+            self._before = self.now
+        self._stepped, self._current = True, False
+        self.now = {name: tuple(map(rounded, memory[name])) for name in self._metres}
+        self._change = 0.0  # largest deviation of a variable from what was said, in metres; infinite if one is new
+        for name, metre in self._metres.items():
+            now, said = self.now[name], self._before.get(name, ())
+            if is_known(now):
+                new = not said or not is_known(said)
+                self._change = inf if new else max(self._change, dist(now, said) / metre)
+
+    @property
+    def said(self) -> Memory:
+        """Variables as said last; at first as they begin."""
+        return self.now if self._current else self._before
+
+    @property
+    def words(self) -> Words:
+        """Variables as said last, those that are known."""
+        return _known(self.said) if self.spoken else ()
+
+    @property
+    def fresh(self) -> Words:
+        """Variables that a transmission says now, those that are known."""
+        return _known(self.now) if self._stepped else ()
 
     def deviation(self, of_pose: float) -> float:
-        """Largest deviation of what neighbours know, in metres, of pose and variables; infinite if one is new."""
+        """Largest deviation of what neighbours know, of pose and variables [m]; infinite if one is new. Quiet."""
         if not self._stepped:
             return of_pose
-        worst = of_pose if self.spoken else inf
-        if self.now is self.said:  # it has not stepped since
-            return worst
-        for name, metre in self._metres.items():
-            now, said = self.now[name], self.said[name]
-            if is_known(now):
-                worst = max(worst, dist(now, said) / metre if is_known(said) else inf)
-        return worst
+        return max(of_pose, self._change) if self.spoken else inf
 
     def record(self) -> None:
-        """Note that the present words are transmitted now."""
-        if self._stepped and not (self.spoken and self.said is self.now):
-            self.said, self.spoken = self.now, True
-            self.words = tuple((name, values) for name, values in self.now.items() if is_known(values))
+        """Note that the present words are transmitted now. Quiet."""
+        if self._stepped:
+            self.spoken = self._current = True
+            self._change = 0.0
 
 
 class Stepping:
     """A law at work for one robot."""
+
+    RARE: ClassVar = ("_law", "_target", "control", "facts", "scan")
 
     def __init__(self, assignment: Assignment) -> None:
         """Begin; raises PluginError if `begin` of the law fails or gives what cannot be used."""
@@ -76,7 +97,9 @@ class Stepping:
         )  # fmt: skip
         self.memory = self._begin()
         self.speech = Speech(law, self.memory) if law.SAYS else None  # None: the law says nothing
-        self.control = Control()  # result of the last step
+        self.control = Control()  # result of the last step: a velocity [m/s], or a goal [m], and a yaw [rad]
+        self.velocity, self.goal, self.yaw = REST, UNKNOWN, nan
+        self.gives_goal = False
         self.measures: dict[str, float] = {}  # likewise
         self.moves = True  # the robot may move; set by its caller, and likewise
         self.scan: Any = None  # range readings
@@ -145,6 +168,9 @@ class Stepping:
     def step(self, view: View) -> None:
         """Step, and keep what the law decided."""
         self.control = control = self.rehearse(view)
+        self.gives_goal = control.goal is not None
+        self.velocity, self.goal = _vector(control.velocity, REST), _vector(control.goal, UNKNOWN)
+        self.yaw = float(control.yaw)
         self.memory = {name: tuple(map(float, values)) for name, values in control.memory.items()}
         self.measures = {name: float(value) for name, value in control.measures.items()}
         self._stepped = self.tick
@@ -171,14 +197,6 @@ class Stepping:
         return control
 
     @property
-    def velocity(self) -> Vector | None:
-        """Velocity that the law decided [m/s]; None: it gave a goal."""
-        control = self.control
-        if control.velocity is None:
-            return None if control.goal is not None else (0.0, 0.0, nan)
-        return control.velocity
-
-    @property
     def sound(self) -> bool:
         """Whether all that the last step decided for the body is finite, or a height that is left out."""
         return is_sound(self.control)
@@ -193,6 +211,18 @@ def is_sound(control: Control) -> bool:
 def rounded(value: float) -> float:
     """A number of `DIGITS` significant digits; NaN where it is none that can be said."""
     return float(f"{value:.{DIGITS}g}") if abs(value) <= ENORMOUS else nan
+
+
+def _known(variables: Memory) -> Words:
+    return tuple((name, values) for name, values in variables.items() if is_known(values))
+
+
+def _vector(values: Iterable[float] | None, other: Vector) -> Vector:
+    """Three numbers as floats, or another vector in place of None."""
+    if values is None:
+        return other
+    x, y, z = map(float, values)
+    return x, y, z
 
 
 def _size(values: object) -> int:

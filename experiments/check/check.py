@@ -41,10 +41,7 @@ def compilation(analysis: Analysis) -> Iterator[Finding]:
     plan = analysis.plan
     foreign = [each for each in ticking_plugins(plan) if each.__module__.partition(".")[0] != "agents"]
     cost = "runs in virtual time and sweeps take 10 to 20 times as long as compiled ones"
-    if foreign and not analysis.is_gradient:
-        if type(plan.law) in foreign:
-            yield Finding("remark", "uncompiled", f"laws that remember are not compiled: {cost}")
-    elif foreign and machine.works() and (text := refusal(isolated(plan).changed(avoidance=plan.experiment.avoidance))):
+    if foreign and machine.works() and (text := refusal(isolated(plan).changed(avoidance=plan.experiment.avoidance))):
         message = f"{plain(text)}, which is not compiled: {cost} (docs/plugins.md, the subset)"
         yield Finding("remark", "uncompiled", message)
 

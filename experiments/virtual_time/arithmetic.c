@@ -15,6 +15,7 @@ double floor(double), ceil(double), trunc(double), rint(double), sqrt(double), f
 #endif
 
 static whole fault, turns;
+static whole (*back)(whole, whole, double *); /* calls a rare function of an object in Python; 1: an error */
 static const union { whole bits; double number; } unknown = {0x7ff8000000000000}; /* NaN */
 static const double inf = 1e999, largest = 2305843009213693952.0; /* 2^61 */
 static const whole exact = 9007199254740992; /* 2^53, up to which floats have every whole number */

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from math import inf, nan
@@ -166,15 +166,17 @@ class VirtualNetwork:
         self.seq[row] += 1
         seq, channel = self.seq[row], self._channel
         sample = Sample(row, seq, t, robot.sent_position, robot.sent_velocity, yaw, words=robot.words)
-        said: dict[str, tuple[float, ...]] = {}
-        if self.says and not self._lean:
-            said = {name: (nan,) * size for name, size in self.says.items()} | dict(robot.words)
-        self._sent.add(row, t, sample, tuple(chain.from_iterable(said.values())))
+        self._sent.add(row, t, sample, () if self._lean else self._numbers(robot.words))
         size = _size(self._plan, sample, start) if channel.limited else 0
         for link in self._links[row]:
             channel.send(link, sample, seq, t, start=start, size=size)
         if self.centre is not None:
             self.centre.transmit(sample, start, size)
+
+    def _numbers(self, words: Words) -> tuple[float, ...]:
+        """Numbers of all variables, NaN of those that are not said."""
+        said = {name: (nan,) * size for name, size in self.says.items()} | dict(words)
+        return tuple(chain.from_iterable(said.values()))
 
     def retire(self, row: int, t: float) -> None:
         """A robot lands at `t` [s] in mid-run: it is silent, and lost to the others, none of which follows it down."""
@@ -227,10 +229,25 @@ class VirtualNetwork:
             ways[link].put(sample.seq, sample.stamp, sample.position, sample.velocity, sample.yaw)
         return under_way
 
+    def take_back(self, handed: Sequence[Arrived]) -> None:
+        """Samples that were handed to the links of a stretch are under way as before: it was not flown."""
+        for link, _, sample in sorted(handed, key=lambda each: (each[2].stamp, each[2].row, each[0])):
+            self._channel.send(link, sample, sample.seq, sample.stamp)
+
     def leave(
-        self, ways: Sequence[Way], members: Sequence[Member], ledger: Ledger, before: Sequence[Arrived], t: float
+        self,
+        ways: Sequence[Way],
+        members: Sequence[Member],
+        ledger: Ledger,
+        before: Sequence[Arrived],
+        t: float,
+        *,
+        words: Callable[[int, float], Words],
     ) -> None:
-        """Take over what members sent until `t` [s], by their ledger, and what was received of it and of `before`."""
+        """Take over what members sent until `t` [s], by their ledger, and what was received of it and of `before`.
+
+        `words`: what a robot, by its row, said at a time [s].
+        """
         for member in members:
             self.seq[member.row] = member.seq
         under_way = []
@@ -239,13 +256,17 @@ class VirtualNetwork:
             while way.first != way.next:
                 k, row = way.first, robot.neighbours.all[number].sender
                 _, seq, stamp, x, y, z, vx, vy, vz, yaw = way.samples[k * SENT : (k + 1) * SENT]
-                under_way.append((stamp, row, link, Sample(row, int(seq), stamp, (x, y, z), (vx, vy, vz), yaw)))
+                pose = Sample(row, int(seq), stamp, (x, y, z), (vx, vy, vz), yaw, words=words(row, stamp))
+                under_way.append((stamp, row, link, pose))
                 way.first = (k + 1) % way.size
         for stamp, _, link, sample in sorted(under_way, key=itemgetter(0, 1, 2)):  # same order as they were sent
             self._channel.send(link, sample, sample.seq, stamp)
         sent = np.frombuffer(ledger.sent)[: ledger.count * SENT].reshape(-1, SENT)
         sent = sent[np.lexsort((sent[:, 0], sent[:, 2]))]  # robots of a kind are flown together
-        self._sent.extend(sent, sent[:, 2], sent[:, 0])
+        said = list[tuple[float, ...]]()
+        if self.says and not self._lean:
+            said = [self._numbers(words(int(row), stamp)) for row, _, stamp in sent[:, :3].tolist()]
+        self._sent.extend(sent, sent[:, 2], sent[:, 0], said)
         if not self._lean:
             self._receive_all(sent, before, t)
 
@@ -287,9 +308,10 @@ class _Samples:
         if extra:
             self._extra.append(extra)
 
-    def extend(self, samples: Array, arrival: Array, link: Array) -> None:
+    def extend(self, samples: Array, arrival: Array, link: Array, extra: Sequence[tuple[float, ...]] = ()) -> None:
         """Add samples (K, 10) with their `arrival` (K,) [s] and `link` (K,)."""
         self._settle()
+        self._extra += extra
         self._parts.append(np.column_stack([link, arrival, samples]))
 
     def _settle(self) -> None:

@@ -142,8 +142,8 @@ class Layouts:
         self._of[id(thing)] = (thing, None)
         owner: type = type(thing)
         fields, fixed = dict[str, Any](), dict[str, Any]()
-        names = getattr(owner, "FIXED", ())
-        for name in (*attributes(owner), *(each for each in getattr(thing, "__dict__", ()) if each not in LEFT_OUT)):
+        names, rare = getattr(owner, "FIXED", ()), LEFT_OUT | set(getattr(owner, "RARE", ()))
+        for name in (*attributes(owner), *(each for each in getattr(thing, "__dict__", ()) if each not in rare)):
             try:
                 value = getattr(thing, name)
             except AttributeError:  # never set
@@ -186,7 +186,7 @@ class Image:
     def load(self) -> None:
         """Read the values of all objects that can change back."""
         memory = self.memory
-        for thing, layout, at in self._things:
+        for thing, layout, at in self.changing:
             layout.load(thing, memory, at)
         for items, kind, at in self._lists:
             items[:] = _items(memory, at, len(items), kind)
@@ -196,7 +196,7 @@ class Image:
         self.words = np.zeros(self._size, dtype=np.int64)
         self.memory, self._base = self.words.data.cast("B"), self.words.ctypes.data
         self.known: dict[int, int] = {}  # address by identity
-        self._things: list[tuple[Any, RecordLayout, int]] = []
+        self.changing: list[tuple[Any, RecordLayout, int]] = []  # objects that can change, each with its place [bytes]
         self._lists: list[tuple[list[Any], Items, int]] = []
         self.used = 0
         try:
@@ -225,7 +225,7 @@ class Image:
         except (struct.error, AttributeError) as error:
             raise TypeError(f"{layout.owner.__name__} has an attribute that has changed its type: {error}") from error
         if not layout.frozen:
-            self._things.append((thing, layout, at))
+            self.changing.append((thing, layout, at))
         return self._base + at
 
     def put_items(self, items: Any, kind: Items) -> tuple[int, int]:

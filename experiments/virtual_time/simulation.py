@@ -25,6 +25,7 @@ from experiments.definition.plan import Plan
 from experiments.virtual_time.company import AT_END, AT_HAZARDS, LEAN, PLACES, WIDTH, Ledger
 from experiments.virtual_time.conductor import PATIENCE_S, VirtualConductor
 from experiments.virtual_time.network import CentreLog, VirtualNetwork
+from experiments.virtual_time.steps import Steps
 from experiments.virtual_time.stretch import Stretches, stretches_of
 from twins.arrays import Array, Index
 from twins.body import TwinBody
@@ -238,7 +239,7 @@ class VirtualRun:
             sample["obstacles"] = [tuple(each) for each in self.twin.engine.obstacles]
         self._samples.append(sample)
 
-    def note(self, ledger: Ledger) -> None:
+    def note(self, ledger: Ledger, steps: Steps) -> None:
         """Note the samples of a compiled stretch."""
         self._settle()
         count, rows = ledger.sample, len(self.robots)
@@ -249,6 +250,7 @@ class VirtualRun:
         if self.lean:
             columns.setdefault("true_position", []).append(numbers.copy())
             return
+        self._remembered += steps.remembered(ledger.times[:count])
         for what, (begin, end) in PLACES.items():
             column = numbers[:, :, begin] if end == begin + 1 else numbers[:, :, begin:end]
             columns.setdefault(what, []).append(column.copy())

@@ -20,6 +20,7 @@ from experiments.virtual_time import company, machine
 from experiments.virtual_time.company import AT_END, Crew, Ledger, Member, Planned, Way
 from experiments.virtual_time.network import VirtualNetwork
 from experiments.virtual_time.records import Image, Layouts, RecordLayout
+from experiments.virtual_time.steps import Steps
 from experiments.virtual_time.translation import BOOLEAN, DOUBLE, WHOLE, OutsideError, Program
 from twins.body import TwinBody
 
@@ -82,7 +83,7 @@ class Flown(Protocol):
     lean: bool  # True for samples of true positions alone
     lonely: bool  # each robot moves by itself, and the network does nothing but take its time
 
-    def note(self, ledger: Ledger) -> None:
+    def note(self, ledger: Ledger, steps: Steps) -> None:
         """Note the samples of a stretch."""
         ...
 
@@ -108,13 +109,7 @@ def possible(flight: Flown) -> bool:
     """Whether the robots of a flight can be flown by compiled functions, unless a plug-in is outside of the subset."""
     if not flight.lonely or not machine.works():
         return False
-    if any(robot.goals.changes_shape or robot.guidance is not None for robot in flight.robots):
-        return False
-    if flight.robots[0].stepping is None:
-        return True
-    law = flight.robots[0].assignment.law
-    REFUSED[type(law).__name__] = f"the law {type(law).__name__} remembers, in tables that are not compiled"
-    return False
+    return all(robot.guidance is None for robot in flight.robots)
 
 
 @dataclass
@@ -155,6 +150,7 @@ class Stretches:
             self._members[sender.sender].ways.append(way)
             self._ways.append(way)
         self._plans: dict[int, Planned] = {}
+        self._steps = Steps(flight.robots)
         self.flown, self.refusal = 0, ""
         self._prepared: Prepared | None = None
         self._paused_until, self._pause = 0, PAUSE
@@ -180,19 +176,21 @@ class Stretches:
             member.seq = flight.network.seq[member.row]
             member.twin.reserve(ticks)
         before = flight.network.board(self._ways)
+        self._steps.begin({(sample.row, sample.stamp): sample.words for _, _, sample in before})
         with self._planned(k, end):
             last = self._run(ledger, k, end)
         if last < 0:
-            flight.network.leave(self._ways, self._members, ledger, before, -np.inf)
+            flight.network.take_back(before)
             return k, AT_END
+        self._steps.end()
         if last - k < LEAST:
             self._paused_until, self._pause = last + self._pause, min(2 * self._pause, LONGEST_PAUSE)
         else:
             self._pause = PAUSE
         self.flown += last - k
         done = last - 1 if ledger.reason == AT_END else last
-        flight.network.leave(self._ways, self._members, ledger, before, done * flight.dt)
-        flight.note(ledger)
+        flight.network.leave(self._ways, self._members, ledger, before, done * flight.dt, words=self._steps.words)
+        flight.note(ledger, self._steps)
         flight.twin.moved_to(done * flight.dt)
         return last, ledger.reason
 
@@ -209,8 +207,13 @@ class Stretches:
         if self.refusal:
             REFUSED[str(prepared.layout)] = self.refusal
         elif image is not None:
-            crew = image.address(image.roots[0][0])
-            found = prepared.driver.run(crew, k, end, flight.dt, flight.log_every, flight.network.instant)
+            self._steps.board(image)
+            given = (k, end, flight.dt, flight.log_every, flight.network.instant, self._steps.address)
+            found = prepared.driver.run(image.address(image.roots[0][0]), *given)
+            if found < 0:
+                self._steps.undo()
+            if isinstance(self._steps.error, KeyboardInterrupt):
+                raise self._steps.error
         if found < 0:  # flown plain; that tells an error
             self._refused = True
         elif image is not None:
@@ -310,7 +313,6 @@ def driver(crew: RecordLayout, groups: int, *, often: bool) -> CompiledLoop:
             named = isinstance(error, OutsideError | machine.NoCompilerError)
             known.refusal = str(error) if named else f"{type(error).__name__}: {error}"
         else:
-            # no other thread runs meanwhile: `fault` is one for all
-            of_c = ctypes.PYFUNCTYPE(ctypes.c_int64, ctypes.c_void_p, *(TYPES[kind] for kind in GIVEN))
+            of_c = ctypes.PYFUNCTYPE(ctypes.c_int64, ctypes.c_void_p, *(TYPES[kind] for kind in (*GIVEN, WHOLE)))
             known.run = of_c(address)
     return known

@@ -2,7 +2,8 @@
 
 A record becomes a struct, a tuple a struct by value, a list an address with a count, `self.held` is `self->held`; C has
 Python's arithmetic from `arithmetic.c`. The order is Python's: calls and indices become statements, since C may take
-operands in any order. What the walk has no method for is outside of the subset, and the error names file and line.
+operands in any order. A method that its class names in `RARE` is called back in Python. What the walk has no method for
+is outside of the subset, and the error names file and line.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ NAMED: Final[dict[type, str]] = {  # constructs outside of the subset
 C_WORDS: Final = re.compile(
     "auto|break|case|char|const|continue|default|do|double|else|enum|extern|float|for|goto|if|inline|int|long|register|"
     "restrict|return|short|signed|sizeof|static|struct|switch|typedef|union|unsigned|void|volatile|while|"
-    "whole|fault|turns|unknown|inf|exact|largest|nothing|fly|stretch|_.*|.*_|py_.*"
+    "whole|fault|turns|back|unknown|inf|exact|largest|nothing|fly|stretch|_.*|.*_|py_.*"
 )
 
 
@@ -206,7 +207,10 @@ class Program:
         walk = Walk(self, next(each for each in ast.parse(source).body if isinstance(each, ast.FunctionDef)), space)
         assert walk.result_for(types) == WHOLE
         given, call = walk.head(), f"stretch({', '.join(map(mangled, walk.arguments))})"
-        fly = f"whole fly({given}) {{ fault = turns = 0; whole last = {call}; return fault ? -1 : last; }}\n"
+        fly = (
+            f"whole fly({given}, whole python) {{\n  back = (whole (*)(whole, whole, double *))python;\n"
+            f"  fault = turns = 0;\n  whole last = {call};\n  return fault ? -1 : last;\n}}\n"
+        )
         return "\n".join([ARITHMETIC.read_text(encoding="utf-8"), *self._texts, walk.text("stretch"), fly])
 
 
@@ -705,6 +709,9 @@ class Walk(ast.NodeVisitor):
         return self.call(found, given[:first], dict(zip(names, given[first:], strict=True)), node)
 
     def call(self, function: FunctionType, given: list[Value], by_name: Mapping[str, Value], node: ast.AST) -> Value:
+        rare = getattr(getattr(given[0].type, "owner", None), "RARE", ()) if given else ()
+        if function.__name__ in rare:
+            return self.call_back(given[0], rare.index(function.__name__), given[1:], node)
         parameters = inspect.signature(function).parameters
         defaults = {name: each.default for name, each in parameters.items() if each.default is not each.empty}
         rest = [*parameters][len(given) :]
@@ -719,6 +726,16 @@ class Walk(ast.NodeVisitor):
         found = self.saved(Value(result, text))
         self.emit(f"if (fault) {LEAVE}")
         return found
+
+    def call_back(self, thing: Value, which: int, given: Sequence[Value], node: ast.AST) -> Value:
+        """Call of a rare function of an object, in Python, with numbers; it returns nothing."""
+        parts = [part for each in given for part in (self.parts(each, node) if each.type != DOUBLE else [each])]
+        numbers, name = ", ".join(self.of_type(each, DOUBLE, node).text for each in parts), self.new()
+        self.emit(
+            f"double {name}[] = {{{numbers}}};",
+            f"if (back((whole){thing.text}, {which}, {name})) {{ fault = 1; {LEAVE} }}",
+        )
+        return constant(None)
 
     def builtin(self, found: Any, node: ast.Call) -> Value:  # noqa: PLR0911 - one for each sort
         """Value of a function of `math`, or of one that Python has by itself."""

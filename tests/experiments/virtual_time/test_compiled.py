@@ -18,11 +18,19 @@ from agents.body.limits import Safety
 from agents.decision.lifecycle import Phase
 from agents.formation.link import BY_BEARING, BY_DISTANCE, BY_RELATIVE
 from agents.plugins import registry
+from agents.plugins.law import Control, Law
 from agents.plugins.laws import Gradient
 from agents.plugins.registry import AVOIDANCES, LAWS, PREDICTORS, TRIGGERS, PluginError
 from agents.plugins.triggers import Trigger
 from agents.vectors import UNKNOWN, clamp, norm
-from experiments.definition.experiment import ChannelTable, Formation, LegTable, RobotTable, WorldTable
+from experiments.definition.experiment import (
+    ChangeTable,
+    ChannelTable,
+    Formation,
+    LegTable,
+    RobotTable,
+    WorldTable,
+)
 from experiments.virtual_time import machine, stretch
 from tests.agents.plugins.test_every_plugin import made as plugin
 from tests.experiments.virtual_time.evaluators import alike, evaluated, same
@@ -31,6 +39,7 @@ from tests.small import pair as small_pair
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 WANTS = {"distance": BY_DISTANCE, "any": BY_DISTANCE, "relative": BY_RELATIVE, "bearing": BY_BEARING}
+REMEMBERING = [name for name in registry.names(LAWS) if not issubclass(registry.struct(LAWS, name), Gradient)]
 NATURE = {
     "all": Disturbance(position_sigma=0.0005, yaw_sigma=0.002),
     "crazyflie": Disturbance(position_sigma=0.0005, hover_jitter=Jitter(0.01), wind=(0.2, -0.1)),
@@ -63,7 +72,7 @@ def every_plugin():
     """Experiment, and change of its robots: each has the next law, trigger, predictor, avoidance and kind."""
     sending, updating = plugins(TRIGGERS, "communication"), plugins(TRIGGERS, "control")
     predictors, avoidances = plugins(PREDICTORS), plugins(AVOIDANCES)
-    laws = [law for law in plugins(LAWS) if isinstance(law, Gradient)]  # those that remember are flown plain
+    laws = [law for law in plugins(LAWS) if isinstance(law, Gradient)]
     kinds = ("crazyflie", "khepera4", "tello", "turtlebot3", "omni", "ackermann", "double-integrator")
     count = max(map(len, (sending, updating, laws, predictors, avoidances, kinds)))
 
@@ -143,6 +152,68 @@ def test_every_plugin_and_model(monkeypatch):
     for name, rare in RARE.items():
         every = {each for each in functions(import_module(name)) if not each.__name__.startswith("__")}
         assert {each.__qualname__ for each in every - reached} == rare, name
+
+
+@pytest.mark.parametrize("name", REMEMBERING)
+def test_every_law_that_remembers(name):
+    """Its steps are called back in Python; ticks between them are compiled. A user's laws are among them."""
+    law, circle = plugin(LAWS, name), {"kind": "circle", "radius": 0.3, "period_s": 9.0}
+    starts = {"A": [-0.4, 0.0], "B": [0.4, 0.1], "C": [-0.3, 0.8]}
+    robots = {each: RobotTable(kind="khepera4", start=start) for each, start in starts.items()}
+    links = Formation(links={"A > B": 0.8, "A > C": 0.8, "B - C": 0.9})
+    seen = {"relative": (0.4, 0.3, 0.0), "bearing": (0.6, 0.8, math.nan), "wants": WANTS.get(law.NEEDS, BY_DISTANCE)}
+
+    def change(given):
+        neighbours = tuple(changed(link, **seen) for link in given.neighbours)
+        return replace(given, law=law, neighbours=neighbours, trigger=plugin(TRIGGERS, "send-on-delta"))
+
+    experiment = follower(
+        robots=robots, formation=links, duration_s=3.0, channel=ChannelTable(delay_s=0.03),
+        timeline=[LegTable(at_s=0.5, robot="A", plan=circle)],
+    )  # fmt: skip
+    assert same(experiment, change=change)[1] > 200
+    if not name.startswith("m"):
+        same(experiment, change=change, lean=True, seed=2)
+
+
+class Growing(Trigger, frozen=True):
+    """A trigger with whole numbers beyond those of C, once the run has lasted."""
+
+    def fires(self, view):
+        return view.since_event > 0.2 or (view.since_start > 1.2 and (1 << 60) * 4 > 7)
+
+
+def test_steps_of_failed_stretch_are_taken_back():
+    def change(given):
+        neighbours = tuple(changed(link, relative=(0.4, 0.3, 0.0), wants=BY_RELATIVE) for link in given.neighbours)
+        return replace(given, law=plugin(LAWS, "leader-observer"), trigger=Growing(), neighbours=neighbours)
+
+    _, ticks = same(follower(duration_s=3.0, channel=ChannelTable(delay_s=0.03)), change=change)
+    assert ticks < 150
+
+
+class Failing(Law, frozen=True):
+    """A law that fails in its run."""
+
+    def step(self, view, memory):
+        return Control(velocity=(0.1 / max(1.0 - view.time, 0.0), 0.0, math.nan))
+
+
+def test_law_that_fails_in_a_step():
+    faults = set()
+    for compiled in (False, True):
+        with pytest.raises((PluginError, ZeroDivisionError)) as caught:
+            evaluated(follower(), compiled=compiled, change=lambda given: replace(given, law=Failing()))
+        faults.add(str(caught.value))
+    assert len(faults) == 1
+
+
+@pytest.mark.parametrize("law", ["distance", "consensus"])
+def test_changing_formations_are_compiled(law):
+    change = ChangeTable(at_s=1.0, over_s=1.0, links={"A > B": 0.7})
+    made = follower(formation=Formation(links={"A > B": 0.5}, law=law, changes=[change]))
+    assert same(made)[1] > 200
+    assert same(made, change=lambda given: replace(given, update=plugin(TRIGGERS, "send-on-delta")))[1] > 200
 
 
 GAIN = 0.2
