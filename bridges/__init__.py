@@ -1,4 +1,4 @@
-"""Bodies of real robots, positioning systems, ROS 2 and external simulators: one folder or file per device.
+"""Devices, a folder each: kind, protocol, body and protocol twin of a robot; positioning, ROS 2, external simulators.
 
 May import: agents.
 """

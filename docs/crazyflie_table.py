@@ -10,13 +10,13 @@ from math import factorial, pi
 
 import numpy as np
 
-from agents.kinds.crazyflie import CRAZYFLIE
 from agents.vectors import ZERO
+from bridges.crazyflie.kind import CRAZYFLIE
+from bridges.crazyflie.mujoco.engine import RigidBody
+from bridges.crazyflie.twin.planner import ORDER, OnboardPlanner, evaluate, polynomial
+from bridges.crazyflie.twin.vehicle import LOST, Estimator
 from twins.arrays import Array
-from twins.devices.crazyflie.planner import ORDER, OnboardPlanner, evaluate, polynomial
-from twins.devices.crazyflie.vehicle import LOST, Estimator
 from twins.engines.engine import Engine, EngineInput
-from twins.engines.mujoco_engine import RigidBody
 from twins.engines.point_mass import PointMass
 from twins.scene import Scene
 

@@ -8,11 +8,11 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from agents.kinds.crazyflie import CRAZYFLIE
+from bridges.crazyflie.kind import CRAZYFLIE
+from bridges.crazyflie.mujoco.engine import RigidBody
 from experiments.report.style import CASES, STYLE
 from twins.arrays import Array
 from twins.engines.engine import Engine, EngineInput
-from twins.engines.mujoco_engine import RigidBody
 from twins.engines.point_mass import PointMass
 from twins.scene import Scene
 

@@ -10,6 +10,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from agents.body.byte_stream import MalformedStream
+    from agents.body.capture_reader import CaptureFrame, CaptureReader, MeasuredPose
     from agents.body.interface import Body, BodyEntry, BodyError, BodyFault, BodyRequest, BodyState, call_all
     from agents.body.kinds import KINDS, Flight, Holonomic, Kind, Steered, Wheels
     from agents.formation.link import Link
@@ -23,9 +25,7 @@ if TYPE_CHECKING:
     from agents.plugins.predictors import Predictor
     from agents.plugins.registry import PluginError
     from agents.plugins.triggers import Trigger
-    from agents.protocols.byte_stream import MalformedStream
     from agents.vectors import Vector, clamp, distance, norm, wrap
-    from bridges.motion_capture.reader import CaptureFrame, CaptureReader, MeasuredPose
     from experiments.check.check import check, figures
     from experiments.definition import formation, graph, rigidity
     from experiments.file.document import Document, load, loads

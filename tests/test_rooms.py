@@ -23,7 +23,6 @@ agents.clock agents.ticks agents.user_folder
 agents.formation agents.network
 agents.plugins
 agents.body
-agents.protocols
 agents.kinds
 agents.decision
 agents.safety
@@ -34,7 +33,9 @@ twins.models twins.scene
 twins.engines
 twins.sensing
 twins.body
-bridges twins.devices
+twins.device
+bridges.measured_flight bridges.ros2
+DEVICES
 experiments.arrays experiments.catalogue experiments.cores
 experiments.definition
 experiments.file
@@ -59,7 +60,13 @@ tools.guard
 """
 # laws whose libraries take arrays: they import numpy with them, at first use
 EXTRAS = ("agents.plugins.extras.mpc", "agents.plugins.extras.policy")
-FLOORS = [line.split() for line in ORDER.strip().splitlines()]
+DEVICES = (
+    "crazyflie examples external khepera4 motion_capture tello turtlebot3"  # in one line of ORDER: none imports another
+)
+FLOORS = [
+    [f"bridges.{name}" for name in DEVICES.split()] if line == "DEVICES" else line.split()
+    for line in ORDER.strip().splitlines()
+]
 
 
 @cache
@@ -130,6 +137,16 @@ def test_imports_go_one_way():
         if room(name) != room(other) and floor_of(room(other)) >= floor_of(room(name))
     ]
     assert not against
+
+
+# what imports a device although it is none, and why
+IMPORTS_DEVICES = {"experiments.authoring.crazyswarm": "importer of files that list Crazyflies"}
+
+
+def test_core_imports_no_device():
+    """Without the folder of a device the core and the other devices are whole, as `test_imports_go_one_way` asks."""
+    users = {name for name, others in imports().items() if any(other.startswith("bridges.") for other in others)}
+    assert {name for name in users if not name.startswith("bridges.")} == IMPORTS_DEVICES.keys()
 
 
 def test_no_circle():
@@ -231,14 +248,13 @@ NAMES_KINDS = {
     "experiments.file.reference": "example in a text",
     "experiments.file.structure": "example in a text",
     "experiments.file.text": "example in a text",
-    "experiments.real_time.hosts.installation": "watchdog, a program for one robot",
     "experiments.real_time.hosts.station": "page on radios",
     "experiments.scene.models": "pictures, by their kinds",
     "tools.commands.author": "kind of a new formation, if none is asked for",
     "tools.commands.hosts": "watchdog, a program for one robot",
     "tools.commands.processes": "example in a text",
 }
-OWN_OF_KINDS = ("agents.kinds.", "agents.protocols.", "bridges.", "twins.devices.")
+OWN_OF_KINDS = ("agents.kinds.", "bridges.")
 
 
 def test_kinds_stand_in_their_own_files():

@@ -1,4 +1,4 @@
-"""Simulated bodies: models of one robot each, engines, sensors, disturbances, and protocol twins of devices.
+"""Simulated bodies: models of one robot each, engines, sensors, disturbances, the base of protocol twins.
 
 May import: agents, twins.arrays, twins.models, twins.engines, twins.sensing.
 """

@@ -1,6 +1,7 @@
 """The kinds of robots: size, limits, the setpoint that they take, and all that the project knows of one kind alone.
 
-A kind is a `Kind`, found by the entry-point group `zenpark.kinds`; those that come along live in `agents.kinds`.
+A kind is a `Kind`, found by the entry-point group `zenpark.kinds`; those without a device live in `agents.kinds`, the
+others with their devices in `bridges`.
 """
 
 from __future__ import annotations
@@ -69,12 +70,6 @@ class Airframe:
     thrust: float  # force of a motor at full command [N]
     torque: float  # moment of a motor about its axis, per thrust [m]
     size: tuple[float, float, float]  # sides of the collision box [m]
-
-    def scaled(self, mass: float, arm: float, size: tuple[float, float, float]) -> Airframe:
-        """Scale a design: thrust with the mass, inertia with mass and arm squared, torque with the arm."""
-        heavier, longer = mass / self.mass, arm / self.arm
-        x, y, z = (each * heavier * longer**2 for each in self.inertia)
-        return Airframe(mass, (x, y, z), arm, self.thrust * heavier, self.torque * longer, size)
 
 
 @dataclass(frozen=True)
@@ -179,6 +174,9 @@ class Kind:
     twin: ProtocolTwin | None = None
     # `module:function` of name, body and device settings: a robot's address in ROS 2 on routers of the experiment
     ros_address: str = ""
+    # module of a program for its own computer that stops it without commands; its scripts put_watchdog.sh and
+    # remove_watchdog.sh lie beside it
+    watchdog: str = ""
     takeoff_height: float = nan  # height to which it climbs by itself [m]; NaN: to any
     trial: Trial | None = None
     connect: str = ""  # remedy for a robot that does not answer

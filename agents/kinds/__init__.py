@@ -1,4 +1,4 @@
-"""The kinds of robots that come along, a file each, registered in the group `zenpark.kinds`.
+"""The kinds of robots that are no device, a file each, registered in the group `zenpark.kinds`.
 
-May import: agents.body, agents.protocols, agents.vectors.
+May import: agents.body, agents.vectors.
 """

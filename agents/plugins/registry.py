@@ -48,7 +48,7 @@ BASES: Final = {
     PLANNERS: "agents.plugins.planners:Planner",
     AVOIDANCES: "agents.plugins.avoidance:Avoidance",
     ENGINES: "twins.engines.engine:EngineFactory",
-    POSITIONING: "bridges.motion_capture.reader:CaptureReader",
+    POSITIONING: "agents.body.capture_reader:CaptureReader",
     METRICS: "experiments.metrics.metric:Metric",
 }
 

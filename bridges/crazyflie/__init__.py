@@ -1,4 +1,4 @@
-"""Crazyflie body through cflib, for real drones and protocol twins (cflib is GPL-3.0: imported when one is opened).
+"""Crazyflie: kind, and body through cflib for drones and protocol twins (cflib is GPL-3.0: imported when opened).
 
-May import: agents.
+May import: agents, bridges.crazyflie.protocol, bridges.measured_flight.
 """

@@ -13,7 +13,11 @@ from agents.body.external_pose import External
 from agents.body.interface import Body, BodyEntry, BodyError, BodyFault, BodyRequest, BodyState, RangeScan
 from agents.clock import uptime
 from agents.network.messages import Inspection, number
-from agents.protocols.crazyflie import (
+from agents.vectors import UNKNOWN, Setpoint, Vector
+from bridges.crazyflie.file_faults import file_faults
+from bridges.crazyflie.link import prepare
+from bridges.crazyflie.pilot import CrazyfliePilot
+from bridges.crazyflie.protocol.addresses import (
     CrazyflieSettings,
     Lighthouse,
     address,
@@ -24,11 +28,7 @@ from agents.protocols.crazyflie import (
     overload,
     radio_loads,
 )
-from agents.protocols.crtp import Info
-from agents.vectors import UNKNOWN, Setpoint, Vector
-from bridges.crazyflie.file_faults import file_faults
-from bridges.crazyflie.link import prepare
-from bridges.crazyflie.pilot import CrazyfliePilot
+from bridges.crazyflie.protocol.crtp import Info
 from bridges.crazyflie.telemetry import BEARING, ELEVATION, Telemetry
 
 STALE_S: Final = 0.5  # the note reports poses older than this

@@ -13,7 +13,7 @@ from array import array
 from collections.abc import Callable, Sequence
 from typing import Any, Final
 
-from agents.protocols.crazyradio import ACK, ANSWER, EXCHANGE, RETRY_S, SWITCH_S, Simulated
+from bridges.crazyflie.protocol.crazyradio import ACK, ANSWER, EXCHANGE, RETRY_S, SWITCH_S, Simulated
 
 ANSWER_S: Final = 0.1  # longest wait for the simulated air
 MAX_ANSWER_BYTES: Final = 64  # [bytes] longest answer

@@ -9,7 +9,8 @@ from itertools import combinations
 from typing import Final
 
 from agents.body.interface import BodyEntry, BodyFault, judged, settings, shared_devices
-from agents.protocols.crazyflie import (
+from bridges.crazyflie.geometry import check_anchors, in_one_plane, stations
+from bridges.crazyflie.protocol.addresses import (
     CrazyflieSettings,
     Lighthouse,
     Loco,
@@ -19,8 +20,7 @@ from agents.protocols.crazyflie import (
     device_of,
     dongle_of,
 )
-from agents.protocols.crazyradio import software
-from bridges.crazyflie.geometry import check_anchors, in_one_plane, stations
+from bridges.crazyflie.protocol.crazyradio import software
 
 BODY: Final = ("body",)
 SYSTEM: Final = ("device", "positioning")

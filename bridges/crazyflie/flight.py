@@ -16,10 +16,10 @@ from typing import Final
 
 from agents.body.interface import UNANSWERED
 from agents.clock import uptime
-from agents.kinds.crazyflie import CRAZYFLIE
-from agents.protocols.crazyflie import SETPOINT_PACKETS, CrazyflieSettings, Outside
-from agents.protocols.crtp import HighLevel, Info, LogStatus
+from bridges.crazyflie.kind import CRAZYFLIE
 from bridges.crazyflie.link import CrazyflieLink
+from bridges.crazyflie.protocol.addresses import SETPOINT_PACKETS, CrazyflieSettings, Outside
+from bridges.crazyflie.protocol.crtp import HighLevel, Info, LogStatus
 from bridges.crazyflie.telemetry import Telemetry
 from bridges.crazyflie.trajectory import HOLD_S, SINK, STOP_S, Target, stop_descent_s
 

@@ -19,12 +19,12 @@ from typing import Any, ClassVar, Final, Protocol
 
 from agents.body.interface import BodyError
 from agents.clock import uptime
-from agents.protocols import crtp
-from agents.protocols.crazyflie import dongle_of
-from agents.protocols.crazyradio import software
-from agents.protocols.crtp import HighLevel, MemoryKind, Port
 from agents.user_folder import cache_folder
 from bridges.crazyflie.dongle import plug_in
+from bridges.crazyflie.protocol import crtp
+from bridges.crazyflie.protocol.addresses import dongle_of
+from bridges.crazyflie.protocol.crazyradio import software
+from bridges.crazyflie.protocol.crtp import HighLevel, MemoryKind, Port
 from bridges.crazyflie.trajectory import PLACES, PromptRadio, TrajectoryMemory
 
 FIRST_S: Final = 0.6  # time to the first packet; cflib never repeats its first two requests

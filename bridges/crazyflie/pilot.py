@@ -9,8 +9,6 @@ from typing import Final
 
 from agents.body.interface import BodyError
 from agents.clock import uptime
-from agents.protocols.crazyflie import CrazyflieSettings, Outside
-from agents.protocols.crtp import Info
 from agents.ticks import Ticks
 from agents.vectors import Vector, distance
 from bridges.crazyflie.flight import (
@@ -23,6 +21,8 @@ from bridges.crazyflie.flight import (
 )
 from bridges.crazyflie.link import CrazyflieLink, LinkError, SilentError
 from bridges.crazyflie.positioning import Convergence, configure
+from bridges.crazyflie.protocol.addresses import CrazyflieSettings, Outside
+from bridges.crazyflie.protocol.crtp import Info
 from bridges.crazyflie.telemetry import Telemetry
 from bridges.crazyflie.trajectory import Target
 

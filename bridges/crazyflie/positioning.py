@@ -13,11 +13,11 @@ import msgspec
 
 from agents.body.interface import BodyError
 from agents.clock import uptime
-from agents.protocols import crtp
-from agents.protocols.crazyflie import CrazyflieSettings, Lighthouse, Loco, Outside
 from agents.vectors import Vector
 from bridges.crazyflie.geometry import StationFile, Sweep, check_anchors, stations
 from bridges.crazyflie.link import REPEAT_S, CrazyflieLink, LinkError
+from bridges.crazyflie.protocol import crtp
+from bridges.crazyflie.protocol.addresses import CrazyflieSettings, Lighthouse, Loco, Outside
 
 ESTIMATORS: Final = {"auto": 0, "complementary": 1, "kalman": 2, "ukf": 3}
 LOCO_MODES: Final = {"auto": 0, "twr": 1, "tdoa2": 2, "tdoa3": 3}

@@ -11,10 +11,10 @@ from math import exp, inf, isfinite, nan, radians
 from typing import Final
 
 from agents.clock import uptime
-from agents.protocols.crtp import MM, Info, Power
 from bridges.crazyflie.delay import ClimbLog
 from bridges.crazyflie.link import CrazyflieLink
 from bridges.crazyflie.positioning import SETTLED_BELOW
+from bridges.crazyflie.protocol.crtp import MM, Info, Power
 
 # for firmwares without a supervisor
 OLD_INFO: Final = {"sys.canfly": Info.ARMED | Info.CAN_FLY, "sys.isFlying": Info.FLYING, "sys.isTumbled": Info.TUMBLED}

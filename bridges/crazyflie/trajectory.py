@@ -22,9 +22,9 @@ from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 from agents.clock import uptime
-from agents.protocols import crtp
-from agents.protocols.crazyradio import COUNTERS, NULL
-from agents.protocols.crtp import HighLevel, Port
+from bridges.crazyflie.protocol import crtp
+from bridges.crazyflie.protocol.crazyradio import COUNTERS, NULL
+from bridges.crazyflie.protocol.crtp import HighLevel, Port
 
 HOLD_S: Final = 1.0  # [s] least hover before the descent
 SINK: Final = 0.3  # [m/s] speed of the descent

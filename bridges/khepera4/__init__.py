@@ -1,4 +1,4 @@
-"""Khepera IV over TCP or a serial line: the body, one link per robot, odometry.
+"""Khepera IV over TCP or a serial line: kind, protocol, body, one link per robot, odometry, protocol twin.
 
-May import: agents.
+May import: agents, bridges.measured_flight, twins.
 """

@@ -25,8 +25,8 @@ from agents.body.interface import (
 )
 from agents.clock import uptime
 from agents.network.messages import Inspection
-from agents.protocols import khepera4 as protocol
 from agents.vectors import Setpoint, Vector
+from bridges.khepera4 import protocol
 from bridges.khepera4.drivers import FIRST_ANSWER_S
 from bridges.khepera4.link import Khepera4Link, KheperaAddress
 

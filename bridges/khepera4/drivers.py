@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 from agents.clock import uptime
-from agents.protocols import khepera4 as protocol
+from bridges.khepera4 import protocol
 from bridges.khepera4.odometry import Odometer
 
 NEVER: Final = math.inf

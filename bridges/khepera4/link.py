@@ -19,8 +19,8 @@ from urllib.parse import parse_qsl, urlsplit
 from agents.body.device_locks import numeric
 from agents.body.interface import FRESH_S, BodyError
 from agents.clock import uptime
-from agents.protocols import khepera4 as protocol
 from agents.ticks import Ticks
+from bridges.khepera4 import protocol
 from bridges.khepera4.drivers import FIRST_ANSWER_S, Driver, KTeam, Wire, WrongServer, identify
 from bridges.khepera4.odometry import Odometer
 

@@ -6,7 +6,7 @@ import math
 from typing import Final
 
 from agents.body.external_pose import velocity_after
-from agents.protocols import khepera4 as protocol
+from bridges.khepera4 import protocol
 
 ORIGIN: Final = 0.01  # [m, rad] counters closer to zero are at zero: who switched it on has touched its wheels
 

@@ -8,10 +8,10 @@ import time
 from collections import Counter
 from typing import ClassVar, Final
 
-from agents.protocols import natnet
-from agents.protocols.byte_stream import MalformedStream
-from agents.protocols.natnet import MessageKind, NatNetFrame, ServerInfo
-from bridges.motion_capture.reader import CaptureFrame, CaptureReader, MeasuredPose, by_name, readable, rotation_of
+from agents.body.byte_stream import MalformedStream
+from agents.body.capture_reader import CaptureFrame, CaptureReader, MeasuredPose, by_name, readable, rotation_of
+from bridges.motion_capture.protocol import natnet
+from bridges.motion_capture.protocol.natnet import MessageKind, NatNetFrame, ServerInfo
 
 PACKET: Final = 1 << 16  # [bytes] largest packet of UDP
 NAMES_S: Final = 2.0  # period of the question for the names of bodies
@@ -30,7 +30,7 @@ class OptiTrackReader(CaptureReader):
     UP: ClassVar = "y"
     PROGRAM: ClassVar = "Motive with its streaming switched on"
     TRANSPORT: ClassVar = "UDP"
-    TWIN: ClassVar = "twins.devices.optitrack:OptiTrackTwin"
+    TWIN: ClassVar = "bridges.motion_capture.twin.optitrack:OptiTrackTwin"
 
     def __init__(self, host: str, port: int = natnet.COMMAND_PORT, timeout_s: float = 2.0) -> None:
         deadline = time.monotonic() + timeout_s

@@ -15,6 +15,8 @@ from typing import Annotated, Final, Literal
 import msgspec
 from msgspec import Meta
 
+from agents.body.byte_stream import MalformedStream
+from agents.body.capture_reader import CaptureFrame, CaptureReader, MeasuredPose, parse_server
 from agents.body.coordinates import Coordinates
 from agents.body.external_pose import External
 from agents.clock import Clock, uptime
@@ -23,12 +25,10 @@ from agents.network import session as network
 from agents.network.keys import Keys
 from agents.network.shutdown import Farewell, closing_cleanly, end
 from agents.plugins import registry
-from agents.protocols.byte_stream import MalformedStream
 from agents.runtime import command_line
 from agents.runtime.command_line import NetworkLaunch, on_termination
 from agents.runtime.lifeline import Lifeline
 from agents.vectors import NotNegative, Vector
-from bridges.motion_capture.reader import CaptureFrame, CaptureReader, MeasuredPose, parse_server
 
 FIRST_S: Final = 5.0  # deadline of the first answer of the server
 ATTEMPT_S: Final = 2.0  # deadline of each attempt to connect

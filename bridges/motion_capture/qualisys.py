@@ -8,10 +8,10 @@ import time
 from collections import deque
 from typing import ClassVar, Final
 
-from agents.protocols import qtm
-from agents.protocols.byte_stream import MalformedStream
-from agents.protocols.qtm import PacketFramer, QtmFrame, QtmPacketKind
-from bridges.motion_capture.reader import CaptureFrame, CaptureReader, MeasuredPose, by_name, readable, received
+from agents.body.byte_stream import MalformedStream
+from agents.body.capture_reader import CaptureFrame, CaptureReader, MeasuredPose, by_name, readable, received
+from bridges.motion_capture.protocol import qtm
+from bridges.motion_capture.protocol.qtm import PacketFramer, QtmFrame, QtmPacketKind
 
 NAMES_S: Final = 1.0  # period of the question for the names of bodies
 UPWARD: Final = {"+Y": "y", "+Z": "z"}  # axes that can be read
@@ -22,7 +22,7 @@ class QualisysReader(CaptureReader):
 
     PORT: ClassVar = qtm.PORT
     PROGRAM: ClassVar = "QTM, with its real-time output on"
-    TWIN: ClassVar = "twins.devices.qualisys:QualisysTwin"
+    TWIN: ClassVar = "bridges.motion_capture.twin.qualisys:QualisysTwin"
 
     def __init__(self, host: str, port: int = qtm.PORT, timeout_s: float = 2.0) -> None:
         deadline = time.monotonic() + timeout_s

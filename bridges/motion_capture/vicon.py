@@ -11,10 +11,10 @@ import time
 from collections import deque
 from typing import ClassVar
 
-from agents.protocols import vicon_datastream
-from agents.protocols.byte_stream import MalformedStream
-from agents.protocols.vicon_datastream import BlockKind, Framer, Segment, Subject
-from bridges.motion_capture.reader import CaptureFrame, CaptureReader, MeasuredPose, by_name, readable, received
+from agents.body.byte_stream import MalformedStream
+from agents.body.capture_reader import CaptureFrame, CaptureReader, MeasuredPose, by_name, readable, received
+from bridges.motion_capture.protocol import vicon_datastream
+from bridges.motion_capture.protocol.vicon_datastream import BlockKind, Framer, Segment, Subject
 
 
 class Decoder:
@@ -66,7 +66,7 @@ class ViconReader(CaptureReader):
 
     PORT: ClassVar = vicon_datastream.PORT
     PROGRAM: ClassVar = "Tracker or Nexus"
-    TWIN: ClassVar = "twins.devices.vicon:ViconTwin"
+    TWIN: ClassVar = "bridges.motion_capture.twin.vicon:ViconTwin"
 
     def __init__(self, host: str, port: int = vicon_datastream.PORT, timeout_s: float = 2.0) -> None:
         deadline = time.monotonic() + timeout_s

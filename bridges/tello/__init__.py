@@ -1,4 +1,4 @@
-"""DJI Tello through djitellopy: the body, one pilot per drone.
+"""DJI Tello through djitellopy: kind, protocol, body, one pilot per drone, protocol twin.
 
-May import: agents.
+May import: agents, bridges.measured_flight, twins.
 """

@@ -31,8 +31,8 @@ from agents.body.interface import (
     shared_devices,
 )
 from agents.clock import uptime
-from agents.protocols import tello as protocol
 from agents.vectors import UNKNOWN, ZERO, Setpoint, Vector
+from bridges.tello import protocol
 from bridges.tello.library import TelloLibrary, filters_answers
 from bridges.tello.pilot import Duty, TelloPilot
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from agents.body.interface import BodyError
-from agents.protocols import tello as protocol
+from bridges.tello import protocol
 from bridges.tello.pilot import Vendor
 
 MAX_DATAGRAMS: Final = 100  # datagrams read at a time from a socket: a flood must not keep the pilots from their drones

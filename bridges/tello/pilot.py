@@ -16,7 +16,7 @@ from typing import Any, Final, Protocol
 from agents.body.interface import FRESH_S, UNANSWERED
 from agents.body.kinds import Kind
 from agents.clock import uptime
-from agents.protocols import tello as protocol
+from bridges.tello import protocol
 
 SDK_RETRY_S: Final = 0.5  # pause between two attempts to enter SDK mode
 LAND_RETRY_S: Final = 1.0  # pause between two `land` without an answer

@@ -1,4 +1,4 @@
-"""TurtleBot3 over Zenoh (zenoh-bridge-ros2dds or rmw_zenoh): the body, and one robot with its topics.
+"""TurtleBot3 over Zenoh: kind, protocol, body, one robot with its topics, watchdog for it, protocol twin.
 
-May import: agents.
+May import: agents, bridges.ros2, twins.
 """

@@ -33,9 +33,10 @@ from agents.errors import ExplainedError
 from agents.network import session as network
 from agents.network.messages import Inspection, number
 from agents.network.shutdown import leave
-from agents.protocols import ros2, turtlebot3
-from agents.protocols.ros2_node import Participant
 from agents.vectors import UNKNOWN, Setpoint, Vector
+from bridges.ros2 import messages as ros2
+from bridges.ros2.node import Participant
+from bridges.turtlebot3 import protocol as turtlebot3
 from bridges.turtlebot3.odometry import SILENCE_S
 from bridges.turtlebot3.robot import REPEAT_S, TurtleBotConnection
 

@@ -10,9 +10,9 @@ from math import cos, hypot, inf, isfinite, nan, pi, sin
 from typing import Final
 
 from agents.body.external_pose import velocity_after
-from agents.protocols import ros2
-from agents.protocols.ros2 import Message
 from agents.vectors import wrap
+from bridges.ros2 import messages as ros2
+from bridges.ros2.messages import Message
 
 SILENCE_S: Final = 0.5  # age of odometry from which the robot is out of reach and gets zeros
 STANDING: Final = (0.015, 0.06)  # [m/s, rad/s] slower robots stand

@@ -14,9 +14,10 @@ import zenoh
 from agents.body.interface import FRESH_S, UNANSWERED, BodyRequest, RangeScan, settings
 from agents.network import pubsub
 from agents.network import session as network
-from agents.protocols import ros2, turtlebot3
-from agents.protocols.ros2 import Message
-from agents.protocols.ros2_node import Participant
+from bridges.ros2 import messages as ros2
+from bridges.ros2.messages import Message
+from bridges.ros2.node import Participant
+from bridges.turtlebot3 import protocol as turtlebot3
 from bridges.turtlebot3.odometry import STANDING, Odometry, StampAge
 
 REPEAT_S: Final = 0.05  # longest time between commands while the robot shall move,

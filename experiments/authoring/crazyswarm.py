@@ -20,7 +20,7 @@ from msgspec import Meta, Struct
 from agents.body.interface import BodyError
 from agents.plugins import registry
 from agents.plugins.registry import did_you_mean
-from agents.protocols import crazyflie as protocol
+from bridges.crazyflie.protocol import addresses as protocol
 from experiments.authoring.robotic_park.file import MISSING, YamlValue, load, text_of
 from experiments.catalogue import index
 from experiments.check.findings import join_names

@@ -38,7 +38,8 @@ from experiments.virtual_time.conductor import Stuck
 from experiments.virtual_time.log import RunRecorder
 from experiments.virtual_time.simulation import simulate
 
-PACKAGES: Final = ("agents", "twins")  # packages with plug-ins, which no line imports: all of them counts
+# modules that no line imports because they are, or may be, plug-ins
+PLUG_INS: Final = ("agents/**/*.py", "twins/**/*.py", "bridges/*/kind.py", "bridges/*/mujoco/*.py")
 WORK: Final = "experiments/sweep/runs.py"  # this module: with what it imports, all other code that determines results
 _IMPORT: Final = re.compile(r"^\s*(?:from\s+([\w.]+)\s+)?import\s+(\([^)]*\)|.*)", re.MULTILINE)
 _COMMENT: Final = re.compile(r"\n?[^\S\n]*#[^\"'\n]*$|\n(?=\n)", re.MULTILINE)  # comments and blank lines
@@ -120,7 +121,7 @@ def code_of(plan: Plan) -> str:
 def digest_of_code(root: Path = ROOT) -> str:
     """Digest of our modules that determine results, without their comments; those of reports are not among them."""
     total, seen = hashlib.sha256(), set[Path]()
-    left = [root / WORK, *(file for name in PACKAGES for file in (root / name).rglob("*.py"))]
+    left = [root / WORK, *(file for pattern in PLUG_INS for file in root.glob(pattern))]
     texts = dict[str, str]()
     while left:
         file = left.pop()

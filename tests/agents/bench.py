@@ -11,10 +11,10 @@ from agents.body.interface import BodyState
 from agents.decision.assignment import Assignment
 from agents.decision.lifecycle import AIRBORNE, READY, RUNNING
 from agents.decision.situation import ProcessHealth
-from agents.kinds.khepera4 import KHEPERA4
 from agents.plugins.avoidance import Nearby, OwnState
 from agents.robot import Robot
 from agents.vectors import ZERO, Vector
+from bridges.khepera4.kind import KHEPERA4
 from experiments.definition import bodies
 from experiments.definition.experiment import Experiment, RobotTable
 from experiments.definition.plan import Plan

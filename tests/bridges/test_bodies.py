@@ -7,13 +7,13 @@ import pytest
 
 from agents.body.device_locks import Claims
 from agents.body.interface import BodyError, refuse
-from agents.protocols.crazyflie import device_of
 from bridges.crazyflie.body import CrazyflieBody
+from bridges.crazyflie.protocol.addresses import device_of
 from bridges.khepera4.body import KheperaBody
 from bridges.khepera4.link import KheperaAddress
 from bridges.tello.body import TelloBody
 from bridges.turtlebot3.body import TurtleBot3
-from tests.bridges import turtlebots
+from tests.bridges.turtlebot3 import turtlebots
 from tests.requests import request
 
 pytestmark = pytest.mark.usefixtures("runtime_folder")

@@ -21,8 +21,8 @@ from agents.network import messages
 from agents.network.keys import Keys
 from agents.network.pubsub import alive_token, pose_publisher
 from agents.network.session import open_session, received
-from agents.protocols import ros2
-from bridges.ros2 import GoalHeight, main, ros_name, scan, transform
+from bridges.ros2 import messages as ros2
+from bridges.ros2.bridge import GoalHeight, main, ros_name, scan, transform
 from tests.commands import started
 from tests.waiting import until
 
@@ -253,7 +253,7 @@ class Realm:
 def sides(router):
     """A ROS node and a realm with the bridge between them."""
     with (
-        started("-m", "bridges.ros2", "--connect", router.endpoint, "--domain", "7", stderr=None) as process,
+        started("-m", "bridges.ros2.bridge", "--connect", router.endpoint, "--domain", "7", stderr=None) as process,
         open_session([router.endpoint], name="realm") as inside,
         open_session([router.endpoint], name="ros") as outside,
     ):

@@ -10,27 +10,29 @@ from unittest import mock
 
 import numpy as np
 
+from agents.body.byte_stream import MalformedStream
 from agents.body.kinds import KINDS
-from agents.protocols import crtp, khepera4, natnet, qtm
-from agents.protocols import vicon_datastream as vicon
-from agents.protocols.byte_stream import MalformedStream
-from agents.protocols.crtp import HighLevel, Log, Misc, Port, Setpoint, SupervisorCommand
-from agents.protocols.natnet import MessageKind, NatNetFrame, RigidBodyPose, ServerInfo
-from agents.protocols.qtm import BodyPose, PacketFramer, QtmFrame, QtmPacketKind
-from agents.protocols.tello import TelloSettings
-from agents.protocols.vicon_datastream import BlockKind, Segment
+from bridges.crazyflie.protocol import crtp
+from bridges.crazyflie.protocol.crtp import HighLevel, Log, Misc, Port, Setpoint, SupervisorCommand
+from bridges.crazyflie.twin.device import CrazyflieTwin
+from bridges.khepera4 import protocol as khepera4
 from bridges.khepera4.drivers import KTeam, identify
 from bridges.khepera4.odometry import Odometer
+from bridges.khepera4.twin import KheperaDevice
+from bridges.motion_capture.protocol import natnet, qtm
+from bridges.motion_capture.protocol import vicon_datastream as vicon
+from bridges.motion_capture.protocol.natnet import MessageKind, NatNetFrame, RigidBodyPose, ServerInfo
+from bridges.motion_capture.protocol.qtm import BodyPose, PacketFramer, QtmFrame, QtmPacketKind
+from bridges.motion_capture.protocol.vicon_datastream import BlockKind, Segment
 from bridges.motion_capture.publisher import PoseFilter
+from bridges.motion_capture.twin.vicon import ViconClient, ViconTwin
 from bridges.motion_capture.vicon import Decoder
 from bridges.tello.pilot import TelloPilot
+from bridges.tello.protocol import TelloSettings
+from bridges.tello.twin import TelloDevice
 from tests.fuzz.target import Target, Wire, place, renewed
 from tests.requests import request
-from twins.devices.crazyflie.device import CrazyflieTwin
-from twins.devices.device import DeviceRequest, Faults
-from twins.devices.khepera4 import KheperaDevice
-from twins.devices.tello import TelloDevice
-from twins.devices.vicon import ViconClient, ViconTwin
+from twins.device import DeviceRequest, Faults
 
 LETTERS = dict(zip("pqrstk", (*khepera4.PARK, "kteam"), strict=True))  # the first byte says which server
 

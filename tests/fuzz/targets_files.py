@@ -21,16 +21,19 @@ from mcap.data_stream import RecordBuilder
 from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC
 
+from agents.body.capture_reader import parse_server
 from agents.body.interface import BodyError, settings
 from agents.errors import ExplainedError
 from agents.network import messages as wire
 from agents.network import zenoh_config as sessions
 from agents.plugins import registry
 from agents.plugins.recorded import formats
-from agents.protocols import crazyflie, khepera4, tello, turtlebot3
 from bridges.crazyflie.geometry import stations
+from bridges.crazyflie.protocol import addresses as crazyflie
+from bridges.khepera4 import protocol as khepera4
 from bridges.khepera4.link import KheperaAddress
-from bridges.motion_capture.reader import parse_server
+from bridges.tello import protocol as tello
+from bridges.turtlebot3 import protocol as turtlebot3
 from experiments.authoring import crazyswarm
 from experiments.authoring.robotic_park.convert import convert_text
 from experiments.catalogue import index
@@ -56,7 +59,7 @@ from tests.experiments.file import test_graphs as graph_files
 from tests.fuzz.messages import KEYS, good, of_all
 from tests.fuzz.target import Target, place, split
 from tools.commands.network import key_expression
-from twins.devices.device import Faults
+from twins.device import Faults
 
 MALFORMED = Path(__file__).parents[1] / "experiments" / "file" / "malformed"
 

@@ -19,6 +19,8 @@ from agents.network.name_ownership import OwnershipCheck
 from agents.runtime.loop import Runtime, Setup
 from agents.vectors import is_finite
 from bridges.external import ExternalBody
+from bridges.motion_capture.twin.capture import TruthSubscription
+from bridges.motion_capture.twin.vicon import ViconTwin
 from experiments.definition import bodies
 from experiments.file import document
 from experiments.real_time.conductor import orders
@@ -35,8 +37,6 @@ from tests.fuzz.target import Target, place, renewed, split
 from tests.network import Net, Reply, Sample
 from tests.requests import request
 from tools.commands.network import members, readable
-from twins.devices.capture import TruthSubscription
-from twins.devices.vicon import ViconTwin
 
 
 @cache

@@ -6,17 +6,17 @@ from itertools import count
 import numpy as np
 
 from agents.network.keys import Keys
-from agents.protocols import ros2
-from agents.protocols.ros2_node import Participant
 from agents.vectors import is_finite
-from bridges.ros2 import Graph
+from bridges.ros2 import messages as ros2
+from bridges.ros2.bridge import Graph
+from bridges.ros2.node import Participant
 from bridges.turtlebot3.body import TurtleBot3
+from bridges.turtlebot3.twin import TurtleBot3Twin
 from tests.fuzz.messages import everything
 from tests.fuzz.target import Target, place, renewed, split
 from tests.network import Sample
 from tests.requests import request
-from twins.devices.device import DeviceRequest, Faults
-from twins.devices.turtlebot3 import TurtleBot3Twin
+from twins.device import DeviceRequest, Faults
 
 
 def ros_messages():

@@ -24,7 +24,7 @@ ROLES: Final = {  # by the module that a process runs
     "experiments.real_time.processes.world": "world",
     "experiments.real_time.processes.centre": "centre",
     "bridges.motion_capture.publisher": "positioning",
-    "twins.devices.capture": "capture",
+    "bridges.motion_capture.twin.capture": "capture",
 }
 ROBOT: Final = "experiments.real_time.processes.robot"
 OTHER: Final = "other"

@@ -210,7 +210,10 @@ ROLES = {
 }  # of processes, by their modules
 
 
-CAPTURE = {"bridges.motion_capture.publisher": "{}", "twins.devices.capture": "{}-twin"}  # roles, with the system
+CAPTURE = {
+    "bridges.motion_capture.publisher": "{}",
+    "bridges.motion_capture.twin.capture": "{}-twin",
+}  # roles, with the system
 
 
 class Flight:

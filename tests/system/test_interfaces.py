@@ -11,13 +11,13 @@ from pathlib import Path
 
 import pytest
 
-from agents.protocols.tello import TelloPlace
+from bridges.tello import twin as tello
 from bridges.tello.library import TelloLibrary, filters_answers
+from bridges.tello.protocol import TelloPlace
 from tests.requests import request
 from tests.system.machines import why_not
 from tests.waiting import until
-from twins.devices import tello
-from twins.devices.device import DeviceRequest, Faults
+from twins.device import DeviceRequest, Faults
 
 LACKING = why_not() or ("" if find_spec("djitellopy") else "needs djitellopy")
 pytestmark = [pytest.mark.system, pytest.mark.skipif(bool(LACKING), reason=LACKING)]

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from agents.network import messages
-from agents.protocols import ros2
-from bridges.ros2 import diagnostic, scan, transform
+from bridges.ros2 import messages as ros2
+from bridges.ros2.bridge import diagnostic, scan, transform
 from tests.commands import zenpark
 from tests.fuzz.targets_ros import ros_messages
 from tests.system.rclpy_wheels import APART, LOOPBACK, PYTHON, missing

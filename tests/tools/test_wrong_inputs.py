@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from agents.body.interface import BodyEntry
-from agents.kinds.khepera4 import KHEPERA4
+from bridges.khepera4.kind import KHEPERA4
 from experiments.check.safety import libraries
 from experiments.definition.plan import Plan
 from experiments.file.document import loads

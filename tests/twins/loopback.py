@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from twins.devices.capture import upright
-from twins.devices.device import Capture, DeviceRequest, Faults
-from twins.devices.vicon import ViconTwin
+from bridges.motion_capture.twin.capture import upright
+from bridges.motion_capture.twin.vicon import ViconTwin
+from twins.device import Capture, DeviceRequest, Faults
 
 
 class Served:

@@ -10,12 +10,12 @@ import pytest
 from agents.body.external_pose import External
 from agents.body.interface import BodyError, Disturbance, Jitter
 from agents.body.kinds import KINDS
-from agents.kinds.crazyflie import CRAZYFLIE
-from agents.kinds.khepera4 import KHEPERA4
-from agents.kinds.tello import TELLO
-from agents.kinds.turtlebot3 import TURTLEBOT3
 from agents.plugins.registry import load
 from agents.vectors import NO_SETPOINT, ZERO
+from bridges.crazyflie.kind import CRAZYFLIE
+from bridges.khepera4.kind import KHEPERA4
+from bridges.tello.kind import TELLO
+from bridges.turtlebot3.kind import TURTLEBOT3
 from tests.requests import request
 from twins.body import CATCH_UP_S, TwinBody, instants
 from twins.engines.engine import World
@@ -229,7 +229,7 @@ def test_every_kind_has_a_registered_twin():
 def test_quiet_robot_needs_no_numpy():
     program = """
 import sys
-from agents.kinds.crazyflie import CRAZYFLIE
+from bridges.crazyflie.kind import CRAZYFLIE
 from tests.requests import request
 from twins.body import TwinBody
 body = TwinBody(request((CRAZYFLIE,)))

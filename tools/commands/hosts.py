@@ -65,17 +65,19 @@ def watchdog(
     remove: Annotated[bool, Option("--remove", help="Remove it.")] = False,
 ) -> None:
     """Install a watchdog on a TurtleBot3, which stops it when no command arrives."""
-    from agents.protocols import turtlebot3
+    from agents.plugins import registry
     from experiments.real_time.hosts import installation
 
+    kind = registry.load(registry.ROBOTS, "turtlebot3")
     if robot is None:
-        sys.stdout.write(installation.WATCHDOG.read_text("utf-8"))
+        sys.stdout.write(installation.watchdog(kind).read_text("utf-8"))
         return
-    at = turtlebot3.address(robot, f"ros2dds://{namespace}", turtlebot3.TurtleBot3Settings())
+    address = registry.find(kind.ros_address, f"ROS 2 of the kind {kind.name}")
+    at = address(robot, f"ros2dds://{namespace}", {}, of_twin=False)
     said = (
-        installation.remove_watchdog(robot)
+        installation.remove_watchdog(kind, robot)
         if remove
-        else installation.put_watchdog(robot, namespace=at.namespace, domain=domain, silence_s=silence)
+        else installation.put_watchdog(kind, robot, namespace=at.namespace, domain=domain, silence_s=silence)
     )
     for line in said:
         print(f"{robot}: {line}")

@@ -242,5 +242,5 @@ def bridge(
         raise typer.BadParameter(f"'{what}' is none of {', '.join(systems)}, ros2", param_hint="bridge")
     words = context.args if "--connect" in context.args else [*context.args, *given]
     if what == "ros2":
-        return int(import_module("bridges.ros2").main(words))
+        return int(import_module("bridges.ros2.bridge").main(words))
     return int(import_module("bridges.motion_capture.publisher").main([what, *words]))

@@ -1,4 +1,4 @@
-"""Physics engines behind one interface: point masses, pymunk (planar rigid bodies), MuJoCo (rigid quadrotors).
+"""Physics engines behind one interface: point masses, pymunk (planar rigid bodies).
 
 May import: agents, twins.arrays, twins.models, twins.scene.
 """

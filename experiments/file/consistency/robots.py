@@ -6,11 +6,11 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import Final
 
+from agents.body.capture_reader import parse_server
 from agents.body.interface import BodyError
 from agents.body.kinds import KINDS, Kind
 from agents.plugins import files, registry
 from agents.plugins.registry import did_you_mean
-from bridges.motion_capture.reader import parse_server
 from experiments.definition.bodies import body_faults, device_struct, driven_kind
 from experiments.definition.experiment import MEAN, TWIN, WORLD, WORST, Experiment, RobotTable
 from experiments.file.consistency.arena import WALL

@@ -186,7 +186,7 @@ class CaseProcesses:
             sigma = max(LEAST_SIGMA, *asked)
             noise = ["--sigma", str(sigma), "--seed", str(experiment.seed)]
             arguments = [capture.system, *bodies, "--listen", "127.0.0.1:0", *noise, *coordinates, *realm]
-            twin = context.start(capture.source, "twins.devices.capture", *arguments)
+            twin = context.start(capture.source, "bridges.motion_capture.twin.capture", *arguments)
             self._standins.append(twin.name)
             host = twin.await_lines(rf"^{capture.system} (ready on) (\S+)$", 1, context.ended)["ready on"]
         maps = [part for body in bodies for part in ("--map", body)]

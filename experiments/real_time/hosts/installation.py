@@ -1,15 +1,16 @@
-"""Put this zenpark, the certificates of a lab or the watchdog of a TurtleBot on another machine over ssh."""
+"""Put this zenpark, the certificates of a lab or the watchdog of a robot on another machine over ssh."""
 
 from __future__ import annotations
 
 import io
 import tarfile
 from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path, PurePosixPath
 from typing import Final
 
+from agents.body.kinds import Kind
 from agents.network.lab import AUTHORITY
-from bridges.turtlebot3 import watchdog
 from experiments.definition.experiment import Host
 from experiments.real_time.hosts import certificates
 from experiments.real_time.hosts.hosts import HostError, run_script
@@ -21,9 +22,6 @@ WATCHDOG_S: Final = 120.0
 FILES: Final = ("zenpark", "face", "pyproject.toml", "README.md", "LICENSE")
 PUT_ZENPARK: Final = Path(__file__).with_name("put_zenpark.sh").read_text("utf-8")
 PUT_CERTIFICATES: Final = Path(__file__).with_name("put_certificates.sh").read_text("utf-8")
-PUT_WATCHDOG: Final = Path(__file__).with_name("put_watchdog.sh").read_text("utf-8")
-REMOVE_WATCHDOG: Final = Path(__file__).with_name("remove_watchdog.sh").read_text("utf-8")
-WATCHDOG: Final = Path(watchdog.__file__)
 WATCHDOG_FOLDER: Final = "zenpark-watchdog"  # name in the home folder on the robot
 
 
@@ -81,10 +79,19 @@ def send(name: str, host: Host, folder: Path, robots: Sequence[str]) -> str:
     return f"certificates of {', '.join(robots)} put into {place}{more}"
 
 
-def put_watchdog(robot: str, *, namespace: str, domain: int, silence_s: float) -> list[str]:
-    """Put the watchdog of a TurtleBot on it, without zenpark there, and start it; returns what there is to say.
+def watchdog(kind: Kind) -> Path:
+    """The program that stops robots of a kind without commands; raises HostError if there is none."""
+    spec = find_spec(kind.watchdog) if kind.watchdog else None
+    if spec is None or spec.origin is None:
+        raise HostError(f"the kind {kind.name} has no watchdog for its own computer")
+    return Path(spec.origin)
+
+
+def put_watchdog(kind: Kind, robot: str, *, namespace: str, domain: int, silence_s: float) -> list[str]:
+    """Put the watchdog of a robot on it, without zenpark there, and start it; returns what there is to say.
 
     Args:
+        kind: Kind of the robot.
         robot: Address as ssh takes it.
         namespace: Of the robot's ROS nodes, without slashes around it; may be empty.
         domain: ROS_DOMAIN_ID.
@@ -93,15 +100,17 @@ def put_watchdog(robot: str, *, namespace: str, domain: int, silence_s: float) -
     Raises:
         HostError: If the robot cannot be reached, has no ROS 2, or the watchdog does not come up.
     """
-    return _watchdog_script(robot, PUT_WATCHDOG, WATCHDOG_FOLDER, namespace, str(domain), f"{silence_s:g}")
+    return _watchdog_script(kind, robot, "put_watchdog.sh", namespace, str(domain), f"{silence_s:g}")
 
 
-def remove_watchdog(robot: str) -> list[str]:
+def remove_watchdog(kind: Kind, robot: str) -> list[str]:
     """Stop the watchdog and remove it; returns what there is to say."""
-    return _watchdog_script(robot, REMOVE_WATCHDOG, WATCHDOG_FOLDER)
+    return _watchdog_script(kind, robot, "remove_watchdog.sh")
 
 
-def _watchdog_script(robot: str, *script: str) -> list[str]:
+def _watchdog_script(kind: Kind, robot: str, script: str, *arguments: str) -> list[str]:
+    program = watchdog(kind)
+    text = program.with_name(script).read_text("utf-8")
     late = f"did not answer within {WATCHDOG_S:g} s; try it by hand: ssh {robot}"
-    host, given = Host(address=robot), WATCHDOG.read_bytes()
-    return run_script(robot, host, script, given, limit_s=WATCHDOG_S, late=late).splitlines()
+    words, given = (text, WATCHDOG_FOLDER, *arguments), program.read_bytes()
+    return run_script(robot, Host(address=robot), words, given, limit_s=WATCHDOG_S, late=late).splitlines()

@@ -32,7 +32,7 @@ from experiments.definition.plan import Plan
 from experiments.file import structure
 from experiments.file.problems import refusal
 from experiments.real_time.processes.joining import Launch
-from twins.devices.device import Device, DeviceRequest, Faults, serve_until_next
+from twins.device import Device, DeviceRequest, Faults, serve_until_next
 
 
 class TwinLaunch(Launch, frozen=True, kw_only=True):

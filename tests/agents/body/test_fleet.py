@@ -12,8 +12,8 @@ from agents.body.interface import Body, BodyError, BodyState, Disturbance
 from agents.body.shadow_twin import Shadowed, shadowed
 from agents.network.messages import Inspection
 from agents.plugins import registry
-from agents.protocols.crazyflie import device_of
 from agents.vectors import NO_SETPOINT, UNKNOWN, ZERO
+from bridges.crazyflie.protocol.addresses import device_of
 from tests.cases import for_each
 from tests.commands import started
 from tests.requests import request

@@ -10,12 +10,12 @@ from agents.body.limits import Limits
 from agents.decision.neighbours import Incoming, Neighbours
 from agents.decision.perception import AHEAD_S, CLIMB_S, SCAN_S, SIGHT_M, Perception
 from agents.decision.situation import Situation
-from agents.kinds.crazyflie import CRAZYFLIE
-from agents.kinds.khepera4 import KHEPERA4
-from agents.kinds.tello import TELLO
-from agents.kinds.turtlebot3 import TURTLEBOT3
 from agents.plugins.avoidance import Avoidance
 from agents.vectors import ZERO
+from bridges.crazyflie.kind import CRAZYFLIE
+from bridges.khepera4.kind import KHEPERA4
+from bridges.tello.kind import TELLO
+from bridges.turtlebot3.kind import TURTLEBOT3
 
 LIMITS = Limits(low=(-5.0, -5.0, 0.0), high=(5.0, 5.0, 2.5), speed=0.5)
 

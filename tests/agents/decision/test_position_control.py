@@ -8,10 +8,10 @@ from hypothesis import strategies as st
 
 from agents.body.kinds import KINDS, Agility
 from agents.decision.position_control import REACHED, TURNED, PositionController, TwoWheels
-from agents.kinds.crazyflie import CRAZYFLIE
-from agents.kinds.khepera4 import KHEPERA4
-from agents.kinds.tello import TELLO
-from agents.kinds.turtlebot3 import TURTLEBOT3
+from bridges.crazyflie.kind import CRAZYFLIE
+from bridges.khepera4.kind import KHEPERA4
+from bridges.tello.kind import TELLO
+from bridges.turtlebot3.kind import TURTLEBOT3
 from tests.cases import examples
 from twins.models.differential import Differential
 

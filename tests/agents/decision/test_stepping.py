@@ -11,14 +11,14 @@ import pytest
 from agents.decision.lifecycle import LANDING, RUNNING
 from agents.decision.position_control import LEASH, VelocityFollower
 from agents.decision.stepping import Speech, Stepping
-from agents.kinds.crazyflie import CRAZYFLIE
-from agents.kinds.khepera4 import KHEPERA4
 from agents.network import messages, validation
 from agents.network.messages import Malformed, Variable
 from agents.plugins.law import Control, Law, RobotFacts, Said
 from agents.plugins.planners import Leg, Line
 from agents.plugins.registry import PluginError
 from agents.vectors import UNKNOWN, ZERO
+from bridges.crazyflie.kind import CRAZYFLIE
+from bridges.khepera4.kind import KHEPERA4
 from experiments.definition.plan import Plan
 from tests.agents.bench import Bench
 from tests.small import triangle

@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 from agents.decision.control_updates import ControlUpdates
 from agents.decision.neighbours import Incoming, Neighbours
 from agents.decision.transmission import LowPass, Transmitter
-from agents.kinds.crazyflie import CRAZYFLIE
-from agents.kinds.khepera4 import KHEPERA4
-from agents.kinds.tello import TELLO
 from agents.plugins.predictors import HOLD, ConstantVelocity
 from agents.plugins.triggers import SendOnDelta
 from agents.vectors import NO_SETPOINT, UNKNOWN, ZERO
+from bridges.crazyflie.kind import CRAZYFLIE
+from bridges.khepera4.kind import KHEPERA4
+from bridges.tello.kind import TELLO
 from experiments.definition.experiment import Formation, LegTable
 from tests.agents.bench import Swarm
 from tests.cases import examples

@@ -11,14 +11,14 @@ from hypothesis import strategies as st
 from scipy.optimize import linprog
 
 from agents.body.kinds import KINDS
-from agents.kinds.crazyflie import CRAZYFLIE
-from agents.kinds.khepera4 import KHEPERA4
-from agents.kinds.tello import TELLO
-from agents.kinds.turtlebot3 import TURTLEBOT3
 from agents.plugins.avoidance import Nearby, Potential, measure_gap
 from agents.plugins.barrier import Barrier, closest
 from agents.plugins.registry import AVOIDANCES, build
 from agents.vectors import ZERO
+from bridges.crazyflie.kind import CRAZYFLIE
+from bridges.khepera4.kind import KHEPERA4
+from bridges.tello.kind import TELLO
+from bridges.turtlebot3.kind import TURTLEBOT3
 from experiments.definition.plan import Plan
 from tests.agents.bench import NOTHING, Bench, near, own
 from tests.cases import examples, for_each

@@ -15,9 +15,9 @@ import pytest
 
 from agents.body.interface import BodyError, refuse
 from agents.formation.link import Link
-from agents.kinds.khepera4 import KHEPERA4
 from agents.plugins import registry
 from agents.vectors import ZERO
+from bridges.khepera4.kind import KHEPERA4
 from experiments.definition.plan import Plan
 from tests.agents.bench import Bench, near, own
 from tests.agents.plugins.test_triggers import Play, standing

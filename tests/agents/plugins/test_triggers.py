@@ -13,7 +13,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from agents.decision.transmission import Transmitter
-from agents.kinds.khepera4 import KHEPERA4
 from agents.plugins import registry
 from agents.plugins.predictors import HOLD, ConstantVelocity, Predictor
 from agents.plugins.trigger_families import (
@@ -29,6 +28,7 @@ from agents.plugins.trigger_families import (
 )
 from agents.plugins.triggers import LastEvent, Periodic, SendOnDelta, Trigger, TriggerState
 from agents.vectors import NO_SETPOINT, ZERO, Vector
+from bridges.khepera4.kind import KHEPERA4
 from tests.cases import examples
 
 DT = 0.02

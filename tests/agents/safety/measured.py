@@ -9,12 +9,12 @@ from agents.body.external_pose import External
 from agents.body.interface import BodyState
 from agents.decision.lifecycle import AIRBORNE, READY
 from agents.robot import Robot
+from bridges.crazyflie.twin.vehicle import Vehicle
 from experiments.definition.experiment import RobotTable
 from experiments.definition.plan import Plan
 from tests.requests import request
 from tests.small import small
-from twins.devices.crazyflie.vehicle import Vehicle
-from twins.devices.device import Capture, Faults
+from twins.device import Capture, Faults
 
 DT = 0.01  # [s]
 CLIMB, DESCENT, SHORTEST_S = 0.4, 0.22, 1.5  # of the bridge [m/s], [s]

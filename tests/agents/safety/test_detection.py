@@ -9,16 +9,16 @@ from agents.body.interface import BodyState, RangeScan
 from agents.body.limits import Limits
 from agents.decision.neighbours import Incoming, Neighbours
 from agents.decision.situation import LATE_SHARE, SILENT_S, ProcessHealth, Situation
-from agents.kinds.crazyflie import CRAZYFLIE
-from agents.kinds.khepera4 import KHEPERA4
-from agents.kinds.tello import TELLO
-from agents.kinds.turtlebot3 import TURTLEBOT3
 from agents.plugins.predictors import HOLD
 from agents.safety.detection import FOREIGN_S, LOWEST_DESCENT_M_S, Detector, RobotStatus, tilt_angle, tilted
 from agents.safety.hazards import Cause, Hazards, Outcome
 from agents.safety.preflight import FRAME, LOST_S, Preflight
 from agents.safety.setpoint_filter import SetpointFilter
 from agents.vectors import UNKNOWN, ZERO
+from bridges.crazyflie.kind import CRAZYFLIE
+from bridges.khepera4.kind import KHEPERA4
+from bridges.tello.kind import TELLO
+from bridges.turtlebot3.kind import TURTLEBOT3
 
 DT, NAN = 0.01, math.nan
 

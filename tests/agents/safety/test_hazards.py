@@ -5,9 +5,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from agents.body.limits import Limits
-from agents.kinds.crazyflie import CRAZYFLIE
-from agents.kinds.khepera4 import KHEPERA4
 from agents.safety.hazards import Cause, Hazards, Outcome, failed, is_blind, rules
+from bridges.crazyflie.kind import CRAZYFLIE
+from bridges.khepera4.kind import KHEPERA4
 from tests.cases import examples
 
 DT = 0.01

@@ -13,15 +13,15 @@ from agents.body.limits import Limits
 from agents.decision.lifecycle import DONE, RUNNING
 from agents.decision.neighbours import Incoming, Neighbours
 from agents.decision.situation import ProcessHealth, Situation
-from agents.kinds.crazyflie import CRAZYFLIE
-from agents.kinds.khepera4 import KHEPERA4
-from agents.kinds.tello import TELLO
-from agents.kinds.turtlebot3 import TURTLEBOT3
 from agents.plugins.predictors import HOLD
 from agents.safety.hazards import Cause
 from agents.safety.landing import NEAR, PATIENCE_S, ROOM, Landing
 from agents.safety.setpoint_filter import SetpointFilter
 from agents.vectors import clamp
+from bridges.crazyflie.kind import CRAZYFLIE
+from bridges.khepera4.kind import KHEPERA4
+from bridges.tello.kind import TELLO
+from bridges.turtlebot3.kind import TURTLEBOT3
 from experiments.definition.experiment import LegTable, RobotTable
 from tests.agents.bench import Swarm
 from tests.cases import for_each, mostly_slow

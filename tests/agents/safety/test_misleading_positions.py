@@ -5,11 +5,11 @@ from math import hypot, radians
 import pytest
 
 from agents.decision.lifecycle import AIRBORNE, DONE
-from agents.kinds.crazyflie import CRAZYFLIE
 from agents.safety.direction_check import DirectionCheck
+from bridges.crazyflie.kind import CRAZYFLIE
 from experiments.definition.experiment import LegTable
 from tests.agents.safety.measured import DT, Flown
-from twins.devices.device import Faults
+from twins.device import Faults
 
 LINE = [LegTable(at_s=1.0, robot="F", plan={"kind": "line", "move_by": [0.5, 0.0], "speed": 0.3})]
 TURNED, STUCK = "cut: it flies beside its commands", "cut: its measured height does not follow its climb"

@@ -5,10 +5,10 @@ import math
 import pytest
 
 from agents.body.kinds import KINDS
-from agents.kinds.crazyflie import CRAZYFLIE
-from agents.kinds.khepera4 import KHEPERA4
-from agents.kinds.turtlebot3 import TURTLEBOT3
 from agents.safety.motion_check import MotionCheck
+from bridges.crazyflie.kind import CRAZYFLIE
+from bridges.khepera4.kind import KHEPERA4
+from bridges.turtlebot3.kind import TURTLEBOT3
 
 DT, FINE = 0.01, (False, False)
 every_kind = pytest.mark.parametrize("kind", KINDS.values(), ids=lambda kind: kind.name)

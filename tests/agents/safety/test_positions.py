@@ -4,10 +4,10 @@ from math import inf, isfinite, isnan, nan, pi, remainder, sqrt, tau
 
 import pytest
 
-from agents.kinds.crazyflie import CRAZYFLIE
-from agents.kinds.khepera4 import KHEPERA4
 from agents.safety.positions import FLIP, JUMP_M, PLAUSIBLE_SPEED, Continuity, ExternalPositions
 from agents.vectors import UNKNOWN
+from bridges.crazyflie.kind import CRAZYFLIE
+from bridges.khepera4.kind import KHEPERA4
 
 FAR = JUMP_M + PLAUSIBLE_SPEED * CRAZYFLIE.speed * 0.3  # [m] within a gap of 0.3 s in the measurements
 FLIPPED = FLIP + PLAUSIBLE_SPEED * KHEPERA4.turn_rate * 0.02  # [rad] within 0.02 s

@@ -12,11 +12,11 @@ from agents.body.interface import BodyState
 from agents.body.kinds import KINDS
 from agents.body.limits import Limits
 from agents.decision.situation import Situation
-from agents.kinds.crazyflie import CRAZYFLIE
-from agents.kinds.khepera4 import KHEPERA4
-from agents.kinds.tello import TELLO
-from agents.kinds.turtlebot3 import TURTLEBOT3
 from agents.safety.setpoint_filter import FLOOR_M, OUTSIDE_M, SetpointFilter
+from bridges.crazyflie.kind import CRAZYFLIE
+from bridges.khepera4.kind import KHEPERA4
+from bridges.tello.kind import TELLO
+from bridges.turtlebot3.kind import TURTLEBOT3
 from tests.cases import examples
 
 EACH = pytest.mark.parametrize("kind", KINDS.values(), ids=lambda kind: kind.name)

@@ -12,16 +12,16 @@ import yaml
 from cflib.drivers import crazyradio
 
 from agents.body.interface import BodyError
-from agents.protocols.crazyflie import CrazyflieSettings, Outside, capacity, overload
-from agents.protocols.crtp import MemoryKind
 from bridges.crazyflie import link
-from tests.bridges.crazyflie_flight import connected, connected_twins, motors, supervised, truth
+from bridges.crazyflie.protocol.addresses import CrazyflieSettings, Outside, capacity, overload
+from bridges.crazyflie.protocol.crtp import MemoryKind
+from bridges.crazyflie.twin.device import CrazyflieTwin
+from bridges.crazyflie.twin.supervisor import SupervisorState
+from tests.bridges.crazyflie.flights import connected, connected_twins, motors, supervised, truth
 from tests.requests import request
 from tests.twins.loopback import Served
 from tests.waiting import until
-from twins.devices.crazyflie.device import CrazyflieTwin
-from twins.devices.crazyflie.supervisor import SupervisorState
-from twins.devices.device import Faults
+from twins.device import Faults
 
 RADIO = "radio://0/80/2M/E7E7E7E701"
 DONGLE = {"link": "radio"}

@@ -6,9 +6,9 @@ import struct
 import numpy as np
 import pytest
 
-from agents.protocols.crtp import Port
 from bridges.crazyflie.delay import ClimbLog, delay
-from tests.twins.crazyflie_wire import DT, Wire
+from bridges.crazyflie.protocol.crtp import Port
+from tests.bridges.crazyflie.wire import DT, Wire
 
 
 def hop(late, rate_hz=20, noise=0.001, sigma=0.1, height=0.2, **faults):

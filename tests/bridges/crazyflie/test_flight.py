@@ -11,17 +11,17 @@ import numpy as np
 import pytest
 
 from agents.body.interface import UNANSWERED
-from agents.protocols import crtp
-from agents.protocols.crazyflie import CrazyflieSettings
-from agents.protocols.crtp import HighLevel, Info, LogStatus, Port
 from agents.safety.detection import LOWEST_DESCENT_M_S
 from agents.vectors import ZERO
 from bridges.crazyflie import flight as module
 from bridges.crazyflie import pilot
 from bridges.crazyflie.flight import FlightControl, FlightPhase
+from bridges.crazyflie.protocol import crtp
+from bridges.crazyflie.protocol.addresses import CrazyflieSettings
+from bridges.crazyflie.protocol.crtp import HighLevel, Info, LogStatus, Port
 from bridges.crazyflie.telemetry import PacketAge, Telemetry
 from bridges.crazyflie.trajectory import HOLD_S, SINK, TAKEOFFS, TrajectoryMemory
-from tests.bridges.crazyflie_flight import clocked
+from tests.bridges.crazyflie.flights import clocked
 from tests.waiting import ManualClock, until
 
 PLACE = (0.1, 0.2, 0.5, 0.0)

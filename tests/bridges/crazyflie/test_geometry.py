@@ -6,11 +6,11 @@ import pytest
 import yaml
 
 from agents.body.interface import BodyEntry, BodyError
-from agents.kinds.crazyflie import CRAZYFLIE
-from agents.protocols.crazyflie import CrazyflieSettings, Lighthouse, Loco
 from bridges.crazyflie.body import CrazyflieBody
 from bridges.crazyflie.geometry import check_anchors, stations
+from bridges.crazyflie.kind import CRAZYFLIE
 from bridges.crazyflie.positioning import configure
+from bridges.crazyflie.protocol.addresses import CrazyflieSettings, Lighthouse, Loco
 
 for_each = pytest.mark.parametrize
 EYE = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]

@@ -14,10 +14,6 @@ import numpy as np
 import pytest
 
 from agents.decision.lifecycle import AIRBORNE, RUNNING, Lifecycle
-from agents.kinds.crazyflie import CRAZYFLIE
-from agents.protocols import crtp
-from agents.protocols.crazyflie import YOUNG_S, CrazyflieSettings, Outside, chosen, oldest_pose, overload
-from agents.protocols.crtp import HighLevel, Log, Port, Setpoint
 from agents.safety.detection import Ascent
 from agents.safety.motion_check import MotionCheck
 from agents.safety.setpoint_filter import OUTSIDE_M
@@ -25,17 +21,21 @@ from agents.ticks import Ticks
 from agents.vectors import ZERO
 from bridges.crazyflie import trajectory
 from bridges.crazyflie.flight import DESCENT, FALLEN, FlightControl, FlightPhase
+from bridges.crazyflie.kind import CRAZYFLIE
 from bridges.crazyflie.link import BUSY_S
 from bridges.crazyflie.pilot import LOGS_S, LOOP_HZ, SAFE_PARAMETERS
+from bridges.crazyflie.protocol import crtp
+from bridges.crazyflie.protocol.addresses import YOUNG_S, CrazyflieSettings, Outside, chosen, oldest_pose, overload
+from bridges.crazyflie.protocol.crtp import HighLevel, Log, Port, Setpoint
 from bridges.crazyflie.telemetry import Telemetry
+from bridges.crazyflie.twin.device import CrazyflieTwin
+from bridges.crazyflie.twin.supervisor import SupervisorState
+from bridges.crazyflie.twin.tables import LOG_CODES, PACKINGS
 from experiments.real_time.conductor.hot_changes import CLIMB_S
-from tests.bridges.crazyflie_flight import clocked
+from tests.bridges.crazyflie.flights import clocked
 from tests.requests import request
 from tests.waiting import ManualClock
-from twins.devices.crazyflie.device import CrazyflieTwin
-from twins.devices.crazyflie.supervisor import SupervisorState
-from twins.devices.crazyflie.tables import LOG_CODES, PACKINGS
-from twins.devices.device import DeviceRequest, Faults
+from twins.device import DeviceRequest, Faults
 
 pytestmark = pytest.mark.slow
 CODES = {"int16_t": "i16", "uint16_t": "u16", "uint8_t": "u8", "int8_t": "i8", "FP16": "half"}

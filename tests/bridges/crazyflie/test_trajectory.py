@@ -5,16 +5,16 @@ import array
 import numpy as np
 import pytest
 
-from agents.protocols import crtp
-from agents.protocols.crazyradio import COUNTERS, NULL
-from agents.protocols.crtp import HighLevel, MemoryKind, Port
 from bridges.crazyflie import trajectory as module
+from bridges.crazyflie.protocol import crtp
+from bridges.crazyflie.protocol.crazyradio import COUNTERS, NULL
+from bridges.crazyflie.protocol.crtp import HighLevel, MemoryKind, Port
 from bridges.crazyflie.trajectory import COMPRESSED, HOLD_S, POLYNOMIALS, REPEAT_S, SINK, START_EXPIRY_S, TAKEOFFS
-from tests.bridges.crazyflie_flight import clocked
+from bridges.crazyflie.twin.memory import Memories
+from bridges.crazyflie.twin.planner import OnboardPlanner, evaluate, polynomial
+from bridges.crazyflie.twin.trajectories import Trajectories
+from tests.bridges.crazyflie.flights import clocked
 from tests.waiting import ManualClock
-from twins.devices.crazyflie.memory import Memories
-from twins.devices.crazyflie.planner import OnboardPlanner, evaluate, polynomial
-from twins.devices.crazyflie.trajectories import Trajectories
 
 DT = 0.01
 TOUCHES = 0.5  # [m/s] faster at the floor is no landing

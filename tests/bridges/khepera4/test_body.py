@@ -16,18 +16,18 @@ from hypothesis import strategies as st
 
 from agents.body.interface import FRESH_S, BodyError
 from agents.clock import uptime
-from agents.kinds.khepera4 import KHEPERA4
-from agents.protocols import khepera4 as protocol
+from bridges.khepera4 import protocol
 from bridges.khepera4.body import KheperaBody
+from bridges.khepera4.kind import KHEPERA4
 from bridges.khepera4.link import Khepera4Link, KheperaAddress, KheperaOdometry
 from bridges.khepera4.odometry import Odometer
+from bridges.khepera4.twin import KheperaDevice, answer_kteam
 from tests.bridges.driver import Driver, constant, toward
 from tests.cases import mostly_slow
 from tests.requests import request
 from tests.twins.loopback import Served, reached
 from tests.waiting import PATIENCE_S
-from twins.devices.device import DeviceRequest, Faults
-from twins.devices.khepera4 import KheperaDevice, answer_kteam
+from twins.device import DeviceRequest, Faults
 
 PARK, KTEAM, ONCE = ({"server": name} for name in ("2025-05", "kteam", "2023-01-07"))
 ONE = request("khepera4", ["khepera4-twin"])

@@ -8,15 +8,14 @@ from types import SimpleNamespace
 import pytest
 
 from agents.decision.position_control import PositionController
-from agents.kinds.khepera4 import KHEPERA4
-from agents.protocols import khepera4 as protocol
-from bridges.khepera4 import drivers
+from bridges.khepera4 import drivers, protocol
 from bridges.khepera4.drivers import KTeam, UnknownAnswer, Wire, WrongServer
+from bridges.khepera4.kind import KHEPERA4
 from bridges.khepera4.odometry import Odometer
+from bridges.khepera4.twin import KheperaDevice
 from tests.requests import request as robots
 from tests.waiting import ManualClock
-from twins.devices.device import DeviceRequest, Faults
-from twins.devices.khepera4 import KheperaDevice
+from twins.device import DeviceRequest, Faults
 
 DT = 0.01
 

@@ -12,19 +12,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from agents.body.capture_reader import CaptureFrame, MeasuredPose, parse_server
 from agents.body.coordinates import yaw_of
 from agents.network import messages, pubsub
 from agents.network import session as network
-from agents.protocols import vicon_datastream
+from bridges.motion_capture.protocol import vicon_datastream
 from bridges.motion_capture.publisher import Bridge, FrameQueue, PoseFilter, parse_maps
-from bridges.motion_capture.reader import CaptureFrame, MeasuredPose, parse_server
+from bridges.motion_capture.twin.capture import upright
 from bridges.motion_capture.vicon import ViconReader
 from experiments.file import document
 from tests.commands import python, started
 from tests.system.lab import RobotProcess, Watcher
 from tests.twins import loopback
 from tests.waiting import PATIENCE_S, ManualClock, until
-from twins.devices.capture import upright
 
 Camera = partial(loopback.Camera, sigma=1e-9)  # what repeats itself is not believed
 UPRIGHT = tuple(upright(0.3).ravel().tolist())

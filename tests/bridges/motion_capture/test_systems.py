@@ -13,18 +13,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
+from agents.body.byte_stream import MalformedStream
+from agents.body.capture_reader import rotation_of
 from agents.body.coordinates import Coordinates
 from agents.plugins import registry
-from agents.protocols import natnet, qtm
-from agents.protocols.byte_stream import MalformedStream
-from agents.protocols.natnet import MessageKind, NatNetFrame, RigidBodyPose
-from agents.protocols.qtm import BodyPose, QtmFrame
+from bridges.motion_capture.protocol import natnet, qtm
+from bridges.motion_capture.protocol.natnet import MessageKind, NatNetFrame, RigidBodyPose
+from bridges.motion_capture.protocol.qtm import BodyPose, QtmFrame
 from bridges.motion_capture.publisher import Bridge, PoseFilter
-from bridges.motion_capture.reader import rotation_of
+from bridges.motion_capture.twin.capture import upright
+from bridges.motion_capture.twin.optitrack import OptiTrackTwin, quaternion
 from tests.waiting import ManualClock
-from twins.devices.capture import upright
-from twins.devices.device import Faults
-from twins.devices.optitrack import OptiTrackTwin, quaternion
+from twins.device import Faults
 
 ARENA = Coordinates(origin=(1.0, -2.0, 0.5), heading=0.7)
 BODIES = {"CF01": "cf_1", "KH01": "Rigid Body 2"}

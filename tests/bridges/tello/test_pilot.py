@@ -11,13 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from agents.body.interface import UNANSWERED, BodyError
-from agents.kinds.tello import TELLO
-from agents.protocols import tello as protocol
-from agents.protocols.tello import TelloPlace
-from bridges.tello import pilot
+from bridges.tello import pilot, protocol
 from bridges.tello.body import TelloBody
+from bridges.tello.kind import TELLO
 from bridges.tello.library import TelloLibrary, filters_answers
 from bridges.tello.pilot import Duty, TelloPilot
+from bridges.tello.protocol import TelloPlace
 from tests.requests import request
 
 SPEED = st.floats(-1.0, 1.0)

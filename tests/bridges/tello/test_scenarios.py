@@ -16,13 +16,13 @@ import numpy as np
 import pytest
 
 from agents.body.interface import BodyError
-from agents.kinds.tello import TELLO
 from bridges.tello.body import TelloBody
+from bridges.tello.kind import TELLO
+from bridges.tello.twin import TelloDevice
 from tests.bridges.driver import Driver, toward
 from tests.conftest import ROOT
 from tests.requests import request
 from tests.twins.loopback import Served, reached
-from twins.devices.tello import TelloDevice
 
 ONE = request("tello", ["tello-twin"], external=True, yaw=0.5)
 NOBODY = "tello://127.0.0.77:18889"

@@ -12,11 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from agents.body.interface import UNANSWERED, BodyError
-from agents.protocols import ros2, turtlebot3
+from bridges.ros2 import messages as ros2
+from bridges.turtlebot3 import protocol as turtlebot3
 from bridges.turtlebot3.body import DIAGNOSIS_S, OPEN_S, TurtleBot3
 from bridges.turtlebot3.odometry import StampAge
 from bridges.turtlebot3.robot import ZEROS, TurtleBotConnection, ranges
-from tests.bridges.turtlebots import NOWHERE, STYLES, FakeRos, Stage, clock, odometry, request
+from tests.bridges.turtlebot3.turtlebots import NOWHERE, STYLES, FakeRos, Stage, clock, odometry, request
 from tests.waiting import ManualClock, until
 
 

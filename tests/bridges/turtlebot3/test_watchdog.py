@@ -11,6 +11,7 @@ from unittest.mock import MagicMock
 import pytest
 
 from bridges.turtlebot3 import watchdog
+from bridges.turtlebot3.kind import TURTLEBOT3
 from bridges.turtlebot3.watchdog import TYPES, StopTimer, WatchdogNode, moving, type_of_robot
 from experiments.real_time.hosts import installation
 from experiments.real_time.hosts.hosts import HostError
@@ -138,26 +139,30 @@ def robot_home(tmp_path, monkeypatch):
 @pytest.mark.system
 def test_watchdog_is_installed_kept_and_removed(robot_home):
     for attempt in range(2):  # a second time replaces the first
-        said = installation.put_watchdog("robot", namespace="tb3_0", domain=30, silence_s=0.5)
+        said = installation.put_watchdog(TURTLEBOT3, "robot", namespace="tb3_0", domain=30, silence_s=0.5)
         assert "it is started at each boot (crontab -l)" in said
         assert "watches cmd_vel (geometry_msgs/msg/TwistStamped): stops the robot after 0.5 s" in said[-1], attempt
         assert "__ns:=/tb3_0" in said[-1]
     folder = robot_home / "zenpark-watchdog"
     assert (robot_home / "crontab").read_text() == f"@reboot {folder}/run\n"
-    assert (folder / "watchdog.py").read_bytes() == installation.WATCHDOG.read_bytes()
+    assert (folder / "watchdog.py").read_bytes() == installation.watchdog(TURTLEBOT3).read_bytes()
     first = int((folder / "pid").read_text())
     os.kill(first, signal.SIGKILL)
     until(lambda: int((folder / "pid").read_text() or first) != first, "it is started anew")
-    assert installation.remove_watchdog("robot") == ["removed"]
+    assert installation.remove_watchdog(TURTLEBOT3, "robot") == ["removed"]
     assert not folder.exists()
     assert (robot_home / "crontab").read_text() == ""
-    assert installation.remove_watchdog("robot") == ["there is none"]
+    assert installation.remove_watchdog(TURTLEBOT3, "robot") == ["there is none"]
 
 
 @pytest.mark.system
 @pytest.mark.usefixtures("robot_home")
-def test_a_robot_without_ros_is_named(monkeypatch):
-    without = installation.PUT_WATCHDOG.replace("${ROS_SETUP:-$setup}", "$setup")
-    monkeypatch.setattr(installation, "PUT_WATCHDOG", without)
+def test_a_robot_without_ros_is_named(monkeypatch, tmp_path):
+    program = installation.watchdog(TURTLEBOT3)
+    script = program.with_name("put_watchdog.sh").read_text("utf-8")
+    (tmp_path / "put_watchdog.sh").write_text(script.replace("${ROS_SETUP:-$setup}", "$setup"))
+    without = tmp_path / program.name
+    without.write_bytes(program.read_bytes())
+    monkeypatch.setattr(installation, "watchdog", lambda _: without)
     with pytest.raises(HostError, match=r"(?s)^robot: .*there is no ROS 2 under /opt/ros$"):
-        installation.put_watchdog("robot", namespace="", domain=30, silence_s=0.5)
+        installation.put_watchdog(TURTLEBOT3, "robot", namespace="", domain=30, silence_s=0.5)

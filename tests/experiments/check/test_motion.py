@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from agents.body.interface import Disturbance, Jitter
-from agents.kinds.crazyflie import CRAZYFLIE
+from bridges.crazyflie.kind import CRAZYFLIE
 from experiments.check.analysis import Analysis
 from experiments.check.check import figures
 from experiments.check.ideal_run import Prediction, isolated, predict, repetitions

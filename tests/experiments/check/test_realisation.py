@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from agents.formation.link import BY_RELATIVE
-from agents.kinds.crazyflie import CRAZYFLIE
-from agents.kinds.khepera4 import KHEPERA4
-from agents.kinds.tello import TELLO
 from agents.plugins.laws import Displacement, Distance
+from bridges.crazyflie.kind import CRAZYFLIE
+from bridges.khepera4.kind import KHEPERA4
+from bridges.tello.kind import TELLO
 from experiments.authoring import layouts
 from experiments.check import realisation
 from experiments.check.analysis import Analysis

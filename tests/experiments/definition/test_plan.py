@@ -15,12 +15,12 @@ from agents.body.interface import BodyError, BodyState, Disturbance, Jitter
 from agents.body.kinds import KINDS, Kind
 from agents.body.limits import Safety
 from agents.errors import Refusal
-from agents.kinds.turtlebot3 import TURTLEBOT3
 from agents.network import channel_model, messages
 from agents.plugins.laws import Distance
 from agents.plugins.planners import Line
 from agents.plugins.triggers import Periodic, SendOnDelta
 from agents.robot import Robot
+from bridges.turtlebot3.kind import TURTLEBOT3
 from experiments import run
 from experiments.check.analysis import Analysis
 from experiments.check.ideal_run import predict

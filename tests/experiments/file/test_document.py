@@ -27,7 +27,7 @@ from experiments.file.text import MAX_TEXT_BYTES
 from tests.experiments.traces import parse_links
 from tests.small import PERIODIC, changed
 from twins.body import TwinBody
-from twins.devices.device import Faults
+from twins.device import Faults
 from twins.scene import Obstacle
 
 MALFORMED = Path(__file__).parent / "malformed"

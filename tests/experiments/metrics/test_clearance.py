@@ -7,10 +7,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from agents.kinds.crazyflie import CRAZYFLIE
-from agents.kinds.khepera4 import KHEPERA4
-from agents.kinds.turtlebot3 import TURTLEBOT3
 from agents.network.messages import Contact
+from bridges.crazyflie.kind import CRAZYFLIE
+from bridges.khepera4.kind import KHEPERA4
+from bridges.turtlebot3.kind import TURTLEBOT3
 from experiments.definition.experiment import Arena
 from experiments.metrics.clearance import Clearance, collisions
 from experiments.metrics.results import Approach, Collision

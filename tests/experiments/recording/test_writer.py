@@ -21,7 +21,7 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
 from agents.network.messages import Event, HostClock, Pose, PoseReceipt
-from bridges import ros2 as bridge
+from bridges.ros2 import bridge
 from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
 from experiments.recording import writer

@@ -165,7 +165,7 @@ REPORT, LAW, COUNTS = "experiments/report/figures.py", "agents/plugins/laws.py",
 def copied(tmp_path_factory):
     """A copy of all code of which sweeps and reports are made."""
     root = tmp_path_factory.mktemp("code")
-    for package in ("agents", "twins", "experiments"):
+    for package in ("agents", "bridges", "twins", "experiments"):
         shutil.copytree(ROOT / package, root / package, ignore=shutil.ignore_patterns("__pycache__"))
     return root
 
@@ -181,6 +181,8 @@ def copied(tmp_path_factory):
         ("experiments/definition/formation.py", "return", "return  -", False),
         ("experiments/virtual_time/network.py", "return", "return  -", False),
         ("twins/body.py", "return", "return  -", False),
+        ("bridges/tello/kind.py", "speed=1.0", "speed=1.1", False),
+        ("bridges/tello/body.py", "return", "return  -", True),
     ],
 )
 def test_only_code_that_determines_results_counts(copied, file, old, new, same):

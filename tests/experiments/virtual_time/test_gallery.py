@@ -9,13 +9,13 @@ from scipy.special import gammaincinv
 
 from agents.decision.position_control import LEASH
 from agents.formation.link import Link
-from agents.kinds.crazyflie import CRAZYFLIE
 from agents.plugins.gallery.coverage import Coverage
 from agents.plugins.gallery.enclosing import Enclosing
 from agents.plugins.gallery.integral import Integral
 from agents.plugins.gallery.leader_observer import LeaderObserver
 from agents.plugins.law import NeighbourView, RobotFacts, View
 from agents.vectors import ZERO
+from bridges.crazyflie.kind import CRAZYFLIE
 from experiments.catalogue import index
 from experiments.definition.standby import without_standby
 from experiments.file import document

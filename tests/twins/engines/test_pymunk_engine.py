@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from agents.body.interface import BodyError
-from agents.kinds.crazyflie import CRAZYFLIE
-from agents.kinds.khepera4 import KHEPERA4
 from agents.kinds.omni import OMNI
-from agents.kinds.tello import TELLO
-from agents.kinds.turtlebot3 import TURTLEBOT3
 from agents.plugins import registry
 from agents.plugins.planners import Line
 from agents.vectors import UNKNOWN
+from bridges.crazyflie.kind import CRAZYFLIE
+from bridges.khepera4.kind import KHEPERA4
+from bridges.tello.kind import TELLO
+from bridges.turtlebot3.kind import TURTLEBOT3
 from tests.twins.planar_drive import DT, Drive, columns, command, furnished, stage
 from twins.engines.point_mass import PointMass
 from twins.engines.pymunk_engine import Planar

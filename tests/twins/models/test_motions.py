@@ -5,11 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from agents.kinds.crazyflie import CRAZYFLIE
-from agents.kinds.khepera4 import KHEPERA4
-from agents.kinds.tello import TELLO
-from agents.kinds.turtlebot3 import TURTLEBOT3
 from agents.vectors import NO_SETPOINT, ZERO
+from bridges.crazyflie.kind import CRAZYFLIE
+from bridges.khepera4.kind import KHEPERA4
+from bridges.tello.kind import TELLO
+from bridges.turtlebot3.kind import TURTLEBOT3
 from tests.cases import mostly_slow
 from twins.models.differential import Differential
 from twins.models.onboard_flight import CLIMB, TOUCHDOWN

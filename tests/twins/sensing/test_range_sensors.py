@@ -10,10 +10,10 @@ import pytest
 
 from agents.body.interface import BodyError
 from agents.body.kinds import KINDS
-from agents.kinds.crazyflie import CRAZYFLIE
-from agents.kinds.khepera4 import KHEPERA4
-from agents.kinds.turtlebot3 import TURTLEBOT3
 from agents.vectors import ZERO
+from bridges.crazyflie.kind import CRAZYFLIE
+from bridges.khepera4.kind import KHEPERA4
+from bridges.turtlebot3.kind import TURTLEBOT3
 from tests.requests import request
 from twins.body import TwinBody
 from twins.engines.engine import EngineInput, World

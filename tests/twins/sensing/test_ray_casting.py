@@ -7,10 +7,10 @@ import numpy as np
 import pymunk
 import pytest
 
-from agents.kinds.crazyflie import CRAZYFLIE
-from agents.kinds.khepera4 import KHEPERA4
-from agents.kinds.tello import TELLO
-from agents.kinds.turtlebot3 import TURTLEBOT3
+from bridges.crazyflie.kind import CRAZYFLIE
+from bridges.khepera4.kind import KHEPERA4
+from bridges.tello.kind import TELLO
+from bridges.turtlebot3.kind import TURTLEBOT3
 from twins.scene import Obstacle, Scene
 from twins.sensing.ray_casting import BUDGET, Beams, Caster, Fan
 

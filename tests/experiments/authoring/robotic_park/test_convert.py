@@ -10,8 +10,8 @@ import pytest
 
 from agents.formation.anchors import Anchor
 from agents.formation.link import BY_DISTANCE, BY_RELATIVE
-from agents.kinds.crazyflie import CRAZYFLIE
-from agents.kinds.khepera4 import KHEPERA4
+from bridges.crazyflie.kind import CRAZYFLIE
+from bridges.khepera4.kind import KHEPERA4
 from experiments.authoring import layouts
 from experiments.authoring.robotic_park.convert import convert, convert_text
 from experiments.authoring.robotic_park.file import ParkTrigger, starts_from

@@ -9,9 +9,9 @@ import pytest
 from agents.body.limits import Safety
 from agents.body.measured_positions import FROZEN
 from agents.clock import Clock
-from agents.kinds.tello import TELLO
 from agents.network.messages import Inspection, Reply, State, Status
 from agents.safety.preflight import FRAME
+from bridges.tello.kind import TELLO
 from experiments.definition.experiment import RobotTable
 from experiments.definition.plan import Plan
 from experiments.file import document

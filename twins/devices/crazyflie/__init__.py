@@ -1,4 +1,0 @@
-"""Protocol twin of the Crazyflie 2.x: CRTP over UDP, for an unmodified cflib.
-
-May import: agents, twins.arrays, twins.body, twins.engines, twins.models, twins.devices.
-"""
