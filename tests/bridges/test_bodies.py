@@ -2,6 +2,7 @@
 
 import select
 import socket
+from contextlib import ExitStack, suppress
 
 import pytest
 
@@ -104,12 +105,21 @@ def turtlebot(port):
     return TurtleBot3(turtlebots.request(endpoint, "ros2dds://tb3_0?distro=humble")), f"ros2dds://tb3_0 by {endpoint}"
 
 
+def free_for_both(stack):
+    """Sockets of UDP and TCP at one port, which other processes may have for one of the two."""
+    while True:
+        packets = stack.enter_context(socket.socket(type=socket.SOCK_DGRAM))
+        connections = stack.enter_context(socket.socket())
+        packets.bind(("127.0.0.1", 0))
+        with suppress(OSError):
+            connections.bind(("127.0.0.1", port := packets.getsockname()[1]))
+            return packets, connections, port
+
+
 @pytest.mark.parametrize("opened", [crazyflie, khepera, tello, turtlebot])
 def test_driven_device_gets_nothing_from_a_second_process(opened):
-    with socket.socket(type=socket.SOCK_DGRAM) as packets, socket.socket() as connections:
-        packets.bind(("127.0.0.1", 0))
-        port = packets.getsockname()[1]
-        connections.bind(("127.0.0.1", port))
+    with ExitStack() as both:
+        packets, connections, port = free_for_both(both)
         connections.listen()
         body, device = opened(port)
         first = Claims(["CF07"], [device])
